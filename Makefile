@@ -1,0 +1,51 @@
+# Every target sets up what it needs first; no environment has to be active.
+#   make lens-opt ARGS="--quick --out runs/mine"      PYTHON=/path/to/python3.12 chooses the interpreter
+SHELL := bash
+.DEFAULT_GOAL := help
+PYTHON ?=
+ARGS ?=
+RUN := .venv/bin/python
+
+.PHONY: help setup lens-opt placement speed-error stability gradcheck test lint doctor clean
+
+help: ## this list
+	@sed -n 's/^\([a-z-]*\):.*## /  make \1|/p' Makefile | awk -F'|' '{printf "%-20s %s\n", $$1, $$2}'
+
+setup: .venv/installed.stamp .venv/llvm.stamp ## environment, packages and LLVM (only what has changed)
+
+.venv/installed.stamp: pyproject.toml constraints.txt setup/make_venv.sh
+	@setup/make_venv.sh .venv "$(PYTHON)"
+	@$(RUN) -m pip install --disable-pip-version-check --quiet --editable ".[dev]" --constraint constraints.txt
+	@touch $@
+
+.venv/llvm.stamp: .venv/installed.stamp setup/install_llvm.sh
+	@if setup/install_llvm.sh $(RUN); then touch $@; fi
+
+lens-opt: setup ## optimise a lens for event flow, the main job
+	@$(RUN) -m studies.lens_opt $(ARGS)
+
+placement: setup ## where to mount the camera on a robot
+	@$(RUN) -m studies.placement $(ARGS)
+
+speed-error: setup ## time and error of every fidelity level
+	@$(RUN) -m studies.speed_error $(ARGS)
+
+stability: setup ## hard cases: outcome expected and seen
+	@$(RUN) -m studies.stability $(ARGS)
+
+gradcheck: setup ## autograd against differences, junction by junction
+	@$(RUN) -m studies.gradient_flow $(ARGS)
+
+test: setup ## all tests
+	@$(RUN) -m pytest $(ARGS)
+
+lint: setup ## ruff and pyright
+	@$(RUN) -m ruff check .
+	@$(RUN) -m pyright $(ARGS)
+
+doctor: setup ## what is installed, what is missing, what to do
+	@$(RUN) -m codesign doctor
+
+clean: ## remove the environment and caches; results in runs/ stay
+	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,1 @@
+"""Differentiable co-design: lens, render, event camera, event flow."""

@@ -1,0 +1,256 @@
+"""The only place that picks a Mitsuba variant, checks LLVM, and bridges drjit and torch."""
+
+import hashlib
+import json
+import os
+import platform
+import subprocess
+import sys
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from codesign.errors import BackendError, GradientError
+
+MINIMUM_LLVM = 19  # 15 and 16 abort the process while compiling Mitsuba 3.9 kernels; 14 is refused; 19 and 22 work
+INSTALL_LLVM = {
+    "Linux": "install LLVM 19 or newer: 'apt-get install libllvm19' (Debian, Ubuntu), 'dnf install llvm-libs' (Fedora) or 'conda install -c conda-forge libllvm19'",
+    "Darwin": "install LLVM 19 or newer: 'brew install llvm', then set DRJIT_LIBLLVM_PATH=$(brew --prefix llvm)/lib/libLLVM.dylib",
+    "Windows": "install LLVM 19 or newer from the LLVM project's Windows installer, then set DRJIT_LIBLLVM_PATH to LLVM-C.dll",
+}
+_TRIAL = """
+import mitsuba as mi
+mi.set_variant({variant!r})
+import drjit as dr
+scene = mi.load_dict({{'type': 'scene', 'e': {{'type': 'constant'}}, 'i': {{'type': 'path'}}, 's': {{'type': 'sphere', 'bsdf': {{'type': 'diffuse'}}}},
+    'sensor': {{'type': 'perspective', 'to_world': mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]), 'film': {{'type': 'hdrfilm', 'width': 8, 'height': 8}}}}}})
+image = mi.render(scene, spp=2)
+dr.eval(image)
+assert 0 < float(dr.mean(image.array)[0] if hasattr(dr.mean(image.array), '__len__') else dr.mean(image.array)) < 10
+print('render ok')
+"""
+
+
+def install_hint():
+    """One line that says how to get a good LLVM on this system."""
+    return INSTALL_LLVM.get(platform.system(), INSTALL_LLVM["Linux"])
+
+
+def llvm_version():
+    """Version of the LLVM that drjit found, as (major, minor, patch), or None when it found none."""
+    import drjit as dr
+
+    found = tuple(dr.detail.llvm_version())
+    return None if found[0] < 0 else found
+
+
+def check_version(device="cpu"):
+    """Raise BackendError unless the compiler drjit needs for ``device`` is present and fit. Costs milliseconds."""
+    if device.startswith("cuda"):
+        if not torch.cuda.is_available():
+            raise BackendError("device 'cuda' was asked for but torch sees no CUDA device; use --device cpu, or install a CUDA build of torch and a driver.")
+        return
+    found, path = llvm_version(), os.environ.get("DRJIT_LIBLLVM_PATH")
+    where = f" (DRJIT_LIBLLVM_PATH={path})" if path else ""
+    remedy = ("unset DRJIT_LIBLLVM_PATH, or " if path else "") + install_hint()
+    if found is None:
+        raise BackendError(f"no usable LLVM library was found{where}; {remedy}.")
+    if found[0] < MINIMUM_LLVM:
+        dotted = ".".join(map(str, found))
+        raise BackendError(f"LLVM {dotted} was found{where}, but rendering needs {MINIMUM_LLVM} or newer (older ones abort the process); {remedy}.")
+
+
+def variant(device="cpu"):
+    """Name of the Mitsuba variant used on ``device``: one radiance channel, because event sensors are monochrome."""
+    return "cuda_ad_mono" if device.startswith("cuda") else "llvm_ad_mono"
+
+
+def trial_render(device="cpu", timeout_s=180):
+    """Render a tiny scene in a subprocess, since a bad LLVM aborts the process. Returns (worked, message)."""
+    command = [sys.executable, "-c", _TRIAL.format(variant=variant(device))]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+    except subprocess.TimeoutExpired:
+        return False, f"the trial render did not end within {timeout_s} s"
+    if done.returncode == 0 and "render ok" in done.stdout:
+        return True, "ok"
+    last = (done.stderr.strip().splitlines() or [""])[-1]
+    return False, f"the trial render ended with code {done.returncode} ({last[:200]})"
+
+
+def _memory_file():
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "codesign" / "trial_render.json"
+
+
+def _machine_key(device):
+    facts = [variant(device), version("mitsuba"), version("drjit"), platform.platform(), sys.executable, str(llvm_version()), os.environ.get("DRJIT_LIBLLVM_PATH", "")]
+    return hashlib.sha256("|".join(facts).encode()).hexdigest()
+
+
+@lru_cache(maxsize=4)
+def require_renderer(device="cpu"):
+    """Check once that rendering works; raise BackendError with one sentence otherwise.
+
+    The version check runs in every process; the trial render runs once per machine and set of versions, and is remembered.
+    """
+    check_version(device)
+    key, memory = _machine_key(device), _memory_file()
+    try:
+        known = json.loads(memory.read_text())
+    except (OSError, ValueError):
+        known = {}
+    if not (isinstance(known, dict) and known.get(key) == "ok"):
+        worked, message = trial_render(device)
+        if not worked:
+            raise BackendError(f"{message}; {install_hint()}, then run 'python -m codesign doctor'.")
+        try:
+            memory.parent.mkdir(parents=True, exist_ok=True)
+            memory.write_text(json.dumps({key: "ok"}))
+        except OSError:
+            return  # an unwritable cache costs a trial render per process, nothing else
+
+
+@lru_cache(maxsize=4)
+def mitsuba(device="cpu") -> Any:
+    """The Mitsuba module with the variant of ``device`` set, after the renderer check."""
+    require_renderer(device)
+    import mitsuba as mi
+
+    mi.set_variant(variant(device))
+    return mi
+
+
+@dataclass(frozen=True)
+class Arrays:
+    """The drjit array types of one device and precision."""
+
+    Float: Any
+    UInt32: Any
+    Int32: Any
+    Bool: Any
+    Array3: Any
+
+
+@lru_cache(maxsize=8)
+def arrays(device="cpu", dtype=torch.float32):
+    """drjit types that match a torch device and dtype (float32 or float64)."""
+    check_version(device)
+    if device.startswith("cuda"):
+        import drjit.cuda.ad as ad
+    else:
+        import drjit.llvm.ad as ad
+    if dtype == torch.float32:
+        return Arrays(ad.Float, ad.UInt32, ad.Int, ad.Bool, ad.Array3f)
+    if dtype == torch.float64:
+        return Arrays(ad.Float64, ad.UInt32, ad.Int, ad.Bool, ad.Array3f64)
+    raise GradientError(f"kernels compute in float32 or float64, not {dtype}; convert the tensor first.")
+
+
+def widen(arr, parameters, count, width):
+    """Gather each of ``count`` scalars of a flat array into a full-width array.
+
+    A scalar used by a million lanes would make one full recomputation per use in the backward pass; a gather makes one reduction.
+    """
+    import drjit as dr
+
+    zero = dr.opaque(arr.UInt32, 0, width)
+    return [dr.gather(arr.Float, parameters, zero + k) for k in range(count)]
+
+
+def run_kernel(kernel, inputs, out_shapes):
+    """Run a drjit kernel on torch tensors, with first derivatives.
+
+    Args:
+      kernel: callable (arrays, *flat) -> tuple of flat drjit arrays; must be a pure function of its inputs. Integer outputs carry no gradient.
+      inputs: float tensors of one dtype and device; each is handed to the kernel flattened (row-major).
+      out_shapes: shape of each output.
+    Returns: tuple of tensors that own their memory (no aliasing with the inputs).
+    Gradient: reverse mode, by running the kernel again in backward, so any number of backward passes give the same numbers.
+    Raises: GradientError on mixed dtypes, and when a second derivative is asked for.
+    """
+    inputs = tuple(inputs)
+    dtypes, devices = {x.dtype for x in inputs}, {x.device for x in inputs}
+    if len(dtypes) != 1 or len(devices) != 1:
+        raise GradientError(f"a kernel takes tensors of one dtype and one device, got {sorted(map(str, dtypes))} on {sorted(map(str, devices))}; convert them first.")
+    return _Kernel.apply(kernel, tuple(map(tuple, out_shapes)), *inputs)
+
+
+def _to_drjit(arr, tensor):
+    return arr.Float(tensor.detach().contiguous().reshape(-1))
+
+
+def _to_torch(value, shape, inputs):
+    tensor = value.torch()
+    shared = any(tensor.data_ptr() == x.data_ptr() for x in inputs)
+    if tensor.numel() == 1 and torch.Size(shape).numel() != 1:
+        return tensor.expand(torch.Size(shape).numel()).reshape(shape).clone()
+    return (tensor.clone() if shared else tensor).reshape(shape)
+
+
+class _Kernel(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, kernel, out_shapes, *inputs):
+        import drjit as dr
+
+        ctx.kernel, ctx.arrays = kernel, arrays(inputs[0].device.type, inputs[0].dtype)
+        ctx.save_for_backward(*inputs)
+        ctx.set_materialize_grads(False)
+        with dr.suspend_grad():
+            outputs = [dr.detach(o) for o in kernel(ctx.arrays, *[_to_drjit(ctx.arrays, x) for x in inputs])]
+            dr.eval(outputs)
+        dr.sync_thread()
+        seen, tensors = list(inputs), []
+        for value, shape in zip(outputs, out_shapes, strict=True):
+            tensors.append(_to_torch(value, shape, seen))
+            seen.append(tensors[-1])
+        ctx.mark_non_differentiable(*[t for t in tensors if not t.is_floating_point()])
+        return tuple(tensors)
+
+    @staticmethod
+    def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
+        with torch.no_grad():
+            result = _adjoint(ctx, grads)
+        if torch.is_grad_enabled():
+            live = [g for g in result if g is not None]
+            sealed = iter(_NoSecondDerivative.apply(len(live), *live, *ctx.saved_tensors, *[g for g in grads if g is not None]))
+            result = [None if g is None else next(sealed) for g in result]
+        return (None, None, *result)
+
+
+def _adjoint(ctx, grads):
+    """Gradients of the kernel's inputs, by re-running it with drjit's reverse mode."""
+    import drjit as dr
+
+    inputs, arr = ctx.saved_tensors, ctx.arrays
+    wanted = ctx.needs_input_grad[2:]
+    flat = [_to_drjit(arr, x) for x in inputs]
+    for value, want in zip(flat, wanted, strict=True):
+        if want:
+            dr.enable_grad(value)
+    outputs = ctx.kernel(arr, *flat)
+    for value, grad in zip(outputs, grads, strict=True):
+        if grad is not None and dr.grad_enabled(value):
+            seed = _to_drjit(arr, grad)
+            dr.accum_grad(value, seed if dr.width(value) == dr.width(seed) else dr.sum(seed))
+            dr.enqueue(dr.ADMode.Backward, value)
+    dr.traverse(dr.ADMode.Backward)
+    found = [dr.grad(value) if want else None for value, want in zip(flat, wanted, strict=True)]
+    dr.eval(found)
+    dr.sync_thread()
+    return [None if g is None else _to_torch(g, x.shape, inputs) for g, x in zip(found, inputs, strict=True)]
+
+
+class _NoSecondDerivative(torch.autograd.Function):
+    """Passes gradients on unchanged; differentiating them again is refused with a sentence."""
+
+    @staticmethod
+    def forward(ctx, count, *tensors):
+        return tuple(t.clone() for t in tensors[:count])
+
+    @staticmethod
+    def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
+        raise GradientError("drjit kernels give first derivatives only; a second derivative through the lens or the renderer was asked for. Use differences of gradients instead.")

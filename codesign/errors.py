@@ -1,0 +1,39 @@
+"""One small family of exceptions. Every message says what was given, what is allowed, and what to do."""
+
+
+class CodesignError(Exception):
+    """Anything the user can mend. Commands print the message alone and exit with code 2."""
+
+
+class ShapeError(CodesignError, ValueError):
+    """A tensor has the wrong number of axes or the wrong size along one."""
+
+
+class DomainError(CodesignError, ValueError):
+    """A value lies outside what the formula or the hardware allows (NaN included)."""
+
+
+class FileFormatError(CodesignError, ValueError):
+    """A file is missing, malformed, or of a kind this function does not read."""
+
+
+class BackendError(CodesignError, RuntimeError):
+    """A system component that rendering needs (LLVM, a Mitsuba variant, CUDA) is missing or unfit."""
+
+
+class GradientError(CodesignError, RuntimeError):
+    """A derivative was asked for that the backend cannot give (for example a second derivative)."""
+
+
+class NonFiniteError(CodesignError, ArithmeticError):
+    """A value or gradient became infinite or NaN; the message names the junction where it appeared."""
+
+
+def check_finite(tensor, name, remedy="remove or repair the non-finite entries"):
+    """Raise DomainError when ``tensor`` holds NaN or infinity; return it unchanged otherwise."""
+    finite = tensor.detach().isfinite()
+    if not bool(finite.all()):
+        bad = int((~finite).sum())
+        first = (~finite).nonzero()[0].tolist()
+        raise DomainError(f"{name}: {bad} of {finite.numel()} values are NaN or infinite (first at index {first}); {remedy}.")
+    return tensor

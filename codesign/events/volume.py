@@ -1,0 +1,90 @@
+"""Event volumes: counts on a grid of time bins, shared linearly between the two nearest bins.
+
+With n bins the nodes are n equally spaced times from the start to the end of the interval. An event between two nodes is shared in proportion to its
+nearness, so nothing is lost. The end bins collect from one side only: half as much as the others, centred a third of a node spacing inside.
+"""
+
+import torch
+
+from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.events.entry import check_times
+from codesign.types import EventVolume
+
+
+def bin_shares(position, bins):
+    """Share of each bin in events at given places of the interval.
+
+    Args:
+      position: [N] place in the interval, 0 at its start, 1 at its end.
+      bins: number of bins, >= 1.
+    Returns: [N, bins] shares >= 0; each row sums to 1 and has at most two entries. One bin takes everything.
+    """
+    if isinstance(bins, bool) or not isinstance(bins, int) or bins < 1:
+        raise DomainError(f"bins is {bins!r}; a whole number >= 1 is needed.")
+    if bins == 1:
+        return torch.ones_like(position)[:, None]
+    node = torch.arange(bins, dtype=position.dtype, device=position.device)
+    return (1 - (position[:, None] * (bins - 1) - node).abs()).clamp(min=0)
+
+
+def from_counts(counts, t_s, bins):
+    """Sort the counts of consecutive frame intervals into time bins.
+
+    Args:
+      counts: [T-1, 2, ..., H, W] events per interval, ON first, axes between polarity and H as batch ([T-1, 2, H, W]: batch of one).
+      t_s: [T] frame times, seconds, strictly increasing. The events of an interval sit at its middle.
+      bins: number of bins, >= 1.
+    Returns: EventVolume of counts [B, 2, bins, H, W]; the total is conserved.
+      centroid_s: [bins] float64, seconds from t_s[0]: mean time of what a bin collects when events come at an even rate. It does not depend on the
+      counts, so a rate that changes linearly with time is read off at the centroid exactly.
+    Gradient: counts.
+    Raises: ShapeError when axes or the number of times do not fit; DomainError for times that do not increase, counts that are not finite, bins < 1,
+      and for fewer intervals than fill every bin.
+    """
+    if counts.ndim < 4 or counts.shape[0] < 1 or counts.shape[1] != 2:
+        raise ShapeError(f"counts have shape {list(counts.shape)}; [T-1, 2, H, W] or [T-1, 2, K, H, W] is needed (ON first on axis 1).")
+    check_finite(counts, "counts")
+    times_s = check_times(t_s, counts.shape[0] + 1)
+    middle_s = (times_s[1:] + times_s[:-1]) / 2 - times_s[0]
+    shares = bin_shares(middle_s / (times_s[-1] - times_s[0]), bins)
+    collected_s = shares.T @ times_s.diff()
+    if bool((collected_s <= 0).any()):
+        empty = (collected_s <= 0).nonzero().flatten().tolist()
+        raise DomainError(f"bins {empty} of {bins} collect no interval out of {counts.shape[0]}; use fewer bins or more frames.")
+    centroid_s = (shares.T @ (times_s.diff() * middle_s)) / collected_s
+    *batch, height, width = counts.shape[2:]
+    volume = shares.T.to(counts) @ counts.flatten(1)
+    volume = volume.reshape(bins, 2, -1, height, width).permute(2, 1, 0, 3, 4).contiguous()
+    return EventVolume(volume, centroid_s.to(counts.device), collected_s.to(counts.device))
+
+
+def from_stream(stream, t0_us, t1_us, bins, *, dtype=torch.float32):
+    """Sort single events into time bins by their timestamps.
+
+    Args:
+      stream: EventStream.
+      t0_us, t1_us: the interval, integer microseconds, both ends included; tile time with [a, b], [b + 1, c]. Events outside are not asked for.
+      bins: number of bins, >= 1.
+    Returns: EventVolume of counts [1, 2, bins, H, W] whose total is the number of events in the interval, and centroid_s [bins] float64, seconds from
+      t0: (t1 - t0)/(3 (bins - 1)) inside at the ends, the nodes between (even event rate).
+    Gradient: none (timestamps are integers).
+    Raises: DomainError for t1 <= t0 or bins < 1.
+    """
+    if int(t0_us) != t0_us or int(t1_us) != t1_us or t1_us <= t0_us:
+        raise DomainError(f"the interval is {t0_us!r} to {t1_us!r} us; whole microseconds with t1 > t0 are needed.")
+    duration_us = int(t1_us) - int(t0_us)
+    inside = (stream.t_us >= int(t0_us)) & (stream.t_us <= int(t1_us))
+    since_us = (stream.t_us[inside] - int(t0_us)).to(torch.float64)
+    shares = bin_shares(since_us / duration_us, bins)
+    height, width = stream.height_px, stream.width_px
+    pixel = stream.y[inside] * width + stream.x[inside]
+    cell = ((stream.p[inside] < 0).long() * bins)[:, None] + torch.arange(bins, device=pixel.device)
+    counts = torch.zeros(2 * bins * height * width, dtype=torch.float64, device=pixel.device)
+    counts.index_add_(0, (cell * (height * width) + pixel[:, None]).flatten(), shares.flatten())
+    node_s = torch.arange(bins, dtype=torch.float64, device=pixel.device) / max(bins - 1, 1)
+    third = 1 / (3 * max(bins - 1, 1))
+    node_s[0], node_s[-1] = (third, 1 - third) if bins > 1 else (0.5, 0.5)
+    collected_s = torch.full_like(node_s, duration_us * 1e-6 / max(bins - 1, 1))
+    if bins > 1:
+        collected_s[[0, -1]] /= 2
+    return EventVolume(counts.reshape(1, 2, bins, height, width).to(dtype), node_s * (duration_us * 1e-6), collected_s)

@@ -1,0 +1,136 @@
+"""A ray-traced lens whose curvatures, thicknesses, conics, asphere terms and indices carry gradients."""
+
+import copy
+
+import torch
+from torch import nn
+
+from codesign.errors import DomainError, ShapeError
+from codesign.lens import paraxial
+from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.pinhole import ThinLens
+from codesign.lens.surface import scaled
+from codesign.lens.trace import Prescription, trace
+from codesign.types import Rays
+
+
+class GeoLens(nn.Module):
+    """Sequential lens. First vertex at z = 0, light along +z, flat image plane behind the last thickness.
+
+    Learnables (nn.Parameter, one row per surface): curvature_per_mm [S], thickness_mm [S], conic [S], asphere [S, A],
+    index_offset [S] (added to the index behind each surface, dimensionless, zero at first).
+    """
+
+    def __init__(self, surfaces, entrance_pupil_diameter_mm, dtype=torch.float64, soft_edge_mm=0.2, name="lens"):
+        super().__init__()
+        surfaces = tuple(surfaces)
+        if not surfaces:
+            raise DomainError(f"{name}: a lens needs at least one surface; none were given.")
+        for i, surface in enumerate(surfaces):
+            surface.check(f"{name}, surface {i + 1}")
+        if not entrance_pupil_diameter_mm > 0:
+            raise DomainError(f"{name}: entrance pupil diameter {entrance_pupil_diameter_mm} mm must be positive.")
+        stops = [i for i, s in enumerate(surfaces) if s.is_stop]
+        if len(stops) > 1:
+            raise DomainError(f"{name}: surfaces {[i + 1 for i in stops]} are all marked as the stop; mark one.")
+        self.name, self.surfaces, self.stop_index = name, surfaces, stops[0] if stops else 0
+        self.entrance_pupil_diameter_mm, self.soft_edge_mm = float(entrance_pupil_diameter_mm), float(soft_edge_mm)
+        terms = max(len(s.asphere) for s in surfaces)
+        rows = [[*s.asphere, *[0.0] * (terms - len(s.asphere))] for s in surfaces]
+        self.curvature_per_mm = nn.Parameter(torch.tensor([s.curvature_per_mm for s in surfaces], dtype=dtype))
+        self.thickness_mm = nn.Parameter(torch.tensor([s.thickness_mm for s in surfaces], dtype=dtype))
+        self.conic = nn.Parameter(torch.tensor([s.conic for s in surfaces], dtype=dtype))
+        self.asphere = nn.Parameter(torch.tensor(rows, dtype=dtype).reshape(len(surfaces), terms))
+        self.index_offset = nn.Parameter(torch.zeros(len(surfaces), dtype=dtype))
+        self.register_buffer("semi_aperture_mm", torch.tensor([s.semi_aperture_mm for s in surfaces], dtype=dtype))
+
+    def replace(self, **tensors):
+        """A lens that shares everything with this one except the named tensors, which may depend on other tensors.
+
+        The way to optimise: build curvatures and thicknesses from a design vector, put them in, trace, and go backward.
+        """
+        twin = copy.copy(self)
+        twin._parameters = dict(self._parameters)
+        for name, value in tensors.items():
+            if name not in self._parameters:
+                raise DomainError(f"a lens has no tensor '{name}'; it has {', '.join(self._parameters)}.")
+            if value.shape != self._parameters[name].shape:
+                raise ShapeError(f"{name} has shape {tuple(self._parameters[name].shape)}, got {tuple(value.shape)}.")
+            del twin._parameters[name]
+            object.__setattr__(twin, name, value)
+        return twin
+
+    def freeze(self, *names):
+        """Stop the gradient to the named tensors (all when none is named); returns the lens."""
+        for name in names or tuple(self._parameters):
+            self._parameters[name].requires_grad_(False)
+        return self
+
+    def scaled(self, factor):
+        """A new lens with all lengths multiplied by ``factor`` (same f-number and angles), from the current values."""
+        return GeoLens([scaled(s, factor) for s in self.to_surfaces()], self.entrance_pupil_diameter_mm * factor, self.curvature_per_mm.dtype, self.soft_edge_mm * factor, self.name)
+
+    def to_surfaces(self):
+        """The current values as a tuple of Surface."""
+        from codesign.lens.surface import Surface
+
+        found = []
+        rows = zip(self.surfaces, self.curvature_per_mm.tolist(), self.thickness_mm.tolist(), self.conic.tolist(), self.asphere.tolist(), strict=True)
+        for old, c, t, k, a in rows:
+            terms = tuple(a) if any(a) else ()
+            found.append(Surface(1 / c if c else float("inf"), t, old.medium, old.semi_aperture_mm, k, terms, old.is_stop))
+        return tuple(found)
+
+    def index(self, wavelength_um=WAVELENGTH_UM["d"]):
+        """Indices [S + 1] at a wavelength, the first before the lens (air)."""
+        values = [1.0, *[1.0 if s.medium is None else s.medium.index(wavelength_um) for s in self.surfaces]]
+        base = torch.tensor(values, dtype=self.curvature_per_mm.dtype, device=self.curvature_per_mm.device)
+        return base + torch.cat([torch.zeros_like(self.index_offset[:1]), self.index_offset])
+
+    def first_order(self, wavelength_um=WAVELENGTH_UM["d"]):
+        """Paraxial figures (FirstOrder) at a wavelength, differentiable."""
+        c = paraxial.powers_curvature(self.curvature_per_mm, self.asphere)
+        return paraxial.first_order(c, self.thickness_mm, self.index(wavelength_um), self.stop_index, self.entrance_pupil_diameter_mm)
+
+    def prescription(self, wavelength_um=WAVELENGTH_UM["d"]):
+        """The numbers the ray-trace kernel needs."""
+        return Prescription(self.curvature_per_mm, self.thickness_mm, self.conic, self.asphere, self.index(wavelength_um), self.semi_aperture_mm, self.soft_edge_mm)
+
+    def trace(self, origin_mm, direction, wavelength_um=WAVELENGTH_UM["d"]):
+        """Trace rays to the image plane: origins [N, 3] relative to the first vertex, unit directions [N, 3] -> TraceResult."""
+        for label, value in (("origin_mm", origin_mm), ("direction", direction)):
+            if value.ndim != 2 or value.shape[1] != 3:
+                raise ShapeError(f"{label} must be [N, 3], got {tuple(value.shape)}.")
+        return trace(self.prescription(wavelength_um), origin_mm, direction)
+
+    def thin(self, wavelength_um=WAVELENGTH_UM["d"]):
+        """The paraxial level of this lens: same focal length, pupil and defocus, no aberrations."""
+        f = self.first_order(wavelength_um)
+        return ThinLens(f.efl_mm, self.entrance_pupil_diameter_mm, f.efl_mm + self.thickness_mm[-1] - f.bfl_mm)
+
+    def camera_rays(self, film_mm, pupil, wavelength_um=WAVELENGTH_UM["d"]):
+        """Rays from image points through the lens towards the scene.
+
+        Args:
+          film_mm: [N, 2] image points as seen upright (x right, y down), millimetres from the axis.
+          pupil: [N, 2] points of the unit disc, placed on the paraxial exit pupil; (0, 0) is the chief ray.
+        Returns: Rays in camera axes, origins on the entrance-pupil plane (the camera's origin), in metres.
+        Gradient: to every lens tensor. The pupil sampling itself is the stop; the other surfaces clip with soft edges.
+        """
+        f = self.first_order(wavelength_um)
+        back = self.prescription(wavelength_um).reversed(-f.entrance_pupil_z_mm)
+        last = self.thickness_mm[-1]
+        start = torch.cat([-film_mm, -last.expand(film_mm.shape[0], 1)], 1)  # the image is inverted on the film
+        target = torch.cat([pupil * (f.exit_pupil_diameter_mm / 2), -f.exit_pupil_z_mm.expand(pupil.shape[0], 1)], 1)
+        towards = torch.nn.functional.normalize(target - start, dim=1)
+        towards = towards * torch.sign(towards[:, 2:])  # a virtual exit pupil behind the film points the other way
+        apertures = back.semi_aperture_mm.clone()
+        apertures[len(self.surfaces) - 1 - self.stop_index] = 1e6
+        back = Prescription(back.curvature_per_mm, back.thickness_mm, back.conic, back.asphere, back.index, apertures, back.soft_edge_mm)
+        out = trace(back, start, towards)
+        if bool((out.weight.detach() <= 0).all()):
+            raise DomainError(f"{self.name}: every ray fails (first at surface {len(self.surfaces) - int(out.failed_surface.min())} of {len(self.surfaces)}, counted from the object); weaken the curvatures or open the apertures.")
+        return Rays(out.position_mm * 1e-3, out.direction, out.weight)
+
+    def extra_repr(self):
+        return f"{self.name}, {len(self.surfaces)} surfaces, entrance pupil {self.entrance_pupil_diameter_mm:g} mm"

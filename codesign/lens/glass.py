@@ -1,0 +1,63 @@
+"""Refractive index of optical glass as a function of wavelength."""
+
+from dataclasses import dataclass
+
+from codesign.errors import DomainError
+
+WAVELENGTH_UM = {"F": 0.4861327, "d": 0.5875618, "C": 0.6562725}
+
+
+@dataclass(frozen=True)
+class Glass:
+    """A medium known by its indices at the F, d and C lines (486.1, 587.6, 656.3 nm), relative to air."""
+
+    name: str
+    index_F: float
+    index_d: float
+    index_C: float
+
+    @staticmethod
+    def from_indices(F, d, C, name="custom"):
+        """Glass from its indices at the F, d and C lines; each must be at least 1."""
+        if not all(1.0 <= n < 5.0 for n in (F, d, C)):
+            raise DomainError(f"glass {name}: indices F={F}, d={d}, C={C} must lie in [1, 5); check the catalogue page.")
+        return Glass(name, float(F), float(d), float(C))
+
+    @staticmethod
+    def named(name):
+        """Glass by its catalogue name; DomainError lists the known names when there is none."""
+        if name not in CATALOGUE:
+            raise DomainError(f"glass '{name}' is not in the catalogue; known names: {', '.join(sorted(CATALOGUE))}. Give its indices with Glass.from_indices.")
+        return CATALOGUE[name]
+
+    def index(self, wavelength_um):
+        """Index at a vacuum wavelength in micrometres: A + B/w^2 + C/w^4 through the three lines, exact at each.
+
+        Raises: DomainError outside 0.36 to 1.1 um, where three visible lines say little.
+        """
+        if not 0.36 <= wavelength_um <= 1.1:
+            raise DomainError(f"glass {self.name}: wavelength {wavelength_um} um lies outside 0.36 to 1.1 um; give a wavelength in micrometres.")
+        x = wavelength_um**-2
+        nodes = [(WAVELENGTH_UM["F"] ** -2, self.index_F), (WAVELENGTH_UM["d"] ** -2, self.index_d), (WAVELENGTH_UM["C"] ** -2, self.index_C)]
+        total = 0.0
+        for i, (xi, ni) in enumerate(nodes):
+            basis = 1.0
+            for j, (xj, _) in enumerate(nodes):
+                if i != j:
+                    basis *= (x - xj) / (xi - xj)
+            total += ni * basis
+        return total
+
+
+# Schott catalogue values (2017 edition), rounded to 1e-9, relative to air.
+CATALOGUE = {
+    glass.name: glass
+    for glass in (
+        Glass("N-BK7", 1.52237629, 1.516800035, 1.514322347),
+        Glass("N-SK16", 1.627556349, 1.620409965, 1.61727166),
+        Glass("N-SK2", 1.614857066, 1.60738097, 1.604135445),
+        Glass("N-SSK2", 1.630451679, 1.622293796, 1.618770607),
+        Glass("F2", 1.632081457, 1.620040137, 1.615031692),
+        Glass("F5", 1.614612261, 1.603420257, 1.598745273),
+    )
+}

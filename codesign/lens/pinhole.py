@@ -1,0 +1,35 @@
+"""The cheap fidelity levels of a lens: a pinhole, and a thin lens with defocus. Same interface as the traced lens."""
+
+import torch
+
+from codesign.errors import DomainError
+from codesign.types import Rays
+
+
+class ThinLens:
+    """Ideal lens of focal length efl_mm and pupil diameter, with the film image_distance_mm behind it.
+
+    Both lengths may be tensors; gradients flow to them.
+    """
+
+    def __init__(self, efl_mm, entrance_pupil_diameter_mm, image_distance_mm=None):
+        self.efl_mm = torch.as_tensor(efl_mm, dtype=None if torch.is_tensor(efl_mm) else torch.float64)
+        self.entrance_pupil_diameter_mm = float(entrance_pupil_diameter_mm)
+        self.image_distance_mm = self.efl_mm if image_distance_mm is None else torch.as_tensor(image_distance_mm, dtype=self.efl_mm.dtype)
+        if not (float(self.efl_mm.detach()) > 0 and float(self.image_distance_mm.detach()) > 0):
+            raise DomainError(f"thin lens: focal length {float(self.efl_mm)} mm and image distance {float(self.image_distance_mm)} mm must be positive.")
+
+    def camera_rays(self, film_mm, pupil, wavelength_um=None):
+        """Rays towards the scene; see GeoLens.camera_rays. Paraxial refraction: slope out = slope in - q / f."""
+        q = pupil * (self.entrance_pupil_diameter_mm / 2)
+        slope = (q + film_mm) / self.image_distance_mm - q / self.efl_mm
+        direction = torch.nn.functional.normalize(torch.cat([slope, torch.ones_like(slope[:, :1])], 1), dim=1)
+        origin = torch.cat([q, torch.zeros_like(q[:, :1])], 1) * 1e-3
+        return Rays(origin + 0 * direction, direction, torch.ones_like(direction[:, 0]))
+
+
+class Pinhole(ThinLens):
+    """All rays through one point: no blur, no distortion."""
+
+    def __init__(self, efl_mm):
+        super().__init__(efl_mm, 0.0)

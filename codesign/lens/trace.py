@@ -1,0 +1,221 @@
+"""Sequential ray trace through rotationally symmetric surfaces, as one fused drjit kernel.
+
+Intersection with a conic in the form t = F / (G + sqrt(G^2 - A F)), regular at zero curvature (Welford, Aberrations of
+Optical Systems, ch. 4); even aspheres by Newton steps from the conic, the last one differentiable, so that the gradient is
+that of the implicit function; vector form of Snell's law. A ray that fails is frozen where it failed: its square roots keep
+safe inputs, so gradients stay finite, and it carries weight 0, a status and a deficit (how far its radicand fell below zero).
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+from codesign.backend import run_kernel, widen
+
+NEWTON_STEPS = 8
+GRAZING = 1e-8  # smallest radicand taken as a hit; below it the derivative of the square root exceeds 5e3
+
+
+class Status(IntEnum):
+    """What became of a ray."""
+
+    OK = 0
+    MISS = 1
+    TOTAL_REFLECTION = 2
+
+
+@dataclass(frozen=True)
+class Prescription:
+    """Numbers the kernel needs, for one wavelength. Tensors of one dtype and device; gradients flow to all of them.
+
+    curvature_per_mm, thickness_mm, conic, semi_aperture_mm: [S]. asphere: [S, A], coefficients of r^2, r^4, ...
+    index: [S + 1], the first before the first surface. soft_edge_mm: full width of the smooth edge of the apertures.
+    """
+
+    curvature_per_mm: Tensor
+    thickness_mm: Tensor
+    conic: Tensor
+    asphere: Tensor
+    index: Tensor
+    semi_aperture_mm: Tensor
+    soft_edge_mm: float
+
+    def reversed(self, last_gap_mm):
+        """The same lens seen from the image side; ``last_gap_mm`` is the distance of the plane where the rays end."""
+        gaps = torch.cat([self.thickness_mm[:-1].flip(0), last_gap_mm.reshape(1)])
+        return Prescription(-self.curvature_per_mm.flip(0), gaps, self.conic.flip(0), -self.asphere.flip(0), self.index.flip(0), self.semi_aperture_mm.flip(0), self.soft_edge_mm)
+
+
+@dataclass(frozen=True)
+class TraceResult:
+    """Rays on the plane behind the last thickness.
+
+    position_mm: [N, 3] relative to the plane's centre (z = 0). direction: [N, 3] unit. optical_path_mm: [N].
+    weight: [N] product of the soft aperture edges; 0 for failed rays. status: [N] int, see Status.
+    failed_surface: [N] int, first surface where the ray failed, -1 if none. deficit: [N] >= 0, dimensionless.
+    """
+
+    position_mm: Tensor
+    direction: Tensor
+    optical_path_mm: Tensor
+    weight: Tensor
+    status: Tensor
+    failed_surface: Tensor
+    deficit: Tensor
+
+
+def trace(prescription, origin_mm, direction):
+    """Trace rays from points relative to the first vertex to the plane behind the last thickness.
+
+    Args: origin_mm [N, 3], direction [N, 3] unit, both of the prescription's dtype.
+    Returns: TraceResult.
+    Gradient: position, direction, optical path, weight and deficit, to rays and to every tensor of the prescription.
+    """
+    p, count = prescription, origin_mm.shape[0]
+    surfaces = p.curvature_per_mm.numel()
+    conics = _active(p.conic, lambda k: k != 0)
+    terms = [_last_active(row) for row in p.asphere.unbind(0)] if p.asphere.shape[1] else [0] * surfaces
+    refracts = [a != b for a, b in zip(p.index[:-1].tolist(), p.index[1:].tolist(), strict=True)]
+    kernel = _Kernel(surfaces, p.asphere.shape[1], tuple(conics), tuple(terms), tuple(refracts), p.soft_edge_mm)
+    packed = torch.cat([p.curvature_per_mm, p.thickness_mm, p.conic, p.index, p.semi_aperture_mm, p.asphere.reshape(-1)])
+    columns = [*origin_mm.unbind(1), *direction.unbind(1), packed]
+    x, y, dx, dy, dz, path, weight, deficit, status, failed = run_kernel(kernel, columns, [(count,)] * 10)
+    return TraceResult(torch.stack([x, y, torch.zeros_like(x)], 1), torch.stack([dx, dy, dz], 1), path, weight, status, failed, deficit)
+
+
+def _active(tensor, test):
+    """Per surface, whether a term must be computed: its value matters, or its derivative is wanted."""
+    return [tensor.requires_grad or test(v) for v in tensor.tolist()]
+
+
+def _last_active(row):
+    """Number of asphere terms to compute: up to the last that is not zero, all when derivatives are wanted."""
+    values = row.tolist()
+    return len(values) if row.requires_grad else max((i + 1 for i, v in enumerate(values) if v != 0), default=0)
+
+
+@dataclass(frozen=True)
+class _Kernel:
+    surfaces: int
+    asphere_width: int
+    conics: tuple[bool, ...]
+    terms: tuple[int, ...]
+    refracts: tuple[bool, ...]
+    soft_edge_mm: float
+
+    def __call__(self, arr, x, y, z, dx, dy, dz, packed):
+        import drjit as dr
+
+        S, width = self.surfaces, self.asphere_width
+        wide = widen(arr, packed, 5 * S + 1 + S * width, dr.width(x))
+        c, t, k, n, a = wide[:S], wide[S : 2 * S], wide[2 * S : 3 * S], wide[3 * S : 4 * S + 1], wide[4 * S + 1 : 5 * S + 1]
+        asphere = [wide[5 * S + 1 + i * width :][: self.terms[i]] for i in range(S)]
+        o, d = arr.Array3(x, y, z), arr.Array3(dx, dy, dz)
+        alive, path, weight, deficit = dr.full(arr.Bool, True, dr.width(x)), arr.Float(0), arr.Float(1), arr.Float(0)
+        status, failed = arr.Int32(0), arr.Int32(-1)
+        edge = dr.opaque(arr.Float, max(self.soft_edge_mm, 1e-6))
+        for i in range(S):
+            conic = k[i] if self.conics[i] else None
+            step, hit, lack = _intersect(arr, o, d, c[i], conic, asphere[i], alive)
+            deficit += dr.select(alive & ~hit, lack, 0)
+            o, path = o + d * step, path + n[i] * step
+            weight *= _soft_edge((dr.square(a[i]) - dr.square(o.x) - dr.square(o.y)) / (2 * a[i] * edge))
+            here, now = dr.select(alive & ~hit, arr.Int32(int(Status.MISS)), 0), alive & hit
+            if self.refracts[i]:
+                d, kept, lack = _refract(arr, d, _normal(o, c[i], conic, asphere[i]), n[i] / n[i + 1], now)
+                deficit += dr.select(now & ~kept, lack, 0)
+                here, now = dr.select(now & ~kept, arr.Int32(int(Status.TOTAL_REFLECTION)), here), kept
+            status, failed = dr.select(alive, here, status), dr.select(alive & ~now, arr.Int32(i), failed)
+            alive = now
+            o = arr.Array3(o.x, o.y, o.z - t[i])
+        forward = alive & (d.z > 1e-6)
+        status, failed = dr.select(alive & ~forward, arr.Int32(int(Status.MISS)), status), dr.select(alive & ~forward, arr.Int32(S), failed)
+        step = -o.z / dr.select(forward, d.z, 1)
+        step = dr.select(forward, step, 0)
+        return o.x + d.x * step, o.y + d.y * step, d.x, d.y, d.z, path + n[S] * step, dr.select(forward, weight, 0), deficit, status, failed
+
+
+def _intersect(arr, o, d, c, conic, asphere, alive):
+    """Distance along the ray to the surface, whether it is met, and the lack of the radicand where it is not."""
+    import drjit as dr
+
+    square, along = dr.squared_norm(o), dr.dot(d, o)
+    A = c
+    if conic is not None:
+        square, along, A = square + conic * dr.square(o.z), along + conic * d.z * o.z, c * (1 + conic * dr.square(d.z))
+    F, G = c * square - 2 * o.z, d.z - c * along
+    radicand = G * G - A * F
+    hit = alive & (radicand > GRAZING)
+    root = G + dr.sqrt(dr.select(hit, radicand, 1))
+    hit &= root > GRAZING
+    step = dr.select(hit, F / dr.select(hit, root, 1), 0)
+    lack = dr.maximum(GRAZING - radicand, 0)
+    if not asphere:
+        return step, hit, lack
+    start = dr.select(hit, dr.detach(step), dr.detach(-o.z / dr.select(dr.abs(d.z) > 1e-6, d.z, 1)))
+    with dr.suspend_grad():
+        t, od, dd = start, dr.detach(o), dr.detach(d)
+        for _ in range(NEWTON_STEPS):
+            value, slope, _ = _implicit(arr, od + dd * t, dd, c, conic, asphere)
+            t -= value / dr.select(dr.abs(slope) > 1e-6, slope, 1)
+        value, slope, inside = _implicit(arr, od + dd * t, dd, c, conic, asphere)
+        hit = alive & inside & (dr.abs(slope) > 1e-6) & (dr.abs(value) < (1e-10 if arr.Float(0).Type == dr.VarType.Float64 else 1e-4))
+        t, slope = dr.select(hit, t, 0), dr.select(hit, slope, 1)
+    value, _, _ = _implicit(arr, o + d * t, d, c, conic, asphere)
+    return dr.select(hit, t - value / slope, 0), hit, lack
+
+
+def _implicit(arr, p, d, c, conic, asphere):
+    """z - sag(r^2) at a point, its derivative along the ray, and whether the conic part exists there."""
+    import drjit as dr
+
+    r2 = dr.square(p.x) + dr.square(p.y)
+    q = 1 - (c * c * r2 if conic is None else (1 + conic) * c * c * r2)
+    inside = q > GRAZING
+    root = dr.sqrt(dr.select(inside, q, 1))
+    sag, slope = c * r2 / (1 + root), c / (2 * root)
+    power, factor = r2, arr.Float(1)
+    for i, a in enumerate(asphere):
+        sag, slope = sag + a * power, slope + (i + 1) * a * factor
+        power, factor = power * r2, factor * r2
+    return p.z - sag, d.z - 2 * slope * (p.x * d.x + p.y * d.y), inside
+
+
+def _normal(o, c, conic, asphere):
+    """Unit normal at a point of the surface, towards +z."""
+    import drjit as dr
+
+    kind = type(o)
+    if not asphere and conic is None:
+        return kind(-c * o.x, -c * o.y, 1 - c * o.z)
+    if not asphere:
+        normal = kind(-c * o.x, -c * o.y, 1 - c * (1 + conic) * o.z)
+    else:
+        r2 = dr.square(o.x) + dr.square(o.y)
+        q = 1 - (c * c * r2 if conic is None else (1 + conic) * c * c * r2)
+        slope, factor = c / (2 * dr.sqrt(dr.select(q > GRAZING, q, 1))), type(r2)(1)
+        for i, a in enumerate(asphere):
+            slope, factor = slope + (i + 1) * a * factor, factor * r2
+        normal = kind(-2 * slope * o.x, -2 * slope * o.y, 1)
+    return normal / dr.sqrt(dr.maximum(dr.squared_norm(normal), 1e-12))
+
+
+def _soft_edge(x):
+    """Smooth step from 0 to 1 over x in [-1/2, 1/2]; exactly 0 and 1 outside. x is the distance from the edge over its width."""
+    import drjit as dr
+
+    u = dr.clip(x + 0.5, 0, 1)
+    return u * u * (3 - 2 * u)
+
+
+def _refract(arr, d, normal, ratio, alive):
+    """Direction after the surface, whether light passes, and the lack of the radicand where it is totally reflected."""
+    import drjit as dr
+
+    cosine = dr.dot(d, normal)
+    radicand = 1 - ratio * ratio * (1 - cosine * cosine)
+    passes = alive & (radicand > GRAZING)
+    bent = ratio * d + (dr.sqrt(dr.select(passes, radicand, 1)) - ratio * cosine) * normal
+    return dr.select(passes, bent, d), passes, dr.maximum(GRAZING - radicand, 0)

@@ -1,0 +1,58 @@
+"""Rigid motions: SE(3) exponential, composition, inverse. T_world_cam maps camera points to the world and reads right to left."""
+
+import torch
+from kornia.geometry.liegroup import Se3
+
+from codesign.errors import DomainError, ShapeError
+
+
+def se3_exp(twist):
+    """Rigid transform of a twist.
+
+    Args: twist [..., 6]: translation part (m) then rotation vector (rad), in the frame on the right of the product.
+    Returns: [..., 4, 4]. Gradient: exact, also at zero. Source: kornia.geometry.liegroup.Se3.
+    """
+    if twist.shape[-1] != 6:
+        raise ShapeError(f"a twist has 6 components (3 of translation, 3 of rotation), got {tuple(twist.shape)}.")
+    transform = Se3.exp(twist.reshape(-1, 6)).matrix().reshape(*twist.shape[:-1], 4, 4)
+    return transform if twist.requires_grad else transform.detach()  # kornia wraps constants in parameters that would ask for gradients
+
+
+def inverse(transform):
+    """Inverse of rigid transforms [..., 4, 4]."""
+    rotation, translation = transform[..., :3, :3], transform[..., :3, 3:]
+    top = torch.cat([rotation.mT, -rotation.mT @ translation], -1)
+    return torch.cat([top, transform[..., 3:, :]], -2)
+
+
+def apply(transform, points):
+    """Transform points [..., N, 3] by [..., 4, 4]."""
+    return points @ transform[..., :3, :3].mT + transform[..., None, :3, 3]
+
+
+def look_at(origin_m, target_m, down=(0.0, 0.0, -1.0)):
+    """T_world_cam of a camera (x right, y down, z forward) at ``origin_m`` facing ``target_m``; ``down`` is the image's down direction in the world.
+
+    Args: sequences of three numbers. Returns: [4, 4] float64. Raises: DomainError when the view is along ``down``.
+    """
+    origin, target, down = (torch.as_tensor(v, dtype=torch.float64) for v in (origin_m, target_m, down))
+    forward = torch.nn.functional.normalize(target - origin, dim=0)
+    right = torch.linalg.cross(down, forward)
+    if float(right.norm()) < 1e-9:
+        raise DomainError(f"look_at: the view direction {forward.tolist()} is parallel to 'down' {down.tolist()}; give another 'down'.")
+    right = right / right.norm()
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward], 1)
+    pose[:3, 3] = origin
+    return pose
+
+
+def check_poses(transform):
+    """Raise unless the tensor holds rigid transforms [T, 4, 4]; returns it."""
+    if transform.ndim != 3 or transform.shape[1:] != (4, 4):
+        raise ShapeError(f"poses must be [T, 4, 4], got {tuple(transform.shape)}.")
+    rotation = transform.detach()[:, :3, :3].double()
+    error = float((rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().max())
+    if not error < 1e-4:
+        raise DomainError(f"poses are not rigid: R R^T differs from the identity by {error:.3g}; normalise the rotations.")
+    return transform

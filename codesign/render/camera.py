@@ -1,0 +1,119 @@
+"""A camera: a lens before a pixel grid. Makes camera-space rays and projects points."""
+
+from dataclasses import dataclass
+
+import torch
+
+from codesign.errors import DomainError
+from codesign.render.sampling import film_pupil_pattern
+from codesign.types import Rays
+
+_NEWTON_STEPS, _STEP_MM = 6, 1e-4
+
+
+@dataclass(frozen=True)
+class Film:
+    """Pixels of a sensor, or of rectangular windows on it.
+
+    windows_px: tuple of (left, top); each window has height_px rows and width_px columns. A pixel's coordinate is that of its
+    centre: column 0 of the full sensor is x = 0, and the lens axis is at the sensor's middle.
+    """
+
+    sensor_width_px: int
+    sensor_height_px: int
+    width_px: int
+    height_px: int
+    pixel_pitch_mm: float
+    windows_px: tuple[tuple[int, int], ...] | None = None
+
+    @property
+    def shape(self):
+        """Shape of one image: (H, W), or (windows, H, W)."""
+        return (self.height_px, self.width_px) if self.windows_px is None else (len(self.windows_px), self.height_px, self.width_px)
+
+    @property
+    def middle_px(self):
+        return torch.tensor([(self.sensor_width_px - 1) / 2, (self.sensor_height_px - 1) / 2], dtype=torch.float64)
+
+    def pixels(self):
+        """Coordinates (x, y) of all pixel centres on the full sensor, [P, 2] float64, in image order."""
+        y, x = torch.meshgrid(torch.arange(self.height_px, dtype=torch.float64), torch.arange(self.width_px, dtype=torch.float64), indexing="ij")
+        base = torch.stack([x.reshape(-1), y.reshape(-1)], 1)
+        corners = torch.tensor(self.windows_px or ((0, 0),), dtype=torch.float64)
+        return (corners[:, None] + base).reshape(-1, 2)
+
+
+class Camera:
+    """A lens (GeoLens, ThinLens or Pinhole: anything with ``camera_rays``) before a film.
+
+    The same seed gives the same film and pupil samples in every frame and for every lens state (common random numbers).
+    """
+
+    def __init__(self, lens, width_px, height_px, pixel_pitch_mm, samples_per_pixel=16, seed=0, film=None):
+        for label, value in (("width_px", width_px), ("height_px", height_px), ("samples_per_pixel", samples_per_pixel)):
+            if int(value) != value or value < 1:
+                raise DomainError(f"camera: {label} = {value} must be a whole number of at least 1.")
+        if not pixel_pitch_mm > 0:
+            raise DomainError(f"camera: pixel_pitch_mm = {pixel_pitch_mm} must be positive.")
+        self.lens, self.samples_per_pixel, self.seed = lens, int(samples_per_pixel), int(seed)
+        self.film = film or Film(width_px, height_px, width_px, height_px, pixel_pitch_mm)
+
+    def with_lens(self, lens):
+        """The same film and samples behind another lens."""
+        return Camera(lens, self.film.width_px, self.film.height_px, self.film.pixel_pitch_mm, self.samples_per_pixel, self.seed, self.film)
+
+    def film_mm(self, pixels):
+        """Upright image position in millimetres of pixel coordinates [N, 2]."""
+        return (pixels - self.film.middle_px.to(pixels)) * self.film.pixel_pitch_mm
+
+    def rays(self):
+        """All rays of one frame, pixel after pixel, samples_per_pixel each: Rays with N = pixels x samples. Gradient: to the lens."""
+        offset, pupil = film_pupil_pattern(self.samples_per_pixel, self.seed)
+        pixels = self.film.pixels()
+        points = (pixels[:, None] + offset).reshape(-1, 2)
+        return self.lens.camera_rays(self.film_mm(points), pupil.repeat(pixels.shape[0], 1))
+
+    def chief_rays(self, pixels):
+        """Rays through the pupil's centre for pixel coordinates [N, 2]: Rays, float64."""
+        return self.lens.camera_rays(self.film_mm(pixels), torch.zeros_like(pixels))
+
+
+def project(camera, points_cam_m):
+    """Pixel coordinates whose chief ray passes through points.
+
+    Args: points_cam_m [N, 3], camera axes, metres, in front of the camera.
+    Returns: [N, 2] px (the centre of the first pixel is 0, 0). float64.
+    Gradient: to the points and to the lens, by the implicit function theorem (one Newton step with gradients at the solution).
+    Raises: DomainError when a point is not in front of the camera.
+    """
+    if bool((points_cam_m.detach()[:, 2] <= 0).any()):
+        raise DomainError("project: some points lie behind the camera (z <= 0); drop them first.")
+    with torch.no_grad():
+        rays = camera.chief_rays(camera.film.middle_px.reshape(1, 2) + torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64))
+        slope = rays.direction[1, 0] / rays.direction[1, 2] - rays.direction[0, 0] / rays.direction[0, 2]
+        at = camera.film.middle_px + points_cam_m[:, :2] / points_cam_m[:, 2:] / slope
+        step = _STEP_MM / camera.film.pixel_pitch_mm
+        shifts = torch.tensor([[0.0, 0.0], [step, 0.0], [0.0, step]], dtype=at.dtype)
+        for _ in range(_NEWTON_STEPS):
+            miss, ahead_x, ahead_y = _miss(camera, (at[None] + shifts[:, None]).reshape(-1, 2), points_cam_m.repeat(3, 1)).reshape(3, -1, 2)
+            jacobian = torch.stack([ahead_x - miss, ahead_y - miss], -1) / step
+            change = torch.linalg.solve(jacobian, miss)
+            at = at - change
+            if float(change.abs().max()) < 1e-6:  # the next step would be its square
+                break
+    return at - torch.linalg.solve(jacobian, _miss(camera, at, points_cam_m))
+
+
+def _miss(camera, pixels, points_cam_m):
+    """Where chief rays pass the depth of the points, minus the points: [N, 2] metres."""
+    rays = camera.chief_rays(pixels)
+    return rays.origin_m[:, :2] + rays.direction[:, :2] * ((points_cam_m[:, 2:] - rays.origin_m[:, 2:]) / rays.direction[:, 2:]) - points_cam_m[:, :2]
+
+
+def angular_distance_rad(camera, pixels_a, pixels_b):
+    """Angle between the chief rays of two sets of pixel coordinates, [N] rad, smooth with value 0 at equality avoided by 1e-12."""
+    a, b = camera.chief_rays(pixels_a).direction, camera.chief_rays(pixels_b).direction
+    return ((a - b).square().sum(1) + 1e-12).sqrt()
+
+
+__all__ = ["Camera", "Film", "Rays", "angular_distance_rad", "project"]

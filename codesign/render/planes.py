@@ -1,0 +1,59 @@
+"""A textured plane in closed form: band-limited texture, float32 or float64, for checks and smooth scenes."""
+
+import torch
+
+from codesign.errors import DomainError
+from codesign.pose import check_poses
+
+
+class TexturedPlane:
+    """The plane z = 0 of its own frame, with radiance mean * exp(sum of cosines), seen from both sides.
+
+    Args:
+      frequency_per_m: [K, 2] spatial frequencies, cycles per metre; the texture has no detail finer than the largest.
+      amplitude: [K] of the log radiance; phase_rad: [K]. mean: radiance where the sum is zero (0..255 scale).
+      T_world_plane: [4, 4]; identity when None. dtype: precision of intersection and shading.
+    Rays that do not meet the plane see ``mean``.
+    """
+
+    def __init__(self, frequency_per_m, amplitude, phase_rad, mean=100.0, T_world_plane=None, dtype=torch.float64):
+        for label, value in (("frequency_per_m", frequency_per_m), ("amplitude", amplitude), ("phase_rad", phase_rad)):
+            if not bool(torch.isfinite(torch.as_tensor(value)).all()):
+                raise DomainError(f"textured plane: {label} holds NaN or infinite entries; remove them.")
+        self.dtype, self.mean = dtype, float(mean)
+        self.frequency = torch.as_tensor(frequency_per_m, dtype=torch.float64).reshape(-1, 2)
+        self.amplitude, self.phase = torch.as_tensor(amplitude, dtype=torch.float64), torch.as_tensor(phase_rad, dtype=torch.float64)
+        self.T_world_plane = torch.eye(4, dtype=torch.float64) if T_world_plane is None else check_poses(T_world_plane[None].double())[0]
+
+    def _constants(self, arr):
+        """Scalars as opaque drjit values, so that another texture needs no new kernel."""
+        import drjit as dr
+
+        opaque = lambda tensor: [dr.opaque(arr.Float, v) for v in tensor.reshape(-1).tolist()]  # noqa: E731
+        waves = list(zip(opaque(self.frequency[:, 0]), opaque(self.frequency[:, 1]), opaque(self.amplitude), opaque(self.phase), strict=True))
+        return opaque(self.T_world_plane[:3]), waves, dr.opaque(arr.Float, self.mean)
+
+    def radiance(self, arr, origin, direction):
+        """Radiance along world rays (drjit arrays). Gradient: exact, to the rays."""
+        import drjit as dr
+
+        m, waves, mean = self._constants(arr)
+        rel = [origin[i] - m[4 * i + 3] for i in range(3)]
+        local = lambda v: [m[k] * v[0] + m[4 + k] * v[1] + m[8 + k] * v[2] for k in range(3)]  # noqa: E731
+        o, d = local(rel), local(direction)
+        meets = (dr.abs(d[2]) > 1e-9) & (o[2] * d[2] < 0)
+        t = dr.select(meets, -o[2] / dr.select(meets, d[2], 1), 0)
+        x, y = o[0] + t * d[0], o[1] + t * d[1]
+        total = arr.Float(0)
+        for fx, fy, a, phase in waves:
+            total += a * dr.cos((2 * dr.pi) * (fx * x + fy * y) + phase)
+        return mean * dr.select(meets, dr.exp(total), 1)
+
+    def hit(self, origin_m, direction):
+        """Where world rays [N, 3] meet the plane: point, normal, valid (see MitsubaScene.hit)."""
+        normal = self.T_world_plane[:3, 2].to(origin_m)
+        height = (origin_m.detach() - self.T_world_plane[:3, 3].to(origin_m)) @ normal
+        falling = direction.detach() @ normal
+        valid = (height * falling < 0) & (falling.abs() > 1e-9)
+        t = torch.where(valid, -height / torch.where(valid, falling, 1.0), 1.0)
+        return origin_m.detach() + direction.detach() * t[:, None], normal.expand_as(origin_m), valid

@@ -1,0 +1,114 @@
+"""The page of a run: one HTML file that holds everything it shows and loads nothing."""
+
+import base64
+from dataclasses import dataclass, field
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+
+from codesign.errors import DomainError, FileFormatError, ShapeError
+from codesign.report import prose
+
+TEMPLATE = Path(__file__).with_name("page.html.jinja")
+MEDIA = {".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4"}
+
+
+@dataclass(frozen=True)
+class Card:
+    """A headline figure: what it is, its value with unit as text, and a remark below."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A captioned PNG, GIF or MP4, inlined in the page."""
+
+    name: str
+    media: str
+    data: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of numbers (right-aligned) or text, with cells as they are shown."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    numeric: tuple[bool, ...]
+    caption: str
+
+
+@dataclass
+class Section:
+    """A heading and what stands below it, in order: (kind, Markup | Picture | Table)."""
+
+    title: str
+    blocks: list[tuple[str, Any]] = field(default_factory=list)
+
+
+def picture(path, caption):
+    """Inline the image or video at ``path``.
+
+    Raises: FileFormatError when it is missing or not PNG, GIF or MP4.
+    """
+    path = Path(path)
+    media = MEDIA.get(path.suffix.lower())
+    if media is None:
+        raise FileFormatError(f"'{path}' cannot be shown on the page; give one of {', '.join(MEDIA)}.")
+    try:
+        return Picture(path.stem, media, base64.b64encode(path.read_bytes()).decode(), caption)
+    except OSError as error:
+        raise FileFormatError(f"'{path}' cannot be read for the page ({error.strerror}); write it before it is shown.") from error
+
+
+def table(title, columns, rows, caption=""):
+    """Table of numbers, text and None (shown as a dash). A column of numbers is right-aligned; floats show four digits.
+
+    Raises: ShapeError when a row has not one cell per column.
+    """
+    columns, rows = tuple(map(str, columns)), [tuple(row) for row in rows]
+    for index, row in enumerate(rows):
+        if len(row) != len(columns):
+            raise ShapeError(f"table '{title}': row {index} has {len(row)} cells for {len(columns)} columns; give one cell per column.")
+    numeric = tuple(any(_is_number(row[k]) for row in rows) and all(_is_number(row[k]) or row[k] is None for row in rows) for k in range(len(columns)))
+    return Table(title, columns, tuple(tuple(map(cell, row)) for row in rows), numeric, caption)
+
+
+def cell(value):
+    """Text of a table cell."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool) or not _is_number(value):
+        return {True: "yes", False: "no"}.get(value, str(value)) if isinstance(value, bool) else str(value)
+    return f"{int(value)}" if isinstance(value, Integral) else f"{float(value):.4g}".replace("-", "−")
+
+
+def render_page(title, lead, cards, sections, facts):
+    """HTML text of the page.
+
+    Args:
+      title: heading. lead: one paragraph that says what was done and what came out (see prose.to_html).
+      cards: list of Card, the headline figures.
+      sections: list of Section.
+      facts: dictionary of folded tables at the end, heading -> {name: value} (configuration, versions, hardware).
+    Returns: text of a self-contained HTML file.
+    Raises: DomainError when the title is empty.
+    """
+    if not title.strip():
+        raise DomainError("a page needs a title; an empty one was given.")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
+    shown = [section for section in sections if section.blocks]
+    return template.render(title=title, lead=prose.to_html(lead), cards=cards, sections=shown, facts=facts, inline=prose.inline, Markup=Markup)
+
+
+def _is_number(value):
+    return isinstance(value, Real) and not isinstance(value, bool)

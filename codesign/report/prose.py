@@ -1,0 +1,27 @@
+"""A small markdown for the page of a run: paragraphs, lists, **bold**, *emphasis*, `code`. Everything else is text."""
+
+import re
+
+from markupsafe import Markup, escape
+
+_MARKS = ((r"`([^`]+)`", r"<code>\1</code>"), (r"\*\*([^*]+)\*\*", r"<strong>\1</strong>"), (r"(?<![\w*])\*([^*\s][^*]*)\*(?![\w*])", r"<em>\1</em>"))
+
+
+def to_html(text):
+    """HTML of ``text``; blank lines separate paragraphs, and a block whose lines all start with "- " is a list. Markup in it is shown, not used."""
+    return Markup("\n".join(_block(block.strip()) for block in re.split(r"\n\s*\n", text.strip()) if block.strip()))
+
+
+def inline(text):
+    """HTML of one run of text, without a paragraph around it."""
+    html = str(escape(str(text)))
+    for pattern, replacement in _MARKS:
+        html = re.sub(pattern, replacement, html)
+    return Markup(html)
+
+
+def _block(block):
+    lines = [line.strip() for line in block.splitlines()]
+    if all(line.startswith("- ") for line in lines):
+        return "<ul>" + "".join(f"<li>{inline(line[2:])}</li>" for line in lines) + "</ul>"
+    return f"<p>{inline(' '.join(lines))}</p>"

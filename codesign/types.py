@@ -1,0 +1,66 @@
+"""Frozen dataclasses that cross junctions: camera rays, event streams, event volumes, flow fields."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays leaving a camera towards the scene, in camera axes (x right, y down, z forward).
+
+    origin_m: [N, 3] metres, relative to the centre of the entrance pupil.
+    direction: [N, 3] unit vectors.
+    weight: [N] share of the light that passes all apertures, 0 to 1; 0 for a ray that failed.
+    """
+
+    origin_m: Tensor
+    direction: Tensor
+    weight: Tensor
+
+
+@dataclass(frozen=True)
+class EventStream:
+    """A list of events sorted by (t, y, x, p).
+
+    t_us: [N] int64 microseconds. x, y: [N] int64 pixels (column, row). p: [N] int64, +1 ON or -1 OFF.
+    height_px, width_px: size of the sensor the events come from.
+    """
+
+    t_us: Tensor
+    x: Tensor
+    y: Tensor
+    p: Tensor
+    height_px: int
+    width_px: int
+
+    def __len__(self):
+        return int(self.t_us.numel())
+
+
+@dataclass(frozen=True)
+class EventVolume:
+    """Event counts on a grid of time bins.
+
+    counts: [B, 2, bins, H, W], ON first; counts per bin, fractional where events are shared between bins.
+    centroid_s: [bins] mean time of what each bin collects, seconds from the start of the interval.
+    collected_s: [bins] time that each bin collects (half a node spacing at the ends); their sum is the length of the interval.
+    """
+
+    counts: Tensor
+    centroid_s: Tensor
+    collected_s: Tensor
+
+
+@dataclass(frozen=True)
+class FlowField:
+    """Motion of every pixel over one interval.
+
+    flow_px: [B, 2, H, W] pixels per interval, +x right, +y down.
+    valid: [B, H, W] bool, False where the value means nothing (no ground truth, no events).
+    interval_s: length of the interval, seconds.
+    """
+
+    flow_px: Tensor
+    valid: Tensor
+    interval_s: float

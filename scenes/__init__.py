@@ -1,0 +1,1 @@
+"""Worlds and trajectories, as plain builders; no training code."""

@@ -1,0 +1,84 @@
+"""Photographs and procedural patterns as linear radiance textures on the 0..255 scale."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from codesign.errors import DomainError, FileFormatError
+
+PHOTOS = ("brick", "gravel", "grass", "camera", "coffee", "chelsea", "astronaut", "rocket")
+LIFT = 2.0  # the darkest radiance of a photograph: no real wall is perfectly black
+
+
+def photo(source, size_px=512):
+    """A photograph as linear luminance.
+
+    Args: source: a name out of PHOTOS (CC0 and public-domain pictures that come with scikit-image) or a path to an image file.
+    Returns: [H, W] float32, from LIFT to 255, cut to at most size_px square.
+    Raises: FileFormatError when there is no such picture.
+    """
+    if str(source) in PHOTOS:
+        import skimage.data
+
+        picture = getattr(skimage.data, str(source))()
+    else:
+        import imageio.v3 as imageio
+
+        if not Path(source).is_file():
+            raise FileFormatError(f"texture '{source}' is neither a file nor one of {', '.join(PHOTOS)}; give the path of a PNG or JPEG.")
+        try:
+            picture = imageio.imread(source)
+        except (OSError, ValueError) as error:
+            raise FileFormatError(f"texture {source} is not a readable image ({str(error)[:120]}); convert it to PNG.") from error
+    scale = 65535.0 if picture.dtype == np.uint16 else 255.0 if picture.dtype == np.uint8 else 1.0
+    values = np.asarray(picture, dtype=np.float64)[:size_px, :size_px] / scale
+    if values.ndim == 3:
+        values = values[..., :3] @ [0.2126, 0.7152, 0.0722]
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    return check_texture(LIFT + (255 - LIFT) * linear, str(source))
+
+
+def speckle(seed, size_px=512, finest_px=3.0, coarsest_px=24.0, contrast=0.5):
+    """Random pattern with equal power per octave between two periods (texels), exp of a Gaussian field: [size, size] float32."""
+    frequency = np.fft.fftfreq(size_px)
+    radius = np.hypot(frequency[:, None], frequency)
+    band = ((radius >= 1 / coarsest_px) & (radius <= 1 / finest_px)) / np.maximum(radius, 1e-6)
+    field = np.fft.ifft2(np.fft.fft2(np.random.default_rng(seed).standard_normal((size_px, size_px))) * band).real
+    return check_texture(60.0 * np.exp(contrast * field / field.std()), f"speckle {seed}")
+
+
+def checkerboard(squares=8, square_px=32, dark=10.0, bright=200.0):
+    """Black and white squares, [H, W] float32."""
+    row = np.arange(squares * square_px) // square_px
+    return np.where((row[:, None] + row) % 2 == 0, bright, dark).astype(np.float32)
+
+
+def faded_to(texture, level, margin=0.12):
+    """The texture with its borders fading smoothly to a constant, so that adjoining walls meet without a jump."""
+    ramps = []
+    for size in texture.shape:
+        at = (np.arange(size) + 0.5) / size
+        u = np.clip(np.minimum(at, 1 - at) / margin - 0.25, 0, 1)  # the outermost quarter of the margin is constant
+        ramps.append(u * u * (3 - 2 * u))
+    return (level + (texture - level) * ramps[0][:, None] * ramps[1]).astype(np.float32)
+
+
+def check_texture(values, name):
+    """Raise DomainError unless all radiances are finite and at least 0; returns float32."""
+    values = np.asarray(values)
+    if values.ndim != 2 or not np.isfinite(values).all() or (values < 0).any():
+        bad = "NaN or infinite" if not np.isfinite(values).all() else "negative" if values.ndim == 2 else f"shape {values.shape} instead of [H, W] with"
+        raise DomainError(f"texture {name}: {bad} values; give finite radiances of at least 0 as a 2-D array.")
+    return values.astype(np.float32)
+
+
+def waves(seed, count=24, finest_period_m=0.05, coarsest_period_m=0.5, log_contrast=0.4):
+    """Random plane waves for TexturedPlane: frequency [K, 2] (per metre), amplitude [K], phase [K]; periods spread evenly in octaves."""
+    generator = torch.Generator().manual_seed(seed)
+    u = torch.rand(3, count, generator=generator, dtype=torch.float64)
+    period = finest_period_m * (coarsest_period_m / finest_period_m) ** u[0]
+    angle = 2 * math.pi * u[1]
+    frequency = torch.stack([angle.cos(), angle.sin()], 1) / period[:, None]
+    return frequency, torch.full((count,), log_contrast * (2 / count) ** 0.5, dtype=torch.float64), 2 * math.pi * u[2]

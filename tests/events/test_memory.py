@@ -1,0 +1,210 @@
+"""The memory layer against closed forms, a plain autograd loop, and differences of the hard count."""
+
+import math
+
+import pytest
+import torch
+
+from codesign.errors import DomainError, ShapeError
+from codesign.events import lin_log, memory, soft_counts
+
+
+def plain_loop(level, theta_on, theta_off, state=None):
+    """The same model as an ordinary autograd loop with a straight-through floor."""
+
+    def straight_through_floor(quotient):
+        return quotient + (quotient.floor() - quotient).detach()
+
+    if state is None:
+        level, state = level[1:], level[0]
+    counts = []
+    for now in level:
+        difference = now - state
+        on = straight_through_floor((difference.abs() + difference) / 2 / theta_on)
+        off = straight_through_floor((difference.abs() - difference) / 2 / theta_off)
+        state = state + theta_on * on - theta_off * off
+        counts.append(torch.stack((on, off)))
+    return torch.stack(counts), state
+
+
+def random_walk(frames=30, pixels=(5, 4), seed=0, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(seed)
+    return (0.3 * torch.randn(frames, *pixels, generator=generator, dtype=dtype)).cumsum(0)
+
+
+@pytest.mark.parametrize("per_pixel", [False, True])
+@pytest.mark.parametrize("with_state", [False, True])
+def test_counts_and_all_gradients_equal_a_plain_autograd_loop(per_pixel, with_state):
+    generator = torch.Generator().manual_seed(1)
+    shape = (5, 4) if per_pixel else ()
+    level = random_walk()
+    level[7] = level[6]  # a step of exactly zero for pixels whose reference sits at the level
+    level[1] = level[0]
+    inputs = [level.requires_grad_(), (0.2 + 0.05 * torch.rand(shape, generator=generator, dtype=torch.float64)).requires_grad_()]
+    inputs.append((0.3 + 0.05 * torch.rand(shape, generator=generator, dtype=torch.float64)).requires_grad_())
+    if with_state:
+        inputs.append(torch.zeros(5, 4, dtype=torch.float64, requires_grad=True))
+    found = memory(*inputs[:3], state=inputs[3] if with_state else None, log_input=True)
+    truth = plain_loop(*inputs)
+    torch.testing.assert_close(found[0], truth[0], rtol=0, atol=1e-12)  # q + (floor q - q) rounds
+    torch.testing.assert_close(found[1], truth[1], rtol=0, atol=1e-13)
+    weights = [torch.randn(tensor.shape, generator=generator, dtype=torch.float64) for tensor in found]
+    for mine, theirs in zip(torch.autograd.grad(found, inputs, weights), torch.autograd.grad(truth, inputs, weights), strict=True):
+        # the same sums in another order: some thousand terms of float64 rounding
+        torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12 * float(theirs.abs().max()))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_ramp_fires_at_every_threshold_it_crosses(dtype):
+    # log level k * 0.07 against theta 0.2: total after k steps is floor(k * 7 / 20), in integers; k * 7 is never a multiple of 20 for 0 < k < 20
+    level = torch.arange(20, dtype=dtype)[:, None, None] * 0.07 + torch.zeros(20, 2, 3, dtype=dtype)
+    rising, reference = memory(level, 0.2, 0.35, log_input=True)
+    falling, _ = memory(-level, 0.35, 0.2, log_input=True)
+    truth = torch.tensor([k * 7 // 20 - (k - 1) * 7 // 20 for k in range(1, 20)], dtype=dtype)
+    for counts, fired, silent in ((rising, 0, 1), (falling, 1, 0)):
+        assert torch.equal(counts[:, fired], truth[:, None, None].expand(-1, 2, 3))
+        assert not counts[:, silent].any()
+    torch.testing.assert_close(reference, torch.full((2, 3), 6 * 0.2, dtype=dtype))
+
+
+def test_a_sinusoid_counts_its_swing():
+    # amplitude 1.05 = 5.25 thresholds: up 5, then down from 5 to -5 and up again, 10 each; after 4.1 periods at 3.09 thresholds
+    time = torch.arange(0, 4 * 1000 + 101, dtype=torch.float64) / 1000
+    counts, _ = memory((1.05 * torch.sin(2 * math.pi * time))[:, None], 0.2, 0.2, log_input=True)
+    assert counts.sum((0, 2)).tolist() == [5 + 3 * 10 + 8, 4 * 10]
+    assert counts.max() == 1
+
+
+def test_one_big_step_gives_many_events_and_signs_stay_positive():
+    counts, state = memory(torch.tensor([[0.0], [9.9], [-0.3]]), 0.001, 0.25, log_input=True)
+    assert abs(int(counts[0, 0]) - 9900) <= 1  # 9.9/0.001 in float32 is a hair from the whole number
+    assert counts[1].flatten().tolist() == [0, 40]
+    assert not counts.signbit().any()
+    assert abs(float(state) + 0.1) < 2e-3
+
+
+@pytest.mark.parametrize("cut", [1, 2, 13, 29])
+def test_chunks_equal_the_whole_bit_for_bit_gradients_included(cut):
+    whole, parts = (random_walk(dtype=torch.float32).requires_grad_() for _ in range(2))
+    theta = torch.tensor(0.2)
+    counts, state = memory(whole, theta, 0.25, log_input=True)
+    if cut == 1:  # a single first frame needs no call: it is the state
+        second, state_two = memory(parts[1:], theta, 0.25, state=parts[0], log_input=True)
+        first = second[:0]
+    else:
+        first, middle = memory(parts[:cut], theta, 0.25, log_input=True)
+        second, state_two = memory(parts[cut:], theta, 0.25, state=middle, log_input=True)
+    joined = torch.cat((first, second))
+    assert torch.equal(counts, joined)
+    assert torch.equal(state, state_two)
+    weight = torch.randn(counts.shape, generator=torch.Generator().manual_seed(3))
+    (counts * weight).sum().backward()
+    (joined * weight).sum().backward()
+    torch.testing.assert_close(whole.grad, parts.grad, rtol=0, atol=0)
+
+
+def test_gradient_is_the_slope_of_the_hard_count_over_several_thresholds():
+    """Blur a moving texture a little more: d(weighted signed count)/d(contrast), straight-through against differences of whole counts.
+
+    Over a step that moves each pixel by s thresholds, rounding leaves at most one event per pixel at each end, so the difference quotient of one
+    pixel is off by up to 1/s; averaged over P independent pixels by about 1/(s sqrt(3 P)). Here s >= 2 on average, P = 2000: 0.7 %; 3 % allowed.
+    """
+    generator = torch.Generator().manual_seed(5)
+    phase = torch.rand(2000, generator=generator, dtype=torch.float64) * 2 * math.pi
+    time = torch.linspace(0, 1, 61, dtype=torch.float64)[:, None]
+    weight = torch.cos(math.pi * time[1:])  # sees when events come, so the memory matters
+
+    def loss(contrast):
+        counts, _ = memory(contrast * torch.sin(2 * math.pi * time + phase), 0.15, 0.2, log_input=True)
+        return (weight * (counts[:, 0] + 0.5 * counts[:, 1])).sum() + counts.sum()
+
+    contrast = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(loss(contrast), contrast)
+    difference = (loss(torch.tensor(2.4)) - loss(torch.tensor(1.6))) / 0.8
+    assert abs(float(slope / difference) - 1) < 0.03
+
+
+def test_threshold_gradient_follows_the_hard_count():
+    # the total count of a pixel that swings by S (many thresholds) is about S/C: d/dC = -S/C^2 = -(counts)/C. The hard count over a 25 % wider
+    # and narrower threshold gives -S/(C^2 (1 - 0.0625)): 7 % steeper; rounding adds under 1 % at 2000 pixels.
+    generator = torch.Generator().manual_seed(6)
+    swing = 3 + torch.rand(2000, generator=generator, dtype=torch.float64)
+    level = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None] * swing
+    theta = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(memory(level, theta, 0.2, log_input=True)[0].sum(), theta)
+    totals = [memory(level, value, 0.2, log_input=True)[0].sum() for value in (0.15, 0.25)]
+    assert abs(float((totals[1] - totals[0]) / 0.1 / slope) - 1 / (1 - 0.0625)) < 0.05
+
+
+def test_a_still_scene_is_silent_and_its_gradient_has_no_preferred_sign():
+    frames = (torch.rand(1, 6, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(7)) * 255).repeat(10, 1, 1).requires_grad_()
+    for counts in (memory(frames, 0.2, 0.2)[0], soft_counts(frames, 0.2, 0.2)):
+        assert not counts.any()
+        (total,) = torch.autograd.grad(counts.sum(), frames, retain_graph=True)
+        assert not total.any()  # |dL| at its minimum
+        (signed,) = torch.autograd.grad((counts[4, 0] - counts[4, 1]).sum(), frames)
+        slope = torch.where(frames[5] <= 20, math.log(20) / 20, 1 / frames[5]) / 0.2
+        torch.testing.assert_close(signed[5], slope.detach())
+        torch.testing.assert_close(signed[4], -slope.detach())
+
+
+def test_soft_counts_gradient_against_finite_differences_and_sum_against_memory():
+    level = random_walk(8, (3, 2))
+    thetas = [torch.tensor([[0.2], [0.3], [0.25]], dtype=torch.float64, requires_grad=True), torch.tensor(0.15, dtype=torch.float64, requires_grad=True)]
+    assert torch.autograd.gradcheck(lambda x, a, b: soft_counts(x, a, b, log_input=True), (level.requires_grad_(), *thetas))
+    climb = level.detach().abs().cumsum(0)
+    soft, hard = soft_counts(climb, 0.2, 0.2, log_input=True).sum(0), memory(climb, 0.2, 0.2, log_input=True)[0].sum(0)
+    assert torch.equal(soft.floor(), hard)
+
+
+def test_memory_applies_the_lin_log_front_end():
+    frames = torch.rand(6, 4, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(8)) * 200
+    assert torch.equal(memory(frames, 0.2, 0.2)[0], memory(lin_log(frames), 0.2, 0.2, log_input=True)[0])
+
+
+def test_second_derivatives_raise():
+    level = random_walk(4, (2,)).requires_grad_()
+    weight = torch.ones(3, 2, 2, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(memory(level, 0.2, 0.2, log_input=True)[0], level, weight, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        slope.sum().backward()
+
+
+GOOD = torch.full((3, 4, 5), 50.0)
+BAD = [
+    (GOOD[:1], 0.2, ShapeError, "at least 2"),
+    (GOOD[:, :0], 0.2, ShapeError, "no pixel"),
+    (torch.tensor(1.0), 0.2, ShapeError, "no time axis"),
+    (GOOD.index_fill(0, torch.tensor([1]), math.nan), 0.2, DomainError, "NaN"),
+    (GOOD.index_fill(0, torch.tensor([1]), math.inf), 0.2, DomainError, "infinite"),
+    (GOOD.index_fill(0, torch.tensor([2]), -1e-3), 0.2, DomainError, r"index \[2, 0, 0\]"),
+    (GOOD.to(torch.uint8), 0.2, DomainError, "uint8"),
+    ([[1.0]], 0.2, DomainError, "list"),
+    (GOOD, 0.0, DomainError, "> 0"),
+    (GOOD, -0.2, DomainError, "> 0"),
+    (GOOD, math.nan, DomainError, "> 0"),
+    (GOOD, math.inf, DomainError, "> 0"),
+    (GOOD, "0.2", DomainError, "str"),
+    (GOOD, torch.full((5, 4), 0.2), ShapeError, r"\[4, 5\]"),
+    (GOOD, torch.full((3, 4, 5), 0.2), ShapeError, r"\[4, 5\]"),
+]
+
+
+@pytest.mark.parametrize("layer", [memory, soft_counts])
+@pytest.mark.parametrize(("frames", "theta", "error", "words"), BAD)
+def test_bad_input_is_refused_with_a_reason(layer, frames, theta, error, words):
+    with pytest.raises(error, match=words):
+        layer(frames, theta, 0.2)
+    if frames is GOOD:
+        with pytest.raises(error, match=words):
+            layer(frames, 0.2, theta)
+
+
+def test_a_state_of_another_sensor_is_refused():
+    for state in (torch.zeros(5, 4), torch.zeros(4, 5, dtype=torch.float64)):
+        with pytest.raises(ShapeError, match="same sensor"):
+            memory(GOOD, 0.2, 0.2, state=state)
+
+
+def test_log_input_may_be_negative():
+    assert memory(torch.tensor([[-3.0], [-3.5]]), 0.2, 0.2, log_input=True)[0][0, 1] == 2

@@ -1,0 +1,126 @@
+"""Event volumes: conservation, centroids, shares, and agreement of the two builders."""
+
+import pytest
+import torch
+
+from codesign.errors import DomainError, ShapeError
+from codesign.events import from_counts, from_stream
+from codesign.types import EventStream
+
+
+def random_stream(count, height, width, last_us, seed=0, offset_us=0):
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(high):
+        return torch.randint(0, high, (count,), generator=generator)
+
+    return EventStream(draw(last_us + 1).sort().values + offset_us, draw(width), draw(height), draw(2) * 2 - 1, height, width)
+
+
+@pytest.mark.parametrize("bins", [1, 2, 5, 9])
+@pytest.mark.parametrize("batch", [(), (3,), (2, 2)])
+def test_counts_are_conserved_per_pixel_and_polarity(bins, batch):
+    counts = torch.randint(0, 4, (19, 2, *batch, 4, 6), generator=torch.Generator().manual_seed(0)).double()
+    volume = from_counts(counts, torch.linspace(3.0, 3.2, 20, dtype=torch.float64), bins)
+    flat = counts.reshape(19, 2, -1, 4, 6)
+    assert volume.counts.shape == (flat.shape[2], 2, bins, 4, 6)
+    torch.testing.assert_close(volume.counts.sum(2), flat.sum(0).transpose(0, 1), rtol=1e-13, atol=1e-13)
+
+
+def test_one_event_is_shared_between_the_two_nearest_nodes():
+    counts = torch.zeros(8, 2, 1, 2)
+    counts[2, 1, 0, 1] = 3.0  # middle of interval 2 of 8: 2.5/8 of the way, 1.25 nodes of 4 spacings
+    volume = from_counts(counts, torch.arange(9) / 100, 5)
+    expected = torch.zeros(1, 2, 5, 1, 2)
+    expected[0, 1, 1, 0, 1], expected[0, 1, 2, 0, 1] = 3 * 0.75, 3 * 0.25
+    torch.testing.assert_close(volume.counts, expected)
+
+
+@pytest.mark.parametrize("bins", [1, 2, 4, 7])
+def test_centroid_is_the_mean_time_of_what_a_bin_collects_even_for_uneven_frames(bins):
+    # even rate: each interval holds events in proportion to its length; the weighted mean of their times, by a plain loop
+    steps_s = 0.005 + 0.01 * torch.rand(40, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    edges_s = torch.cat((torch.tensor([7.0], dtype=torch.float64), 7 + steps_s.cumsum(0)))
+    mass, moment = [0.0] * bins, [0.0] * bins
+    for k in range(40):
+        counts = torch.zeros(40, 2, 1, 1, dtype=torch.float64)
+        counts[k, 0] = steps_s[k]
+        shared = from_counts(counts, edges_s, bins).counts[0, 0, :, 0, 0]
+        middle_s = float(edges_s[k] + edges_s[k + 1]) / 2 - 7
+        for b in range(bins):
+            mass[b] += float(shared[b])
+            moment[b] += float(shared[b]) * middle_s
+    found = from_counts(torch.zeros(40, 2, 1, 1), edges_s, bins).centroid_s
+    torch.testing.assert_close(found, torch.tensor([m / w for m, w in zip(moment, mass, strict=True)], dtype=torch.float64), rtol=1e-12, atol=0)
+
+
+def test_a_rate_linear_in_time_is_read_off_at_the_centroids_exactly():
+    times_s = torch.linspace(0, 1, 33, dtype=torch.float64)
+    middle_s = (times_s[1:] + times_s[:-1]) / 2
+    flat, slanted = (rate[:, None, None, None].expand(32, 2, 1, 1) for rate in (torch.ones_like(middle_s), 5 + 3 * middle_s))
+    volume = from_counts(slanted, times_s, 6)
+    rate = volume.counts[0, 0, :, 0, 0] / from_counts(flat, times_s, 6).counts[0, 0, :, 0, 0]
+    torch.testing.assert_close(rate, 5 + 3 * volume.centroid_s, rtol=1e-13, atol=0)
+
+
+def test_gradient_of_a_volume_is_its_share():
+    counts = torch.rand(6, 2, 2, 3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda x: from_counts(x, torch.arange(7), 3).counts, (counts,))
+
+
+@pytest.mark.parametrize("bins", [1, 2, 5])
+@pytest.mark.parametrize("offset_us", [0, 1_700_000_000_000_000])
+def test_stream_events_are_conserved_and_shared_by_time(bins, offset_us):
+    stream = random_stream(5000, 3, 4, 100_000, offset_us=offset_us)
+    volume = from_stream(stream, offset_us, offset_us + 100_000, bins, dtype=torch.float64)
+    truth = torch.zeros(2, bins, 3, 4, dtype=torch.float64)
+    for t, x, y, p in zip((stream.t_us - offset_us).tolist(), stream.x.tolist(), stream.y.tolist(), stream.p.tolist(), strict=True):
+        place = t / 100_000 * (bins - 1)
+        low = min(int(place), max(bins - 2, 0))
+        truth[int(p < 0), low, y, x] += 1 - (place - low)
+        if bins > 1:
+            truth[int(p < 0), low + 1, y, x] += place - low
+    torch.testing.assert_close(volume.counts[0], truth, rtol=1e-12, atol=1e-12)
+    assert abs(float(volume.counts.sum()) - 5000) < 1e-8
+
+
+def test_stream_centroids_are_those_of_an_even_rate_and_of_many_short_intervals():
+    every_us = torch.arange(0, 120_001)
+    zero = torch.zeros_like(every_us)
+    stream = EventStream(every_us, zero, zero, zero + 1, 1, 1)
+    volume = from_stream(stream, 0, 120_000, 4, dtype=torch.float64)
+    torch.testing.assert_close(volume.centroid_s, torch.tensor([0.04 / 3, 0.04, 0.08, 0.12 - 0.04 / 3], dtype=torch.float64), rtol=1e-14, atol=0)
+    fine = from_counts(torch.zeros(1200, 2, 1, 1), torch.linspace(0, 0.12, 1201, dtype=torch.float64), 4)
+    # midpoint rule with 400 intervals per node spacing: relative error of the moments about (1/400)^2
+    torch.testing.assert_close(fine.centroid_s, volume.centroid_s, rtol=2e-5, atol=0)
+    # an event per microsecond: the weighted mean itself, one microsecond in 40000 at the cut ends
+    alone = [float((bin_share * every_us * 1e-6).sum() / bin_share.sum()) for bin_share in (1 - (every_us / 40_000 - torch.arange(4)[:, None]).abs()).clamp(min=0)]
+    torch.testing.assert_close(volume.centroid_s, torch.tensor(alone, dtype=torch.float64), rtol=1e-4, atol=0)
+
+
+def test_the_window_holds_both_ends_and_nothing_else():
+    stream = EventStream(torch.tensor([9, 10, 15, 20, 21]), *(torch.zeros(5, dtype=torch.int64),) * 2, torch.ones(5, dtype=torch.int64), 1, 1)
+    assert from_stream(stream, 10, 20, 2).counts[0, 0, :, 0, 0].tolist() == [1.5, 1.5]
+
+
+def test_bad_input_is_refused_with_a_reason():
+    counts, times_s = torch.ones(4, 2, 3, 3), torch.arange(5)
+    for bad, time, bins, error, words in [
+        (counts[:, :1], times_s, 2, ShapeError, "ON first"),
+        (counts[0], times_s, 2, ShapeError, "T-1"),
+        (counts * torch.nan, times_s, 2, DomainError, "NaN"),
+        (counts, times_s[:4], 2, ShapeError, r"\[5\]"),
+        (counts, torch.tensor([0, 1, 1, 2, 3]), 2, DomainError, "increase"),
+        (counts, times_s * torch.nan, 2, DomainError, "t_s"),
+        (counts, times_s, 0, DomainError, "bins"),
+        (counts, times_s, 2.0, DomainError, "bins"),
+        (counts, times_s, 20, DomainError, "fewer bins"),
+    ]:
+        with pytest.raises(error, match=words):
+            from_counts(bad, time, bins)
+    stream = random_stream(5, 3, 3, 10)
+    for window in ((0, 0), (5, 2), (0.5, 2)):
+        with pytest.raises(DomainError, match="interval"):
+            from_stream(stream, *window, 2)
+    with pytest.raises(DomainError, match="bins"):
+        from_stream(stream, 0, 10, -1)
