@@ -15,6 +15,7 @@ setup: .venv/installed.stamp .venv/llvm.stamp ## environment, packages and LLVM 
 
 .venv/installed.stamp: pyproject.toml constraints.txt setup/make_venv.sh
 	@setup/make_venv.sh .venv "$(PYTHON)"
+	@echo "installing the packages of pyproject.toml into .venv (some minutes the first time)"
 	@$(RUN) -m pip install --disable-pip-version-check --quiet --editable ".[dev]" --constraint constraints.txt
 	@touch $@
 

@@ -201,11 +201,13 @@ class _Kernel(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         with dr.suspend_grad():
             outputs = [dr.detach(o) for o in kernel(ctx.arrays, *[_to_drjit(ctx.arrays, x) for x in inputs])]
+            owned = [o.state != dr.VarState.Evaluated for o in outputs]  # memory that was there before may belong to something the kernel captured
             dr.eval(outputs)
         dr.sync_thread()
         seen, tensors = list(inputs), []
-        for value, shape in zip(outputs, out_shapes, strict=True):
-            tensors.append(_to_torch(value, shape, seen))
+        for value, shape, own in zip(outputs, out_shapes, owned, strict=True):
+            tensor = _to_torch(value, shape, seen)
+            tensors.append(tensor if own else tensor.clone())
             seen.append(tensors[-1])
         ctx.mark_non_differentiable(*[t for t in tensors if not t.is_floating_point()])
         return tuple(tensors)

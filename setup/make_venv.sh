@@ -17,8 +17,8 @@ else
     done
 fi
 if [ -z "$python" ]; then
-    found=$("${asked:-python3}" --version 2>/dev/null || echo "no Python")
-    echo "Python 3.11 or newer is needed, but '${asked:-python3}' is: $found. Install one and run 'make setup PYTHON=/path/to/python3.11'." >&2
+    found=$("${asked:-python3}" --version 2>/dev/null | head -n 1 || true)
+    echo "Python 3.11 or newer is needed, but '${asked:-python3}' is: ${found:-not there}. Install one and run 'make setup PYTHON=/path/to/python3.11'." >&2
     exit 2
 fi
 if ! "$python" -m venv --clear "$folder"; then

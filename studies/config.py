@@ -82,7 +82,7 @@ def _plain(name, value) -> Any:
     raise TypeError(f"field {name} of a study's configuration is a {type(value).__name__}; use numbers, text, paths and tuples of them")
 
 
-def _typed(value, hint):
+def _typed(value, hint) -> Any:
     kinds = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
     if isinstance(value, str) and Path in kinds:
         return Path(value)

@@ -1,4 +1,4 @@
-"""Progress of a loop: a bar with loss and time left on a terminal, a line every few seconds elsewhere."""
+"""Progress of a loop: a bar with loss and time left on a terminal; elsewhere a line at the first and last step and every few seconds."""
 
 import time
 
@@ -53,7 +53,7 @@ class StepProgress:
         shown = "  ".join(f"{name} {float(value):.4g}" for name, value in numbers.items())
         if self._bar:
             self._bar.update(self._task, completed=self.done, numbers=shown)
-        elif self.done == self.total or self._last_step - self._last_line >= SECONDS_BETWEEN_LINES:
+        elif self.done in (self._first_done[1], self.total) or self._last_step - self._last_line >= SECONDS_BETWEEN_LINES:
             self._last_line = self._last_step
             self._console.print(f"{self.description}  {self.done}/{self.total}  {shown}  {self._time_left()}".rstrip(), highlight=False, markup=False, soft_wrap=True)
         self._interruption.safe_point()

@@ -15,6 +15,7 @@ A study is a function of a Run and a frozen dataclass:
 
 import dataclasses
 import inspect
+import io
 import json
 import math
 import shlex
@@ -24,6 +25,8 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Generic
 
+import matplotlib
+import matplotlib.pyplot as plt
 import torch
 import tyro
 from rich.console import Console
@@ -118,10 +121,10 @@ class Run(Generic[Config]):
 
     def figure(self, figure, name: str, caption: str, dpi: int = 160):
         """Save a matplotlib figure as <name>.png, show it on the page, and close it. Returns the path."""
-        path = self.path(f"{name}.png")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=dpi, bbox_inches="tight", facecolor="white")
-        _close(figure)
+        path, png = self.path(f"{name}.png"), io.BytesIO()
+        figure.savefig(png, format="png", dpi=dpi, bbox_inches="tight", facecolor="white")
+        plt.close(figure)
+        state.write_atomic(path, png.getvalue())
         self._show("picture", page.picture(path, caption))
         return path
 
@@ -178,7 +181,8 @@ def main(study: Callable[[Run[Config]], None], kind: type[Config], arguments: li
     Raises: SystemExit from the command line itself (0 for --help, 2 for a wrong option).
     """
     name = _name(kind)
-    config = tyro.cli(kind, prog=f"python -m studies.{name}", description=inspect.getdoc(inspect.getmodule(study)), args=arguments)
+    config = tyro.cli(kind, prog=f"python -m studies.{name}", description=sys.modules[study.__module__].__doc__, args=arguments)
+    matplotlib.use("Agg")  # figures go to files; no screen is needed
     run = None
     try:
         with Interruption() as interruption:
@@ -225,9 +229,3 @@ def _read_metrics(path):
         return {name: value for name, value in stored.items() if name not in RESERVED}
     except (OSError, ValueError, AttributeError) as error:
         raise FileFormatError(f"'{path}' is damaged ({error}); remove it to go on with this run.") from error
-
-
-def _close(figure):
-    import matplotlib.pyplot as plt
-
-    plt.close(figure)

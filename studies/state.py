@@ -1,5 +1,6 @@
 """The state of an unfinished run: exact tensors and numbers in one file that holds data only, never code."""
 
+import contextlib
 import io
 import json
 import os
@@ -38,7 +39,8 @@ def write_atomic(path: Path, content: bytes):
     except OSError as error:
         raise CodesignError(f"cannot write {path.name} in folder '{path.parent}' ({error.strerror}); free space there, or choose another folder with --out.") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # gone after a success; after a failure the sentence above matters more
+            temporary.unlink()
 
 
 def write_state(path: Path, tensors: dict[str, Tensor], numbers: dict[str, Any]):
@@ -66,7 +68,7 @@ def read_state(path: Path):
     if not path.exists():
         return None
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as stored:
             header = json.loads(stored["header"].tobytes())
             tensors = {name: torch.from_numpy(stored[f"tensor_{index}"]) for index, name in enumerate(header["names"])}
         return State(tensors, header["numbers"])

@@ -103,6 +103,16 @@ def test_passing_an_input_through_still_copies(inputs):
     assert torch.equal(again, kept)
 
 
+def test_a_captured_array_is_copied_too():
+    import drjit as dr
+
+    constant = dr.arange(backend.arrays().Float, 4)
+    dr.eval(constant)
+    (out,) = backend.run_kernel(lambda arr, v: (constant,), (torch.zeros(4),), [(4,)])
+    out.fill_(9)
+    assert list(constant) == [0, 1, 2, 3]
+
+
 def test_one_value_fills_a_wide_output_and_sums_in_backward(inputs):
     x = inputs[0]
     (out,) = backend.run_kernel(lambda arr, v: (arr.Float(3) * backend.widen(arr, v, 1, 1)[0],), (x,), [(2, 3)])

@@ -13,6 +13,8 @@ from codesign.lens.surface import scaled
 from codesign.lens.trace import Prescription, trace
 from codesign.types import Rays
 
+LEARNABLES = ("curvature_per_mm", "thickness_mm", "conic", "asphere", "index_offset")
+
 
 class GeoLens(nn.Module):
     """Sequential lens. First vertex at z = 0, light along +z, flat image plane behind the last thickness.
@@ -52,11 +54,11 @@ class GeoLens(nn.Module):
         twin = copy.copy(self)
         twin._parameters = dict(self._parameters)
         for name, value in tensors.items():
-            if name not in self._parameters:
-                raise DomainError(f"a lens has no tensor '{name}'; it has {', '.join(self._parameters)}.")
-            if value.shape != self._parameters[name].shape:
-                raise ShapeError(f"{name} has shape {tuple(self._parameters[name].shape)}, got {tuple(value.shape)}.")
-            del twin._parameters[name]
+            if name not in LEARNABLES:
+                raise DomainError(f"a lens has no tensor '{name}'; it has {', '.join(LEARNABLES)}.")
+            if value.shape != getattr(self, name).shape:
+                raise ShapeError(f"{name} has shape {tuple(getattr(self, name).shape)}, got {tuple(value.shape)}.")
+            twin._parameters.pop(name, None)
             object.__setattr__(twin, name, value)
         return twin
 

@@ -1,7 +1,7 @@
 """Cameras, scenes and frames: one wavefront for all frames, ground truth through the current lens."""
 
 from codesign.render import truth
-from codesign.render.camera import Camera, Film, angular_distance_rad, project
+from codesign.render.camera import Camera, Film, angular_miss_rad, project
 from codesign.render.planes import TexturedPlane
 from codesign.render.wavefront import frames, shade
 from codesign.render.world import MitsubaScene
@@ -12,4 +12,4 @@ def true_flow(camera, scene, T_world_cam, stride=1):
     return truth.true_flow(camera, scene, T_world_cam, project, stride)
 
 
-__all__ = ["Camera", "Film", "MitsubaScene", "TexturedPlane", "angular_distance_rad", "frames", "project", "shade", "true_flow", "truth"]
+__all__ = ["Camera", "Film", "MitsubaScene", "TexturedPlane", "angular_miss_rad", "frames", "project", "shade", "true_flow", "truth"]

@@ -110,10 +110,15 @@ def _miss(camera, pixels, points_cam_m):
     return rays.origin_m[:, :2] + rays.direction[:, :2] * ((points_cam_m[:, 2:] - rays.origin_m[:, 2:]) / rays.direction[:, 2:]) - points_cam_m[:, :2]
 
 
-def angular_distance_rad(camera, pixels_a, pixels_b):
-    """Angle between the chief rays of two sets of pixel coordinates, [N] rad, smooth with value 0 at equality avoided by 1e-12."""
-    a, b = camera.chief_rays(pixels_a).direction, camera.chief_rays(pixels_b).direction
-    return ((a - b).square().sum(1) + 1e-12).sqrt()
+def angular_miss_rad(camera, pixels, points_cam_m):
+    """Angle by which the chief rays of pixel coordinates [N, 2] miss points [N, 3] given in camera axes: [N] rad.
+
+    A flow error in task units: zero when the pixel images the point, whatever the focal length and distortion.
+    Gradient: to the pixels, the points and the lens; smooth at zero, where the value is 1e-6 rad instead of 0.
+    """
+    rays = camera.chief_rays(pixels)
+    towards = torch.nn.functional.normalize(points_cam_m - rays.origin_m, dim=1)
+    return ((towards - rays.direction).square().sum(1) + 1e-12).sqrt()
 
 
-__all__ = ["Camera", "Film", "Rays", "angular_distance_rad", "project"]
+__all__ = ["Camera", "Film", "Rays", "angular_miss_rad", "project"]

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
-from markupsafe import Markup
 
 from codesign.errors import DomainError, FileFormatError, ShapeError
 from codesign.report import prose
 
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
+SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 MEDIA = {".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4"}
 
 
@@ -27,9 +27,8 @@ class Card:
 
 @dataclass(frozen=True)
 class Picture:
-    """A captioned PNG, GIF or MP4, inlined in the page."""
+    """A captioned PNG, GIF or MP4, inlined in the page: media type and base64 text."""
 
-    name: str
     media: str
     data: str
     caption: str
@@ -48,7 +47,7 @@ class Table:
 
 @dataclass
 class Section:
-    """A heading and what stands below it, in order: (kind, Markup | Picture | Table)."""
+    """A heading and what stands below it, in order: ("prose", HTML), ("picture", Picture) or ("table", Table)."""
 
     title: str
     blocks: list[tuple[str, Any]] = field(default_factory=list)
@@ -64,7 +63,7 @@ def picture(path, caption):
     if media is None:
         raise FileFormatError(f"'{path}' cannot be shown on the page; give one of {', '.join(MEDIA)}.")
     try:
-        return Picture(path.stem, media, base64.b64encode(path.read_bytes()).decode(), caption)
+        return Picture(media, base64.b64encode(path.read_bytes()).decode(), caption)
     except OSError as error:
         raise FileFormatError(f"'{path}' cannot be read for the page ({error.strerror}); write it before it is shown.") from error
 
@@ -83,12 +82,16 @@ def table(title, columns, rows, caption=""):
 
 
 def cell(value):
-    """Text of a table cell."""
+    """Text of a table cell: four digits of a float, all of an integer, yes or no, a dash for None."""
     if value is None:
         return "–"
-    if isinstance(value, bool) or not _is_number(value):
-        return {True: "yes", False: "no"}.get(value, str(value)) if isinstance(value, bool) else str(value)
-    return f"{int(value)}" if isinstance(value, Integral) else f"{float(value):.4g}".replace("-", "−")
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if not _is_number(value):
+        return str(value)
+    whole = isinstance(value, Integral) or 1e3 <= abs(value) < 1e6
+    mantissa, _, exponent = (f"{value:.0f}" if whole else f"{float(value):.4g}").replace("-", "−").partition("e")
+    return mantissa + (f"·10{str(int(exponent.replace('−', '-'))).translate(SUPERSCRIPT)}" if exponent else "")
 
 
 def render_page(title, lead, cards, sections, facts):
@@ -107,7 +110,7 @@ def render_page(title, lead, cards, sections, facts):
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
     shown = [section for section in sections if section.blocks]
-    return template.render(title=title, lead=prose.to_html(lead), cards=cards, sections=shown, facts=facts, inline=prose.inline, Markup=Markup)
+    return template.render(title=title, lead=prose.to_html(lead), cards=cards, sections=shown, facts=facts, inline=prose.inline, plain=prose.plain)
 
 
 def _is_number(value):

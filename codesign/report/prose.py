@@ -20,6 +20,13 @@ def inline(text):
     return Markup(html)
 
 
+def plain(text):
+    """The text without its marks, for places that hold no markup."""
+    for pattern, _ in _MARKS:
+        text = re.sub(pattern, r"\1", str(text))
+    return text
+
+
 def _block(block):
     lines = [line.strip() for line in block.splitlines()]
     if all(line.startswith("- ") for line in lines):

@@ -94,12 +94,14 @@ def test_stream_centroids_are_those_of_an_even_rate_and_of_many_short_intervals(
     # midpoint rule with 400 intervals per node spacing: relative error of the moments about (1/400)^2
     torch.testing.assert_close(fine.centroid_s, volume.centroid_s, rtol=2e-5, atol=0)
     # an event per microsecond: the weighted mean itself, one microsecond in 40000 at the cut ends
-    alone = [float((bin_share * every_us * 1e-6).sum() / bin_share.sum()) for bin_share in (1 - (every_us / 40_000 - torch.arange(4)[:, None]).abs()).clamp(min=0)]
+    shares = (1 - (every_us / 40_000 - torch.arange(4)[:, None]).abs()).clamp(min=0).double()
+    alone = ((shares * every_us * 1e-6).sum(1) / shares.sum(1)).tolist()
     torch.testing.assert_close(volume.centroid_s, torch.tensor(alone, dtype=torch.float64), rtol=1e-4, atol=0)
 
 
 def test_the_window_holds_both_ends_and_nothing_else():
-    stream = EventStream(torch.tensor([9, 10, 15, 20, 21]), *(torch.zeros(5, dtype=torch.int64),) * 2, torch.ones(5, dtype=torch.int64), 1, 1)
+    zero = torch.zeros(5, dtype=torch.int64)
+    stream = EventStream(torch.tensor([9, 10, 15, 20, 21]), zero, zero, zero + 1, 1, 1)
     assert from_stream(stream, 10, 20, 2).counts[0, 0, :, 0, 0].tolist() == [1.5, 1.5]
 
 

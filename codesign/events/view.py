@@ -1,0 +1,73 @@
+"""Events made visible: red and blue pictures, gray pictures, fading traces, and rate curves."""
+
+import math
+
+import torch
+
+from codesign.errors import DomainError, ShapeError
+from codesign.events.entry import check_times
+
+
+def picture(counts, full_scale=None):
+    """Event frames as colour pictures: white where nothing happened, red for ON, blue for OFF, purple for both.
+
+    Args:
+      counts: [..., 2, H, W] counts >= 0, ON first.
+      full_scale: count of full colour, > 0; None: the largest count, at least 1.
+    Returns: [..., H, W, 3] uint8.
+    """
+    on, off, full = _scaled(counts, full_scale)
+    strength = torch.maximum(on, off).div(full).clamp(max=1)
+    red = on / (on + off).clamp(min=torch.finfo(on.dtype).tiny)
+    colour = torch.stack((red, torch.zeros_like(red), 1 - red), dim=-1)
+    return (255 * (1 - strength[..., None] * (1 - colour))).round().to(torch.uint8)
+
+
+def gray_picture(counts, full_scale=None):
+    """Event frames as gray pictures: middle gray where ON and OFF balance, white for ON, black for OFF.
+
+    Args: as for ``picture``.
+    Returns: [..., H, W] uint8, 128 for no event.
+    """
+    on, off, full = _scaled(counts, full_scale)
+    return (128 + 127 * ((on - off) / full).clamp(-1, 1)).round().to(torch.uint8)
+
+
+def decay(counts, t_s, tau_s):
+    """Exponentially fading sum of events, per polarity.
+
+    Args:
+      counts: [T-1, 2, H, W] counts per interval, counted as if at the interval's end.
+      t_s: [T] times around the intervals, seconds, strictly increasing.
+      tau_s: time in which a trace fades to 1/e, seconds, > 0.
+    Returns: [T-1, 2, H, W]; after each interval of length d: s = s exp(-d/tau) + counts.
+    """
+    if not (0 < tau_s < math.inf):
+        raise DomainError(f"tau_s is {tau_s!r}; a finite time > 0 s is needed.")
+    fade = torch.exp(-check_times(t_s, len(counts) + 1).diff() / tau_s).tolist()
+    traces, trace = torch.empty_like(counts), torch.zeros_like(counts[0])
+    for index, factor in enumerate(fade):
+        trace = traces[index] = trace * factor + counts[index]
+    return traces
+
+
+def rates(counts, t_s):
+    """Event rate of the whole picture over time, per polarity.
+
+    Args: counts: [T-1, 2, H, W]. t_s: [T] seconds, strictly increasing.
+    Returns: middle of each interval [T-1], seconds, and rate [T-1, 2], events per second, ON first.
+    """
+    times_s = check_times(t_s, len(counts) + 1)
+    totals = counts.detach().flatten(2).sum(-1).cpu().double()
+    return (times_s[1:] + times_s[:-1]) / 2, totals / times_s.diff()[:, None]
+
+
+def _scaled(counts, full_scale):
+    if counts.ndim < 3 or counts.shape[-3] != 2:
+        raise ShapeError(f"counts have shape {list(counts.shape)}; [..., 2, H, W] is needed (ON first).")
+    counts = counts.detach()
+    if full_scale is None:
+        full_scale = max(1.0, float(counts.max()))
+    elif not (0 < full_scale < math.inf):
+        raise DomainError(f"full_scale is {full_scale!r}; a finite count > 0 is needed.")
+    return counts[..., 0, :, :], counts[..., 1, :, :], full_scale

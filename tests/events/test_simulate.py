@@ -1,0 +1,229 @@
+"""The hard sensor against closed forms, published emulators, and the statistics of its noise."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from codesign.errors import DomainError, ShapeError
+from codesign.events import SensorModel, SensorState, concatenate, draw_shot_counts, draw_thresholds, lin_log, memory, simulate, to_counts
+from codesign.events.stream import ordered
+
+FIELDS = ("t_us", "x", "y", "p")
+
+
+def same(first, second):
+    return all(torch.equal(getattr(first, name), getattr(second, name)) for name in FIELDS)
+
+
+def intensity(level):
+    """Frames whose lin-log level is ``level`` (>= 3)."""
+    return level.exp()
+
+
+def reference(path, t_s):
+    """A recorded stream and the counts per pixel and frame."""
+    data = np.load(path)
+    t_us = torch.from_numpy(np.round(data["t"].astype(np.float64) * 1e6).astype(np.int64))
+    x, y, p = (torch.from_numpy(data[name].astype(np.int64)) for name in "xyp")
+    stream = ordered(t_us, x, y, p, 64, 64)
+    return data, stream, to_counts(stream, t_s)
+
+
+@pytest.mark.parametrize("offset_s", [0.0, 1_700_000_000.0])
+def test_a_ramp_of_log_intensity_fires_at_known_microseconds(offset_s):
+    # level rises by 1 per 0.1 s from 3: crossing j at 0.02 j s; falls by 0.5 in the next 0.1 s from 4: reference 4, crossing j at 0.1 + 0.05 j
+    level = torch.tensor([3.0, 4.0 + 1e-9, 3.5 - 1e-9], dtype=torch.float64)[:, None, None].expand(3, 1, 2)
+    events = simulate(intensity(level), torch.tensor([0, 0.1, 0.2], dtype=torch.float64) + offset_s, SensorModel(0.2, 0.25))
+    truth = [20_000, 40_000, 60_000, 80_000, 100_000, 150_000, 200_000]
+    for column in (0, 1):
+        mine = events.x == column
+        # an epoch time in float64 seconds is exact to 0.24 us
+        assert (events.t_us[mine] - int(offset_s * 1e6) - torch.tensor(truth)).abs().max() <= (1 if offset_s else 0)
+        assert events.p[mine].tolist() == [1] * 5 + [-1] * 2
+    assert events.t_us.dtype == torch.int64
+
+
+def test_a_sinusoid_fires_when_its_closed_form_crosses():
+    # linear interpolation of a sinusoid of amplitude A at step h is off by A (2 pi h)^2 / 8 = 6e-6 log units; away from the turning points the
+    # slope exceeds A * 2 pi * cos(asin(0.96)) = 2.2 log units/s, so times are good to 3 us, and to 0.5 us of rounding
+    t_s = torch.arange(0, 1999, dtype=torch.float64) / 2000
+    level = 4.5 + 1.25 * torch.sin(2 * math.pi * t_s)
+    events = simulate(intensity(level)[:, None, None], t_s, SensorModel())
+    up = [math.asin(0.16 * j) / (2 * math.pi) for j in range(1, 7)]
+    down = [0.5 - math.asin(0.16 * j) / (2 * math.pi) for j in range(5, -7, -1)]
+    again = [1 + math.asin(0.16 * j) / (2 * math.pi) for j in range(-5, 0)]
+    assert events.p.tolist() == [1] * 6 + [-1] * 12 + [1] * 5
+    assert (events.t_us - 1e6 * torch.tensor(up + down + again, dtype=torch.float64)).abs().max() < 4
+
+
+@pytest.mark.parametrize("sequence", ["edge", "grating", "flicker"])
+@pytest.mark.parametrize("configuration", ["ideal", "asym"])
+def test_counts_equal_v2e_in_every_pixel_and_frame(shared, sequence, configuration):
+    frames = np.load(shared(f"refs/events/seq_{sequence}.npz"))
+    frames, t_s = torch.from_numpy(frames["frames"]), torch.from_numpy(frames["t"])
+    data, stream, truth = reference(shared(f"refs/events/v2e_{sequence}_{configuration}.npz"), t_s)
+    given = json.loads(str(data["params"]))
+    thetas = given["pos_thres"], given["neg_thres"]
+    # v2e rounds the double-precision log level to 1e-8 and goes on in single precision
+    counts, memorised = memory(((lin_log(frames) * 1e8).round() / 1e8).float(), *thetas, log_input=True)
+    assert torch.equal(counts, truth)
+    assert counts.sum((1, 2, 3)).tolist() == data["per_frame"][1:].tolist()
+    assert torch.equal(memorised, torch.from_numpy(data["base_log_frame"]))
+    events = simulate(frames.float(), t_s, SensorModel(*thetas))
+    assert len(events) == len(stream)
+    assert torch.equal(to_counts(events, t_s), truth)
+    # in double precision a level that meets a threshold to 1e-7 may count a frame later: a handful of events in 1e5
+    moved = to_counts(simulate(frames, t_s, SensorModel(*thetas)), t_s) - truth
+    assert moved.cumsum(0).abs().max() <= 1
+    assert int((moved != 0).sum()) <= 1e-4 * len(stream)
+
+
+@pytest.mark.parametrize("sequence", ["edge", "grating"])
+def test_events_equal_the_published_esim_algorithm(shared, sequence):
+    frames = np.load(shared(f"refs/events/seq_{sequence}.npz"))
+    frames, t_s = torch.from_numpy(frames["frames"]), torch.from_numpy(frames["t"])
+    _, truth, _ = reference(shared(f"refs/events/esimpy_fixedalias_{sequence}_ideal_eps1e-3.npz"), t_s)
+    level = (frames / 255 + 1e-3).log()
+    events = simulate((frames / 255 + 1e-3) * 1e5, t_s, SensorModel())  # never below 20, so the level is the reference's but for a constant
+    assert len(events) == len(truth)
+    order = [torch.argsort((e.y * 64 + e.x) * 2**40 + e.t_us, stable=True) for e in (events, truth)]
+    mine, theirs = ([getattr(e, name)[rank] for name in FIELDS] for e, rank in zip((events, truth), order, strict=True))
+    for column in (1, 2, 3):
+        assert torch.equal(mine[column], theirs[column])
+    # the reference keeps levels in float32 (half an ulp: 2.4e-7 below 8, at both ends and in the memorised level: 1e-6); steps are 1 ms long
+    interval = ((mine[0] - 1) // 1000).clamp(min=0)
+    step = (level[interval + 1, mine[2], mine[1]] - level[interval, mine[2], mine[1]]).abs()
+    assert bool(((mine[0] - theirs[0]).abs() <= 1 + 1000 * 1e-6 / step).all())
+
+
+@pytest.mark.parametrize("cuts", [[1], [2, 3], [1, 7, 8, 19]])
+def test_chunks_give_the_events_of_the_whole_with_noise(cuts):
+    generator = torch.Generator().manual_seed(0)
+    frames = torch.rand(20, 9, 8, generator=generator) * 200
+    t_s = torch.rand(20, generator=generator, dtype=torch.float64).cumsum(0) * 0.01
+    sensor = SensorModel(theta_sigma=0.05, shot_rate_hz=50.0)
+    whole = simulate(frames, t_s, sensor, torch.Generator().manual_seed(5))
+    for own in (False, True):  # the generator may travel in the state
+        state, noise = SensorState(), torch.Generator().manual_seed(5)
+        if own:
+            state.generator = noise
+        if cuts[0] == 1:  # a first chunk holds two frames at least
+            cuts = [2, *cuts[1:]]
+        chunks = zip([0, *cuts], [*cuts, 20], strict=True)
+        parts = [simulate(frames[a:b], t_s[a:b], sensor, None if own else noise, state) for a, b in chunks]
+        assert same(whole, concatenate(parts))
+
+
+def test_hard_counts_are_those_of_the_memory_layer_with_the_same_mismatch():
+    frames = torch.rand(12, 7, 6, generator=torch.Generator().manual_seed(1)) * 255
+    t_s = torch.arange(12, dtype=torch.float64) / 240
+    sensor = SensorModel(0.2, 0.3, theta_sigma=0.06)
+    thetas = draw_thresholds(sensor, (7, 6), torch.Generator().manual_seed(9))
+    events = simulate(frames, t_s, sensor, torch.Generator().manual_seed(9))
+    assert torch.equal(to_counts(events, t_s), memory(frames, *thetas)[0])
+
+
+def test_order_is_by_time_row_column_polarity():
+    frames = torch.rand(6, 5, 4, generator=torch.Generator().manual_seed(2)) * 255
+    events = simulate(frames, torch.arange(6) * 1e-5, SensorModel(0.1, 0.1))  # 10 us frames: many ties
+    keys = list(zip(*(getattr(events, name).tolist() for name in ("t_us", "y", "x", "p")), strict=True))
+    assert keys == sorted(keys)
+    assert len(set(events.t_us.tolist())) < len(keys)
+
+
+def test_thresholds_follow_a_clamped_normal_distribution():
+    sensor = SensorModel(0.2, 0.1, theta_sigma=0.05)
+    on, off = (theta.double() for theta in draw_thresholds(sensor, (500, 400), torch.Generator().manual_seed(3)))
+    # 200000 draws: standard error of the mean 1.1e-4, of the deviation 8e-5; five of them allowed
+    assert abs(on.mean() - 0.2) < 5.6e-4
+    assert abs(on.std() - 0.05) < 4e-4
+    below = 0.5 * math.erfc((0.1 - 0.01) / 0.05 / math.sqrt(2))  # share clamped at 0.01: 3.6 %
+    assert abs(float((off == torch.tensor(0.01).double()).double().mean()) - below) < 5 * math.sqrt(below / 200_000)
+    assert float(off.min()) == pytest.approx(0.01)
+    assert abs(float(((on - on.mean()) * (off - off.mean())).mean())) < 5 * 0.05**2 / math.sqrt(200_000)
+    again = draw_thresholds(sensor, (500, 400), torch.Generator().manual_seed(3))
+    assert torch.equal(again[0].double(), on)
+
+
+def test_shot_noise_is_poisson_per_pixel_and_polarity_and_even_in_time():
+    sensor = SensorModel(shot_rate_hz=40.0)
+    interval_s = torch.tensor([0.01, 0.03, 0.05])
+    counts = draw_shot_counts(sensor, (200, 250), interval_s, torch.Generator().manual_seed(4), dtype=torch.float64)
+    for k, expected in enumerate((0.2, 0.6, 1.0)):  # 20 Hz per polarity
+        for polarity in (0, 1):
+            found = counts[k, polarity]
+            assert abs(found.mean() - expected) < 5 * math.sqrt(expected / 50_000)
+            # variance of the sample variance of a Poisson count: (m + 2 m^2)/n
+            assert abs(found.var() - expected) < 5 * math.sqrt((expected + 2 * expected**2) / 50_000)
+    still = torch.full((3, 100, 100), 90.0)
+    events = simulate(still, [0.0, 0.5, 1.0], sensor, torch.Generator().manual_seed(4))
+    assert abs(len(events) - 400_000) < 5 * math.sqrt(400_000)
+    histogram = torch.histc(events.t_us.double(), bins=20, min=0, max=1e6)
+    assert float(((histogram - len(events) / 20) ** 2 / (len(events) / 20)).sum()) < 52  # chi-squared, 19 degrees: 52 is passed once in 10^4
+    assert len(simulate(still, [0.0, 0.5, 1.0], SensorModel())) == 0
+
+
+def test_noise_is_reproducible_and_leaves_the_signal_alone():
+    frames = torch.rand(8, 6, 6, generator=torch.Generator().manual_seed(6)) * 255
+    t_s = torch.arange(8, dtype=torch.float64) / 100
+    noisy = SensorModel(shot_rate_hz=100.0)
+    assert same(simulate(frames, t_s, noisy), simulate(frames, t_s, noisy))
+    assert not same(simulate(frames, t_s, noisy), simulate(frames, t_s, noisy, torch.Generator().manual_seed(1)))
+    excess = to_counts(simulate(frames, t_s, noisy), t_s) - to_counts(simulate(frames, t_s, SensorModel()), t_s)
+    assert bool((excess >= 0).all())
+    assert int(excess.sum()) > 0
+
+
+def test_a_huge_step_and_one_pixel():
+    # from black (level 0) to 1e4 (ln 1e4 = 9.21034): 46 events of 0.2, evenly spaced by 0.2/9.21034 of the interval
+    events = simulate(torch.tensor([0.0, 1e4, 1e4, 1e4], dtype=torch.float64)[:, None, None], [0.0, 1.0, 2.0, 3.0], SensorModel())
+    truth = (torch.arange(1, 47) * 0.2 / math.log(1e4) * 1e6).round().long()
+    assert torch.equal(events.t_us, truth)
+
+
+@pytest.mark.parametrize("field", ["theta_on", "theta_off", "theta_sigma", "shot_rate_hz"])
+@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf, "0.2", None])
+def test_sensor_parameters_are_checked(field, value):
+    with pytest.raises(DomainError, match=field):
+        SensorModel(**{field: value})
+
+
+def test_sensor_refuses_zero_thresholds_and_other_timings():
+    with pytest.raises(DomainError, match="theta_on"):
+        SensorModel(theta_on=0.0)
+    with pytest.raises(DomainError, match="theta_off"):
+        SensorModel(theta_off=0)
+    with pytest.raises(DomainError, match="timing"):
+        SensorModel(timing="exact")
+
+
+def test_bad_frames_and_times_are_refused_and_the_state_stays():
+    good, t_s, sensor = torch.full((3, 4, 5), 50.0), [0.0, 0.1, 0.2], SensorModel()
+    for frames, times_s, error, words in [
+        (good[:1], t_s[:1], ShapeError, "at least 2"),
+        (good[:, 0], t_s, ShapeError, "H, W"),
+        (good * math.nan, t_s, DomainError, "NaN"),
+        (-good, t_s, DomainError, "negative"),
+        (good, t_s[:2], ShapeError, r"\[3\]"),
+        (good, [0.0, 0.1, 0.1], DomainError, "increase"),
+        (good, [0.0, math.nan, 0.1], DomainError, "t_s"),
+    ]:
+        with pytest.raises(error, match=words):
+            simulate(frames, times_s, sensor)
+    state = SensorState()
+    simulate(good, t_s, sensor, state=state)
+    for frames, times_s, error, words in [
+        (good[:, :2], [0.3, 0.4, 0.5], ShapeError, "keeps its size"),
+        (good.double(), [0.3, 0.4, 0.5], ShapeError, "keeps its size"),
+        (good, [0.2, 0.3, 0.4], DomainError, "go on increasing"),
+    ]:
+        with pytest.raises(error, match=words):
+            simulate(frames, times_s, sensor, state=state)
+    assert state.time_s == 0.2
+    with pytest.raises(DomainError, match="interval_s"):
+        draw_shot_counts(sensor, (2, 2), [0.1, 0.0], torch.Generator())
+    with pytest.raises(ShapeError, match="interval_s"):
+        draw_shot_counts(sensor, (2, 2), 0.1, torch.Generator())

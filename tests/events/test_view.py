@@ -1,0 +1,94 @@
+"""Pictures, fading traces, rates and videos of events."""
+
+import math
+import re
+import subprocess
+
+import imageio.v3 as iio
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+
+from codesign.errors import DomainError, FileFormatError, ShapeError
+from codesign.events import decay, decay_video, gray_picture, picture, rates, write_video
+from codesign.events.stream import ordered
+
+COUNTS = torch.tensor([[[4.0, 0, 2, 0]], [[0, 4, 2, 0]]])  # [2, 1, 4]: four ON, four OFF, two of each, none
+
+
+def test_colours_say_polarity_and_strength():
+    assert picture(COUNTS)[0].tolist() == [[255, 0, 0], [0, 0, 255], [191, 128, 191], [255, 255, 255]]
+    assert picture(COUNTS, full_scale=2)[0].tolist() == [[255, 0, 0], [0, 0, 255], [128, 0, 128], [255, 255, 255]]
+    assert gray_picture(COUNTS)[0].tolist() == [255, 1, 128, 128]
+    assert picture(torch.zeros(3, 2, 5, 6)).shape == (3, 5, 6, 3)
+
+
+def test_traces_fade_exponentially():
+    counts = torch.zeros(4, 2, 1, 1, dtype=torch.float64)
+    counts[0, 0], counts[2, 0], counts[1, 1] = 3, 1, 2
+    traces = decay(counts, [0.0, 0.01, 0.03, 0.04, 0.09], tau_s=0.02)[:, :, 0, 0]
+    on = [3, 3 * math.exp(-1), 3 * math.exp(-1.5) + 1, (3 * math.exp(-1.5) + 1) * math.exp(-2.5)]
+    off = [0, 2, 2 * math.exp(-0.5), 2 * math.exp(-3)]
+    torch.testing.assert_close(traces, torch.tensor([on, off], dtype=torch.float64).T)
+
+
+def test_rates_are_events_per_second():
+    counts = torch.zeros(2, 2, 3, 3)
+    counts[0, 0], counts[1, 1, 0, 0] = 1, 5
+    middle_s, rate = rates(counts, [0.0, 0.5, 0.6])
+    torch.testing.assert_close(middle_s, torch.tensor([0.25, 0.55], dtype=torch.float64))
+    torch.testing.assert_close(rate, torch.tensor([[18, 0], [0, 50]], dtype=torch.float64))
+
+
+def test_gif_shows_the_pictures_enlarged_and_even(tmp_path):
+    pictures = picture(torch.stack((COUNTS, COUNTS.flip(0), COUNTS.flip(2))).repeat(1, 1, 3, 1)[..., :3])  # 3 x 3
+    write_video(tmp_path / "e.gif", pictures, fps=10)
+    back = iio.imread(tmp_path / "e.gif")
+    assert back.shape == (3, 258, 258, 3)  # factor 86
+    np.testing.assert_array_equal(back[:, 43::86, 43::86], pictures.numpy())
+
+
+def test_mp4_holds_every_picture_at_its_rate(tmp_path):
+    pictures = torch.full((12, 301, 299), 0, dtype=torch.uint8) + (torch.arange(12, dtype=torch.uint8) * 20)[:, None, None]
+    write_video(tmp_path / "e.mp4", pictures, fps=30)
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(tmp_path / "e.mp4"), "-f", "rawvideo", "-pix_fmt", "gray", "-"]
+    done = subprocess.run(command, capture_output=True, check=True)
+    assert re.search(rb"h264.*300x302.* 30 fps", done.stderr)
+    back = np.frombuffer(done.stdout, np.uint8).reshape(12, 302, 300)
+    # flat gray survives lossy coding to a few levels
+    assert np.abs(back.mean((1, 2)) - np.arange(12) * 20).max() < 4
+
+
+def test_decay_video_is_the_same_from_stream_and_counts(tmp_path):
+    t_us, x, y, p = (torch.tensor(column) for column in ([500, 1500, 1600], [0, 1, 1], [0, 0, 1], [1, -1, 1]))
+    stream = ordered(t_us, x, y, p, 2, 2)
+    counts = torch.zeros(2, 2, 2, 2)
+    counts[0, 0, 0, 0] = counts[1, 1, 0, 1] = counts[1, 0, 1, 1] = 1
+    for name, events in (("a.gif", stream), ("b.gif", counts)):
+        decay_video(tmp_path / name, events, [0, 0.001, 0.002], tau_s=0.001)
+    first, second = (iio.imread(tmp_path / name) for name in ("a.gif", "b.gif"))
+    np.testing.assert_array_equal(first, second)
+    faded = round(255 * (1 - math.exp(-1)))
+    assert second[1, 0, 0].tolist() == [255, faded, faded]
+
+
+def test_bad_input_is_refused_with_a_reason(tmp_path):
+    still = torch.zeros(2, 4, 4, dtype=torch.uint8)
+    for path, pictures, fps, error, words in [
+        ("e.avi", still, 10, FileFormatError, r"\.mp4 or \.gif"),
+        ("none/e.gif", still, 10, FileFormatError, "folder"),
+        ("e.gif", still.float(), 10, ShapeError, "uint8"),
+        ("e.gif", still[0], 10, ShapeError, "uint8"),
+        ("e.gif", still, 0, DomainError, "fps"),
+    ]:
+        with pytest.raises(error, match=words):
+            write_video(tmp_path / path, pictures, fps)
+    with pytest.raises(ShapeError, match="ON first"):
+        picture(torch.zeros(3, 4, 4))
+    for full_scale in (0, -1, math.nan):
+        with pytest.raises(DomainError, match="full_scale"):
+            picture(COUNTS, full_scale)
+    with pytest.raises(DomainError, match="tau_s"):
+        decay(torch.zeros(1, 2, 3, 3), [0, 1], 0)
+    assert not list(tmp_path.iterdir())
