@@ -25,6 +25,8 @@ def memory(frames, theta_on, theta_off, *, state=None, log_input=False):
     Gradient: frames, thetas, state. Straight-through, dn/dL = 1/C and dn/dC = -(L - r)/C^2, through the memory (r is not detached). The polarity is
       chosen by the sign of L - r; at exactly 0 both polarities count half (the mean of the two one-sided slopes). Second derivatives raise.
       Since dr'/dr = 1 - C/C = 0, the tangent of n_t is (dL_t - dL_{t-1})/C_t: the backward pass needs no recurrence.
+      Against differences of the hard count it falls short by about half a threshold per swing between turning points (the way back to the
+      memorised level counts under the old polarity): 2.5 % for swings of 20 thresholds.
     Numerics: the count is the exact floor of the quotient of the two floats. In float32 a level within about 1e-7 |L| of a crossing may fall
       to either side; it is then counted in a later frame, never lost.
     Raises: ShapeError for too few frames or shapes that do not fit; DomainError for theta <= 0, NaN, infinite or negative input.

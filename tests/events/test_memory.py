@@ -104,10 +104,12 @@ def test_chunks_equal_the_whole_bit_for_bit_gradients_included(cut):
 
 
 def test_gradient_is_the_slope_of_the_hard_count_over_several_thresholds():
-    """Blur a moving texture a little more: d(weighted signed count)/d(contrast), straight-through against differences of whole counts.
+    """d(weighted counts)/d(contrast) of moving textures, straight-through against differences of whole counts.
 
     Over a step that moves each pixel by s thresholds, rounding leaves at most one event per pixel at each end, so the difference quotient of one
-    pixel is off by up to 1/s; averaged over P independent pixels by about 1/(s sqrt(3 P)). Here s >= 2 on average, P = 2000: 0.7 %; 3 % allowed.
+    pixel is off by up to 1/s; averaged over P independent pixels by about 1/(s sqrt(3 P)). Here s >= 2 on average, P = 2000: 0.7 %.
+    Besides, after each turning point the level comes back by up to one threshold before its polarity changes; the straight-through slope books
+    that way under the old polarity, and falls short by up to one threshold (half of one on average) per swing of 4/0.2 = 20: 2.5 %, at most 5 %.
     """
     generator = torch.Generator().manual_seed(5)
     phase = torch.rand(2000, generator=generator, dtype=torch.float64) * 2 * math.pi
@@ -121,7 +123,7 @@ def test_gradient_is_the_slope_of_the_hard_count_over_several_thresholds():
     contrast = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(loss(contrast), contrast)
     difference = (loss(torch.tensor(2.4)) - loss(torch.tensor(1.6))) / 0.8
-    assert abs(float(slope / difference) - 1) < 0.03
+    assert -0.057 < float(slope / difference) - 1 < 0.007
 
 
 def test_threshold_gradient_follows_the_hard_count():
