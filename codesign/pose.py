@@ -3,7 +3,7 @@
 import torch
 from kornia.geometry.liegroup import Se3
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError, ShapeError, check_finite
 
 
 def se3_exp(twist):
@@ -48,11 +48,18 @@ def look_at(origin_m, target_m, down=(0.0, 0.0, -1.0)):
 
 
 def check_poses(transform):
-    """Raise unless the tensor holds rigid transforms [T, 4, 4]; returns it."""
-    if transform.ndim != 3 or transform.shape[1:] != (4, 4):
-        raise ShapeError(f"poses must be [T, 4, 4], got {tuple(transform.shape)}.")
-    rotation = transform.detach()[:, :3, :3].double()
+    """Raise unless the tensor holds rigid transforms [T >= 1, 4, 4]; returns it."""
+    if transform.ndim != 3 or transform.shape[1:] != (4, 4) or transform.shape[0] == 0:
+        raise ShapeError(f"poses must be [T >= 1, 4, 4], got {tuple(transform.shape)}.")
+    check_finite(transform, "poses")
+    fixed = transform.detach().double()
+    rotation = fixed[:, :3, :3]
     error = float((rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().max())
-    if not error < 1e-4:
+    if error > 1e-4:
         raise DomainError(f"poses are not rigid: R R^T differs from the identity by {error:.3g}; normalise the rotations.")
+    if bool((torch.linalg.det(rotation) < 0).any()):
+        raise DomainError("poses are not rigid: a rotation has determinant -1, so it mirrors; flip the sign of one axis.")
+    last = (fixed[:, 3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=fixed.device)).abs().max()
+    if float(last) > 1e-6:
+        raise DomainError(f"poses are not rigid: the last row differs from (0, 0, 0, 1) by {float(last):.3g}; give matrices that act on column vectors.")
     return transform

@@ -8,7 +8,7 @@ import torch
 
 from codesign.errors import DomainError, FileFormatError
 
-PHOTOS = ("brick", "gravel", "grass", "camera", "coffee", "chelsea", "astronaut", "rocket")
+PHOTOS = ("brick", "gravel", "grass", "camera", "coffee", "chelsea", "astronaut", "rocket", "hubble_deep_field")
 LIFT = 2.0  # the darkest radiance of a photograph: no real wall is perfectly black
 
 
@@ -38,6 +38,12 @@ def photo(source, size_px=512):
         values = values[..., :3] @ [0.2126, 0.7152, 0.0722]
     linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
     return check_texture(LIFT + (255 - LIFT) * linear, str(source))
+
+
+def shrunk(texture, factor):
+    """The texture averaged over factor x factor texels, so that a few samples per pixel see no detail between them."""
+    height, width = (n // factor * factor for n in texture.shape)
+    return texture[:height, :width].reshape(height // factor, factor, width // factor, factor).mean((1, 3), dtype=np.float64).astype(np.float32)
 
 
 def speckle(seed, size_px=512, finest_px=3.0, coarsest_px=24.0, contrast=0.5):

@@ -54,7 +54,9 @@ def estimate_lk(volume, model="affine", prior_px=8.0, levels_px=(4.0, 2.0, 1.0),
             warped, seen = _warp(blurred, flow, time, grid, sigma)
             mean = (warped * weight).sum(1)
             slope = (warped * weight * (time - mean_time)[:, None, None]).sum(1) / (weight[:, 0, 0] * (time - mean_time).square()).sum()
-            parameters = parameters + _solve(slope, *_gradient(mean), seen, basis, parameters, prior, poisson * noise_floor, sigma)
+            change = _solve(slope, *_gradient(mean), seen, basis, parameters, prior, poisson * noise_floor, sigma)
+            moved = torch.einsum("bck,khw->bchw", change, basis).square().sum(1).mean((1, 2))
+            parameters = parameters + change * (1 + moved / (2 * sigma) ** 2).rsqrt()[:, None, None]  # no step beyond the reach of the linearisation
     flow = torch.einsum("bck,khw->bchw", parameters, basis)
     valid = (counts.detach().sum((1, 2, 3, 4)) > 0)[:, None, None].expand(batch, height, width)
     return FlowField(flow, valid, float(span))

@@ -9,7 +9,7 @@ def endpoint_error(flow, truth):
     """Length of the difference of two flows [..., 2, H, W] -> [..., H, W] px."""
     if flow.shape != truth.shape or flow.shape[-3] != 2:
         raise ShapeError(f"flows must both be [..., 2, H, W]; got {tuple(flow.shape)} and {tuple(truth.shape)}.")
-    return (flow - truth).square().sum(-3).sqrt()
+    return torch.linalg.vector_norm(flow - truth, dim=-3)  # its gradient at zero error is 0, not NaN
 
 
 def _masked_mean(values, mask):
@@ -41,5 +41,5 @@ def angular_error_deg(flow, truth, mask=None):
     """Mean angle in space-time between (u, v, 1) and the truth, degrees (Barron et al., 1994), by atan2 for accuracy at small angles."""
     one = torch.ones_like(flow[..., :1, :, :])
     a, b = torch.cat([flow, one], -3), torch.cat([truth, one], -3)
-    angle = torch.atan2(torch.linalg.cross(a, b, dim=-3).square().sum(-3).sqrt(), (a * b).sum(-3))
+    angle = torch.atan2(torch.linalg.vector_norm(torch.linalg.cross(a, b, dim=-3), dim=-3), (a * b).sum(-3))
     return _masked_mean(torch.rad2deg(angle), mask)

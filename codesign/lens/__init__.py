@@ -1,5 +1,6 @@
 """Differentiable lenses: ray-traced (GeoLens), thin, and pinhole."""
 
+from codesign.lens import catalogue
 from codesign.lens.analysis import rms_spot_mm, spots
 from codesign.lens.catalogue import half_field_deg
 from codesign.lens.files import load, save

@@ -7,24 +7,24 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis import rms_spot_mm, spots
-from codesign.lens.geolens import GeoLens
+from codesign.lens.geolens import LEARNABLES, GeoLens
 from codesign.lens.paraxial import powers_curvature, yu_trace
 
 
 def hold_efl(lens, efl_mm):
     """The lens with its last curvature solved so that the focal length is ``efl_mm`` exactly. Differentiable.
 
-    Source: the y-u trace solved for the last refraction, nu' = -y_1 / f (Smith, Modern Optical Engineering, ch. 2).
+    Source: the y-u trace solved for the last refraction, n'u' = -n' y_1 / f (Smith, Modern Optical Engineering, ch. 2).
     """
     c, t, n = lens.curvature_per_mm, lens.thickness_mm, lens.index()
     vertex = powers_curvature(c, lens.asphere)
     one = torch.ones_like(c[0])
     heights, angles = yu_trace(vertex, t, n, one, torch.zeros_like(one), last=c.numel() - 1)
-    y = heights[-1] + t[-2] * angles[-1] / n[-2]
+    y, nu = (heights[-1] + t[-2] * angles[-1] / n[-2], angles[-1]) if heights else (one, 0 * one)
     step = n[-1] - n[-2]
     if abs(float(step.detach())) < 1e-9 or abs(float(y.detach())) < 1e-9:
-        raise DomainError(f"{lens.name}: the last surface cannot hold the focal length (index step {float(step):.3g}, ray height {float(y):.3g}); end the lens with a refracting surface.")
-    last = (angles[-1] + one / efl_mm) / (y * step) - (vertex[-1] - c[-1])
+        raise DomainError(f"{lens.name}: the last surface cannot hold the focal length (index step {float(step.detach()):.3g}, ray height {float(y.detach()):.3g}); end the lens with a refracting surface.")
+    last = (nu + n[-1] / efl_mm) / (y * step) - (vertex[-1] - c[-1])
     return lens.replace(curvature_per_mm=torch.cat([c[:-1], last.reshape(1)]))
 
 
@@ -45,14 +45,17 @@ def _sag(lens, rows, height):
 
 @dataclass(frozen=True)
 class LensDesign:
-    """Free variables of a lens around a reference, in steps that each move the rays by about the same distance.
+    """Free variables of a lens around a reference; each unit variable moves the rays by the same distance, in its own way.
 
-    reference: the lens at variables = 0. efl_mm: held. scale: [V] step per variable, curvatures (S - 1, per mm) then thicknesses (S, mm).
+    reference: the lens at variables = 0. efl_mm: held.
+    basis: [V, V], columns are changes of curvatures (S - 1, per mm) and thicknesses (S, mm) per unit variable.
+    scale: [V] change of each curvature or thickness that alone moves the rays by that distance.
     floor_mm: [S] least centre thickness; edge_floor_mm: [S - 1] least edge thickness.
     """
 
     reference: GeoLens
     efl_mm: float
+    basis: Tensor
     scale: Tensor
     floor_mm: Tensor
     edge_floor_mm: Tensor
@@ -60,10 +63,13 @@ class LensDesign:
     def lens(self, variables):
         """The lens at dimensionless variables [V]; gradients flow back to them.
 
-        Thicknesses stay above their floors by a smooth bend that is the identity a few floor-widths above.
+        Thicknesses stay above their floors by a smooth bend that is the identity a few hundredths of the floor above it.
         """
+        return self.changed(self.basis @ variables.to(self.basis))
+
+    def changed(self, change):
+        """The lens with curvatures and thicknesses changed by [V] (per mm, then mm) from the reference."""
         count = self.reference.curvature_per_mm.numel()
-        change = variables.to(self.scale) * self.scale
         curvature = self.reference.curvature_per_mm.detach() + torch.cat([change[: count - 1], torch.zeros_like(change[:1])])
         room = self.reference.thickness_mm.detach() + change[count - 1 :] - self.floor_mm
         width = 0.02 * self.floor_mm.clamp_min(1e-3)
@@ -76,46 +82,56 @@ class LensDesign:
         return lack.square().sum()
 
 
-def make_design(lens, fields_rad, step_mm, floor_share=0.6):
-    """LensDesign around ``lens``: every unit variable alone moves the rays of the fields by ``step_mm`` RMS about their mean.
+def make_design(lens, fields_rad, step_mm, floors=None, floor_share=0.6):
+    """LensDesign around ``lens`` whose variables are the principal modes of ray motion.
 
-    Args: fields_rad: angles at which ray motion is measured. floor_share: floors as a share of today's centre and edge thickness.
+    With J the motion of the rays about each spot's mean per scaled curvature and thickness, the variables are the eigenvectors of
+    J^T J, each scaled to move the rays by ``step_mm`` RMS, or to change no curvature or thickness by more than a tenth of its size.
+    Defocus, coma, astigmatism and so on then have separate step sizes, which a step per curvature has not.
+
+    Args: fields_rad: angles at which ray motion is measured. floors: another LensDesign whose thickness floors to keep; by default
+      they are ``floor_share`` of today's centre and edge thicknesses.
     """
     lens = lens.freeze()
     count = lens.curvature_per_mm.numel()
-    efl = float(lens.first_order().efl_mm)
-    edges = edge_thickness_mm(lens)
-    plain = LensDesign(lens, efl, torch.ones(2 * count - 1, dtype=lens.thickness_mm.dtype), lens.thickness_mm * floor_share, edges * torch.where(edges > 0, floor_share, 1 / floor_share))
-    scale = torch.empty_like(plain.scale)
+    size = torch.cat([lens.curvature_per_mm.detach().abs().mean().expand(count - 1), lens.thickness_mm.detach()])
     with torch.no_grad():
-        for v in range(scale.numel()):
-            h = 1e-4 * (float(lens.curvature_per_mm.abs().mean()) if v < count - 1 else float(lens.thickness_mm[v - count + 1]))
-            up, down = torch.zeros_like(scale), torch.zeros_like(scale)
-            up[v], down[v] = h, -h
-            motion = (spots(plain.lens(up), fields_rad)[0] - spots(plain.lens(down), fields_rad)[0]) / (2 * h)
-            motion = motion - motion.mean(1, keepdim=True)  # a shift of the whole spot does not blur
-            scale[v] = step_mm / motion.square().sum(-1).mean().sqrt().clamp_min(1e-12)
-    limit = torch.cat([0.2 * lens.curvature_per_mm.abs().mean().expand(count - 1), 0.2 * lens.thickness_mm])
-    return LensDesign(lens, efl, torch.minimum(scale, limit), plain.floor_mm, plain.edge_floor_mm)
+        edges = edge_thickness_mm(lens)
+        least = (floors.floor_mm, floors.edge_floor_mm) if floors else (lens.thickness_mm * floor_share, edges * torch.where(edges > 0, floor_share, 1 / floor_share))
+        plain = LensDesign(lens, float(lens.first_order().efl_mm), torch.diag(size), size, *least)
+        motion = torch.stack([_motion(plain, v, fields_rad) for v in range(size.numel())], 1) / step_mm  # [rays, V], steps per relative change
+        power, modes = torch.linalg.eigh(motion.T @ motion)
+        reach = torch.minimum(power.clamp_min(1e-30).rsqrt(), 0.1 / modes.abs().amax(0))
+        alone = torch.minimum(motion.norm(dim=0).clamp_min(1e-30).reciprocal(), torch.tensor(0.1, dtype=size.dtype))
+    return LensDesign(lens, plain.efl_mm, size[:, None] * modes * reach, size * alone, *least)
+
+
+def _motion(design, variable, fields_rad, step=1e-4):
+    """Ray motion about the mean of each spot per unit of one variable, RMS-normalised: [rays * 2] mm."""
+    shift = torch.zeros_like(design.scale)
+    shift[variable] = step
+    moved = (spots(design.lens(shift), fields_rad)[0] - spots(design.lens(-shift), fields_rad)[0]) / (2 * step)
+    moved = moved - moved.mean(1, keepdim=True)  # a shift of the whole spot does not blur
+    return moved.reshape(-1) / (moved.shape[0] * moved.shape[1]) ** 0.5
 
 
 def detune(design, fields_rad, target_mm, generator):
-    """Variables [V] along a random direction of curvatures and focus where the mean RMS spot first reaches ``target_mm``.
+    """The reference lens detuned in curvatures and focus until its mean RMS spot is ``target_mm``, focal length held.
 
-    The direction is Gaussian in the design's own steps; thicknesses other than the last keep their values. Raises DomainError when
-    no step up to 30 units reaches the target.
+    The direction is Gaussian in ``design.scale``; thicknesses other than the last keep their values. Raises: DomainError when the
+    direction does not reach the target.
     """
     count = design.reference.curvature_per_mm.numel()
-    direction = torch.randn(design.scale.numel(), generator=generator, dtype=design.scale.dtype)
+    direction = torch.randn(design.scale.numel(), generator=generator, dtype=design.scale.dtype) * design.scale
     direction[count - 1 : -1] = 0
-    spot = lambda size: float(rms_spot_mm(design.lens(direction * size), fields_rad).mean())  # noqa: E731
-    low, high = 0.0, 0.0
     with torch.no_grad():
+        spot = lambda size: float(rms_spot_mm(design.changed(direction * size), fields_rad).mean())  # noqa: E731
+        low, high = 0.0, 0.0
         while spot(high) < target_mm:
             low, high = high, high + 0.05
             if high > 30:
-                raise DomainError(f"detuning along this direction never reaches an RMS spot of {target_mm} mm; choose another seed.")
-        for _ in range(30):
+                raise DomainError(f"detuning along this direction never reaches an RMS spot of {target_mm:.4g} mm; choose another seed.")
+        for _ in range(40):
             middle = (low + high) / 2
             low, high = (middle, high) if spot(middle) < target_mm else (low, middle)
-    return direction * high
+        return design.changed(direction * high)

@@ -1,16 +1,18 @@
 """A ray-traced lens whose curvatures, thicknesses, conics, asphere terms and indices carry gradients."""
 
 import copy
+import dataclasses
+import math
 
 import torch
 from torch import nn
 
 from codesign.errors import DomainError, ShapeError
 from codesign.lens import paraxial
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import AIR, WAVELENGTH_UM
 from codesign.lens.pinhole import ThinLens
-from codesign.lens.surface import scaled
-from codesign.lens.trace import Prescription, trace
+from codesign.lens.surface import Surface, scaled
+from codesign.lens.trace import Prescription, Status, trace
 from codesign.types import Rays
 
 LEARNABLES = ("curvature_per_mm", "thickness_mm", "conic", "asphere", "index_offset")
@@ -30,8 +32,10 @@ class GeoLens(nn.Module):
             raise DomainError(f"{name}: a lens needs at least one surface; none were given.")
         for i, surface in enumerate(surfaces):
             surface.check(f"{name}, surface {i + 1}")
-        if not entrance_pupil_diameter_mm > 0:
-            raise DomainError(f"{name}: entrance pupil diameter {entrance_pupil_diameter_mm} mm must be positive.")
+        if not 0 < entrance_pupil_diameter_mm < math.inf:
+            raise DomainError(f"{name}: entrance pupil diameter {entrance_pupil_diameter_mm} mm must be positive and finite.")
+        if not 0 <= soft_edge_mm < math.inf:
+            raise DomainError(f"{name}: soft edge {soft_edge_mm} mm must be a finite width of at least 0; about 0.1 mm keeps gradients true.")
         stops = [i for i, s in enumerate(surfaces) if s.is_stop]
         if len(stops) > 1:
             raise DomainError(f"{name}: surfaces {[i + 1 for i in stops]} are all marked as the stop; mark one.")
@@ -45,6 +49,10 @@ class GeoLens(nn.Module):
         self.asphere = nn.Parameter(torch.tensor(rows, dtype=dtype).reshape(len(surfaces), terms))
         self.index_offset = nn.Parameter(torch.zeros(len(surfaces), dtype=dtype))
         self.register_buffer("semi_aperture_mm", torch.tensor([s.semi_aperture_mm for s in surfaces], dtype=dtype))
+
+    @property
+    def dtype(self):
+        return self.curvature_per_mm.dtype
 
     def replace(self, **tensors):
         """A lens that shares everything with this one except the named tensors, which may depend on other tensors.
@@ -73,14 +81,14 @@ class GeoLens(nn.Module):
         return GeoLens([scaled(s, factor) for s in self.to_surfaces()], self.entrance_pupil_diameter_mm * factor, self.curvature_per_mm.dtype, self.soft_edge_mm * factor, self.name)
 
     def to_surfaces(self):
-        """The current values as a tuple of Surface."""
-        from codesign.lens.surface import Surface
-
+        """The current values as a tuple of Surface; index offsets go into the media. A curvature that never changed keeps its radius to the last bit."""
         found = []
-        rows = zip(self.surfaces, self.curvature_per_mm.tolist(), self.thickness_mm.tolist(), self.conic.tolist(), self.asphere.tolist(), strict=True)
-        for old, c, t, k, a in rows:
-            terms = tuple(a) if any(a) else ()
-            found.append(Surface(1 / c if c else float("inf"), t, old.medium, old.semi_aperture_mm, k, terms, old.is_stop))
+        columns = (self.curvature_per_mm, self.thickness_mm, self.conic, self.asphere, self.index_offset)
+        at_first = torch.tensor([s.curvature_per_mm for s in self.surfaces], dtype=self.curvature_per_mm.dtype).tolist()
+        for old, first, c, t, k, a, shift in zip(self.surfaces, at_first, *(column.tolist() for column in columns), strict=True):
+            radius = old.radius_mm if c == first else 1 / c if c else math.inf
+            medium = (old.medium or AIR).shifted(shift) if shift else old.medium
+            found.append(Surface(radius, t, medium, old.semi_aperture_mm, k, tuple(a) if any(a) or old.asphere else (), old.is_stop))
         return tuple(found)
 
     def index(self, wavelength_um=WAVELENGTH_UM["d"]):
@@ -114,25 +122,34 @@ class GeoLens(nn.Module):
         """Rays from image points through the lens towards the scene.
 
         Args:
-          film_mm: [N, 2] image points as seen upright (x right, y down), millimetres from the axis.
+          film_mm: [N, 2] image points as seen upright (x right, y down), millimetres from the axis; their dtype is that of the computation.
           pupil: [N, 2] points of the unit disc, placed on the paraxial exit pupil; (0, 0) is the chief ray.
         Returns: Rays in camera axes, origins on the entrance-pupil plane (the camera's origin), in metres.
         Gradient: to every lens tensor. The pupil sampling itself is the stop; the other surfaces clip with soft edges.
         """
         f = self.first_order(wavelength_um)
-        back = self.prescription(wavelength_um).reversed(-f.entrance_pupil_z_mm)
-        last = self.thickness_mm[-1]
+        if not (math.isfinite(float(f.exit_pupil_z_mm.detach())) and math.isfinite(float(f.entrance_pupil_z_mm.detach()))):
+            raise DomainError(f"{self.name}: a pupil lies at infinity (the lens is telecentric), so pupil points have no place; move the stop off the focal plane.")
+        back = self.prescription(wavelength_um).reversed(-f.entrance_pupil_z_mm).to(film_mm.dtype)
+        last, exit_z, exit_diameter = (v.to(film_mm.dtype) for v in (self.thickness_mm[-1], f.exit_pupil_z_mm, f.exit_pupil_diameter_mm))
         start = torch.cat([-film_mm, -last.expand(film_mm.shape[0], 1)], 1)  # the image is inverted on the film
-        target = torch.cat([pupil * (f.exit_pupil_diameter_mm / 2), -f.exit_pupil_z_mm.expand(pupil.shape[0], 1)], 1)
+        target = torch.cat([pupil * (exit_diameter / 2), -exit_z.expand(pupil.shape[0], 1)], 1)
         towards = torch.nn.functional.normalize(target - start, dim=1)
         towards = towards * torch.sign(towards[:, 2:])  # a virtual exit pupil behind the film points the other way
         apertures = back.semi_aperture_mm.clone()
         apertures[len(self.surfaces) - 1 - self.stop_index] = 1e6
-        back = Prescription(back.curvature_per_mm, back.thickness_mm, back.conic, back.asphere, back.index, apertures, back.soft_edge_mm)
-        out = trace(back, start, towards)
+        out = trace(dataclasses.replace(back, semi_aperture_mm=apertures), start, towards)
         if bool((out.weight.detach() <= 0).all()):
-            raise DomainError(f"{self.name}: every ray fails (first at surface {len(self.surfaces) - int(out.failed_surface.min())} of {len(self.surfaces)}, counted from the object); weaken the curvatures or open the apertures.")
+            raise DomainError(f"{self.name}: every ray fails{self._where(out)}; weaken the curvatures or open the apertures.")
         return Rays(out.position_mm * 1e-3, out.direction, out.weight)
+
+    def _where(self, out):
+        """What became of most rays of a backward trace, in words; surfaces are counted from the object."""
+        failed = out.failed_surface[out.status != Status.OK]
+        if failed.numel() == 0:
+            return " (all of them are stopped by the edges of the apertures)"
+        at = len(self.surfaces) - int(failed.mode().values)
+        return f" (most at surface {at} of {len(self.surfaces)}, counted from the object)" if at else " (most before they leave the first surface forwards)"
 
     def extra_repr(self):
         return f"{self.name}, {len(self.surfaces)} surfaces, entrance pupil {self.entrance_pupil_diameter_mm:g} mm"

@@ -30,6 +30,10 @@ class Glass:
             raise DomainError(f"glass '{name}' is not in the catalogue; known names: {', '.join(sorted(CATALOGUE))}. Give its indices with Glass.from_indices.")
         return CATALOGUE[name]
 
+    def shifted(self, offset):
+        """A medium with all indices larger by ``offset``, under the same name with the offset written behind it."""
+        return Glass.from_indices(self.index_F + offset, self.index_d + offset, self.index_C + offset, f"{self.name}{offset:+.6g}")
+
     def index(self, wavelength_um):
         """Index at a vacuum wavelength in micrometres: A + B/w^2 + C/w^4 through the three lines, exact at each.
 
@@ -48,6 +52,8 @@ class Glass:
             total += ni * basis
         return total
 
+
+AIR = Glass("air", 1.0, 1.0, 1.0)
 
 # Schott catalogue values (2017 edition), rounded to 1e-9, relative to air.
 CATALOGUE = {

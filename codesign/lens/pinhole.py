@@ -19,6 +19,10 @@ class ThinLens:
         if not (float(self.efl_mm.detach()) > 0 and float(self.image_distance_mm.detach()) > 0):
             raise DomainError(f"thin lens: focal length {float(self.efl_mm)} mm and image distance {float(self.image_distance_mm)} mm must be positive.")
 
+    @property
+    def dtype(self):
+        return self.efl_mm.dtype
+
     def camera_rays(self, film_mm, pupil, wavelength_um=None):
         """Rays towards the scene; see GeoLens.camera_rays. Paraxial refraction: slope out = slope in - q / f."""
         q = pupil * (self.entrance_pupil_diameter_mm / 2)

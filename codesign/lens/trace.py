@@ -6,7 +6,7 @@ that of the implicit function; vector form of Snell's law. A ray that fails is f
 safe inputs, so gradients stay finite, and it carries weight 0, a status and a deficit (how far its radicand fell below zero).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 
 import torch
@@ -46,6 +46,10 @@ class Prescription:
         """The same lens seen from the image side; ``last_gap_mm`` is the distance of the plane where the rays end."""
         gaps = torch.cat([self.thickness_mm[:-1].flip(0), last_gap_mm.reshape(1)])
         return Prescription(-self.curvature_per_mm.flip(0), gaps, self.conic.flip(0), -self.asphere.flip(0), self.index.flip(0), self.semi_aperture_mm.flip(0), self.soft_edge_mm)
+
+    def to(self, dtype):
+        """The same numbers in another precision; gradients flow through."""
+        return Prescription(*[getattr(self, f.name).to(dtype) for f in fields(self)[:-1]], self.soft_edge_mm)
 
 
 @dataclass(frozen=True)

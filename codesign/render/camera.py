@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import torch
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, check_finite
 from codesign.render.sampling import film_pupil_pattern
 from codesign.types import Rays
 
-_NEWTON_STEPS, _STEP_MM = 6, 1e-4
+_NEWTON_STEPS, _STEP_MM = 8, 1e-4
+_SHRINK_STEPS, _SHRINK = 3, 0.85  # a first guess beyond the lens's field is drawn towards the axis this often, by this factor
 
 
 @dataclass(frozen=True)
@@ -67,11 +68,12 @@ class Camera:
         return (pixels - self.film.middle_px.to(pixels)) * self.film.pixel_pitch_mm
 
     def rays(self):
-        """All rays of one frame, pixel after pixel, samples_per_pixel each: Rays with N = pixels x samples. Gradient: to the lens."""
+        """All rays of one frame, pixel after pixel, samples_per_pixel each: Rays with N = pixels x samples, in the lens's dtype. Gradient: to the lens."""
         offset, pupil = film_pupil_pattern(self.samples_per_pixel, self.seed)
         pixels = self.film.pixels()
         points = (pixels[:, None] + offset).reshape(-1, 2)
-        return self.lens.camera_rays(self.film_mm(points), pupil.repeat(pixels.shape[0], 1))
+        dtype = self.lens.dtype
+        return self.lens.camera_rays(self.film_mm(points).to(dtype), pupil.repeat(pixels.shape[0], 1).to(dtype))
 
     def chief_rays(self, pixels):
         """Rays through the pupil's centre for pixel coordinates [N, 2]: Rays, float64."""
@@ -82,32 +84,43 @@ def project(camera, points_cam_m):
     """Pixel coordinates whose chief ray passes through points.
 
     Args: points_cam_m [N, 3], camera axes, metres, in front of the camera.
-    Returns: [N, 2] px (the centre of the first pixel is 0, 0). float64.
-    Gradient: to the points and to the lens, by the implicit function theorem (one Newton step with gradients at the solution).
-    Raises: DomainError when a point is not in front of the camera.
+    Returns: [N, 2] px (the centre of the first pixel is 0, 0), float64; NaN for points that no chief ray reaches (outside the lens's field).
+    Gradient: to the points and to the lens, by the implicit function theorem (one Newton step with gradients at the solution); 0 to NaN points.
+    Raises: DomainError when a point is not finite or not in front of the camera.
     """
+    check_finite(points_cam_m, "points to project", "drop them first")
     if bool((points_cam_m.detach()[:, 2] <= 0).any()):
         raise DomainError("project: some points lie behind the camera (z <= 0); drop them first.")
+    points_cam_m = points_cam_m.double()
     with torch.no_grad():
         rays = camera.chief_rays(camera.film.middle_px.reshape(1, 2) + torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64))
         slope = rays.direction[1, 0] / rays.direction[1, 2] - rays.direction[0, 0] / rays.direction[0, 2]
         at = camera.film.middle_px + points_cam_m[:, :2] / points_cam_m[:, 2:] / slope
         step = _STEP_MM / camera.film.pixel_pitch_mm
         shifts = torch.tensor([[0.0, 0.0], [step, 0.0], [0.0, step]], dtype=at.dtype)
-        for _ in range(_NEWTON_STEPS):
-            miss, ahead_x, ahead_y = _miss(camera, (at[None] + shifts[:, None]).reshape(-1, 2), points_cam_m.repeat(3, 1)).reshape(3, -1, 2)
+        for turn in range(_NEWTON_STEPS):
+            miss, passes = _miss(camera, (at[None] + shifts[:, None]).reshape(-1, 2), points_cam_m.repeat(3, 1))
+            miss, ahead_x, ahead_y = miss.reshape(3, -1, 2)
             jacobian = torch.stack([ahead_x - miss, ahead_y - miss], -1) / step
+            found = passes.reshape(3, -1).all(0) & (torch.linalg.det(jacobian).abs() > 1e-12 * jacobian.square().sum((1, 2)))
+            jacobian = torch.where(found[:, None, None], jacobian, torch.eye(2, dtype=at.dtype))
             change = torch.linalg.solve(jacobian, miss)
-            at = at - change
-            if float(change.abs().max()) < 1e-6:  # the next step would be its square
+            at = torch.where(found[:, None], at - change, camera.film.middle_px + _SHRINK * (at - camera.film.middle_px))
+            if bool((change[found].abs() < 1e-6).all() & (found.all() | (turn >= _SHRINK_STEPS))):  # the next step would be its square
                 break
-    return at - torch.linalg.solve(jacobian, _miss(camera, at, points_cam_m))
+    miss, passes = _miss(camera, at, points_cam_m)
+    change = torch.linalg.solve(jacobian, torch.where(found[:, None], miss, 0))
+    found = found & passes & (change.detach().abs() < 1e-3).all(1)
+    return torch.where(found[:, None], at - change, torch.nan)
 
 
 def _miss(camera, pixels, points_cam_m):
-    """Where chief rays pass the depth of the points, minus the points: [N, 2] metres."""
-    rays = camera.chief_rays(pixels)
-    return rays.origin_m[:, :2] + rays.direction[:, :2] * ((points_cam_m[:, 2:] - rays.origin_m[:, 2:]) / rays.direction[:, 2:]) - points_cam_m[:, :2]
+    """Where chief rays pass the depth of the points, minus the points: [N, 2] metres; and whether light takes them: [N]."""
+    rays = camera.chief_rays(torch.cat([camera.film.middle_px.reshape(1, 2), pixels]))  # the axial ray goes along: a lens that passes nothing at all is an error
+    origin, direction = rays.origin_m[1:], rays.direction[1:]
+    passes = (rays.weight.detach()[1:] > 0) & (direction.detach()[:, 2] > 1e-6)
+    ahead = (points_cam_m[:, 2:] - origin[:, 2:]) / torch.where(passes[:, None], direction[:, 2:], 1)
+    return origin[:, :2] + direction[:, :2] * ahead - points_cam_m[:, :2], passes
 
 
 def angular_miss_rad(camera, pixels, points_cam_m):

@@ -2,6 +2,7 @@
 
 import torch
 
+from codesign.errors import ShapeError
 from codesign.pose import apply, check_poses, inverse
 
 
@@ -28,10 +29,14 @@ def true_flow(camera, scene, T_world_cam, project, stride=1):
 
     Args: camera with ``chief_rays`` and ``film``; scene with ``hit``; T_world_cam [T, 4, 4];
       project: function (camera, points_cam_m [N, 3]) -> [N, 2] px.
-    Returns: flow [T - stride, 2, *film.shape] px, +x right, +y down; valid [T - stride, *film.shape].
+    Returns: flow [T - stride, 2, *film.shape] px, +x right, +y down; valid [T - stride, *film.shape], False where the ray meets nothing
+      or the point leaves the field of the lens (the flow is 0 there).
     Gradient: to lens and poses. A static world is assumed; occlusion at the later time is not tested.
+    Raises: ShapeError when there are not more poses than ``stride``.
     """
     check_poses(T_world_cam)
+    if not 1 <= stride < T_world_cam.shape[0]:
+        raise ShapeError(f"true flow over {stride} pose(s) ahead needs a stride of at least 1 and more poses than that, got {T_world_cam.shape[0]}; give more poses.")
     pixels = camera.film.pixels()
     rays = camera.chief_rays(pixels)
     flows, masks = [], []
@@ -40,6 +45,8 @@ def true_flow(camera, scene, T_world_cam, project, stride=1):
         ahead = apply(inverse(T_world_cam[now + stride].double()), points)
         seen = valid & (ahead.detach()[:, 2] > 1e-6)
         ahead = torch.where(seen[:, None], ahead, torch.tensor([0.0, 0.0, 1.0], dtype=ahead.dtype))
-        flows.append(torch.where(seen[:, None], project(camera, ahead) - pixels, torch.zeros_like(pixels)).T.reshape(2, *camera.film.shape))
+        moved = project(camera, ahead) - pixels
+        seen = seen & ~moved.detach().isnan().any(1)
+        flows.append(torch.where(seen[:, None], moved, torch.zeros_like(pixels)).T.reshape(2, *camera.film.shape))
         masks.append(seen.reshape(camera.film.shape))
     return torch.stack(flows), torch.stack(masks)
