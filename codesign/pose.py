@@ -33,9 +33,12 @@ def apply(transform, points):
 def look_at(origin_m, target_m, down=(0.0, 0.0, -1.0)):
     """T_world_cam of a camera (x right, y down, z forward) at ``origin_m`` facing ``target_m``; ``down`` is the image's down direction in the world.
 
-    Args: sequences of three numbers. Returns: [4, 4] float64. Raises: DomainError when the view is along ``down``.
+    Args: sequences of three numbers. Returns: [4, 4] float64, without gradient.
+    Raises: DomainError when the two points are one, the view is along ``down``, or a number is not finite.
     """
-    origin, target, down = (torch.as_tensor(v, dtype=torch.float64) for v in (origin_m, target_m, down))
+    origin, target, down = (check_finite(torch.as_tensor(v, dtype=torch.float64), "look_at", "give finite points") for v in (origin_m, target_m, down))
+    if float((target - origin).norm()) == 0:
+        raise DomainError(f"look_at: origin and target are the same point {origin.tolist()}; move one of them.")
     forward = torch.nn.functional.normalize(target - origin, dim=0)
     right = torch.linalg.cross(down, forward)
     if float(right.norm()) < 1e-9:

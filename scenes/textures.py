@@ -46,7 +46,7 @@ def shrunk(texture, factor):
     return texture[:height, :width].reshape(height // factor, factor, width // factor, factor).mean((1, 3), dtype=np.float64).astype(np.float32)
 
 
-def speckle(seed, size_px=512, finest_px=3.0, coarsest_px=24.0, contrast=0.5):
+def speckle(seed, size_px=512, finest_px=6.0, coarsest_px=64.0, contrast=0.5):
     """Random pattern with equal power per octave between two periods (texels), exp of a Gaussian field: [size, size] float32."""
     frequency = np.fft.fftfreq(size_px)
     radius = np.hypot(frequency[:, None], frequency)

@@ -20,9 +20,10 @@ def field_rays(lens, field_rad, pupil, wavelength_um=WAVELENGTH_UM["d"], start_z
     """Parallel rays of one field angle (in +y) through points of the paraxial entrance pupil.
 
     Args: field_rad scalar; pupil [M, 2] on the unit disc (placed at the pupil of the d line). Returns: origins and directions [M, 3].
+    Gradient: origins to the lens, since the pupil moves with it.
     """
     f = lens.first_order()
-    at = torch.cat([pupil * (f.entrance_pupil_diameter_mm.detach() / 2), f.entrance_pupil_z_mm.detach().expand(pupil.shape[0], 1)], 1)
+    at = torch.cat([pupil * (f.entrance_pupil_diameter_mm / 2), f.entrance_pupil_z_mm.expand(pupil.shape[0], 1)], 1)
     direction = torch.tensor([0.0, math.sin(field_rad), math.cos(field_rad)], dtype=pupil.dtype, device=pupil.device).expand(pupil.shape[0], 3)
     return at + direction * ((start_z_mm - at[:, 2:]) / direction[:, 2:]), direction.contiguous()
 

@@ -49,14 +49,12 @@ class LensDesign:
 
     reference: the lens at variables = 0. efl_mm: held.
     basis: [V, V], columns are changes of curvatures (S - 1, per mm) and thicknesses (S, mm) per unit variable.
-    scale: [V] change of each curvature or thickness that alone moves the rays by that distance.
     floor_mm: [S] least centre thickness; edge_floor_mm: [S - 1] least edge thickness.
     """
 
     reference: GeoLens
     efl_mm: float
     basis: Tensor
-    scale: Tensor
     floor_mm: Tensor
     edge_floor_mm: Tensor
 
@@ -92,44 +90,45 @@ def make_design(lens, fields_rad, step_mm, floors=None, floor_share=0.6):
     Args: fields_rad: angles at which ray motion is measured. floors: another LensDesign whose thickness floors to keep; by default
       they are ``floor_share`` of today's centre and edge thicknesses.
     """
-    lens = lens.freeze()
+    lens = lens.replace(**{name: getattr(lens, name).detach().clone() for name in LEARNABLES})  # the caller's lens keeps its gradients
     count = lens.curvature_per_mm.numel()
     size = torch.cat([lens.curvature_per_mm.detach().abs().mean().expand(count - 1), lens.thickness_mm.detach()])
     with torch.no_grad():
         edges = edge_thickness_mm(lens)
         least = (floors.floor_mm, floors.edge_floor_mm) if floors else (lens.thickness_mm * floor_share, edges * torch.where(edges > 0, floor_share, 1 / floor_share))
-        plain = LensDesign(lens, float(lens.first_order().efl_mm), torch.diag(size), size, *least)
+        plain = LensDesign(lens, float(lens.first_order().efl_mm), torch.diag(size), *least)
         motion = torch.stack([_motion(plain, v, fields_rad) for v in range(size.numel())], 1) / step_mm  # [rays, V], steps per relative change
         power, modes = torch.linalg.eigh(motion.T @ motion)
         reach = torch.minimum(power.clamp_min(1e-30).rsqrt(), 0.1 / modes.abs().amax(0))
-        alone = torch.minimum(motion.norm(dim=0).clamp_min(1e-30).reciprocal(), torch.tensor(0.1, dtype=size.dtype))
-    return LensDesign(lens, plain.efl_mm, size[:, None] * modes * reach, size * alone, *least)
+    return LensDesign(lens, plain.efl_mm, size[:, None] * modes * reach, *least)
 
 
 def _motion(design, variable, fields_rad, step=1e-4):
     """Ray motion about the mean of each spot per unit of one variable, RMS-normalised: [rays * 2] mm."""
-    shift = torch.zeros_like(design.scale)
+    shift = torch.zeros_like(design.basis[0])
     shift[variable] = step
-    moved = (spots(design.lens(shift), fields_rad)[0] - spots(design.lens(-shift), fields_rad)[0]) / (2 * step)
-    moved = moved - moved.mean(1, keepdim=True)  # a shift of the whole spot does not blur
+    (ahead, arrived), (behind, also) = spots(design.lens(shift), fields_rad), spots(design.lens(-shift), fields_rad)
+    weight = (arrived * also)[..., None]
+    moved = (ahead - behind) / (2 * step)
+    moved = weight * (moved - (moved * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1))  # a shift of the whole spot does not blur
     return moved.reshape(-1) / (moved.shape[0] * moved.shape[1]) ** 0.5
 
 
 def detune(design, fields_rad, target_mm, generator):
-    """The reference lens detuned in curvatures and focus until its mean RMS spot is ``target_mm``, focal length held.
+    """The reference lens with errors in curvatures and focus that bring its mean RMS spot to ``target_mm``, focal length held.
 
-    The direction is Gaussian in ``design.scale``; thicknesses other than the last keep their values. Raises: DomainError when the
-    direction does not reach the target.
+    Every curvature but the last (which holds the focal length) and the image distance get independent Gaussian errors of one
+    common relative size, which is raised until the target is met. Raises: DomainError when 50 % is not enough.
     """
     count = design.reference.curvature_per_mm.numel()
-    direction = torch.randn(design.scale.numel(), generator=generator, dtype=design.scale.dtype) * design.scale
-    direction[count - 1 : -1] = 0
+    size = torch.cat([design.reference.curvature_per_mm[:-1], torch.zeros_like(design.floor_mm[:-1]), design.reference.thickness_mm[-1:]])
+    direction = torch.randn(2 * count - 1, generator=generator, dtype=size.dtype) * size
     with torch.no_grad():
         spot = lambda size: float(rms_spot_mm(design.changed(direction * size), fields_rad).mean())  # noqa: E731
         low, high = 0.0, 0.0
         while spot(high) < target_mm:
-            low, high = high, high + 0.05
-            if high > 30:
+            low, high = high, high + 0.002
+            if high > 0.5:
                 raise DomainError(f"detuning along this direction never reaches an RMS spot of {target_mm:.4g} mm; choose another seed.")
         for _ in range(40):
             middle = (low + high) / 2

@@ -110,6 +110,6 @@ def save(lens, path):
         part.write_text(json.dumps(page, indent=2) + "\n", encoding="utf-8")
         os.replace(part, path)
     except OSError as error:
-        if part.is_file():
+        if os.path.isfile(part):
             part.unlink()
         raise FileFormatError(f"lens file {path} cannot be written ({error.strerror}); choose a folder you may write to.") from error

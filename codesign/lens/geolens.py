@@ -7,7 +7,7 @@ import math
 import torch
 from torch import nn
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.lens import paraxial
 from codesign.lens.glass import AIR, WAVELENGTH_UM
 from codesign.lens.pinhole import ThinLens
@@ -107,10 +107,19 @@ class GeoLens(nn.Module):
         return Prescription(self.curvature_per_mm, self.thickness_mm, self.conic, self.asphere, self.index(wavelength_um), self.semi_aperture_mm, self.soft_edge_mm)
 
     def trace(self, origin_mm, direction, wavelength_um=WAVELENGTH_UM["d"]):
-        """Trace rays to the image plane: origins [N, 3] relative to the first vertex, unit directions [N, 3] -> TraceResult."""
+        """Trace rays to the image plane: origins [N, 3] relative to the first vertex, unit directions [N, 3] -> TraceResult.
+
+        Raises: ShapeError; DomainError for origins that are not finite or directions that are not unit vectors.
+        """
         for label, value in (("origin_mm", origin_mm), ("direction", direction)):
-            if value.ndim != 2 or value.shape[1] != 3:
-                raise ShapeError(f"{label} must be [N, 3], got {tuple(value.shape)}.")
+            if value.ndim != 2 or value.shape[1] != 3 or value.shape[0] == 0:
+                raise ShapeError(f"{label} must be [N >= 1, 3], got {tuple(value.shape)}.")
+        if origin_mm.shape != direction.shape:
+            raise ShapeError(f"{origin_mm.shape[0]} origins but {direction.shape[0]} directions were given; give one of each per ray.")
+        check_finite(origin_mm, "origin_mm")
+        length = float((torch.linalg.vector_norm(direction.detach(), dim=1) - 1).abs().max())
+        if not length < 1e-4:
+            raise DomainError(f"direction: lengths differ from 1 by up to {length:.3g}; give finite unit vectors (torch.nn.functional.normalize).")
         return trace(self.prescription(wavelength_um), origin_mm, direction)
 
     def thin(self, wavelength_um=WAVELENGTH_UM["d"]):

@@ -3,7 +3,7 @@
 Intersection with a conic in the form t = F / (G + sqrt(G^2 - A F)), regular at zero curvature (Welford, Aberrations of
 Optical Systems, ch. 4); even aspheres by Newton steps from the conic, the last one differentiable, so that the gradient is
 that of the implicit function; vector form of Snell's law. A ray that fails is frozen where it failed: its square roots keep
-safe inputs, so gradients stay finite, and it carries weight 0, a status and a deficit (how far its radicand fell below zero).
+safe inputs, so gradients stay finite, and it carries weight 0, a status and a deficit (how far its radicand fell below zero; 1 where Newton steps found no point of an asphere).
 """
 
 from dataclasses import dataclass, fields
@@ -15,6 +15,8 @@ from torch import Tensor
 from codesign.backend import run_kernel, widen
 
 NEWTON_STEPS = 8
+FLAT = 1e-12  # per mm; a surface flatter than this has no far side
+FORWARD = 1e-6  # smallest z component of a direction that counts as forward
 GRAZING = 1e-8  # smallest radicand taken as a hit; below it the derivative of the square root exceeds 5e3
 
 
@@ -120,6 +122,9 @@ class _Kernel:
         alive, path, weight, deficit = dr.full(arr.Bool, True, dr.width(x)), arr.Float(0), arr.Float(1), arr.Float(0)
         status, failed = arr.Int32(0), arr.Int32(-1)
         edge = dr.opaque(arr.Float, max(self.soft_edge_mm, 1e-6))
+        ahead = d.z > FORWARD
+        start = dr.select(ahead, -o.z / dr.select(ahead, d.z, 1), 0)  # to the first vertex plane: far objects would drown the quadratic in rounding
+        o, path = arr.Array3(o.x + d.x * start, o.y + d.y * start, dr.select(ahead, 0, o.z)), path + n[0] * start
         for i in range(S):
             conic = k[i] if self.conics[i] else None
             step, hit, lack = _intersect(arr, o, d, c[i], conic, asphere[i], alive)
@@ -128,13 +133,14 @@ class _Kernel:
             weight *= _soft_edge((dr.square(a[i]) - dr.square(o.x) - dr.square(o.y)) / (2 * a[i] * edge))
             here, now = dr.select(alive & ~hit, arr.Int32(int(Status.MISS)), 0), alive & hit
             if self.refracts[i]:
-                d, kept, lack = _refract(arr, d, _normal(o, c[i], conic, asphere[i]), n[i] / n[i + 1], now)
+                d, kept, lack = _refract(arr, d, _normal(dr.select(now, o, 0), c[i], conic, asphere[i]), n[i] / n[i + 1], now)
                 deficit += dr.select(now & ~kept, lack, 0)
                 here, now = dr.select(now & ~kept, arr.Int32(int(Status.TOTAL_REFLECTION)), here), kept
             status, failed = dr.select(alive, here, status), dr.select(alive & ~now, arr.Int32(i), failed)
             alive = now
             o = arr.Array3(o.x, o.y, o.z - t[i])
-        forward = alive & (d.z > 1e-6)
+        forward = alive & (d.z > FORWARD)
+        deficit += dr.select(alive & ~forward, FORWARD - d.z, 0)
         status, failed = dr.select(alive & ~forward, arr.Int32(int(Status.MISS)), status), dr.select(alive & ~forward, arr.Int32(S), failed)
         step = -o.z / dr.select(forward, d.z, 1)
         step = dr.select(forward, step, 0)
@@ -142,7 +148,7 @@ class _Kernel:
 
 
 def _intersect(arr, o, d, c, conic, asphere, alive):
-    """Distance along the ray to the surface, whether it is met, and the lack of the radicand where it is not."""
+    """Distance along the ray to the surface, whether it is met, and the lack of the radicand where it is not (elsewhere it means nothing)."""
     import drjit as dr
 
     square, along = dr.squared_norm(o), dr.dot(d, o)
@@ -151,11 +157,14 @@ def _intersect(arr, o, d, c, conic, asphere, alive):
         square, along, A = square + conic * dr.square(o.z), along + conic * d.z * o.z, c * (1 + conic * dr.square(d.z))
     F, G = c * square - 2 * o.z, d.z - c * along
     radicand = G * G - A * F
-    hit = alive & (radicand > GRAZING)
-    root = G + dr.sqrt(dr.select(hit, radicand, 1))
-    hit &= root > GRAZING
-    step = dr.select(hit, F / dr.select(hit, root, 1), 0)
-    lack = dr.maximum(GRAZING - radicand, 0)
+    near = G > 0  # else the ray starts behind the centre, as in a ball lens: the other form of the same root, without cancellation
+    hit = alive & (radicand > GRAZING) & (near | (dr.abs(A) > FLAT))
+    root = dr.sqrt(dr.select(hit, radicand, 1))
+    step = dr.select(near, F, G - root) / dr.select(hit, dr.select(near, G + root, A), 1)
+    side = 1 - (c if conic is None else c * (1 + conic)) * (o.z + d.z * step)
+    lack = dr.select(radicand > GRAZING, dr.select(hit, GRAZING - side, GRAZING - G), GRAZING - radicand)
+    hit &= side > GRAZING  # the half (or sheet) that holds the vertex
+    step = dr.select(hit, step, 0)
     if not asphere:
         return step, hit, lack
     start = dr.select(hit, dr.detach(step), dr.detach(-o.z / dr.select(dr.abs(d.z) > 1e-6, d.z, 1)))
@@ -163,11 +172,12 @@ def _intersect(arr, o, d, c, conic, asphere, alive):
         t, od, dd = start, dr.detach(o), dr.detach(d)
         for _ in range(NEWTON_STEPS):
             value, slope, _ = _implicit(arr, od + dd * t, dd, c, conic, asphere)
-            t -= value / dr.select(dr.abs(slope) > 1e-6, slope, 1)
+            t -= value / dr.select(dr.abs(slope) > GRAZING, slope, 1)
         value, slope, inside = _implicit(arr, od + dd * t, dd, c, conic, asphere)
-        hit = alive & inside & (dr.abs(slope) > 1e-6) & (dr.abs(value) < (1e-10 if arr.Float(0).Type == dr.VarType.Float64 else 1e-4))
+        hit = alive & inside & (slope > GRAZING) & (dr.abs(value) < (1e-10 if dr.type_v(arr.Float) == dr.VarType.Float64 else 1e-4))
         t, slope = dr.select(hit, t, 0), dr.select(hit, slope, 1)
-    value, _, _ = _implicit(arr, o + d * t, d, c, conic, asphere)
+    lack = dr.select(lack > 0, lack, 1)  # the conic is met but no point of the asphere was found
+    value, _, _ = _implicit(arr, dr.select(hit, o + d * t, 0), d, c, conic, asphere)
     return dr.select(hit, t - value / slope, 0), hit, lack
 
 

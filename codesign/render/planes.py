@@ -20,9 +20,14 @@ class TexturedPlane:
         for label, value in (("frequency_per_m", frequency_per_m), ("amplitude", amplitude), ("phase_rad", phase_rad)):
             if not bool(torch.isfinite(torch.as_tensor(value)).all()):
                 raise DomainError(f"textured plane: {label} holds NaN or infinite entries; remove them.")
+        if not 0 <= mean < float("inf"):
+            raise DomainError(f"textured plane: mean = {mean} must be finite and at least 0; give a radiance on the 0..255 scale.")
         self.dtype, self.mean = dtype, float(mean)
         self.frequency = torch.as_tensor(frequency_per_m, dtype=torch.float64).reshape(-1, 2)
         self.amplitude, self.phase = torch.as_tensor(amplitude, dtype=torch.float64), torch.as_tensor(phase_rad, dtype=torch.float64)
+        sizes = self.frequency.shape[0], self.amplitude.numel(), self.phase.numel()
+        if len(set(sizes)) != 1:
+            raise DomainError(f"textured plane: {sizes[0]} frequencies, {sizes[1]} amplitudes, {sizes[2]} phases were given; give one of each per wave.")
         self.T_world_plane = torch.eye(4, dtype=torch.float64) if T_world_plane is None else check_poses(T_world_plane[None].double())[0]
 
     def _constants(self, arr):

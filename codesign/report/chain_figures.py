@@ -1,0 +1,57 @@
+"""Pictures of what passes along the chain: frames, event frames, curves, junction table."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+
+def strips(rows, titles, signed, labels):
+    """Figure of image rows: rows [R][C] of [H, W] arrays; ``signed`` rows are drawn red (ON) and blue (OFF), others in grey."""
+    figure, axes = plt.subplots(len(rows), len(rows[0]), figsize=(2.3 * len(rows[0]), 2.35 * len(rows)), squeeze=False)
+    for r, (row, sign) in enumerate(zip(rows, signed, strict=True)):
+        top = max(float(np.quantile(np.abs(image), 0.99)) for image in row) or 1.0
+        for c, (axis, image) in enumerate(zip(axes[r], row, strict=True)):
+            if sign:
+                axis.imshow(image, cmap="RdBu_r", vmin=-top, vmax=top)
+            else:
+                axis.imshow(np.clip(image / top, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+            axis.set_xticks([])
+            axis.set_yticks([])
+            if r == 0:
+                axis.set_title(titles[c], fontsize=9)
+        axes[r, 0].set_ylabel(labels[r], fontsize=9)
+    figure.tight_layout()
+    return figure
+
+
+def curves(series, ylabel, xlabel="step", logarithmic=False):
+    """Figure of named curves: dict label -> (x, y)."""
+    figure, axis = plt.subplots(figsize=(7, 3.4))
+    for label, (x, y) in series.items():
+        axis.plot(x, y, label=label, marker="o" if len(x) < 20 else None, ms=3, lw=1.4)
+    axis.set(xlabel=xlabel, ylabel=ylabel)
+    if logarithmic:
+        axis.set_yscale("log")
+    if len(series) > 1:
+        axis.legend(fontsize=8, ncols=2)
+    axis.grid(alpha=0.3)
+    figure.tight_layout()
+    return figure
+
+
+def heat_map(values, rows, columns, label):
+    """Figure of a labelled matrix on a logarithmic colour scale; NaN cells stay empty."""
+    from matplotlib.colors import LogNorm
+
+    values = np.asarray(values, dtype=float)
+    figure, axis = plt.subplots(figsize=(1.5 + 1.3 * len(columns), 1.2 + 0.5 * len(rows)))
+    shown = np.where(np.isfinite(values), np.maximum(values, 1e-9), np.nan)
+    picture = axis.imshow(shown, cmap="viridis_r", norm=LogNorm(vmin=max(np.nanmin(shown), 1e-9), vmax=max(np.nanmax(shown), 1e-8)), aspect="auto")
+    for i in range(len(rows)):
+        for j in range(len(columns)):
+            if np.isfinite(values[i, j]):
+                axis.text(j, i, f"{values[i, j]:.1e}", ha="center", va="center", fontsize=8, color="w" if shown[i, j] > np.nanmedian(shown) else "k")
+    axis.set_xticks(range(len(columns)), columns)
+    axis.set_yticks(range(len(rows)), rows)
+    figure.colorbar(picture, label=label)
+    figure.tight_layout()
+    return figure

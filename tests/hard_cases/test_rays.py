@@ -1,0 +1,196 @@
+"""Rays that fail: what they report, that their gradients stay finite, and that they never touch the others."""
+
+import math
+
+import pytest
+import torch
+
+from codesign import lens, render
+from codesign.errors import DomainError, ShapeError
+from codesign.lens import GeoLens, Glass, Status, Surface
+
+INF = float("inf")
+GLASS = Glass.from_indices(1.5, 1.5, 1.5)
+
+
+def f64(rows):
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def unit(rows):
+    return torch.nn.functional.normalize(f64(rows), dim=1)
+
+
+def everything(out):
+    return torch.cat([out.position_mm, out.direction, out.optical_path_mm[:, None], out.weight[:, None], out.deficit[:, None]], 1)
+
+
+def gradients(geo, loss):
+    tensors = [p for p in geo.parameters() if p.numel()]
+    return torch.cat([g.reshape(-1) for g in torch.autograd.grad(loss, tensors, allow_unused=True) if g is not None])
+
+
+# name -> (lens, a ray that fails, its status, the surface where, its deficit by hand)
+CASES = {
+    # 20 mm off the axis of a sphere of 10 mm radius: radicand 1 - (20/10)^2
+    "miss": (GeoLens([Surface(10.0, 5.0, GLASS, 9.0), Surface(INF, 10.0, None, 9.0)], 4.0), (20.0, 0.0, -5.0), (0, 0, 1.0), Status.MISS, 0, 3.0),
+    # sin = 0.8 > 1/1.5 inside the glass: radicand 1 - 1.5^2 * 0.64
+    "total reflection": (
+        GeoLens([Surface(INF, 5.0, GLASS, 99.0), Surface(-10.0, 10.0, None, 9.9)], 4.0), (8.0, 0.0, -5.0), (0, 0, 1.0), Status.TOTAL_REFLECTION, 1, 1.5**2 * 0.64 - 1),
+    # exactly tangent to the sphere: radicand 0, counted as a miss
+    "grazing": (GeoLens([Surface(10.0, 5.0, GLASS, 9.0), Surface(INF, 10.0, None, 9.0)], 4.0), (10.0, 0.0, -5.0), (0, 0, 1.0), Status.MISS, 0, 1e-8),
+    # a conic that ends at 10 / sqrt(1 + 3) = 5 mm: 1 - (1 + k) c^2 r^2 at 8 mm
+    "ellipsoid": (GeoLens([Surface(10.0, 5.0, GLASS, 4.0, conic=3.0), Surface(INF, 10.0, None, 9.0)], 4.0), (8.0, 0.0, -5.0), (0, 0, 1.0), Status.MISS, 0, 4 * 0.64 - 1),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_failed_ray_says_what_where_and_by_how_much(name):
+    geo, origin, direction, status, surface, deficit = CASES[name]
+    out = geo.trace(f64([origin]), f64([direction]))
+    assert (out.status.item(), out.failed_surface.item(), out.weight.item()) == (status, surface, 0.0)
+    assert abs(out.deficit.item() - deficit) <= 1e-7  # radicands are measured from the grazing limit of 1e-8
+
+
+@pytest.mark.parametrize("name", ["miss", "total reflection", "ellipsoid"])
+def test_the_deficit_falls_when_its_gradient_is_followed(name):
+    geo, origin, direction, *_ = CASES[name]
+    x = f64([origin]).requires_grad_()
+    deficit = geo.trace(x, f64([direction])).deficit
+    (slope,) = torch.autograd.grad(deficit.sum(), x)
+    step = 1e-6
+    nearer = geo.trace((x - step * slope / slope.norm()).detach(), f64([direction])).deficit
+    drop = step * float(slope.norm())
+    assert abs(deficit.item() - nearer.item() - drop) <= 1e-5 * drop  # bends by the step over 10 mm; rounding 1e-16 over 1e-6
+
+
+def mixed_lenses():
+    triplet = lens.load("cooke-triplet")
+    surfaces = list(triplet.to_surfaces())
+    surfaces[0] = Surface(22.01359, 3.25896, surfaces[0].medium, 9.5, conic=0.4, asphere=(0.0, -1e-6, 2e-8, -1e-10, 1e-12, 1e-14, 1e-16, 1e-18))
+    return {"spheres": triplet, "asphere": GeoLens(surfaces, 10.0)}
+
+
+BAD_RAYS = [((40.0, 0.0, -5.0), (0, 0, 1.0)), ((0.0, 21.5, -5.0), (0, 0, 1.0)), ((9.0, 0.0, -5.0), (0.9, 0, 1.0)), ((0.0, 3.0, -5.0), (0, 1, 1e-9)), ((2.0, 3.0, -5.0), (0, 0.1, -1.0)), ((1e4, 0, -5.0), (0, 0, 1.0))]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", ["spheres", "asphere"])
+def test_bad_rays_have_finite_values_gradients_and_positive_deficits(kind, dtype):
+    geo = mixed_lenses()[kind].to(dtype)
+    origin = f64([o for o, _ in BAD_RAYS]).to(dtype).requires_grad_()
+    direction = unit([d for _, d in BAD_RAYS]).to(dtype).requires_grad_()
+    out = geo.trace(origin, direction)
+    assert (out.status != Status.OK).all()
+    assert (out.weight == 0).all()
+    assert (out.deficit > 0).all()
+    values = everything(out)
+    tensors = [origin, direction, *(p for p in geo.parameters() if p.numel())]
+    for column in values.unbind(1):
+        grads = torch.autograd.grad(column.sum(), tensors, retain_graph=True, allow_unused=True)
+        assert all(bool(g.isfinite().all()) for g in grads if g is not None)
+    assert bool(values.isfinite().all())
+
+
+@pytest.mark.parametrize("kind", ["spheres", "asphere"])
+def test_bad_rays_leave_the_gradients_of_good_ones_alone(kind, generator):
+    geo = mixed_lenses()[kind]
+    good = torch.cat([4 * torch.rand(40, 2, generator=generator, dtype=torch.float64) - 2, torch.full((40, 1), -5.0, dtype=torch.float64)], 1)
+    ahead = unit([(0.0, 0.1, 1.0)] * 40)
+
+    def weighted(origin, direction):
+        out = geo.trace(origin, direction)
+        return (out.weight * out.position_mm.square().sum(1)).sum(), out
+
+    alone, out = weighted(good, ahead)
+    assert not out.status.any()
+    crowd, _ = weighted(torch.cat([good, f64([o for o, _ in BAD_RAYS])]), torch.cat([ahead, unit([d for _, d in BAD_RAYS])]))
+    # weight 0 times anything finite adds exactly 0; sums over lanes may run in another order
+    a, b = gradients(geo, alone), gradients(geo, crowd)
+    torch.testing.assert_close(b, a, rtol=1e-13, atol=1e-14 * float(a.abs().max()))
+    assert alone.item() == pytest.approx(crowd.item(), rel=1e-14)
+
+
+def test_a_camera_whose_rays_all_fail_says_where():
+    # the ball lens reflects everything that comes from 8 mm off the axis behind it
+    ball = GeoLens([Surface(5.0, 10.0, GLASS, 4.99, is_stop=True), Surface(-5.0, 8.0, None, 4.99)], 8.0, name="ball")
+    film, pupil = f64([[8.0, 0.0]]), f64([[-1.0, 0.0]])
+    with pytest.raises(DomainError, match=r"ball: every ray fails \(most at surface \d of 2, counted from the object\); weaken"):
+        ball.camera_rays(film, pupil)
+    with pytest.raises(DomainError, match="ball: every ray fails"):
+        render.Camera(ball, 4, 4, 0.1, 1, film=render.Film(400, 400, 2, 2, 0.1, ((0, 0),))).rays()
+
+
+def test_a_camera_that_is_all_vignetted_says_so():
+    narrow = GeoLens([Surface(50.0, 3.0, GLASS, 5.0, is_stop=True), Surface(-50.0, 40.0, None, 0.01)], 4.0)
+    with pytest.raises(DomainError, match="edges of the apertures"):
+        narrow.camera_rays(f64([[0.0, 0.0]]), f64([[0.9, 0.0]]))
+
+
+def test_a_telecentric_stop_is_named():
+    # stop in the front focal plane of a thin plano-convex lens: f = R / (n - 1) = 100, its exit pupil at infinity
+    telecentric = GeoLens([Surface(INF, 100.0, None, 5.0, is_stop=True), Surface(50.0, 1.0, GLASS, 9.0), Surface(INF, 100.0, None, 9.0)], 3.0)
+    with pytest.raises(DomainError, match="telecentric"):
+        telecentric.camera_rays(f64([[0.0, 0.0]]), f64([[0.0, 0.0]]))
+
+
+def test_no_rays_wrong_shapes_and_non_finite_rays_are_refused():
+    geo = lens.load("la1509")
+    with pytest.raises(ShapeError, match=r"\[N >= 1, 3\]"):
+        geo.trace(torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64))
+    with pytest.raises(ShapeError, match=r"direction must be \[N >= 1, 3\]"):
+        geo.trace(f64([[0.0, 0, -5]]), f64([0.0, 0, 1]))
+    with pytest.raises(ShapeError, match="2 origins but 1 directions"):
+        geo.trace(f64([[0.0, 0, -5], [1.0, 0, -5]]), f64([[0.0, 0, 1]]))
+    with pytest.raises(DomainError, match="origin_mm"):
+        geo.trace(f64([[math.nan, 0, -5]]), f64([[0.0, 0, 1]]))
+    with pytest.raises(DomainError, match="unit"):
+        geo.trace(f64([[0.0, 0, -5]]), f64([[0.0, 0, 2]]))
+    with pytest.raises(DomainError, match="unit"):
+        geo.trace(f64([[0.0, 0, -5]]), f64([[0.0, math.nan, 1]]))
+
+
+def test_concentric_spheres_leave_rays_through_their_centre_straight():
+    # both radii end in one centre: a ray towards it meets every surface along the normal
+    geo = GeoLens([Surface(10.0, 4.0, GLASS, 9.9), Surface(6.0, 12.0, Glass.named("F2"), 5.9), Surface(-6.0, 20.0, None, 5.9)], 4.0)
+    towards = unit([(x, y, 1.0) for x, y in ((0.0, 0.0), (0.3, 0.1), (-0.6, 0.2), (0.0, 0.9))])
+    out = geo.trace(f64([0.0, 0.0, 10.0]) - 30 * towards, towards)
+    assert not out.status.any()
+    torch.testing.assert_close(out.direction, towards, rtol=0, atol=1e-13)
+    # centre at z = 10, image plane at 4 + 12 + 20 = 36
+    torch.testing.assert_close(out.position_mm[:, :2], towards[:, :2] / towards[:, 2:] * 26, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["double-gauss", "cooke-triplet"])
+def test_single_precision_from_ten_kilometres_away(name):
+    # a parallel beam whose origins lie 10 km before the lens must land where the beam started at the lens does
+    near, far = f64([(x, y, -5.0) for x, y in ((0.0, 0.0), (2.0, 0.0), (0.0, -3.0), (1.5, 2.5))]).float(), None
+    far = near * f64([1, 1, 2e6]).float()
+    direction = torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3).contiguous()
+    truth = lens.load(name).trace(near.double(), direction.double())
+    out = lens.load(name, torch.float32).trace(far, direction)
+    assert not out.status.any()
+    assert float((out.position_mm - truth.position_mm).detach().abs().max()) <= 3e-5  # no worse than from 5 mm
+
+
+def test_a_ball_lens_has_its_textbook_focal_length():
+    # Hecht, Optics, ch. 6: f = n R / (2 (n - 1)) from the centre; rays start behind the centre of the second half
+    R, n = 5.0, 1.5
+    ball = GeoLens([Surface(R, 2 * R, GLASS, 4.99), Surface(-R, n * R / (2 * (n - 1)) - R, None, 4.99)], 2.0)
+    height = 1e-4
+    out = ball.trace(f64([[height, 0, -9.0], [4.0, 0.0, -9.0]]), f64([[0, 0, 1.0]] * 2))
+    assert abs(out.position_mm[0, 0].item()) <= 1e-8 * height  # spherical aberration at this height: (1e-4 / 5)^2 of it
+    # 4 mm off the axis: sin i = 0.8, bent by 2 (i - i') altogether; crosses the axis at R sin i / sin(2 (i - i')) from the centre
+    turn = 2 * (math.asin(0.8) - math.asin(0.8 / n))
+    crossing = 4.0 / math.sin(turn)
+    assert abs(out.position_mm[1, 0].item() - math.tan(turn) * (crossing - n * R / (2 * (n - 1)))) <= 1e-12
+
+
+def test_the_far_half_of_a_sphere_is_not_a_surface():
+    # a ray that dives past the rim behind the centre would meet the sphere only on the half that the lens does not have
+    geo = GeoLens([Surface(10.0, 5.0, GLASS, 9.0), Surface(INF, 10.0, None, 9.0)], 4.0)
+    towards = unit([(-1.0, 0.0, 0.05)])
+    start = f64([[30.0, 0.0, 13.0 - 0.05 * 30]])  # passes the axis at z = 13, beyond the centre at 10
+    out = geo.trace(start, towards)
+    assert (out.status.item(), out.failed_surface.item()) == (Status.MISS, 0)
+    assert out.deficit.item() > 0.1

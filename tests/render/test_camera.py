@@ -1,0 +1,258 @@
+"""Cameras: rays against the forward trace, blur against the defocus formula, projection there and back, windows."""
+
+import math
+
+import pytest
+import torch
+from scipy.special import j1
+
+from codesign import lens, render
+from codesign.errors import DomainError
+from codesign.pose import look_at
+from codesign.render import Camera, Film, TexturedPlane, angular_miss_rad, project
+from scenes import worlds
+
+D = torch.float64
+SENSOR_PX, PITCH_MM = (346, 260), 18.5e-3
+NAMES = ["cooke-triplet", "double-gauss", "la1509"]
+
+
+def fitted(name):
+    """The lens scaled until its published field fills the sensor's half diagonal."""
+    geo = lens.load(name)
+    image_mm = float(geo.first_order().efl_mm.detach()) * math.tan(math.radians(lens.half_field_deg(name)))
+    return geo.scaled(math.hypot(*SENSOR_PX) / 2 * PITCH_MM / image_mm)
+
+
+OPTICS = {
+    "pinhole": lambda: lens.Pinhole(8.0),
+    "thin lens": lambda: lens.ThinLens(8.0, 2.0, 8.05),
+    "cooke-triplet": lambda: fitted("cooke-triplet"),
+    "double-gauss": lambda: fitted("double-gauss"),
+    "la1509": lambda: fitted("la1509"),
+    "cooke-triplet, full size": lambda: lens.load("cooke-triplet"),
+}
+
+
+def random_pixels(count, generator):
+    return torch.rand(count, 2, generator=generator, dtype=D) * torch.tensor([SENSOR_PX[0] - 1, SENSOR_PX[1] - 1], dtype=D)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_camera_rays_run_the_forward_trace_backwards(name, generator):
+    camera = Camera(fitted(name), *SENSOR_PX, PITCH_MM, 1)
+    pixels = random_pixels(30, generator)
+    pupil = 0.4 * torch.randn(30, 2, generator=generator, dtype=D).clamp(-1.5, 1.5)
+    geo, film_mm = camera.lens, camera.film_mm(pixels)
+    rays = geo.camera_rays(film_mm, pupil)
+    passes = rays.weight > 0
+    assert int(passes.sum()) >= 20
+    # camera axes: x right, y down, z towards the scene; lens axes: light along +z. Turned about x by half a turn and mirrored in y: z alone flips
+    flip = torch.tensor([1.0, 1.0, -1.0], dtype=D)
+    pupil_z = geo.first_order().entrance_pupil_z_mm
+    origin = rays.origin_m * 1e3 * flip + pupil_z * torch.tensor([0.0, 0, 1], dtype=D)
+    direction = -rays.direction * flip
+    start = origin - direction * ((origin[:, 2:] + 5.0) / direction[:, 2:])  # before the first vertex
+    out = geo.trace(start.detach(), direction.detach())
+    assert not out.status[passes].any()
+    # the image is upside down on the film; there and back through up to eleven surfaces rounds to 1e-13 mm
+    torch.testing.assert_close(out.position_mm[passes, :2], -film_mm[passes], rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", OPTICS)
+@pytest.mark.parametrize("depth_m", [0.5, 20.0, 1e4])
+def test_projection_brings_points_of_chief_rays_back(name, depth_m, generator):
+    camera = Camera(OPTICS[name](), *SENSOR_PX, PITCH_MM, 1)
+    pixels = random_pixels(60, generator)
+    rays = camera.chief_rays(pixels)
+    points = (rays.origin_m + rays.direction * ((depth_m - rays.origin_m[:, 2:]) / rays.direction[:, 2:])).detach()
+    found = project(camera, points)
+    lit = rays.weight > 0
+    assert int(lit.sum()) >= 55  # the very corners may be vignetted
+    assert float((found - pixels)[lit].detach().abs().max()) <= 1e-9
+
+
+def test_points_outside_the_field_are_nan_and_leave_the_others_alone():
+    camera = Camera(fitted("cooke-triplet"), *SENSOR_PX, PITCH_MM, 1)
+    inside = torch.tensor([[0.0, 0.0, 1.0], [0.2, -0.1, 1.0]], dtype=D)
+    outside = torch.tensor([[3.0, 0.0, 1.0], [0.0, -50.0, 1.0], [1e6, 1e6, 1.0]], dtype=D)
+    geo = camera.lens
+    both = project(camera, torch.cat([outside, inside]))
+    assert both[:3].isnan().all()
+    assert torch.equal(both[3:], project(camera, inside))
+    assert project(camera, outside).isnan().all()
+    (mixed,) = torch.autograd.grad(both[3:].sum(), geo.curvature_per_mm)
+    (alone,) = torch.autograd.grad(project(camera, inside).sum(), geo.curvature_per_mm)
+    torch.testing.assert_close(mixed, alone, rtol=1e-12, atol=0)
+    assert project(camera, inside[:0]).shape == (0, 2)
+
+
+def test_points_that_cannot_be_projected_are_refused():
+    camera = Camera(lens.Pinhole(8.0), 8, 8, 0.1, 1)
+    with pytest.raises(DomainError, match="behind the camera"):
+        project(camera, torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=D))
+    with pytest.raises(DomainError, match="points to project"):
+        project(camera, torch.tensor([[0.0, math.nan, 1.0]], dtype=D))
+
+
+def test_a_pinhole_projects_by_similar_triangles():
+    camera = Camera(lens.Pinhole(8.0), 40, 30, 0.1, 1)
+    found = project(camera, torch.tensor([[0.3, -0.2, 2.0], [0.0, 0.0, 5.0]], dtype=D))
+    truth = torch.tensor([[8.0 / 0.1 * 0.15 + 19.5, -8.0 / 0.1 * 0.1 + 14.5], [19.5, 14.5]], dtype=D)
+    torch.testing.assert_close(found, truth, rtol=0, atol=1e-12)
+
+
+def test_gradients_of_projection_to_points_and_lens(generator):
+    geo = fitted("cooke-triplet")
+    points = torch.cat([0.15 * torch.randn(5, 2, generator=generator, dtype=D), 1 + torch.rand(5, 1, generator=generator, dtype=D)], 1)
+    weights = torch.randn(5, 2, generator=generator, dtype=D)
+
+    def loss(points, curvature, thickness):
+        return (project(Camera(geo.replace(curvature_per_mm=curvature, thickness_mm=thickness), *SENSOR_PX, PITCH_MM, 1), points) * weights).sum()
+
+    inputs = [points, geo.curvature_per_mm.detach(), geo.thickness_mm.detach()]
+    for k, scale in enumerate((1e-4, 1e-5, 1e-3)):
+        leaves = [v.clone().requires_grad_() for v in inputs]
+        (found,) = torch.autograd.grad(loss(*leaves), leaves[k])
+        truth = torch.zeros_like(inputs[k]).reshape(-1)
+        for i in range(truth.numel()):
+            step = torch.zeros_like(truth)
+            step[i] = scale
+            ahead, behind = ([v + s * step.reshape(v.shape) if j == k else v for j, v in enumerate(inputs)] for s in (1, -1))
+            truth[i] = float((loss(*ahead) - loss(*behind)).detach()) / (2 * scale)
+        # steps of 1e-4 or so of each value: differences bend by 1e-7; the solver's own Jacobian (forward step of 1e-4 mm) is as good
+        assert float((found.reshape(-1) - truth).norm() / truth.norm()) <= 1e-6
+
+
+@pytest.mark.parametrize("name", ["pinhole", "cooke-triplet"])
+def test_angular_miss_is_the_angle_between_ray_and_point(name, generator):
+    camera = Camera(OPTICS[name](), *SENSOR_PX, PITCH_MM, 1)
+    pixels = random_pixels(10, generator)
+    rays = camera.chief_rays(pixels)
+    points = (rays.origin_m + 3 * rays.direction).detach()
+    assert float(angular_miss_rad(camera, pixels, points).detach().max()) <= 1.01e-6  # the smooth floor
+    side = torch.nn.functional.normalize(torch.linalg.cross(rays.direction, torch.tensor([0.3, 1.0, 0.2], dtype=D).expand(10, 3)), dim=1).detach()
+    found = angular_miss_rad(camera, pixels, points + 0.03 * side)  # at right angles to the ray: tan = 0.01
+    torch.testing.assert_close(found.detach(), torch.full((10,), 2 * math.sin(math.atan(0.01) / 2), dtype=D), rtol=1e-7, atol=0)  # the chord; the floor adds 5e-9
+
+
+# ---- blur
+
+
+def test_the_blur_disc_of_a_thin_lens_has_the_diameter_of_the_defocus_formula():
+    # Focused at s: 1/s = 1/f - 1/s'. An object at z has a blur disc of diameter A s' |1/s - 1/z| on the film.
+    f, aperture, image, z = 8.0, 2.5, 8.05, 0.6
+    camera = Camera(lens.ThinLens(f, aperture, image), 9, 9, 0.02, 64)
+    diameter_mm = aperture * image * abs((1 / f - 1 / image) - 1 / (z * 1e3))
+    angle = torch.linspace(0, 2 * math.pi, 13, dtype=D)[:-1]
+    rim = torch.stack([angle.cos(), angle.sin()], 1)
+    rays = camera.lens.camera_rays(torch.zeros(12, 2, dtype=D), rim)
+    at = rays.origin_m + rays.direction * ((z - rays.origin_m[:, 2:]) / rays.direction[:, 2:])
+    on_film = at[:, :2] / z * image  # millimetres, by the central ray
+    torch.testing.assert_close(2 * on_film.norm(dim=1), torch.full((12,), diameter_mm, dtype=D), rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("optics", ["thin", "traced"])
+def test_defocus_takes_contrast_away_as_a_blur_disc_does(optics):
+    # a faint grating: contrast falls by 2 J1(x) / x of the disc (x = pi frequency diameter) and sinc of the pixel (Goodman, 6.4)
+    triplet = fitted("cooke-triplet")
+    focused = triplet.replace(thickness_mm=torch.cat([triplet.thickness_mm[:-1], triplet.first_order().bfl_mm.reshape(1) + 0.16]))
+    optic = focused.thin() if optics == "thin" else focused
+    f = float(focused.first_order().efl_mm.detach())
+    image = f + 0.16
+    z = 3.0
+    diameter_m = 1e-3 * float(focused.entrance_pupil_diameter_mm) * abs(1 - z * 1e3 * (1 / f - 1 / image))  # of the disc at the object
+    pixel_m = PITCH_MM / image * z
+    frequency = 0.7 / diameter_m  # x = 2.2: contrast 0.5
+    plane = TexturedPlane([[frequency, 0.0]], [1e-3], [0.0], dtype=D)
+    away = look_at((0, 0, z), (0, 0, 0), down=(0, 1, 0))
+    film = Film(*SENSOR_PX, 64, 1, PITCH_MM, ((141, 129),))
+    camera = Camera(optic, 64, 1, PITCH_MM, 256, film=film)
+    with torch.no_grad():
+        row = render.frames(camera, plane, away[None])[0, 0, 0]
+    x = (torch.arange(64, dtype=D) + 141 - 172.5) * pixel_m
+    design = torch.stack([torch.ones_like(x), (2 * math.pi * frequency * x).cos(), (2 * math.pi * frequency * x).sin()], 1)
+    mean, cosine, sine = torch.linalg.lstsq(design, row[:, None]).solution[:, 0].tolist()
+    contrast = math.hypot(cosine, sine) / mean / 1e-3
+    disc, box = math.pi * frequency * diameter_m, math.pi * frequency * pixel_m
+    truth = 2 * j1(disc) / disc * math.sin(box) / box
+    # 256 samples: 1 %; the triplet's own aberrations near the axis (blur of 1.4 um beside 30 um) and its real magnification: 2 %
+    assert abs(contrast / truth - 1) <= 0.03
+    assert truth < 0.6
+
+
+def test_the_thin_twin_of_a_lens_has_its_focal_length_pupil_and_focus():
+    geo = fitted("double-gauss")
+    thin, first = geo.thin(), geo.first_order()
+    assert thin.efl_mm.item() == pytest.approx(first.efl_mm.item(), rel=1e-14)
+    defocus = float((geo.thickness_mm[-1] - first.bfl_mm).detach())
+    assert (thin.image_distance_mm - thin.efl_mm).item() == pytest.approx(defocus, abs=1e-12)
+    assert torch.autograd.grad(thin.image_distance_mm, geo.thickness_mm)[0][-1].item() == pytest.approx(1, abs=1e-12)
+
+
+# ---- films
+
+
+def test_windows_equal_the_crops_of_the_full_frame():
+    corners = ((0, 0), (17, 5), (40, 30))
+    whole = Film(64, 48, 64, 48, 0.1)
+    windows = Film(64, 48, 12, 9, 0.1, corners)
+    plane = worlds.smooth_plane(4)
+    pose = look_at((0.3, 0.1, 2.0), (0, 0, 0), down=(0, 1, 0))[None]
+    geo = fitted("cooke-triplet")
+    full, part = (render.frames(Camera(geo, 0 + f.width_px, f.height_px, 0.1, 4, film=f), plane, pose) for f in (whole, windows))
+    assert part.shape == (1, 3, 9, 12)
+    for k, (left, top) in enumerate(corners):
+        assert torch.equal(part[0, k], full[0, top : top + 9, left : left + 12])
+
+
+def test_pixels_are_in_image_order_with_the_axis_in_the_middle():
+    film = Film(6, 4, 2, 3, 0.1, ((1, 0), (4, 1)))
+    assert film.pixels()[:3].tolist() == [[1, 0], [2, 0], [1, 1]]
+    assert film.pixels()[6:8].tolist() == [[4, 1], [5, 1]]
+    camera = Camera(lens.Pinhole(5.0), 6, 4, 0.1, 1)
+    assert camera.film_mm(torch.tensor([[2.5, 1.5], [3.5, 1.5]], dtype=D)).tolist() == [[0, 0], [pytest.approx(0.1), 0]]
+
+
+def test_single_precision_lenses_make_single_precision_rays_and_double_truth():
+    double, single = (Camera(lens.load("cooke-triplet", dtype), 16, 12, 0.1, 4) for dtype in (D, torch.float32))
+    a, b = double.rays(), single.rays()
+    assert (b.origin_m.dtype, b.direction.dtype) == (torch.float32, torch.float32)
+    # float32 rounding through six surfaces: 1e-7 of 10 mm or so
+    torch.testing.assert_close(b.direction.double(), a.direction, rtol=0, atol=2e-6)
+    torch.testing.assert_close(b.origin_m.double(), a.origin_m, rtol=0, atol=2e-8)
+    point = torch.tensor([[0.1, 0.05, 1.0]], dtype=D)
+    found = project(single, point)
+    assert found.dtype == D
+    # curvatures rounded to float32 (6e-8) move the image of a 50 mm lens by 6e-8 * 50 pixels or so
+    torch.testing.assert_close(found, project(double, point), rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"samples_per_pixel": 0}, "samples_per_pixel = 0 must be"),
+        ({"samples_per_pixel": 2.5}, "samples_per_pixel = 2.5"),
+        ({"samples_per_pixel": math.nan}, "samples_per_pixel = nan"),
+        ({"width_px": 0}, "width_px = 0"),
+        ({"height_px": -3}, "height_px = -3"),
+        ({"pixel_pitch_mm": 0.0}, "pixel_pitch_mm = 0.0"),
+        ({"pixel_pitch_mm": math.nan}, "pixel_pitch_mm = nan"),
+        ({"film": Film(10, 10, 4, 4, 0.1, ((8, 0),))}, r"window \(8, 0\)"),
+        ({"film": Film(10, 10, 4, 4, 0.1, ())}, "no window"),
+        ({"film": Film(10, 10, 4, 0, 0.1)}, "height_px = 0"),
+    ],
+)
+def test_cameras_that_cannot_be_are_refused(change, sentence):
+    settings = {"width_px": 8, "height_px": 6, "pixel_pitch_mm": 0.1, "samples_per_pixel": 4}
+    with pytest.raises(DomainError, match=sentence):
+        Camera(lens.Pinhole(5.0), **{**settings, **change})
+
+
+def test_thin_lenses_that_cannot_be_are_refused():
+    with pytest.raises(DomainError, match="focal length -5.0 mm"):
+        lens.ThinLens(-5.0, 1.0)
+    with pytest.raises(DomainError, match="image distance nan mm"):
+        lens.ThinLens(5.0, 1.0, math.nan)
+    with pytest.raises(DomainError, match="entrance pupil diameter -1.0 mm"):
+        lens.ThinLens(5.0, -1.0)

@@ -1,0 +1,116 @@
+"""Rigid motions against the matrix exponential, differences, and the axes the camera promises."""
+
+import math
+
+import pytest
+import torch
+
+from codesign.errors import DomainError, ShapeError
+from codesign.pose import apply, check_poses, inverse, look_at, se3_exp
+from codesign.render import Camera, project
+
+D = torch.float64
+
+
+def wedge(twist):
+    """4 x 4 matrix whose exponential is the transform: [[w]x, v; 0, 0]."""
+    v, w = twist[:3], twist[3:]
+    m = torch.zeros(4, 4, dtype=D)
+    m[:3, :3] = torch.linalg.cross(w.expand(3, 3), torch.eye(3, dtype=D), dim=1).T
+    m[:3, 3] = v
+    return m
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-4, 1e-3, 1e-2, 0.3, 1.0, 2.5, 3.1415, math.pi, 4.0])
+def test_exponential_is_that_of_the_matrix(angle, generator):
+    for _ in range(3):
+        axis = torch.nn.functional.normalize(torch.randn(3, dtype=D, generator=generator), dim=0)
+        twist = torch.cat([torch.randn(3, dtype=D, generator=generator), angle * axis])
+        # torch's Pade form is good to some 1e-15 of a norm of at most 5
+        torch.testing.assert_close(se3_exp(twist), torch.linalg.matrix_exp(wedge(twist)), rtol=0, atol=2e-14)
+
+
+def test_a_quarter_turn_about_z_with_translation_by_hand():
+    # left Jacobian of a quarter turn: (2/pi) [[1, -1], [1, 1]]
+    found = se3_exp(torch.tensor([1.0, 0, 0.5, 0, 0, math.pi / 2], dtype=D))
+    truth = torch.tensor([[0, -1, 0, 2 / math.pi], [1, 0, 0, 2 / math.pi], [0, 0, 1, 0.5], [0, 0, 0, 1]], dtype=D)
+    torch.testing.assert_close(found, truth, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-5, 0.5, 2.0])
+def test_gradcheck(scale, generator):
+    twist = (scale * torch.randn(2, 6, dtype=D, generator=generator)).requires_grad_()
+    assert torch.autograd.gradcheck(se3_exp, twist, atol=1e-8)  # steps of 1e-6: differences are good to 1e-9
+
+
+def test_the_derivative_at_zero_is_the_generators():
+    jacobian = torch.autograd.functional.jacobian(se3_exp, torch.zeros(6, dtype=D))
+    for k in range(6):
+        torch.testing.assert_close(jacobian[..., k], wedge(torch.eye(6, dtype=D)[k]), rtol=0, atol=1e-14)
+
+
+def test_inverse_and_apply(generator):
+    transform = se3_exp(torch.randn(4, 2, 6, dtype=D, generator=generator))
+    points = torch.randn(4, 2, 7, 3, dtype=D, generator=generator)
+    torch.testing.assert_close(inverse(transform) @ transform, torch.eye(4, dtype=D).expand(4, 2, 4, 4), rtol=0, atol=1e-14)
+    homogeneous = torch.cat([points, torch.ones_like(points[..., :1])], -1)
+    torch.testing.assert_close(apply(transform, points), torch.einsum("...ij,...nj->...ni", transform, homogeneous)[..., :3], rtol=0, atol=1e-14)
+
+
+def test_constant_twists_give_constant_transforms():
+    assert not se3_exp(torch.zeros(3, 6, dtype=D)).requires_grad
+    assert se3_exp(torch.zeros(6)).dtype == torch.float32
+    with pytest.raises(ShapeError, match="6 components"):
+        se3_exp(torch.zeros(2, 3))
+
+
+def test_look_at_makes_a_rigid_camera_with_right_down_forward(thin_camera):
+    origin, target = (1.0, -4.0, 2.0), (0.5, 1.0, 1.0)
+    pose = look_at(origin, target)
+    check_poses(pose[None])
+    assert float(torch.linalg.det(pose[:3, :3])) == pytest.approx(1, abs=1e-14)
+    forward = torch.tensor(target, dtype=D) - torch.tensor(origin, dtype=D)
+    torch.testing.assert_close(pose[:3, 2], forward / forward.norm(), rtol=0, atol=1e-15)
+    assert abs(float(pose[2, 0])) <= 1e-15  # the image's rows are level
+    assert float(pose[2, 1]) < 0  # down in the image is down in the world
+    # seen from y = -4 towards +y, world +x is to the right and world +z up
+    world = torch.tensor([target, (0.7, 1.0, 1.0), (0.5, 1.0, 1.2)], dtype=D)
+    pixels = project(thin_camera, apply(inverse(pose), world))
+    torch.testing.assert_close(pixels[0], thin_camera.film.middle_px, rtol=0, atol=1e-9)
+    assert float(pixels[1, 0]) > float(pixels[0, 0]) + 1
+    assert float(pixels[2, 1]) < float(pixels[0, 1]) - 1
+
+
+@pytest.fixture
+def thin_camera():
+    from codesign.lens import Pinhole
+
+    return Camera(Pinhole(8.0), 64, 48, 0.05, 1)
+
+
+def test_look_at_along_down_and_at_itself_are_refused():
+    with pytest.raises(DomainError, match="parallel"):
+        look_at((0, 0, 2), (0, 0, 0))
+    with pytest.raises(DomainError, match="same point"):
+        look_at((1, 0, 2), (1, 0, 2))
+    with pytest.raises(DomainError, match="look_at"):
+        look_at((math.nan, 0, 2), (1, 0, 2))
+    straight_down = look_at((0, 0, 2), (0, 0, 0), down=(0, -1, 0))
+    torch.testing.assert_close(straight_down[:3, :3], torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], dtype=D), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda p: p[:, :3], "poses must be"),
+        (lambda p: p[:0], "poses must be"),
+        (lambda p: p * torch.diag(torch.tensor([1.01, 1, 1, 1], dtype=D)), "not rigid: R R"),
+        (lambda p: p @ torch.diag(torch.tensor([-1.0, 1, 1, 1], dtype=D)), "mirrors"),
+        (lambda p: torch.cat([p[:, :3], p[:, 3:] + 0.1], 1), "last row"),
+        (lambda p: torch.where(torch.eye(4, dtype=torch.bool).roll(1, 1), torch.nan, p), "poses: .* NaN"),
+        (lambda p: torch.where(torch.arange(16).reshape(4, 4) == 3, torch.inf, p), "poses: .* infinite"),
+    ],
+)
+def test_poses_that_are_not_rigid_are_refused(change, sentence):
+    with pytest.raises((DomainError, ShapeError), match=sentence):
+        check_poses(change(torch.eye(4, dtype=D).repeat(2, 1, 1)))
