@@ -151,14 +151,19 @@ def arrays(device="cpu", dtype=torch.float32):
 
 
 def widen(arr, parameters, count, width):
-    """Gather each of ``count`` scalars of a flat array into a full-width array.
+    """The ``count`` scalars of a flat array, each gathered into a full-width array where its gradient is wanted.
 
     A scalar used by a million lanes would make one full recomputation per use in the backward pass; a gather makes one reduction.
+    Without a gradient a gather per lane only costs time, and the scalars stay scalars (evaluated, so that other values need no new kernel).
     """
     import drjit as dr
 
-    zero = dr.opaque(arr.UInt32, 0, width)
-    return [dr.gather(arr.Float, parameters, zero + k) for k in range(count)]
+    wanted = dr.grad_enabled(parameters)
+    zero = dr.opaque(arr.UInt32, 0, width if wanted else 1)
+    found = [dr.gather(arr.Float, parameters, zero + k) for k in range(count)]
+    if not wanted:
+        dr.eval(found)
+    return found
 
 
 def run_kernel(kernel, inputs, out_shapes):

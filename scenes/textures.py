@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter
 
 from codesign.errors import DomainError, FileFormatError
 
@@ -29,14 +30,14 @@ def photo(source, size_px=512):
         if not Path(source).is_file():
             raise FileFormatError(f"texture '{source}' is neither a file nor one of {', '.join(PHOTOS)}; give the path of a PNG or JPEG.")
         try:
-            picture = imageio.imread(source)
+            picture = imageio.imread(source, plugin="pillow")  # the only one asked: trying them all leaves files open
         except (OSError, ValueError) as error:
             raise FileFormatError(f"texture {source} is not a readable image ({str(error)[:120]}); convert it to PNG.") from error
     scale = 65535.0 if picture.dtype == np.uint16 else 255.0 if picture.dtype == np.uint8 else 1.0
     values = np.asarray(picture, dtype=np.float64)[:size_px, :size_px] / scale
-    if values.ndim == 3:
-        values = values[..., :3] @ [0.2126, 0.7152, 0.0722]
     linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    if linear.ndim == 3:
+        linear = linear[..., :3] @ [0.2126, 0.7152, 0.0722] if linear.shape[2] >= 3 else linear[..., 0]
     return check_texture(LIFT + (255 - LIFT) * linear, str(source))
 
 
@@ -44,6 +45,11 @@ def shrunk(texture, factor):
     """The texture averaged over factor x factor texels, so that a few samples per pixel see no detail between them."""
     height, width = (n // factor * factor for n in texture.shape)
     return texture[:height, :width].reshape(height // factor, factor, width // factor, factor).mean((1, 3), dtype=np.float64).astype(np.float32)
+
+
+def softened(texture, texels):
+    """The texture blurred by a Gaussian of this standard deviation, so that the kinks between bilinear texels become small."""
+    return gaussian_filter(check_texture(texture, "to soften").astype(np.float64), texels, mode="nearest").astype(np.float32)
 
 
 def speckle(seed, size_px=512, finest_px=6.0, coarsest_px=64.0, contrast=0.5):
@@ -63,7 +69,7 @@ def checkerboard(squares=8, square_px=32, dark=10.0, bright=200.0):
 
 def faded_to(texture, level, margin=0.12):
     """The texture with its borders fading smoothly to a constant, so that adjoining walls meet without a jump."""
-    ramps = []
+    texture, ramps = check_texture(texture, "to fade"), []
     for size in texture.shape:
         at = (np.arange(size) + 0.5) / size
         u = np.clip(np.minimum(at, 1 - at) / margin - 0.25, 0, 1)  # the outermost quarter of the margin is constant

@@ -12,6 +12,8 @@ def times(count, rate_hz):
     """Frame times [count] in seconds, starting at 0."""
     if count < 2:
         raise DomainError(f"a trajectory needs at least 2 frames, got {count}.")
+    if not 0 < rate_hz < math.inf:
+        raise DomainError(f"a trajectory's rate_hz = {rate_hz} must be positive and finite.")
     return torch.arange(count, dtype=torch.float64) / rate_hz
 
 
@@ -35,7 +37,10 @@ def orbit(centre_m, radius_m, height_m, rate_rad_s, t_s, phase_rad=0.0):
 def oscillation(start, axis, amplitude_m, frequency_hz, t_s):
     """Sinusoidal motion along a camera axis: axis three numbers, e.g. (0, 0, 1) radial (towards the scene), (0, 1, 0) vertical."""
     shift = amplitude_m * (2 * math.pi * frequency_hz * t_s).sin()
-    direction = torch.nn.functional.normalize(torch.tensor(axis, dtype=torch.float64), dim=0)
+    direction = torch.tensor(axis, dtype=torch.float64)
+    if not 0 < float(direction.norm()) < math.inf:
+        raise DomainError(f"an oscillation needs an axis of finite length other than 0, got {tuple(axis)}.")
+    direction = direction / direction.norm()
     return start @ se3_exp(torch.cat([shift[:, None] * direction, torch.zeros(t_s.numel(), 3, dtype=torch.float64)], 1))
 
 

@@ -26,13 +26,13 @@ class Config(StudyConfig):
     """Lens to start from: cooke-triplet, double-gauss, la1509, or a lens .json file."""
     objective: Literal["flow", "edge"] = "flow"
     """flow: log angular error of event flow; edge: the seed project's edge energy of event frames."""
-    steps: int = 60
+    steps: int = 50
     """Optimisation steps."""
     cases: int = 4
     """Samples (texture, motion, noise) per step."""
     samples: int = 16
     """Rays per pixel while optimising; twice as many when judging."""
-    step_size: float = 0.15
+    step_size: float = 0.3
     """Length of a step in pixels of ray motion per unit of clipped gradient."""
     detuned_px: float = 2.2
     """Mean RMS spot of the detuned start, pixels."""

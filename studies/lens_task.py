@@ -71,10 +71,10 @@ class LensTask:
         later = pose.apply(pose.inverse(case.poses[-1]), points)
         return 1e3 * render.angular_miss_rad(camera, pixels + motion, later).reshape(len(FIELDS), -1).mean(1)
 
-    def chain(self, samples, layer="memory", objective="flow", optics=None):
+    def chain(self, samples, layer="memory", objective="flow", optics=None, sensor=SENSOR):
         """Chain over designs {"variables": [V], "case": Case}; ``optics`` maps a design to a lens (default: the variables through the lens design).
 
-        layer: "memory" (hard counts, straight-through) or "counts" (smooth, no noise). objective: "flow" or "edge".
+        layer: "memory" (hard counts, straight-through), "counts" (the same without quantisation) or "sigmoid" (the seed project's). objective: "flow" or "edge".
         """
         optics = optics or (lambda design: self.design.lens(design["variables"]))
         objectives = {"flow": lambda field, camera, design: self.angular_error_mrad(field, camera, design["case"]).log().mean(), "edge": lambda score, camera, design: score.flow_px}
@@ -82,18 +82,23 @@ class LensTask:
         return graph.Chain(
             lens=lambda design: self.camera(optics(design), samples, design["case"].seed),
             render=lambda rays, design: self.frames(rays, design["case"], samples),
-            events=lambda frames, design: self.volume(frames, design["case"], layer),
+            events=lambda frames, design: self.volume(frames, design["case"], layer, sensor),
             flow=estimators[objective], objective=objectives[objective])
 
     def frames(self, rays, case, samples):
         return render.shade(rays, case.world, case.poses, samples).reshape(case.poses.shape[0], *self.film.shape)
 
-    def volume(self, frames, case, layer):
-        if layer == "counts":
-            return events.from_counts(events.soft_counts(frames, SENSOR.theta_on, SENSOR.theta_off), case.t_s, BINS)
+    def volume(self, frames, case, layer, sensor=SENSOR):
+        """Event volume of a case, with the sensor's threshold mismatch and shot noise drawn from the case's seed."""
         noise = torch.Generator().manual_seed(case.seed)
-        counts, _ = events.memory(frames, *events.draw_thresholds(SENSOR, self.film.shape, noise, dtype=frames.dtype))
-        shot = events.draw_shot_counts(SENSOR, self.film.shape, case.t_s.diff(), noise, dtype=frames.dtype)
+        thresholds = events.draw_thresholds(sensor, self.film.shape, noise, dtype=frames.dtype)
+        shot = events.draw_shot_counts(sensor, self.film.shape, case.t_s.diff(), noise, dtype=frames.dtype)
+        if layer == "memory":
+            counts, _ = events.memory(frames, *thresholds)
+        elif layer == "counts":
+            counts = events.soft_counts(frames, *thresholds)
+        else:
+            counts = events.soft(frames, sensor.theta_on)
         return events.from_counts(counts + shot, case.t_s, BINS)
 
     def judge(self, optics, case, samples=32):

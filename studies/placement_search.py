@@ -9,8 +9,9 @@ from codesign.errors import NonFiniteError
 from codesign.place import Mount
 from studies.placement_task import HALF_RANGE_M, NOMINAL_M
 
-FIRST_STEP, SHRINK, MOMENTUM, PATIENCE = 0.25, 0.5, 0.6, 2  # steps are lengths over radians and half-ranges of the box together
-RENDERS_PER_STEP = 2  # of a gradient step: its backward pass renders once more
+FIRST_STEP, SHRINK, MOMENTUM, PATIENCE = 0.25, 0.6, 0.6, 2
+UNIT = torch.tensor([3.0, 3.0, 3.0, 1.0, 1.0, 1.0], dtype=torch.float64)  # a step of length 1 in each of the mount's numbers: rotations in radians
+RENDERS_PER_STEP = 2  # the backward pass of a gradient step renders once more
 
 
 @dataclass(frozen=True)
@@ -35,18 +36,18 @@ def draw_mount(generator):
     return Mount(NOMINAL_M, HALF_RANGE_M, position_m=position, yaw_rad=yaw, pitch_rad=math.radians(10 + 80 * u[4]), roll_rad=roll)
 
 
-def descend(task, mount, steps, layer="memory", advance=lambda error: None):
+def descend(task, mount, steps, advance=lambda error: None):
     """Gradient steps of set length with momentum from ``mount``; after PATIENCE steps without a new best, back to the best with half the length.
 
-    Hard events make single samples' gradients heavy-tailed, so each is cut to the median length before they are averaged.
+    Steps follow the gradient of the error to be expected (task.expected); what counts as best is the task error with hard events.
     Returns: Path of all mounts tried, steps + 1 long. Raises: NonFiniteError when a gradient is not finite.
     """
     now = mount.numbers.detach().clone()
     best, best_error, best_way = now, math.inf, torch.zeros_like(now)
     momentum, length, since = torch.zeros_like(now), FIRST_STEP, 0
     poses, errors = [], []
-    for turn in range(steps + 1):
-        error, way = task_gradient(task, mount, now, layer, wanted=turn < steps)
+    for _ in range(steps + 1):
+        error, way = downhill(task, mount, now)
         poses.append(mount(now).detach())
         errors.append(error)
         if error < best_error:
@@ -56,34 +57,39 @@ def descend(task, mount, steps, layer="memory", advance=lambda error: None):
         if since > PATIENCE:
             now, way, momentum, length, since = best, best_way, torch.zeros_like(now), SHRINK * length, 0
         momentum = MOMENTUM * momentum + way
-        now = now - length * torch.nn.functional.normalize(momentum, dim=0)
+        now = now + length * torch.nn.functional.normalize(momentum, dim=0) * UNIT
         advance(error)
-    return Path(torch.stack(poses), torch.tensor(errors, dtype=torch.float64), RENDERS_PER_STEP * torch.arange(steps + 1) + 1)
+    return Path(torch.stack(poses), torch.tensor(errors, dtype=torch.float64), RENDERS_PER_STEP * (torch.arange(steps + 1) + 1))
 
 
-def task_gradient(task, mount, numbers, layer="memory", wanted=True):
-    """Task error, and the direction [6] of its robust gradient (length 1, or 0 where no sample feels the mount)."""
-    if not wanted:
-        with torch.no_grad():
-            return float(task.errors(mount(numbers), layer).task), torch.zeros_like(numbers)
+def downhill(task, mount, numbers):
+    """Task error with hard events, and the direction [6] of steepest descent of the expected error, per UNIT (length 1, or 0 where no sample feels the mount).
+
+    Single samples' gradients are heavy-tailed, so each is cut to the median length before they are averaged.
+    """
     copies = numbers.expand(task.samples, 6).clone().requires_grad_()
-    errors = task.errors(mount(copies), layer)
-    (grads,) = torch.autograd.grad(errors.per_sample.square().mean().sqrt(), copies)
+    poses = mount(copies)
+    frames = task.frames(poses)
+    expected = task.expected(poses, frames=frames)
+    (grads,) = torch.autograd.grad(expected.square().mean().sqrt(), copies)
     if not bool(grads.isfinite().all()):
-        raise NonFiniteError("the gradient of the task error became infinite or NaN at junction 'mount'; the mounts tried before it are kept.")
+        raise NonFiniteError("the gradient of the expected error became infinite or NaN at junction 'mount'; finished searches are kept.")
+    grads = grads * UNIT
     lengths = grads.norm(dim=1)
     limit = lengths[lengths > 0].median() if bool((lengths > 0).any()) else 1.0
     cut = grads * (limit / lengths.clamp(min=1e-300)).clamp(max=1)[:, None]
-    return float(errors.task.detach()), torch.nn.functional.normalize(cut.sum(0), dim=0)
+    with torch.no_grad():
+        error = float(task.errors(mount(numbers), frames=frames.detach()).task)
+    return error, -torch.nn.functional.normalize(cut.sum(0), dim=0)
 
 
-def random_search(task, mount, count, generator, layer="memory", advance=lambda error: None):
+def random_search(task, mount, count, generator, advance=lambda error: None):
     """``mount`` and ``count - 1`` drawn ones. Returns: Path."""
     with torch.no_grad():
         poses = torch.stack([mount()] + [draw_mount(generator)() for _ in range(count - 1)])
         errors = []
         for pose in poses:
-            errors.append(float(task.errors(pose, layer).task))
+            errors.append(float(task.errors(pose).task))
             advance(errors[-1])
     return Path(poses, torch.tensor(errors, dtype=torch.float64), torch.arange(count) + 1)
 

@@ -2,10 +2,16 @@
 
 Modelled: a camera of 64 x 64 pixels and 70 degrees on a body that moves in the plane with constant forward, lateral and yaw rate over 40 ms;
 ground with photographs and patterns of several scales; the event sensor's mismatch and shot noise (one fixed draw); affine flow over the image;
-weighted least squares with the true depth, in which ground farther than a few metres counts less, because there a pixel covers whole patterns.
-What makes one mount better than another: near ground moves fast and is seen in detail, but a turn of the body shows best in what is far; texture
-finer than a pixel fires events that follow no motion; flow beyond the reach of the estimator is lost; and the sky shows nothing.
+weighted least squares with the true depth. Since the depth is known, events of ground farther than a few metres are faded out: a pixel covers
+whole patterns there, and what it fires follows no motion.
+What makes one mount better than another: near ground moves fast and is seen in detail, but flow beyond the reach of the estimator is lost, and more
+ground in view means more evidence; a turn of the body and a slip to the side look alike unless near and far ground or both sides of the turn are seen;
+flow over ground that recedes is less affine; the sky shows nothing.
 Not modelled: the robot's own body in view, uneven ground, errors of the depth, lighting.
+
+Common random numbers go with the texture: a sample fixes which patch of ground the camera looks at and how it lies in the image, whatever the mount.
+On ground that looks alike everywhere this changes no expectation, and it makes the errors of neighbouring mounts vary together; with the body's place
+held instead, every turn of the camera by a pixel shows new texture, and the gradient is that of the draw.
 """
 
 import math
@@ -13,20 +19,22 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
+from kornia.filters import gaussian_blur2d, spatial_gradient
 
 from codesign import events, flow, lens, place, render
 from codesign.pose import se3_exp
+from codesign.types import EventVolume
 from scenes import textures, worlds
 
 WIDTH_PX, PITCH_MM, FOCAL_MM = 64, 0.074, 3.4  # the middle of a DAVIS346 read out in blocks of 4 x 4 pixels, behind a wide lens: 70 degrees
 DURATION_S, FRAMES, BINS, SAMPLES = 0.04, 9, 5, 8
-SENSOR = events.SensorModel(theta_on=0.2, theta_off=0.2, theta_sigma=0.03, shot_rate_hz=1.0)
+SENSOR = events.SensorModel(theta_on=0.1, theta_off=0.1, theta_sigma=0.015, shot_rate_hz=1.0)
 NOMINAL_M, HALF_RANGE_M = (0.2, 0.0, 0.4), (0.1, 0.1, 0.1)  # where the camera may sit on the body: 40 cm above the ground, 20 cm ahead of the body's origin
 SCALES = torch.tensor([0.1, 0.1, 0.1], dtype=torch.float64)  # m/s, m/s, rad/s: errors that count 1
-PRIOR = (1.0, 1.0, 1.0)  # m/s, m/s, rad/s
+PRIOR, PRIOR_PX = (1.0, 1.0, 1.0), 4.0  # expected size of velocity (m/s, m/s, rad/s) and of flow over the interval (px)
 FLOW_NOISE_PX = 0.5  # of one pixel's flow over the interval, for the weight of the prior
-PRIOR_PX = 4.0  # expected flow over the interval
-FAR_M = 4.0  # ground at this depth counts half
+NOISE_RATE = 3.0  # events per pixel and interval
+FAR_M = 1.5  # ground at this depth counts half
 TRAINING, HELD_OUT = ("gravel", "grass", "speckle-1"), ("brick", "astronaut", "speckle-2")
 
 
@@ -54,11 +62,11 @@ class Errors:
 
 @dataclass(frozen=True)
 class PlacementTask:
-    """Worlds, and for each the motions: velocity [W, M, 3] (m/s, m/s, rad/s) and T_world_body [W, M, T, 4, 4]; seed of the noise."""
+    """Worlds, and for each the motions: velocity [W, M, 3] (m/s, m/s, rad/s) and the patch looked at, [W, M, 3] (x m, y m, heading rad); seed of the noise."""
 
     worlds: tuple
     velocity: torch.Tensor
-    T_world_body: torch.Tensor
+    patch: torch.Tensor
     seed: int
 
     @cached_property
@@ -73,13 +81,23 @@ class PlacementTask:
     def samples(self):
         return self.velocity.shape[0] * self.velocity.shape[1]
 
+    def poses(self, T_body_cam):
+        """T_world_cam [B, T, 4, 4] of mounts [B, 4, 4], one per sample (world by world)."""
+        velocity, zero = self.velocity.reshape(-1, 3), torch.zeros(self.samples, dtype=torch.float64)
+        twist = torch.stack([velocity[:, 0], velocity[:, 1], zero, zero, zero, velocity[:, 2]], 1)
+        moving = se3_exp((self.t_s - DURATION_S / 2)[:, None] * twist[:, None])
+        patch = self.patch.reshape(-1, 3)
+        looked_at, heading = footprint(T_body_cam)
+        start = planar(patch[:, :2], patch[:, 2]) @ planar(zero[:, None].expand(-1, 2), -heading) @ planar(-looked_at, zero)
+        return start[:, None] @ moving @ T_body_cam[:, None]
+
     def frames(self, T_body_cam):
-        """[T, B, H, W] of mounts [B, 4, 4], one per sample (world by world)."""
+        """[T, B, H, W] of mounts [B, 4, 4]."""
         rays, parts = self.camera.rays(), []
-        for world, bodies, mounts in zip(self.worlds, self.T_world_body, T_body_cam.reshape(*self.velocity.shape[:2], 1, 4, 4), strict=True):
-            poses = bodies @ mounts
-            image = render.shade(rays, world, poses.reshape(-1, 4, 4), SAMPLES)
-            parts.append(image.reshape(*poses.shape[:2], *self.camera.film.shape).transpose(0, 1))
+        poses = self.poses(T_body_cam).reshape(len(self.worlds), -1, FRAMES, 4, 4)
+        for world, each in zip(self.worlds, poses, strict=True):
+            image = render.shade(rays, world, each.reshape(-1, 4, 4), SAMPLES)
+            parts.append(image.reshape(*each.shape[:2], *self.camera.film.shape).transpose(0, 1))
         return torch.cat(parts, 1)
 
     def volume(self, frames, layer="memory"):
@@ -89,7 +107,7 @@ class PlacementTask:
             return events.from_counts(events.soft_counts(frames, SENSOR.theta_on, SENSOR.theta_off), self.t_s, BINS)
         if layer == "sensor":
             volumes = [self._recorded(frames[:, k], k) for k in range(frames.shape[1])]
-            return type(volumes[0])(torch.cat([v.counts for v in volumes]), volumes[0].centroid_s, volumes[0].collected_s)
+            return EventVolume(torch.cat([v.counts for v in volumes]), volumes[0].centroid_s, volumes[0].collected_s)
         counts, _ = events.memory(frames, *events.draw_thresholds(SENSOR, self.camera.film.shape, self._noise(0), dtype=frames.dtype))
         return events.from_counts(counts + self._shots.to(counts), self.t_s, BINS)
 
@@ -112,35 +130,73 @@ class PlacementTask:
         meets = falling.detach() > 1e-6
         return torch.where(meets, T_body_cam[..., 2, 3, None] / torch.where(meets, falling, 1.0), torch.inf)
 
-    def estimate(self, T_body_cam, layer="memory"):
-        """Velocities [B, 3] estimated behind mounts [4, 4] or [B, 4, 4]. Gradient: mounts (straight-through for "memory", exact for "counts")."""
+    def estimate(self, T_body_cam, layer="memory", frames=None):
+        """Velocities [B, 3] estimated behind mounts [4, 4] or [B, 4, 4]; ``frames`` saves rendering them again.
+
+        Gradient: mounts (straight-through for "memory", exact for "counts").
+        """
         mounts = T_body_cam.expand(self.samples, 4, 4)
-        field = flow.estimate_lk(self.volume(self.frames(mounts), layer), model="affine", prior_px=PRIOR_PX)
         depth = self.depth_m(mounts)
-        near = torch.where(depth.isfinite(), depth, 1e3 * FAR_M)
-        weight = (DURATION_S / FLOW_NOISE_PX) ** 2 / (1 + (near / FAR_M) ** 4)
+        near = nearness(depth)
+        volume = self.volume(self.frames(mounts) if frames is None else frames, layer)
+        faded = volume.counts * near.to(volume.counts).reshape(-1, 1, 1, *self.camera.film.shape)
+        field = flow.estimate_lk(EventVolume(faded, volume.centroid_s, volume.collected_s), model="affine", prior_px=PRIOR_PX)
+        weight = near * (DURATION_S / FLOW_NOISE_PX) ** 2
         return place.velocity_from_flow(field.flow_px / DURATION_S, self.camera, depth, mounts, weight, PRIOR)
 
-    def errors(self, T_body_cam, layer="memory"):
-        return Errors(self.estimate(T_body_cam, layer) - self.velocity.reshape(-1, 3))
+    def errors(self, T_body_cam, layer="memory", frames=None):
+        return Errors(self.estimate(T_body_cam, layer, frames) - self.velocity.reshape(-1, 3))
+
+    def expected(self, T_body_cam, layer="counts", frames=None):
+        """Task error [B] to be expected from event noise alone: the Cramér-Rao bound of the velocity, given the edges that the events draw.
+
+        A pixel's event rate V ties one component of the velocity, by grad V . flow = -V_t with noise NOISE_RATE; place.planar_flow makes it a row.
+        Squares summed over thousands of pixels: unlike the error of one draw it has no sign that changes when the image shifts by a pixel, and
+        its gradient points where the task error falls. Gradient: mounts, as for ``estimate``.
+        """
+        mounts = T_body_cam.expand(self.samples, 4, 4)
+        depth = self.depth_m(mounts)
+        counts = self.volume(self.frames(mounts) if frames is None else frames, layer).counts.sum(2)
+        rate = gaussian_blur2d(counts[:, :1] - counts[:, 1:], (7, 7), (1.0, 1.0))
+        edges = spatial_gradient(rate, mode="diff")[:, 0].flatten(2).double()  # [B, 2, P]
+        flow_rows, _ = place.planar_flow(self.camera, depth, mounts)
+        rows = torch.einsum("bcp,bpck->bpk", edges, flow_rows) * (nearness(depth) * DURATION_S / NOISE_RATE)[..., None]
+        normal = rows.mT @ rows + torch.diag(torch.tensor(PRIOR, dtype=torch.float64) ** -2)
+        return (torch.linalg.inv(normal).diagonal(dim1=1, dim2=2) / SCALES**2).mean(1).sqrt()
+
+
+def nearness(depth_m):
+    """Weight of events and flow of ground at a depth: near 1 close by, 1/2 at FAR_M, 0 in the sky."""
+    return 1 / (1 + (torch.where(depth_m.isfinite(), depth_m, 1e3 * FAR_M) / FAR_M) ** 4)
+
+
+def footprint(T_body_cam):
+    """Where mounts [B, 4, 4] look: point on the ground [B, 2] m (drawn in smoothly when the view nears the horizon), and heading [B] of the image about the vertical."""
+    view, height = T_body_cam[:, :3, 2], T_body_cam[:, 2, 3]
+    looked_at = T_body_cam[:, :2, 3] + (height * (view[:, 2] ** 2 + 0.1**2).rsqrt())[:, None] * view[:, :2]
+    down = T_body_cam[:, :3, :3] * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # against a camera that looks straight down
+    return looked_at, torch.atan2(down[:, 1, 0] - down[:, 0, 1], down[:, 0, 0] + down[:, 1, 1])
+
+
+def planar(place_m, heading_rad):
+    """Rigid motions [B, 4, 4] in the plane: places [B, 2] and headings [B]."""
+    c, s, zero, one = heading_rad.cos(), heading_rad.sin(), torch.zeros_like(heading_rad), torch.ones_like(heading_rad)
+    rows = [torch.stack([c, -s, zero, place_m[:, 0]], 1), torch.stack([s, c, zero, place_m[:, 1]], 1)]
+    return torch.stack([*rows, torch.stack([zero, zero, one, zero], 1), torch.stack([zero, zero, zero, one], 1)], 1)
 
 
 def make_world(name):
-    """Ground with a photograph (8 mm a texel, averaged from 2 mm) or with speckle of periods from 24 to 256 mm."""
+    """Ground with a photograph laid out over 2 m, or with speckle of periods from 64 to 512 mm: nothing finer than a few pixels at the near ground."""
     if name.startswith("speckle-"):
-        return worlds.ground(textures.speckle(int(name.split("-")[1])), texel_m=0.004)
-    return worlds.ground(textures.shrunk(textures.photo(name), 4), texel_m=0.008)
+        return worlds.ground(textures.speckle(int(name.split("-")[1]), finest_px=8.0, coarsest_px=64.0), texel_m=0.008)
+    return worlds.ground(textures.shrunk(textures.photo(name), 4), texel_m=0.016)
 
 
 def make_task(names, motions, seed):
-    """Samples on every named texture: mostly forward drives of 0.2 to 1 m/s with some slip and turns, from random places and headings."""
+    """Samples on every named texture: mostly forward drives of 0.2 to 1 m/s with some slip and turns, over random patches of ground."""
     generator = torch.Generator().manual_seed(seed)
-    draw = torch.randn(len(names), motions, 3, generator=generator, dtype=torch.float64)
-    forward = 0.2 + 0.8 * torch.rand(len(names), motions, generator=generator, dtype=torch.float64)
-    velocity = torch.stack([forward, 0.2 * draw[..., 1], 0.6 * draw[..., 2]], -1)
-    start = torch.rand(len(names), motions, 3, generator=generator, dtype=torch.float64) * torch.tensor([4.0, 4.0, 2 * math.pi], dtype=torch.float64) - 2
-    zero = torch.zeros_like(forward)
-    at = se3_exp(torch.stack([start[..., 0], start[..., 1], zero, zero, zero, zero], -1)) @ se3_exp(torch.stack([zero, zero, zero, zero, zero, start[..., 2]], -1))
-    t_s = torch.linspace(0, DURATION_S, FRAMES, dtype=torch.float64)
-    twist = torch.stack([velocity[..., 0], velocity[..., 1], zero, zero, zero, velocity[..., 2]], -1)
-    return PlacementTask(tuple(make_world(name) for name in names), velocity, at[..., None, :, :] @ se3_exp(t_s[:, None] * twist[..., None, :]), seed)
+    draw = torch.randn(len(names), motions, 2, generator=generator, dtype=torch.float64)
+    uniform = torch.rand(len(names), motions, 4, generator=generator, dtype=torch.float64)
+    velocity = torch.stack([0.2 + 0.8 * uniform[..., 0], 0.2 * draw[..., 0], 0.6 * draw[..., 1]], -1)
+    patch = (uniform[..., 1:] - 0.5) * torch.tensor([4.0, 4.0, 2 * math.pi], dtype=torch.float64)
+    return PlacementTask(tuple(make_world(name) for name in names), velocity, patch, seed)

@@ -183,6 +183,7 @@ def main(study: Callable[[Run[Config]], None], kind: type[Config], arguments: li
     name = _name(kind)
     config = tyro.cli(kind, prog=f"python -m studies.{name}", description=sys.modules[study.__module__].__doc__, args=arguments)
     matplotlib.use("Agg")  # figures go to files; no screen is needed
+    torch.set_num_threads(1)  # the heavy work is in drjit's own thread pool, which torch's waiting threads only slow down (measured: 2x)
     run = None
     try:
         with Interruption() as interruption:

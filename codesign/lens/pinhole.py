@@ -17,7 +17,9 @@ class ThinLens:
         self.entrance_pupil_diameter_mm = float(entrance_pupil_diameter_mm)
         self.image_distance_mm = self.efl_mm if image_distance_mm is None else torch.as_tensor(image_distance_mm, dtype=self.efl_mm.dtype)
         if not (float(self.efl_mm.detach()) > 0 and float(self.image_distance_mm.detach()) > 0):
-            raise DomainError(f"thin lens: focal length {float(self.efl_mm)} mm and image distance {float(self.image_distance_mm)} mm must be positive.")
+            raise DomainError(f"thin lens: focal length {float(self.efl_mm.detach())} mm and image distance {float(self.image_distance_mm.detach())} mm must be positive.")
+        if not 0 <= self.entrance_pupil_diameter_mm < float("inf"):
+            raise DomainError(f"thin lens: entrance pupil diameter {self.entrance_pupil_diameter_mm} mm must be finite and at least 0 (0 is a pinhole).")
 
     @property
     def dtype(self):

@@ -84,11 +84,11 @@ def trace(prescription, origin_mm, direction):
     conics = _active(p.conic, lambda k: k != 0)
     terms = [_last_active(row) for row in p.asphere.unbind(0)] if p.asphere.shape[1] else [0] * surfaces
     refracts = [a != b for a, b in zip(p.index[:-1].tolist(), p.index[1:].tolist(), strict=True)]
-    kernel = _Kernel(surfaces, p.asphere.shape[1], tuple(conics), tuple(terms), tuple(refracts), p.soft_edge_mm)
-    packed = torch.cat([p.curvature_per_mm, p.thickness_mm, p.conic, p.index, p.semi_aperture_mm, p.asphere.reshape(-1)])
-    columns = [*origin_mm.unbind(1), *direction.unbind(1), packed]
-    x, y, dx, dy, dz, path, weight, deficit, status, failed = run_kernel(kernel, columns, [(count,)] * 10)
-    return TraceResult(torch.stack([x, y, torch.zeros_like(x)], 1), torch.stack([dx, dy, dz], 1), path, weight, status, failed, deficit)
+    kernel = _Kernel(surfaces, p.asphere.shape[1], tuple(conics), tuple(terms), tuple(refracts))
+    ratio = p.index[:-1] / p.index[1:]
+    per_mm2 = 0.5 / (max(p.soft_edge_mm, 1e-6) * p.semi_aperture_mm)  # slope of the apertures' edges in r^2
+    columns = [origin_mm, direction, p.curvature_per_mm, p.thickness_mm, p.conic, p.index, ratio, per_mm2, p.semi_aperture_mm.square() * per_mm2 + 0.5, p.asphere]
+    return TraceResult(*run_kernel(kernel, columns, [(count, 3), (count, 3), *[(count,)] * 5]))
 
 
 def _active(tensor, test):
@@ -109,42 +109,39 @@ class _Kernel:
     conics: tuple[bool, ...]
     terms: tuple[int, ...]
     refracts: tuple[bool, ...]
-    soft_edge_mm: float
 
-    def __call__(self, arr, x, y, z, dx, dy, dz, packed):
+    def __call__(self, arr, origin, direction, *prescription):
         import drjit as dr
 
-        S, width = self.surfaces, self.asphere_width
-        wide = widen(arr, packed, 5 * S + 1 + S * width, dr.width(x))
-        c, t, k, n, a = wide[:S], wide[S : 2 * S], wide[2 * S : 3 * S], wide[3 * S : 4 * S + 1], wide[4 * S + 1 : 5 * S + 1]
-        asphere = [wide[5 * S + 1 + i * width :][: self.terms[i]] for i in range(S)]
-        o, d = arr.Array3(x, y, z), arr.Array3(dx, dy, dz)
-        alive, path, weight, deficit = dr.full(arr.Bool, True, dr.width(x)), arr.Float(0), arr.Float(1), arr.Float(0)
-        status, failed = arr.Int32(0), arr.Int32(-1)
-        edge = dr.opaque(arr.Float, max(self.soft_edge_mm, 1e-6))
+        S = self.surfaces
+        c, t, k, n, ratio, per_mm2, reach, terms = (widen(arr, values, dr.width(values), dr.width(origin) // 3) for values in prescription)
+        asphere = [terms[i * self.asphere_width :][: self.terms[i]] for i in range(S)]
+        alive, path, weight, deficit = dr.full(arr.Bool, True, dr.width(origin) // 3), arr.Float(0), arr.Float(1), arr.Float(0)
+        o, d = dr.unravel(arr.Array3, origin), dr.unravel(arr.Array3, direction)
+        fate = arr.Int32(-4)  # 4 x surface + status of the failure
         ahead = d.z > FORWARD
         start = dr.select(ahead, -o.z / dr.select(ahead, d.z, 1), 0)  # to the first vertex plane: far objects would drown the quadratic in rounding
         o, path = arr.Array3(o.x + d.x * start, o.y + d.y * start, dr.select(ahead, 0, o.z)), path + n[0] * start
         for i in range(S):
             conic = k[i] if self.conics[i] else None
-            step, hit, lack = _intersect(arr, o, d, c[i], conic, asphere[i], alive)
-            deficit += dr.select(alive & ~hit, lack, 0)
+            step, now, lack = _intersect(arr, o, d, c[i], conic, asphere[i], alive)
             o, path = o + d * step, path + n[i] * step
-            weight *= _soft_edge((dr.square(a[i]) - dr.square(o.x) - dr.square(o.y)) / (2 * a[i] * edge))
-            here, now = dr.select(alive & ~hit, arr.Int32(int(Status.MISS)), 0), alive & hit
+            weight *= _soft_edge(reach[i] - per_mm2[i] * (dr.square(o.x) + dr.square(o.y)))
+            here = arr.Int32(4 * i + Status.MISS)
             if self.refracts[i]:
-                d, kept, lack = _refract(arr, d, _normal(dr.select(now, o, 0), c[i], conic, asphere[i]), n[i] / n[i + 1], now)
-                deficit += dr.select(now & ~kept, lack, 0)
-                here, now = dr.select(now & ~kept, arr.Int32(int(Status.TOTAL_REFLECTION)), here), kept
-            status, failed = dr.select(alive, here, status), dr.select(alive & ~now, arr.Int32(i), failed)
-            alive = now
+                plain = conic is None and not asphere[i]
+                d, kept, lost = _refract(arr, d, _normal(o if plain else dr.select(now, o, 0), c[i], conic, asphere[i]), ratio[i], now)
+                here, lack, now = dr.select(now, arr.Int32(4 * i + Status.TOTAL_REFLECTION), here), dr.select(now, lost, lack), kept
+            fails = alive & ~now
+            fate, deficit, alive = dr.select(fails, here, fate), dr.select(fails, lack, deficit), now
             o = arr.Array3(o.x, o.y, o.z - t[i])
         forward = alive & (d.z > FORWARD)
-        deficit += dr.select(alive & ~forward, FORWARD - d.z, 0)
-        status, failed = dr.select(alive & ~forward, arr.Int32(int(Status.MISS)), status), dr.select(alive & ~forward, arr.Int32(S), failed)
+        fails = alive & ~forward
+        fate, deficit = dr.select(fails, arr.Int32(4 * S + Status.MISS), fate), dr.select(fails, FORWARD - d.z, deficit)
         step = -o.z / dr.select(forward, d.z, 1)
         step = dr.select(forward, step, 0)
-        return o.x + d.x * step, o.y + d.y * step, d.x, d.y, d.z, path + n[S] * step, dr.select(forward, weight, 0), deficit, status, failed
+        position = arr.Array3(o.x + d.x * step, o.y + d.y * step, 0)
+        return dr.ravel(position), dr.ravel(d), path + n[S] * step, dr.select(forward, weight, 0), fate & 3, fate >> 2, deficit
 
 
 def _intersect(arr, o, d, c, conic, asphere, alive):
@@ -217,10 +214,10 @@ def _normal(o, c, conic, asphere):
 
 
 def _soft_edge(x):
-    """Smooth step from 0 to 1 over x in [-1/2, 1/2]; exactly 0 and 1 outside. x is the distance from the edge over its width."""
+    """Smooth step from 0 to 1 over x in [0, 1]; exactly 0 and 1 outside."""
     import drjit as dr
 
-    u = dr.clip(x + 0.5, 0, 1)
+    u = dr.clip(x, 0, 1)
     return u * u * (3 - 2 * u)
 
 

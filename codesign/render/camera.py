@@ -27,6 +27,19 @@ class Film:
     pixel_pitch_mm: float
     windows_px: tuple[tuple[int, int], ...] | None = None
 
+    def check(self):
+        """Raise DomainError unless there are pixels and every window lies on the sensor; returns the film."""
+        for label in ("sensor_width_px", "sensor_height_px", "width_px", "height_px"):
+            _check_whole(label, getattr(self, label))
+        if not 0 < self.pixel_pitch_mm < float("inf"):
+            raise DomainError(f"camera: pixel_pitch_mm = {self.pixel_pitch_mm} must be positive and finite.")
+        if self.windows_px is not None and len(self.windows_px) == 0:
+            raise DomainError("camera: there is no window on the film; give at least one, or None for the whole sensor.")
+        for left, top in self.windows_px or ((0, 0),):
+            if not (0 <= left <= self.sensor_width_px - self.width_px and 0 <= top <= self.sensor_height_px - self.height_px):
+                raise DomainError(f"camera: the window ({left}, {top}) of {self.width_px} x {self.height_px} pixels does not lie on the sensor of {self.sensor_width_px} x {self.sensor_height_px}; move or shrink it.")
+        return self
+
     @property
     def shape(self):
         """Shape of one image: (H, W), or (windows, H, W)."""
@@ -44,6 +57,11 @@ class Film:
         return (corners[:, None] + base).reshape(-1, 2)
 
 
+def _check_whole(label, value):
+    if not (value >= 1 and value % 1 == 0):
+        raise DomainError(f"camera: {label} = {value} must be a whole number of at least 1.")
+
+
 class Camera:
     """A lens (GeoLens, ThinLens or Pinhole: anything with ``camera_rays``) before a film.
 
@@ -51,13 +69,9 @@ class Camera:
     """
 
     def __init__(self, lens, width_px, height_px, pixel_pitch_mm, samples_per_pixel=16, seed=0, film=None):
-        for label, value in (("width_px", width_px), ("height_px", height_px), ("samples_per_pixel", samples_per_pixel)):
-            if int(value) != value or value < 1:
-                raise DomainError(f"camera: {label} = {value} must be a whole number of at least 1.")
-        if not pixel_pitch_mm > 0:
-            raise DomainError(f"camera: pixel_pitch_mm = {pixel_pitch_mm} must be positive.")
+        _check_whole("samples_per_pixel", samples_per_pixel)
         self.lens, self.samples_per_pixel, self.seed = lens, int(samples_per_pixel), int(seed)
-        self.film = film or Film(width_px, height_px, width_px, height_px, pixel_pitch_mm)
+        self.film = (film or Film(width_px, height_px, width_px, height_px, pixel_pitch_mm)).check()
 
     def with_lens(self, lens):
         """The same film and samples behind another lens."""

@@ -1,8 +1,7 @@
 """All frames of a sequence in one wavefront: camera-space rays x poses -> frames."""
 
-
 from codesign.backend import run_kernel
-from codesign.errors import ShapeError
+from codesign.errors import DomainError, ShapeError
 from codesign.pose import check_poses
 
 
@@ -23,6 +22,8 @@ def shade(rays, scene, T_world_cam, samples_per_pixel):
     """
     check_poses(T_world_cam)
     count, poses = rays.weight.numel(), T_world_cam.shape[0]
+    if not samples_per_pixel >= 1:
+        raise DomainError(f"samples_per_pixel = {samples_per_pixel} must be at least 1.")
     if count % samples_per_pixel:
         raise ShapeError(f"{count} rays are not a whole number of pixels at {samples_per_pixel} samples each.")
     dtype = scene.dtype
@@ -49,5 +50,3 @@ class _Wavefront:
         direction = arr.Array3(*[m[4 * r] * d.x + m[4 * r + 1] * d.y + m[4 * r + 2] * d.z for r in range(3)])
         light = self.scene.radiance(arr, origin, direction) * dr.gather(arr.Float, weight, ray)
         return (dr.block_sum(light, self.samples) / self.samples,)
-
-

@@ -79,11 +79,11 @@ def test_points_outside_the_field_are_nan_and_leave_the_others_alone():
     geo = camera.lens
     both = project(camera, torch.cat([outside, inside]))
     assert both[:3].isnan().all()
-    assert torch.equal(both[3:], project(camera, inside))
+    torch.testing.assert_close(both[3:], project(camera, inside), rtol=0, atol=1e-11)  # they may take a Newton step more
     assert project(camera, outside).isnan().all()
     (mixed,) = torch.autograd.grad(both[3:].sum(), geo.curvature_per_mm)
     (alone,) = torch.autograd.grad(project(camera, inside).sum(), geo.curvature_per_mm)
-    torch.testing.assert_close(mixed, alone, rtol=1e-12, atol=0)
+    torch.testing.assert_close(mixed, alone, rtol=1e-9, atol=0)  # the Jacobian is that of the last step but one
     assert project(camera, inside[:0]).shape == (0, 2)
 
 
@@ -156,28 +156,27 @@ def test_the_blur_disc_of_a_thin_lens_has_the_diameter_of_the_defocus_formula():
 def test_defocus_takes_contrast_away_as_a_blur_disc_does(optics):
     # a faint grating: contrast falls by 2 J1(x) / x of the disc (x = pi frequency diameter) and sinc of the pixel (Goodman, 6.4)
     triplet = fitted("cooke-triplet")
-    focused = triplet.replace(thickness_mm=torch.cat([triplet.thickness_mm[:-1], triplet.first_order().bfl_mm.reshape(1) + 0.16]))
+    stopped = lens.GeoLens(triplet.to_surfaces(), triplet.entrance_pupil_diameter_mm / 8)  # f/40: spherical aberration is 1 % of this defocus
+    focused = stopped.replace(thickness_mm=torch.cat([stopped.thickness_mm[:-1], stopped.first_order().bfl_mm.reshape(1) + 0.6]))
     optic = focused.thin() if optics == "thin" else focused
     f = float(focused.first_order().efl_mm.detach())
-    image = f + 0.16
-    z = 3.0
-    diameter_m = 1e-3 * float(focused.entrance_pupil_diameter_mm) * abs(1 - z * 1e3 * (1 / f - 1 / image))  # of the disc at the object
-    pixel_m = PITCH_MM / image * z
+    image, z, pitch_mm = f + 0.6, 3.0, 0.004
+    diameter_m = 1e-3 * focused.entrance_pupil_diameter_mm * abs(1 - z * 1e3 * (1 / f - 1 / image))  # of the disc at the object
+    pixel_m = pitch_mm / image * z
     frequency = 0.7 / diameter_m  # x = 2.2: contrast 0.5
     plane = TexturedPlane([[frequency, 0.0]], [1e-3], [0.0], dtype=D)
     away = look_at((0, 0, z), (0, 0, 0), down=(0, 1, 0))
-    film = Film(*SENSOR_PX, 64, 1, PITCH_MM, ((141, 129),))
-    camera = Camera(optic, 64, 1, PITCH_MM, 256, film=film)
+    camera = Camera(optic, 64, 1, pitch_mm, 256)
     with torch.no_grad():
-        row = render.frames(camera, plane, away[None])[0, 0, 0]
-    x = (torch.arange(64, dtype=D) + 141 - 172.5) * pixel_m
+        row = render.frames(camera, plane, away[None])[0, 0]
+    x = (torch.arange(64, dtype=D) - 31.5) * pixel_m
     design = torch.stack([torch.ones_like(x), (2 * math.pi * frequency * x).cos(), (2 * math.pi * frequency * x).sin()], 1)
     mean, cosine, sine = torch.linalg.lstsq(design, row[:, None]).solution[:, 0].tolist()
     contrast = math.hypot(cosine, sine) / mean / 1e-3
     disc, box = math.pi * frequency * diameter_m, math.pi * frequency * pixel_m
     truth = 2 * j1(disc) / disc * math.sin(box) / box
-    # 256 samples: 1 %; the triplet's own aberrations near the axis (blur of 1.4 um beside 30 um) and its real magnification: 2 %
-    assert abs(contrast / truth - 1) <= 0.03
+    # the formula's slope is -1.2 at x = 2.2: 1 % in the disc is 2 % in contrast; 256 samples add 1 %
+    assert abs(contrast / truth - 1) <= (0.01 if optics == "thin" else 0.03)
     assert truth < 0.6
 
 

@@ -1,0 +1,171 @@
+"""Mitsuba worlds: constants come back, pictures stand upright, static cameras see static frames."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from codesign import lens, render
+from codesign.errors import DomainError, FileFormatError, ShapeError
+from codesign.pose import look_at
+from codesign.render import Camera, MitsubaScene
+from scenes import textures, worlds
+
+D = torch.float64
+CORNERS = np.array([[10.0, 60.0], [120.0, 200.0]], dtype=np.float32)  # top left, top right; bottom left, bottom right
+
+
+def quadrants(size=64):
+    return np.kron(CORNERS, np.ones((size // 2, size // 2), dtype=np.float32))
+
+
+def corners_seen(scene, pose, spread_px=10):
+    """Radiance a little away from the image's middle, as [[top left, top right], [bottom left, bottom right]]."""
+    camera = Camera(lens.Pinhole(8.0), 64, 64, 0.05, 1)
+    image = render.frames(camera, scene, pose[None])[0]
+    at = [32 - spread_px, 31 + spread_px]
+    return image[at][:, at].numpy()
+
+
+def test_a_constant_wall_is_that_constant():
+    scene = worlds.wall(np.full((16, 16), 37.5, dtype=np.float32))
+    image = render.frames(Camera(lens.ThinLens(8.0, 2.0), 12, 9, 0.1, 8), scene, look_at((0.3, -2, 0.4), (0, 0, 0.1))[None])
+    torch.testing.assert_close(image, torch.full((1, 9, 12), 37.5), rtol=1e-6, atol=0)  # interpolation weights and the mean of 8 round
+
+
+def test_a_picture_on_the_wall_is_upright_and_not_mirrored():
+    scene = worlds.wall(quadrants(512), texel_m=16 / 512, half_width_m=8.0)  # the picture once over the whole wall
+    np.testing.assert_allclose(corners_seen(scene, look_at((0, -2, 0), (0, 0, 0))), CORNERS, rtol=1e-6)
+
+
+def test_a_picture_on_the_ground_is_upright_for_one_who_faces_north():
+    scene = worlds.ground(quadrants(512), texel_m=24 / 512, half_width_m=12.0)
+    np.testing.assert_allclose(corners_seen(scene, look_at((0, 0, 2), (0, 0, 0), down=(0, -1, 0))), CORNERS, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("wall", "target"), [(0, (0, 2, 1.3)), (1, (0, -2, 1.3)), (2, (2, 0, 1.3)), (3, (-2, 0, 1.3))])
+def test_pictures_in_the_room_are_upright_and_each_on_its_wall(wall, target):
+    level = 60.0
+    pictures = [np.full((64, 64), level, dtype=np.float32)] * 6
+    pictures[wall] = quadrants()
+    scene = worlds.room(photos=pictures, objects=False)
+    np.testing.assert_allclose(corners_seen(scene, look_at((0, 0, 1.3), target)), CORNERS, rtol=1e-6)
+    behind = [-c for c in target[:2]]
+    np.testing.assert_allclose(corners_seen(scene, look_at((0, 0, 1.3), (*behind, 1.3))), level, rtol=1e-6)
+
+
+def test_the_room_has_no_holes_at_its_seams():
+    scene = worlds.room(photos=[np.full((8, 8), 60.0, dtype=np.float32)] * 6, objects=False)
+    camera = Camera(lens.Pinhole(3.0), 96, 96, 0.06, 4)
+    views = [look_at((0.3, 0.2, 1.0), corner) for corner in ((2, 2, 0), (-2, 2, 2.6), (2, -2, 1.3))]
+    image = render.frames(camera, scene, torch.stack(views))
+    torch.testing.assert_close(image, torch.full_like(image, 60.0), rtol=1e-5, atol=0)
+
+
+def test_texels_have_the_size_they_are_given():
+    # black and bright squares of 0.1 m; from 2 m with 8 mm and 0.05 mm pixels one square is 8 pixels wide
+    camera = Camera(lens.Pinhole(8.0), 64, 8, 0.05, 1)
+    row = render.frames(camera, worlds.checkerboard(square_m=0.1), look_at((0.05, -2, 0.05), (0.05, 0, 0.05))[None])[0, 2]
+    edges = (row > 100).int().diff().nonzero().reshape(-1)
+    assert set(edges.diff().tolist()) == {8}
+    assert row.unique().numel() >= 2 and {10.0, 200.0} <= {round(v, 3) for v in row.tolist()}
+
+
+def test_a_static_camera_sees_equal_frames_and_the_seed_decides_the_samples():
+    scene = worlds.room()
+    pose = look_at((0.5, -1.2, 1.4), (0, 1, 0.8))
+    geo = lens.load("cooke-triplet").scaled(0.1)
+    image = render.frames(Camera(geo, 24, 16, 0.1, 8, seed=1), scene, pose.repeat(5, 1, 1))
+    assert all(torch.equal(image[0], other) for other in image[1:])
+    assert torch.equal(render.frames(Camera(geo, 24, 16, 0.1, 8, seed=1), scene, pose[None])[0], image[0])
+    assert not torch.equal(render.frames(Camera(geo, 24, 16, 0.1, 8, seed=2), scene, pose[None])[0], image[0])
+
+
+def test_ten_kilometres_away_single_precision_still_renders():
+    # a wall at 10 km with texels of 10 m: pixel means of a scene 5000 times closer and finer
+    texture = textures.speckle(0, 64, finest_px=6.0)
+    near, far = worlds.wall(texture, 0.002, 0.064), worlds.wall(texture, 10.0, 320.0)
+    camera = Camera(lens.load("cooke-triplet"), 16, 12, 0.1, 4)
+    a = render.frames(Camera(lens.Pinhole(50.0), 16, 12, 0.1, 4), near, look_at((0, -2, 0), (0, 0, 0))[None])
+    b = render.frames(Camera(lens.Pinhole(50.0), 16, 12, 0.1, 4), far, look_at((0, -1e4, 0), (0, 0, 0))[None])
+    torch.testing.assert_close(a, b, rtol=1e-3, atol=0)  # positions on the wall round to 1e-4 texels, contrasts per texel are below 5
+    poses = torch.stack([look_at((0, -1e4, 0), (0, 0, 0)), look_at((10.0, -1e4, 0), (10.0, 0, 0))])
+    flow, valid = render.true_flow(camera, far, poses)
+    efl = float(camera.lens.first_order().efl_mm.detach())
+    assert bool(valid.all())
+    torch.testing.assert_close(flow[0, 0], torch.full((12, 16), -efl / 0.1 * 10.0 / 1e4, dtype=D), rtol=5e-3, atol=0)  # distortion and the pupil's place
+
+
+def test_scenes_and_textures_that_cannot_be_are_refused(tmp_path):
+    bad = quadrants()
+    bad[3, 4] = math.nan
+    with pytest.raises(DomainError, match="texture of the scene: NaN or infinite"):
+        worlds.wall(bad)
+    with pytest.raises(DomainError, match="negative"):
+        worlds.ground(-quadrants())
+    with pytest.raises(DomainError, match=r"shape \(64,\)"):
+        worlds.room(photos=[np.ones(64)])
+    with pytest.raises(DomainError, match="Mitsuba cannot build the scene"):
+        MitsubaScene({"shape": {"type": "no-such-shape"}})
+    with pytest.raises(FileFormatError, match="neither a file nor one of brick"):
+        textures.photo("nowhere.png")
+    (tmp_path / "broken.png").write_bytes(b"not a picture")
+    with pytest.raises(FileFormatError, match=r"broken\.png is not a readable image"):
+        textures.photo(tmp_path / "broken.png")
+
+
+def test_bad_poses_and_ray_counts_are_refused():
+    camera, scene = Camera(lens.Pinhole(8.0), 4, 4, 0.1, 4), worlds.smooth_plane()
+    with pytest.raises(ShapeError, match="poses must be"):
+        render.frames(camera, scene, torch.eye(4, dtype=D))
+    with pytest.raises(DomainError, match="not rigid"):
+        render.frames(camera, scene, 1.1 * torch.eye(4, dtype=D)[None])
+    with pytest.raises(DomainError, match="poses"):
+        render.frames(camera, scene, torch.full((1, 4, 4), math.nan, dtype=D))
+    with pytest.raises(ShapeError, match="64 rays are not a whole number of pixels at 5"):
+        render.shade(camera.rays(), scene, torch.eye(4, dtype=D)[None], 5)
+    with pytest.raises(DomainError, match="samples_per_pixel = 0"):
+        render.shade(camera.rays(), scene, torch.eye(4, dtype=D)[None], 0)
+
+
+# ---- textures
+
+
+@pytest.mark.parametrize("name", textures.PHOTOS)
+def test_photographs_are_linear_luminance_above_the_lift(name):
+    picture = textures.photo(name, 128)
+    assert (picture.dtype, picture.shape) == (np.float32, (128, 128))
+    assert textures.LIFT <= picture.min() < picture.max() <= 255.001
+
+
+def test_a_photograph_is_linearised_as_srgb(tmp_path):
+    import imageio.v3 as imageio
+
+    values = np.array([[0, 10, 188, 255]], dtype=np.uint8).repeat(2, 0)
+    imageio.imwrite(tmp_path / "gray.png", values)
+    # IEC 61966-2-1 by hand: 10/255 is on the straight part, 188 is linear 0.5029
+    linear = np.array([0.0, 10 / 255 / 12.92, 0.502886, 1.0])
+    np.testing.assert_allclose(textures.photo(tmp_path / "gray.png")[0], 2 + 253 * linear, rtol=2e-6)
+    colour = np.zeros((2, 2, 3), dtype=np.uint8)
+    colour[..., 1] = 255
+    imageio.imwrite(tmp_path / "green.png", colour)
+    np.testing.assert_allclose(textures.photo(tmp_path / "green.png"), 2 + 253 * 0.7152, rtol=2e-6)  # luminance is a sum of linear light
+
+
+def test_speckle_keeps_its_band_and_contrast():
+    field = np.log(textures.speckle(5, 256, finest_px=4.0, coarsest_px=32.0, contrast=0.3).astype(np.float64) / 60)
+    assert field.std() == pytest.approx(0.3, rel=1e-5)
+    power = np.abs(np.fft.fft2(field)) ** 2
+    radius = np.hypot(np.fft.fftfreq(256)[:, None], np.fft.fftfreq(256))
+    inside = (radius >= 1 / 32) & (radius <= 1 / 4)
+    assert power[inside].sum() / power.sum() > 1 - 1e-9  # float32 rounding of the radiance
+    low = power[(radius >= 1 / 32) & (radius < 1 / 16)].sum()
+    assert low / power[(radius >= 1 / 8) & (radius <= 1 / 4)].sum() == pytest.approx(1, abs=0.25)  # equal power per octave; some 300 random modes
+
+
+def test_faded_pictures_end_in_the_level():
+    faded = textures.faded_to(quadrants(), 60.0)
+    for border in (faded[:2], faded[-2:], faded[:, :2], faded[:, -2:]):
+        assert (border == 60).all()
+    np.testing.assert_array_equal(faded[12:-12, 12:-12], quadrants()[12:-12, 12:-12])
