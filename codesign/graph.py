@@ -1,6 +1,7 @@
 """The chain of stages, with a probe at every junction."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,8 +19,8 @@ class Result:
     """
 
     junctions: dict[str, tuple[Tensor, ...]]
-    camera: object
-    field: object
+    camera: Any
+    field: Any
 
     @property
     def loss(self):
@@ -29,7 +30,7 @@ class Result:
         """Gradients at every junction; raises NonFiniteError naming the first junction (from the loss back) where one is not finite."""
         self.loss.backward()
         for name in reversed(JUNCTIONS):
-            if any(t.grad is not None and not bool(t.grad.isfinite().all()) for t in self.junctions[name]):
+            if any(t.grad is not None and not bool(t.grad.isfinite().all()) for t in self.junctions.get(name, ())):
                 raise NonFiniteError(f"the gradient became infinite or NaN at junction '{name}'; the stage after it (towards the loss) has the cause.")
 
     def table(self):
@@ -60,30 +61,36 @@ class Chain:
         self.lens, self.render, self.events, self.flow, self.objective = lens, render, events, flow, objective
 
     def __call__(self, design, recorded=None):
-        """Run the chain. ``recorded`` replaces the tensor of the junctions 'frames' or 'loss' upstream stages would make.
+        """Run the chain.
 
-        Raises: NonFiniteError naming the junction where a value first became infinite or NaN.
+        Args: recorded: junction name ("rays", "frames", "events", "flow") -> the object to put there; the stages before it are not run.
+        Returns: Result. Raises: NonFiniteError naming the junction where a value first became infinite or NaN; DomainError for other names.
         """
-        recorded = dict(recorded or {})
-        if set(recorded) - {"frames"}:
-            raise DomainError(f"recorded junctions {sorted(set(recorded) - {'frames'})} cannot be replaced; 'frames' can.")
-        seen = {}
+        recorded, seen = dict(recorded or {}), {}
+        if set(recorded) - set(_TENSORS):
+            raise DomainError(f"junctions {sorted(set(recorded) - set(_TENSORS))} cannot be replaced; {', '.join(_TENSORS)} can.")
+
+        def at(name, make):
+            value = recorded[name] if name in recorded else make()
+            seen[name] = _probe(name, _TENSORS[name](value))
+            return value
+
         camera = self.lens(design)
-        numbers = [getattr(camera.lens, name) for name in ("curvature_per_mm", "thickness_mm", "efl_mm") if torch.is_tensor(getattr(camera.lens, name, None))]
-        seen["lens"] = _probe("lens", numbers)
-        if "frames" in recorded:
-            seen["rays"], frames = (), recorded["frames"]
-        else:
-            rays = camera.rays()
-            seen["rays"] = _probe("rays", (rays.origin_m, rays.direction, rays.weight))
-            frames = self.render(rays, design)
-        seen["frames"] = _probe("frames", (frames,))
-        volume = self.events(frames, design)
-        seen["events"] = _probe("events", (volume.counts,))
-        field = self.flow(volume, design)
-        seen["flow"] = _probe("flow", (field.flow_px,))
+        seen["lens"] = _probe("lens", [value for value in (getattr(camera.lens, name, None) for name in ("curvature_per_mm", "thickness_mm", "efl_mm")) if torch.is_tensor(value)])
+        rays = lambda: at("rays", camera.rays)  # noqa: E731
+        frames = lambda: at("frames", lambda: self.render(rays(), design))  # noqa: E731
+        volume = lambda: at("events", lambda: self.events(frames(), design))  # noqa: E731
+        field = at("flow", lambda: self.flow(volume(), design))
         seen["loss"] = _probe("loss", (self.objective(field, camera, design),))
         return Result(seen, camera, field)
+
+
+_TENSORS = {
+    "rays": lambda rays: (rays.origin_m, rays.direction, rays.weight),
+    "frames": lambda frames: (frames,),
+    "events": lambda volume: (volume.counts,),
+    "flow": lambda field: (field.flow_px,),
+}
 
 
 def _probe(name, tensors):

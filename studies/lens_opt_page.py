@@ -28,7 +28,8 @@ def write(run, task, lenses, history, junctions, case, found):
     run.figure(_seen(task, lenses, case, run.config.samples), "frames_and_events", "Top of each pair: frame; below: ON minus OFF events (red minus blue).")
     run.section("The way there")
     done = list(range(1, len(history.loss) + 1))
-    run.figure(chain_figures.curves({"each step, its own cases": (done, history.loss), "fixed training cases": (history.checked_step, history.score)}, _loss_label(run.config.objective)), "loss_curve", "Loss while optimising.")
+    losses = {"each step, its own cases": (done, history.loss), "fixed training cases": (history.checked_step, history.score)}
+    run.figure(chain_figures.curves(losses, _loss_label(run.config.objective)), "loss_curve", "Loss while optimising.")
     run.figure(chain_figures.curves({f"field {h:g}": (history.checked_step, [row[k] for row in history.spot_um]) for k, h in enumerate(FIELDS)}, "RMS spot (µm)"), "spot_curve", "RMS spot of the best design so far.")
     for name, unit in (("curvature", "1/mm"), ("thickness", "mm")):
         rows = np.array(getattr(history, name))

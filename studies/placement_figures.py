@@ -47,11 +47,12 @@ def map_of(grid, size, descents):
     axes.set_yticks([15, 30, 45, 60, 75, 90], [f"{90 - t}°" for t in (15, 30, 45, 60, 75, 90)], color="white", fontsize=8)
     axes.set_rlabel_position(20)
     axes.set_xticks([math.radians(a) for a in range(0, 360, 45)], ["forward", "45°", "left 90°", "135°", "backward", "−135°", "right −90°", "−45°"])
+    axes.tick_params(axis="x", pad=9)
     axes.set_title("Task error by where the camera looks\n(middle: straight down, rim: horizon)", pad=14)
     bar = figure.colorbar(shown, ax=axes, shrink=0.75, pad=0.12, label="task error (0.1 m/s, 0.1 rad/s = 1)")
     bar.ax.yaxis.set_major_formatter(PLAIN)
     bar.ax.yaxis.set_minor_formatter(PLAIN)
-    figure.legend(loc="lower center", ncol=3, frameon=False, fontsize=9, bbox_to_anchor=(0.5, 0.0))
+    figure.legend(loc="lower center", ncol=3, frameon=False, fontsize=9, bbox_to_anchor=(0.5, 0.02))
     return figure
 
 

@@ -3,8 +3,11 @@
 The signed event rate of a moving texture moves with it, so the volume obeys V_t + u V_x + v V_y = 0 (Lucas and Kanade, 1981,
 with event rate in place of intensity). The volume is warped back along the current flow; per pixel, the regression of the
 bins over time gives V_t and their mean gives V_x, V_y; all pixels together give the parameters of an affine or quadratic
-field. A Gaussian prior on the flow, weighed against the noise seen in the residuals, keeps the steps small where events are few.
+field. A Gaussian prior on the flow, weighed against the noise seen in the residuals, and a Wiener factor on the slopes keep the
+steps small where events are few.
 """
+
+import math
 
 import torch
 from kornia.filters import gaussian_blur2d
@@ -13,6 +16,7 @@ from torch.nn.functional import grid_sample
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.types import FlowField
 
+_DOUBT = 3.0  # energy of slopes, over that of scattered events, from which they count as texture
 _BASES = {"constant": 1, "affine": 3, "quadratic": 6}
 
 
@@ -36,6 +40,9 @@ def estimate_lk(volume, model="affine", prior_px=8.0, levels_px=(4.0, 2.0, 1.0),
         raise DomainError(f"flow model '{model}' is unknown; choose one of {', '.join(_BASES)}.")
     check_finite(counts, "event volume")
     batch, _, _, height, width = counts.shape
+    least = _odd(max(levels_px))[0] // 2 + 1
+    if min(height, width) < least:
+        raise ShapeError(f"an event volume of {height} x {width} pixels is smaller than the blur of {max(levels_px)} px needs ({least} x {least}); give larger images or finer levels_px.")
     span = volume.collected_s.sum()
     share = (volume.collected_s / span).to(counts)[:, None, None]
     rate = (counts[:, 0] - counts[:, 1]) / share  # events per interval, as if each bin ran over all of it
@@ -54,7 +61,7 @@ def estimate_lk(volume, model="affine", prior_px=8.0, levels_px=(4.0, 2.0, 1.0),
             warped, seen = _warp(blurred, flow, time, grid, sigma)
             mean = (warped * weight).sum(1)
             slope = (warped * weight * (time - mean_time)[:, None, None]).sum(1) / (weight[:, 0, 0] * (time - mean_time).square()).sum()
-            change = _solve(slope, *_gradient(mean), seen, basis, parameters, prior, poisson * noise_floor, sigma)
+            change = _solve(slope, *_gradient(mean, total, sigma), seen, basis, parameters, prior, poisson * noise_floor, sigma)
             moved = torch.einsum("bck,khw->bchw", change, basis).square().sum(1).mean((1, 2))
             parameters = parameters + change * (1 + moved / (2 * sigma) ** 2).rsqrt()[:, None, None]  # no step beyond the reach of the linearisation
     flow = torch.einsum("bck,khw->bchw", parameters, basis)
@@ -88,10 +95,18 @@ def _warp(volume, flow, time, grid, sigma):
     return warped, (inside.clamp(0, 1).square() * (3 - 2 * inside.clamp(0, 1))).prod(-1).prod(1)
 
 
-def _gradient(image):
-    """Central differences d/dx, d/dy of [B, H, W]; one-sided at the border."""
+def _gradient(image, density, sigma):
+    """Central differences d/dx, d/dy of [B, H, W] (one-sided at the border), less what scattered events alone would show.
+
+    As many events per pixel [B] scattered at random give, after the Gaussian, a mean square slope of
+    density (1 - exp(-1 / sigma^2)) / (8 pi sigma^2). Slopes count in the share that exceeds _DOUBT times that (a Wiener factor): taken
+    for texture, scattered events would give flows of many pixels.
+    """
     dy, dx = torch.gradient(image, dim=(1, 2))
-    return dx, dy
+    scattered = density * ((1 - math.exp(-(sigma**-2))) / (8 * math.pi * sigma**2))
+    measured = (dx.square() + dy.square()).mean((1, 2)) / 2
+    texture = (1 - _DOUBT * scattered / measured.clamp_min(1e-30)).clamp_min(0)[:, None, None]
+    return texture * dx, texture * dy
 
 
 def _solve(slope, dx, dy, seen, basis, parameters, prior, floor, sigma):

@@ -25,6 +25,8 @@ class GeoLens(nn.Module):
     index_offset [S] (added to the index behind each surface, dimensionless, zero at first).
     """
 
+    semi_aperture_mm: torch.Tensor
+
     def __init__(self, surfaces, entrance_pupil_diameter_mm, dtype=torch.float64, soft_edge_mm=0.2, name="lens"):
         super().__init__()
         surfaces = tuple(surfaces)
@@ -73,7 +75,7 @@ class GeoLens(nn.Module):
     def freeze(self, *names):
         """Stop the gradient to the named tensors (all when none is named); returns the lens."""
         for name in names or tuple(self._parameters):
-            self._parameters[name].requires_grad_(False)
+            getattr(self, name).requires_grad_(False)
         return self
 
     def scaled(self, factor):
@@ -116,10 +118,11 @@ class GeoLens(nn.Module):
                 raise ShapeError(f"{label} must be [N >= 1, 3], got {tuple(value.shape)}.")
         if origin_mm.shape != direction.shape:
             raise ShapeError(f"{origin_mm.shape[0]} origins but {direction.shape[0]} directions were given; give one of each per ray.")
-        check_finite(origin_mm, "origin_mm")
-        length = float((torch.linalg.vector_norm(direction.detach(), dim=1) - 1).abs().max())
-        if not length < 1e-4:
-            raise DomainError(f"direction: lengths differ from 1 by up to {length:.3g}; give finite unit vectors (torch.nn.functional.normalize).")
+        if not all(map(math.isfinite, map(float, torch.aminmax(origin_mm.detach())))):
+            check_finite(origin_mm, "origin_mm")
+        shortest, longest = torch.aminmax(torch.mv(direction.detach().square(), torch.ones_like(direction[0]).detach()))
+        if not (0.9998 < float(shortest) and float(longest) < 1.0002):
+            raise DomainError(f"direction: squared lengths lie between {float(shortest):.6g} and {float(longest):.6g}; give finite unit vectors (torch.nn.functional.normalize).")
         return trace(self.prescription(wavelength_um), origin_mm, direction)
 
     def thin(self, wavelength_um=WAVELENGTH_UM["d"]):

@@ -6,7 +6,7 @@ that of the implicit function; vector form of Snell's law. A ray that fails is f
 safe inputs, so gradients stay finite, and it carries weight 0, a status and a deficit (how far its radicand fell below zero; 1 where Newton steps found no point of an asphere).
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 
 import torch
@@ -51,7 +51,7 @@ class Prescription:
 
     def to(self, dtype):
         """The same numbers in another precision; gradients flow through."""
-        return Prescription(*[getattr(self, f.name).to(dtype) for f in fields(self)[:-1]], self.soft_edge_mm)
+        return replace(self, **{f.name: getattr(self, f.name).to(dtype) for f in fields(self)[:-1]})
 
 
 @dataclass(frozen=True)

@@ -49,4 +49,6 @@ class _Wavefront:
         origin = arr.Array3(*[m[4 * r] * o.x + m[4 * r + 1] * o.y + m[4 * r + 2] * o.z + m[4 * r + 3] for r in range(3)])
         direction = arr.Array3(*[m[4 * r] * d.x + m[4 * r + 1] * d.y + m[4 * r + 2] * d.z for r in range(3)])
         light = self.scene.radiance(arr, origin, direction) * dr.gather(arr.Float, weight, ray)
+        if dr.grad_enabled(light):  # the adjoint of the sum needs no values of light: without this it would be rendered twice
+            light = dr.replace_grad(dr.zeros(arr.Float, dr.width(light)), light)
         return (dr.block_sum(light, self.samples) / self.samples,)
