@@ -148,6 +148,9 @@ def make_task(source, seed, detuned_px=2.2):
         half_field = math.radians(20.0)  # files do not say their field; that of the Cooke triplet
     nominal = published.scaled(HALF_DIAGONAL_MM / (float(published.first_order().efl_mm.detach()) * math.tan(half_field))).freeze()
     fields = tuple(math.atan(h * HALF_DIAGONAL_MM / float(nominal.first_order().efl_mm)) for h in FIELDS)
+    published_px = float(lens.rms_spot_mm(nominal, fields).mean()) / PITCH_MM
+    if published_px > 0.5 * detuned_px:
+        raise DomainError(f"lens {source}: its mean RMS spot is {published_px:.3g} pixels before any detuning, so there is little to win back; give a sharper lens or a larger --detuned-px.")
     around = make_design(nominal, fields, PITCH_MM)
     start = detune(around, fields, detuned_px * PITCH_MM, torch.Generator().manual_seed(seed))
     return LensTask(nominal, make_design(start, fields, PITCH_MM, floors=around), fields)

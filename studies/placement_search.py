@@ -63,7 +63,7 @@ def descend(task, mount, steps, advance=lambda error: None):
 
 
 def downhill(task, mount, numbers):
-    """Task error with hard events, and the direction [6] of steepest descent of the expected error, per UNIT (length 1, or 0 where no sample feels the mount).
+    """Task error with hard events, and the direction [6] of steepest descent of the expected error, per UNIT (length about 1, or 0 where no sample feels the mount).
 
     Single samples' gradients are heavy-tailed, so each is cut to the median length before they are averaged.
     """
@@ -80,7 +80,8 @@ def downhill(task, mount, numbers):
     cut = grads * (limit / lengths.clamp(min=1e-300)).clamp(max=1)[:, None]
     with torch.no_grad():
         error = float(task.errors(mount(numbers), frames=frames.detach()).task)
-    return error, -torch.nn.functional.normalize(cut.sum(0), dim=0)
+    way = -torch.nn.functional.normalize(cut.sum(0), dim=0)
+    return error, (16 * way).round() / 16  # the backward pass sums in any order (1e-5): without rounding no run would repeat another's path
 
 
 def random_search(task, mount, count, generator, advance=lambda error: None):
