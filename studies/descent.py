@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 
 import torch
 
+GRAIN = 256  # variables stay on a grid: parallel sums in the backward pass differ in their last bits, and a run must repeat to the same numbers
+
 
 @dataclass
 class Descent:
@@ -32,7 +34,7 @@ class Descent:
         norms = [float(g.norm()) for g in gradients]
         mean = torch.stack([g * min(1.0, self.clip / max(n, 1e-30)) for g, n in zip(gradients, norms, strict=True)]).mean(0)
         self.velocity = self.momentum * self.velocity + (1 - self.momentum) * (mean + self.pull * self.variables)
-        self.variables = self.variables - self.step_size * self.velocity
+        self.variables = ((self.variables - self.step_size * self.velocity) * GRAIN).round() / GRAIN
         return norms
 
     def check(self, score):

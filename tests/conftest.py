@@ -4,9 +4,13 @@ import os
 from pathlib import Path
 
 import pytest
-import torch
+
+import codesign  # noqa: F401  (first: it sets OpenMP's wait policy before torch is imported)
+
+import torch  # isort: skip
 
 os.environ.setdefault("MPLBACKEND", "Agg")
+torch.set_num_threads(1)  # small tensors: a second thread costs more than it gives
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = next((folder for folder in (ROOT / "shared", ROOT.parent / "shared") if folder.is_dir()), None)
 

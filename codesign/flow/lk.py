@@ -3,8 +3,8 @@
 The signed event rate of a moving texture moves with it, so the volume obeys V_t + u V_x + v V_y = 0 (Lucas and Kanade, 1981,
 with event rate in place of intensity). The volume is warped back along the current flow; per pixel, the regression of the
 bins over time gives V_t and their mean gives V_x, V_y; all pixels together give the parameters of an affine or quadratic
-field. A Gaussian prior on the flow, weighed against the noise seen in the residuals, and a Wiener factor on the slopes keep the
-steps small where events are few.
+field. A Gaussian prior on the flow, weighed against the noise seen in the residuals, and a Wiener factor on the slopes keep
+the steps small where events are few.
 """
 
 import math
@@ -16,7 +16,7 @@ from torch.nn.functional import grid_sample
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.types import FlowField
 
-_DOUBT = 3.0  # energy of slopes, over that of scattered events, from which they count as texture
+_DOUBT, _FALL = 4.0, 8.0  # energy of slopes, over that of scattered events, at which half of them counts as texture; how sharply it falls below
 _BASES = {"constant": 1, "affine": 3, "quadratic": 6}
 
 
@@ -98,14 +98,15 @@ def _warp(volume, flow, time, grid, sigma):
 def _gradient(image, density, sigma):
     """Central differences d/dx, d/dy of [B, H, W] (one-sided at the border), less what scattered events alone would show.
 
-    As many events per pixel [B] scattered at random give, after the Gaussian, a mean square slope of
-    density (1 - exp(-1 / sigma^2)) / (8 pi sigma^2). Slopes count in the share that exceeds _DOUBT times that (a Wiener factor): taken
-    for texture, scattered events would give flows of many pixels.
+    As many events per pixel [B] scattered at random give, after the Gaussian, a mean square slope s = density (1 - exp(-1 / sigma^2)) /
+    (8 pi sigma^2). Taken for texture they would give flows of many pixels, so slopes of mean square e count by 1 / (1 + (_DOUBT s / e)^_FALL):
+    a smooth Wiener factor, 1 for texture.
     """
     dy, dx = torch.gradient(image, dim=(1, 2))
     scattered = density * ((1 - math.exp(-(sigma**-2))) / (8 * math.pi * sigma**2))
     measured = (dx.square() + dy.square()).mean((1, 2)) / 2
-    texture = (1 - _DOUBT * scattered / measured.clamp_min(1e-30)).clamp_min(0)[:, None, None]
+    excess = measured.clamp_min(1e-30).log() - (_DOUBT * scattered).clamp_min(1e-30).log()
+    texture = torch.sigmoid(_FALL * excess)[:, None, None]
     return texture * dx, texture * dy
 
 
