@@ -119,11 +119,11 @@ def _moving_frames(seed, contrast=0.6):
 
 
 def count_rows(seed):
-    """Smooth event counts with respect to contrast, motion and threshold."""
+    """Smooth event counts with respect to contrast, motion and threshold. Small steps: counts have a kink where the level stands still."""
     frames, params = _moving_frames(seed)
     weight = torch.rand(7, 2, 24, 24, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     params = {**params, "theta": torch.tensor([0.2], dtype=torch.float64)}
-    return certify(lambda p: (weight * events.soft_counts(frames(p), p["theta"], p["theta"])).mean(), params, scales={"theta": 0.1, "shift": 0.1}, ladder=(1e-2, 1e-3, 1e-4), tolerance=1e-5)
+    return certify(lambda p: (weight * events.soft_counts(frames(p), p["theta"], p["theta"])).mean(), params, scales={"theta": 0.1, "shift": 0.1}, ladder=(1e-4, 1e-5, 1e-6), tolerance=1e-5)
 
 
 def flow_rows(seed):
@@ -136,7 +136,7 @@ def flow_rows(seed):
         found = flow.estimate_lk(volume, "constant", levels_px=(2.0, 1.0), steps=2).flow_px
         return found.mean() + 0.1 * found.square().mean()
 
-    return certify(fn, params, scales={"shift": 0.1}, ladder=(1e-2, 1e-3, 1e-4), tolerance=1e-5)
+    return certify(fn, params, scales={"shift": 0.1}, ladder=(1e-3, 1e-4, 1e-5), tolerance=1e-5)
 
 
 def _final(task, case_list, layer, samples, sensor=SENSOR):
@@ -177,7 +177,8 @@ def hard_rows(seed, count):
 
     Steps of half a pixel of ray motion and 1 to 2 pixels of image motion move several counts per pixel row. Single cases are
     noisy on both sides, so both are averaged over motions and textures before they are compared; the noise floor is the standard
-    error of the mean difference.
+    error of the mean difference. On walls that look alike everywhere the mean loss hardly depends on the pose: there the floor is
+    above 1, and the differences themselves say nothing.
     """
     task, pool = make_task("cooke-triplet", seed), make_worlds(TRAINING)
     task_cases = [draw_case(pool, 50_000 + i) for i in range(count)]

@@ -33,7 +33,7 @@ def study(run: Run[Config]):
         for label, required, certificate in cases:
             for row in certificate():
                 rows.append((label, required, row))
-                name = f"{label}_{row.name}".replace(" ", "_").replace("-", "_")
+                name = f"{label}_{row.name}".replace(",", "").replace(" ", "_")
                 run.record(**{f"{name}_relative_error": row.relative_error, f"{name}_cosine": row.cosine, f"{name}_signed_bias": row.signed_bias, f"{name}_noise_floor": row.noise_floor})
             bar.advance(error=worst([r for n, _, r in rows if n == label])[0])
     passed = [_passes(required, row) for _, required, row in rows]
@@ -66,7 +66,8 @@ def _passes(required, row):
 
 
 def _words(required):
-    return ", ".join([f"error ≤ {required['error']:g}"] * ("error" in required) + [f"cosine ≥ {required['cosine']:g}"] * ("cosine" in required))
+    signs = {"error": "≤", "cosine": "≥"}
+    return ", ".join(f"{name} {signs[name]} {value:g}" for name, value in required.items())
 
 
 if __name__ == "__main__":

@@ -10,4 +10,4 @@ from codesign.lens.pinhole import Pinhole, ThinLens
 from codesign.lens.surface import Surface
 from codesign.lens.trace import Status, TraceResult
 
-__all__ = ["WAVELENGTH_UM", "GeoLens", "Glass", "Pinhole", "Status", "Surface", "ThinLens", "TraceResult", "half_field_deg", "load", "rms_spot_mm", "save", "spots"]
+__all__ = ["WAVELENGTH_UM", "GeoLens", "Glass", "Pinhole", "Status", "Surface", "ThinLens", "TraceResult", "catalogue", "half_field_deg", "load", "rms_spot_mm", "save", "spots"]

@@ -121,7 +121,7 @@ class GeoLens(nn.Module):
         if not all(map(math.isfinite, map(float, torch.aminmax(origin_mm.detach())))):
             check_finite(origin_mm, "origin_mm")
         shortest, longest = torch.aminmax(torch.mv(direction.detach().square(), torch.ones_like(direction[0]).detach()))
-        if not (0.9998 < float(shortest) and float(longest) < 1.0002):
+        if not (float(shortest) > 0.9998 and float(longest) < 1.0002):
             raise DomainError(f"direction: squared lengths lie between {float(shortest):.6g} and {float(longest):.6g}; give finite unit vectors (torch.nn.functional.normalize).")
         return trace(self.prescription(wavelength_um), origin_mm, direction)
 

@@ -22,7 +22,7 @@ def pattern(seed, finest_px=6.0, coarsest_px=24.0, count=40):
     return lambda x, y: torch.cos(x[..., None] * kx + y[..., None] * ky + phase).sum(-1) * (2 / count) ** 0.5
 
 
-def moving(seed, matrix=((0.0, 0.0), (0.0, 0.0)), shift=(0.0, 0.0), per_pixel=8.0, steps=200, bins=5):
+def moving(seed, matrix=((0.0, 0.0), (0.0, 0.0)), shift=(0.0, 0.0), per_pixel=8.0, steps=80, bins=5):
     """Volume of a signed event rate carried along the flow matrix (x - centre) + shift, and that flow [2, H, W]."""
     matrix, shift = torch.tensor(matrix, dtype=D), torch.tensor(shift, dtype=D)
     y, x = torch.meshgrid(torch.arange(SIZE, dtype=D), torch.arange(SIZE, dtype=D), indexing="ij")

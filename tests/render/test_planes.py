@@ -65,7 +65,8 @@ def test_frames_equal_the_texture_through_the_homography(samples, dtype, toleran
 
 def test_the_sample_pattern_covers_the_pixel_and_the_pupil_evenly():
     offset, pupil = film_pupil_pattern(1024, 3)
-    assert bool((offset >= -0.5).all()) and bool((offset < 0.5).all())
+    assert bool((offset >= -0.5).all())
+    assert bool((offset < 0.5).all())
     assert float(pupil.square().sum(1).max()) <= 1
     # moments of a unit square and a unit disc; 1024 low-discrepancy points are good to about 1/1024 times some logarithms
     torch.testing.assert_close(offset.mean(0), torch.zeros(2, dtype=D), rtol=0, atol=2e-3)
@@ -110,8 +111,9 @@ def test_flow_equals_the_homography_between_the_poses():
 def test_texture_numbers_that_are_not_finite_are_refused(slot):
     numbers = [v.clone() for v in textures.waves(0)]
     numbers[slot].view(-1)[1] = math.nan
+    frequency, amplitude, phase = numbers
     with pytest.raises(DomainError, match=("frequency_per_m", "amplitude", "phase_rad")[slot]):
-        TexturedPlane(*numbers)
+        TexturedPlane(frequency, amplitude, phase)
 
 
 @pytest.mark.parametrize("mean", [-1.0, math.inf, math.nan])
