@@ -26,6 +26,7 @@ def write(run, task, lenses, history, junctions, case, found):
     run.figure(lens_figures.spot_diagrams(lenses, task.fields_rad, PITCH_MM), "spot_diagrams", "Spots at 587.6 nm about their mean; the red square is one pixel.")
     run.section("What the sensor sees", "One training scene through the detuned and the optimised lens: first frame and signed event counts over the whole interval, at the three windows.")
     run.figure(_seen(task, lenses, case, run.config.samples), "frames_and_events", "Top of each pair: frame; below: ON minus OFF events (red minus blue).")
+    _seed_emulator(run, task, lenses["optimised"], case)
     run.section("The way there")
     done = list(range(1, len(history.loss) + 1))
     losses = {"each step, its own cases": (done, history.loss), "fixed training cases": (history.checked_step, history.score)}
@@ -48,6 +49,16 @@ def write(run, task, lenses, history, junctions, case, found):
     run.finish("Lens optimisation for event flow", lead)
     run.say(f"flow error {m['flow_error_mrad_hard_detuned']:.3f} -> {m['flow_error_mrad_hard_optimised']:.3f} mrad (nominal {m['flow_error_mrad_hard_nominal']:.3f}), "
             f"RMS spot {m['rms_spot_um_detuned']:.1f} -> {m['rms_spot_um_optimised']:.1f} um (nominal {m['rms_spot_um_nominal']:.1f})")
+
+
+def _seed_emulator(run, task, optics, case):
+    """The seed project's view of the same scene: naive frame-difference events as CSV, and their exponential-decay video."""
+    with torch.no_grad():
+        frames = task.frames(task.camera(optics, run.config.samples, case.seed).rays(), case, run.config.samples)
+    stream = events.naive(frames.reshape(frames.shape[0], -1, frames.shape[-1]), case.t_s, SENSOR.theta_on)  # the windows above one another
+    events.write(run.path("events_naive.csv"), stream)
+    events.decay_video(run.path("events_decay.mp4"), stream, case.t_s, 0.015, fps=8)
+    run.video("events_decay.mp4", f"{len(stream)} events of the naive frame-difference emulator (events_naive.csv), fading over 15 ms; the three windows above one another.")
 
 
 def _loss_label(objective):

@@ -33,8 +33,8 @@ def study(run: Run[Config]):
         rows, met = [], 0
         for seed in config.seeds:
             m = found[objective, seed]
-            rows.append([seed, *(round(m[f"flow_error_mrad_hard_{n}"], 3) for n in ("nominal", "detuned", "optimised")), round(m["flow_error_recovered_share"], 3),
-                         *(round(m[f"rms_spot_um_{n}"], 2) for n in ("nominal", "detuned", "optimised")), round(m["rms_spot_recovered_share"], 3), *(round(m[f"edge_energy_hard_{n}"], 3) for n in ("detuned", "optimised"))])
+            flow, spot, edge = ([round(m[f"{key}_{n}"], 3) for n in ("nominal", "detuned", "optimised")] for key in ("flow_error_mrad_hard", "rms_spot_um", "edge_energy_hard"))
+            rows.append([seed, *flow, round(m["flow_error_recovered_share"], 3), *spot, round(m["rms_spot_recovered_share"], 3), *edge[1:]])
             met += _met(objective, m)
             for key in ("flow_error_recovered_share", "rms_spot_recovered_share", "flow_error_lost_share_of_nominal", "seconds_total", "seconds_per_step"):
                 run.record(**{f"{objective}_seed{seed}_{key}": m[key]})

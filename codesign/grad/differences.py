@@ -1,6 +1,7 @@
 """Central differences with common random numbers over a ladder of step sizes, and the plateau on it."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 
@@ -30,7 +31,7 @@ def plateau(fn, point, direction, steps):
     ladder = tuple((h, central(fn, point, direction, h)) for h in steps)
     if len(ladder) == 1:
         return Difference(ladder[0][1], ladder[0][0], 0.0, ladder)
-    gaps = [abs(a[1] - b[1]) for a, b in zip(ladder[:-1], ladder[1:], strict=True)]
+    gaps = [abs(a[1] - b[1]) for a, b in pairwise(ladder)]
     best = min(range(len(gaps)), key=gaps.__getitem__)
     value = (ladder[best][1] + ladder[best + 1][1]) / 2
     return Difference(value, (ladder[best][0] * ladder[best + 1][0]) ** 0.5, gaps[best] / 2, ladder)

@@ -49,4 +49,4 @@ def rms_spot_mm(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"], grid=32):
         raise DomainError(f"{lens.name}: no ray arrives at field {dead} degrees; use a smaller field or weaker curvatures.")
     w = weight[..., None]
     centre = (positions * w).sum(1, keepdim=True) / total[:, None, None]
-    return (((positions - centre).square() * w).sum((1, 2)) / total).sqrt()
+    return torch.linalg.vector_norm((positions - centre) * w, dim=(1, 2)) / total.sqrt()  # weights are 0 or 1; the gradient at a point image is 0

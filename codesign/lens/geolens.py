@@ -75,6 +75,8 @@ class GeoLens(nn.Module):
     def freeze(self, *names):
         """Stop the gradient to the named tensors (all when none is named); returns the lens."""
         for name in names or tuple(self._parameters):
+            if name not in LEARNABLES:
+                raise DomainError(f"a lens has no tensor '{name}'; it has {', '.join(LEARNABLES)}.")
             getattr(self, name).requires_grad_(False)
         return self
 
