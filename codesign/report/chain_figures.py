@@ -50,7 +50,7 @@ def heat_map(values, rows, columns, label):
         for j in range(len(columns)):
             if np.isfinite(values[i, j]):
                 axis.text(j, i, f"{values[i, j]:.1e}", ha="center", va="center", fontsize=8, color="w" if shown[i, j] > np.nanmedian(shown) else "k")
-    axis.set_xticks(range(len(columns)), columns)
+    axis.set_xticks(range(len(columns)), columns, rotation=20, ha="right")
     axis.set_yticks(range(len(rows)), rows)
     figure.colorbar(picture, label=label)
     figure.tight_layout()
