@@ -9,6 +9,7 @@ from codesign.errors import DomainError
 from codesign.lens.analysis import rms_spot_mm, spots
 from codesign.lens.geolens import LEARNABLES, GeoLens
 from codesign.lens.paraxial import powers_curvature, yu_trace
+from codesign.lens.surface import sag_mm
 
 
 def hold_efl(lens, efl_mm):
@@ -35,12 +36,7 @@ def edge_thickness_mm(lens):
 
 
 def _sag(lens, rows, height):
-    c, k = lens.curvature_per_mm[rows], lens.conic[rows]
-    r2 = height.square()
-    sag = c * r2 / (1 + (1 - (1 + k) * c.square() * r2).clamp_min(1e-6).sqrt())
-    for i in range(lens.asphere.shape[1]):
-        sag = sag + lens.asphere[rows, i] * r2 ** (i + 1)
-    return sag
+    return sag_mm(height, lens.curvature_per_mm[rows], lens.conic[rows], lens.asphere[rows].unbind(1))
 
 
 @dataclass(frozen=True)

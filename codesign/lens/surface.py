@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from codesign.errors import DomainError
 from codesign.lens.glass import Glass
 
@@ -52,3 +54,16 @@ def scaled(surface, factor):
     """The same surface with all lengths multiplied by ``factor``."""
     asphere = tuple(a * factor ** (1 - 2 * (i + 1)) for i, a in enumerate(surface.asphere))
     return Surface(surface.radius_mm * factor, surface.thickness_mm * factor, surface.medium, surface.semi_aperture_mm * factor, surface.conic, asphere, surface.is_stop)
+
+
+def sag_mm(height_mm: Tensor, curvature_per_mm, conic, asphere):
+    """Depth of a surface at heights [...] from the axis, mm.
+
+    Args: curvature_per_mm, conic, and each coefficient of r^2, r^4, ... in ``asphere``: numbers, or tensors that broadcast with the heights.
+    Gradient: everything given as a tensor. Beyond the reach of the conic its root is held at 1e-3, so that the gradient stays finite.
+    """
+    r2 = height_mm.square()
+    sag = curvature_per_mm * r2 / (1 + (1 - (1 + conic) * curvature_per_mm**2 * r2).clamp_min(1e-6).sqrt())
+    for i, coefficient in enumerate(asphere):
+        sag = sag + coefficient * r2 ** (i + 1)
+    return sag

@@ -81,7 +81,7 @@ def trace(prescription, origin_mm, direction):
     """
     p, count = prescription, origin_mm.shape[0]
     surfaces = p.curvature_per_mm.numel()
-    conics = _active(p.conic, lambda k: k != 0)
+    conics = [p.conic.requires_grad or k != 0 for k in p.conic.tolist()]  # its value matters, or its derivative is wanted
     terms = [_last_active(row) for row in p.asphere.unbind(0)] if p.asphere.shape[1] else [0] * surfaces
     refracts = [a != b for a, b in zip(p.index[:-1].tolist(), p.index[1:].tolist(), strict=True)]
     kernel = _Kernel(surfaces, p.asphere.shape[1], tuple(conics), tuple(terms), tuple(refracts))
@@ -89,11 +89,6 @@ def trace(prescription, origin_mm, direction):
     per_mm2 = 0.5 / (max(p.soft_edge_mm, 1e-6) * p.semi_aperture_mm)  # slope of the apertures' edges in r^2
     columns = [origin_mm, direction, p.curvature_per_mm, p.thickness_mm, p.conic, p.index, ratio, per_mm2, p.semi_aperture_mm.square() * per_mm2 + 0.5, p.asphere]
     return TraceResult(*run_kernel(kernel, columns, [(count, 3), (count, 3), *[(count,)] * 5]))
-
-
-def _active(tensor, test):
-    """Per surface, whether a term must be computed: its value matters, or its derivative is wanted."""
-    return [tensor.requires_grad or test(v) for v in tensor.tolist()]
 
 
 def _last_active(row):

@@ -1,12 +1,15 @@
 """Pictures of a lens: layout with rays, and spot diagrams."""
 
 import math
+from dataclasses import replace
 
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
 from codesign.lens.analysis import field_rays, spots
+from codesign.lens.geolens import GeoLens
+from codesign.lens.surface import sag_mm
 
 COLOURS = ("#1b6ca8", "#2e8b57", "#c0392b", "#8e44ad")
 
@@ -17,10 +20,8 @@ def draw_layout(axis, lens, fields_rad, rays=5):
     vertices = np.concatenate([[0.0], np.cumsum([s.thickness_mm for s in surfaces])])
     edges = []
     for s, at in zip(surfaces, vertices, strict=False):
-        y = np.linspace(-s.semi_aperture_mm, s.semi_aperture_mm, 61)
-        inside = np.maximum(1 - (1 + s.conic) * (s.curvature_per_mm * y) ** 2, 0)
-        sag = s.curvature_per_mm * y**2 / (1 + np.sqrt(inside)) + sum(a * y ** (2 * i + 2) for i, a in enumerate(s.asphere))
-        edges.append((at + sag, y))
+        y = torch.linspace(-s.semi_aperture_mm, s.semi_aperture_mm, 61, dtype=torch.float64)
+        edges.append((at + sag_mm(y, s.curvature_per_mm, s.conic, s.asphere).numpy(), y.numpy()))
     for i, s in enumerate(surfaces[:-1]):
         if s.medium is not None:
             (za, ya), (zb, yb) = edges[i], edges[i + 1]
@@ -46,23 +47,19 @@ def draw_layout(axis, lens, fields_rad, rays=5):
 
 def _paths(lens, field, pupil, start):
     """Polylines (z, y) of rays, found by tracing the lens cut after each surface."""
-    from codesign.lens.geolens import GeoLens
-
     surfaces = lens.to_surfaces()
     origin, direction = field_rays(lens, field, pupil, start_z_mm=start)
     points = [torch.stack([origin[:, 2], origin[:, 1]], 1)]
     z = 0.0
     for i, s in enumerate(surfaces):
-        part = GeoLens([*surfaces[:i], _without_gap(s)], lens.entrance_pupil_diameter_mm, lens.curvature_per_mm.dtype)
+        part = GeoLens([*surfaces[:i], replace(s, thickness_mm=0.0, is_stop=False)], lens.entrance_pupil_diameter_mm, lens.curvature_per_mm.dtype)
         with torch.no_grad():
             out = part.trace(origin, direction)
         # rays end on the vertex plane behind surface i: step back along the ray onto the surface
         y, slope = out.position_mm[:, 1], out.direction[:, 1] / out.direction[:, 2]
         sag = torch.zeros_like(y)
         for _ in range(8):
-            at = y + slope * sag
-            root = (1 - (1 + s.conic) * (s.curvature_per_mm * at) ** 2).clamp_min(0).sqrt()
-            sag = s.curvature_per_mm * at**2 / (1 + root) + sum(a * at ** (2 * k + 2) for k, a in enumerate(s.asphere))
+            sag = sag_mm(y + slope * sag, s.curvature_per_mm, s.conic, s.asphere)
         points.append(torch.stack([z + sag, y + slope * sag], 1))
         z += s.thickness_mm
     with torch.no_grad():
@@ -70,12 +67,6 @@ def _paths(lens, field, pupil, start):
     points.append(torch.stack([torch.full_like(end.position_mm[:, 1], z), end.position_mm[:, 1]], 1))
     ok = end.status == 0
     return [np.array([p[k].tolist() for p in points]) for k in range(pupil.shape[0]) if bool(ok[k])]
-
-
-def _without_gap(surface):
-    from dataclasses import replace
-
-    return replace(surface, thickness_mm=0.0, is_stop=False)
 
 
 def layouts(lenses, fields_rad):
