@@ -10,7 +10,7 @@ of one draw's error changes sign from pixel to pixel.
 import math
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -38,25 +38,18 @@ class Config(StudyConfig):
     """Columns of the grid, over all yaws."""
 
 
-@dataclass(frozen=True)
-class Plan:
-    """The sizes of a run: those of the configuration, smaller with --quick."""
-
-    starts: int
-    steps: int
-    motions: int
-    pitches: int
-    yaws: int
-
-
 def plan(config):
-    """Raises: DomainError for sizes below 1 (motions and steps) or a grid of less than two mounts."""
+    """The configuration with the sizes this run has: smaller with --quick.
+
+    Raises: DomainError for sizes below 1 (motions and steps) or a grid of less than two mounts.
+    """
     for name in ("starts", "steps", "motions", "pitches", "yaws"):
         if getattr(config, name) < 1:
             raise DomainError(f"--{name} is {getattr(config, name)}; at least 1 is needed.")
     if config.quick:
-        return Plan(min(config.starts, 3), min(config.steps, 6), min(config.motions, 2), min(config.pitches, 5), min(config.yaws, 8))
-    return Plan(config.starts, config.steps, config.motions, config.pitches, config.yaws)
+        most = {"starts": 3, "steps": 6, "motions": 2, "pitches": 5, "yaws": 8}
+        return replace(config, **{name: min(getattr(config, name), limit) for name, limit in most.items()})
+    return config
 
 
 def study(run: Run[Config]):
