@@ -8,7 +8,7 @@ from torch import Tensor
 from codesign.errors import DomainError
 from codesign.lens.analysis import rms_spot_mm, spots
 from codesign.lens.geolens import LEARNABLES, GeoLens
-from codesign.lens.paraxial import powers_curvature, yu_trace
+from codesign.lens.paraxial import bending, yu_trace
 from codesign.lens.surface import sag_mm
 
 
@@ -17,15 +17,14 @@ def hold_efl(lens, efl_mm):
 
     Source: the y-u trace solved for the last refraction, n'u' = -n' y_1 / f (Smith, Modern Optical Engineering, ch. 2).
     """
-    c, t, n = lens.curvature_per_mm, lens.thickness_mm, lens.index()
-    vertex = powers_curvature(c, lens.asphere)
+    c, t, n, power = lens.curvature_per_mm, lens.thickness_mm, lens.index(), lens.surface_power()
     one = torch.ones_like(c[0])
-    heights, angles = yu_trace(vertex, t, n, one, torch.zeros_like(one), last=c.numel() - 1)
+    heights, angles = yu_trace(power, t, n, one, torch.zeros_like(one), last=c.numel() - 1)
     y, nu = (heights[-1] + t[-2] * angles[-1] / n[-2], angles[-1]) if heights else (one, 0 * one)
-    step = n[-1] - n[-2]
+    step = bending(n, lens.mirrors)[-1]
     if abs(float(step.detach())) < 1e-9 or abs(float(y.detach())) < 1e-9:
         raise DomainError(f"{lens.name}: the last surface cannot hold the focal length (index step {float(step.detach()):.3g}, ray height {float(y.detach()):.3g}); end the lens with a refracting surface.")
-    last = (nu + n[-1] / efl_mm) / (y * step) - (vertex[-1] - c[-1])
+    last = c[-1] + ((nu + n[-1] / efl_mm) / y - power[-1]) / step
     return lens.replace(curvature_per_mm=torch.cat([c[:-1], last.reshape(1)]))
 
 

@@ -15,19 +15,23 @@ from codesign.lens.surface import Surface, scaled
 from codesign.lens.trace import Prescription, Status, trace
 from codesign.types import Rays
 
-LEARNABLES = ("curvature_per_mm", "thickness_mm", "conic", "asphere", "index_offset")
+LEARNABLES = ("curvature_per_mm", "thickness_mm", "conic", "asphere", "index_offset", "phase", "decentre_mm", "tilt_rad")
 
 
 class GeoLens(nn.Module):
     """Sequential lens. First vertex at z = 0, light along +z, flat image plane behind the last thickness.
 
     Learnables (nn.Parameter, one row per surface): curvature_per_mm [S], thickness_mm [S], conic [S], asphere [S, A],
-    index_offset [S] (added to the index behind each surface, dimensionless, zero at first).
+    index_offset [S] (added to the index behind each surface, dimensionless, zero at first), phase [S, P] (radians per mm^2, mm^4, ...).
+    Errors of assembly (buffers, with gradients after ``requires_grad_`` or through ``replace``): decentre_mm [S, 2], tilt_rad [S, 2].
+    half_field_deg: the half field the lens is made for, or None where nobody said.
     """
 
     semi_aperture_mm: torch.Tensor
+    decentre_mm: torch.Tensor
+    tilt_rad: torch.Tensor
 
-    def __init__(self, surfaces, entrance_pupil_diameter_mm, dtype=torch.float64, soft_edge_mm=0.2, name="lens"):
+    def __init__(self, surfaces, entrance_pupil_diameter_mm, dtype=torch.float64, soft_edge_mm=0.2, name="lens", half_field_deg=None):
         super().__init__()
         surfaces = tuple(surfaces)
         if not surfaces:
@@ -38,18 +42,23 @@ class GeoLens(nn.Module):
             raise DomainError(f"{name}: entrance pupil diameter {entrance_pupil_diameter_mm} mm must be positive and finite.")
         if not 0 <= soft_edge_mm < math.inf:
             raise DomainError(f"{name}: soft edge {soft_edge_mm} mm must be a finite width of at least 0; about 0.1 mm keeps gradients true.")
+        if half_field_deg is not None and not 0 < half_field_deg < 90:
+            raise DomainError(f"{name}: half field {half_field_deg} degrees must lie between 0 and 90.")
         stops = [i for i, s in enumerate(surfaces) if s.is_stop]
         if len(stops) > 1:
             raise DomainError(f"{name}: surfaces {[i + 1 for i in stops]} are all marked as the stop; mark one.")
         self.name, self.surfaces, self.stop_index = name, surfaces, stops[0] if stops else 0
         self.entrance_pupil_diameter_mm, self.soft_edge_mm = float(entrance_pupil_diameter_mm), float(soft_edge_mm)
-        terms = max(len(s.asphere) for s in surfaces)
-        rows = [[*s.asphere, *[0.0] * (terms - len(s.asphere))] for s in surfaces]
-        self.curvature_per_mm = nn.Parameter(torch.tensor([s.curvature_per_mm for s in surfaces], dtype=dtype))
-        self.thickness_mm = nn.Parameter(torch.tensor([s.thickness_mm for s in surfaces], dtype=dtype))
-        self.conic = nn.Parameter(torch.tensor([s.conic for s in surfaces], dtype=dtype))
-        self.asphere = nn.Parameter(torch.tensor(rows, dtype=dtype).reshape(len(surfaces), terms))
+        self.half_field_deg, self.mirrors = half_field_deg, tuple(s.mirror for s in surfaces)
+        column = lambda values: torch.tensor(values, dtype=dtype)  # noqa: E731
+        self.curvature_per_mm = nn.Parameter(column([s.curvature_per_mm for s in surfaces]))
+        self.thickness_mm = nn.Parameter(column([s.thickness_mm for s in surfaces]))
+        self.conic = nn.Parameter(column([s.conic for s in surfaces]))
+        self.asphere = nn.Parameter(_table([s.asphere for s in surfaces], dtype))
         self.index_offset = nn.Parameter(torch.zeros(len(surfaces), dtype=dtype))
+        self.phase = nn.Parameter(_table([s.phase.coefficients if s.phase else () for s in surfaces], dtype))
+        self.register_buffer("decentre_mm", column([s.decentre_mm for s in surfaces]))
+        self.register_buffer("tilt_rad", column([[math.radians(a) for a in s.tilt_deg] for s in surfaces]))
         self.register_buffer("semi_aperture_mm", torch.tensor([s.semi_aperture_mm for s in surfaces], dtype=dtype))
 
     @property
@@ -82,29 +91,48 @@ class GeoLens(nn.Module):
 
     def scaled(self, factor):
         """A new lens with all lengths multiplied by ``factor`` (same f-number and angles), from the current values."""
-        return GeoLens([scaled(s, factor) for s in self.to_surfaces()], self.entrance_pupil_diameter_mm * factor, self.curvature_per_mm.dtype, self.soft_edge_mm * factor, self.name)
+        surfaces = [scaled(s, factor) for s in self.to_surfaces()]
+        return GeoLens(surfaces, self.entrance_pupil_diameter_mm * factor, self.dtype, self.soft_edge_mm * factor, self.name, self.half_field_deg)
 
     def to_surfaces(self):
-        """The current values as a tuple of Surface; index offsets go into the media. A curvature that never changed keeps its radius to the last bit."""
+        """The current values as a tuple of Surface; index offsets go into the media. A curvature or tilt that never changed keeps its value to the last bit."""
         found = []
-        columns = (self.curvature_per_mm, self.thickness_mm, self.conic, self.asphere, self.index_offset)
-        at_first = torch.tensor([s.curvature_per_mm for s in self.surfaces], dtype=self.curvature_per_mm.dtype).tolist()
-        for old, first, c, t, k, a, shift in zip(self.surfaces, at_first, *(column.tolist() for column in columns), strict=True):
-            radius = old.radius_mm if c == first else 1 / c if c else math.inf
-            medium = (old.medium or AIR).shifted(shift) if shift else old.medium
-            found.append(Surface(radius, t, medium, old.semi_aperture_mm, k, tuple(a) if any(a) or old.asphere else (), old.is_stop))
+        at_first = torch.tensor([s.curvature_per_mm for s in self.surfaces], dtype=self.dtype).tolist()
+        tilts = torch.tensor([[math.radians(a) for a in s.tilt_deg] for s in self.surfaces], dtype=self.dtype).tolist()
+        columns = (getattr(self, name).tolist() for name in LEARNABLES)
+        for old, first, tilted, c, t, k, a, shift, phase, decentre, tilt in zip(self.surfaces, at_first, tilts, *columns, strict=True):
+            found.append(dataclasses.replace(
+                old, radius_mm=old.radius_mm if c == first else 1 / c if c else math.inf, thickness_mm=t, conic=k, asphere=tuple(a) if any(a) or old.asphere else (),
+                medium=(old.medium or AIR).shifted(shift) if shift else old.medium, phase=old.phase and dataclasses.replace(old.phase, coefficients=tuple(phase)),
+                decentre_mm=tuple(decentre), tilt_deg=old.tilt_deg if tilt == tilted else tuple(map(math.degrees, tilt))))
         return tuple(found)
 
     def index(self, wavelength_um=WAVELENGTH_UM["d"]):
-        """Indices [S + 1] at a wavelength, the first before the lens (air)."""
+        """Indices [S + 1] at a wavelength, the first before the lens (air). Behind a mirror it is the index before it."""
         values = [1.0, *[1.0 if s.medium is None else s.medium.index(wavelength_um) for s in self.surfaces]]
-        base = torch.tensor(values, dtype=self.curvature_per_mm.dtype, device=self.curvature_per_mm.device)
-        return base + torch.cat([torch.zeros_like(self.index_offset[:1]), self.index_offset])
+        base = torch.tensor(values, dtype=self.dtype, device=self.curvature_per_mm.device)
+        found = base + torch.cat([torch.zeros_like(self.index_offset[:1]), self.index_offset])
+        if not any(self.mirrors):
+            return found
+        source = list(range(len(values)))
+        for i, mirror in enumerate(self.mirrors):
+            source[i + 1] = source[i] if mirror else i + 1
+        return found[source]
+
+    def path_mm(self, wavelength_um=WAVELENGTH_UM["d"]):
+        """Optical path that the diffractive phases add, as coefficients [S, P] of r^2, r^4, ... in mm."""
+        orders = torch.tensor([s.phase.order if s.phase else 0 for s in self.surfaces], dtype=self.dtype, device=self.phase.device)
+        return self.phase * (orders * (wavelength_um * 1e-3 / (2 * math.pi)))[:, None]
+
+    def surface_power(self, wavelength_um=WAVELENGTH_UM["d"]):
+        """Paraxial power of each surface, [S] per mm: vertex curvature (with the r^2 asphere term) times bending, and diffraction."""
+        vertex = self.curvature_per_mm + 2 * self.asphere[:, 0] if self.asphere.shape[1] else self.curvature_per_mm
+        power = vertex * paraxial.bending(self.index(wavelength_um), self.mirrors)
+        return power - 2 * self.path_mm(wavelength_um)[:, 0] if self.phase.shape[1] else power
 
     def first_order(self, wavelength_um=WAVELENGTH_UM["d"]):
         """Paraxial figures (FirstOrder) at a wavelength, differentiable."""
-        c = paraxial.powers_curvature(self.curvature_per_mm, self.asphere)
-        return paraxial.first_order(c, self.thickness_mm, self.index(wavelength_um), self.stop_index, self.entrance_pupil_diameter_mm)
+        return paraxial.first_order(self.surface_power(wavelength_um), self.thickness_mm, self.index(wavelength_um), self.stop_index, self.entrance_pupil_diameter_mm)
 
     def prescription(self, wavelength_um=WAVELENGTH_UM["d"]):
         """The numbers the ray-trace kernel needs."""
@@ -167,3 +195,9 @@ class GeoLens(nn.Module):
 
     def extra_repr(self):
         return f"{self.name}, {len(self.surfaces)} surfaces, entrance pupil {self.entrance_pupil_diameter_mm:g} mm"
+
+
+def _table(rows, dtype):
+    """Rows of different length as one tensor, filled up with zeros."""
+    width = max(map(len, rows))
+    return torch.tensor([[*row, *[0.0] * (width - len(row))] for row in rows], dtype=dtype).reshape(len(rows), width)

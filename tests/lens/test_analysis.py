@@ -88,7 +88,7 @@ def test_replacing_and_freezing_leave_the_original_alone():
     twin = geo.replace(thickness_mm=geo.thickness_mm * 2)
     assert twin.thickness_mm.tolist() == [2 * t for t in geo.thickness_mm.tolist()]
     assert twin.curvature_per_mm is geo.curvature_per_mm
-    assert {n for n, _ in geo.named_parameters()} == {"curvature_per_mm", "thickness_mm", "conic", "asphere", "index_offset"}
+    assert {n for n, _ in geo.named_parameters()} == {"curvature_per_mm", "thickness_mm", "conic", "asphere", "index_offset", "phase"}
     (grad,) = torch.autograd.grad(twin.first_order().bfl_mm, geo.thickness_mm)
     assert grad[0].item() == pytest.approx(-2 / 1.516800035, rel=1e-9)  # plano-convex: the principal plane moves by t / n
     geo.freeze("conic")
