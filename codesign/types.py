@@ -12,11 +12,14 @@ class Rays:
     origin_m: [N, 3] metres, relative to the centre of the entrance pupil.
     direction: [N, 3] unit vectors.
     weight: [N] share of the light that passes all apertures, 0 to 1; 0 for a ray that failed.
+    irradiance: [N] what an unvignetted ray adds to the irradiance of its image point, relative to the axis (for an ideal lens cos^4 of the
+      angle at the film); None where nobody computed it.
     """
 
     origin_m: Tensor
     direction: Tensor
     weight: Tensor
+    irradiance: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from codesign.atomic import replacing
 from codesign.errors import FileFormatError
-from codesign.events.atomic import replacing
 from codesign.events.file_csv import read_csv, write_csv
 from codesign.events.file_npz import read_npz, write_npz
 

@@ -6,8 +6,8 @@ import imageio.v3 as iio
 import numpy as np
 import torch
 
+from codesign.atomic import replacing
 from codesign.errors import DomainError, FileFormatError, ShapeError
-from codesign.events.atomic import replacing
 from codesign.events.stream import to_counts
 from codesign.events.view import decay, picture
 from codesign.types import EventStream

@@ -5,6 +5,11 @@ from codesign.lens.surface import Surface
 
 _INF = float("inf")
 
+# Schott catalogue values (2017) at F, d, C, rounded to 1e-9 as the published reference traces of these lenses used them
+GLASSES = {
+    "N-BK7": (1.52237629, 1.516800035, 1.514322347), "N-SK16": (1.627556349, 1.620409965, 1.61727166), "N-SK2": (1.614857066, 1.60738097, 1.604135445),
+    "N-SSK2": (1.630451679, 1.622293796, 1.618770607), "F2": (1.632081457, 1.620040137, 1.615031692), "F5": (1.614612261, 1.603420257, 1.598745273)}
+
 # name -> (entrance pupil diameter mm, half field degrees, stop index, rows of radius, thickness, glass, semi-aperture)
 LENSES = {
     # Cooke triplet, 50 mm f/5, 40 degrees (Zemax sample lens)
@@ -24,7 +29,7 @@ LENSES = {
 def named_surfaces(name):
     """Surfaces and entrance pupil diameter (mm) of a published lens."""
     diameter, _, stop, rows = LENSES[name]
-    surfaces = [Surface(r, t, Glass.named(g) if g else None, a, is_stop=i == stop) for i, (r, t, g, a) in enumerate(rows)]
+    surfaces = [Surface(r, t, Glass.from_indices(*GLASSES[g], g) if g else None, a, is_stop=i == stop) for i, (r, t, g, a) in enumerate(rows)]
     return surfaces, diameter
 
 

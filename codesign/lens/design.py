@@ -1,4 +1,4 @@
-"""A lens design as free variables: curvatures but the last, which holds the focal length, and all thicknesses."""
+"""A lens design as free variables: curvatures but one, which holds the focal length, and all thicknesses."""
 
 from dataclasses import dataclass
 
@@ -8,24 +8,10 @@ from torch import Tensor
 from codesign.errors import DomainError
 from codesign.lens.analysis import rms_spot_mm, spots
 from codesign.lens.geolens import LEARNABLES, GeoLens
-from codesign.lens.paraxial import bending, yu_trace
+from codesign.lens.solves import hold_efl, holding_surface
 from codesign.lens.surface import sag_mm
 
-
-def hold_efl(lens, efl_mm):
-    """The lens with its last curvature solved so that the focal length is ``efl_mm`` exactly. Differentiable.
-
-    Source: the y-u trace solved for the last refraction, n'u' = -n' y_1 / f (Smith, Modern Optical Engineering, ch. 2).
-    """
-    c, t, n, power = lens.curvature_per_mm, lens.thickness_mm, lens.index(), lens.surface_power()
-    one = torch.ones_like(c[0])
-    heights, angles = yu_trace(power, t, n, one, torch.zeros_like(one), last=c.numel() - 1)
-    y, nu = (heights[-1] + t[-2] * angles[-1] / n[-2], angles[-1]) if heights else (one, 0 * one)
-    step = bending(n, lens.mirrors)[-1]
-    if abs(float(step.detach())) < 1e-9 or abs(float(y.detach())) < 1e-9:
-        raise DomainError(f"{lens.name}: the last surface cannot hold the focal length (index step {float(step.detach()):.3g}, ray height {float(y.detach()):.3g}); end the lens with a refracting surface.")
-    last = c[-1] + ((nu + n[-1] / efl_mm) / y - power[-1]) / step
-    return lens.replace(curvature_per_mm=torch.cat([c[:-1], last.reshape(1)]))
+__all__ = ["LensDesign", "detune", "edge_thickness_mm", "hold_efl", "make_design"]
 
 
 def edge_thickness_mm(lens):
@@ -42,7 +28,7 @@ def _sag(lens, rows, height):
 class LensDesign:
     """Free variables of a lens around a reference; each unit variable moves the rays by the same distance, in its own way.
 
-    reference: the lens at variables = 0. efl_mm: held.
+    reference: the lens at variables = 0. efl_mm: held, by the last curvature that can (see solves.holding_surface).
     basis: [V, V], columns are changes of curvatures (S - 1, per mm) and thicknesses (S, mm) per unit variable.
     floor_mm: [S] least centre thickness; edge_floor_mm: [S - 1] least edge thickness.
     """
@@ -63,11 +49,12 @@ class LensDesign:
     def changed(self, change):
         """The lens with curvatures and thicknesses changed by [V] (per mm, then mm) from the reference."""
         count = self.reference.curvature_per_mm.numel()
-        curvature = self.reference.curvature_per_mm.detach() + torch.cat([change[: count - 1], torch.zeros_like(change[:1])])
+        at = holding_surface(self.reference)
+        curvature = self.reference.curvature_per_mm.detach() + torch.cat([change[:at], torch.zeros_like(change[:1]), change[at : count - 1]])
         room = self.reference.thickness_mm.detach() + change[count - 1 :] - self.floor_mm
         width = 0.02 * self.floor_mm.clamp_min(1e-3)
         thickness = self.floor_mm + width * torch.nn.functional.softplus(room / width)
-        return hold_efl(self.reference.replace(curvature_per_mm=curvature, thickness_mm=thickness), self.efl_mm)
+        return hold_efl(self.reference.replace(curvature_per_mm=curvature, thickness_mm=thickness), self.efl_mm, at)
 
     def penalty(self, lens):
         """Smooth hinge on edge thicknesses below their floors, in units of 1 % of the focal length squared; 0 when all hold."""
@@ -112,11 +99,12 @@ def _motion(design, variable, fields_rad, step=1e-4):
 def detune(design, fields_rad, target_mm, generator):
     """The reference lens with errors in curvatures and focus that bring its mean RMS spot to ``target_mm``, focal length held.
 
-    Every curvature but the last (which holds the focal length) and the image distance get independent Gaussian errors of one
+    Every curvature but the one that holds the focal length and the image distance get independent Gaussian errors of one
     common relative size, which is raised until the target is met. Raises: DomainError when 50 % is not enough.
     """
     count = design.reference.curvature_per_mm.numel()
-    size = torch.cat([design.reference.curvature_per_mm[:-1], torch.zeros_like(design.floor_mm[:-1]), design.reference.thickness_mm[-1:]])
+    at = holding_surface(design.reference)
+    size = torch.cat([design.reference.curvature_per_mm[:at], design.reference.curvature_per_mm[at + 1 :], torch.zeros_like(design.floor_mm[:-1]), design.reference.thickness_mm[-1:]])
     direction = torch.randn(2 * count - 1, generator=generator, dtype=size.dtype) * size
     with torch.no_grad():
         spot = lambda size: float(rms_spot_mm(design.changed(direction * size), fields_rad).mean())  # noqa: E731

@@ -9,9 +9,10 @@ from torch import nn
 
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.lens import paraxial
+from codesign.lens.aiming import aim_at_stop
 from codesign.lens.glass import AIR, WAVELENGTH_UM
 from codesign.lens.pinhole import ThinLens
-from codesign.lens.surface import Surface, scaled
+from codesign.lens.surface import scaled
 from codesign.lens.trace import Prescription, Status, trace
 from codesign.types import Rays
 
@@ -136,7 +137,10 @@ class GeoLens(nn.Module):
 
     def prescription(self, wavelength_um=WAVELENGTH_UM["d"]):
         """The numbers the ray-trace kernel needs."""
-        return Prescription(self.curvature_per_mm, self.thickness_mm, self.conic, self.asphere, self.index(wavelength_um), self.semi_aperture_mm, self.soft_edge_mm)
+        shape = (self.curvature_per_mm, self.thickness_mm, self.conic, self.asphere)
+        efficiency = math.prod(s.phase.efficiency(wavelength_um) for s in self.surfaces if s.phase)
+        inner = tuple(s.inner_semi_aperture_mm for s in self.surfaces)
+        return Prescription(*shape, self.index(wavelength_um), self.semi_aperture_mm, self.soft_edge_mm, self.path_mm(wavelength_um), self.decentre_mm, self.tilt_rad, self.mirrors, inner, efficiency)
 
     def trace(self, origin_mm, direction, wavelength_um=WAVELENGTH_UM["d"]):
         """Trace rays to the image plane: origins [N, 3] relative to the first vertex, unit directions [N, 3] -> TraceResult.
@@ -160,30 +164,39 @@ class GeoLens(nn.Module):
         f = self.first_order(wavelength_um)
         return ThinLens(f.efl_mm, self.entrance_pupil_diameter_mm, f.efl_mm + self.thickness_mm[-1] - f.bfl_mm)
 
-    def camera_rays(self, film_mm, pupil, wavelength_um=WAVELENGTH_UM["d"]):
+    def camera_rays(self, film_mm, pupil, wavelength_um=WAVELENGTH_UM["d"], aim=False):
         """Rays from image points through the lens towards the scene.
 
         Args:
           film_mm: [N, 2] image points as seen upright (x right, y down), millimetres from the axis; their dtype is that of the computation.
-          pupil: [N, 2] points of the unit disc, placed on the paraxial exit pupil; (0, 0) is the chief ray.
-        Returns: Rays in camera axes, origins on the entrance-pupil plane (the camera's origin), in metres.
+          pupil: [N, 2] points of the unit disc; (0, 0) is the chief ray. They lie on the paraxial exit pupil, or with ``aim`` on the real stop.
+        Returns: Rays in camera axes, origins on the plane of the entrance pupil of the d line (the camera's origin), in metres.
         Gradient: to every lens tensor. The pupil sampling itself is the stop; the other surfaces clip with soft edges.
+        Raises: DomainError when no ray passes or a pupil lies at infinity.
         """
         f = self.first_order(wavelength_um)
-        if not (math.isfinite(float(f.exit_pupil_z_mm.detach())) and math.isfinite(float(f.entrance_pupil_z_mm.detach()))):
+        if not (math.isfinite(f.exit_pupil_z_mm.item()) and math.isfinite(f.entrance_pupil_z_mm.item())):
             raise DomainError(f"{self.name}: a pupil lies at infinity (the lens is telecentric), so pupil points have no place; move the stop off the focal plane.")
-        back = self.prescription(wavelength_um).reversed(-f.entrance_pupil_z_mm).to(film_mm.dtype)
-        last, exit_z, exit_diameter = (v.to(film_mm.dtype) for v in (self.thickness_mm[-1], f.exit_pupil_z_mm, f.exit_pupil_diameter_mm))
-        start = torch.cat([-film_mm, -last.expand(film_mm.shape[0], 1)], 1)  # the image is inverted on the film
-        target = torch.cat([pupil * (exit_diameter / 2), -exit_z.expand(pupil.shape[0], 1)], 1)
-        towards = torch.nn.functional.normalize(target - start, dim=1)
-        towards = towards * torch.sign(towards[:, 2:])  # a virtual exit pupil behind the film points the other way
+        origin_z = self.first_order().entrance_pupil_z_mm  # one origin for all colours
+        back, at_stop = self.prescription(wavelength_um).reversed(-origin_z), len(self.surfaces) - 1 - self.stop_index
+        radius = f.exit_pupil_diameter_mm / 2
+        towards = lambda film, q: _towards(film, q, self.thickness_mm[-1], f.exit_pupil_z_mm)  # noqa: E731
+        if aim:
+            film = film_mm.to(self.dtype)
+            field = lambda q, share: towards(film.repeat(q.shape[0] // film.shape[0], 1) * share, q)  # noqa: E731
+            at = aim_at_stop(field, back.until(at_stop), pupil.to(self.dtype), f.stop_semi_aperture_mm, radius)
+            start, direction = (v.to(film_mm.dtype) for v in towards(film, at.point_mm))
+            spread = ((f.stop_semi_aperture_mm / radius).square() / at.determinant.abs()).to(film_mm.dtype)
+        else:
+            start, direction = (v.to(film_mm.dtype) for v in towards(film_mm, pupil * radius.to(film_mm.dtype)))
+            spread = torch.ones_like(film_mm[:, 0])
+        back = back.to(film_mm.dtype)
         apertures = back.semi_aperture_mm.clone()
-        apertures[len(self.surfaces) - 1 - self.stop_index] = 1e6
-        out = trace(dataclasses.replace(back, semi_aperture_mm=apertures), start, towards)
+        apertures[at_stop] = 1e6
+        out = trace(dataclasses.replace(back, semi_aperture_mm=apertures), start, direction)
         if bool((out.weight.detach() <= 0).all()):
             raise DomainError(f"{self.name}: every ray fails{self._where(out)}; weaken the curvatures or open the apertures.")
-        return Rays(out.position_mm * 1e-3, out.direction, out.weight)
+        return Rays(out.position_mm * 1e-3, out.direction, out.weight, spread * direction[:, 2] ** 4)
 
     def _where(self, out):
         """What became of most rays of a backward trace, in words; surfaces are counted from the object."""
@@ -195,6 +208,14 @@ class GeoLens(nn.Module):
 
     def extra_repr(self):
         return f"{self.name}, {len(self.surfaces)} surfaces, entrance pupil {self.entrance_pupil_diameter_mm:g} mm"
+
+
+def _towards(film_mm, at_mm, last_mm, exit_z_mm):
+    """Rays from upright image points [N, 2] to points [N, 2] of the exit pupil's plane, in the axes of the reversed lens: start and direction [N, 3]."""
+    place = lambda points, z: torch.cat([points, -z.to(points.dtype).expand(points.shape[0], 1)], 1)  # noqa: E731
+    start = place(-film_mm, last_mm)  # the image is inverted on the film
+    direction = torch.nn.functional.normalize(place(at_mm, exit_z_mm) - start, dim=1)
+    return start, direction * torch.sign(direction[:, 2:])  # a virtual exit pupil behind the film points the other way
 
 
 def _table(rows, dtype):

@@ -25,13 +25,14 @@ class ThinLens:
     def dtype(self):
         return self.efl_mm.dtype
 
-    def camera_rays(self, film_mm, pupil, wavelength_um=None):
-        """Rays towards the scene; see GeoLens.camera_rays. Paraxial refraction: slope out = slope in - q / f."""
+    def camera_rays(self, film_mm, pupil, wavelength_um=None, aim=False):
+        """Rays towards the scene; see GeoLens.camera_rays (the pupil is ideal, so aiming changes nothing). Paraxial refraction: slope out = slope in - q / f."""
         q = pupil * (self.entrance_pupil_diameter_mm / 2)
-        slope = (q + film_mm) / self.image_distance_mm - q / self.efl_mm
+        inside = (q + film_mm) / self.image_distance_mm
+        slope = inside - q / self.efl_mm
         direction = torch.nn.functional.normalize(torch.cat([slope, torch.ones_like(slope[:, :1])], 1), dim=1)
         origin = torch.cat([q, torch.zeros_like(q[:, :1])], 1) * 1e-3
-        return Rays(origin + 0 * direction, direction, torch.ones_like(direction[:, 0]))
+        return Rays(origin + 0 * direction, direction, torch.ones_like(direction[:, 0]), (1 + inside.square().sum(1)) ** -2)
 
 
 class Pinhole(ThinLens):

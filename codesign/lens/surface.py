@@ -87,6 +87,8 @@ class Surface:
             raise DomainError(f"{label}: tilt {self.tilt_deg} degrees must stay below 90.")
         if self.phase is not None:
             self.phase.check(label)
+            if self.mirror:
+                raise DomainError(f"{label}: a diffractive phase on a mirror is not traced; put it on a refracting surface or on a plane of its own.")
         reach = (1 + self.conic) * (self.curvature_per_mm * self.semi_aperture_mm) ** 2
         if reach > 1:
             limit = abs(self.radius_mm) / math.sqrt(1 + self.conic)

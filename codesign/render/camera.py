@@ -1,6 +1,8 @@
 """A camera: a lens before a pixel grid. Makes camera-space rays and projects points."""
 
-from dataclasses import dataclass
+import copy
+from dataclasses import dataclass, fields, replace
+from types import MappingProxyType
 
 import torch
 
@@ -66,16 +68,24 @@ class Camera:
     """A lens (GeoLens, ThinLens or Pinhole: anything with ``camera_rays``) before a film.
 
     The same seed gives the same film and pupil samples in every frame and for every lens state (common random numbers).
+    spectrum: anything with wavelengths_um and weights (sum 1), such as lens.Spectrum: each takes an equal share of the samples; None is the d line.
+    falloff: whether the natural illumination falloff (cos^4 and pupil growth) darkens the image; without it the image is as after flat-field correction.
+    aim: whether pupil samples lie on the real stop instead of the paraxial exit pupil; several traces more per frame.
     """
 
-    def __init__(self, lens, width_px, height_px, pixel_pitch_mm, samples_per_pixel=16, seed=0, film=None):
+    def __init__(self, lens, width_px, height_px, pixel_pitch_mm, samples_per_pixel=16, seed=0, film=None, *, spectrum=None, falloff=False, aim=False):
         _check_whole("samples_per_pixel", samples_per_pixel)
+        if spectrum is not None and samples_per_pixel % len(spectrum.wavelengths_um):
+            raise DomainError(f"camera: {samples_per_pixel} samples per pixel cannot be shared equally by {len(spectrum.wavelengths_um)} wavelengths; make the one a multiple of the other.")
         self.lens, self.samples_per_pixel, self.seed = lens, int(samples_per_pixel), int(seed)
         self.film = (film or Film(width_px, height_px, width_px, height_px, pixel_pitch_mm)).check()
+        self.spectrum, self.falloff, self.aim = spectrum, falloff, aim
 
     def with_lens(self, lens):
         """The same film and samples behind another lens."""
-        return Camera(lens, self.film.width_px, self.film.height_px, self.film.pixel_pitch_mm, self.samples_per_pixel, self.seed, self.film)
+        twin = copy.copy(self)
+        twin.lens = lens
+        return twin
 
     def film_mm(self, pixels):
         """Upright image position in millimetres of pixel coordinates [N, 2]."""
@@ -84,10 +94,25 @@ class Camera:
     def rays(self):
         """All rays of one frame, pixel after pixel, samples_per_pixel each: Rays with N = pixels x samples, in the lens's dtype. Gradient: to the lens."""
         offset, pupil = film_pupil_pattern(self.samples_per_pixel, self.seed)
-        pixels = self.film.pixels()
+        if self.spectrum is None:
+            rays, light = self._rays(offset, pupil), None
+        else:
+            colours = len(self.spectrum.wavelengths_um)
+            parts = [self._rays(o, p, {"wavelength_um": w}) for w, o, p in zip(self.spectrum.wavelengths_um, offset.chunk(colours), pupil.chunk(colours), strict=True)]
+            rays = Rays(*(self._joined([getattr(part, f.name) for part in parts]) for f in fields(Rays)))
+            light = torch.tensor(self.spectrum.weights).repeat_interleave(self.samples_per_pixel // colours).to(rays.weight).repeat(self.film.pixels().shape[0]) * colours
+        weight = rays.weight if light is None else rays.weight * light
+        return replace(rays, weight=weight * rays.irradiance if self.falloff else weight)
+
+    def _rays(self, offset, pupil, wavelength=MappingProxyType({})):
+        pixels, dtype = self.film.pixels(), self.lens.dtype
         points = (pixels[:, None] + offset).reshape(-1, 2)
-        dtype = self.lens.dtype
-        return self.lens.camera_rays(self.film_mm(points).to(dtype), pupil.repeat(pixels.shape[0], 1).to(dtype))
+        return self.lens.camera_rays(self.film_mm(points).to(dtype), pupil.repeat(pixels.shape[0], 1).to(dtype), aim=self.aim, **wavelength)
+
+    def _joined(self, parts):
+        """Rays of several colours, pixel after pixel."""
+        pixels = self.film.pixels().shape[0]
+        return torch.cat([part.reshape(pixels, -1, *part.shape[1:]) for part in parts], 1).flatten(0, 1)
 
     def chief_rays(self, pixels):
         """Rays through the pupil's centre for pixel coordinates [N, 2]: Rays, float64."""

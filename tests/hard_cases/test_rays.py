@@ -8,6 +8,8 @@ import torch
 from codesign import lens, render
 from codesign.errors import DomainError, ShapeError
 from codesign.lens import GeoLens, Glass, Status, Surface
+from codesign.lens.surface import Phase
+from codesign.lens.trace import trace
 
 INF = float("inf")
 GLASS = Glass.from_indices(1.5, 1.5, 1.5)
@@ -25,8 +27,12 @@ def everything(out):
     return torch.cat([out.position_mm, out.direction, out.optical_path_mm[:, None], out.weight[:, None], out.deficit[:, None]], 1)
 
 
+def learned(geo):
+    return [t for t in (*geo.parameters(), *geo.buffers()) if t.requires_grad and t.numel()]
+
+
 def gradients(geo, loss):
-    tensors = [p for p in geo.parameters() if p.numel()]
+    tensors = learned(geo)
     return torch.cat([g.reshape(-1) for g in torch.autograd.grad(loss, tensors, allow_unused=True) if g is not None])
 
 
@@ -68,14 +74,19 @@ def mixed_lenses():
     triplet = lens.load("cooke-triplet")
     surfaces = list(triplet.to_surfaces())
     surfaces[0] = Surface(22.01359, 3.25896, surfaces[0].medium, 9.5, conic=0.4, asphere=(0.0, -1e-6, 2e-8, -1e-10, 1e-12, 1e-14, 1e-16, 1e-18))
-    return {"spheres": triplet, "asphere": GeoLens(surfaces, 10.0)}
+    glass = surfaces[0].medium
+    special = GeoLens([Surface(60.0, 4.0, glass, 9.0, decentre_mm=(0.1, 0.2), tilt_deg=(1.0, -1.0)), Surface(INF, 5.0, None, 9.0, phase=Phase((-0.05, 1e-4))),
+                       Surface(-90.0, 5.0, None, 9.0, conic=-1.0, mirror=True, inner_semi_aperture_mm=0.5), Surface(40.0, 3.0, glass, 6.0), Surface(-25.0, 10.0, None, 6.0)], 10.0)
+    special.decentre_mm.requires_grad_()
+    special.tilt_rad.requires_grad_()
+    return {"spheres": triplet, "asphere": GeoLens(surfaces, 10.0), "special": special}
 
 
 BAD_RAYS = [((40.0, 0.0, -5.0), (0, 0, 1.0)), ((0.0, 21.5, -5.0), (0, 0, 1.0)), ((9.0, 0.0, -5.0), (0.9, 0, 1.0)), ((0.0, 3.0, -5.0), (0, 1, 1e-9)), ((2.0, 3.0, -5.0), (0, 0.1, -1.0)), ((1e4, 0, -5.0), (0, 0, 1.0))]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("kind", ["spheres", "asphere"])
+@pytest.mark.parametrize("kind", ["spheres", "asphere", "special"])
 def test_bad_rays_have_finite_values_gradients_and_positive_deficits(kind, dtype):
     geo = mixed_lenses()[kind].to(dtype)
     origin = f64([o for o, _ in BAD_RAYS]).to(dtype).requires_grad_()
@@ -85,14 +96,14 @@ def test_bad_rays_have_finite_values_gradients_and_positive_deficits(kind, dtype
     assert (out.weight == 0).all()
     assert (out.deficit > 0).all()
     values = everything(out)
-    tensors = [origin, direction, *(p for p in geo.parameters() if p.numel())]
+    tensors = [origin, direction, *learned(geo)]
     for column in values.unbind(1):
         grads = torch.autograd.grad(column.sum(), tensors, retain_graph=True, allow_unused=True)
         assert all(bool(g.isfinite().all()) for g in grads if g is not None)
     assert bool(values.isfinite().all())
 
 
-@pytest.mark.parametrize("kind", ["spheres", "asphere"])
+@pytest.mark.parametrize("kind", ["spheres", "asphere", "special"])
 def test_bad_rays_leave_the_gradients_of_good_ones_alone(kind, generator):
     geo = mixed_lenses()[kind]
     good = torch.cat([4 * torch.rand(40, 2, generator=generator, dtype=torch.float64) - 2, torch.full((40, 1), -5.0, dtype=torch.float64)], 1)
@@ -194,3 +205,53 @@ def test_the_far_half_of_a_sphere_is_not_a_surface():
     out = geo.trace(start, towards)
     assert (out.status.item(), out.failed_surface.item()) == (Status.MISS, 0)
     assert out.deficit.item() > 0.1
+
+
+def test_flat_surfaces_have_the_derivatives_of_slightly_bent_ones():
+    """At zero curvature the sphere has no centre, but the ray and its derivative do: central differences over 1e-6 per mm err by their square."""
+    flat = GeoLens([Surface(INF, 4.0, GLASS, 9.0), Surface(INF, 30.0, None, 9.0)], 4.0)
+    origin, direction = f64([(1.0, 2.0, -5.0), (-3.0, 0.5, -5.0)]), unit([(0.1, 0.05, 1.0)] * 2)
+    merit = lambda c: (flat.replace(curvature_per_mm=c).trace(origin, direction).position_mm[:, :2] * f64([[1.0, 0.3], [-0.7, 0.2]])).sum()  # noqa: E731
+    start = torch.zeros(2, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(merit(start), start)
+    for i, shift in enumerate(1e-6 * torch.eye(2, dtype=torch.float64)):
+        assert slope[i].item() == pytest.approx((merit(shift) - merit(-shift)).item() / 2e-6, rel=1e-8)
+
+
+@pytest.mark.parametrize("distance", [1e-3, 1e-5, 1e-7])
+def test_grazing_rays_have_the_steep_but_true_derivatives_of_the_closed_form(distance):
+    """A ray parallel to the axis at R - e meets the sphere at depth R - sqrt(R^2 - h^2), whose slope in h is h / sqrt(R^2 - h^2)."""
+    radius = 10.0
+    height = radius - distance
+    ball = GeoLens([Surface(radius, 20.0, GLASS, 9.999)], 4.0).prescription().until(0)
+    origin = f64([(0.0, height, -5.0)]).requires_grad_()
+    out = trace(ball, origin, f64([(0, 0, 1.0)]))
+    depth = radius - math.sqrt((radius - height) * (radius + height))
+    assert out.position_mm[0, 2].item() == pytest.approx(depth, abs=1e-11)
+    (slope,) = torch.autograd.grad(out.position_mm[0, 2], origin)
+    # R^2 - h^2 is a difference of nearly equal numbers: rounding 1e-16 relative to 2 e / R, and half of that in the root
+    assert slope[0, 1].item() == pytest.approx(height / math.sqrt((radius - height) * (radius + height)), rel=1e-15 * radius / distance + 1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_when_all_rays_are_blocked_the_loss_is_zero_and_so_are_its_gradients(dtype):
+    """Weights of blocked rays are exactly 0, the hard mask says so, and the merit of what arrives has the gradient 0, not NaN."""
+    geo = lens.load("cooke-triplet", dtype)
+    origin, direction = f64([(0.0, 9.9, -5.0), (9.8, 0.0, -5.0)]).to(dtype), f64([(0, 0, 1.0)] * 2).to(dtype)
+    out = geo.trace(origin, direction)
+    assert not out.inside.any()
+    assert out.weight.tolist() == [0.0, 0.0]
+    loss = (out.weight * out.position_mm.square().sum(1)).sum()
+    assert loss.item() == 0
+    assert gradients(geo, loss).abs().max().item() == 0
+
+
+def test_the_hard_mask_is_half_the_soft_edge():
+    """9.4 and 9.6 mm at an aperture of 9.5 mm with an edge of 0.4 mm: both within the soft edge, one inside."""
+    geo = GeoLens([Surface(INF, 10.0, None, 9.5)], 4.0, soft_edge_mm=0.4)
+    out = geo.trace(f64([(0.0, 9.4, 0.0), (0.0, 9.5 + 1e-9, 0.0), (0.0, 9.6, 0.0), (0.0, 9.1, 0.0)]), f64([(0, 0, 1.0)] * 4))
+    assert out.inside.tolist() == [True, False, False, True]
+    assert out.weight[1].item() == pytest.approx(0.5, abs=1e-8)
+    assert 0.5 < out.weight[0].item() < 1
+    assert 0 < out.weight[2].item() < 0.5
+    assert out.weight[3].item() == 1.0

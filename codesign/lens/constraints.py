@@ -1,0 +1,215 @@
+"""What a lens must be to exist: limits on thicknesses, gaps, angles, length, glass and rays, as smooth penalties and as a report.
+
+    limits = Limits(glass_centre_mm=1.0, glass_edge_mm=1.0, air_gap_mm=0.2, track_mm=70.0)
+    found = evaluate(lens, limits)
+    loss = spot + penalty(found)
+    print(report(found))
+
+Every Constraint is a value, a bound and a side. Its penalty is (violation / scale)^2: zero with zero slope where it holds,
+so values and slopes are continuous. Surfaces are counted from 1.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from codesign.errors import DomainError
+from codesign.lens import glass_map
+from codesign.lens.hits import rim_rays, surface_hits
+from codesign.lens.surface import sag_mm
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """One limit on one figure of a lens.
+
+    value: scalar tensor with its gradient. at_least: True for value >= bound, False for value <= bound.
+    scale: the violation that costs a penalty of 1, in the unit of the value. can_bind: False where the bound is also the best value
+    there is (no failed ray), so that it holds or is violated but never binds.
+    """
+
+    name: str
+    value: Tensor
+    bound: float
+    at_least: bool
+    scale: float
+    unit: str
+    can_bind: bool = True
+
+    @property
+    def slack(self):
+        """How far the value stays inside its bound, in its unit; negative when violated. Differentiable."""
+        return self.value - self.bound if self.at_least else self.bound - self.value
+
+    @property
+    def violation(self):
+        """max(0, -slack), in its unit."""
+        return (-self.slack).clamp_min(0)
+
+    @property
+    def row(self):
+        """violation / scale: a residual for least squares."""
+        return self.violation / self.scale
+
+    @property
+    def penalty(self):
+        """(violation / scale)^2, dimensionless."""
+        return self.row.square()
+
+    def state(self, tolerance=1e-3):
+        """One of "violated", "binds" (within tolerance * scale of its bound on either side) and "free"."""
+        share = float(self.slack.detach()) / self.scale
+        if self.can_bind and abs(share) <= tolerance:
+            return "binds"
+        return "free" if share >= 0 else "violated"  # NaN is violated
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What to hold; None leaves a figure free. Lengths in mm, angles in degrees.
+
+    glass_centre_mm, glass_centre_most_mm: centre thickness of glass. glass_edge_mm: thickness of glass at the semi-aperture.
+    air_gap_mm: least air between neighbouring surfaces anywhere within the semi-aperture, the axis included.
+    track_mm: most length from the first vertex to the image. back_focus_mm: least distance from the last surface to the image.
+    incidence_deg: most angle of incidence of any rim or chief ray of ``fields_rad``. steepness: most semi-aperture over radius (1 is a hemisphere).
+    rays: whether every rim and chief ray of ``fields_rad`` must arrive.
+    glass_polygon: corners (nd, Vd) of a convex region of the glass map, see glass_map. index_range: least and most nd of any glass.
+    scale_mm, scale_deg: violations that cost 1.
+    """
+
+    glass_centre_mm: float | None = None
+    glass_centre_most_mm: float | None = None
+    glass_edge_mm: float | None = None
+    air_gap_mm: float | None = None
+    track_mm: float | None = None
+    back_focus_mm: float | None = None
+    incidence_deg: float | None = None
+    steepness: float | None = None
+    rays: bool = False
+    fields_rad: tuple[float, ...] = ()
+    glass_polygon: tuple[tuple[float, float], ...] | None = None
+    index_range: tuple[float, float] | None = None
+    scale_mm: float = 0.5
+    scale_deg: float = 5.0
+
+    def __post_init__(self):
+        if (self.incidence_deg is not None or self.rays) and not self.fields_rad:
+            raise DomainError("limits on angles of incidence and on rays need fields_rad, the field angles whose rays count; for example (0.0, 0.35).")
+        if not (self.scale_mm > 0 and self.scale_deg > 0):
+            raise DomainError(f"scales of violations must be positive, got {self.scale_mm} mm and {self.scale_deg} degrees.")
+
+
+def gap_mm(lens, heights, semi_aperture_mm=None):
+    """Distance along the axis between neighbouring surfaces, [S - 1, H] mm, at ``heights`` [H], shares of the larger of their semi-apertures."""
+    a = lens.semi_aperture_mm if semi_aperture_mm is None else semi_aperture_mm
+    y = torch.maximum(a[:-1], a[1:])[:, None] * heights
+    sag = lambda rows: sag_mm(y, lens.curvature_per_mm[rows, None], lens.conic[rows, None], [k[:, None] for k in lens.asphere[rows].unbind(1)])  # noqa: E731
+    return lens.thickness_mm[:-1, None] + sag(slice(1, None)) - sag(slice(None, -1))
+
+
+def evaluate(lens, limits, semi_aperture_mm=None):
+    """All constraints that ``limits`` asks for, a list of Constraint.
+
+    Args: semi_aperture_mm: [S] where edges and gaps are measured (may carry a gradient); the lens's own when left out. See hits for
+      semi-apertures sized by rays.
+    Gradient: to every lens tensor the figure depends on. A least gap has that of its narrowest place.
+    """
+    apertures = lens.semi_aperture_mm if semi_aperture_mm is None else semi_aperture_mm
+    return [*_thicknesses(lens, limits, apertures), *_lengths(lens, limits), *_steepness(lens, limits, apertures), *_rays(lens, limits), *_glasses(lens, limits)]
+
+
+def penalty(constraints):
+    """Sum of the penalties; exactly 0 when all hold."""
+    return rows(constraints).square().sum()
+
+
+def rows(constraints):
+    """violation / scale of every constraint, [C]: residual rows for least squares whose squares sum to ``penalty``."""
+    if not constraints:
+        raise DomainError("there are no constraints; set at least one limit.")
+    return torch.stack([c.row for c in constraints])
+
+
+def active(constraints, tolerance=1e-3):
+    """The constraints that are violated or bind (within tolerance * scale), the worst first."""
+    found = [c for c in constraints if c.state(tolerance) != "free"]
+    return sorted(found, key=lambda c: float(c.slack.detach()) / c.scale)
+
+
+def report(constraints, tolerance=1e-3):
+    """A printable table: every constraint with value, bound, slack and state, the tightest first."""
+    ordered = sorted(constraints, key=lambda c: float(c.slack.detach()) / c.scale)
+    lines = [("constraint", "value", "bound", "slack", "unit", "state")]
+    lines += [(c.name, f"{float(c.value.detach()):.4f}", f"{'≥' if c.at_least else '≤'} {c.bound:g}", f"{float(c.slack.detach()):+.4f}", c.unit, c.state(tolerance)) for c in ordered]
+    widths = [max(len(line[k]) for line in lines) for k in range(6)]
+    return "\n".join("  ".join(cell.ljust(w) if k in (0, 4, 5) else cell.rjust(w) for k, (cell, w) in enumerate(zip(line, widths, strict=True))).rstrip() for line in lines)
+
+
+def is_glass(lens):
+    """Whether each gap [S] is filled with more than air, judged by its index at the d line."""
+    return [n > 1.001 for n in lens.index()[1:].tolist()]
+
+
+def _thicknesses(lens, limits, apertures):
+    glass, found = is_glass(lens), []
+    between = [f"between surfaces {i + 1} and {i + 2}" for i in range(len(glass) - 1)]
+    lowest = gap_mm(lens, torch.linspace(0, 1, 33, dtype=lens.dtype, device=apertures.device), apertures).amin(1)
+    edges = gap_mm(lens, torch.ones(1, dtype=lens.dtype, device=apertures.device), apertures)[:, 0]
+    for i, where in enumerate(between):
+        if glass[i]:
+            found += _least(f"centre of glass {where}", lens.thickness_mm[i], limits.glass_centre_mm, limits.scale_mm)
+            found += _most(f"centre of glass {where}", lens.thickness_mm[i], limits.glass_centre_most_mm, limits.scale_mm)
+            found += _least(f"edge of glass {where}", edges[i], limits.glass_edge_mm, limits.scale_mm)
+        else:
+            found += _least(f"air {where}", lowest[i], limits.air_gap_mm, limits.scale_mm)
+    return found
+
+
+def _lengths(lens, limits):
+    track = _most("total track", lens.thickness_mm.sum(), limits.track_mm, limits.scale_mm)
+    return track + _least("back focus", lens.thickness_mm[-1], limits.back_focus_mm, limits.scale_mm)
+
+
+def _steepness(lens, limits, apertures):
+    steep = (lens.curvature_per_mm * apertures).abs() * (1 + lens.conic).clamp_min(1e-12).sqrt()
+    return [c for i, value in enumerate(steep.unbind(0)) for c in _most(f"steepness of surface {i + 1}", value, limits.steepness, 0.1, "")]
+
+
+def _rays(lens, limits):
+    if limits.incidence_deg is None and not limits.rays:
+        return []
+    origin, direction = rim_rays(lens, limits.fields_rad)
+    found = []
+    if limits.incidence_deg is not None:
+        hits = surface_hits(lens, origin, direction)
+        sine = (1 - hits.cosine.clamp_max(1).square()).clamp_min(1e-12).sqrt()
+        angle = torch.rad2deg(torch.atan2(sine, hits.cosine))
+        worst = torch.where(hits.passed, angle, 0.0).amax(1)  # a ray that fails is the business of ``rays``
+        found += [c for i, value in enumerate(worst.unbind(0)) for c in _most(f"incidence on surface {i + 1}", value, limits.incidence_deg, limits.scale_deg, "deg")]
+    if limits.rays:
+        out = lens.trace(origin, direction)
+        # a radicand lacks the deficit: exactly 0 for a ray that passes
+        found.append(Constraint("deficit of rays that fail", out.deficit.sum(), 0.0, False, 0.1, "", can_bind=False))
+    return found
+
+
+def _glasses(lens, limits):
+    if limits.glass_polygon is None and limits.index_range is None:
+        return []
+    found = []
+    for i, (nd, vd) in glass_map.places(lens).items():
+        name = f"glass behind surface {i + 1}"
+        if limits.index_range is not None:
+            found += _least(f"index of {name}", nd, limits.index_range[0], 0.01, "") + _most(f"index of {name}", nd, limits.index_range[1], 0.01, "")
+        if limits.glass_polygon is not None:
+            found += _least(f"{name} in the glass map", glass_map.inside(nd, vd, limits.glass_polygon), 0.0, 0.01, "nd")
+    return found
+
+
+def _least(name, value, bound, scale, unit="mm"):
+    return [] if bound is None else [Constraint(name, value, bound, True, scale, unit)]
+
+
+def _most(name, value, bound, scale, unit="mm"):
+    return [] if bound is None else [Constraint(name, value, bound, False, scale, unit)]

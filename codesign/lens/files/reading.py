@@ -1,0 +1,57 @@
+"""Load a lens by name or from a file."""
+
+import os
+from pathlib import Path
+
+import torch
+
+from codesign.errors import CodesignError, FileFormatError
+from codesign.lens import catalogue
+from codesign.lens.files import page
+from codesign.lens.files.assemble import assemble
+from codesign.lens.files.deeplens import is_deeplens, read_deeplens
+from codesign.lens.files.diffoptics import read_diffoptics
+from codesign.lens.files.native import read_native
+from codesign.lens.files.optiland import is_optiland, read_optiland
+from codesign.lens.files.seq import read_seq
+from codesign.lens.files.text import at, read_text, title
+from codesign.lens.files.zmx import read_zmx
+from codesign.lens.geolens import GeoLens
+
+TEXTS = {".zmx": read_zmx, ".seq": read_seq, ".txt": read_diffoptics}
+
+
+def load(source, dtype=torch.float64):
+    """Lens from a catalogue name (cooke-triplet, double-gauss, la1509) or a file; docs/lens_files.md says what is read of each.
+
+    Args: source: name, or path with the extension .json (native, DeepLens or optiland), .zmx, .seq, or .txt (DiffOptics). dtype: precision of the lens.
+    Returns: GeoLens. Files are parsed, never executed; at most 2 MB and 500 surfaces are read.
+    Raises: FileFormatError or DomainError, one sentence naming file, place, fault and remedy; nothing is half loaded or dropped.
+    """
+    if str(source) in catalogue.LENSES:
+        surfaces, diameter = catalogue.named_surfaces(str(source))
+        return GeoLens(surfaces, diameter, dtype, name=str(source), half_field_deg=catalogue.half_field_deg(str(source)))
+    path = Path(source)
+    if not os.path.exists(path):
+        raise FileFormatError(f"lens '{str(source)[:200]}' is neither a file nor a known name; known names: {', '.join(catalogue.LENSES)}.")
+    with at(f"lens file {path}"):
+        suffix = path.suffix.lower()
+        if suffix not in (".json", *TEXTS):
+            raise FileFormatError(f"extension '{path.suffix}' is not read; give .json, {', '.join(TEXTS)}, or one of {', '.join(catalogue.LENSES)}.")
+        text = read_text(path)
+        name = title(path.stem, "lens")
+        try:
+            return _from_json(text, name, dtype) if suffix == ".json" else assemble(TEXTS[suffix](text, name), dtype)
+        except CodesignError:
+            raise
+        except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            raise FileFormatError(f"a value is of the wrong kind or size ({' '.join(str(error).split())[:80]}); see docs/lens_files.md.") from error
+
+
+def _from_json(text, name, dtype):
+    found = page.parse(text)
+    if is_optiland(found):
+        return assemble(read_optiland(found, name), dtype)
+    if is_deeplens(found):
+        return assemble(read_deeplens(found, name), dtype)
+    return read_native(found, name, dtype)

@@ -1,0 +1,99 @@
+"""The text of a lens file, and the numbers in it, read within bounds whatever the file holds."""
+
+import codecs
+import math
+import os
+import re
+import stat
+from contextlib import contextmanager
+
+from codesign.errors import CodesignError, FileFormatError
+
+LARGEST_BYTES = 2_000_000
+MOST_SURFACES, MOST_LINES = 500, 50_000
+NUMBER = re.compile(r"[+-]?(\d{1,40}\.?\d{0,40}|\.\d{1,40})([eE][+-]?\d{1,4})?", re.ASCII)
+CONTROL = re.compile(r"[\x00-\x08\x0b\x0e-\x1f\x7f]")
+
+
+def read_text(path):
+    """The text of a file in UTF-8, UTF-16 (either byte order) or Latin-1; at most LARGEST_BYTES + 1 bytes are read.
+
+    Raises: FileFormatError for what is not a regular file (a pipe is not waited for), is too long, or is not text.
+    """
+    try:
+        with open(path, "rb", opener=_open_regular) as file:
+            content = file.read(LARGEST_BYTES + 1)
+    except OSError as error:
+        raise FileFormatError(f"it cannot be read ({error.strerror}); give a file you may read.") from error
+    if len(content) > LARGEST_BYTES:
+        raise FileFormatError(f"it has more than {LARGEST_BYTES} bytes, which no lens needs; is it a lens file?")
+    try:
+        text = content.decode(_encoding(content))
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"it is not text ({error.encoding} fails at byte {error.start}); save it as UTF-8.") from error
+    text = text.removeprefix("\ufeff").rstrip("\x1a")
+    if max(text.count("\n"), text.count("\r")) > MOST_LINES:
+        raise FileFormatError(f"it has more than {MOST_LINES} lines, which no lens needs; is it a lens file?")
+    strange = CONTROL.search(text)
+    if strange:
+        raise FileFormatError(f"it is not text (control character {ord(strange[0])} at position {strange.start()}); save it as UTF-8.")
+    return text
+
+
+def _open_regular(path, flags):
+    handle = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise FileFormatError("it is not a regular file; give a lens file.")
+    return handle
+
+
+def _encoding(content):
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    if b"\x00" in content[:2]:
+        return "utf-16-be" if content[:1] == b"\x00" else "utf-16-le"
+    try:
+        content.decode("utf-8")
+        return "utf-8"
+    except UnicodeDecodeError:
+        return "latin-1"
+
+
+def lines(text):
+    """The lines of a text, with their numbers from 1."""
+    return enumerate(re.split(r"\r\n|\r|\n", text), 1)
+
+
+def number(word, what):
+    """The finite number a word spells. Raises: FileFormatError naming what it stands for."""
+    value = float(word) if NUMBER.fullmatch(word) else math.nan
+    if not math.isfinite(value):
+        raise FileFormatError(f"{what} is '{shown(word)}', a finite number is needed; correct it.")
+    return value
+
+
+def whole(word, what, most=10_000):
+    """The whole number from 0 to ``most`` a word spells."""
+    if not re.fullmatch(r"\d{1,6}", word, re.ASCII) or int(word) > most:
+        raise FileFormatError(f"{what} is '{shown(word)}', a whole number from 0 to {most} is needed; correct it.")
+    return int(word)
+
+
+def shown(value):
+    """A value of a file as it may stand in a sentence: short, on one line."""
+    return "".join(c if c.isprintable() else "?" for c in " ".join(str(value)[:60].split())[:40])
+
+
+def title(value, otherwise):
+    """A name on one line of at most 80 printable characters; ``otherwise`` where there is none."""
+    return "".join(c for c in " ".join(str(value).split()) if c.isprintable())[:80].strip() or otherwise
+
+
+@contextmanager
+def at(place):
+    """Put the place in front of the sentence of any error of the block."""
+    try:
+        yield
+    except CodesignError as error:
+        raise type(error)(f"{place}: {error}") from error

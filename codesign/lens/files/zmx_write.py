@@ -1,0 +1,77 @@
+"""Writer of OpticStudio .zmx files."""
+
+from codesign.errors import CodesignError, FileFormatError
+from codesign.lens.glass import AIR, WAVELENGTH_UM, Glass, names
+
+MOST_TERMS = 8  # of an even asphere
+SAME_INDEX = 1e-8  # a glass goes by its catalogue name when its indices at F, d and C are the catalogue's to this; published tables round to 1e-9
+
+
+def to_zmx(lens):
+    """The text of a .zmx file of the lens's current values; numbers keep all their digits.
+
+    Kept: curvatures, thicknesses and aspheres with their signs along a fixed axis, conics, stop, apertures and central obstructions, mirrors, diffractive phases,
+    entrance pupil diameter, half field, name. A glass of the catalogue keeps its name; any other becomes a model glass of nd and Vd. Not kept: the width of the soft edges.
+    Raises: DomainError for values that cannot be; FileFormatError for what a centred .zmx surface cannot hold.
+    """
+    field = lens.half_field_deg or 0.0
+    head = ["VERS 140124 0 0", "MODE SEQ", f"NAME {_plain(lens.name)}", "UNIT MM X W X CM MR CPMM", f"ENPD {lens.entrance_pupil_diameter_mm!r}", "ENVD 20 1 0", "FTYP 0 0 2 3 0 0 0",
+            "XFLN 0 0", f"YFLN 0 {field!r}", *(f"WAVM {i} {w!r} 1" for i, w in enumerate(WAVELENGTH_UM.values(), 1)), "PWAV 2", *_block(0, ["TYPE STANDARD", "CURV 0", "DISZ INFINITY"])]
+    sign, lines = 1.0, []
+    surfaces = lens.to_surfaces()
+    for i, surface in enumerate(surfaces, 1):
+        surface.check(f"{lens.name}, surface {i}")
+        lines += _block(i, _surface(surface, sign, f"{lens.name}, surface {i}", i == lens.stop_index + 1))
+        sign = -sign if surface.mirror else sign
+    tail = _block(len(surfaces) + 1, ["TYPE STANDARD", "CURV 0", "DISZ 0"])
+    return "\n".join([*head, *lines, *tail]) + "\n"
+
+
+def _block(number, lines):
+    return [f"SURF {number}", *(f"  {line}" for line in lines)]
+
+
+def _surface(surface, sign, label, is_stop):
+    if any(surface.decentre_mm) or any(surface.tilt_deg):
+        raise FileFormatError(f"{label}: it is decentred or tilted, which is not written to .zmx; save the lens as .json.")
+    if surface.phase is not None and surface.phase.blaze_um is not None:
+        raise FileFormatError(f"{label}: its blaze wavelength has no place in a .zmx file; save the lens as .json, or set blaze_um to None.")
+    terms = [sign * a + 0.0 for a in surface.asphere]
+    if any(terms[MOST_TERMS:]):
+        raise FileFormatError(f"{label}: it has {len(terms)} asphere terms, a .zmx file holds {MOST_TERMS}; save the lens as .json.")
+    kind = "BINARY_2" if surface.phase else "EVENASPH" if any(terms) else "STANDARD"
+    behind = -sign if surface.mirror else sign
+    lines = ["STOP"] if is_stop else []
+    lines += [f"TYPE {kind}", f"CURV {sign * surface.curvature_per_mm + 0.0!r}"]
+    if surface.phase:
+        lines += [f"PARM 0 {surface.phase.order}", f"XDAT 1 {len(surface.phase.coefficients)}", "XDAT 2 1.0", *(f"XDAT {i} {a!r}" for i, a in enumerate(surface.phase.coefficients, 3))]
+    if kind != "STANDARD":
+        lines += [f"PARM {i} {a!r}" for i, a in enumerate(terms[:MOST_TERMS], 1)]
+    lines += [f"DISZ {behind * surface.thickness_mm + 0.0!r}", *_glass(surface)]
+    lines += [f"CONI {surface.conic!r}"] if surface.conic else []
+    aperture = f"CLAP {surface.inner_semi_aperture_mm!r} {surface.semi_aperture_mm!r} 0" if surface.inner_semi_aperture_mm else f"FLAP 0 {surface.semi_aperture_mm!r} 0"
+    return [*lines, f"DIAM {surface.semi_aperture_mm!r} 1 0 0 1 \"\"", aperture]
+
+
+def _glass(surface):
+    if surface.mirror:
+        return ["GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0"]
+    glass = surface.medium
+    if glass is None or glass == AIR:
+        return []
+    model = f"{glass.index_d!r} {glass.abbe_number!r} 0 0 0 0 0 0"
+    return [f"GLAS {glass.name} 0 0 {model}" if _is_named(glass) else f"GLAS ___BLANK 1 0 {model}"]
+
+
+def _is_named(glass):
+    try:
+        known = Glass.named(glass.name)
+    except CodesignError:
+        return False
+    in_catalogue = known.name in names()  # 1.6123/44.1 is a name too, but only here
+    return in_catalogue and not any(c.isspace() for c in glass.name) and all(abs(known.index(w) - glass.index(w)) < SAME_INDEX for w in WAVELENGTH_UM.values())
+
+
+def _plain(name):
+    """A name on one line of printable ASCII."""
+    return "".join(c if c.isascii() and c.isprintable() else "?" for c in name)

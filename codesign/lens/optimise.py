@@ -1,0 +1,127 @@
+"""What the optimisers share: history, Jacobians by autograd or by differences, and scales that give every variable the same effect."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from codesign.errors import DomainError, ShapeError, check_finite
+
+Jacobian = Callable[[Callable[[Tensor], Tensor], Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One step: the loss before it, the norm of its gradient, the length of the trial step, damping (or step size), whether it was accepted."""
+
+    loss: float
+    gradient: float
+    step: float
+    damping: float
+    accepted: bool
+
+
+@dataclass
+class History:
+    """All steps of a run. Indexing and len() go over Entry; ``column`` gives one figure over the steps."""
+
+    entries: list[Entry] = field(default_factory=list)
+
+    def add(self, entry):
+        self.entries.append(entry)
+
+    def column(self, name):
+        """One field of every step, a list."""
+        return [getattr(entry, name) for entry in self.entries]
+
+    def rows(self):
+        """Plain lists for a state file."""
+        return [list(dataclasses.astuple(entry)) for entry in self.entries]
+
+    @staticmethod
+    def of(rows):
+        """The history that ``rows`` came from."""
+        return History([Entry(*row) for row in rows])
+
+    def __len__(self):
+        return len(self.entries)
+
+    def __getitem__(self, at):
+        return self.entries[at]
+
+
+def by_autograd(residuals, variables, value):
+    """Jacobian [M, V] by one backward pass per residual: exact; for few residuals, or as a reference."""
+    at = variables.detach().requires_grad_()
+    with torch.enable_grad():
+        found = residuals(at)
+    if not found.requires_grad:
+        raise DomainError("the residuals do not depend on the variables through torch; use by_differences.")
+    rows = [torch.autograd.grad(entry, at, retain_graph=True, allow_unused=True)[0] for entry in found]
+    return torch.stack([torch.zeros_like(variables) if row is None else row for row in rows]).detach()
+
+
+def by_differences(step, central=False):
+    """A Jacobian by differences of the variables: V more evaluations, 2 V when ``central``.
+
+    Args: step: a number or [V]; the error is about step (step^2 when central) times curvature, plus rounding over step.
+    Where the far side is not finite the other side is used; where neither is, the Jacobian is not finite.
+    """
+
+    def jacobian(residuals, variables, value):
+        steps = torch.as_tensor(step, dtype=variables.dtype, device=variables.device).expand_as(variables)
+        with torch.no_grad():
+            return torch.stack([_slope(residuals, variables, value, v, float(steps[v]), central) for v in range(variables.numel())], 1)
+
+    return jacobian
+
+
+def _slope(residuals, variables, value, at, step, central):
+    def moved(by):
+        shifted = variables.clone()
+        shifted[at] += by
+        return residuals(shifted), float(shifted[at] - variables[at])  # the step that rounding leaves
+
+    ahead, forward = moved(step)
+    if finite(ahead) and not central:
+        return (ahead - value) / forward
+    behind, back = moved(-step)
+    if not finite(ahead):
+        return (behind - value) / back
+    return (ahead - behind) / (forward - back) if finite(behind) else (ahead - value) / forward
+
+
+def finite(value):
+    """Whether every entry is a finite number."""
+    return bool(value.isfinite().all())
+
+
+def check_start(start):
+    """The start as a detached vector. Raises: ShapeError unless [V >= 1]; DomainError when it is not finite."""
+    if start.ndim != 1 or not start.numel():
+        raise ShapeError(f"the start must be a vector [V >= 1], got {tuple(start.shape)}.")
+    return check_finite(start.detach().clone(), "start")
+
+
+def column_scales(jacobian: Tensor, limit: float | Tensor = math.inf):
+    """Step per variable [V] that changes the residuals by 1: one over the column norms, at most ``limit``.
+
+    Args: jacobian [M, V]; limit: number or [V], for variables the residuals hardly see.
+    """
+    norms = torch.linalg.vector_norm(jacobian, dim=0)
+    return torch.minimum(1 / norms.clamp_min(1e-300), torch.as_tensor(limit, dtype=norms.dtype, device=norms.device))
+
+
+def principal_modes(jacobian, limit=math.inf):
+    """Basis [V, V] whose columns are directions with effects at right angles, each of which changes the residuals by 1.
+
+    Args: jacobian [M, V] of variables in comparable units; limit: largest change of any variable by a column, for directions the residuals hardly see.
+    Source: eigenvectors of J^T J, as the right singular vectors of J.
+    """
+    _, sizes, modes = torch.linalg.svd(jacobian, full_matrices=True)
+    sizes = torch.cat([sizes, sizes.new_zeros(modes.shape[0] - sizes.numel())])
+    reach = torch.minimum(1 / sizes.clamp_min(1e-300), limit / modes.abs().amax(1)) if limit < math.inf else 1 / sizes.clamp_min(1e-300)
+    return modes.T * reach

@@ -1,0 +1,95 @@
+"""Pictures of lens errors over the field, over focus, and over the surfaces: distortion, field curvature, through focus, Seidel sums."""
+
+import math
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+
+from codesign.lens import analysis
+from codesign.lens.glass import WAVELENGTH_UM
+from codesign.report.lens_layout import COLOURS
+
+SEIDEL_NAMES = ("spherical $S_I$", "coma $S_{II}$", "astigmatism $S_{III}$", "Petzval $S_{IV}$", "distortion $S_V$")
+SEIDEL_COLOURS = ("#1b6ca8", "#2e8b57", "#d68910", "#8e44ad", "#c0392b")
+
+
+@torch.no_grad()
+def field_errors(lens, half_field_rad, light=tuple(WAVELENGTH_UM.values()), mapping="f-tan", count=21):
+    """Figure over the field: tangential and sagittal focus, distortion, and lateral colour against the first wavelength."""
+    wavelengths, _ = analysis.spectral_lines(light)
+    fields = [half_field_rad * i / (count - 1) for i in range(count)]
+    degrees = np.degrees(fields)
+    figure, axes = plt.subplots(1, 3, figsize=(10, 3.8), sharey=True, layout="constrained")
+    shifts = analysis.focus_shift_mm(lens, fields, wavelengths[0]).numpy()
+    axes[0].plot(shifts[:, 0], degrees, color=COLOURS[0], label="tangential")
+    axes[0].plot(shifts[:, 1], degrees, color=COLOURS[0], ls="--", label="sagittal")
+    axes[0].set(xlabel="focus shift (mm)", ylabel="field (degrees)", title="Field curvature")
+    axes[0].legend(frameon=False, fontsize=8)
+    axes[1].plot(analysis.distortion_percent(lens, fields, mapping, wavelengths[0]).numpy(), degrees, color=COLOURS[2])
+    axes[1].set(xlabel=f"distortion (%), {mapping}", title="Distortion")
+    if len(wavelengths) > 1:
+        colour = analysis.lateral_colour_mm(lens, fields, wavelengths[1:], wavelengths[0]).numpy() * 1e3
+        for k, wavelength in enumerate(wavelengths[1:]):
+            axes[2].plot(colour[:, k], degrees, color=COLOURS[1:][k % 3], label=f"{wavelength * 1e3:.0f} nm")
+        axes[2].legend(frameon=False, fontsize=8)
+    axes[2].set(xlabel=f"height − that at {wavelengths[0] * 1e3:.0f} nm (µm)", title="Lateral colour")
+    for axis in axes:
+        axis.axvline(0, color="0.5", lw=0.6)
+        axis.set_ylim(0, degrees[-1])
+        axis.grid(alpha=0.3)
+        widest = np.abs(axis.get_xlim()).max()
+        axis.set_xlim(-widest, widest)
+    return figure
+
+
+@torch.no_grad()
+def through_focus(lens, fields_rad, defocus_mm, frequency_per_mm, light=WAVELENGTH_UM["d"], vignetting=False, method="geometric"):
+    """Figure over the position of the image plane: RMS spot, and MTF at one frequency."""
+    figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+    z = np.asarray(defocus_mm, dtype=float)
+    sizes = analysis.through_focus_spot_mm(lens, fields_rad, z, light, 24, vignetting) * 1e3
+    for field, row, colour in zip(fields_rad, sizes, COLOURS * len(fields_rad), strict=False):
+        label = f"{math.degrees(field):.3g}°"
+        axes[0].plot(z, row.numpy(), color=colour, label=label)
+        curves = analysis.through_focus_mtf(lens, field, frequency_per_mm, z, light, method, vignetting=vignetting).numpy()
+        axes[1].plot(z, curves[0], color=colour, label=f"{label}, tangential")
+        axes[1].plot(z, curves[1], color=colour, ls="--", label=f"{label}, sagittal")
+    axes[0].set(xlabel="defocus (mm)", ylabel="RMS spot (µm)")
+    axes[0].set_ylim(bottom=0)
+    axes[1].set(xlabel="defocus (mm)", ylabel=f"{method} MTF at {frequency_per_mm:g} / mm", ylim=(0, 1.02))
+    for axis in axes:
+        axis.axvline(0, color="0.5", lw=0.6)
+        axis.grid(alpha=0.3)
+        axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def seidel_bars(sums, wavelength_um=WAVELENGTH_UM["d"]):
+    """Figure of Seidel sums per surface and in total (``SeidelSums``), in waves."""
+    values = torch.cat([sums.per_surface, sums.total[None]]).detach().numpy() / (wavelength_um * 1e-3)
+    figure, axis = plt.subplots(figsize=(max(6.5, 0.75 * len(values) + 2), 3.6), layout="constrained")
+    place = np.arange(len(values))
+    for k, (name, colour) in enumerate(zip(SEIDEL_NAMES, SEIDEL_COLOURS, strict=True)):
+        axis.bar(place + 0.16 * (k - 2), values[:, k], 0.16, color=colour, label=name)
+    axis.axhline(0, color="k", lw=0.7)
+    axis.axvline(len(values) - 1.5, color="0.5", lw=0.8, ls=":")
+    axis.set_xticks(place, [*(str(i + 1) for i in range(len(values) - 1)), "total"])
+    axis.set(xlabel="surface", ylabel="waves")
+    axis.legend(frameon=False, fontsize=8, ncols=5, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    return figure
+
+
+@torch.no_grad()
+def encircled_curves(lens, fields_rad, light=WAVELENGTH_UM["d"], vignetting=False):
+    """Figure of encircled energy (rays, about their mean) over the radius, a curve per field."""
+    figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
+    largest = max(float(analysis.encircled_radius_mm(lens, field, 1.0, light, 48, vignetting)) for field in fields_rad)
+    radii = torch.linspace(0, 1.02 * largest, 200, dtype=lens.dtype)
+    for field, colour in zip(fields_rad, COLOURS * len(fields_rad), strict=False):
+        axis.plot(radii.numpy() * 1e3, analysis.encircled_energy(lens, field, radii, light, 48, vignetting).numpy(), color=colour, label=f"{math.degrees(field):.3g}°")
+    axis.set(xlabel="radius (µm)", ylabel="share of rays inside", ylim=(0, 1.02))
+    axis.set_xlim(left=0)
+    axis.grid(alpha=0.3)
+    axis.legend(frameon=False, fontsize=8)
+    return figure

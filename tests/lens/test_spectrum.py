@@ -1,0 +1,165 @@
+"""Spectra against closed forms: strata of simple curves, Wien's and Planck's laws, the white point of D65, absorption of silicon."""
+
+import math
+
+import numpy as np
+import pytest
+
+from codesign.errors import DomainError, ShapeError
+from codesign.lens.spectrum import LINE_UM, Spectrum, blackbody, daylight_d65, silicon_response
+
+FLAT = (np.array([0.4, 0.7]), np.array([1.0, 1.0]))
+
+
+def test_lines_are_where_they_are():
+    assert Spectrum.line("d") == Spectrum((0.5875618,), (1.0,)) == Spectrum.monochromatic(0.5875618)
+    visible = Spectrum.visible_FdC((1, 2, 1))
+    assert visible.wavelengths_um == (0.4861327, 0.5875618, 0.6562725)
+    assert visible.weights == (0.25, 0.5, 0.25)
+    assert Spectrum.visible_FdC().weights == pytest.approx([1 / 3] * 3, abs=1e-16)
+    assert list(LINE_UM.values()) == sorted(LINE_UM.values())
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 1000])
+def test_a_flat_spectrum_gives_midpoints(count):
+    spectrum = Spectrum.from_curves(FLAT, FLAT, count)
+    assert spectrum.weights == (1 / count,) * count
+    # a difference of moments near 0.2 over an energy of 0.3 / count keeps 1e-16 * count
+    assert spectrum.wavelengths_um == pytest.approx(0.4 + 0.3 * (np.arange(count) + 0.5) / count, abs=1e-15 * (10 + count))
+
+
+@pytest.mark.parametrize("split", [False, True])
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_ramp_gives_the_square_roots(swapped, split):
+    # energy below w is (w - a)^2, so the strata end at a + width sqrt(k/N) and their means are 2/3 of cube over square differences
+    ramp = (np.array([0.4, 0.5, 0.7]), np.array([0.0, 1.0, 3.0])) if split else (np.array([0.4, 0.7]), np.array([0.0, 9.0]))
+    found = Spectrum.from_curves(*((FLAT, ramp) if swapped else (ramp, FLAT)), 5).wavelengths_um
+    u = 0.3 * np.sqrt(np.arange(6) / 5)
+    assert found == pytest.approx(0.4 + 2 / 3 * np.diff(u**3) / np.diff(u**2), abs=1e-14)
+
+
+def test_the_product_of_two_ramps_is_integrated_exactly():
+    up, down = (np.array([0.0, 1.0]) + 0.4, np.array([0.0, 1.0])), (np.array([0.0, 1.0]) + 0.4, np.array([1.0, 0.0]))
+    # t (1 - t): mean 1/2; first half has mean 5/16 (integrals 1/12 and 5/192)
+    assert Spectrum.from_curves(up, down, 1).wavelengths_um == pytest.approx((0.9,), abs=1e-14)
+    assert Spectrum.from_curves(up, down, 2).wavelengths_um == pytest.approx((0.4 + 5 / 16, 0.4 + 11 / 16), abs=1e-14)
+
+
+@pytest.mark.parametrize("count", [2, 5, 24])
+def test_the_mean_wavelength_does_not_depend_on_the_number_of_strata(count):
+    curves = silicon_response(), daylight_d65()
+    spectrum = Spectrum.from_curves(*curves, count)
+    one = Spectrum.from_curves(*curves, 1).wavelengths_um[0]
+    assert np.dot(spectrum.weights, spectrum.wavelengths_um) == pytest.approx(one, abs=1e-13)
+    # and it is the mean of a fine midpoint sum, whose error is of order h^2 = 1e-11
+    w = 0.36 + 0.47 * (np.arange(200_000) + 0.5) / 200_000
+    signal = np.interp(w, *curves[0]) * np.interp(w, *curves[1])
+    assert one == pytest.approx((signal * w).sum() / signal.sum(), abs=1e-9)
+    assert list(spectrum.wavelengths_um) == sorted(spectrum.wavelengths_um)
+
+
+def test_strata_skip_a_gap():
+    gap = (np.array([0.4, 0.45, 0.5, 0.6, 0.65, 0.7]), np.array([0.0, 1, 0, 0, 1, 0]))
+    assert Spectrum.from_curves(gap, FLAT, 2).wavelengths_um == pytest.approx((0.45, 0.65), abs=1e-14)
+    tiny, huge = (gap[0], gap[1] * 1e-300), (FLAT[0], FLAT[1] * 1e300)
+    assert Spectrum.from_curves(tiny, huge, 2) == Spectrum.from_curves(gap, FLAT, 2)
+
+
+@pytest.mark.parametrize("temperature_k", [3000, 4000, 5778, 8000])
+def test_the_peak_of_a_black_body_follows_wien(temperature_k):
+    wavelength_um, value = blackbody(temperature_k)
+    top = int(value.argmax())
+    # vertex of the parabola through the three highest points: third-order terms leave less than a tenth of the 5 nm step
+    left, peak, right = value[top - 1 : top + 2]
+    vertex = wavelength_um[top] + 0.005 * (left - right) / (left - 2 * peak + right) / 2
+    assert vertex == pytest.approx(2897.771955 / temperature_k, abs=5e-4)
+
+
+def test_a_hot_black_body_is_that_of_rayleigh_and_jeans():
+    wavelength_um, value = blackbody(100_000)
+    # 1/(e^x - 1) = 1/x - 1/2 + x/12 with x <= 0.48; the next term, x^3/720, is largest beside the others (0.77/x) at the first point
+    x = 14387.768775 / (wavelength_um * 1e5)
+    jeans = wavelength_um**-5 * (1 / x - 0.5 + x / 12)
+    assert value / value[0] == pytest.approx(jeans / jeans[0], rel=1.05 * 0.48**4 / 720 / 0.77)
+
+
+def test_d65_is_white():
+    def lobe(mean, below, above):
+        return np.exp(-0.5 * ((nm - mean) / np.where(nm < mean, below, above)) ** 2)
+
+    nm = np.arange(380.0, 781.0)
+    # colour matching functions of 1931 as sums of lobes: Wyman, Sloan and Shirley, JCGT 2 (2013), good to about 0.001 in x and y for white
+    x = 1.056 * lobe(599.8, 37.9, 31.0) + 0.362 * lobe(442.0, 16.0, 26.7) - 0.065 * lobe(501.1, 20.4, 26.2)
+    y = 0.821 * lobe(568.8, 46.9, 40.5) + 0.286 * lobe(530.9, 16.3, 31.1)
+    z = 1.217 * lobe(437.0, 11.8, 36.0) + 0.681 * lobe(459.0, 26.0, 13.8)
+    X, Y, Z = (float((np.interp(nm / 1000, *daylight_d65()) * curve).sum()) for curve in (x, y, z))
+    white = (X / (X + Y + Z), Y / (X + Y + Z))
+    assert white == pytest.approx((0.31272, 0.32903), abs=1e-3)
+
+
+@pytest.mark.parametrize(("wavelength_um", "absorption_per_cm"), [(0.5, 1.11e4), (0.6, 4.18e3), (0.7, 1.89e3), (0.8, 8.5e2), (0.9, 3.03e2), (1.0, 6.4e1)])
+def test_a_thin_layer_of_silicon_absorbs_by_its_coefficient(wavelength_um, absorption_per_cm):
+    # so thin that response / w is proportional to the coefficient (0.5 % at 0.5 um); coefficients as Green, 2008, tabulates them
+    w, value = silicon_response(0.01)
+    per_photon = np.interp(wavelength_um, w, value) / wavelength_um / (np.interp(0.5, w, value) / 0.5)
+    assert per_photon == pytest.approx(absorption_per_cm / 1.11e4, rel=0.015)
+
+
+def test_a_thick_layer_counts_every_visible_photon():
+    w, value = silicon_response(1000)
+    visible = (w > 0.37) & (w < 0.9)
+    # 30 absorption lengths at 0.9 um: the response in A/W is proportional to w
+    assert value[visible] / w[visible] == pytest.approx(np.full(visible.sum(), value[visible][0] / w[visible][0]), rel=1e-12)
+
+
+@pytest.mark.parametrize(("wavelengths", "weights", "error", "sentence"), [
+    ((0.5,), (0.5, 0.5), ShapeError, "one weight each"),
+    ((), (), ShapeError, "1 to 1000 wavelengths"),
+    ((0.5,) * 1001, (1 / 1001,) * 1001, ShapeError, "1 to 1000 wavelengths"),
+    ((587.6,), (1.0,), DomainError, "in micrometres"),
+    ((math.nan,), (1.0,), DomainError, "in micrometres"),
+    ((0.5, 0.6), (0.5, 0.6), DomainError, "sum to 1.1"),
+    ((0.5, 0.6), (1.5, -0.5), DomainError, "at least 0"),
+    ((0.5, 0.6), (0.5, math.nan), DomainError, "sum to nan"),
+    (("x",), (1.0,), ShapeError, "sequences of numbers"),
+    (0.5, 1.0, ShapeError, "sequences of numbers"),
+])  # fmt: skip
+def test_spectra_that_cannot_be_are_refused(wavelengths, weights, error, sentence):
+    with pytest.raises(error, match=sentence):
+        Spectrum(wavelengths, weights)
+
+
+@pytest.mark.parametrize(("response", "illuminant", "count", "error", "sentence"), [
+    (FLAT, FLAT, 0, DomainError, "whole number from 1 to 1000"),
+    (FLAT, FLAT, 2.0, DomainError, "whole number"),
+    (FLAT, FLAT, True, DomainError, "whole number"),
+    (FLAT, (np.array([0.8, 0.9]), np.ones(2)), 3, DomainError, "share no wavelengths"),
+    (FLAT, (np.array([400.0, 700.0]), np.ones(2)), 3, DomainError, "give micrometres"),
+    (FLAT, (np.array([0.7, 0.4]), np.ones(2)), 3, DomainError, "must increase"),
+    (FLAT, (np.array([0.4, 0.7]), np.array([1.0, -1.0])), 3, DomainError, "at least 0"),
+    (FLAT, (np.array([0.4, 0.7]), np.array([1.0, math.nan])), 3, DomainError, "finite"),
+    (FLAT, (np.array([0.4, 0.7]), np.array([1.0, math.inf])), 3, DomainError, "finite"),
+    (FLAT, (np.array([0.4, 0.7]), np.zeros(2)), 3, DomainError, "not all 0"),
+    (FLAT, (np.array([0.4, math.nan]), np.ones(2)), 3, DomainError, "must increase"),
+    (FLAT, (np.array([0.4, 0.5, 0.7]), np.ones(2)), 3, ShapeError, r"got \(3,\) and \(2,\)"),
+    (FLAT, (np.array([0.4]), np.ones(1)), 3, ShapeError, "2 <= N"),
+    (FLAT, 3.0, 3, ShapeError, "must be a pair"),
+    (FLAT, ("ab", "cd"), 3, ShapeError, "must be a pair"),
+    ((np.array([0.4, 0.5, 0.7]), np.array([1.0, 0, 0])), (np.array([0.4, 0.5, 0.7]), np.array([0, 0, 1.0])), 3, DomainError, "zero everywhere"),
+])  # fmt: skip
+def test_curves_that_cannot_be_are_refused(response, illuminant, count, error, sentence):
+    with pytest.raises(error, match=sentence):
+        Spectrum.from_curves(response, illuminant, count)
+
+
+def test_named_curves_refuse_what_they_cannot_give():
+    for temperature_k in (0, -5, 1e9, math.nan):
+        with pytest.raises(DomainError, match="500 to 100000 K"):
+            blackbody(temperature_k)
+    with pytest.raises(DomainError, match="depth"):
+        silicon_response(0)
+    with pytest.raises(DomainError, match="known lines: i, h, g"):
+        Spectrum.line("q")
+    for weights in ((0, 0, 0), (1, math.nan, 1), (math.inf, 1, 1)):
+        with pytest.raises(DomainError, match="not all 0"):
+            Spectrum.visible_FdC(weights)
