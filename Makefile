@@ -6,7 +6,7 @@ PYTHON ?=
 ARGS ?=
 RUN := .venv/bin/python
 
-.PHONY: help setup lens-opt placement speed-error stability gradcheck test lint doctor clean
+.PHONY: help setup lens-opt lens-report lens-scratch lens-tolerance lens-bench placement speed-error stability gradcheck test lint doctor clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1|/p' Makefile | awk -F'|' '{printf "%-20s %s\n", $$1, $$2}'
@@ -24,6 +24,19 @@ setup: .venv/installed.stamp .venv/llvm.stamp ## environment, packages and LLVM 
 
 lens-opt: setup ## optimise a lens for event flow, the main job
 	@$(RUN) -m studies.lens_opt $(ARGS)
+
+lens-report: setup ## everything about one lens: make lens-report ARGS="--lens double-gauss"
+	@$(RUN) -m studies.lens_report $(ARGS)
+
+lens-scratch: setup ## triplets designed from flat plates
+	@$(RUN) -m studies.lens_scratch $(ARGS)
+
+lens-tolerance: setup ## what errors of making and mounting do to a lens
+	@$(RUN) -m studies.lens_tolerance $(ARGS)
+
+lens-bench: setup ## speed and error against other ray tracers (installs them)
+	@$(RUN) -m pip install --disable-pip-version-check --quiet --editable ".[bench]" --constraint constraints.txt
+	@$(RUN) -m studies.lens_bench $(ARGS)
 
 placement: setup ## where to mount the camera on a robot
 	@$(RUN) -m studies.placement $(ARGS)

@@ -7,6 +7,7 @@ prints one line of JSON: seconds of every repeat, memory that the work took, and
 has them as variables, all distances.
 """
 
+import contextlib
 import json
 import resource
 import sys
@@ -151,10 +152,8 @@ def resident():
 
 def forget_peak():
     """Start the count of the largest memory anew; returns what is in use. Where the system cannot (not Linux), earlier peaks count too."""
-    try:
+    with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        pass
     return resident()
 
 

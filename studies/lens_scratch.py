@@ -8,6 +8,7 @@ the whole unvignetted pupil, every ray passing and every limit held.
 
 import dataclasses
 import math
+import statistics
 import sys
 import time
 from dataclasses import dataclass
@@ -98,7 +99,7 @@ def record_method(run, method, found):
         f"{method}_seeds_succeeded_at_first_attempt": sum(o.succeeded and o.attempts == 1 for o, _ in found),
         f"{method}_seconds_total": sum(o.seconds for o, _ in found), f"{method}_evaluations_total": sum(o.evaluations for o, _ in found)})
     if spots:
-        run.record(**{f"{method}_best_mean_spot_um": spots[0], f"{method}_median_mean_spot_um": spots[len(spots) // 2], f"{method}_worst_mean_spot_um": spots[-1]})
+        run.record(**{f"{method}_best_mean_spot_um": spots[0], f"{method}_median_mean_spot_um": statistics.median(spots), f"{method}_worst_mean_spot_um": spots[-1]})
     for outcome, verdict in found:
         if verdict is not None and math.isfinite(verdict.mean_um):
             run.record(**{f"{method}_seed{outcome.seed}_mean_spot_um": verdict.mean_um, f"{method}_seed{outcome.seed}_mean_spot_d_um": mean(verdict.spots_d_um)})

@@ -3,6 +3,7 @@
 import math
 
 import matplotlib.pyplot as plt
+from matplotlib.ticker import FixedLocator, NullLocator
 
 from codesign.lens.constraints import active
 from codesign.report import lens_figures
@@ -77,6 +78,9 @@ def spot_figure(outcomes, verdicts, published_um, goal_um):
     axis.axhline(published_um, color="k", linewidth=1, label="published")
     axis.axhline(goal_um, color="k", linewidth=1, linestyle=":", label="goal: twice that")
     axis.set(xlabel="seed", ylabel="mean RMS spot (µm)", yscale="log", ylim=(0.6 * published_um, 1.1 * top))
+    axis.yaxis.set_major_locator(FixedLocator([10, 15, 20, 30, 40, 60, 80]))
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_locator(NullLocator())
     axis.legend(frameon=False, fontsize=8, ncols=3)
     return figure
 

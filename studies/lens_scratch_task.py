@@ -9,7 +9,7 @@ from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens import WAVELENGTH_UM, GeoLens, Glass, Surface
 from codesign.lens.analysis import field_rays, pupil_grid
-from codesign.lens.constraints import Constraint, Limits, evaluate, penalty, rows
+from codesign.lens.constraints import Constraint, Limits, evaluate, rows
 from codesign.lens.hits import paraxial_semi_aperture_mm, traced_semi_aperture_mm
 from codesign.lens.optimise import by_differences
 from codesign.lens.solves import focus_paraxial, hold_efl
@@ -138,8 +138,3 @@ def judge(variables):
         return None
     spots, spots_d = polychromatic_spots_um(made), polychromatic_spots_um(made, ("d",))
     return Verdict(made, spots, spots_d, tuple(evaluate(made, JUDGED_LIMITS)), all(map(math.isfinite, (*spots, *spots_d))))
-
-
-def constraint_penalty(geo, semi_apertures):
-    """Penalty of LIMITS, for a report."""
-    return float(penalty(evaluate(geo, LIMITS, semi_apertures)))

@@ -1,13 +1,20 @@
 """Differentiable lenses: ray-traced (GeoLens), thin, and pinhole."""
 
-from codesign.lens import catalogue
-from codesign.lens.analysis import rms_spot_mm, spots
+from codesign.lens import analysis, catalogue
+from codesign.lens.aiming import aimed_rays
+from codesign.lens.analysis import pupil_grid, rms_spot_mm, spots
 from codesign.lens.catalogue import half_field_deg
 from codesign.lens.files import load, save
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM, Glass
 from codesign.lens.pinhole import Pinhole, ThinLens
-from codesign.lens.surface import Surface
-from codesign.lens.trace import Status, TraceResult
+from codesign.lens.radiometry import relative_illumination
+from codesign.lens.seidel import seidel_sums
+from codesign.lens.spectrum import Spectrum
+from codesign.lens.surface import Phase, Surface
+from codesign.lens.trace import Status, TraceResult, sum_over_chunks
 
-__all__ = ["WAVELENGTH_UM", "GeoLens", "Glass", "Pinhole", "Status", "Surface", "ThinLens", "TraceResult", "catalogue", "half_field_deg", "load", "rms_spot_mm", "save", "spots"]
+__all__ = [
+    "WAVELENGTH_UM", "GeoLens", "Glass", "Phase", "Pinhole", "Spectrum", "Status", "Surface", "ThinLens", "TraceResult", "aimed_rays", "analysis", "catalogue", "half_field_deg",
+    "load", "pupil_grid", "relative_illumination", "rms_spot_mm", "save", "seidel_sums", "spots", "sum_over_chunks",
+]

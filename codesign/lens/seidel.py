@@ -62,8 +62,9 @@ def seidel_sums(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"], short_um=WAVE
     sphere = _refraction(rays, index, lens.mirrors, curvature, power)
     figure = (1 + lens.conic) * lens.curvature_per_mm**3 / 8 + _column(lens.asphere, 1) - curvature**3 / 8  # r^4 beyond the osculating sphere
     plate = _plate(rays, 8 * figure * bending(index, lens.mirrors))
-    parts = [sum(terms) for terms in zip(layer, sphere, plate, strict=True)]
-    return SeidelSums(*parts, *_colour(lens, rays, index, curvature, power, short_um, long_um), rays.invariant_mm)
+    monochromatic = {name: a + b + c for name, a, b, c in zip(NAMES, layer, sphere, plate, strict=True)}
+    axial, lateral = _colour(lens, rays, index, curvature, power, short_um, long_um)
+    return SeidelSums(**monochromatic, axial_colour=axial, lateral_colour=lateral, invariant_mm=rays.invariant_mm)
 
 
 def _column(table, i):

@@ -55,7 +55,7 @@ def hold_efl(lens, efl_mm, surface=None):
     step = bending(n, lens.mirrors)[at]
     weak = [float(v.detach()) for v in (step, y, by_angle)]
     if min(map(abs, weak)) < NO_POWER:
-        raise DomainError(f"{lens.name}: surface {at + 1} cannot hold the focal length (index step {weak[0]:.3g}, ray height {weak[1]:.3g}, lever on the last angle {weak[2]:.3g}); name a refracting one away from an image.")
+        raise DomainError(f"{lens.name}: surface {at + 1} cannot hold the focal length (index step {weak[0]:.3g}, ray height {weak[1]:.3g}, lever {weak[2]:.3g}); name a refracting one away from an image.")
     wanted = (-n[-1] / efl_mm - by_height * y) / by_angle
     solved = c[at] + ((nu - wanted) / y - power[at]) / step
     return lens.replace(curvature_per_mm=torch.cat([c[:at], solved.reshape(1), c[at + 1 :]]))

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
+from codesign.lens.analysis import spots
 from codesign.lens.constraints import is_glass
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.optimise import by_differences, finite
@@ -96,8 +97,6 @@ def linear_figures(half_field_rad, wavelength_um=WAVELENGTH_UM["d"], compensate=
 
     Args: compensate: lens -> lens applied first, such as solves.focus_paraxial; None changes nothing.
     """
-    from codesign.lens.analysis import spots
-
     def figures(lens):
         lens = compensate(lens) if compensate else lens
         f = lens.first_order(wavelength_um)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
+from codesign.lens.analysis import spots
 from codesign.lens.glass import WAVELENGTH_UM
 
 
@@ -49,8 +50,6 @@ def spot_errors(fields_rad, wavelengths_um=(WAVELENGTH_UM["d"],), compensate=Non
 
     Args: compensate: lens -> lens applied first, such as a refocus by solves.focus_rays. Raises: DomainError when a ray fails.
     """
-    from codesign.lens.analysis import spots
-
     def figure(lens):
         lens = compensate(lens) if compensate else lens
         found = [spots(lens, fields_rad, w, grid) for w in wavelengths_um]

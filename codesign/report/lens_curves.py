@@ -8,32 +8,32 @@ import torch
 
 from codesign.lens import analysis
 from codesign.lens.glass import WAVELENGTH_UM
-from codesign.report.lens_layout import COLOURS
+from codesign.report.lens_figures import COLOURS, VISIBLE_UM
 
 SEIDEL_NAMES = ("spherical $S_I$", "coma $S_{II}$", "astigmatism $S_{III}$", "Petzval $S_{IV}$", "distortion $S_V$")
 SEIDEL_COLOURS = ("#1b6ca8", "#2e8b57", "#d68910", "#8e44ad", "#c0392b")
 
 
 @torch.no_grad()
-def field_errors(lens, half_field_rad, light=tuple(WAVELENGTH_UM.values()), mapping="f-tan", count=21):
+def field_errors(lens, half_field_rad, light: object = VISIBLE_UM, mapping="f-tan", count=21):
     """Figure over the field: tangential and sagittal focus, distortion, and lateral colour against the first wavelength."""
-    wavelengths, _ = analysis.spectral_lines(light)
+    reference, *others = analysis.spectral_lines(light)[0]
     fields = [half_field_rad * i / (count - 1) for i in range(count)]
     degrees = np.degrees(fields)
     figure, axes = plt.subplots(1, 3, figsize=(10, 3.8), sharey=True, layout="constrained")
-    shifts = analysis.focus_shift_mm(lens, fields, wavelengths[0]).numpy()
+    shifts = analysis.focus_shift_mm(lens, fields, reference).numpy()
     axes[0].plot(shifts[:, 0], degrees, color=COLOURS[0], label="tangential")
     axes[0].plot(shifts[:, 1], degrees, color=COLOURS[0], ls="--", label="sagittal")
     axes[0].set(xlabel="focus shift (mm)", ylabel="field (degrees)", title="Field curvature")
     axes[0].legend(frameon=False, fontsize=8)
-    axes[1].plot(analysis.distortion_percent(lens, fields, mapping, wavelengths[0]).numpy(), degrees, color=COLOURS[2])
+    axes[1].plot(analysis.distortion_percent(lens, fields[1:], mapping, reference).numpy(), degrees[1:], color=COLOURS[2])  # on the axis it is 0 by definition
     axes[1].set(xlabel=f"distortion (%), {mapping}", title="Distortion")
-    if len(wavelengths) > 1:
-        colour = analysis.lateral_colour_mm(lens, fields, wavelengths[1:], wavelengths[0]).numpy() * 1e3
-        for k, wavelength in enumerate(wavelengths[1:]):
+    if others:
+        colour = analysis.lateral_colour_mm(lens, fields, others, reference).numpy() * 1e3
+        for k, wavelength in enumerate(others):
             axes[2].plot(colour[:, k], degrees, color=COLOURS[1:][k % 3], label=f"{wavelength * 1e3:.0f} nm")
         axes[2].legend(frameon=False, fontsize=8)
-    axes[2].set(xlabel=f"height − that at {wavelengths[0] * 1e3:.0f} nm (µm)", title="Lateral colour")
+    axes[2].set(xlabel=f"height − that at {reference * 1e3:.0f} nm (µm)", title="Lateral colour")
     for axis in axes:
         axis.axvline(0, color="0.5", lw=0.6)
         axis.set_ylim(0, degrees[-1])
@@ -44,7 +44,7 @@ def field_errors(lens, half_field_rad, light=tuple(WAVELENGTH_UM.values()), mapp
 
 
 @torch.no_grad()
-def through_focus(lens, fields_rad, defocus_mm, frequency_per_mm, light=WAVELENGTH_UM["d"], vignetting=False, method="geometric"):
+def through_focus(lens, fields_rad, defocus_mm, frequency_per_mm, light: object = WAVELENGTH_UM["d"], vignetting=False, method="geometric"):
     """Figure over the position of the image plane: RMS spot, and MTF at one frequency."""
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     z = np.asarray(defocus_mm, dtype=float)
@@ -66,22 +66,27 @@ def through_focus(lens, fields_rad, defocus_mm, frequency_per_mm, light=WAVELENG
 
 
 def seidel_bars(sums, wavelength_um=WAVELENGTH_UM["d"]):
-    """Figure of Seidel sums per surface and in total (``SeidelSums``), in waves."""
-    values = torch.cat([sums.per_surface, sums.total[None]]).detach().numpy() / (wavelength_um * 1e-3)
-    figure, axis = plt.subplots(figsize=(max(6.5, 0.75 * len(values) + 2), 3.6), layout="constrained")
+    """Figure of Seidel sums (``SeidelSums``) per surface and, on a scale of its own, in total; in waves."""
+    values = sums.per_surface.detach().numpy() / (wavelength_um * 1e-3)
+    total = sums.total.detach().numpy() / (wavelength_um * 1e-3)
+    figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), width_ratios=[4, 1.2], layout="constrained")
     place = np.arange(len(values))
     for k, (name, colour) in enumerate(zip(SEIDEL_NAMES, SEIDEL_COLOURS, strict=True)):
-        axis.bar(place + 0.16 * (k - 2), values[:, k], 0.16, color=colour, label=name)
-    axis.axhline(0, color="k", lw=0.7)
-    axis.axvline(len(values) - 1.5, color="0.5", lw=0.8, ls=":")
-    axis.set_xticks(place, [*(str(i + 1) for i in range(len(values) - 1)), "total"])
-    axis.set(xlabel="surface", ylabel="waves")
-    axis.legend(frameon=False, fontsize=8, ncols=5, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+        axes[0].bar(place + 0.16 * (k - 2), values[:, k], 0.16, color=colour, label=name)
+    axes[1].bar(range(5), total, 0.7, color=SEIDEL_COLOURS)
+    axes[0].set_xticks(place, [str(i + 1) for i in range(len(values))])
+    axes[1].set_xticks(range(5), ["I", "II", "III", "IV", "V"])
+    axes[0].set(xlabel="surface", ylabel="waves")
+    axes[1].set(xlabel="sum", title="whole lens")
+    for axis in axes:
+        axis.axhline(0, color="k", lw=0.7)
+        axis.grid(axis="y", alpha=0.3)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", frameon=False, fontsize=8, ncols=5)
     return figure
 
 
 @torch.no_grad()
-def encircled_curves(lens, fields_rad, light=WAVELENGTH_UM["d"], vignetting=False):
+def encircled_curves(lens, fields_rad, light: object = WAVELENGTH_UM["d"], vignetting=False):
     """Figure of encircled energy (rays, about their mean) over the radius, a curve per field."""
     figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
     largest = max(float(analysis.encircled_radius_mm(lens, field, 1.0, light, 48, vignetting)) for field in fields_rad)

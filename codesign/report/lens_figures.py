@@ -11,8 +11,9 @@ from codesign.lens import analysis
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.report.lens_layout import COLOURS, draw_layout, layouts, lens_layout
 
-__all__ = ["COLOURS", "draw_layout", "layouts", "lens_layout", "mtf_curves", "opd_maps", "psf_pictures", "ray_fans", "spot_diagrams", "spots_by_wavelength"]
+__all__ = ["COLOURS", "VISIBLE_UM", "draw_layout", "layouts", "lens_layout", "mtf_curves", "opd_maps", "psf_pictures", "ray_fans", "spot_diagrams", "spots_by_wavelength"]
 
+VISIBLE_UM = tuple(WAVELENGTH_UM[line] for line in "dFC")
 LINE_COLOURS = ("#2e8b57", "#1b6ca8", "#c0392b", "#8e44ad", "#d68910")  # of wavelengths; the first is the reference
 
 
@@ -41,7 +42,7 @@ def spot_diagrams(lenses, fields_rad, pixel_mm):
 
 
 @torch.no_grad()
-def spots_by_wavelength(lens, fields_rad, light=tuple(WAVELENGTH_UM.values()), grid=24, vignetting=False):
+def spots_by_wavelength(lens, fields_rad, light: object = VISIBLE_UM, grid=24, vignetting=False):
     """Figure of spots of each field about the chief ray of the first wavelength, a colour per wavelength, with the Airy disc."""
     wavelengths, _ = analysis.spectral_lines(light)
     figure, axes = plt.subplots(1, len(fields_rad), figsize=(3.1 * len(fields_rad), 3.4), sharex=True, sharey=True, squeeze=False, layout="constrained")
@@ -52,7 +53,7 @@ def spots_by_wavelength(lens, fields_rad, light=tuple(WAVELENGTH_UM.values()), g
         for p, w, wavelength, colour in zip(points, weight, wavelengths, LINE_COLOURS * len(wavelengths), strict=False):
             p = ((p[w > 0] - centre) * 1e3).numpy()
             axis.plot(p[:, 0], p[:, 1], ".", ms=1.8, color=colour, label=f"{wavelength * 1e3:.0f} nm")
-        axis.add_patch(plt.Circle((0, 0), airy, fill=False, color="k", lw=0.8))  # pyright: ignore[reportPrivateImportUsage]
+        axis.add_patch(plt.Circle((0, 0), airy, fill=False, color="k", lw=0.9, zorder=5))  # pyright: ignore[reportPrivateImportUsage]
         axis.set_title(f"{math.degrees(field):.3g}°, RMS {1e3 * float(analysis.spot_radius_mm(points, weight)):.1f} µm", fontsize=9)
         axis.set(xlabel="x (µm)", aspect="equal")
     axes[0, 0].set_ylabel("y (µm)")
@@ -63,7 +64,7 @@ def spots_by_wavelength(lens, fields_rad, light=tuple(WAVELENGTH_UM.values()), g
 
 
 @torch.no_grad()
-def ray_fans(lens, fields_rad, light=tuple(WAVELENGTH_UM.values()), vignetting=False):
+def ray_fans(lens, fields_rad, light: object = VISIBLE_UM, vignetting=False):
     """Figure of ray fans: transverse aberration (upper) and optical path difference (lower) over the pupil, a pair of columns per field, relative to the first wavelength's chief ray."""
     wavelengths, _ = analysis.spectral_lines(light)
     figure, axes = plt.subplots(2, 2 * len(fields_rad), figsize=(3.4 * len(fields_rad), 4.6), sharey="row", sharex=True, squeeze=False, layout="constrained")
@@ -97,32 +98,30 @@ def opd_maps(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"], grid=96, vignet
     limit = max(float(f.waves[f.weight > 0].abs().max()) for f in fronts) or 1e-12
     figure, axes = plt.subplots(1, len(fronts), figsize=(2.9 * len(fronts) + 0.8, 3.1), squeeze=False, layout="constrained")
     place = ((pupil + 1) / 2 * grid).long()
-    image = None
     for axis, front, field in zip(axes[0], fronts, fields_rad, strict=True):
         picture = np.full((grid, grid), np.nan)
         picture[place[:, 1], place[:, 0]] = torch.where(front.weight > 0, front.waves, math.nan).numpy()
-        image = axis.imshow(picture, origin="lower", extent=(-1, 1, -1, 1), cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
+        axis.imshow(picture, origin="lower", extent=(-1, 1, -1, 1), cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
         strehl = float(analysis.strehl_direct(front))
         axis.set_title(f"{math.degrees(field):.3g}°, RMS {float(analysis.rms_waves(front)):.3f} waves\nStrehl {strehl:.2g}", fontsize=9)
         axis.set(xticks=[-1, 0, 1], yticks=[-1, 0, 1], xlabel="pupil x")
     axes[0, 0].set_ylabel("pupil y")
-    figure.colorbar(image, ax=list(axes[0]), label="waves", shrink=0.85)
+    figure.colorbar(axes[0, 0].images[0], ax=list(axes[0]), label="waves", shrink=0.85)
     return figure
 
 
 def psf_pictures(psfs, titles, floor=1e-4):
     """Figure of point spreads (list of ``Psf``), each over its own peak on a logarithmic scale. Axes in µm about the reference point."""
     figure, axes = plt.subplots(1, len(psfs), figsize=(2.9 * len(psfs) + 0.8, 3.0), squeeze=False, layout="constrained")
-    image = None
     for axis, psf, title in zip(axes[0], psfs, titles, strict=True):
         energy = psf.energy.detach().numpy()
         half_x, half_y = (energy.shape[0] / 2 * float(p) * 1e3 for p in psf.pitch_mm.detach())
         picture = np.maximum(energy / max(energy.max(), 1e-300), floor)
-        image = axis.imshow(picture, origin="lower", extent=(-half_x, half_x, -half_y, half_y), cmap="magma", norm=LogNorm(floor, 1))
+        axis.imshow(picture, origin="lower", extent=(-half_x, half_x, -half_y, half_y), cmap="magma", norm=LogNorm(floor, 1))
         axis.set(xlabel="x (µm)")
         axis.set_title(title, fontsize=9)
     axes[0, 0].set_ylabel("y (µm)")
-    figure.colorbar(image, ax=list(axes[0]), label="energy / peak", shrink=0.85)
+    figure.colorbar(axes[0, 0].images[0], ax=list(axes[0]), label="energy / peak", shrink=0.85)
     return figure
 
 

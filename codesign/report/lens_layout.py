@@ -96,7 +96,7 @@ def ray_paths(lens, field_rad, pupil, start_z_mm):
             # rays end on the vertex plane behind surface i: step back along the ray onto the surface
             y, slope = out.position_mm[:, 1], out.direction[:, 1] / out.direction[:, 2]
             sag = torch.zeros_like(y)
-            for _ in range(8):
+            for _ in range(40):  # each step shrinks the miss by slope times slope of the surface
                 sag = sag_mm(y + slope * sag, s.curvature_per_mm, s.conic, s.asphere)
             points.append(torch.stack([z + sag, y + slope * sag], 1))
             z += s.thickness_mm

@@ -9,6 +9,7 @@ from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens import GeoLens, Surface, analysis
 from codesign.lens.analysis import Wavefront, peak_to_valley_waves, pupil_grid, remove_fit, rms_waves, strehl_direct, strehl_marechal, wavefront
+from codesign.lens.paraxial import cardinal_points
 from codesign.lens.seidel import seidel_sums
 
 D = torch.float64
@@ -103,7 +104,7 @@ def test_fits_take_away_what_they_fit():
 def test_a_telecentric_lens_has_a_plane_for_a_reference_sphere():
     # a stop in the front focal plane: the wavefront differs from one with a very far pupil by no more than the pupil's distance tells
     surfaces = lens.load("la1509").surfaces
-    front = -float(lens.paraxial.cardinal_points(lens.load("la1509")).front_focal_z_mm.detach())
+    front = -float(cardinal_points(lens.load("la1509")).front_focal_z_mm.detach())
     found = []
     for shift in (0.0, 1e-4):
         stop = Surface(math.inf, front + shift, None, 12.7, is_stop=True)

@@ -22,7 +22,7 @@ def ideal_mtf(frequency_per_mm, fno, wavelength_um=WAVELENGTH_UM["d"]):
     return 2 / math.pi * (v.acos() - v * (1 - v * v).sqrt())
 
 
-def diffraction_mtf(lens, field_rad, frequency_per_mm, light=WAVELENGTH_UM["d"], grid=None, vignetting=False, defocus_mm=0.0):
+def diffraction_mtf(lens, field_rad, frequency_per_mm, light: object = WAVELENGTH_UM["d"], grid=None, vignetting=False, defocus_mm=0.0):
     """MTF with diffraction of one field, from the Fourier transform of the point spread.
 
     Several wavelengths add as complex transfer functions about one image point, so that lateral colour counts.
@@ -41,7 +41,7 @@ def diffraction_mtf(lens, field_rad, frequency_per_mm, light=WAVELENGTH_UM["d"],
     return total.abs()
 
 
-def geometric_mtf(lens, field_rad, frequency_per_mm, light=WAVELENGTH_UM["d"], grid=64, vignetting=False, defocus_mm=0.0):
+def geometric_mtf(lens, field_rad, frequency_per_mm, light: object = WAVELENGTH_UM["d"], grid=64, vignetting=False, defocus_mm=0.0):
     """MTF of the rays alone, |mean of exp(-2 pi i frequency x)|, [2, K] tangential, sagittal. Arguments and gradient as for ``diffraction_mtf``.
 
     Multiply by ``ideal_mtf`` for the usual estimate between the two limits.

@@ -44,7 +44,7 @@ def diffraction_psf(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"], grid=None
     return Psf(energy / energy.sum(), pupil.wavelength_mm / (2 * pupil.cosine_radius * int(padding)), centre)
 
 
-def psf_on_pixels(lens, field_rad, pixel_mm, pixels=64, light=WAVELENGTH_UM["d"], grid=None, vignetting=False, defocus_mm=0.0):
+def psf_on_pixels(lens, field_rad, pixel_mm, pixels=64, light: object = WAVELENGTH_UM["d"], grid=None, vignetting=False, defocus_mm=0.0):
     """Psf of one or several wavelengths by diffraction, on a pixel grid of one's own, about the chief ray of the first wavelength.
 
     The Fourier integral is summed for each pixel centre (two matrix products), so wavelengths share the grid and their lateral
@@ -72,7 +72,7 @@ def psf_on_pixels(lens, field_rad, pixel_mm, pixels=64, light=WAVELENGTH_UM["d"]
     return Psf(total, torch.full((2,), pixel_mm, dtype=lens.dtype), reference)
 
 
-def geometric_psf(lens, field_rad, pixel_mm, pixels=64, light=WAVELENGTH_UM["d"], grid=128, vignetting=False, defocus_mm=0.0):
+def geometric_psf(lens, field_rad, pixel_mm, pixels=64, light: object = WAVELENGTH_UM["d"], grid=128, vignetting=False, defocus_mm=0.0):
     """Psf by rays: each ray's weight is shared bilinearly among the four pixel centres around it. About the chief ray of the first wavelength.
 
     Args: grid: pupil cells across. Rays beyond the grid are lost: the sum of ``energy`` is the share that falls on it.

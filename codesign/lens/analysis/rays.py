@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -83,7 +84,7 @@ def chief_ray(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"], defocus_mm=0.0)
     return trace_field(lens, field_rad, torch.zeros(1, 2, dtype=lens.dtype, device=lens.curvature_per_mm.device), wavelength_um, defocus_mm=defocus_mm)
 
 
-def spectral_lines(light):
+def spectral_lines(light: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Wavelengths (um) and weights that sum to 1, from a wavelength, a list of them (equal weights), or anything with wavelengths_um and weights.
 
     Raises: DomainError for no wavelength, one that is not positive, or weights that are negative or sum to 0.

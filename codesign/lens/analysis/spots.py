@@ -57,7 +57,7 @@ def spot_radius_mm(positions_mm, weight):
     return torch.linalg.vector_norm((points - (points * w).sum(0)) * w.sqrt())
 
 
-def encircled_energy(lens, field_rad, radii_mm, light=WAVELENGTH_UM["d"], grid=64, vignetting=False, defocus_mm=0.0, about_chief=False):
+def encircled_energy(lens, field_rad, radii_mm, light: object = WAVELENGTH_UM["d"], grid=64, vignetting=False, defocus_mm=0.0, about_chief=False):
     """Share of rays within circles about the spot's mean point (or the chief ray of the first wavelength).
 
     Args: radii_mm: [K] increasing or not. Returns: [K] in [0, 1], geometric, without diffraction. Gradient: none (a count).
@@ -69,7 +69,7 @@ def encircled_energy(lens, field_rad, radii_mm, light=WAVELENGTH_UM["d"], grid=6
     return energy[torch.searchsorted(distance.detach()[order], radii, right=True)].clamp_max(1.0)
 
 
-def encircled_radius_mm(lens, field_rad, share=0.8, light=WAVELENGTH_UM["d"], grid=64, vignetting=False, defocus_mm=0.0, about_chief=False):
+def encircled_radius_mm(lens, field_rad, share=0.8, light: object = WAVELENGTH_UM["d"], grid=64, vignetting=False, defocus_mm=0.0, about_chief=False):
     """Radius that holds a share of the rays, scalar mm. Gradient: that of the ray on the rim. Raises: DomainError for a share outside (0, 1]."""
     if not 0 < share <= 1:
         raise DomainError(f"share {share} of encircled energy must lie in (0, 1].")

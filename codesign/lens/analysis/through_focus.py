@@ -11,7 +11,7 @@ from codesign.lens.glass import WAVELENGTH_UM
 METHODS = {"diffraction": diffraction_mtf, "geometric": geometric_mtf}
 
 
-def through_focus_spot_mm(lens, fields_rad, defocus_mm, light=WAVELENGTH_UM["d"], grid=32, vignetting=False):
+def through_focus_spot_mm(lens, fields_rad, defocus_mm, light: object = WAVELENGTH_UM["d"], grid=32, vignetting=False):
     """RMS spot about its mean for each field and plane, [F, Z] mm. Args: defocus_mm: [Z], positive further from the lens. Gradient: to every lens tensor."""
     pupil = pupil_grid(grid, lens.dtype, lens.curvature_per_mm.device)
     wavelengths, shares = spectral_lines(light)
@@ -23,7 +23,7 @@ def through_focus_spot_mm(lens, fields_rad, defocus_mm, light=WAVELENGTH_UM["d"]
     return torch.stack(rows)
 
 
-def through_focus_mtf(lens, field_rad, frequency_per_mm, defocus_mm, light=WAVELENGTH_UM["d"], method="diffraction", grid=None, vignetting=False):
+def through_focus_mtf(lens, field_rad, frequency_per_mm, defocus_mm, light: object = WAVELENGTH_UM["d"], method="diffraction", grid=None, vignetting=False):
     """MTF at one frequency on several planes, [2, Z] tangential, sagittal. Args: method: "diffraction" or "geometric". Gradient: to every lens tensor."""
     if method not in METHODS:
         raise DomainError(f"method '{method}' is not known; known methods: {', '.join(METHODS)}.")

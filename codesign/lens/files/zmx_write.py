@@ -4,6 +4,7 @@ from codesign.errors import CodesignError, FileFormatError
 from codesign.lens.glass import AIR, WAVELENGTH_UM, Glass, names
 
 MOST_TERMS = 8  # of an even asphere
+LEAST_ABBE, MOST_ABBE = 10, 150  # of a model glass
 SAME_INDEX = 1e-8  # a glass goes by its catalogue name when its indices at F, d and C are the catalogue's to this; published tables round to 1e-9
 
 
@@ -14,11 +15,11 @@ def to_zmx(lens):
     entrance pupil diameter, half field, name. A glass of the catalogue keeps its name; any other becomes a model glass of nd and Vd. Not kept: the width of the soft edges.
     Raises: DomainError for values that cannot be; FileFormatError for what a centred .zmx surface cannot hold.
     """
-    field = lens.half_field_deg or 0.0
-    head = ["VERS 140124 0 0", "MODE SEQ", f"NAME {_plain(lens.name)}", "UNIT MM X W X CM MR CPMM", f"ENPD {lens.entrance_pupil_diameter_mm!r}", "ENVD 20 1 0", "FTYP 0 0 2 3 0 0 0",
+    field, surfaces = lens.half_field_deg or 0.0, lens.to_surfaces()
+    head = ["VERS 140124 0 0", "MODE SEQ", f"NAME {_plain(lens.name)}", "UNIT MM X W X CM MR CPMM", f"ENPD {lens.entrance_pupil_diameter_mm!r}", "ENVD 20 1 0",
+            "GCAT SCHOTT OHARA HOYA HIKARI SUMITA CDGM CORNING MISC", "FTYP 0 0 2 3 0 0 0",
             "XFLN 0 0", f"YFLN 0 {field!r}", *(f"WAVM {i} {w!r} 1" for i, w in enumerate(WAVELENGTH_UM.values(), 1)), "PWAV 2", *_block(0, ["TYPE STANDARD", "CURV 0", "DISZ INFINITY"])]
     sign, lines = 1.0, []
-    surfaces = lens.to_surfaces()
     for i, surface in enumerate(surfaces, 1):
         surface.check(f"{lens.name}, surface {i}")
         lines += _block(i, _surface(surface, sign, f"{lens.name}, surface {i}", i == lens.stop_index + 1))
@@ -47,29 +48,32 @@ def _surface(surface, sign, label, is_stop):
         lines += [f"PARM 0 {surface.phase.order}", f"XDAT 1 {len(surface.phase.coefficients)}", "XDAT 2 1.0", *(f"XDAT {i} {a!r}" for i, a in enumerate(surface.phase.coefficients, 3))]
     if kind != "STANDARD":
         lines += [f"PARM {i} {a!r}" for i, a in enumerate(terms[:MOST_TERMS], 1)]
-    lines += [f"DISZ {behind * surface.thickness_mm + 0.0!r}", *_glass(surface)]
+    lines += [f"DISZ {behind * surface.thickness_mm + 0.0!r}", *_glass(surface, label)]
     lines += [f"CONI {surface.conic!r}"] if surface.conic else []
     aperture = f"CLAP {surface.inner_semi_aperture_mm!r} {surface.semi_aperture_mm!r} 0" if surface.inner_semi_aperture_mm else f"FLAP 0 {surface.semi_aperture_mm!r} 0"
     return [*lines, f"DIAM {surface.semi_aperture_mm!r} 1 0 0 1 \"\"", aperture]
 
 
-def _glass(surface):
+def _glass(surface, label):
     if surface.mirror:
         return ["GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0"]
     glass = surface.medium
     if glass is None or glass == AIR:
         return []
-    model = f"{glass.index_d!r} {glass.abbe_number!r} 0 0 0 0 0 0"
-    return [f"GLAS {glass.name} 0 0 {model}" if _is_named(glass) else f"GLAS ___BLANK 1 0 {model}"]
+    if _is_named(glass):
+        return [f"GLAS {glass.name} 0 0 1.5 40 0 0 0 0 0 0"]  # what that program writes for the unused model
+    if not LEAST_ABBE <= glass.abbe_number <= MOST_ABBE:
+        raise FileFormatError(f"{label}: its medium {glass.name} has the Abbe number {glass.abbe_number:.4g}, model glasses {LEAST_ABBE} to {MOST_ABBE}; save the lens as .json.")
+    return [f"GLAS ___BLANK 1 0 {glass.index_d!r} {glass.abbe_number!r} 0 0 0 0 0 0"]
 
 
 def _is_named(glass):
     try:
         known = Glass.named(glass.name)
+        same = all(abs(known.index(w) - glass.index(w)) < SAME_INDEX for w in WAVELENGTH_UM.values())
     except CodesignError:
         return False
-    in_catalogue = known.name in names()  # 1.6123/44.1 is a name too, but only here
-    return in_catalogue and not any(c.isspace() for c in glass.name) and all(abs(known.index(w) - glass.index(w)) < SAME_INDEX for w in WAVELENGTH_UM.values())
+    return same and known.name in names() and not any(c.isspace() for c in glass.name)  # 1.6123/44.1 is a name too, but only here
 
 
 def _plain(name):
