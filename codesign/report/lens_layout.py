@@ -80,7 +80,7 @@ def draw_layout(axis, lens, fields_rad, rays=5):
     axis.set_aspect("equal")
     axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8, title="field", title_fontsize=8)
     if any(lens.mirrors):
-        axis.text(0.01, 0.02, "mirrors (thick) along the unfolded axis", transform=axis.transAxes, fontsize=8, color=MIRROR)
+        axis.text(1.0, 1.02, "mirrors (thick) along the unfolded axis", transform=axis.transAxes, ha="right", fontsize=8, color=MIRROR)
 
 
 def ray_paths(lens, field_rad, pupil, start_z_mm):

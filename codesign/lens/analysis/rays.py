@@ -51,8 +51,9 @@ class ImageRays:
     index: Tensor
 
     def shifted(self, defocus_mm):
-        """The same rays on a plane ``defocus_mm`` further along +z (scalar, may carry a gradient)."""
-        length = defocus_mm / self.direction[:, 2]
+        """The same rays on a plane ``defocus_mm`` further along +z (scalar, may carry a gradient); rays of weight 0 stay where they failed."""
+        arrived = self.weight > 0
+        length = torch.where(arrived, defocus_mm / torch.where(arrived, self.direction[:, 2], 1), 0)
         return replace(self, position_mm=self.position_mm + self.direction[:, :2] * length[:, None], path_mm=self.path_mm + self.index * length)
 
 
