@@ -139,7 +139,7 @@ def make_rays(count, precision, seed):
 
     across = np.random.default_rng(seed).uniform(-10, 10, (count, 2))
     origin = np.concatenate([across, np.full((count, 1), -5.0)], 1).astype(precision)
-    return origin, np.broadcast_to(np.array([0.0, 0.1, 0.99**0.5]), (count, 3)).astype(precision)
+    return origin, np.ascontiguousarray(np.broadcast_to(np.array([0.0, 0.1, 0.99**0.5]), (count, 3)), dtype=precision)
 
 
 def resident():

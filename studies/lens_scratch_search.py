@@ -21,7 +21,7 @@ STAGES = {
 }
 ATTEMPTS = {"curriculum": 3, "direct": 3, "adam": 1}  # draws of a start until one succeeds
 LOSS_CHANGE = 1e-6  # a stage ends when a step gains less than this share
-ADAM_STEP = 0.3  # residual units (0.01 mm RMS) per step
+ADAM_STEP = 1.0  # residual units (0.01 mm RMS) per step
 ADAM_LIMIT = torch.tensor([1e-2] * 5 + [1.0] * 6, dtype=torch.float64)  # per mm and mm: some thicknesses of plane plates move no ray
 
 

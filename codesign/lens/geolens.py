@@ -152,11 +152,11 @@ class GeoLens(nn.Module):
                 raise ShapeError(f"{label} must be [N >= 1, 3], got {tuple(value.shape)}.")
         if origin_mm.shape != direction.shape:
             raise ShapeError(f"{origin_mm.shape[0]} origins but {direction.shape[0]} directions were given; give one of each per ray.")
-        if not all(map(math.isfinite, map(float, torch.aminmax(origin_mm.detach())))):
+        if not all(map(math.isfinite, _range(origin_mm, torch.Tensor.reshape, (-1,)))):
             check_finite(origin_mm, "origin_mm")
-        shortest, longest = torch.aminmax(torch.mv(direction.detach().square(), torch.ones_like(direction[0]).detach()))
-        if not (float(shortest) > 0.9998 and float(longest) < 1.0002):
-            raise DomainError(f"direction: squared lengths lie between {float(shortest):.6g} and {float(longest):.6g}; give finite unit vectors (torch.nn.functional.normalize).")
+        shortest, longest = _range(direction, lambda rows, ones: torch.mv(rows.square(), ones), direction.new_ones(3))
+        if not (shortest > 0.9998 and longest < 1.0002):
+            raise DomainError(f"direction: squared lengths lie between {shortest:.6g} and {longest:.6g}; give finite unit vectors (torch.nn.functional.normalize).")
         return trace(self.prescription(wavelength_um), origin_mm, direction)
 
     def thin(self, wavelength_um=WAVELENGTH_UM["d"]):
@@ -208,6 +208,12 @@ class GeoLens(nn.Module):
 
     def extra_repr(self):
         return f"{self.name}, {len(self.surfaces)} surfaces, entrance pupil {self.entrance_pupil_diameter_mm:g} mm"
+
+
+def _range(rows, function, argument):
+    """Least and largest value of a function of rows [N, 3], in blocks that stay in the cache; NaN where there is one."""
+    found = torch.stack([torch.stack(torch.aminmax(function(part, argument))) for part in rows.detach().split(65_536)])
+    return found[:, 0].min().item(), found[:, 1].max().item()
 
 
 def _towards(film_mm, at_mm, last_mm, exit_z_mm):
