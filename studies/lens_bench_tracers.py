@@ -50,19 +50,19 @@ def codesign_chunks(precision, kind, rays):
     origin, direction = torch.as_tensor(rays[0]), torch.as_tensor(rays[1])
 
     def work():
-        geo.zero_grad()
+        geo.curvature_per_mm.grad = geo.thickness_mm.grad = None
         sum_over_chunks(lambda o, d: geo.trace(o, d).position_mm.sum(), origin, direction).backward()
-        return geo.curvature_per_mm.grad.clone()
+        return geo.curvature_per_mm.grad
 
     return work, lambda gradient: gradient.numpy()
 
 
 def optiland(precision, kind, rays, backend="torch"):
     import numpy as np
-    import optiland.backend as be
-    from optiland.materials import IdealMaterial
-    from optiland.optic import Optic
-    from optiland.rays import RealRays
+    import optiland.backend as be  # pyright: ignore[reportMissingImports]
+    from optiland.materials import IdealMaterial  # pyright: ignore[reportMissingImports]
+    from optiland.optic import Optic  # pyright: ignore[reportMissingImports]
+    from optiland.rays import RealRays  # pyright: ignore[reportMissingImports]
 
     from codesign import lens
 
@@ -106,8 +106,8 @@ def optiland(precision, kind, rays, backend="torch"):
 
 def rayoptics(precision, kind, rays):
     import numpy as np
-    from rayoptics.environment import OpticalModel
-    from rayoptics.raytr import raytrace
+    from rayoptics.environment import OpticalModel  # pyright: ignore[reportMissingImports]
+    from rayoptics.raytr import raytrace  # pyright: ignore[reportMissingImports]
 
     from codesign import lens
 

@@ -5,7 +5,7 @@ import math
 import matplotlib.pyplot as plt
 from matplotlib.ticker import FixedLocator, NullLocator
 
-from codesign.lens.constraints import active
+from codesign.lens.design.constraints import active
 from codesign.report import lens_figures
 from studies.lens_scratch_search import METHODS
 from studies.lens_scratch_task import JUDGED_FIELDS, LIMITS, SPARE_MM

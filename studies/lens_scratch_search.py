@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from codesign.lens.adam import ScaledAdam
-from codesign.lens.least_squares import DampedLeastSquares, StopRules
-from codesign.lens.optimise import column_scales
+from codesign.lens.design.adam import ScaledAdam
+from codesign.lens.design.least_squares import DampedLeastSquares, StopRules
+from codesign.lens.design.optimise import column_scales
 from studies.lens_scratch_task import LINES, Stage, draw_start, jacobian, judge, residuals_of
 
 METHODS = {

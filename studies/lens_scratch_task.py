@@ -9,10 +9,10 @@ from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens import WAVELENGTH_UM, GeoLens, Glass, Surface
 from codesign.lens.analysis import field_rays, pupil_grid
-from codesign.lens.constraints import Constraint, Limits, evaluate, rows
-from codesign.lens.hits import paraxial_semi_aperture_mm, traced_semi_aperture_mm
-from codesign.lens.optimise import by_differences
-from codesign.lens.solves import focus_paraxial, hold_efl
+from codesign.lens.design.constraints import Constraint, Limits, evaluate, rows
+from codesign.lens.design.hits import paraxial_semi_aperture_mm, traced_semi_aperture_mm
+from codesign.lens.design.optimise import by_differences
+from codesign.lens.design.solves import focus_paraxial, hold_efl
 
 EFL_MM, PUPIL_MM, HALF_FIELD = 50.0, 10.0, math.radians(20.0)
 GLASSES = ("N-SK16", "F2", "N-SK16")

@@ -16,9 +16,9 @@ import torch
 from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens import WAVELENGTH_UM
-from codesign.lens.solves import focus_rays
-from codesign.lens.tolerance import LINEAR_FIGURES, Tolerances, Trials, compare, errors_of, linear_figures, monte_carlo, sensitivities, worst_offenders
-from codesign.lens.tolerance_spot import forecast_spot, spot_errors, squared_spots
+from codesign.lens.design.solves import focus_rays
+from codesign.lens.design.tolerance import LINEAR_FIGURES, Tolerances, Trials, compare, errors_of, linear_figures, monte_carlo, sensitivities, worst_offenders
+from codesign.lens.design.tolerance_spot import forecast_spot, spot_errors, squared_spots
 from studies.run import Run, StudyConfig, main
 
 FIELDS = (0.0, 0.7, 1.0)

@@ -1,6 +1,6 @@
 """Differentiable lenses: ray-traced (GeoLens), thin, and pinhole."""
 
-from codesign.lens import analysis, catalogue
+from codesign.lens import analysis, catalogue, design
 from codesign.lens.aiming import aimed_rays
 from codesign.lens.analysis import pupil_grid, rms_spot_mm, spots
 from codesign.lens.catalogue import half_field_deg
@@ -15,6 +15,6 @@ from codesign.lens.surface import Phase, Surface
 from codesign.lens.trace import Status, TraceResult, sum_over_chunks
 
 __all__ = [
-    "WAVELENGTH_UM", "GeoLens", "Glass", "Phase", "Pinhole", "Spectrum", "Status", "Surface", "ThinLens", "TraceResult", "aimed_rays", "analysis", "catalogue", "half_field_deg",
+    "WAVELENGTH_UM", "GeoLens", "Glass", "Phase", "Pinhole", "Spectrum", "Status", "Surface", "ThinLens", "TraceResult", "aimed_rays", "analysis", "catalogue", "design", "half_field_deg",
     "load", "pupil_grid", "relative_illumination", "rms_spot_mm", "save", "seidel_sums", "spots", "sum_over_chunks",
 ]

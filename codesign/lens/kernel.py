@@ -61,7 +61,7 @@ class Kernel:
 
         count = dr.width(origin) // 3
         c, t, k, n, ratio, per_mm2, reach, terms, *special = (widen(arr, values, dr.width(values), count) for values in prescription)
-        path_terms, decentre, cosines, sines, inner_per_mm2, inner_reach = special or [None] * 6
+        path_terms, decentre, cosines, sines, inner_per_mm2, inner_reach = special or [[]] * 6
         alive, path, weight, deficit = dr.full(arr.Bool, True, count), arr.Float(0), arr.Float(1), arr.Float(0)
         o, d = dr.unravel(arr.Array3, origin), dr.unravel(arr.Array3, direction)
         fate, inside = arr.Int32(-8), dr.full(arr.Bool, True, count)  # 8 x surface + status of the failure

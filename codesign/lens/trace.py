@@ -128,8 +128,11 @@ def sum_over_chunks(function, *rays, rows=262_144):
     Args: function of tensors [n, ...] -> tensor, such as a merit of traced rays; rays: tensors [N, ...] split together into ``rows`` at a time.
     Returns: the sum over chunks. Gradient: as if all were traced at once.
     """
-    parts = zip(*(r.split(rows) for r in rays), strict=True)
-    return sum(checkpoint(function, *part, use_reentrant=False) for part in parts)
+    first, *rest = zip(*(r.split(rows) for r in rays), strict=True)
+    total: Tensor = checkpoint(function, *first, use_reentrant=False)  # pyright: ignore[reportAssignmentType]
+    for part in rest:
+        total = total + checkpoint(function, *part, use_reentrant=False)
+    return total
 
 
 def _active(table):

@@ -2,7 +2,6 @@
 
 import copy
 from dataclasses import dataclass, fields, replace
-from types import MappingProxyType
 
 import torch
 
@@ -98,13 +97,17 @@ class Camera:
             rays, light = self._rays(offset, pupil), None
         else:
             colours = len(self.spectrum.wavelengths_um)
-            parts = [self._rays(o, p, {"wavelength_um": w}) for w, o, p in zip(self.spectrum.wavelengths_um, offset.chunk(colours), pupil.chunk(colours), strict=True)]
+            parts = [self._rays(o, p, wavelength_um=w) for w, o, p in zip(self.spectrum.wavelengths_um, offset.chunk(colours), pupil.chunk(colours), strict=True)]
             rays = Rays(*(self._joined([getattr(part, f.name) for part in parts]) for f in fields(Rays)))
             light = torch.tensor(self.spectrum.weights).repeat_interleave(self.samples_per_pixel // colours).to(rays.weight).repeat(self.film.pixels().shape[0]) * colours
         weight = rays.weight if light is None else rays.weight * light
-        return replace(rays, weight=weight * rays.irradiance if self.falloff else weight)
+        if self.falloff:
+            if rays.irradiance is None:
+                raise DomainError("camera: this lens does not say how illumination falls off; leave falloff=False.")
+            weight = weight * rays.irradiance
+        return replace(rays, weight=weight)
 
-    def _rays(self, offset, pupil, wavelength=MappingProxyType({})):
+    def _rays(self, offset, pupil, **wavelength):
         pixels, dtype = self.film.pixels(), self.lens.dtype
         points = (pixels[:, None] + offset).reshape(-1, 2)
         return self.lens.camera_rays(self.film_mm(points).to(dtype), pupil.repeat(pixels.shape[0], 1).to(dtype), aim=self.aim, **wavelength)
@@ -118,12 +121,16 @@ class Camera:
         """Rays through the pupil's centre for pixel coordinates [N, 2]: Rays, float64."""
         return self.lens.camera_rays(self.film_mm(pixels), torch.zeros_like(pixels))
 
+    def rays_through(self, pixels, pupil):
+        """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil: Rays, float64."""
+        return self.lens.camera_rays(self.film_mm(pixels), pupil, aim=self.aim)
 
-def project(camera, points_cam_m):
-    """Pixel coordinates whose chief ray passes through points.
 
-    Args: points_cam_m [N, 3], camera axes, metres, in front of the camera.
-    Returns: [N, 2] px (the centre of the first pixel is 0, 0), float64; NaN for points that no chief ray reaches (outside the lens's field).
+def project(camera, points_cam_m, pupil=None):
+    """Pixel coordinates whose ray through a point of the pupil (the centre when none is given) passes through points of space.
+
+    Args: points_cam_m [N, 3], camera axes, metres, in front of the camera. pupil: [N, 2] on the unit disc, or None for chief rays.
+    Returns: [N, 2] px (the centre of the first pixel is 0, 0), float64; NaN for points that no such ray reaches (outside the lens's field).
     Gradient: to the points and to the lens, by the implicit function theorem (one Newton step with gradients at the solution); 0 to NaN points.
     Raises: DomainError when a point is not finite or not in front of the camera.
     """
@@ -131,6 +138,7 @@ def project(camera, points_cam_m):
     if bool((points_cam_m.detach()[:, 2] <= 0).any()):
         raise DomainError("project: some points lie behind the camera (z <= 0); drop them first.")
     points_cam_m = points_cam_m.double()
+    pupil = torch.zeros_like(points_cam_m[:, :2]).detach() if pupil is None else pupil.to(points_cam_m)
     with torch.no_grad():
         rays = camera.chief_rays(camera.film.middle_px.reshape(1, 2) + torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64))
         slope = rays.direction[1, 0] / rays.direction[1, 2] - rays.direction[0, 0] / rays.direction[0, 2]
@@ -138,7 +146,7 @@ def project(camera, points_cam_m):
         step = _STEP_MM / camera.film.pixel_pitch_mm
         shifts = torch.tensor([[0.0, 0.0], [step, 0.0], [0.0, step]], dtype=at.dtype)
         for turn in range(_NEWTON_STEPS):
-            miss, passes = _miss(camera, (at[None] + shifts[:, None]).reshape(-1, 2), points_cam_m.repeat(3, 1))
+            miss, passes = _miss(camera, (at[None] + shifts[:, None]).reshape(-1, 2), points_cam_m.repeat(3, 1), pupil.repeat(3, 1))
             miss, ahead_x, ahead_y = miss.reshape(3, -1, 2)
             jacobian = torch.stack([ahead_x - miss, ahead_y - miss], -1) / step
             found = passes.reshape(3, -1).all(0) & (torch.linalg.det(jacobian).abs() > 1e-12 * jacobian.square().sum((1, 2)))
@@ -147,15 +155,15 @@ def project(camera, points_cam_m):
             at = torch.where(found[:, None], at - change, camera.film.middle_px + _SHRINK * (at - camera.film.middle_px))
             if bool((change[found].abs() < 1e-6).all() & (found.all() | (turn >= _SHRINK_STEPS))):  # the next step would be its square
                 break
-    miss, passes = _miss(camera, at, points_cam_m)
+    miss, passes = _miss(camera, at, points_cam_m, pupil)
     change = torch.linalg.solve(jacobian, torch.where(found[:, None], miss, 0))
     found = found & passes & (change.detach().abs() < 1e-3).all(1)
     return torch.where(found[:, None], at - change, torch.nan)
 
 
-def _miss(camera, pixels, points_cam_m):
-    """Where chief rays pass the depth of the points, minus the points: [N, 2] metres; and whether light takes them: [N]."""
-    rays = camera.chief_rays(torch.cat([camera.film.middle_px.reshape(1, 2), pixels]))  # the axial ray goes along: a lens that passes nothing at all is an error
+def _miss(camera, pixels, points_cam_m, pupil):
+    """Where rays pass the depth of the points, minus the points: [N, 2] metres; and whether light takes them: [N]."""
+    rays = camera.rays_through(torch.cat([camera.film.middle_px.reshape(1, 2), pixels]), torch.cat([pupil.new_zeros(1, 2), pupil]))  # the axial ray goes along: a lens that passes nothing at all is an error
     origin, direction = rays.origin_m[1:], rays.direction[1:]
     passes = (rays.weight.detach()[1:] > 0) & (direction.detach()[:, 2] > 1e-6)
     ahead = (points_cam_m[:, 2:] - origin[:, 2:]) / torch.where(passes[:, None], direction[:, 2:], 1)

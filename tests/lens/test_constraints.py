@@ -8,10 +8,11 @@ import torch
 
 from codesign import lens
 from codesign.errors import DomainError
-from codesign.lens import GeoLens, Glass, Surface, glass_map
+from codesign.lens import GeoLens, Glass, Surface
 from codesign.lens.analysis import field_rays
-from codesign.lens.constraints import Constraint, Limits, active, evaluate, gap_mm, penalty, report, rows
-from codesign.lens.hits import paraxial_semi_aperture_mm, rim_rays, surface_hits, traced_semi_aperture_mm
+from codesign.lens.design import glass_map
+from codesign.lens.design.constraints import Constraint, Limits, active, evaluate, gap_mm, penalty, report, rows
+from codesign.lens.design.hits import paraxial_semi_aperture_mm, rim_rays, surface_hits, traced_semi_aperture_mm
 
 D = torch.float64
 GLASS = Glass.from_indices(1.5, 1.5, 1.5)

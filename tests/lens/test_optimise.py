@@ -11,9 +11,9 @@ import scipy.optimize
 import torch
 
 from codesign.errors import DomainError, NonFiniteError, ShapeError
-from codesign.lens.adam import ScaledAdam
-from codesign.lens.least_squares import DampedLeastSquares, StopRules
-from codesign.lens.optimise import Entry, History, by_autograd, by_differences, column_scales, principal_modes
+from codesign.lens.design.adam import ScaledAdam
+from codesign.lens.design.least_squares import DampedLeastSquares, StopRules
+from codesign.lens.design.optimise import Entry, History, by_autograd, by_differences, column_scales, principal_modes
 
 D = torch.float64
 

@@ -8,7 +8,7 @@ import torch
 from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens import GeoLens, Glass, Surface
-from codesign.lens.solves import focus_paraxial, focus_rays, hold_efl, holding_surface
+from codesign.lens.design.solves import focus_paraxial, focus_rays, hold_efl, holding_surface
 
 D = torch.float64
 CROWN, PLATE = Glass.from_indices(1.5, 1.5, 1.5), Glass.from_indices(1.6, 1.6, 1.6)

@@ -8,9 +8,9 @@ import torch
 from codesign import lens
 from codesign.errors import DomainError, ShapeError
 from codesign.lens import GeoLens, Glass, Surface
-from codesign.lens.optimise import by_autograd
-from codesign.lens.solves import focus_paraxial, focus_rays
-from codesign.lens.tolerance import (
+from codesign.lens.design.optimise import by_autograd
+from codesign.lens.design.solves import focus_paraxial, focus_rays
+from codesign.lens.design.tolerance import (
     LINEAR_FIGURES,
     Error,
     Tolerances,
@@ -22,7 +22,7 @@ from codesign.lens.tolerance import (
     sensitivities,
     worst_offenders,
 )
-from codesign.lens.tolerance_spot import forecast_spot, spot_errors, squared_spots
+from codesign.lens.design.tolerance_spot import forecast_spot, spot_errors, squared_spots
 
 D = torch.float64
 FIELD = math.radians(20)

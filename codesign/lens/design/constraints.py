@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.lens import glass_map
-from codesign.lens.hits import rim_rays, surface_hits
+from codesign.lens.design import glass_map
+from codesign.lens.design.hits import rim_rays, surface_hits
 from codesign.lens.surface import sag_mm
 
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.lens.optimise import Entry, History, Jacobian, by_autograd, check_start, finite
+from codesign.lens.design.optimise import Entry, History, Jacobian, by_autograd, check_start, finite
 
 __all__ = ["DampedLeastSquares", "StopRules"]
 

@@ -7,11 +7,9 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis import rms_spot_mm, spots
+from codesign.lens.design.solves import hold_efl, holding_surface
 from codesign.lens.geolens import LEARNABLES, GeoLens
-from codesign.lens.solves import hold_efl, holding_surface
 from codesign.lens.surface import sag_mm
-
-__all__ = ["LensDesign", "detune", "edge_thickness_mm", "hold_efl", "make_design"]
 
 
 def edge_thickness_mm(lens):

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, NonFiniteError, ShapeError
-from codesign.lens.optimise import Entry, History, check_start, finite
+from codesign.lens.design.optimise import Entry, History, check_start, finite
 
 __all__ = ["ScaledAdam"]
 

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
 from codesign.lens.analysis import spots
-from codesign.lens.constraints import is_glass
+from codesign.lens.design.constraints import is_glass
+from codesign.lens.design.optimise import by_differences, finite
 from codesign.lens.glass import WAVELENGTH_UM
-from codesign.lens.optimise import by_differences, finite
 
 
 @dataclass(frozen=True)
