@@ -6,7 +6,7 @@ PYTHON ?=
 ARGS ?=
 RUN := .venv/bin/python
 
-.PHONY: help setup lens-opt lens-report lens-scratch lens-tolerance lens-bench placement speed-error stability gradcheck test lint doctor clean
+.PHONY: help setup lens-opt lens-report lens-scratch lens-tolerance lens-bench silhouettes dataset placement speed-error stability gradcheck test lint doctor clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1|/p' Makefile | awk -F'|' '{printf "%-20s %s\n", $$1, $$2}'
@@ -37,6 +37,12 @@ lens-tolerance: setup ## what errors of making and mounting do to a lens
 lens-bench: setup ## speed and error against other ray tracers (installs them)
 	@$(RUN) -m pip install --disable-pip-version-check --quiet --editable ".[bench]" --constraint constraints.txt
 	@$(RUN) -m studies.lens_bench $(ARGS)
+
+silhouettes: setup ## gradients where objects hide one another
+	@$(RUN) -m studies.silhouettes $(ARGS)
+
+dataset: setup ## render trajectories with events and ground truth
+	@$(RUN) -m studies.make_dataset $(ARGS)
 
 placement: setup ## where to mount the camera on a robot
 	@$(RUN) -m studies.placement $(ARGS)

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
 
+from codesign import backend
 from codesign.errors import DomainError, FileFormatError
 
 PHOTOS = ("brick", "gravel", "grass", "camera", "coffee", "chelsea", "astronaut", "rocket", "hubble_deep_field")
@@ -84,6 +85,53 @@ def check_texture(values, name):
         bad = "NaN or infinite" if not np.isfinite(values).all() else "negative" if values.ndim == 2 else f"shape {values.shape} instead of [H, W] with"
         raise DomainError(f"texture {name}: {bad} values; give finite radiances of at least 0 as a 2-D array.")
     return values.astype(np.float32)
+
+
+def picture(source, blur_texels=2.0):
+    """What a world's surface is given: an array [H, W], a path, one of PHOTOS, or "speckle-3" (seed 3); files and photographs softened by ``blur_texels``."""
+    if not isinstance(source, str | Path):
+        return check_texture(source, "given as an array")
+    if str(source).startswith("speckle-") and str(source)[8:].isdigit():
+        return np.minimum(softened(speckle(int(str(source)[8:]), finest_px=16.0, contrast=0.4), blur_texels), 255)
+    return softened(photo(source), blur_texels)
+
+
+def sky(seed=0, height_px=256, zenith=90.0, horizon=190.0, ground=40.0, sun_elevation_deg=40.0, sun_azimuth_deg=200.0):
+    """A procedural sky as an equirectangular picture [height, 2 height], first row at the zenith: a gradient, soft clouds, a broad soft sun; 255 at most."""
+    width = 2 * height_px
+    elevation = np.pi / 2 - (np.arange(height_px)[:, None] + 0.5) * np.pi / height_px
+    azimuth = (np.arange(width) + 0.5) * 2 * np.pi / width
+    noise = gaussian_filter(np.random.default_rng(seed).standard_normal((height_px, width)), (height_px / 48, height_px / 20), mode=["nearest", "wrap"])  # pyright: ignore[reportArgumentType]
+    clouds = 25 * np.tanh(1.5 * noise / noise.std()) * np.clip(2 * elevation, 0, 1)
+    up = np.clip(elevation / (np.pi / 2), 0, 1)
+    clear = horizon + (zenith - horizon) * up**0.6 + clouds
+    e, a = np.radians(sun_elevation_deg), np.radians(sun_azimuth_deg)
+    cosine = np.sin(elevation) * np.sin(e) + np.cos(elevation) * np.cos(e) * np.cos(azimuth - a)
+    bright = clear + (250 - clear) * np.exp(20 * (cosine - 1))
+    below = 1 / (1 + np.exp(elevation / 0.02))  # no jump at the horizon
+    return check_texture(np.clip(bright + (ground - bright) * below, 0, 255), "of the procedural sky")
+
+
+def environment(path, mean=80.0):
+    """Luminance of an equirectangular HDR file (.hdr, .exr, or any picture Mitsuba reads), scaled to a mean radiance over the sphere: [H, W] float32.
+
+    Bright lamps and suns stay as far above 255 as they are in the file. Raises: FileFormatError when it is missing or unreadable, DomainError for bad values.
+    """
+    if not Path(path).is_file():
+        raise FileFormatError(f"environment map '{path}' is not a file; give the path of an equirectangular .hdr or .exr picture.")
+    if not 0 < mean < math.inf:
+        raise DomainError(f"environment map {path}: mean = {mean} must be positive and finite.")
+    mi = backend.mitsuba("cpu")
+    try:
+        values = np.array(mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.Y, mi.Struct.Type.Float32, srgb_gamma=False), dtype=np.float64)
+    except Exception as error:  # Mitsuba raises plain RuntimeErrors of many lines
+        raise FileFormatError(f"environment map '{path}' cannot be read ({str(error).splitlines()[-1][:120]}); convert it to .exr or .hdr.") from error
+    values = check_texture(values.reshape(values.shape[0], -1), str(path)).astype(np.float64)
+    weight = np.sin((np.arange(len(values)) + 0.5) * np.pi / len(values))[:, None]
+    level = (values * weight).mean() / weight.mean()
+    if level <= 0:
+        raise DomainError(f"environment map {path} is black; give one with light in it.")
+    return check_texture(values * (mean / level), str(path))
 
 
 def waves(seed, count=24, finest_period_m=0.05, coarsest_period_m=0.5, log_contrast=0.4):

@@ -198,6 +198,25 @@ class GeoLens(nn.Module):
             raise DomainError(f"{self.name}: every ray fails{self._where(out)}; weaken the curvatures or open the apertures.")
         return Rays(out.position_mm * 1e-3, out.direction, out.weight, spread * direction[:, 2] ** 4)
 
+    def film_points(self, points_mm, pupil, wavelength_um=WAVELENGTH_UM["d"]):
+        """Where light from points of space meets the film, through points of the paraxial entrance pupil; the other way of ``camera_rays``.
+
+        Args: points_mm [N, 3] in camera axes, millimetres from the entrance pupil's centre; pupil [N, 2] on the unit disc, aimed at the entrance pupil.
+        Returns: film_mm [N, 2] as seen upright; pupil [N, 2], the point of the exit pupil that the light passed, so that ``camera_rays(film_mm, pupil)``
+          goes back to the point; passes [N] bool. Gradient: to points, pupil and lens.
+        """
+        f, dtype = self.first_order(wavelength_um), points_mm.dtype
+        at = torch.cat([pupil * (f.entrance_pupil_diameter_mm.to(dtype) / 2), torch.zeros_like(pupil[:, :1])], 1)
+        flip = points_mm.new_tensor([1.0, 1.0, -1.0])
+        start, direction = points_mm * flip, torch.nn.functional.normalize((at - points_mm) * flip, dim=1)
+        start = torch.cat([start[:, :2], start[:, 2:] + self.first_order().entrance_pupil_z_mm.to(dtype)], 1)
+        lens = self.prescription(wavelength_um).to(dtype)
+        apertures = lens.semi_aperture_mm.clone()
+        apertures[self.stop_index] = 1e6
+        out = trace(dataclasses.replace(lens, semi_aperture_mm=apertures), start, direction)
+        back = (f.exit_pupil_z_mm - self.thickness_mm[-1]).to(dtype) * out.direction[:, :2] / out.direction[:, 2:]
+        return -out.position_mm[:, :2], (out.position_mm[:, :2] + back) / (f.exit_pupil_diameter_mm.to(dtype) / 2), out.weight.detach() > 0
+
     def _where(self, out):
         """What became of most rays of a backward trace, in words; surfaces are counted from the object."""
         failed = out.failed_surface[out.status != Status.OK]

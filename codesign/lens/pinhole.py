@@ -1,5 +1,7 @@
 """The cheap fidelity levels of a lens: a pinhole, and a thin lens with defocus. Same interface as the traced lens."""
 
+import copy
+
 import torch
 
 from codesign.errors import DomainError
@@ -25,6 +27,15 @@ class ThinLens:
     def dtype(self):
         return self.efl_mm.dtype
 
+    def replace(self, **lengths):
+        """The same lens with another efl_mm or image_distance_mm."""
+        twin = copy.copy(self)
+        for name, value in lengths.items():
+            if name not in ("efl_mm", "image_distance_mm"):
+                raise DomainError(f"a thin lens has no tensor '{name}'; it has efl_mm and image_distance_mm.")
+            setattr(twin, name, torch.as_tensor(value, dtype=self.efl_mm.dtype))
+        return twin
+
     def camera_rays(self, film_mm, pupil, wavelength_um=None, aim=False):
         """Rays towards the scene; see GeoLens.camera_rays (the pupil is ideal, so aiming changes nothing). Paraxial refraction: slope out = slope in - q / f."""
         q = pupil * (self.entrance_pupil_diameter_mm / 2)
@@ -33,6 +44,12 @@ class ThinLens:
         direction = torch.nn.functional.normalize(torch.cat([slope, torch.ones_like(slope[:, :1])], 1), dim=1)
         origin = torch.cat([q, torch.zeros_like(q[:, :1])], 1) * 1e-3
         return Rays(origin + 0 * direction, direction, torch.ones_like(direction[:, 0]), (1 + inside.square().sum(1)) ** -2)
+
+    def film_points(self, points_mm, pupil, wavelength_um=None):
+        """Where light from points of space meets the film; see GeoLens.film_points (here the pupil points stay as they are)."""
+        q = pupil * (self.entrance_pupil_diameter_mm / 2)
+        inside = (points_mm[:, :2] - q) / points_mm[:, 2:] + q / self.efl_mm
+        return inside * self.image_distance_mm - q, pupil, points_mm.detach()[:, 2] > 0
 
 
 class Pinhole(ThinLens):

@@ -86,6 +86,12 @@ class Camera:
         twin.lens = lens
         return twin
 
+    def with_seed(self, seed):
+        """The same lens and film with other samples."""
+        twin = copy.copy(self)
+        twin.seed = int(seed)
+        return twin
+
     def film_mm(self, pixels):
         """Upright image position in millimetres of pixel coordinates [N, 2]."""
         return (pixels - self.film.middle_px.to(pixels)) * self.film.pixel_pitch_mm

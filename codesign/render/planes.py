@@ -40,6 +40,10 @@ class TexturedPlane:
 
     def radiance(self, arr, origin, direction):
         """Radiance along world rays (drjit arrays). Gradient: exact, to the rays."""
+        return self.radiance_and_distance(arr, origin, direction)[0]
+
+    def radiance_and_distance(self, arr, origin, direction):
+        """Radiance as above, and the distance to the plane (infinite where it is not met), which carries no gradient."""
         import drjit as dr
 
         m, waves, mean = self._constants(arr)
@@ -52,7 +56,7 @@ class TexturedPlane:
         total = arr.Float(0)
         for fx, fy, a, phase in waves:
             total += a * dr.cos((2 * dr.pi) * (fx * x + fy * y) + phase)
-        return mean * dr.select(meets, dr.exp(total), 1)
+        return mean * dr.select(meets, dr.exp(total), 1), dr.select(meets, dr.detach(t), dr.inf)
 
     def hit(self, origin_m, direction):
         """Where world rays [N, 3] meet the plane: point, normal, valid (see MitsubaScene.hit)."""

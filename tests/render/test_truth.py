@@ -11,6 +11,7 @@ from codesign.pose import apply, inverse, look_at, se3_exp
 from codesign.render import Camera, TexturedPlane, true_flow
 from codesign.render.truth import world_points
 from scenes import textures, worlds
+from scenes.build import GAP_M
 
 D = torch.float64
 WALL = np.full((8, 8), 50.0, dtype=np.float32)
@@ -105,13 +106,14 @@ def test_points_and_depths_under_pixels():
 
 
 def test_depth_of_a_sphere_in_the_room_by_hand():
-    # the ball of the room: centre (0.1, 0.5, 0.25), radius 0.25; seen from 1.5 m along -y at its height the depth is 1.25 m
+    # the ball of the room, of radius 0.25 at (0.1, 0.5), rests just over the floor; seen from 1.5 m along -y at its height the depth is 1.25 m
+    height = 0.25 + GAP_M
     camera = Camera(lens.Pinhole(8.0), 1, 1, 0.1, 1)
-    pose = look_at((0.1, -1.0, 0.25), (0.1, 0.5, 0.25))
+    pose = look_at((0.1, -1.0, height), (0.1, 0.5, height))
     points, depth, valid = world_points(camera.chief_rays(camera.film.pixels()), worlds.room(), pose)
     assert valid.tolist() == [True]
     assert depth.item() == pytest.approx(1.25, abs=1e-6)  # float32 geometry
-    assert points[0].tolist() == pytest.approx([0.1, 0.25, 0.25], abs=1e-6)
+    assert points[0].tolist() == pytest.approx([0.1, 0.25, height], abs=1e-6)
 
 
 def test_gradients_of_flow_to_lens_and_poses(generator):

@@ -1,4 +1,4 @@
-"""Camera paths as poses T_world_cam [T, 4, 4] at uniform times."""
+"""Simple camera paths as poses T_world_cam [T, 4, 4] at given times."""
 
 import math
 

@@ -1,0 +1,177 @@
+"""Frames of a scene along a trajectory, and the ways to their gradient.
+
+interior: what moves inside surfaces (plain automatic differentiation). boundary: with the motion of silhouettes and edges. difference: central differences
+with common random numbers, twelve renders for the poses and two per lens number. auto: the cheapest of the three that agrees with differences, asked once
+per scene, camera and group of parameters.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+
+from codesign.errors import DomainError
+from codesign.pose import inverse, se3_exp
+from codesign.render.boundary import boundary_term
+from codesign.render.moving import at_frames
+from codesign.render.wavefront import shade
+
+Way = Literal["interior", "boundary", "difference", "auto"]
+WAYS: tuple[Way, ...] = ("interior", "boundary", "difference", "auto")
+PROVEN: tuple[Way, ...] = ("interior", "boundary")  # those that differences judge
+POSE_STEP = (2e-3, 2e-3, 2e-3, 2e-3, 2e-3, 2e-3)  # metres and radians
+LENS_STEP = {"curvature_per_mm": 2e-5, "thickness_mm": 5e-3, "conic": 1e-2, "index_offset": 1e-4, "efl_mm": 1e-2, "image_distance_mm": 2e-3}
+PASSES = 0.05  # relative L2 distance from differences up to which a way is kept
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What ``choose`` found for one group of parameters: the way to use, and the relative error of each way against differences."""
+
+    way: Way
+    errors: dict[str, float]
+    noise: float
+
+    def __str__(self):
+        measured = ", ".join(f"{way} {error:.1%}" for way, error in self.errors.items())
+        return f"{self.way}: relative error against differences: {measured}; the differences themselves {self.noise:.1%}"
+
+
+def frames(camera, scene, T_world_cam, gradient: Way = "interior", per_px=3.0):
+    """Frames of a scene along a trajectory.
+
+    Args: camera: Camera. scene: anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane). T_world_cam: [T, 4, 4].
+      gradient: "interior", "boundary", "difference" or "auto", see the top of this file; the frames are the same. per_px: samples per pixel length of
+      silhouettes and edges for "boundary".
+    Returns: [T, H, W] (or [T, windows, H, W]) linear irradiance in the scene's units, box-filtered over each pixel.
+    Gradient: lens and poses; "interior" leaves out the motion of silhouettes.
+    Raises: DomainError for an unknown way, or a scene whose silhouettes are not known.
+    """
+    if gradient not in WAYS:
+        raise DomainError(f"gradient = {gradient!r} is not known; choose one of {', '.join(WAYS)}.")
+    if gradient == "auto":
+        gradient = settled(camera, scene, T_world_cam)
+    if gradient == "difference":
+        return by_differences(camera, scene, T_world_cam)
+    found = image(camera, scene, T_world_cam)
+    return found + boundary_term(camera, scene, T_world_cam, per_px) if gradient == "boundary" else found
+
+
+def image(camera, scene, T_world_cam):
+    """Frames [T, *film.shape] with their interior gradient."""
+    return shade(camera.rays(), scene, T_world_cam, camera.samples_per_pixel).reshape(T_world_cam.shape[0], *camera.film.shape)
+
+
+def by_differences(camera, scene, T_world_cam):
+    """Frames whose gradient to poses and lens tensors is that of central differences with common random numbers."""
+    if any(pose.requires_grad for pose in getattr(scene, "T_world_object", ())):
+        raise DomainError("gradient 'difference' goes to camera and lens only, but the pose of an object asks for one; use 'interior'.")
+    with torch.no_grad():
+        found = first = image(camera, scene, T_world_cam)
+    if T_world_cam.requires_grad:
+        twist = _twist(T_world_cam)
+        for k in range(6):
+            slope = pose_difference(camera, scene, T_world_cam, k)
+            found = found + slope * twist[:, k].to(first).reshape(-1, *[1] * (first.ndim - 1))
+    for name, tensor in lens_tensors(camera.lens).items():
+        for i in range(tensor.numel()):
+            slope = lens_difference(camera, scene, T_world_cam, name, i)
+            value = tensor.reshape(-1)[i]
+            found = found + slope * (value - value.detach()).to(first)
+    return found
+
+
+def _twist(T_world_cam):
+    """Zero-valued twists [T, 6] (translation first) whose gradient is that of small motions of the poses in their own axes."""
+    small = inverse(T_world_cam.detach().double()) @ T_world_cam.double()
+    turn = (small[:, :3, :3] - small[:, :3, :3].mT) / 2
+    return torch.stack([*small[:, :3, 3].unbind(1), turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], 1)
+
+
+def pose_difference(camera, scene, T_world_cam, k):
+    """Change of the frames per unit of the k-th component of the twist of every pose, by central differences."""
+    step = torch.zeros(6, dtype=torch.float64)
+    step[k] = POSE_STEP[k]
+    with torch.no_grad():
+        ahead, behind = (image(camera, scene, T_world_cam.double() @ se3_exp(sign * step[None])) for sign in (1, -1))
+    return (ahead - behind) / (2 * POSE_STEP[k])
+
+
+def lens_tensors(lens):
+    """Tensors of a lens that ask for gradients, by name."""
+    names = ("curvature_per_mm", "thickness_mm", "conic", "asphere", "index_offset", "phase", "decentre_mm", "tilt_rad", "efl_mm", "image_distance_mm")
+    found = {name: getattr(lens, name, None) for name in names}
+    return {name: t for name, t in found.items() if torch.is_tensor(t) and t.requires_grad and t.numel()}
+
+
+def lens_difference(camera, scene, T_world_cam, name, i):
+    """Change of the frames per unit of one number of the lens, by central differences."""
+    if name not in LENS_STEP:
+        raise DomainError(f"differences to the lens's {name} have no step; freeze it, or use gradient 'boundary'.")
+    step, value = LENS_STEP[name], getattr(camera.lens, name).detach()
+    shift = torch.zeros_like(value).reshape(-1)
+    shift[i] = step
+    with torch.no_grad():
+        ahead, behind = (image(camera.with_lens(camera.lens.replace(**{name: value + sign * shift.reshape(value.shape)})), scene, T_world_cam) for sign in (1, -1))
+    return (ahead - behind) / (2 * step)
+
+
+def settled(camera, scene, T_world_cam):
+    """The way ``choose`` found for this scene, camera and set of parameters; asked once and remembered by the scene."""
+    if any(pose.requires_grad for pose in getattr(scene, "T_world_object", ())):
+        return "interior"  # the only way that reaches objects
+    lens = lens_tensors(camera.lens)
+    groups = [*(["pose"] if T_world_cam.requires_grad else []), *lens]
+    if not groups:
+        return "interior"
+    memory = scene.__dict__.setdefault("_ways", {})
+    key = (tuple(groups), camera.film, camera.samples_per_pixel, type(camera.lens).__name__)
+    if key not in memory:
+        memory[key] = choose(camera, scene, T_world_cam)
+    order = {way: i for i, way in enumerate(WAYS)}
+    return max((choice.way for choice in memory[key].values()), key=order.__getitem__)
+
+
+def choose(camera, scene, T_world_cam, seed=0):
+    """Choice per group of parameters ("pose" and each lens tensor that asks for gradients): the cheapest way that agrees with differences.
+
+    A random smooth weighting of the pixels stands for the loss; differences are taken at two seeds of the camera, whose disagreement is their noise.
+    A way passes within PASSES plus that noise, of which no more than PASSES counts. Two frames are looked at.
+    """
+    which = [0, -1] if T_world_cam.shape[0] > 1 else [0]
+    scene, poses = at_frames(scene, which), T_world_cam.detach()[which]
+    generator = torch.Generator().manual_seed(seed)
+    height, width = camera.film.shape[-2:]
+    coarse = torch.randn(1, 1, max(2, height // 6), max(2, width // 6), generator=generator)
+    weight = torch.nn.functional.interpolate(coarse, size=(height, width), mode="bilinear", align_corners=True)[0, 0]
+    other = camera.with_seed(camera.seed + 1)
+    found = {}
+    for group in [*(["pose"] if T_world_cam.requires_grad else []), *lens_tensors(camera.lens)]:
+        truth, again = (_by_group(c, scene, poses, group, weight) for c in (camera, other))
+        noise = float((truth - again).norm() / truth.norm().clamp_min(1e-30)) / 2
+        errors = {}
+        for way in PROVEN:
+            try:
+                errors[way] = float((_by_way(camera, scene, poses, group, weight, way) - truth).norm() / truth.norm().clamp_min(1e-30))
+            except DomainError:
+                continue  # the scene has no known outline
+            if errors[way] <= PASSES + min(noise, PASSES):  # differences that do not know better than that judge nothing
+                found[group] = Choice(way, errors, noise)
+                break
+        else:
+            found[group] = Choice("difference", errors, noise)
+    return found
+
+
+def _by_group(camera, scene, poses, group, weight):
+    if group == "pose":
+        return torch.stack([(pose_difference(camera, scene, poses, k) * weight).sum((-2, -1)) for k in range(6)]).double()
+    return torch.stack([(lens_difference(camera, scene, poses, group, i) * weight).sum() for i in range(getattr(camera.lens, group).numel())]).double()
+
+
+def _by_way(camera, scene, poses, group, weight, way):
+    twist = torch.zeros(poses.shape[0], 6, dtype=torch.float64, requires_grad=True)
+    pictures = frames(camera, scene, poses.double() @ se3_exp(twist), way)
+    target = twist if group == "pose" else getattr(camera.lens, group)
+    (gradient,) = torch.autograd.grad((pictures * weight).sum(), target)
+    return gradient.T.double() if group == "pose" else gradient.reshape(-1).double()

@@ -1,0 +1,141 @@
+"""What worlds are made of: painted shapes and lamps, and the light levels at which they can be shown.
+
+A world is described once. At the level "emissive" every surface shows its picture as radiance; at "baked" and "path" the same pictures are albedo
+and the world's lamps light them (see codesign.render.light). Metres, z up, radiance on the 0..255 scale.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from codesign import backend
+from codesign.errors import DomainError
+from codesign.render import MitsubaScene, light
+from codesign.render.charts import emissive_mesh
+from scenes import bodies, textures
+
+GAP_M = 1e-3  # between things that rest on each other: shapes never interpenetrate
+WHITE = 0.95  # albedo of a picture's 255
+
+
+@dataclass(frozen=True)
+class Paint:
+    """What is on a surface. picture: [H, W] radiance 0..255, first row at the top; repeat: times along u and v; wrap: how it goes on.
+
+    albedo: of a picture's 255 where the world is lit. glow: uniform radiance that the surface emits there, on top of what it reflects.
+    """
+
+    picture: Any
+    repeat: tuple[float, float] = (1.0, 1.0)
+    wrap: str = "mirror"
+    albedo: float = WHITE
+    glow: float = 0.0
+
+
+@dataclass(frozen=True)
+class World:
+    """Shapes (name -> (geometry, Paint)) that every level shows; background: sky that every level shows; lamps: Mitsuba lights of the lit levels; texel_m: size of baked light-map texels that suits its things."""
+
+    shapes: dict[str, tuple[Any, Paint]]
+    background: dict[str, Any] = field(default_factory=dict)
+    lamps: dict[str, Any] = field(default_factory=dict)
+    texel_m: float = 0.08  # of baked light
+
+
+Light = Callable[[World, str], Any]
+
+
+def emissive(world, device="cpu"):
+    """The world with its pictures as radiance: one ray cast and one lookup per ray, no shading but what the pictures hold."""
+    mi = backend.mitsuba(device)
+    shapes = {}
+    for name, (geometry, paint) in world.shapes.items():
+        if isinstance(geometry, bodies.Body):
+            radiance = _level(name, paint) * bodies.skylight(geometry)
+            shapes[name] = emissive_mesh(mi, geometry.vertices_m, geometry.faces, radiance)
+        else:
+            shapes[name] = {**geometry, "emitter": {"type": "area", "radiance": _bitmap(mi, paint, 1.0)}}
+    return MitsubaScene({**shapes, **world.background}, device)
+
+
+def baked(world, device="cpu", **options):
+    """The world lit by its lamps, worked out once; options go to light.bake."""
+    return light.bake(lit(world, device), device, **{"texel_m": world.texel_m, **options})
+
+
+def path(world, device="cpu", **options):
+    """The world lit by its lamps, by path tracing for every camera ray; options go to light.PathScene."""
+    return light.PathScene(lit(world, device), device, **options)
+
+
+LEVELS: dict[str, Light] = {"emissive": emissive, "baked": baked, "path": path}
+
+
+def lit(world, device="cpu"):
+    """Mitsuba description of the world as Lambertian surfaces with lamps."""
+    mi = backend.mitsuba(device)
+    shapes = {}
+    for name, (geometry, paint) in world.shapes.items():
+        if isinstance(geometry, bodies.Body):
+            grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": paint.albedo * _level(name, paint) / 255}}
+            shapes[name] = emissive_mesh(mi, geometry.vertices_m, geometry.faces, None, bsdf=grey)
+            continue
+        brightest = paint.albedo * float(np.max(paint.picture)) / 255
+        if not 0 <= brightest <= 1:
+            raise DomainError(f"shape '{name}': its brightest texel would have albedo {brightest:.3g}; albedos lie in 0..1.")
+        shapes[name] = {**geometry, "bsdf": {"type": "diffuse", "reflectance": _bitmap(mi, paint, paint.albedo / 255)}}
+        if paint.glow:
+            shapes[name]["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": float(paint.glow)}}
+    return {**shapes, **world.background, **world.lamps}
+
+
+def _level(name, paint):
+    """The one radiance of a body, which has no texture coordinates."""
+    picture = textures.check_texture(paint.picture, f"of '{name}'")
+    return float(picture.mean())
+
+
+def _bitmap(mi, paint, scale):
+    upright = (scale * textures.check_texture(paint.picture, "of the scene"))[::-1, :, None]  # Mitsuba puts the first row at v = 0, the bottom
+    to_uv = mi.ScalarTransform3f().scale([float(n) for n in paint.repeat])
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(upright, dtype=np.float32)), "raw": True, "wrap_mode": paint.wrap, "to_uv": to_uv}
+
+
+# ---- geometry
+
+
+def rectangle(mi, centre, normal_to, width_m, height_m, up=(0, 0, 1)):
+    """A rectangle at ``centre`` facing ``normal_to``; its picture stands upright along ``up``."""
+    frame = mi.ScalarTransform4f().look_at(origin=list(centre), target=list(normal_to), up=list(up)) @ mi.ScalarTransform4f().scale([width_m / 2, height_m / 2, 1])
+    return {"type": "rectangle", "to_world": frame}
+
+
+def block(mi, x, y, bottom_m, half_m, turn_deg=0.0):
+    """A cuboid of half sizes ``half_m`` (three numbers) that stands GAP_M over ``bottom_m``."""
+    T = mi.ScalarTransform4f
+    return {"type": "cube", "to_world": T().translate([x, y, bottom_m + GAP_M + half_m[2]]).rotate([0, 0, 1], turn_deg).scale(list(half_m))}
+
+
+def ball(mi, x, y, bottom_m, radius_m):
+    """A sphere that rests GAP_M over ``bottom_m``."""
+    return {"type": "sphere", "to_world": mi.ScalarTransform4f().translate([x, y, bottom_m + GAP_M + radius_m]).scale(radius_m)}
+
+
+def pole(mi, start, end, radius_m):
+    """A cylinder and the disk that closes its far end, as two geometries. start, end: its axis."""
+    start, end = np.array(start, dtype=float), np.array(end, dtype=float)
+    length = float(np.linalg.norm(end - start))
+    helper = [0, 0, 1] if abs(end[2] - start[2]) < 0.9 * length else [1, 0, 0]
+    T = mi.ScalarTransform4f
+    tube = T().look_at(origin=start.tolist(), target=end.tolist(), up=helper) @ T().scale([radius_m, radius_m, length])
+    cap = T().look_at(origin=end.tolist(), target=(2 * end - start).tolist(), up=helper) @ T().scale([radius_m, radius_m, 1])
+    return {"type": "cylinder", "to_world": tube}, {"type": "disk", "to_world": cap}
+
+
+def sky(mi, picture):
+    """Environment map of an equirectangular picture [H, W], first row at the zenith; columns run from +y over +x, as on a compass."""
+    values = textures.check_texture(picture, "of the sky")
+    bitmap = mi.Bitmap(np.ascontiguousarray(np.repeat(values[..., None], 3, 2)))
+    return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90)}

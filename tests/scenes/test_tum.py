@@ -1,0 +1,142 @@
+"""TUM trajectory files: round trips, what is tolerated, what is refused; and the path between recorded poses."""
+
+import math
+
+import pytest
+import torch
+
+from codesign.errors import DomainError, FileFormatError, ShapeError
+from codesign.pose import check_poses, inverse, se3_exp
+from scenes.tum import Recorded, read_tum, write_tum
+
+D = torch.float64
+LINE = "0.5 1 2 3 0 0 0 1"
+
+
+def some_poses(count, size=1.0):
+    """Random rigid motions, with half turns among them."""
+    twists = torch.randn(count, 6, generator=torch.Generator().manual_seed(0), dtype=D) * size
+    twists[0] = 0
+    twists[1, 3:] = torch.tensor([math.pi, 0, 0])
+    return se3_exp(twists)
+
+
+def test_round_trip_keeps_every_digit(tmp_path):
+    t = torch.cumsum(torch.rand(200, generator=torch.Generator().manual_seed(1), dtype=D) + 1e-3, 0) + 1.7e9  # epoch times
+    poses = some_poses(200, 2.0)
+    write_tum(tmp_path / "path.txt", t, poses)
+    t_back, back = read_tum(tmp_path / "path.txt")
+    assert torch.equal(t_back, t)
+    assert torch.equal(back[:, :3, 3], poses[:, :3, 3])
+    torch.testing.assert_close(back, poses, rtol=0, atol=1e-12)
+
+
+def test_the_quaternion_is_the_scalar_last_one_of_the_format(tmp_path):
+    # a quarter turn to the left about z: (0, 0, sin 45, cos 45); x goes to y
+    (tmp_path / "a.txt").write_text(f"1.0 4 5 6 0 0 {math.sqrt(0.5)!r} {math.sqrt(0.5)!r}\n")
+    t, poses = read_tum(tmp_path / "a.txt")
+    expected = torch.tensor([[[0, -1, 0, 4], [1, 0, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1]]], dtype=D)
+    assert t.tolist() == [1.0]
+    torch.testing.assert_close(poses, expected, rtol=0, atol=1e-15)
+
+
+def test_comments_tabs_and_line_ends_do_not_matter(tmp_path):
+    text = "\ufeff# ground truth\r\n\r\n  0.5\t1  2 3   0 0 0 1  \r\n# more\n1.5e0 -1. +2 .5 0 0 0 -1.0"
+    (tmp_path / "a.txt").write_bytes(text.encode())
+    t, poses = read_tum(tmp_path / "a.txt")
+    assert t.tolist() == [0.5, 1.5]
+    assert poses[:, :3, 3].tolist() == [[1, 2, 3], [-1, 2, 0.5]]
+    torch.testing.assert_close(poses[:, :3, :3], torch.eye(3, dtype=D).expand(2, 3, 3), rtol=0, atol=0)
+
+
+def test_four_digit_quaternions_become_rotations(tmp_path):
+    (tmp_path / "a.txt").write_text("0 0 0 0 0.1826 0.3651 0.5477 0.7303\n")
+    check_poses(read_tum(tmp_path / "a.txt")[1])
+    rotation = read_tum(tmp_path / "a.txt")[1][0, :3, :3]
+    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=D), rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize(("text", "sentence"), [
+    ("", "holds no pose"),
+    ("# only a comment\n", "holds no pose"),
+    (f"{LINE}\n1.0 1 2 3 0 0 0\n", "line 2: '1.0 1 2 3 0 0 0' is not"),
+    (f"# c\n{LINE} 9\n", "line 2: .* is not"),
+    (f"{LINE}\n1.0 nan 2 3 0 0 0 1\n", "line 2: .* finite decimal numbers"),
+    (f"{LINE}\n1.0 inf 2 3 0 0 0 1\n", "line 2"),
+    (f"{LINE}\n1.0 1e999 2 3 0 0 0 1\n", "line 2: a number is too large"),
+    (f"{LINE}\n1_0 1 2 3 0 0 0 1\n", "line 2"),
+    (f"{LINE}\n\n1.0 1 2 3 0 0 0 0\n", "line 3: the quaternion"),
+    (f"{LINE}\n1.0 1 2 3 0 0 0 1.01\n", "line 2: the quaternion"),
+    (f"{LINE}\n1.0 1 2 3 1e300 0 0 1\n", "line 2: the quaternion"),
+    (f"{LINE}\n0.5 1 2 3 0 0 0 1\n", "line 2: the timestamp"),
+    (f"{LINE}\n0.4 1 2 3 0 0 0 1\n", "line 2: the timestamp"),
+    (f"{LINE}\n1.0 {'1' * 500} 2 3 0 0 0 1\n", "line 2"),
+    ("0,5,1,2,3,0,0,0,1\n", "line 1"),
+])
+def test_hostile_files_are_refused_with_the_line(text, sentence, tmp_path):
+    (tmp_path / "a.txt").write_text(text)
+    with pytest.raises(FileFormatError, match=sentence) as caught:
+        read_tum(tmp_path / "a.txt")
+    assert "\n" not in str(caught.value)
+
+
+def test_other_files_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(FileFormatError, match="no trajectory file"):
+        read_tum(tmp_path / "none.txt")
+    with pytest.raises(FileFormatError, match="no trajectory file"):
+        read_tum(tmp_path)
+    (tmp_path / "binary").write_bytes(b"\x89PNG\xff\xfe")
+    with pytest.raises(FileFormatError, match="not a text file"):
+        read_tum(tmp_path / "binary")
+    monkeypatch.setattr("scenes.tum.MOST_BYTES", 50)
+    (tmp_path / "large.txt").write_text(LINE + " " * 100)
+    with pytest.raises(FileFormatError, match="larger than 50 bytes"):
+        read_tum(tmp_path / "large.txt")
+    monkeypatch.setattr("scenes.tum.MOST_POSES", 2)
+    (tmp_path / "long.txt").write_text("".join(f"{k} 0 0 0 0 0 0 1\n" for k in range(3))[:50])
+    with pytest.raises(FileFormatError, match="line 3: more than 2 poses"):
+        read_tum(tmp_path / "long.txt")
+    with pytest.raises(FileFormatError, match="existing, writable folder"):
+        write_tum(tmp_path / "none" / "a.txt", torch.zeros(1), torch.eye(4)[None])
+
+
+def test_writing_refuses_what_is_no_trajectory(tmp_path):
+    with pytest.raises(DomainError, match="not rigid"):
+        write_tum(tmp_path / "a.txt", torch.zeros(1), 2 * torch.eye(4)[None])
+    with pytest.raises(DomainError, match="increase strictly"):
+        write_tum(tmp_path / "a.txt", torch.zeros(2), torch.eye(4).expand(2, 4, 4))
+    with pytest.raises(ShapeError, match="one per pose"):
+        write_tum(tmp_path / "a.txt", torch.zeros(3), torch.eye(4).expand(2, 4, 4))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_recorded_path_is_a_geodesic_through_its_poses():
+    twist = torch.tensor([0.4, -0.2, 0.1, 0.5, 0.3, -0.8], dtype=D)
+    start = some_poses(3)[2]
+    exact = lambda t: start @ se3_exp(t[:, None] * twist)  # noqa: E731
+    knots = torch.tensor([0.0, 0.3, 1.0, 2.2], dtype=D)
+    path, t = Recorded(knots, exact(knots)), torch.linspace(0, 2.2, 45, dtype=D)
+    torch.testing.assert_close(path(t), exact(t), rtol=0, atol=1e-13)  # constant twist: the geodesic is the motion itself
+    torch.testing.assert_close(path.velocity(t), twist.expand(45, 6), rtol=0, atol=1e-12)
+    other = Recorded(torch.arange(5, dtype=D), some_poses(6, 0.8)[torch.tensor([0, 2, 3, 4, 5])])
+    torch.testing.assert_close(other(other.t_s), other.poses, rtol=0, atol=1e-13)
+    step = inverse(other(torch.tensor([1.2], dtype=D))) @ other(torch.tensor([1.7], dtype=D))
+    torch.testing.assert_close(step, se3_exp(0.5 * other.velocity(torch.tensor([1.4], dtype=D))), rtol=0, atol=1e-13)
+
+
+def test_recorded_paths_refuse_times_outside_and_ambiguous_turns():
+    poses = some_poses(2)
+    with pytest.raises(DomainError, match=r"turns by 3\.14 rad"):
+        Recorded([0.0, 1.0], poses)
+    path = Recorded([0.0, 1.0], poses[:1].expand(2, 4, 4))
+    torch.testing.assert_close(path(torch.tensor([0.5])), poses[:1], rtol=0, atol=0)  # standing still
+    with pytest.raises(DomainError, match="from 0 to 1 s"):
+        path(torch.tensor([1.5]))
+    with pytest.raises(ShapeError, match="at least 2"):
+        Recorded([0.0], poses[:1])
+
+
+def test_reading_gives_a_trajectory(tmp_path):
+    write_tum(tmp_path / "a.txt", [0.0, 1.0], some_poses(4, 0.5)[2:])
+    path = Recorded.read(tmp_path / "a.txt")
+    torch.testing.assert_close(path(torch.tensor([1.0])), some_poses(4, 0.5)[3:], rtol=0, atol=1e-12)

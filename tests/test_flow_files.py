@@ -1,0 +1,156 @@
+"""Flow files: the bytes of both formats, round trips within half a quantum, other writers' PNGs, and damaged files."""
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+import torch
+
+from codesign import backend
+from codesign.errors import DomainError, FileFormatError, ShapeError
+from codesign.flow_files import read_flow, write_flow
+
+QUANTUM_PX = 1 / 128
+
+
+@pytest.fixture
+def field():
+    generator = torch.Generator().manual_seed(0)
+    flow = (torch.rand(2, 37, 53, generator=generator, dtype=torch.float64) - 0.5) * 511.9
+    return flow, torch.rand(37, 53, generator=generator) > 0.3
+
+
+def png(width, height, raw, depth=16, colour=2, interlace=0, pieces=1):
+    chunk = lambda name, data: struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))  # noqa: E731
+    packed = zlib.compress(raw)
+    cut = -(-len(packed) // pieces)
+    data = b"".join(chunk(b"IDAT", packed[k : k + cut]) for k in range(0, len(packed), cut))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, interlace)) + chunk(b"tEXt", b"k\0v") + data + chunk(b"IEND", b"")
+
+
+def test_round_trips_keep_validity_exactly_and_flow_to_the_format(field, tmp_path):
+    flow, valid = field
+    for name, tolerance in (("a.png", QUANTUM_PX / 2), ("a.flo", 255 * 2**-24)):  # half a quantum; half a unit in the last place of float32
+        write_flow(tmp_path / name, flow, valid)
+        back, seen = read_flow(tmp_path / name)
+        assert torch.equal(seen, valid)
+        assert back.dtype == torch.float32
+        assert float((back - flow).abs()[:, valid].max()) <= tolerance
+        assert float(back[:, ~valid].abs().max()) == 0
+        write_flow(tmp_path / f"b{name}", back, seen)
+        assert (tmp_path / f"b{name}").read_bytes() == (tmp_path / name).read_bytes()  # reading and writing again changes nothing
+
+
+def test_the_png_holds_the_numbers_of_the_format(tmp_path):
+    flow = torch.tensor([[[1.5, -256.0]], [[0.0, 255.9921875]]], dtype=torch.float64)
+    write_flow(tmp_path / "a.png", flow)
+    content = (tmp_path / "a.png").read_bytes()
+    assert content[16:26] == struct.pack(">IIBB", 2, 1, 16, 2)
+    length = int.from_bytes(content[33:37], "big")
+    raw = zlib.decompress(content[41 : 41 + length])
+    assert raw[0] == 2  # difference to the row above, which for the first row is the row itself
+    assert struct.unpack(">6H", raw[1:]) == (32768 + 192, 32768, 1, 0, 65535, 1)
+
+
+def test_other_programs_read_the_png(field, tmp_path):
+    flow, valid = field
+    write_flow(tmp_path / "a.png", flow, valid)
+    pixels = np.array(backend.mitsuba().Bitmap(str(tmp_path / "a.png")))  # libpng
+    expected = np.where(valid, np.rint(flow.numpy() * 128) + 32768, 0)
+    np.testing.assert_array_equal(pixels[..., :2].transpose(2, 0, 1), expected)
+    np.testing.assert_array_equal(pixels[..., 2] == 1, valid)
+
+
+def test_png_rows_filtered_in_any_way_are_read(tmp_path):
+    rng = np.random.default_rng(0)
+    height, width = 11, 7
+    pixels = rng.integers(0, 2**16, (height, width, 3))
+    pixels[..., 2] = rng.integers(0, 2, (height, width))
+    rows = pixels.astype(">u2").view(np.uint8).reshape(height, -1).astype(int)
+    raw = b""
+    for y, row in enumerate(rows):  # the five filters, by their definition in the PNG specification, section 9
+        kind, above = y % 5, rows[y - 1] if y else np.zeros_like(row)
+        left, corner = np.concatenate([np.zeros(6, int), row[:-6]]), np.concatenate([np.zeros(6, int), above[:-6]])
+        guess = left + above - corner
+        distance = np.stack([abs(guess - left), abs(guess - above), abs(guess - corner)])
+        paeth = np.stack([left, above, corner])[distance.argmin(0), np.arange(len(row))]
+        raw += bytes([kind]) + ((row - (0, left, above, (left + above) // 2, paeth)[kind]) % 256).astype(np.uint8).tobytes()
+    (tmp_path / "a.png").write_bytes(png(width, height, raw, pieces=3))
+    flow, valid = read_flow(tmp_path / "a.png")
+    np.testing.assert_array_equal(valid, pixels[..., 2] == 1)
+    np.testing.assert_array_equal(flow, np.where(valid, (pixels[..., :2].transpose(2, 0, 1) - 32768) / 128, 0).astype(np.float32))
+
+
+def test_flo_holds_the_bytes_of_the_format(tmp_path):
+    flow = torch.tensor([[[1.0, 2.0, 3.0]], [[-1.0, -2.0, -3.0]]])
+    write_flow(tmp_path / "a.flo", flow, torch.tensor([[True, True, False]]))
+    assert (tmp_path / "a.flo").read_bytes() == b"PIEH" + struct.pack("<ii6f", 3, 1, 1, -1, 2, -2, 1e10, 1e10)
+
+
+@pytest.mark.parametrize("value", [256.0, -256.01, 1e6])
+def test_flows_beyond_sixteen_bits_are_refused_not_clipped(value, tmp_path):
+    flow = torch.zeros(2, 4, 5, dtype=torch.float64)
+    flow[1, 2, 3] = value
+    with pytest.raises(DomainError, match="column 3, row 2 does not fit 16 bits"):
+        write_flow(tmp_path / "a.png", flow)
+    assert not list(tmp_path.iterdir())
+    valid = flow[1] == 0
+    write_flow(tmp_path / "a.png", flow, valid)  # not valid: its value does not matter
+    assert torch.equal(read_flow(tmp_path / "a.png")[1], valid)
+    write_flow(tmp_path / "a.flo", flow)
+    assert float(read_flow(tmp_path / "a.flo")[0][1, 2, 3]) == np.float32(value)
+
+
+def test_what_is_no_flow_is_refused(tmp_path):
+    with pytest.raises(DomainError, match="NaN or infinite"):
+        write_flow(tmp_path / "a.png", torch.full((2, 3, 3), torch.nan))
+    with pytest.raises(ShapeError, match=r"\[2, H, W\]"):
+        write_flow(tmp_path / "a.png", torch.zeros(3, 3, 2))
+    with pytest.raises(ShapeError, match="valid mask"):
+        write_flow(tmp_path / "a.png", torch.zeros(2, 3, 3), torch.ones(3, 3))
+    with pytest.raises(FileFormatError, match=r"end in \.flo or \.png"):
+        write_flow(tmp_path / "a.tif", torch.zeros(2, 3, 3))
+    with pytest.raises(DomainError, match="reads as unknown"):
+        write_flow(tmp_path / "a.flo", torch.full((2, 3, 3), 2e9))
+    with pytest.raises(FileFormatError, match="existing, writable folder"):
+        write_flow(tmp_path / "none" / "a.flo", torch.zeros(2, 3, 3))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.flo"])
+def test_files_cut_off_anywhere_are_refused_in_one_sentence(name, field, tmp_path):
+    write_flow(tmp_path / name, *field)
+    content = (tmp_path / name).read_bytes()
+    for length in (0, 3, 8, 11, 20, 40, len(content) // 2, len(content) - 1):
+        (tmp_path / name).write_bytes(content[:length])
+        with pytest.raises(FileFormatError) as caught:
+            read_flow(tmp_path / name)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(FileFormatError, match="cannot read the flow file"):
+        read_flow(tmp_path / f"none-{name}")
+
+
+@pytest.mark.parametrize(("content", "sentence"), [
+    (png(2, 1, b"\0" * 7, depth=8), "bit depth 8"),
+    (png(2, 1, b"\0" * 5, colour=0), "colour type 0"),
+    (png(2, 1, b"\0" * 13, interlace=1), "interlacing 1"),
+    (png(2, 1, b"\0" * 12), "holds 12"),
+    (png(2, 1, b"\0" * 14), "holds more"),
+    (png(2, 1, b"\x05" + b"\0" * 12), "filter 5"),
+    (png(2, 1, b"\0" * 6 + b"\2" + b"\0" * 6), "third channel"),
+    (png(2**31, 2**31 - 1, b""), "up to"),
+    (png(2, 1, b"\0" * 13)[:-20] + b"\0" * 20, "damaged"),
+    (png(4000, 4000, b"\0" * 20_000_000), "holds 20000000"),
+])
+def test_pngs_that_are_no_flow_are_refused(content, sentence, tmp_path):
+    (tmp_path / "a.png").write_bytes(content)
+    with pytest.raises(FileFormatError, match=sentence):
+        read_flow(tmp_path / "a.png")
+
+
+def test_flo_sizes_that_cannot_be_are_refused(tmp_path):
+    for width, height in ((-1, 5), (0, 0), (2**30, 2**30), (5, 6)):
+        (tmp_path / "a.flo").write_bytes(b"PIEH" + struct.pack("<ii", width, height) + b"\0" * 8 * 25)
+        with pytest.raises(FileFormatError, match="do not hold"):
+            read_flow(tmp_path / "a.flo")
