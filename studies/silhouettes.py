@@ -62,7 +62,7 @@ class Task:
         coarse = torch.randn(1, 1, 6, 6, generator=torch.Generator().manual_seed(3))
         self.weight = torch.nn.functional.interpolate(coarse, size=(SIZE_PX, SIZE_PX), mode="bicubic")[0, 0]
 
-    def loss(self, numbers, group, samples, seed, way: Way = "interior", per_px=3.0):
+    def loss(self, numbers, group, samples, seed, way: Way = "interior", per_px=2.5):
         optics, turn = self.lens, torch.zeros(6, dtype=torch.float64)
         if group == "pose":
             turn = numbers
@@ -74,7 +74,7 @@ class Task:
         frames = render.frames(camera, self.scene, self.pose @ pose.se3_exp(turn[None]), gradient=way, per_px=per_px)
         return (self.weight * frames[0]).double().mean()
 
-    def gradient(self, group, samples, seed, way: Way, per_px=3.0):
+    def gradient(self, group, samples, seed, way: Way, per_px=2.5):
         start = torch.zeros(6, dtype=torch.float64, requires_grad=True)
         return torch.autograd.grad(self.loss(start, group, samples, seed, way, per_px), start)[0]
 

@@ -13,13 +13,13 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from codesign.backend import arrays
 from codesign.errors import DomainError
 from codesign.pose import apply, inverse
 from codesign.render.sampling import film_pupil_pattern
-from codesign.render.wavefront import shade
-from codesign.types import Rays
 
 ASIDE_RAD = 1e-5  # where the two radiances are read, either side of a curve; a float32 ray is good to a hundredth of that
+WIDER = 1.15  # a lens with this much distortion still finds the points at the film's edge
 HIDDEN = 5e-3  # a point is hidden when something beside it is nearer by this share; a curved surface falls away by less
 STEP, PUPIL_STEP = 1e-4, 1e-3  # of a piece, for its tangent on the film; of the pupil, for the motion at one point of it
 _AHEAD = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -36,7 +36,7 @@ class CurvePoints:
     frame: Tensor
 
 
-def boundary_term(camera, scene, T_world_cam, per_px=3.0):
+def boundary_term(camera, scene, T_world_cam, per_px=2.5):
     """Zero-valued image [T, *film.shape] whose gradient is that of moving silhouettes and edges.
 
     Args: camera, scene, T_world_cam as for ``frames``; scene with ``outline()``, ``hit`` and ``radiance``. per_px: samples per pixel length of curve.
@@ -94,12 +94,17 @@ def _sample(camera, scene, T_world_cam, per_px):
             ends = [_flat(back, curve.points(index, bounds[:, i], eye), px_per_slope) for i in (0, 1)]
             middle = (ends[0][0] + ends[1][0]) / 2
             half = torch.tensor([film.sensor_width_px, film.sensor_height_px], dtype=torch.float64) / 2
-            reach = 1.15 * half + 8 + (ends[1][0] - ends[0][0]).abs()
+            reach = WIDER * half + 1 + (ends[1][0] - ends[0][0]).abs()
             ahead = ends[0][1] & ends[1][1] & (middle.abs() < reach).all(1)
             index, bounds, length = index[ahead], bounds[ahead], (ends[1][0] - ends[0][0])[ahead].norm(dim=1)
             if not index.numel():
                 continue
             piece, inside, fraction = _places(length, per_px, generator)
+            flat = (ends[0][0][ahead][piece] + inside[:, None] * (ends[1][0] - ends[0][0])[ahead][piece]).abs()
+            near = torch.nonzero((flat < WIDER * half + 1).all(1))[:, 0]
+            piece, inside, fraction = piece[near], inside[near], fraction[near]
+            if not piece.numel():
+                continue
             count, wide = piece.numel(), (bounds[:, 1] - bounds[:, 0])[piece]
             s = bounds[piece, 0] + inside * wide
             pupil = pupils[(torch.arange(count) + torch.randint(4096, (1,), generator=generator)) % 4096] if aperture_m else torch.zeros(count, 2, dtype=torch.float64)
@@ -175,11 +180,9 @@ def _jumps(camera, scene, T_world_cam, points):
     pose = T_world_cam[frame]
     world = [(pose[:, :3, :3] @ part[..., None])[..., 0] for part in (origin, direction)]
     start, along = (world[0] + pose[:, :3, 3]).reshape(-1, 3), world[1].reshape(-1, 3)
-    hit, _, valid = scene.hit(start, along)
-    distance = torch.where(valid, (hit - start).norm(dim=1), torch.inf).reshape(2, -1)
+    light, distance = (v.reshape(2, -1) for v in _look(scene, start, along))
     reach = (y - origin[0]).norm(dim=1)
-    light = shade(Rays(start, along, weight.reshape(-1)), scene, torch.eye(4, dtype=torch.float64)[None], 1)[0].double().reshape(2, -1)
-    jump = (light[0] - light[1]) * length * share * (distance.amin(0) > reach * (1 - HIDDEN))
+    jump = (weight[0] * light[0] - weight[1] * light[1]) * length * share * (distance.amin(0) > reach * (1 - HIDDEN))
     # where the ray meets the depth of the point, per film position across the curve and along it
     here = origin + direction * ((y[:, 2:] - origin[..., 2:]) / direction[..., 2:])
     middle = (direction[0] + direction[1]) / 2
@@ -190,6 +193,17 @@ def _jumps(camera, scene, T_world_cam, points):
     per_miss = torch.linalg.inv(torch.where(fine[:, None, None], jacobian, torch.eye(2, dtype=y.dtype)))[:, 0]
     pixel = pixel[rows] + frame * math.prod(film.shape)
     return Jumps(points.world_m[rows], frame, x, q, pixel, jump, per_miss)[torch.nonzero(fine)[:, 0]]
+
+
+def _look(scene, origin, direction):
+    """Radiance [n] and distance [n] along world rays [n, 3], float64 without gradient."""
+    import drjit as dr
+
+    arr = arrays(origin.device.type, scene.dtype)
+    o, d = (arr.Array3(*[arr.Float(c.to(scene.dtype).contiguous()) for c in part.unbind(1)]) for part in (origin, direction))
+    light, distance = scene.radiance_and_distance(arr, o, d)
+    dr.eval(light, distance)
+    return [torch.as_tensor(v.numpy()).double() for v in (arr.Float(light), arr.Float(distance))]
 
 
 def _on_film(camera, y, on, pupil):

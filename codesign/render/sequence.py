@@ -37,7 +37,7 @@ class Choice:
         return f"{self.way}: relative error against differences: {measured}; the differences themselves {self.noise:.1%}"
 
 
-def frames(camera, scene, T_world_cam, gradient: Way = "interior", per_px=3.0):
+def frames(camera, scene, T_world_cam, gradient: Way = "interior", per_px=2.5):
     """Frames of a scene along a trajectory.
 
     Args: camera: Camera. scene: anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane). T_world_cam: [T, 4, 4].
