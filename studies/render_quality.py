@@ -48,7 +48,8 @@ def study(run: Run[Config]) -> None:
     met = {"lens_over_pinhole": found["lens_over_pinhole"] <= ASKED["lens_over_pinhole"], "mitsuba_over_wavefront": found["mitsuba_over_wavefront"] >= ASKED["mitsuba_over_wavefront"],
            "static_camera_events": found["static_camera_events"] == 0, "false_events": found["false_events"] < ASKED["false_events"],
            "chain_relative_error": found["chain_relative_error"] <= ASKED["chain_relative_error"]}
-    words = {"lens_over_pinhole": "CPU time of frames through the traced triplet over those through a pinhole", "mitsuba_over_wavefront": "CPU time of one Mitsuba render with pose gradient per frame over ours, emission only on both sides",
+    words = {"lens_over_pinhole": "CPU time of frames through the traced triplet over those through a pinhole",
+             "mitsuba_over_wavefront": "CPU time of one Mitsuba render with pose gradient per frame over ours, emission only on both sides",
              "static_camera_events": "events of a static camera, threshold 0.1", "false_events": "events that differ from those of a reference of many samples, share",
              "chain_relative_error": "whole chain in float64 against differences, relative error"}
     run.table("Figures", ("what", "found", "asked", "met"), [(words[k], found[k], ASKED.get(k, 0), "yes" if met[k] else "NO") for k in words])
