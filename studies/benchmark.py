@@ -13,6 +13,7 @@ import torch
 from codesign import lens, pose, render
 from codesign.errors import DomainError
 from scenes import trajectories, worlds
+from studies.lens_bench_tracers import tracing_work
 from studies.run import Run, StudyConfig, main
 from studies.timing import measure, resident_mb
 
@@ -74,17 +75,7 @@ def tracing(kind, dtype, count, seed):
     across = 20 * torch.rand(count, 2, generator=torch.Generator().manual_seed(seed), dtype=dtype) - 10
     origin = torch.cat([across, torch.full_like(across[:, :1], -5.0)], 1)
     direction = torch.tensor([0.0, 0.1, 0.99**0.5], dtype=dtype).expand(count, 3).contiguous()
-    seeds = torch.ones_like(origin)
-
-    def forward():
-        with torch.no_grad():
-            geo.trace(origin, direction)
-
-    def forward_backward():
-        geo.zero_grad()
-        geo.trace(origin, direction).position_mm.backward(seeds)
-
-    return forward if kind == "forward" else forward_backward, lambda: (origin.clone(), direction.clone()), len(geo.surfaces)
+    return tracing_work(geo, kind, origin, direction), lambda: (origin.clone(), direction.clone()), len(geo.surfaces)
 
 
 def render_step(seed, frames=20, size_px=96, samples=8):

@@ -20,7 +20,7 @@ import torch
 
 from codesign import lens
 from codesign.errors import DomainError
-from studies.lens_bench_tracers import SURFACES, make_rays
+from studies.lens_bench_tracers import SURFACES, make_rays, tracing_work
 from studies.run import Run, StudyConfig, main
 from studies.timing import Timing, measure
 
@@ -167,7 +167,7 @@ KINDS, ROUNDS = ("forward", "forward_backward"), 8
 def growth_in_rays(counts, seed, progress):
     """Least seconds of a call per kind and number of rays."""
     geo = lens.load("double-gauss", torch.float32).freeze("conic", "asphere", "index_offset")
-    return {kind: least([timed_work(geo, kind, n, seed) for n in counts], [max(2, min(20, 1_000_000 // n)) for n in counts], progress) for kind in KINDS}
+    return {kind: least([tracing_work(geo, kind, *rays_for(n, seed)) for n in counts], [max(2, min(20, 1_000_000 // n)) for n in counts], progress) for kind in KINDS}
 
 
 def growth_in_surfaces(seed, progress):
@@ -176,7 +176,11 @@ def growth_in_surfaces(seed, progress):
     numbers = [2 * ((SURFACES * times + 1) // 2) for times in LONGER]
     stack = lambda n: [lens.Surface(900.0 if i % 2 else -900.0, 1.0, None if i % 2 else glass, 80.0) for i in range(n)]  # noqa: E731
     lenses = [lens.GeoLens(stack(n), 10.0, torch.float32).freeze("conic", "asphere", "index_offset") for n in numbers]
-    return numbers, {kind: least([timed_work(geo, kind, 300_000, seed) for geo in lenses], [4] * len(lenses), progress) for kind in KINDS}
+    return numbers, {kind: least([tracing_work(geo, kind, *rays_for(300_000, seed)) for geo in lenses], [4] * len(lenses), progress) for kind in KINDS}
+
+
+def rays_for(count, seed):
+    return map(torch.as_tensor, make_rays(count, "float32", seed))
 
 
 def least(works, repeats, progress):
@@ -188,21 +192,6 @@ def least(works, repeats, progress):
     for _ in works:
         progress.advance()
     return found
-
-
-def timed_work(geo, kind, count, seed):
-    origin, direction = map(torch.as_tensor, make_rays(count, "float32", seed))
-    seeds = torch.ones_like(origin)
-
-    def work():
-        if kind == "forward":
-            with torch.no_grad():
-                geo.trace(origin, direction)
-        else:
-            geo.zero_grad()
-            geo.trace(origin, direction).position_mm.backward(seeds)
-
-    return work
 
 
 def show_growth(run, counts, growth, longer):

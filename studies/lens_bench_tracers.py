@@ -18,13 +18,10 @@ from pathlib import Path
 SURFACES = 11
 
 
-def codesign(precision, kind, rays):
+def tracing_work(geo, kind, origin, direction):
+    """A function that traces rays once ("forward"), or traces them and goes back to all that the lens learns ("forward_backward"); returns positions."""
     import torch
 
-    from codesign import lens
-
-    geo = lens.load("double-gauss", getattr(torch, precision)).freeze("conic", "asphere", "index_offset")
-    origin, direction = torch.as_tensor(rays[0]), torch.as_tensor(rays[1])
     seeds = torch.ones_like(origin)
 
     def work():
@@ -36,7 +33,16 @@ def codesign(precision, kind, rays):
         position.backward(seeds)
         return position
 
-    return work, lambda position: position.detach().numpy()[:, :2]
+    return work
+
+
+def codesign(precision, kind, rays):
+    import torch
+
+    from codesign import lens
+
+    geo = lens.load("double-gauss", getattr(torch, precision)).freeze("conic", "asphere", "index_offset")
+    return tracing_work(geo, kind, *map(torch.as_tensor, rays)), lambda position: position.detach().numpy()[:, :2]
 
 
 def codesign_chunks(precision, kind, rays):

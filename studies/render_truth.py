@@ -33,7 +33,7 @@ def study(run: Run[Config]) -> None:
         moving = max(flow_error(card, moving=True) for card in (plane, rectangle))
         run.record(flow_still_px=still, flow_moving_px=moving, flow_analytic_px=flow_error(plane, moving=True))
         progress.advance()
-        rows = {name: unproject_error(optics, 4 if run.config.quick else 1) for name, optics in lenses().items()}
+        rows = {name: unproject_error(optics(), 4 if run.config.quick else 1) for name, optics in OPTICS.items()}
         run.record(unproject_px=max(rows.values()), **{f"unproject_{name.replace('-', '_').replace(' ', '_')}_px": error for name, error in rows.items()})
         progress.advance()
         pictures = {"perspective": against("perspective", lens.Pinhole(5.0)), "thinlens": against("thinlens", lens.ThinLens(1 / (1 / 5.0 + 1 / 2000.0), 20.0, 5.0))}
@@ -79,15 +79,20 @@ def flow_error(card, moving):
     return worst
 
 
-def lenses():
-    """Five lenses whose field fills the sensor's half diagonal, or nearly."""
+def fitted(name):
+    """The lens scaled until its published field fills the sensor's half diagonal."""
+    geo = lens.load(name)
+    image_mm = float(geo.first_order().efl_mm.detach()) * math.tan(math.radians(lens.half_field_deg(name)))
+    return geo.scaled(math.hypot(*SENSOR_PX) / 2 * PITCH_MM / image_mm)
 
-    def fitted(name):
-        geo = lens.load(name)
-        image_mm = float(geo.first_order().efl_mm.detach()) * math.tan(math.radians(lens.half_field_deg(name)))
-        return geo.scaled(math.hypot(*SENSOR_PX) / 2 * PITCH_MM / image_mm).freeze()
 
-    return {"pinhole": lens.Pinhole(8.0), "thin lens": lens.ThinLens(8.0, 2.0, 8.05), **{name: fitted(name) for name in ("cooke-triplet", "double-gauss", "la1509")}}
+OPTICS = {
+    "pinhole": lambda: lens.Pinhole(8.0),
+    "thin lens": lambda: lens.ThinLens(8.0, 2.0, 8.05),
+    "cooke-triplet": lambda: fitted("cooke-triplet"),
+    "double-gauss": lambda: fitted("double-gauss"),
+    "la1509": lambda: fitted("la1509"),
+}
 
 
 def unproject_error(optics, every):

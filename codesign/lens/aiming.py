@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.trace import Status, trace
 
 NEWTON_STEPS, HALVINGS, FIELD_STEPS = 12, 6, 16
@@ -60,14 +61,13 @@ def aim_at_stop(rays, until_stop, pupil, stop_radius_mm, pupil_radius_mm):
     return Aim(at - change, torch.linalg.det(jacobian), found)
 
 
-def aimed_rays(lens, field_rad, pupil, wavelength_um=None, start_z_mm=-5.0):
+def aimed_rays(lens, field_rad, pupil, wavelength_um=WAVELENGTH_UM["d"], start_z_mm=-5.0):
     """Parallel rays of one field angle (in +y) that meet the real stop at points of its disc.
 
     Args: field_rad scalar; pupil [M, 2] on the unit disc, in units of the stop's paraxial radius. Returns: origins and directions [M, 3], lens axes.
     Gradient: origins to the lens. Warns: when some rays cannot be aimed.
     """
-    w = {} if wavelength_um is None else {"wavelength_um": wavelength_um}
-    f, pupil = lens.first_order(**w), pupil.to(lens.dtype)
+    f, pupil = lens.first_order(wavelength_um), pupil.to(lens.dtype)
     tangent = torch.tan(torch.as_tensor(field_rad, dtype=lens.dtype))
 
     def rays(points, share):
@@ -76,7 +76,7 @@ def aimed_rays(lens, field_rad, pupil, wavelength_um=None, start_z_mm=-5.0):
         at = torch.cat([points, f.entrance_pupil_z_mm.expand(points.shape[0], 1)], 1)
         return at + slope * (start_z_mm - at[:, 2:]), direction
 
-    aim = aim_at_stop(rays, lens.prescription(**w).until(lens.stop_index), pupil, f.stop_semi_aperture_mm, f.entrance_pupil_diameter_mm / 2)
+    aim = aim_at_stop(rays, lens.prescription(wavelength_um).until(lens.stop_index), pupil, f.stop_semi_aperture_mm, f.entrance_pupil_diameter_mm / 2)
     return rays(aim.point_mm, torch.ones_like(pupil[:, :1]))
 
 

@@ -152,9 +152,10 @@ class GeoLens(nn.Module):
                 raise ShapeError(f"{label} must be [N >= 1, 3], got {tuple(value.shape)}.")
         if origin_mm.shape != direction.shape:
             raise ShapeError(f"{origin_mm.shape[0]} origins but {direction.shape[0]} directions were given; give one of each per ray.")
-        if not all(map(math.isfinite, _range(origin_mm, torch.Tensor.reshape, (-1,)))):
+        if not all(map(math.isfinite, _range(origin_mm, lambda rows: rows))):
             check_finite(origin_mm, "origin_mm")
-        shortest, longest = _range(direction, lambda rows, ones: torch.mv(rows.square(), ones), direction.new_ones(3))
+        ones = direction.new_ones(3)
+        shortest, longest = _range(direction, lambda rows: torch.mv(rows.square(), ones))
         if not (shortest > 0.9998 and longest < 1.0002):
             raise DomainError(f"direction: squared lengths lie between {shortest:.6g} and {longest:.6g}; give finite unit vectors (torch.nn.functional.normalize).")
         return trace(self.prescription(wavelength_um), origin_mm, direction)
@@ -177,8 +178,7 @@ class GeoLens(nn.Module):
         f = self.first_order(wavelength_um)
         if not (math.isfinite(f.exit_pupil_z_mm.item()) and math.isfinite(f.entrance_pupil_z_mm.item())):
             raise DomainError(f"{self.name}: a pupil lies at infinity (the lens is telecentric), so pupil points have no place; move the stop off the focal plane.")
-        origin_z = self.first_order().entrance_pupil_z_mm  # one origin for all colours
-        back, at_stop = self.prescription(wavelength_um).reversed(-origin_z), len(self.surfaces) - 1 - self.stop_index
+        back, at_stop = self.prescription(wavelength_um).reversed(-self._origin_z_mm(f, wavelength_um)), len(self.surfaces) - 1 - self.stop_index
         radius = f.exit_pupil_diameter_mm / 2
         towards = lambda film, q: _towards(film, q, self.thickness_mm[-1], f.exit_pupil_z_mm)  # noqa: E731
         if aim:
@@ -190,10 +190,7 @@ class GeoLens(nn.Module):
         else:
             start, direction = (v.to(film_mm.dtype) for v in towards(film_mm, pupil * radius.to(film_mm.dtype)))
             spread = torch.ones_like(film_mm[:, 0])
-        back = back.to(film_mm.dtype)
-        apertures = back.semi_aperture_mm.clone()
-        apertures[at_stop] = 1e6
-        out = trace(dataclasses.replace(back, semi_aperture_mm=apertures), start, direction)
+        out = trace(back.to(film_mm.dtype).opened(at_stop), start, direction)
         if bool((out.weight.detach() <= 0).all()):
             raise DomainError(f"{self.name}: every ray fails{self._where(out)}; weaken the curvatures or open the apertures.")
         return Rays(out.position_mm * 1e-3, out.direction, out.weight, spread * direction[:, 2] ** 4)
@@ -209,13 +206,15 @@ class GeoLens(nn.Module):
         at = torch.cat([pupil * (f.entrance_pupil_diameter_mm.to(dtype) / 2), torch.zeros_like(pupil[:, :1])], 1)
         flip = points_mm.new_tensor([1.0, 1.0, -1.0])
         start, direction = points_mm * flip, torch.nn.functional.normalize((at - points_mm) * flip, dim=1)
-        start = torch.cat([start[:, :2], start[:, 2:] + self.first_order().entrance_pupil_z_mm.to(dtype)], 1)
-        lens = self.prescription(wavelength_um).to(dtype)
-        apertures = lens.semi_aperture_mm.clone()
-        apertures[self.stop_index] = 1e6
-        out = trace(dataclasses.replace(lens, semi_aperture_mm=apertures), start, direction)
+        start = torch.cat([start[:, :2], start[:, 2:] + self._origin_z_mm(f, wavelength_um).to(dtype)], 1)
+        out = trace(self.prescription(wavelength_um).to(dtype).opened(self.stop_index), start, direction)
         back = (f.exit_pupil_z_mm - self.thickness_mm[-1]).to(dtype) * out.direction[:, :2] / out.direction[:, 2:]
         return -out.position_mm[:, :2], (out.position_mm[:, :2] + back) / (f.exit_pupil_diameter_mm.to(dtype) / 2), out.weight.detach() > 0
+
+    def _origin_z_mm(self, f, wavelength_um):
+        """Where the camera's origin lies: at the entrance pupil of the d line, one for all colours. f: first-order figures at the wavelength."""
+        d = WAVELENGTH_UM["d"]
+        return (f if wavelength_um == d else self.first_order(d)).entrance_pupil_z_mm
 
     def _where(self, out):
         """What became of most rays of a backward trace, in words; surfaces are counted from the object."""
@@ -229,9 +228,9 @@ class GeoLens(nn.Module):
         return f"{self.name}, {len(self.surfaces)} surfaces, entrance pupil {self.entrance_pupil_diameter_mm:g} mm"
 
 
-def _range(rows, function, argument):
+def _range(rows, function):
     """Least and largest value of a function of rows [N, 3], in blocks that stay in the cache; NaN where there is one."""
-    found = torch.stack([torch.stack(torch.aminmax(function(part, argument))) for part in rows.detach().split(65_536)])
+    found = torch.stack([torch.stack(torch.aminmax(function(part))) for part in rows.detach().split(65_536)])
     return found[:, 0].min().item(), found[:, 1].max().item()
 
 

@@ -52,6 +52,12 @@ class Prescription:
         rows["path_mm"], rows["mirrors"] = rows["path_mm"] * keep[:, None], (*self.mirrors[:surface], False)
         return replace(self, **rows, index=self.index[[*range(surface + 1), surface]], to_plane=False)
 
+    def opened(self, surface):
+        """The same lens with one aperture that clips nothing: rays that are placed on the stop are not to be weighed by its edge."""
+        apertures = self.semi_aperture_mm.clone()
+        apertures[surface] = 1e6
+        return replace(self, semi_aperture_mm=apertures)
+
     def to(self, dtype):
         """The same numbers in another precision; gradients flow through."""
         return self._each(lambda tensor: tensor.to(dtype))

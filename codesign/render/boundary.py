@@ -39,7 +39,7 @@ class CurvePoints:
 def boundary_term(camera, scene, T_world_cam, per_px=2.5):
     """Zero-valued image [T, *film.shape] whose gradient is that of moving silhouettes and edges.
 
-    Args: camera, scene, T_world_cam as for ``frames``; scene with ``outline()``, ``hit`` and ``radiance``. per_px: samples per pixel length of curve.
+    Args: camera, scene, T_world_cam as for ``frames``; scene with ``outline()`` and ``radiance_and_distance``. per_px: samples per pixel length of curve.
     Gradient: lens and poses. The curves' own world points do not move (rigid scenes).
     Raises: DomainError for cameras with a spectrum or aimed pupils, whose boundary is not implemented.
     """
@@ -47,11 +47,12 @@ def boundary_term(camera, scene, T_world_cam, per_px=2.5):
         raise DomainError("gradient 'boundary' is there for cameras without aim, spectrum and falloff; drop these, or use 'difference'.")
     shape = (T_world_cam.shape[0], *camera.film.shape)
     with torch.no_grad():
-        found = _jumps(camera, scene, T_world_cam.double(), _sample(camera, scene, T_world_cam, per_px))
+        px_per_slope = 1 / camera.slope_per_px()
+        found = _jumps(camera, scene, T_world_cam.double(), _sample(camera, scene, T_world_cam, per_px, px_per_slope), ASIDE_RAD * px_per_slope)
     if found is None or found.frame.numel() == 0:
         return torch.zeros(shape, dtype=scene.dtype)
     back = inverse(T_world_cam.double())[found.frame]
-    y = (back[:, :3, :3] @ found.world_m[:, :, None])[..., 0] + back[:, :3, 3]
+    y = apply(back, found.world_m[:, None])[:, 0]
     rays = camera.rays_through(found.film_px, found.pupil)
     ahead = (y[:, 2:] - rays.origin_m[:, 2:]) / rays.direction[:, 2:]
     miss = rays.origin_m[:, :2] + rays.direction[:, :2] * ahead - y[:, :2]  # zero; how it changes tells how the film position must
@@ -77,11 +78,10 @@ class Jumps:
         return Jumps(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
-def _sample(camera, scene, T_world_cam, per_px):
+def _sample(camera, scene, T_world_cam, per_px, px_per_slope):
     """Points on all curves that may fall on the film, about ``per_px`` per pixel length, stratified along each frame's curves."""
     film, parts = camera.film, []
     centre = T_world_cam[:, :3, 3].double()
-    px_per_slope = _px_per_slope(camera)
     aperture_m = getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2
     _, pupils = film_pupil_pattern(4096, camera.seed)
     generator = torch.Generator().manual_seed(camera.seed)
@@ -141,12 +141,6 @@ def _places(length, per_px, generator):
     return torch.cat([long[which], short[piece]]), torch.cat([inside, within]), torch.cat([1 / count[which].double(), total[-1] / few / size])
 
 
-def _px_per_slope(camera):
-    """Pixels per unit slope of a ray, near the axis."""
-    rays = camera.chief_rays(camera.film.middle_px + torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64))
-    return 1 / float(rays.direction[1, 0] / rays.direction[1, 2] - rays.direction[0, 0] / rays.direction[0, 2])
-
-
 def _flat(back, world_m, px_per_slope):
     """Rough film position [n, 2] px from the axis, and whether the point lies in front of the camera."""
     y = apply(back, world_m)
@@ -154,12 +148,11 @@ def _flat(back, world_m, px_per_slope):
     return y[:, :2] / torch.where(front, y[:, 2], 1.0)[:, None] * px_per_slope, front
 
 
-def _jumps(camera, scene, T_world_cam, points):
-    """Jumps at the points that are seen, or None."""
+def _jumps(camera, scene, T_world_cam, points, aside):
+    """Jumps at the points that are seen, or None; radiances are read ``aside`` px from the curves."""
     film = camera.film
     back = inverse(T_world_cam)[points.frame]
-    into = lambda w: (back[:, :3, :3] @ w[:, :, None])[..., 0] + back[:, :3, 3]  # noqa: E731
-    y, on = into(points.world_m), into(points.ahead_m)
+    y, on = apply(back, torch.stack([points.world_m, points.ahead_m], 1)).unbind(1)
     front = (y[:, 2] > 1e-3) & (on[:, 2] > 1e-3)
     if not bool(front.any()):
         return None
@@ -174,7 +167,6 @@ def _jumps(camera, scene, T_world_cam, points):
     x, q, y, on, tangent, length, frame = x[rows], q[rows], y[rows], on[rows], tangent[rows], length[rows], points.frame[rows]
     share = points.share[rows]
     normal = torch.stack([-tangent[:, 1], tangent[:, 0]], 1) / length[:, None]
-    aside = ASIDE_RAD * _px_per_slope(camera)
     rays = camera.rays_through(torch.cat([x - aside * normal, x + aside * normal]), q.repeat(2, 1))
     origin, direction, weight = rays.origin_m.reshape(2, -1, 3), rays.direction.reshape(2, -1, 3), rays.weight.reshape(2, -1)
     pose = T_world_cam[frame]
@@ -229,7 +221,7 @@ def _pixels(film, x):
     found = torch.full(x.shape[:1], -1)
     size = film.width_px * film.height_px
     for number, (left, top) in reversed(list(enumerate(film.windows_px or ((0, 0),)))):
-        column, row = (x[:, 0].nan_to_num(-1e9) - left + 0.5).floor(), (x[:, 1].nan_to_num(-1e9) - top + 0.5).floor()
+        column, row = (x[:, 0] - left + 0.5).floor(), (x[:, 1] - top + 0.5).floor()
         inside = (column >= 0) & (column < film.width_px) & (row >= 0) & (row < film.height_px)
         found = torch.where(inside, (number * size + row * film.width_px + column).long(), found)
     return found

@@ -127,6 +127,12 @@ class Camera:
         """Rays through the pupil's centre for pixel coordinates [N, 2]: Rays, float64."""
         return self.lens.camera_rays(self.film_mm(pixels), torch.zeros_like(pixels))
 
+    def slope_per_px(self):
+        """Slope of a chief ray per pixel, near the axis; no gradient."""
+        with torch.no_grad():
+            rays = self.chief_rays(self.film.middle_px + torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64))
+        return float(rays.direction[1, 0] / rays.direction[1, 2] - rays.direction[0, 0] / rays.direction[0, 2])
+
     def rays_through(self, pixels, pupil):
         """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil: Rays, float64."""
         return self.lens.camera_rays(self.film_mm(pixels), pupil, aim=self.aim)
@@ -146,9 +152,7 @@ def project(camera, points_cam_m, pupil=None):
     points_cam_m = points_cam_m.double()
     pupil = torch.zeros_like(points_cam_m[:, :2]).detach() if pupil is None else pupil.to(points_cam_m)
     with torch.no_grad():
-        rays = camera.chief_rays(camera.film.middle_px.reshape(1, 2) + torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64))
-        slope = rays.direction[1, 0] / rays.direction[1, 2] - rays.direction[0, 0] / rays.direction[0, 2]
-        at = camera.film.middle_px + points_cam_m[:, :2] / points_cam_m[:, 2:] / slope
+        at = camera.film.middle_px + points_cam_m[:, :2] / points_cam_m[:, 2:] / camera.slope_per_px()
         step = _STEP_MM / camera.film.pixel_pitch_mm
         shifts = torch.tensor([[0.0, 0.0], [step, 0.0], [0.0, step]], dtype=at.dtype)
         for turn in range(_NEWTON_STEPS):

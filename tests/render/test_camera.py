@@ -11,27 +11,14 @@ from codesign.errors import DomainError
 from codesign.pose import look_at
 from codesign.render import Camera, Film, TexturedPlane, angular_miss_rad, project
 from scenes import worlds
+from studies.render_truth import OPTICS as FITTED
+from studies.render_truth import PITCH_MM, SENSOR_PX, fitted
 
 D = torch.float64
-SENSOR_PX, PITCH_MM = (346, 260), 18.5e-3
 NAMES = ["cooke-triplet", "double-gauss", "la1509"]
 
 
-def fitted(name):
-    """The lens scaled until its published field fills the sensor's half diagonal."""
-    geo = lens.load(name)
-    image_mm = float(geo.first_order().efl_mm.detach()) * math.tan(math.radians(lens.half_field_deg(name)))
-    return geo.scaled(math.hypot(*SENSOR_PX) / 2 * PITCH_MM / image_mm)
-
-
-OPTICS = {
-    "pinhole": lambda: lens.Pinhole(8.0),
-    "thin lens": lambda: lens.ThinLens(8.0, 2.0, 8.05),
-    "cooke-triplet": lambda: fitted("cooke-triplet"),
-    "double-gauss": lambda: fitted("double-gauss"),
-    "la1509": lambda: fitted("la1509"),
-    "cooke-triplet, full size": lambda: lens.load("cooke-triplet"),
-}
+OPTICS = {**FITTED, "cooke-triplet, full size": lambda: lens.load("cooke-triplet")}
 
 
 def random_pixels(count, generator):

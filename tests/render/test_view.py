@@ -11,25 +11,9 @@ from codesign.errors import DomainError, ShapeError
 from codesign.pose import apply, inverse, look_at, se3_exp
 from codesign.render import Camera, MitsubaScene, MovingScene, TexturedPlane, check_view, flow_and_occlusion, project, true_flow, view
 from scenes import textures, worlds
+from studies.render_truth import OPTICS, PITCH_MM, SENSOR_PX
 
 D = torch.float64
-SENSOR_PX, PITCH_MM = (346, 260), 18.5e-3
-
-
-def fitted(name):
-    """The lens scaled until its published field fills the sensor's half diagonal."""
-    geo = lens.load(name)
-    image_mm = float(geo.first_order().efl_mm.detach()) * math.tan(math.radians(lens.half_field_deg(name)))
-    return geo.scaled(math.hypot(*SENSOR_PX) / 2 * PITCH_MM / image_mm)
-
-
-OPTICS = {
-    "pinhole": lambda: lens.Pinhole(8.0),
-    "thin lens": lambda: lens.ThinLens(8.0, 2.0, 8.05),
-    "cooke-triplet": lambda: fitted("cooke-triplet"),
-    "double-gauss": lambda: fitted("double-gauss"),
-    "la1509": lambda: fitted("la1509"),
-}
 
 
 def plane(seed=1, height_m=0.0):
