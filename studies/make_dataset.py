@@ -195,7 +195,7 @@ class Sequence:
         first, last = chunk * size, min((chunk + 1) * size, self.config.frames)
         if self.state is None:  # at the start of a session
             self.state = store.read_state(store.part_path(self.folder, chunk - 1)) if chunk else SensorState(generator=self.noise)
-        clock, sensor = self.clock, SensorModel(self.config.theta, self.config.theta, self.config.theta_sigma, self.config.shot_rate_hz)
+        clock, sensor = self.clock, SensorModel(self.config.theta, self.config.theta, self.config.theta_sigma, shot_rate_hz=self.config.shot_rate_hz)
         with clock.on("frames"):
             frames = shade(self.rays, at_frames(self.scene, slice(first, last)), self.poses[first:last], self.camera.samples_per_pixel).reshape(-1, *self.camera.film.shape)
         with clock.on("truth"):

@@ -46,10 +46,10 @@ def write_part(path: Path, arrays: dict[str, torch.Tensor], events: EventStream,
             file[name] = arrays[name].cpu().numpy().astype(kind)
         for name, values in (("x", events.x), ("y", events.y), ("p", events.p > 0), ("t", events.t_us)):
             file[name] = values.cpu().numpy().astype(EVENT_TYPES[name])
-        for name in ("reference", "level", "theta_on", "theta_off"):
-            file[f"state/{name}"] = getattr(state, name).contiguous().numpy()
+        for name, tensor in state.tensors().items():
+            file[f"state/{name}"] = tensor.contiguous().numpy()
         file["state/generator"] = generator.get_state().numpy()
-        file["state/time_s"] = state.time_s
+        file["state/start_s"], file["state/time_s"] = state.start_s, state.time_s
     write_atomic(path, content.getvalue())
 
 
@@ -57,10 +57,11 @@ def read_state(path: Path):
     """The sensor's state that a part ends with. Raises: FileFormatError when the part is damaged."""
     try:
         with h5(path) as file:
-            tensors = {name: torch.from_numpy(file[f"state/{name}"][()]) for name in ("reference", "level", "theta_on", "theta_off", "generator")}
+            stored = {name: values[()] for name, values in file["state"].items()}
+            times = {name: float(stored.pop(name)) for name in ("start_s", "time_s")}
             generator = torch.Generator()
-            generator.set_state(tensors.pop("generator"))
-            return SensorState(**tensors, time_s=float(file["state/time_s"][()]), generator=generator)
+            generator.set_state(torch.from_numpy(stored.pop("generator")))
+            return SensorState(**{name: torch.from_numpy(values) for name, values in stored.items()}, **times, generator=generator)
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise FileFormatError(f"'{path}' is damaged ({error}); remove it and go on again with --resume.") from error
 

@@ -168,7 +168,7 @@ def test_events_are_those_of_the_stored_frames_whatever_the_chunks(dataset):
             t_s = torch.from_numpy(frames["t_s"][()])
             torch.testing.assert_close(t_s, torch.arange(14, dtype=D) / 90, rtol=0, atol=1e-15)
             np.testing.assert_array_equal(frames["timestamps"][()], np.rint(np.arange(14) / 90 * 1e6))
-            whole = simulate(torch.from_numpy(frames["frames"][()]), t_s, SensorModel(0.2, 0.2, 0.02, 0.1), state=SensorState(generator=torch.Generator().manual_seed(2 * index + 1)))
+            whole = simulate(torch.from_numpy(frames["frames"][()]), t_s, SensorModel(0.2, 0.2, 0.02, shot_rate_hz=0.1), state=SensorState(generator=torch.Generator().manual_seed(2 * index + 1)))
             assert len(whole) > 200
             for key, values in (("t", whole.t_us), ("x", whole.x), ("y", whole.y), ("p", (whole.p > 0).long())):
                 np.testing.assert_array_equal(events[f"events/{key}"][()], values.numpy())

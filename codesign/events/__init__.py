@@ -1,40 +1,71 @@
 """Events: from frames to counts, streams and volumes, hard and differentiable.
 
-Differentiable: ``memory`` (default), ``soft_counts``, ``soft``. Hard: ``simulate`` (sensor), ``naive`` (frame difference).
+Hard: ``simulate`` (sensor), ``naive`` (frame difference). Differentiable: ``memory`` (default), ``soft_counts``, ``soft``, ``dense``, ``expected``,
+``sensor_counts``; ``EventLayer`` calls any of them alike.
 """
 
 from codesign.events.files import read, write
+from codesign.events.formats.aedat4_frames import RecordedFrames, read_frames
 from codesign.events.intensity import lin_log
-from codesign.events.memory import memory, soft_counts
-from codesign.events.naive import naive
-from codesign.events.sensor import SensorModel, draw_shot_counts, draw_thresholds
-from codesign.events.simulate import SensorState, simulate
-from codesign.events.soft import soft
+from codesign.events.layers.dense import dense
+from codesign.events.layers.expected import annealed, expected
+from codesign.events.layers.layer import EventLayer
+from codesign.events.layers.low_pass import low_pass
+from codesign.events.layers.memory import memory, soft_counts
+from codesign.events.layers.physical import PhysicalState, sensor_counts
+from codesign.events.layers.soft import soft
+from codesign.events.sensor.model import PRESETS, SensorModel, draw_shot_counts, draw_thresholds
+from codesign.events.sensor.naive import naive
+from codesign.events.sensor.simulate import dense_counts, simulate
+from codesign.events.sensor.state import SensorState
+from codesign.events.sources.frames import open_frames
 from codesign.events.stream import concatenate, to_counts
-from codesign.events.video import decay_video, write_video
-from codesign.events.view import decay, gray_picture, picture, rates
-from codesign.events.volume import from_counts, from_stream
+from codesign.events.views.video import decay_video, write_video
+from codesign.events.views.view import gray_picture, picture, rates
+from codesign.events.volumes.spikes import spikes_from_counts, spikes_from_stream, stream_from_spikes
+from codesign.events.volumes.surface import surface_from_counts, surface_from_stream, surface_from_times
+from codesign.events.volumes.traces import decay, decay_from_stream
+from codesign.events.volumes.volume import from_counts, from_stream
 
 __all__ = [
+    "PRESETS",
+    "EventLayer",
+    "PhysicalState",
+    "RecordedFrames",
     "SensorModel",
     "SensorState",
+    "annealed",
     "concatenate",
     "decay",
+    "decay_from_stream",
     "decay_video",
+    "dense",
+    "dense_counts",
     "draw_shot_counts",
     "draw_thresholds",
+    "expected",
     "from_counts",
     "from_stream",
     "gray_picture",
     "lin_log",
+    "low_pass",
     "memory",
     "naive",
+    "open_frames",
     "picture",
     "rates",
     "read",
+    "read_frames",
+    "sensor_counts",
     "simulate",
     "soft",
     "soft_counts",
+    "spikes_from_counts",
+    "spikes_from_stream",
+    "stream_from_spikes",
+    "surface_from_counts",
+    "surface_from_stream",
+    "surface_from_times",
     "to_counts",
     "write",
     "write_video",

@@ -4,21 +4,44 @@ from pathlib import Path
 
 from codesign.atomic import replacing
 from codesign.errors import FileFormatError
-from codesign.events.file_csv import read_csv, write_csv
-from codesign.events.file_npz import read_npz, write_npz
+from codesign.events.formats.aedat2 import read_aedat2, write_aedat2
+from codesign.events.formats.aedat4 import read_aedat4, write_aedat4
+from codesign.events.formats.dat import read_dat, write_dat
+from codesign.events.formats.hdf5 import read_hdf5, write_hdf5
+from codesign.events.formats.npz import read_npz, write_npz
+from codesign.events.formats.raw import read_raw, write_raw
+from codesign.events.formats.text import read_csv, write_csv
 
-READERS = {".csv": read_csv, ".npz": read_npz}
-WRITERS = {".csv": write_csv, ".npz": write_npz}
+READERS = {
+    ".aedat": read_aedat2,
+    ".aedat2": read_aedat2,
+    ".aedat4": read_aedat4,
+    ".csv": read_csv,
+    ".dat": read_dat,
+    ".h5": read_hdf5,
+    ".npz": read_npz,
+    ".raw": read_raw,
+}
+WRITERS = {
+    ".aedat": write_aedat2,
+    ".aedat2": write_aedat2,
+    ".aedat4": write_aedat4,
+    ".csv": write_csv,
+    ".dat": write_dat,
+    ".h5": write_hdf5,
+    ".npz": write_npz,
+    ".raw": write_raw,
+}
 
 
 def read(path, *, height_px=None, width_px=None):
     """Read an event stream.
 
     Args:
-      path: file ending in .csv (header t,x,y,p; microseconds) or .npz.
-      height_px, width_px: sensor size. Needed for formats without one (.csv: else the smallest that holds the events); checked against the others.
-    Returns: EventStream sorted by (t, y, x, p).
-    Raises: FileFormatError when the file is missing, malformed (with the line where there are lines) or of another kind.
+      path: file ending in .h5 (DSEC's or v2e's layout), .aedat4, .raw (EVT 2.0, EVT 3.0), .dat, .csv (header t,x,y,p; microseconds) or .npz.
+      height_px, width_px: sensor size. Taken where the file has none (else the smallest that holds the events); checked against the file otherwise.
+    Returns: EventStream sorted by (t, y, x, p), times as the file gives them.
+    Raises: FileFormatError when the file is missing, malformed (with the line or event where there is one) or of another kind.
     """
     path = Path(path)
     reader = _choose(READERS, path, "read")
@@ -30,15 +53,23 @@ def read(path, *, height_px=None, width_px=None):
         raise FileFormatError(f"cannot read {path}: {error.strerror or error}.") from error
 
 
-def write(path, stream):
+def write(path, stream, *, evt=None):
     """Write an event stream; the file appears whole or not at all, and an earlier one stays when writing fails.
 
-    Args: path: file ending in .csv or .npz, in an existing folder. stream: EventStream.
-    Raises: FileFormatError for an unknown extension or a folder that is missing or not writable.
+    Args:
+      path: file ending in .h5, .aedat4, .raw, .dat, .aedat or .aedat2 (both AEDAT 2.0), .csv or .npz, in an existing folder.
+      stream: EventStream.
+      evt: encoding of .raw files, 2 or 3 (the default); for no other.
+    Raises: FileFormatError for an unknown extension, a stream that the format cannot hold, or a folder that is missing or not writable.
     """
     writer = _choose(WRITERS, Path(path), "written")
+    if evt is not None and writer is not write_raw:
+        raise FileFormatError(f"evt={evt!r} was given for {path}; it chooses the encoding of .raw files alone.")
     with replacing(path) as temporary:
-        writer(temporary, stream)
+        try:
+            writer(temporary, stream, *(() if evt is None else (evt,)))
+        except FileFormatError as error:  # writers know what does not fit, not where the file will lie
+            raise FileFormatError(f"cannot write {path}: {error}") from error
 
 
 def _choose(table, path, verb):

@@ -1,9 +1,11 @@
-"""Front end of the event sensor: linear for dark pixels, logarithmic for the rest."""
+"""Front end of the event sensor: from linear intensity to log level."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 
+from codesign.errors import DomainError
 from codesign.events.entry import check_frames
 
 JOINT = 20.0  # intensity on the 0-255 scale where the linear part meets the logarithm
@@ -29,7 +31,50 @@ def _lin_log(frames):
     return torch.where(frames <= JOINT, frames * DARK_SLOPE, frames.clamp(min=JOINT).log())
 
 
+@dataclass(frozen=True)
+class FrontEnd:
+    """How frames become log levels: lin-log of the 0-255 scale, or ln(I + eps) of linear frames in any unit, or frames that are log levels already.
+
+    log_input: the frames are log levels. log_eps: eps > 0, in the frames' unit; None: lin-log.
+    """
+
+    log_input: bool = False
+    log_eps: float | None = None
+
+    def __post_init__(self):
+        if self.log_eps is not None and (self.log_input or not 0 < self.log_eps < math.inf):
+            given = "log_input is set" if self.log_input else f"log_eps is {self.log_eps!r}"
+            raise DomainError(f"{given}; give frames of log levels, or a finite log_eps > 0 in the unit of linear frames, or neither for lin-log.")
+
+    def level(self, frames):
+        """Log level of a tensor of frames; gradient: frames."""
+        if self.log_input:
+            return frames
+        return _lin_log(frames) if self.log_eps is None else (frames + self.log_eps).log()
+
+    def slope(self, frames):
+        """Derivative of the level to the frame."""
+        if self.log_input:
+            return torch.ones_like(frames)
+        if self.log_eps is not None:
+            return 1 / (frames + self.log_eps)
+        return torch.where(frames <= JOINT, DARK_SLOPE, 1 / frames.clamp(min=JOINT))
+
+    def traced(self, dr, frames):
+        """The same of a drjit array, and its slope as a function (called where a gradient is wanted)."""
+        if self.log_input:
+            return frames, lambda: frames * 0 + 1
+        if self.log_eps is not None:
+            return dr.log(frames + self.log_eps), lambda: dr.rcp(frames + self.log_eps)
+        dark, safe = frames <= JOINT, dr.maximum(frames, JOINT)
+        return dr.select(dark, frames * DARK_SLOPE, dr.log(safe)), lambda: dr.select(dark, DARK_SLOPE, dr.rcp(safe))
+
+    def accepts(self, dr, frames):
+        """Mask of drjit values that may enter: finite, and >= 0 where they are linear."""
+        return dr.isfinite(frames) if self.log_input else (frames >= 0) & (frames < math.inf)
+
+
 def log_levels(frames, log_input, minimum):
     """Check frames and bring them to log intensity; ``log_input`` says that they already are."""
     check_frames(frames, minimum, non_negative=not log_input)
-    return frames if log_input else _lin_log(frames)
+    return FrontEnd(log_input).level(frames)

@@ -3,6 +3,7 @@
 import math
 import re
 import subprocess
+from typing import Any
 
 import imageio.v3 as iio
 import imageio_ffmpeg
@@ -12,6 +13,8 @@ import torch
 
 from codesign.errors import DomainError, FileFormatError, ShapeError
 from codesign.events import decay, decay_video, gray_picture, picture, rates, write_video
+from codesign.events.views.rate_curves import rate_figure
+from codesign.events.views.space_time import sample, space_time_figure
 from codesign.events.stream import ordered
 
 COUNTS = torch.tensor([[[4.0, 0, 2, 0]], [[0, 4, 2, 0]]])  # [2, 1, 4]: four ON, four OFF, two of each, none
@@ -92,3 +95,66 @@ def test_bad_input_is_refused_with_a_reason(tmp_path):
     with pytest.raises(DomainError, match="tau_s"):
         decay(torch.zeros(1, 2, 3, 3), [0, 1], 0)
     assert not list(tmp_path.iterdir())
+
+
+def test_pictures_may_come_one_by_one(tmp_path):
+    pictures = picture(torch.rand(5, 2, 20, 30, generator=torch.Generator().manual_seed(0)))
+    write_video(tmp_path / "whole.mp4", pictures, fps=20)
+    write_video(tmp_path / "single.mp4", (each.numpy() for each in pictures), fps=20)
+    assert (tmp_path / "whole.mp4").read_bytes() == (tmp_path / "single.mp4").read_bytes()
+    for bad, words in ((iter(()), "at least one"), (iter([pictures[0], pictures[0, :10]]), "one size")):
+        with pytest.raises(ShapeError, match=words):
+            write_video(tmp_path / "bad.mp4", bad, fps=20)
+    assert not (tmp_path / "bad.mp4").exists()
+
+
+def test_a_long_strip_is_enlarged_no_further_than_a_screen(tmp_path):
+    write_video(tmp_path / "e.gif", torch.zeros(2, 10, 400, dtype=torch.uint8), fps=10)
+    assert iio.imread(tmp_path / "e.gif").shape[-3:] == (30, 1200, 3)
+
+
+def test_the_figure_of_rates_draws_the_rates_in_its_units():
+    middle_s, rate_hz = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64), torch.tensor([[1000.0, 0], [5000, 2500], [0, 10]], dtype=torch.float64)
+    axis = rate_figure(middle_s, rate_hz).axes[0]
+    on, off = axis.lines
+    assert axis.get_xlabel() == "time (ms)"
+    assert axis.get_ylabel() == "kevents per second"
+    np.testing.assert_allclose(np.asarray(on.get_xdata()), [100, 200, 300])
+    np.testing.assert_allclose(np.asarray(on.get_ydata()), [1, 5, 0])
+    np.testing.assert_allclose(np.asarray(off.get_ydata()), [0, 2.5, 0.01])
+    with pytest.raises(ShapeError, match=r"\[K, 2\]"):
+        rate_figure(middle_s, rate_hz[:2])
+
+
+def test_the_figure_in_space_and_time_shows_as_many_events_as_it_says():
+    count = 5000
+    generator = torch.Generator().manual_seed(0)
+    x, y, p = (torch.randint(0, high, (count,), generator=generator) for high in (40, 30, 2))
+    stream = ordered(torch.arange(count) * 100 + 7, x, y, 2 * p - 1, 30, 40)
+    figure = space_time_figure(stream, points=1000)
+    points: Any = figure.axes[0].collections[0]
+    shown = points._offsets3d
+    assert [len(column) for column in shown] == [1000] * 3
+    assert "1,000 of 5,000 events" in figure.get_suptitle()
+    index = np.rint(np.asarray(shown[0]) * 10).astype(int)  # 0.1 ms apart
+    np.testing.assert_array_equal(np.asarray(shown[1]), stream.x[index])
+    np.testing.assert_array_equal(np.asarray(shown[2]), stream.y[index])
+    assert "all 5,000 events" in space_time_figure(stream).get_suptitle()
+    with pytest.raises(DomainError, match="points"):
+        space_time_figure(stream, points=0)
+    none = torch.zeros(0, dtype=torch.int64)
+    with pytest.raises(ShapeError, match="no event"):
+        space_time_figure(ordered(none, none, none, none, 3, 3))
+
+
+@pytest.mark.parametrize("count", [30, 130])  # by permutation, and by drawing again
+def test_a_sample_holds_every_event_equally_often(count):
+    generator, hits = torch.Generator().manual_seed(0), torch.zeros(count)
+    for _ in range(2000):
+        chosen = sample(count, 20, generator)
+        assert len(set(chosen.tolist())) == 20
+        hits[chosen] += 1
+    expected = 2000 * 20 / count
+    # binomial: five standard deviations
+    assert float((hits - expected).abs().max()) < 5 * math.sqrt(expected * (1 - 20 / count))
+    assert sample(7, 20, generator).tolist() == list(range(7))

@@ -5,6 +5,7 @@ import torch
 
 from codesign.errors import DomainError, ShapeError
 from codesign.events import from_counts, from_stream
+from codesign.events.volumes.spikes import spikes_from_counts, spikes_from_stream, stream_from_spikes
 from codesign.types import EventStream
 
 
@@ -126,3 +127,54 @@ def test_bad_input_is_refused_with_a_reason():
             from_stream(stream, *window, 2)
     with pytest.raises(DomainError, match="bins"):
         from_stream(stream, 0, 10, -1)
+
+
+def test_spikes_are_events_per_step_and_go_back_exactly():
+    offset_us = 1_700_000_000_000_000
+    stream = random_stream(3000, 3, 4, 99_999, offset_us=offset_us)
+    spikes = spikes_from_stream(stream, offset_us, 1000, 100)
+    truth = torch.zeros(2, 4, 3, 100)
+    for t, x, y, p in zip((stream.t_us - offset_us).tolist(), stream.x.tolist(), stream.y.tolist(), stream.p.tolist(), strict=True):
+        truth[int(p < 0), x, y, t // 1000] = 1
+    assert torch.equal(spikes, truth)
+    back = stream_from_spikes(spikes, offset_us, 1000)
+    assert len(back) == int(spikes.sum())
+    assert set(((back.t_us - offset_us) % 1000).tolist()) == {0}
+    assert torch.equal(spikes_from_stream(back, offset_us, 1000, 100), spikes)
+    # at a microsecond per step nothing merges but events that are the same
+    few = random_stream(50, 3, 4, 999, seed=1)
+    again = stream_from_spikes(spikes_from_stream(few, 0, 1, 1000), 0, 1)
+    found, events = (set(zip(*(getattr(each, name).tolist() for name in ("t_us", "x", "y", "p")), strict=True)) for each in (again, few))
+    assert len(again) == len(events)
+    assert found == events
+
+
+def test_spikes_outside_the_steps_are_not_asked_for():
+    zero = torch.zeros(4, dtype=torch.int64)
+    stream = EventStream(torch.tensor([9, 10, 29, 30]), zero, zero, zero + 1, 1, 1)
+    assert spikes_from_stream(stream, 10, 10, 2)[0, 0, 0].tolist() == [1, 1]
+    assert spikes_from_stream(stream, 20, 10, 3)[0, 0, 0].tolist() == [1, 1, 0]
+    assert spikes_from_stream(stream, 11, 10, 1)[0, 0, 0].tolist() == [0]  # one microsecond early
+
+
+def test_spikes_of_counts_are_binary_for_whole_and_shares_for_soft_ones():
+    counts = torch.tensor([[0.0, 1.0], [3.0, 0.25]])[:, None, :, None].expand(2, 2, 2, 1)  # [T, 2, H = 2, W = 1]
+    spikes = spikes_from_counts(counts)
+    assert spikes.shape == (2, 1, 2, 2)
+    assert spikes[1, 0].tolist() == [[0, 1], [1, 0.25]]
+    soft = (0.05 + 0.9 * torch.rand(3, 2, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))).requires_grad_()
+    assert torch.autograd.gradcheck(spikes_from_counts, (soft,))
+    assert not torch.autograd.grad(spikes_from_counts(soft + 1).sum(), soft)[0].any()
+
+
+def test_bad_spikes_are_refused_with_a_reason():
+    stream = random_stream(5, 3, 3, 10)
+    for arguments, words in (((0.5, 1, 1), "t0_us"), ((0, 0, 1), "step_us"), ((0, 1, 0), "steps"), ((0, 1, True), "steps")):
+        with pytest.raises(DomainError, match=words):
+            spikes_from_stream(stream, *arguments)
+    for spikes, error, words in ((torch.zeros(2, 3, 3), ShapeError, "W, H, T"), (torch.full((2, 1, 1, 1), 0.5), DomainError, "other than 0 and 1")):
+        with pytest.raises(error, match=words):
+            stream_from_spikes(spikes, 0, 1)
+    for counts, error, words in ((torch.zeros(3, 1, 2, 2), ShapeError, "ON first"), (-torch.ones(3, 2, 2, 2), DomainError, "0 or more")):
+        with pytest.raises(error, match=words):
+            spikes_from_counts(counts)

@@ -1,4 +1,4 @@
-"""Events made visible: red and blue pictures, gray pictures, fading traces, and rate curves."""
+"""Events made visible: red and blue pictures, gray pictures, and rates over time."""
 
 import math
 
@@ -31,24 +31,6 @@ def gray_picture(counts, full_scale=None):
     """
     on, off, full = _scaled(counts, full_scale)
     return (128 + 127 * ((on - off) / full).clamp(-1, 1)).round().to(torch.uint8)
-
-
-def decay(counts, t_s, tau_s):
-    """Exponentially fading sum of events, per polarity.
-
-    Args:
-      counts: [T-1, 2, H, W] counts per interval, counted as if at the interval's end.
-      t_s: [T] times around the intervals, seconds, strictly increasing.
-      tau_s: time in which a trace fades to 1/e, seconds, > 0.
-    Returns: [T-1, 2, H, W]; after each interval of length d: s = s exp(-d/tau) + counts.
-    """
-    if not (0 < tau_s < math.inf):
-        raise DomainError(f"tau_s is {tau_s!r}; a finite time > 0 s is needed.")
-    fade = torch.exp(-check_times(t_s, len(counts) + 1).diff() / tau_s).tolist()
-    traces, trace = torch.empty_like(counts), torch.zeros_like(counts[0])
-    for index, factor in enumerate(fade):
-        trace = traces[index] = trace * factor + counts[index]
-    return traces
 
 
 def rates(counts, t_s):

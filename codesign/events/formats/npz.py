@@ -1,5 +1,6 @@
 """Event streams as NPZ: arrays t_us, x, y, p and the sensor size height_px, width_px."""
 
+import math
 import zipfile
 import zlib
 
@@ -9,13 +10,21 @@ import torch
 from codesign.errors import CodesignError, FileFormatError
 from codesign.events.stream import ordered
 
+HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+DEFLATE_RATIO = 1040  # at most 1032 to 1
 NAMES = ("t_us", "x", "y", "p", "height_px", "width_px")
 
 
 def write_npz(path, stream):
     """Write events and sensor size to ``path``, compressed."""
     arrays = {name: np.asarray(torch.as_tensor(getattr(stream, name)).cpu()) for name in NAMES}
-    np.savez_compressed(path, allow_pickle=False, **arrays)
+    for name in ("x", "y", "p"):  # a few bits each: narrow arrays pack faster
+        arrays[name] = arrays[name].astype(np.min_scalar_type(-max(stream.height_px, stream.width_px) - 1))
+    # what np.savez_compressed writes, at a level four times faster
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, values in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, values, allow_pickle=False)
 
 
 def read_npz(path, height_px=None, width_px=None):
@@ -25,8 +34,12 @@ def read_npz(path, height_px=None, width_px=None):
     """
     try:
         # opened here, because np.load leaves the file open when it is corrupt
-        with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in NAMES}
+        with open(path, "rb") as opened:
+            _check_sizes(path, opened)
+            with np.load(opened, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in NAMES}
+    except FileFormatError:
+        raise
     except (ValueError, KeyError, EOFError, OSError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error, AttributeError, TypeError) as error:
         raise FileFormatError(f"{path} is not an NPZ file of events with arrays {', '.join(NAMES)}: {error}.") from error
     for name, values in arrays.items():
@@ -46,3 +59,16 @@ def read_npz(path, height_px=None, width_px=None):
         return ordered(t_us, x, y, p, *size)
     except CodesignError as error:
         raise FileFormatError(f"{path}: {error}") from error
+
+
+def _check_sizes(path, opened):
+    """Refuse arrays that claim more values than are there, before memory is taken for them."""
+    with zipfile.ZipFile(opened) as archive:
+        for name in NAMES:
+            entry = archive.getinfo(f"{name}.npy")
+            with archive.open(entry) as member:
+                shape, _, dtype = HEADERS[np.lib.format.read_magic(member)](member)
+                claimed_bytes = member.tell() + math.prod(shape) * dtype.itemsize
+            if claimed_bytes != entry.file_size or entry.file_size > DEFLATE_RATIO * min(entry.compress_size, path.stat().st_size) + 4096:
+                raise FileFormatError(f"{path}: array {name} claims {list(shape)} values, not what the file holds; it is damaged.")
+    opened.seek(0)

@@ -19,12 +19,17 @@ def bin_shares(position, bins):
       bins: number of bins, >= 1.
     Returns: [N, bins] shares >= 0; each row sums to 1 and has at most two entries. One bin takes everything.
     """
-    if isinstance(bins, bool) or not isinstance(bins, int) or bins < 1:
-        raise DomainError(f"bins is {bins!r}; a whole number >= 1 is needed.")
+    check_bins(bins)
     if bins == 1:
         return torch.ones_like(position)[:, None]
     node = torch.arange(bins, dtype=position.dtype, device=position.device)
     return (1 - (position[:, None] * (bins - 1) - node).abs()).clamp(min=0)
+
+
+def check_bins(bins):
+    """Raise DomainError unless ``bins`` is a whole number >= 1."""
+    if isinstance(bins, bool) or not isinstance(bins, int) or bins < 1:
+        raise DomainError(f"bins is {bins!r}; a whole number >= 1 is needed.")
 
 
 def from_counts(counts, t_s, bins):
@@ -72,16 +77,22 @@ def from_stream(stream, t0_us, t1_us, bins, *, dtype=torch.float32):
     """
     if int(t0_us) != t0_us or int(t1_us) != t1_us or t1_us <= t0_us:
         raise DomainError(f"the interval is {t0_us!r} to {t1_us!r} us; whole microseconds with t1 > t0 are needed.")
+    check_bins(bins)
     duration_us = int(t1_us) - int(t0_us)
-    inside = (stream.t_us >= int(t0_us)) & (stream.t_us <= int(t1_us))
-    since_us = (stream.t_us[inside] - int(t0_us)).to(torch.float64)
-    shares = bin_shares(since_us / duration_us, bins)
+    first, last = torch.searchsorted(stream.t_us, torch.tensor([int(t0_us), int(t1_us) + 1], device=stream.t_us.device)).tolist()
+    t_us, x, y, p = (column[first:last] for column in (stream.t_us, stream.x, stream.y, stream.p))
     height, width = stream.height_px, stream.width_px
-    pixel = stream.y[inside] * width + stream.x[inside]
-    cell = ((stream.p[inside] < 0).long() * bins)[:, None] + torch.arange(bins, device=pixel.device)
-    counts = torch.zeros(2 * bins * height * width, dtype=torch.float64, device=pixel.device)
-    counts.index_add_(0, (cell * (height * width) + pixel[:, None]).flatten(), shares.flatten())
-    node_s = torch.arange(bins, dtype=torch.float64, device=pixel.device) / max(bins - 1, 1)
+    # numerators of the place in node spacings: whole numbers, exact at any time
+    scaled = (t_us - int(t0_us)) * (bins - 1)
+    node = torch.div(scaled, duration_us, rounding_mode="floor")
+    share = (scaled - node * duration_us).to(torch.float64) / duration_us
+    cell = (((p < 0).long() * bins + node) * height + y) * width + x
+    counts = torch.zeros(2 * bins * height * width + height * width, dtype=torch.float64, device=cell.device)  # one spare node: an event at the end gives it 0
+    counts.index_add_(0, cell, 1 - share)
+    if bins > 1:
+        counts.index_add_(0, cell + height * width, share)
+    counts = counts[: 2 * bins * height * width]
+    node_s = torch.arange(bins, dtype=torch.float64, device=cell.device) / max(bins - 1, 1)
     third = 1 / (3 * max(bins - 1, 1))
     node_s[0], node_s[-1] = (third, 1 - third) if bins > 1 else (0.5, 0.5)
     collected_s = torch.full_like(node_s, duration_us * 1e-6 / max(bins - 1, 1))

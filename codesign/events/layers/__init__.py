@@ -1,0 +1,1 @@
+"""Differentiable event layers, from the sigmoid to the full sensor."""

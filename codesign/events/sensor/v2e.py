@@ -1,0 +1,125 @@
+"""The sensor as v2e times it: every pixel's i-th event of a frame gets the i-th of the frame's equal time slots.
+
+Kept beside the interpolated sensor so that results with v2e can be repeated event by event; precisions and the order of operations are v2e's.
+Source: Hu, Liu, Delbruck, "v2e: From Video Frames to Realistic DVS Events", CVPR-W 2021, and the published program.
+"""
+
+import math
+
+import torch
+
+from codesign.errors import DomainError
+
+DARK, SPAN = 20.0, 275.0  # the bandwidth and the noise follow (I + 20)/275, 1 at I = 255
+EXACT_SINGLE_S = 8.0  # up to here single-precision seconds resolve a microsecond, and v2e's rounding is repeated; later slots are computed in double
+
+
+def front_end(frames):
+    """Lin-log level as v2e rounds it: computed in double precision, to 8 decimals, kept in single. frames: [T, H, W]."""
+    frames = frames.double()
+    level = torch.where(frames <= DARK, frames * (math.log(DARK) / DARK), frames.clamp(min=DARK).log())
+    return ((level * 1e8).round() / 1e8).float()
+
+
+def interval(frame, level, time_s, sensor, generator, state):
+    """Events of the interval that ends with ``frame``; moves the state on.
+
+    Args: frame: [H, W] intensity 0 to 255. level: [H, W] from ``front_end``. time_s: its time.
+    Returns: t_us, x, y, p: int64 [N] each, unsorted.
+    """
+    dt_s = time_s - state.time_s
+    light = (frame.double() + DARK) / SPAN
+    seen = _photoreceptor(level, light, dt_s, sensor, generator, state)
+    if sensor.leaks:
+        rate_hz = state.leak_hz
+        if sensor.leak_jitter > 0:
+            rate_hz = rate_hz * (1 - sensor.leak_jitter * _randn(rate_hz, generator))
+        state.reference = state.reference - dt_s * rate_hz * state.theta_on.to(rate_hz)
+    difference = seen - state.reference
+    theta_on, theta_off = state.theta_on.to(difference), state.theta_off.to(difference)  # single precision without, double with a low-pass
+    on = torch.div(difference.clamp(min=0), theta_on, rounding_mode="floor").long()
+    off = torch.div((-difference).clamp(min=0), theta_off, rounding_mode="floor").long()
+    slots = max(1, int(torch.maximum(on, off).max()))
+    times = _slots(state.time_s - state.start_s, time_s - state.start_s, dt_s, slots)
+    if sensor.refractory_s > dt_s / slots:
+        on, off, found = _with_dead_time(on, off, times, sensor.refractory_s, state)
+    else:
+        found = [(*_each(fired), torch.full((int(fired.sum()),), p)) for fired, p in ((on, 1), (off, -1))]
+        if state.last_event_s is not None:
+            last = torch.maximum(on, off)
+            state.last_event_s = torch.where(last > 0, times.to(state.last_event_s.dtype)[(last - 1).clamp(min=0)], state.last_event_s)
+    state.reference = state.reference.to(difference) + on * state.theta_on.float() - off * state.theta_off.float()  # a single-precision product at all times
+    if sensor.has_shots:
+        found += _shots(light, dt_s, slots, sensor, generator, state)
+    state.time_s = time_s
+    y, x, nth, p = (torch.cat(column) for column in zip(*found, strict=True))
+    return round(state.start_s * 1e6) + ((times.double() + _fraction(state.start_s)) * 1e6).round().long()[nth], x, y, p
+
+
+def _fraction(start_s):
+    """Seconds from the nearest whole microsecond to the start."""
+    return start_s - round(start_s * 1e6) / 1e6
+
+
+def _photoreceptor(level, light, dt_s, sensor, generator, state):
+    """Low-passed level, plus noise; moves both on."""
+    omega = 2 * math.pi * sensor.cutoff_hz
+    if sensor.cutoff_hz > 0:
+        share = (light * (dt_s * omega)).clamp(max=1)
+        state.level = (1 - share) * state.level + share * level
+    else:
+        state.level = level
+    if not sensor.photoreceptor_noise:
+        return state.level
+    share = dt_s * omega
+    if share >= 2:
+        raise DomainError(
+            f"frames {dt_s:g} s apart make v2e's noise filter of {sensor.cutoff_hz:g} Hz unstable; use frames closer than {2 / omega:.3g} s, or timing 'interpolated'."
+        )
+    strength = sensor.noise_level() / math.sqrt(share / (2 - share))  # the filter lets this part of white noise through
+    state.noise = (1 - share) * state.noise + share * strength * _randn(state.noise, generator)
+    return state.level + state.noise
+
+
+def _slots(before_s, now_s, dt_s, count):
+    """[count] times of the frame's slots since the first frame, seconds."""
+    return torch.linspace(before_s + dt_s / count, now_s, count, dtype=torch.float32 if now_s < EXACT_SINGLE_S else torch.float64)
+
+
+def _with_dead_time(on, off, times, refractory_s, state):
+    """Keep the events that come later than the dead time behind the last one kept; the others are not counted, so the next frames see them again."""
+    kept_on, kept_off, found = torch.zeros_like(on), torch.zeros_like(off), []
+    last = state.last_event_s.to(times.dtype)
+    for index, time in enumerate(times):
+        ready = time - last > refractory_s
+        for fired, kept, p in ((on > index, kept_on, 1), (off > index, kept_off, -1)):
+            fired = fired & ready
+            kept += fired
+            y, x = fired.nonzero(as_tuple=True)
+            last[y, x] = time
+            found.append((y, x, torch.full_like(x, index), torch.full_like(x, p)))
+    state.last_event_s = last
+    return kept_on, kept_off, found
+
+
+def _shots(light, dt_s, slots, sensor, generator, state):
+    """Noise events: at most one per pixel and frame, in the last slot; they set the memorised level to the level seen."""
+    chance = sensor.shot_rate_hz / 2 * dt_s * (1 - 0.75 * light)
+    draw = torch.rand(light.shape, generator=generator, dtype=torch.float64, device=generator.device).to(light.device)
+    on = draw > 1 - chance * (sensor.theta_on / state.theta_on)
+    off = draw < chance * (sensor.theta_off / state.theta_off)
+    state.reference = torch.where(on | off, state.level, state.reference)
+    places = ((*fired.nonzero(as_tuple=True), p) for fired, p in ((on, 1), (off, -1)))
+    return [(y, x, torch.full_like(x, slots - 1), torch.full_like(x, p)) for y, x, p in places]
+
+
+def _randn(like, generator):
+    return torch.randn(like.shape, generator=generator, dtype=like.dtype, device=generator.device).to(like.device)
+
+
+def _each(counts):
+    """Row, column and running number (from 0) of every single event in a map of counts."""
+    y, x = counts.nonzero(as_tuple=True)
+    many = counts[y, x]
+    nth = torch.arange(int(many.sum()), device=counts.device) - (many.cumsum(0) - many).repeat_interleave(many)
+    return y.repeat_interleave(many), x.repeat_interleave(many), nth

@@ -1,0 +1,1 @@
+"""Frames from videos, folders, array stacks and high-speed recordings."""

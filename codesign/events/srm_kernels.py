@@ -1,0 +1,113 @@
+"""The kernels of the spike response model as linear recursions: one decay a, one amplitude m, at most two states.
+
+    pair     q <- a (q + p), p <- a p, y = m q, p <- p + z      y_t = m sum_{k>=1} k a^k z_{t-k}      (alpha response, slayer reset)
+    late     p <- a p, y = m p, p <- p + z                      y_t = m sum_{k>=1} a^k z_{t-k}        (thesis reset)
+    early    y = m p, p <- a p + z                              y_t = m sum_{k>=1} a^{k-1} z_{t-k}    (exp and step reset)
+    sum      p <- p + z, y = p                                  y_t = sum_{k>=0} z_{t-k}              (step response)
+    none     y = z
+
+No sum is cut: the recursion is the whole kernel. ``retreat`` is the adjoint of ``advance``, and its derivative with respect to one parameter of a and m is
+``retreat_tangent``; all three work on numbers and on arrays of any library.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+STATES = {"pair": 2, "late": 1, "early": 1, "sum": 1, "none": 0}
+RESPONSES = {"none": "none", "alpha": "pair", "step": "sum"}
+RESETS = {"slayer": "pair", "thesis": "late", "exp": "early", "step": "early"}
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """Decay a and amplitude m per pixel, and their derivatives with respect to h = dt/tau; float64 tensors [N]."""
+
+    a: Any
+    m: Any
+    a_h: Any
+    m_h: Any
+
+
+def response_coefficients(h):
+    """Alpha kernel (k h) exp(1 - k h), k >= 1: a = exp(-h), m = e h."""
+    a = (-h).exp()
+    return Coefficients(a, math.e * h, -a, (0 * h) + math.e)
+
+
+def reset_coefficients(kernel, h, amplitude):
+    """Reset kernel of the given name, with amplitude = -reset_scale * theta.
+
+    slayer: amplitude k h exp(1 - k h); thesis: amplitude exp(1 - k h); exp: amplitude exp(-(k - 1) h); step: amplitude; all for k >= 1.
+    """
+    a, zero = (-h).exp(), 0 * h
+    if kernel == "slayer":
+        return Coefficients(a, math.e * h * amplitude, -a, math.e * amplitude)
+    if kernel == "thesis":
+        return Coefficients(a, math.e * amplitude, -a, zero)
+    if kernel == "exp":
+        return Coefficients(a, amplitude, -a, zero)
+    return Coefficients(zero + 1, amplitude, zero, zero)
+
+
+def absolute_sum(kind, a, m, steps):
+    """Sum of |kernel| over its lags, closed form; a kernel that does not decay is summed over ``steps`` lags."""
+    if kind == "pair":
+        return m.abs() * a / (1 - a) ** 2
+    decaying = (1 - a**steps) / (1 - a)
+    total = decaying.where(a < 1, float(steps))
+    return m.abs() * (a * total if kind == "late" else total)
+
+
+def advance(kind, states, a, m, z=None):
+    """One step of the recursion up to its output y; returns y and the states, into whose first one the input z is still to be added.
+
+    ``sum`` and ``none`` take z in at once.
+    """
+    if kind == "pair":
+        p, q = states
+        q = a * (q + p)
+        return m * q, [a * p, q]
+    if kind == "late":
+        p = a * states[0]
+        return m * p, [p]
+    if kind == "early":
+        return m * states[0], [a * states[0]]
+    if kind == "sum":
+        return states[0] + z, [states[0] + z]
+    return z, []
+
+
+def inflow(kind, adjoint, y):
+    """Adjoint of the input z of a step, from the adjoint of the states after it and the adjoint y of its output."""
+    if kind == "none":
+        return y
+    return adjoint[0] + y if kind == "sum" else adjoint[0]
+
+
+def retreat(kind, adjoint, a, m, y):
+    """Adjoint of the states before a step, from the adjoint after it and the adjoint y of its output."""
+    if kind == "pair":
+        p, q = adjoint[0], adjoint[1] + m * y
+        return [a * (p + q), a * q]
+    if kind == "late":
+        return [a * (adjoint[0] + m * y)]
+    if kind == "early":
+        return [a * adjoint[0] + m * y]
+    return [adjoint[0] + y] if kind == "sum" else []
+
+
+def retreat_tangent(kind, tangent, adjoint, a, m, da, dm, y):
+    """Derivative of ``retreat`` where a and m move by da and dm, y being held; da None stands for zero (``adjoint`` is then not needed)."""
+    if kind == "pair":
+        p, q = tangent[0], tangent[1] + dm * y
+        moved = [a * (p + q), a * q]
+        if da is None:
+            return moved
+        later = adjoint[1] + m * y
+        return [moved[0] + da * (adjoint[0] + later), moved[1] + da * later]
+    if kind == "late":
+        moved = a * (tangent[0] + dm * y)
+        return [moved if da is None else moved + da * (adjoint[0] + m * y)]
+    moved = a * tangent[0] + dm * y
+    return [moved if da is None else moved + da * adjoint[0]]

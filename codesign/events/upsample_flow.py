@@ -1,0 +1,52 @@
+"""Optical flow between two frames, both ways, from coarse to fine."""
+
+import torch
+from torch.nn.functional import conv2d, interpolate, pad
+
+from codesign.events.upsample_match import RADIUS_PX, with_matches
+from codesign.events.upsample_tvl1 import refined
+
+DARK_OFFSET = 12.0  # on the 0-255 scale: flow is found on ln(I + 12), so that dark edges count about as the sensor sees them
+SMALLEST_PX = 12  # shorter side of the coarsest scale
+MATCHED_PX = 80  # matches are sought at the first scale whose shorter side is at most this: there they reach an eighth of the picture
+PREFILTER_PX = 1.04  # standard deviation of the blur before every halving
+WARPS, ITERATIONS = 4, 20
+
+
+@torch.no_grad()
+def flow_both_ways(first, second):
+    """Dense flow between two frames.
+
+    Args: first, second: [H, W] linear intensity on the 0-255 scale.
+    Returns: [2, 2, H, W]: from the first to the second, and from the second to the first; pixels, +x right, +y down. Exactly 0 for equal frames.
+    Gradient: none.
+    """
+    scales = [(torch.stack((first, second))[:, None] + DARK_OFFSET).log()]
+    while min(scales[-1].shape[-2:]) >= 2 * SMALLEST_PX:
+        scales.append(_halved(scales[-1]))
+    matched = next((number for number, levels in enumerate(scales) if min(levels.shape[-2:]) <= MATCHED_PX), len(scales) - 1)
+    flow = torch.zeros_like(scales[-1]).repeat(1, 2, 1, 1)
+    for number in reversed(range(len(scales))):
+        levels = scales[number]
+        size = levels.shape[-2:]
+        if flow.shape[-2:] != size:
+            growth = torch.tensor([size[1] / flow.shape[3], size[0] / flow.shape[2]], dtype=flow.dtype, device=flow.device)
+            flow = interpolate(flow, size, mode="bilinear", align_corners=False) * growth[:, None, None]
+        if number == matched and min(size) > RADIUS_PX:
+            flow = with_matches(levels, flow)
+        flow = refined(levels, levels.flip(0), flow, WARPS, ITERATIONS)
+    return flow
+
+
+def _halved(levels):
+    height, width = levels.shape[-2:]
+    return interpolate(blurred(levels, PREFILTER_PX), (round(height / 2), round(width / 2)), mode="bilinear", align_corners=False)
+
+
+def blurred(field, deviation_px):
+    """Gaussian blur of [B, 1, H, W], the border repeated."""
+    reach = int(3 * deviation_px + 0.5)
+    kernel = torch.exp(-torch.arange(-reach, reach + 1, dtype=field.dtype, device=field.device).square() / (2 * deviation_px**2))
+    kernel = kernel / kernel.sum()
+    across = conv2d(pad(field, (reach, reach, 0, 0), mode="replicate"), kernel.reshape(1, 1, 1, -1))
+    return conv2d(pad(across, (0, 0, reach, reach), mode="replicate"), kernel.reshape(1, 1, -1, 1))

@@ -1,0 +1,1 @@
+"""Events made visible: pictures, videos, rate curves, space-time plots."""

@@ -1,0 +1,77 @@
+"""Pictures to MP4 or GIF, one by one, and the exponential-decay video of events."""
+
+from contextlib import closing
+from pathlib import Path
+
+import imageio.v3 as iio
+import imageio_ffmpeg
+import numpy as np
+
+from codesign.atomic import replacing
+from codesign.errors import DomainError, FileFormatError, ShapeError
+from codesign.events.stream import to_counts
+from codesign.events.views.view import picture
+from codesign.events.volumes.traces import decay
+from codesign.types import EventStream
+
+LEAST_SIDE_PX = 256  # small frames are enlarged until their shorter side reaches this, so that single pixels can be seen,
+LARGEST_SIDE_PX = 1280  # unless the longer one would exceed this
+
+
+def write_video(path, pictures, fps):
+    """Write pictures as a video; small ones are enlarged by whole factors, odd sizes get one more row or column of their edge.
+
+    Args:
+      path: file ending in .mp4 (H.264) or .gif.
+      pictures: [N, H, W, 3] or [N, H, W] uint8, N >= 1; or anything that yields such pictures one after the other (an MP4 then needs the memory of one).
+      fps: pictures per second, > 0 (a GIF keeps hundredths of a second: at most 50).
+    Raises: FileFormatError for another extension or a folder that is not writable; ShapeError, DomainError for anything but such pictures.
+    """
+    path = Path(path)
+    if not 0 < fps <= 1000:
+        raise DomainError(f"fps is {fps!r}; pictures per second, above 0 and up to 1000, are needed.")
+    if path.suffix.lower() not in (".mp4", ".gif"):
+        raise FileFormatError(f"{path} ends in {path.suffix or 'nothing'!r}; videos end in .mp4 or .gif.")
+    ready = _prepared(pictures)
+    first = next(ready, None)
+    if first is None:
+        raise ShapeError("no picture given; a video needs at least one, uint8 [H, W, 3] or [H, W].")
+    with replacing(path) as temporary:
+        if path.suffix.lower() == ".mp4":
+            size = (first.shape[1], first.shape[0])
+            with closing(imageio_ffmpeg.write_frames(str(temporary), size, fps=fps, codec="libx264", quality=8, macro_block_size=2)) as file:
+                file.send(None)
+                file.send(np.ascontiguousarray(first))
+                for each in ready:
+                    file.send(np.ascontiguousarray(each))
+        else:
+            iio.imwrite(temporary, np.stack([first, *ready]), plugin="pillow", duration=1000 / fps, loop=0)
+
+
+def decay_video(path, events, t_s, tau_s, *, fps=25, full_scale=None):
+    """Write the exponential-decay video of events: red ON and blue OFF traces that fade.
+
+    Args:
+      path: file ending in .mp4 or .gif.
+      events: EventStream, or counts [T-1, 2, H, W] per interval.
+      t_s: [T] seconds; one picture per interval.
+      tau_s: fading time, seconds. fps: pictures per second of the video. full_scale: as for ``picture``.
+    """
+    counts = to_counts(events, t_s) if isinstance(events, EventStream) else events.detach()
+    write_video(path, picture(decay(counts, t_s, tau_s), full_scale), fps)
+
+
+def _prepared(pictures):
+    """Colour pictures of even size, enlarged; each is checked as it comes."""
+    size = None
+    for index, given in enumerate(pictures):
+        each = np.asarray(given.cpu() if hasattr(given, "cpu") else given)
+        if each.dtype != np.uint8 or each.ndim not in (2, 3) or 0 in each.shape or (each.ndim == 3 and each.shape[-1] != 3):
+            raise ShapeError(f"picture {index} is {each.dtype} {list(each.shape)}; uint8 [H, W, 3] or [H, W] is needed.")
+        if size is not None and each.shape != size:
+            raise ShapeError(f"picture {index} has shape {list(each.shape)}, those before {list(size)}; a video has one size.")
+        size = each.shape
+        colour = np.repeat(each[..., None], 3, axis=-1) if each.ndim == 2 else each
+        factor = max(1, min(-(-LEAST_SIDE_PX // min(size[:2])), LARGEST_SIDE_PX // max(size[:2])))
+        large = colour.repeat(factor, axis=0).repeat(factor, axis=1)
+        yield np.pad(large, ((0, large.shape[0] % 2), (0, large.shape[1] % 2), (0, 0)), mode="edge")

@@ -1,0 +1,1 @@
+"""Events on grids: volumes, time surfaces, fading traces, spike tensors."""

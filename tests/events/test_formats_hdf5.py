@@ -1,0 +1,126 @@
+"""DSEC's and v2e's HDF5 layouts, put together with h5py alone; and the index of milliseconds against its definition."""
+
+import h5py
+import hdf5plugin
+import numpy as np
+import pytest
+import torch
+
+from codesign.errors import FileFormatError
+from codesign.events import read, write
+from codesign.events.stream import ordered
+
+FIELDS = ("t_us", "x", "y", "p")
+EPOCH_US = 1_643_243_628_737_093
+
+
+def example():
+    """t, x, y, p (1 or 0) of 3000 events within 40 ms, sorted."""
+    dice = np.random.default_rng(0)
+    columns = (np.sort(dice.integers(0, 40_000, 3000)), dice.integers(0, 640, 3000), dice.integers(0, 480, 3000), dice.integers(0, 2, 3000))
+    return columns
+
+
+def stream_of(t_us, x, y, p, height_px=480, width_px=640):
+    t_us, x, y, p = (torch.tensor(np.asarray(values), dtype=torch.int64) for values in (t_us, x, y, p))
+    return ordered(t_us, x, y, 2 * p - 1, height_px, width_px)
+
+
+def dsec(path, change=None, **packing):
+    """A file as DSEC publishes them; ``change`` replaces datasets (None removes one)."""
+    t, x, y, p = example()
+    arrays = {
+        "events/t": t.astype(np.uint32),
+        "events/x": x.astype(np.uint16),
+        "events/y": y.astype(np.uint16),
+        "events/p": p.astype(np.uint8),
+        "t_offset": np.int64(EPOCH_US),
+        "ms_to_idx": np.array([np.count_nonzero(t < 1000 * k) for k in range(41)], np.uint64),
+    } | (change or {})
+    with h5py.File(path, "w") as file:
+        for name, values in arrays.items():
+            if values is not None:
+                file.create_dataset(name, data=values, **(packing if np.ndim(values) else {}))
+    return path
+
+
+@pytest.mark.parametrize("packing", [dict(hdf5plugin.Blosc(cname="zstd", clevel=1)), {"compression": "gzip", "shuffle": True, "fletcher32": True}, {"chunks": True}, {}])
+def test_published_files_are_read(tmp_path, packing):
+    events, truth = read(dsec(tmp_path / "e.h5", **packing), height_px=480, width_px=640), stream_of(example()[0] + EPOCH_US, *example()[1:])
+    assert all(torch.equal(getattr(events, name), getattr(truth, name)) for name in FIELDS)
+
+
+def test_what_is_written_follows_the_layout(tmp_path):
+    t, x, y, p = example()
+    write(tmp_path / "e.h5", stream_of(t + EPOCH_US, x, y, p))
+    with h5py.File(tmp_path / "e.h5") as file:
+        names = ("events/t", "events/x", "events/y", "events/p", "t_offset", "ms_to_idx")
+        since_us, columns, rows, on, offset_us, index = (np.asarray(file[name]) for name in names)
+    assert [values.dtype for values in (since_us, columns, rows, on, offset_us, index)] == [np.uint32, np.uint16, np.uint16, np.uint8, np.int64, np.uint64]
+    assert int(offset_us) == EPOCH_US + t[0]
+    assert np.array_equal(since_us, t - t[0])
+    assert index.tolist() == [np.count_nonzero(since_us < 1000 * k) for k in range(len(index))]
+    assert index[-1] == len(t)  # the last millisecond is closed
+    assert set(on.tolist()) == {0, 1}
+    back = read(tmp_path / "e.h5")
+    assert (back.height_px, back.width_px) == (480, 640)
+
+
+@pytest.mark.parametrize("with_frames", [True, False])
+def test_v2e_files_are_read(tmp_path, with_frames):
+    t, x, y, p = example()
+    with h5py.File(tmp_path / "e.h5", "w") as file:  # as v2e makes it: grown from nothing, packed with gzip
+        rows = file.create_dataset("events", shape=(0, 4), maxshape=(None, 4), dtype="uint32", compression="gzip")
+        rows.resize(3000, axis=0)
+        rows[:] = np.stack((t, x, y, p), axis=1)
+        if with_frames:
+            file.create_dataset("frame", data=np.zeros((2, 500, 700), np.uint8), compression="gzip")
+    events, truth = read(tmp_path / "e.h5"), stream_of(*example())
+    assert all(torch.equal(getattr(events, name), getattr(truth, name)) for name in FIELDS)
+    assert (events.height_px, events.width_px) == ((500, 700) if with_frames else (int(y.max()) + 1, int(x.max()) + 1))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"events/p": None}, "events/p is absent"),
+        ({"t_offset": None}, "t_offset is absent"),
+        ({"t_offset": np.int64(2**62)}, "61 bits"),
+        ({"t_offset": np.zeros(2, int)}, "2 values"),
+        ({"events/x": np.zeros(5, np.uint16)}, "equal length"),
+        ({"events/x": np.zeros(3000)}, "whole numbers"),
+        ({"events/p": np.full(3000, 2, np.uint8)}, "polarity spans 2 to 2"),
+        ({"events/t": example()[0][::-1].astype(np.uint32), "ms_to_idx": None}, "before an earlier"),
+        ({"ms_to_idx": np.arange(41)}, "first event of each millisecond"),
+        ({"ms_to_idx": np.array([0, 2**40])}, "no list of places"),
+    ],
+)
+def test_malformed_files_are_refused(tmp_path, change, words):
+    with pytest.raises(FileFormatError, match=words):
+        read(dsec(tmp_path / "e.h5", change))
+
+
+def test_files_that_point_elsewhere_are_refused(tmp_path):
+    dsec(tmp_path / "other.h5")
+    with h5py.File(tmp_path / "e.h5", "w") as file:
+        file["events"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "events")
+    with pytest.raises(FileFormatError, match="link to another"):
+        read(tmp_path / "e.h5")
+    dsec(tmp_path / "e.h5", {"events/x": None})
+    with h5py.File(tmp_path / "e.h5", "a") as file:
+        layout = h5py.VirtualLayout((3000,), np.uint16)
+        layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "events/x", (3000,))
+        file.create_virtual_dataset("events/x", layout)
+    with pytest.raises(FileFormatError, match="other files"):
+        read(tmp_path / "e.h5")
+    with pytest.raises(FileFormatError, match="filters"):
+        read(dsec(tmp_path / "e.h5", compression="lzf"))
+    (tmp_path / "e.h5").write_bytes(b"not HDF5")
+    with pytest.raises(FileFormatError, match="not a readable HDF5"):
+        read(tmp_path / "e.h5")
+
+
+def test_streams_longer_than_32_bits_of_microseconds_are_refused(tmp_path):
+    with pytest.raises(FileFormatError, match="32 bits"):
+        write(tmp_path / "e.h5", stream_of([0, 2**32], [1, 1], [1, 1], [1, 1]))
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,193 @@
+"""Prophesee's RAW and DAT files: a recording decoded by another program, and words put together by the published bit layout."""
+
+import numpy as np
+import pytest
+import torch
+
+from codesign.errors import FileFormatError
+from codesign.events import read, write
+from codesign.events.stream import ordered
+
+FIELDS = ("t_us", "x", "y", "p")
+EVT3 = b"% evt 3.0\n% format EVT3;height=720;width=1280\n% geometry 1280x720\n% end\n"
+EVT2 = b"% evt 2.0\n% geometry 640x480\n% end\n"
+DAT = b"% Data file containing CD events\n% Version 2\n% Width 640\n% Height 480\n\x0c\x08"
+
+
+def rows(stream):
+    return [tuple(row) for row in torch.stack([getattr(stream, name) for name in FIELDS], 1).tolist()]
+
+
+def evt3(*words):
+    """Words of (type, 12 bits)."""
+    return EVT3 + np.array([kind << 12 | load for kind, load in words], "<u2").tobytes()
+
+
+def evt2_event(t_us, x, y, p):
+    return p << 28 | (t_us & 63) << 22 | x << 11 | y
+
+
+def evt2(*words):
+    return EVT2 + np.array(words, "<u4").tobytes()
+
+
+def dat(*events):
+    return DAT + np.array([(t_us, p << 28 | y << 14 | x) for t_us, x, y, p in events], "<u4").tobytes()
+
+
+def stream_of(*events, height_px=480, width_px=640):
+    t_us, x, y, p = torch.tensor(events).unbind(1)
+    return ordered(t_us, x, y, p, height_px, width_px)
+
+
+def test_a_recording_decodes_as_another_program_decodes_it(shared):
+    events = read(shared("data/prophesee_gen3_vga/faery_evt2.raw"))
+    truth = np.load(shared("data/prophesee_gen3_vga/faery_evt2.npz"))  # in file order, its first time subtracted
+    order = np.lexsort((truth["p"], truth["x"], truth["y"], truth["t"]))
+    assert (events.height_px, events.width_px) == (480, 640)
+    for found, wanted in ((events.t_us - events.t_us[0], truth["t"]), (events.x, truth["x"]), (events.y, truth["y"]), (events.p > 0, truth["p"])):
+        assert np.array_equal(found.numpy(), wanted[order])
+    assert int(events.t_us[0]) == 913_716_224  # the clock of the camera stays
+
+
+@pytest.mark.parametrize("encoding", [2, 3])
+def test_raw_written_again_decodes_to_the_same_recording(shared, tmp_path, encoding):
+    events = read(shared("data/prophesee_gen3_vga/faery_evt2.raw"))
+    write(tmp_path / "e.raw", events, evt=encoding)
+    back = read(tmp_path / "e.raw")
+    assert all(torch.equal(getattr(events, name), getattr(back, name)) for name in FIELDS)
+
+
+def test_evt3_singles_vectors_and_time_parts(tmp_path):
+    path = tmp_path / "e.raw"
+    path.write_bytes(
+        evt3(
+            (0x8, 2), (0x6, 5), (0x0, 0x800 | 7), (0x2, 0x800 | 30),  # high 2, low 5, row 7 (slave camera's bit set), one ON event in column 30
+            (0x3, 0x800 | 100), (0x4, 0b100000000001), (0x4, 0b10), (0x5, 0xF81),  # base 100 ON: columns 100, 111; then from 112: 113; then from 124: 124, 131
+            (0x8, 2), (0x2, 31),  # a repeated high part leaves the low one
+            (0x8, 3), (0x2, 32),  # a new high part starts the low one at zero
+            (0xA, 0x101), (0xE, 0x14), (0xF, 1), (0x7, 2),  # trigger, counter and continuations: no events
+            (0x6, 9), (0x5, 1),  # the base has moved on to 132
+        )
+    )  # fmt: skip
+    t_us = 2 * 4096 + 5
+    truth = [(t_us, x, 7, 1) for x in (30, 100, 111, 113, 124, 131)] + [(t_us, 31, 7, -1), (3 * 4096, 32, 7, -1), (3 * 4096 + 9, 132, 7, 1)]
+    events = read(path)
+    assert rows(events) == sorted(truth, key=lambda row: (row[0], row[2], row[1], row[3]))
+    assert (events.height_px, events.width_px) == (720, 1280)
+
+
+def test_clocks_start_again_and_go_on(tmp_path):
+    path = tmp_path / "e.raw"
+    path.write_bytes(evt3((0x0, 1), (0x8, 0xFFF), (0x6, 0xFFF), (0x2, 5), (0x8, 0), (0x6, 2), (0x2, 6), (0x8, 0xFFF), (0x8, 0), (0x2, 7)))
+    assert rows(read(path)) == [(2**24 - 1, 5, 1, -1), (2**24 + 2, 6, 1, -1), (2**25, 7, 1, -1)]
+    high = 0x8 << 28
+    path.write_bytes(evt2(high | 2**28 - 1, evt2_event(63, 5, 1, 0), high, evt2_event(2, 6, 1, 1)))
+    assert rows(read(path)) == [(2**34 - 1, 5, 1, -1), (2**34 + 2, 6, 1, 1)]
+    path = tmp_path / "e.dat"
+    path.write_bytes(dat((2**32 - 1, 5, 1, 0), (2, 6, 1, 1)))
+    assert rows(read(path)) == [(2**32 - 1, 5, 1, -1), (2**32 + 2, 6, 1, 1)]
+
+
+def test_what_is_written_is_what_the_layout_says(tmp_path):
+    stream = stream_of((4096 * 3 + 70, 9, 4, 1), (4096 * 3 + 70, 10, 4, -1))
+    write(tmp_path / "e.raw", stream)
+    assert np.frombuffer((tmp_path / "e.raw").read_bytes().split(b"% end\n")[1], "<u2").tolist() == [0x8003, 0x6046, 0x0004, 0x2809, 0x200A]
+    write(tmp_path / "e.raw", stream, evt=2)
+    words = [0x80000000 | (4096 * 3 + 70) // 64, *(evt2_event(4096 * 3 + 70, x, 4, p) for x, p in ((9, 1), (10, 0)))]
+    assert np.frombuffer((tmp_path / "e.raw").read_bytes().split(b"% end\n")[1], "<u4").tolist() == words
+    write(tmp_path / "e.dat", stream)
+    assert (tmp_path / "e.dat").read_bytes().endswith(dat((4096 * 3 + 70, 9, 4, 1), (4096 * 3 + 70, 10, 4, 0))[len(DAT) - 2 :])
+
+
+def test_events_that_come_before_their_time_or_row_are_left_out_with_a_warning(tmp_path):
+    path = tmp_path / "e.raw"
+    path.write_bytes(evt3((0x0, 1), (0x2, 4), (0x5, 0b11), (0x8, 0), (0x2, 5)))  # one event without a time, two without a column base
+    with pytest.warns(UserWarning, match="3 events ahead"):
+        assert rows(read(path)) == [(0, 5, 1, -1)]
+    path.write_bytes(evt2(evt2_event(1, 2, 3, 1), 0x80000000, evt2_event(1, 2, 3, 1)))
+    with pytest.warns(UserWarning, match="1 events ahead"):
+        assert rows(read(path)) == [(1, 2, 3, 1)]
+
+
+def test_small_disorder_is_sorted_and_more_is_refused(tmp_path):
+    path = tmp_path / "e.dat"
+    path.write_bytes(dat((5000, 1, 1, 1), (4000, 2, 1, 1), (5000, 0, 1, 1)))
+    assert rows(read(path)) == [(4000, 2, 1, 1), (5000, 0, 1, 1), (5000, 1, 1, 1)]
+    path.write_bytes(dat((5000, 1, 1, 1), (3999, 2, 1, 1)))
+    with pytest.raises(FileFormatError, match="event 1 lies 1001 us before"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("e.raw", b"", "encoding nowhere"),
+        ("e.raw", b"% evt 2.1\n% end\n", "2.1"),
+        ("e.raw", b"% evt 3.0\n% format EVT2\n% end\n", r"2\.0.*3\.0"),
+        ("e.raw", b"% evt 3.0\n% endianness big\n% end\n", "big"),
+        ("e.raw", b"% evt 3.0\n% geometry 640\n% end\n", "WIDTHxHEIGHT"),
+        ("e.raw", b"% evt 3.0\n% format EVT3;height=4;width=5\n% geometry 4x5\n% end\n", "two sensor sizes"),
+        ("e.raw", b"% evt 3.0\n% geometry 9000x5\n% end\n", "from 1 to 2048"),
+        ("e.raw", b"% evt 3.0\n% evt 2.0\n% end\n", "twice"),
+        ("e.raw", b"% evt \xff\n% end\n", "ASCII"),
+        ("e.raw", b"% evt 3.0", "does not end"),
+        ("e.raw", b"% evt 3.0\n% end\n", "no event"),
+        ("e.raw", EVT3 + b"\x00", "amid a word"),
+        ("e.raw", evt3((0x8, 0), (0x9, 0)), "word 1 has type 0x9"),
+        ("e.raw", evt2(0x80000000, 0x30000000), "word 1 has type 0x3"),
+        ("e.raw", evt3((0x8, 0), (0x0, 720), (0x2, 5)), "y = 720.*720 pixels"),
+        ("e.raw", b"% evt 3.0\n% end\n" + evt3((0x8, 0), (0x0, 1), (0x3, 2047), (0x5, 2))[len(EVT3) :], "column 2048"),
+        ("e.raw", evt3((0x8, 2048), (0x0, 1), (0x2, 5), (0x8, 0), (0x2, 5)), "before an earlier"),  # one wrong bit is no new loop
+        ("e.dat", DAT.replace(b"Version 2", b"Version 1"), "version '1'"),
+        ("e.dat", DAT[:-2] + b"\x0e\x08", "0e 08"),
+        ("e.dat", DAT[:-1], "type and size are 0c"),
+        ("e.dat", DAT + b"1234567", "amid an event"),
+        ("e.dat", dat((1, 2, 3, 2)), "polarity 2"),
+        ("e.dat", dat((1, 640, 3, 1)), "x = 640"),
+        ("e.dat", DAT.replace(b"Width 640", b"Width -6"), "Width as '-6'"),
+    ],
+)
+def test_malformed_files_are_refused(tmp_path, name, content, words):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match=words):
+        read(path)
+
+
+def test_sizes_come_from_the_header_the_caller_or_the_events(tmp_path):
+    path = tmp_path / "e.raw"
+    path.write_bytes(b"% evt 2.0\n% end\n" + evt2(0x80000000, evt2_event(1, 9, 5, 1))[len(EVT2) :])
+    assert (read(path).height_px, read(path).width_px) == (6, 10)
+    events = read(path, height_px=480, width_px=640)
+    assert (events.height_px, events.width_px) == (480, 640)
+    with pytest.raises(FileFormatError, match=r"x = 9.*9 pixels"):
+        read(path, width_px=9)
+    path.write_bytes(evt2(0x80000000, evt2_event(1, 9, 5, 1)))
+    with pytest.raises(FileFormatError, match="width_px 640, but 641"):
+        read(path, width_px=641)
+
+
+@pytest.mark.parametrize(
+    ("name", "stream", "evt", "words"),
+    [
+        ("e.raw", stream_of((0, 1, 1, 1), width_px=2049), 3, "at most 2048 x 2048"),
+        ("e.raw", stream_of((-1, 1, 1, 1)), 2, "times span -1"),
+        ("e.raw", stream_of((0, 1, 1, 1), (2**46, 1, 1, 1)), 3, "starts again 4194304 times"),
+        ("e.raw", stream_of((0, 1, 1, 1)), 4, "evt=4"),
+        ("e.dat", stream_of((0, 1, 1, 1)), 3, "evt=3"),
+        ("e.dat", stream_of((0, 1, 1, 1), (2**32 + 5, 1, 1, 1)), None, "32-bit clock"),
+        ("e.dat", stream_of((0, 1, 1, 1), width_px=2**14 + 1), None, "16384 x 16384"),
+    ],
+)
+def test_streams_a_format_cannot_hold_are_refused(tmp_path, name, stream, evt, words):
+    with pytest.raises(FileFormatError, match=words):
+        write(tmp_path / name, stream, evt=evt)
+    assert not list(tmp_path.iterdir())
+
+
+def test_long_silences_and_late_starts_survive(tmp_path):
+    stream = stream_of((2**50 + 3, 1, 1, 1), (2**50 + 2**36, 2, 1, -1))  # 4096 loops of EVT 3.0, 4 of EVT 2.0
+    for evt in (2, 3):
+        write(tmp_path / "e.raw", stream, evt=evt)
+        assert rows(read(tmp_path / "e.raw")) == rows(stream)

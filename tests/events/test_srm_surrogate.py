@@ -1,0 +1,37 @@
+import pytest
+import torch
+
+from codesign.errors import DomainError
+from codesign.events.surrogate import FastSigmoid, Laplace, Triangular
+
+KINDS = [Laplace, FastSigmoid, Triangular]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_density_is_the_derivative_of_the_integral(kind):
+    surrogate = kind(alpha=1.4, beta=2.2)
+    x = torch.linspace(-3, 3, 401, dtype=torch.float64) + 1e-4  # off the kinks at 0 and +-1/beta
+    step = 1e-6
+    slope = (surrogate.torch_integral(x + step) - surrogate.torch_integral(x - step)) / (2 * step)
+    # differences: rounding 1e-16 / 2e-6, curvature beyond 1e-11
+    assert (slope - surrogate.torch_density(x)).abs().max() < 1e-9
+    assert float(surrogate.torch_density(torch.zeros(1, dtype=torch.float64))) == pytest.approx(1 / 1.4, rel=1e-15)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_unit_mass_rises_from_zero_to_one(kind):
+    surrogate = kind.unit(width=0.3)
+    far = torch.tensor([-1e9, 0.0, 1e9], dtype=torch.float64)
+    assert surrogate.torch_integral(far).tolist() == pytest.approx([0, 0.5, 1], abs=1e-9)
+
+
+def test_laplace_is_the_published_formula():
+    x = torch.tensor([-0.7, 0.2], dtype=torch.float64)
+    assert torch.allclose(Laplace(1.4, 1 / 0.7).torch_density(x), (-x.abs() / 0.7).exp() / 1.4, rtol=1e-14)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("alpha", "beta", "word"), [(0.0, 1.0, "alpha"), (1.0, -1.0, "beta"), (float("nan"), 1.0, "alpha"), (1.0, float("inf"), "beta"), ("1", 1.0, "alpha")])
+def test_parameters_are_checked(kind, alpha, beta, word):
+    with pytest.raises(DomainError, match=word):
+        kind(alpha, beta)
