@@ -30,6 +30,7 @@ from studies.video_to_events_pictures import View
 from studies.video_to_events_sensor import chosen_sensor, with_sensor_options
 from studies.video_to_events_state import Progress
 from studies.video_to_events_steps import Steps
+from studies.video_to_events_upsample import pieces
 
 PIXELS_PER_CHUNK = 2**20  # worked on together
 SECONDS_BETWEEN_SAVES = 20.0
@@ -61,6 +62,8 @@ class Options(StudyConfig):
     """Digital value of full light, 255 for the sensor; left out: 255 of 8 bits, 65535 of 16, and 255 of floats. 4095 for 12 bits stored in 16."""
     sensor_size: tuple[int, int] | None = None
     """Width and height of the sensor, pixels; frames are brought to it, stretched where the proportions differ. Left out: that of the frames."""
+    upsample: float | None = None
+    """Put frames between the frames, along their optical flow, until nothing moves by more than this many pixels from one to the next; 0.5 is good. Left out: none."""
     preset: str = "default"
     """Sensor: ideal (no noise), clean, noisy, or default: those of v2e and of its command line."""
     events: tuple[str, ...] = ("events.h5",)
@@ -107,11 +110,13 @@ def study(run: Run[Options]) -> None:
             index = slice(state.next_frame, min(state.next_frame + size, last))
             seen = light(list(islice(frames, index.stop - index.start)), index.start)
             begun = time.perf_counter()
-            found = events.simulate(seen, t_s[index], sensor, state=state.sensor)
+            for shown, shown_s in pieces(config.upsample, steps.before, state.sensor.time_s, seen, t_s[index]):
+                found = events.simulate(shown, shown_s, sensor, state=state.sensor)
+                steps.add(shown)
+                log.append(found)
+                state.count(found, len(shown))
             state.simulating_s += time.perf_counter() - begun
-            steps.add(seen)
-            log.append(found)
-            state.advance(index.stop, found, light.largest, time.perf_counter() - start)
+            state.advance(index.stop, light.largest, time.perf_counter() - start)
             if state.next_frame == last or time.monotonic() - saved > SECONDS_BETWEEN_SAVES:
                 state.save(run, steps)
                 saved = time.monotonic()
@@ -125,7 +130,7 @@ def checked(config):
     """The configuration. Raises: DomainError for options that cannot be, before anything is read."""
     if config.input is None:
         raise DomainError("no input given; name a video, a folder of pictures, a .npy or .npz stack, or a .mraw recording with --input.")
-    for name in ("fps", "slow_motion", "white_level", "preview_slowdown", "decay_tau_s", "preview_full_scale"):
+    for name in ("fps", "slow_motion", "white_level", "preview_slowdown", "decay_tau_s", "preview_full_scale", "upsample"):
         value = getattr(config, name)
         if value is not None and not 0 < value < math.inf:
             raise DomainError(f"--{name.replace('_', '-')} is {value:g}; a finite number above 0 is needed.")

@@ -22,7 +22,7 @@ def show(view, state, steps, sensor, clock, written):
     pixels = view.log.height_px * view.log.width_px
     rate_hz = state.events / view.duration_s / pixels
     run.record(
-        frames=frames, width_px=view.log.width_px, height_px=view.log.height_px, duration_s=view.duration_s,
+        frames=frames, simulated_frames=state.simulated, width_px=view.log.width_px, height_px=view.log.height_px, duration_s=view.duration_s,
         events=state.events, events_on=state.on, events_off=off,
         rate_on_hz=state.on / view.duration_s, rate_off_hz=off / view.duration_s, events_per_pixel_s=rate_hz,
         seconds=state.seconds, mpixel_per_s=frames * pixels / state.seconds / 1e6,
@@ -39,6 +39,8 @@ def show(view, state, steps, sensor, clock, written):
         pictures(view)
     run.section("Input and sensor", f"Clock: {clock}. Events carry that time in microseconds, from {float(view.t_s[0]):.6f} s to {float(view.t_s[-1]):.6f} s.")
     run.text(_light(view))
+    if view.config.upsample is not None:
+        run.text(f"Upsampled: the sensor saw {state.simulated} frames, so that nothing moves by more than {view.config.upsample:g} px from one to the next, along optical flow (see docs/upsampling.md).")
     run.table(f"Sensor: {view.config.preset}", ("parameter", "value"), [(name, str(value)) for name, value in dataclasses.asdict(sensor).items()])
     if written:
         run.table("Event files", ("file", "MB"), [(path.name, path.stat().st_size / 1e6) for path in written])
@@ -55,7 +57,7 @@ def warn(view, state, steps, sensor):
         "What happens inside such a step is not in the video: its events lie on a straight line of log intensity between two frames."
     )
     if steps.too_large:
-        found = f"**Too slow for its motion.** {found} Record at about {math.ceil(steps.remedy)} times the frame rate, or put frames in between by motion interpolation (and give the new --fps)."
+        found = f"**Too slow for its motion.** {found} Record at about {math.ceil(steps.remedy)} times the frame rate, or put frames between with --upsample 0.5."
         run.say(f"warning: the video is too slow: {steps.large_share_of_moving:.0%} of the moving pixels step by {least} thresholds or more per frame; see the report.")
     run.text(found)
     figure = drawn.steps_figure(steps)

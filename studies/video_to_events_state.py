@@ -16,7 +16,7 @@ class Progress:
     """State of the simulation behind the frame ``next_frame`` - 1.
 
     facts: what must be the same when the run goes on. sensor: SensorState. events, on: events made, and how many of them are ON.
-    largest: digital value seen. seconds, simulating_s: time spent on everything, and on the sensor alone. histogram, before: see Steps.
+    simulated: frames that the sensor saw, those put between with them. largest: digital value seen. seconds, simulating_s: time spent on everything, and on the sensor alone. histogram, before: see Steps.
     """
 
     next_frame: int
@@ -24,22 +24,26 @@ class Progress:
     sensor: SensorState
     events: int = 0
     on: int = 0
+    simulated: int = 0
     largest: float = 0.0
     seconds: float = 0.0
     simulating_s: float = 0.0
     histogram: Tensor = field(default_factory=lambda: torch.zeros(LARGEST + 1, dtype=torch.int64))
     before: Tensor | None = None
 
-    def advance(self, next_frame, found, largest, seconds):
-        """Take in the events of a chunk."""
+    def count(self, found, frames):
+        """Take in the events of some frames."""
+        self.events, self.on, self.simulated = self.events + len(found), self.on + int((found.p > 0).sum()), self.simulated + frames
+
+    def advance(self, next_frame, largest, seconds):
+        """Go on behind a chunk."""
         self.next_frame, self.largest = next_frame, max(self.largest, largest)
-        self.events, self.on = self.events + len(found), self.on + int((found.p > 0).sum())
         self.seconds += seconds
 
     def save(self, run, steps):
         """Write the state into the run's folder."""
         tensors = {"histogram": steps.histogram, **({} if steps.before is None else {"before": steps.before})}
-        numbers = {name: getattr(self, name) for name in ("next_frame", "facts", "events", "on", "largest", "seconds", "simulating_s")}
+        numbers = {name: getattr(self, name) for name in ("next_frame", "facts", "events", "on", "simulated", "largest", "seconds", "simulating_s")}
         numbers["sensor"] = {}
         for each in dataclasses.fields(self.sensor):
             value = getattr(self.sensor, each.name)

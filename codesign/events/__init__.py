@@ -19,7 +19,11 @@ from codesign.events.sensor.naive import naive
 from codesign.events.sensor.simulate import dense_counts, simulate
 from codesign.events.sensor.state import SensorState
 from codesign.events.sources.frames import open_frames
+from codesign.events.srm import srm
+from codesign.events.srm_scale import alpha_response, drive_scale
+from codesign.events.srm_state import SrmState
 from codesign.events.stream import concatenate, to_counts
+from codesign.events.surrogate import FastSigmoid, Laplace, Triangular
 from codesign.events.views.video import decay_video, write_video
 from codesign.events.views.view import gray_picture, picture, rates
 from codesign.events.volumes.spikes import spikes_from_counts, spikes_from_stream, stream_from_spikes
@@ -30,10 +34,15 @@ from codesign.events.volumes.volume import from_counts, from_stream
 __all__ = [
     "PRESETS",
     "EventLayer",
+    "FastSigmoid",
+    "Laplace",
     "PhysicalState",
     "RecordedFrames",
     "SensorModel",
     "SensorState",
+    "SrmState",
+    "Triangular",
+    "alpha_response",
     "annealed",
     "concatenate",
     "decay",
@@ -43,6 +52,7 @@ __all__ = [
     "dense_counts",
     "draw_shot_counts",
     "draw_thresholds",
+    "drive_scale",
     "expected",
     "from_counts",
     "from_stream",
@@ -62,6 +72,7 @@ __all__ = [
     "soft_counts",
     "spikes_from_counts",
     "spikes_from_stream",
+    "srm",
     "stream_from_spikes",
     "surface_from_counts",
     "surface_from_stream",

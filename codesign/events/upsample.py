@@ -8,7 +8,8 @@ from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import check_frames, check_times
 from codesign.events.intensity import lin_log
 from codesign.events.upsample_between import between, visibility
-from codesign.events.upsample_flow import flow_both_ways
+from codesign.events.upsample_flow import flow_both_ways, flow_levels
+from codesign.events.upsample_hidden import repaired
 from codesign.events.upsample_steps import largest, largest_change, shares, step_times, steps_for
 
 MAX_STEPS = 256
@@ -75,6 +76,7 @@ def _pieces(frames, t_s, max_displacement_px, max_log_change, max_steps):
 def _interval(first, second, start_s, end_s, max_displacement_px, max_log_change, max_steps):
     """Frames that lead from the first to the second, the second among them."""
     flows = flow_both_ways(first.detach().float(), second.detach().float()).to(first)
+    flows = repaired(flow_levels(first, second), flows, visibility(flows))
     seen = visibility(flows)
     count = steps_for(largest(flows.norm(dim=1)), max_displacement_px, max_steps, "the place of things, in pixels,", start_s, end_s)
     while True:

@@ -1,12 +1,13 @@
 """Frames between two frames: each scene point on its straight way from one to the other, hidden ones taken from the frame that shows them."""
 
 import torch
+from torch.nn.functional import max_pool2d
 
 from codesign.events.upsample_flow import blurred
 from codesign.events.upsample_warp import inside, sampled, splatted
 
 TOLERANCE_PX, TOLERANCE_SHARE = 0.5, 0.05  # forward and backward flow agree to about this much, plus this share of the motion
-HIDDEN = 0.01  # weight of what has no counterpart in the other frame: it shows where nothing else does
+HIDDEN = 0.05  # weight of what has no counterpart in the other frame: it shows where nothing else does
 LEAST = 1e-4  # weight below which a pixel counts as empty
 HOLE_PX = 1.5  # standard deviation of the blur that fills pixels on which nothing lands; grows until none is left
 
@@ -27,14 +28,17 @@ def between(first, second, flows, seen, share):
 
     Args:
       first, second: [H, W] linear intensity. flows: [2, 2, H, W] from ``flow_both_ways``. seen: [2, H, W] from ``visibility``. share: 0..1.
-    Returns: [H, W]; negative overshoot of the bicubic kernel is set to 0.
-    Gradient: first and second (linear in them, but for that overshoot), for fixed flows.
+    Returns: [H, W]. What the bicubic kernel makes darker or brighter than all nine pixels around is set to the darkest or brightest of them: next to a
+      sharp edge its overshoot would be many thresholds of a dark pixel.
+    Gradient: first and second (piecewise linear in them), for fixed flows.
     Source: flow carried forward to the time asked for, Baker et al., A database and evaluation methodology for optical flow, 2011, section 3.3.
     """
     motion, weight = _motion_at(flows, seen, share)
-    pictures = sampled(torch.stack((first, second))[:, None], torch.stack((-share * motion, (1 - share) * motion)))[:, 0]
-    early, late = (1 - share) * weight[0], share * weight[1]
-    return (pictures[0] + late / (early + late) * (pictures[1] - pictures[0])).clamp(min=0)
+    pictures, moved = torch.stack((first, second))[:, None], torch.stack((-share * motion, (1 - share) * motion))
+    darkest, brightest = (sampled(bound, moved, "nearest") for bound in (-max_pool2d(-pictures, 3, 1, 1), max_pool2d(pictures, 3, 1, 1)))
+    early, late = sampled(pictures, moved).maximum(darkest).minimum(brightest)[:, 0]
+    weight = share * weight[1] / ((1 - share) * weight[0] + share * weight[1])
+    return early + weight * (late - early)
 
 
 @torch.no_grad()

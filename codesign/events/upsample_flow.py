@@ -3,7 +3,7 @@
 import torch
 from torch.nn.functional import conv2d, interpolate, pad
 
-from codesign.events.upsample_match import RADIUS_PX, with_matches
+from codesign.events.upsample_match import with_matches
 from codesign.events.upsample_tvl1 import refined
 
 DARK_OFFSET = 12.0  # on the 0-255 scale: flow is found on ln(I + 12), so that dark edges count about as the sensor sees them
@@ -21,7 +21,7 @@ def flow_both_ways(first, second):
     Returns: [2, 2, H, W]: from the first to the second, and from the second to the first; pixels, +x right, +y down. Exactly 0 for equal frames.
     Gradient: none.
     """
-    scales = [(torch.stack((first, second))[:, None] + DARK_OFFSET).log()]
+    scales = [flow_levels(first, second)[:, None]]
     while min(scales[-1].shape[-2:]) >= 2 * SMALLEST_PX:
         scales.append(_halved(scales[-1]))
     matched = next((number for number, levels in enumerate(scales) if min(levels.shape[-2:]) <= MATCHED_PX), len(scales) - 1)
@@ -32,10 +32,15 @@ def flow_both_ways(first, second):
         if flow.shape[-2:] != size:
             growth = torch.tensor([size[1] / flow.shape[3], size[0] / flow.shape[2]], dtype=flow.dtype, device=flow.device)
             flow = interpolate(flow, size, mode="bilinear", align_corners=False) * growth[:, None, None]
-        if number == matched and min(size) > RADIUS_PX:
+        if number == matched:
             flow = with_matches(levels, flow)
         flow = refined(levels, levels.flip(0), flow, WARPS, ITERATIONS)
     return flow
+
+
+def flow_levels(first, second):
+    """[2, H, W] log levels of two frames [H, W] in which motion is looked for."""
+    return (torch.stack((first, second)).detach() + DARK_OFFSET).log()
 
 
 def _halved(levels):

@@ -11,7 +11,7 @@ RADIUS_PX = 9  # displacements looked at, at the scale of matching
 WINDOW_PX = 1  # neighbours on each side
 MOST = 0.5  # log units; larger differences count as this, so that an occluded corner does not decide
 STILLNESS = 5e-4  # log units per pixel: of equals the smaller displacement is taken
-BETTER, MARGIN = 0.7, 3e-3  # a match replaces the flow where its difference is below this share of the flow's, by at least this
+BETTER, MARGIN = 0.7, 0.02  # a match replaces the flow where its difference is below this share of the flow's, by at least this
 AGREEMENT_PX = 1.5  # and where both directions agree
 
 

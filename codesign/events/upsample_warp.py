@@ -24,10 +24,10 @@ def sampled(pictures, displacement_px, mode="bicubic"):
 
 
 def inside(displacement_px):
-    """[B, 1, H, W] 1 where a pixel plus its displacement lies in the picture, else 0."""
+    """[B, 1, H, W] 1 where a pixel plus its displacement lies in the picture, to its edge half a pixel from the outermost centres, else 0."""
     at = places(displacement_px) + displacement_px
-    last = torch.tensor([at.shape[-1] - 1, at.shape[-2] - 1], dtype=at.dtype, device=at.device)[:, None, None]
-    return ((at >= 0) & (at <= last)).all(1, keepdim=True).to(at.dtype)
+    size = torch.tensor([at.shape[-1], at.shape[-2]], dtype=at.dtype, device=at.device)[:, None, None]
+    return ((at >= -0.5) & (at <= size - 0.5)).all(1, keepdim=True).to(at.dtype)
 
 
 def splatted(values, displacement_px):

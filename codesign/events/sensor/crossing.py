@@ -12,6 +12,7 @@ import torch
 from codesign import backend
 from codesign.events.sensor.random_bits import exponential, hashed, normal_pair, uniform
 
+MOST_EVENTS = 1e6  # of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop counting
 CARRIED = ("reference", "level", "input_level", "input", "noise", "last_event_s", "hazard", "shots")  # what changes from frame to frame
 
 
@@ -21,7 +22,8 @@ def run(frames, front_end, dt_s, interval_key, sensor, state, sink):
     Args: frames: [T, ...] float32 or float64, not yet checked. front_end: FrontEnd. dt_s: [T] length of the interval that ends with each frame.
       interval_key: [T] int32, random. sensor: SensorModel. state: SensorState (read only).
       sink: ``EventKeys`` or ``DenseCounts``; takes every event.
-    Returns: dict of the carried tensors after the chunk; bad: whether a value was not finite or negative (then everything else is void).
+    Returns: dict of the carried tensors after the chunk; what was wrong: 0 nothing, 1 a value that is not finite or negative, 2 a pixel with more than
+      ``MOST_EVENTS`` events in an interval (then everything else is void).
     """
     import drjit as dr
 
@@ -34,18 +36,19 @@ def run(frames, front_end, dt_s, interval_key, sensor, state, sink):
     values, end = arr.Float(frames.detach().reshape(-1)), dr.opaque(arr.UInt32, len(frames))
     dr.eval(values, carried, step.held)
 
-    def body(index, bad, *carried):
+    def body(index, bad, busy, *carried):
         value = dr.gather(arr.Float, values, index * pixels + lane)
-        bad |= ~front_end.accepts(dr, value)
-        after = step(index, value, dict(zip(names, carried, strict=True)))
-        return index + 1, bad, *(after[name] for name in names)
+        fits = front_end.accepts(dr, value)
+        after, too_many = step(index, dr.select(fits, value, 1), dict(zip(names, carried, strict=True)))  # an infinite level would fire without end
+        return index + 1, bad | ~fits, busy | too_many, *(after[name] for name in names)
 
     with dr.suspend_grad():
-        _, bad, *carried = dr.while_loop((dr.zeros(arr.UInt32, count), dr.zeros(arr.Bool, count), *carried), lambda index, *_: index < end, body, mode="symbolic")
-        bad = dr.any(bad)
-        dr.eval(carried, bad, sink.arrays())
+        none = dr.zeros(arr.Bool, count)
+        _, bad, busy, *carried = dr.while_loop((dr.zeros(arr.UInt32, count), none, none, *carried), lambda index, *_: index < end, body, mode="symbolic")
+        wrong = dr.max(dr.select(bad, arr.UInt32(1), dr.select(busy, arr.UInt32(2), 0)))
+        dr.eval(carried, wrong, sink.arrays())
     dr.sync_thread()
-    return {name: _unload(arr, value, getattr(state, name)) for name, value in zip(names, carried, strict=True)}, bool(bad[0])
+    return {name: _unload(arr, value, getattr(state, name)) for name, value in zip(names, carried, strict=True)}, int(wrong[0])
 
 
 def _load(arr, tensor):
@@ -107,8 +110,7 @@ class _Step:
         if self.leak_hz is not None:
             rise = self.leak_hz * dt_s
             base = base - (rise * (1 - self.jitter * gauss[1]) if self.jitters else rise) * self.theta_on
-        self._fire(index, dt_s, light, start, signal, base, now)
-        return now
+        return now, self._fire(index, dt_s, light, start, signal, base, now)
 
     def _low_passed(self, share, level, now):
         """Exact answer of the one-pole filter to an input that is linear over the interval; ``share``: interval over time constant."""
@@ -118,7 +120,7 @@ class _Step:
         return level + (now["level"] - now["input_level"]) * fade - (level - now["input_level"]) * mean
 
     def _fire(self, index, dt_s, light, start, signal, base, now):
-        """All events of the interval in order of time; moves the reference, the dead time and the hazard on."""
+        """All events of the interval in order of time; moves the reference, the dead time and the hazard on. Returns where there were too many."""
         dr, arr, sensor = self.dr, self.arr, self.sensor
         dead, shots = "last_event_s" in now, sensor.has_shots
         last_s = now.get("last_event_s", arr.Float(0))
@@ -128,6 +130,8 @@ class _Step:
             on_pace, off_pace = (share * self.half_rate_hz * dt_s * nominal / theta for nominal, theta in zip(self.nominal, (self.theta_on, self.theta_off), strict=True))
             pace = on_pace + off_pace
         end = signal - base
+        too_many = (dr.abs(end) > MOST_EVENTS * dr.minimum(self.theta_on, self.theta_off)) | (pace > MOST_EVENTS)
+        end, pace = dr.select(too_many, 0, end), dr.select(too_many, 0, pace)
         slope = end - start
         rising = end > 0
         hazard, drawn = now.get("hazard", arr.Float(0)), now.get("shots", arr.UInt32(0))
@@ -168,3 +172,4 @@ class _Step:
             now["last_event_s"] = dr.maximum(last_s - dt_s, -1e6)
         if shots:
             now["hazard"], now["shots"] = hazard - pace, drawn
+        return too_many

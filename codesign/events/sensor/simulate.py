@@ -147,9 +147,12 @@ def _random_keys(count, sensor, state, generator):
 def _advance(frames, times_s, keys, sensor, state, front_end, sink):
     """Run the kernel and move the state on; on bad frames raise before anything has changed."""
     dt_s = torch.tensor(times_s, dtype=torch.float64) - torch.tensor([state.time_s, *times_s[:-1]], dtype=torch.float64)
-    carried, bad = crossing.run(frames, front_end, dt_s.to(frames), keys, sensor, state, sink)
-    if bad:
+    carried, wrong = crossing.run(frames, front_end, dt_s.to(frames), keys, sensor, state, sink)
+    if wrong == 1:
         check_frames(frames, 1, non_negative=not front_end.log_input)
+    if wrong:
+        many = f"more than {crossing.MOST_EVENTS:.0f} events between two frames"
+        raise DomainError(f"a pixel would fire {many}; check the unit of the frames (log levels are natural logarithms), the thresholds, the noise rates and the times.")
     for name, tensor in carried.items():
         setattr(state, name, tensor)
     state.time_s = times_s[-1]

@@ -1,0 +1,24 @@
+"""Mean rate of noise events per polarity and light: what no generator can foresee pixel by pixel, but has to give in number."""
+
+import torch
+from torch import nn
+
+from codesign.events.spiking.front import DARK_LIGHT, FULL_LIGHT
+
+
+class NoiseRate(nn.Module):
+    """rate = a exp(-b light) events per pixel and second, light = (I + 20)/275, one a per polarity; a starts at 0.
+
+    amplitude_hz below 0 counts as 0.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.amplitude_hz = nn.Parameter(torch.zeros(2))
+        self.fade = nn.Parameter(torch.ones(()))
+
+    def forward(self, intensity):
+        """intensity: [T, ...]; returns [T, 2, ...], ON first."""
+        shape = torch.exp(-self.fade * (intensity + DARK_LIGHT) / FULL_LIGHT)
+        on, off = self.amplitude_hz.clamp(min=0)
+        return torch.stack((on * shape, off * shape), dim=1)
