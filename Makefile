@@ -6,7 +6,7 @@ PYTHON ?=
 ARGS ?=
 RUN := .venv/bin/python
 
-.PHONY: help setup lens-opt lens-report lens-scratch lens-tolerance lens-bench silhouettes dataset placement speed-error stability gradcheck test lint doctor clean
+.PHONY: help setup lens-opt lens-report lens-scratch lens-tolerance lens-bench silhouettes dataset video-to-events event-gradient event-bench srm-bench davis placement speed-error stability gradcheck test lint doctor clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1|/p' Makefile | awk -F'|' '{printf "%-20s %s\n", $$1, $$2}'
@@ -43,6 +43,22 @@ silhouettes: setup ## gradients where objects hide one another
 
 dataset: setup ## render trajectories with events and ground truth
 	@$(RUN) -m studies.make_dataset $(ARGS)
+
+video-to-events: setup ## events out of a video: make video-to-events ARGS="--input clip.mp4"
+	@$(RUN) -m studies.video_to_events $(ARGS)
+
+event-gradient: setup ## gradients of the event layers against differences of hard counts
+	@$(RUN) -m studies.event_gradient $(ARGS)
+
+event-bench: setup ## speed and memory of the event stage
+	@$(RUN) -m studies.event_bench $(ARGS)
+
+srm-bench: setup ## the spiking layer against a convolution and two spiking libraries (installs them)
+	@$(RUN) -m pip install --disable-pip-version-check --quiet --editable ".[bench]" --constraint constraints.txt
+	@$(RUN) -m studies.srm_bench $(ARGS)
+
+davis: setup ## a sensor fitted to a real recording, judged on its other half
+	@$(RUN) -m studies.davis_fit $(ARGS)
 
 placement: setup ## where to mount the camera on a robot
 	@$(RUN) -m studies.placement $(ARGS)

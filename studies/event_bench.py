@@ -5,6 +5,7 @@ costs depends on how often it fires, so both are told. The last part streams fra
 """
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import matplotlib.pyplot as plt
@@ -95,7 +96,7 @@ def timed(frames, repeats):
         leaf.grad = None
         layer(leaf).backward(weight)
 
-    works = {name: lambda sensor=sensor: events.simulate(frames, t_s, sensor) for name, sensor in SENSORS.items()}
+    works: dict[str, Callable] = {name: lambda sensor=sensor: events.simulate(frames, t_s, sensor) for name, sensor in SENSORS.items()}
     works["hard, v2e timing"] = lambda: events.simulate(frames, t_s, events.SensorModel(timing="v2e"))
     works["memory, forward"] = lambda: events.memory(frames, THETA, THETA)
     works["memory, forward + backward"] = lambda: differentiated(lambda f: events.memory(f, THETA, THETA)[0])

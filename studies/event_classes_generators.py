@@ -12,17 +12,19 @@ import torch
 
 from codesign import events
 from codesign.types import EventStream
-from studies.event_classes_saccades import DURATION_S, frame_times, frames
+from studies.event_classes_saccades import frame_times, frames
 
-SENSOR = replace(events.PRESETS["noisy"], refractory_s=1e-3)  # v2e's published hard case, with the dead time it leaves out
-THETAS = (0.1, 0.15, 0.3, 0.4, 0.6)  # tried beside the nominal threshold, which is the sensor's own
+# v2e's noisy preset with unequal thresholds and a dead time: what an ideal sensor lacks, all at once
+SENSOR = replace(events.PRESETS["noisy"], theta_on=0.18, theta_off=0.22, refractory_s=1e-3)
+NOMINAL_THETA = 0.2  # mean of the sensor's own
+THETAS = (0.07, 0.1, 0.15, NOMINAL_THETA, 0.3, 0.45, 0.6)
 PICTURES_AT_ONCE = 50
 
 
 @dataclass(frozen=True)
 class Source:
-    """A generator as the study lists it. key: in metrics.json. label: on the page. rate: "video" or "sensor", which frames it sees.
-    make: the generator; with ``searched`` instead a function from a threshold to one. fresh_noise: its events differ from call to call.
+    """A generator as the study lists it. key: in metrics.json. label: on the page. make: the generator; with ``searched`` instead a function from a
+    threshold to one. rate: "video" or "sensor", which frames it sees.
     """
 
     key: str
@@ -54,10 +56,12 @@ def of_naive(theta):
 
 PHYSICAL = Source("physical", "physical sensor (upper bound)", of_sensor(SENSOR), rate="sensor")
 SOURCES = (
-    Source("naive", "naive, θ 0.2", of_naive(SENSOR.theta_on)),
+    Source("naive", "naive, θ 0.2", of_naive(NOMINAL_THETA)),
     Source("naive_best", "naive, best θ", of_naive, searched=True),
-    Source("esim", "ESIM, θ 0.2", of_ideal(SENSOR.theta_on)),
+    Source("esim", "ESIM, θ 0.2", of_ideal(NOMINAL_THETA)),
     Source("esim_best", "ESIM, best θ", of_ideal, searched=True),
+    Source("esim_shots", "ESIM, θ 0.2, with shot noise", of_sensor(events.SensorModel(NOMINAL_THETA, NOMINAL_THETA, shot_rate_hz=SENSOR.shot_rate_hz))),
+    Source("sensor_on_video", "physical sensor's model on video", of_sensor(SENSOR)),
     Source("v2e", "v2e, default sensor", of_sensor(replace(events.PRESETS["default"], timing="v2e"))),
 )
 

@@ -11,6 +11,7 @@ from studies.event_classes_pictures import CLASSES
 
 WIDTH = 16
 BATCH = 50
+SHIFT_PX = 2  # recordings are learnt from at random places
 RATE, DECAY = 4e-3, 1e-2  # peak learning rate and weight decay of AdamW
 
 
@@ -70,7 +71,7 @@ def train(voxels, labels, epochs, seed, device="cpu"):
     for _ in range(epochs):
         for chosen in torch.randperm(len(voxels), generator=generator).tensor_split(batches):
             optimiser.zero_grad()
-            F.cross_entropy(net(voxels[chosen].to(device)), labels[chosen].to(device)).backward()
+            F.cross_entropy(net(shifted(voxels[chosen].to(device), generator)), labels[chosen].to(device)).backward()
             optimiser.step()
             schedule.step()
     return net.eval()
@@ -80,6 +81,13 @@ def train(voxels, labels, epochs, seed, device="cpu"):
 def predict(net, voxels, device="cpu"):
     """Most likely class of every recording, [N] int64."""
     return torch.cat([net(part.to(device)).argmax(1).cpu() for part in voxels.split(500)])
+
+
+def shifted(voxels, generator):
+    """A batch moved by the same random whole number of pixels, up to SHIFT_PX each way; what leaves is lost, what enters is empty."""
+    row, column = torch.randint(2 * SHIFT_PX + 1, (2,), generator=generator).tolist()
+    height, width = voxels.shape[-2:]
+    return F.pad(voxels, (SHIFT_PX,) * 4)[..., row : row + height, column : column + width]
 
 
 def _conv(inputs, outputs, size, stride):

@@ -19,15 +19,15 @@ from codesign.errors import DomainError
 from scenes import textures
 
 CLASSES = 10
-FONTS = ("DejaVuSans", "DejaVuSans-BoldOblique", "DejaVuSansMono", "DejaVuSerif", "DejaVuSerif-Bold", "STIXGeneral", "STIXGeneralBolIta", "cmr10", "cmss10", "cmtt10")
+FONTS = ("DejaVuSans", "DejaVuSans-BoldOblique", "DejaVuSansMono", "DejaVuSerif", "STIXGeneral", "cmss10")
 PHOTOS = {"training": ("gravel", "coffee", "astronaut", "rocket", "camera"), "test": ("brick", "grass", "chelsea", "hubble_deep_field")}
 TILE_PX = 64  # the window of the sensor is its middle; the rest moves in and out of sight
 BORDER_PX = 8  # here a tile fades to its mean, so that it can be repeated without a seam; never in sight
 FINE = 4  # raster points per pixel and axis
-HEIGHT_PX, OFFSET_PX, TURN_DEG = (13.0, 22.0), 3.0, 15.0
-CONTRAST = (0.25, 0.8)  # natural log of digit over background, either sign
-CLUTTER = 0.35  # exponent of the photograph: 1 leaves it as it is, 0 makes it even
-LIGHT = (15.0, 150.0)  # mean intensity of a picture, 0-255 scale
+HEIGHT_PX, OFFSET_PX, TURN_DEG = (18.0, 22.0), 1.5, 6.0
+CONTRAST = (0.4, 0.9)  # natural log of digit over background, either sign
+CLUTTER = 0.15  # exponent of the photograph: 1 leaves it as it is, 0 makes it even
+LIGHT = (30.0, 200.0)  # mean intensity of a picture, 0-255 scale
 BLUR_PX = 0.7  # standard deviation of the lens's Gaussian blur
 
 

@@ -1,7 +1,6 @@
-"""Sequences to learn from and to be judged on: frames, their times, and the hard events of a physical sensor, rendered or recorded."""
+"""Sequences to learn from and to be judged on: frames, their times, and the hard events of a physical sensor, rendered."""
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -9,19 +8,16 @@ from torch import Tensor
 from codesign import events, render
 from codesign.events import SensorModel
 from studies import make_dataset
-from studies.davis_fit_recording import Recording
-from studies.davis_fit_upsample import between, flows
 from studies.make_dataset_motion import LEAD_S, motion
 
 RATE_HZ = 500.0
 SIZE_PX = 64
 RENDERED_TOGETHER = 40
-# v2e's noisy preset with unequal thresholds and a dead time: what an ideal sensor lacks, all at once
+# what an ideal sensor lacks, all at once: unequal thresholds that scatter, bandwidth, leak, noise, dead time
 SENSOR = SensorModel(0.18, 0.22, theta_sigma=0.03, cutoff_hz=60.0, leak_rate_hz=0.1, leak_jitter=0.1, rate_cov_decades=0.1, shot_rate_hz=0.5, refractory_s=1e-3)
 TRAINING = [(world, family, 10 + k) for world in ("room", "corridor", "checkerboard") for k, family in enumerate(("driving", "orbital", "flying", "vertical"))]
 UNSEEN_MOTION = [("room", "flying", 50), ("corridor", "driving", 51), ("room", "radial", 52)]
 UNSEEN_WORLD = [("outdoor", "flying", 60), ("outdoor", "driving", 61), ("tabletop", "flying", 62), ("tabletop", "orbital", 63)]
-STEPS_PER_INTERVAL = 8  # of the recording: 5 ms
 
 
 @dataclass(frozen=True)
@@ -57,19 +53,14 @@ def hard(frames, t_s, sensor, seed):
     return events.dense_counts(frames, t_s, sensor, torch.Generator().manual_seed(seed))
 
 
-def upsampled(recording: Recording, steps=STEPS_PER_INTERVAL, advance=lambda: None):
-    """The recording as one Sequence: steps between frames moved along their optical flow, events counted between them."""
-    parts = []
-    for first, second in pairwise(recording.frames):
-        parts.append(between(first, second, *flows(first, second), steps))
-        advance()
-    share = torch.arange(steps, dtype=torch.float64) / steps
-    start_s, length_s = recording.mid_s[:-1, None], recording.mid_s.diff()[:, None]
-    t_s = torch.cat(((start_s + share * length_s).flatten(), recording.mid_s[-1:]))
-    return Sequence("DAVIS recording", torch.cat((*parts, recording.frames[-1:])), t_s, events.to_counts(recording.stream, t_s))
-
-
 def part(sequence, first, last):
     """Intervals ``first`` to ``last`` - 1 of a sequence."""
     again = None if sequence.again is None else sequence.again[first:last]
     return replace(sequence, frames=sequence.frames[first : last + 1], t_s=sequence.t_s[first : last + 1], counts=sequence.counts[first:last], again=again)
+
+
+def tiles(sequence, rows=4, columns=4):
+    """The picture cut into equal parts, what is left over at the far edges left out: list of Sequences."""
+    height, width = (side // number for side, number in zip(sequence.frames.shape[1:], (rows, columns), strict=True))
+    windows = [(..., slice(y * height, (y + 1) * height), slice(x * width, (x + 1) * width)) for y in range(rows) for x in range(columns)]
+    return [replace(sequence, frames=sequence.frames[window], counts=sequence.counts[window]) for window in windows]

@@ -1,5 +1,7 @@
 """Training: Spike-ESIM and the thesis network by van Rossum and count loss, ESIM's single threshold by search."""
 
+import math
+
 import torch
 
 from codesign import events
@@ -7,10 +9,9 @@ from codesign.events import SensorModel
 from codesign.events.spiking.losses import count_loss, van_rossum
 
 TAU_S = 0.01  # of the van Rossum loss, as in the thesis
-COUNT_WEIGHT = 0.1
-CROP_PX, BATCH = 32, 4
-SLOW, FAST = 3e-3, 2e-2  # step of Adam for convolution weights and for single physical numbers
-THETAS = [0.1 * 1.12**k for k in range(26)]  # 0.1 to 1.7
+CROP_PX, BATCH = 32, 2
+SLOW, FAST, NOISE = 3e-3, 2e-2, 5e-2  # step of Adam for convolution weights and for single physical numbers, for noise rates (Hz)
+THETAS = [0.12 * 1.15**k for k in range(18)]  # 0.12 to 1.3
 COUNT_BLOCK = {"side_px": 8, "steps": 8}
 
 
@@ -25,21 +26,26 @@ def pooled_distance(found, target):
     return count_loss(found, target, **COUNT_BLOCK) / count_loss(torch.zeros_like(target), target, **COUNT_BLOCK)
 
 
-def objective(found, target, dt_s):
+def objective(found, target, dt_s, count_weight):
     """What is made small: van Rossum distance and a share of the pooled one."""
-    return distance(found, target, dt_s) + COUNT_WEIGHT * pooled_distance(found, target)
+    return distance(found, target, dt_s) + count_weight * pooled_distance(found, target)
 
 
 def crops(sequences, generator, batch=BATCH, size_px=CROP_PX):
-    """A batch of random squares out of random sequences of one length and rate: frames [T, B, h, w], t_s [T], counts [T-1, 2, B, h, w]."""
-    frames, counts = [], []
-    for _ in range(batch):
-        sequence = sequences[_integer(len(sequences), generator)]
-        y, x = (_integer(side - size_px + 1, generator) for side in sequence.frames.shape[1:])
-        window = (..., slice(y, y + size_px), slice(x, x + size_px))
-        frames.append(sequence.frames[window])
-        counts.append(sequence.counts[window])
-    return torch.stack(frames, 1), sequences[0].t_s, torch.stack(counts, 2)
+    """A batch of random squares out of random sequences of one length and rate: frames [T, B, h, w], t_s [T], counts [T-1, 2, B, h, w].
+
+    A batch without any event has no relative loss; then another is drawn.
+    """
+    while True:
+        frames, counts = [], []
+        for _ in range(batch):
+            sequence = sequences[_integer(len(sequences), generator)]
+            y, x = (_integer(side - size_px + 1, generator) for side in sequence.frames.shape[1:])
+            window = (..., slice(y, y + size_px), slice(x, x + size_px))
+            frames.append(sequence.frames[window])
+            counts.append(sequence.counts[window])
+        if any(bool(part.any()) for part in counts):
+            return torch.stack(frames, 1), sequences[0].t_s, torch.stack(counts, 2)
 
 
 def parameter_groups(model):
@@ -47,19 +53,19 @@ def parameter_groups(model):
     slow = [parameter for name, parameter in model.named_parameters() if name.startswith(("branch", "prefilter"))]
     fast = [parameter for name, parameter in model.named_parameters() if not name.startswith(("branch", "prefilter", "noise"))]
     noise = [parameter for name, parameter in model.named_parameters() if name.startswith("noise")]
-    return [{"params": slow, "lr": SLOW}, {"params": fast, "lr": FAST}, {"params": noise, "lr": 5 * FAST}]
+    return [{"params": slow, "lr": SLOW}, {"params": fast, "lr": FAST}, {"params": noise, "lr": NOISE}]
 
 
-def train_ours(model, sequences, steps, generator, advance, optimiser=None, first=0):
-    """Adam, its step falling as a half cosine to a twentieth. ``optimiser``, ``first``: of an earlier session. Returns losses."""
-    optimiser = optimiser or make_optimiser(model)
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: 0.05 + 0.475 * (1 + torch.cos(torch.tensor(torch.pi * step / steps)).item()))
-    losses = []
-    for _ in range(first, steps):
-        frames, t_s, counts = crops(sequences, generator)
+def train_ours(model, sequences, steps, generator, advance, until=None, *, count_weight=0.1, **options):
+    """Adam, its step falling as a half cosine to a twentieth over ``steps``; stops after ``until`` steps. options: of ``crops``. Returns losses."""
+    optimiser, losses = torch.optim.Adam(parameter_groups(model), betas=(0.9, 0.98)), []
+    falling = lambda step: 0.05 + 0.475 * (1 + math.cos(math.pi * step / steps))  # noqa: E731
+    late = lambda step: float(2 * step >= steps)  # noqa: E731  noise is what remains when the signal is learnt
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, [falling, falling, late])
+    for _ in range(steps if until is None else until):
+        frames, t_s, counts = crops(sequences, generator, **options)
         found, _ = model(frames, t_s)
-        dt_s = float(t_s[1] - t_s[0])
-        loss = objective(found + model.expected_noise(frames, t_s), counts, dt_s)
+        loss = objective(found + model.expected_noise(frames, t_s), counts, float(t_s[1] - t_s[0]), count_weight)
         optimiser.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -70,17 +76,13 @@ def train_ours(model, sequences, steps, generator, advance, optimiser=None, firs
     return losses
 
 
-def make_optimiser(model):
-    return torch.optim.Adam(parameter_groups(model), betas=(0.9, 0.98))
-
-
-def train_thesis(network, sequences, steps, generator, advance):
+def train_thesis(network, sequences, steps, generator, advance, light=32.0):
     """The thesis' way: Adam at 0.01, van Rossum loss alone, one sequence after the other. Returns losses."""
     optimiser, losses = torch.optim.Adam(network.parameters(), lr=0.01), []
     for _ in range(steps):
         sequence = sequences[_integer(len(sequences), generator)]
-        spikes, _, _ = network(sequence.frames / 255)
-        loss = distance(spikes, sequence.counts, sequence.dt_s)
+        spikes, _, _ = network(sequence.frames / light)
+        loss = van_rossum(spikes, sequence.counts, tau_s=TAU_S, dt=sequence.dt_s)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -89,18 +91,23 @@ def train_thesis(network, sequences, steps, generator, advance):
     return losses
 
 
+def total_distance(generate, sequences):
+    """Van Rossum loss of all sequences together over that of silence. generate: function from a sequence to counts."""
+    sums = torch.zeros(2, dtype=torch.float64)
+    for sequence in sequences:
+        for k, found in enumerate((generate(sequence), torch.zeros_like(sequence.counts))):
+            sums[k] += float(van_rossum(found, sequence.counts, tau_s=TAU_S, dt=sequence.dt_s))
+    return float(sums[0] / sums[1])
+
+
 def best_theta(sequences):
-    """The single threshold with which ESIM comes closest to all sequences, by van Rossum distance."""
-
-    def mean_distance(theta):
-        return sum(float(distance(esim(sequence, theta), sequence.counts, sequence.dt_s)) for sequence in sequences) / len(sequences)
-
-    return min(THETAS, key=mean_distance)
+    """The single threshold with which ESIM comes closest to all sequences together, by van Rossum distance."""
+    return min(THETAS, key=lambda theta: total_distance(lambda sequence: esim_counts(sequence.frames, sequence.t_s, theta), sequences))
 
 
-def esim(sequence, theta):
+def esim_counts(frames, t_s, theta):
     """Counts of the ideal sensor."""
-    return events.dense_counts(sequence.frames, sequence.t_s, SensorModel(theta, theta))
+    return events.dense_counts(frames, t_s, SensorModel(theta, theta))
 
 
 def _integer(limit, generator):

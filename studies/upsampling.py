@@ -74,7 +74,8 @@ def _measured(run, name, shown, stride):
 
 
 def _caption(name, stride):
-    return f"{SCENES[name].capitalize()}; {stride * STEP_PX:.3g} px between the frames kept. Above: the middle of the first interval; below: events of the whole sequence, red ON, blue OFF."
+    above = "Above: the middle of the first interval, and what is wrong in it (full colour: a fifth of the brightest)"
+    return f"{SCENES[name].capitalize()}; {stride * STEP_PX:.3g} px between the frames kept. {above}; below: events of the whole sequence, red ON, blue OFF."
 
 
 def _recording(name, path, factors):

@@ -18,9 +18,9 @@ def side_by_side(shown, stride, exact, blended, truth, streams):
     for axis, name, frames in zip(axes[0], ("true", "upsampled", "blended"), (shown.frames, exact, blended), strict=False):
         axis.imshow(frames[middle].numpy(), cmap="gray", vmin=0, vmax=bright)
         axis.set_title(f"{name}, frame {middle}", fontsize=9)
-    difference = (exact - shown.frames)[middle].numpy()
+    difference = (exact[middle] - shown.frames[middle]).numpy()
     axes[0][3].imshow(difference, cmap="RdBu_r", vmin=-0.2 * bright, vmax=0.2 * bright)
-    axes[0][3].set_title("upsampled - true, colour full at a fifth of the brightest", fontsize=9)
+    axes[0][3].set_title("upsampled - true", fontsize=9)
     for axis, name in zip(axes[1], ("true", *WAYS), strict=True):
         stream = truth if name == "true" else streams[name]
         axis.imshow(events.picture(events.to_counts(stream, ends)[0], FULL_COLOUR).numpy())

@@ -24,8 +24,8 @@ FIELD_DEG, SAMPLES = 45.0, 16
 
 @dataclass(frozen=True)
 class Sequence:
-    """frames: [T, H, W]. flow_px, seen: functions of a stride to true flow [n, 2, H, W] between the frames 0, stride, 2 stride, ... and whether the point
-    lies in the later frame, not hidden, [n, H, W] bool."""
+    """frames: [T, H, W]. truth: {stride: (flow, seen)} between the frames 0, stride, 2 stride, ...: true flow [n, 2, H, W], px, and whether a point is in
+    the later frame and not hidden there, [n, H, W] bool."""
 
     frames: Tensor
     truth: dict

@@ -50,6 +50,8 @@ def _motion_at(flows, seen, share):
     total = carried[0] + carried[1]
     motion, mass = total[..., :2].permute(2, 0, 1), total[..., 2]
     empty, width = mass < LEAST, HOLE_PX
+    if bool(empty.all()):  # everything left the picture: blend where it stands
+        return torch.zeros_like(motion), torch.ones_like(seen)
     motion = motion / mass.clamp(min=LEAST)
     while bool(empty.any()):
         known = (~empty).to(motion.dtype)

@@ -8,7 +8,7 @@ from codesign.events.upsample_tvl1 import refined
 
 DARK_OFFSET = 12.0  # on the 0-255 scale: flow is found on ln(I + 12), so that dark edges count about as the sensor sees them
 SMALLEST_PX = 12  # shorter side of the coarsest scale
-MATCHED_PX = 80  # matches are sought at the first scale whose shorter side is at most this: there they reach an eighth of the picture
+MATCHED_PX = 80  # matches are sought at the first scale whose shorter side is at most this: there they reach a ninth of it or more
 PREFILTER_PX = 1.04  # standard deviation of the blur before every halving
 WARPS, ITERATIONS = 4, 20
 
@@ -21,6 +21,8 @@ def flow_both_ways(first, second):
     Returns: [2, 2, H, W]: from the first to the second, and from the second to the first; pixels, +x right, +y down. Exactly 0 for equal frames.
     Gradient: none.
     """
+    if torch.equal(first, second):
+        return first.new_zeros(2, 2, *first.shape)
     scales = [flow_levels(first, second)[:, None]]
     while min(scales[-1].shape[-2:]) >= 2 * SMALLEST_PX:
         scales.append(_halved(scales[-1]))
@@ -39,8 +41,10 @@ def flow_both_ways(first, second):
 
 
 def flow_levels(first, second):
-    """[2, H, W] log levels of two frames [H, W] in which motion is looked for."""
-    return (torch.stack((first, second)).detach() + DARK_OFFSET).log()
+    """[2, H, W] log levels of two frames [H, W] in which motion is looked for; light that changed everywhere alike (their median) is taken out."""
+    levels = (torch.stack((first, second)).detach() + DARK_OFFSET).log()
+    levels[1] -= (levels[1] - levels[0]).median()
+    return levels
 
 
 def _halved(levels):

@@ -3,7 +3,7 @@
 import torch
 
 DOUBTED = 0.5  # visibility below which the flow of a pixel is replaced
-SAMPLES = 7  # on each side: a neighbourhood is looked at in 15 x 15 places
+SAMPLES = 4  # on each side: a neighbourhood is looked at in 9 x 9 places
 REACH = 1.5  # times the largest difference of motion: a hidden strip is at most as wide as that
 ALIKE = 0.15  # log units
 NEAR = 0.3  # share of the reach: standard deviation of the weight by distance

@@ -1,6 +1,9 @@
 """Dense optical flow at one scale: total variation of the flow against the absolute brightness difference, by alternating closed-form steps."""
 
+from dataclasses import dataclass
+
 import torch
+from torch import Tensor
 from torch.nn.functional import pad
 
 from codesign.events.upsample_warp import inside, sampled
@@ -25,21 +28,17 @@ def refined(first, second, flow, warps, iterations):
       a median filter between warps as in Wedel et al., An improved algorithm for TV-L1 optical flow, 2009.
     """
     dual_x, dual_y = torch.zeros_like(flow), torch.zeros_like(flow)
-    limit = DATA_WEIGHT * COUPLING
+    buffers = Buffers(flow)
     for _ in range(warps):
         flow = median(flow)
         seen = inside(flow)
         warped = sampled(second, flow)
         gradient = _gradient((warped + first) / 2) * seen
         square = gradient.square().sum(1, keepdim=True) + LEAST_GRADIENT
-        along, most = gradient / square, limit * square
         constant = (warped - first) * seen - (gradient * flow).sum(1, keepdim=True)
+        data = Linear(constant, gradient, gradient / square, DATA_WEIGHT * COUPLING * square, -DATA_WEIGHT * COUPLING * square)
         for _ in range(iterations):
-            residual = torch.addcmul(torch.addcmul(constant, gradient[:, :1], flow[:, :1]), gradient[:, 1:], flow[:, 1:])
-            flow = flow - torch.minimum(torch.maximum(residual, -most), most) * along + COUPLING * _divergence(dual_x, dual_y)
-            dx, dy = pad(flow.diff(dim=3), (0, 1)), pad(flow.diff(dim=2), (0, 0, 0, 1))
-            scale = 1 / (1 + DUAL_STEP / COUPLING * torch.sqrt(dx * dx + dy * dy))
-            dual_x, dual_y = (dual_x + DUAL_STEP / COUPLING * dx) * scale, (dual_y + DUAL_STEP / COUPLING * dy) * scale
+            _iterate(flow, dual_x, dual_y, data, buffers)
     return median(flow)
 
 
@@ -53,13 +52,43 @@ def median(field):
     return values[4]
 
 
+@dataclass(frozen=True)
+class Linear:
+    """The brightness difference about a flow: constant + gradient . flow, [B, 1, H, W] and [B, 2, H, W]; the step along it and its bounds."""
+
+    constant: Tensor
+    gradient: Tensor
+    along: Tensor
+    most: Tensor
+    least: Tensor
+
+
+class Buffers:
+    """Memory that all iterations share: allocating it anew takes longer than the arithmetic."""
+
+    def __init__(self, flow):
+        self.residual, self.divergence, self.size = flow.new_empty(flow[:, :1].shape), torch.empty_like(flow), torch.empty_like(flow)
+        self.across, self.down = torch.zeros_like(flow), torch.zeros_like(flow)  # the last column and row stay 0
+
+
+def _iterate(flow, dual_x, dual_y, data, buffers):
+    """One step of the data term, one of the smoothness, in place."""
+    residual, divergence, size, across, down = buffers.residual, buffers.divergence, buffers.size, buffers.across, buffers.down
+    torch.addcmul(data.constant, data.gradient[:, :1], flow[:, :1], out=residual)
+    residual.addcmul_(data.gradient[:, 1:], flow[:, 1:])
+    torch.minimum(residual, data.most, out=residual)
+    torch.maximum(residual, data.least, out=residual)
+    torch.add(dual_x, dual_y, out=divergence)
+    divergence[..., 1:] -= dual_x[..., :-1]
+    divergence[..., 1:, :] -= dual_y[..., :-1, :]
+    flow.addcmul_(residual, data.along, value=-1).add_(divergence, alpha=COUPLING)
+    torch.sub(flow[..., 1:], flow[..., :-1], out=across[..., :-1])
+    torch.sub(flow[..., 1:, :], flow[..., :-1, :], out=down[..., :-1, :])
+    torch.mul(across, across, out=size).addcmul_(down, down).sqrt_().mul_(DUAL_STEP / COUPLING).add_(1)
+    dual_x.add_(across, alpha=DUAL_STEP / COUPLING).div_(size)
+    dual_y.add_(down, alpha=DUAL_STEP / COUPLING).div_(size)
+
+
 def _gradient(picture):
     around = pad(picture, (1, 1, 1, 1), mode="replicate")
     return torch.cat((around[..., 1:-1, 2:] - around[..., 1:-1, :-2], around[..., 2:, 1:-1] - around[..., :-2, 1:-1]), 1) / 2
-
-
-def _divergence(dual_x, dual_y):
-    total = dual_x + dual_y
-    total[..., 1:] -= dual_x[..., :-1]
-    total[..., 1:, :] -= dual_y[..., :-1, :]
-    return total

@@ -13,9 +13,9 @@ import torch
 
 from codesign.errors import DomainError, FileFormatError, ShapeError
 from codesign.events import decay, decay_video, gray_picture, picture, rates, write_video
+from codesign.events.stream import ordered
 from codesign.events.views.rate_curves import rate_figure
 from codesign.events.views.space_time import sample, space_time_figure
-from codesign.events.stream import ordered
 
 COUNTS = torch.tensor([[[4.0, 0, 2, 0]], [[0, 4, 2, 0]]])  # [2, 1, 4]: four ON, four OFF, two of each, none
 

@@ -52,12 +52,12 @@ class EventLayer(nn.Module):
         if self.kind == "sensor":
             design = {name: self.value(name) for name in self.log_values}
             return sensor_counts(frames, t_s, self.sensor, generator=torch.Generator().manual_seed(self.seed), state=state, log_input=self.log_input, **design)
-        thetas = self._thetas(frames)
+        theta_on, theta_off = self._thetas(frames)
         if self.kind == "sigmoid":
-            return self._sigmoid(frames, thetas, state)
+            return self._sigmoid(frames, (theta_on, theta_off), state)
         if self.kind == "expected":
-            return expected(frames, *thetas, self.spread, state=state, log_input=self.log_input)
-        return {"memory": memory, "dense": dense}[self.kind](frames, *thetas, state=state, log_input=self.log_input)
+            return expected(frames, theta_on, theta_off, self.spread, state=state, log_input=self.log_input)
+        return {"memory": memory, "dense": dense}[self.kind](frames, theta_on, theta_off, state=state, log_input=self.log_input)
 
     def _thetas(self, frames):
         """Thresholds ON and OFF, with the mismatch of every pixel where the layer knows mismatch."""

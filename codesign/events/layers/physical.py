@@ -62,7 +62,7 @@ def sensor_counts(frames, t_s, sensor, *, generator=None, state=None, log_input=
         level = low_pass(level, frames.exp() if log_input else frames, interval_s, value["cutoff_hz"], None if state is None else state.level)
     thetas = [_drawn(value[name], value["theta_sigma"], None if draws is None else draws[index], level) for index, name in enumerate(("theta_on", "theta_off"))]
     seen = level
-    if hard_sensor.leaks:  # a memorised level that falls is a signal that rises
+    if hard_state.leak_hz is not None:  # a memorised level that falls is a signal that rises
         seen = level + ((times_s - times_s[0]).to(level).reshape(-1, *[1] * (level.ndim - 1)) * hard_state.leak_hz * thetas[0])
     smooth, reference = memory(seen[1:], *thetas, state=seen[0] if state is None else state.reference, log_input=True)
     if hard_sensor.refractory_s > 0:

@@ -98,7 +98,7 @@ class _Step:
             now["input_level"] = level
         else:
             now["level"] = level
-        gauss = normal_pair(dr, self.arr, self.key ^ dr.gather(self.arr.UInt32, self.interval_key, index)) if self.jitters or sensor.photoreceptor_noise else None
+        gauss = normal_pair(dr, self.arr, self.key ^ dr.gather(self.arr.UInt32, self.interval_key, index)) if self.jitters or sensor.photoreceptor_noise else (0.0, 0.0)
         signal = now["level"]
         if sensor.photoreceptor_noise:
             keep = dr.exp(-self.omega * dt_s)

@@ -53,6 +53,7 @@ def simulate(frames, t_s, sensor, generator=None, state=None, *, log_input=False
     if sensor.timing == "v2e":
         stream = _v2e_events(frames, times_s, sensor, generator, moved, front_end)
     else:
+        assert moved.time_s is not None  # set by the first frame
         layout = KeyLayout(round(moved.time_s * 1e6), height_px, width_px)
         _check_range(layout, times_s[-1])
         keys, size, density = [], max(CHUNK_FRAMES, CHUNK_PIXELS // (height_px * width_px)), EVENTS_PER_PIXEL
@@ -60,7 +61,8 @@ def simulate(frames, t_s, sensor, generator=None, state=None, *, log_input=False
             chunk = slice(first, first + size)
             keys.append(_interpolated_keys(frames[chunk], times_s[chunk], sensor, generator, moved, front_end, layout, density))
             density = 1.25 * len(keys[-1]) / frames[chunk].numel()
-        stream = EventStream(*layout.columns(keys[0] if len(keys) == 1 else np.concatenate(keys)), height_px, width_px)
+        t_us, x, y, p = layout.columns(keys[0] if len(keys) == 1 else np.concatenate(keys))
+        stream = EventStream(t_us, x, y, p, height_px, width_px)
     state.__dict__.update(moved.__dict__)
     return stream
 

@@ -49,7 +49,7 @@ def begin(state, sensor, frame, level, time_s, generator):
     """
     pixels, place = level.shape, {"dtype": level.dtype, "device": level.device}
     exact = sensor.timing == "v2e" and sensor.theta_sigma == 0  # v2e keeps drawn thresholds in single, nominal ones in double precision
-    state.theta_on, state.theta_off = draw_thresholds(sensor, pixels, generator, **(place | {"dtype": torch.float64} if exact else place))
+    state.theta_on, state.theta_off = draw_thresholds(sensor, pixels, generator, dtype=torch.float64 if exact else level.dtype, device=level.device)
     state.reference, state.level = level.clone(), level.clone()
     state.start_s = state.time_s = time_s
     if sensor.leaks:

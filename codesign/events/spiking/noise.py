@@ -9,7 +9,7 @@ from codesign.events.spiking.front import DARK_LIGHT, FULL_LIGHT
 class NoiseRate(nn.Module):
     """rate = a exp(-b light) events per pixel and second, light = (I + 20)/275, one a per polarity; a starts at 0.
 
-    amplitude_hz below 0 counts as 0.
+    amplitude_hz below 0 counts as 0 but keeps its gradient, so that it finds its way back.
     """
 
     def __init__(self):
@@ -20,5 +20,5 @@ class NoiseRate(nn.Module):
     def forward(self, intensity):
         """intensity: [T, ...]; returns [T, 2, ...], ON first."""
         shape = torch.exp(-self.fade * (intensity + DARK_LIGHT) / FULL_LIGHT)
-        on, off = self.amplitude_hz.clamp(min=0)
+        on, off = self.amplitude_hz + (self.amplitude_hz.clamp(min=0) - self.amplitude_hz).detach()
         return torch.stack((on * shape, off * shape), dim=1)

@@ -37,8 +37,8 @@ class TwoBranchSpikes(nn.Module):
             raise DomainError(f"channels is {channels!r}; give 3 for RGB or 1 for monochrome frames.")
         draw = torch.rand(2, channels, 3, 3, generator=torch.Generator().manual_seed(seed)) / (9 * channels)
         self.weight_on, self.weight_off = nn.Parameter(draw[0]), nn.Parameter(draw[1])
-        self.theta, self.smoothing_tau = theta, smoothing_tau
-        self._options = {"tau_r": tau_r, "dt": dt, "kernel": kernel, "surrogate": surrogate, "through_reset": through_reset}
+        self.theta, self.dt, self.smoothing_tau = theta, dt, smoothing_tau
+        self._options = {"tau_r": tau_r, "kernel": kernel, "surrogate": surrogate, "through_reset": through_reset}
 
     def forward(self, frames, state=None, *, theta=None):
         """Spikes of the frames.
@@ -53,7 +53,7 @@ class TwoBranchSpikes(nn.Module):
         """
         drive, last = self._drive(frames, state)
         neurons = None if state is None else state.neurons
-        spikes, potential, neurons = srm(drive, theta=self.theta if theta is None else theta, state=neurons, **self._response(), **self._options)
+        spikes, potential, neurons = srm(drive, theta=self.theta if theta is None else theta, state=neurons, dt=self.dt, **self._response(), **self._options)
         return spikes, potential, BranchState(last, neurons)
 
     @torch.no_grad()
@@ -64,7 +64,7 @@ class TwoBranchSpikes(nn.Module):
         """
         drive, _ = self._drive(frames, None)
         for branch, weight in enumerate((self.weight_on, self.weight_off)):
-            weight.mul_(drive_scale(drive[:, branch], theta=self.theta, share=share, dt=self._options["dt"], **self._response()))
+            weight.mul_(drive_scale(drive[:, branch], theta=self.theta, share=share, dt=self.dt, **self._response()))
 
     def _response(self):
         return {} if self.smoothing_tau is None else {"response": "alpha", "tau_s": self.smoothing_tau}

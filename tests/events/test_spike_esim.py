@@ -1,0 +1,206 @@
+"""Spike-ESIM against the hard sensor, closed forms of its parts, and chunks against the whole."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from codesign import events
+from codesign.errors import DomainError, FileFormatError, ShapeError
+from codesign.events import SensorModel, lin_log
+from codesign.events.spiking.spike_esim import SpikeEsim
+
+D = torch.float64
+
+
+def clip(frames=40, side=12, seed=0, dtype=D):
+    """Smooth random pictures that change by about a threshold every few frames."""
+    draw = torch.randn(frames, side, side, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+    return (3.5 + (0.15 * draw).cumsum(0)).clamp(0.1, 5.5).exp(), torch.arange(frames, dtype=D) / 500
+
+
+def disturbed(seed=1, **options):
+    """A generator all of whose parameters have moved from where they start."""
+    model, draw = SpikeEsim(0.2, 0.25, **options), torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.05 * torch.randn(parameter.shape, generator=draw, dtype=parameter.dtype))
+        model.bandwidth.gate.fill_(0.6)
+    return model
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, D])
+def test_untrained_it_is_the_ideal_sensor(dtype):
+    frames, t_s = clip(dtype=dtype)
+    counts, _ = SpikeEsim(0.2, 0.25)(frames, t_s)
+    truth = events.dense_counts(lin_log(frames), t_s, SensorModel(0.2, 0.25), log_input=True)
+    assert truth.sum() > 1000
+    assert torch.equal(counts, truth)
+
+
+def test_untrained_with_dead_time_it_is_the_sensor_with_that_dead_time():
+    frames, t_s = clip()
+    counts, _ = SpikeEsim(0.1, 0.1, refractory_s=1e-3)(frames, t_s)
+    truth = events.dense_counts(lin_log(frames), t_s, SensorModel(0.1, 0.1, refractory_s=1e-3), log_input=True)
+    assert torch.equal(counts, truth)
+
+
+def test_spiking_comparator_is_the_ideal_sensor_where_no_step_holds_two_events():
+    # levels that move by at most 0.2 per step against a threshold of 0.25: at most one event per step and none left over
+    draw = torch.rand(60, 6, 6, generator=torch.Generator().manual_seed(3), dtype=D)
+    frames = (4 + (0.4 * draw - 0.2).cumsum(0)).clamp(3.1, 5.4).exp()
+    t_s = torch.arange(60, dtype=D) / 500
+    counts, _ = SpikeEsim(0.25, 0.25, comparator="srm")(frames, t_s)
+    truth = events.dense_counts(lin_log(frames), t_s, SensorModel(0.25, 0.25), log_input=True)
+    assert truth.sum() > 100
+    assert torch.equal(counts, truth)
+
+
+@pytest.mark.parametrize("options", [{}, {"refractory_s": 1e-3}, {"comparator": "srm"}])
+@pytest.mark.parametrize("dtype", [torch.float32, D])
+def test_chunks_equal_the_whole_bit_for_bit(options, dtype):
+    frames, t_s = clip(side=11, dtype=dtype)
+    model = disturbed(**options)
+    whole, end = model(frames, t_s)
+    parts, state = [], None
+    for first, last in ((0, 3), (3, 4), (4, 21), (21, 40)):
+        counts, state = model(frames[first:last], t_s[first:last], state)
+        parts.append(counts)
+    assert torch.equal(torch.cat(parts), whole)
+    assert state is not None
+    for name in ("level", "filtered", "slow", "frame"):
+        assert torch.equal(getattr(state, name), getattr(end, name))
+
+
+def test_batches_are_sequences_of_their_own():
+    one, t_s = clip(seed=1)
+    other, _ = clip(seed=2)
+    model = disturbed()
+    together, _ = model(torch.stack((one, other), 1), t_s)
+    # a convolution of two pictures may round differently from one of one: a level within 1e-12 of a threshold could move, none does here
+    for index, frames in enumerate((one, other)):
+        assert torch.equal(together[:, :, index], model(frames, t_s)[0])
+
+
+def test_bandwidth_is_the_photoreceptor_of_the_hard_sensor():
+    frames, t_s = clip()
+    model = SpikeEsim(0.2, 0.25, cutoff_hz=40.0)
+    with torch.no_grad():
+        model.bandwidth.gate.fill_(1.0)
+        model.bandwidth.double().log_cutoff.fill_(math.log(40.0))
+    truth = events.dense_counts(frames, t_s, SensorModel(0.2, 0.25, cutoff_hz=40.0))
+    # both solve the same equation exactly; a level within rounding (1e-14) of a threshold may count one frame later
+    counts, _ = model(frames, t_s)
+    assert truth.sum() > 200
+    assert float((counts - truth).detach().abs().sum()) <= 1e-3 * float(truth.sum())
+
+
+def test_tone_curve_with_one_slope_scales_the_threshold():
+    frames, t_s = clip()
+    model = SpikeEsim(0.2, 0.25)
+    with torch.no_grad():
+        model.tone.double().log_slope.fill_(math.log(2.0))
+    truth = events.dense_counts(lin_log(frames), t_s, SensorModel(0.1, 0.125), log_input=True)
+    moved = (model(frames, t_s)[0] - truth).cumsum(0)
+    assert moved.abs().max() <= 1  # rounding moves an event by a frame, and loses none
+    assert int((moved != 0).sum()) <= 1e-3 * int(truth.sum())
+
+
+def test_thresholds_scale_at_test_time():
+    frames, t_s = clip()
+    truth = events.dense_counts(lin_log(frames), t_s, SensorModel(0.3, 0.5), log_input=True)
+    counts, _ = SpikeEsim(0.2, 0.25)(frames, t_s, theta_scale=torch.tensor([1.5, 2.0]))
+    assert float((counts - truth).detach().abs().sum()) <= 1e-3 * float(truth.sum())  # 1.5 * 0.2 is not 0.3 to the last bit
+
+
+def test_a_still_scene_gives_nothing_and_a_slow_ramp_all_its_thresholds():
+    model = disturbed()
+    still = torch.full((30, 8, 8), 80.0, dtype=D)
+    t_s = torch.arange(401, dtype=D) / 500
+    assert model(still, t_s[:30])[0].sum() == 0
+    ramp = (3.5 + torch.linspace(0, 1.701, 401, dtype=D)).exp()[:, None, None].expand(-1, 4, 4)  # 8 thresholds of 0.2 and half a one
+    counts, _ = SpikeEsim(0.2, 0.2)(ramp, t_s)
+    assert torch.equal(counts.sum(0), torch.stack((torch.full((4, 4), 8.0, dtype=D), torch.zeros(4, 4, dtype=D))))
+
+
+def test_levels_have_exact_gradients_in_every_parameter():
+    frames, t_s = clip(frames=5, side=4)
+    model = disturbed(width=2).double()
+    names = [name for name, _ in model.named_parameters() if name.startswith(("prefilter", "tone", "bandwidth", "branch"))]
+
+    def levels(*values):
+        return torch.func.functional_call(_Levels(model), dict(zip([f"model.{name}" for name in names], values, strict=True)), (frames, t_s))
+
+    assert torch.autograd.gradcheck(levels, tuple(model.get_parameter(name).detach().clone().requires_grad_() for name in names), atol=1e-6)
+
+
+class _Levels(torch.nn.Module):
+    def __init__(self, model):
+        super().__init__()
+        self.model = model
+
+    def forward(self, frames, t_s):
+        return self.model._levels(frames, t_s, None)[0]
+
+
+def test_drawn_noise_is_poisson_of_the_expected_rate():
+    model = SpikeEsim()
+    with torch.no_grad():
+        model.noise_rate.amplitude_hz.copy_(torch.tensor([30.0, 10.0]))
+        model.noise_rate.fade.fill_(2.0)
+    frames, t_s = torch.full((201, 30, 30), 117.5, dtype=D), torch.arange(201, dtype=D) / 500
+    expected = torch.tensor([30.0, 10.0]) * math.exp(-2.0 * 0.5) / 500  # light (117.5 + 20)/275 = 1/2
+    assert torch.allclose(model.expected_noise(frames, t_s)[0, :, 0, 0], expected.double(), rtol=1e-6)
+    counts, _ = model.draw(frames, t_s, torch.Generator().manual_seed(0))  # a still scene: nothing but noise
+    for polarity in (0, 1):
+        found = counts[:, polarity]
+        error = math.sqrt(float(expected[polarity]) / found.numel())
+        assert abs(float(found.mean() - expected[polarity])) < 4 * error
+        assert abs(float(found.var() - expected[polarity])) < 4 * error * 1.1  # variance of the sample variance: (m + 2 m^2)/n
+
+
+def test_saved_generators_come_back(tmp_path):
+    frames, t_s = clip()
+    model = disturbed(refractory_s=1e-3, depth=2)
+    model.save(tmp_path / "generator.npz")
+    again = SpikeEsim.load(tmp_path / "generator.npz")
+    assert again.settings == model.settings
+    assert torch.equal(again(frames, t_s)[0], model(frames, t_s)[0])
+    (tmp_path / "other.npz").write_bytes(b"no archive")
+    for name, words in (("absent.npz", "not there"), ("other.npz", "holds no generator")):
+        with pytest.raises(FileFormatError, match=words):
+            SpikeEsim.load(tmp_path / name)
+    with torch.no_grad():
+        model.tone.log_slope[0] = math.nan
+    model.save(tmp_path / "poisoned.npz")
+    with pytest.raises(FileFormatError, match="NaN"):
+        SpikeEsim.load(tmp_path / "poisoned.npz")
+
+
+def test_bad_input_is_refused():
+    frames, t_s = clip(frames=4)
+    model = SpikeEsim()
+    _, state = model(frames, t_s)
+    for pictures, times_s, before, error, words in [
+        (frames * math.nan, t_s, None, DomainError, "NaN"),
+        (frames * math.inf, t_s, None, DomainError, "infinit"),
+        (-frames, t_s, None, DomainError, "negative"),
+        (frames[:1], t_s[:1], None, ShapeError, "at least 2"),
+        (frames[:, 0], t_s, None, ShapeError, "H, W"),
+        (frames, t_s[:3], None, ShapeError, r"\[4\]"),
+        (frames, t_s, state, DomainError, "go on increasing"),
+        (frames[:, :6], t_s + 1, state, ShapeError, "keeps its frame size"),
+        (frames.float(), t_s + 1, state, ShapeError, "keeps its frame size"),
+    ]:
+        with pytest.raises(error, match=words):
+            model(pictures, times_s, before)
+    for scale in (0.0, -1.0, math.nan, [1.0, 2.0, 3.0]):
+        with pytest.raises(DomainError, match="theta_scale"):
+            model(frames, t_s, theta_scale=scale)
+    options: dict[str, Any]
+    for options, words in (({"theta_on": 0.0}, "theta_on"), ({"theta_off": math.nan}, "theta_off"), ({"comparator": "soft"}, "comparator"), ({"refractory_s": -1.0}, "refractory_s")):
+        with pytest.raises(DomainError, match=words):
+            SpikeEsim(**options)
+    with pytest.raises(DomainError, match="dead time"):
+        SpikeEsim(refractory_s=1e-3, comparator="srm")
