@@ -1,6 +1,6 @@
 """How true are events of a video that was upsampled, against events of the frames that were left out of it?
 
-Sequences are rendered at a high rate, every k-th frame is kept, and events of the upsampled frames (codesign.events.upsample) are compared with events of
+Sequences are rendered at a high rate, every k-th frame is kept, and events of the upsampled frames (codesign.events.upsampling.upsample) are compared with events of
 all frames. Controls: frames between by linear blending, and the kept frames alone. High-speed recordings likewise, with the frames that were dropped.
 Frames are instantaneous, here and in the method.
 """
@@ -14,7 +14,7 @@ import torch
 
 from codesign import events
 from codesign.events.sources.frames import open_frames
-from codesign.events.upsample import upsample
+from codesign.events.upsampling.upsample import upsample
 from studies import upsampling_figures as drawn
 from studies.run import Run, StudyConfig, main
 from studies.upsampling_measure import WAYS, Row, between_kept, blended_frames, event_errors, flow_error, pace, psnr

@@ -9,9 +9,9 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from codesign import events
-from codesign.events.upsample_between import between, visibility
-from codesign.events.upsample_flow import flow_both_ways, flow_levels
-from codesign.events.upsample_hidden import repaired
+from codesign.events.upsampling.between import between, visibility
+from codesign.events.upsampling.flow import flow_both_ways, flow_levels
+from codesign.events.upsampling.hidden import repaired
 
 WAYS = ("upsampled", "blended", "kept")
 POOL_PX, POOL_S = 4, 0.005

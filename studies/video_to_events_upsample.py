@@ -2,14 +2,14 @@
 
 import torch
 
-from codesign.events.upsample import upsample_stream
+from codesign.events.upsampling.upsample import upsample_stream
 
 
 def pieces(max_displacement_px, before, before_s, seen, t_s):
     """What the sensor sees of a chunk: frames [n, H, W] and their times, piece by piece.
 
     Args:
-      max_displacement_px: see ``codesign.events.upsample``; None: the frames as they are, in one piece.
+      max_displacement_px: see ``codesign.events.upsampling.upsample``; None: the frames as they are, in one piece.
       before, before_s: last frame [H, W] of the chunk before and its time; None for the first chunk.
       seen: [N, H, W] frames of the chunk. t_s: [N] seconds.
     The pieces of all chunks together do not depend on where the chunks begin.

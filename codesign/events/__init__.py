@@ -24,7 +24,7 @@ from codesign.events.srm_scale import alpha_response, drive_scale
 from codesign.events.srm_state import SrmState
 from codesign.events.stream import concatenate, to_counts
 from codesign.events.surrogate import FastSigmoid, Laplace, Triangular
-from codesign.events.upsample import upsample, upsample_stream
+from codesign.events.upsampling.upsample import upsample, upsample_stream
 from codesign.events.views.video import decay_video, write_video
 from codesign.events.views.view import gray_picture, picture, rates
 from codesign.events.volumes.spikes import spikes_from_counts, spikes_from_stream, stream_from_spikes

@@ -7,7 +7,7 @@ import torch
 
 from codesign.errors import DomainError, ShapeError
 from codesign.events import SensorModel, lin_log, simulate
-from codesign.events.upsample import upsample, upsample_stream
+from codesign.events.upsampling.upsample import upsample, upsample_stream
 
 
 def pattern(x, y):

@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from codesign.events.upsample_between import between, visibility
-from codesign.events.upsample_flow import flow_both_ways
-from codesign.events.upsample_hidden import repaired
-from codesign.events.upsample_match import with_matches
-from codesign.events.upsample_tvl1 import median
-from codesign.events.upsample_warp import inside, sampled, splatted
+from codesign.events.upsampling.between import between, visibility
+from codesign.events.upsampling.flow import flow_both_ways
+from codesign.events.upsampling.hidden import repaired
+from codesign.events.upsampling.match import with_matches
+from codesign.events.upsampling.tvl1 import median
+from codesign.events.upsampling.warp import inside, sampled, splatted
 
 
 def textured(height, width, seed=0):

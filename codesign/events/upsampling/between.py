@@ -3,8 +3,8 @@
 import torch
 from torch.nn.functional import max_pool2d
 
-from codesign.events.upsample_flow import blurred
-from codesign.events.upsample_warp import inside, sampled, splatted
+from codesign.events.upsampling.flow import blurred
+from codesign.events.upsampling.warp import inside, sampled, splatted
 
 TOLERANCE_PX, TOLERANCE_SHARE = 0.5, 0.05  # forward and backward flow agree to about this much, plus this share of the motion
 HIDDEN = 0.05  # weight of what has no counterpart in the other frame: it shows where nothing else does

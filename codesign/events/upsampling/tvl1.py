@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from codesign.events.upsample_warp import inside, sampled
+from codesign.events.upsampling.warp import inside, sampled
 
 DATA_WEIGHT = 20.0  # lambda, for pictures of natural-log units
 COUPLING = 0.3  # theta: how far the solution of the data term may leave the smooth one

@@ -3,8 +3,8 @@
 import torch
 from torch.nn.functional import conv2d, interpolate, pad
 
-from codesign.events.upsample_match import with_matches
-from codesign.events.upsample_tvl1 import refined
+from codesign.events.upsampling.match import with_matches
+from codesign.events.upsampling.tvl1 import refined
 
 DARK_OFFSET = 12.0  # on the 0-255 scale: flow is found on ln(I + 12), so that dark edges count about as the sensor sees them
 SMALLEST_PX = 12  # shorter side of the coarsest scale

@@ -7,10 +7,10 @@ import torch
 from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import check_frames, check_times
 from codesign.events.intensity import lin_log
-from codesign.events.upsample_between import between, visibility
-from codesign.events.upsample_flow import flow_both_ways, flow_levels
-from codesign.events.upsample_hidden import repaired
-from codesign.events.upsample_steps import largest, largest_change, shares, step_times, steps_for
+from codesign.events.upsampling.between import between, visibility
+from codesign.events.upsampling.flow import flow_both_ways, flow_levels
+from codesign.events.upsampling.hidden import repaired
+from codesign.events.upsampling.steps import largest, largest_change, shares, step_times, steps_for
 
 MAX_STEPS = 256
 

@@ -5,7 +5,7 @@ import math
 import torch
 from torch.nn.functional import avg_pool2d, pad
 
-from codesign.events.upsample_warp import sampled
+from codesign.events.upsampling.warp import sampled
 
 RADIUS_PX = 9  # displacements looked at, at the scale of matching
 WINDOW_PX = 1  # neighbours on each side

@@ -1,0 +1,1 @@
+"""Frames between frames, along the flow, before events are made of them."""
