@@ -17,7 +17,7 @@ from studies.event_classes_saccades import frame_times, frames
 # v2e's noisy preset with unequal thresholds and a dead time: what an ideal sensor lacks, all at once
 SENSOR = replace(events.PRESETS["noisy"], theta_on=0.18, theta_off=0.22, refractory_s=1e-3)
 NOMINAL_THETA = 0.2  # mean of the sensor's own
-THETAS = (0.07, 0.1, 0.15, NOMINAL_THETA, 0.3, 0.45, 0.6)
+THETAS = (0.05, 0.07, 0.1, NOMINAL_THETA, 0.3, 0.45)
 PICTURES_AT_ONCE = 50
 
 

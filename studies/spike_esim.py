@@ -24,7 +24,7 @@ from studies.run import Run, StudyConfig, main
 
 JUDGED = ("thesis", "smoothed", "esim", "ours")
 SHOWN = (*JUDGED, "ours_signal", "ours_expected", "sensor again")
-RECORDING_TRAINING = {"size_px": 48, "batch": 4, "count_weight": 0.3}
+RECORDING_TRAINING = {"size_px": 48, "batch": 4, "count_weight": 0.3, "fast": 6e-2}
 RENDERED_TRAINING = {"size_px": 32, "batch": 2, "count_weight": 0.1}
 
 
@@ -98,7 +98,7 @@ def train(run, config, learning):
     shelf, number = jobs.Jobs(run), count(1)
     total = len(learning) * jobs.job_steps(config.steps) + round(jobs.COMPARED_STEPS * config.steps)
     trained, losses = {}, {}
-    with run.progress(total, "training") as progress:
+    with run.progress(total, "training", shelf.steps_done()) as progress:
         for kind, found in learning.items():
             crops = RENDERED_TRAINING if kind == "rendered" else RECORDING_TRAINING
             seed = config.seed + next(number)

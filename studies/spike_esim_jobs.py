@@ -45,6 +45,10 @@ class Jobs:
         self.tensors = dict(stored.tensors) if stored else {}
         self.numbers = dict(stored.numbers) if stored else {}
 
+    def steps_done(self):
+        """Optimisation steps of finished jobs."""
+        return sum(len(value) for name, value in self.numbers.items() if name.endswith("_losses"))
+
     def module(self, key, module, train):
         """``module`` after ``train(module)`` (returns the losses), and the losses."""
         if f"{key}_losses" in self.numbers:
@@ -67,6 +71,9 @@ def train_all(jobs, kind, sequences, steps, seed, options, advance):
     theta = jobs.number(f"{kind}_theta", lambda: training.best_theta(sequences))
     networks = {name: _thesis(jobs, f"{kind}_{name}", smoothing, sequences, steps // 2, seed, advance) for name, smoothing in (("thesis", None), ("smoothed", SMOOTHING_MS))}
     ours, losses = jobs.module(f"{kind}_ours", SpikeEsim(**START, seed=seed), lambda model: _ours(model, sequences, steps, steps, seed, options, advance))
+    scale = jobs.number(f"{kind}_ours_scale", lambda: training.calibrated_scale(ours, sequences))
+    with torch.no_grad():
+        ours.log_gain.add_(torch.tensor(scale, dtype=torch.float64).log())
     return Trained(networks, theta, ours), losses
 
 

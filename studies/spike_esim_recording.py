@@ -27,11 +27,12 @@ def upsampled(recording: Recording, steps=STEPS_PER_INTERVAL, advance=lambda: No
     for first, second in pairwise(recording.frames):
         fields.append(flows(first, second))
         advance()
-    speeds = [gaussian_filter(np.hypot(*forth), SMOOTH_PX) + STILL_PX for forth, _ in fields]
+    speeds = [gaussian_filter(np.sqrt((forth**2).sum(0)), SMOOTH_PX) + STILL_PX for forth, _ in fields]
     for index, (first, second) in enumerate(pairwise(recording.frames)):
+        forth, back = fields[index]
         before, speed, after = speeds[max(index - 1, 0)], speeds[index], speeds[min(index + 1, len(speeds) - 1)]
         slopes = [np.clip((speed + beside) / (2 * speed), 0, STEEPEST) for beside in (before, after)]
-        made += [first, *(moved(first, second, *fields[index], travelled(step / steps, *slopes)) for step in range(1, steps))]
+        made += [first, *(moved(first, second, forth, back, travelled(step / steps, *slopes)) for step in range(1, steps))]
     share = torch.arange(steps, dtype=torch.float64) / steps
     t_s = (recording.mid_s[:-1, None] + share * recording.mid_s.diff()[:, None]).flatten()
     t_s = torch.cat((t_s, recording.mid_s[-1:]))

@@ -1,6 +1,7 @@
 """Spike-ESIM against the hard sensor, closed forms of its parts, and chunks against the whole."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from codesign import events
 from codesign.errors import DomainError, FileFormatError, ShapeError
-from codesign.events import SensorModel, lin_log
+from codesign.events import SensorModel, lin_log, spiking
 from codesign.events.spiking.spike_esim import SpikeEsim
 
 D = torch.float64
@@ -176,6 +177,20 @@ def test_saved_generators_come_back(tmp_path):
     model.save(tmp_path / "poisoned.npz")
     with pytest.raises(FileFormatError, match="NaN"):
         SpikeEsim.load(tmp_path / "poisoned.npz")
+
+
+def test_the_generator_that_comes_along_has_learnt_its_sensor():
+    model = SpikeEsim.load(Path(spiking.__file__).parent / "spike_esim_rendered.npz")
+    # it was trained on hard events of a sensor with thresholds 0.18 and 0.22 and 1 ms dead time; tone and bandwidth trade with thresholds by some percent
+    assert model.thetas().tolist() == pytest.approx([0.18, 0.22], rel=0.1)
+    dead_s = model.refractory_s()
+    assert dead_s is not None
+    assert float(dead_s.detach()) == pytest.approx(1e-3, rel=0.2)
+    frames, t_s = clip(frames=60, side=24, dtype=torch.float32)
+    found, _ = model(frames, t_s)
+    target = events.dense_counts(frames, t_s, SensorModel(0.18, 0.22, cutoff_hz=60.0, refractory_s=1e-3))
+    # white changes from frame to frame are nothing it was trained on; an ideal sensor gives three times the events
+    assert float(found.detach().sum() / target.sum()) == pytest.approx(1, abs=0.25)
 
 
 def test_bad_input_is_refused():
