@@ -13,7 +13,7 @@ import codesign  # noqa: F401  (first: it sets OpenMP's wait policy before torch
 
 import torch  # isort: skip
 
-from codesign.events.srm import srm
+from codesign.events.spiking.srm import srm
 from studies.lens_bench_tracers import forget_peak, peak
 
 PIXELS = (2, 128, 128)

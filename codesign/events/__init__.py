@@ -19,11 +19,14 @@ from codesign.events.sensor.naive import naive
 from codesign.events.sensor.simulate import dense_counts, simulate
 from codesign.events.sensor.state import SensorState
 from codesign.events.sources.frames import open_frames
-from codesign.events.srm import srm
-from codesign.events.srm_scale import alpha_response, drive_scale
-from codesign.events.srm_state import SrmState
+from codesign.events.spiking.losses import count_loss, van_rossum
+from codesign.events.spiking.spike_esim import SpikeEsim, SpikeEsimState
+from codesign.events.spiking.srm import srm
+from codesign.events.spiking.srm_scale import alpha_response, drive_scale
+from codesign.events.spiking.srm_state import SrmState
+from codesign.events.spiking.surrogate import FastSigmoid, Laplace, Triangular
+from codesign.events.spiking.two_branches import TwoBranchSpikes
 from codesign.events.stream import concatenate, to_counts
-from codesign.events.surrogate import FastSigmoid, Laplace, Triangular
 from codesign.events.upsampling.upsample import upsample, upsample_stream
 from codesign.events.views.video import decay_video, write_video
 from codesign.events.views.view import gray_picture, picture, rates
@@ -41,11 +44,15 @@ __all__ = [
     "RecordedFrames",
     "SensorModel",
     "SensorState",
+    "SpikeEsim",
+    "SpikeEsimState",
     "SrmState",
     "Triangular",
+    "TwoBranchSpikes",
     "alpha_response",
     "annealed",
     "concatenate",
+    "count_loss",
     "decay",
     "decay_from_stream",
     "decay_video",
@@ -81,6 +88,7 @@ __all__ = [
     "to_counts",
     "upsample",
     "upsample_stream",
+    "van_rossum",
     "write",
     "write_video",
 ]

@@ -8,8 +8,8 @@ import torch
 
 from codesign.errors import DomainError, ShapeError
 from codesign.events.spiking.losses import count_loss, van_rossum
+from codesign.events.spiking.surrogate import Laplace
 from codesign.events.spiking.two_branches import TwoBranchSpikes
-from codesign.events.surrogate import Laplace
 
 D = torch.float64
 

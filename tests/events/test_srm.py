@@ -6,10 +6,10 @@ import torch
 
 from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
 from codesign.events.layers.memory import memory
-from codesign.events.srm import srm
-from codesign.events.srm_scale import alpha_response, drive_scale
-from codesign.events.srm_state import SrmState
-from codesign.events.surrogate import FastSigmoid, Laplace, Triangular
+from codesign.events.spiking.srm import srm
+from codesign.events.spiking.srm_scale import alpha_response, drive_scale
+from codesign.events.spiking.srm_state import SrmState
+from codesign.events.spiking.surrogate import FastSigmoid, Laplace, Triangular
 
 F64 = torch.float64
 

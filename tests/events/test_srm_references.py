@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.events.srm import srm
-from codesign.events.srm_scale import alpha_response
-from codesign.events.surrogate import Laplace
+from codesign.events.spiking.srm import srm
+from codesign.events.spiking.srm_scale import alpha_response
+from codesign.events.spiking.surrogate import Laplace
 
 KERNELS = {"alpha": "slayer", "thesis": "thesis", "gehrig": "exp"}
 CASES = ["a_slayer_vimeo", "b_thesis_vimeo", "d_half_ts", "g_silent", "h_saturating"]

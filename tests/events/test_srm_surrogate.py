@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from codesign.errors import DomainError
-from codesign.events.surrogate import FastSigmoid, Laplace, Triangular
+from codesign.events.spiking.surrogate import FastSigmoid, Laplace, Triangular
 
 KINDS = [Laplace, FastSigmoid, Triangular]
 

@@ -77,8 +77,7 @@ class _MemorisedCounts(Function):
     def backward(ctx, *grads):
         frames, theta_on, theta_off, start = ctx.saved_tensors
         grad_counts, grad_end = grads
-        grad_frames = torch.empty_like(frames, memory_format=torch.contiguous_format)
-        grad_start, *grad_thetas = kernel.adjoint(
+        grad_frames, grad_start, *grad_thetas = kernel.adjoint(
             frames[ctx.first :],
             start,
             theta_on,
@@ -86,7 +85,7 @@ class _MemorisedCounts(Function):
             ctx.front_end,
             grad_counts,
             grad_end.sum(0),
-            out=grad_frames[ctx.first :],
+            first=ctx.first,
             wants_thetas=any(ctx.needs_input_grad[1:3]),
         )
         needed = zip(grad_thetas, (theta_on, theta_off), ctx.needs_input_grad[1:3], strict=True)

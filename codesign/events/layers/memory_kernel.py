@@ -11,7 +11,6 @@ So an engaged step pulls at its own level, and pushes at the level of the step e
 import torch
 
 from codesign import backend
-from codesign.errors import BackendError
 
 CHUNK_PIXELS, CHUNK_FRAMES = 1 << 22, 32  # few frames per kernel read memory in few streams, which the processor fetches ahead
 
@@ -48,15 +47,11 @@ class _Run:
     def tensor(self, value, shape):
         return value.torch().reshape(shape).clone()
 
-    def shared(self, tensor):
-        """drjit array in the memory of a torch tensor, to be filled by kernels."""
-        return self.arr.Float(tensor.reshape(-1))
-
-    def check(self, target, tensor):
-        """Every backend shares memory with torch today; were that to change, results must not be lost silently."""
-        self.dr.sync_thread()
-        if target.torch().data_ptr() != tensor.data_ptr():
-            raise BackendError("drjit did not write into torch's memory; this version of drjit does not fit, see constraints.txt for versions that do.")
+    def fresh(self, count):
+        """Memory to be filled by kernels. It is drjit's, which hands the same pages out again and again: new pages from the system cost more than the kernel."""
+        target = self.dr.empty(self.arr.Float, count)
+        self.dr.eval(target)
+        return target
 
     def compare(self, difference):
         """Counts ON, counts OFF, and what the memorised level moves by."""
@@ -100,8 +95,7 @@ def count(frames, start, theta_on, theta_off, front_end):
     """Counts [T, 2, ...] of frames [T, ...] from a start [2, ...] (memorised level, centre of the play); the state after them; whether a value may not enter."""
     run = _Run(frames, theta_on, theta_off, front_end)
     dr, arr = run.dr, run.arr
-    counts = frames.new_empty((len(frames), 2, *frames.shape[1:]))
-    target = run.shared(counts)
+    target = run.fresh(2 * frames.numel())
 
     def step(index, value, reference, centre, bad):
         bad |= ~front_end.accepts(dr, value)
@@ -115,18 +109,19 @@ def count(frames, start, theta_on, theta_off, front_end):
 
     reference, centre, bad = run(step, (run.load(start[0]), run.load(start[1]), dr.zeros(arr.Bool, run.width)), target)
     bad = bool(dr.any(bad)[0])
-    run.check(target, counts)
-    return counts, torch.stack([run.tensor(value, start.shape[1:]) for value in (reference, centre)]), bad
+    dr.sync_thread()
+    return target.torch().reshape(len(frames), 2, *frames.shape[1:]), torch.stack([run.tensor(value, start.shape[1:]) for value in (reference, centre)]), bad
 
 
-def adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end, *, out, wants_thetas):
-    """Adjoint of ``count``: writes the gradient of the frames to ``out`` [T, ...]; returns those of the start, theta_on, theta_off [...] (zero unless wanted).
+def adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end, *, first, wants_thetas):
+    """Adjoint of ``count``: gradients of the frames [first + T, ...] (rows before ``first`` are left to the caller), start, theta_on, theta_off [...] (zero
+    unless wanted).
 
     Args: grad_end: [...] of the memorised level and the play's centre together; the start's is theirs together, too.
     """
     run = _Run(frames, theta_on, theta_off, front_end)
     dr, arr = run.dr, run.arr
-    seed, target = run.load(grad_counts), run.shared(out)
+    seed, target, offset = run.load(grad_counts), run.fresh((first + len(frames)) * run.width), dr.opaque(arr.UInt32, first)
     never = 0xFFFFFFFF
 
     def step(index, value, centre, pull, slope, engaged, anchor, grad_start, grad_on, grad_off, grad_width):
@@ -136,9 +131,9 @@ def adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end
         moves, place = is_on | is_off, 2 * index * run.pixels + run.lane
         seed_on, seed_off = dr.gather(arr.Float, seed, place, is_on) / run.theta_on, dr.gather(arr.Float, seed, place + run.pixels, is_off) / run.theta_off
         now_pull = seed_on - seed_off  # adjoint of this level through this step's count
-        dr.scatter(target, dr.zeros(arr.Float, run.width), index * run.pixels + run.lane, mode=dr.ReduceMode.NoConflicts)  # until it is known
+        dr.scatter(target, dr.zeros(arr.Float, run.width), (index + offset) * run.pixels + run.lane, mode=dr.ReduceMode.NoConflicts)  # until it is known
         known = moves & (engaged != never)
-        dr.scatter(target, (pull - now_pull) * slope, engaged * run.pixels + run.lane, active=known, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(target, (pull - now_pull) * slope, (engaged + offset) * run.pixels + run.lane, active=known, mode=dr.ReduceMode.NoConflicts)
         grad_start = grad_start - dr.select(moves & ~known, now_pull, 0)
         if wants_thetas:
             grad_on, grad_off = grad_on - seed_on * rise / run.theta_on, grad_off - seed_off * fall / run.theta_off
@@ -152,9 +147,10 @@ def adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end
     begun = (run.load(start[1]), zero, zero, dr.full(arr.UInt32, never, run.width), zero + 0.5, zero, zero, zero, zero)
     _, pull, slope, engaged, anchor, grad_start, grad_on, grad_off, grad_width = run(step, begun, target)
     end, known = run.load(grad_end), engaged != never
-    dr.scatter(target, (pull + end) * slope, engaged * run.pixels + run.lane, active=known, mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(target, (pull + end) * slope, (engaged + offset) * run.pixels + run.lane, active=known, mode=dr.ReduceMode.NoConflicts)
     grad_start = grad_start + dr.select(known, 0, end)
     grad_width = grad_width + end * (anchor - 0.5)
     dr.eval(target, grad_start, grad_on, grad_off, grad_width)
-    run.check(target, out)
-    return tuple(run.tensor(grad, start.shape[1:]) for grad in (grad_start, grad_on + grad_width / 2, grad_off + grad_width / 2))
+    dr.sync_thread()
+    grad_frames = target.torch().reshape(first + len(frames), *frames.shape[1:])
+    return grad_frames, *(run.tensor(grad, start.shape[1:]) for grad in (grad_start, grad_on + grad_width / 2, grad_off + grad_width / 2))

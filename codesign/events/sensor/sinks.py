@@ -112,5 +112,5 @@ class DenseCounts:
         return (self._counts,)
 
     def tensor(self, shape):
-        """The counts as a tensor of its own memory."""
-        return self._counts.torch().reshape(shape).clone()
+        """The counts as a tensor; call once, it takes the memory over."""
+        return self._counts.torch().reshape(shape)

@@ -5,8 +5,8 @@ import torch
 from codesign.events.layers.memory import memory
 from codesign.events.layers.physical import sensor_counts
 from codesign.events.sensor.model import SensorModel
-from codesign.events.srm import srm
-from codesign.events.surrogate import FastSigmoid
+from codesign.events.spiking.srm import srm
+from codesign.events.spiking.surrogate import FastSigmoid
 
 
 def count_memorised(level, t_s, theta, state, refractory_s):

@@ -3,7 +3,7 @@
 import torch.nn.functional as F
 
 from codesign.errors import DomainError, ShapeError
-from codesign.events.srm_scale import alpha_response
+from codesign.events.spiking.srm_scale import alpha_response
 
 
 def van_rossum(found, target, *, tau_s, dt=1.0):

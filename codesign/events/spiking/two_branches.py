@@ -7,9 +7,9 @@ from torch import Tensor, nn
 
 from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import check_frames
-from codesign.events.srm import srm
-from codesign.events.srm_scale import drive_scale
-from codesign.events.srm_state import SrmState
+from codesign.events.spiking.srm import srm
+from codesign.events.spiking.srm_scale import drive_scale
+from codesign.events.spiking.srm_state import SrmState
 
 
 @dataclass(frozen=True)

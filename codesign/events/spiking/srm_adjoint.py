@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from codesign.events.srm_forward import operations
-from codesign.events.srm_kernels import inflow, retreat, retreat_tangent
+from codesign.events.spiking.srm_forward import operations
+from codesign.events.spiking.srm_kernels import inflow, retreat, retreat_tangent
 
 
 @dataclass(frozen=True)

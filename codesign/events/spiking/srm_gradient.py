@@ -7,10 +7,10 @@ from torch.autograd import Function
 
 from codesign.backend import arrays
 from codesign.errors import GradientError, NonFiniteError, check_finite
-from codesign.events.srm_adjoint import Wanted, pack, scan_back, unpack
-from codesign.events.srm_forward import Grid, Plan, scan
-from codesign.events.srm_kernels import absolute_sum, reset_coefficients, response_coefficients
-from codesign.events.surrogate import Surrogate
+from codesign.events.spiking.srm_adjoint import Wanted, pack, scan_back, unpack
+from codesign.events.spiking.srm_forward import Grid, Plan, scan
+from codesign.events.spiking.srm_kernels import absolute_sum, reset_coefficients, response_coefficients
+from codesign.events.spiking.surrogate import Surrogate
 
 BOUND = 0.9  # "bounded" keeps rho * sum|nu| at most this: the adjoint then shrinks by 10 % per pass through the reset
 STAGGER = 768  # floats ahead of the potential: where potentials and their gradient share their place in a memory page, backward takes 1.4 times as long

@@ -3,8 +3,8 @@
 import torch
 
 from codesign.errors import NonFiniteError
-from codesign.events.srm_gradient import BOUND, reset_sum
-from codesign.events.srm_state import SrmState, entering_state
+from codesign.events.spiking.srm_gradient import BOUND, reset_sum
+from codesign.events.spiking.srm_state import SrmState, entering_state
 
 
 def run_truncated(setup, drive, theta, h_response, h_reset, state, cut):

@@ -3,7 +3,7 @@
 import torch
 
 from codesign.errors import DomainError
-from codesign.events.srm import per_pixel, srm
+from codesign.events.spiking.srm import per_pixel, srm
 
 
 def alpha_response(signal, *, tau_s, dt=1.0, state=None):

@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.events.srm_forward import Plan
-from codesign.events.srm_gradient import Setup, reset_sum, run
-from codesign.events.srm_kernels import RESETS, RESPONSES, STATES
-from codesign.events.srm_state import SrmState, entering_state
-from codesign.events.srm_truncated import run_truncated
-from codesign.events.surrogate import Laplace, Surrogate
+from codesign.events.spiking.srm_forward import Plan
+from codesign.events.spiking.srm_gradient import Setup, reset_sum, run
+from codesign.events.spiking.srm_kernels import RESETS, RESPONSES, STATES
+from codesign.events.spiking.srm_state import SrmState, entering_state
+from codesign.events.spiking.srm_truncated import run_truncated
+from codesign.events.spiking.surrogate import Laplace, Surrogate
 
 THROUGH_RESET = ("off", "full", "bounded")
 NONFINITE = ("raise", "zero")

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
-from codesign.events.srm_kernels import STATES, advance
-from codesign.events.surrogate import Operations, Surrogate
+from codesign.events.spiking.srm_kernels import STATES, advance
+from codesign.events.spiking.surrogate import Operations, Surrogate
 
 
 @dataclass(frozen=True)
