@@ -58,10 +58,10 @@ def read_state(path: Path):
     try:
         with h5(path) as file:
             stored = {name: values[()] for name, values in file["state"].items()}
-            times = {name: float(stored.pop(name)) for name in ("start_s", "time_s")}
+            start_s, time_s = (float(stored.pop(name)) for name in ("start_s", "time_s"))
             generator = torch.Generator()
             generator.set_state(torch.from_numpy(stored.pop("generator")))
-            return SensorState(**{name: torch.from_numpy(values) for name, values in stored.items()}, **times, generator=generator)
+            return SensorState(**{name: torch.from_numpy(values) for name, values in stored.items()}, start_s=start_s, time_s=time_s, generator=generator)
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise FileFormatError(f"'{path}' is damaged ({error}); remove it and go on again with --resume.") from error
 

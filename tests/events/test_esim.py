@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from codesign.events import SensorModel, SensorState, concatenate, simulate, to_counts
-from codesign.events.stream import ordered
 
 FIELDS = ("t_us", "x", "y", "p")
 
@@ -59,7 +58,7 @@ def test_dead_time_and_unequal_thresholds_equal_the_algorithm_written_out(refrac
     whole = simulate(levels, t_s, sensor, log_input=True)
     for y in range(5):
         for x in range(6):
-            truth = written_out(levels[:, y, x].numpy(), t_s.numpy(), *thetas, refractory_s)
+            truth = written_out(levels[:, y, x].numpy(), t_s.numpy(), thetas[0], thetas[1], refractory_s)
             mine = (whole.x == x) & (whole.y == y)
             assert whole.p[mine].tolist() == [p for _, p in truth]
             assert np.abs(whole.t_us[mine].numpy() - 1e6 * np.array([t for t, _ in truth])).max() <= 0.5 + 1e-3
@@ -71,6 +70,4 @@ def test_dead_time_and_unequal_thresholds_equal_the_algorithm_written_out(refrac
 
 def test_the_first_event_of_a_pixel_waits_for_no_dead_time():
     events = simulate(torch.tensor([3.0, 4.0])[:, None, None], [0.0, 1.0], SensorModel(refractory_s=100.0), log_input=True)
-    stream = ordered(torch.tensor([200_000]), *torch.tensor([[0], [0], [1]]), 1, 1)
-    assert events.t_us.tolist() == pytest.approx(stream.t_us.tolist(), abs=1)
-    assert len(events) == 1
+    assert events.t_us.tolist() == pytest.approx([200_000], abs=1)  # the four crossings behind it fall into the dead time

@@ -146,8 +146,8 @@ def test_static_scenes_are_silent_without_noise_in_every_preset_of_the_physics()
     still = torch.rand(9, 8, generator=torch.Generator().manual_seed(0)).mul(255).expand(20, 9, 8)
     t_s = torch.arange(20, dtype=torch.float64) * 0.05
     for sensor in (SensorModel(), PRESETS["clean"], SensorModel(cutoff_hz=3.0, refractory_s=1e-3, theta_sigma=0.05)):
-        for front_end in ({}, {"log_eps": 1e-3}):
-            assert len(simulate(still, t_s, sensor, **front_end)) == 0
+        for log_eps in (None, 1e-3):
+            assert len(simulate(still, t_s, sensor, log_eps=log_eps)) == 0
 
 
 def test_linear_frames_of_high_dynamic_range_take_the_logarithm():

@@ -121,7 +121,9 @@ def adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end
     """
     run = _Run(frames, theta_on, theta_off, front_end)
     dr, arr = run.dr, run.arr
-    seed, target, offset = run.load(grad_counts), run.fresh((first + len(frames)) * run.width), dr.opaque(arr.UInt32, first)
+    seed, offset = run.load(grad_counts), dr.opaque(arr.UInt32, first)
+    target = dr.zeros(arr.Float, (first + len(frames)) * run.width)  # steps inside the play keep 0
+    dr.eval(target)
     never = 0xFFFFFFFF
 
     def step(index, value, centre, pull, slope, engaged, anchor, grad_start, grad_on, grad_off, grad_width):
@@ -131,7 +133,6 @@ def adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end
         moves, place = is_on | is_off, 2 * index * run.pixels + run.lane
         seed_on, seed_off = dr.gather(arr.Float, seed, place, is_on) / run.theta_on, dr.gather(arr.Float, seed, place + run.pixels, is_off) / run.theta_off
         now_pull = seed_on - seed_off  # adjoint of this level through this step's count
-        dr.scatter(target, dr.zeros(arr.Float, run.width), (index + offset) * run.pixels + run.lane, mode=dr.ReduceMode.NoConflicts)  # until it is known
         known = moves & (engaged != never)
         dr.scatter(target, (pull - now_pull) * slope, (engaged + offset) * run.pixels + run.lane, active=known, mode=dr.ReduceMode.NoConflicts)
         grad_start = grad_start - dr.select(moves & ~known, now_pull, 0)

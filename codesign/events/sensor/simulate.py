@@ -53,7 +53,6 @@ def simulate(frames, t_s, sensor, generator=None, state=None, *, log_input=False
     if sensor.timing == "v2e":
         stream = _v2e_events(frames, times_s, sensor, generator, moved, front_end)
     else:
-        assert moved.time_s is not None  # set by the first frame
         layout = KeyLayout(round(moved.time_s * 1e6), height_px, width_px)
         _check_range(layout, times_s[-1])
         keys, size, density = [], max(CHUNK_FRAMES, CHUNK_PIXELS // (height_px * width_px)), EVENTS_PER_PIXEL

@@ -1,6 +1,7 @@
 """What a sensor remembers between chunks of frames, and how it begins."""
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,12 +20,13 @@ class SensorState:
     so <= 0); hazard: [H, W] noise still to pass until the next noise event; key, shots: [H, W] int32 random key and noise events so far.
     """
 
-    reference: Tensor | None = None
-    level: Tensor | None = None
-    theta_on: Tensor | None = None
-    theta_off: Tensor | None = None
-    start_s: float | None = None
-    time_s: float | None = None
+    # Any: filled by the first frame, and used as tensors and numbers from then on
+    reference: Any = None
+    level: Any = None
+    theta_on: Any = None
+    theta_off: Any = None
+    start_s: Any = None
+    time_s: Any = None
     generator: torch.Generator | None = None
     input_level: Tensor | None = None
     input: Tensor | None = None
