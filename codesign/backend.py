@@ -166,6 +166,12 @@ def widen(arr, parameters, count, width):
     return found
 
 
+def frames_per_kernel(pixels):
+    """How many frames of so many pixels one loop over time should take: few frames read memory in few streams, which the processor fetches ahead;
+    many save calls."""
+    return max(32, (1 << 22) // pixels)
+
+
 def run_kernel(kernel, inputs, out_shapes):
     """Run a drjit kernel on torch tensors, with first derivatives.
 
@@ -223,7 +229,7 @@ class _Kernel(torch.autograd.Function):
             result = _adjoint(ctx, grads)
         if torch.is_grad_enabled():
             live = [g for g in result if g is not None]
-            sealed = iter(_NoSecondDerivative.apply(len(live), *live, *ctx.saved_tensors, *[g for g in grads if g is not None]))
+            sealed = iter(NoSecondDerivative.apply(_FIRST_ONLY, len(live), *live, *ctx.saved_tensors, *[g for g in grads if g is not None]))
             result = [None if g is None else next(sealed) for g in result]
         return (None, None, *result)
 
@@ -251,13 +257,17 @@ def _adjoint(ctx, grads):
     return [None if g is None else _to_torch(g, x.shape, inputs) for g, x in zip(found, inputs, strict=True)]
 
 
-class _NoSecondDerivative(torch.autograd.Function):
-    """Passes gradients on unchanged; differentiating them again is refused with a sentence."""
+_FIRST_ONLY = "drjit kernels give first derivatives only; a second derivative through the lens or the renderer was asked for. Use differences of gradients instead."
+
+
+class NoSecondDerivative(torch.autograd.Function):
+    """Passes the first ``count`` tensors, gradients, on unchanged; differentiating them again raises GradientError with ``sentence``."""
 
     @staticmethod
-    def forward(ctx, count, *tensors):
+    def forward(ctx, sentence, count, *tensors):
+        ctx.sentence = sentence
         return tuple(t.clone() for t in tensors[:count])
 
     @staticmethod
     def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
-        raise GradientError("drjit kernels give first derivatives only; a second derivative through the lens or the renderer was asked for. Use differences of gradients instead.")
+        raise GradientError(ctx.sentence)

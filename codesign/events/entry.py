@@ -17,6 +17,18 @@ def check_frames(frames, minimum=2, *, name="frames", non_negative=True):
       non_negative: also refuse values below 0 (linear intensity).
     Raises: ShapeError for too few frames or no pixels; DomainError for other types, NaN, infinite or negative values.
     """
+    check_layout(frames, minimum, name=name)
+    low, high = (float(bound) for bound in frames.detach().aminmax())
+    if not (math.isfinite(low) and math.isfinite(high)):
+        check_finite(frames, name)
+    if non_negative and low < 0:
+        first = (frames.detach() < 0).nonzero()[0].tolist()
+        raise DomainError(f"{name} reach down to {low:g} (first negative at index {first}); intensities are 0 or more: subtract the black level first.")
+    return frames
+
+
+def check_layout(frames, minimum=2, *, name="frames"):
+    """The part of ``check_frames`` that reads no value: type, number of frames, pixels. For kernels that look at the values themselves."""
     if not isinstance(frames, Tensor) or frames.dtype not in (torch.float32, torch.float64):
         given = frames.dtype if isinstance(frames, Tensor) else type(frames).__name__
         raise DomainError(f"{name} are {given}; a torch tensor of float32 or float64 is needed: convert with torch.as_tensor(frames).float().")
@@ -25,13 +37,6 @@ def check_frames(frames, minimum=2, *, name="frames", non_negative=True):
         raise ShapeError(f"{name} hold {count} frame(s) (shape {list(frames.shape)}); at least {minimum} are needed, time on the first axis.")
     if frames.numel() == 0:
         raise ShapeError(f"{name} have shape {list(frames.shape)}, which holds no pixel; give at least one.")
-    low, high = (float(bound) for bound in frames.detach().aminmax())
-    if not (math.isfinite(low) and math.isfinite(high)):
-        check_finite(frames, name)
-    if non_negative and low < 0:
-        first = (frames.detach() < 0).nonzero()[0].tolist()
-        raise DomainError(f"{name} reach down to {low:g} (first negative at index {first}); intensities are 0 or more: subtract the black level first.")
-    return frames
 
 
 def check_theta(theta, name, frames):

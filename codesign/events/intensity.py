@@ -31,6 +31,11 @@ def _lin_log(frames):
     return torch.where(frames <= JOINT, frames * DARK_SLOPE, frames.clamp(min=JOINT).log())
 
 
+def light_share(intensity):
+    """How far the photoreceptor's speed and noise are from dark to full light: (I + 20)/275, 1 at I = 255. Tensors and drjit arrays. Source: v2e."""
+    return (intensity + 20) / 275
+
+
 @dataclass(frozen=True)
 class FrontEnd:
     """How frames become log levels: lin-log of the 0-255 scale, or ln(I + eps) of linear frames in any unit, or frames that are log levels already.

@@ -4,6 +4,8 @@ import math
 
 import torch
 
+from codesign.events.intensity import light_share
+
 
 def low_pass(level, intensity, interval_s, cutoff_hz, start=None):
     """Log levels behind a one-pole filter whose bandwidth follows intensity, for input that is linear between frames.
@@ -17,7 +19,7 @@ def low_pass(level, intensity, interval_s, cutoff_hz, start=None):
     Returns: [T, ...] filtered levels, the start included.
     Gradient: level, intensity, cutoff_hz, start; exact.
     """
-    light = (0.5 * (intensity[1:] + intensity[:-1]) + 20) / 275
+    light = light_share(0.5 * (intensity[1:] + intensity[:-1]))
     pace = light * (2 * math.pi * cutoff_hz) * interval_s.to(level).reshape(-1, *[1] * (level.ndim - 1))
     fade, mean = torch.exp(-pace), fading_mean(pace)
     filtered = [level[0] if start is None else start]

@@ -5,7 +5,7 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
 from codesign.errors import ShapeError
-from codesign.events.entry import check_frames, check_theta
+from codesign.events.entry import check_frames, check_layout, check_theta
 from codesign.events.intensity import FrontEnd, log_levels
 from codesign.events.layers import memory_kernel as kernel
 
@@ -32,9 +32,8 @@ def memory(frames, theta_on, theta_off, *, state=None, log_input=False):
     Cost: one pass over the frames forward, one backward; no memory beside counts and gradients.
     Source: Rebecq et al., ESIM, CoRL 2018; v2e (Hu et al., CVPR-W 2021), memorised brightness; Bengio et al. 2013, straight-through; the play is ours.
     """
-    front_end, least = FrontEnd(log_input), 2 if state is None else 1
-    if not torch.is_tensor(frames) or frames.ndim == 0 or len(frames) < least or frames.numel() == 0 or frames.dtype not in (torch.float32, torch.float64):
-        check_frames(frames, least)
+    front_end = FrontEnd(log_input)
+    check_layout(frames, minimum=2 if state is None else 1)
     theta_on, theta_off = check_theta(theta_on, "theta_on", frames), check_theta(theta_off, "theta_off", frames)
     if state is not None and state.shape == frames.shape[1:]:
         state = torch.stack((state, state))

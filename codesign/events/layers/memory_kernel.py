@@ -12,8 +12,6 @@ import torch
 
 from codesign import backend
 
-CHUNK_PIXELS, CHUNK_FRAMES = 1 << 22, 32  # few frames per kernel read memory in few streams, which the processor fetches ahead
-
 
 def levels(frames, front_end):
     """Log levels of frames by the arithmetic of the kernels; also whether one may not enter (then the levels mean nothing)."""
@@ -70,7 +68,7 @@ class _Run:
     def __call__(self, step, carried, target):
         """Carry values through step(index, value, *carried) for every frame; ``target`` is what the steps write to."""
         dr, arr = self.dr, self.arr
-        size = max(CHUNK_FRAMES, CHUNK_PIXELS // self.width)
+        size = backend.frames_per_kernel(self.width)
         with dr.suspend_grad():
             for first in range(0, len(self.frames), size):
                 begin, end = dr.opaque(arr.UInt32, first, self.width), dr.opaque(arr.UInt32, min(first + size, len(self.frames)))

@@ -10,6 +10,7 @@ import math
 import torch
 
 from codesign import backend
+from codesign.events.intensity import light_share
 from codesign.events.sensor.random_bits import exponential, hashed, normal_pair, uniform
 
 MOST_EVENTS = 1e6  # of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop counting
@@ -89,7 +90,7 @@ class _Step:
         level, _ = self.front_end.traced(dr, value)
         if "input" in now:
             intensity = dr.exp(value) if self.front_end.log_input else value
-            light = (0.5 * (now["input"] + intensity) + 20) / 275  # of the middle of the interval
+            light = light_share(0.5 * (now["input"] + intensity))  # of the middle of the interval
             now["input"], before = intensity, now["level"]
         else:
             light, before = None, now["level"]

@@ -7,7 +7,7 @@ import torch
 
 from codesign import backend
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import check_frames, check_times
+from codesign.events.entry import check_frames, check_layout, check_times
 from codesign.events.intensity import FrontEnd
 from codesign.events.sensor import crossing, v2e
 from codesign.events.sensor.sinks import DenseCounts, EventKeys, KeyLayout
@@ -15,7 +15,6 @@ from codesign.events.sensor.state import SensorState, begin
 from codesign.events.stream import ordered
 from codesign.types import EventStream
 
-CHUNK_PIXELS, CHUNK_FRAMES = 1 << 22, 32  # few frames per kernel read memory in few streams, which the processor fetches ahead; many save calls
 EVENTS_PER_PIXEL = 0.1  # room made at first
 KEY_BITS = 63
 
@@ -45,8 +44,8 @@ def simulate(frames, t_s, sensor, generator=None, state=None, *, log_input=False
     """
     state = SensorState() if state is None else state
     moved, front_end = replace(state), FrontEnd(log_input, log_eps)
-    if not torch.is_tensor(frames) or frames.ndim != 3:
-        check_frames(frames, minimum=1)
+    check_layout(frames, minimum=1)
+    if frames.ndim != 3:
         raise ShapeError(f"frames have shape {list(frames.shape)}; [T, H, W] is needed.")
     frames, times_s, generator = _open(frames, t_s, sensor, generator, moved, front_end)
     height_px, width_px = frames.shape[1:]
@@ -55,7 +54,7 @@ def simulate(frames, t_s, sensor, generator=None, state=None, *, log_input=False
     else:
         layout = KeyLayout(round(moved.time_s * 1e6), height_px, width_px)
         _check_range(layout, times_s[-1])
-        keys, size, density = [], max(CHUNK_FRAMES, CHUNK_PIXELS // (height_px * width_px)), EVENTS_PER_PIXEL
+        keys, size, density = [], backend.frames_per_kernel(height_px * width_px), EVENTS_PER_PIXEL
         for first in range(0, len(frames), size):
             chunk = slice(first, first + size)
             keys.append(_interpolated_keys(frames[chunk], times_s[chunk], sensor, generator, moved, front_end, layout, density))
@@ -89,10 +88,7 @@ def dense_counts(frames, t_s, sensor, generator=None, state=None, *, log_input=F
 def _open(frames, t_s, sensor, generator, state, front_end):
     """Check what can be checked without reading every frame, and begin an empty state with the first. Returns the frames and times still to be seen."""
     fresh = state.level is None
-    if not torch.is_tensor(frames) or frames.ndim == 0 or frames.shape[0] < (2 if fresh else 1) or frames.numel() == 0 or not frames.is_floating_point():
-        check_frames(frames, minimum=2 if fresh else 1)
-    if frames.dtype not in (torch.float32, torch.float64):
-        check_frames(frames)
+    check_layout(frames, minimum=2 if fresh else 1)
     times_s = check_times(t_s, len(frames)).tolist()
     if state.generator is None:
         state.generator = torch.Generator().manual_seed(0)

@@ -9,16 +9,14 @@ import math
 import torch
 
 from codesign.errors import DomainError
+from codesign.events.intensity import FrontEnd, light_share
 
-DARK, SPAN = 20.0, 275.0  # the bandwidth and the noise follow (I + 20)/275, 1 at I = 255
 EXACT_SINGLE_S = 8.0  # up to here single-precision seconds resolve a microsecond, and v2e's rounding is repeated; later slots are computed in double
 
 
 def front_end(frames):
     """Lin-log level as v2e rounds it: computed in double precision, to 8 decimals, kept in single. frames: [T, H, W]."""
-    frames = frames.double()
-    level = torch.where(frames <= DARK, frames * (math.log(DARK) / DARK), frames.clamp(min=DARK).log())
-    return ((level * 1e8).round() / 1e8).float()
+    return ((FrontEnd().level(frames.double()) * 1e8).round() / 1e8).float()
 
 
 def interval(frame, level, time_s, sensor, generator, state):
@@ -28,7 +26,7 @@ def interval(frame, level, time_s, sensor, generator, state):
     Returns: t_us, x, y, p: int64 [N] each, unsorted.
     """
     dt_s = time_s - state.time_s
-    light = (frame.double() + DARK) / SPAN
+    light = light_share(frame.double())
     seen = _photoreceptor(level, light, dt_s, sensor, generator, state)
     if sensor.leaks:
         rate_hz = state.leak_hz

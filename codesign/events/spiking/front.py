@@ -6,11 +6,11 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from codesign.events.intensity import light_share
 from codesign.events.layers.low_pass import fading_mean
 
 KNOTS = 6
 DARKEST, BRIGHTEST = 0.0, math.log(256.0)  # log levels between which the tone curve bends
-FULL_LIGHT, DARK_LIGHT = 275.0, 20.0  # light = (I + 20)/275, as in the physical sensor
 
 
 class Prefilter(nn.Module):
@@ -57,7 +57,7 @@ class Bandwidth(nn.Module):
 
     def advance(self, filtered, before, now, intensity, interval_s):
         """The filter after an interval over which the level runs linearly from ``before`` to ``now``; intensity: mean over the interval."""
-        light = (intensity + DARK_LIGHT) / FULL_LIGHT
+        light = light_share(intensity)
         pace = (2 * math.pi * interval_s) * torch.exp(self.log_cutoff + self.power * light.log())
         return now + (filtered - before) * torch.exp(-pace) - (now - before) * fading_mean(pace)
 

@@ -3,7 +3,7 @@
 import torch
 from torch import nn
 
-from codesign.events.spiking.front import DARK_LIGHT, FULL_LIGHT
+from codesign.events.intensity import light_share
 
 
 class NoiseRate(nn.Module):
@@ -19,6 +19,6 @@ class NoiseRate(nn.Module):
 
     def forward(self, intensity):
         """intensity: [T, ...]; returns [T, 2, ...], ON first."""
-        shape = torch.exp(-self.fade * (intensity + DARK_LIGHT) / FULL_LIGHT)
+        shape = torch.exp(-self.fade * light_share(intensity))
         on, off = self.amplitude_hz + (self.amplitude_hz.clamp(min=0) - self.amplitude_hz).detach()
         return torch.stack((on * shape, off * shape), dim=1)

@@ -5,12 +5,14 @@ from dataclasses import astuple, dataclass
 import torch
 from torch.autograd import Function
 
-from codesign.backend import arrays
-from codesign.errors import GradientError, NonFiniteError, check_finite
+from codesign.backend import NoSecondDerivative, arrays
+from codesign.errors import NonFiniteError, check_finite
 from codesign.events.spiking.srm_adjoint import Wanted, pack, scan_back, unpack
 from codesign.events.spiking.srm_forward import Grid, Plan, scan
 from codesign.events.spiking.srm_kernels import absolute_sum, reset_coefficients, response_coefficients
 from codesign.events.spiking.surrogate import Surrogate
+
+FIRST_ONLY = "events.srm gives first derivatives only, and a second one was asked for; use differences of gradients instead."
 
 BOUND = 0.9  # "bounded" keeps rho * sum|nu| at most this: the adjoint then shrinks by 10 % per pass through the reset
 STAGGER = 768  # floats ahead of the potential: where potentials and their gradient share their place in a memory page, backward takes 1.4 times as long
@@ -77,7 +79,7 @@ class _Srm(Function):
             result = _backward(ctx, grads)
         if torch.is_grad_enabled():
             live = [g for g in result if g is not None]
-            sealed = iter(_NoSecondDerivative.apply(len(live), *live, *[x for x in (*ctx.saved_tensors, *grads) if x is not None]))
+            sealed = iter(NoSecondDerivative.apply(FIRST_ONLY, len(live), *live, *[x for x in (*ctx.saved_tensors, *grads) if x is not None]))
             result = [None if g is None else next(sealed) for g in result]
         return None, *result
 
@@ -195,15 +197,3 @@ class _Work:
         parts = [[[next(values) for _ in range(count)] for count in counts] for _ in range(self.channels)]
         empty = torch.zeros(0, self.channels, self.grid.lanes, dtype=torch.float64, device=self.theta.device)
         return [torch.stack([torch.stack([part[which][j] for part in parts]) for j in range(count)]) if count else empty for which, count in enumerate(counts)]
-
-
-class _NoSecondDerivative(Function):
-    """Passes gradients on unchanged; differentiating them again is refused with a sentence."""
-
-    @staticmethod
-    def forward(ctx, count, *tensors):
-        return tuple(t.clone() for t in tensors[:count])
-
-    @staticmethod
-    def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
-        raise GradientError("events.srm gives first derivatives only, and a second one was asked for; use differences of gradients instead.")
