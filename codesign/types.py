@@ -1,4 +1,4 @@
-"""Frozen dataclasses that cross junctions: camera rays, event streams, event volumes, flow fields."""
+"""Frozen dataclasses that cross junctions: camera rays, event streams, event volumes, flow fields, windows to learn flow from."""
 
 from dataclasses import dataclass
 
@@ -59,11 +59,28 @@ class EventVolume:
 class FlowField:
     """Motion of every pixel over one interval.
 
-    flow_px: [B, 2, H, W] pixels per interval, +x right, +y down.
+    flow_px: [B, 2, H, W] pixels per interval, +x right, +y down: where the point seen at the start of the interval lies at its end.
     valid: [B, H, W] bool, False where the value means nothing (no ground truth, no events).
     interval_s: length of the interval, seconds.
+    confidence: [B, H, W] in 0..1, 0 where nothing was seen, 1 for a flow known exactly; None where nobody estimated it.
+    covariance_px2: [B, 3, H, W] of the error, px^2: xx, xy, yy; None where nobody estimated it.
     """
 
     flow_px: Tensor
     valid: Tensor
     interval_s: float
+    confidence: Tensor | None = None
+    covariance_px2: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class FlowWindows:
+    """A batch to learn flow from, or to judge it on.
+
+    volume: EventVolume of B samples. truth: FlowField of the same interval, on the pixels of its start.
+    frames: [B, 2, H, W] linear intensity at the start and at the end, 0..255 scale; None where there are none.
+    """
+
+    volume: EventVolume
+    truth: FlowField
+    frames: Tensor | None = None

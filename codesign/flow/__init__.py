@@ -1,6 +1,10 @@
-"""Event flow: the closed-form estimator and error measures."""
+"""Event flow: the closed form, the refiner and the networks it is compared with, losses, error measures, network files and sources of windows."""
 
-from codesign.flow import metrics
+from codesign.flow import contrast, losses, metrics, sources
+from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
+from codesign.flow.checkpoint import load, save
+from codesign.flow.export import export
 from codesign.flow.lk import estimate_lk
+from codesign.flow.refiner import Refiner
 
-__all__ = ["estimate_lk", "metrics"]
+__all__ = ["FlowNetEvents", "Refiner", "SpikeFlowNet", "contrast", "estimate_lk", "export", "load", "losses", "metrics", "save", "sources"]

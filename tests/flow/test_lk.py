@@ -1,6 +1,7 @@
 """The closed-form estimator on analytically moving patterns, on noise, and its gradient."""
 
 import math
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -23,7 +24,11 @@ def pattern(seed, finest_px=6.0, coarsest_px=24.0, count=40):
 
 
 def moving(seed, matrix=((0.0, 0.0), (0.0, 0.0)), shift=(0.0, 0.0), per_pixel=8.0, steps=80, bins=5):
-    """Volume of a signed event rate carried along the flow matrix (x - centre) + shift, and that flow [2, H, W]."""
+    """Volume of a signed event rate whose points move evenly, by matrix (x - centre) + shift from where they are at mid-interval, and the flow [2, H, W].
+
+    A point seen at a at the start is at x with a = x - (matrix x + shift) / 2 at mid-interval, so the flow on the pixels of the start is
+    matrix (1 - matrix / 2)^-1 (a + shift / 2) + shift.
+    """
     matrix, shift = torch.tensor(matrix, dtype=D), torch.tensor(shift, dtype=D)
     y, x = torch.meshgrid(torch.arange(SIZE, dtype=D), torch.arange(SIZE, dtype=D), indexing="ij")
     at = torch.stack([x, y], -1) - (SIZE - 1) / 2
@@ -34,7 +39,22 @@ def moving(seed, matrix=((0.0, 0.0), (0.0, 0.0)), shift=(0.0, 0.0), per_pixel=8.
         signed = rate(origin[..., 0], origin[..., 1]) * per_pixel / steps
         counts.append(torch.stack([signed.clamp_min(0), (-signed).clamp_min(0)]))
     volume = events.from_counts(torch.stack(counts), torch.linspace(0, SPAN_S, steps + 1, dtype=D), bins)
-    return volume, (at @ matrix.T + shift).permute(2, 0, 1)
+    middle = (at + shift / 2) @ torch.linalg.inv(torch.eye(2, dtype=D) - matrix / 2).T
+    return volume, (middle @ matrix.T + shift).permute(2, 0, 1)
+
+
+@dataclass(frozen=True)
+class Certain:
+    flow_px: torch.Tensor
+    confidence: torch.Tensor
+    covariance_px2: torch.Tensor
+
+
+def certain(field):
+    """The field's flow, confidence and covariance, which the closed form always gives."""
+    if field.confidence is None or field.covariance_px2 is None:
+        raise AssertionError("the closed form gave no confidence or covariance")
+    return Certain(field.flow_px, field.confidence, field.covariance_px2)
 
 
 def mean_error(field, truth):
@@ -70,8 +90,13 @@ def test_affine_flow(matrix):
 def test_flow_changes_sign_with_time_and_turns_with_the_image():
     volume, _ = moving(3, shift=(2.0, 1.0))
     found = estimate_lk(volume).flow_px
-    backwards = EventVolume(volume.counts.flip(2), volume.centroid_s, volume.collected_s)
-    torch.testing.assert_close(estimate_lk(backwards).flow_px, -found, rtol=0, atol=1e-9)
+    back = estimate_lk(EventVolume(volume.counts.flip(2), volume.centroid_s, volume.collected_s)).flow_px[0].flatten(1).T
+    # backwards in time, the flow begins where the other one ends: back(x + found(x)) = -found(x), with both of them affine
+    y, x = torch.meshgrid(torch.arange(SIZE, dtype=D), torch.arange(SIZE, dtype=D), indexing="ij")
+    ones, starts = torch.ones(SIZE * SIZE, 1, dtype=D), torch.stack([x, y], -1).flatten(0, 1)
+    affine = torch.linalg.lstsq(torch.cat([ones, starts], 1), back).solution
+    there = found[0].flatten(1).T
+    torch.testing.assert_close(torch.cat([ones, starts + there], 1) @ affine, -there, rtol=0, atol=1e-9)
     swapped = EventVolume(volume.counts.flip(1), volume.centroid_s, volume.collected_s)
     torch.testing.assert_close(estimate_lk(swapped).flow_px, found, rtol=0, atol=1e-12)  # polarity does not matter
     turned = EventVolume(volume.counts.transpose(3, 4), volume.centroid_s, volume.collected_s)
@@ -186,3 +211,39 @@ def test_small_images_work_with_finer_levels():
     found = estimate_lk(small, model="constant", levels_px=(1.5, 1.0))
     assert found.flow_px.shape == (1, 2, 10, 10)
     assert mean_error(found, truth[:, 20:30, 20:30]) <= 0.3 * length(truth)  # a hundred pixels, with half of them near the border
+
+
+def test_flow_belongs_to_the_pixels_of_the_start():
+    # a zoom by 1 + m about the centre while shifting by s: a point seen at a is at (1 + m/2)/(1 - m/2) a + s' at the end, so flow at the centre pixel is
+    # s / (1 - m/2) (worked out in ``moving``); taken on the pixels of mid-interval it would be s, 0.2 px less
+    volume, truth = moving(2, ((0.1, 0.0), (0.0, 0.1)), (4.0, 0.0))
+    centre = estimate_lk(volume).flow_px[0, 0, SIZE // 2 - 1 : SIZE // 2 + 1, SIZE // 2 - 1 : SIZE // 2 + 1].mean()
+    assert float(truth[0, SIZE // 2 - 1 : SIZE // 2 + 1, SIZE // 2 - 1 : SIZE // 2 + 1].mean()) == pytest.approx(4.0 / 0.95, rel=1e-9)
+    assert float(centre) == pytest.approx(4.0 / 0.95, abs=0.05)  # a quarter of that difference
+
+
+def test_confidence_follows_from_the_covariance_and_is_zero_without_events():
+    volume, _ = moving(0, shift=(1.0, 0.5), steps=10)
+    field = certain(estimate_lk(EventVolume(torch.cat([volume.counts, 0 * volume.counts]), volume.centroid_s, volume.collected_s), model="constant", prior_px=2.0))
+    variance = field.covariance_px2[:, 0] + field.covariance_px2[:, 2]
+    torch.testing.assert_close(field.confidence, 1 - variance / 8, rtol=1e-12, atol=1e-12)  # the prior's: 2^2 + 2^2
+    assert not field.confidence[1].any()
+    assert float(field.confidence[0].min()) > 0.99
+
+
+@pytest.mark.parametrize("model", ["affine", "quadratic"])
+def test_gradients_of_the_uncertainty_are_those_of_differences(model, generator):
+    volume, _ = moving(4, shift=(0.7, -0.4), steps=20, bins=3)
+    counts = (volume.counts[..., 10:24, 8:22] * 0.3).clone().requires_grad_()
+    weights = torch.randn(4, 14, 14, generator=generator, dtype=D)
+
+    def loss(counts):
+        field = certain(estimate_lk(EventVolume(counts, volume.centroid_s, volume.collected_s), model=model))
+        return (field.confidence[0] * weights[0]).sum() + (field.covariance_px2[0] * weights[1:]).sum()
+
+    (found,) = torch.autograd.grad(loss(counts), counts)
+    for _ in range(3):
+        tangent = torch.randn(counts.shape, generator=generator, dtype=D)
+        ahead, behind = (float(loss((counts + s * 1e-6 * tangent).detach())) for s in (1, -1))
+        truth = (ahead - behind) / 2e-6
+        assert abs(float((found * tangent).sum()) - truth) <= 1e-5 * abs(truth) + 1e-6

@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from codesign.errors import DomainError, ShapeError
+from codesign.events.stream import ordered
 from codesign.flow import metrics
+from codesign.types import EventVolume, FlowField
 
 D = torch.float64
 
@@ -84,3 +86,144 @@ def test_empty_masks_and_wrong_shapes_are_refused():
         metrics.aee(FOUND, TRUTH, torch.ones(4, 4, dtype=torch.bool))
     with pytest.raises(ShapeError, match=r"\[\.\.\., 2, H, W\]"):
         metrics.angular_error_deg(torch.zeros(3, 4, 4), torch.zeros(3, 4, 4))
+
+
+def test_both_conditions_of_an_outlier_are_explicit():
+    assert metrics.outlier_percent(FOUND, TRUTH).item() == pytest.approx(100 * 2 / 5)
+    assert metrics.outlier_percent(FOUND, TRUTH, share=0.0).item() == metrics.npe(FOUND, TRUTH, 3.0).item() == pytest.approx(100 * 3 / 5)
+    assert metrics.outlier_percent(FOUND, TRUTH, pixels=0.0, share=0.04).item() == pytest.approx(100 * 2 / 5)  # 3.5 of 100 is 3.5 %
+
+
+def test_zero_flow_error_is_the_mean_true_length():
+    assert metrics.zero_flow_error(TRUTH).item() == pytest.approx((100 + 10 + math.sqrt(2)) / 5)
+    assert metrics.zero_flow_error(TRUTH, torch.tensor([[True, False, False, True, False]])).item() == pytest.approx(5)
+
+
+def test_masks_of_events_and_truth():
+    counts = torch.zeros(2, 2, 3, 1, 4)
+    counts[0, 0, 1, 0, 0] = 0.25  # a part of an event
+    counts[0, 1, 2, 0, 2] = 3
+    counts[1, 1, 0, 0, 3] = 1
+    valid = torch.tensor([[[True, True, False, False]], [[False, False, True, True]]])
+    found = metrics.masks(EventVolume(counts, torch.arange(3.0), torch.ones(3)), FlowField(torch.zeros(2, 2, 1, 4), valid, 3.0))
+    assert found["events"].tolist() == [[[True, False, True, False]], [[False, False, False, True]]]
+    assert found["both"].tolist() == [[[True, False, False, False]], [[False, False, False, True]]]
+    assert found["valid"] is valid
+    with pytest.raises(ShapeError, match="volume and truth differ"):
+        metrics.masks(EventVolume(counts, torch.arange(3.0), torch.ones(3)), FlowField(torch.zeros(2, 2, 1, 3), valid[..., :3], 3.0))
+
+
+@pytest.mark.parametrize("measure", [metrics.aee, metrics.outlier_percent, metrics.angular_error_deg, lambda f, t, m=None: metrics.npe(f, t, 3.0, m)])
+def test_nan_is_no_inlier(measure):
+    flow = FOUND.clone()
+    flow[0, 0, 1] = math.nan
+    with pytest.raises(DomainError, match="NaN or infinite at 1 of 5 pixels"):
+        measure(flow, TRUTH)
+    mask = torch.tensor([[True, False, True, True, True]])
+    assert measure(flow, TRUTH, mask).item() == measure(FOUND, TRUTH, mask).item()
+
+
+# rays
+
+
+def test_ray_errors_of_a_pinhole_in_closed_form():
+    # focal length 50 px, axis at (2, 1): the end (52, 1) lies at 45 degrees, (2, 51) too, 60 degrees from it; (2, 1) is the axis
+    direction = metrics.pinhole_directions(3, 5, 50.0)
+    truth = torch.zeros(2, 3, 5, dtype=D)
+    mask = torch.zeros(3, 5, dtype=torch.bool)
+    mask[1, 2] = True
+    pairs = [((50.0, 0.0), (0.0, 0.0), 45.0), ((50.0, 0.0), (0.0, 50.0), 60.0), ((-50.0, 0.0), (50.0, 0.0), 90.0), ((7.3, 1.0), (7.3, 1.0), 0.0)]
+    for flow, other, degrees in pairs:
+        found, truth = (torch.tensor(pair, dtype=D)[:, None, None].expand(2, 3, 5) for pair in (flow, other))
+        # the ends lie far outside the image: linear beyond its border is exact for a pinhole; rays of any length count the same
+        for scale in (1.0, 0.1):
+            assert metrics.ray_error_mrad(found, truth, scale * direction, mask).item() == pytest.approx(1000 * math.radians(degrees), abs=1e-9)
+    batch = torch.stack([found, found])
+    assert metrics.ray_error_mrad(batch, batch, direction).item() == pytest.approx(0, abs=1e-12)
+
+
+def test_the_angle_of_a_pixel_in_closed_form():
+    # solid angle of a pixel of a pinhole: cos^3 / f^2
+    focal = 20.0
+    found = metrics.mrad_per_pixel(metrics.pinhole_directions(7, 9, focal))
+    y, x = torch.meshgrid(torch.arange(7, dtype=D) - 3, torch.arange(9, dtype=D) - 4, indexing="ij")
+    cosine = focal / (x.square() + y.square() + focal**2).sqrt()
+    torch.testing.assert_close(found, 1000 * cosine**1.5 / focal, rtol=1e-12, atol=0)
+    # and a short flow of one pixel is that angle on the axis
+    truth = torch.zeros(2, 7, 9, dtype=D)
+    axis = torch.zeros(7, 9, dtype=torch.bool)
+    axis[3, 4] = True
+    error = metrics.ray_error_mrad(truth + torch.tensor([1e-6, 0.0], dtype=D)[:, None, None], truth, metrics.pinhole_directions(7, 9, focal), axis)
+    assert error.item() == pytest.approx(1e-6 * found[3, 4].item(), rel=1e-9)
+
+
+def test_a_principal_point_off_the_middle():
+    direction = metrics.pinhole_directions(3, 5, 10.0, centre_px=(0.0, 2.0))
+    assert direction[2, 0].tolist() == [0, 0, 1]
+    assert direction[0, 4].tolist() == pytest.approx([0.4, -0.2, 1])
+
+
+def test_rays_that_do_not_fit_are_refused():
+    flow = torch.zeros(2, 3, 5, dtype=D)
+    with pytest.raises(ShapeError, match=r"directions must be \[H, W, 3\]"):
+        metrics.ray_error_mrad(flow, flow, metrics.pinhole_directions(3, 4, 10.0))
+    with pytest.raises(DomainError, match="does not go forward"):
+        metrics.ray_error_mrad(flow, flow, -metrics.pinhole_directions(3, 5, 10.0))
+
+
+# events alone
+
+
+def line(steps, width, height=3):
+    """A vertical line that starts at column 2 and moves a pixel to the right per 1000 us; one event per pixel it comes to."""
+    k = torch.arange(steps).repeat_interleave(height)
+    return ordered(1000 * k, 2 + k, torch.arange(height).repeat(steps), torch.ones_like(k), height, width), 1000 * (steps - 1)
+
+
+def constant(u, width, height=3):
+    return torch.tensor([u, 0.0], dtype=D)[:, None, None].expand(2, height, width)
+
+
+@pytest.mark.parametrize(("steps", "width"), [(5, 12), (9, 16)])
+def test_a_moving_line_in_closed_form(steps, width):
+    # unwarped: n of w columns hold 1; warped: one of them n. Variances n/w - (n/w)^2 and n^2/w - (n/w)^2
+    stream, end_us = line(steps, width)
+    flow = constant(steps - 1.0, width)
+    for at in (0.0, 0.4, 1.0):
+        assert metrics.fwl(stream, flow, 0, end_us, at) == pytest.approx(steps * (width - 1) / (width - steps))
+    # mean squares of the times: of k / (n - 1) before, (2n - 1) / (6 (n - 1)); of their mean after, 1/4
+    assert metrics.rsat(stream, flow, 0, end_us) == pytest.approx(1.5 * (steps - 1) / (2 * steps - 1))
+    for measure in (metrics.fwl, metrics.rsat):
+        assert measure(stream, torch.zeros(2, 3, width), 0, end_us) == 1
+    assert metrics.fwl(stream, flow[None].float(), 0, end_us) == pytest.approx(steps * (width - 1) / (width - steps), rel=1e-6)
+
+
+def test_events_that_leave_count_in_the_denominator_only():
+    # from column 2 + k at time k/4 to column 2 + k + (1 - k/4) u; for u = 8 that is 10 - k: mirrored, and as sharp as before
+    stream, end_us = line(5, 12)
+    assert metrics.fwl(stream, constant(8.0, 12), 0, end_us) == pytest.approx(1)
+    # u = 40: to 42 - 9 k = 42, 33, 24, 15, 6: one stays. Variances 1/12 - 1/144 and 5/12 - 25/144
+    assert metrics.fwl(stream, constant(40.0, 12), 0, end_us) == pytest.approx(11 / 35)
+    assert metrics.rsat(stream, constant(40.0, 12), 0, end_us) == pytest.approx(1 / (9 / 24))  # the last, at time 1; before, 9 / 24
+    with pytest.raises(DomainError, match="every event out of the image"):
+        metrics.rsat(stream, constant(40.0, 12), 0, end_us + 1000)  # at 4/5 of the window it leaves too
+
+
+def test_polarities_share_an_image_in_fwl_but_not_in_rsat():
+    # ON at column 1, time 0, OFF at column 2, time 1, flow 1: both end on column 2
+    stream = ordered(torch.tensor([0, 10]), torch.tensor([1, 2]), torch.tensor([0, 0]), torch.tensor([1, -1]), 1, 4)
+    flow = constant(1.0, 4, 1)
+    assert metrics.fwl(stream, flow, 0, 10) == pytest.approx((4 / 4 - 1 / 4) / (2 / 4 - 1 / 4))
+    assert metrics.rsat(stream, flow, 0, 10) == pytest.approx(2)  # (0 + 1) / 1 pixel against (0 + 1) / 2 pixels
+
+
+def test_event_measures_without_an_answer_are_refused():
+    stream, end_us = line(5, 12)
+    for measure in (metrics.fwl, metrics.rsat):
+        with pytest.raises(DomainError, match="no event lies between"):
+            measure(stream, constant(1.0, 12), end_us + 1, end_us + 5)
+    everywhere = ordered(torch.arange(4), torch.tensor([0, 1, 0, 1]), torch.tensor([0, 0, 1, 1]), torch.ones(4), 2, 2)
+    with pytest.raises(DomainError, match="equally many events"):
+        metrics.fwl(everywhere, torch.zeros(2, 2, 2), 0, 3)
+    with pytest.raises(DomainError, match="at the start of the interval"):
+        metrics.rsat(ordered(torch.zeros(1), torch.zeros(1), torch.zeros(1), torch.ones(1), 2, 2), torch.zeros(2, 2, 2), 0, 3)

@@ -1,0 +1,24 @@
+"""Bins of an event volume looked up along a flow, and pixel grids."""
+
+import torch
+from torch.nn.functional import grid_sample
+
+
+def pixel_grid(height, width, like):
+    """Pixel positions [2, H, W], (x, y) with the origin at the first pixel's centre."""
+    y, x = torch.meshgrid(torch.arange(height, dtype=like.dtype, device=like.device), torch.arange(width, dtype=like.dtype, device=like.device), indexing="ij")
+    return torch.stack([x, y])
+
+
+def along_flow(bins, flow_px, time):
+    """What each bin holds where a point of the start has got to.
+
+    Args: bins: [B, T, H, W]. flow_px: [B, 2, H, W] px per window on pixels of the start. time: [T] bin times, 0 at the start of the window, 1 at its end.
+    Returns: [B, T, H, W], bin k at q + time_k flow(q) for every pixel q, bilinear; 0 outside the image.
+    Gradient: bins and flow.
+    """
+    batch, count, height, width = bins.shape
+    at = pixel_grid(height, width, flow_px) + time[:, None, None, None] * flow_px[:, None]  # [B, T, 2, H, W]
+    half = torch.tensor([width / 2, height / 2], dtype=flow_px.dtype, device=flow_px.device)[:, None, None]
+    unit = ((at + 0.5) / half - 1).permute(0, 1, 3, 4, 2).reshape(batch * count, height, width, 2)
+    return grid_sample(bins.reshape(batch * count, 1, height, width), unit, align_corners=False).reshape(bins.shape)

@@ -1,0 +1,70 @@
+"""Windows of events out of the rendered 3-D worlds: surfaces that hide one another, the full sensor, exact flow. Networks are judged on them."""
+
+import torch
+
+from codesign import events, lens, render
+from codesign.errors import DomainError
+from codesign.types import EventVolume, FlowField, FlowWindows
+from scenes import worlds
+from studies.make_dataset import make_world
+from studies.make_dataset_motion import FAMILIES, LEAD_S, motion
+
+PATH_S = 1.0  # length of the path a window is taken from
+PROBE_S = 0.01  # over which the speed in the image is measured
+LONGEST_S = 0.4
+LEAD = 8  # frames before the window, over which the memorised levels settle
+ALL = tuple(name for name in worlds.WORLDS if not name.startswith(("blank", "dark")))
+
+
+class WorldWindows:
+    """Source of FlowWindows: ``batch(indices)``.
+
+    A window of interval 1 starts somewhere on a path of one of five families, and lasts until the root mean square flow is ``flow_px`` (drawn evenly).
+    Args: names: worlds, taken in turn. seed: other seeds give other paths. size_px: width and height. flow_px: (least, most). theta: threshold, or
+    (least, most). noise: background events per pixel, polarity and eighth of the window, (least, most), evenly in the logarithm. fov_deg: horizontal field.
+    """
+
+    def __init__(self, names=ALL, *, seed=0, size_px=128, bins=8, intervals=32, flow_px=(1.5, 8.0), theta=(0.1, 0.2), noise=(0.0005, 0.005), fov_deg=(45.0, 80.0), samples=8):
+        unknown = sorted(set(names) - set(worlds.WORLDS))
+        if unknown or not names:
+            raise DomainError(f"worlds {unknown} are unknown; there are {', '.join(worlds.WORLDS)}.")
+        self.names, self.seed, self.size_px, self.bins, self.intervals = tuple(names), seed, size_px, bins, intervals
+        self.flow_px, self.theta, self.noise, self.fov_deg, self.samples = flow_px, theta, noise, fov_deg, samples
+        self._built = {}
+
+    @torch.no_grad()
+    def batch(self, indices):
+        """Samples of these numbers; truth is valid where the world is seen (the sky has no flow) and its point stays in the image."""
+        parts = [self._window(int(index)) for index in indices]
+        counts, flow, valid, frames = (torch.cat([part[k] for part in parts]) for k in range(4))
+        shell = parts[0][4]
+        return FlowWindows(EventVolume(counts, shell.centroid_s, shell.collected_s), FlowField(flow, valid, 1.0), frames)
+
+    def _window(self, index):
+        draw = torch.Generator().manual_seed(1_000_003 * self.seed + index)
+        between = lambda low, high: low + (high - low) * float(torch.rand((), generator=draw, dtype=torch.float64))  # noqa: E731
+        name = self.names[index % len(self.names)]
+        if name not in self._built:
+            self._built[name] = make_world(name, "emissive")
+        scene, stage = self._built[name]
+        camera = self._camera(between(*self.fov_deg))
+        path = motion(FAMILIES[index // len(self.names) % len(FAMILIES)], stage, scene, camera, PATH_S, draw)
+        start = LEAD_S + between(0.05, PATH_S - LONGEST_S)
+        flow, seen = render.true_flow(camera, scene, path(start + torch.tensor([0.0, PROBE_S], dtype=torch.float64)).detach())
+        speed = float(flow[0].square().sum(0)[seen[0]].mean().sqrt()) / PROBE_S
+        length = min(between(*self.flow_px) / max(speed, 1e-6), LONGEST_S)
+        t = torch.arange(-LEAD, self.intervals + 1, dtype=torch.float64) / self.intervals
+        poses = path(start + length * t).detach()
+        frames = render.frames(camera, scene, poses)
+        flow, valid = render.true_flow(camera, scene, poses[[LEAD, -1]])
+        theta = between(*self.theta)
+        noise = self.noise[0] * (self.noise[1] / self.noise[0]) ** between(0, 1)
+        sensor = events.SensorModel(theta, theta, 0.03 * theta, shot_rate_hz=16 * noise)  # in windows of one second: two polarities, eight eighths
+        counts = events.dense_counts(frames, t - t[0], sensor, generator=draw)[LEAD:]
+        volume = events.from_counts(counts, t[LEAD:], self.bins)
+        return volume.counts.float(), flow.float(), valid, frames[[LEAD, -1]][None].float(), volume
+
+    def _camera(self, fov_deg):
+        focal_mm = 4.0
+        width_mm = 2 * focal_mm * torch.tensor(fov_deg / 2).deg2rad().tan().item()
+        return render.Camera(lens.Pinhole(focal_mm), self.size_px, self.size_px, width_mm / self.size_px, self.samples)

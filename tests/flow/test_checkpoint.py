@@ -1,0 +1,156 @@
+"""Network files: every bit comes back, equal networks are equal files, and each kind of damage is one clear error."""
+
+import json
+import sys
+
+import pytest
+import safetensors.torch
+import torch
+from torch import nn
+
+from codesign.errors import DomainError, FileFormatError
+from codesign.flow import checkpoint
+
+
+class Tiny(nn.Module):
+    """Stands for a network; the tests look at its weights alone."""
+
+    def __init__(self, bins=2, width=3):
+        super().__init__()
+        if width > 9:
+            raise DomainError("width is at most 9")
+        self.config = {"bins": bins, "width": width}
+        self.layer = nn.Conv2d(2 * bins, width, 3)
+        self.register_buffer("scale", torch.tensor(1 / 3, dtype=torch.float64))
+        self.low = nn.Parameter(torch.tensor([1.5, -0.0], dtype=torch.bfloat16))
+
+
+class Other(Tiny):
+    """A network without a name."""
+
+
+@pytest.fixture(autouse=True)
+def named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "tiny_networks", sys.modules[__name__])
+    monkeypatch.setattr(Tiny, "__module__", "tiny_networks")
+    monkeypatch.setitem(checkpoint.NETWORKS, "tiny", "tiny_networks:Tiny")
+
+
+@pytest.fixture
+def path(tmp_path):
+    checkpoint.save(Tiny(width=4), tmp_path / "tiny.safetensors", {"seed": 3, "note": "π"})
+    return tmp_path / "tiny.safetensors"
+
+
+def test_every_bit_comes_back(tmp_path):
+    network = Tiny(bins=3, width=5).train()
+    checkpoint.save(network, tmp_path / "a.safetensors", {"seed": 3, "loss": 0.1 + 0.2, "note": "π"})
+    back = checkpoint.load(tmp_path / "a.safetensors")
+    assert isinstance(back, Tiny)
+    assert back.config == {"bins": 3, "width": 5}
+    assert not back.training
+    own = network.state_dict()
+    for name, tensor in back.state_dict().items():
+        assert tensor.dtype == own[name].dtype
+        assert tensor.reshape(-1).view(torch.uint8).tolist() == own[name].reshape(-1).view(torch.uint8).tolist()
+    assert checkpoint.read(tmp_path / "a.safetensors").metadata == {"seed": 3, "loss": 0.1 + 0.2, "note": "π"}
+
+
+def test_equal_networks_are_equal_files(tmp_path, path):
+    again = checkpoint.load(path)
+    checkpoint.save(again, tmp_path / "b.safetensors", {"seed": 3, "note": "π"})
+    assert (tmp_path / "b.safetensors").read_bytes() == path.read_bytes()
+
+
+def test_a_name_stands_for_the_delivered_file(monkeypatch, tmp_path, path):
+    monkeypatch.setitem(checkpoint.DELIVERED, "refiner", path)
+    assert torch.equal(checkpoint.load("refiner").layer.weight, checkpoint.load(path).layer.weight)
+    monkeypatch.setitem(checkpoint.DELIVERED, "refiner", tmp_path / "gone.safetensors")
+    with pytest.raises(FileFormatError, match="does not exist"):
+        checkpoint.load("refiner")
+    with pytest.raises(FileFormatError, match="neither a delivered network"):
+        checkpoint.load("refinerr")
+
+
+def test_a_file_cut_anywhere_is_refused(path, tmp_path):
+    whole = path.read_bytes()
+    for length in (0, 4, 8, 100, len(whole) // 2, len(whole) - 1):
+        (tmp_path / "cut.safetensors").write_bytes(whole[:length])
+        with pytest.raises(FileFormatError, match="damaged"):
+            checkpoint.load(tmp_path / "cut.safetensors")
+
+
+def test_no_changed_byte_goes_unseen(path, tmp_path):
+    whole = path.read_bytes()
+    for place in range(0, len(whole), 37):  # header and tensors alike
+        (tmp_path / "bad.safetensors").write_bytes(whole[:place] + bytes([whole[place] ^ 0x10]) + whole[place + 1 :])
+        with pytest.raises(FileFormatError):
+            checkpoint.load(tmp_path / "bad.safetensors")
+
+
+def test_pickles_are_never_opened(tmp_path):
+    torch.save(Tiny().state_dict(), tmp_path / "a.safetensors")
+    with pytest.raises(FileFormatError, match="damaged or not written by codesign"):
+        checkpoint.load(tmp_path / "a.safetensors")
+    safetensors.torch.save_file({"a": torch.zeros(2)}, tmp_path / "b.safetensors")
+    with pytest.raises(FileFormatError, match="not written by codesign"):
+        checkpoint.load(tmp_path / "b.safetensors")
+
+
+def rewritten(path, **changes):
+    """The file with another content, its checksum right."""
+    stored = checkpoint.read(path)
+    content = {"kind": "network", "network": stored.network, "config": stored.config, "metadata": {}, **{k: v for k, v in changes.items() if k != "weights"}}
+    checkpoint.write_tensors(path, changes.get("weights", stored.weights), content)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"version": 2}, "format version 2, this codesign reads version 1"),
+        ({"kind": "training"}, "holds no network"),
+        ({"network": "gone"}, "network 'gone' is unknown"),
+        ({"config": {"width": 4, "depth": 2}}, "another version of this network"),
+        ({"config": {"width": 40}}, "width is at most 9"),
+        ({"config": {"width": 5}}, r"'layer.bias' is \[4\], the network's is \[5\]"),
+        ({"config": []}, "holds no network"),
+    ],
+)
+def test_what_does_not_fit_is_named(path, changes, sentence):
+    with pytest.raises(FileFormatError, match=sentence):
+        checkpoint.load(rewritten(path, **changes))
+
+
+def test_weights_must_be_those_of_the_network(path):
+    weights = checkpoint.read(path).weights
+    for changed, sentence in (
+        ({k: v for k, v in weights.items() if k != "scale"}, "lacks the weight 'scale'"),
+        (weights | {"more": torch.zeros(1)}, "has a weight 'more'"),
+        (weights | {"layer.bias": torch.full((4,), torch.nan)}, "'layer.bias' is NaN"),
+    ):
+        with pytest.raises(FileFormatError, match=sentence):
+            checkpoint.load(rewritten(path, weights=changed))
+
+
+def test_what_cannot_be_loaded_again_is_not_saved(tmp_path, path):
+    before = path.read_bytes()
+    with pytest.raises(DomainError, match="have no name"):
+        checkpoint.save(Other(), path)
+    bad = Tiny()
+    nn.init.constant_(bad.layer.weight, torch.inf)
+    with pytest.raises(DomainError, match=r"layer\.weight"):
+        checkpoint.save(bad, path)
+    with pytest.raises(DomainError, match="plain, finite JSON"):
+        checkpoint.save(Tiny(), path, {"loss": float("nan")})
+    assert path.read_bytes() == before
+    with pytest.raises(FileFormatError, match="existing, writable folder"):
+        checkpoint.save(Tiny(), tmp_path / "nowhere" / "a.safetensors")
+
+
+def test_the_header_is_readable_by_other_tools(path):
+    with safetensors.safe_open(str(path), framework="pt") as stored:
+        content = json.loads(json.loads(stored.metadata()["codesign"])["content"])
+    assert content["network"] == "tiny"
+    assert content["config"] == {"bins": 2, "width": 4}
+    assert content["metadata"]["seed"] == 3

@@ -1,0 +1,89 @@
+"""Networks as programs: the same numbers as the network, from torch.export and from ONNX, and refusals."""
+
+import importlib.util
+import warnings
+
+import pytest
+import torch
+from torch import nn
+
+from codesign.errors import DomainError, FileFormatError
+from codesign.events import from_stream
+from codesign.flow.export import eliminate, evenly_timed, export
+from codesign.types import EventStream, FlowField
+
+needs_onnx = pytest.mark.skipif(importlib.util.find_spec("onnxscript") is None or importlib.util.find_spec("onnx") is None, reason="needs onnx and onnxscript")
+
+
+class Small(nn.Module):
+    """Every kind of step that flow networks have: a check of the values, numbers worked out from the bins' times, a solve, a warp, a branch for the size."""
+
+    def __init__(self, solves=True):
+        super().__init__()
+        self.config = {"bins": 4}
+        self.solves = solves
+        self.layer = nn.Conv2d(8, 2, 3, padding=1)
+        self.layer.weight.data = self.layer.weight.data.contiguous(memory_format=torch.channels_last)
+        self.drop = nn.Dropout(0.5)
+
+    def forward(self, volume):
+        counts = volume.counts
+        if not bool(counts.isfinite().all()):
+            raise DomainError("not finite")
+        span = float(volume.collected_s.sum())
+        middle = float((volume.centroid_s * volume.collected_s).sum()) / span**2
+        x = self.drop(self.layer(nn.functional.pad(counts.flatten(1, 2), (0, 1))))[..., :-1] * (1 + middle)
+        if self.solves:
+            cross = torch.einsum("bihw,bjhw->bij", x, x) + torch.diag(torch.tensor([1.0, 2.0]))
+            x = torch.einsum("bij,bjhw->bihw", torch.linalg.solve(cross, torch.eye(2) + 0.5 * cross) + torch.linalg.inv(cross), x)
+        return FlowField(x, counts.sum((1, 2)) > 0, span)
+
+
+def load(path, counts):
+    """Outputs of a program file."""
+    if path.suffix == ".pt2":
+        return torch.export.load(path).module()(counts)
+    from onnx.reference import ReferenceEvaluator
+
+    return [torch.from_numpy(output) for output in ReferenceEvaluator(str(path)).run(["flow_px", "confidence"], {"counts": counts.numpy()})]
+
+
+@pytest.mark.parametrize("name", ["small.pt2", pytest.param("small.onnx", marks=needs_onnx)])
+def test_the_program_gives_the_numbers_of_the_network(tmp_path, generator, name):
+    """torch.export runs the same operations; ONNX's own order of sums differs in the last bits of numbers of order 1."""
+    network = Small().train()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of the packages that write and read programs
+        export(network, tmp_path / name, 9, 12, batch=2)
+        assert network.training, "left as it was"
+        network.eval()
+        counts = torch.rand(2, 2, 4, 9, 12, generator=generator)
+        counts[0, :, :, :3] = 0
+        flow, confidence = load(tmp_path / name, counts)
+    expected = network(evenly_timed(counts))
+    assert torch.allclose(flow, expected.flow_px, atol=0 if name.endswith("pt2") else 1e-5, rtol=0)
+    assert torch.equal(confidence, expected.valid.float())
+    assert float(flow.abs().max()) > 0.1
+
+
+def test_the_bins_are_those_of_a_stream():
+    empty = torch.zeros(0, dtype=torch.int64)
+    stream = from_stream(EventStream(empty, empty, empty, empty, 3, 3), 0, 1_000_000, 5)
+    ours = evenly_timed(torch.zeros(1, 2, 5, 3, 3))
+    assert torch.allclose(ours.centroid_s, stream.centroid_s, rtol=1e-15)
+    assert torch.allclose(ours.collected_s, stream.collected_s, rtol=1e-15)
+
+
+def test_solving_by_elimination_is_solving(generator):
+    """Positive definite matrices of condition below 100: float64 rounding stays below 1e-12."""
+    root = torch.randn(3, 6, 6, generator=generator, dtype=torch.float64)
+    matrix, right = root @ root.mT + torch.eye(6), torch.randn(3, 6, 4, generator=generator, dtype=torch.float64)
+    assert torch.allclose(eliminate(matrix, right), torch.linalg.solve(matrix, right), rtol=1e-12, atol=1e-12)
+
+
+def test_what_cannot_be_written_is_said(tmp_path):
+    with pytest.raises(DomainError, match=r"ends in \.pt2"):
+        export(Small(), tmp_path / "small.pth", 8, 8)
+    with pytest.raises(FileFormatError, match="existing, writable folder"):
+        export(Small(), tmp_path / "nowhere" / "small.pt2", 8, 8)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,92 @@
+"""A training run small enough for tests: a linear network, windows with one known answer, and the command on both."""
+
+import json
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib.pyplot as plt
+import torch
+from torch import nn
+
+from codesign.flow import checkpoint
+from codesign.types import EventVolume, FlowField, FlowWindows
+from studies import train_flow, train_flow_page, train_flow_sources
+from studies.run import main
+
+BINS, SIDE = 2, 16
+TRUE_WEIGHTS = torch.tensor([[0.5, -0.25, 1.0, 0.0], [-1.0, 0.75, 0.25, 0.5]])  # flow of a window is this times its counts, pixel by pixel
+
+
+class Linear(nn.Module):
+    """Flow linear in the counts of its pixel: training has one known answer, TRUE_WEIGHTS."""
+
+    def __init__(self, bins=BINS, gain=1.0):
+        super().__init__()
+        self.config = {"bins": bins, "gain": gain}
+        self.layer = nn.Conv2d(2 * bins, 2, 1, bias=False)
+
+    def predictions(self, volume):
+        flow = self.config["gain"] * self.layer(volume.counts.flatten(1, 2))
+        return [FlowField(flow, torch.ones_like(flow[:, 0], dtype=torch.bool), 1.0)]
+
+    def forward(self, volume):
+        return self.predictions(volume)[-1]
+
+
+class Made:
+    """Source of windows whose flow is TRUE_WEIGHTS times the counts; ``before`` is called with the indices of every batch."""
+
+    def __init__(self, seed=0, frames=True, before=lambda indices: None):
+        self.seed, self.frames, self.before = seed, frames, before
+
+    def batch(self, indices):
+        self.before(indices)
+        counts = torch.stack([torch.randn(2, BINS, SIDE, SIDE, generator=torch.Generator().manual_seed(1000 * self.seed + i)).square() for i in indices])
+        flow = torch.einsum("fc,bchw->bfhw", TRUE_WEIGHTS, counts.flatten(1, 2))
+        valid = torch.ones(len(counts), SIDE, SIDE, dtype=torch.bool)
+        times = torch.tensor([0.25, 0.75], dtype=torch.float64), torch.tensor([0.5, 0.5], dtype=torch.float64)
+        return FlowWindows(EventVolume(counts, *times), FlowField(flow, valid, 1.0), counts[:, 0] if self.frames else None)
+
+
+def register(before=lambda indices: None, frames=True):
+    """Put the network and the source where the command finds them."""
+    checkpoint.NETWORKS["linear"] = f"{Linear.__module__}:Linear"
+    train_flow_sources.TRAINING["made"] = lambda shape, seed: [(1.0, Made(seed, frames, before))]
+    train_flow_sources.VALIDATION.clear()
+    train_flow_sources.VALIDATION["unseen"] = lambda shape, seed: Made(seed + 77)
+
+
+@contextmanager
+def tables_kept():
+    """The tables of networks and sources are as they were afterwards."""
+    tables: list[dict[str, Any]] = [checkpoint.NETWORKS, train_flow_sources.TRAINING, train_flow_sources.VALIDATION]
+    before = [dict(table) for table in tables]
+    try:
+        yield
+    finally:
+        for table, content in zip(tables, before, strict=True):
+            table.clear()
+            table.update(content)
+
+
+def undraw(replace=setattr):
+    """Leave out the figures, which nobody looks at here and which take most of the time."""
+    for name in ("curves", "pictures"):
+        replace(train_flow_page, name, lambda *_: plt.figure(figsize=(1, 1)))
+
+
+BASE = ["--network", "linear", "--mix", "made", "--bins", "2", "--height-px", "16", "--width-px", "16", "--batch", "4", "--final-windows", "8", "--validation-windows", "4", "--device", "cpu"]
+
+
+def train(folder, *more):
+    return main(train_flow.study, train_flow.Config, [*BASE, "--out", str(folder), *more])
+
+
+def state_of(folder):
+    """Every tensor of the last checkpoint, as bytes."""
+    (path,) = (folder / "checkpoint").glob("step_*.safetensors")
+    return {name: tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes() for name, tensor in checkpoint.read_tensors(path)[0].items()}
+
+
+def metrics_of(folder):
+    return json.loads((folder / "metrics.json").read_text())
