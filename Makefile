@@ -6,7 +6,7 @@ PYTHON ?=
 ARGS ?=
 RUN := .venv/bin/python
 
-.PHONY: help setup lens-opt lens-report lens-scratch lens-tolerance lens-bench silhouettes dataset video-to-events event-gradient event-bench srm-bench davis placement speed-error stability gradcheck test lint doctor clean
+.PHONY: help setup lens-opt lens-report lens-scratch lens-tolerance lens-bench silhouettes dataset video-to-events event-gradient event-bench srm-bench davis train-flow flow-quality flow-compare flow-cost flow-recording placement speed-error stability gradcheck test lint doctor clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1|/p' Makefile | awk -F'|' '{printf "%-20s %s\n", $$1, $$2}'
@@ -59,6 +59,21 @@ srm-bench: setup ## the spiking layer against a convolution and two spiking libr
 
 davis: setup ## a sensor fitted to a real recording, judged on its other half
 	@$(RUN) -m studies.davis_fit $(ARGS)
+
+train-flow: setup ## train a flow network: make train-flow ARGS="--network refiner --cpu-minutes 20"
+	@$(RUN) -m studies.train_flow $(ARGS)
+
+flow-quality: setup ## error of the delivered refiner and of the closed form on unseen textures and worlds
+	@$(RUN) -m studies.flow_quality $(ARGS)
+
+flow-compare: setup ## the refiner against networks of its size, same windows and budget
+	@$(RUN) -m studies.flow_compare $(ARGS)
+
+flow-cost: setup ## time and memory of flow estimators
+	@$(RUN) -m studies.flow_cost $(ARGS)
+
+flow-recording: setup ## flow of a recording: make flow-recording ARGS="--recording FOLDER"
+	@$(RUN) -m studies.flow_recording $(ARGS)
 
 placement: setup ## where to mount the camera on a robot
 	@$(RUN) -m studies.placement $(ARGS)

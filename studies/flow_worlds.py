@@ -24,7 +24,7 @@ class WorldWindows:
     (least, most). noise: background events per pixel, polarity and eighth of the window, (least, most), evenly in the logarithm. fov_deg: horizontal field.
     """
 
-    def __init__(self, names=ALL, *, seed=0, size_px=128, bins=8, intervals=32, flow_px=(1.5, 8.0), theta=(0.1, 0.2), noise=(0.0005, 0.005), fov_deg=(45.0, 80.0), samples=8):
+    def __init__(self, names=ALL, *, seed=0, size_px=128, bins=8, intervals=32, flow_px=(1.0, 6.0), theta=(0.1, 0.2), noise=(0.0005, 0.005), fov_deg=(45.0, 80.0), samples=8):
         unknown = sorted(set(names) - set(worlds.WORLDS))
         if unknown or not names:
             raise DomainError(f"worlds {unknown} are unknown; there are {', '.join(worlds.WORLDS)}.")

@@ -33,7 +33,7 @@ class Config(StudyConfig):
     """Arguments of the network's constructor, name=number."""
     weights: int = 0
     """Number of weights wanted of a network that comes in sizes; 0 leaves its own."""
-    mix: str = "layers"
+    mix: str = "delivered"
     """Windows to train on (studies.train_flow_sources)."""
     data: Path | None = None
     """Folder of a data set (ours, DSEC, MVSEC) to train on instead; its last tenth is what is judged on."""
@@ -41,7 +41,7 @@ class Config(StudyConfig):
     """Frame intervals per window of a data set."""
     loss: str = "supervised"
     """supervised, contrast or photometric."""
-    unit: Literal["px", "motion"] = "px"
+    unit: Literal["px", "motion"] = "motion"
     """Errors count in pixels, or as shares of the window's own root mean square flow (supervised)."""
     claim_weight: float = 0.1
     """Weight of the likelihood that teaches a network its confidence (supervised)."""
@@ -59,21 +59,21 @@ class Config(StudyConfig):
     """Width likewise."""
     bins: int = 8
     """Time bins of the windows."""
-    reuse: int = 1
+    reuse: int = 4
     """Times that windows are shown, turned and mirrored in between; making them costs as much as a step."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     """Largest step of AdamW."""
     weight_decay: float = 1e-4
     """Decay of AdamW."""
     warm_up: float = 0.05
     """Share of the budget over which the step grows; then it falls as a half cosine to a hundredth."""
-    clip: float = 10.0
+    clip: float = 5.0
     """Longest gradient; longer ones are shortened to it, and counted."""
-    average: float = 0.0
+    average: float = 0.998
     """Decay per step of a running average of the weights, which is then what is judged and kept; 0 for none."""
     validate_on: tuple[str, ...] = ()
     """Sets to judge on; all when left out."""
-    validate_every: int = 250
+    validate_every: int = 1000
     """Steps between validations."""
     validation_windows: int = 48
     """Windows of each set in between."""

@@ -4,7 +4,7 @@ A source has ``batch(indices) -> FlowWindows``; its sample i depends on i and th
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -30,7 +30,12 @@ class Shape:
         return RenderedWindows(draws, seed=seed, height_px=height_px or self.height_px, width_px=width_px or self.width_px, bins=self.bins)
 
 
+DENSE = Draws(flow_px=(0.5, 7.0), contrast=(0.8, 1.8), theta=(0.08, 0.25))
+FLAT = Draws(motion="similarity", layers=(0, 0), flow_px=(0.0, 7.0), contrast=(0.7, 1.6), theta=(0.08, 0.25))
+WIDE = Draws(layers=(1, 4), flow_px=(1.0, 9.0), contrast=(0.8, 1.8), theta=(0.08, 0.25))
+
 TRAINING: dict[str, Callable[[Shape, int], list]] = {
+    "delivered": lambda shape, seed: [(0.55, shape(DENSE, seed)), (0.25, shape(FLAT, seed + 1)), (0.2, shape(WIDE, seed + 2, 96, 96))],
     "layers": lambda shape, seed: [(1.0, shape(Draws(), seed))],
     "planes": lambda shape, seed: [(1.0, shape(Draws(layers=(0, 0)), seed))],
 }
@@ -41,7 +46,7 @@ VALIDATION: dict[str, Callable[[Shape, int], Any]] = {
     "fine_theta_0.2": lambda shape, seed: shape(planes("fine", 0.2), seed + UNSEEN),
     "mixed_theta_0.1": lambda shape, seed: shape(planes("mixed", 0.1), seed + UNSEEN),
     "mixed_theta_0.2": lambda shape, seed: shape(planes("mixed", 0.2), seed + UNSEEN),
-    "layers": lambda shape, seed: shape(Draws("mixed", layers=(1, 3)), seed + UNSEEN),
+    "layers": lambda shape, seed: shape(replace(DENSE, textures="mixed", layers=(1, 3)), seed + UNSEEN),
 }
 """Name -> function (shape, seed) -> source; textures and seeds that no training mix uses."""
 

@@ -13,12 +13,16 @@ def pixel_grid(height, width, like):
 def along_flow(bins, flow_px, time):
     """What each bin holds where a point of the start has got to.
 
-    Args: bins: [B, T, H, W]. flow_px: [B, 2, H, W] px per window on pixels of the start. time: [T] bin times, 0 at the start of the window, 1 at its end.
-    Returns: [B, T, H, W], bin k at q + time_k flow(q) for every pixel q, bilinear; 0 outside the image.
-    Gradient: bins and flow.
+    Args: bins: [B, T, H, W], or [B, C, T, H, W] with polarities or the like. flow_px: [B, 2, H, W] px per window on pixels of the start.
+      time: [T] bin times, 0 at the start of the window, 1 at its end.
+    Returns: as bins: bin k at q + time_k flow(q) for every pixel q, bilinear; 0 outside the image.
+    Gradient: bins and flow; piecewise smooth in the flow, as bilinear lookups are.
     """
-    batch, count, height, width = bins.shape
+    *_, count, height, width = bins.shape
+    batch = bins.shape[0]
     at = pixel_grid(height, width, flow_px) + time[:, None, None, None] * flow_px[:, None]  # [B, T, 2, H, W]
     half = torch.tensor([width / 2, height / 2], dtype=flow_px.dtype, device=flow_px.device)[:, None, None]
     unit = ((at + 0.5) / half - 1).permute(0, 1, 3, 4, 2).reshape(batch * count, height, width, 2)
-    return grid_sample(bins.reshape(batch * count, 1, height, width), unit, align_corners=False).reshape(bins.shape)
+    each = bins.reshape(batch, -1, count, height, width).transpose(1, 2)
+    found = grid_sample(each.reshape(batch * count, -1, height, width), unit, align_corners=False)
+    return found.reshape(each.shape).transpose(1, 2).reshape(bins.shape)

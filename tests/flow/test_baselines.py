@@ -7,9 +7,9 @@ import torch
 
 from codesign.errors import DomainError, ShapeError
 from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
-from codesign.flow.baselines.entry import presence
 from codesign.flow.baselines.rescale import rescale_flow
 from codesign.flow.baselines.weights import channels, count_weights
+from codesign.flow.entry import presence
 from codesign.types import EventVolume
 
 D = torch.float64

@@ -8,8 +8,8 @@ from codesign.errors import DomainError, GradientError, ShapeError
 from codesign.events import from_stream
 from codesign.events.spiking.surrogate import FastSigmoid, Surrogate
 from codesign.flow.baselines import SpikeFlowNet, from_halves, integrate_and_fire, to_halves
-from codesign.flow.baselines.entry import normalise
 from codesign.flow.baselines.weights import count_weights
+from codesign.flow.entry import normalise
 from codesign.flow.losses import photometric_loss, smoothness_loss
 from codesign.types import EventStream, EventVolume
 from studies.flow_cost_steps import StepByStep

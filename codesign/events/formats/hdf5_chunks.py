@@ -34,12 +34,12 @@ def values(path, dataset, name):
         if dataset.size * dataset.dtype.itemsize > file_bytes:
             raise FileFormatError(f"{path}: {name} claims {dataset.size} values, more than the file has; it was cut or is damaged.")
         return np.asarray(dataset[()])
-    places = _places(path, dataset, name, file_bytes)
+    places = places_of(path, dataset, name, file_bytes)
     plist = dataset.id.get_create_plist()
     filters = [plist.get_filter(k) for k in range(plist.get_nfilters())]
     kinds = [kind for kind, *_ in filters]
     if kinds == [BLOSC]:
-        _check_blosc(path, dataset, name, places, filters[0][2])
+        check_blosc(path, dataset, name, places, filters[0][2])
         return np.asarray(dataset[()])
     if not set(kinds) <= {GZIP, SHUFFLE, FLETCHER32} or len(set(kinds)) < len(kinds):
         raise FileFormatError(f"{path}: {name} went through the filters {kinds}; gzip, shuffle, fletcher32, or Blosc alone are read; write it anew with gzip.")
@@ -48,23 +48,23 @@ def values(path, dataset, name):
         data = dataset.id.read_direct_chunk(at)[1]
         for k in reversed(range(len(kinds))):
             if not mask >> k & 1:
-                data = _undone(path, name, kinds[k], filters[k][2], data, _chunk_bytes(dataset))
-        if len(data) != _chunk_bytes(dataset):
-            raise _damaged(path, name, at)
+                data = undone(path, name, kinds[k], filters[k][2], data, chunk_bytes(dataset))
+        if len(data) != chunk_bytes(dataset):
+            raise damaged(path, name, at)
         block = np.frombuffer(data, dataset.dtype).reshape(dataset.chunks)
         place = tuple(slice(first, first + length) for first, length in zip(at, dataset.chunks, strict=True))
         found[place] = block[tuple(slice(0, length) for length in found[place].shape)]
     return found
 
 
-def _chunk_bytes(dataset):
+def chunk_bytes(dataset):
     return math.prod(dataset.chunks) * dataset.dtype.itemsize
 
 
-def _places(path, dataset, name, file_bytes):
+def places_of(path, dataset, name, file_bytes):
     """[(first indices, mask of filters left out, stored bytes)] of all blocks, which must cover the dataset once."""
     needed = math.prod(-(-length // chunk) for length, chunk in zip(dataset.shape, dataset.chunks, strict=True))
-    if needed > file_bytes or max(needed * _chunk_bytes(dataset), dataset.size * dataset.dtype.itemsize) > LIMIT_RATIO * file_bytes + LIMIT_EXTRA_BYTES:
+    if needed > file_bytes or max(needed * chunk_bytes(dataset), dataset.size * dataset.dtype.itemsize) > LIMIT_RATIO * file_bytes + LIMIT_EXTRA_BYTES:
         raise FileFormatError(f"{path}: {name} claims {list(dataset.shape)} values, out of proportion to a file of {file_bytes} bytes; it is damaged.")
     places = []
     dataset.id.chunk_iter(lambda info: places.append((tuple(info.chunk_offset), info.filter_mask, info.size)))
@@ -75,21 +75,21 @@ def _places(path, dataset, name, file_bytes):
     return places
 
 
-def _undone(path, name, kind, options, data, limit_bytes):
+def undone(path, name, kind, options, data, limit_bytes):
     """One filter undone."""
     if kind == GZIP:
         unpacker = zlib.decompressobj()
         data = unpacker.decompress(data, limit_bytes + 4)
         if not unpacker.eof or unpacker.unused_data:
-            raise _damaged(path, name, "gzip")
+            raise damaged(path, name, "gzip")
         return data
     if kind == SHUFFLE:
         width = options[0] if options else 0
         if not 0 < width <= 8 or len(data) % width:
-            raise _damaged(path, name, "shuffle")
+            raise damaged(path, name, "shuffle")
         return np.frombuffer(data, np.uint8).reshape(width, -1).T.tobytes()
     if len(data) < 4:
-        raise _damaged(path, name, "fletcher32")
+        raise damaged(path, name, "fletcher32")
     words = np.frombuffer(data[:-4] + bytes(len(data) % 2), ">u2").astype(np.int64)  # an odd last byte is the high half of a word
     low, high = struct.unpack("<HH", data[-4:])
     if (int(words.sum()) - low) % 65535 or (int((words * np.arange(len(words), 0, -1) % 65535).sum()) - high) % 65535:
@@ -97,11 +97,11 @@ def _undone(path, name, kind, options, data, limit_bytes):
     return data[:-4]
 
 
-def _check_blosc(path, dataset, name, places, options):
+def check_blosc(path, dataset, name, places, options):
     """Every block must unpack to its chunk by its own header, and the filter must have been told so."""
-    width, size = dataset.dtype.itemsize, _chunk_bytes(dataset)
+    width, size = dataset.dtype.itemsize, chunk_bytes(dataset)
     if len(options) < 4 or tuple(options[2:4]) != (width, size):
-        raise _damaged(path, name, "Blosc's parameters")
+        raise damaged(path, name, "Blosc's parameters")
     for at, mask, stored in places:
         data = dataset.id.read_direct_chunk(at)[1]
         if mask & 1:
@@ -110,8 +110,8 @@ def _check_blosc(path, dataset, name, places, options):
             version, _, _, typesize, unpacked, block, packed = struct.unpack_from("<4B3I", data) if len(data) >= 16 else (0,) * 7
             fits = (version, typesize, unpacked, packed) == (2, width, size, len(data)) and 0 < block <= max(size, 1)
         if not fits:
-            raise _damaged(path, name, at)
+            raise damaged(path, name, at)
 
 
-def _damaged(path, name, where):
+def damaged(path, name, where):
     return FileFormatError(f"{path}: a block of {name} ({where}) does not unpack to what it should; the file is damaged.")

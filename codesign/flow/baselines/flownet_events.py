@@ -4,27 +4,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, silu
 
-from codesign.flow.baselines.entry import check_bins, check_sizes, check_volume, normalise, pad_to, to_field
 from codesign.flow.baselines.rescale import rescale_flow
 from codesign.flow.baselines.weights import channels, fill_budget, start
+from codesign.flow.entry import check_bins, check_sizes, check_volume, normalise, pad_to, to_field
+from codesign.flow.layers import Layer
 from codesign.types import EventVolume, FlowField
 
 STRIDE = 16
-GROUPS = 4
-
-
-class _Layer(nn.Module):
-    """3 x 3 convolution, group normalisation, SiLU; ``active=False`` leaves the last out."""
-
-    def __init__(self, inputs, outputs, stride=1, active=True):
-        super().__init__()
-        self.convolution = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
-        self.norm = nn.GroupNorm(GROUPS, outputs)
-        self.active = active
-
-    def forward(self, x):
-        x = self.norm(self.convolution(x))
-        return silu(x) if self.active else x
 
 
 class FlowNetEvents(nn.Module):
@@ -47,10 +33,10 @@ class FlowNetEvents(nn.Module):
         inside = channels(width, 8) if hidden is None else hidden
         down = [channels(width, factor) for factor in (1, 2, 4, 8)]
         up = [channels(width, factor) for factor in (4, 2, 1, 0.5)]
-        self.encoder = nn.ModuleList(_Layer(a, b, stride=2) for a, b in zip([2 * bins, *down], down, strict=False))
-        self.residual = nn.ModuleList(nn.Sequential(_Layer(down[3], inside), _Layer(inside, down[3], active=False)) for _ in range(2))
+        self.encoder = nn.ModuleList(Layer(a, b, stride=2) for a, b in zip([2 * bins, *down], down, strict=False))
+        self.residual = nn.ModuleList(nn.Sequential(Layer(down[3], inside), Layer(inside, down[3], active=False)) for _ in range(2))
         skipped = [2 * down[3]] + [a + b + 2 for a, b in zip(up, reversed(down[:3]), strict=False)]
-        self.decoder = nn.ModuleList(_Layer(a, b) for a, b in zip(skipped, up, strict=True))
+        self.decoder = nn.ModuleList(Layer(a, b) for a, b in zip(skipped, up, strict=True))
         self.heads = nn.ModuleList(nn.Conv2d(b, 2, 1) for b in up)
         start(self, seed, 2.0, self.heads)
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]

@@ -6,11 +6,11 @@ from torch.nn.functional import conv_transpose2d, leaky_relu
 
 from codesign.errors import DomainError, ShapeError
 from codesign.events.spiking.surrogate import FastSigmoid
-from codesign.flow.baselines.entry import check_bins, check_sizes, check_volume, normalise, pad_to, to_field
 from codesign.flow.baselines.halves import to_halves
 from codesign.flow.baselines.neuron import integrate_and_fire
 from codesign.flow.baselines.rescale import rescale_flow
 from codesign.flow.baselines.weights import channels, fill_budget, start
+from codesign.flow.entry import check_bins, check_sizes, check_volume, normalise, pad_to, to_field
 from codesign.types import EventVolume, FlowField
 
 STRIDE = 16

@@ -59,7 +59,7 @@ class Rows:
                 raise FileFormatError(f"{self.path}: {self.name} claims {dataset.size} values, more than the file has; it was cut or is damaged.")
             return
         self.block_shape = tuple(dataset.chunks)
-        for place in chunks._places(self.path, dataset, self.name, size):
+        for place in chunks.places_of(self.path, dataset, self.name, size):
             self.places.setdefault(place[0][0], []).append(place)
         plist = dataset.id.get_create_plist()
         self.filters = [plist.get_filter(k) for k in range(plist.get_nfilters())]
@@ -96,12 +96,12 @@ class Rows:
         """One unpacked block, after checking that it is what it claims."""
         at, mask, _ = place
         if self.filters and self.filters[0][0] == chunks.BLOSC:
-            chunks._check_blosc(self.path, dataset, self.name, [place], self.filters[0][2])
+            chunks.check_blosc(self.path, dataset, self.name, [place], self.filters[0][2])
             return np.asarray(dataset[tuple(slice(a, a + n) for a, n in zip(at, self.block_shape or (), strict=True))])
-        data, size = dataset.id.read_direct_chunk(at)[1], chunks._chunk_bytes(dataset)
+        data, size = dataset.id.read_direct_chunk(at)[1], chunks.chunk_bytes(dataset)
         for k in reversed(range(len(self.filters))):
             if not mask >> k & 1:
-                data = chunks._undone(self.path, self.name, self.filters[k][0], self.filters[k][2], data, size)
+                data = chunks.undone(self.path, self.name, self.filters[k][0], self.filters[k][2], data, size)
         if len(data) != size:
-            raise chunks._damaged(self.path, self.name, at)
+            raise chunks.damaged(self.path, self.name, at)
         return np.frombuffer(data, dataset.dtype).reshape(self.block_shape)

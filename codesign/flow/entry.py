@@ -1,4 +1,4 @@
-"""What every baseline does around its layers: check the volume, normalise it, pad it to the stride, and fade the flow in with the events."""
+"""What every network does around its layers: check the volume, normalise it, pad it to the stride, and fade the flow in with the events."""
 
 from torch.nn.functional import pad
 
