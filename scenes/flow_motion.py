@@ -35,7 +35,8 @@ def camera(draw, t, width_px, height_px, flow_px, layers):
     slant = draw.normal(0, 0.35, (layers, 2))
     normal = inverse_depth[:, None] * np.concatenate([slant, np.ones((layers, 1))], 1)
     turn, move = _twist(draw, focal, max(width_px, height_px))
-    extra = [_twist(draw, focal, max(width_px, height_px)) if layer and draw.random() < 1 / 4 else None for layer in range(layers)]
+    still = np.zeros(3), np.zeros(3)
+    extra = [_twist(draw, focal, max(width_px, height_px)) if layer and draw.random() < 1 / 4 else still for layer in range(layers)]
     x, y = np.array([-1, 1, -1, 1, 0]) * width_px / 2, np.array([-1, -1, 1, 1, 0]) * height_px / 2
     probe = np.stack([x, y, np.ones(5)])
     wanted, size = draw.uniform(*flow_px), 1.0
@@ -43,7 +44,7 @@ def camera(draw, t, width_px, height_px, flow_px, layers):
     def motion(times):
         out = np.empty((layers, len(times), 3, 3))
         for layer in range(layers):
-            w, v = (turn, move) if extra[layer] is None else (turn + 0.5 * extra[layer][0], move + extra[layer][1])
+            w, v = turn + 0.5 * extra[layer][0], move + extra[layer][1]
             out[layer] = k @ (_rotations(size * w, times) + size * times[:, None, None] * np.outer(v, normal[layer])) @ k_inverse
         return out
 

@@ -91,19 +91,19 @@ class RenderedWindows:
             motion = flow_motion.similarity(draw, self.t, self.width_px, self.height_px, d.flow_px)
         else:
             motion = flow_motion.camera(draw, self.t, self.width_px, self.height_px, d.flow_px, 1 + extra)
-        blur_px = np.hypot(BLUR_LEAST_PX, draw.uniform(*d.blur_px))
+        blur_px = np.hypot(BLUR_LEAST_PX, draw.uniform(d.blur_px[0], d.blur_px[1]))
         crops, places = zip(*[self._layer(draw, layer, blur_px) for layer in range(1 + extra)], strict=True)
-        theta = np.exp(draw.uniform(*np.log(d.theta)))
+        theta = _log_uniform(draw, *d.theta)
         thetas = theta * np.clip(1 + d.mismatch * draw.standard_normal((2, *shape)), 0.2, None)
-        rate = np.exp(draw.uniform(*np.log(d.noise))) * 8 if d.noise[1] > 0 else 0.0
+        rate = _log_uniform(draw, *d.noise) * 8 if d.noise[1] > 0 else 0.0
         count = draw.poisson(rate * 2 * shape[0] * shape[1])
         noise = np.stack([draw.integers(0, high, count) for high in (self.intervals, 2, *shape)])
         return {
             "motion": torch.from_numpy(motion).float(),
             "crop": torch.stack(crops),
             "place": torch.from_numpy(np.stack(places)).float(),
-            "distortion": draw.uniform(*d.distortion),
-            "contrast": float(draw.uniform(*d.contrast)),
+            "distortion": draw.uniform(d.distortion[0], d.distortion[1]),
+            "contrast": float(draw.uniform(d.contrast[0], d.contrast[1])),
             "theta": torch.from_numpy(thetas).float(),
             "noise": torch.from_numpy(noise),
         }
@@ -156,6 +156,10 @@ class RenderedWindows:
                 cover = _lookup(crop[None, 1:], _apply(place, points)[None])[0, 0, 0]
                 flow = torch.where(cover > 0.5, moved, flow)
         return flow
+
+
+def _log_uniform(draw, least, most):
+    return float(np.exp(draw.uniform(np.log(least), np.log(most))))
 
 
 def _mirrored(values, size):
@@ -212,7 +216,7 @@ def _lookup(crop, units):
 
 def _compose(sample, points):
     """Frames [T, H, W]: each layer over those behind it."""
-    frames = None
+    frames = torch.zeros(())
     for layer, (motion, crop, place) in enumerate(zip(sample["motion"], sample["crop"], sample["place"], strict=True)):
         units = _apply(place @ torch.linalg.inv(motion), points)
         if layer == 0:

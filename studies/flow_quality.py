@@ -11,6 +11,7 @@ from codesign import flow
 from codesign.errors import DomainError
 from codesign.flow.metrics import endpoint_error
 from studies.flow_worlds import ALL, WorldWindows
+from studies.make_dataset_page import flow_colours
 from studies.run import Run, StudyConfig, main
 from studies.train_flow_sources import UNSEEN, VALIDATION, Shape
 from studies.train_flow_validate import batches
@@ -73,10 +74,10 @@ def _row(run, name, found):
     zero, closed, ours, claimed = found.T
     draw = np.random.default_rng(0)
     again = draw.integers(0, len(found), (DRAWS, len(found)))
-    ratio = lambda values, pick=slice(None): values[pick].mean(-1) / zero[pick].mean(-1)  # noqa: E731
+    ratio = lambda values: values.mean() / zero.mean()  # noqa: E731
     cells = [name.replace("_", " "), round(zero.mean(), 2)]
     for who, values in (("closed_form", closed), ("refiner", ours)):
-        low, high = np.quantile(ratio(values, again), [0.025, 0.975])
+        low, high = np.quantile(values[again].mean(1) / zero[again].mean(1), [0.025, 0.975])
         worse = 100 * (values > zero).mean()
         run.record(**{f"{name}_{who}_ratio": ratio(values), f"{name}_{who}_ratio_low": low, f"{name}_{who}_ratio_high": high, f"{name}_{who}_worse_percent": worse, f"{name}_{who}_aee_px": values.mean()})
         cells += [round(ratio(values), 3), f"{low:.3f} to {high:.3f}", round(worse, 1)]
@@ -103,20 +104,13 @@ def _figure(shown):
         row[0].imshow(signed, cmap="RdBu_r", vmin=-4, vmax=4)
         most = float(flows[0].square().sum(0).sqrt().max())
         for axis, field in zip(row[1:4], flows, strict=True):
-            axis.imshow(colours(field.numpy(), most))
+            axis.imshow(flow_colours(field.numpy(), most))
         row[4].imshow(confidence, cmap="gray", vmin=0, vmax=1)
     for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title, fontsize=9)
     for axis in axes.flat:
         axis.set_axis_off()
     return figure
-
-
-def colours(flow_px, most_px):
-    """Flow [2, H, W] as colours [H, W, 3]: hue for direction, white for none, full colour for ``most_px``."""
-    angle, length = np.arctan2(flow_px[1], flow_px[0]), np.hypot(*flow_px)
-    hue = (angle / (2 * np.pi)) % 1.0
-    return plt.get_cmap("hsv")(hue)[..., :3] * (share := np.clip(length / max(most_px, 1e-9), 0, 1)[..., None]) + (1 - share)
 
 
 if __name__ == "__main__":

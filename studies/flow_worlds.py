@@ -36,9 +36,11 @@ class WorldWindows:
     def batch(self, indices):
         """Samples of these numbers; truth is valid where the world is seen (the sky has no flow) and its point stays in the image."""
         parts = [self._window(int(index)) for index in indices]
-        counts, flow, valid, frames = (torch.cat([part[k] for part in parts]) for k in range(4))
-        shell = parts[0][4]
-        return FlowWindows(EventVolume(counts, shell.centroid_s, shell.collected_s), FlowField(flow, valid, 1.0), frames)
+        join = lambda choose: torch.cat([choose(part) for part in parts])  # noqa: E731
+        shell = parts[0].volume
+        volume = EventVolume(join(lambda part: part.volume.counts), shell.centroid_s, shell.collected_s)
+        truth = FlowField(join(lambda part: part.truth.flow_px), join(lambda part: part.truth.valid), 1.0)
+        return FlowWindows(volume, truth, join(lambda part: part.frames))
 
     def _window(self, index):
         draw = torch.Generator().manual_seed(1_000_003 * self.seed + index)
@@ -62,7 +64,8 @@ class WorldWindows:
         sensor = events.SensorModel(theta, theta, 0.03 * theta, shot_rate_hz=16 * noise)  # in windows of one second: two polarities, eight eighths
         counts = events.dense_counts(frames, t - t[0], sensor, generator=draw)[LEAD:]
         volume = events.from_counts(counts, t[LEAD:], self.bins)
-        return volume.counts.float(), flow.float(), valid, frames[[LEAD, -1]][None].float(), volume
+        volume = EventVolume(volume.counts.float(), volume.centroid_s, volume.collected_s)
+        return FlowWindows(volume, FlowField(flow.float(), valid, 1.0), frames[[LEAD, -1]][None].float())
 
     def _camera(self, fov_deg):
         focal_mm = 4.0

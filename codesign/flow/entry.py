@@ -30,7 +30,7 @@ def check_volume(volume, bins):
     counts = volume.counts
     if counts.ndim != 5 or counts.shape[1] != 2 or counts.shape[2] != bins or min(counts.shape) < 1:
         raise ShapeError(f"this network takes event volumes [B, 2, {bins}, H, W], got {tuple(counts.shape)}; make the volume with {bins} bins or build the network for others.")
-    return counts if bool(counts.detach().sum().isfinite()) else check_finite(counts, "event volume")
+    return check_finite(counts, "event volume")
 
 
 def normalise(counts):

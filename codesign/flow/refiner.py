@@ -49,8 +49,8 @@ class Refiner(nn.Module):
         self.blend = nn.Conv2d(2 * c, 9 * (POOL * CELL) ** 2, 1)
         self.doubt = nn.Conv2d(2 * c, 1, 1)
         for last in (self.blend, self.doubt):
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
+            for parameter in last.parameters():
+                nn.init.zeros_(parameter)
 
     def forward(self, volume):
         """Flow of an EventVolume [B, 2, bins, H, W] of any H, W.

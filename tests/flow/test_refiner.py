@@ -46,8 +46,8 @@ def test_without_corrections_the_start_comes_through():
     """With the correcting layers at zero the answer is the start, averaged over cells of 4 px: a constant flow exactly, all but the fading-in of events."""
     fresh = network()
     for head in (fresh.change_middle, fresh.change_fine):
-        torch.nn.init.zeros_(head.weight)
-        torch.nn.init.zeros_(head.bias)
+        for parameter in head.parameters():
+            torch.nn.init.zeros_(parameter)
     start = torch.tensor([1.5, -0.75], dtype=D)[None, :, None, None].expand(1, 2, 32, 48).clone()
     for field in fresh.predictions(volume(events(1, 2, 8, 32, 48)), start):
         torch.testing.assert_close(field.flow_px, start.expand_as(field.flow_px), rtol=1e-4, atol=0)  # n^2 / (n^2 + 100) of 7000 events

@@ -76,6 +76,7 @@ def test_events_are_the_log_change_over_the_threshold():
     draws = dataclasses.replace(planes("fine", theta=0.1, noise=(0.0, 0.0)), mismatch=0.0)
     windows = RenderedWindows(draws, seed=2).batch(range(4))
     signed = (windows.volume.counts[:, 0] - windows.volume.counts[:, 1]).sum(1) * 0.1
+    assert windows.frames is not None
     change = windows.frames[:, 1].log() - windows.frames[:, 0].log()
     assert (signed - change).abs().max() <= 0.2 + 1e-4
 
