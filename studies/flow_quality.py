@@ -66,7 +66,8 @@ def _errors(source, count, network, progress):
         found.append(torch.stack([*errors, mean(endpoint_error(ours.flow_px, truth.flow_px).square() / claim)], 1))
         if len(shown) < SHOWN:
             shown += [(windows.volume.counts[k], truth.flow_px[k], closed.flow_px[k], ours.flow_px[k], ours.confidence[k]) for k in range(min(SHOWN - len(shown), len(weight)))]
-        progress.advance(len(weight))
+        for _ in weight:
+            progress.advance()
     return torch.cat(found).numpy(), shown
 
 
