@@ -45,7 +45,7 @@ def study(run: Run[Config]) -> None:
         for name, (source, number) in sets.items():
             found, shown = _errors(source, number, network, progress)
             rows.append(_row(run, name, found))
-            run.figure(_figure(shown), name, f"{name.replace('_', ' ')}: events (red ON, blue OFF), true flow, closed form, refiner, and where the refiner is sure. Colour is direction, strength length.")
+            run.figure(_figure(shown), name, f"{name.replace('_', ' ')}: events (red ON, blue OFF), true flow, closed form, refiner, and the deviation it claims. Colour: direction, strength: length.")
             if name == "worlds":
                 _worlds(run, found)
     columns = ["windows", "zero flow (px)", "closed form", "95 %", "worse than zero (%)", "refiner", "95 %", "worse than zero (%)", "refiner / closed form", "error / claimed"]
@@ -65,7 +65,7 @@ def _errors(source, count, network, progress):
         errors = [mean(endpoint_error(field, truth.flow_px)) for field in (torch.zeros_like(truth.flow_px), closed.flow_px, ours.flow_px)]
         found.append(torch.stack([*errors, mean(endpoint_error(ours.flow_px, truth.flow_px).square() / claim)], 1))
         if len(shown) < SHOWN:
-            shown += [(windows.volume.counts[k], truth.flow_px[k], closed.flow_px[k], ours.flow_px[k], ours.confidence[k]) for k in range(min(SHOWN - len(shown), len(weight)))]
+            shown += [(windows.volume.counts[k], truth.flow_px[k], closed.flow_px[k], ours.flow_px[k], (claim[k] / 2).sqrt()) for k in range(min(SHOWN - len(shown), len(weight)))]
         for _ in weight:
             progress.advance()
     return torch.cat(found).numpy(), shown
@@ -99,14 +99,14 @@ def _worlds(run, found):
 
 def _figure(shown):
     figure, axes = plt.subplots(len(shown), 5, figsize=(11, 2.2 * len(shown)), constrained_layout=True, squeeze=False)
-    titles = ("events", "true flow", "closed form", "refiner", "confidence")
-    for row, (counts, *flows, confidence) in zip(axes, shown, strict=True):
+    titles = ("events", "true flow", "closed form", "refiner", "deviation claimed (white: 2 px)")
+    for row, (counts, *flows, deviation_px) in zip(axes, shown, strict=True):
         signed = (counts[0] - counts[1]).sum(0)
         row[0].imshow(signed, cmap="RdBu_r", vmin=-4, vmax=4)
         most = float(flows[0].square().sum(0).sqrt().max())
         for axis, field in zip(row[1:4], flows, strict=True):
             axis.imshow(flow_colours(field.numpy(), most))
-        row[4].imshow(confidence, cmap="gray", vmin=0, vmax=1)
+        row[4].imshow(deviation_px, cmap="gray", vmin=0, vmax=2)
     for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title, fontsize=9)
     for axis in axes.flat:
