@@ -33,7 +33,7 @@ def undrawn(monkeypatch):
 
 def test_training_finds_the_known_answer(tmp_path):
     """At the end of a falling schedule AdamW is within about its last step sizes of the answer: 1e-2 of weights of order 1."""
-    assert train(tmp_path / "run", "--steps", "250", "--learning-rate", "0.05", "--weight-decay", "0", "--clip", "10") == 0
+    assert train(tmp_path / "run", "--steps", "250", "--learning-rate", "0.05", "--weight-decay", "0", "--clip", "10", "--average", "0") == 0
     network = checkpoint.load(tmp_path / "run" / "network.safetensors")
     assert torch.allclose(network.layer.weight[:, :, 0, 0], TRUE_WEIGHTS, atol=1e-2)
     found = metrics_of(tmp_path / "run")
@@ -97,7 +97,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path):
 @pytest.mark.parametrize("name", ["supervised", "motion", "contrast", "photometric"])
 def test_the_loss_is_the_one_that_is_asked_for(tmp_path, name):
     """The loss of the first step, put together by hand from the published terms."""
-    options = ["--loss", "supervised", "--unit", "motion"] if name == "motion" else ["--loss", name]
+    options = ["--loss", "supervised", "--unit", "motion"] if name == "motion" else ["--loss", name, "--unit", "px"]
     given = Linear()
     torch.nn.init.constant_(given.layer.weight, 0.2)
     checkpoint.save(given, tmp_path / "given.safetensors")

@@ -16,6 +16,7 @@ POOL = 2  # pixels a side over which the volume is averaged before anything else
 CELL = 2  # averaged pixels a side of the cells on which flow is corrected
 SCALES = (1, 2, 4)  # averaged pixels over which slopes are taken
 SEEN = 6 * len(SCALES) + 2  # what ``_evidence`` tells of a cell
+JUDGED = 12  # averaged pixels a side of the windows in which start and corrected flow are compared
 PRIOR_PX = 8.0
 LARGEST = 8.0  # event rates that many times the usual one are compressed
 FLOOR_PX2 = 1e-3  # variance claimed at least
@@ -55,35 +56,40 @@ class Refiner(nn.Module):
     def forward(self, volume):
         """Flow of an EventVolume [B, 2, bins, H, W] of any H, W.
 
+        The corrected flow counts where it leaves less that moves than the start does, over windows of 26 px; the start where it does not. So the answer stays
+        near the closed form where that is right already.
         Returns: FlowField with confidence and covariance (the same along x and y). An empty sample has flow 0, confidence 0 and no gradient.
-        Gradient: counts and weights. Second derivatives: none are promised.
+        Gradient: counts and weights.
         Raises: ShapeError for other shapes or numbers of bins; DomainError for counts that are not finite.
         """
-        return self.predictions(volume)[-1]
+        bins = _Bins(volume, self.config["bins"])
+        start_px = bins.padded(_closed_form(volume))
+        flow_px, doubt = self._corrected(bins, start_px)[-1]
+        misfits = [bins.misfit(flow) for flow in (start_px, flow_px)]
+        share = misfits[0].square() / (misfits[0].square() + misfits[1].square())
+        return _field(start_px + _larger(share[:, None], POOL) * (flow_px - start_px), doubt, volume)
 
     def predictions(self, volume, start_px=None):
-        """FlowFields after each correction, the last one the answer. start_px: [B, 2, H, W] flow to begin with instead of the closed form's."""
-        counts = check_volume(volume, self.config["bins"])
-        if start_px is None:
-            with torch.autocast(counts.device.type, enabled=False):  # its solves need full precision
-                start_px = estimate_lk(volume, model="quadratic").flow_px
-        span = volume.collected_s.sum()
-        share, time = ((values / span).to(counts) for values in (volume.collected_s, volume.centroid_s))
-        rates = _rates(avg_pool2d(pad_to(counts.flatten(1, 2), STRIDE), POOL), share)  # [B, 2, bins, h, w]
-        extra = (0, -counts.shape[-1] % STRIDE, 0, -counts.shape[-2] % STRIDE)
-        flow = avg_pool2d(pad(start_px, extra, mode="replicate"), POOL * CELL) / POOL  # in averaged pixels, as all flows below
-        fields = []
+        """FlowFields after each correction, by themselves: what training looks at. start_px: [B, 2, H, W] flow to begin with instead of the closed form's."""
+        bins = _Bins(volume, self.config["bins"])
+        start_px = bins.padded(_closed_form(volume) if start_px is None else start_px)
+        return [_field(flow_px, doubt, volume) for flow_px, doubt in self._corrected(bins, start_px)]
+
+    def _corrected(self, bins, start_px):
+        """(flow px, log variance px^2) of the padded volume after each correction."""
+        flow = avg_pool2d(start_px, POOL * CELL) / POOL  # in averaged pixels
+        found = []
         for step in range(self.config["steps"]):
             dense = _larger(flow, CELL)
-            with torch.autocast(counts.device.type, enabled=False):
-                warped = along_flow(rates, dense.float() if rates.dtype == torch.float32 else dense, time)
-                seen = _evidence(warped[:, 0] - warped[:, 1], share, time)
-            change, core = self._correction(torch.cat([warped, rates], 1).flatten(1, 2), dense * (POOL / PRIOR_PX), seen)
+            warped = bins.warped(dense)
+            with torch.autocast(flow.device.type, enabled=False):
+                seen = _evidence(*bins.mean_and_slope(warped), warped)
+            change, core = self._correction(torch.cat([warped, bins.rates], 1).flatten(1, 2), dense * (POOL / PRIOR_PX), seen)
             flow = flow + change
             last = step + 1 == self.config["steps"]
             flow_px = POOL * (_blended(flow, self.blend(core), POOL * CELL) if last else _larger(flow, POOL * CELL))
-            fields.append(_field(flow_px, _larger(self.doubt(core), POOL * CELL)[:, 0], volume))
-        return fields
+            found.append((flow_px, _larger(self.doubt(core), POOL * CELL)[:, 0]))
+        return found
 
     def _correction(self, rates, dense, seen):
         """Change of the flow on cells [B, 2, h, w], and the features it came from."""
@@ -113,31 +119,65 @@ def _field(flow_px, doubt, volume):
     return FlowField(shown * flow_px[..., :height, :width], valid, float(volume.collected_s.sum()), confidence, covariance)
 
 
-def _rates(counts, share):
-    """Event rates [B, 2, bins, h, w] from counts [B, 2 bins, h, w], in units of the sample's root mean square, large ones compressed smoothly."""
-    rate = counts.unflatten(1, (2, -1)) / (share[:, None, None] * len(share))
-    rate = rate * (rate.sum(1).square().mean((1, 2, 3)) + 1e-4).rsqrt()[:, None, None, None, None]
-    return rate * (1 + (rate / LARGEST).square()).rsqrt()
+def _closed_form(volume):
+    with torch.autocast(volume.counts.device.type, enabled=False):  # its solves need full precision
+        return estimate_lk(volume, model="quadratic").flow_px
 
 
-def _evidence(warped, share, time):
-    """What the warped bins [B, bins, h, w] (ON less OFF) say about the flow that is still missing, on cells [B, SEEN, h / CELL, w / CELL].
+class _Bins:
+    """Event rates [B, 2, bins, h, w] of a volume, averaged over POOL x POOL px, and how they are read.
+
+    Rates are in units of the sample's root mean square, large ones compressed smoothly; sides are padded with empty pixels to multiples of STRIDE.
+    """
+
+    def __init__(self, volume, bins):
+        counts = check_volume(volume, bins)
+        span = volume.collected_s.sum()
+        self.share, self.time = ((values / span).to(counts) for values in (volume.collected_s, volume.centroid_s))
+        self.extra = (0, -counts.shape[-1] % STRIDE, 0, -counts.shape[-2] % STRIDE)
+        rate = avg_pool2d(pad_to(counts.flatten(1, 2), STRIDE), POOL).unflatten(1, (2, -1)) / (self.share[:, None, None] * bins)
+        rate = rate * (rate.sum(1).square().mean((1, 2, 3)) + 1e-4).rsqrt()[:, None, None, None, None]
+        self.rates = rate * (1 + (rate / LARGEST).square()).rsqrt()
+
+    def padded(self, flow_px):
+        """A flow of the volume continued to the padded size."""
+        return pad(flow_px, self.extra, mode="replicate") if any(self.extra) else flow_px
+
+    def warped(self, flow):
+        """Rates along a flow in averaged pixels [B, 2, h, w]."""
+        with torch.autocast(flow.device.type, enabled=False):
+            return along_flow(self.rates, flow.to(self.rates.dtype), self.time)
+
+    def mean_and_slope(self, rates):
+        """Mean over the bins of ON less OFF, and its slope over time per window, [B, h, w] each."""
+        signed = rates[:, 0] - rates[:, 1]
+        centred = self.time - (self.share * self.time).sum()
+        lean = self.share * centred / (self.share * centred.square()).sum()
+        return (signed * self.share[:, None, None]).sum(1), (signed * lean[:, None, None]).sum(1)
+
+    def misfit(self, flow_px):
+        """Mean square of what still moves along a flow [B, 2, H, W] px, over windows, [B, h, w], on a small floor, so that two flows that fit alike share."""
+        energy = self.mean_and_slope(self.warped(avg_pool2d(flow_px, POOL) / POOL))[1].square()
+        reach = min(JUDGED // 2, *(side - 1 for side in energy.shape[-2:]))
+        near = avg_pool2d(pad(energy[:, None], (reach, reach, reach, reach), mode="reflect"), 2 * reach + 1, stride=1)[:, 0]
+        return near + 1e-3 * energy.mean((1, 2), keepdim=True) + 1e-4
+
+
+def _evidence(mean, moving, warped):
+    """What the warped bins [B, 2, bins, h, w], their mean and slope, say about the flow that is still missing, on cells [B, SEEN, h / CELL, w / CELL].
 
     Mean and mean square of the rate; per scale the local least-squares flow (2), orientation (2) and strength (1) of the texture, strength of what moves (1).
     """
-    weight = share[:, None, None]
-    middle = (share * time).sum()
-    lean = weight * (time - middle)[:, None, None] / (share * (time - middle).square()).sum()
-    mean, slope = (warped * weight).sum(1, keepdim=True), (warped * lean).sum(1, keepdim=True)
-    both = torch.cat([mean, slope], 1)
-    found = [avg_pool2d(torch.cat([mean, warped.square().mean(1, keepdim=True)], 1), CELL)]
+    both = torch.stack([mean, moving], 1)
+    square = (warped[:, 0] - warped[:, 1]).square().mean(1)
+    found = [avg_pool2d(torch.stack([mean, square], 1), CELL)]
     for scale in SCALES:
         level = avg_pool2d(both, scale) if scale > 1 else both
         edge = pad(level[:, :1], (1, 1, 1, 1), mode="replicate")[:, 0]
         dx = (edge[:, 1:-1, 2:] - edge[:, 1:-1, :-2]) / (2 * scale)
         dy = (edge[:, 2:, 1:-1] - edge[:, :-2, 1:-1]) / (2 * scale)
-        moving = level[:, 1]
-        products = torch.stack([dx * dx, dx * dy, dy * dy, dx * moving, dy * moving, moving * moving], 1)
+        slope = level[:, 1]
+        products = torch.stack([dx * dx, dx * dy, dy * dy, dx * slope, dy * slope, slope * slope], 1)
         if scale < CELL:
             products = avg_pool2d(products, CELL // scale)
         products = avg_pool2d(products, 3, stride=1, padding=1, count_include_pad=False)

@@ -101,6 +101,7 @@ def test_any_size_is_padded_and_cropped_back():
     found = made.predictions(volume(counts), start)[-1]
     wide = made.predictions(volume(torch.nn.functional.pad(counts, (0, 14, 0, 11))), torch.zeros(2, 2, 48, 64, dtype=D))[-1]
     torch.testing.assert_close(found.flow_px, wide.flow_px[..., :37, :50], rtol=0, atol=1e-12)
+    assert found.confidence is not None
     assert found.confidence.shape == (2, 37, 50)
 
 
@@ -141,3 +142,18 @@ def test_the_budget_of_weights():
     made = Refiner()
     assert sum(parameter.numel() for parameter in made.parameters()) <= 500_000
     assert made.config == {"bins": 8, "width": 28, "steps": 2}
+
+
+def test_a_wrong_correction_hardly_counts():
+    """The network is made to add 3 px everywhere; along the true start nothing moves, so the answer must keep to it."""
+    windows = RenderedWindows(planes("fine", 0.1), seed=12).batch(range(4))
+    made = network(dtype=torch.float32, steps=1)
+    for head in (made.change_middle, made.change_fine, made.blend):
+        for parameter in head.parameters():
+            torch.nn.init.zeros_(parameter)
+    assert made.change_fine.bias is not None
+    torch.nn.init.constant_(made.change_fine.bias, 1.5)  # averaged pixels of 2 px
+    truth = windows.truth.flow_px
+    error = lambda flow_px: float((flow_px - truth).square().sum(1).sqrt().mean().detach())  # noqa: E731
+    assert error(made.predictions(windows.volume)[-1].flow_px) > 3.5
+    assert error(made(windows.volume).flow_px) < 0.5
