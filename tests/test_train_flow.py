@@ -33,7 +33,7 @@ def undrawn(monkeypatch):
 
 def test_training_finds_the_known_answer(tmp_path):
     """At the end of a falling schedule AdamW is within about its last step sizes of the answer: 1e-2 of weights of order 1."""
-    assert train(tmp_path / "run", "--steps", "250", "--learning-rate", "0.05", "--weight-decay", "0", "--clip", "10", "--average", "0") == 0
+    assert train(tmp_path / "run", "--steps", "250", "--learning-rate", "0.05", "--weight-decay", "0", "--clip", "10", "--average", "0", "--reuse", "1") == 0
     network = checkpoint.load(tmp_path / "run" / "network.safetensors")
     assert torch.allclose(network.layer.weight[:, :, 0, 0], TRUE_WEIGHTS, atol=1e-2)
     found = metrics_of(tmp_path / "run")
