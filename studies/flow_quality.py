@@ -102,11 +102,11 @@ def _figure(shown):
     titles = ("events", "true flow", "closed form", "refiner", "deviation claimed (white: 2 px)")
     for row, (counts, *flows, deviation_px) in zip(axes, shown, strict=True):
         signed = (counts[0] - counts[1]).sum(0)
-        row[0].imshow(signed, cmap="RdBu_r", vmin=-4, vmax=4)
+        row[0].imshow(signed.numpy(), cmap="RdBu_r", vmin=-4, vmax=4)
         most = float(flows[0].square().sum(0).sqrt().max())
         for axis, field in zip(row[1:4], flows, strict=True):
             axis.imshow(flow_colours(field.numpy(), most))
-        row[4].imshow(deviation_px, cmap="gray", vmin=0, vmax=2)
+        row[4].imshow(deviation_px.numpy(), cmap="gray", vmin=0, vmax=2)
     for axis, title in zip(axes[0], titles, strict=True):
         axis.set_title(title, fontsize=9)
     for axis in axes.flat:

@@ -34,15 +34,8 @@ DENSE = Draws(flow_px=(0.5, 7.0), contrast=(0.8, 1.8), theta=(0.08, 0.25))
 FLAT = Draws(motion="similarity", layers=(0, 0), flow_px=(0.0, 7.0), contrast=(0.7, 1.6), theta=(0.08, 0.25))
 WIDE = Draws(layers=(1, 4), flow_px=(1.0, 9.0), contrast=(0.8, 1.8), theta=(0.08, 0.25))
 
-
-def faint(draws, contrast):
-    """The same, down to this contrast and with thresholds up to 0.3: many windows with few events."""
-    return replace(draws, contrast=(contrast, draws.contrast[1]), theta=(draws.theta[0], 0.3))
-
-
 TRAINING: dict[str, Callable[[Shape, int], list]] = {
     "dense": lambda shape, seed: [(0.55, shape(DENSE, seed)), (0.25, shape(FLAT, seed + 1)), (0.2, shape(WIDE, seed + 2, 96, 96))],
-    "broad": lambda shape, seed: [(0.4, shape(faint(DENSE, 0.3), seed)), (0.4, shape(faint(FLAT, 0.2), seed + 1)), (0.2, shape(WIDE, seed + 2, 96, 96))],
     "layers": lambda shape, seed: [(1.0, shape(Draws(), seed))],
     "planes": lambda shape, seed: [(1.0, shape(Draws(layers=(0, 0)), seed))],
 }
