@@ -204,8 +204,12 @@ def learning_rate(config, share):
 
 
 def run_here(arguments=None):
-    """Exit code of this process: the first one runs the study, the others follow it."""
-    return main(study, Config, arguments) if place()[0] == 0 else follow()
+    """Exit code of this process: the first one runs the study; the others follow it, and end here."""
+    if place()[0] == 0:
+        return main(study, Config, arguments)
+    code = follow()
+    sys.stdout.flush()
+    os._exit(code)  # threads of the connection may still be ending, and the interpreter's own end aborts on them now and then
 
 
 if __name__ == "__main__":

@@ -65,6 +65,7 @@ class Ranks:
     def leave(self):
         """End the connection."""
         if self.count > 1:
+            dist.barrier()  # nobody hangs up while another still speaks
             dist.destroy_process_group()
 
 
