@@ -35,7 +35,7 @@ class Config(StudyConfig):
     """Processor time of every training, making the windows included, minutes."""
     weights: int = 0
     """Weights of the rivals; 0 for as many as the refiner has."""
-    mix: str = "dense"
+    mix: str = "delivered"
     """Windows to train on (studies.train_flow_sources)."""
     windows: int = 128
     """Windows of every set of flat textures to judge on."""

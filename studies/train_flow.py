@@ -33,7 +33,7 @@ class Config(StudyConfig):
     """Arguments of the network's constructor, name=number."""
     weights: int = 0
     """Number of weights wanted of a network that comes in sizes; 0 leaves its own."""
-    mix: str = "dense"
+    mix: str = "delivered"
     """Windows to train on (studies.train_flow_sources)."""
     data: Path | None = None
     """Folder of a data set (ours, DSEC, MVSEC) to train on instead; its last tenth is what is judged on."""

@@ -35,7 +35,7 @@ FLAT = Draws(motion="similarity", layers=(0, 0), flow_px=(0.0, 7.0), contrast=(0
 WIDE = Draws(layers=(1, 4), flow_px=(1.0, 9.0), contrast=(0.8, 1.8), theta=(0.08, 0.25))
 
 TRAINING: dict[str, Callable[[Shape, int], list]] = {
-    "dense": lambda shape, seed: [(0.55, shape(DENSE, seed)), (0.25, shape(FLAT, seed + 1)), (0.2, shape(WIDE, seed + 2, 96, 96))],
+    "delivered": lambda shape, seed: [(0.55, shape(DENSE, seed)), (0.25, shape(FLAT, seed + 1)), (0.2, shape(WIDE, seed + 2, 96, 96))],
     "layers": lambda shape, seed: [(1.0, shape(Draws(), seed))],
     "planes": lambda shape, seed: [(1.0, shape(Draws(layers=(0, 0)), seed))],
 }
