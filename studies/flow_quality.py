@@ -4,12 +4,12 @@ import sys
 from dataclasses import dataclass
 
 import matplotlib.pyplot as plt
-import numpy as np
 import torch
 
 from codesign import flow
 from codesign.errors import DomainError
 from codesign.flow.metrics import endpoint_error
+from studies.flow_closed_form_score import Score
 from studies.flow_worlds import ALL, WorldWindows
 from studies.make_dataset_page import flow_colours
 from studies.run import Run, StudyConfig, main
@@ -73,18 +73,15 @@ def _errors(source, count, network, progress):
 
 def _row(run, name, found):
     zero, closed, ours, claimed = found.T
-    draw = np.random.default_rng(0)
-    again = draw.integers(0, len(found), (DRAWS, len(found)))
-    ratio = lambda values: values.mean() / zero.mean()  # noqa: E731
     cells = [name.replace("_", " "), round(zero.mean(), 2)]
     for who, values in (("closed_form", closed), ("refiner", ours)):
-        low, high = np.quantile(values[again].mean(1) / zero[again].mean(1), [0.025, 0.975])
-        worse = 100 * (values > zero).mean()
-        run.record(**{f"{name}_{who}_ratio": ratio(values), f"{name}_{who}_ratio_low": low, f"{name}_{who}_ratio_high": high, f"{name}_{who}_worse_percent": worse, f"{name}_{who}_aee_px": values.mean()})
-        cells += [round(ratio(values), 3), f"{low:.3f} to {high:.3f}", round(worse, 1)]
+        judged = Score(values, zero, None)
+        low, high = judged.ratio_interval(0, DRAWS)
+        run.record(**{f"{name}_{who}_ratio": judged.ratio, f"{name}_{who}_ratio_low": low, f"{name}_{who}_ratio_high": high, f"{name}_{who}_worse_percent": judged.worse_percent, f"{name}_{who}_aee_px": values.mean()})
+        cells += [round(judged.ratio, 3), f"{low:.3f} to {high:.3f}", round(judged.worse_percent, 1)]
     share, honest = ours.mean() / closed.mean(), claimed.mean() ** 0.5
     run.record(**{f"{name}_refiner_over_closed_form": share, f"{name}_zero_flow_px": zero.mean(), f"{name}_windows": len(found), f"{name}_error_over_claimed": honest})
-    run.card(name.replace("_", " "), f"{ratio(ours):.3f} x zero flow", f"closed form {ratio(closed):.3f}")
+    run.card(name.replace("_", " "), f"{ours.mean() / zero.mean():.3f} x zero flow", f"closed form {closed.mean() / zero.mean():.3f}")
     return [*cells, round(share, 2), round(honest, 2)]
 
 

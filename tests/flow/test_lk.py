@@ -1,7 +1,6 @@
 """The closed-form estimator on analytically moving patterns, on noise, and its gradient."""
 
 import math
-from dataclasses import dataclass
 
 import pytest
 import torch
@@ -10,6 +9,7 @@ from codesign import events
 from codesign.errors import DomainError, ShapeError
 from codesign.flow import estimate_lk
 from codesign.types import EventVolume
+from tests.certain_case import certain
 
 D = torch.float64
 SIZE, SPAN_S = 48, 0.05
@@ -41,20 +41,6 @@ def moving(seed, matrix=((0.0, 0.0), (0.0, 0.0)), shift=(0.0, 0.0), per_pixel=8.
     volume = events.from_counts(torch.stack(counts), torch.linspace(0, SPAN_S, steps + 1, dtype=D), bins)
     middle = (at + shift / 2) @ torch.linalg.inv(torch.eye(2, dtype=D) - matrix / 2).T
     return volume, (middle @ matrix.T + shift).permute(2, 0, 1)
-
-
-@dataclass(frozen=True)
-class Certain:
-    flow_px: torch.Tensor
-    confidence: torch.Tensor
-    covariance_px2: torch.Tensor
-
-
-def certain(field):
-    """The field's flow, confidence and covariance, which the closed form always gives."""
-    if field.confidence is None or field.covariance_px2 is None:
-        raise AssertionError("the closed form gave no confidence or covariance")
-    return Certain(field.flow_px, field.confidence, field.covariance_px2)
 
 
 def mean_error(field, truth):

@@ -1,7 +1,6 @@
 """The parts of the closed-form estimator: fields and their prior, the noise model, and how well its covariance says how large errors are."""
 
 import math
-from dataclasses import dataclass
 
 import numpy
 import pytest
@@ -10,22 +9,9 @@ import torch
 from codesign.flow import estimate_lk, lk_field, lk_level
 from codesign.types import EventVolume
 from scenes.flow_windows import RenderedWindows, planes
+from tests.certain_case import certain
 
 D = torch.float64
-
-
-@dataclass(frozen=True)
-class Certain:
-    flow_px: torch.Tensor
-    confidence: torch.Tensor
-    covariance_px2: torch.Tensor
-
-
-def certain(field):
-    """The field's flow, confidence and covariance, which the closed form always gives."""
-    if field.confidence is None or field.covariance_px2 is None:
-        raise AssertionError("the closed form gave no confidence or covariance")
-    return Certain(field.flow_px, field.confidence, field.covariance_px2)
 
 
 @pytest.mark.parametrize("model", ["affine", "quadratic"])
