@@ -2,5 +2,6 @@
 
 import os
 
-# Torch's OpenMP threads would busy-wait after each operation on the core that drjit's thread pool needs (a render step took 2x the CPU).
+# Torch's OpenMP threads would busy-wait after each operation on the core that drjit's thread pool needs (a
+# render step took 2x the CPU).
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")

@@ -25,8 +25,12 @@ def main(arguments=None):
     )
     parser.add_argument("--version", action="version", version=f"codesign {installed}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
-    doctor = commands.add_parser("doctor", help="what is installed, what is missing, what to do; exit 0 only when a render works")
-    doctor.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where the trial render runs (default: cpu)")
+    doctor = commands.add_parser(
+        "doctor", help="what is installed, what is missing, what to do; exit 0 only when a render works"
+    )
+    doctor.add_argument(
+        "--device", choices=("cpu", "cuda"), default="cpu", help="where the trial render runs (default: cpu)"
+    )
     chosen = parser.parse_args(arguments)
     if chosen.command is None:
         parser.print_help()

@@ -16,7 +16,9 @@ import torch
 
 from codesign.errors import BackendError, GradientError
 
-MINIMUM_LLVM = 19  # 15 and 16 abort the process while compiling Mitsuba 3.9 kernels; 14 is refused; 19 and 22 work
+MINIMUM_LLVM = (
+    19  # 15 and 16 abort the process while compiling Mitsuba 3.9 kernels; 14 is refused; 19 and 22 work
+)
 INSTALL_LLVM = {
     "Linux": "install LLVM 19 or newer: 'apt-get install libllvm19' (Debian, Ubuntu), 'dnf install llvm-libs' (Fedora) or 'conda install -c conda-forge libllvm19'",
     "Darwin": "install LLVM 19 or newer: 'brew install llvm', then set DRJIT_LIBLLVM_PATH=$(brew --prefix llvm)/lib/libLLVM.dylib",
@@ -49,23 +51,32 @@ def llvm_version():
 
 
 def check_version(device="cpu"):
-    """Raise BackendError unless the compiler drjit needs for ``device`` is present and fit. Costs milliseconds."""
+    """Raise BackendError unless the compiler drjit needs for ``device`` is present and fit. Costs
+    milliseconds."""
     if device.startswith("cuda"):
         if not torch.cuda.is_available():
-            raise BackendError("device 'cuda' was asked for but torch sees no CUDA device; use --device cpu, or install a CUDA build of torch and a driver.")
+            raise BackendError(
+                "device 'cuda' was asked for but torch sees no CUDA device; use --device cpu, or install a "
+                "CUDA build of torch and a driver."
+            )
         return
-    found, path = llvm_version(), os.environ.get("DRJIT_LIBLLVM_PATH")
+    found = llvm_version()
+    path = os.environ.get("DRJIT_LIBLLVM_PATH")
     where = f" (DRJIT_LIBLLVM_PATH={path})" if path else ""
     remedy = ("unset DRJIT_LIBLLVM_PATH, or " if path else "") + install_hint()
     if found is None:
         raise BackendError(f"no usable LLVM library was found{where}; {remedy}.")
     if found[0] < MINIMUM_LLVM:
         dotted = ".".join(map(str, found))
-        raise BackendError(f"LLVM {dotted} was found{where}, but rendering needs {MINIMUM_LLVM} or newer (older ones abort the process); {remedy}.")
+        raise BackendError(
+            f"LLVM {dotted} was found{where}, but rendering needs {MINIMUM_LLVM} or newer (older ones abort "
+            f"the process); {remedy}."
+        )
 
 
 def variant(device="cpu"):
-    """Name of the Mitsuba variant used on ``device``: one radiance channel, because event sensors are monochrome."""
+    """Name of the Mitsuba variant used on ``device``: one radiance channel, because event sensors are
+    monochrome."""
     return "cuda_ad_mono" if device.startswith("cuda") else "llvm_ad_mono"
 
 
@@ -87,7 +98,15 @@ def _memory_file():
 
 
 def _machine_key(device):
-    facts = [variant(device), version("mitsuba"), version("drjit"), platform.platform(), sys.executable, str(llvm_version()), os.environ.get("DRJIT_LIBLLVM_PATH", "")]
+    facts = [
+        variant(device),
+        version("mitsuba"),
+        version("drjit"),
+        platform.platform(),
+        sys.executable,
+        str(llvm_version()),
+        os.environ.get("DRJIT_LIBLLVM_PATH", ""),
+    ]
     return hashlib.sha256("|".join(facts).encode()).hexdigest()
 
 
@@ -95,10 +114,12 @@ def _machine_key(device):
 def require_renderer(device="cpu"):
     """Check once that rendering works; raise BackendError with one sentence otherwise.
 
-    The version check runs in every process; the trial render runs once per machine and set of versions, and is remembered.
+    The version check runs in every process; the trial render runs once per machine and set of versions, and
+    is remembered.
     """
     check_version(device)
-    key, memory = _machine_key(device), _memory_file()
+    key = _machine_key(device)
+    memory = _memory_file()
     try:
         known = json.loads(memory.read_text())
     except (OSError, ValueError):
@@ -151,10 +172,13 @@ def arrays(device="cpu", dtype=torch.float32):
 
 
 def widen(arr, parameters, count, width):
-    """The ``count`` scalars of a flat array, each gathered into a full-width array where its gradient is wanted.
+    """The ``count`` scalars of a flat array, each gathered into a full-width array where its gradient is
+    wanted.
 
-    A scalar used by a million lanes would make one full recomputation per use in the backward pass; a gather makes one reduction.
-    Without a gradient a gather per lane only costs time, and the scalars stay scalars (evaluated, so that other values need no new kernel).
+    A scalar used by a million lanes would make one full recomputation per use in the backward pass; a gather
+    makes one reduction.
+    Without a gradient a gather per lane only costs time, and the scalars stay scalars (evaluated, so that
+    other values need no new kernel).
     """
     import drjit as dr
 
@@ -167,7 +191,8 @@ def widen(arr, parameters, count, width):
 
 
 def frames_per_kernel(pixels):
-    """How many frames of so many pixels one loop over time should take: few frames read memory in few streams, which the processor fetches ahead;
+    """How many frames of so many pixels one loop over time should take: few frames read memory in few
+    streams, which the processor fetches ahead;
     many save calls."""
     return max(32, (1 << 22) // pixels)
 
@@ -176,17 +201,23 @@ def run_kernel(kernel, inputs, out_shapes):
     """Run a drjit kernel on torch tensors, with first derivatives.
 
     Args:
-      kernel: callable (arrays, *flat) -> tuple of flat drjit arrays; must be a pure function of its inputs. Integer outputs carry no gradient.
+      kernel: callable (arrays, *flat) -> tuple of flat drjit arrays; must be a pure function of its inputs.
+        Integer outputs carry no gradient.
       inputs: float tensors of one dtype and device; each is handed to the kernel flattened (row-major).
       out_shapes: shape of each output.
     Returns: tuple of tensors that own their memory (no aliasing with the inputs).
-    Gradient: reverse mode, by running the kernel again in backward, so any number of backward passes give the same numbers.
+    Gradient: reverse mode, by running the kernel again in backward, so any number of backward passes give the
+      same numbers.
     Raises: GradientError on mixed dtypes, and when a second derivative is asked for.
     """
     inputs = tuple(inputs)
-    dtypes, devices = {x.dtype for x in inputs}, {x.device for x in inputs}
+    dtypes = {x.dtype for x in inputs}
+    devices = {x.device for x in inputs}
     if len(dtypes) != 1 or len(devices) != 1:
-        raise GradientError(f"a kernel takes tensors of one dtype and one device, got {sorted(map(str, dtypes))} on {sorted(map(str, devices))}; convert them first.")
+        raise GradientError(
+            f"a kernel takes tensors of one dtype and one device, got {sorted(map(str, dtypes))} on "
+            f"{sorted(map(str, devices))}; convert them first."
+        )
     return _Kernel.apply(kernel, tuple(map(tuple, out_shapes)), *inputs)
 
 
@@ -207,15 +238,19 @@ class _Kernel(torch.autograd.Function):
     def forward(ctx, kernel, out_shapes, *inputs):
         import drjit as dr
 
-        ctx.kernel, ctx.arrays = kernel, arrays(inputs[0].device.type, inputs[0].dtype)
+        ctx.kernel = kernel
+        ctx.arrays = arrays(inputs[0].device.type, inputs[0].dtype)
         ctx.save_for_backward(*inputs)
         ctx.set_materialize_grads(False)
         with dr.suspend_grad():
             outputs = [dr.detach(o) for o in kernel(ctx.arrays, *[_to_drjit(ctx.arrays, x) for x in inputs])]
-            owned = [o.state != dr.VarState.Evaluated for o in outputs]  # memory that was there before may belong to something the kernel captured
+            owned = [
+                o.state != dr.VarState.Evaluated for o in outputs
+            ]  # memory that was there before may belong to something the kernel captured
             dr.eval(outputs)
         dr.sync_thread()
-        seen, tensors = list(inputs), []
+        seen = list(inputs)
+        tensors = []
         for value, shape, own in zip(outputs, out_shapes, owned, strict=True):
             tensor = _to_torch(value, shape, seen)
             tensors.append(tensor if own else tensor.clone())
@@ -229,7 +264,11 @@ class _Kernel(torch.autograd.Function):
             result = _adjoint(ctx, grads)
         if torch.is_grad_enabled():
             live = [g for g in result if g is not None]
-            sealed = iter(NoSecondDerivative.apply(_FIRST_ONLY, len(live), *live, *ctx.saved_tensors, *[g for g in grads if g is not None]))
+            sealed = iter(
+                NoSecondDerivative.apply(
+                    _FIRST_ONLY, len(live), *live, *ctx.saved_tensors, *[g for g in grads if g is not None]
+                )
+            )
             result = [None if g is None else next(sealed) for g in result]
         return (None, None, *result)
 
@@ -238,7 +277,8 @@ def _adjoint(ctx, grads):
     """Gradients of the kernel's inputs, by re-running it with drjit's reverse mode."""
     import drjit as dr
 
-    inputs, arr = ctx.saved_tensors, ctx.arrays
+    inputs = ctx.saved_tensors
+    arr = ctx.arrays
     wanted = ctx.needs_input_grad[2:]
     flat = [_to_drjit(arr, x) for x in inputs]
     for value, want in zip(flat, wanted, strict=True):
@@ -261,7 +301,8 @@ _FIRST_ONLY = "drjit kernels give first derivatives only; a second derivative th
 
 
 class NoSecondDerivative(torch.autograd.Function):
-    """Passes the first ``count`` tensors, gradients, on unchanged; differentiating them again raises GradientError with ``sentence``."""
+    """Passes the first ``count`` tensors, gradients, on unchanged; differentiating them again raises
+    GradientError with ``sentence``."""
 
     @staticmethod
     def forward(ctx, sentence, count, *tensors):

@@ -1,4 +1,5 @@
-"""`python -m codesign doctor`: what is installed, what is missing, what to do. One line each; works when nothing else does."""
+"""`python -m codesign doctor`: what is installed, what is missing, what to do. One line each; works when
+nothing else does."""
 
 import os
 import platform
@@ -39,23 +40,36 @@ def diagnose(device="cpu"):
 
 
 def main(device="cpu"):
-    """Print the findings as they come. Returns the exit code: 0 when a render works and nothing it needs is unfit, else 2."""
+    """Print the findings as they come. Returns the exit code: 0 when a render works and nothing it needs is
+    unfit, else 2."""
     sys.stdout.reconfigure(errors="replace")  # pyright: ignore[reportAttributeAccessIssue]
     colour = sys.stdout.isatty() and "NO_COLOR" not in os.environ
-    marks = {True: "\033[32m✔\033[0m", False: "\033[31m✘\033[0m", None: "·"} if colour else {True: "ok     ", False: "missing", None: "       "}
+    marks = (
+        {True: "\033[32m✔\033[0m", False: "\033[31m✘\033[0m", None: "·"}
+        if colour
+        else {True: "ok     ", False: "missing", None: "       "}
+    )
     ready = True
     for finding in diagnose(device):
         print(f"{marks[finding.ok]} {finding.name:<9}{finding.found}", flush=True)
         if finding.remedy:
             print(f"            -> {finding.remedy}", flush=True)
         ready = ready and finding.ok is not False
-    print("Ready: a render works." if ready else "Not ready: nothing can be rendered yet; do what the arrows say.")
+    print(
+        "Ready: a render works."
+        if ready
+        else "Not ready: nothing can be rendered yet; do what the arrows say."
+    )
     return 0 if ready else 2
 
 
 def _python():
     good = sys.version_info[:2] >= PYTHON_NEEDED
-    remedy = "" if good else f"install Python {'.'.join(map(str, PYTHON_NEEDED))} or newer, then 'make setup PYTHON=/path/to/it'"
+    remedy = (
+        ""
+        if good
+        else f"install Python {'.'.join(map(str, PYTHON_NEEDED))} or newer, then 'make setup PYTHON=/path/to/it'"
+    )
     return Finding("Python", good, f"{platform.python_version()} at {sys.executable}", remedy)
 
 
@@ -84,7 +98,11 @@ def _llvm(device):
         from codesign.errors import BackendError
 
         found = backend.llvm_version()
-        text = "none found" if found is None else f"{'.'.join(map(str, found))} at {mapped_llvm() or 'a path that could not be found out'}"
+        text = (
+            "none found"
+            if found is None
+            else f"{'.'.join(map(str, found))} at {mapped_llvm() or 'a path that could not be found out'}"
+        )
         if device.startswith("cuda"):
             return Finding("LLVM", None, text + " (not needed on cuda)")
         try:
@@ -97,7 +115,8 @@ def _llvm(device):
 
 
 def mapped_llvm():
-    """Path of the LLVM library this process has loaded: from the kernel's list on Linux, else DRJIT_LIBLLVM_PATH, else None."""
+    """Path of the LLVM library this process has loaded: from the kernel's list on Linux, else
+    DRJIT_LIBLLVM_PATH, else None."""
     try:
         for line in Path("/proc/self/maps").read_text().splitlines():
             path = line[line.find("/") :] if "/" in line else ""
@@ -118,7 +137,12 @@ def _cuda(device):
         needed = device.startswith("cuda")
         return Finding("CUDA", False if needed else None, _sentence(error), REINSTALL if needed else "")
     if device.startswith("cuda"):
-        return Finding("CUDA", False, "no device", "install an NVIDIA driver and a CUDA build of torch, or use --device cpu")
+        return Finding(
+            "CUDA",
+            False,
+            "no device",
+            "install an NVIDIA driver and a CUDA build of torch, or use --device cpu",
+        )
     return Finding("CUDA", None, "no device; everything runs on the CPU")
 
 
@@ -128,7 +152,11 @@ def _threads():
         import drjit
         import torch
 
-        return Finding("threads", None, f"{cores} usable cores; torch {torch.get_num_threads()}, drjit {drjit.thread_count()}")
+        return Finding(
+            "threads",
+            None,
+            f"{cores} usable cores; torch {torch.get_num_threads()}, drjit {drjit.thread_count()}",
+        )
     except Exception as error:  # noqa: BLE001 - see _package
         return Finding("threads", None, f"{cores} usable cores ({_sentence(error)})")
 

@@ -37,5 +37,8 @@ def check_finite(tensor, name, remedy="remove or repair the non-finite entries")
     if not bool(finite.all()):
         bad = int((~finite).sum())
         first = (~finite).nonzero()[0].tolist()
-        raise DomainError(f"{name}: {bad} of {finite.numel()} values are NaN or infinite (first at index {first}); {remedy}.")
+        raise DomainError(
+            f"{name}: {bad} of {finite.numel()} values are NaN or infinite (first at index {first}); "
+            f"{remedy}."
+        )
     return tensor

@@ -1,9 +1,13 @@
 """Flow fields to and from files: 16-bit PNG as in DSEC, and Middlebury .flo. The extension says which.
 
-DSEC: three channels of 16 bits. The first two are round(128 v) + 2^15 for the flow v to the right and down (px), the third is 1 where it is valid, else 0.
-Flows from -256 to 255.99 px fit, to 1/256 px; larger valid ones are refused, never clipped. Invalid pixels are written as 0, 0, 0 and read as flow 0.
-Middlebury: the float32 202021.25, width and height as int32, then (right, down) float32 pixel by pixel, all little-endian. Invalid pixels hold 1e10, and
-components above 1e9 in size read as invalid. Sources: the DSEC data format page; Baker et al., A database and evaluation methodology for optical flow, IJCV 2011.
+DSEC: three channels of 16 bits. The first two are round(128 v) + 2^15 for the flow v to the right and down
+  (px), the third is 1 where it is valid, else 0.
+Flows from -256 to 255.99 px fit, to 1/256 px; larger valid ones are refused, never clipped. Invalid pixels
+are written as 0, 0, 0 and read as flow 0.
+Middlebury: the float32 202021.25, width and height as int32, then (right, down) float32 pixel by pixel, all
+  little-endian. Invalid pixels hold 1e10, and
+components above 1e9 in size read as invalid. Sources: the DSEC data format page; Baker et al., A database and
+  evaluation methodology for optical flow, IJCV 2011.
 """
 
 import struct
@@ -16,8 +20,11 @@ import torch
 from codesign.atomic import replacing
 from codesign.errors import DomainError, FileFormatError, ShapeError
 
-SCALE, OFFSET = 128.0, 2**15
-FLO_TAG, FLO_UNKNOWN, FLO_LIMIT = struct.pack("<f", 202021.25), 1e10, 1e9
+SCALE = 128.0
+OFFSET = 2**15
+FLO_TAG = struct.pack("<f", 202021.25)
+FLO_UNKNOWN = 1e10
+FLO_LIMIT = 1e9
 PNG_START = b"\x89PNG\r\n\x1a\n"
 MOST_PIXELS = 64_000_000  # what a file may announce
 MOST_BYTES = 1_000_000_000
@@ -26,8 +33,10 @@ MOST_BYTES = 1_000_000_000
 def write_flow(path, flow_px, valid=None):
     """Write one flow field; the file appears whole or not at all.
 
-    Args: path: ending in .png (DSEC) or .flo. flow_px: [2, H, W] px, +x right, +y down. valid: [H, W] bool, everything when None.
-    Raises: ShapeError; DomainError when a valid flow is not finite or does not fit the format; FileFormatError for another extension or a folder not writable.
+    Args: path: ending in .png (DSEC) or .flo. flow_px: [2, H, W] px, +x right, +y down. valid: [H, W] bool,
+      everything when None.
+    Raises: ShapeError; DomainError when a valid flow is not finite or does not fit the format;
+      FileFormatError for another extension or a folder not writable.
     """
     path = Path(path)
     encode = _choose({".png": _to_png, ".flo": _to_flo}, path, "written")
@@ -36,7 +45,9 @@ def write_flow(path, flow_px, valid=None):
         raise ShapeError(f"a flow to write must be [2, H, W], got {list(flow.shape)}.")
     seen = np.ones(flow.shape[1:], bool) if valid is None else torch.as_tensor(valid).detach().cpu().numpy()
     if seen.shape != flow.shape[1:] or seen.dtype != np.bool_:
-        raise ShapeError(f"the valid mask must be bool {list(flow.shape[1:])}, got {seen.dtype} {list(seen.shape)}.")
+        raise ShapeError(
+            f"the valid mask must be bool {list(flow.shape[1:])}, got {seen.dtype} {list(seen.shape)}."
+        )
     if not np.isfinite(flow[:, seen]).all():
         raise DomainError("a flow marked as valid is NaN or infinite; mark it as not valid.")
     content = encode(flow, seen)
@@ -65,23 +76,36 @@ def read_flow(path):
 def _choose(table, path, verb):
     choice = table.get(path.suffix.lower())
     if choice is None:
-        raise FileFormatError(f"{path} ends in {path.suffix or 'nothing'!r}; flow files that can be {verb} end in .flo or .png.")
+        raise FileFormatError(
+            f"{path} ends in {path.suffix or 'nothing'!r}; flow files that can be {verb} end in .flo or .png."
+        )
     return choice
 
 
 def _to_flo(flow, valid):
     if bool((np.abs(flow[:, valid]) > FLO_LIMIT).any()):
-        raise DomainError(f"a valid flow exceeds {FLO_LIMIT:g} px, which a .flo file reads as unknown; mark it as not valid.")
+        raise DomainError(
+            f"a valid flow exceeds {FLO_LIMIT:g} px, which a .flo file reads as unknown; mark it as not "
+            "valid."
+        )
     pixels = np.where(valid, flow, FLO_UNKNOWN).transpose(1, 2, 0).astype("<f4")
     return FLO_TAG + struct.pack("<ii", flow.shape[2], flow.shape[1]) + pixels.tobytes()
 
 
 def _from_flo(path, content):
     if content[:4] != FLO_TAG or len(content) < 12:
-        raise FileFormatError(f"{path} is not a .flo file: it does not begin with the number 202021.25 and a size.")
+        raise FileFormatError(
+            f"{path} is not a .flo file: it does not begin with the number 202021.25 and a size."
+        )
     width, height = struct.unpack("<ii", content[4:12])
-    if not (width >= 1 and height >= 1 and width * height <= MOST_PIXELS) or len(content) != 12 + 8 * width * height:
-        raise FileFormatError(f"{path} announces {width} x {height} pixels, which its {len(content)} bytes do not hold; it is cut off or damaged.")
+    if (
+        not (width >= 1 and height >= 1 and width * height <= MOST_PIXELS)
+        or len(content) != 12 + 8 * width * height
+    ):
+        raise FileFormatError(
+            f"{path} announces {width} x {height} pixels, which its {len(content)} bytes do not hold; it is "
+            "cut off or damaged."
+        )
     flow = np.frombuffer(content, "<f4", offset=12).reshape(height, width, 2).transpose(2, 0, 1)
     return flow, (np.abs(flow) <= FLO_LIMIT).all(0)  # NaN is unknown too
 
@@ -92,13 +116,23 @@ def _to_png(flow, valid):
     if outside.any():
         row, column = np.argwhere(outside)[0]
         x, y = flow[:, row, column]
-        raise DomainError(f"the flow ({x:.4g}, {y:.4g}) px at column {column}, row {row} does not fit 16 bits (-256 to 255.99 px); mark it as not valid, shorten the interval, or write .flo.")
+        raise DomainError(
+            f"the flow ({x:.4g}, {y:.4g}) px at column {column}, row {row} does not fit 16 bits (-256 to "
+            "255.99 px); mark it as not valid, shorten the interval, or write .flo."
+        )
     pixels = np.concatenate([np.where(valid, value, 0), valid[None]]).transpose(1, 2, 0).astype(">u2")
     rows = pixels.reshape(flow.shape[1], -1).view(np.uint8)
     above = np.vstack([np.zeros_like(rows[:1]), rows[:-1]])
-    filtered = np.hstack([np.full((len(rows), 1), 2, np.uint8), rows - above])  # every row as its difference from the one above (PNG filter 2), modulo 256
+    filtered = np.hstack(
+        [np.full((len(rows), 1), 2, np.uint8), rows - above]
+    )  # every row as its difference from the one above (PNG filter 2), modulo 256
     header = struct.pack(">IIBBBBB", flow.shape[2], flow.shape[1], 16, 2, 0, 0, 0)
-    return PNG_START + _chunk(b"IHDR", header) + _chunk(b"IDAT", zlib.compress(filtered.tobytes(), 3)) + _chunk(b"IEND", b"")
+    return (
+        PNG_START
+        + _chunk(b"IHDR", header)
+        + _chunk(b"IDAT", zlib.compress(filtered.tobytes(), 3))
+        + _chunk(b"IEND", b"")
+    )
 
 
 def _chunk(name, data):
@@ -106,14 +140,21 @@ def _chunk(name, data):
 
 
 def _from_png(path, content):
-    header, packed = None, []
+    header = None
+    packed = []
     for name, data in _chunks(path, content):
         if name == b"IHDR" and len(data) == 13:
             header = struct.unpack(">IIBBBBB", data)
         packed += [data] if name == b"IDAT" else []
     if header is None or header[2:] != (16, 2, 0, 0, 0):
-        found = "no header" if header is None else f"bit depth {header[2]}, colour type {header[3]}, interlacing {header[6]}"
-        raise FileFormatError(f"{path} is not a flow PNG (three channels of 16 bits, not interlaced): {found}.")
+        found = (
+            "no header"
+            if header is None
+            else f"bit depth {header[2]}, colour type {header[3]}, interlacing {header[6]}"
+        )
+        raise FileFormatError(
+            f"{path} is not a flow PNG (three channels of 16 bits, not interlaced): {found}."
+        )
     width, height = header[:2]
     if not 1 <= width * height <= MOST_PIXELS:
         raise FileFormatError(f"{path} announces {width} x {height} pixels; up to {MOST_PIXELS} are read.")
@@ -124,13 +165,24 @@ def _from_png(path, content):
     except zlib.error as error:
         raise FileFormatError(f"{path} is damaged: its pixels do not unpack ({error}).") from error
     if len(raw) != size:
-        raise FileFormatError(f"{path} is damaged: {width} x {height} pixels need {size} bytes, it holds {'more' if len(raw) > size else len(raw)}.")
+        raise FileFormatError(
+            f"{path} is damaged: {width} x {height} pixels need {size} bytes, it holds "
+            f"{'more' if len(raw) > size else len(raw)}."
+        )
     rows = np.frombuffer(raw, np.uint8).reshape(height, 1 + 6 * width)
     if rows[:, 0].max() > 4:
         raise FileFormatError(f"{path} is damaged: row filter {rows[:, 0].max()} does not exist.")
-    pixels = _unfiltered(rows[:, 0], rows[:, 1:].reshape(height, width, 6)).reshape(height, -1).view(">u2").reshape(height, width, 3)
+    pixels = (
+        _unfiltered(rows[:, 0], rows[:, 1:].reshape(height, width, 6))
+        .reshape(height, -1)
+        .view(">u2")
+        .reshape(height, width, 3)
+    )
     if pixels[..., 2].max() > 1:
-        raise FileFormatError(f"{path} is not a flow PNG: its third channel reaches {pixels[..., 2].max()}, but holds 1 for valid pixels and 0 for others.")
+        raise FileFormatError(
+            f"{path} is not a flow PNG: its third channel reaches {pixels[..., 2].max()}, but holds 1 for "
+            "valid pixels and 0 for others."
+        )
     return (pixels[..., :2].transpose(2, 0, 1).astype(np.float64) - OFFSET) / SCALE, pixels[..., 2] == 1
 
 
@@ -141,7 +193,9 @@ def _chunks(path, content):
     at = 8
     while at < len(content):
         length = int.from_bytes(content[at : at + 4], "big")
-        name, data, check = content[at + 4 : at + 8], content[at + 8 : at + 8 + length], content[at + 8 + length : at + 12 + length]
+        name = content[at + 4 : at + 8]
+        data = content[at + 8 : at + 8 + length]
+        check = content[at + 8 + length : at + 12 + length]
         if len(check) != 4 or int.from_bytes(check, "big") != zlib.crc32(name + data):
             raise FileFormatError(f"{path} is cut off or damaged at byte {at}.")
         yield name, data
@@ -152,7 +206,8 @@ def _chunks(path, content):
 
 
 def _unfiltered(kinds, filtered):
-    """Pixels [H, W, 6] uint8 from filtered ones (PNG filters 0 to 4, one per row), along diagonals, on which no pixel depends on another."""
+    """Pixels [H, W, 6] uint8 from filtered ones (PNG filters 0 to 4, one per row), along diagonals, on which
+    no pixel depends on another."""
     if (kinds <= 2).all() and not (kinds == 1).any():
         out = filtered.copy()
         for row in range(1, len(out)):
@@ -165,9 +220,18 @@ def _unfiltered(kinds, filtered):
         row = np.arange(max(0, diagonal - width + 1), min(height, diagonal + 1))
         column = diagonal - row
         kind = kinds[row, None]
-        left, up, corner = out[row + 1, column], out[row, column + 1], out[row, column]
+        left = out[row + 1, column]
+        up = out[row, column + 1]
+        corner = out[row, column]
         guess = left + up - corner
-        to_left, to_up, to_corner = abs(guess - left), abs(guess - up), abs(guess - corner)
-        paeth = np.where((to_left <= to_up) & (to_left <= to_corner), left, np.where(to_up <= to_corner, up, corner))
-        out[row + 1, column + 1] = (filtered[row, column] + np.select([kind == 1, kind == 2, kind == 3, kind == 4], [left, up, (left + up) // 2, paeth], 0)) & 255
+        to_left = abs(guess - left)
+        to_up = abs(guess - up)
+        to_corner = abs(guess - corner)
+        paeth = np.where(
+            (to_left <= to_up) & (to_left <= to_corner), left, np.where(to_up <= to_corner, up, corner)
+        )
+        out[row + 1, column + 1] = (
+            filtered[row, column]
+            + np.select([kind == 1, kind == 2, kind == 3, kind == 4], [left, up, (left + up) // 2, paeth], 0)
+        ) & 255
     return out[1:, 1:].astype(np.uint8)

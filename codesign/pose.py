@@ -1,4 +1,5 @@
-"""Rigid motions: SE(3) exponential, composition, inverse. T_world_cam maps camera points to the world and reads right to left."""
+"""Rigid motions: SE(3) exponential, composition, inverse. T_world_cam maps camera points to the world and
+reads right to left."""
 
 import torch
 from kornia.geometry.liegroup import Se3
@@ -9,18 +10,24 @@ from codesign.errors import DomainError, ShapeError, check_finite
 def se3_exp(twist):
     """Rigid transform of a twist.
 
-    Args: twist [..., 6]: translation part (m) then rotation vector (rad), in the frame on the right of the product.
+    Args: twist [..., 6]: translation part (m) then rotation vector (rad), in the frame on the right of the
+      product.
     Returns: [..., 4, 4]. Gradient: exact, also at zero. Source: kornia.geometry.liegroup.Se3.
     """
     if twist.shape[-1] != 6:
-        raise ShapeError(f"a twist has 6 components (3 of translation, 3 of rotation), got {tuple(twist.shape)}.")
+        raise ShapeError(
+            f"a twist has 6 components (3 of translation, 3 of rotation), got {tuple(twist.shape)}."
+        )
     transform = Se3.exp(twist.reshape(-1, 6)).matrix().reshape(*twist.shape[:-1], 4, 4)
-    return transform if twist.requires_grad else transform.detach()  # kornia wraps constants in parameters that would ask for gradients
+    return (
+        transform if twist.requires_grad else transform.detach()
+    )  # kornia wraps constants in parameters that would ask for gradients
 
 
 def inverse(transform):
     """Inverse of rigid transforms [..., 4, 4]."""
-    rotation, translation = transform[..., :3, :3], transform[..., :3, 3:]
+    rotation = transform[..., :3, :3]
+    translation = transform[..., :3, 3:]
     top = torch.cat([rotation.mT, -rotation.mT @ translation], -1)
     return torch.cat([top, transform[..., 3:, :]], -2)
 
@@ -31,18 +38,27 @@ def apply(transform, points):
 
 
 def look_at(origin_m, target_m, down=(0.0, 0.0, -1.0)):
-    """T_world_cam of a camera (x right, y down, z forward) at ``origin_m`` facing ``target_m``; ``down`` is the image's down direction in the world.
+    """T_world_cam of a camera (x right, y down, z forward) at ``origin_m`` facing ``target_m``; ``down`` is
+    the image's down direction in the world.
 
     Args: sequences of three numbers. Returns: [4, 4] float64, without gradient.
     Raises: DomainError when the two points are one, the view is along ``down``, or a number is not finite.
     """
-    origin, target, down = (check_finite(torch.as_tensor(v, dtype=torch.float64), "look_at", "give finite points") for v in (origin_m, target_m, down))
+    origin, target, down = (
+        check_finite(torch.as_tensor(v, dtype=torch.float64), "look_at", "give finite points")
+        for v in (origin_m, target_m, down)
+    )
     if float((target - origin).norm()) == 0:
-        raise DomainError(f"look_at: origin and target are the same point {origin.tolist()}; move one of them.")
+        raise DomainError(
+            f"look_at: origin and target are the same point {origin.tolist()}; move one of them."
+        )
     forward = torch.nn.functional.normalize(target - origin, dim=0)
     right = torch.linalg.cross(down, forward)
     if float(right.norm()) < 1e-9:
-        raise DomainError(f"look_at: the view direction {forward.tolist()} is parallel to 'down' {down.tolist()}; give another 'down'.")
+        raise DomainError(
+            f"look_at: the view direction {forward.tolist()} is parallel to 'down' {down.tolist()}; give "
+            "another 'down'."
+        )
     right = right / right.norm()
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward], 1)
@@ -57,12 +73,25 @@ def check_poses(transform):
     check_finite(transform, "poses")
     fixed = transform.detach().double()
     rotation = fixed[:, :3, :3]
-    error = float((rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().max())
+    error = float(
+        (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().max()
+    )
     if error > 1e-4:
-        raise DomainError(f"poses are not rigid: R R^T differs from the identity by {error:.3g}; normalise the rotations.")
+        raise DomainError(
+            f"poses are not rigid: R R^T differs from the identity by {error:.3g}; normalise the rotations."
+        )
     if bool((torch.linalg.det(rotation) < 0).any()):
-        raise DomainError("poses are not rigid: a rotation has determinant -1, so it mirrors; flip the sign of one axis.")
-    last = (fixed[:, 3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=fixed.device)).abs().max()
+        raise DomainError(
+            "poses are not rigid: a rotation has determinant -1, so it mirrors; flip the sign of one axis."
+        )
+    last = (
+        (fixed[:, 3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=fixed.device))
+        .abs()
+        .max()
+    )
     if float(last) > 1e-6:
-        raise DomainError(f"poses are not rigid: the last row differs from (0, 0, 0, 1) by {float(last):.3g}; give matrices that act on column vectors.")
+        raise DomainError(
+            f"poses are not rigid: the last row differs from (0, 0, 0, 1) by {float(last):.3g}; give "
+            "matrices that act on column vectors."
+        )
     return transform

@@ -1,6 +1,7 @@
 """What worlds are made of: painted shapes and lamps, and the light levels at which they can be shown.
 
-A world is described once. At the level "emissive" every surface shows its picture as radiance; at "baked" and "path" the same pictures are albedo
+A world is described once. At the level "emissive" every surface shows its picture as radiance; at "baked" and
+"path" the same pictures are albedo
 and the world's lamps light them (see codesign.render.light). Metres, z up, radiance on the 0..255 scale.
 """
 
@@ -22,9 +23,11 @@ WHITE = 0.95  # albedo of a picture's 255
 
 @dataclass(frozen=True)
 class Paint:
-    """What is on a surface. picture: [H, W] radiance 0..255, first row at the top; repeat: times along u and v; wrap: how it goes on.
+    """What is on a surface. picture: [H, W] radiance 0..255, first row at the top; repeat: times along u and
+    v; wrap: how it goes on.
 
-    albedo: of a picture's 255 where the world is lit. glow: uniform radiance that the surface emits there, on top of what it reflects.
+    albedo: of a picture's 255 where the world is lit. glow: uniform radiance that the surface emits there, on
+      top of what it reflects.
     """
 
     picture: Any
@@ -36,7 +39,8 @@ class Paint:
 
 @dataclass(frozen=True)
 class World:
-    """Shapes (name -> (geometry, Paint)) that every level shows; background: sky that every level shows; lamps: Mitsuba lights of the lit levels; texel_m: size of baked light-map texels that suits its things."""
+    """Shapes (name -> (geometry, Paint)) that every level shows; background: sky that every level shows;
+    lamps: Mitsuba lights of the lit levels; texel_m: size of baked light-map texels that suits its things."""
 
     shapes: dict[str, tuple[Any, Paint]]
     background: dict[str, Any] = field(default_factory=dict)
@@ -48,7 +52,8 @@ Light = Callable[[World, str], Any]
 
 
 def emissive(world, device="cpu"):
-    """The world with its pictures as radiance: one ray cast and one lookup per ray, no shading but what the pictures hold."""
+    """The world with its pictures as radiance: one ray cast and one lookup per ray, no shading but what the
+    pictures hold."""
     mi = backend.mitsuba(device)
     shapes = {}
     for name, (geometry, paint) in world.shapes.items():
@@ -79,15 +84,26 @@ def lit(world, device="cpu"):
     shapes = {}
     for name, (geometry, paint) in world.shapes.items():
         if isinstance(geometry, bodies.Body):
-            grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": paint.albedo * _level(name, paint) / 255}}
+            grey = {
+                "type": "diffuse",
+                "reflectance": {"type": "rgb", "value": paint.albedo * _level(name, paint) / 255},
+            }
             shapes[name] = emissive_mesh(mi, geometry.vertices_m, geometry.faces, None, bsdf=grey)
             continue
         brightest = paint.albedo * float(np.max(paint.picture)) / 255
         if not 0 <= brightest <= 1:
-            raise DomainError(f"shape '{name}': its brightest texel would have albedo {brightest:.3g}; albedos lie in 0..1.")
-        shapes[name] = {**geometry, "bsdf": {"type": "diffuse", "reflectance": _bitmap(mi, paint, paint.albedo / 255)}}
+            raise DomainError(
+                f"shape '{name}': its brightest texel would have albedo {brightest:.3g}; albedos lie in 0..1."
+            )
+        shapes[name] = {
+            **geometry,
+            "bsdf": {"type": "diffuse", "reflectance": _bitmap(mi, paint, paint.albedo / 255)},
+        }
         if paint.glow:
-            shapes[name]["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": float(paint.glow)}}
+            shapes[name]["emitter"] = {
+                "type": "area",
+                "radiance": {"type": "rgb", "value": float(paint.glow)},
+            }
     return {**shapes, **world.background, **world.lamps}
 
 
@@ -98,9 +114,17 @@ def _level(name, paint):
 
 
 def _bitmap(mi, paint, scale):
-    upright = (scale * textures.check_texture(paint.picture, "of the scene"))[::-1, :, None]  # Mitsuba puts the first row at v = 0, the bottom
+    upright = (scale * textures.check_texture(paint.picture, "of the scene"))[
+        ::-1, :, None
+    ]  # Mitsuba puts the first row at v = 0, the bottom
     to_uv = mi.ScalarTransform3f().scale([float(n) for n in paint.repeat])
-    return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(upright, dtype=np.float32)), "raw": True, "wrap_mode": paint.wrap, "to_uv": to_uv}
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(np.ascontiguousarray(upright, dtype=np.float32)),
+        "raw": True,
+        "wrap_mode": paint.wrap,
+        "to_uv": to_uv,
+    }
 
 
 # ---- geometry
@@ -108,34 +132,51 @@ def _bitmap(mi, paint, scale):
 
 def rectangle(mi, centre, normal_to, width_m, height_m, up=(0, 0, 1)):
     """A rectangle at ``centre`` facing ``normal_to``; its picture stands upright along ``up``."""
-    frame = mi.ScalarTransform4f().look_at(origin=list(centre), target=list(normal_to), up=list(up)) @ mi.ScalarTransform4f().scale([width_m / 2, height_m / 2, 1])
+    frame = mi.ScalarTransform4f().look_at(
+        origin=list(centre), target=list(normal_to), up=list(up)
+    ) @ mi.ScalarTransform4f().scale([width_m / 2, height_m / 2, 1])
     return {"type": "rectangle", "to_world": frame}
 
 
 def block(mi, x, y, bottom_m, half_m, turn_deg=0.0):
     """A cuboid of half sizes ``half_m`` (three numbers) that stands GAP_M over ``bottom_m``."""
     T = mi.ScalarTransform4f
-    return {"type": "cube", "to_world": T().translate([x, y, bottom_m + GAP_M + half_m[2]]).rotate([0, 0, 1], turn_deg).scale(list(half_m))}
+    return {
+        "type": "cube",
+        "to_world": T()
+        .translate([x, y, bottom_m + GAP_M + half_m[2]])
+        .rotate([0, 0, 1], turn_deg)
+        .scale(list(half_m)),
+    }
 
 
 def ball(mi, x, y, bottom_m, radius_m):
     """A sphere that rests GAP_M over ``bottom_m``."""
-    return {"type": "sphere", "to_world": mi.ScalarTransform4f().translate([x, y, bottom_m + GAP_M + radius_m]).scale(radius_m)}
+    return {
+        "type": "sphere",
+        "to_world": mi.ScalarTransform4f().translate([x, y, bottom_m + GAP_M + radius_m]).scale(radius_m),
+    }
 
 
 def pole(mi, start, end, radius_m):
     """A cylinder and the disk that closes its far end, as two geometries. start, end: its axis."""
-    start, end = np.array(start, dtype=float), np.array(end, dtype=float)
+    start = np.array(start, dtype=float)
+    end = np.array(end, dtype=float)
     length = float(np.linalg.norm(end - start))
     helper = [0, 0, 1] if abs(end[2] - start[2]) < 0.9 * length else [1, 0, 0]
     T = mi.ScalarTransform4f
-    tube = T().look_at(origin=start.tolist(), target=end.tolist(), up=helper) @ T().scale([radius_m, radius_m, length])
-    cap = T().look_at(origin=end.tolist(), target=(2 * end - start).tolist(), up=helper) @ T().scale([radius_m, radius_m, 1])
+    tube = T().look_at(origin=start.tolist(), target=end.tolist(), up=helper) @ T().scale(
+        [radius_m, radius_m, length]
+    )
+    cap = T().look_at(origin=end.tolist(), target=(2 * end - start).tolist(), up=helper) @ T().scale(
+        [radius_m, radius_m, 1]
+    )
     return {"type": "cylinder", "to_world": tube}, {"type": "disk", "to_world": cap}
 
 
 def sky(mi, picture):
-    """Environment map of an equirectangular picture [H, W], first row at the zenith; columns run from +y over +x, as on a compass."""
+    """Environment map of an equirectangular picture [H, W], first row at the zenith; columns run from +y over
+    +x, as on a compass."""
     values = textures.check_texture(picture, "of the sky")
     bitmap = mi.Bitmap(np.ascontiguousarray(np.repeat(values[..., None], 3, 2)))
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90)}

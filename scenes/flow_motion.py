@@ -6,26 +6,38 @@ import numpy as np
 def similarity(draw, t, width_px, height_px, flow_px):
     """Rotation, zoom and translation about the image centre.
 
-    Args: draw: numpy Generator. t: [T] times, window = 0..1. flow_px: (least, most) translation, px per window, uniform over the ring.
+    Args: draw: numpy Generator. t: [T] times, window = 0..1. flow_px: (least, most) translation, px per
+      window, uniform over the ring.
     Returns: [1, T, 3, 3]: from pixels at t = 0 (centred, px) to pixels at t.
     """
     least, most = flow_px
     length = np.sqrt(draw.uniform(least**2, most**2))
     angle = draw.uniform(0, 2 * np.pi)
     reach = np.hypot(width_px, height_px) / 2
-    zoom, turn = draw.uniform(-1, 1, 2) * 0.3 * most / reach  # at the corners up to 0.3 of the largest translation each
+    zoom, turn = (
+        draw.uniform(-1, 1, 2) * 0.3 * most / reach
+    )  # at the corners up to 0.3 of the largest translation each
     m = np.exp(t * complex(zoom, turn))
     out = np.zeros((1, len(t), 3, 3))
-    out[0, :, 0, 0], out[0, :, 0, 1], out[0, :, 1, 0], out[0, :, 1, 1], out[0, :, 2, 2] = m.real, -m.imag, m.imag, m.real, 1
+    out[0, :, 0, 0], out[0, :, 0, 1], out[0, :, 1, 0], out[0, :, 1, 1], out[0, :, 2, 2] = (
+        m.real,
+        -m.imag,
+        m.imag,
+        m.real,
+        1,
+    )
     out[0, :, 0, 2], out[0, :, 1, 2] = t * length * np.cos(angle), t * length * np.sin(angle)
     return out
 
 
 def camera(draw, t, width_px, height_px, flow_px, layers):
-    """A pinhole camera with a random focal length that turns and moves before tilted planes at different depths.
+    """A pinhole camera with a random focal length that turns and moves before tilted planes at different
+    depths.
 
-    H(t) = K (R(t) + T(t) n^T) K^-1, with n the plane's normal over its depth (Hartley and Zisserman, 2004, eq. 13.2). One nearer layer in four moves by itself.
-    flow_px: (least, most): the root mean square flow at the image corners and centre over all layers is drawn uniformly between these.
+    H(t) = K (R(t) + T(t) n^T) K^-1, with n the plane's normal over its depth (Hartley and Zisserman, 2004,
+    eq. 13.2). One nearer layer in four moves by itself.
+    flow_px: (least, most): the root mean square flow at the image corners and centre over all layers is drawn
+      uniformly between these.
     Returns: [layers, T, 3, 3], the farthest layer first.
     """
     focal = draw.uniform(0.6, 2.5) * max(width_px, height_px)
@@ -36,16 +48,26 @@ def camera(draw, t, width_px, height_px, flow_px, layers):
     normal = inverse_depth[:, None] * np.concatenate([slant, np.ones((layers, 1))], 1)
     turn, move = _twist(draw, focal, max(width_px, height_px))
     still = np.zeros(3), np.zeros(3)
-    extra = [_twist(draw, focal, max(width_px, height_px)) if layer and draw.random() < 1 / 4 else still for layer in range(layers)]
-    x, y = np.array([-1, 1, -1, 1, 0]) * width_px / 2, np.array([-1, -1, 1, 1, 0]) * height_px / 2
+    extra = [
+        _twist(draw, focal, max(width_px, height_px)) if layer and draw.random() < 1 / 4 else still
+        for layer in range(layers)
+    ]
+    x = np.array([-1, 1, -1, 1, 0]) * width_px / 2
+    y = np.array([-1, -1, 1, 1, 0]) * height_px / 2
     probe = np.stack([x, y, np.ones(5)])
-    wanted, size = draw.uniform(*flow_px), 1.0
+    wanted = draw.uniform(*flow_px)
+    size = 1.0
 
     def motion(times):
         out = np.empty((layers, len(times), 3, 3))
         for layer in range(layers):
-            w, v = turn + 0.5 * extra[layer][0], move + extra[layer][1]
-            out[layer] = k @ (_rotations(size * w, times) + size * times[:, None, None] * np.outer(v, normal[layer])) @ k_inverse
+            w = turn + 0.5 * extra[layer][0]
+            v = move + extra[layer][1]
+            out[layer] = (
+                k
+                @ (_rotations(size * w, times) + size * times[:, None, None] * np.outer(v, normal[layer]))
+                @ k_inverse
+            )
         return out
 
     for _ in range(3):  # flow is nearly proportional to the twist: three corrections settle its size
@@ -57,7 +79,8 @@ def camera(draw, t, width_px, height_px, flow_px, layers):
 
 
 def _twist(draw, focal, width_px):
-    """Turn (rad) and move (in depths of the nearest plane), one of them sometimes absent; turning about the view axis acts with the image's radius."""
+    """Turn (rad) and move (in depths of the nearest plane), one of them sometimes absent; turning about the
+    view axis acts with the image's radius."""
     turn, move = draw.normal(0, 1, (2, 3)) * np.array([1, 1, 2 * focal / width_px])
     kind = draw.random()
     return turn * draw.uniform(0.1, 1) * (kind > 0.3), move * draw.uniform(0.1, 1) * (kind < 0.8)
@@ -67,4 +90,8 @@ def _rotations(w, times):
     """Rotations exp(t w) [T, 3, 3] (Rodrigues)."""
     angle = np.linalg.norm(w)
     cross = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]]) / max(angle, 1e-12)
-    return np.eye(3) + np.sin(times * angle)[:, None, None] * cross + (1 - np.cos(times * angle))[:, None, None] * cross @ cross
+    return (
+        np.eye(3)
+        + np.sin(times * angle)[:, None, None] * cross
+        + (1 - np.cos(times * angle))[:, None, None] * cross @ cross
+    )

@@ -17,14 +17,20 @@ POOLS = ("procedural", "fine", "mixed")
 def pool(name):
     """Textures of a kind, as a tuple of [H, W] float32 radiances (0..255 scale).
 
-    "procedural": speckle of many spectra and piles of discs and bars with smooth areas between; what networks are trained on.
-    "fine": gravel, grass, brick and three speckles with seeds of their own: detail everywhere. "mixed": camera, chelsea, coffee, astronaut, rocket:
+    "procedural": speckle of many spectra and piles of discs and bars with smooth areas between; what networks
+    are trained on.
+    "fine": gravel, grass, brick and three speckles with seeds of their own: detail everywhere. "mixed":
+    camera, chelsea, coffee, astronaut, rocket:
     photographs with large smooth areas. No photograph is in "procedural".
     """
     if name == "fine":
-        return tuple(textures.photo(source) for source in ("gravel", "grass", "brick")) + tuple(textures.speckle(90_000 + k, finest_px=f, coarsest_px=24.0) for k, f in enumerate((4.0, 6.0, 8.0)))
+        return tuple(textures.photo(source) for source in ("gravel", "grass", "brick")) + tuple(
+            textures.speckle(90_000 + k, finest_px=f, coarsest_px=24.0) for k, f in enumerate((4.0, 6.0, 8.0))
+        )
     if name == "mixed":
-        return tuple(textures.photo(source) for source in ("camera", "chelsea", "coffee", "astronaut", "rocket"))
+        return tuple(
+            textures.photo(source) for source in ("camera", "chelsea", "coffee", "astronaut", "rocket")
+        )
     if name == "procedural":
         return tuple(_procedural(seed) for seed in range(PROCEDURAL_COUNT))
     raise DomainError(f"texture pool {name!r} is unknown; there are {', '.join(POOLS)}.")
@@ -35,20 +41,27 @@ def _procedural(seed):
     draw = np.random.default_rng((7, seed))
     if seed % 3 == 0:
         finest = draw.uniform(3.0, 12.0)
-        return textures.speckle(seed, finest_px=finest, coarsest_px=finest * draw.uniform(3, 16), contrast=draw.uniform(0.2, 0.7))
+        return textures.speckle(
+            seed, finest_px=finest, coarsest_px=finest * draw.uniform(3, 16), contrast=draw.uniform(0.2, 0.7)
+        )
     return pile(draw)
 
 
 def pile(draw, size_px=SIZE, shapes=1500):
-    """Discs and bars of many sizes, each hiding what lies below, over a soft ramp; some carry grain, most are smooth.
+    """Discs and bars of many sizes, each hiding what lies below, over a soft ramp; some carry grain, most are
+    smooth.
 
-    Occluding shapes with sizes of density r^-3 have the statistics of natural images (Lee, Mumford and Huang, IJCV 2001).
+    Occluding shapes with sizes of density r^-3 have the statistics of natural images (Lee, Mumford and Huang,
+    IJCV 2001).
     """
     y, x = np.mgrid[:size_px, :size_px].astype(np.float32)
     log_level = np.float32(draw.uniform(3.0, 4.5)) + _ramp(x, y, draw)
-    grain = gaussian_filter(draw.standard_normal((size_px, size_px)), draw.uniform(0.7, 2.5), mode="wrap").astype(np.float32)
+    grain = gaussian_filter(
+        draw.standard_normal((size_px, size_px)), draw.uniform(0.7, 2.5), mode="wrap"
+    ).astype(np.float32)
     grain /= grain.std()
-    smallest, largest = draw.uniform(2, 6), draw.uniform(60, 160)
+    smallest = draw.uniform(2, 6)
+    largest = draw.uniform(60, 160)
     share = draw.uniform(0, 0.6)  # of shapes with grain
     for _ in range(int(shapes * draw.uniform(0.1, 1.0))):
         u = draw.random()
@@ -59,14 +72,19 @@ def pile(draw, size_px=SIZE, shapes=1500):
         if x1 <= x0 or y1 <= y0:
             continue
         here = (slice(y0, y1), slice(x0, x1))
-        dx, dy = x[here] - cx, y[here] - cy
+        dx = x[here] - cx
+        dy = y[here] - cy
         if draw.random() < 0.5:
             inside = dx * dx + dy * dy < radius * radius
         else:
-            angle, flat = draw.uniform(0, np.pi), draw.uniform(0.1, 1.0)
-            along, across = dx * np.cos(angle) + dy * np.sin(angle), dy * np.cos(angle) - dx * np.sin(angle)
+            angle = draw.uniform(0, np.pi)
+            flat = draw.uniform(0.1, 1.0)
+            along = dx * np.cos(angle) + dy * np.sin(angle)
+            across = dy * np.cos(angle) - dx * np.sin(angle)
             inside = (np.abs(along) < radius) & (np.abs(across) < flat * radius)
-        value = np.float32(draw.uniform(1.5, 5.4)) + 0.5 * _ramp(dx * (size_px / (4 * radius)) + size_px / 2, dy * (size_px / (4 * radius)) + size_px / 2, draw)
+        value = np.float32(draw.uniform(1.5, 5.4)) + 0.5 * _ramp(
+            dx * (size_px / (4 * radius)) + size_px / 2, dy * (size_px / (4 * radius)) + size_px / 2, draw
+        )
         if draw.random() < share:
             value = value + np.float32(draw.uniform(0.05, 0.4)) * grain[here]
         log_level[here] = np.where(inside, value, log_level[here])

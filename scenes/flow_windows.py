@@ -1,6 +1,8 @@
-"""Windows of events with exact flow, made on the fly: flat layers of texture before a moving camera, hard events, sensor noise.
+"""Windows of events with exact flow, made on the fly: flat layers of texture before a moving camera, hard
+events, sensor noise.
 
-Every sample is drawn from its own random numbers (seed, index), so it is the same in any batch, on any process.
+Every sample is drawn from its own random numbers (seed, index), so it is the same in any batch, on any
+process.
 """
 
 from dataclasses import dataclass
@@ -22,10 +24,14 @@ BLUR_LEAST_PX = 0.4  # the pixel's own area
 class Draws:
     """Ranges (least, most) from which a sample is drawn.
 
-    textures: pool of scenes.flow_textures. motion: "similarity" (one plane; rotation, zoom, translation) or "camera" (tilted planes, perspective).
-    layers: planes before the background. flow_px: see scenes.flow_motion. theta: contrast threshold, drawn evenly in its logarithm. mismatch: relative
-    spread of thresholds over pixels. noise: background events per pixel, polarity and eighth of the window, evenly in the logarithm. contrast: factor on
-    log radiance. scale: texels per pixel. blur_px: Gaussian defocus, standard deviation. distortion: radial, relative at the corner.
+    textures: pool of scenes.flow_textures. motion: "similarity" (one plane; rotation, zoom, translation) or
+      "camera" (tilted planes, perspective).
+    layers: planes before the background. flow_px: see scenes.flow_motion. theta: contrast threshold, drawn
+      evenly in its logarithm. mismatch: relative
+    spread of thresholds over pixels. noise: background events per pixel, polarity and eighth of the window,
+      evenly in the logarithm. contrast: factor on
+    log radiance. scale: texels per pixel. blur_px: Gaussian defocus, standard deviation. distortion: radial,
+      relative at the corner.
     """
 
     textures: str = "procedural"
@@ -43,18 +49,35 @@ class Draws:
 
 def planes(textures="fine", theta=0.2, noise=(0.0005, 0.01), blur_px=0.0):
     """The plain test case: one plane, rotation, zoom and translation up to 6 px, nothing else varied."""
-    return Draws(textures, "similarity", (0, 0), (0.0, 6.0), (theta, theta), 0.03, noise, (1.0, 1.0), (0.8, 1.2), (blur_px, blur_px), (0.0, 0.0))
+    return Draws(
+        textures,
+        "similarity",
+        (0, 0),
+        (0.0, 6.0),
+        (theta, theta),
+        0.03,
+        noise,
+        (1.0, 1.0),
+        (0.8, 1.2),
+        (blur_px, blur_px),
+        (0.0, 0.0),
+    )
 
 
 class RenderedWindows:
     """Source of FlowWindows: ``batch(indices)``.
 
-    Args: draws: Draws. seed: other seeds give other samples. height_px, width_px: size. bins: time bins. intervals: frames per window.
+    Args: draws: Draws. seed: other seeds give other samples. height_px, width_px: size. bins: time bins.
+      intervals: frames per window.
     """
 
     def __init__(self, draws=None, *, seed=0, height_px=64, width_px=64, bins=8, intervals=32):
-        self.draws, self.seed = draws or Draws(), seed
-        self.height_px, self.width_px, self.bins, self.intervals = height_px, width_px, bins, intervals
+        self.draws = draws or Draws()
+        self.seed = seed
+        self.height_px = height_px
+        self.width_px = width_px
+        self.bins = bins
+        self.intervals = intervals
         if self.draws.motion not in ("similarity", "camera"):
             raise DomainError(f"motion is {self.draws.motion!r}; 'similarity' and 'camera' are possible.")
         if self.draws.motion == "similarity" and self.draws.layers[1] > 0:
@@ -64,27 +87,41 @@ class RenderedWindows:
         self.t = np.concatenate([np.arange(-LEAD, 0), np.arange(intervals + 1)]) / intervals
 
     def batch(self, indices):
-        """Samples of these numbers: FlowWindows of interval 1 s, truth on the pixels of the start, exact and valid everywhere (also where the point gets hidden)."""
+        """Samples of these numbers: FlowWindows of interval 1 s, truth on the pixels of the start, exact and
+        valid everywhere (also where the point gets hidden)."""
         drawn = [self._draw(index) for index in indices]
         still = self._undistorted([sample["distortion"] for sample in drawn])  # [B, H, W, 2]
-        frames, truth = [], []
+        frames = []
+        truth = []
         for sample, points in zip(drawn, still, strict=True):
             frames.append(_compose(sample, points))
             truth.append(self._truth(sample, points))
         frames = torch.stack(frames, 1)  # [T, B, H, W]
-        log_level = frames.clamp_min(1e-3).log_() * torch.tensor([sample["contrast"] for sample in drawn])[:, None, None]
+        log_level = (
+            frames.clamp_min(1e-3).log_()
+            * torch.tensor([sample["contrast"] for sample in drawn])[:, None, None]
+        )
         theta = torch.stack([sample["theta"] for sample in drawn], 1)  # [2, B, H, W]
         counts, _ = memory(log_level, theta[0], theta[1], log_input=True)
         counts = counts[LEAD:]
         for number, sample in enumerate(drawn):
             time, polarity, row, column = sample["noise"]
-            counts.index_put_((time, polarity, torch.full_like(time, number), row, column), torch.ones(len(time)), accumulate=True)
+            counts.index_put_(
+                (time, polarity, torch.full_like(time, number), row, column),
+                torch.ones(len(time)),
+                accumulate=True,
+            )
         t_s = torch.linspace(0, 1, self.intervals + 1, dtype=torch.float64)
         flow = torch.stack(truth)
-        return FlowWindows(from_counts(counts, t_s, self.bins), FlowField(flow, torch.ones_like(flow[:, 0], dtype=torch.bool), 1.0), frames[[LEAD, -1]].transpose(0, 1))
+        return FlowWindows(
+            from_counts(counts, t_s, self.bins),
+            FlowField(flow, torch.ones_like(flow[:, 0], dtype=torch.bool), 1.0),
+            frames[[LEAD, -1]].transpose(0, 1),
+        )
 
     def _draw(self, index):
-        d, draw = self.draws, np.random.default_rng((self.seed, int(index)))
+        d = self.draws
+        draw = np.random.default_rng((self.seed, int(index)))
         shape = (self.height_px, self.width_px)
         extra = int(draw.integers(d.layers[0], d.layers[1] + 1))
         if d.motion == "similarity":
@@ -109,7 +146,8 @@ class RenderedWindows:
         }
 
     def _layer(self, draw, layer, blur_px):
-        """A piece of a texture with its cover [2, C, C], blurred, and where pixels at t = 0 lie on it, in grid_sample's units [3, 3]."""
+        """A piece of a texture with its cover [2, C, C], blurred, and where pixels at t = 0 lie on it, in
+        grid_sample's units [3, 3]."""
         texture = self.textures[draw.integers(len(self.textures))]
         size = min(self.crop, *texture.shape)
         top, left = (int(draw.integers(0, extent - size + 1)) for extent in texture.shape)
@@ -117,28 +155,44 @@ class RenderedWindows:
         piece[1] = 1.0
         values = torch.from_numpy(np.ascontiguousarray(texture[top : top + size, left : left + size]))
         piece[0] = _mirrored(values, self.crop)
-        scale, angle, flip = draw.uniform(*self.draws.scale), draw.uniform(0, 2 * np.pi), draw.choice([-1.0, 1.0])
+        scale = draw.uniform(*self.draws.scale)
+        angle = draw.uniform(0, 2 * np.pi)
+        flip = draw.choice([-1.0, 1.0])
         if layer:
             piece[1] = _cover(draw, self.crop, scale, min(self.height_px, self.width_px))
-        piece = _gaussian(piece * torch.stack([piece[1], torch.ones_like(piece[1])]), blur_px * scale)  # radiance weighted with cover
-        turn = scale * np.array([[np.cos(angle), -np.sin(angle) * flip], [np.sin(angle), np.cos(angle) * flip]])
+        piece = _gaussian(
+            piece * torch.stack([piece[1], torch.ones_like(piece[1])]), blur_px * scale
+        )  # radiance weighted with cover
+        turn = scale * np.array(
+            [[np.cos(angle), -np.sin(angle) * flip], [np.sin(angle), np.cos(angle) * flip]]
+        )
         place = np.eye(3)
         place[:2, :2] = turn * 2 / self.crop
         return piece, place
 
     def _pixels(self):
-        y, x = torch.meshgrid(torch.arange(self.height_px) - (self.height_px - 1) / 2, torch.arange(self.width_px) - (self.width_px - 1) / 2, indexing="ij")
+        y, x = torch.meshgrid(
+            torch.arange(self.height_px) - (self.height_px - 1) / 2,
+            torch.arange(self.width_px) - (self.width_px - 1) / 2,
+            indexing="ij",
+        )
         return torch.stack([x, y], -1)
 
     def _undistorted(self, distortions):
-        """Where an ideal pinhole would see what each pixel sees, centred px [B, H, W, 2]: x (1 + k r^2), r = 1 at the corner."""
+        """Where an ideal pinhole would see what each pixel sees, centred px [B, H, W, 2]: x (1 + k r^2), r =
+        1 at the corner."""
         pixels = self._pixels()
         radius2 = pixels.square().sum(-1) / pixels.square().sum(-1).max()
-        return pixels * (1 + torch.tensor(distortions, dtype=torch.float32)[:, None, None, None] * radius2[..., None])
+        return pixels * (
+            1 + torch.tensor(distortions, dtype=torch.float32)[:, None, None, None] * radius2[..., None]
+        )
 
     def _distorted(self, ideal, distortions):
         """The inverse, by fixed point (contraction factor below 0.15 within twice the image)."""
-        k = torch.tensor(distortions, dtype=torch.float32)[:, None, None, None] / self._pixels().square().sum(-1).max()
+        k = (
+            torch.tensor(distortions, dtype=torch.float32)[:, None, None, None]
+            / self._pixels().square().sum(-1).max()
+        )
         found = ideal
         for _ in range(12):
             found = ideal / (1 + k * found.square().sum(-1, keepdim=True)).clamp_min(0.5)
@@ -146,7 +200,8 @@ class RenderedWindows:
 
     def _truth(self, sample, points):
         """Flow [2, H, W] of the topmost layer at the start."""
-        pixels, flow = self._pixels(), None
+        pixels = self._pixels()
+        flow = None
         for motion, crop, place in zip(sample["motion"], sample["crop"], sample["place"], strict=True):
             end = _apply(motion[-1], points).movedim(0, -1)
             moved = (self._distorted(end[None], [sample["distortion"]])[0] - pixels).movedim(-1, 0)
@@ -165,7 +220,10 @@ def _log_uniform(draw, least, most):
 def _mirrored(values, size):
     """[H, W] continued by reflection to [size, size]."""
     rows, columns = (torch.arange(size) % (2 * extent - 2) for extent in values.shape)
-    rows, columns = (torch.where(at < extent, at, 2 * extent - 2 - at) for at, extent in zip((rows, columns), values.shape, strict=True))
+    rows, columns = (
+        torch.where(at < extent, at, 2 * extent - 2 - at)
+        for at, extent in zip((rows, columns), values.shape, strict=True)
+    )
     return values[rows][:, columns]
 
 
@@ -175,25 +233,35 @@ def _cover(draw, size, scale, image_px):
     cover = np.zeros((size, size), bool)
     for _ in range(int(draw.integers(1, 4))):
         cx, cy = draw.uniform(-0.5, 0.5, 2) * image_px * scale
-        radius, angle = draw.uniform(0.08, 0.35) * image_px * scale, draw.uniform(0, np.pi)
-        dx, dy = x - cx, y - cy
-        along, across = dx * np.cos(angle) + dy * np.sin(angle), dy * np.cos(angle) - dx * np.sin(angle)
-        shape, flat = draw.integers(3), draw.uniform(0.15, 1.0)
+        radius = draw.uniform(0.08, 0.35) * image_px * scale
+        angle = draw.uniform(0, np.pi)
+        dx = x - cx
+        dy = y - cy
+        along = dx * np.cos(angle) + dy * np.sin(angle)
+        across = dy * np.cos(angle) - dx * np.sin(angle)
+        shape = draw.integers(3)
+        flat = draw.uniform(0.15, 1.0)
         if shape == 0:
             bearing = np.arctan2(across, along)
-            wave = sum(draw.normal(0, 0.15) * np.cos(n * bearing + draw.uniform(0, 2 * np.pi)) for n in (2, 3, 5))
+            wave = sum(
+                draw.normal(0, 0.15) * np.cos(n * bearing + draw.uniform(0, 2 * np.pi)) for n in (2, 3, 5)
+            )
             cover |= np.hypot(along, across) < radius * (1 + wave)
         elif shape == 1:
             cover |= (np.abs(along) < radius) & (np.abs(across) < flat * radius)
         else:
-            cover |= (np.abs(across) < flat * radius / 2) & (np.abs(along) < 4 * radius)  # a post across the image
+            cover |= (np.abs(across) < flat * radius / 2) & (
+                np.abs(along) < 4 * radius
+            )  # a post across the image
     return torch.from_numpy(cover.astype(np.float32))
 
 
 def _gaussian(images, sigma):
-    """[N, S, S] blurred (periodic) by a Gaussian of this standard deviation, through the Fourier transform."""
+    """[N, S, S] blurred (periodic) by a Gaussian of this standard deviation, through the Fourier
+    transform."""
     size = images.shape[-1]
-    fx, fy = torch.fft.rfftfreq(size), torch.fft.fftfreq(size)
+    fx = torch.fft.rfftfreq(size)
+    fy = torch.fft.fftfreq(size)
     low_pass = torch.exp(-2 * np.pi**2 * sigma**2 * (fy[:, None].square() + fx.square()))
     return torch.fft.irfft2(torch.fft.rfft2(images) * low_pass, s=(size, size)).clamp_min(0)
 
@@ -207,7 +275,8 @@ def _apply(homography, points):
 
 
 def _lookup(crop, units):
-    """A texture [1, C, S, S] at grid_sample's units [T, 2, H, W] -> [T, C, H, W]; mirrored beyond the border."""
+    """A texture [1, C, S, S] at grid_sample's units [T, 2, H, W] -> [T, C, H, W]; mirrored beyond the
+    border."""
     times, _, height, width = units.shape
     grid = units.permute(0, 2, 3, 1).reshape(1, times * height, width, 2)
     found = grid_sample(crop, grid, padding_mode="reflection", align_corners=False)
@@ -217,7 +286,9 @@ def _lookup(crop, units):
 def _compose(sample, points):
     """Frames [T, H, W]: each layer over those behind it."""
     frames = torch.zeros(())
-    for layer, (motion, crop, place) in enumerate(zip(sample["motion"], sample["crop"], sample["place"], strict=True)):
+    for layer, (motion, crop, place) in enumerate(
+        zip(sample["motion"], sample["crop"], sample["place"], strict=True)
+    ):
         units = _apply(place @ torch.linalg.inv(motion), points)
         if layer == 0:
             frames = _lookup(crop[None, :1], units)[:, 0]

@@ -10,14 +10,25 @@ from scipy.ndimage import gaussian_filter
 from codesign import backend
 from codesign.errors import DomainError, FileFormatError
 
-PHOTOS = ("brick", "gravel", "grass", "camera", "coffee", "chelsea", "astronaut", "rocket", "hubble_deep_field")
+PHOTOS = (
+    "brick",
+    "gravel",
+    "grass",
+    "camera",
+    "coffee",
+    "chelsea",
+    "astronaut",
+    "rocket",
+    "hubble_deep_field",
+)
 LIFT = 2.0  # the darkest radiance of a photograph: no real wall is perfectly black
 
 
 def photo(source, size_px=512):
     """A photograph as linear luminance.
 
-    Args: source: a name out of PHOTOS (CC0 and public-domain pictures that come with scikit-image) or a path to an image file.
+    Args: source: a name out of PHOTOS (CC0 and public-domain pictures that come with scikit-image) or a path
+      to an image file.
     Returns: [H, W] float32, from LIFT to 255, cut to at most size_px square.
     Raises: FileFormatError when there is no such picture.
     """
@@ -29,11 +40,18 @@ def photo(source, size_px=512):
         import imageio.v3 as imageio
 
         if not Path(source).is_file():
-            raise FileFormatError(f"texture '{source}' is neither a file nor one of {', '.join(PHOTOS)}; give the path of a PNG or JPEG.")
+            raise FileFormatError(
+                f"texture '{source}' is neither a file nor one of {', '.join(PHOTOS)}; give the path of a "
+                "PNG or JPEG."
+            )
         try:
-            picture = imageio.imread(source, plugin="pillow")  # the only one asked: trying them all leaves files open
+            picture = imageio.imread(
+                source, plugin="pillow"
+            )  # the only one asked: trying them all leaves files open
         except (OSError, ValueError) as error:
-            raise FileFormatError(f"texture {source} is not a readable image ({str(error)[:120]}); convert it to PNG.") from error
+            raise FileFormatError(
+                f"texture {source} is not a readable image ({str(error)[:120]}); convert it to PNG."
+            ) from error
     scale = 65535.0 if picture.dtype == np.uint16 else 255.0 if picture.dtype == np.uint8 else 1.0
     values = np.asarray(picture, dtype=np.float64)[:size_px, :size_px] / scale
     linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
@@ -43,22 +61,34 @@ def photo(source, size_px=512):
 
 
 def shrunk(texture, factor):
-    """The texture averaged over factor x factor texels, so that a few samples per pixel see no detail between them."""
+    """The texture averaged over factor x factor texels, so that a few samples per pixel see no detail between
+    them."""
     height, width = (n // factor * factor for n in texture.shape)
-    return texture[:height, :width].reshape(height // factor, factor, width // factor, factor).mean((1, 3), dtype=np.float64).astype(np.float32)
+    return (
+        texture[:height, :width]
+        .reshape(height // factor, factor, width // factor, factor)
+        .mean((1, 3), dtype=np.float64)
+        .astype(np.float32)
+    )
 
 
 def softened(texture, texels):
-    """The texture blurred by a Gaussian of this standard deviation, so that the kinks between bilinear texels become small."""
-    return gaussian_filter(check_texture(texture, "to soften").astype(np.float64), texels, mode="nearest").astype(np.float32)
+    """The texture blurred by a Gaussian of this standard deviation, so that the kinks between bilinear texels
+    become small."""
+    return gaussian_filter(
+        check_texture(texture, "to soften").astype(np.float64), texels, mode="nearest"
+    ).astype(np.float32)
 
 
 def speckle(seed, size_px=512, finest_px=6.0, coarsest_px=64.0, contrast=0.5):
-    """Random pattern with equal power per octave between two periods (texels), exp of a Gaussian field: [size, size] float32."""
+    """Random pattern with equal power per octave between two periods (texels), exp of a Gaussian field:
+    [size, size] float32."""
     frequency = np.fft.fftfreq(size_px)
     radius = np.hypot(frequency[:, None], frequency)
     band = ((radius >= 1 / coarsest_px) & (radius <= 1 / finest_px)) / np.maximum(radius, 1e-6)
-    field = np.fft.ifft2(np.fft.fft2(np.random.default_rng(seed).standard_normal((size_px, size_px))) * band).real
+    field = np.fft.ifft2(
+        np.fft.fft2(np.random.default_rng(seed).standard_normal((size_px, size_px))) * band
+    ).real
     return check_texture(60.0 * np.exp(contrast * field / field.std()), f"speckle {seed}")
 
 
@@ -69,11 +99,15 @@ def checkerboard(squares=8, square_px=32, dark=10.0, bright=200.0):
 
 
 def faded_to(texture, level, margin=0.12):
-    """The texture with its borders fading smoothly to a constant, so that adjoining walls meet without a jump."""
-    texture, ramps = check_texture(texture, "to fade"), []
+    """The texture with its borders fading smoothly to a constant, so that adjoining walls meet without a
+    jump."""
+    texture = check_texture(texture, "to fade")
+    ramps = []
     for size in texture.shape:
         at = (np.arange(size) + 0.5) / size
-        u = np.clip(np.minimum(at, 1 - at) / margin - 0.25, 0, 1)  # the outermost quarter of the margin is constant
+        u = np.clip(
+            np.minimum(at, 1 - at) / margin - 0.25, 0, 1
+        )  # the outermost quarter of the margin is constant
         ramps.append(u * u * (3 - 2 * u))
     return (level + (texture - level) * ramps[0][:, None] * ramps[1]).astype(np.float32)
 
@@ -82,30 +116,55 @@ def check_texture(values, name):
     """Raise DomainError unless all radiances are finite and at least 0; returns float32."""
     values = np.asarray(values)
     if values.ndim != 2 or not np.isfinite(values).all() or (values < 0).any():
-        bad = "NaN or infinite" if not np.isfinite(values).all() else "negative" if values.ndim == 2 else f"shape {values.shape} instead of [H, W] with"
-        raise DomainError(f"texture {name}: {bad} values; give finite radiances of at least 0 as a 2-D array.")
+        bad = (
+            "NaN or infinite"
+            if not np.isfinite(values).all()
+            else "negative"
+            if values.ndim == 2
+            else f"shape {values.shape} instead of [H, W] with"
+        )
+        raise DomainError(
+            f"texture {name}: {bad} values; give finite radiances of at least 0 as a 2-D array."
+        )
     return values.astype(np.float32)
 
 
 def picture(source, blur_texels=2.0):
-    """What a world's surface is given: an array [H, W], a path, one of PHOTOS, or "speckle-3" (seed 3); files and photographs softened by ``blur_texels``."""
+    """What a world's surface is given: an array [H, W], a path, one of PHOTOS, or "speckle-3" (seed 3); files
+    and photographs softened by ``blur_texels``."""
     if not isinstance(source, str | Path):
         return check_texture(source, "given as an array")
     if str(source).startswith("speckle-") and str(source)[8:].isdigit():
-        return np.minimum(softened(speckle(int(str(source)[8:]), finest_px=16.0, contrast=0.4), blur_texels), 255)
+        return np.minimum(
+            softened(speckle(int(str(source)[8:]), finest_px=16.0, contrast=0.4), blur_texels), 255
+        )
     return softened(photo(source), blur_texels)
 
 
-def sky(seed=0, height_px=256, zenith=90.0, horizon=190.0, ground=40.0, sun_elevation_deg=40.0, sun_azimuth_deg=200.0):
-    """A procedural sky as an equirectangular picture [height, 2 height], first row at the zenith: a gradient, soft clouds, a broad soft sun; 255 at most."""
+def sky(
+    seed=0,
+    height_px=256,
+    zenith=90.0,
+    horizon=190.0,
+    ground=40.0,
+    sun_elevation_deg=40.0,
+    sun_azimuth_deg=200.0,
+):
+    """A procedural sky as an equirectangular picture [height, 2 height], first row at the zenith: a gradient,
+    soft clouds, a broad soft sun; 255 at most."""
     width = 2 * height_px
     elevation = np.pi / 2 - (np.arange(height_px)[:, None] + 0.5) * np.pi / height_px
     azimuth = (np.arange(width) + 0.5) * 2 * np.pi / width
-    noise = gaussian_filter(np.random.default_rng(seed).standard_normal((height_px, width)), (height_px / 48, height_px / 20), mode=["nearest", "wrap"])  # pyright: ignore[reportArgumentType]
+    noise = gaussian_filter(
+        np.random.default_rng(seed).standard_normal((height_px, width)),
+        (height_px / 48, height_px / 20),
+        mode=["nearest", "wrap"],
+    )  # pyright: ignore[reportArgumentType]
     clouds = 25 * np.tanh(1.5 * noise / noise.std()) * np.clip(2 * elevation, 0, 1)
     up = np.clip(elevation / (np.pi / 2), 0, 1)
     clear = horizon + (zenith - horizon) * up**0.6 + clouds
-    e, a = np.radians(sun_elevation_deg), np.radians(sun_azimuth_deg)
+    e = np.radians(sun_elevation_deg)
+    a = np.radians(sun_azimuth_deg)
     cosine = np.sin(elevation) * np.sin(e) + np.cos(elevation) * np.cos(e) * np.cos(azimuth - a)
     bright = clear + (250 - clear) * np.exp(20 * (cosine - 1))
     below = 1 / (1 + np.exp(elevation / 0.02))  # no jump at the horizon
@@ -113,19 +172,30 @@ def sky(seed=0, height_px=256, zenith=90.0, horizon=190.0, ground=40.0, sun_elev
 
 
 def environment(path, mean=80.0):
-    """Luminance of an equirectangular HDR file (.hdr, .exr, or any picture Mitsuba reads), scaled to a mean radiance over the sphere: [H, W] float32.
+    """Luminance of an equirectangular HDR file (.hdr, .exr, or any picture Mitsuba reads), scaled to a mean
+    radiance over the sphere: [H, W] float32.
 
-    Bright lamps and suns stay as far above 255 as they are in the file. Raises: FileFormatError when it is missing or unreadable, DomainError for bad values.
+    Bright lamps and suns stay as far above 255 as they are in the file. Raises: FileFormatError when it is
+    missing or unreadable, DomainError for bad values.
     """
     if not Path(path).is_file():
-        raise FileFormatError(f"environment map '{path}' is not a file; give the path of an equirectangular .hdr or .exr picture.")
+        raise FileFormatError(
+            f"environment map '{path}' is not a file; give the path of an equirectangular .hdr or .exr "
+            "picture."
+        )
     if not 0 < mean < math.inf:
         raise DomainError(f"environment map {path}: mean = {mean} must be positive and finite.")
     mi = backend.mitsuba("cpu")
     try:
-        values = np.array(mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.Y, mi.Struct.Type.Float32, srgb_gamma=False), dtype=np.float64)
+        values = np.array(
+            mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.Y, mi.Struct.Type.Float32, srgb_gamma=False),
+            dtype=np.float64,
+        )
     except Exception as error:  # Mitsuba raises plain RuntimeErrors of many lines
-        raise FileFormatError(f"environment map '{path}' cannot be read ({str(error).splitlines()[-1][:120]}); convert it to .exr or .hdr.") from error
+        raise FileFormatError(
+            f"environment map '{path}' cannot be read ({str(error).splitlines()[-1][:120]}); convert it to "
+            ".exr or .hdr."
+        ) from error
     values = check_texture(values.reshape(values.shape[0], -1), str(path)).astype(np.float64)
     weight = np.sin((np.arange(len(values)) + 0.5) * np.pi / len(values))[:, None]
     level = (values * weight).mean() / weight.mean()
@@ -135,10 +205,15 @@ def environment(path, mean=80.0):
 
 
 def waves(seed, count=24, finest_period_m=0.05, coarsest_period_m=0.5, log_contrast=0.4):
-    """Random plane waves for TexturedPlane: frequency [K, 2] (per metre), amplitude [K], phase [K]; periods spread evenly in octaves."""
+    """Random plane waves for TexturedPlane: frequency [K, 2] (per metre), amplitude [K], phase [K]; periods
+    spread evenly in octaves."""
     generator = torch.Generator().manual_seed(seed)
     u = torch.rand(3, count, generator=generator, dtype=torch.float64)
     period = finest_period_m * (coarsest_period_m / finest_period_m) ** u[0]
     angle = 2 * math.pi * u[1]
     frequency = torch.stack([angle.cos(), angle.sin()], 1) / period[:, None]
-    return frequency, torch.full((count,), log_contrast * (2 / count) ** 0.5, dtype=torch.float64), 2 * math.pi * u[2]
+    return (
+        frequency,
+        torch.full((count,), log_contrast * (2 / count) ** 0.5, dtype=torch.float64),
+        2 * math.pi * u[2],
+    )

@@ -1,6 +1,8 @@
-"""Trajectories as TUM text files: one pose per line, ``timestamp tx ty tz qx qy qz qw``; and a trajectory through recorded poses.
+"""Trajectories as TUM text files: one pose per line, ``timestamp tx ty tz qx qy qz qw``; and a trajectory
+through recorded poses.
 
-Lines that begin with # and empty lines are skipped; numbers are separated by spaces or tabs. Source: the file formats of the TUM RGB-D benchmark
+Lines that begin with # and empty lines are skipped; numbers are separated by spaces or tabs. Source: the file
+formats of the TUM RGB-D benchmark
 (Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012).
 """
 
@@ -17,7 +19,9 @@ from codesign.errors import DomainError, FileFormatError, ShapeError, check_fini
 from codesign.pose import check_poses, inverse, se3_exp
 from scenes.trajectories.trajectory import Trajectory
 
-MOST_BYTES, MOST_POSES, LONGEST_LINE = 64_000_000, 1_000_000, 400
+MOST_BYTES = 64_000_000
+MOST_POSES = 1_000_000
+LONGEST_LINE = 400
 UNIT_TOLERANCE = 1e-3  # of a quaternion's length: files with four digits stay within 1e-4
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?")
 HEADER = "# timestamp tx ty tz qx qy qz qw"
@@ -33,24 +37,32 @@ def write_tum(path, t_s, poses):
     turn = Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat(canonical=True)
     rows = np.concatenate([t_s.numpy()[:, None], poses[:, :3, 3].numpy(), turn], 1).tolist()
     with replacing(path) as temporary:
-        temporary.write_text("\n".join([HEADER, *(" ".join(map(repr, row)) for row in rows)]) + "\n", encoding="utf-8")
+        temporary.write_text(
+            "\n".join([HEADER, *(" ".join(map(repr, row)) for row in rows)]) + "\n", encoding="utf-8"
+        )
 
 
 def read_tum(path):
     """Read a trajectory.
 
     Returns: t_s [n] float64 seconds, poses [n, 4, 4] float64. Quaternions are normalised.
-    Raises: FileFormatError, with the line, for anything but eight finite numbers, times that do not increase, or a quaternion whose length is not 1 to 0.001; for
+    Raises: FileFormatError, with the line, for anything but eight finite numbers, times that do not increase,
+      or a quaternion whose length is not 1 to 0.001; for
       files that are missing, empty, or larger than 64 MB or a million poses.
     """
-    path, rows, numbers = Path(path), [], []
+    path = Path(path)
+    rows = []
+    numbers = []
     for number, line in enumerate(_text(path).split("\n"), start=1):
         line = line.strip(" \t\r")
         if not line or line.startswith("#"):
             continue
         words = line.split() if len(line) <= LONGEST_LINE else []
         if len(words) != 8 or not all(NUMBER.fullmatch(word) for word in words):
-            raise FileFormatError(f"{path}, line {number}: {line[:60]!r} is not 'timestamp tx ty tz qx qy qz qw', eight finite decimal numbers.")
+            raise FileFormatError(
+                f"{path}, line {number}: {line[:60]!r} is not 'timestamp tx ty tz qx qy qz qw', eight "
+                "finite decimal numbers."
+            )
         if len(rows) == MOST_POSES:
             raise FileFormatError(f"{path}, line {number}: more than {MOST_POSES} poses; split the file.")
         rows.append([float(word) for word in words])
@@ -62,7 +74,10 @@ def read_tum(path):
         length = np.linalg.norm(table[:, 4:], axis=1)
     for bad, reason in (
         (~np.isfinite(table).all(1), "a number is too large for 64 bits"),
-        (~(np.abs(length - 1) <= UNIT_TOLERANCE), f"the quaternion qx qy qz qw has not length 1 (to {UNIT_TOLERANCE:g}), so it is no rotation"),
+        (
+            ~(np.abs(length - 1) <= UNIT_TOLERANCE),
+            f"the quaternion qx qy qz qw has not length 1 (to {UNIT_TOLERANCE:g}), so it is no rotation",
+        ),
         (np.diff(table[:, 0], prepend=-np.inf) <= 0, "the timestamp is not after the one before"),
     ):
         if bad.any():
@@ -91,12 +106,14 @@ def _text(path):
 
 
 class Recorded(Trajectory):
-    """A trajectory through poses at times: between two of them the constant twist that leads from one to the next (a geodesic of SE(3)).
+    """A trajectory through poses at times: between two of them the constant twist that leads from one to the
+    next (a geodesic of SE(3)).
 
     Continuous, with a velocity that jumps at the recorded times; there the segment behind counts.
 
     Args: t_s: [n >= 2] increasing seconds. poses: [n, 4, 4] rigid.
-    Raises: ShapeError; DomainError, also when the body turns by more than 3 rad between two poses, where the way is not clear.
+    Raises: ShapeError; DomainError, also when the body turns by more than 3 rad between two poses, where the
+      way is not clear.
     """
 
     def __init__(self, t_s, poses):
@@ -105,11 +122,16 @@ class Recorded(Trajectory):
             raise ShapeError("a recorded trajectory needs at least 2 poses.")
         self.span_s = (float(self.t_s[0]), float(self.t_s[-1]))
         step = inverse(self.poses[:-1]) @ self.poses[1:]
-        turn = torch.from_numpy(Rotation.from_matrix(step[:, :3, :3].numpy()).as_quat(canonical=True)[:, [3, 0, 1, 2]].copy())
+        turn = torch.from_numpy(
+            Rotation.from_matrix(step[:, :3, :3].numpy()).as_quat(canonical=True)[:, [3, 0, 1, 2]].copy()
+        )
         twist = Se3(So3.from_wxyz(turn), step[:, :3, 3]).log().detach()
         if float(twist[:, 3:].norm(dim=1).max()) > 3:
             at = int(twist[:, 3:].norm(dim=1).argmax())
-            raise DomainError(f"the body turns by {float(twist[at, 3:].norm()):.3g} rad between {float(self.t_s[at]):g} and {float(self.t_s[at + 1]):g} s; give poses closer together (at most 3 rad apart).")
+            raise DomainError(
+                f"the body turns by {float(twist[at, 3:].norm()):.3g} rad between {float(self.t_s[at]):g} "
+                f"and {float(self.t_s[at + 1]):g} s; give poses closer together (at most 3 rad apart)."
+            )
         self.twist_per_s = twist / self.t_s.diff()[:, None]
 
     @staticmethod
@@ -129,10 +151,13 @@ class Recorded(Trajectory):
 
 
 def _checked(t_s, poses):
-    t_s, poses = torch.as_tensor(t_s, dtype=torch.float64).detach().cpu(), torch.as_tensor(poses).detach().double().cpu()
+    t_s = torch.as_tensor(t_s, dtype=torch.float64).detach().cpu()
+    poses = torch.as_tensor(poses).detach().double().cpu()
     check_poses(poses)
     if t_s.shape != poses.shape[:1]:
-        raise ShapeError(f"{tuple(t_s.shape)} times were given for {poses.shape[0]} poses; give one per pose.")
+        raise ShapeError(
+            f"{tuple(t_s.shape)} times were given for {poses.shape[0]} poses; give one per pose."
+        )
     check_finite(t_s, "times of poses")
     if bool((t_s.diff() <= 0).any()):
         raise DomainError("the times of poses must increase strictly; sort them and drop doubles.")

@@ -1,8 +1,12 @@
-"""Worlds: one function each, in metres, z up, radiance on the 0..255 scale. WORLDS names those that need no argument.
+"""Worlds: one function each, in metres, z up, radiance on the 0..255 scale. WORLDS names those that need no
+argument.
 
-Worlds with a ``light`` argument can be shown at three levels (scenes.build.LEVELS): emissive (their pictures as radiance), baked and path (their pictures
-as albedo under their own lamps). Things that rest on each other keep a gap of 1 mm, and no two shapes interpenetrate.
-Pictures may be arrays, paths, names of textures.PHOTOS, or "speckle-<seed>"; those from files are softened by two texels, because at the grain of a
+Worlds with a ``light`` argument can be shown at three levels (scenes.build.LEVELS): emissive (their pictures
+as radiance), baked and path (their pictures
+as albedo under their own lamps). Things that rest on each other keep a gap of 1 mm, and no two shapes
+interpenetrate.
+Pictures may be arrays, paths, names of textures.PHOTOS, or "speckle-<seed>"; those from files are softened by
+two texels, because at the grain of a
 photograph bilinear texels have kinks and gradients, though right, are as rough as the grain.
 """
 
@@ -17,13 +21,28 @@ from scenes.build import GAP_M, Paint, World, ball, block, emissive, pole, recta
 from scenes.tabletop import tabletop
 
 PAINT = 60.0  # the wall colour that pictures fade to
-SUN_ELEVATION_DEG, SUN_AZIMUTH_DEG = 40.0, 200.0
+SUN_ELEVATION_DEG = 40.0
+SUN_AZIMUTH_DEG = 200.0
 
-__all__ = ["VIEWS", "WORLDS", "blank_room", "checkerboard", "corridor", "dark_room", "ground", "outdoor", "room", "smooth_plane", "tabletop", "wall"]
+__all__ = [
+    "VIEWS",
+    "WORLDS",
+    "blank_room",
+    "checkerboard",
+    "corridor",
+    "dark_room",
+    "ground",
+    "outdoor",
+    "room",
+    "smooth_plane",
+    "tabletop",
+    "wall",
+]
 
 
 def wall(texture, texel_m=0.002, half_width_m=8.0, wrap="mirror", device="cpu") -> MitsubaScene:
-    """One endless-looking wall, the plane y = 0 seen from y < 0, tiled (wrap "mirror" or "repeat") with a texture at ``texel_m`` per texel."""
+    """One endless-looking wall, the plane y = 0 seen from y < 0, tiled (wrap "mirror" or "repeat") with a
+    texture at ``texel_m`` per texel."""
     return _plane("wall", texture, texel_m, half_width_m, (0, -1, 0), (0, 0, 1), wrap, device)
 
 
@@ -39,7 +58,10 @@ def ground(texture, texel_m=0.004, half_width_m=12.0, device="cpu"):
 
 def _plane(name, texture, texel_m, half_width_m, towards, up, wrap, device):
     texture = textures.check_texture(texture, "of the scene")
-    repeat = (2 * half_width_m / (texel_m * texture.shape[1]), 2 * half_width_m / (texel_m * texture.shape[0]))
+    repeat = (
+        2 * half_width_m / (texel_m * texture.shape[1]),
+        2 * half_width_m / (texel_m * texture.shape[0]),
+    )
     shape = rectangle(backend.mitsuba(device), (0, 0, 0), towards, 2 * half_width_m, 2 * half_width_m, up)
     return emissive(World({name: (shape, Paint(texture, repeat, wrap))}), device)
 
@@ -48,18 +70,30 @@ def _walls(mi, paints, size_m):
     """Six inner sides of a box that stands on z = 0: north, south, east, west, floor, ceiling."""
     x, y, z = (s / 2 for s in size_m)
     sides = [
-        ("north", (0, y, z), (0, -y, z), 2 * x, 2 * z, (0, 0, 1)), ("south", (0, -y, z), (0, y, z), 2 * x, 2 * z, (0, 0, 1)),
-        ("east", (x, 0, z), (-x, 0, z), 2 * y, 2 * z, (0, 0, 1)), ("west", (-x, 0, z), (x, 0, z), 2 * y, 2 * z, (0, 0, 1)),
-        ("floor", (0, 0, 0), (0, 0, 1), 2 * x, 2 * y, (0, 1, 0)), ("ceiling", (0, 0, 2 * z), (0, 0, 0), 2 * x, 2 * y, (0, 1, 0)),
+        ("north", (0, y, z), (0, -y, z), 2 * x, 2 * z, (0, 0, 1)),
+        ("south", (0, -y, z), (0, y, z), 2 * x, 2 * z, (0, 0, 1)),
+        ("east", (x, 0, z), (-x, 0, z), 2 * y, 2 * z, (0, 0, 1)),
+        ("west", (-x, 0, z), (x, 0, z), 2 * y, 2 * z, (0, 0, 1)),
+        ("floor", (0, 0, 0), (0, 0, 1), 2 * x, 2 * y, (0, 1, 0)),
+        ("ceiling", (0, 0, 2 * z), (0, 0, 0), 2 * x, 2 * y, (0, 1, 0)),
     ]
     return {name: (rectangle(mi, *rest), paint) for (name, *rest), paint in zip(sides, paints, strict=True)}
 
 
-def room(photos=("brick", "gravel", "grass", "camera", "coffee", "astronaut"), size_m=(4.0, 4.0, 2.6), objects=True, device="cpu", light=emissive):
-    """A room with photographs on its four walls, floor and ceiling, and two crates and a ball when ``objects``.
+def room(
+    photos=("brick", "gravel", "grass", "camera", "coffee", "astronaut"),
+    size_m=(4.0, 4.0, 2.6),
+    objects=True,
+    device="cpu",
+    light=emissive,
+):
+    """A room with photographs on its four walls, floor and ceiling, and two crates and a ball when
+    ``objects``.
 
-    Every picture fades to one wall colour at its border, so walls meet without a jump of radiance; without objects the image
-    has no discontinuities that move, and its interior gradient is the whole gradient. Where it is lit, its ceiling is the lamp.
+    Every picture fades to one wall colour at its border, so walls meet without a jump of radiance; without
+    objects the image
+    has no discontinuities that move, and its interior gradient is the whole gradient. Where it is lit, its
+    ceiling is the lamp.
     """
     mi = backend.mitsuba(device)
     pictures = [textures.faded_to(textures.picture(p), PAINT) for p in photos]
@@ -73,89 +107,190 @@ def room(photos=("brick", "gravel", "grass", "camera", "coffee", "astronaut"), s
 
 
 def blank_room(level=PAINT, size_m=(4.0, 4.0, 2.6), device="cpu", light=emissive):
-    """A closed room whose every surface has one radiance: the negative control, in which no motion makes an event.
+    """A closed room whose every surface has one radiance: the negative control, in which no motion makes an
+    event.
 
-    Where it is lit it stays so: its walls reflect a half and emit the other half of their radiance (a white furnace).
+    Where it is lit it stays so: its walls reflect a half and emit the other half of their radiance (a white
+      furnace).
     """
-    even = Paint(np.full((8, 8), level, dtype=np.float32), albedo=0.5 * 255 / level if level > 0 else 0.0, glow=level / 2)
+    even = Paint(
+        np.full((8, 8), level, dtype=np.float32),
+        albedo=0.5 * 255 / level if level > 0 else 0.0,
+        glow=level / 2,
+    )
     return light(World(_walls(backend.mitsuba(device), [even] * 6, size_m)), device)
 
 
-def corridor(photos=("brick", "gravel", "speckle-4"), length_m=14.0, width_m=2.2, height_m=2.6, device="cpu", light=emissive):
-    """A corridor along +y, entered at y = 0, with pillars on both sides; pictures for walls, floor and pillars. Luminous ceiling where it is lit."""
+def corridor(
+    photos=("brick", "gravel", "speckle-4"),
+    length_m=14.0,
+    width_m=2.2,
+    height_m=2.6,
+    device="cpu",
+    light=emissive,
+):
+    """A corridor along +y, entered at y = 0, with pillars on both sides; pictures for walls, floor and
+    pillars. Luminous ceiling where it is lit."""
     mi = backend.mitsuba(device)
     side, floor, column = (textures.picture(p) for p in photos)
     bright = textures.softened(textures.speckle(9, finest_px=24.0, contrast=0.1), 4.0)
-    along, tile = length_m / height_m, height_m
+    along = length_m / height_m
+    tile = height_m
     shapes = {
-        "west": (rectangle(mi, (-width_m / 2, length_m / 2, height_m / 2), (0, length_m / 2, height_m / 2), length_m, height_m), Paint(side, (along, 1))),
-        "east": (rectangle(mi, (width_m / 2, length_m / 2, height_m / 2), (0, length_m / 2, height_m / 2), length_m, height_m), Paint(side, (along, 1))),
-        "floor": (rectangle(mi, (0, length_m / 2, 0), (0, length_m / 2, 1), width_m, length_m, (0, 1, 0)), Paint(floor, (width_m / tile, along))),
-        "ceiling": (rectangle(mi, (0, length_m / 2, height_m), (0, length_m / 2, 0), width_m, length_m, (0, 1, 0)), Paint(bright, (width_m / tile, along), glow=250.0)),
-        "end": (rectangle(mi, (0, length_m, height_m / 2), (0, 0, height_m / 2), width_m, height_m), Paint(column)),
-        "start": (rectangle(mi, (0, 0, height_m / 2), (0, length_m, height_m / 2), width_m, height_m), Paint(column)),
+        "west": (
+            rectangle(
+                mi,
+                (-width_m / 2, length_m / 2, height_m / 2),
+                (0, length_m / 2, height_m / 2),
+                length_m,
+                height_m,
+            ),
+            Paint(side, (along, 1)),
+        ),
+        "east": (
+            rectangle(
+                mi,
+                (width_m / 2, length_m / 2, height_m / 2),
+                (0, length_m / 2, height_m / 2),
+                length_m,
+                height_m,
+            ),
+            Paint(side, (along, 1)),
+        ),
+        "floor": (
+            rectangle(mi, (0, length_m / 2, 0), (0, length_m / 2, 1), width_m, length_m, (0, 1, 0)),
+            Paint(floor, (width_m / tile, along)),
+        ),
+        "ceiling": (
+            rectangle(mi, (0, length_m / 2, height_m), (0, length_m / 2, 0), width_m, length_m, (0, 1, 0)),
+            Paint(bright, (width_m / tile, along), glow=250.0),
+        ),
+        "end": (
+            rectangle(mi, (0, length_m, height_m / 2), (0, 0, height_m / 2), width_m, height_m),
+            Paint(column),
+        ),
+        "start": (
+            rectangle(mi, (0, 0, height_m / 2), (0, length_m, height_m / 2), width_m, height_m),
+            Paint(column),
+        ),
     }
     for k, y in enumerate(np.arange(2.0, length_m - 0.5, 2.0)):
         for x in (-1, 1):
             half = (0.08, 0.12, height_m / 2 - GAP_M)
-            shapes[f"pillar-{k}{'w' if x < 0 else 'e'}"] = (block(mi, x * (width_m / 2 - half[0] - GAP_M), float(y), 0.0, half), Paint(column, (0.3, 3)))
+            shapes[f"pillar-{k}{'w' if x < 0 else 'e'}"] = (
+                block(mi, x * (width_m / 2 - half[0] - GAP_M), float(y), 0.0, half),
+                Paint(column, (0.3, 3)),
+            )
     return light(World(shapes), device)
 
 
-def outdoor(seed=0, clutter=48, half_width_m=14.0, photo="gravel", environment=None, meshes=(), device="cpu", light=emissive):
+def outdoor(
+    seed=0,
+    clutter=48,
+    half_width_m=14.0,
+    photo="gravel",
+    environment=None,
+    meshes=(),
+    device="cpu",
+    light=emissive,
+):
     """Open ground with crates, balls and posts under a sky; a clear lane along x = 0 to drive or fly in.
 
-    Args: photo: picture of the ground. environment: path of an equirectangular .hdr or .exr map; None is a procedural sky with a sun.
-      meshes: robot bodies as (path, x, y, turn_deg) or (path, x, y, turn_deg, scale), each resting on the ground.
-    Where it is lit, the sky lights it, with a sun of its own when the sky is procedural. The sky lies at infinity: no point of it has a depth.
+    Args: photo: picture of the ground. environment: path of an equirectangular .hdr or .exr map; None is a
+      procedural sky with a sun.
+      meshes: robot bodies as (path, x, y, turn_deg) or (path, x, y, turn_deg, scale), each resting on the
+        ground.
+    Where it is lit, the sky lights it, with a sun of its own when the sky is procedural. The sky lies at
+    infinity: no point of it has a depth.
     """
-    mi, random = backend.mitsuba(device), np.random.default_rng(seed)
+    mi = backend.mitsuba(device)
+    random = np.random.default_rng(seed)
     tile = 512 * 0.012
-    shapes: dict = {"ground": (rectangle(mi, (0, 0, 0), (0, 0, 1), 2 * half_width_m, 2 * half_width_m, (0, 1, 0)), Paint(textures.picture(photo), (2 * half_width_m / tile, 2 * half_width_m / tile)))}
+    shapes: dict = {
+        "ground": (
+            rectangle(mi, (0, 0, 0), (0, 0, 1), 2 * half_width_m, 2 * half_width_m, (0, 1, 0)),
+            Paint(textures.picture(photo), (2 * half_width_m / tile, 2 * half_width_m / tile)),
+        )
+    }
     pictures = [textures.picture(p) for p in ("brick", "speckle-1", "speckle-2", "grass")]
     places = [(float(x), float(y), 1.0) for _, x, y, *_ in meshes]
     for k, (path, x, y, turn_deg, *scale) in enumerate(meshes):
-        shapes[f"body-{k}"] = (bodies.read(path, *scale).placed(x, y, GAP_M, turn_deg), Paint(np.full((4, 4), 120.0)))
+        shapes[f"body-{k}"] = (
+            bodies.read(path, *scale).placed(x, y, GAP_M, turn_deg),
+            Paint(np.full((4, 4), 120.0)),
+        )
     while len(places) < clutter + len(meshes):
         x, y = random.uniform(-0.5, 0.5, 2) * half_width_m
         size = float(random.uniform(0.15, 0.5))
-        if abs(x) < 0.7 + 1.5 * size or any(math.hypot(x - px, y - py) < 1.8 * (size + other) for px, py, other in places):
+        if abs(x) < 0.7 + 1.5 * size or any(
+            math.hypot(x - px, y - py) < 1.8 * (size + other) for px, py, other in places
+        ):
             continue
         k = len(places)
         places.append((x, y, size))
         paint = Paint(pictures[k % 4])
         if k % 3 == 0:
-            shapes[f"crate-{k}"] = (block(mi, x, y, 0.0, (size, size, size * random.uniform(0.6, 1.6)), random.uniform(0, 90)), paint)
+            shapes[f"crate-{k}"] = (
+                block(mi, x, y, 0.0, (size, size, size * random.uniform(0.6, 1.6)), random.uniform(0, 90)),
+                paint,
+            )
         elif k % 3 == 1:
             shapes[f"ball-{k}"] = (ball(mi, x, y, 0.0, size), paint)
         else:
             height = random.uniform(1.2, 3.0)
             tube, cap = pole(mi, (x, y, GAP_M), (x, y, height), 0.03 + 0.1 * size)
-            shapes[f"post-{k}"], shapes[f"cap-{k}"] = (tube, Paint(pictures[k % 4], (1, 4))), (cap, Paint(np.full((4, 4), 90.0)))
-    above = textures.sky(seed, sun_elevation_deg=SUN_ELEVATION_DEG, sun_azimuth_deg=SUN_AZIMUTH_DEG) if environment is None else textures.environment(environment)
+            shapes[f"post-{k}"], shapes[f"cap-{k}"] = (
+                (tube, Paint(pictures[k % 4], (1, 4))),
+                (cap, Paint(np.full((4, 4), 90.0))),
+            )
+    above = (
+        textures.sky(seed, sun_elevation_deg=SUN_ELEVATION_DEG, sun_azimuth_deg=SUN_AZIMUTH_DEG)
+        if environment is None
+        else textures.environment(environment)
+    )
     lamps = {"sun": _sun(800.0)} if environment is None else {}
     return light(World(shapes, {"sky": sky(mi, above)}, lamps, texel_m=0.08), device)
 
 
 def _sun(irradiance):
-    elevation, azimuth = math.radians(SUN_ELEVATION_DEG), math.radians(SUN_AZIMUTH_DEG)
-    towards = [-math.cos(elevation) * math.sin(azimuth), -math.cos(elevation) * math.cos(azimuth), -math.sin(elevation)]
+    elevation = math.radians(SUN_ELEVATION_DEG)
+    azimuth = math.radians(SUN_AZIMUTH_DEG)
+    towards = [
+        -math.cos(elevation) * math.sin(azimuth),
+        -math.cos(elevation) * math.cos(azimuth),
+        -math.sin(elevation),
+    ]
     return {"type": "directional", "direction": towards, "irradiance": {"type": "rgb", "value": irradiance}}
 
 
 def dark_room(seed=0, spots=10, dark=1.5, bright=255.0, size_m=(4.0, 4.0, 2.6), device="cpu", light=emissive):
-    """A room near darkness (mean radiance ``dark``) with a few small bright balls in the air, placed at random without touching."""
-    mi, random = backend.mitsuba(device), np.random.default_rng(seed)
-    dim = [textures.faded_to(textures.softened(textures.speckle(seed + k, finest_px=16.0, contrast=0.35), 2.0), PAINT) * (dark / PAINT) for k in range(6)]
+    """A room near darkness (mean radiance ``dark``) with a few small bright balls in the air, placed at
+    random without touching."""
+    mi = backend.mitsuba(device)
+    random = np.random.default_rng(seed)
+    dim = [
+        textures.faded_to(
+            textures.softened(textures.speckle(seed + k, finest_px=16.0, contrast=0.35), 2.0), PAINT
+        )
+        * (dark / PAINT)
+        for k in range(6)
+    ]
     shapes = _walls(mi, [Paint(picture, albedo=0.25 * 255 / float(picture.max())) for picture in dim], size_m)
-    low, high = np.array([-size_m[0] / 2, -size_m[1] / 2, 0]) + 0.4, np.array([size_m[0] / 2, size_m[1] / 2, size_m[2]]) - 0.4
+    low = np.array([-size_m[0] / 2, -size_m[1] / 2, 0]) + 0.4
+    high = np.array([size_m[0] / 2, size_m[1] / 2, size_m[2]]) - 0.4
     places = []
     while len(places) < spots:
         place = random.uniform(low, high)
-        if all(np.linalg.norm(place - other) > 0.4 for other in places) and np.linalg.norm(place - [0, -1.2, 1.3]) > 0.7:
+        if (
+            all(np.linalg.norm(place - other) > 0.4 for other in places)
+            and np.linalg.norm(place - [0, -1.2, 1.3]) > 0.7
+        ):
             places.append(place)
             radius = float(random.uniform(0.015, 0.04))
-            shapes[f"spot-{len(places)}"] = (ball(mi, float(place[0]), float(place[1]), float(place[2]), radius), Paint(np.full((4, 4), bright, dtype=np.float32), albedo=0.0, glow=bright))
+            shapes[f"spot-{len(places)}"] = (
+                ball(mi, float(place[0]), float(place[1]), float(place[2]), radius),
+                Paint(np.full((4, 4), bright, dtype=np.float32), albedo=0.0, glow=bright),
+            )
     return light(World(shapes), device)
 
 
@@ -165,10 +300,20 @@ def smooth_plane(seed=0, T_world_plane=None, **options):
 
 
 WORLDS = {
-    "checkerboard": checkerboard, "room": room, "corridor": corridor, "outdoor": outdoor, "tabletop": tabletop, "blank-room": blank_room, "dark-room": dark_room,
+    "checkerboard": checkerboard,
+    "room": room,
+    "corridor": corridor,
+    "outdoor": outdoor,
+    "tabletop": tabletop,
+    "blank-room": blank_room,
+    "dark-room": dark_room,
 }
 VIEWS = {  # where a camera of about 45 degrees stands, and what it looks at, to see what a world has
-    "checkerboard": ((0.13, -2.0, 0.08), (0.13, 0.0, 0.08)), "room": ((0.4, -1.5, 1.3), (-0.1, 1.0, 0.7)), "corridor": ((0.2, 0.6, 1.4), (-0.1, 8.0, 1.2)),
-    "outdoor": ((0.0, -7.5, 1.6), (0.0, 0.0, 0.9)), "tabletop": ((0.3, -1.0, 1.25), (0.0, 0.05, 0.78)), "blank-room": ((0.4, -1.5, 1.3), (-0.1, 1.0, 0.7)),
+    "checkerboard": ((0.13, -2.0, 0.08), (0.13, 0.0, 0.08)),
+    "room": ((0.4, -1.5, 1.3), (-0.1, 1.0, 0.7)),
+    "corridor": ((0.2, 0.6, 1.4), (-0.1, 8.0, 1.2)),
+    "outdoor": ((0.0, -7.5, 1.6), (0.0, 0.0, 0.9)),
+    "tabletop": ((0.3, -1.0, 1.25), (0.0, 0.05, 0.78)),
+    "blank-room": ((0.4, -1.5, 1.3), (-0.1, 1.0, 0.7)),
     "dark-room": ((0.0, -1.5, 1.3), (0.0, 1.0, 1.1)),
 }

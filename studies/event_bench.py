@@ -1,7 +1,10 @@
-"""Speed and memory of the event stage: hard sensor, memory layer and their relatives, beside a memory copy of the frames, in one run.
+"""Speed and memory of the event stage: hard sensor, memory layer and their relatives, beside a memory copy of
+the frames, in one run.
 
-Frames of a drifting texture at 1,000 frames per second, at two speeds: calm (about 2 events per 100 pixels and frame) and busy (about 25). What a pixel
-costs depends on how often it fires, so both are told. The last part streams frames through a sensor with every kind of noise and watches the memory.
+Frames of a drifting texture at 1,000 frames per second, at two speeds: calm (about 2 events per 100 pixels
+and frame) and busy (about 25). What a pixel
+costs depends on how often it fires, so both are told. The last part streams frames through a sensor with
+every kind of noise and watches the memory.
 """
 
 import sys
@@ -13,21 +16,34 @@ import numpy as np
 import torch
 
 from codesign import events
-from studies.run import Run, StudyConfig, main
-from studies.timing import measure, resident_mb
+from studies.frame.run import Run, StudyConfig, main
+from studies.frame.timing import measure, resident_mb
 
 SIZES = {"346x260": (260, 346, 96), "1280x720": (720, 1280, 32)}
 SPEED_PX = {"calm": 0.05, "busy": 0.6}
-FPS, THETA = 1000, 0.2
+FPS = 1000
+THETA = 0.2
 NOISE = events.SensorModel(
-    theta_sigma=0.03, cutoff_hz=300.0, leak_rate_hz=0.1, leak_jitter=0.1, rate_cov_decades=0.1, shot_rate_hz=1.0, refractory_s=0.5e-3
+    theta_sigma=0.03,
+    cutoff_hz=300.0,
+    leak_rate_hz=0.1,
+    leak_jitter=0.1,
+    rate_cov_decades=0.1,
+    shot_rate_hz=1.0,
+    refractory_s=0.5e-3,
 )  # every kind that v2e has by default
 SENSORS = {
     "hard, ideal": events.SensorModel(),
     "hard, full noise": NOISE,
-    "hard, photoreceptor noise": events.SensorModel(theta_sigma=0.03, cutoff_hz=300.0, shot_rate_hz=1.0, photoreceptor_noise=True),
+    "hard, photoreceptor noise": events.SensorModel(
+        theta_sigma=0.03, cutoff_hz=300.0, shot_rate_hz=1.0, photoreceptor_noise=True
+    ),
 }
-ASKED = {"hard, ideal": 120.0, "hard, full noise": 60.0, "memory, forward + backward": 120.0}  # million pixels per second, two cores
+ASKED = {
+    "hard, ideal": 120.0,
+    "hard, full noise": 60.0,
+    "memory, forward + backward": 120.0,
+}  # million pixels per second, two cores
 
 
 @dataclass(frozen=True)
@@ -48,7 +64,10 @@ def study(run: Run[Config]) -> None:
     with run.progress(len(sizes) * len(SPEED_PX) + 1, "timing") as progress:
         for size, (height, width, count) in sizes.items():
             for pace, speed_px in SPEED_PX.items():
-                rows += [(size, pace, *row) for row in timed(texture(height, width, count, speed_px, run.config.seed), repeats)]
+                rows += [
+                    (size, pace, *row)
+                    for row in timed(texture(height, width, count, speed_px, run.config.seed), repeats)
+                ]
                 progress.advance()
         memory = stream(run.config.seed, streamed)
         progress.advance()
@@ -59,23 +78,64 @@ def study(run: Run[Config]) -> None:
         if fired is not None:
             run.record(**{f"{key}_events_per_pixel_frame": fired})
         if name in ASKED and rate < ASKED[name]:
-            missed.append(f"{name} ({pace}, {size}): {rate:.0f} of {ASKED[name]:.0f} million pixels per second")
+            missed.append(
+                f"{name} ({pace}, {size}): {rate:.0f} of {ASKED[name]:.0f} million pixels per second"
+            )
     grown = max(memory) - memory[len(memory) // 10]
-    run.record(streamed_frames=streamed, stream_first_mb=memory[0], stream_tenth_mb=memory[len(memory) // 10], stream_last_mb=memory[-1], stream_growth_mb=grown)
-    run.section("Speed", "Million pixels per second by the clock and per second of the processor; cost in copies of the frames in memory, timed in the same run.")
-    columns = ("size", "pace", "what", "Mpixel/s", "asked", "Mpixel per CPU-second", "copies", "events per pixel and frame")
-    run.table("Event stage", columns, [(size, pace, name, rate, ASKED.get(name), cpu, copies, fired) for size, pace, name, rate, cpu, copies, fired in rows])
-    run.section("Memory", f"{streamed:,} frames of 32 x 32 pixels through a sensor with all noise, 500 at a time.")
-    run.figure(figure(memory, streamed), "memory", "Resident memory while frames are streamed: flat after the first chunks.")
+    run.record(
+        streamed_frames=streamed,
+        stream_first_mb=memory[0],
+        stream_tenth_mb=memory[len(memory) // 10],
+        stream_last_mb=memory[-1],
+        stream_growth_mb=grown,
+    )
+    run.section(
+        "Speed",
+        "Million pixels per second by the clock and per second of the processor; cost in copies of the "
+        "frames in memory, timed in the same run.",
+    )
+    columns = (
+        "size",
+        "pace",
+        "what",
+        "Mpixel/s",
+        "asked",
+        "Mpixel per CPU-second",
+        "copies",
+        "events per pixel and frame",
+    )
+    run.table(
+        "Event stage",
+        columns,
+        [
+            (size, pace, name, rate, ASKED.get(name), cpu, copies, fired)
+            for size, pace, name, rate, cpu, copies, fired in rows
+        ],
+    )
+    run.section(
+        "Memory", f"{streamed:,} frames of 32 x 32 pixels through a sensor with all noise, 500 at a time."
+    )
+    run.figure(
+        figure(memory, streamed),
+        "memory",
+        "Resident memory while frames are streamed: flat after the first chunks.",
+    )
     run.card("memory growth", f"{grown:.1f} MB", f"{streamed:,} frames, after the first tenth")
-    run.finish("Speed of the event stage", "All figures are met." if not missed else f"**Missed:** {'; '.join(missed)}.")
+    run.finish(
+        "Speed of the event stage",
+        "All figures are met." if not missed else f"**Missed:** {'; '.join(missed)}.",
+    )
 
 
 def texture(height, width, count, speed_px, seed):
     """[T, H, W] frames 20 to 220 of a smooth random texture that drifts along x by ``speed_px`` per frame."""
     generator = torch.Generator().manual_seed(seed)
-    coarse = torch.rand(1, 1, height // 4 + 2, width // 4 + 8 + int(count * speed_px) // 4, generator=generator)
-    fine = torch.nn.functional.interpolate(coarse, scale_factor=4, mode="bicubic")[0, 0].clamp(0, 1) * 200 + 20
+    coarse = torch.rand(
+        1, 1, height // 4 + 2, width // 4 + 8 + int(count * speed_px) // 4, generator=generator
+    )
+    fine = (
+        torch.nn.functional.interpolate(coarse, scale_factor=4, mode="bicubic")[0, 0].clamp(0, 1) * 200 + 20
+    )
     frames = torch.empty(count, height, width)
     for k in range(count):
         whole, part = divmod(k * speed_px, 1.0)
@@ -86,7 +146,9 @@ def texture(height, width, count, speed_px, seed):
 
 def timed(frames, repeats):
     """Rows (what, Mpixel/s, Mpixel per CPU-second, copies, events per pixel and frame) of every layer."""
-    t_s, pixels, rows = torch.arange(len(frames), dtype=torch.float64) / FPS, frames.numel() / 1e6, []
+    t_s = torch.arange(len(frames), dtype=torch.float64) / FPS
+    pixels = frames.numel() / 1e6
+    rows = []
     target = torch.empty_like(frames)
     copy = measure(lambda: target.copy_(frames), repeats).wall
     leaf = frames.clone().requires_grad_()
@@ -96,7 +158,9 @@ def timed(frames, repeats):
         leaf.grad = None
         layer(leaf).backward(weight)
 
-    works: dict[str, Callable] = {name: lambda sensor=sensor: events.simulate(frames, t_s, sensor) for name, sensor in SENSORS.items()}
+    works: dict[str, Callable] = {
+        name: lambda sensor=sensor: events.simulate(frames, t_s, sensor) for name, sensor in SENSORS.items()
+    }
     works["hard, v2e timing"] = lambda: events.simulate(frames, t_s, events.SensorModel(timing="v2e"))
     works["memory, forward"] = lambda: events.memory(frames, THETA, THETA)
     works["memory, forward + backward"] = lambda: differentiated(lambda f: events.memory(f, THETA, THETA)[0])
@@ -111,7 +175,9 @@ def timed(frames, repeats):
 
 def stream(seed, count, chunk=500):
     """Resident memory after every chunk, MB; the events are dropped."""
-    base, state, memory = texture(32, 32, chunk, 0.05, seed), events.SensorState(), []
+    base = texture(32, 32, chunk, 0.05, seed)
+    state = events.SensorState()
+    memory = []
     for first in range(0, count, chunk):
         t_s = torch.arange(first, first + chunk, dtype=torch.float64) / FPS
         events.simulate(base, t_s, NOISE, state=state)

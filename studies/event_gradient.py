@@ -1,9 +1,14 @@
-"""Do the differentiable event layers point the way the hard sensor goes? Against differences of hard counts, by layer, frame rate and direction.
+"""Do the differentiable event layers point the way the hard sensor goes? Against differences of hard counts,
+by layer, frame rate and direction.
 
-A camera passes a textured plane behind a thin lens. Counts are pooled over blocks, quarters of the time and polarity; one direction each changes the
-contrast of the scene, the focus of the lens, or the pose of the camera, by enough to move log levels by about a threshold. The derivative of every
-pooled count along the direction, averaged over the step, is set beside the difference of the hard counts over the step. A pixel's count is a whole number
-that depends on where inside its threshold it began; the differences are means over random beginnings, the same on both sides.
+A camera passes a textured plane behind a thin lens. Counts are pooled over blocks, quarters of the time and
+polarity; one direction each changes the
+contrast of the scene, the focus of the lens, or the pose of the camera, by enough to move log levels by about
+a threshold. The derivative of every
+pooled count along the direction, averaged over the step, is set beside the difference of the hard counts over
+the step. A pixel's count is a whole number
+that depends on where inside its threshold it began; the differences are means over random beginnings, the
+same on both sides.
 """
 
 import itertools
@@ -16,10 +21,15 @@ import torch
 
 from codesign import events, lens, pose, render
 from scenes import textures, trajectories
-from studies.run import Run, StudyConfig, main
+from studies.frame.run import Run, StudyConfig, main
 
-SIZE_PX, PITCH_MM, DURATION_S, THETA, SAMPLES = 64, 0.06, 0.1, 0.15, 4
-BLOCK_PX, PARTS = 16, 4
+SIZE_PX = 64
+PITCH_MM = 0.06
+DURATION_S = 0.1
+THETA = 0.15
+SAMPLES = 4
+BLOCK_PX = 16
+PARTS = 4
 RATES_HZ = (60, 240, 1000)
 REFERENCE_HZ = 5000
 ASKED = {"cosine": 0.98, "scale": (0.9, 1.1), "count_error": 0.02}
@@ -31,7 +41,9 @@ LAYERS = {
     "expected, spread 0.15": lambda frames: events.expected(frames, THETA, THETA, 0.15)[0],
     "memory": lambda frames: events.memory(frames, THETA, THETA)[0],
 }
-FAST, SLOW_HZ = ("sigmoid", "memory"), 240  # the others are loops of torch over frames: compared up to this rate
+# the others are loops of torch over frames: compared up to this rate
+FAST = ("sigmoid", "memory")
+SLOW_HZ = 240
 
 
 @dataclass(frozen=True)
@@ -68,10 +80,18 @@ class Case:
         stand = torch.eye(4, dtype=torch.float64)
         stand[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
         # periods of 7 px and more: what a lens slightly out of focus still shows
-        self.plane = render.TexturedPlane(*textures.waves(seed, 12, finest_period_m=0.08, coarsest_period_m=0.5, log_contrast=1.2), T_world_plane=stand, dtype=torch.float64)
+        self.plane = render.TexturedPlane(
+            *textures.waves(seed, 12, finest_period_m=0.08, coarsest_period_m=0.5, log_contrast=1.2),
+            T_world_plane=stand,
+            dtype=torch.float64,
+        )
         generator = torch.Generator().manual_seed(seed)
         angle = float(torch.rand((), generator=generator)) * 2 * np.pi
-        self.velocity_m_s = (1.2 * np.cos(angle), 0.4 * float(torch.randn((), generator=generator)), 1.2 * np.sin(angle))
+        self.velocity_m_s = (
+            1.2 * np.cos(angle),
+            0.4 * float(torch.randn((), generator=generator)),
+            1.2 * np.sin(angle),
+        )
 
     @torch.no_grad()
     def frames(self, rate_hz, direction, s):
@@ -86,7 +106,11 @@ class Case:
         optics = lens.ThinLens(torch.tensor(image_mm, dtype=torch.float64), focal_mm, focal_mm / 2.5)
         frames = render.frames(render.Camera(optics, SIZE_PX, SIZE_PX, PITCH_MM, SAMPLES), self.plane, path)
         level = frames.log()
-        return (level.mean() + (1 + direction.contrast * s) * (level - level.mean())).exp() if direction.contrast else frames
+        return (
+            (level.mean() + (1 + direction.contrast * s) * (level - level.mean())).exp()
+            if direction.contrast
+            else frames
+        )
 
 
 def times(rate_hz):
@@ -105,7 +129,9 @@ def pooled(counts):
 def study(run: Run[Config]) -> None:
     scenes = 1 if run.config.quick else run.config.scenes
     rates = RATES_HZ[:2] if run.config.quick else RATES_HZ
-    rows, slopes, differences = [], {}, {}
+    rows = []
+    slopes = {}
+    differences = {}
     with run.progress(scenes * len(rates), "differentiating") as progress:
         for seed in range(run.config.seed, run.config.seed + scenes):
             case = Case(seed)
@@ -115,44 +141,89 @@ def study(run: Run[Config]) -> None:
                     differences.setdefault(key, []).append(difference)
                 progress.advance()
     for key, found in slopes.items():
-        slope, difference = torch.cat(found), torch.cat(differences[key])
-        rows.append((*key, float(slope @ difference / (slope.norm() * difference.norm())), float(slope @ difference / (difference @ difference))))
+        slope = torch.cat(found)
+        difference = torch.cat(differences[key])
+        rows.append(
+            (
+                *key,
+                float(slope @ difference / (slope.norm() * difference.norm())),
+                float(slope @ difference / (difference @ difference)),
+            )
+        )
         layer, rate_hz, direction = key
         name = f"{layer.split(',')[0]}_{direction}_{rate_hz}fps"
         run.record(**{f"cosine_{name}": rows[-1][3], f"scale_{name}": rows[-1][4]})
-    counts = count_errors(range(run.config.seed, run.config.seed + scenes), 1000 if run.config.quick else REFERENCE_HZ)
+    counts = count_errors(
+        range(run.config.seed, run.config.seed + scenes), 1000 if run.config.quick else REFERENCE_HZ
+    )
     for (layer, rate_hz), error in counts.items():
         run.record(**{f"count_error_{layer.split(',')[0]}_{rate_hz}fps": error})
     low, high = ASKED["scale"]
-    missed = [f"{direction} at {rate} fps (cosine {cosine:.3f}, scale {scale:.3f})" for layer, rate, direction, cosine, scale in rows
-              if layer == "memory" and not (cosine >= ASKED["cosine"] and low <= scale <= high)]
-    missed += [f"counts at {rate} fps ({error:.1%})" for (layer, rate), error in counts.items() if layer == "memory" and rate >= 240 and error > ASKED["count_error"]]
-    run.section("Gradients", f"Asked of the memory layer: cosine at least {ASKED['cosine']}, scale {low} to {high}.")
-    run.table("Derivatives of pooled counts against differences of hard counts", ("layer", "frames per second", "direction", "cosine", "scale"), rows)
+    missed = [
+        f"{direction} at {rate} fps (cosine {cosine:.3f}, scale {scale:.3f})"
+        for layer, rate, direction, cosine, scale in rows
+        if layer == "memory" and not (cosine >= ASKED["cosine"] and low <= scale <= high)
+    ]
+    missed += [
+        f"counts at {rate} fps ({error:.1%})"
+        for (layer, rate), error in counts.items()
+        if layer == "memory" and rate >= 240 and error > ASKED["count_error"]
+    ]
+    run.section(
+        "Gradients", f"Asked of the memory layer: cosine at least {ASKED['cosine']}, scale {low} to {high}."
+    )
+    run.table(
+        "Derivatives of pooled counts against differences of hard counts",
+        ("layer", "frames per second", "direction", "cosine", "scale"),
+        rows,
+    )
     run.text("\n".join(f"- **{d.name}**: {d.noun}." for d in DIRECTIONS))
-    run.figure(figure(rows, rates), "gradients", "Cosine and scale by frame rate; a line per direction. Scales beyond the axis are in the table.")
-    run.section("Counts", f"Signed sums hide nothing here: the error is the sum of |difference| of counts per polarity and sequence over the total, against the hard sensor at {REFERENCE_HZ} fps.")
-    run.table("Error of the total counts", ("layer", "frames per second", "error"), [(*key, error) for key, error in counts.items()])
-    run.finish("Gradients of the event layers", "The memory layer meets every figure asked." if not missed else f"**Missed by the memory layer:** {'; '.join(missed)}.")
+    run.figure(
+        figure(rows, rates),
+        "gradients",
+        "Cosine and scale by frame rate; a line per direction. Scales beyond the axis are in the table.",
+    )
+    run.section(
+        "Counts",
+        "Signed sums hide nothing here: the error is the sum of |difference| of counts per polarity and "
+        f"sequence over the total, against the hard sensor at {REFERENCE_HZ} fps.",
+    )
+    run.table(
+        "Error of the total counts",
+        ("layer", "frames per second", "error"),
+        [(*key, error) for key, error in counts.items()],
+    )
+    run.finish(
+        "Gradients of the event layers",
+        "The memory layer meets every figure asked."
+        if not missed
+        else f"**Missed by the memory layer:** {'; '.join(missed)}.",
+    )
 
 
 def compare(case, rate_hz):
-    """Key, derivative averaged over the step, and difference of hard counts, for every layer and direction."""
+    """Key, derivative averaged over the step, and difference of hard counts, for every layer and
+    direction."""
     for direction in DIRECTIONS:
         along = [case.frames(rate_hz, direction, 2 * k / SECTIONS - 1) for k in range(SECTIONS + 1)]
         difference = (hard_counts(along[-1]) - hard_counts(along[0])) / 2
         for name, layer in LAYERS.items():
             if rate_hz > SLOW_HZ and name not in FAST:
                 continue
-            # to second order, the derivative over a section is that at the mean of its ends, along their difference
-            slopes = [derivative(layer, (first + second) / 2, second - first) for first, second in itertools.pairwise(along)]
+            # to second order, the derivative over a section is that at the mean of its ends, along their
+            # difference
+            slopes = [
+                derivative(layer, (first + second) / 2, second - first)
+                for first, second in itertools.pairwise(along)
+            ]
             yield (name, rate_hz, direction.name), torch.stack(slopes).sum(0) / 2, difference
 
 
 @torch.no_grad()
 def hard_counts(frames):
     """Pooled hard counts, the mean over beginnings evenly spread inside the threshold."""
-    generator, level = torch.Generator().manual_seed(0), events.lin_log(frames[:1])[0]
+    generator = torch.Generator().manual_seed(0)
+    level = events.lin_log(frames[:1])[0]
     total = 0.0
     for _ in range(BEGINNINGS):
         begun = level + THETA * (torch.rand(level.shape, generator=generator, dtype=level.dtype) - 0.5)
@@ -161,23 +232,32 @@ def hard_counts(frames):
 
 
 def derivative(layer, frames, tangent):
-    """Derivative of every pooled count along a tangent of the frames. Pixels are independent: one backward pass serves all blocks of a part and polarity."""
+    """Derivative of every pooled count along a tangent of the frames. Pixels are independent: one backward
+    pass serves all blocks of a part and polarity."""
     frames = frames.clone().requires_grad_()
     counts = layer(frames)
-    part, blocks, found = torch.arange(len(counts)) * PARTS // len(counts), SIZE_PX // BLOCK_PX, []
+    part = torch.arange(len(counts)) * PARTS // len(counts)
+    blocks = SIZE_PX // BLOCK_PX
+    found = []
     for time in range(PARTS):
         for polarity in (0, 1):
             (grad,) = torch.autograd.grad(counts[part == time, polarity].sum(), frames, retain_graph=True)
-            found.append((grad * tangent).sum(0).reshape(blocks, BLOCK_PX, blocks, BLOCK_PX).sum((1, 3)).flatten())
+            found.append(
+                (grad * tangent).sum(0).reshape(blocks, BLOCK_PX, blocks, BLOCK_PX).sum((1, 3)).flatten()
+            )
     return torch.cat(found)
 
 
 def count_errors(seeds, reference_hz):
     """Layer and rate -> error of the totals per polarity against hard events at the reference rate."""
-    wrong, total, still = {}, 0.0, Direction("still", "nothing")
+    wrong = {}
+    total = 0.0
+    still = Direction("still", "nothing")
     for seed in seeds:
         case = Case(seed)
-        stream = events.simulate(case.frames(reference_hz, still, 0.0), times(reference_hz), events.SensorModel(THETA, THETA))
+        stream = events.simulate(
+            case.frames(reference_hz, still, 0.0), times(reference_hz), events.SensorModel(THETA, THETA)
+        )
         truth = torch.tensor([int((stream.p == polarity).sum()) for polarity in (1, -1)], dtype=torch.float64)
         total += float(truth.sum())
         for rate_hz in (*RATES_HZ[:2], 500, 1000):
@@ -195,7 +275,15 @@ def figure(rows, rates):
         for number, direction in enumerate(DIRECTIONS):
             mine = [row for row in rows if row[0] == layer and row[2] == direction.name]
             for axis, column in zip(axes, (3, 4), strict=True):
-                axis.plot([row[1] for row in mine], [row[column] for row in mine], "o-", color=colour, label=layer if number == 0 else None, markersize=4, linewidth=1)
+                axis.plot(
+                    [row[1] for row in mine],
+                    [row[column] for row in mine],
+                    "o-",
+                    color=colour,
+                    label=layer if number == 0 else None,
+                    markersize=4,
+                    linewidth=1,
+                )
     for axis, title in zip(axes, ("cosine", "scale"), strict=True):
         axis.axhline(1, color="0.6", linewidth=0.8)
         axis.set(xscale="log", xlabel="frames per second", title=title, xticks=rates, xticklabels=rates)

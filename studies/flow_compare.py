@@ -1,6 +1,8 @@
-"""The refiner against a plain and a spiking network of as many weights: the same windows, the same processor time, several seeds.
+"""The refiner against a plain and a spiking network of as many weights: the same windows, the same processor
+time, several seeds.
 
-Every training is a run of studies.train_flow in a folder below; those that are done are kept when the study goes on with --resume. Then all networks are
+Every training is a run of studies.train_flow in a folder below; those that are done are kept when the study
+goes on with --resume. Then all networks are
 judged on the same windows.
 """
 
@@ -15,14 +17,18 @@ import matplotlib.pyplot as plt
 from codesign import flow
 from codesign.errors import CodesignError, DomainError
 from codesign.flow.refiner import Refiner
-from studies.flow_worlds import ALL, WorldWindows
-from studies.run import Run, StudyConfig, main
-from studies.train_flow_sources import UNSEEN, VALIDATION, Shape
-from studies.train_flow_validate import batches, score
+from scenes.flow_worlds import ALL, WorldWindows
+from studies.frame.run import Run, StudyConfig, main
+from studies.train_flow.sources import UNSEEN, VALIDATION, Shape
+from studies.train_flow.validate import batches, score
 
 NAMES = {"refiner": "refiner", "flownet-events": "FlowNetEvents", "spike-flownet": "spiking encoder"}
 RIVALS = ("flownet-events", "spike-flownet")
-RATES = {"refiner": 1e-3, "flownet-events": 2e-3, "spike-flownet": 3e-3}  # found in short trials of 300 to 750 steps (1e-3 and 3e-3 for the spiking network)
+RATES = {
+    "refiner": 1e-3,
+    "flownet-events": 2e-3,
+    "spike-flownet": 3e-3,
+}  # found in short trials of 300 to 750 steps (1e-3 and 3e-3 for the spiking network)
 SEED = 55  # of what is judged here
 POLL_S = 1.0
 
@@ -36,7 +42,7 @@ class Config(StudyConfig):
     weights: int = 0
     """Weights of the rivals; 0 for as many as the refiner has."""
     mix: str = "delivered"
-    """Windows to train on (studies.train_flow_sources)."""
+    """Windows to train on (studies.train_flow.sources)."""
     windows: int = 128
     """Windows of every set of flat textures to judge on."""
     world_windows: int = 40
@@ -47,31 +53,89 @@ class Config(StudyConfig):
 
 def study(run: Run[Config]) -> None:
     config = run.config
-    if not config.seeds or config.cpu_minutes <= 0 or config.jobs < 1 or min(config.windows, config.world_windows) < 1:
-        raise DomainError("give at least one seed, one window of each kind and one job, and more than 0 minutes.")
+    if (
+        not config.seeds
+        or config.cpu_minutes <= 0
+        or config.jobs < 1
+        or min(config.windows, config.world_windows) < 1
+    ):
+        raise DomainError(
+            "give at least one seed, one window of each kind and one job, and more than 0 minutes."
+        )
     wanted = [(network, seed) for seed in config.seeds for network in NAMES]
     _train(run, wanted)
     networks = {job: flow.load(_folder(run, *job) / "network.safetensors").eval() for job in wanted}
     found = _judge(run, networks)
-    rows, met = [], 0
+    rows = []
+    met = 0
     for name, scores in found.items():
         ratios = {network: [scores[network, seed].ratio for seed in config.seeds] for network in NAMES}
-        share = {rival: max(a / b for a, b in zip(ratios["refiner"], ratios[rival], strict=True)) for rival in RIVALS}
+        share = {
+            rival: max(a / b for a, b in zip(ratios["refiner"], ratios[rival], strict=True))
+            for rival in RIVALS
+        }
         met += sum(value <= 0.5 for value in share.values())
         for network in NAMES:
-            run.record(**{f"{name}_{_key(network)}_ratio_seed{seed}": value for seed, value in zip(config.seeds, ratios[network], strict=True)})
-            run.record(**{f"{name}_{_key(network)}_worse_percent_mean": statistics.fmean(scores[network, seed].worse_percent for seed in config.seeds)})
-        run.record(**{f"{name}_refiner_over_{_key(rival)}_largest": share[rival] for rival in RIVALS}, **{f"{name}_closed_form_ratio": scores["closed form"].ratio})
+            run.record(
+                **{
+                    f"{name}_{_key(network)}_ratio_seed{seed}": value
+                    for seed, value in zip(config.seeds, ratios[network], strict=True)
+                }
+            )
+            run.record(
+                **{
+                    f"{name}_{_key(network)}_worse_percent_mean": statistics.fmean(
+                        scores[network, seed].worse_percent for seed in config.seeds
+                    )
+                }
+            )
+        run.record(
+            **{f"{name}_refiner_over_{_key(rival)}_largest": share[rival] for rival in RIVALS},
+            **{f"{name}_closed_form_ratio": scores["closed form"].ratio},
+        )
         run.record(**{f"{name}_zero_flow_px": scores["closed form"].zero_flow_px})
-        rows.append([name.replace("_", " "), round(scores["closed form"].ratio, 3), *[_spread(ratios[network]) for network in NAMES], *[round(share[rival], 2) for rival in RIVALS]])
-    weights = {network: sum(p.numel() for p in networks[network, config.seeds[0]].parameters()) for network in NAMES}
-    run.record(**{f"{_key(network)}_weights": weights[network] for network in NAMES}, shares_met=met, shares_asked=2 * len(rows))
+        rows.append(
+            [
+                name.replace("_", " "),
+                round(scores["closed form"].ratio, 3),
+                *[_spread(ratios[network]) for network in NAMES],
+                *[round(share[rival], 2) for rival in RIVALS],
+            ]
+        )
+    weights = {
+        network: sum(p.numel() for p in networks[network, config.seeds[0]].parameters()) for network in NAMES
+    }
+    run.record(
+        **{f"{_key(network)}_weights": weights[network] for network in NAMES},
+        shares_met=met,
+        shares_asked=2 * len(rows),
+    )
     run.card("Half of a rival's error or less", f"{met} of {2 * len(rows)}", "sets and rivals, worst seed")
-    columns = ["windows", "closed form", *NAMES.values(), *[f"refiner / {NAMES[rival]}, worst seed" for rival in RIVALS]]
-    run.table("Endpoint error over that of zero flow", columns, rows, f"Least to largest of {len(config.seeds)} seeds. Asked: at most half of either rival.")
-    run.table("Networks", ["network", "weights", "learning rate"], [[NAMES[n], weights[n], RATES[n]] for n in NAMES])
-    run.figure(_figure(found, config.seeds), "compare", "Error over that of zero flow; a dot is a seed, the line is the closed form.")
-    run.finish("Refiner against networks of its size", f"{config.cpu_minutes:g} minutes of processor time each; textures, motions and worlds of the judging were never trained on.")
+    columns = [
+        "windows",
+        "closed form",
+        *NAMES.values(),
+        *[f"refiner / {NAMES[rival]}, worst seed" for rival in RIVALS],
+    ]
+    run.table(
+        "Endpoint error over that of zero flow",
+        columns,
+        rows,
+        f"Least to largest of {len(config.seeds)} seeds. Asked: at most half of either rival.",
+    )
+    run.table(
+        "Networks", ["network", "weights", "learning rate"], [[NAMES[n], weights[n], RATES[n]] for n in NAMES]
+    )
+    run.figure(
+        _figure(found, config.seeds),
+        "compare",
+        "Error over that of zero flow; a dot is a seed, the line is the closed form.",
+    )
+    run.finish(
+        "Refiner against networks of its size",
+        f"{config.cpu_minutes:g} minutes of processor time each; textures, motions and worlds of the "
+        "judging were never trained on.",
+    )
 
 
 def _folder(run, network, seed):
@@ -87,13 +151,18 @@ def _train(run, wanted):
             while waiting or active:
                 while waiting and len(active) < run.config.jobs:
                     job = waiting.pop(0)
-                    active[job] = subprocess.Popen(_command(run, *job), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+                    active[job] = subprocess.Popen(
+                        _command(run, *job), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+                    )
                 time.sleep(POLL_S)
                 for job in [job for job, process in active.items() if process.poll() is not None]:
                     process = active.pop(job)
                     said = (process.stderr.read() if process.stderr else "").strip().splitlines()
                     if process.returncode != 0:
-                        raise CodesignError(f"the training of {job[0]} with seed {job[1]} ended with code {process.returncode}: {said[-1] if said else 'no word'}")
+                        raise CodesignError(
+                            f"the training of {job[0]} with seed {job[1]} ended with code "
+                            f"{process.returncode}: {said[-1] if said else 'no word'}"
+                        )
                     progress.advance()
         finally:
             for process in active.values():
@@ -101,11 +170,23 @@ def _train(run, wanted):
 
 
 def _command(run, network, seed):
-    config, folder = run.config, _folder(run, network, seed)
+    config = run.config
+    folder = _folder(run, network, seed)
     if (folder / "checkpoint").exists():
         return [sys.executable, "-m", "studies.train_flow", "--resume", str(folder)]
-    options = {"network": network, "seed": seed, "cpu-minutes": config.cpu_minutes, "mix": config.mix, "learning-rate": RATES[network], "out": folder}
-    options |= {"final-windows": 8, "validate-every": 10**9, "validate-on": "layers"}  # all are judged together afterwards
+    options = {
+        "network": network,
+        "seed": seed,
+        "cpu-minutes": config.cpu_minutes,
+        "mix": config.mix,
+        "learning-rate": RATES[network],
+        "out": folder,
+    }
+    options |= {
+        "final-windows": 8,
+        "validate-every": 10**9,
+        "validate-on": "layers",
+    }  # all are judged together afterwards
     if network != "refiner":
         options["weights"] = config.weights or sum(p.numel() for p in Refiner().parameters())
     given = [word for name, value in options.items() for word in (f"--{name}", str(value))]
@@ -114,9 +195,16 @@ def _command(run, network, seed):
 
 def _judge(run, networks):
     """Set -> who -> Score, every network on the same windows."""
-    config, shape, bins = run.config, Shape(64, 64, 8), 8
-    sets = {name: (make(shape, SEED), 8 if config.quick else config.windows) for name, make in VALIDATION.items()}
-    sets["worlds"] = (WorldWindows(ALL, seed=UNSEEN + SEED, bins=bins), 5 if config.quick else config.world_windows)
+    config = run.config
+    shape = Shape(64, 64, 8)
+    bins = 8
+    sets = {
+        name: (make(shape, SEED), 8 if config.quick else config.windows) for name, make in VALIDATION.items()
+    }
+    sets["worlds"] = (
+        WorldWindows(ALL, seed=UNSEEN + SEED, bins=bins),
+        5 if config.quick else config.world_windows,
+    )
     estimators = {"closed form": flow.estimate_lk, **networks}
     found = {}
     with run.progress(len(sets), "judging") as progress:
@@ -140,9 +228,25 @@ def _figure(found, seeds):
     for place, scores in enumerate(found.values()):
         for shift, network in enumerate(NAMES):
             label = NAMES[network] if place == 0 else None
-            axes.plot([scores[network, seed].ratio for seed in seeds], [place + 0.2 * (shift - 1)] * len(seeds), "o", color=f"C{shift}", label=label)
-        axes.plot([scores["closed form"].ratio] * 2, [place - 0.35, place + 0.35], color="0.4", label="closed form" if place == 0 else None)
-    axes.set(yticks=range(len(found)), yticklabels=[name.replace("_", " ") for name in found], xlabel="endpoint error over that of zero flow", xlim=(0, None))
+            axes.plot(
+                [scores[network, seed].ratio for seed in seeds],
+                [place + 0.2 * (shift - 1)] * len(seeds),
+                "o",
+                color=f"C{shift}",
+                label=label,
+            )
+        axes.plot(
+            [scores["closed form"].ratio] * 2,
+            [place - 0.35, place + 0.35],
+            color="0.4",
+            label="closed form" if place == 0 else None,
+        )
+    axes.set(
+        yticks=range(len(found)),
+        yticklabels=[name.replace("_", " ") for name in found],
+        xlabel="endpoint error over that of zero flow",
+        xlim=(0, None),
+    )
     axes.invert_yaxis()
     axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
     return figure

@@ -1,7 +1,10 @@
-"""How true the traced lenses are: rays, first-order figures, spots and ray derivatives against independent programs.
+"""How true the traced lenses are: rays, first-order figures, spots and ray derivatives against independent
+programs.
 
-Three published lenses (Cooke triplet, double Gauss, a plano-convex singlet) are traced in float64 and float32. The truth is a folder of reference
-files: 54 rays per lens traced with 30 digits, focal lengths, nine spot diagrams by a public ray tracer, and derivatives of rays with respect to
+Three published lenses (Cooke triplet, double Gauss, a plano-convex singlet) are traced in float64 and
+float32. The truth is a folder of reference
+files: 54 rays per lens traced with 30 digits, focal lengths, nine spot diagrams by a public ray tracer, and
+  derivatives of rays with respect to
 curvatures, thicknesses and indices with 32 digits, and Seidel sums of every surface by the same ray tracer.
 """
 
@@ -17,7 +20,7 @@ import torch
 from codesign import lens
 from codesign.errors import FileFormatError
 from codesign.lens.seidel import seidel_sums
-from studies.run import Run, StudyConfig, main
+from studies.frame.run import Run, StudyConfig, main
 
 FILES = {"cooke-triplet": "cooke_triplet.json", "double-gauss": "double_gauss.json", "la1509": "la1509.json"}
 PRECISION = {"float64": torch.float64, "float32": torch.float32}
@@ -34,13 +37,16 @@ FIGURES = {
 }
 SLOTS = {"c": "curvature_per_mm", "t": "thickness_mm", "n": "index_offset"}
 RAY = ("x", "y", "L", "M", "N", "opl")
-SMALL = 1e-3  # a derivative below this share of the largest to a parameter of its kind (many vanish by symmetry) is judged against that share
+# a derivative below this share of the largest to a parameter of its kind (many vanish by symmetry) is judged
+# against that share
+SMALL = 1e-3
 
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
     references: Path | None = None
-    """Folder that holds cooke_triplet.json, double_gauss.json and la1509.json; ../shared/refs/lens beside the repository when left out."""
+    """Folder that holds cooke_triplet.json, double_gauss.json and la1509.json; ../shared/refs/lens beside the
+    repository when left out."""
 
 
 def study(run: Run[Config]) -> None:
@@ -53,7 +59,9 @@ def study(run: Run[Config]) -> None:
                 errors[precision, name] = compare(name, page, dtype)
                 progress.advance(position_mm=errors[precision, name]["max_position_error_mm"])
     for (precision, name), found in errors.items():
-        run.record(**{f"{figure}_{precision}_{name.replace('-', '_')}": value for figure, value in found.items()})
+        run.record(
+            **{f"{figure}_{precision}_{name.replace('-', '_')}": value for figure, value in found.items()}
+        )
     missed = []
     for column, precision in enumerate(PRECISION):
         for figure, (label, *limits) in FIGURES.items():
@@ -62,8 +70,13 @@ def study(run: Run[Config]) -> None:
             run.record(**{f"{figure}_{precision}": worst})
             if limit is not None and worst > limit:
                 missed.append(f"{label} ({precision}): {worst:.2g} against {limit:g}")
-    run.record(focal_length_relative_error=run.metrics["focal_length_relative_error_float64"], spot_relative_error=run.metrics["spot_relative_error_float64"],
-               derivative_relative_error=run.metrics["derivative_relative_error_float64"], seidel_relative_error=run.metrics["seidel_relative_error_float64"], figures_missed=len(missed))
+    run.record(
+        focal_length_relative_error=run.metrics["focal_length_relative_error_float64"],
+        spot_relative_error=run.metrics["spot_relative_error_float64"],
+        derivative_relative_error=run.metrics["derivative_relative_error_float64"],
+        seidel_relative_error=run.metrics["seidel_relative_error_float64"],
+        figures_missed=len(missed),
+    )
     show(run, errors, missed)
 
 
@@ -80,49 +93,78 @@ def read_page(path):
         page = json.loads(Path(path).read_text(encoding="utf-8"))
         missing = {"wavelengths_um", "rays", "spots", "first_order", "ray_parameter_gradients_d"} - set(page)
     except OSError as error:
-        raise FileFormatError(f"the lens references are not there ('{path}': {error.strerror}); name their folder with --references.") from error
+        raise FileFormatError(
+            f"the lens references are not there ('{path}': {error.strerror}); name their folder with "
+            "--references."
+        ) from error
     except (ValueError, TypeError) as error:
-        raise FileFormatError(f"'{path}' is not a file of lens references ({error}); name their folder with --references.") from error
+        raise FileFormatError(
+            f"'{path}' is not a file of lens references ({error}); name their folder with --references."
+        ) from error
     if missing:
-        raise FileFormatError(f"'{path}' lacks {', '.join(sorted(missing))}; name a folder of lens references with --references.")
+        raise FileFormatError(
+            f"'{path}' lacks {', '.join(sorted(missing))}; name a folder of lens references with "
+            "--references."
+        )
     return page
 
 
 def compare(name, page, dtype=torch.float64):
     """Errors of a named lens against a reference page.
 
-    Args: name: catalogue name. page: dictionary of a reference file. dtype: precision of the lens and its rays.
+    Args: name: catalogue name. page: dictionary of a reference file. dtype: precision of the lens and its
+      rays.
     Returns: dictionary with the keys of FIGURES.
     """
     geo = lens.load(name, dtype)
-    return {**_rays(geo, page, dtype), **_seidel(geo, page), "focal_length_relative_error": _first_order(geo, page), "spot_relative_error": _spots(geo, page), "derivative_relative_error": _derivatives(geo, page, dtype)}
+    return {
+        **_rays(geo, page, dtype),
+        **_seidel(geo, page),
+        "focal_length_relative_error": _first_order(geo, page),
+        "spot_relative_error": _spots(geo, page),
+        "derivative_relative_error": _derivatives(geo, page, dtype),
+    }
 
 
 def _rays(geo, page, dtype):
     worst = torch.zeros(6, dtype=torch.float64)
     for line, wavelength_um in page["wavelengths_um"].items():
         rows = [row for row in page["rays"] if row["w"] == line]
-        start, towards = (torch.tensor([row[key] for row in rows], dtype=torch.float64).to(dtype) for key in ("start", "dir"))
+        start, towards = (
+            torch.tensor([row[key] for row in rows], dtype=torch.float64).to(dtype)
+            for key in ("start", "dir")
+        )
         out = geo.trace(start, towards, wavelength_um)
         found = torch.cat([out.position_mm[:, :2], out.direction, out.optical_path_mm[:, None]], 1).detach()
         truth = torch.tensor([[float(row["mp30"][key]) for key in RAY] for row in rows], dtype=torch.float64)
         worst = torch.maximum(worst, (found - truth).abs().amax(0))
-    return {"max_position_error_mm": float(worst[:2].max()), "max_direction_error": float(worst[2:5].max()), "max_path_error_mm": float(worst[5])}
+    return {
+        "max_position_error_mm": float(worst[:2].max()),
+        "max_direction_error": float(worst[2:5].max()),
+        "max_path_error_mm": float(worst[5]),
+    }
 
 
 def _first_order(geo, page):
     """Largest relative error of focal length and back focal length at the three lines."""
     worst = 0.0
     for line, wavelength_um in page["wavelengths_um"].items():
-        found, truth = geo.first_order(wavelength_um), page["first_order"][line]
-        worst = max(worst, abs(float(found.efl_mm.detach()) / truth["efl"]["own"] - 1), abs(float(found.bfl_mm.detach()) / truth["bfl"]["own"] - 1))
+        found = geo.first_order(wavelength_um)
+        truth = page["first_order"][line]
+        worst = max(
+            worst,
+            abs(float(found.efl_mm.detach()) / truth["efl"]["own"] - 1),
+            abs(float(found.bfl_mm.detach()) / truth["bfl"]["own"] - 1),
+        )
     return worst
 
 
 def _spots(geo, page):
     worst = 0.0
     for row in page["spots"]:
-        positions, _ = lens.spots(geo, [math.radians(page["half_field_deg"] * row["H"])], lens.WAVELENGTH_UM[row["w"]])
+        positions, _ = lens.spots(
+            geo, [math.radians(page["half_field_deg"] * row["H"])], lens.WAVELENGTH_UM[row["w"]]
+        )
         positions = positions.detach()[0]
         rms_um = 1e3 * float((positions - positions.mean(0)).square().sum(1).mean().sqrt())
         worst = max(worst, abs(rms_um / row["rayoptics"]["rms_centroid_um"] - 1))
@@ -132,11 +174,16 @@ def _spots(geo, page):
 def _derivatives(geo, page, dtype):
     worst = 0.0
     for case in page["ray_parameter_gradients_d"]["rays"]:
-        out = geo.trace(*(torch.tensor([case["ray"][key]], dtype=torch.float64).to(dtype) for key in ("start", "dir")))
+        out = geo.trace(
+            *(torch.tensor([case["ray"][key]], dtype=torch.float64).to(dtype) for key in ("start", "dir"))
+        )
         values = [*out.position_mm[0, :2], *out.direction[0], out.optical_path_mm[0]]
         tensors = [getattr(geo, name) for name in SLOTS.values()]
         found = [torch.autograd.grad(value, tensors, retain_graph=True) for value in values]
-        largest = {kind: max(abs(row["d"][key]) for row in case["grads"] if row["param"] == kind for key in RAY) for kind in SLOTS}
+        largest = {
+            kind: max(abs(row["d"][key]) for row in case["grads"] if row["param"] == kind for key in RAY)
+            for kind in SLOTS
+        }
         for row in case["grads"]:
             at = list(SLOTS).index(row["param"])
             mine = torch.stack([part[at][row["surface"]] for part in found]).double()
@@ -147,44 +194,91 @@ def _derivatives(geo, page, dtype):
 
 
 def _seidel(geo, page):
-    """Largest relative error of S_I to S_V: of the lens against one program, of every surface (over the largest of its kind) against another.
+    """Largest relative error of S_I to S_V: of the lens against one program, of every surface (over the
+    largest of its kind) against another.
 
-    The second puts the object at 1e10 mm, which moves small entries of single surfaces by up to 1e-6 of themselves.
+    The second puts the object at 1e10 mm, which moves small entries of single surfaces by up to 1e-6 of
+    themselves.
     """
-    sums, reference = seidel_sums(geo, math.radians(page["half_field_deg"])), page["seidel_d"]
+    sums = seidel_sums(geo, math.radians(page["half_field_deg"]))
+    reference = page["seidel_d"]
     total = -torch.tensor(reference["optiland_seidels"], dtype=torch.float64)  # the other sign convention
-    each = torch.tensor([reference["rayoptics_per_surface"][f"S-{k}"][:-1] for k in ("I", "II", "III", "IV", "V")], dtype=torch.float64).T
-    worst = lambda found, truth, size: float(((found.detach().double() - truth).abs() / size).max())  # noqa: E731
-    return {"seidel_relative_error": worst(sums.total, total, total.abs()), "seidel_surface_relative_error": worst(sums.per_surface, each, each.abs().amax(0))}
+    each = torch.tensor(
+        [reference["rayoptics_per_surface"][f"S-{k}"][:-1] for k in ("I", "II", "III", "IV", "V")],
+        dtype=torch.float64,
+    ).T
+
+    def worst(found, truth, size):
+        return float(((found.detach().double() - truth).abs() / size).max())
+
+    return {
+        "seidel_relative_error": worst(sums.total, total, total.abs()),
+        "seidel_surface_relative_error": worst(sums.per_surface, each, each.abs().amax(0)),
+    }
 
 
 def show(run, errors, missed):
     """Cards, figure, table and the page."""
     worst = run.metrics
-    run.card("Ray position, float64", f"{worst['max_position_error_mm_float64']:.1e} mm", "largest of 162 rays; asked: 1e-11")
-    run.card("Ray position, float32", f"{worst['max_position_error_mm_float32_double_gauss']:.1e} mm", "double Gauss; asked: 3e-5")
+    run.card(
+        "Ray position, float64",
+        f"{worst['max_position_error_mm_float64']:.1e} mm",
+        "largest of 162 rays; asked: 1e-11",
+    )
+    run.card(
+        "Ray position, float32",
+        f"{worst['max_position_error_mm_float32_double_gauss']:.1e} mm",
+        "double Gauss; asked: 3e-5",
+    )
     run.card("Spots", f"{worst['spot_relative_error']:.1e}", "relative; asked: 1e-9")
     run.card("Ray derivatives", f"{worst['derivative_relative_error']:.1e}", "relative; asked: 1e-8")
     run.card("Seidel sums", f"{worst['seidel_relative_error']:.1e}", "relative; asked: 1e-6")
-    run.section("Error over what is asked", "Each mark is one lens. Left of the line: better than asked. The references' own programs differ by up to 5e-14 mm, which no comparison can undercut.")
-    run.figure(_figure(errors), "errors", "Largest error of each lens, divided by the largest error allowed, on a logarithmic axis.")
+    run.section(
+        "Error over what is asked",
+        "Each mark is one lens. Left of the line: better than asked. The references' own programs differ by "
+        "up to 5e-14 mm, which no comparison can undercut.",
+    )
+    run.figure(
+        _figure(errors),
+        "errors",
+        "Largest error of each lens, divided by the largest error allowed, on a logarithmic axis.",
+    )
     for precision in PRECISION:
-        rows = [(label, *(f"{errors[precision, name][figure]:.1e}" for name in FILES), f"{limits[precision == 'float32']:g}" if limits[precision == "float32"] else None)
-                for figure, (label, *limits) in FIGURES.items()]
+        rows = [
+            (
+                label,
+                *(f"{errors[precision, name][figure]:.1e}" for name in FILES),
+                f"{limits[precision == 'float32']:g}" if limits[precision == "float32"] else None,
+            )
+            for figure, (label, *limits) in FIGURES.items()
+        ]
         run.table(f"Largest errors, {precision}", ("figure", *FILES, "asked"), rows)
-    run.text(f"Derivatives: |found − true| over the true entry, or over {SMALL:g} of the ray's largest derivative to a parameter of the same kind where the entry is smaller than that.")
+    run.text(
+        f"Derivatives: |found − true| over the true entry, or over {SMALL:g} of the ray's largest "
+        "derivative to a parameter of the same kind where the entry is smaller than that."
+    )
     lead = "All figures are met." if not missed else f"**Missed:** {'; '.join(missed)}."
-    run.finish("Lens accuracy", f"Three published lenses against independent programs, in float64 and float32. {lead}")
+    run.finish(
+        "Lens accuracy",
+        f"Three published lenses against independent programs, in float64 and float32. {lead}",
+    )
 
 
 def _figure(errors):
-    rows = [(figure, precision, limits[k]) for k, precision in enumerate(PRECISION) for figure, (_, *limits) in FIGURES.items() if limits[k] is not None]
+    rows = [
+        (figure, precision, limits[k])
+        for k, precision in enumerate(PRECISION)
+        for figure, (_, *limits) in FIGURES.items()
+        if limits[k] is not None
+    ]
     figure, axes = plt.subplots(figsize=(8, 3.4), layout="constrained")
     for marker, name in zip("os^", FILES, strict=True):
         shares = [max(errors[precision, name][key] / limit, 1e-7) for key, precision, limit in rows]
         axes.plot(shares, range(len(rows)), marker, label=name, alpha=0.8, markersize=7, linestyle="none")
     axes.axvline(1, color="firebrick", linewidth=1.5)
-    axes.set_yticks(range(len(rows)), [f"{FIGURES[key][0].split(',')[0]}, {precision}" for key, precision, _ in rows])
+    axes.set_yticks(
+        range(len(rows)), [f"{FIGURES[key][0].split(',')[0]}, {precision}" for key, precision, _ in rows]
+    )
     axes.set(xscale="log", xlabel="error / largest error allowed", xlim=(5e-8, 10))
     axes.invert_yaxis()
     axes.grid(axis="x", alpha=0.3)

@@ -1,6 +1,8 @@
-"""What becomes of published lens files: which load, why the others are refused, and whether focal lengths are those their makers claim.
+"""What becomes of published lens files: which load, why the others are refused, and whether focal lengths are
+those their makers claim.
 
-Every .json, .zmx, .seq and .txt file of a folder is loaded. Where a header, title, catalogue number, patent or file note claims a focal length, it is
+Every .json, .zmx, .seq and .txt file of a folder is loaded. Where a header, title, catalogue number, patent
+or file note claims a focal length, it is
 compared with the paraxial one of the loaded lens, at the wavelength of the claim.
 """
 
@@ -14,8 +16,8 @@ import torch
 
 from codesign import lens
 from codesign.errors import CodesignError, FileFormatError
-from studies import state
-from studies.run import Run, StudyConfig, main
+from studies.frame import state
+from studies.frame.run import Run, StudyConfig, main
 
 EXTENSIONS = (".json", ".zmx", ".seq", ".txt")
 ALLOWED = 0.005  # relative difference of focal lengths up to which a claim counts as met
@@ -24,7 +26,8 @@ D_UM = 0.5875618
 
 @dataclass(frozen=True)
 class Claim:
-    """A focal length somebody states for a file: mm, wavelength in um, where it is said, and why it may differ."""
+    """A focal length somebody states for a file: mm, wavelength in um, where it is said, and why it may
+    differ."""
 
     efl_mm: float
     wavelength_um: float
@@ -35,10 +38,16 @@ class Claim:
 NAME_ROUNDS = "product names round the focal length"
 CLAIMS = {
     "deeplens/camera/ef35mm_f2.0.zmx": Claim(35.0, D_UM, "name", NAME_ROUNDS),
-    "deeplens/camera/ef85mm_f1.8.json": Claim(85.0, D_UM, "name", "the header holds another quantity, see below"),
+    "deeplens/camera/ef85mm_f1.8.json": Claim(
+        85.0, D_UM, "name", "the header holds another quantity, see below"
+    ),
     "deeplens/camera/rf16mm_f2.8.json": Claim(16.0, D_UM, "name", NAME_ROUNDS),
-    "deeplens/camera/rf24mm_f1.8.json": Claim(24.0, D_UM, "name", NAME_ROUNDS + "; the header repeats that of ef40mm_f2.8 to the last digit"),
-    "deeplens/thorlabs/acl12708u.json": Claim(8.0, D_UM, "catalogue", "the catalogue rounds, and holds for its own wavelength (8.03 mm at 780 nm)"),
+    "deeplens/camera/rf24mm_f1.8.json": Claim(
+        24.0, D_UM, "name", NAME_ROUNDS + "; the header repeats that of ef40mm_f2.8 to the last digit"
+    ),
+    "deeplens/thorlabs/acl12708u.json": Claim(
+        8.0, D_UM, "catalogue", "the catalogue rounds, and holds for its own wavelength (8.03 mm at 780 nm)"
+    ),
     "diffoptics/ThorLabs/ACL5040U.txt": Claim(40.0, D_UM, "catalogue"),
     "diffoptics/ThorLabs/LA1131.txt": Claim(49.8, D_UM, "catalogue"),
     "diffoptics/end2end/end2end_edof.txt": Claim(100.0, D_UM, "catalogue, its doublet"),
@@ -53,7 +62,12 @@ CLAIMS = {
     "rayoptics/paraboloid.seq": Claim(100.0, 0.55, "title f/1, pupil 100 mm"),
     "rayoptics/paraboloid_f8.seq": Claim(200.0, 0.55, "title"),
     "rayoptics/questar35.seq": Claim(1282.0, 0.555, "maker, 3.5 inch"),
-    "rayoptics/rc_f16.seq": Claim(3962.4 * 8, 0.55, "f/8 and 3962.4 mm", "the title says f/16; the file has the pupil 3962.4 mm in a comment and twice that in force"),
+    "rayoptics/rc_f16.seq": Claim(
+        3962.4 * 8,
+        0.55,
+        "f/8 and 3962.4 mm",
+        "the title says f/16; the file has the pupil 3962.4 mm in a comment and twice that in force",
+    ),
     "rayoptics/zmax_55278.zmx": Claim(52.24, D_UM, "DBDT record"),
 }
 
@@ -61,12 +75,14 @@ CLAIMS = {
 @dataclass(frozen=True)
 class Config(StudyConfig):
     folder: Path | None = None
-    """Folder of lens files, searched with its subfolders; ../shared/data/lenses beside the repository when left out."""
+    """Folder of lens files, searched with its subfolders; ../shared/data/lenses beside the repository when
+    left out."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one file. efl_mm is at the wavelength of the first claim; claims pair each claim with the lens's focal length for it."""
+    """What became of one file. efl_mm is at the wavelength of the first claim; claims pair each claim with
+    the lens's focal length for it."""
 
     file: str
     reason: str = ""
@@ -98,7 +114,9 @@ def lens_files(folder):
     """The lens files of a folder, sorted. Raises: FileFormatError when there are none."""
     found = sorted(path for path in Path(folder).rglob("*") if path.suffix.lower() in EXTENSIONS)
     if not found:
-        raise FileFormatError(f"'{folder}' holds no lens file ({', '.join(EXTENSIONS)}); name another folder with --folder.")
+        raise FileFormatError(
+            f"'{folder}' holds no lens file ({', '.join(EXTENSIONS)}); name another folder with --folder."
+        )
     return found
 
 
@@ -111,7 +129,14 @@ def examine(path, folder):
         return Outcome(name, str(error).replace(f"lens file {path}: ", "", 1))
     claims = ([CLAIMS[name]] if name in CLAIMS else []) + header_claims(path, geo)
     found = tuple((claim, efl_mm(geo, claim.wavelength_um)) for claim in claims)
-    return Outcome(name, "", len(geo.surfaces), geo.entrance_pupil_diameter_mm, found[0][1] if found else efl_mm(geo), found)
+    return Outcome(
+        name,
+        "",
+        len(geo.surfaces),
+        geo.entrance_pupil_diameter_mm,
+        found[0][1] if found else efl_mm(geo),
+        found,
+    )
 
 
 def efl_mm(geo, wavelength_um=D_UM):
@@ -123,30 +148,43 @@ def efl_mm(geo, wavelength_um=D_UM):
 
 
 def header_claims(path, geo):
-    """The focal length in the header of a DeepLens file; some headers hold the one of the image's edge, which distortion changes."""
+    """The focal length in the header of a DeepLens file; some headers hold the one of the image's edge, which
+    distortion changes."""
     if path.suffix.lower() != ".json":
         return []
     page = json.loads(path.read_text(encoding="utf-8"))
     if "foclen" not in page:
         return []
-    edge, remark = edge_focal_length_mm(geo, page["r_sensor"]), ""
+    edge = edge_focal_length_mm(geo, page["r_sensor"])
+    remark = ""
     if abs(efl_mm(geo) / page["foclen"] - 1) > ALLOWED:
         near = edge is not None and abs(edge / page["foclen"] - 1) < 2 * ALLOWED
         remark = f"at the sensor's edge, radius / tan(field) = {edge:.4g} mm" if edge is not None else ""
         focus = f"the paraxial focus lies {float((geo.first_order().bfl_mm - geo.thickness_mm[-1]).detach()):+.2g} mm from the image plane"
-        remark = f"the header holds the focal length of the image's edge: {remark}" if near else f"unexplained; {focus}; {remark}"
+        remark = (
+            f"the header holds the focal length of the image's edge: {remark}"
+            if near
+            else f"unexplained; {focus}; {remark}"
+        )
     return [Claim(page["foclen"], D_UM, "header", remark)]
 
 
 def edge_focal_length_mm(geo, radius_mm):
-    """Image height / tan(field) where the chief ray meets the image at ``radius_mm``; None where it never does."""
+    """Image height / tan(field) where the chief ray meets the image at ``radius_mm``; None where it never
+    does."""
     angles = torch.arange(1, 800, dtype=torch.float64).mul(math.radians(0.1))
     towards = torch.stack([torch.zeros_like(angles), angles.sin(), angles.cos()], 1)
-    centre = torch.stack([torch.zeros(()), torch.zeros(()), geo.first_order().entrance_pupil_z_mm.detach()]).double()
+    centre = torch.stack(
+        [torch.zeros(()), torch.zeros(()), geo.first_order().entrance_pupil_z_mm.detach()]
+    ).double()
     out = geo.trace(centre - 50 * towards, towards)
     heights = torch.where(out.status == 0, out.position_mm[:, 1].detach().abs(), math.nan)
     meets = (heights >= radius_mm).nonzero()
-    return radius_mm / math.tan(float(angles[meets[0]])) if len(meets) and not bool(heights[: meets[0]].isnan().any()) else None
+    return (
+        radius_mm / math.tan(float(angles[meets[0]]))
+        if len(meets) and not bool(heights[: meets[0]].isnan().any())
+        else None
+    )
 
 
 def show(run, outcomes):
@@ -155,17 +193,52 @@ def show(run, outcomes):
     claims = [(o.file, claim, found) for o in loaded for claim, found in o.claims if found is not None]
     differences = [abs(found / claim.efl_mm - 1) for _, claim, found in claims]
     met = sum(d <= ALLOWED for d in differences)
-    run.record(files=len(outcomes), loaded=len(loaded), refused=len(outcomes) - len(loaded), claims=len(claims), claims_met=met, claims_missed=len(claims) - met,
-               claims_missed_without_reason=sum(d > ALLOWED and (not claim.remark or claim.remark.startswith("unexplained")) for d, (_, claim, _) in zip(differences, claims, strict=True)))
+    run.record(
+        files=len(outcomes),
+        loaded=len(loaded),
+        refused=len(outcomes) - len(loaded),
+        claims=len(claims),
+        claims_met=met,
+        claims_missed=len(claims) - met,
+        claims_missed_without_reason=sum(
+            d > ALLOWED and (not claim.remark or claim.remark.startswith("unexplained"))
+            for d, (_, claim, _) in zip(differences, claims, strict=True)
+        ),
+    )
     rows = [row for outcome in outcomes for row in table_rows(outcome)]
-    columns = ("file", "result", "surfaces", "pupil mm", "EFL mm", "claimed mm", "claimed by", "difference %", "remark")
-    lines = ["| " + " | ".join(columns) + " |", "|---" * len(columns) + "|", *("| " + " | ".join("" if v is None else str(v) for v in row) + " |" for row in rows)]
+    columns = (
+        "file",
+        "result",
+        "surfaces",
+        "pupil mm",
+        "EFL mm",
+        "claimed mm",
+        "claimed by",
+        "difference %",
+        "remark",
+    )
+    lines = [
+        "| " + " | ".join(columns) + " |",
+        "|---" * len(columns) + "|",
+        *("| " + " | ".join("" if v is None else str(v) for v in row) + " |" for row in rows),
+    ]
     state.write_atomic(run.path("table.md"), ("\n".join(lines) + "\n").encode())
-    run.card("Files that load", f"{len(loaded)} of {len(outcomes)}", "the others are refused with their reason")
+    run.card(
+        "Files that load", f"{len(loaded)} of {len(outcomes)}", "the others are refused with their reason"
+    )
     run.card("Focal lengths", f"{met} of {len(claims)}", f"within {100 * ALLOWED:g} % of what is claimed")
     run.section("Files")
-    run.table("Every file", columns, rows, "EFL: paraxial focal length at the wavelength of the claim, at 0.5876 µm where there is none.")
-    run.finish("Lens files", f"{len(loaded)} of {len(outcomes)} published lens files load; {met} of {len(claims)} claimed focal lengths are met within {100 * ALLOWED:g} %.")
+    run.table(
+        "Every file",
+        columns,
+        rows,
+        "EFL: paraxial focal length at the wavelength of the claim, at 0.5876 µm where there is none.",
+    )
+    run.finish(
+        "Lens files",
+        f"{len(loaded)} of {len(outcomes)} published lens files load; {met} of {len(claims)} claimed focal "
+        f"lengths are met within {100 * ALLOWED:g} %.",
+    )
 
 
 def table_rows(outcome):
@@ -174,8 +247,28 @@ def table_rows(outcome):
         return [(outcome.file, "refused", None, None, None, None, None, None, outcome.reason)]
     start = (outcome.file, "loads", outcome.surfaces, f"{outcome.pupil_mm:.5g}")
     if not outcome.claims:
-        return [(*start, f"{outcome.efl_mm:.6g}" if outcome.efl_mm is not None else "afocal", None, None, None, "")]
-    return [(*start, f"{found:.6g}", f"{claim.efl_mm:.6g}", claim.source, f"{100 * (found / claim.efl_mm - 1):+.2f}", claim.remark) for claim, found in outcome.claims if found is not None]
+        return [
+            (
+                *start,
+                f"{outcome.efl_mm:.6g}" if outcome.efl_mm is not None else "afocal",
+                None,
+                None,
+                None,
+                "",
+            )
+        ]
+    return [
+        (
+            *start,
+            f"{found:.6g}",
+            f"{claim.efl_mm:.6g}",
+            claim.source,
+            f"{100 * (found / claim.efl_mm - 1):+.2f}",
+            claim.remark,
+        )
+        for claim, found in outcome.claims
+        if found is not None
+    ]
 
 
 if __name__ == "__main__":

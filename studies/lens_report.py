@@ -1,6 +1,8 @@
-"""What a lens can do: first-order figures, Seidel sums, layout, spots, fans, wavefront, point spread, MTF, distortion and field curvature on one page.
+"""What a lens can do: first-order figures, Seidel sums, layout, spots, fans, wavefront, point spread, MTF,
+distortion and field curvature on one page.
 
-Any lens that `codesign.lens.load` reads. The object is at infinity; apertures clip. Where a lens names no half field, the largest field up to 10 degrees
+Any lens that `codesign.lens.load` reads. The object is at infinity; apertures clip. Where a lens names no
+half field, the largest field up to 10 degrees
 whose chief ray and at least half of whose rays arrive is taken, and the page says so.
 """
 
@@ -17,7 +19,7 @@ from codesign.lens import analysis
 from codesign.lens.paraxial import cardinal_points
 from codesign.lens.seidel import seidel_sums
 from codesign.report import lens_curves, lens_figures
-from studies.run import Run, StudyConfig, main
+from studies.frame.run import Run, StudyConfig, main
 
 SHARES = (0.0, 0.7, 1.0)
 WIDEST_DEG = 10.0  # where a lens does not say
@@ -38,11 +40,18 @@ class Config(StudyConfig):
 def study(run: Run[Config]) -> None:
     start = time.perf_counter()
     geo = lens.load(run.config.lens).requires_grad_(False)
-    light, quick = run.config.wavelengths_um, run.config.quick
+    light = run.config.wavelengths_um
+    quick = run.config.quick
     analysis.spectral_lines(light)
     half_deg, why = half_field(geo, run.config.half_field_deg, light[0])
     fields, left_out = arriving([math.radians(half_deg) * h for h in SHARES], geo, light[0])
-    notes = [why, *(f"The field of {math.degrees(f):.3g}° is left out: fewer than {FEWEST:.0%} of its rays arrive." for f in left_out)]
+    notes = [
+        why,
+        *(
+            f"The field of {math.degrees(f):.3g}° is left out: fewer than {FEWEST:.0%} of its rays arrive."
+            for f in left_out
+        ),
+    ]
     first_order(run, geo, light, half_deg)
     seidel(run, geo, math.radians(half_deg), light[0])
     pictures(run, geo, fields, light, quick)
@@ -62,14 +71,22 @@ def half_field(geo, wanted_deg, wavelength_um):
     degrees = WIDEST_DEG
     while degrees > 0.1 and arrival(geo, math.radians(degrees), wavelength_um) < 0.5:
         degrees /= 1.25
-    return degrees, f"The lens names no half field; {degrees:.3g}° is taken, the largest up to {WIDEST_DEG:g}° (in steps of 1.25) of which at least half of the rays pass."
+    return (
+        degrees,
+        f"The lens names no half field; {degrees:.3g}° is taken, the largest up to {WIDEST_DEG:g}° (in "
+        "steps of 1.25) of which at least half of the rays pass.",
+    )
 
 
 def arrival(geo, field_rad, wavelength_um):
     """Share of the pupil's light that arrives at a field, 0 when its chief ray does not."""
     try:
         analysis.chief_ray(geo, field_rad, wavelength_um)
-        return float(analysis.trace_field(geo, field_rad, analysis.pupil_grid(32, geo.dtype), wavelength_um, vignetting=True).weight.mean())
+        return float(
+            analysis.trace_field(
+                geo, field_rad, analysis.pupil_grid(32, geo.dtype), wavelength_um, vignetting=True
+            ).weight.mean()
+        )
     except DomainError:
         return 0.0
 
@@ -78,115 +95,257 @@ def arriving(fields, geo, wavelength_um):
     """Fields that can be shown, and those that cannot. Raises: DomainError when none can."""
     good = [field for field in fields if arrival(geo, field, wavelength_um) >= FEWEST]
     if not good:
-        raise DomainError(f"{geo.name}: hardly a ray of the fields {[round(math.degrees(f), 2) for f in fields]} degrees passes all apertures; check apertures, stop and entrance pupil.")
+        raise DomainError(
+            f"{geo.name}: hardly a ray of the fields {[round(math.degrees(f), 2) for f in fields]} degrees "
+            "passes all apertures; check apertures, stop and entrance pupil."
+        )
     return good, [field for field in fields if field not in good]
 
 
 def first_order(run, geo, light, half_deg):
     """Focal length, pupils and cardinal points."""
-    f, points = geo.first_order(light[0]), cardinal_points(geo, light[0])
+    f = geo.first_order(light[0])
+    points = cardinal_points(geo, light[0])
     run.card("Focal length", f"{float(f.efl_mm):.4g} mm", f"f/{float(f.fno):.3g} at {light[0] * 1e3:.0f} nm")
     run.record(efl_mm=f.efl_mm, bfl_mm=f.bfl_mm, fno=f.fno)
     run.section("First order")
     total = float(geo.thickness_mm[:-1].sum())
     rows = [
-        ("effective focal length", f.efl_mm), ("back focal length", f.bfl_mm), ("f-number (no unit)", f.fno), ("image plane behind the last vertex", geo.thickness_mm[-1]),
-        ("length, first to last vertex", torch.tensor(total)), ("entrance pupil, from the first vertex", f.entrance_pupil_z_mm), ("entrance pupil diameter", f.entrance_pupil_diameter_mm),
-        ("exit pupil, from the last vertex", f.exit_pupil_z_mm), ("exit pupil diameter", f.exit_pupil_diameter_mm), ("stop semi-aperture", f.stop_semi_aperture_mm),
-        ("front focal point, from the first vertex", points.front_focal_z_mm), ("front principal point, from the first vertex", points.front_principal_z_mm),
-        ("rear principal point, from the last vertex", points.rear_principal_z_mm), ("rear nodal point, from the last vertex", points.rear_nodal_z_mm),
+        ("effective focal length", f.efl_mm),
+        ("back focal length", f.bfl_mm),
+        ("f-number (no unit)", f.fno),
+        ("image plane behind the last vertex", geo.thickness_mm[-1]),
+        ("length, first to last vertex", torch.tensor(total)),
+        ("entrance pupil, from the first vertex", f.entrance_pupil_z_mm),
+        ("entrance pupil diameter", f.entrance_pupil_diameter_mm),
+        ("exit pupil, from the last vertex", f.exit_pupil_z_mm),
+        ("exit pupil diameter", f.exit_pupil_diameter_mm),
+        ("stop semi-aperture", f.stop_semi_aperture_mm),
+        ("front focal point, from the first vertex", points.front_focal_z_mm),
+        ("front principal point, from the first vertex", points.front_principal_z_mm),
+        ("rear principal point, from the last vertex", points.rear_principal_z_mm),
+        ("rear nodal point, from the last vertex", points.rear_nodal_z_mm),
         (f"image height at {half_deg:.4g}°, paraxial", f.efl_mm * math.tan(math.radians(half_deg))),
     ]
-    run.table(f"Paraxial figures at {light[0] * 1e3:.1f} nm, mm", ("figure", "mm"), [(name, f"{float(value):.6g}") for name, value in rows])
+    run.table(
+        f"Paraxial figures at {light[0] * 1e3:.1f} nm, mm",
+        ("figure", "mm"),
+        [(name, f"{float(value):.6g}") for name, value in rows],
+    )
     colour = analysis.chromatic_focus_shift_mm(geo, light, light[0])
     if len(light) > 1:
-        run.table("Paraxial focus by wavelength", ("nm", "shift (µm)"), [(f"{w * 1e3:.1f}", f"{1e3 * float(shift):.4g}") for w, shift in zip(light, colour, strict=True)])
+        run.table(
+            "Paraxial focus by wavelength",
+            ("nm", "shift (µm)"),
+            [(f"{w * 1e3:.1f}", f"{1e3 * float(shift):.4g}") for w, shift in zip(light, colour, strict=True)],
+        )
 
 
 def seidel(run, geo, half_rad, wavelength_um):
     """Seidel sums, where the lens has paraxial rays."""
     sums = seidel_sums(geo, half_rad, wavelength_um)
-    run.section("Seidel sums", "Wavefront coefficients in waves at the rims of pupil and field; positive spherical aberration is undercorrected. Colour sums lie between F and C.")
-    run.figure(lens_curves.seidel_bars(sums, wavelength_um), "seidel", "Contributions of the surfaces, and their sums.")
+    run.section(
+        "Seidel sums",
+        "Wavefront coefficients in waves at the rims of pupil and field; positive spherical aberration is "
+        "undercorrected. Colour sums lie between F and C.",
+    )
+    run.figure(
+        lens_curves.seidel_bars(sums, wavelength_um),
+        "seidel",
+        "Contributions of the surfaces, and their sums.",
+    )
     waves = 1 / (wavelength_um * 1e-3)
-    columns = torch.cat([sums.per_surface, sums.axial_colour[:, None], sums.lateral_colour[:, None]], 1) * waves
+    columns = (
+        torch.cat([sums.per_surface, sums.axial_colour[:, None], sums.lateral_colour[:, None]], 1) * waves
+    )
     rows = [(str(i + 1), *(f"{float(v):.4f}" for v in row)) for i, row in enumerate(columns)]
-    run.table("Seidel sums, waves", ("surface", "S I", "S II", "S III", "S IV", "S V", "C I", "C II"), [*rows, ("total", *(f"{float(v):.4f}" for v in columns.sum(0)))])
-    run.record(**{f"seidel_{name}_waves": float(v) * waves for name, v in zip(("spherical", "coma", "astigmatism", "petzval", "distortion"), sums.total, strict=True)})
+    run.table(
+        "Seidel sums, waves",
+        ("surface", "S I", "S II", "S III", "S IV", "S V", "C I", "C II"),
+        [*rows, ("total", *(f"{float(v):.4f}" for v in columns.sum(0)))],
+    )
+    run.record(
+        **{
+            f"seidel_{name}_waves": float(v) * waves
+            for name, v in zip(
+                ("spherical", "coma", "astigmatism", "petzval", "distortion"), sums.total, strict=True
+            )
+        }
+    )
 
 
 def pictures(run, geo, fields, light, quick):
     """Layout, spots, fans, field errors."""
     run.section("Layout")
-    run.figure(lens_figures.lens_layout(geo, fields), "layout", "Cross-section with meridional rays; only rays that pass all apertures are drawn.")
+    run.figure(
+        lens_figures.lens_layout(geo, fields),
+        "layout",
+        "Cross-section with meridional rays; only rays that pass all apertures are drawn.",
+    )
     run.section("Rays")
-    run.figure(lens_figures.spots_by_wavelength(geo, fields, light, 16 if quick else 24, True), "spots", f"Spots about the chief ray at {light[0] * 1e3:.0f} nm; the circle is the Airy disc.")
-    run.figure(lens_figures.ray_fans(geo, fields, light, True), "fans", "Ray fans: transverse aberration and optical path difference over the pupil.")
-    run.figure(lens_curves.encircled_curves(geo, fields, light, True), "encircled_energy", "Encircled energy of the rays about their mean.")
+    run.figure(
+        lens_figures.spots_by_wavelength(geo, fields, light, 16 if quick else 24, True),
+        "spots",
+        f"Spots about the chief ray at {light[0] * 1e3:.0f} nm; the circle is the Airy disc.",
+    )
+    run.figure(
+        lens_figures.ray_fans(geo, fields, light, True),
+        "fans",
+        "Ray fans: transverse aberration and optical path difference over the pupil.",
+    )
+    run.figure(
+        lens_curves.encircled_curves(geo, fields, light, True),
+        "encircled_energy",
+        "Encircled energy of the rays about their mean.",
+    )
     run.section("Over the field")
-    run.figure(lens_curves.field_errors(geo, fields[-1] or math.radians(0.5), light, count=9 if quick else 21), "field_errors",
-               "Field curvature of thin bundles, distortion against f tan, and lateral colour of the chief ray.")
+    run.figure(
+        lens_curves.field_errors(geo, fields[-1] or math.radians(0.5), light, count=9 if quick else 21),
+        "field_errors",
+        "Field curvature of thin bundles, distortion against f tan, and lateral colour of the chief ray.",
+    )
     rows = []
     for field in fields:
         positions, weight = analysis.polychromatic_spot(geo, field, light, 32, True)
         shift = analysis.focus_shift_mm(geo, [field], light[0])[0]
         name = f"{math.degrees(field):.3g}".replace(".", "p")
-        radius, distortion = 1e3 * float(analysis.spot_radius_mm(positions, weight)), float(analysis.distortion_percent(geo, [field], wavelength_um=light[0])[0])
+        radius = 1e3 * float(analysis.spot_radius_mm(positions, weight))
+        distortion = float(analysis.distortion_percent(geo, [field], wavelength_um=light[0])[0])
         passed = arrival(geo, field, light[0])
-        run.record(**{f"rms_spot_um_{name}deg": radius, f"distortion_percent_{name}deg": distortion, f"passed_share_{name}deg": passed})
-        rows.append((f"{math.degrees(field):.3g}", f"{radius:.2f}", f"{distortion:.3f}", f"{float(shift[0]):.4f}", f"{float(shift[1]):.4f}", f"{passed:.3f}"))
-    run.table("By field", ("degrees", "RMS spot (µm)", "distortion (%)", "tangential focus (mm)", "sagittal focus (mm)", "share that passes"), rows)
+        run.record(
+            **{
+                f"rms_spot_um_{name}deg": radius,
+                f"distortion_percent_{name}deg": distortion,
+                f"passed_share_{name}deg": passed,
+            }
+        )
+        rows.append(
+            (
+                f"{math.degrees(field):.3g}",
+                f"{radius:.2f}",
+                f"{distortion:.3f}",
+                f"{float(shift[0]):.4f}",
+                f"{float(shift[1]):.4f}",
+                f"{passed:.3f}",
+            )
+        )
+    run.table(
+        "By field",
+        (
+            "degrees",
+            "RMS spot (µm)",
+            "distortion (%)",
+            "tangential focus (mm)",
+            "sagittal focus (mm)",
+            "share that passes",
+        ),
+        rows,
+    )
 
 
 def sharpness(run, geo, fields, light, quick):
     """Wavefront, point spread, MTF."""
-    run.section("Wavefront", f"At {light[0] * 1e3:.0f} nm, against the sphere about the chief ray's image point.")
-    run.figure(lens_figures.opd_maps(geo, fields, light[0], 48 if quick else 96, True), "wavefront", "Optical path difference over the entrance pupil, piston and tilt removed.")
+    run.section(
+        "Wavefront", f"At {light[0] * 1e3:.0f} nm, against the sphere about the chief ray's image point."
+    )
+    run.figure(
+        lens_figures.opd_maps(geo, fields, light[0], 48 if quick else 96, True),
+        "wavefront",
+        "Optical path difference over the entrance pupil, piston and tilt removed.",
+    )
     rows = []
     for field in fields:
         front = analysis.wavefront(geo, field, light[0], 64, True)
         flat = analysis.remove_fit(front)
         rms = float(analysis.rms_waves(front))
         run.record(**{f"rms_waves_{math.degrees(field):.3g}".replace(".", "p") + "deg": rms})
-        rows.append((f"{math.degrees(field):.3g}", f"{rms:.4f}", f"{float(analysis.rms_waves(flat)):.4f}", f"{float(analysis.peak_to_valley_waves(front)):.3f}", f"{float(analysis.strehl_direct(flat)):.4f}"))
-    run.table("Wavefront by field", ("degrees", "RMS (waves)", "RMS without tilt", "peak to valley", "Strehl ratio without tilt"), rows)
+        rows.append(
+            (
+                f"{math.degrees(field):.3g}",
+                f"{rms:.4f}",
+                f"{float(analysis.rms_waves(flat)):.4f}",
+                f"{float(analysis.peak_to_valley_waves(front)):.3f}",
+                f"{float(analysis.strehl_direct(flat)):.4f}",
+            )
+        )
+    run.table(
+        "Wavefront by field",
+        ("degrees", "RMS (waves)", "RMS without tilt", "peak to valley", "Strehl ratio without tilt"),
+        rows,
+    )
     fno = float(geo.first_order(light[0]).fno.abs())
-    widest = max(float(analysis.encircled_radius_mm(geo, field, 0.99, light, 48, True, about_chief=True)) for field in fields)
+    widest = max(
+        float(analysis.encircled_radius_mm(geo, field, 0.99, light, 48, True, about_chief=True))
+        for field in fields
+    )
     pixels = 64 if quick else 96
     pixel = max(2.6 * widest, 12 * light[0] * 1e-3 * fno) / pixels
     top = round_frequency(min(1 / (light[0] * 1e-3 * fno), 250.0))
     frequency = torch.linspace(0, top, 51, dtype=geo.dtype)
-    psfs, titles, curves = [], [], {}
+    psfs = []
+    titles = []
+    curves = {}
     for field in fields:
-        title, steep = f"{math.degrees(field):.3g}°", not sampled(geo, field, light)
-        if steep or 1.2 * pixels * pixel > MOST_CELLS * min(light) * 1e-3 * fno:  # the picture repeats with the number of cells
+        title = f"{math.degrees(field):.3g}°"
+        steep = not sampled(geo, field, light)
+        if (
+            steep or 1.2 * pixels * pixel > MOST_CELLS * min(light) * 1e-3 * fno
+        ):  # the picture repeats with the number of cells
             psfs.append(analysis.geometric_psf(geo, field, pixel, pixels, light, 256, True))
             titles.append(f"{title}, rays")
         else:
             psfs.append(analysis.psf_on_pixels(geo, field, pixel, pixels, light, MOST_CELLS, True))
             titles.append(f"{title}, diffraction")
         if steep:
-            curve = analysis.geometric_mtf(geo, field, frequency, light, 96, True) * analysis.ideal_mtf(frequency, fno, light[0])
+            curve = analysis.geometric_mtf(geo, field, frequency, light, 96, True) * analysis.ideal_mtf(
+                frequency, fno, light[0]
+            )
         else:
             curve = analysis.diffraction_mtf(geo, field, frequency, light, 256 if quick else MOST_CELLS, True)
         curves[f"{title}{', rays' if steep else ''}"] = curve
-        run.record(**{f"mtf_{side}_{math.degrees(field):.3g}".replace(".", "p") + "deg": float(value) for side, value in zip(("tangential", "sagittal"), curve[:, 20], strict=True)})
+        run.record(
+            **{
+                f"mtf_{side}_{math.degrees(field):.3g}".replace(".", "p") + "deg": float(value)
+                for side, value in zip(("tangential", "sagittal"), curve[:, 20], strict=True)
+            }
+        )
     run.record(mtf_at_per_mm=float(frequency[20]))
     traced = any("rays" in name for name in (*titles, *curves))
-    run.section("Point spread and MTF", "Where it says rays, the aberration is too large for a sampled wavefront: rays stand in, their MTF multiplied by that of a perfect lens." if traced else "")
-    run.figure(lens_figures.psf_pictures(psfs, titles), "psf", f"Point spread in light of {len(light)} wavelength{'s' * (len(light) > 1)}, each over its peak.")
-    run.figure(lens_figures.mtf_curves(frequency, curves, analysis.ideal_mtf(frequency, fno, light[0])), "mtf", "MTF; dotted: a perfect lens of the same f-number on the axis.")
+    run.section(
+        "Point spread and MTF",
+        "Where it says rays, the aberration is too large for a sampled wavefront: rays stand in, their MTF "
+        "multiplied by that of a perfect lens."
+        if traced
+        else "",
+    )
+    run.figure(
+        lens_figures.psf_pictures(psfs, titles),
+        "psf",
+        f"Point spread in light of {len(light)} wavelength{'s' * (len(light) > 1)}, each over its peak.",
+    )
+    run.figure(
+        lens_figures.mtf_curves(frequency, curves, analysis.ideal_mtf(frequency, fno, light[0])),
+        "mtf",
+        "MTF; dotted: a perfect lens of the same f-number on the axis.",
+    )
     depth = max(8 * light[0] * 1e-3 * fno**2, 2 * widest * fno)
     shifts = torch.linspace(-depth, depth, 11 if quick else 31).tolist()
-    run.figure(lens_curves.through_focus(geo, fields, shifts, float(frequency[10]), light, True), "through_focus",
-               f"RMS spot, and geometric MTF at {float(frequency[10]):g} line pairs per mm, over the place of the image plane.")
+    run.figure(
+        lens_curves.through_focus(geo, fields, shifts, float(frequency[10]), light, True),
+        "through_focus",
+        f"RMS spot, and geometric MTF at {float(frequency[10]):g} line pairs per mm, over the place of the "
+        "image plane.",
+    )
 
 
 def sampled(geo, field, light):
-    """Whether the wavefront of a field is gentle enough for ``MOST_CELLS`` pupil cells at every wavelength."""
+    """Whether the wavefront of a field is gentle enough for ``MOST_CELLS`` pupil cells at every
+    wavelength."""
     try:
         for wavelength_um in light:
-            analysis.pupil_function(geo, field, wavelength_um, MOST_CELLS // 2, True)  # half the cells: a lens that just passes has room
+            analysis.pupil_function(
+                geo, field, wavelength_um, MOST_CELLS // 2, True
+            )  # half the cells: a lens that just passes has room
     except DomainError:
         return False
     return True

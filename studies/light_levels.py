@@ -1,6 +1,8 @@
-"""How much light transport a world needs: every world at every light level it has, with its cost and its error against the next finer level.
+"""How much light transport a world needs: every world at every light level it has, with its cost and its
+error against the next finer level.
 
-Levels: emissive (pictures as radiance), baked (Lambertian light worked out once), path (paths traced for every camera ray). A camera moves past each
+Levels: emissive (pictures as radiance), baked (Lambertian light worked out once), path (paths traced for
+  every camera ray). A camera moves past each
 world; costs are CPU seconds, errors are shares of the radiance with the noise of path tracing taken out.
 """
 
@@ -18,7 +20,7 @@ from codesign import lens, pose, render
 from codesign.errors import DomainError
 from codesign.render import light
 from scenes import build, worlds
-from studies.run import Run, StudyConfig, main
+from studies.frame.run import Run, StudyConfig, main
 
 FIELD = 6.4 / 8.0  # width of the image over the focal length
 
@@ -41,7 +43,8 @@ class Config(StudyConfig):
 
 @dataclass(frozen=True)
 class Row:
-    """One level of one world: CPU seconds to make it and to render the frames, and its error against the next finer level (None for the finest)."""
+    """One level of one world: CPU seconds to make it and to render the frames, and its error against the next
+    finer level (None for the finest)."""
 
     world: str
     level: str
@@ -56,17 +59,31 @@ def study(run: Run[Config]) -> None:
     unknown = [name for name in config.world if name not in worlds.WORLDS]
     if unknown:
         raise DomainError(f"there is no world '{unknown[0]}'; choose from {', '.join(worlds.WORLDS)}.")
-    if config.width_px < 8 or config.frames < 1 or config.paths < 1 or config.bake_samples < 1 or not config.tolerance > 0:
-        raise DomainError("width_px must be at least 8; frames, paths and bake_samples at least 1; tolerance positive.")
+    if (
+        config.width_px < 8
+        or config.frames < 1
+        or config.paths < 1
+        or config.bake_samples < 1
+        or not config.tolerance > 0
+    ):
+        raise DomainError(
+            "width_px must be at least 8; frames, paths and bake_samples at least 1; tolerance positive."
+        )
     width = min(config.width_px, 48) if config.quick else config.width_px
     camera = render.Camera(lens.Pinhole(8.0), width, width * 3 // 4, 8.0 * FIELD / width, 4, config.seed)
-    options = {"emissive": {}, "baked": {"samples": 8 if config.quick else config.bake_samples, "seed": config.seed}, "path": {"samples": 4 if config.quick else config.paths, "seed": config.seed}}
+    options = {
+        "emissive": {},
+        "baked": {"samples": 8 if config.quick else config.bake_samples, "seed": config.seed},
+        "path": {"samples": 4 if config.quick else config.paths, "seed": config.seed},
+    }
     names = config.world or tuple(worlds.WORLDS)
     rows: list[Row] = []
     lines = []
     with run.progress(len(names), "worlds") as progress:
         for name in names:
-            found, reason = measure(name, camera, options, 1 if config.quick else config.frames, config.tolerance)
+            found, reason = measure(
+                name, camera, options, 1 if config.quick else config.frames, config.tolerance
+            )
             rows += found
             lines.append(f"- **{name}**: {reason}")
             progress.advance()
@@ -74,12 +91,19 @@ def study(run: Run[Config]) -> None:
         key = f"{row.world}_{row.level}".replace("-", "_")
         run.record(**{f"{key}_made_cpu_s": row.made_cpu_s, f"{key}_frames_cpu_s": row.frames_cpu_s})
         if row.error is not None:
-            run.record(**{f"{key}_rms_error": float(row.error.rms.max()), f"{key}_rms_error_after_gain": float(row.error.rms_after_gain.max()), f"{key}_noise": float(row.error.noise.max())})
+            run.record(
+                **{
+                    f"{key}_rms_error": float(row.error.rms.max()),
+                    f"{key}_rms_error_after_gain": float(row.error.rms_after_gain.max()),
+                    f"{key}_noise": float(row.error.noise.max()),
+                }
+            )
     show(run, rows, lines)
 
 
 def path_of(name, frames):
-    """Poses [T, 4, 4] of a camera at the world's viewpoint that moves 5 cm to its right and turns by a degree per frame."""
+    """Poses [T, 4, 4] of a camera at the world's viewpoint that moves 5 cm to its right and turns by a degree
+    per frame."""
     start = pose.look_at(*worlds.VIEWS[name])
     twist = torch.tensor([0.05, 0, 0, 0, math.radians(1), 0], dtype=torch.float64)
     return start @ pose.se3_exp(torch.arange(frames, dtype=torch.float64)[:, None] * twist)
@@ -87,15 +111,18 @@ def path_of(name, frames):
 
 def measure(name, camera, options, frames, tolerance):
     """Rows of a world's levels, and the reason for the level to take."""
-    make, poses = worlds.WORLDS[name], path_of(name, frames)
+    make = worlds.WORLDS[name]
+    poses = path_of(name, frames)
     several = "light" in inspect.signature(make).parameters
-    scenes, made = {}, {}
+    scenes = {}
+    made = {}
     for level in options if several else ("emissive",):
         start = time.process_time()
         scenes[level] = make(light=_with(build.LEVELS[level], options[level])) if several else make()
         made[level] = time.process_time() - start
     choice = light.choose(scenes, camera, poses, tolerance, after_gain=True)
-    levels, rows = list(scenes), []
+    levels = list(scenes)
+    rows = []
     for level, finer in zip(levels, [*levels[1:], None], strict=True):
         error = light.level_error(scenes[level], scenes[finer], camera, poses) if finer else None
         with torch.no_grad():
@@ -115,28 +142,80 @@ def show(run, rows, lines):
     if lit:
         baked = [float(row.error.rms_after_gain.max()) for row in lit if row.error is not None]
         run.card("Baked against path", f"{max(baked):.1%}", "largest RMS error after gain")
-    run.section("The worlds", "Every world at its levels, cheap to full from left to right, on one scale (gamma 2.2, 255 is white).")
+    run.section(
+        "The worlds",
+        "Every world at its levels, cheap to full from left to right, on one scale (gamma 2.2, 255 is "
+        "white).",
+    )
     run.figure(contact_sheet(rows), "worlds", "First frame of each world and level.", dpi=110)
-    run.section("Cost and error", "The error of a level is against the level below it in the table: the finer one of the same world.")
-    number = lambda row, part: None if row.error is None else f"{float(getattr(row.error, part).max()):.2%}"  # noqa: E731
-    columns = ("world", "level", "made, CPU-s", "frames, CPU-s", "RMS error", "after gain", "95 % of pixels", "reference noise")
-    run.table("", columns, [(row.world, row.level, f"{row.made_cpu_s:.2f}", f"{row.frames_cpu_s:.3f}", *(number(row, part) for part in ("rms", "rms_after_gain", "percentile_95", "noise"))) for row in rows],
-              "Errors are shares of the radiance, the largest over the frames. "
-              "'After gain': one brightness factor per frame is forgiven, as by a sensor of log intensity. "
-              "The RMS errors have the reference's noise taken out, the percentile has not.")
-    run.section("The level to take", f"The cheapest whose error after gain stays within {run.config.tolerance:g}:\n\n" + "\n".join(lines))
-    run.finish("Light levels", "Emissive pictures, light baked once, and path tracing on the same camera rays: what each costs and how far it is from the next.")
+    run.section(
+        "Cost and error",
+        "The error of a level is against the level below it in the table: the finer one of the same world.",
+    )
+
+    def number(row, part):
+        return None if row.error is None else f"{float(getattr(row.error, part).max()):.2%}"
+
+    columns = (
+        "world",
+        "level",
+        "made, CPU-s",
+        "frames, CPU-s",
+        "RMS error",
+        "after gain",
+        "95 % of pixels",
+        "reference noise",
+    )
+    run.table(
+        "",
+        columns,
+        [
+            (
+                row.world,
+                row.level,
+                f"{row.made_cpu_s:.2f}",
+                f"{row.frames_cpu_s:.3f}",
+                *(number(row, part) for part in ("rms", "rms_after_gain", "percentile_95", "noise")),
+            )
+            for row in rows
+        ],
+        "Errors are shares of the radiance, the largest over the frames. "
+        "'After gain': one brightness factor per frame is forgiven, as by a sensor of log intensity. "
+        "The RMS errors have the reference's noise taken out, the percentile has not.",
+    )
+    run.section(
+        "The level to take",
+        f"The cheapest whose error after gain stays within {run.config.tolerance:g}:\n\n" + "\n".join(lines),
+    )
+    run.finish(
+        "Light levels",
+        "Emissive pictures, light baked once, and path tracing on the same camera rays: what each costs and "
+        "how far it is from the next.",
+    )
 
 
 def contact_sheet(rows):
     """Figure of the first frames: a row per world, a column per level."""
-    names, levels = list(dict.fromkeys(row.world for row in rows)), list(build.LEVELS)
-    figure, axes = plt.subplots(len(names), len(levels), figsize=(3.2 * len(levels), 2.5 * len(names)), squeeze=False, layout="constrained")
+    names = list(dict.fromkeys(row.world for row in rows))
+    levels = list(build.LEVELS)
+    figure, axes = plt.subplots(
+        len(names),
+        len(levels),
+        figsize=(3.2 * len(levels), 2.5 * len(names)),
+        squeeze=False,
+        layout="constrained",
+    )
     for axis in axes.flat:
         axis.axis("off")
     for row in rows:
         axis = axes[names.index(row.world)][levels.index(row.level)]
-        axis.imshow((np.clip(row.picture, 0, 255) / 255) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        axis.imshow(
+            (np.clip(row.picture, 0, 255) / 255) ** (1 / 2.2),
+            cmap="gray",
+            vmin=0,
+            vmax=1,
+            interpolation="nearest",
+        )
         axis.set_title(f"{row.world}, {row.level}", fontsize=9)
     return figure
 

@@ -1,7 +1,10 @@
-"""Is the gradient right where objects hide one another? Frames of occluders over a wall, to the camera's pose and to the lens.
+"""Is the gradient right where objects hide one another? Frames of occluders over a wall, to the camera's pose
+and to the lens.
 
-The loss is a fixed smooth weighting of one frame. Its differences, with many samples and common random numbers at several seeds, are the truth and tell their own noise;
-beside them stand the interior gradient (plain automatic differentiation), and the one with the boundary term, with many samples and with the usual 16.
+The loss is a fixed smooth weighting of one frame. Its differences, with many samples and common random
+numbers at several seeds, are the truth and tell their own noise;
+beside them stand the interior gradient (plain automatic differentiation), and the one with the boundary term,
+with many samples and with the usual 16.
 """
 
 import math
@@ -14,13 +17,18 @@ import torch
 from codesign import lens, pose, render
 from codesign.errors import DomainError
 from codesign.render.sequence import Way
-from studies import silhouette_scenes
-from studies.run import Run, StudyConfig, main
-from studies.timing import measure
+from scenes import silhouettes as silhouette_scenes
+from studies.frame.run import Run, StudyConfig, main
+from studies.frame.timing import measure
 
-SIZE_PX, PITCH_MM, SAMPLES = 32, 0.25, 16
+SIZE_PX = 32
+PITCH_MM = 0.25
+SAMPLES = 16
 LENSES = ("pinhole", "thin", "traced")
-STEPS = {"pose": (2e-3,) * 6, "lens": (2e-4,) * 3 + (2e-2,) * 3}  # metres and radians; curvatures per mm, thicknesses mm
+STEPS = {
+    "pose": (2e-3,) * 6,
+    "lens": (2e-4,) * 3 + (2e-2,) * 3,
+}  # metres and radians; curvatures per mm, thicknesses mm
 ASKED = {"pose": 0.03, "lens": 0.03, "single": 0.10, "interior": 0.005, "cost": 2.0}
 ROWS = (0, 2, 4), (1, 3, 5)  # curvatures, and thicknesses of which the last is the focus
 
@@ -38,7 +46,11 @@ def study(run: Run[Config]) -> None:
     if config.many < 64 or config.seeds < 2:
         raise DomainError(f"many = {config.many} and seeds = {config.seeds} must be at least 64 and 2.")
     many, seeds = (512, 2) if config.quick else (config.many, config.seeds)
-    cases = [(scene, kind) for scene in silhouette_scenes.NAMES for kind in (LENSES if scene == "cubes" else ("pinhole", "traced"))]
+    cases = [
+        (scene, kind)
+        for scene in silhouette_scenes.NAMES
+        for kind in (LENSES if scene == "cubes" else ("pinhole", "traced"))
+    ]
     cases = [("cubes", "pinhole"), ("cubes", "traced"), ("poles", "traced")] if config.quick else cases
     rows = []
     with run.progress(len(cases), "scenes") as progress:
@@ -57,21 +69,33 @@ class Task:
 
     def __init__(self, scene, kind):
         self.scene = scene
-        self.lens = {"pinhole": lambda: lens.Pinhole(11.0), "thin": lambda: lens.ThinLens(11.0, 2.2, 11.06), "traced": lambda: lens.load("cooke-triplet").scaled(0.22).freeze()}[kind]()
+        self.lens = {
+            "pinhole": lambda: lens.Pinhole(11.0),
+            "thin": lambda: lens.ThinLens(11.0, 2.2, 11.06),
+            "traced": lambda: lens.load("cooke-triplet").scaled(0.22).freeze(),
+        }[kind]()
         self.pose = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7))[None]
         coarse = torch.randn(1, 1, 6, 6, generator=torch.Generator().manual_seed(3))
         self.weight = torch.nn.functional.interpolate(coarse, size=(SIZE_PX, SIZE_PX), mode="bicubic")[0, 0]
 
     def loss(self, numbers, group, samples, seed, way: Way = "interior", per_px=2.5):
-        optics, turn = self.lens, torch.zeros(6, dtype=torch.float64)
+        optics = self.lens
+        turn = torch.zeros(6, dtype=torch.float64)
         if group == "pose":
             turn = numbers
         else:
             base = torch.zeros(2, 6, dtype=torch.float64)
-            change = base.index_put((torch.tensor([0, 0, 0, 1, 1, 1]), torch.tensor([*ROWS[0], *ROWS[1]])), numbers)
-            optics = self.lens.replace(curvature_per_mm=self.lens.curvature_per_mm + change[0], thickness_mm=self.lens.thickness_mm + change[1])
+            change = base.index_put(
+                (torch.tensor([0, 0, 0, 1, 1, 1]), torch.tensor([*ROWS[0], *ROWS[1]])), numbers
+            )
+            optics = self.lens.replace(
+                curvature_per_mm=self.lens.curvature_per_mm + change[0],
+                thickness_mm=self.lens.thickness_mm + change[1],
+            )
         camera = render.Camera(optics, SIZE_PX, SIZE_PX, PITCH_MM, samples, seed)
-        frames = render.frames(camera, self.scene, self.pose @ pose.se3_exp(turn[None]), gradient=way, per_px=per_px)
+        frames = render.frames(
+            camera, self.scene, self.pose @ pose.se3_exp(turn[None]), gradient=way, per_px=per_px
+        )
         return (self.weight * frames[0]).double().mean()
 
     def gradient(self, group, samples, seed, way: Way, per_px=2.5):
@@ -82,71 +106,127 @@ class Task:
         found = []
         for step in torch.diag(torch.tensor(STEPS[group], dtype=torch.float64)):
             with torch.no_grad():
-                found.append((self.loss(step, group, samples, seed) - self.loss(-step, group, samples, seed)) / (2 * step.sum()))
+                found.append(
+                    (self.loss(step, group, samples, seed) - self.loss(-step, group, samples, seed))
+                    / (2 * step.sum())
+                )
         return torch.stack(found)
 
 
 def compare(run, task, scene, kind, group, many, seeds, seed):
-    """One row: relative L2 errors of the ways against differences, scaled so that every number counts by its own step."""
+    """One row: relative L2 errors of the ways against differences, scaled so that every number counts by its
+    own step."""
     scale = torch.tensor(STEPS[group], dtype=torch.float64)
     truths = torch.stack([task.differences(group, many, seed + 100 + k) for k in range(seeds)]) * scale
-    truth, error = truths.mean(0), truths.std(0) / math.sqrt(seeds)
-    away = lambda g: float((g * scale - truth).norm() / truth.norm())  # noqa: E731
-    mean = lambda way: torch.stack([task.gradient(group, many, seed + 200 + k, way, 64.0) for k in range(seeds)])  # noqa: E731
-    interior, whole = mean("interior"), mean("boundary")
+    truth = truths.mean(0)
+    error = truths.std(0) / math.sqrt(seeds)
+
+    def away(g):
+        return float((g * scale - truth).norm() / truth.norm())
+
+    def mean(way):
+        return torch.stack([task.gradient(group, many, seed + 200 + k, way, 64.0) for k in range(seeds)])
+
+    interior = mean("interior")
+    whole = mean("boundary")
     single = [away(task.gradient(group, SAMPLES, seed + 300 + k, "boundary")) for k in range(2 * seeds)]
     spread = (whole * scale).std(0) / math.sqrt(seeds)
-    bias = ((whole.mean(0) * scale - truth) / (error.square() + spread.square()).sqrt().clamp_min(1e-30)).tolist()
-    found = {"interior": away(interior.mean(0)), "whole": away(whole.mean(0)), "single": sorted(single)[len(single) // 2], "noise": float(error.norm() / truth.norm()),
-             "worst_bias": max(map(abs, bias))}
+    bias = (
+        (whole.mean(0) * scale - truth) / (error.square() + spread.square()).sqrt().clamp_min(1e-30)
+    ).tolist()
+    found = {
+        "interior": away(interior.mean(0)),
+        "whole": away(whole.mean(0)),
+        "single": sorted(single)[len(single) // 2],
+        "noise": float(error.norm() / truth.norm()),
+        "worst_bias": max(map(abs, bias)),
+    }
     run.record(**{f"{scene}_{kind}_{group}_{name}": value for name, value in found.items()})
     return scene, kind, group, found
 
 
 def cost_ratio():
-    """CPU time of forward and backward with the boundary term over that without: 20 frames of the cubes, 96 x 96, 8 samples, triplet."""
-    scene, optics = silhouette_scenes.build("cubes"), lens.load("cooke-triplet", torch.float32).scaled(0.22).freeze("conic", "asphere", "index_offset")
+    """CPU time of forward and backward with the boundary term over that without: 20 frames of the cubes, 96 x
+    96, 8 samples, triplet."""
+    scene = silhouette_scenes.build("cubes")
+    optics = lens.load("cooke-triplet", torch.float32).scaled(0.22).freeze("conic", "asphere", "index_offset")
     camera = render.Camera(optics, 96, 96, PITCH_MM * SIZE_PX / 96, 8)
-    shifts = torch.linspace(0, 0.2, 20, dtype=torch.float64)[:, None] * torch.tensor([[1.0, 0, 0, 0, 0, 0]], dtype=torch.float64)
+    shifts = torch.linspace(0, 0.2, 20, dtype=torch.float64)[:, None] * torch.tensor(
+        [[1.0, 0, 0, 0, 0, 0]], dtype=torch.float64
+    )
     path = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7)) @ pose.se3_exp(shifts)
 
     def work(way):
         twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
         frames = render.frames(camera, scene, path @ pose.se3_exp(twist), gradient=way)
-        torch.autograd.grad(frames.diff(dim=0).square().mean(), [twist, optics.curvature_per_mm, optics.thickness_mm])
+        torch.autograd.grad(
+            frames.diff(dim=0).square().mean(), [twist, optics.curvature_per_mm, optics.thickness_mm]
+        )
 
     return measure(lambda: work("boundary"), 5).cpu / measure(lambda: work("interior"), 5).cpu
 
 
 def show(run, rows, cost):
-    table, missed = [], []
+    table = []
+    missed = []
     for scene, kind, group, found in rows:
-        asked = ASKED["interior"] if scene == "wall" and kind == "pinhole" and group == "pose" else ASKED[group]
-        table.append((scene, kind, group, *(found[name] for name in ("interior", "whole", "single", "noise", "worst_bias"))))
+        asked = (
+            ASKED["interior"] if scene == "wall" and kind == "pinhole" and group == "pose" else ASKED[group]
+        )
+        table.append(
+            (
+                scene,
+                kind,
+                group,
+                *(found[name] for name in ("interior", "whole", "single", "noise", "worst_bias")),
+            )
+        )
         if found["whole"] > asked:
             missed.append(f"{scene}, {kind}, {group}: {found['whole']:.1%}")
         if found["single"] > ASKED["single"]:
-            missed.append(f"{scene}, {kind}, {group}, one estimate of {SAMPLES} samples: {found['single']:.1%}")
+            missed.append(
+                f"{scene}, {kind}, {group}, one estimate of {SAMPLES} samples: {found['single']:.1%}"
+            )
     if cost > ASKED["cost"]:
         missed.append(f"cost {cost:.2f} x")
     worst = max(found["whole"] for *_, found in rows)
     run.record(worst_error=worst, missed=len(missed))
     run.card("Worst error", f"{worst:.1%}", "with the boundary term, many samples; asked: 3 %")
     run.card("Cost", f"{cost:.2f} x", "forward + backward with the boundary term over without; asked: 2")
-    columns = ("scene", "lens", "to", "interior only", "with boundary", f"one estimate, {SAMPLES} samples, median", "noise of the differences", "largest bias, standard errors")
+    columns = (
+        "scene",
+        "lens",
+        "to",
+        "interior only",
+        "with boundary",
+        f"one estimate, {SAMPLES} samples, median",
+        "noise of the differences",
+        "largest bias, standard errors",
+    )
     run.table("Relative L2 error of the gradient", columns, table)
     figure, axis = plt.subplots(figsize=(9, 3.6), layout="constrained")
     at = range(len(rows))
-    series = (("interior", "#c0392b", "interior only"), ("single", "#e08e0b", f"with boundary, {SAMPLES} samples"), ("whole", "#1b6ca8", "with boundary, many samples"),
-              ("noise", "#888888", "noise of the differences"))
+    series = (
+        ("interior", "#c0392b", "interior only"),
+        ("single", "#e08e0b", f"with boundary, {SAMPLES} samples"),
+        ("whole", "#1b6ca8", "with boundary, many samples"),
+        ("noise", "#888888", "noise of the differences"),
+    )
     for name, colour, label in series:
         axis.semilogy(at, [found[name] for *_, found in rows], "o", color=colour, label=label)
     axis.axhline(ASKED["pose"], color="firebrick", lw=1)
     axis.set_xticks(at, [f"{scene}\n{kind}\n{group}" for scene, kind, group, _ in rows], fontsize=6)
     axis.set(ylabel="relative error")
     axis.legend(frameon=False, fontsize=7, ncols=4, bbox_to_anchor=(0.5, 1.14), loc="upper center")
-    run.figure(figure, "errors", "Error of the gradient against differences. Red line: what is asked of many samples.")
-    run.finish("Gradients at silhouettes", "All figures are met." if not missed else f"**Missed:** {'; '.join(missed)}.")
+    run.figure(
+        figure,
+        "errors",
+        "Error of the gradient against differences. Red line: what is asked of many samples.",
+    )
+    run.finish(
+        "Gradients at silhouettes",
+        "All figures are met." if not missed else f"**Missed:** {'; '.join(missed)}.",
+    )
 
 
 if __name__ == "__main__":

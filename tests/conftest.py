@@ -1,4 +1,5 @@
-"""What every test may ask for: reference data beside the checkout, a seeded generator, a screenless matplotlib."""
+"""What every test may ask for: reference data beside the checkout, a seeded generator, a screenless
+matplotlib."""
 
 import os
 from pathlib import Path
@@ -17,7 +18,8 @@ SHARED = next((folder for folder in (ROOT / "shared", ROOT.parent / "shared") if
 
 @pytest.fixture(scope="session")
 def shared():
-    """Function from a relative name ("refs/lens/rays.json") to its path in the shared folder; skips the test when it is not there."""
+    """Function from a relative name ("refs/lens/rays.json") to its path in the shared folder; skips the test
+    when it is not there."""
 
     def find(name):
         if SHARED is None:

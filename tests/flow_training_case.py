@@ -1,4 +1,5 @@
-"""A training run small enough for tests: a linear network, windows with one known answer, and the command on both."""
+"""A training run small enough for tests: a linear network, windows with one known answer, and the command on
+both."""
 
 import json
 from contextlib import contextmanager
@@ -10,11 +11,16 @@ from torch import nn
 
 from codesign.flow import checkpoint
 from codesign.types import EventVolume, FlowField, FlowWindows
-from studies import train_flow, train_flow_page, train_flow_sources
-from studies.run import main
+from studies.frame.run import main
+from studies.train_flow import __main__ as train_flow
+from studies.train_flow import page as train_flow_page
+from studies.train_flow import sources as train_flow_sources
 
-BINS, SIDE = 2, 16
-TRUE_WEIGHTS = torch.tensor([[0.5, -0.25, 1.0, 0.0], [-1.0, 0.75, 0.25, 0.5]])  # flow of a window is this times its counts, pixel by pixel
+BINS = 2
+SIDE = 16
+TRUE_WEIGHTS = torch.tensor(
+    [[0.5, -0.25, 1.0, 0.0], [-1.0, 0.75, 0.25, 0.5]]
+)  # flow of a window is this times its counts, pixel by pixel
 
 
 class Linear(nn.Module):
@@ -34,18 +40,30 @@ class Linear(nn.Module):
 
 
 class Made:
-    """Source of windows whose flow is TRUE_WEIGHTS times the counts; ``before`` is called with the indices of every batch."""
+    """Source of windows whose flow is TRUE_WEIGHTS times the counts; ``before`` is called with the indices of
+    every batch."""
 
     def __init__(self, seed=0, frames=True, before=lambda indices: None):
-        self.seed, self.frames, self.before = seed, frames, before
+        self.seed = seed
+        self.frames = frames
+        self.before = before
 
     def batch(self, indices):
         self.before(indices)
-        counts = torch.stack([torch.randn(2, BINS, SIDE, SIDE, generator=torch.Generator().manual_seed(1000 * self.seed + i)).square() for i in indices])
+        counts = torch.stack(
+            [
+                torch.randn(
+                    2, BINS, SIDE, SIDE, generator=torch.Generator().manual_seed(1000 * self.seed + i)
+                ).square()
+                for i in indices
+            ]
+        )
         flow = torch.einsum("fc,bchw->bfhw", TRUE_WEIGHTS, counts.flatten(1, 2))
         valid = torch.ones(len(counts), SIDE, SIDE, dtype=torch.bool)
         times = torch.tensor([0.25, 0.75], dtype=torch.float64), torch.tensor([0.5, 0.5], dtype=torch.float64)
-        return FlowWindows(EventVolume(counts, *times), FlowField(flow, valid, 1.0), counts[:, 0] if self.frames else None)
+        return FlowWindows(
+            EventVolume(counts, *times), FlowField(flow, valid, 1.0), counts[:, 0] if self.frames else None
+        )
 
 
 def register(before=lambda indices: None, frames=True):
@@ -59,7 +77,11 @@ def register(before=lambda indices: None, frames=True):
 @contextmanager
 def tables_kept():
     """The tables of networks and sources are as they were afterwards."""
-    tables: list[dict[str, Any]] = [checkpoint.NETWORKS, train_flow_sources.TRAINING, train_flow_sources.VALIDATION]
+    tables: list[dict[str, Any]] = [
+        checkpoint.NETWORKS,
+        train_flow_sources.TRAINING,
+        train_flow_sources.VALIDATION,
+    ]
     before = [dict(table) for table in tables]
     try:
         yield
@@ -75,7 +97,26 @@ def undraw(replace=setattr):
         replace(train_flow_page, name, lambda *_: plt.figure(figsize=(1, 1)))
 
 
-BASE = ["--network", "linear", "--mix", "made", "--bins", "2", "--height-px", "16", "--width-px", "16", "--batch", "4", "--final-windows", "8", "--validation-windows", "4", "--device", "cpu"]
+BASE = [
+    "--network",
+    "linear",
+    "--mix",
+    "made",
+    "--bins",
+    "2",
+    "--height-px",
+    "16",
+    "--width-px",
+    "16",
+    "--batch",
+    "4",
+    "--final-windows",
+    "8",
+    "--validation-windows",
+    "4",
+    "--device",
+    "cpu",
+]
 
 
 def train(folder, *more):
@@ -85,7 +126,10 @@ def train(folder, *more):
 def state_of(folder):
     """Every tensor of the last checkpoint, as bytes."""
     (path,) = (folder / "checkpoint").glob("step_*.safetensors")
-    return {name: tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes() for name, tensor in checkpoint.read_tensors(path)[0].items()}
+    return {
+        name: tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
+        for name, tensor in checkpoint.read_tensors(path)[0].items()
+    }
 
 
 def metrics_of(folder):

@@ -32,12 +32,15 @@ def inputs(request, generator):
 
 
 def test_values_and_dtype_follow_the_inputs(inputs):
-    outputs, expected = call(*inputs), same_in_torch(*inputs)
+    outputs = call(*inputs)
+    expected = same_in_torch(*inputs)
     assert [o.dtype for o in outputs] == [inputs[0].dtype, inputs[0].dtype, torch.int32]
     assert [o.shape for o in outputs] == [e.shape for e in expected]
     # drjit's sin and exp are within 2 units in the last place; values here stay below 8
     for got, want in zip(outputs, expected, strict=True):
-        torch.testing.assert_close(got, want, rtol=4 * torch.finfo(inputs[0].dtype).eps, atol=8 * torch.finfo(inputs[0].dtype).eps)
+        torch.testing.assert_close(
+            got, want, rtol=4 * torch.finfo(inputs[0].dtype).eps, atol=8 * torch.finfo(inputs[0].dtype).eps
+        )
 
 
 def test_gradcheck_in_double(generator):
@@ -47,11 +50,16 @@ def test_gradcheck_in_double(generator):
 
 
 def test_gradient_equals_torch(inputs):
-    seeds = [torch.linspace(-1, 1, N, dtype=inputs[0].dtype), torch.linspace(2, 3, N, dtype=inputs[0].dtype)[:, None]]
+    seeds = [
+        torch.linspace(-1, 1, N, dtype=inputs[0].dtype),
+        torch.linspace(2, 3, N, dtype=inputs[0].dtype)[:, None],
+    ]
     got = torch.autograd.grad(call(*inputs)[:2], inputs, seeds)
     want = torch.autograd.grad(same_in_torch(*inputs)[:2], inputs, seeds)
     for g, w in zip(got, want, strict=True):
-        torch.testing.assert_close(g, w, rtol=20 * torch.finfo(w.dtype).eps, atol=20 * torch.finfo(w.dtype).eps)  # sums of ten terms of order one
+        torch.testing.assert_close(
+            g, w, rtol=20 * torch.finfo(w.dtype).eps, atol=20 * torch.finfo(w.dtype).eps
+        )  # sums of ten terms of order one
 
 
 def test_second_backward_gives_the_same_numbers(inputs):
@@ -115,7 +123,9 @@ def test_a_captured_array_is_copied_too():
 
 def test_one_value_fills_a_wide_output_and_sums_in_backward(inputs):
     x = inputs[0]
-    (out,) = backend.run_kernel(lambda arr, v: (arr.Float(3) * backend.widen(arr, v, 1, 1)[0],), (x,), [(2, 3)])
+    (out,) = backend.run_kernel(
+        lambda arr, v: (arr.Float(3) * backend.widen(arr, v, 1, 1)[0],), (x,), [(2, 3)]
+    )
     assert out.shape == (2, 3)
     (grad,) = torch.autograd.grad(out.sum(), x)
     assert torch.equal(grad, torch.tensor([18.0, 0, 0, 0, 0], dtype=x.dtype))
@@ -132,7 +142,9 @@ def test_integer_outputs_carry_no_gradient(inputs):
 
 def test_mixed_dtypes_are_refused():
     with pytest.raises(GradientError, match=r"float32.*float64"):
-        backend.run_kernel(lambda arr, x, y: (x + y,), (torch.zeros(2), torch.zeros(2, dtype=torch.float64)), [(2,)])
+        backend.run_kernel(
+            lambda arr, x, y: (x + y,), (torch.zeros(2), torch.zeros(2, dtype=torch.float64)), [(2,)]
+        )
     with pytest.raises(GradientError, match="float16"):
         backend.run_kernel(lambda arr, x: (x,), (torch.zeros(2, dtype=torch.float16),), [(2,)])
 

@@ -1,4 +1,5 @@
-"""The doctor and the renderer check, in processes of their own: a bad LLVM may abort the process, and must not."""
+"""The doctor and the renderer check, in processes of their own: a bad LLVM may abort the process, and must
+not."""
 
 import os
 import subprocess
@@ -14,7 +15,14 @@ LLVM_15 = Path("/usr/lib/x86_64-linux-gnu/libLLVM-15.so")
 
 def python(*arguments, **environment):
     """Run Python with ``arguments`` and extra environment variables; returns the finished process."""
-    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False, timeout=300, env={**os.environ, **environment})
+    return subprocess.run(
+        [sys.executable, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+        env={**os.environ, **environment},
+    )
 
 
 @pytest.fixture(params=["absent", "llvm 15"])
@@ -31,7 +39,16 @@ def test_doctor_approves_a_machine_that_renders():
     done = python("-m", "codesign", "doctor")
     assert done.returncode == 0, done.stdout + done.stderr
     lines = done.stdout.splitlines()
-    assert [line[8:].split()[0] for line in lines[:-1]] == ["Python", "torch", "mitsuba", "drjit", "LLVM", "CUDA", "threads", "render"]
+    assert [line[8:].split()[0] for line in lines[:-1]] == [
+        "Python",
+        "torch",
+        "mitsuba",
+        "drjit",
+        "LLVM",
+        "CUDA",
+        "threads",
+        "render",
+    ]
     assert lines[-1].startswith("Ready")
     assert "llvm_ad_mono" in done.stdout
     found = backend.llvm_version()

@@ -1,4 +1,5 @@
-"""Flow files: the bytes of both formats, round trips within half a quantum, other writers' PNGs, and damaged files."""
+"""Flow files: the bytes of both formats, round trips within half a quantum, other writers' PNGs, and damaged
+files."""
 
 import struct
 import zlib
@@ -22,16 +23,27 @@ def field():
 
 
 def png(width, height, raw, depth=16, colour=2, interlace=0, pieces=1):
-    chunk = lambda name, data: struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))  # noqa: E731
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
     packed = zlib.compress(raw)
     cut = -(-len(packed) // pieces)
     data = b"".join(chunk(b"IDAT", packed[k : k + cut]) for k in range(0, len(packed), cut))
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, interlace)) + chunk(b"tEXt", b"k\0v") + data + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, interlace))
+        + chunk(b"tEXt", b"k\0v")
+        + data
+        + chunk(b"IEND", b"")
+    )
 
 
 def test_round_trips_keep_validity_exactly_and_flow_to_the_format(field, tmp_path):
     flow, valid = field
-    for name, tolerance in (("a.png", QUANTUM_PX / 2), ("a.flo", 255 * 2**-24)):  # half a quantum; half a unit in the last place of float32
+    for name, tolerance in (
+        ("a.png", QUANTUM_PX / 2),
+        ("a.flo", 255 * 2**-24),
+    ):  # half a quantum; half a unit in the last place of float32
         write_flow(tmp_path / name, flow, valid)
         back, seen = read_flow(tmp_path / name)
         assert torch.equal(seen, valid)
@@ -39,7 +51,9 @@ def test_round_trips_keep_validity_exactly_and_flow_to_the_format(field, tmp_pat
         assert float((back - flow).abs()[:, valid].max()) <= tolerance
         assert float(back[:, ~valid].abs().max()) == 0
         write_flow(tmp_path / f"b{name}", back, seen)
-        assert (tmp_path / f"b{name}").read_bytes() == (tmp_path / name).read_bytes()  # reading and writing again changes nothing
+        assert (tmp_path / f"b{name}").read_bytes() == (
+            tmp_path / name
+        ).read_bytes()  # reading and writing again changes nothing
 
 
 def test_the_png_holds_the_numbers_of_the_format(tmp_path):
@@ -64,22 +78,32 @@ def test_other_programs_read_the_png(field, tmp_path):
 
 def test_png_rows_filtered_in_any_way_are_read(tmp_path):
     rng = np.random.default_rng(0)
-    height, width = 11, 7
+    height = 11
+    width = 7
     pixels = rng.integers(0, 2**16, (height, width, 3))
     pixels[..., 2] = rng.integers(0, 2, (height, width))
     rows = pixels.astype(">u2").view(np.uint8).reshape(height, -1).astype(int)
     raw = b""
-    for y, row in enumerate(rows):  # the five filters, by their definition in the PNG specification, section 9
-        kind, above = y % 5, rows[y - 1] if y else np.zeros_like(row)
-        left, corner = np.concatenate([np.zeros(6, int), row[:-6]]), np.concatenate([np.zeros(6, int), above[:-6]])
+    for y, row in enumerate(
+        rows
+    ):  # the five filters, by their definition in the PNG specification, section 9
+        kind = y % 5
+        above = rows[y - 1] if y else np.zeros_like(row)
+        left = np.concatenate([np.zeros(6, int), row[:-6]])
+        corner = np.concatenate([np.zeros(6, int), above[:-6]])
         guess = left + above - corner
         distance = np.stack([abs(guess - left), abs(guess - above), abs(guess - corner)])
         paeth = np.stack([left, above, corner])[distance.argmin(0), np.arange(len(row))]
-        raw += bytes([kind]) + ((row - (0, left, above, (left + above) // 2, paeth)[kind]) % 256).astype(np.uint8).tobytes()
+        raw += (
+            bytes([kind])
+            + ((row - (0, left, above, (left + above) // 2, paeth)[kind]) % 256).astype(np.uint8).tobytes()
+        )
     (tmp_path / "a.png").write_bytes(png(width, height, raw, pieces=3))
     flow, valid = read_flow(tmp_path / "a.png")
     np.testing.assert_array_equal(valid, pixels[..., 2] == 1)
-    np.testing.assert_array_equal(flow, np.where(valid, (pixels[..., :2].transpose(2, 0, 1) - 32768) / 128, 0).astype(np.float32))
+    np.testing.assert_array_equal(
+        flow, np.where(valid, (pixels[..., :2].transpose(2, 0, 1) - 32768) / 128, 0).astype(np.float32)
+    )
 
 
 def test_flo_holds_the_bytes_of_the_format(tmp_path):
@@ -131,18 +155,21 @@ def test_files_cut_off_anywhere_are_refused_in_one_sentence(name, field, tmp_pat
         read_flow(tmp_path / f"none-{name}")
 
 
-@pytest.mark.parametrize(("content", "sentence"), [
-    (png(2, 1, b"\0" * 7, depth=8), "bit depth 8"),
-    (png(2, 1, b"\0" * 5, colour=0), "colour type 0"),
-    (png(2, 1, b"\0" * 13, interlace=1), "interlacing 1"),
-    (png(2, 1, b"\0" * 12), "holds 12"),
-    (png(2, 1, b"\0" * 14), "holds more"),
-    (png(2, 1, b"\x05" + b"\0" * 12), "filter 5"),
-    (png(2, 1, b"\0" * 6 + b"\2" + b"\0" * 6), "third channel"),
-    (png(2**31, 2**31 - 1, b""), "up to"),
-    (png(2, 1, b"\0" * 13)[:-20] + b"\0" * 20, "damaged"),
-    (png(4000, 4000, b"\0" * 20_000_000), "holds 20000000"),
-])
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (png(2, 1, b"\0" * 7, depth=8), "bit depth 8"),
+        (png(2, 1, b"\0" * 5, colour=0), "colour type 0"),
+        (png(2, 1, b"\0" * 13, interlace=1), "interlacing 1"),
+        (png(2, 1, b"\0" * 12), "holds 12"),
+        (png(2, 1, b"\0" * 14), "holds more"),
+        (png(2, 1, b"\x05" + b"\0" * 12), "filter 5"),
+        (png(2, 1, b"\0" * 6 + b"\2" + b"\0" * 6), "third channel"),
+        (png(2**31, 2**31 - 1, b""), "up to"),
+        (png(2, 1, b"\0" * 13)[:-20] + b"\0" * 20, "damaged"),
+        (png(4000, 4000, b"\0" * 20_000_000), "holds 20000000"),
+    ],
+)
 def test_pngs_that_are_no_flow_are_refused(content, sentence, tmp_path):
     (tmp_path / "a.png").write_bytes(content)
     with pytest.raises(FileFormatError, match=sentence):

@@ -14,14 +14,17 @@ D = torch.float64
 
 def wedge(twist):
     """4 x 4 matrix whose exponential is the transform: [[w]x, v; 0, 0]."""
-    v, w = twist[:3], twist[3:]
+    v = twist[:3]
+    w = twist[3:]
     m = torch.zeros(4, 4, dtype=D)
     m[:3, :3] = torch.linalg.cross(w.expand(3, 3), torch.eye(3, dtype=D), dim=1).T
     m[:3, 3] = v
     return m
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-4, 1e-3, 1e-2, 0.3, 1.0, 2.5, 3.1415, math.pi, 4.0])
+@pytest.mark.parametrize(
+    "angle", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-4, 1e-3, 1e-2, 0.3, 1.0, 2.5, 3.1415, math.pi, 4.0]
+)
 def test_exponential_is_that_of_the_matrix(angle, generator):
     for _ in range(3):
         axis = torch.nn.functional.normalize(torch.randn(3, dtype=D, generator=generator), dim=0)
@@ -33,7 +36,9 @@ def test_exponential_is_that_of_the_matrix(angle, generator):
 def test_a_quarter_turn_about_z_with_translation_by_hand():
     # left Jacobian of a quarter turn: (2/pi) [[1, -1], [1, 1]]
     found = se3_exp(torch.tensor([1.0, 0, 0.5, 0, 0, math.pi / 2], dtype=D))
-    truth = torch.tensor([[0, -1, 0, 2 / math.pi], [1, 0, 0, 2 / math.pi], [0, 0, 1, 0.5], [0, 0, 0, 1]], dtype=D)
+    truth = torch.tensor(
+        [[0, -1, 0, 2 / math.pi], [1, 0, 0, 2 / math.pi], [0, 0, 1, 0.5], [0, 0, 0, 1]], dtype=D
+    )
     torch.testing.assert_close(found, truth, rtol=0, atol=1e-15)
 
 
@@ -55,9 +60,16 @@ def test_the_derivative_at_zero_is_the_generators():
 def test_inverse_and_apply(generator):
     transform = se3_exp(torch.randn(4, 2, 6, dtype=D, generator=generator))
     points = torch.randn(4, 2, 7, 3, dtype=D, generator=generator)
-    torch.testing.assert_close(inverse(transform) @ transform, torch.eye(4, dtype=D).expand(4, 2, 4, 4), rtol=0, atol=1e-14)
+    torch.testing.assert_close(
+        inverse(transform) @ transform, torch.eye(4, dtype=D).expand(4, 2, 4, 4), rtol=0, atol=1e-14
+    )
     homogeneous = torch.cat([points, torch.ones_like(points[..., :1])], -1)
-    torch.testing.assert_close(apply(transform, points), torch.einsum("...ij,...nj->...ni", transform, homogeneous)[..., :3], rtol=0, atol=1e-14)
+    torch.testing.assert_close(
+        apply(transform, points),
+        torch.einsum("...ij,...nj->...ni", transform, homogeneous)[..., :3],
+        rtol=0,
+        atol=1e-14,
+    )
 
 
 def test_constant_twists_give_constant_transforms():
@@ -68,7 +80,8 @@ def test_constant_twists_give_constant_transforms():
 
 
 def test_look_at_makes_a_rigid_camera_with_right_down_forward(thin_camera):
-    origin, target = (1.0, -4.0, 2.0), (0.5, 1.0, 1.0)
+    origin = (1.0, -4.0, 2.0)
+    target = (0.5, 1.0, 1.0)
     pose = look_at(origin, target)
     check_poses(pose[None])
     assert float(torch.linalg.det(pose[:3, :3])) == pytest.approx(1, abs=1e-14)
@@ -99,7 +112,12 @@ def test_look_at_along_down_and_at_itself_are_refused():
     with pytest.raises(DomainError, match="look_at"):
         look_at((math.nan, 0, 2), (1, 0, 2))
     straight_down = look_at((0, 0, 2), (0, 0, 0), down=(0, -1, 0))
-    torch.testing.assert_close(straight_down[:3, :3], torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], dtype=D), rtol=0, atol=1e-15)
+    torch.testing.assert_close(
+        straight_down[:3, :3],
+        torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]], dtype=D),
+        rtol=0,
+        atol=1e-15,
+    )
 
 
 @pytest.mark.parametrize(

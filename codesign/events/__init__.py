@@ -1,6 +1,7 @@
 """Events: from frames to counts, streams and volumes, hard and differentiable.
 
-Hard: ``simulate`` (sensor), ``naive`` (frame difference). Differentiable: ``memory`` (default), ``soft_counts``, ``soft``, ``dense``, ``expected``,
+Hard: ``simulate`` (sensor), ``naive`` (frame difference). Differentiable: ``memory`` (default),
+  ``soft_counts``, ``soft``, ``dense``, ``expected``,
 ``sensor_counts``; ``EventLayer`` calls any of them alike.
 """
 

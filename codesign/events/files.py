@@ -38,10 +38,13 @@ def read(path, *, height_px=None, width_px=None):
     """Read an event stream.
 
     Args:
-      path: file ending in .h5 (DSEC's or v2e's layout), .aedat4, .raw (EVT 2.0, EVT 3.0), .dat, .csv (header t,x,y,p; microseconds) or .npz.
-      height_px, width_px: sensor size. Taken where the file has none (else the smallest that holds the events); checked against the file otherwise.
+      path: file ending in .h5 (DSEC's or v2e's layout), .aedat4, .raw (EVT 2.0, EVT 3.0), .dat, .csv (header
+        t,x,y,p; microseconds) or .npz.
+      height_px, width_px: sensor size. Taken where the file has none (else the smallest that holds the
+        events); checked against the file otherwise.
     Returns: EventStream sorted by (t, y, x, p), times as the file gives them.
-    Raises: FileFormatError when the file is missing, malformed (with the line or event where there is one) or of another kind.
+    Raises: FileFormatError when the file is missing, malformed (with the line or event where there is one) or
+      of another kind.
     """
     path = Path(path)
     reader = _choose(READERS, path, "read")
@@ -54,17 +57,22 @@ def read(path, *, height_px=None, width_px=None):
 
 
 def write(path, stream, *, evt=None):
-    """Write an event stream; the file appears whole or not at all, and an earlier one stays when writing fails.
+    """Write an event stream; the file appears whole or not at all, and an earlier one stays when writing
+    fails.
 
     Args:
-      path: file ending in .h5, .aedat4, .raw, .dat, .aedat or .aedat2 (both AEDAT 2.0), .csv or .npz, in an existing folder.
+      path: file ending in .h5, .aedat4, .raw, .dat, .aedat or .aedat2 (both AEDAT 2.0), .csv or .npz, in an
+        existing folder.
       stream: EventStream.
       evt: encoding of .raw files, 2 or 3 (the default); for no other.
-    Raises: FileFormatError for an unknown extension, a stream that the format cannot hold, or a folder that is missing or not writable.
+    Raises: FileFormatError for an unknown extension, a stream that the format cannot hold, or a folder that
+      is missing or not writable.
     """
     writer = _choose(WRITERS, Path(path), "written")
     if evt is not None and writer is not write_raw:
-        raise FileFormatError(f"evt={evt!r} was given for {path}; it chooses the encoding of .raw files alone.")
+        raise FileFormatError(
+            f"evt={evt!r} was given for {path}; it chooses the encoding of .raw files alone."
+        )
     with replacing(path) as temporary:
         try:
             writer(temporary, stream, *(() if evt is None else (evt,)))
@@ -75,5 +83,8 @@ def write(path, stream, *, evt=None):
 def _choose(table, path, verb):
     choice = table.get(path.suffix.lower())
     if choice is None:
-        raise FileFormatError(f"{path} ends in {path.suffix or 'nothing'!r}; event files that can be {verb} end in {', '.join(sorted(table))}.")
+        raise FileFormatError(
+            f"{path} ends in {path.suffix or 'nothing'!r}; event files that can be {verb} end in "
+            f"{', '.join(sorted(table))}."
+        )
     return choice

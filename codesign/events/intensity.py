@@ -16,10 +16,13 @@ def lin_log(frames):
     """Log intensity with a linear part for dark pixels.
 
     Args:
-      frames: [T, ...] linear intensity on the 0-255 scale, finite, >= 0 (values above 255 are taken as they are).
+      frames: [T, ...] linear intensity on the 0-255 scale, finite, >= 0 (values above 255 are taken as they
+        are).
     Returns:
-      [T, ...] natural log units: I ln(20)/20 for I <= 20, ln I above. Continuous; v2e's rounding to 1e-8 is left out.
-    Gradient: frames. Slope ln(20)/20 = 0.1498 up to and including I = 20, 1/I above (it drops to 0.05 at the joint, as in v2e).
+      [T, ...] natural log units: I ln(20)/20 for I <= 20, ln I above. Continuous; v2e's rounding to 1e-8 is
+        left out.
+    Gradient: frames. Slope ln(20)/20 = 0.1498 up to and including I = 20, 1/I above (it drops to 0.05 at the
+      joint, as in v2e).
     Raises: DomainError for NaN, infinite or negative values.
     Source: v2e (Hu, Liu, Delbruck, CVPR-W 2021), lin-log mapping.
     """
@@ -27,18 +30,21 @@ def lin_log(frames):
 
 
 def _lin_log(frames):
-    # the logarithm gets a safe input where it is not selected, so that its gradient there is 0 and not 0 * inf
+    # the logarithm gets a safe input where it is not selected, so that its gradient there is 0 and not 0 *
+    # inf
     return torch.where(frames <= JOINT, frames * DARK_SLOPE, frames.clamp(min=JOINT).log())
 
 
 def light_share(intensity):
-    """How far the photoreceptor's speed and noise are from dark to full light: (I + 20)/275, 1 at I = 255. Tensors and drjit arrays. Source: v2e."""
+    """How far the photoreceptor's speed and noise are from dark to full light: (I + 20)/275, 1 at I = 255.
+    Tensors and drjit arrays. Source: v2e."""
     return (intensity + 20) / 275
 
 
 @dataclass(frozen=True)
 class FrontEnd:
-    """How frames become log levels: lin-log of the 0-255 scale, or ln(I + eps) of linear frames in any unit, or frames that are log levels already.
+    """How frames become log levels: lin-log of the 0-255 scale, or ln(I + eps) of linear frames in any unit,
+    or frames that are log levels already.
 
     log_input: the frames are log levels. log_eps: eps > 0, in the frames' unit; None: lin-log.
     """
@@ -49,7 +55,10 @@ class FrontEnd:
     def __post_init__(self):
         if self.log_eps is not None and (self.log_input or not 0 < self.log_eps < math.inf):
             given = "log_input is set" if self.log_input else f"log_eps is {self.log_eps!r}"
-            raise DomainError(f"{given}; give frames of log levels, or a finite log_eps > 0 in the unit of linear frames, or neither for lin-log.")
+            raise DomainError(
+                f"{given}; give frames of log levels, or a finite log_eps > 0 in the unit of linear frames, "
+                "or neither for lin-log."
+            )
 
     def level(self, frames):
         """Log level of a tensor of frames; gradient: frames."""
@@ -71,8 +80,11 @@ class FrontEnd:
             return frames, lambda: frames * 0 + 1
         if self.log_eps is not None:
             return dr.log(frames + self.log_eps), lambda: dr.rcp(frames + self.log_eps)
-        dark, safe = frames <= JOINT, dr.maximum(frames, JOINT)
-        return dr.select(dark, frames * DARK_SLOPE, dr.log(safe)), lambda: dr.select(dark, DARK_SLOPE, dr.rcp(safe))
+        dark = frames <= JOINT
+        safe = dr.maximum(frames, JOINT)
+        return dr.select(dark, frames * DARK_SLOPE, dr.log(safe)), lambda: dr.select(
+            dark, DARK_SLOPE, dr.rcp(safe)
+        )
 
     def accepts(self, dr, frames):
         """Mask of drjit values that may enter: finite, and >= 0 where they are linear."""

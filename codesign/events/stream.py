@@ -17,10 +17,16 @@ def ordered(t_us, x, y, p, height_px, width_px):
     """
     t_us, x, y, p = (values.to(torch.int64) for values in (t_us, x, y, p))
     if not (t_us.shape == x.shape == y.shape == p.shape == (t_us.numel(),)):
-        raise ShapeError(f"t_us, x, y, p have shapes {[list(v.shape) for v in (t_us, x, y, p)]}; four lists of equal length are needed.")
+        raise ShapeError(
+            f"t_us, x, y, p have shapes {[list(v.shape) for v in (t_us, x, y, p)]}; four lists of equal "
+            "length are needed."
+        )
     for values, name, size in ((x, "x", width_px), (y, "y", height_px)):
         if values.numel() and (int(values.min()) < 0 or int(values.max()) >= size):
-            raise DomainError(f"{name} spans {int(values.min())} to {int(values.max())}; the sensor has {size} pixels there (0 to {size - 1}).")
+            raise DomainError(
+                f"{name} spans {int(values.min())} to {int(values.max())}; the sensor has {size} pixels "
+                f"there (0 to {size - 1})."
+            )
     if bool((p.abs() != 1).any()):
         raise DomainError(f"polarity {int(p[p.abs() != 1][0])} found; +1 (ON) or -1 (OFF) is allowed.")
     rank = torch.argsort((y * width_px + x) * 2 + (p > 0), stable=True)
@@ -32,8 +38,13 @@ def concatenate(streams):
     """One ordered stream of several from the same sensor (for example of consecutive chunks)."""
     sizes = {(stream.height_px, stream.width_px) for stream in streams}
     if len(sizes) != 1:
-        raise ShapeError(f"sensor sizes {sorted(sizes)} given; at least one stream is needed and all must come from one sensor.")
-    t_us, x, y, p = (torch.cat([getattr(stream, name) for stream in streams]) for name in ("t_us", "x", "y", "p"))
+        raise ShapeError(
+            f"sensor sizes {sorted(sizes)} given; at least one stream is needed and all must come from one "
+            "sensor."
+        )
+    t_us, x, y, p = (
+        torch.cat([getattr(stream, name) for stream in streams]) for name in ("t_us", "x", "y", "p")
+    )
     return ordered(t_us, x, y, p, *sizes.pop())
 
 
@@ -42,17 +53,23 @@ def to_counts(stream, t_s, *, dtype=torch.float32):
 
     Args:
       stream: EventStream.
-      t_s: [T] times, seconds, strictly increasing, used to the nearest microsecond. An event at a time belongs to the interval that ends there;
-        one at the first time belongs to the first interval. Events before the first and after the last time are not asked for.
+      t_s: [T] times, seconds, strictly increasing, used to the nearest microsecond. An event at a time
+        belongs to the interval that ends there;
+        one at the first time belongs to the first interval. Events before the first and after the last time
+        are not asked for.
     Returns: [T-1, 2, H, W] counts, ON first.
     Gradient: none.
     """
     times_us = (check_times(t_s, len(t_s)) * 1e6).round().long()
     if len(times_us) < 2 or bool((times_us.diff() <= 0).any()):
-        raise DomainError(f"t_s holds {len(times_us)} times; at least two, a microsecond or more apart, are needed.")
+        raise DomainError(
+            f"t_s holds {len(times_us)} times; at least two, a microsecond or more apart, are needed."
+        )
     times_us = times_us.to(stream.t_us.device)
     inside = (stream.t_us >= times_us[0]) & (stream.t_us <= times_us[-1])
     interval = (torch.searchsorted(times_us, stream.t_us[inside]) - 1).clamp(min=0)
-    cell = ((interval * 2 + (stream.p[inside] < 0)) * stream.height_px + stream.y[inside]) * stream.width_px + stream.x[inside]
+    cell = (
+        (interval * 2 + (stream.p[inside] < 0)) * stream.height_px + stream.y[inside]
+    ) * stream.width_px + stream.x[inside]
     shape = (len(times_us) - 1, 2, stream.height_px, stream.width_px)
     return torch.bincount(cell, minlength=torch.Size(shape).numel()).reshape(shape).to(dtype)

@@ -1,4 +1,5 @@
-"""Event flow: the closed form, the refiner and the networks it is compared with, losses, error measures, network files and sources of windows."""
+"""Event flow: the closed form, the refiner and the networks it is compared with, losses, error measures,
+network files and sources of windows."""
 
 from codesign.flow import contrast, losses, metrics, sources
 from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
@@ -7,4 +8,16 @@ from codesign.flow.export import export
 from codesign.flow.lk import estimate_lk
 from codesign.flow.refiner import Refiner
 
-__all__ = ["FlowNetEvents", "Refiner", "SpikeFlowNet", "contrast", "estimate_lk", "export", "load", "losses", "metrics", "save", "sources"]
+__all__ = [
+    "FlowNetEvents",
+    "Refiner",
+    "SpikeFlowNet",
+    "contrast",
+    "estimate_lk",
+    "export",
+    "load",
+    "losses",
+    "metrics",
+    "save",
+    "sources",
+]

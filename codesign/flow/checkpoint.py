@@ -1,6 +1,8 @@
-"""Trained networks on disk: weights in safetensors, everything else as JSON in the file's header; data only, never code.
+"""Trained networks on disk: weights in safetensors, everything else as JSON in the file's header; data only,
+never code.
 
-A network file can be damaged, cut short, or written by another version; each of these ends in one FileFormatError, before any number is computed.
+A network file can be damaged, cut short, or written by another version; each of these ends in one
+FileFormatError, before any number is computed.
 """
 
 import hashlib
@@ -29,7 +31,8 @@ DELIVERED = {"refiner": Path(__file__).with_name("refiner.safetensors")}
 
 @dataclass(frozen=True)
 class NetworkFile:
-    """What a network file holds: name of the network, its constructor's arguments, weights, and what the writer added."""
+    """What a network file holds: name of the network, its constructor's arguments, weights, and what the
+    writer added."""
 
     network: str
     config: dict[str, Any]
@@ -56,9 +59,13 @@ def network_name(network):
     kind = type(network)
     for name, place in NETWORKS.items():
         module, known = place.split(":")
-        if known == kind.__qualname__ and (kind.__module__ == module or kind.__module__.startswith(f"{module}.")):
+        if known == kind.__qualname__ and (
+            kind.__module__ == module or kind.__module__.startswith(f"{module}.")
+        ):
             return name
-    raise DomainError(f"networks of class {kind.__qualname__} have no name; add it to codesign.flow.checkpoint.NETWORKS.")
+    raise DomainError(
+        f"networks of class {kind.__qualname__} have no name; add it to codesign.flow.checkpoint.NETWORKS."
+    )
 
 
 def save(network, path, metadata=None):
@@ -67,32 +74,49 @@ def save(network, path, metadata=None):
     Args:
       network: nn.Module of a class in NETWORKS, with its constructor's arguments in ``config``.
       metadata: plain JSON values to keep with it (seed, steps, figures, command), or None.
-    Raises: DomainError for a network without name, weights that are not finite, and metadata that JSON cannot hold; FileFormatError when the file cannot be written.
+    Raises: DomainError for a network without name, weights that are not finite, and metadata that JSON cannot
+      hold; FileFormatError when the file cannot be written.
     """
     weights = network.state_dict()
     bad = [name for name, tensor in weights.items() if not bool(tensor.isfinite().all())]
     if bad:
-        raise DomainError(f"weights {', '.join(bad[:3])} are NaN or infinite; such a network is not worth keeping.")
-    content = {"kind": "network", "network": network_name(network), "config": dict(network.config), "metadata": metadata or {}, "torch": torch.__version__}
+        raise DomainError(
+            f"weights {', '.join(bad[:3])} are NaN or infinite; such a network is not worth keeping."
+        )
+    content = {
+        "kind": "network",
+        "network": network_name(network),
+        "config": dict(network.config),
+        "metadata": metadata or {},
+        "torch": torch.__version__,
+    }
     try:
         json.dumps(content, allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise DomainError(f"configuration and metadata of a network must be plain, finite JSON values ({error}).") from error
+        raise DomainError(
+            f"configuration and metadata of a network must be plain, finite JSON values ({error})."
+        ) from error
     write_tensors(path, weights, content)
 
 
 def load(name_or_path):
     """A trained network, in evaluation mode, on the CPU.
 
-    Args: name_or_path: "refiner", the one delivered with the package, or the path of a file that ``save`` wrote.
-    Returns: the network, a callable from EventVolume to FlowField. Its weights still take gradients; ``requires_grad_(False)`` saves their cost.
-    Raises: FileFormatError when the file is missing, damaged, of another version, or does not fit its network.
+    Args: name_or_path: "refiner", the one delivered with the package, or the path of a file that ``save``
+      wrote.
+    Returns: the network, a callable from EventVolume to FlowField. Its weights still take gradients;
+      ``requires_grad_(False)`` saves their cost.
+    Raises: FileFormatError when the file is missing, damaged, of another version, or does not fit its
+      network.
     """
     path = Path(name_or_path)
     if str(name_or_path) in DELIVERED:
         path = DELIVERED[str(name_or_path)]
     elif path.suffix != ".safetensors":
-        raise FileFormatError(f"'{name_or_path}' is neither a delivered network ({', '.join(DELIVERED)}) nor a .safetensors file; give one of these.")
+        raise FileFormatError(
+            f"'{name_or_path}' is neither a delivered network ({', '.join(DELIVERED)}) nor a .safetensors "
+            "file; give one of these."
+        )
     return build(read(path), path).eval()
 
 
@@ -102,8 +126,14 @@ def read(path):
     Raises: FileFormatError when it is missing, damaged, of another version or another kind.
     """
     weights, content = read_tensors(path)
-    if content.get("kind") != "network" or not isinstance(content.get("network"), str) or not isinstance(content.get("config"), dict):
-        raise FileFormatError(f"'{path}' holds no network; give the file network.safetensors of a training run.")
+    if (
+        content.get("kind") != "network"
+        or not isinstance(content.get("network"), str)
+        or not isinstance(content.get("config"), dict)
+    ):
+        raise FileFormatError(
+            f"'{path}' holds no network; give the file network.safetensors of a training run."
+        )
     return NetworkFile(content["network"], content["config"], weights, content.get("metadata", {}))
 
 
@@ -115,7 +145,10 @@ def build(stored, path):
     try:
         network = network_class(stored.network)(**stored.config)
     except (CodesignError, TypeError) as error:
-        raise FileFormatError(f"'{path}' cannot be built as '{stored.network}' ({error}); it was written by another version of this network.") from error
+        raise FileFormatError(
+            f"'{path}' cannot be built as '{stored.network}' ({error}); it was written by another version "
+            "of this network."
+        ) from error
     fill(network, stored.weights, path)
     return network
 
@@ -128,9 +161,15 @@ def fill(network, weights, path):
     own = network.state_dict()
     for name in sorted(own.keys() | weights.keys()):
         if name not in own or name not in weights:
-            raise FileFormatError(f"'{path}' {'has a weight' if name in weights else 'lacks the weight'} '{name}' that this network {'lacks' if name in weights else 'has'}; it is of another network.")
+            raise FileFormatError(
+                f"'{path}' {'has a weight' if name in weights else 'lacks the weight'} '{name}' that this "
+                f"network {'lacks' if name in weights else 'has'}; it is of another network."
+            )
         if own[name].shape != weights[name].shape:
-            raise FileFormatError(f"'{path}': weight '{name}' is {list(weights[name].shape)}, the network's is {list(own[name].shape)}; it is of another network.")
+            raise FileFormatError(
+                f"'{path}': weight '{name}' is {list(weights[name].shape)}, the network's is "
+                f"{list(own[name].shape)}; it is of another network."
+            )
         if not bool(weights[name].isfinite().all()):
             raise FileFormatError(f"'{path}': weight '{name}' is NaN or infinite; the file is of no use.")
     network.load_state_dict(weights)
@@ -156,20 +195,32 @@ def read_tensors(path):
     """
     path = Path(path)
     if not path.is_file():
-        raise FileFormatError(f"'{path}' does not exist or is no file; give the path of a .safetensors file that a training run wrote.")
+        raise FileFormatError(
+            f"'{path}' does not exist or is no file; give the path of a .safetensors file that a training "
+            "run wrote."
+        )
     try:
         with safe_open(str(path), framework="pt") as stored:
             header = json.loads((stored.metadata() or {})["codesign"])
             tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118  no mapping
-        digest, text = header["sha256"], header["content"]
+        digest = header["sha256"]
+        text = header["content"]
         content = json.loads(text)
         version = content["version"]
     except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
-        raise FileFormatError(f"'{path}' is damaged or not written by codesign ({type(error).__name__}: {error}); train or copy it again.") from error
+        raise FileFormatError(
+            f"'{path}' is damaged or not written by codesign ({type(error).__name__}: {error}); train or "
+            "copy it again."
+        ) from error
     if version != VERSION:
-        raise FileFormatError(f"'{path}' has format version {version}, this codesign reads version {VERSION}; train it again, or use the codesign that wrote it.")
+        raise FileFormatError(
+            f"'{path}' has format version {version}, this codesign reads version {VERSION}; train it again, "
+            "or use the codesign that wrote it."
+        )
     if digest != _digest(tensors, text):
-        raise FileFormatError(f"'{path}' is damaged (its checksum does not fit its content); train or copy it again.")
+        raise FileFormatError(
+            f"'{path}' is damaged (its checksum does not fit its content); train or copy it again."
+        )
     return tensors, content
 
 

@@ -1,8 +1,12 @@
-"""Images of warped events: each event moves along the flow to one time, and a flow that is right makes the image sharp.
+"""Images of warped events: each event moves along the flow to one time, and a flow that is right makes the
+image sharp.
 
-Time runs from 0 at the start of the window to 1 at its end. An event at pixel x and time tau lies at x + (at - tau) flow at time ``at``. Its flow is that of its
-own pixel (``carry_steps=0``, what the literature does), or, since a FlowField lives on the pixels of the window's start, that of the pixel it came from:
-x0 = x - tau flow(x0), by fixed-point steps from x0 = x, bilinear between pixels. Each step leaves an error one order higher in the slope of the flow.
+Time runs from 0 at the start of the window to 1 at its end. An event at pixel x and time tau lies at x + (at
+- tau) flow at time ``at``. Its flow is that of its
+own pixel (``carry_steps=0``, what the literature does), or, since a FlowField lives on the pixels of the
+window's start, that of the pixel it came from:
+x0 = x - tau flow(x0), by fixed-point steps from x0 = x, bilinear between pixels. Each step leaves an error
+one order higher in the slope of the flow.
 """
 
 from dataclasses import dataclass
@@ -18,7 +22,8 @@ from codesign.errors import DomainError, ShapeError, check_finite
 class EventTracks:
     """Events (or contents of bins) with the straight lines they move along.
 
-    x_px, y_px: [N] pixel where each was seen. time: [N] when, as a share of the window. count: [B, 2, N] how many, ON first.
+    x_px, y_px: [N] pixel where each was seen. time: [N] when, as a share of the window. count: [B, 2, N] how
+      many, ON first.
     flow_px: [B, 2, N] pixels per window. height_px, width_px: size of the sensor.
     """
 
@@ -40,8 +45,10 @@ def volume_tracks(volume, flow_px, carry_steps=0):
     """Tracks of the contents of an event volume, each bin at its centroid.
 
     Args:
-      volume: EventVolume, counts [B, 2, bins, H, W]. flow_px: [B, 2, H, W] pixels per window, on the pixels of its start.
-      carry_steps: fixed-point steps that look for the start of each track; 0 takes the flow of the pixel where the event is.
+      volume: EventVolume, counts [B, 2, bins, H, W]. flow_px: [B, 2, H, W] pixels per window, on the pixels
+        of its start.
+      carry_steps: fixed-point steps that look for the start of each track; 0 takes the flow of the pixel
+        where the event is.
     Returns: EventTracks of N = bins H W.
     Gradient: counts and flow_px.
     Raises: ShapeError; DomainError for a flow that is not finite.
@@ -52,10 +59,14 @@ def volume_tracks(volume, flow_px, carry_steps=0):
     batch, _, bins, height, width = counts.shape
     flow = _entered(flow_px, (batch, 2, height, width))
     time = volume_times(volume, flow)
-    y, x = torch.meshgrid(*(torch.arange(size, dtype=flow.dtype, device=flow.device) for size in (height, width)), indexing="ij")
+    y, x = torch.meshgrid(
+        *(torch.arange(size, dtype=flow.dtype, device=flow.device) for size in (height, width)), indexing="ij"
+    )
     x, y, time = (values.expand(bins, height, width).flatten() for values in (x, y, time[:, None, None]))
     own = flow[:, :, None].expand(batch, 2, bins, height, width).flatten(2)
-    return EventTracks(x, y, time, counts.flatten(2), _carried(flow, own, x, y, time, carry_steps), height, width)
+    return EventTracks(
+        x, y, time, counts.flatten(2), _carried(flow, own, x, y, time, carry_steps), height, width
+    )
 
 
 def volume_times(volume, like):
@@ -67,43 +78,66 @@ def stream_tracks(stream, flow_px, t0_us, t1_us, carry_steps=0):
     """Tracks of the single events from t0 to t1, both included, at their time stamps.
 
     Args:
-      stream: EventStream. flow_px: [2, H, W] or [1, 2, H, W] pixels from t0 to t1. t0_us, t1_us: whole microseconds. carry_steps: as in volume_tracks.
+      stream: EventStream. flow_px: [2, H, W] or [1, 2, H, W] pixels from t0 to t1. t0_us, t1_us: whole
+        microseconds. carry_steps: as in volume_tracks.
     Returns: EventTracks of B = 1.
     Gradient: flow_px.
-    Raises: ShapeError; DomainError for an empty interval, an interval without events, or a flow that is not finite.
+    Raises: ShapeError; DomainError for an empty interval, an interval without events, or a flow that is not
+      finite.
     """
     if int(t0_us) != t0_us or int(t1_us) != t1_us or t1_us <= t0_us:
-        raise DomainError(f"the interval is {t0_us!r} to {t1_us!r} us; whole microseconds with t1 > t0 are needed.")
-    flow = _entered(flow_px if flow_px.ndim == 4 else flow_px[None], (1, 2, stream.height_px, stream.width_px))
-    first, last = torch.searchsorted(stream.t_us, torch.tensor([int(t0_us), int(t1_us) + 1], device=stream.t_us.device)).tolist()
+        raise DomainError(
+            f"the interval is {t0_us!r} to {t1_us!r} us; whole microseconds with t1 > t0 are needed."
+        )
+    flow = _entered(
+        flow_px if flow_px.ndim == 4 else flow_px[None], (1, 2, stream.height_px, stream.width_px)
+    )
+    first, last = torch.searchsorted(
+        stream.t_us, torch.tensor([int(t0_us), int(t1_us) + 1], device=stream.t_us.device)
+    ).tolist()
     if first == last:
-        raise DomainError(f"no event lies between {t0_us} and {t1_us} us, so there is nothing to warp; choose an interval with events.")
-    t_us, x, y, p = (column[first:last].to(flow.device) for column in (stream.t_us, stream.x, stream.y, stream.p))
+        raise DomainError(
+            f"no event lies between {t0_us} and {t1_us} us, so there is nothing to warp; choose an interval "
+            "with events."
+        )
+    t_us, x, y, p = (
+        column[first:last].to(flow.device) for column in (stream.t_us, stream.x, stream.y, stream.p)
+    )
     time = ((t_us - int(t0_us)).double() / (int(t1_us) - int(t0_us))).to(flow)
     count = torch.stack([p > 0, p < 0])[None].to(flow)
     own = flow[:, :, y, x]
-    x, y = x.to(flow), y.to(flow)
-    return EventTracks(x, y, time, count, _carried(flow, own, x, y, time, carry_steps), stream.height_px, stream.width_px)
+    x = x.to(flow)
+    y = y.to(flow)
+    return EventTracks(
+        x, y, time, count, _carried(flow, own, x, y, time, carry_steps), stream.height_px, stream.width_px
+    )
 
 
 def count_image(tracks, at):
-    """Image [B, 2, H, W] of the events moved to the time ``at``, each shared between the four pixels around it in proportion to its nearness.
+    """Image [B, 2, H, W] of the events moved to the time ``at``, each shared between the four pixels around
+    it in proportion to its nearness.
 
-    A share that falls on no pixel is lost: the image and ``leaving`` add up to all events. Gradient: counts and flow; piecewise smooth, with a kink where an
+    A share that falls on no pixel is lost: the image and ``leaving`` add up to all events. Gradient: counts
+      and flow; piecewise smooth, with a kink where an
     event crosses the centre line of a pixel.
     """
     return _shared(tracks, tracks.count, at)
 
 
 def time_image(tracks, at):
-    """Mean time [B, 2, H, W] of the events that share in a pixel, 0 where there are none. Gradient: as in count_image, but without bound where a count goes to 0."""
+    """Mean time [B, 2, H, W] of the events that share in a pixel, 0 where there are none. Gradient: as in
+    count_image, but without bound where a count goes to 0."""
     return _ratio(_shared(tracks, tracks.count * tracks.time, at), _shared(tracks, tracks.count, at))
 
 
 def nearest_images(tracks, at):
-    """Counts and mean times, [B, 2, H, W] each, with every event on the pixel nearest to it (a tie goes right and down). Gradient: none in the flow."""
+    """Counts and mean times, [B, 2, H, W] each, with every event on the pixel nearest to it (a tie goes right
+    and down). Gradient: none in the flow."""
     column, row = (torch.floor(value.detach() + 0.5).long() for value in tracks.positions(at))
-    counts, sums = (_gathered(tracks, column, row, [(0, 0, value)]) for value in (tracks.count, tracks.count * tracks.time))
+    counts, sums = (
+        _gathered(tracks, column, row, [(0, 0, value)])
+        for value in (tracks.count, tracks.count * tracks.time)
+    )
     return counts, _ratio(sums, counts)
 
 
@@ -113,14 +147,18 @@ def leaving(tracks, at):
 
 
 def smooth_image(tracks, at, weight=None):
-    """Like count_image, with each event spread over the nine pixels around it by the quadratic B-spline (Gaussian-like, variance 1/4 px^2).
+    """Like count_image, with each event spread over the nine pixels around it by the quadratic B-spline
+    (Gaussian-like, variance 1/4 px^2).
 
-    The spread is alike wherever an event falls, so the image is no sharper for whole-pixel motion (bilinear shares have a variance between 0 and 1/4), and its
-    gradient has no jumps. weight: [B, N] factor per event, or None. Gradient: counts, flow and weight; continuous.
+    The spread is alike wherever an event falls, so the image is no sharper for whole-pixel motion (bilinear
+    shares have a variance between 0 and 1/4), and its
+    gradient has no jumps. weight: [B, N] factor per event, or None. Gradient: counts, flow and weight;
+      continuous.
     """
     x, y = tracks.positions(at)
     column, row = (value.detach().add(0.5).floor() for value in (x, y))
-    across, along = _spline(x - column), _spline(y - row)
+    across = _spline(x - column)
+    along = _spline(y - row)
     count = tracks.count if weight is None else tracks.count * weight[:, None]
     parts = ((i - 1, k - 1, count * (across[i] * along[k])[:, None]) for i in range(3) for k in range(3))
     return _gathered(tracks, column.long(), row.long(), parts)
@@ -130,20 +168,26 @@ def still_image(counts):
     """What smooth_image gives at zero flow, for counts [B, 2, bins, H, W], much faster."""
     image = counts.sum(2)
     for axis in (2, 3):
-        nothing, length = torch.zeros_like(image.narrow(axis, 0, 1)), image.shape[axis] - 1
-        before, after = torch.cat([nothing, image.narrow(axis, 0, length)], axis), torch.cat([image.narrow(axis, 1, length), nothing], axis)
+        nothing = torch.zeros_like(image.narrow(axis, 0, 1))
+        length = image.shape[axis] - 1
+        before = torch.cat([nothing, image.narrow(axis, 0, length)], axis)
+        after = torch.cat([image.narrow(axis, 1, length), nothing], axis)
         image = 0.75 * image + 0.125 * (before + after)  # the B-spline at offset 0
     return image
 
 
 def warp_jacobian(tracks, bins, at):
-    """Jacobian of the warp to the time ``at`` at each pixel of each bin of a volume, by central differences over the flow of its tracks.
+    """Jacobian of the warp to the time ``at`` at each pixel of each bin of a volume, by central differences
+    over the flow of its tracks.
 
-    Returns: dx'/dx, dx'/dy, dy'/dx, dy'/dy, [B, bins, H, W] each. Gradient: flow. Raises: ShapeError for images less than 2 pixels high or wide.
+    Returns: dx'/dx, dx'/dy, dy'/dx, dy'/dy, [B, bins, H, W] each. Gradient: flow. Raises: ShapeError for
+      images less than 2 pixels high or wide.
     """
     shape = (bins, tracks.height_px, tracks.width_px)
     if min(shape[1:]) < 2:
-        raise ShapeError(f"an image of {shape[1]} x {shape[2]} pixels has no slope of the flow; at least 2 x 2 are needed.")
+        raise ShapeError(
+            f"an image of {shape[1]} x {shape[2]} pixels has no slope of the flow; at least 2 x 2 are needed."
+        )
     by_y, by_x = torch.gradient(tracks.flow_px.unflatten(2, shape), dim=(3, 4))
     span = at - tracks.time.reshape(1, *shape)
     return 1 + span * by_x[:, 0], span * by_y[:, 0], span * by_x[:, 1], 1 + span * by_y[:, 1]
@@ -152,7 +196,8 @@ def warp_jacobian(tracks, bins, at):
 def area_change(jacobian):
     """Factor by which a warp with this Jacobian changes a small area; negative where it folds over.
 
-    Source: Shiba, Aoki, Gallego, Event collapse in contrast maximization frameworks, Sensors 2022, sec. 3.4.2.
+    Source: Shiba, Aoki, Gallego, Event collapse in contrast maximization frameworks, Sensors 2022, sec.
+      3.4.2.
     """
     xx, xy, yx, yy = jacobian
     return xx * yy - xy * yx
@@ -170,7 +215,8 @@ def sharpness(image):
 
 
 def _spline(offset):
-    """Shares of the pixel before, the nearest and the one after, at an offset of -1/2 to 1/2 from the nearest."""
+    """Shares of the pixel before, the nearest and the one after, at an offset of -1/2 to 1/2 from the
+    nearest."""
     return (0.5 - offset).square() / 2, 0.75 - offset.square(), (0.5 + offset).square() / 2
 
 
@@ -178,7 +224,9 @@ def _entered(flow_px, shape):
     if tuple(flow_px.shape) != shape:
         raise ShapeError(f"the flow of these events must be {list(shape)}, got {list(flow_px.shape)}.")
     check_finite(flow_px, "flow")
-    return flow_px.to(torch.promote_types(flow_px.dtype, torch.float32))  # places in half precision would be half a pixel off
+    return flow_px.to(
+        torch.promote_types(flow_px.dtype, torch.float32)
+    )  # places in half precision would be half a pixel off
 
 
 def _carried(flow, own, x, y, time, steps):
@@ -188,30 +236,55 @@ def _carried(flow, own, x, y, time, steps):
     found = own
     for _ in range(steps):
         start = torch.stack([x - time * found[:, 0], y - time * found[:, 1]], -1)
-        found = grid_sample(flow, (2 * start / size - 1)[:, None], padding_mode="border", align_corners=True)[:, :, 0]
+        found = grid_sample(flow, (2 * start / size - 1)[:, None], padding_mode="border", align_corners=True)[
+            :, :, 0
+        ]
     return found
 
 
 def _shared(tracks, values, at):
     """Bilinear shares of values [B, 2, N] at the places of the tracks, summed on the pixels [B, 2, H, W]."""
     x, y = tracks.positions(at)
-    left, top = x.detach().floor(), y.detach().floor()
-    right, down = x - left, y - top
-    corners = ((0, 0, (1 - right) * (1 - down)), (1, 0, right * (1 - down)), (0, 1, (1 - right) * down), (1, 1, right * down))
-    return _gathered(tracks, left.long(), top.long(), ((step_x, step_y, values * share[:, None]) for step_x, step_y, share in corners))
+    left = x.detach().floor()
+    top = y.detach().floor()
+    right = x - left
+    down = y - top
+    corners = (
+        (0, 0, (1 - right) * (1 - down)),
+        (1, 0, right * (1 - down)),
+        (0, 1, (1 - right) * down),
+        (1, 1, right * down),
+    )
+    return _gathered(
+        tracks,
+        left.long(),
+        top.long(),
+        ((step_x, step_y, values * share[:, None]) for step_x, step_y, share in corners),
+    )
 
 
 def _gathered(tracks, column, row, parts):
-    """Sums on the pixels [B, 2, H, W] of parts (step right, step down, values [B, 2, N]), steps from -1 to 1 from whole pixels [B, N].
+    """Sums on the pixels [B, 2, H, W] of parts (step right, step down, values [B, 2, N]), steps from -1 to 1
+    from whole pixels [B, N].
 
-    What is outside falls on a margin that is cut off: places beyond are held two pixels from the image, so that no step leads back to it.
+    What is outside falls on a margin that is cut off: places beyond are held two pixels from the image, so
+      that no step leads back to it.
     """
-    height, width, margin = tracks.height_px, tracks.width_px, 3
+    height = tracks.height_px
+    width = tracks.width_px
+    margin = 3
     across = width + 2 * margin
     cell = (row.clamp(-2, height + 1) + margin) * across + column.clamp(-2, width + 1) + margin
-    image = torch.zeros(*tracks.count.shape[:2], (height + 2 * margin) * across, dtype=torch.result_type(tracks.count, tracks.flow_px), device=cell.device)
+    image = torch.zeros(
+        *tracks.count.shape[:2],
+        (height + 2 * margin) * across,
+        dtype=torch.result_type(tracks.count, tracks.flow_px),
+        device=cell.device,
+    )
     for step_x, step_y, values in parts:
-        image = image.scatter_add(2, (cell + (step_y * across + step_x))[:, None].expand_as(values), values.to(image.dtype))
+        image = image.scatter_add(
+            2, (cell + (step_y * across + step_x))[:, None].expand_as(values), values.to(image.dtype)
+        )
     return image.unflatten(2, (height + 2 * margin, across))[..., margin:-margin, margin:-margin]
 
 

@@ -1,4 +1,5 @@
-"""What every network does around its layers: check the volume, normalise it, pad it to the stride, and fade the flow in with the events."""
+"""What every network does around its layers: check the volume, normalise it, pad it to the stride, and fade
+the flow in with the events."""
 
 from torch.nn.functional import pad
 
@@ -29,14 +30,19 @@ def check_volume(volume, bins):
     """
     counts = volume.counts
     if counts.ndim != 5 or counts.shape[1] != 2 or counts.shape[2] != bins or min(counts.shape) < 1:
-        raise ShapeError(f"this network takes event volumes [B, 2, {bins}, H, W], got {tuple(counts.shape)}; make the volume with {bins} bins or build the network for others.")
+        raise ShapeError(
+            f"this network takes event volumes [B, 2, {bins}, H, W], got {tuple(counts.shape)}; make the "
+            f"volume with {bins} bins or build the network for others."
+        )
     return check_finite(counts, "event volume")
 
 
 def normalise(counts):
-    """Counts of each sample over the mean count that an event finds in its own bin: about 1 where there are events, whatever contrast and threshold.
+    """Counts of each sample over the mean count that an event finds in its own bin: about 1 where there are
+    events, whatever contrast and threshold.
 
-    Args: counts [B, ...]. Returns: the same shape. Gradient: counts. One added event keeps it smooth down to an empty sample.
+    Args: counts [B, ...]. Returns: the same shape. Gradient: counts. One added event keeps it smooth down to
+      an empty sample.
     """
     flat = counts.flatten(1)
     usual = (flat.square().sum(1) + 1) / (flat.sum(1) + 1)
@@ -44,13 +50,15 @@ def normalise(counts):
 
 
 def presence(counts):
-    """n^2 / (n^2 + FEW^2) of the n events of each sample, [B, 1, 1, 1]: flow and gradient are 0 for an empty one."""
+    """n^2 / (n^2 + FEW^2) of the n events of each sample, [B, 1, 1, 1]: flow and gradient are 0 for an empty
+    one."""
     square = counts.flatten(1).sum(1).square()
     return (square / (square + FEW**2))[:, None, None, None]
 
 
 def pad_to(image, stride):
-    """Zeros to the right and below, up to the next multiple of ``stride``; pixels keep their places. Crop with ``[..., :H, :W]``."""
+    """Zeros to the right and below, up to the next multiple of ``stride``; pixels keep their places. Crop
+    with ``[..., :H, :W]``."""
     return pad(image, (0, -image.shape[-1] % stride, 0, -image.shape[-2] % stride))
 
 
@@ -60,4 +68,6 @@ def to_field(flow_px, volume):
     shown = presence(counts)
     batch, _, height, width = flow_px.shape
     valid = (counts.detach().flatten(1).sum(1) > 0)[:, None, None].expand(batch, height, width)
-    return FlowField(flow_px * shown, valid, float(volume.collected_s.sum()), shown[:, 0].expand(batch, height, width))
+    return FlowField(
+        flow_px * shown, valid, float(volume.collected_s.sum()), shown[:, 0].expand(batch, height, width)
+    )

@@ -1,4 +1,5 @@
-"""Flow networks as programs that run without this package: torch.export (.pt2) and, where every operation has a counterpart, ONNX (.onnx)."""
+"""Flow networks as programs that run without this package: torch.export (.pt2) and, where every operation has
+a counterpart, ONNX (.onnx)."""
 
 import contextlib
 import io
@@ -15,7 +16,8 @@ from codesign.types import EventVolume
 
 
 def evenly_timed(counts, interval_s=1.0):
-    """EventVolume of counts [B, 2, bins, H, W] whose bins are those of codesign.events.from_stream: equally spaced nodes, the two at the ends collecting half."""
+    """EventVolume of counts [B, 2, bins, H, W] whose bins are those of codesign.events.from_stream: equally
+    spaced nodes, the two at the ends collecting half."""
     bins = counts.shape[2]
     step = interval_s / (bins - 1)
     centroid_s = torch.arange(bins, dtype=torch.float64) * step
@@ -30,21 +32,28 @@ def export(network, path, height_px, width_px, batch=1):
 
     Args:
       network: flow network with ``config["bins"]``. path: .pt2 (torch.export) or .onnx.
-      height_px, width_px, batch: of the counts [batch, 2, bins, H, W] that the program takes; it returns flow [batch, 2, H, W] and confidence [batch, H, W].
-    Raises: DomainError for another extension, for ONNX without its packages, and for a network with an operation that ONNX lacks; FileFormatError when the
+      height_px, width_px, batch: of the counts [batch, 2, bins, H, W] that the program takes; it returns flow
+        [batch, 2, H, W] and confidence [batch, H, W].
+    Raises: DomainError for another extension, for ONNX without its packages, and for a network with an
+      operation that ONNX lacks; FileFormatError when the
       file cannot be written.
 
-    Load .pt2 by ``torch.export.load(path).module()``, .onnx by any ONNX runtime (input "counts", outputs "flow_px", "confidence").
+    Load .pt2 by ``torch.export.load(path).module()``, .onnx by any ONNX runtime (input "counts", outputs
+    "flow_px", "confidence").
     """
     path = Path(path)
     if path.suffix not in (".pt2", ".onnx"):
-        raise DomainError(f"'{path.name}' is no program file; give a name that ends in .pt2 (torch.export) or .onnx.")
+        raise DomainError(
+            f"'{path.name}' is no program file; give a name that ends in .pt2 (torch.export) or .onnx."
+        )
     program = trace(network, height_px, width_px, batch)
     with replacing(path) as temporary:
         if path.suffix == ".pt2":
             buffer = io.BytesIO()
             with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", message="No complete tensor")  # weights in channels-last order
+                warnings.filterwarnings(
+                    "ignore", message="No complete tensor"
+                )  # weights in channels-last order
                 torch.export.save(program, buffer)
             temporary.write_bytes(buffer.getvalue())
         else:
@@ -54,7 +63,8 @@ def export(network, path, height_px, width_px, batch=1):
 def trace(network, height_px, width_px, batch=1):
     """torch.export's ExportedProgram of a network, in evaluation mode.
 
-    What depends on the bins' times alone becomes a constant. The program looks at no value and so refuses none: counts that are not finite give a flow that is not.
+    What depends on the bins' times alone becomes a constant. The program looks at no value and so refuses
+    none: counts that are not finite give a flow that is not.
     """
 
     def program(counts):
@@ -66,7 +76,8 @@ def trace(network, height_px, width_px, batch=1):
     counts = torch.zeros(batch, 2, network.config["bins"], height_px, width_px)
     try:
         with torch.no_grad():
-            # traced with values, since torch.export alone cannot follow a check for finite input or a number computed from the bins' times
+            # traced with values, since torch.export alone cannot follow a check for finite input or a number
+            # computed from the bins' times
             graph = make_fx(program, tracing_mode="real", _error_on_data_dependent_ops=False)(counts)
             _tidy(graph)
             return torch.export.export(graph, (counts,), strict=False)
@@ -75,7 +86,8 @@ def trace(network, height_px, width_px, batch=1):
 
 
 def _tidy(graph):
-    """Drop what only looked at values while tracing; give every constant storage of its own, so that none is saved with a larger one it is a view of."""
+    """Drop what only looked at values while tracing; give every constant storage of its own, so that none is
+    saved with a larger one it is a view of."""
     for looking in (torch.ops.aten._local_scalar_dense.default, torch.ops.aten._linalg_check_errors.default):
         for node in graph.graph.find_nodes(op="call_function", target=looking):
             if not node.users:
@@ -89,9 +101,11 @@ def _tidy(graph):
 
 
 def eliminate(matrix, right):
-    """Solution [..., n, m] of positive definite systems [..., n, n] by Gauss-Jordan elimination, which needs no exchange of rows there: plain operations alone."""
+    """Solution [..., n, m] of positive definite systems [..., n, n] by Gauss-Jordan elimination, which needs
+    no exchange of rows there: plain operations alone."""
     size = matrix.shape[-1]
-    unit, rows = torch.eye(size, dtype=matrix.dtype), torch.cat([matrix, right], -1)
+    unit = torch.eye(size, dtype=matrix.dtype)
+    rows = torch.cat([matrix, right], -1)
     for k in range(size):
         pivot = rows[..., k : k + 1, :] / rows[..., k : k + 1, k : k + 1]
         rows = rows - (rows[..., :, k : k + 1] - unit[:, k : k + 1]) * pivot
@@ -101,32 +115,63 @@ def eliminate(matrix, right):
 def _solve_ex(matrix, right, *, left=True, check_errors=False):
     column = right.ndim == matrix.ndim - 1
     found = eliminate(matrix, right[..., None] if column else right)
-    return found[..., 0] if column else found, matrix, matrix[..., 0, :].to(torch.int32), matrix[..., 0, 0].to(torch.int32)  # factors and flags: never used
+    return (
+        found[..., 0] if column else found,
+        matrix,
+        matrix[..., 0, :].to(torch.int32),
+        matrix[..., 0, 0].to(torch.int32),
+    )  # factors and flags: never used
 
 
 def _inverse_ex(matrix, *, check_errors=False):
-    return eliminate(matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype).expand_as(matrix)), matrix[..., 0, 0].to(torch.int32)
+    return eliminate(matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype).expand_as(matrix)), matrix[
+        ..., 0, 0
+    ].to(torch.int32)
 
 
-PLAIN = {torch.ops.aten._linalg_solve_ex.default: _solve_ex, torch.ops.aten.linalg_inv_ex.default: _inverse_ex}  # ONNX has neither
+PLAIN = {
+    torch.ops.aten._linalg_solve_ex.default: _solve_ex,
+    torch.ops.aten.linalg_inv_ex.default: _inverse_ex,
+}  # ONNX has neither
 
 
 def _onnx(program, name):
-    """Bytes of an ONNX model with its weights inside. The small systems that flow networks solve are positive definite."""
+    """Bytes of an ONNX model with its weights inside. The small systems that flow networks solve are positive
+    definite."""
     try:
         import onnxscript  # noqa: F401
     except ImportError as error:
-        raise DomainError("ONNX needs the packages onnx and onnxscript ('pip install onnx onnxscript'); or give a name that ends in .pt2.") from error
+        raise DomainError(
+            "ONNX needs the packages onnx and onnxscript ('pip install onnx onnxscript'); or give a name "
+            "that ends in .pt2."
+        ) from error
     log = logging.getLogger("torch.onnx")
     level = log.level
-    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():  # the exporter's own progress and deprecations
+    with (
+        contextlib.redirect_stdout(io.StringIO()),
+        warnings.catch_warnings(),
+    ):  # the exporter's own progress and deprecations
         warnings.simplefilter("ignore")
         log.setLevel(logging.ERROR)
         try:
-            model = torch.onnx.export(program.run_decompositions(PLAIN), (), dynamo=True, optimize=False, input_names=["counts"], output_names=["flow_px", "confidence"], verbose=False)
+            model = torch.onnx.export(
+                program.run_decompositions(PLAIN),
+                (),
+                dynamo=True,
+                optimize=False,
+                input_names=["counts"],
+                output_names=["flow_px", "confidence"],
+                verbose=False,
+            )
         except torch.onnx.OnnxExporterError as error:
-            missing = next((line for line in str(error).splitlines() if "No ONNX function found" in line), "see the error before")
-            raise DomainError(f"{name} has an operation that ONNX lacks ({missing.strip()[:200]}); give a name that ends in .pt2 for torch.export.") from error
+            missing = next(
+                (line for line in str(error).splitlines() if "No ONNX function found" in line),
+                "see the error before",
+            )
+            raise DomainError(
+                f"{name} has an operation that ONNX lacks ({missing.strip()[:200]}); give a name that ends "
+                "in .pt2 for torch.export."
+            ) from error
         finally:
             log.setLevel(level)
     assert model is not None

@@ -1,10 +1,15 @@
 """Closed-form event flow: coarse-to-fine Bayesian least squares on event volumes.
 
-The signed event rate of a moving texture moves with it, so the volume obeys V_t + u V_x + v V_y = 0 (Lucas and Kanade, 1981,
-with event rate in place of intensity). The volume is warped back along the current flow; per pixel, the regression of the
-bins over time gives V_t and their mean gives V_x, V_y; all pixels together pull at the parameters of an affine or quadratic
-field (lk_level). A Gaussian prior on the field (lk_field) holds against the pull, which is weighed by the noise that scattered
-events put into it, so that few events mean small steps, and the spread of what is left is returned with the flow.
+The signed event rate of a moving texture moves with it, so the volume obeys V_t + u V_x + v V_y = 0 (Lucas
+and Kanade, 1981,
+with event rate in place of intensity). The volume is warped back along the current flow; per pixel, the
+regression of the
+bins over time gives V_t and their mean gives V_x, V_y; all pixels together pull at the parameters of an
+affine or quadratic
+field (lk_level). A Gaussian prior on the field (lk_field) holds against the pull, which is weighed by the
+noise that scattered
+events put into it, so that few events mean small steps, and the spread of what is left is returned with the
+flow.
 """
 
 import torch
@@ -20,11 +25,15 @@ def estimate_lk(volume, model="affine", prior_px=3.0, levels_px=(4.0, 2.0, 1.0),
     Args:
       volume: EventVolume, counts [B, 2, bins >= 2, H, W].
       model: "constant", "affine" or "quadratic" field over the image.
-      prior_px: standard deviation expected of each component of the flow at the image centre, px per interval; weak evidence leaves the flow near zero.
+      prior_px: standard deviation expected of each component of the flow at the image centre, px per
+        interval; weak evidence leaves the flow near zero.
       levels_px: Gaussian blur of the volume, coarse to fine. steps: Gauss-Newton steps at each.
-      noise_floor: least noise assumed, relative to that of a Poisson volume with these counts; matters for counts without quantisation or noise.
-    Returns: FlowField on the pixels of the start of the interval: flow_px [B, 2, H, W] px per interval; covariance_px2 [B, 3, H, W] of its error by
-      the posterior of the parameters; confidence [B, H, W] = 1 - trace(covariance) / trace(prior covariance); valid is False for samples without
+      noise_floor: least noise assumed, relative to that of a Poisson volume with these counts; matters for
+        counts without quantisation or noise.
+    Returns: FlowField on the pixels of the start of the interval: flow_px [B, 2, H, W] px per interval;
+      covariance_px2 [B, 3, H, W] of its error by
+      the posterior of the parameters; confidence [B, H, W] = 1 - trace(covariance) / trace(prior covariance);
+      valid is False for samples without
       events, whose flow and confidence are 0 and whose covariance is the prior's.
     Gradient: counts, of flow, covariance and confidence.
     Raises: ShapeError, DomainError.
@@ -41,7 +50,10 @@ def estimate_lk(volume, model="affine", prior_px=3.0, levels_px=(4.0, 2.0, 1.0),
     batch, _, _, height, width = counts.shape
     least = max(lk_level.least_px(blur_px) for blur_px in levels_px)
     if min(height, width) < least:
-        raise ShapeError(f"an event volume of {height} x {width} pixels is smaller than the blur of {max(levels_px)} px needs ({least} x {least}); give larger images or finer levels_px.")
+        raise ShapeError(
+            f"an event volume of {height} x {width} pixels is smaller than the blur of {max(levels_px)} px "
+            f"needs ({least} x {least}); give larger images or finer levels_px."
+        )
     shape = lk_field.Polynomials(model, height, width)
     prior = shape.prior_precision(prior_px).to(counts)
     parameters = torch.zeros(batch, 2 * shape.terms, dtype=counts.dtype, device=counts.device)
@@ -54,7 +66,9 @@ def estimate_lk(volume, model="affine", prior_px=3.0, levels_px=(4.0, 2.0, 1.0),
             precision = prior + evidence
             change = torch.linalg.solve(precision, pull - parameters @ prior)
             moved = shape.mean_square(change)
-            parameters = parameters + change * (1 + moved / (2 * blur_px) ** 2).rsqrt()[:, None]  # no step beyond the reach of the linearisation
+            parameters = (
+                parameters + change * (1 + moved / (2 * blur_px) ** 2).rsqrt()[:, None]
+            )  # no step beyond the reach of the linearisation
     flow, places = shape.at_start(parameters)
     covariance = shape.covariance(torch.linalg.inv(precision), places)
     widest = shape.covariance(torch.linalg.inv(prior.expand(batch, -1, -1)), places)

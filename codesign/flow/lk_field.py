@@ -1,13 +1,19 @@
-"""Polynomial flow fields: their basis, the prior on their parameters, the step from mid-interval to the start, the spread of the flow.
+"""Polynomial flow fields: their basis, the prior on their parameters, the step from mid-interval to the
+start, the spread of the flow.
 
-A field is u = sum p_k b_k(x, y), v = sum q_k b_k(x, y) with b = 1, x, y, x^2, xy, y^2 on coordinates that reach from -1 to 1 along the longer side.
+A field is u = sum p_k b_k(x, y), v = sum q_k b_k(x, y) with b = 1, x, y, x^2, xy, y^2 on coordinates that
+reach from -1 to 1 along the longer side.
 Parameters are [B, 2K]: p_1..p_K, q_1..q_K.
 """
 
 import torch
 
 TERMS = {"constant": 1, "affine": 3, "quadratic": 6}
-AFFINE, SHEAR, QUADRATIC = 0.35, 0.25, 0.15  # expected flow at the border from these terms, over that of the constant: cameras mostly shift, turn and approach
+# expected flow at the border from these terms, over that of the constant: cameras mostly shift, turn and
+# approach
+AFFINE = 0.35
+SHEAR = 0.25
+QUADRATIC = 0.15
 FIXED_POINT_STEPS = 4  # each gains a factor of half the flow's gradient, some 0.03 per px and px
 
 
@@ -15,7 +21,9 @@ class Polynomials:
     """Fields of one model over an image of height x width pixels."""
 
     def __init__(self, model, height, width):
-        self.terms, self.height, self.width = TERMS[model], height, width
+        self.terms = TERMS[model]
+        self.height = height
+        self.width = width
         self.half = max(height, width) / 2
 
     def scaled(self, x_px, y_px):
@@ -27,14 +35,23 @@ class Polynomials:
         return torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v][: self.terms], dim)
 
     def prior_precision(self, prior_px):
-        """Inverse covariance [2K, 2K] of the parameters, per px^2: constant, divergence, rotation, two shears, quadratic terms, all independent."""
+        """Inverse covariance [2K, 2K] of the parameters, per px^2: constant, divergence, rotation, two
+        shears, quadratic terms, all independent."""
         k = self.terms
         unit = torch.eye(2 * k, dtype=torch.float64)
         precision = torch.zeros(2 * k, 2 * k, dtype=torch.float64)
         independent = [(unit[0], 1.0), (unit[k], 1.0)]
         if k >= 3:
-            ux, uy, vx, vy = unit[1], unit[2], unit[k + 1], unit[k + 2]
-            independent += [((ux + vy) / 2, AFFINE), ((vx - uy) / 2, AFFINE), ((ux - vy) / 2, SHEAR), ((vx + uy) / 2, SHEAR)]
+            ux = unit[1]
+            uy = unit[2]
+            vx = unit[k + 1]
+            vy = unit[k + 2]
+            independent += [
+                ((ux + vy) / 2, AFFINE),
+                ((vx - uy) / 2, AFFINE),
+                ((ux - vy) / 2, SHEAR),
+                ((vx + uy) / 2, SHEAR),
+            ]
         if k == 6:
             independent += [(unit[i + offset], QUADRATIC) for i in (3, 4, 5) for offset in (0, k)]
         for direction, relative in independent:
@@ -44,17 +61,28 @@ class Polynomials:
     def mean_square(self, parameters):
         """Mean squared length [B] of the flow over the square [-1, 1]^2."""
         p = parameters.reshape(len(parameters), 2, self.terms)
-        second = p.new_tensor([[1, 0, 0, 1 / 3, 0, 1 / 3], [0, 1 / 3, 0, 0, 0, 0], [0, 0, 1 / 3, 0, 0, 0], [1 / 3, 0, 0, 1 / 5, 0, 1 / 9], [0, 0, 0, 0, 1 / 9, 0], [1 / 3, 0, 0, 1 / 9, 0, 1 / 5]])
+        second = p.new_tensor(
+            [
+                [1, 0, 0, 1 / 3, 0, 1 / 3],
+                [0, 1 / 3, 0, 0, 0, 0],
+                [0, 0, 1 / 3, 0, 0, 0],
+                [1 / 3, 0, 0, 1 / 5, 0, 1 / 9],
+                [0, 0, 0, 0, 1 / 9, 0],
+                [1 / 3, 0, 0, 1 / 9, 0, 1 / 5],
+            ]
+        )
         return torch.einsum("bck,kl,bcl->b", p, second[: self.terms, : self.terms], p)
 
     def at_start(self, parameters):
-        """From the field at mid-interval to the flow on the pixels of the start, by fixed point: w(x) = v(x + w(x) / 2).
+        """From the field at mid-interval to the flow on the pixels of the start, by fixed point: w(x) = v(x +
+        w(x) / 2).
 
         Returns: flow [B, 2, H, W] px, and the basis [B, K, H, W] where each pixel is at mid-interval.
         """
         p = parameters.reshape(len(parameters), 2, self.terms)
         u, v = self.scaled(torch.arange(self.width).to(p)[None, :], torch.arange(self.height).to(p)[:, None])
-        u, v = u.expand(len(p), self.height, self.width), v.expand(len(p), self.height, self.width)
+        u = u.expand(len(p), self.height, self.width)
+        v = v.expand(len(p), self.height, self.width)
         places = self.basis(u, v, 1)
         flow = (p @ places.flatten(2)).unflatten(2, u.shape[1:])
         for _ in range(FIXED_POINT_STEPS if self.terms > 1 else 0):
@@ -64,6 +92,7 @@ class Polynomials:
 
     def covariance(self, covariance, places):
         """Covariance [B, 3, H, W] (xx, xy, yy) of the flow from that of the parameters [B, 2K, 2K]."""
-        k, at = self.terms, places.flatten(2)
+        k = self.terms
+        at = places.flatten(2)
         blocks = torch.stack([covariance[:, :k, :k], covariance[:, :k, k:], covariance[:, k:, k:]], 1)
         return ((blocks @ at[:, None]) * at[:, None]).sum(2).unflatten(2, places.shape[2:])

@@ -1,11 +1,16 @@
-"""One scale of the closed form: the blurred volume on its own grid, and what it says about the parameters of a field.
+"""One scale of the closed form: the blurred volume on its own grid, and what it says about the parameters of
+a field.
 
 Noise. Events scattered at random, rho per pixel and window, put into a volume blurred by a Gaussian of sigma
-- temporal slopes of variance rho / (sum w t^2) / (4 pi sigma^2), w the share of the window in a bin and t its time, and
+- temporal slopes of variance rho / (sum w t^2) / (4 pi sigma^2), w the share of the window in a bin and t its
+  time, and
 - slopes of the mean of variance kappa rho, about rho / (8 pi sigma^4), which look like texture and are none.
-The first sets how much the pull of the data can be trusted; how far real events are from Poisson is read off the residual. The second is an error in
-the regressors (Fuller, Measurement Error Models, 1987): with N = sum g g^T the normal matrix of the slopes seen and Z what scattered events alone would
-add to it, a direction of the parameters in which Z makes up the share z counts by (1 - z)^4 / ((1 - z)^4 + (3 z)^4): nearly 1 for texture, 1/82 where all is noise.
+The first sets how much the pull of the data can be trusted; how far real events are from Poisson is read off
+the residual. The second is an error in
+the regressors (Fuller, Measurement Error Models, 1987): with N = sum g g^T the normal matrix of the slopes
+  seen and Z what scattered events alone would
+add to it, a direction of the parameters in which Z makes up the share z counts by (1 - z)^4 / ((1 - z)^4 + (3
+z)^4): nearly 1 for texture, 1/82 where all is noise.
 """
 
 import math
@@ -13,10 +18,14 @@ import math
 import torch
 from torch.nn.functional import avg_pool2d, conv1d, conv2d, grid_sample, pad
 
-DOUBT, DOUBLINGS = 3.0, 2  # the factor 3 and the power 4 = 2^2 above
+# the factor 3 and the power 4 = 2^2 above
+DOUBT = 3.0
+DOUBLINGS = 2
 FEW_EVENTS = 10.0  # worth of Poisson noise the measured noise starts from: some events alone fit any field
 OVERLAP = 4 * math.pi  # blurred white noise is alike over 4 pi sigma^2 pixels
-CALIBRATION = 3.0  # for what makes errors larger than that: bins share events, thresholds quantise, fields warp imperfectly (docs/flow_closed_form.md)
+# for what makes errors larger than that: bins share events, thresholds quantise, fields warp imperfectly
+# (docs/flow_closed_form.md)
+CALIBRATION = 3.0
 TINY = 1e-12
 
 
@@ -31,21 +40,27 @@ def least_px(sigma_px):
 
 
 def signed_rate(volume):
-    """(weight [n], time [n]) of the bins, events per interval [B, n, H, W] as if each bin ran over all of it, and events of both signs per pixel [B, H, W].
+    """(weight [n], time [n]) of the bins, events per interval [B, n, H, W] as if each bin ran over all of it,
+    and events of both signs per pixel [B, H, W].
 
     Weights are the shares of the interval; time is 0 at mid-interval, in intervals.
     """
     counts = volume.counts
     span = volume.collected_s.sum()
-    weight, time = (volume.collected_s / span).to(counts), (volume.centroid_s / span).to(counts) - 0.5
+    weight = (volume.collected_s / span).to(counts)
+    time = (volume.centroid_s / span).to(counts) - 0.5
     return (weight, time), (counts[:, 0] - counts[:, 1]) / weight[:, None, None], counts.sum((1, 2))
 
 
 class Level:
-    """The volume blurred by a Gaussian of sigma_px, sampled at the centres of squares of ``stride`` x ``stride`` pixels."""
+    """The volume blurred by a Gaussian of sigma_px, sampled at the centres of squares of ``stride`` x
+    ``stride`` pixels."""
 
     def __init__(self, rate, density, times, shape, sigma_px, noise_floor):
-        self.sigma, self.shape, self.noise_floor, self.stride = sigma_px, shape, noise_floor, stride(sigma_px)
+        self.sigma = sigma_px
+        self.shape = shape
+        self.noise_floor = noise_floor
+        self.stride = stride(sigma_px)
         self.rate, kernel = _blurred(rate, sigma_px)
         self.density = (avg_pool2d(density, self.stride) if self.stride > 1 else density).flatten(1)
         self.rows, self.columns = self.rate.shape[-2:]
@@ -62,52 +77,95 @@ class Level:
         self.texture_noise = _slope_of_noise(kernel, self.stride)
         # in grid_sample's units, -1 and 1 at the outermost samples
         self.half = torch.stack([x[-1] - first, y[-1] - first]) / 2
-        self.middle = (torch.tensor([shape.width, shape.height]).to(rate) - 1 - 2 * first) / (2 * self.half) - 1
+        self.middle = (torch.tensor([shape.width, shape.height]).to(rate) - 1 - 2 * first) / (
+            2 * self.half
+        ) - 1
         self.reach = torch.tensor([shape.width, shape.height]).to(rate) / 2 - 0.5
         self.speed = time[:, None, None] / self.half
-        self.grid = torch.stack([((x - first) / self.half[0] - 1).expand(self.rows, -1), ((y - first) / self.half[1] - 1)[:, None].expand(-1, self.columns)], -1).flatten(0, 1)
+        self.grid = torch.stack(
+            [
+                ((x - first) / self.half[0] - 1).expand(self.rows, -1),
+                ((y - first) / self.half[1] - 1)[:, None].expand(-1, self.columns),
+            ],
+            -1,
+        ).flatten(0, 1)
 
     def evidence(self, parameters):
-        """Precision [B, 2K, 2K] that the data add at these parameters, and their pull [B, 2K] on them: precision times the distance to the best fit."""
-        batch, k = len(parameters), self.shape.terms
+        """Precision [B, 2K, 2K] that the data add at these parameters, and their pull [B, 2K] on them:
+        precision times the distance to the best fit."""
+        batch = len(parameters)
+        k = self.shape.terms
         warped, seen = self._warped(self.basis @ parameters.reshape(batch, 2, k).mT)
         mean, slope = (self.contrast @ warped).unbind(1)
-        dy, dx = (d.flatten(1) / self.stride for d in torch.gradient(mean.unflatten(1, (self.rows, self.columns)), dim=(1, 2)))
-        sx, sy = seen * dx, seen * dy
-        xx, xy, yy, crowd = (torch.stack([sx * dx, sx * dy, sy * dy, seen * self.density], 1) @ self.products).unflatten(2, (k, k)).unbind(1)
+        dy, dx = (
+            d.flatten(1) / self.stride
+            for d in torch.gradient(mean.unflatten(1, (self.rows, self.columns)), dim=(1, 2))
+        )
+        sx = seen * dx
+        sy = seen * dy
+        xx, xy, yy, crowd = (
+            (torch.stack([sx * dx, sx * dy, sy * dy, seen * self.density], 1) @ self.products)
+            .unflatten(2, (k, k))
+            .unbind(1)
+        )
         normal = torch.cat([torch.cat([xx, xy], 2), torch.cat([xy, yy], 2)], 1)
-        scattered = torch.block_diag(torch.ones(k, k), torch.ones(k, k)).to(crowd) * crowd.repeat(1, 2, 2) * self.texture_noise
+        scattered = (
+            torch.block_diag(torch.ones(k, k), torch.ones(k, k)).to(crowd)
+            * crowd.repeat(1, 2, 2)
+            * self.texture_noise
+        )
         right = -(torch.stack([sx * slope, sy * slope], 1) @ self.basis).flatten(1)
         trust = _trust(normal, scattered)
-        scale = (CALIBRATION * OVERLAP * self.sigma**2 / self.stride**2 * self._noise(normal, right, crowd[:, 0, 0], (seen * slope.square()).sum(1)))[:, None, None]
+        scale = (
+            CALIBRATION
+            * OVERLAP
+            * self.sigma**2
+            / self.stride**2
+            * self._noise(normal, right, crowd[:, 0, 0], (seen * slope.square()).sum(1))
+        )[:, None, None]
         return normal @ trust / scale, (right[:, None] @ trust / scale)[:, 0]
 
     def _noise(self, normal, right, events, energy):
-        """Variance [B] of the temporal slopes: what the best fit leaves of their energy, on a floor, per sample of the grid."""
+        """Variance [B] of the temporal slopes: what the best fit leaves of their energy, on a floor, per
+        sample of the grid."""
         ridge = (1e-6 * normal.diagonal(dim1=1, dim2=2).mean(1)[:, None] + TINY).expand_as(right)
         explained = (right * torch.linalg.solve(normal + torch.diag_embed(ridge), right)).sum(1)
-        left = torch.sqrt((energy - explained).square() + (1e-6 * energy).square() + TINY**2)  # positive and smooth
-        few, expected = FEW_EVENTS / self.stride**2 * self.slope_noise, events * self.slope_noise
+        left = torch.sqrt(
+            (energy - explained).square() + (1e-6 * energy).square() + TINY**2
+        )  # positive and smooth
+        few = FEW_EVENTS / self.stride**2 * self.slope_noise
+        expected = events * self.slope_noise
         return self.slope_noise * (left + self.noise_floor * expected + few) / (expected + few)
 
     def _warped(self, flow):
-        """Bins carried back to mid-interval along the flow [B, P, 2], as [B, n, P], and a smooth window [B, P] that fades where they leave the image."""
+        """Bins carried back to mid-interval along the flow [B, P, 2], as [B, n, P], and a smooth window [B,
+        P] that fades where they leave the image."""
         batch, bins = self.rate.shape[:2]
         at = self.grid + self.speed * flow[:, None]
-        warped = grid_sample(self.rate.flatten(0, 1)[:, None], at.reshape(batch * bins, self.rows, self.columns, 2), padding_mode="border", align_corners=True)
-        inside = ((self.reach - (at[:, [0, -1]] - self.middle).abs() * self.half) / (1 + self.sigma)).clamp(0, 1)
+        warped = grid_sample(
+            self.rate.flatten(0, 1)[:, None],
+            at.reshape(batch * bins, self.rows, self.columns, 2),
+            padding_mode="border",
+            align_corners=True,
+        )
+        inside = ((self.reach - (at[:, [0, -1]] - self.middle).abs() * self.half) / (1 + self.sigma)).clamp(
+            0, 1
+        )
         window = (inside.square() * (3 - 2 * inside)).unbind(3)
         window = window[0] * window[1]
         return warped.reshape(batch, bins, -1), window[:, 0] * window[:, 1]
 
 
 def _trust(normal, scattered):
-    """N^-1 times the part of N that is texture (see above), [B, 2K, 2K]; powers of the share of noise (N + Z)^-1 Z, whose eigenvalues are 0 to 1."""
+    """N^-1 times the part of N that is texture (see above), [B, 2K, 2K]; powers of the share of noise (N +
+    Z)^-1 Z, whose eigenvalues are 0 to 1."""
     unit = torch.eye(normal.shape[-1]).to(normal)
     noise = torch.linalg.solve(normal + scattered + TINY * unit, scattered + TINY * unit)
-    texture, doubt = unit - noise, DOUBT * noise
+    texture = unit - noise
+    doubt = DOUBT * noise
     for _ in range(DOUBLINGS):
-        texture, doubt = texture @ texture, doubt @ doubt
+        texture = texture @ texture
+        doubt = doubt @ doubt
     return torch.linalg.solve(texture + doubt, texture)
 
 
@@ -118,22 +176,27 @@ def _radius(sigma_px):
 
 
 def _spread(sigma_px):
-    """Standard deviation, in samples of the grid, of the Gaussian that follows averaging over squares (variance (step^2 - 1) / 12)."""
+    """Standard deviation, in samples of the grid, of the Gaussian that follows averaging over squares
+    (variance (step^2 - 1) / 12)."""
     step = stride(sigma_px)
     return math.sqrt(sigma_px**2 - (step**2 - 1) / 12) / step
 
 
 def _blurred(images, sigma_px):
-    """[B, n, H, W] averaged over squares, then through a Gaussian, together of standard deviation sigma; mirrored at the border.
+    """[B, n, H, W] averaged over squares, then through a Gaussian, together of standard deviation sigma;
+    mirrored at the border.
 
     Returns: images at the centres of the squares, and the whole kernel along one axis, taps of 1 px.
     """
-    step, reach = stride(sigma_px), _radius(sigma_px)
+    step = stride(sigma_px)
+    reach = _radius(sigma_px)
     taps = torch.exp(-torch.arange(-reach, reach + 1).to(images).square() / (2 * _spread(sigma_px) ** 2))
     taps = taps / taps.sum()
     pooled = avg_pool2d(images, step) if step > 1 else images
     bins = pooled.shape[1]
-    each = taps.expand(bins, 1, 1, -1).contiguous()  # bins as channels: one image at a time takes eight times as long
+    each = taps.expand(
+        bins, 1, 1, -1
+    ).contiguous()  # bins as channels: one image at a time takes eight times as long
     flat = pad(pooled, (reach, reach, reach, reach), mode="reflect")
     found = conv2d(conv2d(flat, each, groups=bins), each.mT.contiguous(), groups=bins)
     spaced = pad(taps[:, None], (0, step - 1)).flatten()
@@ -142,7 +205,8 @@ def _blurred(images, sigma_px):
 
 
 def _slope_of_noise(kernel, step):
-    """Mean square of a central difference, per px^2, in white noise of variance 1 per pixel behind this separable kernel."""
+    """Mean square of a central difference, per px^2, in white noise of variance 1 per pixel behind this
+    separable kernel."""
     wide = pad(kernel, (2 * step, 2 * step))
     difference = (wide[2 * step :] - wide[: -2 * step]) / (2 * step)
     return float(difference.square().sum() * kernel.square().sum())

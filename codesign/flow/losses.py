@@ -1,7 +1,9 @@
 """Losses to learn flow with: from true flow, from the events alone, and from frames.
 
-Every loss is a mean over the samples of a batch of a mean over the pixels of the sample, so that equal shares of a batch, on several machines, average to the
-loss of the whole. They are smooth (C1) in the flow unless the docstring says otherwise. Non-finite predictions show as a non-finite loss.
+Every loss is a mean over the samples of a batch of a mean over the pixels of the sample, so that equal shares
+of a batch, on several machines, average to the
+loss of the whole. They are smooth (C1) in the flow unless the docstring says otherwise. Non-finite
+predictions show as a non-finite loss.
 """
 
 import torch
@@ -9,15 +11,31 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from codesign.errors import DomainError, ShapeError
-from codesign.flow.contrast import area_change, sharpness, smooth_image, still_image, volume_tracks, warp_jacobian
+from codesign.flow.contrast import (
+    area_change,
+    sharpness,
+    smooth_image,
+    still_image,
+    volume_tracks,
+    warp_jacobian,
+)
 
-REFERENCES = ((0.0, 0.25), (0.5, 0.5), (1.0, 0.25))  # (time, weight): start, middle and end of the window, as in Shiba et al., ECCV 2022, sec. 3.2
-_FAINT = 1e-6  # sharpness, (events per pixel)^2, far below that of any scene: no events count as sharp as at zero flow
-_FOLD, _FREE, _MOST = 0.2, 1.5, 2.5  # area changes from _FOLD to _FREE count in full; folds count 0, no event counts more than _MOST
+REFERENCES = (
+    (0.0, 0.25),
+    (0.5, 0.5),
+    (1.0, 0.25),
+)  # (time, weight): start, middle and end of the window, as in Shiba et al., ECCV 2022, sec. 3.2
+# sharpness, (events per pixel)^2, far below that of any scene: no events count as sharp as at zero flow
+_FAINT = 1e-6
+# area changes from _FOLD to _FREE count in full; folds count 0, no event counts more than _MOST
+_FOLD = 0.2
+_FREE = 1.5
+_MOST = 2.5
 
 
 def charbonnier(squared, epsilon, exponent=0.5):
-    """(s + epsilon^2)^exponent - epsilon^(2 exponent) of squared lengths s: 0 at 0, smooth, s^exponent far away. Source: Charbonnier et al., ICIP 1994; Sun et al., IJCV 2014."""
+    """(s + epsilon^2)^exponent - epsilon^(2 exponent) of squared lengths s: 0 at 0, smooth, s^exponent far
+    away. Source: Charbonnier et al., ICIP 1994; Sun et al., IJCV 2014."""
     return (squared + epsilon**2) ** exponent - epsilon ** (2 * exponent)
 
 
@@ -25,37 +43,52 @@ def supervised_loss(predictions, truth, gamma=0.8, epsilon=0.01, unit_per_px: fl
     """Charbonnier loss on the endpoint error of a list of predictions, coarse or early first.
 
     Args:
-      predictions: list of n FlowField [B, 2, H, W], all at full resolution. truth: FlowField of the same size.
-      gamma: prediction i counts gamma^(n - 1 - i), scaled so that the weights sum to 1. epsilon: width of the parabola at 0, in the unit of the error.
-      unit_per_px: what one pixel is worth: 1 for an error in px, ``relative_unit(truth)`` [B] for parts of the motion of the sample,
+      predictions: list of n FlowField [B, 2, H, W], all at full resolution. truth: FlowField of the same
+        size.
+      gamma: prediction i counts gamma^(n - 1 - i), scaled so that the weights sum to 1. epsilon: width of the
+        parabola at 0, in the unit of the error.
+      unit_per_px: what one pixel is worth: 1 for an error in px, ``relative_unit(truth)`` [B] for parts of
+        the motion of the sample,
         ``metrics.mrad_per_pixel(direction)`` [H, W] or [B, H, W] for an angle.
-    Returns: scalar. Only valid pixels of the truth count. A sample without any counts 0, its place in the mean of the batch included, so that the denominator
+    Returns: scalar. Only valid pixels of the truth count. A sample without any counts 0, its place in the
+      mean of the batch included, so that the denominator
       does not depend on how a batch is split; ``require_valid`` refuses such samples where data enter.
     Gradient: flow_px of the predictions.
     Raises: ShapeError.
     Source: the weights are those of Teed and Deng, RAFT, ECCV 2020, sec. 3.4.
     """
     unit = _per_pixel(unit_per_px, truth.flow_px)
-    return _over_predictions(predictions, truth, gamma, lambda field, error: charbonnier(error.square().sum(1) * unit.square(), epsilon))
+    return _over_predictions(
+        predictions,
+        truth,
+        gamma,
+        lambda field, error: charbonnier(error.square().sum(1) * unit.square(), epsilon),
+    )
 
 
 def likelihood_loss(predictions, truth, gamma=0.8, floor_px=0.1, prior_px=8.0):
-    """Negative log likelihood of the error under the covariance that each prediction claims for itself, a Gaussian less its constant ln 2 pi.
+    """Negative log likelihood of the error under the covariance that each prediction claims for itself, a
+    Gaussian less its constant ln 2 pi.
 
     Args:
-      predictions, truth, gamma: as in supervised_loss. Each prediction has covariance_px2, or else confidence c, read as the share of the prior that the events
+      predictions, truth, gamma: as in supervised_loss. Each prediction has covariance_px2, or else confidence
+        c, read as the share of the prior that the events
         have removed: variance prior_px^2 (1 - c) per axis.
-      floor_px: standard deviation added to every claim (in squares), so that no claim is exact and the loss stays bounded below by 2 ln floor_px.
-    Returns: scalar, (m^2 + ln det S) / 2 with S = covariance + floor_px^2 and m^2 = e^T S^-1 e, over the valid pixels as in supervised_loss. Another unit only shifts it.
+      floor_px: standard deviation added to every claim (in squares), so that no claim is exact and the loss
+        stays bounded below by 2 ln floor_px.
+    Returns: scalar, (m^2 + ln det S) / 2 with S = covariance + floor_px^2 and m^2 = e^T S^-1 e, over the
+      valid pixels as in supervised_loss. Another unit only shifts it.
     Gradient: flow_px, covariance_px2 or confidence.
-    Raises: ShapeError; DomainError for a prediction with neither claim, and for a covariance that is not positive semidefinite.
+    Raises: ShapeError; DomainError for a prediction with neither claim, and for a covariance that is not
+      positive semidefinite.
     Source: Nix and Weigend, ICNN 1994, in two dimensions.
     """
 
     def nll(field, error):
         xx, xy, yy = _covariance(field, prior_px)
         spare = floor_px**2
-        # xx yy - xy^2 >= 0 apart from rounding; taken by itself it cannot cancel the floor's part of the determinant
+        # xx yy - xy^2 >= 0 apart from rounding; taken by itself it cannot cancel the floor's part of the
+        # determinant
         determinant = spare**2 + spare * (xx + yy) + (xx * yy - xy.square()).clamp_min(0)
         u, v = error.unbind(1)
         squared = ((yy + spare) * u.square() - 2 * xy * u * v + (xx + spare) * v.square()) / determinant
@@ -65,32 +98,47 @@ def likelihood_loss(predictions, truth, gamma=0.8, floor_px=0.1, prior_px=8.0):
 
 
 def relative_unit(truth, floor_px=1.0):
-    """[B] 1 / sqrt(mean squared length of the valid true flow + floor_px^2): turns an error in px into a share of the sample's motion. Gradient: none."""
-    squared = _known(truth).detach().square().sum(1).flatten(1).sum(1) / truth.valid.flatten(1).sum(1).clamp_min(1)
+    """[B] 1 / sqrt(mean squared length of the valid true flow + floor_px^2): turns an error in px into a
+    share of the sample's motion. Gradient: none."""
+    squared = _known(truth).detach().square().sum(1).flatten(1).sum(1) / truth.valid.flatten(1).sum(
+        1
+    ).clamp_min(1)
     return (squared + floor_px**2).rsqrt()
 
 
 def require_valid(truth):
-    """Raise DomainError when a sample of the truth has no valid pixel; return the truth unchanged otherwise."""
+    """Raise DomainError when a sample of the truth has no valid pixel; return the truth unchanged
+    otherwise."""
     empty = (~truth.valid.flatten(1).any(1)).nonzero().flatten().tolist()
     if empty:
-        raise DomainError(f"samples {empty} have no pixel with known flow, so nothing can be learnt from them; leave these windows out or repair their valid masks.")
+        raise DomainError(
+            f"samples {empty} have no pixel with known flow, so nothing can be learnt from them; leave "
+            "these windows out or repair their valid masks."
+        )
     return truth
 
 
 def contrast_loss(volume, flow_px, carry_steps=1, references=REFERENCES):
-    """Contrast maximisation without event collapse: zero-flow sharpness of the events over their sharpness when warped.
+    """Contrast maximisation without event collapse: zero-flow sharpness of the events over their sharpness
+    when warped.
 
     Args:
-      volume: EventVolume, counts [B, 2, bins, H, W]. flow_px: [B, 2, H, W] pixels per window. carry_steps: as in contrast.volume_tracks.
-      references: (time, weight) pairs; the images of warped events at these times count with these weights, which sum to 1.
-    Returns: scalar mean over the batch of the weighted mean of the ratios; 1 for zero flow, less for flow that explains the events; 1 for a sample without events.
-    Guard: an event counts as much as the warp stretches the area around it (from 0 where it folds or turns over to 2.5). Squeezing the events into less space then
-      leaves the mean squared slope of their image unchanged (in two dimensions it is invariant under change of scale), so only alignment pays; and ratios are
-      averaged, not sharpnesses, so that one very sharp image does not make up for blurred others. What leaves the image is lost, which costs sharpness.
+      volume: EventVolume, counts [B, 2, bins, H, W]. flow_px: [B, 2, H, W] pixels per window. carry_steps: as
+        in contrast.volume_tracks.
+      references: (time, weight) pairs; the images of warped events at these times count with these weights,
+        which sum to 1.
+    Returns: scalar mean over the batch of the weighted mean of the ratios; 1 for zero flow, less for flow
+      that explains the events; 1 for a sample without events.
+    Guard: an event counts as much as the warp stretches the area around it (from 0 where it folds or turns
+      over to 2.5). Squeezing the events into less space then
+      leaves the mean squared slope of their image unchanged (in two dimensions it is invariant under change
+      of scale), so only alignment pays; and ratios are
+      averaged, not sharpnesses, so that one very sharp image does not make up for blurred others. What leaves
+      the image is lost, which costs sharpness.
     Gradient: counts and flow; 0 in both for an empty volume.
     Raises: as volume_tracks.
-    Source: Shiba, Aoki, Gallego, Secrets of event-based optical flow, ECCV 2022, sec. 3.2; area change: Shiba et al., Sensors 2022, sec. 3.4.2, here as a weight.
+    Source: Shiba, Aoki, Gallego, Secrets of event-based optical flow, ECCV 2022, sec. 3.2; area change: Shiba
+      et al., Sensors 2022, sec. 3.4.2, here as a weight.
     """
     tracks = volume_tracks(volume, flow_px, carry_steps)
     still = sharpness(still_image(volume.counts)) + _FAINT
@@ -102,7 +150,8 @@ def contrast_loss(volume, flow_px, carry_steps=1, references=REFERENCES):
 
 
 def plain_contrast_loss(volume, flow_px, carry_steps=0, references=REFERENCES):
-    """The objective as published, zero-flow sharpness over mean sharpness, without a guard: a flow into one point beats the true one.
+    """The objective as published, zero-flow sharpness over mean sharpness, without a guard: a flow into one
+    point beats the true one.
 
     To compare with, and for flows that cannot contract. Arguments, gradient and source as in contrast_loss.
     """
@@ -112,36 +161,57 @@ def plain_contrast_loss(volume, flow_px, carry_steps=0, references=REFERENCES):
 
 
 def collapse_penalty(volume, flow_px, least=0.8, references=REFERENCES):
-    """Mean over the events of max(0, least - area change of the warp)^2: the published guard, to be added to plain_contrast_loss with a weight.
+    """Mean over the events of max(0, least - area change of the warp)^2: the published guard, to be added to
+    plain_contrast_loss with a weight.
 
-    Contractions to less than ``least`` of the area are punished whether they are true or not. Returns: scalar; 0 for a sample without events.
-    Gradient: counts and flow. Source: Shiba et al., Sensors 2022, sec. 3.4.2 and 3.6 (here squared beyond the threshold, to be smooth).
+    Contractions to less than ``least`` of the area are punished whether they are true or not. Returns:
+    scalar; 0 for a sample without events.
+    Gradient: counts and flow. Source: Shiba et al., Sensors 2022, sec. 3.4.2 and 3.6 (here squared beyond the
+      threshold, to be smooth).
     """
     tracks = volume_tracks(volume, flow_px)
     events = volume.counts.sum(1)
-    total = sum(share * (events * (least - area_change(warp_jacobian(tracks, events.shape[1], at))).clamp_min(0).square()).sum((1, 2, 3)) for at, share in references)
+    total = sum(
+        share
+        * (
+            events * (least - area_change(warp_jacobian(tracks, events.shape[1], at))).clamp_min(0).square()
+        ).sum((1, 2, 3))
+        for at, share in references
+    )
     return (total / (events.sum((1, 2, 3)) + _FAINT)).mean()
 
 
 def photometric_loss(frames, flow_px, epsilon=1e-3, exponent=0.45):
     """Charbonnier difference between the start frame and the end frame read where the flow leads.
 
-    Args: frames: [B, 2, H, W] intensity at the start and at the end, 0..255. flow_px: [B, 2, H, W] pixels per window.
-    Returns: scalar, differences in units of 255. A pixel that leaves the image keeps its zero-flow difference, so that leaving never pays; over the last pixel
+    Args: frames: [B, 2, H, W] intensity at the start and at the end, 0..255. flow_px: [B, 2, H, W] pixels per
+      window.
+    Returns: scalar, differences in units of 255. A pixel that leaves the image keeps its zero-flow
+      difference, so that leaving never pays; over the last pixel
       before the border one blends into the other.
-    Gradient: frames and flow; bilinear reading makes it piecewise smooth, with kinks where the flow leads to a pixel's centre line.
+    Gradient: frames and flow; bilinear reading makes it piecewise smooth, with kinks where the flow leads to
+      a pixel's centre line.
     Raises: ShapeError.
-    Source: Zhu et al., EV-FlowNet, RSS 2018 (there pixels that leave are not treated); used by Lee et al., Spike-FlowNet, ECCV 2020.
+    Source: Zhu et al., EV-FlowNet, RSS 2018 (there pixels that leave are not treated); used by Lee et al.,
+      Spike-FlowNet, ECCV 2020.
     """
     flow_px = _full(flow_px)
     if frames is None or frames.shape != flow_px.shape:
-        raise ShapeError(f"frames must be {list(flow_px.shape)}, start and end, for this flow; got {None if frames is None else list(frames.shape)}.")
+        raise ShapeError(
+            f"frames must be {list(flow_px.shape)}, start and end, for this flow; got "
+            f"{None if frames is None else list(frames.shape)}."
+        )
     height, width = flow_px.shape[2:]
-    y, x = torch.meshgrid(*(torch.arange(size, dtype=flow_px.dtype, device=flow_px.device) for size in (height, width)), indexing="ij")
+    y, x = torch.meshgrid(
+        *(torch.arange(size, dtype=flow_px.dtype, device=flow_px.device) for size in (height, width)),
+        indexing="ij",
+    )
     at = torch.stack([x + flow_px[:, 0], y + flow_px[:, 1]], -1)
     size = torch.tensor([width - 1, height - 1], dtype=flow_px.dtype, device=flow_px.device)
     start, end = (frames / 255).to(torch.promote_types(frames.dtype, flow_px.dtype)).split(1, 1)
-    read = grid_sample(end, (2 * at / size.clamp_min(1) - 1).to(end), padding_mode="border", align_corners=True)
+    read = grid_sample(
+        end, (2 * at / size.clamp_min(1) - 1).to(end), padding_mode="border", align_corners=True
+    )
     depth = (torch.minimum(at, size - at) + 1).clamp(0, 1)  # 1 on the image, 0 from one pixel outside on
     inside = (depth.square() * (3 - 2 * depth)).prod(-1, keepdim=True).movedim(-1, 1)
     moved, still = (charbonnier((image - start).square(), epsilon, exponent) for image in (read, end))
@@ -151,13 +221,16 @@ def photometric_loss(frames, flow_px, epsilon=1e-3, exponent=0.45):
 def smoothness_loss(flow_px, frame=None, epsilon=1e-3, exponent=0.45, edge=0.1):
     """Charbonnier difference between the flows of neighbours in a row and in a column.
 
-    Args: flow_px: [B, 2, H, W]. frame: [B, H, W] intensity 0..255; a difference d (in units of 255) between neighbours lets them part, by a factor exp(-|d| / edge). None: everywhere alike.
+    Args: flow_px: [B, 2, H, W]. frame: [B, H, W] intensity 0..255; a difference d (in units of 255) between
+      neighbours lets them part, by a factor exp(-|d| / edge). None: everywhere alike.
     Returns: scalar, the mean over rows plus the mean over columns. Gradient: flow.
     Source: Zhu et al., EV-FlowNet, RSS 2018; edge weights: Heise et al., ICCV 2013.
     """
     flow_px = _full(flow_px)
     if frame is not None and frame.shape != flow_px[:, 0].shape:
-        raise ShapeError(f"the frame must be {list(flow_px[:, 0].shape)} for this flow, got {list(frame.shape)}.")
+        raise ShapeError(
+            f"the frame must be {list(flow_px[:, 0].shape)} for this flow, got {list(frame.shape)}."
+        )
     total = flow_px.new_zeros(())
     for axis in (2, 3):
         penalty = charbonnier(flow_px.diff(dim=axis).square().sum(1), epsilon, exponent)
@@ -170,19 +243,31 @@ def smoothness_loss(flow_px, frame=None, epsilon=1e-3, exponent=0.45, edge=0.1):
 def _over_predictions(predictions, truth, gamma, per_pixel):
     if not predictions:
         raise ShapeError("no prediction was given; a list of at least one FlowField is needed.")
-    target, weights = _known(truth), 0.0
+    target = _known(truth)
+    weights = 0.0
     total = target.new_zeros(())
     for field in predictions:
         if field.flow_px.shape != target.shape:
-            raise ShapeError(f"predictions must be {list(target.shape)} like the truth, at full resolution; got {list(field.flow_px.shape)}.")
-        total, weights = gamma * total + _valid_mean(per_pixel(field, _full(field.flow_px) - target), truth.valid), gamma * weights + 1
+            raise ShapeError(
+                f"predictions must be {list(target.shape)} like the truth, at full resolution; got "
+                f"{list(field.flow_px.shape)}."
+            )
+        total = gamma * total + _valid_mean(per_pixel(field, _full(field.flow_px) - target), truth.valid)
+        weights = gamma * weights + 1
     return total / weights
 
 
 def _known(truth):
     """True flow, 0 where it is unknown: what is not valid may be NaN and must not reach the gradient."""
-    if truth.flow_px.ndim != 4 or truth.flow_px.shape[1] != 2 or truth.valid.shape != truth.flow_px[:, 0].shape:
-        raise ShapeError(f"the truth must be [B, 2, H, W] with valid [B, H, W]; got {list(truth.flow_px.shape)} and {list(truth.valid.shape)}.")
+    if (
+        truth.flow_px.ndim != 4
+        or truth.flow_px.shape[1] != 2
+        or truth.valid.shape != truth.flow_px[:, 0].shape
+    ):
+        raise ShapeError(
+            f"the truth must be [B, 2, H, W] with valid [B, H, W]; got {list(truth.flow_px.shape)} and "
+            f"{list(truth.valid.shape)}."
+        )
     return torch.where(truth.valid[:, None], truth.flow_px, 0.0)
 
 
@@ -197,28 +282,41 @@ def _per_pixel(unit, flow):
     try:
         return unit.expand_as(flow[:, 0])
     except RuntimeError:
-        raise ShapeError(f"unit_per_px must be a number, [B], [H, W] or [B, H, W] for a flow {list(flow.shape)}; got {list(unit.shape)}.") from None
+        raise ShapeError(
+            f"unit_per_px must be a number, [B], [H, W] or [B, H, W] for a flow {list(flow.shape)}; got "
+            f"{list(unit.shape)}."
+        ) from None
 
 
 def _covariance(field, prior_px):
     full = torch.promote_types(field.flow_px.dtype, torch.float32)
     if field.covariance_px2 is None and field.confidence is None:
-        raise DomainError("a prediction has neither covariance_px2 nor confidence, so it has no likelihood; use supervised_loss, or an estimator that gives one.")
+        raise DomainError(
+            "a prediction has neither covariance_px2 nor confidence, so it has no likelihood; use "
+            "supervised_loss, or an estimator that gives one."
+        )
     if field.covariance_px2 is None:
         if not bool(((field.confidence >= 0) & (field.confidence <= 1)).all()):
-            raise DomainError("a confidence lies outside 0 to 1; 0 means nothing was seen, 1 a flow known exactly.")
+            raise DomainError(
+                "a confidence lies outside 0 to 1; 0 means nothing was seen, 1 a flow known exactly."
+            )
         variance = prior_px**2 * (1 - field.confidence.to(full))
         return variance, torch.zeros_like(variance), variance
     xx, xy, yy = field.covariance_px2.to(full).unbind(1)
     slack = 1e-4 * xx * yy if xx.dtype == torch.float32 else 1e-9 * xx * yy  # rounding of the products
     if bool((xx < 0).any() | (yy < 0).any() | (xy.square() > xx * yy + slack).any()):
-        raise DomainError("covariance_px2 is not positive semidefinite somewhere (xx, yy >= 0 and xy^2 <= xx yy are needed); build it from a triangular factor.")
+        raise DomainError(
+            "covariance_px2 is not positive semidefinite somewhere (xx, yy >= 0 and xy^2 <= xx yy are "
+            "needed); build it from a triangular factor."
+        )
     return xx, xy, yy
 
 
 def _stretch(jacobian):
-    """Weight of events where a warp has this Jacobian: the area change, smoothly 0 where the warp folds or turns over and at most _MOST where it tears apart."""
-    area, upright = area_change(jacobian), (jacobian[0] + jacobian[3]) / 2
+    """Weight of events where a warp has this Jacobian: the area change, smoothly 0 where the warp folds or
+    turns over and at most _MOST where it tears apart."""
+    area = area_change(jacobian)
+    upright = (jacobian[0] + jacobian[3]) / 2
     over = (area - _FREE).clamp_min(0)
     return _rise(area) * _rise(upright) * (area - over + (_MOST - _FREE) * torch.tanh(over / (_MOST - _FREE)))
 

@@ -1,6 +1,8 @@
-"""Flow errors as the field defines them. Conventions are in each docstring and in docs/flow_metrics.md, since published code disagrees.
+"""Flow errors as the field defines them. Conventions are in each docstring and in docs/flow_metrics.md, since
+published code disagrees.
 
-Flows are [..., 2, H, W] pixels per window, masks [..., H, W] bool. Every mean runs over the masked pixels of all samples together.
+Flows are [..., 2, H, W] pixels per window, masks [..., H, W] bool. Every mean runs over the masked pixels of
+all samples together.
 """
 
 import torch
@@ -17,20 +19,29 @@ def endpoint_error(flow, truth):
 
 def _check(flow, truth):
     if flow.shape != truth.shape or flow.ndim < 3 or flow.shape[-3] != 2:
-        raise ShapeError(f"flows must both be [..., 2, H, W]; got {tuple(flow.shape)} and {tuple(truth.shape)}.")
+        raise ShapeError(
+            f"flows must both be [..., 2, H, W]; got {tuple(flow.shape)} and {tuple(truth.shape)}."
+        )
 
 
 def _masked(values, mask):
     """The values under the mask, flat; a non-finite one would count as no outlier, so it is refused."""
     if mask is not None:
         if mask.shape != values.shape:
-            raise ShapeError(f"the mask must be {tuple(values.shape)}, one entry per pixel, got {tuple(mask.shape)}.")
+            raise ShapeError(
+                f"the mask must be {tuple(values.shape)}, one entry per pixel, got {tuple(mask.shape)}."
+            )
         if not bool(mask.any()):
-            raise DomainError("the mask selects no pixel, so the error is undefined; check the valid and event masks.")
+            raise DomainError(
+                "the mask selects no pixel, so the error is undefined; check the valid and event masks."
+            )
         values = values[mask]
     finite = values.detach().isfinite()
     if not bool(finite.all()):
-        raise DomainError(f"the flow error is NaN or infinite at {int((~finite).sum())} of {finite.numel()} pixels; mask pixels without true flow, and check the estimate.")
+        raise DomainError(
+            f"the flow error is NaN or infinite at {int((~finite).sum())} of {finite.numel()} pixels; mask "
+            "pixels without true flow, and check the estimate."
+        )
     return values.flatten()
 
 
@@ -40,37 +51,48 @@ def aee(flow, truth, mask=None):
 
 
 def zero_flow_error(truth, mask=None):
-    """Average endpoint error of the estimate "nothing moves", px: the mean true length, which every error should be compared with."""
+    """Average endpoint error of the estimate "nothing moves", px: the mean true length, which every error
+    should be compared with."""
     return aee(torch.zeros_like(truth), truth, mask)
 
 
 def outlier_percent(flow, truth, mask=None, pixels=3.0, share=0.05):
-    """Share of pixels, in percent, whose endpoint error is above ``pixels`` AND above ``share`` of the true length (KITTI 2015: 3 px and 5 %)."""
-    error, length = endpoint_error(flow, truth), truth.square().sum(-3).sqrt()
-    error, length = _masked(error, mask), _masked(length, mask)
+    """Share of pixels, in percent, whose endpoint error is above ``pixels`` AND above ``share`` of the true
+    length (KITTI 2015: 3 px and 5 %)."""
+    error = endpoint_error(flow, truth)
+    length = truth.square().sum(-3).sqrt()
+    error = _masked(error, mask)
+    length = _masked(length, mask)
     return 100 * ((error > pixels) & (error > share * length)).to(error.dtype).mean()
 
 
 def npe(flow, truth, pixels, mask=None):
-    """Share of pixels, in percent, whose endpoint error is above ``pixels`` (DSEC's 1PE, 2PE, 3PE; what event papers on MVSEC call outliers is ``pixels=3``)."""
+    """Share of pixels, in percent, whose endpoint error is above ``pixels`` (DSEC's 1PE, 2PE, 3PE; what event
+    papers on MVSEC call outliers is ``pixels=3``)."""
     error = _masked(endpoint_error(flow, truth), mask)
     return 100 * (error > pixels).to(error.dtype).mean()
 
 
 def angular_error_deg(flow, truth, mask=None):
-    """Mean angle in space-time between (u, v, 1) and the truth, degrees (Barron et al., 1994), by atan2 for accuracy at small angles."""
+    """Mean angle in space-time between (u, v, 1) and the truth, degrees (Barron et al., 1994), by atan2 for
+    accuracy at small angles."""
     _check(flow, truth)
     one = torch.ones_like(flow[..., :1, :, :])
-    return _masked(torch.rad2deg(_angle(torch.cat([flow, one], -3), torch.cat([truth, one], -3))), mask).mean()
+    return _masked(
+        torch.rad2deg(_angle(torch.cat([flow, one], -3), torch.cat([truth, one], -3))), mask
+    ).mean()
 
 
 def ray_error_mrad(flow, truth, direction, mask=None):
-    """Mean angle between the rays at the estimated and the true end of each pixel's motion, milliradians per window.
+    """Mean angle between the rays at the estimated and the true end of each pixel's motion, milliradians per
+    window.
 
     Args:
       flow, truth: [..., 2, H, W] px. mask: [..., H, W] or None.
-      direction: [H, W, 3] of the rays through the pixel centres (camera axes, z forward), of any length: chief rays of a camera, or pinhole_directions.
-    Returns: scalar. Between pixels x/z and y/z are bilinear, outside the image linear like its outermost pixels: exact for a pinhole.
+      direction: [H, W, 3] of the rays through the pixel centres (camera axes, z forward), of any length:
+        chief rays of a camera, or pinhole_directions.
+    Returns: scalar. Between pixels x/z and y/z are bilinear, outside the image linear like its outermost
+      pixels: exact for a pinhole.
     Gradient: flow, truth, direction. Raises: ShapeError; DomainError for rays that do not go forward.
     """
     _check(flow, truth)
@@ -79,16 +101,22 @@ def ray_error_mrad(flow, truth, direction, mask=None):
 
 
 def mrad_per_pixel(direction):
-    """Angle that one pixel spans, milliradians [H, W]: the root of its solid angle, from rays [H, W, 3] by central differences. Gradient: direction."""
+    """Angle that one pixel spans, milliradians [H, W]: the root of its solid angle, from rays [H, W, 3] by
+    central differences. Gradient: direction."""
     x, y = _slopes(direction, direction)
     (x_by_y, x_by_x), (y_by_y, y_by_x) = torch.gradient(x), torch.gradient(y)
     return 1000 * ((x_by_x * y_by_y - x_by_y * y_by_x).abs() * (1 + x.square() + y.square()) ** -1.5).sqrt()
 
 
 def pinhole_directions(height_px, width_px, focal_px, centre_px=None, dtype=torch.float64):
-    """Directions [H, W, 3], z = 1, of a pinhole camera; centre_px: (x, y) of the axis, the image's middle when None."""
+    """Directions [H, W, 3], z = 1, of a pinhole camera; centre_px: (x, y) of the axis, the image's middle
+    when None."""
     centre_x, centre_y = ((width_px - 1) / 2, (height_px - 1) / 2) if centre_px is None else centre_px
-    y, x = torch.meshgrid(torch.arange(height_px, dtype=dtype) - centre_y, torch.arange(width_px, dtype=dtype) - centre_x, indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(height_px, dtype=dtype) - centre_y,
+        torch.arange(width_px, dtype=dtype) - centre_x,
+        indexing="ij",
+    )
     return torch.stack([x / focal_px, y / focal_px, torch.ones_like(x)], -1)
 
 
@@ -99,34 +127,50 @@ def event_mask(volume):
 
 def masks(volume, truth):
     """The three masks that errors are reported under: {"valid", "events", "both"}, each [B, H, W] bool."""
-    events, valid = event_mask(volume), truth.valid
+    events = event_mask(volume)
+    valid = truth.valid
     if events.shape != valid.shape:
-        raise ShapeError(f"volume and truth differ in size: {tuple(events.shape)} and {tuple(valid.shape)} pixels.")
+        raise ShapeError(
+            f"volume and truth differ in size: {tuple(events.shape)} and {tuple(valid.shape)} pixels."
+        )
     return {"valid": valid, "events": events, "both": valid & events}
 
 
 def fwl(stream, flow_px, t0_us, t1_us, at=1.0, carry_steps=0):
-    """Flow warp loss: variance of the image of warped events over its variance at zero flow. Above 1 the flow makes the events sharper.
+    """Flow warp loss: variance of the image of warped events over its variance at zero flow. Above 1 the flow
+    makes the events sharper.
 
-    Args: stream: EventStream. flow_px: [2, H, W] pixels from t0 to t1. t0_us, t1_us: whole microseconds, both ends included. at: time the events are moved
-      to, 0 for t0, 1 for t1. carry_steps: see contrast; 0 gives each event the flow of its own pixel, as published.
-    Returns: float. Polarities added, every event on its nearest pixel, variance over all pixels of the sensor. Events that leave the image count in the
+    Args: stream: EventStream. flow_px: [2, H, W] pixels from t0 to t1. t0_us, t1_us: whole microseconds, both
+      ends included. at: time the events are moved
+      to, 0 for t0, 1 for t1. carry_steps: see contrast; 0 gives each event the flow of its own pixel, as
+        published.
+    Returns: float. Polarities added, every event on its nearest pixel, variance over all pixels of the
+      sensor. Events that leave the image count in the
       denominator only.
-    Gradient: none. Raises: DomainError for an interval without events, or with equally many events on every pixel. Source: Stoffregen et al., ECCV 2020, sec. 4.1.
+    Gradient: none. Raises: DomainError for an interval without events, or with equally many events on every
+      pixel. Source: Stoffregen et al., ECCV 2020, sec. 4.1.
     """
     tracks = stream_tracks(stream, flow_px.detach(), t0_us, t1_us, carry_steps)
-    still, moved = (nearest_images(tracks, time)[0].double().sum(1).var(correction=0) for time in (tracks.time, at))
+    still, moved = (
+        nearest_images(tracks, time)[0].double().sum(1).var(correction=0) for time in (tracks.time, at)
+    )
     if float(still) == 0:
-        raise DomainError("every pixel has equally many events, so the variance at zero flow is 0 and FWL undefined; choose another interval.")
+        raise DomainError(
+            "every pixel has equally many events, so the variance at zero flow is 0 and FWL undefined; "
+            "choose another interval."
+        )
     return float(moved / still)
 
 
 def rsat(stream, flow_px, t0_us, t1_us, carry_steps=0):
-    """Ratio of the squared average time stamps, warped to t1 over unwarped. Below 1 the flow aligns the events.
+    """Ratio of the squared average time stamps, warped to t1 over unwarped. Below 1 the flow aligns the
+    events.
 
-    Args: as fwl. Returns: float; of either image, the sum over pixels and polarities of the squared mean time (0 at t0, 1 at t1) over the number of pixels with events of any
+    Args: as fwl. Returns: float; of either image, the sum over pixels and polarities of the squared mean time
+      (0 at t0, 1 at t1) over the number of pixels with events of any
       polarity. Every event on its nearest pixel; events that leave the image are lost from the warped one.
-    Gradient: none. Raises: DomainError for an interval without events, or when all leave the image, or lie at t0. Source: Hagenaars et al., NeurIPS 2021.
+    Gradient: none. Raises: DomainError for an interval without events, or when all leave the image, or lie at
+      t0. Source: Hagenaars et al., NeurIPS 2021.
     """
     tracks = stream_tracks(stream, flow_px.detach(), t0_us, t1_us, carry_steps)
     squares = []
@@ -134,10 +178,15 @@ def rsat(stream, flow_px, t0_us, t1_us, carry_steps=0):
         counts, mean_time = (image.double() for image in nearest_images(tracks, time))
         pixels = (counts.sum(1) > 0).sum()
         if int(pixels) == 0:
-            raise DomainError("the flow moves every event out of the image, so RSAT is undefined; check the flow's unit (pixels per window).")
+            raise DomainError(
+                "the flow moves every event out of the image, so RSAT is undefined; check the flow's unit "
+                "(pixels per window)."
+            )
         squares.append(float(mean_time.square().sum() / pixels))
     if squares[0] == 0:
-        raise DomainError("all events lie at the start of the interval, so RSAT is undefined; choose another interval.")
+        raise DomainError(
+            "all events lie at the start of the interval, so RSAT is undefined; choose another interval."
+        )
     return squares[1] / squares[0]
 
 
@@ -147,20 +196,35 @@ def _angle(a, b):
 
 def _slopes(direction, like):
     """x/z and y/z, [2, H, W]."""
-    if direction.ndim != 3 or direction.shape[2] != 3 or (like is not direction and direction.shape[:2] != like.shape[-2:]) or min(direction.shape[:2]) < 2:
-        raise ShapeError(f"directions must be [H, W, 3] for each pixel of the flow, at least 2 x 2; got {tuple(direction.shape)} for {tuple(like.shape)}.")
+    if (
+        direction.ndim != 3
+        or direction.shape[2] != 3
+        or (like is not direction and direction.shape[:2] != like.shape[-2:])
+        or min(direction.shape[:2]) < 2
+    ):
+        raise ShapeError(
+            "directions must be [H, W, 3] for each pixel of the flow, at least 2 x 2; got "
+            f"{tuple(direction.shape)} for {tuple(like.shape)}."
+        )
     if not bool((direction[..., 2] > 0).all()):
-        raise DomainError("a direction does not go forward (z > 0 is needed, camera axes: x right, y down, z forward).")
+        raise DomainError(
+            "a direction does not go forward (z > 0 is needed, camera axes: x right, y down, z forward)."
+        )
     return (direction[..., :2] / direction[..., 2:]).movedim(2, 0).to(like)
 
 
 def _ray_at(plane, flow):
     """Rays (x/z, y/z, 1) at the ends of a flow: bilinear in the nearest cell of four pixels."""
     height, width = plane.shape[1:]
-    y, x = torch.meshgrid(*(torch.arange(size, dtype=flow.dtype, device=flow.device) for size in (height, width)), indexing="ij")
-    x, y = x + flow[..., 0, :, :], y + flow[..., 1, :, :]
-    column, row = x.detach().floor().long().clamp(0, width - 2), y.detach().floor().long().clamp(0, height - 2)
-    right, down = x - column, y - row
+    y, x = torch.meshgrid(
+        *(torch.arange(size, dtype=flow.dtype, device=flow.device) for size in (height, width)), indexing="ij"
+    )
+    x = x + flow[..., 0, :, :]
+    y = y + flow[..., 1, :, :]
+    column = x.detach().floor().long().clamp(0, width - 2)
+    row = y.detach().floor().long().clamp(0, height - 2)
+    right = x - column
+    down = y - row
     above = plane[:, row, column] * (1 - right) + plane[:, row, column + 1] * right
     below = plane[:, row + 1, column] * (1 - right) + plane[:, row + 1, column + 1] * right
     ray = above * (1 - down) + below * down

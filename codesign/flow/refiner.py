@@ -1,4 +1,5 @@
-"""A small network that corrects the closed form: the volume is warped along the flow so far, and what still moves says what to add."""
+"""A small network that corrects the closed form: the volume is warped along the flow so far, and what still
+moves says what to add."""
 
 import torch
 from torch import nn
@@ -12,7 +13,9 @@ from codesign.flow.warp import along_flow
 from codesign.types import FlowField
 
 STRIDE = 16  # sizes are padded to multiples of this
-POOL = 2  # pixels a side over which the volume is averaged before anything else: no coarser than the closed form's finest blur
+# pixels a side over which the volume is averaged before anything else: no coarser than the closed form's
+# finest blur
+POOL = 2
 CELL = 2  # averaged pixels a side of the cells on which flow is corrected
 SCALES = (1, 2, 4)  # averaged pixels over which slopes are taken
 SEEN = 6 * len(SCALES) + 2  # what ``_evidence`` tells of a cell
@@ -25,17 +28,24 @@ FLOOR_PX2 = 1e-3  # variance claimed at least
 class Refiner(nn.Module):
     """Event flow by a few corrections of the closed form (quadratic field).
 
-    Args: bins: time bins of the volumes. width: channels on the finest grid, a multiple of 4. steps: corrections, by the same weights.
-    A correction warps the volume along the flow so far. A small U-Net on cells of 4 to 16 px reads the bins as they are and as they are warped, the flow so
-    far, and the local least-squares solutions of V_t + u V_x + v V_y = 0 for what still moves, at three scales; it adds to the flow on cells of 8 and of 4 px.
-    Warping looks bins up at q + t flow(q), so the flow belongs to the pixels of the window's start, as the truth does.
+    Args: bins: time bins of the volumes. width: channels on the finest grid, a multiple of 4. steps:
+      corrections, by the same weights.
+    A correction warps the volume along the flow so far. A small U-Net on cells of 4 to 16 px reads the bins
+    as they are and as they are warped, the flow so
+    far, and the local least-squares solutions of V_t + u V_x + v V_y = 0 for what still moves, at three
+    scales; it adds to the flow on cells of 8 and of 4 px.
+    Warping looks bins up at q + t flow(q), so the flow belongs to the pixels of the window's start, as the
+    truth does.
     """
 
     def __init__(self, bins: int = 8, width: int = 28, steps: int = 2):
         super().__init__()
         check_bins(bins)
         if steps < 1 or width < GROUPS or width % GROUPS:
-            raise DomainError(f"width = {width}, steps = {steps}; a width that is a multiple of {GROUPS} and at least 1 step are needed.")
+            raise DomainError(
+                f"width = {width}, steps = {steps}; a width that is a multiple of {GROUPS} and at least 1 "
+                "step are needed."
+            )
         self.config = {"bins": bins, "width": width, "steps": steps}
         c = width
         self.texture = Layer(4 * bins + 2, c)
@@ -56,9 +66,11 @@ class Refiner(nn.Module):
     def forward(self, volume):
         """Flow of an EventVolume [B, 2, bins, H, W] of any H, W.
 
-        The corrected flow counts where it leaves less that moves than the start does, over windows of 26 px; the start where it does not. So the answer stays
+        The corrected flow counts where it leaves less that moves than the start does, over windows of 26 px;
+        the start where it does not. So the answer stays
         near the closed form where that is right already.
-        Returns: FlowField with confidence and covariance (the same along x and y). An empty sample has flow 0, confidence 0 and no gradient.
+        Returns: FlowField with confidence and covariance (the same along x and y). An empty sample has flow
+          0, confidence 0 and no gradient.
         Gradient: counts and weights.
         Raises: ShapeError for other shapes or numbers of bins; DomainError for counts that are not finite.
         """
@@ -70,7 +82,8 @@ class Refiner(nn.Module):
         return _field(start_px + _larger(share[:, None], POOL) * (flow_px - start_px), doubt, volume)
 
     def predictions(self, volume, start_px=None):
-        """FlowFields after each correction, by themselves: what training looks at. start_px: [B, 2, H, W] flow to begin with instead of the closed form's."""
+        """FlowFields after each correction, by themselves: what training looks at. start_px: [B, 2, H, W]
+        flow to begin with instead of the closed form's."""
         bins = _Bins(volume, self.config["bins"])
         start_px = bins.padded(_closed_form(volume) if start_px is None else start_px)
         return [_field(flow_px, doubt, volume) for flow_px, doubt in self._corrected(bins, start_px)]
@@ -84,10 +97,14 @@ class Refiner(nn.Module):
             warped = bins.warped(dense)
             with torch.autocast(flow.device.type, enabled=False):
                 seen = _evidence(*bins.mean_and_slope(warped), warped)
-            change, core = self._correction(torch.cat([warped, bins.rates], 1).flatten(1, 2), dense * (POOL / PRIOR_PX), seen)
+            change, core = self._correction(
+                torch.cat([warped, bins.rates], 1).flatten(1, 2), dense * (POOL / PRIOR_PX), seen
+            )
             flow = flow + change
             last = step + 1 == self.config["steps"]
-            flow_px = POOL * (_blended(flow, self.blend(core), POOL * CELL) if last else _larger(flow, POOL * CELL))
+            flow_px = POOL * (
+                _blended(flow, self.blend(core), POOL * CELL) if last else _larger(flow, POOL * CELL)
+            )
             found.append((flow_px, _larger(self.doubt(core), POOL * CELL)[:, 0]))
         return found
 
@@ -108,15 +125,20 @@ def _larger(image, factor):
 
 
 def _field(flow_px, doubt, volume):
-    """FlowField cropped to the volume's size, faded in with the sample's events. doubt: [B, H, W] log variance, px^2."""
+    """FlowField cropped to the volume's size, faded in with the sample's events. doubt: [B, H, W] log
+    variance, px^2."""
     counts = volume.counts
     height, width = counts.shape[-2:]
     shown = presence(counts)
-    variance = FLOOR_PX2 + PRIOR_PX**2 * (1 - shown[:, 0]) + shown[:, 0] * torch.exp(doubt[:, :height, :width])
+    variance = (
+        FLOOR_PX2 + PRIOR_PX**2 * (1 - shown[:, 0]) + shown[:, 0] * torch.exp(doubt[:, :height, :width])
+    )
     valid = (counts.detach().sum((1, 2, 3, 4)) > 0)[:, None, None].expand(-1, height, width)
     confidence = shown[:, 0] * PRIOR_PX**2 / (PRIOR_PX**2 + variance)
     covariance = torch.stack([variance, torch.zeros_like(variance), variance], 1)
-    return FlowField(shown * flow_px[..., :height, :width], valid, float(volume.collected_s.sum()), confidence, covariance)
+    return FlowField(
+        shown * flow_px[..., :height, :width], valid, float(volume.collected_s.sum()), confidence, covariance
+    )
 
 
 def _closed_form(volume):
@@ -127,15 +149,20 @@ def _closed_form(volume):
 class _Bins:
     """Event rates [B, 2, bins, h, w] of a volume, averaged over POOL x POOL px, and how they are read.
 
-    Rates are in units of the sample's root mean square, large ones compressed smoothly; sides are padded with empty pixels to multiples of STRIDE.
+    Rates are in units of the sample's root mean square, large ones compressed smoothly; sides are padded with
+    empty pixels to multiples of STRIDE.
     """
 
     def __init__(self, volume, bins):
         counts = check_volume(volume, bins)
         span = volume.collected_s.sum()
-        self.share, self.time = ((values / span).to(counts) for values in (volume.collected_s, volume.centroid_s))
+        self.share, self.time = (
+            (values / span).to(counts) for values in (volume.collected_s, volume.centroid_s)
+        )
         self.extra = (0, -counts.shape[-1] % STRIDE, 0, -counts.shape[-2] % STRIDE)
-        rate = avg_pool2d(pad_to(counts.flatten(1, 2), STRIDE), POOL).unflatten(1, (2, -1)) / (self.share[:, None, None] * bins)
+        rate = avg_pool2d(pad_to(counts.flatten(1, 2), STRIDE), POOL).unflatten(1, (2, -1)) / (
+            self.share[:, None, None] * bins
+        )
         rate = rate * (rate.sum(1).square().mean((1, 2, 3)) + 1e-4).rsqrt()[:, None, None, None, None]
         self.rates = rate * (1 + (rate / LARGEST).square()).rsqrt()
 
@@ -156,17 +183,22 @@ class _Bins:
         return (signed * self.share[:, None, None]).sum(1), (signed * lean[:, None, None]).sum(1)
 
     def misfit(self, flow_px):
-        """Mean square of what still moves along a flow [B, 2, H, W] px, over windows, [B, h, w], on a small floor, so that two flows that fit alike share."""
+        """Mean square of what still moves along a flow [B, 2, H, W] px, over windows, [B, h, w], on a small
+        floor, so that two flows that fit alike share."""
         energy = self.mean_and_slope(self.warped(avg_pool2d(flow_px, POOL) / POOL))[1].square()
         reach = min(JUDGED // 2, *(side - 1 for side in energy.shape[-2:]))
-        near = avg_pool2d(pad(energy[:, None], (reach, reach, reach, reach), mode="reflect"), 2 * reach + 1, stride=1)[:, 0]
+        near = avg_pool2d(
+            pad(energy[:, None], (reach, reach, reach, reach), mode="reflect"), 2 * reach + 1, stride=1
+        )[:, 0]
         return near + 1e-3 * energy.mean((1, 2), keepdim=True) + 1e-4
 
 
 def _evidence(mean, moving, warped):
-    """What the warped bins [B, 2, bins, h, w], their mean and slope, say about the flow that is still missing, on cells [B, SEEN, h / CELL, w / CELL].
+    """What the warped bins [B, 2, bins, h, w], their mean and slope, say about the flow that is still
+    missing, on cells [B, SEEN, h / CELL, w / CELL].
 
-    Mean and mean square of the rate; per scale the local least-squares flow (2), orientation (2) and strength (1) of the texture, strength of what moves (1).
+    Mean and mean square of the rate; per scale the local least-squares flow (2), orientation (2) and strength
+    (1) of the texture, strength of what moves (1).
     """
     both = torch.stack([mean, moving], 1)
     square = (warped[:, 0] - warped[:, 1]).square().mean(1)
@@ -187,18 +219,32 @@ def _evidence(mean, moving, warped):
 
 
 def _local_flow(products, reach):
-    """Damped least-squares flow within ``reach``, and what it rests on, [B, 6, h, w], from the sums xx, xy, yy, xs, ys, ss of slopes in space and time."""
+    """Damped least-squares flow within ``reach``, and what it rests on, [B, 6, h, w], from the sums xx, xy,
+    yy, xs, ys, ss of slopes in space and time."""
     xx, xy, yy, xs, ys, ss = products.unbind(1)
     damping = 0.02 * (xx + yy).mean((1, 2), keepdim=True) + 0.02 * ss * (POOL / PRIOR_PX) ** 2 + 1e-6
-    a, b = xx + damping, yy + damping
+    a = xx + damping
+    b = yy + damping
     determinant = a * b - xy * xy  # at least damping squared
-    u, v = (xy * ys - b * xs) / determinant, (xy * xs - a * ys) / determinant
+    u = (xy * ys - b * xs) / determinant
+    v = (xy * xs - a * ys) / determinant
     limit = (1 + (u * u + v * v) / reach**2).rsqrt()
-    return torch.stack([u * limit, v * limit, (xx - yy) / (a + b), 2 * xy / (a + b), (xx + yy + 1e-6).log() / 4, (ss + 1e-6).log() / 4], 1)
+    return torch.stack(
+        [
+            u * limit,
+            v * limit,
+            (xx - yy) / (a + b),
+            2 * xy / (a + b),
+            (xx + yy + 1e-6).log() / 4,
+            (ss + 1e-6).log() / 4,
+        ],
+        1,
+    )
 
 
 def _blended(flow, weights, factor):
-    """Every fine pixel as a learnt mean of the nine cells around its own (Teed and Deng, RAFT, ECCV 2020, section 3.3)."""
+    """Every fine pixel as a learnt mean of the nine cells around its own (Teed and Deng, RAFT, ECCV 2020,
+    section 3.3)."""
     batch, _, height, width = flow.shape
     mix = weights.reshape(batch, 1, 9, factor, factor, height, width).softmax(2)
     near = unfold(pad(flow, (1, 1, 1, 1), mode="replicate"), 3).reshape(batch, 2, 9, 1, 1, height, width)

@@ -6,14 +6,19 @@ from torch.nn.functional import grid_sample
 
 def pixel_grid(height, width, like):
     """Pixel positions [2, H, W], (x, y) with the origin at the first pixel's centre."""
-    y, x = torch.meshgrid(torch.arange(height, dtype=like.dtype, device=like.device), torch.arange(width, dtype=like.dtype, device=like.device), indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(height, dtype=like.dtype, device=like.device),
+        torch.arange(width, dtype=like.dtype, device=like.device),
+        indexing="ij",
+    )
     return torch.stack([x, y])
 
 
 def along_flow(bins, flow_px, time):
     """What each bin holds where a point of the start has got to.
 
-    Args: bins: [B, T, H, W], or [B, C, T, H, W] with polarities or the like. flow_px: [B, 2, H, W] px per window on pixels of the start.
+    Args: bins: [B, T, H, W], or [B, C, T, H, W] with polarities or the like. flow_px: [B, 2, H, W] px per
+      window on pixels of the start.
       time: [T] bin times, 0 at the start of the window, 1 at its end.
     Returns: as bins: bin k at q + time_k flow(q) for every pixel q, bilinear; 0 outside the image.
     Gradient: bins and flow; piecewise smooth in the flow, as bilinear lookups are.

@@ -14,10 +14,14 @@ DEFAULT_LADDER = tuple(10.0**-k for k in (2, 2.5, 3, 3.5, 4, 4.5, 5))
 class Row:
     """The certificate of one group of parameters.
 
-    autograd, difference: one number per parameter (or per random direction). relative_error: L2 of their difference over L2 of the differences.
-    cosine: of the two vectors. signed_bias: (autograd . difference) / |difference|^2 - 1; negative means too small.
-    noise_floor: L2 of the differences' own noise, relative like the error. step_plateau: step found, per parameter.
-    verdict: "pass" (error within tolerance), "noise" (error within three noise floors, so the differences cannot judge), or "fail".
+    autograd, difference: one number per parameter (or per random direction). relative_error: L2 of their
+      difference over L2 of the differences.
+    cosine: of the two vectors. signed_bias: (autograd . difference) / |difference|^2 - 1; negative means too
+      small.
+    noise_floor: L2 of the differences' own noise, relative like the error. step_plateau: step found, per
+      parameter.
+    verdict: "pass" (error within tolerance), "noise" (error within three noise floors, so the differences
+      cannot judge), or "fail".
     """
 
     name: str
@@ -31,16 +35,29 @@ class Row:
     verdict: str
 
 
-def certify(fn, params, *, scales=None, ladder=DEFAULT_LADDER, tolerance=0.01, directions=None, generator=None, difference_fn=None):
+def certify(
+    fn,
+    params,
+    *,
+    scales=None,
+    ladder=DEFAULT_LADDER,
+    tolerance=0.01,
+    directions=None,
+    generator=None,
+    difference_fn=None,
+):
     """Compare autograd of a scalar function with differences, group by group.
 
     Args:
       fn: function of a dict of tensors -> scalar tensor; the same random numbers at every call.
       params: name -> tensor (the point where the gradient is checked).
-      scales: name -> step unit (number or tensor like the parameter); 1 where left out. A ladder rung h moves a parameter by h * scale.
+      scales: name -> step unit (number or tensor like the parameter); 1 where left out. A ladder rung h moves
+        a parameter by h * scale.
       ladder: relative steps, large to small. tolerance: relative error that passes.
-      directions: None checks every component; a number checks that many random unit directions per group (many parameters), drawn with ``generator``.
-      difference_fn: function whose differences judge, when it is not ``fn`` itself (a hard loss beside its smooth gradient).
+      directions: None checks every component; a number checks that many random unit directions per group
+        (many parameters), drawn with ``generator``.
+      difference_fn: function whose differences judge, when it is not ``fn`` itself (a hard loss beside its
+        smooth gradient).
     Returns: list of Row, one per group.
     Raises: GradientError when the loss does not depend on a group through autograd at all.
     """
@@ -48,16 +65,25 @@ def certify(fn, params, *, scales=None, ladder=DEFAULT_LADDER, tolerance=0.01, d
     leaves = {name: value.detach().clone().requires_grad_(True) for name, value in params.items()}
     loss = fn(leaves)
     if loss.numel() != 1:
-        raise DomainError(f"certify needs a scalar function, got shape {tuple(loss.shape)}; reduce it to one number.")
+        raise DomainError(
+            f"certify needs a scalar function, got shape {tuple(loss.shape)}; reduce it to one number."
+        )
     grads = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
     rows = []
     for (name, value), grad in zip(params.items(), grads, strict=True):
         if grad is None:
-            raise GradientError(f"the function does not depend on '{name}' through autograd; the graph is cut somewhere before it.")
+            raise GradientError(
+                f"the function does not depend on '{name}' through autograd; the graph is cut somewhere "
+                "before it."
+            )
         unit = (scales or {}).get(name, 1.0) * torch.ones_like(value)
         others = {k: v.detach() for k, v in params.items()}
-        alone = lambda x, name=name, others=others: judge({**others, name: x})  # noqa: E731
-        found, analytic = [], []
+
+        def alone(x, name=name, others=others):
+            return judge({**others, name: x})
+
+        found = []
+        analytic = []
         for direction in _directions(value, directions, generator):
             step = direction * unit
             found.append(plateau(alone, value.detach(), step, ladder))
@@ -74,13 +100,25 @@ def _directions(value, count, generator):
 
 
 def _row(name, analytic, found, tolerance):
-    a, d = torch.tensor(analytic, dtype=torch.float64), torch.tensor([f.value for f in found], dtype=torch.float64)
+    a = torch.tensor(analytic, dtype=torch.float64)
+    d = torch.tensor([f.value for f in found], dtype=torch.float64)
     noise = torch.tensor([f.noise for f in found], dtype=torch.float64).norm()
     size = max(float(d.norm()), 1e-300)
-    error, floor = float((a - d).norm()) / size, float(noise) / size
+    error = float((a - d).norm()) / size
+    floor = float(noise) / size
     cosine = float(a @ d) / max(float(a.norm()) * size, 1e-300)
     verdict = "pass" if error <= tolerance else "noise" if error <= 3 * floor else "fail"
-    return Row(name, tuple(analytic), tuple(d.tolist()), error, cosine, float(a @ d) / size**2 - 1, floor, tuple(f.step for f in found), verdict)
+    return Row(
+        name,
+        tuple(analytic),
+        tuple(d.tolist()),
+        error,
+        cosine,
+        float(a @ d) / size**2 - 1,
+        floor,
+        tuple(f.step for f in found),
+        verdict,
+    )
 
 
 def worst(rows):

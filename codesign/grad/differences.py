@@ -8,7 +8,8 @@ import torch
 
 @dataclass(frozen=True)
 class Difference:
-    """A derivative by differences: its value, the step of the plateau, and the noise floor (how much neighbouring rungs disagree)."""
+    """A derivative by differences: its value, the step of the plateau, and the noise floor (how much
+    neighbouring rungs disagree)."""
 
     value: float
     step: float
@@ -17,7 +18,8 @@ class Difference:
 
 
 def central(fn, point, direction, step):
-    """(f(x + h d) - f(x - h d)) / 2h for a function of one tensor. fn must use the same random numbers at both ends."""
+    """(f(x + h d) - f(x - h d)) / 2h for a function of one tensor. fn must use the same random numbers at
+    both ends."""
     with torch.no_grad():
         return (float(fn(point + step * direction)) - float(fn(point - step * direction))) / (2 * step)
 
@@ -25,8 +27,10 @@ def central(fn, point, direction, step):
 def plateau(fn, point, direction, steps):
     """Differences over the ladder ``steps``; the plateau is the pair of neighbouring rungs that agree best.
 
-    Too small a step drowns in rounding, too large a one bends; between them neighbouring rungs agree. The value is the mean of
-    that pair and the noise floor half their distance (with one rung: no floor is known, and it is reported as 0).
+    Too small a step drowns in rounding, too large a one bends; between them neighbouring rungs agree. The
+    value is the mean of
+    that pair and the noise floor half their distance (with one rung: no floor is known, and it is reported as
+    0).
     """
     ladder = tuple((h, central(fn, point, direction, h)) for h in steps)
     if len(ladder) == 1:

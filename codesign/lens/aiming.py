@@ -1,7 +1,9 @@
 """Ray aiming: rays that meet the real stop at given points, and the image irradiance that follows from them.
 
-Paraxial pupils are where thin pencils near the axis see the stop; off the axis the real pupil moves, tilts and shrinks. Aiming solves, ray by
-ray, for the point of the paraxial pupil plane through which the ray must start: Newton steps with the exact derivative of each ray, halved until the
+Paraxial pupils are where thin pencils near the axis see the stop; off the axis the real pupil moves, tilts
+and shrinks. Aiming solves, ray by
+ray, for the point of the paraxial pupil plane through which the ray must start: Newton steps with the exact
+derivative of each ray, halved until the
 miss falls; rays that do not get there are led to their field from the axis in small steps.
 """
 
@@ -14,16 +16,20 @@ from torch import Tensor
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.trace import Status, trace
 
-NEWTON_STEPS, HALVINGS, FIELD_STEPS = 12, 6, 16
+NEWTON_STEPS = 12
+HALVINGS = 6
+FIELD_STEPS = 16
 REACHED = 1e-11  # miss at the stop, relative to the stop's radius: where rounding of a float64 trace begins
-DIFFERENCE = 1e-3  # step of the derivative that goes into the irradiance, relative to the pupil's size; its error is the square
+# step of the derivative that goes into the irradiance, relative to the pupil's size; its error is the square
+DIFFERENCE = 1e-3
 
 
 @dataclass(frozen=True)
 class Aim:
     """Where rays cross the paraxial pupil's plane to meet the stop.
 
-    point_mm: [N, 2]. determinant: [N], area at the stop per area of the pupil plane. found: [N] bool; where False, no ray meets the stop there and the point is the paraxial one.
+    point_mm: [N, 2]. determinant: [N], area at the stop per area of the pupil plane. found: [N] bool; where
+      False, no ray meets the stop there and the point is the paraxial one.
     """
 
     point_mm: Tensor
@@ -35,15 +41,21 @@ def aim_at_stop(rays, until_stop, pupil, stop_radius_mm, pupil_radius_mm):
     """Solve for the points of the pupil plane whose rays meet the stop at the targets.
 
     Args:
-      rays: function (points [K N, 2], share [K N, 1]) -> origin, direction [K N, 3], for the N rays K times over; share scales the field from the axis (0)
+      rays: function (points [K N, 2], share [K N, 1]) -> origin, direction [K N, 3], for the N rays K times
+        over; share scales the field from the axis (0)
         to where it is wanted (1).
-      until_stop: Prescription that ends on the stop. pupil: [N, 2] points of the unit disc; the radii give it its size on the stop and on the pupil plane.
-    Returns: Aim. Gradient: point_mm and determinant to every tensor behind ``rays``, ``until_stop`` and the radii, by the implicit function theorem.
+      until_stop: Prescription that ends on the stop. pupil: [N, 2] points of the unit disc; the radii give it
+        its size on the stop and on the pupil plane.
+    Returns: Aim. Gradient: point_mm and determinant to every tensor behind ``rays``, ``until_stop`` and the
+      radii, by the implicit function theorem.
     Warns: when some rays cannot be aimed; they keep their guess.
     """
     target_mm = pupil * stop_radius_mm
     with torch.no_grad():
-        fixed, guess_mm, size, scale = until_stop.detached(), pupil * pupil_radius_mm, pupil_radius_mm.detach(), stop_radius_mm.detach()
+        fixed = until_stop.detached()
+        guess_mm = pupil * pupil_radius_mm
+        size = pupil_radius_mm.detach()
+        scale = stop_radius_mm.detach()
         full = torch.ones_like(guess_mm[:, :1])
         at, found = _newton(rays, fixed, target_mm, guess_mm.clone(), full, scale)
         lost = torch.nonzero(~found)[:, 0]
@@ -51,10 +63,26 @@ def aim_at_stop(rays, until_stop, pupil, stop_radius_mm, pupil_radius_mm):
             at[lost], found[lost] = _from_the_axis(rays, fixed, target_mm, guess_mm, lost, scale)
             if not bool(found.all()):
                 at[~found] = guess_mm[~found]
-                warnings.warn(f"{int((~found).sum())} of {found.numel()} rays cannot be aimed at the stop (no light takes that way); they keep their paraxial aim.", stacklevel=3)
-    shifts = DIFFERENCE * size * torch.tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=at.dtype, device=at.device)
-    stop = _meet(rays, until_stop, (at[None] + shifts[:, None]).reshape(-1, 2), full.repeat(5, 1)).position_mm[:, :2].reshape(5, -1, 2)
-    jacobian = torch.stack([stop[1] - stop[2], stop[3] - stop[4]], -1) / (2 * DIFFERENCE * size)  # [N, stop, pupil]
+                warnings.warn(
+                    f"{int((~found).sum())} of {found.numel()} rays cannot be aimed at the stop (no light "
+                    "takes that way); they keep their paraxial aim.",
+                    stacklevel=3,
+                )
+    shifts = (
+        DIFFERENCE
+        * size
+        * torch.tensor(
+            [[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=at.dtype, device=at.device
+        )
+    )
+    stop = (
+        _meet(rays, until_stop, (at[None] + shifts[:, None]).reshape(-1, 2), full.repeat(5, 1))
+        .position_mm[:, :2]
+        .reshape(5, -1, 2)
+    )
+    jacobian = torch.stack([stop[1] - stop[2], stop[3] - stop[4]], -1) / (
+        2 * DIFFERENCE * size
+    )  # [N, stop, pupil]
     usable = found & (torch.linalg.det(jacobian.detach()).abs() > 1e-12)
     jacobian = torch.where(usable[:, None, None], jacobian, torch.eye(2, dtype=at.dtype, device=at.device))
     change = torch.linalg.solve(jacobian.detach(), torch.where(usable[:, None], stop[0] - target_mm, 0))
@@ -64,10 +92,12 @@ def aim_at_stop(rays, until_stop, pupil, stop_radius_mm, pupil_radius_mm):
 def aimed_rays(lens, field_rad, pupil, wavelength_um=WAVELENGTH_UM["d"], start_z_mm=-5.0):
     """Parallel rays of one field angle (in +y) that meet the real stop at points of its disc.
 
-    Args: field_rad scalar; pupil [M, 2] on the unit disc, in units of the stop's paraxial radius. Returns: origins and directions [M, 3], lens axes.
+    Args: field_rad scalar; pupil [M, 2] on the unit disc, in units of the stop's paraxial radius. Returns:
+      origins and directions [M, 3], lens axes.
     Gradient: origins to the lens. Warns: when some rays cannot be aimed.
     """
-    f, pupil = lens.first_order(wavelength_um), pupil.to(lens.dtype)
+    f = lens.first_order(wavelength_um)
+    pupil = pupil.to(lens.dtype)
     tangent = torch.tan(torch.as_tensor(field_rad, dtype=lens.dtype))
 
     def rays(points, share):
@@ -76,7 +106,13 @@ def aimed_rays(lens, field_rad, pupil, wavelength_um=WAVELENGTH_UM["d"], start_z
         at = torch.cat([points, f.entrance_pupil_z_mm.expand(points.shape[0], 1)], 1)
         return at + slope * (start_z_mm - at[:, 2:]), direction
 
-    aim = aim_at_stop(rays, lens.prescription(wavelength_um).until(lens.stop_index), pupil, f.stop_semi_aperture_mm, f.entrance_pupil_diameter_mm / 2)
+    aim = aim_at_stop(
+        rays,
+        lens.prescription(wavelength_um).until(lens.stop_index),
+        pupil,
+        f.stop_semi_aperture_mm,
+        f.entrance_pupil_diameter_mm / 2,
+    )
     return rays(aim.point_mm, torch.ones_like(pupil[:, :1]))
 
 
@@ -85,7 +121,8 @@ def _meet(rays, until_stop, points, share):
 
 
 def _newton(rays, until_stop, target, at, share, scale):
-    """Newton steps from ``at`` [N, 2]; returns points and whether each ray reached its target. Rays that have no derivative stay."""
+    """Newton steps from ``at`` [N, 2]; returns points and whether each ray reached its target. Rays that have
+    no derivative stay."""
     miss, passes = _miss(rays, until_stop, target, at, share)
     for _ in range(NEWTON_STEPS):
         active = torch.nonzero(passes & (miss.norm(dim=1) > REACHED * scale))[:, 0]
@@ -100,7 +137,8 @@ def _newton(rays, until_stop, target, at, share, scale):
             trial = before - step * 0.5**halving
             there, reaches = _miss(rays, until_stop, target, trial, share)
             better = reaches & (there.norm(dim=1) < miss.norm(dim=1))
-            at, miss = torch.where(better[:, None], trial, at), torch.where(better[:, None], there, miss)
+            at = torch.where(better[:, None], trial, at)
+            miss = torch.where(better[:, None], there, miss)
             step = torch.where(better[:, None], 0, step)
             if not bool(step.any()):
                 break
@@ -110,8 +148,11 @@ def _newton(rays, until_stop, target, at, share, scale):
 
 
 def _from_the_axis(rays, until_stop, target, guess, rows, scale):
-    """Follow rays from the axis, where the paraxial guess holds, to their field in small steps; returns points and whether they arrived."""
-    full, at, before = torch.zeros_like(target[:, :1]), guess.clone(), guess.clone()
+    """Follow rays from the axis, where the paraxial guess holds, to their field in small steps; returns
+    points and whether they arrived."""
+    full = torch.zeros_like(target[:, :1])
+    at = guess.clone()
+    before = guess.clone()
     for k in range(FIELD_STEPS + 1):
         share = full + k / FIELD_STEPS
         start = at + (at - before) if k > 1 else at  # go on as before
@@ -127,7 +168,8 @@ def _miss(rays, until_stop, target, at, share):
 
 
 def _jacobian(rays, until_stop, at, share, rows):
-    """Motion at the stop per motion on the pupil plane, [rows, 2, 2]; exact, since each ray depends on its own point only."""
+    """Motion at the stop per motion on the pupil plane, [rows, 2, 2]; exact, since each ray depends on its
+    own point only."""
     with torch.enable_grad():
         points = at.clone().requires_grad_(True)
         stop = _meet(rays, until_stop, points, share).position_mm

@@ -10,11 +10,27 @@ from codesign.errors import DomainError
 from codesign.lens import glass_catalogue
 
 WAVELENGTH_UM = {"F": 0.4861327, "d": 0.5875618, "C": 0.6562725}
-LONGEST_NAME, LONGEST_SOURCE = 80, 200
-LEAST_INDEX, INDEX_LIMIT = 1.0, 5.0
+LONGEST_NAME = 80
+LONGEST_SOURCE = 200
+LEAST_INDEX = 1.0
+INDEX_LIMIT = 5.0
 _LINES_RANGE_UM = (0.36, 1.1)
 # CODE V writes NBK7_SCHOTT; the last three stand for catalogues, not makers
-_MAKERS = ("SCHOTT", "OHARA", "HOYA", "HIKARI", "NIKON", "SUMITA", "CDGM", "CORNING", "LIGHTPATH", "ZEON", "SPECIAL", "MISC", "PLASTIC")
+_MAKERS = (
+    "SCHOTT",
+    "OHARA",
+    "HOYA",
+    "HIKARI",
+    "NIKON",
+    "SUMITA",
+    "CDGM",
+    "CORNING",
+    "LIGHTPATH",
+    "ZEON",
+    "SPECIAL",
+    "MISC",
+    "PLASTIC",
+)
 _CODE = re.compile(r"([0-9]{3})([0-9]{3})(?:\.[0-9]{3})?|([0-9]{3,6})\.([0-9]{3,6})")
 _PAIR = re.compile(r"([0-9]\.[0-9]{1,16}) ?[/:] ?([0-9]{1,3}(?:\.[0-9]{1,16})?)")
 
@@ -29,21 +45,34 @@ def _area(a, b, c):
 
 
 def _through_lines(indices, wavelength_um):
-    """A + B/w + C/w^3.5 through the indices at F, d and C, exact at each. Source: Conrady, Applied Optics and Optical Design."""
+    """A + B/w + C/w^3.5 through the indices at F, d and C, exact at each. Source: Conrady, Applied Optics and
+    Optical Design."""
     F, d, C, w = (_conrady(x) for x in (*WAVELENGTH_UM.values(), wavelength_um))
     whole = _area(F, d, C)
-    return indices[0] * (_area(w, d, C) / whole) + indices[1] * (_area(F, w, C) / whole) + indices[2] * (_area(F, d, w) / whole)
+    return (
+        indices[0] * (_area(w, d, C) / whole)
+        + indices[1] * (_area(F, w, C) / whole)
+        + indices[2] * (_area(F, d, w) / whole)
+    )
 
 
 def _sellmeier(coefficients, wavelength_um):
     """n^2 - 1 = sum of B w^2 / (w^2 - C); coefficients B1, C1 (um^2), B2, C2, ..."""
     square = wavelength_um**2
-    return _root(1 + sum(b * square / (square - c) for b, c in zip(coefficients[::2], coefficients[1::2], strict=True)))
+    return _root(
+        1 + sum(b * square / (square - c) for b, c in zip(coefficients[::2], coefficients[1::2], strict=True))
+    )
 
 
 def _schott(coefficients, wavelength_um):
-    """n^2 = sum of a w^k, k = 0, 2, -2, -4, -6, -8 (Schott before 1992), then -10, -12 and 4 (Hikari's extension)."""
-    return _root(sum(a * wavelength_um**k for a, k in zip(coefficients, (0, 2, -2, -4, -6, -8, -10, -12, 4), strict=False)))
+    """n^2 = sum of a w^k, k = 0, 2, -2, -4, -6, -8 (Schott before 1992), then -10, -12 and 4 (Hikari's
+    extension)."""
+    return _root(
+        sum(
+            a * wavelength_um**k
+            for a, k in zip(coefficients, (0, 2, -2, -4, -6, -8, -10, -12, 4), strict=False)
+        )
+    )
 
 
 def _cauchy(coefficients, wavelength_um):
@@ -69,7 +98,8 @@ class Glass:
     """A medium: a dispersion model of ``MODELS``, its coefficients, and the wavelengths (um) they hold for.
 
     offset: added to the model's index at every wavelength (melt data, or an index that was optimised).
-    Raises: DomainError for a name, model, coefficients or range that cannot be, or an index outside [1, 5) at F, d or C.
+    Raises: DomainError for a name, model, coefficients or range that cannot be, or an index outside [1, 5) at
+      F, d or C.
     """
 
     name: str
@@ -80,20 +110,42 @@ class Glass:
     offset: float = 0.0
 
     def __post_init__(self):
-        if not isinstance(self.name, str) or not 0 < len(self.name) <= LONGEST_NAME or not self.name.isprintable():
-            raise DomainError(f"glass name {_cut(self.name)} must be 1 to {LONGEST_NAME} printable characters.")
+        if (
+            not isinstance(self.name, str)
+            or not 0 < len(self.name) <= LONGEST_NAME
+            or not self.name.isprintable()
+        ):
+            raise DomainError(
+                f"glass name {_cut(self.name)} must be 1 to {LONGEST_NAME} printable characters."
+            )
         if not isinstance(self.source, str) or len(self.source) > LONGEST_SOURCE:
-            raise DomainError(f"glass {self.name}: source {_cut(self.source)} must be a text of at most {LONGEST_SOURCE} characters.")
+            raise DomainError(
+                f"glass {self.name}: source {_cut(self.source)} must be a text of at most {LONGEST_SOURCE} "
+                "characters."
+            )
         if not isinstance(self.model, str) or self.model not in MODELS:
-            raise DomainError(f"glass {self.name}: model {_cut(self.model)} is not known; known models: {', '.join(MODELS)}.")
+            raise DomainError(
+                f"glass {self.name}: model {_cut(self.model)} is not known; known models: "
+                f"{', '.join(MODELS)}."
+            )
         counts = MODELS[self.model][1]
-        coefficients, span = _numbers(self, "coefficients", self.coefficients), _numbers(self, "range_um", self.range_um)
+        coefficients = _numbers(self, "coefficients", self.coefficients)
+        span = _numbers(self, "range_um", self.range_um)
         if len(coefficients) not in counts:
-            raise DomainError(f"glass {self.name}: model {self.model} takes {' or '.join(map(str, counts))} coefficients, {len(coefficients)} were given.")
+            raise DomainError(
+                f"glass {self.name}: model {self.model} takes {' or '.join(map(str, counts))} coefficients, "
+                f"{len(coefficients)} were given."
+            )
         if len(span) != 2 or not 0.1 <= span[0] < span[1] <= 100:
-            raise DomainError(f"glass {self.name}: range_um {span} must be two increasing wavelengths in micrometres, 0.1 to 100.")
+            raise DomainError(
+                f"glass {self.name}: range_um {span} must be two increasing wavelengths in micrometres, 0.1 "
+                "to 100."
+            )
         if self.model == "sellmeier" and any(span[0] ** 2 <= c <= span[1] ** 2 for c in coefficients[1::2]):
-            raise DomainError(f"glass {self.name}: a resonance lies inside {span[0]:g} to {span[1]:g} um, where the index is infinite; give a range on one side of it.")
+            raise DomainError(
+                f"glass {self.name}: a resonance lies inside {span[0]:g} to {span[1]:g} um, where the index "
+                "is infinite; give a range on one side of it."
+            )
         object.__setattr__(self, "coefficients", coefficients)
         object.__setattr__(self, "range_um", span)
         object.__setattr__(self, "offset", _numbers(self, "offset", (self.offset,))[0])
@@ -103,37 +155,51 @@ class Glass:
 
     @staticmethod
     def from_indices(F, d, C, name="custom"):
-        """Glass from its indices at the F, d and C lines, each in [1, 5); exact there, valid from 0.36 to 1.1 um.
+        """Glass from its indices at the F, d and C lines, each in [1, 5); exact there, valid from 0.36 to 1.1
+        um.
 
-        Errors over the catalogue, median and 95th percentile: 2e-5, 1.5e-4 from 0.45 to 0.70 um; 7e-5, 1.4e-4 at 0.85 um.
+        Errors over the catalogue, median and 95th percentile: 2e-5, 1.5e-4 from 0.45 to 0.70 um; 7e-5, 1.4e-4
+          at 0.85 um.
         Source: Conrady's three-term formula. Raises: DomainError.
         """
         if not all(_is_number(n) and LEAST_INDEX <= n < INDEX_LIMIT for n in (F, d, C)):
-            raise DomainError(f"glass {_cut(name)}: indices F={_cut(F)}, d={_cut(d)}, C={_cut(C)} must lie in [1, 5); check the catalogue page.")
+            raise DomainError(
+                f"glass {_cut(name)}: indices F={_cut(F)}, d={_cut(d)}, C={_cut(C)} must lie in [1, 5); "
+                "check the catalogue page."
+            )
         return Glass(name, "lines", (F, d, C))
 
     @staticmethod
     def from_abbe(nd, Vd, name=None):
         """Glass from nd and the Abbe number Vd = (nd - 1) / (nF - nC), which it has exactly.
 
-        The third condition is the partial dispersion (nF - nd) / (nF - nC) = 0.6831 + 0.7828 / Vd, the least-squares line over 429
-        glasses of the catalogue: they scatter about it by 0.0019 (about a line in Vd by 0.0028). Errors over these glasses, median,
-        95th percentile and worst: 1.6e-5, 5e-5, 3.3e-4 at F and C; 6e-5, 1.7e-4, 7e-4 from 0.45 to 0.70 um; 9e-5, 2.8e-4, 6e-4 at
-        g (0.4358 um); 1.1e-4, 3.7e-4, 2.2e-3 at 0.85 um. The normal line P_gF = 0.6438 - 0.001682 Vd in its place has the same medians,
+        The third condition is the partial dispersion (nF - nd) / (nF - nC) = 0.6831 + 0.7828 / Vd, the
+        least-squares line over 429
+        glasses of the catalogue: they scatter about it by 0.0019 (about a line in Vd by 0.0028). Errors over
+          these glasses, median,
+        95th percentile and worst: 1.6e-5, 5e-5, 3.3e-4 at F and C; 6e-5, 1.7e-4, 7e-4 from 0.45 to 0.70 um;
+          9e-5, 2.8e-4, 6e-4 at
+        g (0.4358 um); 1.1e-4, 3.7e-4, 2.2e-3 at 0.85 um. The normal line P_gF = 0.6438 - 0.001682 Vd in its
+        place has the same medians,
         but 3.0e-4 and 1.5e-3 from 0.45 to 0.70 um: dense flints lie far from it.
         Args: nd in (1, 5); Vd from 10 to 150. Raises: DomainError.
         """
         if not (_is_number(nd) and _is_number(Vd) and LEAST_INDEX < nd < INDEX_LIMIT and 10 <= Vd <= 150):
-            raise DomainError(f"glass {'' if name is None else _cut(name) + ': '}nd={_cut(nd)}, Vd={_cut(Vd)}: nd must lie in (1, 5) and Vd in 10 to 150; for a medium without dispersion use Glass.from_indices.")
+            raise DomainError(
+                f"glass {'' if name is None else _cut(name) + ': '}nd={_cut(nd)}, Vd={_cut(Vd)}: nd must "
+                "lie in (1, 5) and Vd in 10 to 150; for a medium without dispersion use Glass.from_indices."
+            )
         spread = (nd - 1) / Vd
         index_F = nd + (0.6831 + 0.7828 / Vd) * spread
         return Glass.from_indices(index_F, nd, index_F - spread, name or f"{nd:.6g}/{Vd:.5g}")
 
     @staticmethod
     def named(name):
-        """Glass by its catalogue name; case, "-", "_", spaces and a manufacturer suffix (NBK7_SCHOTT) do not matter.
+        """Glass by its catalogue name; case, "-", "_", spaces and a manufacturer suffix (NBK7_SCHOTT) do not
+        matter.
 
-        What looks like a code stands for nd and Vd, as in ``from_abbe``: 517642, 517.642, 517642.251, 517000.642000, 1.5168/64.17.
+        What looks like a code stands for nd and Vd, as in ``from_abbe``: 517642, 517.642, 517642.251,
+        517000.642000, 1.5168/64.17.
         Raises: DomainError that offers the three nearest names.
         """
         if not isinstance(name, str) or len(name) > LONGEST_NAME:
@@ -152,28 +218,49 @@ class Glass:
         if glass is None:
             near = difflib.get_close_matches(_key(text), known, n=8, cutoff=0.0)
             offers = ", ".join(list(dict.fromkeys(known[key].name for key in near))[:3])
-            raise DomainError(f"glass {_cut(name)} is not in the catalogue; the nearest names are {offers}; else give Glass.from_indices or Glass.from_abbe.")
+            raise DomainError(
+                f"glass {_cut(name)} is not in the catalogue; the nearest names are {offers}; else give "
+                "Glass.from_indices or Glass.from_abbe."
+            )
         return glass
 
     @staticmethod
     def from_dict(page):
-        """Glass from what ``to_dict`` gave, or from {"name", "F", "d", "C"}; anything else is a DomainError."""
+        """Glass from what ``to_dict`` gave, or from {"name", "F", "d", "C"}; anything else is a
+        DomainError."""
         if not isinstance(page, dict):
-            raise DomainError(f"glass {_cut(page)} must be an object with name, model, coefficients and range_um, or with F, d and C.")
-        needed, free = (("name", "model", "coefficients", "range_um"), ("source", "offset")) if "model" in page else (("F", "d", "C"), ("name",))
+            raise DomainError(
+                f"glass {_cut(page)} must be an object with name, model, coefficients and range_um, or with "
+                "F, d and C."
+            )
+        needed, free = (
+            (("name", "model", "coefficients", "range_um"), ("source", "offset"))
+            if "model" in page
+            else (("F", "d", "C"), ("name",))
+        )
         for key in needed:
             if key not in page:
-                raise DomainError(f"glass {_cut(page.get('name', 'custom'))}: the field '{key}' is missing; it needs {', '.join(needed)}.")
+                raise DomainError(
+                    f"glass {_cut(page.get('name', 'custom'))}: the field '{key}' is missing; it needs "
+                    f"{', '.join(needed)}."
+                )
         for key in page:
             if key not in needed and key not in free:
-                raise DomainError(f"glass {_cut(page.get('name', 'custom'))}: the field {_cut(key)} is not known; it has {', '.join((*needed, *free))}.")
+                raise DomainError(
+                    f"glass {_cut(page.get('name', 'custom'))}: the field {_cut(key)} is not known; it has "
+                    f"{', '.join((*needed, *free))}."
+                )
         return Glass(**page) if "model" in page else Glass.from_indices(**page)
 
     def to_dict(self):
         """Plain JSON types that ``from_dict`` turns into an equal glass, to the last bit."""
         return {
-            "name": self.name, "model": self.model, "coefficients": list(self.coefficients),
-            "range_um": list(self.range_um), "source": self.source, "offset": self.offset,
+            "name": self.name,
+            "model": self.model,
+            "coefficients": list(self.coefficients),
+            "range_um": list(self.range_um),
+            "source": self.source,
+            "offset": self.offset,
         }
 
     def shifted(self, offset):
@@ -181,13 +268,20 @@ class Glass:
         return replace(self, offset=self.offset + offset)
 
     def index(self, wavelength_um):
-        """Index at a wavelength in micrometres. Raises: DomainError outside the range of the glass, or where the model leaves [1, 5)."""
+        """Index at a wavelength in micrometres. Raises: DomainError outside the range of the glass, or where
+        the model leaves [1, 5)."""
         first, last = self.range_um
         if not first <= wavelength_um <= last:
-            raise DomainError(f"glass {self.name}: wavelength {wavelength_um:g} um lies outside {first:g} to {last:g} um, where it is known; give a wavelength in micrometres.")
+            raise DomainError(
+                f"glass {self.name}: wavelength {wavelength_um:g} um lies outside {first:g} to {last:g} um, "
+                "where it is known; give a wavelength in micrometres."
+            )
         value = MODELS[self.model][0](self.coefficients, wavelength_um) + self.offset
         if not LEAST_INDEX <= value < INDEX_LIMIT:
-            raise DomainError(f"glass {self.name}: index {value:.6g} at {wavelength_um:g} um must lie in [1, 5); check coefficients and offset.")
+            raise DomainError(
+                f"glass {self.name}: index {value:.6g} at {wavelength_um:g} um must lie in [1, 5); check "
+                "coefficients and offset."
+            )
         return value
 
     @property
@@ -216,7 +310,10 @@ def names():
 
 @functools.cache
 def _by_key():
-    found = {_key(name): Glass(name, model, coefficients, span, source) for name, model, span, _, coefficients, source in glass_catalogue.rows()}
+    found = {
+        _key(name): Glass(name, model, coefficients, span, source)
+        for name, model, span, _, coefficients, source in glass_catalogue.rows()
+    }
     found |= {_key(alias): found[_key(name)] for alias, name in glass_catalogue.ALIASES.items()}
     return found | {"AIR": AIR}
 
@@ -244,7 +341,9 @@ def _is_number(value):
 
 def _numbers(glass, field, values):
     if not isinstance(values, (tuple, list)) or len(values) > 12 or not all(map(_is_number, values)):
-        raise DomainError(f"glass {glass.name}: {field} {_cut(values)} must be at most 12 finite numbers of at most 1e6.")
+        raise DomainError(
+            f"glass {glass.name}: {field} {_cut(values)} must be at most 12 finite numbers of at most 1e6."
+        )
     return tuple(map(float, values))
 
 

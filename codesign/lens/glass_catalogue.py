@@ -1,16 +1,32 @@
 """Published dispersion coefficients of optical glasses and plastics, one per line.
 
-Each row: name, model (see ``codesign.lens.glass.MODELS``), first and last wavelength (um) of the published range, the nd and Vd
-that the same publication states beside the coefficients (kept to check them), coefficients. A line that starts with # names
-the source of the rows below it. Indices are relative to air at 20 to 25 C, wavelengths in air, as the catalogues state.
-Coefficients are facts of the makers' catalogues; read from the refractiveindex.info database (CC0) and public catalogue files.
+Each row: name, model (see ``codesign.lens.glass.MODELS``), first and last wavelength (um) of the published
+  range, the nd and Vd
+that the same publication states beside the coefficients (kept to check them), coefficients. A line that
+starts with # names
+the source of the rows below it. Indices are relative to air at 20 to 25 C, wavelengths in air, as the
+catalogues state.
+Coefficients are facts of the makers' catalogues; read from the refractiveindex.info database (CC0) and public
+catalogue files.
 """
 
-# other spellings in use -> row; CODE V's manufacturer suffixes and all of "-", "_" and " " are dropped before a name is looked up
+# other spellings in use -> row; CODE V's manufacturer suffixes and all of "-", "_" and " " are dropped before
+# a name is looked up
 ALIASES = {
-    "SILICA": "F-SILICA", "FUSED SILICA": "F-SILICA", "SIO2": "F-SILICA", "HPFS7980": "C79-80", "7980": "C79-80",
-    "AL2O3": "SAPPHIRE", "SSK4": "SSK4A", "E48": "E48R", "ZEONEX E48R": "E48R", "ZEONEX 480R": "480R",
-    "PC": "POLYCARB", "POLYCARBONATE": "POLYCARB", "PS": "POLYSTYR", "POLYSTYRENE": "POLYSTYR",
+    "SILICA": "F-SILICA",
+    "FUSED SILICA": "F-SILICA",
+    "SIO2": "F-SILICA",
+    "HPFS7980": "C79-80",
+    "7980": "C79-80",
+    "AL2O3": "SAPPHIRE",
+    "SSK4": "SSK4A",
+    "E48": "E48R",
+    "ZEONEX E48R": "E48R",
+    "ZEONEX 480R": "480R",
+    "PC": "POLYCARB",
+    "POLYCARBONATE": "POLYCARB",
+    "PS": "POLYSTYR",
+    "POLYSTYRENE": "POLYSTYR",
 }
 
 

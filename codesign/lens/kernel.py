@@ -1,9 +1,13 @@
 """The ray-trace kernel: one fused drjit program for a whole lens.
 
-Intersection with a conic in the form t = F / (G + sqrt(G^2 - A F)), regular at zero curvature (Welford, Aberrations of
-Optical Systems, ch. 4); even aspheres by Newton steps from the conic, the last one differentiable, so that the gradient is
-that of the implicit function; vector forms of Snell's law, reflection and the local grating equation. A ray that fails is frozen
-where it failed: its square roots keep safe inputs, so gradients stay finite, and it carries weight 0, a status and a deficit (how
+Intersection with a conic in the form t = F / (G + sqrt(G^2 - A F)), regular at zero curvature (Welford,
+Aberrations of
+Optical Systems, ch. 4); even aspheres by Newton steps from the conic, the last one differentiable, so that
+the gradient is
+that of the implicit function; vector forms of Snell's law, reflection and the local grating equation. A ray
+that fails is frozen
+where it failed: its square roots keep safe inputs, so gradients stay finite, and it carries weight 0, a
+  status and a deficit (how
 far its radicand fell below zero; 1 where Newton steps found no point of an asphere).
 """
 
@@ -44,7 +48,8 @@ class Works:
 
 @dataclass(frozen=True)
 class Kernel:
-    """The program for one sequence of surfaces. Called with flat drjit arrays: see ``trace.trace`` for what they hold."""
+    """The program for one sequence of surfaces. Called with flat drjit arrays: see ``trace.trace`` for what
+    they hold."""
 
     works: tuple[Works, ...]
     asphere_width: int
@@ -60,23 +65,39 @@ class Kernel:
         import drjit as dr
 
         count = dr.width(origin) // 3
-        c, t, k, n, ratio, per_mm2, reach, terms, *special = (widen(arr, values, dr.width(values), count) for values in prescription)
+        c, t, k, n, ratio, per_mm2, reach, terms, *special = (
+            widen(arr, values, dr.width(values), count) for values in prescription
+        )
         path_terms, decentre, cosines, sines, inner_per_mm2, inner_reach = special or [[]] * 6
-        alive, path, weight, deficit = dr.full(arr.Bool, True, count), arr.Float(0), arr.Float(1), arr.Float(0)
-        o, d = dr.unravel(arr.Array3, origin), dr.unravel(arr.Array3, direction)
-        fate, inside = arr.Int32(-8), dr.full(arr.Bool, True, count)  # 8 x surface + status of the failure
+        alive = dr.full(arr.Bool, True, count)
+        path = arr.Float(0)
+        weight = arr.Float(1)
+        deficit = arr.Float(0)
+        o = dr.unravel(arr.Array3, origin)
+        d = dr.unravel(arr.Array3, direction)
+        # 8 x surface + status of the failure
+        fate = arr.Int32(-8)
+        inside = dr.full(arr.Bool, True, count)
         ahead = d.z > FORWARD
-        start = dr.select(ahead, -o.z / dr.select(ahead, d.z, 1), 0)  # to the first vertex plane: far objects would drown the quadratic in rounding
-        o, path = arr.Array3(o.x + d.x * start, o.y + d.y * start, dr.select(ahead, 0, o.z)), path + n[0] * start
+        start = dr.select(
+            ahead, -o.z / dr.select(ahead, d.z, 1), 0
+        )  # to the first vertex plane: far objects would drown the quadratic in rounding
+        o = arr.Array3(o.x + d.x * start, o.y + d.y * start, dr.select(ahead, 0, o.z))
+        path = path + n[0] * start
         for i, work in enumerate(self.works):
             frame = _Frame(decentre, cosines, sines, i) if work.moved else None
             if frame:
                 o, d = frame.enter(o, d)
-            conic, asphere = k[i] if work.conic else None, terms[i * self.asphere_width :][: work.asphere]
+            conic = k[i] if work.conic else None
+            asphere = terms[i * self.asphere_width :][: work.asphere]
             step, now, lack = _intersect(arr, o, d, c[i], conic, asphere, alive)
-            o, path = o + d * step, path + n[i] * step
+            o = o + d * step
+            path = path + n[i] * step
             r2 = dr.square(o.x) + dr.square(o.y)
-            edges = [reach[i] - per_mm2[i] * r2, *([inner_reach[i] + inner_per_mm2[i] * r2] if work.obstructed else [])]
+            edges = [
+                reach[i] - per_mm2[i] * r2,
+                *([inner_reach[i] + inner_per_mm2[i] * r2] if work.obstructed else []),
+            ]
             for edge in edges:  # 1/2 at the edge itself
                 weight *= _soft_edge(edge)
                 inside &= (edge >= 0.5) | ~now
@@ -88,29 +109,45 @@ class Kernel:
                     d = dr.select(now, d - 2 * dr.dot(d, normal) * normal, d)
                 else:
                     if work.path:
-                        added, gradient = _diffraction(arr, o, r2, path_terms[i * self.path_width :][: work.path])
+                        added, gradient = _diffraction(
+                            arr, o, r2, path_terms[i * self.path_width :][: work.path]
+                        )
                         path = path + dr.select(now, added, 0)
                         d, kept, lost = _diffract(d, normal, gradient, n[i], n[i + 1], now)
                     else:
                         d, kept, lost = _refract(d, normal, ratio[i], now)
-                    here, lack, now = dr.select(now, arr.Int32(8 * i + Status.TOTAL_REFLECTION), here), dr.select(now, lost, lack), kept
+                    here = dr.select(now, arr.Int32(8 * i + Status.TOTAL_REFLECTION), here)
+                    lack = dr.select(now, lost, lack)
+                    now = kept
             fails = alive & ~now
-            fate, deficit, alive = dr.select(fails, here, fate), dr.select(fails, lack, deficit), now
+            fate = dr.select(fails, here, fate)
+            deficit = dr.select(fails, lack, deficit)
+            alive = now
             if frame:
                 o, d = frame.leave(o, d)
             if work.mirror:
-                o, d = arr.Array3(o.x, o.y, -o.z), arr.Array3(d.x, d.y, -d.z)
+                o = arr.Array3(o.x, o.y, -o.z)
+                d = arr.Array3(d.x, d.y, -d.z)
             if self.to_plane or i + 1 < len(self.works):
                 o = arr.Array3(o.x, o.y, o.z - t[i])
         S = len(self.works)
         forward = alive & (d.z > FORWARD)
         fails = alive & ~forward
-        fate, deficit = dr.select(fails, arr.Int32(8 * S + Status.MISS), fate), dr.select(fails, FORWARD - d.z, deficit)
+        fate = dr.select(fails, arr.Int32(8 * S + Status.MISS), fate)
+        deficit = dr.select(fails, FORWARD - d.z, deficit)
         position = o
         if self.to_plane:
             step = dr.select(forward, -o.z / dr.select(forward, d.z, 1), 0)
-            position, path = arr.Array3(o.x + d.x * step, o.y + d.y * step, 0), path + n[S] * step
-        return dr.ravel(position), dr.ravel(d), path, dr.select(forward, weight, 0), dr.select(inside, fate + 4, fate), deficit
+            position = arr.Array3(o.x + d.x * step, o.y + d.y * step, 0)
+            path = path + n[S] * step
+        return (
+            dr.ravel(position),
+            dr.ravel(d),
+            path,
+            dr.select(forward, weight, 0),
+            dr.select(inside, fate + 4, fate),
+            deficit,
+        )
 
 
 @dataclass(frozen=True)
@@ -132,27 +169,42 @@ class _Frame:
         return type(o)(o.x + x, o.y + y, o.z), self._turn_out(d)
 
     def _turn_in(self, v):
-        (ca, cb), (sa, sb) = (values[2 * self.row : 2 * self.row + 2] for values in (self.cosines, self.sines))
-        y, z = v.y * ca + v.z * sa, v.z * ca - v.y * sa
+        (ca, cb), (sa, sb) = (
+            values[2 * self.row : 2 * self.row + 2] for values in (self.cosines, self.sines)
+        )
+        y = v.y * ca + v.z * sa
+        z = v.z * ca - v.y * sa
         return type(v)(v.x * cb - z * sb, y, v.x * sb + z * cb)
 
     def _turn_out(self, v):
-        (ca, cb), (sa, sb) = (values[2 * self.row : 2 * self.row + 2] for values in (self.cosines, self.sines))
-        x, z = v.x * cb + v.z * sb, v.z * cb - v.x * sb
+        (ca, cb), (sa, sb) = (
+            values[2 * self.row : 2 * self.row + 2] for values in (self.cosines, self.sines)
+        )
+        x = v.x * cb + v.z * sb
+        z = v.z * cb - v.x * sb
         return type(v)(x, v.y * ca - z * sa, v.y * sa + z * ca)
 
 
 def _intersect(arr, o, d, c, conic, asphere, alive):
-    """Distance along the ray to the surface, whether it is met, and the lack of the radicand where it is not (elsewhere it means nothing)."""
+    """Distance along the ray to the surface, whether it is met, and the lack of the radicand where it is not
+    (elsewhere it means nothing)."""
     import drjit as dr
 
-    square, along = dr.squared_norm(o), dr.dot(d, o)
+    square = dr.squared_norm(o)
+    along = dr.dot(d, o)
     A = c
     if conic is not None:
-        square, along, A = square + conic * dr.square(o.z), along + conic * d.z * o.z, c * (1 + conic * dr.square(d.z))
-    F, G = c * square - 2 * o.z, d.z - c * along
+        square = square + conic * dr.square(o.z)
+        along = along + conic * d.z * o.z
+        A = c * (1 + conic * dr.square(d.z))
+    F = c * square - 2 * o.z
+    G = d.z - c * along
     radicand = G * G - A * F
-    near = G > 0  # else the ray starts behind the centre, as in a ball lens: the other form of the same root, without cancellation
+    near = (
+        G > 0
+        # else the ray starts behind the centre, as in a ball lens: the other form of the same root, without
+        # cancellation
+    )
     hit = alive & (radicand > GRAZING) & (near | (dr.abs(A) > FLAT))
     root = dr.sqrt(dr.select(hit, radicand, 1))
     step = dr.select(near, F, G - root) / dr.select(hit, dr.select(near, G + root, A), 1)
@@ -164,13 +216,21 @@ def _intersect(arr, o, d, c, conic, asphere, alive):
         return step, hit, lack
     start = dr.select(hit, dr.detach(step), dr.detach(-o.z / dr.select(dr.abs(d.z) > 1e-6, d.z, 1)))
     with dr.suspend_grad():
-        t, od, dd = start, dr.detach(o), dr.detach(d)
+        t = start
+        od = dr.detach(o)
+        dd = dr.detach(d)
         for _ in range(NEWTON_STEPS):
             value, slope, _ = _implicit(arr, od + dd * t, dd, c, conic, asphere)
             t -= value / dr.select(dr.abs(slope) > GRAZING, slope, 1)
         value, slope, inside = _implicit(arr, od + dd * t, dd, c, conic, asphere)
-        hit = alive & inside & (slope > GRAZING) & (dr.abs(value) < (1e-10 if dr.type_v(arr.Float) == dr.VarType.Float64 else 1e-4))
-        t, slope = dr.select(hit, t, 0), dr.select(hit, slope, 1)
+        hit = (
+            alive
+            & inside
+            & (slope > GRAZING)
+            & (dr.abs(value) < (1e-10 if dr.type_v(arr.Float) == dr.VarType.Float64 else 1e-4))
+        )
+        t = dr.select(hit, t, 0)
+        slope = dr.select(hit, slope, 1)
     lack = dr.select(lack > 0, lack, 1)  # the conic is met but no point of the asphere was found
     value, _, _ = _implicit(arr, dr.select(hit, o + d * t, 0), d, c, conic, asphere)
     return dr.select(hit, t - value / slope, 0), hit, lack
@@ -184,11 +244,15 @@ def _implicit(arr, p, d, c, conic, asphere):
     q = 1 - (c * c * r2 if conic is None else (1 + conic) * c * c * r2)
     inside = q > GRAZING
     root = dr.sqrt(dr.select(inside, q, 1))
-    sag, slope = c * r2 / (1 + root), c / (2 * root)
-    power, factor = r2, arr.Float(1)
+    sag = c * r2 / (1 + root)
+    slope = c / (2 * root)
+    power = r2
+    factor = arr.Float(1)
     for i, a in enumerate(asphere):
-        sag, slope = sag + a * power, slope + (i + 1) * a * factor
-        power, factor = power * r2, factor * r2
+        sag = sag + a * power
+        slope = slope + (i + 1) * a * factor
+        power = power * r2
+        factor = factor * r2
     return p.z - sag, d.z - 2 * slope * (p.x * d.x + p.y * d.y), inside
 
 
@@ -204,9 +268,11 @@ def _normal(o, c, conic, asphere):
     else:
         r2 = dr.square(o.x) + dr.square(o.y)
         q = 1 - (c * c * r2 if conic is None else (1 + conic) * c * c * r2)
-        slope, factor = c / (2 * dr.sqrt(dr.select(q > GRAZING, q, 1))), type(r2)(1)
+        slope = c / (2 * dr.sqrt(dr.select(q > GRAZING, q, 1)))
+        factor = type(r2)(1)
         for i, a in enumerate(asphere):
-            slope, factor = slope + (i + 1) * a * factor, factor * r2
+            slope = slope + (i + 1) * a * factor
+            factor = factor * r2
         normal = kind(-2 * slope * o.x, -2 * slope * o.y, 1)
     return normal / dr.sqrt(dr.maximum(dr.squared_norm(normal), 1e-12))
 
@@ -220,7 +286,8 @@ def _soft_edge(x):
 
 
 def _refract(d, normal, ratio, alive):
-    """Direction after the surface, whether light passes, and the lack of the radicand where it is totally reflected."""
+    """Direction after the surface, whether light passes, and the lack of the radicand where it is totally
+    reflected."""
     import drjit as dr
 
     cosine = dr.dot(d, normal)
@@ -232,7 +299,9 @@ def _refract(d, normal, ratio, alive):
 
 def _diffraction(arr, o, r2, terms):
     """Optical path that a phase adds at a point, and its gradient across the axis."""
-    path, slope, power = arr.Float(0), arr.Float(0), arr.Float(1)
+    path = arr.Float(0)
+    slope = arr.Float(0)
+    power = arr.Float(1)
     for i, a in enumerate(terms):
         slope = slope + 2 * (i + 1) * a * power
         power = power * r2
@@ -241,7 +310,8 @@ def _diffraction(arr, o, r2, terms):
 
 
 def _diffract(d, normal, gradient, before, after, alive):
-    """Local grating equation: the tangential part of n d gains the tangential gradient of the added path. Returns as ``_refract``."""
+    """Local grating equation: the tangential part of n d gains the tangential gradient of the added path.
+    Returns as ``_refract``."""
     import drjit as dr
 
     across = before * d + gradient

@@ -1,4 +1,5 @@
-"""First-order optics by the y-u trace, differentiable. Surfaces enter by their power, so the r^2 asphere term, mirrors and diffraction count."""
+"""First-order optics by the y-u trace, differentiable. Surfaces enter by their power, so the r^2 asphere
+term, mirrors and diffraction count."""
 
 import math
 from dataclasses import dataclass
@@ -30,7 +31,8 @@ class FirstOrder:
 
 
 def bending(index, mirrors):
-    """Change of surface power per vertex curvature, [S]: n' - n where light passes, -2 n where it is reflected (unfolded axis).
+    """Change of surface power per vertex curvature, [S]: n' - n where light passes, -2 n where it is
+    reflected (unfolded axis).
 
     Args: index [S + 1]; mirrors: S booleans.
     """
@@ -46,7 +48,8 @@ def yu_trace(power, thickness_mm, index, y, nu, first=0, last=None):
     Returns: lists of y and nu per surface.
     """
     last = power.numel() if last is None else last
-    heights, angles = [], []
+    heights = []
+    angles = []
     for i in range(first, last):
         nu = nu - y * power[i]
         heights.append(y)
@@ -56,44 +59,65 @@ def yu_trace(power, thickness_mm, index, y, nu, first=0, last=None):
 
 
 def first_order(power, thickness_mm, index, stop, entrance_pupil_diameter_mm):
-    """First-order figures. Gradient: to every tensor. Raises: DomainError for an afocal lens or a stop that no ray images.
+    """First-order figures. Gradient: to every tensor. Raises: DomainError for an afocal lens or a stop that
+    no ray images.
 
     Source: Smith, Modern Optical Engineering, ch. 2 and 9.
     """
-    one, zero = torch.ones_like(power[0]), torch.zeros_like(power[0])
+    one = torch.ones_like(power[0])
+    zero = torch.zeros_like(power[0])
     heights, angles = yu_trace(power, thickness_mm, index, one, zero)
     total = -angles[-1]
     if abs(float(total.detach())) < 1e-12:
-        raise DomainError("the lens is afocal (its power is zero), so it has no focal length; change a curvature.")
-    efl, bfl = index[-1] / total, index[-1] * heights[-1] / total
+        raise DomainError(
+            "the lens is afocal (its power is zero), so it has no focal length; change a curvature."
+        )
+    efl = index[-1] / total
+    bfl = index[-1] * heights[-1] / total
     # from the stop centre backwards to the object side: y and nu at the stop, undone surface by surface
-    y, nu = zero, one
+    y = zero
+    nu = one
     for i in range(stop - 1, -1, -1):
         y = y - thickness_mm[i] * nu / index[i + 1]
         nu = nu + y * power[i]
     entrance_z = -y * index[0] / nu
-    semi_stop = entrance_pupil_diameter_mm / 2 * nu.abs()  # magnification of a pupil: reduced angle at the stop over reduced angle outside
+    semi_stop = (
+        entrance_pupil_diameter_mm / 2 * nu.abs()
+    )  # magnification of a pupil: reduced angle at the stop over reduced angle outside
     heights, angles = yu_trace(power, thickness_mm, index, zero, one, first=stop)
-    y, nu = heights[-1], angles[-1]
-    exit_z, exit_diameter = -y * index[-1] / nu, 2 * semi_stop / nu.abs()
+    y = heights[-1]
+    nu = angles[-1]
+    exit_z = -y * index[-1] / nu
+    exit_diameter = 2 * semi_stop / nu.abs()
     diameter = torch.as_tensor(entrance_pupil_diameter_mm, dtype=one.dtype, device=one.device) * one
     return FirstOrder(efl, bfl, efl / diameter, entrance_z, diameter, exit_z, exit_diameter, semi_stop)
 
 
 def system_matrix(lens, wavelength_um=WAVELENGTH_UM["d"]):
-    """Matrix [[A, B], [C, D]] from the plane of the first vertex to that of the last, for columns (y in mm, n u). Its determinant is 1.
+    """Matrix [[A, B], [C, D]] from the plane of the first vertex to that of the last, for columns (y in mm, n
+    u). Its determinant is 1.
 
-    C is minus the power per mm. Gradient: to every lens tensor that bends or moves light. Source: Gerrard and Burch, Matrix Methods in Optics, ch. 2.
+    C is minus the power per mm. Gradient: to every lens tensor that bends or moves light. Source: Gerrard and
+      Burch, Matrix Methods in Optics, ch. 2.
     """
-    power, thickness_mm, index = lens.surface_power(wavelength_um), lens.thickness_mm, lens.index(wavelength_um)
-    one, zero = torch.ones_like(power[0]), torch.zeros_like(power[0])
-    columns = [(heights[-1], angles[-1]) for heights, angles in (yu_trace(power, thickness_mm, index, *start) for start in ((one, zero), (zero, one)))]
+    power = lens.surface_power(wavelength_um)
+    thickness_mm = lens.thickness_mm
+    index = lens.index(wavelength_um)
+    one = torch.ones_like(power[0])
+    zero = torch.zeros_like(power[0])
+    columns = [
+        (heights[-1], angles[-1])
+        for heights, angles in (
+            yu_trace(power, thickness_mm, index, *start) for start in ((one, zero), (zero, one))
+        )
+    ]
     return torch.stack([torch.stack([column[i] for column in columns]) for i in (0, 1)])
 
 
 @dataclass(frozen=True)
 class CardinalPoints:
-    """Positions on the axis, scalar tensors in mm: those of object space from the first vertex, those of image space from the last vertex, positive along +z."""
+    """Positions on the axis, scalar tensors in mm: those of object space from the first vertex, those of
+    image space from the last vertex, positive along +z."""
 
     front_focal_z_mm: Tensor
     front_principal_z_mm: Tensor
@@ -106,25 +130,43 @@ class CardinalPoints:
 
 
 def cardinal_points(lens, wavelength_um=WAVELENGTH_UM["d"]):
-    """CardinalPoints of a lens. Focal lengths are n / power and n' / power, both positive for a converging lens.
+    """CardinalPoints of a lens. Focal lengths are n / power and n' / power, both positive for a converging
+    lens.
 
-    Gradient: to every lens tensor that bends or moves light. Raises: DomainError for an afocal lens. Source: Gerrard and Burch, ch. 2.
+    Gradient: to every lens tensor that bends or moves light. Raises: DomainError for an afocal lens. Source:
+      Gerrard and Burch, ch. 2.
     """
     (A, _), (C, D) = system_matrix(lens, wavelength_um)
     index = lens.index(wavelength_um)
     if abs(float(C.detach())) < 1e-12:
-        raise DomainError(f"{lens.name}: the lens is afocal (its power is zero), so it has no cardinal points; change a curvature.")
-    front, rear = -index[0] / C, -index[-1] / C
+        raise DomainError(
+            f"{lens.name}: the lens is afocal (its power is zero), so it has no cardinal points; change a "
+            "curvature."
+        )
+    front = -index[0] / C
+    rear = -index[-1] / C
     shift = rear - front  # from a principal point to the nodal point of the same space
-    return CardinalPoints(-front * D, front * (1 - D), front * (1 - D) + shift, rear * A, rear * (A - 1), rear * (A - 1) + shift, front, rear)
+    return CardinalPoints(
+        -front * D,
+        front * (1 - D),
+        front * (1 - D) + shift,
+        rear * A,
+        rear * (A - 1),
+        rear * (A - 1) + shift,
+        front,
+        rear,
+    )
 
 
 @dataclass(frozen=True)
 class ParaxialRays:
-    """The marginal ray (from the axial object point to the rim of the pupil) and the chief ray (from the rim of the field through the centre of the stop).
+    """The marginal ray (from the axial object point to the rim of the pupil) and the chief ray (from the rim
+    of the field through the centre of the stop).
 
-    marginal_height_mm, chief_height_mm: [S] on each surface. marginal_angle, chief_angle: [S + 1] slopes before the first surface
-    and behind each surface. invariant_mm: scalar n (chief slope x marginal height - marginal slope x chief height), the same everywhere.
+    marginal_height_mm, chief_height_mm: [S] on each surface. marginal_angle, chief_angle: [S + 1] slopes
+      before the first surface
+    and behind each surface. invariant_mm: scalar n (chief slope x marginal height - marginal slope x chief
+      height), the same everywhere.
     """
 
     marginal_height_mm: Tensor
@@ -137,30 +179,53 @@ class ParaxialRays:
 def paraxial_rays(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"]):
     """ParaxialRays for an object at infinity.
 
-    Args: field_rad: half field, whose tangent is the slope of the chief ray in object space; a number below 90 degrees.
-    Gradient: to every lens tensor that bends or moves light. Raises: DomainError for a field of 90 degrees and more, or an entrance pupil at infinity.
+    Args: field_rad: half field, whose tangent is the slope of the chief ray in object space; a number below
+      90 degrees.
+    Gradient: to every lens tensor that bends or moves light. Raises: DomainError for a field of 90 degrees
+      and more, or an entrance pupil at infinity.
     """
     if not abs(field_rad) < math.pi / 2:
-        raise DomainError(f"{lens.name}: a paraxial chief ray at {math.degrees(field_rad):.4g} degrees has no slope; give a field below 90 degrees.")
+        raise DomainError(
+            f"{lens.name}: a paraxial chief ray at {math.degrees(field_rad):.4g} degrees has no slope; give "
+            "a field below 90 degrees."
+        )
     f = lens.first_order(wavelength_um)
     if not math.isfinite(float(f.entrance_pupil_z_mm.detach())):
-        raise DomainError(f"{lens.name}: the entrance pupil lies at infinity, so no chief ray comes from an object at infinity; move the stop.")
-    power, thickness_mm, index = lens.surface_power(wavelength_um), lens.thickness_mm, lens.index(wavelength_um)
+        raise DomainError(
+            f"{lens.name}: the entrance pupil lies at infinity, so no chief ray comes from an object at "
+            "infinity; move the stop."
+        )
+    power = lens.surface_power(wavelength_um)
+    thickness_mm = lens.thickness_mm
+    index = lens.index(wavelength_um)
     slope = torch.full_like(power[0], math.tan(field_rad))
-    starts = ((f.entrance_pupil_diameter_mm / 2, torch.zeros_like(slope)), (-slope * f.entrance_pupil_z_mm, slope * index[0]))
-    (y, nu), (y_bar, nu_bar) = (tuple(map(torch.stack, yu_trace(power, thickness_mm, index, *start))) for start in starts)
-    angles, chief_angles = torch.cat([starts[0][1].reshape(1), nu]) / index, torch.cat([starts[1][1].reshape(1), nu_bar]) / index
+    starts = (
+        (f.entrance_pupil_diameter_mm / 2, torch.zeros_like(slope)),
+        (-slope * f.entrance_pupil_z_mm, slope * index[0]),
+    )
+    (y, nu), (y_bar, nu_bar) = (
+        tuple(map(torch.stack, yu_trace(power, thickness_mm, index, *start))) for start in starts
+    )
+    angles = torch.cat([starts[0][1].reshape(1), nu]) / index
+    chief_angles = torch.cat([starts[1][1].reshape(1), nu_bar]) / index
     return ParaxialRays(y, angles, y_bar, chief_angles, starts[1][1] * starts[0][0])
 
 
 def circle_of_confusion_mm(thin, distance_m):
-    """Diameter on the film of the blur of an axial object point, D |s (1/f - 1/d) - 1| for pupil D, film distance s and object distance d from the lens.
+    """Diameter on the film of the blur of an axial object point, D |s (1/f - 1/d) - 1| for pupil D, film
+    distance s and object distance d from the lens.
 
-    Args: thin: ThinLens, or what ``GeoLens.thin`` returns. distance_m: > 0, metres; number or tensor of any shape, inf is allowed.
+    Args: thin: ThinLens, or what ``GeoLens.thin`` returns. distance_m: > 0, metres; number or tensor of any
+      shape, inf is allowed.
     Returns: mm, shape of the distance. Gradient: to focal length, film distance and object distance.
     Raises: DomainError for a distance that is not positive.
     """
     distance_m = torch.as_tensor(distance_m, dtype=thin.dtype, device=thin.efl_mm.device)
     if not bool((distance_m > 0).all()):
-        raise DomainError(f"object distances must be positive (metres before the lens), got {distance_m.tolist()}.")
-    return thin.entrance_pupil_diameter_mm * (thin.image_distance_mm * (1 / thin.efl_mm - 1 / (distance_m * 1e3)) - 1).abs()
+        raise DomainError(
+            f"object distances must be positive (metres before the lens), got {distance_m.tolist()}."
+        )
+    return (
+        thin.entrance_pupil_diameter_mm
+        * (thin.image_distance_mm * (1 / thin.efl_mm - 1 / (distance_m * 1e3)) - 1).abs()
+    )

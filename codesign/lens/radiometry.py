@@ -15,12 +15,18 @@ def relative_illumination(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"], gr
     Returns: [fields]. For an ideal lens of small aperture without distortion it is cos^4 of the field angle.
     Gradient: to every lens tensor.
     Raises: DomainError for a field that no ray passes.
-    Source: E = integral of radiance over image-space direction cosines (Slyusarev; Rimmer, Relative illumination calculations, Proc. SPIE 655, 1986).
+    Source: E = integral of radiance over image-space direction cosines (Slyusarev; Rimmer, Relative
+      illumination calculations, Proc. SPIE 655, 1986).
     """
-    pupil, fields = pupil_grid(grid), [0.0, *map(float, fields_rad)]
+    pupil = pupil_grid(grid)
+    fields = [0.0, *map(float, fields_rad)]
     heights = [_image_height(lens, field, wavelength_um) for field in fields]
-    film = torch.stack([torch.zeros_like(torch.stack(heights)), torch.stack(heights)], 1).repeat_interleave(pupil.shape[0], 0)
-    rays = lens.camera_rays(-film, pupil.repeat(len(fields), 1), wavelength_um, aim=True)  # camera rays take points as seen upright
+    film = torch.stack([torch.zeros_like(torch.stack(heights)), torch.stack(heights)], 1).repeat_interleave(
+        pupil.shape[0], 0
+    )
+    rays = lens.camera_rays(
+        -film, pupil.repeat(len(fields), 1), wavelength_um, aim=True
+    )  # camera rays take points as seen upright
     light = (rays.weight * rays.irradiance).reshape(len(fields), -1).mean(1)
     return light[1:] / light[0]
 
@@ -30,5 +36,8 @@ def _image_height(lens, field_rad, wavelength_um):
     origin, direction = aimed_rays(lens, field_rad, torch.zeros(1, 2, dtype=lens.dtype), wavelength_um)
     out = lens.trace(origin, direction, wavelength_um)
     if out.status[0] != 0:
-        raise DomainError(f"{lens.name}: the chief ray of field {field_rad * 57.29578:.4g} degrees does not pass the lens; use a smaller field.")
+        raise DomainError(
+            f"{lens.name}: the chief ray of field {field_rad * 57.29578:.4g} degrees does not pass the "
+            "lens; use a smaller field."
+        )
     return out.position_mm[0, 1]

@@ -9,23 +9,122 @@ from codesign.errors import DomainError, ShapeError
 
 # Fraunhofer's letters, wavelengths in air. Source: ISO 7944 and Schott TIE-29
 LINE_UM = {
-    "i": 0.365014, "h": 0.4046561, "g": 0.4358343, "F'": 0.4799914, "F": 0.4861327, "e": 0.5460740, "d": 0.5875618, "D": 0.5892938,
-    "C'": 0.6438469, "C": 0.6562725, "r": 0.7065188, "s": 0.85211, "t": 1.01398,
+    "i": 0.365014,
+    "h": 0.4046561,
+    "g": 0.4358343,
+    "F'": 0.4799914,
+    "F": 0.4861327,
+    "e": 0.5460740,
+    "d": 0.5875618,
+    "D": 0.5892938,
+    "C'": 0.6438469,
+    "C": 0.6562725,
+    "r": 0.7065188,
+    "s": 0.85211,
+    "t": 1.01398,
 }
 MOST_WAVELENGTHS = 1000
 SECOND_RADIATION_UM_K = 14387.768775  # h c / k, exact in the SI of 2019
 
-# CIE standard illuminant D65, 300 to 830 nm in steps of 10 nm, linear between them by definition. Source: CIE S 014-2 / ISO 11664-2
+# CIE standard illuminant D65, 300 to 830 nm in steps of 10 nm, linear between them by definition. Source: CIE
+# S 014-2 / ISO 11664-2
 _D65 = (
-    0.0341, 3.2945, 20.236, 37.0535, 39.9488, 44.9117, 46.6383, 52.0891, 49.9755, 54.6482, 82.7549, 91.486, 93.4318, 86.6823, 104.865, 117.008, 117.812, 114.861,
-    115.923, 108.811, 109.354, 107.802, 104.79, 107.689, 104.405, 104.046, 100.0, 96.3342, 95.788, 88.6856, 90.0062, 89.5991, 87.6987, 83.2886, 83.6992, 80.0268,
-    80.2146, 82.2778, 78.2842, 69.7213, 71.6091, 74.349, 61.604, 69.8856, 75.087, 63.5927, 46.4182, 66.8054, 63.3828, 64.304, 59.4519, 51.959, 57.4406, 60.3125,
+    0.0341,
+    3.2945,
+    20.236,
+    37.0535,
+    39.9488,
+    44.9117,
+    46.6383,
+    52.0891,
+    49.9755,
+    54.6482,
+    82.7549,
+    91.486,
+    93.4318,
+    86.6823,
+    104.865,
+    117.008,
+    117.812,
+    114.861,
+    115.923,
+    108.811,
+    109.354,
+    107.802,
+    104.79,
+    107.689,
+    104.405,
+    104.046,
+    100.0,
+    96.3342,
+    95.788,
+    88.6856,
+    90.0062,
+    89.5991,
+    87.6987,
+    83.2886,
+    83.6992,
+    80.0268,
+    80.2146,
+    82.2778,
+    78.2842,
+    69.7213,
+    71.6091,
+    74.349,
+    61.604,
+    69.8856,
+    75.087,
+    63.5927,
+    46.4182,
+    66.8054,
+    63.3828,
+    64.304,
+    59.4519,
+    51.959,
+    57.4406,
+    60.3125,
 )
-# extinction coefficient of silicon at 300 K, 360 to 1100 nm in steps of 20 nm. Source: Green, Sol. Energ. Mat. Sol. Cells 92, 1305 (2008)
+# extinction coefficient of silicon at 300 K, 360 to 1100 nm in steps of 20 nm. Source: Green, Sol. Energ.
+# Mat. Sol. Cells 92, 1305 (2008)
 _SILICON_K = (
-    2.966, 0.946, 0.296, 0.176, 0.107, 0.071381, 0.055004, 0.044165, 0.036415, 0.030295, 0.025758, 0.022524, 0.019934, 0.017367, 0.015432, 0.013498, 0.011905,
-    0.010528, 0.0096257, 0.008362, 0.007197, 0.0063933, 0.0054113, 0.0046134, 0.0039439, 0.0032781, 0.0026821, 0.0021701, 0.0017571, 0.0013689, 0.0010237,
-    0.00074866, 0.0005093, 0.00032386, 0.00018704, 9.3631e-05, 5.3285e-05, 3.0637e-05,
+    2.966,
+    0.946,
+    0.296,
+    0.176,
+    0.107,
+    0.071381,
+    0.055004,
+    0.044165,
+    0.036415,
+    0.030295,
+    0.025758,
+    0.022524,
+    0.019934,
+    0.017367,
+    0.015432,
+    0.013498,
+    0.011905,
+    0.010528,
+    0.0096257,
+    0.008362,
+    0.007197,
+    0.0063933,
+    0.0054113,
+    0.0046134,
+    0.0039439,
+    0.0032781,
+    0.0026821,
+    0.0021701,
+    0.0017571,
+    0.0013689,
+    0.0010237,
+    0.00074866,
+    0.0005093,
+    0.00032386,
+    0.00018704,
+    9.3631e-05,
+    5.3285e-05,
+    3.0637e-05,
 )
 
 
@@ -40,14 +139,24 @@ class Spectrum:
     weights: tuple
 
     def __post_init__(self):
-        wavelengths, weights = _floats(self.wavelengths_um), _floats(self.weights)
+        wavelengths = _floats(self.wavelengths_um)
+        weights = _floats(self.weights)
         if len(wavelengths) != len(weights) or not 0 < len(wavelengths) <= MOST_WAVELENGTHS:
-            raise ShapeError(f"a spectrum has 1 to {MOST_WAVELENGTHS} wavelengths and one weight each; {len(wavelengths)} wavelengths and {len(weights)} weights were given.")
+            raise ShapeError(
+                f"a spectrum has 1 to {MOST_WAVELENGTHS} wavelengths and one weight each; "
+                f"{len(wavelengths)} wavelengths and {len(weights)} weights were given."
+            )
         for wavelength_um in wavelengths:
             if not 0.1 <= wavelength_um <= 100:
-                raise DomainError(f"wavelength {wavelength_um:g} um lies outside 0.1 to 100 um; give wavelengths in micrometres.")
+                raise DomainError(
+                    f"wavelength {wavelength_um:g} um lies outside 0.1 to 100 um; give wavelengths in "
+                    "micrometres."
+                )
         if not (min(weights) >= 0 and abs(math.fsum(weights) - 1) <= 1e-9):
-            raise DomainError(f"weights of a spectrum must be at least 0 and sum to 1; they sum to {math.fsum(weights):.6g}. Spectrum.weighted divides by their sum.")
+            raise DomainError(
+                "weights of a spectrum must be at least 0 and sum to 1; they sum to "
+                f"{math.fsum(weights):.6g}. Spectrum.weighted divides by their sum."
+            )
         object.__setattr__(self, "wavelengths_um", wavelengths)
         object.__setattr__(self, "weights", weights)
 
@@ -57,7 +166,9 @@ class Spectrum:
         weights = _floats(weights)
         total = math.fsum(weights) if all(map(math.isfinite, weights)) else math.nan
         if not 0 < total < math.inf:
-            raise DomainError(f"weights of a spectrum must be finite, at least 0 and not all 0; their sum is {total:g}.")
+            raise DomainError(
+                f"weights of a spectrum must be finite, at least 0 and not all 0; their sum is {total:g}."
+            )
         return Spectrum(wavelengths_um, tuple(w / total for w in weights))
 
     @staticmethod
@@ -69,65 +180,85 @@ class Spectrum:
     def line(letter):
         """One spectral line by its letter (``LINE_UM``)."""
         if letter not in LINE_UM:
-            raise DomainError(f"spectral line {str(letter)[:20]!r} is not known; known lines: {', '.join(LINE_UM)}.")
+            raise DomainError(
+                f"spectral line {str(letter)[:20]!r} is not known; known lines: {', '.join(LINE_UM)}."
+            )
         return Spectrum.monochromatic(LINE_UM[letter])
 
     @staticmethod
     def visible_FdC(weights=(1.0, 1.0, 1.0)):
-        """The F, d and C lines, the classical visible spectrum of lens design, equally weighted unless ``weights`` says otherwise."""
+        """The F, d and C lines, the classical visible spectrum of lens design, equally weighted unless
+        ``weights`` says otherwise."""
         return Spectrum.weighted(tuple(LINE_UM[letter] for letter in "FdC"), weights)
 
     @staticmethod
     def from_curves(response, illuminant, count):
         """``count`` wavelengths of equal weight for what a sensor sees of an illuminant.
 
-        The product of the curves (linear between their points, over the range they share) is cut into ``count`` strata of equal
-        signal; each is represented by its signal-weighted mean wavelength, so the mean wavelength of the whole is exact.
-        Args: response, illuminant: pairs (wavelength_um [N], value [N]), increasing wavelengths, values >= 0 of any scale; the
+        The product of the curves (linear between their points, over the range they share) is cut into
+        ``count`` strata of equal
+        signal; each is represented by its signal-weighted mean wavelength, so the mean wavelength of the
+        whole is exact.
+        Args: response, illuminant: pairs (wavelength_um [N], value [N]), increasing wavelengths, values >= 0
+          of any scale; the
         response per unit of radiant energy (A/W) when the illuminant is in energy. count: 1 to 1000.
         Raises: ShapeError, DomainError.
         """
         if isinstance(count, bool) or not isinstance(count, int) or not 0 < count <= MOST_WAVELENGTHS:
             raise DomainError(f"count {str(count)[:20]} must be a whole number from 1 to {MOST_WAVELENGTHS}.")
         (w1, v1), (w2, v2) = _curve(response, "response"), _curve(illuminant, "illuminant")
-        first, last = max(w1[0], w2[0]), min(w1[-1], w2[-1])
+        first = max(w1[0], w2[0])
+        last = min(w1[-1], w2[-1])
         if not first < last:
-            raise DomainError(f"response ({w1[0]:g} to {w1[-1]:g} um) and illuminant ({w2[0]:g} to {w2[-1]:g} um) share no wavelengths.")
+            raise DomainError(
+                f"response ({w1[0]:g} to {w1[-1]:g} um) and illuminant ({w2[0]:g} to {w2[-1]:g} um) share "
+                "no wavelengths."
+            )
         knots = np.union1d(w1, w2)
         knots = knots[(knots >= first) & (knots <= last)]
         # values are scaled so that tiny or huge units neither vanish nor overflow in the product
         segments = _Segments(knots, np.interp(knots, w1, v1 / v1.max()), np.interp(knots, w2, v2 / v2.max()))
         if not segments.energy[-1] > 0:
-            raise DomainError(f"response times illuminant is zero everywhere from {first:g} to {last:g} um; give curves that overlap.")
+            raise DomainError(
+                f"response times illuminant is zero everywhere from {first:g} to {last:g} um; give curves "
+                "that overlap."
+            )
         bounds = [segments.at(segments.energy[-1] * k / count) for k in range(count + 1)]
         energy, moment = np.diff(np.array(bounds), axis=0).T
         return Spectrum(tuple((moment / energy).tolist()), (1.0 / count,) * count)
 
 
 class _Segments:
-    """Running integrals of a product of two piecewise linear curves, and of wavelength times it: exact polynomials per segment."""
+    """Running integrals of a product of two piecewise linear curves, and of wavelength times it: exact
+    polynomials per segment."""
 
     def __init__(self, knots, a, b):
-        self.start, self.width = knots[:-1], np.diff(knots)
-        da, db = np.diff(a), np.diff(b)
+        self.start = knots[:-1]
+        self.width = np.diff(knots)
+        da = np.diff(a)
+        db = np.diff(b)
         self.terms = np.stack([a[:-1] * b[:-1], a[:-1] * db + da * b[:-1], da * db], axis=1)
         energy, moment = zip(*(self._upto(i, 1.0) for i in range(len(da))), strict=True)
         self.energy, self.moment = (np.concatenate([[0.0], np.cumsum(x)]) for x in (energy, moment))
 
     def _upto(self, i, t):
         """Energy and first moment of segment i from its start to the fraction t."""
-        p, h = self.terms[i], self.width[i]
+        p = self.terms[i]
+        h = self.width[i]
         energy = h * (p[0] * t + p[1] * t**2 / 2 + p[2] * t**3 / 3)
         return energy, self.start[i] * energy + h * h * (p[0] * t**2 / 2 + p[1] * t**3 / 3 + p[2] * t**4 / 4)
 
     def at(self, energy):
         """Energy and moment below the wavelength at which the running energy reaches ``energy``."""
         i = min(max(int(np.searchsorted(self.energy, energy)) - 1, 0), len(self.width) - 1)
-        low, high = 0.0, 1.0
+        low = 0.0
+        high = 1.0
         # bisection to the last bit: the energy within a segment never falls
         for _ in range(60):
             middle = (low + high) / 2
-            low, high = (middle, high) if self.energy[i] + self._upto(i, middle)[0] < energy else (low, middle)
+            low, high = (
+                (middle, high) if self.energy[i] + self._upto(i, middle)[0] < energy else (low, middle)
+            )
         inside = self._upto(i, high)
         return self.energy[i] + inside[0], self.moment[i] + inside[1]
 
@@ -136,16 +267,23 @@ def _floats(values):
     try:
         return tuple(map(float, values))
     except (TypeError, ValueError, OverflowError) as error:
-        raise ShapeError(f"wavelengths and weights of a spectrum must be sequences of numbers ({str(error)[:80]}).") from error
+        raise ShapeError(
+            f"wavelengths and weights of a spectrum must be sequences of numbers ({str(error)[:80]})."
+        ) from error
 
 
 def _curve(curve, name):
     try:
         wavelength_um, value = (np.asarray(x, dtype=np.float64) for x in curve)
     except (TypeError, ValueError, OverflowError) as error:
-        raise ShapeError(f"{name} must be a pair (wavelength_um [N], value [N]) of numbers ({str(error)[:80]}).") from error
+        raise ShapeError(
+            f"{name} must be a pair (wavelength_um [N], value [N]) of numbers ({str(error)[:80]})."
+        ) from error
     if wavelength_um.ndim != 1 or wavelength_um.shape != value.shape or not 2 <= len(value) <= 10_000:
-        raise ShapeError(f"{name} must be a pair (wavelength_um [N], value [N]) with 2 <= N <= 10000, got {wavelength_um.shape} and {value.shape}.")
+        raise ShapeError(
+            f"{name} must be a pair (wavelength_um [N], value [N]) with 2 <= N <= 10000, got "
+            f"{wavelength_um.shape} and {value.shape}."
+        )
     if not (np.diff(wavelength_um) > 0).all() or not (wavelength_um[0] >= 0.1 and wavelength_um[-1] <= 100):
         raise DomainError(f"{name}: wavelengths must increase and lie in 0.1 to 100; give micrometres.")
     if not (value >= 0).all() or not 0 < value.max() < math.inf:
@@ -154,32 +292,42 @@ def _curve(curve, name):
 
 
 def blackbody(temperature_k):
-    """Planck's radiance per wavelength, 0.30 to 1.20 um in steps of 5 nm, largest value 1: (wavelength_um, value).
+    """Planck's radiance per wavelength, 0.30 to 1.20 um in steps of 5 nm, largest value 1: (wavelength_um,
+    value).
 
     Args: temperature_k from 500 to 100000. Raises: DomainError.
     """
     if not 500 <= temperature_k <= 100_000:
-        raise DomainError(f"temperature {temperature_k:g} K must lie in 500 to 100000 K; daylight has about 6500 K, a tungsten lamp 2856 K.")
+        raise DomainError(
+            f"temperature {temperature_k:g} K must lie in 500 to 100000 K; daylight has about 6500 K, a "
+            "tungsten lamp 2856 K."
+        )
     wavelength_um = np.linspace(0.30, 1.20, 181)
     value = wavelength_um**-5 / np.expm1(SECOND_RADIATION_UM_K / (wavelength_um * temperature_k))
     return wavelength_um, value / value.max()
 
 
 def daylight_d65():
-    """CIE standard illuminant D65 (radiant energy, 100 at 560 nm), 0.30 to 0.83 um: (wavelength_um, value)."""
+    """CIE standard illuminant D65 (radiant energy, 100 at 560 nm), 0.30 to 0.83 um: (wavelength_um,
+    value)."""
     return np.linspace(0.30, 0.83, len(_D65)), np.array(_D65)
 
 
 def silicon_response(depth_um=5.0):
-    """Response of a generic monochrome silicon sensor per unit of radiant energy, 0.36 to 1.10 um, largest value 1: (wavelength_um, value).
+    """Response of a generic monochrome silicon sensor per unit of radiant energy, 0.36 to 1.10 um, largest
+    value 1: (wavelength_um, value).
 
-    An approximation: every photon absorbed within ``depth_um`` counts, w (1 - exp(-4 pi k depth / w)); reflection, the cover glass and
-    losses at the surface are left out, so a real sensor falls faster in the blue. Five micrometres is a usual epitaxial layer.
+    An approximation: every photon absorbed within ``depth_um`` counts, w (1 - exp(-4 pi k depth / w));
+      reflection, the cover glass and
+    losses at the surface are left out, so a real sensor falls faster in the blue. Five micrometres is a usual
+    epitaxial layer.
     Args: depth_um from 0.01 to 1000. Raises: DomainError.
     Source: Beer and Lambert's law with the extinction coefficient of Green, 2008.
     """
     if not 0.01 <= depth_um <= 1000:
-        raise DomainError(f"depth {depth_um:g} um must lie in 0.01 to 1000 um; sensors have about 2 to 10 um.")
+        raise DomainError(
+            f"depth {depth_um:g} um must lie in 0.01 to 1000 um; sensors have about 2 to 10 um."
+        )
     wavelength_um = np.linspace(0.36, 1.10, len(_SILICON_K))
     value = -wavelength_um * np.expm1(-4 * np.pi * np.array(_SILICON_K) * depth_um / wavelength_um)
     return wavelength_um, value / value.max()

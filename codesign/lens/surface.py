@@ -1,4 +1,5 @@
-"""One surface of a sequential lens: shape, what it does to light, the gap behind it, and the medium in that gap."""
+"""One surface of a sequential lens: shape, what it does to light, the gap behind it, and the medium in that
+gap."""
 
 import math
 from dataclasses import dataclass, replace
@@ -11,11 +12,14 @@ from codesign.lens.glass import Glass
 
 @dataclass(frozen=True)
 class Phase:
-    """A diffractive phase on a surface: phi(r) = sum of coefficients[i] r^(2i + 2), in radians and mm, used in one order.
+    """A diffractive phase on a surface: phi(r) = sum of coefficients[i] r^(2i + 2), in radians and mm, used
+    in one order.
 
-    The ray gains the path m w phi / (2 pi), so a negative first coefficient converges light. blaze_um: wavelength at which the
+    The ray gains the path m w phi / (2 pi), so a negative first coefficient converges light. blaze_um:
+    wavelength at which the
     grating is blazed for its order; it sets ``efficiency``, None leaves that at 1.
-    Source: Buralli, Morris and Rogers, Optical performance of holographic kinoforms, Applied Optics 28 (1989).
+    Source: Buralli, Morris and Rogers, Optical performance of holographic kinoforms, Applied Optics 28
+      (1989).
     """
 
     coefficients: tuple[float, ...]
@@ -24,13 +28,21 @@ class Phase:
 
     def check(self, label):
         """Raise DomainError when the phase cannot exist."""
-        if not self.coefficients or not all(math.isfinite(a) for a in self.coefficients) or not isinstance(self.order, int):
-            raise DomainError(f"{label}: a phase needs finite coefficients and a whole order, got {self.coefficients} and {self.order!r}.")
+        if (
+            not self.coefficients
+            or not all(math.isfinite(a) for a in self.coefficients)
+            or not isinstance(self.order, int)
+        ):
+            raise DomainError(
+                f"{label}: a phase needs finite coefficients and a whole order, got {self.coefficients} and "
+                f"{self.order!r}."
+            )
         if self.blaze_um is not None and not 0 < self.blaze_um < math.inf:
             raise DomainError(f"{label}: blaze wavelength {self.blaze_um} um must be positive.")
 
     def efficiency(self, wavelength_um):
-        """Scalar efficiency of the order at a wavelength: sinc^2(m (blaze / w) - m) for a surface blazed for order m, without the dispersion of its material."""
+        """Scalar efficiency of the order at a wavelength: sinc^2(m (blaze / w) - m) for a surface blazed for
+        order m, without the dispersion of its material."""
         if self.blaze_um is None:
             return 1.0
         x = math.pi * self.order * (self.blaze_um / wavelength_um - 1)
@@ -48,10 +60,13 @@ class Surface:
     conic: conic constant k (0 sphere, -1 paraboloid).
     asphere: coefficients of r^2, r^4, r^6, ... in mm^-1, mm^-3, mm^-5, ...
     is_stop: whether this surface is the aperture stop.
-    mirror: whether it reflects. The axis is unfolded at a mirror: light travels along +z behind it too, so lengths and curvatures
-      that follow count along the light (a file's signs are turned by its reader); its medium is the one in front of it.
+    mirror: whether it reflects. The axis is unfolded at a mirror: light travels along +z behind it too, so
+      lengths and curvatures
+      that follow count along the light (a file's signs are turned by its reader); its medium is the one in
+      front of it.
     phase: a diffractive phase, or None.
-    decentre_mm: (x, y) of the vertex; tilt_deg: about x, then about y, around that vertex. Later surfaces stay where they were.
+    decentre_mm: (x, y) of the vertex; tilt_deg: about x, then about y, around that vertex. Later surfaces
+      stay where they were.
     inner_semi_aperture_mm: half the diameter of a central obstruction, 0 for none.
     """
 
@@ -74,41 +89,78 @@ class Surface:
 
     def check(self, label):
         """Raise DomainError naming the value and the remedy when the surface cannot exist."""
-        numbers = (self.thickness_mm, self.semi_aperture_mm, self.conic, *self.asphere, *self.decentre_mm, *self.tilt_deg)
+        numbers = (
+            self.thickness_mm,
+            self.semi_aperture_mm,
+            self.conic,
+            *self.asphere,
+            *self.decentre_mm,
+            *self.tilt_deg,
+        )
         if math.isnan(self.radius_mm) or self.radius_mm == 0 or not all(math.isfinite(v) for v in numbers):
-            raise DomainError(f"{label}: radius {self.radius_mm} mm, thickness {self.thickness_mm} mm, conic {self.conic} and asphere {self.asphere} must be finite numbers, the radius not 0 (inf is a plane).")
+            raise DomainError(
+                f"{label}: radius {self.radius_mm} mm, thickness {self.thickness_mm} mm, conic {self.conic} "
+                f"and asphere {self.asphere} must be finite numbers, the radius not 0 (inf is a plane)."
+            )
         if self.thickness_mm < 0:
-            raise DomainError(f"{label}: thickness {self.thickness_mm} mm is negative; light travels towards +z, so give the distance to the next surface as 0 or more.")
+            raise DomainError(
+                f"{label}: thickness {self.thickness_mm} mm is negative; light travels towards +z, so give "
+                "the distance to the next surface as 0 or more."
+            )
         if self.semi_aperture_mm <= 0:
             raise DomainError(f"{label}: semi-aperture {self.semi_aperture_mm} mm must be positive.")
         if not 0 <= self.inner_semi_aperture_mm < self.semi_aperture_mm:
-            raise DomainError(f"{label}: central obstruction of {self.inner_semi_aperture_mm} mm must be at least 0 and smaller than the semi-aperture {self.semi_aperture_mm} mm.")
+            raise DomainError(
+                f"{label}: central obstruction of {self.inner_semi_aperture_mm} mm must be at least 0 and "
+                f"smaller than the semi-aperture {self.semi_aperture_mm} mm."
+            )
         if max(map(abs, self.tilt_deg)) >= 90:
             raise DomainError(f"{label}: tilt {self.tilt_deg} degrees must stay below 90.")
         if self.phase is not None:
             self.phase.check(label)
             if self.mirror:
-                raise DomainError(f"{label}: a diffractive phase on a mirror is not traced; put it on a refracting surface or on a plane of its own.")
+                raise DomainError(
+                    f"{label}: a diffractive phase on a mirror is not traced; put it on a refracting "
+                    "surface or on a plane of its own."
+                )
         reach = (1 + self.conic) * (self.curvature_per_mm * self.semi_aperture_mm) ** 2
         if reach > 1:
             limit = abs(self.radius_mm) / math.sqrt(1 + self.conic)
-            raise DomainError(f"{label}: semi-aperture {self.semi_aperture_mm} mm exceeds what radius {self.radius_mm} mm and conic {self.conic} reach ({limit:.6g} mm); make the aperture smaller or the radius longer.")
+            raise DomainError(
+                f"{label}: semi-aperture {self.semi_aperture_mm} mm exceeds what radius {self.radius_mm} mm "
+                f"and conic {self.conic} reach ({limit:.6g} mm); make the aperture smaller or the radius "
+                "longer."
+            )
         return self
 
 
 def scaled(surface, factor):
     """The same surface with all lengths multiplied by ``factor``."""
     asphere = tuple(a * factor ** (1 - 2 * (i + 1)) for i, a in enumerate(surface.asphere))
-    phase = surface.phase and replace(surface.phase, coefficients=tuple(a * factor ** (-2 * (i + 1)) for i, a in enumerate(surface.phase.coefficients)))
-    lengths = {name: getattr(surface, name) * factor for name in ("radius_mm", "thickness_mm", "semi_aperture_mm", "inner_semi_aperture_mm")}
-    return replace(surface, **lengths, asphere=asphere, phase=phase, decentre_mm=(surface.decentre_mm[0] * factor, surface.decentre_mm[1] * factor))
+    phase = surface.phase and replace(
+        surface.phase,
+        coefficients=tuple(a * factor ** (-2 * (i + 1)) for i, a in enumerate(surface.phase.coefficients)),
+    )
+    lengths = {
+        name: getattr(surface, name) * factor
+        for name in ("radius_mm", "thickness_mm", "semi_aperture_mm", "inner_semi_aperture_mm")
+    }
+    return replace(
+        surface,
+        **lengths,
+        asphere=asphere,
+        phase=phase,
+        decentre_mm=(surface.decentre_mm[0] * factor, surface.decentre_mm[1] * factor),
+    )
 
 
 def sag_mm(height_mm: Tensor, curvature_per_mm, conic, asphere):
     """Depth of a surface at heights [...] from the axis, mm.
 
-    Args: curvature_per_mm, conic, and each coefficient of r^2, r^4, ... in ``asphere``: numbers, or tensors that broadcast with the heights.
-    Gradient: everything given as a tensor. Beyond the reach of the conic its root is held at 1e-3, so that the gradient stays finite.
+    Args: curvature_per_mm, conic, and each coefficient of r^2, r^4, ... in ``asphere``: numbers, or tensors
+      that broadcast with the heights.
+    Gradient: everything given as a tensor. Beyond the reach of the conic its root is held at 1e-3, so that
+      the gradient stays finite.
     """
     r2 = height_mm.square()
     sag = curvature_per_mm * r2 / (1 + (1 - (1 + conic) * curvature_per_mm**2 * r2).clamp_min(1e-6).sqrt())

@@ -12,12 +12,17 @@ from codesign.lens.kernel import Kernel, Status, Works
 
 @dataclass(frozen=True)
 class Prescription:
-    """Numbers the kernel needs, for one wavelength. Tensors of one dtype and device; gradients flow to all of them.
+    """Numbers the kernel needs, for one wavelength. Tensors of one dtype and device; gradients flow to all of
+    them.
 
-    curvature_per_mm, thickness_mm, conic, semi_aperture_mm: [S]. asphere: [S, A], coefficients of r^2, r^4, ...
-    index: [S + 1], the first before the first surface. soft_edge_mm: full width of the smooth edge of the apertures.
-    path_mm: [S, P], optical path added by a diffractive phase, coefficients of r^2, r^4, ...; efficiency: product of its efficiencies.
-    decentre_mm, tilt_rad: [S, 2] each. mirrors: S booleans; the axis is unfolded behind a mirror (see Surface).
+    curvature_per_mm, thickness_mm, conic, semi_aperture_mm: [S]. asphere: [S, A], coefficients of r^2, r^4,
+      ...
+    index: [S + 1], the first before the first surface. soft_edge_mm: full width of the smooth edge of the
+      apertures.
+    path_mm: [S, P], optical path added by a diffractive phase, coefficients of r^2, r^4, ...; efficiency:
+      product of its efficiencies.
+    decentre_mm, tilt_rad: [S, 2] each. mirrors: S booleans; the axis is unfolded behind a mirror (see
+      Surface).
     inner_semi_aperture_mm: S numbers, radii of central obstructions (0: none).
     to_plane: whether rays go on to the plane behind the last thickness, or end on the last surface itself.
     """
@@ -38,22 +43,44 @@ class Prescription:
     to_plane: bool = True
 
     def reversed(self, last_gap_mm):
-        """The same lens seen from the image side; ``last_gap_mm`` is the distance of the plane where the rays end."""
+        """The same lens seen from the image side; ``last_gap_mm`` is the distance of the plane where the rays
+        end."""
         gaps = torch.cat([self.thickness_mm[:-1].flip(0), last_gap_mm.reshape(1)])
-        turn = torch.tensor([1.0 if mirror else -1.0 for mirror in self.mirrors], dtype=gaps.dtype, device=gaps.device)  # a mirror faces the light from either way
-        shapes = {"curvature_per_mm": (turn * self.curvature_per_mm).flip(0), "asphere": (turn[:, None] * self.asphere).flip(0), "tilt_rad": (turn[:, None] * self.tilt_rad).flip(0)}
-        same = {name: getattr(self, name).flip(0) for name in ("conic", "index", "semi_aperture_mm", "path_mm", "decentre_mm")}
-        return replace(self, thickness_mm=gaps, mirrors=self.mirrors[::-1], inner_semi_aperture_mm=self.inner_semi_aperture_mm[::-1], **shapes, **same)
+        turn = torch.tensor(
+            [1.0 if mirror else -1.0 for mirror in self.mirrors], dtype=gaps.dtype, device=gaps.device
+        )  # a mirror faces the light from either way
+        shapes = {
+            "curvature_per_mm": (turn * self.curvature_per_mm).flip(0),
+            "asphere": (turn[:, None] * self.asphere).flip(0),
+            "tilt_rad": (turn[:, None] * self.tilt_rad).flip(0),
+        }
+        same = {
+            name: getattr(self, name).flip(0)
+            for name in ("conic", "index", "semi_aperture_mm", "path_mm", "decentre_mm")
+        }
+        return replace(
+            self,
+            thickness_mm=gaps,
+            mirrors=self.mirrors[::-1],
+            inner_semi_aperture_mm=self.inner_semi_aperture_mm[::-1],
+            **shapes,
+            **same,
+        )
 
     def until(self, surface):
         """The part of the lens up to a surface (counted from 0), where rays end unbent."""
-        rows = {f.name: getattr(self, f.name)[: surface + 1] for f in fields(self) if f.name not in ("index", "soft_edge_mm", "efficiency", "to_plane")}
+        rows = {
+            f.name: getattr(self, f.name)[: surface + 1]
+            for f in fields(self)
+            if f.name not in ("index", "soft_edge_mm", "efficiency", "to_plane")
+        }
         keep = torch.arange(surface + 1, device=self.path_mm.device) < surface
         rows["path_mm"], rows["mirrors"] = rows["path_mm"] * keep[:, None], (*self.mirrors[:surface], False)
         return replace(self, **rows, index=self.index[[*range(surface + 1), surface]], to_plane=False)
 
     def opened(self, surface):
-        """The same lens with one aperture that clips nothing: rays that are placed on the stop are not to be weighed by its edge."""
+        """The same lens with one aperture that clips nothing: rays that are placed on the stop are not to be
+        weighed by its edge."""
         apertures = self.semi_aperture_mm.clone()
         apertures[surface] = 1e6
         return replace(self, semi_aperture_mm=apertures)
@@ -67,7 +94,14 @@ class Prescription:
         return self._each(Tensor.detach)
 
     def _each(self, change):
-        return replace(self, **{f.name: change(getattr(self, f.name)) for f in fields(self) if torch.is_tensor(getattr(self, f.name))})
+        return replace(
+            self,
+            **{
+                f.name: change(getattr(self, f.name))
+                for f in fields(self)
+                if torch.is_tensor(getattr(self, f.name))
+            },
+        )
 
 
 @dataclass(frozen=True)
@@ -93,12 +127,14 @@ class TraceResult:
 
     @property
     def inside(self):
-        """The hard mask: whether each ray lies within every clear aperture it reached and outside every obstruction, [N] bool."""
+        """The hard mask: whether each ray lies within every clear aperture it reached and outside every
+        obstruction, [N] bool."""
         return (self.fate & 4) != 0
 
     @property
     def failed_surface(self):
-        """First surface (from 0) where each ray failed, S where it failed to leave forwards, -1 if nowhere, [N] int."""
+        """First surface (from 0) where each ray failed, S where it failed to leave forwards, -1 if nowhere,
+        [N] int."""
         return self.fate >> 3
 
 
@@ -107,31 +143,67 @@ def trace(prescription, origin_mm, direction):
 
     Args: origin_mm [N, 3], direction [N, 3] unit, both of the prescription's dtype.
     Returns: TraceResult.
-    Gradient: position, direction, optical path, weight and deficit, to rays and to every tensor of the prescription.
+    Gradient: position, direction, optical path, weight and deficit, to rays and to every tensor of the
+      prescription.
     """
-    p, count = prescription, origin_mm.shape[0]
+    p = prescription
+    count = origin_mm.shape[0]
     edge = max(p.soft_edge_mm, 1e-6)
-    conics = [p.conic.requires_grad or k != 0 for k in p.conic.tolist()]  # its value matters, or its derivative is wanted
+    conics = [
+        p.conic.requires_grad or k != 0 for k in p.conic.tolist()
+    ]  # its value matters, or its derivative is wanted
     refracts = [a != b for a, b in zip(p.index[:-1].tolist(), p.index[1:].tolist(), strict=True)]
     moved = [any(row) for row in torch.cat([p.decentre_mm, p.tilt_rad], 1).tolist()]
     if p.decentre_mm.requires_grad or p.tilt_rad.requires_grad:
         moved = [True] * len(moved)
-    works = [Works(*of) for of in zip(conics, _active(p.asphere), refracts, p.mirrors, _active(p.path_mm), moved, map(bool, p.inner_semi_aperture_mm), strict=True)]
+    works = [
+        Works(*of)
+        for of in zip(
+            conics,
+            _active(p.asphere),
+            refracts,
+            p.mirrors,
+            _active(p.path_mm),
+            moved,
+            map(bool, p.inner_semi_aperture_mm),
+            strict=True,
+        )
+    ]
     kernel = Kernel(tuple(works), p.asphere.shape[1], p.path_mm.shape[1], p.to_plane)
     ratio = p.index[:-1] / p.index[1:]
     per_mm2 = 0.5 / (edge * p.semi_aperture_mm)  # slope of the apertures' edges in r^2
-    columns = [origin_mm, direction, p.curvature_per_mm, p.thickness_mm, p.conic, p.index, ratio, per_mm2, p.semi_aperture_mm.square() * per_mm2 + 0.5, p.asphere]
+    columns = [
+        origin_mm,
+        direction,
+        p.curvature_per_mm,
+        p.thickness_mm,
+        p.conic,
+        p.index,
+        ratio,
+        per_mm2,
+        p.semi_aperture_mm.square() * per_mm2 + 0.5,
+        p.asphere,
+    ]
     if kernel.special:
         inner = p.curvature_per_mm.new_tensor(p.inner_semi_aperture_mm)
-        columns += [p.path_mm, p.decentre_mm, p.tilt_rad.cos(), p.tilt_rad.sin(), 0.5 / (edge * inner.clamp_min(1e-6)), 0.5 - inner * (0.5 / edge)]
+        columns += [
+            p.path_mm,
+            p.decentre_mm,
+            p.tilt_rad.cos(),
+            p.tilt_rad.sin(),
+            0.5 / (edge * inner.clamp_min(1e-6)),
+            0.5 - inner * (0.5 / edge),
+        ]
     found = TraceResult(*run_kernel(kernel, columns, [(count, 3), (count, 3), *[(count,)] * 4]))
     return found if p.efficiency == 1 else replace(found, weight=found.weight * p.efficiency)
 
 
 def sum_over_chunks(function, *rays, rows=262_144):
-    """Sum of ``function(*chunk)`` over chunks of rays, in bounded memory: a chunk is traced again when its gradient is due.
+    """Sum of ``function(*chunk)`` over chunks of rays, in bounded memory: a chunk is traced again when its
+    gradient is due.
 
-    Args: function of tensors [n, ...] -> tensor, such as a merit of traced rays; rays: tensors [N, ...] split together into ``rows`` at a time.
+    Args: function of tensors [n, ...] -> tensor, such as a merit of traced rays; rays: tensors [N, ...] split
+      together into ``rows`` at a time.
     Returns: the sum over chunks. Gradient: as if all were traced at once.
     """
     first, *rest = zip(*(r.split(rows) for r in rays), strict=True)
@@ -142,7 +214,8 @@ def sum_over_chunks(function, *rays, rows=262_144):
 
 
 def _active(table):
-    """Number of polynomial terms to compute per surface: up to the last that is not zero, all when derivatives are wanted."""
+    """Number of polynomial terms to compute per surface: up to the last that is not zero, all when
+    derivatives are wanted."""
     if table.requires_grad or not table.shape[1]:
         return [table.shape[1]] * table.shape[0]
     return [max((i + 1 for i, v in enumerate(row) if v != 0), default=0) for row in table.tolist()]

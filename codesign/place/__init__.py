@@ -1,4 +1,5 @@
-"""Placement: a camera mount on a robot body, and what the camera can tell from there about the body's motion."""
+"""Placement: a camera mount on a robot body, and what the camera can tell from there about the body's
+motion."""
 
 from codesign.place.mount import Mount
 from codesign.place.observability import information, planar_flow, velocity_from_flow

@@ -1,7 +1,10 @@
-"""A camera mount on a robot body: six unconstrained numbers to a pose with a limited position and a free rotation.
+"""A camera mount on a robot body: six unconstrained numbers to a pose with a limited position and a free
+rotation.
 
-Body axes: x forward, y left, z up. Camera axes: x right, y down, z forward. Yaw turns the view to the left, pitch tilts it down (90 degrees
-looks straight down), roll turns the image about the view; at zero the camera looks along the body's x axis with level rows.
+Body axes: x forward, y left, z up. Camera axes: x right, y down, z forward. Yaw turns the view to the left,
+  pitch tilts it down (90 degrees
+looks straight down), roll turns the image about the view; at zero the camera looks along the body's x axis
+with level rows.
 """
 
 import torch
@@ -10,18 +13,25 @@ from torch import nn
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.pose import se3_exp
 
-AXES_BODY_CAM = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)  # of a level camera that looks forward
+AXES_BODY_CAM = torch.tensor(
+    [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64
+)  # of a level camera that looks forward
 
 
 class Mount(nn.Module):
     """Pose T_body_cam of a camera on a body.
 
     Args:
-      nominal_m: three numbers, body axes: middle of the box of allowed positions. half_range_m: half its size per axis, >= 0 (0 holds that axis).
-      yaw_rad, pitch_rad, roll_rad: attitude where the rotation part of ``numbers`` is zero. position_m: where to start, strictly inside the box; None starts in the middle.
-    numbers: [6] float64, learnable, unconstrained. position = nominal + half_range tanh(numbers[:3]); rotation = start attitude times exp(numbers[3:]),
-      a rotation vector in camera axes (so looking straight down, where yaw and roll turn about one axis, is a pose like any other).
-    Raises: DomainError when a number is not finite, a range is negative, or the start lies outside the box; ShapeError for other than three numbers.
+      nominal_m: three numbers, body axes: middle of the box of allowed positions. half_range_m: half its size
+        per axis, >= 0 (0 holds that axis).
+      yaw_rad, pitch_rad, roll_rad: attitude where the rotation part of ``numbers`` is zero. position_m: where
+        to start, strictly inside the box; None starts in the middle.
+    numbers: [6] float64, learnable, unconstrained. position = nominal + half_range tanh(numbers[:3]);
+      rotation = start attitude times exp(numbers[3:]),
+      a rotation vector in camera axes (so looking straight down, where yaw and roll turn about one axis, is a
+      pose like any other).
+    Raises: DomainError when a number is not finite, a range is negative, or the start lies outside the box;
+      ShapeError for other than three numbers.
     """
 
     start_attitude: torch.Tensor
@@ -30,9 +40,13 @@ class Mount(nn.Module):
 
     def __init__(self, nominal_m, half_range_m, *, yaw_rad=0.0, pitch_rad=0.0, roll_rad=0.0, position_m=None):
         super().__init__()
-        nominal, half = _three(nominal_m, "nominal_m"), _three(half_range_m, "half_range_m")
+        nominal = _three(nominal_m, "nominal_m")
+        half = _three(half_range_m, "half_range_m")
         if bool((half < 0).any()):
-            raise DomainError(f"mount: half_range_m is {half.tolist()}; the box of allowed positions needs sizes of at least 0 (0 holds an axis).")
+            raise DomainError(
+                f"mount: half_range_m is {half.tolist()}; the box of allowed positions needs sizes of at "
+                "least 0 (0 holds an axis)."
+            )
         self.register_buffer("nominal_m", nominal)
         self.register_buffer("half_range_m", half)
         self.register_buffer("start_attitude", attitude(yaw_rad, pitch_rad, roll_rad))
@@ -41,26 +55,36 @@ class Mount(nn.Module):
         self.numbers = nn.Parameter(start)
 
     def _unbounded(self, position):
-        offset, half = position - self.nominal_m, self.half_range_m
+        offset = position - self.nominal_m
+        half = self.half_range_m
         free = half > 0
         if bool((torch.where(free, offset.abs() >= half, offset != 0)).any()):
-            low, high = (self.nominal_m - half).tolist(), (self.nominal_m + half).tolist()
-            raise DomainError(f"mount: position_m {position.tolist()} is not strictly inside the allowed box from {low} to {high} m; move it inside, or widen half_range_m.")
+            low = (self.nominal_m - half).tolist()
+            high = (self.nominal_m + half).tolist()
+            raise DomainError(
+                f"mount: position_m {position.tolist()} is not strictly inside the allowed box from {low} "
+                f"to {high} m; move it inside, or widen half_range_m."
+            )
         return torch.atanh(torch.where(free, offset / torch.where(free, half, 1.0), 0.0))
 
     def forward(self, numbers=None):
-        """T_body_cam [..., 4, 4] of ``numbers`` [..., 6]; the mount's own when None. Gradient: exact, to the numbers.
+        """T_body_cam [..., 4, 4] of ``numbers`` [..., 6]; the mount's own when None. Gradient: exact, to the
+        numbers.
 
         Raises: ShapeError when the last axis is not 6; DomainError when one is not finite.
         """
         numbers = self.numbers if numbers is None else numbers
         if numbers.shape[-1] != 6:
-            raise ShapeError(f"mount: its numbers are [..., 6] (position, rotation), got {tuple(numbers.shape)}.")
+            raise ShapeError(
+                f"mount: its numbers are [..., 6] (position, rotation), got {tuple(numbers.shape)}."
+            )
         check_finite(numbers, "mount numbers", "go back to the last finite ones")
         position = self.nominal_m + self.half_range_m * torch.tanh(numbers[..., :3])
         turn = se3_exp(torch.cat([torch.zeros_like(numbers[..., 3:]), numbers[..., 3:]], -1))[..., :3, :3]
         top = torch.cat([self.start_attitude @ turn, position[..., None]], -1)
-        last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device).expand(*top.shape[:-2], 1, 4)
+        last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device).expand(
+            *top.shape[:-2], 1, 4
+        )
         return torch.cat([top, last], -2)
 
     def in_world(self, T_world_body, numbers=None):
@@ -69,19 +93,28 @@ class Mount(nn.Module):
 
 
 def attitude(yaw_rad, pitch_rad, roll_rad):
-    """Rotation [3, 3] from camera to body axes: Rz(yaw) Ry(pitch) Rx(roll) after the axes of a level camera. Raises: DomainError when not finite."""
+    """Rotation [3, 3] from camera to body axes: Rz(yaw) Ry(pitch) Rx(roll) after the axes of a level camera.
+    Raises: DomainError when not finite."""
     turn = torch.eye(3, dtype=torch.float64)
-    for axis, angle, name in ((2, yaw_rad, "yaw_rad"), (1, pitch_rad, "pitch_rad"), (0, roll_rad, "roll_rad")):
+    for axis, angle, name in (
+        (2, yaw_rad, "yaw_rad"),
+        (1, pitch_rad, "pitch_rad"),
+        (0, roll_rad, "roll_rad"),
+    ):
         vector = torch.zeros(6, dtype=torch.float64)
-        vector[3 + axis] = check_finite(torch.as_tensor(angle, dtype=torch.float64), f"mount: {name}", "give a finite angle")
+        vector[3 + axis] = check_finite(
+            torch.as_tensor(angle, dtype=torch.float64), f"mount: {name}", "give a finite angle"
+        )
         turn = turn @ se3_exp(vector)[:3, :3]
     return turn @ AXES_BODY_CAM
 
 
 def yaw_pitch_roll_rad(T_body_cam):
-    """Angles [..., 3] of a mount, the inverse of ``attitude``: yaw and roll in (-pi, pi], pitch in [-pi/2, pi/2].
+    """Angles [..., 3] of a mount, the inverse of ``attitude``: yaw and roll in (-pi, pi], pitch in [-pi/2,
+    pi/2].
 
-    Yaw and pitch are where the camera's axis points; looking straight up or down only their sum with roll means something.
+    Yaw and pitch are where the camera's axis points; looking straight up or down only their sum with roll
+    means something.
     """
     turn = T_body_cam[..., :3, :3] @ AXES_BODY_CAM.to(T_body_cam).mT
     yaw = torch.atan2(turn[..., 1, 0], turn[..., 0, 0])
@@ -90,7 +123,11 @@ def yaw_pitch_roll_rad(T_body_cam):
 
 
 def _three(values, name):
-    values = check_finite(torch.as_tensor(values, dtype=torch.float64), f"mount: {name}", "give finite metres")
+    values = check_finite(
+        torch.as_tensor(values, dtype=torch.float64), f"mount: {name}", "give finite metres"
+    )
     if values.shape != (3,):
-        raise ShapeError(f"mount: {name} needs three numbers (x forward, y left, z up), got shape {tuple(values.shape)}.")
+        raise ShapeError(
+            f"mount: {name} needs three numbers (x forward, y left, z up), got shape {tuple(values.shape)}."
+        )
     return values

@@ -1,7 +1,10 @@
-"""The body's planar velocity from image flow, and how well a mount can tell it: weighted least squares with known depth.
+"""The body's planar velocity from image flow, and how well a mount can tell it: weighted least squares with
+known depth.
 
-A static point X in camera axes moves as X' = -(v + w x X) when the camera moves with velocity v and rotation rate w (Longuet-Higgins and
-Prazdny, 1980). The pixel that images it moves so that its chief ray goes on passing through the point, for any lens that has chief rays.
+A static point X in camera axes moves as X' = -(v + w x X) when the camera moves with velocity v and rotation
+rate w (Longuet-Higgins and
+Prazdny, 1980). The pixel that images it moves so that its chief ray goes on passing through the point, for
+any lens that has chief rays.
 The flow is linear in (forward m/s, lateral m/s to the left, yaw rate rad/s to the left) of the body's origin.
 """
 
@@ -9,23 +12,32 @@ import torch
 
 from codesign.errors import DomainError, ShapeError, check_finite
 
-_STEP_PX = 1e-3  # central differences of chief rays: exact for a pinhole, 1e-6 of the third derivative otherwise
-_SMALLEST_RATIO = 1e-12  # of eigenvalues of the information matrix, below which a velocity is not observable in float64
+_STEP_PX = (
+    1e-3  # central differences of chief rays: exact for a pinhole, 1e-6 of the third derivative otherwise
+)
+_SMALLEST_RATIO = (
+    1e-12  # of eigenvalues of the information matrix, below which a velocity is not observable in float64
+)
 
 
 def planar_flow(camera, depth_m, T_body_cam):
     """Flow that each unit of planar body velocity makes in every pixel.
 
     Args:
-      camera: has ``chief_rays`` and ``film`` (see render.Camera). depth_m: [..., P] true depth along the camera's z axis per pixel, film order.
+      camera: has ``chief_rays`` and ``film`` (see render.Camera). depth_m: [..., P] true depth along the
+        camera's z axis per pixel, film order.
       T_body_cam: [..., 4, 4]. Pixels without a surface carry a depth that is not finite or not positive.
     Returns: flow [..., P, 2, 3] px/s per (m/s, m/s, rad/s); 0 where there is no surface. seen [..., P] bool.
     Gradient: depth, mount, and the lens behind the chief rays.
-    Raises: ShapeError when the depths are not one per pixel, or the mount is not [..., 4, 4]; DomainError when the mount is not finite.
+    Raises: ShapeError when the depths are not one per pixel, or the mount is not [..., 4, 4]; DomainError
+      when the mount is not finite.
     """
     pixels = camera.film.pixels()
     if depth_m.shape[-1:] != pixels.shape[:1] or T_body_cam.shape[-2:] != (4, 4):
-        raise ShapeError(f"planar flow needs depths [..., {pixels.shape[0]}] (one per pixel) and a mount [..., 4, 4], got {tuple(depth_m.shape)} and {tuple(T_body_cam.shape)}.")
+        raise ShapeError(
+            f"planar flow needs depths [..., {pixels.shape[0]}] (one per pixel) and a mount [..., 4, 4], "
+            f"got {tuple(depth_m.shape)} and {tuple(T_body_cam.shape)}."
+        )
     check_finite(T_body_cam, "T_body_cam")
     depth = depth_m.double()
     seen = depth.detach().isfinite() & (depth.detach() > 0)
@@ -43,12 +55,15 @@ def velocity_from_flow(flow_px_s, camera, depth_m, T_body_cam, weight=None, prio
     """Planar velocity of the body by weighted least squares.
 
     Args:
-      flow_px_s: [B, 2, H, W] image flow, px per second. camera, depth_m [P] or [B, P], T_body_cam [4, 4] or [B, 4, 4]: as for planar_flow.
+      flow_px_s: [B, 2, H, W] image flow, px per second. camera, depth_m [P] or [B, P], T_body_cam [4, 4] or
+        [B, 4, 4]: as for planar_flow.
       weight: [P] or [B, P] >= 0, inverse variance of the flow per pixel, s^2/px^2; equal weights when None.
-      prior: [3] standard deviations expected of (m/s, m/s, rad/s) around zero; what the image does not show then stays near zero. None: no prior.
+      prior: [3] standard deviations expected of (m/s, m/s, rad/s) around zero; what the image does not show
+        then stays near zero. None: no prior.
     Returns: [B, 3] forward m/s, lateral m/s (left), yaw rate rad/s (left), float64.
     Gradient: flow, depth, mount, weight, lens.
-    Raises: ShapeError; DomainError for NaN in flow, negative weights, and (without a prior) when no pixel sees a surface or the velocity is not observable.
+    Raises: ShapeError; DomainError for NaN in flow, negative weights, and (without a prior) when no pixel
+      sees a surface or the velocity is not observable.
     """
     if flow_px_s.ndim != 4 or flow_px_s.shape[1] != 2:
         raise ShapeError(f"velocity_from_flow needs flow [B, 2, H, W], got {tuple(flow_px_s.shape)}.")
@@ -56,16 +71,21 @@ def velocity_from_flow(flow_px_s, camera, depth_m, T_body_cam, weight=None, prio
     rows, weight = _weighted_rows(camera, depth_m, T_body_cam, weight)
     measured = flow_px_s.double().flatten(2).mT  # [B, P, 2]
     if measured.shape[1] != rows.shape[-3]:
-        raise ShapeError(f"the flow has {measured.shape[1]} pixels, the camera {rows.shape[-3]}; use the flow of this camera.")
+        raise ShapeError(
+            f"the flow has {measured.shape[1]} pixels, the camera {rows.shape[-3]}; use the flow of this "
+            "camera."
+        )
     normal = _normal_matrix(rows, weight, prior)
     right = torch.einsum("...pck,...p,...pc->...k", rows, weight, measured)
     return torch.linalg.solve(normal.expand(*right.shape, 3), right)
 
 
 def information(camera, depth_m, T_body_cam, weight=None, prior=None):
-    """Information matrix of (forward m/s, lateral m/s, yaw rate rad/s) in a flow field: sum over pixels of weight J^T J.
+    """Information matrix of (forward m/s, lateral m/s, yaw rate rad/s) in a flow field: sum over pixels of
+    weight J^T J.
 
-    Args: as for velocity_from_flow, with or without a batch axis. With weight = 1 / variance of the flow (s^2/px^2) its inverse is the covariance of the velocity.
+    Args: as for velocity_from_flow, with or without a batch axis. With weight = 1 / variance of the flow
+      (s^2/px^2) its inverse is the covariance of the velocity.
     Returns: [3, 3] (or [B, 3, 3]), float64. Gradient: depth, mount, weight, lens.
     Raises: as velocity_from_flow.
     """
@@ -73,22 +93,35 @@ def information(camera, depth_m, T_body_cam, weight=None, prior=None):
 
 
 def _chief_lines(camera, pixels):
-    """Chief rays as lines x(z) = base + slope z, [P, 2] each, and their change per pixel, [P, 2, 2] (last axis: pixel x, y)."""
-    step = torch.tensor([[0.0, 0.0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=pixels.dtype, device=pixels.device) * _STEP_PX
+    """Chief rays as lines x(z) = base + slope z, [P, 2] each, and their change per pixel, [P, 2, 2] (last
+    axis: pixel x, y)."""
+    step = (
+        torch.tensor([[0.0, 0.0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=pixels.dtype, device=pixels.device)
+        * _STEP_PX
+    )
     rays = camera.chief_rays((pixels + step[:, None]).reshape(-1, 2))
-    origin, direction = rays.origin_m.double(), rays.direction.double()
+    origin = rays.origin_m.double()
+    direction = rays.direction.double()
     slope = direction[:, :2] / direction[:, 2:]
     base = (origin[:, :2] - slope * origin[:, 2:]).reshape(5, -1, 2)
     slope = slope.reshape(5, -1, 2)
-    change = lambda v: torch.stack([v[1] - v[2], v[3] - v[4]], -1) / (2 * _STEP_PX)  # noqa: E731
+
+    def change(v):
+        return torch.stack([v[1] - v[2], v[3] - v[4]], -1) / (2 * _STEP_PX)
+
     return base[0], slope[0], change(base), change(slope)
 
 
 def _point_velocity(point, T_body_cam):
-    """Velocity in camera axes of static points [..., P, 3] per unit of planar body velocity: [..., P, 3 (axis), 3 (unit)]."""
-    rotation, position = T_body_cam[..., :3, :3], T_body_cam[..., :3, 3]
-    zero, one = torch.zeros_like(position[..., 0]), torch.ones_like(position[..., 0])
-    lever = torch.stack([-position[..., 1], position[..., 0], zero], -1)  # z x position: velocity of the camera when the body turns
+    """Velocity in camera axes of static points [..., P, 3] per unit of planar body velocity: [..., P, 3
+    (axis), 3 (unit)]."""
+    rotation = T_body_cam[..., :3, :3]
+    position = T_body_cam[..., :3, 3]
+    zero = torch.zeros_like(position[..., 0])
+    one = torch.ones_like(position[..., 0])
+    lever = torch.stack(
+        [-position[..., 1], position[..., 0], zero], -1
+    )  # z x position: velocity of the camera when the body turns
     units = torch.stack([torch.stack([one, zero, zero], -1), torch.stack([zero, one, zero], -1), lever], -1)
     velocity = rotation.mT @ units  # of the camera, in camera axes
     up = rotation[..., 2, :, None].mT.expand_as(point)  # the body's z axis in camera axes
@@ -103,7 +136,10 @@ def _weighted_rows(camera, depth_m, T_body_cam, weight):
         return rows, seen.to(rows)
     check_finite(weight, "flow weight")
     if bool((weight.detach() < 0).any()):
-        raise DomainError(f"a flow weight is negative (smallest {float(weight.detach().min()):.3g}); weights are inverse variances, at least 0.")
+        raise DomainError(
+            f"a flow weight is negative (smallest {float(weight.detach().min()):.3g}); weights are inverse "
+            "variances, at least 0."
+        )
     return rows, torch.where(seen, weight.double(), 0.0)
 
 
@@ -112,12 +148,21 @@ def _normal_matrix(rows, weight, prior):
     if prior is not None:
         deviation = torch.as_tensor(prior, dtype=rows.dtype, device=rows.device)
         if deviation.shape != (3,) or not bool(((deviation > 0) & deviation.isfinite()).all()):
-            raise DomainError(f"prior is {deviation.tolist()}; three finite standard deviations > 0 (m/s, m/s, rad/s) are needed.")
+            raise DomainError(
+                f"prior is {deviation.tolist()}; three finite standard deviations > 0 (m/s, m/s, rad/s) are "
+                "needed."
+            )
         return normal + torch.diag(deviation**-2)
     fixed = normal.detach()
     if not bool((weight.detach() > 0).any(-1).all()):
-        raise DomainError("no pixel sees the ground with positive weight, so the flow says nothing about the velocity; turn the camera towards the ground, or give a prior.")
+        raise DomainError(
+            "no pixel sees the ground with positive weight, so the flow says nothing about the velocity; "
+            "turn the camera towards the ground, or give a prior."
+        )
     eigenvalues = torch.linalg.eigvalsh(fixed)
     if bool((eigenvalues[..., 0] <= _SMALLEST_RATIO * eigenvalues[..., 2]).any()):
-        raise DomainError("the velocity is not observable: some motion of the body leaves the flow of all weighted pixels as it is; see more of the ground, or give a prior.")
+        raise DomainError(
+            "the velocity is not observable: some motion of the body leaves the flow of all weighted pixels "
+            "as it is; see more of the ground, or give a prior."
+        )
     return normal

@@ -6,14 +6,41 @@ from codesign.render.check import check_view
 from codesign.render.moving import MovingScene
 from codesign.render.planes import TexturedPlane
 from codesign.render.sequence import frames
-from codesign.render.time import adaptive_times, crossing_error_px, exposed_frames, frame_chunks, gauss_legendre, midpoints
+from codesign.render.time import (
+    adaptive_times,
+    crossing_error_px,
+    exposed_frames,
+    frame_chunks,
+    gauss_legendre,
+    midpoints,
+)
 from codesign.render.truth import FlowTruth, View, flow_and_occlusion, true_flow, view
 from codesign.render.velocity import camera_velocity
 from codesign.render.wavefront import shade
 from codesign.render.world import MitsubaScene
 
 __all__ = [
-    "Camera", "Film", "FlowTruth", "MitsubaScene", "MovingScene", "TexturedPlane", "View", "adaptive_times",
-    "angular_miss_rad", "camera_velocity", "check_view", "crossing_error_px", "exposed_frames", "flow_and_occlusion", "frame_chunks", "frames",
-    "gauss_legendre", "midpoints", "project", "shade", "true_flow", "truth", "view",
+    "Camera",
+    "Film",
+    "FlowTruth",
+    "MitsubaScene",
+    "MovingScene",
+    "TexturedPlane",
+    "View",
+    "adaptive_times",
+    "angular_miss_rad",
+    "camera_velocity",
+    "check_view",
+    "crossing_error_px",
+    "exposed_frames",
+    "flow_and_occlusion",
+    "frame_chunks",
+    "frames",
+    "gauss_legendre",
+    "midpoints",
+    "project",
+    "shade",
+    "true_flow",
+    "truth",
+    "view",
 ]

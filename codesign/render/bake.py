@@ -1,7 +1,9 @@
 """Light of a Lambertian scene, computed once by path tracing and kept as emissive textures.
 
-Outgoing radiance of a Lambertian surface is emission + albedo x irradiance / pi, the same from every side. Irradiance is smooth, so it is estimated on a
-coarse light map; albedo and emission are read at their own resolution; the product is the texture of a ``MitsubaScene``.
+Outgoing radiance of a Lambertian surface is emission + albedo x irradiance / pi, the same from every side.
+Irradiance is smooth, so it is estimated on a
+coarse light map; albedo and emission are read at their own resolution; the product is the texture of a
+``MitsubaScene``.
 """
 
 import itertools
@@ -15,34 +17,62 @@ from codesign.errors import DomainError
 from codesign.render.charts import Faces, charts_of, placed
 from codesign.render.world import MitsubaScene
 
-LIFT = 5e-5  # of (1 m + distance from the origin): height over the surface from which a texel is looked at; about half of Mitsuba's own ray offset
-SIZES = (1 << 14, 1 << 17, 1 << 20)  # of launches: a new size is a new kernel, so points are padded to one of these
+# of (1 m + distance from the origin): height over the surface from which a texel is looked at; about half of
+# Mitsuba's own ray offset
+LIFT = 5e-5
+SIZES = (
+    1 << 14,
+    1 << 17,
+    1 << 20,
+)  # of launches: a new size is a new kernel, so points are padded to one of these
 FACE = 8  # times the samples of a texel for a face, since faces are larger than texels
 DARK = 1e-4  # an albedo below this shows no light worth measuring
 INVISIBLE = ("point", "directional", "spot")  # lamps that no camera ray meets
 
 
-def bake(description, device="cpu", *, texel_m=0.05, samples=64, seed=0, max_depth=8, max_texels=512, fine=10):
+def bake(
+    description, device="cpu", *, texel_m=0.05, samples=64, seed=0, max_depth=8, max_texels=512, fine=10
+):
     """A MitsubaScene whose emissive textures are the outgoing radiance of a Lambertian scene.
 
     Args:
-      description: Mitsuba scene dictionary of rectangles, disks, spheres, cylinders, cubes and meshes (dictionaries, or mi.Mesh objects) with 'diffuse'
-        BSDFs, area emitters where they glow, and lamps of any kind. Environment maps stay in the scene, seen and lighting.
-      texel_m: size of light-map texels, from 4 to max_texels along each side of a shape. samples: paths per texel; seed: of all of them.
-      max_depth: longest path. fine: texels of a finished texture per light-map texel along each side, unless its picture is coarser than that.
-    Returns: MitsubaScene. Meshes without texture coordinates get one radiance per face, cubes a texture of six parts.
-    Error: noise of about 1 / sqrt(samples) of what arrives indirectly, light smeared over a texel at contact shadows; see light.level_error.
-    Raises: DomainError for surfaces that are not diffuse (their radiance depends on the side one looks from), two-sided ones (one texture per surface),
+      description: Mitsuba scene dictionary of rectangles, disks, spheres, cylinders, cubes and meshes
+        (dictionaries, or mi.Mesh objects) with 'diffuse'
+        BSDFs, area emitters where they glow, and lamps of any kind. Environment maps stay in the scene, seen
+        and lighting.
+      texel_m: size of light-map texels, from 4 to max_texels along each side of a shape. samples: paths per
+        texel; seed: of all of them.
+      max_depth: longest path. fine: texels of a finished texture per light-map texel along each side, unless
+        its picture is coarser than that.
+    Returns: MitsubaScene. Meshes without texture coordinates get one radiance per face, cubes a texture of
+      six parts.
+    Error: noise of about 1 / sqrt(samples) of what arrives indirectly, light smeared over a texel at contact
+      shadows; see light.level_error.
+    Raises: DomainError for surfaces that are not diffuse (their radiance depends on the side one looks from),
+      two-sided ones (one texture per surface),
       shapes without known charts, texture coordinates that overlap or leave the unit square.
     """
     if not (texel_m > 0 and samples >= 1 and max_texels >= 4 and fine >= 1):
-        raise DomainError(f"bake: texel_m = {texel_m}, samples = {samples}, max_texels = {max_texels}, fine = {fine}: sizes must be positive, samples and fine at least 1, max_texels at least 4.")
+        raise DomainError(
+            f"bake: texel_m = {texel_m}, samples = {samples}, max_texels = {max_texels}, fine = {fine}: "
+            "sizes must be positive, samples and fine at least 1, max_texels at least 4."
+        )
     lit = MitsubaScene(description, device, merge=False)  # every shape keeps its name
     mi = lit.mi
     _check_surfaces(mi, lit.scene, description)
-    work = _Bake(mi, lit.scene, mi.load_dict({"type": "path", "max_depth": int(max_depth), "rr_depth": 64}), np.random.default_rng(seed), int(samples), float(texel_m), int(max_texels), int(fine))
+    work = _Bake(
+        mi,
+        lit.scene,
+        mi.load_dict({"type": "path", "max_depth": int(max_depth), "rr_depth": 64}),
+        np.random.default_rng(seed),
+        int(samples),
+        float(texel_m),
+        int(max_texels),
+        int(fine),
+    )
     shapes = {shape.id(): shape for shape in lit.scene.shapes()}
-    kept, found = {}, {}
+    kept = {}
+    found = {}
     for name, entry in description.items():
         kind = entry.get("type") if isinstance(entry, dict) else None
         if kind in ("envmap", "constant", "sunsky"):
@@ -51,10 +81,32 @@ def bake(description, device="cpu", *, texel_m=0.05, samples=64, seed=0, max_dep
             shape = entry if kind is None else shapes[name]
             found[name] = (entry, shape, charts_of(mi, name, entry, shape))
         elif kind not in INVISIBLE and isinstance(entry, dict):
-            raise DomainError(f"bake: '{name}' of type '{kind}' is neither a shape nor a light that is known here; leave it out.")
-    textures = work.textures([(name, entry, chart) for name, (entry, _, charts) in found.items() if not isinstance(charts, Faces) for chart in charts])
-    radiance = {name: work.faces(charts) if isinstance(charts, Faces) else [next(textures) for _ in charts] for name, (_, _, charts) in found.items()}
-    return MitsubaScene({**{name: placed(mi, entry, shape, charts, radiance[name]) for name, (entry, shape, charts) in found.items()}, **kept}, device)  # made last: each new object would mean new kernels
+            raise DomainError(
+                f"bake: '{name}' of type '{kind}' is neither a shape nor a light that is known here; leave "
+                "it out."
+            )
+    textures = work.textures(
+        [
+            (name, entry, chart)
+            for name, (entry, _, charts) in found.items()
+            if not isinstance(charts, Faces)
+            for chart in charts
+        ]
+    )
+    radiance = {
+        name: work.faces(charts) if isinstance(charts, Faces) else [next(textures) for _ in charts]
+        for name, (_, _, charts) in found.items()
+    }
+    return MitsubaScene(
+        {
+            **{
+                name: placed(mi, entry, shape, charts, radiance[name])
+                for name, (entry, shape, charts) in found.items()
+            },
+            **kept,
+        },
+        device,
+    )  # made last: each new object would mean new kernels
 
 
 def _check_surfaces(mi, scene, description):
@@ -62,12 +114,23 @@ def _check_surfaces(mi, scene, description):
         bsdf = shape.bsdf()
         if bsdf is None:
             continue
-        flags, name = bsdf.flags(), shape.id()
-        lambertian = int(mi.BSDFFlags.DiffuseReflection) | int(mi.BSDFFlags.FrontSide) | int(mi.BSDFFlags.SpatiallyVarying)
+        flags = bsdf.flags()
+        name = shape.id()
+        lambertian = (
+            int(mi.BSDFFlags.DiffuseReflection)
+            | int(mi.BSDFFlags.FrontSide)
+            | int(mi.BSDFFlags.SpatiallyVarying)
+        )
         if int(flags) & int(mi.BSDFFlags.BackSide):
-            raise DomainError(f"bake: shape '{name}' reflects on both sides, and one texture holds one; use a plain 'diffuse' surface on a closed shape.")
+            raise DomainError(
+                f"bake: shape '{name}' reflects on both sides, and one texture holds one; use a plain "
+                "'diffuse' surface on a closed shape."
+            )
         if int(flags) & ~lambertian:
-            raise DomainError(f"bake: shape '{name}' is not Lambertian, so its radiance depends on where it is seen from; use 'diffuse', or PathScene.")
+            raise DomainError(
+                f"bake: shape '{name}' is not Lambertian, so its radiance depends on where it is seen from; "
+                "use 'diffuse', or PathScene."
+            )
 
 
 @dataclass(frozen=True)
@@ -83,10 +146,13 @@ class _Bake:
 
     def textures(self, jobs):
         """Outgoing radiance [H, W] of each (name, entry, chart), in order."""
-        coarse, fine = [self._coarse(chart) for _, _, chart in jobs], [self._fine(entry, chart) for _, entry, chart in jobs]
+        coarse = [self._coarse(chart) for _, _, chart in jobs]
+        fine = [self._fine(entry, chart) for _, entry, chart in jobs]
         total, count = ([np.zeros(rows * columns) for rows, columns in coarse] for _ in range(2))
         there = [False] * len(jobs)
-        for (k, texel, inside), light, albedo, _, seen in self._stream(self._coarse_points(jobs, coarse), True):
+        for (k, texel, inside), light, albedo, _, seen in self._stream(
+            self._coarse_points(jobs, coarse), True
+        ):
             seen &= inside
             there[k] |= bool(seen.any())
             seen &= albedo > DARK
@@ -94,9 +160,14 @@ class _Bake:
             count[k] += np.bincount(texel, seen, len(total[k]))
         for k, (name, _, _) in enumerate(jobs):
             if not there[k]:
-                raise DomainError(f"bake: nothing of shape '{name}' can be seen from its front; another shape covers it, or its normals point inwards.")
+                raise DomainError(
+                    f"bake: nothing of shape '{name}' can be seen from its front; another shape covers it, "
+                    "or its normals point inwards."
+                )
         for (k, inside), _, albedo, emission, seen in self._stream(self._fine_points(jobs, fine), False):
-            light = _filled((total[k] / np.maximum(count[k], 1)).reshape(coarse[k]), (count[k] > 0).reshape(coarse[k]))
+            light = _filled(
+                (total[k] / np.maximum(count[k], 1)).reshape(coarse[k]), (count[k] > 0).reshape(coarse[k])
+            )
             seen = (seen & inside).reshape(fine[k])
             albedo, emission = (_filled(part.reshape(fine[k]), seen) for part in (albedo, emission))
             yield (emission + albedo * _resized(light, fine[k])).astype(np.float32)
@@ -108,7 +179,9 @@ class _Bake:
             for start in range(0, rows * columns, block):
                 texel = np.repeat(np.arange(start, min(start + block, rows * columns)), self.samples)
                 shift = self.random.random((2, texel.size))
-                points, normals, inside = chart.at((texel % columns + shift[0]) / columns, (texel // columns + shift[1]) / rows)
+                points, normals, inside = chart.at(
+                    (texel % columns + shift[0]) / columns, (texel // columns + shift[1]) / rows
+                )
                 yield points, normals, (k, texel, inside)
 
     def _fine_points(self, jobs, sizes):
@@ -119,25 +192,37 @@ class _Bake:
             yield points, normals, (k, inside)
 
     def _stream(self, requests, paths):
-        """Answers of ``_look`` to (points, normals, tag), as (tag, *answers) in order; small requests share a launch, since setting one up costs a tenth of a second."""
-        waiting, lanes = [], 0
+        """Answers of ``_look`` to (points, normals, tag), as (tag, *answers) in order; small requests share a
+        launch, since setting one up costs a tenth of a second."""
+        waiting = []
+        lanes = 0
         for request in itertools.chain(requests, [None]):
             if waiting and (request is None or lanes + len(request[0]) > SIZES[-1]):
                 points, normals = (np.concatenate([np.float32(row[k]) for row in waiting]) for k in (0, 1))
                 ends = np.cumsum([len(row[0]) for row in waiting])[:-1]
-                for (_, _, tag), *answers in zip(waiting, *(np.split(part, ends) for part in self._look(points, normals, paths)), strict=True):
+                for (_, _, tag), *answers in zip(
+                    waiting,
+                    *(np.split(part, ends) for part in self._look(points, normals, paths)),
+                    strict=True,
+                ):
                     yield tag, *answers
-                waiting, lanes = [], 0
+                waiting = []
+                lanes = 0
             if request is not None:
                 waiting.append(request)
                 lanes += len(request[0])
 
     def _fine(self, entry, chart):
-        """Texels (rows, columns) of the finished texture: those of the pictures on the shape, but no more than ``fine`` per light-map texel."""
+        """Texels (rows, columns) of the finished texture: those of the pictures on the shape, but no more
+        than ``fine`` per light-map texel."""
         coarse = np.array(self._coarse(chart))
         wanted = [2 * coarse]
         for surface, slot in (("bsdf", "reflectance"), ("emitter", "radiance")):
-            picture = entry.get(surface, {}).get(slot) if isinstance(entry, dict) and isinstance(entry.get(surface), dict) else None
+            picture = (
+                entry.get(surface, {}).get(slot)
+                if isinstance(entry, dict) and isinstance(entry.get(surface), dict)
+                else None
+            )
             if isinstance(picture, dict) and picture.get("type") == "bitmap" and "bitmap" in picture:
                 columns, rows = picture["bitmap"].size()
                 scale = np.array(picture["to_uv"].matrix, dtype=float) if "to_uv" in picture else np.eye(3)
@@ -145,38 +230,59 @@ class _Bake:
         return tuple(int(n) for n in np.minimum(np.max(wanted, 0), np.maximum(self.fine, 2) * coarse))
 
     def _coarse(self, chart):
-        return tuple(int(n) for n in np.clip(np.ceil(np.array(chart.size_m)[::-1] / self.texel_m), 4, self.max_texels))
+        return tuple(
+            int(n) for n in np.clip(np.ceil(np.array(chart.size_m)[::-1] / self.texel_m), 4, self.max_texels)
+        )
 
     def faces(self, charts):
         """Outgoing radiance [F] of faces."""
         points, normals = charts.points(self.random, FACE * self.samples)
-        light, albedo, emission, seen = (part.reshape(points.shape[:2]) for part in self._look(points.reshape(-1, 3), np.repeat(normals, FACE * self.samples, 0), True))
-        return (np.where(seen, emission + albedo * light, 0).sum(1) / np.maximum(seen.sum(1), 1)).astype(np.float32)
+        light, albedo, emission, seen = (
+            part.reshape(points.shape[:2])
+            for part in self._look(points.reshape(-1, 3), np.repeat(normals, FACE * self.samples, 0), True)
+        )
+        return (np.where(seen, emission + albedo * light, 0).sum(1) / np.maximum(seen.sum(1), 1)).astype(
+            np.float32
+        )
 
     def _look(self, points, normals, paths):
-        """Light (irradiance / pi), albedo, emission and whether the surface is there, for points just before a surface; numpy [N]."""
+        """Light (irradiance / pi), albedo, emission and whether the surface is there, for points just before
+        a surface; numpy [N]."""
         import drjit as dr
 
-        mi, parts = self.mi, []
+        mi = self.mi
+        parts = []
         for start in range(0, len(points), SIZES[-1]):
-            p, n = points[start : start + SIZES[-1]], normals[start : start + SIZES[-1]]
-            count, width = len(p), next(size for size in SIZES if size >= len(p))
+            p = points[start : start + SIZES[-1]]
+            n = normals[start : start + SIZES[-1]]
+            count = len(p)
+            width = next(size for size in SIZES if size >= len(p))
             p, n = (np.concatenate([part, np.broadcast_to(part[-1], (width - count, 3))]) for part in (p, n))
             lift = LIFT * (1 + np.abs(p).max(1))
-            ray = mi.RayDifferential3f(mi.Point3f(*_columns(mi, p + lift[:, None] * n)), mi.Vector3f(*_columns(mi, -n)))
+            ray = mi.RayDifferential3f(
+                mi.Point3f(*_columns(mi, p + lift[:, None] * n)), mi.Vector3f(*_columns(mi, -n))
+            )
             si = self.scene.ray_intersect(mi.Ray3f(ray.o, ray.d))
             bsdf = si.bsdf()
-            albedo, emission = bsdf.eval_diffuse_reflectance(si)[0], si.emitter(self.scene).eval(si)[0]
+            albedo = bsdf.eval_diffuse_reflectance(si)[0]
+            emission = si.emitter(self.scene).eval(si)[0]
             height = mi.Float(lift.astype(np.float32))
             seen = si.is_valid() & (si.t > 0.5 * height) & (si.t < 2 * height)
             light = mi.Float(0)
             if paths:
                 sampler = mi.load_dict({"type": "independent"})
-                sampler.seed(dr.opaque(mi.UInt32, int(self.random.integers(2**31))), width)  # opaque: one kernel for all calls
+                sampler.seed(
+                    dr.opaque(mi.UInt32, int(self.random.integers(2**31))), width
+                )  # opaque: one kernel for all calls
                 radiance = self.integrator.sample(self.scene, sampler, ray)[0][0]
                 light = dr.maximum(radiance - emission, 0) / dr.maximum(albedo, DARK)
             dr.eval(light, albedo, emission, seen)
-            parts.append([np.broadcast_to(np.array(part), (width,))[:count].astype(kind) for part, kind in ((light, float), (albedo, float), (emission, float), (seen, bool))])
+            parts.append(
+                [
+                    np.broadcast_to(np.array(part), (width,))[:count].astype(kind)
+                    for part, kind in ((light, float), (albedo, float), (emission, float), (seen, bool))
+                ]
+            )
         return [np.concatenate(column) for column in zip(*parts, strict=True)]
 
 
@@ -195,5 +301,3 @@ def _filled(values, known):
 def _resized(light, shape):
     """Bilinear, texel centres at half-integers as a texture lookup has them."""
     return zoom(light, np.array(shape) / light.shape, order=1, mode="nearest", grid_mode=True)
-
-

@@ -9,15 +9,19 @@ from codesign.errors import DomainError, check_finite
 from codesign.render.sampling import film_pupil_pattern
 from codesign.types import Rays
 
-_NEWTON_STEPS, _STEP_MM = 8, 1e-4
-_SHRINK_STEPS, _SHRINK = 3, 0.85  # a first guess beyond the lens's field is drawn towards the axis this often, by this factor
+_NEWTON_STEPS = 8
+_STEP_MM = 1e-4
+# a first guess beyond the lens's field is drawn towards the axis this often, by this factor
+_SHRINK_STEPS = 3
+_SHRINK = 0.85
 
 
 @dataclass(frozen=True)
 class Film:
     """Pixels of a sensor, or of rectangular windows on it.
 
-    windows_px: tuple of (left, top); each window has height_px rows and width_px columns. A pixel's coordinate is that of its
+    windows_px: tuple of (left, top); each window has height_px rows and width_px columns. A pixel's
+      coordinate is that of its
     centre: column 0 of the full sensor is x = 0, and the lens axis is at the sensor's middle.
     """
 
@@ -35,24 +39,43 @@ class Film:
         if not 0 < self.pixel_pitch_mm < float("inf"):
             raise DomainError(f"camera: pixel_pitch_mm = {self.pixel_pitch_mm} must be positive and finite.")
         if self.windows_px is not None and len(self.windows_px) == 0:
-            raise DomainError("camera: there is no window on the film; give at least one, or None for the whole sensor.")
+            raise DomainError(
+                "camera: there is no window on the film; give at least one, or None for the whole sensor."
+            )
         for left, top in self.windows_px or ((0, 0),):
-            if not (0 <= left <= self.sensor_width_px - self.width_px and 0 <= top <= self.sensor_height_px - self.height_px):
-                raise DomainError(f"camera: the window ({left}, {top}) of {self.width_px} x {self.height_px} pixels does not lie on the sensor of {self.sensor_width_px} x {self.sensor_height_px}; move or shrink it.")
+            if not (
+                0 <= left <= self.sensor_width_px - self.width_px
+                and 0 <= top <= self.sensor_height_px - self.height_px
+            ):
+                raise DomainError(
+                    f"camera: the window ({left}, {top}) of {self.width_px} x {self.height_px} pixels does "
+                    f"not lie on the sensor of {self.sensor_width_px} x {self.sensor_height_px}; move or "
+                    "shrink it."
+                )
         return self
 
     @property
     def shape(self):
         """Shape of one image: (H, W), or (windows, H, W)."""
-        return (self.height_px, self.width_px) if self.windows_px is None else (len(self.windows_px), self.height_px, self.width_px)
+        return (
+            (self.height_px, self.width_px)
+            if self.windows_px is None
+            else (len(self.windows_px), self.height_px, self.width_px)
+        )
 
     @property
     def middle_px(self):
-        return torch.tensor([(self.sensor_width_px - 1) / 2, (self.sensor_height_px - 1) / 2], dtype=torch.float64)
+        return torch.tensor(
+            [(self.sensor_width_px - 1) / 2, (self.sensor_height_px - 1) / 2], dtype=torch.float64
+        )
 
     def pixels(self):
         """Coordinates (x, y) of all pixel centres on the full sensor, [P, 2] float64, in image order."""
-        y, x = torch.meshgrid(torch.arange(self.height_px, dtype=torch.float64), torch.arange(self.width_px, dtype=torch.float64), indexing="ij")
+        y, x = torch.meshgrid(
+            torch.arange(self.height_px, dtype=torch.float64),
+            torch.arange(self.width_px, dtype=torch.float64),
+            indexing="ij",
+        )
         base = torch.stack([x.reshape(-1), y.reshape(-1)], 1)
         corners = torch.tensor(self.windows_px or ((0, 0),), dtype=torch.float64)
         return (corners[:, None] + base).reshape(-1, 2)
@@ -66,19 +89,43 @@ def _check_whole(label, value):
 class Camera:
     """A lens (GeoLens, ThinLens or Pinhole: anything with ``camera_rays``) before a film.
 
-    The same seed gives the same film and pupil samples in every frame and for every lens state (common random numbers).
-    spectrum: anything with wavelengths_um and weights (sum 1), such as lens.Spectrum: each takes an equal share of the samples; None is the d line.
-    falloff: whether the natural illumination falloff (cos^4 and pupil growth) darkens the image; without it the image is as after flat-field correction.
-    aim: whether pupil samples lie on the real stop instead of the paraxial exit pupil; several traces more per frame.
+    The same seed gives the same film and pupil samples in every frame and for every lens state (common random
+    numbers).
+    spectrum: anything with wavelengths_um and weights (sum 1), such as lens.Spectrum: each takes an equal
+      share of the samples; None is the d line.
+    falloff: whether the natural illumination falloff (cos^4 and pupil growth) darkens the image; without it
+      the image is as after flat-field correction.
+    aim: whether pupil samples lie on the real stop instead of the paraxial exit pupil; several traces more
+      per frame.
     """
 
-    def __init__(self, lens, width_px, height_px, pixel_pitch_mm, samples_per_pixel=16, seed=0, film=None, *, spectrum=None, falloff=False, aim=False):
+    def __init__(
+        self,
+        lens,
+        width_px,
+        height_px,
+        pixel_pitch_mm,
+        samples_per_pixel=16,
+        seed=0,
+        film=None,
+        *,
+        spectrum=None,
+        falloff=False,
+        aim=False,
+    ):
         _check_whole("samples_per_pixel", samples_per_pixel)
         if spectrum is not None and samples_per_pixel % len(spectrum.wavelengths_um):
-            raise DomainError(f"camera: {samples_per_pixel} samples per pixel cannot be shared equally by {len(spectrum.wavelengths_um)} wavelengths; make the one a multiple of the other.")
-        self.lens, self.samples_per_pixel, self.seed = lens, int(samples_per_pixel), int(seed)
+            raise DomainError(
+                f"camera: {samples_per_pixel} samples per pixel cannot be shared equally by "
+                f"{len(spectrum.wavelengths_um)} wavelengths; make the one a multiple of the other."
+            )
+        self.lens = lens
+        self.samples_per_pixel = int(samples_per_pixel)
+        self.seed = int(seed)
         self.film = (film or Film(width_px, height_px, width_px, height_px, pixel_pitch_mm)).check()
-        self.spectrum, self.falloff, self.aim = spectrum, falloff, aim
+        self.spectrum = spectrum
+        self.falloff = falloff
+        self.aim = aim
 
     def with_lens(self, lens):
         """The same film and samples behind another lens."""
@@ -97,26 +144,47 @@ class Camera:
         return (pixels - self.film.middle_px.to(pixels)) * self.film.pixel_pitch_mm
 
     def rays(self):
-        """All rays of one frame, pixel after pixel, samples_per_pixel each: Rays with N = pixels x samples, in the lens's dtype. Gradient: to the lens."""
+        """All rays of one frame, pixel after pixel, samples_per_pixel each: Rays with N = pixels x samples,
+        in the lens's dtype. Gradient: to the lens."""
         offset, pupil = film_pupil_pattern(self.samples_per_pixel, self.seed)
         if self.spectrum is None:
-            rays, light = self._rays(offset, pupil), None
+            rays = self._rays(offset, pupil)
+            light = None
         else:
             colours = len(self.spectrum.wavelengths_um)
-            parts = [self._rays(o, p, wavelength_um=w) for w, o, p in zip(self.spectrum.wavelengths_um, offset.chunk(colours), pupil.chunk(colours), strict=True)]
+            parts = [
+                self._rays(o, p, wavelength_um=w)
+                for w, o, p in zip(
+                    self.spectrum.wavelengths_um, offset.chunk(colours), pupil.chunk(colours), strict=True
+                )
+            ]
             rays = Rays(*(self._joined([getattr(part, f.name) for part in parts]) for f in fields(Rays)))
-            light = torch.tensor(self.spectrum.weights).repeat_interleave(self.samples_per_pixel // colours).to(rays.weight).repeat(self.film.pixels().shape[0]) * colours
+            light = (
+                torch.tensor(self.spectrum.weights)
+                .repeat_interleave(self.samples_per_pixel // colours)
+                .to(rays.weight)
+                .repeat(self.film.pixels().shape[0])
+                * colours
+            )
         weight = rays.weight if light is None else rays.weight * light
         if self.falloff:
             if rays.irradiance is None:
-                raise DomainError("camera: this lens does not say how illumination falls off; leave falloff=False.")
+                raise DomainError(
+                    "camera: this lens does not say how illumination falls off; leave falloff=False."
+                )
             weight = weight * rays.irradiance
         return replace(rays, weight=weight)
 
     def _rays(self, offset, pupil, **wavelength):
-        pixels, dtype = self.film.pixels(), self.lens.dtype
+        pixels = self.film.pixels()
+        dtype = self.lens.dtype
         points = (pixels[:, None] + offset).reshape(-1, 2)
-        return self.lens.camera_rays(self.film_mm(points).to(dtype), pupil.repeat(pixels.shape[0], 1).to(dtype), aim=self.aim, **wavelength)
+        return self.lens.camera_rays(
+            self.film_mm(points).to(dtype),
+            pupil.repeat(pixels.shape[0], 1).to(dtype),
+            aim=self.aim,
+            **wavelength,
+        )
 
     def _joined(self, parts):
         """Rays of several colours, pixel after pixel."""
@@ -130,8 +198,12 @@ class Camera:
     def slope_per_px(self):
         """Slope of a chief ray per pixel, near the axis; no gradient."""
         with torch.no_grad():
-            rays = self.chief_rays(self.film.middle_px + torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64))
-        return float(rays.direction[1, 0] / rays.direction[1, 2] - rays.direction[0, 0] / rays.direction[0, 2])
+            rays = self.chief_rays(
+                self.film.middle_px + torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
+            )
+        return float(
+            rays.direction[1, 0] / rays.direction[1, 2] - rays.direction[0, 0] / rays.direction[0, 2]
+        )
 
     def rays_through(self, pixels, pupil):
         """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil: Rays, float64."""
@@ -139,11 +211,15 @@ class Camera:
 
 
 def project(camera, points_cam_m, pupil=None):
-    """Pixel coordinates whose ray through a point of the pupil (the centre when none is given) passes through points of space.
+    """Pixel coordinates whose ray through a point of the pupil (the centre when none is given) passes through
+    points of space.
 
-    Args: points_cam_m [N, 3], camera axes, metres, in front of the camera. pupil: [N, 2] on the unit disc, or None for chief rays.
-    Returns: [N, 2] px (the centre of the first pixel is 0, 0), float64; NaN for points that no such ray reaches (outside the lens's field).
-    Gradient: to the points and to the lens, by the implicit function theorem (one Newton step with gradients at the solution); 0 to NaN points.
+    Args: points_cam_m [N, 3], camera axes, metres, in front of the camera. pupil: [N, 2] on the unit disc, or
+      None for chief rays.
+    Returns: [N, 2] px (the centre of the first pixel is 0, 0), float64; NaN for points that no such ray
+      reaches (outside the lens's field).
+    Gradient: to the points and to the lens, by the implicit function theorem (one Newton step with gradients
+      at the solution); 0 to NaN points.
     Raises: DomainError when a point is not finite or not in front of the camera.
     """
     check_finite(points_cam_m, "points to project", "drop them first")
@@ -156,14 +232,25 @@ def project(camera, points_cam_m, pupil=None):
         step = _STEP_MM / camera.film.pixel_pitch_mm
         shifts = torch.tensor([[0.0, 0.0], [step, 0.0], [0.0, step]], dtype=at.dtype)
         for turn in range(_NEWTON_STEPS):
-            miss, passes = _miss(camera, (at[None] + shifts[:, None]).reshape(-1, 2), points_cam_m.repeat(3, 1), pupil.repeat(3, 1))
+            miss, passes = _miss(
+                camera,
+                (at[None] + shifts[:, None]).reshape(-1, 2),
+                points_cam_m.repeat(3, 1),
+                pupil.repeat(3, 1),
+            )
             miss, ahead_x, ahead_y = miss.reshape(3, -1, 2)
             jacobian = torch.stack([ahead_x - miss, ahead_y - miss], -1) / step
-            found = passes.reshape(3, -1).all(0) & (torch.linalg.det(jacobian).abs() > 1e-12 * jacobian.square().sum((1, 2)))
+            found = passes.reshape(3, -1).all(0) & (
+                torch.linalg.det(jacobian).abs() > 1e-12 * jacobian.square().sum((1, 2))
+            )
             jacobian = torch.where(found[:, None, None], jacobian, torch.eye(2, dtype=at.dtype))
             change = torch.linalg.solve(jacobian, miss)
-            at = torch.where(found[:, None], at - change, camera.film.middle_px + _SHRINK * (at - camera.film.middle_px))
-            if bool((change[found].abs() < 1e-6).all() & (found.all() | (turn >= _SHRINK_STEPS))):  # the next step would be its square
+            at = torch.where(
+                found[:, None], at - change, camera.film.middle_px + _SHRINK * (at - camera.film.middle_px)
+            )
+            if bool(
+                (change[found].abs() < 1e-6).all() & (found.all() | (turn >= _SHRINK_STEPS))
+            ):  # the next step would be its square
                 break
     miss, passes = _miss(camera, at, points_cam_m, pupil)
     change = torch.linalg.solve(jacobian, torch.where(found[:, None], miss, 0))
@@ -172,19 +259,26 @@ def project(camera, points_cam_m, pupil=None):
 
 
 def _miss(camera, pixels, points_cam_m, pupil):
-    """Where rays pass the depth of the points, minus the points: [N, 2] metres; and whether light takes them: [N]."""
-    rays = camera.rays_through(torch.cat([camera.film.middle_px.reshape(1, 2), pixels]), torch.cat([pupil.new_zeros(1, 2), pupil]))  # the axial ray goes along: a lens that passes nothing at all is an error
-    origin, direction = rays.origin_m[1:], rays.direction[1:]
+    """Where rays pass the depth of the points, minus the points: [N, 2] metres; and whether light takes them:
+    [N]."""
+    rays = camera.rays_through(
+        torch.cat([camera.film.middle_px.reshape(1, 2), pixels]), torch.cat([pupil.new_zeros(1, 2), pupil])
+    )  # the axial ray goes along: a lens that passes nothing at all is an error
+    origin = rays.origin_m[1:]
+    direction = rays.direction[1:]
     passes = (rays.weight.detach()[1:] > 0) & (direction.detach()[:, 2] > 1e-6)
     ahead = (points_cam_m[:, 2:] - origin[:, 2:]) / torch.where(passes[:, None], direction[:, 2:], 1)
     return origin[:, :2] + direction[:, :2] * ahead - points_cam_m[:, :2], passes
 
 
 def angular_miss_rad(camera, pixels, points_cam_m):
-    """Angle by which the chief rays of pixel coordinates [N, 2] miss points [N, 3] given in camera axes: [N] rad.
+    """Angle by which the chief rays of pixel coordinates [N, 2] miss points [N, 3] given in camera axes: [N]
+    rad.
 
-    A flow error in task units: zero when the pixel images the point, whatever the focal length and distortion.
-    Gradient: to the pixels, the points and the lens; smooth at zero, where the value is 1e-6 rad instead of 0.
+    A flow error in task units: zero when the pixel images the point, whatever the focal length and
+      distortion.
+    Gradient: to the pixels, the points and the lens; smooth at zero, where the value is 1e-6 rad instead of
+      0.
     """
     rays = camera.chief_rays(pixels)
     towards = torch.nn.functional.normalize(points_cam_m - rays.origin_m, dim=1)

@@ -1,4 +1,5 @@
-"""Where the texels of a shape lie: charts from texture coordinates to points and normals, for shapes whose light is baked."""
+"""Where the texels of a shape lie: charts from texture coordinates to points and normals, for shapes whose
+light is baked."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,13 +9,15 @@ import numpy as np
 
 from codesign.errors import DomainError
 
-CUBE_GAP = 2  # texels around each face of a cube's texture that repeat its border, so that interpolation sees no neighbour
+# texels around each face of a cube's texture that repeat its border, so that interpolation sees no neighbour
+CUBE_GAP = 2
 OVERLAP = 1.02  # area of all triangles in texture space over the area they cover
 
 
 @dataclass(frozen=True)
 class Chart:
-    """A map from the unit square to a surface: ``at`` takes u, v [N] (v up) and gives points [N, 3], normals [N, 3], on the surface [N]. size_m: its extent along u and v."""
+    """A map from the unit square to a surface: ``at`` takes u, v [N] (v up) and gives points [N, 3], normals
+    [N, 3], on the surface [N]. size_m: its extent along u and v."""
 
     size_m: tuple[float, float]
     at: Callable[[Any, Any], tuple[Any, Any, Any]]
@@ -22,22 +25,27 @@ class Chart:
 
 @dataclass(frozen=True)
 class Faces:
-    """A triangle mesh without texture coordinates: corners [F, 3, 3]; flip: -1 where normals point to the other side."""
+    """A triangle mesh without texture coordinates: corners [F, 3, 3]; flip: -1 where normals point to the
+    other side."""
 
     corners: np.ndarray
     flip: float
 
     def points(self, random, samples):
         """Uniform points [F, samples, 3] on every face, and the faces' normals [F, 3]."""
-        s, t = np.sqrt(random.random((len(self.corners), samples))), random.random((len(self.corners), samples))
+        s = np.sqrt(random.random((len(self.corners), samples)))
+        t = random.random((len(self.corners), samples))
         weights = np.stack([1 - s, s * (1 - t), s * t], -1)
         across = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
-        return weights @ self.corners, self.flip * across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-30)
+        return weights @ self.corners, self.flip * across / np.maximum(
+            np.linalg.norm(across, axis=1, keepdims=True), 1e-30
+        )
 
 
 def charts_of(mi, name, entry, shape) -> Any:
     """Charts of a Mitsuba shape, or Faces. Raises: DomainError for a shape that has neither."""
-    kind, flip = shape.shape_type(), -1.0 if shape.has_flipped_normals() else 1.0
+    kind = shape.shape_type()
+    flip = -1.0 if shape.has_flipped_normals() else 1.0
     parameters = mi.traverse(shape)
     if kind == int(mi.ShapeType.Rectangle):
         return [_rectangle(_matrix(parameters), flip)]
@@ -48,13 +56,26 @@ def charts_of(mi, name, entry, shape) -> Any:
     if kind == int(mi.ShapeType.Cylinder):
         return [_cylinder(_matrix(parameters), flip)]
     if not shape.is_mesh():
-        raise DomainError(f"bake: shape '{name}' has no texture chart here; use meshes, rectangles, cubes, spheres, disks and cylinders, or PathScene.")
+        raise DomainError(
+            f"bake: shape '{name}' has no texture chart here; use meshes, rectangles, cubes, spheres, disks "
+            "and cylinders, or PathScene."
+        )
     vertices, faces = mesh_arrays(parameters)
     if isinstance(entry, dict) and entry.get("type") == "cube":
         return [_rectangle(frame, 1.0) for frame in cube_frames(_cube_matrix(entry))]
     if not shape.has_vertex_texcoords():
         return Faces(vertices[faces], flip)
-    return [_unwrapped(mi, name, shape, vertices, faces, np.array(parameters["vertex_texcoords"], dtype=float).reshape(-1, 2), flip)]
+    return [
+        _unwrapped(
+            mi,
+            name,
+            shape,
+            vertices,
+            faces,
+            np.array(parameters["vertex_texcoords"], dtype=float).reshape(-1, 2),
+            flip,
+        )
+    ]
 
 
 def placed(mi, entry, shape, charts, textures):
@@ -66,9 +87,22 @@ def placed(mi, entry, shape, charts, textures):
         atlas, vertices, faces, uv = cube_atlas(cube_frames(_cube_matrix(entry)), textures)
         return emissive_mesh(mi, vertices, faces, emitter(mi, atlas), uv)
     if isinstance(entry, dict):
-        return {**{key: value for key, value in entry.items() if key not in ("bsdf", "emitter") and not _is_surface(value)}, "emitter": emitter(mi, textures[0])}
+        return {
+            **{
+                key: value
+                for key, value in entry.items()
+                if key not in ("bsdf", "emitter") and not _is_surface(value)
+            },
+            "emitter": emitter(mi, textures[0]),
+        }
     parameters = mi.traverse(shape)
-    return emissive_mesh(mi, *mesh_arrays(parameters), emitter(mi, textures[0]), np.array(parameters["vertex_texcoords"]).reshape(-1, 2), flip=shape.has_flipped_normals())
+    return emissive_mesh(
+        mi,
+        *mesh_arrays(parameters),
+        emitter(mi, textures[0]),
+        np.array(parameters["vertex_texcoords"]).reshape(-1, 2),
+        flip=shape.has_flipped_normals(),
+    )
 
 
 def _is_surface(value):
@@ -77,14 +111,27 @@ def _is_surface(value):
 
 def emitter(mi, texture):
     """Area emitter of a texture [H, W] whose first row is v = 0."""
-    return {"type": "area", "radiance": {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(texture, dtype=np.float32)[..., None]), "raw": True, "wrap_mode": "clamp"}}
+    return {
+        "type": "area",
+        "radiance": {
+            "type": "bitmap",
+            "bitmap": mi.Bitmap(np.ascontiguousarray(texture, dtype=np.float32)[..., None]),
+            "raw": True,
+            "wrap_mode": "clamp",
+        },
+    }
 
 
 def emissive_mesh(mi, vertices, faces, light, uv=None, flip=False, bsdf=None):
-    """A Mitsuba mesh of flat faces: ``light`` is an emitter dictionary, an array [F] of radiance per face, or None; ``bsdf`` a dictionary or None."""
+    """A Mitsuba mesh of flat faces: ``light`` is an emitter dictionary, an array [F] of radiance per face, or
+    None; ``bsdf`` a dictionary or None."""
     properties = mi.Properties()
     if light is not None:
-        source = light if isinstance(light, dict) else {"type": "area", "radiance": {"type": "mesh_attribute", "name": "face_radiance"}}
+        source = (
+            light
+            if isinstance(light, dict)
+            else {"type": "area", "radiance": {"type": "mesh_attribute", "name": "face_radiance"}}
+        )
         properties["mesh_emitter"] = mi.load_dict(source)
     if bsdf is not None:
         properties["mesh_bsdf"] = mi.load_dict(bsdf)
@@ -104,7 +151,9 @@ def emissive_mesh(mi, vertices, faces, light, uv=None, flip=False, bsdf=None):
 
 def mesh_arrays(parameters):
     """Vertices [V, 3] float64 and faces [F, 3] of a mesh."""
-    return np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3), np.array(parameters["faces"]).reshape(-1, 3)
+    return np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3), np.array(
+        parameters["faces"]
+    ).reshape(-1, 3)
 
 
 # ---- the map of each shape; texture coordinates as Mitsuba has them
@@ -131,10 +180,12 @@ def _rectangle(matrix, flip):
 
 
 def _disk(matrix, flip):
-    flat, radius = _rectangle(matrix, flip), float(np.linalg.norm(matrix[:3, 0]))
+    flat = _rectangle(matrix, flip)
+    radius = float(np.linalg.norm(matrix[:3, 0]))
 
     def at(u, v):
-        x, y = u * np.cos(2 * np.pi * v), u * np.sin(2 * np.pi * v)
+        x = u * np.cos(2 * np.pi * v)
+        y = u * np.sin(2 * np.pi * v)
         return flat.at((x + 1) / 2, (y + 1) / 2)
 
     return Chart((radius, 2 * np.pi * radius), at)
@@ -144,20 +195,30 @@ def _sphere(matrix, flip):
     radius = float(np.linalg.norm(matrix[:3, 0]))
 
     def at(u, v):
-        phi, theta = 2 * np.pi * u, np.pi * v
+        phi = 2 * np.pi * u
+        theta = np.pi * v
         local = np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], -1)
-        return _to_world(matrix, local), flip * local @ matrix[:3, :3].T / radius, np.ones(len(local), dtype=bool)
+        return (
+            _to_world(matrix, local),
+            flip * local @ matrix[:3, :3].T / radius,
+            np.ones(len(local), dtype=bool),
+        )
 
     return Chart((2 * np.pi * radius, np.pi * radius), at)
 
 
 def _cylinder(matrix, flip):
-    radius, length = float(np.linalg.norm(matrix[:3, 0])), float(np.linalg.norm(matrix[:3, 2]))
+    radius = float(np.linalg.norm(matrix[:3, 0]))
+    length = float(np.linalg.norm(matrix[:3, 2]))
 
     def at(u, v):
         phi = 2 * np.pi * u
         around = np.stack([np.cos(phi), np.sin(phi), 0 * phi], -1)
-        return _to_world(matrix, around + np.stack([0 * v, 0 * v, v], -1)), flip * around @ matrix[:3, :3].T / radius, np.ones(len(around), dtype=bool)
+        return (
+            _to_world(matrix, around + np.stack([0 * v, 0 * v, v], -1)),
+            flip * around @ matrix[:3, :3].T / radius,
+            np.ones(len(around), dtype=bool),
+        )
 
     return Chart((2 * np.pi * radius, length), at)
 
@@ -165,28 +226,49 @@ def _cylinder(matrix, flip):
 def _unwrapped(mi, name, shape, vertices, faces, uv, flip):
     """A mesh with texture coordinates that cover each place at most once."""
     if uv.min() < -1e-6 or uv.max() > 1 + 1e-6:
-        raise DomainError(f"bake: texture coordinates of mesh '{name}' leave the unit square, where one texel would hold several places; unwrap it anew.")
+        raise DomainError(
+            f"bake: texture coordinates of mesh '{name}' leave the unit square, where one texel would hold "
+            "several places; unwrap it anew."
+        )
     a, b, c = (uv[faces[:, k]] for k in range(3))
     area = 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]).sum()
     side = 512
     v, u = np.divmod(np.arange(side * side), side)
-    look = lambda u, v: shape.eval_parameterization(mi.Point2f(mi.Float(np.float32(u)), mi.Float(np.float32(v))))  # noqa: E731
+
+    def look(u, v):
+        return shape.eval_parameterization(mi.Point2f(mi.Float(np.float32(u)), mi.Float(np.float32(v))))
+
     covered = float(np.array(look((u + 0.5) / side, (v + 0.5) / side).is_valid()).mean())
     if area > OVERLAP * covered + 4 / side:
-        raise DomainError(f"bake: texture coordinates of mesh '{name}' overlap (triangles of area {area:.3g} cover {covered:.3g}); unwrap it so that no two places share a texel.")
-    world = 0.5 * np.linalg.norm(np.cross(vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]), axis=1).sum()
+        raise DomainError(
+            f"bake: texture coordinates of mesh '{name}' overlap (triangles of area {area:.3g} cover "
+            f"{covered:.3g}); unwrap it so that no two places share a texel."
+        )
+    world = (
+        0.5
+        * np.linalg.norm(
+            np.cross(
+                vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
+            ),
+            axis=1,
+        ).sum()
+    )
     size = float(np.sqrt(world / max(area, 1e-9)))
 
     def at(u, v):
         si = look(u, v)
         inside = np.array(si.is_valid()).astype(bool)
-        points, normals = (np.where(inside[:, None], np.array(part, dtype=np.float64).T, fallback) for part, fallback in ((si.p, 0.0), (si.n, 1.0)))
+        points, normals = (
+            np.where(inside[:, None], np.array(part, dtype=np.float64).T, fallback)
+            for part, fallback in ((si.p, 0.0), (si.n, 1.0))
+        )
         return points, normals, inside
 
     return Chart((size, size), at)
 
 
-# ---- cubes: six rectangles in one texture, since Mitsuba's cube has the same texture coordinates on every face
+# ---- cubes: six rectangles in one texture, since Mitsuba's cube has the same texture coordinates on every
+# face
 
 
 def _cube_matrix(entry):
@@ -211,13 +293,19 @@ def cube_frames(matrix):
 def cube_atlas(frames, textures):
     """One texture of six, three beside each other in two rows, with the mesh that uses it.
 
-    Returns: atlas [H, W], vertices [24, 3], faces [12, 3], uv [24, 2]; each face of the cube has four vertices of its own.
+    Returns: atlas [H, W], vertices [24, 3], faces [12, 3], uv [24, 2]; each face of the cube has four
+      vertices of its own.
     """
     rows, columns = (max(t.shape[k] for t in textures) + 2 * CUBE_GAP for k in (0, 1))
-    atlas, vertices, faces, uv = np.zeros((2 * rows, 3 * columns), dtype=np.float32), [], [], []
+    atlas = np.zeros((2 * rows, 3 * columns), dtype=np.float32)
+    vertices = []
+    faces = []
+    uv = []
     for k, (frame, texture) in enumerate(zip(frames, textures, strict=True)):
         top, left, (h, w) = k // 3 * rows, k % 3 * columns, texture.shape
-        padded = np.pad(texture, ((CUBE_GAP, rows - h - CUBE_GAP), (CUBE_GAP, columns - w - CUBE_GAP)), mode="edge")
+        padded = np.pad(
+            texture, ((CUBE_GAP, rows - h - CUBE_GAP), (CUBE_GAP, columns - w - CUBE_GAP)), mode="edge"
+        )
         atlas[top : top + rows, left : left + columns] = padded
         corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=float)
         vertices.append(_to_world(frame, np.column_stack([2 * corners - 1, np.zeros(4)])))

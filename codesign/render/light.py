@@ -1,7 +1,10 @@
-"""How much light transport a scene gets: emissive lookup, light baked once into textures, or Mitsuba's path integrator on the same camera rays.
+"""How much light transport a scene gets: emissive lookup, light baked once into textures, or Mitsuba's path
+integrator on the same camera rays.
 
-The cheap level is ``MitsubaScene``: every surface shows its own radiance. ``bake`` (codesign.render.bake) computes the light of a Lambertian scene once
-and returns such a ``MitsubaScene``. ``PathScene`` traces paths for every camera ray: the reference. All three have ``radiance``, ``hit`` and ``dtype``.
+The cheap level is ``MitsubaScene``: every surface shows its own radiance. ``bake`` (codesign.render.bake)
+  computes the light of a Lambertian scene once
+and returns such a ``MitsubaScene``. ``PathScene`` traces paths for every camera ray: the reference. All three
+have ``radiance``, ``hit`` and ``dtype``.
 """
 
 import copy
@@ -19,17 +22,22 @@ from codesign.render.world import MitsubaScene
 
 __all__ = ["Choice", "LevelError", "PathScene", "bake", "choose", "level_error"]
 
-FLOOR = 0.05  # share of a frame's mean radiance below which errors are relative to this share instead of to the pixel
+# share of a frame's mean radiance below which errors are relative to this share instead of to the pixel
+FLOOR = 0.05
 
 
 class PathScene(MitsubaScene):
     """A Mitsuba scene of any surfaces and lights, seen by path tracing along the camera's own rays.
 
     Args:
-      description: a Mitsuba scene dictionary. samples: paths per camera ray, on top of the camera's samples per pixel.
-      max_depth: longest path; 1 sees emitters only, 2 one reflection, -1 any length. seed: of the random numbers; equal calls give equal frames.
-    Noise is independent from ray to ray, so a camera at rest sees frames that differ by it: raise samples until events of noise are rare.
-    Gradient: none. A path's light behind a moved ray jumps wherever the path changes, and differentiating the numbers one by one is not the gradient
+      description: a Mitsuba scene dictionary. samples: paths per camera ray, on top of the camera's samples
+        per pixel.
+      max_depth: longest path; 1 sees emitters only, 2 one reflection, -1 any length. seed: of the random
+        numbers; equal calls give equal frames.
+    Noise is independent from ray to ray, so a camera at rest sees frames that differ by it: raise samples
+    until events of noise are rare.
+    Gradient: none. A path's light behind a moved ray jumps wherever the path changes, and differentiating the
+      numbers one by one is not the gradient
     of their mean; asking for it raises GradientError.
     """
 
@@ -37,9 +45,12 @@ class PathScene(MitsubaScene):
         if not samples >= 1:
             raise DomainError(f"path light: samples = {samples} per ray must be at least 1.")
         if max_depth != -1 and not max_depth >= 1:
-            raise DomainError(f"path light: max_depth = {max_depth} must be at least 1, or -1 for any length.")
+            raise DomainError(
+                f"path light: max_depth = {max_depth} must be at least 1, or -1 for any length."
+            )
         super().__init__(description, device)
-        self.samples, self.seed = int(samples), int(seed)
+        self.samples = int(samples)
+        self.seed = int(seed)
         self.integrator = self.mi.load_dict({"type": "path", "max_depth": int(max_depth), "rr_depth": 64})
 
     def with_seed(self, seed):
@@ -49,19 +60,29 @@ class PathScene(MitsubaScene):
         return twin
 
     def radiance(self, arr, origin, direction):
-        """Mean radiance of ``samples`` paths along each world ray. Raises: GradientError when a gradient is asked for."""
+        """Mean radiance of ``samples`` paths along each world ray. Raises: GradientError when a gradient is
+        asked for."""
         import drjit as dr
 
         if dr.grad_enabled(origin, direction):
-            raise GradientError("PathScene has no gradient; differentiate a scene of baked light (light.bake), or use differences with common random numbers.")
-        mi, count = self.mi, dr.width(origin, direction)
+            raise GradientError(
+                "PathScene has no gradient; differentiate a scene of baked light (light.bake), or use "
+                "differences with common random numbers."
+            )
+        mi = self.mi
+        count = dr.width(origin, direction)
         if count * self.samples >= 2**32:
-            raise DomainError(f"path light: {count} rays of {self.samples} paths are more than fit into one launch; render fewer frames at a time.")
+            raise DomainError(
+                f"path light: {count} rays of {self.samples} paths are more than fit into one launch; "
+                "render fewer frames at a time."
+            )
         dr.eval(origin, direction)
         ray = dr.arange(mi.UInt32, count * self.samples) // self.samples
         o, d = (dr.gather(mi.Point3f, mi.Point3f(part), ray) for part in (origin, direction))
         sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(dr.opaque(mi.UInt32, self.seed), count * self.samples)  # opaque: another seed needs no new kernel
+        sampler.seed(
+            dr.opaque(mi.UInt32, self.seed), count * self.samples
+        )  # opaque: another seed needs no new kernel
         light, _, _ = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(o, mi.Vector3f(d)))
         return dr.block_sum(light[0], self.samples) / self.samples
 
@@ -71,8 +92,10 @@ class LevelError:
     """Error of one light level against another, per frame: [T] tensors, shares of the reference's radiance.
 
     mean, percentile_95, maximum: of |cheap - reference| over the pixels, the reference's noise included.
-    rms: root mean square with the noise taken out (products of errors against two independent references), 0 where noise hides it.
-    rms_after_gain: the same after the best single factor for the frame: what is left for a sensor of log intensity.
+    rms: root mean square with the noise taken out (products of errors against two independent references), 0
+      where noise hides it.
+    rms_after_gain: the same after the best single factor for the frame: what is left for a sensor of log
+      intensity.
     noise: standard deviation of a pixel of the reference, root mean square.
     """
 
@@ -87,13 +110,19 @@ class LevelError:
 def level_error(scene_cheap, scene_reference, camera, T_world_cam):
     """Relative radiance error of a cheap scene against a reference, seen by a camera along poses [T, 4, 4].
 
-    The error of a pixel is relative to the reference there, or to FLOOR of the frame's mean where that is more. A reference with ``with_seed``
-    (PathScene) is rendered twice with independent numbers; any other counts as free of noise. No gradient. Returns: LevelError.
+    The error of a pixel is relative to the reference there, or to FLOOR of the frame's mean where that is
+    more. A reference with ``with_seed``
+    (PathScene) is rendered twice with independent numbers; any other counts as free of noise. No gradient.
+    Returns: LevelError.
     Raises: DomainError when a frame of the reference is black.
     """
     with torch.no_grad():
         first = _flat(camera, scene_reference, T_world_cam)
-        second = _flat(camera, scene_reference.with_seed(scene_reference.seed + 1), T_world_cam) if hasattr(scene_reference, "with_seed") else first
+        second = (
+            _flat(camera, scene_reference.with_seed(scene_reference.seed + 1), T_world_cam)
+            if hasattr(scene_reference, "with_seed")
+            else first
+        )
         return _compare(_flat(camera, scene_cheap, T_world_cam), first, second)
 
 
@@ -104,18 +133,34 @@ def _flat(camera, scene, T_world_cam):
 def _compare(cheap, first, second):
     reference = (first + second) / 2
     if bool((reference.mean(1) <= 0).any()):
-        raise DomainError("level_error: a frame of the reference is black, so no error is relative to it; turn the camera towards some light.")
+        raise DomainError(
+            "level_error: a frame of the reference is black, so no error is relative to it; turn the camera "
+            "towards some light."
+        )
     size = reference.maximum(FLOOR * reference.mean(1, keepdim=True))
     share = (cheap - reference).abs() / size
-    product = lambda image: ((image - first) * (image - second) / size.square()).mean(1).clamp_min(0).sqrt()  # noqa: E731
-    gain = (cheap * reference / size.square()).sum(1, keepdim=True) / (cheap / size).square().sum(1, keepdim=True).clamp_min(1e-300)
+
+    def product(image):
+        return ((image - first) * (image - second) / size.square()).mean(1).clamp_min(0).sqrt()
+
+    gain = (cheap * reference / size.square()).sum(1, keepdim=True) / (cheap / size).square().sum(
+        1, keepdim=True
+    ).clamp_min(1e-300)
     noise = ((first - second) / (2 * size)).square().mean(1).sqrt()
-    return LevelError(share.mean(1), share.quantile(0.95, dim=1), share.amax(1), product(cheap), product(gain * cheap), noise)
+    return LevelError(
+        share.mean(1),
+        share.quantile(0.95, dim=1),
+        share.amax(1),
+        product(cheap),
+        product(gain * cheap),
+        noise,
+    )
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The level chosen: its name and scene, the reason in one sentence, errors and CPU seconds of every level by name."""
+    """The level chosen: its name and scene, the reason in one sentence, errors and CPU seconds of every level
+    by name."""
 
     name: str
     scene: Any
@@ -125,7 +170,8 @@ class Choice:
 
 
 def choose(levels, camera, T_world_cam, tolerance, after_gain=False):
-    """The cheapest light level whose RMS radiance error against the last one stays within a tolerance in every frame.
+    """The cheapest light level whose RMS radiance error against the last one stays within a tolerance in
+    every frame.
 
     Args: levels: dictionary name -> scene, the last of them the reference. tolerance: share of the radiance.
       after_gain: whether one brightness factor per frame is forgiven, as by a sensor of log intensity.
@@ -135,9 +181,13 @@ def choose(levels, camera, T_world_cam, tolerance, after_gain=False):
     if not levels:
         raise DomainError("light.choose: there is no level to choose from; give at least one.")
     if not 0 < tolerance < float("inf"):
-        raise DomainError(f"light.choose: tolerance = {tolerance} must be positive and finite, such as 0.05 for 5 %.")
+        raise DomainError(
+            f"light.choose: tolerance = {tolerance} must be positive and finite, such as 0.05 for 5 %."
+        )
     *_, last = levels
-    reference, errors, cpu_s = levels[last], {}, {}
+    reference = levels[last]
+    errors = {}
+    cpu_s = {}
     with torch.no_grad():
         pictures = {}
         for name, scene in levels.items():
@@ -145,15 +195,24 @@ def choose(levels, camera, T_world_cam, tolerance, after_gain=False):
             start = time.process_time()
             pictures[name] = _flat(camera, scene, T_world_cam)
             cpu_s[name] = time.process_time() - start
-        other = _flat(camera, reference.with_seed(reference.seed + 1), T_world_cam) if hasattr(reference, "with_seed") else pictures[last]
+        other = (
+            _flat(camera, reference.with_seed(reference.seed + 1), T_world_cam)
+            if hasattr(reference, "with_seed")
+            else pictures[last]
+        )
     for name, picture in pictures.items():
         errors[name] = _compare(picture, pictures[last], other)
-    worst = {name: 0.0 if name == last else float((e.rms_after_gain if after_gain else e.rms).max()) for name, e in errors.items()}
+    worst = {
+        name: 0.0 if name == last else float((e.rms_after_gain if after_gain else e.rms).max())
+        for name, e in errors.items()
+    }
     name = min((n for n in levels if worst[n] <= tolerance), key=lambda n: cpu_s[n])
     noise = f"noise of the comparison {float(errors[last].noise.max()):.2g}"
     if name == last:
         others = ", ".join(f"{n} {worst[n]:.2g}" for n in levels if n != last)
-        reason = f"{name}: no cheaper level stays within {tolerance:g} of it" + (f" (RMS errors: {others}; {noise})." if others else ".")
+        reason = f"{name}: no cheaper level stays within {tolerance:g} of it" + (
+            f" (RMS errors: {others}; {noise})." if others else "."
+        )
     else:
         reason = f"{name}: the cheapest level within {tolerance:g} of {last}, with an RMS error of {worst[name]:.2g} ({noise}) for {cpu_s[name]:.2g} CPU-s instead of {cpu_s[last]:.2g}."
     return Choice(name, levels[name], reason, errors, cpu_s)

@@ -1,4 +1,5 @@
-"""A world with objects that move: every object is a scene in its own frame, with a pose per frame of the sequence."""
+"""A world with objects that move: every object is a scene in its own frame, with a pose per frame of the
+sequence."""
 
 import torch
 
@@ -10,40 +11,64 @@ class MovingScene:
     """A static scene and rigid objects that move through it; what is nearest along a ray is seen.
 
     Args:
-      static: a scene in world axes (MitsubaScene, TexturedPlane). Where a ray meets nothing at all, the background of this scene is seen.
-      objects: {name: (scene in the object's own axes, T_world_object [T, 4, 4])}, the same T for all; frame t of a sequence has its objects at pose t.
+      static: a scene in world axes (MitsubaScene, TexturedPlane). Where a ray meets nothing at all, the
+        background of this scene is seen.
+      objects: {name: (scene in the object's own axes, T_world_object [T, 4, 4])}, the same T for all; frame t
+        of a sequence has its objects at pose t.
     Computes in float32 when one of the scenes does, otherwise in float64.
     Gradient: to T_world_object, for what moves inside surfaces; silhouettes are left out.
-    Raises: DomainError when poses are not rigid or a scene cannot say how far away it is; ShapeError when the numbers of poses differ.
+    Raises: DomainError when poses are not rigid or a scene cannot say how far away it is; ShapeError when the
+      numbers of poses differ.
     """
 
     def __init__(self, static, objects):
-        self.static, self.names = static, tuple(objects)
+        self.static = static
+        self.names = tuple(objects)
         self.scenes = (static, *(scene for scene, _ in objects.values()))
         for name, scene in zip(("static", *self.names), self.scenes, strict=True):
             if isinstance(scene, MovingScene):
-                raise DomainError(f"moving scene: part '{name}' is itself a moving scene; give its objects one by one, with poses in the world.")
+                raise DomainError(
+                    f"moving scene: part '{name}' is itself a moving scene; give its objects one by one, "
+                    "with poses in the world."
+                )
             if not _says_distance(type(scene)):
-                raise DomainError(f"moving scene: part '{name}', a {type(scene).__name__}, does not say how far away its light comes from; give a MitsubaScene or a TexturedPlane.")
+                raise DomainError(
+                    f"moving scene: part '{name}', a {type(scene).__name__}, does not say how far away its "
+                    "light comes from; give a MitsubaScene or a TexturedPlane."
+                )
         self.T_world_object = tuple(_checked(name, poses) for name, (_, poses) in objects.items())
         lengths = {name: poses.shape[0] for name, poses in zip(self.names, self.T_world_object, strict=True)}
         if len(set(lengths.values())) > 1:
             raise ShapeError(f"moving scene: the objects have {lengths} poses; give each one pose per frame.")
-        self.dtype = torch.float32 if any(scene.dtype == torch.float32 for scene in self.scenes) else torch.float64
+        self.dtype = (
+            torch.float32 if any(scene.dtype == torch.float32 for scene in self.scenes) else torch.float64
+        )
 
     def during(self, frames):
         """The same scene for some of the frames only: a slice or a list of frame numbers."""
-        return MovingScene(self.static, {name: (scene, poses[frames]) for name, scene, poses in zip(self.names, self.scenes[1:], self.T_world_object, strict=True)})
+        return MovingScene(
+            self.static,
+            {
+                name: (scene, poses[frames])
+                for name, scene, poses in zip(self.names, self.scenes[1:], self.T_world_object, strict=True)
+            },
+        )
 
     def check_length(self, count):
         """Raise ShapeError unless every object has ``count`` poses."""
         for name, poses in zip(self.names, self.T_world_object, strict=True):
             if poses.shape[0] != count:
-                raise ShapeError(f"moving scene: object '{name}' has {poses.shape[0]} poses for {count} frames; give one per frame, or cut the scene with ``during``.")
+                raise ShapeError(
+                    f"moving scene: object '{name}' has {poses.shape[0]} poses for {count} frames; give one "
+                    "per frame, or cut the scene with ``during``."
+                )
 
     def outline(self):
         """Raise DomainError: the boundary term holds scenes still."""
-        raise DomainError("the outlines of moving objects carry no gradient; ask for gradient 'interior', or for a scene without objects.")
+        raise DomainError(
+            "the outlines of moving objects carry no gradient; ask for gradient 'interior', or for a scene "
+            "without objects."
+        )
 
 
 def parts(scene):
@@ -52,7 +77,8 @@ def parts(scene):
 
 
 def poses_of_parts(scene, count):
-    """T_world_part [parts, T, 4, 4], float64: the identity for the static scene. Raises: ShapeError unless every object has ``count`` poses."""
+    """T_world_part [parts, T, 4, 4], float64: the identity for the static scene. Raises: ShapeError unless
+    every object has ``count`` poses."""
     still = torch.eye(4, dtype=torch.float64).expand(count, 4, 4)
     if not isinstance(scene, MovingScene):
         return still[None]
@@ -61,7 +87,8 @@ def poses_of_parts(scene, count):
 
 
 def cameras_in_parts(scene, T_world_cam):
-    """Poses of the camera [T, 4, 4] in the axes of every part: as given for the static one, float64 for objects."""
+    """Poses of the camera [T, 4, 4] in the axes of every part: as given for the static one, float64 for
+    objects."""
     objects = poses_of_parts(scene, T_world_cam.shape[0])[1:]
     return [T_world_cam, *(inverse(poses.to(T_world_cam.device)) @ T_world_cam.double() for poses in objects)]
 
@@ -72,7 +99,8 @@ def at_frames(scene, frames):
 
 
 def _says_distance(kind):
-    """Whether a class has a ``radiance_and_distance`` beside its ``radiance``: one inherited from further up would tell of other light."""
+    """Whether a class has a ``radiance_and_distance`` beside its ``radiance``: one inherited from further up
+    would tell of other light."""
     owner = next((base for base in kind.__mro__ if "radiance" in vars(base)), None)
     return owner is not None and "radiance_and_distance" in vars(owner)
 

@@ -10,32 +10,61 @@ class TexturedPlane:
     """The plane z = 0 of its own frame, with radiance mean * exp(sum of cosines), seen from both sides.
 
     Args:
-      frequency_per_m: [K, 2] spatial frequencies, cycles per metre; the texture has no detail finer than the largest.
+      frequency_per_m: [K, 2] spatial frequencies, cycles per metre; the texture has no detail finer than the
+        largest.
       amplitude: [K] of the log radiance; phase_rad: [K]. mean: radiance where the sum is zero (0..255 scale).
       T_world_plane: [4, 4]; identity when None. dtype: precision of intersection and shading.
     Rays that do not meet the plane see ``mean``.
     """
 
-    def __init__(self, frequency_per_m, amplitude, phase_rad, mean=100.0, T_world_plane=None, dtype=torch.float64):
-        for label, value in (("frequency_per_m", frequency_per_m), ("amplitude", amplitude), ("phase_rad", phase_rad)):
+    def __init__(
+        self, frequency_per_m, amplitude, phase_rad, mean=100.0, T_world_plane=None, dtype=torch.float64
+    ):
+        for label, value in (
+            ("frequency_per_m", frequency_per_m),
+            ("amplitude", amplitude),
+            ("phase_rad", phase_rad),
+        ):
             if not bool(torch.isfinite(torch.as_tensor(value)).all()):
                 raise DomainError(f"textured plane: {label} holds NaN or infinite entries; remove them.")
         if not 0 <= mean < float("inf"):
-            raise DomainError(f"textured plane: mean = {mean} must be finite and at least 0; give a radiance on the 0..255 scale.")
-        self.dtype, self.mean = dtype, float(mean)
+            raise DomainError(
+                f"textured plane: mean = {mean} must be finite and at least 0; give a radiance on the "
+                "0..255 scale."
+            )
+        self.dtype = dtype
+        self.mean = float(mean)
         self.frequency = torch.as_tensor(frequency_per_m, dtype=torch.float64).reshape(-1, 2)
-        self.amplitude, self.phase = torch.as_tensor(amplitude, dtype=torch.float64), torch.as_tensor(phase_rad, dtype=torch.float64)
+        self.amplitude = torch.as_tensor(amplitude, dtype=torch.float64)
+        self.phase = torch.as_tensor(phase_rad, dtype=torch.float64)
         sizes = self.frequency.shape[0], self.amplitude.numel(), self.phase.numel()
         if len(set(sizes)) != 1:
-            raise DomainError(f"textured plane: {sizes[0]} frequencies, {sizes[1]} amplitudes, {sizes[2]} phases were given; give one of each per wave.")
-        self.T_world_plane = torch.eye(4, dtype=torch.float64) if T_world_plane is None else check_poses(T_world_plane[None].double())[0]
+            raise DomainError(
+                f"textured plane: {sizes[0]} frequencies, {sizes[1]} amplitudes, {sizes[2]} phases were "
+                "given; give one of each per wave."
+            )
+        self.T_world_plane = (
+            torch.eye(4, dtype=torch.float64)
+            if T_world_plane is None
+            else check_poses(T_world_plane[None].double())[0]
+        )
 
     def _constants(self, arr):
         """Scalars as opaque drjit values, so that another texture needs no new kernel."""
         import drjit as dr
 
-        opaque = lambda tensor: [dr.opaque(arr.Float, v) for v in tensor.reshape(-1).tolist()]  # noqa: E731
-        waves = list(zip(opaque(self.frequency[:, 0]), opaque(self.frequency[:, 1]), opaque(self.amplitude), opaque(self.phase), strict=True))
+        def opaque(tensor):
+            return [dr.opaque(arr.Float, v) for v in tensor.reshape(-1).tolist()]
+
+        waves = list(
+            zip(
+                opaque(self.frequency[:, 0]),
+                opaque(self.frequency[:, 1]),
+                opaque(self.amplitude),
+                opaque(self.phase),
+                strict=True,
+            )
+        )
         return opaque(self.T_world_plane[:3]), waves, dr.opaque(arr.Float, self.mean)
 
     def radiance(self, arr, origin, direction):
@@ -43,16 +72,22 @@ class TexturedPlane:
         return self.radiance_and_distance(arr, origin, direction)[0]
 
     def radiance_and_distance(self, arr, origin, direction):
-        """Radiance as above, and the distance to the plane (infinite where it is not met), which carries no gradient."""
+        """Radiance as above, and the distance to the plane (infinite where it is not met), which carries no
+        gradient."""
         import drjit as dr
 
         m, waves, mean = self._constants(arr)
         rel = [origin[i] - m[4 * i + 3] for i in range(3)]
-        local = lambda v: [m[k] * v[0] + m[4 + k] * v[1] + m[8 + k] * v[2] for k in range(3)]  # noqa: E731
-        o, d = local(rel), local(direction)
+
+        def local(v):
+            return [m[k] * v[0] + m[4 + k] * v[1] + m[8 + k] * v[2] for k in range(3)]
+
+        o = local(rel)
+        d = local(direction)
         meets = (dr.abs(d[2]) > 1e-9) & (o[2] * d[2] < 0)
         t = dr.select(meets, -o[2] / dr.select(meets, d[2], 1), 0)
-        x, y = o[0] + t * d[0], o[1] + t * d[1]
+        x = o[0] + t * d[0]
+        y = o[1] + t * d[1]
         total = arr.Float(0)
         for fx, fy, a, phase in waves:
             total += a * dr.cos((2 * dr.pi) * (fx * x + fy * y) + phase)

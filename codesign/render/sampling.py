@@ -1,4 +1,5 @@
-"""One low-discrepancy pattern over film and pupil, shared by all pixels, all frames, and both sides of a difference."""
+"""One low-discrepancy pattern over film and pupil, shared by all pixels, all frames, and both sides of a
+difference."""
 
 import math
 
@@ -8,8 +9,10 @@ import torch
 def film_pupil_pattern(samples, seed):
     """Scrambled Sobol points over pixel x pupil.
 
-    Args: samples per pixel, seed. Returns: offset [samples, 2] in pixels, within [-1/2, 1/2); pupil [samples, 2] on the unit disc; float64.
-    The same pattern in every pixel makes the sampled point spread the same everywhere: a static scene gives equal frames and
+    Args: samples per pixel, seed. Returns: offset [samples, 2] in pixels, within [-1/2, 1/2); pupil [samples,
+      2] on the unit disc; float64.
+    The same pattern in every pixel makes the sampled point spread the same everywhere: a static scene gives
+    equal frames and
     a moving one no sampling flicker. A single sample is the pixel centre through the pupil centre.
     """
     if samples == 1:

@@ -1,7 +1,9 @@
 """Frames of a scene along a trajectory, and the ways to their gradient.
 
-interior: what moves inside surfaces (plain automatic differentiation). boundary: with the motion of silhouettes and edges. difference: central differences
-with common random numbers, twelve renders for the poses and two per lens number. auto: the cheapest of the three that agrees with differences, asked once
+interior: what moves inside surfaces (plain automatic differentiation). boundary: with the motion of
+  silhouettes and edges. difference: central differences
+with common random numbers, twelve renders for the poses and two per lens number. auto: the cheapest of the
+three that agrees with differences, asked once
 per scene, camera and group of parameters.
 """
 
@@ -20,13 +22,21 @@ Way = Literal["interior", "boundary", "difference", "auto"]
 WAYS: tuple[Way, ...] = ("interior", "boundary", "difference", "auto")
 PROVEN: tuple[Way, ...] = ("interior", "boundary")  # those that differences judge
 POSE_STEP = (2e-3, 2e-3, 2e-3, 2e-3, 2e-3, 2e-3)  # metres and radians
-LENS_STEP = {"curvature_per_mm": 2e-5, "thickness_mm": 5e-3, "conic": 1e-2, "index_offset": 1e-4, "efl_mm": 1e-2, "image_distance_mm": 2e-3}
+LENS_STEP = {
+    "curvature_per_mm": 2e-5,
+    "thickness_mm": 5e-3,
+    "conic": 1e-2,
+    "index_offset": 1e-4,
+    "efl_mm": 1e-2,
+    "image_distance_mm": 2e-3,
+}
 PASSES = 0.05  # relative L2 distance from differences up to which a way is kept
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What ``choose`` found for one group of parameters: the way to use, and the relative error of each way against differences."""
+    """What ``choose`` found for one group of parameters: the way to use, and the relative error of each way
+    against differences."""
 
     way: Way
     errors: dict[str, float]
@@ -40,10 +50,13 @@ class Choice:
 def frames(camera, scene, T_world_cam, gradient: Way = "interior", per_px=2.5):
     """Frames of a scene along a trajectory.
 
-    Args: camera: Camera. scene: anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane). T_world_cam: [T, 4, 4].
-      gradient: "interior", "boundary", "difference" or "auto", see the top of this file; the frames are the same. per_px: samples per pixel length of
+    Args: camera: Camera. scene: anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane).
+      T_world_cam: [T, 4, 4].
+      gradient: "interior", "boundary", "difference" or "auto", see the top of this file; the frames are the
+        same. per_px: samples per pixel length of
       silhouettes and edges for "boundary".
-    Returns: [T, H, W] (or [T, windows, H, W]) linear irradiance in the scene's units, box-filtered over each pixel.
+    Returns: [T, H, W] (or [T, windows, H, W]) linear irradiance in the scene's units, box-filtered over each
+      pixel.
     Gradient: lens and poses; "interior" leaves out the motion of silhouettes.
     Raises: DomainError for an unknown way, or a scene whose silhouettes are not known.
     """
@@ -59,13 +72,19 @@ def frames(camera, scene, T_world_cam, gradient: Way = "interior", per_px=2.5):
 
 def image(camera, scene, T_world_cam):
     """Frames [T, *film.shape] with their interior gradient."""
-    return shade(camera.rays(), scene, T_world_cam, camera.samples_per_pixel).reshape(T_world_cam.shape[0], *camera.film.shape)
+    return shade(camera.rays(), scene, T_world_cam, camera.samples_per_pixel).reshape(
+        T_world_cam.shape[0], *camera.film.shape
+    )
 
 
 def by_differences(camera, scene, T_world_cam):
-    """Frames whose gradient to poses and lens tensors is that of central differences with common random numbers."""
+    """Frames whose gradient to poses and lens tensors is that of central differences with common random
+    numbers."""
     if any(pose.requires_grad for pose in getattr(scene, "T_world_object", ())):
-        raise DomainError("gradient 'difference' goes to camera and lens only, but the pose of an object asks for one; use 'interior'.")
+        raise DomainError(
+            "gradient 'difference' goes to camera and lens only, but the pose of an object asks for one; "
+            "use 'interior'."
+        )
     with torch.no_grad():
         found = first = image(camera, scene, T_world_cam)
     if T_world_cam.requires_grad:
@@ -82,24 +101,39 @@ def by_differences(camera, scene, T_world_cam):
 
 
 def _twist(T_world_cam):
-    """Zero-valued twists [T, 6] (translation first) whose gradient is that of small motions of the poses in their own axes."""
+    """Zero-valued twists [T, 6] (translation first) whose gradient is that of small motions of the poses in
+    their own axes."""
     small = inverse(T_world_cam.detach().double()) @ T_world_cam.double()
     turn = (small[:, :3, :3] - small[:, :3, :3].mT) / 2
     return torch.stack([*small[:, :3, 3].unbind(1), turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], 1)
 
 
 def pose_difference(camera, scene, T_world_cam, k):
-    """Change of the frames per unit of the k-th component of the twist of every pose, by central differences."""
+    """Change of the frames per unit of the k-th component of the twist of every pose, by central
+    differences."""
     step = torch.zeros(6, dtype=torch.float64)
     step[k] = POSE_STEP[k]
     with torch.no_grad():
-        ahead, behind = (image(camera, scene, T_world_cam.double() @ se3_exp(sign * step[None])) for sign in (1, -1))
+        ahead, behind = (
+            image(camera, scene, T_world_cam.double() @ se3_exp(sign * step[None])) for sign in (1, -1)
+        )
     return (ahead - behind) / (2 * POSE_STEP[k])
 
 
 def lens_tensors(lens):
     """Tensors of a lens that ask for gradients, by name."""
-    names = ("curvature_per_mm", "thickness_mm", "conic", "asphere", "index_offset", "phase", "decentre_mm", "tilt_rad", "efl_mm", "image_distance_mm")
+    names = (
+        "curvature_per_mm",
+        "thickness_mm",
+        "conic",
+        "asphere",
+        "index_offset",
+        "phase",
+        "decentre_mm",
+        "tilt_rad",
+        "efl_mm",
+        "image_distance_mm",
+    )
     found = {name: getattr(lens, name, None) for name in names}
     return {name: t for name, t in found.items() if torch.is_tensor(t) and t.requires_grad and t.numel()}
 
@@ -107,17 +141,28 @@ def lens_tensors(lens):
 def lens_difference(camera, scene, T_world_cam, name, i):
     """Change of the frames per unit of one number of the lens, by central differences."""
     if name not in LENS_STEP:
-        raise DomainError(f"differences to the lens's {name} have no step; freeze it, or use gradient 'boundary'.")
-    step, value = LENS_STEP[name], getattr(camera.lens, name).detach()
+        raise DomainError(
+            f"differences to the lens's {name} have no step; freeze it, or use gradient 'boundary'."
+        )
+    step = LENS_STEP[name]
+    value = getattr(camera.lens, name).detach()
     shift = torch.zeros_like(value).reshape(-1)
     shift[i] = step
     with torch.no_grad():
-        ahead, behind = (image(camera.with_lens(camera.lens.replace(**{name: value + sign * shift.reshape(value.shape)})), scene, T_world_cam) for sign in (1, -1))
+        ahead, behind = (
+            image(
+                camera.with_lens(camera.lens.replace(**{name: value + sign * shift.reshape(value.shape)})),
+                scene,
+                T_world_cam,
+            )
+            for sign in (1, -1)
+        )
     return (ahead - behind) / (2 * step)
 
 
 def settled(camera, scene, T_world_cam):
-    """The way ``choose`` found for this scene, camera and set of parameters; asked once and remembered by the scene."""
+    """The way ``choose`` found for this scene, camera and set of parameters; asked once and remembered by the
+    scene."""
     if any(pose.requires_grad for pose in getattr(scene, "T_world_object", ())):
         return "interior"  # the only way that reaches objects
     lens = lens_tensors(camera.lens)
@@ -133,17 +178,22 @@ def settled(camera, scene, T_world_cam):
 
 
 def choose(camera, scene, T_world_cam, seed=0):
-    """Choice per group of parameters ("pose" and each lens tensor that asks for gradients): the cheapest way that agrees with differences.
+    """Choice per group of parameters ("pose" and each lens tensor that asks for gradients): the cheapest way
+    that agrees with differences.
 
-    A random smooth weighting of the pixels stands for the loss; differences are taken at two seeds of the camera, whose disagreement is their noise.
+    A random smooth weighting of the pixels stands for the loss; differences are taken at two seeds of the
+    camera, whose disagreement is their noise.
     A way passes within PASSES plus that noise, of which no more than PASSES counts. Two frames are looked at.
     """
     which = [0, -1] if T_world_cam.shape[0] > 1 else [0]
-    scene, poses = at_frames(scene, which), T_world_cam.detach()[which]
+    scene = at_frames(scene, which)
+    poses = T_world_cam.detach()[which]
     generator = torch.Generator().manual_seed(seed)
     height, width = camera.film.shape[-2:]
     coarse = torch.randn(1, 1, max(2, height // 6), max(2, width // 6), generator=generator)
-    weight = torch.nn.functional.interpolate(coarse, size=(height, width), mode="bilinear", align_corners=True)[0, 0]
+    weight = torch.nn.functional.interpolate(
+        coarse, size=(height, width), mode="bilinear", align_corners=True
+    )[0, 0]
     other = camera.with_seed(camera.seed + 1)
     found = {}
     for group in [*(["pose"] if T_world_cam.requires_grad else []), *lens_tensors(camera.lens)]:
@@ -152,10 +202,15 @@ def choose(camera, scene, T_world_cam, seed=0):
         errors = {}
         for way in PROVEN:
             try:
-                errors[way] = float((_by_way(camera, scene, poses, group, weight, way) - truth).norm() / truth.norm().clamp_min(1e-30))
+                errors[way] = float(
+                    (_by_way(camera, scene, poses, group, weight, way) - truth).norm()
+                    / truth.norm().clamp_min(1e-30)
+                )
             except DomainError:
                 continue  # the scene has no known outline
-            if errors[way] <= PASSES + min(noise, PASSES):  # differences that do not know better than that judge nothing
+            if errors[way] <= PASSES + min(
+                noise, PASSES
+            ):  # differences that do not know better than that judge nothing
                 found[group] = Choice(way, errors, noise)
                 break
         else:
@@ -165,8 +220,15 @@ def choose(camera, scene, T_world_cam, seed=0):
 
 def _by_group(camera, scene, poses, group, weight):
     if group == "pose":
-        return torch.stack([(pose_difference(camera, scene, poses, k) * weight).sum((-2, -1)) for k in range(6)]).double()
-    return torch.stack([(lens_difference(camera, scene, poses, group, i) * weight).sum() for i in range(getattr(camera.lens, group).numel())]).double()
+        return torch.stack(
+            [(pose_difference(camera, scene, poses, k) * weight).sum((-2, -1)) for k in range(6)]
+        ).double()
+    return torch.stack(
+        [
+            (lens_difference(camera, scene, poses, group, i) * weight).sum()
+            for i in range(getattr(camera.lens, group).numel())
+        ]
+    ).double()
 
 
 def _by_way(camera, scene, poses, group, weight, way):

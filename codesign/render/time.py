@@ -1,6 +1,8 @@
-"""Time: exposures, frame times that follow the motion, and sequences too long for memory. Rays are traced once for a whole sequence.
+"""Time: exposures, frame times that follow the motion, and sequences too long for memory. Rays are traced
+once for a whole sequence.
 
-A trajectory is a function of times [n] in seconds to poses T_world_cam [n, 4, 4]. Where objects move, the scene is a function too: of times [n] to a
+A trajectory is a function of times [n] in seconds to poses T_world_cam [n, 4, 4]. Where objects move, the
+scene is a function too: of times [n] to a
 MovingScene with n poses per object.
 """
 
@@ -16,18 +18,24 @@ from codesign.render.truth import track
 from codesign.render.wavefront import shade
 
 FIRST_STEP = 1 / 64  # of the interval, until the motion is known
-GROWTH, AIM = 2.0, 0.95  # from step to step at most; the share of the largest displacement that steps aim at
+# from step to step at most; the share of the largest displacement that steps aim at
+GROWTH = 2.0
+AIM = 0.95
 COARSE = 8  # times the spacing of pixels, for the search of a step; the step found is judged by all
 SMALLEST_STEP = 1e-9  # of the interval
 
 
 def midpoints(samples):
-    """Times in -1/2..1/2 and weights of equal shares of an exposure, two float64 tensors [samples]: edges blur to equal steps."""
-    return (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5, torch.full((samples,), 1 / samples, dtype=torch.float64)
+    """Times in -1/2..1/2 and weights of equal shares of an exposure, two float64 tensors [samples]: edges
+    blur to equal steps."""
+    return (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5, torch.full(
+        (samples,), 1 / samples, dtype=torch.float64
+    )
 
 
 def gauss_legendre(samples):
-    """As ``midpoints``, by Gauss-Legendre quadrature: exact for what changes as a polynomial of degree 2 samples - 1 over the exposure."""
+    """As ``midpoints``, by Gauss-Legendre quadrature: exact for what changes as a polynomial of degree 2
+    samples - 1 over the exposure."""
     nodes, weights = np.polynomial.legendre.leggauss(samples)
     return torch.from_numpy(nodes) / 2, torch.from_numpy(weights) / 2
 
@@ -35,8 +43,10 @@ def gauss_legendre(samples):
 def exposed_frames(camera, scene, trajectory, t_s, exposure_s, samples=8, rule=midpoints):
     """Frames averaged over an exposure centred on each time: motion blur.
 
-    Args: camera: Camera. scene, trajectory: see the top of this file. t_s: [T]. exposure_s: length of the exposure, >= 0. samples: time samples per frame.
-      rule: ``midpoints`` (error of a moving edge: at most its jump / (2 samples)) or ``gauss_legendre`` (for smooth textures).
+    Args: camera: Camera. scene, trajectory: see the top of this file. t_s: [T]. exposure_s: length of the
+      exposure, >= 0. samples: time samples per frame.
+      rule: ``midpoints`` (error of a moving edge: at most its jump / (2 samples)) or ``gauss_legendre`` (for
+        smooth textures).
     Returns: [T, *film.shape], the mean of the irradiance over the exposure, in the scene's units.
     Gradient: lens, and whatever the trajectory's poses depend on; interior term only.
     Raises: DomainError on a negative exposure, fewer than one sample, or poses that are not rigid.
@@ -46,7 +56,8 @@ def exposed_frames(camera, scene, trajectory, t_s, exposure_s, samples=8, rule=m
         raise DomainError(f"exposure_s = {exposure_s} must be finite and at least 0 seconds.")
     if not (samples >= 1 and samples % 1 == 0):
         raise DomainError(f"an exposure of {samples} time samples: give a whole number of at least 1.")
-    rays, total = camera.rays(), torch.zeros(())
+    rays = camera.rays()
+    total = torch.zeros(())
     for node, weight in zip(*(column.tolist() for column in rule(int(samples))), strict=True):
         at = t_s + node * exposure_s
         total = total + weight * shade(rays, _at(scene, at), _poses(trajectory, at), camera.samples_per_pixel)
@@ -54,10 +65,12 @@ def exposed_frames(camera, scene, trajectory, t_s, exposure_s, samples=8, rule=m
 
 
 def frame_chunks(camera, scene, T_world_cam, frames_per_chunk):
-    """Generator of the frames of a long sequence, some at a time: [<= frames_per_chunk, *film.shape] each, in bounded memory.
+    """Generator of the frames of a long sequence, some at a time: [<= frames_per_chunk, *film.shape] each, in
+    bounded memory.
 
     Joined, the chunks are what ``frames`` gives, bit for bit: every frame is the same sum in the same order.
-    Gradient: as ``frames`` has it (interior term). All chunks share one trace of the lens, so going backward from one chunk at a time needs
+    Gradient: as ``frames`` has it (interior term). All chunks share one trace of the lens, so going backward
+      from one chunk at a time needs
     ``retain_graph=True`` where the lens is learned.
     """
     check_poses(T_world_cam)
@@ -66,92 +79,148 @@ def frame_chunks(camera, scene, T_world_cam, frames_per_chunk):
     count = T_world_cam.shape[0]
     if isinstance(scene, MovingScene):
         scene.check_length(count)
-    return _chunks(camera, scene, T_world_cam, [slice(first, min(first + int(frames_per_chunk), count)) for first in range(0, count, int(frames_per_chunk))])
+    return _chunks(
+        camera,
+        scene,
+        T_world_cam,
+        [
+            slice(first, min(first + int(frames_per_chunk), count))
+            for first in range(0, count, int(frames_per_chunk))
+        ],
+    )
 
 
 def _chunks(camera, scene, T_world_cam, pieces):
     rays = camera.rays()
     for piece in pieces:
-        yield shade(rays, at_frames(scene, piece), T_world_cam[piece], camera.samples_per_pixel).reshape(-1, *camera.film.shape)
+        yield shade(rays, at_frames(scene, piece), T_world_cam[piece], camera.samples_per_pixel).reshape(
+            -1, *camera.film.shape
+        )
 
 
 def adaptive_times(camera, scene, trajectory, start_s, end_s, largest_px, every_px=1):
     """Frame times between which no pixel's point moves by more than a given distance in the image.
 
-    Args: camera, scene, trajectory: see the top of this file. largest_px: largest displacement between frames, > 0. every_px: spacing of the pixels that
-      are looked at, the film's border included; 1 looks at all, more is faster and may miss what is narrower or moves more between them.
+    Args: camera, scene, trajectory: see the top of this file. largest_px: largest displacement between
+      frames, > 0. every_px: spacing of the pixels that
+      are looked at, the film's border included; 1 looks at all, more is faster and may miss what is narrower
+      or moves more between them.
     Returns: [n] float64 times, increasing, the first start_s and the last end_s. No gradient.
-    Every step is judged by the displacement itself, through the lens: of the points seen at its start, and of the points seen at its end. Steps grow at
-    most twofold and are judged at their middle too (on a coarser grid), so that a motion that comes back within a step is met by its parts.
+    Every step is judged by the displacement itself, through the lens: of the points seen at its start, and of
+    the points seen at its end. Steps grow at
+    most twofold and are judged at their middle too (on a coarser grid), so that a motion that comes back
+    within a step is met by its parts.
     Linear interpolation between the frames then times a crossing to within ``crossing_error_px`` of motion.
-    Raises: DomainError when the interval is empty, largest_px is not positive, or a displacement does not shrink with the step (a jump).
-    Source: Rebecq, Gehrig and Scaramuzza, ESIM: an open event camera simulator, CoRL 2018 (adaptive sampling by the largest displacement).
+    Raises: DomainError when the interval is empty, largest_px is not positive, or a displacement does not
+      shrink with the step (a jump).
+    Source: Rebecq, Gehrig and Scaramuzza, ESIM: an open event camera simulator, CoRL 2018 (adaptive sampling
+      by the largest displacement).
     """
     if not (math.isfinite(start_s) and math.isfinite(end_s) and start_s < end_s):
-        raise DomainError(f"adaptive times: from {start_s} to {end_s} s is no interval; give finite times, the end after the start.")
+        raise DomainError(
+            f"adaptive times: from {start_s} to {end_s} s is no interval; give finite times, the end after "
+            "the start."
+        )
     if not 0 < largest_px < math.inf:
         raise DomainError(f"adaptive times: largest_px = {largest_px} must be positive and finite.")
     if not (every_px >= 1 and every_px % 1 == 0):
         raise DomainError(f"adaptive times: every_px = {every_px} must be a whole number of at least 1.")
     shortest = SMALLEST_STEP * (end_s - start_s)
     with torch.no_grad():
-        grids = [(pixels, camera.chief_rays(pixels)) for pixels in (coarse_pixels(camera.film, int(spacing)) for spacing in (COARSE * every_px, every_px))]
-        times, step = [float(start_s)], FIRST_STEP * (end_s - start_s)
+        grids = [
+            (pixels, camera.chief_rays(pixels))
+            for pixels in (
+                coarse_pixels(camera.film, int(spacing)) for spacing in (COARSE * every_px, every_px)
+            )
+        ]
+        times = [float(start_s)]
+        step = FIRST_STEP * (end_s - start_s)
         while times[-1] < end_s:
             now = times[-1]
             step = min(step, end_s - now)
-            while (moved := _displacement_px(camera, scene, trajectory, (now, now + step), grids, largest_px)) > largest_px:
+            while (
+                moved := _displacement_px(camera, scene, trajectory, (now, now + step), grids, largest_px)
+            ) > largest_px:
                 step *= max(0.01, 0.9 * AIM * largest_px / moved)
                 if step < shortest:
-                    raise DomainError(f"adaptive times: the image jumps by {moved:.3g} px at {now:.9g} s however short the step; give a path and objects that move continuously.")
+                    raise DomainError(
+                        f"adaptive times: the image jumps by {moved:.3g} px at {now:.9g} s however short "
+                        "the step; give a path and objects that move continuously."
+                    )
             times.append(end_s if now + step >= end_s - shortest else now + step)
             step *= min(GROWTH, AIM * largest_px / max(moved, 1e-300))
     return torch.tensor(times, dtype=torch.float64)
 
 
 def crossing_error_px(largest_px, period_px, slope=1.0):
-    """How far a pattern has moved at most between the true and the linearly interpolated time at which a pixel crosses a threshold.
+    """How far a pattern has moved at most between the true and the linearly interpolated time at which a
+    pixel crosses a threshold.
 
-    Args: largest_px: motion between frames, at constant speed. period_px: the finest period in the image. slope: of the level at the crossing, as a share
+    Args: largest_px: motion between frames, at constant speed. period_px: the finest period in the image.
+      slope: of the level at the crossing, as a share
       of its largest slope, within the step, in 0..1.
-    Between frames a chord misses a level L by at most h^2 max|L''| / 8, hence the crossing by that over |L'|; for a sinusoid of wave number
-    k = 2 pi / period that moves by d per step this is k d^2 / (8 slope) pixels of motion. Divided by the speed in px/s it is the error in seconds.
+    Between frames a chord misses a level L by at most h^2 max|L''| / 8, hence the crossing by that over |L'|;
+    for a sinusoid of wave number
+    k = 2 pi / period that moves by d per step this is k d^2 / (8 slope) pixels of motion. Divided by the
+    speed in px/s it is the error in seconds.
     """
     if not (largest_px > 0 and period_px > 0 and 0 < slope <= 1):
-        raise DomainError(f"crossing error: largest_px = {largest_px}, period_px = {period_px} must be positive, and slope = {slope} in 0..1.")
+        raise DomainError(
+            f"crossing error: largest_px = {largest_px}, period_px = {period_px} must be positive, and "
+            f"slope = {slope} in 0..1."
+        )
     return 2 * math.pi / period_px * largest_px**2 / (8 * slope)
 
 
 def coarse_pixels(film, every_px):
-    """Pixel coordinates [N, 2] on a grid over every window of the film, its last rows and columns included."""
-    rows, columns = (torch.linspace(0, n - 1, max(1, math.ceil((n - 1) / every_px)) + 1, dtype=torch.float64) if n > 1 else torch.zeros(1, dtype=torch.float64) for n in (film.height_px, film.width_px))
+    """Pixel coordinates [N, 2] on a grid over every window of the film, its last rows and columns
+    included."""
+    rows, columns = (
+        torch.linspace(0, n - 1, max(1, math.ceil((n - 1) / every_px)) + 1, dtype=torch.float64)
+        if n > 1
+        else torch.zeros(1, dtype=torch.float64)
+        for n in (film.height_px, film.width_px)
+    )
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
     return (corners[:, None] + torch.stack([x.reshape(-1), y.reshape(-1)], 1)).reshape(-1, 2)
 
 
 def _displacement_px(camera, scene, trajectory, ends, grids, largest_px):
-    """The largest displacement within a step, px; infinite when a point passes the camera. The fine grid is asked only when the coarse one finds no more than allowed."""
+    """The largest displacement within a step, px; infinite when a point passes the camera. The fine grid is
+    asked only when the coarse one finds no more than allowed."""
     at = torch.tensor([ends[0], (ends[0] + ends[1]) / 2, ends[1]], dtype=torch.float64)
-    poses, shown, largest = _poses(trajectory, at), _at(scene, at), 0.0
+    poses = _poses(trajectory, at)
+    shown = _at(scene, at)
+    largest = 0.0
     for (pixels, rays), pairs in zip(grids, (((0, 1), (0, 2), (2, 0)), ((0, 2), (2, 0))), strict=True):
         for now, later in pairs:
             found = track(camera, shown, poses, now, later, pixels, rays)
             lost = (found.hits.part >= 0) & ~found.valid
-            largest = max(largest, float((found.to_px - pixels).norm(dim=1).max()), _lost_px(camera, found, rays, lost) if bool(lost.any()) else 0.0)
+            largest = max(
+                largest,
+                float((found.to_px - pixels).norm(dim=1).max()),
+                _lost_px(camera, found, rays, lost) if bool(lost.any()) else 0.0,
+            )
         if largest > largest_px:
             break
     return largest
 
 
 def _lost_px(camera, found, rays, lost):
-    """Displacement of points that left the field of the lens, by the scale at its axis; infinite behind the camera."""
+    """Displacement of points that left the field of the lens, by the scale at its axis; infinite behind the
+    camera."""
     if not bool(found.in_front[lost].all()):
         return math.inf
-    axis = camera.chief_rays(camera.film.middle_px + torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)).direction
+    axis = camera.chief_rays(
+        camera.film.middle_px + torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
+    ).direction
     slope_per_px = float(axis[1, 0] / axis[1, 2] - axis[0, 0] / axis[0, 2])
-    before, after = rays.direction[lost].double(), found.points_cam_m[lost]
-    return float((after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:]).norm(dim=1).max()) / slope_per_px
+    before = rays.direction[lost].double()
+    after = found.points_cam_m[lost]
+    return (
+        float((after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:]).norm(dim=1).max()) / slope_per_px
+    )
 
 
 def _at(scene, t_s):

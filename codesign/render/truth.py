@@ -1,4 +1,5 @@
-"""Ground truth through the current lens: points, depth, objects, flow and occlusion, in float64 with gradients."""
+"""Ground truth through the current lens: points, depth, objects, flow and occlusion, in float64 with
+gradients."""
 
 from dataclasses import dataclass
 
@@ -10,7 +11,9 @@ from codesign.pose import apply, check_poses, inverse
 from codesign.render.camera import project
 from codesign.render.moving import cameras_in_parts, parts, poses_of_parts
 
-ROUNDING = 2e-6  # of lengths: 32 units in the last place of a float32, for a ray moved into an object's axes and met with its surface
+# of lengths: 32 units in the last place of a float32, for a ray moved into an object's axes and met with its
+# surface
+ROUNDING = 2e-6
 GRAZING = 1e-3  # cosines of incidence below this count as this
 
 
@@ -18,8 +21,10 @@ GRAZING = 1e-3  # cosines of incidence below this count as this
 class View:
     """What lies under the pixel centres of one frame; zero (object_id -1) where not valid.
 
-    points_world_m, normal: [*film.shape, 3] in world axes, the normal of unit length and as the surface has it. depth_m: [*film.shape] along the
-    camera's z axis. object_id: [*film.shape] int64, 0 for the static scene, then the moving objects in order. valid: [*film.shape] bool.
+    points_world_m, normal: [*film.shape, 3] in world axes, the normal of unit length and as the surface has
+      it. depth_m: [*film.shape] along the
+    camera's z axis. object_id: [*film.shape] int64, 0 for the static scene, then the moving objects in order.
+    valid: [*film.shape] bool.
     """
 
     points_world_m: Tensor
@@ -31,7 +36,8 @@ class View:
 
 @dataclass(frozen=True)
 class FlowTruth:
-    """flow_px: [T - stride, 2, *film.shape], +x right, +y down, 0 where not valid. valid, occluded: [T - stride, *film.shape] bool; occluded points are hidden later."""
+    """flow_px: [T - stride, 2, *film.shape], +x right, +y down, 0 where not valid. valid, occluded: [T -
+    stride, *film.shape] bool; occluded points are hidden later."""
 
     flow_px: Tensor
     valid: Tensor
@@ -40,7 +46,8 @@ class FlowTruth:
 
 @dataclass(frozen=True)
 class Hits:
-    """First surfaces along rays: local_m, normal [N, 3] in the axes of the part [N] that is met (-1 for none), distance_m [N] (infinite for none)."""
+    """First surfaces along rays: local_m, normal [N, 3] in the axes of the part [N] that is met (-1 for
+    none), distance_m [N] (infinite for none)."""
 
     local_m: Tensor
     normal: Tensor
@@ -51,15 +58,19 @@ class Hits:
 def first_hits(rays, scene, cameras):
     """The nearest surface of all parts of a scene along rays given in camera space.
 
-    Args: rays: Rays [N]. cameras: pose [4, 4] of the camera in the axes of every part. Rays that carry no light meet nothing.
+    Args: rays: Rays [N]. cameras: pose [4, 4] of the camera in the axes of every part. Rays that carry no
+      light meet nothing.
     Gradient: to rays and poses, surfaces taken as their tangent planes.
     """
-    origin_cam, direction_cam, lit = rays.origin_m.double(), rays.direction.double(), rays.weight.detach() > 0
+    origin_cam = rays.origin_m.double()
+    direction_cam = rays.direction.double()
+    lit = rays.weight.detach() > 0
     nearest = torch.full(lit.shape, torch.inf, dtype=torch.float64)
     local = normal = torch.zeros_like(origin_cam)
     part = torch.full(lit.shape, -1)
     for number, (scene_of_part, pose) in enumerate(zip(parts(scene), cameras, strict=True)):
-        origin, direction = apply(pose.double(), origin_cam), direction_cam @ pose[:3, :3].double().mT
+        origin = apply(pose.double(), origin_cam)
+        direction = direction_cam @ pose[:3, :3].double().mT
         point, across, valid = scene_of_part.hit(origin, direction)
         falling = (direction * across).sum(1)
         usable = valid & (falling.detach().abs() > 1e-9) & lit
@@ -67,7 +78,10 @@ def first_hits(rays, scene, cameras):
         distance = torch.where(usable, distance, torch.ones_like(distance))
         closer = usable & (distance.detach() < nearest.detach())
         nearest = torch.where(closer, distance, nearest)
-        local, normal = (torch.where(closer[:, None], new, old) for new, old in ((origin + direction * distance[:, None], local), (across.double(), normal)))
+        local, normal = (
+            torch.where(closer[:, None], new, old)
+            for new, old in ((origin + direction * distance[:, None], local), (across.double(), normal))
+        )
         part = torch.where(closer, number, part)
     return Hits(local, normal, part, nearest)
 
@@ -75,7 +89,8 @@ def first_hits(rays, scene, cameras):
 def world_points(rays, scene, T_world_cam):
     """World points under rays given in camera space, from one pose.
 
-    Args: rays: Rays [N] (chief rays). scene: anything with ``hit``, or a MovingScene of one frame. T_world_cam: [4, 4].
+    Args: rays: Rays [N] (chief rays). scene: anything with ``hit``, or a MovingScene of one frame.
+      T_world_cam: [4, 4].
     Returns: points [N, 3] metres, depth [N] along the camera's z axis, valid [N].
     Gradient: to rays and poses, the surface taken as its tangent plane at the hit.
     """
@@ -85,7 +100,8 @@ def world_points(rays, scene, T_world_cam):
 
 
 def view(camera, scene, T_world_cam, frame):
-    """View of one frame of a sequence: T_world_cam [T, 4, 4], frame a number. Gradient: points and depth to the lens, camera and object poses."""
+    """View of one frame of a sequence: T_world_cam [T, 4, 4], frame a number. Gradient: points and depth to
+    the lens, camera and object poses."""
     check_poses(T_world_cam)
     count = T_world_cam.shape[0]
     if not -count <= frame < count:
@@ -95,21 +111,36 @@ def view(camera, scene, T_world_cam, frame):
     valid = hits.part >= 0
     T_world_part = poses_of_parts(scene, count)[:, frame]
     turn = T_world_part[hits.part.clamp_min(0), :3, :3]
-    shaped = lambda f: torch.where(valid if f.ndim == 1 else valid[:, None], f, 0).reshape(*camera.film.shape, *f.shape[1:])  # noqa: E731
+
+    def shaped(f):
+        return torch.where(valid if f.ndim == 1 else valid[:, None], f, 0).reshape(
+            *camera.film.shape, *f.shape[1:]
+        )
+
     normal = (turn @ hits.normal[..., None])[..., 0]
-    return View(shaped(_carried(hits, T_world_part)), shaped(_depth(rays, hits)), shaped(normal), hits.part.reshape(camera.film.shape), valid.reshape(camera.film.shape))
+    return View(
+        shaped(_carried(hits, T_world_part)),
+        shaped(_depth(rays, hits)),
+        shaped(normal),
+        hits.part.reshape(camera.film.shape),
+        valid.reshape(camera.film.shape),
+    )
 
 
 def true_flow(camera, scene, T_world_cam, stride=1):
-    """Flow of every pixel centre from each pose to the one ``stride`` later, through the camera's current lens; points move with their object.
+    """Flow of every pixel centre from each pose to the one ``stride`` later, through the camera's current
+    lens; points move with their object.
 
-    Args: camera with ``chief_rays`` and ``film``; scene with ``hit``, or a MovingScene; T_world_cam [T, 4, 4].
-    Returns: flow [T - stride, 2, *film.shape] px, +x right, +y down; valid [T - stride, *film.shape], False where the ray meets nothing
+    Args: camera with ``chief_rays`` and ``film``; scene with ``hit``, or a MovingScene; T_world_cam [T, 4,
+      4].
+    Returns: flow [T - stride, 2, *film.shape] px, +x right, +y down; valid [T - stride, *film.shape], False
+      where the ray meets nothing
       or the point leaves the field of the lens (the flow is 0 there).
     Gradient: to lens, camera and object poses. Occlusion at the later time is left to ``flow_and_occlusion``.
     Raises: ShapeError when there are not more poses than ``stride``.
     """
-    pixels, pairs = camera.film.pixels(), _pairs(T_world_cam, stride)
+    pixels = camera.film.pixels()
+    pairs = _pairs(T_world_cam, stride)
     rays = camera.chief_rays(pixels)
     tracks = [track(camera, scene, T_world_cam, now, later, pixels, rays) for now, later in pairs]
     return _flow(camera, tracks), torch.stack([t.valid.reshape(camera.film.shape) for t in tracks])
@@ -118,21 +149,30 @@ def true_flow(camera, scene, T_world_cam, stride=1):
 def flow_and_occlusion(camera, scene, T_world_cam, stride=1):
     """As ``true_flow``, and which of the points are hidden at the later time by something nearer: FlowTruth.
 
-    A point is hidden when the later chief ray through its image meets a surface before it by more than rounding: 32 units in the last place of float32
-    geometry, divided by the cosine at which the ray meets the point's own surface, since a ray aside by as much meets it earlier or later by that.
+    A point is hidden when the later chief ray through its image meets a surface before it by more than
+    rounding: 32 units in the last place of float32
+    geometry, divided by the cosine at which the ray meets the point's own surface, since a ray aside by as
+    much meets it earlier or later by that.
     """
-    pixels, pairs = camera.film.pixels(), _pairs(T_world_cam, stride)
+    pixels = camera.film.pixels()
+    pairs = _pairs(T_world_cam, stride)
     rays = camera.chief_rays(pixels)
     tracks = [track(camera, scene, T_world_cam, now, later, pixels, rays) for now, later in pairs]
     occluded = [_hidden(camera, scene, T_world_cam, t).reshape(camera.film.shape) for t in tracks]
-    return FlowTruth(_flow(camera, tracks), torch.stack([t.valid.reshape(camera.film.shape) for t in tracks]), torch.stack(occluded))
+    return FlowTruth(
+        _flow(camera, tracks),
+        torch.stack([t.valid.reshape(camera.film.shape) for t in tracks]),
+        torch.stack(occluded),
+    )
 
 
 @dataclass(frozen=True)
 class Track:
-    """Points under pixels at one frame, and where they are at a later one: hits of the first, points_cam_m [N, 3] and to_px [N, 2] of the later.
+    """Points under pixels at one frame, and where they are at a later one: hits of the first, points_cam_m
+    [N, 3] and to_px [N, 2] of the later.
 
-    in_front: [N] bool, the point lies before the later camera (points_cam_m is (0, 0, 1) elsewhere). valid: [N] bool, it is in the field of the lens too.
+    in_front: [N] bool, the point lies before the later camera (points_cam_m is (0, 0, 1) elsewhere). valid:
+      [N] bool, it is in the field of the lens too.
     """
 
     later: int
@@ -145,7 +185,8 @@ class Track:
 
 
 def track(camera, scene, T_world_cam, now, later, pixels, rays):
-    """Track of the pixel coordinates [N, 2] and their chief rays from frame ``now`` to frame ``later`` of a sequence."""
+    """Track of the pixel coordinates [N, 2] and their chief rays from frame ``now`` to frame ``later`` of a
+    sequence."""
     cameras = cameras_in_parts(scene, T_world_cam)
     hits = first_hits(rays, scene, [poses[now] for poses in cameras])
     ahead = _carried(hits, torch.stack([inverse(poses[later].double()) for poses in cameras]))
@@ -163,7 +204,12 @@ def _hidden(camera, scene, T_world_cam, found):
     rays = camera.chief_rays(torch.where(found.valid[:, None], found.to_px, camera.film.middle_px))
     reach = (found.points_cam_m - rays.origin_m).norm(dim=1)
     turn = torch.stack(cameras)[found.hits.part.clamp_min(0), :3, :3]
-    cosine = ((turn @ rays.direction.double()[..., None])[..., 0] * found.hits.normal).sum(1).abs().clamp_min(GRAZING)
+    cosine = (
+        ((turn @ rays.direction.double()[..., None])[..., 0] * found.hits.normal)
+        .sum(1)
+        .abs()
+        .clamp_min(GRAZING)
+    )
     size = reach + found.hits.local_m.norm(dim=1)  # float32 coordinates round by their own size
     return found.valid & (first_hits(rays, scene, cameras).distance_m < reach - ROUNDING * size / cosine)
 
@@ -171,7 +217,10 @@ def _hidden(camera, scene, T_world_cam, found):
 def _pairs(T_world_cam, stride):
     check_poses(T_world_cam)
     if not 1 <= stride < T_world_cam.shape[0]:
-        raise ShapeError(f"true flow over {stride} pose(s) ahead needs a stride of at least 1 and more poses than that, got {T_world_cam.shape[0]}; give more poses.")
+        raise ShapeError(
+            f"true flow over {stride} pose(s) ahead needs a stride of at least 1 and more poses than that, "
+            f"got {T_world_cam.shape[0]}; give more poses."
+        )
     return [(now, now + stride) for now in range(T_world_cam.shape[0] - stride)]
 
 

@@ -15,17 +15,24 @@ def camera_velocity(T_world_cam, t_s):
     """Mean velocity of a camera between its poses: the constant twist that leads from each pose to the next.
 
     Args: T_world_cam: [T >= 2, 4, 4]. t_s: [T] times, increasing.
-    Returns: two twists [T - 1, 6], translation of the camera's origin (m/s) then rotation (rad/s): in the camera's own axes, where it is the same all
+    Returns: two twists [T - 1, 6], translation of the camera's origin (m/s) then rotation (rad/s): in the
+      camera's own axes, where it is the same all
       through the interval, and in world axes, as it is at the middle of the interval.
     Gradient: to the poses.
-    Raises: DomainError when times do not increase or the camera turns by more than 3 rad from one pose to the next; ShapeError.
+    Raises: DomainError when times do not increase or the camera turns by more than 3 rad from one pose to the
+      next; ShapeError.
     """
     check_poses(T_world_cam)
     t_s = check_finite(torch.as_tensor(t_s, dtype=torch.float64), "times of the poses")
     if t_s.shape != T_world_cam.shape[:1] or t_s.numel() < 2:
-        raise ShapeError(f"camera velocity: {tuple(t_s.shape)} times for {T_world_cam.shape[0]} poses; give one time per pose, and at least two.")
+        raise ShapeError(
+            f"camera velocity: {tuple(t_s.shape)} times for {T_world_cam.shape[0]} poses; give one time per "
+            "pose, and at least two."
+        )
     if not bool((t_s.diff() > 0).all()):
-        raise DomainError("camera velocity: the times must increase from pose to pose; sort them and drop doubles.")
+        raise DomainError(
+            "camera velocity: the times must increase from pose to pose; sort them and drop doubles."
+        )
     poses = T_world_cam.double()
     twist = se3_log(inverse(poses[:-1]) @ poses[1:])
     half_turn = se3_exp(torch.cat([torch.zeros_like(twist[:, :3]), twist[:, 3:] / 2], 1))[:, :3, :3]
@@ -35,20 +42,29 @@ def camera_velocity(T_world_cam, t_s):
 
 
 def se3_log(transform):
-    """Twists [N, 6] of rigid transforms [N, 4, 4], the inverse of ``pose.se3_exp`` for turns of at most 3 rad.
+    """Twists [N, 6] of rigid transforms [N, 4, 4], the inverse of ``pose.se3_exp`` for turns of at most 3
+    rad.
 
     Gradient: exact, also at the identity. Raises: DomainError for larger turns.
-    Source: Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics, 2018, eq. 133, 146 and 173.
+    Source: Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics, 2018, eq. 133, 146
+      and 173.
     """
-    R, t = transform[:, :3, :3], transform[:, :3, 3]
-    sine_axis = torch.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], 1) / 2
-    cosine, square = (R.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2, sine_axis.square().sum(1)
+    R = transform[:, :3, :3]
+    t = transform[:, :3, 3]
+    sine_axis = (
+        torch.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], 1) / 2
+    )
+    cosine = (R.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    square = sine_axis.square().sum(1)
     small = (square < SMALL) & (cosine > 0)
     sine = torch.where(small, 0.1, square).sqrt()
     theta = torch.atan2(sine, torch.where(small, 0.9, cosine))
     turned = float(torch.where(small, 0.0, theta).detach().max())
     if turned > LARGEST_TURN_RAD:
-        raise DomainError(f"camera velocity: the camera turns by {math.degrees(turned):.0f} degrees between two poses; give poses less than 170 degrees apart.")
+        raise DomainError(
+            f"camera velocity: the camera turns by {math.degrees(turned):.0f} degrees between two poses; "
+            "give poses less than 170 degrees apart."
+        )
     series = 1 + square / 6 + 3 * square**2 / 40 + 5 * square**3 / 112  # of arcsin(s) / s
     w = sine_axis * torch.where(small, series, theta / sine)[:, None]
     squared = w.square().sum(1)

@@ -9,20 +9,30 @@ from codesign.render.moving import cameras_in_parts, parts
 def shade(rays, scene, T_world_cam, samples_per_pixel):
     """Pixel means [T, P] of the radiance along rays given in camera space, seen from every pose.
 
-    Args: rays: Rays with N = P x samples_per_pixel. scene: anything with ``radiance`` and ``dtype``, or a MovingScene with T poses per object.
-    Gradient: to the rays (weights included), the poses and the poses of moving objects; the motion of silhouettes is not in it.
+    Args: rays: Rays with N = P x samples_per_pixel. scene: anything with ``radiance`` and ``dtype``, or a
+      MovingScene with T poses per object.
+    Gradient: to the rays (weights included), the poses and the poses of moving objects; the motion of
+      silhouettes is not in it.
     """
     check_poses(T_world_cam)
-    count, poses = rays.weight.numel(), T_world_cam.shape[0]
+    count = rays.weight.numel()
+    poses = T_world_cam.shape[0]
     if not samples_per_pixel >= 1:
         raise DomainError(f"samples_per_pixel = {samples_per_pixel} must be at least 1.")
     if count % samples_per_pixel:
-        raise ShapeError(f"{count} rays are not a whole number of pixels at {samples_per_pixel} samples each.")
+        raise ShapeError(
+            f"{count} rays are not a whole number of pixels at {samples_per_pixel} samples each."
+        )
     if count * poses >= 2**32:
-        raise DomainError(f"{count * poses} rays ({count} for each of {poses} frames) do not fit into one launch; render fewer frames at a time (frame_chunks).")
+        raise DomainError(
+            f"{count * poses} rays ({count} for each of {poses} frames) do not fit into one launch; render "
+            "fewer frames at a time (frame_chunks)."
+        )
     dtype = scene.dtype
     columns = [*rays.origin_m.unbind(1), *rays.direction.unbind(1), rays.weight]
-    inputs = [c.to(dtype) for c in columns] + [pose[:, :3].to(dtype) for pose in cameras_in_parts(scene, T_world_cam)]
+    inputs = [c.to(dtype) for c in columns] + [
+        pose[:, :3].to(dtype) for pose in cameras_in_parts(scene, T_world_cam)
+    ]
     kernel = _Wavefront(parts(scene), count, poses, samples_per_pixel)
     (image,) = run_kernel(kernel, inputs, [(poses, count // samples_per_pixel)])
     return image
@@ -32,7 +42,10 @@ class _Wavefront:
     """The kernel: rays into every part's own frame, and the light of the part that is met first."""
 
     def __init__(self, scenes, count, poses, samples):
-        self.scenes, self.count, self.poses, self.samples = scenes, count, poses, samples
+        self.scenes = scenes
+        self.count = count
+        self.poses = poses
+        self.samples = samples
 
     def __call__(self, arr, ox, oy, oz, dx, dy, dz, weight, *poses):
         import drjit as dr
@@ -40,11 +53,19 @@ class _Wavefront:
         lane = dr.arange(arr.UInt32, self.count * self.poses)
         frame = lane // self.count
         ray = lane - frame * self.count
-        o, d = (arr.Array3(*[dr.gather(arr.Float, v, ray) for v in part]) for part in ((ox, oy, oz), (dx, dy, dz)))
+        o, d = (
+            arr.Array3(*[dr.gather(arr.Float, v, ray) for v in part]) for part in ((ox, oy, oz), (dx, dy, dz))
+        )
         placed = [_placed(arr, o, d, pose, frame) for pose in poses]
-        seen = self.scenes[0].radiance(arr, *placed[0]) if len(placed) == 1 else _nearest(arr, self.scenes, placed)
+        seen = (
+            self.scenes[0].radiance(arr, *placed[0])
+            if len(placed) == 1
+            else _nearest(arr, self.scenes, placed)
+        )
         light = seen * dr.gather(arr.Float, weight, ray)
-        if dr.grad_enabled(light):  # the adjoint of the sum needs no values of light: without this it would be rendered twice
+        if dr.grad_enabled(
+            light
+        ):  # the adjoint of the sum needs no values of light: without this it would be rendered twice
             light = dr.replace_grad(dr.zeros(arr.Float, dr.width(light)), light)
         return (dr.block_sum(light, self.samples) / self.samples,)
 
@@ -54,7 +75,9 @@ def _placed(arr, o, d, pose, frame):
     import drjit as dr
 
     m = [dr.gather(arr.Float, pose, frame * 12 + k) for k in range(12)]
-    origin = arr.Array3(*[m[4 * r] * o.x + m[4 * r + 1] * o.y + m[4 * r + 2] * o.z + m[4 * r + 3] for r in range(3)])
+    origin = arr.Array3(
+        *[m[4 * r] * o.x + m[4 * r + 1] * o.y + m[4 * r + 2] * o.z + m[4 * r + 3] for r in range(3)]
+    )
     return origin, arr.Array3(*[m[4 * r] * d.x + m[4 * r + 1] * d.y + m[4 * r + 2] * d.z for r in range(3)])
 
 

@@ -10,7 +10,8 @@ from codesign.render.outline import outlines
 class MitsubaScene:
     """A Mitsuba scene whose radiance is read directly from its emitters.
 
-    Args: description: a Mitsuba scene dictionary; every shape carries an area emitter. device: "cpu" or "cuda".
+    Args: description: a Mitsuba scene dictionary; every shape carries an area emitter. device: "cpu" or
+      "cuda".
       merge: whether Mitsuba may join meshes that look alike into one.
     Computes in float32. Raises: DomainError when Mitsuba refuses the description.
     """
@@ -18,29 +19,37 @@ class MitsubaScene:
     dtype = torch.float32
 
     def __init__(self, description, device="cpu", *, merge=True):
-        self.mi, self._outline = backend.mitsuba(device), None
+        self.mi = backend.mitsuba(device)
+        self._outline = None
         try:
             self.scene = self.mi.load_dict({"type": "scene", **description}, optimize=merge)
         except CodesignError:
             raise
         except Exception as error:  # Mitsuba raises plain RuntimeErrors of many lines
-            raise DomainError(f"Mitsuba cannot build the scene: {str(error).splitlines()[0][:200]}") from error
+            raise DomainError(
+                f"Mitsuba cannot build the scene: {str(error).splitlines()[0][:200]}"
+            ) from error
 
     def radiance(self, arr, origin, direction):
-        """Radiance along world rays (drjit arrays), 0 where nothing is hit. Gradient: to the rays, inside surfaces."""
+        """Radiance along world rays (drjit arrays), 0 where nothing is hit. Gradient: to the rays, inside
+        surfaces."""
         return self.radiance_and_distance(arr, origin, direction)[0]
 
     def radiance_and_distance(self, arr, origin, direction):
-        """Radiance as above, and the distance to what is hit (infinite where nothing is), which carries no gradient."""
+        """Radiance as above, and the distance to what is hit (infinite where nothing is), which carries no
+        gradient."""
         import drjit as dr
 
         mi = self.mi
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
         found = self.scene.ray_intersect_preliminary(ray, coherent=True)
         si = found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.Minimal)
-        # emission is one-sided by the face: vertex normals are stored to 1 % only and would blacken faces seen nearly edge-on
+        # emission is one-sided by the face: vertex normals are stored to 1 % only and would blacken faces
+        # seen nearly edge-on
         si.wi = mi.Vector3f(0, 0, -dr.dot(si.n, ray.d))
-        if self.scene.environment() is not None:  # a sky is looked up by the direction, which these flags leave out where nothing is met
+        if (
+            self.scene.environment() is not None
+        ):  # a sky is looked up by the direction, which these flags leave out where nothing is met
             si.wi = dr.select(si.is_valid(), si.wi, -ray.d)
         return si.emitter(self.scene).eval(si)[0], found.t
 
@@ -51,14 +60,19 @@ class MitsubaScene:
         return self._outline
 
     def hit(self, origin_m, direction):
-        """First surface met by world rays [N, 3]: point [N, 3], normal [N, 3], valid [N]; no gradient, float64 out of float32 geometry."""
+        """First surface met by world rays [N, 3]: point [N, 3], normal [N, 3], valid [N]; no gradient,
+        float64 out of float32 geometry."""
         mi = self.mi
         if origin_m.shape[0] == 0:  # a cast of no rays would end the process
             return origin_m.detach(), origin_m.detach(), torch.zeros(0, dtype=torch.bool)
         o, d = (part.detach().float().cpu().unbind(1) for part in (origin_m, direction))
-        ray = mi.Ray3f(mi.Point3f(*[mi.Float(v.contiguous()) for v in o]), mi.Vector3f(*[mi.Float(v.contiguous()) for v in d]))
+        ray = mi.Ray3f(
+            mi.Point3f(*[mi.Float(v.contiguous()) for v in o]),
+            mi.Vector3f(*[mi.Float(v.contiguous()) for v in d]),
+        )
         si = self.scene.ray_intersect(ray)
         valid = torch.as_tensor(si.is_valid().numpy()).reshape(-1)
-        t, normal = torch.as_tensor(si.t.numpy()).double(), torch.as_tensor(si.n.numpy()).double()
+        t = torch.as_tensor(si.t.numpy()).double()
+        normal = torch.as_tensor(si.n.numpy()).double()
         t = torch.where(valid, t, torch.ones_like(t))
         return origin_m.detach() + direction.detach() * t[:, None], normal.T, valid

@@ -5,8 +5,11 @@ import numpy as np
 
 
 def strips(rows, titles, signed, labels):
-    """Figure of image rows: rows [R][C] of [H, W] arrays; ``signed`` rows are drawn red (ON) and blue (OFF), others in grey."""
-    figure, axes = plt.subplots(len(rows), len(rows[0]), figsize=(2.3 * len(rows[0]), 2.35 * len(rows)), squeeze=False)
+    """Figure of image rows: rows [R][C] of [H, W] arrays; ``signed`` rows are drawn red (ON) and blue (OFF),
+    others in grey."""
+    figure, axes = plt.subplots(
+        len(rows), len(rows[0]), figsize=(2.3 * len(rows[0]), 2.35 * len(rows)), squeeze=False
+    )
     for r, (row, sign) in enumerate(zip(rows, signed, strict=True)):
         top = max(float(np.quantile(np.abs(image), 0.99)) for image in row) or 1.0
         for c, (axis, image) in enumerate(zip(axes[r], row, strict=True)):
@@ -45,11 +48,24 @@ def heat_map(values, rows, columns, label):
     values = np.asarray(values, dtype=float)
     figure, axis = plt.subplots(figsize=(1.5 + 1.3 * len(columns), 1.2 + 0.5 * len(rows)))
     shown = np.where(np.isfinite(values), np.maximum(values, 1e-9), np.nan)
-    picture = axis.imshow(shown, cmap="viridis_r", norm=LogNorm(vmin=max(np.nanmin(shown), 1e-9), vmax=max(np.nanmax(shown), 1e-8)), aspect="auto")
+    picture = axis.imshow(
+        shown,
+        cmap="viridis_r",
+        norm=LogNorm(vmin=max(np.nanmin(shown), 1e-9), vmax=max(np.nanmax(shown), 1e-8)),
+        aspect="auto",
+    )
     for i in range(len(rows)):
         for j in range(len(columns)):
             if np.isfinite(values[i, j]):
-                axis.text(j, i, f"{values[i, j]:.1e}", ha="center", va="center", fontsize=8, color="w" if shown[i, j] > np.nanmedian(shown) else "k")
+                axis.text(
+                    j,
+                    i,
+                    f"{values[i, j]:.1e}",
+                    ha="center",
+                    va="center",
+                    fontsize=8,
+                    color="w" if shown[i, j] > np.nanmedian(shown) else "k",
+                )
     axis.set_xticks(range(len(columns)), columns, rotation=20, ha="right")
     axis.set_yticks(range(len(rows)), rows)
     figure.colorbar(picture, label=label)

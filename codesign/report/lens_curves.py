@@ -1,4 +1,5 @@
-"""Pictures of lens errors over the field, over focus, and over the surfaces: distortion, field curvature, through focus, Seidel sums."""
+"""Pictures of lens errors over the field, over focus, and over the surfaces: distortion, field curvature,
+through focus, Seidel sums."""
 
 import math
 
@@ -10,13 +11,20 @@ from codesign.lens import analysis
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.report.lens_figures import COLOURS, VISIBLE_UM
 
-SEIDEL_NAMES = ("spherical $S_I$", "coma $S_{II}$", "astigmatism $S_{III}$", "Petzval $S_{IV}$", "distortion $S_V$")
+SEIDEL_NAMES = (
+    "spherical $S_I$",
+    "coma $S_{II}$",
+    "astigmatism $S_{III}$",
+    "Petzval $S_{IV}$",
+    "distortion $S_V$",
+)
 SEIDEL_COLOURS = ("#1b6ca8", "#2e8b57", "#d68910", "#8e44ad", "#c0392b")
 
 
 @torch.no_grad()
 def field_errors(lens, half_field_rad, light: object = VISIBLE_UM, mapping="f-tan", count=21):
-    """Figure over the field: tangential and sagittal focus, distortion, and lateral colour against the first wavelength."""
+    """Figure over the field: tangential and sagittal focus, distortion, and lateral colour against the first
+    wavelength."""
     reference, *others = analysis.spectral_lines(light)[0]
     fields = [half_field_rad * i / (count - 1) for i in range(count)]
     degrees = np.degrees(fields)
@@ -26,7 +34,11 @@ def field_errors(lens, half_field_rad, light: object = VISIBLE_UM, mapping="f-ta
     axes[0].plot(shifts[:, 1], degrees, color=COLOURS[0], ls="--", label="sagittal")
     axes[0].set(xlabel="focus shift (mm)", ylabel="field (degrees)", title="Field curvature")
     axes[0].legend(frameon=False, fontsize=8)
-    axes[1].plot(analysis.distortion_percent(lens, fields[1:], mapping, reference).numpy(), degrees[1:], color=COLOURS[2])  # on the axis it is 0 by definition
+    axes[1].plot(
+        analysis.distortion_percent(lens, fields[1:], mapping, reference).numpy(),
+        degrees[1:],
+        color=COLOURS[2],
+    )  # on the axis it is 0 by definition
     axes[1].set(xlabel=f"distortion (%), {mapping}", title="Distortion")
     if others:
         colour = analysis.lateral_colour_mm(lens, fields, others, reference).numpy() * 1e3
@@ -44,7 +56,15 @@ def field_errors(lens, half_field_rad, light: object = VISIBLE_UM, mapping="f-ta
 
 
 @torch.no_grad()
-def through_focus(lens, fields_rad, defocus_mm, frequency_per_mm, light: object = WAVELENGTH_UM["d"], vignetting=False, method="geometric"):
+def through_focus(
+    lens,
+    fields_rad,
+    defocus_mm,
+    frequency_per_mm,
+    light: object = WAVELENGTH_UM["d"],
+    vignetting=False,
+    method="geometric",
+):
     """Figure over the position of the image plane: RMS spot, and MTF at one frequency."""
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     z = np.asarray(defocus_mm, dtype=float)
@@ -52,7 +72,9 @@ def through_focus(lens, fields_rad, defocus_mm, frequency_per_mm, light: object 
     for field, row, colour in zip(fields_rad, sizes, COLOURS * len(fields_rad), strict=False):
         label = f"{math.degrees(field):.3g}°"
         axes[0].plot(z, row.numpy(), color=colour, label=label)
-        curves = analysis.through_focus_mtf(lens, field, frequency_per_mm, z, light, method, vignetting=vignetting).numpy()
+        curves = analysis.through_focus_mtf(
+            lens, field, frequency_per_mm, z, light, method, vignetting=vignetting
+        ).numpy()
         axes[1].plot(z, curves[0], color=colour, label=f"{label}, tangential")
         axes[1].plot(z, curves[1], color=colour, ls="--", label=f"{label}, sagittal")
     axes[0].set(xlabel="defocus (mm)", ylabel="RMS spot (µm)")
@@ -81,7 +103,9 @@ def seidel_bars(sums, wavelength_um=WAVELENGTH_UM["d"]):
     for axis in axes:
         axis.axhline(0, color="k", lw=0.7)
         axis.grid(axis="y", alpha=0.3)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", frameon=False, fontsize=8, ncols=5)
+    figure.legend(
+        *axes[0].get_legend_handles_labels(), loc="outside upper left", frameon=False, fontsize=8, ncols=5
+    )
     return figure
 
 
@@ -89,10 +113,17 @@ def seidel_bars(sums, wavelength_um=WAVELENGTH_UM["d"]):
 def encircled_curves(lens, fields_rad, light: object = WAVELENGTH_UM["d"], vignetting=False):
     """Figure of encircled energy (rays, about their mean) over the radius, a curve per field."""
     figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
-    largest = max(float(analysis.encircled_radius_mm(lens, field, 1.0, light, 48, vignetting)) for field in fields_rad)
+    largest = max(
+        float(analysis.encircled_radius_mm(lens, field, 1.0, light, 48, vignetting)) for field in fields_rad
+    )
     radii = torch.linspace(0, 1.02 * largest, 200, dtype=lens.dtype)
     for field, colour in zip(fields_rad, COLOURS * len(fields_rad), strict=False):
-        axis.plot(radii.numpy() * 1e3, analysis.encircled_energy(lens, field, radii, light, 48, vignetting).numpy(), color=colour, label=f"{math.degrees(field):.3g}°")
+        axis.plot(
+            radii.numpy() * 1e3,
+            analysis.encircled_energy(lens, field, radii, light, 48, vignetting).numpy(),
+            color=colour,
+            label=f"{math.degrees(field):.3g}°",
+        )
     axis.set(xlabel="radius (µm)", ylabel="share of rays inside", ylim=(0, 1.02))
     axis.set_xlim(left=0)
     axis.grid(alpha=0.3)

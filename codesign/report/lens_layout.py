@@ -15,19 +15,24 @@ from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.surface import sag_mm
 
 COLOURS = ("#1b6ca8", "#2e8b57", "#c0392b", "#8e44ad")
-OUTLINE, GLASS, MIRROR = "#24425c", "#9cc3dd", "#5f6b76"
+OUTLINE = "#24425c"
+GLASS = "#9cc3dd"
+MIRROR = "#5f6b76"
 ENDINGS = (".svg", ".png", ".pdf")
 
 
 def lens_layout(lens, fields_rad=None, path=None, rays=5):
     """Figure of a lens's cross-section with meridional rays.
 
-    Args: fields_rad: angles; None takes 0, 0.7 and 1 of the lens's half field (10 degrees where none is known). path: where to save,
+    Args: fields_rad: angles; None takes 0, 0.7 and 1 of the lens's half field (10 degrees where none is
+      known). path: where to save,
     .svg, .png or .pdf, or None. rays: per field. Mirrors are drawn along the unfolded axis.
     Returns: matplotlib Figure. Raises: FileFormatError for another ending or a place that is not writable.
     """
     if path is not None and Path(path).suffix.lower() not in ENDINGS:
-        raise FileFormatError(f"drawing {path}: extension '{Path(path).suffix}' is not written; use {', '.join(ENDINGS)}.")
+        raise FileFormatError(
+            f"drawing {path}: extension '{Path(path).suffix}' is not written; use {', '.join(ENDINGS)}."
+        )
     if fields_rad is None:
         fields_rad = [math.radians(lens.half_field_deg or 10.0) * h for h in (0.0, 0.7, 1.0)]
     figure, axis = plt.subplots(figsize=(9, 4), layout="constrained")
@@ -37,7 +42,9 @@ def lens_layout(lens, fields_rad=None, path=None, rays=5):
         try:
             figure.savefig(path, dpi=160, facecolor="white")
         except OSError as error:
-            raise FileFormatError(f"drawing {path} cannot be written ({error.strerror}); choose a folder you may write to.") from error
+            raise FileFormatError(
+                f"drawing {path} cannot be written ({error.strerror}); choose a folder you may write to."
+            ) from error
     return figure
 
 
@@ -52,7 +59,8 @@ def layouts(lenses, fields_rad):
 
 
 def draw_layout(axis, lens, fields_rad, rays=5):
-    """Draw the cross-section of a lens with meridional rays of each field into a matplotlib axis. Lengths in mm."""
+    """Draw the cross-section of a lens with meridional rays of each field into a matplotlib axis. Lengths in
+    mm."""
     surfaces = lens.to_surfaces()
     vertices = np.concatenate([[0.0], np.cumsum([s.thickness_mm for s in surfaces])])
     _draw_glass(axis, surfaces, vertices)
@@ -61,40 +69,82 @@ def draw_layout(axis, lens, fields_rad, rays=5):
             continue  # a stop or dummy in air: its mark below says enough
         z, y = _profile(s, at)
         obstructed = np.abs(y) < s.inner_semi_aperture_mm
-        axis.plot(z, np.where(obstructed, np.nan, y), color=MIRROR if s.mirror else OUTLINE, lw=2.2 if s.mirror else 1, ls="--" if s.phase else "-")
+        axis.plot(
+            z,
+            np.where(obstructed, np.nan, y),
+            color=MIRROR if s.mirror else OUTLINE,
+            lw=2.2 if s.mirror else 1,
+            ls="--" if s.phase else "-",
+        )
     tallest = max(s.semi_aperture_mm for s in surfaces)
     _draw_stop(axis, lens, surfaces, vertices, tallest)
     film = vertices[-1]
-    start = -max(0.12 * film, 1.05 * max(0.0, -min(_profile(s, at)[0].min() for s, at in zip(surfaces, vertices, strict=False))))
+    start = -max(
+        0.12 * film,
+        1.05 * max(0.0, -min(_profile(s, at)[0].min() for s, at in zip(surfaces, vertices, strict=False))),
+    )
     highest = 0.0
     for field, colour in zip(fields_rad, COLOURS * len(fields_rad), strict=False):
-        pupil = torch.stack([torch.zeros(rays, dtype=lens.dtype), torch.linspace(-1, 1, rays, dtype=lens.dtype)], 1)
+        pupil = torch.stack(
+            [torch.zeros(rays, dtype=lens.dtype), torch.linspace(-1, 1, rays, dtype=lens.dtype)], 1
+        )
         paths = ray_paths(lens, field, pupil, start)
         for k, path in enumerate(paths):
-            axis.plot(path[:, 0], path[:, 1], color=colour, lw=0.6, label=f"{math.degrees(field):.3g}°" if k == 0 else None)
+            axis.plot(
+                path[:, 0],
+                path[:, 1],
+                color=colour,
+                lw=0.6,
+                label=f"{math.degrees(field):.3g}°" if k == 0 else None,
+            )
             highest = max(highest, abs(path[-1, 1]))
     film_height = 1.1 * highest if highest > 0.05 * tallest else 0.5 * tallest
     axis.plot([film, film], [-film_height, film_height], color="k", lw=1.5)
     axis.axhline(0, color="0.6", lw=0.5, ls=(0, (8, 3, 1, 3)), zorder=0)
     axis.set(xlabel="z (mm)", ylabel="y (mm)")
     axis.set_aspect("equal")
-    axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8, title="field", title_fontsize=8)
+    axis.legend(
+        loc="upper left",
+        bbox_to_anchor=(1.0, 1.0),
+        frameon=False,
+        fontsize=8,
+        title="field",
+        title_fontsize=8,
+    )
     if any(lens.mirrors):
-        axis.text(1.0, 1.02, "mirrors (thick) along the unfolded axis", transform=axis.transAxes, ha="right", fontsize=8, color=MIRROR)
+        axis.text(
+            1.0,
+            1.02,
+            "mirrors (thick) along the unfolded axis",
+            transform=axis.transAxes,
+            ha="right",
+            fontsize=8,
+            color=MIRROR,
+        )
 
 
 def ray_paths(lens, field_rad, pupil, start_z_mm):
-    """Polylines [points, 2] (z, y) in mm of the rays of a field that arrive, found by tracing the lens cut off behind each surface."""
+    """Polylines [points, 2] (z, y) in mm of the rays of a field that arrive, found by tracing the lens cut
+    off behind each surface."""
     surfaces = lens.to_surfaces()
     with torch.no_grad():
         origin, direction = source_rays(lens, field_rad, pupil, WAVELENGTH_UM["d"])
         origin = origin + direction * ((start_z_mm - origin[:, 2:]) / direction[:, 2:])
-        points, z = [torch.stack([origin[:, 2], origin[:, 1]], 1)], 0.0
+        points = [torch.stack([origin[:, 2], origin[:, 1]], 1)]
+        z = 0.0
         for i, s in enumerate(surfaces):
-            part = GeoLens([*(replace(q, is_stop=False) for q in surfaces[:i]), replace(s, thickness_mm=0.0, is_stop=False)], lens.entrance_pupil_diameter_mm, lens.dtype)
+            part = GeoLens(
+                [
+                    *(replace(q, is_stop=False) for q in surfaces[:i]),
+                    replace(s, thickness_mm=0.0, is_stop=False),
+                ],
+                lens.entrance_pupil_diameter_mm,
+                lens.dtype,
+            )
             out = part.trace(origin, direction)
             # rays end on the vertex plane behind surface i: step back along the ray onto the surface
-            y, slope = out.position_mm[:, 1], out.direction[:, 1] / out.direction[:, 2]
+            y = out.position_mm[:, 1]
+            slope = out.direction[:, 1] / out.direction[:, 2]
             sag = torch.zeros_like(y)
             for _ in range(40):  # each step shrinks the miss by slope times slope of the surface
                 sag = sag_mm(y + slope * sag, s.curvature_per_mm, s.conic, s.asphere)
@@ -114,7 +164,8 @@ def _profile(surface, vertex_mm, height_mm=None):
 
 
 def _draw_glass(axis, surfaces, vertices):
-    """Elements between surfaces with glass behind them; the smaller face gets a flat rim out to the larger one's edge."""
+    """Elements between surfaces with glass behind them; the smaller face gets a flat rim out to the larger
+    one's edge."""
     for i, s in enumerate(surfaces[:-1]):
         behind = surfaces[i + 1]
         if s.medium is None or s.mirror or behind.mirror:
@@ -124,18 +175,33 @@ def _draw_glass(axis, surfaces, vertices):
         for face, at in ((s, vertices[i]), (behind, vertices[i + 1])):
             z, y = _profile(face, at)
             if face.semi_aperture_mm < rim:  # flat out to the rim
-                z, y = np.concatenate([z[:1], z, z[-1:]]), np.concatenate([[-rim], y, [rim]])
+                z = np.concatenate([z[:1], z, z[-1:]])
+                y = np.concatenate([[-rim], y, [rim]])
             faces.append((z, y))
         (za, ya), (zb, yb) = faces
-        axis.fill(np.concatenate([za, zb[::-1]]), np.concatenate([ya, yb[::-1]]), facecolor=GLASS, edgecolor=OUTLINE, alpha=0.55, lw=0.8)
+        axis.fill(
+            np.concatenate([za, zb[::-1]]),
+            np.concatenate([ya, yb[::-1]]),
+            facecolor=GLASS,
+            edgecolor=OUTLINE,
+            alpha=0.55,
+            lw=0.8,
+        )
 
 
 def _draw_stop(axis, lens, surfaces, vertices, tallest):
     """Black bars from the edge of the paraxial stop outwards."""
     radius = float(lens.first_order().stop_semi_aperture_mm.detach())
-    at = vertices[lens.stop_index] + _profile(surfaces[lens.stop_index], 0.0, min(radius, surfaces[lens.stop_index].semi_aperture_mm))[0][-1]
+    at = (
+        vertices[lens.stop_index]
+        + _profile(surfaces[lens.stop_index], 0.0, min(radius, surfaces[lens.stop_index].semi_aperture_mm))[
+            0
+        ][-1]
+    )
     for sign in (-1, 1):
-        axis.plot([at, at], [sign * radius, sign * max(radius * 1.25, radius + 0.12 * tallest)], color="k", lw=2)
+        axis.plot(
+            [at, at], [sign * radius, sign * max(radius * 1.25, radius + 0.12 * tallest)], color="k", lw=2
+        )
 
 
 def _same_media(surfaces, i):

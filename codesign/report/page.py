@@ -47,7 +47,8 @@ class Table:
 
 @dataclass
 class Section:
-    """A heading and what stands below it, in order: ("prose", HTML), ("picture", Picture) or ("table", Table)."""
+    """A heading and what stands below it, in order: ("prose", HTML), ("picture", Picture) or ("table",
+    Table)."""
 
     title: str
     blocks: list[tuple[str, Any]] = field(default_factory=list)
@@ -65,19 +66,29 @@ def picture(path, caption):
     try:
         return Picture(media, base64.b64encode(path.read_bytes()).decode(), caption)
     except OSError as error:
-        raise FileFormatError(f"'{path}' cannot be read for the page ({error.strerror}); write it before it is shown.") from error
+        raise FileFormatError(
+            f"'{path}' cannot be read for the page ({error.strerror}); write it before it is shown."
+        ) from error
 
 
 def table(title, columns, rows, caption=""):
-    """Table of numbers, text and None (shown as a dash). A column of numbers is right-aligned; floats show four digits.
+    """Table of numbers, text and None (shown as a dash). A column of numbers is right-aligned; floats show
+    four digits.
 
     Raises: ShapeError when a row has not one cell per column.
     """
-    columns, rows = tuple(map(str, columns)), [tuple(row) for row in rows]
+    columns = tuple(map(str, columns))
+    rows = [tuple(row) for row in rows]
     for index, row in enumerate(rows):
         if len(row) != len(columns):
-            raise ShapeError(f"table '{title}': row {index} has {len(row)} cells for {len(columns)} columns; give one cell per column.")
-    numeric = tuple(any(_is_number(row[k]) for row in rows) and all(_is_number(row[k]) or row[k] is None for row in rows) for k in range(len(columns)))
+            raise ShapeError(
+                f"table '{title}': row {index} has {len(row)} cells for {len(columns)} columns; give one "
+                "cell per column."
+            )
+    numeric = tuple(
+        any(_is_number(row[k]) for row in rows) and all(_is_number(row[k]) or row[k] is None for row in rows)
+        for k in range(len(columns))
+    )
     return Table(title, columns, tuple(tuple(map(cell, row)) for row in rows), numeric, caption)
 
 
@@ -90,8 +101,12 @@ def cell(value):
     if not _is_number(value):
         return str(value)
     whole = isinstance(value, Integral) or 1e3 <= abs(value) < 1e6
-    mantissa, _, exponent = (f"{value:.0f}" if whole else f"{float(value):.4g}").replace("-", "−").partition("e")
-    return mantissa + (f"·10{str(int(exponent.replace('−', '-'))).translate(SUPERSCRIPT)}" if exponent else "")
+    mantissa, _, exponent = (
+        (f"{value:.0f}" if whole else f"{float(value):.4g}").replace("-", "−").partition("e")
+    )
+    return mantissa + (
+        f"·10{str(int(exponent.replace('−', '-'))).translate(SUPERSCRIPT)}" if exponent else ""
+    )
 
 
 def render_page(title, lead, cards, sections, facts):
@@ -101,16 +116,27 @@ def render_page(title, lead, cards, sections, facts):
       title: heading. lead: one paragraph that says what was done and what came out (see prose.to_html).
       cards: list of Card, the headline figures.
       sections: list of Section.
-      facts: dictionary of folded tables at the end, heading -> {name: value} (configuration, versions, hardware).
+      facts: dictionary of folded tables at the end, heading -> {name: value} (configuration, versions,
+        hardware).
     Returns: text of a self-contained HTML file.
     Raises: DomainError when the title is empty.
     """
     if not title.strip():
         raise DomainError("a page needs a title; an empty one was given.")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
     shown = [section for section in sections if section.blocks]
-    return template.render(title=title, lead=prose.to_html(lead), cards=cards, sections=shown, facts=facts, inline=prose.inline, plain=prose.plain)
+    return template.render(
+        title=title,
+        lead=prose.to_html(lead),
+        cards=cards,
+        sections=shown,
+        facts=facts,
+        inline=prose.inline,
+        plain=prose.plain,
+    )
 
 
 def _is_number(value):

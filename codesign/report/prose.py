@@ -1,15 +1,23 @@
-"""A small markdown for the page of a run: paragraphs, lists, **bold**, *emphasis*, `code`. Everything else is text."""
+"""A small markdown for the page of a run: paragraphs, lists, **bold**, *emphasis*, `code`. Everything else is
+text."""
 
 import re
 
 from markupsafe import Markup, escape
 
-_MARKS = ((r"`([^`]+)`", r"<code>\1</code>"), (r"\*\*([^*]+)\*\*", r"<strong>\1</strong>"), (r"(?<![\w*])\*([^*\s][^*]*)\*(?![\w*])", r"<em>\1</em>"))
+_MARKS = (
+    (r"`([^`]+)`", r"<code>\1</code>"),
+    (r"\*\*([^*]+)\*\*", r"<strong>\1</strong>"),
+    (r"(?<![\w*])\*([^*\s][^*]*)\*(?![\w*])", r"<em>\1</em>"),
+)
 
 
 def to_html(text):
-    """HTML of ``text``; blank lines separate paragraphs, and a block whose lines all start with "- " is a list. Markup in it is shown, not used."""
-    return Markup("\n".join(_block(block.strip()) for block in re.split(r"\n\s*\n", text.strip()) if block.strip()))
+    """HTML of ``text``; blank lines separate paragraphs, and a block whose lines all start with "- " is a
+    list. Markup in it is shown, not used."""
+    return Markup(
+        "\n".join(_block(block.strip()) for block in re.split(r"\n\s*\n", text.strip()) if block.strip())
+    )
 
 
 def inline(text):

@@ -1,6 +1,8 @@
-"""Paths of cameras and bodies: simple ones as poses at given times, and five families as smooth functions of time.
+"""Paths of cameras and bodies: simple ones as poses at given times, and five families as smooth functions of
+time.
 
-Functions (``orbit``, ``radial``, ...) give poses T_world_cam at times. Trajectories (``Orbital``, ``Swinging.radial``, ``Swinging.vertical``, ``Driving``, ``Flying``) are called with any
+Functions (``orbit``, ``radial``, ...) give poses T_world_cam at times. Trajectories (``Orbital``,
+``Swinging.radial``, ``Swinging.vertical``, ``Driving``, ``Flying``) are called with any
 times and give T_world_body; ``mounted`` puts a camera on one.
 """
 
@@ -13,6 +15,21 @@ from scenes.trajectories.trajectory import Trajectory, body_at, mounted
 from scenes.trajectories.waves import Waves
 
 __all__ = [
-    "Driving", "Flying", "Orbital", "Polynomials", "Swinging", "Trajectory", "Waves", "body_at", "body_twist", "minimum_snap", "mounted", "orbit", "oscillation", "radial", "times",
-    "translation", "vertical",
+    "Driving",
+    "Flying",
+    "Orbital",
+    "Polynomials",
+    "Swinging",
+    "Trajectory",
+    "Waves",
+    "body_at",
+    "body_twist",
+    "minimum_snap",
+    "mounted",
+    "orbit",
+    "oscillation",
+    "radial",
+    "times",
+    "translation",
+    "vertical",
 ]

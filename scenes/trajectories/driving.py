@@ -16,35 +16,69 @@ NODES = 8  # of Gauss and Legendre on such a step: exact to rounding for the slo
 class Driving(Trajectory):
     """Pose of the body of a robot that drives on the plane z = 0.
 
-    The wheels turn at speeds v -/+ w track / 2 (left, right), with speed v and turn rate w smooth random functions of time. Over the ground a wheel
-    moves slower, by its slip (a share, at most ``slip``); in a turn the robot slides outwards at ``side_slip_s`` times its sideways acceleration. Without
-    slip the velocity has no sideways part (the nonholonomic constraint) and heading and distance are those the wheels count.
+    The wheels turn at speeds v -/+ w track / 2 (left, right), with speed v and turn rate w smooth random
+    functions of time. Over the ground a wheel
+    moves slower, by its slip (a share, at most ``slip``); in a turn the robot slides outwards at
+    ``side_slip_s`` times its sideways acceleration. Without
+    slip the velocity has no sideways part (the nonholonomic constraint) and heading and distance are those
+    the wheels count.
 
     Args:
       generator: torch.Generator. duration_s: poses exist from 0 to there.
-      speed_m_s, turn_rad_s: mean speed and turn rate (left positive). speed_share: by how much the speed varies, below 1. turn_swing_rad_s: by how much the rate does.
+      speed_m_s, turn_rad_s: mean speed and turn rate (left positive). speed_share: by how much the speed
+        varies, below 1. turn_swing_rad_s: by how much the rate does.
       track_m: distance of the wheels. slip: largest slip, 0 to below 1. side_slip_s: seconds.
-      height_m: of the body's origin over the ground. heave_m, pitch_rad, roll_rad: largest shake, between 2 and 9 Hz.
+      height_m: of the body's origin over the ground. heave_m, pitch_rad, roll_rad: largest shake, between 2
+        and 9 Hz.
       x_m, y_m, yaw_rad: pose at time 0 (without shake).
     """
 
-    def __init__(self, generator, duration_s, speed_m_s=0.6, turn_rad_s=0.0, *, speed_share=0.3, turn_swing_rad_s=0.6, track_m=0.3, slip=0.05, side_slip_s=0.02,
-                 height_m=0.3, heave_m=0.003, pitch_rad=0.008, roll_rad=0.008, x_m=0.0, y_m=0.0, yaw_rad=0.0):
+    def __init__(
+        self,
+        generator,
+        duration_s,
+        speed_m_s=0.6,
+        turn_rad_s=0.0,
+        *,
+        speed_share=0.3,
+        turn_swing_rad_s=0.6,
+        track_m=0.3,
+        slip=0.05,
+        side_slip_s=0.02,
+        height_m=0.3,
+        heave_m=0.003,
+        pitch_rad=0.008,
+        roll_rad=0.008,
+        x_m=0.0,
+        y_m=0.0,
+        yaw_rad=0.0,
+    ):
         self.span_s = (0.0, positive("duration_s", duration_s, most=1e4))
-        if not (math.isfinite(speed_m_s) and math.isfinite(turn_rad_s) and math.isfinite(x_m + y_m + yaw_rad + height_m)):
+        if not (
+            math.isfinite(speed_m_s)
+            and math.isfinite(turn_rad_s)
+            and math.isfinite(x_m + y_m + yaw_rad + height_m)
+        ):
             raise DomainError("driving: speed, turn rate and start must be finite numbers.")
         positive("speed_share", speed_share, 0, 1, inclusive=True)
-        self.track_m, self.side_slip_s = positive("track_m", track_m), positive("side_slip_s", side_slip_s, inclusive=True)
+        self.track_m = positive("track_m", track_m)
+        self.side_slip_s = positive("side_slip_s", side_slip_s, inclusive=True)
         positive("slip", slip, 0, 1, inclusive=True)
         speed = Waves.random(generator, speed_m_s, abs(speed_m_s) * speed_share, 0.1, 0.5)
         turn = Waves.random(generator, turn_rad_s, turn_swing_rad_s, 0.1, 0.5)
         self._wheels = tuple(speed.plus(turn.scaled(side * self.track_m / 2)) for side in (-1, 1))
-        self._rolled = tuple(wheel.times(Waves.random(generator, 1 - slip / 2, slip / 2, 0.2, 1.5)) for wheel in self._wheels)
+        self._rolled = tuple(
+            wheel.times(Waves.random(generator, 1 - slip / 2, slip / 2, 0.2, 1.5)) for wheel in self._wheels
+        )
         self._turn = self._rolled[1].plus(self._rolled[0].scaled(-1)).scaled(1 / self.track_m)
-        self._shake = tuple(Waves.random(generator, 0.0, bound, 2.0, 9.0, 4) for bound in (heave_m, pitch_rad, roll_rad))
-        self.height_m, self.start = float(height_m), (float(x_m), float(y_m), float(yaw_rad))
+        self._shake = tuple(
+            Waves.random(generator, 0.0, bound, 2.0, 9.0, 4) for bound in (heave_m, pitch_rad, roll_rad)
+        )
+        self.height_m = float(height_m)
+        self.start = (float(x_m), float(y_m), float(yaw_rad))
         nodes, weights = np.polynomial.legendre.leggauss(NODES)
-        self._nodes, self._weights = torch.from_numpy(nodes / 2 + 0.5), torch.from_numpy(weights / 2)
+        self._nodes = torch.from_numpy(nodes / 2 + 0.5)
+        self._weights = torch.from_numpy(weights / 2)
         knots = torch.arange(math.ceil(self.span_s[1] / STEP_S) + 1, dtype=torch.float64) * STEP_S
         moved = self._moved(knots[:-1], torch.full_like(knots[:-1], STEP_S))
         self._table = torch.cat([torch.zeros(1, 2, dtype=torch.float64), moved.cumsum(0)])
@@ -55,7 +89,8 @@ class Driving(Trajectory):
         return torch.stack([wheel(t) for wheel in self._wheels], 1)
 
     def ground_velocity(self, t_s):
-        """Forward m/s, sideways m/s (left) and turn rate rad/s of the undercarriage, slip included and shake left out: [n, 3]."""
+        """Forward m/s, sideways m/s (left) and turn rate rad/s of the undercarriage, slip included and shake
+        left out: [n, 3]."""
         return self._ground(self._times(t_s))
 
     def heading_rad(self, t_s):
@@ -66,7 +101,8 @@ class Driving(Trajectory):
         return self.start[2] + self._turn.integral(t_s)
 
     def _ground(self, t_s):
-        forward, turn = (self._rolled[0](t_s) + self._rolled[1](t_s)) / 2, self._turn(t_s)
+        forward = (self._rolled[0](t_s) + self._rolled[1](t_s)) / 2
+        turn = self._turn(t_s)
         return torch.stack([forward, -self.side_slip_s * forward * turn, turn], -1)
 
     def _moved(self, start_s, length_s):
@@ -74,7 +110,9 @@ class Driving(Trajectory):
         t = start_s[:, None] + self._nodes * length_s[:, None]
         forward, left, _ = self._ground(t).unbind(-1)
         yaw = self._yaw(t)
-        rate = torch.stack([forward * yaw.cos() - left * yaw.sin(), forward * yaw.sin() + left * yaw.cos()], -1)
+        rate = torch.stack(
+            [forward * yaw.cos() - left * yaw.sin(), forward * yaw.sin() + left * yaw.cos()], -1
+        )
         return (rate * self._weights[:, None]).sum(1) * length_s[:, None]
 
     def _pose(self, t_s):
@@ -82,12 +120,21 @@ class Driving(Trajectory):
         knot = index.to(t_s) * STEP_S
         place = self._table[index] + self._moved(knot, t_s - knot)
         heave, pitch, roll = (wave(t_s) for wave in self._shake)
-        position = torch.stack([self.start[0] + place[:, 0], self.start[1] + place[:, 1], self.height_m + heave], 1)
+        position = torch.stack(
+            [self.start[0] + place[:, 0], self.start[1] + place[:, 1], self.height_m + heave], 1
+        )
         return rigid(_turned(2, self._yaw(t_s)) @ _turned(1, pitch) @ _turned(0, roll), position)
 
 
 def _turned(axis, angle_rad):
     """Rotations [n, 3, 3] about a coordinate axis."""
-    one, nothing, c, s = torch.ones_like(angle_rad), torch.zeros_like(angle_rad), angle_rad.cos(), angle_rad.sin()
-    rows = {0: (one, nothing, nothing, nothing, c, -s, nothing, s, c), 1: (c, nothing, s, nothing, one, nothing, -s, nothing, c), 2: (c, -s, nothing, s, c, nothing, nothing, nothing, one)}
+    one = torch.ones_like(angle_rad)
+    nothing = torch.zeros_like(angle_rad)
+    c = angle_rad.cos()
+    s = angle_rad.sin()
+    rows = {
+        0: (one, nothing, nothing, nothing, c, -s, nothing, s, c),
+        1: (c, nothing, s, nothing, one, nothing, -s, nothing, c),
+        2: (c, -s, nothing, s, c, nothing, nothing, nothing, one),
+    }
     return torch.stack(rows[axis], 1).reshape(-1, 3, 3)

@@ -1,7 +1,9 @@
 """Polynomial paths of least snap (fourth derivative) through points at given times, by one linear system.
 
-The path of least integral of squared snap with given points, and with velocity, acceleration and jerk of 0 at both ends, has degree 7 between points and
-six continuous derivatives at them (the Euler-Lagrange equation x^(8) = 0 with its natural conditions). That is 8 conditions per segment for 8 coefficients.
+The path of least integral of squared snap with given points, and with velocity, acceleration and jerk of 0 at
+both ends, has degree 7 between points and
+six continuous derivatives at them (the Euler-Lagrange equation x^(8) = 0 with its natural conditions). That
+is 8 conditions per segment for 8 coefficients.
 Source: Mellinger and Kumar, Minimum snap trajectory generation and control for quadrotors, ICRA 2011.
 """
 
@@ -20,14 +22,18 @@ LARGEST_RATIO = 100.0  # of segment durations: beyond, the linear system loses t
 
 @dataclass(frozen=True)
 class Polynomials:
-    """Piecewise polynomials: coefficient [M, 8, D] of powers of (t - start) / length per segment, knots_s [M + 1]."""
+    """Piecewise polynomials: coefficient [M, 8, D] of powers of (t - start) / length per segment, knots_s [M
+    + 1]."""
 
     coefficient: Tensor
     knots_s: Tensor
 
     def __call__(self, t_s, order=0):
-        """The ``order``-th derivative at times [n] (seconds): [n, D]. At a knot the segment behind it counts; gradient to the time."""
-        segment = (torch.searchsorted(self.knots_s, t_s.detach().contiguous(), right=True) - 1).clamp(0, len(self.knots_s) - 2)
+        """The ``order``-th derivative at times [n] (seconds): [n, D]. At a knot the segment behind it counts;
+        gradient to the time."""
+        segment = (torch.searchsorted(self.knots_s, t_s.detach().contiguous(), right=True) - 1).clamp(
+            0, len(self.knots_s) - 2
+        )
         length = self.knots_s.diff()[segment]
         u = ((t_s - self.knots_s[segment]) / length)[:, None]
         value = torch.zeros_like(u)
@@ -49,27 +55,40 @@ def minimum_snap(points, t_s):
 
     Args: points: [K >= 2, D] to pass, t_s: [K] when, strictly increasing seconds.
     Returns: Polynomials, float64.
-    Raises: ShapeError; DomainError for values that are not finite, times that do not increase, durations that differ more than 100 times, more than 200 points.
+    Raises: ShapeError; DomainError for values that are not finite, times that do not increase, durations that
+      differ more than 100 times, more than 200 points.
     """
-    points, t_s = torch.as_tensor(points, dtype=torch.float64), torch.as_tensor(t_s, dtype=torch.float64)
+    points = torch.as_tensor(points, dtype=torch.float64)
+    t_s = torch.as_tensor(t_s, dtype=torch.float64)
     if points.ndim != 2 or len(points) < 2 or t_s.shape != points.shape[:1]:
-        raise ShapeError(f"minimum snap needs points [K >= 2, D] and one time each, got {tuple(points.shape)} and {tuple(t_s.shape)}.")
+        raise ShapeError(
+            f"minimum snap needs points [K >= 2, D] and one time each, got {tuple(points.shape)} and "
+            f"{tuple(t_s.shape)}."
+        )
     if len(points) > MOST_POINTS:
-        raise DomainError(f"minimum snap takes at most {MOST_POINTS} points, got {len(points)}; split the path.")
+        raise DomainError(
+            f"minimum snap takes at most {MOST_POINTS} points, got {len(points)}; split the path."
+        )
     check_finite(points, "waypoints")
     check_finite(t_s, "waypoint times")
     length = t_s.diff()
     if bool((length <= 0).any()):
         raise DomainError(f"waypoint times must increase strictly, got {t_s.tolist()}.")
     if float(length.max() / length.min()) > LARGEST_RATIO:
-        raise DomainError(f"the segments last from {float(length.min()):g} to {float(length.max()):g} s; let the longest be at most {LARGEST_RATIO:g} times the shortest.")
+        raise DomainError(
+            f"the segments last from {float(length.min()):g} to {float(length.max()):g} s; let the longest "
+            f"be at most {LARGEST_RATIO:g} times the shortest."
+        )
     segments = len(length)
     relative = (length / length.mean()).tolist()
-    matrix, right = torch.zeros(TERMS * segments, TERMS * segments, dtype=torch.float64), torch.zeros(TERMS * segments, points.shape[1], dtype=torch.float64)
+    matrix = torch.zeros(TERMS * segments, TERMS * segments, dtype=torch.float64)
+    right = torch.zeros(TERMS * segments, points.shape[1], dtype=torch.float64)
     row = 0
 
     def put(segment, u, order, sign=1.0):
-        matrix[row, TERMS * segment : TERMS * (segment + 1)] += sign * _row(u, order) / relative[segment] ** order
+        matrix[row, TERMS * segment : TERMS * (segment + 1)] += (
+            sign * _row(u, order) / relative[segment] ** order
+        )
 
     for k in range(segments):
         for u in (0.0, 1.0):
@@ -91,4 +110,7 @@ def minimum_snap(points, t_s):
 
 def _row(u, order):
     """Factors of the 8 coefficients in the ``order``-th derivative by u."""
-    return torch.tensor([math.perm(k, order) * u ** (k - order) if k >= order else 0.0 for k in range(TERMS)], dtype=torch.float64)
+    return torch.tensor(
+        [math.perm(k, order) * u ** (k - order) if k >= order else 0.0 for k in range(TERMS)],
+        dtype=torch.float64,
+    )

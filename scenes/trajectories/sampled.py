@@ -18,7 +18,8 @@ def times(count, rate_hz):
 
 
 def body_twist(start, twist_per_s, t_s):
-    """Constant velocity in the camera's own axes: start [4, 4], twist_per_s [..., 6] (m/s, rad/s), t_s [T] -> [..., T, 4, 4]."""
+    """Constant velocity in the camera's own axes: start [4, 4], twist_per_s [..., 6] (m/s, rad/s), t_s [T] ->
+    [..., T, 4, 4]."""
     return start @ se3_exp(t_s[:, None] * twist_per_s[..., None, :])
 
 
@@ -31,17 +32,25 @@ def orbit(centre_m, radius_m, height_m, rate_rad_s, t_s, phase_rad=0.0):
     """A circle about a vertical axis, looking at its centre."""
     angle = (phase_rad + rate_rad_s * t_s).tolist()
     cx, cy, cz = centre_m
-    return torch.stack([look_at((cx + radius_m * math.cos(a), cy + radius_m * math.sin(a), cz + height_m), centre_m) for a in angle])
+    return torch.stack(
+        [
+            look_at((cx + radius_m * math.cos(a), cy + radius_m * math.sin(a), cz + height_m), centre_m)
+            for a in angle
+        ]
+    )
 
 
 def oscillation(start, axis, amplitude_m, frequency_hz, t_s):
-    """Sinusoidal motion along a camera axis: axis three numbers, e.g. (0, 0, 1) radial (towards the scene), (0, 1, 0) vertical."""
+    """Sinusoidal motion along a camera axis: axis three numbers, e.g. (0, 0, 1) radial (towards the scene),
+    (0, 1, 0) vertical."""
     shift = amplitude_m * (2 * math.pi * frequency_hz * t_s).sin()
     direction = torch.tensor(axis, dtype=torch.float64)
     if not 0 < float(direction.norm()) < math.inf:
         raise DomainError(f"an oscillation needs an axis of finite length other than 0, got {tuple(axis)}.")
     direction = direction / direction.norm()
-    return start @ se3_exp(torch.cat([shift[:, None] * direction, torch.zeros(t_s.numel(), 3, dtype=torch.float64)], 1))
+    return start @ se3_exp(
+        torch.cat([shift[:, None] * direction, torch.zeros(t_s.numel(), 3, dtype=torch.float64)], 1)
+    )
 
 
 def radial(start, amplitude_m, frequency_hz, t_s):

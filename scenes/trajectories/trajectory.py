@@ -1,6 +1,8 @@
-"""What a trajectory is: a smooth function from time to the pose of a body, with its velocity; and a camera mounted on one.
+"""What a trajectory is: a smooth function from time to the pose of a body, with its velocity; and a camera
+mounted on one.
 
-Body axes: x forward, y left, z up. A velocity is a twist in body axes: [n, 6], metres per second, then radians per second, so that
+Body axes: x forward, y left, z up. A velocity is a twist in body axes: [n, 6], metres per second, then
+  radians per second, so that
 T(t + dt) is T(t) exp(dt velocity(t)) to first order.
 """
 
@@ -27,19 +29,38 @@ class Trajectory(ABC):
 
         Args: t_s: [n] seconds, in any order.
         Returns: [n, 4, 4] float64, without gradient to the time.
-        Raises: ShapeError for anything but a list of times; DomainError for times that are not finite or lie outside ``span_s``.
+        Raises: ShapeError for anything but a list of times; DomainError for times that are not finite or lie
+          outside ``span_s``.
         """
         return self._pose(self._times(t_s))
 
     def velocity(self, t_s):
-        """Twist in body axes at times [n]: [n, 6] float64 (m/s, rad/s). Exact: the derivative of the poses, number by number."""
+        """Twist in body axes at times [n]: [n, 6] float64 (m/s, rad/s). Exact: the derivative of the poses,
+        number by number."""
         with torch.enable_grad():
             t = self._times(t_s).clone().requires_grad_()
             pose = self._pose(t)
-            change = torch.stack([torch.autograd.grad(pose[:, i, j].sum(), t, retain_graph=True)[0] for i in range(3) for j in range(4)], 1).reshape(-1, 3, 4)
+            change = torch.stack(
+                [
+                    torch.autograd.grad(pose[:, i, j].sum(), t, retain_graph=True)[0]
+                    for i in range(3)
+                    for j in range(4)
+                ],
+                1,
+            ).reshape(-1, 3, 4)
         pose = pose.detach()
         local = pose[:, :3, :3].mT @ change
-        turn = torch.stack([local[:, 2, 1] - local[:, 1, 2], local[:, 0, 2] - local[:, 2, 0], local[:, 1, 0] - local[:, 0, 1]], 1) / 2
+        turn = (
+            torch.stack(
+                [
+                    local[:, 2, 1] - local[:, 1, 2],
+                    local[:, 0, 2] - local[:, 2, 0],
+                    local[:, 1, 0] - local[:, 0, 1],
+                ],
+                1,
+            )
+            / 2
+        )
         return torch.cat([local[:, :, 3], turn], 1)
 
     @abstractmethod
@@ -51,28 +72,40 @@ class Trajectory(ABC):
         if t.ndim != 1 or t.numel() == 0:
             raise ShapeError(f"a trajectory takes a list of times [n >= 1], got shape {tuple(t.shape)}.")
         check_finite(t, "trajectory times", "give finite seconds")
-        if self.span_s is not None and not (self.span_s[0] <= float(t.min()) and float(t.max()) <= self.span_s[1]):
-            raise DomainError(f"the trajectory runs from {self.span_s[0]:g} to {self.span_s[1]:g} s, but times from {float(t.min()):g} to {float(t.max()):g} s were asked for; stay inside.")
+        if self.span_s is not None and not (
+            self.span_s[0] <= float(t.min()) and float(t.max()) <= self.span_s[1]
+        ):
+            raise DomainError(
+                f"the trajectory runs from {self.span_s[0]:g} to {self.span_s[1]:g} s, but times from "
+                f"{float(t.min()):g} to {float(t.max()):g} s were asked for; stay inside."
+            )
         return t
 
 
 class _Mounted:
     def __init__(self, trajectory, T_body_cam):
-        self.trajectory, self.T_body_cam, self.span_s = trajectory, T_body_cam, trajectory.span_s
+        self.trajectory = trajectory
+        self.T_body_cam = T_body_cam
+        self.span_s = trajectory.span_s
 
     def __call__(self, t_s):
         return self.trajectory(t_s) @ self.T_body_cam
 
     def velocity(self, t_s):
-        turn, place = self.T_body_cam[:3, :3], self.T_body_cam[:3, 3]
+        turn = self.T_body_cam[:3, :3]
+        place = self.T_body_cam[:3, 3]
         straight, rate = self.trajectory.velocity(t_s).split(3, 1)
-        return torch.cat([(straight + torch.linalg.cross(rate, place.expand_as(rate))) @ turn, rate @ turn], 1)
+        return torch.cat(
+            [(straight + torch.linalg.cross(rate, place.expand_as(rate))) @ turn, rate @ turn], 1
+        )
 
 
 def mounted(trajectory, T_body_cam):
-    """The path of a camera on a body: T_world_cam = T_world_body T_body_cam, with the camera's velocity in its own axes.
+    """The path of a camera on a body: T_world_cam = T_world_body T_body_cam, with the camera's velocity in
+    its own axes.
 
-    Args: trajectory: anything with a call, ``velocity`` and ``span_s``. T_body_cam: [4, 4], for example of codesign.place.Mount.
+    Args: trajectory: anything with a call, ``velocity`` and ``span_s``. T_body_cam: [4, 4], for example of
+      codesign.place.Mount.
     Returns: a trajectory of the camera (x right, y down, z forward). Gradient: to T_body_cam.
     Raises: ShapeError, DomainError when T_body_cam is not one rigid transform.
     """
@@ -82,7 +115,8 @@ def mounted(trajectory, T_body_cam):
 
 
 def body_at(origin_m, target_m, up=(0.0, 0.0, 1.0)):
-    """Pose T_world_body [4, 4] of a body at ``origin_m`` whose forward axis points at ``target_m``. Raises: as codesign.pose.look_at."""
+    """Pose T_world_body [4, 4] of a body at ``origin_m`` whose forward axis points at ``target_m``. Raises:
+    as codesign.pose.look_at."""
     pose = look_at(origin_m, target_m, tuple(-v for v in up))
     pose[:3, :3] = pose[:3, :3] @ AXES_BODY_CAM.mT
     return pose
@@ -95,7 +129,11 @@ def rigid(rotation, position_m):
 
 
 def positive(name, value, least=0.0, most=float("inf"), inclusive=False):
-    """Raise DomainError unless ``least`` < value < ``most`` (or ``least`` <= value); returns it as a float."""
+    """Raise DomainError unless ``least`` < value < ``most`` (or ``least`` <= value); returns it as a
+    float."""
     if not ((least <= value if inclusive else least < value) and value < most):
-        raise DomainError(f"trajectory: {name} = {value} must be {'at least' if inclusive else 'above'} {least:g} and below {most:g}.")
+        raise DomainError(
+            f"trajectory: {name} = {value} must be {'at least' if inclusive else 'above'} {least:g} and "
+            f"below {most:g}."
+        )
     return float(value)

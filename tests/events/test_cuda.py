@@ -3,7 +3,16 @@
 import pytest
 import torch
 
-from codesign.events import SensorModel, from_counts, from_stream, memory, simulate, soft, soft_counts, to_counts
+from codesign.events import (
+    SensorModel,
+    from_counts,
+    from_stream,
+    memory,
+    simulate,
+    soft,
+    soft_counts,
+    to_counts,
+)
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 T_S = torch.arange(9, dtype=torch.float64) / 240
@@ -29,7 +38,10 @@ def test_differentiable_layers_and_volumes():
 
 def test_hard_sensor_with_noise_from_one_generator():
     sensor = SensorModel(theta_sigma=0.03, shot_rate_hz=20.0)
-    on_cpu, on_cuda = (simulate(frames().to(device), T_S, sensor, torch.Generator().manual_seed(1)) for device in ("cpu", "cuda"))
+    on_cpu, on_cuda = (
+        simulate(frames().to(device), T_S, sensor, torch.Generator().manual_seed(1))
+        for device in ("cpu", "cuda")
+    )
     assert torch.equal(to_counts(on_cpu, T_S), to_counts(on_cuda, T_S).cpu())
     volumes = [from_stream(events, 0, 33_334, 5).counts.cpu() for events in (on_cpu, on_cuda)]
     torch.testing.assert_close(*volumes)

@@ -23,7 +23,8 @@ def random_events(count=20_000, seed=0):
 @pytest.mark.parametrize("extension", [".csv", ".npz", ".CSV", ".aedat4"])
 @pytest.mark.parametrize("count", [20_000, 1, 0])
 def test_round_trip_is_exact(tmp_path, extension, count):
-    stream, path = random_events(count), tmp_path / f"events{extension}"
+    stream = random_events(count)
+    path = tmp_path / f"events{extension}"
     write(path, stream)
     back = read(path, height_px=260, width_px=346)
     assert all(torch.equal(getattr(stream, name), getattr(back, name)) for name in FIELDS)
@@ -37,7 +38,9 @@ def test_csv_is_the_text_it_says(tmp_path):
     write(path, ordered(t_us, x, y, p, 9, 9))
     assert path.read_text() == f"t,x,y,p\n7,3,0,-1\n{2**40},0,5,1\n"
     assert (read(path).height_px, read(path).width_px) == (6, 4)  # the smallest sensor that holds them
-    path.write_text("t,x,y,p\r\n1, 2,3,0\r\n1,1,3,1")  # other programs: CRLF, spaces, 0 for OFF, no last newline, ties in any order
+    path.write_text(
+        "t,x,y,p\r\n1, 2,3,0\r\n1,1,3,1"
+    )  # other programs: CRLF, spaces, 0 for OFF, no last newline, ties in any order
     back = read(path)
     assert [getattr(back, name).tolist() for name in FIELDS] == [[1, 1], [1, 2], [3, 3], [1, -1]]
 
@@ -81,9 +84,11 @@ def test_csv_events_outside_a_given_sensor_are_refused(tmp_path):
 
 
 def test_mutated_npz_never_gives_a_wrong_stream(tmp_path):
-    path, stream = tmp_path / "e.npz", random_events(200)
+    path = tmp_path / "e.npz"
+    stream = random_events(200)
     write(path, stream)
-    whole, dice = path.read_bytes(), random.Random(0)
+    whole = path.read_bytes()
+    dice = random.Random(0)
     for trial in range(300):
         data = bytearray(whole)
         if trial % 3 == 0:
@@ -102,7 +107,14 @@ def test_mutated_npz_never_gives_a_wrong_stream(tmp_path):
 
 def test_npz_of_something_else_is_refused(tmp_path):
     path = tmp_path / "e.npz"
-    good = {"t_us": np.arange(3), "x": np.zeros(3, int), "y": np.zeros(3, int), "p": np.ones(3, int), "height_px": np.array(2), "width_px": np.array(2)}
+    good = {
+        "t_us": np.arange(3),
+        "x": np.zeros(3, int),
+        "y": np.zeros(3, int),
+        "p": np.ones(3, int),
+        "height_px": np.array(2),
+        "width_px": np.array(2),
+    }
     for change, words in [
         ({"t_us": None}, "t_us"),
         ({"t_us": np.arange(3.0)}, "whole numbers"),

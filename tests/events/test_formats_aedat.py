@@ -1,4 +1,5 @@
-"""AEDAT 4.0 against a published recording, byte for byte where both write the same; AEDAT 2.0 against its bit layout."""
+"""AEDAT 4.0 against a published recording, byte for byte where both write the same; AEDAT 2.0 against its bit
+layout."""
 
 import struct
 
@@ -24,9 +25,12 @@ def stream_of(*events, height_px=260, width_px=346):
 
 
 def blocks(data):
-    """(header, [(stream, place, packet)], table) of a file, by the published layout; nothing is decompressed."""
+    """(header, [(stream, place, packet)], table) of a file, by the published layout; nothing is
+    decompressed."""
     start = 18 + struct.unpack_from("<I", data, 14)[0]
-    table_at, at, packets = struct.unpack_from("<q", data, 14 + 40)[0], start, []
+    table_at = struct.unpack_from("<q", data, 14 + 40)[0]
+    at = start
+    packets = []
     while at < table_at:
         stream, size = struct.unpack_from("<ii", data, at)
         packets.append((stream, at + 8, data[at + 8 : at + 8 + size]))
@@ -35,31 +39,53 @@ def blocks(data):
 
 
 def test_a_recording_decodes_as_another_program_decodes_it(shared):
-    events, truth = read(shared(RECORDING)), np.load(shared("data/davis346_newton_cradle/demo-01.npz"))
+    events = read(shared(RECORDING))
+    truth = np.load(shared("data/davis346_newton_cradle/demo-01.npz"))
     order = np.lexsort((truth["p"], truth["x"], truth["y"], truth["t"]))
     assert (events.height_px, events.width_px) == (260, 346)
-    for found, wanted in ((events.t_us - int(truth["t0_us"]), truth["t"]), (events.x, truth["x"]), (events.y, truth["y"]), (events.p > 0, truth["p"])):
+    for found, wanted in (
+        (events.t_us - int(truth["t0_us"]), truth["t"]),
+        (events.x, truth["x"]),
+        (events.y, truth["y"]),
+        (events.p > 0, truth["p"]),
+    ):
         assert np.array_equal(found.numpy(), wanted[order])
     recorded = read_frames(shared(RECORDING))
     assert np.array_equal(recorded.frames.numpy(), truth["frames"])
-    for found, wanted in ((recorded.exposure_start_us, truth["exposure"][:, 0]), (recorded.exposure_end_us, truth["exposure"][:, 1])):
+    for found, wanted in (
+        (recorded.exposure_start_us, truth["exposure"][:, 0]),
+        (recorded.exposure_end_us, truth["exposure"][:, 1]),
+    ):
         assert np.array_equal(found.numpy() - int(truth["t0_us"]), wanted)
 
 
 def test_packets_and_header_are_laid_out_as_in_the_recording(shared, tmp_path):
     header, packets, _ = blocks(shared(RECORDING).read_bytes())
     first = next(lz4.frame.decompress(packet) for stream, _, packet in packets if stream == 0)
-    events = np.frombuffer(first, np.dtype({"names": list("txyp"), "formats": ["<i8", "<i2", "<i2", "?"], "offsets": [0, 8, 10, 12], "itemsize": 16}), offset=32)
+    events = np.frombuffer(
+        first,
+        np.dtype(
+            {
+                "names": list("txyp"),
+                "formats": ["<i8", "<i2", "<i2", "?"],
+                "offsets": [0, 8, 10, 12],
+                "itemsize": 16,
+            }
+        ),
+        offset=32,
+    )
     ties = events[np.lexsort((events["p"], events["x"], events["y"], events["t"]))]
     t_us, x, y, p = (torch.from_numpy(ties[name].astype(np.int64)) for name in "txyp")
     write(tmp_path / "e.aedat4", ordered(t_us, x, y, 2 * p - 1, 260, 346))
     written_header, written, table = blocks((tmp_path / "e.aedat4").read_bytes())
     assert len(written) == 1
     assert lz4.frame.decompress(written[0][2]) == first[:32] + ties.tobytes()
-    # size prefix, place of the table and length of the text differ; offsets, identifier, slots and compression do not
+    # size prefix, place of the table and length of the text differ; offsets, identifier, slots and
+    # compression do not
     assert written_header[4:40] == header[4:40]
     assert b'<attr key="sizeX" type="int">346</attr>' in written_header
-    # the table at the end, walked by hand: root 28, its vector at 40, one entry, whose shared slots begin at 18
+    # the table at the end, walked by hand: root 28, its vector at 40, one entry, whose shared slots begin at
+    # 18
     table = lz4.frame.decompress(table)
     assert struct.unpack_from("<II4s", table) == (len(table) - 4, 28, b"FTAB")
     assert struct.unpack_from("<II", table, 40)[0] == 1
@@ -68,16 +94,23 @@ def test_packets_and_header_are_laid_out_as_in_the_recording(shared, tmp_path):
     at = [entry + offset for offset in struct.unpack_from("<5H", table, slots + 4)]
     assert struct.unpack_from("<q", table, at[0])[0] == written[0][1]
     assert struct.unpack_from("<ii", table, at[1]) == (0, len(written[0][2]))
-    assert [struct.unpack_from("<q", table, place)[0] for place in at[2:]] == [len(ties), int(t_us[0]), int(t_us[-1])]
+    assert [struct.unpack_from("<q", table, place)[0] for place in at[2:]] == [
+        len(ties),
+        int(t_us[0]),
+        int(t_us[-1]),
+    ]
     assert all(place % 8 == 0 for place in (at[0], *at[2:]))
 
 
 def test_every_compression_and_a_missing_table_are_read(tmp_path):
-    path, stream = tmp_path / "e.aedat4", stream_of((5, 1, 2, 1), (9, 3, 4, -1))
+    path = tmp_path / "e.aedat4"
+    stream = stream_of((5, 1, 2, 1), (9, 3, 4, -1))
     write(path, stream)
     header, packets, _ = blocks(path.read_bytes())
     body = lz4.frame.decompress(packets[0][2])
-    for code, pack in enumerate((bytes, lz4.frame.compress, lz4.frame.compress, zstandard.compress, zstandard.compress)):
+    for code, pack in enumerate(
+        (bytes, lz4.frame.compress, lz4.frame.compress, zstandard.compress, zstandard.compress)
+    ):
         packet = pack(body)
         changed = bytearray(MAGIC + header + struct.pack("<ii", 0, len(packet)) + packet)
         struct.pack_into("<i", changed, 14 + 32, code)
@@ -132,7 +165,10 @@ def test_a_block_that_unpacks_without_end_is_refused(tmp_path):
     path = tmp_path / "e.aedat4"
     write(path, stream_of((5, 1, 2, 1)))
     header, _, _ = blocks(path.read_bytes())
-    for code, bomb in ((1, lz4.frame.compress(bytes(2**26))), (3, zstandard.compress(bytes(2**26)))):  # ZSTD packs zeros 20000 to 1
+    for code, bomb in (
+        (1, lz4.frame.compress(bytes(2**26))),
+        (3, zstandard.compress(bytes(2**26))),
+    ):  # ZSTD packs zeros 20000 to 1
         changed = bytearray(MAGIC + header + struct.pack("<ii", 0, len(bomb)) + bomb)
         struct.pack_into("<i", changed, 14 + 32, code)
         struct.pack_into("<q", changed, 14 + 40, -1)
@@ -141,9 +177,13 @@ def test_a_block_that_unpacks_without_end_is_refused(tmp_path):
             read(path)
 
 
-@pytest.mark.parametrize(("extension", "height_px", "width_px", "chip"), [(".aedat2", 260, 346, b"DAVIS346"), (".aedat", 180, 240, b"DAVIS240C")])
+@pytest.mark.parametrize(
+    ("extension", "height_px", "width_px", "chip"),
+    [(".aedat2", 260, 346, b"DAVIS346"), (".aedat", 180, 240, b"DAVIS240C")],
+)
 def test_aedat2_holds_mirrored_addresses_and_big_endian_times(tmp_path, extension, height_px, width_px, chip):
-    path, generator = tmp_path / f"e{extension}", torch.Generator().manual_seed(0)
+    path = tmp_path / f"e{extension}"
+    generator = torch.Generator().manual_seed(0)
     t_us = torch.randint(0, 2**31, (1000,), generator=generator)
     x, y, p = (torch.randint(0, high, (1000,), generator=generator) for high in (width_px, height_px, 2))
     stream = ordered(t_us, x, y, 2 * p - 1, height_px, width_px)
@@ -162,7 +202,9 @@ def test_aedat2_holds_mirrored_addresses_and_big_endian_times(tmp_path, extensio
 
 
 def test_aedat2_never_lets_an_event_pass_for_a_header_line(tmp_path):
-    path, stream = tmp_path / "e.aedat2", stream_of((7, 1, 259 - 140, 1))  # row 140 from the bottom: its address begins with '#'
+    # row 140 from the bottom: its address begins with '#'
+    path = tmp_path / "e.aedat2"
+    stream = stream_of((7, 1, 259 - 140, 1))
     write(path, stream)
     data = path.read_bytes().split(b"#End Of ASCII Header\r\n", 1)[1]
     assert data[:1] != b"#"
@@ -172,7 +214,10 @@ def test_aedat2_never_lets_an_event_pass_for_a_header_line(tmp_path):
 @pytest.mark.parametrize(
     ("stream", "words"),
     [
-        (stream_of((0, 1, 1, 1), height_px=480, width_px=640), "346 x 260 and 240 x 180 pixels, not 640 x 480"),
+        (
+            stream_of((0, 1, 1, 1), height_px=480, width_px=640),
+            "346 x 260 and 240 x 180 pixels, not 640 x 480",
+        ),
         (stream_of((2**31, 1, 1, 1)), "holds 0 to 2147483647"),
         (stream_of((-1, 1, 1, 1)), "times span -1"),
     ],

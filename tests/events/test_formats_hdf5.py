@@ -1,4 +1,5 @@
-"""DSEC's and v2e's HDF5 layouts, put together with h5py alone; and the index of milliseconds against its definition."""
+"""DSEC's and v2e's HDF5 layouts, put together with h5py alone; and the index of milliseconds against its
+definition."""
 
 import h5py
 import hdf5plugin
@@ -17,7 +18,12 @@ EPOCH_US = 1_643_243_628_737_093
 def example():
     """t, x, y, p (1 or 0) of 3000 events within 40 ms, sorted."""
     dice = np.random.default_rng(0)
-    columns = (np.sort(dice.integers(0, 40_000, 3000)), dice.integers(0, 640, 3000), dice.integers(0, 480, 3000), dice.integers(0, 2, 3000))
+    columns = (
+        np.sort(dice.integers(0, 40_000, 3000)),
+        dice.integers(0, 640, 3000),
+        dice.integers(0, 480, 3000),
+        dice.integers(0, 2, 3000),
+    )
     return columns
 
 
@@ -44,9 +50,18 @@ def dsec(path, change=None, **packing):
     return path
 
 
-@pytest.mark.parametrize("packing", [dict(hdf5plugin.Blosc(cname="zstd", clevel=1)), {"compression": "gzip", "shuffle": True, "fletcher32": True}, {"chunks": True}, {}])
+@pytest.mark.parametrize(
+    "packing",
+    [
+        dict(hdf5plugin.Blosc(cname="zstd", clevel=1)),
+        {"compression": "gzip", "shuffle": True, "fletcher32": True},
+        {"chunks": True},
+        {},
+    ],
+)
 def test_published_files_are_read(tmp_path, packing):
-    events, truth = read(dsec(tmp_path / "e.h5", **packing), height_px=480, width_px=640), stream_of(example()[0] + EPOCH_US, *example()[1:])
+    events = read(dsec(tmp_path / "e.h5", **packing), height_px=480, width_px=640)
+    truth = stream_of(example()[0] + EPOCH_US, *example()[1:])
     assert all(torch.equal(getattr(events, name), getattr(truth, name)) for name in FIELDS)
 
 
@@ -56,7 +71,14 @@ def test_what_is_written_follows_the_layout(tmp_path):
     with h5py.File(tmp_path / "e.h5") as file:
         names = ("events/t", "events/x", "events/y", "events/p", "t_offset", "ms_to_idx")
         since_us, columns, rows, on, offset_us, index = (np.asarray(file[name]) for name in names)
-    assert [values.dtype for values in (since_us, columns, rows, on, offset_us, index)] == [np.uint32, np.uint16, np.uint16, np.uint8, np.int64, np.uint64]
+    assert [values.dtype for values in (since_us, columns, rows, on, offset_us, index)] == [
+        np.uint32,
+        np.uint16,
+        np.uint16,
+        np.uint8,
+        np.int64,
+        np.uint64,
+    ]
     assert int(offset_us) == EPOCH_US + t[0]
     assert np.array_equal(since_us, t - t[0])
     assert index.tolist() == [np.count_nonzero(since_us < 1000 * k) for k in range(len(index))]
@@ -70,14 +92,19 @@ def test_what_is_written_follows_the_layout(tmp_path):
 def test_v2e_files_are_read(tmp_path, with_frames):
     t, x, y, p = example()
     with h5py.File(tmp_path / "e.h5", "w") as file:  # as v2e makes it: grown from nothing, packed with gzip
-        rows = file.create_dataset("events", shape=(0, 4), maxshape=(None, 4), dtype="uint32", compression="gzip")
+        rows = file.create_dataset(
+            "events", shape=(0, 4), maxshape=(None, 4), dtype="uint32", compression="gzip"
+        )
         rows.resize(3000, axis=0)
         rows[:] = np.stack((t, x, y, p), axis=1)
         if with_frames:
             file.create_dataset("frame", data=np.zeros((2, 500, 700), np.uint8), compression="gzip")
-    events, truth = read(tmp_path / "e.h5"), stream_of(*example())
+    events = read(tmp_path / "e.h5")
+    truth = stream_of(*example())
     assert all(torch.equal(getattr(events, name), getattr(truth, name)) for name in FIELDS)
-    assert (events.height_px, events.width_px) == ((500, 700) if with_frames else (int(y.max()) + 1, int(x.max()) + 1))
+    assert (events.height_px, events.width_px) == (
+        (500, 700) if with_frames else (int(y.max()) + 1, int(x.max()) + 1)
+    )
 
 
 @pytest.mark.parametrize(

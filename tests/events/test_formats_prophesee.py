@@ -1,4 +1,5 @@
-"""Prophesee's RAW and DAT files: a recording decoded by another program, and words put together by the published bit layout."""
+"""Prophesee's RAW and DAT files: a recording decoded by another program, and words put together by the
+published bit layout."""
 
 import numpy as np
 import pytest
@@ -42,10 +43,17 @@ def stream_of(*events, height_px=480, width_px=640):
 
 def test_a_recording_decodes_as_another_program_decodes_it(shared):
     events = read(shared("data/prophesee_gen3_vga/faery_evt2.raw"))
-    truth = np.load(shared("data/prophesee_gen3_vga/faery_evt2.npz"))  # in file order, its first time subtracted
+    truth = np.load(
+        shared("data/prophesee_gen3_vga/faery_evt2.npz")
+    )  # in file order, its first time subtracted
     order = np.lexsort((truth["p"], truth["x"], truth["y"], truth["t"]))
     assert (events.height_px, events.width_px) == (480, 640)
-    for found, wanted in ((events.t_us - events.t_us[0], truth["t"]), (events.x, truth["x"]), (events.y, truth["y"]), (events.p > 0, truth["p"])):
+    for found, wanted in (
+        (events.t_us - events.t_us[0], truth["t"]),
+        (events.x, truth["x"]),
+        (events.y, truth["y"]),
+        (events.p > 0, truth["p"]),
+    ):
         assert np.array_equal(found.numpy(), wanted[order])
     assert int(events.t_us[0]) == 913_716_224  # the clock of the camera stays
 
@@ -62,8 +70,10 @@ def test_evt3_singles_vectors_and_time_parts(tmp_path):
     path = tmp_path / "e.raw"
     path.write_bytes(
         evt3(
-            (0x8, 2), (0x6, 5), (0x0, 0x800 | 7), (0x2, 0x800 | 30),  # high 2, low 5, row 7 (slave camera's bit set), one ON event in column 30
-            (0x3, 0x800 | 100), (0x4, 0b100000000001), (0x4, 0b10), (0x5, 0xF81),  # base 100 ON: columns 100, 111; then from 112: 113; then from 124: 124, 131
+            # high 2, low 5, row 7 (slave camera's bit set), one ON event in column 30
+            (0x8, 2), (0x6, 5), (0x0, 0x800 | 7), (0x2, 0x800 | 30),
+            # base 100 ON: columns 100, 111; then from 112: 113; then from 124: 124, 131
+            (0x3, 0x800 | 100), (0x4, 0b100000000001), (0x4, 0b10), (0x5, 0xF81),
             (0x8, 2), (0x2, 31),  # a repeated high part leaves the low one
             (0x8, 3), (0x2, 32),  # a new high part starts the low one at zero
             (0xA, 0x101), (0xE, 0x14), (0xF, 1), (0x7, 2),  # trigger, counter and continuations: no events
@@ -71,7 +81,11 @@ def test_evt3_singles_vectors_and_time_parts(tmp_path):
         )
     )  # fmt: skip
     t_us = 2 * 4096 + 5
-    truth = [(t_us, x, 7, 1) for x in (30, 100, 111, 113, 124, 131)] + [(t_us, 31, 7, -1), (3 * 4096, 32, 7, -1), (3 * 4096 + 9, 132, 7, 1)]
+    truth = [(t_us, x, 7, 1) for x in (30, 100, 111, 113, 124, 131)] + [
+        (t_us, 31, 7, -1),
+        (3 * 4096, 32, 7, -1),
+        (3 * 4096 + 9, 132, 7, 1),
+    ]
     events = read(path)
     assert rows(events) == sorted(truth, key=lambda row: (row[0], row[2], row[1], row[3]))
     assert (events.height_px, events.width_px) == (720, 1280)
@@ -79,7 +93,20 @@ def test_evt3_singles_vectors_and_time_parts(tmp_path):
 
 def test_clocks_start_again_and_go_on(tmp_path):
     path = tmp_path / "e.raw"
-    path.write_bytes(evt3((0x0, 1), (0x8, 0xFFF), (0x6, 0xFFF), (0x2, 5), (0x8, 0), (0x6, 2), (0x2, 6), (0x8, 0xFFF), (0x8, 0), (0x2, 7)))
+    path.write_bytes(
+        evt3(
+            (0x0, 1),
+            (0x8, 0xFFF),
+            (0x6, 0xFFF),
+            (0x2, 5),
+            (0x8, 0),
+            (0x6, 2),
+            (0x2, 6),
+            (0x8, 0xFFF),
+            (0x8, 0),
+            (0x2, 7),
+        )
+    )
     assert rows(read(path)) == [(2**24 - 1, 5, 1, -1), (2**24 + 2, 6, 1, -1), (2**25, 7, 1, -1)]
     high = 0x8 << 28
     path.write_bytes(evt2(high | 2**28 - 1, evt2_event(63, 5, 1, 0), high, evt2_event(2, 6, 1, 1)))
@@ -92,17 +119,32 @@ def test_clocks_start_again_and_go_on(tmp_path):
 def test_what_is_written_is_what_the_layout_says(tmp_path):
     stream = stream_of((4096 * 3 + 70, 9, 4, 1), (4096 * 3 + 70, 10, 4, -1))
     write(tmp_path / "e.raw", stream)
-    assert np.frombuffer((tmp_path / "e.raw").read_bytes().split(b"% end\n")[1], "<u2").tolist() == [0x8003, 0x6046, 0x0004, 0x2809, 0x200A]
+    assert np.frombuffer((tmp_path / "e.raw").read_bytes().split(b"% end\n")[1], "<u2").tolist() == [
+        0x8003,
+        0x6046,
+        0x0004,
+        0x2809,
+        0x200A,
+    ]
     write(tmp_path / "e.raw", stream, evt=2)
-    words = [0x80000000 | (4096 * 3 + 70) // 64, *(evt2_event(4096 * 3 + 70, x, 4, p) for x, p in ((9, 1), (10, 0)))]
+    words = [
+        0x80000000 | (4096 * 3 + 70) // 64,
+        *(evt2_event(4096 * 3 + 70, x, 4, p) for x, p in ((9, 1), (10, 0))),
+    ]
     assert np.frombuffer((tmp_path / "e.raw").read_bytes().split(b"% end\n")[1], "<u4").tolist() == words
     write(tmp_path / "e.dat", stream)
-    assert (tmp_path / "e.dat").read_bytes().endswith(dat((4096 * 3 + 70, 9, 4, 1), (4096 * 3 + 70, 10, 4, 0))[len(DAT) - 2 :])
+    assert (
+        (tmp_path / "e.dat")
+        .read_bytes()
+        .endswith(dat((4096 * 3 + 70, 9, 4, 1), (4096 * 3 + 70, 10, 4, 0))[len(DAT) - 2 :])
+    )
 
 
 def test_events_that_come_before_their_time_or_row_are_left_out_with_a_warning(tmp_path):
     path = tmp_path / "e.raw"
-    path.write_bytes(evt3((0x0, 1), (0x2, 4), (0x5, 0b11), (0x8, 0), (0x2, 5)))  # one event without a time, two without a column base
+    path.write_bytes(
+        evt3((0x0, 1), (0x2, 4), (0x5, 0b11), (0x8, 0), (0x2, 5))
+    )  # one event without a time, two without a column base
     with pytest.warns(UserWarning, match="3 events ahead"):
         assert rows(read(path)) == [(0, 5, 1, -1)]
     path.write_bytes(evt2(evt2_event(1, 2, 3, 1), 0x80000000, evt2_event(1, 2, 3, 1)))
@@ -137,8 +179,16 @@ def test_small_disorder_is_sorted_and_more_is_refused(tmp_path):
         ("e.raw", evt3((0x8, 0), (0x9, 0)), "word 1 has type 0x9"),
         ("e.raw", evt2(0x80000000, 0x30000000), "word 1 has type 0x3"),
         ("e.raw", evt3((0x8, 0), (0x0, 720), (0x2, 5)), "y = 720.*720 pixels"),
-        ("e.raw", b"% evt 3.0\n% end\n" + evt3((0x8, 0), (0x0, 1), (0x3, 2047), (0x5, 2))[len(EVT3) :], "column 2048"),
-        ("e.raw", evt3((0x8, 2048), (0x0, 1), (0x2, 5), (0x8, 0), (0x2, 5)), "before an earlier"),  # one wrong bit is no new loop
+        (
+            "e.raw",
+            b"% evt 3.0\n% end\n" + evt3((0x8, 0), (0x0, 1), (0x3, 2047), (0x5, 2))[len(EVT3) :],
+            "column 2048",
+        ),
+        (
+            "e.raw",
+            evt3((0x8, 2048), (0x0, 1), (0x2, 5), (0x8, 0), (0x2, 5)),
+            "before an earlier",
+        ),  # one wrong bit is no new loop
         ("e.dat", DAT.replace(b"Version 2", b"Version 1"), "version '1'"),
         ("e.dat", DAT[:-2] + b"\x0e\x08", "0e 08"),
         ("e.dat", DAT[:-1], "type and size are 0c"),

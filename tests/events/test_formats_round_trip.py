@@ -15,12 +15,16 @@ EPOCH_US = 1_643_243_628_737_093  # a clock that counts from 1970
 def random_stream(first_us, span_us):
     """A million events with many equal times, every column, row and polarity of a 640 x 480 sensor."""
     generator = torch.Generator().manual_seed(0)
-    t_us, x, y, p = (torch.randint(0, high, (1_000_000,), generator=generator) for high in (span_us, 640, 480, 2))
+    t_us, x, y, p = (
+        torch.randint(0, high, (1_000_000,), generator=generator) for high in (span_us, 640, 480, 2)
+    )
     return ordered(first_us + t_us, x, y, 2 * p - 1, 480, 640)
 
 
 @pytest.mark.parametrize(("first_us", "span_us"), [(EPOCH_US, 10_000_000), (2**32 - 1000, 2**34)])
-@pytest.mark.parametrize(("name", "evt"), [("e.h5", None), ("e.aedat4", None), ("e.raw", 3), ("e.raw", 2), ("e.dat", None)])
+@pytest.mark.parametrize(
+    ("name", "evt"), [("e.h5", None), ("e.aedat4", None), ("e.raw", 3), ("e.raw", 2), ("e.dat", None)]
+)
 def test_a_million_events_come_back_exactly(tmp_path, name, evt, first_us, span_us):
     if name == "e.h5":
         span_us = 10_000_000  # its times have 32 bits from the first event on
@@ -31,12 +35,17 @@ def test_a_million_events_come_back_exactly(tmp_path, name, evt, first_us, span_
     assert (back.height_px, back.width_px) == (480, 640)
 
 
-@pytest.mark.parametrize(("name", "evt"), [("e.h5", None), ("e.aedat4", None), ("e.raw", 3), ("e.raw", 2), ("e.dat", None), ("e.npz", None)])
+@pytest.mark.parametrize(
+    ("name", "evt"),
+    [("e.h5", None), ("e.aedat4", None), ("e.raw", 3), ("e.raw", 2), ("e.dat", None), ("e.npz", None)],
+)
 @pytest.mark.parametrize("count", [0, 1])
 def test_no_event_and_one_event_come_back_with_the_sensor_size(tmp_path, name, evt, count):
     t_us, x, y, p = (torch.tensor([value] * count, dtype=torch.int64) for value in (EPOCH_US, 3, 5, -1))
     stream = ordered(t_us, x, y, p, 480, 640)
     write(tmp_path / name, stream, evt=evt)
     back = read(tmp_path / name)
-    assert [getattr(back, field).tolist() for field in ("t_us", "x", "y", "p")] == [[value] * count for value in (EPOCH_US, 3, 5, -1)]
+    assert [getattr(back, field).tolist() for field in ("t_us", "x", "y", "p")] == [
+        [value] * count for value in (EPOCH_US, 3, 5, -1)
+    ]
     assert (back.height_px, back.width_px) == (480, 640)

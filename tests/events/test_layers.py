@@ -1,4 +1,5 @@
-"""The differentiable layers: closed forms, Monte Carlo means, differences of the hard sensor, and one interface for all."""
+"""The differentiable layers: closed forms, Monte Carlo means, differences of the hard sensor, and one
+interface for all."""
 
 import math
 
@@ -6,15 +7,40 @@ import pytest
 import torch
 
 from codesign.errors import DomainError, ShapeError
-from codesign.events import EventLayer, SensorModel, SensorState, annealed, dense, expected, low_pass, memory, sensor_counts, simulate, soft, to_counts
+from codesign.events import (
+    EventLayer,
+    SensorModel,
+    SensorState,
+    annealed,
+    dense,
+    expected,
+    low_pass,
+    memory,
+    sensor_counts,
+    simulate,
+    soft,
+    to_counts,
+)
 from codesign.events.layers.layer import KINDS
 
 D = torch.float64
-PHYSICAL = SensorModel(0.15, 0.2, 0.03, 60.0, leak_rate_hz=3.0, leak_jitter=0.2, rate_cov_decades=0.2, shot_rate_hz=20.0, refractory_s=2e-3)
+PHYSICAL = SensorModel(
+    0.15,
+    0.2,
+    0.03,
+    60.0,
+    leak_rate_hz=3.0,
+    leak_jitter=0.2,
+    rate_cov_decades=0.2,
+    shot_rate_hz=20.0,
+    refractory_s=2e-3,
+)
 
 
 def drifting(frames=30, shape=(6, 5), dtype=D):
-    drift = torch.randn(frames, *shape, generator=torch.Generator().manual_seed(1), dtype=dtype).cumsum(0) * 0.1
+    drift = (
+        torch.randn(frames, *shape, generator=torch.Generator().manual_seed(1), dtype=dtype).cumsum(0) * 0.1
+    )
     return (4 + drift).exp(), torch.arange(frames, dtype=D) * 2e-3
 
 
@@ -22,11 +48,18 @@ def moving_pattern(fps=240, size=48):
     """Sum of plane waves drifting over the sensor: log levels [T, size, size]."""
     generator = torch.Generator().manual_seed(0)
     wave = torch.randn(12, 2, generator=generator, dtype=D) * 0.25
-    phase, strength = torch.rand(12, generator=generator, dtype=D) * 2 * math.pi, torch.rand(12, generator=generator, dtype=D) * 0.3 + 0.1
-    t_s, place = torch.arange(0, 0.25, 1 / fps, dtype=D), torch.arange(size, dtype=D)
+    phase = torch.rand(12, generator=generator, dtype=D) * 2 * math.pi
+    strength = torch.rand(12, generator=generator, dtype=D) * 0.3 + 0.1
+    t_s = torch.arange(0, 0.25, 1 / fps, dtype=D)
+    place = torch.arange(size, dtype=D)
     y, x = torch.meshgrid(place, place, indexing="ij")
     speed = torch.tensor([60.0, 25.0], dtype=D)
-    argument = wave[:, :1, None, None] * x + wave[:, 1:, None, None] * y + phase[:, None, None, None] + (wave @ speed)[:, None, None, None] * t_s[:, None, None]
+    argument = (
+        wave[:, :1, None, None] * x
+        + wave[:, 1:, None, None] * y
+        + phase[:, None, None, None]
+        + (wave @ speed)[:, None, None, None] * t_s[:, None, None]
+    )
     return 4.2 + (strength[:, None, None, None] * argument.cos()).sum(0), t_s
 
 
@@ -49,7 +82,8 @@ def test_dense_gradient_is_the_surrogate_slope():
 
 @pytest.mark.parametrize("spread", [0.05, 0.15, 0.4])
 def test_expected_counts_are_means_over_thresholds(spread):
-    # hard counts of one step, 200,000 drawn thresholds each: standard error below 0.4 % of the spread in counts
+    # hard counts of one step, 200,000 drawn thresholds each: standard error below 0.4 % of the spread in
+    # counts
     steps = torch.tensor([0.0, 0.05, 0.1, 0.19, 0.21, 0.5, 1.5, 3.0, -0.3, -2.0], dtype=D)
     level = torch.stack((torch.zeros_like(steps), steps))
     drawn = torch.exp(spread * torch.randn(200_000, 1, generator=torch.Generator().manual_seed(2), dtype=D))
@@ -72,7 +106,9 @@ def test_expected_counts_become_hard_counts_and_stay_smooth_through_the_series_e
     torch.testing.assert_close(near_hard[0][:, clear], hard[0][:, clear], rtol=0, atol=1e-5)
     # the sum over events is left for its integral at 1.2/spread events
     around = 0.2 * 1.2 / 0.15 * torch.tensor([1 - 1e-9, 1 + 1e-9], dtype=D)
-    counts, reference = expected(torch.stack((torch.zeros(2, dtype=D), around)), 0.2, 0.2, 0.15, log_input=True)
+    counts, reference = expected(
+        torch.stack((torch.zeros(2, dtype=D), around)), 0.2, 0.2, 0.15, log_input=True
+    )
     assert float(counts[0, 0].diff().abs()) < 1e-7
     assert float(reference.diff().abs()) < 1e-7
     assert annealed(0, 100) == 0.5
@@ -88,14 +124,18 @@ def test_smooth_layers_pass_gradcheck():
     cutoff = torch.tensor(40.0, dtype=D, requires_grad=True)
     assert torch.autograd.gradcheck(lambda f, c: low_pass(f.log(), f, t_s.diff(), c), (frames, cutoff))
     slow = torch.tensor(1e-4, dtype=D, requires_grad=True)  # the series for small steps
-    assert torch.autograd.gradcheck(lambda f, c: low_pass(f.log(), f, t_s.diff(), c), (frames, slow), atol=1e-7)
+    assert torch.autograd.gradcheck(
+        lambda f, c: low_pass(f.log(), f, t_s.diff(), c), (frames, slow), atol=1e-7
+    )
 
 
 def test_the_low_pass_is_that_of_the_hard_sensor():
     frames, t_s = drifting()
     state = SensorState()
     simulate(frames, t_s, SensorModel(cutoff_hz=45.0), state=state)
-    torch.testing.assert_close(low_pass(frames.log(), frames, t_s.diff(), 45.0)[-1], state.level, rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        low_pass(frames.log(), frames, t_s.diff(), 45.0)[-1], state.level, rtol=0, atol=1e-12
+    )
 
 
 def test_the_physical_layer_gives_the_events_of_the_sensor():
@@ -110,15 +150,24 @@ def test_without_physics_its_gradient_is_that_of_the_memory_layer():
     frames, t_s = drifting()
     weight = torch.randn(29, 2, 6, 5, generator=torch.Generator().manual_seed(4), dtype=D)
     found = []
-    for layer in (lambda f, a, b: sensor_counts(f, t_s, SensorModel(0.15, 0.2), theta_on=a, theta_off=b)[0], lambda f, a, b: memory(f, a, b)[0]):
-        inputs = [frames.clone().requires_grad_(), torch.tensor(0.15, dtype=D, requires_grad=True), torch.tensor(0.2, dtype=D, requires_grad=True)]
+    for layer in (
+        lambda f, a, b: sensor_counts(f, t_s, SensorModel(0.15, 0.2), theta_on=a, theta_off=b)[0],
+        lambda f, a, b: memory(f, a, b)[0],
+    ):
+        inputs = [
+            frames.clone().requires_grad_(),
+            torch.tensor(0.15, dtype=D, requires_grad=True),
+            torch.tensor(0.2, dtype=D, requires_grad=True),
+        ]
         found.append(torch.autograd.grad((weight * layer(*inputs)).sum(), inputs))
     for mine, theirs in zip(*found, strict=True):
         torch.testing.assert_close(mine, theirs)
 
 
-# cosine and scale of the gradient of pooled counts against differences of the hard sensor's, measured 0.98/0.93, 0.98/0.91, 0.95/0.69, 0.92/0.83,
-# 0.99/0.93: the bounds leave room for another seed, not for a missing term (a threshold gradient without memory has scale below 0.5)
+# cosine and scale of the gradient of pooled counts against differences of the hard sensor's, measured
+# 0.98/0.93, 0.98/0.91, 0.95/0.69, 0.92/0.83,
+# 0.99/0.93: the bounds leave room for another seed, not for a missing term (a threshold gradient without
+# memory has scale below 0.5)
 @pytest.mark.parametrize(
     ("name", "sensor", "step", "cosine", "scales"),
     [
@@ -134,13 +183,18 @@ def test_gradients_to_the_sensor_follow_differences_of_hard_counts(name, sensor,
     before = getattr(sensor, name)
 
     def pooled(value):
-        counts, _ = sensor_counts(level, t_s, sensor, generator=torch.Generator().manual_seed(1), log_input=True, **{name: value})
+        counts, _ = sensor_counts(
+            level, t_s, sensor, generator=torch.Generator().manual_seed(1), log_input=True, **{name: value}
+        )
         return counts[:56].reshape(4, 14, 2, 4, 12, 4, 12).sum((1, 4, 6)).flatten()
 
     value = torch.tensor(before, dtype=D, requires_grad=True)
     counts = pooled(value)
     slope = torch.stack([torch.autograd.grad(count, value, retain_graph=True)[0] for count in counts])
-    difference = (pooled(torch.tensor(before * (1 + step), dtype=D)) - pooled(torch.tensor(before * (1 - step), dtype=D))) / (2 * step * before)
+    difference = (
+        pooled(torch.tensor(before * (1 + step), dtype=D))
+        - pooled(torch.tensor(before * (1 - step), dtype=D))
+    ) / (2 * step * before)
     assert float(slope @ difference / (slope.norm() * difference.norm())) > cosine
     assert scales[0] < float(slope @ difference / (difference @ difference)) < scales[1]
 
@@ -177,7 +231,9 @@ def test_learnt_thresholds_find_those_behind_the_counts():
 
 def test_sigmoid_of_the_interface_is_the_function():
     frames, t_s = drifting()
-    torch.testing.assert_close(EventLayer("sigmoid", SensorModel(0.2, 0.2))(frames, t_s)[0], soft(frames, 0.2))
+    torch.testing.assert_close(
+        EventLayer("sigmoid", SensorModel(0.2, 0.2))(frames, t_s)[0], soft(frames, 0.2)
+    )
 
 
 def test_bad_input_is_refused():
@@ -194,7 +250,11 @@ def test_bad_input_is_refused():
         sensor_counts(frames, t_s, SensorModel(), theta_on=torch.tensor(-1.0))
     with pytest.raises(DomainError, match="spread"):
         expected(frames, 0.2, 0.2, 0.0)
-    for layer in (lambda f: dense(f, 0.2, 0.2), lambda f: expected(f, 0.2, 0.2, 0.1), lambda f: sensor_counts(f, t_s[: len(f)], SensorModel())):
+    for layer in (
+        lambda f: dense(f, 0.2, 0.2),
+        lambda f: expected(f, 0.2, 0.2, 0.1),
+        lambda f: sensor_counts(f, t_s[: len(f)], SensorModel()),
+    ):
         with pytest.raises(ShapeError, match="at least 2"):
             layer(frames[:1])
         with pytest.raises(DomainError, match="NaN"):

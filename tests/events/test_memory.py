@@ -10,16 +10,21 @@ from codesign.events import lin_log, memory, soft_counts
 
 
 def plain_loop(level, theta_on, theta_off, state=None):
-    """The same model as ordinary loops: whole counts forward, the play's slopes backward. Returns counts, memorised level, centre of the play."""
+    """The same model as ordinary loops: whole counts forward, the play's slopes backward. Returns counts,
+    memorised level, centre of the play."""
     if state is None:
         level, state = level[1:], level[0]
-    reference, centre, width, counts = state.detach(), state, (theta_on + theta_off) / 2, []
+    reference = state.detach()
+    centre = state
+    width = (theta_on + theta_off) / 2
+    counts = []
     for now in level:
         with torch.no_grad():
             on = (now - reference).clamp(min=0).div(theta_on, rounding_mode="floor")
             off = (reference - now).clamp(min=0).div(theta_off, rounding_mode="floor")
             reference = reference + theta_on * on - theta_off * off
-        rise, fall = (now - centre - width / 2).clamp(min=0), (centre - width / 2 - now).clamp(min=0)
+        rise = (now - centre - width / 2).clamp(min=0)
+        fall = (centre - width / 2 - now).clamp(min=0)
         centre = centre + rise - fall
         smooth = torch.stack((rise / theta_on, fall / theta_off))
         counts.append(torch.stack((on, off)) + (smooth - smooth.detach()))
@@ -37,7 +42,10 @@ def test_counts_and_all_gradients_equal_a_plain_autograd_loop(per_pixel, with_st
     generator = torch.Generator().manual_seed(1)
     shape = (5, 4) if per_pixel else ()
     level = random_walk()
-    inputs = [level.requires_grad_(), (0.2 + 0.05 * torch.rand(shape, generator=generator, dtype=torch.float64)).requires_grad_()]
+    inputs = [
+        level.requires_grad_(),
+        (0.2 + 0.05 * torch.rand(shape, generator=generator, dtype=torch.float64)).requires_grad_(),
+    ]
     inputs.append((0.3 + 0.05 * torch.rand(shape, generator=generator, dtype=torch.float64)).requires_grad_())
     if with_state:
         inputs.append(torch.zeros(5, 4, dtype=torch.float64, requires_grad=True))
@@ -45,8 +53,11 @@ def test_counts_and_all_gradients_equal_a_plain_autograd_loop(per_pixel, with_st
     truth, reference, centre = plain_loop(*inputs)
     torch.testing.assert_close(counts, truth, rtol=0, atol=1e-12)  # n + (s - s) rounds
     torch.testing.assert_close(state.detach(), torch.stack((reference, centre)).detach(), rtol=0, atol=1e-13)
-    weights = [torch.randn(tensor.shape, generator=generator, dtype=torch.float64) for tensor in (counts, centre)]
-    found, expected = torch.autograd.grad((counts, state[1]), inputs, weights), torch.autograd.grad((truth, centre), inputs, weights)
+    weights = [
+        torch.randn(tensor.shape, generator=generator, dtype=torch.float64) for tensor in (counts, centre)
+    ]
+    found = torch.autograd.grad((counts, state[1]), inputs, weights)
+    expected = torch.autograd.grad((truth, centre), inputs, weights)
     for mine, theirs in zip(found, expected, strict=True):
         # the same sums in another order: some thousand terms of float64 rounding
         torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12 * float(theirs.abs().max()))
@@ -54,7 +65,8 @@ def test_counts_and_all_gradients_equal_a_plain_autograd_loop(per_pixel, with_st
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_ramp_fires_at_every_threshold_it_crosses(dtype):
-    # log level k * 0.07 against theta 0.2: total after k steps is floor(k * 7 / 20), in integers; k * 7 is never a multiple of 20 for 0 < k < 20
+    # log level k * 0.07 against theta 0.2: total after k steps is floor(k * 7 / 20), in integers; k * 7 is
+    # never a multiple of 20 for 0 < k < 20
     level = torch.arange(20, dtype=dtype)[:, None, None] * 0.07 + torch.zeros(20, 2, 3, dtype=dtype)
     rising, reference = memory(level, 0.2, 0.35, log_input=True)
     falling, _ = memory(-level, 0.35, 0.2, log_input=True)
@@ -66,7 +78,8 @@ def test_a_ramp_fires_at_every_threshold_it_crosses(dtype):
 
 
 def test_a_sinusoid_counts_its_swing():
-    # amplitude 1.05 = 5.25 thresholds: up 5, then down from 5 to -5 and up again, 10 each; after 4.1 periods at 3.09 thresholds
+    # amplitude 1.05 = 5.25 thresholds: up 5, then down from 5 to -5 and up again, 10 each; after 4.1 periods
+    # at 3.09 thresholds
     time = torch.arange(0, 4 * 1000 + 101, dtype=torch.float64) / 1000
     counts, _ = memory((1.05 * torch.sin(2 * math.pi * time))[:, None], 0.2, 0.2, log_input=True)
     assert counts.sum((0, 2)).tolist() == [5 + 3 * 10 + 8, 4 * 10]
@@ -102,8 +115,10 @@ def test_chunks_equal_the_whole_bit_for_bit_gradients_included(cut):
 
 
 def test_the_play_is_the_mean_of_the_hard_count_over_all_places_inside_the_threshold():
-    # a long swing first, so that every pixel stands at an even place below its turning point; then ways back of 0 to 3 thresholds
-    theta, pixels = 0.2, 4000
+    # a long swing first, so that every pixel stands at an even place below its turning point; then ways back
+    # of 0 to 3 thresholds
+    theta = 0.2
+    pixels = 4000
     start = torch.arange(pixels, dtype=torch.float64) / pixels * theta
     for back in (0.1, 0.15, 0.19, 0.21, 0.3, 0.55):
         level = torch.stack((torch.zeros(pixels), 2 + start, 2 + start - back)).double()
@@ -114,8 +129,10 @@ def test_the_play_is_the_mean_of_the_hard_count_over_all_places_inside_the_thres
 def test_gradient_is_the_slope_of_the_mean_hard_count():
     """d(weighted counts)/d(contrast) of moving textures against differences of whole counts, 2000 phases.
 
-    Rounding leaves an error of half an event per pixel and end, evenly spread: 0.4/sqrt(2000) of an event against slopes of some 10 events per unit
-    times a step of 0.8: 0.2 %; that of the step's curvature (turning points move with the phase only) is below it.
+    Rounding leaves an error of half an event per pixel and end, evenly spread: 0.4/sqrt(2000) of an event
+    against slopes of some 10 events per unit
+    times a step of 0.8: 0.2 %; that of the step's curvature (turning points move with the phase only) is
+      below it.
     """
     generator = torch.Generator().manual_seed(5)
     phase = torch.rand(2000, generator=generator, dtype=torch.float64) * 2 * math.pi
@@ -133,7 +150,8 @@ def test_gradient_is_the_slope_of_the_mean_hard_count():
 
 
 def test_threshold_gradient_follows_the_hard_count():
-    # the total count of a pixel that swings by S (many thresholds) is about S/C: d/dC = -S/C^2 = -(counts)/C. The hard count over a 25 % wider
+    # the total count of a pixel that swings by S (many thresholds) is about S/C: d/dC = -S/C^2 = -(counts)/C.
+    # The hard count over a 25 % wider
     # and narrower threshold gives -S/(C^2 (1 - 0.0625)): 7 % steeper; rounding adds under 1 % at 2000 pixels.
     generator = torch.Generator().manual_seed(6)
     swing = 3 + torch.rand(2000, generator=generator, dtype=torch.float64)
@@ -151,8 +169,12 @@ def test_a_still_scene_is_silent_and_changes_below_the_threshold_have_no_gradien
     counts.sum().backward()
     torch.testing.assert_close(level.grad, torch.zeros_like(level))
     assert torch.equal(state, torch.full((2, 3, 3), 4.0, dtype=torch.float64))
-    # the play reaches a half threshold from where it starts: a quarter moves nothing, three quarters pull at the end and push at the start
-    small, large = (torch.tensor([0.0, 0.2 * share, 0.2 * share], dtype=torch.float64, requires_grad=True) for share in (0.25, 0.75))
+    # the play reaches a half threshold from where it starts: a quarter moves nothing, three quarters pull at
+    # the end and push at the start
+    small, large = (
+        torch.tensor([0.0, 0.2 * share, 0.2 * share], dtype=torch.float64, requires_grad=True)
+        for share in (0.25, 0.75)
+    )
     for level, slopes in ((small, [0, 0, 0]), (large, [-5, 5, 0])):
         memory(level[:, None], 0.2, 0.2, log_input=True)[0].sum().backward()
         torch.testing.assert_close(level.grad, torch.tensor(slopes, dtype=torch.float64))
@@ -160,10 +182,16 @@ def test_a_still_scene_is_silent_and_changes_below_the_threshold_have_no_gradien
 
 def test_soft_counts_gradient_against_finite_differences_and_sum_against_memory():
     level = random_walk(8, (3, 2))
-    thetas = [torch.tensor([[0.2], [0.3], [0.25]], dtype=torch.float64, requires_grad=True), torch.tensor(0.15, dtype=torch.float64, requires_grad=True)]
-    assert torch.autograd.gradcheck(lambda x, a, b: soft_counts(x, a, b, log_input=True), (level.requires_grad_(), *thetas))
+    thetas = [
+        torch.tensor([[0.2], [0.3], [0.25]], dtype=torch.float64, requires_grad=True),
+        torch.tensor(0.15, dtype=torch.float64, requires_grad=True),
+    ]
+    assert torch.autograd.gradcheck(
+        lambda x, a, b: soft_counts(x, a, b, log_input=True), (level.requires_grad_(), *thetas)
+    )
     climb = level.detach().abs().cumsum(0)
-    soft, hard = soft_counts(climb, 0.2, 0.2, log_input=True).sum(0), memory(climb, 0.2, 0.2, log_input=True)[0].sum(0)
+    soft = soft_counts(climb, 0.2, 0.2, log_input=True).sum(0)
+    hard = memory(climb, 0.2, 0.2, log_input=True)[0].sum(0)
     assert torch.equal(soft.floor(), hard)
 
 
@@ -175,7 +203,9 @@ def test_memory_applies_the_lin_log_front_end():
 def test_second_derivatives_raise():
     level = random_walk(4, (2,)).requires_grad_()
     weight = torch.ones(3, 2, 2, dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(memory(level, 0.2, 0.2, log_input=True)[0], level, weight, create_graph=True)
+    (slope,) = torch.autograd.grad(
+        memory(level, 0.2, 0.2, log_input=True)[0], level, weight, create_graph=True
+    )
     with pytest.raises(RuntimeError, match="once_differentiable"):
         slope.sum().backward()
 

@@ -15,7 +15,14 @@ def drawn():
 
     arr = backend.arrays("cpu", torch.float32)
     bits = hashed(dr, dr.arange(arr.UInt32, 1 << 20))
-    return [value.torch().double() for value in (uniform(arr, bits), exponential(dr, arr, bits), *normal_pair(dr, arr, dr.arange(arr.UInt32, 1 << 20)))]
+    return [
+        value.torch().double()
+        for value in (
+            uniform(arr, bits),
+            exponential(dr, arr, bits),
+            *normal_pair(dr, arr, dr.arange(arr.UInt32, 1 << 20)),
+        )
+    ]
 
 
 def test_uniform_numbers_fill_the_unit_interval(drawn):
@@ -36,7 +43,9 @@ def test_moments_are_those_of_the_laws(drawn):
         assert float(normal.mean()) == pytest.approx(0, abs=error)
         assert float(normal.var()) == pytest.approx(1, abs=error * math.sqrt(2))
         assert float((normal**4).mean()) == pytest.approx(3, abs=error * math.sqrt(96))
-        assert float((normal.abs() > 3).double().mean()) == pytest.approx(math.erfc(3 / math.sqrt(2)), rel=0.1)
+        assert float((normal.abs() > 3).double().mean()) == pytest.approx(
+            math.erfc(3 / math.sqrt(2)), rel=0.1
+        )
 
 
 def test_neighbours_and_pairs_are_uncorrelated(drawn):

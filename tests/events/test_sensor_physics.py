@@ -1,4 +1,5 @@
-"""Low-pass, leak, noise events, hot pixels and dead time of the interpolated sensor against differential equations and the laws of their randomness."""
+"""Low-pass, leak, noise events, hot pixels and dead time of the interpolated sensor against differential
+equations and the laws of their randomness."""
 
 import math
 
@@ -23,7 +24,9 @@ def same(first, second):
 def clip(frames=30, dtype=torch.float32):
     generator = torch.Generator().manual_seed(1)
     drift = torch.randn(frames, 9, 8, generator=generator, dtype=dtype).cumsum(0) * 0.1
-    return (4 + drift).exp(), torch.rand(frames, generator=generator, dtype=torch.float64).add(0.2).cumsum(0) * 2e-3
+    return (4 + drift).exp(), torch.rand(frames, generator=generator, dtype=torch.float64).add(0.2).cumsum(
+        0
+    ) * 2e-3
 
 
 @pytest.mark.parametrize("cutoff_hz", [0.01, 30.0, 2000.0])
@@ -31,24 +34,33 @@ def test_the_low_pass_solves_its_differential_equation(cutoff_hz):
     frames, t_s = clip(dtype=torch.float64)
     state = SensorState()
     simulate(frames, t_s, SensorModel(cutoff_hz=cutoff_hz), state=state)
-    intensity, level, t = frames[:, 3, 4].numpy(), frames[:, 3, 4].log().numpy(), t_s.numpy()
+    intensity = frames[:, 3, 4].numpy()
+    level = frames[:, 3, 4].log().numpy()
+    t = t_s.numpy()
     filtered = level[0]
     for k in range(1, len(t)):
         pace = 2 * math.pi * cutoff_hz * (0.5 * (intensity[k - 1] + intensity[k]) + 20) / 275
         slope = (level[k] - level[k - 1]) / (t[k] - t[k - 1])
-        right = lambda s, v, k=k, pace=pace, slope=slope: pace * (level[k - 1] + slope * s - v)  # noqa: E731
-        filtered = solve_ivp(right, (0, t[k] - t[k - 1]), [filtered], method="Radau", rtol=1e-10, atol=1e-12).y[0, -1]
+
+        def right(s, v, k=k, pace=pace, slope=slope):
+            return pace * (level[k - 1] + slope * s - v)
+
+        filtered = solve_ivp(
+            right, (0, t[k] - t[k - 1]), [filtered], method="Radau", rtol=1e-10, atol=1e-12
+        ).y[0, -1]
     assert float(state.level[3, 4]) == pytest.approx(filtered, abs=1e-8)
 
 
 @pytest.mark.parametrize(("fps", "error"), [(400, 0.02), (2000, 1e-3)])
 def test_a_sinusoid_through_the_low_pass_has_its_textbook_amplitude(fps, error):
-    # so small that the bandwidth is that of exp(4); gain 1/sqrt(1 + (f/fc)^2), times sinc^2 for the chords between frames. What the chords add at
+    # so small that the bandwidth is that of exp(4); gain 1/sqrt(1 + (f/fc)^2), times sinc^2 for the chords
+    # between frames. What the chords add at
     # fps - 40 Hz folds back: (40/360)^2 = 1.2 % of it at 400 fps, (40/1960)^2 at 2000
     bandwidth_hz = 50 * (math.exp(4) + 20) / 275
     t_s = torch.arange(0, 0.2, 1 / fps, dtype=torch.float64)
     level = (4 + 0.01 * torch.sin(2 * math.pi * 40 * t_s))[:, None, None]
-    seen, state = [float(level[0])], SensorState()
+    seen = [float(level[0])]
+    state = SensorState()
     for k in range(1, len(t_s)):
         chunk = slice(0, 2) if k == 1 else slice(k, k + 1)
         simulate(level[chunk], t_s[chunk], SensorModel(cutoff_hz=50.0), state=state, log_input=True)
@@ -57,19 +69,29 @@ def test_a_sinusoid_through_the_low_pass_has_its_textbook_amplitude(fps, error):
     wave = torch.tensor(seen, dtype=torch.float64)[late] - 4
     phase = 2 * math.pi * 40 * t_s[late]
     amplitude = 2 * math.hypot(float((wave * phase.sin()).mean()), float((wave * phase.cos()).mean()))
-    assert amplitude == pytest.approx(0.01 * np.sinc(40 / fps) ** 2 / math.sqrt(1 + (40 / bandwidth_hz) ** 2), rel=error)
+    assert amplitude == pytest.approx(
+        0.01 * np.sinc(40 / fps) ** 2 / math.sqrt(1 + (40 / bandwidth_hz) ** 2), rel=error
+    )
 
 
 @pytest.mark.parametrize("timing", ["interpolated", "v2e"])
 def test_any_chunking_gives_the_events_of_the_whole_with_everything_on(timing):
     frames, t_s = clip()
     everything = SensorModel(**{**EVERYTHING.__dict__, "timing": timing})
-    for sensor in (everything, SensorModel(theta_sigma=0.02, cutoff_hz=50.0, shot_rate_hz=2.0, photoreceptor_noise=True, timing=timing)):
+    for sensor in (
+        everything,
+        SensorModel(
+            theta_sigma=0.02, cutoff_hz=50.0, shot_rate_hz=2.0, photoreceptor_noise=True, timing=timing
+        ),
+    ):
         whole = simulate(frames, t_s, sensor, torch.Generator().manual_seed(5))
         assert len(whole) > 100
         for cuts in ([2, 3], [9, 10, 29], list(range(2, 30))):
             state = SensorState(generator=torch.Generator().manual_seed(5))
-            parts = [simulate(frames[a:b], t_s[a:b], sensor, state=state) for a, b in zip([0, *cuts], [*cuts, 30], strict=True)]
+            parts = [
+                simulate(frames[a:b], t_s[a:b], sensor, state=state)
+                for a, b in zip([0, *cuts], [*cuts, 30], strict=True)
+            ]
             assert same(whole, concatenate(parts))
         assert not same(whole, simulate(frames, t_s, sensor, torch.Generator().manual_seed(6)))
 
@@ -77,9 +99,14 @@ def test_any_chunking_gives_the_events_of_the_whole_with_everything_on(timing):
 def test_dense_counts_are_the_counts_of_the_events():
     frames, t_s = clip()
     events = simulate(frames, t_s, EVERYTHING, torch.Generator().manual_seed(5))
-    assert torch.equal(dense_counts(frames, t_s, EVERYTHING, torch.Generator().manual_seed(5)), to_counts(events, t_s))
+    assert torch.equal(
+        dense_counts(frames, t_s, EVERYTHING, torch.Generator().manual_seed(5)), to_counts(events, t_s)
+    )
     batch = frames.reshape(30, 3, 3, 8)
-    assert torch.equal(dense_counts(batch, t_s, EVERYTHING, torch.Generator().manual_seed(5)).reshape(29, 2, 9, 8), to_counts(events, t_s))
+    assert torch.equal(
+        dense_counts(batch, t_s, EVERYTHING, torch.Generator().manual_seed(5)).reshape(29, 2, 9, 8),
+        to_counts(events, t_s),
+    )
     with pytest.raises(DomainError, match="interpolated"):
         dense_counts(frames, t_s, SensorModel(timing="v2e"))
 
@@ -88,25 +115,41 @@ def test_dense_counts_are_the_counts_of_the_events():
 def test_noise_events_are_a_poisson_process_at_every_frame_rate(fps):
     # (I + 20)/275 = 0.4 at I = 90: 40 Hz * (1 - 0.3) = 28 Hz
     still = torch.full((fps + 1, 50, 80), 90.0)
-    events = simulate(still, torch.arange(fps + 1, dtype=torch.float64) / fps, SensorModel(shot_rate_hz=40.0), torch.Generator().manual_seed(4))
+    events = simulate(
+        still,
+        torch.arange(fps + 1, dtype=torch.float64) / fps,
+        SensorModel(shot_rate_hz=40.0),
+        torch.Generator().manual_seed(4),
+    )
     expected = 28 * 4000
     assert abs(len(events) - expected) < 4 * math.sqrt(expected)
-    assert abs(int((events.p > 0).sum()) - expected / 2) < 4 * math.sqrt(expected / 4) + 4 * math.sqrt(expected) / 2
+    assert (
+        abs(int((events.p > 0).sum()) - expected / 2)
+        < 4 * math.sqrt(expected / 4) + 4 * math.sqrt(expected) / 2
+    )
     histogram = torch.histc(events.t_us.double(), bins=20, min=0, max=1e6)
-    assert float(((histogram - len(events) / 20) ** 2 / (len(events) / 20)).sum()) < 45  # chi-squared, 19 degrees: passed once in a thousand
+    assert (
+        float(((histogram - len(events) / 20) ** 2 / (len(events) / 20)).sum()) < 45
+    )  # chi-squared, 19 degrees: passed once in a thousand
     per_pixel = torch.bincount(events.y * 80 + events.x, minlength=4000).double()
-    assert float(per_pixel.var() / per_pixel.mean()) == pytest.approx(1, abs=4 * math.sqrt(2 / 4000))  # Poisson: variance = mean
+    assert float(per_pixel.var() / per_pixel.mean()) == pytest.approx(
+        1, abs=4 * math.sqrt(2 / 4000)
+    )  # Poisson: variance = mean
     rank = np.lexsort((events.t_us, events.x, events.y))
     gap = np.diff(events.t_us.numpy()[rank])
     gap = gap[np.diff(events.y.numpy()[rank] * 80 + events.x.numpy()[rank]) == 0] * 1e-6
-    assert np.mean(gap < 0.01) == pytest.approx(1 - math.exp(-0.28), abs=0.01)  # waiting times; the window of 1 s cuts a few long ones
+    assert np.mean(gap < 0.01) == pytest.approx(
+        1 - math.exp(-0.28), abs=0.01
+    )  # waiting times; the window of 1 s cuts a few long ones
 
 
 def test_noise_events_scale_with_thresholds_and_reset_the_memorised_level():
     still = torch.full((101, 100, 100), 90.0)
     state = SensorState()
     t_s = torch.arange(101, dtype=torch.float64) / 50
-    events = simulate(still, t_s, SensorModel(theta_sigma=0.05, shot_rate_hz=30.0), torch.Generator().manual_seed(2), state)
+    events = simulate(
+        still, t_s, SensorModel(theta_sigma=0.05, shot_rate_hz=30.0), torch.Generator().manual_seed(2), state
+    )
     on = torch.bincount((events.y * 100 + events.x)[events.p > 0], minlength=10_000).double()
     expected = 15 * 0.7 * 2 * 0.2 / state.theta_on.double().flatten()  # per pixel, 2 s
     split = state.theta_on.flatten() < 0.2
@@ -115,15 +158,28 @@ def test_noise_events_scale_with_thresholds_and_reset_the_memorised_level():
     # a drift below every threshold: each noise event sets the memorised level to the level seen
     ramp = (4 + 0.19 * torch.arange(2) + torch.zeros(60, 60, 2)).permute(2, 0, 1)
     state = SensorState()
-    simulate(ramp, [0.0, 1.0], SensorModel(shot_rate_hz=1e3), torch.Generator().manual_seed(2), state, log_input=True)
+    simulate(
+        ramp,
+        [0.0, 1.0],
+        SensorModel(shot_rate_hz=1e3),
+        torch.Generator().manual_seed(2),
+        state,
+        log_input=True,
+    )
     rate_hz = 1e3 * (1 - 0.75 * (0.5 * (math.exp(4) + math.exp(4.19)) + 20) / 275)
-    # the last noise event lies 1/rate back on average, an exponential law: 1.7 % standard error of 3600 pixels
+    # the last noise event lies 1/rate back on average, an exponential law: 1.7 % standard error of 3600
+    # pixels
     assert float((state.level - state.reference).mean()) == pytest.approx(0.19 / rate_hz, rel=0.06)
 
 
 def test_hot_pixels_fire_on_at_their_rate_and_others_are_silent():
     sensor = SensorModel(hot_pixel_share=0.1, hot_pixel_rate_hz=50.0)
-    events = simulate(torch.full((21, 100, 100), 60.0), torch.arange(21, dtype=torch.float64) / 20, sensor, torch.Generator().manual_seed(0))
+    events = simulate(
+        torch.full((21, 100, 100), 60.0),
+        torch.arange(21, dtype=torch.float64) / 20,
+        sensor,
+        torch.Generator().manual_seed(0),
+    )
     per_pixel = torch.bincount(events.y * 100 + events.x, minlength=10_000)
     hot = per_pixel > 0
     assert abs(int(hot.sum()) - 1000) < 4 * math.sqrt(900)
@@ -135,7 +191,12 @@ def test_hot_pixels_fire_on_at_their_rate_and_others_are_silent():
 
 def test_dead_time_bounds_the_rate_of_a_pixel():
     level = torch.linspace(0, 50, 51)[:, None, None].expand(51, 2, 2)
-    events = simulate(level, torch.arange(51, dtype=torch.float64) * 0.01, SensorModel(0.1, 0.1, refractory_s=0.0035), log_input=True)
+    events = simulate(
+        level,
+        torch.arange(51, dtype=torch.float64) * 0.01,
+        SensorModel(0.1, 0.1, refractory_s=0.0035),
+        log_input=True,
+    )
     # a crossing per millisecond: after an event those at 1, 2, 3 ms are lost, that at 4 ms counts
     gaps = events.t_us[(events.x == 0) & (events.y == 0)].diff()
     assert (gaps - 4000).abs().max() <= 1
@@ -145,7 +206,11 @@ def test_dead_time_bounds_the_rate_of_a_pixel():
 def test_static_scenes_are_silent_without_noise_in_every_preset_of_the_physics():
     still = torch.rand(9, 8, generator=torch.Generator().manual_seed(0)).mul(255).expand(20, 9, 8)
     t_s = torch.arange(20, dtype=torch.float64) * 0.05
-    for sensor in (SensorModel(), PRESETS["clean"], SensorModel(cutoff_hz=3.0, refractory_s=1e-3, theta_sigma=0.05)):
+    for sensor in (
+        SensorModel(),
+        PRESETS["clean"],
+        SensorModel(cutoff_hz=3.0, refractory_s=1e-3, theta_sigma=0.05),
+    ):
         for log_eps in (None, 1e-3):
             assert len(simulate(still, t_s, sensor, log_eps=log_eps)) == 0
 

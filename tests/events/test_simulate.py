@@ -8,7 +8,16 @@ import pytest
 import torch
 
 from codesign.errors import DomainError, ShapeError
-from codesign.events import SensorModel, SensorState, draw_shot_counts, draw_thresholds, lin_log, memory, simulate, to_counts
+from codesign.events import (
+    SensorModel,
+    SensorState,
+    draw_shot_counts,
+    draw_thresholds,
+    lin_log,
+    memory,
+    simulate,
+    to_counts,
+)
 from codesign.events.stream import ordered
 
 FIELDS = ("t_us", "x", "y", "p")
@@ -34,21 +43,28 @@ def reference(path, t_s):
 
 @pytest.mark.parametrize("offset_s", [0.0, 1_700_000_000.0])
 def test_a_ramp_of_log_intensity_fires_at_known_microseconds(offset_s):
-    # level rises by 1 per 0.1 s from 3: crossing j at 0.02 j s; falls by 0.5 in the next 0.1 s from 4: reference 4, crossing j at 0.1 + 0.05 j
+    # level rises by 1 per 0.1 s from 3: crossing j at 0.02 j s; falls by 0.5 in the next 0.1 s from 4:
+    # reference 4, crossing j at 0.1 + 0.05 j
     level = torch.tensor([3.0, 4.0 + 1e-9, 3.5 - 1e-9], dtype=torch.float64)[:, None, None].expand(3, 1, 2)
-    events = simulate(intensity(level), torch.tensor([0, 0.1, 0.2], dtype=torch.float64) + offset_s, SensorModel(0.2, 0.25))
+    events = simulate(
+        intensity(level), torch.tensor([0, 0.1, 0.2], dtype=torch.float64) + offset_s, SensorModel(0.2, 0.25)
+    )
     truth = [20_000, 40_000, 60_000, 80_000, 100_000, 150_000, 200_000]
     for column in (0, 1):
         mine = events.x == column
         # an epoch time in float64 seconds is exact to 0.24 us
-        assert (events.t_us[mine] - int(offset_s * 1e6) - torch.tensor(truth)).abs().max() <= (1 if offset_s else 0)
+        assert (events.t_us[mine] - int(offset_s * 1e6) - torch.tensor(truth)).abs().max() <= (
+            1 if offset_s else 0
+        )
         assert events.p[mine].tolist() == [1] * 5 + [-1] * 2
     assert events.t_us.dtype == torch.int64
 
 
 def test_a_sinusoid_fires_when_its_closed_form_crosses():
-    # linear interpolation of a sinusoid of amplitude A at step h is off by A (2 pi h)^2 / 8 = 6e-6 log units; away from the turning points the
-    # slope exceeds A * 2 pi * cos(asin(0.96)) = 2.2 log units/s, so times are good to 3 us, and to 0.5 us of rounding
+    # linear interpolation of a sinusoid of amplitude A at step h is off by A (2 pi h)^2 / 8 = 6e-6 log units;
+    # away from the turning points the
+    # slope exceeds A * 2 pi * cos(asin(0.96)) = 2.2 log units/s, so times are good to 3 us, and to 0.5 us of
+    # rounding
     t_s = torch.arange(0, 1999, dtype=torch.float64) / 2000
     level = 4.5 + 1.25 * torch.sin(2 * math.pi * t_s)
     events = simulate(intensity(level)[:, None, None], t_s, SensorModel())
@@ -75,7 +91,8 @@ def test_counts_equal_v2e_in_every_pixel_and_frame(shared, sequence, configurati
     events = simulate(frames.float(), t_s, SensorModel(*thetas))
     assert len(events) == len(stream)
     assert torch.equal(to_counts(events, t_s), truth)
-    # in double precision a level that meets a threshold to 1e-7 may count a frame later: a handful of events in 1e5
+    # in double precision a level that meets a threshold to 1e-7 may count a frame later: a handful of events
+    # in 1e5
     moved = to_counts(simulate(frames, t_s, SensorModel(*thetas)), t_s) - truth
     assert moved.cumsum(0).abs().max() <= 1
     assert int((moved != 0).sum()) <= 1e-4 * len(stream)
@@ -100,12 +117,16 @@ def test_order_is_by_time_row_column_polarity():
 
 def test_thresholds_follow_a_clamped_normal_distribution():
     sensor = SensorModel(0.2, 0.1, theta_sigma=0.05)
-    on, off = (theta.double() for theta in draw_thresholds(sensor, (500, 400), torch.Generator().manual_seed(3)))
+    on, off = (
+        theta.double() for theta in draw_thresholds(sensor, (500, 400), torch.Generator().manual_seed(3))
+    )
     # 200000 draws: standard error of the mean 1.1e-4, of the deviation 8e-5; five of them allowed
     assert abs(on.mean() - 0.2) < 5.6e-4
     assert abs(on.std() - 0.05) < 4e-4
     below = 0.5 * math.erfc((0.1 - 0.01) / 0.05 / math.sqrt(2))  # share clamped at 0.01: 3.6 %
-    assert abs(float((off == torch.tensor(0.01).double()).double().mean()) - below) < 5 * math.sqrt(below / 200_000)
+    assert abs(float((off == torch.tensor(0.01).double()).double().mean()) - below) < 5 * math.sqrt(
+        below / 200_000
+    )
     assert float(off.min()) == pytest.approx(0.01)
     assert abs(float(((on - on.mean()) * (off - off.mean())).mean())) < 5 * 0.05**2 / math.sqrt(200_000)
     again = draw_thresholds(sensor, (500, 400), torch.Generator().manual_seed(3))
@@ -115,7 +136,9 @@ def test_thresholds_follow_a_clamped_normal_distribution():
 def test_drawn_shot_counts_are_poisson_per_pixel_and_polarity():
     sensor = SensorModel(shot_rate_hz=40.0)
     interval_s = torch.tensor([0.01, 0.03, 0.05])
-    counts = draw_shot_counts(sensor, (200, 250), interval_s, torch.Generator().manual_seed(4), dtype=torch.float64)
+    counts = draw_shot_counts(
+        sensor, (200, 250), interval_s, torch.Generator().manual_seed(4), dtype=torch.float64
+    )
     for k, expected in enumerate((0.2, 0.6, 1.0)):  # 20 Hz per polarity
         for polarity in (0, 1):
             found = counts[k, polarity]
@@ -125,8 +148,13 @@ def test_drawn_shot_counts_are_poisson_per_pixel_and_polarity():
 
 
 def test_a_huge_step_and_one_pixel():
-    # from black (level 0) to 1e4 (ln 1e4 = 9.21034): 46 events of 0.2, evenly spaced by 0.2/9.21034 of the interval
-    events = simulate(torch.tensor([0.0, 1e4, 1e4, 1e4], dtype=torch.float64)[:, None, None], [0.0, 1.0, 2.0, 3.0], SensorModel())
+    # from black (level 0) to 1e4 (ln 1e4 = 9.21034): 46 events of 0.2, evenly spaced by 0.2/9.21034 of the
+    # interval
+    events = simulate(
+        torch.tensor([0.0, 1e4, 1e4, 1e4], dtype=torch.float64)[:, None, None],
+        [0.0, 1.0, 2.0, 3.0],
+        SensorModel(),
+    )
     truth = (torch.arange(1, 47) * 0.2 / math.log(1e4) * 1e6).round().long()
     assert torch.equal(events.t_us, truth)
 
@@ -148,7 +176,9 @@ def test_sensor_refuses_zero_thresholds_and_other_timings():
 
 
 def test_bad_frames_and_times_are_refused_and_the_state_stays():
-    good, t_s, sensor = torch.full((3, 4, 5), 50.0), [0.0, 0.1, 0.2], SensorModel()
+    good = torch.full((3, 4, 5), 50.0)
+    t_s = [0.0, 0.1, 0.2]
+    sensor = SensorModel()
     for frames, times_s, error, words in [
         (good[:1], t_s[:1], ShapeError, "at least 2"),
         (good[:, 0], t_s, ShapeError, "H, W"),

@@ -23,7 +23,8 @@ def clip(frames=40, side=12, seed=0, dtype=D):
 
 def disturbed(seed=1, **options):
     """A generator all of whose parameters have moved from where they start."""
-    model, draw = SpikeEsim(0.2, 0.25, **options), torch.Generator().manual_seed(seed)
+    model = SpikeEsim(0.2, 0.25, **options)
+    draw = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.05 * torch.randn(parameter.shape, generator=draw, dtype=parameter.dtype))
@@ -43,12 +44,15 @@ def test_untrained_it_is_the_ideal_sensor(dtype):
 def test_untrained_with_dead_time_it_is_the_sensor_with_that_dead_time():
     frames, t_s = clip()
     counts, _ = SpikeEsim(0.1, 0.1, refractory_s=1e-3)(frames, t_s)
-    truth = events.dense_counts(lin_log(frames), t_s, SensorModel(0.1, 0.1, refractory_s=1e-3), log_input=True)
+    truth = events.dense_counts(
+        lin_log(frames), t_s, SensorModel(0.1, 0.1, refractory_s=1e-3), log_input=True
+    )
     assert torch.equal(counts, truth)
 
 
 def test_spiking_comparator_is_the_ideal_sensor_where_no_step_holds_two_events():
-    # levels that move by at most 0.2 per step against a threshold of 0.25: at most one event per step and none left over
+    # levels that move by at most 0.2 per step against a threshold of 0.25: at most one event per step and
+    # none left over
     draw = torch.rand(60, 6, 6, generator=torch.Generator().manual_seed(3), dtype=D)
     frames = (4 + (0.4 * draw - 0.2).cumsum(0)).clamp(3.1, 5.4).exp()
     t_s = torch.arange(60, dtype=D) / 500
@@ -64,7 +68,8 @@ def test_chunks_equal_the_whole_bit_for_bit(options, dtype):
     frames, t_s = clip(side=11, dtype=dtype)
     model = disturbed(**options)
     whole, end = model(frames, t_s)
-    parts, state = [], None
+    parts = []
+    state = None
     for first, last in ((0, 3), (3, 4), (4, 21), (21, 40)):
         counts, state = model(frames[first:last], t_s[first:last], state)
         parts.append(counts)
@@ -79,7 +84,8 @@ def test_batches_are_sequences_of_their_own():
     other, _ = clip(seed=2)
     model = disturbed()
     together, _ = model(torch.stack((one, other), 1), t_s)
-    # a convolution of two pictures may round differently from one of one: a level within 1e-12 of a threshold could move, none does here
+    # a convolution of two pictures may round differently from one of one: a level within 1e-12 of a threshold
+    # could move, none does here
     for index, frames in enumerate((one, other)):
         assert torch.equal(together[:, :, index], model(frames, t_s)[0])
 
@@ -91,7 +97,8 @@ def test_bandwidth_is_the_photoreceptor_of_the_hard_sensor():
         model.bandwidth.gate.fill_(1.0)
         model.bandwidth.double().log_cutoff.fill_(math.log(40.0))
     truth = events.dense_counts(frames, t_s, SensorModel(0.2, 0.25, cutoff_hz=40.0))
-    # both solve the same equation exactly; a level within rounding (1e-14) of a threshold may count one frame later
+    # both solve the same equation exactly; a level within rounding (1e-14) of a threshold may count one frame
+    # later
     counts, _ = model(frames, t_s)
     assert truth.sum() > 200
     assert float((counts - truth).detach().abs().sum()) <= 1e-3 * float(truth.sum())
@@ -112,7 +119,9 @@ def test_thresholds_scale_at_test_time():
     frames, t_s = clip()
     truth = events.dense_counts(lin_log(frames), t_s, SensorModel(0.3, 0.5), log_input=True)
     counts, _ = SpikeEsim(0.2, 0.25)(frames, t_s, theta_scale=torch.tensor([1.5, 2.0]))
-    assert float((counts - truth).detach().abs().sum()) <= 1e-3 * float(truth.sum())  # 1.5 * 0.2 is not 0.3 to the last bit
+    assert float((counts - truth).detach().abs().sum()) <= 1e-3 * float(
+        truth.sum()
+    )  # 1.5 * 0.2 is not 0.3 to the last bit
 
 
 def test_a_still_scene_gives_nothing_and_a_slow_ramp_all_its_thresholds():
@@ -120,20 +129,34 @@ def test_a_still_scene_gives_nothing_and_a_slow_ramp_all_its_thresholds():
     still = torch.full((30, 8, 8), 80.0, dtype=D)
     t_s = torch.arange(401, dtype=D) / 500
     assert model(still, t_s[:30])[0].sum() == 0
-    ramp = (3.5 + torch.linspace(0, 1.701, 401, dtype=D)).exp()[:, None, None].expand(-1, 4, 4)  # 8 thresholds of 0.2 and half a one
+    ramp = (
+        (3.5 + torch.linspace(0, 1.701, 401, dtype=D)).exp()[:, None, None].expand(-1, 4, 4)
+    )  # 8 thresholds of 0.2 and half a one
     counts, _ = SpikeEsim(0.2, 0.2)(ramp, t_s)
-    assert torch.equal(counts.sum(0), torch.stack((torch.full((4, 4), 8.0, dtype=D), torch.zeros(4, 4, dtype=D))))
+    assert torch.equal(
+        counts.sum(0), torch.stack((torch.full((4, 4), 8.0, dtype=D), torch.zeros(4, 4, dtype=D)))
+    )
 
 
 def test_levels_have_exact_gradients_in_every_parameter():
     frames, t_s = clip(frames=5, side=4)
     model = disturbed(width=2).double()
-    names = [name for name, _ in model.named_parameters() if name.startswith(("prefilter", "tone", "bandwidth", "branch"))]
+    names = [
+        name
+        for name, _ in model.named_parameters()
+        if name.startswith(("prefilter", "tone", "bandwidth", "branch"))
+    ]
 
     def levels(*values):
-        return torch.func.functional_call(_Levels(model), dict(zip([f"model.{name}" for name in names], values, strict=True)), (frames, t_s))
+        return torch.func.functional_call(
+            _Levels(model), dict(zip([f"model.{name}" for name in names], values, strict=True)), (frames, t_s)
+        )
 
-    assert torch.autograd.gradcheck(levels, tuple(model.get_parameter(name).detach().clone().requires_grad_() for name in names), atol=1e-6)
+    assert torch.autograd.gradcheck(
+        levels,
+        tuple(model.get_parameter(name).detach().clone().requires_grad_() for name in names),
+        atol=1e-6,
+    )
 
 
 class _Levels(torch.nn.Module):
@@ -150,7 +173,8 @@ def test_drawn_noise_is_poisson_of_the_expected_rate():
     with torch.no_grad():
         model.noise_rate.amplitude_hz.copy_(torch.tensor([30.0, 10.0]))
         model.noise_rate.fade.fill_(2.0)
-    frames, t_s = torch.full((201, 30, 30), 117.5, dtype=D), torch.arange(201, dtype=D) / 500
+    frames = torch.full((201, 30, 30), 117.5, dtype=D)
+    t_s = torch.arange(201, dtype=D) / 500
     expected = torch.tensor([30.0, 10.0]) * math.exp(-2.0 * 0.5) / 500  # light (117.5 + 20)/275 = 1/2
     assert torch.allclose(model.expected_noise(frames, t_s)[0, :, 0, 0], expected.double(), rtol=1e-6)
     counts, _ = model.draw(frames, t_s, torch.Generator().manual_seed(0))  # a still scene: nothing but noise
@@ -158,7 +182,9 @@ def test_drawn_noise_is_poisson_of_the_expected_rate():
         found = counts[:, polarity]
         error = math.sqrt(float(expected[polarity]) / found.numel())
         assert abs(float(found.mean() - expected[polarity])) < 4 * error
-        assert abs(float(found.var() - expected[polarity])) < 4 * error * 1.1  # variance of the sample variance: (m + 2 m^2)/n
+        assert (
+            abs(float(found.var() - expected[polarity])) < 4 * error * 1.1
+        )  # variance of the sample variance: (m + 2 m^2)/n
 
 
 def test_saved_generators_come_back(tmp_path):
@@ -181,7 +207,8 @@ def test_saved_generators_come_back(tmp_path):
 
 def test_the_generator_that_comes_along_has_learnt_its_sensor():
     model = SpikeEsim.load(Path(spiking.__file__).parent / "spike_esim_rendered.npz")
-    # it was trained on hard events of a sensor with thresholds 0.18 and 0.22 and 1 ms dead time; tone and bandwidth trade with thresholds by some percent
+    # it was trained on hard events of a sensor with thresholds 0.18 and 0.22 and 1 ms dead time; tone and
+    # bandwidth trade with thresholds by some percent
     assert model.thetas().tolist() == pytest.approx([0.18, 0.22], rel=0.1)
     dead_s = model.refractory_s()
     assert dead_s is not None
@@ -189,7 +216,8 @@ def test_the_generator_that_comes_along_has_learnt_its_sensor():
     frames, t_s = clip(frames=60, side=24, dtype=torch.float32)
     found, _ = model(frames, t_s)
     target = events.dense_counts(frames, t_s, SensorModel(0.18, 0.22, cutoff_hz=60.0, refractory_s=1e-3))
-    # white changes from frame to frame are nothing it was trained on; an ideal sensor gives three times the events
+    # white changes from frame to frame are nothing it was trained on; an ideal sensor gives three times the
+    # events
     assert float(found.detach().sum() / target.sum()) == pytest.approx(1, abs=0.25)
 
 
@@ -214,7 +242,12 @@ def test_bad_input_is_refused():
         with pytest.raises(DomainError, match="theta_scale"):
             model(frames, t_s, theta_scale=scale)
     options: dict[str, Any]
-    for options, words in (({"theta_on": 0.0}, "theta_on"), ({"theta_off": math.nan}, "theta_off"), ({"comparator": "soft"}, "comparator"), ({"refractory_s": -1.0}, "refractory_s")):
+    for options, words in (
+        ({"theta_on": 0.0}, "theta_on"),
+        ({"theta_off": math.nan}, "theta_off"),
+        ({"comparator": "soft"}, "comparator"),
+        ({"refractory_s": -1.0}, "refractory_s"),
+    ):
         with pytest.raises(DomainError, match=words):
             SpikeEsim(**options)
     with pytest.raises(DomainError, match="dead time"):

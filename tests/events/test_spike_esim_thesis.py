@@ -19,7 +19,12 @@ def steps_first(array):
 
 
 def of_thesis(data, through_reset):
-    network = TwoBranchSpikes(3, theta=0.7, surrogate=Laplace(float(data["alpha"]), float(data["beta"])), through_reset=through_reset).double()
+    network = TwoBranchSpikes(
+        3,
+        theta=0.7,
+        surrogate=Laplace(float(data["alpha"]), float(data["beta"])),
+        through_reset=through_reset,
+    ).double()
     with torch.no_grad():
         network.weight_on.copy_(torch.from_numpy(data["wp"]))
         network.weight_off.copy_(torch.from_numpy(data["wn"]))
@@ -42,9 +47,11 @@ def test_network_of_the_thesis_equals_the_reference(shared, through_reset, name)
 
 def test_chunks_of_the_network_equal_the_whole(shared):
     data = dict(np.load(shared("refs/srm/z_spike_esim.npz")))
-    network, frames = of_thesis(data, "off"), steps_first(data["I"])
+    network = of_thesis(data, "off")
+    frames = steps_first(data["I"])
     whole, _, _ = network(frames)
-    parts, state = [], None
+    parts = []
+    state = None
     for first, last in ((0, 5), (5, 6), (6, 30), (30, 41)):
         spikes, _, state = network(frames[first:last], state)
         parts.append(spikes)
@@ -65,12 +72,16 @@ def test_smoothing_is_the_alpha_response_of_the_drive_and_its_delay_two_time_con
     assert (potential[:, 0, 1, 1] - truth).abs().max() <= 1e-14
     course = potential[:, 0, 1, 1].detach()
     delay = float((k * course).sum() / course.sum())
-    assert delay == pytest.approx(2 * tau, rel=1e-3)  # mean of t exp(-t/tau) is 2 tau; sampled: tau coth(1/(2 tau)), 8e-4 more
+    assert delay == pytest.approx(
+        2 * tau, rel=1e-3
+    )  # mean of t exp(-t/tau) is 2 tau; sampled: tau coth(1/(2 tau)), 8e-4 more
 
 
 def test_it_forgets_a_slow_ramp_and_wakes_on_silence_are_refused():
     network = TwoBranchSpikes(1)
-    slow = torch.linspace(0, 8, 801)[:, None, None].expand(-1, 4, 4)  # eight thresholds in steps of a hundredth
+    slow = torch.linspace(0, 8, 801)[:, None, None].expand(
+        -1, 4, 4
+    )  # eight thresholds in steps of a hundredth
     with torch.no_grad():
         network.weight_on.fill_(1 / 9)
     assert network(slow)[0].sum() == 0
@@ -84,20 +95,28 @@ def test_a_woken_network_reaches_its_threshold_with_the_share_asked():
     network.wake(frames, share=0.1)
     drive, _ = network._drive(frames, None)
     for branch in (0, 1):
-        assert float((drive[:, branch] >= 0.7 * (1 - 1e-6)).double().mean()) == pytest.approx(0.1, abs=1 / drive[:, branch].numel())
+        assert float((drive[:, branch] >= 0.7 * (1 - 1e-6)).double().mean()) == pytest.approx(
+            0.1, abs=1 / drive[:, branch].numel()
+        )
 
 
 def test_van_rossum_of_a_lone_event_has_its_closed_form():
-    target, found = torch.zeros(4000, 2, 1, 1, dtype=D), torch.zeros(4000, 2, 1, 1, dtype=D)
+    target = torch.zeros(4000, 2, 1, 1, dtype=D)
+    found = torch.zeros(4000, 2, 1, 1, dtype=D)
     found[3, 0] = 1
-    h, dt = 0.1, 2e-3
+    h = 0.1
+    dt = 2e-3
     q = math.exp(-2 * h)
     truth = 0.5 * dt * h**2 * math.e**2 * q * (1 + q) / (1 - q) ** 3  # sum of k^2 q^k
     assert float(van_rossum(found, target, tau_s=dt / h, dt=dt)) == pytest.approx(truth, rel=1e-12)
-    assert truth == pytest.approx(math.e**2 * (dt / h) / 8, rel=1e-2)  # the integral; the sum differs by O(h^2)
+    assert truth == pytest.approx(
+        math.e**2 * (dt / h) / 8, rel=1e-2
+    )  # the integral; the sum differs by O(h^2)
     apart = found.roll(40, 0)  # the overlap of two responses z = 4 tau apart: e^2 tau/4 e^-z (1 + z)
     overlap = math.e**2 * (dt / h) / 4 * math.exp(-4) * (1 + 4)
-    assert float(van_rossum(found, apart, tau_s=dt / h, dt=dt)) == pytest.approx(2 * truth - overlap, rel=1e-2)
+    assert float(van_rossum(found, apart, tau_s=dt / h, dt=dt)) == pytest.approx(
+        2 * truth - overlap, rel=1e-2
+    )
 
 
 def test_count_loss_is_half_the_chi_square_of_blocks():
@@ -111,7 +130,8 @@ def test_count_loss_is_half_the_chi_square_of_blocks():
 
 
 def test_bad_input_is_refused():
-    network, frames = TwoBranchSpikes(1), torch.rand(5, 6, 6)
+    network = TwoBranchSpikes(1)
+    frames = torch.rand(5, 6, 6)
     _, _, state = network(frames)
     for pictures, before, error, words in [
         (frames * math.nan, None, DomainError, "NaN"),

@@ -25,20 +25,26 @@ def test_the_response_to_one_impulse_is_the_alpha_kernel(dtype):
     drive[0] = 1
     response, _ = alpha_response(drive, tau_s=tau, dt=0.5)
     h = torch.arange(4000, dtype=F64)[:, None] * 0.5 / tau
-    # k multiplications by the decay each round once: k eps <= 4000 * 1.1e-16 = 4.4e-13 relative of a value <= 1; float32 rounds the result
+    # k multiplications by the decay each round once: k eps <= 4000 * 1.1e-16 = 4.4e-13 relative of a value <=
+    # 1; float32 rounds the result
     assert (response.to(F64) - h * (1 - h).exp()).abs().max() <= (4e-12 if dtype == F64 else 6e-8)
 
 
-@pytest.mark.parametrize(("kernel", "formula"), [
-    ("slayer", lambda k, h: k * h * math.exp(1 - k * h)),
-    ("thesis", lambda k, h: math.exp(1 - k * h)),
-    ("exp", lambda k, h: math.exp(-(k - 1) * h)),
-    ("step", lambda k, h: 1.0),
-])
+@pytest.mark.parametrize(
+    ("kernel", "formula"),
+    [
+        ("slayer", lambda k, h: k * h * math.exp(1 - k * h)),
+        ("thesis", lambda k, h: math.exp(1 - k * h)),
+        ("exp", lambda k, h: math.exp(-(k - 1) * h)),
+        ("step", lambda k, h: 1.0),
+    ],
+)
 def test_one_spike_leaves_the_reset_kernel(kernel, formula):
     drive = torch.zeros(30, 2, dtype=F64)
     drive[3] = 5.0
-    spikes, potential, _ = srm(drive, theta=torch.tensor([0.5, 2.0]), tau_r=3.0, dt=0.5, kernel=kernel, reset_scale=1.5)
+    spikes, potential, _ = srm(
+        drive, theta=torch.tensor([0.5, 2.0]), tau_r=3.0, dt=0.5, kernel=kernel, reset_scale=1.5
+    )
     assert spikes.sum(0).tolist() == [1, 1]
     for pixel, theta in enumerate((0.5, 2.0)):
         truth = [-1.5 * theta * formula(t - 3, 0.5 / 3) for t in range(4, 30)]
@@ -49,35 +55,71 @@ def test_one_spike_leaves_the_reset_kernel(kernel, formula):
 @pytest.mark.parametrize("response", ["none", "alpha", "step"])
 def test_recursion_equals_the_finite_kernels_step_by_step_when_nothing_is_cut(kernel, response):
     drive = noise(60, 2, 3) - 0.35
-    settings = {"theta": 0.8, "tau_s": 4.0, "tau_r": 2.0, "kernel": kernel, "response": response, "coupled": True, "through_reset": "bounded"}
-    found, truth = [], []
+    settings = {
+        "theta": 0.8,
+        "tau_s": 4.0,
+        "tau_r": 2.0,
+        "kernel": kernel,
+        "response": response,
+        "coupled": True,
+        "through_reset": "bounded",
+    }
+    found = []
+    truth = []
     for place, cut in ((found, None), (truth, 1e-300)):
-        inputs = [drive.clone().requires_grad_(), *(torch.tensor(v, dtype=F64, requires_grad=True) for v in (0.8, 4.0, 2.0))]
+        inputs = [
+            drive.clone().requires_grad_(),
+            *(torch.tensor(v, dtype=F64, requires_grad=True) for v in (0.8, 4.0, 2.0)),
+        ]
         settings.update(theta=inputs[1], tau_s=inputs[2], tau_r=inputs[3])
         spikes, potential, _ = srm(inputs[0], truncation=cut, **settings)
         loss = (spikes * noise(60, 2, 3, seed=1)).sum() + (potential * noise(60, 2, 3, seed=2)).sum()
-        place += [spikes, potential, *torch.autograd.grad(loss, inputs, allow_unused=True, materialize_grads=True)]
+        place += [
+            spikes,
+            potential,
+            *torch.autograd.grad(loss, inputs, allow_unused=True, materialize_grads=True),
+        ]
     assert torch.equal(found[0], truth[0])
     for a, b in zip(found[1:], truth[1:], strict=True):
-        assert (a - b).abs().max() <= 1e-11 * (1 + b.abs().max())  # 60 steps of rounding, two orders of operations
+        assert (a - b).abs().max() <= 1e-11 * (
+            1 + b.abs().max()
+        )  # 60 steps of rounding, two orders of operations
 
 
-@pytest.mark.parametrize(("surrogate", "kernel", "response", "coupled"), [
-    (Laplace(1.5, 0.9), "slayer", "alpha", False),
-    (Laplace(1.5, 0.9), "thesis", "none", True),
-    (FastSigmoid(1.5, 0.9), "exp", "alpha", True),
-    (Triangular(1.5, 0.2), "step", "step", True),
-])
+@pytest.mark.parametrize(
+    ("surrogate", "kernel", "response", "coupled"),
+    [
+        (Laplace(1.5, 0.9), "slayer", "alpha", False),
+        (Laplace(1.5, 0.9), "thesis", "none", True),
+        (FastSigmoid(1.5, 0.9), "exp", "alpha", True),
+        (Triangular(1.5, 0.2), "step", "step", True),
+    ],
+)
 @pytest.mark.filterwarnings("ignore:max rho:RuntimeWarning")
 def test_the_smooth_twin_passes_gradcheck_in_every_input(surrogate, kernel, response, coupled):
     drive = noise(7, 2, 2).requires_grad_()
-    theta, tau_s, tau_r = ((v + noise(2, 1, seed=s)).requires_grad_() for v, s in ((0.5, 1), (3.0, 2), (1.5, 3)))
+    theta, tau_s, tau_r = (
+        (v + noise(2, 1, seed=s)).requires_grad_() for v, s in ((0.5, 1), (3.0, 2), (1.5, 3))
+    )
     counts = {"alpha": 2, "step": 1, "none": 0}[response], {"slayer": 2}.get(kernel, 1)
     start = [noise(count, 2, 2, seed=5).requires_grad_() for count in counts]
 
     def layer(drive, theta, tau_s, tau_r, *states):
-        spikes, potential, state = srm(drive, theta=theta, tau_s=tau_s, tau_r=tau_r, kernel=kernel, response=response, coupled=coupled, surrogate=surrogate,
-                                       state=SrmState(*states), through_reset="full", smooth=True, segment=3, reset_scale=1.2)
+        spikes, potential, state = srm(
+            drive,
+            theta=theta,
+            tau_s=tau_s,
+            tau_r=tau_r,
+            kernel=kernel,
+            response=response,
+            coupled=coupled,
+            surrogate=surrogate,
+            state=SrmState(*states),
+            through_reset="full",
+            smooth=True,
+            segment=3,
+            reset_scale=1.2,
+        )
         return [x for x in (spikes, potential, state.response, state.reset) if x.numel()]
 
     assert torch.autograd.gradcheck(layer, (drive, theta, tau_s, tau_r, *start))
@@ -89,28 +131,72 @@ def test_the_smooth_twin_passes_gradcheck_in_every_input(surrogate, kernel, resp
 def test_chunks_give_the_whole_bit_for_bit_and_the_same_gradient(cuts, truncation, dtype):
     results = []
     for sizes in ([40], cuts):
-        drive, theta, tau_r = noise(40, 2, 5, dtype=dtype).requires_grad_(), torch.tensor(0.9, requires_grad=True, dtype=F64), torch.tensor(2.0, requires_grad=True, dtype=F64)
-        state, spikes, potential = None, [], []
+        drive = noise(40, 2, 5, dtype=dtype).requires_grad_()
+        theta = torch.tensor(0.9, requires_grad=True, dtype=F64)
+        tau_r = torch.tensor(2.0, requires_grad=True, dtype=F64)
+        state = None
+        spikes = []
+        potential = []
         for part in drive.split(sizes):
-            s, u, state = srm(part, theta=theta, tau_s=3.0, tau_r=tau_r, response="alpha", state=state, coupled=True, through_reset="bounded", surrogate=Laplace(2.0, 1.0),
-                              truncation=truncation)
+            s, u, state = srm(
+                part,
+                theta=theta,
+                tau_s=3.0,
+                tau_r=tau_r,
+                response="alpha",
+                state=state,
+                coupled=True,
+                through_reset="bounded",
+                surrogate=Laplace(2.0, 1.0),
+                truncation=truncation,
+            )
             spikes.append(s)
             potential.append(u)
-        spikes, potential = torch.cat(spikes), torch.cat(potential)
-        results.append((spikes, potential, *torch.autograd.grad((spikes * noise(40, 2, 5, seed=4, dtype=dtype)).sum() + potential.square().sum(), (drive, theta, tau_r))))
+        spikes = torch.cat(spikes)
+        potential = torch.cat(potential)
+        results.append(
+            (
+                spikes,
+                potential,
+                *torch.autograd.grad(
+                    (spikes * noise(40, 2, 5, seed=4, dtype=dtype)).sum() + potential.square().sum(),
+                    (drive, theta, tau_r),
+                ),
+            )
+        )
     assert torch.equal(results[0][0], results[1][0])
     assert torch.equal(results[0][1], results[1][1])
     for whole, parts in zip(results[0][2:], results[1][2:], strict=True):
-        # the same sums; float32 rounds the drive's gradient alone, but torch adds up finite kernels in float32
-        assert (whole - parts).abs().max() <= (1e-13 if dtype == F64 else 1e-6 if truncation is None else 1e-4) * (1 + whole.abs().max())
+        # the same sums; float32 rounds the drive's gradient alone, but torch adds up finite kernels in
+        # float32
+        assert (whole - parts).abs().max() <= (
+            1e-13 if dtype == F64 else 1e-6 if truncation is None else 1e-4
+        ) * (1 + whole.abs().max())
 
 
 def test_segments_change_no_gradient():
     found = []
     for segment in (None, 1, 7, 100):
-        inputs = [noise(50, 2, 3).requires_grad_(), *(torch.tensor(v, dtype=F64, requires_grad=True) for v in (0.9, 4.0, 2.0))]
-        spikes, potential, state = srm(inputs[0], theta=inputs[1], tau_s=inputs[2], tau_r=inputs[3], response="alpha", through_reset="bounded", coupled=True, segment=segment)
-        loss = (spikes * noise(50, 2, 3, seed=1)).sum() + potential.square().sum() + state.response.sum() + state.reset.square().sum()
+        inputs = [
+            noise(50, 2, 3).requires_grad_(),
+            *(torch.tensor(v, dtype=F64, requires_grad=True) for v in (0.9, 4.0, 2.0)),
+        ]
+        spikes, potential, state = srm(
+            inputs[0],
+            theta=inputs[1],
+            tau_s=inputs[2],
+            tau_r=inputs[3],
+            response="alpha",
+            through_reset="bounded",
+            coupled=True,
+            segment=segment,
+        )
+        loss = (
+            (spikes * noise(50, 2, 3, seed=1)).sum()
+            + potential.square().sum()
+            + state.response.sum()
+            + state.reset.square().sum()
+        )
         found.append([spikes, *torch.autograd.grad(loss, inputs)])
     for other in found[1:]:
         assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
@@ -122,7 +208,8 @@ def test_float32_spikes_equal_float64_over_1e5_steps():
         settings = {"theta": 0.7, "tau_s": tau_s, "tau_r": 5.0, "kernel": kernel, "response": "alpha"}
         single, potential, _ = srm(drive, **settings)
         truth, exact, _ = srm(drive.double(), **settings)
-        # the recursion runs in float64 for both, so not one spike differs; the potential is rounded once, to 2^-24
+        # the recursion runs in float64 for both, so not one spike differs; the potential is rounded once, to
+        # 2^-24
         assert torch.equal(single.double(), truth)
         assert bool(((potential.double() - exact).abs() <= exact.abs() * 2**-24 + 1e-40).all())
         assert 0.01 < float(truth.mean()) < 0.99
@@ -130,8 +217,14 @@ def test_float32_spikes_equal_float64_over_1e5_steps():
 
 def test_gradient_through_the_reset_explodes_in_full_and_not_when_bounded():
     drive = torch.full((200, 1), 1.0, dtype=F64, requires_grad=True)
-    settings = {"theta": 1.0, "tau_r": 2.0, "reset_scale": 4.0, "surrogate": Laplace(0.7, 0.001)}  # rho hardly below 1 / 0.7 anywhere
-    # then the adjoint grows backwards by z with (1 - w)^2 = -c w, w = exp(-1/2) / z, c = 4 e / 2 / 0.7: z = 3.4 per step
+    settings = {
+        "theta": 1.0,
+        "tau_r": 2.0,
+        "reset_scale": 4.0,
+        "surrogate": Laplace(0.7, 0.001),
+    }  # rho hardly below 1 / 0.7 anywhere
+    # then the adjoint grows backwards by z with (1 - w)^2 = -c w, w = exp(-1/2) / z, c = 4 e / 2 / 0.7: z =
+    # 3.4 per step
     with pytest.warns(RuntimeWarning, match="not below 1"):
         full = srm(drive, through_reset="full", **settings)[0]
     bounded = srm(drive, through_reset="bounded", **settings)[0]
@@ -155,7 +248,11 @@ def test_a_tie_spikes():
     below = torch.nextafter(drive, torch.zeros_like(drive))
     settings = {"theta": torch.tensor(0.5), "kernel": "step", "reset_scale": 0.0, "response": "step"}
     assert srm(drive, **settings)[0].flatten().tolist() == [1, 1, 1]
-    assert srm(below, **settings)[0].flatten().tolist() == [0, 1, 1]  # 0.5 - 1 ulp, then 0.75, then a sum that stays
+    assert srm(below, **settings)[0].flatten().tolist() == [
+        0,
+        1,
+        1,
+    ]  # 0.5 - 1 ulp, then 0.75, then a sum that stays
 
 
 def test_step_kernel_follows_the_memory_layer_where_no_step_exceeds_a_threshold():
@@ -163,7 +260,14 @@ def test_step_kernel_follows_the_memory_layer_where_no_step_exceeds_a_threshold(
     steps = torch.randint(-15, 16, (300, 4, 5), generator=torch.Generator().manual_seed(3)).double() / 64
     level = torch.cat([torch.zeros(1, 4, 5, dtype=F64), steps.cumsum(0)])
     truth, _ = memory(level, 0.25, 0.25, log_input=True)
-    spikes, _, _ = srm(torch.stack([steps, -steps], 1), theta=0.25, kernel="step", response="step", reset_scale=1.0, coupled=True)
+    spikes, _, _ = srm(
+        torch.stack([steps, -steps], 1),
+        theta=0.25,
+        kernel="step",
+        response="step",
+        reset_scale=1.0,
+        coupled=True,
+    )
     assert torch.equal(spikes, truth)
 
 
@@ -173,9 +277,14 @@ def test_silent_and_saturating_input_keep_finite_gradients():
     assert not spikes.any()
     assert not potential.any()
     spikes.sum().backward()
-    # at rest rho(-theta) = exp(-1) / (2 theta) everywhere, summed over the alpha kernel's lags that are still to come
+    # at rest rho(-theta) = exp(-1) / (2 theta) everywhere, summed over the alpha kernel's lags that are still
+    # to come
     lags = torch.arange(50, dtype=F64) / 10
-    truth = math.exp(-1) / 2e-3 * torch.stack([(lags[1:50 - t] * (1 - lags[1:50 - t]).exp()).sum() for t in range(50)])
+    truth = (
+        math.exp(-1)
+        / 2e-3
+        * torch.stack([(lags[1 : 50 - t] * (1 - lags[1 : 50 - t]).exp()).sum() for t in range(50)])
+    )
     assert silent.grad is not None
     assert (silent.grad[:, 0].double() - truth).abs().max() <= 1e-6 * truth.max()
     loud = torch.full((50, 1), 1e6, requires_grad=True)
@@ -202,17 +311,21 @@ def test_drive_scale_brings_the_asked_share_to_threshold(response, tau_s):
 @pytest.mark.parametrize("truncation", [None, 0.01])
 def test_non_finite_drive_is_refused_or_taken_as_zero(bad, truncation):
     drive = noise(20, 3, dtype=torch.float32)
-    poisoned, cleaned = drive.clone(), drive.clone()
+    poisoned = drive.clone()
+    cleaned = drive.clone()
     poisoned[4, 1], cleaned[4, 1] = bad, 0
     settings = {"theta": 1.0, "tau_r": 1.0, "tau_s": 3.0, "response": "alpha", "truncation": truncation}
     with pytest.raises(DomainError, match=r"drive: 1 of 60 .*\[4, 1\].*zero"):
         srm(poisoned, **settings)
     poisoned.requires_grad_()
     cleaned.requires_grad_()
-    found, truth = srm(poisoned, nonfinite="zero", **settings), srm(cleaned, **settings)
+    found = srm(poisoned, nonfinite="zero", **settings)
+    truth = srm(cleaned, **settings)
     assert torch.equal(found[0], truth[0])
     assert torch.equal(found[1], truth[1])
-    (found,), (truth,) = (torch.autograd.grad(s[0].sum(), x) for s, x in ((found, poisoned), (truth, cleaned)))
+    (found,), (truth,) = (
+        torch.autograd.grad(s[0].sum(), x) for s, x in ((found, poisoned), (truth, cleaned))
+    )
     assert float(found[4, 1]) == 0
     truth[4, 1] = 0
     assert torch.equal(found, truth)
@@ -223,35 +336,46 @@ def test_an_overflow_is_an_error():
         srm(torch.full((3, 1), 3e38), theta=1.0, kernel="step", response="step")
 
 
-@pytest.mark.parametrize(("change", "error", "words"), [
-    ({"drive": torch.zeros(0, 3)}, ShapeError, "no time step"),
-    ({"drive": torch.zeros(3, 0)}, ShapeError, "no pixel"),
-    ({"drive": torch.zeros(3, 2, dtype=torch.float16)}, DomainError, "float32 or float64"),
-    ({"drive": [1.0]}, DomainError, "tensor"),
-    ({"theta": 0.0}, DomainError, "theta spans"),
-    ({"theta": torch.tensor([1.0, math.nan])}, DomainError, "theta spans"),
-    ({"theta": torch.ones(4)}, ShapeError, "theta has shape"),
-    ({"tau_r": -1.0}, DomainError, "tau_r spans"),
-    ({"tau_r": None}, DomainError, "tau_r is None"),
-    ({"tau_s": None, "response": "alpha"}, DomainError, "tau_s is None"),
-    ({"tau_s": 0.0, "response": "alpha"}, DomainError, "tau_s spans"),
-    ({"dt": 0.0}, DomainError, "dt is"),
-    ({"dt": math.nan}, DomainError, "dt is"),
-    ({"reset_scale": -1.0}, DomainError, "reset_scale"),
-    ({"kernel": "alpha"}, DomainError, "kernel is 'alpha'"),
-    ({"response": "exp"}, DomainError, "response is 'exp'"),
-    ({"through_reset": "on"}, DomainError, "through_reset"),
-    ({"nonfinite": "skip"}, DomainError, "nonfinite"),
-    ({"segment": 0}, DomainError, "segment"),
-    ({"segment": 2, "truncation": 0.01}, DomainError, "segment does not go"),
-    ({"truncation": 0.0}, DomainError, "truncation"),
-    ({"surrogate": "laplace"}, DomainError, "surrogate"),
-    ({"coupled": True, "drive": torch.zeros(3, 3)}, ShapeError, "coupled"),
-    ({"state": torch.zeros(2, 2)}, DomainError, "SrmState"),
-    ({"state": SrmState(torch.zeros(0, 2, dtype=F64), torch.zeros(1, 2, dtype=F64))}, ShapeError, "state.reset"),
-    ({"state": SrmState(torch.zeros(0, 2, dtype=F64), torch.zeros(2, 2))}, ShapeError, "float32"),
-    ({"state": SrmState(torch.zeros(0, 2, dtype=F64), torch.full((2, 2), math.nan, dtype=F64))}, DomainError, "state.reset"),
-])
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        ({"drive": torch.zeros(0, 3)}, ShapeError, "no time step"),
+        ({"drive": torch.zeros(3, 0)}, ShapeError, "no pixel"),
+        ({"drive": torch.zeros(3, 2, dtype=torch.float16)}, DomainError, "float32 or float64"),
+        ({"drive": [1.0]}, DomainError, "tensor"),
+        ({"theta": 0.0}, DomainError, "theta spans"),
+        ({"theta": torch.tensor([1.0, math.nan])}, DomainError, "theta spans"),
+        ({"theta": torch.ones(4)}, ShapeError, "theta has shape"),
+        ({"tau_r": -1.0}, DomainError, "tau_r spans"),
+        ({"tau_r": None}, DomainError, "tau_r is None"),
+        ({"tau_s": None, "response": "alpha"}, DomainError, "tau_s is None"),
+        ({"tau_s": 0.0, "response": "alpha"}, DomainError, "tau_s spans"),
+        ({"dt": 0.0}, DomainError, "dt is"),
+        ({"dt": math.nan}, DomainError, "dt is"),
+        ({"reset_scale": -1.0}, DomainError, "reset_scale"),
+        ({"kernel": "alpha"}, DomainError, "kernel is 'alpha'"),
+        ({"response": "exp"}, DomainError, "response is 'exp'"),
+        ({"through_reset": "on"}, DomainError, "through_reset"),
+        ({"nonfinite": "skip"}, DomainError, "nonfinite"),
+        ({"segment": 0}, DomainError, "segment"),
+        ({"segment": 2, "truncation": 0.01}, DomainError, "segment does not go"),
+        ({"truncation": 0.0}, DomainError, "truncation"),
+        ({"surrogate": "laplace"}, DomainError, "surrogate"),
+        ({"coupled": True, "drive": torch.zeros(3, 3)}, ShapeError, "coupled"),
+        ({"state": torch.zeros(2, 2)}, DomainError, "SrmState"),
+        (
+            {"state": SrmState(torch.zeros(0, 2, dtype=F64), torch.zeros(1, 2, dtype=F64))},
+            ShapeError,
+            "state.reset",
+        ),
+        ({"state": SrmState(torch.zeros(0, 2, dtype=F64), torch.zeros(2, 2))}, ShapeError, "float32"),
+        (
+            {"state": SrmState(torch.zeros(0, 2, dtype=F64), torch.full((2, 2), math.nan, dtype=F64))},
+            DomainError,
+            "state.reset",
+        ),
+    ],
+)
 def test_bad_input_is_refused_with_a_sentence(change, error, words):
     settings = {"drive": torch.zeros(3, 2), "theta": 1.0, "tau_r": 1.0, **change}
     with pytest.raises(error, match=words):
@@ -273,11 +397,15 @@ def test_outputs_own_their_memory():
     for tensor in (spikes, potential, state.reset):
         tensor.fill_(7)
     assert torch.equal(drive, before)
-    assert torch.equal(srm(drive, theta=1.0, tau_r=1.0)[1][0], before[0])  # at rest, the potential of the first step is the drive
+    assert torch.equal(
+        srm(drive, theta=1.0, tau_r=1.0)[1][0], before[0]
+    )  # at rest, the potential of the first step is the drive
 
 
 def test_one_value_alone_and_a_single_pixel():
-    spikes, potential, state = srm(torch.tensor([1.5, 1.5], dtype=F64), theta=1.0, tau_r=1.0, kernel="exp", reset_scale=1.0)
+    spikes, potential, state = srm(
+        torch.tensor([1.5, 1.5], dtype=F64), theta=1.0, tau_r=1.0, kernel="exp", reset_scale=1.0
+    )
     assert spikes.tolist() == [1, 0]
     assert potential.tolist() == [1.5, 0.5]
     assert state.reset.shape == (1,)
@@ -289,7 +417,17 @@ def test_other_numbers_and_lengths_compile_no_new_kernel():
     def step(steps, theta, tau, beta, segment):
         drive = noise(steps, 2, 9, dtype=torch.float32).requires_grad_()
         theta = torch.tensor(theta, requires_grad=True)
-        spikes, _, _ = srm(drive, theta=theta, tau_s=tau, tau_r=tau / 2, dt=theta.item(), response="alpha", through_reset="bounded", surrogate=Laplace(2.0, beta), segment=segment)
+        spikes, _, _ = srm(
+            drive,
+            theta=theta,
+            tau_s=tau,
+            tau_r=tau / 2,
+            dt=theta.item(),
+            response="alpha",
+            through_reset="bounded",
+            surrogate=Laplace(2.0, beta),
+            segment=segment,
+        )
         torch.autograd.grad(spikes.sum(), (drive, theta))
 
     step(12, 1.0, 5.0, 1.0, 5)

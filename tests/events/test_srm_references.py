@@ -1,4 +1,5 @@
-"""The spike response layer against independently computed cases: spikes, potentials, gradients of both conventions, a trained network."""
+"""The spike response layer against independently computed cases: spikes, potentials, gradients of both
+conventions, a trained network."""
 
 import numpy as np
 import pytest
@@ -15,9 +16,17 @@ CASES = ["a_slayer_vimeo", "b_thesis_vimeo", "d_half_ts", "g_silent", "h_saturat
 def read(path):
     """Arrays of a case, time first, and the layer's settings."""
     data = np.load(path)
-    number = {name: float(data[name]) for name in ("theta", "tau_r", "Ts", "scale", "alpha", "beta") if name in data}
-    settings = {"theta": number["theta"], "tau_r": number["tau_r"], "dt": number["Ts"], "kernel": KERNELS[str(data["kind"])],
-                "reset_scale": number["scale"], "surrogate": Laplace(number["alpha"], number["beta"])}
+    number = {
+        name: float(data[name]) for name in ("theta", "tau_r", "Ts", "scale", "alpha", "beta") if name in data
+    }
+    settings = {
+        "theta": number["theta"],
+        "tau_r": number["tau_r"],
+        "dt": number["Ts"],
+        "kernel": KERNELS[str(data["kind"])],
+        "reset_scale": number["scale"],
+        "surrogate": Laplace(number["alpha"], number["beta"]),
+    }
     return data, settings
 
 
@@ -55,9 +64,13 @@ def test_truncated_kernels_and_forgotten_states_give_the_spikes_of_slayer(shared
 @pytest.mark.parametrize("case", CASES)
 def test_alpha_response_of_the_spikes_equals_the_reference(shared, case):
     data, _ = read(shared(f"refs/srm/{case}.npz"))
-    response, state = alpha_response(steps_first(data["spikes"]), tau_s=float(data["tau_s"]), dt=float(data["Ts"]))
+    response, state = alpha_response(
+        steps_first(data["spikes"]), tau_s=float(data["tau_s"]), dt=float(data["Ts"])
+    )
     assert (response - steps_first(data["psp"])).abs().max() <= 1e-12
-    assert (state.response - torch.from_numpy(data["psp_state"])).abs().max() <= 1e-11  # sums of up to 100 spikes
+    assert (
+        state.response - torch.from_numpy(data["psp_state"])
+    ).abs().max() <= 1e-11  # sums of up to 100 spikes
 
 
 @pytest.mark.parametrize("response", ["step", "none"])
@@ -65,7 +78,14 @@ def test_coupled_step_reset_is_the_memorised_reference_model(shared, response):
     data = np.load(shared("refs/srm/l_esim_limit.npz"))
     level = steps_first(data["L"])
     drive = torch.cat([level[:1], level.diff(dim=0)]) if response == "step" else level
-    spikes, _, _ = srm(torch.stack([drive, -drive], 1), theta=float(data["C"]), kernel="step", response=response, reset_scale=1.0, coupled=True)
+    spikes, _, _ = srm(
+        torch.stack([drive, -drive], 1),
+        theta=float(data["C"]),
+        kernel="step",
+        response=response,
+        reset_scale=1.0,
+        coupled=True,
+    )
     truth = torch.stack([steps_first(data["P"]), steps_first(data["N"])], 1)
     assert torch.equal(spikes, truth)  # levels are multiples of 2^-9 and theta of 2^-3: no rounding anywhere
 
@@ -74,7 +94,9 @@ def network(data, settings, through_reset, smooth):
     """Loss, spikes, potential and weight gradients of the two-branch network of the thesis."""
     steps = steps_first(data["I"]).diff(dim=0)  # [T, 3, 6, 6]
     weights = [torch.from_numpy(data[name]).requires_grad_() for name in ("wp", "wn")]
-    drive = torch.cat([torch.conv2d(sign * steps, w[None], padding=1) for sign, w in zip((1, -1), weights, strict=True)], 1)
+    drive = torch.cat(
+        [torch.conv2d(sign * steps, w[None], padding=1) for sign, w in zip((1, -1), weights, strict=True)], 1
+    )
     spikes, potential, _ = srm(drive, through_reset=through_reset, smooth=smooth, **settings)
     difference, _ = alpha_response(spikes - steps_first(data["target"]), tau_s=float(data["tau_s"]))
     loss = difference.square().sum() / 2
@@ -92,7 +114,9 @@ def test_loss_and_weight_gradients_of_the_spiking_network_equal_the_reference(sh
         assert (potential - steps_first(data["u"])).abs().max() <= 1e-12
         assert abs(loss - float(data["loss"])) <= 1e-10
         assert (of_spikes - steps_first(data["grad_s"])).abs().max() <= 1e-11  # values up to 20
-        assert (of_weights - torch.from_numpy(data[name])).abs().max() <= 1e-9  # values up to 340: 3e-12 relative
+        assert (
+            of_weights - torch.from_numpy(data[name])
+        ).abs().max() <= 1e-9  # values up to 340: 3e-12 relative
     loss, _, _, _, of_weights = network(data, settings, "full", smooth=True)
     assert abs(loss - float(data["smooth_loss"])) <= 1e-10
     assert (of_weights - torch.from_numpy(data["smooth_gw"])).abs().max() <= 1e-9

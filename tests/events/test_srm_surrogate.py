@@ -15,7 +15,9 @@ def test_the_density_is_the_derivative_of_the_integral(kind):
     slope = (surrogate.torch_integral(x + step) - surrogate.torch_integral(x - step)) / (2 * step)
     # differences: rounding 1e-16 / 2e-6, curvature beyond 1e-11
     assert (slope - surrogate.torch_density(x)).abs().max() < 1e-9
-    assert float(surrogate.torch_density(torch.zeros(1, dtype=torch.float64))) == pytest.approx(1 / 1.4, rel=1e-15)
+    assert float(surrogate.torch_density(torch.zeros(1, dtype=torch.float64))) == pytest.approx(
+        1 / 1.4, rel=1e-15
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -31,7 +33,16 @@ def test_laplace_is_the_published_formula():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("alpha", "beta", "word"), [(0.0, 1.0, "alpha"), (1.0, -1.0, "beta"), (float("nan"), 1.0, "alpha"), (1.0, float("inf"), "beta"), ("1", 1.0, "alpha")])
+@pytest.mark.parametrize(
+    ("alpha", "beta", "word"),
+    [
+        (0.0, 1.0, "alpha"),
+        (1.0, -1.0, "beta"),
+        (float("nan"), 1.0, "alpha"),
+        (1.0, float("inf"), "beta"),
+        ("1", 1.0, "alpha"),
+    ],
+)
 def test_parameters_are_checked(kind, alpha, beta, word):
     with pytest.raises(DomainError, match=word):
         kind(alpha, beta)

@@ -17,12 +17,15 @@ def test_sorting_against_python():
     t, x, y = (torch.randint(0, 6, (500,), generator=generator) for _ in range(3))
     p = torch.randint(0, 2, (500,), generator=generator) * 2 - 1
     stream = ordered(t + 2**40, x, y, p, 6, 6)
-    found = list(zip(stream.t_us.tolist(), stream.y.tolist(), stream.x.tolist(), stream.p.tolist(), strict=True))
+    found = list(
+        zip(stream.t_us.tolist(), stream.y.tolist(), stream.x.tolist(), stream.p.tolist(), strict=True)
+    )
     assert found == sorted(zip((t + 2**40).tolist(), y.tolist(), x.tolist(), p.tolist(), strict=True))
 
 
 def test_an_event_at_a_frame_time_belongs_to_the_interval_that_ends_there():
-    t_us, zero = torch.tensor([-1, 0, 1, 1000, 1001, 2000, 2001]), torch.zeros(7, dtype=torch.int64)
+    t_us = torch.tensor([-1, 0, 1, 1000, 1001, 2000, 2001])
+    zero = torch.zeros(7, dtype=torch.int64)
     counts = to_counts(ordered(t_us, zero, zero, zero - 1, 1, 1), [0, 0.001, 0.002])
     assert counts[:, :, 0, 0].tolist() == [[0, 3], [0, 2]]
 

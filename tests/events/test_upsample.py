@@ -1,4 +1,5 @@
-"""Upsampling of video against closed forms: moving patterns, occlusion, still scenes, and the events they make."""
+"""Upsampling of video against closed forms: moving patterns, occlusion, still scenes, and the events they
+make."""
 
 import math
 
@@ -12,13 +13,17 @@ from codesign.events.upsampling.upsample import upsample, upsample_stream
 
 def pattern(x, y):
     """Smooth light on the 0-255 scale at any place; periods of 9 to 23 px."""
-    waves = torch.sin(0.7 * x + 0.2 * y) + torch.sin(0.27 * x - 0.31 * y + 1) + torch.sin(0.1 * x + 0.55 * y + 2)
+    waves = (
+        torch.sin(0.7 * x + 0.2 * y) + torch.sin(0.27 * x - 0.31 * y + 1) + torch.sin(0.1 * x + 0.55 * y + 2)
+    )
     return 90 * torch.exp(0.25 * waves)
 
 
 def moving(shifts, height=48, width=64, dtype=torch.float32):
     """[T, H, W] of the pattern moved by each (x, y) of ``shifts``, pixels."""
-    y, x = torch.meshgrid(torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij"
+    )
     return torch.stack([pattern(x - dx, y - dy) for dx, dy in shifts]).to(dtype)
 
 
@@ -31,9 +36,13 @@ def test_a_moving_pattern_is_where_it_should_be_in_between(shift):
     frames = moving([(0, 0), shift])
     made, t_s = upsample(frames, [0.0, 0.01])
     truth = moving([(float(t) / 0.01 * shift[0], float(t) / 0.01 * shift[1]) for t in t_s])
-    # Light of period 9 px and more: the cubic kernel is off by at most 0.5 % of the swing (30) there, and 0.1 px of wrong flow by 0.1 * 2 pi / 9 of it,
+    # Light of period 9 px and more: the cubic kernel is off by at most 0.5 % of the swing (30) there, and 0.1
+    # px of wrong flow by 0.1 * 2 pi / 9 of it,
     # 2; the straight line between the frames, the control, is off by more than ten times that.
-    error, blended = (inner(each - truth).square().mean().sqrt() for each in (made, frames[0] + (t_s[:, None, None] / 0.01).float() * (frames[1] - frames[0])))
+    error, blended = (
+        inner(each - truth).square().mean().sqrt()
+        for each in (made, frames[0] + (t_s[:, None, None] / 0.01).float() * (frames[1] - frames[0]))
+    )
     assert error < 2
     assert blended > 10 * error
     # at least as many steps as pixels of motion, and no more than the 0.1 px of error asks for
@@ -50,7 +59,9 @@ def test_given_frames_and_times_stay_exactly():
     assert torch.equal(made[at], frames)
     assert int(at[2] - at[1]) == 1  # equal frames: nothing between
     steps = t_s.diff()
-    assert torch.allclose(steps[: int(at[1])], steps[0], rtol=1e-4)  # even, to the 0.1 us that seconds since the epoch resolve
+    assert torch.allclose(
+        steps[: int(at[1])], steps[0], rtol=1e-4
+    )  # even, to the 0.1 us that seconds since the epoch resolve
 
 
 def test_a_still_video_stays_bit_for_bit_and_makes_no_event():
@@ -63,29 +74,41 @@ def test_a_still_video_stays_bit_for_bit_and_makes_no_event():
 
 
 def test_light_that_grows_is_shared_evenly_and_kept_within_the_bound():
-    # nothing moves: between the frames intensity is a straight line, by conservation of the weights; ln 2 in steps of at most 0.1 takes ten:
+    # nothing moves: between the frames intensity is a straight line, by conservation of the weights; ln 2 in
+    # steps of at most 0.1 takes ten:
     # the first of n equal steps of intensity is ln(1 + 1/n), 0.095 at n = 10 and 0.105 at 9
     frames = torch.full((2, 24, 32), 100.0)
     frames[1] *= 2
     made, t_s = upsample(frames, [0.0, 1.0], max_log_change=0.1)
     assert len(made) == 11
-    # rounding of the pyramid moves even light by 1e-4 px, and the outermost pixels lose that share of the weight of one frame, of a quarter of 100
-    torch.testing.assert_close(made, (100 + 100 * t_s.float())[:, None, None].expand(-1, 24, 32), rtol=0, atol=0.005)
+    # rounding of the pyramid moves even light by 1e-4 px, and the outermost pixels lose that share of the
+    # weight of one frame, of a quarter of 100
+    torch.testing.assert_close(
+        made, (100 + 100 * t_s.float())[:, None, None].expand(-1, 24, 32), rtol=0, atol=0.005
+    )
     assert float(lin_log(made).diff(dim=0).abs().max()) <= 0.1
 
 
 def test_what_a_moving_square_hides_and_bares_is_background():
-    # a textured square passes 8 px before a still, textured wall; in the middle the strips beside it show wall, that one of the frames still or already shows
-    wall, square = moving([(0, 0)], 64, 96)[0], 2.2 * moving([(5, 11)], 64, 96)[0]
+    # a textured square passes 8 px before a still, textured wall; in the middle the strips beside it show
+    # wall, that one of the frames still or already shows
+    wall = moving([(0, 0)], 64, 96)[0]
+    square = 2.2 * moving([(5, 11)], 64, 96)[0]
     frames = [torch.where(_square(shift), square.roll(shift, 1), wall) for shift in (0, 4, 8)]
     # 8 px and what the flow errs by, in steps of at most 4.5 px: two steps
     made, t_s = upsample(torch.stack((frames[0], frames[2])), [0.0, 1.0], max_displacement_px=4.5)
     assert t_s.tolist() == [0.0, 0.5, 1.0]
     wrong = (made[1] - frames[1]).abs()
     strips = _square(0) ^ _square(8)
-    # blending shows half of each in the strips; one pixel of 16 there may be at a wrongly placed edge (a boundary off by a pixel of 4 + 4 in a row)
+    # blending shows half of each in the strips; one pixel of 16 there may be at a wrongly placed edge (a
+    # boundary off by a pixel of 4 + 4 in a row)
     blended = ((frames[0] + frames[2]) / 2 - frames[1]).abs()
-    print(float(wrong[strips].mean()), float(blended[strips].mean()), float(wrong[~strips].mean()), float(blended[~strips].mean()))
+    print(
+        float(wrong[strips].mean()),
+        float(blended[strips].mean()),
+        float(wrong[~strips].mean()),
+        float(blended[~strips].mean()),
+    )
     assert float(wrong[strips].mean()) < 0.25 * float(blended[strips].mean())
     assert float(wrong[~strips].mean()) < 0.5
 
@@ -98,12 +121,17 @@ def _square(shift):
 
 def test_events_of_the_upsampled_video_are_those_of_the_true_one():
     shifts = [(0.25 * k, 0.1 * k) for k in range(65)]
-    frames, t_s, sensor = moving(shifts), torch.arange(65, dtype=torch.float64) / 1000, SensorModel(0.1, 0.1)
+    frames = moving(shifts)
+    t_s = torch.arange(65, dtype=torch.float64) / 1000
+    sensor = SensorModel(0.1, 0.1)
     truth = simulate(frames, t_s, sensor)
     kept = frames[::16], t_s[::16]
-    found, control = simulate(*upsample(*kept, max_displacement_px=0.5), sensor), simulate(*kept, sensor)
-    # 4.3 px between frames, half of the finest period: a straight line loses what rises and falls within; at 0.5 px a sinusoid of 9 px is cut by
-    # 1 - cos(pi 0.5 / 9) = 1.5 % at its peaks, and borders, 1/8 of the picture, are unknown for up to half of the motion
+    found = simulate(*upsample(*kept, max_displacement_px=0.5), sensor)
+    control = simulate(*kept, sensor)
+    # 4.3 px between frames, half of the finest period: a straight line loses what rises and falls within; at
+    # 0.5 px a sinusoid of 9 px is cut by
+    # 1 - cos(pi 0.5 / 9) = 1.5 % at its peaks, and borders, 1/8 of the picture, are unknown for up to half of
+    # the motion
     assert 0.9 < len(found) / len(truth) < 1.1
     assert len(control) < 0.8 * len(truth)
     for polarity in (-1, 1):
@@ -111,7 +139,8 @@ def test_events_of_the_upsampled_video_are_those_of_the_true_one():
 
 
 def test_the_stream_gives_the_whole_bit_for_bit():
-    frames, times = moving([(0, 0), (2, 1), (5, 1), (5.5, 0)]), [0.0, 0.1, 0.3, 0.4]
+    frames = moving([(0, 0), (2, 1), (5, 1), (5.5, 0)])
+    times = [0.0, 0.1, 0.3, 0.4]
     whole, whole_s = upsample(frames, times, max_displacement_px=0.7)
     pieces = list(upsample_stream(iter(frames), iter(times), max_displacement_px=0.7))
     assert len(pieces) == len(frames)
@@ -124,15 +153,19 @@ def test_gradients_to_the_frames_are_those_of_differences():
     frames = moving([(0, 0), (2.3, 0.8)], 24, 30, torch.float64).requires_grad_()
     weight = torch.rand(3, 24, 30, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     (upsample(frames, [0.0, 1.0], max_displacement_px=1.6)[0][:3] * weight).sum().backward()
-    # for light that is scaled as a whole flow and visibility stay (but for the offset of the dark), and the result is linear in the frames:
+    # for light that is scaled as a whole flow and visibility stay (but for the offset of the dark), and the
+    # result is linear in the frames:
     # the sum of gradient times frames is the weighted sum itself (Euler)
     made = upsample(frames.detach(), [0.0, 1.0], max_displacement_px=1.6)[0][:3]
     assert frames.grad is not None
-    assert float((frames.grad * frames.detach()).sum()) == pytest.approx(float((made * weight).sum()), rel=1e-12)
+    assert float((frames.grad * frames.detach()).sum()) == pytest.approx(
+        float((made * weight).sum()), rel=1e-12
+    )
 
 
 def test_what_cannot_be_is_refused_with_a_sentence():
-    frames, times = moving([(0, 0), (6, 0)]), [0.0, 0.1]
+    frames = moving([(0, 0), (6, 0)])
+    times = [0.0, 0.1]
     for arguments, options, error, words in [
         ((frames[:1], [0.0]), {}, ShapeError, "at least 2"),
         ((frames[0], times), {}, ShapeError, r"\[T, H, W\]|times|t_s"),

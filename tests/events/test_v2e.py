@@ -1,4 +1,5 @@
-"""Timing "v2e" against the recorded events of v2e itself, and the statistics of its noise for both timings."""
+"""Timing "v2e" against the recorded events of v2e itself, and the statistics of its noise for both
+timings."""
 
 import json
 import math
@@ -12,7 +13,17 @@ from codesign.events import SensorModel, SensorState, concatenate, simulate
 
 FIELDS = ("t_us", "x", "y", "p")
 CONFIGURATIONS = ("ideal", "asym", "cut30", "refr3ms", "leak20_det")
-STATISTICS = ("shot5_dn0", "shot5_dn20", "shot5_dn128", "shot5_dn255", "shot5_dn128_sig.03", "leak1", "leak1_jit0_cov0", "leak1_cov.3", "leak1_sig.03")
+STATISTICS = (
+    "shot5_dn0",
+    "shot5_dn20",
+    "shot5_dn128",
+    "shot5_dn255",
+    "shot5_dn128_sig.03",
+    "leak1",
+    "leak1_jit0_cov0",
+    "leak1_cov.3",
+    "leak1_sig.03",
+)
 
 
 def sensor_of(given, timing):
@@ -35,18 +46,24 @@ def sensor_of(given, timing):
 @pytest.mark.parametrize("configuration", CONFIGURATIONS)
 def test_every_event_of_v2e_to_the_microsecond(shared, sequence, configuration):
     file = np.load(shared(f"refs/events/seq_{sequence}.npz"))
-    frames, t_s = torch.from_numpy(file["frames"]), torch.from_numpy(file["t"])
+    frames = torch.from_numpy(file["frames"])
+    t_s = torch.from_numpy(file["t"])
     data = np.load(shared(f"refs/events/v2e_{sequence}_{configuration}.npz"))
-    sensor, state = sensor_of(json.loads(str(data["params"])), "v2e"), SensorState()
+    sensor = sensor_of(json.loads(str(data["params"])), "v2e")
+    state = SensorState()
     events = simulate(frames, t_s, sensor, state=state)
     t_us = np.round(data["t"].astype(np.float64) * 1e6).astype(np.int64)
     rank = np.lexsort((data["p"], data["x"], data["y"], t_us))
-    for mine, theirs in zip((events.t_us, events.x, events.y, events.p), (t_us, data["x"], data["y"], data["p"]), strict=True):
+    for mine, theirs in zip(
+        (events.t_us, events.x, events.y, events.p), (t_us, data["x"], data["y"], data["p"]), strict=True
+    ):
         assert np.array_equal(mine.numpy(), theirs[rank].astype(np.int64))
     assert np.array_equal(state.reference.numpy(), data["base_log_frame"])
     assert np.array_equal(state.level.numpy(), data["lp_log_frame"])
     parts_state = SensorState()
-    parts = concatenate([simulate(frames[a:b], t_s[a:b], sensor, state=parts_state) for a, b in ((0, 2), (2, 3), (3, 120))])
+    parts = concatenate(
+        [simulate(frames[a:b], t_s[a:b], sensor, state=parts_state) for a, b in ((0, 2), (2, 3), (3, 120))]
+    )
     assert all(torch.equal(getattr(parts, name), getattr(events, name)) for name in FIELDS)
 
 
@@ -58,11 +75,14 @@ def test_noise_rates_are_those_of_v2e(shared, timing, case):
     t_s = torch.arange(truth["frames"], dtype=torch.float64) * truth["dt"]
     events = simulate(frames, t_s, sensor_of(truth["params"], timing), torch.Generator().manual_seed(7))
     for polarity, name in ((1, "on"), (-1, "off")):
-        per_pixel = torch.bincount((events.y * 64 + events.x)[events.p == polarity], minlength=4096).double() / float(t_s[-1])
+        per_pixel = torch.bincount(
+            (events.y * 64 + events.x)[events.p == polarity], minlength=4096
+        ).double() / float(t_s[-1])
         # both are samples: their 95 % intervals add as squares; 1.7 of it is passed once in a thousand
         interval = math.hypot(truth[name]["ci95"], 1.96 * float(per_pixel.std()) / 64)
         assert abs(float(per_pixel.mean()) - truth[name]["mean_hz"]) <= 1.7 * interval + 1e-9
-        # standard error of a deviation: at most 2 % here (4096 pixels, tails of the log-normal included), of two samples
+        # standard error of a deviation: at most 2 % here (4096 pixels, tails of the log-normal included), of
+        # two samples
         assert float(per_pixel.std()) == pytest.approx(truth[name]["pix_std"], rel=0.09, abs=1e-9)
 
 
@@ -72,10 +92,16 @@ def test_counts_under_mismatch_are_those_of_v2e(shared, timing, sigma):
     file = np.load(shared("refs/events/seq_grating.npz"))
     truth = json.loads(shared("refs/events/v2e_stats.json").read_text())[f"grating40_counts_sigma{sigma:g}"]
     sensor = SensorModel(theta_sigma=sigma, timing=timing)
-    streams = [simulate(torch.from_numpy(file["frames"][:40]), file["t"][:40], sensor, torch.Generator().manual_seed(seed)) for seed in range(5)]
+    streams = [
+        simulate(
+            torch.from_numpy(file["frames"][:40]), file["t"][:40], sensor, torch.Generator().manual_seed(seed)
+        )
+        for seed in range(5)
+    ]
     for polarity, name in ((1, "on"), (-1, "off")):
         mean = np.mean([int((stream.p == polarity).sum()) for stream in streams])
-        # means of five seeds each: their difference has sd * sqrt(2/5); 3.3 of it is passed once in a thousand
+        # means of five seeds each: their difference has sd * sqrt(2/5); 3.3 of it is passed once in a
+        # thousand
         assert abs(mean - truth[f"{name}_mean"]) <= 3.3 * truth[f"{name}_sd"] * math.sqrt(2 / 5)
 
 
@@ -85,7 +111,9 @@ def test_slots_keep_microseconds_at_epoch_times_and_late():
         for gap_s in (1e-3, 20.0):  # beyond 8 s single precision no longer resolves a microsecond
             t_s = start_s + torch.arange(4, dtype=torch.float64) * gap_s
             events = simulate(frames, t_s, SensorModel(timing="v2e"))
-            truth, steps = [], [2, 2, 4]  # ln 1.6 = 0.47: two of 0.2, back by two, then ln 2.4 = 0.875: four
+            # ln 1.6 = 0.47: two of 0.2, back by two, then ln 2.4 = 0.875: four
+            truth = []
+            steps = [2, 2, 4]
             for k, n in enumerate(steps):
                 truth += [round(start_s * 1e6) + round((k + (i + 1) / n) * gap_s * 1e6) for i in range(n)]
             assert max(abs(a - b) for a, b in zip(events.t_us.tolist(), truth, strict=True)) <= 1

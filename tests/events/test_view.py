@@ -22,7 +22,12 @@ COUNTS = torch.tensor([[[4.0, 0, 2, 0]], [[0, 4, 2, 0]]])  # [2, 1, 4]: four ON,
 
 def test_colours_say_polarity_and_strength():
     assert picture(COUNTS)[0].tolist() == [[255, 0, 0], [0, 0, 255], [191, 128, 191], [255, 255, 255]]
-    assert picture(COUNTS, full_scale=2)[0].tolist() == [[255, 0, 0], [0, 0, 255], [128, 0, 128], [255, 255, 255]]
+    assert picture(COUNTS, full_scale=2)[0].tolist() == [
+        [255, 0, 0],
+        [0, 0, 255],
+        [128, 0, 128],
+        [255, 255, 255],
+    ]
     assert gray_picture(COUNTS)[0].tolist() == [255, 1, 128, 128]
     assert picture(torch.zeros(3, 2, 5, 6)).shape == (3, 5, 6, 3)
 
@@ -45,7 +50,9 @@ def test_rates_are_events_per_second():
 
 
 def test_gif_shows_the_pictures_enlarged_and_even(tmp_path):
-    pictures = picture(torch.stack((COUNTS, COUNTS.flip(0), COUNTS.flip(2))).repeat(1, 1, 3, 1)[..., :3])  # 3 x 3
+    pictures = picture(
+        torch.stack((COUNTS, COUNTS.flip(0), COUNTS.flip(2))).repeat(1, 1, 3, 1)[..., :3]
+    )  # 3 x 3
     write_video(tmp_path / "e.gif", pictures, fps=10)
     back = iio.imread(tmp_path / "e.gif")
     assert back.shape == (3, 258, 258, 3)  # factor 86
@@ -53,9 +60,21 @@ def test_gif_shows_the_pictures_enlarged_and_even(tmp_path):
 
 
 def test_mp4_holds_every_picture_at_its_rate(tmp_path):
-    pictures = torch.full((12, 301, 299), 0, dtype=torch.uint8) + (torch.arange(12, dtype=torch.uint8) * 20)[:, None, None]
+    pictures = (
+        torch.full((12, 301, 299), 0, dtype=torch.uint8)
+        + (torch.arange(12, dtype=torch.uint8) * 20)[:, None, None]
+    )
     write_video(tmp_path / "e.mp4", pictures, fps=30)
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(tmp_path / "e.mp4"), "-f", "rawvideo", "-pix_fmt", "gray", "-"]
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-i",
+        str(tmp_path / "e.mp4"),
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "gray",
+        "-",
+    ]
     done = subprocess.run(command, capture_output=True, check=True)
     assert re.search(rb"h264.*300x302.* 30 fps", done.stderr)
     back = np.frombuffer(done.stdout, np.uint8).reshape(12, 302, 300)
@@ -114,7 +133,8 @@ def test_a_long_strip_is_enlarged_no_further_than_a_screen(tmp_path):
 
 
 def test_the_figure_of_rates_draws_the_rates_in_its_units():
-    middle_s, rate_hz = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64), torch.tensor([[1000.0, 0], [5000, 2500], [0, 10]], dtype=torch.float64)
+    middle_s = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    rate_hz = torch.tensor([[1000.0, 0], [5000, 2500], [0, 10]], dtype=torch.float64)
     axis = rate_figure(middle_s, rate_hz).axes[0]
     on, off = axis.lines
     assert axis.get_xlabel() == "time (ms)"
@@ -149,7 +169,8 @@ def test_the_figure_in_space_and_time_shows_as_many_events_as_it_says():
 
 @pytest.mark.parametrize("count", [30, 130])  # by permutation, and by drawing again
 def test_a_sample_holds_every_event_equally_often(count):
-    generator, hits = torch.Generator().manual_seed(0), torch.zeros(count)
+    generator = torch.Generator().manual_seed(0)
+    hits = torch.zeros(count)
     for _ in range(2000):
         chosen = sample(count, 20, generator)
         assert len(set(chosen.tolist())) == 20

@@ -15,7 +15,9 @@ def random_stream(count, height, width, last_us, seed=0, offset_us=0):
     def draw(high):
         return torch.randint(0, high, (count,), generator=generator)
 
-    return EventStream(draw(last_us + 1).sort().values + offset_us, draw(width), draw(height), draw(2) * 2 - 1, height, width)
+    return EventStream(
+        draw(last_us + 1).sort().values + offset_us, draw(width), draw(height), draw(2) * 2 - 1, height, width
+    )
 
 
 @pytest.mark.parametrize("bins", [1, 2, 5, 9])
@@ -39,10 +41,12 @@ def test_one_event_is_shared_between_the_two_nearest_nodes():
 
 @pytest.mark.parametrize("bins", [1, 2, 4, 7])
 def test_centroid_is_the_mean_time_of_what_a_bin_collects_even_for_uneven_frames(bins):
-    # even rate: each interval holds events in proportion to its length; the weighted mean of their times, by a plain loop
+    # even rate: each interval holds events in proportion to its length; the weighted mean of their times, by
+    # a plain loop
     steps_s = 0.005 + 0.01 * torch.rand(40, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     edges_s = torch.cat((torch.tensor([7.0], dtype=torch.float64), 7 + steps_s.cumsum(0)))
-    mass, moment = [0.0] * bins, [0.0] * bins
+    mass = [0.0] * bins
+    moment = [0.0] * bins
     for k in range(40):
         counts = torch.zeros(40, 2, 1, 1, dtype=torch.float64)
         counts[k, 0] = steps_s[k]
@@ -52,13 +56,21 @@ def test_centroid_is_the_mean_time_of_what_a_bin_collects_even_for_uneven_frames
             mass[b] += float(shared[b])
             moment[b] += float(shared[b]) * middle_s
     found = from_counts(torch.zeros(40, 2, 1, 1), edges_s, bins).centroid_s
-    torch.testing.assert_close(found, torch.tensor([m / w for m, w in zip(moment, mass, strict=True)], dtype=torch.float64), rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        found,
+        torch.tensor([m / w for m, w in zip(moment, mass, strict=True)], dtype=torch.float64),
+        rtol=1e-12,
+        atol=0,
+    )
 
 
 def test_a_rate_linear_in_time_is_read_off_at_the_centroids_exactly():
     times_s = torch.linspace(0, 1, 33, dtype=torch.float64)
     middle_s = (times_s[1:] + times_s[:-1]) / 2
-    flat, slanted = (rate[:, None, None, None].expand(32, 2, 1, 1) for rate in (torch.ones_like(middle_s), 5 + 3 * middle_s))
+    flat, slanted = (
+        rate[:, None, None, None].expand(32, 2, 1, 1)
+        for rate in (torch.ones_like(middle_s), 5 + 3 * middle_s)
+    )
     volume = from_counts(slanted, times_s, 6)
     rate = volume.counts[0, 0, :, 0, 0] / from_counts(flat, times_s, 6).counts[0, 0, :, 0, 0]
     torch.testing.assert_close(rate, 5 + 3 * volume.centroid_s, rtol=1e-13, atol=0)
@@ -75,7 +87,13 @@ def test_stream_events_are_conserved_and_shared_by_time(bins, offset_us):
     stream = random_stream(5000, 3, 4, 100_000, offset_us=offset_us)
     volume = from_stream(stream, offset_us, offset_us + 100_000, bins, dtype=torch.float64)
     truth = torch.zeros(2, bins, 3, 4, dtype=torch.float64)
-    for t, x, y, p in zip((stream.t_us - offset_us).tolist(), stream.x.tolist(), stream.y.tolist(), stream.p.tolist(), strict=True):
+    for t, x, y, p in zip(
+        (stream.t_us - offset_us).tolist(),
+        stream.x.tolist(),
+        stream.y.tolist(),
+        stream.p.tolist(),
+        strict=True,
+    ):
         place = t / 100_000 * (bins - 1)
         low = min(int(place), max(bins - 2, 0))
         truth[int(p < 0), low, y, x] += 1 - (place - low)
@@ -90,7 +108,12 @@ def test_stream_centroids_are_those_of_an_even_rate_and_of_many_short_intervals(
     zero = torch.zeros_like(every_us)
     stream = EventStream(every_us, zero, zero, zero + 1, 1, 1)
     volume = from_stream(stream, 0, 120_000, 4, dtype=torch.float64)
-    torch.testing.assert_close(volume.centroid_s, torch.tensor([0.04 / 3, 0.04, 0.08, 0.12 - 0.04 / 3], dtype=torch.float64), rtol=1e-14, atol=0)
+    torch.testing.assert_close(
+        volume.centroid_s,
+        torch.tensor([0.04 / 3, 0.04, 0.08, 0.12 - 0.04 / 3], dtype=torch.float64),
+        rtol=1e-14,
+        atol=0,
+    )
     fine = from_counts(torch.zeros(1200, 2, 1, 1), torch.linspace(0, 0.12, 1201, dtype=torch.float64), 4)
     # midpoint rule with 400 intervals per node spacing: relative error of the moments about (1/400)^2
     torch.testing.assert_close(fine.centroid_s, volume.centroid_s, rtol=2e-5, atol=0)
@@ -107,7 +130,8 @@ def test_the_window_holds_both_ends_and_nothing_else():
 
 
 def test_bad_input_is_refused_with_a_reason():
-    counts, times_s = torch.ones(4, 2, 3, 3), torch.arange(5)
+    counts = torch.ones(4, 2, 3, 3)
+    times_s = torch.arange(5)
     for bad, time, bins, error, words in [
         (counts[:, :1], times_s, 2, ShapeError, "ON first"),
         (counts[0], times_s, 2, ShapeError, "T-1"),
@@ -134,7 +158,13 @@ def test_spikes_are_events_per_step_and_go_back_exactly():
     stream = random_stream(3000, 3, 4, 99_999, offset_us=offset_us)
     spikes = spikes_from_stream(stream, offset_us, 1000, 100)
     truth = torch.zeros(2, 4, 3, 100)
-    for t, x, y, p in zip((stream.t_us - offset_us).tolist(), stream.x.tolist(), stream.y.tolist(), stream.p.tolist(), strict=True):
+    for t, x, y, p in zip(
+        (stream.t_us - offset_us).tolist(),
+        stream.x.tolist(),
+        stream.y.tolist(),
+        stream.p.tolist(),
+        strict=True,
+    ):
         truth[int(p < 0), x, y, t // 1000] = 1
     assert torch.equal(spikes, truth)
     back = stream_from_spikes(spikes, offset_us, 1000)
@@ -144,7 +174,10 @@ def test_spikes_are_events_per_step_and_go_back_exactly():
     # at a microsecond per step nothing merges but events that are the same
     few = random_stream(50, 3, 4, 999, seed=1)
     again = stream_from_spikes(spikes_from_stream(few, 0, 1, 1000), 0, 1)
-    found, events = (set(zip(*(getattr(each, name).tolist() for name in ("t_us", "x", "y", "p")), strict=True)) for each in (again, few))
+    found, events = (
+        set(zip(*(getattr(each, name).tolist() for name in ("t_us", "x", "y", "p")), strict=True))
+        for each in (again, few)
+    )
     assert len(again) == len(events)
     assert found == events
 
@@ -158,23 +191,38 @@ def test_spikes_outside_the_steps_are_not_asked_for():
 
 
 def test_spikes_of_counts_are_binary_for_whole_and_shares_for_soft_ones():
-    counts = torch.tensor([[0.0, 1.0], [3.0, 0.25]])[:, None, :, None].expand(2, 2, 2, 1)  # [T, 2, H = 2, W = 1]
+    counts = torch.tensor([[0.0, 1.0], [3.0, 0.25]])[:, None, :, None].expand(
+        2, 2, 2, 1
+    )  # [T, 2, H = 2, W = 1]
     spikes = spikes_from_counts(counts)
     assert spikes.shape == (2, 1, 2, 2)
     assert spikes[1, 0].tolist() == [[0, 1], [1, 0.25]]
-    soft = (0.05 + 0.9 * torch.rand(3, 2, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))).requires_grad_()
+    soft = (
+        0.05 + 0.9 * torch.rand(3, 2, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    ).requires_grad_()
     assert torch.autograd.gradcheck(spikes_from_counts, (soft,))
     assert not torch.autograd.grad(spikes_from_counts(soft + 1).sum(), soft)[0].any()
 
 
 def test_bad_spikes_are_refused_with_a_reason():
     stream = random_stream(5, 3, 3, 10)
-    for arguments, words in (((0.5, 1, 1), "t0_us"), ((0, 0, 1), "step_us"), ((0, 1, 0), "steps"), ((0, 1, True), "steps")):
+    for arguments, words in (
+        ((0.5, 1, 1), "t0_us"),
+        ((0, 0, 1), "step_us"),
+        ((0, 1, 0), "steps"),
+        ((0, 1, True), "steps"),
+    ):
         with pytest.raises(DomainError, match=words):
             spikes_from_stream(stream, *arguments)
-    for spikes, error, words in ((torch.zeros(2, 3, 3), ShapeError, "W, H, T"), (torch.full((2, 1, 1, 1), 0.5), DomainError, "other than 0 and 1")):
+    for spikes, error, words in (
+        (torch.zeros(2, 3, 3), ShapeError, "W, H, T"),
+        (torch.full((2, 1, 1, 1), 0.5), DomainError, "other than 0 and 1"),
+    ):
         with pytest.raises(error, match=words):
             stream_from_spikes(spikes, 0, 1)
-    for counts, error, words in ((torch.zeros(3, 1, 2, 2), ShapeError, "ON first"), (-torch.ones(3, 2, 2, 2), DomainError, "0 or more")):
+    for counts, error, words in (
+        (torch.zeros(3, 1, 2, 2), ShapeError, "ON first"),
+        (-torch.ones(3, 2, 2, 2), DomainError, "0 or more"),
+    ):
         with pytest.raises(error, match=words):
             spikes_from_counts(counts)

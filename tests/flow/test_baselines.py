@@ -1,4 +1,5 @@
-"""What both baseline networks promise: any size, empty volumes, exact gradients, a weight budget, the same network from its configuration."""
+"""What both baseline networks promise: any size, empty volumes, exact gradients, a weight budget, the same
+network from its configuration."""
 
 import math
 
@@ -19,11 +20,16 @@ NETWORKS = [FlowNetEvents, SpikeFlowNet]
 
 def as_volume(counts):
     bins = counts.shape[2]
-    return EventVolume(counts, torch.linspace(0, 0.05, bins, dtype=D), torch.full((bins,), 0.05 / bins, dtype=D))
+    return EventVolume(
+        counts, torch.linspace(0, 0.05, bins, dtype=D), torch.full((bins,), 0.05 / bins, dtype=D)
+    )
 
 
 def busy(batch=1, height=32, width=32, seed=0, mean=0.3, bins=BINS):
-    return torch.poisson(torch.full((batch, 2, bins, height, width), mean, dtype=D), generator=torch.Generator().manual_seed(seed))
+    return torch.poisson(
+        torch.full((batch, 2, bins, height, width), mean, dtype=D),
+        generator=torch.Generator().manual_seed(seed),
+    )
 
 
 def small(network, **options):
@@ -33,12 +39,15 @@ def small(network, **options):
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("size", [(37, 53), (16, 16), (5, 90), (1, 1)])
 def test_any_size_is_padded_with_emptiness_and_cropped_back(network, size):
-    # the pixels keep their places: the same events in the corner of a larger empty image, already a multiple of the stride
+    # the pixels keep their places: the same events in the corner of a larger empty image, already a multiple
+    # of the stride
     height, width = size
-    net, counts = small(network), busy(1, height, width)
+    net = small(network)
+    counts = busy(1, height, width)
     large = torch.zeros(1, 2, BINS, height + -height % 16, width + -width % 16, dtype=D)
     large[..., :height, :width] = counts
-    found, truth = net.predictions(as_volume(counts)), net.predictions(as_volume(large))
+    found = net.predictions(as_volume(counts))
+    truth = net.predictions(as_volume(large))
     for a, b in zip(found, truth, strict=True):
         assert a.flow_px.shape == (1, 2, height, width)
         assert torch.equal(a.flow_px, b.flow_px[..., :height, :width])
@@ -46,13 +55,17 @@ def test_any_size_is_padded_with_emptiness_and_cropped_back(network, size):
 
 @pytest.mark.parametrize("network", NETWORKS)
 def test_predictions_are_the_levels_in_full_resolution_pixels(network):
-    net, volume = small(network), as_volume(busy(2, 32, 48))
-    levels, found = net._levels(volume), net.predictions(volume)
+    net = small(network)
+    volume = as_volume(busy(2, 32, 48))
+    levels = net._levels(volume)
+    found = net.predictions(volume)
     shown = presence(volume.counts)
     for factor, level, field in zip((8, 4, 2, 1), levels, found, strict=True):
         assert level.shape == (2, 2, 32 // factor, 48 // factor)
         # a bilinear resampling keeps the mean of a field whose border repeats; the vectors grow with the grid
-        torch.testing.assert_close(field.flow_px.mean((2, 3)), factor * (level * shown).mean((2, 3)), rtol=1e-9, atol=1e-12)
+        torch.testing.assert_close(
+            field.flow_px.mean((2, 3)), factor * (level * shown).mean((2, 3)), rtol=1e-9, atol=1e-12
+        )
     assert torch.equal(found[-1].flow_px, net(volume).flow_px)
     assert found[-1].interval_s == pytest.approx(0.05)
 
@@ -76,7 +89,9 @@ def test_an_empty_sample_has_zero_flow_confidence_and_gradient_and_does_not_touc
     flow = net(as_volume(alone)).flow_px
     (grad_alone,) = torch.autograd.grad(flow.square().sum() + flow.sum(), alone)
     tolerance = 1e-12 if dtype == D else 1e-5  # sums in another order
-    torch.testing.assert_close(flow, field.flow_px[2:], rtol=0, atol=tolerance * float(flow.detach().abs().max()))
+    torch.testing.assert_close(
+        flow, field.flow_px[2:], rtol=0, atol=tolerance * float(flow.detach().abs().max())
+    )
     torch.testing.assert_close(grad_alone, grad[2:], rtol=0, atol=10 * tolerance * float(grad.abs().max()))
 
 
@@ -101,7 +116,8 @@ def case(name):
 
 @pytest.mark.parametrize("name", ["busy", "one event", "saturated", "constant"])
 def test_gradient_of_the_plain_network_against_central_differences(name, generator):
-    net, counts = small(FlowNetEvents), case(name).requires_grad_()
+    net = small(FlowNetEvents)
+    counts = case(name).requires_grad_()
     weight = torch.randn(1, 2, 20, 24, generator=generator, dtype=D)
 
     def loss(counts):
@@ -113,14 +129,16 @@ def test_gradient_of_the_plain_network_against_central_differences(name, generat
         step = 1e-5
         with torch.no_grad():
             truth = float(loss(counts + step * tangent) - loss(counts - step * tangent)) / (2 * step)
-        # error of a central difference: step^2 times the third derivative, here of the order of the first over (a tenth)^2, and rounding 1e-15 / step
+        # error of a central difference: step^2 times the third derivative, here of the order of the first
+        # over (a tenth)^2, and rounding 1e-15 / step
         assert float((found * tangent).sum()) == pytest.approx(truth, rel=1e-6, abs=1e-8)
 
 
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("budget", [300_000, 400_000, 500_000])
 def test_a_weight_budget_is_filled_and_hardly_exceeded(network, budget):
-    # a step of 4 hidden channels adds 2 blocks of 2 layers of 9 x 4 weights to each of the last layer's channels, and their two norms
+    # a step of 4 hidden channels adds 2 blocks of 2 layers of 9 x 4 weights to each of the last layer's
+    # channels, and their two norms
     net = network.with_weights(budget)
     step = 2 * (2 * 9 * 4 * channels(net.config["width"], 8) + 2 * 4)
     assert budget <= count_weights(net) < budget + step
@@ -129,7 +147,8 @@ def test_a_weight_budget_is_filled_and_hardly_exceeded(network, budget):
 
 
 def test_weights_of_the_plain_network_by_hand():
-    w, bins = 16, 8
+    w = 16
+    bins = 8
     encoder = 9 * w * (2 * bins + 1 * 2 * w + 2 * 4 * w + 4 * 8 * w)
     residual = 4 * 9 * (8 * w) ** 2
     decoder = 9 * (16 * w * 4 * w + (8 * w + 2) * 2 * w + (4 * w + 2) * w + (2 * w + 2) * w // 2)
@@ -140,7 +159,8 @@ def test_weights_of_the_plain_network_by_hand():
 
 @pytest.mark.parametrize("network", NETWORKS)
 def test_configuration_and_weights_make_the_same_network(network):
-    net, volume = small(network, seed=3), as_volume(busy())
+    net = small(network, seed=3)
+    volume = as_volume(busy())
     again = network(**net.config).double()
     assert torch.equal(again(volume).flow_px, net(volume).flow_px)  # the seed alone draws the weights
     other = network(**{**net.config, "seed": 4}).double()
@@ -183,15 +203,24 @@ def test_unfit_constructions_are_refused(build, sentence):
 
 @pytest.mark.parametrize("size", [(24, 36), (7, 5), (12, 30)])
 def test_rescaled_flow_of_an_affine_motion(size):
-    # pixel i of n has its centre at (i + 1/2) / n of the image; bilinear interpolation is exact for an affine field where no border is repeated
-    matrix, shift = torch.tensor([[0.3, -0.2], [0.1, 0.4]], dtype=D), torch.tensor([1.5, -2.0], dtype=D)
+    # pixel i of n has its centre at (i + 1/2) / n of the image; bilinear interpolation is exact for an affine
+    # field where no border is repeated
+    matrix = torch.tensor([[0.3, -0.2], [0.1, 0.4]], dtype=D)
+    shift = torch.tensor([1.5, -2.0], dtype=D)
 
     def field(height, width):
-        y, x = torch.meshgrid((torch.arange(height, dtype=D) + 0.5) / height, (torch.arange(width, dtype=D) + 0.5) / width, indexing="ij")
-        of_image = torch.einsum("ij,jhw->ihw", matrix, torch.stack([x, y])) + shift[:, None, None]  # in widths and heights of the image
+        y, x = torch.meshgrid(
+            (torch.arange(height, dtype=D) + 0.5) / height,
+            (torch.arange(width, dtype=D) + 0.5) / width,
+            indexing="ij",
+        )
+        of_image = (
+            torch.einsum("ij,jhw->ihw", matrix, torch.stack([x, y])) + shift[:, None, None]
+        )  # in widths and heights of the image
         return (of_image * torch.tensor([width, height], dtype=D)[:, None, None])[None], x, y
 
-    source, truth = field(12, 10)[0], field(*size)
+    source = field(12, 10)[0]
+    truth = field(*size)
     found, (expected, x, y) = rescale_flow(source, size), truth
     inside = (x > 0.5 / 10) & (x < 1 - 0.5 / 10) & (y > 0.5 / 12) & (y < 1 - 0.5 / 12)
     assert int(inside.sum()) >= 12

@@ -1,4 +1,5 @@
-"""The spiking baseline against its published form, and the cure for each of the troubles that form is known for (docs/flow_baselines.md)."""
+"""The spiking baseline against its published form, and the cure for each of the troubles that form is known
+for (docs/flow_baselines.md)."""
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from codesign.flow.baselines.weights import count_weights
 from codesign.flow.entry import normalise
 from codesign.flow.losses import photometric_loss, smoothness_loss
 from codesign.types import EventStream, EventVolume
-from studies.flow_cost_steps import StepByStep
+from studies.flow_cost.steps import StepByStep
 
 D = torch.float64
 THETA = 0.75
@@ -30,16 +31,24 @@ class Published(Surrogate):
 
 def as_volume(counts):
     bins = counts.shape[2]
-    return EventVolume(counts, torch.linspace(0, 0.05, bins, dtype=D), torch.full((bins,), 0.05 / bins, dtype=D))
+    return EventVolume(
+        counts, torch.linspace(0, 0.05, bins, dtype=D), torch.full((bins,), 0.05 / bins, dtype=D)
+    )
 
 
 def busy(batch=1, size=32, bins=8, mean=0.3, seed=0):
-    return torch.poisson(torch.full((batch, 2, bins, size, size), mean, dtype=D), generator=torch.Generator().manual_seed(seed))
+    return torch.poisson(
+        torch.full((batch, 2, bins, size, size), mean, dtype=D), generator=torch.Generator().manual_seed(seed)
+    )
 
 
 def by_hand(net, halves):
-    """Sums and flows of the published loop: step by step, layer by layer, hard reset, every neck and head on its own; each level adds to the coarser flow."""
-    sums, potential = ([torch.zeros(len(halves), c, 32 >> i, 32 >> i, dtype=D) for i, c in enumerate((8, 16, 32, 64), 1)] for _ in range(2))
+    """Sums and flows of the published loop: step by step, layer by layer, hard reset, every neck and head on
+    its own; each level adds to the coarser flow."""
+    sums, potential = (
+        [torch.zeros(len(halves), c, 32 >> i, 32 >> i, dtype=D) for i, c in enumerate((8, 16, 32, 64), 1)]
+        for _ in range(2)
+    )
     for t in range(halves.shape[4]):
         x = halves[..., t]
         for i, layer in enumerate(net.encoder):
@@ -48,12 +57,17 @@ def by_hand(net, halves):
             u = potential[i] + current
             x = (u >= THETA).to(u)
             potential[i] = u * (1 - x)
-    x, flows = sums[3], []
+    x = sums[3]
+    flows = []
     for first, second in net.residual:
-        x = x + leaky_relu(conv2d(leaky_relu(conv2d(x, first.weight, padding=1), 0.1), second.weight, padding=1), 0.1)
+        x = x + leaky_relu(
+            conv2d(leaky_relu(conv2d(x, first.weight, padding=1), 0.1), second.weight, padding=1), 0.1
+        )
     for level in range(4):
         neck = conv_transpose2d(x, net.necks[level].weight, stride=2, padding=1)
-        coarser = 2 * interpolate(flows[-1], scale_factor=2.0, mode="bilinear") if flows else 0.0  # twice the pixels, twice the vectors
+        coarser = (
+            2 * interpolate(flows[-1], scale_factor=2.0, mode="bilinear") if flows else 0.0
+        )  # twice the pixels, twice the vectors
         flows.append(coarser + conv2d(neck, net.heads[level].weight))
         if level < 3:
             up = leaky_relu(conv_transpose2d(x, net.decoder[level].weight, stride=2, padding=1), 0.1)
@@ -88,7 +102,9 @@ def test_halves_are_on_off_former_latter():
     for half in (0, 1):
         for polarity in (0, 1):
             for step in range(3):
-                assert torch.equal(halves[:, 2 * half + polarity, :, :, step], counts[:, polarity, 3 * half + step])
+                assert torch.equal(
+                    halves[:, 2 * half + polarity, :, :, step], counts[:, polarity, 3 * half + step]
+                )
     assert torch.equal(from_halves(halves), counts)
     with pytest.raises(ShapeError, match="even number of bins"):
         to_halves(counts[:, :, :5])
@@ -103,10 +119,18 @@ def test_spikes_and_their_gradient_by_hand():
     spikes = integrate_and_fire(current, THETA, surrogate)
     assert spikes.tolist() == [0, 1, 0, 0, 1]
     seed = torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0], dtype=D)
-    own = seed * torch.tensor([1 / (2 * THETA * (1 + abs(u - THETA) / THETA) ** 2) for u in (0.5, 1.0, -0.2, 0.5, 0.9)], dtype=D)
-    truth = torch.stack([own[0] + own[1], own[1], own[2:].sum(), own[3:].sum(), own[4]])  # nothing passes the reset after the second step
-    torch.testing.assert_close(torch.autograd.grad(spikes, current, seed, create_graph=True)[0], truth, rtol=1e-14, atol=0)
-    (grad,) = torch.autograd.grad(integrate_and_fire(current, THETA, surrogate), current, seed, create_graph=True)
+    own = seed * torch.tensor(
+        [1 / (2 * THETA * (1 + abs(u - THETA) / THETA) ** 2) for u in (0.5, 1.0, -0.2, 0.5, 0.9)], dtype=D
+    )
+    truth = torch.stack(
+        [own[0] + own[1], own[1], own[2:].sum(), own[3:].sum(), own[4]]
+    )  # nothing passes the reset after the second step
+    torch.testing.assert_close(
+        torch.autograd.grad(spikes, current, seed, create_graph=True)[0], truth, rtol=1e-14, atol=0
+    )
+    (grad,) = torch.autograd.grad(
+        integrate_and_fire(current, THETA, surrogate), current, seed, create_graph=True
+    )
     with pytest.raises(GradientError, match="first derivative of a spike only"):
         torch.autograd.grad(grad.sum(), current)
     with pytest.raises(ShapeError, match="time axis"):
@@ -119,7 +143,8 @@ def test_spikes_and_their_gradient_by_hand():
 
 
 def deep_gradient(surrogate, scale):
-    """Norm of the gradient that reaches the events through all four spiking layers, the sums of the last one being asked for."""
+    """Norm of the gradient that reaches the events through all four spiking layers, the sums of the last one
+    being asked for."""
     net = SpikeFlowNet(bins=8, width=8.0).double()
     net.surrogate = surrogate
     halves = (scale * to_halves(busy(mean=0.6))).requires_grad_()
@@ -134,13 +159,15 @@ def test_a_silent_encoder_receives_gradient():
     soft, _ = deep_gradient(FastSigmoid.unit(THETA), 0.05)
     assert seen == 0.0  # no spike in the layers before
     assert hard == 0.0
-    # at rest the density is 1 / (8 theta), an eighth of the published one: at least that share cubed, three layers, of what an encoder in full activity gets
+    # at rest the density is 1 / (8 theta), an eighth of the published one: at least that share cubed, three
+    # layers, of what an encoder in full activity gets
     active, _ = deep_gradient(Published(THETA, 1.0), 1.0)
     assert soft >= active / 8**3
 
 
 def test_gradient_norms_stay_within_bounds_over_contrast():
-    # the density lies between 1/(8 theta) at rest and 1/(2 theta) at threshold and falls slowly beyond; the published one jumps between 0 and 1/theta
+    # the density lies between 1/(8 theta) at rest and 1/(2 theta) at threshold and falls slowly beyond; the
+    # published one jumps between 0 and 1/theta
     scales = (0.02, 0.1, 0.3, 1.0, 3.0)
     hard = [deep_gradient(Published(THETA, 1.0), s)[0] for s in scales]
     soft = [deep_gradient(FastSigmoid.unit(THETA), s)[0] for s in scales]
@@ -161,10 +188,19 @@ def test_the_gradient_passes_the_threshold_continuously():
 
 
 def test_an_event_that_crosses_a_bin_border_changes_the_input_continuously():
-    # 8 nodes over 7 ms: a microsecond moves a thousandth of an event from one bin to the next, so the input changes by 2/1000, also from half to half
+    # 8 nodes over 7 ms: a microsecond moves a thousandth of an event from one bin to the next, so the input
+    # changes by 2/1000, also from half to half
     def halves(t_us):
         column = torch.tensor([t_us])
-        return to_halves(from_stream(EventStream(column, torch.tensor([3]), torch.tensor([2]), torch.tensor([1]), 6, 5), 0, 7000, 8, dtype=D).counts)
+        return to_halves(
+            from_stream(
+                EventStream(column, torch.tensor([3]), torch.tensor([2]), torch.tensor([1]), 6, 5),
+                0,
+                7000,
+                8,
+                dtype=D,
+            ).counts
+        )
 
     for border in (500, 999, 1000, 3000, 3499, 3500, 4000, 6999):
         change = (halves(border + 1) - halves(border)).abs().sum()
@@ -180,17 +216,23 @@ def test_an_event_that_crosses_a_bin_border_changes_the_input_continuously():
 
 @pytest.mark.parametrize("factor", [0.5, 3.0, 20.0])
 def test_the_input_does_not_depend_on_the_threshold_that_made_the_counts(factor):
-    # usual count (sum c^2 + 1) / (sum c + 1): a factor k on all counts cancels but for the added event, 1 part in k sum c or so
+    # usual count (sum c^2 + 1) / (sum c + 1): a factor k on all counts cancels but for the added event, 1
+    # part in k sum c or so
     counts = busy(mean=0.6)
-    plain, scaled = normalise(counts), normalise(factor * counts)
-    n, n2 = float(counts.sum()), float(counts.square().sum())
+    plain = normalise(counts)
+    scaled = normalise(factor * counts)
+    n = float(counts.sum())
+    n2 = float(counts.square().sum())
     expected = factor * ((n2 + 1) / (n + 1)) / ((factor**2 * n2 + 1) / (factor * n + 1))
     torch.testing.assert_close(scaled, plain * expected, rtol=1e-12, atol=0)
     assert abs(expected - 1) <= 2 / (min(factor, 1.0) * n)
     net = SpikeFlowNet(bins=8, width=8.0).double()
     with torch.no_grad():
-        first, second = net(as_volume(counts)).flow_px, net(as_volume(factor * counts)).flow_px
-    assert float((first - second).norm()) <= 0.05 * float(first.norm())  # few neurons lie within that part of their threshold
+        first = net(as_volume(counts)).flow_px
+        second = net(as_volume(factor * counts)).flow_px
+    assert float((first - second).norm()) <= 0.05 * float(
+        first.norm()
+    )  # few neurons lie within that part of their threshold
 
 
 # trouble (d): sparse samples
@@ -212,30 +254,41 @@ def test_no_sample_is_skipped_for_having_few_events():
     alone = [gradient([k]) for k in range(4)]
     assert not alone[1].any()
     assert all(bool(alone[k].any()) for k in (0, 2, 3))
-    torch.testing.assert_close(gradient([0, 1, 2, 3]), sum(alone[1:], alone[0]), rtol=1e-9, atol=1e-9)  # every sample counts, in full
+    torch.testing.assert_close(
+        gradient([0, 1, 2, 3]), sum(alone[1:], alone[0]), rtol=1e-9, atol=1e-9
+    )  # every sample counts, in full
 
 
 def test_the_step_by_step_form_of_the_cost_study_gives_the_same_flow():
-    fast, slow = SpikeFlowNet(bins=8, width=8.0).double(), StepByStep(bins=8, width=8.0).double()
+    fast = SpikeFlowNet(bins=8, width=8.0).double()
+    slow = StepByStep(bins=8, width=8.0).double()
     volume = as_volume(busy(2, mean=0.6))
     with torch.no_grad():
         torch.testing.assert_close(slow(volume).flow_px, fast(volume).flow_px, rtol=1e-10, atol=1e-10)
 
 
 def test_the_published_loss_reaches_the_decoder_with_its_true_gradient(generator):
-    # photometric plus ten times smoothness at every scale; spikes do not depend on the decoder, so its gradient is exact and differences of the loss must show it
-    net, volume = SpikeFlowNet(bins=8, width=8.0).double(), as_volume(busy(mean=0.6))
+    # photometric plus ten times smoothness at every scale; spikes do not depend on the decoder, so its
+    # gradient is exact and differences of the loss must show it
+    net = SpikeFlowNet(bins=8, width=8.0).double()
+    volume = as_volume(busy(mean=0.6))
     frames = 255 * torch.rand(1, 2, 32, 32, generator=generator, dtype=D)
-    smooth = torch.nn.functional.avg_pool2d(frames, 5, 1, 2)  # a bilinear reading has kinks; a gentle picture has gentle ones
+    smooth = torch.nn.functional.avg_pool2d(
+        frames, 5, 1, 2
+    )  # a bilinear reading has kinks; a gentle picture has gentle ones
     weights = [weight for name, weight in net.named_parameters() if name.startswith(("necks", "heads"))]
 
     def loss():
         fields = net.predictions(volume)
-        return sum((photometric_loss(smooth, f.flow_px) + 10 * smoothness_loss(f.flow_px) for f in fields), torch.zeros((), dtype=D))
+        return sum(
+            (photometric_loss(smooth, f.flow_px) + 10 * smoothness_loss(f.flow_px) for f in fields),
+            torch.zeros((), dtype=D),
+        )
 
     found = torch.autograd.grad(loss(), weights)
     tangents = [torch.randn(w.shape, generator=generator, dtype=D) * w.detach().std() for w in weights]
-    values, step = [], 1e-7
+    values = []
+    step = 1e-7
     with torch.no_grad():
         for sign in (1, -2):
             for weight, tangent in zip(weights, tangents, strict=True):
@@ -243,12 +296,15 @@ def test_the_published_loss_reaches_the_decoder_with_its_true_gradient(generator
             values.append(float(loss()))
     truth = (values[0] - values[1]) / (2 * step)
     # rounding 1e-15 / step, and a kink crossed by one reading in ten thousand
-    assert float(sum((g * t).sum() for g, t in zip(found, tangents, strict=True))) == pytest.approx(truth, rel=1e-4)
+    assert float(sum((g * t).sum() for g, t in zip(found, tangents, strict=True))) == pytest.approx(
+        truth, rel=1e-4
+    )
 
 
 def test_mixed_precision_makes_no_neuron_fire_that_did_not():
     # the decoder alone rounds to bfloat16, 2^-9 relative in each of its seven layers
-    net, volume = SpikeFlowNet(bins=8, width=8.0), as_volume(busy(mean=0.6).float())
+    net = SpikeFlowNet(bins=8, width=8.0)
+    volume = as_volume(busy(mean=0.6).float())
     with torch.no_grad():
         exact = net(volume).flow_px
         with torch.autocast("cpu", dtype=torch.bfloat16):

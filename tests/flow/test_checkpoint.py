@@ -1,4 +1,5 @@
-"""Network files: every bit comes back, equal networks are equal files, and each kind of damage is one clear error."""
+"""Network files: every bit comes back, equal networks are equal files, and each kind of damage is one clear
+error."""
 
 import json
 import sys
@@ -52,7 +53,9 @@ def test_every_bit_comes_back(tmp_path):
     own = network.state_dict()
     for name, tensor in back.state_dict().items():
         assert tensor.dtype == own[name].dtype
-        assert tensor.reshape(-1).view(torch.uint8).tolist() == own[name].reshape(-1).view(torch.uint8).tolist()
+        assert (
+            tensor.reshape(-1).view(torch.uint8).tolist() == own[name].reshape(-1).view(torch.uint8).tolist()
+        )
     assert checkpoint.read(tmp_path / "a.safetensors").metadata == {"seed": 3, "loss": 0.1 + 0.2, "note": "π"}
 
 
@@ -83,7 +86,9 @@ def test_a_file_cut_anywhere_is_refused(path, tmp_path):
 def test_no_changed_byte_goes_unseen(path, tmp_path):
     whole = path.read_bytes()
     for place in range(0, len(whole), 37):  # header and tensors alike
-        (tmp_path / "bad.safetensors").write_bytes(whole[:place] + bytes([whole[place] ^ 0x10]) + whole[place + 1 :])
+        (tmp_path / "bad.safetensors").write_bytes(
+            whole[:place] + bytes([whole[place] ^ 0x10]) + whole[place + 1 :]
+        )
         with pytest.raises(FileFormatError):
             checkpoint.load(tmp_path / "bad.safetensors")
 
@@ -100,7 +105,13 @@ def test_pickles_are_never_opened(tmp_path):
 def rewritten(path, **changes):
     """The file with another content, its checksum right."""
     stored = checkpoint.read(path)
-    content = {"kind": "network", "network": stored.network, "config": stored.config, "metadata": {}, **{k: v for k, v in changes.items() if k != "weights"}}
+    content = {
+        "kind": "network",
+        "network": stored.network,
+        "config": stored.config,
+        "metadata": {},
+        **{k: v for k, v in changes.items() if k != "weights"},
+    }
     checkpoint.write_tensors(path, changes.get("weights", stored.weights), content)
     return path
 

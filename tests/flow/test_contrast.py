@@ -1,4 +1,5 @@
-"""Images of warped events against moves worked out by hand, closed forms of affine maps, and finite differences."""
+"""Images of warped events against moves worked out by hand, closed forms of affine maps, and finite
+differences."""
 
 import math
 
@@ -14,9 +15,12 @@ D = torch.float64
 
 
 def window(counts):
-    """EventVolume of counts [B, 2, bins, H, W] whose bins lie at evenly spaced times from 0 to 1 of a window of 0.2 s."""
+    """EventVolume of counts [B, 2, bins, H, W] whose bins lie at evenly spaced times from 0 to 1 of a window
+    of 0.2 s."""
     bins = counts.shape[2]
-    return EventVolume(counts, torch.linspace(0, 0.2, bins, dtype=D), torch.full((bins,), 0.2 / bins, dtype=D))
+    return EventVolume(
+        counts, torch.linspace(0, 0.2, bins, dtype=D), torch.full((bins,), 0.2 / bins, dtype=D)
+    )
 
 
 def uniform(u, v, height, width):
@@ -61,19 +65,25 @@ def test_shares_of_an_event_between_pixels_and_what_leaves():
 
 
 def test_a_stream_uses_exact_time_stamps_and_both_ends_of_the_interval():
-    # an edge that passes one pixel per millisecond; the event before and the one after are not of the interval
+    # an edge that passes one pixel per millisecond; the event before and the one after are not of the
+    # interval
     t_us = torch.tensor([4999, 5000, 6000, 7000, 8000, 8001])
-    stream = ordered(t_us, torch.tensor([0, 2, 3, 4, 5, 0]), torch.full((6,), 1), torch.tensor([1, 1, -1, 1, 1, 1]), 3, 8)
+    stream = ordered(
+        t_us, torch.tensor([0, 2, 3, 4, 5, 0]), torch.full((6,), 1), torch.tensor([1, 1, -1, 1, 1, 1]), 3, 8
+    )
     tracks = contrast.stream_tracks(stream, uniform(3.0, 0.0, 3, 8), 5000, 8000)
     image = contrast.count_image(tracks, 1.0)[0]
     assert image[:, 1, 5].tolist() == pytest.approx([3, 1])
     assert float(image.sum()) == pytest.approx(4)
-    assert contrast.time_image(tracks, 0.0)[0, :, 1, 2].tolist() == pytest.approx([(0 + 2 / 3 + 1) / 3, 1 / 3])
+    assert contrast.time_image(tracks, 0.0)[0, :, 1, 2].tolist() == pytest.approx(
+        [(0 + 2 / 3 + 1) / 3, 1 / 3]
+    )
 
 
 @pytest.mark.parametrize("zoom", [0.2, -0.2])
 def test_tracks_are_carried_back_to_the_pixel_they_start_from(zoom):
-    # flow zoom x0 of the start: at time tau the point is at x = x0 (1 + tau zoom), so its flow is zoom x / (1 + tau zoom); k steps give the
+    # flow zoom x0 of the start: at time tau the point is at x = x0 (1 + tau zoom), so its flow is zoom x / (1
+    # + tau zoom); k steps give the
     # geometric series to order k, whose next term is zoom x (tau zoom)^(k + 1)
     height = width = 17
     y, x = torch.meshgrid(*[torch.arange(17, dtype=D) - 8] * 2, indexing="ij")
@@ -81,7 +91,9 @@ def test_tracks_are_carried_back_to_the_pixel_they_start_from(zoom):
     volume = window(torch.ones(1, 2, 3, height, width, dtype=D))
     inside = slice(3, 14)
     for steps in (0, 1, 2, 3):
-        found = contrast.volume_tracks(volume, flow, steps).flow_px.unflatten(2, (3, height, width))[0, :, :, inside, inside]
+        found = contrast.volume_tracks(volume, flow, steps).flow_px.unflatten(2, (3, height, width))[
+            0, :, :, inside, inside
+        ]
         for k, tau in enumerate((0.0, 0.5, 1.0)):
             exact = (flow[0] / (1 + tau * zoom))[:, inside, inside]
             left = (exact * (-tau * zoom) ** (steps + 1)).abs().max()
@@ -98,13 +110,17 @@ def test_the_smooth_spread_is_alike_wherever_an_event_falls():
         assert float(image.sum()) == pytest.approx(1)
         for shares, centre in ((image.sum(0), 4 + u), (image.sum(1), 4 + v)):
             assert float((shares * place).sum()) == pytest.approx(centre)
-            assert float((shares * (place - centre) ** 2).sum()) == pytest.approx(0.25)  # of the quadratic B-spline, at every offset
+            assert float((shares * (place - centre) ** 2).sum()) == pytest.approx(
+                0.25
+            )  # of the quadratic B-spline, at every offset
 
 
 def test_still_image_is_the_smooth_image_at_zero_flow(generator):
     volume = window(torch.rand(2, 2, 3, 5, 7, generator=generator, dtype=D))
     tracks = contrast.volume_tracks(volume, torch.zeros(2, 2, 5, 7, dtype=D))
-    torch.testing.assert_close(contrast.still_image(volume.counts), contrast.smooth_image(tracks, 0.3), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        contrast.still_image(volume.counts), contrast.smooth_image(tracks, 0.3), rtol=0, atol=1e-12
+    )
 
 
 def test_area_change_of_an_affine_flow_is_its_determinant():
@@ -120,41 +136,57 @@ def test_area_change_of_an_affine_flow_is_its_determinant():
 
 
 def test_weighted_by_area_a_contracted_image_is_as_sharp_as_before():
-    # a Gaussian of variance 16 px^2 shrunk by 0.7: mean square slope goes as (mass / variance)^2. The spread adds 1/4 px^2 before and after
-    size, shrink = 49, 0.7
+    # a Gaussian of variance 16 px^2 shrunk by 0.7: mean square slope goes as (mass / variance)^2. The spread
+    # adds 1/4 px^2 before and after
+    size = 49
+    shrink = 0.7
     y, x = torch.meshgrid(*[torch.arange(size, dtype=D) - 24] * 2, indexing="ij")
     counts = torch.exp(-(x**2 + y**2) / 32).expand(1, 2, 1, size, size)
     volume = EventVolume(counts, torch.ones(1, dtype=D), torch.ones(1, dtype=D))  # seen at the end
     tracks = contrast.volume_tracks(volume, (1 - shrink) * torch.stack([x, y])[None])
     still = float(contrast.sharpness(contrast.still_image(counts)))
     weight = contrast.area_change(contrast.warp_jacobian(tracks, 1, 0.0)).flatten(1)
-    guarded, plain = (float(contrast.sharpness(contrast.smooth_image(tracks, 0.0, w))) / still for w in (weight, None))
+    guarded, plain = (
+        float(contrast.sharpness(contrast.smooth_image(tracks, 0.0, w))) / still for w in (weight, None)
+    )
     gain = (16.25 / (0.49 * 16 + 0.25)) ** 2
-    # differences of neighbours lose k^2 / 12 of a wave k, 1 / (8 variance) of a Gaussian's energy: 0.8 % before and 1.5 % after
+    # differences of neighbours lose k^2 / 12 of a wave k, 1 / (8 variance) of a Gaussian's energy: 0.8 %
+    # before and 1.5 % after
     assert plain == pytest.approx(gain, rel=0.01)
     assert guarded == pytest.approx(gain * 0.49**2, rel=0.01)
     assert guarded < 1 < plain / 3
 
 
 def check_gradients(function, *inputs):
-    assert torch.autograd.gradcheck(function, [value.clone().requires_grad_() for value in inputs], eps=1e-6, atol=1e-7, rtol=1e-5)
+    assert torch.autograd.gradcheck(
+        function, [value.clone().requires_grad_() for value in inputs], eps=1e-6, atol=1e-7, rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize("carry_steps", [0, 1])
-@pytest.mark.parametrize("image", [contrast.count_image, contrast.time_image, contrast.smooth_image, contrast.warp_jacobian])
+@pytest.mark.parametrize(
+    "image", [contrast.count_image, contrast.time_image, contrast.smooth_image, contrast.warp_jacobian]
+)
 def test_gradcheck_in_counts_and_flow(image, carry_steps, generator):
     shell = window(torch.zeros(1, 2, 3, 4, 5, dtype=D))
 
     def call(counts, flow):
-        tracks = contrast.volume_tracks(EventVolume(counts, shell.centroid_s, shell.collected_s), flow, carry_steps)
-        return contrast.area_change(image(tracks, 3, 0.8)) if image is contrast.warp_jacobian else image(tracks, 0.8)
+        tracks = contrast.volume_tracks(
+            EventVolume(counts, shell.centroid_s, shell.collected_s), flow, carry_steps
+        )
+        return (
+            contrast.area_change(image(tracks, 3, 0.8))
+            if image is contrast.warp_jacobian
+            else image(tracks, 0.8)
+        )
 
     counts = 0.5 + torch.rand(1, 2, 3, 4, 5, generator=generator, dtype=D)
     check_gradients(call, counts, 1.5 * torch.randn(1, 2, 4, 5, generator=generator, dtype=D))
 
 
 def test_the_smooth_image_has_no_jump_in_its_gradient():
-    # an event that crosses the border between two pixels, and the centre line of one: bilinear shares jump there, the B-spline does not
+    # an event that crosses the border between two pixels, and the centre line of one: bilinear shares jump
+    # there, the B-spline does not
     counts = torch.zeros(1, 2, 1, 1, 9, dtype=D)
     counts[0, 0, 0, 0, 4] = 1
     volume = EventVolume(counts, torch.zeros(1, dtype=D), torch.ones(1, dtype=D))
@@ -162,21 +194,37 @@ def test_the_smooth_image_has_no_jump_in_its_gradient():
 
     def slope(image, u):
         flow = uniform(u, 0.0, 1, 9).requires_grad_()
-        (grad,) = torch.autograd.grad((image(contrast.volume_tracks(volume, flow), 1.0)[0, 0, 0] * weights).sum(), flow)
+        (grad,) = torch.autograd.grad(
+            (image(contrast.volume_tracks(volume, flow), 1.0)[0, 0, 0] * weights).sum(), flow
+        )
         return float(grad[0, 0, 0, 4])
 
     for place in (0.5, 1.0):
-        assert abs(slope(contrast.smooth_image, place + 1e-9) - slope(contrast.smooth_image, place - 1e-9)) <= 1e-7  # curvature 2 times 2e-9
-    assert abs(slope(contrast.count_image, 1 + 1e-9) - slope(contrast.count_image, 1 - 1e-9)) == pytest.approx(2)
+        assert (
+            abs(slope(contrast.smooth_image, place + 1e-9) - slope(contrast.smooth_image, place - 1e-9))
+            <= 1e-7
+        )  # curvature 2 times 2e-9
+    assert abs(
+        slope(contrast.count_image, 1 + 1e-9) - slope(contrast.count_image, 1 - 1e-9)
+    ) == pytest.approx(2)
 
 
 @pytest.mark.parametrize(("events_type", "flow_type"), [(torch.float32, D), (D, torch.float32)])
 def test_mixed_precision_gives_the_same_images(events_type, flow_type):
-    volume, flow = moving_dots(), uniform(7.5, 0.25, 8, 16)
+    volume = moving_dots()
+    flow = uniform(7.5, 0.25, 8, 16)
     exact = contrast.volume_tracks(volume, flow)
-    mixed = contrast.volume_tracks(EventVolume(volume.counts.to(events_type), volume.centroid_s, volume.collected_s), flow.to(flow_type))
-    for image in (contrast.count_image, contrast.smooth_image, lambda tracks, at: contrast.nearest_images(tracks, at)[0]):
-        torch.testing.assert_close(image(mixed, 0.9).to(D), image(exact, 0.9), rtol=0, atol=1e-5)  # single precision of places up to 16 px
+    mixed = contrast.volume_tracks(
+        EventVolume(volume.counts.to(events_type), volume.centroid_s, volume.collected_s), flow.to(flow_type)
+    )
+    for image in (
+        contrast.count_image,
+        contrast.smooth_image,
+        lambda tracks, at: contrast.nearest_images(tracks, at)[0],
+    ):
+        torch.testing.assert_close(
+            image(mixed, 0.9).to(D), image(exact, 0.9), rtol=0, atol=1e-5
+        )  # single precision of places up to 16 px
 
 
 def test_half_precision_flow_keeps_its_place():
@@ -192,12 +240,18 @@ def test_what_cannot_be_warped_is_refused():
     with pytest.raises(ShapeError, match=r"must be \[1, 2, 8, 16\], got \[1, 2, 8, 8\]"):
         contrast.volume_tracks(volume, torch.zeros(1, 2, 8, 8, dtype=D))
     with pytest.raises(ShapeError, match=r"\[B, 2, bins, H, W\]"):
-        contrast.volume_tracks(EventVolume(volume.counts[0], volume.centroid_s, volume.collected_s), torch.zeros(1, 2, 8, 16))
+        contrast.volume_tracks(
+            EventVolume(volume.counts[0], volume.centroid_s, volume.collected_s), torch.zeros(1, 2, 8, 16)
+        )
     flat = window(torch.zeros(1, 2, 2, 1, 4, dtype=D))
     with pytest.raises(ShapeError, match="1 x 4 pixels has no slope"):
         contrast.warp_jacobian(contrast.volume_tracks(flat, torch.zeros(1, 2, 1, 4, dtype=D)), 2, 0.0)
     stream = ordered(torch.tensor([10]), torch.tensor([1]), torch.tensor([1]), torch.tensor([1]), 8, 16)
-    for t0_us, t1_us, sentence in ((20, 30, "no event lies between 20 and 30 us"), (30, 20, "t1 > t0"), (0, 10.5, "whole microseconds")):
+    for t0_us, t1_us, sentence in (
+        (20, 30, "no event lies between 20 and 30 us"),
+        (30, 20, "t1 > t0"),
+        (0, 10.5, "whole microseconds"),
+    ):
         with pytest.raises(DomainError, match=sentence):
             contrast.stream_tracks(stream, torch.zeros(2, 8, 16), t0_us, t1_us)
     flow = torch.zeros(1, 2, 8, 16, dtype=D)

@@ -12,11 +12,15 @@ from codesign.events import from_stream
 from codesign.flow.export import eliminate, evenly_timed, export
 from codesign.types import EventStream, FlowField
 
-needs_onnx = pytest.mark.skipif(importlib.util.find_spec("onnxscript") is None or importlib.util.find_spec("onnx") is None, reason="needs onnx and onnxscript")
+needs_onnx = pytest.mark.skipif(
+    importlib.util.find_spec("onnxscript") is None or importlib.util.find_spec("onnx") is None,
+    reason="needs onnx and onnxscript",
+)
 
 
 class Small(nn.Module):
-    """Every kind of step that flow networks have: a check of the values, numbers worked out from the bins' times, a solve, a warp, a branch for the size."""
+    """Every kind of step that flow networks have: a check of the values, numbers worked out from the bins'
+    times, a solve, a warp, a branch for the size."""
 
     def __init__(self, solves=True):
         super().__init__()
@@ -35,7 +39,11 @@ class Small(nn.Module):
         x = self.drop(self.layer(nn.functional.pad(counts.flatten(1, 2), (0, 1))))[..., :-1] * (1 + middle)
         if self.solves:
             cross = torch.einsum("bihw,bjhw->bij", x, x) + torch.diag(torch.tensor([1.0, 2.0]))
-            x = torch.einsum("bij,bjhw->bihw", torch.linalg.solve(cross, torch.eye(2) + 0.5 * cross) + torch.linalg.inv(cross), x)
+            x = torch.einsum(
+                "bij,bjhw->bihw",
+                torch.linalg.solve(cross, torch.eye(2) + 0.5 * cross) + torch.linalg.inv(cross),
+                x,
+            )
         return FlowField(x, counts.sum((1, 2)) > 0, span)
 
 
@@ -45,12 +53,16 @@ def load(path, counts):
         return torch.export.load(path).module()(counts)
     from onnx.reference import ReferenceEvaluator
 
-    return [torch.from_numpy(output) for output in ReferenceEvaluator(str(path)).run(["flow_px", "confidence"], {"counts": counts.numpy()})]
+    return [
+        torch.from_numpy(output)
+        for output in ReferenceEvaluator(str(path)).run(["flow_px", "confidence"], {"counts": counts.numpy()})
+    ]
 
 
 @pytest.mark.parametrize("name", ["small.pt2", pytest.param("small.onnx", marks=needs_onnx)])
 def test_the_program_gives_the_numbers_of_the_network(tmp_path, generator, name):
-    """torch.export runs the same operations; ONNX's own order of sums differs in the last bits of numbers of order 1."""
+    """torch.export runs the same operations; ONNX's own order of sums differs in the last bits of numbers of
+    order 1."""
     network = Small().train()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of the packages that write and read programs
@@ -77,7 +89,8 @@ def test_the_bins_are_those_of_a_stream():
 def test_solving_by_elimination_is_solving(generator):
     """Positive definite matrices of condition below 100: float64 rounding stays below 1e-12."""
     root = torch.randn(3, 6, 6, generator=generator, dtype=torch.float64)
-    matrix, right = root @ root.mT + torch.eye(6), torch.randn(3, 6, 4, generator=generator, dtype=torch.float64)
+    matrix = root @ root.mT + torch.eye(6)
+    right = torch.randn(3, 6, 4, generator=generator, dtype=torch.float64)
     assert torch.allclose(eliminate(matrix, right), torch.linalg.solve(matrix, right), rtol=1e-12, atol=1e-12)
 
 

@@ -21,7 +21,9 @@ def field(values, valid=None, **claims):
 
 
 def check_gradients(function, *inputs):
-    assert torch.autograd.gradcheck(function, [value.clone().requires_grad_() for value in inputs], eps=1e-6, atol=1e-8, rtol=1e-5)
+    assert torch.autograd.gradcheck(
+        function, [value.clone().requires_grad_() for value in inputs], eps=1e-6, atol=1e-8, rtol=1e-5
+    )
 
 
 # supervised
@@ -29,7 +31,9 @@ def check_gradients(function, *inputs):
 
 def test_charbonnier_by_hand():
     squared = torch.tensor([0.0, 9.0, 16.0], dtype=D)
-    assert losses.charbonnier(squared, 4.0).tolist() == pytest.approx([0, 1, math.sqrt(32) - 4])  # sqrt(9 + 16) - 4
+    assert losses.charbonnier(squared, 4.0).tolist() == pytest.approx(
+        [0, 1, math.sqrt(32) - 4]
+    )  # sqrt(9 + 16) - 4
     assert losses.charbonnier(squared, 4.0, 1.0).tolist() == pytest.approx([0, 9, 16])
 
 
@@ -39,17 +43,24 @@ LAST = field([[(0.0, 3.0), (1.0, 3.0)], [(0.0, 2.0), (5.0, 5.0)]])
 
 
 def test_supervised_loss_by_hand():
-    # epsilon 4: an error of 3 px costs 1, one of 2 px sqrt(20) - 4. FIRST: samples (1 + 0) / 2 and sqrt(20) - 4; LAST: (1 + 1) / 2 and 0
-    first, last = (0.5 + math.sqrt(20) - 4) / 2, 0.5
+    # epsilon 4: an error of 3 px costs 1, one of 2 px sqrt(20) - 4. FIRST: samples (1 + 0) / 2 and sqrt(20) -
+    # 4; LAST: (1 + 1) / 2 and 0
+    first = (0.5 + math.sqrt(20) - 4) / 2
+    last = 0.5
     assert float(losses.supervised_loss([FIRST], TRUTH, epsilon=4.0)) == pytest.approx(first)
-    assert float(losses.supervised_loss([FIRST, LAST], TRUTH, gamma=0.5, epsilon=4.0)) == pytest.approx((0.5 * first + last) / 1.5)
+    assert float(losses.supervised_loss([FIRST, LAST], TRUTH, gamma=0.5, epsilon=4.0)) == pytest.approx(
+        (0.5 * first + last) / 1.5
+    )
     three = [FIRST, FIRST, LAST]
-    assert float(losses.supervised_loss(three, TRUTH, gamma=0.5, epsilon=4.0)) == pytest.approx((0.75 * first + last) / 1.75)
+    assert float(losses.supervised_loss(three, TRUTH, gamma=0.5, epsilon=4.0)) == pytest.approx(
+        (0.75 * first + last) / 1.75
+    )
 
 
 @pytest.mark.parametrize("unit", [2.0, [2.0, 2.0], [[2.0, 2.0]], [[[2.0, 2.0]], [[2.0, 2.0]]]])
 def test_units_scale_the_error_before_the_parabola(unit):
-    # FIRST in half pixels: 6 of 8 costs sqrt(36 + 64) - 8 = 2, 4 of 8 costs sqrt(16 + 64) - 8: twice as much as before
+    # FIRST in half pixels: 6 of 8 costs sqrt(36 + 64) - 8 = 2, 4 of 8 costs sqrt(16 + 64) - 8: twice as much
+    # as before
     found = losses.supervised_loss([FIRST], TRUTH, epsilon=8.0, unit_per_px=torch.tensor(unit, dtype=D))
     assert float(found) == pytest.approx(0.5 + math.sqrt(80) - 8 + 0.5 - 0.5 - (math.sqrt(80) - 8) / 2 + 0.0)
 
@@ -75,7 +86,9 @@ def test_samples_without_truth_count_zero_and_may_hold_anything():
     truth = field([[(nan, nan), (1.0, 0.0)], [(nan, 2.0), (math.inf, 9.0)]], [[False, True], [False, False]])
     flow = FIRST.flow_px.clone().requires_grad_()
     loss = losses.supervised_loss([replace(FIRST, flow_px=flow + 1)], truth, epsilon=4.0)
-    assert loss.item() == pytest.approx((math.sqrt(18) - 4) / 2)  # the one error is (1, 1); the second sample adds 0 to the mean of two
+    assert loss.item() == pytest.approx(
+        (math.sqrt(18) - 4) / 2
+    )  # the one error is (1, 1); the second sample adds 0 to the mean of two
     (grad,) = torch.autograd.grad(loss, flow)
     slope = 1 / math.sqrt(18) / 2
     assert grad.flatten().tolist() == pytest.approx([0, slope, 0, slope, 0, 0, 0, 0])
@@ -93,10 +106,23 @@ def test_gradcheck_of_the_supervised_losses(generator):
         a, b, c = factor.unbind(1)
         return torch.stack([a * a, a * b, b * b + c * c], 1)
 
-    check_gradients(lambda f: losses.supervised_loss([FIRST, replace(LAST, flow_px=f)], TRUTH, unit_per_px=losses.relative_unit(TRUTH)), flow)
-    check_gradients(lambda f, k: losses.likelihood_loss([replace(LAST, flow_px=f, covariance_px2=covariance(k))], TRUTH), flow, factor)
-    check_gradients(lambda f, c: losses.likelihood_loss([replace(LAST, flow_px=f, confidence=c)], TRUTH), flow, confidence)
-    check_gradients(lambda f: losses.supervised_loss([replace(LAST, flow_px=f)], TRUTH), TRUTH.flow_px)  # smooth at zero error
+    check_gradients(
+        lambda f: losses.supervised_loss(
+            [FIRST, replace(LAST, flow_px=f)], TRUTH, unit_per_px=losses.relative_unit(TRUTH)
+        ),
+        flow,
+    )
+    check_gradients(
+        lambda f, k: losses.likelihood_loss([replace(LAST, flow_px=f, covariance_px2=covariance(k))], TRUTH),
+        flow,
+        factor,
+    )
+    check_gradients(
+        lambda f, c: losses.likelihood_loss([replace(LAST, flow_px=f, confidence=c)], TRUTH), flow, confidence
+    )
+    check_gradients(
+        lambda f: losses.supervised_loss([replace(LAST, flow_px=f)], TRUTH), TRUTH.flow_px
+    )  # smooth at zero error
 
 
 def test_likelihood_is_that_of_a_gaussian(generator):
@@ -106,7 +132,9 @@ def test_likelihood_is_that_of_a_gaussian(generator):
     known = torch.distributions.MultivariateNormal(truth, matrix + 0.01 * torch.eye(2, dtype=D))
     expected = -known.log_prob(flow).mean() - math.log(2 * math.pi)
     claim = torch.stack([matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]], 1)[:, :, None]
-    found = losses.likelihood_loss([field(flow.tolist(), covariance_px2=claim)], field(truth.tolist()), floor_px=0.1)
+    found = losses.likelihood_loss(
+        [field(flow.tolist(), covariance_px2=claim)], field(truth.tolist()), floor_px=0.1
+    )
     assert float(found) == pytest.approx(float(expected))
 
 
@@ -122,12 +150,17 @@ def test_likelihood_of_a_confidence_is_least_where_it_is_honest():
 
 
 def test_a_degenerate_covariance_keeps_its_floor_in_single_precision():
-    # fully correlated, 100 px: S = 1e4 [[1, 1], [1, 1]] + 0.01 I has the determinant 1e-4 + 0.01 * 2e4; float32 loses it in xx yy - xy^2
+    # fully correlated, 100 px: S = 1e4 [[1, 1], [1, 1]] + 0.01 I has the determinant 1e-4 + 0.01 * 2e4;
+    # float32 loses it in xx yy - xy^2
     claim = torch.full((1, 3, 1, 1), 1e4)
     shape = (1, 2, 1, 1)
     truth = FlowField(torch.zeros(shape), torch.ones(1, 1, 1, dtype=torch.bool), 0.05)
-    found = losses.likelihood_loss([FlowField(torch.tensor([1.0, -1.0]).reshape(shape), truth.valid, 0.05, covariance_px2=claim)], truth)
-    assert float(found) == pytest.approx((2 / 0.01 + math.log(1e-4 + 200)) / 2, rel=1e-5)  # (1, -1) lies across the long axis
+    found = losses.likelihood_loss(
+        [FlowField(torch.tensor([1.0, -1.0]).reshape(shape), truth.valid, 0.05, covariance_px2=claim)], truth
+    )
+    assert float(found) == pytest.approx(
+        (2 / 0.01 + math.log(1e-4 + 200)) / 2, rel=1e-5
+    )  # (1, -1) lies across the long axis
 
 
 # frames
@@ -135,24 +168,39 @@ def test_a_degenerate_covariance_keeps_its_floor_in_single_precision():
 
 def test_photometric_loss_of_a_moved_picture(generator):
     wide = 255 * torch.rand(9, 14, generator=generator, dtype=D)
-    frames = torch.stack([wide[:, 3:], wide[:, :-3]])[None]  # what is at x in the first is at x + 3 in the second
+    frames = torch.stack([wide[:, 3:], wide[:, :-3]])[
+        None
+    ]  # what is at x in the first is at x + 3 in the second
     flow = torch.tensor([3.0, 0.0], dtype=D)[None, :, None, None].expand(1, 2, 9, 11).contiguous()
     # the last three columns leave and keep their zero-flow difference; all others fit
     still = losses.charbonnier(((frames[:, 1] - frames[:, 0]) / 255).square(), 1e-3, 0.45)
-    assert float(losses.photometric_loss(frames, flow)) == pytest.approx(float(still[..., -3:].sum() / still.numel()))
+    assert float(losses.photometric_loss(frames, flow)) == pytest.approx(
+        float(still[..., -3:].sum() / still.numel())
+    )
     for away in (1e3, -1e6):
-        assert float(losses.photometric_loss(frames, torch.full_like(flow, away))) == pytest.approx(float(still.mean()))
-    assert float(losses.photometric_loss(frames, torch.zeros_like(flow))) == pytest.approx(float(still.mean()))
+        assert float(losses.photometric_loss(frames, torch.full_like(flow, away))) == pytest.approx(
+            float(still.mean())
+        )
+    assert float(losses.photometric_loss(frames, torch.zeros_like(flow))) == pytest.approx(
+        float(still.mean())
+    )
 
 
 def test_smoothness_of_a_ramp_by_hand():
-    # u grows by 3 per column and v by 4 per row: (9 + 16)^0.5 - 4 = 1 along x with epsilon 4, and (16 + 9) ... along y: sqrt(16 + 16) - 4
+    # u grows by 3 per column and v by 4 per row: (9 + 16)^0.5 - 4 = 1 along x with epsilon 4, and (16 + 9)
+    # ... along y: sqrt(16 + 16) - 4
     y, x = torch.meshgrid(torch.arange(4, dtype=D), torch.arange(5, dtype=D), indexing="ij")
     flow = torch.stack([3 * x, 4 * y])[None]
-    assert float(losses.smoothness_loss(flow, epsilon=4.0, exponent=0.5)) == pytest.approx(1 + math.sqrt(32) - 4)
+    assert float(losses.smoothness_loss(flow, epsilon=4.0, exponent=0.5)) == pytest.approx(
+        1 + math.sqrt(32) - 4
+    )
     edge = torch.zeros(1, 4, 5, dtype=D)
-    edge[:, :, 2:] = 255 * 0.1 * math.log(2)  # an edge between columns 1 and 2 that halves one of four differences in a row
-    assert float(losses.smoothness_loss(flow, edge, epsilon=4.0, exponent=0.5)) == pytest.approx(3.5 / 4 + math.sqrt(32) - 4)
+    edge[:, :, 2:] = (
+        255 * 0.1 * math.log(2)
+    )  # an edge between columns 1 and 2 that halves one of four differences in a row
+    assert float(losses.smoothness_loss(flow, edge, epsilon=4.0, exponent=0.5)) == pytest.approx(
+        3.5 / 4 + math.sqrt(32) - 4
+    )
     assert float(losses.smoothness_loss(torch.ones(1, 2, 4, 5))) == 0
 
 
@@ -164,16 +212,21 @@ def test_gradcheck_of_the_frame_losses(generator):
 
 
 def test_half_precision_predictions_lose_no_place(generator):
-    # 0.25 px is exact in bfloat16, and so must the loss be: bfloat16 pixel numbers above 256 would be two apart
+    # 0.25 px is exact in bfloat16, and so must the loss be: bfloat16 pixel numbers above 256 would be two
+    # apart
     frames = 255 * torch.rand(1, 2, 3, 400, generator=generator)
     truth = FlowField(torch.zeros(1, 2, 3, 400), torch.ones(1, 3, 400, dtype=torch.bool), 0.05)
-    volume = EventVolume(torch.rand(1, 2, 2, 3, 400, generator=generator), torch.tensor([0.0, 1.0]), torch.tensor([0.5, 0.5]))
+    volume = EventVolume(
+        torch.rand(1, 2, 2, 3, 400, generator=generator), torch.tensor([0.0, 1.0]), torch.tensor([0.5, 0.5])
+    )
     for loss in (
         lambda flow: losses.photometric_loss(frames, flow),
         lambda flow: losses.smoothness_loss(flow),
         lambda flow: losses.contrast_loss(volume, flow),
         lambda flow: losses.supervised_loss([replace(truth, flow_px=flow)], truth),
-        lambda flow: losses.likelihood_loss([replace(truth, flow_px=flow, confidence=flow[:, 0] + 0.5)], truth),
+        lambda flow: losses.likelihood_loss(
+            [replace(truth, flow_px=flow, confidence=flow[:, 0] + 0.5)], truth
+        ),
     ):
         flow = torch.full((1, 2, 3, 400), 0.25)
         assert loss(flow.bfloat16()).item() == loss(flow).item()
@@ -189,7 +242,17 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(DomainError, match="neither covariance_px2 nor confidence"):
         losses.likelihood_loss([FIRST], TRUTH)
     with pytest.raises(DomainError, match="not positive semidefinite"):
-        losses.likelihood_loss([replace(FIRST, covariance_px2=torch.tensor([1.0, 2.0, 1.0], dtype=D)[None, :, None, None].expand(2, 3, 1, 2))], TRUTH)
+        losses.likelihood_loss(
+            [
+                replace(
+                    FIRST,
+                    covariance_px2=torch.tensor([1.0, 2.0, 1.0], dtype=D)[None, :, None, None].expand(
+                        2, 3, 1, 2
+                    ),
+                )
+            ],
+            TRUTH,
+        )
     with pytest.raises(DomainError, match="confidence lies outside 0 to 1"):
         losses.likelihood_loss([replace(FIRST, confidence=torch.full((2, 1, 2), 1.5, dtype=D))], TRUTH)
     with pytest.raises(ShapeError, match="frames must be"):

@@ -31,16 +31,20 @@ def test_endpoint_errors_and_their_mean():
 
 
 def test_a_batch_is_averaged_over_pixels_not_over_samples():
-    found, truth = torch.stack([FOUND, TRUTH]), torch.stack([TRUTH, TRUTH])
+    found = torch.stack([FOUND, TRUTH])
+    truth = torch.stack([TRUTH, TRUTH])
     mask = torch.tensor([[[True, False, False, False, False]], [[True, True, True, False, False]]])
     assert metrics.aee(found, truth, mask).item() == pytest.approx(5.0 / 4)
 
 
 def test_an_outlier_needs_both_three_pixels_and_five_per_cent():
     # 5 px of 0: yes. 3.5 px of 100 (3.5 %): no. 4.5 px of 10: yes. 2.9 px of 1: no (below 3 px)
-    found, truth = torch.cat([FOUND, field([(3.9, 0.0)])], 2), torch.cat([TRUTH, field([(1.0, 0.0)])], 2)
+    found = torch.cat([FOUND, field([(3.9, 0.0)])], 2)
+    truth = torch.cat([TRUTH, field([(1.0, 0.0)])], 2)
     assert metrics.outlier_percent(found, truth).item() == pytest.approx(100 * 2 / 6)
-    assert metrics.outlier_percent(field([(3.0, 0.0)]), field([(0.0, 0.0)])).item() == 0  # exactly 3 px is not above
+    assert (
+        metrics.outlier_percent(field([(3.0, 0.0)]), field([(0.0, 0.0)])).item() == 0
+    )  # exactly 3 px is not above
 
 
 def test_share_of_errors_above_a_number_of_pixels():
@@ -51,7 +55,12 @@ def test_share_of_errors_above_a_number_of_pixels():
 
 def test_angular_error_in_closed_form():
     # (0, 0, 1) to (1, 0, 1) is 45 degrees; (1, 0, 1) to (-1, 0, 1) is 90; (1, 0, 1) to (0, 1, 1) is 60
-    pairs = [((0.0, 0.0), (1.0, 0.0), 45.0), ((1.0, 0.0), (-1.0, 0.0), 90.0), ((1.0, 0.0), (0.0, 1.0), 60.0), ((2.0, 3.0), (2.0, 3.0), 0.0)]
+    pairs = [
+        ((0.0, 0.0), (1.0, 0.0), 45.0),
+        ((1.0, 0.0), (-1.0, 0.0), 90.0),
+        ((1.0, 0.0), (0.0, 1.0), 60.0),
+        ((2.0, 3.0), (2.0, 3.0), 0.0),
+    ]
     for a, b, degrees in pairs:
         assert metrics.angular_error_deg(field([a]), field([b])).item() == pytest.approx(degrees, abs=1e-12)
 
@@ -70,12 +79,19 @@ def test_gradients_at_zero_error_are_zero_not_nan():
         assert not grad.any()
     flow = FOUND.clone().requires_grad_()
     (grad,) = torch.autograd.grad(metrics.aee(flow, TRUTH), flow)
-    assert grad[:, 0, 0].tolist() == pytest.approx([0.6 / 5, 0.8 / 5])  # the unit vector of the error over five pixels
+    assert grad[:, 0, 0].tolist() == pytest.approx(
+        [0.6 / 5, 0.8 / 5]
+    )  # the unit vector of the error over five pixels
 
 
 def test_empty_masks_and_wrong_shapes_are_refused():
     nothing = torch.zeros(1, 5, dtype=torch.bool)
-    for measure in (metrics.aee, metrics.outlier_percent, metrics.angular_error_deg, lambda f, t, m: metrics.npe(f, t, 3.0, m)):
+    for measure in (
+        metrics.aee,
+        metrics.outlier_percent,
+        metrics.angular_error_deg,
+        lambda f, t, m: metrics.npe(f, t, 3.0, m),
+    ):
         with pytest.raises(DomainError, match="selects no pixel"):
             measure(FOUND, TRUTH, nothing)
     with pytest.raises(ShapeError, match=r"\[\.\.\., 2, H, W\]"):
@@ -90,13 +106,21 @@ def test_empty_masks_and_wrong_shapes_are_refused():
 
 def test_both_conditions_of_an_outlier_are_explicit():
     assert metrics.outlier_percent(FOUND, TRUTH).item() == pytest.approx(100 * 2 / 5)
-    assert metrics.outlier_percent(FOUND, TRUTH, share=0.0).item() == metrics.npe(FOUND, TRUTH, 3.0).item() == pytest.approx(100 * 3 / 5)
-    assert metrics.outlier_percent(FOUND, TRUTH, pixels=0.0, share=0.04).item() == pytest.approx(100 * 2 / 5)  # 3.5 of 100 is 3.5 %
+    assert (
+        metrics.outlier_percent(FOUND, TRUTH, share=0.0).item()
+        == metrics.npe(FOUND, TRUTH, 3.0).item()
+        == pytest.approx(100 * 3 / 5)
+    )
+    assert metrics.outlier_percent(FOUND, TRUTH, pixels=0.0, share=0.04).item() == pytest.approx(
+        100 * 2 / 5
+    )  # 3.5 of 100 is 3.5 %
 
 
 def test_zero_flow_error_is_the_mean_true_length():
     assert metrics.zero_flow_error(TRUTH).item() == pytest.approx((100 + 10 + math.sqrt(2)) / 5)
-    assert metrics.zero_flow_error(TRUTH, torch.tensor([[True, False, False, True, False]])).item() == pytest.approx(5)
+    assert metrics.zero_flow_error(
+        TRUTH, torch.tensor([[True, False, False, True, False]])
+    ).item() == pytest.approx(5)
 
 
 def test_masks_of_events_and_truth():
@@ -105,15 +129,28 @@ def test_masks_of_events_and_truth():
     counts[0, 1, 2, 0, 2] = 3
     counts[1, 1, 0, 0, 3] = 1
     valid = torch.tensor([[[True, True, False, False]], [[False, False, True, True]]])
-    found = metrics.masks(EventVolume(counts, torch.arange(3.0), torch.ones(3)), FlowField(torch.zeros(2, 2, 1, 4), valid, 3.0))
+    found = metrics.masks(
+        EventVolume(counts, torch.arange(3.0), torch.ones(3)), FlowField(torch.zeros(2, 2, 1, 4), valid, 3.0)
+    )
     assert found["events"].tolist() == [[[True, False, True, False]], [[False, False, False, True]]]
     assert found["both"].tolist() == [[[True, False, False, False]], [[False, False, False, True]]]
     assert found["valid"] is valid
     with pytest.raises(ShapeError, match="volume and truth differ"):
-        metrics.masks(EventVolume(counts, torch.arange(3.0), torch.ones(3)), FlowField(torch.zeros(2, 2, 1, 3), valid[..., :3], 3.0))
+        metrics.masks(
+            EventVolume(counts, torch.arange(3.0), torch.ones(3)),
+            FlowField(torch.zeros(2, 2, 1, 3), valid[..., :3], 3.0),
+        )
 
 
-@pytest.mark.parametrize("measure", [metrics.aee, metrics.outlier_percent, metrics.angular_error_deg, lambda f, t, m=None: metrics.npe(f, t, 3.0, m)])
+@pytest.mark.parametrize(
+    "measure",
+    [
+        metrics.aee,
+        metrics.outlier_percent,
+        metrics.angular_error_deg,
+        lambda f, t, m=None: metrics.npe(f, t, 3.0, m),
+    ],
+)
 def test_nan_is_no_inlier(measure):
     flow = FOUND.clone()
     flow[0, 0, 1] = math.nan
@@ -127,17 +164,26 @@ def test_nan_is_no_inlier(measure):
 
 
 def test_ray_errors_of_a_pinhole_in_closed_form():
-    # focal length 50 px, axis at (2, 1): the end (52, 1) lies at 45 degrees, (2, 51) too, 60 degrees from it; (2, 1) is the axis
+    # focal length 50 px, axis at (2, 1): the end (52, 1) lies at 45 degrees, (2, 51) too, 60 degrees from it;
+    # (2, 1) is the axis
     direction = metrics.pinhole_directions(3, 5, 50.0)
     truth = torch.zeros(2, 3, 5, dtype=D)
     mask = torch.zeros(3, 5, dtype=torch.bool)
     mask[1, 2] = True
-    pairs = [((50.0, 0.0), (0.0, 0.0), 45.0), ((50.0, 0.0), (0.0, 50.0), 60.0), ((-50.0, 0.0), (50.0, 0.0), 90.0), ((7.3, 1.0), (7.3, 1.0), 0.0)]
+    pairs = [
+        ((50.0, 0.0), (0.0, 0.0), 45.0),
+        ((50.0, 0.0), (0.0, 50.0), 60.0),
+        ((-50.0, 0.0), (50.0, 0.0), 90.0),
+        ((7.3, 1.0), (7.3, 1.0), 0.0),
+    ]
     for flow, other, degrees in pairs:
         found, truth = (torch.tensor(pair, dtype=D)[:, None, None].expand(2, 3, 5) for pair in (flow, other))
-        # the ends lie far outside the image: linear beyond its border is exact for a pinhole; rays of any length count the same
+        # the ends lie far outside the image: linear beyond its border is exact for a pinhole; rays of any
+        # length count the same
         for scale in (1.0, 0.1):
-            assert metrics.ray_error_mrad(found, truth, scale * direction, mask).item() == pytest.approx(1000 * math.radians(degrees), abs=1e-9)
+            assert metrics.ray_error_mrad(found, truth, scale * direction, mask).item() == pytest.approx(
+                1000 * math.radians(degrees), abs=1e-9
+            )
     batch = torch.stack([found, found])
     assert metrics.ray_error_mrad(batch, batch, direction).item() == pytest.approx(0, abs=1e-12)
 
@@ -153,7 +199,12 @@ def test_the_angle_of_a_pixel_in_closed_form():
     truth = torch.zeros(2, 7, 9, dtype=D)
     axis = torch.zeros(7, 9, dtype=torch.bool)
     axis[3, 4] = True
-    error = metrics.ray_error_mrad(truth + torch.tensor([1e-6, 0.0], dtype=D)[:, None, None], truth, metrics.pinhole_directions(7, 9, focal), axis)
+    error = metrics.ray_error_mrad(
+        truth + torch.tensor([1e-6, 0.0], dtype=D)[:, None, None],
+        truth,
+        metrics.pinhole_directions(7, 9, focal),
+        axis,
+    )
     assert error.item() == pytest.approx(1e-6 * found[3, 4].item(), rel=1e-9)
 
 
@@ -175,9 +226,12 @@ def test_rays_that_do_not_fit_are_refused():
 
 
 def line(steps, width, height=3):
-    """A vertical line that starts at column 2 and moves a pixel to the right per 1000 us; one event per pixel it comes to."""
+    """A vertical line that starts at column 2 and moves a pixel to the right per 1000 us; one event per pixel
+    it comes to."""
     k = torch.arange(steps).repeat_interleave(height)
-    return ordered(1000 * k, 2 + k, torch.arange(height).repeat(steps), torch.ones_like(k), height, width), 1000 * (steps - 1)
+    return ordered(
+        1000 * k, 2 + k, torch.arange(height).repeat(steps), torch.ones_like(k), height, width
+    ), 1000 * (steps - 1)
 
 
 def constant(u, width, height=3):
@@ -190,31 +244,42 @@ def test_a_moving_line_in_closed_form(steps, width):
     stream, end_us = line(steps, width)
     flow = constant(steps - 1.0, width)
     for at in (0.0, 0.4, 1.0):
-        assert metrics.fwl(stream, flow, 0, end_us, at) == pytest.approx(steps * (width - 1) / (width - steps))
+        assert metrics.fwl(stream, flow, 0, end_us, at) == pytest.approx(
+            steps * (width - 1) / (width - steps)
+        )
     # mean squares of the times: of k / (n - 1) before, (2n - 1) / (6 (n - 1)); of their mean after, 1/4
     assert metrics.rsat(stream, flow, 0, end_us) == pytest.approx(1.5 * (steps - 1) / (2 * steps - 1))
     for measure in (metrics.fwl, metrics.rsat):
         assert measure(stream, torch.zeros(2, 3, width), 0, end_us) == 1
-    assert metrics.fwl(stream, flow[None].float(), 0, end_us) == pytest.approx(steps * (width - 1) / (width - steps), rel=1e-6)
+    assert metrics.fwl(stream, flow[None].float(), 0, end_us) == pytest.approx(
+        steps * (width - 1) / (width - steps), rel=1e-6
+    )
 
 
 def test_events_that_leave_count_in_the_denominator_only():
-    # from column 2 + k at time k/4 to column 2 + k + (1 - k/4) u; for u = 8 that is 10 - k: mirrored, and as sharp as before
+    # from column 2 + k at time k/4 to column 2 + k + (1 - k/4) u; for u = 8 that is 10 - k: mirrored, and as
+    # sharp as before
     stream, end_us = line(5, 12)
     assert metrics.fwl(stream, constant(8.0, 12), 0, end_us) == pytest.approx(1)
     # u = 40: to 42 - 9 k = 42, 33, 24, 15, 6: one stays. Variances 1/12 - 1/144 and 5/12 - 25/144
     assert metrics.fwl(stream, constant(40.0, 12), 0, end_us) == pytest.approx(11 / 35)
-    assert metrics.rsat(stream, constant(40.0, 12), 0, end_us) == pytest.approx(1 / (9 / 24))  # the last, at time 1; before, 9 / 24
+    assert metrics.rsat(stream, constant(40.0, 12), 0, end_us) == pytest.approx(
+        1 / (9 / 24)
+    )  # the last, at time 1; before, 9 / 24
     with pytest.raises(DomainError, match="every event out of the image"):
         metrics.rsat(stream, constant(40.0, 12), 0, end_us + 1000)  # at 4/5 of the window it leaves too
 
 
 def test_polarities_share_an_image_in_fwl_but_not_in_rsat():
     # ON at column 1, time 0, OFF at column 2, time 1, flow 1: both end on column 2
-    stream = ordered(torch.tensor([0, 10]), torch.tensor([1, 2]), torch.tensor([0, 0]), torch.tensor([1, -1]), 1, 4)
+    stream = ordered(
+        torch.tensor([0, 10]), torch.tensor([1, 2]), torch.tensor([0, 0]), torch.tensor([1, -1]), 1, 4
+    )
     flow = constant(1.0, 4, 1)
     assert metrics.fwl(stream, flow, 0, 10) == pytest.approx((4 / 4 - 1 / 4) / (2 / 4 - 1 / 4))
-    assert metrics.rsat(stream, flow, 0, 10) == pytest.approx(2)  # (0 + 1) / 1 pixel against (0 + 1) / 2 pixels
+    assert metrics.rsat(stream, flow, 0, 10) == pytest.approx(
+        2
+    )  # (0 + 1) / 1 pixel against (0 + 1) / 2 pixels
 
 
 def test_event_measures_without_an_answer_are_refused():
@@ -222,8 +287,15 @@ def test_event_measures_without_an_answer_are_refused():
     for measure in (metrics.fwl, metrics.rsat):
         with pytest.raises(DomainError, match="no event lies between"):
             measure(stream, constant(1.0, 12), end_us + 1, end_us + 5)
-    everywhere = ordered(torch.arange(4), torch.tensor([0, 1, 0, 1]), torch.tensor([0, 0, 1, 1]), torch.ones(4), 2, 2)
+    everywhere = ordered(
+        torch.arange(4), torch.tensor([0, 1, 0, 1]), torch.tensor([0, 0, 1, 1]), torch.ones(4), 2, 2
+    )
     with pytest.raises(DomainError, match="equally many events"):
         metrics.fwl(everywhere, torch.zeros(2, 2, 2), 0, 3)
     with pytest.raises(DomainError, match="at the start of the interval"):
-        metrics.rsat(ordered(torch.zeros(1), torch.zeros(1), torch.zeros(1), torch.ones(1), 2, 2), torch.zeros(2, 2, 2), 0, 3)
+        metrics.rsat(
+            ordered(torch.zeros(1), torch.zeros(1), torch.zeros(1), torch.ones(1), 2, 2),
+            torch.zeros(2, 2, 2),
+            0,
+            3,
+        )

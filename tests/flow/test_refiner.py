@@ -1,4 +1,5 @@
-"""The refining network: where it stands still, what it does to sizes, gradients against differences, and what a few steps of training do."""
+"""The refining network: where it stands still, what it does to sizes, gradients against differences, and what
+a few steps of training do."""
 
 import pytest
 import torch
@@ -25,7 +26,9 @@ def network(seed=0, dtype=D, **options):
 
 def volume(counts):
     bins = counts.shape[2]
-    return EventVolume(counts, (torch.arange(bins, dtype=D) + 0.5) / bins, torch.full((bins,), 1 / bins, dtype=D))
+    return EventVolume(
+        counts, (torch.arange(bins, dtype=D) + 0.5) / bins, torch.full((bins,), 1 / bins, dtype=D)
+    )
 
 
 def events(*shape, rate=0.3, seed=1):
@@ -33,7 +36,8 @@ def events(*shape, rate=0.3, seed=1):
 
 
 def test_bins_are_looked_up_along_the_flow():
-    """A picture linear in x and y, carried along: sampling at q + t flow(q) is exact for bilinear lookups away from the border."""
+    """A picture linear in x and y, carried along: sampling at q + t flow(q) is exact for bilinear lookups
+    away from the border."""
     x, y = pixel_grid(12, 16, torch.zeros((), dtype=D))
     flow = torch.stack([0.3 + 0.05 * x, -0.4 + 0.02 * y])[None]
     time = torch.tensor([0.0, 0.5, 1.0], dtype=D)
@@ -43,14 +47,17 @@ def test_bins_are_looked_up_along_the_flow():
 
 
 def test_without_corrections_the_start_comes_through():
-    """With the correcting layers at zero the answer is the start, averaged over cells of 4 px: a constant flow exactly, all but the fading-in of events."""
+    """With the correcting layers at zero the answer is the start, averaged over cells of 4 px: a constant
+    flow exactly, all but the fading-in of events."""
     fresh = network()
     for head in (fresh.change_middle, fresh.change_fine):
         for parameter in head.parameters():
             torch.nn.init.zeros_(parameter)
     start = torch.tensor([1.5, -0.75], dtype=D)[None, :, None, None].expand(1, 2, 32, 48).clone()
     for field in fresh.predictions(volume(events(1, 2, 8, 32, 48)), start):
-        torch.testing.assert_close(field.flow_px, start.expand_as(field.flow_px), rtol=1e-4, atol=0)  # n^2 / (n^2 + 100) of 7000 events
+        torch.testing.assert_close(
+            field.flow_px, start.expand_as(field.flow_px), rtol=1e-4, atol=0
+        )  # n^2 / (n^2 + 100) of 7000 events
 
 
 def test_loss_gradient_to_the_volume_passes_gradcheck():
@@ -75,7 +82,8 @@ def test_an_empty_volume_gives_zero_flow_zero_confidence_and_zero_gradient():
 
 @pytest.mark.parametrize("case", ["one event", "saturated", "constant", "one row"])
 def test_odd_volumes_keep_value_and_gradient_tame(case):
-    """No scene moves by more than a few times the prior, whatever the counts: bounded flow, and a gradient that differences confirm along one direction."""
+    """No scene moves by more than a few times the prior, whatever the counts: bounded flow, and a gradient
+    that differences confirm along one direction."""
     counts = torch.zeros(1, 2, 8, 16, 16, dtype=D)
     if case == "one event":
         counts[0, 0, 3, 8, 8] = 1.0
@@ -83,9 +91,15 @@ def test_odd_volumes_keep_value_and_gradient_tame(case):
         counts[0, :, :, 8] = 5.0
     else:
         counts += 1e4 if case == "saturated" else 2.0
-    made, counts = network(), counts.requires_grad_()
-    direction = torch.randn(counts.shape, dtype=D, generator=torch.Generator().manual_seed(3)) * counts.detach().max()
-    total = lambda step: made(volume(counts.detach() + step * direction)).flow_px.sum()  # noqa: E731
+    made = network()
+    counts = counts.requires_grad_()
+    direction = (
+        torch.randn(counts.shape, dtype=D, generator=torch.Generator().manual_seed(3)) * counts.detach().max()
+    )
+
+    def total(step):
+        return made(volume(counts.detach() + step * direction)).flow_px.sum()
+
     field = made(volume(counts))
     assert field.flow_px.abs().max() < 40.0
     (gradient,) = torch.autograd.grad(field.flow_px.sum(), counts)
@@ -96,31 +110,44 @@ def test_odd_volumes_keep_value_and_gradient_tame(case):
 
 
 def test_any_size_is_padded_and_cropped_back():
-    made, counts = network(), events(2, 2, 8, 37, 50)
+    made = network()
+    counts = events(2, 2, 8, 37, 50)
     start = torch.zeros(2, 2, 37, 50, dtype=D)
     found = made.predictions(volume(counts), start)[-1]
-    wide = made.predictions(volume(torch.nn.functional.pad(counts, (0, 14, 0, 11))), torch.zeros(2, 2, 48, 64, dtype=D))[-1]
+    wide = made.predictions(
+        volume(torch.nn.functional.pad(counts, (0, 14, 0, 11))), torch.zeros(2, 2, 48, 64, dtype=D)
+    )[-1]
     torch.testing.assert_close(found.flow_px, wide.flow_px[..., :37, :50], rtol=0, atol=1e-12)
     assert found.confidence is not None
     assert found.confidence.shape == (2, 37, 50)
 
 
 def test_samples_do_not_see_each_other():
-    made, counts = network(), events(3, 2, 8, 32, 32)
+    made = network()
+    counts = events(3, 2, 8, 32, 32)
     counts[1] *= 100
-    together, alone = made(volume(counts)), made(volume(counts[2:]))
+    together = made(volume(counts))
+    alone = made(volume(counts[2:]))
     torch.testing.assert_close(together.flow_px[2], alone.flow_px[0], rtol=0, atol=1e-9)
 
 
 def test_a_few_steps_teach_what_the_closed_form_leaves():
-    """Eight windows learnt by heart: from a start 1 px off everywhere, forty steps must take away most of it."""
+    """Eight windows learnt by heart: from a start 1 px off everywhere, forty steps must take away most of
+    it."""
     windows = RenderedWindows(planes("fine", 0.1), seed=9, height_px=32, width_px=32).batch(range(8))
     made = network(dtype=torch.float32, steps=2).train()
     truth = windows.truth.flow_px
     start = truth + torch.tensor([0.8, -0.6])[:, None, None]
     optimiser = torch.optim.Adam(made.parameters(), 3e-3)
     for _ in range(40):
-        error = (made.predictions(windows.volume, start)[-1].flow_px - truth).square().sum(1).add(1e-6).sqrt().mean()
+        error = (
+            (made.predictions(windows.volume, start)[-1].flow_px - truth)
+            .square()
+            .sum(1)
+            .add(1e-6)
+            .sqrt()
+            .mean()
+        )
         optimiser.zero_grad()
         error.backward()
         optimiser.step()
@@ -145,7 +172,8 @@ def test_the_budget_of_weights():
 
 
 def test_a_wrong_correction_hardly_counts():
-    """The network is made to add 3 px everywhere; along the true start nothing moves, so the answer must keep to it."""
+    """The network is made to add 3 px everywhere; along the true start nothing moves, so the answer must keep
+    to it."""
     windows = RenderedWindows(planes("fine", 0.1), seed=12).batch(range(4))
     made = network(dtype=torch.float32, steps=1)
     for head in (made.change_middle, made.change_fine, made.blend):
@@ -154,6 +182,9 @@ def test_a_wrong_correction_hardly_counts():
     assert made.change_fine.bias is not None
     torch.nn.init.constant_(made.change_fine.bias, 1.5)  # averaged pixels of 2 px
     truth = windows.truth.flow_px
-    error = lambda flow_px: float((flow_px - truth).square().sum(1).sqrt().mean().detach())  # noqa: E731
+
+    def error(flow_px):
+        return float((flow_px - truth).square().sum(1).sqrt().mean().detach())
+
     assert error(made.predictions(windows.volume)[-1].flow_px) > 3.5
     assert error(made(windows.volume).flow_px) < 0.5

@@ -1,4 +1,5 @@
-"""Our data sets as sources of windows: against what is stored and against the renderer; damage before training; rows of large files."""
+"""Our data sets as sources of windows: against what is stored and against the renderer; damage before
+training; rows of large files."""
 
 import json
 import shutil
@@ -18,12 +19,25 @@ from codesign.flow.sources.collate import bin_times
 from codesign.flow.sources.rows import Rows
 from codesign.render import flow_and_occlusion
 from scenes import worlds
-from studies import make_dataset as study
-from studies.make_dataset_store import h5
-from studies.run import main
+from studies.frame.run import main
+from studies.make_dataset import __main__ as study
+from studies.make_dataset.store import h5
 
 D = torch.float64
-OPTIONS = ["--trajectories", "2", "--frames", "13", "--size", "40", "--samples", "2", "--chunk", "5", "--rate-hz", "90"]
+OPTIONS = [
+    "--trajectories",
+    "2",
+    "--frames",
+    "13",
+    "--size",
+    "40",
+    "--samples",
+    "2",
+    "--chunk",
+    "5",
+    "--rate-hz",
+    "90",
+]
 
 
 # ours
@@ -64,7 +78,9 @@ def test_windows_of_one_interval_are_what_is_stored(dataset):
             np.testing.assert_array_equal(batch.truth.valid[k].numpy(), file["valid"][frame])
             assert batch.frames is not None
             np.testing.assert_array_equal(batch.frames[k].numpy(), file["frames"][frame : frame + 2])
-        torch.testing.assert_close(batch.volume.centroid_s, volume.centroid_s, rtol=1e-4, atol=0)  # frame times are whole microseconds: 11111 or 11112
+        torch.testing.assert_close(
+            batch.volume.centroid_s, volume.centroid_s, rtol=1e-4, atol=0
+        )  # frame times are whole microseconds: 11111 or 11112
         torch.testing.assert_close(batch.volume.collected_s, volume.collected_s, rtol=1e-4, atol=0)
     assert batch.truth.interval_s == pytest.approx(1 / 90, rel=1e-4)
     alone = source.batch([2])
@@ -75,15 +91,20 @@ def test_flow_over_several_frames_is_the_renderers(dataset, rendered):
     source = DatasetWindows(dataset / "sequence_000_orbital", window_frames=6, stride_frames=3)
     assert len(source) == 3
     batch = source.batch([1])
-    truth, seen = rendered.flow_px[0], rendered.valid[0]
+    truth = rendered.flow_px[0]
+    seen = rendered.valid[0]
     assert float(truth.norm(dim=0).mean()) > 1
     both = batch.truth.valid[0] & seen
-    assert float((both == seen).double().mean()) > 0.99  # points far outside the picture have no place in the fit
-    # float32 depth to 6e-8 of some metres over a flow of some px, and the fit of the camera (1e-4 px, measured with traced rays)
+    assert (
+        float((both == seen).double().mean()) > 0.99
+    )  # points far outside the picture have no place in the fit
+    # float32 depth to 6e-8 of some metres over a flow of some px, and the fit of the camera (1e-4 px,
+    # measured with traced rays)
     assert float((batch.truth.flow_px[0].double() - truth).norm(dim=0)[both].max()) < 2e-4
     stream = events.read(dataset / "sequence_000_orbital" / "events.h5", height_px=40, width_px=40)
     with h5(dataset / "sequence_000_orbital" / "frames.h5") as file:
-        t0_us, t1_us = int(file["timestamps"][3]), int(file["timestamps"][9])
+        t0_us = int(file["timestamps"][3])
+        t1_us = int(file["timestamps"][9])
         assert batch.frames is not None
         np.testing.assert_array_equal(batch.frames[0].numpy(), file["frames"][()][[3, 9]])
     assert torch.equal(batch.volume.counts, events.from_stream(stream, t0_us, t1_us, 8).counts)
@@ -91,30 +112,43 @@ def test_flow_over_several_frames_is_the_renderers(dataset, rendered):
 
 def test_flow_followed_from_frame_to_frame_is_near_the_renderers(dataset, rendered):
     sequence = DatasetWindows(dataset / "sequence_000_orbital", window_frames=6).sequences[0]
-    flows, valid, occluded = (torch.from_numpy(sequence.rows[name].read(3, 9)) for name in ("flow", "valid", "occluded"))
+    flows, valid, occluded = (
+        torch.from_numpy(sequence.rows[name].read(3, 9)) for name in ("flow", "valid", "occluded")
+    )
     flow, seen = chained(flows.double(), valid, occluded)
     seen = seen & rendered.valid[0]
     assert float(seen.double().mean()) > 0.5
     error = (flow - rendered.flow_px[0]).norm(dim=0)[seen]
-    # bilinear lookups smooth the flow by its curvature; across edges of depth that differ by less than the threshold it is wrong by a part of that
+    # bilinear lookups smooth the flow by its curvature; across edges of depth that differ by less than the
+    # threshold it is wrong by a part of that
     assert float(error.median()) < 0.01
     assert float(error.quantile(0.95)) < 0.3
 
 
 def test_pieces_depend_on_seed_and_number_alone(dataset):
-    whole, source = DatasetWindows(dataset), DatasetWindows(dataset, crop_px=(16, 24), seed=5)
-    one, other = source.batch([7, 3]), source.batch([3])
+    whole = DatasetWindows(dataset)
+    source = DatasetWindows(dataset, crop_px=(16, 24), seed=5)
+    one = source.batch([7, 3])
+    other = source.batch([3])
     assert one.volume.counts.shape == (2, 2, 8, 16, 24)
     assert one.frames is not None
     assert one.frames.shape == (2, 2, 16, 24)
     assert torch.equal(one.volume.counts[1], other.volume.counts[0])
     full = whole.batch([3])
     found = [
-        (top, left) for top in range(25) for left in range(17)
-        if torch.equal(full.truth.flow_px[0, :, top : top + 16, left : left + 24], other.truth.flow_px[0]) and torch.equal(full.volume.counts[0, ..., top : top + 16, left : left + 24], other.volume.counts[0])
+        (top, left)
+        for top in range(25)
+        for left in range(17)
+        if torch.equal(full.truth.flow_px[0, :, top : top + 16, left : left + 24], other.truth.flow_px[0])
+        and torch.equal(full.volume.counts[0, ..., top : top + 16, left : left + 24], other.volume.counts[0])
     ]
     assert len(found) == 1
-    moved = [not torch.equal(DatasetWindows(dataset, crop_px=(16, 24), seed=seed).batch([3]).truth.flow_px, other.truth.flow_px) for seed in range(5)]
+    moved = [
+        not torch.equal(
+            DatasetWindows(dataset, crop_px=(16, 24), seed=seed).batch([3]).truth.flow_px, other.truth.flow_px
+        )
+        for seed in range(5)
+    ]
     assert any(moved)
     with pytest.raises(ShapeError, match="the pictures have 40 x 40"):
         DatasetWindows(dataset, crop_px=(16, 41))
@@ -151,10 +185,19 @@ def damaged(dataset, tmp_path, what):
     return folder
 
 
-@pytest.mark.parametrize(("what", "reason"), [
-    ("missing", "lacks events.h5"), ("cut", "by the manifest; it was cut"), ("cut, no manifest", "cut or damaged"), ("manifest", "manifest.json is missing"), ("format", "format 'codesign-dataset/9'"),
-    ("shape", r"flow has shape \[12, 2, 40, 39\], \[12, 2, 40, 40\] is needed"), ("times", "do not rise"), ("index", "no index"),
-])
+@pytest.mark.parametrize(
+    ("what", "reason"),
+    [
+        ("missing", "lacks events.h5"),
+        ("cut", "by the manifest; it was cut"),
+        ("cut, no manifest", "cut or damaged"),
+        ("manifest", "manifest.json is missing"),
+        ("format", "format 'codesign-dataset/9'"),
+        ("shape", r"flow has shape \[12, 2, 40, 39\], \[12, 2, 40, 40\] is needed"),
+        ("times", "do not rise"),
+        ("index", "no index"),
+    ],
+)
 def test_damaged_data_sets_are_refused_at_once(what, reason, dataset, tmp_path):
     with pytest.raises(FileFormatError, match=reason):
         DatasetWindows(damaged(dataset, tmp_path, what))
@@ -163,8 +206,11 @@ def test_damaged_data_sets_are_refused_at_once(what, reason, dataset, tmp_path):
 def test_numbers_that_mean_nothing(dataset):
     source = DatasetWindows(dataset)
     for call, reason in (
-        (lambda: source.batch([24]), "the source has 24"), (lambda: source.batch([-1]), "the source has 24"), (lambda: source.batch([]), "no samples"),
-        (lambda: DatasetWindows(dataset, window_frames=13), "no sequence"), (lambda: DatasetWindows(dataset, window_frames=0), "whole numbers from 1"),
+        (lambda: source.batch([24]), "the source has 24"),
+        (lambda: source.batch([-1]), "the source has 24"),
+        (lambda: source.batch([]), "no samples"),
+        (lambda: DatasetWindows(dataset, window_frames=13), "no sequence"),
+        (lambda: DatasetWindows(dataset, window_frames=0), "whole numbers from 1"),
     ):
         with pytest.raises(DomainError, match=reason):
             call()
@@ -175,7 +221,15 @@ def test_numbers_that_mean_nothing(dataset):
 # rows of files
 
 
-@pytest.mark.parametrize("packing", [{}, {"chunks": (7, 2, 3)}, {"chunks": (7, 2, 3), "compression": "gzip", "shuffle": True, "fletcher32": True}, {"chunks": (16, 4, 5), **hdf5plugin.Blosc()}])
+@pytest.mark.parametrize(
+    "packing",
+    [
+        {},
+        {"chunks": (7, 2, 3)},
+        {"chunks": (7, 2, 3), "compression": "gzip", "shuffle": True, "fletcher32": True},
+        {"chunks": (16, 4, 5), **hdf5plugin.Blosc()},
+    ],
+)
 def test_rows_are_those_of_the_library(packing, tmp_path):
     values = np.random.default_rng(0).normal(size=(50, 4, 5))
     with h5(tmp_path / "a.h5", "w") as file:
@@ -201,7 +255,12 @@ def test_rows_refuse_what_the_library_would_end_the_process_on(tmp_path):
     np.testing.assert_array_equal(rows.read(0, 20), np.arange(20))
     with pytest.raises(FileFormatError, match="does not unpack"):
         rows.read(0, 40)
-    for name, reason in (("b", "went through the filters"), ("c", "kept in other files"), ("d", "no list of numbers"), ("e", "no list of numbers")):
+    for name, reason in (
+        ("b", "went through the filters"),
+        ("c", "kept in other files"),
+        ("d", "no list of numbers"),
+        ("e", "no list of numbers"),
+    ):
         with pytest.raises(FileFormatError, match=reason):
             Rows(path, name)
 
@@ -211,5 +270,7 @@ def test_times_of_the_bins_are_those_of_from_stream():
     stream = ordered(one, one, one, one, 3, 3)
     for bins in (1, 2, 5):
         volume = events.from_stream(stream, 0, 1000, bins)
-        for found, expected in zip(bin_times(bins, 1e-3), (volume.centroid_s, volume.collected_s), strict=True):
+        for found, expected in zip(
+            bin_times(bins, 1e-3), (volume.centroid_s, volume.collected_s), strict=True
+        ):
             torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)

@@ -28,24 +28,37 @@ def recording(folder, rate=(0.2, -0.3, 0.5), start_s=100.0, duration_s=0.5, coun
     columns = made(count, start_s=start_s, duration_s=duration_s)
     (folder / "events.txt").write_text(eth_text(columns))
     t_s = start_s - 0.1 + np.arange(round((duration_s + 0.2) * 1000)) / 1000
-    np.savetxt(folder / "imu.txt", np.column_stack([t_s, np.zeros((len(t_s), 3)), np.tile(rate, (len(t_s), 1))]), fmt="%.9f")
+    np.savetxt(
+        folder / "imu.txt",
+        np.column_stack([t_s, np.zeros((len(t_s), 3)), np.tile(rate, (len(t_s), 1))]),
+        fmt="%.9f",
+    )
     (folder / "calib.txt").write_text(ETH_CALIBRATION)
     return columns
 
 
 def test_a_recording_is_cut_into_windows_with_the_flow_of_its_rotation(tmp_path):
     columns = recording(tmp_path / "shapes_rotation")
-    packets = read_packets(tmp_path / "shapes_rotation", options=PacketOptions(window_s=0.02, start_s=0.1, count=3))
+    packets = read_packets(
+        tmp_path / "shapes_rotation", options=PacketOptions(window_s=0.02, start_s=0.1, count=3)
+    )
     camera = read_calibration(tmp_path / "shapes_rotation" / "calib.txt")
-    expected, valid = camera.rotation_flow(Rotation.from_rotvec(-np.array([0.2, -0.3, 0.5]) * 0.02).as_matrix(), *DAVIS)
+    expected, valid = camera.rotation_flow(
+        Rotation.from_rotvec(-np.array([0.2, -0.3, 0.5]) * 0.02).as_matrix(), *DAVIS
+    )
     assert len(packets) == 3
     for k, packet in enumerate(packets):
-        assert (packet.t0_us, packet.t1_us) == (columns[0][0] + 100_000 + 20_000 * k, columns[0][0] + 120_000 + 20_000 * k)
+        assert (packet.t0_us, packet.t1_us) == (
+            columns[0][0] + 100_000 + 20_000 * k,
+            columns[0][0] + 120_000 + 20_000 * k,
+        )
         inside = (columns[0] >= packet.t0_us) & (columns[0] <= packet.t1_us)
         assert len(packet.stream) == inside.sum()
         np.testing.assert_array_equal(packet.stream.t_us.numpy(), columns[0][inside])
         assert torch.equal(true(packet).valid[0], torch.from_numpy(valid))
-        np.testing.assert_allclose(true(packet).flow_px[0].numpy(), expected, rtol=0, atol=1e-5)  # float32 of some px
+        np.testing.assert_allclose(
+            true(packet).flow_px[0].numpy(), expected, rtol=0, atol=1e-5
+        )  # float32 of some px
         assert true(packet).interval_s == pytest.approx(0.02)
         assert any("rotation alone" in note for note in packet.notes)
     spread = read_packets(tmp_path / "shapes_rotation", options=PacketOptions(window_s=0.02, count=3))
@@ -69,14 +82,20 @@ def field(k=0):
     return torch.stack([(x - 100) / 64 + k, (y - 80) / 32 - k])
 
 
-@pytest.mark.parametrize("layout", ["files", "subfolders", "folders", "folder of truth", "one file of truth", "zip"])
+@pytest.mark.parametrize(
+    "layout", ["files", "subfolders", "folders", "folder of truth", "one file of truth", "zip"]
+)
 def test_numbered_packets_and_their_flows(layout, tmp_path):
-    place, truth, kept = tmp_path / "data", None, {}
+    place = tmp_path / "data"
+    truth = None
+    kept = {}
     for k in (2, 10, 1):  # in order of numbers, not of letters
         columns = kept[k] = made(300, seed=k, start_s=k, duration_s=0.03)
         folder = place / {"subfolders": f"packet_{k}", "folders": "events"}.get(layout, "")
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / ("events.txt" if layout == "subfolders" else f"packet_{k}.txt")).write_text(eth_text(columns))
+        (folder / ("events.txt" if layout == "subfolders" else f"packet_{k}.txt")).write_text(
+            eth_text(columns)
+        )
         if layout == "folder of truth":
             truth = tmp_path / "truth"
             truth.mkdir(exist_ok=True)
@@ -105,7 +124,9 @@ def test_numbered_packets_and_their_flows(layout, tmp_path):
 def test_flows_without_times_follow_one_another_and_long_files_are_no_packets(tmp_path):
     columns = recording(tmp_path / "a" / "one", start_s=100.0, duration_s=2.0)
     np.save(tmp_path / "flow.npy", np.stack([field(k).numpy() for k in range(3)]))
-    packets = read_packets(tmp_path / "a" / "one", tmp_path / "flow.npy", PacketOptions(window_s=0.02, truth_interval_s=0.02))
+    packets = read_packets(
+        tmp_path / "a" / "one", tmp_path / "flow.npy", PacketOptions(window_s=0.02, truth_interval_s=0.02)
+    )
     assert [packet.t0_us - columns[0][0] for packet in packets] == [0, 20_000, 40_000]
     assert all(torch.equal(true(packet).flow_px[0], field(k)) for k, packet in enumerate(packets))
     recording(tmp_path / "a" / "two", start_s=300.0, duration_s=2.0)
@@ -126,15 +147,26 @@ def test_a_flow_over_another_time_is_scaled_and_says_so(tmp_path):
     write_flow(tmp_path / "flow.flo", field())
     (whole,) = read_packets(tmp_path / "a", tmp_path / "flow.flo")  # no times: the flow of the whole packet
     assert torch.equal(true(whole).flow_px[0], field())
-    (rate,) = read_packets(tmp_path / "a", tmp_path / "flow.flo", PacketOptions(window_s=0.02, start_s=0.0, truth_unit="px/s"))
+    (rate,) = read_packets(
+        tmp_path / "a", tmp_path / "flow.flo", PacketOptions(window_s=0.02, start_s=0.0, truth_unit="px/s")
+    )
     torch.testing.assert_close(true(rate).flow_px[0], field() * 0.02, rtol=1e-6, atol=0)
-    (told,) = read_packets(tmp_path / "a", tmp_path / "flow.flo", PacketOptions(window_s=0.02, start_s=0.0, truth_interval_s=0.08))
+    (told,) = read_packets(
+        tmp_path / "a",
+        tmp_path / "flow.flo",
+        PacketOptions(window_s=0.02, start_s=0.0, truth_interval_s=0.08),
+    )
     torch.testing.assert_close(true(told).flow_px[0], field() / 4, rtol=1e-6, atol=0)
 
 
 def test_flows_outside_the_recording_are_counted(tmp_path):
     recording(tmp_path / "a", start_s=100.0, duration_s=0.1)
-    np.savez(tmp_path / "flow.npz", flow=np.stack([field(k).numpy() for k in range(3)]), t0=[99.9, 100.02, 100.05], t1=[99.95, 100.04, 100.07])
+    np.savez(
+        tmp_path / "flow.npz",
+        flow=np.stack([field(k).numpy() for k in range(3)]),
+        t0=[99.9, 100.02, 100.05],
+        t1=[99.95, 100.04, 100.07],
+    )
     packets = read_packets(tmp_path / "a", tmp_path / "flow.npz")
     assert [packet.t0_us for packet in packets] == [100_020_000, 100_050_000]
     assert all("1 of 3 true flows lie outside" in packet.notes[0] for packet in packets)
@@ -151,7 +183,14 @@ def test_every_kind_of_event_file_is_a_recording(tmp_path):
     write(tmp_path / "a.h5", stream)
     write(tmp_path / "a.aedat4", stream)
     write(tmp_path / "a.npz", stream)
-    np.savez(tmp_path / "b.npz", t=t_us, x=x.astype(np.int16), y=y.astype(np.int16), p=on.astype(np.uint8), frames=np.zeros((2, *DAVIS), np.uint8))
+    np.savez(
+        tmp_path / "b.npz",
+        t=t_us,
+        x=x.astype(np.int16),
+        y=y.astype(np.int16),
+        p=on.astype(np.uint8),
+        frames=np.zeros((2, *DAVIS), np.uint8),
+    )
     np.save(tmp_path / "c.npy", np.column_stack([t_us * 1e-6, x, y, on]))
     for name in ("a.h5", "a.aedat4", "a.npz", "b.npz", "c.npy"):
         (packet,) = read_packets(tmp_path / name)
@@ -160,11 +199,18 @@ def test_every_kind_of_event_file_is_a_recording(tmp_path):
         assert (packet.stream.height_px, packet.stream.width_px) == DAVIS
 
 
-@pytest.mark.parametrize(("options", "error", "reason"), [
-    (PacketOptions(window_s=-1.0), DomainError, "above 0"), (PacketOptions(window_s=0.1, events=3), DomainError, "one of both"), (PacketOptions(truth_unit="m"), DomainError, "'px/s'"),
-    (PacketOptions(window_s=9.0), DomainError, "no window of 9 s"), (PacketOptions(events=10**6), DomainError, "windows of 1000000"),
-    (PacketOptions(columns="abcd"), FileFormatError, "four letters"), (PacketOptions(time_unit="h"), FileFormatError, "time unit 'h'"),
-])
+@pytest.mark.parametrize(
+    ("options", "error", "reason"),
+    [
+        (PacketOptions(window_s=-1.0), DomainError, "above 0"),
+        (PacketOptions(window_s=0.1, events=3), DomainError, "one of both"),
+        (PacketOptions(truth_unit="m"), DomainError, "'px/s'"),
+        (PacketOptions(window_s=9.0), DomainError, "no window of 9 s"),
+        (PacketOptions(events=10**6), DomainError, "windows of 1000000"),
+        (PacketOptions(columns="abcd"), FileFormatError, "four letters"),
+        (PacketOptions(time_unit="h"), FileFormatError, "time unit 'h'"),
+    ],
+)
 def test_options_that_mean_nothing(options, error, reason, tmp_path):
     recording(tmp_path / "a", duration_s=0.05)
     with pytest.raises(error, match=reason):

@@ -13,14 +13,17 @@ from codesign.events.stream import ordered
 from codesign.flow.sources import DsecWindows, MvsecWindows, open_windows
 from codesign.flow.sources.rectified import splatted
 from codesign.flow_files import write_flow
-from studies.make_dataset_store import h5
+from studies.make_dataset.store import h5
 
 # DSEC
 
 
 def some_events(count, size, t0_us, t1_us, seed=0):
     draw = torch.Generator().manual_seed(seed)
-    t_us, x, y, on = (torch.randint(low, high, (count,), generator=draw) for low, high in ((t0_us, t1_us + 1), (0, size[1]), (0, size[0]), (0, 2)))
+    t_us, x, y, on = (
+        torch.randint(low, high, (count,), generator=draw)
+        for low, high in ((t0_us, t1_us + 1), (0, size[1]), (0, size[0]), (0, 2))
+    )
     return ordered(t_us, x, y, 2 * on - 1, *size)
 
 
@@ -30,8 +33,13 @@ def dsec_field(k):
 
 
 def make_dsec(folder, shift=(0.0, 0.0), layout="one", blosc=False, name="thun_00_a"):
-    """A sequence of 120 x 160 px in the published layout; rectification moves everything by ``shift`` (x, y)."""
-    held, flows = ((folder / "train_events" / name, folder / "train_optical_flow" / name) if layout == "two" else (folder / name, folder / name))
+    """A sequence of 120 x 160 px in the published layout; rectification moves everything by ``shift`` (x,
+    y)."""
+    held, flows = (
+        (folder / "train_events" / name, folder / "train_optical_flow" / name)
+        if layout == "two"
+        else (folder / name, folder / name)
+    )
     place = held / "events" / "left"
     place.mkdir(parents=True)
     (flows / "flow" / "forward").mkdir(parents=True)
@@ -42,7 +50,9 @@ def make_dsec(folder, shift=(0.0, 0.0), layout="one", blosc=False, name="thun_00
             for key in "xypt":
                 values = file[f"events/{key}"][()]
                 del file[f"events/{key}"]
-                file["events"].create_dataset(key, data=values, chunks=(1000,), **hdf5plugin.Blosc(cname="zstd", clevel=3, shuffle=1))
+                file["events"].create_dataset(
+                    key, data=values, chunks=(1000,), **hdf5plugin.Blosc(cname="zstd", clevel=3, shuffle=1)
+                )
     y, x = np.mgrid[0:120, 0:160].astype(np.float32)
     with h5(place / "rectify_map.h5", "w") as file:
         file["rectify_map"] = np.stack([x + np.float32(shift[0]), y + np.float32(shift[1])], -1)
@@ -74,8 +84,11 @@ def test_dsec_windows(layout, blosc, tmp_path):
 
 
 def test_events_between_pixels_are_shared_and_none_is_lost():
-    t_us, on = torch.tensor([100, 150, 200]), torch.tensor([True, False, True])
-    counts = splatted(t_us, torch.tensor([2.25, 3.0, -0.5]), torch.tensor([1.5, 2.0, 0.0]), on, 100, 200, 3, 4, 6)
+    t_us = torch.tensor([100, 150, 200])
+    on = torch.tensor([True, False, True])
+    counts = splatted(
+        t_us, torch.tensor([2.25, 3.0, -0.5]), torch.tensor([1.5, 2.0, 0.0]), on, 100, 200, 3, 4, 6
+    )
     expected = torch.zeros(2, 3, 4, 6)
     expected[0, 0, 1:3, 2], expected[0, 0, 1:3, 3] = 0.375, 0.125
     expected[1, 1, 2, 3] = 1.0
@@ -83,13 +96,24 @@ def test_events_between_pixels_are_shared_and_none_is_lost():
     torch.testing.assert_close(counts, expected, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize(("what", "reason"), [
-    ("map", "rectify_map.h5 is missing"), ("map shape", "rectify_map has shape"), ("events", "events.h5 is missing"), ("lines", "2 lines for 3 files"), ("png", "is not a PNG file"), ("clock", "the events of"),
-    ("cut", "cut or damaged"), ("nothing", "holds no sequence of DSEC"), ("left", "is missing; download the events"),
-])
+@pytest.mark.parametrize(
+    ("what", "reason"),
+    [
+        ("map", "rectify_map.h5 is missing"),
+        ("map shape", "rectify_map has shape"),
+        ("events", "events.h5 is missing"),
+        ("lines", "2 lines for 3 files"),
+        ("png", "is not a PNG file"),
+        ("clock", "the events of"),
+        ("cut", "cut or damaged"),
+        ("nothing", "holds no sequence of DSEC"),
+        ("left", "is missing; download the events"),
+    ],
+)
 def test_damaged_dsec_is_refused_at_once(what, reason, tmp_path):
     folder = make_dsec(tmp_path / "dsec")
-    place, flow = folder / "thun_00_a" / "events" / "left", folder / "thun_00_a" / "flow"
+    place = folder / "thun_00_a" / "events" / "left"
+    flow = folder / "thun_00_a" / "flow"
     times = flow / "forward_timestamps.txt"
     if what == "map":
         (place / "rectify_map.h5").unlink()
@@ -123,19 +147,30 @@ def mvsec_stream():
 
 
 def make_mvsec(folder, chunks=None):
-    """indoor_flying1 of 26 x 34 px: flow (8, -4) px per 50 ms, grey frames every 31.25 ms; nothing measured in the first columns."""
+    """indoor_flying1 of 26 x 34 px: flow (8, -4) px per 50 ms, grey frames every 31.25 ms; nothing measured
+    in the first columns."""
     folder.mkdir(parents=True)
     stream = mvsec_stream()
-    rows = torch.stack([stream.x.double(), stream.y.double(), stream.t_us.double() / 1e6, stream.p.double()], 1).numpy()
+    rows = torch.stack(
+        [stream.x.double(), stream.y.double(), stream.t_us.double() / 1e6, stream.p.double()], 1
+    ).numpy()
     with h5(folder / "indoor_flying1_data.hdf5", "w") as file:
         group = file.create_group("davis/left")
-        group.create_dataset("events", data=rows, **({} if chunks is None else {"chunks": chunks, "compression": "gzip"}))
+        group.create_dataset(
+            "events", data=rows, **({} if chunks is None else {"chunks": chunks, "compression": "gzip"})
+        )
         group["image_raw_ts"] = 10.0 + np.arange(19) * 0.03125
         group["image_raw"] = np.zeros((19, 26, 34), np.uint8)
-    x_flow, y_flow = np.full((11, 26, 34), 8.0), np.full((11, 26, 34), -4.0)
+    x_flow = np.full((11, 26, 34), 8.0)
+    y_flow = np.full((11, 26, 34), -4.0)
     x_flow[:, :, :5] = y_flow[:, :, :5] = 0.0
     save = np.savez if chunks is None else np.savez_compressed  # left on the disk, or read
-    save(folder / "indoor_flying1_gt_flow_dist.npz", timestamps=10.02 + 0.05 * np.arange(11), x_flow_dist=x_flow, y_flow_dist=y_flow)
+    save(
+        folder / "indoor_flying1_gt_flow_dist.npz",
+        timestamps=10.02 + 0.05 * np.arange(11),
+        x_flow_dist=x_flow,
+        y_flow_dist=y_flow,
+    )
     return folder
 
 
@@ -144,7 +179,13 @@ def test_mvsec_windows(frames, chunks, tmp_path):
     source = MvsecWindows(make_mvsec(tmp_path / "m", chunks), frames, bins=5)
     length_s = 0.05 if frames == 0 else 0.03125 * frames
     starts = 10.02 + 0.05 * np.arange(10) if frames == 0 else 10 + 0.03125 * np.arange(19)
-    starts = [float(t) for t in starts if t >= 10.02 and t + length_s <= 10.52 + 1e-9 and (frames == 0 or t + length_s <= 10 + 18 * 0.03125 + 1e-9)]
+    starts = [
+        float(t)
+        for t in starts
+        if t >= 10.02
+        and t + length_s <= 10.52 + 1e-9
+        and (frames == 0 or t + length_s <= 10 + 18 * 0.03125 + 1e-9)
+    ]
     assert len(source) == len(starts)
     assert source.left_out == 0
     index = len(source) // 2
@@ -153,27 +194,47 @@ def test_mvsec_windows(frames, chunks, tmp_path):
     expected = events.from_stream(mvsec_stream(), t0_us, round((starts[index] + length_s) * 1e6), 5).counts
     assert torch.equal(batch.volume.counts, expected)
     assert float(expected.sum()) > 0
-    flow, valid = batch.truth.flow_px[0], batch.truth.valid[0]
+    flow = batch.truth.flow_px[0]
+    valid = batch.truth.valid[0]
     share = length_s / 0.05
     y, x = np.mgrid[0:26, 0:34]
     assert valid[20, 7]
     assert not valid[:, :5].any()
-    torch.testing.assert_close(flow[:, valid], torch.tensor([[8.0], [-4.0]]).expand(-1, int(valid.sum())) * share, rtol=1e-6, atol=1e-5)
-    # followed through as many intervals as the window touches: it ends where a lookup, one interval's part before the end, leaves the picture
-    touched = [max(0, min(starts[index] + length_s, 10.07 + 0.05 * k) - max(starts[index], 10.02 + 0.05 * k)) / 0.05 for k in range(11)]
+    torch.testing.assert_close(
+        flow[:, valid],
+        torch.tensor([[8.0], [-4.0]]).expand(-1, int(valid.sum())) * share,
+        rtol=1e-6,
+        atol=1e-5,
+    )
+    # followed through as many intervals as the window touches: it ends where a lookup, one interval's part
+    # before the end, leaves the picture
+    touched = [
+        max(0, min(starts[index] + length_s, 10.07 + 0.05 * k) - max(starts[index], 10.02 + 0.05 * k)) / 0.05
+        for k in range(11)
+    ]
     before_last = sum(touched) - [part for part in touched if part > 1e-9][-1]
     inside = (x >= 5) & (x + 8 * before_last <= 33 + 1e-6) & (y - 4 * before_last >= -1e-6)
     np.testing.assert_array_equal(valid.numpy(), inside)
     assert batch.truth.interval_s == pytest.approx(length_s)
 
 
-@pytest.mark.parametrize(("what", "reason"), [
-    ("flow", "has no indoor_flying1_gt_flow_dist.npz"), ("npz", "no whole .npz file"), ("names", "no whole .npz file"), ("times", "rising times"), ("hdf5", "cut or damaged"),
-    ("columns", r"\[9000, 3\]"), ("nothing", "holds no"), ("short", "no window"),
-])
+@pytest.mark.parametrize(
+    ("what", "reason"),
+    [
+        ("flow", "has no indoor_flying1_gt_flow_dist.npz"),
+        ("npz", "no whole .npz file"),
+        ("names", "no whole .npz file"),
+        ("times", "rising times"),
+        ("hdf5", "cut or damaged"),
+        ("columns", r"\[9000, 3\]"),
+        ("nothing", "holds no"),
+        ("short", "no window"),
+    ],
+)
 def test_damaged_mvsec_is_refused_at_once(what, reason, tmp_path):
     folder = make_mvsec(tmp_path / "m")
-    data, flow = folder / "indoor_flying1_data.hdf5", folder / "indoor_flying1_gt_flow_dist.npz"
+    data = folder / "indoor_flying1_data.hdf5"
+    flow = folder / "indoor_flying1_gt_flow_dist.npz"
     span_s = None
     if what == "flow":
         flow.unlink()
@@ -182,7 +243,12 @@ def test_damaged_mvsec_is_refused_at_once(what, reason, tmp_path):
     elif what == "names":
         np.savez(flow, timestamps=np.arange(3.0))
     elif what == "times":
-        np.savez(flow, timestamps=np.zeros(11), x_flow_dist=np.ones((11, 26, 34)), y_flow_dist=np.ones((11, 26, 34)))
+        np.savez(
+            flow,
+            timestamps=np.zeros(11),
+            x_flow_dist=np.ones((11, 26, 34)),
+            y_flow_dist=np.ones((11, 26, 34)),
+        )
     elif what == "hdf5":
         data.write_bytes(data.read_bytes()[:2000])
     elif what == "columns":
@@ -199,7 +265,9 @@ def test_damaged_mvsec_is_refused_at_once(what, reason, tmp_path):
 
 
 def test_a_folder_is_opened_as_what_it_is(tmp_path):
-    with pytest.raises(FileFormatError, match=r"rectify_map has shape \[120, 160, 2\], \[480, 640, 2\]"):  # DSEC's own size
+    with pytest.raises(
+        FileFormatError, match=r"rectify_map has shape \[120, 160, 2\], \[480, 640, 2\]"
+    ):  # DSEC's own size
         open_windows(make_dsec(tmp_path / "d"))
     assert isinstance(open_windows(make_mvsec(tmp_path / "m"), window_frames=1), MvsecWindows)
     (tmp_path / "empty").mkdir()

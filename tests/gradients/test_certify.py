@@ -50,9 +50,14 @@ def test_scales_set_the_unit_of_every_number():
 
 
 def test_noise_is_told_from_error():
-    # A loss rounded to 1e-3 has differences good to about 1e-3 / h: on this ladder they cannot judge a gradient of 1
-    noisy = lambda p: torch.round(p["x"].sum() * 1e3) / 1e3 + (p["x"].sum() - p["x"].sum().detach())  # noqa: E731
-    (row,) = certify(noisy, {"x": torch.full((3,), 0.12345, dtype=D)}, ladder=(3e-3, 2e-3, 1.3e-3), tolerance=1e-6)
+    # A loss rounded to 1e-3 has differences good to about 1e-3 / h: on this ladder they cannot judge a
+    # gradient of 1
+    def noisy(p):
+        return torch.round(p["x"].sum() * 1e3) / 1e3 + (p["x"].sum() - p["x"].sum().detach())
+
+    (row,) = certify(
+        noisy, {"x": torch.full((3,), 0.12345, dtype=D)}, ladder=(3e-3, 2e-3, 1.3e-3), tolerance=1e-6
+    )
     assert row.verdict in ("noise", "pass")
     assert row.relative_error < 0.5
 
@@ -63,7 +68,10 @@ def test_cut_graph_is_refused():
 
 
 def test_plateau_of_a_cubic():
-    # d/dx x^3 at 1: difference is 3 + h^2, so neighbouring rungs agree best at the smallest steps and the floor is their half distance
-    found = plateau(lambda x: x.pow(3).sum(), torch.ones(1, dtype=D), torch.ones(1, dtype=D), (1e-1, 1e-2, 1e-3))
+    # d/dx x^3 at 1: difference is 3 + h^2, so neighbouring rungs agree best at the smallest steps and the
+    # floor is their half distance
+    found = plateau(
+        lambda x: x.pow(3).sum(), torch.ones(1, dtype=D), torch.ones(1, dtype=D), (1e-1, 1e-2, 1e-3)
+    )
     assert found.value == pytest.approx(3 + (1e-4 + 1e-6) / 2, abs=1e-9)
     assert found.noise == pytest.approx((1e-4 - 1e-6) / 2, rel=1e-6)

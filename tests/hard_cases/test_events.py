@@ -1,4 +1,5 @@
-"""Hard cases of the event stage: counts in closed form, gradients that stay finite, streams that refuse what cannot be."""
+"""Hard cases of the event stage: counts in closed form, gradients that stay finite, streams that refuse what
+cannot be."""
 
 import math
 
@@ -6,7 +7,17 @@ import pytest
 import torch
 
 from codesign.errors import DomainError
-from codesign.events import EventLayer, SensorModel, SensorState, lin_log, memory, sensor_counts, simulate, soft_counts, to_counts
+from codesign.events import (
+    EventLayer,
+    SensorModel,
+    SensorState,
+    lin_log,
+    memory,
+    sensor_counts,
+    simulate,
+    soft_counts,
+    to_counts,
+)
 from codesign.events.layers.layer import KINDS
 
 D = torch.float64
@@ -20,11 +31,14 @@ def level_of(value):
 
 def hard_total(values, theta):
     """Signed and absolute counts of one pixel, by the definition in plain numbers."""
-    reference, on, off = level_of(values[0]), 0, 0
+    reference = level_of(values[0])
+    on = 0
+    off = 0
     for value in values[1:]:
         count = math.trunc((level_of(value) - reference) / theta)
         reference += count * theta
-        on, off = on + max(count, 0), off + max(-count, 0)
+        on = on + max(count, 0)
+        off = off + max(-count, 0)
     return on, off
 
 
@@ -48,7 +62,8 @@ def test_counts_are_those_of_the_definition_and_gradients_are_finite(case, theta
     truth = hard_total(CASES[case], theta)
     t_s = torch.tensor([0.0, 1e-5, 0.3, 0.30001, 7.0, 7.5])[: len(frames)]  # far from uniform
     counts, _ = memory(frames, theta, theta)
-    # a level that meets a threshold to the last bit may count one frame later: at most one event per frame and polarity
+    # a level that meets a threshold to the last bit may count one frame later: at most one event per frame
+    # and polarity
     found = counts.sum((0, 2, 3)).tolist()
     assert abs(found[0] - truth[0]) <= 1
     assert abs(found[1] - truth[1]) <= 1
@@ -59,7 +74,9 @@ def test_counts_are_those_of_the_definition_and_gradients_are_finite(case, theta
     for layer in (
         lambda f: memory(f, theta, theta)[0],
         lambda f: soft_counts(f, theta, theta),
-        lambda f: sensor_counts(f, t_s, full, cutoff_hz=torch.tensor(100.0), refractory_s=torch.tensor(1e-4))[0],
+        lambda f: sensor_counts(f, t_s, full, cutoff_hz=torch.tensor(100.0), refractory_s=torch.tensor(1e-4))[
+            0
+        ],
     ):
         (grad,) = torch.autograd.grad(layer(frames).square().sum(), frames)
         assert bool(grad.isfinite().all())
@@ -67,7 +84,12 @@ def test_counts_are_those_of_the_definition_and_gradients_are_finite(case, theta
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_gradients_of_every_layer_stay_finite_on_the_worst_clip(kind):
-    frames = torch.tensor([0.0, 255.0, 0.0, 1e4, 1e-6, 20.0, 20.0, 300.0], dtype=D)[:, None, None].expand(8, 2, 3).clone().requires_grad_()
+    frames = (
+        torch.tensor([0.0, 255.0, 0.0, 1e4, 1e-6, 20.0, 20.0, 300.0], dtype=D)[:, None, None]
+        .expand(8, 2, 3)
+        .clone()
+        .requires_grad_()
+    )
     layer = EventLayer(kind, SensorModel(cutoff_hz=50.0, refractory_s=1e-3), learn=("theta_on", "theta_off"))
     counts, _ = layer(frames, torch.arange(8) * 1e-3)
     inputs = [frames, *layer.parameters()]
@@ -76,7 +98,12 @@ def test_gradients_of_every_layer_stay_finite_on_the_worst_clip(kind):
 
 
 def test_ten_thousand_events_of_one_pixel_come_evenly():
-    events = simulate(torch.tensor([0.0, 10.0005], dtype=D)[:, None, None], [0.0, 1.0], SensorModel(1e-3, 1e-3), log_input=True)
+    events = simulate(
+        torch.tensor([0.0, 10.0005], dtype=D)[:, None, None],
+        [0.0, 1.0],
+        SensorModel(1e-3, 1e-3),
+        log_input=True,
+    )
     assert len(events) == 10_000
     truth = (torch.arange(1, 10_001) * 1e-3 / 10.0005 * 1e6).round().long()
     assert (events.t_us - truth).abs().max() <= 1
@@ -85,12 +112,18 @@ def test_ten_thousand_events_of_one_pixel_come_evenly():
 def test_a_long_pause_between_frames_loses_no_microsecond():
     # one day between two frames: the crossing of the level's middle at half a day
     day_s = 86_400.0
-    events = simulate(torch.tensor([4.0, 5.0], dtype=D)[:, None, None], [1e9, 1e9 + day_s], SensorModel(0.5, 0.5), log_input=True)
+    events = simulate(
+        torch.tensor([4.0, 5.0], dtype=D)[:, None, None],
+        [1e9, 1e9 + day_s],
+        SensorModel(0.5, 0.5),
+        log_input=True,
+    )
     assert (events.t_us - torch.tensor([int(1e15 + day_s * 5e5), int(1e15 + day_s * 1e6)])).abs().max() <= 1
 
 
 def test_refused_frames_leave_a_stream_as_it_was():
-    sensor, state = SensorModel(theta_sigma=0.02, shot_rate_hz=5.0), SensorState()
+    sensor = SensorModel(theta_sigma=0.02, shot_rate_hz=5.0)
+    state = SensorState()
     good = torch.rand(5, 3, 4, generator=torch.Generator().manual_seed(0)) * 200
     simulate(good, torch.arange(5) * 0.01, sensor, state=state)
     for frames, times, words in (
@@ -121,7 +154,8 @@ def test_more_events_than_a_pixel_can_make_are_refused_instead_of_counted_for_ev
 
 
 def test_levels_and_thresholds_beyond_single_precision_steps_still_add_up():
-    # float32 near ln(1e12) = 27.6 resolves 2e-6: counts over a long ramp stay whole and add up to the way within one
+    # float32 near ln(1e12) = 27.6 resolves 2e-6: counts over a long ramp stay whole and add up to the way
+    # within one
     frames = torch.logspace(6, 12, 200)[:, None, None]
     counts, state = memory(frames, 1e-3, 1e-3)
     way = float(lin_log(frames.double())[-1] - lin_log(frames.double())[0])

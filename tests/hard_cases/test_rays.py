@@ -1,4 +1,5 @@
-"""Rays that fail: what they report, that their gradients stay finite, and that they never touch the others."""
+"""Rays that fail: what they report, that their gradients stay finite, and that they never touch the
+others."""
 
 import math
 
@@ -24,7 +25,16 @@ def unit(rows):
 
 
 def everything(out):
-    return torch.cat([out.position_mm, out.direction, out.optical_path_mm[:, None], out.weight[:, None], out.deficit[:, None]], 1)
+    return torch.cat(
+        [
+            out.position_mm,
+            out.direction,
+            out.optical_path_mm[:, None],
+            out.weight[:, None],
+            out.deficit[:, None],
+        ],
+        1,
+    )
 
 
 def learned(geo):
@@ -33,20 +43,49 @@ def learned(geo):
 
 def gradients(geo, loss):
     tensors = learned(geo)
-    return torch.cat([g.reshape(-1) for g in torch.autograd.grad(loss, tensors, allow_unused=True) if g is not None])
+    return torch.cat(
+        [g.reshape(-1) for g in torch.autograd.grad(loss, tensors, allow_unused=True) if g is not None]
+    )
 
 
 # name -> (lens, a ray that fails, its status, the surface where, its deficit by hand)
 CASES = {
     # 20 mm off the axis of a sphere of 10 mm radius: radicand 1 - (20/10)^2
-    "miss": (GeoLens([Surface(10.0, 5.0, GLASS, 9.0), Surface(INF, 10.0, None, 9.0)], 4.0), (20.0, 0.0, -5.0), (0, 0, 1.0), Status.MISS, 0, 3.0),
+    "miss": (
+        GeoLens([Surface(10.0, 5.0, GLASS, 9.0), Surface(INF, 10.0, None, 9.0)], 4.0),
+        (20.0, 0.0, -5.0),
+        (0, 0, 1.0),
+        Status.MISS,
+        0,
+        3.0,
+    ),
     # sin = 0.8 > 1/1.5 inside the glass: radicand 1 - 1.5^2 * 0.64
     "total reflection": (
-        GeoLens([Surface(INF, 5.0, GLASS, 99.0), Surface(-10.0, 10.0, None, 9.9)], 4.0), (8.0, 0.0, -5.0), (0, 0, 1.0), Status.TOTAL_REFLECTION, 1, 1.5**2 * 0.64 - 1),
+        GeoLens([Surface(INF, 5.0, GLASS, 99.0), Surface(-10.0, 10.0, None, 9.9)], 4.0),
+        (8.0, 0.0, -5.0),
+        (0, 0, 1.0),
+        Status.TOTAL_REFLECTION,
+        1,
+        1.5**2 * 0.64 - 1,
+    ),
     # exactly tangent to the sphere: radicand 0, counted as a miss
-    "grazing": (GeoLens([Surface(10.0, 5.0, GLASS, 9.0), Surface(INF, 10.0, None, 9.0)], 4.0), (10.0, 0.0, -5.0), (0, 0, 1.0), Status.MISS, 0, 1e-8),
+    "grazing": (
+        GeoLens([Surface(10.0, 5.0, GLASS, 9.0), Surface(INF, 10.0, None, 9.0)], 4.0),
+        (10.0, 0.0, -5.0),
+        (0, 0, 1.0),
+        Status.MISS,
+        0,
+        1e-8,
+    ),
     # a conic that ends at 10 / sqrt(1 + 3) = 5 mm: 1 - (1 + k) c^2 r^2 at 8 mm
-    "ellipsoid": (GeoLens([Surface(10.0, 5.0, GLASS, 4.0, conic=3.0), Surface(INF, 10.0, None, 9.0)], 4.0), (8.0, 0.0, -5.0), (0, 0, 1.0), Status.MISS, 0, 4 * 0.64 - 1),
+    "ellipsoid": (
+        GeoLens([Surface(10.0, 5.0, GLASS, 4.0, conic=3.0), Surface(INF, 10.0, None, 9.0)], 4.0),
+        (8.0, 0.0, -5.0),
+        (0, 0, 1.0),
+        Status.MISS,
+        0,
+        4 * 0.64 - 1,
+    ),
 }
 
 
@@ -67,22 +106,46 @@ def test_the_deficit_falls_when_its_gradient_is_followed(name):
     step = 1e-6
     nearer = geo.trace((x - step * slope / slope.norm()).detach(), f64([direction])).deficit
     drop = step * float(slope.norm())
-    assert abs(deficit.item() - nearer.item() - drop) <= 1e-5 * drop  # bends by the step over 10 mm; rounding 1e-16 over 1e-6
+    assert (
+        abs(deficit.item() - nearer.item() - drop) <= 1e-5 * drop
+    )  # bends by the step over 10 mm; rounding 1e-16 over 1e-6
 
 
 def mixed_lenses():
     triplet = lens.load("cooke-triplet")
     surfaces = list(triplet.to_surfaces())
-    surfaces[0] = Surface(22.01359, 3.25896, surfaces[0].medium, 9.5, conic=0.4, asphere=(0.0, -1e-6, 2e-8, -1e-10, 1e-12, 1e-14, 1e-16, 1e-18))
+    surfaces[0] = Surface(
+        22.01359,
+        3.25896,
+        surfaces[0].medium,
+        9.5,
+        conic=0.4,
+        asphere=(0.0, -1e-6, 2e-8, -1e-10, 1e-12, 1e-14, 1e-16, 1e-18),
+    )
     glass = surfaces[0].medium
-    special = GeoLens([Surface(60.0, 4.0, glass, 9.0, decentre_mm=(0.1, 0.2), tilt_deg=(1.0, -1.0)), Surface(INF, 5.0, None, 9.0, phase=Phase((-0.05, 1e-4))),
-                       Surface(-90.0, 5.0, None, 9.0, conic=-1.0, mirror=True, inner_semi_aperture_mm=0.5), Surface(40.0, 3.0, glass, 6.0), Surface(-25.0, 10.0, None, 6.0)], 10.0)
+    special = GeoLens(
+        [
+            Surface(60.0, 4.0, glass, 9.0, decentre_mm=(0.1, 0.2), tilt_deg=(1.0, -1.0)),
+            Surface(INF, 5.0, None, 9.0, phase=Phase((-0.05, 1e-4))),
+            Surface(-90.0, 5.0, None, 9.0, conic=-1.0, mirror=True, inner_semi_aperture_mm=0.5),
+            Surface(40.0, 3.0, glass, 6.0),
+            Surface(-25.0, 10.0, None, 6.0),
+        ],
+        10.0,
+    )
     special.decentre_mm.requires_grad_()
     special.tilt_rad.requires_grad_()
     return {"spheres": triplet, "asphere": GeoLens(surfaces, 10.0), "special": special}
 
 
-BAD_RAYS = [((40.0, 0.0, -5.0), (0, 0, 1.0)), ((0.0, 21.5, -5.0), (0, 0, 1.0)), ((9.0, 0.0, -5.0), (0.9, 0, 1.0)), ((0.0, 3.0, -5.0), (0, 1, 1e-9)), ((2.0, 3.0, -5.0), (0, 0.1, -1.0)), ((1e4, 0, -5.0), (0, 0, 1.0))]
+BAD_RAYS = [
+    ((40.0, 0.0, -5.0), (0, 0, 1.0)),
+    ((0.0, 21.5, -5.0), (0, 0, 1.0)),
+    ((9.0, 0.0, -5.0), (0.9, 0, 1.0)),
+    ((0.0, 3.0, -5.0), (0, 1, 1e-9)),
+    ((2.0, 3.0, -5.0), (0, 0.1, -1.0)),
+    ((1e4, 0, -5.0), (0, 0, 1.0)),
+]
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -106,7 +169,13 @@ def test_bad_rays_have_finite_values_gradients_and_positive_deficits(kind, dtype
 @pytest.mark.parametrize("kind", ["spheres", "asphere", "special"])
 def test_bad_rays_leave_the_gradients_of_good_ones_alone(kind, generator):
     geo = mixed_lenses()[kind]
-    good = torch.cat([4 * torch.rand(40, 2, generator=generator, dtype=torch.float64) - 2, torch.full((40, 1), -5.0, dtype=torch.float64)], 1)
+    good = torch.cat(
+        [
+            4 * torch.rand(40, 2, generator=generator, dtype=torch.float64) - 2,
+            torch.full((40, 1), -5.0, dtype=torch.float64),
+        ],
+        1,
+    )
     ahead = unit([(0.0, 0.1, 1.0)] * 40)
 
     def weighted(origin, direction):
@@ -115,18 +184,27 @@ def test_bad_rays_leave_the_gradients_of_good_ones_alone(kind, generator):
 
     alone, out = weighted(good, ahead)
     assert not out.status.any()
-    crowd, _ = weighted(torch.cat([good, f64([o for o, _ in BAD_RAYS])]), torch.cat([ahead, unit([d for _, d in BAD_RAYS])]))
+    crowd, _ = weighted(
+        torch.cat([good, f64([o for o, _ in BAD_RAYS])]), torch.cat([ahead, unit([d for _, d in BAD_RAYS])])
+    )
     # weight 0 times anything finite adds exactly 0; sums over lanes may run in another order
-    a, b = gradients(geo, alone), gradients(geo, crowd)
+    a = gradients(geo, alone)
+    b = gradients(geo, crowd)
     torch.testing.assert_close(b, a, rtol=1e-13, atol=1e-14 * float(a.abs().max()))
     assert alone.item() == pytest.approx(crowd.item(), rel=1e-14)
 
 
 def test_a_camera_whose_rays_all_fail_says_where():
     # the ball lens reflects everything that comes from 8 mm off the axis behind it
-    ball = GeoLens([Surface(5.0, 10.0, GLASS, 4.99, is_stop=True), Surface(-5.0, 8.0, None, 4.99)], 8.0, name="ball")
-    film, pupil = f64([[8.0, 0.0]]), f64([[-1.0, 0.0]])
-    with pytest.raises(DomainError, match=r"ball: every ray fails \(most at surface \d of 2, counted from the object\); weaken"):
+    ball = GeoLens(
+        [Surface(5.0, 10.0, GLASS, 4.99, is_stop=True), Surface(-5.0, 8.0, None, 4.99)], 8.0, name="ball"
+    )
+    film = f64([[8.0, 0.0]])
+    pupil = f64([[-1.0, 0.0]])
+    with pytest.raises(
+        DomainError,
+        match=r"ball: every ray fails \(most at surface \d of 2, counted from the object\); weaken",
+    ):
         ball.camera_rays(film, pupil)
     with pytest.raises(DomainError, match="ball: every ray fails"):
         render.Camera(ball, 4, 4, 0.1, 1, film=render.Film(400, 400, 2, 2, 0.1, ((0, 0),))).rays()
@@ -139,8 +217,16 @@ def test_a_camera_that_is_all_vignetted_says_so():
 
 
 def test_a_telecentric_stop_is_named():
-    # stop in the front focal plane of a thin plano-convex lens: f = R / (n - 1) = 100, its exit pupil at infinity
-    telecentric = GeoLens([Surface(INF, 100.0, None, 5.0, is_stop=True), Surface(50.0, 1.0, GLASS, 9.0), Surface(INF, 100.0, None, 9.0)], 3.0)
+    # stop in the front focal plane of a thin plano-convex lens: f = R / (n - 1) = 100, its exit pupil at
+    # infinity
+    telecentric = GeoLens(
+        [
+            Surface(INF, 100.0, None, 5.0, is_stop=True),
+            Surface(50.0, 1.0, GLASS, 9.0),
+            Surface(INF, 100.0, None, 9.0),
+        ],
+        3.0,
+    )
     with pytest.raises(DomainError, match="telecentric"):
         telecentric.camera_rays(f64([[0.0, 0.0]]), f64([[0.0, 0.0]]))
 
@@ -163,42 +249,61 @@ def test_no_rays_wrong_shapes_and_non_finite_rays_are_refused():
 
 def test_concentric_spheres_leave_rays_through_their_centre_straight():
     # both radii end in one centre: a ray towards it meets every surface along the normal
-    geo = GeoLens([Surface(10.0, 4.0, GLASS, 9.9), Surface(6.0, 12.0, Glass.named("F2"), 5.9), Surface(-6.0, 20.0, None, 5.9)], 4.0)
+    geo = GeoLens(
+        [
+            Surface(10.0, 4.0, GLASS, 9.9),
+            Surface(6.0, 12.0, Glass.named("F2"), 5.9),
+            Surface(-6.0, 20.0, None, 5.9),
+        ],
+        4.0,
+    )
     towards = unit([(x, y, 1.0) for x, y in ((0.0, 0.0), (0.3, 0.1), (-0.6, 0.2), (0.0, 0.9))])
     out = geo.trace(f64([0.0, 0.0, 10.0]) - 30 * towards, towards)
     assert not out.status.any()
     torch.testing.assert_close(out.direction, towards, rtol=0, atol=1e-13)
     # centre at z = 10, image plane at 4 + 12 + 20 = 36
-    torch.testing.assert_close(out.position_mm[:, :2], towards[:, :2] / towards[:, 2:] * 26, rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        out.position_mm[:, :2], towards[:, :2] / towards[:, 2:] * 26, rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("name", ["double-gauss", "cooke-triplet"])
 def test_single_precision_from_ten_kilometres_away(name):
-    # a parallel beam whose origins lie 10 km before the lens must land where the beam started at the lens does
-    near, far = f64([(x, y, -5.0) for x, y in ((0.0, 0.0), (2.0, 0.0), (0.0, -3.0), (1.5, 2.5))]).float(), None
+    # a parallel beam whose origins lie 10 km before the lens must land where the beam started at the lens
+    # does
+    near = f64([(x, y, -5.0) for x, y in ((0.0, 0.0), (2.0, 0.0), (0.0, -3.0), (1.5, 2.5))]).float()
+    far = None
     far = near * f64([1, 1, 2e6]).float()
     direction = torch.tensor([[0.0, 0.0, 1.0]]).expand(4, 3).contiguous()
     truth = lens.load(name).trace(near.double(), direction.double())
     out = lens.load(name, torch.float32).trace(far, direction)
     assert not out.status.any()
-    assert float((out.position_mm - truth.position_mm).detach().abs().max()) <= 3e-5  # no worse than from 5 mm
+    assert (
+        float((out.position_mm - truth.position_mm).detach().abs().max()) <= 3e-5
+    )  # no worse than from 5 mm
 
 
 def test_a_ball_lens_has_its_textbook_focal_length():
-    # Hecht, Optics, ch. 6: f = n R / (2 (n - 1)) from the centre; rays start behind the centre of the second half
-    R, n = 5.0, 1.5
+    # Hecht, Optics, ch. 6: f = n R / (2 (n - 1)) from the centre; rays start behind the centre of the second
+    # half
+    R = 5.0
+    n = 1.5
     ball = GeoLens([Surface(R, 2 * R, GLASS, 4.99), Surface(-R, n * R / (2 * (n - 1)) - R, None, 4.99)], 2.0)
     height = 1e-4
     out = ball.trace(f64([[height, 0, -9.0], [4.0, 0.0, -9.0]]), f64([[0, 0, 1.0]] * 2))
-    assert abs(out.position_mm[0, 0].item()) <= 1e-8 * height  # spherical aberration at this height: (1e-4 / 5)^2 of it
-    # 4 mm off the axis: sin i = 0.8, bent by 2 (i - i') altogether; crosses the axis at R sin i / sin(2 (i - i')) from the centre
+    assert (
+        abs(out.position_mm[0, 0].item()) <= 1e-8 * height
+    )  # spherical aberration at this height: (1e-4 / 5)^2 of it
+    # 4 mm off the axis: sin i = 0.8, bent by 2 (i - i') altogether; crosses the axis at R sin i / sin(2 (i -
+    # i')) from the centre
     turn = 2 * (math.asin(0.8) - math.asin(0.8 / n))
     crossing = 4.0 / math.sin(turn)
     assert abs(out.position_mm[1, 0].item() - math.tan(turn) * (crossing - n * R / (2 * (n - 1)))) <= 1e-12
 
 
 def test_the_far_half_of_a_sphere_is_not_a_surface():
-    # a ray that dives past the rim behind the centre would meet the sphere only on the half that the lens does not have
+    # a ray that dives past the rim behind the centre would meet the sphere only on the half that the lens
+    # does not have
     geo = GeoLens([Surface(10.0, 5.0, GLASS, 9.0), Surface(INF, 10.0, None, 9.0)], 4.0)
     towards = unit([(-1.0, 0.0, 0.05)])
     start = f64([[30.0, 0.0, 13.0 - 0.05 * 30]])  # passes the axis at z = 13, beyond the centre at 10
@@ -208,10 +313,18 @@ def test_the_far_half_of_a_sphere_is_not_a_surface():
 
 
 def test_flat_surfaces_have_the_derivatives_of_slightly_bent_ones():
-    """At zero curvature the sphere has no centre, but the ray and its derivative do: central differences over 1e-6 per mm err by their square."""
+    """At zero curvature the sphere has no centre, but the ray and its derivative do: central differences over
+    1e-6 per mm err by their square."""
     flat = GeoLens([Surface(INF, 4.0, GLASS, 9.0), Surface(INF, 30.0, None, 9.0)], 4.0)
-    origin, direction = f64([(1.0, 2.0, -5.0), (-3.0, 0.5, -5.0)]), unit([(0.1, 0.05, 1.0)] * 2)
-    merit = lambda c: (flat.replace(curvature_per_mm=c).trace(origin, direction).position_mm[:, :2] * f64([[1.0, 0.3], [-0.7, 0.2]])).sum()  # noqa: E731
+    origin = f64([(1.0, 2.0, -5.0), (-3.0, 0.5, -5.0)])
+    direction = unit([(0.1, 0.05, 1.0)] * 2)
+
+    def merit(c):
+        return (
+            flat.replace(curvature_per_mm=c).trace(origin, direction).position_mm[:, :2]
+            * f64([[1.0, 0.3], [-0.7, 0.2]])
+        ).sum()
+
     start = torch.zeros(2, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(merit(start), start)
     for i, shift in enumerate(1e-6 * torch.eye(2, dtype=torch.float64)):
@@ -220,7 +333,8 @@ def test_flat_surfaces_have_the_derivatives_of_slightly_bent_ones():
 
 @pytest.mark.parametrize("distance", [1e-3, 1e-5, 1e-7])
 def test_grazing_rays_have_the_steep_but_true_derivatives_of_the_closed_form(distance):
-    """A ray parallel to the axis at R - e meets the sphere at depth R - sqrt(R^2 - h^2), whose slope in h is h / sqrt(R^2 - h^2)."""
+    """A ray parallel to the axis at R - e meets the sphere at depth R - sqrt(R^2 - h^2), whose slope in h is
+    h / sqrt(R^2 - h^2)."""
     radius = 10.0
     height = radius - distance
     ball = GeoLens([Surface(radius, 20.0, GLASS, 9.999)], 4.0).prescription().until(0)
@@ -229,15 +343,20 @@ def test_grazing_rays_have_the_steep_but_true_derivatives_of_the_closed_form(dis
     depth = radius - math.sqrt((radius - height) * (radius + height))
     assert out.position_mm[0, 2].item() == pytest.approx(depth, abs=1e-11)
     (slope,) = torch.autograd.grad(out.position_mm[0, 2], origin)
-    # R^2 - h^2 is a difference of nearly equal numbers: rounding 1e-16 relative to 2 e / R, and half of that in the root
-    assert slope[0, 1].item() == pytest.approx(height / math.sqrt((radius - height) * (radius + height)), rel=1e-15 * radius / distance + 1e-12)
+    # R^2 - h^2 is a difference of nearly equal numbers: rounding 1e-16 relative to 2 e / R, and half of that
+    # in the root
+    assert slope[0, 1].item() == pytest.approx(
+        height / math.sqrt((radius - height) * (radius + height)), rel=1e-15 * radius / distance + 1e-12
+    )
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_when_all_rays_are_blocked_the_loss_is_zero_and_so_are_its_gradients(dtype):
-    """Weights of blocked rays are exactly 0, the hard mask says so, and the merit of what arrives has the gradient 0, not NaN."""
+    """Weights of blocked rays are exactly 0, the hard mask says so, and the merit of what arrives has the
+    gradient 0, not NaN."""
     geo = lens.load("cooke-triplet", dtype)
-    origin, direction = f64([(0.0, 9.9, -5.0), (9.8, 0.0, -5.0)]).to(dtype), f64([(0, 0, 1.0)] * 2).to(dtype)
+    origin = f64([(0.0, 9.9, -5.0), (9.8, 0.0, -5.0)]).to(dtype)
+    direction = f64([(0, 0, 1.0)] * 2).to(dtype)
     out = geo.trace(origin, direction)
     assert not out.inside.any()
     assert out.weight.tolist() == [0.0, 0.0]
@@ -247,9 +366,13 @@ def test_when_all_rays_are_blocked_the_loss_is_zero_and_so_are_its_gradients(dty
 
 
 def test_the_hard_mask_is_half_the_soft_edge():
-    """9.4 and 9.6 mm at an aperture of 9.5 mm with an edge of 0.4 mm: both within the soft edge, one inside."""
+    """9.4 and 9.6 mm at an aperture of 9.5 mm with an edge of 0.4 mm: both within the soft edge, one
+    inside."""
     geo = GeoLens([Surface(INF, 10.0, None, 9.5)], 4.0, soft_edge_mm=0.4)
-    out = geo.trace(f64([(0.0, 9.4, 0.0), (0.0, 9.5 + 1e-9, 0.0), (0.0, 9.6, 0.0), (0.0, 9.1, 0.0)]), f64([(0, 0, 1.0)] * 4))
+    out = geo.trace(
+        f64([(0.0, 9.4, 0.0), (0.0, 9.5 + 1e-9, 0.0), (0.0, 9.6, 0.0), (0.0, 9.1, 0.0)]),
+        f64([(0, 0, 1.0)] * 4),
+    )
     assert out.inside.tolist() == [True, False, False, True]
     assert out.weight[1].item() == pytest.approx(0.5, abs=1e-8)
     assert 0.5 < out.weight[0].item() < 1

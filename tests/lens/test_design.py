@@ -37,8 +37,14 @@ def test_the_focal_length_is_held_exactly(name, target_mm):
     "surfaces",
     [
         [Surface(20.0, 40.0, GLASS, 5.0)],  # one surface, the image inside the glass
-        [Surface(30.0, 4.0, GLASS, 5.0), Surface(-80.0, 40.0, Glass.named("F2"), 5.0)],  # the image inside the second glass
-        [Surface(30.0, 4.0, GLASS, 5.0), Surface(-80.0, 40.0, None, 5.0, asphere=(-1e-3, 1e-6))],  # the last surface has an r^2 term
+        [
+            Surface(30.0, 4.0, GLASS, 5.0),
+            Surface(-80.0, 40.0, Glass.named("F2"), 5.0),
+        ],  # the image inside the second glass
+        [
+            Surface(30.0, 4.0, GLASS, 5.0),
+            Surface(-80.0, 40.0, None, 5.0, asphere=(-1e-3, 1e-6)),
+        ],  # the last surface has an r^2 term
     ],
 )
 def test_the_focal_length_is_held_in_any_medium(surfaces):
@@ -50,10 +56,14 @@ def test_holding_is_differentiable_and_leaves_no_freedom():
     held = hold_efl(geo, 50.0)
     tensors = [geo.curvature_per_mm, geo.thickness_mm]
     for grad, value in zip(torch.autograd.grad(held.first_order().efl_mm, tensors), tensors, strict=True):
-        # d efl vanishes; its two halves are as large as d efl / d c of the free lens, some 1e3, and cancel to rounding
+        # d efl vanishes; its two halves are as large as d efl / d c of the free lens, some 1e3, and cancel to
+        # rounding
         assert float((grad * value.detach().abs().mean()).abs().max()) <= 1e-10
     held = hold_efl(geo, 50.0)
-    solved = lambda t: hold_efl(geo.replace(thickness_mm=t), 50.0).curvature_per_mm[-1]  # noqa: E731
+
+    def solved(t):
+        return hold_efl(geo.replace(thickness_mm=t), 50.0).curvature_per_mm[-1]
+
     t = geo.thickness_mm.detach()
     (found,) = torch.autograd.grad(held.curvature_per_mm[-1], geo.thickness_mm)
     for i in range(t.numel()):
@@ -64,13 +74,18 @@ def test_holding_is_differentiable_and_leaves_no_freedom():
 
 def test_a_surface_without_power_is_refused():
     with pytest.raises(DomainError, match="index step 0"):
-        hold_efl(GeoLens([Surface(30.0, 4.0, GLASS, 5.0), Surface(-80.0, 40.0, GLASS, 5.0)], 4.0), 50.0, surface=1)
+        hold_efl(
+            GeoLens([Surface(30.0, 4.0, GLASS, 5.0), Surface(-80.0, 40.0, GLASS, 5.0)], 4.0), 50.0, surface=1
+        )
 
 
 def test_zero_variables_are_the_reference(design):
-    geo, reference = design.lens(torch.zeros_like(design.basis[0])), lens.load("cooke-triplet")
+    geo = design.lens(torch.zeros_like(design.basis[0]))
+    reference = lens.load("cooke-triplet")
     torch.testing.assert_close(geo.curvature_per_mm, reference.curvature_per_mm, rtol=1e-13, atol=1e-15)
-    torch.testing.assert_close(geo.thickness_mm, reference.thickness_mm, rtol=1e-13, atol=0)  # 33 widths above the floor: exp(-33)
+    torch.testing.assert_close(
+        geo.thickness_mm, reference.thickness_mm, rtol=1e-13, atol=0
+    )  # 33 widths above the floor: exp(-33)
 
 
 def test_making_a_design_leaves_the_lens_alone():
@@ -84,7 +99,8 @@ def test_making_a_design_leaves_the_lens_alone():
 
 
 def motion(design, variables):
-    """Ray motion about each spot's mean per unit along a direction of the variables, [rays * 2] mm, RMS-normalised."""
+    """Ray motion about each spot's mean per unit along a direction of the variables, [rays * 2] mm,
+    RMS-normalised."""
     ahead, behind = (lens.spots(design.lens(0.01 * s * variables), FIELDS)[0] for s in (1, -1))
     moved = (ahead - behind) / 0.02
     return (moved - moved.mean(1, keepdim=True)).reshape(-1) / (moved.shape[0] * moved.shape[1]) ** 0.5
@@ -93,8 +109,12 @@ def motion(design, variables):
 def test_every_unit_variable_moves_the_rays_by_the_stated_rms_each_in_its_own_way(design):
     units = torch.eye(design.basis.shape[0], dtype=D)
     jacobian = torch.stack([motion(design, unit) for unit in units], 1)
-    size = torch.cat([design.reference.curvature_per_mm.abs().mean().expand(5), design.reference.thickness_mm])
-    held = (design.basis.abs() / size[:, None]).amax(0) >= 0.1 * (1 - 1e-9)  # a tenth of a curvature or thickness is the limit
+    size = torch.cat(
+        [design.reference.curvature_per_mm.abs().mean().expand(5), design.reference.thickness_mm]
+    )
+    held = (design.basis.abs() / size[:, None]).amax(0) >= 0.1 * (
+        1 - 1e-9
+    )  # a tenth of a curvature or thickness is the limit
     gram = jacobian.T @ jacobian / 0.01**2
     free = ~held
     assert int(free.sum()) >= 3  # the strong modes: defocus and its kin
@@ -106,13 +126,18 @@ def test_every_unit_variable_moves_the_rays_by_the_stated_rms_each_in_its_own_wa
 def test_gradients_reach_every_variable(design, generator):
     at = (0.1 * torch.randn(design.basis.shape[0], dtype=D, generator=generator)).requires_grad_()
     weights = torch.randn(2, 812, 2, dtype=D, generator=generator)
-    loss = lambda v: (lens.spots(design.lens(v), FIELDS)[0] * weights).sum()  # noqa: E731
+
+    def loss(v):
+        return (lens.spots(design.lens(v), FIELDS)[0] * weights).sum()
+
     (found,) = torch.autograd.grad(loss(at), at)
     for v in range(at.numel()):
         step = torch.zeros_like(design.basis[0])
         step[v] = 1e-4
         truth = float((loss(at + step) - loss(at - step)).detach()) / 2e-4
-        assert abs(float(found[v]) - truth) <= 1e-6 * float(found.abs().max())  # steps of 1e-4 units bend by 1e-8 or so
+        assert abs(float(found[v]) - truth) <= 1e-6 * float(
+            found.abs().max()
+        )  # steps of 1e-4 units bend by 1e-8 or so
 
 
 def test_thicknesses_stay_above_their_floors(design):
@@ -121,11 +146,20 @@ def test_thicknesses_stay_above_their_floors(design):
     thickness = design.changed(crushed).thickness_mm
     assert bool((thickness >= design.floor_mm).all())
     torch.testing.assert_close(thickness, design.floor_mm, rtol=1e-6, atol=0)
-    torch.testing.assert_close(design.floor_mm, 0.6 * lens.load("cooke-triplet").thickness_mm.detach(), rtol=1e-14, atol=0)
+    torch.testing.assert_close(
+        design.floor_mm, 0.6 * lens.load("cooke-triplet").thickness_mm.detach(), rtol=1e-14, atol=0
+    )
 
 
 def test_a_lens_with_a_zero_gap_makes_a_design_of_finite_steps():
-    cemented = GeoLens([Surface(50.0, 3.0, GLASS, 5.0), Surface(-50.0, 0.0, Glass.named("F2"), 5.0), Surface(-80.0, 60.0, None, 5.0)], 8.0)
+    cemented = GeoLens(
+        [
+            Surface(50.0, 3.0, GLASS, 5.0),
+            Surface(-50.0, 0.0, Glass.named("F2"), 5.0),
+            Surface(-80.0, 60.0, None, 5.0),
+        ],
+        8.0,
+    )
     made = make_design(cemented, [0.0], 0.01)
     assert bool(made.basis.isfinite().all())
     assert not made.basis[3].any()  # a change relative to nothing
@@ -135,20 +169,34 @@ def test_a_lens_with_a_zero_gap_makes_a_design_of_finite_steps():
 def test_edge_thickness_by_hand():
     # R = 50 and -40 at the larger semi-aperture 12: sags 50 - sqrt(50^2 - 144) and -(40 - sqrt(40^2 - 144))
     geo = GeoLens([Surface(50.0, 6.0, GLASS, 12.0), Surface(-40.0, 30.0, None, 10.0)], 8.0)
-    sag = lambda R: R - math.sqrt(R * R - 144)  # noqa: E731
+
+    def sag(R):
+        return R - math.sqrt(R * R - 144)
+
     assert edge_thickness_mm(geo).tolist() == pytest.approx([6 - sag(50.0) - sag(40.0)], abs=1e-13)
     # a paraboloid r^2 / 2R and an r^4 term
-    bent = GeoLens([Surface(50.0, 6.0, GLASS, 12.0, conic=-1.0), Surface(math.inf, 30.0, None, 10.0, asphere=(0.0, 1e-5))], 8.0)
+    bent = GeoLens(
+        [
+            Surface(50.0, 6.0, GLASS, 12.0, conic=-1.0),
+            Surface(math.inf, 30.0, None, 10.0, asphere=(0.0, 1e-5)),
+        ],
+        8.0,
+    )
     assert edge_thickness_mm(bent).tolist() == pytest.approx([6 - 144 / 100 + 1e-5 * 144**2], abs=1e-13)
 
 
 def test_penalty_by_hand_and_its_slope():
     geo = GeoLens([Surface(50.0, 6.0, GLASS, 12.0), Surface(-40.0, 30.0, None, 10.0)], 8.0)
     edge = float(edge_thickness_mm(geo).detach())
-    wants = lambda floor: LensDesign(geo, 50.0, torch.eye(3, dtype=D), geo.thickness_mm, torch.tensor([floor], dtype=D))  # noqa: E731
+
+    def wants(floor):
+        return LensDesign(geo, 50.0, torch.eye(3, dtype=D), geo.thickness_mm, torch.tensor([floor], dtype=D))
+
     assert wants(edge - 0.1).penalty(geo).item() == 0
     lacking = wants(edge + 0.25)
-    assert lacking.penalty(geo).item() == pytest.approx((0.25 / 0.5) ** 2, rel=1e-12)  # 1 % of 50 mm is 0.5 mm
+    assert lacking.penalty(geo).item() == pytest.approx(
+        (0.25 / 0.5) ** 2, rel=1e-12
+    )  # 1 % of 50 mm is 0.5 mm
     (slope,) = torch.autograd.grad(lacking.penalty(geo), geo.thickness_mm)
     assert slope.tolist() == pytest.approx([-2 * 0.25 / 0.5**2, 0.0], rel=1e-12)
 
@@ -159,7 +207,9 @@ def test_detuning_reaches_its_target_and_keeps_the_other_thicknesses(design, see
     assert abs(float(lens.rms_spot_mm(geo, FIELDS).mean()) / 0.05 - 1) <= 1e-9  # forty halvings
     assert abs(efl(geo) / design.efl_mm - 1) <= 1e-12
     torch.testing.assert_close(geo.thickness_mm[:-1], design.reference.thickness_mm[:-1], rtol=1e-12, atol=0)
-    assert float((geo.curvature_per_mm / design.reference.curvature_per_mm - 1).abs().min()) > 0  # every curvature took part
+    assert (
+        float((geo.curvature_per_mm / design.reference.curvature_per_mm - 1).abs().min()) > 0
+    )  # every curvature took part
     again = detune(design, FIELDS, 0.05, torch.Generator().manual_seed(seed))
     assert torch.equal(geo.curvature_per_mm, again.curvature_per_mm)
 

@@ -17,7 +17,13 @@ def page(**changes):
         {"radius_mm": 50.0, "thickness_mm": 3.0, "medium": "N-BK7", "semi_aperture_mm": 5.0},
         {"radius_mm": None, "thickness_mm": 40.0, "medium": None, "semi_aperture_mm": 5.0},
     ]
-    return {"schema": "codesign-lens/1", "name": "test", "entrance_pupil_diameter_mm": 8.0, "surfaces": surfaces, **changes}
+    return {
+        "schema": "codesign-lens/1",
+        "name": "test",
+        "entrance_pupil_diameter_mm": 8.0,
+        "surfaces": surfaces,
+        **changes,
+    }
 
 
 def with_surface(**changes):
@@ -34,7 +40,15 @@ def write(folder, content):
 
 def special_lens():
     surfaces = [
-        Surface(31.7, 5.1, Glass.from_indices(1.61, 1.6, 1.595, "mine"), 9.0, conic=-0.7, asphere=(1e-4, -2.2e-6), is_stop=True),
+        Surface(
+            31.7,
+            5.1,
+            Glass.from_indices(1.61, 1.6, 1.595, "mine"),
+            9.0,
+            conic=-0.7,
+            asphere=(1e-4, -2.2e-6),
+            is_stop=True,
+        ),
         Surface(-50.3, 0.1, None, 9.0),
         Surface(float("inf"), 2.0, Glass.named("F2"), 8.0, asphere=(0.0, 1e-7, 3e-9)),
         Surface(-44.4, 41.0, None, 8.0, conic=0.3),
@@ -45,14 +59,32 @@ def special_lens():
 def rare_lens():
     """A lens with everything only the newer schema holds."""
     surfaces = [
-        Surface(31.7, 5.1, Glass.from_abbe(1.6123, 44.1), 9.0, is_stop=True, phase=Phase((-3.3, 0.01), order=2, blaze_um=0.55)),
+        Surface(
+            31.7,
+            5.1,
+            Glass.from_abbe(1.6123, 44.1),
+            9.0,
+            is_stop=True,
+            phase=Phase((-3.3, 0.01), order=2, blaze_um=0.55),
+        ),
         Surface(-250.0, 20.0, None, 9.0, inner_semi_aperture_mm=1.25),
-        Surface(-180.3, 21.0, None, 9.0, conic=-1.1, mirror=True, decentre_mm=(0.1, -0.2), tilt_deg=(0.3, 1 / 3)),
+        Surface(
+            -180.3, 21.0, None, 9.0, conic=-1.1, mirror=True, decentre_mm=(0.1, -0.2), tilt_deg=(0.3, 1 / 3)
+        ),
     ]
     return GeoLens(surfaces, 9.5, soft_edge_mm=0.15, name="rare", half_field_deg=12.3)
 
 
-@pytest.mark.parametrize("make", [special_lens, rare_lens, lambda: lens.load("cooke-triplet"), lambda: lens.load("double-gauss"), lambda: lens.load("la1509").scaled(0.37)])
+@pytest.mark.parametrize(
+    "make",
+    [
+        special_lens,
+        rare_lens,
+        lambda: lens.load("cooke-triplet"),
+        lambda: lens.load("double-gauss"),
+        lambda: lens.load("la1509").scaled(0.37),
+    ],
+)
 def test_a_round_trip_is_exact(make, tmp_path):
     before = make()
     lens.save(before, tmp_path / "a.json")
@@ -70,12 +102,21 @@ def test_a_round_trip_is_exact(make, tmp_path):
 
 def test_changed_values_are_what_is_saved(tmp_path, generator):
     geo = special_lens()
-    changed = geo.replace(curvature_per_mm=geo.curvature_per_mm * 1.1, thickness_mm=geo.thickness_mm + 0.01, index_offset=torch.tensor([0.01, 0, -0.02, 0], dtype=torch.float64))
+    changed = geo.replace(
+        curvature_per_mm=geo.curvature_per_mm * 1.1,
+        thickness_mm=geo.thickness_mm + 0.01,
+        index_offset=torch.tensor([0.01, 0, -0.02, 0], dtype=torch.float64),
+    )
     lens.save(changed, tmp_path / "a.json")
     after = lens.load(tmp_path / "a.json")
-    rays = torch.tensor([[1.0, 2.0, -5.0], [-3.0, 0.5, -5.0]], dtype=torch.float64), torch.tensor([[0.0, 0.0, 1.0]] * 2, dtype=torch.float64)
+    rays = (
+        torch.tensor([[1.0, 2.0, -5.0], [-3.0, 0.5, -5.0]], dtype=torch.float64),
+        torch.tensor([[0.0, 0.0, 1.0]] * 2, dtype=torch.float64),
+    )
     # 1 / (1 / c) may differ from c in the last bit
-    torch.testing.assert_close(after.trace(*rays).position_mm, changed.trace(*rays).position_mm, rtol=0, atol=1e-13)
+    torch.testing.assert_close(
+        after.trace(*rays).position_mm, changed.trace(*rays).position_mm, rtol=0, atol=1e-13
+    )
 
 
 BAD = {
@@ -93,12 +134,18 @@ BAD = {
     "radius zero": (with_surface(radius_mm=0.0), "radius 0.0 mm"),
     "radius NaN": (with_surface(radius_mm=float("nan")), "surface 1: radius_mm is nan, a finite number"),
     "thickness negative": (with_surface(thickness_mm=-1.5), "thickness -1.5 mm is negative"),
-    "thickness infinite": (with_surface(thickness_mm=float("inf")), "surface 1: thickness_mm is inf, a finite number"),
+    "thickness infinite": (
+        with_surface(thickness_mm=float("inf")),
+        "surface 1: thickness_mm is inf, a finite number",
+    ),
     "thickness true": (with_surface(thickness_mm=True), "thickness_mm is 'True'"),
     "thickness a list": (with_surface(thickness_mm=[[1]]), "thickness_mm is"),
     "number too large": (json.dumps(page()).replace("50.0", "1" + "0" * 400), "a finite number is needed"),
     "number of 5000 digits": (json.dumps(page()).replace("50.0", "1" * 5000), "not readable JSON"),
-    "aperture beyond the radius": (with_surface(radius_mm=4.0), "semi-aperture 5.0 mm exceeds what radius 4.0 mm"),
+    "aperture beyond the radius": (
+        with_surface(radius_mm=4.0),
+        "semi-aperture 5.0 mm exceeds what radius 4.0 mm",
+    ),
     "aperture beyond the conic": (with_surface(conic=120.0), "conic 120.0 reach"),
     "aperture zero": (with_surface(semi_aperture_mm=0), "semi-aperture 0.0 mm must be positive"),
     "glass unknown": (with_surface(medium="UNOBTAINIUM"), "glass 'UNOBTAINIUM' is not in the catalogue"),
@@ -111,23 +158,37 @@ BAD = {
     "asphere NaN": (with_surface(asphere=[float("nan")]), "asphere is nan, a finite number"),
     "stop a string": (with_surface(is_stop="false"), "is_stop is 'false', true or false is needed"),
     "two stops": (page(surfaces=[{**s, "is_stop": True} for s in page()["surfaces"]]), "mark one"),
-    "pupil missing": ({k: v for k, v in page().items() if k != "entrance_pupil_diameter_mm"}, "'entrance_pupil_diameter_mm' is missing"),
+    "pupil missing": (
+        {k: v for k, v in page().items() if k != "entrance_pupil_diameter_mm"},
+        "'entrance_pupil_diameter_mm' is missing",
+    ),
     "pupil negative": (page(entrance_pupil_diameter_mm=-1), "entrance pupil diameter -1.0 mm"),
     "pupil infinite": (page(entrance_pupil_diameter_mm=float("inf")), "entrance pupil diameter inf mm"),
     "soft edge NaN": (page(soft_edge_mm=float("nan")), "soft_edge_mm is nan, a finite number"),
     "a key twice": (json.dumps(page())[:-1] + ', "name": "again"}', "the key 'name' comes twice"),
-    "nested too deep for a lens": (page(name=[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]), "nests deeper than 30"),
+    "nested too deep for a lens": (
+        page(name=[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[[]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]]),
+        "nests deeper than 30",
+    ),
     "an unknown field": (with_surface(toroid=3.0), "surface 1: the field 'toroid' is not understood"),
     "an unknown field of the lens": (page(zoom=2), "the field 'zoom' is not understood"),
     "mirror a number": (with_surface(mirror=1), "mirror is '1', true or false"),
     "phase a list": (with_surface(phase=[1.0]), "phase is"),
     "phase empty": (with_surface(phase={"coefficients": []}), "needs finite coefficients"),
-    "order a fraction": (with_surface(phase={"coefficients": [-3.0], "order": 1.5}), "order is '1.5', a whole number"),
+    "order a fraction": (
+        with_surface(phase={"coefficients": [-3.0], "order": 1.5}),
+        "order is '1.5', a whole number",
+    ),
     "order huge": (with_surface(phase={"coefficients": [-3.0], "order": 10**300}), "a whole number"),
     "decentre of one number": (with_surface(decentre_mm=[1.0]), "decentre_mm has 1 numbers, two"),
     "obstruction too large": (with_surface(inner_semi_aperture_mm=6.0), "central obstruction of 6.0 mm"),
     "half field of 90 degrees": (page(half_field_deg=90.0), "half field 90.0 degrees"),
-    "glass of an unknown model": (with_surface(medium={"name": "x", "model": "herzberger", "coefficients": [1.5], "range_um": [0.4, 0.7]}), "model 'herzberger' is not known"),
+    "glass of an unknown model": (
+        with_surface(
+            medium={"name": "x", "model": "herzberger", "coefficients": [1.5], "range_um": [0.4, 0.7]}
+        ),
+        "model 'herzberger' is not known",
+    ),
     "soft edge negative": (page(soft_edge_mm=-0.1), "soft edge -0.1 mm"),
     "deeply nested": ("[" * 100_000 + "]" * 100_000, "not readable JSON"),
     "huge": (" " * 2_000_001, "more than 2000000 bytes"),

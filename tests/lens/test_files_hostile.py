@@ -1,4 +1,5 @@
-"""Hostile lens files: every one ends in one sentence, after a bounded amount of reading, whatever its extension."""
+"""Hostile lens files: every one ends in one sentence, after a bounded amount of reading, whatever its
+extension."""
 
 import os
 import random
@@ -68,7 +69,9 @@ def test_no_more_than_the_limit_is_ever_read(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
 def test_what_is_no_regular_file_is_neither_waited_for_nor_followed(extension, tmp_path):
-    pipe, folder, loop, link = (tmp_path / f"{name}{extension}" for name in ("pipe", "folder", "loop", "link"))
+    pipe, folder, loop, link = (
+        tmp_path / f"{name}{extension}" for name in ("pipe", "folder", "loop", "link")
+    )
     os.mkfifo(pipe)
     folder.mkdir()
     loop.symlink_to(loop)
@@ -112,7 +115,8 @@ def test_a_damaged_real_file_is_refused_or_is_a_lens(extension, tmp_path, genera
     random_ = random.Random(1)
     lens_count = 0
     for _ in range(150):
-        at, new = random_.randrange(len(good)), random_.choice("0123456789-+.eEnN \n;&!'\"{}[],:Sx\x00\xe9")
+        at = random_.randrange(len(good))
+        new = random_.choice("0123456789-+.eEnN \n;&!'\"{}[],:Sx\x00\xe9")
         path.write_text(good[:at] + new + good[at + 1 :], encoding="utf-8")
         try:
             geo = lens.load(path)

@@ -16,7 +16,8 @@ from codesign.lens.spectrum import LINE_UM
 
 ROWS = {row[0]: row for row in glass_catalogue.rows()}
 
-# indices as the makers' own tables print them beside the coefficients, to five decimals: Schott 2018, Ohara, Hoya 2018, Hikari 2020, Sumita 2020
+# indices as the makers' own tables print them beside the coefficients, to five decimals: Schott 2018, Ohara,
+# Hoya 2018, Hikari 2020, Sumita 2020
 PRINTED_AT = ("t", "r", "C", "e", "F", "g", "h")
 PRINTED = {
     "N-BK7": (1.50731, 1.51289, 1.51432, 1.51872, 1.52238, 1.52668, 1.53024),
@@ -45,8 +46,18 @@ PRINTED = {
 }
 # deviation of P_gF = (ng - nF) / (nF - nC) from the normal line 0.6438 - 0.001682 Vd, Schott catalogue 2017
 PARTIAL_DISPERSION = {
-    "N-BK7": -0.0009, "F2": 0.0002, "SF11": 0.0142, "N-SF6": 0.0146, "N-LAK8": -0.0083, "N-KZFS4": -0.01, "N-FK51A": 0.0342, "N-PK52A": 0.0311,
-    "N-SK16": -0.0011, "LLF1": -0.0009, "N-LASF9": 0.0037, "N-BAF10": -0.0016,
+    "N-BK7": -0.0009,
+    "F2": 0.0002,
+    "SF11": 0.0142,
+    "N-SF6": 0.0146,
+    "N-LAK8": -0.0083,
+    "N-KZFS4": -0.01,
+    "N-FK51A": 0.0342,
+    "N-PK52A": 0.0311,
+    "N-SK16": -0.0011,
+    "LLF1": -0.0009,
+    "N-LASF9": 0.0037,
+    "N-BAF10": -0.0016,
 }
 
 
@@ -60,9 +71,13 @@ def conrady(name):
 def test_every_entry_has_the_published_index_and_abbe_number(name):
     *_, (nd, abbe), _, source = ROWS[name]
     glass = Glass.named(name)
-    # Five printed decimals, and the makers quote 5e-6 for their formulas. Sumita, Zeon and Osaka Gas print measured values beside a fit:
-    # two or three units of the fifth decimal, of the third for the polyesters (spread between lots), and Vd with at most one decimal.
-    index, number = {"Sumita": (2.5e-5, 0.25), "Zeon": (2.5e-5, 0.06), "Osaka": (1e-3, 0.3)}.get(re.split("[, ]", source)[0], (6e-6, 0.01))
+    # Five printed decimals, and the makers quote 5e-6 for their formulas. Sumita, Zeon and Osaka Gas print
+    # measured values beside a fit:
+    # two or three units of the fifth decimal, of the third for the polyesters (spread between lots), and Vd
+    # with at most one decimal.
+    index, number = {"Sumita": (2.5e-5, 0.25), "Zeon": (2.5e-5, 0.06), "Osaka": (1e-3, 0.3)}.get(
+        re.split("[, ]", source)[0], (6e-6, 0.01)
+    )
     if name == "SAPPHIRE":  # printed to four decimals
         index = 5e-5
     assert glass.name == name
@@ -81,7 +96,8 @@ def test_the_catalogue_is_large_and_its_names_are_told_apart():
 @pytest.mark.parametrize("name", PRINTED)
 def test_indices_agree_with_the_printed_tables(name):
     glass = Glass.named(name)
-    # half a unit of the fifth decimal and the rounding of the line's wavelength (Hoya prints 1013.98 and 706.52 nm); Sumita prints what it measured
+    # half a unit of the fifth decimal and the rounding of the line's wavelength (Hoya prints 1013.98 and
+    # 706.52 nm); Sumita prints what it measured
     tolerance = 2.5e-5 if name.startswith("K-") else 6e-6
     for line, index in zip(PRINTED_AT, PRINTED[name], strict=True):
         assert glass.index(LINE_UM[line]) == pytest.approx(index, abs=tolerance), line
@@ -92,7 +108,9 @@ def test_blue_partial_dispersion_agrees_with_the_data_sheet(name):
     glass = Glass.named(name)
     partial = (glass.index(LINE_UM["g"]) - glass.index_F) / (glass.index_F - glass.index_C)
     # printed to 1e-4; ng - nF carries 1e-6 in about 0.01
-    assert partial - (0.6438 - 0.001682 * glass.abbe_number) == pytest.approx(PARTIAL_DISPERSION[name], abs=1.6e-4)
+    assert partial - (0.6438 - 0.001682 * glass.abbe_number) == pytest.approx(
+        PARTIAL_DISPERSION[name], abs=1.6e-4
+    )
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -101,17 +119,27 @@ def test_catalogue_glasses_give_the_rounded_indices_of_the_reference_lenses(name
     for row in page["surfaces"]:
         if row["glass"]:
             for line, wavelength_um in WAVELENGTH_UM.items():
-                assert Glass.named(row["material"]).index(wavelength_um) == pytest.approx(row["n"][line], abs=6e-10)  # rounded to 1e-9
+                assert Glass.named(row["material"]).index(wavelength_um) == pytest.approx(
+                    row["n"][line], abs=6e-10
+                )  # rounded to 1e-9
 
 
 @pytest.mark.parametrize("name", LENSES)
 def test_named_lenses_are_the_published_prescriptions(name, shared):
     page = json.loads(shared(f"refs/lens/{name.replace('-', '_')}.json").read_text())
     geo = lens.load(name)
-    assert (geo.stop_index, geo.entrance_pupil_diameter_mm, lens.half_field_deg(name)) == (page["stop_index"], page["epd"], page["half_field_deg"])
+    assert (geo.stop_index, geo.entrance_pupil_diameter_mm, lens.half_field_deg(name)) == (
+        page["stop_index"],
+        page["epd"],
+        page["half_field_deg"],
+    )
     for mine, theirs in zip(geo.to_surfaces(), page["surfaces"], strict=True):
         assert mine.radius_mm == (math.inf if theirs["radius"] is None else theirs["radius"])
-        assert (mine.thickness_mm, mine.semi_aperture_mm, mine.conic) == (theirs["thickness"], theirs["semi_aperture"], theirs["conic"])
+        assert (mine.thickness_mm, mine.semi_aperture_mm, mine.conic) == (
+            theirs["thickness"],
+            theirs["semi_aperture"],
+            theirs["conic"],
+        )
         for line, wavelength_um in WAVELENGTH_UM.items():
             index = 1.0 if mine.medium is None else mine.medium.index(wavelength_um)
             assert index == pytest.approx(theirs["n"][line], abs=1e-12)
@@ -119,7 +147,8 @@ def test_named_lenses_are_the_published_prescriptions(name, shared):
 
 @pytest.mark.parametrize("name", ["N-BK7", "F2", "S-LAH79"])
 def test_three_lines_are_met_exactly_and_followed_between(name):
-    true, three = Glass.named(name), conrady(name)
+    true = Glass.named(name)
+    three = conrady(name)
     for wavelength_um in WAVELENGTH_UM.values():
         assert three.index(wavelength_um) == pytest.approx(true.index(wavelength_um), abs=1e-15)
     # Conrady's three terms; with 1/w^2 and 1/w^4 the same glasses are missed by ten times as much
@@ -129,8 +158,12 @@ def test_three_lines_are_met_exactly_and_followed_between(name):
 
 def test_models_follow_their_formulas():
     # round numbers by hand at w = 0.5 um: w^2 = 1/4
-    assert Glass("a", "cauchy", (1.5, 0.01, 0.001), (0.3, 1.0)).index(0.5) == pytest.approx(1.5 + 0.04 + 0.016, abs=1e-15)
-    assert Glass("a", "sellmeier", (1.0, 0.05, 0.5, 0.15), (0.45, 1.0)).index(0.5) == pytest.approx(math.sqrt(1 + 0.25 / 0.2 + 0.125 / 0.1), abs=1e-15)
+    assert Glass("a", "cauchy", (1.5, 0.01, 0.001), (0.3, 1.0)).index(0.5) == pytest.approx(
+        1.5 + 0.04 + 0.016, abs=1e-15
+    )
+    assert Glass("a", "sellmeier", (1.0, 0.05, 0.5, 0.15), (0.45, 1.0)).index(0.5) == pytest.approx(
+        math.sqrt(1 + 0.25 / 0.2 + 0.125 / 0.1), abs=1e-15
+    )
     powers = (2.0, 0.4, 0.01, 0.001, 1e-4, 1e-5, 1e-6, 1e-7, 0.8)
     square = 2 + 0.1 + 0.04 + 0.016 + 0.0064 + 0.00256 + 0.001024 + 0.0004096 + 0.05
     assert Glass("a", "schott", powers, (0.3, 1.0)).index(0.5) == pytest.approx(math.sqrt(square), abs=1e-15)
@@ -138,7 +171,9 @@ def test_models_follow_their_formulas():
     assert AIR.abbe_number == math.inf
 
 
-@pytest.mark.parametrize(("nd", "abbe"), [(1.5168, 64.17), (1.92286, 18.9), (1.43875, 94.93), (1.7725, 49.6), (1.5, 150.0)])
+@pytest.mark.parametrize(
+    ("nd", "abbe"), [(1.5168, 64.17), (1.92286, 18.9), (1.43875, 94.93), (1.7725, 49.6), (1.5, 150.0)]
+)
 def test_a_glass_from_nd_and_abbe_number_has_both(nd, abbe):
     glass = Glass.from_abbe(nd, abbe)
     assert glass.index_d == nd
@@ -146,7 +181,9 @@ def test_a_glass_from_nd_and_abbe_number_has_both(nd, abbe):
 
 
 def test_the_error_of_a_glass_from_nd_and_abbe_number_is_the_stated_one():
-    at, visible, blue = [], [], []
+    at = []
+    visible = []
+    blue = []
     for name, (*_, _, source) in ROWS.items():
         true = Glass.named(name)
         if not (true.range_um[0] < LINE_UM["g"] and true.range_um[1] >= 0.70) or "Osaka" in source:
@@ -190,13 +227,23 @@ def test_the_glasses_of_every_lens_file_at_hand_are_known(shared):
         data = path.read_bytes()
         text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "latin-1")
         if path.suffix.lower() == ".zmx":
-            found |= {name for name in re.findall(r"^ *GLAS +(\S+)", text, re.MULTILINE) if name not in ("MIRROR", "___BLANK")}
+            found |= {
+                name
+                for name in re.findall(r"^ *GLAS +(\S+)", text, re.MULTILINE)
+                if name not in ("MIRROR", "___BLANK")
+            }
         elif path.suffix == ".json" and path.name != "materials_data.json":
-            found |= set(re.findall(r'"mat[12]": *"([^"]+)"', text)) | set(re.findall(r'yml",\s*"name": *"([^"]+)"', text))
+            found |= set(re.findall(r'"mat[12]": *"([^"]+)"', text)) | set(
+                re.findall(r'yml",\s*"name": *"([^"]+)"', text)
+            )
         elif path.suffix == ".txt":
             found |= {row[4] for row in map(str.split, text.splitlines()[2:]) if len(row) > 4}
         elif path.suffix == ".seq":
-            found |= {name.strip("'") for name in re.findall(r"^ *S[OI]? +\S+ +\S+ +('?[A-Z0-9][\w.-]+'?)", text, re.MULTILINE) if name != "REFL"}
+            found |= {
+                name.strip("'")
+                for name in re.findall(r"^ *S[OI]? +\S+ +\S+ +('?[A-Z0-9][\w.-]+'?)", text, re.MULTILINE)
+                if name != "REFL"
+            }
     found -= {"OCCLUDER", "occluder", "VACUUM"}  # a hole, and what those files call air
     assert len(found) > 90
     for name in found:
@@ -224,12 +271,29 @@ def test_glasses_that_cannot_be_are_refused():
         AIR.shifted(-0.1)
 
 
-@pytest.mark.parametrize("name", ["UNOBTAINIUM", "N-BK77", "", "\n", "x" * 80, "-" * 80, "LAF20_HOYA", "1.5/", "51764", "\u0665\u0661\u0667\u0666\u0664\u0662", "N-BK7_"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "UNOBTAINIUM",
+        "N-BK77",
+        "",
+        "\n",
+        "x" * 80,
+        "-" * 80,
+        "LAF20_HOYA",
+        "1.5/",
+        "51764",
+        "\u0665\u0661\u0667\u0666\u0664\u0662",
+        "N-BK7_",
+    ],
+)
 def test_an_unknown_name_offers_the_three_nearest(name):
     if name == "N-BK7_":  # a trailing separator is spelling
         assert Glass.named(name).name == "N-BK7"
         return
-    with pytest.raises(DomainError, match=r"is not in the catalogue; the nearest names are [^,;]+, [^,;]+, [^,;]+;") as caught:
+    with pytest.raises(
+        DomainError, match=r"is not in the catalogue; the nearest names are [^,;]+, [^,;]+, [^,;]+;"
+    ) as caught:
         Glass.named(name)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 250
@@ -240,7 +304,11 @@ def test_the_nearest_names_are_near():
         Glass.named("N-BK77")
 
 
-@pytest.mark.parametrize("name", ["x" * 10**7, "N-SF" * 10**6, 10**5000, None, ["N-BK7"], b"N-BK7"], ids=["long", "repeated", "integer", "none", "list", "bytes"])
+@pytest.mark.parametrize(
+    "name",
+    ["x" * 10**7, "N-SF" * 10**6, 10**5000, None, ["N-BK7"], b"N-BK7"],
+    ids=["long", "repeated", "integer", "none", "list", "bytes"],
+)
 def test_a_hostile_name_is_refused_at_once_in_a_short_sentence(name):
     start = time.perf_counter()
     with pytest.raises(DomainError, match="must be a text of at most 80 characters") as caught:
@@ -261,11 +329,15 @@ def test_a_round_trip_through_json_is_exact(glass):
 def test_a_shift_adds_to_every_index():
     glass = Glass.named("N-BK7")
     for wavelength_um in (0.4, 0.5876, 1.5):
-        assert glass.shifted(0.01).shifted(0.02).index(wavelength_um) == pytest.approx(glass.index(wavelength_um) + 0.03, abs=1e-15)
+        assert glass.shifted(0.01).shifted(0.02).index(wavelength_um) == pytest.approx(
+            glass.index(wavelength_um) + 0.03, abs=1e-15
+        )
 
 
 def test_indices_at_three_lines_are_a_page_too():
-    assert Glass.from_dict({"name": "mine", "F": 1.61, "d": 1.6, "C": 1.595}) == Glass.from_indices(1.61, 1.6, 1.595, "mine")
+    assert Glass.from_dict({"name": "mine", "F": 1.61, "d": 1.6, "C": 1.595}) == Glass.from_indices(
+        1.61, 1.6, 1.595, "mine"
+    )
 
 
 BAD_PAGES = {

@@ -1,4 +1,5 @@
-"""Published lens files, where they lie beside the checkout: focal lengths against what makers and patents say, one lens in two formats, and reasons for refusals."""
+"""Published lens files, where they lie beside the checkout: focal lengths against what makers and patents
+say, one lens in two formats, and reasons for refusals."""
 
 import contextlib
 import json
@@ -10,16 +11,36 @@ import torch
 from codesign import lens
 from codesign.errors import CodesignError, DomainError
 from studies import lens_files
+from studies.frame.run import main
 from studies.lens_files import ALLOWED, CLAIMS, examine
-from studies.run import main
 
 FOLDER = "data/lenses"
 EXTENSIONS = (".json", ".zmx", ".seq", ".txt")
 
 # files whose own header states the paraxial focal length
-HEADERS = [f"deeplens/{name}.json" for name in ("camera/ef100mm_f2.8", "camera/rf50mm_f1.8", "camera/sigma70mm_f2.8", "camera/yongnuo_50mm_f1.8", "cooke", "thorlabs/lb1471a")]
+HEADERS = [
+    f"deeplens/{name}.json"
+    for name in (
+        "camera/ef100mm_f2.8",
+        "camera/rf50mm_f1.8",
+        "camera/sigma70mm_f2.8",
+        "camera/yongnuo_50mm_f1.8",
+        "cooke",
+        "thorlabs/lb1471a",
+    )
+]
 # and files that claim none, for the round trips
-OTHERS = [f"rayoptics/{name}" for name in ("US05331467-1.zmx", "US08427765-1.ZMX", "HoO-V2C18Ex27.zmx", "schmidt.seq", "achroMangin_ok.seq", "asp46.seq")]
+OTHERS = [
+    f"rayoptics/{name}"
+    for name in (
+        "US05331467-1.zmx",
+        "US08427765-1.ZMX",
+        "HoO-V2C18Ex27.zmx",
+        "schmidt.seq",
+        "achroMangin_ok.seq",
+        "asp46.seq",
+    )
+]
 # file -> what the sentence must name
 REFUSED = {
     "deeplens/materials_data.json": "schema",
@@ -51,14 +72,20 @@ def test_focal_lengths_are_within_half_a_percent_of_what_is_claimed(name, shared
     assert found == pytest.approx(claim.efl_mm, rel=ALLOWED)
 
 
-@pytest.mark.parametrize(("name", "claimed"), [("rf16mm_f2.8", 16), ("rf24mm_f1.8", 24), ("ef35mm_f2.0", 35), ("ef40mm_f2.8", 40), ("ef50mm_f1.8", 50)])
+@pytest.mark.parametrize(
+    ("name", "claimed"),
+    [("rf16mm_f2.8", 16), ("rf24mm_f1.8", 24), ("ef35mm_f2.0", 35), ("ef40mm_f2.8", 40), ("ef50mm_f1.8", 50)],
+)
 def test_camera_lenses_have_the_focal_length_of_their_name_as_far_as_names_are_rounded(name, claimed, shared):
     geo = lens.load(shared(f"{FOLDER}/deeplens/camera/{name}.json"))
     assert geo.first_order().efl_mm.item() == pytest.approx(claimed, rel=0.031)
-    assert geo.first_order().bfl_mm.item() == pytest.approx(geo.thickness_mm[-1].item(), abs=0.05)  # and they are in focus
+    assert geo.first_order().bfl_mm.item() == pytest.approx(
+        geo.thickness_mm[-1].item(), abs=0.05
+    )  # and they are in focus
 
 
-# file -> wavelength um; focal length, back focal length, entrance pupil diameter and its distance from the first surface, mm, without signs, as ray-optics 0.9.8 reads the same file
+# file -> wavelength um; focal length, back focal length, entrance pupil diameter and its distance from the
+# first surface, mm, without signs, as ray-optics 0.9.8 reads the same file
 PEER = {
     "CODV_32327.seq": (0.5876, 100.030812742, 95.9519441518, 25.0, 0.0),
     "CODV_49664.seq": (0.5876, 35.0106981913, 28.0864845268, 25.0, 0.0),
@@ -86,9 +113,18 @@ def test_first_order_figures_are_those_of_another_reader(name, shared):
     assert found == pytest.approx(true, rel=1e-6)  # it puts objects at infinity to 1e10 mm
 
 
-# file -> (wavelength um, largest miss of the axis in mm by rays parallel to it through 0.5 and 0.9 of the pupil); a wrong sign anywhere misses by millimetres
-FOCUSED = {"paraboloid.seq": (0.55, 1e-12), "paraboloid_f8.seq": (0.55, 1e-12), "CODV_65988.seq": (0.5876, 2e-5), "questar35.seq": (0.555, 0.02), "US05331467-1.zmx": (0.5876, 0.03),
-           "HoO-V2C18Ex03.zmx": (0.55, 0.002), "schmidt.seq": (0.5876, 0.02), "CODV_49664.seq": (0.5876, 0.01)}
+# file -> (wavelength um, largest miss of the axis in mm by rays parallel to it through 0.5 and 0.9 of the
+# pupil); a wrong sign anywhere misses by millimetres
+FOCUSED = {
+    "paraboloid.seq": (0.55, 1e-12),
+    "paraboloid_f8.seq": (0.55, 1e-12),
+    "CODV_65988.seq": (0.5876, 2e-5),
+    "questar35.seq": (0.555, 0.02),
+    "US05331467-1.zmx": (0.5876, 0.03),
+    "HoO-V2C18Ex03.zmx": (0.55, 0.002),
+    "schmidt.seq": (0.5876, 0.02),
+    "CODV_49664.seq": (0.5876, 0.01),
+}
 
 
 @pytest.mark.parametrize("name", FOCUSED)
@@ -115,9 +151,13 @@ def test_every_file_is_a_lens_or_is_refused_by_name(shared):
         assert sentence in refused[name]
 
 
-@pytest.mark.parametrize(("name", "stored"), [("CODV_32327", 95.95194415183156), ("CODV_65564", 0.9176749924408083)])
+@pytest.mark.parametrize(
+    ("name", "stored"), [("CODV_32327", 95.95194415183156), ("CODV_65564", 0.9176749924408083)]
+)
 def test_the_solved_focus_is_the_one_another_program_stored(name, stored, shared):
-    assert lens.load(shared(f"{FOLDER}/rayoptics/{name}.seq")).thickness_mm[-1].item() == pytest.approx(stored, rel=1e-12)
+    assert lens.load(shared(f"{FOLDER}/rayoptics/{name}.seq")).thickness_mm[-1].item() == pytest.approx(
+        stored, rel=1e-12
+    )
 
 
 def test_a_diffractive_surface_brings_the_focus_where_the_maker_put_the_image(shared):
@@ -128,38 +168,59 @@ def test_a_diffractive_surface_brings_the_focus_where_the_maker_put_the_image(sh
 
 
 def fan(geo, half_field_deg=5.0):
-    """Rays on and off axis through a tenth of the pupil's width and its rim, on the entrance pupil of the lens."""
+    """Rays on and off axis through a tenth of the pupil's width and its rim, on the entrance pupil of the
+    lens."""
     f = geo.first_order()
     pupil = torch.tensor([[0.0, 0.0], [0.0, 0.5], [0.5, 0.0], [0.0, -0.9]], dtype=torch.float64)
-    origins = torch.cat([pupil * geo.entrance_pupil_diameter_mm / 2, f.entrance_pupil_z_mm.detach().expand(4, 1)], 1)
-    towards = torch.tensor([0.0, math.sin(math.radians(half_field_deg)), math.cos(math.radians(half_field_deg))], dtype=torch.float64).expand(4, 3)
+    origins = torch.cat(
+        [pupil * geo.entrance_pupil_diameter_mm / 2, f.entrance_pupil_z_mm.detach().expand(4, 1)], 1
+    )
+    towards = torch.tensor(
+        [0.0, math.sin(math.radians(half_field_deg)), math.cos(math.radians(half_field_deg))],
+        dtype=torch.float64,
+    ).expand(4, 3)
     return origins - 50 * towards, towards.contiguous()
 
 
 def same_rays(a, b, atol, leading_mm=0.0):
-    """Positions of the same rays through two lenses; the second begins with a plane ``leading_mm`` in front of the first's vertex."""
+    """Positions of the same rays through two lenses; the second begins with a plane ``leading_mm`` in front
+    of the first's vertex."""
     origins, towards = fan(a)
     shift = torch.tensor([0.0, 0.0, leading_mm], dtype=torch.float64)
-    torch.testing.assert_close(b.trace(origins + shift, towards).position_mm, a.trace(origins, towards).position_mm, rtol=0, atol=atol)
+    torch.testing.assert_close(
+        b.trace(origins + shift, towards).position_mm,
+        a.trace(origins, towards).position_mm,
+        rtol=0,
+        atol=atol,
+    )
 
 
 def test_one_lens_as_text_and_as_zmx(shared):
-    text, zmx = (lens.load(shared(f"{FOLDER}/diffoptics/DoubleGauss/US02532751-1.{kind}")) for kind in ("txt", "zmx"))
-    assert text.entrance_pupil_diameter_mm == pytest.approx(zmx.entrance_pupil_diameter_mm, rel=1e-7)  # its wavelength is 587.562 nm, not 587.5618
+    text, zmx = (
+        lens.load(shared(f"{FOLDER}/diffoptics/DoubleGauss/US02532751-1.{kind}")) for kind in ("txt", "zmx")
+    )
+    assert text.entrance_pupil_diameter_mm == pytest.approx(
+        zmx.entrance_pupil_diameter_mm, rel=1e-7
+    )  # its wavelength is 587.562 nm, not 587.5618
     same_rays(text, zmx, 5e-5)  # one radius is -7.02695 in one and -7.027 in the other
 
 
 def test_one_lens_as_deeplens_and_as_zmx(shared):
-    page, zmx = (lens.load(shared(f"{FOLDER}/deeplens/camera/ef35mm_f2.0.{kind}")) for kind in ("json", "zmx"))
+    page, zmx = (
+        lens.load(shared(f"{FOLDER}/deeplens/camera/ef35mm_f2.0.{kind}")) for kind in ("json", "zmx")
+    )
     same_rays(page, zmx, 1e-10)
 
 
 def test_one_lens_from_optiland_and_from_the_catalogue(shared):
-    same_rays(lens.load("cooke-triplet"), lens.load(shared(f"{FOLDER}/optiland/Cooke_triplet.json")), 1e-7)  # indices rounded to 1e-9 in one
+    same_rays(
+        lens.load("cooke-triplet"), lens.load(shared(f"{FOLDER}/optiland/Cooke_triplet.json")), 1e-7
+    )  # indices rounded to 1e-9 in one
 
 
 def test_double_gauss_of_the_program_that_sells_it_and_of_the_catalogue(shared):
-    named, file = lens.load("double-gauss"), lens.load(shared(f"{FOLDER}/rayoptics/ag_dblgauss.seq"))
+    named = lens.load("double-gauss")
+    file = lens.load(shared(f"{FOLDER}/rayoptics/ag_dblgauss.seq"))
     assert file.first_order().efl_mm.item() == pytest.approx(named.first_order().efl_mm.item(), rel=1e-3)
 
 
@@ -171,15 +232,29 @@ def test_real_lenses_survive_a_round_trip(name, extension, shared, tmp_path):
     after = lens.load(tmp_path / f"a.{extension}")
     for a, b in zip(before.to_surfaces(), after.to_surfaces(), strict=True):
         assert b.radius_mm == pytest.approx(a.radius_mm, rel=3e-16 if extension == "zmx" else 0, abs=0)
-        for field in ("thickness_mm", "semi_aperture_mm", "conic", "is_stop", "mirror", "phase", "inner_semi_aperture_mm", *(["asphere", "medium"] if extension == "json" else [])):
-            assert getattr(a, field) == getattr(b, field) or (field == "is_stop" and before.stop_index == after.stop_index), field
+        for field in (
+            "thickness_mm",
+            "semi_aperture_mm",
+            "conic",
+            "is_stop",
+            "mirror",
+            "phase",
+            "inner_semi_aperture_mm",
+            *(["asphere", "medium"] if extension == "json" else []),
+        ):
+            assert getattr(a, field) == getattr(b, field) or (
+                field == "is_stop" and before.stop_index == after.stop_index
+            ), field
     assert after.entrance_pupil_diameter_mm == before.entrance_pupil_diameter_mm
     with contextlib.suppress(DomainError):  # a file of planes has no focal length
-        assert after.first_order().efl_mm.item() == pytest.approx(before.first_order().efl_mm.item(), rel=1e-12)
+        assert after.first_order().efl_mm.item() == pytest.approx(
+            before.first_order().efl_mm.item(), rel=1e-12
+        )
 
 
 def test_a_study_of_a_folder_counts_what_loads(tmp_path, capsys):
-    folder, out = tmp_path / "lenses", tmp_path / "run"
+    folder = tmp_path / "lenses"
+    out = tmp_path / "run"
     folder.mkdir()
     lens.save(lens.load("la1509"), folder / "good.zmx")
     (folder / "bad.seq").write_text("S 1 1 NOGLASS")
@@ -191,5 +266,12 @@ def test_a_study_of_a_folder_counts_what_loads(tmp_path, capsys):
     assert "| bad.seq | refused |" in table
     assert "glass 'NOGLASS' is not in the catalogue" in table
     assert "| good.zmx | loads | 2 | 20 | 99.6" in table
-    assert main(lens_files.study, lens_files.Config, ["--out", str(tmp_path / "none"), "--folder", str(tmp_path / "nowhere")]) == 2
+    assert (
+        main(
+            lens_files.study,
+            lens_files.Config,
+            ["--out", str(tmp_path / "none"), "--folder", str(tmp_path / "nowhere")],
+        )
+        == 2
+    )
     assert "name another folder with --folder" in capsys.readouterr().err

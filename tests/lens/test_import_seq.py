@@ -1,4 +1,5 @@
-"""Reading .seq: closed forms of first-order optics for what the file says, and a sentence for what it cannot say here."""
+"""Reading .seq: closed forms of first-order optics for what the file says, and a sentence for what it cannot
+say here."""
 
 import math
 
@@ -47,12 +48,17 @@ def test_a_singlet_is_what_the_lensmaker_says(tmp_path):
     geo = load(tmp_path, SINGLET)
     assert efl(geo) == pytest.approx(thick(0.02, -0.01, 4), rel=1e-14)
     assert (geo.name, geo.entrance_pupil_diameter_mm, geo.half_field_deg) == ("a; singlet!", 10, 5)
-    assert geo.to_surfaces() == (Surface(50.0, 4.0, Glass.named("N-BK7"), 8.0, is_stop=True), Surface(-100.0, 60.0, None, 7.0))
+    assert geo.to_surfaces() == (
+        Surface(50.0, 4.0, Glass.named("N-BK7"), 8.0, is_stop=True),
+        Surface(-100.0, 60.0, None, 7.0),
+    )
 
 
 def test_curvatures_are_read_where_radii_are_not_asked_for(tmp_path):
     for mode in ("RDM N;LEN", "LEN"):
-        geo = load(tmp_path, SINGLET.replace("RDM;LEN", mode).replace("S 50", "S 0.02").replace("S -100", "s -0.01"))
+        geo = load(
+            tmp_path, SINGLET.replace("RDM;LEN", mode).replace("S 50", "S 0.02").replace("S -100", "s -0.01")
+        )
         assert efl(geo) == pytest.approx(thick(0.02, -0.01, 4), rel=1e-14)
 
 
@@ -72,22 +78,32 @@ def test_the_first_surface_is_the_stop_where_none_is_named(tmp_path):
     assert load(tmp_path, SINGLET.replace("STO\n", "").replace("GO", "STO S2")).stop_index == 1
 
 
-@pytest.mark.parametrize(("word", "index", "abbe"), [("517.642", 1.517, 64.2), ("517000.520000", 1.517, 52.0), ("500.700", 1.5, 70.0)])
+@pytest.mark.parametrize(
+    ("word", "index", "abbe"),
+    [("517.642", 1.517, 64.2), ("517000.520000", 1.517, 52.0), ("500.700", 1.5, 70.0)],
+)
 def test_glass_codes(word, index, abbe, tmp_path):
     glass = load(tmp_path, SINGLET.replace("NBK7_SCHOTT", word)).to_surfaces()[0].medium
     assert (glass.index_d, glass.abbe_number) == pytest.approx((index, abbe), rel=1e-13)
 
 
 def test_private_glasses_have_their_tabulated_indices(tmp_path):
-    table = "PRV\nPWL 656.2725 587.5618 &\n 486.1327\n'MINE' 1.51 1.52 1.53\n'OTHER' LAU 2.3 0 0 0 0 0\nEND\nSO"
-    glass = load(tmp_path, SINGLET.replace("SO", table).replace("NBK7_SCHOTT", "'MINE'")).to_surfaces()[0].medium
+    table = (
+        "PRV\nPWL 656.2725 587.5618 &\n 486.1327\n'MINE' 1.51 1.52 1.53\n'OTHER' LAU 2.3 0 0 0 0 0\nEND\nSO"
+    )
+    glass = (
+        load(tmp_path, SINGLET.replace("SO", table).replace("NBK7_SCHOTT", "'MINE'")).to_surfaces()[0].medium
+    )
     assert (glass.index_F, glass.index_d, glass.index_C) == pytest.approx((1.53, 1.52, 1.51), rel=1e-12)
     with pytest.raises(CodesignError, match="glass OTHER is given by a formula"):
         load(tmp_path, SINGLET.replace("SO", table).replace("NBK7_SCHOTT", "'OTHER'"))
 
 
 def test_the_solve_for_the_image_finds_the_paraxial_focus(tmp_path):
-    geo = load(tmp_path, SINGLET.replace("CIR 7", "CIR 7; PIM").replace("SI 0 0", "SI 0 -0.25").replace("-100 60", "-100 -7"))
+    geo = load(
+        tmp_path,
+        SINGLET.replace("CIR 7", "CIR 7; PIM").replace("SI 0 0", "SI 0 -0.25").replace("-100 60", "-100 -7"),
+    )
     back = thick(0.02, -0.01, 4) * (1 - (N - 1) * 4 * 0.02 / N)
     assert geo.thickness_mm[-1].item() == pytest.approx(back - 0.25, rel=1e-13)
 
@@ -104,7 +120,9 @@ def test_the_pupil_from_the_image_side(spec, factor, tmp_path):
     assert geo.entrance_pupil_diameter_mm == pytest.approx(factor * efl(geo), rel=1e-13)
 
 
-@pytest.mark.parametrize(("fields", "true"), [("XAN 0 3\nYAN 0 4", 5.0), ("YIM 0 10", None), ("YRI 0 10", None), ("YAN 0", 0.0)])
+@pytest.mark.parametrize(
+    ("fields", "true"), [("XAN 0 3\nYAN 0 4", 5.0), ("YIM 0 10", None), ("YRI 0 10", None), ("YAN 0", 0.0)]
+)
 def test_the_half_field(fields, true, tmp_path):
     geo = load(tmp_path, SINGLET.replace("YAN 0 3 5", fields))
     true = math.degrees(math.atan(10 / efl(geo))) if true is None else true or None
@@ -120,13 +138,23 @@ def test_the_aspheres_powers(tmp_path):
 
 def test_a_diffractive_surface_has_the_power_of_its_path(tmp_path):
     doe = "CIR 8\nDIF DOE\nHOR 1\nHWL 550\nHCT R\nHCO C1 -0.0025"
-    geo = load(tmp_path, SINGLET.replace("CIR 8", doe).replace("S 50", "S 0").replace("S -100", "S 0").replace(" NBK7_SCHOTT", ""))
+    geo = load(
+        tmp_path,
+        SINGLET.replace("CIR 8", doe)
+        .replace("S 50", "S 0")
+        .replace("S -100", "S 0")
+        .replace(" NBK7_SCHOTT", ""),
+    )
     assert geo.first_order(0.55).efl_mm.item() == pytest.approx(200, rel=1e-13)  # path -r^2 / 2 f
     assert geo.to_surfaces()[0].phase == Phase((-0.0025 * 2 * math.pi / 550e-6,), 1)
 
 
 def test_a_mangin_mirror_is_unfolded(tmp_path):
-    geo = load(tmp_path, "RDM\nDIM M\nEPD 100\nWL 587.5618\nSO 0 1e13\nS -1200 10 NBK7_SCHOTT\nS -1000 -10 REFL\nS -1200 -500\nSI 0 0")
+    geo = load(
+        tmp_path,
+        "RDM\nDIM M\nEPD 100\nWL 587.5618\nSO 0 1e13\nS -1200 10 NBK7_SCHOTT\nS -1000 -10 REFL\nS -1200 "
+        "-500\nSI 0 0",
+    )
     front, mirror, back = geo.to_surfaces()
     assert (front.radius_mm, mirror.radius_mm, back.radius_mm) == (-1200, -1000, 1200)
     assert (front.thickness_mm, mirror.thickness_mm, back.thickness_mm) == (10, 10, 500)
@@ -137,27 +165,56 @@ def test_a_mangin_mirror_is_unfolded(tmp_path):
 
 
 def test_one_surface_may_move_and_return(tmp_path):
-    moved = load(tmp_path, SINGLET.replace("CIR 7", "CIR 7; DAR; XDE 0.1; YDE -0.2; ADE 1.5; BDE -0.5; CDE 30")).to_surfaces()[1]
+    moved = load(
+        tmp_path, SINGLET.replace("CIR 7", "CIR 7; DAR; XDE 0.1; YDE -0.2; ADE 1.5; BDE -0.5; CDE 30")
+    ).to_surfaces()[1]
     assert (moved.decentre_mm, moved.tilt_deg) == ((0.1, -0.2), (-1.5, 0.5))  # ADE and BDE are left-handed
-    behind = load(tmp_path, "RDM\nDIM M\nEPD 10\nSO 0 1e13\nS -1000 -40 REFL\nS -500 -90 ; DAR; YDE 0.3; ADE 1.5\nSI 0 0").to_surfaces()[1]
-    assert (behind.decentre_mm, behind.tilt_deg) == ((0.0, 0.3), (1.5, 0.0))  # seen along the light, which travels towards -z there
+    behind = load(
+        tmp_path,
+        "RDM\nDIM M\nEPD 10\nSO 0 1e13\nS -1000 -40 REFL\nS -500 -90 ; DAR; YDE 0.3; ADE 1.5\nSI 0 0",
+    ).to_surfaces()[1]
+    assert (behind.decentre_mm, behind.tilt_deg) == (
+        (0.0, 0.3),
+        (1.5, 0.0),
+    )  # seen along the light, which travels towards -z there
 
 
 def test_obstructions_and_holes(tmp_path):
-    front, back = load(tmp_path, SINGLET.replace("CIR 8", "CIR 8\nCIR EDG 9\nCIR OBS L'A' 1.5").replace("CIR 7", "CIR HOL 0.5")).to_surfaces()
-    assert (front.semi_aperture_mm, front.inner_semi_aperture_mm, back.inner_semi_aperture_mm) == (8, 1.5, 0.5)
+    front, back = load(
+        tmp_path,
+        SINGLET.replace("CIR 8", "CIR 8\nCIR EDG 9\nCIR OBS L'A' 1.5").replace("CIR 7", "CIR HOL 0.5"),
+    ).to_surfaces()
+    assert (front.semi_aperture_mm, front.inner_semi_aperture_mm, back.inner_semi_aperture_mm) == (
+        8,
+        1.5,
+        0.5,
+    )
 
 
 def test_solves_and_pickups_keep_the_stored_values(tmp_path):
     extra = "CIR 7\nTHI HMY 0.0\nCUY UMY -0.1\nCCY 0; THC 0\n"
-    assert load(tmp_path, SINGLET.replace("CIR 7", extra).replace("GO", "PIK THI S2 Z1 THI S1 Z1\nDER VAL I1 -0.6")).to_surfaces() == load(tmp_path, SINGLET).to_surfaces()
+    assert (
+        load(
+            tmp_path,
+            SINGLET.replace("CIR 7", extra).replace("GO", "PIK THI S2 Z1 THI S1 Z1\nDER VAL I1 -0.6"),
+        ).to_surfaces()
+        == load(tmp_path, SINGLET).to_surfaces()
+    )
 
 
 BAD = {
     "tilt of all that follows": ("CIR 7", "ADE 5", "surface 2: it shifts or tilts everything behind it"),
-    "tilt and reverse": ("CIR 7", "ADE 5; REV", r"surface 2: it tilts or shifts everything behind it \(REV\)"),
+    "tilt and reverse": (
+        "CIR 7",
+        "ADE 5; REV",
+        r"surface 2: it tilts or shifts everything behind it \(REV\)",
+    ),
     "bend": ("CIR 7", "BEN", "bends the axis"),
-    "conic on a sphere": ("CIR 7", "K -1", "surface 2: it has a conic constant or asphere terms, but its shape is SPH"),
+    "conic on a sphere": (
+        "CIR 7",
+        "K -1",
+        "surface 2: it has a conic constant or asphere terms, but its shape is SPH",
+    ),
     "asphere on a conic": ("CIR 7", "CON; A 1e-6", "but its shape is CON"),
     "phase on what does not diffract": ("CIR 7", "HWL 550; HCO C1 1", "does not diffract"),
     "shift along the axis": ("CIR 7", "DAR; ZDE 1", "shifted along the axis"),
@@ -172,7 +229,11 @@ BAD = {
     "unknown command": ("CIR 7", "WOB 7", "command 'WOB' is not understood; delete it"),
     "zoom": ("CIR 7", "ZOO 3", "command 'ZOO' is not understood"),
     "before any surface": ("DIM M", "CIR 7", "stands before any surface"),
-    "unknown glass": ("NBK7_SCHOTT", "NBK77_SCHOTT", "surface 1: glass 'NBK77_SCHOTT' is not in the catalogue; the nearest names are"),
+    "unknown glass": (
+        "NBK7_SCHOTT",
+        "NBK77_SCHOTT",
+        "surface 1: glass 'NBK77_SCHOTT' is not in the catalogue; the nearest names are",
+    ),
     "total reflection": ("NBK7_SCHOTT", "TIRO", "reflects totally"),
     "unit unknown": ("DIM M", "DIM F", "unit 'F' is not known"),
     "object NA": ("EPD 10", "NAO 0.1", "give the entrance pupil diameter"),
@@ -200,7 +261,11 @@ BAD = {
 def test_what_cannot_be_traced_is_refused_by_name(fault, tmp_path):
     old, new, sentence = BAD[fault]
     assert old in SINGLET
-    content = SINGLET.replace("SO 0 1e13\n", "SO 0 1e13\n").replace(old, new, 1) if fault != "before any surface" else SINGLET.replace("EPD 10\n", "EPD 10\nCIR 7\n")
+    content = (
+        SINGLET.replace("SO 0 1e13\n", "SO 0 1e13\n").replace(old, new, 1)
+        if fault != "before any surface"
+        else SINGLET.replace("EPD 10\n", "EPD 10\nCIR 7\n")
+    )
     with pytest.raises(CodesignError, match=sentence) as caught:
         load(tmp_path, content)
     message = str(caught.value)

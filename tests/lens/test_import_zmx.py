@@ -1,4 +1,5 @@
-"""Reading and writing .zmx: closed forms of first-order optics for what the file says, and a sentence for what it cannot say here."""
+"""Reading and writing .zmx: closed forms of first-order optics for what the file says, and a sentence for
+what it cannot say here."""
 
 import codecs
 import math
@@ -13,11 +14,37 @@ from codesign.lens import GeoLens, Glass, Surface
 from codesign.lens.surface import Phase
 
 N = Glass.named("N-BK7").index_d
-HEAD = ["VERS 140124 0 0", "MODE SEQ", "NAME a singlet", "UNIT MM X W X CM MR CPMM", "ENPD 10", "FTYP 0 0 2 1 0 0 0", "XFLN 0 3", "YFLN 0 4", "WAVM 1 0.5875618 1", "PWAV 1"]
-OBJECT = ["SURF 0", "  TYPE STANDARD", "  CURV 0.0 0 0 0 0 \"\"", "  DISZ INFINITY"]
-FRONT = ["SURF 1", "  STOP", "  TYPE STANDARD", "  CURV 0.02 0 0 0 0 \"\"", "  DISZ 4", "  GLAS N-BK7 0 0 1.5 40 0 0 0 0 0 0", "  DIAM 8 1 0 0 1 \"\""]
-BACK = ["SURF 2", "  TYPE STANDARD", "  CURV -0.01 0 0 0 0 \"\"", "  DISZ 60", "  DIAM 7 1 0 0 1 \"\""]
-IMAGE = ["SURF 3", "  TYPE STANDARD", "  CURV 0.0", "  DISZ 0", "TOL TOFF   0   0", "EFLY 1 3 0 0 0 0 0 0 0 0"]
+HEAD = [
+    "VERS 140124 0 0",
+    "MODE SEQ",
+    "NAME a singlet",
+    "UNIT MM X W X CM MR CPMM",
+    "ENPD 10",
+    "FTYP 0 0 2 1 0 0 0",
+    "XFLN 0 3",
+    "YFLN 0 4",
+    "WAVM 1 0.5875618 1",
+    "PWAV 1",
+]
+OBJECT = ["SURF 0", "  TYPE STANDARD", '  CURV 0.0 0 0 0 0 ""', "  DISZ INFINITY"]
+FRONT = [
+    "SURF 1",
+    "  STOP",
+    "  TYPE STANDARD",
+    '  CURV 0.02 0 0 0 0 ""',
+    "  DISZ 4",
+    "  GLAS N-BK7 0 0 1.5 40 0 0 0 0 0 0",
+    '  DIAM 8 1 0 0 1 ""',
+]
+BACK = ["SURF 2", "  TYPE STANDARD", '  CURV -0.01 0 0 0 0 ""', "  DISZ 60", '  DIAM 7 1 0 0 1 ""']
+IMAGE = [
+    "SURF 3",
+    "  TYPE STANDARD",
+    "  CURV 0.0",
+    "  DISZ 0",
+    "TOL TOFF   0   0",
+    "EFLY 1 3 0 0 0 0 0 0 0 0",
+]
 
 
 def text(head=HEAD, surfaces=(OBJECT, FRONT, BACK, IMAGE)):
@@ -51,12 +78,25 @@ def test_a_singlet_is_what_the_lensmaker_says(tmp_path):
     assert geo.entrance_pupil_diameter_mm == 10
     assert geo.half_field_deg == pytest.approx(5)  # 3 and 4 degrees
     assert geo.name == "a singlet"
-    assert geo.to_surfaces() == (Surface(50.0, 4.0, Glass.named("N-BK7"), 8.0, is_stop=True), Surface(-100.0, 60.0, None, 7.0))
+    assert geo.to_surfaces() == (
+        Surface(50.0, 4.0, Glass.named("N-BK7"), 8.0, is_stop=True),
+        Surface(-100.0, 60.0, None, 7.0),
+    )
 
 
-@pytest.mark.parametrize("encode", [
-    lambda t: codecs.BOM_UTF16_LE + t.encode("utf-16-le"), lambda t: codecs.BOM_UTF16_BE + t.encode("utf-16-be"), lambda t: t.encode("utf-16-le"), lambda t: t.encode("utf-8"),
-    lambda t: codecs.BOM_UTF8 + t.encode("utf-8"), lambda t: t.encode("latin-1"), lambda t: t.replace("\n", "\r\n").encode("utf-8"), lambda t: t.replace("\n", "\r").encode("latin-1")])
+@pytest.mark.parametrize(
+    "encode",
+    [
+        lambda t: codecs.BOM_UTF16_LE + t.encode("utf-16-le"),
+        lambda t: codecs.BOM_UTF16_BE + t.encode("utf-16-be"),
+        lambda t: t.encode("utf-16-le"),
+        lambda t: t.encode("utf-8"),
+        lambda t: codecs.BOM_UTF8 + t.encode("utf-8"),
+        lambda t: t.encode("latin-1"),
+        lambda t: t.replace("\n", "\r\n").encode("utf-8"),
+        lambda t: t.replace("\n", "\r").encode("latin-1"),
+    ],
+)
 def test_every_encoding_reads_the_same(encode, tmp_path):
     content = text().replace("a singlet", "Ø 16 singlet")
     geo = load(tmp_path, encode(content))
@@ -66,12 +106,17 @@ def test_every_encoding_reads_the_same(encode, tmp_path):
 @pytest.mark.parametrize(("unit", "unit_mm"), [("MM", 1), ("CM", 10), ("IN", 25.4), ("M", 1000)])
 def test_units_become_millimetres(unit, unit_mm, tmp_path):
     asphere = changed(FRONT, "TYPE", ["  TYPE EVENASPH", "  PARM 1 0.001", "  PARM 2 -2e-5"])
-    geo = load(tmp_path, text(changed(HEAD, "UNIT", [f"UNIT {unit} X W X CM MR CPMM"]), (OBJECT, asphere, BACK, IMAGE)))
+    geo = load(
+        tmp_path,
+        text(changed(HEAD, "UNIT", [f"UNIT {unit} X W X CM MR CPMM"]), (OBJECT, asphere, BACK, IMAGE)),
+    )
     true = load(tmp_path, text(surfaces=(OBJECT, asphere, BACK, IMAGE))).scaled(unit_mm)
     assert efl(geo) == pytest.approx(efl(true), rel=1e-13)
     assert geo.entrance_pupil_diameter_mm == 10 * unit_mm
     for name in ("curvature_per_mm", "thickness_mm", "asphere", "semi_aperture_mm"):
-        torch.testing.assert_close(getattr(geo, name)[..., :2], getattr(true, name)[..., :2], rtol=1e-13, atol=0)
+        torch.testing.assert_close(
+            getattr(geo, name)[..., :2], getattr(true, name)[..., :2], rtol=1e-13, atol=0
+        )
 
 
 def matrix(geo):
@@ -88,11 +133,22 @@ def matrix(geo):
 @pytest.mark.parametrize("distance", [math.inf, 200.0])
 @pytest.mark.parametrize("stop", [1, 2])
 def test_the_pupil_follows_from_any_way_to_give_it(spec, distance, stop, tmp_path):
-    front, back = (FRONT, BACK) if stop == 1 else ([x for x in FRONT if "STOP" not in x], [BACK[0], "  STOP", *BACK[1:]])
-    blocks = (changed(OBJECT, "DISZ", [f"  DISZ {'INFINITY' if math.isinf(distance) else distance}"]), front, back, IMAGE)
+    front, back = (
+        (FRONT, BACK)
+        if stop == 1
+        else ([x for x in FRONT if "STOP" not in x], [BACK[0], "  STOP", *BACK[1:]])
+    )
+    blocks = (
+        changed(OBJECT, "DISZ", [f"  DISZ {'INFINITY' if math.isinf(distance) else distance}"]),
+        front,
+        back,
+        IMAGE,
+    )
     geo = load(tmp_path, text(changed(HEAD, "ENPD", [spec]), blocks))
     (a, b), (c, d) = matrix(geo)
-    to_stop = np.eye(2) if stop == 1 else np.array([[1, 4 / N], [0, 1]]) @ np.array([[1, 0], [-(N - 1) * 0.02, 1]])
+    to_stop = (
+        np.eye(2) if stop == 1 else np.array([[1, 4 / N], [0, 1]]) @ np.array([[1, 0], [-(N - 1) * 0.02, 1]])
+    )
     pupil_z = to_stop[0, 1] / to_stop[0, 0]
     if spec == "ENPD 10":
         true = 10
@@ -107,16 +163,28 @@ def test_the_pupil_follows_from_any_way_to_give_it(spec, distance, stop, tmp_pat
 
 
 def test_a_floating_stop_without_a_diameter_takes_the_widest_axial_beam_the_lens_lets_through(tmp_path):
-    geo = load(tmp_path, text(changed(HEAD, "ENPD", ["FLOA"]), (OBJECT, [x for x in FRONT if "DIAM" not in x], BACK, IMAGE)))
+    geo = load(
+        tmp_path,
+        text(changed(HEAD, "ENPD", ["FLOA"]), (OBJECT, [x for x in FRONT if "DIAM" not in x], BACK, IMAGE)),
+    )
     height = matrix(geo)[0, 0]  # at the back, where the semi-diameter is 7
     assert geo.entrance_pupil_diameter_mm == pytest.approx(2 * 7 / height, rel=1e-12)
 
 
 @pytest.mark.parametrize(("kind", "height"), [(0, 12.0), (2, 10.0), (3, 10.0), (1, 30.0)])
 def test_the_half_field_follows_from_any_way_to_give_it(kind, height, tmp_path):
-    head = changed(changed(changed(HEAD, "FTYP", [f"FTYP {kind} 0 2 1 0 0 0"]), "XFLN", ["XFLN 0 0"]), "YFLN", [f"YFLN 0 {height} 99"])  # the third is not in use
+    head = changed(
+        changed(changed(HEAD, "FTYP", [f"FTYP {kind} 0 2 1 0 0 0"]), "XFLN", ["XFLN 0 0"]),
+        "YFLN",
+        [f"YFLN 0 {height} 99"],
+    )  # the third is not in use
     geo = load(tmp_path, text(head, (changed(OBJECT, "DISZ", ["  DISZ 200"]), FRONT, BACK, IMAGE)))
-    true = {0: 12.0, 1: math.degrees(math.atan(30 / 200)), 2: math.degrees(math.atan(10 / efl(geo))), 3: math.degrees(math.atan(10 / efl(geo)))}[kind]
+    true = {
+        0: 12.0,
+        1: math.degrees(math.atan(30 / 200)),
+        2: math.degrees(math.atan(10 / efl(geo))),
+        3: math.degrees(math.atan(10 / efl(geo))),
+    }[kind]
     assert geo.half_field_deg == pytest.approx(true, rel=1e-12)
 
 
@@ -128,30 +196,75 @@ def test_parm_1_is_the_square_of_the_height(tmp_path):
 
 @pytest.mark.parametrize(("order", "radius"), [(1, 1.0), (2, 5.0)])
 def test_a_binary_phase_has_the_power_of_its_first_term(order, radius, tmp_path):
-    doe = changed(changed(FRONT, "TYPE", ["  TYPE BINARY_2", f"  PARM 0 {order}", "  XDAT 1 2 0 0", f"  XDAT 2 {radius} 0 0", "  XDAT 3 -40 0 0", "  XDAT 4 0.5 0 0"]), "CURV", ["  CURV 0"])
-    geo = load(tmp_path, text(surfaces=(OBJECT, [x for x in doe if "GLAS" not in x], changed(BACK, "CURV", ["  CURV 0"]), IMAGE)))
-    assert efl(geo) == pytest.approx(math.pi * radius**2 / (order * 40 * 0.5875618e-3), rel=1e-13)  # path m w phi / 2 pi = -r^2 / 2 f
+    doe = changed(
+        changed(
+            FRONT,
+            "TYPE",
+            [
+                "  TYPE BINARY_2",
+                f"  PARM 0 {order}",
+                "  XDAT 1 2 0 0",
+                f"  XDAT 2 {radius} 0 0",
+                "  XDAT 3 -40 0 0",
+                "  XDAT 4 0.5 0 0",
+            ],
+        ),
+        "CURV",
+        ["  CURV 0"],
+    )
+    geo = load(
+        tmp_path,
+        text(
+            surfaces=(OBJECT, [x for x in doe if "GLAS" not in x], changed(BACK, "CURV", ["  CURV 0"]), IMAGE)
+        ),
+    )
+    assert efl(geo) == pytest.approx(
+        math.pi * radius**2 / (order * 40 * 0.5875618e-3), rel=1e-13
+    )  # path m w phi / 2 pi = -r^2 / 2 f
     assert geo.to_surfaces()[0].phase == Phase((-40 / radius**2, 0.5 / radius**4), order)
 
 
 CASSEGRAIN = [  # two mirrors: primary R -200, secondary R -80 as written, 75 apart
-    ["SURF 1", "  STOP", "  CURV -0.005", "  DISZ -75", "  GLAS MIRROR 0 0 1.5 40", "  CONI -1", "  DIAM 25", "  CLAP 6 25 0"],
+    [
+        "SURF 1",
+        "  STOP",
+        "  CURV -0.005",
+        "  DISZ -75",
+        "  GLAS MIRROR 0 0 1.5 40",
+        "  CONI -1",
+        "  DIAM 25",
+        "  CLAP 6 25 0",
+    ],
     ["SURF 2", "  CURV -0.0125", "  DISZ 80", "  GLAS MIRROR 0 0 1.5 40", "  CONI -9", "  DIAM 11"],
 ]
 
 
 def test_mirrors_are_unfolded(tmp_path):
     geo = load(tmp_path, text(changed(HEAD, "ENPD", ["ENPD 50"]), (OBJECT, *CASSEGRAIN, IMAGE)))
-    f1, f2, d = 100.0, -40.0, 75.0
+    f1 = 100.0
+    f2 = -40.0
+    d = 75.0
     assert efl(geo) == pytest.approx(f1 * f2 / (f1 + f2 - d), rel=1e-13)  # two thin elements
     front, back = geo.to_surfaces()
-    assert (front.radius_mm, front.thickness_mm, front.mirror, front.inner_semi_aperture_mm) == (-200, 75, True, 6)
+    assert (front.radius_mm, front.thickness_mm, front.mirror, front.inner_semi_aperture_mm) == (
+        -200,
+        75,
+        True,
+        6,
+    )
     assert (back.radius_mm, back.thickness_mm, back.conic, back.mirror) == (80, 80, -9, True)
 
 
 def test_the_light_may_step_back_at_a_plane_that_does_nothing(tmp_path):
     dummy = ["SURF 1", "  CURV 0", "  DISZ -5"]
-    blocks = (OBJECT, dummy, changed(FRONT, "SURF", ["SURF 2"]), changed(changed(BACK, "SURF", ["SURF 3"]), "DISZ", ["  DISZ 65"]), ["SURF 4", "  CURV 0", "  DISZ -5"], ["SURF 5", "  CURV 0"])
+    blocks = (
+        OBJECT,
+        dummy,
+        changed(FRONT, "SURF", ["SURF 2"]),
+        changed(changed(BACK, "SURF", ["SURF 3"]), "DISZ", ["  DISZ 65"]),
+        ["SURF 4", "  CURV 0", "  DISZ -5"],
+        ["SURF 5", "  CURV 0"],
+    )
     assert load(tmp_path, text(surfaces=blocks)).to_surfaces() == load(tmp_path, text()).to_surfaces()
     kept = (OBJECT, changed(dummy, "DISZ", ["  DISZ 5"]), *blocks[2:])
     assert [s.thickness_mm for s in load(tmp_path, text(surfaces=kept)).to_surfaces()] == [5, 4, 60]
@@ -160,21 +273,43 @@ def test_the_light_may_step_back_at_a_plane_that_does_nothing(tmp_path):
 def test_obstructions_and_rings_become_an_inner_aperture(tmp_path):
     for line in ("  OBSC 0 2.5 0", "  CLAP 2.5 8 0"):
         geo = load(tmp_path, text(surfaces=(OBJECT, [*FRONT, line], BACK, IMAGE)))
-        assert (geo.to_surfaces()[0].inner_semi_aperture_mm, geo.to_surfaces()[0].semi_aperture_mm) == (2.5, 8)
+        assert (geo.to_surfaces()[0].inner_semi_aperture_mm, geo.to_surfaces()[0].semi_aperture_mm) == (
+            2.5,
+            8,
+        )
 
 
 def test_a_model_glass_has_its_index_and_abbe_number(tmp_path):
-    geo = load(tmp_path, text(surfaces=(OBJECT, changed(FRONT, "GLAS", ["  GLAS ___BLANK 1 0 1.6123 44.1 0 0 0"]), BACK, IMAGE)))
+    geo = load(
+        tmp_path,
+        text(
+            surfaces=(OBJECT, changed(FRONT, "GLAS", ["  GLAS ___BLANK 1 0 1.6123 44.1 0 0 0"]), BACK, IMAGE)
+        ),
+    )
     glass = geo.to_surfaces()[0].medium
     assert (glass.index_d, glass.abbe_number) == pytest.approx((1.6123, 44.1), rel=1e-13)
 
 
 def test_apertures_a_file_leaves_out_let_the_field_pass(tmp_path):
-    geo = load(tmp_path, text(surfaces=(OBJECT, [x for x in FRONT if "DIAM" not in x], [x for x in BACK if "DIAM" not in x], IMAGE)))
+    geo = load(
+        tmp_path,
+        text(
+            surfaces=(
+                OBJECT,
+                [x for x in FRONT if "DIAM" not in x],
+                [x for x in BACK if "DIAM" not in x],
+                IMAGE,
+            )
+        ),
+    )
     stop, back = geo.semi_aperture_mm.tolist()
     assert stop == pytest.approx(5)
-    rays = torch.tensor([[0.0, y - 5 * math.tan(math.radians(5)), -5.0] for y in (-4.9, 0, 4.9)], dtype=torch.float64)
-    towards = torch.tensor([0.0, math.sin(math.radians(5)), math.cos(math.radians(5))], dtype=torch.float64).expand(3, 3)
+    rays = torch.tensor(
+        [[0.0, y - 5 * math.tan(math.radians(5)), -5.0] for y in (-4.9, 0, 4.9)], dtype=torch.float64
+    )
+    towards = torch.tensor(
+        [0.0, math.sin(math.radians(5)), math.cos(math.radians(5))], dtype=torch.float64
+    ).expand(3, 3)
     assert geo.trace(rays, towards).weight.tolist() == pytest.approx([1, 1, 1], abs=0.5)
     assert back < 6
 
@@ -186,16 +321,38 @@ def test_a_written_file_reads_back_to_the_last_digit_or_two(name, tmp_path):
     after = lens.load(tmp_path / "a.zmx")
     for old, new in zip(before.to_surfaces(), after.to_surfaces(), strict=True):
         assert new.radius_mm == pytest.approx(old.radius_mm, rel=3e-16)  # it passes through its reciprocal
-        assert (new.thickness_mm, new.semi_aperture_mm, new.conic, new.asphere, new.mirror) == (old.thickness_mm, old.semi_aperture_mm, old.conic, old.asphere, old.mirror)
+        assert (new.thickness_mm, new.semi_aperture_mm, new.conic, new.asphere, new.mirror) == (
+            old.thickness_mm,
+            old.semi_aperture_mm,
+            old.conic,
+            old.asphere,
+            old.mirror,
+        )
         assert (new.medium and new.medium.name) == (old.medium and old.medium.name)
     for wavelength_um in lens.WAVELENGTH_UM.values():
-        assert after.index(wavelength_um).tolist() == pytest.approx(before.index(wavelength_um).tolist(), abs=1e-8)
-    assert (after.name, after.stop_index, after.entrance_pupil_diameter_mm, after.half_field_deg) == (before.name, before.stop_index, before.entrance_pupil_diameter_mm, before.half_field_deg)
+        assert after.index(wavelength_um).tolist() == pytest.approx(
+            before.index(wavelength_um).tolist(), abs=1e-8
+        )
+    assert (after.name, after.stop_index, after.entrance_pupil_diameter_mm, after.half_field_deg) == (
+        before.name,
+        before.stop_index,
+        before.entrance_pupil_diameter_mm,
+        before.half_field_deg,
+    )
 
 
 def test_all_a_zmx_file_can_hold_is_written(tmp_path):
     surfaces = [
-        Surface(31.7, 5.1, Glass.from_abbe(1.6123, 44.1), 9.0, conic=-0.7, asphere=(1e-4, -2.2e-6), is_stop=True, phase=Phase((-3.3, 0.01), order=2)),
+        Surface(
+            31.7,
+            5.1,
+            Glass.from_abbe(1.6123, 44.1),
+            9.0,
+            conic=-0.7,
+            asphere=(1e-4, -2.2e-6),
+            is_stop=True,
+            phase=Phase((-3.3, 0.01), order=2),
+        ),
         Surface(-180.3, 21.0, None, 9.0, conic=-1.1, mirror=True, inner_semi_aperture_mm=1.25),
         Surface(250.0, 3.0, Glass.named("F2"), 9.0, asphere=(0.0, 1e-7)),
         Surface(float("inf"), 21.0, None, 9.0),
@@ -210,19 +367,32 @@ def test_all_a_zmx_file_can_hold_is_written(tmp_path):
     for old, new in zip(surfaces, after.to_surfaces(), strict=True):
         assert new.radius_mm == pytest.approx(old.radius_mm, rel=3e-16)
         assert new.asphere[: len(old.asphere)] == old.asphere
-        assert not any(new.asphere[len(old.asphere):])
-        for name in ("thickness_mm", "semi_aperture_mm", "conic", "is_stop", "mirror", "phase", "inner_semi_aperture_mm"):
+        assert not any(new.asphere[len(old.asphere) :])
+        for name in (
+            "thickness_mm",
+            "semi_aperture_mm",
+            "conic",
+            "is_stop",
+            "mirror",
+            "phase",
+            "inner_semi_aperture_mm",
+        ):
             assert getattr(new, name) == getattr(old, name), name
     assert after.to_surfaces()[2].medium == Glass.named("F2")
-    assert after.index(0.65).tolist() == pytest.approx(before.index(0.65).tolist(), abs=2e-5)  # of the model glass, nd and Vd are kept
+    assert after.index(0.65).tolist() == pytest.approx(
+        before.index(0.65).tolist(), abs=2e-5
+    )  # of the model glass, nd and Vd are kept
     assert after.first_order().efl_mm.item() == pytest.approx(before.first_order().efl_mm.item(), rel=1e-12)
 
 
 def test_what_a_zmx_file_cannot_hold_is_not_written(tmp_path):
     plain = Surface(50.0, 40.0, None, 5.0)
-    for rare, reason in ((Surface(50.0, 4.0, None, 5.0, tilt_deg=(1.0, 0.0)), "decentred or tilted"), (Surface(50.0, 4.0, None, 5.0, asphere=(0.0,) * 8 + (1e-20,)), "9 asphere terms"),
-                         (Surface(50.0, 4.0, Glass.from_indices(1.5, 1.5, 1.5, "flat"), 5.0), "Abbe number inf"),
-                         (Surface(50.0, 4.0, None, 5.0, phase=Phase((-1.0,), blaze_um=0.5)), "blaze wavelength")):
+    for rare, reason in (
+        (Surface(50.0, 4.0, None, 5.0, tilt_deg=(1.0, 0.0)), "decentred or tilted"),
+        (Surface(50.0, 4.0, None, 5.0, asphere=(0.0,) * 8 + (1e-20,)), "9 asphere terms"),
+        (Surface(50.0, 4.0, Glass.from_indices(1.5, 1.5, 1.5, "flat"), 5.0), "Abbe number inf"),
+        (Surface(50.0, 4.0, None, 5.0, phase=Phase((-1.0,), blaze_um=0.5)), "blaze wavelength"),
+    ):
         with pytest.raises(FileFormatError, match=f"surface 1: .*{reason}.*save the lens as .json"):
             lens.save(GeoLens([rare, plain], 5.0), tmp_path / "a.zmx")
     assert not list(tmp_path.iterdir())
@@ -251,7 +421,10 @@ def head(old, *new):
 
 
 BAD = {
-    "coordinate break": (front("TYPE", "TYPE COORDBRK", "PARM 3 45"), "surface 1: type COORDBRK is not read.*tilts or shifts"),
+    "coordinate break": (
+        front("TYPE", "TYPE COORDBRK", "PARM 3 45"),
+        "surface 1: type COORDBRK is not read.*tilts or shifts",
+    ),
     "toroid": (front("TYPE", "TYPE TOROIDAL"), "type TOROIDAL"),
     "paraxial": (front("TYPE", "TYPE PARAXIAL"), "ideal thin lens"),
     "odd asphere": (front("TYPE", "TYPE ODDASPHE"), "odd powers"),
@@ -265,20 +438,50 @@ BAD = {
     "ring obstruction": (at_front("OBSC 1 2 0"), "blocks a ring"),
     "unknown keyword": (at_front("WOBL 3"), "keyword 'WOBL' is not understood; delete the line"),
     "two curvatures": (at_front("CURV 0.03"), "CURV comes twice"),
-    "unknown glass": (front("GLAS", "GLAS N-BK77 0 0 1.5 40"), "surface 1: glass 'N-BK77' is not in the catalogue; the nearest names are .*N-BK7"),
+    "unknown glass": (
+        front("GLAS", "GLAS N-BK77 0 0 1.5 40"),
+        "surface 1: glass 'N-BK77' is not in the catalogue; the nearest names are .*N-BK7",
+    ),
     "model glass without numbers": (front("GLAS", "GLAS ___BLANK 1 0"), "no index and Abbe number"),
     "model glass without dispersion": (front("GLAS", "GLAS ___BLANK 1 0 1.5 0"), "Vd=0.0"),
-    "negative edge": (front("DISZ", "DISZ 0.3"), "surface 1: the glass behind it is -.* mm thick at .* mm from the axis"),
-    "backwards": (text(surfaces=(OBJECT, FRONT, changed(BACK, "DISZ", ["  DISZ -3"]), IMAGE)), "surface 2: the light would travel 3 mm backwards"),
+    "negative edge": (
+        front("DISZ", "DISZ 0.3"),
+        "surface 1: the glass behind it is -.* mm thick at .* mm from the axis",
+    ),
+    "backwards": (
+        text(surfaces=(OBJECT, FRONT, changed(BACK, "DISZ", ["  DISZ -3"]), IMAGE)),
+        "surface 2: the light would travel 3 mm backwards",
+    ),
     "aperture beyond the sphere": (front("DIAM", "DIAM 51"), "surface 1: semi-aperture 51.0 mm exceeds"),
     "negative diameter": (front("DIAM", "DIAM -8"), "semi-diameter is -8"),
-    "no stop": (text(surfaces=(OBJECT, [x for x in FRONT if "STOP" not in x], BACK, IMAGE)), "mark one between object and image with STOP"),
-    "two stops": (text(surfaces=(OBJECT, FRONT, [BACK[0], "  STOP", *BACK[1:]], IMAGE)), r"surfaces \[1, 2\] are marked as the stop"),
-    "stop on the image": (text(surfaces=(OBJECT, [x for x in FRONT if "STOP" not in x], BACK, [IMAGE[0], "  STOP"])), r"\[3\] are marked"),
-    "curved image": (text(surfaces=(OBJECT, FRONT, BACK, changed(IMAGE, "CURV", ["  CURV 0.01"]))), "only a flat image plane"),
-    "immersed object": (text(surfaces=([*OBJECT, "  GLAS WATER 0 0"], FRONT, BACK, IMAGE)), "object lies in 'WATER'"),
-    "a number missing": (text(surfaces=(OBJECT, FRONT, changed(BACK, "SURF", ["SURF 3"]), IMAGE)), "surface 2 is missing"),
-    "a number twice": (text(surfaces=(OBJECT, FRONT, changed(BACK, "SURF", ["SURF 1"]), IMAGE)), "surface 1 comes twice"),
+    "no stop": (
+        text(surfaces=(OBJECT, [x for x in FRONT if "STOP" not in x], BACK, IMAGE)),
+        "mark one between object and image with STOP",
+    ),
+    "two stops": (
+        text(surfaces=(OBJECT, FRONT, [BACK[0], "  STOP", *BACK[1:]], IMAGE)),
+        r"surfaces \[1, 2\] are marked as the stop",
+    ),
+    "stop on the image": (
+        text(surfaces=(OBJECT, [x for x in FRONT if "STOP" not in x], BACK, [IMAGE[0], "  STOP"])),
+        r"\[3\] are marked",
+    ),
+    "curved image": (
+        text(surfaces=(OBJECT, FRONT, BACK, changed(IMAGE, "CURV", ["  CURV 0.01"]))),
+        "only a flat image plane",
+    ),
+    "immersed object": (
+        text(surfaces=([*OBJECT, "  GLAS WATER 0 0"], FRONT, BACK, IMAGE)),
+        "object lies in 'WATER'",
+    ),
+    "a number missing": (
+        text(surfaces=(OBJECT, FRONT, changed(BACK, "SURF", ["SURF 3"]), IMAGE)),
+        "surface 2 is missing",
+    ),
+    "a number twice": (
+        text(surfaces=(OBJECT, FRONT, changed(BACK, "SURF", ["SURF 1"]), IMAGE)),
+        "surface 1 comes twice",
+    ),
     "no surface": (text(surfaces=(OBJECT, IMAGE[:1])).replace("SURF 3", "SURF 1"), "it has 2 surfaces"),
     "too many surfaces": ("\n".join([*HEAD, *(f"SURF {i}" for i in range(600))]), "more than 500 surfaces"),
     "not sequential": (head("MODE", "MODE NSC"), "mode 'NSC'"),
@@ -295,7 +498,13 @@ BAD = {
     "infinite thickness": (front("DISZ", "DISZ INFINITY"), "finite"),
     "underscores": (front("CURV", "CURV 1_0"), "a finite number"),
     "5000 digits": (front("CURV", "CURV " + "9" * 5000), "a finite number"),
-    "a focal length that is none": (text(changed(HEAD, "ENPD", ["FNUM 5 0"]), (OBJECT, changed(FRONT, "CURV", ["  CURV 0"]), changed(BACK, "CURV", ["  CURV 0"]), IMAGE)), "afocal"),
+    "a focal length that is none": (
+        text(
+            changed(HEAD, "ENPD", ["FNUM 5 0"]),
+            (OBJECT, changed(FRONT, "CURV", ["  CURV 0"]), changed(BACK, "CURV", ["  CURV 0"]), IMAGE),
+        ),
+        "afocal",
+    ),
 }
 
 

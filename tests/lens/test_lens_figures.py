@@ -1,4 +1,5 @@
-"""What the drawings of a lens show: true sags, rays that end where they are traced to, curves with the values of the analysis; and the study on odd lenses."""
+"""What the drawings of a lens show: true sags, rays that end where they are traced to, curves with the values
+of the analysis; and the study on odd lenses."""
 
 import json
 import math
@@ -17,7 +18,7 @@ from codesign.lens.seidel import seidel_sums
 from codesign.report import lens_curves, lens_figures
 from codesign.report.lens_layout import ray_paths
 from studies import lens_report
-from studies.run import main
+from studies.frame.run import main
 
 D = torch.float64
 
@@ -29,13 +30,23 @@ def _close_figures():
 
 
 def telescope():
-    """A Cassegrain: 200 mm f/8, a paraboloid and a hyperboloid, its axis unfolded at both mirrors; no half field."""
-    # primary f = 500 mm, secondary magnifies 3.2 times; k = -((m + 1) / (m - 1))^2 (Schroeder, Astronomical Optics, ch. 2)
-    m, f1, gap = 3.2, 500.0, 380.0
+    """A Cassegrain: 200 mm f/8, a paraboloid and a hyperboloid, its axis unfolded at both mirrors; no half
+    field."""
+    # primary f = 500 mm, secondary magnifies 3.2 times; k = -((m + 1) / (m - 1))^2 (Schroeder, Astronomical
+    # Optics, ch. 2)
+    m = 3.2
+    f1 = 500.0
+    gap = 380.0
     image = m * (f1 - gap)
     radius = 2 * image / (m - 1)  # of the secondary; convex, so it bends the other way than the primary
-    primary = Surface(-2 * f1, gap, None, 100.0, conic=-1.0, is_stop=True, mirror=True, inner_semi_aperture_mm=25.0)
-    return GeoLens([primary, Surface(radius, image, None, 40.0, conic=-(((m + 1) / (m - 1)) ** 2), mirror=True)], 200.0, name="cassegrain")
+    primary = Surface(
+        -2 * f1, gap, None, 100.0, conic=-1.0, is_stop=True, mirror=True, inner_semi_aperture_mm=25.0
+    )
+    return GeoLens(
+        [primary, Surface(radius, image, None, 40.0, conic=-(((m + 1) / (m - 1)) ** 2), mirror=True)],
+        200.0,
+        name="cassegrain",
+    )
 
 
 def values(line, axis):
@@ -43,7 +54,8 @@ def values(line, axis):
 
 
 def test_ray_paths_lie_on_the_surfaces_and_end_on_the_traced_points():
-    geo, field = lens.load("double-gauss"), math.radians(10.0)
+    geo = lens.load("double-gauss")
+    field = math.radians(10.0)
     pupil = torch.tensor([[0.0, -0.6], [0.0, 0.0], [0.0, 0.7]], dtype=D)
     paths = ray_paths(geo, field, pupil, -10.0)
     end = analysis.trace_field(geo, field, pupil).position_mm[:, 1].detach().numpy()
@@ -55,7 +67,9 @@ def test_ray_paths_lie_on_the_surfaces_and_end_on_the_traced_points():
         assert path[-1] == pytest.approx([vertices[-1], height], abs=1e-9)
         for s, at, (z, y) in zip(geo.surfaces, vertices, path[1:], strict=False):
             c = s.curvature_per_mm
-            assert z - at == pytest.approx(c * y * y / (1 + math.sqrt(1 - c * c * y * y)), abs=1e-9)  # a sphere
+            assert z - at == pytest.approx(
+                c * y * y / (1 + math.sqrt(1 - c * c * y * y)), abs=1e-9
+            )  # a sphere
 
 
 def test_a_layout_is_saved_by_its_ending(tmp_path):
@@ -76,15 +90,20 @@ def test_a_layout_says_that_mirrors_are_unfolded():
 
 
 def test_curves_carry_the_values_of_the_analysis():
-    geo, field = lens.load("cooke-triplet"), math.radians(20.0)
+    geo = lens.load("cooke-triplet")
+    field = math.radians(20.0)
     figure = lens_curves.field_errors(geo, field, count=5)
     shown = values(figure.axes[0].lines[0], "x")[-1]
     assert shown == analysis.focus_shift_mm(geo, [field])[0, 0].item()
     assert values(figure.axes[1].lines[0], "x")[-1] == analysis.distortion_percent(geo, [field]).item()
     bars = lens_curves.seidel_bars(seidel_sums(geo, field)).axes[1].patches
-    assert [b.get_height() for b in bars if isinstance(b, Rectangle)] == pytest.approx((seidel_sums(geo, field).total / 0.5875618e-3).tolist(), rel=1e-12)
+    assert [b.get_height() for b in bars if isinstance(b, Rectangle)] == pytest.approx(
+        (seidel_sums(geo, field).total / 0.5875618e-3).tolist(), rel=1e-12
+    )
     fans = lens_figures.ray_fans(geo, [field])
-    assert values(fans.axes[0].lines[0], "y")[-1] == pytest.approx(1e3 * analysis.ray_fan(geo, field, count=65).tangential_mm[-1].item(), rel=1e-12)
+    assert values(fans.axes[0].lines[0], "y")[-1] == pytest.approx(
+        1e3 * analysis.ray_fan(geo, field, count=65).tangential_mm[-1].item(), rel=1e-12
+    )
     encircled = values(lens_curves.encircled_curves(geo, [0.0]).axes[0].lines[0], "y")
     assert (encircled[0], encircled[-1]) == (0, 1)
     focus = values(lens_curves.through_focus(geo, [0.0], [-0.1, 0.0], 20.0).axes[0].lines[0], "y")
@@ -97,15 +116,25 @@ def test_the_report_of_odd_lenses(name, tmp_path, monkeypatch):
         geo = telescope()
         monkeypatch.setattr(lens_report.lens, "load", lambda _: geo)
     elif name == "vignetted":  # the full field is wider than its apertures
-        surfaces = [replace(s, semi_aperture_mm=min(s.semi_aperture_mm, 4.5)) for s in lens.load("cooke-triplet").surfaces]
+        surfaces = [
+            replace(s, semi_aperture_mm=min(s.semi_aperture_mm, 4.5))
+            for s in lens.load("cooke-triplet").surfaces
+        ]
         geo = GeoLens(surfaces, 10.0, name="narrow", half_field_deg=40.0)
         monkeypatch.setattr(lens_report.lens, "load", lambda _: geo)
-    assert main(lens_report.study, lens_report.Config, ["--lens", name, "--quick", "--out", str(tmp_path / "run")]) == 0
+    assert (
+        main(
+            lens_report.study, lens_report.Config, ["--lens", name, "--quick", "--out", str(tmp_path / "run")]
+        )
+        == 0
+    )
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     page = (tmp_path / "run" / "report.html").read_text()
     if name == "la1509":
         assert metrics["efl_mm"] == pytest.approx(99.6516960375206, rel=1e-12)
-        assert metrics["seidel_spherical_waves"] == pytest.approx(0.022022275303298557 / 0.5875618e-3, rel=1e-11)
+        assert metrics["seidel_spherical_waves"] == pytest.approx(
+            0.022022275303298557 / 0.5875618e-3, rel=1e-11
+        )
     elif name == "telescope":
         assert metrics["efl_mm"] == pytest.approx(1600.0, rel=1e-12)
         assert metrics["rms_waves_0deg"] <= 1e-6  # a classical Cassegrain is perfect on its axis
@@ -117,5 +146,10 @@ def test_the_report_of_odd_lenses(name, tmp_path, monkeypatch):
 
 
 def test_the_report_refuses_what_cannot_be(tmp_path, capsys):
-    assert main(lens_report.study, lens_report.Config, ["--half-field-deg", "95", "--out", str(tmp_path / "run")]) == 2
+    assert (
+        main(
+            lens_report.study, lens_report.Config, ["--half-field-deg", "95", "--out", str(tmp_path / "run")]
+        )
+        == 2
+    )
     assert "a half field of 95.0 degrees cannot be" in capsys.readouterr().err

@@ -1,4 +1,5 @@
-"""Optimisers against problems of the literature, scipy, and their own interrupted runs (which must repeat to the last bit)."""
+"""Optimisers against problems of the literature, scipy, and their own interrupted runs (which must repeat to
+the last bit)."""
 
 import io
 import itertools
@@ -13,7 +14,14 @@ import torch
 from codesign.errors import DomainError, NonFiniteError, ShapeError
 from codesign.lens.design.adam import ScaledAdam
 from codesign.lens.design.least_squares import DampedLeastSquares, StopRules
-from codesign.lens.design.optimise import Entry, History, by_autograd, by_differences, column_scales, principal_modes
+from codesign.lens.design.optimise import (
+    Entry,
+    History,
+    by_autograd,
+    by_differences,
+    column_scales,
+    principal_modes,
+)
 
 D = torch.float64
 
@@ -27,11 +35,15 @@ def rosenbrock(x):
 
 
 def powell_singular(x):
-    return torch.stack([x[0] + 10 * x[1], 5**0.5 * (x[2] - x[3]), (x[1] - 2 * x[2]) ** 2, 10**0.5 * (x[0] - x[3]) ** 2])
+    return torch.stack(
+        [x[0] + 10 * x[1], 5**0.5 * (x[2] - x[3]), (x[1] - 2 * x[2]) ** 2, 10**0.5 * (x[0] - x[3]) ** 2]
+    )
 
 
 def freudenstein_roth(x):
-    return torch.stack([-13 + x[0] + ((5 - x[1]) * x[1] - 2) * x[1], -29 + x[0] + ((x[1] + 1) * x[1] - 14) * x[1]])
+    return torch.stack(
+        [-13 + x[0] + ((5 - x[1]) * x[1] - 2) * x[1], -29 + x[0] + ((x[1] + 1) * x[1] - 14) * x[1]]
+    )
 
 
 TIMES = torch.linspace(0.1, 4, 40, dtype=D)
@@ -43,7 +55,9 @@ def decay(x):
 
 
 class TestDampedLeastSquares:
-    @pytest.mark.parametrize("jacobian", [by_autograd, by_differences(1e-7), by_differences(1e-5, central=True)])
+    @pytest.mark.parametrize(
+        "jacobian", [by_autograd, by_differences(1e-7), by_differences(1e-5, central=True)]
+    )
     def test_rosenbrock_reaches_its_zero(self, jacobian):
         solver = DampedLeastSquares(rosenbrock, vector(-1.2, 1.0), jacobian)
         found = solver.run(200)
@@ -51,44 +65,69 @@ class TestDampedLeastSquares:
         torch.testing.assert_close(found, vector(1, 1), rtol=0, atol=1e-9)
 
     def test_powell_singular_function(self):
-        """The Jacobian is singular at the minimum 0: convergence is linear, a factor of two per step in x, never a breakdown."""
-        solver = DampedLeastSquares(powell_singular, vector(3, -1, 0, 1), stop=StopRules(steps=200, gradient=0, step=0, loss=0))
+        """The Jacobian is singular at the minimum 0: convergence is linear, a factor of two per step in x,
+        never a breakdown."""
+        solver = DampedLeastSquares(
+            powell_singular, vector(3, -1, 0, 1), stop=StopRules(steps=200, gradient=0, step=0, loss=0)
+        )
         found = solver.run()
         assert float(found.abs().max()) <= 1e-4
         assert solver.loss <= 1e-16  # fourth powers of 1e-4
 
     def test_a_linear_problem_takes_one_step(self, generator):
-        A, b = torch.randn(9, 4, dtype=D, generator=generator), torch.randn(9, dtype=D, generator=generator)
+        A = torch.randn(9, 4, dtype=D, generator=generator)
+        b = torch.randn(9, dtype=D, generator=generator)
         solver = DampedLeastSquares(lambda x: A @ x - b, torch.zeros(4, dtype=D), damping=1e-15)
         solver.step()
         truth = torch.linalg.lstsq(A, b).solution
-        torch.testing.assert_close(solver.variables, truth, rtol=1e-12, atol=1e-12)  # condition of A some 10, damping 1e-15
+        torch.testing.assert_close(
+            solver.variables, truth, rtol=1e-12, atol=1e-12
+        )  # condition of A some 10, damping 1e-15
 
-    @pytest.mark.parametrize(("problem", "start"), [(freudenstein_roth, (0.5, -2.0)), (decay, (1.0, 1.0, 0.0)), (rosenbrock, (-1.2, 1.0))])
+    @pytest.mark.parametrize(
+        ("problem", "start"),
+        [(freudenstein_roth, (0.5, -2.0)), (decay, (1.0, 1.0, 0.0)), (rosenbrock, (-1.2, 1.0))],
+    )
     def test_minima_agree_with_scipy(self, problem, start):
         solver = DampedLeastSquares(problem, vector(*start))
         found = solver.run(1000)
-        plain = lambda x: problem(torch.from_numpy(np.asarray(x))).numpy()  # noqa: E731
-        truth = scipy.optimize.least_squares(plain, start, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=10000)
-        # a minimum with a residual is known to the root of rounding by its loss, 1e-8, and better by its gradient
+
+        def plain(x):
+            return problem(torch.from_numpy(np.asarray(x))).numpy()
+
+        truth = scipy.optimize.least_squares(
+            plain, start, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=10000
+        )
+        # a minimum with a residual is known to the root of rounding by its loss, 1e-8, and better by its
+        # gradient
         assert solver.loss == pytest.approx(truth.cost, rel=1e-12, abs=1e-25)
         torch.testing.assert_close(found, torch.from_numpy(truth.x), rtol=1e-5, atol=1e-6)
 
     @pytest.mark.parametrize(
-        ("lower", "upper"), [((-5, -5), (0.8, 5)), ((-5, 1.5), (5, 5)), ((-1.5, 0.5), (0.5, 3))])
+        ("lower", "upper"), [((-5, -5), (0.8, 5)), ((-5, 1.5), (5, 5)), ((-1.5, 0.5), (0.5, 3))]
+    )
     def test_bounded_minima_agree_with_scipy(self, lower, upper):
         solver = DampedLeastSquares(rosenbrock, vector(-1.2, 1.9), lower=vector(*lower), upper=vector(*upper))
         found = solver.run(500)
-        plain = lambda x: rosenbrock(torch.from_numpy(np.asarray(x))).numpy()  # noqa: E731
-        truth = scipy.optimize.least_squares(plain, (-1.2, 1.9), bounds=(lower, upper), xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=10000)
+
+        def plain(x):
+            return rosenbrock(torch.from_numpy(np.asarray(x))).numpy()
+
+        truth = scipy.optimize.least_squares(
+            plain, (-1.2, 1.9), bounds=(lower, upper), xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=10000
+        )
         assert bool((found >= vector(*lower)).all())
         assert bool((found <= vector(*upper)).all())
-        assert solver.loss == pytest.approx(truth.cost, rel=1e-6, abs=1e-12)  # scipy's interior steps stop just short of a bound
+        assert solver.loss == pytest.approx(
+            truth.cost, rel=1e-6, abs=1e-12
+        )  # scipy's interior steps stop just short of a bound
         torch.testing.assert_close(found, torch.from_numpy(truth.x), rtol=1e-4, atol=1e-5)
 
     def test_a_hinge_row_gives_the_minimum_of_the_penalised_problem(self):
         """min (x - 3)^2 + w^2 max(0, x - 1)^2 lies at (3 + w^2) / (1 + w^2)."""
-        solver = DampedLeastSquares(lambda x: torch.stack([x[0] - 3, 10 * (x[0] - 1).clamp_min(0)]), vector(0.0))
+        solver = DampedLeastSquares(
+            lambda x: torch.stack([x[0] - 3, 10 * (x[0] - 1).clamp_min(0)]), vector(0.0)
+        )
         assert solver.run(100).item() == pytest.approx((3 + 100) / 101, rel=1e-9)
 
     def test_residuals_that_are_not_finite_are_failed_steps(self):
@@ -116,23 +155,30 @@ class TestDampedLeastSquares:
         assert all(b <= a for a, b in itertools.pairwise(losses))
         assert calls == solver.history.entries
         x = vector(15.0, -2.0)
-        r, J = freudenstein_roth(x), by_autograd(freudenstein_roth, x, None)
+        r = freudenstein_roth(x)
+        J = by_autograd(freudenstein_roth, x, None)
         assert losses[0] == pytest.approx(float(r.square().sum()) / 2, rel=1e-14)
         assert solver.history[0].gradient == pytest.approx(float((J.T @ r).norm()), rel=1e-12)
         assert solver.stopped in ("gradient", "step", "loss", "damping")
 
     def test_steps_do_not_depend_on_the_units_of_the_variables(self):
         units = vector(1e-3, 1e4, 7.0)
-        plain, other = DampedLeastSquares(decay, vector(1, 1, 0.1)), DampedLeastSquares(lambda u: decay(units * u), vector(1, 1, 0.1) / units)
+        plain = DampedLeastSquares(decay, vector(1, 1, 0.1))
+        other = DampedLeastSquares(lambda u: decay(units * u), vector(1, 1, 0.1) / units)
         for _ in range(6):
             plain.step()
             other.step()
-            torch.testing.assert_close(units * other.variables, plain.variables, rtol=1e-9, atol=1e-12)  # the same in exact arithmetic
+            torch.testing.assert_close(
+                units * other.variables, plain.variables, rtol=1e-9, atol=1e-12
+            )  # the same in exact arithmetic
 
     @pytest.mark.parametrize("route", ["json", "torch"])
     def test_a_resumed_run_repeats_the_uninterrupted_one_to_the_last_bit(self, route):
-        make = lambda: DampedLeastSquares(powell_singular, vector(3, -1, 0, 1), by_differences(1e-7))  # noqa: E731
-        whole, first = make(), make()
+        def make():
+            return DampedLeastSquares(powell_singular, vector(3, -1, 0, 1), by_differences(1e-7))
+
+        whole = make()
+        first = make()
         whole.run(25)
         first.run(11)
         resumed = make().resume(carried(first.state(), route))
@@ -151,23 +197,29 @@ class TestDampedLeastSquares:
         with pytest.raises(DomainError, match="residuals at the start"):
             DampedLeastSquares(lambda x: torch.log(x), vector(-1.0))
         with pytest.raises(ShapeError, match="state has 2"):
-            DampedLeastSquares(powell_singular, vector(3, -1, 0, 1)).resume(DampedLeastSquares(rosenbrock, vector(0, 0)).state())
+            DampedLeastSquares(powell_singular, vector(3, -1, 0, 1)).resume(
+                DampedLeastSquares(rosenbrock, vector(0, 0)).state()
+            )
 
 
 class TestScaledAdam:
     def test_the_first_steps_by_hand(self):
-        """Loss x^2 / 2 with scale 2: u' = -0.1 sign at first (Kingma and Ba), so x moves by 0.2; then the averages by hand."""
+        """Loss x^2 / 2 with scale 2: u' = -0.1 sign at first (Kingma and Ba), so x moves by 0.2; then the
+        averages by hand."""
         solver = ScaledAdam(lambda x: x.square().sum() / 2, vector(5.0), vector(2.0), step_size=0.1)
         solver.step()
         assert solver.variables.item() == pytest.approx(5 - 0.2, rel=1e-12)
-        g1, g2 = 2 * 5.0, 2 * 4.8
-        mean, square = (0.9 * 0.1 * g1 + 0.1 * g2) / (1 - 0.9**2), (0.999 * 0.001 * g1**2 + 0.001 * g2**2) / (1 - 0.999**2)
+        g1 = 2 * 5.0
+        g2 = 2 * 4.8
+        mean = (0.9 * 0.1 * g1 + 0.1 * g2) / (1 - 0.9**2)
+        square = (0.999 * 0.001 * g1**2 + 0.001 * g2**2) / (1 - 0.999**2)
         solver.step()
         assert solver.variables.item() == pytest.approx(4.8 - 2 * 0.1 * mean / square**0.5, rel=1e-12)
 
     def test_it_takes_the_steps_of_torch_adam(self):
         """An independent program: torch.optim.Adam on the scaled variables."""
-        scales, start = vector(0.3, 2.0), vector(-1.2, 1.0)
+        scales = vector(0.3, 2.0)
+        start = vector(-1.2, 1.0)
         mine = ScaledAdam(lambda x: rosenbrock(x).square().sum(), start, scales, step_size=0.05)
         u = torch.zeros(2, dtype=D, requires_grad=True)
         theirs = torch.optim.Adam([u], lr=0.05, eps=1e-12)
@@ -179,10 +231,15 @@ class TestScaledAdam:
         torch.testing.assert_close(mine.variables, (start + scales * u).detach(), rtol=1e-9, atol=1e-9)
 
     def test_scales_from_the_jacobian_mend_bad_units(self, generator):
-        """A quadratic with columns of size 1e-3 and 1e3: the same path in scaled units as with columns of size 1."""
+        """A quadratic with columns of size 1e-3 and 1e3: the same path in scaled units as with columns of
+        size 1."""
         A = torch.linalg.qr(torch.randn(6, 2, dtype=D, generator=generator))[0]
-        units, target = vector(1e-3, 1e3), torch.randn(6, dtype=D, generator=generator)
-        loss = lambda x: (A @ (x * units) - target).square().sum()  # noqa: E731
+        units = vector(1e-3, 1e3)
+        target = torch.randn(6, dtype=D, generator=generator)
+
+        def loss(x):
+            return (A @ (x * units) - target).square().sum()
+
         solver = ScaledAdam(loss, vector(0, 0), column_scales(A * units), step_size=0.05)
         best = solver.run(800)
         truth = float((target - A @ (A.T @ target)).square().sum())
@@ -190,8 +247,11 @@ class TestScaledAdam:
 
     @pytest.mark.parametrize("route", ["json", "torch"])
     def test_a_resumed_run_repeats_the_uninterrupted_one_to_the_last_bit(self, route):
-        make = lambda: ScaledAdam(lambda x: rosenbrock(x).square().sum(), vector(-1.2, 1.0), vector(0.5, 1.0))  # noqa: E731
-        whole, first = make(), make()
+        def make():
+            return ScaledAdam(lambda x: rosenbrock(x).square().sum(), vector(-1.2, 1.0), vector(0.5, 1.0))
+
+        whole = make()
+        first = make()
         whole.run(40)
         first.run(17)
         resumed = make().resume(carried(first.state(), route))
@@ -201,8 +261,11 @@ class TestScaledAdam:
         assert torch.equal(resumed.best, whole.best)
 
     def test_a_loss_that_is_not_finite_is_a_failed_step(self):
-        """5 x - log x has its minimum at 0.2; from 0.5 a first step of 1.7 lands at -1.2, where the logarithm is NaN."""
-        solver = ScaledAdam(lambda x: -torch.log(x).sum() + 5 * x.sum(), vector(0.5), step_size=1.7, betas=(0.5, 0.9))
+        """5 x - log x has its minimum at 0.2; from 0.5 a first step of 1.7 lands at -1.2, where the logarithm
+        is NaN."""
+        solver = ScaledAdam(
+            lambda x: -torch.log(x).sum() + 5 * x.sum(), vector(0.5), step_size=1.7, betas=(0.5, 0.9)
+        )
         for _ in range(300):
             solver.step()
             assert bool(solver.variables.isfinite().all())
@@ -216,19 +279,27 @@ def test_jacobians_against_derivatives_by_hand():
     x = vector(-1.2, 1.0)
     truth = torch.tensor([[-20 * -1.2, 10.0], [-1.0, 0.0]], dtype=D)
     torch.testing.assert_close(by_autograd(rosenbrock, x, rosenbrock(x)), truth, rtol=1e-14, atol=0)
-    # forward: half the second derivative (20) times the step, and rounding 1e-15 over it; central: exact on a quadratic but for rounding
+    # forward: half the second derivative (20) times the step, and rounding 1e-15 over it; central: exact on a
+    # quadratic but for rounding
     torch.testing.assert_close(by_differences(1e-6)(rosenbrock, x, rosenbrock(x)), truth, rtol=0, atol=1.1e-5)
-    torch.testing.assert_close(by_differences(1e-4, central=True)(rosenbrock, x, rosenbrock(x)), truth, rtol=0, atol=1e-10)
+    torch.testing.assert_close(
+        by_differences(1e-4, central=True)(rosenbrock, x, rosenbrock(x)), truth, rtol=0, atol=1e-10
+    )
 
 
 def test_differences_use_the_side_where_the_residuals_exist():
     x = vector(1.0)
-    near_edge = lambda at: torch.sqrt(1 - at) + at  # noqa: E731 - NaN above 1
+
+    def near_edge(at):
+        return torch.sqrt(1 - at) + at  # NaN above 1
+
     at = vector(1 - 1e-7)
     slope = by_differences(1e-5)(near_edge, at, near_edge(at))
     truth = (near_edge(at) - near_edge(at - 1e-5)) / 1e-5
     torch.testing.assert_close(slope[:, 0], truth, rtol=1e-6, atol=0)
-    assert not bool(by_differences(1e-5)(lambda at: torch.where(at == x, at, math.nan), x, x).isfinite().all())
+    assert not bool(
+        by_differences(1e-5)(lambda at: torch.where(at == x, at, math.nan), x, x).isfinite().all()
+    )
 
 
 def test_principal_modes_have_effects_at_right_angles_of_size_one(generator):

@@ -15,13 +15,19 @@ D = torch.float64
 
 def thick(radius_a=60.0, radius_b=-90.0, thickness=8.0, n=1.6):
     glass = Glass.from_indices(n, n, n)
-    return GeoLens([Surface(radius_a, thickness, glass, 9.0, is_stop=True), Surface(radius_b, 50.0, None, 9.0)], 10.0)
+    return GeoLens(
+        [Surface(radius_a, thickness, glass, 9.0, is_stop=True), Surface(radius_b, 50.0, None, 9.0)], 10.0
+    )
 
 
 def test_matrix_of_a_thick_lens():
-    n, t = 1.6, 8.0
-    a, b = (n - 1) / 60.0, (1 - n) / -90.0
-    truth = torch.tensor([[1 - a * t / n, t / n], [-(a + b - a * b * t / n), 1 - b * t / n]], dtype=D)  # Gullstrand
+    n = 1.6
+    t = 8.0
+    a = (n - 1) / 60.0
+    b = (1 - n) / -90.0
+    truth = torch.tensor(
+        [[1 - a * t / n, t / n], [-(a + b - a * b * t / n), 1 - b * t / n]], dtype=D
+    )  # Gullstrand
     torch.testing.assert_close(system_matrix(thick()).detach(), truth, rtol=1e-14, atol=1e-16)
 
 
@@ -29,20 +35,27 @@ def test_matrix_of_a_thick_lens():
 def test_the_matrix_keeps_the_invariant(name):
     geo = lens.load(name)
     assert float(torch.linalg.det(system_matrix(geo).detach())) == pytest.approx(1, abs=1e-13)
-    first, points = geo.first_order(), cardinal_points(geo)
+    first = geo.first_order()
+    points = cardinal_points(geo)
     assert float(points.rear_focal_z_mm.detach()) == pytest.approx(float(first.bfl_mm.detach()), rel=1e-13)
     rays = paraxial_rays(geo, 0.2)
     n = geo.index().detach()
-    y, y_bar = rays.marginal_height_mm, rays.chief_height_mm
+    y = rays.marginal_height_mm
+    y_bar = rays.chief_height_mm
     behind = n[1:] * (rays.chief_angle[1:] * y - rays.marginal_angle[1:] * y_bar)
-    torch.testing.assert_close(behind.detach(), rays.invariant_mm.detach().expand_as(behind), rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        behind.detach(), rays.invariant_mm.detach().expand_as(behind), rtol=1e-12, atol=0
+    )
     assert float(y_bar[geo.stop_index].abs().detach()) <= 1e-12
-    assert float(y[geo.stop_index].abs().detach()) == pytest.approx(float(first.stop_semi_aperture_mm.detach()), rel=1e-12)
+    assert float(y[geo.stop_index].abs().detach()) == pytest.approx(
+        float(first.stop_semi_aperture_mm.detach()), rel=1e-12
+    )
 
 
 def test_cardinal_points_of_a_ball_in_air():
     # both principal and both nodal points of a ball lie in its centre; f = n R / 2 (n - 1)
-    R, n = 10.0, 1.5
+    R = 10.0
+    n = 1.5
     points = cardinal_points(thick(R, -R, 2 * R, n))
     for z in (points.front_principal_z_mm, points.front_nodal_z_mm):
         assert float(z.detach()) == pytest.approx(R, rel=1e-13)
@@ -52,19 +65,28 @@ def test_cardinal_points_of_a_ball_in_air():
 
 
 def test_an_eye_has_its_nodal_points_apart_from_its_principal_points():
-    # one refracting surface into n': principal points on it, nodal points in its centre, focal lengths R / (n' - 1) and n' R / (n' - 1)
-    R, n = 5.55, 4 / 3
+    # one refracting surface into n': principal points on it, nodal points in its centre, focal lengths R /
+    # (n' - 1) and n' R / (n' - 1)
+    R = 5.55
+    n = 4 / 3
     eye = GeoLens([Surface(R, 22.2, Glass.from_indices(n, n, n), 3.0, is_stop=True)], 3.0)
     points = cardinal_points(eye)
-    assert [float(v.detach()) for v in (points.front_principal_z_mm, points.rear_principal_z_mm)] == pytest.approx([0, 0], abs=1e-13)
-    assert [float(v.detach()) for v in (points.front_nodal_z_mm, points.rear_nodal_z_mm)] == pytest.approx([R, R], rel=1e-12)
+    assert [
+        float(v.detach()) for v in (points.front_principal_z_mm, points.rear_principal_z_mm)
+    ] == pytest.approx([0, 0], abs=1e-13)
+    assert [float(v.detach()) for v in (points.front_nodal_z_mm, points.rear_nodal_z_mm)] == pytest.approx(
+        [R, R], rel=1e-12
+    )
     assert float(points.front_focal_length_mm.detach()) == pytest.approx(R / (n - 1), rel=1e-13)
     assert float(points.rear_focal_z_mm.detach()) == pytest.approx(n * R / (n - 1), rel=1e-13)
     assert float(points.front_focal_z_mm.detach()) == pytest.approx(-R / (n - 1), rel=1e-13)
 
 
 def test_what_has_no_paraxial_figures_is_refused():
-    window = GeoLens([Surface(math.inf, 5.0, Glass.from_indices(1.5, 1.5, 1.5), 5.0), Surface(math.inf, 5.0, None, 5.0)], 3.0)
+    window = GeoLens(
+        [Surface(math.inf, 5.0, Glass.from_indices(1.5, 1.5, 1.5), 5.0), Surface(math.inf, 5.0, None, 5.0)],
+        3.0,
+    )
     with pytest.raises(DomainError, match="no cardinal points"):
         cardinal_points(window)
     with pytest.raises(DomainError, match="at 90 degrees has no slope"):
@@ -76,13 +98,18 @@ def test_what_has_no_paraxial_figures_is_refused():
 def test_circle_of_confusion_is_the_spread_of_the_rays():
     thin = ThinLens(50.0, 20.0, 50.7)
     for distance_m in (0.4, 3.0, 50.0):
-        # rays from two film points through both rims; where they pass the object's plane is linear in the film point
+        # rays from two film points through both rims; where they pass the object's plane is linear in the
+        # film point
         film = torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=D).repeat(2, 1)
         pupil = torch.tensor([[1.0, 0.0]] * 2 + [[-1.0, 0.0]] * 2, dtype=D)
         rays = thin.camera_rays(film, pupil)
         at = rays.origin_m[:, 0] + rays.direction[:, 0] / rays.direction[:, 2] * distance_m
-        start = [float(-a / (b - a)) for a, b in (at[:2], at[2:])]  # film points whose rays meet the axis there
-        assert float(circle_of_confusion_mm(thin, distance_m)) == pytest.approx(abs(start[0] - start[1]), rel=1e-10)
+        start = [
+            float(-a / (b - a)) for a, b in (at[:2], at[2:])
+        ]  # film points whose rays meet the axis there
+        assert float(circle_of_confusion_mm(thin, distance_m)) == pytest.approx(
+            abs(start[0] - start[1]), rel=1e-10
+        )
     assert float(circle_of_confusion_mm(ThinLens(50.0, 20.0), math.inf)) == 0
     sharp = 50.0 * 50.7 / 0.7 * 1e-3  # 1 / f = 1 / s + 1 / d
     assert float(circle_of_confusion_mm(thin, sharp)) == pytest.approx(0, abs=1e-13)
@@ -91,8 +118,26 @@ def test_circle_of_confusion_is_the_spread_of_the_rays():
 def test_gradients_of_paraxial_figures():
     def figures(curvature, thickness):
         geo = thick().replace(curvature_per_mm=curvature, thickness_mm=thickness)
-        rays, points = paraxial_rays(geo, 0.2), cardinal_points(geo)
-        return torch.cat([system_matrix(geo).reshape(-1), rays.chief_angle, rays.marginal_height_mm, points.front_nodal_z_mm.reshape(1), circle_of_confusion_mm(geo.thin(), 2.0).reshape(1)])
+        rays = paraxial_rays(geo, 0.2)
+        points = cardinal_points(geo)
+        return torch.cat(
+            [
+                system_matrix(geo).reshape(-1),
+                rays.chief_angle,
+                rays.marginal_height_mm,
+                points.front_nodal_z_mm.reshape(1),
+                circle_of_confusion_mm(geo.thin(), 2.0).reshape(1),
+            ]
+        )
 
     start = thick()
-    assert torch.autograd.gradcheck(figures, (start.curvature_per_mm.detach().clone().requires_grad_(), start.thickness_mm.detach().clone().requires_grad_()), eps=1e-7, atol=1e-5, rtol=1e-5)
+    assert torch.autograd.gradcheck(
+        figures,
+        (
+            start.curvature_per_mm.detach().clone().requires_grad_(),
+            start.thickness_mm.detach().clone().requires_grad_(),
+        ),
+        eps=1e-7,
+        atol=1e-5,
+        rtol=1e-5,
+    )

@@ -15,12 +15,17 @@ LINES = (0.5875618, 0.4861327, 0.6562725)
 
 
 def paraboloid(diameter=5.0, focal_length=100.0):
-    return GeoLens([Surface(-2 * focal_length, focal_length, None, 30.0, conic=-1.0, is_stop=True, mirror=True)], diameter)
+    return GeoLens(
+        [Surface(-2 * focal_length, focal_length, None, 30.0, conic=-1.0, is_stop=True, mirror=True)],
+        diameter,
+    )
 
 
 def test_the_airy_pattern():
     # f/20: (2 J1(x) / x)^2 with x = pi r / (w N); its first zero at 1.22 w N
-    pixel, w, N = 5e-4, 0.5875618e-3, 20.0
+    pixel = 5e-4
+    w = 0.5875618e-3
+    N = 20.0
     energy = psf_on_pixels(paraboloid(), 0.0, pixel, 128, grid=256).energy.detach()
     r = (torch.arange(128, dtype=D) - 64) * pixel
     x = math.pi * r / (w * N)
@@ -38,13 +43,17 @@ def test_the_airy_pattern():
 
 @pytest.mark.parametrize("field_deg", [0.0, 1.5])
 def test_peak_and_energy_of_the_fft_are_those_of_the_pupil(field_deg):
-    geo, field = GeoLens(lens.load("la1509").surfaces, 8.0), math.radians(field_deg)
+    geo = GeoLens(lens.load("la1509").surfaces, 8.0)
+    field = math.radians(field_deg)
     psf = diffraction_psf(geo, field, grid=64, padding=4)
     assert psf.energy.shape == (256, 256)
     assert float(psf.energy.sum().detach()) == pytest.approx(1, abs=1e-12)
     front = wavefront(geo, field, grid=64)
-    # |sum of A|^2 = m^2 x energy x sum |A|^2 (Parseval), so the middle pixel holds the Strehl ratio times M / m^2 of M lit cells
-    assert float(psf.energy[128, 128].detach()) == pytest.approx(float(strehl_direct(front).detach()) * front.waves.numel() / 256**2, rel=1e-10)
+    # |sum of A|^2 = m^2 x energy x sum |A|^2 (Parseval), so the middle pixel holds the Strehl ratio times M /
+    # m^2 of M lit cells
+    assert float(psf.energy[128, 128].detach()) == pytest.approx(
+        float(strehl_direct(front).detach()) * front.waves.numel() / 256**2, rel=1e-10
+    )
 
 
 def test_the_two_transforms_agree():
@@ -53,11 +62,14 @@ def test_the_two_transforms_agree():
     pixels = psf_on_pixels(geo, 0.0, float(fft.pitch_mm[0].detach()), 64, grid=32)
     torch.testing.assert_close(fft.pitch_mm[0], fft.pitch_mm[1], rtol=1e-10, atol=0)
     torch.testing.assert_close(pixels.energy, fft.energy, rtol=1e-6, atol=1e-12)
-    torch.testing.assert_close(fft.pitch_mm[0].detach(), torch.tensor(0.5875618e-3 * 99.65 / 8 / 2, dtype=D), rtol=5e-3, atol=0)  # w N / padding, N to (y / f)^2
+    torch.testing.assert_close(
+        fft.pitch_mm[0].detach(), torch.tensor(0.5875618e-3 * 99.65 / 8 / 2, dtype=D), rtol=5e-3, atol=0
+    )  # w N / padding, N to (y / f)^2
 
 
 def test_the_geometric_spread_keeps_light_and_its_mean():
-    geo, field = lens.load("cooke-triplet"), math.radians(14.0)
+    geo = lens.load("cooke-triplet")
+    field = math.radians(14.0)
     for light in (LINES[0], LINES):
         psf = geometric_psf(geo, field, 0.001, 200, light, grid=64)
         assert float(psf.energy.sum().detach()) == pytest.approx(1, abs=1e-12)
@@ -73,8 +85,10 @@ def test_the_geometric_spread_keeps_light_and_its_mean():
 
 
 def test_diffraction_keeps_the_mean_of_the_rays():
-    # the mean of |U|^2 is the mean slope of the wavefront (Ehrenfest), and the sign of y is that of the lens: coma of a singlet
-    geo, field = GeoLens(lens.load("la1509").surfaces, 16.0), math.radians(2.0)
+    # the mean of |U|^2 is the mean slope of the wavefront (Ehrenfest), and the sign of y is that of the lens:
+    # coma of a singlet
+    geo = GeoLens(lens.load("la1509").surfaces, 16.0)
+    field = math.radians(2.0)
     psf = diffraction_psf(geo, field, grid=256, padding=4)
     at = torch.arange(1024, dtype=D) - 512
     mean = float(((psf.energy.sum(1) * at).sum() * psf.pitch_mm[1]).detach())
@@ -92,19 +106,27 @@ def test_gradients_of_point_spreads():
     def check(make, step, rel):
         value = geo.curvature_per_mm.detach()
         leaf = value.clone().requires_grad_()
-        loss = lambda c: (make(geo.replace(curvature_per_mm=c)).energy * picture).sum()  # noqa: E731
+
+        def loss(c):
+            return (make(geo.replace(curvature_per_mm=c)).energy * picture).sum()
+
         (found,) = torch.autograd.grad(loss(leaf), leaf)
         direction = torch.tensor([0.02, 0.001], dtype=D)
         truth = float((loss(value + step * direction) - loss(value - step * direction)).detach()) / (2 * step)
         assert float(found @ direction) == pytest.approx(truth, rel=rel)
 
     check(lambda g: psf_on_pixels(g, 0.02, 0.002, 24, LINES, grid=64), 1e-6, 1e-5)
-    check(lambda g: geometric_psf(g, 0.02, 0.002, 24, LINES, grid=32), 1e-9, 1e-3)  # bilinear: steps so small that hardly a ray changes its pixel
+    check(
+        lambda g: geometric_psf(g, 0.02, 0.002, 24, LINES, grid=32), 1e-9, 1e-3
+    )  # bilinear: steps so small that hardly a ray changes its pixel
 
 
 def test_what_cannot_be_sampled_is_refused():
     geo = lens.load("double-gauss")
-    with pytest.raises(DomainError, match=r"neighbouring pupil cells differ by .* waves at field 14 degrees with a grid of 32"):
+    with pytest.raises(
+        DomainError,
+        match=r"neighbouring pupil cells differ by .* waves at field 14 degrees with a grid of 32",
+    ):
         diffraction_psf(geo, math.radians(14.0), grid=32)
     with pytest.raises(DomainError, match="padding 1 must be a whole number of at least 2"):
         diffraction_psf(geo, 0.0, padding=1)

@@ -1,4 +1,5 @@
-"""The design study from plane plates: its residuals are the spots it is judged by, its searches go on exactly, its intervals are Wilson's."""
+"""The design study from plane plates: its residuals are the spots it is judged by, its searches go on
+exactly, its intervals are Wilson's."""
 
 import json
 import math
@@ -10,9 +11,9 @@ import torch
 from codesign import lens
 from codesign.lens import WAVELENGTH_UM
 from codesign.lens.analysis import pupil_grid
-from studies.lens_scratch import wilson
-from studies.lens_scratch_search import Search
-from studies.lens_scratch_task import (
+from studies.lens_scratch.__main__ import wilson
+from studies.lens_scratch.search import Search
+from studies.lens_scratch.task import (
     EFL_MM,
     HALF_FIELD,
     JUDGED_FIELDS,
@@ -30,7 +31,8 @@ D = torch.float64
 
 
 def published():
-    """The Cooke triplet in the study's variables, with its image plane at the paraxial focus; and as published."""
+    """The Cooke triplet in the study's variables, with its image plane at the paraxial focus; and as
+    published."""
     geo = lens.load("cooke-triplet").freeze()
     return torch.cat([geo.curvature_per_mm[:5], geo.thickness_mm[:5], torch.zeros(1, dtype=D)]), geo
 
@@ -70,7 +72,8 @@ def test_the_judge_sees_the_published_lens_as_it_is():
 
 @pytest.mark.parametrize("method", ["curriculum", "adam"])
 def test_a_search_goes_on_exactly_after_a_break(method):
-    whole, first = Search(method, 5, 21.6), Search(method, 5, 21.6)
+    whole = Search(method, 5, 21.6)
+    first = Search(method, 5, 21.6)
     for _ in range(24):  # past the end of the curriculum's first stage
         whole.step()
     for _ in range(22):
@@ -84,7 +87,10 @@ def test_a_search_goes_on_exactly_after_a_break(method):
     else:  # the backward pass sums in parallel, so last bits differ
         assert resumed.losses == pytest.approx(whole.losses, rel=1e-9)
     assert (resumed.stage, resumed.borders, resumed.steps) == (whole.stage, whole.borders, whole.steps)
-    assert resumed.evaluations - whole.evaluations in (0, 11)  # a break after a rejected step takes its Jacobian again
+    assert resumed.evaluations - whole.evaluations in (
+        0,
+        11,
+    )  # a break after a rejected step takes its Jacobian again
 
 
 @pytest.mark.parametrize(("wins", "count"), [(0, 10), (6, 10), (10, 10)])
@@ -94,7 +100,8 @@ def test_wilson_interval_against_scipy(wins, count):
 
 
 def test_one_seed_reaches_the_published_lens():
-    """From plane plates: better than twice the published spot, all limits held. The yardstick is what the study prints."""
+    """From plane plates: better than twice the published spot, all limits held. The yardstick is what the
+    study prints."""
     goal = 2 * sum(polychromatic_spots_um(published()[1])) / 3
     search = Search("direct", 5, goal)
     while search.outcome is None:
@@ -106,7 +113,10 @@ def test_one_seed_reaches_the_published_lens():
     surfaces = verdict.geo.to_surfaces()
     for i in (0, 2, 4):  # edges by hand
         height = max(surfaces[i].semi_aperture_mm, surfaces[i + 1].semi_aperture_mm)
-        sag = [math.copysign(abs(s.radius_mm) - math.sqrt(s.radius_mm**2 - height**2), s.radius_mm) for s in surfaces[i : i + 2]]
+        sag = [
+            math.copysign(abs(s.radius_mm) - math.sqrt(s.radius_mm**2 - height**2), s.radius_mm)
+            for s in surfaces[i : i + 2]
+        ]
         assert surfaces[i].thickness_mm - sag[0] + sag[1] >= 1.0 - 1e-3
         assert surfaces[i].thickness_mm >= 1.0 - 1e-3
     assert sum(s.thickness_mm for s in surfaces) <= 75

@@ -1,4 +1,5 @@
-"""Spectra against closed forms: strata of simple curves, Wien's and Planck's laws, the white point of D65, absorption of silicon."""
+"""Spectra against closed forms: strata of simple curves, Wien's and Planck's laws, the white point of D65,
+absorption of silicon."""
 
 import math
 
@@ -25,24 +26,34 @@ def test_a_flat_spectrum_gives_midpoints(count):
     spectrum = Spectrum.from_curves(FLAT, FLAT, count)
     assert spectrum.weights == (1 / count,) * count
     # a difference of moments near 0.2 over an energy of 0.3 / count keeps 1e-16 * count
-    assert spectrum.wavelengths_um == pytest.approx(0.4 + 0.3 * (np.arange(count) + 0.5) / count, abs=1e-15 * (10 + count))
+    assert spectrum.wavelengths_um == pytest.approx(
+        0.4 + 0.3 * (np.arange(count) + 0.5) / count, abs=1e-15 * (10 + count)
+    )
 
 
 @pytest.mark.parametrize("split", [False, True])
 @pytest.mark.parametrize("swapped", [False, True])
 def test_a_ramp_gives_the_square_roots(swapped, split):
-    # energy below w is (w - a)^2, so the strata end at a + width sqrt(k/N) and their means are 2/3 of cube over square differences
-    ramp = (np.array([0.4, 0.5, 0.7]), np.array([0.0, 1.0, 3.0])) if split else (np.array([0.4, 0.7]), np.array([0.0, 9.0]))
+    # energy below w is (w - a)^2, so the strata end at a + width sqrt(k/N) and their means are 2/3 of cube
+    # over square differences
+    ramp = (
+        (np.array([0.4, 0.5, 0.7]), np.array([0.0, 1.0, 3.0]))
+        if split
+        else (np.array([0.4, 0.7]), np.array([0.0, 9.0]))
+    )
     found = Spectrum.from_curves(*((FLAT, ramp) if swapped else (ramp, FLAT)), 5).wavelengths_um
     u = 0.3 * np.sqrt(np.arange(6) / 5)
     assert found == pytest.approx(0.4 + 2 / 3 * np.diff(u**3) / np.diff(u**2), abs=1e-14)
 
 
 def test_the_product_of_two_ramps_is_integrated_exactly():
-    up, down = (np.array([0.0, 1.0]) + 0.4, np.array([0.0, 1.0])), (np.array([0.0, 1.0]) + 0.4, np.array([1.0, 0.0]))
+    up = (np.array([0.0, 1.0]) + 0.4, np.array([0.0, 1.0]))
+    down = (np.array([0.0, 1.0]) + 0.4, np.array([1.0, 0.0]))
     # t (1 - t): mean 1/2; first half has mean 5/16 (integrals 1/12 and 5/192)
     assert Spectrum.from_curves(up, down, 1).wavelengths_um == pytest.approx((0.9,), abs=1e-14)
-    assert Spectrum.from_curves(up, down, 2).wavelengths_um == pytest.approx((0.4 + 5 / 16, 0.4 + 11 / 16), abs=1e-14)
+    assert Spectrum.from_curves(up, down, 2).wavelengths_um == pytest.approx(
+        (0.4 + 5 / 16, 0.4 + 11 / 16), abs=1e-14
+    )
 
 
 @pytest.mark.parametrize("count", [2, 5, 24])
@@ -61,7 +72,8 @@ def test_the_mean_wavelength_does_not_depend_on_the_number_of_strata(count):
 def test_strata_skip_a_gap():
     gap = (np.array([0.4, 0.45, 0.5, 0.6, 0.65, 0.7]), np.array([0.0, 1, 0, 0, 1, 0]))
     assert Spectrum.from_curves(gap, FLAT, 2).wavelengths_um == pytest.approx((0.45, 0.65), abs=1e-14)
-    tiny, huge = (gap[0], gap[1] * 1e-300), (FLAT[0], FLAT[1] * 1e300)
+    tiny = (gap[0], gap[1] * 1e-300)
+    huge = (FLAT[0], FLAT[1] * 1e300)
     assert Spectrum.from_curves(tiny, huge, 2) == Spectrum.from_curves(gap, FLAT, 2)
 
 
@@ -69,7 +81,8 @@ def test_strata_skip_a_gap():
 def test_the_peak_of_a_black_body_follows_wien(temperature_k):
     wavelength_um, value = blackbody(temperature_k)
     top = int(value.argmax())
-    # vertex of the parabola through the three highest points: third-order terms leave less than a tenth of the 5 nm step
+    # vertex of the parabola through the three highest points: third-order terms leave less than a tenth of
+    # the 5 nm step
     left, peak, right = value[top - 1 : top + 2]
     vertex = wavelength_um[top] + 0.005 * (left - right) / (left - 2 * peak + right) / 2
     assert vertex == pytest.approx(2897.771955 / temperature_k, abs=5e-4)
@@ -77,7 +90,8 @@ def test_the_peak_of_a_black_body_follows_wien(temperature_k):
 
 def test_a_hot_black_body_is_that_of_rayleigh_and_jeans():
     wavelength_um, value = blackbody(100_000)
-    # 1/(e^x - 1) = 1/x - 1/2 + x/12 with x <= 0.48; the next term, x^3/720, is largest beside the others (0.77/x) at the first point
+    # 1/(e^x - 1) = 1/x - 1/2 + x/12 with x <= 0.48; the next term, x^3/720, is largest beside the others
+    # (0.77/x) at the first point
     x = 14387.768775 / (wavelength_um * 1e5)
     jeans = wavelength_um**-5 * (1 / x - 0.5 + x / 12)
     assert value / value[0] == pytest.approx(jeans / jeans[0], rel=1.05 * 0.48**4 / 720 / 0.77)
@@ -88,7 +102,8 @@ def test_d65_is_white():
         return np.exp(-0.5 * ((nm - mean) / np.where(nm < mean, below, above)) ** 2)
 
     nm = np.arange(380.0, 781.0)
-    # colour matching functions of 1931 as sums of lobes: Wyman, Sloan and Shirley, JCGT 2 (2013), good to about 0.001 in x and y for white
+    # colour matching functions of 1931 as sums of lobes: Wyman, Sloan and Shirley, JCGT 2 (2013), good to
+    # about 0.001 in x and y for white
     x = 1.056 * lobe(599.8, 37.9, 31.0) + 0.362 * lobe(442.0, 16.0, 26.7) - 0.065 * lobe(501.1, 20.4, 26.2)
     y = 0.821 * lobe(568.8, 46.9, 40.5) + 0.286 * lobe(530.9, 16.3, 31.1)
     z = 1.217 * lobe(437.0, 11.8, 36.0) + 0.681 * lobe(459.0, 26.0, 13.8)
@@ -97,9 +112,13 @@ def test_d65_is_white():
     assert white == pytest.approx((0.31272, 0.32903), abs=1e-3)
 
 
-@pytest.mark.parametrize(("wavelength_um", "absorption_per_cm"), [(0.5, 1.11e4), (0.6, 4.18e3), (0.7, 1.89e3), (0.8, 8.5e2), (0.9, 3.03e2), (1.0, 6.4e1)])
+@pytest.mark.parametrize(
+    ("wavelength_um", "absorption_per_cm"),
+    [(0.5, 1.11e4), (0.6, 4.18e3), (0.7, 1.89e3), (0.8, 8.5e2), (0.9, 3.03e2), (1.0, 6.4e1)],
+)
 def test_a_thin_layer_of_silicon_absorbs_by_its_coefficient(wavelength_um, absorption_per_cm):
-    # so thin that response / w is proportional to the coefficient (0.5 % at 0.5 um); coefficients as Green, 2008, tabulates them
+    # so thin that response / w is proportional to the coefficient (0.5 % at 0.5 um); coefficients as Green,
+    # 2008, tabulates them
     w, value = silicon_response(0.01)
     per_photon = np.interp(wavelength_um, w, value) / wavelength_um / (np.interp(0.5, w, value) / 0.5)
     assert per_photon == pytest.approx(absorption_per_cm / 1.11e4, rel=0.015)
@@ -109,7 +128,9 @@ def test_a_thick_layer_counts_every_visible_photon():
     w, value = silicon_response(1000)
     visible = (w > 0.37) & (w < 0.9)
     # 30 absorption lengths at 0.9 um: the response in A/W is proportional to w
-    assert value[visible] / w[visible] == pytest.approx(np.full(visible.sum(), value[visible][0] / w[visible][0]), rel=1e-12)
+    assert value[visible] / w[visible] == pytest.approx(
+        np.full(visible.sum(), value[visible][0] / w[visible][0]), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize(("wavelengths", "weights", "error", "sentence"), [

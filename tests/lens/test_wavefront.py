@@ -1,4 +1,5 @@
-"""Wavefront errors against exact paraboloids, Seidel's W040, a public program, and closed forms of the Strehl ratio."""
+"""Wavefront errors against exact paraboloids, Seidel's W040, a public program, and closed forms of the Strehl
+ratio."""
 
 import math
 
@@ -8,22 +9,52 @@ import torch
 from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens import GeoLens, Surface, analysis
-from codesign.lens.analysis import Wavefront, peak_to_valley_waves, pupil_grid, remove_fit, rms_waves, strehl_direct, strehl_marechal, wavefront
+from codesign.lens.analysis import (
+    Wavefront,
+    peak_to_valley_waves,
+    pupil_grid,
+    remove_fit,
+    rms_waves,
+    strehl_direct,
+    strehl_marechal,
+    wavefront,
+)
 from codesign.lens.paraxial import cardinal_points
 from codesign.lens.seidel import seidel_sums
 
 D = torch.float64
-# d line, 740 rays of a 32 x 32 grid over [-1, 1] with its ends, fields 0, 0.7 and 1 of the half field: standard deviation and mean of
-# the optical path difference in waves. Computed with optiland (release of 2026) from the same indices; its sign is the same.
+# d line, 740 rays of a 32 x 32 grid over [-1, 1] with its ends, fields 0, 0.7 and 1 of the half field:
+# standard deviation and mean of
+# the optical path difference in waves. Computed with optiland (release of 2026) from the same indices; its
+# sign is the same.
 PEER = {
-    "cooke-triplet": ((0.209454595832, -0.529330646764), (0.59139948487, -0.162493761113), (0.332904033883, 0.636245869922)),
-    "double-gauss": ((1.57245172496, 1.82189681178), (2.53247561522, 3.70906301581), (3.55001828511, 5.7433459115)),
-    "la1509": ((1.37092602113, 1.52600634442), (1.57721143745, 1.85768632039), (1.79493879906, 2.20279713645)),
+    "cooke-triplet": (
+        (0.209454595832, -0.529330646764),
+        (0.59139948487, -0.162493761113),
+        (0.332904033883, 0.636245869922),
+    ),
+    "double-gauss": (
+        (1.57245172496, 1.82189681178),
+        (2.53247561522, 3.70906301581),
+        (3.55001828511, 5.7433459115),
+    ),
+    "la1509": (
+        (1.37092602113, 1.52600634442),
+        (1.57721143745, 1.85768632039),
+        (1.79493879906, 2.20279713645),
+    ),
 }
 
 
 def paraboloid(diameter=40.0, focal_length=100.0, defocus=0.0):
-    return GeoLens([Surface(-2 * focal_length, focal_length + defocus, None, 30.0, conic=-1.0, is_stop=True, mirror=True)], diameter)
+    return GeoLens(
+        [
+            Surface(
+                -2 * focal_length, focal_length + defocus, None, 30.0, conic=-1.0, is_stop=True, mirror=True
+            )
+        ],
+        diameter,
+    )
 
 
 @pytest.mark.parametrize("name", PEER)
@@ -46,15 +77,22 @@ def test_a_paraboloid_is_perfect_on_its_axis():
     assert float(front.opd_mm.abs().max().detach()) <= 1e-12  # roundings of paths of 200 mm
     assert float(strehl_direct(front).detach()) == pytest.approx(1, abs=1e-12)
     leaf = torch.tensor([-1 / 200.0], dtype=D, requires_grad=True)
-    (gradient,) = torch.autograd.grad(rms_waves(wavefront(paraboloid().replace(curvature_per_mm=leaf), 0.0)), leaf)
+    (gradient,) = torch.autograd.grad(
+        rms_waves(wavefront(paraboloid().replace(curvature_per_mm=leaf), 0.0)), leaf
+    )
     assert bool(gradient.isfinite().all())  # the norm of a vector that is nearly 0
 
 
 @pytest.mark.parametrize("shift", [-0.3, 0.05, 2.0])
 def test_defocus_of_a_perfect_lens_is_the_gap_between_two_spheres(shift):
-    # rays at angle a through the focus F meet the sphere of radius f + s about F + s at r = sqrt((f + s)^2 - s^2 sin^2 a) - s cos a; OPD = r - f
-    f, pupil = 100.0, pupil_grid(16)
-    for front in (wavefront(paraboloid(defocus=shift), 0.0, pupil=pupil), wavefront(paraboloid(), 0.0, pupil=pupil, defocus_mm=shift)):
+    # rays at angle a through the focus F meet the sphere of radius f + s about F + s at r = sqrt((f + s)^2 -
+    # s^2 sin^2 a) - s cos a; OPD = r - f
+    f = 100.0
+    pupil = pupil_grid(16)
+    for front in (
+        wavefront(paraboloid(defocus=shift), 0.0, pupil=pupil),
+        wavefront(paraboloid(), 0.0, pupil=pupil, defocus_mm=shift),
+    ):
         angle = 2 * torch.atan(pupil.norm(dim=1) * 20.0 / (2 * f))  # of a paraboloid
         truth = ((f + shift) ** 2 - (shift * angle.sin()) ** 2).sqrt() - shift * angle.cos() - f
         torch.testing.assert_close(front.opd_mm.detach(), truth, rtol=0, atol=1e-12)
@@ -68,27 +106,42 @@ def test_spherical_aberration_of_a_singlet_is_an_eighth_of_the_seidel_sum():
         small = GeoLens(geo.surfaces, diameter)
         with torch.no_grad():
             small.thickness_mm[-1] = small.first_order().bfl_mm
-        ratio.append(float((wavefront(small, 0.0, pupil=rim).opd_mm / (seidel_sums(small, 0.01).total[0] / 8)).detach()))
+        ratio.append(
+            float(
+                (wavefront(small, 0.0, pupil=rim).opd_mm / (seidel_sums(small, 0.01).total[0] / 8)).detach()
+            )
+        )
     assert ratio[0] == pytest.approx(1, abs=2e-3)
-    assert (4 * ratio[1] - ratio[0]) / 3 == pytest.approx(1, abs=1e-6)  # (y / f)^4 = 2e-7, and roundings of 1e-14 mm beside 2e-7 mm
+    assert (4 * ratio[1] - ratio[0]) / 3 == pytest.approx(
+        1, abs=1e-6
+    )  # (y / f)^4 = 2e-7, and roundings of 1e-14 mm beside 2e-7 mm
 
 
 def disc(waves, count=200):
     pupil = pupil_grid(count)
     r2 = pupil.square().sum(1)
-    return Wavefront(pupil, waves(pupil, r2) * 0.5875618e-3, torch.ones_like(r2), torch.zeros_like(pupil), 0.5875618)
+    return Wavefront(
+        pupil, waves(pupil, r2) * 0.5875618e-3, torch.ones_like(r2), torch.zeros_like(pupil), 0.5875618
+    )
 
 
 def test_rms_and_strehl_of_defocus_and_spherical_aberration():
-    # W r^2: RMS W / sqrt 12, Strehl sinc^2 W; W r^4: RMS 2 W / sqrt 45 (Mahajan, Optical Imaging and Aberrations, ch. 8)
+    # W r^2: RMS W / sqrt 12, Strehl sinc^2 W; W r^4: RMS 2 W / sqrt 45 (Mahajan, Optical Imaging and
+    # Aberrations, ch. 8)
     for size in (0.1, 0.25, 1.0):
         defocus = disc(lambda p, r2, size=size: size * r2)
-        assert float(rms_waves(defocus)) == pytest.approx(size / math.sqrt(12), rel=5e-4)  # the rim is a staircase of 1 / 100
+        assert float(rms_waves(defocus)) == pytest.approx(
+            size / math.sqrt(12), rel=5e-4
+        )  # the rim is a staircase of 1 / 100
         assert float(peak_to_valley_waves(defocus)) == pytest.approx(size, rel=1e-3)
         sinc = math.sin(math.pi * size) / (math.pi * size)
         assert float(strehl_direct(defocus)) == pytest.approx(sinc**2, abs=3e-4)
-        assert float(rms_waves(disc(lambda p, r2, size=size: size * r2**2))) == pytest.approx(2 * size / math.sqrt(45), rel=1e-3)
-    assert float(strehl_marechal(disc(lambda p, r2: 0.05 * r2))) == pytest.approx(math.exp(-((2 * math.pi * 0.05) ** 2) / 12), rel=1e-4)
+        assert float(rms_waves(disc(lambda p, r2, size=size: size * r2**2))) == pytest.approx(
+            2 * size / math.sqrt(45), rel=1e-3
+        )
+    assert float(strehl_marechal(disc(lambda p, r2: 0.05 * r2))) == pytest.approx(
+        math.exp(-((2 * math.pi * 0.05) ** 2) / 12), rel=1e-4
+    )
 
 
 def test_fits_take_away_what_they_fit():
@@ -96,13 +149,22 @@ def test_fits_take_away_what_they_fit():
     assert float(rms_waves(remove_fit(tilted, focus=True))) <= 1e-12
     assert float(remove_fit(tilted, tilt=False).waves.mean()) == pytest.approx(0, abs=1e-12)
     # focus balances r^4: sqrt(4 / 45) falls to 1 / (6 sqrt 5) (Mahajan)
-    assert float(rms_waves(remove_fit(disc(lambda p, r2: r2**2), focus=True))) == pytest.approx(1 / (6 * math.sqrt(5)), rel=1e-3)
-    blocked = Wavefront(tilted.pupil, torch.where(tilted.pupil[:, 0] > 0.5, 7.0, tilted.opd_mm), (tilted.pupil[:, 0] <= 0.5).double(), tilted.slope, 0.5875618)
+    assert float(rms_waves(remove_fit(disc(lambda p, r2: r2**2), focus=True))) == pytest.approx(
+        1 / (6 * math.sqrt(5)), rel=1e-3
+    )
+    blocked = Wavefront(
+        tilted.pupil,
+        torch.where(tilted.pupil[:, 0] > 0.5, 7.0, tilted.opd_mm),
+        (tilted.pupil[:, 0] <= 0.5).double(),
+        tilted.slope,
+        0.5875618,
+    )
     assert float(rms_waves(remove_fit(blocked, focus=True))) <= 1e-12  # what no light passes does not count
 
 
 def test_a_telecentric_lens_has_a_plane_for_a_reference_sphere():
-    # a stop in the front focal plane: the wavefront differs from one with a very far pupil by no more than the pupil's distance tells
+    # a stop in the front focal plane: the wavefront differs from one with a very far pupil by no more than
+    # the pupil's distance tells
     surfaces = lens.load("la1509").surfaces
     front = -float(cardinal_points(lens.load("la1509")).front_focal_z_mm.detach())
     found = []
@@ -111,7 +173,9 @@ def test_a_telecentric_lens_has_a_plane_for_a_reference_sphere():
         geo = GeoLens([stop, *(Surface(s.radius_mm, s.thickness_mm, s.medium, 12.7) for s in surfaces)], 10.0)
         found.append(wavefront(geo, 0.02, grid=16).waves.detach())
     assert bool(found[0].isfinite().all())
-    torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-4)  # moved 1e-4 mm: slopes of the wavefront by 1e-6 of 10 waves
+    torch.testing.assert_close(
+        found[0], found[1], rtol=0, atol=1e-4
+    )  # moved 1e-4 mm: slopes of the wavefront by 1e-6 of 10 waves
 
 
 def test_failed_and_vignetted_rays_weigh_nothing():
@@ -136,13 +200,27 @@ def test_gradient_of_the_wavefront_error():
         value = getattr(geo, name).detach()
         leaf = value.clone().requires_grad_()
         (found,) = torch.autograd.grad(loss(**{name: leaf}), leaf)
-        direction = torch.linspace(0.5, 1.0, 6, dtype=D) * (value.abs().mean() + 0.1 * (name == "index_offset"))
+        direction = torch.linspace(0.5, 1.0, 6, dtype=D) * (
+            value.abs().mean() + 0.1 * (name == "index_offset")
+        )
         step = 3e-5
-        near, far = (float((loss(**{name: value + k * step * direction}) - loss(**{name: value - k * step * direction})).detach()) for k in (1, 2))
-        assert float(found @ direction) == pytest.approx((8 * near - far) / (12 * step), rel=1e-6), name  # roundings of 1e-11 waves over differences of 1e-4
+        near, far = (
+            float(
+                (
+                    loss(**{name: value + k * step * direction})
+                    - loss(**{name: value - k * step * direction})
+                ).detach()
+            )
+            for k in (1, 2)
+        )
+        assert float(found @ direction) == pytest.approx((8 * near - far) / (12 * step), rel=1e-6), (
+            name
+        )  # roundings of 1e-11 waves over differences of 1e-4
 
 
 def test_single_precision_is_not_refused():
     front = analysis.wavefront(lens.load("la1509", torch.float32), 0.0, grid=8)
     exact = analysis.wavefront(lens.load("la1509"), 0.0, grid=8)
-    assert float((front.waves.double() - exact.waves).abs().max().detach()) <= 0.1  # paths of 105 mm to 6e-8: 0.01 waves each
+    assert (
+        float((front.waves.double() - exact.waves).abs().max().detach()) <= 0.1
+    )  # paths of 105 mm to 6e-8: 0.01 waves each

@@ -11,7 +11,8 @@ from codesign.place.mount import yaw_pitch_roll_rad
 from codesign.pose import check_poses
 
 D = torch.float64
-NOMINAL, HALF = (0.2, -0.1, 0.4), (0.1, 0.05, 0.2)
+NOMINAL = (0.2, -0.1, 0.4)
+HALF = (0.1, 0.05, 0.2)
 
 
 def axes(mount):
@@ -37,9 +38,16 @@ def test_known_attitudes(angles, right, view):
 
 
 def test_angles_are_read_back(generator):
-    for yaw, pitch, roll in ((torch.rand(20, 3, generator=generator, dtype=D) * 2 - 1) * torch.tensor([3.1, 1.5, 3.1], dtype=D)).tolist():
+    for yaw, pitch, roll in (
+        (torch.rand(20, 3, generator=generator, dtype=D) * 2 - 1) * torch.tensor([3.1, 1.5, 3.1], dtype=D)
+    ).tolist():
         mount = Mount(NOMINAL, HALF, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll)
-        torch.testing.assert_close(yaw_pitch_roll_rad(mount().detach()), torch.tensor([yaw, pitch, roll], dtype=D), rtol=0, atol=1e-13)  # atan2 near the pole: rounding over cos 1.5
+        torch.testing.assert_close(
+            yaw_pitch_roll_rad(mount().detach()),
+            torch.tensor([yaw, pitch, roll], dtype=D),
+            rtol=0,
+            atol=1e-13,
+        )  # atan2 near the pole: rounding over cos 1.5
 
 
 def test_positions_stay_in_the_box_and_rotations_are_free(generator):
@@ -55,12 +63,16 @@ def test_positions_stay_in_the_box_and_rotations_are_free(generator):
 
 def test_start_position_is_kept_and_a_zero_range_holds_an_axis():
     mount = Mount(NOMINAL, (0.1, 0.0, 0.2), position_m=(0.25, -0.1, 0.25))
-    torch.testing.assert_close(mount().detach()[:3, 3], torch.tensor([0.25, -0.1, 0.25], dtype=D), rtol=0, atol=1e-15)
+    torch.testing.assert_close(
+        mount().detach()[:3, 3], torch.tensor([0.25, -0.1, 0.25], dtype=D), rtol=0, atol=1e-15
+    )
     moved = mount(torch.full((6,), 2.0, dtype=D))
     assert float(moved[1, 3]) == -0.1
 
 
-@pytest.mark.parametrize("pitch", [0.3, math.pi / 2])  # straight down, where yaw and roll are one, is no special case
+@pytest.mark.parametrize(
+    "pitch", [0.3, math.pi / 2]
+)  # straight down, where yaw and roll are one, is no special case
 def test_gradient_of_the_pose(generator, pitch):
     mount = Mount(NOMINAL, HALF, yaw_rad=0.4, pitch_rad=pitch)
     numbers = (0.5 * torch.randn(2, 6, generator=generator, dtype=D)).requires_grad_()
@@ -71,10 +83,14 @@ def test_gradient_of_the_pose(generator, pitch):
 
 def test_a_moving_body_carries_its_camera():
     mount = Mount((0.2, 0.0, 0.4), HALF, pitch_rad=math.pi / 2)
-    turned = torch.tensor([[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=D)  # body at (5, 6), heading +y
+    turned = torch.tensor(
+        [[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=D
+    )  # body at (5, 6), heading +y
     pose = mount.in_world(turned).detach()
     torch.testing.assert_close(pose[:3, 3], torch.tensor([5.0, 6.2, 0.4], dtype=D), rtol=0, atol=1e-15)
-    torch.testing.assert_close(pose[:3, 1], torch.tensor([0.0, -1, 0], dtype=D), rtol=0, atol=1e-15)  # image down is backward
+    torch.testing.assert_close(
+        pose[:3, 1], torch.tensor([0.0, -1, 0], dtype=D), rtol=0, atol=1e-15
+    )  # image down is backward
 
 
 @pytest.mark.parametrize(
@@ -83,7 +99,11 @@ def test_a_moving_body_carries_its_camera():
         (lambda: Mount((0, 0, math.nan), HALF), DomainError, "nominal_m"),
         (lambda: Mount(NOMINAL, (0.1, -0.1, 0.1)), DomainError, "at least 0"),
         (lambda: Mount(NOMINAL, HALF, yaw_rad=math.inf), DomainError, "yaw_rad"),
-        (lambda: Mount(NOMINAL, HALF, position_m=(0.31, -0.1, 0.4)), DomainError, "not strictly inside the allowed box"),
+        (
+            lambda: Mount(NOMINAL, HALF, position_m=(0.31, -0.1, 0.4)),
+            DomainError,
+            "not strictly inside the allowed box",
+        ),
         (lambda: Mount((0, 0), HALF), ShapeError, "three numbers"),
         (lambda: Mount(NOMINAL, HALF)(torch.zeros(5, dtype=D)), ShapeError, r"\[..., 6\]"),
         (lambda: Mount(NOMINAL, HALF)(torch.full((6,), math.nan, dtype=D)), DomainError, "last finite"),

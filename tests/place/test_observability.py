@@ -1,4 +1,5 @@
-"""Velocity from flow against flow of motions carried out exactly, and against closed forms of simple mounts."""
+"""Velocity from flow against flow of motions carried out exactly, and against closed forms of simple
+mounts."""
 
 import math
 
@@ -44,13 +45,17 @@ def body_at(velocity, t_s):
 
 
 def ground(camera, T_body_cam):
-    """World points on z = 0 under the pixels, depth (NaN where there is none) and a mask: by the renderer's ground truth."""
-    points, depth, valid = world_points(camera.chief_rays(camera.film.pixels()), worlds.smooth_plane(), T_body_cam)
+    """World points on z = 0 under the pixels, depth (NaN where there is none) and a mask: by the renderer's
+    ground truth."""
+    points, depth, valid = world_points(
+        camera.chief_rays(camera.film.pixels()), worlds.smooth_plane(), T_body_cam
+    )
     return points, torch.where(valid, depth, torch.nan), valid
 
 
 def exact_flow(camera, T_body_cam, velocity, dt_s=1e-3):
-    """Image velocity [1, 2, H, W] of static ground: points are projected before and after, by an eighth-order central difference in time."""
+    """Image velocity [1, 2, H, W] of static ground: points are projected before and after, by an eighth-order
+    central difference in time."""
     points, depth, valid = ground(camera, T_body_cam)
     safe = torch.where(valid[:, None], points, points[valid][0])
     total = torch.zeros(len(points), 2, dtype=D)
@@ -66,7 +71,8 @@ def exact_flow(camera, T_body_cam, velocity, dt_s=1e-3):
 def test_exact_flow_gives_back_the_velocity(camera, placed, velocity):
     T_body_cam = mount_of(*placed)
     flow, depth = exact_flow(camera, T_body_cam, velocity)
-    # projection is good to 1e-13 px relative to 10 px, over 1e-3 s: 1e-9 px/s against tens of px/s per m/s, averaged over hundreds of pixels
+    # projection is good to 1e-13 px relative to 10 px, over 1e-3 s: 1e-9 px/s against tens of px/s per m/s,
+    # averaged over hundreds of pixels
     found = place.velocity_from_flow(flow, camera, depth, T_body_cam)
     torch.testing.assert_close(found[0], velocity, rtol=0, atol=1e-9)
 
@@ -75,19 +81,23 @@ def test_weights_do_not_move_an_exact_answer(camera, generator):
     T_body_cam = mount_of(*MOUNTS[1])
     flow, depth = exact_flow(camera, T_body_cam, VELOCITIES[0])
     weight = torch.rand(depth.shape, generator=generator, dtype=D)
-    torch.testing.assert_close(place.velocity_from_flow(flow, camera, depth, T_body_cam, weight)[0], VELOCITIES[0], rtol=0, atol=1e-9)
+    torch.testing.assert_close(
+        place.velocity_from_flow(flow, camera, depth, T_body_cam, weight)[0], VELOCITIES[0], rtol=0, atol=1e-9
+    )
 
 
 def test_flow_through_a_real_lens(triplet):
     T_body_cam = mount_of(*MOUNTS[1])
     flow, depth = exact_flow(triplet, T_body_cam, VELOCITIES[0])
     found = place.velocity_from_flow(flow, triplet, depth, T_body_cam)
-    # differences of chief rays over 2e-3 px: rounding of the trace (1e-13 mm over 1e-3 px) leaves 1e-7 of a slope
+    # differences of chief rays over 2e-3 px: rounding of the trace (1e-13 mm over 1e-3 px) leaves 1e-7 of a
+    # slope
     torch.testing.assert_close(found[0], VELOCITIES[0], rtol=0, atol=1e-6)
 
 
 def test_straight_down_is_the_textbook_case(camera):
-    """Camera axis down at height h through the body's origin: velocity = flow h / f, and turning is a rotation about the image's middle."""
+    """Camera axis down at height h through the body's origin: velocity = flow h / f, and turning is a
+    rotation about the image's middle."""
     T_body_cam = mount_of(*MOUNTS[0])
     depth = torch.full((24 * 16,), HEIGHT, dtype=D)
     rows, seen = place.planar_flow(camera, depth, T_body_cam)
@@ -97,11 +107,24 @@ def test_straight_down_is_the_textbook_case(camera):
     expected = torch.zeros(24 * 16, 2, 3, dtype=D)
     expected[:, 1, 0] = focal_px / HEIGHT  # forward: the ground moves down in the image
     expected[:, 0, 1] = focal_px / HEIGHT  # to the left: it moves right
-    expected[:, 0, 2], expected[:, 1, 2] = -from_middle[:, 1], from_middle[:, 0]  # body left turn seen from above: the image turns right
-    torch.testing.assert_close(rows, expected, rtol=0, atol=1e-9)  # differences of positions of 10 px over 1e-3 px: 1e-12 relative
-    pixels, radius_2 = 24 * 16, from_middle.square().sum()
-    closed = torch.diag(torch.stack([torch.tensor(pixels * (focal_px / HEIGHT) ** 2, dtype=D)] * 2 + [radius_2]))
-    torch.testing.assert_close(place.information(camera, depth, T_body_cam, 2 * torch.ones(24 * 16, dtype=D)), 2 * closed, rtol=1e-9, atol=1e-6)
+    expected[:, 0, 2], expected[:, 1, 2] = (
+        -from_middle[:, 1],
+        from_middle[:, 0],
+    )  # body left turn seen from above: the image turns right
+    torch.testing.assert_close(
+        rows, expected, rtol=0, atol=1e-9
+    )  # differences of positions of 10 px over 1e-3 px: 1e-12 relative
+    pixels = 24 * 16
+    radius_2 = from_middle.square().sum()
+    closed = torch.diag(
+        torch.stack([torch.tensor(pixels * (focal_px / HEIGHT) ** 2, dtype=D)] * 2 + [radius_2])
+    )
+    torch.testing.assert_close(
+        place.information(camera, depth, T_body_cam, 2 * torch.ones(24 * 16, dtype=D)),
+        2 * closed,
+        rtol=1e-9,
+        atol=1e-6,
+    )
 
 
 @pytest.mark.parametrize("placed", MOUNTS[1:])
@@ -113,7 +136,8 @@ def test_information_is_the_covariance_of_noisy_estimates(camera, placed, genera
     noise = torch.randn(draws, 2, *camera.film.shape, generator=generator, dtype=D)
     found = place.velocity_from_flow(noise, camera, depth, T_body_cam)
     whitened = torch.linalg.cholesky(place.information(camera, depth, T_body_cam)).mT @ found.T
-    # entries of a sample covariance of unit variates have standard deviation <= sqrt(2 / draws) = 0.022; five of them
+    # entries of a sample covariance of unit variates have standard deviation <= sqrt(2 / draws) = 0.022; five
+    # of them
     torch.testing.assert_close(whitened @ whitened.T / draws, torch.eye(3, dtype=D), rtol=0, atol=0.11)
 
 
@@ -125,7 +149,9 @@ def test_gradients_of_velocity_and_information(camera, generator):
 
     def along(scale):
         f, d, m, w = (t + scale * k for t, k in zip(tensors, directions, strict=True))
-        return place.velocity_from_flow(f, camera, d, m, w).sum() + place.information(camera, d, m, w).logdet()
+        return (
+            place.velocity_from_flow(f, camera, d, m, w).sum() + place.information(camera, d, m, w).logdet()
+        )
 
     directions = [torch.randn(t.shape, generator=generator, dtype=D) * t.detach().abs() for t in tensors]
     grads = torch.autograd.grad(along(0.0), tensors)
@@ -133,7 +159,9 @@ def test_gradients_of_velocity_and_information(camera, generator):
     with torch.no_grad():
         step = 1e-5
         difference = float(along(step) - along(-step)) / (2 * step)
-    assert analytic == pytest.approx(difference, rel=1e-6)  # truncation (1e-5)^2 times moderate third derivatives
+    assert analytic == pytest.approx(
+        difference, rel=1e-6
+    )  # truncation (1e-5)^2 times moderate third derivatives
 
 
 def test_a_prior_keeps_what_is_not_seen_at_zero(camera):

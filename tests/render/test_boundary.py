@@ -1,4 +1,5 @@
-"""Silhouettes: gradients of frames with occluders against differences with common random numbers, outlines against closed forms."""
+"""Silhouettes: gradients of frames with occluders against differences with common random numbers, outlines
+against closed forms."""
 
 import math
 
@@ -10,16 +11,20 @@ from codesign import backend, pose, render
 from codesign.errors import DomainError
 from codesign.render import MitsubaScene
 from codesign.render.outline import Cylinders, Segments, Spheres, mesh_edges, outlines
-from studies import silhouette_scenes
+from scenes import silhouettes as silhouette_scenes
 from studies.silhouettes import STEPS, Task
 
 F64 = torch.float64
 
 
-@pytest.mark.parametrize(("scene", "kind"), [("cubes", "pinhole"), ("spheres", "traced"), ("poles", "thin"), ("fence", "traced")])
+@pytest.mark.parametrize(
+    ("scene", "kind"), [("cubes", "pinhole"), ("spheres", "traced"), ("poles", "thin"), ("fence", "traced")]
+)
 def test_pose_gradients_with_occluders(scene, kind):
-    """Six components together; differences with 1024 samples at two seeds know the truth to 1 to 2 %, 32 samples per pixel of edge add as much."""
-    task, scale = Task(silhouette_scenes.build(scene), kind), torch.tensor(STEPS["pose"], dtype=F64)
+    """Six components together; differences with 1024 samples at two seeds know the truth to 1 to 2 %, 32
+    samples per pixel of edge add as much."""
+    task = Task(silhouette_scenes.build(scene), kind)
+    scale = torch.tensor(STEPS["pose"], dtype=F64)
     truth = torch.stack([task.differences("pose", 1024, seed) for seed in (11, 12)]).mean(0) * scale
     plain, whole = (task.gradient("pose", 1024, 13, way, 32.0) * scale for way in ("interior", "boundary"))
     assert float((plain - truth).norm() / truth.norm()) > 0.2
@@ -28,7 +33,8 @@ def test_pose_gradients_with_occluders(scene, kind):
 
 def test_lens_gradients_with_occluders():
     """Three curvatures and three thicknesses of the traced triplet, the last of which is the focus."""
-    task, scale = Task(silhouette_scenes.build("cubes"), "traced"), torch.tensor(STEPS["lens"], dtype=F64)
+    task = Task(silhouette_scenes.build("cubes"), "traced")
+    scale = torch.tensor(STEPS["lens"], dtype=F64)
     truth = torch.stack([task.differences("lens", 2048, seed) for seed in (11, 12)]).mean(0) * scale
     plain, whole = (task.gradient("lens", 1024, 13, way, 32.0) * scale for way in ("interior", "boundary"))
     assert float((plain - truth).norm() / truth.norm()) > 0.15
@@ -39,26 +45,39 @@ def test_the_boundary_term_changes_no_frame():
     scene = silhouette_scenes.build("cubes")
     camera = render.Camera(Task(scene, "traced").lens, 16, 16, 0.5, 4)
     path = Task(scene, "pinhole").pose
-    assert torch.equal(render.frames(camera, scene, path), render.frames(camera, scene, path, gradient="boundary"))
+    assert torch.equal(
+        render.frames(camera, scene, path), render.frames(camera, scene, path, gradient="boundary")
+    )
 
 
 def test_a_bright_square_moves_by_its_closed_form():
-    """A square of radiance 100 alone before a pinhole: sideways the sum of all pixels stays, a weighted one gains radiance times length times motion on both sides."""
+    """A square of radiance 100 alone before a pinhole: sideways the sum of all pixels stays, a weighted one
+    gains radiance times length times motion on both sides."""
     mi = backend.mitsuba()
     T = mi.ScalarTransform4f
-    square = {"type": "rectangle", "to_world": T().translate([0.013, 0.021, 2.0]).rotate([0, 1, 0], 180).scale(0.2), "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 100.0}}}
-    scene, camera = MitsubaScene({"square": square}), render.Camera(render_pinhole(), 32, 32, 0.25, 16)
+    square = {
+        "type": "rectangle",
+        "to_world": T().translate([0.013, 0.021, 2.0]).rotate([0, 1, 0], 180).scale(0.2),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 100.0}},
+    }
+    scene = MitsubaScene({"square": square})
+    camera = render.Camera(render_pinhole(), 32, 32, 0.25, 16)
     twist = torch.zeros(6, dtype=F64, requires_grad=True)
-    image = render.frames(camera, scene, torch.eye(4, dtype=F64)[None] @ pose.se3_exp(twist[None]), gradient="boundary")[0].double()
+    image = render.frames(
+        camera, scene, torch.eye(4, dtype=F64)[None] @ pose.se3_exp(twist[None]), gradient="boundary"
+    )[0].double()
     columns = torch.arange(32, dtype=F64)
     (total,) = torch.autograd.grad(image.sum(), twist, retain_graph=True)
     (first,) = torch.autograd.grad((image * columns).sum(), twist)
     px_per_m = 11.0 / 0.25 / 2.0
     side = 0.4 * px_per_m  # 8.8 px
     assert abs(float(total[0])) < 1e-6 * 100 * side * px_per_m  # the two sides cancel
-    # the sides lie in columns 11 and 20, whose weights they carry; points at equal shares of an edge sum a constant exactly
+    # the sides lie in columns 11 and 20, whose weights they carry; points at equal shares of an edge sum a
+    # constant exactly
     assert float(first[0]) == pytest.approx(-100 * side * (20 - 11) * px_per_m, rel=1e-6)
-    assert float(total[2]) == pytest.approx(2 * 100 * side**2 / 2.0, rel=1e-4)  # nearer by dz: the area grows by 2 dz / z
+    assert float(total[2]) == pytest.approx(
+        2 * 100 * side**2 / 2.0, rel=1e-4
+    )  # nearer by dz: the area grows by 2 dz / z
 
 
 def render_pinhole():
@@ -71,11 +90,14 @@ def test_differences_as_the_gradient_are_differences():
     task = Task(silhouette_scenes.build("cubes"), "pinhole")
     found = task.gradient("pose", 64, 5, "difference")
     truth = task.differences("pose", 64, 5)
-    torch.testing.assert_close(found, truth, rtol=2e-2, atol=2e-2 * float(truth.norm()))  # the same steps of 2e-3, float32 frames
+    torch.testing.assert_close(
+        found, truth, rtol=2e-2, atol=2e-2 * float(truth.norm())
+    )  # the same steps of 2e-3, float32 frames
 
 
 def test_auto_takes_the_cheapest_way_that_agrees():
-    scene, wall = silhouette_scenes.build("cubes"), silhouette_scenes.build("wall")
+    scene = silhouette_scenes.build("cubes")
+    wall = silhouette_scenes.build("wall")
     task = Task(scene, "pinhole")
     camera = render.Camera(task.lens, 24, 24, 0.33, 64)
     path = (task.pose @ pose.se3_exp(torch.zeros(1, 6, dtype=F64))).detach().requires_grad_(True)
@@ -93,13 +115,18 @@ def test_auto_takes_the_cheapest_way_that_agrees():
 
 
 def test_outlines_of_spheres_and_cylinders_are_tangent_to_the_view():
-    eye, s = torch.tensor([0.3, -2.0, 0.4], dtype=F64), torch.linspace(0, 0.99, 20, dtype=F64)
+    eye = torch.tensor([0.3, -2.0, 0.4], dtype=F64)
+    s = torch.linspace(0, 0.99, 20, dtype=F64)
     ball = Spheres(torch.tensor([[0.1, 0.2, 0.3]], dtype=F64), torch.tensor([0.5], dtype=F64))
     y = ball.points(torch.zeros(20, dtype=torch.long), s, eye.expand(20, 3))
     outward = y - ball.centre
     torch.testing.assert_close(outward.norm(dim=1), torch.full((20,), 0.5, dtype=F64))
     torch.testing.assert_close((outward * (y - eye)).sum(1), torch.zeros(20, dtype=F64), rtol=0, atol=1e-12)
-    tube = Cylinders(torch.tensor([[0.0, 0.0, -1.0]], dtype=F64), torch.tensor([[0.2, 0.1, 1.0]], dtype=F64), torch.tensor([0.1], dtype=F64))
+    tube = Cylinders(
+        torch.tensor([[0.0, 0.0, -1.0]], dtype=F64),
+        torch.tensor([[0.2, 0.1, 1.0]], dtype=F64),
+        torch.tensor([0.1], dtype=F64),
+    )
     y = tube.points(torch.zeros(20, dtype=torch.long), 2 * s, eye.expand(20, 3))
     axis = torch.nn.functional.normalize(tube.end - tube.start, dim=1)
     outward = (y - tube.start) - ((y - tube.start) * axis).sum(1, keepdim=True) * axis
@@ -109,15 +136,35 @@ def test_outlines_of_spheres_and_cylinders_are_tangent_to_the_view():
 
 def test_flat_diagonals_are_no_edges_and_inner_edges_count_at_silhouettes_only():
     corners = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
-    faces = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])
+    faces = np.array(
+        [
+            [0, 1, 3],
+            [0, 3, 2],
+            [4, 6, 7],
+            [4, 7, 5],
+            [0, 4, 5],
+            [0, 5, 1],
+            [2, 3, 7],
+            [2, 7, 6],
+            [0, 2, 6],
+            [0, 6, 4],
+            [1, 5, 7],
+            [1, 7, 3],
+        ]
+    )
     assert len(mesh_edges(corners, faces)) == 12
     angle = np.linspace(0, 2 * np.pi, 65)[:-1]
     ring = np.concatenate([np.stack([np.cos(angle), np.sin(angle), 0 * angle + z], 1) for z in (0.0, 1.0)])
-    sides = np.array([[i, (i + 1) % 64, 64 + i] for i in range(64)] + [[(i + 1) % 64, 64 + (i + 1) % 64, 64 + i] for i in range(64)])
+    sides = np.array(
+        [[i, (i + 1) % 64, 64 + i] for i in range(64)]
+        + [[(i + 1) % 64, 64 + (i + 1) % 64, 64 + i] for i in range(64)]
+    )
     rows = mesh_edges(ring, sides)
     assert sum(row[3] for row in rows) == 128  # the open ends
     start, end, normals, always = (torch.tensor(np.array(c)) for c in zip(*rows, strict=True))
-    index, _ = Segments(start, end, normals, always.bool()).pieces(torch.tensor([5.0, 0.1, 0.5], dtype=F64), 10.0)
+    index, _ = Segments(start, end, normals, always.bool()).pieces(
+        torch.tensor([5.0, 0.1, 0.5], dtype=F64), 10.0
+    )
     assert int((~always.bool()[index]).sum()) == 2  # of 64 inner edges, the two where the tube turns away
 
 
@@ -125,7 +172,12 @@ def test_interpenetrating_objects_and_unknown_ways_are_refused():
     mi = backend.mitsuba()
     T = mi.ScalarTransform4f
     light = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
-    two = MitsubaScene({"a": {"type": "cube", "emitter": light}, "b": {"type": "cube", "to_world": T().translate([0.9, 0.8, 0.7]), "emitter": light}})
+    two = MitsubaScene(
+        {
+            "a": {"type": "cube", "emitter": light},
+            "b": {"type": "cube", "to_world": T().translate([0.9, 0.8, 0.7]), "emitter": light},
+        }
+    )
     with pytest.raises(DomainError, match=r"an edge of shape '[ab]' passes through another shape"):
         outlines(mi, two.scene)
     scene = silhouette_scenes.build("wall")
@@ -133,12 +185,18 @@ def test_interpenetrating_objects_and_unknown_ways_are_refused():
     with pytest.raises(DomainError, match="choose one of interior, boundary, difference, auto"):
         render.frames(camera, scene, torch.eye(4, dtype=F64)[None], gradient="exact")  # pyright: ignore[reportArgumentType]
     with pytest.raises(DomainError, match="without aim, spectrum and falloff"):
-        render.frames(render.Camera(render_pinhole(), 4, 4, 1.0, 1, falloff=True), scene, torch.eye(4, dtype=F64)[None], gradient="boundary")
+        render.frames(
+            render.Camera(render_pinhole(), 4, 4, 1.0, 1, falloff=True),
+            scene,
+            torch.eye(4, dtype=F64)[None],
+            gradient="boundary",
+        )
     assert math.isfinite(float(render.frames(camera, scene, torch.eye(4, dtype=F64)[None]).sum()))
 
 
 def test_moving_objects_keep_their_own_gradient_or_are_refused_one():
-    card, wall = silhouette_scenes.build("cubes"), silhouette_scenes.build("wall")
+    card = silhouette_scenes.build("cubes")
+    wall = silhouette_scenes.build("wall")
     still = torch.eye(4, dtype=F64).expand(3, 4, 4)
     path = Task(wall, "pinhole").pose.expand(3, 4, 4).clone().requires_grad_(True)
     camera = render.Camera(render_pinhole(), 8, 8, 1.0, 4)
@@ -147,7 +205,9 @@ def test_moving_objects_keep_their_own_gradient_or_are_refused_one():
         render.frames(camera, asks, path, gradient="difference")
     assert torch.equal(render.frames(camera, asks, path, gradient="auto"), render.frames(camera, asks, path))
     moving = render.MovingScene(wall, {"card": (card, still)})
-    frames = render.frames(camera, moving, path, gradient="auto")  # outlines of moving objects are not known: differences
+    frames = render.frames(
+        camera, moving, path, gradient="auto"
+    )  # outlines of moving objects are not known: differences
     (found,) = torch.autograd.grad(frames.sum(), path)
     (truth,) = torch.autograd.grad(render.frames(camera, moving, path, gradient="difference").sum(), path)
     torch.testing.assert_close(found, truth, rtol=1e-5, atol=1e-5 * float(truth.norm()))
@@ -157,7 +217,16 @@ def test_a_seam_of_two_walls_counts_once():
     mi = backend.mitsuba()
     T = mi.ScalarTransform4f
     light = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
-    scene = MitsubaScene({"floor": {"type": "rectangle", "emitter": light}, "wall": {"type": "rectangle", "to_world": T().translate([0, 1, 1]).rotate([1, 0, 0], 90), "emitter": light}})
+    scene = MitsubaScene(
+        {
+            "floor": {"type": "rectangle", "emitter": light},
+            "wall": {
+                "type": "rectangle",
+                "to_world": T().translate([0, 1, 1]).rotate([1, 0, 0], 90),
+                "emitter": light,
+            },
+        }
+    )
     (edges,) = scene.outline()
     assert isinstance(edges, Segments)
     assert edges.start.shape[0] == 7  # two rectangles of four edges, one shared

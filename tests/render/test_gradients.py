@@ -18,19 +18,24 @@ def triplet():
 
 
 def make_frames(scene, camera, start):
-    """Function of (twist of the whole path [6], relative changes of curvatures [6] and thicknesses [6]) -> frames, float64."""
-    c, t = camera.lens.curvature_per_mm.detach(), camera.lens.thickness_mm.detach()
+    """Function of (twist of the whole path [6], relative changes of curvatures [6] and thicknesses [6]) ->
+    frames, float64."""
+    c = camera.lens.curvature_per_mm.detach()
+    t = camera.lens.thickness_mm.detach()
 
     def frames(twist, curvature, thickness):
         changed = camera.lens.replace(curvature_per_mm=c * (1 + curvature), thickness_mm=t * (1 + thickness))
-        return render.frames(camera.with_lens(changed), scene, start @ se3_exp(twist) @ se3_exp(MOVES)).double()
+        return render.frames(
+            camera.with_lens(changed), scene, start @ se3_exp(twist) @ se3_exp(MOVES)
+        ).double()
 
     return frames
 
 
 def differences(loss, size, slot, step):
     """Central differences with common random numbers along each of six parameters of one slot."""
-    zero, found = [torch.zeros(6, dtype=D)] * 3, []
+    zero = [torch.zeros(6, dtype=D)] * 3
+    found = []
     with torch.no_grad():
         for i in range(size):
             shift = step * torch.eye(6, dtype=D)[i]
@@ -47,20 +52,28 @@ def test_frames_of_the_analytic_plane_in_double_precision(generator):
     camera = Camera(triplet(), 12, 10, 0.1, 8)
     frames = make_frames(worlds.smooth_plane(3), camera, look_at((0.2, 0.1, 2.0), (0, 0, 0), down=(0, 1, 0)))
     weights = torch.randn(2, 10, 12, generator=generator, dtype=D)
-    loss = lambda *parameters: (frames(*parameters) * weights).sum()  # noqa: E731
+
+    def loss(*parameters):
+        return (frames(*parameters) * weights).sum()
+
     at = leaves()
     found = torch.autograd.grad(loss(*at), at)
     for slot, (step, tolerance) in enumerate(((1e-6, 1e-7), (1e-6, 1e-7), (1e-6, 1e-7))):
         truth = differences(loss, 6, slot, step)
-        # exp of cosines is smooth: steps of 1e-6 m move phases by 1e-4, so differences bend by 1e-9; rounding 1e-13 of the loss over 1e-6
+        # exp of cosines is smooth: steps of 1e-6 m move phases by 1e-4, so differences bend by 1e-9; rounding
+        # 1e-13 of the loss over 1e-6
         assert float((found[slot] - truth).norm() / truth.norm()) <= tolerance
 
 
 def test_frames_to_pinhole_and_thin_lens_lengths(generator):
-    scene, pose = worlds.smooth_plane(5), look_at((0.2, 0.1, 2.0), (0, 0, 0), down=(0, 1, 0))[None]
+    scene = worlds.smooth_plane(5)
+    pose = look_at((0.2, 0.1, 2.0), (0, 0, 0), down=(0, 1, 0))[None]
     weights = torch.randn(1, 8, 8, generator=generator, dtype=D)
     for make in (lambda f: lens.Pinhole(f), lambda f: lens.ThinLens(f, 2.0, f * 1.01)):
-        loss = lambda f, make=make: (render.frames(Camera(make(f), 8, 8, 0.2, 8), scene, pose) * weights).sum()  # noqa: E731
+
+        def loss(f, make=make):
+            return (render.frames(Camera(make(f), 8, 8, 0.2, 8), scene, pose) * weights).sum()
+
         f = torch.tensor(6.0, dtype=D, requires_grad=True)
         (found,) = torch.autograd.grad(loss(f), f)
         truth = float(loss(f.detach() + 1e-5) - loss(f.detach() - 1e-5)) / 2e-5
@@ -90,8 +103,10 @@ def relative(found, truth):
 
 @pytest.mark.parametrize("view", ROOM_VIEWS)
 def test_photometric_loss_in_the_textured_room(view, room):
-    # One per cent is asked for; 0.1 to 0.3 % is found. Bilinear texels have kinks that differences straddle (noise that grows as the
-    # root of the step), and float32 poses of 1 m round to 1e-7 (noise that falls as its inverse): steps of 0.1 to 0.3 mm lie between.
+    # One per cent is asked for; 0.1 to 0.3 % is found. Bilinear texels have kinks that differences straddle
+    # (noise that grows as the
+    # root of the step), and float32 poses of 1 m round to 1e-7 (noise that falls as its inverse): steps of
+    # 0.1 to 0.3 mm lie between.
     loss = photometric(room, Camera(triplet(), 48, 48, 0.0555, 16), view)
     at = leaves()
     found = torch.autograd.grad(loss(*at), at)
@@ -101,11 +116,16 @@ def test_photometric_loss_in_the_textured_room(view, room):
 
 
 def test_the_mean_gradient_along_a_step_is_its_difference_even_on_grainy_photographs():
-    # The fundamental theorem holds whatever the kinks: the mean of the derivative over a step is the difference quotient.
+    # The fundamental theorem holds whatever the kinks: the mean of the derivative over a step is the
+    # difference quotient.
     # On unsoftened grain a single point misses by some per cent; the mean of eight keeps a tenth of that.
-    grainy = worlds.room(photos=[textures.photo(p) for p in ("brick", "gravel", "grass", "camera", "coffee", "astronaut")], objects=False)
+    grainy = worlds.room(
+        photos=[textures.photo(p) for p in ("brick", "gravel", "grass", "camera", "coffee", "astronaut")],
+        objects=False,
+    )
     loss = photometric(grainy, Camera(triplet(), 32, 32, 0.0833, 16), ROOM_VIEWS[1])
-    step, points = 2e-4, (torch.arange(8, dtype=D) + 0.5) / 4 - 1
+    step = 2e-4
+    points = (torch.arange(8, dtype=D) + 0.5) / 4 - 1
     means = torch.zeros(6, dtype=D)
     for i in range(6):
         for u in points:
@@ -121,12 +141,18 @@ def test_gradients_are_the_same_at_the_second_backward(room):
     loss = frames(*at).square().mean()
     first = [g.clone() for g in torch.autograd.grad(loss, at, retain_graph=True)]
     second = torch.autograd.grad(loss, at)
-    for a, b in zip(first, second, strict=True):  # threads add 1152 float32 terms in any order; a re-used tape was wrong by factors
+    for a, b in zip(
+        first, second, strict=True
+    ):  # threads add 1152 float32 terms in any order; a re-used tape was wrong by factors
         torch.testing.assert_close(a, b, rtol=0, atol=1e-5 * float(a.abs().max()))
 
 
 def test_a_second_derivative_is_refused():
-    frames = make_frames(worlds.smooth_plane(0), Camera(triplet(), 4, 4, 0.2, 4), look_at((0.2, 0.1, 2.0), (0, 0, 0), down=(0, 1, 0)))
+    frames = make_frames(
+        worlds.smooth_plane(0),
+        Camera(triplet(), 4, 4, 0.2, 4),
+        look_at((0.2, 0.1, 2.0), (0, 0, 0), down=(0, 1, 0)),
+    )
     at = leaves()
     (grad, *_) = torch.autograd.grad(frames(*at).sum(), at, create_graph=True)
     with pytest.raises(GradientError, match="first derivatives only"):
@@ -135,10 +161,15 @@ def test_a_second_derivative_is_refused():
 
 def test_gradients_of_a_window_are_those_of_its_crop():
     pose = look_at((0.2, 0.1, 2.0), (0, 0, 0), down=(0, 1, 0))[None]
-    whole, window = render.Film(20, 16, 20, 16, 0.1), render.Film(20, 16, 6, 5, 0.1, ((9, 4),))
+    whole = render.Film(20, 16, 20, 16, 0.1)
+    window = render.Film(20, 16, 6, 5, 0.1, ((9, 4),))
     grads = []
     for film, crop in ((whole, (slice(4, 9), slice(9, 15))), (window, (slice(None), slice(None)))):
         geo = triplet()
-        image = render.frames(Camera(geo, film.width_px, film.height_px, 0.1, 4, film=film), worlds.smooth_plane(2), pose).reshape(-1, film.height_px, film.width_px)[0]
+        image = render.frames(
+            Camera(geo, film.width_px, film.height_px, 0.1, 4, film=film), worlds.smooth_plane(2), pose
+        ).reshape(-1, film.height_px, film.width_px)[0]
         grads.append(torch.autograd.grad(image[crop].square().sum(), geo.curvature_per_mm)[0])
-    torch.testing.assert_close(grads[0], grads[1], rtol=1e-12, atol=0)  # the same rays, summed in another order
+    torch.testing.assert_close(
+        grads[0], grads[1], rtol=1e-12, atol=0
+    )  # the same rays, summed in another order

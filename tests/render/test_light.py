@@ -1,4 +1,5 @@
-"""Light levels: closed forms of radiative transfer, baked light against path tracing, and the choice between levels."""
+"""Light levels: closed forms of radiative transfer, baked light against path tracing, and the choice between
+levels."""
 
 import math
 from typing import Any
@@ -28,13 +29,20 @@ def grey(albedo, radiance=0.0) -> Any:
 
 def square(centre, normal, side=1.0, up=(0, 1, 0), **surface: Any):
     mi = backend.mitsuba()
-    frame = mi.ScalarTransform4f().look_at(origin=list(centre), target=[c + n for c, n in zip(centre, normal, strict=True)], up=list(up))
-    return {"type": "rectangle", "to_world": frame @ mi.ScalarTransform4f().scale([side / 2, side / 2, 1]), **surface}
+    frame = mi.ScalarTransform4f().look_at(
+        origin=list(centre), target=[c + n for c, n in zip(centre, normal, strict=True)], up=list(up)
+    )
+    return {
+        "type": "rectangle",
+        "to_world": frame @ mi.ScalarTransform4f().scale([side / 2, side / 2, 1]),
+        **surface,
+    }
 
 
 def radiance_at(scene, points, normals, lift_m=0.005):
     """Radiance of surface points [N, 3], looked at along their normals."""
-    points, normals = torch.as_tensor(np.array(points), dtype=D), torch.as_tensor(np.array(normals), dtype=D)
+    points = torch.as_tensor(np.array(points), dtype=D)
+    normals = torch.as_tensor(np.array(normals), dtype=D)
     rays = Rays(points + lift_m * normals, -normals, torch.ones(len(points), dtype=D))
     return render.shade(rays, scene, torch.eye(4, dtype=D)[None], 1)[0].double()
 
@@ -56,41 +64,82 @@ def test_a_white_furnace_has_emission_over_one_minus_albedo(albedo):
     faces = {}
     for axis in range(3):
         for sign in (-1, 1):
-            centre, up = np.zeros(3), np.zeros(3)
+            centre = np.zeros(3)
+            up = np.zeros(3)
             centre[axis], up[(axis + 1) % 3] = sign, 1
             faces[f"face-{axis}{sign + 1}"] = square(centre, -centre, 2.0, up, **grey(albedo, 20.0))
-    truth, camera, pose = 20 / (1 - albedo), Camera(lens.Pinhole(4.0), 16, 12, 0.3, 4), look_at((0.1, 0.2, 0.3), (0, 1, 0))[None]
-    for scene, relative in ((light.PathScene(faces, samples=128, max_depth=-1), 1e-3), (light.bake(faces, texel_m=0.25, samples=512, max_depth=64), 2e-3)):
+    truth = 20 / (1 - albedo)
+    camera = Camera(lens.Pinhole(4.0), 16, 12, 0.3, 4)
+    pose = look_at((0.1, 0.2, 0.3), (0, 1, 0))[None]
+    for scene, relative in (
+        (light.PathScene(faces, samples=128, max_depth=-1), 1e-3),
+        (light.bake(faces, texel_m=0.25, samples=512, max_depth=64), 2e-3),
+    ):
         image = render.frames(camera, scene, pose).double()
-        # a path's light has a relative spread of about 0.5; 100,000 paths and some 60 texels of 512 paths: 0.0002 and 0.003 / 5 at 1 sigma
+        # a path's light has a relative spread of about 0.5; 100,000 paths and some 60 texels of 512 paths:
+        # 0.0002 and 0.003 / 5 at 1 sigma
         assert float(image.mean()) == pytest.approx(truth, rel=5 * relative / 2)
         assert float((image / truth - 1).abs().max()) < 0.25
 
 
 def test_a_point_under_a_disc_receives_pi_l_sine_squared():
     mi = backend.mitsuba()
-    height, radius, source, albedo = 0.7, 0.5, 100.0, 0.6
-    disc = {"type": "disk", "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, height], target=[0, 0, 0], up=[0, 1, 0]).scale(radius), **grey(0.0, source)}
+    height = 0.7
+    radius = 0.5
+    source = 100.0
+    albedo = 0.6
+    disc = {
+        "type": "disk",
+        "to_world": mi.ScalarTransform4f()
+        .look_at(origin=[0, 0, height], target=[0, 0, 0], up=[0, 1, 0])
+        .scale(radius),
+        **grey(0.0, source),
+    }
     scene = {"disc": disc, "patch": square((0, 0, 0), (0, 0, 1), 0.01, **grey(albedo))}
     truth = albedo / math.pi * math.pi * source * radius**2 / (radius**2 + height**2)
     centre = np.zeros((256, 3))
-    # over a patch of 1 cm irradiance changes by 1e-4; light sampled over the disc has a relative spread of 0.35: 16,384 and 4 x 4 x 4096 paths
-    assert float(radiance_at(light.PathScene(scene, samples=64), centre, UP[:256]).mean()) == pytest.approx(truth, rel=0.014)
-    assert float(radiance_at(light.bake(scene, samples=4096), grid() * 0.01, UP).mean()) == pytest.approx(truth, rel=0.007)
+    # over a patch of 1 cm irradiance changes by 1e-4; light sampled over the disc has a relative spread of
+    # 0.35: 16,384 and 4 x 4 x 4096 paths
+    assert float(radiance_at(light.PathScene(scene, samples=64), centre, UP[:256]).mean()) == pytest.approx(
+        truth, rel=0.014
+    )
+    assert float(radiance_at(light.bake(scene, samples=4096), grid() * 0.01, UP).mean()) == pytest.approx(
+        truth, rel=0.007
+    )
 
 
-PARALLEL = 2 / math.pi * (math.log(2 / math.sqrt(3)) + 2 * math.sqrt(2) * math.atan(1 / math.sqrt(2)) - 2 * math.atan(1))
-PERPENDICULAR = (2 * math.atan(1) - math.sqrt(2) * math.atan(1 / math.sqrt(2)) + 0.25 * math.log(0.75)) / math.pi
+PARALLEL = (
+    2
+    / math.pi
+    * (math.log(2 / math.sqrt(3)) + 2 * math.sqrt(2) * math.atan(1 / math.sqrt(2)) - 2 * math.atan(1))
+)
+PERPENDICULAR = (
+    2 * math.atan(1) - math.sqrt(2) * math.atan(1 / math.sqrt(2)) + 0.25 * math.log(0.75)
+) / math.pi
 
 
-@pytest.mark.parametrize(("centre", "normal", "up", "form_factor"), [((0, 0, 1), (0, 0, -1), (0, 1, 0), PARALLEL), ((0.5, 0, 0.5), (-1, 0, 0), (0, 1, 0), PERPENDICULAR)])
+@pytest.mark.parametrize(
+    ("centre", "normal", "up", "form_factor"),
+    [((0, 0, 1), (0, 0, -1), (0, 1, 0), PARALLEL), ((0.5, 0, 0.5), (-1, 0, 0), (0, 1, 0), PERPENDICULAR)],
+)
 def test_squares_exchange_light_by_their_form_factor(centre, normal, up, form_factor):
-    # Source: Howell, A catalog of radiation transfer configuration factors, C-11 and C-14 (unit squares, distance 1; with a common edge)
-    scene = {"source": square(centre, normal, 1.0, up, **grey(0.0, 100.0)), "receiver": square((0, 0, 0), (0, 0, 1), **grey(0.5))}
+    # Source: Howell, A catalog of radiation transfer configuration factors, C-11 and C-14 (unit squares,
+    # distance 1; with a common edge)
+    scene = {
+        "source": square(centre, normal, 1.0, up, **grey(0.0, 100.0)),
+        "receiver": square((0, 0, 0), (0, 0, 1), **grey(0.5)),
+    }
     truth = 0.5 * 100 * form_factor  # mean irradiance is pi L F for equal areas
-    # direct light has a relative spread below 1: 65,536 paths; near the common edge it is largest, and texels of 5 cm sum it exactly
-    assert float(radiance_at(light.PathScene(scene, samples=64), grid(), UP, 1e-4).mean()) == pytest.approx(truth, rel=0.02)
-    assert float(radiance_at(light.bake(scene, samples=256, texel_m=1 / 32, fine=1), grid(64), np.tile(UP, (4, 1)), 1e-4).mean()) == pytest.approx(truth, rel=0.02)
+    # direct light has a relative spread below 1: 65,536 paths; near the common edge it is largest, and texels
+    # of 5 cm sum it exactly
+    assert float(radiance_at(light.PathScene(scene, samples=64), grid(), UP, 1e-4).mean()) == pytest.approx(
+        truth, rel=0.02
+    )
+    assert float(
+        radiance_at(
+            light.bake(scene, samples=256, texel_m=1 / 32, fine=1), grid(64), np.tile(UP, (4, 1)), 1e-4
+        ).mean()
+    ) == pytest.approx(truth, rel=0.02)
 
 
 # ---- baked against path traced
@@ -103,7 +152,14 @@ def tetrahedron(mi, uv):
         return emissive_mesh(mi, vertices, faces, None, bsdf=grey(0.6)["bsdf"])
     corners = np.array([[0.02, 0.02], [0.47, 0.02], [0.02, 0.47]])
     places = np.concatenate([corners + shift for shift in ([0, 0], [0.5, 0], [0, 0.5], [0.5, 0.5])])
-    return emissive_mesh(mi, vertices[faces.reshape(-1)] + [0, -0.6, 0], np.arange(12).reshape(4, 3), None, places, bsdf=grey(0.6)["bsdf"])
+    return emissive_mesh(
+        mi,
+        vertices[faces.reshape(-1)] + [0, -0.6, 0],
+        np.arange(12).reshape(4, 3),
+        None,
+        places,
+        bsdf=grey(0.6)["bsdf"],
+    )
 
 
 @pytest.fixture(scope="module")
@@ -111,13 +167,34 @@ def still_life():
     mi = backend.mitsuba()
     T = mi.ScalarTransform4f
     picture = mi.Bitmap(textures.softened(textures.speckle(1, 64, finest_px=16.0), 2.0)[..., None] / 300)
-    patterned: dict[str, Any] = {"bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": picture, "raw": True}}}
+    patterned: dict[str, Any] = {
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": picture, "raw": True}}
+    }
     return {
-        "floor": square((0, 0, 0), (0, 0, 1), 3.0, **patterned), "cube": {"type": "cube", "to_world": T().translate([0.7, 0.2, 0.201]).rotate([0, 0, 1], 25).scale([0.2, 0.15, 0.2]), **patterned},
-        "ball": {"type": "sphere", "center": [0, 0.3, 0.302], "radius": 0.3, **grey(0.7)}, "tube": {"type": "cylinder", "p0": [0.3, -0.5, 0.01], "p1": [0.3, -0.5, 0.6], "radius": 0.06, **grey(0.4)},
-        "cap": {"type": "disk", "to_world": T().translate([0.3, -0.5, 0.6]).scale(0.06), **grey(0.4)}, "bare": tetrahedron(mi, uv=False), "unwrapped": tetrahedron(mi, uv=True),
-        "lamp": square((0.5, -1.2, 2.0), (-0.3, 0.5, -1), 0.5, **grey(0.2, 800.0)), "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 60.0}},
-        "sun": {"type": "directional", "direction": [0.2, 0.3, -1], "irradiance": {"type": "rgb", "value": 150.0}},
+        "floor": square((0, 0, 0), (0, 0, 1), 3.0, **patterned),
+        "cube": {
+            "type": "cube",
+            "to_world": T().translate([0.7, 0.2, 0.201]).rotate([0, 0, 1], 25).scale([0.2, 0.15, 0.2]),
+            **patterned,
+        },
+        "ball": {"type": "sphere", "center": [0, 0.3, 0.302], "radius": 0.3, **grey(0.7)},
+        "tube": {
+            "type": "cylinder",
+            "p0": [0.3, -0.5, 0.01],
+            "p1": [0.3, -0.5, 0.6],
+            "radius": 0.06,
+            **grey(0.4),
+        },
+        "cap": {"type": "disk", "to_world": T().translate([0.3, -0.5, 0.6]).scale(0.06), **grey(0.4)},
+        "bare": tetrahedron(mi, uv=False),
+        "unwrapped": tetrahedron(mi, uv=True),
+        "lamp": square((0.5, -1.2, 2.0), (-0.3, 0.5, -1), 0.5, **grey(0.2, 800.0)),
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 60.0}},
+        "sun": {
+            "type": "directional",
+            "direction": [0.2, 0.3, -1],
+            "irradiance": {"type": "rgb", "value": 150.0},
+        },
     }
 
 
@@ -127,46 +204,76 @@ def baked_still_life(still_life):
 
 
 def test_baked_light_is_path_traced_light_on_every_kind_of_shape(still_life, baked_still_life):
-    mi, reference = backend.mitsuba(), light.PathScene(still_life, samples=256)
+    mi = backend.mitsuba()
+    reference = light.PathScene(still_life, samples=256)
     shapes = {shape.id(): shape for shape in MitsubaScene(still_life, merge=False).scene.shapes()}
     for name in ("floor", "cube", "ball", "tube", "cap", "lamp"):
         for chart in charts_of(mi, name, still_life[name], shapes[name]):
             u, v = np.random.default_rng(0).random((2, 512))
             points, normals, _ = chart.at(u, v)
-            ours, theirs = (radiance_at(scene, points, normals, 5e-4) for scene in (baked_still_life, reference))
-            # 131,072 paths per face, 16 to 6000 texels of 256 paths: below 0.5 %. Under the cube, 1 mm over the floor, there is next to no light
+            ours, theirs = (
+                radiance_at(scene, points, normals, 5e-4) for scene in (baked_still_life, reference)
+            )
+            # 131,072 paths per face, 16 to 6000 texels of 256 paths: below 0.5 %. Under the cube, 1 mm over
+            # the floor, there is next to no light
             assert abs(float((ours - theirs).mean())) < 0.01 * max(float(theirs.mean()), 5.0), name
 
 
-def test_meshes_without_texture_coordinates_show_the_mean_light_of_each_face_and_others_their_texture(still_life, baked_still_life):
-    mi, reference, random = backend.mitsuba(), light.PathScene(still_life, samples=128), np.random.default_rng(0)
+def test_meshes_without_texture_coordinates_show_the_mean_light_of_each_face_and_others_their_texture(
+    still_life, baked_still_life
+):
+    mi = backend.mitsuba()
+    reference = light.PathScene(still_life, samples=128)
+    random = np.random.default_rng(0)
     points, normals = charts_of(mi, "bare", still_life["bare"], still_life["bare"]).points(random, 256)
     for face in range(4):
-        ours, theirs = (radiance_at(scene, points[face], np.tile(normals[face], (256, 1)), 5e-4) for scene in (baked_still_life, reference))
+        ours, theirs = (
+            radiance_at(scene, points[face], np.tile(normals[face], (256, 1)), 5e-4)
+            for scene in (baked_still_life, reference)
+        )
         # 2048 and 32,768 paths of a relative spread of 0.5 to 1: 1 to 2 %
         assert float(ours.std()) < 1e-3
-        assert float(ours.mean()) == pytest.approx(float(theirs.mean()), rel=0.05, abs=0.5)  # the face over the floor has next to no light
+        assert float(ours.mean()) == pytest.approx(
+            float(theirs.mean()), rel=0.05, abs=0.5
+        )  # the face over the floor has next to no light
     (chart,) = charts_of(mi, "unwrapped", still_life["unwrapped"], still_life["unwrapped"])
     points, normals, inside = chart.at(*random.random((2, 4096)))
-    ours, theirs = (radiance_at(scene, points[inside], normals[inside], 5e-4) for scene in (baked_still_life, reference))
+    ours, theirs = (
+        radiance_at(scene, points[inside], normals[inside], 5e-4) for scene in (baked_still_life, reference)
+    )
     assert 0.3 < inside.mean() < 0.5  # four triangles of a tenth of the unit square each
     assert float(ours.mean()) == pytest.approx(float(theirs.mean()), rel=0.02)
 
 
 def test_frames_of_baked_light_are_frames_of_path_tracing_within_its_noise(still_life, baked_still_life):
-    camera, pose = Camera(lens.Pinhole(6.0), 48, 36, 0.12, 4), look_at((0.6, -2.2, 1.3), (0, 0, 0.2))[None]
+    camera = Camera(lens.Pinhole(6.0), 48, 36, 0.12, 4)
+    pose = look_at((0.6, -2.2, 1.3), (0, 0, 0.2))[None]
     error = light.level_error(baked_still_life, light.PathScene(still_life, samples=64), camera, pose)
-    # 256 paths per texel leave 1 to 2 % of light's own noise in the texture; what is beyond it are shadow edges within a texel of 4 cm
+    # 256 paths per texel leave 1 to 2 % of light's own noise in the texture; what is beyond it are shadow
+    # edges within a texel of 4 cm
     assert float(error.rms) < 0.03
     assert float(error.noise) < 0.06
 
 
 def test_a_cube_is_baked_face_by_face_where_its_faces_share_texture_coordinates():
     mi = backend.mitsuba()
-    scene = {"cube": {"type": "cube", "to_world": mi.ScalarTransform4f().scale([0.3, 0.2, 0.1]), **grey(0.5)}, "sun": {"type": "directional", "direction": [0, 0, -1], "irradiance": {"type": "rgb", "value": 100.0}}}
+    scene = {
+        "cube": {"type": "cube", "to_world": mi.ScalarTransform4f().scale([0.3, 0.2, 0.1]), **grey(0.5)},
+        "sun": {
+            "type": "directional",
+            "direction": [0, 0, -1],
+            "irradiance": {"type": "rgb", "value": 100.0},
+        },
+    }
     baked = light.bake(scene, samples=1)
-    found = radiance_at(baked, [[0, 0, 0.1], [0, 0, -0.1], [0.3, 0, 0], [0.29, 0.19, 0.1]], [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0, 0, 1]])
-    np.testing.assert_allclose(found, [50 / math.pi, 0, 0, 50 / math.pi], rtol=1e-4, atol=1e-4)  # a sun overhead has one direction: no noise
+    found = radiance_at(
+        baked,
+        [[0, 0, 0.1], [0, 0, -0.1], [0.3, 0, 0], [0.29, 0.19, 0.1]],
+        [[0, 0, 1], [0, 0, -1], [1, 0, 0], [0, 0, 1]],
+    )
+    np.testing.assert_allclose(
+        found, [50 / math.pi, 0, 0, 50 / math.pi], rtol=1e-4, atol=1e-4
+    )  # a sun overhead has one direction: no noise
     (edges,) = baked.outline()  # still one mesh of twelve edges
     assert isinstance(edges, Segments)
     assert len(edges.start) == 12
@@ -175,14 +282,20 @@ def test_a_cube_is_baked_face_by_face_where_its_faces_share_texture_coordinates(
 def test_the_sky_is_the_same_at_every_level():
     picture = textures.sky(3, 64)
     scene = {"sky": sky(backend.mitsuba(), picture)}
-    camera, poses = Camera(lens.Pinhole(3.0), 24, 18, 0.2, 4), torch.stack([look_at((0, 0, 1), at) for at in ((1, 0, 1.2), (0, 1, 2.0), (-1, -1, 0.6))])
-    seen = [render.frames(camera, made, poses) for made in (MitsubaScene(scene), light.PathScene(scene, samples=1))]
+    camera = Camera(lens.Pinhole(3.0), 24, 18, 0.2, 4)
+    poses = torch.stack([look_at((0, 0, 1), at) for at in ((1, 0, 1.2), (0, 1, 2.0), (-1, -1, 0.6))])
+    seen = [
+        render.frames(camera, made, poses)
+        for made in (MitsubaScene(scene), light.PathScene(scene, samples=1))
+    ]
     torch.testing.assert_close(seen[0], seen[1], rtol=1e-4, atol=1e-3)
     assert float(seen[0].std()) > 5  # and it is not plain
 
 
 def test_equal_seeds_give_equal_frames_and_others_do_not(still_life):
-    scene, camera, pose = light.PathScene(still_life, samples=2), Camera(lens.Pinhole(6.0), 8, 6, 0.6, 2), look_at((0.6, -2.2, 1.3), (0, 0, 0.2))[None]
+    scene = light.PathScene(still_life, samples=2)
+    camera = Camera(lens.Pinhole(6.0), 8, 6, 0.6, 2)
+    pose = look_at((0.6, -2.2, 1.3), (0, 0, 0.2))[None]
     first = render.frames(camera, scene, pose)
     assert torch.equal(first, render.frames(camera, scene, pose))
     assert not torch.equal(first, render.frames(camera, scene.with_seed(1), pose))
@@ -195,7 +308,8 @@ def flat_wall(level):
     return worlds.wall(np.full((8, 8), level, dtype=np.float32))
 
 
-CAMERA, POSES = Camera(lens.Pinhole(8.0), 8, 6, 0.1, 2), look_at((0.1, -2, 0.1), (0, 0, 0)).repeat(2, 1, 1)
+CAMERA = Camera(lens.Pinhole(8.0), 8, 6, 0.1, 2)
+POSES = look_at((0.1, -2, 0.1), (0, 0, 0)).repeat(2, 1, 1)
 
 
 def test_a_level_that_is_a_tenth_brighter_is_wrong_by_a_tenth_and_by_nothing_after_gain():
@@ -207,11 +321,14 @@ def test_a_level_that_is_a_tenth_brighter_is_wrong_by_a_tenth_and_by_nothing_aft
 
 
 def test_noise_of_the_reference_is_not_taken_for_error(still_life):
-    scene, camera, pose = light.PathScene(still_life, samples=8), Camera(lens.Pinhole(6.0), 48, 36, 0.12, 2), look_at((0.6, -2.2, 1.3), (0, 0, 0.2))[None]
+    scene = light.PathScene(still_life, samples=8)
+    camera = Camera(lens.Pinhole(6.0), 48, 36, 0.12, 2)
+    pose = look_at((0.6, -2.2, 1.3), (0, 0, 0.2))[None]
     truth = light.PathScene(still_life, samples=512, seed=9)
     error = light.level_error(truth, scene, camera, pose)
     assert float(error.noise) > 0.01
-    # the products of independent errors average to nothing: over 1728 pixels their mean is below 5 / sqrt(1728) of the noise's square, plus the truth's own
+    # the products of independent errors average to nothing: over 1728 pixels their mean is below 5 /
+    # sqrt(1728) of the noise's square, plus the truth's own
     assert float(error.rms) < float(error.noise) * (5 * 2 / 1728**0.5 + 16 / 512) ** 0.5
 
 
@@ -222,7 +339,9 @@ def test_the_cheapest_level_within_the_tolerance_is_chosen_and_says_why():
     assert "no cheaper level stays within 0.01" in strict.reason
     assert "plain 0.1" in strict.reason
     assert loose.name == min(levels, key=lambda name: loose.cpu_s[name])
-    assert light.choose(levels, CAMERA, POSES, 0.01, after_gain=True).errors["plain"].rms_after_gain.max() < 0.01
+    assert (
+        light.choose(levels, CAMERA, POSES, 0.01, after_gain=True).errors["plain"].rms_after_gain.max() < 0.01
+    )
 
 
 def test_what_cannot_be_is_refused_in_a_sentence(still_life):
@@ -232,14 +351,27 @@ def test_what_cannot_be_is_refused_in_a_sentence(still_life):
         light.bake({"a": {**sheet, "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}})
     with pytest.raises(DomainError, match="not Lambertian"):
         light.bake({"a": {**sheet, "bsdf": {"type": "roughconductor"}}})
-    overlapping, outside = np.tile([[0, 0], [1, 0], [0, 1]], (2, 1)).astype(float), np.array([[0, 0], [2, 0], [0, 1], [0, 0], [2, 0], [0, 1]], dtype=float)
+    overlapping = np.tile([[0, 0], [1, 0], [0, 1]], (2, 1)).astype(float)
+    outside = np.array([[0, 0], [2, 0], [0, 1], [0, 0], [2, 0], [0, 1]], dtype=float)
     triangles = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]], dtype=float)
     for uv, sentence in ((overlapping, "overlap"), (outside, "leave the unit square")):
         with pytest.raises(DomainError, match=sentence):
-            light.bake({"a": emissive_mesh(mi, triangles, np.arange(6).reshape(2, 3), None, uv, bsdf=grey(0.5)["bsdf"])})
+            light.bake(
+                {
+                    "a": emissive_mesh(
+                        mi, triangles, np.arange(6).reshape(2, 3), None, uv, bsdf=grey(0.5)["bsdf"]
+                    )
+                }
+            )
     with pytest.raises(DomainError, match="nothing of shape 'a' can be seen"):
-        light.bake({"a": {**sheet, **grey(0.5)}, "b": square((0, 0, 4.5e-5), (0, 0, 1), 2.0, **grey(0.5))}, samples=1)
-    for call in (lambda: light.bake(still_life, samples=0), lambda: light.PathScene(still_life, samples=0), lambda: light.PathScene(still_life, max_depth=0)):
+        light.bake(
+            {"a": {**sheet, **grey(0.5)}, "b": square((0, 0, 4.5e-5), (0, 0, 1), 2.0, **grey(0.5))}, samples=1
+        )
+    for call in (
+        lambda: light.bake(still_life, samples=0),
+        lambda: light.PathScene(still_life, samples=0),
+        lambda: light.PathScene(still_life, max_depth=0),
+    ):
         with pytest.raises(DomainError):
             call()
     with pytest.raises(DomainError, match="no level"):
@@ -249,6 +381,8 @@ def test_what_cannot_be_is_refused_in_a_sentence(still_life):
     with pytest.raises(DomainError, match="black"):
         light.level_error(flat_wall(1.0), flat_wall(0.0), CAMERA, POSES)
     efl = torch.tensor(6.0, dtype=D, requires_grad=True)
-    image = render.frames(Camera(lens.Pinhole(efl), 4, 3, 0.6, 2), light.PathScene(still_life, samples=1), POSES[:1])
+    image = render.frames(
+        Camera(lens.Pinhole(efl), 4, 3, 0.6, 2), light.PathScene(still_life, samples=1), POSES[:1]
+    )
     with pytest.raises(GradientError, match="PathScene has no gradient"):
         image.sum().backward()

@@ -14,7 +14,10 @@ from codesign.render.sampling import film_pupil_pattern
 from scenes import textures, worlds
 
 D = torch.float64
-FOCAL_MM, PITCH_MM, WIDTH, HEIGHT = 6.0, 0.05, 24, 16
+FOCAL_MM = 6.0
+PITCH_MM = 0.05
+WIDTH = 24
+HEIGHT = 16
 
 
 def tilted_plane(dtype=D, seed=3):
@@ -24,13 +27,19 @@ def tilted_plane(dtype=D, seed=3):
 
 def poses():
     base = look_at((0.4, -0.5, 2.6), (0.1, 0.1, 0.3), down=(0.2, 1.0, 0.1))
-    steps = torch.tensor([[0, 0, 0, 0, 0, 0], [0.05, -0.03, 0.08, 0.02, -0.03, 0.05], [0.1, 0.0, 0.1, -0.02, 0.03, 0.1]], dtype=D)
+    steps = torch.tensor(
+        [[0, 0, 0, 0, 0, 0], [0.05, -0.03, 0.08, 0.02, -0.03, 0.05], [0.1, 0.0, 0.1, -0.02, 0.03, 0.1]],
+        dtype=D,
+    )
     return base @ se3_exp(steps)
 
 
 def homography(pose, plane):
-    """Pixel (x, y, 1) -> plane coordinates (X, Y, 1) up to scale: the inverse of K [r1 r2 t] (Hartley and Zisserman, 8.1)."""
-    K = np.array([[FOCAL_MM / PITCH_MM, 0, (WIDTH - 1) / 2], [0, FOCAL_MM / PITCH_MM, (HEIGHT - 1) / 2], [0, 0, 1]])
+    """Pixel (x, y, 1) -> plane coordinates (X, Y, 1) up to scale: the inverse of K [r1 r2 t] (Hartley and
+    Zisserman, 8.1)."""
+    K = np.array(
+        [[FOCAL_MM / PITCH_MM, 0, (WIDTH - 1) / 2], [0, FOCAL_MM / PITCH_MM, (HEIGHT - 1) / 2], [0, 0, 1]]
+    )
     T = np.linalg.inv(pose.numpy()) @ plane.T_world_plane.numpy()
     return np.linalg.inv(K @ T[:3, [0, 1, 3]])
 
@@ -53,13 +62,18 @@ def pixel_grid():
 @pytest.mark.parametrize("samples", [1, 8])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(D, 1e-11), (torch.float32, 2e-4)])
 def test_frames_equal_the_texture_through_the_homography(samples, dtype, tolerance):
-    # float64: rounding times the phase gradient (2 pi 20 per metre at 3 m); float32: the same with 1e-7 instead of 1e-16
+    # float64: rounding times the phase gradient (2 pi 20 per metre at 3 m); float32: the same with 1e-7
+    # instead of 1e-16
     plane = tilted_plane(dtype)
-    found = render.frames(Camera(lens.Pinhole(FOCAL_MM), WIDTH, HEIGHT, PITCH_MM, samples, seed=5), plane, poses())
+    found = render.frames(
+        Camera(lens.Pinhole(FOCAL_MM), WIDTH, HEIGHT, PITCH_MM, samples, seed=5), plane, poses()
+    )
     assert found.dtype == dtype
     offsets = film_pupil_pattern(samples, 5)[0].numpy()
     for image, pose in zip(found.double(), poses(), strict=True):
-        truth = np.mean([radiance(plane, plane_points(pose, plane, pixel_grid() + offset)) for offset in offsets], 0)
+        truth = np.mean(
+            [radiance(plane, plane_points(pose, plane, pixel_grid() + offset)) for offset in offsets], 0
+        )
         np.testing.assert_allclose(image.numpy().ravel(), truth, rtol=tolerance)
 
 
@@ -68,20 +82,24 @@ def test_the_sample_pattern_covers_the_pixel_and_the_pupil_evenly():
     assert bool((offset >= -0.5).all())
     assert bool((offset < 0.5).all())
     assert float(pupil.square().sum(1).max()) <= 1
-    # moments of a unit square and a unit disc; 1024 low-discrepancy points are good to about 1/1024 times some logarithms
+    # moments of a unit square and a unit disc; 1024 low-discrepancy points are good to about 1/1024 times
+    # some logarithms
     torch.testing.assert_close(offset.mean(0), torch.zeros(2, dtype=D), rtol=0, atol=2e-3)
     torch.testing.assert_close(offset.T @ offset / 1024, torch.eye(2, dtype=D) / 12, rtol=0, atol=2e-3)
     torch.testing.assert_close(pupil.mean(0), torch.zeros(2, dtype=D), rtol=0, atol=5e-3)
     torch.testing.assert_close(pupil.T @ pupil / 1024, torch.eye(2, dtype=D) / 4, rtol=0, atol=5e-3)
     radius = pupil.square().sum(1)  # uniform on [0, 1] for an area-preserving map
-    torch.testing.assert_close(radius.sort().values, (torch.arange(1024, dtype=D) + 0.5) / 1024, rtol=0, atol=1e-2)
+    torch.testing.assert_close(
+        radius.sort().values, (torch.arange(1024, dtype=D) + 0.5) / 1024, rtol=0, atol=1e-2
+    )
     assert torch.equal(film_pupil_pattern(16, 3)[1], film_pupil_pattern(16, 3)[1])
 
 
 def test_the_plane_is_seen_from_both_sides_and_its_back_is_the_mirrored_front():
     plane = TexturedPlane(*textures.waves(1), dtype=D)
     camera = Camera(lens.Pinhole(FOCAL_MM), WIDTH, HEIGHT, PITCH_MM, 1)
-    above, below = look_at((0, 0, 2.0), (0, 0, 0), down=(0, 1, 0)), look_at((0, 0, -2.0), (0, 0, 0), down=(0, 1, 0))
+    above = look_at((0, 0, 2.0), (0, 0, 0), down=(0, 1, 0))
+    below = look_at((0, 0, -2.0), (0, 0, 0), down=(0, 1, 0))
     front, back = render.frames(camera, plane, torch.stack([above, below]))
     torch.testing.assert_close(back, front.flip(1), rtol=1e-12, atol=0)
 
@@ -100,11 +118,17 @@ def test_flow_equals_the_homography_between_the_poses():
         found, valid = true_flow(camera, plane, poses(), stride=stride)
         assert valid.all()
         for k in range(3 - stride):
-            now, later = poses()[k], poses()[k + stride]
+            now = poses()[k]
+            later = poses()[k + stride]
             points = plane_points(now, plane, pixel_grid())
-            h = np.concatenate([points, np.ones_like(points[:, :1])], 1) @ np.linalg.inv(homography(later, plane)).T
+            h = (
+                np.concatenate([points, np.ones_like(points[:, :1])], 1)
+                @ np.linalg.inv(homography(later, plane)).T
+            )
             truth = (h[:, :2] / h[:, 2:] - pixel_grid()).T.reshape(2, HEIGHT, WIDTH)
-            np.testing.assert_allclose(found[k].numpy(), truth, atol=1e-9)  # asked for: 1e-4; one Newton step from 1e-6 px leaves rounding
+            np.testing.assert_allclose(
+                found[k].numpy(), truth, atol=1e-9
+            )  # asked for: 1e-4; one Newton step from 1e-6 px leaves rounding
 
 
 @pytest.mark.parametrize("slot", [0, 1, 2])
@@ -129,30 +153,52 @@ def test_wave_lists_of_different_lengths_are_refused():
 
 
 def test_waves_stay_inside_their_band():
-    frequency, amplitude, _ = textures.waves(7, count=200, finest_period_m=0.02, coarsest_period_m=0.3, log_contrast=0.5)
+    frequency, amplitude, _ = textures.waves(
+        7, count=200, finest_period_m=0.02, coarsest_period_m=0.3, log_contrast=0.5
+    )
     period = 1 / frequency.norm(dim=1)
     assert 0.02 <= float(period.min()) < 0.022
     assert 0.27 < float(period.max()) <= 0.3
-    assert float(amplitude.square().sum() / 2) == pytest.approx(0.25, rel=1e-12)  # variance of the log radiance is contrast squared
+    assert float(amplitude.square().sum() / 2) == pytest.approx(
+        0.25, rel=1e-12
+    )  # variance of the log radiance is contrast squared
     assert isinstance(worlds.smooth_plane(2, finest_period_m=0.1), TexturedPlane)
 
 
 def test_mitsuba_renders_the_same_picture():
-    """The plane in closed form against the same pattern as a bitmap of 2048 texels under Mitsuba: bilinear interpolation errs by (2 pi / (texels per wave))^2 / 8 of the
+    """The plane in closed form against the same pattern as a bitmap of 2048 texels under Mitsuba: bilinear
+    interpolation errs by (2 pi / (texels per wave))^2 / 8 of the
     pattern's log amplitude, 1e-5 here; float32 rays at 2 m move the pattern by 1e-7 m."""
     import numpy as np
 
     from codesign import backend, lens, pose, render
 
-    half, texels, frequency, amplitude, phase = 1.5, 2048, ((0.9, 0.3), (-0.4, 1.1)), (0.4, 0.3), (0.3, 1.1)
+    half = 1.5
+    texels = 2048
+    frequency = ((0.9, 0.3), (-0.4, 1.1))
+    amplitude = (0.4, 0.3)
+    phase = (0.3, 1.1)
     at = ((np.arange(texels) + 0.5) / texels * 2 - 1) * half
-    wave = sum(a * np.cos(2 * np.pi * (fx * at[None, :] + fy * at[:, None]) + p) for (fx, fy), a, p in zip(frequency, amplitude, phase, strict=True))
+    wave = sum(
+        a * np.cos(2 * np.pi * (fx * at[None, :] + fy * at[:, None]) + p)
+        for (fx, fy), a, p in zip(frequency, amplitude, phase, strict=True)
+    )
     mi = backend.mitsuba()
-    light = {"type": "area", "radiance": {"type": "bitmap", "bitmap": mi.Bitmap((100 * np.exp(wave))[..., None].astype(np.float32)), "raw": True}}
-    card = render.MitsubaScene({"card": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(half), "emitter": light}})
+    light = {
+        "type": "area",
+        "radiance": {
+            "type": "bitmap",
+            "bitmap": mi.Bitmap((100 * np.exp(wave))[..., None].astype(np.float32)),
+            "raw": True,
+        },
+    }
+    card = render.MitsubaScene(
+        {"card": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(half), "emitter": light}}
+    )
     plane = render.TexturedPlane(frequency, amplitude, phase)
     camera = render.Camera(lens.load("cooke-triplet").scaled(0.22).freeze(), 32, 24, 0.2, 16)
     path = pose.look_at((0.1, 0.05, 2.0), (0.0, 0.1, 0.0), down=(0.0, -1.0, 0.0))[None]
-    ours, theirs = render.frames(camera, plane, path), render.frames(camera, card, path)
+    ours = render.frames(camera, plane, path)
+    theirs = render.frames(camera, card, path)
     assert float(ours.std()) > 10
     torch.testing.assert_close(theirs.double(), ours, rtol=2e-5, atol=0)

@@ -1,4 +1,5 @@
-"""Exposures against closed-form blur, adaptive times against dense flow and exact crossings, chunks against the whole."""
+"""Exposures against closed-form blur, adaptive times against dense flow and exact crossings, chunks against
+the whole."""
 
 import itertools
 import math
@@ -12,13 +13,24 @@ from codesign import backend, lens, render
 from codesign.errors import DomainError, ShapeError
 from codesign.events import SensorModel, simulate
 from codesign.pose import look_at, se3_exp
-from codesign.render import Camera, MitsubaScene, MovingScene, TexturedPlane, adaptive_times, crossing_error_px, exposed_frames, frame_chunks
+from codesign.render import (
+    Camera,
+    MitsubaScene,
+    MovingScene,
+    TexturedPlane,
+    adaptive_times,
+    crossing_error_px,
+    exposed_frames,
+    frame_chunks,
+)
 from codesign.render.time import coarse_pixels, gauss_legendre, midpoints
 from codesign.types import Rays
 from scenes import textures, trajectories, worlds
 
 D = torch.float64
-FOCAL_MM, PITCH_MM, HEIGHT_M = 8.0, 0.1, 2.0
+FOCAL_MM = 8.0
+PITCH_MM = 0.1
+HEIGHT_M = 2.0
 PX_M = PITCH_MM / FOCAL_MM * HEIGHT_M  # a pixel on the plane
 
 
@@ -44,32 +56,62 @@ def camera(width=24, height=1, samples=1, optics=None):
 # ---- exposures
 
 
-@pytest.mark.parametrize(("rule", "samples", "tolerance"), [(gauss_legendre, 12, 1e-12), (midpoints, 64, 4e-4)])
+@pytest.mark.parametrize(
+    ("rule", "samples", "tolerance"), [(gauss_legendre, 12, 1e-12), (midpoints, 64, 4e-4)]
+)
 def test_a_moving_grating_is_blurred_as_its_harmonics_are(rule, samples, tolerance):
-    # exp(a cos u) = I0(a) + 2 sum I_k(a) cos(k u) (Abramowitz and Stegun 9.6.34); a motion by d during the exposure takes each by sinc(k d / period).
-    # Midpoints miss by h^2/24 of the change of slope over the exposure: (1/64)^2 / 24 of 2 pi x 0.5 x (1 + a) e^a x 2 = 2e-4 or so
-    period, speed, exposure, contrast = 9.0, 300.0, 0.015, 0.8  # half a period
+    # exp(a cos u) = I0(a) + 2 sum I_k(a) cos(k u) (Abramowitz and Stegun 9.6.34); a motion by d during the
+    # exposure takes each by sinc(k d / period).
+    # Midpoints miss by h^2/24 of the change of slope over the exposure: (1/64)^2 / 24 of 2 pi x 0.5 x (1 + a)
+    # e^a x 2 = 2e-4 or so
+    # half a period
+    period = 9.0
+    speed = 300.0
+    exposure = 0.015
+    contrast = 0.8
     t_s = torch.tensor([0.0, 0.004, 0.011], dtype=D)
     found = exposed_frames(camera(), grating(period, contrast), sliding(speed), t_s, exposure, samples, rule)
     x = torch.arange(24, dtype=D) - 11.5 + speed * t_s[:, None]
     phase = (2 * math.pi * x / period + 0.3).numpy()
-    shares = [2 * iv(k, contrast) * np.sinc(k * speed * exposure / period) * np.cos(k * phase) for k in range(1, 16)]
+    shares = [
+        2 * iv(k, contrast) * np.sinc(k * speed * exposure / period) * np.cos(k * phase) for k in range(1, 16)
+    ]
     np.testing.assert_allclose(found[:, 0].numpy(), 100 * (iv(0, contrast) + sum(shares)), rtol=tolerance)
 
 
 def test_a_moving_edge_blurs_to_a_ramp_of_the_length_of_its_motion():
-    # a bright card before the dark: the share of the exposure that a pixel's ray meets the card; midpoints step, by at most half a sample
-    mi, samples = backend.mitsuba(), 20
+    # a bright card before the dark: the share of the exposure that a pixel's ray meets the card; midpoints
+    # step, by at most half a sample
+    mi = backend.mitsuba()
+    samples = 20
     bitmap = mi.Bitmap(np.full((2, 2, 1), 200.0, dtype=np.float32))
-    card = MitsubaScene({"card": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([1, 1, 1]), "emitter": {"type": "area", "radiance": {"type": "bitmap", "bitmap": bitmap, "raw": True}}}})
-    along, speed, exposure = float(above()[0, 0]), 400.0, 0.03  # 12 px
+    card = MitsubaScene(
+        {
+            "card": {
+                "type": "rectangle",
+                "to_world": mi.ScalarTransform4f().scale([1, 1, 1]),
+                "emitter": {"type": "area", "radiance": {"type": "bitmap", "bitmap": bitmap, "raw": True}},
+            }
+        }
+    )
+    # 12 px
+    along = float(above()[0, 0])
+    speed = 400.0
+    exposure = 0.03
 
     def scene(t_s):
         poses = torch.eye(4, dtype=D).repeat(t_s.numel(), 1, 1)
-        poses[:, 0, 3] = along * (speed * PX_M * t_s - 1.0)  # the card's leading edge passes the middle at 0 s
-        return MovingScene(TexturedPlane([[1.0, 0.0]], [0.0], [0.0], mean=20.0, T_world_plane=_lower()), {"card": (card, poses)})
+        poses[:, 0, 3] = along * (
+            speed * PX_M * t_s - 1.0
+        )  # the card's leading edge passes the middle at 0 s
+        return MovingScene(
+            TexturedPlane([[1.0, 0.0]], [0.0], [0.0], mean=20.0, T_world_plane=_lower()),
+            {"card": (card, poses)},
+        )
 
-    still = lambda t_s: above().repeat(t_s.numel(), 1, 1)  # noqa: E731
+    def still(t_s):
+        return above().repeat(t_s.numel(), 1, 1)
+
     t_s = torch.tensor([0.0, 0.005], dtype=D)
     found = exposed_frames(camera(40), scene, still, t_s, exposure, samples)[:, 0].double()
     x = torch.arange(40, dtype=D) - 19.5
@@ -88,35 +130,58 @@ def _lower():
 
 def test_no_exposure_is_the_frame_and_the_lens_keeps_its_gradient(generator):
     geo = lens.load("cooke-triplet").scaled(0.16)
-    cam, scene, t_s = camera(12, 8, 4, geo), worlds.smooth_plane(3), torch.tensor([0.0, 0.01], dtype=D)
+    cam = camera(12, 8, 4, geo)
+    scene = worlds.smooth_plane(3)
+    t_s = torch.tensor([0.0, 0.01], dtype=D)
     frames = render.frames(cam, scene, sliding(100.0)(t_s))
-    torch.testing.assert_close(exposed_frames(cam, scene, sliding(100.0), t_s, 0.0, 3), frames, rtol=1e-13, atol=0)
+    torch.testing.assert_close(
+        exposed_frames(cam, scene, sliding(100.0), t_s, 0.0, 3), frames, rtol=1e-13, atol=0
+    )
     weights = torch.randn(2, 8, 12, generator=generator, dtype=D)
 
     def loss(speed, curvature):
         changed = cam.with_lens(geo.replace(curvature_per_mm=geo.curvature_per_mm.detach() * (1 + curvature)))
-        path = lambda t: above() @ se3_exp(t[:, None] * torch.cat([speed, torch.zeros(3, dtype=D)]))  # noqa: E731
+
+        def path(t):
+            return above() @ se3_exp(t[:, None] * torch.cat([speed, torch.zeros(3, dtype=D)]))
+
         return (exposed_frames(changed, scene, path, t_s, 0.02, 4, gauss_legendre) * weights).sum()
 
-    leaves = [torch.tensor([0.5, -0.3, 0.2], dtype=D, requires_grad=True), torch.zeros(6, dtype=D, requires_grad=True)]
+    leaves = [
+        torch.tensor([0.5, -0.3, 0.2], dtype=D, requires_grad=True),
+        torch.zeros(6, dtype=D, requires_grad=True),
+    ]
     found = torch.autograd.grad(loss(*leaves), leaves)
     for slot, step in enumerate((1e-5, 1e-6)):
         truth = torch.zeros_like(found[slot])
         for i in range(truth.numel()):
             shift = torch.zeros_like(truth)
             shift[i] = step
-            ahead, behind = ([leaf.detach() + s * shift if k == slot else leaf.detach() for k, leaf in enumerate(leaves)] for s in (1, -1))
+            ahead, behind = (
+                [leaf.detach() + s * shift if k == slot else leaf.detach() for k, leaf in enumerate(leaves)]
+                for s in (1, -1)
+            )
             truth[i] = float((loss(*ahead) - loss(*behind)).detach()) / (2 * step)
-        assert float((found[slot] - truth).norm() / truth.norm()) <= 1e-7  # as in test_gradients: smooth textures
+        assert (
+            float((found[slot] - truth).norm() / truth.norm()) <= 1e-7
+        )  # as in test_gradients: smooth textures
 
 
 @pytest.mark.parametrize(
     ("change", "sentence"),
-    [({"exposure_s": -1.0}, "exposure_s = -1.0"), ({"exposure_s": math.nan}, "exposure_s = nan"), ({"samples": 0}, "exposure of 0"), ({"samples": 1.5}, "exposure of 1.5"), ({"t_s": [math.nan]}, "times of the frames")],
+    [
+        ({"exposure_s": -1.0}, "exposure_s = -1.0"),
+        ({"exposure_s": math.nan}, "exposure_s = nan"),
+        ({"samples": 0}, "exposure of 0"),
+        ({"samples": 1.5}, "exposure of 1.5"),
+        ({"t_s": [math.nan]}, "times of the frames"),
+    ],
 )
 def test_exposures_that_cannot_be_are_refused(change, sentence):
     with pytest.raises(DomainError, match=sentence):
-        exposed_frames(camera(), grating(9.0), sliding(1.0), **{"t_s": [0.0], "exposure_s": 0.01, "samples": 4, **change})
+        exposed_frames(
+            camera(), grating(9.0), sliding(1.0), **{"t_s": [0.0], "exposure_s": 0.01, "samples": 4, **change}
+        )
     with pytest.raises(DomainError, match="not rigid"):
         exposed_frames(camera(), grating(9.0), lambda t: 2 * sliding(1.0)(t), [0.0], 0.01)
 
@@ -137,31 +202,55 @@ def dense_displacement_px(cam, scene, trajectory, times):
 
 
 def test_uniform_motion_gets_uniform_times():
-    times = adaptive_times(camera(16, 12), worlds.ground(np.full((8, 8), 50.0, dtype=np.float32)), sliding(100.0), 0.5, 0.75, 0.5)
+    times = adaptive_times(
+        camera(16, 12), worlds.ground(np.full((8, 8), 50.0, dtype=np.float32)), sliding(100.0), 0.5, 0.75, 0.5
+    )
     assert times[0].item() == 0.5
     assert times[-1].item() == 0.75
     steps = times.diff()[8:-1]
-    torch.testing.assert_close(steps, torch.full_like(steps, 0.95 * 0.5 / 100.0), rtol=1e-4, atol=0)  # float32 geometry: 1e-7 of 2 m over 0.0125 m
+    torch.testing.assert_close(
+        steps, torch.full_like(steps, 0.95 * 0.5 / 100.0), rtol=1e-4, atol=0
+    )  # float32 geometry: 1e-7 of 2 m over 0.0125 m
 
 
 @pytest.mark.parametrize("optics", ["pinhole", "cooke-triplet"])
 def test_no_pixel_moves_further_than_asked_in_a_room_with_crates(optics):
     cam = camera(40, 30, 1, lens.Pinhole(3.0) if optics == "pinhole" else lens.load(optics).scaled(0.08))
-    room, base = worlds.room(), look_at((0.2, -1.2, 1.2), (0.0, 1.0, 0.5))
-    path = lambda t: base @ se3_exp(torch.stack([0.3 * (7 * t).sin(), 0 * t, 0.2 * t, 0 * t, 0.3 * (4 * t).cos() - 0.3, 0.4 * t * t], -1))  # noqa: E731
+    room = worlds.room()
+    base = look_at((0.2, -1.2, 1.2), (0.0, 1.0, 0.5))
+
+    def path(t):
+        return base @ se3_exp(
+            torch.stack(
+                [0.3 * (7 * t).sin(), 0 * t, 0.2 * t, 0 * t, 0.3 * (4 * t).cos() - 0.3, 0.4 * t * t], -1
+            )
+        )
+
     times = adaptive_times(cam, room, path, 0.1, 0.9 if optics == "pinhole" else 0.3, 2.0)
     moved = dense_displacement_px(cam, room, path, times)
     assert float(moved.max()) <= 2.0
     assert float(moved[3:-1].median()) >= 1.6  # and not much less: frames are not wasted
     steps = times.diff()[3:-1]
-    assert float(steps.max() / steps.min()) > (1.5 if optics == "pinhole" else 1.05)  # the speed changes, so do the steps
+    assert float(steps.max() / steps.min()) > (
+        1.5 if optics == "pinhole" else 1.05
+    )  # the speed changes, so do the steps
 
 
 def test_moving_objects_shorten_the_steps():
-    still = lambda t: above().repeat(t.numel(), 1, 1)  # noqa: E731
+    def still(t):
+        return above().repeat(t.numel(), 1, 1)
+
     mi = backend.mitsuba()
     bitmap = mi.Bitmap(np.full((2, 2, 1), 200.0, dtype=np.float32))
-    ball = MitsubaScene({"ball": {"type": "sphere", "radius": 0.2, "emitter": {"type": "area", "radiance": {"type": "bitmap", "bitmap": bitmap, "raw": True}}}})
+    ball = MitsubaScene(
+        {
+            "ball": {
+                "type": "sphere",
+                "radius": 0.2,
+                "emitter": {"type": "area", "radiance": {"type": "bitmap", "bitmap": bitmap, "raw": True}},
+            }
+        }
+    )
 
     def scene(t_s):
         poses = torch.eye(4, dtype=D).repeat(t_s.numel(), 1, 1)
@@ -183,23 +272,33 @@ def test_a_world_at_rest_needs_few_times():
 
 @pytest.mark.parametrize("largest_px", [0.25, 0.5, 1.0])
 def test_crossings_between_adaptive_frames_are_timed_within_the_bound(largest_px):
-    # log radiance of the grating is a cosine of the time at every pixel: crossings of levels in closed form, against chords between the frames
-    period, speed, contrast = 8.0, 120.0, 0.8
+    # log radiance of the grating is a cosine of the time at every pixel: crossings of levels in closed form,
+    # against chords between the frames
+    period = 8.0
+    speed = 120.0
+    contrast = 0.8
     cam = camera(16)
     times = adaptive_times(cam, grating(period, contrast), sliding(speed), 0.0, 0.4, largest_px)
-    level = (render.frames(cam, grating(period, contrast), sliding(speed)(times))[:, 0] / 100).log() / contrast  # cosine of the phase
+    level = (
+        render.frames(cam, grating(period, contrast), sliding(speed)(times))[:, 0] / 100
+    ).log() / contrast  # cosine of the phase
     x = torch.arange(16, dtype=D) - 7.5
     wave = 2 * math.pi / period
     phase = wave * (x + speed * times[:, None]) + 0.3
     torch.testing.assert_close(level, phase.cos(), rtol=0, atol=1e-12)
-    found, worst, steep = 0, 0.0, 1.0
+    found = 0
+    worst = 0.0
+    steep = 1.0
     for threshold in (-0.8, -0.4, 0.0, 0.3, 0.7):
         for k in range(len(times) - 1):
             crossed = (level[k] - threshold) * (level[k + 1] - threshold) < 0
             share = (threshold - level[k]) / (level[k + 1] - level[k])
             guess = times[k] + share * (times[k + 1] - times[k])
             for p in torch.nonzero(crossed)[:, 0].tolist():
-                turns = (torch.arange(-40, 60, dtype=D)[:, None] * 2 * math.pi + math.acos(threshold) * torch.tensor([1.0, -1.0], dtype=D)).reshape(-1)
+                turns = (
+                    torch.arange(-40, 60, dtype=D)[:, None] * 2 * math.pi
+                    + math.acos(threshold) * torch.tensor([1.0, -1.0], dtype=D)
+                ).reshape(-1)
                 exact = ((turns - 0.3) / wave - x[p]) / speed
                 worst = max(worst, float((exact - guess[p]).abs().min()) * speed)
                 steep = min(steep, float(phase[k : k + 2, p].sin().abs().min()))
@@ -207,19 +306,33 @@ def test_crossings_between_adaptive_frames_are_timed_within_the_bound(largest_px
     assert found > 200
     # the smallest slope within any of the steps that hold a crossing bounds them all
     assert worst <= crossing_error_px(largest_px, period, steep)
-    # and the bound is of the right size: at thresholds' own slopes (0.6 at least) it is missed by less than an order of magnitude
+    # and the bound is of the right size: at thresholds' own slopes (0.6 at least) it is missed by less than
+    # an order of magnitude
     assert worst >= 0.1 * crossing_error_px(largest_px, period, 0.6)
 
 
 def test_events_of_adaptive_frames_are_timed_within_the_bound():
-    # against events of closed-form intensities 5e-3 px apart, which time themselves ten thousand times better. A maximum that no frame hits may lose the
-    # events of its tip: pixels with as many events in both are compared, at slopes that stay away from 0 within the step
-    period, speed, contrast, largest_px = 16.0, 120.0, 0.8, 0.5
+    # against events of closed-form intensities 5e-3 px apart, which time themselves ten thousand times
+    # better. A maximum that no frame hits may lose the
+    # events of its tip: pixels with as many events in both are compared, at slopes that stay away from 0
+    # within the step
+    period = 16.0
+    speed = 120.0
+    contrast = 0.8
+    largest_px = 0.5
     cam = camera(32)
     times = adaptive_times(cam, grating(period, contrast), sliding(speed), 0.0, 0.4, largest_px)
-    found = simulate(render.frames(cam, grating(period, contrast), sliding(speed)(times)), times, SensorModel(0.15, 0.15))
-    fine, x, wave = torch.linspace(0, 0.4, 10_001, dtype=D), torch.arange(32, dtype=D) - 15.5, 2 * math.pi / period
-    truth = simulate(100 * (contrast * (wave * (x + speed * fine[:, None]) + 0.3).cos()).exp()[:, None], fine, SensorModel(0.15, 0.15))
+    found = simulate(
+        render.frames(cam, grating(period, contrast), sliding(speed)(times)), times, SensorModel(0.15, 0.15)
+    )
+    fine = torch.linspace(0, 0.4, 10_001, dtype=D)
+    x = torch.arange(32, dtype=D) - 15.5
+    wave = 2 * math.pi / period
+    truth = simulate(
+        100 * (contrast * (wave * (x + speed * fine[:, None]) + 0.3).cos()).exp()[:, None],
+        fine,
+        SensorModel(0.15, 0.15),
+    )
     compared = 0
     for p in range(32):
         mine, theirs = (torch.stack([e.t_us, e.p], 1)[e.x == p] for e in (found, truth))
@@ -229,19 +342,36 @@ def test_events_of_adaptive_frames_are_timed_within_the_bound():
         slope = (wave * (x[p] + speed * theirs[:, 0] * 1e-6) + 0.3).sin().abs() - wave * largest_px
         for late_us, steep in zip((mine[:, 0] - theirs[:, 0]).abs().tolist(), slope.tolist(), strict=True):
             if steep > 0.2:
-                assert late_us <= 1e6 / speed * crossing_error_px(largest_px, period, steep) + 1  # whole microseconds
+                assert (
+                    late_us <= 1e6 / speed * crossing_error_px(largest_px, period, steep) + 1
+                )  # whole microseconds
                 compared += 1
     assert compared > 600
 
 
 @pytest.mark.parametrize(
     ("change", "sentence"),
-    [({"end_s": 0.0}, "no interval"), ({"start_s": math.nan}, "no interval"), ({"largest_px": 0.0}, "largest_px = 0.0"), ({"every_px": 0}, "every_px = 0"),
-     ({"trajectory": lambda t: sliding(1.0)((t > 0.5) * 50.0)}, "jumps by")],
+    [
+        ({"end_s": 0.0}, "no interval"),
+        ({"start_s": math.nan}, "no interval"),
+        ({"largest_px": 0.0}, "largest_px = 0.0"),
+        ({"every_px": 0}, "every_px = 0"),
+        ({"trajectory": lambda t: sliding(1.0)((t > 0.5) * 50.0)}, "jumps by"),
+    ],
 )
 def test_adaptive_times_that_cannot_be_are_refused(change, sentence):
     with pytest.raises(DomainError, match=sentence):
-        adaptive_times(**{"camera": camera(), "scene": grating(9.0), "trajectory": sliding(1.0), "start_s": 0.0, "end_s": 1.0, "largest_px": 0.5, **change})
+        adaptive_times(
+            **{
+                "camera": camera(),
+                "scene": grating(9.0),
+                "trajectory": sliding(1.0),
+                "start_s": 0.0,
+                "end_s": 1.0,
+                "largest_px": 0.5,
+                **change,
+            }
+        )
     with pytest.raises(DomainError, match="slope = 0"):
         crossing_error_px(1.0, 8.0, 0)
 
@@ -260,11 +390,16 @@ def test_the_coarse_grid_spans_every_window():
 @pytest.mark.parametrize("kind", ["room", "plane", "moving"])
 @pytest.mark.parametrize("size", [1, 3, 7, 20])
 def test_chunks_joined_are_the_sequence_bit_for_bit(kind, size):
-    cam, t_s = camera(13, 9, 4, lens.load("cooke-triplet").scaled(0.1)), trajectories.times(7, 100.0)
+    cam = camera(13, 9, 4, lens.load("cooke-triplet").scaled(0.1))
+    t_s = trajectories.times(7, 100.0)
     start = look_at((0.5, -1.2, 1.4), (0, 1, 0.8))
     poses = trajectories.translation(start, (1.0, 0.3, 0.5), t_s)
     card = trajectories.translation(look_at((0.0, 0.5, 1.0), (0.5, -1.2, 1.4)), (-1.0, 0.5, 0.2), t_s)
-    scene = {"room": lambda: worlds.room(), "plane": lambda: worlds.smooth_plane(3), "moving": lambda: MovingScene(worlds.room(), {"card": (worlds.smooth_plane(1), card)})}[kind]()
+    scene = {
+        "room": lambda: worlds.room(),
+        "plane": lambda: worlds.smooth_plane(3),
+        "moving": lambda: MovingScene(worlds.room(), {"card": (worlds.smooth_plane(1), card)}),
+    }[kind]()
     chunks = list(frame_chunks(cam, scene, poses, size))
     assert [len(c) for c in chunks] == [min(size, 7 - k) for k in range(0, 7, size)]
     assert torch.equal(torch.cat(chunks), render.frames(cam, scene, poses))
@@ -272,7 +407,9 @@ def test_chunks_joined_are_the_sequence_bit_for_bit(kind, size):
 
 def test_the_lens_is_traced_once_and_its_gradient_is_the_sum_over_chunks(monkeypatch):
     geo = lens.load("cooke-triplet").scaled(0.1)
-    cam, scene, poses = camera(9, 6, 4, geo), worlds.smooth_plane(3), sliding(50.0)(trajectories.times(5, 100.0))
+    cam = camera(9, 6, 4, geo)
+    scene = worlds.smooth_plane(3)
+    poses = sliding(50.0)(trajectories.times(5, 100.0))
     (truth,) = torch.autograd.grad(render.frames(cam, scene, poses).square().sum(), geo.curvature_per_mm)
     traced = []
     rays = cam.rays
@@ -285,7 +422,9 @@ def test_the_lens_is_traced_once_and_its_gradient_is_the_sum_over_chunks(monkeyp
 
 
 def test_sequences_of_too_many_rays_are_refused_with_the_way_out():
-    many = Rays(torch.zeros(1, 3).expand(2**31, 3), torch.zeros(1, 3).expand(2**31, 3), torch.zeros(1).expand(2**31))
+    many = Rays(
+        torch.zeros(1, 3).expand(2**31, 3), torch.zeros(1, 3).expand(2**31, 3), torch.zeros(1).expand(2**31)
+    )
     with pytest.raises(DomainError, match=r"4294967296 rays .* \(frame_chunks\)"):
         render.shade(many, grating(9.0), sliding(1.0)(torch.zeros(2, dtype=D)), 1)
 
@@ -293,6 +432,14 @@ def test_sequences_of_too_many_rays_are_refused_with_the_way_out():
 def test_chunks_that_cannot_be_are_refused_before_anything_is_rendered():
     with pytest.raises(DomainError, match="frames_per_chunk = 0"):
         frame_chunks(camera(), grating(9.0), sliding(1.0)(torch.zeros(2, dtype=D)), 0)
-    moving = MovingScene(grating(9.0), {"card": (worlds.smooth_plane(textures.PHOTOS.index("brick")), sliding(1.0)(torch.zeros(3, dtype=D)))})
+    moving = MovingScene(
+        grating(9.0),
+        {
+            "card": (
+                worlds.smooth_plane(textures.PHOTOS.index("brick")),
+                sliding(1.0)(torch.zeros(3, dtype=D)),
+            )
+        },
+    )
     with pytest.raises(ShapeError, match="'card' has 3 poses for 2 frames"):
         frame_chunks(camera(), moving, sliding(1.0)(torch.zeros(2, dtype=D)), 1)

@@ -1,5 +1,5 @@
-"""Ground truth through the lens: closed-form flow, points under pixels, gradients, and where there is no truth."""
-
+"""Ground truth through the lens: closed-form flow, points under pixels, gradients, and where there is no
+truth."""
 
 import numpy as np
 import pytest
@@ -34,16 +34,22 @@ def upright_plane(normal_distance_m=0.0):
 
 
 def wall_homography(now, later, K):
-    """Pixels of one view to pixels of another, for the plane y = 0: K (R - t n^T / d) K^-1 (Hartley and Zisserman, 13.1)."""
+    """Pixels of one view to pixels of another, for the plane y = 0: K (R - t n^T / d) K^-1 (Hartley and
+    Zisserman, 13.1)."""
     relative = np.linalg.inv(later.numpy()) @ now.numpy()
-    normal = now.numpy()[:3, :3].T @ np.array([0.0, 1.0, 0.0])  # n . X = d for points of the wall, in the first camera's axes
+    normal = now.numpy()[:3, :3].T @ np.array(
+        [0.0, 1.0, 0.0]
+    )  # n . X = d for points of the wall, in the first camera's axes
     distance = -now.numpy()[1, 3]
     return K @ (relative[:3, :3] + np.outer(relative[:3, 3], normal) / distance) @ np.linalg.inv(K)
 
 
-@pytest.mark.parametrize(("scene", "tolerance_px"), [(upright_plane, 1e-9), (lambda: worlds.wall(WALL), 1e-4)])
+@pytest.mark.parametrize(
+    ("scene", "tolerance_px"), [(upright_plane, 1e-9), (lambda: worlds.wall(WALL), 1e-4)]
+)
 def test_pinhole_flow_of_a_wall_is_its_homography(scene, tolerance_px):
-    # Mitsuba's geometry is float32: 2e-7 of 2 m moves a point along its ray only, and so shifts the flow by less than 1e-5 px
+    # Mitsuba's geometry is float32: 2e-7 of 2 m moves a point along its ray only, and so shifts the flow by
+    # less than 1e-5 px
     poses = motions([0] * 6, [0.03, -0.02, 0.05, 0.01, -0.02, 0.03], [0.05, 0.02, 0.08, 0.03, -0.01, 0.05])
     camera = Camera(lens.Pinhole(8.0), 20, 14, 0.1, 1)
     flow, valid = true_flow(camera, scene(), poses)
@@ -51,7 +57,10 @@ def test_pinhole_flow_of_a_wall_is_its_homography(scene, tolerance_px):
     K = np.array([[80.0, 0, 9.5], [0, 80.0, 6.5], [0, 0, 1]])
     pixels = camera.film.pixels().numpy()
     for k in range(2):
-        h = np.concatenate([pixels, np.ones_like(pixels[:, :1])], 1) @ wall_homography(poses[k], poses[k + 1], K).T
+        h = (
+            np.concatenate([pixels, np.ones_like(pixels[:, :1])], 1)
+            @ wall_homography(poses[k], poses[k + 1], K).T
+        )
         truth = (h[:, :2] / h[:, 2:] - pixels).T.reshape(2, 14, 20)
         np.testing.assert_allclose(flow[k].numpy(), truth, rtol=0, atol=tolerance_px)
 
@@ -78,7 +87,8 @@ def test_flow_through_a_traced_lens_leads_to_the_same_point_of_the_wall(name):
     meet = []
     for at, pose in ((pixels, poses[0]), (ends, poses[1])):  # by hand: where the chief ray crosses y = 0
         rays = camera.chief_rays(at)
-        origin, direction = apply(pose, rays.origin_m), rays.direction @ pose[:3, :3].T
+        origin = apply(pose, rays.origin_m)
+        direction = rays.direction @ pose[:3, :3].T
         meet.append((origin - direction * (origin[:, 1:2] / direction[:, 1:2])).detach())
     pixel_m = 0.2 / float(camera.lens.first_order().efl_mm.detach()) * 2.0
     miss_px = (meet[0] - meet[1]).norm(dim=1)[valid.reshape(-1)] / pixel_m
@@ -90,7 +100,9 @@ def test_ignoring_the_distortion_of_the_lens_would_show():
     camera = Camera(lens.load("cooke-triplet").scaled(0.2), 12, 10, 0.6, 1)
     poses = motions([0] * 6, [0.2, 0.0, 0.0, 0, 0, 0])
     traced, seen = true_flow(camera, upright_plane(), poses)
-    pinhole, _ = true_flow(camera.with_lens(lens.Pinhole(camera.lens.first_order().efl_mm.detach())), upright_plane(), poses)
+    pinhole, _ = true_flow(
+        camera.with_lens(lens.Pinhole(camera.lens.first_order().efl_mm.detach())), upright_plane(), poses
+    )
     assert float((traced - pinhole).detach().abs().amax(1)[seen].max()) > 0.02
 
 
@@ -106,7 +118,8 @@ def test_points_and_depths_under_pixels():
 
 
 def test_depth_of_a_sphere_in_the_room_by_hand():
-    # the ball of the room, of radius 0.25 at (0.1, 0.5), rests just over the floor; seen from 1.5 m along -y at its height the depth is 1.25 m
+    # the ball of the room, of radius 0.25 at (0.1, 0.5), rests just over the floor; seen from 1.5 m along -y
+    # at its height the depth is 1.25 m
     height = 0.25 + GAP_M
     camera = Camera(lens.Pinhole(8.0), 1, 1, 0.1, 1)
     pose = look_at((0.1, -1.0, height), (0.1, 0.5, height))
@@ -118,14 +131,19 @@ def test_depth_of_a_sphere_in_the_room_by_hand():
 
 def test_gradients_of_flow_to_lens_and_poses(generator):
     geo = lens.load("cooke-triplet").scaled(0.2)
-    scene, base = upright_plane(), start()
+    scene = upright_plane()
+    base = start()
     weights = torch.randn(1, 2, 4, 5, generator=generator, dtype=D)
 
     def loss(curvature, thickness, twists):
         camera = Camera(geo.replace(curvature_per_mm=curvature, thickness_mm=thickness), 5, 4, 0.8, 1)
         return (true_flow(camera, scene, base @ se3_exp(twists))[0] * weights).sum()
 
-    inputs = [geo.curvature_per_mm.detach(), geo.thickness_mm.detach(), torch.tensor([[0.01, 0, 0, 0, 0.01, 0], [0.03, -0.02, 0.05, 0.01, -0.02, 0.03]], dtype=D)]
+    inputs = [
+        geo.curvature_per_mm.detach(),
+        geo.thickness_mm.detach(),
+        torch.tensor([[0.01, 0, 0, 0, 0.01, 0], [0.03, -0.02, 0.05, 0.01, -0.02, 0.03]], dtype=D),
+    ]
     leaves = [v.clone().requires_grad_() for v in inputs]
     found = torch.autograd.grad(loss(*leaves), leaves)
     for k, step in enumerate((1e-6, 1e-4, 1e-5)):
@@ -133,7 +151,10 @@ def test_gradients_of_flow_to_lens_and_poses(generator):
         for i in range(truth.numel()):
             shift = torch.zeros(inputs[k].numel(), dtype=D)
             shift[i] = step
-            ahead, behind = ([v + s * shift.reshape(v.shape) if j == k else v for j, v in enumerate(inputs)] for s in (1, -1))
+            ahead, behind = (
+                [v + s * shift.reshape(v.shape) if j == k else v for j, v in enumerate(inputs)]
+                for s in (1, -1)
+            )
             truth[i] = float((loss(*ahead) - loss(*behind)).detach()) / (2 * step)
         # rounding: 1e-11 px over 1e-5; the projection's Jacobian is good to 1e-7
         assert float((found[k].reshape(-1) - truth).norm() / truth.norm()) <= 1e-6
@@ -142,15 +163,21 @@ def test_gradients_of_flow_to_lens_and_poses(generator):
 def test_what_leaves_the_field_or_meets_nothing_is_invalid_zero_and_without_gradient():
     geo = lens.load("cooke-triplet").scaled(0.2)
     camera = Camera(geo, 12, 10, 0.2, 1)
-    turned = start() @ se3_exp(torch.tensor([0, 0, 0, 0, 1.2, 0], dtype=D))  # by 69 degrees, far beyond the 20 of the lens
+    turned = start() @ se3_exp(
+        torch.tensor([0, 0, 0, 0, 1.2, 0], dtype=D)
+    )  # by 69 degrees, far beyond the 20 of the lens
     flow, valid = true_flow(camera, upright_plane(), torch.stack([start(), turned]))
     assert not valid.any()
     assert not flow.any()
     away = look_at((0.0, -2.0, 0.0), (0.0, -4.0, 0.0))
     flow, valid = true_flow(camera, upright_plane(), torch.stack([away, away]))
     assert not valid.any()
-    poses = torch.stack([start(), start() @ se3_exp(torch.tensor([0, 0, 0, 0, 0.3, 0], dtype=D))]).requires_grad_()
-    flow, valid = true_flow(Camera(geo, 12, 10, 0.5, 1), upright_plane(), poses)  # 17 degrees either side, turned by as much again
+    poses = torch.stack(
+        [start(), start() @ se3_exp(torch.tensor([0, 0, 0, 0, 0.3, 0], dtype=D))]
+    ).requires_grad_()
+    flow, valid = true_flow(
+        Camera(geo, 12, 10, 0.5, 1), upright_plane(), poses
+    )  # 17 degrees either side, turned by as much again
     assert 0 < int(valid.sum()) < valid.numel()
     for grad in torch.autograd.grad(flow.square().sum(), [poses, geo.curvature_per_mm, geo.thickness_mm]):
         assert bool(grad.isfinite().all())
@@ -167,7 +194,12 @@ def test_static_cameras_have_no_flow():
 @pytest.mark.parametrize("stride", [0, -1, 2, 5])
 def test_strides_without_a_later_pose_are_refused(stride):
     with pytest.raises(ShapeError, match="stride of at least 1"):
-        true_flow(Camera(lens.Pinhole(8.0), 4, 4, 0.1, 1), upright_plane(), motions([0] * 6, [0.1] * 6), stride=stride)
+        true_flow(
+            Camera(lens.Pinhole(8.0), 4, 4, 0.1, 1),
+            upright_plane(),
+            motions([0] * 6, [0.1] * 6),
+            stride=stride,
+        )
 
 
 def test_poses_that_are_not_rigid_are_refused():
@@ -184,7 +216,9 @@ def test_windows_have_the_flow_of_the_full_frame():
     assert part.shape == (1, 2, 2, 5, 6)
     assert valid.shape == (1, 2, 5, 6)
     for k, (left, top) in enumerate(corners):
-        torch.testing.assert_close(part[0, :, k], full[0, :, top : top + 5, left : left + 6], rtol=0, atol=1e-10)
+        torch.testing.assert_close(
+            part[0, :, k], full[0, :, top : top + 5, left : left + 6], rtol=0, atol=1e-10
+        )
 
 
 def test_angles_of_the_field_survive_the_world(generator):
@@ -192,7 +226,9 @@ def test_angles_of_the_field_survive_the_world(generator):
     camera = Camera(lens.Pinhole(8.0), 6, 6, 0.1, 1)
     pose = se3_exp(torch.randn(6, generator=generator, dtype=D))
     plane = upright_plane()
-    moved = TexturedPlane(plane.frequency, plane.amplitude, plane.phase, T_world_plane=pose @ plane.T_world_plane)
+    moved = TexturedPlane(
+        plane.frequency, plane.amplitude, plane.phase, T_world_plane=pose @ plane.T_world_plane
+    )
     rays = camera.chief_rays(camera.film.pixels())
     a, _, _ = world_points(rays, plane, start())
     b, _, _ = world_points(rays, moved, pose @ start())

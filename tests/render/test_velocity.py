@@ -1,4 +1,5 @@
-"""Camera velocity from poses: constant twists come back, world axes by differences, and the logarithm against the matrix logarithm."""
+"""Camera velocity from poses: constant twists come back, world axes by differences, and the logarithm against
+the matrix logarithm."""
 
 import math
 
@@ -30,7 +31,8 @@ def test_a_constant_twist_comes_back_at_any_spacing():
 
 
 def test_velocity_in_world_axes_is_that_of_the_centre_and_the_spin_at_the_middle():
-    # by central differences of the position and of the rotation about the middle time: they bend by (1e-4)^2 of the motion
+    # by central differences of the position and of the rotation about the middle time: they bend by (1e-4)^2
+    # of the motion
     t_s = torch.tensor([0.2, 0.6], dtype=D)
     _, world = camera_velocity(trajectories.body_twist(start(), TWIST, t_s), t_s)
     around = trajectories.body_twist(start(), TWIST, torch.tensor([0.4 - 1e-4, 0.4, 0.4 + 1e-4], dtype=D))
@@ -43,8 +45,15 @@ def test_velocity_in_world_axes_is_that_of_the_centre_and_the_spin_at_the_middle
 def test_a_camera_that_only_slides_has_the_same_velocity_in_the_world_turned():
     t_s = trajectories.times(4, 100.0)
     body, world = camera_velocity(trajectories.translation(start(), (0.1, 0.2, -0.3), t_s), t_s)
-    torch.testing.assert_close(body, torch.tensor([0.1, 0.2, -0.3, 0, 0, 0], dtype=D).expand(3, 6), rtol=0, atol=1e-13)
-    torch.testing.assert_close(world[:, :3], (start()[:3, :3] @ torch.tensor([0.1, 0.2, -0.3], dtype=D)).expand(3, 3), rtol=0, atol=1e-13)
+    torch.testing.assert_close(
+        body, torch.tensor([0.1, 0.2, -0.3, 0, 0, 0], dtype=D).expand(3, 6), rtol=0, atol=1e-13
+    )
+    torch.testing.assert_close(
+        world[:, :3],
+        (start()[:3, :3] @ torch.tensor([0.1, 0.2, -0.3], dtype=D)).expand(3, 3),
+        rtol=0,
+        atol=1e-13,
+    )
     assert float(world[:, 3:].abs().max()) <= 1e-13
 
 
@@ -53,7 +62,9 @@ def test_logarithm_is_that_of_the_matrix(angle, generator):
     axis = torch.nn.functional.normalize(torch.randn(3, dtype=D, generator=generator), dim=0)
     twist = torch.cat([torch.randn(3, dtype=D, generator=generator), angle * axis])
     found = se3_log(se3_exp(twist)[None])[0]
-    torch.testing.assert_close(found, twist, rtol=0, atol=2e-15 / max(math.sin(angle), 0.1))  # the angle comes of a sine that is small near half a turn
+    torch.testing.assert_close(
+        found, twist, rtol=0, atol=2e-15 / max(math.sin(angle), 0.1)
+    )  # the angle comes of a sine that is small near half a turn
     L = torch.from_numpy(np.real(logm(se3_exp(twist).numpy())))
     torch.testing.assert_close(found, torch.stack([*L[:3, 3], L[2, 1], L[0, 2], L[1, 0]]), rtol=0, atol=1e-12)
 
@@ -61,7 +72,9 @@ def test_logarithm_is_that_of_the_matrix(angle, generator):
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-5, 4e-3, 0.5])
 def test_gradcheck(scale, generator):
     twist = (scale * torch.randn(2, 6, dtype=D, generator=generator)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda w: se3_log(se3_exp(w)), twist, atol=1e-8)  # the identity, by way of the group
+    assert torch.autograd.gradcheck(
+        lambda w: se3_log(se3_exp(w)), twist, atol=1e-8
+    )  # the identity, by way of the group
 
 
 def test_poses_and_times_without_a_velocity_are_refused():
@@ -75,6 +88,9 @@ def test_poses_and_times_without_a_velocity_are_refused():
     with pytest.raises(DomainError, match="times of the poses"):
         camera_velocity(poses, torch.tensor([0.0, math.nan, 1.0]))
     with pytest.raises(DomainError, match="turns by 178 degrees"):
-        camera_velocity(torch.stack([poses[0], poses[0] @ se3_exp(torch.tensor([0, 0, 0, 0, 3.1, 0], dtype=D))]), torch.tensor([0.0, 1.0]))
+        camera_velocity(
+            torch.stack([poses[0], poses[0] @ se3_exp(torch.tensor([0, 0, 0, 0, 3.1, 0], dtype=D))]),
+            torch.tensor([0.0, 1.0]),
+        )
     with pytest.raises(DomainError, match="not rigid"):
         camera_velocity(2 * poses, torch.tensor([0.0, 1.0, 2.0]))

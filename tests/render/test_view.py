@@ -9,7 +9,17 @@ import torch
 from codesign import backend, lens, render
 from codesign.errors import DomainError, ShapeError
 from codesign.pose import apply, inverse, look_at, se3_exp
-from codesign.render import Camera, MitsubaScene, MovingScene, TexturedPlane, check_view, flow_and_occlusion, project, true_flow, view
+from codesign.render import (
+    Camera,
+    MitsubaScene,
+    MovingScene,
+    TexturedPlane,
+    check_view,
+    flow_and_occlusion,
+    project,
+    true_flow,
+    view,
+)
 from scenes import textures, worlds
 from studies.render_truth import OPTICS, PITCH_MM, SENSOR_PX
 
@@ -24,12 +34,22 @@ def plane(seed=1, height_m=0.0):
 
 def emitting(radiance=100.0, **description):
     bitmap = backend.mitsuba().Bitmap(np.full((2, 2, 1), radiance, dtype=np.float32))
-    return MitsubaScene({"shape": {**description, "emitter": {"type": "area", "radiance": {"type": "bitmap", "bitmap": bitmap, "raw": True}}}})
+    return MitsubaScene(
+        {
+            "shape": {
+                **description,
+                "emitter": {"type": "area", "radiance": {"type": "bitmap", "bitmap": bitmap, "raw": True}},
+            }
+        }
+    )
 
 
 def rectangle(half_width_m, half_height_m):
     """A rectangle in z = 0 that faces +z."""
-    return emitting(type="rectangle", to_world=backend.mitsuba().ScalarTransform4f().scale([half_width_m, half_height_m, 1]))
+    return emitting(
+        type="rectangle",
+        to_world=backend.mitsuba().ScalarTransform4f().scale([half_width_m, half_height_m, 1]),
+    )
 
 
 def shifted(*offsets):
@@ -59,10 +79,13 @@ def motion(count=3, height_m=0.4):
 
 
 def test_points_depth_normals_and_objects_of_a_view_by_hand():
-    # a ball of 0.25 m at (0.1, 0, 0.5) over the ground, seen from 2 m: rays by similar triangles, the ball by its quadratic
+    # a ball of 0.25 m at (0.1, 0, 0.5) over the ground, seen from 2 m: rays by similar triangles, the ball by
+    # its quadratic
     cam = Camera(lens.Pinhole(8.0), 61, 41, 0.1, 1)
     centre = torch.tensor([0.1, 0.0, 0.5], dtype=D)
-    scene = MovingScene(plane(), {"ball": (emitting(type="sphere", radius=0.25), shifted((3.0, 0, 0.5), centre.tolist()))})
+    scene = MovingScene(
+        plane(), {"ball": (emitting(type="sphere", radius=0.25), shifted((3.0, 0, 0.5), centre.tolist()))}
+    )
     found = view(cam, scene, above(count=2), 1)
     slope = (cam.film.pixels() - cam.film.middle_px) * 0.1 / 8.0
     ray = torch.cat([slope, torch.ones(slope.shape[0], 1, dtype=D)], 1) @ above()[0, :3, :3].T
@@ -82,20 +105,33 @@ def test_points_depth_normals_and_objects_of_a_view_by_hand():
     assert float((found.depth_m.reshape(-1) - (2 - points[:, 2]))[clear].abs().max()) <= 1e-5
     normal = torch.where(meets[:, None], (points - centre) / 0.25, torch.tensor([0.0, 0.0, 1.0], dtype=D))
     assert float((found.normal.reshape(-1, 3) - normal)[clear].norm(dim=1).max()) <= 1e-4
-    assert torch.equal(view(cam, scene, above(count=2), 0).object_id, torch.zeros(41, 61, dtype=torch.long))  # the ball is elsewhere in frame 0
+    assert torch.equal(
+        view(cam, scene, above(count=2), 0).object_id, torch.zeros(41, 61, dtype=torch.long)
+    )  # the ball is elsewhere in frame 0
 
 
 @pytest.mark.parametrize("name", OPTICS)
 def test_points_of_a_view_project_to_their_pixels(name):
-    cam = Camera(OPTICS[name](), *SENSOR_PX, PITCH_MM, 1, film=render.Film(*SENSOR_PX, 9, 7, PITCH_MM, ((0, 0), (168, 126), (300, 40))))
+    cam = Camera(
+        OPTICS[name](),
+        *SENSOR_PX,
+        PITCH_MM,
+        1,
+        film=render.Film(*SENSOR_PX, 9, 7, PITCH_MM, ((0, 0), (168, 126), (300, 40))),
+    )
     radius = 0.016 if name == "la1509" else 0.1  # a field of 2 degrees, or 20
-    scene = MovingScene(plane(2, -0.5), {"ball": (emitting(type="sphere", radius=radius), path(2)[1:] @ shifted((0.0, 0.0, 1.6)))})
+    scene = MovingScene(
+        plane(2, -0.5),
+        {"ball": (emitting(type="sphere", radius=radius), path(2)[1:] @ shifted((0.0, 0.0, 1.6)))},
+    )
     found = view(cam, scene, path(2)[1:], 0)
     assert found.depth_m.shape == (3, 7, 9)
     assert set(found.object_id[found.valid].unique().tolist()) == {0, 1}
     back = project(cam, apply(inverse(path(2)[1]), found.points_world_m[found.valid]))
     assert int(found.valid.sum()) >= 120
-    assert float((back - cam.film.pixels()[found.valid.reshape(-1)]).detach().abs().max()) <= 1e-9  # the point is on the ray to rounding, wherever float32 put the surface
+    assert (
+        float((back - cam.film.pixels()[found.valid.reshape(-1)]).detach().abs().max()) <= 1e-9
+    )  # the point is on the ray to rounding, wherever float32 put the surface
 
 
 def test_pixels_that_meet_nothing_are_zero_and_without_object():
@@ -119,55 +155,82 @@ def pixel_homography(camera_pose, plane_pose, K):
 
 @pytest.mark.parametrize(("card", "tolerance_px"), [(plane, 1e-9), (lambda: rectangle(3.0, 3.0), 1e-4)])
 def test_flow_of_a_moving_plane_is_its_homography(card, tolerance_px):
-    # asked for: 1e-3. Float32 geometry shifts a point along its ray by 2e-7 of 2 m, which shows as less than 1e-5 px of flow
-    cam, poses, objects = Camera(lens.Pinhole(8.0), 24, 16, 0.1, 1), path(), motion()
+    # asked for: 1e-3. Float32 geometry shifts a point along its ray by 2e-7 of 2 m, which shows as less than
+    # 1e-5 px of flow
+    cam = Camera(lens.Pinhole(8.0), 24, 16, 0.1, 1)
+    poses = path()
+    objects = motion()
     flow, valid = true_flow(cam, MovingScene(plane(2, -3.0), {"card": (card(), objects)}), poses)
     assert bool(valid.all())
     K = np.array([[80.0, 0, 11.5], [0, 80.0, 7.5], [0, 0, 1]])
     pixels = cam.film.pixels().numpy()
     for k in range(2):
-        H = pixel_homography(poses[k + 1], objects[k + 1], K) @ np.linalg.inv(pixel_homography(poses[k], objects[k], K))
+        H = pixel_homography(poses[k + 1], objects[k + 1], K) @ np.linalg.inv(
+            pixel_homography(poses[k], objects[k], K)
+        )
         h = np.concatenate([pixels, np.ones_like(pixels[:, :1])], 1) @ H.T
-        np.testing.assert_allclose(flow[k].numpy(), (h[:, :2] / h[:, 2:] - pixels).T.reshape(2, 16, 24), rtol=0, atol=tolerance_px)
+        np.testing.assert_allclose(
+            flow[k].numpy(), (h[:, :2] / h[:, 2:] - pixels).T.reshape(2, 16, 24), rtol=0, atol=tolerance_px
+        )
 
 
 def test_flow_of_a_moving_ball_and_of_the_ground_behind_it():
-    cam, poses = Camera(lens.Pinhole(8.0), 48, 32, 0.1, 1), path(2)
-    objects = shifted((0.0, 0.0, 0.5), (0.0, 0.0, 0.5)) @ se3_exp(torch.tensor([[0.0] * 6, [0.06, -0.04, 0.05, 0.1, -0.2, 0.3]], dtype=D))
+    cam = Camera(lens.Pinhole(8.0), 48, 32, 0.1, 1)
+    poses = path(2)
+    objects = shifted((0.0, 0.0, 0.5), (0.0, 0.0, 0.5)) @ se3_exp(
+        torch.tensor([[0.0] * 6, [0.06, -0.04, 0.05, 0.1, -0.2, 0.3]], dtype=D)
+    )
     scene = MovingScene(plane(), {"ball": (emitting(type="sphere", radius=0.25), objects)})
     flow, valid = true_flow(cam, scene, poses)
     seen = view(cam, scene, poses, 0)
     rays = cam.chief_rays(cam.film.pixels())
-    eye, ray = poses[0, :3, 3], rays.direction @ poses[0, :3, :3].T
+    eye = poses[0, :3, 3]
+    ray = rays.direction @ poses[0, :3, :3].T
     off = eye - objects[0, :3, 3]
     b = ray @ off
     root = (b.square() - off @ off + 0.25**2).reshape(32, 48)
-    ball = (root > 1e-3) & (seen.object_id == 1)  # a few pixels from the outline, where the surface is nearly along the ray
+    ball = (root > 1e-3) & (
+        seen.object_id == 1
+    )  # a few pixels from the outline, where the surface is nearly along the ray
     assert int(ball.sum()) > 200
     where = eye + (-b - root.reshape(-1).clamp_min(0).sqrt())[:, None] * ray
     later = apply(objects[1] @ inverse(objects[0]), where)
     cam_later = apply(inverse(poses[1]), later)
     to = cam_later[:, :2] / cam_later[:, 2:] * 80.0 + cam.film.middle_px
     truth = (to - cam.film.pixels()).T.reshape(2, 32, 48)
-    assert float((flow[0] - truth).abs().amax(0)[ball].max()) <= 1e-3  # asked for; float32 depth over the cosine of 0.1 moves points by 2e-6 m, 1e-5 px
+    assert (
+        float((flow[0] - truth).abs().amax(0)[ball].max()) <= 1e-3
+    )  # asked for; float32 depth over the cosine of 0.1 moves points by 2e-6 m, 1e-5 px
     still, _ = true_flow(cam, plane(), poses)
     ground = seen.object_id == 0
-    torch.testing.assert_close(flow[0][:, ground], still[0][:, ground], rtol=0, atol=1e-12)  # the ground flows as if there were no ball
+    torch.testing.assert_close(
+        flow[0][:, ground], still[0][:, ground], rtol=0, atol=1e-12
+    )  # the ground flows as if there were no ball
     assert bool(valid.all())
 
 
 def test_gradients_of_flow_and_points_to_object_poses(generator):
     geo = lens.load("cooke-triplet").scaled(0.2)
-    poses, objects = path(2), motion(2)
-    weights, cloud = torch.randn(1, 2, 4, 5, generator=generator, dtype=D), torch.randn(4, 5, 4, generator=generator, dtype=D)
+    poses = path(2)
+    objects = motion(2)
+    weights = torch.randn(1, 2, 4, 5, generator=generator, dtype=D)
+    cloud = torch.randn(4, 5, 4, generator=generator, dtype=D)
 
     def loss(twists, moved, curvature):
         c = Camera(geo.replace(curvature_per_mm=curvature), 5, 4, 0.8, 1)
         scene = MovingScene(plane(2, -3.0), {"card": (plane(), objects @ se3_exp(twists))})
         found = view(c, scene, poses @ se3_exp(moved), 1)
-        return (true_flow(c, scene, poses @ se3_exp(moved))[0] * weights).sum() + (found.points_world_m * cloud[..., :3]).sum() + (found.depth_m * cloud[..., 3]).sum()
+        return (
+            (true_flow(c, scene, poses @ se3_exp(moved))[0] * weights).sum()
+            + (found.points_world_m * cloud[..., :3]).sum()
+            + (found.depth_m * cloud[..., 3]).sum()
+        )
 
-    inputs = [torch.tensor([[0.01, 0, 0, 0, 0.01, 0], [0.03, -0.02, 0.05, 0.01, -0.02, 0.03]], dtype=D), torch.zeros(2, 6, dtype=D), geo.curvature_per_mm.detach()]
+    inputs = [
+        torch.tensor([[0.01, 0, 0, 0, 0.01, 0], [0.03, -0.02, 0.05, 0.01, -0.02, 0.03]], dtype=D),
+        torch.zeros(2, 6, dtype=D),
+        geo.curvature_per_mm.detach(),
+    ]
     leaves = [v.clone().requires_grad_() for v in inputs]
     found = torch.autograd.grad(loss(*leaves), leaves)
     for k, step in enumerate((1e-5, 1e-5, 1e-6)):
@@ -175,7 +238,10 @@ def test_gradients_of_flow_and_points_to_object_poses(generator):
         for i in range(truth.numel()):
             shift = torch.zeros(inputs[k].numel(), dtype=D)
             shift[i] = step
-            ahead, behind = ([v + s * shift.reshape(v.shape) if j == k else v for j, v in enumerate(inputs)] for s in (1, -1))
+            ahead, behind = (
+                [v + s * shift.reshape(v.shape) if j == k else v for j, v in enumerate(inputs)]
+                for s in (1, -1)
+            )
             truth[i] = float((loss(*ahead) - loss(*behind)).detach()) / (2 * step)
         # rounding: 1e-11 px over 1e-5; the projection's Jacobian is good to 1e-7
         assert float((found[k].reshape(-1) - truth).norm() / truth.norm()) <= 1e-6
@@ -186,15 +252,22 @@ def test_gradients_of_flow_and_points_to_object_poses(generator):
 
 @pytest.mark.parametrize("optics", ["pinhole", "cooke-triplet"])
 def test_a_card_that_moves_hides_what_it_comes_to_cover(optics):
-    # a card 0.3 x 0.2 m at half height, 0.25 m to the right and 0.06 m up between the frames; ground points are hidden where they lie in its later shadow
-    cam = Camera(lens.Pinhole(8.0) if optics == "pinhole" else lens.load(optics).scaled(0.16), 48, 40, 0.05, 1)
+    # a card 0.3 x 0.2 m at half height, 0.25 m to the right and 0.06 m up between the frames; ground points
+    # are hidden where they lie in its later shadow
+    cam = Camera(
+        lens.Pinhole(8.0) if optics == "pinhole" else lens.load(optics).scaled(0.16), 48, 40, 0.05, 1
+    )
     offsets = torch.tensor([[-0.1, 0.02, 1.0], [0.15, -0.04, 1.0]], dtype=D)
-    scene = MovingScene(worlds.ground(np.full((8, 8), 50.0, dtype=np.float32)), {"card": (rectangle(0.15, 0.1), shifted(*offsets.tolist()))})
+    scene = MovingScene(
+        worlds.ground(np.full((8, 8), 50.0, dtype=np.float32)),
+        {"card": (rectangle(0.15, 0.1), shifted(*offsets.tolist()))},
+    )
     found = flow_and_occlusion(cam, scene, above(count=2))
     seen = view(cam, scene, above(count=2), 0)
     rays = cam.chief_rays(cam.film.pixels())  # by hand, in world axes, for the ground's points
     R = above()[0, :3, :3]
-    eye, ray = apply(above()[0], rays.origin_m).detach(), (rays.direction @ R.T).detach()
+    eye = apply(above()[0], rays.origin_m).detach()
+    ray = (rays.direction @ R.T).detach()
     inside = []
     for offset in offsets:
         at = (eye + (1.0 - eye[:, 2:]) / ray[:, 2:] * ray)[:, :2] - offset[:2]
@@ -206,20 +279,26 @@ def test_a_card_that_moves_hides_what_it_comes_to_cover(optics):
     assert torch.equal(found.occluded.reshape(-1)[clear], truth[clear])
     assert torch.equal(seen.object_id.reshape(-1)[clear], (inside[0] > 0).long()[clear])
     assert not bool((found.occluded & ~found.valid).any())
-    assert float(found.flow_px[0][:, (seen.object_id == 0) & seen.valid].detach().abs().max()) <= 1e-9  # the ground does not move
+    assert (
+        float(found.flow_px[0][:, (seen.object_id == 0) & seen.valid].detach().abs().max()) <= 1e-9
+    )  # the ground does not move
 
 
 def test_points_of_a_ball_that_turns_are_hidden_when_they_face_away():
-    # a point is hidden by its own ball when its normal points away from the eye: closed form, with no other surface nearer
-    cam, poses = Camera(lens.Pinhole(8.0), 64, 48, 0.1, 1), above(count=2)
+    # a point is hidden by its own ball when its normal points away from the eye: closed form, with no other
+    # surface nearer
+    cam = Camera(lens.Pinhole(8.0), 64, 48, 0.1, 1)
+    poses = above(count=2)
     objects = torch.stack([torch.eye(4, dtype=D), se3_exp(torch.tensor([0, 0, 0, 0, 0.9, 0], dtype=D))])
     scene = MovingScene(plane(2, -1.0), {"ball": (emitting(type="sphere", radius=0.4), objects)})
-    found, seen = flow_and_occlusion(cam, scene, poses), view(cam, scene, poses, 0)
+    found = flow_and_occlusion(cam, scene, poses)
+    seen = view(cam, scene, poses, 0)
     local = seen.points_world_m.reshape(-1, 3)
     later = apply(objects[1], local)
     facing = ((poses[1, :3, 3] - later) * later / 0.4).sum(1) / (poses[1, :3, 3] - later).norm(dim=1)
     ball = seen.object_id.reshape(-1) == 1
-    # the tolerance is 2e-6 x 2 m over the cosine, the ball's own depth behind the surface 0.8 m x cosine: they part at cosines of 3e-3
+    # the tolerance is 2e-6 x 2 m over the cosine, the ball's own depth behind the surface 0.8 m x cosine:
+    # they part at cosines of 3e-3
     clear = ball & (facing.abs() > 5e-3)
     assert int(clear.sum()) > 700
     assert torch.equal(found.occluded.reshape(-1)[clear], facing[clear] < 0)
@@ -239,29 +318,43 @@ def test_nothing_hides_when_nothing_moves(optics):
 
 @pytest.mark.parametrize("world", ["room", "corridor", "outdoor"])
 def test_a_pinhole_that_turns_about_itself_uncovers_nothing(world, generator):
-    # what is in front of what along a ray through one point depends on that point alone; the rays are other ones to float32, so rounding gets its chance
-    cam, scene, n = Camera(lens.Pinhole(3.0), 160, 120, 0.03, 1), worlds.WORLDS[world](), 0
+    # what is in front of what along a ray through one point depends on that point alone; the rays are other
+    # ones to float32, so rounding gets its chance
+    cam = Camera(lens.Pinhole(3.0), 160, 120, 0.03, 1)
+    scene = worlds.WORLDS[world]()
+    n = 0
     for _ in range(3):
         turns = 0.3 * torch.randn(2, 3, generator=generator, dtype=D)
-        found = flow_and_occlusion(cam, scene, look_at(*worlds.VIEWS[world]) @ se3_exp(torch.cat([torch.zeros_like(turns), turns], 1)))
+        found = flow_and_occlusion(
+            cam,
+            scene,
+            look_at(*worlds.VIEWS[world]) @ se3_exp(torch.cat([torch.zeros_like(turns), turns], 1)),
+        )
         assert not bool(found.occluded.any())
         n += int(found.valid.sum())
     assert n > 20_000
 
 
 def test_a_camera_that_passes_a_crate_loses_what_it_hides():
-    # masks by a depth map of the later view: a point is hidden when the later view's surface at its pixel is nearer by more than texels of that map
-    cam, room = Camera(lens.Pinhole(3.0), 96, 72, 0.05, 1), worlds.room()
-    poses = torch.stack([look_at((0.0, -1.2, 0.9), (0.1, 0.8, 0.4)), look_at((0.5, -1.0, 0.9), (0.1, 0.8, 0.4))])
-    found, later = flow_and_occlusion(cam, room, poses), view(cam, room, poses, 1)
+    # masks by a depth map of the later view: a point is hidden when the later view's surface at its pixel is
+    # nearer by more than texels of that map
+    cam = Camera(lens.Pinhole(3.0), 96, 72, 0.05, 1)
+    room = worlds.room()
+    poses = torch.stack(
+        [look_at((0.0, -1.2, 0.9), (0.1, 0.8, 0.4)), look_at((0.5, -1.0, 0.9), (0.1, 0.8, 0.4))]
+    )
+    found = flow_and_occlusion(cam, room, poses)
+    later = view(cam, room, poses, 1)
     now = view(cam, room, poses, 0)
     depth = apply(inverse(poses[1]), now.points_world_m.reshape(-1, 3))[:, 2].reshape(72, 96)
     to = (cam.film.pixels() + found.flow_px[0].reshape(2, -1).T).reshape(72, 96, 2)
     low = to.floor().long()
     inside = (low >= 0).all(2) & (low[..., 0] < 95) & (low[..., 1] < 71) & found.valid[0]
-    row, column = low[..., 1].clamp(0, 70), low[..., 0].clamp(0, 94)
+    row = low[..., 1].clamp(0, 70)
+    column = low[..., 0].clamp(0, 94)
     around = torch.stack([later.depth_m[row + i, column + j] for i in (0, 1) for j in (0, 1)])
-    hidden, free = inside & (around.amax(0) < 0.97 * depth), inside & (around.amin(0) > 0.97 * depth)
+    hidden = inside & (around.amax(0) < 0.97 * depth)
+    free = inside & (around.amin(0) > 0.97 * depth)
     assert int(hidden.sum()) > 100
     assert bool(found.occluded[0][hidden].all())
     assert int(free.sum()) > 3000
@@ -273,8 +366,14 @@ def test_a_camera_that_passes_a_crate_loses_what_it_hides():
 
 def test_good_views_pass():
     cam = Camera(lens.load("cooke-triplet").scaled(0.1), 32, 24, 0.1, 4)
-    check_view(cam, worlds.room(), torch.stack([look_at((0.5, -1.2, 1.4), (0, 1, 0.8)), look_at((-0.5, -1.0, 1.0), (0, 1, 0.8))]))
-    check_view(cam, MovingScene(plane(2, -1.0), {"ball": (emitting(type="sphere", radius=0.2), motion())}), path())
+    check_view(
+        cam,
+        worlds.room(),
+        torch.stack([look_at((0.5, -1.2, 1.4), (0, 1, 0.8)), look_at((-0.5, -1.0, 1.0), (0, 1, 0.8))]),
+    )
+    check_view(
+        cam, MovingScene(plane(2, -1.0), {"ball": (emitting(type="sphere", radius=0.2), motion())}), path()
+    )
     below = look_at((0, 0, -2.0), (0, 0, 0), down=(0, 1, 0))
     check_view(cam, plane(), below[None])  # planes shine to both sides
     dome = emitting(type="sphere", radius=5.0, flip_normals=True)
@@ -285,13 +384,42 @@ def test_good_views_pass():
     ("scene", "poses", "sentence"),
     [
         (lambda: worlds.room(), lambda: 1.01 * look_at((0.5, -1.2, 1.4), (0, 1, 0.8))[None], "not rigid"),
-        (lambda: worlds.room(), lambda: torch.stack([look_at((0.5, -1.2, 1.4), (0, 1, 0.8)), look_at((0.1, 0.5, 0.25), (0, 1, 0.3))]), "frame 1: 100% of the rays meet surfaces from behind"),
-        (lambda: worlds.room(), lambda: look_at((-0.9, 0.9, 0.3), (0, 1, 0.5))[None], "frame 0: 100% .* inside an object"),
-        (lambda: worlds.room(objects=False), lambda: look_at((0, -4.0, 1.3), (0, 0, 1.3))[None], "behind a wall"),
-        (lambda: worlds.wall(np.full((8, 8), 50.0, dtype=np.float32)), lambda: look_at((0, -2.0, 0), (0, -3.0, 0))[None], "frame 0 is empty"),
-        (lambda: plane(), lambda: torch.cat([above(), look_at((0, 0, 2.0), (0, 0, 4.0), down=(0, 1, 0))[None]]), "frame 1 is empty"),
+        (
+            lambda: worlds.room(),
+            lambda: torch.stack(
+                [look_at((0.5, -1.2, 1.4), (0, 1, 0.8)), look_at((0.1, 0.5, 0.25), (0, 1, 0.3))]
+            ),
+            "frame 1: 100% of the rays meet surfaces from behind",
+        ),
+        (
+            lambda: worlds.room(),
+            lambda: look_at((-0.9, 0.9, 0.3), (0, 1, 0.5))[None],
+            "frame 0: 100% .* inside an object",
+        ),
+        (
+            lambda: worlds.room(objects=False),
+            lambda: look_at((0, -4.0, 1.3), (0, 0, 1.3))[None],
+            "behind a wall",
+        ),
+        (
+            lambda: worlds.wall(np.full((8, 8), 50.0, dtype=np.float32)),
+            lambda: look_at((0, -2.0, 0), (0, -3.0, 0))[None],
+            "frame 0 is empty",
+        ),
+        (
+            lambda: plane(),
+            lambda: torch.cat([above(), look_at((0, 0, 2.0), (0, 0, 4.0), down=(0, 1, 0))[None]]),
+            "frame 1 is empty",
+        ),
         (lambda: plane(), lambda: above(2e-4), "0.201 mm before the camera, which is less than the radius"),
-        (lambda: MovingScene(plane(2, -1.0), {"ball": (emitting(type="sphere", radius=0.2), shifted((0, 0, 0.5), (0, 0, 1.9)))}), lambda: above(count=2), "frame 1: 100%"),
+        (
+            lambda: MovingScene(
+                plane(2, -1.0),
+                {"ball": (emitting(type="sphere", radius=0.2), shifted((0, 0, 0.5), (0, 0, 1.9)))},
+            ),
+            lambda: above(count=2),
+            "frame 1: 100%",
+        ),
         (lambda: emitting(-3.0, type="sphere", radius=0.2), lambda: above(), "frame 0 has a radiance of -3"),
         (lambda: emitting(math.nan, type="sphere", radius=0.2), lambda: above(), "radiance of nan"),
     ],

@@ -13,7 +13,9 @@ from codesign.render import Camera, MitsubaScene
 from scenes import textures, worlds
 
 D = torch.float64
-CORNERS = np.array([[10.0, 60.0], [120.0, 200.0]], dtype=np.float32)  # top left, top right; bottom left, bottom right
+CORNERS = np.array(
+    [[10.0, 60.0], [120.0, 200.0]], dtype=np.float32
+)  # top left, top right; bottom left, bottom right
 
 
 def quadrants(size=64):
@@ -21,7 +23,8 @@ def quadrants(size=64):
 
 
 def corners_seen(scene, pose, spread_px=10):
-    """Radiance a little away from the image's middle, as [[top left, top right], [bottom left, bottom right]]."""
+    """Radiance a little away from the image's middle, as [[top left, top right], [bottom left, bottom
+    right]]."""
     camera = Camera(lens.Pinhole(8.0), 64, 64, 0.05, 1)
     image = render.frames(camera, scene, pose[None])[0]
     at = [32 - spread_px, 31 + spread_px]
@@ -30,21 +33,31 @@ def corners_seen(scene, pose, spread_px=10):
 
 def test_a_constant_wall_is_that_constant():
     scene = worlds.wall(np.full((16, 16), 37.5, dtype=np.float32))
-    image = render.frames(Camera(lens.ThinLens(8.0, 2.0), 12, 9, 0.1, 8), scene, look_at((0.3, -2, 0.4), (0, 0, 0.1))[None])
-    torch.testing.assert_close(image, torch.full((1, 9, 12), 37.5), rtol=1e-6, atol=0)  # interpolation weights and the mean of 8 round
+    image = render.frames(
+        Camera(lens.ThinLens(8.0, 2.0), 12, 9, 0.1, 8), scene, look_at((0.3, -2, 0.4), (0, 0, 0.1))[None]
+    )
+    torch.testing.assert_close(
+        image, torch.full((1, 9, 12), 37.5), rtol=1e-6, atol=0
+    )  # interpolation weights and the mean of 8 round
 
 
 def test_a_picture_on_the_wall_is_upright_and_not_mirrored():
-    scene = worlds.wall(quadrants(512), texel_m=16 / 512, half_width_m=8.0)  # the picture once over the whole wall
+    scene = worlds.wall(
+        quadrants(512), texel_m=16 / 512, half_width_m=8.0
+    )  # the picture once over the whole wall
     np.testing.assert_allclose(corners_seen(scene, look_at((0, -2, 0), (0, 0, 0))), CORNERS, rtol=1e-6)
 
 
 def test_a_picture_on_the_ground_is_upright_for_one_who_faces_north():
     scene = worlds.ground(quadrants(512), texel_m=24 / 512, half_width_m=12.0)
-    np.testing.assert_allclose(corners_seen(scene, look_at((0, 0, 2), (0, 0, 0), down=(0, -1, 0))), CORNERS, rtol=1e-6)
+    np.testing.assert_allclose(
+        corners_seen(scene, look_at((0, 0, 2), (0, 0, 0), down=(0, -1, 0))), CORNERS, rtol=1e-6
+    )
 
 
-@pytest.mark.parametrize(("wall", "target"), [(0, (0, 2, 1.3)), (1, (0, -2, 1.3)), (2, (2, 0, 1.3)), (3, (-2, 0, 1.3))])
+@pytest.mark.parametrize(
+    ("wall", "target"), [(0, (0, 2, 1.3)), (1, (0, -2, 1.3)), (2, (2, 0, 1.3)), (3, (-2, 0, 1.3))]
+)
 def test_pictures_in_the_room_are_upright_and_each_on_its_wall(wall, target):
     level = 60.0
     pictures = [np.full((64, 64), level, dtype=np.float32)] * 6
@@ -66,7 +79,9 @@ def test_the_room_has_no_holes_at_its_seams():
 def test_texels_have_the_size_they_are_given():
     # black and bright squares of 0.1 m; from 2 m with 8 mm and 0.05 mm pixels one square is 8 pixels wide
     camera = Camera(lens.Pinhole(8.0), 64, 8, 0.05, 1)
-    row = render.frames(camera, worlds.checkerboard(square_m=0.1), look_at((0.05, -2, 0.05), (0.05, 0, 0.05))[None])[0, 2]
+    row = render.frames(
+        camera, worlds.checkerboard(square_m=0.1), look_at((0.05, -2, 0.05), (0.05, 0, 0.05))[None]
+    )[0, 2]
     edges = (row > 100).int().diff().nonzero().reshape(-1)
     assert set(edges.diff().tolist()) == {8}
     assert {10.0, 200.0} <= {round(v, 3) for v in row.tolist()}
@@ -85,16 +100,21 @@ def test_a_static_camera_sees_equal_frames_and_the_seed_decides_the_samples():
 def test_ten_kilometres_away_single_precision_still_renders():
     # a wall at 10 km with texels of 10 m: pixel means of a scene 5000 times closer and finer
     texture = textures.speckle(0, 64, finest_px=6.0)
-    near, far = worlds.wall(texture, 0.002, 0.064), worlds.wall(texture, 10.0, 320.0)
+    near = worlds.wall(texture, 0.002, 0.064)
+    far = worlds.wall(texture, 10.0, 320.0)
     camera = Camera(lens.load("cooke-triplet"), 16, 12, 0.1, 4)
     a = render.frames(Camera(lens.Pinhole(50.0), 16, 12, 0.1, 4), near, look_at((0, -2, 0), (0, 0, 0))[None])
     b = render.frames(Camera(lens.Pinhole(50.0), 16, 12, 0.1, 4), far, look_at((0, -1e4, 0), (0, 0, 0))[None])
-    torch.testing.assert_close(a, b, rtol=1e-3, atol=0)  # positions on the wall round to 1e-4 texels, contrasts per texel are below 5
+    torch.testing.assert_close(
+        a, b, rtol=1e-3, atol=0
+    )  # positions on the wall round to 1e-4 texels, contrasts per texel are below 5
     poses = torch.stack([look_at((0, -1e4, 0), (0, 0, 0)), look_at((10.0, -1e4, 0), (10.0, 0, 0))])
     flow, valid = render.true_flow(camera, far, poses)
     efl = float(camera.lens.first_order().efl_mm.detach())
     assert bool(valid.all())
-    torch.testing.assert_close(flow[0, 0], torch.full((12, 16), -efl / 0.1 * 10.0 / 1e4, dtype=D), rtol=5e-3, atol=0)  # distortion and the pupil's place
+    torch.testing.assert_close(
+        flow[0, 0], torch.full((12, 16), -efl / 0.1 * 10.0 / 1e4, dtype=D), rtol=5e-3, atol=0
+    )  # distortion and the pupil's place
 
 
 def test_scenes_and_textures_that_cannot_be_are_refused(tmp_path):
@@ -116,7 +136,8 @@ def test_scenes_and_textures_that_cannot_be_are_refused(tmp_path):
 
 
 def test_bad_poses_and_ray_counts_are_refused():
-    camera, scene = Camera(lens.Pinhole(8.0), 4, 4, 0.1, 4), worlds.smooth_plane()
+    camera = Camera(lens.Pinhole(8.0), 4, 4, 0.1, 4)
+    scene = worlds.smooth_plane()
     with pytest.raises(ShapeError, match="poses must be"):
         render.frames(camera, scene, torch.eye(4, dtype=D))
     with pytest.raises(DomainError, match="not rigid"):
@@ -150,18 +171,24 @@ def test_a_photograph_is_linearised_as_srgb(tmp_path):
     colour = np.zeros((2, 2, 3), dtype=np.uint8)
     colour[..., 1] = 255
     imageio.imwrite(tmp_path / "green.png", colour)
-    np.testing.assert_allclose(textures.photo(tmp_path / "green.png"), 2 + 253 * 0.7152, rtol=2e-6)  # luminance is a sum of linear light
+    np.testing.assert_allclose(
+        textures.photo(tmp_path / "green.png"), 2 + 253 * 0.7152, rtol=2e-6
+    )  # luminance is a sum of linear light
 
 
 def test_speckle_keeps_its_band_and_contrast():
-    field = np.log(textures.speckle(5, 256, finest_px=4.0, coarsest_px=32.0, contrast=0.3).astype(np.float64) / 60)
+    field = np.log(
+        textures.speckle(5, 256, finest_px=4.0, coarsest_px=32.0, contrast=0.3).astype(np.float64) / 60
+    )
     assert field.std() == pytest.approx(0.3, rel=1e-5)
     power = np.abs(np.fft.fft2(field)) ** 2
     radius = np.hypot(np.fft.fftfreq(256)[:, None], np.fft.fftfreq(256))
     inside = (radius >= 1 / 32) & (radius <= 1 / 4)
     assert power[inside].sum() / power.sum() > 1 - 1e-9  # float32 rounding of the radiance
     low = power[(radius >= 1 / 32) & (radius < 1 / 16)].sum()
-    assert low / power[(radius >= 1 / 8) & (radius <= 1 / 4)].sum() == pytest.approx(1, abs=0.25)  # equal power per octave; some 300 random modes
+    assert low / power[(radius >= 1 / 8) & (radius <= 1 / 4)].sum() == pytest.approx(
+        1, abs=0.25
+    )  # equal power per octave; some 300 random modes
 
 
 def test_faded_pictures_end_in_the_level():

@@ -1,4 +1,5 @@
-"""Windows made on the fly: their flow against the pictures themselves, their statistics against what was asked for."""
+"""Windows made on the fly: their flow against the pictures themselves, their statistics against what was
+asked for."""
 
 import dataclasses
 
@@ -18,14 +19,18 @@ def layered():
 
 
 def test_the_flow_leads_to_the_same_radiance(layered):
-    """Where a point stays in sight, the end frame at q + flow(q) shows what the first frame shows at q: the median over all pixels is far below the change in place."""
+    """Where a point stays in sight, the end frame at q + flow(q) shows what the first frame shows at q: the
+    median over all pixels is far below the change in place."""
     windows = layered.batch(range(6))
     first, last = windows.frames.log().unbind(1)
     brought = along_flow(last[:, None], windows.truth.flow_px, torch.ones(1))[:, 0]
     inside = along_flow(torch.ones_like(last[:, None]), windows.truth.flow_px, torch.ones(1))[:, 0] > 0.999
     for k in range(6):
-        moved, still = (brought - first).abs()[k][inside[k]], (last - first).abs()[k][inside[k]]
-        assert moved.median() < 0.1 * still.mean()  # the mean counts occlusions and the bilinear lookup of sharp edges
+        moved = (brought - first).abs()[k][inside[k]]
+        still = (last - first).abs()[k][inside[k]]
+        assert (
+            moved.median() < 0.1 * still.mean()
+        )  # the mean counts occlusions and the bilinear lookup of sharp edges
         assert moved.mean() < 0.6 * still.mean()
 
 
@@ -33,20 +38,25 @@ def test_similarity_flow_is_the_closed_form():
     draw = np.random.default_rng(5)
     motion = flow_motion.similarity(draw, np.array([0.0, 0.5, 1.0]), 64, 48, (2.0, 6.0))[0]
     np.testing.assert_allclose(motion[0], np.eye(3), atol=1e-15)
-    a, b = motion[2, 0, 0], motion[2, 1, 0]
+    a = motion[2, 0, 0]
+    b = motion[2, 1, 0]
     m = complex(a, b)
-    np.testing.assert_allclose(complex(motion[1, 0, 0], motion[1, 1, 0]), m**0.5, rtol=1e-12)  # half the way is the square root
+    np.testing.assert_allclose(
+        complex(motion[1, 0, 0], motion[1, 1, 0]), m**0.5, rtol=1e-12
+    )  # half the way is the square root
     source = RenderedWindows(planes("fine"), seed=4)
     flow = source.batch([7]).truth.flow_px[0].double()
     # an affine field: second differences vanish; divergence is 2 (Re m - 1), curl 2 Im m, the same everywhere
     assert flow.diff(dim=1).diff(dim=1).abs().max() < 2e-5
-    dx, dy = flow.diff(dim=2).mean((1, 2)), flow.diff(dim=1).mean((1, 2))
+    dx = flow.diff(dim=2).mean((1, 2))
+    dy = flow.diff(dim=1).mean((1, 2))
     assert abs(dx[0] - dy[1]) < 1e-5
     assert abs(dx[1] + dy[0]) < 1e-5
 
 
 def test_camera_motion_obeys_the_plane_homography():
-    """At a small twist the flow of a plane is quadratic in the pixel; the root mean square at the probes is the one asked for."""
+    """At a small twist the flow of a plane is quadratic in the pixel; the root mean square at the probes is
+    the one asked for."""
     draw = np.random.default_rng(8)
     found = flow_motion.camera(draw, np.array([0.0, 1.0]), 64, 64, (3.0, 3.0), 2)
     np.testing.assert_allclose(found[:, 0], np.broadcast_to(np.eye(3), (2, 3, 3)), atol=1e-12)
@@ -57,13 +67,15 @@ def test_camera_motion_obeys_the_plane_homography():
 
 
 def test_samples_do_not_depend_on_their_batch(layered):
-    together, alone = layered.batch([2, 5, 9]), layered.batch([5])
+    together = layered.batch([2, 5, 9])
+    alone = layered.batch([5])
     assert torch.equal(together.volume.counts[1], alone.volume.counts[0])
     assert torch.equal(together.truth.flow_px[1], alone.truth.flow_px[0])
 
 
 def test_noise_is_as_frequent_as_asked():
-    """A still sensor before a uniform wall: only noise. 1 % per pixel, polarity and eighth gives 0.08 per pixel and polarity; Poisson within 5 sigma."""
+    """A still sensor before a uniform wall: only noise. 1 % per pixel, polarity and eighth gives 0.08 per
+    pixel and polarity; Poisson within 5 sigma."""
     draws = dataclasses.replace(planes("fine", noise=(0.01, 0.01)), contrast=(1e-6, 1e-6))
     counts = RenderedWindows(draws, seed=1).batch(range(8)).volume.counts
     expected = 0.08 * 64 * 64 * 8
@@ -72,7 +84,8 @@ def test_noise_is_as_frequent_as_asked():
 
 
 def test_events_are_the_log_change_over_the_threshold():
-    """Without mismatch and noise, signed counts times the threshold follow the change of log radiance to within one threshold and the level before the window."""
+    """Without mismatch and noise, signed counts times the threshold follow the change of log radiance to
+    within one threshold and the level before the window."""
     draws = dataclasses.replace(planes("fine", theta=0.1, noise=(0.0, 0.0)), mismatch=0.0)
     windows = RenderedWindows(draws, seed=2).batch(range(4))
     signed = (windows.volume.counts[:, 0] - windows.volume.counts[:, 1]).sum(1) * 0.1

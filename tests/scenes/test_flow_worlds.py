@@ -5,16 +5,19 @@ import torch
 
 from codesign.errors import DomainError
 from codesign.flow.warp import along_flow
-from studies.flow_worlds import WorldWindows
+from scenes.flow_worlds import WorldWindows
 
 
 @pytest.fixture(scope="module")
 def windows():
-    return WorldWindows(("room", "tabletop"), seed=4, size_px=48, intervals=16, flow_px=(2.0, 3.0), samples=4).batch([0, 1])
+    return WorldWindows(
+        ("room", "tabletop"), seed=4, size_px=48, intervals=16, flow_px=(2.0, 3.0), samples=4
+    ).batch([0, 1])
 
 
 def test_the_flow_leads_to_the_same_radiance(windows):
-    """The end frame at q + flow(q) shows what the first frame shows at q, up to pixels of four rays each; along the reversed flow, or in place, it does not."""
+    """The end frame at q + flow(q) shows what the first frame shows at q, up to pixels of four rays each;
+    along the reversed flow, or in place, it does not."""
     first, last = windows.frames.clamp_min(1).log().unbind(1)
 
     def misfit(flow_px):
@@ -29,7 +32,12 @@ def test_the_flow_leads_to_the_same_radiance(windows):
 
 def test_a_window_lasts_until_the_flow_is_as_long_as_asked(windows):
     """The speed is measured at the start of the window and changes little within it."""
-    length = torch.stack([flow.square().sum(0)[seen].mean().sqrt() for flow, seen in zip(windows.truth.flow_px, windows.truth.valid, strict=True)])
+    length = torch.stack(
+        [
+            flow.square().sum(0)[seen].mean().sqrt()
+            for flow, seen in zip(windows.truth.flow_px, windows.truth.valid, strict=True)
+        ]
+    )
     assert (length > 1.5).all()
     assert (length < 3.8).all()
 

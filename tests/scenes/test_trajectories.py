@@ -21,10 +21,23 @@ def start():
 
 
 def test_times_are_uniform_from_zero():
-    torch.testing.assert_close(trajectories.times(5, 200.0), torch.tensor([0.0, 0.005, 0.01, 0.015, 0.02], dtype=D), rtol=0, atol=1e-17)
+    torch.testing.assert_close(
+        trajectories.times(5, 200.0),
+        torch.tensor([0.0, 0.005, 0.01, 0.015, 0.02], dtype=D),
+        rtol=0,
+        atol=1e-17,
+    )
 
 
-@pytest.mark.parametrize(("count", "rate", "sentence"), [(1, 100.0, "at least 2 frames"), (5, 0.0, "rate_hz = 0.0"), (5, -3.0, "rate_hz = -3.0"), (5, math.nan, "rate_hz = nan")])
+@pytest.mark.parametrize(
+    ("count", "rate", "sentence"),
+    [
+        (1, 100.0, "at least 2 frames"),
+        (5, 0.0, "rate_hz = 0.0"),
+        (5, -3.0, "rate_hz = -3.0"),
+        (5, math.nan, "rate_hz = nan"),
+    ],
+)
 def test_too_few_frames_and_impossible_rates_are_refused(count, rate, sentence):
     with pytest.raises(DomainError, match=sentence):
         trajectories.times(count, rate)
@@ -55,12 +68,17 @@ def test_body_twist_keeps_its_velocity_in_the_camera_and_batches(start):
 
 
 def test_an_orbit_keeps_its_distance_and_looks_at_the_centre():
-    centre, radius, height, rate = (0.5, -0.2, 1.0), 2.0, 0.7, 3.0
+    centre = (0.5, -0.2, 1.0)
+    radius = 2.0
+    height = 0.7
+    rate = 3.0
     t = trajectories.times(25, 20.0)
     path = trajectories.orbit(centre, radius, height, rate, t, phase_rad=0.4)
     check_poses(path)
     away = torch.tensor(centre, dtype=D) - path[:, :3, 3]
-    torch.testing.assert_close(away.norm(dim=1), torch.full((25,), math.hypot(radius, height), dtype=D), rtol=1e-14, atol=0)
+    torch.testing.assert_close(
+        away.norm(dim=1), torch.full((25,), math.hypot(radius, height), dtype=D), rtol=1e-14, atol=0
+    )
     torch.testing.assert_close(path[:, :3, 2], away / away.norm(dim=1, keepdim=True), rtol=0, atol=1e-14)
     torch.testing.assert_close(path[:, 2, 3], torch.full((25,), 1.7, dtype=D), rtol=0, atol=1e-15)
     bearing = torch.atan2(-away[:, 1], -away[:, 0])
@@ -71,13 +89,16 @@ def test_an_orbit_keeps_its_distance_and_looks_at_the_centre():
 
 @pytest.mark.parametrize(("path", "axis"), [(trajectories.radial, 2), (trajectories.vertical, 1)])
 def test_oscillations_have_their_amplitude_period_and_axis(path, axis, start):
-    amplitude, frequency = 0.05, 4.0
+    amplitude = 0.05
+    frequency = 4.0
     t = trajectories.times(1001, 1000.0)  # four periods, 250 frames each
     poses = path(start, amplitude, frequency, t)
     check_poses(poses)
     moved = (poses[:, :3, 3] - start[:3, 3]) @ start[:3, :3]  # along the camera's axes
     shift = moved[:, axis]
-    assert float(shift.max()) == pytest.approx(amplitude, rel=1e-4)  # the crest lies within half a frame: cos(pi / 250)
+    assert float(shift.max()) == pytest.approx(
+        amplitude, rel=1e-4
+    )  # the crest lies within half a frame: cos(pi / 250)
     assert float(shift.min()) == pytest.approx(-amplitude, rel=1e-4)
     torch.testing.assert_close(shift[250:], shift[:-250], rtol=0, atol=1e-14)  # the period
     assert float(moved[:, [i for i in range(3) if i != axis]].abs().max()) <= 1e-15
@@ -87,7 +108,9 @@ def test_oscillations_have_their_amplitude_period_and_axis(path, axis, start):
 
 def test_an_axis_may_have_any_length_but_zero(start):
     t = trajectories.times(5, 100.0)
-    long, short = (trajectories.oscillation(start, axis, 0.1, 3.0, t) for axis in ((3, 0, 4), (0.6, 0.0, 0.8)))
+    long, short = (
+        trajectories.oscillation(start, axis, 0.1, 3.0, t) for axis in ((3, 0, 4), (0.6, 0.0, 0.8))
+    )
     torch.testing.assert_close(long, short, rtol=0, atol=1e-15)
     with pytest.raises(DomainError, match="axis"):
         trajectories.oscillation(start, (0, 0, 0), 0.1, 3.0, t)
@@ -112,7 +135,8 @@ def test_poses_are_rigid_and_the_velocity_leads_from_one_to_the_next(family):
     t = torch.linspace(0.013, 4.9, 157, dtype=D)
     check_poses(path(t))
     step = 1e-4
-    # a twist constant over the step differs from the path by the third derivative: step^3 / 24 times (2 pi 9 Hz)^3 * 0.008 rad and the like
+    # a twist constant over the step differs from the path by the third derivative: step^3 / 24 times (2 pi 9
+    # Hz)^3 * 0.008 rad and the like
     ahead = path(t - step / 2) @ se3_exp(step * path.velocity(t))
     torch.testing.assert_close(ahead, path(t + step / 2), rtol=0, atol=1e-9)
 
@@ -120,23 +144,40 @@ def test_poses_are_rigid_and_the_velocity_leads_from_one_to_the_next(family):
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_same_seed_gives_the_same_path_and_order_of_times_does_not_matter(family):
     t = torch.linspace(0, 4.9, 31, dtype=D)
-    one, two = FAMILIES[family](), FAMILIES[family]()
+    one = FAMILIES[family]()
+    two = FAMILIES[family]()
     assert torch.equal(one(t), two(t))
     shuffled = torch.randperm(31, generator=seeded())
     torch.testing.assert_close(one(t[shuffled]), one(t)[shuffled], rtol=0, atol=1e-15)
 
 
-@pytest.mark.parametrize(("t", "error", "sentence"), [
-    ([0.0, math.nan], DomainError, "finite seconds"), ([5.1], DomainError, "from 0 to 5 s"), ([-0.1], DomainError, "from 0 to 5 s"),
-    ([], ShapeError, "list of times"), ([[0.0]], ShapeError, "list of times"),
-])
+@pytest.mark.parametrize(
+    ("t", "error", "sentence"),
+    [
+        ([0.0, math.nan], DomainError, "finite seconds"),
+        ([5.1], DomainError, "from 0 to 5 s"),
+        ([-0.1], DomainError, "from 0 to 5 s"),
+        ([], ShapeError, "list of times"),
+        ([[0.0]], ShapeError, "list of times"),
+    ],
+)
 def test_impossible_times_are_refused(t, error, sentence):
     with pytest.raises(error, match=sentence):
         Driving(seeded(), 5.0)(torch.tensor(t, dtype=D))
 
 
 def test_orbits_have_their_radius_rate_and_view():
-    orbit = Orbital((0.5, -0.2, 1.0), 2.0, 0.7, 1.3, 0.4, radius_swing=0.25, rate_swing=0.5, radius_period_s=1.7, rate_period_s=2.9)
+    orbit = Orbital(
+        (0.5, -0.2, 1.0),
+        2.0,
+        0.7,
+        1.3,
+        0.4,
+        radius_swing=0.25,
+        rate_swing=0.5,
+        radius_period_s=1.7,
+        rate_period_s=2.9,
+    )
     t = torch.linspace(0, 8, 801, dtype=D)
     away = orbit(t)[:, :3, 3] - torch.tensor([0.5, -0.2, 1.0], dtype=D)
     radius = away[:, :2].norm(dim=1)
@@ -145,21 +186,42 @@ def test_orbits_have_their_radius_rate_and_view():
     assert float(orbit(t)[:, 2, 1].abs().max()) == 0  # level: the left axis is horizontal
     bearing = torch.remainder(torch.atan2(away[:, 1], away[:, 0]).diff(), 2 * math.pi) / 0.01
     middle = (t[1:] + t[:-1]) / 2
-    torch.testing.assert_close(bearing, 1.3 * (1 + 0.5 * (2 * math.pi * middle / 2.9).cos()), rtol=1e-4, atol=0)  # h^2/24 of (2 pi / 2.9)^2
+    torch.testing.assert_close(
+        bearing, 1.3 * (1 + 0.5 * (2 * math.pi * middle / 2.9).cos()), rtol=1e-4, atol=0
+    )  # h^2/24 of (2 pi / 2.9)^2
     # without swings: the closed form of a circle, and of its velocity
-    plain, rate = Orbital((0.0, 0.0, 0.0), 2.0, 0.0, 1.3), 1.3
-    torch.testing.assert_close(plain.velocity(t), torch.tensor([0, -2.0 * rate, 0, 0, 0, rate], dtype=D).expand(801, 6), rtol=0, atol=1e-13)
+    plain = Orbital((0.0, 0.0, 0.0), 2.0, 0.0, 1.3)
+    rate = 1.3
+    torch.testing.assert_close(
+        plain.velocity(t),
+        torch.tensor([0, -2.0 * rate, 0, 0, 0, rate], dtype=D).expand(801, 6),
+        rtol=0,
+        atol=1e-13,
+    )
 
 
-@pytest.mark.parametrize("values", [{"radius_m": 0.0}, {"rate_rad_s": 0.0}, {"radius_swing": 1.0}, {"rate_swing": -0.1}, {"rate_period_s": math.nan}])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"radius_m": 0.0},
+        {"rate_rad_s": 0.0},
+        {"radius_swing": 1.0},
+        {"rate_swing": -0.1},
+        {"rate_period_s": math.nan},
+    ],
+)
 def test_orbits_refuse_what_is_none(values):
     with pytest.raises(DomainError, match="must be"):
         Orbital((0, 0, 0), **{"radius_m": 1.0, "height_m": 0.5, "rate_rad_s": 1.0, **values})
 
 
 def test_swings_keep_their_axis_and_speed_limit():
-    start, t = body_at((0.3, -1.0, 1.2), (0.1, 1.0, 0.9)), torch.linspace(0, 5, 2001, dtype=D)
-    for swing, axis in ((Swinging.radial(start, 0.3, 0.8), start[:3, 0]), (Swinging.vertical(start, 0.3, 0.8), torch.tensor([0, 0, 1.0], dtype=D))):
+    start = body_at((0.3, -1.0, 1.2), (0.1, 1.0, 0.9))
+    t = torch.linspace(0, 5, 2001, dtype=D)
+    for swing, axis in (
+        (Swinging.radial(start, 0.3, 0.8), start[:3, 0]),
+        (Swinging.vertical(start, 0.3, 0.8), torch.tensor([0, 0, 1.0], dtype=D)),
+    ):
         shift = swing(t)[:, :3, 3] - start[:3, 3]
         along = shift @ axis
         torch.testing.assert_close(along, 0.3 * (2 * math.pi * 0.8 * t).sin(), rtol=0, atol=1e-14)
@@ -170,10 +232,13 @@ def test_swings_keep_their_axis_and_speed_limit():
 
 
 def test_waves_integrate_and_multiply_exactly_and_stay_in_bounds():
-    one, two = Waves.random(seeded(3), 0.7, 0.2, 0.1, 2.0), Waves.random(seeded(4), -0.3, 0.5, 0.2, 1.0, 4)
+    one = Waves.random(seeded(3), 0.7, 0.2, 0.1, 2.0)
+    two = Waves.random(seeded(4), -0.3, 0.5, 0.2, 1.0, 4)
     t = torch.linspace(-3, 9, 97, dtype=D)
     torch.testing.assert_close(one.times(two)(t), one(t) * two(t), rtol=0, atol=1e-15)
-    torch.testing.assert_close(one.times(one)(t), one(t) ** 2, rtol=0, atol=1e-15)  # differences of frequencies are 0
+    torch.testing.assert_close(
+        one.times(one)(t), one(t) ** 2, rtol=0, atol=1e-15
+    )  # differences of frequencies are 0
     nodes, weights = (torch.from_numpy(v) for v in np.polynomial.legendre.leggauss(200))
     numeric = ((one.times(one))(t[:, None] * (nodes + 1) / 2) * weights).sum(1) * t / 2
     torch.testing.assert_close(one.times(one).integral(t), numeric, rtol=0, atol=1e-12)
@@ -181,7 +246,22 @@ def test_waves_integrate_and_multiply_exactly_and_stay_in_bounds():
 
 
 def test_a_robot_without_slip_obeys_its_wheels():
-    robot, t = Driving(seeded(5), 6.0, 0.7, 0.4, slip=0.0, side_slip_s=0.0, track_m=0.25, x_m=0.2, y_m=-0.1, yaw_rad=0.9, heave_m=0, pitch_rad=0, roll_rad=0), torch.linspace(0, 6, 601, dtype=D)
+    robot = Driving(
+        seeded(5),
+        6.0,
+        0.7,
+        0.4,
+        slip=0.0,
+        side_slip_s=0.0,
+        track_m=0.25,
+        x_m=0.2,
+        y_m=-0.1,
+        yaw_rad=0.9,
+        heave_m=0,
+        pitch_rad=0,
+        roll_rad=0,
+    )
+    t = torch.linspace(0, 6, 601, dtype=D)
     left, right = robot.wheel_speeds(t).unbind(1)
     twist = robot.velocity(t)
     torch.testing.assert_close(twist[:, 0], (left + right) / 2, rtol=0, atol=1e-12)
@@ -192,13 +272,28 @@ def test_a_robot_without_slip_obeys_its_wheels():
     at = 3 * (nodes + 1)
     yaw = robot.heading_rad(at)
     speed = robot.wheel_speeds(at).mean(1)
-    end = torch.stack([0.2 + 3 * (weights * speed * yaw.cos()).sum(), -0.1 + 3 * (weights * speed * yaw.sin()).sum()])
+    end = torch.stack(
+        [0.2 + 3 * (weights * speed * yaw.cos()).sum(), -0.1 + 3 * (weights * speed * yaw.sin()).sum()]
+    )
     torch.testing.assert_close(robot(t[-1:])[0, :2, 3], end, rtol=0, atol=1e-12)
     torch.testing.assert_close(robot(t[:1])[0, :2, 3], torch.tensor([0.2, -0.1], dtype=D), rtol=0, atol=1e-15)
 
 
 def test_slip_slows_and_slides_outwards_and_the_shake_stays_in_its_bounds():
-    robot, t = Driving(seeded(6), 6.0, 0.7, 0.8, slip=0.1, side_slip_s=0.05, turn_swing_rad_s=0.2, heave_m=0.004, pitch_rad=0.01, roll_rad=0.02, height_m=0.3), torch.linspace(0, 6, 2001, dtype=D)
+    robot = Driving(
+        seeded(6),
+        6.0,
+        0.7,
+        0.8,
+        slip=0.1,
+        side_slip_s=0.05,
+        turn_swing_rad_s=0.2,
+        heave_m=0.004,
+        pitch_rad=0.01,
+        roll_rad=0.02,
+        height_m=0.3,
+    )
+    t = torch.linspace(0, 6, 2001, dtype=D)
     forward, left, turn = robot.ground_velocity(t).unbind(1)
     rolled = robot.wheel_speeds(t)
     assert bool((forward <= rolled.mean(1) + 1e-15).all())
@@ -213,11 +308,17 @@ def test_slip_slows_and_slides_outwards_and_the_shake_stays_in_its_bounds():
 
 
 def snap_by_quadratic_programme(points, times_s):
-    """Least integral of squared snap in another basis (monomials of time itself), with continuity only up to jerk, by its KKT system."""
-    segments, terms = len(times_s) - 1, 8
+    """Least integral of squared snap in another basis (monomials of time itself), with continuity only up to
+    jerk, by its KKT system."""
+    segments = len(times_s) - 1
+    terms = 8
     cost = np.zeros((segments * terms, segments * terms))
-    rows, right = [], []
-    power = lambda t, order: [math.perm(k, order) * t ** (k - order) if k >= order else 0.0 for k in range(terms)]  # noqa: E731
+    rows = []
+    right = []
+
+    def power(t, order):
+        return [math.perm(k, order) * t ** (k - order) if k >= order else 0.0 for k in range(terms)]
+
     for m, length in enumerate(np.diff(times_s)):
         nodes, weights = np.polynomial.legendre.leggauss(8)  # squared cubics: exact
         for node, weight in zip((nodes + 1) * length / 2, weights * length / 2, strict=True):
@@ -238,34 +339,48 @@ def snap_by_quadratic_programme(points, times_s):
         condition([(0, 0.0, order, 1)], np.zeros(points.shape[1]))
         condition([(segments - 1, times_s[-1] - times_s[-2], order, 1)], np.zeros(points.shape[1]))
         for m in range(segments - 1):
-            condition([(m, times_s[m + 1] - times_s[m], order, 1), (m + 1, 0.0, order, -1)], np.zeros(points.shape[1]))
-    a, b = np.array(rows), np.array(right)
+            condition(
+                [(m, times_s[m + 1] - times_s[m], order, 1), (m + 1, 0.0, order, -1)],
+                np.zeros(points.shape[1]),
+            )
+    a = np.array(rows)
+    b = np.array(right)
     kkt = np.block([[cost, a.T], [a, np.zeros((len(a), len(a)))]])
-    return np.linalg.lstsq(kkt, np.concatenate([np.zeros((segments * terms, points.shape[1])), b]), rcond=None)[0][: segments * terms].reshape(segments, terms, -1)
+    return np.linalg.lstsq(
+        kkt, np.concatenate([np.zeros((segments * terms, points.shape[1])), b]), rcond=None
+    )[0][: segments * terms].reshape(segments, terms, -1)
 
 
 @pytest.fixture(scope="module")
 def waypoints():
     generator = seeded(7)
-    return torch.randn(6, 3, generator=generator, dtype=D), torch.tensor([0.0, 0.8, 2.1, 2.9, 4.4, 5.0], dtype=D)
+    return torch.randn(6, 3, generator=generator, dtype=D), torch.tensor(
+        [0.0, 0.8, 2.1, 2.9, 4.4, 5.0], dtype=D
+    )
 
 
 def test_minimum_snap_is_the_solution_of_the_quadratic_programme(waypoints):
     points, t = waypoints
     path = minimum_snap(points, t)
     reference = snap_by_quadratic_programme(points.numpy(), t.numpy())
-    mine = path.coefficient.numpy() / np.diff(t.numpy())[:, None, None] ** np.arange(8)[:, None]  # per second, as the reference has them
+    mine = (
+        path.coefficient.numpy() / np.diff(t.numpy())[:, None, None] ** np.arange(8)[:, None]
+    )  # per second, as the reference has them
     at = np.linspace(0, 1, 9)
     for m, length in enumerate(np.diff(t.numpy())):
         basis = (at[:, None] * length) ** np.arange(8)
-        np.testing.assert_allclose(basis @ mine[m], basis @ reference[m], rtol=0, atol=1e-7)  # the monomial basis costs it eight digits
+        np.testing.assert_allclose(
+            basis @ mine[m], basis @ reference[m], rtol=0, atol=1e-7
+        )  # the monomial basis costs it eight digits
 
 
 def test_minimum_snap_passes_its_points_and_has_six_continuous_derivatives(waypoints):
     points, t = waypoints
     path = minimum_snap(points, t)
     torch.testing.assert_close(path(t), points, rtol=0, atol=1e-11)
-    lengths, before, after = t.diff(), path.coefficient[:-1], path.coefficient[1:]
+    lengths = t.diff()
+    before = path.coefficient[:-1]
+    after = path.coefficient[1:]
     for order in range(7):
         factor = torch.tensor([math.perm(k, order) for k in range(8)], dtype=D)
         end = (factor[:, None] * before).sum(1) / lengths[:-1, None] ** order
@@ -284,32 +399,50 @@ def test_perturbations_of_a_minimum_snap_path_raise_its_snap(waypoints):
     cost = cross = bump = 0.0
     generator = seeded(8)
     for start, length in zip(t[:-1], t.diff(), strict=True):
-        at, weight = start + length * (nodes + 1) / 2, weights * length / 2
+        at = start + length * (nodes + 1) / 2
+        weight = weights * length / 2
         snap = path(at, 4)
         cost = cost + (weight[:, None] * snap**2).sum()
-        # u^4 (1 - u)^4: zero with three derivatives at both ends of the segment, fourth derivative in closed form
-        u, amplitude = (nodes + 1) / 2, torch.randn(1, 3, generator=generator, dtype=D)
+        # u^4 (1 - u)^4: zero with three derivatives at both ends of the segment, fourth derivative in closed
+        # form
+        u = (nodes + 1) / 2
+        amplitude = torch.randn(1, 3, generator=generator, dtype=D)
         fourth = (24 - 480 * u + 2160 * u**2 - 3360 * u**3 + 1680 * u**4)[:, None] * amplitude / length**4
         cross = cross + (weight[:, None] * snap * fourth).sum()
         bump = bump + (weight[:, None] * fourth**2).sum()
     assert float(path.cost()) == pytest.approx(float(cost), rel=1e-11)
-    assert abs(float(cross)) < 1e-9 * float((cost * bump) ** 0.5)  # stationary: so a perturbation adds its own snap and nothing else
-    # a waypoint's velocity changed while all points are kept: solved again from there, the sum of two paths costs more
+    assert abs(float(cross)) < 1e-9 * float(
+        (cost * bump) ** 0.5
+    )  # stationary: so a perturbation adds its own snap and nothing else
+    # a waypoint's velocity changed while all points are kept: solved again from there, the sum of two paths
+    # costs more
     middle = path(torch.tensor([2.5], dtype=D))
-    detour = minimum_snap(torch.cat([points[:3], middle + 0.01, points[3:]]), torch.cat([t[:3], torch.tensor([2.5], dtype=D), t[3:]]))
-    through = minimum_snap(torch.cat([points[:3], middle, points[3:]]), torch.cat([t[:3], torch.tensor([2.5], dtype=D), t[3:]]))
+    detour = minimum_snap(
+        torch.cat([points[:3], middle + 0.01, points[3:]]),
+        torch.cat([t[:3], torch.tensor([2.5], dtype=D), t[3:]]),
+    )
+    through = minimum_snap(
+        torch.cat([points[:3], middle, points[3:]]), torch.cat([t[:3], torch.tensor([2.5], dtype=D), t[3:]])
+    )
     assert float(detour.cost()) > float(path.cost())
-    assert float(through.cost()) == pytest.approx(float(path.cost()), rel=1e-9)  # a point of the path changes nothing
+    assert float(through.cost()) == pytest.approx(
+        float(path.cost()), rel=1e-9
+    )  # a point of the path changes nothing
 
 
 def test_two_points_give_the_rest_to_rest_polynomial():
     path = minimum_snap([[0.0], [2.0]], [0.0, 3.0])
     t = torch.linspace(0, 3, 31, dtype=D)
     u = t / 3
-    torch.testing.assert_close(path(t)[:, 0], 2 * (35 * u**4 - 84 * u**5 + 70 * u**6 - 20 * u**7), rtol=0, atol=1e-13)
+    torch.testing.assert_close(
+        path(t)[:, 0], 2 * (35 * u**4 - 84 * u**5 + 70 * u**6 - 20 * u**7), rtol=0, atol=1e-13
+    )
 
 
-@pytest.mark.parametrize(("t", "sentence"), [([0.0, 1.0, 1.0], "increase strictly"), ([0.0, 1.0, math.nan], "NaN"), ([0.0, 0.001, 5.0], "100 times")])
+@pytest.mark.parametrize(
+    ("t", "sentence"),
+    [([0.0, 1.0, 1.0], "increase strictly"), ([0.0, 1.0, math.nan], "NaN"), ([0.0, 0.001, 5.0], "100 times")],
+)
 def test_minimum_snap_refuses_times_it_cannot_use(t, sentence):
     with pytest.raises(DomainError, match=sentence):
         minimum_snap(torch.zeros(3, 3, dtype=D), t)
@@ -318,7 +451,9 @@ def test_minimum_snap_refuses_times_it_cannot_use(t, sentence):
 def test_a_flight_obeys_newton_and_its_rates_are_those_of_differential_flatness():
     flight = FAMILIES["flying"]()
     t = torch.linspace(0.01, 4.7, 301, dtype=D)
-    pose, acceleration, jerk = flight(t), flight.path(t, 2)[:, :3], flight.path(t, 3)[:, :3]
+    pose = flight(t)
+    acceleration = flight.path(t, 2)[:, :3]
+    jerk = flight.path(t, 3)[:, :3]
     up = pose[:, :3, 2]
     gravity = torch.tensor([0.0, 0.0, 9.81], dtype=D)
     thrust = flight.thrust_m_s2(t)
@@ -328,11 +463,15 @@ def test_a_flight_obeys_newton_and_its_rates_are_those_of_differential_flatness(
     rates = flight.velocity(t)[:, 3:]
     torch.testing.assert_close(rates[:, 0], -(change * pose[:, :3, 1]).sum(1), rtol=0, atol=1e-12)
     torch.testing.assert_close(rates[:, 1], (change * pose[:, :3, 0]).sum(1), rtol=0, atol=1e-12)
-    heading = torch.atan2(pose[:, 1, 0], pose[:, 0, 0])  # of the forward axis, which lies in the plane of heading and thrust
+    heading = torch.atan2(
+        pose[:, 1, 0], pose[:, 0, 0]
+    )  # of the forward axis, which lies in the plane of heading and thrust
     across = torch.stack([-heading.sin(), heading.cos(), torch.zeros_like(heading)], 1)
     yaw = flight.path(t)[:, 3]
     left = torch.stack([-yaw.sin(), yaw.cos(), torch.zeros_like(yaw)], 1)
-    assert float((pose[:, :3, 0] * left).sum(1).abs().max()) < 0.3  # small tilts: forward stays near the heading
+    assert (
+        float((pose[:, :3, 0] * left).sum(1).abs().max()) < 0.3
+    )  # small tilts: forward stays near the heading
     assert float((across * left).sum(1).min()) > 0.9
     # hovering ends: level, at rest
     ends = flight(torch.tensor([0.0, flight.span_s[1]], dtype=D))
@@ -345,7 +484,8 @@ def test_flights_into_free_fall_are_refused():
 
 
 def test_a_mounted_camera_is_the_body_times_the_mount_and_passes_gradients_on():
-    path, t = FAMILIES["driving"](), torch.linspace(0.1, 4.5, 23, dtype=D)
+    path = FAMILIES["driving"]()
+    t = torch.linspace(0.1, 4.5, 23, dtype=D)
     mount = Mount((0.1, 0.0, 0.2), (0.2, 0.1, 0.1), yaw_rad=0.3, pitch_rad=0.2, roll_rad=0.1)
     camera = mounted(path, mount())
     torch.testing.assert_close(camera(t), path(t) @ mount(), rtol=0, atol=1e-15)
@@ -355,6 +495,11 @@ def test_a_mounted_camera_is_the_body_times_the_mount_and_passes_gradients_on():
     torch.testing.assert_close(ahead, se3_exp(step * twist), rtol=0, atol=1e-9)
     weight = torch.randn(23, 4, 4, generator=seeded(9), dtype=D)
     numbers = mount.numbers.detach().requires_grad_()
-    assert torch.autograd.gradcheck(lambda n: (mounted(path, mount(n))(t) * weight).sum() + mounted(path, mount(n)).velocity(t).square().sum(), (numbers,))
+    assert torch.autograd.gradcheck(
+        lambda n: (
+            (mounted(path, mount(n))(t) * weight).sum() + mounted(path, mount(n)).velocity(t).square().sum()
+        ),
+        (numbers,),
+    )
     with pytest.raises(ShapeError, match="one pose"):
         mounted(path, torch.eye(3, dtype=D))

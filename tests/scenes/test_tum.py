@@ -1,4 +1,5 @@
-"""TUM trajectory files: round trips, what is tolerated, what is refused; and the path between recorded poses."""
+"""TUM trajectory files: round trips, what is tolerated, what is refused; and the path between recorded
+poses."""
 
 import math
 
@@ -22,7 +23,9 @@ def some_poses(count, size=1.0):
 
 
 def test_round_trip_keeps_every_digit(tmp_path):
-    t = torch.cumsum(torch.rand(200, generator=torch.Generator().manual_seed(1), dtype=D) + 1e-3, 0) + 1.7e9  # epoch times
+    t = (
+        torch.cumsum(torch.rand(200, generator=torch.Generator().manual_seed(1), dtype=D) + 1e-3, 0) + 1.7e9
+    )  # epoch times
     poses = some_poses(200, 2.0)
     write_tum(tmp_path / "path.txt", t, poses)
     t_back, back = read_tum(tmp_path / "path.txt")
@@ -56,23 +59,26 @@ def test_four_digit_quaternions_become_rotations(tmp_path):
     torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=D), rtol=0, atol=1e-15)
 
 
-@pytest.mark.parametrize(("text", "sentence"), [
-    ("", "holds no pose"),
-    ("# only a comment\n", "holds no pose"),
-    (f"{LINE}\n1.0 1 2 3 0 0 0\n", "line 2: '1.0 1 2 3 0 0 0' is not"),
-    (f"# c\n{LINE} 9\n", "line 2: .* is not"),
-    (f"{LINE}\n1.0 nan 2 3 0 0 0 1\n", "line 2: .* finite decimal numbers"),
-    (f"{LINE}\n1.0 inf 2 3 0 0 0 1\n", "line 2"),
-    (f"{LINE}\n1.0 1e999 2 3 0 0 0 1\n", "line 2: a number is too large"),
-    (f"{LINE}\n1_0 1 2 3 0 0 0 1\n", "line 2"),
-    (f"{LINE}\n\n1.0 1 2 3 0 0 0 0\n", "line 3: the quaternion"),
-    (f"{LINE}\n1.0 1 2 3 0 0 0 1.01\n", "line 2: the quaternion"),
-    (f"{LINE}\n1.0 1 2 3 1e300 0 0 1\n", "line 2: the quaternion"),
-    (f"{LINE}\n0.5 1 2 3 0 0 0 1\n", "line 2: the timestamp"),
-    (f"{LINE}\n0.4 1 2 3 0 0 0 1\n", "line 2: the timestamp"),
-    (f"{LINE}\n1.0 {'1' * 500} 2 3 0 0 0 1\n", "line 2"),
-    ("0,5,1,2,3,0,0,0,1\n", "line 1"),
-])
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "holds no pose"),
+        ("# only a comment\n", "holds no pose"),
+        (f"{LINE}\n1.0 1 2 3 0 0 0\n", "line 2: '1.0 1 2 3 0 0 0' is not"),
+        (f"# c\n{LINE} 9\n", "line 2: .* is not"),
+        (f"{LINE}\n1.0 nan 2 3 0 0 0 1\n", "line 2: .* finite decimal numbers"),
+        (f"{LINE}\n1.0 inf 2 3 0 0 0 1\n", "line 2"),
+        (f"{LINE}\n1.0 1e999 2 3 0 0 0 1\n", "line 2: a number is too large"),
+        (f"{LINE}\n1_0 1 2 3 0 0 0 1\n", "line 2"),
+        (f"{LINE}\n\n1.0 1 2 3 0 0 0 0\n", "line 3: the quaternion"),
+        (f"{LINE}\n1.0 1 2 3 0 0 0 1.01\n", "line 2: the quaternion"),
+        (f"{LINE}\n1.0 1 2 3 1e300 0 0 1\n", "line 2: the quaternion"),
+        (f"{LINE}\n0.5 1 2 3 0 0 0 1\n", "line 2: the timestamp"),
+        (f"{LINE}\n0.4 1 2 3 0 0 0 1\n", "line 2: the timestamp"),
+        (f"{LINE}\n1.0 {'1' * 500} 2 3 0 0 0 1\n", "line 2"),
+        ("0,5,1,2,3,0,0,0,1\n", "line 1"),
+    ],
+)
 def test_hostile_files_are_refused_with_the_line(text, sentence, tmp_path):
     (tmp_path / "a.txt").write_text(text)
     with pytest.raises(FileFormatError, match=sentence) as caught:
@@ -113,15 +119,23 @@ def test_writing_refuses_what_is_no_trajectory(tmp_path):
 def test_a_recorded_path_is_a_geodesic_through_its_poses():
     twist = torch.tensor([0.4, -0.2, 0.1, 0.5, 0.3, -0.8], dtype=D)
     start = some_poses(3)[2]
-    exact = lambda t: start @ se3_exp(t[:, None] * twist)  # noqa: E731
+
+    def exact(t):
+        return start @ se3_exp(t[:, None] * twist)
+
     knots = torch.tensor([0.0, 0.3, 1.0, 2.2], dtype=D)
-    path, t = Recorded(knots, exact(knots)), torch.linspace(0, 2.2, 45, dtype=D)
-    torch.testing.assert_close(path(t), exact(t), rtol=0, atol=1e-13)  # constant twist: the geodesic is the motion itself
+    path = Recorded(knots, exact(knots))
+    t = torch.linspace(0, 2.2, 45, dtype=D)
+    torch.testing.assert_close(
+        path(t), exact(t), rtol=0, atol=1e-13
+    )  # constant twist: the geodesic is the motion itself
     torch.testing.assert_close(path.velocity(t), twist.expand(45, 6), rtol=0, atol=1e-12)
     other = Recorded(torch.arange(5, dtype=D), some_poses(6, 0.8)[torch.tensor([0, 2, 3, 4, 5])])
     torch.testing.assert_close(other(other.t_s), other.poses, rtol=0, atol=1e-13)
     step = inverse(other(torch.tensor([1.2], dtype=D))) @ other(torch.tensor([1.7], dtype=D))
-    torch.testing.assert_close(step, se3_exp(0.5 * other.velocity(torch.tensor([1.4], dtype=D))), rtol=0, atol=1e-13)
+    torch.testing.assert_close(
+        step, se3_exp(0.5 * other.velocity(torch.tensor([1.4], dtype=D))), rtol=0, atol=1e-13
+    )
 
 
 def test_recorded_paths_refuse_times_outside_and_ambiguous_turns():

@@ -1,4 +1,5 @@
-"""Worlds: what they promise about gaps, levels, seeds and the negative control; meshes and skies from files."""
+"""Worlds: what they promise about gaps, levels, seeds and the negative control; meshes and skies from
+files."""
 
 import itertools
 
@@ -30,11 +31,16 @@ def test_every_world_shows_something_in_range_from_its_viewpoint(name):
         assert float(image.log().std()) > 0.15  # there is contrast
 
 
-@pytest.mark.parametrize("level", [build.emissive, lambda world, device: build.baked(world, device, samples=64, max_depth=16, texel_m=0.4)])
+@pytest.mark.parametrize(
+    "level",
+    [build.emissive, lambda world, device: build.baked(world, device, samples=64, max_depth=16, texel_m=0.4)],
+)
 def test_the_blank_room_shows_one_radiance_whatever_moves(level):
-    start, scene = look_at(*worlds.VIEWS["blank-room"]), worlds.blank_room(40.0, light=level)
+    start = look_at(*worlds.VIEWS["blank-room"])
+    scene = worlds.blank_room(40.0, light=level)
     image = render.frames(CAMERA, scene, start @ se3_exp(0.2 * torch.eye(6, dtype=torch.float64)))
-    # emissive: rounding. Baked: 64 paths of a furnace per texel, relative spread 0.5: 6 %, of which a log threshold of 0.2 sees nothing
+    # emissive: rounding. Baked: 64 paths of a furnace per texel, relative spread 0.5: 6 %, of which a log
+    # threshold of 0.2 sees nothing
     assert float((image / 40 - 1).abs().max()) < (1e-5 if level is build.emissive else 0.15)
 
 
@@ -47,22 +53,34 @@ def inside(kind, matrix, points, margin_m):
     if kind == "sphere":
         return np.linalg.norm(local, axis=1) * size[0] < size[0] + margin_m
     along = local[:, 2] * size[2]
-    return (np.linalg.norm(local[:, :2], axis=1) * size[0] < size[0] + margin_m) & (along > -margin_m) & (along < size[2] + margin_m)
+    return (
+        (np.linalg.norm(local[:, :2], axis=1) * size[0] < size[0] + margin_m)
+        & (along > -margin_m)
+        & (along < size[2] + margin_m)
+    )
 
 
 @pytest.mark.parametrize("name", BUILT)
 def test_nothing_interpenetrates_and_gaps_are_a_millimetre(name):
-    mi, world = backend.mitsuba(), described(name)
+    mi = backend.mitsuba()
+    world = described(name)
     solid: dict = {}
-    sheets, clouds = {}, {}
+    sheets = {}
+    clouds = {}
     random = np.random.default_rng(0)
     for shape, (geometry, _) in world.shapes.items():
-        matrix, kind = np.array(geometry["to_world"].matrix, dtype=float).reshape(4, 4), geometry["type"]
+        matrix = np.array(geometry["to_world"].matrix, dtype=float).reshape(4, 4)
+        kind = geometry["type"]
         if kind == "rectangle":
             sheets[shape] = matrix
         elif kind != "disk":  # the lid of a cylinder belongs to it
             solid[shape] = kind, matrix
-            clouds[shape] = np.concatenate([chart.at(*random.random((2, 300)))[0] for chart in charts_of(mi, shape, geometry, mi.load_dict(geometry))])
+            clouds[shape] = np.concatenate(
+                [
+                    chart.at(*random.random((2, 300)))[0]
+                    for chart in charts_of(mi, shape, geometry, mi.load_dict(geometry))
+                ]
+            )
     boxes = {shape: (cloud.min(0), cloud.max(0)) for shape, cloud in clouds.items()}
     for one, other in itertools.permutations(solid, 2):
         if (boxes[one][0] > boxes[other][1] + 0.01).any() or (boxes[one][1] < boxes[other][0] - 0.01).any():
@@ -77,40 +95,76 @@ def test_nothing_interpenetrates_and_gaps_are_a_millimetre(name):
 
 @pytest.mark.parametrize("name", ["outdoor", "tabletop", "dark-room"])
 def test_the_seed_decides_where_things_are(name):
-    places = [[np.array(geometry["to_world"].matrix).tolist() for geometry, _ in described(name, seed=seed).shapes.values()] for seed in (1, 1, 2)]
+    places = [
+        [
+            np.array(geometry["to_world"].matrix).tolist()
+            for geometry, _ in described(name, seed=seed).shapes.values()
+        ]
+        for seed in (1, 1, 2)
+    ]
     assert places[0] == places[1]
     assert places[0] != places[2]
 
 
 def test_a_lit_room_is_brightest_at_its_ceiling_and_darker_than_its_lamp():
     scene = worlds.room(light=lambda world, device: build.path(world, device, samples=8))
-    up, ahead = render.frames(CAMERA, scene, torch.stack([look_at((0.3, -1.2, 1.0), (0.1, 0.0, 2.6)), look_at((0.3, -1.2, 1.3), (0, 1, 0.8))]))
+    up, ahead = render.frames(
+        CAMERA,
+        scene,
+        torch.stack([look_at((0.3, -1.2, 1.0), (0.1, 0.0, 2.6)), look_at((0.3, -1.2, 1.3), (0, 1, 0.8))]),
+    )
     assert 250 < float(up.max()) < 400
     assert 2 < float(ahead.mean()) < 60
     with pytest.raises(DomainError, match="albedo"):
-        build.lit(build.World({"a": (build.rectangle(backend.mitsuba(), (0, 0, 0), (0, 0, 1), 1, 1, (0, 1, 0)), build.Paint(np.full((4, 4), 255.0), albedo=1.2))}))
+        build.lit(
+            build.World(
+                {
+                    "a": (
+                        build.rectangle(backend.mitsuba(), (0, 0, 0), (0, 0, 1), 1, 1, (0, 1, 0)),
+                        build.Paint(np.full((4, 4), 255.0), albedo=1.2),
+                    )
+                }
+            )
+        )
 
 
 # ---- bodies
 
 
-TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 2]], dtype=float), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+TETRAHEDRON = (
+    np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 2]], dtype=float),
+    np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
+)
 
 
 def written(path, kind):
     vertices, faces = TETRAHEDRON
     if kind == "ascii.stl":
-        facets = "".join("facet normal 0 0 0\nouter loop\n" + "".join(f"vertex {x} {y} {z}\n" for x, y, z in vertices[face]) + "endloop\nendfacet\n" for face in faces)
+        facets = "".join(
+            "facet normal 0 0 0\nouter loop\n"
+            + "".join(f"vertex {x} {y} {z}\n" for x, y, z in vertices[face])
+            + "endloop\nendfacet\n"
+            for face in faces
+        )
         path.write_text(f"solid t\n{facets}endsolid t\n")
     elif kind == "binary.stl":
-        record = np.zeros(4, dtype=np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]))
+        record = np.zeros(
+            4, dtype=np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+        )
         record["corners"] = vertices[faces]
         path.write_bytes(bytes(80) + (4).to_bytes(4, "little") + record.tobytes())
     elif kind == "t.obj":
-        path.write_text("".join(f"v {x} {y} {z}\n" for x, y, z in vertices) + "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces))
+        path.write_text(
+            "".join(f"v {x} {y} {z}\n" for x, y, z in vertices)
+            + "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in faces)
+        )
     else:
-        path.write_text("ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face 4\nproperty list uchar int vertex_indices\nend_header\n"
-                        + "".join(f"{x} {y} {z}\n" for x, y, z in vertices) + "".join(f"3 {a} {b} {c}\n" for a, b, c in faces))
+        path.write_text(
+            "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float "
+            "z\nelement face 4\nproperty list uchar int vertex_indices\nend_header\n"
+            + "".join(f"{x} {y} {z}\n" for x, y, z in vertices)
+            + "".join(f"3 {a} {b} {c}\n" for a, b, c in faces)
+        )
     return path
 
 
@@ -118,18 +172,26 @@ def written(path, kind):
 def test_a_tetrahedron_is_read_from_every_format(tmp_path, kind):
     body = bodies.read(written(tmp_path / kind, kind), scale=0.5)
     corners = body.vertices_m[body.faces]
-    # volume by the divergence theorem: positive when normals point outwards; a sixth of 1 x 1 x 2, halved thrice
+    # volume by the divergence theorem: positive when normals point outwards; a sixth of 1 x 1 x 2, halved
+    # thrice
     volume = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
     assert volume == pytest.approx(2 / 6 / 8, rel=1e-6)
     placed = body.placed(3.0, -2.0, 0.1, 90.0).vertices_m
-    np.testing.assert_allclose([placed.min(0), placed.max(0)], [[2.75, -2.25, 0.1], [3.25, -1.75, 1.1]], atol=1e-7)
+    np.testing.assert_allclose(
+        [placed.min(0), placed.max(0)], [[2.75, -2.25, 0.1], [3.25, -1.75, 1.1]], atol=1e-7
+    )
 
 
 def test_files_that_are_no_meshes_are_refused(tmp_path):
     (tmp_path / "broken.stl").write_bytes(bytes(100))
     (tmp_path / "broken.obj").write_text("f 1 2 3\n")
     (tmp_path / "robot.dae").write_text("<xml/>")
-    for name, sentence in (("nowhere.stl", "is not a file"), ("broken.stl", "is not an STL file"), ("broken.obj", "cannot be read as OBJ|no faces"), ("robot.dae", "convert it")):
+    for name, sentence in (
+        ("nowhere.stl", "is not a file"),
+        ("broken.stl", "is not an STL file"),
+        ("broken.obj", "cannot be read as OBJ|no faces"),
+        ("robot.dae", "convert it"),
+    ):
         with pytest.raises(FileFormatError, match=sentence):
             bodies.read(tmp_path / name)
     with pytest.raises(DomainError, match="scale = 0"):
@@ -142,7 +204,9 @@ def test_a_robot_stands_on_the_ground(shared):
     assert (size > 0.1).all()
     assert (size < 1.0).all()  # a robot of half a metre, in metres
     scene = worlds.outdoor(clutter=0, meshes=[(path, 0.0, 0.0, 30.0)])
-    points, depth, valid = render.truth.world_points(CAMERA.chief_rays(CAMERA.film.pixels()), scene, look_at((0.0, -1.2, 0.6), (0, 0, 0.1)))
+    points, depth, valid = render.truth.world_points(
+        CAMERA.chief_rays(CAMERA.film.pixels()), scene, look_at((0.0, -1.2, 0.6), (0, 0, 0.1))
+    )
     assert 0.05 < float(points[valid][:, 2].max()) < 0.5
     assert float((points[valid][:, 2] > 0.01).double().mean()) > 0.05
 
@@ -161,7 +225,9 @@ def test_a_sky_from_a_file_has_its_mean_and_its_east_in_the_east(tmp_path):
         assert float((values * weight).mean() / weight.mean()) == pytest.approx(30, rel=1e-5)
     scene = worlds.outdoor(clutter=0, environment=tmp_path / "sky.exr")
     views = [look_at((0, 0, 1), (x, y, 1)) for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))]
-    brightest = render.frames(Camera(lens.Pinhole(8.0), 16, 12, 0.3, 4), scene, torch.stack(views)).amax((1, 2))
+    brightest = render.frames(Camera(lens.Pinhole(8.0), 16, 12, 0.3, 4), scene, torch.stack(views)).amax(
+        (1, 2)
+    )
     assert int(brightest.argmax()) == 0
     assert float(brightest[0]) > 20 * float(brightest[1:].max())
 

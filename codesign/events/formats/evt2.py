@@ -1,4 +1,5 @@
-"""EVT 2.0: 32-bit words, one event each, with the low six bits of its time; time-high words carry the other 28.
+"""EVT 2.0: 32-bit words, one event each, with the low six bits of its time; time-high words carry the other
+28.
 
 Source: Prophesee Metavision documentation, "EVT 2.0 Format".
 """
@@ -19,16 +20,22 @@ def decoded(path, words):
     """Events of EVT 2.0 words.
 
     Args: path: for messages. words: [N] uint32.
-    Returns: t_us, x, y, p (0 or 1) in file order, and the number of events ahead of the first time-high word, which have no time and are left out.
+    Returns: t_us, x, y, p (0 or 1) in file order, and the number of events ahead of the first time-high word,
+      which have no time and are left out.
     Raises: FileFormatError for a word of a reserved type.
     """
     kind = (words >> 28).astype(np.uint8)
-    is_event, is_time = kind <= 1, kind == TIME_HIGH
+    is_event = kind <= 1
+    is_time = kind == TIME_HIGH
     strange = ~(is_event | is_time | np.isin(kind, OTHER_TYPES))
     if bool(strange.any()):
         at = int(np.argmax(strange))
-        raise FileFormatError(f"{path}: word {at} has type {kind[at]:#x}, which EVT 2.0 reserves; the file is damaged or not EVT 2.0.")
-    where, at = np.flatnonzero(is_event), np.flatnonzero(is_time)
+        raise FileFormatError(
+            f"{path}: word {at} has type {kind[at]:#x}, which EVT 2.0 reserves; the file is damaged or not "
+            "EVT 2.0."
+        )
+    where = np.flatnonzero(is_event)
+    at = np.flatnonzero(is_time)
     starts = np.cumsum(is_event)[at]
     high = unwrapped((words[at] & LAST_HIGH).astype(np.int64), LAST_HIGH + 1)
     t_us, untimed = held(starts, high << 6, len(where))
@@ -40,8 +47,16 @@ def encoded(t_us, x, y, p):
     """EVT 2.0 words of ordered events; t_us counts from the start of the file's clock."""
     high = t_us >> 6
     moved = np.diff(high, prepend=-1) != 0
-    word = np.stack((TIME_HIGH << 28 | high & LAST_HIGH, (p > 0).astype(np.int64) << 28 | (t_us & 0x3F) << 22 | x << 11 | y), axis=1)
+    word = np.stack(
+        (
+            TIME_HIGH << 28 | high & LAST_HIGH,
+            (p > 0).astype(np.int64) << 28 | (t_us & 0x3F) << 22 | x << 11 | y,
+        ),
+        axis=1,
+    )
     present = np.stack((moved, np.ones_like(moved)), axis=1)
     starts = np.cumsum(1 + moved) - (1 + moved)
     loops = np.diff(t_us // LOOP_US, prepend=0)
-    return with_loops_told(word[present].astype(WORD), starts, loops, TIME_HIGH << 28 | LAST_HIGH, TIME_HIGH << 28)
+    return with_loops_told(
+        word[present].astype(WORD), starts, loops, TIME_HIGH << 28 | LAST_HIGH, TIME_HIGH << 28
+    )

@@ -1,4 +1,5 @@
-"""EVT 3.0: 16-bit words that each change one part of the state (time, row, column base) or emit events from it, one or up to twelve at once.
+"""EVT 3.0: 16-bit words that each change one part of the state (time, row, column base) or emit events from
+it, one or up to twelve at once.
 
 Source: Prophesee Metavision documentation, "EVT 3.0 Format".
 """
@@ -10,7 +11,13 @@ from codesign.events.formats.clock import held, unwrapped, with_loops_told
 
 WORD = np.dtype("<u2")
 LOOP_US = 2**24
-ADDR_Y, ADDR_X, BASE_X, VECT_12, VECT_8, TIME_LOW, TIME_HIGH = 0x0, 0x2, 0x3, 0x4, 0x5, 0x6, 0x8
+ADDR_Y = 0x0
+ADDR_X = 0x2
+BASE_X = 0x3
+VECT_12 = 0x4
+VECT_8 = 0x5
+TIME_LOW = 0x6
+TIME_HIGH = 0x8
 OTHER_TYPES = (0x7, 0xA, 0xE, 0xF)  # triggers, counters and what continues them: no events of pixels
 KNOWN = np.isin(np.arange(16), (ADDR_Y, ADDR_X, BASE_X, VECT_12, VECT_8, TIME_LOW, TIME_HIGH, *OTHER_TYPES))
 STEP = np.array([12 if kind == VECT_12 else 8 if kind == VECT_8 else 0 for kind in range(16)])
@@ -25,18 +32,25 @@ def decoded(path, words):
     """Events of EVT 3.0 words.
 
     Args: path: for messages. words: [N] uint16.
-    Returns: t_us, x, y, p (0 or 1) in file order, and the number of events ahead of the first word that gives their time, row or column base; they are
+    Returns: t_us, x, y, p (0 or 1) in file order, and the number of events ahead of the first word that gives
+      their time, row or column base; they are
       left out.
-    Raises: FileFormatError for a word of a reserved type, and for a vector that leaves the 11 bits of a column.
+    Raises: FileFormatError for a word of a reserved type, and for a vector that leaves the 11 bits of a
+      column.
     """
     kind = (words >> 12).astype(np.uint8)
     if not bool(KNOWN[kind].all()):
         at = int(np.argmin(KNOWN[kind]))
-        raise FileFormatError(f"{path}: word {at} has type {kind[at]:#x}, which EVT 3.0 reserves; the file is damaged or not EVT 3.0.")
+        raise FileFormatError(
+            f"{path}: word {at} has type {kind[at]:#x}, which EVT 3.0 reserves; the file is damaged or not "
+            "EVT 3.0."
+        )
     load = words & 0xFFF
     is_vector = (kind == VECT_12) | (kind == VECT_8)
     emits = is_vector | (kind == ADDR_X)
-    where, ahead = np.flatnonzero(emits), np.cumsum(emits)  # ahead: how many words have emitted events up to each
+    # ahead: how many words have emitted events up to each
+    where = np.flatnonzero(emits)
+    ahead = np.cumsum(emits)
     column, mask, on, lost = _columns(kind, load, is_vector, where, ahead)
     at, since_us = _times(kind, load)
     t_us, untimed = held(ahead[at], since_us, len(where))
@@ -44,13 +58,20 @@ def decoded(path, words):
     row, rowless = held(ahead[at], load[at] & 0x7FF, len(where))
     first = max(untimed, rowless)
     lost += int(BIT_COUNT[mask[:first]].sum(dtype=np.int64))
-    t_us, row, column, mask, on = t_us[first - untimed :], row[first - rowless :], column[first:], mask[first:], on[first:]
+    t_us = t_us[first - untimed :]
+    row = row[first - rowless :]
+    column = column[first:]
+    mask = mask[first:]
+    on = on[first:]
     count = BIT_COUNT[mask].astype(np.intp)
     last = np.cumsum(count)
     bit = np.arange(int(last[-1]) if last.size else 0) + np.repeat(BIT_START[mask] - (last - count), count)
     x = np.repeat(column, count) + BIT_LIST[bit]
     if x.size and int(x.max()) > 0x7FF:
-        raise FileFormatError(f"{path}: a vector of EVT 3.0 reaches column {int(x.max())}; columns end at 2047; the file is damaged.")
+        raise FileFormatError(
+            f"{path}: a vector of EVT 3.0 reaches column {int(x.max())}; columns end at 2047; the file is "
+            "damaged."
+        )
     return np.repeat(t_us, count), x, np.repeat(row, count), np.repeat(on, count), lost
 
 
@@ -71,9 +92,14 @@ def _times(kind, load):
 
 
 def _columns(kind, load, is_vector, where, ahead):
-    """First column, mask of columns and polarity of each emitting word, and how many events of vectors are left out for want of a base."""
-    vector, kind_there, load_there = is_vector[where], kind[where], load[where]
-    passed = np.concatenate(([0], np.cumsum(STEP[kind_there])))  # columns that vectors have moved the base by, ahead of each emitting word
+    """First column, mask of columns and polarity of each emitting word, and how many events of vectors are
+    left out for want of a base."""
+    vector = is_vector[where]
+    kind_there = kind[where]
+    load_there = load[where]
+    passed = np.concatenate(
+        ([0], np.cumsum(STEP[kind_there]))
+    )  # columns that vectors have moved the base by, ahead of each emitting word
     at = np.flatnonzero(kind == BASE_X)
     base, baseless = held(ahead[at], (load[at] & 0x7FF) - passed[ahead[at]], len(where))
     on, _ = held(ahead[at], load[at] >> 11, len(where))
@@ -86,11 +112,22 @@ def _columns(kind, load, is_vector, where, ahead):
 
 
 def encoded(t_us, x, y, p):
-    """EVT 3.0 words of ordered events, one column word per event; t_us counts from the start of the file's clock."""
+    """EVT 3.0 words of ordered events, one column word per event; t_us counts from the start of the file's
+    clock."""
     moved = np.diff(t_us, prepend=-1) != 0
     high_moved = np.diff(t_us >> 12, prepend=-1) != 0
-    word = np.stack((TIME_HIGH << 12 | t_us >> 12 & 0xFFF, TIME_LOW << 12 | t_us & 0xFFF, y, ADDR_X << 12 | (p > 0).astype(np.int64) << 11 | x), axis=1)
+    word = np.stack(
+        (
+            TIME_HIGH << 12 | t_us >> 12 & 0xFFF,
+            TIME_LOW << 12 | t_us & 0xFFF,
+            y,
+            ADDR_X << 12 | (p > 0).astype(np.int64) << 11 | x,
+        ),
+        axis=1,
+    )
     present = np.stack((high_moved, moved, np.diff(y, prepend=-1) != 0, np.ones_like(moved)), axis=1)
     count = present.sum(axis=1)
     loops = np.diff(t_us // LOOP_US, prepend=0)
-    return with_loops_told(word[present].astype(WORD), np.cumsum(count) - count, loops, TIME_HIGH << 12 | 0xFFF, TIME_HIGH << 12)
+    return with_loops_told(
+        word[present].astype(WORD), np.cumsum(count) - count, loops, TIME_HIGH << 12 | 0xFFF, TIME_HIGH << 12
+    )

@@ -30,7 +30,8 @@ def write_npz(path, stream):
 def read_npz(path, height_px=None, width_px=None):
     """Read events from ``path``; a size given must be the one in the file.
 
-    Raises: FileFormatError when the file is truncated, corrupt, not NPZ, lacks an array, or holds values that are no events.
+    Raises: FileFormatError when the file is truncated, corrupt, not NPZ, lacks an array, or holds values that
+      are no events.
     """
     try:
         # opened here, because np.load leaves the file open when it is corrupt
@@ -40,17 +41,37 @@ def read_npz(path, height_px=None, width_px=None):
                 arrays = {name: file[name] for name in NAMES}
     except FileFormatError:
         raise
-    except (ValueError, KeyError, EOFError, OSError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error, AttributeError, TypeError) as error:
-        raise FileFormatError(f"{path} is not an NPZ file of events with arrays {', '.join(NAMES)}: {error}.") from error
+    except (
+        ValueError,
+        KeyError,
+        EOFError,
+        OSError,
+        NotImplementedError,
+        RuntimeError,
+        zipfile.BadZipFile,
+        zlib.error,
+        AttributeError,
+        TypeError,
+    ) as error:
+        raise FileFormatError(
+            f"{path} is not an NPZ file of events with arrays {', '.join(NAMES)}: {error}."
+        ) from error
     for name, values in arrays.items():
         if values.dtype.kind not in "iu" or values.ndim != (0 if name.endswith("px") else 1):
-            raise FileFormatError(f"{path}: array {name} is {values.dtype} {list(values.shape)}; whole numbers are needed, one size and lists of events.")
+            raise FileFormatError(
+                f"{path}: array {name} is {values.dtype} {list(values.shape)}; whole numbers are needed, "
+                "one size and lists of events."
+            )
         if values.size and int(values.max()) >= 2**63:
-            raise FileFormatError(f"{path}: array {name} reaches {int(values.max())}, beyond 64-bit signed integers.")
+            raise FileFormatError(
+                f"{path}: array {name} reaches {int(values.max())}, beyond 64-bit signed integers."
+            )
     size = int(arrays["height_px"]), int(arrays["width_px"])
     for given, found, name in ((height_px, size[0], "height_px"), (width_px, size[1], "width_px")):
         if given is not None and given != found:
-            raise FileFormatError(f"{path} comes from a sensor with {name} {found}, but {given} was asked for.")
+            raise FileFormatError(
+                f"{path} comes from a sensor with {name} {found}, but {given} was asked for."
+            )
     t_us, x, y, p = (torch.from_numpy(arrays[name].astype(np.int64)) for name in NAMES[:4])
     if bool((t_us.diff() < 0).any()):
         at = int((t_us.diff() < 0).nonzero()[0]) + 1
@@ -69,6 +90,12 @@ def _check_sizes(path, opened):
             with archive.open(entry) as member:
                 shape, _, dtype = HEADERS[np.lib.format.read_magic(member)](member)
                 claimed_bytes = member.tell() + math.prod(shape) * dtype.itemsize
-            if claimed_bytes != entry.file_size or entry.file_size > DEFLATE_RATIO * min(entry.compress_size, path.stat().st_size) + 4096:
-                raise FileFormatError(f"{path}: array {name} claims {list(shape)} values, not what the file holds; it is damaged.")
+            if (
+                claimed_bytes != entry.file_size
+                or entry.file_size > DEFLATE_RATIO * min(entry.compress_size, path.stat().st_size) + 4096
+            ):
+                raise FileFormatError(
+                    f"{path}: array {name} claims {list(shape)} values, not what the file holds; it is "
+                    "damaged."
+                )
     opened.seek(0)

@@ -1,6 +1,7 @@
 """Prophesee RAW files: an ASCII header, then EVT 2.0 or EVT 3.0 words, little-endian.
 
-Times are those of the file: nothing is subtracted. A stream that starts beyond the first loop of the format's clock (EVT 2.0: 2^34 us, EVT 3.0: 2^24 us)
+Times are those of the file: nothing is subtracted. A stream that starts beyond the first loop of the format's
+  clock (EVT 2.0: 2^34 us, EVT 3.0: 2^24 us)
 is written with those whole loops in the header, under a keyword of ours that other readers pass over.
 Source: Prophesee Metavision documentation, "RAW File Format".
 """
@@ -21,36 +22,56 @@ GEOMETRY = re.compile(r"(\d{1,5})x(\d{1,5})")
 
 
 def read_raw(path, height_px=None, width_px=None):
-    """Read events from ``path``; the sensor size is the header's, else the caller's, else the smallest that holds the events.
+    """Read events from ``path``; the sensor size is the header's, else the caller's, else the smallest that
+    holds the events.
 
-    Events ahead of the first word that gives a time or row are left out with a warning: recordings may start amid the camera's words.
-    Raises: FileFormatError for another encoding, a damaged header or word, a file cut amid a word, or time going back (see arrival).
+    Events ahead of the first word that gives a time or row are left out with a warning: recordings may start
+    amid the camera's words.
+    Raises: FileFormatError for another encoding, a damaged header or word, a file cut amid a word, or time
+      going back (see arrival).
     """
     data = path.read_bytes()
     fields, start = parsed(path, data)
     version, options = _format(path, fields)
     encoding = ENCODINGS[version]
     if (len(data) - start) % encoding.WORD.itemsize:
-        raise FileFormatError(f"{path} ends amid a word of {encoding.WORD.itemsize} bytes; it was cut, copy it again.")
+        raise FileFormatError(
+            f"{path} ends amid a word of {encoding.WORD.itemsize} bytes; it was cut, copy it again."
+        )
     t_us, x, y, p, lost = encoding.decoded(path, np.frombuffer(data, encoding.WORD, offset=start))
     if lost:
-        warnings.warn(f"{path}: {lost} events ahead of the first time, row or column base are left out; the file starts amid the camera's words.", stacklevel=2)
+        warnings.warn(
+            f"{path}: {lost} events ahead of the first time, row or column base are left out; the file "
+            "starts amid the camera's words.",
+            stacklevel=2,
+        )
     t_us += time_offset_us(path, fields, encoding.LOOP_US)
-    return arranged(path, t_us, x, y, p, size=_size(path, fields, options), height_px=height_px, width_px=width_px)
+    return arranged(
+        path, t_us, x, y, p, size=_size(path, fields, options), height_px=height_px, width_px=width_px
+    )
 
 
 def write_raw(path, stream, evt=3):
     """Write events to ``path`` as EVT 3.0 or (evt=2) EVT 2.0.
 
-    Raises: FileFormatError for a sensor beyond 2048 x 2048, negative times, another ``evt``, or silences of very many loops of the clock.
+    Raises: FileFormatError for a sensor beyond 2048 x 2048, negative times, another ``evt``, or silences of
+      very many loops of the clock.
     """
     if evt not in ENCODINGS:
         raise FileFormatError(f"evt={evt!r} was given; 2 (EVT 2.0) and 3 (EVT 3.0) are written.")
     encoding = ENCODINGS[evt]
-    t_us, x, y, p = columns(stream, height_limit_px=SIDE_PX, width_limit_px=SIDE_PX, first_us=0, last_us=2**62, name=f"EVT {evt}.0")
+    t_us, x, y, p = columns(
+        stream,
+        height_limit_px=SIDE_PX,
+        width_limit_px=SIDE_PX,
+        first_us=0,
+        last_us=2**62,
+        name=f"EVT {evt}.0",
+    )
     offset_us = int(t_us[0]) // encoding.LOOP_US * encoding.LOOP_US if t_us.size else 0
     words = encoding.encoded(t_us - offset_us, x, y, p)
-    height_px, width_px = stream.height_px, stream.width_px
+    height_px = stream.height_px
+    width_px = stream.width_px
     header = f"% evt {evt}.0\n% format EVT{evt};height={height_px};width={width_px}\n% geometry {width_px}x{height_px}\n% {OFFSET_KEY} {offset_us}\n% end\n"
     path.write_bytes(header.encode("ascii") + words.tobytes())
 
@@ -62,10 +83,15 @@ def _format(path, fields):
     said = {fields["evt"]} if "evt" in fields else set()
     said |= {f"{name[3:]}.0" if name.startswith("EVT") and name[3:].isdigit() else name} if name else set()
     if len(said) != 1 or not said <= {"2.0", "3.0"}:
-        raise FileFormatError(f"{path}: the header gives the encoding {sorted(said) or 'nowhere'}; EVT 2.0 and EVT 3.0 are read.")
+        raise FileFormatError(
+            f"{path}: the header gives the encoding {sorted(said) or 'nowhere'}; EVT 2.0 and EVT 3.0 are "
+            "read."
+        )
     endianness = fields.get("endianness", options.get("endianness", "little"))
     if endianness != "little":
-        raise FileFormatError(f"{path}: the header says the words are {endianness!r}-endian; little-endian is read.")
+        raise FileFormatError(
+            f"{path}: the header says the words are {endianness!r}-endian; little-endian is read."
+        )
     return int(float(said.pop())), options
 
 
@@ -75,11 +101,22 @@ def _size(path, fields, options):
     if "geometry" in fields:
         match = GEOMETRY.fullmatch(fields["geometry"])
         if match is None:
-            raise FileFormatError(f"{path}: the header gives the geometry as {fields['geometry'][:40]!r}; WIDTHxHEIGHT is needed.")
+            raise FileFormatError(
+                f"{path}: the header gives the geometry as {fields['geometry'][:40]!r}; WIDTHxHEIGHT is "
+                "needed."
+            )
         sizes.add((match[2], match[1]))
     if "height" in options or "width" in options:
         sizes.add((options.get("height", ""), options.get("width", "")))
-    sizes = {tuple(whole_number(path, text, name, 1, SIDE_PX) for text, name in zip(size, ("the height", "the width"), strict=True)) for size in sizes}
+    sizes = {
+        tuple(
+            whole_number(path, text, name, 1, SIDE_PX)
+            for text, name in zip(size, ("the height", "the width"), strict=True)
+        )
+        for size in sizes
+    }
     if len(sizes) > 1:
-        raise FileFormatError(f"{path}: the header gives two sensor sizes, {sorted(sizes)}; keep the right one.")
+        raise FileFormatError(
+            f"{path}: the header gives two sensor sizes, {sorted(sizes)}; keep the right one."
+        )
     return sizes.pop() if sizes else None

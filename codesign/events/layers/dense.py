@@ -1,4 +1,5 @@
-"""Dense event frames: the sensor's comparator with a surrogate slope, at most one event per pixel, polarity and frame."""
+"""Dense event frames: the sensor's comparator with a surrogate slope, at most one event per pixel, polarity
+and frame."""
 
 import torch
 from torch.autograd import Function
@@ -10,24 +11,33 @@ from codesign.events.intensity import log_levels
 def dense(frames, theta_on, theta_off, *, sharpness=5.0, state=None, log_input=False):
     """Events of a comparator that looks once per frame; a pixel that fires memorises the level it sees.
 
-    With u = (L - r)/theta_on - 1 an ON event is the step H(u), likewise OFF; then r := L where one fired. In the manner of SENPI: the physics of the
+    With u = (L - r)/theta_on - 1 an ON event is the step H(u), likewise OFF; then r := L where one fired. In
+    the manner of SENPI: the physics of the
     pixel forward, a surrogate only for the step.
 
     Args:
-      frames: [T, ...] linear intensity on the 0-255 scale, or log levels with ``log_input``. theta_on, theta_off: thresholds > 0, scalar or broadcasting
-      over one frame. sharpness: b of the surrogate slope b/(1 + b |u|)^2, > 0. state: [...] memorised level of an earlier chunk.
+      frames: [T, ...] linear intensity on the 0-255 scale, or log levels with ``log_input``. theta_on,
+        theta_off: thresholds > 0, scalar or broadcasting
+      over one frame. sharpness: b of the surrogate slope b/(1 + b |u|)^2, > 0. state: [...] memorised level
+        of an earlier chunk.
     Returns: counts [T-1, 2, ...] of 0 and 1 ([T, 2, ...] with a state), ON first; state [...].
     Gradient: frames, thetas, state; surrogate slope at the step, exact elsewhere, through the memory.
     Raises: ShapeError, DomainError as ``memory``.
     Source: comparator surrogate: Zenke and Ganguli 2018 (fast sigmoid).
     """
     level = log_levels(frames, log_input, minimum=2 if state is None else 1)
-    theta_on, theta_off = check_theta(theta_on, "theta_on", level), check_theta(theta_off, "theta_off", level)
+    theta_on = check_theta(theta_on, "theta_on", level)
+    theta_off = check_theta(theta_off, "theta_off", level)
     reference = level[0] if state is None else state
     counts = []
     for now in level[1:] if state is None else level:
         difference = now - reference
-        fired = torch.stack((_Step.apply(difference / theta_on - 1, sharpness), _Step.apply(-difference / theta_off - 1, sharpness)))
+        fired = torch.stack(
+            (
+                _Step.apply(difference / theta_on - 1, sharpness),
+                _Step.apply(-difference / theta_off - 1, sharpness),
+            )
+        )
         reference = reference + (fired[0] + fired[1]) * difference
         counts.append(fired)
     return torch.stack(counts), reference

@@ -13,32 +13,46 @@ from codesign.events.layers import memory_kernel as kernel
 def memory(frames, theta_on, theta_off, *, state=None, log_input=False):
     """Event counts per pixel and interval against the memorised log level r of each pixel.
 
-    Per interval, with L the new log level and C = theta_on where L > r, else theta_off: n = trunc((L - r) / C), then r += C n.
+    Per interval, with L the new log level and C = theta_on where L > r, else theta_off: n = trunc((L - r) /
+    C), then r += C n.
 
     Args:
-      frames: [T, ...] linear intensity on the 0-255 scale (lin-log is applied here), any pixel shape; log intensity with ``log_input``.
-      theta_on, theta_off: contrast thresholds > 0, natural log units; scalar or broadcasting over one frame (mismatch), learnable or not.
-      state: what an earlier chunk returned, [2, ...], or a memorised level [...]. None: r starts at the first frame, and T frames give T-1 intervals.
-        With a state every frame is new: T frames give T intervals, so chunks [0:k], [k:] with the state equal the whole bit for bit.
+      frames: [T, ...] linear intensity on the 0-255 scale (lin-log is applied here), any pixel shape; log
+        intensity with ``log_input``.
+      theta_on, theta_off: contrast thresholds > 0, natural log units; scalar or broadcasting over one frame
+        (mismatch), learnable or not.
+      state: what an earlier chunk returned, [2, ...], or a memorised level [...]. None: r starts at the first
+        frame, and T frames give T-1 intervals.
+        With a state every frame is new: T frames give T intervals, so chunks [0:k], [k:] with the state equal
+          the whole bit for bit.
     Returns:
       counts: [T-1, 2, ...] ([T, 2, ...] with a state), ON first, whole numbers >= 0.
-      state: [2, ...] the memorised level, and the centre of its play (below), to carry on. It keeps its graph: detach it to cut the gradient between chunks.
-    Gradient: frames, thetas, state: of the mean count over all places of a pixel inside its threshold (straight through the rounding). After a turn of the
-      signal the mean count stays 0 until the way back exceeds a threshold, then grows by 1/C per unit of level: a play of width (theta_on + theta_off)/2.
-      A level inside the play has no gradient, so scenes that never reach a threshold have none: start those with ``soft_counts``. Second derivatives raise.
-    Numerics: the count is the exact floor of the quotient of the two floats. In float32 a level within about 1e-7 |L| of a crossing may fall
+      state: [2, ...] the memorised level, and the centre of its play (below), to carry on. It keeps its
+        graph: detach it to cut the gradient between chunks.
+    Gradient: frames, thetas, state: of the mean count over all places of a pixel inside its threshold
+      (straight through the rounding). After a turn of the
+      signal the mean count stays 0 until the way back exceeds a threshold, then grows by 1/C per unit of
+      level: a play of width (theta_on + theta_off)/2.
+      A level inside the play has no gradient, so scenes that never reach a threshold have none: start those
+      with ``soft_counts``. Second derivatives raise.
+    Numerics: the count is the exact floor of the quotient of the two floats. In float32 a level within about
+      1e-7 |L| of a crossing may fall
       to either side; it is then counted in a later frame, never lost.
-    Raises: ShapeError for too few frames or shapes that do not fit; DomainError for theta <= 0, NaN, infinite or negative input.
+    Raises: ShapeError for too few frames or shapes that do not fit; DomainError for theta <= 0, NaN, infinite
+      or negative input.
     Cost: one pass over the frames forward, one backward; no memory beside counts and gradients.
-    Source: Rebecq et al., ESIM, CoRL 2018; v2e (Hu et al., CVPR-W 2021), memorised brightness; Bengio et al. 2013, straight-through; the play is ours.
+    Source: Rebecq et al., ESIM, CoRL 2018; v2e (Hu et al., CVPR-W 2021), memorised brightness; Bengio et al.
+      2013, straight-through; the play is ours.
     """
     front_end = FrontEnd(log_input)
     check_layout(frames, minimum=2 if state is None else 1)
-    theta_on, theta_off = check_theta(theta_on, "theta_on", frames), check_theta(theta_off, "theta_off", frames)
+    theta_on = check_theta(theta_on, "theta_on", frames)
+    theta_off = check_theta(theta_off, "theta_off", frames)
     if state is not None and state.shape == frames.shape[1:]:
         state = torch.stack((state, state))
     if state is not None and (state.shape != (2, *frames.shape[1:]) or state.dtype != frames.dtype):
-        given, wanted = f"{state.dtype} {list(state.shape)}", f"{frames.dtype} {list(frames.shape[1:])}"
+        given = f"{state.dtype} {list(state.shape)}"
+        wanted = f"{frames.dtype} {list(frames.shape[1:])}"
         raise ShapeError(f"state is {given}, one frame is {wanted}; pass the state of the same sensor.")
     return _MemorisedCounts.apply(frames, theta_on, theta_off, state, front_end)
 
@@ -48,13 +62,17 @@ def soft_counts(frames, theta_on, theta_off, *, log_input=False):
 
     Args: as for ``memory``.
     Returns:
-      [T-1, 2, ...] ON = max(dL, 0)/theta_on, OFF = max(-dL, 0)/theta_off, with dL the step between consecutive frames; >= 0, 0 for a static scene.
-      Equals the memory layer's counts to within one event per pixel at any time, summed over a monotone stretch.
-    Gradient: frames, thetas; exact, but at dL = 0, where both polarities get half their slope (the central difference).
+      [T-1, 2, ...] ON = max(dL, 0)/theta_on, OFF = max(-dL, 0)/theta_off, with dL the step between
+      consecutive frames; >= 0, 0 for a static scene.
+      Equals the memory layer's counts to within one event per pixel at any time, summed over a monotone
+      stretch.
+    Gradient: frames, thetas; exact, but at dL = 0, where both polarities get half their slope (the central
+      difference).
     Raises: as ``memory``.
     """
     level = log_levels(frames, log_input, minimum=2)
-    theta_on, theta_off = check_theta(theta_on, "theta_on", level), check_theta(theta_off, "theta_off", level)
+    theta_on = check_theta(theta_on, "theta_on", level)
+    theta_off = check_theta(theta_off, "theta_off", level)
     step = level.diff(dim=0)
     return torch.stack(((step.abs() + step) / (2 * theta_on), (step.abs() - step) / (2 * theta_off)), dim=1)
 
@@ -62,9 +80,13 @@ def soft_counts(frames, theta_on, theta_off, *, log_input=False):
 class _MemorisedCounts(Function):
     @staticmethod
     def forward(ctx, frames, theta_on, theta_off, state, front_end):
-        # the first level comes by the arithmetic of the kernel: a static scene then differs from it by nothing
-        start = kernel.levels(frames[:1], front_end)[0].expand(2, *frames.shape[1:]) if state is None else state
-        ctx.front_end, ctx.first = front_end, int(state is None)
+        # the first level comes by the arithmetic of the kernel: a static scene then differs from it by
+        # nothing
+        start = (
+            kernel.levels(frames[:1], front_end)[0].expand(2, *frames.shape[1:]) if state is None else state
+        )
+        ctx.front_end = front_end
+        ctx.first = int(state is None)
         counts, end, bad = kernel.count(frames[ctx.first :], start, theta_on, theta_off, front_end)
         if bad or ctx.first:
             check_frames(frames if bad else frames[:1], 1, non_negative=not front_end.log_input)
@@ -92,5 +114,6 @@ class _MemorisedCounts(Function):
         if ctx.first:
             grad_frames[0] = grad_start * ctx.front_end.slope(frames[0])
             return grad_frames, *grad_thetas, None, None
-        # the play alone carries the gradient: what reaches the memorised level reaches it through the play's centre
+        # the play alone carries the gradient: what reaches the memorised level reaches it through the play's
+        # centre
         return grad_frames, *grad_thetas, torch.stack((torch.zeros_like(grad_start), grad_start)), None

@@ -1,4 +1,5 @@
-"""The full sensor made differentiable: hard events forward, and backward the slopes of a smooth account of the same physics."""
+"""The full sensor made differentiable: hard events forward, and backward the slopes of a smooth account of
+the same physics."""
 
 from dataclasses import dataclass, replace
 
@@ -14,13 +15,21 @@ from codesign.events.sensor.model import THETA_MINIMUM
 from codesign.events.sensor.simulate import dense_counts
 from codesign.events.sensor.state import SensorState
 
-DESIGN = ("theta_on", "theta_off", "theta_sigma", "cutoff_hz", "refractory_s")  # fields of SensorModel that may carry a gradient
+DESIGN = (
+    "theta_on",
+    "theta_off",
+    "theta_sigma",
+    "cutoff_hz",
+    "refractory_s",
+)  # fields of SensorModel that may carry a gradient
 
 
 @dataclass(frozen=True)
 class PhysicalState:
-    """What ``sensor_counts`` carries over chunks. sensor: SensorState of the hard sensor; reference, level: [...] of the smooth account (their graph is
-    kept); frame: [...] last frame; draws: [2, ...] standard normal numbers of the thresholds; time_s: time of the last frame."""
+    """What ``sensor_counts`` carries over chunks. sensor: SensorState of the hard sensor; reference, level:
+    [...] of the smooth account (their graph is
+    kept); frame: [...] last frame; draws: [2, ...] standard normal numbers of the thresholds; time_s: time of
+    the last frame."""
 
     sensor: SensorState
     reference: Tensor
@@ -33,50 +42,86 @@ class PhysicalState:
 def sensor_counts(frames, t_s, sensor, *, generator=None, state=None, log_input=False, **design):
     """Event counts of the physical sensor with gradients to frames and to the sensor's own parameters.
 
-    Forward: exactly the counts of ``simulate``, noise and all. Backward: the low-pass is linear and exact; thresholds are C = theta + sigma e with the
-    drawn e held fixed; leakage adds a known ramp; counts follow ``memory`` (slope 1/C through the memorised level); dead time T thins n events of
-    smooth rate r to n / max(1, r T + 1/2), the mean of regular arrivals over all phases. Noise events have no gradient.
+    Forward: exactly the counts of ``simulate``, noise and all. Backward: the low-pass is linear and exact;
+      thresholds are C = theta + sigma e with the
+    drawn e held fixed; leakage adds a known ramp; counts follow ``memory`` (slope 1/C through the memorised
+    level); dead time T thins n events of
+    smooth rate r to n / max(1, r T + 1/2), the mean of regular arrivals over all phases. Noise events have no
+    gradient.
 
     Args:
-      frames: [T, ...] intensity on the 0-255 scale, or its natural logarithm with ``log_input``. t_s: [T] seconds. sensor: SensorModel, timing "interpolated".
-      generator: for thresholds and noise; None: seed 0. state: PhysicalState of an earlier chunk (then T frames give T intervals).
-      design: tensors that replace fields of the sensor and receive gradients: theta_on, theta_off, theta_sigma, cutoff_hz, refractory_s (0-dim).
+      frames: [T, ...] intensity on the 0-255 scale, or its natural logarithm with ``log_input``. t_s: [T]
+        seconds. sensor: SensorModel, timing "interpolated".
+      generator: for thresholds and noise; None: seed 0. state: PhysicalState of an earlier chunk (then T
+        frames give T intervals).
+      design: tensors that replace fields of the sensor and receive gradients: theta_on, theta_off,
+        theta_sigma, cutoff_hz, refractory_s (0-dim).
     Returns: counts [T-1, 2, ...] whole numbers, ON first; PhysicalState.
     Gradient: frames and design, as above; docs/events.md has each against differences of the hard counts.
-    Raises: DomainError for other names in ``design`` or values outside the sensor's domain, and as ``simulate``.
+    Raises: DomainError for other names in ``design`` or values outside the sensor's domain, and as
+      ``simulate``.
     """
     unknown = set(design) - set(DESIGN)
     if unknown:
-        raise DomainError(f"{sorted(unknown)} cannot carry a gradient; design variables of the sensor are {', '.join(DESIGN)}.")
-    hard_sensor = replace(sensor, **{name: float(torch.as_tensor(value).detach()) for name, value in design.items()})
+        raise DomainError(
+            f"{sorted(unknown)} cannot carry a gradient; design variables of the sensor are "
+            f"{', '.join(DESIGN)}."
+        )
+    hard_sensor = replace(
+        sensor, **{name: float(torch.as_tensor(value).detach()) for name, value in design.items()}
+    )
     value = {name: design.get(name, getattr(sensor, name)) for name in DESIGN}
     check_frames(frames, 2 if state is None else 1, non_negative=not log_input)
     times_s = check_times(t_s, len(frames))
     hard_state = SensorState(generator=generator) if state is None else replace(state.sensor)
     hard = dense_counts(frames, t_s, hard_sensor, state=hard_state, log_input=log_input)
     if state is not None:
-        frames, times_s = torch.cat((state.frame[None], frames)), torch.cat((torch.tensor([state.time_s], dtype=torch.float64), times_s))
-    interval_s, draws = times_s.diff(), _draws(hard_sensor, hard_state) if state is None else state.draws
+        frames = torch.cat((state.frame[None], frames))
+        times_s = torch.cat((torch.tensor([state.time_s], dtype=torch.float64), times_s))
+    interval_s = times_s.diff()
+    draws = _draws(hard_sensor, hard_state) if state is None else state.draws
     level = FrontEnd(log_input).level(frames)
     if hard_sensor.cutoff_hz > 0:
-        level = low_pass(level, frames.exp() if log_input else frames, interval_s, value["cutoff_hz"], None if state is None else state.level)
-    thetas = [_drawn(value[name], value["theta_sigma"], None if draws is None else draws[index], level) for index, name in enumerate(("theta_on", "theta_off"))]
+        level = low_pass(
+            level,
+            frames.exp() if log_input else frames,
+            interval_s,
+            value["cutoff_hz"],
+            None if state is None else state.level,
+        )
+    thetas = [
+        _drawn(value[name], value["theta_sigma"], None if draws is None else draws[index], level)
+        for index, name in enumerate(("theta_on", "theta_off"))
+    ]
     seen = level
     if hard_state.leak_hz is not None:  # a memorised level that falls is a signal that rises
-        seen = level + ((times_s - times_s[0]).to(level).reshape(-1, *[1] * (level.ndim - 1)) * hard_state.leak_hz * thetas[0])
-    smooth, reference = memory(seen[1:], *thetas, state=seen[0] if state is None else state.reference, log_input=True)
+        seen = level + (
+            (times_s - times_s[0]).to(level).reshape(-1, *[1] * (level.ndim - 1))
+            * hard_state.leak_hz
+            * thetas[0]
+        )
+    smooth, reference = memory(
+        seen[1:], *thetas, state=seen[0] if state is None else state.reference, log_input=True
+    )
     if hard_sensor.refractory_s > 0:
         smooth = smooth * _passing(seen.diff(dim=0), thetas, interval_s, value["refractory_s"])[:, None]
     counts = hard + (smooth - smooth.detach())
     ramp = (seen[-1] - level[-1]).detach()
-    return counts, PhysicalState(hard_state, reference - ramp, level[-1], frames[-1], draws, float(times_s[-1]))
+    return counts, PhysicalState(
+        hard_state, reference - ramp, level[-1], frames[-1], draws, float(times_s[-1])
+    )
 
 
 def _draws(sensor, state):
     """Standard normal numbers behind the thresholds that the hard sensor drew; None without mismatch."""
     if sensor.theta_sigma == 0:
         return None
-    return torch.stack(((state.theta_on - sensor.theta_on) / sensor.theta_sigma, (state.theta_off - sensor.theta_off) / sensor.theta_sigma))
+    return torch.stack(
+        (
+            (state.theta_on - sensor.theta_on) / sensor.theta_sigma,
+            (state.theta_off - sensor.theta_off) / sensor.theta_sigma,
+        )
+    )
 
 
 def _drawn(theta, sigma, draw, level):
@@ -84,11 +129,14 @@ def _drawn(theta, sigma, draw, level):
     theta = torch.as_tensor(theta, dtype=level.dtype, device=level.device)
     if draw is None:
         return theta
-    return (theta + torch.as_tensor(sigma, dtype=level.dtype, device=level.device) * draw).clamp(min=THETA_MINIMUM)
+    return (theta + torch.as_tensor(sigma, dtype=level.dtype, device=level.device) * draw).clamp(
+        min=THETA_MINIMUM
+    )
 
 
 def _passing(step, thetas, interval_s, refractory_s):
-    """Share of regularly arriving events that dead time lets pass, [T-1, ...]: one in ceil(r T), averaged over phases."""
+    """Share of regularly arriving events that dead time lets pass, [T-1, ...]: one in ceil(r T), averaged
+    over phases."""
     theta = torch.where(step > 0, thetas[0], thetas[1])
     rate_hz = step.abs() / theta / interval_s.to(step).reshape(-1, *[1] * (step.ndim - 1))
     return 1 / (rate_hz * refractory_s + 0.5).clamp(min=1)

@@ -15,12 +15,15 @@ def soft(frames, theta, *, sharpness=None, log_input=False):
     """Soft events of consecutive frames, without memory and capped at one per pixel, polarity and frame.
 
     Args:
-      frames: [T, ...] linear intensity on the 0-255 scale (lin-log is applied here), any pixel shape; log intensity with ``log_input``.
+      frames: [T, ...] linear intensity on the 0-255 scale (lin-log is applied here), any pixel shape; log
+        intensity with ``log_input``.
       theta: contrast threshold > 0, natural log units, scalar or broadcasting over one frame.
       sharpness: k > 0 in 1/log units; None: k = 5/theta.
-    Returns: [T-1, 2, ...] ON = sigmoid(k (dL - theta)), OFF = sigmoid(k (-dL - theta)), between 0 and 1, never 0.
+    Returns: [T-1, 2, ...] ON = sigmoid(k (dL - theta)), OFF = sigmoid(k (-dL - theta)), between 0 and 1,
+      never 0.
     Gradient: frames and theta, exact.
-    Raises: ShapeError for fewer than two frames; DomainError for theta or sharpness <= 0, NaN, infinite or negative input.
+    Raises: ShapeError for fewer than two frames; DomainError for theta or sharpness <= 0, NaN, infinite or
+      negative input.
     """
     level = log_levels(frames, log_input, minimum=2)
     theta = check_theta(theta, "theta", level)
@@ -29,4 +32,6 @@ def soft(frames, theta, *, sharpness=None, log_input=False):
     elif not (0 < sharpness < math.inf):
         raise DomainError(f"sharpness is {sharpness!r}; a finite number > 0 is needed (None gives 5/theta).")
     step = level.diff(dim=0)
-    return torch.stack((torch.sigmoid(sharpness * (step - theta)), torch.sigmoid(sharpness * (-step - theta))), dim=1)
+    return torch.stack(
+        (torch.sigmoid(sharpness * (step - theta)), torch.sigmoid(sharpness * (-step - theta))), dim=1
+    )

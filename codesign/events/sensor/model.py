@@ -1,4 +1,5 @@
-"""The event sensor: its parameters, and the random parts that the hard simulator and the differentiable layers share."""
+"""The event sensor: its parameters, and the random parts that the hard simulator and the differentiable
+layers share."""
 
 import math
 from dataclasses import dataclass, fields
@@ -17,17 +18,25 @@ class SensorModel:
 
     theta_on, theta_off: nominal contrast thresholds, natural log units, > 0.
     theta_sigma: standard deviation of the thresholds over pixels, natural log units, >= 0.
-    cutoff_hz: bandwidth of the photoreceptor at full light, a one-pole low-pass of the log level; it shrinks with intensity as (I + 20)/275. 0: none.
-    leak_rate_hz: ON events per pixel and second from leakage, on average. leak_jitter: standard deviation of the leak from frame to frame, relative.
+    cutoff_hz: bandwidth of the photoreceptor at full light, a one-pole low-pass of the log level; it shrinks
+      with intensity as (I + 20)/275. 0: none.
+    leak_rate_hz: ON events per pixel and second from leakage, on average. leak_jitter: standard deviation of
+      the leak from frame to frame, relative.
     rate_cov_decades: spread of the leak rate over pixels, standard deviation of its base-10 logarithm.
-    shot_rate_hz: noise events per pixel and second in the dark, both polarities together; a quarter at full light (1 - 0.75 (I + 20)/275). It scales
+    shot_rate_hz: noise events per pixel and second in the dark, both polarities together; a quarter at full
+      light (1 - 0.75 (I + 20)/275). It scales
       inversely with the pixel's threshold, and a noise event sets the memorised level to the level seen.
     refractory_s: dead time of a pixel after an event, seconds.
-    photoreceptor_noise: noise of the log level before the comparator instead of separate noise events, of the strength that v2e's fit assigns to
-      shot_rate_hz; the rate that comes out depends on bandwidth and frame rate (measured in docs/events.md). Needs cutoff_hz and shot_rate_hz above 0.
-    hot_pixel_share: share of pixels that fire by themselves. hot_pixel_rate_hz: their rate (ON, as a leak), events per second.
-    timing: "interpolated": each event at the time its pixel crosses the threshold, log level linear in time between frames; events inside the dead time
-      are lost (ESIM). "v2e": the frame-wide time slots of v2e, where events inside the dead time are deferred.
+    photoreceptor_noise: noise of the log level before the comparator instead of separate noise events, of the
+      strength that v2e's fit assigns to
+      shot_rate_hz; the rate that comes out depends on bandwidth and frame rate (measured in docs/events.md).
+      Needs cutoff_hz and shot_rate_hz above 0.
+    hot_pixel_share: share of pixels that fire by themselves. hot_pixel_rate_hz: their rate (ON, as a leak),
+      events per second.
+    timing: "interpolated": each event at the time its pixel crosses the threshold, log level linear in time
+      between frames; events inside the dead time
+      are lost (ESIM). "v2e": the frame-wide time slots of v2e, where events inside the dead time are
+      deferred.
     Source: v2e (Hu, Liu, Delbruck, CVPR-W 2021); Rebecq et al., ESIM, CoRL 2018.
     """
 
@@ -49,19 +58,34 @@ class SensorModel:
         if self.timing not in TIMINGS:
             raise DomainError(f"timing is {self.timing!r}; allowed: {', '.join(map(repr, TIMINGS))}.")
         if not isinstance(self.photoreceptor_noise, bool):
-            raise DomainError(f"SensorModel.photoreceptor_noise is {self.photoreceptor_noise!r}; True or False is needed.")
+            raise DomainError(
+                f"SensorModel.photoreceptor_noise is {self.photoreceptor_noise!r}; True or False is needed."
+            )
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name in ("timing", "photoreceptor_noise"):
                 continue
             positive = field.name in ("theta_on", "theta_off")
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value < 0 or (positive and value == 0):
-                raise DomainError(f"SensorModel.{field.name} is {value!r}; a finite number {'> 0' if positive else '>= 0'} is needed.")
+            if (
+                isinstance(value, bool)
+                or not isinstance(value, (int, float))
+                or not math.isfinite(value)
+                or value < 0
+                or (positive and value == 0)
+            ):
+                raise DomainError(
+                    f"SensorModel.{field.name} is {value!r}; a finite number "
+                    f"{'> 0' if positive else '>= 0'} is needed."
+                )
         if self.hot_pixel_share > 1:
-            raise DomainError(f"SensorModel.hot_pixel_share is {self.hot_pixel_share!r}; a share of pixels, 0 to 1, is needed.")
+            raise DomainError(
+                f"SensorModel.hot_pixel_share is {self.hot_pixel_share!r}; a share of pixels, 0 to 1, is "
+                "needed."
+            )
         if self.photoreceptor_noise and not (self.cutoff_hz > 0 and self.shot_rate_hz > 0):
             raise DomainError(
-                f"photoreceptor_noise needs cutoff_hz and shot_rate_hz above 0 (its strength follows from both); they are {self.cutoff_hz} and {self.shot_rate_hz}."
+                "photoreceptor_noise needs cutoff_hz and shot_rate_hz above 0 (its strength follows from "
+                f"both); they are {self.cutoff_hz} and {self.shot_rate_hz}."
             )
 
     @property
@@ -75,15 +99,19 @@ class SensorModel:
         return self.shot_rate_hz > 0 and not self.photoreceptor_noise
 
     def noise_level(self):
-        """Standard deviation of the photoreceptor noise at the comparator, natural log units; 0 without ``photoreceptor_noise``.
+        """Standard deviation of the photoreceptor noise at the comparator, natural log units; 0 without
+        ``photoreceptor_noise``.
 
-        Source: v2e's fit of the threshold-to-noise ratio that gives a wanted noise rate R at bandwidth f: with x = log10(R / 2 f), the smaller of the
-        two thresholds over 10^y, y = -0.0026 x^3 - 0.036 x^2 - 0.1949 x + 0.321. The mean of the smaller one is exact here (v2e draws 300).
+        Source: v2e's fit of the threshold-to-noise ratio that gives a wanted noise rate R at bandwidth f:
+          with x = log10(R / 2 f), the smaller of the
+        two thresholds over 10^y, y = -0.0026 x^3 - 0.036 x^2 - 0.1949 x + 0.321. The mean of the smaller one
+        is exact here (v2e draws 300).
         """
         if not self.photoreceptor_noise:
             return 0.0
         x = math.log10(self.shot_rate_hz / (2 * self.cutoff_hz))
-        smaller, spread = min(self.theta_on, self.theta_off), math.sqrt(2) * self.theta_sigma
+        smaller = min(self.theta_on, self.theta_off)
+        spread = math.sqrt(2) * self.theta_sigma
         if spread > 0:  # mean of the smaller of two independent normal numbers (Clark 1961)
             share = (self.theta_off - self.theta_on) / spread
             above = 0.5 * math.erfc(-share / math.sqrt(2))
@@ -93,60 +121,105 @@ class SensorModel:
 
 
 CLEAN = SensorModel(theta_sigma=0.02)
-NOISY = SensorModel(theta_sigma=0.05, cutoff_hz=30.0, leak_rate_hz=0.1, leak_jitter=0.1, rate_cov_decades=0.1, shot_rate_hz=5.0)
-DAVIS = SensorModel(theta_sigma=0.03, cutoff_hz=300.0, leak_rate_hz=0.01, leak_jitter=0.1, rate_cov_decades=0.1, shot_rate_hz=0.001, refractory_s=0.0005)
-PRESETS = {"ideal": SensorModel(), "clean": CLEAN, "noisy": NOISY, "default": DAVIS}  # v2e's presets and the defaults of its command line
+NOISY = SensorModel(
+    theta_sigma=0.05,
+    cutoff_hz=30.0,
+    leak_rate_hz=0.1,
+    leak_jitter=0.1,
+    rate_cov_decades=0.1,
+    shot_rate_hz=5.0,
+)
+DAVIS = SensorModel(
+    theta_sigma=0.03,
+    cutoff_hz=300.0,
+    leak_rate_hz=0.01,
+    leak_jitter=0.1,
+    rate_cov_decades=0.1,
+    shot_rate_hz=0.001,
+    refractory_s=0.0005,
+)
+PRESETS = {
+    "ideal": SensorModel(),
+    "clean": CLEAN,
+    "noisy": NOISY,
+    "default": DAVIS,
+}  # v2e's presets and the defaults of its command line
 
 
 def draw_thresholds(sensor, pixels, generator, *, dtype=torch.float32, device="cpu"):
     """Contrast thresholds of every pixel.
 
     Args:
-      sensor: SensorModel. pixels: shape of one frame. generator: draws happen on its device; untouched when theta_sigma is 0.
-    Returns: theta_on, theta_off: ``pixels`` each, natural log units: N(theta, sigma), values below 0.01 set to 0.01; first all ON, then all OFF.
+      sensor: SensorModel. pixels: shape of one frame. generator: draws happen on its device; untouched when
+        theta_sigma is 0.
+    Returns: theta_on, theta_off: ``pixels`` each, natural log units: N(theta, sigma), values below 0.01 set
+      to 0.01; first all ON, then all OFF.
     Source: v2e (Hu et al., CVPR-W 2021), threshold mismatch.
     """
     nominal = (sensor.theta_on, sensor.theta_off)
     if sensor.theta_sigma == 0:
         return tuple(torch.tensor(theta, dtype=dtype, device=device).expand(pixels) for theta in nominal)
-    spread = (sensor.theta_sigma * torch.randn(tuple(pixels), generator=generator, dtype=dtype, device=generator.device) for _ in nominal)
-    return tuple((theta + noise).clamp(min=THETA_MINIMUM).to(device) for theta, noise in zip(nominal, spread, strict=True))
+    spread = (
+        sensor.theta_sigma
+        * torch.randn(tuple(pixels), generator=generator, dtype=dtype, device=generator.device)
+        for _ in nominal
+    )
+    return tuple(
+        (theta + noise).clamp(min=THETA_MINIMUM).to(device)
+        for theta, noise in zip(nominal, spread, strict=True)
+    )
 
 
 def draw_leak_rates(sensor, pixels, generator, *, dtype=torch.float32, device="cpu"):
-    """Leak of every pixel in ON thresholds per second, [*pixels]: log-normal spread around leak_rate_hz, plus the rate of hot pixels.
+    """Leak of every pixel in ON thresholds per second, [*pixels]: log-normal spread around leak_rate_hz, plus
+    the rate of hot pixels.
 
     Draws only what the sensor has: the spread, then which pixels are hot.
-    Source: v2e, noise_rate_cov_decades (a median of leak_rate_hz; the mean is higher by exp((ln 10 c)^2 / 2)).
+    Source: v2e, noise_rate_cov_decades (a median of leak_rate_hz; the mean is higher by exp((ln 10 c)^2 /
+      2)).
     """
     rate_hz = torch.full(tuple(pixels), sensor.leak_rate_hz, dtype=dtype)
     if sensor.leak_rate_hz > 0 and sensor.rate_cov_decades > 0:
         spread = torch.randn(tuple(pixels), generator=generator, dtype=dtype, device=generator.device).cpu()
         rate_hz = rate_hz * torch.pow(10.0, sensor.rate_cov_decades * spread)
     if sensor.hot_pixel_share * sensor.hot_pixel_rate_hz > 0:
-        hot = torch.rand(tuple(pixels), generator=generator, device=generator.device).cpu() < sensor.hot_pixel_share
+        hot = (
+            torch.rand(tuple(pixels), generator=generator, device=generator.device).cpu()
+            < sensor.hot_pixel_share
+        )
         rate_hz = rate_hz + sensor.hot_pixel_rate_hz * hot.to(dtype)
     return rate_hz.to(device)
 
 
 def draw_shot_counts(sensor, pixels, interval_s, generator, *, dtype=torch.float32, device="cpu"):
-    """Noise events per pixel and interval: Poisson, shot_rate_hz/2 per polarity. Add them to the counts of any event layer.
+    """Noise events per pixel and interval: Poisson, shot_rate_hz/2 per polarity. Add them to the counts of
+    any event layer.
 
-    The rate is shot_rate_hz at every intensity, and the memorised level stays: one fixed draw serves a whole optimisation.
+    The rate is shot_rate_hz at every intensity, and the memorised level stays: one fixed draw serves a whole
+    optimisation.
 
     Args:
-      sensor: SensorModel. pixels: shape of one frame. interval_s: [T-1] lengths of the intervals, seconds, > 0.
-      generator: draws happen on its device, one interval after the other, so chunks draw what the whole draws; untouched when the rate is 0.
+      sensor: SensorModel. pixels: shape of one frame. interval_s: [T-1] lengths of the intervals, seconds, >
+        0.
+      generator: draws happen on its device, one interval after the other, so chunks draw what the whole
+        draws; untouched when the rate is 0.
     Returns: [T-1, 2, *pixels] whole numbers >= 0, ON first.
     """
     interval_s = torch.as_tensor(interval_s, dtype=torch.float64)
     if interval_s.ndim != 1:
-        raise ShapeError(f"interval_s has shape {list(interval_s.shape)}; one length per interval is needed, [T-1].")
+        raise ShapeError(
+            f"interval_s has shape {list(interval_s.shape)}; one length per interval is needed, [T-1]."
+        )
     if not bool(((interval_s > 0) & interval_s.isfinite()).all()):
-        raise DomainError("interval_s holds a length that is not a finite number > 0; give t_s.diff() of increasing frame times.")
+        raise DomainError(
+            "interval_s holds a length that is not a finite number > 0; give t_s.diff() of increasing frame "
+            "times."
+        )
     counts = torch.zeros((len(interval_s), 2, *pixels), dtype=dtype, device=device)
     if sensor.shot_rate_hz > 0:
-        rate_hz = torch.full((2, *pixels), sensor.shot_rate_hz / 2, dtype=torch.float64, device=generator.device)
+        rate_hz = torch.full(
+            (2, *pixels), sensor.shot_rate_hz / 2, dtype=torch.float64, device=generator.device
+        )
         for index, length_s in enumerate(interval_s.tolist()):
             counts[index] = torch.poisson(rate_hz * length_s, generator=generator).to(counts)
     return counts

@@ -10,17 +10,22 @@ from codesign.events.stream import ordered
 
 @torch.no_grad()
 def naive(frames, t_s, theta, *, log_input=False):
-    """At most one event per pixel and frame: ON when dL >= theta, OFF when dL <= -theta between consecutive frames.
+    """At most one event per pixel and frame: ON when dL >= theta, OFF when dL <= -theta between consecutive
+    frames.
 
-    What stays below the threshold is forgotten, what exceeds it several times counts once: slow motion goes unseen and fast edges lose events.
+    What stays below the threshold is forgotten, what exceeds it several times counts once: slow motion goes
+    unseen and fast edges lose events.
 
     Args:
-      frames: [T, H, W] linear intensity on the 0-255 scale (lin-log is applied here); log intensity with ``log_input``.
-      t_s: [T] frame times, seconds, strictly increasing. An event gets the time of the later frame, to the nearest microsecond.
+      frames: [T, H, W] linear intensity on the 0-255 scale (lin-log is applied here); log intensity with
+        ``log_input``.
+      t_s: [T] frame times, seconds, strictly increasing. An event gets the time of the later frame, to the
+        nearest microsecond.
       theta: contrast threshold > 0, natural log units, scalar or broadcasting over one frame.
     Returns: EventStream sorted by (t, y, x, p).
     Gradient: none.
-    Raises: ShapeError for fewer than two frames or other shapes; DomainError for theta <= 0, NaN, negative input or times that do not increase.
+    Raises: ShapeError for fewer than two frames or other shapes; DomainError for theta <= 0, NaN, negative
+      input or times that do not increase.
     """
     level = log_levels(frames, log_input, minimum=2)
     if level.ndim != 3:

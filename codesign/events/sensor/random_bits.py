@@ -1,10 +1,12 @@
-"""Random numbers inside drjit kernels, without a state: hashes of a key per pixel and a counter, so that chunks and threads change nothing."""
+"""Random numbers inside drjit kernels, without a state: hashes of a key per pixel and a counter, so that
+chunks and threads change nothing."""
 
 import math
 
 
 def hashed(dr, bits):
-    """32 well-mixed bits of 32 bits; one to one. Source: C. Wellons, "Prospecting for Hash Functions" (triple32, bias 0.02 of ideal)."""
+    """32 well-mixed bits of 32 bits; one to one. Source: C. Wellons, "Prospecting for Hash Functions"
+    (triple32, bias 0.02 of ideal)."""
     bits = (bits ^ (bits >> 17)) * 0xED5AD4BB
     bits = (bits ^ (bits >> 11)) * 0xAC4C1B51
     bits = (bits ^ (bits >> 15)) * 0x31848BAB

@@ -23,27 +23,36 @@ KEY_BITS = 63
 def simulate(frames, t_s, sensor, generator=None, state=None, *, log_input=False, log_eps=None):
     """Events of a sensor that sees the frames one after the other; log level runs linearly between them.
 
-    Per interval a pixel fires each time its level crosses its memorised level by one more threshold, as many times as it does so. Low-pass, mismatch,
-    leak, noise, dead time and hot pixels come with the fields of the sensor. Without them the counts are those of ``memory``.
+    Per interval a pixel fires each time its level crosses its memorised level by one more threshold, as many
+    times as it does so. Low-pass, mismatch,
+    leak, noise, dead time and hot pixels come with the fields of the sensor. Without them the counts are
+    those of ``memory``.
 
     Args:
-      frames: [T, H, W] linear intensity on the 0-255 scale (lin-log is applied here; brighter values are taken as they are), finite, >= 0.
+      frames: [T, H, W] linear intensity on the 0-255 scale (lin-log is applied here; brighter values are
+        taken as they are), finite, >= 0.
       t_s: [T] frame times, seconds, strictly increasing; microseconds stay exact at epoch times (float64).
       sensor: SensorModel.
       generator: torch.Generator for all that is random. None: the one in ``state``, which starts at seed 0.
-      state: SensorState carried over chunks, changed in place; empty for the first. Later chunks start with the frame after the last one seen, and may
+      state: SensorState carried over chunks, changed in place; empty for the first. Later chunks start with
+        the frame after the last one seen, and may
         hold a single frame. Any chunking gives the events of the whole.
-      log_input: frames are natural-log levels (of the 0-255 scale where the sensor's speed or noise depends on intensity).
-      log_eps: level is ln(I + log_eps) instead of lin-log, for linear frames of high dynamic range (ESIM: 1e-3 with frames 0 to 1; where speed or noise
+      log_input: frames are natural-log levels (of the 0-255 scale where the sensor's speed or noise depends
+        on intensity).
+      log_eps: level is ln(I + log_eps) instead of lin-log, for linear frames of high dynamic range (ESIM:
+        1e-3 with frames 0 to 1; where speed or noise
         depends on intensity, scale frames so that 255 is full light).
     Returns: EventStream sorted by (t, y, x, p), int64 microseconds. The first frame gives no event.
     Gradient: none (see ``sensor_counts`` for one).
-    Raises: ShapeError for too few frames or a size that changed; DomainError for NaN, infinite or negative frames, or times that do not increase.
+    Raises: ShapeError for too few frames or a size that changed; DomainError for NaN, infinite or negative
+      frames, or times that do not increase.
       The state is then as before.
-    Source: Rebecq et al., ESIM, CoRL 2018 (linear interpolation of log intensity); v2e (Hu, Liu, Delbruck, CVPR-W 2021), docs/events.md.
+    Source: Rebecq et al., ESIM, CoRL 2018 (linear interpolation of log intensity); v2e (Hu, Liu, Delbruck,
+      CVPR-W 2021), docs/events.md.
     """
     state = SensorState() if state is None else state
-    moved, front_end = replace(state), FrontEnd(log_input, log_eps)
+    moved = replace(state)
+    front_end = FrontEnd(log_input, log_eps)
     check_layout(frames, minimum=1)
     if frames.ndim != 3:
         raise ShapeError(f"frames have shape {list(frames.shape)}; [T, H, W] is needed.")
@@ -54,10 +63,16 @@ def simulate(frames, t_s, sensor, generator=None, state=None, *, log_input=False
     else:
         layout = KeyLayout(round(moved.time_s * 1e6), height_px, width_px)
         _check_range(layout, times_s[-1])
-        keys, size, density = [], backend.frames_per_kernel(height_px * width_px), EVENTS_PER_PIXEL
+        keys = []
+        size = backend.frames_per_kernel(height_px * width_px)
+        density = EVENTS_PER_PIXEL
         for first in range(0, len(frames), size):
             chunk = slice(first, first + size)
-            keys.append(_interpolated_keys(frames[chunk], times_s[chunk], sensor, generator, moved, front_end, layout, density))
+            keys.append(
+                _interpolated_keys(
+                    frames[chunk], times_s[chunk], sensor, generator, moved, front_end, layout, density
+                )
+            )
             density = 1.25 * len(keys[-1]) / frames[chunk].numel()
         t_us, x, y, p = layout.columns(keys[0] if len(keys) == 1 else np.concatenate(keys))
         stream = EventStream(t_us, x, y, p, height_px, width_px)
@@ -73,20 +88,27 @@ def dense_counts(frames, t_s, sensor, generator=None, state=None, *, log_input=F
     Returns: [T-1, 2, ...] ([T, 2, ...] for a later chunk), ON first.
     """
     if sensor.timing != "interpolated":
-        raise DomainError(f"dense counts come from timing 'interpolated', the sensor has {sensor.timing!r}; use simulate and to_counts.")
+        raise DomainError(
+            f"dense counts come from timing 'interpolated', the sensor has {sensor.timing!r}; use simulate "
+            "and to_counts."
+        )
     state = SensorState() if state is None else state
-    moved, front_end = replace(state), FrontEnd(log_input, log_eps)
+    moved = replace(state)
+    front_end = FrontEnd(log_input, log_eps)
     frames, times_s, generator = _open(frames, t_s, sensor, generator, moved, front_end)
     import drjit as dr
 
     sink = DenseCounts(dr, backend.arrays(frames.device.type, frames.dtype), len(frames), frames[0].numel())
-    _advance(frames, times_s, _random_keys(len(frames), sensor, moved, generator), sensor, moved, front_end, sink)
+    _advance(
+        frames, times_s, _random_keys(len(frames), sensor, moved, generator), sensor, moved, front_end, sink
+    )
     state.__dict__.update(moved.__dict__)
     return sink.tensor((len(frames), 2, *frames.shape[1:]))
 
 
 def _open(frames, t_s, sensor, generator, state, front_end):
-    """Check what can be checked without reading every frame, and begin an empty state with the first. Returns the frames and times still to be seen."""
+    """Check what can be checked without reading every frame, and begin an empty state with the first. Returns
+    the frames and times still to be seen."""
     fresh = state.level is None
     check_layout(frames, minimum=2 if fresh else 1)
     times_s = check_times(t_s, len(frames)).tolist()
@@ -96,14 +118,32 @@ def _open(frames, t_s, sensor, generator, state, front_end):
     frames = frames.detach()
     if fresh:
         check_frames(frames[:1], 1, non_negative=not front_end.log_input)
-        level = v2e.front_end(frames[:1]) if sensor.timing == "v2e" and front_end == FrontEnd() else front_end.level(frames[:1])
-        begin(state, sensor, frames[0].exp() if front_end.log_input else frames[0], level[0], times_s[0], generator)
+        level = (
+            v2e.front_end(frames[:1])
+            if sensor.timing == "v2e" and front_end == FrontEnd()
+            else front_end.level(frames[:1])
+        )
+        begin(
+            state,
+            sensor,
+            frames[0].exp() if front_end.log_input else frames[0],
+            level[0],
+            times_s[0],
+            generator,
+        )
         return frames[1:], times_s[1:], generator
-    shape, dtype = state.level.shape, state.level.dtype
+    shape = state.level.shape
+    dtype = state.level.dtype
     if shape != frames.shape[1:] or (dtype != frames.dtype and sensor.timing != "v2e"):
-        raise ShapeError(f"{frames.dtype} frames of {list(frames.shape[1:])} pixels follow {dtype} frames of {list(shape)} pixels; a sensor keeps its size and type.")
+        raise ShapeError(
+            f"{frames.dtype} frames of {list(frames.shape[1:])} pixels follow {dtype} frames of "
+            f"{list(shape)} pixels; a sensor keeps its size and type."
+        )
     if times_s[0] <= state.time_s:
-        raise DomainError(f"the chunk starts at {times_s[0]!r} s, the last frame seen was at {state.time_s!r} s; times must go on increasing.")
+        raise DomainError(
+            f"the chunk starts at {times_s[0]!r} s, the last frame seen was at {state.time_s!r} s; times "
+            "must go on increasing."
+        )
     return frames, times_s, generator
 
 
@@ -112,18 +152,26 @@ def _v2e_events(frames, times_s, sensor, generator, state, front_end):
     for frame, time_s in zip(frames, times_s, strict=True):
         check_frames(frame[None], 1, non_negative=not front_end.log_input)
         level = v2e.front_end(frame) if front_end == FrontEnd() else front_end.level(frame)
-        parts.append(v2e.interval(frame.exp() if front_end.log_input else frame, level, time_s, sensor, generator, state))
+        parts.append(
+            v2e.interval(
+                frame.exp() if front_end.log_input else frame, level, time_s, sensor, generator, state
+            )
+        )
     return ordered(*(torch.cat(column) for column in zip(*parts, strict=True)), *frames.shape[1:])
 
 
 def _interpolated_keys(frames, times_s, sensor, generator, state, front_end, layout, density):
-    """Sorted keys of the events of one chunk; a chunk busier than the room made for it is run again with the room it needs."""
+    """Sorted keys of the events of one chunk; a chunk busier than the room made for it is run again with the
+    room it needs."""
     import drjit as dr
 
     arr = backend.arrays(frames.device.type, frames.dtype)
-    random_keys, starts_s, capacity = _random_keys(len(frames), sensor, state, generator), [state.time_s, *times_s[:-1]], 4096 + int(density * frames.numel())
+    random_keys = _random_keys(len(frames), sensor, state, generator)
+    starts_s = [state.time_s, *times_s[:-1]]
+    capacity = 4096 + int(density * frames.numel())
     while True:
-        sink, trial = EventKeys(dr, arr, starts_s, times_s, layout, capacity), replace(state)
+        sink = EventKeys(dr, arr, starts_s, times_s, layout, capacity)
+        trial = replace(state)
         _advance(frames, times_s, random_keys, sensor, trial, front_end, sink)
         if sink.found <= capacity:
             state.__dict__.update(trial.__dict__)
@@ -137,19 +185,29 @@ def _random_keys(count, sensor, state, generator):
         return torch.zeros(count, dtype=torch.int32)
     whole = torch.iinfo(torch.int32)
     # one at a time, so that chunks draw what the whole draws
-    drawn = [torch.randint(whole.min, whole.max, (), generator=generator, dtype=torch.int64, device=generator.device) for _ in range(count)]
+    drawn = [
+        torch.randint(
+            whole.min, whole.max, (), generator=generator, dtype=torch.int64, device=generator.device
+        )
+        for _ in range(count)
+    ]
     return torch.stack(drawn).to(torch.int32).to(state.level.device)
 
 
 def _advance(frames, times_s, keys, sensor, state, front_end, sink):
     """Run the kernel and move the state on; on bad frames raise before anything has changed."""
-    dt_s = torch.tensor(times_s, dtype=torch.float64) - torch.tensor([state.time_s, *times_s[:-1]], dtype=torch.float64)
+    dt_s = torch.tensor(times_s, dtype=torch.float64) - torch.tensor(
+        [state.time_s, *times_s[:-1]], dtype=torch.float64
+    )
     carried, wrong = crossing.run(frames, front_end, dt_s.to(frames), keys, sensor, state, sink)
     if wrong == 1:
         check_frames(frames, 1, non_negative=not front_end.log_input)
     if wrong:
         many = f"more than {crossing.MOST_EVENTS:.0f} events between two frames"
-        raise DomainError(f"a pixel would fire {many}; check the unit of the frames (log levels are natural logarithms), the thresholds, the noise rates and the times.")
+        raise DomainError(
+            f"a pixel would fire {many}; check the unit of the frames (log levels are natural logarithms), "
+            "the thresholds, the noise rates and the times."
+        )
     for name, tensor in carried.items():
         setattr(state, name, tensor)
     state.time_s = times_s[-1]
@@ -158,4 +216,7 @@ def _advance(frames, times_s, keys, sensor, state, front_end, sink):
 def _check_range(layout, end_s):
     if end_s * 1e6 - layout.origin_us >= 2 ** (KEY_BITS - layout.pixel_bits):
         size = f"{layout.height_px} x {layout.width_px} pixels"
-        raise DomainError(f"frames from {layout.origin_us} us to {end_s!r} s with {size} exceed 64-bit event keys; pass them in shorter chunks with a state.")
+        raise DomainError(
+            f"frames from {layout.origin_us} us to {end_s!r} s with {size} exceed 64-bit event keys; pass "
+            "them in shorter chunks with a state."
+        )

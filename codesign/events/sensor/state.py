@@ -13,11 +13,16 @@ from codesign.events.sensor.model import draw_leak_rates, draw_thresholds
 class SensorState:
     """Memory of a sensor. Make an empty one; ``simulate`` fills it and moves it on.
 
-    reference: [H, W] memorised log level. level: [H, W] log level behind the low-pass. theta_on, theta_off: [H, W] drawn thresholds.
-    start_s, time_s: times of the first and the last frame. generator: used when none is passed; starts at seed 0.
-    Only where the sensor needs them: input_level, input: [H, W] last log level before the low-pass, last intensity; noise: [H, W] photoreceptor
-    noise; leak_hz: [H, W]; last_event_s: [H, W] time of the last event (since the first frame for timing "v2e", since the last frame otherwise,
-    so <= 0); hazard: [H, W] noise still to pass until the next noise event; key, shots: [H, W] int32 random key and noise events so far.
+    reference: [H, W] memorised log level. level: [H, W] log level behind the low-pass. theta_on, theta_off:
+      [H, W] drawn thresholds.
+    start_s, time_s: times of the first and the last frame. generator: used when none is passed; starts at
+      seed 0.
+    Only where the sensor needs them: input_level, input: [H, W] last log level before the low-pass, last
+      intensity; noise: [H, W] photoreceptor
+    noise; leak_hz: [H, W]; last_event_s: [H, W] time of the last event (since the first frame for timing
+    "v2e", since the last frame otherwise,
+    so <= 0); hazard: [H, W] noise still to pass until the next noise event; key, shots: [H, W] int32 random
+    key and noise events so far.
     """
 
     # Any: filled by the first frame, and used as tensors and numbers from then on
@@ -46,18 +51,27 @@ class SensorState:
 def begin(state, sensor, frame, level, time_s, generator):
     """Fill an empty state at the first frame, which gives no event.
 
-    Draws, in this order and only what the sensor has: thresholds, leak rates, hot pixels, first noise hazards, keys.
+    Draws, in this order and only what the sensor has: thresholds, leak rates, hot pixels, first noise
+      hazards, keys.
     Args: frame: [H, W] intensity. level: [H, W] its log level.
     """
-    pixels, place = level.shape, {"dtype": level.dtype, "device": level.device}
-    exact = sensor.timing == "v2e" and sensor.theta_sigma == 0  # v2e keeps drawn thresholds in single, nominal ones in double precision
-    state.theta_on, state.theta_off = draw_thresholds(sensor, pixels, generator, dtype=torch.float64 if exact else level.dtype, device=level.device)
-    state.reference, state.level = level.clone(), level.clone()
+    pixels = level.shape
+    place = {"dtype": level.dtype, "device": level.device}
+    exact = (
+        sensor.timing == "v2e" and sensor.theta_sigma == 0
+    )  # v2e keeps drawn thresholds in single, nominal ones in double precision
+    state.theta_on, state.theta_off = draw_thresholds(
+        sensor, pixels, generator, dtype=torch.float64 if exact else level.dtype, device=level.device
+    )
+    state.reference = level.clone()
+    state.level = level.clone()
     state.start_s = state.time_s = time_s
     if sensor.leaks:
         state.leak_hz = draw_leak_rates(sensor, pixels, generator, **place)
     if sensor.refractory_s > 0:
-        quiet_s = sensor.refractory_s if sensor.timing == "v2e" else 1e6  # seconds; v2e's first event also waits
+        quiet_s = (
+            sensor.refractory_s if sensor.timing == "v2e" else 1e6
+        )  # seconds; v2e's first event also waits
         state.last_event_s = torch.full(pixels, -quiet_s, **place)
     if sensor.cutoff_hz > 0 or sensor.has_shots:
         state.input = frame.clone()
@@ -65,9 +79,18 @@ def begin(state, sensor, frame, level, time_s, generator):
         state.input_level = level.clone()
     if sensor.photoreceptor_noise:
         state.noise = torch.zeros(pixels, **place)
-    if sensor.timing == "interpolated" and (sensor.has_shots or sensor.photoreceptor_noise or (sensor.leaks and sensor.leak_jitter > 0)):
+    if sensor.timing == "interpolated" and (
+        sensor.has_shots or sensor.photoreceptor_noise or (sensor.leaks and sensor.leak_jitter > 0)
+    ):
         uniform = torch.rand(tuple(pixels), generator=generator, dtype=torch.float64, device=generator.device)
         state.hazard = (-torch.log1p(-uniform)).to(level)
         whole = torch.iinfo(torch.int32)
-        state.key = torch.randint(whole.min, whole.max, tuple(pixels), generator=generator, dtype=torch.int64, device=generator.device).to(level.device, torch.int32)
+        state.key = torch.randint(
+            whole.min,
+            whole.max,
+            tuple(pixels),
+            generator=generator,
+            dtype=torch.int64,
+            device=generator.device,
+        ).to(level.device, torch.int32)
         state.shots = torch.zeros(pixels, dtype=torch.int32, device=level.device)

@@ -1,7 +1,10 @@
-"""The sensor as v2e times it: every pixel's i-th event of a frame gets the i-th of the frame's equal time slots.
+"""The sensor as v2e times it: every pixel's i-th event of a frame gets the i-th of the frame's equal time
+slots.
 
-Kept beside the interpolated sensor so that results with v2e can be repeated event by event; precisions and the order of operations are v2e's.
-Source: Hu, Liu, Delbruck, "v2e: From Video Frames to Realistic DVS Events", CVPR-W 2021, and the published program.
+Kept beside the interpolated sensor so that results with v2e can be repeated event by event; precisions and
+the order of operations are v2e's.
+Source: Hu, Liu, Delbruck, "v2e: From Video Frames to Realistic DVS Events", CVPR-W 2021, and the published
+  program.
 """
 
 import math
@@ -11,11 +14,14 @@ import torch
 from codesign.errors import DomainError
 from codesign.events.intensity import FrontEnd, light_share
 
-EXACT_SINGLE_S = 8.0  # up to here single-precision seconds resolve a microsecond, and v2e's rounding is repeated; later slots are computed in double
+# up to here single-precision seconds resolve a microsecond, and v2e's rounding is repeated; later slots are
+# computed in double
+EXACT_SINGLE_S = 8.0
 
 
 def front_end(frames):
-    """Lin-log level as v2e rounds it: computed in double precision, to 8 decimals, kept in single. frames: [T, H, W]."""
+    """Lin-log level as v2e rounds it: computed in double precision, to 8 decimals, kept in single. frames:
+    [T, H, W]."""
     return ((FrontEnd().level(frames.double()) * 1e8).round() / 1e8).float()
 
 
@@ -34,7 +40,9 @@ def interval(frame, level, time_s, sensor, generator, state):
             rate_hz = rate_hz * (1 - sensor.leak_jitter * _randn(rate_hz, generator))
         state.reference = state.reference - dt_s * rate_hz * state.theta_on.to(rate_hz)
     difference = seen - state.reference
-    theta_on, theta_off = state.theta_on.to(difference), state.theta_off.to(difference)  # single precision without, double with a low-pass
+    # single precision without, double with a low-pass
+    theta_on = state.theta_on.to(difference)
+    theta_off = state.theta_off.to(difference)
     on = torch.div(difference.clamp(min=0), theta_on, rounding_mode="floor").long()
     off = torch.div((-difference).clamp(min=0), theta_off, rounding_mode="floor").long()
     slots = max(1, int(torch.maximum(on, off).max()))
@@ -45,13 +53,22 @@ def interval(frame, level, time_s, sensor, generator, state):
         found = [(*_each(fired), torch.full((int(fired.sum()),), p)) for fired, p in ((on, 1), (off, -1))]
         if state.last_event_s is not None:
             last = torch.maximum(on, off)
-            state.last_event_s = torch.where(last > 0, times.to(state.last_event_s.dtype)[(last - 1).clamp(min=0)], state.last_event_s)
-    state.reference = state.reference.to(difference) + on * state.theta_on.float() - off * state.theta_off.float()  # a single-precision product at all times
+            state.last_event_s = torch.where(
+                last > 0, times.to(state.last_event_s.dtype)[(last - 1).clamp(min=0)], state.last_event_s
+            )
+    state.reference = (
+        state.reference.to(difference) + on * state.theta_on.float() - off * state.theta_off.float()
+    )  # a single-precision product at all times
     if sensor.has_shots:
         found += _shots(light, dt_s, slots, sensor, generator, state)
     state.time_s = time_s
     y, x, nth, p = (torch.cat(column) for column in zip(*found, strict=True))
-    return round(state.start_s * 1e6) + ((times.double() + _fraction(state.start_s)) * 1e6).round().long()[nth], x, y, p
+    return (
+        round(state.start_s * 1e6) + ((times.double() + _fraction(state.start_s)) * 1e6).round().long()[nth],
+        x,
+        y,
+        p,
+    )
 
 
 def _fraction(start_s):
@@ -72,21 +89,32 @@ def _photoreceptor(level, light, dt_s, sensor, generator, state):
     share = dt_s * omega
     if share >= 2:
         raise DomainError(
-            f"frames {dt_s:g} s apart make v2e's noise filter of {sensor.cutoff_hz:g} Hz unstable; use frames closer than {2 / omega:.3g} s, or timing 'interpolated'."
+            f"frames {dt_s:g} s apart make v2e's noise filter of {sensor.cutoff_hz:g} Hz unstable; use "
+            f"frames closer than {2 / omega:.3g} s, or timing 'interpolated'."
         )
-    strength = sensor.noise_level() / math.sqrt(share / (2 - share))  # the filter lets this part of white noise through
+    strength = sensor.noise_level() / math.sqrt(
+        share / (2 - share)
+    )  # the filter lets this part of white noise through
     state.noise = (1 - share) * state.noise + share * strength * _randn(state.noise, generator)
     return state.level + state.noise
 
 
 def _slots(before_s, now_s, dt_s, count):
     """[count] times of the frame's slots since the first frame, seconds."""
-    return torch.linspace(before_s + dt_s / count, now_s, count, dtype=torch.float32 if now_s < EXACT_SINGLE_S else torch.float64)
+    return torch.linspace(
+        before_s + dt_s / count,
+        now_s,
+        count,
+        dtype=torch.float32 if now_s < EXACT_SINGLE_S else torch.float64,
+    )
 
 
 def _with_dead_time(on, off, times, refractory_s, state):
-    """Keep the events that come later than the dead time behind the last one kept; the others are not counted, so the next frames see them again."""
-    kept_on, kept_off, found = torch.zeros_like(on), torch.zeros_like(off), []
+    """Keep the events that come later than the dead time behind the last one kept; the others are not
+    counted, so the next frames see them again."""
+    kept_on = torch.zeros_like(on)
+    kept_off = torch.zeros_like(off)
+    found = []
     last = state.last_event_s.to(times.dtype)
     for index, time in enumerate(times):
         ready = time - last > refractory_s
@@ -101,9 +129,12 @@ def _with_dead_time(on, off, times, refractory_s, state):
 
 
 def _shots(light, dt_s, slots, sensor, generator, state):
-    """Noise events: at most one per pixel and frame, in the last slot; they set the memorised level to the level seen."""
+    """Noise events: at most one per pixel and frame, in the last slot; they set the memorised level to the
+    level seen."""
     chance = sensor.shot_rate_hz / 2 * dt_s * (1 - 0.75 * light)
-    draw = torch.rand(light.shape, generator=generator, dtype=torch.float64, device=generator.device).to(light.device)
+    draw = torch.rand(light.shape, generator=generator, dtype=torch.float64, device=generator.device).to(
+        light.device
+    )
     on = draw > 1 - chance * (sensor.theta_on / state.theta_on)
     off = draw < chance * (sensor.theta_off / state.theta_off)
     state.reference = torch.where(on | off, state.level, state.reference)
@@ -112,12 +143,16 @@ def _shots(light, dt_s, slots, sensor, generator, state):
 
 
 def _randn(like, generator):
-    return torch.randn(like.shape, generator=generator, dtype=like.dtype, device=generator.device).to(like.device)
+    return torch.randn(like.shape, generator=generator, dtype=like.dtype, device=generator.device).to(
+        like.device
+    )
 
 
 def _each(counts):
     """Row, column and running number (from 0) of every single event in a map of counts."""
     y, x = counts.nonzero(as_tuple=True)
     many = counts[y, x]
-    nth = torch.arange(int(many.sum()), device=counts.device) - (many.cumsum(0) - many).repeat_interleave(many)
+    nth = torch.arange(int(many.sum()), device=counts.device) - (many.cumsum(0) - many).repeat_interleave(
+        many
+    )
     return y.repeat_interleave(many), x.repeat_interleave(many), nth

@@ -8,7 +8,16 @@ import numpy as np
 from codesign.errors import FileFormatError
 from codesign.events.sources.frames import PICTURES, FrameSource, same_size
 
-BROKEN = (OSError, ValueError, SyntaxError, TypeError, KeyError, IndexError, EOFError, RuntimeError)  # what Pillow and tifffile raise on damaged files
+BROKEN = (
+    OSError,
+    ValueError,
+    SyntaxError,
+    TypeError,
+    KeyError,
+    IndexError,
+    EOFError,
+    RuntimeError,
+)  # what Pillow and tifffile raise on damaged files
 
 
 def open_folder(folder):
@@ -16,39 +25,70 @@ def open_folder(folder):
 
     Raises: FileFormatError for fewer than two pictures, and for a first one that cannot be read.
     """
-    paths = sorted((path for path in folder.iterdir() if path.suffix.lower() in PICTURES and not path.name.startswith(".")), key=natural)
+    paths = sorted(
+        (
+            path
+            for path in folder.iterdir()
+            if path.suffix.lower() in PICTURES and not path.name.startswith(".")
+        ),
+        key=natural,
+    )
     if len(paths) < 2:
-        raise FileFormatError(f"the folder {folder} holds {len(paths)} picture(s) ({', '.join(PICTURES)}); events need at least two.")
+        raise FileFormatError(
+            f"the folder {folder} holds {len(paths)} picture(s) ({', '.join(PICTURES)}); events need at "
+            "least two."
+        )
     kinds = sorted({path.suffix.lower() for path in paths})
     if len(kinds) > 1:
-        raise FileFormatError(f"the folder {folder} holds pictures of several kinds ({', '.join(kinds)}), whose order is not clear; leave one kind in it.")
+        raise FileFormatError(
+            f"the folder {folder} holds pictures of several kinds ({', '.join(kinds)}), whose order is not "
+            "clear; leave one kind in it."
+        )
     first = read_picture(paths[0])
     height, width = first.shape[:2]
 
     def read(start):
-        yield from same_size(((index, _alike(path, first)) for index, path in enumerate(paths[start:], start)), folder, first.shape, len(paths))
+        yield from same_size(
+            ((index, _alike(path, first)) for index, path in enumerate(paths[start:], start)),
+            folder,
+            first.shape,
+            len(paths),
+        )
 
-    return FrameSource(folder, len(paths), height, width, 255.0 if first.dtype == np.uint8 else 65535.0, None, "", read)
+    return FrameSource(
+        folder, len(paths), height, width, 255.0 if first.dtype == np.uint8 else 65535.0, None, "", read
+    )
 
 
 def natural(path):
     """Sort key of a file name that puts frame 2 before frame 10."""
-    return [(int(part), "") if part.isdigit() else (-1, part.lower()) for part in re.split(r"([0-9]+)", path.stem)], path.name
+    return [
+        (int(part), "") if part.isdigit() else (-1, part.lower()) for part in re.split(r"([0-9]+)", path.stem)
+    ], path.name
 
 
 def read_picture(path):
-    """One picture as stored: [H, W] or [H, W, 3], uint8 or uint16. Palettes become colours, black and white becomes 0 and 255.
+    """One picture as stored: [H, W] or [H, W, 3], uint8 or uint16. Palettes become colours, black and white
+    becomes 0 and 255.
 
-    Raises: FileFormatError when it cannot be read, holds several pages, is partly transparent, or is of another depth.
+    Raises: FileFormatError when it cannot be read, holds several pages, is partly transparent, or is of
+      another depth.
     """
     try:
         if path.suffix.lower() == ".png" and _is_deep_colour(path):
-            raise FileFormatError(f"{path} is a PNG in colour with 16 bits, which the reader would cut to 8; convert it to TIFF, or to gray.")
-        picture = np.asarray(iio.imread(path, plugin="tifffile" if path.suffix.lower().startswith(".tif") else "pillow"))
+            raise FileFormatError(
+                f"{path} is a PNG in colour with 16 bits, which the reader would cut to 8; convert it to "
+                "TIFF, or to gray."
+            )
+        picture = np.asarray(
+            iio.imread(path, plugin="tifffile" if path.suffix.lower().startswith(".tif") else "pillow")
+        )
     except FileFormatError:
         raise
     except BROKEN as error:
-        raise FileFormatError(f"{path} cannot be read as a picture ({error}); is it one, and whole?") from error
+        raise FileFormatError(
+            f"{path} cannot be read as a picture ({error}); is it one, and whole?"
+        ) from error
     if picture.dtype == bool:
         picture = picture.astype(np.uint8) * 255
     if picture.ndim == 3 and picture.shape[-1] in (2, 4):
@@ -56,15 +96,25 @@ def read_picture(path):
         if bool((picture[..., -1] != full).any()):
             raise FileFormatError(f"{path} is partly transparent; put it on a background first.")
         picture = picture[..., 0] if picture.shape[-1] == 2 else picture[..., :3]
-    if picture.dtype not in (np.uint8, np.uint16) or picture.ndim not in (2, 3) or (picture.ndim == 3 and picture.shape[-1] != 3):
-        raise FileFormatError(f"{path} holds {picture.dtype} {list(picture.shape)}; one page of 8 or 16 bits, gray or red, green, blue, is needed.")
+    if (
+        picture.dtype not in (np.uint8, np.uint16)
+        or picture.ndim not in (2, 3)
+        or (picture.ndim == 3 and picture.shape[-1] != 3)
+    ):
+        raise FileFormatError(
+            f"{path} holds {picture.dtype} {list(picture.shape)}; one page of 8 or 16 bits, gray or red, "
+            "green, blue, is needed."
+        )
     return picture
 
 
 def _alike(path, first):
     picture = read_picture(path)
     if picture.dtype != first.dtype:
-        raise FileFormatError(f"{path} has {8 * picture.dtype.itemsize} bits, the first picture {8 * first.dtype.itemsize}; all must have the same depth.")
+        raise FileFormatError(
+            f"{path} has {8 * picture.dtype.itemsize} bits, the first picture {8 * first.dtype.itemsize}; "
+            "all must have the same depth."
+        )
     return picture
 
 

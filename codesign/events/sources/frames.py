@@ -1,4 +1,5 @@
-"""Frames to make events of: a video, a folder of pictures, a stack of arrays, or a raw recording, opened alike and read piece by piece."""
+"""Frames to make events of: a video, a folder of pictures, a stack of arrays, or a raw recording, opened
+alike and read piece by piece."""
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
@@ -19,10 +20,13 @@ class FrameSource:
     """Frames that can be read in order, from any of them on.
 
     path: where they come from. count: number of frames. height_px, width_px: their size.
-    white: digital value of full scale: 255, 65535, that of the camera for .mraw, or 255 for floating-point stacks, which are taken to be on the 0-255 scale.
-    t_s: [count] float64 times since the first frame, seconds, as the container or the file has them; None where it has none.
+    white: digital value of full scale: 255, 65535, that of the camera for .mraw, or 255 for floating-point
+      stacks, which are taken to be on the 0-255 scale.
+    t_s: [count] float64 times since the first frame, seconds, as the container or the file has them; None
+      where it has none.
     clock: where t_s comes from, for people.
-    read: function from the index of a frame to an iterator over it and all later ones: [H, W] or [H, W, 3] (red, green, blue), as stored.
+    read: function from the index of a frame to an iterator over it and all later ones: [H, W] or [H, W, 3]
+      (red, green, blue), as stored.
     complaint: what the decoder found wrong with the file, empty when nothing.
     """
 
@@ -38,14 +42,18 @@ class FrameSource:
 
 
 def open_frames(path):
-    """Open a video file, a folder of pictures, a .npy or .npz stack, or a .mraw recording; frames are read when they are asked for.
+    """Open a video file, a folder of pictures, a .npy or .npz stack, or a .mraw recording; frames are read
+    when they are asked for.
 
     Args:
-      path: .mp4, .avi, .mov, .mkv, .webm, .gif …; a folder of PNG, JPEG, TIFF or BMP of 8 or 16 bits, taken in natural order (2 before 10);
-        .npy [T, H, W] or [T, H, W, 3]; .npz with one such array (called ``frames`` if there are several) and, if wanted, its times as ``t_s`` or ``t_us``;
+      path: .mp4, .avi, .mov, .mkv, .webm, .gif …; a folder of PNG, JPEG, TIFF or BMP of 8 or 16 bits, taken
+        in natural order (2 before 10);
+        .npy [T, H, W] or [T, H, W, 3]; .npz with one such array (called ``frames`` if there are several) and,
+        if wanted, its times as ``t_s`` or ``t_us``;
         .mraw with its .cihx or .cih beside it.
     Returns: FrameSource.
-    Raises: FileFormatError when there is nothing at the path, or nothing that can be read as at least two frames of one size.
+    Raises: FileFormatError when there is nothing at the path, or nothing that can be read as at least two
+      frames of one size.
     """
     from codesign.events.sources import folder, mraw, stack, video  # each needs FrameSource
 
@@ -60,21 +68,33 @@ def open_frames(path):
     if suffix == ".mraw":
         return mraw.open_mraw(path)
     if suffix in PICTURES:
-        raise FileFormatError(f"{path} is a single picture; events need at least two: give the folder with all of them.")
+        raise FileFormatError(
+            f"{path} is a single picture; events need at least two: give the folder with all of them."
+        )
     if suffix in VIDEOS:
         return video.open_video(path)
-    raise FileFormatError(f"{path} ends in {path.suffix or 'nothing'!r}; frames come from a folder of pictures, .npy, .npz, .mraw, or a video: {', '.join(VIDEOS)}.")
+    raise FileFormatError(
+        f"{path} ends in {path.suffix or 'nothing'!r}; frames come from a folder of pictures, .npy, .npz, "
+        f".mraw, or a video: {', '.join(VIDEOS)}."
+    )
 
 
 def same_size(frames, path, shape, count):
-    """Pass frames on while they have one shape. Raises: FileFormatError naming the first that differs, or the number of frames that are missing."""
+    """Pass frames on while they have one shape. Raises: FileFormatError naming the first that differs, or the
+    number of frames that are missing."""
     index = -1
     for index, frame in frames:
         if frame.shape != shape:
-            raise FileFormatError(f"frame {index} of {path} is {_size(frame.shape)}, the first is {_size(shape)}; all frames must have one size and kind.")
+            raise FileFormatError(
+                f"frame {index} of {path} is {_size(frame.shape)}, the first is {_size(shape)}; all frames "
+                "must have one size and kind."
+            )
         yield frame
     if index + 1 < count:
-        raise FileFormatError(f"{path} ends after frame {index + 1} of {count}; the file is damaged: use a whole copy, or stop earlier.")
+        raise FileFormatError(
+            f"{path} ends after frame {index + 1} of {count}; the file is damaged: use a whole copy, or "
+            "stop earlier."
+        )
 
 
 def times_from_fps(count, fps):

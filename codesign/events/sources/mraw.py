@@ -1,6 +1,7 @@
 """Frames of a Photron high-speed camera: raw values in .mraw, their description beside it in .cihx or .cih.
 
-Source: the published reader pyMRAW (github.com/ladisk/pyMRAW) for the names of the fields and the packing of 12 bits: two values in three bytes,
+Source: the published reader pyMRAW (github.com/ladisk/pyMRAW) for the names of the fields and the packing of
+  12 bits: two values in three bytes,
 the first in byte 0 and the upper half of byte 1.
 """
 
@@ -11,37 +12,78 @@ import numpy as np
 from codesign.errors import FileFormatError
 from codesign.events.sources.frames import FrameSource, same_size, times_from_fps
 
-XML = {"rate": "recordRate", "frames": "totalFrame", "width": "width", "height": "height", "bits": "bit", "depth": "depth", "side": "side"}
+XML = {
+    "rate": "recordRate",
+    "frames": "totalFrame",
+    "width": "width",
+    "height": "height",
+    "bits": "bit",
+    "depth": "depth",
+    "side": "side",
+}
 TEXT = {
-    "rate": "Record Rate(fps)", "frames": "Total Frame", "width": "Image Width", "height": "Image Height",
-    "bits": "Color Bit", "depth": "EffectiveBit Depth", "side": "EffectiveBit Side",
+    "rate": "Record Rate(fps)",
+    "frames": "Total Frame",
+    "width": "Image Width",
+    "height": "Image Height",
+    "bits": "Color Bit",
+    "depth": "EffectiveBit Depth",
+    "side": "EffectiveBit Side",
 }
 
 
 def open_mraw(path):
     """Open a monochrome recording of 8, 12 (packed) or 16 bits; its times follow from the record rate.
 
-    Full scale is that of the effective bits where they are the lower ones of what is stored, else that of the bits stored.
-    Raises: FileFormatError when the description is missing or incomplete, or the file is not as long as it says.
+    Full scale is that of the effective bits where they are the lower ones of what is stored, else that of the
+    bits stored.
+    Raises: FileFormatError when the description is missing or incomplete, or the file is not as long as it
+      says.
     """
     facts = _facts(path)
-    count, height, width, bits = (_number(facts, name, path) for name in ("frames", "height", "width", "bits"))
+    count, height, width, bits = (
+        _number(facts, name, path) for name in ("frames", "height", "width", "bits")
+    )
     rate = facts.get("rate", "").split("/")[0]
     if not rate.isdigit() or int(rate) == 0:
-        raise FileFormatError(f"the description of {path.name} gives the record rate {facts.get('rate')!r}; a whole number of frames per second is needed.")
+        raise FileFormatError(
+            f"the description of {path.name} gives the record rate {facts.get('rate')!r}; a whole number of "
+            "frames per second is needed."
+        )
     if bits not in (8, 12, 16) or width * height * bits % 8:
-        raise FileFormatError(f"{path} holds {width} x {height} pixels of {bits} bits; whole bytes of 8, 12 or 16 bits are read.")
+        raise FileFormatError(
+            f"{path} holds {width} x {height} pixels of {bits} bits; whole bytes of 8, 12 or 16 bits are "
+            "read."
+        )
     size = width * height * bits // 8
     if path.stat().st_size != count * size or count < 2:
-        raise FileFormatError(f"{path} has {path.stat().st_size} bytes; {count} frames (two or more) of {width} x {height} pixels and {bits} bits, monochrome, are {count * size}.")
+        raise FileFormatError(
+            f"{path} has {path.stat().st_size} bytes; {count} frames (two or more) of {width} x {height} "
+            f"pixels and {bits} bits, monochrome, are {count * size}."
+        )
     lower = facts.get("side", "").lower() == "lower" and facts.get("depth", "").isdigit()
     white = 2.0 ** (min(bits, int(facts["depth"])) if lower else bits) - 1
 
     def read(start):
-        frames = ((index, _values(np.fromfile(path, np.uint8, size, offset=index * size), bits).reshape(height, width)) for index in range(start, count))
+        frames = (
+            (
+                index,
+                _values(np.fromfile(path, np.uint8, size, offset=index * size), bits).reshape(height, width),
+            )
+            for index in range(start, count)
+        )
         yield from same_size(frames, path, (height, width), count)
 
-    return FrameSource(path, count, height, width, white, times_from_fps(count, int(rate)), f"record rate of the camera, {rate} frames per second", read)
+    return FrameSource(
+        path,
+        count,
+        height,
+        width,
+        white,
+        times_from_fps(count, int(rate)),
+        f"record rate of the camera, {rate} frames per second",
+        read,
+    )
 
 
 def _values(data, bits):
@@ -54,17 +96,25 @@ def _values(data, bits):
 
 
 def _facts(path):
-    for suffix, pattern, names in ((".cihx", r"<{}>\s*([^<]*?)\s*</", XML), (".cih", r"(?m)^{} : (.*?)\s*$", TEXT)):
+    for suffix, pattern, names in (
+        (".cihx", r"<{}>\s*([^<]*?)\s*</", XML),
+        (".cih", r"(?m)^{} : (.*?)\s*$", TEXT),
+    ):
         beside = path.with_suffix(suffix)
         if beside.is_file():
             # patterns and no parser: the XML stands behind other bytes, and nothing in it is ever expanded
             text = beside.read_text(encoding="latin-1")
             found = {name: re.search(pattern.format(re.escape(key)), text) for name, key in names.items()}
             return {name: match[1] for name, match in found.items() if match}
-    raise FileFormatError(f"{path} has no description beside it ({path.stem}.cihx or {path.stem}.cih), which says its size and frame rate; copy it there.")
+    raise FileFormatError(
+        f"{path} has no description beside it ({path.stem}.cihx or {path.stem}.cih), which says its size "
+        "and frame rate; copy it there."
+    )
 
 
 def _number(facts, name, path):
     if not facts.get(name, "").isdigit():
-        raise FileFormatError(f"the description of {path.name} gives {name} as {facts.get(name)!r}; a whole number is needed.")
+        raise FileFormatError(
+            f"the description of {path.name} gives {name} as {facts.get(name)!r}; a whole number is needed."
+        )
     return int(facts[name])

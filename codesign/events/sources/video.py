@@ -1,4 +1,5 @@
-"""Frames of a video file, decoded by FFmpeg one after the other, with the times that the container gives them."""
+"""Frames of a video file, decoded by FFmpeg one after the other, with the times that the container gives
+them."""
 
 import re
 import subprocess
@@ -14,9 +15,11 @@ from codesign.events.sources.frames import FrameSource, same_size
 
 
 def open_video(path):
-    """Open a video: it is decoded once to count its frames and read their times; the pictures themselves are decoded again when they are asked for.
+    """Open a video: it is decoded once to count its frames and read their times; the pictures themselves are
+    decoded again when they are asked for.
 
-    Times are exact multiples of the container's time base, also where the frame rate varies. Frames are those that FFmpeg decodes, in colour of 8 bits,
+    Times are exact multiples of the container's time base, also where the frame rate varies. Frames are those
+    that FFmpeg decodes, in colour of 8 bits,
     or of 16 for videos of more than 8; none is repeated or left out to reach an even rate.
     Raises: FileFormatError when FFmpeg finds no video in the file, or fewer than two frames.
     """
@@ -28,45 +31,92 @@ def open_video(path):
     height, width = first.shape[:2]
     white = 255.0 if first.dtype == np.uint8 else 65535.0
     even = bool((np.diff(t_s) > 0).all())
-    clock = f"{path.suffix[1:].upper()} container, {(len(t_s) - 1) / t_s[-1]:.6g} frames per second on average" if even else ""
+    clock = (
+        f"{path.suffix[1:].upper()} container, {(len(t_s) - 1) / t_s[-1]:.6g} frames per second on average"
+        if even
+        else ""
+    )
 
     def read(start):
         yield from same_size(enumerate(_decode(path, start), start), path, first.shape, len(t_s))
 
-    return FrameSource(path, len(t_s), height, width, white, torch.from_numpy(t_s) if even else None, clock, read, complaint)
+    return FrameSource(
+        path, len(t_s), height, width, white, torch.from_numpy(t_s) if even else None, clock, read, complaint
+    )
 
 
 def _times(path):
     """[T] seconds of every frame since the first, and what the decoder complained about.
 
-    Packets alone would be quicker to list, but a video that was cut without coding it again holds packets that are not shown.
+    Packets alone would be quicker to list, but a video that was cut without coding it again holds packets
+    that are not shown.
     """
-    times = ["-vf", "scale=2:2:flags=neighbor", "-fps_mode", "passthrough", "-enc_time_base", "demux", "-c:v", "rawvideo", "-f", "framecrc"]
+    times = [
+        "-vf",
+        "scale=2:2:flags=neighbor",
+        "-fps_mode",
+        "passthrough",
+        "-enc_time_base",
+        "demux",
+        "-c:v",
+        "rawvideo",
+        "-f",
+        "framecrc",
+    ]
     command = [*_ffmpeg(path), "-map", "0:v:0", *times, "-"]
-    done = subprocess.run(command, capture_output=True, check=False, stdin=subprocess.DEVNULL, start_new_session=True)
+    done = subprocess.run(
+        command, capture_output=True, check=False, stdin=subprocess.DEVNULL, start_new_session=True
+    )
     base = re.search(rb"#tb 0: (\d+)/(\d+)", done.stdout)
-    ticks = np.array([int(line.split(b",")[2]) for line in done.stdout.splitlines() if not line.startswith(b"#")], dtype=np.int64)
+    ticks = np.array(
+        [int(line.split(b",")[2]) for line in done.stdout.splitlines() if not line.startswith(b"#")],
+        dtype=np.int64,
+    )
     if done.returncode or base is None or not len(ticks):
-        raise FileFormatError(f"{path} cannot be read as a video ({_reason(done.stderr, path)}); is it one, and whole?")
+        raise FileFormatError(
+            f"{path} cannot be read as a video ({_reason(done.stderr, path)}); is it one, and whole?"
+        )
     # the quotient of two integers below 2^53 is rounded once: 1/3 s is the float nearest to it
-    return (ticks - ticks[0]) * int(base[1]) / int(base[2]), _reason(done.stderr, path) if done.stderr.strip() else ""
+    return (ticks - ticks[0]) * int(base[1]) / int(base[2]), _reason(
+        done.stderr, path
+    ) if done.stderr.strip() else ""
 
 
 def _decode(path, start):
-    """Frames from number ``start`` on; each comes with its own header, so that its size and depth are known and not assumed."""
-    # autoscale off: a video that changes its size is not brought to one in silence; passthrough: no frame is repeated or dropped
+    """Frames from number ``start`` on; each comes with its own header, so that its size and depth are known
+    and not assumed."""
+    # autoscale off: a video that changes its size is not brought to one in silence; passthrough: no frame is
+    # repeated or dropped
     chosen = ["-vf", rf"select=gte(n\,{start})"] if start else []
-    command = [*_ffmpeg(path), "-map", "0:v:0", *chosen, "-fps_mode", "passthrough", "-noautoscale", "-c:v", "ppm", "-f", "image2pipe", "-"]
+    command = [
+        *_ffmpeg(path),
+        "-map",
+        "0:v:0",
+        *chosen,
+        "-fps_mode",
+        "passthrough",
+        "-noautoscale",
+        "-c:v",
+        "ppm",
+        "-f",
+        "image2pipe",
+        "-",
+    ]
     with tempfile.TemporaryFile() as notes:
         # a group of its own: Ctrl-C then ends the run between two steps, not the decoder in the middle of one
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=notes, stdin=subprocess.DEVNULL, start_new_session=True) as process:
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=notes, stdin=subprocess.DEVNULL, start_new_session=True
+        ) as process:
             try:
                 assert process.stdout is not None
                 while (frame := _picture(process.stdout)) is not None:
                     yield frame
                 if process.wait():
                     notes.seek(0)
-                    raise FileFormatError(f"{path} cannot be decoded further ({_reason(notes.read(), path)}); use a whole copy, or stop earlier.")
+                    raise FileFormatError(
+                        f"{path} cannot be decoded further ({_reason(notes.read(), path)}); use a whole "
+                        "copy, or stop earlier."
+                    )
             finally:
                 process.kill()
 
@@ -84,10 +134,24 @@ def _picture(pipe):
 
 
 def _ffmpeg(path):
-    # "file:" keeps a name with a colon from being taken for a protocol, and the list keeps playlists inside the machine
-    return [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-protocol_whitelist", "file,pipe", "-i", f"file:{path}"]
+    # "file:" keeps a name with a colon from being taken for a protocol, and the list keeps playlists inside
+    # the machine
+    return [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-v",
+        "error",
+        "-nostdin",
+        "-protocol_whitelist",
+        "file,pipe",
+        "-i",
+        f"file:{path}",
+    ]
 
 
 def _reason(notes, path):
     lines = [line.strip() for line in notes.decode(errors="replace").splitlines() if line.strip()]
-    return re.sub(r"\[[^]]*\]\s*", "", lines[0]).replace(f"file:{path}", "the file").rstrip(".") if lines else "no picture found"
+    return (
+        re.sub(r"\[[^]]*\]\s*", "", lines[0]).replace(f"file:{path}", "the file").rstrip(".")
+        if lines
+        else "no picture found"
+    )

@@ -1,4 +1,5 @@
-"""From the level that a pixel sees to its events: the memorised-reference layer, the coupled spike response layer, or a pixel with dead time."""
+"""From the level that a pixel sees to its events: the memorised-reference layer, the coupled spike response
+layer, or a pixel with dead time."""
 
 import torch
 
@@ -12,18 +13,31 @@ from codesign.events.spiking.surrogate import FastSigmoid
 def count_memorised(level, t_s, theta, state, refractory_s):
     """Counts of ``events.memory``, or, with a dead time, those of ``events.sensor_counts``.
 
-    Args: level: [T, ...]. t_s: [T]. theta: [2]. state: what an earlier call returned, or None. refractory_s: 0-dim tensor > 0, or None.
-    Returns: counts [T-1, 2, ...] ([T, 2, ...] with a state); state to carry on. Gradient: by the play of ``events.memory``.
+    Args: level: [T, ...]. t_s: [T]. theta: [2]. state: what an earlier call returned, or None. refractory_s:
+      0-dim tensor > 0, or None.
+    Returns: counts [T-1, 2, ...] ([T, 2, ...] with a state); state to carry on. Gradient: by the play of
+      ``events.memory``.
     """
     if refractory_s is None:
         return memory(level, theta[0], theta[1], state=state, log_input=True)
-    return sensor_counts(level, t_s, SensorModel(), state=state, log_input=True, theta_on=theta[0], theta_off=theta[1], refractory_s=refractory_s)
+    return sensor_counts(
+        level,
+        t_s,
+        SensorModel(),
+        state=state,
+        log_input=True,
+        theta_on=theta[0],
+        theta_off=theta[1],
+        refractory_s=refractory_s,
+    )
 
 
 def count_spikes(level, t_s, theta, state, refractory_s):
-    """At most one event per step and polarity: a spike response layer with step kernels and coupled polarities, which memorises the same level.
+    """At most one event per step and polarity: a spike response layer with step kernels and coupled
+    polarities, which memorises the same level.
 
-    Gradient: by a fast sigmoid of width theta, through the reset where it cannot grow. It has no dead time; refractory_s must be None.
+    Gradient: by a fast sigmoid of width theta, through the reset where it cannot grow. It has no dead time;
+      refractory_s must be None.
     """
     start, neurons = (level[:1], None) if state is None else (state[0][None], state[1])
     step = torch.cat((start, level if state is not None else level[1:])).diff(dim=0)

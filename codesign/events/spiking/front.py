@@ -1,4 +1,5 @@
-"""The learnable front end of Spike-ESIM: noise prefilter, tone curve, bandwidth. Each is exactly the identity before it is trained."""
+"""The learnable front end of Spike-ESIM: noise prefilter, tone curve, bandwidth. Each is exactly the identity
+before it is trained."""
 
 import math
 
@@ -10,11 +11,14 @@ from codesign.events.intensity import light_share
 from codesign.events.layers.low_pass import fading_mean
 
 KNOTS = 6
-DARKEST, BRIGHTEST = 0.0, math.log(256.0)  # log levels between which the tone curve bends
+# log levels between which the tone curve bends
+DARKEST = 0.0
+BRIGHTEST = math.log(256.0)
 
 
 class Prefilter(nn.Module):
-    """Spatial 3x3 filter of the log level with unit gain for an even picture; ``weight`` is what it adds to the identity, less its mean."""
+    """Spatial 3x3 filter of the log level with unit gain for an even picture; ``weight`` is what it adds to
+    the identity, less its mean."""
 
     def __init__(self):
         super().__init__()
@@ -29,7 +33,8 @@ class Prefilter(nn.Module):
 
 
 class ToneCurve(nn.Module):
-    """Monotone change of the level: slope exp(w_k) in each of six stretches of log level, so gain per intensity. Stands also for a dark offset."""
+    """Monotone change of the level: slope exp(w_k) in each of six stretches of log level, so gain per
+    intensity. Stands also for a dark offset."""
 
     def __init__(self):
         super().__init__()
@@ -44,9 +49,11 @@ class ToneCurve(nn.Module):
 
 
 class Bandwidth(nn.Module):
-    """One-pole low-pass of the level, mixed in by ``gate``: 0 leaves the level as it is, 1 is a photoreceptor.
+    """One-pole low-pass of the level, mixed in by ``gate``: 0 leaves the level as it is, 1 is a
+    photoreceptor.
 
-    The corner frequency is f light^p with light = (I + 20)/275; f and p are learnt, p starts at 1 (photocurrent sets the bandwidth).
+    The corner frequency is f light^p with light = (I + 20)/275; f and p are learnt, p starts at 1
+    (photocurrent sets the bandwidth).
     """
 
     def __init__(self, cutoff_hz=100.0):
@@ -56,7 +63,8 @@ class Bandwidth(nn.Module):
         self.power = nn.Parameter(torch.ones(()))
 
     def advance(self, filtered, before, now, intensity, interval_s):
-        """The filter after an interval over which the level runs linearly from ``before`` to ``now``; intensity: mean over the interval."""
+        """The filter after an interval over which the level runs linearly from ``before`` to ``now``;
+        intensity: mean over the interval."""
         light = light_share(intensity)
         pace = (2 * math.pi * interval_s) * torch.exp(self.log_cutoff + self.power * light.log())
         return now + (filtered - before) * torch.exp(-pace) - (now - before) * fading_mean(pace)

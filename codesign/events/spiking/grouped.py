@@ -1,4 +1,5 @@
-"""A picture-by-picture function over time, in groups of one size, so that chunks of time round as the whole does."""
+"""A picture-by-picture function over time, in groups of one size, so that chunks of time round as the whole
+does."""
 
 import torch
 import torch.nn.functional as F
@@ -9,7 +10,8 @@ GROUP = 8
 def grouped(function, pictures):
     """Apply ``function`` to all pictures of a sequence.
 
-    A convolution may choose its algorithm by the number of pictures it gets; it always gets GROUP steps here, the last ones filled up with zeros.
+    A convolution may choose its algorithm by the number of pictures it gets; it always gets GROUP steps here,
+    the last ones filled up with zeros.
 
     Args: function: [N, C, H, W] to [N, C', H, W], each picture for itself. pictures: [T, B, C, H, W].
     Returns: [T, B, C', H, W]. Gradient: pictures and what the function holds.

@@ -1,4 +1,5 @@
-"""Mean rate of noise events per polarity and light: what no generator can foresee pixel by pixel, but has to give in number."""
+"""Mean rate of noise events per polarity and light: what no generator can foresee pixel by pixel, but has to
+give in number."""
 
 import torch
 from torch import nn
@@ -7,7 +8,8 @@ from codesign.events.intensity import light_share
 
 
 class NoiseRate(nn.Module):
-    """rate = a exp(-b light) events per pixel and second, light = (I + 20)/275, one a per polarity; a starts at 0.
+    """rate = a exp(-b light) events per pixel and second, light = (I + 20)/275, one a per polarity; a starts
+    at 0.
 
     amplitude_hz below 0 counts as 0 but keeps its gradient, so that it finds its way back.
     """

@@ -1,4 +1,5 @@
-"""Spike-ESIM: an event generator that starts as the ideal memorised-reference sensor and learns what a real one does differently."""
+"""Spike-ESIM: an event generator that starts as the ideal memorised-reference sensor and learns what a real
+one does differently."""
 
 import math
 from dataclasses import dataclass
@@ -24,7 +25,8 @@ SLOW_S = 0.05  # time constant of the slow level that the residual branch compar
 class SpikeEsimState:
     """What Spike-ESIM carries over chunks; it keeps its graph.
 
-    level, filtered, slow: [B, 1, H, W] level behind the tone curve, behind the bandwidth, and a slow mean of it. frame: [...] last frame, time_s its time.
+    level, filtered, slow: [B, 1, H, W] level behind the tone curve, behind the bandwidth, and a slow mean of
+      it. frame: [...] last frame, time_s its time.
     comparator: state of the comparator.
     """
 
@@ -37,24 +39,51 @@ class SpikeEsimState:
 
 
 class SpikeEsim(nn.Module):
-    """Frames to events: log level, prefilter, tone curve, bandwidth, residual branch, and a comparator with a memorised level per pixel.
+    """Frames to events: log level, prefilter, tone curve, bandwidth, residual branch, and a comparator with a
+    memorised level per pixel.
 
-    Untrained it is the ideal sensor of the given thresholds, exactly: every learnt part starts as the identity or at zero effect.
+    Untrained it is the ideal sensor of the given thresholds, exactly: every learnt part starts as the
+    identity or at zero effect.
 
-    theta_on, theta_off: contrast thresholds > 0, natural log units. refractory_s: dead time, 0 for none; learnt when above 0. cutoff_hz: corner frequency
-      at full light that the bandwidth starts to learn from. comparator: "memory" (any number of events per interval) or "srm" (coupled spike response
+    theta_on, theta_off: contrast thresholds > 0, natural log units. refractory_s: dead time, 0 for none;
+      learnt when above 0. cutoff_hz: corner frequency
+      at full light that the bandwidth starts to learn from. comparator: "memory" (any number of events per
+      interval) or "srm" (coupled spike response
       layer, at most one per step and polarity). width, depth: of the residual branch. seed: of its weights.
     """
 
-    def __init__(self, theta_on=0.2, theta_off=0.2, *, refractory_s=0.0, cutoff_hz=100.0, comparator="memory", width=6, depth=1, seed=0):
+    def __init__(
+        self,
+        theta_on=0.2,
+        theta_off=0.2,
+        *,
+        refractory_s=0.0,
+        cutoff_hz=100.0,
+        comparator="memory",
+        width=6,
+        depth=1,
+        seed=0,
+    ):
         super().__init__()
         if comparator not in COMPARATORS:
             raise DomainError(f"comparator is {comparator!r}; allowed: {', '.join(map(repr, COMPARATORS))}.")
-        for name, value, least in (("theta_on", theta_on, 1e-6), ("theta_off", theta_off, 1e-6), ("refractory_s", refractory_s, 0.0), ("cutoff_hz", cutoff_hz, 1e-6)):
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not least <= value < math.inf:
+        for name, value, least in (
+            ("theta_on", theta_on, 1e-6),
+            ("theta_off", theta_off, 1e-6),
+            ("refractory_s", refractory_s, 0.0),
+            ("cutoff_hz", cutoff_hz, 1e-6),
+        ):
+            if (
+                isinstance(value, bool)
+                or not isinstance(value, (int, float))
+                or not least <= value < math.inf
+            ):
                 raise DomainError(f"{name} is {value!r}; give a finite number of at least {least:g}.")
         if comparator == "srm" and refractory_s > 0:
-            raise DomainError(f"refractory_s is {refractory_s!r}, but the comparator 'srm' has no dead time; choose 'memory', or refractory_s=0.")
+            raise DomainError(
+                f"refractory_s is {refractory_s!r}, but the comparator 'srm' has no dead time; choose "
+                "'memory', or refractory_s=0."
+            )
         self.settings = {
             "theta_on": theta_on,
             "theta_off": theta_off,
@@ -65,14 +94,22 @@ class SpikeEsim(nn.Module):
             "depth": depth,
             "seed": seed,
         }
-        self.log_gain = nn.Parameter(torch.zeros(2, dtype=torch.float64))  # of the thresholds, so that 0 is the given one exactly
+        self.log_gain = nn.Parameter(
+            torch.zeros(2, dtype=torch.float64)
+        )  # of the thresholds, so that 0 is the given one exactly
         self.log_dead = nn.Parameter(torch.zeros((), dtype=torch.float64)) if refractory_s > 0 else None
-        self.prefilter, self.tone, self.bandwidth = Prefilter(), ToneCurve(), Bandwidth(cutoff_hz)
-        self.branch, self.noise_rate = ResidualBranch(width, depth, seed), NoiseRate()
+        self.prefilter = Prefilter()
+        self.tone = ToneCurve()
+        self.bandwidth = Bandwidth(cutoff_hz)
+        self.branch = ResidualBranch(width, depth, seed)
+        self.noise_rate = NoiseRate()
 
     def thetas(self):
         """Thresholds ON and OFF as they are now: [2] float64, natural log units."""
-        return torch.tensor((self.settings["theta_on"], self.settings["theta_off"]), dtype=torch.float64) * self.log_gain.exp()
+        return (
+            torch.tensor((self.settings["theta_on"], self.settings["theta_off"]), dtype=torch.float64)
+            * self.log_gain.exp()
+        )
 
     def refractory_s(self):
         """Dead time as it is now, 0-dim tensor, or None when there is none."""
@@ -82,24 +119,37 @@ class SpikeEsim(nn.Module):
         """Events of the frames, without noise.
 
         Args:
-          frames: [T, H, W] or [T, B, H, W] linear intensity on the 0-255 scale, finite, >= 0. t_s: [T] seconds.
+          frames: [T, H, W] or [T, B, H, W] linear intensity on the 0-255 scale, finite, >= 0. t_s: [T]
+            seconds.
           state: SpikeEsimState of the chunk before; then T frames give T intervals. None: T frames give T-1.
-          theta_scale: factor on both thresholds for this call, a number or [2] tensor (ON, OFF): sensitivity at test time.
-        Returns: counts [T-1, 2, ...] whole numbers, ON first; state to carry on. Chunks equal the whole bit for bit.
+          theta_scale: factor on both thresholds for this call, a number or [2] tensor (ON, OFF): sensitivity
+            at test time.
+        Returns: counts [T-1, 2, ...] whole numbers, ON first; state to carry on. Chunks equal the whole bit
+          for bit.
         Gradient: every parameter but the noise rates, and frames; through the comparator.
-        Raises: ShapeError, DomainError for frames, times or scales that cannot be (NaN and infinity among them).
+        Raises: ShapeError, DomainError for frames, times or scales that cannot be (NaN and infinity among
+          them).
         """
         frames, times_s = _checked(frames, t_s, state)
         scale = torch.as_tensor(theta_scale, dtype=torch.float64)
         if scale.shape not in ((), (2,)) or not bool((scale.isfinite() & (scale > 0)).all()):
-            raise DomainError(f"theta_scale is {theta_scale!r}; a finite factor > 0, or one each for ON and OFF, is needed.")
+            raise DomainError(
+                f"theta_scale is {theta_scale!r}; a finite factor > 0, or one each for ON and OFF, is needed."
+            )
         seen, after = self._levels(frames, times_s, state)
         compare = COMPARATORS[self.settings["comparator"]]
-        counts, comparator = compare(seen, times_s[-len(seen) :], self.thetas() * scale, None if state is None else state.comparator, self.refractory_s())
+        counts, comparator = compare(
+            seen,
+            times_s[-len(seen) :],
+            self.thetas() * scale,
+            None if state is None else state.comparator,
+            self.refractory_s(),
+        )
         return counts, SpikeEsimState(*after, frames[-1], float(times_s[-1]), comparator)
 
     def expected_noise(self, frames, t_s, state=None):
-        """Mean number of noise events per interval, [T-1, 2, ...] ([T, 2, ...] with a state), ON first. Gradient: the noise rates, frames."""
+        """Mean number of noise events per interval, [T-1, 2, ...] ([T, 2, ...] with a state), ON first.
+        Gradient: the noise rates, frames."""
         frames, times_s = _checked(frames, t_s, state)
         if state is not None:
             frames = torch.cat((state.frame[None], frames))
@@ -108,7 +158,8 @@ class SpikeEsim(nn.Module):
 
     @torch.no_grad()
     def draw(self, frames, t_s, generator, state=None, *, theta_scale=1.0):
-        """Hard events with noise: ``forward`` plus a Poisson draw of ``expected_noise``. Returns counts and state."""
+        """Hard events with noise: ``forward`` plus a Poisson draw of ``expected_noise``. Returns counts and
+        state."""
         noise = torch.poisson(self.expected_noise(frames, t_s, state), generator=generator)
         counts, after = self(frames, t_s, state, theta_scale=theta_scale)
         return counts + noise, after
@@ -119,26 +170,40 @@ class SpikeEsim(nn.Module):
 
     @classmethod
     def load(cls, path):
-        """A generator that ``save`` wrote. Raises: FileFormatError when the file is missing, damaged or of another kind."""
+        """A generator that ``save`` wrote. Raises: FileFormatError when the file is missing, damaged or of
+        another kind."""
         return read_generator(path, cls)
 
     def _levels(self, frames, times_s, state):
         """What the comparators see, [T, ...], and (level, filtered, slow) after the last frame."""
         intensity = frames.reshape(len(frames), -1, *frames.shape[-2:])
-        log_level = torch.stack([lin_log(picture[None])[0] for picture in intensity])  # one by one: logarithms of vectors round by their place
+        log_level = torch.stack(
+            [lin_log(picture[None])[0] for picture in intensity]
+        )  # one by one: logarithms of vectors round by their place
         levels = grouped(lambda pictures: self.tone(self.prefilter(pictures)), log_level[:, :, None])
         if state is None:
-            filtered, slow, before, light, rest = levels[0], levels[0], levels[0], intensity[0], levels[1:]
+            filtered = levels[0]
+            slow = levels[0]
+            before = levels[0]
+            light = intensity[0]
+            rest = levels[1:]
         else:
-            filtered, slow, before, light, rest = state.filtered, state.slow, state.level, state.frame.reshape(intensity.shape[1:]), levels
+            filtered = state.filtered
+            slow = state.slow
+            before = state.level
+            light = state.frame.reshape(intensity.shape[1:])
+            rest = levels
         follow = [(filtered, slow)] if state is None else []
         for now, picture, step_s in zip(rest, intensity[-len(rest) :], times_s.diff().tolist(), strict=True):
             filtered = self.bandwidth.advance(filtered, before, now, (light + picture)[:, None] / 2, step_s)
             slow = now + (slow - now) * math.exp(-step_s / SLOW_S)
             follow.append((filtered, slow))
-            before, light = now, picture
+            before = now
+            light = picture
         low, mean = (torch.stack(pictures) for pictures in zip(*follow, strict=True))
-        pictures = torch.cat((levels / 4 - 1, 4 * (levels - low), 2 * (levels - mean)), dim=2)  # of the order of 1
+        pictures = torch.cat(
+            (levels / 4 - 1, 4 * (levels - low), 2 * (levels - mean)), dim=2
+        )  # of the order of 1
         seen = self.bandwidth.mixed(levels, low) + grouped(self.branch, pictures)
         return seen.reshape(frames.shape), (before, filtered, slow)
 
@@ -147,13 +212,23 @@ def _checked(frames, t_s, state):
     """Frames as given and the times of all frames seen by this call, that of the state's last frame first."""
     check_frames(frames, 2 if state is None else 1)
     if frames.ndim not in (3, 4) or min(frames.shape[-2:]) < 2:
-        raise ShapeError(f"frames have shape {list(frames.shape)}; [T, H, W] or [T, B, H, W] of at least 2 x 2 pixels is needed.")
+        raise ShapeError(
+            f"frames have shape {list(frames.shape)}; [T, H, W] or [T, B, H, W] of at least 2 x 2 pixels is "
+            "needed."
+        )
     times_s = check_times(t_s, len(frames))
     if state is None:
         return frames, times_s
     if state.frame.shape != frames.shape[1:] or state.frame.dtype != frames.dtype:
-        given, wanted = f"{frames.dtype} {list(frames.shape[1:])}", f"{state.frame.dtype} {list(state.frame.shape)}"
-        raise ShapeError(f"frames of {given} follow frames of {wanted}; a generator keeps its frame size and type over chunks.")
+        given = f"{frames.dtype} {list(frames.shape[1:])}"
+        wanted = f"{state.frame.dtype} {list(state.frame.shape)}"
+        raise ShapeError(
+            f"frames of {given} follow frames of {wanted}; a generator keeps its frame size and type over "
+            "chunks."
+        )
     if float(times_s[0]) <= state.time_s:
-        raise DomainError(f"the chunk starts at {float(times_s[0])!r} s, the last frame seen was at {state.time_s!r} s; times must go on increasing.")
+        raise DomainError(
+            f"the chunk starts at {float(times_s[0])!r} s, the last frame seen was at {state.time_s!r} s; "
+            "times must go on increasing."
+        )
     return frames, torch.cat((torch.tensor([state.time_s], dtype=torch.float64), times_s))

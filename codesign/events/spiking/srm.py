@@ -1,4 +1,5 @@
-"""The spike response model as an event layer: exact kernels by recursion, learnable thresholds and time constants, explicit state."""
+"""The spike response model as an event layer: exact kernels by recursion, learnable thresholds and time
+constants, explicit state."""
 
 import math
 import warnings
@@ -37,70 +38,129 @@ def srm(
     truncation=None,
     nonfinite="raise",
 ):
-    """Spikes s_t = [u_t >= theta] of the potential u_t = (response of the drive)_t + sum over k >= 1 of nu_k s_{t-k}; a tie u_t = theta spikes.
+    """Spikes s_t = [u_t >= theta] of the potential u_t = (response of the drive)_t + sum over k >= 1 of nu_k
+    s_{t-k}; a tie u_t = theta spikes.
 
     Args:
-      drive: [T, ...] float32 or float64, any pixel shape; without a response it is the synaptic potential itself, in the units of theta.
-      theta: threshold > 0; scalar or broadcasting over one frame, learnable or not, as are the time constants.
+      drive: [T, ...] float32 or float64, any pixel shape; without a response it is the synaptic potential
+        itself, in the units of theta.
+      theta: threshold > 0; scalar or broadcasting over one frame, learnable or not, as are the time
+        constants.
       tau_s: time constant of the alpha response, in the unit of dt; only ``response="alpha"`` uses it.
       tau_r: time constant of the reset kernel, in the unit of dt; every reset kernel but "step" uses it.
       dt: length of a step.
-      kernel: reset, with amplitude A = reset_scale * theta and h = k dt / tau_r: "slayer" nu_k = -A h exp(1 - h); "thesis" -A exp(1 - h);
+      kernel: reset, with amplitude A = reset_scale * theta and h = k dt / tau_r: "slayer" nu_k = -A h exp(1 -
+        h); "thesis" -A exp(1 - h);
         "exp" -A exp(-(k - 1) dt / tau_r); "step" -A.
       state: SrmState of the chunk before; None: at rest.
-      response: "none"; "alpha": kernel (k dt / tau_s) exp(1 - k dt / tau_s), k >= 1, not multiplied by dt; "step": the sum of all drives so far.
-      coupled: drive is [T, 2, ...], ON first, and the reset of one polarity is added with the other sign to the other. With ``kernel="step"``,
-        ``response="step"``, ``reset_scale=1`` and log-intensity steps as drive (ON +, OFF -) this is the memorised-reference event model.
-      surrogate: Laplace, FastSigmoid or Triangular; None: Laplace of unit mass and width mean(theta), that is alpha = 2 theta, beta = 1 / theta.
-      through_reset: gradient of a spike by way of the resets it causes: "off" (as SLAYER), "full", or "bounded", in which rho there is at most
+      response: "none"; "alpha": kernel (k dt / tau_s) exp(1 - k dt / tau_s), k >= 1, not multiplied by dt;
+        "step": the sum of all drives so far.
+      coupled: drive is [T, 2, ...], ON first, and the reset of one polarity is added with the other sign to
+        the other. With ``kernel="step"``,
+        ``response="step"``, ``reset_scale=1`` and log-intensity steps as drive (ON +, OFF -) this is the
+        memorised-reference event model.
+      surrogate: Laplace, FastSigmoid or Triangular; None: Laplace of unit mass and width mean(theta), that is
+        alpha = 2 theta, beta = 1 / theta.
+      through_reset: gradient of a spike by way of the resets it causes: "off" (as SLAYER), "full", or
+        "bounded", in which rho there is at most
         0.9 / sum|nu|, so that the adjoint cannot grow.
-      smooth: replace the spike by the surrogate's integral: the smooth twin, whose gradient with "full" is exact.
-      segment: steps per segment. Potentials are then recomputed in the backward pass from the states kept between segments: O(sqrt(T)) memory at about sqrt(8 T).
-      truncation: cut both kernels where they fall below this value after their time constant, as SLAYER does at 0.01; None: whole kernels.
+      smooth: replace the spike by the surrogate's integral: the smooth twin, whose gradient with "full" is
+        exact.
+      segment: steps per segment. Potentials are then recomputed in the backward pass from the states kept
+        between segments: O(sqrt(T)) memory at about sqrt(8 T).
+      truncation: cut both kernels where they fall below this value after their time constant, as SLAYER does
+        at 0.01; None: whole kernels.
       nonfinite: "raise", or "zero": NaN and infinite drives count as 0 and get no gradient.
     Returns:
       spikes, potential: [T, ...] as ``drive``; spikes are 0 or 1.
-      state: SrmState to carry on. The recursion runs in float64 whatever the drive, and chunks equal the whole bit for bit.
-    Gradient: drive, theta, tau_s, tau_r, state; spikes by the surrogate. theta and tau_r act through the reset amplitude with spikes held, also when
+      state: SrmState to carry on. The recursion runs in float64 whatever the drive, and chunks equal the
+        whole bit for bit.
+    Gradient: drive, theta, tau_s, tau_r, state; spikes by the surrogate. theta and tau_r act through the
+      reset amplitude with spikes held, also when
       through_reset is "off". Second derivatives raise.
-    Raises: ShapeError for T = 0, no pixel, shapes that do not fit; DomainError for thresholds, time constants or dt that are not positive, unknown
-      names, NaN or infinite drive; NonFiniteError when a finite drive overflows. Warns (RuntimeWarning) when "full" breaks max rho * sum|nu| < 1.
-    Source: Gerstner and Kistler, Spiking Neuron Models, 2002, section 4.2; Shrestha and Orchard, SLAYER, NeurIPS 2018.
+    Raises: ShapeError for T = 0, no pixel, shapes that do not fit; DomainError for thresholds, time constants
+      or dt that are not positive, unknown
+      names, NaN or infinite drive; NonFiniteError when a finite drive overflows. Warns (RuntimeWarning) when
+      "full" breaks max rho * sum|nu| < 1.
+    Source: Gerstner and Kistler, Spiking Neuron Models, 2002, section 4.2; Shrestha and Orchard, SLAYER,
+      NeurIPS 2018.
     """
     drive = _checked_drive(drive, nonfinite, truncation)
     pixels = drive.shape[1:]
     if coupled and (not pixels or pixels[0] != 2):
-        raise ShapeError(f"coupled polarities need a drive of shape [T, 2, ...], ON first, got {list(drive.shape)}; stack the two drives on axis 1.")
+        raise ShapeError(
+            f"coupled polarities need a drive of shape [T, 2, ...], ON first, got {list(drive.shape)}; "
+            "stack the two drives on axis 1."
+        )
     _choice("kernel", kernel, RESETS)
     _choice("response", response, RESPONSES)
     _choice("through_reset", through_reset, THROUGH_RESET)
-    dt, reset_scale = _number("dt", dt, least=0, strict=True), _number("reset_scale", reset_scale, least=0)
+    dt = _number("dt", dt, least=0, strict=True)
+    reset_scale = _number("reset_scale", reset_scale, least=0)
     theta = per_pixel(theta, "theta", drive)
     tau_s = per_pixel(tau_s, "tau_s", drive) if response == "alpha" else None
     tau_r = per_pixel(tau_r, "tau_r", drive) if kernel != "step" else torch.ones_like(theta)
     if surrogate is None:
         surrogate = Laplace.unit(float(theta.detach().mean()))
     elif not isinstance(surrogate, Surrogate):
-        raise DomainError(f"surrogate is {surrogate!r}; pass events.Laplace, events.FastSigmoid or events.Triangular.")
-    plan = Plan(RESPONSES[response], RESETS[kernel], 2 if coupled else 1, type(surrogate), bool(smooth), through_reset, nonfinite == "zero")
+        raise DomainError(
+            f"surrogate is {surrogate!r}; pass events.Laplace, events.FastSigmoid or events.Triangular."
+        )
+    plan = Plan(
+        RESPONSES[response],
+        RESETS[kernel],
+        2 if coupled else 1,
+        type(surrogate),
+        bool(smooth),
+        through_reset,
+        nonfinite == "zero",
+    )
     setup = Setup(plan, kernel, reset_scale, surrogate, _segment(segment), tuple(drive.shape))
     h_reset = dt / tau_r
     if through_reset == "full" and torch.is_grad_enabled():
         _warn_if_unstable(setup, theta.detach(), h_reset.detach(), drive.shape[0])
     if truncation is not None:
         if segment is not None:
-            raise DomainError("segment does not go with truncation, whose kernels have no states to begin a segment from; leave one of them out.")
-        return run_truncated(setup, drive, theta, None if tau_s is None else dt / tau_s, h_reset, state, _number("truncation", truncation, least=0, strict=True))
+            raise DomainError(
+                "segment does not go with truncation, whose kernels have no states to begin a segment from; "
+                "leave one of them out."
+            )
+        return run_truncated(
+            setup,
+            drive,
+            theta,
+            None if tau_s is None else dt / tau_s,
+            h_reset,
+            state,
+            _number("truncation", truncation, least=0, strict=True),
+        )
     if drive.numel() >= 2**32:
-        raise ShapeError(f"drive holds {drive.numel()} values, a call addresses up to 2**32; give it in chunks of time and carry the state.")
+        raise ShapeError(
+            f"drive holds {drive.numel()} values, a call addresses up to 2**32; give it in chunks of time "
+            "and carry the state."
+        )
     state = entering_state(state, (STATES[plan.response], STATES[plan.reset]), pixels, drive.device)
 
     def lanes(x):
         return x.expand(pixels).reshape(plan.channels, -1).contiguous()
 
-    states = [rows.reshape(rows.shape[0], plan.channels, pixels.numel() // plan.channels) for rows in (state.response, state.reset)]
-    spikes, potential, *after = run(setup, drive.reshape(drive.shape[0], plan.channels, -1), lanes(theta), None if tau_s is None else lanes(dt / tau_s), lanes(h_reset), *states)
-    return spikes.view(drive.shape), potential.view(drive.shape), SrmState(*(rows.reshape(rows.shape[0], *pixels) for rows in after))
+    states = [
+        rows.reshape(rows.shape[0], plan.channels, pixels.numel() // plan.channels)
+        for rows in (state.response, state.reset)
+    ]
+    spikes, potential, *after = run(
+        setup,
+        drive.reshape(drive.shape[0], plan.channels, -1),
+        lanes(theta),
+        None if tau_s is None else lanes(dt / tau_s),
+        lanes(h_reset),
+        *states,
+    )
+    return (
+        spikes.view(drive.shape),
+        potential.view(drive.shape),
+        SrmState(*(rows.reshape(rows.shape[0], *pixels) for rows in after)),
+    )
 
 
 def per_pixel(value, name, drive):
@@ -110,10 +170,16 @@ def per_pixel(value, name, drive):
     """
     if isinstance(value, bool) or not isinstance(value, (Tensor, float, int)):
         raise DomainError(f"{name} is {value!r}; give a number or a tensor, > 0.")
-    value, pixels = torch.as_tensor(value, dtype=torch.float64, device=drive.device), drive.shape[1:]
-    fits = value.ndim <= len(pixels) and all(a in (1, b) for a, b in zip(reversed(value.shape), reversed(pixels), strict=False))
+    value = torch.as_tensor(value, dtype=torch.float64, device=drive.device)
+    pixels = drive.shape[1:]
+    fits = value.ndim <= len(pixels) and all(
+        a in (1, b) for a, b in zip(reversed(value.shape), reversed(pixels), strict=False)
+    )
     if not fits or value.numel() == 0:
-        raise ShapeError(f"{name} has shape {list(value.shape)}; it must be a scalar or fit the pixel shape {list(pixels)}.")
+        raise ShapeError(
+            f"{name} has shape {list(value.shape)}; it must be a scalar or fit the pixel shape "
+            f"{list(pixels)}."
+        )
     low, high = (float(bound) for bound in value.detach().aminmax())
     if not (low > 0 and math.isfinite(high)):
         raise DomainError(f"{name} spans {low:g} to {high:g}; every value must be a finite number > 0.")
@@ -123,15 +189,25 @@ def per_pixel(value, name, drive):
 def _checked_drive(drive, nonfinite, truncation):
     if not isinstance(drive, Tensor) or drive.dtype not in (torch.float32, torch.float64):
         given = drive.dtype if isinstance(drive, Tensor) else type(drive).__name__
-        raise DomainError(f"drive is {given}; a torch tensor of float32 or float64 is needed: convert with torch.as_tensor(drive).float().")
+        raise DomainError(
+            f"drive is {given}; a torch tensor of float32 or float64 is needed: convert with "
+            "torch.as_tensor(drive).float()."
+        )
     if drive.ndim == 0 or drive.shape[0] == 0:
-        raise ShapeError(f"drive has shape {list(drive.shape)}, which holds no time step; give at least one, time on the first axis.")
+        raise ShapeError(
+            f"drive has shape {list(drive.shape)}, which holds no time step; give at least one, time on the "
+            "first axis."
+        )
     if drive.numel() == 0:
         raise ShapeError(f"drive has shape {list(drive.shape)}, which holds no pixel; give at least one.")
     _choice("nonfinite", nonfinite, NONFINITE)
     if truncation is None:
         return drive  # the loop over time looks at every value anyway
-    return check_finite(drive, "drive", 'remove or repair them, or pass nonfinite="zero"') if nonfinite == "raise" else drive.where(drive.isfinite(), 0)
+    return (
+        check_finite(drive, "drive", 'remove or repair them, or pass nonfinite="zero"')
+        if nonfinite == "raise"
+        else drive.where(drive.isfinite(), 0)
+    )
 
 
 def _choice(name, value, allowed):
@@ -140,14 +216,22 @@ def _choice(name, value, allowed):
 
 
 def _number(name, value, least, strict=False):
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not (least < value if strict else least <= value) or value == math.inf:
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, float))
+        or not (least < value if strict else least <= value)
+        or value == math.inf
+    ):
         raise DomainError(f"{name} is {value!r}; give a finite number {'>' if strict else '>='} {least}.")
     return float(value)
 
 
 def _segment(segment):
     if segment is not None and (isinstance(segment, bool) or not isinstance(segment, int) or segment < 1):
-        raise DomainError(f"segment is {segment!r}; give a whole number of steps >= 1 (about the square root of 8 T needs least memory), or None.")
+        raise DomainError(
+            f"segment is {segment!r}; give a whole number of steps >= 1 (about the square root of 8 T needs "
+            "least memory), or None."
+        )
     return segment
 
 
@@ -155,7 +239,8 @@ def _warn_if_unstable(setup, theta, h_reset, steps):
     bound = float(reset_sum(setup, theta, h_reset, steps).max()) / setup.surrogate.alpha
     if bound >= 1:
         warnings.warn(
-            f"max rho * sum|nu| is {bound:.3g}, not below 1: gradients through the reset may grow without bound over time; use through_reset='bounded', or a larger alpha.",
+            f"max rho * sum|nu| is {bound:.3g}, not below 1: gradients through the reset may grow without "
+            "bound over time; use through_reset='bounded', or a larger alpha.",
             RuntimeWarning,
             stacklevel=3,
         )

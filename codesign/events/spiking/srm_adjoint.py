@@ -1,4 +1,5 @@
-"""The spike response model backward in time: one symbolic drjit loop that carries the adjoint of every state and, where asked, its parameter derivatives."""
+"""The spike response model backward in time: one symbolic drjit loop that carries the adjoint of every state
+and, where asked, its parameter derivatives."""
 
 from dataclasses import dataclass
 
@@ -8,9 +9,11 @@ from codesign.events.spiking.srm_kernels import inflow, retreat, retreat_tangent
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which gradients the loop computes: of the drive, of theta, of h = dt/tau of the response and of the reset.
+    """Which gradients the loop computes: of the drive, of theta, of h = dt/tau of the response and of the
+    reset.
 
-    through_reset: whether the adjoint of the reset states is carried (for the spikes before, for h of the reset, or for the initial state).
+    through_reset: whether the adjoint of the reset states is carried (for the spikes before, for h of the
+      reset, or for the initial state).
     """
 
     drive: bool
@@ -22,7 +25,8 @@ class Wanted:
     def layout(self, plan):
         """Number of loop variables of one channel, by what they hold, in their order.
 
-        response, reset: adjoints of the states. *_tangent: derivatives of those by h, or by theta. *_sum: gradients gathered so far.
+        response, reset: adjoints of the states. *_tangent: derivatives of those by h, or by theta. *_sum:
+          gradients gathered so far.
         """
         response, reset = plan.counts
         return {
@@ -40,7 +44,10 @@ class Wanted:
 def unpack(flat, layout, channels):
     """Loop variables as one dictionary of lists per channel."""
     values = iter(flat)
-    return [{name: [next(values) for _ in range(count)] for name, count in layout.items()} for _ in range(channels)]
+    return [
+        {name: [next(values) for _ in range(count)] for name, count in layout.items()}
+        for _ in range(channels)
+    ]
 
 
 def pack(parts):
@@ -53,8 +60,10 @@ def scan_back(plan, wanted, grid, numbers, surrogate, arrays, carried, span, ori
 
     Args:
       plan, grid: as in ``scan``. surrogate: its numbers, opaque, of the drive's precision.
-      numbers: per channel, by name: as in ``scan``, and response_a_h, response_m_h, reset_a_h, reset_m_h, reset_m_theta, limit.
-      arrays: flat arrays by name: drive, grad_spikes, grad_potential, grad_drive (scattered into) and spikes hold all steps; potential begins at step
+      numbers: per channel, by name: as in ``scan``, and response_a_h, response_m_h, reset_a_h, reset_m_h,
+        reset_m_theta, limit.
+      arrays: flat arrays by name: drive, grad_spikes, grad_potential, grad_drive (scattered into) and spikes
+        hold all steps; potential begins at step
         ``origin`` (opaque). None: no such gradient.
       carried: loop variables after the last step.
       span: first step and end, opaque.
@@ -62,7 +71,9 @@ def scan_back(plan, wanted, grid, numbers, surrogate, arrays, carried, span, ori
     """
     import drjit as dr
 
-    Double, ops, layout = grid.double.Float, operations(), wanted.layout(plan)
+    Double = grid.double.Float
+    ops = operations()
+    layout = wanted.layout(plan)
     first, end = span
 
     def through_threshold(t, k, n, part):
@@ -71,8 +82,15 @@ def scan_back(plan, wanted, grid, numbers, surrogate, arrays, carried, span, ori
         rho = Double(plan.surrogate.density(ops, x, *surrogate))  # no better known than the stored potential
         spiking = Double(0) if arrays["grad_spikes"] is None else rho * grid.read(arrays["grad_spikes"], t, k)
         if plan.through_reset != "off":  # part["reset"][0]: what this spike does to all later potentials
-            spiking = spiking + (rho if plan.through_reset == "full" else dr.minimum(rho, n["limit"])) * part["reset"][0]
-        return (spiking if arrays["grad_potential"] is None else spiking + grid.read(arrays["grad_potential"], t, k)), spiking
+            spiking = (
+                spiking
+                + (rho if plan.through_reset == "full" else dr.minimum(rho, n["limit"])) * part["reset"][0]
+            )
+        return (
+            spiking
+            if arrays["grad_potential"] is None
+            else spiking + grid.read(arrays["grad_potential"], t, k)
+        ), spiking
 
     def respond(t, k, n, part, y):
         """Through the response kernel to the drive, and one step back."""
@@ -85,26 +103,47 @@ def scan_back(plan, wanted, grid, numbers, surrogate, arrays, carried, span, ori
         if wanted.response:
             part["response_sum"][0] = part["response_sum"][0] + z * part["response_tangent"][0]
             moved = n["response_a_h"], n["response_m_h"]
-            part["response_tangent"] = retreat_tangent(plan.response, part["response_tangent"], part["response"], n["response_a"], n["response_m"], *moved, y)
+            part["response_tangent"] = retreat_tangent(
+                plan.response,
+                part["response_tangent"],
+                part["response"],
+                n["response_a"],
+                n["response_m"],
+                *moved,
+                y,
+            )
         if wanted.drive:
             of_drive = inflow(plan.response, part["response"], y)
-            grid.write(arrays["grad_drive"], grid.single.Float(of_drive if usable is None else dr.select(usable, of_drive, 0)), t, k)
+            grid.write(
+                arrays["grad_drive"],
+                grid.single.Float(of_drive if usable is None else dr.select(usable, of_drive, 0)),
+                t,
+                k,
+            )
         part["response"] = retreat(plan.response, part["response"], n["response_a"], n["response_m"], y)
 
     def reset(t, k, n, part, y):
         """Through the reset kernel to the spikes, and one step back."""
         s = grid.read(arrays["spikes"], t, k) if wanted.reset or wanted.theta else None
         coefficients = n["reset_a"], n["reset_m"]
-        for name, moved in (("reset", (n["reset_a_h"], n["reset_m_h"])), ("theta", (None, n["reset_m_theta"]))):
+        for name, moved in (
+            ("reset", (n["reset_a_h"], n["reset_m_h"])),
+            ("theta", (None, n["reset_m_theta"])),
+        ):
             if getattr(wanted, name):
                 part[f"{name}_sum"][0] = part[f"{name}_sum"][0] + s * part[f"{name}_tangent"][0]
-                part[f"{name}_tangent"] = retreat_tangent(plan.reset, part[f"{name}_tangent"], part["reset"], *coefficients, *moved, y)
+                part[f"{name}_tangent"] = retreat_tangent(
+                    plan.reset, part[f"{name}_tangent"], part["reset"], *coefficients, *moved, y
+                )
         if wanted.through_reset:
             part["reset"] = retreat(plan.reset, part["reset"], *coefficients, y)
 
     def body(t, *flat):
-        t, parts = t - 1, unpack(flat, layout, plan.channels)
-        found = [through_threshold(t, k, n, part) for k, (n, part) in enumerate(zip(numbers, parts, strict=True))]
+        t = t - 1
+        parts = unpack(flat, layout, plan.channels)
+        found = [
+            through_threshold(t, k, n, part) for k, (n, part) in enumerate(zip(numbers, parts, strict=True))
+        ]
         for k, (n, part) in enumerate(zip(numbers, parts, strict=True)):
             y, spiking = found[k]
             if wanted.theta:
@@ -114,4 +153,6 @@ def scan_back(plan, wanted, grid, numbers, surrogate, arrays, carried, span, ori
         return t, *pack(parts)
 
     last = end + dr.zeros(grid.single.UInt32, grid.lanes)
-    return dr.while_loop((last, *carried), lambda t, *rest: t > first, body, mode="symbolic", label="srm adjoint")[1:]
+    return dr.while_loop(
+        (last, *carried), lambda t, *rest: t > first, body, mode="symbolic", label="srm adjoint"
+    )[1:]

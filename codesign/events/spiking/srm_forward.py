@@ -1,4 +1,5 @@
-"""The spike response model forward in time: one symbolic drjit loop, one lane per pixel (or per pair of coupled polarities)."""
+"""The spike response model forward in time: one symbolic drjit loop, one lane per pixel (or per pair of
+coupled polarities)."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,8 +12,10 @@ from codesign.events.spiking.surrogate import Operations, Surrogate
 class Plan:
     """What decides the shape of the loop: a new plan is a new kernel, new numbers are not.
 
-    response, reset: kinds of recursion (see srm_kernels). channels: 2 where ON and OFF reset one another, else 1. surrogate: its class.
-    smooth: spikes are the surrogate's integral. through_reset: "off", "full" or "bounded". zero_nonfinite: take NaN and infinite drive as 0.
+    response, reset: kinds of recursion (see srm_kernels). channels: 2 where ON and OFF reset one another,
+      else 1. surrogate: its class.
+    smooth: spikes are the surrogate's integral. through_reset: "off", "full" or "bounded". zero_nonfinite:
+      take NaN and infinite drive as 0.
     """
 
     response: str
@@ -31,7 +34,8 @@ class Plan:
 
 @dataclass(frozen=True)
 class Grid:
-    """How lanes address arrays [T, channels, lanes]: drjit types of the drive and of float64, lane index per channel, values of one time step."""
+    """How lanes address arrays [T, channels, lanes]: drjit types of the drive and of float64, lane index per
+    channel, values of one time step."""
 
     single: Any
     double: Any
@@ -43,7 +47,8 @@ class Grid:
     def make(cls, single, double, lanes, channels):
         import drjit as dr
 
-        lane, count = dr.arange(single.UInt32, lanes), dr.opaque(single.UInt32, lanes)
+        lane = dr.arange(single.UInt32, lanes)
+        count = dr.opaque(single.UInt32, lanes)
         index = tuple(lane + k * count for k in range(channels))
         dr.eval(index)
         return cls(single, double, lanes, index, dr.opaque(single.UInt32, lanes * channels))
@@ -72,21 +77,27 @@ def scan(plan, grid, numbers, surrogate, drive, states, span, origin, spikes, po
 
     Args:
       plan: Plan. grid: Grid.
-      numbers: per channel, float64 drjit arrays [lanes] by name: theta, response_a, response_m, reset_a, reset_m. surrogate: its numbers, opaque.
+      numbers: per channel, float64 drjit arrays [lanes] by name: theta, response_a, response_m, reset_a,
+        reset_m. surrogate: its numbers, opaque.
       drive: flat [T * channels * lanes].
       states: drjit arrays [lanes], channel by channel, response before reset.
-      span: first step and end, opaque. origin: the step that the first row of ``spikes`` and ``potential`` belongs to, opaque.
-      spikes, potential: flat arrays scattered into; None: not kept. shift: place of the first potential, opaque.
+      span: first step and end, opaque. origin: the step that the first row of ``spikes`` and ``potential``
+        belongs to, opaque.
+      spikes, potential: flat arrays scattered into; None: not kept. shift: place of the first potential,
+        opaque.
     Returns: the states after the last step, and per lane whether something became NaN or infinite.
     """
     import drjit as dr
 
-    Double, ops = grid.double.Float, operations()
+    Double = grid.double.Float
+    ops = operations()
     first, end = span
 
     def body(t, bad, *flat):
         values = iter(flat)
-        parts, responses, resets = [], [], []
+        parts = []
+        responses = []
+        resets = []
         for k, n in enumerate(numbers):
             response, reset = ([next(values) for _ in range(count)] for count in plan.counts)
             z = grid.read(drive, t, k)
@@ -103,7 +114,11 @@ def scan(plan, grid, numbers, surrogate, drive, states, span, origin, spikes, po
         for k, (n, (response, reset)) in enumerate(zip(numbers, parts, strict=True)):
             u = responses[k] + (resets[k] if plan.channels == 1 else resets[k] - resets[1 - k])
             x = u - n["theta"]
-            s = plan.surrogate.integral(ops, x, *surrogate) if plan.smooth else dr.select(x >= 0, Double(1), Double(0))
+            s = (
+                plan.surrogate.integral(ops, x, *surrogate)
+                if plan.smooth
+                else dr.select(x >= 0, Double(1), Double(0))
+            )
             reset[0] = reset[0] + s
             after += [*response, *reset]
             kept = grid.single.Float(u)
@@ -116,5 +131,7 @@ def scan(plan, grid, numbers, surrogate, drive, states, span, origin, spikes, po
 
     start = first + dr.zeros(grid.single.UInt32, grid.lanes)
     healthy = dr.zeros(grid.single.Bool, grid.lanes)
-    _, bad, *states = dr.while_loop((start, healthy, *states), lambda t, *rest: t < end, body, mode="symbolic", label="srm forward")
+    _, bad, *states = dr.while_loop(
+        (start, healthy, *states), lambda t, *rest: t < end, body, mode="symbolic", label="srm forward"
+    )
     return states, bad

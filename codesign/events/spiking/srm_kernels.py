@@ -1,4 +1,5 @@
-"""The kernels of the spike response model as linear recursions: one decay a, one amplitude m, at most two states.
+"""The kernels of the spike response model as linear recursions: one decay a, one amplitude m, at most two
+states.
 
     pair     q <- a (q + p), p <- a p, y = m q, p <- p + z      y_t = m sum_{k>=1} k a^k z_{t-k}      (alpha response, slayer reset)
     late     p <- a p, y = m p, p <- p + z                      y_t = m sum_{k>=1} a^k z_{t-k}        (thesis reset)
@@ -6,7 +7,8 @@
     sum      p <- p + z, y = p                                  y_t = sum_{k>=0} z_{t-k}              (step response)
     none     y = z
 
-No sum is cut: the recursion is the whole kernel. ``retreat`` is the adjoint of ``advance``, and its derivative with respect to one parameter of a and m is
+No sum is cut: the recursion is the whole kernel. ``retreat`` is the adjoint of ``advance``, and its
+  derivative with respect to one parameter of a and m is
 ``retreat_tangent``; all three work on numbers and on arrays of any library.
 """
 
@@ -21,7 +23,8 @@ RESETS = {"slayer": "pair", "thesis": "late", "exp": "early", "step": "early"}
 
 @dataclass(frozen=True)
 class Coefficients:
-    """Decay a and amplitude m per pixel, and their derivatives with respect to h = dt/tau; float64 tensors [N]."""
+    """Decay a and amplitude m per pixel, and their derivatives with respect to h = dt/tau; float64 tensors
+    [N]."""
 
     a: Any
     m: Any
@@ -38,9 +41,11 @@ def response_coefficients(h):
 def reset_coefficients(kernel, h, amplitude):
     """Reset kernel of the given name, with amplitude = -reset_scale * theta.
 
-    slayer: amplitude k h exp(1 - k h); thesis: amplitude exp(1 - k h); exp: amplitude exp(-(k - 1) h); step: amplitude; all for k >= 1.
+    slayer: amplitude k h exp(1 - k h); thesis: amplitude exp(1 - k h); exp: amplitude exp(-(k - 1) h); step:
+      amplitude; all for k >= 1.
     """
-    a, zero = (-h).exp(), 0 * h
+    a = (-h).exp()
+    zero = 0 * h
     if kernel == "slayer":
         return Coefficients(a, math.e * h * amplitude, -a, math.e * amplitude)
     if kernel == "thesis":
@@ -51,7 +56,8 @@ def reset_coefficients(kernel, h, amplitude):
 
 
 def absolute_sum(kind, a, m, steps):
-    """Sum of |kernel| over its lags, closed form; a kernel that does not decay is summed over ``steps`` lags."""
+    """Sum of |kernel| over its lags, closed form; a kernel that does not decay is summed over ``steps``
+    lags."""
     if kind == "pair":
         return m.abs() * a / (1 - a) ** 2
     decaying = (1 - a**steps) / (1 - a)
@@ -60,7 +66,8 @@ def absolute_sum(kind, a, m, steps):
 
 
 def advance(kind, states, a, m, z=None):
-    """One step of the recursion up to its output y; returns y and the states, into whose first one the input z is still to be added.
+    """One step of the recursion up to its output y; returns y and the states, into whose first one the input
+    z is still to be added.
 
     ``sum`` and ``none`` take z in at once.
     """
@@ -79,7 +86,8 @@ def advance(kind, states, a, m, z=None):
 
 
 def inflow(kind, adjoint, y):
-    """Adjoint of the input z of a step, from the adjoint of the states after it and the adjoint y of its output."""
+    """Adjoint of the input z of a step, from the adjoint of the states after it and the adjoint y of its
+    output."""
     if kind == "none":
         return y
     return adjoint[0] + y if kind == "sum" else adjoint[0]
@@ -88,7 +96,8 @@ def inflow(kind, adjoint, y):
 def retreat(kind, adjoint, a, m, y):
     """Adjoint of the states before a step, from the adjoint after it and the adjoint y of its output."""
     if kind == "pair":
-        p, q = adjoint[0], adjoint[1] + m * y
+        p = adjoint[0]
+        q = adjoint[1] + m * y
         return [a * (p + q), a * q]
     if kind == "late":
         return [a * (adjoint[0] + m * y)]
@@ -98,9 +107,11 @@ def retreat(kind, adjoint, a, m, y):
 
 
 def retreat_tangent(kind, tangent, adjoint, a, m, da, dm, y):
-    """Derivative of ``retreat`` where a and m move by da and dm, y being held; da None stands for zero (``adjoint`` is then not needed)."""
+    """Derivative of ``retreat`` where a and m move by da and dm, y being held; da None stands for zero
+    (``adjoint`` is then not needed)."""
     if kind == "pair":
-        p, q = tangent[0], tangent[1] + dm * y
+        p = tangent[0]
+        q = tangent[1] + dm * y
         moved = [a * (p + q), a * q]
         if da is None:
             return moved

@@ -7,34 +7,45 @@ from codesign.events.spiking.srm import per_pixel, srm
 
 
 def alpha_response(signal, *, tau_s, dt=1.0, state=None):
-    """The alpha kernel applied to a signal, exactly: y_t = sum over k >= 1 of (k h) exp(1 - k h) signal_{t-k} with h = dt / tau_s.
+    """The alpha kernel applied to a signal, exactly: y_t = sum over k >= 1 of (k h) exp(1 - k h) signal_{t-k}
+    with h = dt / tau_s.
 
-    Args: as for ``srm``. signal: [T, ...], for example spikes (their difference to a target gives the van Rossum loss).
+    Args: as for ``srm``. signal: [T, ...], for example spikes (their difference to a target gives the van
+      Rossum loss).
     Returns: y [T, ...] and the SrmState to carry on.
     Gradient: signal, tau_s, state.
     Raises: as ``srm``.
     """
-    _, response, state = srm(signal, theta=1.0, tau_s=tau_s, dt=dt, kernel="step", response="alpha", reset_scale=0.0, state=state)
+    _, response, state = srm(
+        signal, theta=1.0, tau_s=tau_s, dt=dt, kernel="step", response="alpha", reset_scale=0.0, state=state
+    )
     return response, state
 
 
 def drive_scale(drive, *, theta, tau_s=None, dt=1.0, response="none", share=0.05):
-    """Factor for the drive that lifts a share of all potentials to their threshold before any reset, so that training does not start dead or saturated.
+    """Factor for the drive that lifts a share of all potentials to their threshold before any reset, so that
+    training does not start dead or saturated.
 
     Args:
       drive: [T, ...]; theta, tau_s, dt, response: as for ``srm``.
       share: of (time, pixel) pairs that reach the threshold, 0 < share < 1.
     Returns: factor > 0, a float.
-    Raises: DomainError when less than that share of the potentials is above 0 (a silent input: no factor helps), or share is out of range.
+    Raises: DomainError when less than that share of the potentials is above 0 (a silent input: no factor
+      helps), or share is out of range.
     """
     if isinstance(share, bool) or not isinstance(share, (int, float)) or not 0 < share < 1:
         raise DomainError(f"share is {share!r}; give a number between 0 and 1 (0.05 is typical).")
     with torch.no_grad():
-        _, potential, _ = srm(drive, theta=1.0, tau_s=tau_s, dt=dt, kernel="step", response=response, reset_scale=0.0)
+        _, potential, _ = srm(
+            drive, theta=1.0, tau_s=tau_s, dt=dt, kernel="step", response=response, reset_scale=0.0
+        )
         relative = (potential / per_pixel(theta, "theta", drive)).flatten()
         reached = max(1, round(share * relative.numel()))
         level = float(relative.kthvalue(relative.numel() + 1 - reached).values)
     if level <= 0:
         above = int((relative > 0).sum())
-        raise DomainError(f"only {above} of {relative.numel()} potentials are above 0, {reached} are to reach the threshold; the input is silent: check it, or lower share.")
+        raise DomainError(
+            f"only {above} of {relative.numel()} potentials are above 0, {reached} are to reach the "
+            "threshold; the input is silent: check it, or lower share."
+        )
     return 1 / level

@@ -10,9 +10,11 @@ from codesign.errors import DomainError, ShapeError, check_finite
 
 @dataclass(frozen=True)
 class SrmState:
-    """State after the last step of a chunk. It keeps its graph: ``detach`` it to cut the gradient between chunks.
+    """State after the last step of a chunk. It keeps its graph: ``detach`` it to cut the gradient between
+    chunks.
 
-    response: [states, ...] of the response kernel, float64 whatever the drive (0 to 2 states; the last taps - 1 drives with ``srm_truncated``).
+    response: [states, ...] of the response kernel, float64 whatever the drive (0 to 2 states; the last taps -
+      1 drives with ``srm_truncated``).
     reset: [states, ...] of the reset kernel, likewise (1 or 2 states; the last taps - 1 spikes).
     """
 
@@ -30,16 +32,23 @@ def entering_state(state, counts, pixels, device, dtype=torch.float64):
     Args:
       state: SrmState or None.
       counts: number of states of response and reset. pixels: shape of one frame.
-    Raises: DomainError for something else than an SrmState, or values that are not finite; ShapeError for a state of other size, type or device.
+    Raises: DomainError for something else than an SrmState, or values that are not finite; ShapeError for a
+      state of other size, type or device.
     """
     shapes = [(count, *pixels) for count in counts]
     if state is None:
         return SrmState(*(torch.zeros(shape, dtype=dtype, device=device) for shape in shapes))
     if not isinstance(state, SrmState):
-        raise DomainError(f"state is a {type(state).__name__}; pass the SrmState that the chunk before returned, or None to begin at rest.")
+        raise DomainError(
+            f"state is a {type(state).__name__}; pass the SrmState that the chunk before returned, or None "
+            "to begin at rest."
+        )
     for name, shape in zip(("response", "reset"), shapes, strict=True):
         given = getattr(state, name)
         if tuple(given.shape) != shape or given.dtype != dtype or given.device.type != device.type:
-            raise ShapeError(f"state.{name} is {given.dtype} {list(given.shape)} on {given.device}, this layer keeps {dtype} {list(shape)} on {device}; pass the state of the same layer and frame.")
+            raise ShapeError(
+                f"state.{name} is {given.dtype} {list(given.shape)} on {given.device}, this layer keeps "
+                f"{dtype} {list(shape)} on {device}; pass the state of the same layer and frame."
+            )
         check_finite(given, f"state.{name}", "begin again from a state that is finite")
     return state

@@ -1,4 +1,5 @@
-"""The spike response model with finite kernels, step by step in torch: what SLAYER computes, for comparison with work that used it."""
+"""The spike response model with finite kernels, step by step in torch: what SLAYER computes, for comparison
+with work that used it."""
 
 import torch
 
@@ -11,7 +12,8 @@ def run_truncated(setup, drive, theta, h_response, h_reset, state, cut):
     """As ``events.srm``, every kernel ended at its first value below ``cut`` later than its time constant.
 
     Args:
-      setup: Setup. drive: [T, ...] finite. theta, h_response (None: no alpha response), h_reset: float64, broadcasting over a frame.
+      setup: Setup. drive: [T, ...] finite. theta, h_response (None: no alpha response), h_reset: float64,
+        broadcasting over a frame.
       state: SrmState of the last drives and spikes, or None. cut: potential units.
     Returns: spikes, potential [T, ...] and SrmState.
     Gradient: torch's own, all inputs.
@@ -19,7 +21,11 @@ def run_truncated(setup, drive, theta, h_response, h_reset, state, cut):
     """
     pixels = drive.shape[1:]
     taps = reset_taps(setup.kernel, h_reset, -setup.reset_scale * theta, cut, pixels).to(drive.dtype)
-    response = None if h_response is None else cut_taps(alpha, h_response, torch.ones_like(h_response), cut, pixels).to(drive.dtype)
+    response = (
+        None
+        if h_response is None
+        else cut_taps(alpha, h_response, torch.ones_like(h_response), cut, pixels).to(drive.dtype)
+    )
     total = setup.plan.response == "sum"
     kept = 1 if total else 0 if response is None else response.shape[0] - 1
     state = entering_state(state, (kept, taps.shape[0] - 1), pixels, drive.device, drive.dtype)
@@ -31,7 +37,9 @@ def run_truncated(setup, drive, theta, h_response, h_reset, state, cut):
         filtered = drive if response is None else finite_response(inputs, response, drive.shape[0])
         last = inputs[inputs.shape[0] - kept :]
     limit = (BOUND / reset_sum(setup, theta, h_reset, drive.shape[0])).to(drive.dtype)
-    spikes, potentials, past = [], [], state.reset
+    spikes = []
+    potentials = []
+    past = state.reset
     for y in filtered:
         r = (taps[1:] * past).sum(0)
         u = y + (r - r.flip(0) if setup.plan.channels == 2 else r)
@@ -44,7 +52,10 @@ def run_truncated(setup, drive, theta, h_response, h_reset, state, cut):
         potentials.append(u)
     potential = torch.stack(potentials)
     if not bool(potential.detach().isfinite().all()):
-        raise NonFiniteError("the potential of events.srm overflows; scale the drive down (events.drive_scale proposes a factor).")
+        raise NonFiniteError(
+            "the potential of events.srm overflows; scale the drive down (events.drive_scale proposes a "
+            "factor)."
+        )
     return torch.stack(spikes), potential, SrmState(last, past)
 
 
@@ -66,17 +77,23 @@ def alpha(h, k):
 
 
 def reset_taps(kernel, h, amplitude, cut, pixels):
-    """Reset kernel at lags 0, 1, ... [taps, ...]; its value at lag 0 is 0. The step kernel has one lag, which stands for all."""
+    """Reset kernel at lags 0, 1, ... [taps, ...]; its value at lag 0 is 0. The step kernel has one lag, which
+    stands for all."""
     if kernel == "step":
         later = amplitude.reshape(1, *[1] * (len(pixels) - amplitude.ndim), *amplitude.shape)
         return torch.cat([torch.zeros_like(later), later])
-    shapes = {"slayer": alpha, "thesis": lambda h, k: (1 - k * h).exp(), "exp": lambda h, k: (-(k - 1) * h).exp()}
+    shapes = {
+        "slayer": alpha,
+        "thesis": lambda h, k: (1 - k * h).exp(),
+        "exp": lambda h, k: (-(k - 1) * h).exp(),
+    }
     taps = cut_taps(shapes[kernel], h, amplitude, cut, pixels)
     return torch.cat([torch.zeros_like(taps[:1]), taps[1:]])
 
 
 def cut_taps(shape, h, amplitude, cut, pixels):
-    """Values of a kernel at lags 0 to the longest one kept over all pixels, zero where a pixel's own kernel has ended."""
+    """Values of a kernel at lags 0 to the longest one kept over all pixels, zero where a pixel's own kernel
+    has ended."""
     h, amplitude = (x.reshape(*[1] * (len(pixels) - x.ndim), *x.shape) for x in (h, amplitude))
     lags = 64
     while True:

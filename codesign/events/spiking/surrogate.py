@@ -1,7 +1,9 @@
 """Surrogate derivatives of the spike, with the antiderivative that makes an exact smooth twin of the layer.
 
-A surrogate is the density rho(x) that stands in for the derivative of the step at x = u - theta. Its integral from -infinity replaces the step in the smooth
-twin, whose gradient is therefore exact. All three have their largest value 1/alpha at the threshold and the width 1/beta.
+A surrogate is the density rho(x) that stands in for the derivative of the step at x = u - theta. Its integral
+from -infinity replaces the step in the smooth
+twin, whose gradient is therefore exact. All three have their largest value 1/alpha at the threshold and the
+width 1/beta.
 """
 
 import math
@@ -31,7 +33,8 @@ TORCH = Operations(torch.exp2, torch.abs, lambda x, floor: x.clamp_min(floor), t
 
 @dataclass(frozen=True)
 class Surrogate:
-    """Height 1/alpha at the threshold (alpha in spikes^-1 times potential units), width 1/beta in potential units.
+    """Height 1/alpha at the threshold (alpha in spikes^-1 times potential units), width 1/beta in potential
+    units.
 
     Raises: DomainError when alpha or beta is not a positive finite number.
     """
@@ -43,11 +46,15 @@ class Surrogate:
     def __post_init__(self):
         for name, value in (("alpha", self.alpha), ("beta", self.beta)):
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
-                raise DomainError(f"{type(self).__name__}: {name} is {value!r}; give a finite number > 0, for example {type(self).__name__}.unit(width=theta).")
+                raise DomainError(
+                    f"{type(self).__name__}: {name} is {value!r}; give a finite number > 0, for example "
+                    f"{type(self).__name__}.unit(width=theta)."
+                )
 
     @classmethod
     def unit(cls, width):
-        """The surrogate of the given width in potential units whose integral is 1, like that of the step's true derivative."""
+        """The surrogate of the given width in potential units whose integral is 1, like that of the step's
+        true derivative."""
         return cls(cls.mass * width, 1 / width)
 
     @staticmethod
@@ -79,7 +86,9 @@ class Laplace(Surrogate):
 
     @staticmethod
     def density(operations, x, alpha, beta):
-        return operations.exp2(-LOG2_E * beta * operations.abs(x)) / alpha  # exp2: drjit's exp takes twice as long
+        return (
+            operations.exp2(-LOG2_E * beta * operations.abs(x)) / alpha
+        )  # exp2: drjit's exp takes twice as long
 
     @staticmethod
     def integral(operations, x, alpha, beta):

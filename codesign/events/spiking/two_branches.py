@@ -1,4 +1,5 @@
-"""The spiking network of the thesis: brightness steps, one 3x3 convolution per polarity, a spike response threshold; and its smoothed variant."""
+"""The spiking network of the thesis: brightness steps, one 3x3 convolution per polarity, a spike response
+threshold; and its smoothed variant."""
 
 from dataclasses import dataclass
 
@@ -14,57 +15,96 @@ from codesign.events.spiking.srm_state import SrmState
 
 @dataclass(frozen=True)
 class BranchState:
-    """What the network carries over chunks. frame: [C, H, W] last frame; neurons: SrmState of the spike response layer."""
+    """What the network carries over chunks. frame: [C, H, W] last frame; neurons: SrmState of the spike
+    response layer."""
 
     frame: Tensor
     neurons: SrmState
 
 
 class TwoBranchSpikes(nn.Module):
-    """ON and OFF spikes of +dI and -dI, each through its own convolution and threshold: 9 weights per channel and branch, no bias, no shared weight.
+    """ON and OFF spikes of +dI and -dI, each through its own convolution and threshold: 9 weights per channel
+    and branch, no bias, no shared weight.
 
-    It has no memory of brightness: a change that is too slow to reach the threshold within the reset's time never gives an event.
+    It has no memory of brightness: a change that is too slow to reach the threshold within the reset's time
+      never gives an event.
 
-    channels: 3 for RGB, 1 for monochrome frames. theta: threshold > 0. tau_r: time constant of the reset, in the unit of dt. dt: length of a step.
-    smoothing_tau: None for the network itself; else time constant of an alpha response of the drive before the threshold (temporal smoothing): weak
-      changes add up over a few tau, and events come later, by 2 tau for a short change. kernel, surrogate, through_reset: as for ``events.srm``.
-    seed: of the weights, uniform in 0 to 1 over their number, so that ON starts as brighter and OFF as darker.
+    channels: 3 for RGB, 1 for monochrome frames. theta: threshold > 0. tau_r: time constant of the reset, in
+      the unit of dt. dt: length of a step.
+    smoothing_tau: None for the network itself; else time constant of an alpha response of the drive before
+      the threshold (temporal smoothing): weak
+      changes add up over a few tau, and events come later, by 2 tau for a short change. kernel, surrogate,
+      through_reset: as for ``events.srm``.
+    seed: of the weights, uniform in 0 to 1 over their number, so that ON starts as brighter and OFF as
+      darker.
     """
 
-    def __init__(self, channels=3, *, theta=1.0, tau_r=1.0, dt=1.0, smoothing_tau=None, kernel="slayer", surrogate=None, through_reset="off", seed=0):
+    def __init__(
+        self,
+        channels=3,
+        *,
+        theta=1.0,
+        tau_r=1.0,
+        dt=1.0,
+        smoothing_tau=None,
+        kernel="slayer",
+        surrogate=None,
+        through_reset="off",
+        seed=0,
+    ):
         super().__init__()
         if isinstance(channels, bool) or not isinstance(channels, int) or channels < 1:
             raise DomainError(f"channels is {channels!r}; give 3 for RGB or 1 for monochrome frames.")
         draw = torch.rand(2, channels, 3, 3, generator=torch.Generator().manual_seed(seed)) / (9 * channels)
-        self.weight_on, self.weight_off = nn.Parameter(draw[0]), nn.Parameter(draw[1])
-        self.theta, self.dt, self.smoothing_tau = theta, dt, smoothing_tau
-        self._options = {"tau_r": tau_r, "kernel": kernel, "surrogate": surrogate, "through_reset": through_reset}
+        self.weight_on = nn.Parameter(draw[0])
+        self.weight_off = nn.Parameter(draw[1])
+        self.theta = theta
+        self.dt = dt
+        self.smoothing_tau = smoothing_tau
+        self._options = {
+            "tau_r": tau_r,
+            "kernel": kernel,
+            "surrogate": surrogate,
+            "through_reset": through_reset,
+        }
 
     def forward(self, frames, state=None, *, theta=None):
         """Spikes of the frames.
 
         Args:
           frames: [T, C, H, W], or [T, H, W] with one channel; linear intensity in any unit, finite.
-          state: BranchState of the chunk before; then T frames give T steps. None: at rest, T frames give T-1 steps.
+          state: BranchState of the chunk before; then T frames give T steps. None: at rest, T frames give T-1
+            steps.
           theta: threshold for this call; None: the one of the network.
-        Returns: spikes and potential [T-1, 2, H, W] ([T, 2, H, W] with a state), ON first; BranchState to carry on. Chunks equal the whole.
+        Returns: spikes and potential [T-1, 2, H, W] ([T, 2, H, W] with a state), ON first; BranchState to
+          carry on. Chunks equal the whole.
         Gradient: weights and frames, by the surrogate.
         Raises: ShapeError for other shapes or too few frames; DomainError for NaN or infinity.
         """
         drive, last = self._drive(frames, state)
         neurons = None if state is None else state.neurons
-        spikes, potential, neurons = srm(drive, theta=self.theta if theta is None else theta, state=neurons, dt=self.dt, **self._response(), **self._options)
+        spikes, potential, neurons = srm(
+            drive,
+            theta=self.theta if theta is None else theta,
+            state=neurons,
+            dt=self.dt,
+            **self._response(),
+            **self._options,
+        )
         return spikes, potential, BranchState(last, neurons)
 
     @torch.no_grad()
     def wake(self, frames, share=0.05):
-        """Scale the weights of either branch so that ``share`` of its potentials reaches the threshold on these frames: training never starts dead.
+        """Scale the weights of either branch so that ``share`` of its potentials reaches the threshold on
+        these frames: training never starts dead.
 
         Raises: DomainError when the frames are too silent for any scale (see ``events.drive_scale``).
         """
         drive, _ = self._drive(frames, None)
         for branch, weight in enumerate((self.weight_on, self.weight_off)):
-            weight.mul_(drive_scale(drive[:, branch], theta=self.theta, share=share, dt=self.dt, **self._response()))
+            weight.mul_(
+                drive_scale(drive[:, branch], theta=self.theta, share=share, dt=self.dt, **self._response())
+            )
 
     def _response(self):
         return {} if self.smoothing_tau is None else {"response": "alpha", "tau_s": self.smoothing_tau}
@@ -75,12 +115,25 @@ class TwoBranchSpikes(nn.Module):
         if frames.ndim == 3 and channels == 1:
             frames = frames[:, None]
         if frames.ndim != 4 or frames.shape[1] != channels:
-            raise ShapeError(f"frames have shape {list(frames.shape)}; [T, {channels}, H, W] is needed (channels={channels}).")
+            raise ShapeError(
+                f"frames have shape {list(frames.shape)}; [T, {channels}, H, W] is needed "
+                f"(channels={channels})."
+            )
         if state is not None and (state.frame.shape != frames.shape[1:] or state.frame.dtype != frames.dtype):
-            given, wanted = f"{frames.dtype} {list(frames.shape[1:])}", f"{state.frame.dtype} {list(state.frame.shape)}"
-            raise ShapeError(f"frames of {given} follow frames of {wanted}; a network keeps its frame size and type over chunks.")
+            given = f"{frames.dtype} {list(frames.shape[1:])}"
+            wanted = f"{state.frame.dtype} {list(state.frame.shape)}"
+            raise ShapeError(
+                f"frames of {given} follow frames of {wanted}; a network keeps its frame size and type over "
+                "chunks."
+            )
         steps = (frames if state is None else torch.cat((state.frame[None], frames))).diff(dim=0)
         weights = (self.weight_on, -self.weight_off)
-        # one step at a time: a convolution of another batch size may round differently, and chunks are to equal the whole
-        drive = torch.stack([torch.cat([torch.conv2d(step[None], w[None].to(step), padding=1)[0] for w in weights]) for step in steps])
+        # one step at a time: a convolution of another batch size may round differently, and chunks are to
+        # equal the whole
+        drive = torch.stack(
+            [
+                torch.cat([torch.conv2d(step[None], w[None].to(step), padding=1)[0] for w in weights])
+                for step in steps
+            ]
+        )
         return drive, frames[-1]

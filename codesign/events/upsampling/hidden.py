@@ -1,4 +1,5 @@
-"""Motion of what only one of two frames shows: that of seen pixels nearby which look alike, and not that of what hides it."""
+"""Motion of what only one of two frames shows: that of seen pixels nearby which look alike, and not that of
+what hides it."""
 
 import torch
 
@@ -15,9 +16,12 @@ def repaired(levels, flows, seen):
     """Flow with the values of doubted pixels replaced.
 
     Args:
-      levels: [2, H, W] log levels of both frames. flows: [2, 2, H, W] both ways. seen: [2, H, W] visibility of either frame in the other.
-    Returns: [2, 2, H, W]: in doubted pixels the median of the flow over seen pixels around, weighted by visibility, likeness and nearness.
-    Source: weighted median of Sun, Roth and Black, Secrets of optical flow estimation and their principles, CVPR 2010, section 5.
+      levels: [2, H, W] log levels of both frames. flows: [2, 2, H, W] both ways. seen: [2, H, W] visibility
+        of either frame in the other.
+    Returns: [2, 2, H, W]: in doubted pixels the median of the flow over seen pixels around, weighted by
+      visibility, likeness and nearness.
+    Source: weighted median of Sun, Roth and Black, Secrets of optical flow estimation and their principles,
+      CVPR 2010, section 5.
     """
     height, width = levels.shape[-2:]
     spread_px = float((flows.amax((2, 3)) - flows.amin((2, 3))).max())
@@ -29,14 +33,17 @@ def repaired(levels, flows, seen):
     for flow, level, weight, mask in zip(flows, levels, seen, seen < DOUBTED, strict=True):
         old = flow.clone()
         for y, x in zip(*(place.split(WORKED_ON) for place in mask.nonzero().T), strict=True):
-            row, column = y[:, None] + dy, x[:, None] + dx
+            row = y[:, None] + dy
+            column = x[:, None] + dx
             within = (row >= 0) & (row < height) & (column >= 0) & (column < width)
             at = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
             unlike = (level.flatten()[at] - level[y, x][:, None]).abs()
             vote = within * near * torch.exp(-unlike / ALIKE) * (weight * (weight >= DOUBTED)).flatten()[at]
             found = vote.sum(1) > 0
             for component in range(2):
-                flow[component, y, x] = torch.where(found, _weighted_median(old[component].flatten()[at], vote), old[component, y, x])
+                flow[component, y, x] = torch.where(
+                    found, _weighted_median(old[component].flatten()[at], vote), old[component, y, x]
+                )
     return flows
 
 

@@ -1,4 +1,5 @@
-"""Block matching: which of many whole-pixel displacements fits a neighbourhood best. It finds what a coarse picture no longer shows."""
+"""Block matching: which of many whole-pixel displacements fits a neighbourhood best. It finds what a coarse
+picture no longer shows."""
 
 import math
 
@@ -11,14 +12,17 @@ RADIUS_PX = 9  # displacements looked at, at the scale of matching
 WINDOW_PX = 1  # neighbours on each side
 MOST = 0.5  # log units; larger differences count as this, so that an occluded corner does not decide
 STILLNESS = 5e-4  # log units per pixel: of equals the smaller displacement is taken
-BETTER, MARGIN = 0.7, 0.02  # a match replaces the flow where its difference is below this share of the flow's, by at least this
+# a match replaces the flow where its difference is below this share of the flow's, by at least this
+BETTER = 0.7
+MARGIN = 0.02
 AGREEMENT_PX = 1.5  # and where both directions agree
 
 
 def with_matches(levels, flow):
     """The flow, with matches where they fit much better.
 
-    Args: levels: [2, 1, H, W] log levels of both frames. flow: [2, 2, H, W] from the first to the second, and back, pixels of this scale.
+    Args: levels: [2, 1, H, W] log levels of both frames. flow: [2, 2, H, W] from the first to the second, and
+      back, pixels of this scale.
     Returns: [2, 2, H, W].
     Source: the idea of Xu, Jia and Matsushita, Motion detail preserving optical flow estimation, 2012.
     """

@@ -6,7 +6,9 @@ import torch
 
 from codesign.errors import DomainError
 
-LARGEST_SHARE = 0.999  # of the pixels keep a bound; the rest is what the flow got wrong, which would otherwise decide
+LARGEST_SHARE = (
+    0.999  # of the pixels keep a bound; the rest is what the flow got wrong, which would otherwise decide
+)
 
 
 def largest(values):
@@ -16,11 +18,13 @@ def largest(values):
 
 
 def steps_for(amount, bound, max_steps, what, start_s, end_s):
-    """Least number of equal steps that keep ``amount`` within ``bound`` each. Raises: DomainError when that takes more than ``max_steps``."""
+    """Least number of equal steps that keep ``amount`` within ``bound`` each. Raises: DomainError when that
+    takes more than ``max_steps``."""
     count = max(1, math.ceil(amount / bound * (1 - 1e-6)))
     if count > max_steps:
         raise DomainError(
-            f"between the frames at {start_s:.9g} s and {end_s:.9g} s {what} changes by {amount:.3g}; steps of {bound:g} take {count}, more than max_steps = {max_steps}: "
+            f"between the frames at {start_s:.9g} s and {end_s:.9g} s {what} changes by {amount:.3g}; steps "
+            f"of {bound:g} take {count}, more than max_steps = {max_steps}: "
             "record faster, or allow larger or more steps."
         )
     return count

@@ -1,4 +1,5 @@
-"""Dense optical flow at one scale: total variation of the flow against the absolute brightness difference, by alternating closed-form steps."""
+"""Dense optical flow at one scale: total variation of the flow against the absolute brightness difference, by
+alternating closed-form steps."""
 
 from dataclasses import dataclass
 
@@ -22,12 +23,15 @@ def refined(first, second, flow, warps, iterations):
 
     Args:
       first, second: [B, 1, H, W] log levels. flow: [B, 2, H, W] guess, pixels, +x right, +y down.
-      warps: how often the brightness difference is made linear about the current flow. iterations: of the solver in between.
+      warps: how often the brightness difference is made linear about the current flow. iterations: of the
+        solver in between.
     Returns: [B, 2, H, W]. Where the flow leaves the picture it follows its neighbours.
-    Source: Zach, Pock and Bischof, A duality based approach for realtime TV-L1 optical flow, DAGM 2007; gradients averaged over both pictures and
+    Source: Zach, Pock and Bischof, A duality based approach for realtime TV-L1 optical flow, DAGM 2007;
+      gradients averaged over both pictures and
       a median filter between warps as in Wedel et al., An improved algorithm for TV-L1 optical flow, 2009.
     """
-    dual_x, dual_y = torch.zeros_like(flow), torch.zeros_like(flow)
+    dual_x = torch.zeros_like(flow)
+    dual_y = torch.zeros_like(flow)
     buffers = Buffers(flow)
     for _ in range(warps):
         flow = median(flow)
@@ -36,7 +40,13 @@ def refined(first, second, flow, warps, iterations):
         gradient = _gradient((warped + first) / 2) * seen
         square = gradient.square().sum(1, keepdim=True) + LEAST_GRADIENT
         constant = (warped - first) * seen - (gradient * flow).sum(1, keepdim=True)
-        data = Linear(constant, gradient, gradient / square, DATA_WEIGHT * COUPLING * square, -DATA_WEIGHT * COUPLING * square)
+        data = Linear(
+            constant,
+            gradient,
+            gradient / square,
+            DATA_WEIGHT * COUPLING * square,
+            -DATA_WEIGHT * COUPLING * square,
+        )
         for _ in range(iterations):
             _iterate(flow, dual_x, dual_y, data, buffers)
     return median(flow)
@@ -48,13 +58,17 @@ def median(field):
     around = pad(field, (1, 1, 1, 1), mode="replicate")
     values = [around[..., y : y + height, x : x + width] for y in range(3) for x in range(3)]
     for low, high in MEDIAN_OF_NINE:
-        values[low], values[high] = torch.minimum(values[low], values[high]), torch.maximum(values[low], values[high])
+        values[low], values[high] = (
+            torch.minimum(values[low], values[high]),
+            torch.maximum(values[low], values[high]),
+        )
     return values[4]
 
 
 @dataclass(frozen=True)
 class Linear:
-    """The brightness difference about a flow: constant + gradient . flow, [B, 1, H, W] and [B, 2, H, W]; the step along it and its bounds."""
+    """The brightness difference about a flow: constant + gradient . flow, [B, 1, H, W] and [B, 2, H, W]; the
+    step along it and its bounds."""
 
     constant: Tensor
     gradient: Tensor
@@ -67,13 +81,21 @@ class Buffers:
     """Memory that all iterations share: allocating it anew takes longer than the arithmetic."""
 
     def __init__(self, flow):
-        self.residual, self.divergence, self.size = flow.new_empty(flow[:, :1].shape), torch.empty_like(flow), torch.empty_like(flow)
-        self.across, self.down = torch.zeros_like(flow), torch.zeros_like(flow)  # the last column and row stay 0
+        self.residual = flow.new_empty(flow[:, :1].shape)
+        self.divergence = torch.empty_like(flow)
+        self.size = torch.empty_like(flow)
+        # the last column and row stay 0
+        self.across = torch.zeros_like(flow)
+        self.down = torch.zeros_like(flow)
 
 
 def _iterate(flow, dual_x, dual_y, data, buffers):
     """One step of the data term, one of the smoothness, in place."""
-    residual, divergence, size, across, down = buffers.residual, buffers.divergence, buffers.size, buffers.across, buffers.down
+    residual = buffers.residual
+    divergence = buffers.divergence
+    size = buffers.size
+    across = buffers.across
+    down = buffers.down
     torch.addcmul(data.constant, data.gradient[:, :1], flow[:, :1], out=residual)
     residual.addcmul_(data.gradient[:, 1:], flow[:, 1:])
     torch.minimum(residual, data.most, out=residual)
@@ -91,4 +113,10 @@ def _iterate(flow, dual_x, dual_y, data, buffers):
 
 def _gradient(picture):
     around = pad(picture, (1, 1, 1, 1), mode="replicate")
-    return torch.cat((around[..., 1:-1, 2:] - around[..., 1:-1, :-2], around[..., 2:, 1:-1] - around[..., :-2, 1:-1]), 1) / 2
+    return (
+        torch.cat(
+            (around[..., 1:-1, 2:] - around[..., 1:-1, :-2], around[..., 2:, 1:-1] - around[..., :-2, 1:-1]),
+            1,
+        )
+        / 2
+    )

@@ -1,4 +1,5 @@
-"""Video to a higher frame rate, so that events see motion and not jumps: frames between frames along their optical flow."""
+"""Video to a higher frame rate, so that events see motion and not jumps: frames between frames along their
+optical flow."""
 
 import math
 
@@ -18,38 +19,55 @@ MAX_STEPS = 256
 def upsample(frames, t_s, *, max_displacement_px=1.0, max_log_change=None, max_steps=MAX_STEPS):
     """Put frames between the frames of a video until nothing moves further than a bound from one to the next.
 
-    Frames are taken as instantaneous: blur of an exposure is moved along and not undone. Motion is straight and even between two frames, and light
+    Frames are taken as instantaneous: blur of an exposure is moved along and not undone. Motion is straight
+      and even between two frames, and light
     changes evenly along it. Each interval gets as many steps as its own motion asks for.
 
     Args:
       frames: [T, H, W] linear intensity on the 0-255 scale, finite, >= 0.
       t_s: [T] frame times, seconds, strictly increasing.
       max_displacement_px: how far 99.9 % of the pixels move at most per step, by the flow found, > 0.
-      max_log_change: how far the lin-log level of 99.9 % of the pixels moves at most per step, natural log units, > 0; None: not asked.
+      max_log_change: how far the lin-log level of 99.9 % of the pixels moves at most per step, natural log
+        units, > 0; None: not asked.
       max_steps: most steps per interval that may be needed.
-    Returns: frames [T', H, W] and times [T'] float64, the given ones among them exactly. Where two frames are equal, nothing is put between.
+    Returns: frames [T', H, W] and times [T'] float64, the given ones among them exactly. Where two frames are
+      equal, nothing is put between.
     Gradient: frames, for the flow, visibility and number of steps found, which are held fixed; none to times.
-    Raises: ShapeError for fewer than two frames or other shapes; DomainError for NaN, infinite or negative frames, times that do not increase, bounds that
+    Raises: ShapeError for fewer than two frames or other shapes; DomainError for NaN, infinite or negative
+      frames, times that do not increase, bounds that
       are not positive, or an interval that needs more than max_steps.
-    Source: Gehrig et al., Video to Events, CVPR 2020 (upsampling before event generation); Rebecq et al., ESIM, CoRL 2018 (both bounds).
+    Source: Gehrig et al., Video to Events, CVPR 2020 (upsampling before event generation); Rebecq et al.,
+      ESIM, CoRL 2018 (both bounds).
     """
     check_frames(frames)
     if frames.ndim != 3:
         raise ShapeError(f"frames have shape {list(frames.shape)}; [T, H, W] is needed.")
-    pieces = list(upsample_stream(frames, check_times(t_s, len(frames)), max_displacement_px=max_displacement_px, max_log_change=max_log_change, max_steps=max_steps))
+    pieces = list(
+        upsample_stream(
+            frames,
+            check_times(t_s, len(frames)),
+            max_displacement_px=max_displacement_px,
+            max_log_change=max_log_change,
+            max_steps=max_steps,
+        )
+    )
     return torch.cat([piece for piece, _ in pieces]), torch.cat([times_s for _, times_s in pieces])
 
 
 def upsample_stream(frames, t_s, *, max_displacement_px=1.0, max_log_change=None, max_steps=MAX_STEPS):
     """``upsample`` of frames that come one after the other, in the memory of one interval.
 
-    Args: frames: anything that yields frames [H, W]. t_s: anything that yields as many times. The rest as for ``upsample``.
-    Returns: iterator over (frames [n, H, W], times [n] float64): first the first frame alone, then for each later frame those that lead to it, and itself.
+    Args: frames: anything that yields frames [H, W]. t_s: anything that yields as many times. The rest as for
+      ``upsample``.
+    Returns: iterator over (frames [n, H, W], times [n] float64): first the first frame alone, then for each
+      later frame those that lead to it, and itself.
       Joined they are what ``upsample`` gives, bit for bit.
     Raises: as ``upsample``; bounds at once, frames and times when they come.
     """
     for name, bound in (("max_displacement_px", max_displacement_px), ("max_log_change", max_log_change)):
-        if not (bound is None and name == "max_log_change") and not (isinstance(bound, (int, float)) and 0 < bound < math.inf):
+        if not (bound is None and name == "max_log_change") and not (
+            isinstance(bound, (int, float)) and 0 < bound < math.inf
+        ):
             raise DomainError(f"{name} is {bound!r}; a finite number above 0 is needed.")
     if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
         raise DomainError(f"max_steps is {max_steps!r}; a whole number of at least 1 is needed.")
@@ -57,20 +75,30 @@ def upsample_stream(frames, t_s, *, max_displacement_px=1.0, max_log_change=None
 
 
 def _pieces(frames, t_s, max_displacement_px, max_log_change, max_steps):
-    before, before_s = None, -math.inf
+    before = None
+    before_s = -math.inf
     for index, (frame, time_s) in enumerate(zip(frames, t_s, strict=True)):
         check_frames(frame[None], 1, name=f"frame {index}")
         time_s = float(time_s)
-        if frame.ndim != 2 or (before is not None and (frame.shape != before.shape or frame.dtype != before.dtype)):
-            raise ShapeError(f"frame {index} is {frame.dtype} {list(frame.shape)}; all frames are [H, W] of one size and type.")
+        if frame.ndim != 2 or (
+            before is not None and (frame.shape != before.shape or frame.dtype != before.dtype)
+        ):
+            raise ShapeError(
+                f"frame {index} is {frame.dtype} {list(frame.shape)}; all frames are [H, W] of one size and "
+                "type."
+            )
         if not before_s < time_s < math.inf:
-            raise DomainError(f"frame {index} is at {time_s!r} s, the one before at {before_s!r} s; times must be finite and increase strictly.")
+            raise DomainError(
+                f"frame {index} is at {time_s!r} s, the one before at {before_s!r} s; times must be finite "
+                "and increase strictly."
+            )
         if before is None:
             yield frame[None], torch.tensor([time_s], dtype=torch.float64)
         else:
             made = _interval(before, frame, before_s, time_s, max_displacement_px, max_log_change, max_steps)
             yield made, step_times(before_s, time_s, len(made))
-        before, before_s = frame, time_s
+        before = frame
+        before_s = time_s
 
 
 def _interval(first, second, start_s, end_s, max_displacement_px, max_log_change, max_steps):
@@ -78,7 +106,14 @@ def _interval(first, second, start_s, end_s, max_displacement_px, max_log_change
     flows = flow_both_ways(first.detach().float(), second.detach().float()).to(first)
     flows = repaired(flow_levels(first, second), flows, visibility(flows))
     seen = visibility(flows)
-    count = steps_for(largest(flows.norm(dim=1)), max_displacement_px, max_steps, "the place of things, in pixels,", start_s, end_s)
+    count = steps_for(
+        largest(flows.norm(dim=1)),
+        max_displacement_px,
+        max_steps,
+        "the place of things, in pixels,",
+        start_s,
+        end_s,
+    )
     while True:
         made = torch.stack([*(between(first, second, flows, seen, share) for share in shares(count)), second])
         if max_log_change is None:
@@ -87,4 +122,6 @@ def _interval(first, second, start_s, end_s, max_displacement_px, max_log_change
         change = largest_change(lin_log(torch.cat((first[None], made)).detach()))
         if change <= max_log_change:
             return made
-        count = max(count + 1, steps_for(change * count, max_log_change, max_steps, "the log level", start_s, end_s))
+        count = max(
+            count + 1, steps_for(change * count, max_log_change, max_steps, "the log level", start_s, end_s)
+        )

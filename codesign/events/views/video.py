@@ -14,18 +14,23 @@ from codesign.events.views.view import picture
 from codesign.events.volumes.traces import decay
 from codesign.types import EventStream
 
-LEAST_SIDE_PX = 256  # small frames are enlarged until their shorter side reaches this, so that single pixels can be seen,
+LEAST_SIDE_PX = (
+    256  # small frames are enlarged until their shorter side reaches this, so that single pixels can be seen,
+)
 LARGEST_SIDE_PX = 1280  # unless the longer one would exceed this
 
 
 def write_video(path, pictures, fps):
-    """Write pictures as a video; small ones are enlarged by whole factors, odd sizes get one more row or column of their edge.
+    """Write pictures as a video; small ones are enlarged by whole factors, odd sizes get one more row or
+    column of their edge.
 
     Args:
       path: file ending in .mp4 (H.264) or .gif.
-      pictures: [N, H, W, 3] or [N, H, W] uint8, N >= 1; or anything that yields such pictures one after the other (an MP4 then needs the memory of one).
+      pictures: [N, H, W, 3] or [N, H, W] uint8, N >= 1; or anything that yields such pictures one after the
+        other (an MP4 then needs the memory of one).
       fps: pictures per second, > 0 (a GIF keeps hundredths of a second: at most 50).
-    Raises: FileFormatError for another extension or a folder that is not writable; ShapeError, DomainError for anything but such pictures.
+    Raises: FileFormatError for another extension or a folder that is not writable; ShapeError, DomainError
+      for anything but such pictures.
     """
     path = Path(path)
     if not 0 < fps <= 1000:
@@ -39,7 +44,11 @@ def write_video(path, pictures, fps):
     with replacing(path) as temporary:
         if path.suffix.lower() == ".mp4":
             size = (first.shape[1], first.shape[0])
-            with closing(imageio_ffmpeg.write_frames(str(temporary), size, fps=fps, codec="libx264", quality=8, macro_block_size=2)) as file:
+            with closing(
+                imageio_ffmpeg.write_frames(
+                    str(temporary), size, fps=fps, codec="libx264", quality=8, macro_block_size=2
+                )
+            ) as file:
                 file.send(None)
                 file.send(np.ascontiguousarray(first))
                 for each in ready:
@@ -66,10 +75,20 @@ def _prepared(pictures):
     size = None
     for index, given in enumerate(pictures):
         each = np.asarray(given.cpu() if hasattr(given, "cpu") else given)
-        if each.dtype != np.uint8 or each.ndim not in (2, 3) or 0 in each.shape or (each.ndim == 3 and each.shape[-1] != 3):
-            raise ShapeError(f"picture {index} is {each.dtype} {list(each.shape)}; uint8 [H, W, 3] or [H, W] is needed.")
+        if (
+            each.dtype != np.uint8
+            or each.ndim not in (2, 3)
+            or 0 in each.shape
+            or (each.ndim == 3 and each.shape[-1] != 3)
+        ):
+            raise ShapeError(
+                f"picture {index} is {each.dtype} {list(each.shape)}; uint8 [H, W, 3] or [H, W] is needed."
+            )
         if size is not None and each.shape != size:
-            raise ShapeError(f"picture {index} has shape {list(each.shape)}, those before {list(size)}; a video has one size.")
+            raise ShapeError(
+                f"picture {index} has shape {list(each.shape)}, those before {list(size)}; a video has one "
+                "size."
+            )
         size = each.shape
         colour = np.repeat(each[..., None], 3, axis=-1) if each.ndim == 2 else each
         factor = max(1, min(-(-LEAST_SIDE_PX // min(size[:2])), LARGEST_SIDE_PX // max(size[:2])))

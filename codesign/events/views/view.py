@@ -9,7 +9,8 @@ from codesign.events.entry import check_times
 
 
 def picture(counts, full_scale=None):
-    """Event frames as colour pictures: white where nothing happened, red for ON, blue for OFF, purple for both.
+    """Event frames as colour pictures: white where nothing happened, red for ON, blue for OFF, purple for
+    both.
 
     Args:
       counts: [..., 2, H, W] counts >= 0, ON first.

@@ -1,4 +1,5 @@
-"""Spike tensors [2, W, H, T]: one binary spike per polarity, column, row and time step, ON first, as spiking networks take them."""
+"""Spike tensors [2, W, H, T]: one binary spike per polarity, column, row and time step, ON first, as spiking
+networks take them."""
 
 import torch
 
@@ -11,15 +12,21 @@ def spikes_from_stream(stream, t0_us, step_us, steps, *, dtype=torch.float32):
 
     Args:
       stream: EventStream.
-      t0_us: start of step 0, whole microseconds. step_us: length of a step, whole microseconds, > 0. steps: number of steps T, >= 1.
-    Returns: [2, W, H, T]: 1 where at least one event lies in [t0 + k step, t0 + (k + 1) step), else 0. Events of one pixel, polarity and step become one
-      spike (the number of events less the sum of the tensor says how many went into others); those outside the T steps are not asked for.
+      t0_us: start of step 0, whole microseconds. step_us: length of a step, whole microseconds, > 0. steps:
+        number of steps T, >= 1.
+    Returns: [2, W, H, T]: 1 where at least one event lies in [t0 + k step, t0 + (k + 1) step), else 0. Events
+      of one pixel, polarity and step become one
+      spike (the number of events less the sum of the tensor says how many went into others); those outside
+      the T steps are not asked for.
       Neurons of ``events.srm``: ``spikes.flatten(0, 2).T`` is [T, N].
     Gradient: none (timestamps are integers).
     Raises: DomainError for times or numbers that are not whole, or not positive.
-    Source: layout of Gehrig et al., Event-Based Angular Velocity Regression with Spiking Networks, ICRA 2020, and of SLAYER (Shrestha, Orchard 2018).
+    Source: layout of Gehrig et al., Event-Based Angular Velocity Regression with Spiking Networks, ICRA 2020,
+      and of SLAYER (Shrestha, Orchard 2018).
     """
-    t0_us, step_us, steps = _whole(t0_us, "t0_us"), _whole(step_us, "step_us", 1), _whole(steps, "steps", 1)
+    t0_us = _whole(t0_us, "t0_us")
+    step_us = _whole(step_us, "step_us", 1)
+    steps = _whole(steps, "steps", 1)
     step = torch.div(stream.t_us - t0_us, step_us, rounding_mode="floor")
     inside = (step >= 0) & (step < steps)
     shape = (2, stream.width_px, stream.height_px, steps)
@@ -29,17 +36,21 @@ def spikes_from_stream(stream, t0_us, step_us, steps, *, dtype=torch.float32):
 
 
 def stream_from_spikes(spikes, t0_us, step_us):
-    """Stream with one event per spike, at the start of its step; ``spikes_from_stream`` of it gives the same spikes.
+    """Stream with one event per spike, at the start of its step; ``spikes_from_stream`` of it gives the same
+    spikes.
 
     Args:
       spikes: [2, W, H, T] of 0 and 1, ON first. t0_us, step_us: as for ``spikes_from_stream``.
     Raises: ShapeError for another shape; DomainError for values other than 0 and 1.
     """
-    t0_us, step_us = _whole(t0_us, "t0_us"), _whole(step_us, "step_us", 1)
+    t0_us = _whole(t0_us, "t0_us")
+    step_us = _whole(step_us, "step_us", 1)
     if spikes.ndim != 4 or spikes.shape[0] != 2 or 0 in spikes.shape:
         raise ShapeError(f"spikes have shape {list(spikes.shape)}; [2, W, H, T] is needed (ON first).")
     if not bool(((spikes == 0) | (spikes == 1)).all()):
-        raise DomainError("spikes hold values other than 0 and 1; round soft spikes before making single events of them.")
+        raise DomainError(
+            "spikes hold values other than 0 and 1; round soft spikes before making single events of them."
+        )
     off, x, y, step = spikes.nonzero(as_tuple=True)
     return ordered(t0_us + step * step_us, x, y, 1 - 2 * off, spikes.shape[2], spikes.shape[1])
 
@@ -53,14 +64,20 @@ def spikes_from_counts(counts):
     Raises: ShapeError for another shape; DomainError for counts that are negative or not finite.
     """
     if counts.ndim != 4 or counts.shape[1] != 2 or 0 in counts.shape:
-        raise ShapeError(f"counts have shape {list(counts.shape)}; [T, 2, H, W] is needed (ON first on axis 1).")
+        raise ShapeError(
+            f"counts have shape {list(counts.shape)}; [T, 2, H, W] is needed (ON first on axis 1)."
+        )
     check_finite(counts, "counts")
     if bool((counts < 0).any()):
-        raise DomainError(f"counts reach down to {float(counts.detach().min()):g}; numbers of events are 0 or more.")
+        raise DomainError(
+            f"counts reach down to {float(counts.detach().min()):g}; numbers of events are 0 or more."
+        )
     return counts.clamp(max=1).permute(1, 3, 2, 0).contiguous()
 
 
 def _whole(value, name, least=None):
     if isinstance(value, bool) or int(value) != value or (least is not None and value < least):
-        raise DomainError(f"{name} is {value!r}; a whole number{'' if least is None else f' >= {least}'} is needed.")
+        raise DomainError(
+            f"{name} is {value!r}; a whole number{'' if least is None else f' >= {least}'} is needed."
+        )
     return int(value)

@@ -20,7 +20,8 @@ def decay(counts, t_s, tau_s):
     """
     check_tau(tau_s)
     fade = torch.exp(check_times(t_s, len(counts) + 1).diff() / -tau_s).tolist()
-    trace, traces = torch.zeros_like(counts[0]), []
+    trace = torch.zeros_like(counts[0])
+    traces = []
     for now, factor in zip(counts, fade, strict=True):
         trace = trace * factor + now
         traces.append(trace)
@@ -28,24 +29,33 @@ def decay(counts, t_s, tau_s):
 
 
 def decay_from_stream(stream, at_us, tau_s, *, start=None, dtype=torch.float32):
-    """Exponentially fading sum of single events at given times: sum over t <= t_ref of exp(-(t_ref - t) / tau).
+    """Exponentially fading sum of single events at given times: sum over t <= t_ref of exp(-(t_ref - t) /
+    tau).
 
     Args:
       stream: EventStream.
-      at_us: [K] reference times, whole microseconds, strictly increasing. Events at a reference time belong to it.
+      at_us: [K] reference times, whole microseconds, strictly increasing. Events at a reference time belong
+        to it.
       tau_s: seconds, > 0.
-      start: (trace [2, H, W], its time in whole microseconds) of an earlier chunk, whose events are then not in the stream; None: nothing before.
+      start: (trace [2, H, W], its time in whole microseconds) of an earlier chunk, whose events are then not
+        in the stream; None: nothing before.
     Returns: [K, 2, H, W], summed in float64, ON first.
     Gradient: none (timestamps are integers).
-    Raises: DomainError for reference times that are not whole or do not increase, and for tau; ShapeError for a trace of another size.
+    Raises: DomainError for reference times that are not whole or do not increase, and for tau; ShapeError for
+      a trace of another size.
     """
     check_tau(tau_s)
-    height, width = stream.height_px, stream.width_px
-    trace, before_us = torch.zeros(2 * height * width, dtype=torch.float64, device=stream.t_us.device), None
+    height = stream.height_px
+    width = stream.width_px
+    trace = torch.zeros(2 * height * width, dtype=torch.float64, device=stream.t_us.device)
+    before_us = None
     if start is not None:
         earlier, before_us = start
         if earlier.shape != (2, height, width):
-            raise ShapeError(f"the trace to go on with has shape {list(earlier.shape)}; the sensor's is {[2, height, width]}.")
+            raise ShapeError(
+                f"the trace to go on with has shape {list(earlier.shape)}; the sensor's is "
+                f"{[2, height, width]}."
+            )
         trace += earlier.to(trace).flatten()
     traces = []
     for time_us, (cell, t_us) in segments(stream, at_us):
@@ -58,13 +68,24 @@ def decay_from_stream(stream, at_us, tau_s, *, start=None, dtype=torch.float32):
 
 
 def segments(stream, at_us):
-    """For every reference time: the time, and (cell, t_us) of the events after the one before, up to and including it.
+    """For every reference time: the time, and (cell, t_us) of the events after the one before, up to and
+    including it.
 
-    A cell is the place of (polarity, row, column) in a flattened [2, H, W]. Raises: DomainError for times that are not whole or do not increase.
+    A cell is the place of (polarity, row, column) in a flattened [2, H, W]. Raises: DomainError for times
+    that are not whole or do not increase.
     """
     times_us = torch.as_tensor(at_us)
-    if times_us.ndim != 1 or not len(times_us) or times_us.is_floating_point() or times_us.is_complex() or bool((times_us.diff() <= 0).any()):
-        raise DomainError(f"at_us is {at_us if len(str(at_us)) < 80 else str(at_us)[:80] + ' …'}; a list of whole microseconds that increase strictly is needed.")
+    if (
+        times_us.ndim != 1
+        or not len(times_us)
+        or times_us.is_floating_point()
+        or times_us.is_complex()
+        or bool((times_us.diff() <= 0).any())
+    ):
+        raise DomainError(
+            f"at_us is {at_us if len(str(at_us)) < 80 else str(at_us)[:80] + ' …'}; a list of whole "
+            "microseconds that increase strictly is needed."
+        )
     ends = torch.searchsorted(stream.t_us, times_us.to(stream.t_us), right=True).tolist()
     cell = ((stream.p < 0).long() * stream.height_px + stream.y) * stream.width_px + stream.x
     for time_us, first, last in zip(times_us.tolist(), [0, *ends], ends, strict=False):

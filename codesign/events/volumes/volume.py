@@ -1,7 +1,9 @@
 """Event volumes: counts on a grid of time bins, shared linearly between the two nearest bins.
 
-With n bins the nodes are n equally spaced times from the start to the end of the interval. An event between two nodes is shared in proportion to its
-nearness, so nothing is lost. The end bins collect from one side only: half as much as the others, centred a third of a node spacing inside.
+With n bins the nodes are n equally spaced times from the start to the end of the interval. An event between
+two nodes is shared in proportion to its
+nearness, so nothing is lost. The end bins collect from one side only: half as much as the others, centred a
+third of a node spacing inside.
 """
 
 import torch
@@ -36,18 +38,24 @@ def from_counts(counts, t_s, bins):
     """Sort the counts of consecutive frame intervals into time bins.
 
     Args:
-      counts: [T-1, 2, ..., H, W] events per interval, ON first, axes between polarity and H as batch ([T-1, 2, H, W]: batch of one).
+      counts: [T-1, 2, ..., H, W] events per interval, ON first, axes between polarity and H as batch ([T-1,
+        2, H, W]: batch of one).
       t_s: [T] frame times, seconds, strictly increasing. The events of an interval sit at its middle.
       bins: number of bins, >= 1.
     Returns: EventVolume of counts [B, 2, bins, H, W]; the total is conserved.
-      centroid_s: [bins] float64, seconds from t_s[0]: mean time of what a bin collects when events come at an even rate. It does not depend on the
+      centroid_s: [bins] float64, seconds from t_s[0]: mean time of what a bin collects when events come at an
+        even rate. It does not depend on the
       counts, so a rate that changes linearly with time is read off at the centroid exactly.
     Gradient: counts.
-    Raises: ShapeError when axes or the number of times do not fit; DomainError for times that do not increase, counts that are not finite, bins < 1,
+    Raises: ShapeError when axes or the number of times do not fit; DomainError for times that do not
+      increase, counts that are not finite, bins < 1,
       and for fewer intervals than fill every bin.
     """
     if counts.ndim < 4 or counts.shape[0] < 1 or counts.shape[1] != 2:
-        raise ShapeError(f"counts have shape {list(counts.shape)}; [T-1, 2, H, W] or [T-1, 2, K, H, W] is needed (ON first on axis 1).")
+        raise ShapeError(
+            f"counts have shape {list(counts.shape)}; [T-1, 2, H, W] or [T-1, 2, K, H, W] is needed (ON "
+            "first on axis 1)."
+        )
     check_finite(counts, "counts")
     times_s = check_times(t_s, counts.shape[0] + 1)
     middle_s = (times_s[1:] + times_s[:-1]) / 2 - times_s[0]
@@ -55,7 +63,10 @@ def from_counts(counts, t_s, bins):
     collected_s = shares.T @ times_s.diff()
     if bool((collected_s <= 0).any()):
         empty = (collected_s <= 0).nonzero().flatten().tolist()
-        raise DomainError(f"bins {empty} of {bins} collect no interval out of {counts.shape[0]}; use fewer bins or more frames.")
+        raise DomainError(
+            f"bins {empty} of {bins} collect no interval out of {counts.shape[0]}; use fewer bins or more "
+            "frames."
+        )
     centroid_s = (shares.T @ (times_s.diff() * middle_s)) / collected_s
     *batch, height, width = counts.shape[2:]
     volume = shares.T.to(counts) @ counts.flatten(1)
@@ -68,26 +79,35 @@ def from_stream(stream, t0_us, t1_us, bins, *, dtype=torch.float32):
 
     Args:
       stream: EventStream.
-      t0_us, t1_us: the interval, integer microseconds, both ends included; tile time with [a, b], [b + 1, c]. Events outside are not asked for.
+      t0_us, t1_us: the interval, integer microseconds, both ends included; tile time with [a, b], [b + 1, c].
+        Events outside are not asked for.
       bins: number of bins, >= 1.
-    Returns: EventVolume of counts [1, 2, bins, H, W] whose total is the number of events in the interval, and centroid_s [bins] float64, seconds from
+    Returns: EventVolume of counts [1, 2, bins, H, W] whose total is the number of events in the interval, and
+      centroid_s [bins] float64, seconds from
       t0: (t1 - t0)/(3 (bins - 1)) inside at the ends, the nodes between (even event rate).
     Gradient: none (timestamps are integers).
     Raises: DomainError for t1 <= t0 or bins < 1.
     """
     if int(t0_us) != t0_us or int(t1_us) != t1_us or t1_us <= t0_us:
-        raise DomainError(f"the interval is {t0_us!r} to {t1_us!r} us; whole microseconds with t1 > t0 are needed.")
+        raise DomainError(
+            f"the interval is {t0_us!r} to {t1_us!r} us; whole microseconds with t1 > t0 are needed."
+        )
     check_bins(bins)
     duration_us = int(t1_us) - int(t0_us)
-    first, last = torch.searchsorted(stream.t_us, torch.tensor([int(t0_us), int(t1_us) + 1], device=stream.t_us.device)).tolist()
+    first, last = torch.searchsorted(
+        stream.t_us, torch.tensor([int(t0_us), int(t1_us) + 1], device=stream.t_us.device)
+    ).tolist()
     t_us, x, y, p = (column[first:last] for column in (stream.t_us, stream.x, stream.y, stream.p))
-    height, width = stream.height_px, stream.width_px
+    height = stream.height_px
+    width = stream.width_px
     # numerators of the place in node spacings: whole numbers, exact at any time
     scaled = (t_us - int(t0_us)) * (bins - 1)
     node = torch.div(scaled, duration_us, rounding_mode="floor")
     share = (scaled - node * duration_us).to(torch.float64) / duration_us
     cell = (((p < 0).long() * bins + node) * height + y) * width + x
-    counts = torch.zeros(2 * bins * height * width + height * width, dtype=torch.float64, device=cell.device)  # one spare node: an event at the end gives it 0
+    counts = torch.zeros(
+        2 * bins * height * width + height * width, dtype=torch.float64, device=cell.device
+    )  # one spare node: an event at the end gives it 0
     counts.index_add_(0, cell, 1 - share)
     if bins > 1:
         counts.index_add_(0, cell + height * width, share)
@@ -98,4 +118,6 @@ def from_stream(stream, t0_us, t1_us, bins, *, dtype=torch.float32):
     collected_s = torch.full_like(node_s, duration_us * 1e-6 / max(bins - 1, 1))
     if bins > 1:
         collected_s[[0, -1]] /= 2
-    return EventVolume(counts.reshape(1, 2, bins, height, width).to(dtype), node_s * (duration_us * 1e-6), collected_s)
+    return EventVolume(
+        counts.reshape(1, 2, bins, height, width).to(dtype), node_s * (duration_us * 1e-6), collected_s
+    )

@@ -1,4 +1,5 @@
-"""Networks to compare event flow with: a plain convolutional one and one with a spiking encoder. See docs/flow_baselines.md."""
+"""Networks to compare event flow with: a plain convolutional one and one with a spiking encoder. See
+docs/flow_baselines.md."""
 
 from codesign.flow.baselines.flownet_events import FlowNetEvents
 from codesign.flow.baselines.halves import from_halves, to_halves

@@ -14,15 +14,20 @@ STRIDE = 16
 
 
 class FlowNetEvents(nn.Module):
-    """Four strided layers, two residual blocks, four decoding layers that each add to the flow and hand it on, with skip connections.
+    """Four strided layers, two residual blocks, four decoding layers that each add to the flow and hand it
+    on, with skip connections.
 
     Args:
-      bins: bins of the volumes, >= 2. width: channels of the first layer (8 times as many in the last); every layer takes the nearest multiple of 4.
-      hidden: channels inside the residual blocks, a multiple of 4; None for 8 times ``width``. seed: of the first weights.
-    Called with an EventVolume [B, 2, bins, H, W] of any H, W: FlowField, px per interval at full resolution. Its confidence only says whether the sample had events.
+      bins: bins of the volumes, >= 2. width: channels of the first layer (8 times as many in the last); every
+        layer takes the nearest multiple of 4.
+      hidden: channels inside the residual blocks, a multiple of 4; None for 8 times ``width``. seed: of the
+        first weights.
+    Called with an EventVolume [B, 2, bins, H, W] of any H, W: FlowField, px per interval at full resolution.
+      Its confidence only says whether the sample had events.
     Gradient: counts and weights; smooth, so any order.
     Raises: ShapeError, DomainError.
-    Source: Zhu et al., EV-FlowNet, RSS 2018, fig. 4, with group normalisation (Wu and He, ECCV 2018) and SiLU.
+    Source: Zhu et al., EV-FlowNet, RSS 2018, fig. 4, with group normalisation (Wu and He, ECCV 2018) and
+      SiLU.
     """
 
     def __init__(self, bins: int = 8, width: float = 32.0, hidden: int | None = None, seed: int = 0):
@@ -33,8 +38,12 @@ class FlowNetEvents(nn.Module):
         inside = channels(width, 8) if hidden is None else hidden
         down = [channels(width, factor) for factor in (1, 2, 4, 8)]
         up = [channels(width, factor) for factor in (4, 2, 1, 0.5)]
-        self.encoder = nn.ModuleList(Layer(a, b, stride=2) for a, b in zip([2 * bins, *down], down, strict=False))
-        self.residual = nn.ModuleList(nn.Sequential(Layer(down[3], inside), Layer(inside, down[3], active=False)) for _ in range(2))
+        self.encoder = nn.ModuleList(
+            Layer(a, b, stride=2) for a, b in zip([2 * bins, *down], down, strict=False)
+        )
+        self.residual = nn.ModuleList(
+            nn.Sequential(Layer(down[3], inside), Layer(inside, down[3], active=False)) for _ in range(2)
+        )
         skipped = [2 * down[3]] + [a + b + 2 for a, b in zip(up, reversed(down[:3]), strict=False)]
         self.decoder = nn.ModuleList(Layer(a, b) for a, b in zip(skipped, up, strict=True))
         self.heads = nn.ModuleList(nn.Conv2d(b, 2, 1) for b in up)
@@ -43,7 +52,8 @@ class FlowNetEvents(nn.Module):
 
     @classmethod
     def with_weights(cls, weights: int, bins: int = 8, seed: int = 0) -> "FlowNetEvents":
-        """The network with the fewest weights that are not below the budget (at most 4 % above it from 0.3 M on)."""
+        """The network with the fewest weights that are not below the budget (at most 4 % above it from 0.3 M
+        on)."""
         width, hidden = fill_budget(lambda **sizes: cls(bins, **sizes), weights)
         return cls(bins, width, hidden, seed)
 
@@ -51,14 +61,16 @@ class FlowNetEvents(nn.Module):
         return self._finish(volume, self._levels(volume)[-1])
 
     def predictions(self, volume: EventVolume) -> list[FlowField]:
-        """Flow of every decoding layer at full resolution, in pixels there, coarse first; the last is what a call returns."""
+        """Flow of every decoding layer at full resolution, in pixels there, coarse first; the last is what a
+        call returns."""
         return [self._finish(volume, level) for level in self._levels(volume)]
 
     def _levels(self, volume) -> list[Tensor]:
         """Flow at 1/8, 1/4, 1/2 and all of the padded resolution, in pixels of each."""
         counts = check_volume(volume, self.config["bins"])
         x = pad_to(normalise(counts).flatten(1, 2), STRIDE).contiguous(memory_format=torch.channels_last)
-        skips, flows = [], []
+        skips = []
+        flows = []
         for layer in self.encoder:
             x = layer(x)
             skips.append(x)
@@ -67,7 +79,11 @@ class FlowNetEvents(nn.Module):
         for layer, head in zip(self.decoder, self.heads, strict=True):
             x = torch.cat([x, skips.pop(), *flows[-1:]], 1)
             x = layer(interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False))
-            change = head(x)  # normalisation takes the mean from what is handed on, so each level adds to the flow instead of saying it anew
+            change = head(
+                x
+                # normalisation takes the mean from what is handed on, so each level adds to the flow instead of
+                # saying it anew
+            )
             flows.append(rescale_flow(flows[-1], change.shape[2:]) + change if flows else change)
         return flows
 

@@ -11,8 +11,13 @@ _FIRST_ONLY = "a surrogate stands for the first derivative of a spike only; a se
 class _Fire(torch.autograd.Function):
     @staticmethod
     def forward(ctx, current, threshold, surrogate):
-        ctx.threshold, ctx.surrogate = threshold, surrogate
-        ctx.save_for_backward(current)  # the potential is made again: it would weigh as much, and the current ties a second derivative to its refusal
+        ctx.threshold = threshold
+        ctx.surrogate = surrogate
+        ctx.save_for_backward(
+            current
+            # the potential is made again: it would weigh as much, and the current ties a second derivative to its
+            # refusal
+        )
         return _run(current, threshold, torch.empty_like(current[:1]))
 
     @staticmethod
@@ -30,8 +35,10 @@ class _Fire(torch.autograd.Function):
 
 
 def _run(current, threshold, potential):
-    """Spikes [T, ...]; potentials before the reset are left in ``potential``, as far as it is long. Into buffers made once: fresh ones cost more than the arithmetic."""
-    spikes, rest = torch.empty_like(current), torch.zeros_like(current[0])
+    """Spikes [T, ...]; potentials before the reset are left in ``potential``, as far as it is long. Into
+    buffers made once: fresh ones cost more than the arithmetic."""
+    spikes = torch.empty_like(current)
+    rest = torch.zeros_like(current[0])
     for t in range(len(current)):
         u = torch.add(rest, current[t], out=potential[t % len(potential)])
         torch.ge(u, threshold, out=spikes[t])
@@ -40,15 +47,20 @@ def _run(current, threshold, potential):
 
 
 def integrate_and_fire(current, threshold, surrogate):
-    """Spikes of neurons without leak that fall back to 0 when they fire: u_t = u_{t-1} (1 - s_{t-1}) + I_t, s_t = [u_t >= threshold].
+    """Spikes of neurons without leak that fall back to 0 when they fire: u_t = u_{t-1} (1 - s_{t-1}) + I_t,
+    s_t = [u_t >= threshold].
 
     Args:
       current: [T, ...] input of every step, in units of the potential.
-      threshold: > 0. surrogate: codesign.events.spiking.surrogate.Surrogate, its density at u - threshold stands for the derivative of the step.
+      threshold: > 0. surrogate: codesign.events.spiking.surrogate.Surrogate, its density at u - threshold
+        stands for the derivative of the step.
     Returns: [T, ...] spikes, 0 or 1.
-    Gradient: current; lambda_t = g_t rho(u_t - threshold) + (1 - s_t) lambda_{t+1}, the reset taken as it happened. First derivatives only.
-    Raises: GradientError for a second derivative; ShapeError without a step; DomainError for a threshold <= 0.
-    Source: Lee et al., Spike-FlowNet, ECCV 2020, eqs. 1 to 3, which lets rho be 1 / threshold above it and 0 below.
+    Gradient: current; lambda_t = g_t rho(u_t - threshold) + (1 - s_t) lambda_{t+1}, the reset taken as it
+      happened. First derivatives only.
+    Raises: GradientError for a second derivative; ShapeError without a step; DomainError for a threshold <=
+      0.
+    Source: Lee et al., Spike-FlowNet, ECCV 2020, eqs. 1 to 3, which lets rho be 1 / threshold above it and 0
+      below.
     """
     if current.ndim < 1 or len(current) < 1:
         raise ShapeError(f"the current needs a time axis with at least one step, got {tuple(current.shape)}.")

@@ -12,14 +12,20 @@ def rescale_flow(flow_px, size):
     Args:
       flow_px: [B, 2, H, W] in pixels of its own grid.
       size: (height, width) of the new grid, >= 1.
-    Returns: [B, 2, height, width] in pixels of the new grid: resampled bilinearly between pixel centres (constant beyond the outermost), x times width / W, y times height / H.
+    Returns: [B, 2, height, width] in pixels of the new grid: resampled bilinearly between pixel centres
+      (constant beyond the outermost), x times width / W, y times height / H.
     Gradient: flow_px.
     Raises: ShapeError.
     """
     height, width = size
     if flow_px.ndim != 4 or flow_px.shape[1] != 2 or min(height, width, *flow_px.shape[2:]) < 1:
-        raise ShapeError(f"a flow is [B, 2, H, W] and its new size at least 1 x 1; got {tuple(flow_px.shape)} and {height} x {width}.")
+        raise ShapeError(
+            f"a flow is [B, 2, H, W] and its new size at least 1 x 1; got {tuple(flow_px.shape)} and "
+            f"{height} x {width}."
+        )
     if tuple(size) == tuple(flow_px.shape[2:]):
         return flow_px
-    factor = torch.tensor([width / flow_px.shape[3], height / flow_px.shape[2]], dtype=flow_px.dtype, device=flow_px.device)
+    factor = torch.tensor(
+        [width / flow_px.shape[3], height / flow_px.shape[2]], dtype=flow_px.dtype, device=flow_px.device
+    )
     return interpolate(flow_px, (height, width), mode="bilinear", align_corners=False) * factor[:, None, None]

@@ -16,17 +16,23 @@ def count_weights(module):
 
 
 def start(module, seed, variance, heads=()):
-    """Draw convolutions from a normal distribution of variance ``variance`` / inputs of a weight (a hundredth of that in ``heads``), biases 0.
+    """Draw convolutions from a normal distribution of variance ``variance`` / inputs of a weight (a hundredth
+    of that in ``heads``), biases 0.
 
     The generator's seed is the only source. Modules on the meta device, built to be counted, are left alone.
     """
     generator = torch.Generator().manual_seed(seed)
     for part in module.modules():
-        if isinstance(part, (torch.nn.Conv2d, torch.nn.ConvTranspose2d)) and part.weight.device.type != "meta":
+        if (
+            isinstance(part, (torch.nn.Conv2d, torch.nn.ConvTranspose2d))
+            and part.weight.device.type != "meta"
+        ):
             inputs = part.in_channels * part.kernel_size[0] * part.kernel_size[1]
             small = 0.1 if any(part is head for head in heads) else 1.0
             with torch.no_grad():
-                part.weight.copy_(torch.randn(part.weight.shape, generator=generator) * (small * (variance / inputs) ** 0.5))
+                part.weight.copy_(
+                    torch.randn(part.weight.shape, generator=generator) * (small * (variance / inputs) ** 0.5)
+                )
                 if part.bias is not None:
                     part.bias.zero_()
 
@@ -34,7 +40,8 @@ def start(module, seed, variance, heads=()):
 def fill_budget(build, weights):
     """Arguments (width, hidden) of the network with the fewest weights that is not below the budget.
 
-    Args: build: function of width and hidden (channels inside the residual blocks, None for the usual number) that makes the network. weights: the budget.
+    Args: build: function of width and hidden (channels inside the residual blocks, None for the usual number)
+      that makes the network. weights: the budget.
     Raises: DomainError when even the narrowest network is above the budget.
     """
 
@@ -43,14 +50,20 @@ def fill_budget(build, weights):
             return count_weights(build(width=width, hidden=hidden))
 
     if counted(1.0) > weights:
-        raise DomainError(f"a budget of {weights} weights is too small; the narrowest network has {counted(1.0)}.")
-    low, high = 4, 8  # widths in quarters
+        raise DomainError(
+            f"a budget of {weights} weights is too small; the narrowest network has {counted(1.0)}."
+        )
+    # widths in quarters
+    low = 4
+    high = 8
     while counted(high / 4) <= weights:
-        low, high = high, 2 * high
+        low = high
+        high = 2 * high
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (middle, high) if counted(middle / 4) <= weights else (low, middle)
-    width, hidden = low / 4, channels(low / 4, 8)
+    width = low / 4
+    hidden = channels(low / 4, 8)
     while counted(width, hidden) < weights:
         hidden += 4
     return width, hidden

@@ -1,4 +1,5 @@
-"""Where flow is learned from and judged on: recordings with true flow by path, and folders of data sets as sources of windows."""
+"""Where flow is learned from and judged on: recordings with true flow by path, and folders of data sets as
+sources of windows."""
 
 from codesign.flow.sources.dsec import DsecWindows
 from codesign.flow.sources.mvsec import MvsecWindows
@@ -7,4 +8,13 @@ from codesign.flow.sources.packets import Packet, PacketOptions, read_packets
 from codesign.flow.sources.rendered import DatasetWindows
 from codesign.flow.sources.text_events import read_text_events
 
-__all__ = ["DatasetWindows", "DsecWindows", "MvsecWindows", "Packet", "PacketOptions", "open_windows", "read_packets", "read_text_events"]
+__all__ = [
+    "DatasetWindows",
+    "DsecWindows",
+    "MvsecWindows",
+    "Packet",
+    "PacketOptions",
+    "open_windows",
+    "read_packets",
+    "read_text_events",
+]

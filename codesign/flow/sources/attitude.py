@@ -1,4 +1,5 @@
-"""How the camera of a recording turned: from its gyroscope (imu.txt) or from recorded poses (groundtruth.txt)."""
+"""How the camera of a recording turned: from its gyroscope (imu.txt) or from recorded poses
+(groundtruth.txt)."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,8 @@ MOST_BYTES = 2_000_000_000
 
 @dataclass(frozen=True)
 class Attitude:
-    """t_s: [N] rising seconds. turns: N rotations R_world_camera, interpolated along great circles. position_m: [N, 3], or None. name: the file."""
+    """t_s: [N] rising seconds. turns: N rotations R_world_camera, interpolated along great circles.
+    position_m: [N, 3], or None. name: the file."""
 
     t_s: np.ndarray
     turns: Any
@@ -26,19 +28,28 @@ class Attitude:
     def turn(self, t0_s, t1_s):
         """R_later_earlier [3, 3]: takes directions in the camera's axes at t0 to those at t1.
 
-        Raises: FileFormatError when the window is not covered by samples, or lies across a gap of more than 0.1 s.
+        Raises: FileFormatError when the window is not covered by samples, or lies across a gap of more than
+          0.1 s.
         """
         if not (self.t_s[0] <= t0_s and t1_s <= self.t_s[-1]):
-            raise FileFormatError(f"{self.name} covers {self.t_s[0]:.6f} to {self.t_s[-1]:.6f} s, not the window {t0_s:.6f} to {t1_s:.6f} s; choose windows inside.")
-        first, last = np.searchsorted(self.t_s, t0_s, "right") - 1, np.searchsorted(self.t_s, t1_s, "left")
+            raise FileFormatError(
+                f"{self.name} covers {self.t_s[0]:.6f} to {self.t_s[-1]:.6f} s, not the window {t0_s:.6f} "
+                f"to {t1_s:.6f} s; choose windows inside."
+            )
+        first = np.searchsorted(self.t_s, t0_s, "right") - 1
+        last = np.searchsorted(self.t_s, t1_s, "left")
         gap_s = float(np.diff(self.t_s[first : last + 1]).max())
         if gap_s > LARGEST_GAP_S:
-            raise FileFormatError(f"{self.name} has no sample for {gap_s:.3f} s in the window {t0_s:.6f} to {t1_s:.6f} s; at most {LARGEST_GAP_S} s are interpolated.")
+            raise FileFormatError(
+                f"{self.name} has no sample for {gap_s:.3f} s in the window {t0_s:.6f} to {t1_s:.6f} s; at "
+                f"most {LARGEST_GAP_S} s are interpolated."
+            )
         turns = Slerp(self.t_s[first : last + 1], self.turns[first : last + 1])(np.array([t0_s, t1_s]))
         return (turns[1].inv() * turns[0]).as_matrix()
 
     def moved_m(self, t0_s, t1_s):
-        """Distance between the camera's places at both times, metres; None where nobody recorded it. Linear between samples."""
+        """Distance between the camera's places at both times, metres; None where nobody recorded it. Linear
+        between samples."""
         if self.position_m is None:
             return None
         places = np.array([np.interp([t0_s, t1_s], self.t_s, column) for column in self.position_m.T])
@@ -46,12 +57,15 @@ class Attitude:
 
 
 def read_gyroscope(path, axes=None):
-    """Attitude of ``t ax ay az gx gy gz`` (seconds, m/s^2, rad/s): rates integrated from sample to sample, each interval at the mean of its ends.
+    """Attitude of ``t ax ay az gx gy gz`` (seconds, m/s^2, rad/s): rates integrated from sample to sample,
+    each interval at the mean of its ends.
 
-    Args: axes: [3, 3], camera axes from the gyroscope's (identity when None). The gyroscope's offset is not removed.
+    Args: axes: [3, 3], camera axes from the gyroscope's (identity when None). The gyroscope's offset is not
+      removed.
     """
     table = _table(path, 7, "t ax ay az gx gy gz")
-    t_s, rate = table[:, 0], table[:, 4:] @ (np.eye(3) if axes is None else np.asarray(axes)).T
+    t_s = table[:, 0]
+    rate = table[:, 4:] @ (np.eye(3) if axes is None else np.asarray(axes)).T
     steps = Rotation.from_rotvec((rate[1:] + rate[:-1]) / 2 * np.diff(t_s)[:, None])
     turns = [Rotation.identity()]
     for step in steps:
@@ -65,16 +79,22 @@ def read_poses(path):
     length = np.linalg.norm(table[:, 4:], axis=1)
     if bool((np.abs(length - 1) > UNIT_TOLERANCE).any()):
         at = int(np.argmax(np.abs(length - 1) > UNIT_TOLERANCE))
-        raise FileFormatError(f"{path}, row {at + 1} of numbers: the quaternion has length {length[at]:.4g}, not 1; the order is qx qy qz qw.")
+        raise FileFormatError(
+            f"{path}, row {at + 1} of numbers: the quaternion has length {length[at]:.4g}, not 1; the order "
+            "is qx qy qz qw."
+        )
     return Attitude(table[:, 0], Rotation.from_quat(table[:, 4:]), table[:, 1:4], str(path))
 
 
 def _table(path, columns, names):
-    """[N >= 2, columns] finite numbers with rising times in the first column; repeated times are left out after the first."""
+    """[N >= 2, columns] finite numbers with rising times in the first column; repeated times are left out
+    after the first."""
     path = Path(path)
     try:
         if path.stat().st_size > MOST_BYTES:
-            raise FileFormatError(f"{path} has more than {MOST_BYTES} bytes; cut it to the part that is needed.")
+            raise FileFormatError(
+                f"{path} has more than {MOST_BYTES} bytes; cut it to the part that is needed."
+            )
         with path.open("rb") as file:
             delimiter = "," if b"," in file.read(400) else None
         table = np.loadtxt(path, ndmin=2, comments="#", delimiter=delimiter)
@@ -83,8 +103,13 @@ def _table(path, columns, names):
     except (OSError, ValueError) as error:
         raise FileFormatError(f"{path} cannot be read as lines of '{names}' ({error}).") from error
     if table.shape[1] != columns or len(table) < 2 or not np.isfinite(table).all():
-        raise FileFormatError(f"{path} has {len(table)} rows of {table.shape[1]} numbers; at least two rows of {columns} finite ones are needed: '{names}'.")
+        raise FileFormatError(
+            f"{path} has {len(table)} rows of {table.shape[1]} numbers; at least two rows of {columns} "
+            f"finite ones are needed: '{names}'."
+        )
     rises = np.diff(table[:, 0])
     if bool((rises < 0).any()):
-        raise FileFormatError(f"{path}: the time of row {int(np.argmax(rises < 0)) + 2} lies before that of the row above.")
+        raise FileFormatError(
+            f"{path}: the time of row {int(np.argmax(rises < 0)) + 2} lies before that of the row above."
+        )
     return table[np.concatenate([[True], rises > 0])]

@@ -1,4 +1,5 @@
-"""The camera of a recording: a pinhole with radial and tangential distortion, as in calib.txt (fx fy cx cy k1 k2 p1 p2 k3)."""
+"""The camera of a recording: a pinhole with radial and tangential distortion, as in calib.txt (fx fy cx cy k1
+k2 p1 p2 k3)."""
 
 import math
 from dataclasses import dataclass
@@ -8,12 +9,14 @@ import numpy as np
 
 from codesign.errors import DomainError, FileFormatError
 
-STEPS, RESIDUAL_PX = 50, 1e-6
+STEPS = 50
+RESIDUAL_PX = 1e-6
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """focal_px: (fx, fy). centre_px: (cx, cy). distortion: (k1, k2, p1, p2, k3), dimensionless. Source: Brown, Photogrammetric Engineering 1966."""
+    """focal_px: (fx, fy). centre_px: (cx, cy). distortion: (k1, k2, p1, p2, k3), dimensionless. Source:
+    Brown, Photogrammetric Engineering 1966."""
 
     focal_px: tuple[float, float]
     centre_px: tuple[float, float]
@@ -22,13 +25,21 @@ class Calibration:
     def distorted(self, slopes):
         """Image slopes [..., 2] (x/z, y/z) to those the lens makes of them."""
         k1, k2, p1, p2, k3 = self.distortion
-        x, y = slopes[..., 0], slopes[..., 1]
+        x = slopes[..., 0]
+        y = slopes[..., 1]
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        return np.stack([x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1)
+        return np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ],
+            -1,
+        )
 
     def project(self, directions):
-        """Pixels [..., 2] of directions [..., 3] in camera axes (x right, y down, z forward); NaN behind the camera."""
+        """Pixels [..., 2] of directions [..., 3] in camera axes (x right, y down, z forward); NaN behind the
+        camera."""
         z = np.where(directions[..., 2:] > 0, directions[..., 2:], np.nan)
         return self.distorted(directions[..., :2] / z) * self.focal_px + self.centre_px
 
@@ -67,23 +78,38 @@ def read_calibration(path):
         words = path.read_text(encoding="utf-8").replace(",", " ").split()
         values = [float(word) for word in words if not word.endswith(":")]
     except (OSError, ValueError) as error:
-        raise FileFormatError(f"{path} is no calibration: 'fx fy cx cy k1 k2 p1 p2 k3' in pixels is needed ({error}).") from error
+        raise FileFormatError(
+            f"{path} is no calibration: 'fx fy cx cy k1 k2 p1 p2 k3' in pixels is needed ({error})."
+        ) from error
     if len(values) not in (4, 8, 9) or not all(map(math.isfinite, values)) or not min(values[:2]) > 0:
-        raise FileFormatError(f"{path} holds {len(values)} numbers; fx fy cx cy k1 k2 p1 p2 k3 are needed (distortion or k3 may be left out), fx and fy above 0.")
+        raise FileFormatError(
+            f"{path} holds {len(values)} numbers; fx fy cx cy k1 k2 p1 p2 k3 are needed (distortion or k3 "
+            "may be left out), fx and fy above 0."
+        )
     return Calibration((values[0], values[1]), (values[2], values[3]), tuple((values[4:] + [0.0] * 5)[:5]))
 
 
 def signed_axes(text):
-    """[3, 3] matrix of axes such as "xyz" or "-y+xz": row k says which of the sensor's axes is the camera's k-th.
+    """[3, 3] matrix of axes such as "xyz" or "-y+xz": row k says which of the sensor's axes is the camera's
+    k-th.
 
     Raises: DomainError unless each of x, y, z appears once.
     """
-    signs, names, sign = [], [], 1.0
+    signs = []
+    names = []
+    sign = 1.0
     for letter in text.replace(" ", ""):
         if letter in "+-":
             sign = 1.0 if letter == "+" else -1.0
         else:
-            signs, names, sign = [*signs, sign], [*names, letter], 1.0
+            signs = [*signs, sign]
+            names = [*names, letter]
+            sign = 1.0
     if sorted(names) != ["x", "y", "z"]:
-        raise DomainError(f"gyro axes {text!r}: name each of x, y, z once, with a sign where needed, for example 'xyz' or 'x-y-z'.")
-    return np.array([[value * (name == axis) for axis in "xyz"] for name, value in zip(names, signs, strict=True)])
+        raise DomainError(
+            f"gyro axes {text!r}: name each of x, y, z once, with a sign where needed, for example 'xyz' or "
+            "'x-y-z'."
+        )
+    return np.array(
+        [[value * (name == axis) for axis in "xyz"] for name, value in zip(names, signs, strict=True)]
+    )

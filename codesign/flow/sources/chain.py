@@ -14,26 +14,47 @@ def chained(flows_px, valid, hidden=None):
     Args:
       flows_px: [K, 2, H, W] px, each on the pixels of the start of its own part.
       valid: [K, H, W] bool.
-      hidden: [K, H, W] bool: the point is hidden by something at the end of the part, so that the next flow read there would be that of another surface.
-    Returns: flow_px [2, H, W] on the pixels of the first instant, 0 where not valid; valid [H, W]: every part was, the place stayed in the picture up to the
+      hidden: [K, H, W] bool: the point is hidden by something at the end of the part, so that the next flow
+        read there would be that of another surface.
+    Returns: flow_px [2, H, W] on the pixels of the first instant, 0 where not valid; valid [H, W]: every part
+      was, the place stayed in the picture up to the
       last one, was not hidden before it, and never between surfaces whose flows differ by more than 0.75 px.
     Gradient: flows_px.
     """
-    if flows_px.ndim != 4 or flows_px.shape[1] != 2 or valid.shape != (flows_px.shape[0], *flows_px.shape[2:]):
-        raise ShapeError(f"flows and valid have shapes {list(flows_px.shape)} and {list(valid.shape)}; [K, 2, H, W] and [K, H, W] are needed.")
+    if (
+        flows_px.ndim != 4
+        or flows_px.shape[1] != 2
+        or valid.shape != (flows_px.shape[0], *flows_px.shape[2:])
+    ):
+        raise ShapeError(
+            f"flows and valid have shapes {list(flows_px.shape)} and {list(valid.shape)}; [K, 2, H, W] and "
+            "[K, H, W] are needed."
+        )
     height, width = flows_px.shape[2:]
-    y, x = torch.meshgrid(*(torch.arange(n, dtype=flows_px.dtype, device=flows_px.device) for n in (height, width)), indexing="ij")
-    total, seen, before = flows_px[0], valid[0], torch.stack([x, y], -1)
+    y, x = torch.meshgrid(
+        *(torch.arange(n, dtype=flows_px.dtype, device=flows_px.device) for n in (height, width)),
+        indexing="ij",
+    )
+    total = flows_px[0]
+    seen = valid[0]
+    before = torch.stack([x, y], -1)
     size = torch.tensor([max(width - 1, 1), max(height - 1, 1)], dtype=flows_px.dtype, device=flows_px.device)
     for k in range(1, len(flows_px)):
         at = torch.stack([x + total[0], y + total[1]], -1)
         inside = ((at >= 0) & (at <= size)).all(-1)
         at = torch.where(inside[..., None], at, torch.zeros_like(at))
-        step = grid_sample(flows_px[k : k + 1], (2 * at / size - 1)[None], mode="bilinear", padding_mode="border", align_corners=True)[0]
+        step = grid_sample(
+            flows_px[k : k + 1],
+            (2 * at / size - 1)[None],
+            mode="bilinear",
+            padding_mode="border",
+            align_corners=True,
+        )[0]
         seen = seen & inside & _sure(flows_px[k].detach(), valid[k], at.detach())
         if hidden is not None:
             seen = seen & ~_nearest(hidden[k - 1], before)
-        before, total = at.detach(), total + step
+        before = at.detach()
+        total = total + step
     return torch.where(seen, total, torch.zeros_like(total)), seen
 
 
@@ -43,7 +64,9 @@ def _nearest(mask, at):
 
 def _sure(flow, valid, at):
     """Whether the four pixels around each place are valid and move alike."""
-    columns, rows = ((at[..., k].floor().long(), at[..., k].ceil().long()) for k in (0, 1))  # one and the same where the place is on a pixel
+    columns, rows = (
+        (at[..., k].floor().long(), at[..., k].ceil().long()) for k in (0, 1)
+    )  # one and the same where the place is on a pixel
     corners = [(row, column) for column in columns for row in rows]
     around = torch.stack([flow[:, r, c] for r, c in corners])
     alike = (around.amax(0) - around.amin(0)).amax(0) <= EDGE_PX

@@ -13,7 +13,8 @@ ALIKE = 0.05  # windows of one source may differ in length by this share
 
 @dataclass(frozen=True)
 class Sample:
-    """counts: [2, bins, H, W]. flow_px: [2, H, W]. valid: [H, W]. seconds: length of the window. frames: [2, H, W], or None."""
+    """counts: [2, bins, H, W]. flow_px: [2, H, W]. valid: [H, W]. seconds: length of the window. frames: [2,
+    H, W], or None."""
 
     counts: Tensor
     flow_px: Tensor
@@ -24,15 +25,21 @@ class Sample:
 
 @dataclass(frozen=True)
 class Crop:
-    """A piece of every picture, at a place that depends on the seed and the sample's number alone. size_px: (height, width); None: the whole."""
+    """A piece of every picture, at a place that depends on the seed and the sample's number alone. size_px:
+    (height, width); None: the whole."""
 
     size_px: tuple[int, int] | None
     seed: int = 0
 
     def check(self, height_px, width_px):
         """Raise ShapeError unless the piece fits."""
-        if self.size_px is not None and not (0 < self.size_px[0] <= height_px and 0 < self.size_px[1] <= width_px):
-            raise ShapeError(f"pieces of {self.size_px[1]} x {self.size_px[0]} px were asked for; the pictures have {width_px} x {height_px}.")
+        if self.size_px is not None and not (
+            0 < self.size_px[0] <= height_px and 0 < self.size_px[1] <= width_px
+        ):
+            raise ShapeError(
+                f"pieces of {self.size_px[1]} x {self.size_px[0]} px were asked for; the pictures have "
+                f"{width_px} x {height_px}."
+            )
 
     def __call__(self, index, sample):
         """The piece of sample ``index``."""
@@ -40,26 +47,43 @@ class Crop:
             return sample
         height, width = sample.valid.shape
         draw = torch.Generator().manual_seed((1_000_003 * self.seed + index) % 2**63)
-        top, left = (int(torch.randint(n - m + 1, (), generator=draw)) for n, m in zip((height, width), self.size_px, strict=True))
+        top, left = (
+            int(torch.randint(n - m + 1, (), generator=draw))
+            for n, m in zip((height, width), self.size_px, strict=True)
+        )
         cut = (..., slice(top, top + self.size_px[0]), slice(left, left + self.size_px[1]))
         frames = None if sample.frames is None else sample.frames[cut]
-        return Sample(sample.counts[cut].contiguous(), sample.flow_px[cut].contiguous(), sample.valid[cut].contiguous(), sample.seconds, frames)
+        return Sample(
+            sample.counts[cut].contiguous(),
+            sample.flow_px[cut].contiguous(),
+            sample.valid[cut].contiguous(),
+            sample.seconds,
+            frames,
+        )
 
 
 def collate(samples):
-    """FlowWindows of samples. Flows stay those of each sample's own window; the times of the bins are those of the mean window.
+    """FlowWindows of samples. Flows stay those of each sample's own window; the times of the bins are those
+    of the mean window.
 
     Raises: DomainError without a sample; ShapeError when sizes differ.
     """
     if not samples:
         raise DomainError("a batch of no samples was asked for; give at least one index.")
     if len({sample.counts.shape for sample in samples}) > 1:
-        raise ShapeError(f"samples of shapes {sorted({tuple(sample.counts.shape) for sample in samples})} do not fit in one batch; cut pieces of one size (crop_px).")
+        raise ShapeError(
+            f"samples of shapes {sorted({tuple(sample.counts.shape) for sample in samples})} do not fit in "
+            "one batch; cut pieces of one size (crop_px)."
+        )
     bins = samples[0].counts.shape[1]
     seconds = sum(sample.seconds for sample in samples) / len(samples)
     centroid_s, collected_s = bin_times(bins, seconds)
     volume = EventVolume(torch.stack([sample.counts for sample in samples]), centroid_s, collected_s)
-    truth = FlowField(torch.stack([sample.flow_px for sample in samples]), torch.stack([sample.valid for sample in samples]), seconds)
+    truth = FlowField(
+        torch.stack([sample.flow_px for sample in samples]),
+        torch.stack([sample.valid for sample in samples]),
+        seconds,
+    )
     frames = [sample.frames for sample in samples if sample.frames is not None]
     return FlowWindows(volume, truth, torch.stack(frames) if len(frames) == len(samples) else None)
 
@@ -79,7 +103,10 @@ def check_indices(indices, count):
     """The indices as whole numbers from 0 to count - 1. Raises: DomainError."""
     found = [int(index) for index in indices]
     if any(not 0 <= index < count for index in found):
-        raise DomainError(f"sample {next(index for index in found if not 0 <= index < count)} was asked for; the source has {count} (0 to {count - 1}).")
+        raise DomainError(
+            f"sample {next(index for index in found if not 0 <= index < count)} was asked for; the source "
+            f"has {count} (0 to {count - 1})."
+        )
     return found
 
 
@@ -88,4 +115,7 @@ def check_lengths(seconds, name):
     middle = sorted(seconds)[len(seconds) // 2]
     worst = max(seconds, key=lambda value: abs(value - middle))
     if abs(worst - middle) > ALIKE * middle:
-        raise DomainError(f"{name} has windows of {middle:.6f} s and one of {worst:.6f} s; all must last alike within {100 * ALIKE:g} %.")
+        raise DomainError(
+            f"{name} has windows of {middle:.6f} s and one of {worst:.6f} s; all must last alike within "
+            f"{100 * ALIKE:g} %."
+        )

@@ -10,7 +10,12 @@ from codesign.events.stream import ordered
 from codesign.types import EventStream
 
 # width, height: the sensors that recordings without a size come from, smallest first
-SENSORS_PX = {"DAVIS240C": (240, 180), "DAVIS346": (346, 260), "VGA (DVXplorer, Prophesee Gen3)": (640, 480), "Prophesee HD": (1280, 720)}
+SENSORS_PX = {
+    "DAVIS240C": (240, 180),
+    "DAVIS346": (346, 260),
+    "VGA (DVXplorer, Prophesee Gen3)": (640, 480),
+    "Prophesee HD": (1280, 720),
+}
 LIMIT_PX = 2**15
 
 
@@ -18,7 +23,8 @@ LIMIT_PX = 2**15
 class EventColumns:
     """Events in order of time, 13 bytes each.
 
-    t_us: [N] int64 microseconds. x, y: [N] int16. on: [N] bool. height_px, width_px: sensor size. size_from: a phrase that says where that came from.
+    t_us: [N] int64 microseconds. x, y: [N] int16. on: [N] bool. height_px, width_px: sensor size. size_from:
+      a phrase that says where that came from.
     """
 
     t_us: np.ndarray
@@ -35,39 +41,57 @@ class EventColumns:
     def window(self, t0_us, t1_us):
         """EventStream of the events from t0_us to t1_us, both included."""
         first, last = np.searchsorted(self.t_us, [t0_us, t1_us + 1])
-        t, x, y, on = (torch.from_numpy(values[first:last].astype(np.int64)) for values in (self.t_us, self.x, self.y, self.on))
+        t, x, y, on = (
+            torch.from_numpy(values[first:last].astype(np.int64))
+            for values in (self.t_us, self.x, self.y, self.on)
+        )
         return ordered(t, x, y, 2 * on - 1, self.height_px, self.width_px)
 
 
 def from_stream(stream: EventStream, size_from="the file"):
     """EventColumns of an EventStream."""
     if max(stream.height_px, stream.width_px) > LIMIT_PX:
-        raise FileFormatError(f"the sensor has {stream.width_px} x {stream.height_px} pixels; up to {LIMIT_PX} a side are read.")
+        raise FileFormatError(
+            f"the sensor has {stream.width_px} x {stream.height_px} pixels; up to {LIMIT_PX} a side are read."
+        )
     t, x, y, p = (values.cpu().numpy() for values in (stream.t_us, stream.x, stream.y, stream.p))
-    return EventColumns(t, x.astype(np.int16), y.astype(np.int16), p > 0, stream.height_px, stream.width_px, size_from)
+    return EventColumns(
+        t, x.astype(np.int16), y.astype(np.int16), p > 0, stream.height_px, stream.width_px, size_from
+    )
 
 
 def settled_size(path, x, y, given=None, told=None, told_by="the file"):
     """(height_px, width_px, phrase that says where they are from).
 
-    Args: path: for messages. x, y: [N] columns and rows of the events. given: (height_px, width_px) of the caller, or None. told: the same from the
+    Args: path: for messages. x, y: [N] columns and rows of the events. given: (height_px, width_px) of the
+      caller, or None. told: the same from the
       data, or None; told_by: what told them.
     A recording that says nothing is taken to be of the smallest sensor of SENSORS_PX that holds its events.
     Raises: FileFormatError for sizes that disagree, and for an event outside, with its number.
     """
     if given is not None and told is not None and tuple(given) != tuple(told):
-        raise FileFormatError(f"{path} comes from a sensor of {told[1]} x {told[0]} pixels by {told_by}, but {given[1]} x {given[0]} was asked for.")
+        raise FileFormatError(
+            f"{path} comes from a sensor of {told[1]} x {told[0]} pixels by {told_by}, but {given[1]} x "
+            f"{given[0]} was asked for."
+        )
     if told is not None:
         (height, width), phrase = told, told_by
     elif given is not None:
         (height, width), phrase = given, "the options"
     else:
         reach = (int(x.max()) + 1, int(y.max()) + 1) if len(x) else (1, 1)
-        fits = [(name, size) for name, size in SENSORS_PX.items() if size[0] >= reach[0] and size[1] >= reach[1]]
+        fits = [
+            (name, size) for name, size in SENSORS_PX.items() if size[0] >= reach[0] and size[1] >= reach[1]
+        ]
         name, (width, height) = fits[0] if fits else ("its events", reach)
-        phrase = f"{name}, the smallest known sensor that holds the events" if fits else "the events themselves"
+        phrase = (
+            f"{name}, the smallest known sensor that holds the events" if fits else "the events themselves"
+        )
     for label, values, limit in (("x", x, width), ("y", y, height)):
         if len(values) and (int(values.min()) < 0 or int(values.max()) >= limit):
             at = int(np.argmax((values < 0) | (values >= limit)))
-            raise FileFormatError(f"{path}: event {at} lies at {label} = {int(values[at])}; the sensor has {limit} pixels there by {phrase} (0 to {limit - 1}).")
+            raise FileFormatError(
+                f"{path}: event {at} lies at {label} = {int(values[at])}; the sensor has {limit} pixels "
+                f"there by {phrase} (0 to {limit - 1})."
+            )
     return int(height), int(width), phrase

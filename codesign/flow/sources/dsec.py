@@ -1,7 +1,10 @@
-"""Windows of DSEC as published: events/left/events.h5 with rectify_map.h5, flow/forward/*.png with forward_timestamps.txt, per sequence.
+"""Windows of DSEC as published: events/left/events.h5 with rectify_map.h5, flow/forward/*.png with
+forward_timestamps.txt, per sequence.
 
-The true flow lies on the rectified picture of the left event camera, so events are rectified before they are counted. Each flow file is one window (100 ms).
-Source: Gehrig et al., "DSEC: A Stereo Event Camera Dataset for Driving Scenarios", RA-L 2021; its published description of the data format.
+The true flow lies on the rectified picture of the left event camera, so events are rectified before they are
+counted. Each flow file is one window (100 ms).
+Source: Gehrig et al., "DSEC: A Stereo Event Camera Dataset for Driving Scenarios", RA-L 2021; its published
+  description of the data format.
 """
 
 import re
@@ -29,70 +32,114 @@ class DsecWindows:
     """Windows of all sequences under a folder that have flow.
 
     Args:
-      folder: one sequence, a folder of sequences, or one that holds train_events and train_optical_flow side by side.
-      bins: of the volumes. crop_px: (height, width) of a piece at a random place, or None. seed: of that place. size_px: of the camera.
-    Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or do not fit together.
+      folder: one sequence, a folder of sequences, or one that holds train_events and train_optical_flow side
+        by side.
+      bins: of the volumes. crop_px: (height, width) of a piece at a random place, or None. seed: of that
+        place. size_px: of the camera.
+    Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or do not
+      fit together.
     """
 
     def __init__(self, folder, bins=8, crop_px=None, seed=0, size_px=SIZE_PX):
-        self.bins, self.crop, self.size_px = bins, Crop(crop_px, seed), (int(size_px[0]), int(size_px[1]))
+        self.bins = bins
+        self.crop = Crop(crop_px, seed)
+        self.size_px = (int(size_px[0]), int(size_px[1]))
         self.crop.check(*self.size_px)
         self.sequences = [Sequence(events, flow, self.size_px) for events, flow in _places(Path(folder))]
-        self.windows = [(k, index) for k, sequence in enumerate(self.sequences) for index in range(len(sequence.files))]
-        check_lengths([(t1 - t0) * 1e-6 for sequence in self.sequences for t0, t1 in sequence.spans_us], f"DSEC in {folder}")
+        self.windows = [
+            (k, index) for k, sequence in enumerate(self.sequences) for index in range(len(sequence.files))
+        ]
+        check_lengths(
+            [(t1 - t0) * 1e-6 for sequence in self.sequences for t0, t1 in sequence.spans_us],
+            f"DSEC in {folder}",
+        )
 
     def __len__(self):
         return len(self.windows)
 
     def batch(self, indices):
         """FlowWindows of these samples, without frames; each depends on its index and the seed alone."""
-        return collate([self.crop(index, self._sample(*self.windows[index])) for index in check_indices(indices, len(self))])
+        return collate(
+            [
+                self.crop(index, self._sample(*self.windows[index]))
+                for index in check_indices(indices, len(self))
+            ]
+        )
 
     def _sample(self, sequence, index):
         sequence = self.sequences[sequence]
         t0_us, t1_us = sequence.spans_us[index]
         flow, valid = read_flow(sequence.files[index])
         if tuple(valid.shape) != self.size_px:
-            raise FileFormatError(f"{sequence.files[index]} has {valid.shape[1]} x {valid.shape[0]} px; {self.size_px[1]} x {self.size_px[0]} are needed.")
+            raise FileFormatError(
+                f"{sequence.files[index]} has {valid.shape[1]} x {valid.shape[0]} px; {self.size_px[1]} x "
+                f"{self.size_px[0]} are needed."
+            )
         t_us, x_px, y_px, on = sequence.rectified(t0_us, t1_us)
         counts = splatted(t_us, x_px, y_px, on, t0_us, t1_us, self.bins, *self.size_px)
         return Sample(counts, flow, valid, (t1_us - t0_us) * 1e-6)
 
 
 class Sequence:
-    """One sequence. files: its flow files. spans_us: [(from, to)] of each, on the clock of the events with t_offset added."""
+    """One sequence. files: its flow files. spans_us: [(from, to)] of each, on the clock of the events with
+    t_offset added."""
 
     def __init__(self, events, flow, size_px):
-        self.path, self.size_px = events / "events.h5", size_px
+        self.path = events / "events.h5"
+        self.size_px = size_px
         for path in (self.path, events / "rectify_map.h5"):
             if not path.is_file():
-                raise FileFormatError(f"{path} is missing; DSEC's events come as two files, events.h5 and rectify_map.h5.")
-        self.map: np.ndarray = Rows(events / "rectify_map.h5", "rectify_map", [size_px[1], 2], size_px[0]).read(0, size_px[0]).astype(np.float64)
+                raise FileFormatError(
+                    f"{path} is missing; DSEC's events come as two files, events.h5 and rectify_map.h5."
+                )
+        self.map: np.ndarray = (
+            Rows(events / "rectify_map.h5", "rectify_map", [size_px[1], 2], size_px[0])
+            .read(0, size_px[0])
+            .astype(np.float64)
+        )
         self.rows = {"t": Rows(self.path, "events/t", [])}
         self.rows |= {name: Rows(self.path, f"events/{name}", [], len(self.rows["t"])) for name in "xyp"}
         index = Rows(self.path, "ms_to_idx", [])
-        self.ms_to_idx, self.offset_us = index.read(0, len(index)).astype(np.int64), _scalar(self.path, "t_offset")
-        if not len(index) or bool((np.diff(self.ms_to_idx) < 0).any()) or not 0 <= self.ms_to_idx[0] <= self.ms_to_idx[-1] <= len(self.rows["t"]):
-            raise FileFormatError(f"{self.path}: ms_to_idx is no index of its {len(self.rows['t'])} events; the file is damaged.")
+        self.ms_to_idx = index.read(0, len(index)).astype(np.int64)
+        self.offset_us = _scalar(self.path, "t_offset")
+        if (
+            not len(index)
+            or bool((np.diff(self.ms_to_idx) < 0).any())
+            or not 0 <= self.ms_to_idx[0] <= self.ms_to_idx[-1] <= len(self.rows["t"])
+        ):
+            raise FileFormatError(
+                f"{self.path}: ms_to_idx is no index of its {len(self.rows['t'])} events; the file is "
+                "damaged."
+            )
         self.files, self.spans_us = _flows(flow)
         end_us = self.offset_us + 1000 * len(self.ms_to_idx)
         outside = [span for span in self.spans_us if not self.offset_us <= span[0] < span[1] <= end_us]
         if outside:
-            raise FileFormatError(f"{flow} has a flow from {outside[0][0]} to {outside[0][1]} us; the events of {self.path} run from {self.offset_us} to about {end_us} us.")
+            raise FileFormatError(
+                f"{flow} has a flow from {outside[0][0]} to {outside[0][1]} us; the events of {self.path} "
+                f"run from {self.offset_us} to about {end_us} us."
+            )
 
     def rectified(self, t0_us, t1_us):
         """(t_us, x_px, y_px, on) of the events of a window, on the rectified picture."""
-        first, last = (t0_us - self.offset_us) // 1000, (t1_us - self.offset_us) // 1000 + 1
-        low, high = int(self.ms_to_idx[first]), int(self.ms_to_idx[last]) if last < len(self.ms_to_idx) else len(self.rows["t"])
+        first = (t0_us - self.offset_us) // 1000
+        last = (t1_us - self.offset_us) // 1000 + 1
+        low = int(self.ms_to_idx[first])
+        high = int(self.ms_to_idx[last]) if last < len(self.ms_to_idx) else len(self.rows["t"])
         columns = {name: self.rows[name].read(low, high).astype(np.int64) for name in "txyp"}
         inside = (columns["t"] + self.offset_us >= t0_us) & (columns["t"] + self.offset_us <= t1_us)
         t, x, y, p = (columns[name][inside] for name in "txyp")
         height, width = self.size_px
         if bool(((x < 0) | (x >= width) | (y < 0) | (y >= height) | (p < 0) | (p > 1)).any()):
-            raise FileFormatError(f"{self.path} holds events outside {width} x {height} px or of another polarity than 0 and 1; it is damaged.")
+            raise FileFormatError(
+                f"{self.path} holds events outside {width} x {height} px or of another polarity than 0 and "
+                "1; it is damaged."
+            )
         place = torch.from_numpy(self.map[y, x])
         if not bool(torch.isfinite(place).all()):
-            raise FileFormatError(f"{self.path.parent / 'rectify_map.h5'} is not finite where there are events.")
+            raise FileFormatError(
+                f"{self.path.parent / 'rectify_map.h5'} is not finite where there are events."
+            )
         return torch.from_numpy(t + self.offset_us), place[:, 0], place[:, 1], torch.from_numpy(p == 1)
 
 
@@ -101,25 +148,42 @@ def _places(folder):
     pairs = ((folder, folder), (folder / "train_events", folder / "train_optical_flow"))
     found = []
     for events, flows in pairs:
-        for flow in [flows, *sorted((entry for entry in flows.iterdir() if entry.is_dir()), key=natural)] if flows.is_dir() else []:
+        for flow in (
+            [flows, *sorted((entry for entry in flows.iterdir() if entry.is_dir()), key=natural)]
+            if flows.is_dir()
+            else []
+        ):
             place = flow / "flow"
             name = "" if flow == flows else flow.name
             if (place / "forward").is_dir() and (place / "forward_timestamps.txt").is_file():
                 if not (events / name / "events" / "left").is_dir():
-                    raise FileFormatError(f"{flow} has flow but {events / name / 'events' / 'left'} is missing; download the events of that sequence too.")
+                    raise FileFormatError(
+                        f"{flow} has flow but {events / name / 'events' / 'left'} is missing; download the "
+                        "events of that sequence too."
+                    )
                 found.append((events / name / "events" / "left", place))
     if not found:
-        raise FileFormatError(f"{folder} holds no sequence of DSEC with flow: events/left/events.h5, flow/forward/*.png and flow/forward_timestamps.txt are needed.")
+        raise FileFormatError(
+            f"{folder} holds no sequence of DSEC with flow: events/left/events.h5, flow/forward/*.png and "
+            "flow/forward_timestamps.txt are needed."
+        )
     return found
 
 
 def _flows(folder):
     """(flow files, [(from, to) us]) of a sequence."""
     files = sorted((folder / "forward").glob("*.png"), key=natural)
-    lines = [line for line in (folder / "forward_timestamps.txt").read_text(encoding="utf-8").splitlines() if line.strip() and not line.startswith("#")]
+    lines = [
+        line
+        for line in (folder / "forward_timestamps.txt").read_text(encoding="utf-8").splitlines()
+        if line.strip() and not line.startswith("#")
+    ]
     numbers = [re.fullmatch(r"\s*(\d{1,18})\s*,\s*(\d{1,18})\s*", line) for line in lines]
     if not all(numbers) or len(lines) != len(files) or not files:
-        raise FileFormatError(f"{folder / 'forward_timestamps.txt'} has {len(lines)} lines for {len(files)} files of flow; one line 'from, to' in microseconds for each is needed.")
+        raise FileFormatError(
+            f"{folder / 'forward_timestamps.txt'} has {len(lines)} lines for {len(files)} files of flow; "
+            "one line 'from, to' in microseconds for each is needed."
+        )
     for file in files:
         with file.open("rb") as opened:
             if opened.read(8) != PNG_START:

@@ -1,4 +1,5 @@
-"""What lies in the folder of a recording: event files, flow files, and the text files beside them. Zip archives are unpacked for as long as they are needed."""
+"""What lies in the folder of a recording: event files, flow files, and the text files beside them. Zip
+archives are unpacked for as long as they are needed."""
 
 import re
 import tempfile
@@ -11,9 +12,20 @@ from codesign.events.files import READERS
 
 EVENT_SUFFIXES = {".txt", ".npy", *READERS}
 FLOW_SUFFIXES = {".flo", ".png", ".npy", ".npz", ".mat", ".txt", ".csv"}
-SIDE_FILES = {"imu.txt", "groundtruth.txt", "calib.txt", "images.txt", "readme.txt", "license.txt", "timestamps.txt", "forward_timestamps.txt"}
+SIDE_FILES = {
+    "imu.txt",
+    "groundtruth.txt",
+    "calib.txt",
+    "images.txt",
+    "readme.txt",
+    "license.txt",
+    "timestamps.txt",
+    "forward_timestamps.txt",
+}
 FLOW_WORDS = re.compile(r"(flow|truth|^gt|_gt|gt_|^of_|_of$)", re.IGNORECASE)
-MOST_RATIO, MOST_BYTES = 1040, 40_000_000_000  # of an archive: what deflate can reach; what is unpacked at most
+# of an archive: what deflate can reach; what is unpacked at most
+MOST_RATIO = 1040
+MOST_BYTES = 40_000_000_000
 
 
 @contextmanager
@@ -24,7 +36,10 @@ def opened(path):
     """
     path = Path(path)
     if not path.exists():
-        raise FileFormatError(f"nothing lies at {path}; give a folder with events.txt, an event file, or a zip archive of either.")
+        raise FileFormatError(
+            f"nothing lies at {path}; give a folder with events.txt, an event file, or a zip archive of "
+            "either."
+        )
     if path.suffix.lower() != ".zip":
         yield path
         return
@@ -33,15 +48,23 @@ def opened(path):
             with zipfile.ZipFile(path) as archive:
                 members = [entry for entry in archive.infolist() if not entry.is_dir()]
                 size = sum(entry.file_size for entry in members)
-                if size > MOST_BYTES or any(entry.file_size > MOST_RATIO * entry.compress_size + 4096 for entry in members):
-                    raise FileFormatError(f"{path} would unpack to {size} bytes, more than {MOST_BYTES} or than its own size allows; unpack it by hand.")
+                if size > MOST_BYTES or any(
+                    entry.file_size > MOST_RATIO * entry.compress_size + 4096 for entry in members
+                ):
+                    raise FileFormatError(
+                        f"{path} would unpack to {size} bytes, more than {MOST_BYTES} or than its own size "
+                        "allows; unpack it by hand."
+                    )
                 archive.extractall(folder, members)  # keeps inside the folder whatever the names say
         except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError, ValueError) as error:
             if isinstance(error, FileFormatError):
                 raise
             raise FileFormatError(f"{path} is not a readable zip archive ({error}).") from error
         inside = Path(folder)
-        while len(entries := [entry for entry in inside.iterdir() if entry.name != "__MACOSX"]) == 1 and entries[0].is_dir():
+        while (
+            len(entries := [entry for entry in inside.iterdir() if entry.name != "__MACOSX"]) == 1
+            and entries[0].is_dir()
+        ):
             inside = entries[0]
         yield inside
 
@@ -52,66 +75,119 @@ def natural(path):
 
 
 def event_files(path):
-    """[event file] of a recording: the file itself; events.* of a folder; otherwise one per packet, from the folder or its subfolders, in natural order.
+    """[event file] of a recording: the file itself; events.* of a folder; otherwise one per packet, from the
+    folder or its subfolders, in natural order.
 
     Raises: FileFormatError when there is none.
     """
     path = Path(path)
     if path.is_file():
         return [path]
-    for folders in ([path], sorted((entry for entry in path.iterdir() if entry.is_dir() and not FLOW_WORDS.search(entry.name)), key=natural)):
+    for folders in (
+        [path],
+        sorted(
+            (entry for entry in path.iterdir() if entry.is_dir() and not FLOW_WORDS.search(entry.name)),
+            key=natural,
+        ),
+    ):
         files = []
         for folder in folders:
-            found = sorted((entry for entry in folder.iterdir() if entry.is_file() and _holds_events(entry)), key=natural)
+            found = sorted(
+                (entry for entry in folder.iterdir() if entry.is_file() and _holds_events(entry)), key=natural
+            )
             named = [entry for entry in found if entry.stem.lower() == "events"]
             files += named[:1] if named else found
         if files:
             return files
-    raise FileFormatError(f"{path} holds no events: no events.txt, no event file by another name ({', '.join(sorted(EVENT_SUFFIXES))}), and no subfolder with one.")
+    raise FileFormatError(
+        f"{path} holds no events: no events.txt, no event file by another name "
+        f"({', '.join(sorted(EVENT_SUFFIXES))}), and no subfolder with one."
+    )
 
 
 def flow_files(folder):
-    """[flow file] of a folder that holds nothing else of these kinds, in natural order; flow/forward inside where there is one."""
+    """[flow file] of a folder that holds nothing else of these kinds, in natural order; flow/forward inside
+    where there is one."""
     folder = Path(folder)
     for inside in (folder / "flow" / "forward", folder / "forward", folder / "flow", folder):
         if inside.is_dir():
-            files = [entry for entry in inside.iterdir() if entry.is_file() and entry.suffix.lower() in FLOW_SUFFIXES and entry.name.lower() not in SIDE_FILES]
-            named = [entry for entry in files if FLOW_WORDS.search(entry.stem) or entry.suffix.lower() == ".flo"]
-            chosen = files if inside != folder and not named else named or [entry for entry in files if entry.suffix.lower() in (".png", ".npy", ".npz", ".mat")]
+            files = [
+                entry
+                for entry in inside.iterdir()
+                if entry.is_file()
+                and entry.suffix.lower() in FLOW_SUFFIXES
+                and entry.name.lower() not in SIDE_FILES
+            ]
+            named = [
+                entry for entry in files if FLOW_WORDS.search(entry.stem) or entry.suffix.lower() == ".flo"
+            ]
+            chosen = (
+                files
+                if inside != folder and not named
+                else named
+                or [entry for entry in files if entry.suffix.lower() in (".png", ".npy", ".npz", ".mat")]
+            )
             if chosen:
                 return sorted(_one_kind(chosen), key=natural)
     raise FileFormatError(f"{folder} holds no flow files ({', '.join(sorted(FLOW_SUFFIXES))}).")
 
 
 def truth_beside(events, alone):
-    """The flow file that lies beside a packet's event file: its name with flow or truth in it, or the same number; None when there is none.
+    """The flow file that lies beside a packet's event file: its name with flow or truth in it, or the same
+    number; None when there is none.
 
     Args: events: path of the event file. alone: it is the only one of its folder.
     """
-    beside = [entry for entry in sorted(events.parent.iterdir(), key=natural) if entry.is_file() and entry != events and entry.name.lower() not in SIDE_FILES]
-    named = [entry for entry in beside if entry.suffix.lower() in FLOW_SUFFIXES and (FLOW_WORDS.search(entry.stem) or entry.suffix.lower() == ".flo")]
+    beside = [
+        entry
+        for entry in sorted(events.parent.iterdir(), key=natural)
+        if entry.is_file() and entry != events and entry.name.lower() not in SIDE_FILES
+    ]
+    named = [
+        entry
+        for entry in beside
+        if entry.suffix.lower() in FLOW_SUFFIXES
+        and (FLOW_WORDS.search(entry.stem) or entry.suffix.lower() == ".flo")
+    ]
     if not alone:
         numbers = re.findall(r"\d+", events.stem)
-        named = [entry for entry in named if (numbers and [int(n) for n in re.findall(r"\d+", entry.stem)] == [int(n) for n in numbers]) or entry.stem.startswith(events.stem)]
+        named = [
+            entry
+            for entry in named
+            if (numbers and [int(n) for n in re.findall(r"\d+", entry.stem)] == [int(n) for n in numbers])
+            or entry.stem.startswith(events.stem)
+        ]
     return _one_kind(named)[0] if named else None
 
 
 def truth_folder(events):
     """The folder of flow files beside an event file or beside its folder; None when there is none."""
     for place in (events.parent, events.parent.parent):
-        for entry in sorted((entry for entry in place.iterdir() if entry.is_dir() and FLOW_WORDS.search(entry.name)), key=natural):
-            if any(file.suffix.lower() in FLOW_SUFFIXES and file.name.lower() not in SIDE_FILES for file in entry.rglob("*")):
+        for entry in sorted(
+            (entry for entry in place.iterdir() if entry.is_dir() and FLOW_WORDS.search(entry.name)),
+            key=natural,
+        ):
+            if any(
+                file.suffix.lower() in FLOW_SUFFIXES and file.name.lower() not in SIDE_FILES
+                for file in entry.rglob("*")
+            ):
                 return entry
     return None
 
 
 def side_file(events, name):
     """A file such as imu.txt in the folder of an event file, or in the one above; None when there is none."""
-    return next((folder / name for folder in (events.parent, events.parent.parent) if (folder / name).is_file()), None)
+    return next(
+        (folder / name for folder in (events.parent, events.parent.parent) if (folder / name).is_file()), None
+    )
 
 
 def _holds_events(entry):
-    return entry.suffix.lower() in EVENT_SUFFIXES and entry.name.lower() not in SIDE_FILES and not FLOW_WORDS.search(entry.stem)
+    return (
+        entry.suffix.lower() in EVENT_SUFFIXES
+        and entry.name.lower() not in SIDE_FILES
+        and not FLOW_WORDS.search(entry.stem)
+    )
 
 
 def _one_kind(files):

@@ -1,9 +1,13 @@
-"""Windows of MVSEC as published: NAME_data.hdf5 (davis/left/events, image_raw_ts) with NAME_gt_flow_dist.npz (x_flow_dist, y_flow_dist, timestamps).
+"""Windows of MVSEC as published: NAME_data.hdf5 (davis/left/events, image_raw_ts) with NAME_gt_flow_dist.npz
+(x_flow_dist, y_flow_dist, timestamps).
 
-A flow of the file leads from its own time to the next one's, on the raw (distorted) pixels of the left camera; (0, 0) means that nothing was measured. The usual
-tests take windows between grey frames: dt = 1 from one to the next, dt = 4 to the fourth. There the flow is followed from its time on, whole
+A flow of the file leads from its own time to the next one's, on the raw (distorted) pixels of the left
+camera; (0, 0) means that nothing was measured. The usual
+tests take windows between grey frames: dt = 1 from one to the next, dt = 4 to the fourth. There the flow is
+  followed from its time on, whole
 intervals and linear parts of them (see chain), and is not valid where it leads out of what was measured.
-Sources: Zhu et al., "The Multivehicle Stereo Event Camera Dataset", RA-L 2018; Zhu et al., EV-FlowNet, RSS 2018 (dt = 1, 4).
+Sources: Zhu et al., "The Multivehicle Stereo Event Camera Dataset", RA-L 2018; Zhu et al., EV-FlowNet, RSS
+2018 (dt = 1, 4).
 """
 
 from pathlib import Path
@@ -19,7 +23,8 @@ from codesign.flow.sources.chain import chained
 from codesign.flow.sources.collate import ALIKE, Crop, Sample, check_indices, collate
 from codesign.flow.sources.rows import Rows
 
-DATA, FLOW = "_data.hdf5", "_gt_flow_dist.npz"
+DATA = "_data.hdf5"
+FLOW = "_gt_flow_dist.npz"
 BLOCK = 4096  # events between the times that are kept to find a window
 
 
@@ -27,21 +32,36 @@ class MvsecWindows:
     """Windows of the sequences of a folder.
 
     Args:
-      folder: where NAME_data.hdf5 and NAME_gt_flow_dist.npz lie. frames: 1 or 4 grey frames per window (the dt of the literature); 0: the intervals of the
-        true flow itself. bins: of the volumes. crop_px: (height, width) of a piece at a random place, or None. seed: of that place.
-      span_s: (from, to) part of the sequences in seconds after their first true flow, or None; published tests leave out the start and the landing.
-    Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or do not fit together.
+      folder: where NAME_data.hdf5 and NAME_gt_flow_dist.npz lie. frames: 1 or 4 grey frames per window (the
+        dt of the literature); 0: the intervals of the
+        true flow itself. bins: of the volumes. crop_px: (height, width) of a piece at a random place, or
+          None. seed: of that place.
+      span_s: (from, to) part of the sequences in seconds after their first true flow, or None; published
+        tests leave out the start and the landing.
+    Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or do not
+      fit together.
     Windows that last longer or shorter than the median by 5 percent are not used: ``left_out`` counts them.
     """
 
     def __init__(self, folder, frames=1, bins=8, crop_px=None, seed=0, span_s=None):
         if frames < 0:
-            raise DomainError(f"frames is {frames}; 1 or 4 grey frames per window, or 0 for the intervals of the true flow, is possible.")
-        self.bins, self.crop = bins, Crop(crop_px, seed)
+            raise DomainError(
+                f"frames is {frames}; 1 or 4 grey frames per window, or 0 for the intervals of the true "
+                "flow, is possible."
+            )
+        self.bins = bins
+        self.crop = Crop(crop_px, seed)
         self.sequences = [Sequence(*files) for files in _places(Path(folder))]
-        found = [(k, *window) for k, sequence in enumerate(self.sequences) for window in sequence.windows(frames, span_s)]
+        found = [
+            (k, *window)
+            for k, sequence in enumerate(self.sequences)
+            for window in sequence.windows(frames, span_s)
+        ]
         if not found:
-            raise DomainError(f"no window of {frames} grey frame(s) in {folder} lies within its true flow and events; is the part asked for too short?")
+            raise DomainError(
+                f"no window of {frames} grey frame(s) in {folder} lies within its true flow and events; is "
+                "the part asked for too short?"
+            )
         middle = float(np.median([t1 - t0 for _, t0, t1 in found]))
         self.windows = [window for window in found if abs(window[2] - window[1] - middle) <= ALIKE * middle]
         self.left_out = len(found) - len(self.windows)
@@ -53,48 +73,74 @@ class MvsecWindows:
 
     def batch(self, indices):
         """FlowWindows of these samples, without frames; each depends on its index and the seed alone."""
-        return collate([self.crop(index, self._sample(*self.windows[index])) for index in check_indices(indices, len(self))])
+        return collate(
+            [
+                self.crop(index, self._sample(*self.windows[index]))
+                for index in check_indices(indices, len(self))
+            ]
+        )
 
     def _sample(self, sequence, t0_s, t1_s):
         sequence = self.sequences[sequence]
         flow, valid = sequence.flow(t0_s, t1_s)
-        t0_us, t1_us = round(t0_s * 1e6), round(t1_s * 1e6)
+        t0_us = round(t0_s * 1e6)
+        t1_us = round(t1_s * 1e6)
         volume = from_stream(sequence.stream(t0_us, t1_us), t0_us, t1_us, self.bins)
         return Sample(volume.counts[0], flow.float(), valid, t1_s - t0_s)
 
 
 class Sequence:
-    """One sequence. flow_s: [N] times of the true flows. frame_s: [M] times of the grey frames. size_px: (height, width)."""
+    """One sequence. flow_s: [N] times of the true flows. frame_s: [M] times of the grey frames. size_px:
+    (height, width)."""
 
     def __init__(self, data, truth):
         self.truth = truth
         shapes = npz_member.shapes(truth, ("x_flow_dist", "y_flow_dist", "timestamps"))
         self.flow_s = np.asarray(npz_member.array(truth, "timestamps"), np.float64)
         count, *size = shapes["x_flow_dist"]
-        if shapes["y_flow_dist"] != shapes["x_flow_dist"] or len(size) != 2 or self.flow_s.shape != (count,) or count < 2 or bool((np.diff(self.flow_s) <= 0).any()):
-            raise FileFormatError(f"{truth} has flows {shapes['x_flow_dist']}, {shapes['y_flow_dist']} and times {list(self.flow_s.shape)}; [N, H, W] twice and N rising times are needed.")
-        self.size_px, self.fields = tuple(size), None
+        if (
+            shapes["y_flow_dist"] != shapes["x_flow_dist"]
+            or len(size) != 2
+            or self.flow_s.shape != (count,)
+            or count < 2
+            or bool((np.diff(self.flow_s) <= 0).any())
+        ):
+            raise FileFormatError(
+                f"{truth} has flows {shapes['x_flow_dist']}, {shapes['y_flow_dist']} and times "
+                f"{list(self.flow_s.shape)}; [N, H, W] twice and N rising times are needed."
+            )
+        self.size_px = tuple(size)
+        self.fields = None
         self.events = Rows(data, "davis/left/events", [4])
         frames = Rows(data, "davis/left/image_raw_ts", [])
         self.frame_s = frames.read(0, len(frames)).astype(np.float64)
         if len(self.events) < 2 or bool((np.diff(self.frame_s) <= 0).any()):
-            raise FileFormatError(f"{data} has {len(self.events)} events, or frame times that do not rise; it is damaged.")
+            raise FileFormatError(
+                f"{data} has {len(self.events)} events, or frame times that do not rise; it is damaged."
+            )
         self.ends_s = float(self.events[0][2]), float(self.events[len(self.events) - 1][2])
 
     def windows(self, frames, span_s):
         """[(from, to)] seconds."""
         ends = (self.flow_s, 1) if frames == 0 else (self.frame_s, frames)
-        first, last = max(self.flow_s[0], self.ends_s[0]), min(self.flow_s[-1], self.ends_s[1])
+        first = max(self.flow_s[0], self.ends_s[0])
+        last = min(self.flow_s[-1], self.ends_s[1])
         if span_s is not None:
-            first, last = max(first, self.flow_s[0] + span_s[0]), min(last, self.flow_s[0] + span_s[1])
-        return [(float(t0), float(t1)) for t0, t1 in zip(ends[0][: -ends[1]], ends[0][ends[1] :], strict=True) if first <= t0 and t1 <= last]
+            first = max(first, self.flow_s[0] + span_s[0])
+            last = min(last, self.flow_s[0] + span_s[1])
+        return [
+            (float(t0), float(t1))
+            for t0, t1 in zip(ends[0][: -ends[1]], ends[0][ends[1] :], strict=True)
+            if first <= t0 and t1 <= last
+        ]
 
     def flow(self, t0_s, t1_s):
         """(flow_px [2, H, W], valid [H, W]) on the pixels of t0_s, to t1_s."""
         if self.fields is None:
             self.fields = [npz_member.array(self.truth, name) for name in ("x_flow_dist", "y_flow_dist")]
         first = int(np.searchsorted(self.flow_s, t0_s, "right")) - 1
-        parts, masks = [], []
+        parts = []
+        masks = []
         while first < len(self.flow_s) - 1 and self.flow_s[first] < t1_s - 1e-9:
             length = self.flow_s[first + 1] - self.flow_s[first]
             share = (min(t1_s, self.flow_s[first + 1]) - max(t0_s, self.flow_s[first])) / length
@@ -110,19 +156,34 @@ class Sequence:
         low = self._place(t0_us * 1e-6 - 1e-6)
         high = self._place(t1_us * 1e-6 + 1e-6)
         rows = self.events.read(low, high).astype(np.float64)
-        x, y, t, p = rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3]
+        x = rows[:, 0]
+        y = rows[:, 1]
+        t = rows[:, 2]
+        p = rows[:, 3]
         t_us = np.rint(t * 1e6)
         inside = (t_us >= t0_us) & (t_us <= t1_us)
-        wrong = ~((x % 1 == 0) & (y % 1 == 0) & (x >= 0) & (y >= 0) & (x < self.size_px[1]) & (y < self.size_px[0]) & (np.abs(p) == 1))
+        wrong = ~(
+            (x % 1 == 0)
+            & (y % 1 == 0)
+            & (x >= 0)
+            & (y >= 0)
+            & (x < self.size_px[1])
+            & (y < self.size_px[0])
+            & (np.abs(p) == 1)
+        )
         if bool((wrong & inside).any()):
             at = int(np.argmax(wrong & inside))
-            raise FileFormatError(f"{self.events.path}: event {low + at} is ({x[at]:g}, {y[at]:g}, {p[at]:g}); pixels within {self.size_px[1]} x {self.size_px[0]} and polarity +1 or -1 are needed.")
+            raise FileFormatError(
+                f"{self.events.path}: event {low + at} is ({x[at]:g}, {y[at]:g}, {p[at]:g}); pixels within "
+                f"{self.size_px[1]} x {self.size_px[0]} and polarity +1 or -1 are needed."
+            )
         t_us, x, y, p = (torch.from_numpy(values[inside].astype(np.int64)) for values in (t_us, x, y, p))
         return ordered(t_us, x, y, p, *self.size_px)
 
     def _place(self, t_s):
         """Number of the first event not before a time, by bisection: a few blocks are read, not the file."""
-        low, high = 0, len(self.events)
+        low = 0
+        high = len(self.events)
         while high - low > BLOCK:
             middle = (low + high) // 2
             low, high = (middle, high) if self.events[middle][2] < t_s else (low, middle)
@@ -139,6 +200,8 @@ def _places(folder):
         name = path.name.removesuffix(DATA) + FLOW
         found = sorted(folder.rglob(name))
         if not found:
-            raise FileFormatError(f"{path} has no {name} beside it; download the true flow of that sequence too.")
+            raise FileFormatError(
+                f"{path} has no {name} beside it; download the true flow of that sequence too."
+            )
         pairs.append((path, found[0]))
     return pairs

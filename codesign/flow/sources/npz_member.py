@@ -1,4 +1,5 @@
-"""Arrays of a large .npz file: their shapes without reading them, and their values from the disk as they are needed where the file is not packed."""
+"""Arrays of a large .npz file: their shapes without reading them, and their values from the disk as they are
+needed where the file is not packed."""
 
 import math
 import struct
@@ -14,20 +15,29 @@ LOCAL_HEADER_BYTES = 30  # PKWARE, .ZIP File Format Specification, 4.3.7
 
 
 def shapes(path, names):
-    """{name: shape} of arrays of numbers, after checking that the file holds what they claim. Raises: FileFormatError."""
+    """{name: shape} of arrays of numbers, after checking that the file holds what they claim. Raises:
+    FileFormatError."""
     with _archive(path, names) as archive:
         found = {}
         for name in names:
             with archive.open(f"{name}.npy") as member:
                 shape, _, dtype = HEADERS[np.lib.format.read_magic(member)](member)
-                if dtype.kind not in "fiu" or member.tell() + math.prod(shape) * dtype.itemsize != archive.getinfo(f"{name}.npy").file_size:
-                    raise FileFormatError(f"{path}: {name} claims {list(shape)} numbers of {dtype}, not what the file holds; it is damaged.")
+                if (
+                    dtype.kind not in "fiu"
+                    or member.tell() + math.prod(shape) * dtype.itemsize
+                    != archive.getinfo(f"{name}.npy").file_size
+                ):
+                    raise FileFormatError(
+                        f"{path}: {name} claims {list(shape)} numbers of {dtype}, not what the file holds; "
+                        "it is damaged."
+                    )
             found[name] = list(shape)
         return found
 
 
 def array(path, name):
-    """One array: left on the disk (read-only) where the archive holds it as it is, read into memory as float32 or less where it is packed."""
+    """One array: left on the disk (read-only) where the archive holds it as it is, read into memory as
+    float32 or less where it is packed."""
     with _archive(path, [name]) as archive:
         entry = archive.getinfo(f"{name}.npy")
         with archive.open(entry) as member:
@@ -51,5 +61,15 @@ def _archive(path, names):
             yield archive
     except FileFormatError:
         raise
-    except (OSError, KeyError, ValueError, EOFError, struct.error, MemoryError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
+    except (
+        OSError,
+        KeyError,
+        ValueError,
+        EOFError,
+        struct.error,
+        MemoryError,
+        zipfile.BadZipFile,
+        NotImplementedError,
+        RuntimeError,
+    ) as error:
         raise FileFormatError(f"{path} is no whole .npz file with {', '.join(names)} ({error}).") from error

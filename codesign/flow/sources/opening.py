@@ -11,7 +11,8 @@ from codesign.flow.sources.rendered import DatasetWindows
 def open_windows(folder, bins=8, window_frames=1, crop_px=None, seed=0):
     """The source of windows that a folder is: one of our data sets, DSEC, or MVSEC.
 
-    Args: bins: of the volumes. window_frames: frame intervals per window (our data sets), or grey frames (MVSEC); DSEC has its own windows.
+    Args: bins: of the volumes. window_frames: frame intervals per window (our data sets), or grey frames
+      (MVSEC); DSEC has its own windows.
       crop_px: (height, width) of a piece at a random place, or None. seed: of that place.
     Returns: DatasetWindows, DsecWindows or MvsecWindows: ``len(source)`` and ``source.batch(indices)``.
     Raises: FileFormatError when the folder is none of these, or something in it is missing or damaged.
@@ -25,4 +26,7 @@ def open_windows(folder, bins=8, window_frames=1, crop_px=None, seed=0):
         return MvsecWindows(folder, window_frames, bins, crop_px, seed)
     if next(folder.rglob("forward_timestamps.txt"), None) is not None:
         return DsecWindows(folder, bins, crop_px, seed)
-    raise FileFormatError(f"{folder} is no data set that is known: manifest.json (ours), *{DATA} (MVSEC) and flow/forward_timestamps.txt (DSEC) are all absent.")
+    raise FileFormatError(
+        f"{folder} is no data set that is known: manifest.json (ours), *{DATA} (MVSEC) and "
+        "flow/forward_timestamps.txt (DSEC) are all absent."
+    )

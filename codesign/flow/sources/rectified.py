@@ -7,25 +7,44 @@ from codesign.events.volumes.volume import check_bins
 
 
 def splatted(t_us, x_px, y_px, on, t0_us, t1_us, bins, height_px, width_px):
-    """Counts [2, bins, H, W] float32 of events at fractional places, shared bilinearly by four pixels and linearly by two bins.
+    """Counts [2, bins, H, W] float32 of events at fractional places, shared bilinearly by four pixels and
+    linearly by two bins.
 
     Args: t_us: [N] int64 within t0_us to t1_us. x_px, y_px: [N] float. on: [N] bool.
     Events, and shares of them, that fall outside the picture are left out; everything else is conserved.
     """
     check_bins(bins)
     if not t_us.shape == x_px.shape == y_px.shape == on.shape:
-        raise ShapeError(f"times, places and polarities have shapes {[list(v.shape) for v in (t_us, x_px, y_px, on)]}; four alike are needed.")
+        raise ShapeError(
+            f"times, places and polarities have shapes {[list(v.shape) for v in (t_us, x_px, y_px, on)]}; "
+            "four alike are needed."
+        )
     place = (t_us - t0_us).double() / (t1_us - t0_us) * (bins - 1)
-    column, row, node = x_px.double().floor(), y_px.double().floor(), place.floor()
+    column = x_px.double().floor()
+    row = y_px.double().floor()
+    node = place.floor()
     counts = torch.zeros(2 * bins * height_px * width_px, dtype=torch.float64)
     for dx in (0, 1):
         for dy in (0, 1):
             for dt in (0, 1):
                 share = torch.ones_like(place)
-                for value, low, step in ((x_px.double(), column, dx), (y_px.double(), row, dy), (place, node, dt)):
+                for value, low, step in (
+                    (x_px.double(), column, dx),
+                    (y_px.double(), row, dy),
+                    (place, node, dt),
+                ):
                     share = share * (value - low if step else 1 - (value - low))
-                at_x, at_y, at_t = (column + dx).long(), (row + dy).long(), (node + dt).long()
-                inside = (at_x >= 0) & (at_x < width_px) & (at_y >= 0) & (at_y < height_px) & (at_t < bins) & (share > 0)
+                at_x = (column + dx).long()
+                at_y = (row + dy).long()
+                at_t = (node + dt).long()
+                inside = (
+                    (at_x >= 0)
+                    & (at_x < width_px)
+                    & (at_y >= 0)
+                    & (at_y < height_px)
+                    & (at_t < bins)
+                    & (share > 0)
+                )
                 cell = (((~on).long() * bins + at_t) * height_px + at_y) * width_px + at_x
                 counts.index_add_(0, cell[inside], share[inside])
     return counts.reshape(2, bins, height_px, width_px).float()

@@ -1,4 +1,5 @@
-"""Windows of the data sets that studies.make_dataset writes (docs/datasets.md): events, true flow over one frame interval or several, and the frames."""
+"""Windows of the data sets that studies.make_dataset writes (docs/datasets.md): events, true flow over one
+frame interval or several, and the frames."""
 
 import json
 from pathlib import Path
@@ -23,23 +24,42 @@ class DatasetWindows:
 
     Args:
       folder: a data set (with manifest.json) or one sequence of it. bins: of the volumes.
-      window_frames: frame intervals per window. stride_frames: between the starts of windows (window_frames when None).
-      crop_px: (height, width) of a piece at a random place, or None. seed: of that place. sequences: names to use, all when None.
-    Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or do not fit together; DomainError for sequences too short.
+      window_frames: frame intervals per window. stride_frames: between the starts of windows (window_frames
+        when None).
+      crop_px: (height, width) of a piece at a random place, or None. seed: of that place. sequences: names to
+        use, all when None.
+    Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or do not
+      fit together; DomainError for sequences too short.
 
-    Flow over one interval is the stored one. Over several, points of the static world are carried there by depth and poses through the camera's rays (exact
-    to the fit of the camera, CameraFit.error_px); points of moving objects, whose poses are not stored, along the flows in between (see chain).
+    Flow over one interval is the stored one. Over several, points of the static world are carried there by
+    depth and poses through the camera's rays (exact
+    to the fit of the camera, CameraFit.error_px); points of moving objects, whose poses are not stored, along
+    the flows in between (see chain).
     """
 
-    def __init__(self, folder, bins=8, window_frames=1, stride_frames=None, crop_px=None, seed=0, sequences=None):
+    def __init__(
+        self, folder, bins=8, window_frames=1, stride_frames=None, crop_px=None, seed=0, sequences=None
+    ):
         if window_frames < 1 or (stride_frames is not None and stride_frames < 1):
-            raise DomainError(f"window_frames is {window_frames}, stride_frames {stride_frames}; whole numbers from 1 are needed.")
-        self.bins, self.window_frames, self.crop = bins, window_frames, Crop(crop_px, seed)
+            raise DomainError(
+                f"window_frames is {window_frames}, stride_frames {stride_frames}; whole numbers from 1 are "
+                "needed."
+            )
+        self.bins = bins
+        self.window_frames = window_frames
+        self.crop = Crop(crop_px, seed)
         self.sequences = [Sequence(place, sizes) for place, sizes in _places(Path(folder), sequences)]
         step = stride_frames or window_frames
-        self.windows = [(k, first) for k, sequence in enumerate(self.sequences) for first in range(0, sequence.count - window_frames, step)]
+        self.windows = [
+            (k, first)
+            for k, sequence in enumerate(self.sequences)
+            for first in range(0, sequence.count - window_frames, step)
+        ]
         if not self.windows:
-            raise DomainError(f"no sequence of {folder} has the {window_frames + 1} frames that windows of {window_frames} interval(s) need.")
+            raise DomainError(
+                f"no sequence of {folder} has the {window_frames + 1} frames that windows of "
+                f"{window_frames} interval(s) need."
+            )
         for sequence in self.sequences:
             self.crop.check(*sequence.size_px)
 
@@ -48,10 +68,16 @@ class DatasetWindows:
 
     def batch(self, indices):
         """FlowWindows of these samples; each depends on its index and the seed alone."""
-        return collate([self.crop(index, self._sample(*self.windows[index])) for index in check_indices(indices, len(self))])
+        return collate(
+            [
+                self.crop(index, self._sample(*self.windows[index]))
+                for index in check_indices(indices, len(self))
+            ]
+        )
 
     def _sample(self, sequence, first):
-        sequence, last = self.sequences[sequence], first + self.window_frames
+        sequence = self.sequences[sequence]
+        last = first + self.window_frames
         flow, valid = sequence.flow(first, last)
         t0_us, t1_us = (int(sequence.times_us[k]) for k in (first, last))
         volume = from_stream(sequence.stream(t0_us, t1_us), t0_us, t1_us, self.bins)
@@ -66,43 +92,73 @@ class Sequence:
         self.folder = folder
         for name in ("frames.h5", "events.h5", "camera.h5"):
             if not (folder / name).is_file():
-                raise FileFormatError(f"{folder} lacks {name}; copy the sequence again, or make the data set anew.")
+                raise FileFormatError(
+                    f"{folder} lacks {name}; copy the sequence again, or make the data set anew."
+                )
             found = (folder / name).stat().st_size
             if sizes is not None and found != sizes.get(name):
-                raise FileFormatError(f"{folder / name} has {found} bytes, {sizes.get(name)} by the manifest; it was cut or changed.")
+                raise FileFormatError(
+                    f"{folder / name} has {found} bytes, {sizes.get(name)} by the manifest; it was cut or "
+                    "changed."
+                )
         path = folder / "frames.h5"
         self.rows = {"frames": Rows(path, "frames")}
         if len(self.rows["frames"].shape) != 3:
-            raise FileFormatError(f"{path}: frames has shape {list(self.rows['frames'].shape)}; [T, H, W] is needed.")
+            raise FileFormatError(
+                f"{path}: frames has shape {list(self.rows['frames'].shape)}; [T, H, W] is needed."
+            )
         self.count, *size = self.rows["frames"].shape
         self.size_px = tuple(size)
         for name, shape, count in (
-            ("depth", size, self.count), ("object_id", size, self.count), ("flow", [2, *size], self.count - 1), ("valid", size, self.count - 1),
-            ("occluded", size, self.count - 1), ("poses", [4, 4], self.count), ("timestamps", [], self.count),
+            ("depth", size, self.count),
+            ("object_id", size, self.count),
+            ("flow", [2, *size], self.count - 1),
+            ("valid", size, self.count - 1),
+            ("occluded", size, self.count - 1),
+            ("poses", [4, 4], self.count),
+            ("timestamps", [], self.count),
         ):
             self.rows[name] = Rows(path, name, shape, count)
         self.times_us = self.rows["timestamps"].read(0, self.count).astype(np.int64)
         self.poses = self.rows["poses"].read(0, self.count)
         if bool((np.diff(self.times_us) <= 0).any()) or not np.isfinite(self.poses).all():
-            raise FileFormatError(f"{path}: its frame times do not rise, or its poses are not finite; the file is damaged.")
+            raise FileFormatError(
+                f"{path}: its frame times do not rise, or its poses are not finite; the file is damaged."
+            )
         events = folder / "events.h5"
         self.events = {"t": Rows(events, "events/t", [])}
         self.events |= {name: Rows(events, f"events/{name}", [], len(self.events["t"])) for name in "xyp"}
         self.ms_to_idx = Rows(events, "ms_to_idx", []).read(0, self.times_us[-1] // 1000 + 2).astype(np.int64)
-        if bool((np.diff(self.ms_to_idx) < 0).any()) or not 0 <= self.ms_to_idx[0] <= self.ms_to_idx[-1] <= len(self.events["t"]):
-            raise FileFormatError(f"{events}: ms_to_idx is no index of its {len(self.events['t'])} events; the file is damaged.")
-        camera = {name: Rows(folder / "camera.h5", name, [size[1], 3], size[0]).read(0, size[0]) for name in ("direction", "origin_m")}
-        self.rays, self.fit = camera, None
+        if bool((np.diff(self.ms_to_idx) < 0).any()) or not 0 <= self.ms_to_idx[0] <= self.ms_to_idx[
+            -1
+        ] <= len(self.events["t"]):
+            raise FileFormatError(
+                f"{events}: ms_to_idx is no index of its {len(self.events['t'])} events; the file is damaged."
+            )
+        camera = {
+            name: Rows(folder / "camera.h5", name, [size[1], 3], size[0]).read(0, size[0])
+            for name in ("direction", "origin_m")
+        }
+        self.rays = camera
+        self.fit = None
 
     def stream(self, t0_us, t1_us):
         """EventStream of the events from t0_us to t1_us, both included."""
-        low, high = self.ms_to_idx[t0_us // 1000], self.ms_to_idx[min(t1_us // 1000 + 1, len(self.ms_to_idx) - 1)]
-        columns = {name: rows.read(int(low), int(high)).astype(np.int64) for name, rows in self.events.items()}
+        low = self.ms_to_idx[t0_us // 1000]
+        high = self.ms_to_idx[min(t1_us // 1000 + 1, len(self.ms_to_idx) - 1)]
+        columns = {
+            name: rows.read(int(low), int(high)).astype(np.int64) for name, rows in self.events.items()
+        }
         inside = (columns["t"] >= t0_us) & (columns["t"] <= t1_us)
         t, x, y, p = (torch.from_numpy(columns[name][inside]) for name in "txyp")
         height, width = self.size_px
-        if len(t) and (bool((t.diff() < 0).any()) or int(x.max()) >= width or int(y.max()) >= height or int(p.max()) > 1):
-            raise FileFormatError(f"{self.folder / 'events.h5'} holds events that are not in order, outside {width} x {height} px or of another polarity; it is damaged.")
+        if len(t) and (
+            bool((t.diff() < 0).any()) or int(x.max()) >= width or int(y.max()) >= height or int(p.max()) > 1
+        ):
+            raise FileFormatError(
+                f"{self.folder / 'events.h5'} holds events that are not in order, outside {width} x "
+                f"{height} px or of another polarity; it is damaged."
+            )
         return EventStream(t, x, y, 2 * p - 1, height, width)
 
     def flow(self, first, last):
@@ -112,21 +168,31 @@ class Sequence:
         moving = torch.from_numpy(self.rows["object_id"][first]) > 0
         flow, seen = self.carried(first, last)
         if bool(moving.any()):
-            flows, valid, occluded = (torch.from_numpy(self.rows[name].read(first, last)) for name in ("flow", "valid", "occluded"))
+            flows, valid, occluded = (
+                torch.from_numpy(self.rows[name].read(first, last)) for name in ("flow", "valid", "occluded")
+            )
             along, followed = chained(flows.double(), valid, occluded)
-            flow, seen = torch.where(moving, along, flow), torch.where(moving, followed, seen)
+            flow = torch.where(moving, along, flow)
+            seen = torch.where(moving, followed, seen)
         return flow.float(), seen
 
     def carried(self, first, last):
-        """Flow of points at rest, by their depth, both poses and the camera's rays: [2, H, W] float64, valid [H, W]."""
+        """Flow of points at rest, by their depth, both poses and the camera's rays: [2, H, W] float64, valid
+        [H, W]."""
         if self.fit is None:
-            self.fit = CameraFit(self.rays["direction"], self.rays["origin_m"], str(self.folder / "camera.h5"))
-        depth, direction, origin = self.rows["depth"][first].astype(np.float64), self.rays["direction"], self.rays["origin_m"]
+            self.fit = CameraFit(
+                self.rays["direction"], self.rays["origin_m"], str(self.folder / "camera.h5")
+            )
+        depth = self.rows["depth"][first].astype(np.float64)
+        direction = self.rays["direction"]
+        origin = self.rays["origin_m"]
         height, width = self.size_px
         scale = (depth - origin[..., 2]) / direction[..., 2]  # depth counts along the camera's z axis
         points = (origin + scale[..., None] * direction).reshape(-1, 3)
         T_last_first = np.linalg.inv(self.poses[last]) @ self.poses[first]
-        landed = self.fit.project(points @ T_last_first[:3, :3].T + T_last_first[:3, 3]).reshape(height, width, 2)
+        landed = self.fit.project(points @ T_last_first[:3, :3].T + T_last_first[:3, 3]).reshape(
+            height, width, 2
+        )
         x, y = np.meshgrid(np.arange(width), np.arange(height))
         flow = (landed - np.stack([x, y], -1)).transpose(2, 0, 1)
         valid = np.isfinite(flow).all(0) & (depth > 0)
@@ -140,13 +206,28 @@ def _places(folder, names):
     path = folder / "manifest.json"
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
-        kind, sequences, files = manifest["format"], list(manifest["sequences"]), {name: entry["bytes"] for name, entry in manifest["files"].items()}
+        kind = manifest["format"]
+        sequences = list(manifest["sequences"])
+        files = {name: entry["bytes"] for name, entry in manifest["files"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise FileFormatError(f"{folder} is no data set: its manifest.json is missing or malformed, so it was not finished ('python -m studies.make_dataset --resume' does).") from error
+        raise FileFormatError(
+            f"{folder} is no data set: its manifest.json is missing or malformed, so it was not finished "
+            "('python -m studies.make_dataset --resume' does)."
+        ) from error
     if kind != FORMAT:
         raise FileFormatError(f"{path} says format {kind!r}; {FORMAT!r} is read.")
     unknown = sorted(set(names or ()) - set(sequences))
     if unknown:
         raise FileFormatError(f"{folder} has no sequence {unknown[0]!r}; it has {', '.join(sequences)}.")
     chosen = [name for name in sequences if names is None or name in names]
-    return [(folder / name, {file.removeprefix(f"{name}/"): size for file, size in files.items() if file.startswith(f"{name}/")}) for name in chosen]
+    return [
+        (
+            folder / name,
+            {
+                file.removeprefix(f"{name}/"): size
+                for file, size in files.items()
+                if file.startswith(f"{name}/")
+            },
+        )
+        for name in chosen
+    ]

@@ -1,4 +1,5 @@
-"""Rows of large HDF5 datasets, block by block, with the guard against damaged files that the event readers have (see codesign.events.formats.hdf5_chunks)."""
+"""Rows of large HDF5 datasets, block by block, with the guard against damaged files that the event readers
+have (see codesign.events.formats.hdf5_chunks)."""
 
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,28 +14,42 @@ from codesign.events.formats.hdf5 import LIBRARY_ERRORS
 
 @contextmanager
 def reading(path):
-    """Context in which all that h5py raises on a missing or damaged file becomes one FileFormatError that names it."""
+    """Context in which all that h5py raises on a missing or damaged file becomes one FileFormatError that
+    names it."""
     try:
         yield
     except FileFormatError:
         raise
     except LIBRARY_ERRORS as error:
-        raise FileFormatError(f"{path} is missing, cut or damaged, or no HDF5 file ({str(error)[:160]}).") from error
+        raise FileFormatError(
+            f"{path} is missing, cut or damaged, or no HDF5 file ({str(error)[:160]})."
+        ) from error
 
 
 class Rows:
-    """A dataset of numbers in a file, read by ranges of its first axis. The file is open only while it is read.
+    """A dataset of numbers in a file, read by ranges of its first axis. The file is open only while it is
+    read.
 
-    Args: path: the file. name: the dataset. columns: shape of a row (None: any). count: number of rows that it must have (None: any).
-    Raises: FileFormatError when it is absent, of another shape, cut, packed by a filter that is not trusted, or kept in other files.
+    Args: path: the file. name: the dataset. columns: shape of a row (None: any). count: number of rows that
+      it must have (None: any).
+    Raises: FileFormatError when it is absent, of another shape, cut, packed by a filter that is not trusted,
+      or kept in other files.
     """
 
     def __init__(self, path, name, columns=None, count=None):
-        self.path, self.name, self.block_shape = Path(path), name, None
-        self.places, self.filters = {}, []
+        self.path = Path(path)
+        self.name = name
+        self.block_shape = None
+        self.places = {}
+        self.filters = []
         with self._dataset() as dataset:
-            if (columns is not None and dataset.shape[1:] != tuple(columns)) or (count is not None and len(dataset) != count):
-                wanted = [count if count is not None else "N", *(columns if columns is not None else dataset.shape[1:])]
+            if (columns is not None and dataset.shape[1:] != tuple(columns)) or (
+                count is not None and len(dataset) != count
+            ):
+                wanted = [
+                    count if count is not None else "N",
+                    *(columns if columns is not None else dataset.shape[1:]),
+                ]
                 raise FileFormatError(f"{path}: {name} has shape {list(dataset.shape)}, {wanted} is needed.")
             self.shape = dataset.shape
             self._find_blocks(dataset)
@@ -46,17 +61,31 @@ class Rows:
     def _dataset(self):
         with reading(self.path), h5py.File(self.path, "r", locking=False) as file:
             dataset = file.get(self.name)
-            if not isinstance(dataset, h5py.Dataset) or dataset.shape is None or dataset.ndim < 1 or dataset.dtype.kind not in "iufb":
+            if (
+                not isinstance(dataset, h5py.Dataset)
+                or dataset.shape is None
+                or dataset.ndim < 1
+                or dataset.dtype.kind not in "iufb"
+            ):
                 raise FileFormatError(f"{self.path} has no list of numbers named {self.name}.")
-            if not isinstance(file.get(self.name, getlink=True), h5py.HardLink) or dataset.is_virtual or dataset.external:
-                raise FileFormatError(f"{self.path}: {self.name} is kept in other files; files must hold their own data.")
+            if (
+                not isinstance(file.get(self.name, getlink=True), h5py.HardLink)
+                or dataset.is_virtual
+                or dataset.external
+            ):
+                raise FileFormatError(
+                    f"{self.path}: {self.name} is kept in other files; files must hold their own data."
+                )
             yield dataset
 
     def _find_blocks(self, dataset):
         size = self.path.stat().st_size
         if dataset.chunks is None:
             if dataset.size * dataset.dtype.itemsize > size:
-                raise FileFormatError(f"{self.path}: {self.name} claims {dataset.size} values, more than the file has; it was cut or is damaged.")
+                raise FileFormatError(
+                    f"{self.path}: {self.name} claims {dataset.size} values, more than the file has; it was "
+                    "cut or is damaged."
+                )
             return
         self.block_shape = tuple(dataset.chunks)
         for place in chunks.places_of(self.path, dataset, self.name, size):
@@ -66,12 +95,18 @@ class Rows:
         kinds = [kind for kind, *_ in self.filters]
         trusted = {chunks.GZIP, chunks.SHUFFLE, chunks.FLETCHER32}
         if kinds != [chunks.BLOSC] and (not set(kinds) <= trusted or len(set(kinds)) < len(kinds)):
-            raise FileFormatError(f"{self.path}: {self.name} went through the filters {kinds}; gzip, shuffle, fletcher32, or Blosc alone are read; write it anew with gzip.")
+            raise FileFormatError(
+                f"{self.path}: {self.name} went through the filters {kinds}; gzip, shuffle, fletcher32, or "
+                "Blosc alone are read; write it anew with gzip."
+            )
 
     def read(self, first, last):
-        """Rows first to last - 1 as a numpy array, in the file's type. Raises: FileFormatError for a range outside, and for damaged blocks."""
+        """Rows first to last - 1 as a numpy array, in the file's type. Raises: FileFormatError for a range
+        outside, and for damaged blocks."""
         if not 0 <= first <= last <= len(self):
-            raise FileFormatError(f"{self.path}: rows {first} to {last} of {self.name} were asked for, which has {len(self)}.")
+            raise FileFormatError(
+                f"{self.path}: rows {first} to {last} of {self.name} were asked for, which has {len(self)}."
+            )
         with self._dataset() as dataset:
             if dataset.shape != self.shape or (dataset.chunks and tuple(dataset.chunks)) != self.block_shape:
                 raise FileFormatError(f"{self.path} changed while it was in use.")
@@ -82,10 +117,16 @@ class Rows:
             for start in range(first // depth * depth, last, depth):
                 for place in self.places[start]:
                     at = place[0]
-                    low, high = max(first, at[0]), min(last, at[0] + depth)
-                    target = (slice(low - first, high - first), *(slice(a, a + n) for a, n in zip(at[1:], self.block_shape[1:], strict=True)))
+                    low = max(first, at[0])
+                    high = min(last, at[0] + depth)
+                    target = (
+                        slice(low - first, high - first),
+                        *(slice(a, a + n) for a, n in zip(at[1:], self.block_shape[1:], strict=True)),
+                    )
                     room = found[target].shape[1:]  # blocks at the end reach beyond the dataset
-                    found[target] = self._block(dataset, place)[(slice(low - at[0], high - at[0]), *(slice(0, n) for n in room))]
+                    found[target] = self._block(dataset, place)[
+                        (slice(low - at[0], high - at[0]), *(slice(0, n) for n in room))
+                    ]
             return found
 
     def __getitem__(self, index):
@@ -97,8 +138,11 @@ class Rows:
         at, mask, _ = place
         if self.filters and self.filters[0][0] == chunks.BLOSC:
             chunks.check_blosc(self.path, dataset, self.name, [place], self.filters[0][2])
-            return np.asarray(dataset[tuple(slice(a, a + n) for a, n in zip(at, self.block_shape or (), strict=True))])
-        data, size = dataset.id.read_direct_chunk(at)[1], chunks.chunk_bytes(dataset)
+            return np.asarray(
+                dataset[tuple(slice(a, a + n) for a, n in zip(at, self.block_shape or (), strict=True))]
+            )
+        data = dataset.id.read_direct_chunk(at)[1]
+        size = chunks.chunk_bytes(dataset)
         for k in reversed(range(len(self.filters))):
             if not mask >> k & 1:
                 data = chunks.undone(self.path, self.name, self.filters[k][0], self.filters[k][2], data, size)

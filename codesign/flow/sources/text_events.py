@@ -1,7 +1,9 @@
 """Events as text, one per line: ``t x y p`` as in the Event-Camera Dataset, or what a header line says.
 
-Times with a fraction are seconds, whole ones microseconds; p is 1 and 0, or +1 and -1. Numbers are separated by blanks or commas. A first line of two whole
-numbers is the sensor's width and height; lines that begin with # are skipped at the top. Source: Mueggler et al., IJRR 2017 (layout of events.txt).
+Times with a fraction are seconds, whole ones microseconds; p is 1 and 0, or +1 and -1. Numbers are separated
+by blanks or commas. A first line of two whole
+numbers is the sensor's width and height; lines that begin with # are skipped at the top. Source: Mueggler et
+al., IJRR 2017 (layout of events.txt).
 """
 
 import io
@@ -17,7 +19,20 @@ from codesign.flow.sources.columns import LIMIT_PX, EventColumns, settled_size
 
 CHUNK_BYTES = 2**23
 MOST_EVENTS = 500_000_000
-NAMES = {"t": "t", "ts": "t", "time": "t", "timestamp": "t", "timestamps": "t", "t_us": "t", "t_s": "t", "x": "x", "y": "y", "p": "p", "pol": "p", "polarity": "p"}
+NAMES = {
+    "t": "t",
+    "ts": "t",
+    "time": "t",
+    "timestamp": "t",
+    "timestamps": "t",
+    "t_us": "t",
+    "t_s": "t",
+    "x": "x",
+    "y": "y",
+    "p": "p",
+    "pol": "p",
+    "polarity": "p",
+}
 ORDERS = ("txyp", "xytp")
 UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -28,13 +43,18 @@ def read_text_events(path, size=None, told=None, told_by="the file", columns="au
 
     Args:
       path: file. size, told, told_by: see columns.settled_size.
-      columns: order of the four columns, for example "txyp"; "auto" takes the header's, else "txyp", else "xytp" where only the third column rises.
-      time_unit: "s", "ms", "us", "ns"; "auto": seconds where a time of the first chunk has a fraction, else microseconds.
+      columns: order of the four columns, for example "txyp"; "auto" takes the header's, else "txyp", else
+        "xytp" where only the third column rises.
+      time_unit: "s", "ms", "us", "ns"; "auto": seconds where a time of the first chunk has a fraction, else
+        microseconds.
     Returns: EventColumns in order of time. Events up to 1 ms late are put in order.
-    Raises: FileFormatError naming the line that is not four numbers, goes back in time, lies outside the sensor or has another polarity.
+    Raises: FileFormatError naming the line that is not four numbers, goes back in time, lies outside the
+      sensor or has another polarity.
     """
     path = Path(path)
-    parts, number, carried_us = [], 1, -(2**62)
+    parts = []
+    number = 1
+    carried_us = -(2**62)
     try:
         with open(path, "rb") as file:
             first_lines, columns, told_in_file = _head(path, file, columns)
@@ -58,28 +78,44 @@ def read_text_events(path, size=None, told=None, told_by="the file", columns="au
     del parts
     if bool((t_us[1:] < t_us[:-1]).any()):
         order = np.argsort(t_us, kind="stable")
-        t_us, x, y, on = t_us[order], x[order], y[order], on[order]
+        t_us = t_us[order]
+        x = x[order]
+        y = y[order]
+        on = on[order]
     return EventColumns(t_us, x, y, on, *settled_size(path, x, y, size, told, told_by))
 
 
 def _head(path, file, columns):
-    """(lines used up, order of the columns, (height, width) or None) of comments, a header, or a size at the top of the file."""
-    used, told = 0, None
+    """(lines used up, order of the columns, (height, width) or None) of comments, a header, or a size at the
+    top of the file."""
+    used = 0
+    told = None
     while True:
-        here, line = file.tell(), file.readline(4096)
+        here = file.tell()
+        line = file.readline(4096)
         words = line.replace(b",", b" ").split()
-        if line.startswith(b"#") and (not words[1:] or words[1].decode("ascii", "replace").lower() not in NAMES):
+        if line.startswith(b"#") and (
+            not words[1:] or words[1].decode("ascii", "replace").lower() not in NAMES
+        ):
             used += 1
         elif words and not NUMBER.fullmatch(words[-1]):
             names = [word.decode("ascii", "replace").lower() for word in words if word != b"#"]
             found = "".join(NAMES.get(name.removeprefix("#"), "?") for name in names)
             if sorted(found) != ["p", "t", "x", "y"]:
-                raise FileFormatError(f"{path}, line {used + 1}: {line[:60].decode('ascii', 'replace').rstrip()!r} is neither an event of four numbers nor a header that names t, x, y, p.")
-            used, columns = used + 1, found if columns == "auto" else columns
+                raise FileFormatError(
+                    f"{path}, line {used + 1}: {line[:60].decode('ascii', 'replace').rstrip()!r} is neither "
+                    "an event of four numbers nor a header that names t, x, y, p."
+                )
+            used = used + 1
+            columns = found if columns == "auto" else columns
         elif len(words) == 2 and told is None and all(word.isdigit() for word in words):
-            used, told = used + 1, (int(words[1]), int(words[0]))
+            used = used + 1
+            told = (int(words[1]), int(words[0]))
             if not all(1 <= side <= LIMIT_PX for side in told):
-                raise FileFormatError(f"{path}, line {used}: a sensor of {told[1]} x {told[0]} pixels is announced; 1 to {LIMIT_PX} a side are possible.")
+                raise FileFormatError(
+                    f"{path}, line {used}: a sensor of {told[1]} x {told[0]} pixels is announced; 1 to "
+                    f"{LIMIT_PX} a side are possible."
+                )
         else:
             file.seek(here)
             return used, columns, told
@@ -92,13 +128,17 @@ def _whole_lines(path, file, number):
         block += file.readline(4096)
         if not block.endswith(b"\n"):
             if file.read(1):
-                raise FileFormatError(f"{path}: a line after line {number} is longer than 4096 bytes; this is no text file of events.")
+                raise FileFormatError(
+                    f"{path}: a line after line {number} is longer than 4096 bytes; this is no text file of "
+                    "events."
+                )
             block += b"\n"
     return block.replace(b",", b" ") if b"," in block else block
 
 
 def _table(path, lines, number):
-    """[N, 4] float64 of whole lines, and the number of the line of each row. Every line must hold four numbers or nothing."""
+    """[N, 4] float64 of whole lines, and the number of the line of each row. Every line must hold four
+    numbers or nothing."""
     raw = np.frombuffer(lines, np.uint8)
     blank = raw <= 32
     starts = ~blank & np.concatenate([[True], blank[:-1]])
@@ -110,13 +150,17 @@ def _table(path, lines, number):
     rows = np.flatnonzero(words)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # how older versions of numpy say that they met no number
+            warnings.simplefilter(
+                "ignore", DeprecationWarning
+            )  # how older versions of numpy say that they met no number
             found = np.fromstring(lines.decode("latin-1"), np.float64, sep=" ")
     except ValueError:
         found = np.empty(0)
     if len(found) != 4 * len(rows) or not np.isfinite(found).all():
         for at, line in enumerate(io.BytesIO(lines)):
-            if line.strip() and not all(NUMBER.fullmatch(word) and np.isfinite(float(word)) for word in line.split()):
+            if line.strip() and not all(
+                NUMBER.fullmatch(word) and np.isfinite(float(word)) for word in line.split()
+            ):
                 raise _bad(path, lines, number, at)
     return found.reshape(-1, 4), number + rows
 
@@ -124,15 +168,27 @@ def _table(path, lines, number):
 def _bad(path, lines, number, at):
     number += at
     line = lines.split(b"\n", at + 1)[at][:60].decode("ascii", "replace").rstrip()
-    return FileFormatError(f"{path}, line {number}: {line!r} is not an event of four finite numbers (t x y p).")
+    return FileFormatError(
+        f"{path}, line {number}: {line!r} is not an event of four finite numbers (t x y p)."
+    )
 
 
 def _settled_order(path, table, columns):
     if columns == "auto":
-        rising = [order for order in ORDERS if bool((np.diff(table[:, order.index("t")]) >= 0).all()) and bool((table[:, [order.index("x"), order.index("y")]] % 1 == 0).all())]
-        return rising[0] if rising else ORDERS[0]  # without either, the line that goes back in time is named by the check that follows
+        rising = [
+            order
+            for order in ORDERS
+            if bool((np.diff(table[:, order.index("t")]) >= 0).all())
+            and bool((table[:, [order.index("x"), order.index("y")]] % 1 == 0).all())
+        ]
+        return (
+            rising[0] if rising else ORDERS[0]
+        )  # without either, the line that goes back in time is named by the check that follows
     if sorted(columns) != ["p", "t", "x", "y"]:
-        raise FileFormatError(f"columns {columns!r} given for {path}; the four letters t, x, y, p in the file's order are needed, for example 'txyp'.")
+        raise FileFormatError(
+            f"columns {columns!r} given for {path}; the four letters t, x, y, p in the file's order are "
+            "needed, for example 'txyp'."
+        )
     return columns
 
 
@@ -140,7 +196,9 @@ def _settled_unit(path, times, unit):
     if unit == "auto":
         return "s" if bool((times % 1 != 0).any()) else "us"
     if unit not in UNITS_US:
-        raise FileFormatError(f"time unit {unit!r} given for {path}; choose one of {', '.join(UNITS_US)} or auto.")
+        raise FileFormatError(
+            f"time unit {unit!r} given for {path}; choose one of {', '.join(UNITS_US)} or auto."
+        )
     return unit
 
 
@@ -151,11 +209,20 @@ def _checked(path, table, at_lines, columns, us, carried_us):
     latest_us = np.maximum(np.maximum.accumulate(t_us), carried_us) if len(t_us) else t_us
     for bad, reason in (
         ((np.abs(t_us) >= 2**61), "its time exceeds 61 bits of microseconds"),
-        (t_us < latest_us - DISORDER_US, f"its time lies more than {DISORDER_US} us before that of an earlier line"),
-        ((x % 1 != 0) | (y % 1 != 0) | (x < 0) | (y < 0) | (x >= LIMIT_PX) | (y >= LIMIT_PX), f"pixel coordinates are whole numbers from 0 to {LIMIT_PX - 1}"),
+        (
+            t_us < latest_us - DISORDER_US,
+            f"its time lies more than {DISORDER_US} us before that of an earlier line",
+        ),
+        (
+            (x % 1 != 0) | (y % 1 != 0) | (x < 0) | (y < 0) | (x >= LIMIT_PX) | (y >= LIMIT_PX),
+            f"pixel coordinates are whole numbers from 0 to {LIMIT_PX - 1}",
+        ),
         (~((p == 1) | (p == 0) | (p == -1)), "polarity is 1 or 0 (or +1 and -1)"),
     ):
         if bool(bad.any()):
             at = int(np.argmax(bad))
-            raise FileFormatError(f"{path}, line {at_lines[at]}: {' '.join(f'{value:.15g}' for value in table[at])!r}: {reason}.")
+            raise FileFormatError(
+                f"{path}, line {at_lines[at]}: {' '.join(f'{value:.15g}' for value in table[at])!r}: "
+                f"{reason}."
+            )
     return t_us.astype(np.int64), x.astype(np.int16), y.astype(np.int16), p > 0

@@ -1,4 +1,5 @@
-"""Ground-truth flow of a recording by path: flow files of several kinds, tables of text, and folders of them with their times."""
+"""Ground-truth flow of a recording by path: flow files of several kinds, tables of text, and folders of them
+with their times."""
 
 import re
 import zipfile
@@ -15,11 +16,35 @@ from codesign.flow.sources import folders
 from codesign.flow_files import read_flow
 
 ARRAYS = ("flow", "flow_px", "gt_flow", "flow_gt", "gt", "truth", "arr_0")
-PAIRS = (("x_flow_dist", "y_flow_dist"), ("x_flow", "y_flow"), ("flow_x", "flow_y"), ("vx", "vy"), ("u", "v"), ("vxGT", "vyGT"))
+PAIRS = (
+    ("x_flow_dist", "y_flow_dist"),
+    ("x_flow", "y_flow"),
+    ("flow_x", "flow_y"),
+    ("vx", "vy"),
+    ("u", "v"),
+    ("vxGT", "vyGT"),
+)
 MASKS = ("valid", "mask", "valid_mask")
 TIMES = ("timestamps", "t", "ts")
-COLUMNS = {"vx": "u", "vy": "v", "flow_x": "u", "flow_y": "v", "u": "u", "v": "v", "x": "x", "y": "y", "valid": "valid", "t": "t", "p": "p"}
-TABLES = {2: ("u", "v"), 4: ("x", "y", "u", "v"), 5: ("x", "y", "u", "v", "valid"), 6: ("t", "x", "y", "p", "u", "v")}
+COLUMNS = {
+    "vx": "u",
+    "vy": "v",
+    "flow_x": "u",
+    "flow_y": "v",
+    "u": "u",
+    "v": "v",
+    "x": "x",
+    "y": "y",
+    "valid": "valid",
+    "t": "t",
+    "p": "p",
+}
+TABLES = {
+    2: ("u", "v"),
+    4: ("x", "y", "u", "v"),
+    5: ("x", "y", "u", "v", "valid"),
+    6: ("t", "x", "y", "p", "u", "v"),
+}
 MOST_VALUES = 2_000_000_000
 
 
@@ -27,7 +52,8 @@ MOST_VALUES = 2_000_000_000
 class TrueFlow:
     """One flow as its file has it.
 
-    flow: [2, H, W], right and down, in the file's unit. valid: [H, W] bool. span_s: (from, to) seconds on the recording's clock; None where the file has no
+    flow: [2, H, W], right and down, in the file's unit. valid: [H, W] bool. span_s: (from, to) seconds on the
+      recording's clock; None where the file has no
     times, or one time only. name: the file, and which of its flows.
     """
 
@@ -41,11 +67,14 @@ def read_truth(path, size_px):
     """Read the flow fields of a file or folder, in order.
 
     Args:
-      path: .flo, .png (16 bits as in DSEC), .npy, .npz or .mat (up to version 7) ([2, H, W] or [H, W, 2], or several along a first axis; .npz also as a pair of components and with
-        valid and timestamps, the layout of MVSEC among them), .txt or .csv (see docs/flow_recordings.md); or a folder of such files, with their times in
+      path: .flo, .png (16 bits as in DSEC), .npy, .npz or .mat (up to version 7) ([2, H, W] or [H, W, 2], or
+        several along a first axis; .npz also as a pair of components and with
+        valid and timestamps, the layout of MVSEC among them), .txt or .csv (see docs/flow_recordings.md); or
+        a folder of such files, with their times in
         timestamps.txt or forward_timestamps.txt.
       size_px: (height, width) of the recording, which tables of text need; every flow must have it.
-    Returns: [TrueFlow]. Flows that are not finite are not valid; in MVSEC's layout neither are those of exactly (0, 0).
+    Returns: [TrueFlow]. Flows that are not finite are not valid; in MVSEC's layout neither are those of
+      exactly (0, 0).
     Raises: FileFormatError for anything else.
     """
     path = Path(path)
@@ -53,14 +82,19 @@ def read_truth(path, size_px):
         files = folders.flow_files(path)
         flows = [flow for file in files for flow in _of_file(file, size_px)]
         spans = _spans_beside(path, files[0].parent, len(flows))
-        flows = [replace(flow, span_s=span) for flow, span in zip(flows, spans, strict=True)] if spans else flows
+        flows = (
+            [replace(flow, span_s=span) for flow, span in zip(flows, spans, strict=True)] if spans else flows
+        )
     elif path.is_file():
         flows = _of_file(path, size_px)
     else:
         raise FileFormatError(f"no ground truth lies at {path}; check the path.")
     for flow in flows:
         if flow.flow.shape[1:] != tuple(size_px):
-            raise FileFormatError(f"{flow.name} has {flow.flow.shape[2]} x {flow.flow.shape[1]} pixels, the recording {size_px[1]} x {size_px[0]}; give the sensor size if it was guessed.")
+            raise FileFormatError(
+                f"{flow.name} has {flow.flow.shape[2]} x {flow.flow.shape[1]} pixels, the recording "
+                f"{size_px[1]} x {size_px[0]}; give the sensor size if it was guessed."
+            )
     return flows
 
 
@@ -82,18 +116,34 @@ def _of_file(path, size_px):
         return _of_arrays(path)
     if suffix in (".txt", ".csv"):
         return [_of_table(path, size_px)]
-    raise FileFormatError(f"{path} ends in {path.suffix or 'nothing'!r}; ground truth is read from {', '.join(sorted(folders.FLOW_SUFFIXES))}, imu.txt and groundtruth.txt.")
+    raise FileFormatError(
+        f"{path} ends in {path.suffix or 'nothing'!r}; ground truth is read from "
+        f"{', '.join(sorted(folders.FLOW_SUFFIXES))}, imu.txt and groundtruth.txt."
+    )
 
 
 def _arrays(path) -> dict[str, np.ndarray]:
     """The arrays of a file by name; the only one of an .npy file as "arr_0"."""
     try:
         with path.open("rb") as file:
-            loaded: Any = loadmat(file) if path.suffix.lower() == ".mat" else np.load(file, allow_pickle=False)
+            loaded: Any = (
+                loadmat(file) if path.suffix.lower() == ".mat" else np.load(file, allow_pickle=False)
+            )
             if isinstance(loaded, np.ndarray):
                 return {"arr_0": loaded}
             return {name: np.asarray(loaded[name]) for name in loaded if name[0] != "_"}
-    except (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile, NotImplementedError, MatReadError, TypeError, IndexError) as error:
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        EOFError,
+        MemoryError,
+        zipfile.BadZipFile,
+        NotImplementedError,
+        MatReadError,
+        TypeError,
+        IndexError,
+    ) as error:
         raise FileFormatError(f"{path} is not a readable file of arrays ({error}).") from error
 
 
@@ -104,18 +154,30 @@ def _of_arrays(path):
     if pair:
         parts = [arrays[part] for part in pair]
         if parts[0].shape != parts[1].shape or parts[0].ndim not in (2, 3):
-            raise FileFormatError(f"{path}: {pair[0]} and {pair[1]} have shapes {parts[0].shape} and {parts[1].shape}; two alike, [H, W] or [N, H, W], are needed.")
+            raise FileFormatError(
+                f"{path}: {pair[0]} and {pair[1]} have shapes {parts[0].shape} and {parts[1].shape}; two "
+                "alike, [H, W] or [N, H, W], are needed."
+            )
         flow = np.stack(parts, -3)
     elif name:
         flow = arrays[name]
     else:
-        raise FileFormatError(f"{path} holds {', '.join(sorted(arrays)) or 'nothing'}; an array named {', '.join(ARRAYS)} or a pair such as {', '.join(PAIRS[0])} is needed.")
+        raise FileFormatError(
+            f"{path} holds {', '.join(sorted(arrays)) or 'nothing'}; an array named {', '.join(ARRAYS)} or "
+            f"a pair such as {', '.join(PAIRS[0])} is needed."
+        )
     if flow.dtype.kind not in "fiu" or flow.ndim not in (3, 4) or flow.size > MOST_VALUES:
-        raise FileFormatError(f"{path} holds a flow of {flow.dtype} {list(flow.shape)}; numbers [2, H, W] or [H, W, 2] are needed, or several of them.")
+        raise FileFormatError(
+            f"{path} holds a flow of {flow.dtype} {list(flow.shape)}; numbers [2, H, W] or [H, W, 2] are "
+            "needed, or several of them."
+        )
     flow = flow[None] if flow.ndim == 3 else flow
     if flow.shape[1] != 2:
         if flow.shape[3] not in (2, 3):
-            raise FileFormatError(f"{path} holds a flow of shape {list(flow.shape)}; [2, H, W] or [H, W, 2] is needed, or several along a first axis.")
+            raise FileFormatError(
+                f"{path} holds a flow of shape {list(flow.shape)}; [2, H, W] or [H, W, 2] is needed, or "
+                "several along a first axis."
+            )
         flow = np.moveaxis(flow, 3, 1)  # a third channel says what is valid
     flow, third = flow[:, :2].astype(np.float64), flow[:, 2:]
     valid = np.asarray(np.isfinite(flow).all(1))
@@ -126,15 +188,21 @@ def _of_arrays(path):
     mask = next((arrays[mask] for mask in MASKS if mask in arrays), None)
     if mask is not None:
         if mask.shape not in (valid.shape, valid.shape[1:]):
-            raise FileFormatError(f"{path}: the mask has shape {list(mask.shape)}, the flow's is {list(valid.shape)}.")
+            raise FileFormatError(
+                f"{path}: the mask has shape {list(mask.shape)}, the flow's is {list(valid.shape)}."
+            )
         valid &= mask.astype(bool)
     spans = _spans_of(path, arrays, len(flow))
     flow = np.where(valid[:, None], flow, 0.0)
-    return [TrueFlow(flow[k], valid[k], spans[k], str(path) if len(flow) == 1 else f"{path} [{k}]") for k in range(len(flow))]
+    return [
+        TrueFlow(flow[k], valid[k], spans[k], str(path) if len(flow) == 1 else f"{path} [{k}]")
+        for k in range(len(flow))
+    ]
 
 
 def _spans_of(path, arrays, count):
-    """[(from, to) or None] by the arrays t0 and t1, or by timestamps, at each of which a flow begins that ends at the next (MVSEC)."""
+    """[(from, to) or None] by the arrays t0 and t1, or by timestamps, at each of which a flow begins that
+    ends at the next (MVSEC)."""
     if "t0" in arrays and "t1" in arrays:
         ends = np.stack([arrays["t0"].reshape(-1), arrays["t1"].reshape(-1)], -1).astype(np.float64)
         return _checked_spans(path, ends, count)
@@ -151,27 +219,48 @@ def _spans_of(path, arrays, count):
 
 
 def _spans_beside(folder, inside, count):
-    """[(from, to)] in seconds of the text file of times of a folder, in whole microseconds or in seconds; None without one."""
+    """[(from, to)] in seconds of the text file of times of a folder, in whole microseconds or in seconds;
+    None without one."""
     names = ("forward_timestamps.txt", "timestamps.txt")
-    file = next((place / name for place in (inside, inside.parent, folder) for name in names if (place / name).is_file()), None)
+    file = next(
+        (
+            place / name
+            for place in (inside, inside.parent, folder)
+            for name in names
+            if (place / name).is_file()
+        ),
+        None,
+    )
     if file is None:
         return None
     try:
-        rows = [[float(word) for word in re.split(r"[,\s]+", line.strip())] for line in file.read_text(encoding="utf-8").splitlines() if line.strip() and not line.startswith("#")]
+        rows = [
+            [float(word) for word in re.split(r"[,\s]+", line.strip())]
+            for line in file.read_text(encoding="utf-8").splitlines()
+            if line.strip() and not line.startswith("#")
+        ]
         ends = np.array(rows, np.float64)
     except (OSError, ValueError) as error:
-        raise FileFormatError(f"{file} is no list of times: lines of 'from, to' are needed ({error}).") from error
+        raise FileFormatError(
+            f"{file} is no list of times: lines of 'from, to' are needed ({error})."
+        ) from error
     if ends.ndim == 2 and ends.shape[1] == 1 and len(ends) == count + 1:
         ends = np.concatenate([ends[:-1], ends[1:]], 1)
     if ends.ndim != 2 or ends.shape[1] != 2:
-        raise FileFormatError(f"{file} has {list(ends.shape)} numbers; one line of two times per flow is needed, or one time more than there are flows.")
+        raise FileFormatError(
+            f"{file} has {list(ends.shape)} numbers; one line of two times per flow is needed, or one time "
+            "more than there are flows."
+        )
     return _checked_spans(file, ends, count)
 
 
 def _checked_spans(path, ends, count):
     """Spans in seconds; whole numbers are microseconds."""
     if ends.shape != (count, 2) or not np.isfinite(ends).all() or bool((ends[:, 1] <= ends[:, 0]).any()):
-        raise FileFormatError(f"{path}: times of shape {list(ends.shape)} for {count} flow(s); each flow needs a time from and a later time to.")
+        raise FileFormatError(
+            f"{path}: times of shape {list(ends.shape)} for {count} flow(s); each flow needs a time from "
+            "and a later time to."
+        )
     ends = ends / 1e6 if bool((ends % 1 == 0).all()) and float(ends.max()) >= 1000 else ends
     return [(float(first), float(last)) for first, last in ends]
 
@@ -190,26 +279,38 @@ def _of_table(path, size_px):
         raise FileFormatError(f"{path} is no table of numbers ({error}).") from error
     height, width = size_px
     if not header and table.shape == (2 * height, width):
-        return _filled(path, table.reshape(2, height, width), np.isfinite(table.reshape(2, height, width)).all(0))
+        return _filled(
+            path, table.reshape(2, height, width), np.isfinite(table.reshape(2, height, width)).all(0)
+        )
     names = tuple(COLUMNS.get(word, "?") for word in words) if header else TABLES.get(table.shape[1], ())
     if len(names) != table.shape[1] or "u" not in names or "v" not in names or len(set(names)) != len(names):
         raise FileFormatError(
-            f"{path} has {table.shape[0]} lines of {table.shape[1]} numbers; 'u v' for all pixels row by row, 'x y u v', 'x y u v valid', 't x y p u v' or 2 x {height} lines of {width} are read."
+            f"{path} has {table.shape[0]} lines of {table.shape[1]} numbers; 'u v' for all pixels row by "
+            f"row, 'x y u v', 'x y u v valid', 't x y p u v' or 2 x {height} lines of {width} are read."
         )
     uv = table[:, [names.index("u"), names.index("v")]]
     if "x" not in names:
         if len(uv) not in (1, height * width):
-            raise FileFormatError(f"{path} has {len(uv)} lines of 'u v'; one for all pixels or {height * width} ({height} rows of {width}) are needed.")
+            raise FileFormatError(
+                f"{path} has {len(uv)} lines of 'u v'; one for all pixels or {height * width} ({height} "
+                f"rows of {width}) are needed."
+            )
         flow = np.broadcast_to(uv, (height * width, 2)).reshape(height, width, 2).transpose(2, 0, 1)
         return _filled(path, flow, np.isfinite(flow).all(0))
-    x, y = table[:, names.index("x")], table[:, names.index("y")]
+    x = table[:, names.index("x")]
+    y = table[:, names.index("y")]
     outside = ~((x % 1 == 0) & (y % 1 == 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
     if bool(outside.any()):
-        raise FileFormatError(f"{path}, row {int(np.argmax(outside)) + 1} of numbers: pixel ({x[outside][0]:g}, {y[outside][0]:g}) is none of a sensor of {width} x {height}.")
+        raise FileFormatError(
+            f"{path}, row {int(np.argmax(outside)) + 1} of numbers: pixel ({x[outside][0]:g}, "
+            f"{y[outside][0]:g}) is none of a sensor of {width} x {height}."
+        )
     use = np.isfinite(uv).all(1) & (table[:, names.index("valid")] > 0 if "valid" in names else True)
     cell = (y * width + x).astype(np.int64)[use]
     count = np.bincount(cell, minlength=height * width)
-    flow = np.stack([np.bincount(cell, uv[use, k], height * width) / np.maximum(count, 1) for k in (0, 1)])  # the mean of several flows of a pixel
+    flow = np.stack(
+        [np.bincount(cell, uv[use, k], height * width) / np.maximum(count, 1) for k in (0, 1)]
+    )  # the mean of several flows of a pixel
     return _filled(path, flow.reshape(2, height, width), (count > 0).reshape(height, width))
 
 

@@ -1,4 +1,5 @@
-"""What a lens does to light of an object at infinity: spots, fans, wavefront, point spread, MTF, distortion, field curvature, colour."""
+"""What a lens does to light of an object at infinity: spots, fans, wavefront, point spread, MTF, distortion,
+field curvature, colour."""
 
 from codesign.lens.analysis.chromatic import chromatic_focus_shift_mm, lateral_colour_mm
 from codesign.lens.analysis.distortion import chief_height_mm, distortion_percent
@@ -7,14 +8,69 @@ from codesign.lens.analysis.field_curvature import focus_shift_mm
 from codesign.lens.analysis.mtf import diffraction_mtf, geometric_mtf, ideal_mtf
 from codesign.lens.analysis.psf import Psf, diffraction_psf, geometric_psf, psf_on_pixels
 from codesign.lens.analysis.pupil import PupilFunction, pupil_function
-from codesign.lens.analysis.rays import ImageRays, chief_ray, field_rays, pupil_grid, spectral_lines, trace_field
-from codesign.lens.analysis.spots import encircled_energy, encircled_radius_mm, polychromatic_spot, rms_spot_mm, spot_radius_mm, spots
+from codesign.lens.analysis.rays import (
+    ImageRays,
+    chief_ray,
+    field_rays,
+    pupil_grid,
+    spectral_lines,
+    trace_field,
+)
+from codesign.lens.analysis.spots import (
+    encircled_energy,
+    encircled_radius_mm,
+    polychromatic_spot,
+    rms_spot_mm,
+    spot_radius_mm,
+    spots,
+)
 from codesign.lens.analysis.through_focus import through_focus_mtf, through_focus_spot_mm
-from codesign.lens.analysis.wavefront import Wavefront, peak_to_valley_waves, remove_fit, rms_waves, strehl_direct, strehl_marechal, wavefront
+from codesign.lens.analysis.wavefront import (
+    Wavefront,
+    peak_to_valley_waves,
+    remove_fit,
+    rms_waves,
+    strehl_direct,
+    strehl_marechal,
+    wavefront,
+)
 
 __all__ = [
-    "ImageRays", "Psf", "PupilFunction", "RayFan", "Wavefront", "chief_height_mm", "chief_ray", "chromatic_focus_shift_mm", "diffraction_mtf", "diffraction_psf",
-    "distortion_percent", "encircled_energy", "encircled_radius_mm", "field_rays", "focus_shift_mm", "geometric_mtf", "geometric_psf", "ideal_mtf", "lateral_colour_mm",
-    "peak_to_valley_waves", "polychromatic_spot", "psf_on_pixels", "pupil_function", "pupil_grid", "ray_fan", "remove_fit", "rms_spot_mm", "rms_waves", "spectral_lines",
-    "spot_radius_mm", "spots", "strehl_direct", "strehl_marechal", "through_focus_mtf", "through_focus_spot_mm", "trace_field", "wavefront",
+    "ImageRays",
+    "Psf",
+    "PupilFunction",
+    "RayFan",
+    "Wavefront",
+    "chief_height_mm",
+    "chief_ray",
+    "chromatic_focus_shift_mm",
+    "diffraction_mtf",
+    "diffraction_psf",
+    "distortion_percent",
+    "encircled_energy",
+    "encircled_radius_mm",
+    "field_rays",
+    "focus_shift_mm",
+    "geometric_mtf",
+    "geometric_psf",
+    "ideal_mtf",
+    "lateral_colour_mm",
+    "peak_to_valley_waves",
+    "polychromatic_spot",
+    "psf_on_pixels",
+    "pupil_function",
+    "pupil_grid",
+    "ray_fan",
+    "remove_fit",
+    "rms_spot_mm",
+    "rms_waves",
+    "spectral_lines",
+    "spot_radius_mm",
+    "spots",
+    "strehl_direct",
+    "strehl_marechal",
+    "through_focus_mtf",
+    "through_focus_spot_mm",
+    "trace_field",
+    "wavefront",
 ]

@@ -13,6 +13,7 @@ def lateral_colour_mm(lens, fields_rad, wavelengths_um, reference_um=WAVELENGTH_
 
 
 def chromatic_focus_shift_mm(lens, wavelengths_um, reference_um=WAVELENGTH_UM["d"]):
-    """Paraxial back focal length minus that at the reference wavelength, [W] mm. Gradient: to every lens tensor."""
+    """Paraxial back focal length minus that at the reference wavelength, [W] mm. Gradient: to every lens
+    tensor."""
     reference = lens.first_order(reference_um).bfl_mm
     return torch.stack([lens.first_order(float(w)).bfl_mm - reference for w in wavelengths_um])

@@ -12,10 +12,13 @@ from codesign.lens.glass import WAVELENGTH_UM
 
 @dataclass(frozen=True)
 class RayFan:
-    """Aberrations along a pupil diameter, relative to the reference point (the chief ray's, unless another was given).
+    """Aberrations along a pupil diameter, relative to the reference point (the chief ray's, unless another
+    was given).
 
-    pupil: [M] in [-1, 1]. tangential_mm: [M] transverse aberration in y of rays (0, pupil); sagittal_mm: [M] that in x of rays
-    (pupil, 0). tangential_waves, sagittal_waves: [M] optical path differences. tangential_weight, sagittal_weight: [M], 0 where no ray arrives.
+    pupil: [M] in [-1, 1]. tangential_mm: [M] transverse aberration in y of rays (0, pupil); sagittal_mm: [M]
+      that in x of rays
+    (pupil, 0). tangential_waves, sagittal_waves: [M] optical path differences. tangential_weight,
+      sagittal_weight: [M], 0 where no ray arrives.
     """
 
     pupil: Tensor
@@ -27,20 +30,41 @@ class RayFan:
     sagittal_weight: Tensor
 
 
-def ray_fan(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"], count=33, vignetting=False, reference_mm=None, defocus_mm=0.0):
+def ray_fan(
+    lens,
+    field_rad,
+    wavelength_um=WAVELENGTH_UM["d"],
+    count=33,
+    vignetting=False,
+    reference_mm=None,
+    defocus_mm=0.0,
+):
     """RayFan of one field and wavelength.
 
     Args:
-      count: rays per diameter, odd to hold the chief ray. reference_mm: [2] image point to which both aberrations refer; None is
+      count: rays per diameter, odd to hold the chief ray. reference_mm: [2] image point to which both
+        aberrations refer; None is
       the chief ray of this wavelength. Give that of a middle wavelength to see lateral colour.
-    Gradient: aberrations to every lens tensor. Raises: DomainError when no ray, or not the chief ray, arrives.
+    Gradient: aberrations to every lens tensor. Raises: DomainError when no ray, or not the chief ray,
+      arrives.
     """
     like = lens.curvature_per_mm
-    line, zero = torch.linspace(-1, 1, count, dtype=like.dtype, device=like.device), torch.zeros(count, dtype=like.dtype, device=like.device)
+    line = torch.linspace(-1, 1, count, dtype=like.dtype, device=like.device)
+    zero = torch.zeros(count, dtype=like.dtype, device=like.device)
     pupil = torch.cat([torch.stack([zero, line], 1), torch.stack([line, zero], 1)])
     rays = trace_field(lens, field_rad, pupil, wavelength_um, vignetting, defocus_mm)
     chief = chief_ray(lens, field_rad, wavelength_um, defocus_mm)
     centre = chief.position_mm[0] if reference_mm is None else reference_mm
     away = rays.position_mm - centre
-    waves = path_difference_mm(lens, rays, chief, wavelength_um, reference_mm, defocus_mm) / (wavelength_um * 1e-3)
-    return RayFan(line, away[:count, 1], away[count:, 0], waves[:count], waves[count:], rays.weight[:count], rays.weight[count:])
+    waves = path_difference_mm(lens, rays, chief, wavelength_um, reference_mm, defocus_mm) / (
+        wavelength_um * 1e-3
+    )
+    return RayFan(
+        line,
+        away[:count, 1],
+        away[count:, 0],
+        waves[:count],
+        waves[count:],
+        rays.weight[:count],
+        rays.weight[count:],
+    )

@@ -7,13 +7,17 @@ from codesign.lens.glass import WAVELENGTH_UM
 
 
 def focus_shift_mm(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"], reach=1e-3):
-    """Tangential and sagittal focus of each field, along z from the image plane; the difference is the astigmatism.
+    """Tangential and sagittal focus of each field, along z from the image plane; the difference is the
+    astigmatism.
 
-    Rays at +-reach and +-2 reach of the pupil radius stand for the infinitely thin bundle of Coddington's equations; four points
-    cancel the terms of third order in the reach, so what is left is rounding (below 1e-8 of the focal length).
+    Rays at +-reach and +-2 reach of the pupil radius stand for the infinitely thin bundle of Coddington's
+    equations; four points
+    cancel the terms of third order in the reach, so what is left is rounding (below 1e-8 of the focal
+    length).
 
     Args: fields_rad: F angles. reach: share of the pupil radius.
-    Returns: [F, 2] mm, tangential (rays displaced in y) then sagittal (in x); positive behind the image plane.
+    Returns: [F, 2] mm, tangential (rays displaced in y) then sagittal (in x); positive behind the image
+      plane.
     Gradient: to every lens tensor. Raises: DomainError when a field does not arrive.
     """
     line = torch.tensor([-2.0, -1.0, 1.0, 2.0], dtype=lens.dtype, device=lens.curvature_per_mm.device) * reach
@@ -23,7 +27,10 @@ def focus_shift_mm(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"], reach=1e-
     for field in fields_rad:
         rays = trace_field(lens, float(field), pupil, wavelength_um)
         slope = rays.direction[:, :2] / rays.direction[:, 2:]
-        moves = [_slope_at_zero(values) for values in (rays.position_mm[:4, 1], slope[:4, 1], rays.position_mm[4:, 0], slope[4:, 0])]
+        moves = [
+            _slope_at_zero(values)
+            for values in (rays.position_mm[:4, 1], slope[:4, 1], rays.position_mm[4:, 0], slope[4:, 0])
+        ]
         found.append(torch.stack([-moves[0] / moves[1], -moves[2] / moves[3]]))
     return torch.stack(found)
 

@@ -1,6 +1,7 @@
 """Modulation transfer: by diffraction, geometric, and that of a perfect lens.
 
-Tangential means a pattern that varies along y, the direction of the field (its lines lie across it); sagittal one that varies along x.
+Tangential means a pattern that varies along y, the direction of the field (its lines lie across it); sagittal
+one that varies along x.
 """
 
 import math
@@ -17,39 +18,65 @@ PADDING = 2  # the line spread is then free of aliasing up to the cut-off
 
 
 def ideal_mtf(frequency_per_mm, fno, wavelength_um=WAVELENGTH_UM["d"]):
-    """MTF of a perfect lens with a round pupil, (2 / pi) (acos v - v sqrt(1 - v^2)), v = frequency x wavelength x f-number. Shape of the frequency; 0 beyond v = 1."""
+    """MTF of a perfect lens with a round pupil, (2 / pi) (acos v - v sqrt(1 - v^2)), v = frequency x
+    wavelength x f-number. Shape of the frequency; 0 beyond v = 1."""
     v = (torch.as_tensor(frequency_per_mm) * (wavelength_um * 1e-3 * fno)).abs().clamp_max(1.0)
     return 2 / math.pi * (v.acos() - v * (1 - v * v).sqrt())
 
 
-def diffraction_mtf(lens, field_rad, frequency_per_mm, light: object = WAVELENGTH_UM["d"], grid=None, vignetting=False, defocus_mm=0.0):
+def diffraction_mtf(
+    lens,
+    field_rad,
+    frequency_per_mm,
+    light: object = WAVELENGTH_UM["d"],
+    grid=None,
+    vignetting=False,
+    defocus_mm=0.0,
+):
     """MTF with diffraction of one field, from the Fourier transform of the point spread.
 
-    Several wavelengths add as complex transfer functions about one image point, so that lateral colour counts.
+    Several wavelengths add as complex transfer functions about one image point, so that lateral colour
+    counts.
 
-    Args: frequency_per_mm: [K] line pairs per mm in the image. light, grid, vignetting, defocus_mm: see ``psf_on_pixels``.
+    Args: frequency_per_mm: [K] line pairs per mm in the image. light, grid, vignetting, defocus_mm: see
+      ``psf_on_pixels``.
     Returns: [2, K] tangential, sagittal, in [0, 1]; exactly 0 beyond the cut-off.
     Gradient: to every lens tensor. Raises: DomainError for a negative frequency, and see ``pupil_function``.
     """
     frequency = _frequencies(lens, frequency_per_mm)
     wavelengths, shares = spectral_lines(light)
     reference = chief_ray(lens, field_rad, wavelengths[0], defocus_mm).position_mm[0]
-    total = torch.zeros(2, frequency.numel(), dtype=torch.complex128 if lens.dtype == torch.float64 else torch.complex64, device=frequency.device)
+    total = torch.zeros(
+        2,
+        frequency.numel(),
+        dtype=torch.complex128 if lens.dtype == torch.float64 else torch.complex64,
+        device=frequency.device,
+    )
     for wavelength_um, share in zip(wavelengths, shares, strict=True):
         pupil = pupil_function(lens, field_rad, wavelength_um, grid, vignetting, defocus_mm, reference)
         total = total + share * torch.stack([_transfer(pupil, axis, frequency) for axis in (1, 0)])
     return total.abs()
 
 
-def geometric_mtf(lens, field_rad, frequency_per_mm, light: object = WAVELENGTH_UM["d"], grid=64, vignetting=False, defocus_mm=0.0):
-    """MTF of the rays alone, |mean of exp(-2 pi i frequency x)|, [2, K] tangential, sagittal. Arguments and gradient as for ``diffraction_mtf``.
+def geometric_mtf(
+    lens,
+    field_rad,
+    frequency_per_mm,
+    light: object = WAVELENGTH_UM["d"],
+    grid=64,
+    vignetting=False,
+    defocus_mm=0.0,
+):
+    """MTF of the rays alone, |mean of exp(-2 pi i frequency x)|, [2, K] tangential, sagittal. Arguments and
+    gradient as for ``diffraction_mtf``.
 
     Multiply by ``ideal_mtf`` for the usual estimate between the two limits.
     """
     frequency = _frequencies(lens, frequency_per_mm)
     positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm)
     lit = weight.reshape(-1).detach() > 0
-    points, weight = positions.reshape(-1, 2)[lit], weight.reshape(-1)[lit]
+    points = positions.reshape(-1, 2)[lit]
+    weight = weight.reshape(-1)[lit]
     away = points - (points * weight[:, None]).sum(0)
     found = []
     for axis in (1, 0):
@@ -59,14 +86,17 @@ def geometric_mtf(lens, field_rad, frequency_per_mm, light: object = WAVELENGTH_
 
 
 def _transfer(pupil, axis, frequency):
-    """Complex transfer along an axis (0: x, 1: y) at frequencies [K], from the line spread of the zero-padded pupil."""
+    """Complex transfer along an axis (0: x, 1: y) at frequencies [K], from the line spread of the zero-padded
+    pupil."""
     n = pupil.field.shape[0]
     field = pupil.field if axis else pupil.field.T
     # line spread along y: by Parseval, |.|^2 may be summed over x in the pupil instead of the image
     spread = torch.fft.ifft(field, n=n * PADDING, dim=0)
     line_spread = torch.fft.fftshift((spread.real.square() + spread.imag.square()).sum(1))
     radius = pupil.cosine_radius[axis]
-    place = (torch.arange(n * PADDING, dtype=frequency.dtype, device=frequency.device) - n * PADDING // 2) * (pupil.wavelength_mm / (2 * radius * PADDING))
+    place = (torch.arange(n * PADDING, dtype=frequency.dtype, device=frequency.device) - n * PADDING // 2) * (
+        pupil.wavelength_mm / (2 * radius * PADDING)
+    )
     phase = 2 * math.pi * frequency[:, None] * place
     found = torch.complex(phase.cos() @ line_spread, -(phase.sin() @ line_spread)) / line_spread.sum()
     return torch.where(frequency < 2 * radius / pupil.wavelength_mm, found, 0)

@@ -1,4 +1,5 @@
-"""Point spread functions: by diffraction from the pupil's wavefront, and geometric by counting rays on pixels."""
+"""Point spread functions: by diffraction from the pupil's wavefront, and geometric by counting rays on
+pixels."""
 
 import math
 from dataclasses import dataclass
@@ -15,9 +16,11 @@ from codesign.lens.glass import WAVELENGTH_UM
 
 @dataclass(frozen=True)
 class Psf:
-    """A point image. Rows along +y, columns along +x of the lens; the reference point lies on [K // 2, K // 2] of K rows and columns.
+    """A point image. Rows along +y, columns along +x of the lens; the reference point lies on [K // 2, K //
+    2] of K rows and columns.
 
-    energy: [K, K] share of the light per pixel. pitch_mm: [2] pixel size (x, y). reference_mm: [2] the reference point on the image plane.
+    energy: [K, K] share of the light per pixel. pitch_mm: [2] pixel size (x, y). reference_mm: [2] the
+      reference point on the image plane.
     """
 
     energy: Tensor
@@ -25,13 +28,25 @@ class Psf:
     reference_mm: Tensor
 
 
-def diffraction_psf(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"], grid=None, padding=4, vignetting=False, defocus_mm=0.0, reference_mm=None):
+def diffraction_psf(
+    lens,
+    field_rad,
+    wavelength_um=WAVELENGTH_UM["d"],
+    grid=None,
+    padding=4,
+    vignetting=False,
+    defocus_mm=0.0,
+    reference_mm=None,
+):
     """Psf by a Fourier transform of the pupil, zero-padded from n to n * padding cells.
 
-    The pixel is then wavelength / (2 r padding), r the pupil's radius in direction cosines: a quarter of the Airy scale wavelength
-    times f-number per unit of padding 4. The picture repeats with n wavelength times f-number. Energy sums to 1.
+    The pixel is then wavelength / (2 r padding), r the pupil's radius in direction cosines: a quarter of the
+    Airy scale wavelength
+    times f-number per unit of padding 4. The picture repeats with n wavelength times f-number. Energy sums to
+    1.
 
-    Args: grid, vignetting, defocus_mm, reference_mm: see ``pupil_function``. padding: >= 2, so that the energy is not aliased.
+    Args: grid, vignetting, defocus_mm, reference_mm: see ``pupil_function``. padding: >= 2, so that the
+      energy is not aliased.
     Gradient: energy and pitch to every lens tensor. Raises: DomainError, see ``pupil_function``.
     """
     if int(padding) != padding or padding < 2:
@@ -40,18 +55,35 @@ def diffraction_psf(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"], grid=None
     count = pupil.field.shape[0] * int(padding)
     amplitude = torch.fft.fftshift(torch.fft.ifft2(pupil.field, s=(count, count)))
     energy = amplitude.real.square() + amplitude.imag.square()
-    centre = chief_ray(lens, field_rad, wavelength_um, defocus_mm).position_mm[0] if reference_mm is None else torch.as_tensor(reference_mm)
+    centre = (
+        chief_ray(lens, field_rad, wavelength_um, defocus_mm).position_mm[0]
+        if reference_mm is None
+        else torch.as_tensor(reference_mm)
+    )
     return Psf(energy / energy.sum(), pupil.wavelength_mm / (2 * pupil.cosine_radius * int(padding)), centre)
 
 
-def psf_on_pixels(lens, field_rad, pixel_mm, pixels=64, light: object = WAVELENGTH_UM["d"], grid=None, vignetting=False, defocus_mm=0.0):
-    """Psf of one or several wavelengths by diffraction, on a pixel grid of one's own, about the chief ray of the first wavelength.
+def psf_on_pixels(
+    lens,
+    field_rad,
+    pixel_mm,
+    pixels=64,
+    light: object = WAVELENGTH_UM["d"],
+    grid=None,
+    vignetting=False,
+    defocus_mm=0.0,
+):
+    """Psf of one or several wavelengths by diffraction, on a pixel grid of one's own, about the chief ray of
+    the first wavelength.
 
-    The Fourier integral is summed for each pixel centre (two matrix products), so wavelengths share the grid and their lateral
-    colour is in it. The energy of a pixel is the density at its centre times its area; the sum tells the share that falls on the grid.
+    The Fourier integral is summed for each pixel centre (two matrix products), so wavelengths share the grid
+    and their lateral
+    colour is in it. The energy of a pixel is the density at its centre times its area; the sum tells the
+    share that falls on the grid.
 
     Args: pixel_mm: size of a square pixel. pixels: rows and columns. light: see ``spectral_lines``.
-    Gradient: to every lens tensor. Raises: DomainError, see ``pupil_function``, and when the grid is wider than the sampled pupil's period.
+    Gradient: to every lens tensor. Raises: DomainError, see ``pupil_function``, and when the grid is wider
+      than the sampled pupil's period.
     """
     wavelengths, shares = spectral_lines(light)
     reference = chief_ray(lens, field_rad, wavelengths[0], defocus_mm).position_mm[0]
@@ -63,31 +95,57 @@ def psf_on_pixels(lens, field_rad, pixel_mm, pixels=64, light: object = WAVELENG
         line = (torch.arange(n, dtype=lens.dtype, device=reference.device) + 0.5) / n * 2 - 1
         period = n * pupil.wavelength_mm / (2 * float(pupil.cosine_radius.detach().max()))
         if pixels * pixel_mm > period:
-            raise DomainError(f"{lens.name}: {pixels} pixels of {pixel_mm:g} mm are wider than the {period:.3g} mm that {n} pupil cells resolve; give fewer pixels or a finer pupil grid.")
-        along = [torch.polar(torch.ones_like(a), a) for a in (2 * math.pi / pupil.wavelength_mm * r * at[:, None] * line for r in pupil.cosine_radius)]
+            raise DomainError(
+                f"{lens.name}: {pixels} pixels of {pixel_mm:g} mm are wider than the {period:.3g} mm that "
+                f"{n} pupil cells resolve; give fewer pixels or a finer pupil grid."
+            )
+        along = [
+            torch.polar(torch.ones_like(a), a)
+            for a in (2 * math.pi / pupil.wavelength_mm * r * at[:, None] * line for r in pupil.cosine_radius)
+        ]
         amplitude = along[1] @ pupil.field @ along[0].T
         cell = (2 / n) ** 2 * pupil.cosine_radius.prod()  # solid angle of a pupil cell in direction cosines
         density = (amplitude.real.square() + amplitude.imag.square()) * cell / pupil.wavelength_mm**2
-        total = total + share * density * pixel_mm**2 / (pupil.field.real.square() + pupil.field.imag.square()).sum()
+        total = (
+            total
+            + share * density * pixel_mm**2 / (pupil.field.real.square() + pupil.field.imag.square()).sum()
+        )
     return Psf(total, torch.full((2,), pixel_mm, dtype=lens.dtype), reference)
 
 
-def geometric_psf(lens, field_rad, pixel_mm, pixels=64, light: object = WAVELENGTH_UM["d"], grid=128, vignetting=False, defocus_mm=0.0):
-    """Psf by rays: each ray's weight is shared bilinearly among the four pixel centres around it. About the chief ray of the first wavelength.
+def geometric_psf(
+    lens,
+    field_rad,
+    pixel_mm,
+    pixels=64,
+    light: object = WAVELENGTH_UM["d"],
+    grid=128,
+    vignetting=False,
+    defocus_mm=0.0,
+):
+    """Psf by rays: each ray's weight is shared bilinearly among the four pixel centres around it. About the
+    chief ray of the first wavelength.
 
-    Args: grid: pupil cells across. Rays beyond the grid are lost: the sum of ``energy`` is the share that falls on it.
+    Args: grid: pupil cells across. Rays beyond the grid are lost: the sum of ``energy`` is the share that
+      falls on it.
     Gradient: energy to every lens tensor, piecewise linear in the ray positions.
     """
     positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm)
     reference = chief_ray(lens, field_rad, spectral_lines(light)[0][0], defocus_mm).position_mm[0]
     place = (positions.reshape(-1, 2) - reference) / pixel_mm + pixels // 2  # x, y in pixels
     low = place.detach().floor()
-    share, low = place - low, low.long()
+    share = place - low
+    low = low.long()
     energy = torch.zeros(pixels * pixels, dtype=lens.dtype, device=reference.device)
     for step_x in (0, 1):
         for step_y in (0, 1):
-            x, y = low[:, 0] + step_x, low[:, 1] + step_y
-            part = weight.reshape(-1) * (share[:, 0] if step_x else 1 - share[:, 0]) * (share[:, 1] if step_y else 1 - share[:, 1])
+            x = low[:, 0] + step_x
+            y = low[:, 1] + step_y
+            part = (
+                weight.reshape(-1)
+                * (share[:, 0] if step_x else 1 - share[:, 0])
+                * (share[:, 1] if step_y else 1 - share[:, 1])
+            )
             on = (x >= 0) & (x < pixels) & (y >= 0) & (y < pixels)
             energy = energy.index_add(0, (y * pixels + x)[on], part[on])
     return Psf(energy.reshape(pixels, pixels), torch.full((2,), pixel_mm, dtype=lens.dtype), reference)

@@ -10,7 +10,9 @@ from codesign.errors import DomainError
 from codesign.lens.analysis.wavefront import wavefront
 from codesign.lens.glass import WAVELENGTH_UM
 
-COARSEST, FINEST = 128, 1024  # cells across the pupil when the number is found from the aberration
+# cells across the pupil when the number is found from the aberration
+COARSEST = 128
+FINEST = 1024
 LARGEST_STEP_WAVES = 0.5  # between neighbouring cells; beyond it the sampled phase is ambiguous
 
 
@@ -18,9 +20,12 @@ LARGEST_STEP_WAVES = 0.5  # between neighbouring cells; beyond it the sampled ph
 class PupilFunction:
     """Field on the reference sphere of one field and wavelength.
 
-    field: [n, n] complex, rows along y, columns along x, on the cell centres of [-1, 1]^2 in units of ``cosine_radius``, in the order of
-      rising direction cosines of the light that goes to the image point (so a point high in the pupil stands at a low y); 0 outside the pupil.
-    cosine_radius: [2] (x, y) half width of the pupil in direction cosines times index, as seen from the image point: 1 / (2 f-number).
+    field: [n, n] complex, rows along y, columns along x, on the cell centres of [-1, 1]^2 in units of
+      ``cosine_radius``, in the order of
+      rising direction cosines of the light that goes to the image point (so a point high in the pupil stands
+      at a low y); 0 outside the pupil.
+    cosine_radius: [2] (x, y) half width of the pupil in direction cosines times index, as seen from the image
+      point: 1 / (2 f-number).
     """
 
     field: Tensor
@@ -37,15 +42,26 @@ class PupilFunction:
         return 2 * self.cosine_radius / self.wavelength_mm
 
 
-def pupil_function(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"], grid=None, vignetting=False, defocus_mm=0.0, reference_mm=None):
+def pupil_function(
+    lens,
+    field_rad,
+    wavelength_um=WAVELENGTH_UM["d"],
+    grid=None,
+    vignetting=False,
+    defocus_mm=0.0,
+    reference_mm=None,
+):
     """PupilFunction of one field: amplitude times exp(-2 pi i OPD / wavelength).
 
-    Points that are even over the entrance pupil are taken as even in the direction cosines towards the image point (Abbe's sine
-    condition); their scale in x and y, which holds the foreshortening off the axis, is fitted to the traced rays. A cell counts when
+    Points that are even over the entrance pupil are taken as even in the direction cosines towards the image
+    point (Abbe's sine
+    condition); their scale in x and y, which holds the foreshortening off the axis, is fitted to the traced
+    rays. A cell counts when
     its centre lies in the disc; the staircase at the rim costs about 1e-3 of MTF at 64 cells and 3e-4 at 128.
 
     Args: grid: cells across; None picks a power of two from the aberration. reference_mm: see ``wavefront``.
-    Gradient: to every lens tensor. Raises: DomainError when neighbouring cells differ by more than half a wave, or no ray arrives.
+    Gradient: to every lens tensor. Raises: DomainError when neighbouring cells differ by more than half a
+      wave, or no ray arrives.
     """
     if grid is None:
         grid = _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, reference_mm)
@@ -62,16 +78,28 @@ def pupil_function(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"], grid=None,
     lit = torch.zeros_like(seen).masked_scatter(seen, front.weight > 0)
     worst = _largest_step(opd, lit)
     if worst > LARGEST_STEP_WAVES:
-        raise DomainError(f"{lens.name}: neighbouring pupil cells differ by {worst:.2g} waves at field {math.degrees(field_rad):.4g} degrees with a grid of {grid}; "
-                          f"below {LARGEST_STEP_WAVES} is needed: give a finer grid, or use the geometric spread, which fits such large aberrations.")
-    field = torch.zeros(grid, grid, dtype=torch.complex128 if like.dtype == torch.float64 else torch.complex64, device=like.device)
+        raise DomainError(
+            f"{lens.name}: neighbouring pupil cells differ by {worst:.2g} waves at field "
+            f"{math.degrees(field_rad):.4g} degrees with a grid of {grid}; "
+            f"below {LARGEST_STEP_WAVES} is needed: give a finer grid, or use the geometric spread, which "
+            "fits such large aberrations."
+        )
+    field = torch.zeros(
+        grid,
+        grid,
+        dtype=torch.complex128 if like.dtype == torch.float64 else torch.complex64,
+        device=like.device,
+    )
     field = field.masked_scatter(seen, torch.complex(amplitude * phase.cos(), -amplitude * phase.sin()))
-    mirrored = [axis for axis, value in ((1, scale[0]), (0, scale[1])) if float(value.detach()) < 0]  # light from above goes down
+    mirrored = [
+        axis for axis, value in ((1, scale[0]), (0, scale[1])) if float(value.detach()) < 0
+    ]  # light from above goes down
     return PupilFunction(field.flip(mirrored), scale.abs(), wavelength_um)
 
 
 def _cosine_radius(front):
-    """Least-squares slope of direction cosines over pupil coordinates, [2]; negative where light from above goes down."""
+    """Least-squares slope of direction cosines over pupil coordinates, [2]; negative where light from above
+    goes down."""
     w = front.weight[:, None] / front.weight.sum()
     pupil = front.pupil - (front.pupil * w).sum(0)
     cosines = front.slope - (front.slope * w).sum(0)
@@ -80,17 +108,33 @@ def _cosine_radius(front):
 
 def _largest_step(opd, lit):
     """Largest difference of neighbours where both are lit."""
-    steps = [((a - b).abs() * (p & q)).max() for a, b, p, q in ((opd[1:], opd[:-1], lit[1:], lit[:-1]), (opd[:, 1:], opd[:, :-1], lit[:, 1:], lit[:, :-1]))]
+    steps = [
+        ((a - b).abs() * (p & q)).max()
+        for a, b, p, q in (
+            (opd[1:], opd[:-1], lit[1:], lit[:-1]),
+            (opd[:, 1:], opd[:, :-1], lit[:, 1:], lit[:, :-1]),
+        )
+    ]
     return float(torch.stack(steps).max())
 
 
 def _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, reference_mm):
-    """Power of two for which neighbours differ by at most a third of a wave, from a coarse look at the wavefront."""
+    """Power of two for which neighbours differ by at most a third of a wave, from a coarse look at the
+    wavefront."""
     line = torch.linspace(-1, 1, 65, dtype=lens.dtype, device=lens.curvature_per_mm.device)
     y, x = torch.meshgrid(line, line, indexing="ij")
     inside = x * x + y * y <= 1
     with torch.no_grad():
-        front = wavefront(lens, field_rad, wavelength_um, 0, vignetting, defocus_mm, reference_mm, torch.stack([x, y], -1)[inside])
+        front = wavefront(
+            lens,
+            field_rad,
+            wavelength_um,
+            0,
+            vignetting,
+            defocus_mm,
+            reference_mm,
+            torch.stack([x, y], -1)[inside],
+        )
     opd = torch.zeros_like(x).masked_scatter(inside, front.waves)
     lit = torch.zeros_like(inside).masked_scatter(inside, front.weight > 0)
     needed = 64 * _largest_step(opd, lit) / (LARGEST_STEP_WAVES / 1.5)

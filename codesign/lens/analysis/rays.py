@@ -1,4 +1,5 @@
-"""The rays every analysis of a lens is made of: one field of an object at infinity, traced to the image plane."""
+"""The rays every analysis of a lens is made of: one field of an object at infinity, traced to the image
+plane."""
 
 import math
 from dataclasses import dataclass, replace
@@ -22,17 +23,23 @@ def pupil_grid(count, dtype=torch.float64, device="cpu"):
 def field_rays(lens, field_rad, pupil, wavelength_um=WAVELENGTH_UM["d"], start_z_mm=-5.0):
     """Parallel rays of one field angle (in +y) through points of the paraxial entrance pupil.
 
-    Args: field_rad scalar; pupil [M, 2] on the unit disc (placed at the pupil of the d line). Returns: origins and directions [M, 3].
+    Args: field_rad scalar; pupil [M, 2] on the unit disc (placed at the pupil of the d line). Returns:
+      origins and directions [M, 3].
     Gradient: origins to the lens, since the pupil moves with it.
     """
     f = lens.first_order()
-    at = torch.cat([pupil * (f.entrance_pupil_diameter_mm / 2), f.entrance_pupil_z_mm.expand(pupil.shape[0], 1)], 1)
-    direction = torch.tensor([0.0, math.sin(field_rad), math.cos(field_rad)], dtype=pupil.dtype, device=pupil.device).expand(pupil.shape[0], 3)
+    at = torch.cat(
+        [pupil * (f.entrance_pupil_diameter_mm / 2), f.entrance_pupil_z_mm.expand(pupil.shape[0], 1)], 1
+    )
+    direction = torch.tensor(
+        [0.0, math.sin(field_rad), math.cos(field_rad)], dtype=pupil.dtype, device=pupil.device
+    ).expand(pupil.shape[0], 3)
     return at + direction * ((start_z_mm - at[:, 2:]) / direction[:, 2:]), direction.contiguous()
 
 
 def source_rays(lens, field_rad, pupil, wavelength_um):
-    """The rays all analyses start with; the one place that decides where pupil points lie (now: on the paraxial entrance pupil)."""
+    """The rays all analyses start with; the one place that decides where pupil points lie (now: on the
+    paraxial entrance pupil)."""
     return field_rays(lens, field_rad, pupil, wavelength_um)
 
 
@@ -40,8 +47,10 @@ def source_rays(lens, field_rad, pupil, wavelength_um):
 class ImageRays:
     """Rays of one field and wavelength on a plane across the axis near the image.
 
-    position_mm: [M, 2] (x, y). direction: [M, 3] unit. path_mm: [M] optical path from a plane wavefront of the field (one for
-    all rays) to the plane. weight: [M] >= 0, 0 for rays that do not arrive. index: refractive index in image space.
+    position_mm: [M, 2] (x, y). direction: [M, 3] unit. path_mm: [M] optical path from a plane wavefront of
+      the field (one for
+    all rays) to the plane. weight: [M] >= 0, 0 for rays that do not arrive. index: refractive index in image
+      space.
     """
 
     position_mm: Tensor
@@ -51,17 +60,23 @@ class ImageRays:
     index: Tensor
 
     def shifted(self, defocus_mm):
-        """The same rays on a plane ``defocus_mm`` further along +z (scalar, may carry a gradient); rays of weight 0 stay where they failed."""
+        """The same rays on a plane ``defocus_mm`` further along +z (scalar, may carry a gradient); rays of
+        weight 0 stay where they failed."""
         arrived = self.weight > 0
         length = torch.where(arrived, defocus_mm / torch.where(arrived, self.direction[:, 2], 1), 0)
-        return replace(self, position_mm=self.position_mm + self.direction[:, :2] * length[:, None], path_mm=self.path_mm + self.index * length)
+        return replace(
+            self,
+            position_mm=self.position_mm + self.direction[:, :2] * length[:, None],
+            path_mm=self.path_mm + self.index * length,
+        )
 
 
 def trace_field(lens, field_rad, pupil, wavelength_um=WAVELENGTH_UM["d"], vignetting=False, defocus_mm=0.0):
     """Trace one field (object at infinity, in +y) through pupil points to the image plane.
 
     Args:
-      field_rad: scalar angle. pupil: [M, 2] on the unit disc. vignetting: weigh rays by the apertures' soft edges; otherwise
+      field_rad: scalar angle. pupil: [M, 2] on the unit disc. vignetting: weigh rays by the apertures' soft
+        edges; otherwise
       every ray that arrives weighs 1. defocus_mm: distance of the plane behind the lens's own image plane.
     Returns: ImageRays.
     Gradient: positions, directions and paths to every lens tensor; with vignetting the weights too.
@@ -74,29 +89,46 @@ def trace_field(lens, field_rad, pupil, wavelength_um=WAVELENGTH_UM["d"], vignet
     arrived = (out.status == 0).to(out.weight.dtype)
     weight = out.weight * arrived if vignetting else arrived
     if not bool((weight.detach() > 0).any()):
-        raise DomainError(f"{lens.name}: no ray arrives at field {math.degrees(field_rad):.4g} degrees; use a smaller field, weaker curvatures or larger apertures.")
+        raise DomainError(
+            f"{lens.name}: no ray arrives at field {math.degrees(field_rad):.4g} degrees; use a smaller "
+            "field, weaker curvatures or larger apertures."
+        )
     index = lens.index(wavelength_um)
-    path = out.optical_path_mm + index[0] * (origin * direction).sum(1)  # from the plane wavefront through the first vertex
+    path = out.optical_path_mm + index[0] * (origin * direction).sum(
+        1
+    )  # from the plane wavefront through the first vertex
     return ImageRays(out.position_mm[:, :2], out.direction, path, weight, index[-1]).shifted(defocus_mm)
 
 
 def chief_ray(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"], defocus_mm=0.0):
-    """The ray through the centre of the pupil, as ImageRays with M = 1. Raises: DomainError when it does not arrive."""
-    return trace_field(lens, field_rad, torch.zeros(1, 2, dtype=lens.dtype, device=lens.curvature_per_mm.device), wavelength_um, defocus_mm=defocus_mm)
+    """The ray through the centre of the pupil, as ImageRays with M = 1. Raises: DomainError when it does not
+    arrive."""
+    return trace_field(
+        lens,
+        field_rad,
+        torch.zeros(1, 2, dtype=lens.dtype, device=lens.curvature_per_mm.device),
+        wavelength_um,
+        defocus_mm=defocus_mm,
+    )
 
 
 def spectral_lines(light: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Wavelengths (um) and weights that sum to 1, from a wavelength, a list of them (equal weights), or anything with wavelengths_um and weights.
+    """Wavelengths (um) and weights that sum to 1, from a wavelength, a list of them (equal weights), or
+    anything with wavelengths_um and weights.
 
     Raises: DomainError for no wavelength, one that is not positive, or weights that are negative or sum to 0.
     """
     if hasattr(light, "wavelengths_um"):
-        wavelengths, weights = [float(w) for w in light.wavelengths_um], [float(w) for w in light.weights]
+        wavelengths = [float(w) for w in light.wavelengths_um]
+        weights = [float(w) for w in light.weights]
     else:
         wavelengths = [float(light)] if isinstance(light, (int, float)) else [float(w) for w in light]
         weights = [1.0] * len(wavelengths)
     if not wavelengths or len(wavelengths) != len(weights) or not all(0 < w < math.inf for w in wavelengths):
-        raise DomainError(f"light of wavelengths {wavelengths} um with weights {weights}: give at least one positive wavelength, and one weight for each.")
+        raise DomainError(
+            f"light of wavelengths {wavelengths} um with weights {weights}: give at least one positive "
+            "wavelength, and one weight for each."
+        )
     total = sum(weights)
     if not (all(w >= 0 for w in weights) and 0 < total < math.inf):
         raise DomainError(f"weights {weights} must be at least 0, with a positive sum.")

@@ -10,9 +10,11 @@ from codesign.lens.glass import WAVELENGTH_UM
 
 
 def spots(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"], grid=32):
-    """Spot diagrams: ray positions on the image plane, [fields, M, 2] mm, and weights [fields, M] (1, or 0 for failed rays).
+    """Spot diagrams: ray positions on the image plane, [fields, M, 2] mm, and weights [fields, M] (1, or 0
+    for failed rays).
 
-    Equal weights over a square pupil grid, no clipping by apertures. Gradient: positions to every lens tensor.
+    Equal weights over a square pupil grid, no clipping by apertures. Gradient: positions to every lens
+    tensor.
     """
     pupil = pupil_grid(grid, lens.curvature_per_mm.dtype, lens.curvature_per_mm.device)
     rays = [source_rays(lens, float(f), pupil, wavelength_um) for f in fields_rad]
@@ -22,24 +24,36 @@ def spots(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"], grid=32):
 
 
 def rms_spot_mm(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"], grid=32):
-    """RMS distance of rays from their mean point, [fields] mm. Raises DomainError where no ray of a field arrives."""
+    """RMS distance of rays from their mean point, [fields] mm. Raises DomainError where no ray of a field
+    arrives."""
     positions, weight = spots(lens, fields_rad, wavelength_um, grid)
     total = weight.sum(1)
     if bool((total == 0).any()):
-        dead = [round(math.degrees(float(f)), 2) for f, n in zip(fields_rad, total.tolist(), strict=True) if n == 0]
-        raise DomainError(f"{lens.name}: no ray arrives at field {dead} degrees; use a smaller field or weaker curvatures.")
+        dead = [
+            round(math.degrees(float(f)), 2)
+            for f, n in zip(fields_rad, total.tolist(), strict=True)
+            if n == 0
+        ]
+        raise DomainError(
+            f"{lens.name}: no ray arrives at field {dead} degrees; use a smaller field or weaker curvatures."
+        )
     w = weight[..., None]
     centre = (positions * w).sum(1, keepdim=True) / total[:, None, None]
-    return torch.linalg.vector_norm((positions - centre) * w, dim=(1, 2)) / total.sqrt()  # weights are 0 or 1; the gradient at a point image is 0
+    return (
+        torch.linalg.vector_norm((positions - centre) * w, dim=(1, 2)) / total.sqrt()
+    )  # weights are 0 or 1; the gradient at a point image is 0
 
 
 def polychromatic_spot(lens, field_rad, light, grid=32, vignetting=False, defocus_mm=0.0):
     """Spot of one field in light of several wavelengths, lateral colour included.
 
-    Args: light: see ``spectral_lines``. grid: pupil cells across. vignetting, defocus_mm: see ``trace_field``.
-    Returns: positions [W, M, 2] mm on the image plane, and weights [W, M] that sum to 1 (rays of one wavelength share its weight
+    Args: light: see ``spectral_lines``. grid: pupil cells across. vignetting, defocus_mm: see
+      ``trace_field``.
+    Returns: positions [W, M, 2] mm on the image plane, and weights [W, M] that sum to 1 (rays of one
+      wavelength share its weight
       as far as they arrive).
-    Gradient: positions (with vignetting also weights) to every lens tensor. Raises: DomainError when no ray of a wavelength arrives.
+    Gradient: positions (with vignetting also weights) to every lens tensor. Raises: DomainError when no ray
+      of a wavelength arrives.
     """
     pupil = pupil_grid(grid, lens.dtype, lens.curvature_per_mm.device)
     wavelengths, shares = spectral_lines(light)
@@ -49,18 +63,32 @@ def polychromatic_spot(lens, field_rad, light, grid=32, vignetting=False, defocu
 
 
 def spot_radius_mm(positions_mm, weight):
-    """RMS distance from the weighted mean point. Args: positions [..., 2] mm, weight [...]. Returns: scalar mm; its gradient is 0 at a point image."""
-    points, w = positions_mm.reshape(-1, 2), (weight / weight.sum()).reshape(-1, 1)
-    # norm of positions times root weights: regular at a point image; the root of a weight 0 has no derivative, so it is left out
+    """RMS distance from the weighted mean point. Args: positions [..., 2] mm, weight [...]. Returns: scalar
+    mm; its gradient is 0 at a point image."""
+    points = positions_mm.reshape(-1, 2)
+    w = (weight / weight.sum()).reshape(-1, 1)
+    # norm of positions times root weights: regular at a point image; the root of a weight 0 has no
+    # derivative, so it is left out
     passed = w.detach()[:, 0] > 0
-    points, w = points[passed], w[passed]
+    points = points[passed]
+    w = w[passed]
     return torch.linalg.vector_norm((points - (points * w).sum(0)) * w.sqrt())
 
 
-def encircled_energy(lens, field_rad, radii_mm, light: object = WAVELENGTH_UM["d"], grid=64, vignetting=False, defocus_mm=0.0, about_chief=False):
+def encircled_energy(
+    lens,
+    field_rad,
+    radii_mm,
+    light: object = WAVELENGTH_UM["d"],
+    grid=64,
+    vignetting=False,
+    defocus_mm=0.0,
+    about_chief=False,
+):
     """Share of rays within circles about the spot's mean point (or the chief ray of the first wavelength).
 
-    Args: radii_mm: [K] increasing or not. Returns: [K] in [0, 1], geometric, without diffraction. Gradient: none (a count).
+    Args: radii_mm: [K] increasing or not. Returns: [K] in [0, 1], geometric, without diffraction. Gradient:
+      none (a count).
     """
     distance, weight = _distances(lens, field_rad, light, grid, vignetting, defocus_mm, about_chief)
     radii = torch.as_tensor(radii_mm, dtype=distance.dtype, device=distance.device).reshape(-1)
@@ -69,20 +97,35 @@ def encircled_energy(lens, field_rad, radii_mm, light: object = WAVELENGTH_UM["d
     return energy[torch.searchsorted(distance.detach()[order], radii, right=True)].clamp_max(1.0)
 
 
-def encircled_radius_mm(lens, field_rad, share=0.8, light: object = WAVELENGTH_UM["d"], grid=64, vignetting=False, defocus_mm=0.0, about_chief=False):
-    """Radius that holds a share of the rays, scalar mm. Gradient: that of the ray on the rim. Raises: DomainError for a share outside (0, 1]."""
+def encircled_radius_mm(
+    lens,
+    field_rad,
+    share=0.8,
+    light: object = WAVELENGTH_UM["d"],
+    grid=64,
+    vignetting=False,
+    defocus_mm=0.0,
+    about_chief=False,
+):
+    """Radius that holds a share of the rays, scalar mm. Gradient: that of the ray on the rim. Raises:
+    DomainError for a share outside (0, 1]."""
     if not 0 < share <= 1:
         raise DomainError(f"share {share} of encircled energy must lie in (0, 1].")
     distance, weight = _distances(lens, field_rad, light, grid, vignetting, defocus_mm, about_chief)
     order = distance.detach().argsort()
     reached = weight.detach()[order].cumsum(0)
-    at = int(torch.searchsorted(reached, torch.tensor(share - 1e-12, dtype=reached.dtype)).clamp_max(reached.numel() - 1))
+    at = int(
+        torch.searchsorted(reached, torch.tensor(share - 1e-12, dtype=reached.dtype)).clamp_max(
+            reached.numel() - 1
+        )
+    )
     return distance[order[at]]
 
 
 def _distances(lens, field_rad, light, grid, vignetting, defocus_mm, about_chief):
     positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm)
-    points, weight = positions.reshape(-1, 2), weight.reshape(-1)
+    points = positions.reshape(-1, 2)
+    weight = weight.reshape(-1)
     if about_chief:
         centre = chief_ray(lens, field_rad, spectral_lines(light)[0][0], defocus_mm).position_mm
     else:

@@ -11,21 +11,55 @@ from codesign.lens.glass import WAVELENGTH_UM
 METHODS = {"diffraction": diffraction_mtf, "geometric": geometric_mtf}
 
 
-def through_focus_spot_mm(lens, fields_rad, defocus_mm, light: object = WAVELENGTH_UM["d"], grid=32, vignetting=False):
-    """RMS spot about its mean for each field and plane, [F, Z] mm. Args: defocus_mm: [Z], positive further from the lens. Gradient: to every lens tensor."""
+def through_focus_spot_mm(
+    lens, fields_rad, defocus_mm, light: object = WAVELENGTH_UM["d"], grid=32, vignetting=False
+):
+    """RMS spot about its mean for each field and plane, [F, Z] mm. Args: defocus_mm: [Z], positive further
+    from the lens. Gradient: to every lens tensor."""
     pupil = pupil_grid(grid, lens.dtype, lens.curvature_per_mm.device)
     wavelengths, shares = spectral_lines(light)
     rows = []
     for field in fields_rad:
         rays = [trace_field(lens, float(field), pupil, w, vignetting) for w in wavelengths]
         weight = torch.stack([r.weight * share for r, share in zip(rays, shares, strict=True)])
-        rows.append(torch.stack([spot_radius_mm(torch.stack([r.shifted(float(z)).position_mm for r in rays]), weight) for z in defocus_mm]))
+        rows.append(
+            torch.stack(
+                [
+                    spot_radius_mm(torch.stack([r.shifted(float(z)).position_mm for r in rays]), weight)
+                    for z in defocus_mm
+                ]
+            )
+        )
     return torch.stack(rows)
 
 
-def through_focus_mtf(lens, field_rad, frequency_per_mm, defocus_mm, light: object = WAVELENGTH_UM["d"], method="diffraction", grid=None, vignetting=False):
-    """MTF at one frequency on several planes, [2, Z] tangential, sagittal. Args: method: "diffraction" or "geometric". Gradient: to every lens tensor."""
+def through_focus_mtf(
+    lens,
+    field_rad,
+    frequency_per_mm,
+    defocus_mm,
+    light: object = WAVELENGTH_UM["d"],
+    method="diffraction",
+    grid=None,
+    vignetting=False,
+):
+    """MTF at one frequency on several planes, [2, Z] tangential, sagittal. Args: method: "diffraction" or
+    "geometric". Gradient: to every lens tensor."""
     if method not in METHODS:
         raise DomainError(f"method '{method}' is not known; known methods: {', '.join(METHODS)}.")
     options = {} if grid is None else {"grid": grid}
-    return torch.cat([METHODS[method](lens, field_rad, [frequency_per_mm], light, vignetting=vignetting, defocus_mm=float(z), **options) for z in defocus_mm], 1)
+    return torch.cat(
+        [
+            METHODS[method](
+                lens,
+                field_rad,
+                [frequency_per_mm],
+                light,
+                vignetting=vignetting,
+                defocus_mm=float(z),
+                **options,
+            )
+            for z in defocus_mm
+        ],
+        1,
+    )

@@ -1,8 +1,12 @@
-"""Wavefront error of a lens: optical path differences from the reference sphere, their RMS, and the Strehl ratio.
+"""Wavefront error of a lens: optical path differences from the reference sphere, their RMS, and the Strehl
+ratio.
 
-The object is at infinity, so paths count from one plane wavefront across the field direction. The reference sphere is centred on
-the chief ray's image point (or another given point) and passes through the centre of the paraxial exit pupil. An optical path
-difference is positive where the wavefront is ahead of the sphere, so that undercorrected spherical aberration is positive (W040 = S_I / 8).
+The object is at infinity, so paths count from one plane wavefront across the field direction. The reference
+sphere is centred on
+the chief ray's image point (or another given point) and passes through the centre of the paraxial exit pupil.
+An optical path
+difference is positive where the wavefront is ahead of the sphere, so that undercorrected spherical aberration
+is positive (W040 = S_I / 8).
 Source: Welford, Aberrations of Optical Systems, ch. 7; Born and Wolf, ch. 9.
 """
 
@@ -21,8 +25,10 @@ from codesign.lens.glass import WAVELENGTH_UM
 class Wavefront:
     """Optical path differences over the pupil.
 
-    pupil: [M, 2] points of the unit disc (entrance pupil). opd_mm: [M], positive where the wavefront is ahead. weight: [M], 0 where
-    no light passes. slope: [M, 2] direction cosines times index from the ray's point on the reference sphere to its centre, minus those of the chief ray.
+    pupil: [M, 2] points of the unit disc (entrance pupil). opd_mm: [M], positive where the wavefront is
+      ahead. weight: [M], 0 where
+    no light passes. slope: [M, 2] direction cosines times index from the ray's point on the reference sphere
+      to its centre, minus those of the chief ray.
     """
 
     pupil: Tensor
@@ -40,18 +46,30 @@ class Wavefront:
 def path_difference_mm(lens, rays, chief, wavelength_um, reference_mm=None, defocus_mm=0.0):
     """Optical path of the chief ray minus that of each ray, both up to the reference sphere, [M] mm.
 
-    Args: rays, chief: ImageRays of the lens on the plane ``defocus_mm`` behind its image plane. reference_mm: [2] centre of the sphere.
+    Args: rays, chief: ImageRays of the lens on the plane ``defocus_mm`` behind its image plane. reference_mm:
+      [2] centre of the sphere.
     Raises: DomainError when the exit pupil lies in the image, or a sphere is too small for the rays.
     """
     return _on_sphere(lens, rays, chief, wavelength_um, reference_mm, defocus_mm)[0]
 
 
-def wavefront(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"], grid=64, vignetting=False, defocus_mm=0.0, reference_mm=None, pupil=None):
+def wavefront(
+    lens,
+    field_rad,
+    wavelength_um=WAVELENGTH_UM["d"],
+    grid=64,
+    vignetting=False,
+    defocus_mm=0.0,
+    reference_mm=None,
+    pupil=None,
+):
     """Wavefront of one field.
 
     Args:
-      grid: pupil cells across (the points are those of ``pupil_grid``), unless ``pupil`` [M, 2] gives the points themselves.
-      vignetting, defocus_mm: see ``trace_field``. reference_mm: [2] centre of the reference sphere; None is the chief ray's point.
+      grid: pupil cells across (the points are those of ``pupil_grid``), unless ``pupil`` [M, 2] gives the
+        points themselves.
+      vignetting, defocus_mm: see ``trace_field``. reference_mm: [2] centre of the reference sphere; None is
+        the chief ray's point.
     Returns: Wavefront.
     Gradient: opd_mm to every lens tensor. Raises: DomainError when no ray, or not the chief ray, arrives.
     """
@@ -64,10 +82,12 @@ def wavefront(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"], grid=64, vignet
 
 
 def remove_fit(front, tilt=True, focus=False):
-    """The wavefront without piston, and as asked without tilt and focus (x^2 + y^2), by a weighted least-squares fit. Differentiable."""
+    """The wavefront without piston, and as asked without tilt and focus (x^2 + y^2), by a weighted
+    least-squares fit. Differentiable."""
     x, y = front.pupil.unbind(1)
     columns = [torch.ones_like(x), *([x, y] if tilt else []), *([x * x + y * y] if focus else [])]
-    basis, w = torch.stack(columns, 1), front.weight[:, None]
+    basis = torch.stack(columns, 1)
+    w = front.weight[:, None]
     normal = basis.T @ (basis * w)
     # a fan has no extent across, so its normal matrix is singular: the pseudo-inverse fits what there is
     fit = torch.linalg.pinv(normal, hermitian=True) @ (basis.T @ (front.opd_mm[:, None] * w))
@@ -75,7 +95,8 @@ def remove_fit(front, tilt=True, focus=False):
 
 
 def rms_waves(front):
-    """RMS of the optical path difference about its mean, in waves; scalar. Gradient: to opd and weights; 0 for a perfect wavefront."""
+    """RMS of the optical path difference about its mean, in waves; scalar. Gradient: to opd and weights; 0
+    for a perfect wavefront."""
     w = front.weight / front.weight.sum()
     away = front.waves - (front.waves * w).sum()
     return torch.linalg.vector_norm(away * torch.where(w > 0, w, 1).sqrt() * (w > 0))
@@ -88,14 +109,16 @@ def peak_to_valley_waves(front):
 
 
 def strehl_direct(front):
-    """Strehl ratio |mean of exp(-i k W)|^2 at the centre of the reference sphere; scalar in [0, 1]. Remove the tilt first to follow the peak."""
+    """Strehl ratio |mean of exp(-i k W)|^2 at the centre of the reference sphere; scalar in [0, 1]. Remove
+    the tilt first to follow the peak."""
     w = front.weight / front.weight.sum()
     phase = 2 * math.pi * front.waves
     return (w * phase.cos()).sum().square() + (w * phase.sin()).sum().square()
 
 
 def strehl_marechal(front):
-    """Strehl ratio exp(-(2 pi sigma)^2) from the RMS in waves; good above about 0.3. Source: Mahajan, JOSA 73 (1983)."""
+    """Strehl ratio exp(-(2 pi sigma)^2) from the RMS in waves; good above about 0.3. Source: Mahajan, JOSA 73
+    (1983)."""
     return torch.exp(-(2 * math.pi * rms_waves(front)).square())
 
 
@@ -104,27 +127,40 @@ def _on_sphere(lens, rays, chief, wavelength_um, reference_mm, defocus_mm):
     centre = chief.position_mm[0] if reference_mm is None else reference_mm
     bend = _sphere_curvature(lens, centre, wavelength_um, defocus_mm)
     lengths = [_to_sphere(bundle, centre, bend) for bundle in (rays, chief)]
-    towards = [bundle.direction[:, :2] * (1 - bend * length)[:, None] - bend * (bundle.position_mm - centre) for bundle, length in zip((rays, chief), lengths, strict=True)]
-    return chief.index * (lengths[1] - lengths[0]) + (chief.path_mm - rays.path_mm), rays.index * (towards[0] - towards[1])
+    towards = [
+        bundle.direction[:, :2] * (1 - bend * length)[:, None] - bend * (bundle.position_mm - centre)
+        for bundle, length in zip((rays, chief), lengths, strict=True)
+    ]
+    return chief.index * (lengths[1] - lengths[0]) + (chief.path_mm - rays.path_mm), rays.index * (
+        towards[0] - towards[1]
+    )
 
 
 def _sphere_curvature(lens, centre, wavelength_um, defocus_mm):
-    """1 / radius of the reference sphere, positive when the exit pupil lies before the image; 0 for a telecentric lens."""
+    """1 / radius of the reference sphere, positive when the exit pupil lies before the image; 0 for a
+    telecentric lens."""
     f = lens.first_order(wavelength_um)
     before = lens.thickness_mm[-1] + defocus_mm - f.exit_pupil_z_mm  # mm from the exit pupil to the plane
     if abs(float(before.detach())) < 1e-9:
-        raise DomainError(f"{lens.name}: the exit pupil lies in the image plane, so there is no reference sphere; move the image plane or the stop.")
+        raise DomainError(
+            f"{lens.name}: the exit pupil lies in the image plane, so there is no reference sphere; move "
+            "the image plane or the stop."
+        )
     if not math.isfinite(float(before.detach())):
         return torch.zeros_like(centre[0])
     return torch.sign(before) / (before.square() + centre.square().sum()).sqrt()
 
 
 def _to_sphere(rays, centre, bend):
-    """Signed distance along each ray to the reference sphere, plus its radius: free of cancellation, and regular when the sphere is a plane."""
+    """Signed distance along each ray to the reference sphere, plus its radius: free of cancellation, and
+    regular when the sphere is a plane."""
     away = torch.cat([rays.position_mm - centre, torch.zeros_like(rays.position_mm[:, :1])], 1)
     along = (away * rays.direction).sum(1)
     across = away.square().sum(1) - along.square()
     radicand = 1 - across * bend.square()
     if bool((radicand.detach()[rays.weight.detach() > 0] <= 0).any()):
-        raise DomainError("rays pass further from the image point than the reference sphere's radius; the aberration is too large for a wavefront, use spots instead.")
+        raise DomainError(
+            "rays pass further from the image point than the reference sphere's radius; the aberration is "
+            "too large for a wavefront, use spots instead."
+        )
     return across * bend / (1 + radicand.clamp_min(1e-12).sqrt()) - along

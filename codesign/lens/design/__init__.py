@@ -1,4 +1,5 @@
-"""Designing a lens: solves, constraints, optimisers, tolerances, and designs in principal modes of ray motion."""
+"""Designing a lens: solves, constraints, optimisers, tolerances, and designs in principal modes of ray
+motion."""
 
 from codesign.lens.design.adam import ScaledAdam
 from codesign.lens.design.constraints import Limits
@@ -7,4 +8,16 @@ from codesign.lens.design.modes import LensDesign, detune, edge_thickness_mm, ma
 from codesign.lens.design.solves import focus_paraxial, focus_rays, hold_efl
 from codesign.lens.design.tolerance import Tolerances
 
-__all__ = ["DampedLeastSquares", "LensDesign", "Limits", "ScaledAdam", "Tolerances", "detune", "edge_thickness_mm", "focus_paraxial", "focus_rays", "hold_efl", "make_design"]
+__all__ = [
+    "DampedLeastSquares",
+    "LensDesign",
+    "Limits",
+    "ScaledAdam",
+    "Tolerances",
+    "detune",
+    "edge_thickness_mm",
+    "focus_paraxial",
+    "focus_rays",
+    "hold_efl",
+    "make_design",
+]

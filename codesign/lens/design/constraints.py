@@ -1,11 +1,13 @@
-"""What a lens must be to exist: limits on thicknesses, gaps, angles, length, glass and rays, as smooth penalties and as a report.
+"""What a lens must be to exist: limits on thicknesses, gaps, angles, length, glass and rays, as smooth
+penalties and as a report.
 
     limits = Limits(glass_centre_mm=1.0, glass_edge_mm=1.0, air_gap_mm=0.2, track_mm=70.0)
     found = evaluate(lens, limits)
     loss = spot + penalty(found)
     print(report(found))
 
-Every Constraint is a value, a bound and a side. Its penalty is (violation / scale)^2: zero with zero slope where it holds,
+Every Constraint is a value, a bound and a side. Its penalty is (violation / scale)^2: zero with zero slope
+where it holds,
 so values and slopes are continuous. Surfaces are counted from 1.
 """
 
@@ -25,7 +27,8 @@ class Constraint:
     """One limit on one figure of a lens.
 
     value: scalar tensor with its gradient. at_least: True for value >= bound, False for value <= bound.
-    scale: the violation that costs a penalty of 1, in the unit of the value. can_bind: False where the bound is also the best value
+    scale: the violation that costs a penalty of 1, in the unit of the value. can_bind: False where the bound
+      is also the best value
     there is (no failed ray), so that it holds or is violated but never binds.
     """
 
@@ -69,12 +72,16 @@ class Constraint:
 class Limits:
     """What to hold; None leaves a figure free. Lengths in mm, angles in degrees.
 
-    glass_centre_mm, glass_centre_most_mm: centre thickness of glass. glass_edge_mm: thickness of glass at the semi-aperture.
+    glass_centre_mm, glass_centre_most_mm: centre thickness of glass. glass_edge_mm: thickness of glass at the
+      semi-aperture.
     air_gap_mm: least air between neighbouring surfaces anywhere within the semi-aperture, the axis included.
-    track_mm: most length from the first vertex to the image. back_focus_mm: least distance from the last surface to the image.
-    incidence_deg: most angle of incidence of any rim or chief ray of ``fields_rad``. steepness: most semi-aperture over radius (1 is a hemisphere).
+    track_mm: most length from the first vertex to the image. back_focus_mm: least distance from the last
+      surface to the image.
+    incidence_deg: most angle of incidence of any rim or chief ray of ``fields_rad``. steepness: most
+      semi-aperture over radius (1 is a hemisphere).
     rays: whether every rim and chief ray of ``fields_rad`` must arrive.
-    glass_polygon: corners (nd, Vd) of a convex region of the glass map, see glass_map. index_range: least and most nd of any glass.
+    glass_polygon: corners (nd, Vd) of a convex region of the glass map, see glass_map. index_range: least and
+      most nd of any glass.
     scale_mm, scale_deg: violations that cost 1.
     """
 
@@ -95,28 +102,49 @@ class Limits:
 
     def __post_init__(self):
         if (self.incidence_deg is not None or self.rays) and not self.fields_rad:
-            raise DomainError("limits on angles of incidence and on rays need fields_rad, the field angles whose rays count; for example (0.0, 0.35).")
+            raise DomainError(
+                "limits on angles of incidence and on rays need fields_rad, the field angles whose rays "
+                "count; for example (0.0, 0.35)."
+            )
         if not (self.scale_mm > 0 and self.scale_deg > 0):
-            raise DomainError(f"scales of violations must be positive, got {self.scale_mm} mm and {self.scale_deg} degrees.")
+            raise DomainError(
+                f"scales of violations must be positive, got {self.scale_mm} mm and {self.scale_deg} degrees."
+            )
 
 
 def gap_mm(lens, heights, semi_aperture_mm=None):
-    """Distance along the axis between neighbouring surfaces, [S - 1, H] mm, at ``heights`` [H], shares of the larger of their semi-apertures."""
+    """Distance along the axis between neighbouring surfaces, [S - 1, H] mm, at ``heights`` [H], shares of the
+    larger of their semi-apertures."""
     a = lens.semi_aperture_mm if semi_aperture_mm is None else semi_aperture_mm
     y = torch.maximum(a[:-1], a[1:])[:, None] * heights
-    sag = lambda rows: sag_mm(y, lens.curvature_per_mm[rows, None], lens.conic[rows, None], [k[:, None] for k in lens.asphere[rows].unbind(1)])  # noqa: E731
+
+    def sag(rows):
+        return sag_mm(
+            y,
+            lens.curvature_per_mm[rows, None],
+            lens.conic[rows, None],
+            [k[:, None] for k in lens.asphere[rows].unbind(1)],
+        )
+
     return lens.thickness_mm[:-1, None] + sag(slice(1, None)) - sag(slice(None, -1))
 
 
 def evaluate(lens, limits, semi_aperture_mm=None):
     """All constraints that ``limits`` asks for, a list of Constraint.
 
-    Args: semi_aperture_mm: [S] where edges and gaps are measured (may carry a gradient); the lens's own when left out. See hits for
+    Args: semi_aperture_mm: [S] where edges and gaps are measured (may carry a gradient); the lens's own when
+      left out. See hits for
       semi-apertures sized by rays.
     Gradient: to every lens tensor the figure depends on. A least gap has that of its narrowest place.
     """
     apertures = lens.semi_aperture_mm if semi_aperture_mm is None else semi_aperture_mm
-    return [*_thicknesses(lens, limits, apertures), *_lengths(lens, limits), *_steepness(lens, limits, apertures), *_rays(lens, limits), *_glasses(lens, limits)]
+    return [
+        *_thicknesses(lens, limits, apertures),
+        *_lengths(lens, limits),
+        *_steepness(lens, limits, apertures),
+        *_rays(lens, limits),
+        *_glasses(lens, limits),
+    ]
 
 
 def penalty(constraints):
@@ -125,7 +153,8 @@ def penalty(constraints):
 
 
 def rows(constraints):
-    """violation / scale of every constraint, [C]: residual rows for least squares whose squares sum to ``penalty``."""
+    """violation / scale of every constraint, [C]: residual rows for least squares whose squares sum to
+    ``penalty``."""
     if not constraints:
         raise DomainError("there are no constraints; set at least one limit.")
     return torch.stack([c.row for c in constraints])
@@ -141,9 +170,25 @@ def report(constraints, tolerance=1e-3):
     """A printable table: every constraint with value, bound, slack and state, the tightest first."""
     ordered = sorted(constraints, key=lambda c: float(c.slack.detach()) / c.scale)
     lines = [("constraint", "value", "bound", "slack", "unit", "state")]
-    lines += [(c.name, f"{float(c.value.detach()):.4f}", f"{'≥' if c.at_least else '≤'} {c.bound:g}", f"{float(c.slack.detach()):+.4f}", c.unit, c.state(tolerance)) for c in ordered]
+    lines += [
+        (
+            c.name,
+            f"{float(c.value.detach()):.4f}",
+            f"{'≥' if c.at_least else '≤'} {c.bound:g}",
+            f"{float(c.slack.detach()):+.4f}",
+            c.unit,
+            c.state(tolerance),
+        )
+        for c in ordered
+    ]
     widths = [max(len(line[k]) for line in lines) for k in range(6)]
-    return "\n".join("  ".join(cell.ljust(w) if k in (0, 4, 5) else cell.rjust(w) for k, (cell, w) in enumerate(zip(line, widths, strict=True))).rstrip() for line in lines)
+    return "\n".join(
+        "  ".join(
+            cell.ljust(w) if k in (0, 4, 5) else cell.rjust(w)
+            for k, (cell, w) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
 
 
 def is_glass(lens):
@@ -152,14 +197,21 @@ def is_glass(lens):
 
 
 def _thicknesses(lens, limits, apertures):
-    glass, found = is_glass(lens), []
+    glass = is_glass(lens)
+    found = []
     between = [f"between surfaces {i + 1} and {i + 2}" for i in range(len(glass) - 1)]
-    lowest = gap_mm(lens, torch.linspace(0, 1, 33, dtype=lens.dtype, device=apertures.device), apertures).amin(1)
+    lowest = gap_mm(
+        lens, torch.linspace(0, 1, 33, dtype=lens.dtype, device=apertures.device), apertures
+    ).amin(1)
     edges = gap_mm(lens, torch.ones(1, dtype=lens.dtype, device=apertures.device), apertures)[:, 0]
     for i, where in enumerate(between):
         if glass[i]:
-            found += _least(f"centre of glass {where}", lens.thickness_mm[i], limits.glass_centre_mm, limits.scale_mm)
-            found += _most(f"centre of glass {where}", lens.thickness_mm[i], limits.glass_centre_most_mm, limits.scale_mm)
+            found += _least(
+                f"centre of glass {where}", lens.thickness_mm[i], limits.glass_centre_mm, limits.scale_mm
+            )
+            found += _most(
+                f"centre of glass {where}", lens.thickness_mm[i], limits.glass_centre_most_mm, limits.scale_mm
+            )
             found += _least(f"edge of glass {where}", edges[i], limits.glass_edge_mm, limits.scale_mm)
         else:
             found += _least(f"air {where}", lowest[i], limits.air_gap_mm, limits.scale_mm)
@@ -173,7 +225,11 @@ def _lengths(lens, limits):
 
 def _steepness(lens, limits, apertures):
     steep = (lens.curvature_per_mm * apertures).abs() * (1 + lens.conic).clamp_min(1e-12).sqrt()
-    return [c for i, value in enumerate(steep.unbind(0)) for c in _most(f"steepness of surface {i + 1}", value, limits.steepness, 0.1, "")]
+    return [
+        c
+        for i, value in enumerate(steep.unbind(0))
+        for c in _most(f"steepness of surface {i + 1}", value, limits.steepness, 0.1, "")
+    ]
 
 
 def _rays(lens, limits):
@@ -186,11 +242,19 @@ def _rays(lens, limits):
         sine = (1 - hits.cosine.clamp_max(1).square()).clamp_min(1e-12).sqrt()
         angle = torch.rad2deg(torch.atan2(sine, hits.cosine))
         worst = torch.where(hits.passed, angle, 0.0).amax(1)  # a ray that fails is the business of ``rays``
-        found += [c for i, value in enumerate(worst.unbind(0)) for c in _most(f"incidence on surface {i + 1}", value, limits.incidence_deg, limits.scale_deg, "deg")]
+        found += [
+            c
+            for i, value in enumerate(worst.unbind(0))
+            for c in _most(
+                f"incidence on surface {i + 1}", value, limits.incidence_deg, limits.scale_deg, "deg"
+            )
+        ]
     if limits.rays:
         out = lens.trace(origin, direction)
         # a radicand lacks the deficit: exactly 0 for a ray that passes
-        found.append(Constraint("deficit of rays that fail", out.deficit.sum(), 0.0, False, 0.1, "", can_bind=False))
+        found.append(
+            Constraint("deficit of rays that fail", out.deficit.sum(), 0.0, False, 0.1, "", can_bind=False)
+        )
     return found
 
 
@@ -201,9 +265,13 @@ def _glasses(lens, limits):
     for i, (nd, vd) in glass_map.places(lens).items():
         name = f"glass behind surface {i + 1}"
         if limits.index_range is not None:
-            found += _least(f"index of {name}", nd, limits.index_range[0], 0.01, "") + _most(f"index of {name}", nd, limits.index_range[1], 0.01, "")
+            found += _least(f"index of {name}", nd, limits.index_range[0], 0.01, "") + _most(
+                f"index of {name}", nd, limits.index_range[1], 0.01, ""
+            )
         if limits.glass_polygon is not None:
-            found += _least(f"{name} in the glass map", glass_map.inside(nd, vd, limits.glass_polygon), 0.0, 0.01, "nd")
+            found += _least(
+                f"{name} in the glass map", glass_map.inside(nd, vd, limits.glass_polygon), 0.0, 0.01, "nd"
+            )
     return found
 
 

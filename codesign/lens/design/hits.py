@@ -15,8 +15,10 @@ from codesign.lens.trace import trace
 
 @dataclass(frozen=True)
 class Hits:
-    """Rays at every surface. height_mm: [S, N] distance from the vertex across the axis. cosine: [S, N] of the angle of incidence, 1 where
-    the surface does not bend light. passed: [S, N], False from the surface on where a ray failed; its numbers then mean nothing."""
+    """Rays at every surface. height_mm: [S, N] distance from the vertex across the axis. cosine: [S, N] of
+    the angle of incidence, 1 where
+    the surface does not bend light. passed: [S, N], False from the surface on where a ray failed; its numbers
+      then mean nothing."""
 
     height_mm: Tensor
     cosine: Tensor
@@ -24,23 +26,36 @@ class Hits:
 
 
 def surface_hits(lens, origin_mm, direction, wavelength_um=WAVELENGTH_UM["d"]):
-    """Trace rays once per surface, up to it, and once to the image. Args: origin_mm, direction [N, 3], see GeoLens.trace. Returns: Hits.
+    """Trace rays once per surface, up to it, and once to the image. Args: origin_mm, direction [N, 3], see
+    GeoLens.trace. Returns: Hits.
 
-    The normal is read off the change of direction, n'd' - n d = const N, so shapes, decentres and tilts need no second formula.
-    Gradient: heights and cosines to rays and to every lens tensor. Raises: DomainError for a lens with diffractive phases, which bend off the normal.
+    The normal is read off the change of direction, n'd' - n d = const N, so shapes, decentres and tilts need
+    no second formula.
+    Gradient: heights and cosines to rays and to every lens tensor. Raises: DomainError for a lens with
+      diffractive phases, which bend off the normal.
     """
     if any(s.phase for s in lens.surfaces):
-        raise DomainError(f"{lens.name}: angles of incidence on diffractive surfaces are not computed; leave the incidence limit out.")
+        raise DomainError(
+            f"{lens.name}: angles of incidence on diffractive surfaces are not computed; leave the "
+            "incidence limit out."
+        )
     whole = lens.prescription(wavelength_um)
     count = whole.curvature_per_mm.numel()
-    traced = [*(trace(whole.until(i), origin_mm, direction) for i in range(count)), lens.trace(origin_mm, direction, wavelength_um)]
-    heights, cosines, passed = [], [], []
+    traced = [
+        *(trace(whole.until(i), origin_mm, direction) for i in range(count)),
+        lens.trace(origin_mm, direction, wavelength_um),
+    ]
+    heights = []
+    cosines = []
+    passed = []
     for i, (here, next_) in enumerate(pairwise(traced)):
-        before, after = here.direction, next_.direction
+        before = here.direction
+        after = next_.direction
         if lens.mirrors[i]:
             after = after * after.new_tensor([1.0, 1.0, -1.0])  # the trace unfolds the axis behind a mirror
         bend = whole.index[i + 1] * after - whole.index[i] * before
-        ok, length2 = next_.status == 0, bend.square().sum(1)
+        ok = next_.status == 0
+        length2 = bend.square().sum(1)
         bends = ok & (length2 > 1e-18)
         length = torch.where(bends, length2, 1.0).sqrt()
         cosines.append(torch.where(bends, ((bend * before).sum(1) / length).abs(), 1.0))
@@ -50,28 +65,43 @@ def surface_hits(lens, origin_mm, direction, wavelength_um=WAVELENGTH_UM["d"]):
 
 
 def rim_rays(lens, fields_rad, count=16):
-    """The chief ray and ``count`` rays on the rim of the entrance pupil, for each field. Returns: origins and directions [fields * (count + 1), 3]."""
-    turn = torch.arange(count, dtype=lens.dtype, device=lens.curvature_per_mm.device) * (2 * torch.pi / count) + torch.pi / 2
+    """The chief ray and ``count`` rays on the rim of the entrance pupil, for each field. Returns: origins and
+    directions [fields * (count + 1), 3]."""
+    turn = (
+        torch.arange(count, dtype=lens.dtype, device=lens.curvature_per_mm.device) * (2 * torch.pi / count)
+        + torch.pi / 2
+    )
     pupil = torch.cat([torch.zeros_like(turn[:1]).expand(1, 2), torch.stack([turn.cos(), turn.sin()], 1)])
     rays = [field_rays(lens, float(f), pupil) for f in fields_rad]
     return torch.cat([o for o, _ in rays]), torch.cat([d for _, d in rays])
 
 
 def traced_semi_aperture_mm(lens, fields_rad, margin=0.05, count=16):
-    """Semi-aperture that lets the full pupil of all fields pass, [S] mm: the largest height of a rim ray, times 1 + margin.
+    """Semi-aperture that lets the full pupil of all fields pass, [S] mm: the largest height of a rim ray,
+    times 1 + margin.
 
     Gradient: of the highest ray. Raises: DomainError when a rim ray fails.
     """
     hits = surface_hits(lens, *rim_rays(lens, fields_rad, count))
     if not bool(hits.passed[-1].all()):
-        raise DomainError(f"{lens.name}: {int((~hits.passed[-1]).sum())} of {hits.passed.shape[1]} rim rays fail, so its apertures cannot be sized; use a smaller field or weaker curvatures.")
+        raise DomainError(
+            f"{lens.name}: {int((~hits.passed[-1]).sum())} of {hits.passed.shape[1]} rim rays fail, so its "
+            "apertures cannot be sized; use a smaller field or weaker curvatures."
+        )
     return hits.height_mm.amax(1) * (1 + margin)
 
 
 def paraxial_semi_aperture_mm(lens, half_field_rad, margin=0.05):
-    """The same from the paraxial marginal and chief ray, |y| + |y_chief|, [S] mm: defined for every lens, without tracing. Differentiable."""
-    f, n, t, power = lens.first_order(), lens.index(), lens.thickness_mm, lens.surface_power()
-    count, slope = power.numel(), torch.tan(torch.as_tensor(half_field_rad, dtype=lens.dtype, device=power.device))
-    marginal, _ = yu_trace(power, t, n, f.entrance_pupil_diameter_mm / 2, torch.zeros_like(power[0]), last=count)
+    """The same from the paraxial marginal and chief ray, |y| + |y_chief|, [S] mm: defined for every lens,
+    without tracing. Differentiable."""
+    f = lens.first_order()
+    n = lens.index()
+    t = lens.thickness_mm
+    power = lens.surface_power()
+    count = power.numel()
+    slope = torch.tan(torch.as_tensor(half_field_rad, dtype=lens.dtype, device=power.device))
+    marginal, _ = yu_trace(
+        power, t, n, f.entrance_pupil_diameter_mm / 2, torch.zeros_like(power[0]), last=count
+    )
     chief, _ = yu_trace(power, t, n, -f.entrance_pupil_z_mm * slope, slope * n[0], last=count)
     return (torch.stack(marginal).abs() + torch.stack(chief).abs()) * (1 + margin)

@@ -1,9 +1,14 @@
-"""Damped least squares (Levenberg-Marquardt) on any function of variables to residuals, resumable, with bounds.
+"""Damped least squares (Levenberg-Marquardt) on any function of variables to residuals, resumable, with
+bounds.
 
-Each step solves (J^T J + damping D^2) step = -J^T r with D the largest column norms of J seen so far, so the units of the variables
-do not matter. The gain ratio (what the sum of squares lost over what the linear model promised) multiplies the damping down after a
-good step and up after a bad one. Constraints beyond bounds are residual rows of their own, such as weight * max(0, lack).
-Source: Marquardt, SIAM J. Appl. Math. 11 (1963); Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05 (update of the damping);
+Each step solves (J^T J + damping D^2) step = -J^T r with D the largest column norms of J seen so far, so the
+units of the variables
+do not matter. The gain ratio (what the sum of squares lost over what the linear model promised) multiplies
+the damping down after a
+good step and up after a bad one. Constraints beyond bounds are residual rows of their own, such as weight *
+max(0, lack).
+Source: Marquardt, SIAM J. Appl. Math. 11 (1963); Nielsen, Damping parameter in Marquardt's method,
+  IMM-REP-1999-05 (update of the damping);
 More, The Levenberg-Marquardt algorithm, LNM 630 (1978) (scaling).
 """
 
@@ -25,7 +30,8 @@ class StopRules:
     """When a run ends by itself; each is checked after every step.
 
     steps: most steps of a run. gradient: largest cosine between a column of J and r (0 at a minimum).
-    step: length of a step over that of the variables, both in units of D. loss: relative decrease by an accepted step.
+    step: length of a step over that of the variables, both in units of D. loss: relative decrease by an
+      accepted step.
     damping: largest damping, reached when no step of any size helps.
     """
 
@@ -42,23 +48,41 @@ class DampedLeastSquares:
     Args:
       residuals: pure function; a value that is not finite counts as a failed step.
       start: [V], a point where the residuals are finite.
-      jacobian: function of (residuals, variables, value there) to [M, V]: ``by_autograd`` (the default), ``by_differences(...)`` or your own.
-      lower, upper: [V] bounds, or None. A variable on a bound that wants to leave is held; steps are cut at bounds.
+      jacobian: function of (residuals, variables, value there) to [M, V]: ``by_autograd`` (the default),
+        ``by_differences(...)`` or your own.
+      lower, upper: [V] bounds, or None. A variable on a bound that wants to leave is held; steps are cut at
+        bounds.
       damping: first damping, relative to D^2.
     variables, loss: where it stands. history: History. stopped: why the last run ended, "" while it has not.
-    Raises: ShapeError, DomainError for a start that is not finite, outside its bounds, or has residuals that are not finite.
+    Raises: ShapeError, DomainError for a start that is not finite, outside its bounds, or has residuals that
+      are not finite.
     """
 
-    def __init__(self, residuals: Callable[[Tensor], Tensor], start: Tensor, jacobian: Jacobian = by_autograd, lower: Tensor | None = None, upper: Tensor | None = None,
-                 damping: float = 1e-3, stop: StopRules | None = None):
-        self.residuals, self.jacobian, self.stop = residuals, jacobian, stop or StopRules()
+    def __init__(
+        self,
+        residuals: Callable[[Tensor], Tensor],
+        start: Tensor,
+        jacobian: Jacobian = by_autograd,
+        lower: Tensor | None = None,
+        upper: Tensor | None = None,
+        damping: float = 1e-3,
+        stop: StopRules | None = None,
+    ):
+        self.residuals = residuals
+        self.jacobian = jacobian
+        self.stop = stop or StopRules()
         self.variables = check_start(start)
         self.lower, self.upper = _bounds(self.variables, lower, upper)
         if not 0 < damping < math.inf:
             raise DomainError(f"damping {damping} must be positive and finite; 1e-3 suits most starts.")
-        self.damping, self.growth, self.scale = float(damping), 2.0, torch.zeros_like(self.variables)
-        self.history, self.stopped = History(), ""
-        self._value = check_finite(self._residuals(self.variables), "residuals at the start", "start where they are finite")
+        self.damping = float(damping)
+        self.growth = 2.0
+        self.scale = torch.zeros_like(self.variables)
+        self.history = History()
+        self.stopped = ""
+        self._value = check_finite(
+            self._residuals(self.variables), "residuals at the start", "start where they are finite"
+        )
         self._slopes: Tensor | None = None
 
     @property
@@ -67,9 +91,11 @@ class DampedLeastSquares:
         return float(self._value.square().sum()) / 2
 
     def step(self):
-        """One trial step, accepted or not. Returns its Entry; ``stopped`` says whether a rule ended the run."""
+        """One trial step, accepted or not. Returns its Entry; ``stopped`` says whether a rule ended the
+        run."""
         J = self._slopes = self._jacobian() if self._slopes is None else self._slopes
-        r, x = self._value, self.variables
+        r = self._value
+        x = self.variables
         gradient = J.T @ r
         free = ~(((x <= self.lower) & (gradient > 0)) | ((x >= self.upper) & (gradient < 0)))
         self.scale = torch.maximum(self.scale, torch.linalg.vector_norm(J, dim=0))
@@ -79,25 +105,33 @@ class DampedLeastSquares:
         trial = torch.minimum(torch.maximum(x + step, self.lower), self.upper)
         step = trial - x
         value = self._residuals(trial)
-        before, after = self.loss, float(value.square().sum()) / 2
-        # the model's decrease, as a product: the difference of two sums of squares drowns in rounding near a minimum
+        before = self.loss
+        after = float(value.square().sum()) / 2
+        # the model's decrease, as a product: the difference of two sums of squares drowns in rounding near a
+        # minimum
         promised = -float(gradient @ step) - float((J @ step).square().sum()) / 2
         accepted = finite(value) and after < before and promised > 0
         gain = (before - after) / promised if accepted else 0.0
         steepest = _cosine(J, r, gradient, free)
         entry = Entry(before, float(gradient.norm()), float(step.norm()), self.damping, accepted)
-        moved, size = float((D * step).norm()), float((D * x).norm())
+        moved = float((D * step).norm())
+        size = float((D * x).norm())
         if accepted:
-            self.variables, self._value, self._slopes = trial, value, None
-            self.damping, self.growth = max(self.damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 1e-15), 2.0
+            self.variables = trial
+            self._value = value
+            self._slopes = None
+            self.damping = max(self.damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), 1e-15)
+            self.growth = 2.0
         else:
-            self.damping, self.growth = self.damping * self.growth, self.growth * 2
+            self.damping = self.damping * self.growth
+            self.growth = self.growth * 2
         self.history.add(entry)
         self.stopped = self._why(steepest, moved, size, before, after, accepted)
         return entry
 
     def run(self, steps: int | None = None, progress: Callable[[Entry], object] | None = None):
-        """Step until a rule ends it, or for ``steps`` more. ``progress`` is called after each step. Returns the variables."""
+        """Step until a rule ends it, or for ``steps`` more. ``progress`` is called after each step. Returns
+        the variables."""
         self.stopped = ""
         for _ in range(steps if steps is not None else self.stop.steps):
             entry = self.step()
@@ -110,16 +144,30 @@ class DampedLeastSquares:
 
     def state(self):
         """Everything needed to go on, as numbers and lists that JSON and torch.save keep to the last bit."""
-        return {"variables": self.variables.tolist(), "scale": self.scale.tolist(), "damping": self.damping, "growth": self.growth, "history": self.history.rows()}
+        return {
+            "variables": self.variables.tolist(),
+            "scale": self.scale.tolist(),
+            "damping": self.damping,
+            "growth": self.growth,
+            "history": self.history.rows(),
+        }
 
     def resume(self, state: dict):
-        """Go on from ``state``; the same steps follow as without the break. Raises: ShapeError when it belongs to other variables."""
+        """Go on from ``state``; the same steps follow as without the break. Raises: ShapeError when it
+        belongs to other variables."""
         found = torch.tensor(state["variables"], dtype=self.variables.dtype, device=self.variables.device)
         if found.shape != self.variables.shape:
-            raise ShapeError(f"the state has {found.numel()} variables, this problem has {self.variables.numel()}; give the state of the same problem.")
-        self.variables, self.scale = found, torch.tensor(state["scale"], dtype=found.dtype, device=found.device)
-        self.damping, self.growth, self.history = float(state["damping"]), float(state["growth"]), History.of(state["history"])
-        self._value, self._slopes = self._residuals(found), None
+            raise ShapeError(
+                f"the state has {found.numel()} variables, this problem has {self.variables.numel()}; give "
+                "the state of the same problem."
+            )
+        self.variables = found
+        self.scale = torch.tensor(state["scale"], dtype=found.dtype, device=found.device)
+        self.damping = float(state["damping"])
+        self.growth = float(state["growth"])
+        self.history = History.of(state["history"])
+        self._value = self._residuals(found)
+        self._slopes = None
         return self
 
     def _residuals(self, variables):
@@ -132,8 +180,15 @@ class DampedLeastSquares:
     def _jacobian(self):
         slopes = self.jacobian(self.residuals, self.variables, self._value)
         if slopes.shape != (self._value.numel(), self.variables.numel()):
-            raise ShapeError(f"the Jacobian has shape {tuple(slopes.shape)}, but there are {self._value.numel()} residuals and {self.variables.numel()} variables.")
-        return check_finite(slopes, "Jacobian", "the residuals have no derivative here; start elsewhere, or bound the variables")
+            raise ShapeError(
+                f"the Jacobian has shape {tuple(slopes.shape)}, but there are {self._value.numel()} "
+                f"residuals and {self.variables.numel()} variables."
+            )
+        return check_finite(
+            slopes,
+            "Jacobian",
+            "the residuals have no derivative here; start elsewhere, or bound the variables",
+        )
 
     def _why(self, steepest, moved, size, before, after, accepted):
         stop = self.stop
@@ -163,7 +218,12 @@ def _bounds(start, lower, upper):
     low = torch.full_like(start, -math.inf) if lower is None else lower.to(start)
     high = torch.full_like(start, math.inf) if upper is None else upper.to(start)
     if low.shape != start.shape or high.shape != start.shape:
-        raise ShapeError(f"bounds must have the shape of the variables {tuple(start.shape)}, got {tuple(low.shape)} and {tuple(high.shape)}.")
+        raise ShapeError(
+            f"bounds must have the shape of the variables {tuple(start.shape)}, got {tuple(low.shape)} and "
+            f"{tuple(high.shape)}."
+        )
     if not bool(((low <= start) & (start <= high)).all()):
-        raise DomainError("the start lies outside its bounds, or a lower bound above its upper; move the start inside.")
+        raise DomainError(
+            "the start lies outside its bounds, or a lower bound above its upper; move the start inside."
+        )
     return low, high

@@ -13,7 +13,8 @@ from codesign.lens.surface import sag_mm
 
 
 def edge_thickness_mm(lens):
-    """Gap between neighbouring surfaces at the larger of their semi-apertures, [S - 1] mm. Gradient: curvatures, thicknesses, conics."""
+    """Gap between neighbouring surfaces at the larger of their semi-apertures, [S - 1] mm. Gradient:
+    curvatures, thicknesses, conics."""
     a = torch.maximum(lens.semi_aperture_mm[:-1], lens.semi_aperture_mm[1:])
     return lens.thickness_mm[:-1] + _sag(lens, slice(1, None), a) - _sag(lens, slice(None, -1), a)
 
@@ -24,10 +25,13 @@ def _sag(lens, rows, height):
 
 @dataclass(frozen=True)
 class LensDesign:
-    """Free variables of a lens around a reference; each unit variable moves the rays by the same distance, in its own way.
+    """Free variables of a lens around a reference; each unit variable moves the rays by the same distance, in
+    its own way.
 
-    reference: the lens at variables = 0. efl_mm: held, by the last curvature that can (see solves.holding_surface).
-    basis: [V, V], columns are changes of curvatures (S - 1, per mm) and thicknesses (S, mm) per unit variable.
+    reference: the lens at variables = 0. efl_mm: held, by the last curvature that can (see
+      solves.holding_surface).
+    basis: [V, V], columns are changes of curvatures (S - 1, per mm) and thicknesses (S, mm) per unit
+      variable.
     floor_mm: [S] least centre thickness; edge_floor_mm: [S - 1] least edge thickness.
     """
 
@@ -40,7 +44,8 @@ class LensDesign:
     def lens(self, variables):
         """The lens at dimensionless variables [V]; gradients flow back to them.
 
-        Thicknesses stay above their floors by a smooth bend that is the identity a few hundredths of the floor above it.
+        Thicknesses stay above their floors by a smooth bend that is the identity a few hundredths of the
+        floor above it.
         """
         return self.changed(self.basis @ variables.to(self.basis))
 
@@ -48,14 +53,19 @@ class LensDesign:
         """The lens with curvatures and thicknesses changed by [V] (per mm, then mm) from the reference."""
         count = self.reference.curvature_per_mm.numel()
         at = holding_surface(self.reference)
-        curvature = self.reference.curvature_per_mm.detach() + torch.cat([change[:at], torch.zeros_like(change[:1]), change[at : count - 1]])
+        curvature = self.reference.curvature_per_mm.detach() + torch.cat(
+            [change[:at], torch.zeros_like(change[:1]), change[at : count - 1]]
+        )
         room = self.reference.thickness_mm.detach() + change[count - 1 :] - self.floor_mm
         width = 0.02 * self.floor_mm.clamp_min(1e-3)
         thickness = self.floor_mm + width * torch.nn.functional.softplus(room / width)
-        return hold_efl(self.reference.replace(curvature_per_mm=curvature, thickness_mm=thickness), self.efl_mm, at)
+        return hold_efl(
+            self.reference.replace(curvature_per_mm=curvature, thickness_mm=thickness), self.efl_mm, at
+        )
 
     def penalty(self, lens):
-        """Smooth hinge on edge thicknesses below their floors, in units of 1 % of the focal length squared; 0 when all hold."""
+        """Smooth hinge on edge thicknesses below their floors, in units of 1 % of the focal length squared; 0
+        when all hold."""
         lack = (self.edge_floor_mm - edge_thickness_mm(lens)).clamp_min(0) / (0.01 * self.efl_mm)
         return lack.square().sum()
 
@@ -63,21 +73,37 @@ class LensDesign:
 def make_design(lens, fields_rad, step_mm, floors=None, floor_share=0.6):
     """LensDesign around ``lens`` whose variables are the principal modes of ray motion.
 
-    With J the motion of the rays about each spot's mean per scaled curvature and thickness, the variables are the eigenvectors of
-    J^T J, each scaled to move the rays by ``step_mm`` RMS, or to change no curvature or thickness by more than a tenth of its size.
+    With J the motion of the rays about each spot's mean per scaled curvature and thickness, the variables are
+    the eigenvectors of
+    J^T J, each scaled to move the rays by ``step_mm`` RMS, or to change no curvature or thickness by more
+    than a tenth of its size.
     Defocus, coma, astigmatism and so on then have separate step sizes, which a step per curvature has not.
 
-    Args: fields_rad: angles at which ray motion is measured. floors: another LensDesign whose thickness floors to keep; by default
+    Args: fields_rad: angles at which ray motion is measured. floors: another LensDesign whose thickness
+      floors to keep; by default
       they are ``floor_share`` of today's centre and edge thicknesses.
     """
-    lens = lens.replace(**{name: getattr(lens, name).detach().clone() for name in LEARNABLES})  # the caller's lens keeps its gradients
+    lens = lens.replace(
+        **{name: getattr(lens, name).detach().clone() for name in LEARNABLES}
+    )  # the caller's lens keeps its gradients
     count = lens.curvature_per_mm.numel()
-    size = torch.cat([lens.curvature_per_mm.detach().abs().mean().expand(count - 1), lens.thickness_mm.detach()])
+    size = torch.cat(
+        [lens.curvature_per_mm.detach().abs().mean().expand(count - 1), lens.thickness_mm.detach()]
+    )
     with torch.no_grad():
         edges = edge_thickness_mm(lens)
-        least = (floors.floor_mm, floors.edge_floor_mm) if floors else (lens.thickness_mm * floor_share, edges * torch.where(edges > 0, floor_share, 1 / floor_share))
+        least = (
+            (floors.floor_mm, floors.edge_floor_mm)
+            if floors
+            else (
+                lens.thickness_mm * floor_share,
+                edges * torch.where(edges > 0, floor_share, 1 / floor_share),
+            )
+        )
         plain = LensDesign(lens, float(lens.first_order().efl_mm), torch.diag(size), *least)
-        motion = torch.stack([_motion(plain, v, fields_rad) for v in range(size.numel())], 1) / step_mm  # [rays, V], steps per relative change
+        motion = (
+            torch.stack([_motion(plain, v, fields_rad) for v in range(size.numel())], 1) / step_mm
+        )  # [rays, V], steps per relative change
         power, modes = torch.linalg.eigh(motion.T @ motion)
         reach = torch.minimum(power.clamp_min(1e-30).rsqrt(), 0.1 / modes.abs().amax(0))
     return LensDesign(lens, plain.efl_mm, size[:, None] * modes * reach, *least)
@@ -87,30 +113,53 @@ def _motion(design, variable, fields_rad, step=1e-4):
     """Ray motion about the mean of each spot per unit of one variable, RMS-normalised: [rays * 2] mm."""
     shift = torch.zeros_like(design.basis[0])
     shift[variable] = step
-    (ahead, arrived), (behind, also) = spots(design.lens(shift), fields_rad), spots(design.lens(-shift), fields_rad)
+    (ahead, arrived), (behind, also) = (
+        spots(design.lens(shift), fields_rad),
+        spots(design.lens(-shift), fields_rad),
+    )
     weight = (arrived * also)[..., None]
     moved = (ahead - behind) / (2 * step)
-    moved = weight * (moved - (moved * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1))  # a shift of the whole spot does not blur
+    moved = weight * (
+        moved - (moved * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1)
+    )  # a shift of the whole spot does not blur
     return moved.reshape(-1) / (moved.shape[0] * moved.shape[1]) ** 0.5
 
 
 def detune(design, fields_rad, target_mm, generator):
-    """The reference lens with errors in curvatures and focus that bring its mean RMS spot to ``target_mm``, focal length held.
+    """The reference lens with errors in curvatures and focus that bring its mean RMS spot to ``target_mm``,
+    focal length held.
 
-    Every curvature but the one that holds the focal length and the image distance get independent Gaussian errors of one
-    common relative size, which is raised until the target is met. Raises: DomainError when 50 % is not enough.
+    Every curvature but the one that holds the focal length and the image distance get independent Gaussian
+    errors of one
+    common relative size, which is raised until the target is met. Raises: DomainError when 50 % is not
+    enough.
     """
     count = design.reference.curvature_per_mm.numel()
     at = holding_surface(design.reference)
-    size = torch.cat([design.reference.curvature_per_mm[:at], design.reference.curvature_per_mm[at + 1 :], torch.zeros_like(design.floor_mm[:-1]), design.reference.thickness_mm[-1:]])
+    size = torch.cat(
+        [
+            design.reference.curvature_per_mm[:at],
+            design.reference.curvature_per_mm[at + 1 :],
+            torch.zeros_like(design.floor_mm[:-1]),
+            design.reference.thickness_mm[-1:],
+        ]
+    )
     direction = torch.randn(2 * count - 1, generator=generator, dtype=size.dtype) * size
     with torch.no_grad():
-        spot = lambda size: float(rms_spot_mm(design.changed(direction * size), fields_rad).mean())  # noqa: E731
-        low, high = 0.0, 0.0
+
+        def spot(size):
+            return float(rms_spot_mm(design.changed(direction * size), fields_rad).mean())
+
+        low = 0.0
+        high = 0.0
         while spot(high) < target_mm:
-            low, high = high, high + 0.002
+            low = high
+            high = high + 0.002
             if high > 0.5:
-                raise DomainError(f"detuning along this direction never reaches an RMS spot of {target_mm:.4g} mm; choose another seed.")
+                raise DomainError(
+                    f"detuning along this direction never reaches an RMS spot of {target_mm:.4g} mm; choose "
+                    "another seed."
+                )
         for _ in range(40):
             middle = (low + high) / 2
             low, high = (middle, high) if spot(middle) < target_mm else (low, middle)

@@ -1,4 +1,5 @@
-"""What the optimisers share: history, Jacobians by autograd or by differences, and scales that give every variable the same effect."""
+"""What the optimisers share: history, Jacobians by autograd or by differences, and scales that give every
+variable the same effect."""
 
 import dataclasses
 import math
@@ -15,7 +16,8 @@ Jacobian = Callable[[Callable[[Tensor], Tensor], Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Entry:
-    """One step: the loss before it, the norm of its gradient, the length of the trial step, damping (or step size), whether it was accepted."""
+    """One step: the loss before it, the norm of its gradient, the length of the trial step, damping (or step
+    size), whether it was accepted."""
 
     loss: float
     gradient: float
@@ -67,14 +69,21 @@ def by_autograd(residuals, variables, value):
 def by_differences(step, central=False):
     """A Jacobian by differences of the variables: V more evaluations, 2 V when ``central``.
 
-    Args: step: a number or [V]; the error is about step (step^2 when central) times curvature, plus rounding over step.
+    Args: step: a number or [V]; the error is about step (step^2 when central) times curvature, plus rounding
+      over step.
     Where the far side is not finite the other side is used; where neither is, the Jacobian is not finite.
     """
 
     def jacobian(residuals, variables, value):
         steps = torch.as_tensor(step, dtype=variables.dtype, device=variables.device).expand_as(variables)
         with torch.no_grad():
-            return torch.stack([_slope(residuals, variables, value, v, float(steps[v]), central) for v in range(variables.numel())], 1)
+            return torch.stack(
+                [
+                    _slope(residuals, variables, value, v, float(steps[v]), central)
+                    for v in range(variables.numel())
+                ],
+                1,
+            )
 
     return jacobian
 
@@ -100,7 +109,8 @@ def finite(value):
 
 
 def check_start(start):
-    """The start as a detached vector. Raises: ShapeError unless [V >= 1]; DomainError when it is not finite."""
+    """The start as a detached vector. Raises: ShapeError unless [V >= 1]; DomainError when it is not
+    finite."""
     if start.ndim != 1 or not start.numel():
         raise ShapeError(f"the start must be a vector [V >= 1], got {tuple(start.shape)}.")
     return check_finite(start.detach().clone(), "start")
@@ -112,16 +122,24 @@ def column_scales(jacobian: Tensor, limit: float | Tensor = math.inf):
     Args: jacobian [M, V]; limit: number or [V], for variables the residuals hardly see.
     """
     norms = torch.linalg.vector_norm(jacobian, dim=0)
-    return torch.minimum(1 / norms.clamp_min(1e-300), torch.as_tensor(limit, dtype=norms.dtype, device=norms.device))
+    return torch.minimum(
+        1 / norms.clamp_min(1e-300), torch.as_tensor(limit, dtype=norms.dtype, device=norms.device)
+    )
 
 
 def principal_modes(jacobian, limit=math.inf):
-    """Basis [V, V] whose columns are directions with effects at right angles, each of which changes the residuals by 1.
+    """Basis [V, V] whose columns are directions with effects at right angles, each of which changes the
+    residuals by 1.
 
-    Args: jacobian [M, V] of variables in comparable units; limit: largest change of any variable by a column, for directions the residuals hardly see.
+    Args: jacobian [M, V] of variables in comparable units; limit: largest change of any variable by a column,
+      for directions the residuals hardly see.
     Source: eigenvectors of J^T J, as the right singular vectors of J.
     """
     _, sizes, modes = torch.linalg.svd(jacobian, full_matrices=True)
     sizes = torch.cat([sizes, sizes.new_zeros(modes.shape[0] - sizes.numel())])
-    reach = torch.minimum(1 / sizes.clamp_min(1e-300), limit / modes.abs().amax(1)) if limit < math.inf else 1 / sizes.clamp_min(1e-300)
+    reach = (
+        torch.minimum(1 / sizes.clamp_min(1e-300), limit / modes.abs().amax(1))
+        if limit < math.inf
+        else 1 / sizes.clamp_min(1e-300)
+    )
     return modes.T * reach

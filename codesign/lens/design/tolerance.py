@@ -1,10 +1,13 @@
-"""What manufacturing errors do to a lens: sensitivities, their linear and quadratic forecast, and Monte Carlo to judge it.
+"""What manufacturing errors do to a lens: sensitivities, their linear and quadratic forecast, and Monte Carlo
+to judge it.
 
-    tolerances = Tolerances(radius_relative=1e-3, thickness_mm=0.02, index=5e-4, decentre_mm=0.01, tilt_deg=0.02)
+    tolerances = Tolerances(radius_relative=1e-3, thickness_mm=0.02, index=5e-4, decentre_mm=0.01,
+    tilt_deg=0.02)
     J = sensitivities(geo, tolerances, linear_figures(0.3))
     trials = monte_carlo(geo, tolerances, linear_figures(0.3), 1000, torch.Generator().manual_seed(0))
 
-A figure is a function from a lens to a vector [K]. Errors are independent, normal, and each number of Tolerances is one standard deviation.
+A figure is a function from a lens to a vector [K]. Errors are independent, normal, and each number of
+Tolerances is one standard deviation.
 """
 
 import math
@@ -24,9 +27,12 @@ from codesign.lens.glass import WAVELENGTH_UM
 class Tolerances:
     """Standard deviations of independent normal errors, all at least 0; 0 leaves that kind out.
 
-    radius_relative: of every radius, as a share. radius_mm: of every radius, mm. fringes: rings of Newton's power fringes over the
-    semi-aperture, at 546 nm (N rings change the curvature by N wavelength / semi-aperture^2). The three add in squares.
-    thickness_mm: of every thickness but the last, which is the focus. index: of every glass, the same at every wavelength.
+    radius_relative: of every radius, as a share. radius_mm: of every radius, mm. fringes: rings of Newton's
+      power fringes over the
+    semi-aperture, at 546 nm (N rings change the curvature by N wavelength / semi-aperture^2). The three add
+    in squares.
+    thickness_mm: of every thickness but the last, which is the focus. index: of every glass, the same at
+      every wavelength.
     decentre_mm: of every surface, in x and in y. tilt_deg: of every surface, about x and about y.
     """
 
@@ -41,14 +47,17 @@ class Tolerances:
     def __post_init__(self):
         for name, value in vars(self).items():
             if not 0 <= value < math.inf:
-                raise DomainError(f"tolerance {name} is {value}; it is a standard deviation, a finite number of at least 0.")
+                raise DomainError(
+                    f"tolerance {name} is {value}; it is a standard deviation, a finite number of at least 0."
+                )
         if not any(vars(self).values()):
             raise DomainError("all tolerances are 0, so nothing varies; give at least one.")
 
 
 @dataclass(frozen=True)
 class Error:
-    """One independent error: a name with the surface counted from 1, the lens tensor and entry it changes, and its standard deviation."""
+    """One independent error: a name with the surface counted from 1, the lens tensor and entry it changes,
+    and its standard deviation."""
 
     name: str
     tensor: str
@@ -57,28 +66,45 @@ class Error:
 
 
 def errors_of(lens, tolerances):
-    """The independent errors of a lens under ``tolerances``, a list of Error. A plane keeps its radius but not its fringes.
+    """The independent errors of a lens under ``tolerances``, a list of Error. A plane keeps its radius but
+    not its fringes.
 
     Surfaces that do not bend light (a stop in air) have no shape or place to get wrong.
     """
-    found, glass, t = [], is_glass(lens), tolerances
+    found = []
+    glass = is_glass(lens)
+    t = tolerances
     index = lens.index().tolist()
-    for i, (c, a) in enumerate(zip(lens.curvature_per_mm.tolist(), lens.semi_aperture_mm.tolist(), strict=True)):
-        where, bends = f"surface {i + 1}", index[i] != index[i + 1] or lens.mirrors[i]
-        curvature = math.hypot(c * t.radius_relative, c * c * t.radius_mm, t.fringes * 0.546074e-3 / a**2) if bends else 0.0
+    for i, (c, a) in enumerate(
+        zip(lens.curvature_per_mm.tolist(), lens.semi_aperture_mm.tolist(), strict=True)
+    ):
+        where = f"surface {i + 1}"
+        bends = index[i] != index[i + 1] or lens.mirrors[i]
+        curvature = (
+            math.hypot(c * t.radius_relative, c * c * t.radius_mm, t.fringes * 0.546074e-3 / a**2)
+            if bends
+            else 0.0
+        )
         found.append(Error(f"curvature of {where}", "curvature_per_mm", (i,), curvature))
         if i + 1 < len(glass):
             found.append(Error(f"thickness behind {where}", "thickness_mm", (i,), t.thickness_mm))
         if glass[i] and not lens.mirrors[i]:
             found.append(Error(f"index behind {where}", "index_offset", (i,), t.index))
         for axis, label in enumerate("xy"):
-            found.append(Error(f"decentre of {where} in {label}", "decentre_mm", (i, axis), t.decentre_mm * bends))
-            found.append(Error(f"tilt of {where} about {label}", "tilt_rad", (i, axis), math.radians(t.tilt_deg) * bends))
+            found.append(
+                Error(f"decentre of {where} in {label}", "decentre_mm", (i, axis), t.decentre_mm * bends)
+            )
+            found.append(
+                Error(
+                    f"tilt of {where} about {label}", "tilt_rad", (i, axis), math.radians(t.tilt_deg) * bends
+                )
+            )
     return [error for error in found if error.deviation > 0]
 
 
 def perturbed(lens, errors, amounts):
-    """The lens with errors of ``amounts`` [P] standard deviations. Gradient: to the amounts and to the lens."""
+    """The lens with errors of ``amounts`` [P] standard deviations. Gradient: to the amounts and to the
+    lens."""
     if amounts.shape != (len(errors),):
         raise ShapeError(f"{len(errors)} errors need as many amounts, got shape {tuple(amounts.shape)}.")
     tensors = {}
@@ -92,11 +118,13 @@ def perturbed(lens, errors, amounts):
 
 
 def linear_figures(half_field_rad, wavelength_um=WAVELENGTH_UM["d"], compensate=None, grid=8):
-    """Figures that errors change in proportion: the function lens -> [5] of EFL, BFL, distortion at the field (relative), and the x and y of the
+    """Figures that errors change in proportion: the function lens -> [5] of EFL, BFL, distortion at the field
+    (relative), and the x and y of the
     axial spot's mean point; lengths in mm. Names: LINEAR_FIGURES.
 
     Args: compensate: lens -> lens applied first, such as solves.focus_paraxial; None changes nothing.
     """
+
     def figures(lens):
         lens = compensate(lens) if compensate else lens
         f = lens.first_order(wavelength_um)
@@ -104,7 +132,9 @@ def linear_figures(half_field_rad, wavelength_um=WAVELENGTH_UM["d"], compensate=
         weight = arrived[..., None] / arrived.sum(1)[:, None, None]
         mean = (position * weight).sum(1)
         shift = mean[1, 1] - mean[0, 1]
-        return torch.stack([f.efl_mm, f.bfl_mm, shift / (f.efl_mm * math.tan(half_field_rad)) - 1, mean[0, 0], mean[0, 1]])
+        return torch.stack(
+            [f.efl_mm, f.bfl_mm, shift / (f.efl_mm * math.tan(half_field_rad)) - 1, mean[0, 0], mean[0, 1]]
+        )
 
     return figures
 
@@ -113,15 +143,21 @@ LINEAR_FIGURES = ("EFL (mm)", "BFL (mm)", "distortion", "image shift x (mm)", "i
 
 
 def sensitivities(lens, tolerances, figures, jacobian=None):
-    """Change of every figure per standard deviation of every error, [K, P]. The columns are in the order of ``errors_of``.
+    """Change of every figure per standard deviation of every error, [K, P]. The columns are in the order of
+    ``errors_of``.
 
-    Args: figures: lens -> [K]. jacobian: optimise.by_autograd for analytic gradients (K backward passes, best for few figures), or
-      optimise.by_differences(step), step in standard deviations; central differences of 0.1 when left out (2 P evaluations).
+    Args: figures: lens -> [K]. jacobian: optimise.by_autograd for analytic gradients (K backward passes, best
+      for few figures), or
+      optimise.by_differences(step), step in standard deviations; central differences of 0.1 when left out (2
+      P evaluations).
     Gradient: none.
     """
     errors = errors_of(lens, tolerances)
     still = torch.zeros(len(errors), dtype=lens.dtype, device=lens.curvature_per_mm.device)
-    function = lambda amounts: figures(perturbed(lens, errors, amounts))  # noqa: E731
+
+    def function(amounts):
+        return figures(perturbed(lens, errors, amounts))
+
     with torch.no_grad():
         value = function(still)
     return (jacobian or by_differences(0.1, central=True))(function, still, value)
@@ -129,7 +165,8 @@ def sensitivities(lens, tolerances, figures, jacobian=None):
 
 @dataclass(frozen=True)
 class Trials:
-    """Monte Carlo: amounts [N, P] in standard deviations, figures [N, K], nominal [K], failed: trials without a finite result (their figures are NaN)."""
+    """Monte Carlo: amounts [N, P] in standard deviations, figures [N, K], nominal [K], failed: trials without
+    a finite result (their figures are NaN)."""
 
     amounts: Tensor
     figures: Tensor
@@ -143,10 +180,12 @@ class Trials:
 
 
 def monte_carlo(lens, tolerances, figures, count, generator, progress=None):
-    """Trials of ``count`` lenses with random errors. A compensator belongs into ``figures``: it sees the faulty lens.
+    """Trials of ``count`` lenses with random errors. A compensator belongs into ``figures``: it sees the
+    faulty lens.
 
     Args: generator: torch.Generator (CPU). progress: called after every trial, or None.
-    A lens that raises DomainError (no ray arrives, no focal length) is a failed trial: counted, never dropped in silence.
+    A lens that raises DomainError (no ray arrives, no focal length) is a failed trial: counted, never dropped
+    in silence.
     """
     if count < 1:
         raise DomainError(f"{count} trials were asked for; give at least 1.")
@@ -169,8 +208,10 @@ def monte_carlo(lens, tolerances, figures, count, generator, progress=None):
 
 @dataclass(frozen=True)
 class Comparison:
-    """Linear forecast against trials, each [K]: standard deviations forecast and simulated, the correlation of the changes forecast and simulated
-    trial by trial, and how far the mean moved, in simulated standard deviations (0 for a figure that is linear)."""
+    """Linear forecast against trials, each [K]: standard deviations forecast and simulated, the correlation
+    of the changes forecast and simulated
+    trial by trial, and how far the mean moved, in simulated standard deviations (0 for a figure that is
+    linear)."""
 
     forecast: Tensor
     simulated: Tensor
@@ -179,22 +220,33 @@ class Comparison:
 
 
 def compare(slopes, trials):
-    """Comparison of ``sensitivities`` [K, P] with trials of the same lens and tolerances. A figure that nothing changes has correlation 1."""
+    """Comparison of ``sensitivities`` [K, P] with trials of the same lens and tolerances. A figure that
+    nothing changes has correlation 1."""
     good = trials.figures.isfinite().all(1)
     if int(good.sum()) < 3:
-        raise DomainError(f"only {int(good.sum())} trials worked, too few to compare; use smaller tolerances.")
+        raise DomainError(
+            f"only {int(good.sum())} trials worked, too few to compare; use smaller tolerances."
+        )
     change = trials.figures[good] - trials.nominal
     linear = trials.amounts[good] @ slopes.T
     simulated = change.std(0)
-    a, b = linear - linear.mean(0), change - change.mean(0)
+    a = linear - linear.mean(0)
+    b = change - change.mean(0)
     size = torch.linalg.vector_norm(a, dim=0) * torch.linalg.vector_norm(b, dim=0)
     correlation = torch.where(size > 0, (a * b).sum(0) / size.clamp_min(1e-300), 1.0)
-    return Comparison(torch.linalg.vector_norm(slopes, dim=1), simulated, correlation, change.mean(0) / simulated.clamp_min(1e-300))
+    return Comparison(
+        torch.linalg.vector_norm(slopes, dim=1),
+        simulated,
+        correlation,
+        change.mean(0) / simulated.clamp_min(1e-300),
+    )
 
 
 def worst_offenders(lens, tolerances, slopes, figure, most=10):
-    """The errors that change one figure most: a list of (name, change per standard deviation, share of the forecast variance)."""
-    errors, row = errors_of(lens, tolerances), slopes[figure]
+    """The errors that change one figure most: a list of (name, change per standard deviation, share of the
+    forecast variance)."""
+    errors = errors_of(lens, tolerances)
+    row = slopes[figure]
     total = float(row.square().sum())
     order = row.abs().argsort(descending=True)[:most].tolist()
     return [(errors[k].name, float(row[k]), float(row[k]) ** 2 / total if total else 0.0) for k in order]

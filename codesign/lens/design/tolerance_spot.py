@@ -1,8 +1,12 @@
-"""The spot under manufacturing errors. Near an optimum its slope vanishes, so the linear forecast fails; the ray errors themselves stay linear.
+"""The spot under manufacturing errors. Near an optimum its slope vanishes, so the linear forecast fails; the
+ray errors themselves stay linear.
 
-With r the ray errors of the nominal lens about their spot's mean (divided by the root of the ray count, so that r.r is the squared RMS
-spot) and A their change per standard deviation of each error, an error e gives |r + A e|^2. For independent normal e this has mean
-r.r + tr(A^T A) and variance 4 |A^T r|^2 + 2 tr((A^T A)^2). What is left out is the curvature of the rays themselves, r . d2r / de2.
+With r the ray errors of the nominal lens about their spot's mean (divided by the root of the ray count, so
+that r.r is the squared RMS
+spot) and A their change per standard deviation of each error, an error e gives |r + A e|^2. For independent
+normal e this has mean
+r.r + tr(A^T A) and variance 4 |A^T r|^2 + 2 tr((A^T A)^2). What is left out is the curvature of the rays
+themselves, r . d2r / de2.
 """
 
 from dataclasses import dataclass
@@ -17,7 +21,8 @@ from codesign.lens.glass import WAVELENGTH_UM
 
 @dataclass(frozen=True)
 class SpotForecast:
-    """Per field: nominal [F] squared RMS spot, linear [F, P] its slope 2 A^T r, added [F, P] the diagonal of A^T A (mean square that each error
+    """Per field: nominal [F] squared RMS spot, linear [F, P] its slope 2 A^T r, added [F, P] the diagonal of
+    A^T A (mean square that each error
     adds), square [F, P, P] all of A^T A. In mm^2 and per standard deviation."""
 
     nominal: Tensor
@@ -42,20 +47,31 @@ class SpotForecast:
 
     def at(self, amounts):
         """Squared RMS spot forecast for errors of ``amounts`` [N, P] standard deviations, [N, F] mm^2."""
-        return self.nominal + amounts @ self.linear.T + torch.einsum("np,fpq,nq->nf", amounts, self.square, amounts)
+        return (
+            self.nominal
+            + amounts @ self.linear.T
+            + torch.einsum("np,fpq,nq->nf", amounts, self.square, amounts)
+        )
 
 
 def spot_errors(fields_rad, wavelengths_um=(WAVELENGTH_UM["d"],), compensate=None, grid=12):
-    """The figure lens -> [F * M * 2]: ray errors about the mean point of their field over all wavelengths, mm, divided by the root of the ray count.
+    """The figure lens -> [F * M * 2]: ray errors about the mean point of their field over all wavelengths,
+    mm, divided by the root of the ray count.
 
-    Args: compensate: lens -> lens applied first, such as a refocus by solves.focus_rays. Raises: DomainError when a ray fails.
+    Args: compensate: lens -> lens applied first, such as a refocus by solves.focus_rays. Raises: DomainError
+      when a ray fails.
     """
+
     def figure(lens):
         lens = compensate(lens) if compensate else lens
         found = [spots(lens, fields_rad, w, grid) for w in wavelengths_um]
-        position, arrived = torch.cat([p for p, _ in found], 1), torch.cat([a for _, a in found], 1)
+        position = torch.cat([p for p, _ in found], 1)
+        arrived = torch.cat([a for _, a in found], 1)
         if not bool(arrived.bool().all()):
-            raise DomainError(f"{lens.name}: {int((arrived == 0).sum())} rays fail; the forecast needs every ray, so use smaller tolerances or fields.")
+            raise DomainError(
+                f"{lens.name}: {int((arrived == 0).sum())} rays fail; the forecast needs every ray, so use "
+                "smaller tolerances or fields."
+            )
         return ((position - position.mean(1, keepdim=True)) / position.shape[1] ** 0.5).reshape(-1)
 
     return figure
@@ -68,6 +84,9 @@ def squared_spots(errors, fields):
 
 def forecast_spot(nominal, slopes, fields):
     """SpotForecast from ray errors [F * M * 2] and their sensitivities [F * M * 2, P]."""
-    r, A = nominal.reshape(fields, -1), slopes.reshape(fields, -1, slopes.shape[1])
+    r = nominal.reshape(fields, -1)
+    A = slopes.reshape(fields, -1, slopes.shape[1])
     square = torch.einsum("fmp,fmq->fpq", A, A)
-    return SpotForecast(r.square().sum(1), 2 * torch.einsum("fmp,fm->fp", A, r), square.diagonal(dim1=1, dim2=2), square)
+    return SpotForecast(
+        r.square().sum(1), 2 * torch.einsum("fmp,fm->fp", A, r), square.diagonal(dim1=1, dim2=2), square
+    )

@@ -10,21 +10,44 @@ from codesign.lens.glass import Glass
 
 SHAPES = ("Spheric", "Aspheric", "Aperture", "Stop", "Plane")
 AIR = ("air", "vacuum", "occluder")
-# positions and sizes given a second time, in brackets where the writer meant them for the eye, and how diffraction of the stop was sampled
-KNOWN = {"idx", "type", "r", "c", "roc", "d", "d_next", "k", "ai", "mat1", "mat2", "is_square", "diffraction", *(f"ai{i}" for i in range(2, 34, 2))}
+# positions and sizes given a second time, in brackets where the writer meant them for the eye, and how
+# diffraction of the stop was sampled
+KNOWN = {
+    "idx",
+    "type",
+    "r",
+    "c",
+    "roc",
+    "d",
+    "d_next",
+    "k",
+    "ai",
+    "mat1",
+    "mat2",
+    "is_square",
+    "diffraction",
+    *(f"ai{i}" for i in range(2, 34, 2)),
+}
 FITS_MM = 1e-3  # positions are written in single precision
 EQUAL = 1e-6  # two spellings of one number in a file agree to this share
 
 
 def is_deeplens(page):
     """Whether a JSON page is of this format."""
-    return isinstance(page, dict) and "schema" not in page and isinstance(page.get("surfaces"), list) and any(isinstance(s, dict) and "d_next" in s for s in page["surfaces"])
+    return (
+        isinstance(page, dict)
+        and "schema" not in page
+        and isinstance(page.get("surfaces"), list)
+        and any(isinstance(s, dict) and "d_next" in s for s in page["surfaces"])
+    )
 
 
 def read_deeplens(page, name):
-    """FileLens of a page. The stop is the surface of type Stop or Aperture, else the one with the smallest aperture (as that program has it); its radius sets the pupil.
+    """FileLens of a page. The stop is the surface of type Stop or Aperture, else the one with the smallest
+    aperture (as that program has it); its radius sets the pupil.
 
-    The header's focal length and f-number are not used: they follow from the surfaces. Raises: FileFormatError naming surface and field.
+    The header's focal length and f-number are not used: they follow from the surfaces. Raises:
+    FileFormatError naming surface and field.
     """
     surfaces: list[FileSurface] = []
     stops = []
@@ -46,19 +69,29 @@ def read_deeplens(page, name):
 
 def _check_front(row, before):
     """Raise where ``mat1`` is not the medium behind the surface before."""
-    given, behind = (str(name).lower() for name in (row.get("mat1", "air"), before[-1].get("mat2", "air") if before else "air"))
+    given, behind = (
+        str(name).lower()
+        for name in (row.get("mat1", "air"), before[-1].get("mat2", "air") if before else "air")
+    )
     given, behind = ("air" if name in AIR else name for name in (given, behind))
     if "mat1" in row and given != behind:
-        raise FileFormatError(f"mat1 is {shown(given)!r}, but the surface before is followed by {shown(behind)!r}; correct one of them.")
+        raise FileFormatError(
+            f"mat1 is {shown(given)!r}, but the surface before is followed by {shown(behind)!r}; correct "
+            "one of them."
+        )
 
 
 def _check_places(page, surfaces):
     """Raise where the positions ``d`` and ``d_sensor`` contradict the distances ``d_next``."""
-    first, z = p.number(page["surfaces"][0], "d", 0.0), 0.0
+    first = p.number(page["surfaces"][0], "d", 0.0)
+    z = 0.0
     for row, surface in zip([*page["surfaces"], {"d": page.get("d_sensor")}], [*surfaces, None], strict=True):
         given = p.number(row, "d") - first if row.get("d") is not None else z
         if abs(given - z) > FITS_MM:
-            raise FileFormatError(f"{'the sensor' if surface is None else f'surface {surface.label}'} lies at {given:.6g} mm, but the distances d_next lead to {z:.6g} mm; correct one of them.")
+            raise FileFormatError(
+                f"{'the sensor' if surface is None else f'surface {surface.label}'} lies at {given:.6g} mm, "
+                f"but the distances d_next lead to {z:.6g} mm; correct one of them."
+            )
         z += surface.thickness if surface else 0.0
 
 
@@ -74,13 +107,23 @@ def _surface(row, label):
     p.only({key: value for key, value in row.items() if not key.startswith("(")}, KNOWN)
     if p.boolean(row, "is_square"):
         raise FileFormatError("its aperture is square, only circles are read; set is_square to false.")
-    conic, asphere = p.number(row, "k", 0.0), _asphere(row)
+    conic = p.number(row, "k", 0.0)
+    asphere = _asphere(row)
     if kind != "Aspheric" and (conic or any(asphere)):
         raise FileFormatError(f"a surface of type {kind} has a conic or asphere; make it Aspheric.")
     medium = row.get("mat2", "air")
     if not isinstance(medium, str):
         raise FileFormatError(f"mat2 is {shown(medium)!r}, a name or 'nd/Vd' is needed.")
-    return FileSurface(label, _curvature(row), p.number(row, "d_next"), _medium(medium), p.number(row, "r"), True, conic, asphere)
+    return FileSurface(
+        label,
+        _curvature(row),
+        p.number(row, "d_next"),
+        _medium(medium),
+        p.number(row, "r"),
+        True,
+        conic,
+        asphere,
+    )
 
 
 def _curvature(row):
@@ -99,7 +142,8 @@ def _curvature(row):
 
 
 def _asphere(row):
-    """Coefficients of r^2, r^4, ...: the list ``ai`` begins at r^2, unless the single fields show that it begins at r^4."""
+    """Coefficients of r^2, r^4, ...: the list ``ai`` begins at r^2, unless the single fields show that it
+    begins at r^4."""
     terms = p.numbers(row, "ai")
     single = {int(key[2:]) // 2: p.number(row, key) for key in row if re.fullmatch(r"ai\d+", key)}
     if not single:
@@ -107,7 +151,10 @@ def _asphere(row):
     last = max(len(terms), *single)
     for shift in (0, 1):
         listed = (0.0,) * shift + terms
-        if all(abs(value - (listed[i - 1] if i <= len(listed) else 0.0)) <= EQUAL * abs(value) for i, value in single.items()):
+        if all(
+            abs(value - (listed[i - 1] if i <= len(listed) else 0.0)) <= EQUAL * abs(value)
+            for i, value in single.items()
+        ):
             return listed
     if terms:
         raise FileFormatError("the list ai and the fields ai2, ai4, ... disagree; keep one of them.")
@@ -119,5 +166,7 @@ def _medium(text):
         return None
     pair = text.split("/")
     if len(pair) == 2:
-        return Glass.from_abbe(number(pair[0].strip(), "the index nd"), number(pair[1].strip(), "the Abbe number"), text)
+        return Glass.from_abbe(
+            number(pair[0].strip(), "the index nd"), number(pair[1].strip(), "the Abbe number"), text
+        )
     return Glass.named(text)

@@ -15,24 +15,58 @@ SCHEMAS = ("codesign-lens/1", "codesign-lens/2")
 def read_native(page, name, dtype):
     """GeoLens of a page. Raises: FileFormatError or DomainError naming surface and field."""
     if not isinstance(page, dict) or page.get("schema") not in SCHEMAS:
-        raise FileFormatError(f"\"schema\" must be \"{SCHEMAS[0]}\" or \"{SCHEMAS[1]}\"; write it with lens.save, or see docs/lens_files.md.")
-    p.only(page, {"schema", "name", "entrance_pupil_diameter_mm", "soft_edge_mm", "half_field_deg", "surfaces"})
+        raise FileFormatError(
+            f'"schema" must be "{SCHEMAS[0]}" or "{SCHEMAS[1]}"; write it with lens.save, or see '
+            "docs/lens_files.md."
+        )
+    p.only(
+        page, {"schema", "name", "entrance_pupil_diameter_mm", "soft_edge_mm", "half_field_deg", "surfaces"}
+    )
     surfaces = []
     for i, row in enumerate(p.rows(page, "surfaces"), 1):
         with at(f"surface {i}"):
             if not isinstance(row, dict):
                 raise FileFormatError(f"it is {shown(row)!r}, an object is needed; see docs/lens_files.md.")
             surfaces.append(_surface(row).check("its shape"))
-    diameter, soft_edge = p.number(page, "entrance_pupil_diameter_mm", infinite=True), p.number(page, "soft_edge_mm", 0.2)
+    diameter = p.number(page, "entrance_pupil_diameter_mm", infinite=True)
+    soft_edge = p.number(page, "soft_edge_mm", 0.2)
     half_field = p.number(page, "half_field_deg") if page.get("half_field_deg") is not None else None
     return GeoLens(surfaces, diameter, dtype, soft_edge, title(page.get("name", name), name), half_field)
 
 
 def _surface(row):
-    p.only(row, {"radius_mm", "thickness_mm", "medium", "semi_aperture_mm", "conic", "asphere", "is_stop", "mirror", "phase", "decentre_mm", "tilt_deg", "inner_semi_aperture_mm"})
+    p.only(
+        row,
+        {
+            "radius_mm",
+            "thickness_mm",
+            "medium",
+            "semi_aperture_mm",
+            "conic",
+            "asphere",
+            "is_stop",
+            "mirror",
+            "phase",
+            "decentre_mm",
+            "tilt_deg",
+            "inner_semi_aperture_mm",
+        },
+    )
     radius = math.inf if p.present(row, "radius_mm") is None else p.number(row, "radius_mm", infinite=True)
-    return Surface(radius, p.number(row, "thickness_mm"), _medium(row.get("medium")), p.number(row, "semi_aperture_mm"), p.number(row, "conic", 0.0), p.numbers(row, "asphere"),
-                   p.boolean(row, "is_stop"), p.boolean(row, "mirror"), _phase(row.get("phase")), _pair(row, "decentre_mm"), _pair(row, "tilt_deg"), p.number(row, "inner_semi_aperture_mm", 0.0))
+    return Surface(
+        radius,
+        p.number(row, "thickness_mm"),
+        _medium(row.get("medium")),
+        p.number(row, "semi_aperture_mm"),
+        p.number(row, "conic", 0.0),
+        p.numbers(row, "asphere"),
+        p.boolean(row, "is_stop"),
+        p.boolean(row, "mirror"),
+        _phase(row.get("phase")),
+        _pair(row, "decentre_mm"),
+        _pair(row, "tilt_deg"),
+        p.number(row, "inner_semi_aperture_mm", 0.0),
+    )
 
 
 def _medium(medium):
@@ -52,7 +86,11 @@ def _phase(phase):
     order = phase.get("order", 1)
     if isinstance(order, bool) or not isinstance(order, int) or abs(order) > 10_000:
         raise FileFormatError(f"order is {shown(order)!r}, a whole number is needed; correct it.")
-    return Phase(p.numbers(phase, "coefficients"), order, None if phase.get("blaze_um") is None else p.number(phase, "blaze_um"))
+    return Phase(
+        p.numbers(phase, "coefficients"),
+        order,
+        None if phase.get("blaze_um") is None else p.number(phase, "blaze_um"),
+    )
 
 
 def _pair(row, key):
@@ -63,15 +101,38 @@ def _pair(row, key):
 
 
 def to_page(lens):
-    """The page of a lens: plain JSON types. Raises: DomainError for values that ``read_native`` would refuse."""
+    """The page of a lens: plain JSON types. Raises: DomainError for values that ``read_native`` would
+    refuse."""
     rows = []
     for i, s in enumerate(lens.to_surfaces(), 1):
         s.check(f"{lens.name}, surface {i}")
-        row = {"radius_mm": None if math.isinf(s.radius_mm) else s.radius_mm, "thickness_mm": s.thickness_mm, "medium": s.medium and s.medium.to_dict(),
-               "semi_aperture_mm": s.semi_aperture_mm, "conic": s.conic, "asphere": list(s.asphere), "is_stop": s.is_stop}
-        phase = s.phase and {"coefficients": list(s.phase.coefficients), "order": s.phase.order, "blaze_um": s.phase.blaze_um}
-        rare = {"mirror": (s.mirror, False), "phase": (phase, None), "decentre_mm": (list(s.decentre_mm), [0.0, 0.0]), "tilt_deg": (list(s.tilt_deg), [0.0, 0.0]),
-                "inner_semi_aperture_mm": (s.inner_semi_aperture_mm, 0.0)}
+        row = {
+            "radius_mm": None if math.isinf(s.radius_mm) else s.radius_mm,
+            "thickness_mm": s.thickness_mm,
+            "medium": s.medium and s.medium.to_dict(),
+            "semi_aperture_mm": s.semi_aperture_mm,
+            "conic": s.conic,
+            "asphere": list(s.asphere),
+            "is_stop": s.is_stop,
+        }
+        phase = s.phase and {
+            "coefficients": list(s.phase.coefficients),
+            "order": s.phase.order,
+            "blaze_um": s.phase.blaze_um,
+        }
+        rare = {
+            "mirror": (s.mirror, False),
+            "phase": (phase, None),
+            "decentre_mm": (list(s.decentre_mm), [0.0, 0.0]),
+            "tilt_deg": (list(s.tilt_deg), [0.0, 0.0]),
+            "inner_semi_aperture_mm": (s.inner_semi_aperture_mm, 0.0),
+        }
         rows.append(row | {key: value for key, (value, usual) in rare.items() if value != usual})
-    return {"schema": SCHEMAS[1], "name": lens.name, "entrance_pupil_diameter_mm": lens.entrance_pupil_diameter_mm, "soft_edge_mm": lens.soft_edge_mm,
-            "half_field_deg": lens.half_field_deg, "surfaces": rows}
+    return {
+        "schema": SCHEMAS[1],
+        "name": lens.name,
+        "entrance_pupil_diameter_mm": lens.entrance_pupil_diameter_mm,
+        "soft_edge_mm": lens.soft_edge_mm,
+        "half_field_deg": lens.half_field_deg,
+        "surfaces": rows,
+    }

@@ -9,9 +9,34 @@ from codesign.lens.files.text import at, shown, title
 from codesign.lens.glass import Glass
 
 SHAPES = ("Plane", "StandardGeometry", "EvenAsphere")
-PUPILS = {"EPD": "diameter", "imageFNO": "f-number", "paraxialImageFNO": "working f-number", "imageNA": "numerical aperture"}
-FIELDS = {"angle": "angle", "object_height": "object height", "paraxial_image_height": "image height", "real_image_height": "image height"}
-SURFACE = {"type", "geometry", "material_pre", "material_post", "is_stop", "aperture", "is_reflective", "interaction_model", "comment", "surface_type", "thickness", "semi_aperture", "radius", "conic"}
+PUPILS = {
+    "EPD": "diameter",
+    "imageFNO": "f-number",
+    "paraxialImageFNO": "working f-number",
+    "imageNA": "numerical aperture",
+}
+FIELDS = {
+    "angle": "angle",
+    "object_height": "object height",
+    "paraxial_image_height": "image height",
+    "real_image_height": "image height",
+}
+SURFACE = {
+    "type",
+    "geometry",
+    "material_pre",
+    "material_post",
+    "is_stop",
+    "aperture",
+    "is_reflective",
+    "interaction_model",
+    "comment",
+    "surface_type",
+    "thickness",
+    "semi_aperture",
+    "radius",
+    "conic",
+}
 
 
 def is_optiland(page):
@@ -20,7 +45,8 @@ def is_optiland(page):
 
 
 def read_optiland(page, name):
-    """FileLens of a page; solves and pickups keep the stored values. Raises: FileFormatError naming surface and field."""
+    """FileLens of a page; solves and pickups keep the stored values. Raises: FileFormatError naming surface
+    and field."""
     entries = []
     for i, row in enumerate(p.rows(p.entry(page, "surface_group"), "surfaces")):
         with at(f"surface {i}"):
@@ -28,7 +54,9 @@ def read_optiland(page, name):
                 raise FileFormatError(f"it is {shown(row)!r}, an object is needed.")
             entries.append((row, _place(row, infinite=i == 0)))
     if len(entries) < 3:
-        raise FileFormatError(f"it has {len(entries)} surfaces; a lens needs at least object, one surface and image.")
+        raise FileFormatError(
+            f"it has {len(entries)} surfaces; a lens needs at least object, one surface and image."
+        )
     surfaces = []
     for i, (row, z) in enumerate(entries[1:-1], 1):
         with at(f"surface {i}"):
@@ -36,11 +64,19 @@ def read_optiland(page, name):
     with at("the image surface"):
         row, (x, y, _) = entries[-1]
         if x or y or _curvature(p.entry(row, "geometry")) or boolean_mirror(row):
-            raise FileFormatError("it is curved, shifted or reflects; only a flat image plane on the axis is read.")
+            raise FileFormatError(
+                "it is curved, shifted or reflects; only a flat image plane on the axis is read."
+            )
     if sum(s.is_stop for s in surfaces) != 1:
-        raise FileFormatError(f"surfaces {[s.label for s in surfaces if s.is_stop]} are marked as the stop; mark one with is_stop.")
+        raise FileFormatError(
+            f"surfaces {[s.label for s in surfaces if s.is_stop]} are marked as the stop; mark one with "
+            "is_stop."
+        )
     with at("the object surface"):
-        if entries[0][0].get("material_post") is not None and _medium(entries[0][0], "material_post") is not None:
+        if (
+            entries[0][0].get("material_post") is not None
+            and _medium(entries[0][0], "material_post") is not None
+        ):
             raise FileFormatError("the object does not lie in air; only objects in air are read.")
     lens = FileLens(name, surfaces, object_distance=abs(entries[1][1][2] - entries[0][1][2]))
     lens.name = title(page.get("name") or "", name)
@@ -51,33 +87,52 @@ def read_optiland(page, name):
 
 
 def _take_pupil(lens, aperture, surfaces):
-    kind, value = p.present(aperture, "type"), p.number(aperture, "value")
+    kind = p.present(aperture, "type")
+    value = p.number(aperture, "value")
     if p.boolean(aperture, "object_space_telecentric"):
-        raise FileFormatError("the object space is telecentric, so its pupil is not that of the stop; switch that off in the file.")
+        raise FileFormatError(
+            "the object space is telecentric, so its pupil is not that of the stop; switch that off in the "
+            "file."
+        )
     if kind == "float_by_stop_size":
         next(s for s in surfaces if s.is_stop).semi_aperture = value / 2
         lens.pupil = "stop", 0.0
     elif kind in PUPILS:
         lens.pupil = PUPILS[kind], value
     else:
-        raise FileFormatError(f"the aperture is given as {shown(kind)}, which says nothing for other object distances or is not known; give it as EPD.")
+        raise FileFormatError(
+            f"the aperture is given as {shown(kind)}, which says nothing for other object distances or is "
+            "not known; give it as EPD."
+        )
 
 
 def _take_field(lens, fields):
     if not isinstance(fields, dict) or not isinstance(fields.get("fields"), list) or not fields["fields"]:
         return
-    kind = fields.get("field_type", fields["fields"][0].get("field_type") if isinstance(fields["fields"][0], dict) else None)
+    kind = fields.get(
+        "field_type", fields["fields"][0].get("field_type") if isinstance(fields["fields"][0], dict) else None
+    )
     kind = kind.get("field_type") if isinstance(kind, dict) else kind
     if kind not in FIELDS:
         raise FileFormatError(f"the fields are given as {shown(kind)}; known are {', '.join(FIELDS)}.")
     if p.boolean(fields, "object_space_telecentric") or p.boolean(fields, "telecentric"):
-        raise FileFormatError("the object space is telecentric, so its pupil is not that of the stop; switch that off in the file.")
+        raise FileFormatError(
+            "the object space is telecentric, so its pupil is not that of the stop; switch that off in the "
+            "file."
+        )
     points = [f for f in fields["fields"] if isinstance(f, dict)]
-    lens.field = FIELDS[kind], max((math.hypot(p.number(f, "x", 0.0), p.number(f, "y", 0.0)) for f in points), default=0.0)
+    lens.field = (
+        FIELDS[kind],
+        max((math.hypot(p.number(f, "x", 0.0), p.number(f, "y", 0.0)) for f in points), default=0.0),
+    )
 
 
 def _take_wavelength(lens, waves):
-    listed = [w for w in waves["wavelengths"] if isinstance(w, dict)] if isinstance(waves, dict) and isinstance(waves.get("wavelengths"), list) else []
+    listed = (
+        [w for w in waves["wavelengths"] if isinstance(w, dict)]
+        if isinstance(waves, dict) and isinstance(waves.get("wavelengths"), list)
+        else []
+    )
     for wave in listed:
         if p.boolean(wave, "is_primary"):
             unit = wave.get("unit", "um")
@@ -90,7 +145,9 @@ def _place(row, infinite):
     """Vertex (x, y, z); z of the object may be infinite."""
     axes = p.entry(p.entry(row, "geometry"), "cs")
     if axes.get("reference_cs") is not None:
-        raise FileFormatError("its axes refer to those of another surface (reference_cs), which is not read; give global axes.")
+        raise FileFormatError(
+            "its axes refer to those of another surface (reference_cs), which is not read; give global axes."
+        )
     if any(p.number(axes, key, 0.0) for key in ("rx", "ry")):
         raise FileFormatError("it is tilted (rx, ry), which is not read; only untilted surfaces are.")
     return p.number(axes, "x", 0.0), p.number(axes, "y", 0.0), p.number(axes, "z", infinite=infinite)
@@ -104,8 +161,20 @@ def _surface(row, label, thickness, place):
     mirror = boolean_mirror(row)
     aperture, inner = _aperture(row.get("aperture"))
     asphere = p.numbers(shape, "coefficients") if shape["type"] == "EvenAsphere" else ()
-    return FileSurface(label, _curvature(shape), thickness, None if mirror else _medium(row, "material_post"), aperture, aperture is not None, p.number(shape, "conic", 0.0), asphere,
-                       p.boolean(row, "is_stop"), mirror, decentre=place[:2], inner=inner)
+    return FileSurface(
+        label,
+        _curvature(shape),
+        thickness,
+        None if mirror else _medium(row, "material_post"),
+        aperture,
+        aperture is not None,
+        p.number(shape, "conic", 0.0),
+        asphere,
+        p.boolean(row, "is_stop"),
+        mirror,
+        decentre=place[:2],
+        inner=inner,
+    )
 
 
 def boolean_mirror(row):
@@ -113,8 +182,14 @@ def boolean_mirror(row):
     model = row.get("interaction_model")
     if model is None:
         return p.boolean(row, "is_reflective")
-    if not isinstance(model, dict) or model.get("type", "RefractiveReflectiveModel") != "RefractiveReflectiveModel":
-        raise FileFormatError(f"its interaction {shown(model.get('type') if isinstance(model, dict) else model)} is not read; only refraction and reflection are.")
+    if (
+        not isinstance(model, dict)
+        or model.get("type", "RefractiveReflectiveModel") != "RefractiveReflectiveModel"
+    ):
+        raise FileFormatError(
+            f"its interaction {shown(model.get('type') if isinstance(model, dict) else model)} is not read; "
+            "only refraction and reflection are."
+        )
     return p.boolean(model, "is_reflective")
 
 
@@ -132,8 +207,12 @@ def _aperture(aperture):
     if aperture is None:
         return None, 0.0
     if not isinstance(aperture, dict) or aperture.get("type") != "RadialAperture":
-        raise FileFormatError("its aperture is not a circle around the axis (RadialAperture), and only those are read; replace it.")
-    inner, outer = p.number(aperture, "r_min", 0.0), p.number(aperture, "r_max", infinite=True)
+        raise FileFormatError(
+            "its aperture is not a circle around the axis (RadialAperture), and only those are read; "
+            "replace it."
+        )
+    inner = p.number(aperture, "r_min", 0.0)
+    outer = p.number(aperture, "r_max", infinite=True)
     return (outer if math.isfinite(outer) else None), inner
 
 
@@ -147,4 +226,6 @@ def _medium(row, key):
         return Glass.from_abbe(p.number(material, "index"), p.number(material, "abbe"))
     if kind == "Material" and isinstance(material.get("name"), str):
         return Glass.named(material["name"])
-    raise FileFormatError(f"its material {shown(kind)} is not read; IdealMaterial, AbbeMaterial and Material are.")
+    raise FileFormatError(
+        f"its material {shown(kind)} is not read; IdealMaterial, AbbeMaterial and Material are."
+    )

@@ -10,13 +10,16 @@ DEEPEST = 30
 
 
 def parse(text):
-    """The object a JSON text holds. Raises: FileFormatError when it is not JSON, nests deeper than 30, or has a key twice."""
+    """The object a JSON text holds. Raises: FileFormatError when it is not JSON, nests deeper than 30, or has
+    a key twice."""
     try:
         page = json.loads(text, object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
         if isinstance(error, FileFormatError):
             raise
-        raise FileFormatError(f"it is not readable JSON ({shown(error)}); write it again with lens.save.") from error
+        raise FileFormatError(
+            f"it is not readable JSON ({shown(error)}); write it again with lens.save."
+        ) from error
     if _depth(page) > DEEPEST:
         raise FileFormatError(f"it nests deeper than {DEEPEST} levels; is it a lens file?")
     return page
@@ -32,15 +35,22 @@ def _once(pairs):
 
 
 def _depth(page):
-    depth, level = 0, [page]
+    depth = 0
+    level = [page]
     while level and depth <= DEEPEST:
         depth += 1
-        level = [v for node in level if isinstance(node, (dict, list)) for v in (node.values() if isinstance(node, dict) else node)]
+        level = [
+            v
+            for node in level
+            if isinstance(node, (dict, list))
+            for v in (node.values() if isinstance(node, dict) else node)
+        ]
     return depth
 
 
 def number(row, key, default=None, infinite=False):
-    """The number under a key, finite unless ``infinite``. Raises: FileFormatError when it is missing, of another kind, or not finite."""
+    """The number under a key, finite unless ``infinite``. Raises: FileFormatError when it is missing, of
+    another kind, or not finite."""
     if key not in row and default is not None:
         return default
     value = present(row, key)
@@ -74,7 +84,9 @@ def numbers(row, key, most=16):
     value = row.get(key)
     value = [] if value is None else value
     if not isinstance(value, list) or len(value) > most:
-        raise FileFormatError(f"{key} is {shown(value)}, a list of at most {most} numbers is needed; correct it.")
+        raise FileFormatError(
+            f"{key} is {shown(value)}, a list of at most {most} numbers is needed; correct it."
+        )
     return tuple(number({key: v}, key) for v in value)
 
 
@@ -90,12 +102,16 @@ def rows(page, key):
     """The list of 1 to MOST_SURFACES objects under a key."""
     value = page.get(key)
     if not isinstance(value, list) or not 0 < len(value) <= MOST_SURFACES:
-        raise FileFormatError(f"\"{key}\" must be a list of 1 to {MOST_SURFACES} surfaces; add at least one.")
+        raise FileFormatError(f'"{key}" must be a list of 1 to {MOST_SURFACES} surfaces; add at least one.')
     return value
 
 
 def only(row, known):
     """Raise for a key that says something (not null, false, zero or empty) and is not known."""
-    strange = [key for key, value in row.items() if key not in known and value not in (None, False, 0, "", [], {})]
+    strange = [
+        key for key, value in row.items() if key not in known and value not in (None, False, 0, "", [], {})
+    ]
     if strange:
-        raise FileFormatError(f"the field '{shown(strange[0])}' is not understood; delete it if it changes no ray.")
+        raise FileFormatError(
+            f"the field '{shown(strange[0])}' is not understood; delete it if it changes no ray."
+        )

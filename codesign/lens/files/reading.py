@@ -22,30 +22,48 @@ TEXTS = {".zmx": read_zmx, ".seq": read_seq, ".txt": read_diffoptics}
 
 
 def load(source, dtype=torch.float64):
-    """Lens from a catalogue name (cooke-triplet, double-gauss, la1509) or a file; docs/lens_files.md says what is read of each.
+    """Lens from a catalogue name (cooke-triplet, double-gauss, la1509) or a file; docs/lens_files.md says
+    what is read of each.
 
-    Args: source: name, or path with the extension .json (native, DeepLens or optiland), .zmx, .seq, or .txt (DiffOptics). dtype: precision of the lens.
+    Args: source: name, or path with the extension .json (native, DeepLens or optiland), .zmx, .seq, or .txt
+      (DiffOptics). dtype: precision of the lens.
     Returns: GeoLens. Files are parsed, never executed; at most 2 MB and 500 surfaces are read.
-    Raises: FileFormatError or DomainError, one sentence naming file, place, fault and remedy; nothing is half loaded or dropped.
+    Raises: FileFormatError or DomainError, one sentence naming file, place, fault and remedy; nothing is half
+      loaded or dropped.
     """
     if str(source) in catalogue.LENSES:
         surfaces, diameter = catalogue.named_surfaces(str(source))
-        return GeoLens(surfaces, diameter, dtype, name=str(source), half_field_deg=catalogue.half_field_deg(str(source)))
+        return GeoLens(
+            surfaces, diameter, dtype, name=str(source), half_field_deg=catalogue.half_field_deg(str(source))
+        )
     path = Path(source)
     if not os.path.exists(path):
-        raise FileFormatError(f"lens '{str(source)[:200]}' is neither a file nor a known name; known names: {', '.join(catalogue.LENSES)}.")
+        raise FileFormatError(
+            f"lens '{str(source)[:200]}' is neither a file nor a known name; known names: "
+            f"{', '.join(catalogue.LENSES)}."
+        )
     with at(f"lens file {path}"):
         suffix = path.suffix.lower()
         if suffix not in (".json", *TEXTS):
-            raise FileFormatError(f"extension '{path.suffix}' is not read; give .json, {', '.join(TEXTS)}, or one of {', '.join(catalogue.LENSES)}.")
+            raise FileFormatError(
+                f"extension '{path.suffix}' is not read; give .json, {', '.join(TEXTS)}, or one of "
+                f"{', '.join(catalogue.LENSES)}."
+            )
         text = read_text(path)
         name = title(path.stem, "lens")
         try:
-            return _from_json(text, name, dtype) if suffix == ".json" else assemble(TEXTS[suffix](text, name), dtype)
+            return (
+                _from_json(text, name, dtype)
+                if suffix == ".json"
+                else assemble(TEXTS[suffix](text, name), dtype)
+            )
         except CodesignError:
             raise
         except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-            raise FileFormatError(f"a value is of the wrong kind or size ({' '.join(str(error).split())[:80]}); see docs/lens_files.md.") from error
+            raise FileFormatError(
+                f"a value is of the wrong kind or size ({' '.join(str(error).split())[:80]}); see "
+                "docs/lens_files.md."
+            ) from error
 
 
 def _from_json(text, name, dtype):

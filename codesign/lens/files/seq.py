@@ -19,8 +19,10 @@ FAR = 1e9  # an object beyond this counts as infinitely far
 def read_seq(text, name):
     """FileLens of the text of a .seq file.
 
-    Without RDM, the first number of S is a curvature; without STO, the first surface is the stop (the program's own defaults).
-    Solves and pickups keep the stored values; PIM is solved again. Raises: FileFormatError naming surface or line for what is not understood.
+    Without RDM, the first number of S is a curvature; without STO, the first surface is the stop (the
+    program's own defaults).
+    Solves and pickups keep the stored values; PIM is solved again. Raises: FileFormatError naming surface or
+    line for what is not understood.
     """
     system = System(name)
     for line, words in statements(text):
@@ -30,8 +32,10 @@ def read_seq(text, name):
 
 
 def statements(text):
-    """Statements of a .seq file as (line number, words): comments from ! dropped, lines ending in & joined, statements parted at ;."""
-    held, start = "", 0
+    """Statements of a .seq file as (line number, words): comments from ! dropped, lines ending in & joined,
+    statements parted at ;."""
+    held = ""
+    start = 0
     for at_line, raw in lines(text):
         parts = _split(raw)
         for i, part in enumerate(parts):
@@ -40,7 +44,8 @@ def statements(text):
             if last and part.rstrip().endswith("&"):
                 held += part.rstrip()[:-1] + " "
                 continue
-            words, held = WORD.findall(held + part), ""
+            words = WORD.findall(held + part)
+            held = ""
             if words:
                 yield start, words
     if held.strip():
@@ -49,7 +54,9 @@ def statements(text):
 
 def _split(line):
     """A line without its comment, parted at semicolons; both only count outside quotes."""
-    parts, quote, begin = [], "", 0
+    parts = []
+    quote = ""
+    begin = 0
     for i, character in enumerate(line):
         if quote:
             quote = "" if character == quote else quote
@@ -70,9 +77,12 @@ class System:
     def __init__(self, name):
         self.lens = FileLens(name)
         self.surfaces: list[SeqSurface] = []
-        self.object, self.image = SeqSurface(0), SeqSurface("image")
+        self.object = SeqSurface(0)
+        self.image = SeqSurface("image")
         self.current: SeqSurface | None = None
-        self.radius_mode, self.waves, self.reference = False, [587.5618], 1
+        self.radius_mode = False
+        self.waves = [587.5618]
+        self.reference = 1
         self.fields: dict[str, list[float]] = {}
         self.glasses = PrivateGlasses()
 
@@ -80,7 +90,8 @@ class System:
         if self.glasses.open:
             self.glasses.take(words)
             return
-        command, values = words[0].upper(), words[1:]
+        command = words[0].upper()
+        values = words[1:]
         if re.fullmatch(r"S(\d{1,4}|O|I)?", command, re.ASCII):
             self._take_surface(command, values)
             return
@@ -117,7 +128,10 @@ class System:
             self.current = self.image
         else:
             if command[1:] and int(command[1:]) != len(self.surfaces) + 1:
-                raise FileFormatError(f"{command} comes where surface {len(self.surfaces) + 1} is due; number the surfaces in order, once each.")
+                raise FileFormatError(
+                    f"{command} comes where surface {len(self.surfaces) + 1} is due; number the surfaces in "
+                    "order, once each."
+                )
             if len(self.surfaces) >= MOST_SURFACES:
                 raise FileFormatError(f"it holds more than {MOST_SURFACES} surfaces; is it a lens?")
             self.current = SeqSurface(len(self.surfaces) + 1)
@@ -131,17 +145,28 @@ class System:
         elif command == "PRV":
             self.glasses.open = True
         elif command in ("TIT", "LEN"):
-            self.lens.name = title(" ".join(values).strip("'\""), self.lens.name) if command == "TIT" else self.lens.name
+            self.lens.name = (
+                title(" ".join(values).strip("'\""), self.lens.name) if command == "TIT" else self.lens.name
+            )
         elif not values:
-            raise FileFormatError(f"command '{shown(command)}' has no value, or is not understood; delete it if it changes no ray.")
+            raise FileFormatError(
+                f"command '{shown(command)}' has no value, or is not understood; delete it if it changes no "
+                "ray."
+            )
         elif command == "DIM":
             if values[0].upper() not in UNITS_MM:
-                raise FileFormatError(f"unit '{shown(values[0])}' is not known; give DIM M (millimetres), C (centimetres) or I (inches).")
+                raise FileFormatError(
+                    f"unit '{shown(values[0])}' is not known; give DIM M (millimetres), C (centimetres) or "
+                    "I (inches)."
+                )
             self.lens.unit_mm = UNITS_MM[values[0].upper()]
         elif command in PUPILS:
             self.lens.pupil = PUPILS[command], number(values[0], command)
         elif command == "NAO":
-            raise FileFormatError("the pupil is given by the cone of light at a near object (NAO), which says nothing for other distances; give the entrance pupil diameter (EPD).")
+            raise FileFormatError(
+                "the pupil is given by the cone of light at a near object (NAO), which says nothing for "
+                "other distances; give the entrance pupil diameter (EPD)."
+            )
         elif command == "WL":
             self.waves = [number(v, command) for v in values]
         elif command == "REF":
@@ -150,17 +175,25 @@ class System:
             self.fields[command] = [number(v, command) for v in values]
         elif command in ("TEM", "PRE"):
             if number(values[0], command) != {"TEM": 20.0, "PRE": 760.0}[command]:
-                raise FileFormatError(f"{command} is {shown(values[0])}; indices are those at 20 degrees and 760 mm of mercury, so remove it or design for that.")
+                raise FileFormatError(
+                    f"{command} is {shown(values[0])}; indices are those at 20 degrees and 760 mm of "
+                    "mercury, so remove it or design for that."
+                )
         else:
-            raise FileFormatError(f"command '{shown(command)}' is not understood; delete it if it changes no ray.")
+            raise FileFormatError(
+                f"command '{shown(command)}' is not understood; delete it if it changes no ray."
+            )
 
     def finish(self):
         """FileLens of all that was read."""
-        lens, stops = self.lens, [s.label for s in self.surfaces if s.is_stop]
+        lens = self.lens
+        stops = [s.label for s in self.surfaces if s.is_stop]
         if not self.surfaces:
             raise FileFormatError("it has no surface (a line such as S 50 3 N-BK7); is it a lens?")
         if len(stops) > 1 or self.object.is_stop or self.image.is_stop:
-            raise FileFormatError(f"surfaces {stops} are marked as the stop (STO); mark one between object and image.")
+            raise FileFormatError(
+                f"surfaces {stops} are marked as the stop (STO); mark one between object and image."
+            )
         if not stops:
             self.surfaces[0].is_stop = True
         self.image.check_image()
@@ -171,11 +204,22 @@ class System:
         lens.defocus = self.image.thickness
         lens.object_distance = self.object.thickness if abs(self.object.thickness) < FAR else math.inf
         if not 1 <= self.reference <= len(self.waves):
-            raise FileFormatError(f"the reference wavelength is number {self.reference} of {len(self.waves)}; correct REF.")
+            raise FileFormatError(
+                f"the reference wavelength is number {self.reference} of {len(self.waves)}; correct REF."
+            )
         lens.wavelength_um = self.waves[self.reference - 1] * 1e-3
         for kind, label in FIELDS.items():
-            x, y = self.fields.get(f"X{kind}", []), self.fields.get(f"Y{kind}", [])
+            x = self.fields.get(f"X{kind}", [])
+            y = self.fields.get(f"Y{kind}", [])
             if x or y:
                 count = max(len(x), len(y))
-                lens.field = label, max(math.hypot(*pair) for pair in zip(x + [0.0] * (count - len(x)), y + [0.0] * (count - len(y)), strict=True))
+                lens.field = (
+                    label,
+                    max(
+                        math.hypot(*pair)
+                        for pair in zip(
+                            x + [0.0] * (count - len(x)), y + [0.0] * (count - len(y)), strict=True
+                        )
+                    ),
+                )
         return lens

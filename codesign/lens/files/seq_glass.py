@@ -38,15 +38,23 @@ class PrivateGlasses:
             return self._private(name)
         code = CODE.fullmatch(name)
         if code:  # 569.631: nd 1.569, Vd 63.1
-            return Glass.from_abbe(1 + int(code[1]) / 10 ** len(code[1]), int(code[2]) / 10 ** (len(code[2]) - 2), name)
+            return Glass.from_abbe(
+                1 + int(code[1]) / 10 ** len(code[1]), int(code[2]) / 10 ** (len(code[2]) - 2), name
+            )
         return Glass.named(name)
 
     def _private(self, name):
         table = self.tables[name]
         if isinstance(table, str):
-            raise FileFormatError(f"its glass {shown(name)} is given by a formula ({shown(table)}), which is not read; give its indices at wavelengths (PWL).")
+            raise FileFormatError(
+                f"its glass {shown(name)} is given by a formula ({shown(table)}), which is not read; give "
+                "its indices at wavelengths (PWL)."
+            )
         if len(table) != len(self.waves_um) or len(set(self.waves_um)) < 2 or min(self.waves_um) <= 0:
-            raise FileFormatError(f"its glass {shown(name)} has {len(table)} indices for {len(self.waves_um)} wavelengths; give one each, for at least two positive wavelengths.")
+            raise FileFormatError(
+                f"its glass {shown(name)} has {len(table)} indices for {len(self.waves_um)} wavelengths; "
+                "give one each, for at least two positive wavelengths."
+            )
         points = sorted(zip(self.waves_um, table, strict=True))
         F, d, C = (_between(points, w, name) for w in WAVELENGTH_UM.values())
         return Glass.from_indices(F, d, C, name)
@@ -58,7 +66,10 @@ def _between(points, wavelength_um, name):
         if a <= wavelength_um <= b and a < b:
             share = (wavelength_um**-2 - a**-2) / (b**-2 - a**-2)
             return n_a + share * (n_b - n_a)
-    raise FileFormatError(f"its glass {shown(name)} is given from {points[0][0]:g} to {points[-1][0]:g} um, without {wavelength_um:g} um; give more indices (PWL).")
+    raise FileFormatError(
+        f"its glass {shown(name)} is given from {points[0][0]:g} to {points[-1][0]:g} um, without "
+        f"{wavelength_um:g} um; give more indices (PWL)."
+    )
 
 
 def _plain(word):

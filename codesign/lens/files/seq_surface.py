@@ -13,17 +13,103 @@ from codesign.lens.surface import Phase
 ASPHERE = {letter: 2 + i for i, letter in enumerate("ABCDEFGHJ")}  # half the power of r: A r^4 to J r^20
 MOVES = ("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE")
 REFUSED = {
-    "REV": "it tilts or shifts everything behind it", "BEN": "it bends the axis", "RET": "it returns to the axes of another surface", "GLB": "it is placed in global axes",
-    "XTO": "it is toroidal", "YTO": "it is toroidal", "CYL": "it is cylindrical", "AAS": "it is anamorphic", "SPS": "it is a special surface", "UDS": "its shape is user-defined", "SPL": "its shape is a spline",
-    "ZRN": "its shape is not one of revolution", "GRN": "its index has a gradient", "HOE": "it is a two-point hologram", "GRT": "it is a ruled grating", "DEF": "its shape is deformed", "NSS": "it is not sequential",
-    "REX": "its aperture is rectangular", "REY": "its aperture is rectangular", "ELX": "its aperture is elliptical", "ELY": "its aperture is elliptical",
-    "ADX": "its aperture is off the axis", "ADY": "its aperture is off the axis", "ARO": "its aperture is turned", "CUX": "its two curvatures differ", "RDX": "its two curvatures differ",
+    "REV": "it tilts or shifts everything behind it",
+    "BEN": "it bends the axis",
+    "RET": "it returns to the axes of another surface",
+    "GLB": "it is placed in global axes",
+    "XTO": "it is toroidal",
+    "YTO": "it is toroidal",
+    "CYL": "it is cylindrical",
+    "AAS": "it is anamorphic",
+    "SPS": "it is a special surface",
+    "UDS": "its shape is user-defined",
+    "SPL": "its shape is a spline",
+    "ZRN": "its shape is not one of revolution",
+    "GRN": "its index has a gradient",
+    "HOE": "it is a two-point hologram",
+    "GRT": "it is a ruled grating",
+    "DEF": "its shape is deformed",
+    "NSS": "it is not sequential",
+    "REX": "its aperture is rectangular",
+    "REY": "its aperture is rectangular",
+    "ELX": "its aperture is elliptical",
+    "ELY": "its aperture is elliptical",
+    "ADX": "its aperture is off the axis",
+    "ADY": "its aperture is off the axis",
+    "ARO": "its aperture is turned",
+    "CUX": "its two curvatures differ",
+    "RDX": "its two curvatures differ",
 }
-OWN = {"SPH", "CON", "ASP", "K", *ASPHERE, "CUF", "CIR", *MOVES, "DAR", "THI", "RDY", "CUY", "GLA", "DIF", "HOR", "HWL", "HCT", "HCO", "RMD"}
+OWN = {
+    "SPH",
+    "CON",
+    "ASP",
+    "K",
+    *ASPHERE,
+    "CUF",
+    "CIR",
+    *MOVES,
+    "DAR",
+    "THI",
+    "RDY",
+    "CUY",
+    "GLA",
+    "DIF",
+    "HOR",
+    "HWL",
+    "HCT",
+    "HCO",
+    "RMD",
+}
 SURFACE = OWN | set(REFUSED)
-# labels, weights, variables, couplings, vignetting of the bundle, colours, solves and pickups: the values they lead to stand in the file, or no ray changes
-IDLE = {"INI", "WTW", "WTF", "WTX", "WTY", "VUX", "VLX", "VUY", "VLY", "SLB", "CCY", "CCX", "THC", "CUC", "GLC", "KC", "AC", "BC", "CC", "DC", "EC", "FC", "GC", "HC", "JC", "HCC", "XDC", "YDC", "ZDC",
-        "ADC", "BDC", "CDC", "CUM", "THM", "GLM", "DER", "CLS", "PIK", "POL", "CA", "GO", "COM", "CWL", "PTC"}
+# labels, weights, variables, couplings, vignetting of the bundle, colours, solves and pickups: the values
+# they lead to stand in the file, or no ray changes
+IDLE = {
+    "INI",
+    "WTW",
+    "WTF",
+    "WTX",
+    "WTY",
+    "VUX",
+    "VLX",
+    "VUY",
+    "VLY",
+    "SLB",
+    "CCY",
+    "CCX",
+    "THC",
+    "CUC",
+    "GLC",
+    "KC",
+    "AC",
+    "BC",
+    "CC",
+    "DC",
+    "EC",
+    "FC",
+    "GC",
+    "HC",
+    "JC",
+    "HCC",
+    "XDC",
+    "YDC",
+    "ZDC",
+    "ADC",
+    "BDC",
+    "CDC",
+    "CUM",
+    "THM",
+    "GLM",
+    "DER",
+    "CLS",
+    "PIK",
+    "POL",
+    "CA",
+    "GO",
+    "COM",
+    "CWL",
+    "PTC",
+}
 
 
 @dataclass
@@ -68,9 +154,14 @@ class SeqSurface:
         """Take one command. Raises: FileFormatError for what cannot be traced."""
         first = values[0].upper() if values else ""
         if command in REFUSED:
-            off_axis_by_nothing = command in ("ADX", "ADY", "ARO", "CUX", "RDX") and values and _is_zero(values[-1])
+            off_axis_by_nothing = (
+                command in ("ADX", "ADY", "ARO", "CUX", "RDX") and values and _is_zero(values[-1])
+            )
             if not off_axis_by_nothing:
-                raise FileFormatError(f"{REFUSED[command]} ({command}), which is not read; use a design of centred surfaces of revolution with circular apertures.")
+                raise FileFormatError(
+                    f"{REFUSED[command]} ({command}), which is not read; use a design of centred surfaces "
+                    "of revolution with circular apertures."
+                )
         elif command in ("SPH", "CON", "ASP"):
             self.kind = command
         elif command == "DAR":
@@ -84,7 +175,10 @@ class SeqSurface:
         elif command in MOVES:
             self.moves[command] = number(first, command)
         elif command == "CUF" and not _is_zero(first):
-            raise FileFormatError(f"it is a Fresnel surface on a curved base (CUF {shown(first)}), which is not read; use the smooth surface.")
+            raise FileFormatError(
+                f"it is a Fresnel surface on a curved base (CUF {shown(first)}), which is not read; use the "
+                "smooth surface."
+            )
         elif command == "CIR":
             self._take_circle(values)
         elif command in ("THI", "RDY", "CUY", "GLA", "RMD"):
@@ -106,19 +200,30 @@ class SeqSurface:
         words = [v.upper() for v in values[:-1] if not v.upper().startswith("L'")]
         kind = words[0] if words else "CLEAR"
         if len(words) > 1 or kind not in ("CLEAR", "OBS", "HOL", "EDG"):
-            raise FileFormatError(f"its aperture CIR {shown(' '.join(values))} is not understood; give CIR, CIR OBS, CIR HOL or CIR EDG with one radius.")
+            raise FileFormatError(
+                f"its aperture CIR {shown(' '.join(values))} is not understood; give CIR, CIR OBS, CIR HOL "
+                "or CIR EDG with one radius."
+            )
         radius = number(values[-1], "CIR")
         if radius <= 0:
             raise FileFormatError(f"the radius of its aperture is {radius:g}; it must be positive.")
-        self.apertures[kind] = min(radius, self.apertures.get(kind, math.inf)) if kind == "CLEAR" else max(radius, self.apertures.get(kind, 0.0))
+        self.apertures[kind] = (
+            min(radius, self.apertures.get(kind, math.inf))
+            if kind == "CLEAR"
+            else max(radius, self.apertures.get(kind, 0.0))
+        )
 
     def _take_diffraction(self, command, values):
         if command == "DIF":
             if values[0].upper() != "DOE":
-                raise FileFormatError(f"it diffracts as {shown(values[0])}; only DIF DOE with a radial phase is read.")
+                raise FileFormatError(
+                    f"it diffracts as {shown(values[0])}; only DIF DOE with a radial phase is read."
+                )
             self.diffractive = True
         elif command == "HCT" and values[0].upper() != "R":
-            raise FileFormatError(f"its phase is of the kind HCT {shown(values[0])}; only radial phases (HCT R) are read.")
+            raise FileFormatError(
+                f"its phase is of the kind HCT {shown(values[0])}; only radial phases (HCT R) are read."
+            )
         elif command == "HOR":
             order = number(values[0], command)
             if order != int(order):
@@ -128,7 +233,9 @@ class SeqSurface:
             self.wavelength_nm = number(values[0], command)
         elif command == "HCO":
             if len(values) != 2 or values[0][:1].upper() != "C":
-                raise FileFormatError(f"HCO {shown(' '.join(values))} is not understood; give HCO C1 with its value.")
+                raise FileFormatError(
+                    f"HCO {shown(' '.join(values))} is not understood; give HCO C1 with its value."
+                )
             term = whole(values[0][1:], "the number of a phase coefficient", 16)
             if term == 0:
                 raise FileFormatError("HCO C0 is not understood; coefficients count from C1.")
@@ -136,7 +243,10 @@ class SeqSurface:
 
     def check_image(self):
         if self.curvature or self.medium is not None or self.mirror or any(self.moves.values()):
-            raise FileFormatError("the image surface is curved, tilted, shifted or followed by glass; only a flat image plane across the axis is read.")
+            raise FileFormatError(
+                "the image surface is curved, tilted, shifted or followed by glass; only a flat image plane "
+                "across the axis is read."
+            )
 
     def check_object(self):
         if self.medium is not None or self.mirror:
@@ -144,30 +254,58 @@ class SeqSurface:
 
     def finish(self, unit_mm):
         """FileSurface of this surface, for a file in units of ``unit_mm``."""
-        moved = any(v for name, v in self.moves.items() if name != "CDE")  # a turn about its own axis changes nothing
+        moved = any(
+            v for name, v in self.moves.items() if name != "CDE"
+        )  # a turn about its own axis changes nothing
         if moved and not self.returns:
-            raise FileFormatError("it shifts or tilts everything behind it (a decentre without DAR); only single surfaces that move are read.")
+            raise FileFormatError(
+                "it shifts or tilts everything behind it (a decentre without DAR); only single surfaces "
+                "that move are read."
+            )
         if self.moves.get("ZDE"):
             raise FileFormatError("it is shifted along the axis (ZDE); put that into the thicknesses.")
         if (self.conic and self.kind == "SPH") or (any(self.terms.values()) and self.kind != "ASP"):
-            raise FileFormatError(f"it has a conic constant or asphere terms, but its shape is {self.kind}; add CON or ASP, or remove them.")
+            raise FileFormatError(
+                f"it has a conic constant or asphere terms, but its shape is {self.kind}; add CON or ASP, "
+                "or remove them."
+            )
         top = max(self.terms, default=0) if self.kind == "ASP" else 0
-        move = lambda name: self.moves.get(name, 0.0)  # noqa: E731
+
+        def move(name):
+            return self.moves.get(name, 0.0)
+
         inner = max(self.apertures.get("OBS", 0.0), self.apertures.get("HOL", 0.0))
         # ADE and BDE turn left-handed about +x and +y
-        return FileSurface(self.label, self.curvature, self.thickness, self.medium, self.apertures.get("CLEAR"), "CLEAR" in self.apertures or inner > 0,
-                           self.conic, tuple(self.terms.get(i, 0.0) for i in range(1, top + 1)), self.is_stop, self.mirror, self._phase(unit_mm),
-                           (move("XDE"), move("YDE")), (-move("ADE"), -move("BDE")), inner)
+        return FileSurface(
+            self.label,
+            self.curvature,
+            self.thickness,
+            self.medium,
+            self.apertures.get("CLEAR"),
+            "CLEAR" in self.apertures or inner > 0,
+            self.conic,
+            tuple(self.terms.get(i, 0.0) for i in range(1, top + 1)),
+            self.is_stop,
+            self.mirror,
+            self._phase(unit_mm),
+            (move("XDE"), move("YDE")),
+            (-move("ADE"), -move("BDE")),
+            inner,
+        )
 
     def _phase(self, unit_mm):
         if not any(self.path.values()):
             return None
         if not self.diffractive:
-            raise FileFormatError("it has phase coefficients (HCO), but does not diffract; add DIF DOE, or remove them.")
+            raise FileFormatError(
+                "it has phase coefficients (HCO), but does not diffract; add DIF DOE, or remove them."
+            )
         if self.wavelength_nm is None or self.wavelength_nm <= 0:
             raise FileFormatError("its diffractive phase has no design wavelength; give HWL in nanometres.")
         wave_number = 2 * math.pi * unit_mm / (self.wavelength_nm * 1e-6)  # radians per unit of path
-        return Phase(tuple(wave_number * self.path.get(i, 0.0) for i in range(1, max(self.path) + 1)), self.order)
+        return Phase(
+            tuple(wave_number * self.path.get(i, 0.0) for i in range(1, max(self.path) + 1)), self.order
+        )
 
 
 def _curvature(word, is_radius):

@@ -1,4 +1,5 @@
-"""A lens as files describe it: signed along a fixed axis, in the file's unit, with pupil and field given in many ways."""
+"""A lens as files describe it: signed along a fixed axis, in the file's unit, with pupil and field given in
+many ways."""
 
 import math
 from dataclasses import dataclass, field
@@ -9,9 +10,11 @@ from codesign.lens.surface import Phase
 
 @dataclass
 class FileSurface:
-    """One surface in the convention of lens files: +z fixed, so curvature and thickness change sign behind a mirror. Lengths in the file's unit.
+    """One surface in the convention of lens files: +z fixed, so curvature and thickness change sign behind a
+    mirror. Lengths in the file's unit.
 
-    label: its number in the file. semi_aperture: None where the file says nothing. fixed: whether that aperture stops rays.
+    label: its number in the file. semi_aperture: None where the file says nothing. fixed: whether that
+      aperture stops rays.
     tilt_deg: right-handed about +x, then about +y. inner: radius of a central obstruction.
     """
 
@@ -35,9 +38,12 @@ class FileSurface:
 class FileLens:
     """All a file says of a lens; the object and the image surface are not among the surfaces.
 
-    pupil: ("diameter" | "f-number" | "working f-number" | "numerical aperture" | "stop", value; the last needs none).
-    field: ("angle" degrees | "object height" | "image height", value) or None. object_distance: from the object to the first surface.
-    focus: whether the last thickness is to be solved for the paraxial focus. defocus: added to the last thickness.
+    pupil: ("diameter" | "f-number" | "working f-number" | "numerical aperture" | "stop", value; the last
+      needs none).
+    field: ("angle" degrees | "object height" | "image height", value) or None. object_distance: from the
+      object to the first surface.
+    focus: whether the last thickness is to be solved for the paraxial focus. defocus: added to the last
+      thickness.
     """
 
     name: str = "lens"

@@ -10,15 +10,18 @@ from contextlib import contextmanager
 from codesign.errors import CodesignError, FileFormatError
 
 LARGEST_BYTES = 2_000_000
-MOST_SURFACES, MOST_LINES = 500, 50_000
+MOST_SURFACES = 500
+MOST_LINES = 50_000
 NUMBER = re.compile(r"[+-]?(\d{1,40}\.?\d{0,40}|\.\d{1,40})([eE][+-]?\d{1,4})?", re.ASCII)
 CONTROL = re.compile(r"[\x00-\x08\x0b\x0e-\x1f\x7f]")
 
 
 def read_text(path):
-    """The text of a file in UTF-8, UTF-16 (either byte order) or Latin-1; at most LARGEST_BYTES + 1 bytes are read.
+    """The text of a file in UTF-8, UTF-16 (either byte order) or Latin-1; at most LARGEST_BYTES + 1 bytes are
+    read.
 
-    Raises: FileFormatError for what is not a regular file (a pipe is not waited for), is too long, or is not text.
+    Raises: FileFormatError for what is not a regular file (a pipe is not waited for), is too long, or is not
+      text.
     """
     try:
         with open(path, "rb", opener=_open_regular) as file:
@@ -26,17 +29,24 @@ def read_text(path):
     except OSError as error:
         raise FileFormatError(f"it cannot be read ({error.strerror}); give a file you may read.") from error
     if len(content) > LARGEST_BYTES:
-        raise FileFormatError(f"it has more than {LARGEST_BYTES} bytes, which no lens needs; is it a lens file?")
+        raise FileFormatError(
+            f"it has more than {LARGEST_BYTES} bytes, which no lens needs; is it a lens file?"
+        )
     try:
         text = content.decode(_encoding(content))
     except UnicodeDecodeError as error:
-        raise FileFormatError(f"it is not text ({error.encoding} fails at byte {error.start}); save it as UTF-8.") from error
+        raise FileFormatError(
+            f"it is not text ({error.encoding} fails at byte {error.start}); save it as UTF-8."
+        ) from error
     text = text.removeprefix("\ufeff").rstrip("\x1a")
     if max(text.count("\n"), text.count("\r")) > MOST_LINES:
         raise FileFormatError(f"it has more than {MOST_LINES} lines, which no lens needs; is it a lens file?")
     strange = CONTROL.search(text)
     if strange:
-        raise FileFormatError(f"it is not text (control character {ord(strange[0])} at position {strange.start()}); save it as UTF-8.")
+        raise FileFormatError(
+            f"it is not text (control character {ord(strange[0])} at position {strange.start()}); save it "
+            "as UTF-8."
+        )
     return text
 
 
@@ -76,7 +86,9 @@ def number(word, what):
 def whole(word, what, most=10_000):
     """The whole number from 0 to ``most`` a word spells."""
     if not re.fullmatch(r"\d{1,6}", word, re.ASCII) or int(word) > most:
-        raise FileFormatError(f"{what} is '{shown(word)}', a whole number from 0 to {most} is needed; correct it.")
+        raise FileFormatError(
+            f"{what} is '{shown(word)}', a whole number from 0 to {most} is needed; correct it."
+        )
     return int(word)
 
 

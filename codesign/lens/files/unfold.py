@@ -1,44 +1,79 @@
-"""From a file's fixed axis to light that always travels along +z: signs turned at mirrors, lengths in millimetres."""
+"""From a file's fixed axis to light that always travels along +z: signs turned at mirrors, lengths in
+millimetres."""
 
 import dataclasses
 import math
 
 from codesign.errors import FileFormatError
 
-ROUNDING = 1e-9  # of a length in the file's unit; a gap negative by less is a rounding error and counts as none
+ROUNDING = (
+    1e-9  # of a length in the file's unit; a gap negative by less is a rounding error and counts as none
+)
 
 
 def unfold(lens):
-    """The surfaces with lengths in millimetres and all signs along the light; dummy planes at which the light steps back are folded away.
+    """The surfaces with lengths in millimetres and all signs along the light; dummy planes at which the light
+    steps back are folded away.
 
-    Args: lens: FileLens. Returns: list of FileSurface; the last thickness is 0 where the paraxial focus is to be solved for.
+    Args: lens: FileLens. Returns: list of FileSurface; the last thickness is 0 where the paraxial focus is to
+      be solved for.
     Raises: FileFormatError when the light would have to travel backwards.
     """
-    found, sign, medium = [], 1.0, None
+    found = []
+    sign = 1.0
+    medium = None
     for surface in lens.surfaces:
-        before, sign = sign, -sign if surface.mirror else sign
+        before = sign
+        sign = -sign if surface.mirror else sign
         medium = medium if surface.mirror else surface.medium
-        found.append(dataclasses.replace(in_mm(surface, lens.unit_mm, before), thickness=surface.thickness * lens.unit_mm * sign, medium=medium))
+        found.append(
+            dataclasses.replace(
+                in_mm(surface, lens.unit_mm, before),
+                thickness=surface.thickness * lens.unit_mm * sign,
+                medium=medium,
+            )
+        )
     if found:
         found[-1].thickness = 0.0 if lens.focus else found[-1].thickness + lens.defocus * lens.unit_mm * sign
     return _without_steps_back(found)
 
 
 def in_mm(surface, unit_mm, sign):
-    """The surface in millimetres, its shape and tilt mirrored in z where ``sign`` is -1; its thickness is left alone."""
+    """The surface in millimetres, its shape and tilt mirrored in z where ``sign`` is -1; its thickness is
+    left alone."""
     asphere = tuple(sign * a * unit_mm ** (-1 - 2 * i) for i, a in enumerate(surface.asphere))
-    phase = surface.phase and dataclasses.replace(surface.phase, coefficients=tuple(a * unit_mm ** (-2 - 2 * i) for i, a in enumerate(surface.phase.coefficients)))
+    phase = surface.phase and dataclasses.replace(
+        surface.phase,
+        coefficients=tuple(a * unit_mm ** (-2 - 2 * i) for i, a in enumerate(surface.phase.coefficients)),
+    )
     aperture = None if surface.semi_aperture is None else surface.semi_aperture * unit_mm
     x, y = surface.decentre
     about_x, about_y = surface.tilt_deg
-    return dataclasses.replace(surface, curvature=sign * surface.curvature / unit_mm, asphere=asphere, phase=phase, semi_aperture=aperture, inner=surface.inner * unit_mm,
-                               decentre=(x * unit_mm, y * unit_mm), tilt_deg=(sign * about_x + 0.0, sign * about_y + 0.0))
+    return dataclasses.replace(
+        surface,
+        curvature=sign * surface.curvature / unit_mm,
+        asphere=asphere,
+        phase=phase,
+        semi_aperture=aperture,
+        inner=surface.inner * unit_mm,
+        decentre=(x * unit_mm, y * unit_mm),
+        tilt_deg=(sign * about_x + 0.0, sign * about_y + 0.0),
+    )
 
 
 def is_dummy(surface, medium_before):
-    """Whether a surface does nothing to any ray: a plane within one medium that neither stops nor turns light."""
-    plain = surface.curvature == 0 and not any(surface.asphere) and surface.phase is None and not surface.mirror
-    return plain and surface.medium == medium_before and not surface.is_stop and not surface.fixed and surface.inner == 0
+    """Whether a surface does nothing to any ray: a plane within one medium that neither stops nor turns
+    light."""
+    plain = (
+        surface.curvature == 0 and not any(surface.asphere) and surface.phase is None and not surface.mirror
+    )
+    return (
+        plain
+        and surface.medium == medium_before
+        and not surface.is_stop
+        and not surface.fixed
+        and surface.inner == 0
+    )
 
 
 def _without_steps_back(surfaces):
@@ -56,8 +91,14 @@ def _without_steps_back(surfaces):
         elif i + 1 < len(surfaces) and is_dummy(surfaces[i + 1], surfaces[i].medium):
             surfaces[i].thickness += surfaces.pop(i + 1).thickness
         else:
-            raise FileFormatError(f"surface {surfaces[i].label}: the light would travel {-surfaces[i].thickness:.6g} mm backwards behind it; "
-                                  "give every thickness along the light (its sign turns at each mirror).")
+            raise FileFormatError(
+                f"surface {surfaces[i].label}: the light would travel {-surfaces[i].thickness:.6g} mm "
+                "backwards behind it; "
+                "give every thickness along the light (its sign turns at each mirror)."
+            )
     if not surfaces or not all(math.isfinite(s.thickness) for s in surfaces):
-        raise FileFormatError("no surface is left between object and image, or one lies infinitely far; give finite distances between real surfaces.")
+        raise FileFormatError(
+            "no surface is left between object and image, or one lies infinitely far; give finite distances "
+            "between real surfaces."
+        )
     return surfaces

@@ -13,14 +13,18 @@ WRITERS = {".json": lambda lens: json.dumps(to_page(lens), indent=2, allow_nan=F
 
 
 def save(lens, path):
-    """Write the lens's current values to a .json file, exactly, or to a .zmx file for other programs (docs/lens_files.md says what that keeps).
+    """Write the lens's current values to a .json file, exactly, or to a .zmx file for other programs
+    (docs/lens_files.md says what that keeps).
 
     A file that was there stays until the new one is whole.
-    Raises: FileFormatError when the place is not writable or the format cannot hold the lens; DomainError for values that ``load`` would refuse.
+    Raises: FileFormatError when the place is not writable or the format cannot hold the lens; DomainError for
+      values that ``load`` would refuse.
     """
     path = Path(path)
     if path.suffix.lower() not in WRITERS:
-        raise FileFormatError(f"lens file {path}: extension '{path.suffix}' is not written; use {' or '.join(WRITERS)}.")
+        raise FileFormatError(
+            f"lens file {path}: extension '{path.suffix}' is not written; use {' or '.join(WRITERS)}."
+        )
     text = WRITERS[path.suffix.lower()](lens)
     with at(f"lens file {path}"), replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")

@@ -15,22 +15,32 @@ FIELDS = ("angle", "object height", "image height", "image height")
 def read_zmx(text, name):
     """FileLens of the text of a .zmx file.
 
-    Outside the surfaces only mode, unit, pupil, field, wavelengths and telecentric or afocal spaces are read: all else there describes analyses.
-    Raises: FileFormatError naming surface and reason for anything in a surface that is not understood, or that no GeoLens can be.
+    Outside the surfaces only mode, unit, pupil, field, wavelengths and telecentric or afocal spaces are read:
+    all else there describes analyses.
+    Raises: FileFormatError naming surface and reason for anything in a surface that is not understood, or
+      that no GeoLens can be.
     """
-    header, entries, ended = Header(name), [], False
+    header = Header(name)
+    entries = []
+    ended = False
     for at_line, line in lines(text):
         keyword, *words = line.split() or [""]
         if keyword == "SURF":
             if ended or len(entries) > MOST_SURFACES + 1:
-                raise FileFormatError(f"line {at_line}: it holds more than {MOST_SURFACES} surfaces, or one behind the end of the list; is it a lens?")
+                raise FileFormatError(
+                    f"line {at_line}: it holds more than {MOST_SURFACES} surfaces, or one behind the end of "
+                    "the list; is it a lens?"
+                )
             entries.append(_entry(words, len(entries)))
         elif entries and not ended and (line[0:1].isspace() or keyword in KEYWORDS) and keyword:
             with at(f"surface {entries[-1].label}"):
                 entries[-1].take(keyword, words)
         elif entries and keyword:
             if keyword in KEYWORDS and line[0:1].isspace():
-                raise FileFormatError(f"line {at_line}: '{shown(keyword)}' stands behind the end of the surfaces; move it to its surface.")
+                raise FileFormatError(
+                    f"line {at_line}: '{shown(keyword)}' stands behind the end of the surfaces; move it to "
+                    "its surface."
+                )
             ended = True  # operands, tolerances, configurations
         elif keyword:
             with at(f"line {at_line}"):
@@ -41,7 +51,9 @@ def read_zmx(text, name):
 def _entry(words, expected):
     label = whole(words[0], "the number of a surface") if words else -1
     if label != expected:
-        raise FileFormatError(f"surface {expected} is missing, or surface {label} comes twice; number the surfaces 0, 1, 2, ...")
+        raise FileFormatError(
+            f"surface {expected} is missing, or surface {label} comes twice; number the surfaces 0, 1, 2, ..."
+        )
     return Entry(label)
 
 
@@ -60,17 +72,24 @@ class Header:
     primary: int = 1
 
     def take(self, keyword, words):
-        numbers = lambda: [number(w, keyword) for w in words]  # noqa: E731
+        def numbers():
+            return [number(w, keyword) for w in words]
+
         if keyword in ("UNIT", "MODE", "ENPD", "FNUM", "FTYP", "PWAV", "WAVM") and not words:
             raise FileFormatError(f"{keyword} has no value; give one.")
         if keyword == "NAME":
             self.name = title(" ".join(words).strip('"'), self.name)
         elif keyword == "MODE" and words[0] != "SEQ":
-            raise FileFormatError(f"mode '{shown(words[0])}' is not sequential; only MODE SEQ describes a lens surface by surface.")
+            raise FileFormatError(
+                f"mode '{shown(words[0])}' is not sequential; only MODE SEQ describes a lens surface by "
+                "surface."
+            )
         elif keyword == "UNIT":
             self.unit = words[0].upper()
             if self.unit not in UNITS_MM:
-                raise FileFormatError(f"unit '{shown(words[0])}' is not known; known are {', '.join(UNITS_MM)}.")
+                raise FileFormatError(
+                    f"unit '{shown(words[0])}' is not known; known are {', '.join(UNITS_MM)}."
+                )
         elif keyword == "ENPD":
             self.pupil = "diameter", number(words[0], keyword)
         elif keyword == "FNUM":
@@ -79,7 +98,10 @@ class Header:
         elif keyword == "FLOA":
             self.pupil = "stop", 0.0
         elif keyword in ("OBNA", "ANAC", "OCNA"):
-            raise FileFormatError(f"the pupil is given by the cone of light at a near object ({keyword}), which says nothing for other distances; give the entrance pupil diameter (ENPD).")
+            raise FileFormatError(
+                f"the pupil is given by the cone of light at a near object ({keyword}), which says nothing "
+                "for other distances; give the entrance pupil diameter (ENPD)."
+            )
         elif keyword == "FTYP":
             self._take_field_type([whole(w, keyword) for w in words])
         elif keyword in ("XFLN", "YFLN"):
@@ -88,30 +110,50 @@ class Header:
             self.waves.update(enumerate(numbers(), 1))
         elif keyword == "WAVM" and len(words) > 1:
             self.waves[whole(words[0], keyword)] = number(words[1], keyword)
-        elif keyword == "ENVD" and len(words) > 2 and words[2] == "1" and (number(words[0], keyword), number(words[1], keyword)) != (20.0, 1.0):
-            raise FileFormatError("its indices are for another temperature or pressure than 20 degrees and 1 atm (ENVD), which is not computed; switch that off in the file.")
+        elif (
+            keyword == "ENVD"
+            and len(words) > 2
+            and words[2] == "1"
+            and (number(words[0], keyword), number(words[1], keyword)) != (20.0, 1.0)
+        ):
+            raise FileFormatError(
+                "its indices are for another temperature or pressure than 20 degrees and 1 atm (ENVD), "
+                "which is not computed; switch that off in the file."
+            )
         elif keyword == "PWAV":
             self.primary = whole(words[0], keyword)
 
     def _take_field_type(self, words):
         words += [0] * (7 - len(words))
-        self.kind, self.count = words[0], words[2] or None
+        self.kind = words[0]
+        self.count = words[2] or None
         if self.kind >= len(FIELDS):
             raise FileFormatError(f"field type {self.kind} is not known; give field angles (FTYP 0).")
         if words[1]:
-            raise FileFormatError("the object space is telecentric, so its pupil is not that of the stop; switch that off in the file (second number of FTYP).")
+            raise FileFormatError(
+                "the object space is telecentric, so its pupil is not that of the stop; switch that off in "
+                "the file (second number of FTYP)."
+            )
         if words[6]:
-            raise FileFormatError("the image space is afocal, so there is no image plane; switch that off in the file (seventh number of FTYP).")
+            raise FileFormatError(
+                "the image space is afocal, so there is no image plane; switch that off in the file "
+                "(seventh number of FTYP)."
+            )
 
     def finish(self, entries):
         """FileLens of this header and the entries of the surfaces, object and image included."""
         if len(entries) < 3:
-            raise FileFormatError(f"it has {len(entries)} surfaces; a lens needs at least object, one surface and image (SURF 0, 1, 2).")
+            raise FileFormatError(
+                f"it has {len(entries)} surfaces; a lens needs at least object, one surface and image (SURF "
+                "0, 1, 2)."
+            )
         if self.unit is None:
             raise FileFormatError("it names no unit of length; add the line UNIT MM.")
         stops = [e.label for e in entries if e.is_stop]
         if len(stops) != 1 or not 0 < stops[0] < len(entries) - 1:
-            raise FileFormatError(f"surfaces {stops} are marked as the stop; mark one between object and image with STOP.")
+            raise FileFormatError(
+                f"surfaces {stops} are marked as the stop; mark one between object and image with STOP."
+            )
         pairs = zip(self.heights.get("XFLN", [0.0]), self.heights.get("YFLN", [0.0]), strict=False)
         height = max((math.hypot(x, y) for x, y in list(pairs)[: self.count]), default=0.0)
         entries[0].check_object()
@@ -120,4 +162,12 @@ class Header:
         for entry in entries[1:-1]:
             with at(f"surface {entry.label}"):
                 surfaces.append(entry.surface())
-        return FileLens(self.name, surfaces, UNITS_MM[self.unit], self.pupil, (FIELDS[self.kind], height), self.waves.get(self.primary, 0.5875618), entries[0].thickness)
+        return FileLens(
+            self.name,
+            surfaces,
+            UNITS_MM[self.unit],
+            self.pupil,
+            (FIELDS[self.kind], height),
+            self.waves.get(self.primary, 0.5875618),
+            entries[0].thickness,
+        )

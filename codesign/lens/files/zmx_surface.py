@@ -19,11 +19,66 @@ REASONS = {
     "ODDASPHE": "odd powers of the height are not read",
     "DGRATING": "a ruled grating has no axis of revolution",
 }
-# solves, pickups, tolerances, drawing, coatings, mechanical sizes and labels: the values they lead to stand in the file, or no ray changes
-IDLE = {"SLAB", "HIDE", "MIRR", "POPS", "FIMP", "COAT", "COMM", "PZUP", "PPAR", "VPAR", "VDSZ", "VCON", "PKUP", "MAZH", "MARG", "EDGE", "MEMA", "OEMA", "TCMM", "TCED", "CHZN",
-        "SCOL", "SOPA", "DRAW", "NOTE", "RCMF"}
-APERTURES = {"SQAP": "rectangular", "ELAP": "elliptical", "UDAP": "user-defined", "UDAD": "user-defined", "USAP": "user-defined", "SQOB": "rectangular", "ELOB": "elliptical", "SPID": "spider"}
-KEYWORDS = IDLE | set(APERTURES) | {"TYPE", "CURV", "DISZ", "GLAS", "CONI", "STOP", "DIAM", "FLAP", "CLAP", "OBSC", "OBDC", "SCBD", "PARM", "XDAT"}
+# solves, pickups, tolerances, drawing, coatings, mechanical sizes and labels: the values they lead to stand
+# in the file, or no ray changes
+IDLE = {
+    "SLAB",
+    "HIDE",
+    "MIRR",
+    "POPS",
+    "FIMP",
+    "COAT",
+    "COMM",
+    "PZUP",
+    "PPAR",
+    "VPAR",
+    "VDSZ",
+    "VCON",
+    "PKUP",
+    "MAZH",
+    "MARG",
+    "EDGE",
+    "MEMA",
+    "OEMA",
+    "TCMM",
+    "TCED",
+    "CHZN",
+    "SCOL",
+    "SOPA",
+    "DRAW",
+    "NOTE",
+    "RCMF",
+}
+APERTURES = {
+    "SQAP": "rectangular",
+    "ELAP": "elliptical",
+    "UDAP": "user-defined",
+    "UDAD": "user-defined",
+    "USAP": "user-defined",
+    "SQOB": "rectangular",
+    "ELOB": "elliptical",
+    "SPID": "spider",
+}
+KEYWORDS = (
+    IDLE
+    | set(APERTURES)
+    | {
+        "TYPE",
+        "CURV",
+        "DISZ",
+        "GLAS",
+        "CONI",
+        "STOP",
+        "DIAM",
+        "FLAP",
+        "CLAP",
+        "OBSC",
+        "OBDC",
+        "SCBD",
+        "PARM",
+        "XDAT",
+    }
+)
 
 
 @dataclass
@@ -45,13 +100,19 @@ class Entry:
     seen: set[str] = field(default_factory=set)
 
     def take(self, keyword, words):
-        """Take one line. Raises: FileFormatError when it is not understood, comes twice, or asks for what cannot be traced."""
+        """Take one line. Raises: FileFormatError when it is not understood, comes twice, or asks for what
+        cannot be traced."""
         if keyword in IDLE:
             return
         if keyword not in KEYWORDS:
-            raise FileFormatError(f"keyword '{shown(keyword)}' is not understood; delete the line if it changes no ray.")
+            raise FileFormatError(
+                f"keyword '{shown(keyword)}' is not understood; delete the line if it changes no ray."
+            )
         if keyword in APERTURES:
-            raise FileFormatError(f"its aperture is {APERTURES[keyword]} ({keyword}), only circles around the axis are read; replace it by its circle.")
+            raise FileFormatError(
+                f"its aperture is {APERTURES[keyword]} ({keyword}), only circles around the axis are read; "
+                "replace it by its circle."
+            )
         once = f"{keyword} {words[0]}" if keyword in ("PARM", "XDAT") and words else keyword
         if once in self.seen:
             raise FileFormatError(f"{once} comes twice; keep one.")
@@ -88,9 +149,13 @@ class Entry:
         """A circle or ring: inner and outer radius."""
         if len(words) < 2:
             raise FileFormatError(f"{keyword} needs two radii; give them.")
-        inner, outer = number(words[0], keyword), number(words[1], keyword)
+        inner = number(words[0], keyword)
+        outer = number(words[1], keyword)
         if not 0 <= inner <= outer:
-            raise FileFormatError(f"{keyword} has the radii {inner:g} and {outer:g}; the first must be at least 0 and smaller than the second.")
+            raise FileFormatError(
+                f"{keyword} has the radii {inner:g} and {outer:g}; the first must be at least 0 and smaller "
+                "than the second."
+            )
         return inner, outer
 
     def _take_flap(self, words):
@@ -102,16 +167,22 @@ class Entry:
     def _take_obsc(self, words):
         inner, outer = self._take_circle(words, "OBSC")
         if inner > 0:
-            raise FileFormatError(f"it blocks a ring from {inner:g} to {outer:g} (OBSC); only a central disc is read.")
+            raise FileFormatError(
+                f"it blocks a ring from {inner:g} to {outer:g} (OBSC); only a central disc is read."
+            )
         self.inner = max(self.inner, outer)
 
     def _take_obdc(self, words):
         if any(number(w, "OBDC") for w in words):
-            raise FileFormatError("its aperture is off the axis (OBDC); only circles around the axis are read.")
+            raise FileFormatError(
+                "its aperture is off the axis (OBDC); only circles around the axis are read."
+            )
 
     def _take_scbd(self, words):
         if any(number(w, "SCBD") for w in words[3:]):
-            raise FileFormatError("it tilts or shifts everything behind it (SCBD); only centred systems are read.")
+            raise FileFormatError(
+                "it tilts or shifts everything behind it (SCBD); only centred systems are read."
+            )
 
     def _take_parm(self, words):
         self.parameters[whole(words[0], "PARM")] = number(words[1], f"PARM {shown(words[0])}")
@@ -121,26 +192,52 @@ class Entry:
 
     def check_object(self):
         if self.glass:
-            raise FileFormatError(f"the object lies in '{shown(self.glass[0])}'; only objects in air are read.")
+            raise FileFormatError(
+                f"the object lies in '{shown(self.glass[0])}'; only objects in air are read."
+            )
 
     def check_image(self):
         if self.curvature or self.kind not in TYPES or any(self.parameters.values()):
-            raise FileFormatError(f"surface {self.label} is a curved or special image surface; only a flat image plane is read.")
+            raise FileFormatError(
+                f"surface {self.label} is a curved or special image surface; only a flat image plane is read."
+            )
 
     def surface(self):
         """FileSurface of this entry."""
         moved = any(v for i, v in self.parameters.items() if i != 6)  # 6: the order of shifts and tilts
         if self.kind not in TYPES and (self.kind != "COORDBRK" or moved):
-            raise FileFormatError(f"type {shown(self.kind)} is not read ({REASONS.get(self.kind, 'only STANDARD, EVENASPH and BINARY_2 are')}); replace it, or use a design without it.")
+            raise FileFormatError(
+                f"type {shown(self.kind)} is not read "
+                f"({REASONS.get(self.kind, 'only STANDARD, EVENASPH and BINARY_2 are')}); replace it, or "
+                "use a design without it."
+            )
         if (self.kind != "BINARY_2" and any(self.extra.values())) or (self.kind == "STANDARD" and moved):
-            raise FileFormatError(f"parameters or extra data (PARM, XDAT) on a surface of type {self.kind} are not understood; delete them if they change no ray.")
+            raise FileFormatError(
+                f"parameters or extra data (PARM, XDAT) on a surface of type {self.kind} are not "
+                "understood; delete them if they change no ray."
+            )
         asphere = tuple(self.parameters.get(i, 0.0) for i in range(1, 9)) if self.kind != "STANDARD" else ()
         if max(self.parameters, default=0) > 8 and any(v for i, v in self.parameters.items() if i > 8):
-            raise FileFormatError("it has parameters beyond PARM 8, which are not understood; delete them if they change no ray.")
+            raise FileFormatError(
+                "it has parameters beyond PARM 8, which are not understood; delete them if they change no "
+                "ray."
+            )
         mirror = bool(self.glass) and self.glass[0].upper() == "MIRROR"
         semi_aperture = self.aperture if self.aperture is not None else self.semi_aperture
-        return FileSurface(self.label, self.curvature, self.thickness, None if mirror else self._medium(), semi_aperture, self.aperture is not None or self.inner > 0, self.conic,
-                           asphere if any(asphere) else (), self.is_stop, mirror, self._phase() if self.kind == "BINARY_2" else None, inner=self.inner)
+        return FileSurface(
+            self.label,
+            self.curvature,
+            self.thickness,
+            None if mirror else self._medium(),
+            semi_aperture,
+            self.aperture is not None or self.inner > 0,
+            self.conic,
+            asphere if any(asphere) else (),
+            self.is_stop,
+            mirror,
+            self._phase() if self.kind == "BINARY_2" else None,
+            inner=self.inner,
+        )
 
     def _medium(self):
         if not self.glass or self.glass[0].upper() == "AIR":
@@ -149,13 +246,21 @@ class Entry:
         if name != "___BLANK":
             return Glass.named(name)
         if len(self.glass) < 5:
-            raise FileFormatError("its model glass has no index and Abbe number; write GLAS ___BLANK 1 0 nd Vd.")
-        return Glass.from_abbe(number(self.glass[3], "the index nd"), number(self.glass[4], "the Abbe number"))
+            raise FileFormatError(
+                "its model glass has no index and Abbe number; write GLAS ___BLANK 1 0 nd Vd."
+            )
+        return Glass.from_abbe(
+            number(self.glass[3], "the index nd"), number(self.glass[4], "the Abbe number")
+        )
 
     def _phase(self):
-        count, radius = self.extra.get(1, 0.0), self.extra.get(2, 1.0)
+        count = self.extra.get(1, 0.0)
+        radius = self.extra.get(2, 1.0)
         if count != int(count) or not 0 <= count <= 16 or radius <= 0:
-            raise FileFormatError(f"its diffractive phase has {count:g} terms over a radius of {radius:g}; give 0 to 16 terms and a positive radius (XDAT 1 and 2).")
+            raise FileFormatError(
+                f"its diffractive phase has {count:g} terms over a radius of {radius:g}; give 0 to 16 terms "
+                "and a positive radius (XDAT 1 and 2)."
+            )
         terms = tuple(self.extra.get(3 + i, 0.0) / radius ** (2 * i + 2) for i in range(int(count)))
         order = self.parameters.get(0, 1.0)
         if order != int(order):

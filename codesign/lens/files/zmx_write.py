@@ -4,22 +4,43 @@ from codesign.errors import CodesignError, FileFormatError
 from codesign.lens.glass import AIR, WAVELENGTH_UM, Glass, names
 
 MOST_TERMS = 8  # of an even asphere
-LEAST_ABBE, MOST_ABBE = 10, 150  # of a model glass
-SAME_INDEX = 1e-8  # a glass goes by its catalogue name when its indices at F, d and C are the catalogue's to this; published tables round to 1e-9
+# of a model glass
+LEAST_ABBE = 10
+MOST_ABBE = 150
+# a glass goes by its catalogue name when its indices at F, d and C are the catalogue's to this; published
+# tables round to 1e-9
+SAME_INDEX = 1e-8
 
 
 def to_zmx(lens):
     """The text of a .zmx file of the lens's current values; numbers keep all their digits.
 
-    Kept: curvatures, thicknesses and aspheres with their signs along a fixed axis, conics, stop, apertures and central obstructions, mirrors, diffractive phases,
-    entrance pupil diameter, half field, name. A glass of the catalogue keeps its name; any other becomes a model glass of nd and Vd. Not kept: the width of the soft edges.
-    Raises: DomainError for values that cannot be; FileFormatError for what a centred .zmx surface cannot hold.
+    Kept: curvatures, thicknesses and aspheres with their signs along a fixed axis, conics, stop, apertures
+      and central obstructions, mirrors, diffractive phases,
+    entrance pupil diameter, half field, name. A glass of the catalogue keeps its name; any other becomes a
+    model glass of nd and Vd. Not kept: the width of the soft edges.
+    Raises: DomainError for values that cannot be; FileFormatError for what a centred .zmx surface cannot
+      hold.
     """
-    field, surfaces = lens.half_field_deg or 0.0, lens.to_surfaces()
-    head = ["VERS 140124 0 0", "MODE SEQ", f"NAME {_plain(lens.name)}", "UNIT MM X W X CM MR CPMM", f"ENPD {lens.entrance_pupil_diameter_mm!r}", "ENVD 20 1 0",
-            "GCAT SCHOTT OHARA HOYA HIKARI SUMITA CDGM CORNING MISC", "FTYP 0 0 2 3 0 0 0",
-            "XFLN 0 0", f"YFLN 0 {field!r}", *(f"WAVM {i} {w!r} 1" for i, w in enumerate(WAVELENGTH_UM.values(), 1)), "PWAV 2", *_block(0, ["TYPE STANDARD", "CURV 0", "DISZ INFINITY"])]
-    sign, lines = 1.0, []
+    field = lens.half_field_deg or 0.0
+    surfaces = lens.to_surfaces()
+    head = [
+        "VERS 140124 0 0",
+        "MODE SEQ",
+        f"NAME {_plain(lens.name)}",
+        "UNIT MM X W X CM MR CPMM",
+        f"ENPD {lens.entrance_pupil_diameter_mm!r}",
+        "ENVD 20 1 0",
+        "GCAT SCHOTT OHARA HOYA HIKARI SUMITA CDGM CORNING MISC",
+        "FTYP 0 0 2 3 0 0 0",
+        "XFLN 0 0",
+        f"YFLN 0 {field!r}",
+        *(f"WAVM {i} {w!r} 1" for i, w in enumerate(WAVELENGTH_UM.values(), 1)),
+        "PWAV 2",
+        *_block(0, ["TYPE STANDARD", "CURV 0", "DISZ INFINITY"]),
+    ]
+    sign = 1.0
+    lines = []
     for i, surface in enumerate(surfaces, 1):
         surface.check(f"{lens.name}, surface {i}")
         lines += _block(i, _surface(surface, sign, f"{lens.name}, surface {i}", i == lens.stop_index + 1))
@@ -34,24 +55,41 @@ def _block(number, lines):
 
 def _surface(surface, sign, label, is_stop):
     if any(surface.decentre_mm) or any(surface.tilt_deg):
-        raise FileFormatError(f"{label}: it is decentred or tilted, which is not written to .zmx; save the lens as .json.")
+        raise FileFormatError(
+            f"{label}: it is decentred or tilted, which is not written to .zmx; save the lens as .json."
+        )
     if surface.phase is not None and surface.phase.blaze_um is not None:
-        raise FileFormatError(f"{label}: its blaze wavelength has no place in a .zmx file; save the lens as .json, or set blaze_um to None.")
+        raise FileFormatError(
+            f"{label}: its blaze wavelength has no place in a .zmx file; save the lens as .json, or set "
+            "blaze_um to None."
+        )
     terms = [sign * a + 0.0 for a in surface.asphere]
     if any(terms[MOST_TERMS:]):
-        raise FileFormatError(f"{label}: it has {len(terms)} asphere terms, a .zmx file holds {MOST_TERMS}; save the lens as .json.")
+        raise FileFormatError(
+            f"{label}: it has {len(terms)} asphere terms, a .zmx file holds {MOST_TERMS}; save the lens as "
+            ".json."
+        )
     kind = "BINARY_2" if surface.phase else "EVENASPH" if any(terms) else "STANDARD"
     behind = -sign if surface.mirror else sign
     lines = ["STOP"] if is_stop else []
     lines += [f"TYPE {kind}", f"CURV {sign * surface.curvature_per_mm + 0.0!r}"]
     if surface.phase:
-        lines += [f"PARM 0 {surface.phase.order}", f"XDAT 1 {len(surface.phase.coefficients)}", "XDAT 2 1.0", *(f"XDAT {i} {a!r}" for i, a in enumerate(surface.phase.coefficients, 3))]
+        lines += [
+            f"PARM 0 {surface.phase.order}",
+            f"XDAT 1 {len(surface.phase.coefficients)}",
+            "XDAT 2 1.0",
+            *(f"XDAT {i} {a!r}" for i, a in enumerate(surface.phase.coefficients, 3)),
+        ]
     if kind != "STANDARD":
         lines += [f"PARM {i} {a!r}" for i, a in enumerate(terms[:MOST_TERMS], 1)]
     lines += [f"DISZ {behind * surface.thickness_mm + 0.0!r}", *_glass(surface, label)]
     lines += [f"CONI {surface.conic!r}"] if surface.conic else []
-    aperture = f"CLAP {surface.inner_semi_aperture_mm!r} {surface.semi_aperture_mm!r} 0" if surface.inner_semi_aperture_mm else f"FLAP 0 {surface.semi_aperture_mm!r} 0"
-    return [*lines, f"DIAM {surface.semi_aperture_mm!r} 1 0 0 1 \"\"", aperture]
+    aperture = (
+        f"CLAP {surface.inner_semi_aperture_mm!r} {surface.semi_aperture_mm!r} 0"
+        if surface.inner_semi_aperture_mm
+        else f"FLAP 0 {surface.semi_aperture_mm!r} 0"
+    )
+    return [*lines, f'DIAM {surface.semi_aperture_mm!r} 1 0 0 1 ""', aperture]
 
 
 def _glass(surface, label):
@@ -63,7 +101,10 @@ def _glass(surface, label):
     if _is_named(glass):
         return [f"GLAS {glass.name} 0 0 1.5 40 0 0 0 0 0 0"]  # what that program writes for the unused model
     if not LEAST_ABBE <= glass.abbe_number <= MOST_ABBE:
-        raise FileFormatError(f"{label}: its medium {glass.name} has the Abbe number {glass.abbe_number:.4g}, model glasses {LEAST_ABBE} to {MOST_ABBE}; save the lens as .json.")
+        raise FileFormatError(
+            f"{label}: its medium {glass.name} has the Abbe number {glass.abbe_number:.4g}, model glasses "
+            f"{LEAST_ABBE} to {MOST_ABBE}; save the lens as .json."
+        )
     return [f"GLAS ___BLANK 1 0 {glass.index_d!r} {glass.abbe_number!r} 0 0 0 0 0 0"]
 
 
@@ -73,7 +114,9 @@ def _is_named(glass):
         same = all(abs(known.index(w) - glass.index(w)) < SAME_INDEX for w in WAVELENGTH_UM.values())
     except CodesignError:
         return False
-    return same and known.name in names() and not any(c.isspace() for c in glass.name)  # 1.6123/44.1 is a name too, but only here
+    return (
+        same and known.name in names() and not any(c.isspace() for c in glass.name)
+    )  # 1.6123/44.1 is a name too, but only here
 
 
 def _plain(name):

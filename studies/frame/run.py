@@ -1,0 +1,278 @@
+"""The frame every study runs in: its command line, folder, progress, saved state, metrics and page.
+
+A study is a function of a Run and a frozen dataclass:
+
+    @dataclass(frozen=True)
+    class Config(StudyConfig):
+        steps: int = 300
+        '''Number of optimisation steps.'''
+
+    def study(run: Run[Config]) -> None: ...
+
+    if __name__ == "__main__":
+        sys.exit(main(study, Config))
+"""
+
+import dataclasses
+import inspect
+import io
+import json
+import math
+import shlex
+import sys
+from collections.abc import Callable
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any, Generic
+
+import matplotlib
+import matplotlib.pyplot as plt
+import torch
+import tyro
+from rich.console import Console
+
+from codesign import backend
+from codesign.errors import CodesignError, DomainError, FileFormatError, NonFiniteError
+from codesign.report import page, prose
+from studies.frame import folder as folders
+from studies.frame import machine, state
+from studies.frame.config import Config, StudyConfig, check_same, read_config, to_json
+from studies.frame.interrupt import Interruption
+from studies.frame.progress import StepProgress
+
+__all__ = ["Run", "StudyConfig", "main", "open_run"]
+
+RESERVED = ("versions", "hardware")
+
+
+class Run(Generic[Config]):
+    """What a study works with: configuration, folder, device, and the ways to keep and show results.
+
+    config: the study's dataclass. folder: where everything is written. device: torch.device with "auto"
+      resolved.
+    resumed: True when this session goes on with an earlier one.
+    """
+
+    def __init__(
+        self,
+        study: str,
+        config: Config,
+        folder: Path,
+        device: torch.device,
+        resumed: bool,
+        interruption: Interruption | None = None,
+    ):
+        self.study = study
+        self.config = config
+        self.folder = folder
+        self.device = device
+        self.resumed = resumed
+        self.metrics: dict[str, float | int] = {}
+        self._console = Console(highlight=False)
+        self._interruption = interruption or Interruption()
+        self._machine = {"versions": machine.versions(), "hardware": machine.hardware()}
+        self._cards: list[page.Card] = []
+        self._sections = [page.Section("")]
+        if resumed and (folder / "metrics.json").exists():
+            self.metrics = _read_metrics(folder / "metrics.json")
+
+    def say(self, text: str):
+        """Print a line, above the progress bar when there is one."""
+        self._console.print(text, markup=False, soft_wrap=True)
+
+    def progress(self, total: int, description: str, done: int = 0):
+        """Context manager around a loop of ``total`` steps; call its ``advance(loss=…)`` after each whole
+        step.
+
+        Args:
+          total: number of steps, those of earlier sessions included. done: how many earlier sessions made.
+        Returns: StepProgress, with ``seconds_per_step``.
+        """
+        return StepProgress(self._console, total, description, done, self._interruption)
+
+    def on_interrupt(self, save: Callable[[], object]):
+        """Call ``save`` when Ctrl-C was pressed, at the next ``advance``, where a step is whole. The last one
+        given counts."""
+        self._interruption.save = save
+
+    def save_state(self, tensors: dict[str, torch.Tensor], numbers: dict[str, Any]):
+        """Store what is needed to go on, exactly, in one atomic write (see
+        studies.frame.state.write_state)."""
+        state.write_state(self.folder / "state.npz", tensors, numbers)
+
+    def load_state(self):
+        """State(tensors, numbers) stored by an earlier session, on the CPU; None for a fresh run.
+
+        Raises: FileFormatError when the file is damaged.
+        """
+        return state.read_state(self.folder / "state.npz")
+
+    def record(self, **numbers: float):
+        """Add to metrics.json, written at once: flat names with their unit, finite numbers (0-d tensors too).
+
+        Raises: NonFiniteError on NaN or infinity, DomainError on anything that is not a number; nothing is
+          written then.
+        """
+        accepted = {name: _metric(name, value) for name, value in numbers.items()}
+        self.metrics.update(accepted)
+        text = json.dumps({**self.metrics, **self._machine}, indent=2, allow_nan=False)
+        state.write_atomic(self.folder / "metrics.json", text.encode())
+
+    def section(self, title: str, text: str = ""):
+        """Begin a section of the page; what follows is shown in it."""
+        self._sections.append(page.Section(title))
+        if text:
+            self.text(text)
+
+    def card(self, label: str, value: str, note: str = ""):
+        """Add a headline figure at the top of the page, for example ("RMS spot", "12.3 µm", "detuned: 41
+        µm")."""
+        self._cards.append(page.Card(label, value, note))
+
+    def text(self, text: str):
+        """Add paragraphs, lists, **bold**, *emphasis* and `code` (see codesign.report.prose)."""
+        self._show("prose", prose.to_html(text))
+
+    def table(self, title: str, columns, rows, caption: str = ""):
+        """Add a table; columns of numbers are right-aligned, None shows as a dash."""
+        self._show("table", page.table(title, columns, rows, caption))
+
+    def figure(self, figure, name: str, caption: str, dpi: int = 160):
+        """Save a matplotlib figure as <name>.png, show it on the page, and close it. Returns the path."""
+        path = self.path(f"{name}.png")
+        png = io.BytesIO()
+        figure.savefig(png, format="png", dpi=dpi, bbox_inches="tight", facecolor="white")
+        plt.close(figure)
+        state.write_atomic(path, png.getvalue())
+        self._show("picture", page.picture(path, caption))
+        return path
+
+    def video(self, path: str | Path, caption: str):
+        """Show an MP4, GIF or PNG file; a relative path is taken inside the run's folder."""
+        self._show("picture", page.picture(self.folder / path, caption))
+
+    def path(self, name: str):
+        """Path of a file inside the run's folder.
+
+        Raises: DomainError when the name leads out of it.
+        """
+        path = self.folder / name
+        if not path.resolve().is_relative_to(self.folder.resolve()):
+            raise DomainError(f"the file name '{name}' leads out of the run's folder; use a plain name.")
+        return path
+
+    def finish(self, title: str, lead: str):
+        """Write metrics.json and report.html. Returns the path of the page."""
+        self.record()
+        configuration = json.loads(to_json(self.study, self.config))
+        facts = {
+            "Configuration": configuration,
+            "Versions": self._machine["versions"],
+            "Hardware": self._machine["hardware"],
+            "Metrics": self.metrics,
+        }
+        html = page.render_page(title, lead, self._cards, self._sections, facts)
+        path = self.folder / "report.html"
+        state.write_atomic(path, html.encode())
+        self.say(f"Done: {path}")
+        return path
+
+    def _show(self, kind, block):
+        self._sections[-1].blocks.append((kind, block))
+
+
+def open_run(study: str, config: Config, interruption: Interruption | None = None) -> Run[Config]:
+    """Make the folder of a new run and write its config.json, or find the run that ``config.resume`` names.
+
+    Raises: CodesignError with one sentence when the folder, the stored configuration or the device is unfit.
+    """
+    if config.resume is not None:
+        stored = read_config(config.resume / "config.json", study, type(config))
+        check_same(
+            dataclasses.replace(stored, out=config.resume if config.out == config.resume else stored.out),
+            config,
+        )
+        return Run(study, stored, config.resume, _device(stored.device), True, interruption)
+    device = _device(config.device)
+    config = dataclasses.replace(config, device=device.type)  # the same device when the run is resumed
+    text = to_json(study, config)
+    folder = folders.fresh(study, config.out)
+    state.write_atomic(folder / "config.json", text.encode())
+    return Run(study, config, folder, device, False, interruption)
+
+
+def main(study: Callable[[Run[Config]], None], kind: type[Config], arguments: list[str] | None = None) -> int:
+    """Run a study from its command line.
+
+    Returns: exit code: 0 done, 2 bad input (one clear line on stderr), 130 interrupted (with the line to go
+      on).
+    Raises: SystemExit from the command line itself (0 for --help, 2 for a wrong option).
+    """
+    name = _name(kind)
+    config = tyro.cli(
+        kind,
+        prog=f"python -m studies.{name}",
+        description=sys.modules[study.__module__].__doc__,
+        args=arguments,
+    )
+    matplotlib.use("Agg")  # figures go to files; no screen is needed
+    torch.set_num_threads(
+        1
+        # the heavy work is in drjit's own thread pool, which torch's waiting threads only slow down (measured:
+        # 2x)
+    )
+    run = None
+    try:
+        with Interruption() as interruption:
+            run = open_run(name, config, interruption)
+            study(run)
+    except CodesignError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        again = (
+            f"; go on with: python -m studies.{name} --resume {shlex.quote(str(run.folder))}" if run else ""
+        )
+        print(f"interrupted{again}", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _name(kind):
+    path = Path(inspect.getfile(kind))
+    return path.parent.name if path.stem.startswith("__") else path.stem
+
+
+def _device(wanted):
+    if wanted == "auto":
+        wanted = "cuda" if torch.cuda.is_available() else "cpu"
+    if wanted == "cuda":
+        backend.check_version("cuda")
+    return torch.device(wanted)
+
+
+def _metric(name, value):
+    if name in RESERVED:
+        raise DomainError(
+            f"a metric cannot be named '{name}', which metrics.json uses itself; choose another name."
+        )
+    if isinstance(value, torch.Tensor) and value.numel() == 1:
+        value = value.item()
+    if not isinstance(value, Real):
+        raise DomainError(
+            f"metric {name} is a {type(value).__name__}, not a number; record one number per name."
+        )
+    if not math.isfinite(value):
+        raise NonFiniteError(
+            f"metric {name} is {value}; metrics are finite numbers, so leave out what has none, and look "
+            "for where it appeared."
+        )
+    return int(value) if isinstance(value, Integral) else float(value)
+
+
+def _read_metrics(path):
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        return {name: value for name, value in stored.items() if name not in RESERVED}
+    except (OSError, ValueError, AttributeError) as error:
+        raise FileFormatError(f"'{path}' is damaged ({error}); remove it to go on with this run.") from error

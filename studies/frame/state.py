@@ -1,0 +1,92 @@
+"""The state of an unfinished run: exact tensors and numbers in one file that holds data only, never code."""
+
+import contextlib
+import io
+import json
+import os
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codesign.errors import CodesignError, FileFormatError, ShapeError
+
+
+@dataclass(frozen=True)
+class State:
+    """What ``write_state`` stored: tensors on the CPU, bit for bit, and a dictionary of plain JSON values."""
+
+    tensors: dict[str, Tensor]
+    numbers: dict[str, Any]
+
+
+def write_atomic(path: Path, content: bytes):
+    """Write ``content`` so that ``path`` holds either the old bytes or all of the new ones, whatever happens
+    in between.
+
+    Raises: CodesignError naming the folder when it cannot be written.
+    """
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise CodesignError(
+            f"cannot write {path.name} in folder '{path.parent}' ({error.strerror}); free space there, or "
+            "choose another folder with --out."
+        ) from error
+    finally:
+        with contextlib.suppress(
+            OSError
+        ):  # gone after a success; after a failure the sentence above matters more
+            temporary.unlink()
+
+
+def write_state(path: Path, tensors: dict[str, Tensor], numbers: dict[str, Any]):
+    """Store tensors (any real, complex, integer or bool dtype numpy knows; a generator's state is one of
+    uint8) and plain numbers.
+
+    Raises: ShapeError for a dtype the file cannot hold; CodesignError when the folder cannot be written.
+    """
+    arrays = {}
+    for index, (name, tensor) in enumerate(tensors.items()):
+        try:
+            arrays[f"tensor_{index}"] = tensor.detach().cpu().numpy()
+        except TypeError as error:
+            raise ShapeError(
+                f"state tensor '{name}' has dtype {tensor.dtype}, which the state file cannot hold; convert "
+                "it to float32 or float64."
+            ) from error
+    header = json.dumps({"names": list(tensors), "numbers": numbers}).encode()
+    buffer = io.BytesIO()
+    np.savez(buffer, header=np.frombuffer(header, dtype=np.uint8), **arrays)
+    write_atomic(path, buffer.getvalue())
+
+
+def read_state(path: Path):
+    """Read what ``write_state`` stored; None when there is no such file.
+
+    Raises: FileFormatError when the file is not a state file.
+    """
+    if not path.exists():
+        return None
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as stored:
+            header = json.loads(stored["header"].tobytes())
+            tensors = {
+                name: torch.from_numpy(stored[f"tensor_{index}"])
+                for index, name in enumerate(header["names"])
+            }
+        return State(tensors, header["numbers"])
+    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise FileFormatError(
+            f"'{path}' is not a state file of a study ({error}); remove it to start this run from the "
+            "beginning."
+        ) from error

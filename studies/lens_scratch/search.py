@@ -1,0 +1,159 @@
+"""One search from plane plates: a method, a seed, its stages and attempts; one optimiser step at a time, so
+that it can stop anywhere and go on."""
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from codesign.lens.design.adam import ScaledAdam
+from codesign.lens.design.least_squares import DampedLeastSquares, StopRules
+from codesign.lens.design.optimise import column_scales
+from studies.lens_scratch.task import LINES, Stage, draw_start, jacobian, judge, residuals_of
+
+METHODS = {
+    "curriculum": "damped least squares; aperture and field grow together",
+    "direct": "damped least squares at full aperture and field at once",
+    "adam": "Adam with steps scaled by the Jacobian, full aperture and field",
+}
+STAGES = {
+    "curriculum": (
+        Stage(0.4, 0.4, ("F", "C"), 20),
+        Stage(0.6, 0.6, ("F", "C"), 15),
+        Stage(0.8, 0.8, ("F", "C"), 20),
+        Stage(1.0, 1.0, LINES, 150),
+    ),
+    "direct": (Stage(1.0, 1.0, LINES, 200),),
+    "adam": (Stage(1.0, 1.0, LINES, 1000),),
+}
+ATTEMPTS = {"curriculum": 3, "direct": 3, "adam": 1}  # draws of a start until one succeeds
+LOSS_CHANGE = 1e-6  # a stage ends when a step gains less than this share
+ADAM_STEP = 1.0  # residual units (0.01 mm RMS) per step
+ADAM_LIMIT = torch.tensor(
+    [1e-2] * 5 + [1.0] * 6, dtype=torch.float64
+)  # per mm and mm: some thicknesses of plane plates move no ray
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a search found. losses: half the sum of squared residuals before each step of the last attempt;
+    borders: steps at which its stages began."""
+
+    method: str
+    seed: int
+    variables: list[float]
+    succeeded: bool
+    attempts: int
+    steps: int
+    evaluations: int
+    seconds: float
+    losses: list[float]
+    borders: list[int]
+
+
+class Search:
+    """A search under way. ``step`` until ``outcome`` is there; ``state`` and ``resume`` carry it over a
+    break.
+
+    goal_um: mean RMS spot that counts as success, together with all limits and all rays. shorten: divides the
+      steps of every stage.
+    """
+
+    def __init__(self, method: str, seed: int, goal_um: float, shorten: int = 1):
+        self.method = method
+        self.seed = seed
+        self.goal_um = goal_um
+        self.stages = tuple(replace(s, steps=s.steps // shorten) for s in STAGES[method])
+        self.attempt = self.steps = self.evaluations = 0
+        self.seconds = 0.0
+        self.outcome = None
+        self._begin_attempt()
+
+    def step(self):
+        """One optimiser step. Returns its Entry."""
+        entry = self.optimiser.step()
+        self.losses.append(entry.loss)
+        self.steps += 1
+        ended = len(self.optimiser.history) >= self.stages[self.stage].steps or getattr(
+            self.optimiser, "stopped", ""
+        )
+        if ended and self.stage + 1 < len(self.stages):
+            self._begin_stage(self.stage + 1, self._variables())
+        elif ended:
+            self._end_attempt()
+        return entry
+
+    def state(self):
+        """Numbers and lists for a state file."""
+        return {
+            "attempt": self.attempt,
+            "stage": self.stage,
+            "steps": self.steps,
+            "evaluations": self.evaluations,
+            "seconds": self.seconds,
+            "losses": self.losses,
+            "borders": self.borders,
+            "began": self.began.tolist(),
+            "optimiser": self.optimiser.state(),
+        }
+
+    def resume(self, state: dict):
+        """Go on from ``state`` of the same method and seed."""
+        self.attempt = state["attempt"]
+        self._begin_stage(state["stage"], torch.tensor(state["began"], dtype=torch.float64))
+        self.optimiser.resume(state["optimiser"])
+        for name in ("steps", "evaluations", "seconds", "losses", "borders"):
+            setattr(self, name, state[name])
+        return self
+
+    def _begin_attempt(self):
+        self.losses = []
+        self.borders = []
+        self._begin_stage(0, draw_start(torch.Generator().manual_seed(1000 * self.seed + self.attempt)))
+
+    def _begin_stage(self, stage, variables):
+        self.stage = stage
+        self.began = variables
+        self.borders.append(len(self.losses))
+        plain = residuals_of(self.stages[stage])
+
+        def residuals(at):
+            self.evaluations += 1
+            return plain(at)
+
+        if self.method == "adam":
+            scales = column_scales(jacobian()(residuals, variables, plain(variables)), ADAM_LIMIT)
+            self.optimiser = ScaledAdam(
+                lambda at: residuals(at).square().sum() / 2, variables, scales, ADAM_STEP
+            )
+        else:
+            self.optimiser = DampedLeastSquares(
+                residuals, variables, jacobian(), stop=StopRules(loss=LOSS_CHANGE)
+            )
+
+    def _variables(self):
+        return self.optimiser.best if isinstance(self.optimiser, ScaledAdam) else self.optimiser.variables
+
+    def _end_attempt(self):
+        verdict = judge(self._variables())
+        succeeded = (
+            verdict is not None
+            and verdict.rays_pass
+            and verdict.limits_hold
+            and verdict.mean_um <= self.goal_um
+        )
+        self.attempt += 1
+        if not succeeded and self.attempt < ATTEMPTS[self.method]:
+            self._begin_attempt()
+            return
+        self.outcome = Outcome(
+            self.method,
+            self.seed,
+            self._variables().tolist(),
+            succeeded,
+            self.attempt,
+            self.steps,
+            self.evaluations,
+            self.seconds,
+            self.losses,
+            self.borders,
+        )

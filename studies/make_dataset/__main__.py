@@ -1,0 +1,372 @@
+"""Data sets of a moving event camera: frames, events, optical flow, depth, poses and calibration along five
+families of trajectories.
+
+Every sequence is a folder with events and frames in HDF5 (laid out as in DSEC), flow as 16-bit PNG, poses as
+text, and the camera's calibration. A run
+that was stopped or killed goes on with --resume, and ends with the same bytes. The layout is described in
+docs/datasets.md.
+"""
+
+import dataclasses
+import inspect
+import io
+import itertools
+import math
+import sys
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+
+from codesign import lens
+from codesign.errors import DomainError
+from codesign.events import SensorModel, SensorState, simulate
+from codesign.flow_files import write_flow
+from codesign.lens import catalogue
+from codesign.render import Camera, shade
+from codesign.render.moving import at_frames
+from scenes import worlds
+from scenes.build import LEVELS
+from scenes.dataset_motion import FAMILIES, LEAD_S, STAGES, Stage, motion
+from scenes.trajectories import times
+from scenes.tum import write_tum
+from studies.frame.run import Run, StudyConfig, main
+from studies.frame.state import write_atomic
+from studies.frame.timing import resident_mb as resident_mb_now
+from studies.make_dataset import page as pages
+from studies.make_dataset import store
+from studies.make_dataset.chart import Chart
+from studies.make_dataset.truth import Segments, truth_of_frames
+
+FIELD_SHARE = 0.95  # of the lens's field that the picture's diagonal takes
+PIXELS_PER_CHUNK = 2**19  # fewer frames than asked for are worked on together where pictures are large
+PIXELS_PER_TRUTH = 2**16  # worked on together in float64
+LONGEST_S = 4000.0  # event times are 32-bit microseconds
+
+
+@dataclass(frozen=True)
+class Config(StudyConfig):
+    trajectories: int = 5
+    """Number of sequences; the families orbital, radial, vertical, driving, flying take turns."""
+    frames: int = 600
+    """Frames of every sequence."""
+    rate_hz: float = 200.0
+    """Frames per second. Events are simulated between them, with log intensity linear in time."""
+    world: str = "room"
+    """The world to move in, a name out of scenes.worlds.WORLDS."""
+    light: Literal["emissive", "baked", "path"] = "emissive"
+    """How the world is lit: its pictures as radiance, its lamps worked out once, or path traced."""
+    lens: str = "cooke-triplet"
+    """A lens of the catalogue, or a lens file."""
+    level: Literal["traced", "thin", "pinhole"] = "traced"
+    """Traced lens, its thin lens (blur without aberrations), or a pinhole."""
+    focal_length_mm: float = 8.0
+    """The lens is scaled to this focal length; the pixels to its field."""
+    size: int = 128
+    """Width and height of the picture, pixels."""
+    samples: int = 8
+    """Rays per pixel."""
+    theta: float = 0.2
+    """Contrast threshold of the event sensor, natural log units."""
+    theta_sigma: float = 0.02
+    """Standard deviation of the thresholds over the pixels."""
+    shot_rate_hz: float = 0.1
+    """Noise events per pixel and second."""
+    chunk: int = 25
+    """Frames that are rendered, simulated and written together; what is lost at most when the run is
+    killed."""
+    flo: bool = False
+    """Also write every flow as a Middlebury .flo file, exact to float32."""
+
+
+class Clock:
+    """Seconds spent per part of the work."""
+
+    def __init__(self):
+        self.spent = dict.fromkeys(("frames", "truth", "events", "flow files", "writing"), 0.0)
+
+    @contextmanager
+    def on(self, name):
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.spent[name] += time.perf_counter() - start
+
+
+@torch.no_grad()
+def study(run: Run[Config]) -> None:
+    config = checked(quick(run.config) if run.config.quick else run.config)
+    scene, stage = make_world(config.world, config.light)
+    camera = make_camera(config)
+    clock = Clock()
+    start = time.perf_counter()
+    names = [
+        f"sequence_{index:03d}_{FAMILIES[index % len(FAMILIES)]}" for index in range(config.trajectories)
+    ]
+    size = chunk_size(config)
+    chunks = math.ceil(config.frames / size)
+    ready = {
+        name: chunks if store.is_done(run.folder / name) else store.parts_done(run.folder / name)
+        for name in names
+    }
+    chart = Chart(camera)
+    rays = camera.rays()
+    chief = camera.chief_rays(camera.film.pixels())
+    segments = Segments(scene)
+    done = sum(ready.values())
+    resident_mb = []
+    with run.progress(chunks * len(names), "chunks", done) as progress:
+        for index, name in enumerate(names):
+            if store.is_done(run.folder / name):
+                continue
+            sequence = Sequence(
+                config, index, run.folder / name, scene, stage, camera, chart, rays, chief, segments, clock
+            )
+            for chunk in range(ready[name], chunks):
+                events = sequence.make(chunk, size)
+                progress.advance(sequence=index, events=events)
+            sequence.finish(chunks)
+            resident_mb.append(resident_mb_now())
+    wall_s = time.perf_counter() - start
+    write_atomic(run.folder / "manifest.json", store.manifest(run.folder, names).encode())
+    fresh = (chunks * len(names) - done) * size
+    if resident_mb:
+        run.record(session_resident_mb_first=resident_mb[0], session_resident_mb_last=resident_mb[-1])
+    pages.show(run, names, clock.spent, wall_s, min(fresh, config.frames * len(names)))
+
+
+def quick(config):
+    """A small data set."""
+    return dataclasses.replace(
+        config,
+        trajectories=min(config.trajectories, 2),
+        frames=min(config.frames, 40),
+        size=min(config.size, 64),
+        samples=min(config.samples, 4),
+    )
+
+
+def checked(config):
+    """Raise DomainError for numbers that give no data set; returns the configuration."""
+    for name, least, most in (
+        ("trajectories", 1, 1000),
+        ("frames", 2, 1_000_000),
+        ("size", 8, 4096),
+        ("samples", 1, 4096),
+        ("chunk", 2, 1000),
+        ("seed", 0, 2**31),
+    ):
+        if not least <= getattr(config, name) <= most:
+            raise DomainError(f"--{name} is {getattr(config, name)}; {least} to {most} are possible.")
+    if not (0 < config.rate_hz <= 1e5 and config.frames / config.rate_hz <= LONGEST_S):
+        raise DomainError(
+            f"--rate-hz is {config.rate_hz:g}: above 0, at most 100000, and such that {config.frames} "
+            f"frames last at most {LONGEST_S:g} s."
+        )
+    if not 0.1 <= config.focal_length_mm <= 1000:
+        raise DomainError(f"--focal-length-mm is {config.focal_length_mm:g}; 0.1 to 1000 are possible.")
+    return config
+
+
+def chunk_size(config):
+    """Frames per part; the same for every session of a run."""
+    return max(2, min(config.chunk, PIXELS_PER_CHUNK // config.size**2))
+
+
+def make_world(name, light):
+    """Scene and Stage of a world by name. Raises: DomainError when there is none."""
+    if name not in worlds.WORLDS:
+        raise DomainError(f"--world is '{name}'; there are {', '.join(worlds.WORLDS)}.")
+    build = worlds.WORLDS[name]
+    if light != "emissive" and "light" not in inspect.signature(build).parameters:
+        raise DomainError(f"the world '{name}' has no lamps; use --light emissive.")
+    options = {} if light == "emissive" else {"light": LEVELS[light]}
+    if name in STAGES:
+        return build(**options), STAGES[name]
+    origin, target = worlds.VIEWS[name]
+    distance = math.dist(origin, target)
+    x, y, z = origin
+    yaw = math.atan2(target[1] - y, target[0] - x)
+    low, high = ((x + side, y + side, z + side) for side in (-0.2, 0.2))
+    return build(**options), Stage(
+        target, low, high, (0.7 * distance, 0.3 * distance), 0.5, (x, y), yaw, 0.0, height_m=z
+    )
+
+
+def make_camera(config):
+    """The camera of a configuration: the lens scaled to its focal length, the film to FIELD_SHARE of its
+    field."""
+    geo = lens.load(config.lens)
+    half_deg = geo.half_field_deg or (
+        lens.half_field_deg(config.lens) if config.lens in catalogue.LENSES else None
+    )
+    if half_deg is None:
+        raise DomainError(
+            f"the lens '{config.lens}' does not say for which field it is made; add half_field_deg to its "
+            "file."
+        )
+    geo = geo.scaled(config.focal_length_mm / float(geo.first_order().efl_mm.detach())).freeze()
+    pitch_mm = (
+        2
+        * config.focal_length_mm
+        * math.tan(math.radians(half_deg))
+        * FIELD_SHARE
+        / (config.size * math.sqrt(2))
+    )
+    chosen = {
+        "traced": lambda: geo,
+        "thin": geo.thin,
+        "pinhole": lambda: lens.Pinhole(config.focal_length_mm),
+    }[config.level]()
+    samples = config.samples if config.level != "pinhole" or config.samples > 1 else 1
+    return Camera(chosen, config.size, config.size, pitch_mm, samples, config.seed)
+
+
+class Sequence:
+    """One sequence in the making."""
+
+    def __init__(self, config, index, folder, scene, stage, camera, chart, rays, chief, segments, clock):
+        self.config = config
+        self.folder = folder
+        self.scene = scene
+        self.camera = camera
+        self.clock = clock
+        self.chart = chart
+        self.rays = rays
+        self.chief = chief
+        self.segments = segments
+        self.family = FAMILIES[index % len(FAMILIES)]
+        (folder / store.PARTS).mkdir(parents=True, exist_ok=True)
+        (folder / "flow" / "forward").mkdir(parents=True, exist_ok=True)
+        self.t_s = times(config.frames, config.rate_hz)
+        draw, self.noise = (
+            torch.Generator().manual_seed(1_000_003 * config.seed + 2 * index + k) for k in (0, 1)
+        )
+        self.path = motion(self.family, stage, scene, camera, float(self.t_s[-1]), draw)
+        self.poses = self.path(LEAD_S + self.t_s).detach()
+        self.state = None
+
+    def make(self, chunk, size):
+        """Render, simulate and store frames chunk * size and on; returns the number of events."""
+        first = chunk * size
+        last = min((chunk + 1) * size, self.config.frames)
+        if self.state is None:  # at the start of a session
+            self.state = (
+                store.read_state(store.part_path(self.folder, chunk - 1))
+                if chunk
+                else SensorState(generator=self.noise)
+            )
+        clock = self.clock
+        sensor = SensorModel(
+            self.config.theta,
+            self.config.theta,
+            self.config.theta_sigma,
+            shot_rate_hz=self.config.shot_rate_hz,
+        )
+        with clock.on("frames"):
+            frames = shade(
+                self.rays,
+                at_frames(self.scene, slice(first, last)),
+                self.poses[first:last],
+                self.camera.samples_per_pixel,
+            ).reshape(-1, *self.camera.film.shape)
+        with clock.on("truth"):
+            truth = self._truth(first, last)
+        with clock.on("events"):
+            events = simulate(frames, self.t_s[first:last], sensor, state=self.state)
+        with clock.on("flow files"):
+            for k, (flow, valid) in enumerate(zip(truth["flow"], truth["valid"], strict=True)):
+                for kind in ("png", "flo") if self.config.flo else ("png",):
+                    write_flow(self.folder / "flow" / "forward" / f"{first + k:06d}.{kind}", flow, valid)
+        with clock.on("writing"):
+            store.write_part(
+                store.part_path(self.folder, chunk), {"frames": frames, **truth}, events, self.state
+            )
+        return len(events)
+
+    def _truth(self, first, last):
+        step = max(1, PIXELS_PER_TRUTH // self.config.size**2)
+        found = []
+        for start in range(first, last, step):
+            stop = min(start + step, last)
+            some = slice(start, min(stop + 1, self.config.frames))
+            found.append(
+                truth_of_frames(
+                    self.chart,
+                    self.chief,
+                    at_frames(self.scene, some),
+                    self.poses[some],
+                    stop - start,
+                    self.segments,
+                )
+            )
+        names = {
+            "depth": "depth_m",
+            "object_id": "object_id",
+            "segment_id": "segment_id",
+            "flow": "flow_px",
+            "valid": "valid",
+            "occluded": "occluded",
+        }
+        return {name: torch.cat([getattr(part, field) for part in found]) for name, field in names.items()}
+
+    def finish(self, count):
+        """Join the parts and write what describes the sequence; last of all the file that says so."""
+        with self.clock.on("writing"):
+            velocity = self.path.velocity(LEAD_S + self.t_s).detach()
+            store.join(
+                self.folder,
+                count,
+                self.t_s.numpy(),
+                {"poses": self.poses.numpy(), "velocity": velocity.numpy()},
+            )
+            write_tum(self.folder / "poses.txt", self.t_s, self.poses)
+            self._calibration()
+            us = np.rint(self.t_s.numpy() * 1e6).astype(np.int64)
+            lines = [
+                "# from_timestamp_us, to_timestamp_us",
+                *(f"{a}, {b}" for a, b in itertools.pairwise(us)),
+            ]
+            write_atomic(self.folder / "flow" / "forward_timestamps.txt", ("\n".join(lines) + "\n").encode())
+            store.finish(
+                self.folder,
+                {"family": self.family, **pages.statistics(self.folder), "segments": self.segments.names},
+            )
+
+    def _calibration(self):
+        """camera.h5: the chief ray of every pixel, camera axes, and the matrix of the pinhole that it is near
+        the axis; lens.json for a traced lens."""
+        film = self.camera.film
+        content = io.BytesIO()
+        centre = film.middle_px.tolist()
+        beside = self.camera.chief_rays(
+            film.middle_px
+            + torch.tensor([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]], dtype=torch.float64)
+        ).direction.double()
+        x = beside[:, 0] / beside[:, 2]
+        y = beside[:, 1] / beside[:, 2]
+        fx = float(1 / (x[0] - x[1]))
+        fy = float(1 / (y[2] - y[3]))
+        with store.h5(content, "w") as file:
+            file["direction"] = self.chief.direction.reshape(*film.shape, 3).double().numpy()
+            file["origin_m"] = self.chief.origin_m.reshape(*film.shape, 3).double().numpy()
+            file["K"] = np.array([[fx, 0, centre[0]], [0, fy, centre[1]], [0, 0, 1.0]])
+            file.attrs.update(
+                lens=self.config.lens,
+                level=self.config.level,
+                focal_length_mm=self.config.focal_length_mm,
+                pixel_pitch_mm=film.pixel_pitch_mm,
+                width_px=film.width_px,
+                height_px=film.height_px,
+            )
+        write_atomic(self.folder / "camera.h5", content.getvalue())
+        if isinstance(self.camera.lens, lens.GeoLens):
+            lens.save(self.camera.lens, self.folder / "lens.json")
+
+
+if __name__ == "__main__":
+    sys.exit(main(study, Config))

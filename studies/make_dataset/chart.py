@@ -1,0 +1,149 @@
+"""A camera's chief rays as polynomials, so that points of space are projected in a few multiplications
+instead of ray traces.
+
+A chief ray that leaves with slope s (dx/dz, dy/dz) starts at base B(s) on the plane of the entrance pupil and
+comes from the pixel U(s). The image of a point
+(X, Y, z) is U(s) with s = (X, Y)/z - B(s)/z, an equation that fixed-point steps solve, since B is a part of a
+millimetre and z is metres. U and B are
+Chebyshev series in both components of s, interpolated at their nodes and checked against traced rays.
+"""
+
+import torch
+
+from codesign.render import project
+
+FAR_M = 1e9  # at which a point is its direction
+DEGREES = (8, 12, 16, 20)
+TOLERANCE_PX = 1e-6
+MARGINS = (0.2, 0.1, 0.03, 0.0)  # of the film's field, beyond its border
+STEPS = 3
+BLOCK = 2048  # points at a time: their series stay in the cache
+
+
+class Chart:
+    """``project`` for one camera, from a table; also gives the chief ray that leads to the point.
+
+    Where the lens has no such polynomials to 1e-6 px, and for points outside the table, rays are traced as in
+    codesign.render.project.
+    """
+
+    def __init__(self, camera):
+        self.camera = camera
+        self.series = None
+        rays = camera.chief_rays(_border(camera.film))
+        slope = (rays.direction[:, :2] / rays.direction[:, 2:]).detach().double()
+        if not bool(slope.isfinite().all() & (rays.weight > 0).all()):
+            return  # the film is larger than the field of the lens
+        middle = (slope.amax(0) + slope.amin(0)) / 2
+        half = (slope.amax(0) - slope.amin(0)) / 2
+        for margin in MARGINS:
+            self.middle = middle
+            self.half = half * (1 + margin)
+            for degree in DEGREES:
+                if (found := self._fitted(degree)) is None:
+                    break  # the lens does not reach as far: try a smaller margin
+                self.series = found
+                if self._error_px() < TOLERANCE_PX:
+                    return
+                self.series = None
+
+    def __call__(self, points_cam_m):
+        """Image and chief ray of points [N, 3] in camera axes with z > 0.
+
+        Returns: pixels [N, 2] (NaN where there is no image), base [N, 2] metres and slope [N, 2] of the chief
+          ray, all float64. No gradient.
+        """
+        pixels, base, slope, inside = self._from_series(points_cam_m)
+        if not bool(inside.all()):
+            rest = ~inside
+            pixels[rest] = project(self.camera, points_cam_m[rest])
+            found = rest & pixels.isfinite().all(1)
+            if bool(found.any()):
+                rays = self.camera.chief_rays(pixels[found])
+                slope[found] = rays.direction[:, :2] / rays.direction[:, 2:]
+                base[found] = rays.origin_m[:, :2] - slope[found] * rays.origin_m[:, 2:]
+        return pixels, base, slope
+
+    def _from_series(self, points_cam_m):
+        straight = points_cam_m[:, :2] / points_cam_m[:, 2:]
+        near = 1 / points_cam_m[:, 2:]
+        if self.series is None:
+            return (
+                torch.full_like(straight, torch.nan),
+                torch.zeros_like(straight),
+                straight.clone(),
+                torch.zeros(len(straight), dtype=torch.bool),
+            )
+        slope = straight
+        base = torch.zeros_like(straight)
+        change = torch.full_like(near[:, 0], torch.inf)
+        for _ in range(STEPS):
+            base = self._series_at(slope, self.series[:, :, 2:])
+            before = slope
+            slope = straight - base * near
+        change = (slope - before).abs().amax(1)
+        inside = (((slope - self.middle) / self.half).abs() <= 1).all(1) & (change < 1e-9)
+        return self._series_at(slope, self.series[:, :, :2]), base, slope, inside
+
+    def _series_at(self, slope, series):
+        at = ((slope - self.middle) / self.half).clamp(-1, 1).T.contiguous()
+        count, _, kinds = series.shape
+        return torch.cat(
+            [
+                ((series.reshape(count, -1).T @ x).reshape(count, kinds, -1) * y[:, None]).sum(0)
+                for x, y in (_chebyshev(part, count) for part in at.split(BLOCK, 1))
+            ],
+            1,
+        ).T
+
+    def _fitted(self, degree):
+        """Coefficients [degree + 1, degree + 1, 4] of pixel and base; None when a node lies outside the
+        lens's field."""
+        count = degree + 1
+        nodes = torch.cos(torch.pi * (torch.arange(count, dtype=torch.float64) + 0.5) / count)
+        x, y = torch.meshgrid(nodes, nodes, indexing="ij")
+        slope = self.middle + self.half * torch.stack([x.reshape(-1), y.reshape(-1)], 1)
+        pixels = project(self.camera, torch.cat([slope, torch.ones_like(slope[:, :1])], 1) * FAR_M)
+        if not bool(pixels.isfinite().all()):
+            return None
+        rays = self.camera.chief_rays(pixels)
+        base = rays.origin_m[:, :2] - rays.direction[:, :2] / rays.direction[:, 2:] * rays.origin_m[:, 2:]
+        values = torch.cat([pixels, base], 1).detach().double().reshape(count, count, 4)
+        basis = _chebyshev(nodes[None], count)[0].T * (
+            2 / count
+        )  # interpolation at the nodes: discrete orthogonality
+        basis[:, 0] /= 2
+        return torch.einsum("ik,jl,ijc->klc", basis, basis, values).contiguous()
+
+    def _error_px(self):
+        """Largest error against traced rays, at points of a spiral over the table and three depths."""
+        k = torch.arange(96, dtype=torch.float64)
+        radius = ((k + 0.5) / 96).sqrt() * 1.3
+        angle = k * 2.399963
+        at = (radius[:, None] * torch.stack([angle.cos(), angle.sin()], 1)).clamp(-0.98, 0.98)
+        depth = torch.tensor([0.3, 1.5, 20.0], dtype=torch.float64).repeat(32)[:, None]
+        points = torch.cat([self.middle + self.half * at, torch.ones_like(depth)], 1) * depth
+        pixels, _, _, inside = self._from_series(points)
+        truth = project(self.camera, points)
+        both = inside & truth.isfinite().all(1)
+        return float((pixels - truth)[both].abs().max()) if bool(both.any()) else float("inf")
+
+
+def _chebyshev(at, count):
+    """T_0 .. T_(count - 1) at values [D, N] in [-1, 1]: [D, count, N]."""
+    terms = torch.ones(at.shape[0], count, at.shape[1], dtype=at.dtype)
+    terms[:, 1] = at
+    for k in range(2, count):
+        torch.sub(2 * at * terms[:, k - 1], terms[:, k - 2], out=terms[:, k])
+    return terms
+
+
+def _border(film):
+    """Pixel coordinates along the border of the whole sensor, half a pixel outside the outermost centres, and
+    its middle."""
+    share = torch.linspace(0, 1, 17, dtype=torch.float64)
+    x = share * film.sensor_width_px - 0.5
+    y = share * film.sensor_height_px - 0.5
+    sides = [torch.stack([x, torch.full_like(x, v)], 1) for v in (-0.5, film.sensor_height_px - 0.5)]
+    sides += [torch.stack([torch.full_like(y, v), y], 1) for v in (-0.5, film.sensor_width_px - 0.5)]
+    return torch.cat([*sides, film.middle_px[None]])

@@ -1,0 +1,92 @@
+"""One or several processes that train the same network, each on its share of every batch."""
+
+import os
+from dataclasses import dataclass, replace
+from datetime import timedelta
+from typing import Any
+
+import torch
+import torch.distributed as dist
+
+from codesign.errors import DomainError
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """This process among ``count``, and the device it computes on."""
+
+    rank: int
+    count: int
+    device: torch.device
+
+    def mine(self, indices):
+        """This process's share of the sample numbers of a batch."""
+        return indices[self.rank :: self.count]
+
+    def sum(self, *numbers):
+        """Sums over all processes, the same on each."""
+        if self.count == 1:
+            return list(numbers)
+        total = torch.tensor(numbers, dtype=torch.float64)
+        dist.all_reduce(total)
+        return total.tolist()
+
+    def average_gradients(self, parameters):
+        """Replace every gradient by its mean over all processes."""
+        if self.count == 1:
+            return
+        flat = torch.cat([parameter.grad.reshape(-1) for parameter in parameters])
+        dist.all_reduce(flat)
+        flat /= self.count
+        for parameter, part in zip(
+            parameters, flat.split([parameter.numel() for parameter in parameters]), strict=True
+        ):
+            parameter.grad = part.view_as(parameter)
+
+    def tell(self, value: Any = None) -> Any:
+        """What the first process gives, on every process."""
+        if self.count == 1:
+            return value
+        held = [value]
+        dist.broadcast_object_list(held, src=0, device=torch.device("cpu"))
+        return held[0]
+
+    def on(self, device_type):
+        """The same process with its device: the processor, or the graphics card of its number on this
+        machine.
+
+        Raises: DomainError when a process has no graphics card of its own.
+        """
+        if device_type != "cuda":
+            return self
+        local = int(os.environ.get("LOCAL_RANK", "0"))
+        if local >= torch.cuda.device_count():
+            raise DomainError(
+                f"process {local} of this machine has no CUDA device ({torch.cuda.device_count()} present); "
+                "start fewer processes, or give --device cpu."
+            )
+        torch.cuda.set_device(local)
+        return replace(self, device=torch.device("cuda", local))
+
+    def leave(self):
+        """End the connection."""
+        if self.count > 1:
+            dist.barrier()  # nobody hangs up while another still speaks
+            dist.destroy_process_group()
+
+
+def place():
+    """(rank, number of processes) that torchrun gave this process; (0, 1) without torchrun."""
+    return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
+
+
+def join():
+    """Connect to the other processes that torchrun started: gloo for tensors on the processor, nccl for those
+    on CUDA. Device: the processor, until ``on``."""
+    rank, count = place()
+    if count > 1:
+        backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and dist.is_nccl_available() else "gloo"
+        dist.init_process_group(
+            backend, timeout=timedelta(hours=1)
+        )  # the first process validates and draws alone meanwhile
+    return Ranks(rank, count, torch.device("cpu"))

@@ -1,0 +1,219 @@
+"""Everything a training run needs, made and checked before its first step."""
+
+import inspect
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from codesign.errors import DomainError, FileFormatError
+from codesign.flow import checkpoint
+from codesign.flow.sources import open_windows
+from studies.train_flow.loss import check_windows, objective
+from studies.train_flow.sources import VALIDATION, Batches, Part, Shape, training_parts
+from studies.train_flow.state import Learner, Progress, load
+
+HELD_OUT = (
+    10  # the last window in so many of a data set is judged on: whole stretches, since neighbours look alike
+)
+
+
+@dataclass
+class Job:
+    """Network and optimiser, batches by step, objective, what to judge on (by name: source and number of
+    windows at most), and what is done already."""
+
+    learner: Learner
+    batches: Batches
+    objective: Any
+    validation: dict[str, Any]
+    progress: Progress
+    facts: dict[str, Any]
+
+
+def check_numbers(config, processes):
+    """Raise DomainError for options that make no sense alone or together."""
+    least = {
+        "batch": 1,
+        "height_px": 16,
+        "width_px": 16,
+        "bins": 2,
+        "reuse": 1,
+        "validate_every": 1,
+        "validation_windows": 1,
+        "final_windows": 1,
+        "save_every": 1,
+        "threads": 0,
+        "weights": 0,
+        "window_frames": 1,
+    }
+    for name, limit in least.items():
+        if getattr(config, name) < limit:
+            raise DomainError(
+                f"--{name.replace('_', '-')} is {getattr(config, name)}; at least {limit} is needed."
+            )
+    if config.steps is not None and config.steps < 1:
+        raise DomainError(f"--steps is {config.steps}; at least 1 is needed.")
+    if config.cpu_minutes is not None and config.cpu_minutes <= 0:
+        raise DomainError(f"--cpu-minutes is {config.cpu_minutes}; give more than 0.")
+    if config.learning_rate <= 0 or config.weight_decay < 0 or config.clip <= 0:
+        raise DomainError(
+            f"learning rate {config.learning_rate}, weight decay {config.weight_decay}, clip {config.clip}: "
+            "give > 0, >= 0 and > 0."
+        )
+    if config.claim_weight < 0 or config.smoothness < 0:
+        raise DomainError(
+            f"claim weight {config.claim_weight}, smoothness {config.smoothness}: weights of 0 or more are "
+            "needed."
+        )
+    if not 0 <= config.warm_up < 1 or not 0 <= config.average < 1:
+        raise DomainError(
+            f"warm-up {config.warm_up}, average {config.average}: shares from 0 to below 1 are needed."
+        )
+    if config.batch % processes:
+        raise DomainError(
+            f"--batch {config.batch} cannot be shared evenly by {processes} processes; give a multiple."
+        )
+    if config.mixed_precision and config.device != "cuda":
+        raise DomainError(
+            "--mixed-precision needs CUDA; leave it out on the processor, where bfloat16 saves nothing."
+        )
+
+
+def prepare(config, folder, resumed, ranks, clock):
+    """Job of a run. ``clock`` counts making the sources as data.
+
+    Raises: CodesignError with one sentence for every unfit option, file or data set.
+    """
+    check_numbers(config, ranks.count)
+    aim = objective(config)
+    network = build_network(config)
+    if config.start is not None:
+        start(network, config)
+    network.to(ranks.device).train()
+    shape = Shape(config.height_px, config.width_px, config.bins)
+    with clock("data"):
+        parts, validation = sources(config, shape)
+        probes = [
+            source.batch(
+                sorted({0, len(source) // 2, len(source) - 1}) if hasattr(source, "__len__") else [0]
+            )
+            for _, source in parts
+        ]
+    for probe in probes:
+        check_windows(config.loss, probe)
+        if probe.volume.counts.shape[2] != config.bins:
+            raise DomainError(
+                f"the windows have {probe.volume.counts.shape[2]} time bins, the network {config.bins}; "
+                f"give --bins {probe.volume.counts.shape[2]}."
+            )
+    learner = Learner(config.network, network, config.learning_rate, config.weight_decay, config.average)
+    facts = {"seed": config.seed, "schedule": schedule_facts(config), "torch": torch.__version__}
+    progress = None
+    if resumed:
+        progress = load(folder / "checkpoint", learner, facts)
+    batches = Batches(parts, config.batch, config.reuse, mine=ranks.mine)
+    return Job(learner, batches, aim, validation, progress or Progress(), facts)
+
+
+def schedule_facts(config):
+    """What the numbers of a run depend on beside network, data and seed."""
+    names = (
+        "steps",
+        "cpu_minutes",
+        "batch",
+        "learning_rate",
+        "weight_decay",
+        "warm_up",
+        "clip",
+        "average",
+        "reuse",
+        "loss",
+        "unit",
+        "claim_weight",
+        "smoothness",
+    )
+    return {name: getattr(config, name) for name in names}
+
+
+def build_network(config):
+    """A fresh network, its weights drawn from the run's seed; the global random numbers stay as they were.
+
+    Raises: DomainError for an unknown name or option.
+    """
+    kind = checkpoint.network_class(config.network)
+    accepted = inspect.signature(kind).parameters
+    options = {"bins": config.bins, **dict(parse(option) for option in config.options)}
+    if "seed" in accepted:
+        options.setdefault("seed", config.seed)
+    unknown = [name for name in options if name not in accepted]
+    if unknown:
+        raise DomainError(
+            f"network '{config.network}' has no option '{unknown[0]}'; it has {', '.join(accepted)}."
+        )
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        try:
+            if config.weights == 0:
+                return kind(**options)
+            if not hasattr(kind, "with_weights"):
+                raise DomainError(
+                    f"--weights is for networks that come in sizes, which '{config.network}' does not; "
+                    "leave it out."
+                )
+            return kind.with_weights(config.weights, **options)
+        except TypeError as error:
+            raise DomainError(f"network '{config.network}' does not take these options ({error}).") from error
+
+
+def parse(option):
+    """("width", 32) out of "width=32"."""
+    name, equals, value = option.partition("=")
+    try:
+        if equals:
+            return name.strip(), json.loads(value)
+    except ValueError:
+        pass  # the sentence below says what is wanted
+    raise DomainError(f"--options {option}: give name=number, for example width=32.")
+
+
+def start(network, config):
+    """Begin with the weights of an earlier network.
+
+    Raises: FileFormatError when they are of another network.
+    """
+    path = checkpoint.DELIVERED.get(str(config.start), Path(config.start))
+    stored = checkpoint.read(path)
+    if stored.network != config.network:
+        raise FileFormatError(
+            f"'{config.start}' holds a '{stored.network}', --network is '{config.network}'; give the same "
+            "network."
+        )
+    checkpoint.fill(network, stored.weights, config.start)
+
+
+def sources(config, shape):
+    """Training parts, and sources to judge on with the number of windows they have (None: as many as
+    wanted)."""
+    if config.data is None:
+        chosen = config.validate_on or tuple(VALIDATION)
+        unknown = [name for name in chosen if name not in VALIDATION]
+        if unknown:
+            raise DomainError(f"--validate-on {unknown[0]} is unknown; choose from {', '.join(VALIDATION)}.")
+        return training_parts(config.mix, shape, config.seed), {
+            name: VALIDATION[name](shape, 0) for name in chosen
+        }
+    whole = open_windows(
+        config.data, config.bins, config.window_frames, (config.height_px, config.width_px), config.seed
+    )
+    held = max(1, len(whole) // HELD_OUT)
+    if len(whole) <= held:
+        raise DomainError(
+            f"'{config.data}' has {len(whole)} window(s); at least 2 are needed to train on some and judge "
+            "on others."
+        )
+    return [(1.0, Part(whole, 0, len(whole) - held))], {
+        "held_out": Part(whole, len(whole) - held, len(whole))
+    }

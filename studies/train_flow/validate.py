@@ -1,0 +1,61 @@
+"""How well an estimator does on windows that no network was trained on, beside zero flow."""
+
+from dataclasses import dataclass
+
+import torch
+
+from codesign.flow.metrics import endpoint_error
+from studies.train_flow.sources import to_device
+
+TOGETHER = 16  # windows judged at a time
+
+
+@dataclass(frozen=True)
+class Score:
+    """Figures of one estimator on one set.
+
+    aee_px, zero_flow_px: mean endpoint error over all valid pixels, of the estimate and of zero flow.
+      worse_percent: share of the windows on which the
+    estimate's own mean error is above zero flow's. windows: how many were judged.
+    """
+
+    aee_px: float
+    zero_flow_px: float
+    worse_percent: float
+    windows: int
+
+    @property
+    def ratio(self):
+        """Error as a share of that of zero flow."""
+        return self.aee_px / self.zero_flow_px
+
+
+def batches(source, count):
+    """The first ``count`` windows of a source, or all of a shorter one, some at a time."""
+    if hasattr(source, "__len__"):
+        count = min(count, len(source))
+    return (source.batch(range(first, min(first + TOGETHER, count))) for first in range(0, count, TOGETHER))
+
+
+@torch.no_grad()
+def score(estimator, found, device=None):
+    """Score of ``estimator`` on an iterable of FlowWindows. Windows without a valid pixel count for
+    nothing."""
+    device = device or torch.device("cpu")
+    sums = torch.zeros(3, dtype=torch.float64)  # error, error of zero flow, pixels
+    worse = judged = 0
+    for windows in found:
+        windows = to_device(windows, device)
+        flow = estimator(windows.volume).flow_px
+        truth = windows.truth.flow_px
+        valid = windows.truth.valid
+        pixels = valid.sum((1, 2)).double()
+        error, zero = (
+            (endpoint_error(each, truth).double() * valid).sum((1, 2))
+            for each in (flow, torch.zeros_like(truth))
+        )
+        sums += torch.stack([error.sum(), zero.sum(), pixels.sum()]).cpu()
+        worse += int((error > zero).sum())
+        judged += int((pixels > 0).sum())
+    error, zero, pixels = sums.tolist()
+    return Score(error / max(pixels, 1.0), zero / max(pixels, 1.0), 100 * worse / max(judged, 1), judged)

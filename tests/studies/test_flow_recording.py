@@ -1,0 +1,141 @@
+"""The study of event flow on a recording: its made-up recording against the renderer, its figures against
+known cases, its errors."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from codesign import events, render
+from codesign.flow.sources import PacketOptions, read_packets
+from codesign.types import FlowField
+from studies.flow_recording import __main__ as study
+from studies.flow_recording import made
+from studies.frame.run import main
+
+SIZE = (45, 60)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("recording") / "made"
+    return folder, *made.make(folder, 0.05, SIZE)
+
+
+def test_the_made_recording_says_what_the_renderer_says(recording):
+    folder, camera, scene, poses = recording
+    for truth in (None, folder / "groundtruth.txt"):
+        (packet,) = read_packets(
+            folder, truth, PacketOptions(window_s=0.04, start_s=0.0, count=1, size_px=SIZE)
+        )
+        ends = [(t * 1e-6 - made.START_S) for t in (packet.t0_us, packet.t1_us)]
+        there, seen = render.true_flow(camera, scene, poses(ends))
+        assert float(there.norm(dim=1).mean()) > 2
+        # the poses are known on a grid of 0.1 ms: half of that at 200 px and a change of rate of 10 rad/s^2
+        # over 40 ms is 4e-3 px
+        assert float((true(packet).flow_px[0] - there[0]).norm(dim=0)[seen[0]].max()) < 5e-3
+        assert bool(true(packet).valid.all())
+
+
+def true(packet):
+    """The true flow of a packet that must have one."""
+    assert packet.truth is not None
+    return packet.truth
+
+
+def run(folder, *options):
+    code = main(study.study, study.Config, ["--out", str(folder), "--estimator", "lk", *options])
+    metrics = folder / "metrics.json"
+    return code, json.loads(metrics.read_text()) if metrics.is_file() else None
+
+
+def test_figures_of_a_run(recording, tmp_path):
+    threads = torch.get_num_threads()
+    code, metrics = run(
+        tmp_path / "run",
+        "--recording",
+        str(recording[0]),
+        "--window-ms",
+        "20",
+        "--start-s",
+        "0.005",
+        "--packets",
+        "2",
+        "--width-px",
+        "60",
+        "--height-px",
+        "45",
+    )
+    torch.set_num_threads(threads)
+    assert code == 0
+    assert metrics is not None
+    packets = read_packets(
+        recording[0], options=PacketOptions(window_s=0.02, start_s=0.005, count=2, size_px=SIZE)
+    )
+    errors = []
+    zero = []
+    for packet in packets:
+        volume = events.from_stream(packet.stream, packet.t0_us, packet.t1_us, 8)
+        flow, _ = study.measured(packet, study.load("lk")["lk"][0], 8)
+        seen = (volume.counts.sum((1, 2)) > 0)[0]
+        errors.append(float((flow.flow_px - true(packet).flow_px)[0].square().sum(0).sqrt()[seen].mean()))
+        zero.append(float(true(packet).flow_px[0].square().sum(0).sqrt()[seen].mean()))
+    assert metrics["lk_aee_px"] == pytest.approx(np.mean(errors), rel=1e-5)
+    assert metrics["lk_zero_aee_px"] == pytest.approx(np.mean(zero), rel=1e-5)
+    assert metrics["aee_px"] == metrics["lk_aee_px"]
+    assert metrics["packets"] == 2
+    assert metrics["events"] == sum(len(packet.stream) for packet in packets)
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "rotation alone" in page
+    assert "The recording is synthetic" not in page
+    assert (tmp_path / "run" / "packet_01.png").is_file()
+
+
+def test_the_true_flow_is_sharper_than_none_and_without_error(recording):
+    (packet,) = read_packets(
+        recording[0], options=PacketOptions(window_s=0.04, start_s=0.0, count=1, size_px=SIZE)
+    )
+    _, right = study.measured(packet, lambda _: packet.truth, 8)
+    _, none = study.measured(
+        packet, lambda _: FlowField(torch.zeros_like(true(packet).flow_px), true(packet).valid, 0.04), 8
+    )
+    assert right["aee_px"] == right["aee_dense_px"] == right["outlier_percent"] == 0
+    assert right["angular_error_deg"] < 0.05  # of float32
+    assert right["fwl"] > 1.2
+    assert right["rsat"] < 1
+    assert none["fwl"] == 1  # by definition
+    assert none["aee_px"] == none["zero_aee_px"]
+
+
+def test_a_recording_without_truth_has_its_sharpness_only(tmp_path):
+    (tmp_path / "events.txt").write_text(
+        "".join(f"{0.1 + k * 1e-4:.6f} {(k * 7) % 60} {(k * 3) % 45} {k % 2}\n" for k in range(400))
+    )
+    code, metrics = run(
+        tmp_path / "run", "--recording", str(tmp_path / "events.txt"), "--width-px", "60", "--height-px", "45"
+    )
+    assert code == 0
+    assert metrics is not None
+    assert metrics["packets_without_truth"] == metrics["packets"] == 1  # shorter than 0.1 s: one packet
+    assert "lk_aee_px" not in metrics
+    assert metrics["lk_fwl"] > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--recording", "absent"], "nothing lies at absent"),
+        (["--estimator", "nothing"], "nothing"),
+        (["--width-px", "60"], "give both"),
+        (["--window-ms", "-1"], "above 0"),
+        (["--truth", "absent.flo"], "no ground truth lies"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_exit_code_2(options, sentence, recording, tmp_path, capsys):
+    base = [] if "--recording" in options else ["--recording", str(recording[0])]
+    size = [] if "--width-px" in options else ["--width-px", "60", "--height-px", "45"]
+    assert main(study.study, study.Config, ["--out", str(tmp_path / "run"), *base, *size, *options]) == 2
+    error = capsys.readouterr().err
+    assert sentence in error
+    assert error.count("\n") == 1

@@ -1,0 +1,424 @@
+"""Data sets: the fast truth against the slow one, files against their definitions, and runs that are killed
+at any moment."""
+
+import hashlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+import torch
+
+from codesign import lens, render
+from codesign.errors import DomainError
+from codesign.events import SensorModel, SensorState, simulate
+from codesign.flow_files import read_flow
+from codesign.pose import inverse, look_at, se3_exp
+from codesign.render import Camera
+from codesign.render.moving import MovingScene, at_frames
+from codesign.render.truth import flow_and_occlusion, view
+from scenes import dataset_motion as motions
+from scenes import worlds
+from scenes.tum import read_tum
+from studies.frame.run import main
+from studies.make_dataset import __main__ as study
+from studies.make_dataset import store
+from studies.make_dataset.chart import TOLERANCE_PX, Chart
+from studies.make_dataset.truth import Segments, truth_of_frames
+
+D = torch.float64
+ROOT = Path(__file__).resolve().parents[2]
+SMALL = [
+    "--trajectories",
+    "2",
+    "--frames",
+    "14",
+    "--size",
+    "24",
+    "--samples",
+    "2",
+    "--chunk",
+    "4",
+    "--rate-hz",
+    "90",
+]  # frames 0.0111 s apart: no whole microseconds
+
+
+def camera(name="cooke-triplet", size=24, level: Literal["traced", "thin", "pinhole"] = "traced"):
+    return study.make_camera(study.Config(lens=name, size=size, samples=2, level=level))
+
+
+def poses(count):
+    start = look_at((0.1, -1.0, 1.1), (0.0, 0.8, 0.5))
+    return start @ se3_exp(
+        torch.arange(count, dtype=D)[:, None] * torch.tensor([0.03, 0.01, 0.05, 0.02, -0.03, 0.04], dtype=D)
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "level"),
+    [
+        ("cooke-triplet", "traced"),
+        ("double-gauss", "traced"),
+        ("cooke-triplet", "thin"),
+        ("cooke-triplet", "pinhole"),
+    ],
+)
+def test_the_chart_projects_as_traced_rays_do(name, level):
+    with torch.no_grad():
+        cam = camera(name, level=level)
+        chart = Chart(cam)
+        assert chart.series is not None
+        draw = torch.rand(400, 3, generator=torch.Generator().manual_seed(0), dtype=D)
+        depth = 0.3 * 100 ** draw[:, 2:]
+        points = torch.cat([(draw[:, :2] - 0.5) * 0.9 * depth, depth], 1)  # within and beyond the field
+        pixels, base, slope = chart(points)
+        truth = render.project(cam, points)
+        assert torch.equal(pixels.isnan(), truth.isnan())
+        seen = truth.isfinite().all(1)
+        assert 0.2 < float(seen.double().mean()) <= 1
+        torch.testing.assert_close(pixels[seen], truth[seen], rtol=0, atol=TOLERANCE_PX)
+        # the ray it names passes through the point: 1e-6 px of a 250 px focal length
+        torch.testing.assert_close(
+            base[seen] + slope[seen] * points[seen, 2:], points[seen, :2], rtol=0, atol=1e-8 * 30
+        )
+
+
+def test_a_film_larger_than_the_field_is_projected_by_tracing():
+    with torch.no_grad():
+        cam = Camera(lens.load("double-gauss").freeze(), 12, 12, 12.0, 1)
+        chart = Chart(cam)
+        assert chart.series is None
+        points = torch.tensor([[0.1, 0.2, 2.0], [0.0, 0.0, 1.0]], dtype=D)
+        torch.testing.assert_close(chart(points)[0], render.project(cam, points), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_the_truth_of_many_frames_is_that_of_each(moving):
+    with torch.no_grad():
+        cam = camera(size=40)
+        T = poses(5)
+        scene = worlds.room()
+        if moving:
+            path = torch.eye(4, dtype=D).repeat(5, 1, 1)
+            path[:, :3, 3] = torch.tensor([-0.2, 0.0, 0.9], dtype=D) + torch.arange(5, dtype=D)[
+                :, None
+            ] * torch.tensor([0.05, 0.02, 0.0], dtype=D)
+            scene = MovingScene(
+                scene,
+                {
+                    "board": (
+                        worlds.smooth_plane(),
+                        path @ se3_exp(torch.tensor([0, 0, -0.9, 1.2, 0, 0], dtype=D)),
+                    )
+                },
+            )
+        chief = cam.chief_rays(cam.film.pixels())
+        segments = Segments(scene)
+        found = truth_of_frames(Chart(cam), chief, scene, T, 5, segments)
+        slow = flow_and_occlusion(cam, scene, T)
+        assert found.flow_px.shape == (4, 2, 40, 40)
+        assert torch.equal(found.valid, slow.valid)
+        torch.testing.assert_close(found.flow_px, slow.flow_px, rtol=0, atol=TOLERANCE_PX)
+        assert (
+            int((found.occluded != slow.occluded).sum()) <= 2
+        )  # a ray 1e-6 px aside may meet another surface at an edge
+        assert bool(found.occluded.any())
+        for k in range(5):
+            each = view(cam, scene, T, k)
+            assert torch.equal(found.object_id[k], each.object_id)
+            torch.testing.assert_close(found.depth_m[k], each.depth_m, rtol=0, atol=1e-12)
+        assert set(found.object_id.unique().tolist()) == ({0, 1} if moving else {0})
+        part = truth_of_frames(Chart(cam), chief, at_frames(scene, slice(2, 4)), T[2:4], 1, segments)
+        assert torch.equal(part.flow_px[0], found.flow_px[2])
+        assert (
+            truth_of_frames(
+                Chart(cam), chief, at_frames(scene, slice(4, 5)), T[4:], 1, segments
+            ).flow_px.shape[0]
+            == 0
+        )
+
+
+def test_segments_are_the_shapes_of_the_scene():
+    with torch.no_grad():
+        cam = camera(size=48)
+        scene = worlds.room()
+        T = poses(1)
+        segments = Segments(scene)
+        found = truth_of_frames(Chart(cam), cam.chief_rays(cam.film.pixels()), scene, T, 1, segments)
+        points = view(cam, scene, T, 0).points_world_m
+        assert segments.names == sorted(segments.names)
+        index = {name: number for number, name in enumerate(segments.names)}
+        distance = (points - torch.tensor([0.1, 0.5, 0.25], dtype=D)).norm(dim=2)
+        on_ball = found.segment_id[0] == index["static/ball"]
+        assert bool(on_ball.any())
+        assert float((distance[on_ball] - 0.25).abs().max()) < 5e-3  # it rests a gap of 1 mm above the ground
+        on_floor = found.segment_id[0] == index["static/floor"]
+        assert torch.equal(on_floor, points[..., 2].abs() < 1e-5)
+        assert torch.equal(found.segment_id[0] == index["static/north"], (points[..., 1] - 2).abs() < 1e-5)
+
+
+@pytest.mark.parametrize("world", list(worlds.WORLDS))
+def test_every_world_has_a_clear_path_of_every_family(world):
+    with torch.no_grad():
+        scene, stage = study.make_world(world, "emissive")
+        cam = camera(size=16)
+        for family in motions.FAMILIES:
+            one, two = (
+                motions.motion(family, stage, scene, cam, 1.5, torch.Generator().manual_seed(3))
+                for _ in range(2)
+            )
+            t = motions.LEAD_S + torch.linspace(0, 1.5, 7, dtype=D)
+            assert torch.equal(one(t), two(t))
+            for k in range(7):
+                seen = view(cam, scene, one(t), k)
+                assert float(seen.valid.double().mean()) > motions.SEEN - 0.1
+                assert float(seen.depth_m[seen.valid].min()) > 0.8 * motions.CLEAR_M
+
+
+def run_study(folder, *more):
+    return main(study.study, study.Config, [*SMALL, "--out", str(folder), *more])
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    threads = torch.get_num_threads()
+    folder = tmp_path_factory.mktemp("data") / "set"
+    assert run_study(folder, "--flo") == 0
+    torch.set_num_threads(threads)
+    return folder
+
+
+def names(folder):
+    return json.loads((folder / "manifest.json").read_text())["sequences"]
+
+
+def test_the_manifest_holds_the_hash_of_every_file(dataset):
+    manifest = json.loads((dataset / "manifest.json").read_text())
+    files = {
+        path.relative_to(dataset).as_posix()
+        for name in manifest["sequences"]
+        for path in (dataset / name).rglob("*")
+        if path.is_file()
+    }
+    assert files == set(manifest["files"])
+    assert manifest["sequences"] == ["sequence_000_orbital", "sequence_001_radial"]
+    for name, entry in manifest["files"].items():
+        content = (dataset / name).read_bytes()
+        assert entry == {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
+    expected = {
+        "camera.h5",
+        "events.h5",
+        "frames.h5",
+        "lens.json",
+        "poses.txt",
+        "sequence.json",
+        "flow/forward_timestamps.txt",
+    }
+    expected |= {f"flow/forward/{k:06d}.{kind}" for k in range(13) for kind in ("png", "flo")}
+    assert {
+        f.removeprefix("sequence_000_orbital/") for f in files if f.startswith("sequence_000")
+    } == expected
+
+
+def test_events_are_those_of_the_stored_frames_whatever_the_chunks(dataset):
+    for index, name in enumerate(names(dataset)):
+        with (
+            store.h5(dataset / name / "frames.h5") as frames,
+            store.h5(dataset / name / "events.h5") as events,
+        ):
+            t_s = torch.from_numpy(frames["t_s"][()])
+            torch.testing.assert_close(t_s, torch.arange(14, dtype=D) / 90, rtol=0, atol=1e-15)
+            np.testing.assert_array_equal(frames["timestamps"][()], np.rint(np.arange(14) / 90 * 1e6))
+            whole = simulate(
+                torch.from_numpy(frames["frames"][()]),
+                t_s,
+                SensorModel(0.2, 0.2, 0.02, shot_rate_hz=0.1),
+                state=SensorState(generator=torch.Generator().manual_seed(2 * index + 1)),
+            )
+            assert len(whole) > 200
+            for key, values in (
+                ("t", whole.t_us),
+                ("x", whole.x),
+                ("y", whole.y),
+                ("p", (whole.p > 0).long()),
+            ):
+                np.testing.assert_array_equal(events[f"events/{key}"][()], values.numpy())
+            assert [events[f"events/{k}"].dtype.name for k in "xypt"] == [
+                "uint16",
+                "uint16",
+                "uint8",
+                "uint32",
+            ]
+            t = events["events/t"][()].astype(np.int64)
+            index_of = events["ms_to_idx"][()].astype(np.int64)
+            assert int(events["t_offset"][()]) == 0
+            assert len(index_of) * 1000 > t[-1]
+            for ms, first in enumerate(index_of):  # the definition in the format's documentation
+                assert first == len(t) or t[first] >= ms * 1000
+                assert first == 0 or t[first - 1] < ms * 1000
+
+
+def test_flow_files_hold_the_flow_and_the_truth_is_the_renderers(dataset):
+    scene, _ = study.make_world("room", "emissive")
+    cam = camera()
+    for name in names(dataset):
+        with store.h5(dataset / name / "frames.h5") as frames:
+            T, flow, valid = (torch.from_numpy(frames[key][()]) for key in ("poses", "flow", "valid"))
+            with torch.no_grad():
+                slow = flow_and_occlusion(cam, scene, T)
+                images = render.frames(cam, scene, T)
+            assert torch.equal(valid, slow.valid)
+            torch.testing.assert_close(
+                flow.double(), slow.flow_px, rtol=0, atol=2e-6
+            )  # the chart's, and float32
+            torch.testing.assert_close(torch.from_numpy(frames["frames"][()]), images, rtol=0, atol=1e-4)
+            torch.testing.assert_close(
+                torch.from_numpy(frames["depth"][3]).double(),
+                view(cam, scene, T, 3).depth_m,
+                rtol=1e-6,
+                atol=0,
+            )
+            step = inverse(T[:-1]) @ T[1:]
+            velocity = torch.from_numpy(frames["velocity"][()])
+            middle = se3_exp((velocity[:-1] + velocity[1:]) / 180)
+            # trapezium rule over 1/90 s: dt^3/12 of the jerk, which for a swing of 0.3 m at 0.7 Hz is 26
+            # m/s^3
+            torch.testing.assert_close(step, middle, rtol=0, atol=3e-6)
+        for k in range(13):
+            for kind, tolerance in (("png", 1 / 256), ("flo", 0)):
+                stored, seen = read_flow(dataset / name / "flow" / "forward" / f"{k:06d}.{kind}")
+                assert torch.equal(seen, valid[k])
+                assert float((stored - flow[k]).abs().max()) <= tolerance
+        t_s, T_text = read_tum(dataset / name / "poses.txt")
+        torch.testing.assert_close(T_text, T, rtol=0, atol=1e-12)
+        lines = (dataset / name / "flow" / "forward_timestamps.txt").read_text().splitlines()
+        assert lines[1:3] == ["0, 11111", "11111, 22222"]
+        assert len(lines) == 14
+
+
+def test_the_calibration_is_the_cameras(dataset):
+    folder = dataset / names(dataset)[0]
+    cam = camera()
+    with store.h5(folder / "camera.h5") as file:
+        rays = cam.chief_rays(cam.film.pixels())
+        np.testing.assert_allclose(
+            file["direction"][()].reshape(-1, 3), rays.direction.detach().numpy(), rtol=0, atol=1e-15
+        )
+        np.testing.assert_allclose(
+            file["origin_m"][()].reshape(-1, 3), rays.origin_m.detach().numpy(), rtol=0, atol=1e-15
+        )
+        # near the axis the lens is the pinhole of K; at 0.7 px its distortion, some percent at the border 17
+        # px away, is 0.002 of that
+        np.testing.assert_allclose(
+            file["K"][()] @ (file["direction"][12, 12] / file["direction"][12, 12, 2]),
+            [12, 12, 1],
+            rtol=0,
+            atol=1e-4,
+        )
+        np.testing.assert_allclose(
+            file["K"][0, 0], 8.0 / file.attrs["pixel_pitch_mm"], rtol=1e-2
+        )  # the film stands off the focal plane by a little
+    back = lens.load(folder / "lens.json")
+    assert float(back.first_order().efl_mm.detach()) == pytest.approx(8.0, rel=1e-12)
+
+
+def command(folder, *more):
+    return [sys.executable, "-m", "studies.make_dataset", *(more or [*SMALL, "--flo", "--out", str(folder)])]
+
+
+def kill_when(folder, appears, *more):
+    """Start the study and end it with SIGKILL as soon as a file matching ``appears`` is there; False when it
+    ended first."""
+    process = subprocess.Popen(
+        command(folder, *more), cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    deadline = time.monotonic() + 120
+    while process.poll() is None and time.monotonic() < deadline:
+        if any(folder.glob(appears)):
+            os.kill(process.pid, signal.SIGKILL)
+            break
+        time.sleep(1e-3)
+    return process.wait() == -signal.SIGKILL
+
+
+@pytest.mark.slow
+def test_a_run_killed_many_times_ends_with_the_same_bytes(dataset, tmp_path):
+    folder = tmp_path / "set"
+    resume = ("--resume", str(folder))
+    assert kill_when(folder, "sequence_000_orbital/flow/forward/000002.png")
+    assert not (folder / "manifest.json").exists()
+    kills = [
+        kill_when(folder, appears, *resume)
+        for appears in ("*/parts/000001.h5", "*/events.h5", "sequence_001*/parts/000002.h5")
+    ]
+    assert all(kills)
+    assert main(study.study, study.Config, list(resume)) == 0
+    assert (folder / "manifest.json").read_bytes() == (dataset / "manifest.json").read_bytes()
+    for name in json.loads((folder / "manifest.json").read_text())["files"]:
+        assert (folder / name).read_bytes() == (dataset / name).read_bytes()
+    assert not [path for path in folder.rglob("*") if path.name.startswith(".") or path.name == store.PARTS]
+    assert main(study.study, study.Config, list(resume)) == 0  # a finished one is finished
+    assert (folder / "manifest.json").read_bytes() == (dataset / "manifest.json").read_bytes()
+
+
+def test_folders_with_other_things_and_damaged_parts_are_refused_in_one_sentence(tmp_path, capsys):
+    (tmp_path / "notes.txt").write_text("mine")
+    assert run_study(tmp_path) == 2
+    assert "holds other things (notes.txt)" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    part = store.part_path(tmp_path, 0)
+    part.parent.mkdir()
+    part.write_bytes(b"not HDF5")
+    with pytest.raises(ValueError, match="is damaged"):
+        store.read_state(part)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--frames", "1"], "--frames is 1"),
+        (["--rate-hz", "0"], "--rate-hz is 0"),
+        (["--world", "moon"], "there are checkerboard"),
+        (["--lens", "none"], "none"),
+        (["--size", "4"], "--size is 4"),
+        (["--seed", "-1"], "--seed is -1"),
+        (["--world", "checkerboard", "--light", "baked"], "has no lamps"),
+        (["--focal-length-mm", "0"], "--focal-length-mm"),
+    ],
+)
+def test_impossible_options_end_with_one_sentence(options, sentence, tmp_path, capsys):
+    assert main(study.study, study.Config, [*options, "--out", str(tmp_path / "set")]) == 2
+    error = capsys.readouterr().err
+    assert sentence in error
+    assert error.count("\n") == 1
+
+
+def test_paths_that_cannot_keep_clear_are_refused():
+    stage = motions.Stage(
+        low_m=(0.0, 1.99, 1.0), high_m=(0.0, 1.995, 1.0), target_m=(0.0, 3.0, 1.0)
+    )  # at the wall
+    with pytest.raises(DomainError, match="none of 200 radial paths"):
+        motions.motion("radial", stage, worlds.room(), camera(size=16), 1.0, torch.Generator().manual_seed(0))
+
+
+def test_the_example_of_the_documentation_runs(dataset):
+    text = (ROOT / "docs" / "datasets.md").read_text()
+    code = re.search(r"```python\n(.*?)```", text, re.S)
+    assert code is not None
+    names_there: dict = {}
+    exec(
+        code.group(1)
+        .replace("runs/mine", str(dataset))
+        .replace("sequence_003_driving", "sequence_000_orbital"),
+        names_there,
+    )
+    assert names_there["frames"].shape == (14, 24, 24)
+    assert len(names_there["x"]) == len(names_there["t"]) > 0

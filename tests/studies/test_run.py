@@ -1,0 +1,392 @@
+"""The frame of a study: exact state, interruption and resumption, refusals, metrics, a page that loads
+nothing."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import torch
+
+from codesign.errors import CodesignError, DomainError, FileFormatError, NonFiniteError, ShapeError
+from studies.frame.config import StudyConfig
+from studies.frame.run import Run, main, open_run
+
+ROOT = Path(__file__).resolve().parents[2]
+# a noisy descent: its numbers depend on the generator, the momentum and the step counter, so a wrong resume
+# shows
+WALK = '''
+"""A walk that can be interrupted."""
+import sys, time
+from dataclasses import dataclass
+import torch
+from studies.frame.run import Run, StudyConfig, main
+
+@dataclass(frozen=True)
+class Config(StudyConfig):
+    steps: int = 40
+    """Number of steps."""
+    pause_s: float = 0.0
+
+def study(run: Run[Config]):
+    generator = torch.Generator().manual_seed(run.config.seed)
+    x, velocity, first = torch.ones(3), torch.zeros(3, dtype=torch.float64), 0
+    if (state := run.load_state()) is not None:
+        x, velocity, first = state.tensors["x"], state.tensors["velocity"], state.numbers["step"]
+        generator.set_state(state.tensors["generator"])
+    step = first
+    save = lambda: run.save_state({"x": x, "velocity": velocity, "generator": generator.get_state()}, {"step": step})
+    run.on_interrupt(save)
+    with run.progress(run.config.steps, "walking", done=first) as bar:
+        while step < run.config.steps:
+            velocity = 0.9 * velocity - 0.1 * x.double() + 0.01 * torch.randn(3, generator=generator)
+            x = x + velocity.float()
+            time.sleep(run.config.pause_s)
+            step += 1
+            run.say(f"step {step}")
+            bar.advance(loss=x.square().sum())
+    run.record(loss_last=x.square().sum(), x_0=x[0], steps=step, first_step=first)
+    run.finish("A walk", "It went on.")
+
+if __name__ == "__main__":
+    sys.exit(main(study, Config))
+'''
+
+
+@dataclass(frozen=True)
+class Config(StudyConfig):
+    limit: float = 1.0
+    sizes: tuple[int, ...] = (1, 2)
+
+
+@pytest.fixture
+def run(tmp_path):
+    return open_run("test_run", Config(out=tmp_path / "out"))
+
+
+def record_one(run: Run[Config]):
+    """The smallest study."""
+    run.record(limit=run.config.limit)
+    run.finish("One number", "It was recorded.")
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in Path(folder).rglob("*") if path.is_file()}
+
+
+def test_state_returns_every_bit(run, generator):
+    tensors = {
+        "float32": torch.randn(3, 4, generator=generator).T,
+        "float64/odd name": torch.tensor([0.1, torch.nan, -0.0, torch.inf, 5e-324], dtype=torch.float64),
+        "int64": torch.tensor([2**62 + 1, -1]),
+        "bool": torch.tensor([True, False]),
+        "scalar": torch.tensor(1 / 3),
+        "empty": torch.zeros(0, 2),
+        "file": torch.randn(2, generator=generator).requires_grad_(),
+        "generator": generator.get_state(),
+    }
+    numbers = {"step": 7, "best": 0.1 + 0.2, "history": [1e-300, float("inf")], "name": "π"}
+    run.save_state(tensors, numbers)
+    stored = run.load_state()
+    assert stored.numbers == numbers
+    assert list(stored.tensors) == list(tensors)
+    for name, tensor in tensors.items():
+        back = stored.tensors[name]
+        assert back.dtype == tensor.dtype
+        assert back.shape == tensor.shape
+        assert back.numpy().tobytes() == tensor.detach().numpy().tobytes()
+    other = torch.Generator()
+    other.set_state(stored.tensors["generator"])
+    assert torch.equal(torch.randn(9, generator=other), torch.randn(9, generator=generator))
+
+
+def test_state_is_data_and_damage_is_named(run):
+    assert run.load_state() is None
+    run.save_state({"x": torch.ones(2)}, {})
+    with np.load(run.folder / "state.npz", allow_pickle=False) as stored:
+        assert all(stored[name].dtype != object for name in stored.files)
+    with pytest.raises(ShapeError, match="bfloat16"):
+        run.save_state({"x": torch.ones(2, dtype=torch.bfloat16)}, {})
+    assert torch.equal(run.load_state().tensors["x"], torch.ones(2)), (
+        "a refused state must not touch the last one"
+    )
+    for damage in (b"", b"not a state", (run.folder / "state.npz").read_bytes()[:-30]):
+        (run.folder / "state.npz").write_bytes(damage)
+        with pytest.raises(FileFormatError, match="not a state file"):
+            run.load_state()
+
+
+def test_interrupted_and_resumed_gives_the_same_numbers(tmp_path):
+    (tmp_path / "walk.py").write_text(WALK)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    command = [sys.executable, "-W", "error", "walk.py"]
+    whole = subprocess.run(
+        [*command, "--out", "whole"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert whole.returncode == 0, whole.stderr
+    assert "walking  40/40  loss" in whole.stdout
+
+    broken = subprocess.Popen(
+        [*command, "--out", "with space", "--pause-s", "0.05"],
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert broken.stdout is not None
+    while broken.stdout.readline() != "step 5\n":
+        assert broken.poll() is None, broken.communicate()
+    broken.send_signal(signal.SIGINT)
+    _, complaint = broken.communicate(timeout=60)
+    assert broken.returncode == 130, complaint
+    assert (
+        complaint.splitlines()[-1] == "interrupted; go on with: python -m studies.walk --resume 'with space'"
+    )
+    assert not (tmp_path / "with space" / "metrics.json").exists()
+
+    resumed = subprocess.run(
+        [*command, "--resume", "with space"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert resumed.returncode == 0, resumed.stderr
+    first, second = (
+        json.loads((tmp_path / folder / "metrics.json").read_text()) for folder in ("whole", "with space")
+    )
+    assert 5 <= second.pop("first_step") < 40, "the second session must start where the first one stopped"
+    assert first.pop("first_step") == 0
+    assert {k: v for k, v in first.items() if k not in ("versions", "hardware")} == {
+        k: v for k, v in second.items() if k not in ("versions", "hardware")
+    }
+    assert (tmp_path / "with space" / "report.html").exists()
+
+
+def test_second_interrupt_ends_at_once(run):
+    saved = []
+    run.on_interrupt(lambda: saved.append(True))
+    with run._interruption as interruption, run.progress(3, "waiting"):
+        signal.raise_signal(signal.SIGINT)
+        assert interruption.requested
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert not saved, "in the middle of a step the state is not whole"
+
+
+def test_command_leaves_what_the_contract_names(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(record_one, Config, ["--limit", "0.5", "--sizes", "3", "4", "5"]) == 0
+    (folder,) = (tmp_path / "runs" / "test_run").iterdir()
+    assert set(contents(folder)) == {"config.json", "metrics.json", "report.html"}
+    config, metrics = (json.loads((folder / f"{name}.json").read_text()) for name in ("config", "metrics"))
+    assert config == {
+        "study": "test_run",
+        "quick": False,
+        "out": None,
+        "seed": 0,
+        "device": config["device"],
+        "resume": None,
+        "limit": 0.5,
+        "sizes": [3, 4, 5],
+    }
+    assert config["device"] in ("cpu", "cuda"), "the stored device is the one that computed"
+    assert metrics["limit"] == 0.5
+    assert metrics["versions"].keys() == {
+        "python",
+        "codesign",
+        "torch",
+        "mitsuba",
+        "drjit",
+        "numpy",
+        "kornia",
+        "commit",
+    }
+    assert metrics["versions"]["torch"] == torch.__version__
+    assert metrics["hardware"]["cores"] >= 1
+    assert "report.html" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("place", ["file/sub", "file"])
+def test_unwritable_folder_is_one_sentence(tmp_path, capsys, place):
+    (tmp_path / "file").write_text("kept")
+    assert main(record_one, Config, ["--out", str(tmp_path / place)]) == 2
+    complaint = capsys.readouterr().err
+    assert re.fullmatch(
+        r"error: the output folder '.*file(/sub)?' cannot be (made|read) \(Not a directory\); choose a "
+        r"folder you may write to with --out\.\n",
+        complaint,
+    )
+    assert contents(tmp_path) == {"file": b"kept"}
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs a folder that even root cannot write into")
+def test_folder_without_write_access_is_one_sentence(capsys):
+    assert main(record_one, Config, ["--out", "/proc/self/results"]) == 2
+    assert capsys.readouterr().err.startswith("error: the output folder '/proc/self/results' cannot be made")
+
+
+def test_earlier_results_are_left_alone(tmp_path, capsys):
+    out = ["--out", str(tmp_path / "out")]
+    assert main(record_one, Config, out) == 0
+    before = contents(tmp_path)
+    assert main(record_one, Config, out) == 2
+    assert "already holds a run of this study" in capsys.readouterr().err
+    assert main(record_one, Config, [*out, "--resume", str(tmp_path / "out"), "--limit", "3"]) == 2
+    assert "--limit is 3.0, but the run to resume was started with 1.0" in capsys.readouterr().err
+    assert contents(tmp_path) == before
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "config.json").write_text("{}")
+    assert main(record_one, Config, ["--out", str(tmp_path / "photos")]) == 2
+    assert "holds other things (config.json)" in capsys.readouterr().err
+
+
+def test_bad_input_can_be_repaired_in_the_same_folder(tmp_path, capsys):
+    def refuse(run):
+        raise DomainError("limit is 9,\nbut at most 2 is allowed; lower it.")
+
+    out = ["--out", str(tmp_path / "out")]
+    assert main(refuse, Config, [*out, "--limit", "9"]) == 2
+    assert capsys.readouterr().err == "error: limit is 9, but at most 2 is allowed; lower it.\n"
+    assert main(record_one, Config, [*out, "--limit", "2"]) == 0
+    assert json.loads((tmp_path / "out" / "config.json").read_text())["limit"] == 2
+
+
+def test_resume_needs_a_run_of_the_same_study(tmp_path, capsys):
+    assert main(record_one, Config, ["--resume", str(tmp_path / "nowhere")]) == 2
+    assert "is not a run that can be resumed" in capsys.readouterr().err
+    open_run("other", Config(out=tmp_path / "other"))
+    assert main(record_one, Config, ["--resume", str(tmp_path / "other")]) == 2
+    assert "is a run of the study 'other'" in capsys.readouterr().err
+    stored = json.loads((tmp_path / "other" / "config.json").read_text())
+    (tmp_path / "other" / "config.json").write_text(
+        json.dumps({**stored, "study": "test_run", "colour": "red"})
+    )
+    assert main(record_one, Config, ["--resume", str(tmp_path / "other")]) == 2
+    assert "another version of this study (fields that differ: colour)" in capsys.readouterr().err
+
+
+def test_resume_takes_the_stored_configuration(tmp_path):
+    made = open_run("test_run", Config(out=tmp_path / "out", limit=0.25, sizes=(9,), seed=4))
+    made.record(early=1)
+    again = open_run("test_run", Config(resume=tmp_path / "out"))
+    assert again.config == made.config
+    assert again.resumed
+    again.record(late=2)
+    stored = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert (stored["early"], stored["late"]) == (1, 2)
+
+
+def test_wrong_options_exit_with_two(capsys, monkeypatch):
+    for arguments in (["--limit", "much"], ["--colour", "red"], ["--device", "tpu"]):
+        with pytest.raises(SystemExit) as ended:
+            main(record_one, Config, arguments)
+        assert ended.value.code == 2
+    assert main(record_one, Config, ["--limit", "inf"]) == 2
+    assert "--limit is inf; give a finite number" in capsys.readouterr().err
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert main(record_one, Config, ["--device", "cuda"]) == 2
+    assert "no CUDA device" in capsys.readouterr().err
+
+
+def test_help_explains_every_option(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(record_one, Config, ["--help"])
+    assert ended.value.code == 0
+    shown = capsys.readouterr().out
+    assert all(
+        option in shown
+        for option in (
+            "--quick",
+            "--out",
+            "--seed",
+            "--device",
+            "--resume",
+            "--limit",
+            "Folder of an interrupted run",
+        )
+    )
+
+
+@pytest.mark.parametrize("value", [float("nan"), torch.tensor(torch.inf), np.float32(-np.inf)])
+def test_metrics_refuse_what_is_not_finite(run, value):
+    run.record(good_mm=np.float64(2.5), count=torch.tensor(3), flag=True)
+    with pytest.raises(NonFiniteError, match="metric bad"):
+        run.record(fine=1.0, bad=value)
+    stored = json.loads((run.folder / "metrics.json").read_text())
+    assert {k: v for k, v in stored.items() if k not in ("versions", "hardware")} == {
+        "good_mm": 2.5,
+        "count": 3,
+        "flag": 1,
+    }
+
+
+def test_metrics_refuse_what_is_not_a_number(run):
+    for name, value in (("versions", 1), ("spot", "12"), ("spots", torch.ones(2))):
+        with pytest.raises(DomainError):
+            run.record(**{name: value})
+
+
+def test_page_holds_everything_and_loads_nothing(run):
+    run.card("RMS spot", "12.3 µm", "detuned: 41 µm")
+    run.section(
+        "Result",
+        "The **lens** is `sharp` <script>alert(1)</script> https://example.org/a.png\n\n- one\n- two",
+    )
+    figure, axes = plt.subplots()
+    axes.plot([0, 1], [1, 0])
+    path = run.figure(figure, "loss", "The loss *falls*.")
+    assert not plt.fignum_exists(figure.number)
+    run.table(
+        "Spots",
+        ["field", "rms_um", "rays"],
+        [["axis", 1234.56, 8], ["edge", -0.000125, None], ["corner", 1.5e-7, 0]],
+    )
+    (run.folder / "events.gif").write_bytes(b"GIF89a")
+    run.video("events.gif", "Events.")
+    run.record(loss_last=0.5)
+    html = run.finish("A sharper lens", "It is *better*.").read_text()
+    loaded = re.findall(
+        r"""(?:src|href|srcset|data|action|poster)\s*=\s*["']([^"']*)|url\(([^)]*)\)|@import\s*([^;]*)""",
+        html,
+    )
+    assert all(any(each) and next(filter(None, each)).startswith("data:") for each in loaded)
+    assert html.count("data:image/png;base64,") == 1
+    assert html.count("data:image/gif;base64,R0lGODlh") == 1
+    assert "<script" not in html
+    assert "The <strong>lens</strong> is <code>sharp</code> &lt;script&gt;" in html
+    assert "<li>two</li>" in html
+    assert '<td>axis</td><td class="number">1235</td><td class="number">8</td>' in html
+    assert '<td class="number">−0.000125</td><td class="number">–</td>' in html
+    assert '<td class="number">1.5·10⁻⁷</td>' in html
+    assert 'alt="The loss falls."' in html
+    assert "12.3 µm" in html
+    assert "loss_last" in html
+    assert plt.imread(path).shape[1] > 600, "figures are sharp enough to print"
+
+
+def test_page_refuses_what_it_cannot_show(run):
+    with pytest.raises(FileFormatError, match="one of"):
+        run.video("scene.exr", "A scene.")
+    with pytest.raises(FileFormatError, match="cannot be read"):
+        run.video("absent.mp4", "Nothing.")
+    with pytest.raises(ShapeError, match="row 1 has 1 cells for 2 columns"):
+        run.table("T", ["a", "b"], [[1, 2], [3]])
+    with pytest.raises(CodesignError, match="leads out of the run's folder"):
+        run.path("../elsewhere.png")

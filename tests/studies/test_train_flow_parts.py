@@ -1,0 +1,142 @@
+"""Parts of the training of flow networks: which windows are shown when and how they are turned, the schedule,
+the scores."""
+
+import math
+
+import pytest
+import torch
+
+from codesign.types import EventVolume, FlowField, FlowWindows
+from studies.train_flow import __main__ as train_flow
+from studies.train_flow.sources import Batches, pick, shuffled, turned
+from studies.train_flow.validate import batches, score
+
+
+class Made:
+    """Source of windows with counts of their own; ``before`` is called with the indices of every batch."""
+
+    def __init__(self, before=lambda indices: None):
+        self.before = before
+
+    def batch(self, indices):
+        self.before(indices)
+        counts = torch.stack(
+            [torch.rand(2, 2, 6, 6, generator=torch.Generator().manual_seed(i)) for i in indices]
+        )
+        flow = counts[:, 0]
+        valid = torch.ones(len(counts), 6, 6, dtype=torch.bool)
+        return FlowWindows(
+            EventVolume(counts, torch.tensor([0.25, 0.75]), torch.tensor([0.5, 0.5])),
+            FlowField(flow, valid, 1.0),
+        )
+
+
+def test_the_schedule_is_a_ramp_and_a_half_cosine():
+    config = train_flow.Config(learning_rate=2e-3, warm_up=0.2, steps=40)
+
+    def rate(share):
+        return train_flow.learning_rate(config, share)
+
+    assert rate(0.0) == pytest.approx(2e-5)
+    assert rate(0.1) == pytest.approx((2e-5 + 2e-3) / 2)
+    assert rate(0.2) == pytest.approx(2e-3)
+    assert rate(0.6) == pytest.approx((2e-5 + 2e-3) / 2)
+    assert rate(1.0) == pytest.approx(2e-5)
+    assert rate(0.4) == pytest.approx(2e-5 + (2e-3 - 2e-5) * math.cos(math.pi / 8) ** 2)
+    assert train_flow.share_done(config, 10, 1e9) == 0.25
+    assert train_flow.share_done(train_flow.Config(), 10, 600.0) == 0.5
+    assert train_flow.share_done(train_flow.Config(steps=40, cpu_minutes=1.0), 10, 59.0) == 0.25
+    assert train_flow.share_done(train_flow.Config(steps=40, cpu_minutes=1.0), 10, 60.0) == 1.0
+
+
+@pytest.mark.parametrize("way", range(16))
+def test_turned_windows_show_the_turned_motion(way):
+    """A dot that moves by the flow of the pixel it starts on is still carried by that pixel's flow after
+    turning; its polarity changes with bit 8 alone."""
+    # x, y
+    start = (3, 5)
+    motion = (2, 1)
+    height = 9
+    width = 12
+    counts = torch.zeros(1, 2, 2, height, width)
+    flow = torch.zeros(1, 2, height, width)
+    counts[0, 0, 0, start[1], start[0]] = 1
+    counts[0, 0, 1, start[1] + motion[1], start[0] + motion[0]] = 1
+    flow[0, :, start[1], start[0]] = torch.tensor(motion).float()
+    valid = flow.abs().sum(1) > 0
+    given = FlowWindows(
+        EventVolume(counts, torch.tensor([0.0, 1.0]), torch.tensor([0.5, 0.5])),
+        FlowField(flow, valid, 1.0),
+        counts.sum(1),
+    )
+    seen = turned(given, way)
+    polarity, when, y, x = seen.volume.counts[0].nonzero().T
+    assert polarity.tolist() == [way >> 3] * 2
+    assert when.tolist() == [0, 1]
+    assert seen.truth.valid[0].nonzero().tolist() == [[int(y[0]), int(x[0])]]
+    assert seen.truth.flow_px[0, :, y[0], x[0]].tolist() == [float(x[1] - x[0]), float(y[1] - y[0])]
+    assert seen.frames is not None
+    assert torch.equal(seen.frames[0], seen.volume.counts[0].sum(0))
+
+
+def test_the_sixteen_ways_differ():
+    given = Made().batch([0])
+    assert len({turned(given, way).volume.counts.numpy().tobytes() for way in range(16)}) == 16
+
+
+def test_windows_are_shown_as_often_as_told_and_resumed_alike():
+    made = []
+    parts = [(1.0, Made(before=lambda indices: made.append(tuple(indices))))]
+    shown = Batches(parts, 2, reuse=3, pool=4)
+    seen = [shown(step).volume.counts for step in range(24)]
+    assert made == [(2 * k, 2 * k + 1) for k in range(8)], "every group is made once"
+    for group in range(8):
+        block, place = divmod(group, 4)
+        versions = [seen[12 * block + 4 * showing + place] for showing in range(3)]
+        assert len({version.numpy().tobytes() for version in versions}) == 3, "each time another way"
+        assert all(torch.allclose(version.sum(), versions[0].sum()) for version in versions)
+    later = Batches(parts, 2, reuse=3, pool=4)
+    assert all(torch.equal(later(step).volume.counts, seen[step]) for step in (9, 10, 17))
+
+
+def test_a_mix_keeps_its_shares():
+    parts = [(0.5, "a"), (0.3, "b"), (0.2, "c")]
+    chosen = [pick(parts, group) for group in range(1000)]
+    for share, name in parts:
+        assert (
+            abs(chosen.count(name) - 1000 * share) <= 3
+        )  # discrepancy of the golden ratio's multiples: of order log(1000)
+
+
+def test_a_finite_source_is_shown_whole_and_in_another_order_each_time():
+    first = shuffled(range(10), 10)
+    second = shuffled(range(10, 20), 10)
+    assert sorted(first) == sorted(second) == list(range(10))
+    assert first != second
+
+
+def test_scores_are_those_worked_out_by_hand():
+    """Two windows: true flow (3, 4) on 2 pixels and (0, 1) on 1. The estimate (3, 0) is 4, 4 and sqrt(10)
+    off; zero flow 5, 5 and 1."""
+    flow = torch.zeros(2, 2, 1, 2)
+    valid = torch.tensor([[[True, True]], [[False, True]]])
+    flow[0, 0], flow[0, 1], flow[1, 1] = 3, 4, 1
+    windows = FlowWindows(
+        EventVolume(torch.zeros(2, 2, 2, 1, 2), torch.tensor([0.0, 1.0]), torch.tensor([0.5, 0.5])),
+        FlowField(flow, valid, 1.0),
+    )
+    guess = torch.zeros(2, 2, 1, 2)
+    guess[:, 0] = 3
+    found = score(lambda volume: FlowField(guess, valid, 1.0), [windows, windows])
+    assert found.aee_px == pytest.approx((8 + math.sqrt(10)) / 3)
+    assert found.zero_flow_px == pytest.approx(11 / 3)
+    assert found.ratio == pytest.approx((8 + math.sqrt(10)) / 11)
+    assert (found.worse_percent, found.windows) == (50.0, 4)
+
+
+def test_validation_takes_no_more_than_there_is():
+    class Short(Made):
+        def __len__(self):
+            return 19
+
+    assert [len(part.volume.counts) for part in batches(Short(), 40)] == [16, 3]

@@ -1,0 +1,440 @@
+"""video_to_events: closed forms for lossless frames, the sensor itself for decoded ones, runs that stop, and
+sentences for what cannot be."""
+
+import dataclasses
+import itertools
+import json
+import math
+import os
+import signal
+from typing import Any
+
+import imageio.v3 as iio
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+
+from codesign import events
+from codesign.errors import DomainError, FileFormatError
+from codesign.events.stream import ordered
+from codesign.types import EventStream
+from studies.frame.run import Run, main
+from studies.video_to_events import __main__ as study
+from studies.video_to_events.clock import read_times
+from studies.video_to_events.light import Light
+from studies.video_to_events.log import RECORD, EventLog
+from studies.video_to_events.sensor import chosen_sensor
+from studies.video_to_events.state import Progress
+from studies.video_to_events.steps import Steps
+
+FIELDS = ("t_us", "x", "y", "p")
+
+
+@pytest.fixture
+def plain(monkeypatch):
+    """No figures and videos: they are looked at by a test of their own."""
+    monkeypatch.setattr(study.pages, "pictures", lambda view: None)
+    monkeypatch.setattr(Run, "figure", lambda *arguments: None)
+
+
+def call(folder, *arguments):
+    return main(study.study, study.Config, ["--out", str(folder), *map(str, arguments)])
+
+
+def write_folder(folder, stack):
+    folder.mkdir()
+    for index, frame in enumerate(stack):
+        iio.imwrite(folder / f"{index}.png", frame)
+    return folder
+
+
+def waves(count=30, height=12, width=16, seed=0):
+    """Gray frames [T, H, W] uint8 whose pixels swing smoothly and far."""
+    phase = 6 * np.random.default_rng(seed).random((height, width))
+    return (120 + 100 * np.sin(0.4 * np.arange(count)[:, None, None] + phase)).astype(np.uint8)
+
+
+def crossings(values, fps, theta):
+    """(microsecond, polarity) of the events of one pixel, by hand: values are gray levels > 20 at an even
+    rate."""
+    level = [math.log(value) for value in values]
+    found = []
+    reference = level[0]
+    for k, (before, after) in enumerate(itertools.pairwise(level)):
+        sign = 1 if after > before else -1
+        while sign * (after - reference) >= theta:
+            reference += sign * theta
+            found.append((1e6 * (k + (reference - before) / (after - before)) / fps, sign))
+    return found
+
+
+def test_a_ramp_of_gray_values_fires_at_known_microseconds(tmp_path, plain):
+    # no step ends on a threshold: ln of whole numbers is no multiple of 0.2 away
+    pixels = [
+        [40, 52, 66, 90, 130, 250],
+        [250, 200, 100, 99, 60, 30],
+        [100, 150, 100, 150, 60, 180],
+        [77] * 6,
+        [30, 31, 33, 36, 39, 42],
+    ]
+    stack = np.array(pixels, np.uint8).T[:, None, :]
+    code = call(
+        tmp_path / "run",
+        "--input",
+        write_folder(tmp_path / "in", stack),
+        "--fps",
+        200,
+        "--preset",
+        "ideal",
+        "--events",
+        "e.npz",
+        "e.csv",
+    )
+    assert code == 0
+    for name in ("e.npz", "e.csv"):
+        stream = events.read(tmp_path / "run" / name)
+        for x, values in enumerate(pixels):
+            truth = crossings(values, 200, 0.2)
+            mine = stream.x == x
+            assert stream.p[mine].tolist() == [sign for _, sign in truth]
+            # rounded to a microsecond; levels are float32 (5e-7 of a step of at least 0.03 in 5000 us)
+            np.testing.assert_allclose(
+                stream.t_us[mine].numpy(), [t for t, _ in truth], atol=0.5 + 5000 * 5e-7 / 0.03
+            )
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    every = [sign for values in pixels for _, sign in crossings(values, 200, 0.2)]
+    assert (metrics["frames"], metrics["events_on"], metrics["events_off"]) == (
+        6,
+        every.count(1),
+        every.count(-1),
+    )
+    assert metrics["rate_on_hz"] == pytest.approx(every.count(1) / 0.025)
+    assert not (tmp_path / "run" / study.LOG).exists()
+
+
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning"
+)  # imageio leaves FFmpeg's pipes open
+def test_a_video_gives_the_events_of_its_frames_as_imageio_decodes_them(tmp_path, plain):
+    writer = imageio_ffmpeg.write_frames(
+        str(tmp_path / "clip.mp4"), (32, 24), fps=25, codec="libx264", macro_block_size=2
+    )
+    writer.send(None)
+    for frame in waves(40, 24, 32):
+        writer.send(np.ascontiguousarray(np.stack([frame, frame[::-1], frame[:, ::-1]], -1)))
+    writer.close()
+    options = ["--preset", "clean", "--seed", 3, "--events", "e.npz"]
+    assert (
+        call(
+            tmp_path / "run",
+            "--input",
+            tmp_path / "clip.mp4",
+            "--slow-motion",
+            10,
+            "--start-s",
+            0.02,
+            "--stop-s",
+            0.1,
+            *options,
+        )
+        == 0
+    )
+    decoded = iio.imread(tmp_path / "clip.mp4", plugin="FFMPEG").astype(np.float64) @ np.array(
+        [0.2126, 0.7152, 0.0722]
+    )
+    t_s = np.arange(40) / 250
+    used = (t_s >= 0.02) & (t_s <= 0.1 + 1e-9)
+    sensor = events.SensorModel(theta_sigma=0.02)
+    truth = events.simulate(
+        torch.from_numpy(decoded[used]).float(), t_s[used], sensor, torch.Generator().manual_seed(3)
+    )
+    found = events.read(tmp_path / "run" / "e.npz")
+    assert len(truth) > 1000
+    order = [
+        torch.argsort((stream.y * 32 + stream.x) * 2**40 + stream.t_us, stable=True)
+        for stream in (truth, found)
+    ]
+    for name in ("x", "y", "p"):
+        assert torch.equal(getattr(truth, name)[order[0]], getattr(found, name)[order[1]])
+    # luminance in single precision moves a crossing by 1e-6 log units of the 0.01 or more that a frame of 4
+    # ms changes
+    assert (truth.t_us[order[0]] - found.t_us[order[1]]).abs().max() <= 1
+
+
+def same_bytes(first, second, names=("e.npz", "e.csv")):
+    return all((first / name).read_bytes() == (second / name).read_bytes() for name in names)
+
+
+@pytest.mark.parametrize("how", ["Ctrl-C", "killed", "killed at the end"])
+def test_an_interrupted_run_goes_on_with_the_same_events(tmp_path, monkeypatch, plain, capsys, how):
+    monkeypatch.setattr(study, "PIXELS_PER_CHUNK", 4 * 12 * 16)
+    monkeypatch.setattr(study, "SECONDS_BETWEEN_SAVES", 0.0 if how == "killed" else 1e9)
+    common = [
+        "--input",
+        write_folder(tmp_path / "in", waves()),
+        "--fps",
+        300,
+        "--preset",
+        "noisy",
+        "--events",
+        "e.npz",
+        "e.csv",
+        "--seed",
+        7,
+    ]
+    assert call(tmp_path / "whole", *common) == 0
+    real = events.simulate
+    write_outputs = study.write_outputs
+    calls = []
+
+    def stops(*arguments, **options):
+        found = real(*arguments, **options)
+        calls.append(len(found))
+        if len(calls) == 4 and how != "killed at the end":
+            if how == "killed":
+                raise KeyboardInterrupt
+            os.kill(os.getpid(), signal.SIGINT)
+        return found
+
+    def at_the_end(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(study.events, "simulate", stops)
+    if how == "killed at the end":
+        monkeypatch.setattr(study, "write_outputs", at_the_end)
+    assert call(tmp_path / "cut", *common) == 130
+    monkeypatch.setattr(study, "write_outputs", write_outputs)
+    assert "--resume" in capsys.readouterr().err
+    with (tmp_path / "cut" / study.LOG).open(
+        "ab"
+    ) as file:  # what a killed run wrote after its state was stored does not count
+        file.write(b"rubbish")
+    assert main(study.study, study.Config, ["--resume", str(tmp_path / "cut")]) == 0
+    assert len(calls) == (9 if how == "killed" else 8)  # of eight chunks the killed run made one again
+    assert same_bytes(tmp_path / "whole", tmp_path / "cut")
+    assert main(study.study, study.Config, ["--resume", str(tmp_path / "cut")]) == 0
+    assert "complete" in capsys.readouterr().out
+
+
+def test_everything_is_drawn_and_shown(tmp_path):
+    looks = ["--preview-fps", 10, "--preview-slowdown", 100, "--sensor-size", 20, 10, "--linear"]
+    assert (
+        call(tmp_path / "run", "--input", write_folder(tmp_path / "in", waves(12)), "--fps", 1000, *looks)
+        == 0
+    )
+    stream = events.read(tmp_path / "run" / "events.h5")
+    assert (stream.width_px, stream.height_px) == (20, 10)
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert page.count("data:image/png") == 4
+    assert page.count("data:video/mp4") == 2
+    assert "sRGB gamma is undone" in page
+    assert "stretched to 20 x 10" in page
+    # 11 ms at 100 times slower and 10 pictures a second
+    assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "run" / "events.mp4"))[0] == 11
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["events_on"] + metrics["events_off"] == len(stream)
+    assert metrics["mpixel_per_s"] == pytest.approx(12 * 200 / metrics["seconds"] / 1e6)
+
+
+def test_epoch_times_of_a_file_stay_exact_to_the_microsecond(tmp_path, plain):
+    start_us = 1_700_000_000_123_457
+    steps = [0, 1000, 1700, 5000]
+    values = [40, 52, 66, 90]
+    (tmp_path / "times.txt").write_text(
+        "# microseconds\n" + "\n".join(str(start_us + step) for step in steps) + "\n"
+    )
+    assert read_times(tmp_path / "times.txt", "us", 4).mul(1e6).round().long().tolist() == [
+        start_us + step for step in steps
+    ]
+    stack = np.array(values, np.uint8)[:, None, None].repeat(2, 1).repeat(2, 2)
+    options = [
+        "--timestamps",
+        tmp_path / "times.txt",
+        "--timestamp-unit",
+        "us",
+        "--preset",
+        "ideal",
+        "--events",
+        "e.npz",
+    ]
+    assert call(tmp_path / "run", "--input", write_folder(tmp_path / "in", stack), *options) == 0
+    truth = []
+    for t, _ in crossings(values, 1, 0.2):  # seconds count frames here
+        k = int(t // 1e6)
+        truth.append(start_us + steps[k] + (t / 1e6 - k) * (steps[k + 1] - steps[k]))
+    found = events.read(tmp_path / "run" / "e.npz").t_us
+    # float64 seconds are exact to 0.24 us there, and events are rounded to 1
+    np.testing.assert_allclose(
+        (found.reshape(-1, 4)[:, 0] - start_us).numpy(), np.array(truth) - start_us, atol=1
+    )
+
+
+def test_light_follows_the_published_curves():
+    gray = np.arange(256, dtype=np.uint8)[None, None]
+    assert torch.equal(Light(255, False)([gray[0]], 0)[0, 0], torch.arange(256.0))
+    linear = Light(255, True)([gray[0]], 0)[0, 0] / 255
+    # IEC 61966-2-1: digital values and their linear light to six decimals
+    for value, light in (
+        (0, 0.0),
+        (10, 0.003035),
+        (11, 0.003347),
+        (128, 0.215861),
+        (188, 0.502886),
+        (255, 1.0),
+    ):
+        assert float(linear[value]) == pytest.approx(light, abs=5e-7)
+    primaries = np.eye(3, dtype=np.uint8)[None] * 255
+    seen = Light(255, False)([primaries], 0)
+    torch.testing.assert_close(seen[0, 0] / 255, torch.tensor([0.2126, 0.7152, 0.0722]), rtol=1e-6, atol=0)
+    assert float(Light(4095, False)([np.full((1, 1), 4095, np.uint16)], 0)) == 255
+    assert float(Light(255, False)([np.full((1, 1), 300.5)], 0)) == 300.5
+
+
+def test_a_new_size_keeps_what_is_even_and_what_is_linear():
+    y, x = np.mgrid[:48, :64].astype(np.float64)
+    ramp = 50 + 2 * x + y
+    small = Light(255, False, (16, 12))([ramp], 0)[0]
+    # the pixel centres of a quarter of the size lie at 4 k + 1.5; away from the edges, where the window is
+    # cut
+    truth = 50 + 2 * (4 * np.arange(16) + 1.5) + (4 * np.arange(12)[:, None] + 1.5)
+    np.testing.assert_allclose(small.numpy()[1:-1, 1:-1], truth[1:-1, 1:-1], rtol=1e-6)
+    np.testing.assert_allclose(
+        Light(255, False, (100, 37))([np.full((48, 64), 99.0)], 0).numpy(), 99, rtol=1e-6
+    )
+
+
+def test_the_share_of_large_steps_is_counted():
+    level = torch.full((3, 10, 10), 5.0)  # far above the linear part
+    level[1:, :3] += 0.2 * 1.5  # 30 pixels by 1.5 thresholds
+    level[1:, 3:5] += 0.2 * 10.5  # 20 pixels by 10.5
+    level[2, 9] -= 0.4 * 4.5  # 10 pixels darker, OFF threshold 0.4
+    sensor = events.SensorModel(theta_on=0.2, theta_off=0.4)
+    for chunks in ([slice(0, 3)], [slice(0, 2), slice(2, 3)]):
+        steps = Steps(sensor, Progress(0, {}, events.SensorState()))
+        for chunk in chunks:
+            steps.add(level.exp()[chunk])
+        assert {n: int(steps.histogram[n]) for n in steps.histogram.nonzero().flatten().tolist()} == {
+            0: 140,
+            1: 30,
+            4: 10,
+            10: 20,
+        }
+        assert steps.large_share == pytest.approx(30 / 200)
+        assert steps.large_share_of_moving == pytest.approx(30 / 60)
+        assert steps.too_large
+        assert steps.remedy == pytest.approx(11 / 3)  # nine in ten move by up to 11 thresholds, 3 are wanted
+
+
+def test_a_video_too_slow_for_its_motion_is_called_so(tmp_path, plain, capsys):
+    flicker = np.array([[30, 250], [250, 30]], np.uint8)[np.arange(6) % 2][:, None, :]
+    assert (
+        call(
+            tmp_path / "run",
+            "--input",
+            write_folder(tmp_path / "in", flicker),
+            "--fps",
+            30,
+            "--preset",
+            "ideal",
+            "--events",
+            "e.npz",
+        )
+        == 0
+    )
+    assert "too slow" in capsys.readouterr().out
+    # every pixel steps by ln(250/30)/0.2 = 10.6 thresholds
+    assert "Of the pixels that make events, 100.0% step" in (tmp_path / "run" / "report.html").read_text()
+    assert json.loads((tmp_path / "run" / "metrics.json").read_text())[
+        "frame_rate_factor_needed"
+    ] == pytest.approx(11 / 3)
+
+
+def test_presets_are_those_of_v2e_and_every_parameter_is_an_option():
+    off = {"cutoff_hz": 0, "leak_rate_hz": 0, "shot_rate_hz": 0, "refractory_s": 0}
+    for name, values in {
+        "clean": {"theta_sigma": 0.02, **off},
+        "noisy": {
+            "theta_sigma": 0.05,
+            "cutoff_hz": 30,
+            "leak_rate_hz": 0.1,
+            "shot_rate_hz": 5,
+            "refractory_s": 0,
+        },
+        "default": {
+            "theta_sigma": 0.03,
+            "cutoff_hz": 300,
+            "leak_rate_hz": 0.01,
+            "shot_rate_hz": 0.001,
+            "refractory_s": 5e-4,
+        },
+    }.items():
+        sensor = chosen_sensor(study.Config(preset=name))
+        assert {field: getattr(sensor, field) for field in values} == values
+        assert (sensor.theta_on, sensor.theta_off) == (0.2, 0.2)
+    given: dict[str, Any] = dataclasses.asdict(events.SensorModel()) | {
+        "theta_off": 0.35,
+        "refractory_s": 0.002,
+        "timing": "v2e",
+    }
+    assert chosen_sensor(study.Config(preset="noisy", **given)) == events.SensorModel(**given)
+    with pytest.raises(DomainError, match="ideal, clean, noisy, default"):
+        chosen_sensor(study.Config(preset="best"))
+
+
+def test_the_log_finds_events_by_time_and_forgets_what_does_not_count(tmp_path):
+    generator = torch.Generator().manual_seed(0)
+    t_us, x, y, p = (torch.randint(0, high, (500,), generator=generator) for high in (300, 9, 7, 2))
+    stream = ordered(t_us + 1_700_000_000_000_000, x, y, 2 * p - 1, 7, 9)
+    log = EventLog(tmp_path / "log", 0, 7, 9)
+    for part in (slice(0, 200), slice(200, 500)):
+        log.append(EventStream(stream.t_us[part], stream.x[part], stream.y[part], stream.p[part], 7, 9))
+    times = [1_700_000_000_000_000 + k for k in (-1, 0, 57, 299, 400)]
+    assert log.positions(times) == np.searchsorted(stream.t_us.numpy(), times, side="right").tolist()
+    for read, part in (
+        (log.read(0, 500), slice(None)),
+        (log.read(123, 321), slice(123, 321)),
+        (log.pick(torch.tensor([3, 77, 499])), [3, 77, 499]),
+    ):
+        assert all(torch.equal(getattr(read, name), getattr(stream, name)[part]) for name in FIELDS)
+    EventLog(tmp_path / "log", 450, 7, 9)
+    assert (tmp_path / "log").stat().st_size == 450 * RECORD.itemsize
+    with pytest.raises(FileFormatError, match="450 of the 451"):
+        EventLog(tmp_path / "log", 451, 7, 9)
+
+
+def test_what_cannot_be_is_one_sentence_and_exit_code_2(tmp_path, capsys):
+    folder = write_folder(tmp_path / "in", waves(4))
+    stack = waves(4).astype(np.float32)
+    stack[2, 3, 4] = np.nan
+    np.save(tmp_path / "nan.npy", stack)
+    for name, lines in (
+        ("back", "0\n0.1\n0.05\n0.2"),
+        ("few", "0\n0.1"),
+        ("word", "0\n0.1\nnoon\n0.2"),
+        ("close", "0\n0.1\n0.1000001\n0.2"),
+    ):
+        (tmp_path / f"{name}.txt").write_text(lines)
+    for index, (arguments, words) in enumerate(
+        [
+            ([], "no input"),
+            (["--input", tmp_path / "none"], "no file or folder"),
+            (["--input", folder], "--fps"),
+            (["--input", folder, "--fps", 0], "--fps is 0"),
+            (["--input", folder, "--timestamps", tmp_path / "back.txt"], "increase strictly"),
+            (["--input", folder, "--timestamps", tmp_path / "few.txt"], "2 times, the input 4"),
+            (["--input", folder, "--timestamps", tmp_path / "word.txt"], "line 3: 'noon'"),
+            (["--input", folder, "--timestamps", tmp_path / "close.txt"], "0.1 us apart"),
+            (["--input", folder, "--timestamps", tmp_path / "none.txt"], "cannot be read"),
+            (["--input", folder, "--timestamps", tmp_path / "few.txt", "--fps", 5], "both given"),
+            (["--input", tmp_path / "nan.npy", "--fps", 30], "frame 2 holds nan at row 3, column 4"),
+            (["--input", folder, "--fps", 30, "--stop-s", -1], "0 frame"),
+            (["--input", folder, "--fps", 30, "--events", "a.doc"], ".doc"),
+            (["--input", folder, "--fps", 30, "--theta-on", -1], "theta_on"),
+            (["--input", folder, "--fps", 30, "--preset", "x"], "ideal"),
+            (["--input", folder, "--fps", 30, "--events", "../e.npz"], "plain name"),
+            (["--input", folder, "--fps", 30, "--sensor-size", 0, 5], "--sensor-size"),
+        ]
+    ):
+        assert call(tmp_path / f"run{index}", *arguments) == 2, words
+        assert words in capsys.readouterr().err
