@@ -216,7 +216,6 @@ def show(run, table, timings, memory, sizes, judged):
             1e3 * timings[name, "forward", size].wall,
             1e9 * timings[name, "forward", size].wall / size**2,
             1e9 * timings[name, "forward", size].cpu / size**2,
-
             memory[name, "forward", size],
             1e6 * memory[name, "forward", size] / size**2,
         )

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from codesign.lens.design.adam import ScaledAdam
-from codesign.lens.design.least_squares import DampedLeastSquares, StopRules
-from codesign.lens.design.optimise import column_scales
+from codesign.grad.jacobian import column_scales
+from codesign.optimise.adam import ScaledAdam
+from codesign.optimise.least_squares import DampedLeastSquares, StopRules
 from studies.lens_scratch.task import LINES, Stage, draw_start, jacobian, judge, residuals_of
 
 METHODS = {

@@ -7,11 +7,11 @@ import torch
 
 from codesign import lens
 from codesign.errors import DomainError
+from codesign.grad.jacobian import by_differences
 from codesign.lens import WAVELENGTH_UM, GeoLens, Glass, Surface
 from codesign.lens.analysis import field_rays, pupil_grid
 from codesign.lens.design.constraints import Constraint, Limits, evaluate, rows
 from codesign.lens.design.hits import paraxial_semi_aperture_mm, traced_semi_aperture_mm
-from codesign.lens.design.optimise import by_differences
 from codesign.lens.design.solves import focus_paraxial, hold_efl
 
 EFL_MM = 50.0

@@ -75,7 +75,6 @@ def _figures_of_merit(run, results):
     run.section(
         "Figures",
         "Loss: van Rossum distance, 10 ms, over that of silence. Rates per polarity in bins of 10 ms; cells of 8 x 8 px; flicker: power of the rate above 50 Hz over the "
-
         "target's. *Sensor, another draw*: the physical sensor itself with other thresholds and noise, the floor of what hard events can reach. Brackets: 95 %, blocks of 16 x 16 px redrawn.",
     )
     for kind in results.sets:

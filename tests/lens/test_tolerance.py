@@ -7,8 +7,8 @@ import torch
 
 from codesign import lens
 from codesign.errors import DomainError, ShapeError
+from codesign.grad.jacobian import by_autograd
 from codesign.lens import GeoLens, Glass, Surface
-from codesign.lens.design.optimise import by_autograd
 from codesign.lens.design.solves import focus_paraxial, focus_rays
 from codesign.lens.design.tolerance import (
     LINEAR_FIGURES,

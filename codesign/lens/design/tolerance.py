@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
+from codesign.grad.jacobian import by_differences, finite
 from codesign.lens.analysis import spots
 from codesign.lens.design.constraints import is_glass
-from codesign.lens.design.optimise import by_differences, finite
 from codesign.lens.glass import WAVELENGTH_UM
 
 

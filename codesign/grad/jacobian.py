@@ -1,58 +1,14 @@
-"""What the optimisers share: history, Jacobians by autograd or by differences, and scales that give every
-variable the same effect."""
+"""Jacobians by autograd or by differences, and scales that give every variable the same effect."""
 
-import dataclasses
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.errors import DomainError
 
 Jacobian = Callable[[Callable[[Tensor], Tensor], Tensor, Tensor], Tensor]
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One step: the loss before it, the norm of its gradient, the length of the trial step, damping (or step
-    size), whether it was accepted."""
-
-    loss: float
-    gradient: float
-    step: float
-    damping: float
-    accepted: bool
-
-
-@dataclass
-class History:
-    """All steps of a run. Indexing and len() go over Entry; ``column`` gives one figure over the steps."""
-
-    entries: list[Entry] = field(default_factory=list)
-
-    def add(self, entry):
-        self.entries.append(entry)
-
-    def column(self, name):
-        """One field of every step, a list."""
-        return [getattr(entry, name) for entry in self.entries]
-
-    def rows(self):
-        """Plain lists for a state file."""
-        return [list(dataclasses.astuple(entry)) for entry in self.entries]
-
-    @staticmethod
-    def of(rows):
-        """The history that ``rows`` came from."""
-        return History([Entry(*row) for row in rows])
-
-    def __len__(self):
-        return len(self.entries)
-
-    def __getitem__(self, at):
-        return self.entries[at]
 
 
 def by_autograd(residuals, variables, value):
@@ -106,14 +62,6 @@ def _slope(residuals, variables, value, at, step, central):
 def finite(value):
     """Whether every entry is a finite number."""
     return bool(value.isfinite().all())
-
-
-def check_start(start):
-    """The start as a detached vector. Raises: ShapeError unless [V >= 1]; DomainError when it is not
-    finite."""
-    if start.ndim != 1 or not start.numel():
-        raise ShapeError(f"the start must be a vector [V >= 1], got {tuple(start.shape)}.")
-    return check_finite(start.detach().clone(), "start")
 
 
 def column_scales(jacobian: Tensor, limit: float | Tensor = math.inf):

@@ -12,16 +12,10 @@ import scipy.optimize
 import torch
 
 from codesign.errors import DomainError, NonFiniteError, ShapeError
-from codesign.lens.design.adam import ScaledAdam
-from codesign.lens.design.least_squares import DampedLeastSquares, StopRules
-from codesign.lens.design.optimise import (
-    Entry,
-    History,
-    by_autograd,
-    by_differences,
-    column_scales,
-    principal_modes,
-)
+from codesign.grad.jacobian import by_autograd, by_differences, column_scales, principal_modes
+from codesign.optimise.adam import ScaledAdam
+from codesign.optimise.history import Entry, History
+from codesign.optimise.least_squares import DampedLeastSquares, StopRules
 
 D = torch.float64
 

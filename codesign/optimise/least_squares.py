@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.lens.design.optimise import Entry, History, Jacobian, by_autograd, check_start, finite
+from codesign.grad.jacobian import Jacobian, by_autograd, finite
+from codesign.optimise.history import Entry, History, check_start
 
 __all__ = ["DampedLeastSquares", "StopRules"]
 

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, NonFiniteError, ShapeError
-from codesign.lens.design.optimise import Entry, History, check_start, finite
+from codesign.grad.jacobian import finite
+from codesign.optimise.history import Entry, History, check_start
 
 __all__ = ["ScaledAdam"]
 
