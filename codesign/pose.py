@@ -66,13 +66,24 @@ def look_at(origin_m, target_m, down=(0.0, 0.0, -1.0)):
     return pose
 
 
+def check_pose(transform):
+    """Raise unless the tensor is one rigid transform [4, 4]; returns it."""
+    if transform.shape != (4, 4):
+        raise ShapeError(f"a pose must be [4, 4], got {tuple(transform.shape)}.")
+    return check_poses(transform[None])[0]
+
+
 def check_poses(transform):
-    """Raise unless the tensor holds rigid transforms [T >= 1, 4, 4]; returns it."""
-    if transform.ndim != 3 or transform.shape[1:] != (4, 4) or transform.shape[0] == 0:
-        raise ShapeError(f"poses must be [T >= 1, 4, 4], got {tuple(transform.shape)}.")
+    """Raise unless the tensor holds rigid transforms [..., T >= 1, 4, 4], a trajectory or a batch of them;
+    returns it."""
+    if transform.ndim < 3 or transform.shape[-2:] != (4, 4) or transform.numel() == 0:
+        raise ShapeError(
+            f"poses must be [T >= 1, 4, 4], or [..., T >= 1, 4, 4] for several trajectories, got "
+            f"{tuple(transform.shape)}."
+        )
     check_finite(transform, "poses")
     fixed = transform.detach().double()
-    rotation = fixed[:, :3, :3]
+    rotation = fixed[..., :3, :3]
     error = float(
         (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().max()
     )
@@ -85,7 +96,7 @@ def check_poses(transform):
             "poses are not rigid: a rotation has determinant -1, so it mirrors; flip the sign of one axis."
         )
     last = (
-        (fixed[:, 3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=fixed.device))
+        (fixed[..., 3, :] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64, device=fixed.device))
         .abs()
         .max()
     )

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from codesign.errors import DomainError, ShapeError
-from codesign.pose import apply, check_poses, inverse, look_at, se3_exp
+from codesign.pose import apply, check_pose, check_poses, inverse, look_at, se3_exp
 from codesign.render import Camera, project
 
 D = torch.float64
@@ -72,6 +72,23 @@ def test_inverse_and_apply(generator):
     )
 
 
+def test_the_gradient_of_the_inverse_is_that_of_differences_and_of_the_group(generator):
+    transform = se3_exp(torch.randn(2, 3, 6, dtype=D, generator=generator))
+    # any change of the entries, as differences see it: the formula is quadratic, so central ones are exact
+    entries = transform.clone().requires_grad_()
+    weights = torch.randn(transform.shape, dtype=D, generator=generator)
+    (found,) = torch.autograd.grad((inverse(entries) * weights).sum(), entries)
+    change = torch.randn(transform.shape, dtype=D, generator=generator)
+    ahead, behind = ((inverse(transform + sign * 1e-2 * change) * weights).sum() for sign in (1, -1))
+    assert float((found * change).sum()) == pytest.approx(float((ahead - behind) / 2e-2), rel=1e-12)
+    # a rigid change T exp(w): the inverse becomes exp(-w) T^-1, whose derivative is -[w] T^-1
+    twist = torch.zeros(2, 3, 6, dtype=D, requires_grad=True)
+    (found,) = torch.autograd.grad((inverse(transform @ se3_exp(twist)) * weights).sum(), twist)
+    for k in range(6):
+        truth = (-wedge(torch.eye(6, dtype=D)[k]) @ torch.linalg.inv(transform) * weights).sum((-2, -1))
+        torch.testing.assert_close(found[..., k], truth, rtol=0, atol=1e-12)
+
+
 def test_constant_twists_give_constant_transforms():
     assert not se3_exp(torch.zeros(3, 6, dtype=D)).requires_grad
     assert se3_exp(torch.zeros(6)).dtype == torch.float32
@@ -135,3 +152,33 @@ def test_look_at_along_down_and_at_itself_are_refused():
 def test_poses_that_are_not_rigid_are_refused(change, sentence):
     with pytest.raises((DomainError, ShapeError), match=sentence):
         check_poses(change(torch.eye(4, dtype=D).repeat(2, 1, 1)))
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda p: p @ torch.diag(torch.tensor([1.0, -1, 1, 1], dtype=D)), "mirrors"),
+        (lambda p: p @ torch.diag(torch.tensor([1.0, 1.01, 1, 1], dtype=D)), "not rigid: R R"),
+        (lambda p: torch.cat([p[:3], p[3:] + 0.1]), "last row"),
+        (lambda p: p * torch.nan, "poses: .* NaN"),
+    ],
+)
+@pytest.mark.parametrize("place", [(0, 0), (1, 2)])
+def test_one_bad_pose_among_good_ones_is_refused(change, sentence, place, generator):
+    good = se3_exp(torch.randn(2, 3, 6, dtype=D, generator=generator))
+    assert check_poses(good) is good
+    bad = good.clone()
+    bad[place] = change(good[place])
+    with pytest.raises(DomainError, match=sentence):
+        check_poses(bad)
+    with pytest.raises(DomainError, match=sentence):
+        check_poses(bad[place[0]])
+
+
+def test_a_single_pose_is_one_matrix(generator):
+    pose = se3_exp(torch.randn(6, dtype=D, generator=generator))
+    assert torch.equal(check_pose(pose), pose)
+    with pytest.raises(ShapeError, match=r"a pose must be \[4, 4\], got \(1, 4, 4\)"):
+        check_pose(pose[None])
+    with pytest.raises(DomainError, match="not rigid"):
+        check_pose(2 * pose)

@@ -47,7 +47,7 @@ class CurvePoints:
 
 
 def boundary_term(camera, scene, T_world_cam, per_px=2.5):
-    """Zero-valued image [T, *film.shape] whose gradient is that of moving silhouettes and edges.
+    """Zero-valued image [..., T, *film.shape] whose gradient is that of moving silhouettes and edges.
 
     Args: camera, scene, T_world_cam as for ``frames``; scene with ``outline()`` and
       ``radiance_and_distance``. per_px: samples per pixel length of curve.
@@ -59,14 +59,16 @@ def boundary_term(camera, scene, T_world_cam, per_px=2.5):
             "gradient 'boundary' is there for cameras without aim, spectrum and falloff; drop these, or use "
             "'difference'."
         )
-    shape = (T_world_cam.shape[0], *camera.film.shape)
+    shape = (*T_world_cam.shape[:-2], *camera.film.shape)
+    frames_each = T_world_cam.shape[-3]
+    T_world_cam = T_world_cam.reshape(-1, 4, 4)
     with torch.no_grad():
         px_per_slope = 1 / camera.slope_per_px()
         found = _jumps(
             camera,
             scene,
             T_world_cam.double(),
-            _sample(camera, scene, T_world_cam, per_px, px_per_slope),
+            _sample(camera, scene, T_world_cam, frames_each, per_px, px_per_slope),
             ASIDE_RAD * px_per_slope,
         )
     if found is None or found.frame.numel() == 0:
@@ -79,10 +81,8 @@ def boundary_term(camera, scene, T_world_cam, per_px=2.5):
         rays.origin_m[:, :2] + rays.direction[:, :2] * ahead - y[:, :2]
     )  # zero; how it changes tells how the film position must
     along = -(miss * found.per_miss).sum(1)
-    image = (
-        torch.zeros(shape, dtype=torch.float64)
-        .reshape(-1)
-        .index_add(0, found.pixel, found.weight * (along - along.detach()))
+    image = torch.zeros(math.prod(shape), dtype=torch.float64).index_add(
+        0, found.pixel, found.weight * (along - along.detach())
     )
     return image.reshape(shape).to(scene.dtype)
 
@@ -105,16 +105,18 @@ class Jumps:
         return Jumps(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
-def _sample(camera, scene, T_world_cam, per_px, px_per_slope):
+def _sample(camera, scene, T_world_cam, frames_each, per_px, px_per_slope):
     """Points on all curves that may fall on the film, about ``per_px`` per pixel length, stratified along
-    each frame's curves."""
+    each frame's curves; every trajectory, of ``frames_each`` frames, draws the same numbers."""
     film = camera.film
     parts = []
     centre = T_world_cam[:, :3, 3].double()
     aperture_m = getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2
     _, pupils = film_pupil_pattern(4096, camera.seed)
-    generator = torch.Generator().manual_seed(camera.seed)
+    generator = torch.Generator()
     for frame, eye in enumerate(centre):
+        if frame % frames_each == 0:
+            generator.manual_seed(camera.seed)
         back = inverse(T_world_cam[frame : frame + 1].double())[0]
         for curve in scene.outline():
             index, bounds = curve.pieces(eye, 8 / px_per_slope)

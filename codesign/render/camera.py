@@ -56,7 +56,7 @@ class Film:
 
     @property
     def shape(self):
-        """Shape of one image: (H, W), or (windows, H, W)."""
+        """Shape of one image: (H, W) for the whole sensor, (windows, H, W) for windows (one window too)."""
         return (
             (self.height_px, self.width_px)
             if self.windows_px is None
@@ -214,19 +214,24 @@ def project(camera, points_cam_m, pupil=None):
     """Pixel coordinates whose ray through a point of the pupil (the centre when none is given) passes through
     points of space.
 
-    Args: points_cam_m [N, 3], camera axes, metres, in front of the camera. pupil: [N, 2] on the unit disc, or
-      None for chief rays.
-    Returns: [N, 2] px (the centre of the first pixel is 0, 0), float64; NaN for points that no such ray
+    Args: points_cam_m [..., N, 3], camera axes, metres, in front of the camera. pupil: [..., N, 2] on the unit
+      disc, or None for chief rays.
+    Returns: [..., N, 2] px (the centre of the first pixel is 0, 0), float64; NaN for points that no such ray
       reaches (outside the lens's field).
     Gradient: to the points and to the lens, by the implicit function theorem (one Newton step with gradients
       at the solution); 0 to NaN points.
     Raises: DomainError when a point is not finite or not in front of the camera.
     """
     check_finite(points_cam_m, "points to project", "drop them first")
+    shape = (*points_cam_m.shape[:-1], 2)
+    points_cam_m = points_cam_m.reshape(-1, 3).double()
     if bool((points_cam_m.detach()[:, 2] <= 0).any()):
         raise DomainError("project: some points lie behind the camera (z <= 0); drop them first.")
-    points_cam_m = points_cam_m.double()
-    pupil = torch.zeros_like(points_cam_m[:, :2]).detach() if pupil is None else pupil.to(points_cam_m)
+    pupil = (
+        torch.zeros_like(points_cam_m[:, :2]).detach()
+        if pupil is None
+        else pupil.reshape(-1, 2).to(points_cam_m)
+    )
     with torch.no_grad():
         at = camera.film.middle_px + points_cam_m[:, :2] / points_cam_m[:, 2:] / camera.slope_per_px()
         step = _STEP_MM / camera.film.pixel_pitch_mm
@@ -255,7 +260,7 @@ def project(camera, points_cam_m, pupil=None):
     miss, passes = _miss(camera, at, points_cam_m, pupil)
     change = torch.linalg.solve(jacobian, torch.where(found[:, None], miss, 0))
     found = found & passes & (change.detach().abs() < 1e-3).all(1)
-    return torch.where(found[:, None], at - change, torch.nan)
+    return torch.where(found[:, None], at - change, torch.nan).reshape(shape)
 
 
 def _miss(camera, pixels, points_cam_m, pupil):

@@ -5,8 +5,7 @@ from dataclasses import replace
 import torch
 
 from codesign.errors import DomainError
-from codesign.pose import check_poses
-from codesign.render.moving import at_frames, cameras_in_parts
+from codesign.render.moving import at_frames, cameras_in_parts, in_one_row
 from codesign.render.time import coarse_pixels
 from codesign.render.truth import first_hits
 from codesign.render.wavefront import shade
@@ -19,7 +18,8 @@ def check_view(camera, scene, T_world_cam, every_px=8):
     """Raise DomainError, with the number of the first frame, when a sequence of views is not one a camera
     could have.
 
-    Args: camera, scene, T_world_cam [T, 4, 4] as for ``frames``. every_px: spacing of the pixels that are
+    Args: camera, scene, T_world_cam [..., T, 4, 4] as for ``frames``; the frames of a batch count through,
+      trajectory after trajectory. every_px: spacing of the pixels that are
       looked at, by one chief ray each.
     Raises: DomainError when poses are not rigid; no ray of a frame meets anything; something lies nearer than
       the radius of the entrance pupil, so that the
@@ -28,7 +28,7 @@ def check_view(camera, scene, T_world_cam, every_px=8):
       that are lit from behind, as planes without sides are, pass); or a radiance is NaN, infinite or
       negative.
     """
-    check_poses(T_world_cam)
+    scene, T_world_cam = in_one_row(scene, T_world_cam)
     with torch.no_grad():
         pixels = coarse_pixels(camera.film, int(every_px))
         rays = camera.chief_rays(pixels)

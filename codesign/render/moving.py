@@ -14,7 +14,8 @@ class MovingScene:
       static: a scene in world axes (MitsubaScene, TexturedPlane). Where a ray meets nothing at all, the
         background of this scene is seen.
       objects: {name: (scene in the object's own axes, T_world_object [T, 4, 4])}, the same T for all; frame t
-        of a sequence has its objects at pose t.
+        of a sequence has its objects at pose t. Before cameras on several trajectories [..., T, 4, 4] objects
+        move the same way for each, or, with poses [..., T, 4, 4] too, their own way.
     Computes in float32 when one of the scenes does, otherwise in float64.
     Gradient: to T_world_object, for what moves inside surfaces; silhouettes are left out.
     Raises: DomainError when poses are not rigid or a scene cannot say how far away it is; ShapeError when the
@@ -37,7 +38,7 @@ class MovingScene:
                     "light comes from; give a MitsubaScene or a TexturedPlane."
                 )
         self.T_world_object = tuple(_checked(name, poses) for name, (_, poses) in objects.items())
-        lengths = {name: poses.shape[0] for name, poses in zip(self.names, self.T_world_object, strict=True)}
+        lengths = {name: poses.shape[-3] for name, poses in zip(self.names, self.T_world_object, strict=True)}
         if len(set(lengths.values())) > 1:
             raise ShapeError(f"moving scene: the objects have {lengths} poses; give each one pose per frame.")
         self.dtype = (
@@ -49,7 +50,7 @@ class MovingScene:
         return MovingScene(
             self.static,
             {
-                name: (scene, poses[frames])
+                name: (scene, poses[..., frames, :, :])
                 for name, scene, poses in zip(self.names, self.scenes[1:], self.T_world_object, strict=True)
             },
         )
@@ -57,11 +58,32 @@ class MovingScene:
     def check_length(self, count):
         """Raise ShapeError unless every object has ``count`` poses."""
         for name, poses in zip(self.names, self.T_world_object, strict=True):
-            if poses.shape[0] != count:
+            if poses.shape[-3] != count:
                 raise ShapeError(
-                    f"moving scene: object '{name}' has {poses.shape[0]} poses for {count} frames; give one "
+                    f"moving scene: object '{name}' has {poses.shape[-3]} poses for {count} frames; give one "
                     "per frame, or cut the scene with ``during``."
                 )
+
+    def in_one_row(self, batch):
+        """The same scene for the frames of all trajectories of a batch of shape (..., T), one after the
+        other: every object has as many poses as there are frames in all."""
+        self.check_length(batch[-1])
+        for name, poses in zip(self.names, self.T_world_object, strict=True):
+            own = poses.shape[:-3]
+            if len(own) >= len(batch) or any(
+                n not in (1, m) for n, m in zip(reversed(own), reversed(batch[:-1]), strict=False)
+            ):
+                raise ShapeError(
+                    f"moving scene: object '{name}' has poses for a batch {tuple(own)} of trajectories, the "
+                    f"camera for {tuple(batch[:-1])}; give one trajectory for all, or one for each."
+                )
+        return MovingScene(
+            self.static,
+            {
+                name: (scene, poses.expand(*batch, 4, 4).reshape(-1, 4, 4))
+                for name, scene, poses in zip(self.names, self.scenes[1:], self.T_world_object, strict=True)
+            },
+        )
 
     def outline(self):
         """Raise DomainError: the boundary term holds scenes still."""
@@ -74,6 +96,15 @@ class MovingScene:
 def parts(scene):
     """The scenes a scene is made of: itself, or the static one and then the objects in order."""
     return scene.scenes if isinstance(scene, MovingScene) else (scene,)
+
+
+def in_one_row(scene, T_world_cam):
+    """The frames of a batch of trajectories [..., T, 4, 4] as one sequence: the scene for it, and poses
+    [N, 4, 4]."""
+    check_poses(T_world_cam)
+    if isinstance(scene, MovingScene):
+        scene = scene.in_one_row(T_world_cam.shape[:-2])
+    return scene, T_world_cam.reshape(-1, 4, 4)
 
 
 def poses_of_parts(scene, count):

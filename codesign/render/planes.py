@@ -3,7 +3,7 @@
 import torch
 
 from codesign.errors import DomainError
-from codesign.pose import check_poses
+from codesign.pose import check_pose
 
 
 class TexturedPlane:
@@ -44,9 +44,7 @@ class TexturedPlane:
                 "given; give one of each per wave."
             )
         self.T_world_plane = (
-            torch.eye(4, dtype=torch.float64)
-            if T_world_plane is None
-            else check_poses(T_world_plane[None].double())[0]
+            torch.eye(4, dtype=torch.float64) if T_world_plane is None else check_pose(T_world_plane.double())
         )
 
     def _constants(self, arr):

@@ -1,4 +1,4 @@
-"""Frames of a scene along a trajectory, and the ways to their gradient.
+"""Frames of a scene along trajectories, and the ways to their gradient.
 
 interior: what moves inside surfaces (plain automatic differentiation). boundary: with the motion of
   silhouettes and edges. difference: central differences
@@ -15,7 +15,7 @@ import torch
 from codesign.errors import DomainError
 from codesign.pose import inverse, se3_exp
 from codesign.render.boundary import boundary_term
-from codesign.render.moving import at_frames
+from codesign.render.moving import at_frames, in_one_row
 from codesign.render.wavefront import shade
 
 Way = Literal["interior", "boundary", "difference", "auto"]
@@ -48,32 +48,34 @@ class Choice:
 
 
 def frames(camera, scene, T_world_cam, gradient: Way = "interior", per_px=2.5):
-    """Frames of a scene along a trajectory.
+    """Frames of a scene along a trajectory, or along several.
 
     Args: camera: Camera. scene: anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane).
-      T_world_cam: [T, 4, 4].
+      T_world_cam: [..., T, 4, 4], several trajectories in one batch as if each were rendered by itself.
       gradient: "interior", "boundary", "difference" or "auto", see the top of this file; the frames are the
         same. per_px: samples per pixel length of
       silhouettes and edges for "boundary".
-    Returns: [T, H, W] (or [T, windows, H, W]) linear irradiance in the scene's units, box-filtered over each
+    Returns: [..., T, H, W] (or [..., T, windows, H, W] behind a Film with windows) linear irradiance in the scene's units, box-filtered over each
       pixel.
     Gradient: lens and poses; "interior" leaves out the motion of silhouettes.
     Raises: DomainError for an unknown way, or a scene whose silhouettes are not known.
     """
     if gradient not in WAYS:
         raise DomainError(f"gradient = {gradient!r} is not known; choose one of {', '.join(WAYS)}.")
-    if gradient == "auto":
-        gradient = settled(camera, scene, T_world_cam)
-    if gradient == "difference":
-        return by_differences(camera, scene, T_world_cam)
+    if gradient in ("auto", "difference"):
+        row = in_one_row(scene, T_world_cam)
+        if gradient == "auto":
+            gradient = settled(camera, *row)
+        if gradient == "difference":
+            return by_differences(camera, *row).reshape(*T_world_cam.shape[:-2], *camera.film.shape)
     found = image(camera, scene, T_world_cam)
     return found + boundary_term(camera, scene, T_world_cam, per_px) if gradient == "boundary" else found
 
 
 def image(camera, scene, T_world_cam):
-    """Frames [T, *film.shape] with their interior gradient."""
+    """Frames [..., T, *film.shape] with their interior gradient."""
     return shade(camera.rays(), scene, T_world_cam, camera.samples_per_pixel).reshape(
-        T_world_cam.shape[0], *camera.film.shape
+        *T_world_cam.shape[:-2], *camera.film.shape
     )
 
 

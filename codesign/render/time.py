@@ -1,7 +1,8 @@
 """Time: exposures, frame times that follow the motion, and sequences too long for memory. Rays are traced
 once for a whole sequence.
 
-A trajectory is a function of times [n] in seconds to poses T_world_cam [n, 4, 4]. Where objects move, the
+A trajectory is a function of times [n] in seconds to poses T_world_cam [n, 4, 4], or [..., n, 4, 4] for
+several in one batch. Where objects move, the
 scene is a function too: of times [n] to a
 MovingScene with n poses per object.
 """
@@ -13,7 +14,7 @@ import torch
 
 from codesign.errors import DomainError, check_finite
 from codesign.pose import check_poses
-from codesign.render.moving import MovingScene, at_frames
+from codesign.render.moving import MovingScene, at_frames, in_one_row
 from codesign.render.truth import track
 from codesign.render.wavefront import shade
 
@@ -47,7 +48,7 @@ def exposed_frames(camera, scene, trajectory, t_s, exposure_s, samples=8, rule=m
       exposure, >= 0. samples: time samples per frame.
       rule: ``midpoints`` (error of a moving edge: at most its jump / (2 samples)) or ``gauss_legendre`` (for
         smooth textures).
-    Returns: [T, *film.shape], the mean of the irradiance over the exposure, in the scene's units.
+    Returns: [..., T, *film.shape], the mean of the irradiance over the exposure, in the scene's units.
     Gradient: lens, and whatever the trajectory's poses depend on; interior term only.
     Raises: DomainError on a negative exposure, fewer than one sample, or poses that are not rigid.
     """
@@ -60,13 +61,13 @@ def exposed_frames(camera, scene, trajectory, t_s, exposure_s, samples=8, rule=m
     total = torch.zeros(())
     for node, weight in zip(*(column.tolist() for column in rule(int(samples))), strict=True):
         at = t_s + node * exposure_s
-        total = total + weight * shade(rays, _at(scene, at), _poses(trajectory, at), camera.samples_per_pixel)
-    return total.reshape(t_s.numel(), *camera.film.shape)
+        total = total + weight * shade(rays, _at(scene, at), trajectory(at), camera.samples_per_pixel)
+    return total.reshape(*total.shape[:-1], *camera.film.shape)
 
 
 def frame_chunks(camera, scene, T_world_cam, frames_per_chunk):
-    """Generator of the frames of a long sequence, some at a time: [<= frames_per_chunk, *film.shape] each, in
-    bounded memory.
+    """Generator of the frames of a long sequence, some at a time: [..., <= frames_per_chunk, *film.shape]
+    each, in bounded memory. T_world_cam: [..., T, 4, 4]; a chunk holds those frames of every trajectory.
 
     Joined, the chunks are what ``frames`` gives, bit for bit: every frame is the same sum in the same order.
     Gradient: as ``frames`` has it (interior term). All chunks share one trace of the lens, so going backward
@@ -76,7 +77,7 @@ def frame_chunks(camera, scene, T_world_cam, frames_per_chunk):
     check_poses(T_world_cam)
     if not (frames_per_chunk >= 1 and frames_per_chunk % 1 == 0):
         raise DomainError(f"frames_per_chunk = {frames_per_chunk} must be a whole number of at least 1.")
-    count = T_world_cam.shape[0]
+    count = T_world_cam.shape[-3]
     if isinstance(scene, MovingScene):
         scene.check_length(count)
     return _chunks(
@@ -93,13 +94,15 @@ def frame_chunks(camera, scene, T_world_cam, frames_per_chunk):
 def _chunks(camera, scene, T_world_cam, pieces):
     rays = camera.rays()
     for piece in pieces:
-        yield shade(rays, at_frames(scene, piece), T_world_cam[piece], camera.samples_per_pixel).reshape(
-            -1, *camera.film.shape
+        poses = T_world_cam[..., piece, :, :]
+        yield shade(rays, at_frames(scene, piece), poses, camera.samples_per_pixel).reshape(
+            *poses.shape[:-2], *camera.film.shape
         )
 
 
 def adaptive_times(camera, scene, trajectory, start_s, end_s, largest_px, every_px=1):
-    """Frame times between which no pixel's point moves by more than a given distance in the image.
+    """Frame times between which no pixel's point moves by more than a given distance in the image, on any of
+    the trajectories.
 
     Args: camera, scene, trajectory: see the top of this file. largest_px: largest displacement between
       frames, > 0. every_px: spacing of the pixels that
@@ -190,11 +193,11 @@ def _displacement_px(camera, scene, trajectory, ends, grids, largest_px):
     """The largest displacement within a step, px; infinite when a point passes the camera. The fine grid is
     asked only when the coarse one finds no more than allowed."""
     at = torch.tensor([ends[0], (ends[0] + ends[1]) / 2, ends[1]], dtype=torch.float64)
-    poses = _poses(trajectory, at)
-    shown = _at(scene, at)
+    shown, poses = in_one_row(_at(scene, at), trajectory(at))
+    firsts = range(0, poses.shape[0], at.numel())
     largest = 0.0
     for (pixels, rays), pairs in zip(grids, (((0, 1), (0, 2), (2, 0)), ((0, 2), (2, 0))), strict=True):
-        for now, later in pairs:
+        for now, later in [(first + a, first + b) for first in firsts for a, b in pairs]:
             found = track(camera, shown, poses, now, later, pixels, rays)
             lost = (found.hits.part >= 0) & ~found.valid
             largest = max(
@@ -225,7 +228,3 @@ def _lost_px(camera, found, rays, lost):
 
 def _at(scene, t_s):
     return scene(t_s) if callable(scene) else scene
-
-
-def _poses(trajectory, t_s):
-    return check_poses(trajectory(t_s))

@@ -9,7 +9,7 @@ from torch import Tensor
 from codesign.errors import ShapeError
 from codesign.pose import apply, check_poses, inverse
 from codesign.render.camera import project
-from codesign.render.moving import cameras_in_parts, parts, poses_of_parts
+from codesign.render.moving import cameras_in_parts, in_one_row, parts, poses_of_parts
 
 # of lengths: 32 units in the last place of a float32, for a ray moved into an object's axes and met with its
 # surface
@@ -36,8 +36,8 @@ class View:
 
 @dataclass(frozen=True)
 class FlowTruth:
-    """flow_px: [T - stride, 2, *film.shape], +x right, +y down, 0 where not valid. valid, occluded: [T -
-    stride, *film.shape] bool; occluded points are hidden later."""
+    """flow_px: [..., T - stride, 2, *film.shape], +x right, +y down, 0 where not valid. valid, occluded:
+    [..., T - stride, *film.shape] bool; occluded points are hidden later."""
 
     flow_px: Tensor
     valid: Tensor
@@ -131,19 +131,17 @@ def true_flow(camera, scene, T_world_cam, stride=1):
     """Flow of every pixel centre from each pose to the one ``stride`` later, through the camera's current
     lens; points move with their object.
 
-    Args: camera with ``chief_rays`` and ``film``; scene with ``hit``, or a MovingScene; T_world_cam [T, 4,
-      4].
-    Returns: flow [T - stride, 2, *film.shape] px, +x right, +y down; valid [T - stride, *film.shape], False
-      where the ray meets nothing
-      or the point leaves the field of the lens (the flow is 0 there).
+    Args: camera with ``chief_rays`` and ``film``; scene with ``hit``, or a MovingScene; T_world_cam
+      [..., T, 4, 4], several trajectories in one batch.
+    Returns: flow [..., T - stride, 2, *film.shape] px, +x right, +y down; valid [..., T - stride,
+      *film.shape], False where the ray meets nothing or the point leaves the field of the lens (the flow is 0
+      there).
     Gradient: to lens, camera and object poses. Occlusion at the later time is left to ``flow_and_occlusion``.
     Raises: ShapeError when there are not more poses than ``stride``.
     """
-    pixels = camera.film.pixels()
-    pairs = _pairs(T_world_cam, stride)
-    rays = camera.chief_rays(pixels)
-    tracks = [track(camera, scene, T_world_cam, now, later, pixels, rays) for now, later in pairs]
-    return _flow(camera, tracks), torch.stack([t.valid.reshape(camera.film.shape) for t in tracks])
+    tracks, _, _ = _tracks(camera, scene, T_world_cam, stride)
+    batch = _batch(T_world_cam, stride)
+    return _flow(camera, tracks, batch), _mask(camera, [t.valid for t in tracks], batch)
 
 
 def flow_and_occlusion(camera, scene, T_world_cam, stride=1):
@@ -154,15 +152,12 @@ def flow_and_occlusion(camera, scene, T_world_cam, stride=1):
     geometry, divided by the cosine at which the ray meets the point's own surface, since a ray aside by as
     much meets it earlier or later by that.
     """
-    pixels = camera.film.pixels()
-    pairs = _pairs(T_world_cam, stride)
-    rays = camera.chief_rays(pixels)
-    tracks = [track(camera, scene, T_world_cam, now, later, pixels, rays) for now, later in pairs]
-    occluded = [_hidden(camera, scene, T_world_cam, t).reshape(camera.film.shape) for t in tracks]
+    tracks, scene, poses = _tracks(camera, scene, T_world_cam, stride)
+    batch = _batch(T_world_cam, stride)
     return FlowTruth(
-        _flow(camera, tracks),
-        torch.stack([t.valid.reshape(camera.film.shape) for t in tracks]),
-        torch.stack(occluded),
+        _flow(camera, tracks, batch),
+        _mask(camera, [t.valid for t in tracks], batch),
+        _mask(camera, [_hidden(camera, scene, poses, t) for t in tracks], batch),
     )
 
 
@@ -214,18 +209,33 @@ def _hidden(camera, scene, T_world_cam, found):
     return found.valid & (first_hits(rays, scene, cameras).distance_m < reach - ROUNDING * size / cosine)
 
 
-def _pairs(T_world_cam, stride):
-    check_poses(T_world_cam)
-    if not 1 <= stride < T_world_cam.shape[0]:
+def _tracks(camera, scene, T_world_cam, stride):
+    """Tracks of all pairs of frames of all trajectories, and scene and poses [N, 4, 4] of the frames in one
+    row."""
+    scene, poses = in_one_row(scene, T_world_cam)
+    length = T_world_cam.shape[-3]
+    if not 1 <= stride < length:
         raise ShapeError(
             f"true flow over {stride} pose(s) ahead needs a stride of at least 1 and more poses than that, "
-            f"got {T_world_cam.shape[0]}; give more poses."
+            f"got {length}; give more poses."
         )
-    return [(now, now + stride) for now in range(T_world_cam.shape[0] - stride)]
+    pixels = camera.film.pixels()
+    rays = camera.chief_rays(pixels)
+    starts = [first + now for first in range(0, poses.shape[0], length) for now in range(length - stride)]
+    return [track(camera, scene, poses, now, now + stride, pixels, rays) for now in starts], scene, poses
 
 
-def _flow(camera, tracks):
-    return torch.stack([(t.to_px - t.from_px).T.reshape(2, *camera.film.shape) for t in tracks])
+def _batch(T_world_cam, stride):
+    return (*T_world_cam.shape[:-3], T_world_cam.shape[-3] - stride)
+
+
+def _flow(camera, tracks, batch):
+    moved = torch.stack([(t.to_px - t.from_px).T for t in tracks])
+    return moved.reshape(*batch, 2, *camera.film.shape)
+
+
+def _mask(camera, rows, batch):
+    return torch.stack(rows).reshape(*batch, *camera.film.shape)
 
 
 def _carried(hits, transforms):

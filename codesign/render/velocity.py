@@ -14,8 +14,8 @@ SMALL = 1e-4  # squared angle below which series are used; their next term is 1e
 def camera_velocity(T_world_cam, t_s):
     """Mean velocity of a camera between its poses: the constant twist that leads from each pose to the next.
 
-    Args: T_world_cam: [T >= 2, 4, 4]. t_s: [T] times, increasing.
-    Returns: two twists [T - 1, 6], translation of the camera's origin (m/s) then rotation (rad/s): in the
+    Args: T_world_cam: [..., T >= 2, 4, 4]. t_s: [T] times, increasing, the same for all trajectories.
+    Returns: two twists [..., T - 1, 6], translation of the camera's origin (m/s) then rotation (rad/s): in the
       camera's own axes, where it is the same all
       through the interval, and in world axes, as it is at the middle of the interval.
     Gradient: to the poses.
@@ -24,9 +24,9 @@ def camera_velocity(T_world_cam, t_s):
     """
     check_poses(T_world_cam)
     t_s = check_finite(torch.as_tensor(t_s, dtype=torch.float64), "times of the poses")
-    if t_s.shape != T_world_cam.shape[:1] or t_s.numel() < 2:
+    if t_s.shape != T_world_cam.shape[-3:-2] or t_s.numel() < 2:
         raise ShapeError(
-            f"camera velocity: {tuple(t_s.shape)} times for {T_world_cam.shape[0]} poses; give one time per "
+            f"camera velocity: {tuple(t_s.shape)} times for {T_world_cam.shape[-3]} poses; give one time per "
             "pose, and at least two."
         )
     if not bool((t_s.diff() > 0).all()):
@@ -34,11 +34,13 @@ def camera_velocity(T_world_cam, t_s):
             "camera velocity: the times must increase from pose to pose; sort them and drop doubles."
         )
     poses = T_world_cam.double()
-    twist = se3_log(inverse(poses[:-1]) @ poses[1:])
-    half_turn = se3_exp(torch.cat([torch.zeros_like(twist[:, :3]), twist[:, 3:] / 2], 1))[:, :3, :3]
+    start = poses[..., :-1, :, :]
+    twist = se3_log((inverse(start) @ poses[..., 1:, :, :]).reshape(-1, 4, 4)).reshape(*start.shape[:-2], 6)
+    half_turn = se3_exp(torch.cat([torch.zeros_like(twist[..., :3]), twist[..., 3:] / 2], -1))[..., :3, :3]
     body = twist / t_s.diff()[:, None]
-    world = poses[:-1, None, :3, :3] @ half_turn[:, None] @ body.reshape(-1, 2, 3, 1)
-    return body, world.reshape(-1, 6)
+    turn = (start[..., :3, :3] @ half_turn)[..., None, :, :]
+    world = turn @ body.reshape(*body.shape[:-1], 2, 3, 1)
+    return body, world.reshape(body.shape)
 
 
 def se3_log(transform):

@@ -1,20 +1,20 @@
-"""All frames of a sequence in one wavefront: camera-space rays x poses -> pixel means."""
+"""All frames of all trajectories in one wavefront: camera-space rays x poses -> pixel means."""
 
 from codesign.backend import run_kernel
 from codesign.errors import DomainError, ShapeError
-from codesign.pose import check_poses
-from codesign.render.moving import cameras_in_parts, parts
+from codesign.render.moving import cameras_in_parts, in_one_row, parts
 
 
 def shade(rays, scene, T_world_cam, samples_per_pixel):
-    """Pixel means [T, P] of the radiance along rays given in camera space, seen from every pose.
+    """Pixel means [..., T, P] of the radiance along rays given in camera space, seen from every pose.
 
     Args: rays: Rays with N = P x samples_per_pixel. scene: anything with ``radiance`` and ``dtype``, or a
-      MovingScene with T poses per object.
+      MovingScene with T poses per object. T_world_cam: [..., T, 4, 4]; all trajectories are one launch.
     Gradient: to the rays (weights included), the poses and the poses of moving objects; the motion of
       silhouettes is not in it.
     """
-    check_poses(T_world_cam)
+    batch = T_world_cam.shape[:-2]
+    scene, T_world_cam = in_one_row(scene, T_world_cam)
     count = rays.weight.numel()
     poses = T_world_cam.shape[0]
     if not samples_per_pixel >= 1:
@@ -35,7 +35,7 @@ def shade(rays, scene, T_world_cam, samples_per_pixel):
     ]
     kernel = _Wavefront(parts(scene), count, poses, samples_per_pixel)
     (image,) = run_kernel(kernel, inputs, [(poses, count // samples_per_pixel)])
-    return image
+    return image.reshape(*batch, -1)
 
 
 class _Wavefront:

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from codesign.pose import check_poses
+from codesign.pose import check_pose
 from scenes.trajectories.trajectory import Trajectory, positive, rigid
 
 
@@ -64,7 +64,7 @@ class Swinging(Trajectory):
     """
 
     def __init__(self, T_world_start, direction, amplitude_m, frequency_hz):
-        self.start = check_poses(T_world_start.detach().double()[None])[0]
+        self.start = check_pose(T_world_start.detach().double())
         self.direction = torch.nn.functional.normalize(torch.as_tensor(direction, dtype=torch.float64), dim=0)
         self.amplitude_m = positive("amplitude_m", amplitude_m)
         self.frequency_hz = positive("frequency_hz", frequency_hz)

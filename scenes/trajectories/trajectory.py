@@ -13,7 +13,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.place.mount import AXES_BODY_CAM
-from codesign.pose import check_poses, look_at
+from codesign.pose import check_pose, look_at
 
 
 class Trajectory(ABC):
@@ -111,7 +111,7 @@ def mounted(trajectory, T_body_cam):
     """
     if T_body_cam.shape != (4, 4):
         raise ShapeError(f"T_body_cam must be one pose [4, 4], got {tuple(T_body_cam.shape)}.")
-    return _Mounted(trajectory, check_poses(T_body_cam.double()[None])[0])
+    return _Mounted(trajectory, check_pose(T_body_cam.double()))
 
 
 def body_at(origin_m, target_m, up=(0.0, 0.0, 1.0)):

@@ -119,12 +119,11 @@ class PlacementTask:
     def frames(self, T_body_cam):
         """[T, B, H, W] of mounts [B, 4, 4]."""
         rays = self.camera.rays()
-        parts = []
-        poses = self.poses(T_body_cam).reshape(len(self.worlds), -1, FRAMES, 4, 4)
-        for world, each in zip(self.worlds, poses, strict=True):
-            image = render.shade(rays, world, each.reshape(-1, 4, 4), SAMPLES)
-            parts.append(image.reshape(*each.shape[:2], *self.camera.film.shape).transpose(0, 1))
-        return torch.cat(parts, 1)
+        poses = self.poses(T_body_cam).unflatten(0, (len(self.worlds), -1))
+        parts = [
+            render.shade(rays, world, each, SAMPLES) for world, each in zip(self.worlds, poses, strict=True)
+        ]
+        return torch.cat(parts).unflatten(-1, self.camera.film.shape).transpose(0, 1)
 
     def volume(self, frames, layer="memory"):
         """Event volume of frames [T, B, H, W]. layer: "memory" (hard counts, straight-through), "counts"
