@@ -2,15 +2,16 @@
 
 Hard: ``simulate`` (sensor), ``naive`` (frame difference). Differentiable: ``memory`` (default),
   ``soft_counts``, ``soft``, ``dense``, ``expected``,
-``sensor_counts``; ``EventLayer`` calls any of them alike.
+``sensor_counts``, ``srm``; ``layer(name)`` makes a module of any of them, with learnable sensor values.
 """
 
 from codesign.events.files import read, write
 from codesign.events.formats.aedat4_frames import RecordedFrames, read_frames
 from codesign.events.intensity import lin_log
+from codesign.events.layers.by_name import LAYERS, layer
 from codesign.events.layers.dense import dense
 from codesign.events.layers.expected import annealed, expected
-from codesign.events.layers.layer import EventLayer
+from codesign.events.layers.layer import ComparatorLayer, EventLayer, PhysicalLayer
 from codesign.events.layers.low_pass import low_pass
 from codesign.events.layers.memory import memory, soft_counts
 from codesign.events.layers.physical import PhysicalState, sensor_counts
@@ -37,10 +38,13 @@ from codesign.events.volumes.traces import decay, decay_from_stream
 from codesign.events.volumes.volume import from_counts, from_stream
 
 __all__ = [
+    "LAYERS",
     "PRESETS",
+    "ComparatorLayer",
     "EventLayer",
     "FastSigmoid",
     "Laplace",
+    "PhysicalLayer",
     "PhysicalState",
     "RecordedFrames",
     "SensorModel",
@@ -66,6 +70,7 @@ __all__ = [
     "from_counts",
     "from_stream",
     "gray_picture",
+    "layer",
     "lin_log",
     "low_pass",
     "memory",

@@ -1,5 +1,4 @@
-"""The differentiable layers: closed forms, Monte Carlo means, differences of the hard sensor, and one
-interface for all."""
+"""The differentiable layers: closed forms, Monte Carlo means, differences of the hard sensor."""
 
 import math
 
@@ -8,7 +7,6 @@ import torch
 
 from codesign.errors import DomainError, ShapeError
 from codesign.events import (
-    EventLayer,
     SensorModel,
     SensorState,
     annealed,
@@ -18,10 +16,8 @@ from codesign.events import (
     memory,
     sensor_counts,
     simulate,
-    soft,
     to_counts,
 )
-from codesign.events.layers.layer import KINDS
 
 D = torch.float64
 PHYSICAL = SensorModel(
@@ -199,51 +195,8 @@ def test_gradients_to_the_sensor_follow_differences_of_hard_counts(name, sensor,
     assert scales[0] < float(slope @ difference / (difference @ difference)) < scales[1]
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_layer_streams_and_is_silent_on_a_static_scene(kind):
-    frames, t_s = drifting()
-    layer = EventLayer(kind, PHYSICAL, learn=("theta_on", "theta_off"))
-    whole, _ = layer(frames, t_s)
-    first, state = layer(frames[:10], t_s[:10])
-    last, _ = layer(frames[10:], t_s[10:], state)
-    assert whole.shape == (29, 2, 6, 5)
-    torch.testing.assert_close(torch.cat((first, last)), whole, rtol=0, atol=1e-12)
-    silent = EventLayer(kind, SensorModel(theta_sigma=0.03, cutoff_hz=30.0, refractory_s=1e-3))
-    still, _ = silent(frames[:1].expand(5, 6, 5), t_s[:5])
-    expected_activity = 1 / (1 + math.exp(5)) if kind == "sigmoid" else 0.0  # the ghosts of the sigmoid
-    torch.testing.assert_close(still, torch.full_like(still, expected_activity), rtol=1e-12, atol=0)
-
-
-def test_learnt_thresholds_find_those_behind_the_counts():
-    level, t_s = moving_pattern(size=24)
-    truth, _ = memory(level, 0.17, 0.23, log_input=True)
-    layer = EventLayer("memory", SensorModel(0.3, 0.3), learn=("theta_on", "theta_off"), log_input=True)
-    optimiser = torch.optim.Adam(layer.parameters(), lr=0.05)
-    for step in range(80):
-        optimiser.param_groups[0]["lr"] = 0.05 * 0.95**step
-        optimiser.zero_grad()
-        counts, _ = layer(level, t_s)
-        ((counts.sum(0) - truth.sum(0)) ** 2).mean().backward()
-        optimiser.step()
-    assert float(layer.value("theta_on").detach()) == pytest.approx(0.17, rel=0.02)
-    assert float(layer.value("theta_off").detach()) == pytest.approx(0.23, rel=0.02)
-
-
-def test_sigmoid_of_the_interface_is_the_function():
-    frames, t_s = drifting()
-    torch.testing.assert_close(
-        EventLayer("sigmoid", SensorModel(0.2, 0.2))(frames, t_s)[0], soft(frames, 0.2)
-    )
-
-
 def test_bad_input_is_refused():
     frames, t_s = drifting(4)
-    with pytest.raises(DomainError, match="event layers are"):
-        EventLayer("spiking")
-    with pytest.raises(DomainError, match="cannot learn"):
-        EventLayer("memory", learn=("cutoff_hz",))
-    with pytest.raises(DomainError, match="switched off"):
-        EventLayer("sensor", learn=("cutoff_hz",))
     with pytest.raises(DomainError, match="cannot carry a gradient"):
         sensor_counts(frames, t_s, SensorModel(), leak_rate_hz=torch.tensor(1.0))
     with pytest.raises(DomainError, match="theta_on"):

@@ -8,9 +8,10 @@ import torch
 
 from codesign.errors import DomainError
 from codesign.events import (
-    EventLayer,
+    LAYERS,
     SensorModel,
     SensorState,
+    layer,
     lin_log,
     memory,
     sensor_counts,
@@ -18,7 +19,6 @@ from codesign.events import (
     soft_counts,
     to_counts,
 )
-from codesign.events.layers.layer import KINDS
 
 D = torch.float64
 THETAS = (1e-3, 0.013, 0.2, 10.0)
@@ -71,18 +71,18 @@ def test_counts_are_those_of_the_definition_and_gradients_are_finite(case, theta
     events = simulate(frames.detach(), t_s, SensorModel(theta, theta))
     assert torch.equal(to_counts(events, t_s, dtype=D), counts.detach())
     full = SensorModel(theta, theta, cutoff_hz=100.0, refractory_s=1e-4)
-    for layer in (
+    for counted in (
         lambda f: memory(f, theta, theta)[0],
         lambda f: soft_counts(f, theta, theta),
         lambda f: sensor_counts(f, t_s, full, cutoff_hz=torch.tensor(100.0), refractory_s=torch.tensor(1e-4))[
             0
         ],
     ):
-        (grad,) = torch.autograd.grad(layer(frames).square().sum(), frames)
+        (grad,) = torch.autograd.grad(counted(frames).square().sum(), frames)
         assert bool(grad.isfinite().all())
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", LAYERS)
 def test_gradients_of_every_layer_stay_finite_on_the_worst_clip(kind):
     frames = (
         torch.tensor([0.0, 255.0, 0.0, 1e4, 1e-6, 20.0, 20.0, 300.0], dtype=D)[:, None, None]
@@ -90,9 +90,10 @@ def test_gradients_of_every_layer_stay_finite_on_the_worst_clip(kind):
         .clone()
         .requires_grad_()
     )
-    layer = EventLayer(kind, SensorModel(cutoff_hz=50.0, refractory_s=1e-3), learn=("theta_on", "theta_off"))
-    counts, _ = layer(frames, torch.arange(8) * 1e-3)
-    inputs = [frames, *layer.parameters()]
+    sensor = SensorModel(cutoff_hz=50.0, refractory_s=1e-3)
+    learnt = layer(kind, sensor, learn=("theta_on", "theta_off", "cutoff_hz"))
+    counts = learnt(frames, torch.arange(8) * 1e-3)
+    inputs = [frames, *learnt.parameters()]
     for grad in torch.autograd.grad(counts.square().sum(), inputs):
         assert bool(grad.isfinite().all())
 

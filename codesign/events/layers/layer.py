@@ -1,113 +1,272 @@
-"""One interface for every differentiable event layer: the same call, the same result, learnable sensor
-parameters."""
+"""Event layers as modules: one call for all of them, and learnable sensor values as unconstrained variables."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
-from torch import nn
+from torch import Generator, Tensor, nn
 
-from codesign.errors import DomainError
-from codesign.events.entry import check_frames
-from codesign.events.intensity import FrontEnd
-from codesign.events.layers.dense import dense
-from codesign.events.layers.expected import expected
-from codesign.events.layers.memory import memory
+from codesign.errors import DomainError, ShapeError
+from codesign.events.entry import check_layout, check_times
+from codesign.events.intensity import log_levels
+from codesign.events.layers.comparators import Comparator
+from codesign.events.layers.low_pass import low_pass
 from codesign.events.layers.physical import DESIGN, sensor_counts
-from codesign.events.layers.soft import soft
-from codesign.events.sensor.model import SensorModel, draw_thresholds
+from codesign.events.sensor.model import SensorModel, draw_deviates, draw_shot_counts, mismatched
+from codesign.events.volumes.volume import from_counts
+from codesign.types import EventVolume
 
-KINDS = ("sigmoid", "dense", "memory", "expected", "sensor")
+STEP = 0.1  # a unit step of a variable changes its value by a tenth: exp(0.1) - 1 = 10.5 %
+THRESHOLDS = ("theta_on", "theta_off")
 
 
 class EventLayer(nn.Module):
-    """Frames to event counts, by one of five models of growing truth.
+    """What all event layers share; ``events.layer(name)`` makes one.
 
-    kind: "sigmoid" (per frame pair, no memory: the baseline), "dense" (comparator with surrogate, one event
-      per frame), "memory" (memorised level,
-    straight-through counts: the default), "expected" (mean counts under threshold mismatch), "sensor" (the
-      full physical sensor).
-    sensor: SensorModel. The first four use its thresholds ("memory" and "dense" also its mismatch); "sensor"
-      uses all of it.
-    learn: fields of the sensor to learn, of theta_on, theta_off, theta_sigma, cutoff_hz, refractory_s; kept
-      as logarithms in ``log_values``.
-    spread: relative threshold spread of "expected"; assign to anneal it (see ``annealed``). seed: of
-      thresholds and noise; fixed, so that calls repeat.
+    sensor: SensorModel that it starts from. learn: fields of the sensor to learn, each a variable v = 0 at
+      first with the value exp(0.1 v) times the sensor's: positive, and a unit step is about 10 %.
+    log_input: frames are log levels instead of linear intensity.
     """
 
-    def __init__(self, kind="memory", sensor=None, *, learn=(), spread=0.15, seed=0, log_input=False):
+    learnable: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        sensor: SensorModel | None = None,
+        *,
+        learn: Sequence[str] = THRESHOLDS,
+        log_input: bool = False,
+    ):
         super().__init__()
-        self.kind = kind
         self.sensor = sensor or SensorModel()
-        self.spread = spread
-        self.seed = seed
         self.log_input = log_input
-        if kind not in KINDS:
-            raise DomainError(f"kind is {kind!r}; event layers are {', '.join(map(repr, KINDS))}.")
-        allowed = DESIGN if kind == "sensor" else ("theta_on", "theta_off")
         for name in learn:
-            if name not in allowed:
+            if name not in self.learnable:
                 raise DomainError(
-                    f"the layer {kind!r} cannot learn {name!r}; it learns {', '.join(allowed)}."
+                    f"a {type(self).__name__} cannot learn {name!r}; it learns {', '.join(self.learnable)}."
                 )
             if getattr(self.sensor, name) <= 0:
                 raise DomainError(
                     f"{name} is 0 in the sensor, so it is switched off; give a value above 0 to learn it."
                 )
-        self.log_values = nn.ParameterDict(
-            {
-                name: nn.Parameter(torch.tensor(getattr(self.sensor, name), dtype=torch.float64).log())
-                for name in learn
-            }
+        self.variables = nn.ParameterDict(
+            [(name, nn.Parameter(torch.zeros((), dtype=torch.float64))) for name in learn]
         )
+        for name in learn:  # buffers, so that a saved layer is complete
+            start = torch.tensor(getattr(self.sensor, name), dtype=torch.float64)
+            self.register_buffer(f"start_{name}", start)
 
-    def value(self, name):
-        """A field of the sensor as it is now: a 0-dim tensor with a gradient when it is learnt, a number
+    def value(self, name: str) -> Tensor | float:
+        """A field of the sensor as it is now: a 0-dim tensor with a gradient where it is learnt, a number
         otherwise."""
-        return self.log_values[name].exp() if name in self.log_values else getattr(self.sensor, name)
+        if name in self.variables:
+            return getattr(self, f"start_{name}") * (STEP * self.variables[name]).exp()
+        return getattr(self.sensor, name)
 
-    def forward(self, frames, t_s, state=None):
-        """Counts of the frames.
+    def fitted(self) -> SensorModel:
+        """The sensor with all values as they are now, for ``events.simulate``."""
+        now = {name: float(torch.as_tensor(self.value(name)).detach()) for name in self.variables}
+        return replace(self.sensor, **now)
 
-        Args: frames: [T, ...] (0-255 scale; log levels with ``log_input``). t_s: [T] seconds. state: what an
-          earlier call returned, to go on behind it.
-        Returns: counts [T-1, 2, ...] ([T, 2, ...] with a state), ON first; the state to carry on (it keeps
-          its graph).
+    def forward(
+        self, frames: Tensor, t_s: Tensor, generator: Generator | Sequence[Generator] | None = None
+    ) -> Tensor:
+        """Event counts of the frames.
+
+        Args:
+          frames: [..., T, H, W] linear intensity on the 0-255 scale (log levels with ``log_input``); axes
+            before time are a batch. t_s: [T] seconds, strictly increasing, the same for the whole batch.
+          generator: for threshold mismatch and noise where the sensor has them. One for all: the samples of
+            a batch draw one after the other, as if each were given by itself; or a list with one each. None:
+            seed 0 in every sample and call.
+        Returns: counts [..., T-1, 2, H, W] >= 0, ON first.
+        Gradient: frames and ``parameters()``, as of the function that the layer calls.
+        Raises: ShapeError, DomainError for frames, times or generators that do not fit.
         """
-        if self.kind == "sensor":
-            design = {name: self.value(name) for name in self.log_values}
-            return sensor_counts(
-                frames,
-                t_s,
-                self.sensor,
-                generator=torch.Generator().manual_seed(self.seed),
-                state=state,
-                log_input=self.log_input,
-                **design,
+        return self.advance(frames, t_s, None, generator)[0]
+
+    def advance(
+        self,
+        frames: Tensor,
+        t_s: Tensor,
+        state: Any = None,
+        generator: Generator | Sequence[Generator] | None = None,
+    ) -> tuple[Tensor, Any]:
+        """The same in chunks of time.
+
+        Args: as for ``forward``. state: what the chunk before returned, which brings its own generators; then
+          T frames give T intervals. None: the first chunk.
+        Returns: counts [..., T-1, 2, H, W] ([..., T, 2, H, W] with a state); state to carry on, with its graph.
+        """
+        if not isinstance(frames, Tensor) or frames.ndim < 3:
+            given = list(frames.shape) if isinstance(frames, Tensor) else type(frames).__name__
+            raise ShapeError(f"frames are {given}; a tensor [T, H, W] or [..., T, H, W] is needed.")
+        if state is not None and generator is not None:
+            raise DomainError(
+                "a generator and a state are given; the state carries the generator of its first chunk on: "
+                "leave the generator out."
             )
-        theta_on, theta_off = self._thetas(frames)
-        if self.kind == "sigmoid":
-            return self._sigmoid(frames, (theta_on, theta_off), state)
-        if self.kind == "expected":
-            return expected(frames, theta_on, theta_off, self.spread, state=state, log_input=self.log_input)
-        return {"memory": memory, "dense": dense}[self.kind](
-            frames, theta_on, theta_off, state=state, log_input=self.log_input
+        frames = frames.movedim(-3, 0)
+        check_layout(frames, 2 if state is None else 1)
+        counts, state = self._count(frames, t_s, state, _generators(generator, frames.shape[1:-2]))
+        return counts.movedim((0, 1), (-4, -3)), state
+
+    def volume(
+        self,
+        frames: Tensor,
+        t_s: Tensor,
+        bins: int,
+        generator: Generator | Sequence[Generator] | None = None,
+    ) -> EventVolume:
+        """Events of the frames in time bins, see ``events.from_counts``.
+
+        Args: as for ``forward``. bins: number of bins.
+        Returns: EventVolume of counts [B, 2, bins, H, W]; several batch axes come as one.
+        Gradient: as ``forward``.
+        """
+        return from_counts(self(frames, t_s, generator).movedim((-4, -3), (0, 1)), t_s, bins)
+
+    def _count(self, frames, t_s, state, generators):
+        """Counts [T-1, 2, ..., H, W] of frames [T, ..., H, W], and the state to carry on."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class LayerState:
+    """What a ``ComparatorLayer`` carries over chunks.
+
+    comparator: state of the comparator. level, frame: [..., H, W] level behind the low-pass and last frame,
+      None without a low-pass. deviates: [2, ..., H, W] standard normal numbers of the thresholds, None without
+      mismatch. time_s: time of the last frame. generators: of the noise still to come, one per sample.
+    """
+
+    comparator: Any
+    level: Tensor | None
+    frame: Tensor | None
+    deviates: Tensor | None
+    time_s: float
+    generators: Sequence[Generator]
+
+
+class ComparatorLayer(EventLayer):
+    """Low-pass (where the sensor has a bandwidth), thresholds (with mismatch), a comparator, noise events.
+
+    Of the sensor it uses theta_on, theta_off, theta_sigma, cutoff_hz and shot_rate_hz (Poisson, as
+    ``draw_shot_counts``, without gradient); leak, dead time and hot pixels are those of ``PhysicalLayer``.
+    comparator: one of ``events.layers.comparators``, or your own of the same call.
+    """
+
+    learnable = ("theta_on", "theta_off", "theta_sigma", "cutoff_hz")
+
+    def __init__(self, comparator: Comparator, sensor: SensorModel | None = None, **options: Any):
+        super().__init__(sensor, **options)
+        self.comparator = comparator
+
+    def _count(self, frames, t_s, state, generators):
+        times_s = _times(frames, t_s, None if state is None else state.time_s)
+        if state is None:
+            state = LayerState(None, None, None, None, 0.0, generators)
+        deviates, shots = self._noise(frames, times_s.diff(), state)
+        seen, level = self._seen(frames, times_s.diff(), state)
+        on, off = (None, None) if deviates is None else deviates
+        theta_on = self._threshold("theta_on", frames, on)
+        theta_off = self._threshold("theta_off", frames, off)
+        is_level = self.log_input or level is not None
+        counts, comparator = self.comparator(seen, theta_on, theta_off, state.comparator, is_level)
+        if shots is not None:
+            counts = counts + shots
+        frame = None if level is None else frames[-1]
+        time_s = float(times_s[-1])
+        return counts, LayerState(comparator, level, frame, deviates, time_s, state.generators)
+
+    def _noise(self, frames, interval_s, state):
+        """Deviates of the thresholds [2, ..., H, W] and noise events [T-1, 2, ..., H, W], None each where the
+        sensor has none; one sample after the other."""
+        pixels = frames.shape[-2:]
+        deviates = []
+        shots = []
+        for generator in state.generators:
+            if self.sensor.theta_sigma > 0 and state.deviates is None:
+                deviates.append(draw_deviates(pixels, generator, dtype=frames.dtype))
+            if self.sensor.has_shots:
+                shots.append(draw_shot_counts(self.sensor, pixels, interval_s, generator, dtype=frames.dtype))
+        batch = frames.shape[1:]
+        return (
+            torch.stack(deviates, 1).reshape(2, *batch).to(frames) if deviates else state.deviates,
+            torch.stack(shots, 2).reshape(-1, 2, *batch).to(frames) if shots else None,
         )
 
-    def _thetas(self, frames):
-        """Thresholds ON and OFF, with the mismatch of every pixel where the layer knows mismatch."""
-        nominal = [
-            torch.as_tensor(self.value(name), dtype=frames.dtype, device=frames.device)
-            for name in ("theta_on", "theta_off")
-        ]
-        if self.sensor.theta_sigma == 0 or self.kind in ("sigmoid", "expected"):
-            return nominal
-        place = {"dtype": frames.dtype, "device": frames.device}
-        drawn = draw_thresholds(
-            self.sensor, frames.shape[1:], torch.Generator().manual_seed(self.seed), **place
-        )
-        return [theta + (pixels - theta.detach()) for theta, pixels in zip(nominal, drawn, strict=True)]
+    def _seen(self, frames, interval_s, state):
+        """What the comparator gets: the frames, or log levels behind the low-pass with the last of them."""
+        if self.sensor.cutoff_hz == 0:
+            return frames, None
+        both = frames if state.frame is None else torch.cat((state.frame[None], frames))
+        level = log_levels(both, self.log_input, minimum=2)
+        intensity = both.exp() if self.log_input else both
+        level = low_pass(level, intensity, interval_s, self.value("cutoff_hz"), state.level)
+        return level[-len(frames) :], level[-1]
 
-    def _sigmoid(self, frames, thetas, state):
-        check_frames(frames, 2 if state is None else 1, non_negative=not self.log_input)
-        level = FrontEnd(self.log_input).level(frames)
-        both = level if state is None else torch.cat((state[None], level))
-        on, off = (soft(both, theta, log_input=True)[:, index] for index, theta in enumerate(thetas))
-        return torch.stack((on, off), dim=1), level[-1]
+    def _threshold(self, name, frames, deviate):
+        theta = torch.as_tensor(self.value(name), dtype=frames.dtype, device=frames.device)
+        if deviate is None or not self.comparator.mismatched:
+            return theta
+        sigma = torch.as_tensor(self.value("theta_sigma"), dtype=frames.dtype, device=frames.device)
+        return mismatched(theta, sigma, deviate)
+
+
+class PhysicalLayer(EventLayer):
+    """``events.sensor_counts``: exactly the events of ``events.simulate``, noise and all, with gradients to
+    the sensor. A batch is one sample after the other."""
+
+    learnable = DESIGN
+
+    def _count(self, frames, t_s, state, generators):
+        samples = frames.reshape(len(frames), -1, *frames.shape[-2:]).unbind(1)
+        design = {name: self.value(name) for name in self.variables}
+        counts, states = zip(
+            *(
+                sensor_counts(
+                    sample,
+                    t_s,
+                    self.sensor,
+                    generator=generator,
+                    state=before,
+                    log_input=self.log_input,
+                    **design,
+                )
+                for sample, generator, before in zip(
+                    samples, generators, state or [None] * len(samples), strict=True
+                )
+            ),
+            strict=True,
+        )
+        return torch.stack(counts, 2).reshape(-1, 2, *frames.shape[1:]), states
+
+
+def _generators(generator, batch):
+    """One generator per sample; the same object several times where one serves all."""
+    count = math.prod(batch)
+    if generator is None:
+        return [Generator().manual_seed(0) for _ in range(count)]
+    if isinstance(generator, Generator):
+        return [generator] * count
+    if len(generator) != count:
+        raise ShapeError(
+            f"{len(generator)} generators are given for a batch of {count}; give one, or one per sample."
+        )
+    return list(generator)
+
+
+def _times(frames, t_s, before_s):
+    """Times of the frames, and before them that of the last frame of the chunk before."""
+    times_s = check_times(t_s, len(frames))
+    if before_s is None:
+        return times_s
+    if float(times_s[0]) <= before_s:
+        raise DomainError(
+            f"the chunk starts at {float(times_s[0])!r} s, the last frame seen was at {before_s!r} s; times "
+            "must go on increasing."
+        )
+    return torch.cat((torch.tensor([before_s], dtype=torch.float64), times_s))

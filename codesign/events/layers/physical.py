@@ -11,7 +11,7 @@ from codesign.events.entry import check_frames, check_times
 from codesign.events.intensity import FrontEnd
 from codesign.events.layers.low_pass import low_pass
 from codesign.events.layers.memory import memory
-from codesign.events.sensor.model import THETA_MINIMUM
+from codesign.events.sensor.model import mismatched
 from codesign.events.sensor.simulate import dense_counts
 from codesign.events.sensor.state import SensorState
 
@@ -125,13 +125,11 @@ def _draws(sensor, state):
 
 
 def _drawn(theta, sigma, draw, level):
-    """Thresholds of every pixel as a function of their mean and spread; a clamped one has no slope."""
+    """Thresholds of every pixel as a function of their mean and spread."""
     theta = torch.as_tensor(theta, dtype=level.dtype, device=level.device)
     if draw is None:
         return theta
-    return (theta + torch.as_tensor(sigma, dtype=level.dtype, device=level.device) * draw).clamp(
-        min=THETA_MINIMUM
-    )
+    return mismatched(theta, torch.as_tensor(sigma, dtype=level.dtype, device=level.device), draw)
 
 
 def _passing(step, thetas, interval_s, refractory_s):

@@ -159,15 +159,26 @@ def draw_thresholds(sensor, pixels, generator, *, dtype=torch.float32, device="c
     nominal = (sensor.theta_on, sensor.theta_off)
     if sensor.theta_sigma == 0:
         return tuple(torch.tensor(theta, dtype=dtype, device=device).expand(pixels) for theta in nominal)
-    spread = (
-        sensor.theta_sigma
-        * torch.randn(tuple(pixels), generator=generator, dtype=dtype, device=generator.device)
-        for _ in nominal
-    )
+    deviates = draw_deviates(pixels, generator, dtype=dtype)
     return tuple(
-        (theta + noise).clamp(min=THETA_MINIMUM).to(device)
-        for theta, noise in zip(nominal, spread, strict=True)
+        mismatched(theta, sensor.theta_sigma, deviate).to(device)
+        for theta, deviate in zip(nominal, deviates, strict=True)
     )
+
+
+def draw_deviates(pixels, generator, *, dtype=torch.float32):
+    """Standard normal numbers behind the thresholds of every pixel, [2, *pixels] on the generator's device:
+    first all ON, then all OFF."""
+    shape = tuple(pixels)
+    return torch.stack(
+        [torch.randn(shape, generator=generator, dtype=dtype, device=generator.device) for _ in range(2)]
+    )
+
+
+def mismatched(theta, sigma, deviate):
+    """Thresholds of every pixel: theta + sigma deviate, at least 0.01. Gradient: theta and sigma, none where
+    the minimum holds."""
+    return (theta + sigma * deviate).clamp(min=THETA_MINIMUM)
 
 
 def draw_leak_rates(sensor, pixels, generator, *, dtype=torch.float32, device="cpu"):

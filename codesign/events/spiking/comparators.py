@@ -36,12 +36,13 @@ def count_spikes(level, t_s, theta, state, refractory_s):
     """At most one event per step and polarity: a spike response layer with step kernels and coupled
     polarities, which memorises the same level.
 
-    Gradient: by a fast sigmoid of width theta, through the reset where it cannot grow. It has no dead time;
-      refractory_s must be None.
+    Args: as for ``count_memorised``. theta: [2], or [2, ...] of every pixel. It has no dead time; refractory_s
+      must be None.
+    Gradient: by a fast sigmoid of width theta, through the reset where it cannot grow.
     """
     start, neurons = (level[:1], None) if state is None else (state[0][None], state[1])
     step = torch.cat((start, level if state is not None else level[1:])).diff(dim=0)
-    thetas = theta.to(level).reshape(2, *[1] * (level.ndim - 1))
+    thetas = theta.to(level)[(..., *[None] * (level.ndim - theta.ndim))]
     spikes, _, neurons = srm(
         torch.stack((step, -step), 1),
         theta=thetas,

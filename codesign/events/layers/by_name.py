@@ -1,0 +1,49 @@
+"""Event layers by name: what a command line or a study's configuration says."""
+
+import difflib
+from typing import Any
+
+from codesign.errors import DomainError
+from codesign.events.layers import comparators
+from codesign.events.layers.layer import ComparatorLayer, EventLayer, PhysicalLayer
+from codesign.events.sensor.model import SensorModel
+
+COMPARATORS = {
+    "sigmoid": comparators.Sigmoid,
+    "counts": comparators.SoftCounts,
+    "dense": comparators.Dense,
+    "memory": comparators.Memory,
+    "expected": comparators.Expected,
+    "srm": comparators.Spikes,
+}
+LAYERS = (*COMPARATORS, "physical")
+
+
+def layer(name: str = "memory", sensor: SensorModel | None = None, **options: Any) -> EventLayer:
+    """The event layer of that name, a module with learnable thresholds.
+
+    Args:
+      name: "sigmoid" (per frame pair, no memory: the baseline), "counts" (the same without cap or ghosts),
+        "dense" (comparator with surrogate, at most one event per frame), "memory" (memorised level,
+        straight-through counts: the default), "expected" (mean counts under threshold mismatch), "srm"
+        (spike response model, at most one event per frame), "physical" (the full sensor).
+      sensor: SensorModel to start from. options: learn, log_input (see ``EventLayer``), and spread of
+        "expected", sharpness of "sigmoid" and "dense".
+    Raises: DomainError for an unknown name, with the nearest one, or a value that cannot be learnt.
+
+    Example:
+    >>> sensor = events.layer("memory", events.SensorModel(theta_on=0.2, theta_off=0.3))
+    >>> frames = torch.tensor([40.0, 100.0, 30.0]).reshape(3, 1, 1)
+    >>> sensor(frames, torch.tensor([0.0, 0.01, 0.02])).flatten(1).tolist()  # ON: ln(100/40)/0.2
+    [[4.0, 0.0], [0.0, 3.0]]
+    """
+    if name == "physical":
+        return PhysicalLayer(sensor, **options)
+    if name not in COMPARATORS:
+        near = difflib.get_close_matches(str(name), LAYERS, n=1)
+        raise DomainError(
+            f"there is no event layer {name!r}{f', did you mean {near[0]!r}?' if near else ''}; event layers "
+            f"are {', '.join(map(repr, LAYERS))}."
+        )
+    own = {key: options.pop(key) for key in ("spread", "sharpness") if key in options}
+    return ComparatorLayer(COMPARATORS[name](**own), sensor, **options)

@@ -1,0 +1,118 @@
+"""The comparators of an event layer: from what a pixel sees to counts, all called alike.
+
+Each is a small object with ``comparator(frames, theta_on, theta_off, state, log_input) -> counts, state``:
+frames [T, ...] give counts [T-1, 2, ...], ON first, and with a state of an earlier call [T, 2, ...].
+``mismatched`` says whether it takes the thresholds of every pixel, or the nominal ones.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+import torch
+from torch import Tensor
+
+from codesign.events.intensity import log_levels
+from codesign.events.layers.dense import dense
+from codesign.events.layers.expected import expected
+from codesign.events.layers.memory import memory, soft_counts
+from codesign.events.layers.soft import soft
+from codesign.events.spiking.comparators import count_spikes
+
+
+class Comparator(Protocol):
+    """What ``ComparatorLayer`` calls. frames: [T, ...] on the 0-255 scale, or log levels with log_input;
+    theta_on, theta_off: 0-dim or [...]; state: what the call before returned, None at first."""
+
+    @property
+    def mismatched(self) -> bool: ...
+
+    def __call__(
+        self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Any, log_input: bool, /
+    ) -> tuple[Tensor, Any]: ...
+
+
+@dataclass
+class Sigmoid:
+    """``events.soft``: sigmoid of the step between two frames, no memory. sharpness: k, or None for 5/theta."""
+
+    sharpness: float | None = None
+    mismatched: ClassVar[bool] = False
+
+    def __call__(
+        self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
+    ) -> tuple[Tensor, Tensor]:
+        frames = _with_last(frames, state)
+        on = soft(frames, theta_on, sharpness=self.sharpness, log_input=log_input)[:, 0]
+        off = soft(frames, theta_off, sharpness=self.sharpness, log_input=log_input)[:, 1]
+        return torch.stack((on, off), dim=1), frames[-1]
+
+
+@dataclass
+class SoftCounts:
+    """``events.soft_counts``: |dL|/theta between two frames, no memory."""
+
+    mismatched: ClassVar[bool] = True
+
+    def __call__(
+        self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
+    ) -> tuple[Tensor, Tensor]:
+        frames = _with_last(frames, state)
+        return soft_counts(frames, theta_on, theta_off, log_input=log_input), frames[-1]
+
+
+@dataclass
+class Dense:
+    """``events.dense``: at most one event per frame and polarity. sharpness: b of the surrogate slope."""
+
+    sharpness: float = 5.0
+    mismatched: ClassVar[bool] = True
+
+    def __call__(
+        self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
+    ) -> tuple[Tensor, Tensor]:
+        return dense(frames, theta_on, theta_off, sharpness=self.sharpness, state=state, log_input=log_input)
+
+
+@dataclass
+class Memory:
+    """``events.memory``: hard counts against the memorised level."""
+
+    mismatched: ClassVar[bool] = True
+
+    def __call__(
+        self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
+    ) -> tuple[Tensor, Tensor]:
+        return memory(frames, theta_on, theta_off, state=state, log_input=log_input)
+
+
+@dataclass
+class Expected:
+    """``events.expected``: mean counts under threshold mismatch. spread: relative standard deviation of the
+    thresholds, in place of a drawn one; assign to anneal it (see ``events.annealed``)."""
+
+    spread: float = 0.15
+    mismatched: ClassVar[bool] = False
+
+    def __call__(
+        self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
+    ) -> tuple[Tensor, Tensor]:
+        return expected(frames, theta_on, theta_off, self.spread, state=state, log_input=log_input)
+
+
+@dataclass
+class Spikes:
+    """``events.srm`` with step kernels and coupled polarities, fed with steps of the log level: at most one
+    event per frame and polarity, the rest of a step stays for the frames after it."""
+
+    mismatched: ClassVar[bool] = True
+
+    def __call__(
+        self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Any, log_input: bool
+    ) -> tuple[Tensor, Any]:
+        level = log_levels(frames, log_input, minimum=2 if state is None else 1)
+        return count_spikes(level, None, torch.stack((theta_on, theta_off)), state, None)
+
+
+def _with_last(frames, last):
+    """The frames, behind the last one of the chunk before where there is one."""
+    return frames if last is None else torch.cat((last[None], frames))
