@@ -8,6 +8,7 @@ watched over many steps.
 
 import sys
 from dataclasses import dataclass
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 import torch
@@ -31,6 +32,7 @@ SETTLED = 10  # steps before memory counts: caches fill
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"steps": 2 * SETTLED}
     rays: int = 1_000_000
     """Rays of the tracing benchmark."""
     repeats: int = 11
@@ -46,13 +48,12 @@ def study(run: Run[Config]) -> None:
             f"rays {config.rays}, repeats {config.repeats}, steps {config.steps}: give at least 1, 9 and "
             f"{2 * SETTLED}."
         )
-    steps = 2 * SETTLED if config.quick else config.steps
     kinds = [(p, k) for p in ("float32",) if config.quick for k in ASKED] or [
         (p, k) for p in PRECISIONS for k in ASKED
     ]
     copies = {}
     traced = {}
-    with run.progress(len(kinds) + steps, "benchmark") as progress:
+    with run.progress(len(kinds) + config.steps, "benchmark") as progress:
         for precision, kind in kinds:
             work, copy, surfaces = tracing(kind, PRECISIONS[precision], config.rays, config.seed)
             copies[precision] = measure(copy, config.repeats)
@@ -80,13 +81,13 @@ def study(run: Run[Config]) -> None:
             memory.append(resident_mb())
             progress.advance(memory_mb=memory[-1])
 
-        rendering = measure(step, steps, warm=0, after_each=watch)
+        rendering = measure(step, config.steps, warm=0, after_each=watch)
     growth = memory[-1] - memory[SETTLED - 1]
     run.record(
         render_cpu_s_per_step=rendering.cpu,
         render_wall_s_per_step=rendering.wall,
         render_wall_iqr_s=rendering.wall_iqr,
-        render_steps=steps,
+        render_steps=config.steps,
         render_second_over_tenth=rendering.wall_s[0] / rendering.wall_s[8],
         memory_growth_mb=growth,
         memory_mb=memory[-1],

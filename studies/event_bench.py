@@ -10,6 +10,7 @@ every kind of noise and watches the memory.
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -48,6 +49,7 @@ ASKED = {
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"repeats": 3, "streamed_frames": 5_000}
     repeats: int = 7
     """Timed repeats of every row; the median counts."""
     streamed_frames: int = 100_000
@@ -58,7 +60,8 @@ class Config(StudyConfig):
 
 def study(run: Run[Config]) -> None:
     torch.set_num_threads(run.config.threads)
-    repeats, streamed = (3, 5_000) if run.config.quick else (run.config.repeats, run.config.streamed_frames)
+    repeats = run.config.repeats
+    streamed = run.config.streamed_frames
     sizes = dict(list(SIZES.items())[:1]) if run.config.quick else SIZES
     rows = []
     with run.progress(len(sizes) * len(SPEED_PX) + 1, "timing") as progress:

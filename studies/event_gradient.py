@@ -14,6 +14,7 @@ same on both sides.
 import itertools
 import sys
 from dataclasses import dataclass
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -69,6 +70,7 @@ DIRECTIONS = (
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"scenes": 1}
     scenes: int = 2
     """Textures and paths over which cosine and scale are taken together."""
 
@@ -127,7 +129,7 @@ def pooled(counts):
 
 
 def study(run: Run[Config]) -> None:
-    scenes = 1 if run.config.quick else run.config.scenes
+    scenes = run.config.scenes
     rates = RATES_HZ[:2] if run.config.quick else RATES_HZ
     rows = []
     slopes = {}

@@ -9,6 +9,7 @@ network where one is installed.
 
 import sys
 from dataclasses import dataclass
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 
@@ -28,6 +29,7 @@ MATTERS = 1.25  # blur matters from where the error is this many times that of a
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"samples": 16}
     samples: int = 96
     """Windows per blur and noise level; the same motions and textures at every blur."""
     theta: float = 0.2
@@ -41,7 +43,7 @@ def study(run: Run[Config]) -> None:
             f"samples = {config.samples}, theta = {config.theta}; give at least 8 samples and a threshold > "
             "0."
         )
-    samples, blurs = (16, BLUR_PX[::2]) if config.quick else (config.samples, BLUR_PX)
+    blurs = BLUR_PX[::2] if config.quick else BLUR_PX
     estimators = {"closed form": flow.estimate_lk, "plain": plain_lk}
     refiner = installed_refiner(run)
     if refiner is not None:
@@ -53,7 +55,7 @@ def study(run: Run[Config]) -> None:
             for noise in NOISE:
                 windows = RenderedWindows(
                     planes("fine", config.theta, (noise, noise), blur_px), seed=config.seed + 1
-                ).batch(range(samples))
+                ).batch(range(config.samples))
                 events[blur_px, noise] = (
                     float(windows.volume.counts.sum()) / windows.volume.counts[:, 0, 0].numel()
                 )

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 
@@ -35,6 +36,7 @@ POLL_S = 1.0
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"windows": 8, "world_windows": 5}
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of weights and windows; every network sees the same windows with the same seed."""
     cpu_minutes: float = 5.0
@@ -198,13 +200,8 @@ def _judge(run, networks):
     config = run.config
     shape = Shape(64, 64, 8)
     bins = 8
-    sets = {
-        name: (make(shape, SEED), 8 if config.quick else config.windows) for name, make in VALIDATION.items()
-    }
-    sets["worlds"] = (
-        WorldWindows(ALL, seed=UNSEEN + SEED, bins=bins),
-        5 if config.quick else config.world_windows,
-    )
+    sets = {name: (make(shape, SEED), config.windows) for name, make in VALIDATION.items()}
+    sets["worlds"] = (WorldWindows(ALL, seed=UNSEEN + SEED, bins=bins), config.world_windows)
     estimators = {"closed form": flow.estimate_lk, **networks}
     found = {}
     with run.progress(len(sets), "judging") as progress:

@@ -3,6 +3,7 @@ worlds that it was never trained on, with hard events."""
 
 import sys
 from dataclasses import dataclass
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 import torch
@@ -24,6 +25,7 @@ DRAWS = 2000  # of the bootstrap
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"windows": 8, "world_windows": 5}
     network: str = "refiner"
     """Network to judge: "refiner" (the delivered one) or the path of a network file."""
     windows: int = 256
@@ -39,16 +41,15 @@ def study(run: Run[Config]) -> None:
             f"--windows {config.windows}, --world-windows {config.world_windows}: at least 2 are needed."
         )
     network = flow.load(config.network).eval()
-    count, world_count = (8, 5) if config.quick else (config.windows, config.world_windows)
     shape = Shape(64, 64, network.config["bins"])
     sets = {
-        name: (make(shape, SEED + config.seed), count)
+        name: (make(shape, SEED + config.seed), config.windows)
         for name, make in VALIDATION.items()
         if name != "worlds"
     }
     sets["worlds"] = (
         WorldWindows(ALL, seed=UNSEEN + SEED + config.seed, bins=network.config["bins"]),
-        world_count,
+        config.world_windows,
     )
     rows = []
     with run.progress(sum(number for _, number in sets.values()), "windows") as progress:

@@ -6,6 +6,7 @@ import sys
 from dataclasses import dataclass
 
 from codesign.errors import DomainError
+from studies.frame.config import configured
 from studies.frame.run import Run, StudyConfig, main, open_run
 from studies.lens_opt import __main__ as lens_opt
 
@@ -99,8 +100,9 @@ def study(run: Run[Config]):
 def _one(run, objective, seed):
     """Metrics of one lens_opt run in a folder below, going on with it when it was interrupted."""
     folder = run.folder / f"{objective}_seed{seed}"
-    fresh = lens_opt.Config(
-        quick=run.config.quick,
+    fresh = configured(
+        lens_opt.Config,
+        run.config.quick,
         out=folder,
         seed=seed,
         device=run.config.device,

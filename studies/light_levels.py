@@ -11,6 +11,7 @@ import math
 import sys
 import time
 from dataclasses import dataclass
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -27,6 +28,7 @@ FIELD = 6.4 / 8.0  # width of the image over the focal length
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"width_px": 48, "frames": 1, "paths": 4, "bake_samples": 8}
     world: tuple[str, ...] = ()
     """Worlds to show, by name; all of them when left out."""
     width_px: int = 96
@@ -69,21 +71,19 @@ def study(run: Run[Config]) -> None:
         raise DomainError(
             "width_px must be at least 8; frames, paths and bake_samples at least 1; tolerance positive."
         )
-    width = min(config.width_px, 48) if config.quick else config.width_px
+    width = config.width_px
     camera = render.Camera(lens.Pinhole(8.0), width, width * 3 // 4, 8.0 * FIELD / width, 4, config.seed)
     options = {
         "emissive": {},
-        "baked": {"samples": 8 if config.quick else config.bake_samples, "seed": config.seed},
-        "path": {"samples": 4 if config.quick else config.paths, "seed": config.seed},
+        "baked": {"samples": config.bake_samples, "seed": config.seed},
+        "path": {"samples": config.paths, "seed": config.seed},
     }
     names = config.world or tuple(worlds.WORLDS)
     rows: list[Row] = []
     lines = []
     with run.progress(len(names), "worlds") as progress:
         for name in names:
-            found, reason = measure(
-                name, camera, options, 1 if config.quick else config.frames, config.tolerance
-            )
+            found, reason = measure(name, camera, options, config.frames, config.tolerance)
             rows += found
             lines.append(f"- **{name}**: {reason}")
             progress.advance()

@@ -12,6 +12,7 @@ float64.
 import math
 import sys
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
@@ -35,6 +36,7 @@ START = ((0.0, -1.2, 1.3), (0.2, 2.0, 1.2))
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"repeats": 3}
     repeats: int = 7
     """Timed repeats."""
 
@@ -44,7 +46,7 @@ def study(run: Run[Config]) -> None:
     with run.progress(5, "measuring") as progress:
         run.record(lens_over_pinhole=lens_cost(run.config.repeats))
         progress.advance()
-        ours, theirs, default = pose_cost(3 if quick else run.config.repeats, 2 if quick else 5)
+        ours, theirs, default = pose_cost(run.config.repeats, 2 if quick else 5)
         run.record(
             wavefront_cpu_s=ours,
             mitsuba_cpu_s=theirs,

@@ -10,6 +10,7 @@ with many samples and with the usual 16.
 import math
 import sys
 from dataclasses import dataclass
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 import torch
@@ -35,6 +36,7 @@ ROWS = (0, 2, 4), (1, 3, 5)  # curvatures, and thicknesses of which the last is 
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"many": 512, "seeds": 2}
     many: int = 1024
     """Samples per pixel of the differences and of the precise gradients."""
     seeds: int = 4
@@ -45,7 +47,6 @@ def study(run: Run[Config]) -> None:
     config = run.config
     if config.many < 64 or config.seeds < 2:
         raise DomainError(f"many = {config.many} and seeds = {config.seeds} must be at least 64 and 2.")
-    many, seeds = (512, 2) if config.quick else (config.many, config.seeds)
     cases = [
         (scene, kind)
         for scene in silhouette_scenes.NAMES
@@ -57,7 +58,7 @@ def study(run: Run[Config]) -> None:
         for scene, kind in cases:
             task = Task(silhouette_scenes.build(scene), kind)
             for group in ("pose", "lens") if kind == "traced" else ("pose",):
-                rows.append(compare(run, task, scene, kind, group, many, seeds, config.seed))
+                rows.append(compare(run, task, scene, kind, group, config.many, config.seeds, config.seed))
             progress.advance()
     cost = cost_ratio()
     run.record(boundary_cost_ratio=cost)

@@ -13,7 +13,7 @@ import sys
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 
@@ -32,6 +32,7 @@ OFFSETS_S = [k * 1e-3 for k in range(11)]
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"upsample": 2, "steps": 6, "resamples": 200}
     recording: Path | None = None
     """File with frames and events, .npz or .aedat4; ../shared/data/davis346_newton_cradle/demo-01.npz beside
     the repository when left out."""
@@ -63,19 +64,14 @@ def study(run: Run[Config]) -> None:
             "each must be at least 1."
         )
     recording = load(config.recording or default_path())
-    factor, steps, resamples = (
-        (min(config.upsample, 2), 6, 200)
-        if config.quick
-        else (config.upsample, config.steps, config.resamples)
-    )
     recorded = recording.counts()
     last = len(recording.frames) - 1
     folds = [
         Fold("second", slice(0, last // 2), slice(last // 2, last)),
         Fold("first", slice(last // 2, last), slice(0, last // 2)),
     ]
-    clips, forth = make_clips(run, recording, factor)
-    sensors = fit_all(run, clips, recorded, folds, steps)
+    clips, forth = make_clips(run, recording, config.upsample)
+    sensors = fit_all(run, clips, recorded, folds, config.steps)
     naives = scan_all(run, clips, recorded, folds)
     simulated = {}
     figures = {}
@@ -85,7 +81,7 @@ def study(run: Run[Config]) -> None:
             recording, clips, sensors[fold.judged], naives[fold.judged], generator
         )
         figures[fold.judged] = {
-            name: judge(counts[fold.test], recorded[fold.test], resamples, config.seed)
+            name: judge(counts[fold.test], recorded[fold.test], config.resamples, config.seed)
             for name, counts in simulated[fold.judged].items()
         }
         for name, found in figures[fold.judged].items():

@@ -11,6 +11,7 @@ pictures. In the manner of N-MNIST and N-Caltech101: three saccades along a tria
 import math
 import sys
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import torch
 
@@ -34,6 +35,7 @@ TRAINING = 3
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"seeds": 2, "training": 60, "test": 60, "calibration": 30, "epochs": 3}
     seeds: int = 5
     """Repeats, each with training pictures, noise and first weights of its own. The test is the same for
     all."""
@@ -53,34 +55,20 @@ class Config(StudyConfig):
     """Frame rate that stands for the motion itself, for the physical sensor."""
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """Counts of a run, smaller with --quick."""
-
-    seeds: int
-    training: int
-    test: int
-    calibration: int
-    epochs: int
-    thetas: tuple
-    fit_steps: int
-
-
 def study(run: Run[Config]) -> None:
-    sizes = _sizes(run.config)
-    test = draw_pictures(sizes.test, "test", (run.config.seed, TEST))
+    config = checked(run.config)
+    test = draw_pictures(config.test, "test", (run.config.seed, TEST))
     heard = _record(run, test, PHYSICAL, TEST)
     store = _Store(run)
-    sources = [*calibrate(run, sizes, store), PHYSICAL]
-    found = repeat(run, sizes, sources, test, heard, store)
+    sources = [*calibrate(run, store), PHYSICAL]
+    found = repeat(run, sources, test, heard, store)
     run.record(
         noise_events_per_picture=noise_alone(test.tiles[:100], run.config.sensor_hz, run.config.seed),
-        training_pictures=sizes.training,
-        test_pictures=sizes.test,
+        training_pictures=config.training,
+        test_pictures=config.test,
     )
     page.show(
         run,
-        sizes,
         [source.key for source in sources],
         {source.key: source.label for source in sources},
         found,
@@ -89,13 +77,13 @@ def study(run: Run[Config]) -> None:
     )
 
 
-def calibrate(run, sizes, store):
+def calibrate(run, store):
     """Every generator but the sensor, thresholds chosen and networks fitted with the physical sensor's
     recordings of calibration pictures."""
     seed = run.config.seed
     video_s = frame_times(run.config.video_hz)
     sensor_s = frame_times(run.config.sensor_hz)
-    pictures = draw_pictures(sizes.calibration, "training", (seed, CALIBRATION))
+    pictures = draw_pictures(run.config.calibration, "training", (seed, CALIBRATION))
     generator = torch.Generator().manual_seed(seed + CALIBRATION)
     counts = []
     for part in pictures.tiles.split(PICTURES_AT_ONCE):
@@ -104,34 +92,36 @@ def calibrate(run, sizes, store):
     seen = frames(pictures.tiles, video_s)
     counts = torch.cat(counts, 2)
     made = []
+    fit_steps = 3 if run.config.quick else FIT_STEPS
     for key in (
         spiking.MODELS
     ):  # fits repeat exactly from the seed and take seconds, so a resumed run makes them again
-        with run.progress(sizes.fit_steps, f"fitting {key}") as progress:
-            made += spiking.fitted(key, seen, counts, video_s, seed, sizes.fit_steps, progress.advance)
+        with run.progress(fit_steps, f"fitting {key}") as progress:
+            made += spiking.fitted(key, seen, counts, video_s, seed, fit_steps, progress.advance)
     heard = _record(run, pictures, PHYSICAL, CALIBRATION)
     return [
         *(
-            _best_threshold(run, sizes, source, pictures, heard, store) if source.searched else source
+            _best_threshold(run, source, pictures, heard, store) if source.searched else source
             for source in SOURCES
         ),
         *made,
     ]
 
 
-def _best_threshold(run, sizes, source, calibration, heard, store):
+def _best_threshold(run, source, calibration, heard, store):
     """The source with the threshold whose events train the best classifier of the calibration recordings."""
-    pictures = draw_pictures(sizes.training, "training", (run.config.seed, TRAINING, sizes.seeds))
+    pictures = draw_pictures(run.config.training, "training", (run.config.seed, TRAINING, run.config.seeds))
     scores = {}
-    with run.progress(len(sizes.thetas), f"θ of {source.key}") as progress:
-        for theta in sizes.thetas:
+    thetas = (0.15, 0.3) if run.config.quick else THETAS
+    with run.progress(len(thetas), f"θ of {source.key}") as progress:
+        for theta in thetas:
             key = f"search/{source.key}/{theta}"
             if key not in store.tensors:
                 voxels = _record(run, pictures, replace(source, make=source.make(theta)), TRAINING)
                 store.put(
                     key,
                     predict(
-                        train(voxels, pictures.labels, sizes.epochs, run.config.seed, run.device),
+                        train(voxels, pictures.labels, run.config.epochs, run.config.seed, run.device),
                         heard,
                         run.device,
                     ),
@@ -144,10 +134,10 @@ def _best_threshold(run, sizes, source, calibration, heard, store):
     return replace(source, make=source.make(best), label=f"{source.label} {best:g}", searched=False)
 
 
-def repeat(run, sizes, sources, test, heard, store):
+def repeat(run, sources, test, heard, store):
     """Predictions of the test by source: [seeds, test] int64. Finished ones are taken from an earlier
     session."""
-    jobs = [(seed, source) for seed in range(sizes.seeds) for source in sources]
+    jobs = [(seed, source) for seed in range(run.config.seeds) for source in sources]
     done = sum(f"test/{source.key}/{seed}" in store.tensors for seed, source in jobs)
     drawn = None
     with run.progress(len(jobs), "training", done) as progress:
@@ -156,9 +146,12 @@ def repeat(run, sizes, sources, test, heard, store):
             if key in store.tensors:
                 continue
             if drawn is None or drawn[0] != seed:
-                drawn = seed, draw_pictures(sizes.training, "training", (run.config.seed, TRAINING, seed))
+                drawn = (
+                    seed,
+                    draw_pictures(run.config.training, "training", (run.config.seed, TRAINING, seed)),
+                )
             voxels = _record(run, drawn[1], source, 100 * TRAINING + seed)
-            net = train(voxels, drawn[1].labels, sizes.epochs, run.config.seed + seed, run.device)
+            net = train(voxels, drawn[1].labels, run.config.epochs, run.config.seed + seed, run.device)
             if seed == 0:
                 own = heard if source is PHYSICAL else _record(run, test, source, TEST)
                 right = predict(net, own, run.device) == test.labels
@@ -173,7 +166,7 @@ def repeat(run, sizes, sources, test, heard, store):
             progress.advance(accuracy=float((guesses == test.labels).double().mean()))
     return {
         source.key: by_seed(
-            [store.tensors[f"test/{source.key}/{seed}"] for seed in range(sizes.seeds)], test.labels
+            [store.tensors[f"test/{source.key}/{seed}"] for seed in range(run.config.seeds)], test.labels
         )
         for source in sources
     }
@@ -200,8 +193,8 @@ def _examples(run, test, sources):
     return shown
 
 
-def _sizes(config):
-    """Sizes of the run. Raises: DomainError for numbers too small to work with."""
+def checked(config):
+    """The configuration. Raises: DomainError for numbers too small to work with."""
     if (
         config.seeds < 2
         or config.training < 2 * CLASSES
@@ -217,19 +210,7 @@ def _sizes(config):
         if not 0 < getattr(config, name) < math.inf:
             raise DomainError(f"{name} is {getattr(config, name)!r}; give a finite rate above 0.")
         frame_times(getattr(config, name))
-    if config.quick:
-        return Sizes(
-            2,
-            min(config.training, 60),
-            min(config.test, 60),
-            min(config.calibration, 30),
-            min(config.epochs, 3),
-            (0.15, 0.3),
-            3,
-        )
-    return Sizes(
-        config.seeds, config.training, config.test, config.calibration, config.epochs, THETAS, FIT_STEPS
-    )
+    return config
 
 
 class _Store:

@@ -18,7 +18,7 @@ ASKED = (
 FULL_SCALE = 3  # signed count of full colour
 
 
-def show(run, sizes, keys, labels, found, examples, truth):
+def show(run, keys, labels, found, examples, truth):
     """Record the figures and write the page. keys: sources in order; labels, found (Found), examples
     ([classes, H, W]): by key."""
     means = {key: interval(found[key].accuracy) for key in keys}
@@ -35,9 +35,9 @@ def show(run, sizes, keys, labels, found, examples, truth):
         run.card(
             labels[key],
             f"{100 * means[key].mean:.1f} %",
-            f"95 % interval {100 * means[key].low:.1f} to {100 * means[key].high:.1f}, {sizes.seeds} seeds",
+            f"95 % interval {100 * means[key].low:.1f} to {100 * means[key].high:.1f}, {run.config.seeds} seeds",
         )
-    run.section("What was done", _account(run, sizes))
+    run.section("What was done", _account(run))
     order = sorted(keys, key=lambda key: means[key].mean)
     run.section("Accuracy")
     now = run.metrics
@@ -60,7 +60,7 @@ def show(run, sizes, keys, labels, found, examples, truth):
         "By generator",
         columns,
         rows,
-        f"In brackets 95 % intervals of the mean over {sizes.seeds} seeds. On its own events: first seed. "
+        f"In brackets 95 % intervals of the mean over {run.config.seeds} seeds. On its own events: first seed. "
         f"Chance is {100 / CLASSES:.0f} %.",
     )
     run.figure(
@@ -90,7 +90,7 @@ def show(run, sizes, keys, labels, found, examples, truth):
     run.figure(
         _confusions(pair, labels, found),
         "confusions",
-        f"Share of each digit (row) that was taken for each (column), physical events, all {sizes.seeds} "
+        f"Share of each digit (row) that was taken for each (column), physical events, all {run.config.seeds} "
         "seeds.",
     )
     best = f"{labels[pair[0]]} {100 * means[pair[0]].mean:.1f} %, {labels['esim_best']} {100 * means['esim_best'].mean:.1f} %, {labels['naive_best']} {100 * means['naive_best'].mean:.1f} %"
@@ -120,7 +120,7 @@ def compare(run, found):
     return gains
 
 
-def _account(run, sizes):
+def _account(run):
     given = ", ".join(
         f"{name} {value:g}" for name, value in vars(SENSOR).items() if isinstance(value, float) and value
     )
@@ -131,10 +131,10 @@ def _account(run, sizes):
         f"{run.config.sensor_hz:g} ({given}), and every picture has a specimen of its own. "
         f"In still pictures it makes {run.metrics['noise_events_per_picture']:.0f} events of noise each.\n\n"
         f"Voxels of 2 x {run.config.bins} bins go into a residual network of 78 thousand weights, "
-        f"{sizes.epochs} passes over {sizes.training} pictures; the test is {sizes.test} other "
+        f"{run.config.epochs} passes over {run.config.training} pictures; the test is {run.config.test} other "
         "pictures on other photographs, seen by the physical sensor. Seeds change training pictures, noise "
         "and first weights.\n\n"
-        f"**Best θ** is the one whose events train the best classifier of {sizes.calibration} calibration "
+        f"**Best θ** is the one whose events train the best classifier of {run.config.calibration} calibration "
         "recordings; the **thesis network** and **Spike-ESIM** are fitted to the same recordings. "
         "*Noise left out*: the fitted Spike-ESIM without its drawn noise. *ESIM with shot noise* knows the "
         "sensor's noise rate, *the sensor's model on video* all of its parameters: neither is fitted."

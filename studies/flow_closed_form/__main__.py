@@ -9,6 +9,7 @@ samples; intervals: 95 %, bootstrap over samples.
 
 import sys
 from dataclasses import dataclass
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -31,6 +32,7 @@ ESTIMATORS = {"closed form": flow.estimate_lk, "plain": plain_lk}
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"samples": 32}
     samples: int = 256
     """Windows per cell (texture kind, threshold, noise)."""
 
@@ -38,7 +40,7 @@ class Config(StudyConfig):
 def study(run: Run[Config]) -> None:
     if run.config.samples < 8:
         raise DomainError(f"samples = {run.config.samples}; give at least 8 per cell.")
-    samples = 32 if run.config.quick else run.config.samples
+    samples = run.config.samples
     cells = [(kind, theta, noise) for kind, theta in TARGETS for noise in NOISE]
     scores = {}
     with run.progress(len(cells), "cells") as progress:

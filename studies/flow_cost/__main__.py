@@ -12,6 +12,7 @@ import os
 import subprocess
 import sys
 from dataclasses import dataclass
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 import torch
@@ -40,6 +41,7 @@ ASKED_GROWTH = 0.2
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"rounds": 1}
     repeats: int = 2
     """Timed calls per turn."""
     rounds: int = 5
@@ -56,7 +58,8 @@ def study(run: Run[Config]) -> None:
             "1 and 1."
         )
     torch.set_num_threads(config.threads)
-    rounds, sizes = (1, SIZES_PX[:2]) if config.quick else (config.rounds, SIZES_PX)
+    rounds = config.rounds
+    sizes = SIZES_PX[:2] if config.quick else SIZES_PX
     table = entries(config.seed)
     growing = [name for name in table if grown(name)]
     found: dict[tuple, list[Timing]] = {}

@@ -5,19 +5,23 @@ import json
 import math
 import types
 import typing
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
 from codesign.errors import DomainError, FileFormatError
 
 
 @dataclass(frozen=True)
 class StudyConfig:
-    """What every study can be told."""
+    """What every study can be told. A study's own dataclass adds its options, all with defaults."""
+
+    QUICK: ClassVar[Mapping[str, Any]] = {}
+    """What --quick sets those options to that were not given."""
 
     quick: bool = False
-    """Smaller and shorter: shows that everything works, not the best result."""
+    """Smaller and shorter: shows that everything works, not the best result. Options given beside it count."""
     out: Path | None = None
     """Folder for the results; runs/<study>/<time> when left out."""
     seed: int = 0
@@ -70,18 +74,38 @@ def read_config(path: Path, study: str, kind: type[Config]) -> Config:
     return kind(**{name: _typed(value, hints[name]) for name, value in stored.items()})
 
 
-def check_same(stored: StudyConfig, given: StudyConfig):
-    """Raise DomainError when an option given beside --resume differs from the stored run: it would have no
-    effect."""
-    for field in dataclasses.fields(given):
-        value = getattr(given, field.name)
-        earlier = getattr(stored, field.name)
-        if field.name != "resume" and value not in (field.default, earlier):
+def configured(kind: type[Config], quick: bool, **given: Any) -> Config:
+    """A study's configuration: what is given comes before what --quick sets, and that before the defaults."""
+    return kind(quick=quick, **{**(kind.QUICK if quick else {}), **given})
+
+
+def resolved(study: str, kind: type[Config], parse: Callable[[Config], Config]) -> Config:
+    """The configuration that a command line asks for; beside --resume that of the stored run.
+
+    Args:
+      study, kind: the study and its dataclass.
+      parse: reads the command line into a configuration, with defaults out of the one it is handed. What is
+        typed and what is a default need not be told apart: the line is read again over other defaults.
+    Raises: FileFormatError when there is no such run; DomainError when an option typed beside --resume is not
+      that of the stored run: it would have no effect.
+    """
+    asked = parse(kind())
+    if asked.resume is None:
+        return parse(configured(kind, quick=True)) if asked.quick else asked
+    stored = read_config(asked.resume / "config.json", study, kind)
+    known = dataclasses.replace(stored, resume=asked.resume)
+    again = parse(known)
+    same = {"out": asked.resume, "device": "auto"}
+    for field in dataclasses.fields(kind):
+        value = getattr(again, field.name)
+        earlier = getattr(known, field.name)
+        if value not in (earlier, same.get(field.name, earlier)):
             option = "--" + field.name.replace("_", "-")
             raise DomainError(
                 f"{option} is {value}, but the run to resume was started with {earlier}; leave {option} "
                 "out, or start a new run."
             )
+    return known
 
 
 def _plain(name, value) -> Any:

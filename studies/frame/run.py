@@ -4,6 +4,7 @@ A study is a function of a Run and a frozen dataclass:
 
     @dataclass(frozen=True)
     class Config(StudyConfig):
+        QUICK: ClassVar = {"steps": 10}  # what --quick sets
         steps: int = 300
         '''Number of optimisation steps.'''
 
@@ -36,7 +37,7 @@ from codesign.errors import CodesignError, DomainError, FileFormatError, NonFini
 from codesign.report import page, prose
 from studies.frame import folder as folders
 from studies.frame import machine, state
-from studies.frame.config import Config, StudyConfig, check_same, read_config, to_json
+from studies.frame.config import Config, StudyConfig, read_config, resolved, to_json
 from studies.frame.interrupt import Interruption
 from studies.frame.progress import StepProgress
 
@@ -182,16 +183,13 @@ class Run(Generic[Config]):
 
 
 def open_run(study: str, config: Config, interruption: Interruption | None = None) -> Run[Config]:
-    """Make the folder of a new run and write its config.json, or find the run that ``config.resume`` names.
+    """Make the folder of a new run and write its config.json, or find the run that ``config.resume`` names,
+    which goes on with its stored configuration.
 
     Raises: CodesignError with one sentence when the folder, the stored configuration or the device is unfit.
     """
     if config.resume is not None:
         stored = read_config(config.resume / "config.json", study, type(config))
-        check_same(
-            dataclasses.replace(stored, out=config.resume if config.out == config.resume else stored.out),
-            config,
-        )
         return Run(study, stored, config.resume, _device(stored.device), True, interruption)
     device = _device(config.device)
     config = dataclasses.replace(config, device=device.type)  # the same device when the run is resumed
@@ -209,12 +207,16 @@ def main(study: Callable[[Run[Config]], None], kind: type[Config], arguments: li
     Raises: SystemExit from the command line itself (0 for --help, 2 for a wrong option).
     """
     name = _name(kind)
-    config = tyro.cli(
-        kind,
-        prog=f"python -m studies.{name}",
-        description=sys.modules[study.__module__].__doc__,
-        args=arguments,
-    )
+
+    def parse(default):
+        return tyro.cli(
+            kind,
+            default=default,
+            prog=f"python -m studies.{name}",
+            description=sys.modules[study.__module__].__doc__,
+            args=arguments,
+        )
+
     matplotlib.use("Agg")  # figures go to files; no screen is needed
     torch.set_num_threads(
         1
@@ -224,7 +226,7 @@ def main(study: Callable[[Run[Config]], None], kind: type[Config], arguments: li
     run = None
     try:
         with Interruption() as interruption:
-            run = open_run(name, config, interruption)
+            run = open_run(name, resolved(name, kind, parse), interruption)
             study(run)
     except CodesignError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

@@ -10,6 +10,7 @@ smooth event layer and once with the straight-through layer against differences 
 
 import sys
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
@@ -22,6 +23,7 @@ from studies.gradient_flow import cases as gradient_cases
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"hard_cases": 6}
     hard_cases: int = 32
     """Motions and textures averaged for the straight-through layer against the hard loss."""
 
@@ -29,8 +31,10 @@ class Config(StudyConfig):
 def study(run: Run[Config]):
     if run.config.hard_cases < 1:
         raise DomainError(f"hard_cases = {run.config.hard_cases} must be at least 1.")
-    hard = 6 if run.config.quick else run.config.hard_cases
-    cases = [*gradient_cases.smooth_cases(run.config.seed), *gradient_cases.hard_cases(run.config.seed, hard)]
+    cases = [
+        *gradient_cases.smooth_cases(run.config.seed),
+        *gradient_cases.hard_cases(run.config.seed, run.config.hard_cases),
+    ]
     rows = []
     with run.progress(len(cases), "certifying") as bar:
         for label, required, certificate in cases:

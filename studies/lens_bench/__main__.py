@@ -15,6 +15,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from importlib.metadata import version
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 import mpmath
@@ -59,6 +60,7 @@ SLOW = 200  # rayoptics traces ray by ray in Python: it gets this many times few
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"rays": 100_000, "repeats": 3, "rounds": 1, "most_rays": 1_000_000}
     rays: int = 1_000_000
     """Rays of the comparison."""
     repeats: int = 7
@@ -76,22 +78,21 @@ def study(run: Run[Config]) -> None:
             f"rays {config.rays}, repeats {config.repeats}, rounds {config.rounds}, most_rays "
             f"{config.most_rays}: give at least 1000, 3, 1 and 20000."
         )
-    rays, repeats, rounds, most = (
-        (100_000, 3, 1, 1_000_000)
-        if config.quick
-        else (config.rays, config.repeats, config.rounds, config.most_rays)
-    )
+    rays = config.rays
+    most = config.most_rays
     cases = [case for case in CASES if case[0] not in PEERS or importlib.util.find_spec(PEERS[case[0]])]
     counts = [n for n in (10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000, 10_000_000) if n <= most]
     found: dict[tuple, list[dict]] = {case: [] for case in cases}
-    with run.progress(rounds * len(cases) + 2 * len(counts) + 2 * len(LONGER) + 4, "timing") as progress:
-        for _ in range(rounds):
+    with run.progress(
+        config.rounds * len(cases) + 2 * len(counts) + 2 * len(LONGER) + 4, "timing"
+    ) as progress:
+        for _ in range(config.rounds):
             for case in cases:
                 found[case].append(
                     in_process(
                         *case,
                         max(rays // SLOW, 256) if case[0] == "rayoptics" else rays,
-                        repeats,
+                        config.repeats,
                         config.seed,
                     )
                 )

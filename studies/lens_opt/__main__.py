@@ -11,7 +11,7 @@ sensor.
 import sys
 import time
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 
@@ -25,6 +25,7 @@ from studies.lens_opt.task import HELD_OUT, TRAINING, draw_case, make_task, make
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"steps": 10, "cases": 2, "judged": 4}
     lens: str = "cooke-triplet"
     """Lens to start from: cooke-triplet, double-gauss, la1509, or a lens .json file."""
     objective: Literal["flow", "edge"] = "flow"
@@ -63,7 +64,8 @@ def study(run: Run[Config]):
             f"steps {config.steps}, cases {config.cases}, samples {config.samples} and judged "
             f"{config.judged} must all be at least 1."
         )
-    steps, cases, judged = (10, 2, 4) if config.quick else (config.steps, config.cases, config.judged)
+    steps = config.steps
+    cases = config.cases
     started = time.perf_counter()
     task = make_task(config.lens, config.seed, config.detuned_px)
     pool = make_worlds(TRAINING)
@@ -138,7 +140,7 @@ def study(run: Run[Config]):
             f"{error} Optimisation stopped at step {len(history.loss) + 1}; the last good design is "
             f"{run.path('lens_optimised.json')}."
         ) from error
-    _finish(run, task, chain, descent, history, scored[0], judged, seconds, started)
+    _finish(run, task, chain, descent, history, scored[0], config.judged, seconds, started)
 
 
 def _restore(run, task, config):

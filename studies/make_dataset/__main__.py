@@ -7,7 +7,6 @@ that was stopped or killed goes on with --resume, and ends with the same bytes. 
 docs/datasets.md.
 """
 
-import dataclasses
 import inspect
 import io
 import itertools
@@ -16,7 +15,7 @@ import sys
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -49,6 +48,7 @@ LONGEST_S = 4000.0  # event times are 32-bit microseconds
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"trajectories": 2, "frames": 40, "size": 64, "samples": 4}
     trajectories: int = 5
     """Number of sequences; the families orbital, radial, vertical, driving, flying take turns."""
     frames: int = 600
@@ -99,7 +99,7 @@ class Clock:
 
 @torch.no_grad()
 def study(run: Run[Config]) -> None:
-    config = checked(quick(run.config) if run.config.quick else run.config)
+    config = checked(run.config)
     scene, stage = make_world(config.world, config.light)
     camera = make_camera(config)
     clock = Clock()
@@ -137,17 +137,6 @@ def study(run: Run[Config]) -> None:
     if resident_mb:
         run.record(session_resident_mb_first=resident_mb[0], session_resident_mb_last=resident_mb[-1])
     pages.show(run, names, clock.spent, wall_s, min(fresh, config.frames * len(names)))
-
-
-def quick(config):
-    """A small data set."""
-    return dataclasses.replace(
-        config,
-        trajectories=min(config.trajectories, 2),
-        frames=min(config.frames, 40),
-        size=min(config.size, 64),
-        samples=min(config.samples, 4),
-    )
 
 
 def checked(config):

@@ -15,7 +15,8 @@ of one draw's error changes sign from pixel to pixel.
 import math
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
@@ -31,6 +32,7 @@ from studies.placement.task import HALF_RANGE_M, HELD_OUT, NOMINAL_M, TRAINING, 
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"starts": 3, "steps": 6, "motions": 2, "pitches": 5, "yaws": 8}
     starts: int = 5
     """Searches of each kind; the first takes its start from --seed, and so on."""
     steps: int = 14
@@ -43,22 +45,16 @@ class Config(StudyConfig):
     """Columns of the grid, over all yaws."""
 
 
-def plan(config):
-    """The configuration with the sizes this run has: smaller with --quick.
-
-    Raises: DomainError for sizes below 1 (motions and steps) or a grid of less than two mounts.
-    """
+def checked(config):
+    """The configuration. Raises: DomainError for sizes below 1."""
     for name in ("starts", "steps", "motions", "pitches", "yaws"):
         if getattr(config, name) < 1:
             raise DomainError(f"--{name} is {getattr(config, name)}; at least 1 is needed.")
-    if config.quick:
-        most = {"starts": 3, "steps": 6, "motions": 2, "pitches": 5, "yaws": 8}
-        return replace(config, **{name: min(getattr(config, name), limit) for name, limit in most.items()})
     return config
 
 
 def study(run: Run[Config]):
-    size = plan(run.config)
+    size = checked(run.config)
     began = time.monotonic()
     if run.device.type != "cpu":
         run.say("This study computes on the CPU; the device asked for stays unused.")

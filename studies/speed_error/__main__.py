@@ -9,6 +9,7 @@ truth.
 
 import sys
 from dataclasses import dataclass
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
@@ -21,6 +22,7 @@ from studies.speed_error.fidelity import Setup, stages
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"size_px": 32, "repeats": 3}
     size_px: int = 64
     """Width and height of the image."""
     repeats: int = 7
@@ -55,15 +57,14 @@ def study(run: Run[Config]) -> None:
     config = run.config
     if config.size_px < 16 or config.repeats < 3:
         raise DomainError(f"size_px {config.size_px} and repeats {config.repeats}: give at least 16 and 3.")
-    repeats = 3 if config.quick else config.repeats
     run.say("preparing the scene and its truth")
-    found = stages(Setup(min(config.size_px, 32) if config.quick else config.size_px, config.seed))
+    found = stages(Setup(config.size_px, config.seed))
     table: dict[str, list[Measured]] = {}
     with run.progress(sum(len(stage.levels) for stage in found), "measuring") as progress:
         for stage in found:
             for level in stage.levels:
                 error = stage.error(level.work())
-                timing = measure(level.work, repeats, warm=1)
+                timing = measure(level.work, config.repeats, warm=1)
                 table.setdefault(stage.name, []).append(Measured(level.name, timing.cpu, timing.wall, error))
                 progress.advance(error=error, cpu_ms=1e3 * timing.cpu)
     lines = []

@@ -12,6 +12,7 @@ import sys
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 
@@ -29,6 +30,7 @@ RENDERED_TRAINING = {"size_px": 32, "batch": 2, "count_weight": 0.1}
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"frames": 60, "steps": 8, "resamples": 100}
     recording: Path | None = None
     """File with frames and events, .npz or .aedat4; ../shared/data/davis346_newton_cradle/demo-01.npz beside
     the repository when left out."""
@@ -47,8 +49,6 @@ def study(run: Run[Config]) -> None:
             f"frames, steps and resamples are {config.frames}, {config.steps} and {config.resamples}; at "
             "least 40, 4 and 10 are needed."
         )
-    if config.quick:
-        config = replace(config, frames=60, steps=8, resamples=100)
     sets, learning = sequences(run, config)
     trained, losses = train(run, config, learning)
     found = {}

@@ -13,6 +13,7 @@ import statistics
 import subprocess
 import sys
 from dataclasses import dataclass
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 
@@ -30,6 +31,7 @@ ARRAY_MB = 4 * 2 * 128 * 128 / 1e6  # one step of one array
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"repeats": 2, "rounds": 1}
     repeats: int = 7
     """Timed repeats per process; the convolution, which takes seconds, gets two."""
     rounds: int = 2
@@ -40,7 +42,9 @@ def study(run: Run[Config]) -> None:
     config = run.config
     if config.repeats < 2 or config.rounds < 1:
         raise DomainError(f"repeats {config.repeats}, rounds {config.rounds}: give at least 2 and 1.")
-    repeats, rounds, steps = (2, 1, STEPS[:1]) if config.quick else (config.repeats, config.rounds, STEPS)
+    repeats = config.repeats
+    rounds = config.rounds
+    steps = STEPS[:1] if config.quick else STEPS
     peers = [name for name, package in PEERS.items() if importlib.util.find_spec(package)]
     layers = ["codesign", "codesign-segments", "convolution", *peers]
     found: dict[tuple, list[dict]] = {}

@@ -13,9 +13,9 @@ import signal
 import sys
 import time
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 
@@ -29,6 +29,14 @@ from studies.train_flow.watch import Watch
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {
+        "steps": 12,
+        "batch": 2,
+        "validation_windows": 4,
+        "final_windows": 8,
+        "validate_every": 6,
+        "save_every": 6,
+    }
     network: str = "refiner"
     """Which network: refiner, flownet-events or spike-flownet."""
     options: tuple[str, ...] = ()
@@ -93,17 +101,6 @@ class Config(StudyConfig):
     """Threads of torch per process; 0 for all cores."""
 
 
-QUICK = {
-    "steps": 12,
-    "batch": 2,
-    "validation_windows": 4,
-    "final_windows": 8,
-    "validate_every": 6,
-    "save_every": 6,
-    "cpu_minutes": None,
-}
-
-
 class Clock:
     """Processor seconds of this process by kind of work."""
 
@@ -121,7 +118,7 @@ class Clock:
 
 def study(run: Run[Config]) -> None:
     ranks = join()
-    config = replace(run.config, **QUICK) if run.config.quick else run.config
+    config = run.config
     ranks.tell((config, run.folder, run.resumed))
     job, ranks, clock = begin(config, run.folder, run.resumed, ranks)
     watch = Watch(run, config, job, clock)

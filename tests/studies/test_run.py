@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -62,6 +63,7 @@ if __name__ == "__main__":
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"limit": 0.125}
     limit: float = 1.0
     sizes: tuple[int, ...] = (1, 2)
 
@@ -291,6 +293,40 @@ def test_resume_takes_the_stored_configuration(tmp_path):
     again.record(late=2)
     stored = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert (stored["early"], stored["late"]) == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("typed", "ran"),
+    [
+        ([], 1.0),
+        (["--quick"], 0.125),
+        (["--quick", "--limit", "0.5"], 0.5),
+        (["--limit", "0.5", "--quick"], 0.5),
+        (["--quick", "--limit", "1.0"], 1.0),  # the default, but typed
+        (["--limit", "0.5"], 0.5),
+    ],
+)
+def test_what_is_typed_comes_before_what_quick_sets(tmp_path, typed, ran):
+    out = tmp_path / "out"
+    assert main(record_one, Config, ["--out", str(out), *typed]) == 0
+    config, metrics = (json.loads((out / f"{name}.json").read_text()) for name in ("config", "metrics"))
+    assert (metrics["limit"], config["limit"], config["quick"]) == (ran, ran, "--quick" in typed)
+    assert config["sizes"] == [1, 2]
+
+
+def test_resume_refuses_only_what_differs_from_the_stored_run(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(record_one, Config, ["--out", str(out), "--quick", "--limit", "0.5"]) == 0
+    for typed in ([], ["--quick"], ["--limit", "0.5"], ["--out", str(out)], ["--device", "auto"]):
+        assert main(record_one, Config, ["--resume", str(out), *typed]) == 0, typed
+        assert json.loads((out / "metrics.json").read_text())["limit"] == 0.5
+    capsys.readouterr()
+    # neither the default nor the quick value is what ran, so typing it is refused like any other
+    for typed in (["--limit", "1.0"], ["--limit", "0.125"], ["--no-quick"], ["--seed", "1"]):
+        assert main(record_one, Config, ["--resume", str(out), *typed]) == 2, typed
+        complaint = capsys.readouterr().err
+        assert "but the run to resume was started with" in complaint
+        assert complaint.count("\n") == 1
 
 
 def test_wrong_options_exit_with_two(capsys, monkeypatch):
