@@ -1,5 +1,4 @@
-"""What every test may ask for: reference data beside the checkout, a seeded generator, a screenless
-matplotlib."""
+"""What every test may ask for: reference data, a seeded generator, a screenless matplotlib."""
 
 import os
 from pathlib import Path
@@ -14,20 +13,22 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 torch.set_num_threads(1)  # small tensors: a second thread costs more than it gives
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = next((folder for folder in (ROOT / "shared", ROOT.parent / "shared") if folder.is_dir()), None)
+SUBSET = ROOT / "tests" / "data"  # of the reference values; see its README.md
 
 
 @pytest.fixture(scope="session")
 def shared():
-    """Function from a relative name ("refs/lens/rays.json") to its path in the shared folder; skips the test
-    when it is not there."""
+    """Function from a relative name ("refs/lens/rays.json") to its path in the shared folder beside the
+    checkout. Where that has none, reference values come from the subset in tests/data, and a test that needs a
+    recording, a lens file or a mesh is skipped."""
 
     def find(name):
-        if SHARED is None:
-            pytest.skip("shared folder absent: the reference data live beside the checkout, in ../shared")
-        path = SHARED / name
-        if not path.exists():
-            pytest.skip(f"shared folder has no {name}")
-        return path
+        for folder in (SHARED, SUBSET):
+            if folder is not None and (folder / name).exists():
+                return folder / name
+        pytest.skip(
+            f"{name} is absent: recordings, lens files and meshes live beside the checkout, in ../shared"
+        )
 
     return find
 

@@ -37,7 +37,8 @@ def reference(path, t_s):
     data = np.load(path)
     t_us = torch.from_numpy(np.round(data["t"].astype(np.float64) * 1e6).astype(np.int64))
     x, y, p = (torch.from_numpy(data[name].astype(np.int64)) for name in "xyp")
-    stream = ordered(t_us, x, y, p, 64, 64)
+    height, width = data["base_log_frame"].shape
+    stream = ordered(t_us, x, y, p, height, width)
     return data, stream, to_counts(stream, t_s)
 
 
