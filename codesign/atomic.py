@@ -1,7 +1,9 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and stay after a loss of power."""
 
+import contextlib
 import os
 import tempfile
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -9,10 +11,11 @@ from codesign.errors import FileFormatError
 
 
 @contextmanager
-def replacing(path):
+def replacing(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` with the same extension; move it into place when the block ends
     well, remove it otherwise.
 
+    The content reaches the disk before the name does, and the name before this returns.
     Raises: FileFormatError when the folder is missing or not writable; an earlier file at ``path`` stays as
       it was.
     """
@@ -30,10 +33,32 @@ def replacing(path):
         mask = os.umask(0)
         os.umask(mask)
         temporary.chmod(0o666 & ~mask)  # mkstemp makes files private
-        temporary.replace(path)
+        _sync(temporary, os.O_RDWR)
+        os.replace(temporary, path)
     except OSError as error:
         raise FileFormatError(
             f"cannot write {path}: {error.strerror or error}; is the disk full, or the path a folder?"
         ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # after a failure the sentence above matters more
+            temporary.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # some file systems cannot sync a folder; the file itself is whole
+        _sync(path.parent, os.O_RDONLY)
+
+
+def write_atomic(path: str | Path, content: bytes) -> None:
+    """Write ``content`` so that ``path`` holds either the old bytes or all of the new ones, whatever happens
+    in between.
+
+    Raises: FileFormatError when it cannot be written.
+    """
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _sync(path, access):
+    opened = os.open(path, access)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)

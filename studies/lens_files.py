@@ -15,8 +15,8 @@ from pathlib import Path
 import torch
 
 from codesign import lens
+from codesign.atomic import write_atomic
 from codesign.errors import CodesignError, FileFormatError
-from studies.frame import state
 from studies.frame.run import Run, StudyConfig, main
 
 EXTENSIONS = (".json", ".zmx", ".seq", ".txt")
@@ -222,7 +222,7 @@ def show(run, outcomes):
         "|---" * len(columns) + "|",
         *("| " + " | ".join("" if v is None else str(v) for v in row) + " |" for row in rows),
     ]
-    state.write_atomic(run.path("table.md"), ("\n".join(lines) + "\n").encode())
+    write_atomic(run.path("table.md"), ("\n".join(lines) + "\n").encode())
     run.card(
         "Files that load", f"{len(loaded)} of {len(outcomes)}", "the others are refused with their reason"
     )

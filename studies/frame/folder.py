@@ -4,8 +4,8 @@ import json
 from datetime import datetime
 from pathlib import Path
 
+from codesign.atomic import write_atomic
 from codesign.errors import CodesignError
-from studies.frame.state import write_atomic
 
 REMEDY = "choose a folder you may write to with --out"
 

@@ -17,7 +17,7 @@ class StepProgress:
       total: number of steps.
       description: what the loop does, one or two words.
       done: steps already made, 0 for a fresh loop.
-      interruption: studies.frame.interrupt.Interruption whose safe point every advance is.
+      interruption: codesign.interrupt.Interruption whose safe point every advance is.
     """
 
     def __init__(self, console: Console, total: int, description: str, done: int, interruption):

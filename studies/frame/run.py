@@ -32,13 +32,14 @@ import torch
 import tyro
 from rich.console import Console
 
-from codesign import backend
+from codesign import backend, state
+from codesign.atomic import write_atomic
 from codesign.errors import CodesignError, DomainError, FileFormatError, NonFiniteError
+from codesign.interrupt import Interruption
 from codesign.report import page, prose
 from studies.frame import folder as folders
-from studies.frame import machine, state
+from studies.frame import machine
 from studies.frame.config import Config, StudyConfig, read_config, resolved, to_json
-from studies.frame.interrupt import Interruption
 from studies.frame.progress import StepProgress
 
 __all__ = ["Run", "StudyConfig", "main", "open_run"]
@@ -98,7 +99,7 @@ class Run(Generic[Config]):
 
     def save_state(self, tensors: dict[str, torch.Tensor], numbers: dict[str, Any]):
         """Store what is needed to go on, exactly, in one atomic write (see
-        studies.frame.state.write_state)."""
+        codesign.state.write_state)."""
         state.write_state(self.folder / "state.npz", tensors, numbers)
 
     def load_state(self):
@@ -117,7 +118,7 @@ class Run(Generic[Config]):
         accepted = {name: _metric(name, value) for name, value in numbers.items()}
         self.metrics.update(accepted)
         text = json.dumps({**self.metrics, **self._machine}, indent=2, allow_nan=False)
-        state.write_atomic(self.folder / "metrics.json", text.encode())
+        write_atomic(self.folder / "metrics.json", text.encode())
 
     def section(self, title: str, text: str = ""):
         """Begin a section of the page; what follows is shown in it."""
@@ -144,7 +145,7 @@ class Run(Generic[Config]):
         png = io.BytesIO()
         figure.savefig(png, format="png", dpi=dpi, bbox_inches="tight", facecolor="white")
         plt.close(figure)
-        state.write_atomic(path, png.getvalue())
+        write_atomic(path, png.getvalue())
         self._show("picture", page.picture(path, caption))
         return path
 
@@ -174,7 +175,7 @@ class Run(Generic[Config]):
         }
         html = page.render_page(title, lead, self._cards, self._sections, facts)
         path = self.folder / "report.html"
-        state.write_atomic(path, html.encode())
+        write_atomic(path, html.encode())
         self.say(f"Done: {path}")
         return path
 
@@ -195,7 +196,7 @@ def open_run(study: str, config: Config, interruption: Interruption | None = Non
     config = dataclasses.replace(config, device=device.type)  # the same device when the run is resumed
     text = to_json(study, config)
     folder = folders.fresh(study, config.out)
-    state.write_atomic(folder / "config.json", text.encode())
+    write_atomic(folder / "config.json", text.encode())
     return Run(study, config, folder, device, False, interruption)
 
 

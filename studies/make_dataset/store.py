@@ -10,8 +10,8 @@ killed.
 import hashlib
 import io
 import json
-import os
 import shutil
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +19,10 @@ import h5py
 import numpy as np
 import torch
 
+from codesign.atomic import replacing, write_atomic
 from codesign.errors import FileFormatError
 from codesign.events import SensorState
 from codesign.types import EventStream
-from studies.frame.state import write_atomic
 
 PARTS = "parts"
 DONE = "sequence.json"
@@ -139,21 +139,11 @@ def manifest(root: Path, sequences):
     )
 
 
-class _whole:
+@contextmanager
+def _whole(path):
     """An HDF5 file that takes its name when it is complete."""
-
-    def __init__(self, path):
-        self.path = path
-        self.temporary = path.with_name(f".{path.name}.tmp")
-
-    def __enter__(self):
-        self.file = h5(self.temporary, "w")
-        return self.file
-
-    def __exit__(self, kind, *_):
-        self.file.close()
-        if kind is None:
-            os.replace(self.temporary, self.path)
+    with replacing(path) as temporary, h5(temporary, "w") as file:
+        yield file
 
 
 def _collect(target, folder, count, kinds, chunk_of):

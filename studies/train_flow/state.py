@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 from torch import nn
 
+from codesign.atomic import write_atomic
 from codesign.errors import FileFormatError
 from codesign.flow import checkpoint
-from studies.frame.state import write_atomic
 
 VERSION = 1
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of AdamW

@@ -1,9 +1,7 @@
 """The state of an unfinished run: exact tensors and numbers in one file that holds data only, never code."""
 
-import contextlib
 import io
 import json
-import os
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.errors import CodesignError, FileFormatError, ShapeError
+from codesign.atomic import write_atomic
+from codesign.errors import FileFormatError, ShapeError
 
 
 @dataclass(frozen=True)
@@ -24,36 +23,11 @@ class State:
     numbers: dict[str, Any]
 
 
-def write_atomic(path: Path, content: bytes):
-    """Write ``content`` so that ``path`` holds either the old bytes or all of the new ones, whatever happens
-    in between.
-
-    Raises: CodesignError naming the folder when it cannot be written.
-    """
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise CodesignError(
-            f"cannot write {path.name} in folder '{path.parent}' ({error.strerror}); free space there, or "
-            "choose another folder with --out."
-        ) from error
-    finally:
-        with contextlib.suppress(
-            OSError
-        ):  # gone after a success; after a failure the sentence above matters more
-            temporary.unlink()
-
-
-def write_state(path: Path, tensors: dict[str, Tensor], numbers: dict[str, Any]):
+def write_state(path: Path, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> None:
     """Store tensors (any real, complex, integer or bool dtype numpy knows; a generator's state is one of
     uint8) and plain numbers.
 
-    Raises: ShapeError for a dtype the file cannot hold; CodesignError when the folder cannot be written.
+    Raises: ShapeError for a dtype the file cannot hold; FileFormatError when it cannot be written.
     """
     arrays = {}
     for index, (name, tensor) in enumerate(tensors.items()):
@@ -70,7 +44,7 @@ def write_state(path: Path, tensors: dict[str, Tensor], numbers: dict[str, Any])
     write_atomic(path, buffer.getvalue())
 
 
-def read_state(path: Path):
+def read_state(path: Path) -> State | None:
     """Read what ``write_state`` stored; None when there is no such file.
 
     Raises: FileFormatError when the file is not a state file.
@@ -87,6 +61,5 @@ def read_state(path: Path):
         return State(tensors, header["numbers"])
     except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
         raise FileFormatError(
-            f"'{path}' is not a state file of a study ({error}); remove it to start this run from the "
-            "beginning."
+            f"'{path}' is not a state file of a run ({error}); remove it to start from the beginning."
         ) from error
