@@ -1,10 +1,11 @@
 """Event flow: the closed form, the refiner and the networks it is compared with, losses, error measures,
-network files and sources of windows."""
+network files, flow files and sources of windows."""
 
 from codesign.flow import contrast, losses, metrics, sources
 from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
 from codesign.flow.checkpoint import load, save
 from codesign.flow.export import export
+from codesign.flow.files import read_flow, write_flow
 from codesign.flow.lk import estimate_lk
 from codesign.flow.refiner import Refiner
 
@@ -18,6 +19,8 @@ __all__ = [
     "load",
     "losses",
     "metrics",
+    "read_flow",
     "save",
     "sources",
+    "write_flow",
 ]

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from codesign.errors import DomainError, FileFormatError
 from codesign.events import write
 from codesign.events.stream import ordered
+from codesign.flow.files import write_flow
 from codesign.flow.sources import PacketOptions, read_packets
 from codesign.flow.sources.calibration import read_calibration
-from codesign.flow_files import write_flow
 from tests.recording_case import DAVIS, ETH_CALIBRATION, eth_text, made
 
 

@@ -15,11 +15,11 @@ import numpy as np
 import torch
 
 from codesign.errors import FileFormatError
+from codesign.flow.files import read_flow
 from codesign.flow.sources.collate import Crop, Sample, check_indices, check_lengths, collate
 from codesign.flow.sources.folders import natural
 from codesign.flow.sources.rectified import splatted
 from codesign.flow.sources.rows import Rows, reading
-from codesign.flow_files import read_flow
 
 SIZE_PX = (480, 640)
 PNG_START = b"\x89PNG\r\n\x1a\n"

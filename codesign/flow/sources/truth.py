@@ -12,8 +12,8 @@ from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
 from codesign.errors import FileFormatError
+from codesign.flow.files import read_flow
 from codesign.flow.sources import folders
-from codesign.flow_files import read_flow
 
 ARRAYS = ("flow", "flow_px", "gt_flow", "flow_gt", "gt", "truth", "arr_0")
 PAIRS = (

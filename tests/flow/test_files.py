@@ -10,7 +10,7 @@ import torch
 
 from codesign import backend
 from codesign.errors import DomainError, FileFormatError, ShapeError
-from codesign.flow_files import read_flow, write_flow
+from codesign.flow.files import read_flow, write_flow
 
 QUANTUM_PX = 1 / 128
 

@@ -30,7 +30,7 @@ MOST_PIXELS = 64_000_000  # what a file may announce
 MOST_BYTES = 1_000_000_000
 
 
-def write_flow(path, flow_px, valid=None):
+def write_flow(path: str | Path, flow_px: torch.Tensor, valid: torch.Tensor | None = None) -> None:
     """Write one flow field; the file appears whole or not at all.
 
     Args: path: ending in .png (DSEC) or .flo. flow_px: [2, H, W] px, +x right, +y down. valid: [H, W] bool,
@@ -55,7 +55,7 @@ def write_flow(path, flow_px, valid=None):
         temporary.write_bytes(content)
 
 
-def read_flow(path):
+def read_flow(path: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
     """Read one flow field.
 
     Returns: flow_px [2, H, W] float32, 0 where not valid; valid [H, W] bool.
