@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from codesign import events
-from codesign.events.sources.frames import open_frames
+from codesign.events.sources.opening import open_frames
 from codesign.events.upsampling.upsample import upsample
 from studies.frame.run import Run, StudyConfig, main
 from studies.upsampling import figures as drawn

@@ -23,7 +23,7 @@ import torch
 
 from codesign import events
 from codesign.errors import DomainError
-from codesign.events.sources.frames import open_frames
+from codesign.events.sources.opening import open_frames
 from codesign.types import EventStream
 from studies.frame.run import Run, StudyConfig, main
 from studies.video_to_events import page as pages
