@@ -8,7 +8,7 @@ from codesign.errors import DomainError
 from codesign.types import EventVolume, FlowField, FlowWindows
 from scenes import worlds
 from scenes.dataset_motion import FAMILIES, LEAD_S, motion
-from studies.make_dataset.__main__ import make_world
+from scenes.stages import make_world
 
 PATH_S = 1.0  # length of the path a window is taken from
 PROBE_S = 0.01  # over which the speed in the image is measured
@@ -79,7 +79,7 @@ class WorldWindows:
 
         name = self.names[index % len(self.names)]
         if name not in self._built:
-            self._built[name] = make_world(name, "emissive")
+            self._built[name] = make_world(name)
         scene, stage = self._built[name]
         camera = self._camera(between(*self.fov_deg))
         path = motion(FAMILIES[index // len(self.names) % len(FAMILIES)], stage, scene, camera, PATH_S, draw)

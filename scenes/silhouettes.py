@@ -100,3 +100,11 @@ def build(name, device="cpu"):
                 "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 30.0 + 25.0 * k}},
             }
     return MitsubaScene(shapes, device)
+
+
+def ball(device="cpu"):
+    """A ball of 0.35 m about the origin, to be moved before another scene."""
+    mi = backend.mitsuba(device)
+    radiance = {"type": "bitmap", "bitmap": mi.Bitmap(smooth(5, cycles=8)), "raw": True}
+    shape = {"type": "sphere", "radius": 0.35, "emitter": {"type": "area", "radiance": radiance}}
+    return MitsubaScene({"ball": shape}, device)

@@ -7,7 +7,6 @@ that was stopped or killed goes on with --resume, and ends with the same bytes. 
 docs/datasets.md.
 """
 
-import inspect
 import io
 import itertools
 import math
@@ -21,19 +20,18 @@ import numpy as np
 import torch
 
 from codesign import lens
+from codesign.atomic import write_atomic
 from codesign.errors import DomainError
 from codesign.events import SensorModel, SensorState, simulate
-from codesign.flow_files import write_flow
+from codesign.flow.files import write_flow
 from codesign.lens import catalogue
 from codesign.render import Camera, shade
 from codesign.render.moving import at_frames
-from scenes import worlds
-from scenes.build import LEVELS
-from scenes.dataset_motion import FAMILIES, LEAD_S, STAGES, Stage, motion
+from scenes.dataset_motion import FAMILIES, LEAD_S, motion
+from scenes.stages import make_world
 from scenes.trajectories import times
 from scenes.tum import write_tum
 from studies.frame.run import Run, StudyConfig, main
-from studies.frame.state import write_atomic
 from studies.frame.timing import resident_mb as resident_mb_now
 from studies.make_dataset import page as pages
 from studies.make_dataset import store
@@ -164,26 +162,6 @@ def checked(config):
 def chunk_size(config):
     """Frames per part; the same for every session of a run."""
     return max(2, min(config.chunk, PIXELS_PER_CHUNK // config.size**2))
-
-
-def make_world(name, light):
-    """Scene and Stage of a world by name. Raises: DomainError when there is none."""
-    if name not in worlds.WORLDS:
-        raise DomainError(f"--world is '{name}'; there are {', '.join(worlds.WORLDS)}.")
-    build = worlds.WORLDS[name]
-    if light != "emissive" and "light" not in inspect.signature(build).parameters:
-        raise DomainError(f"the world '{name}' has no lamps; use --light emissive.")
-    options = {} if light == "emissive" else {"light": LEVELS[light]}
-    if name in STAGES:
-        return build(**options), STAGES[name]
-    origin, target = worlds.VIEWS[name]
-    distance = math.dist(origin, target)
-    x, y, z = origin
-    yaw = math.atan2(target[1] - y, target[0] - x)
-    low, high = ((x + side, y + side, z + side) for side in (-0.2, 0.2))
-    return build(**options), Stage(
-        target, low, high, (0.7 * distance, 0.3 * distance), 0.5, (x, y), yaw, 0.0, height_m=z
-    )
 
 
 def make_camera(config):

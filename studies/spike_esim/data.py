@@ -9,6 +9,7 @@ from torch import Tensor
 from codesign import events, render
 from codesign.events import SensorModel
 from scenes.dataset_motion import LEAD_S, motion
+from scenes.stages import make_world
 from studies.make_dataset import __main__ as make_dataset
 
 RATE_HZ = 500.0
@@ -60,7 +61,7 @@ class Sequence:
 def rendered(world, family, seed, frames, sensor: SensorModel = SENSOR):
     """A rendered sequence of ``frames`` frames at RATE_HZ. seed: of motion and sensor."""
     config = make_dataset.Config(size=SIZE_PX, samples=8, level="thin")
-    scene, stage = make_dataset.make_world(world, "emissive")
+    scene, stage = make_world(world)
     camera = make_dataset.make_camera(config)
     t_s = torch.arange(frames, dtype=torch.float64) / RATE_HZ
     path = motion(family, stage, scene, camera, float(t_s[-1]), torch.Generator().manual_seed(seed))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from codesign import backend, lens, pose, render
+from codesign import lens, pose, render
 from scenes import silhouettes as silhouette_scenes
 from scenes import textures, trajectories, worlds
 
@@ -77,7 +77,7 @@ def _moved(name, way_m, count):
             (way_m * (share - 0.5), torch.full_like(share, -0.6), 0.2 * way_m * (share - 0.5)), 1
         )
         still = worlds.wall(textures.shrunk(textures.photo("brick"), 2), texel_m=0.006)
-        return render.MovingScene(still, {"ball": (_ball(), stand)}), pose.look_at(
+        return render.MovingScene(still, {"ball": (silhouette_scenes.ball(), stand)}), pose.look_at(
             (0, -2, 0), (0, 0, 0)
         ).expand(count, 4, 4).contiguous()
     if name == "wall":
@@ -93,11 +93,3 @@ def _moved(name, way_m, count):
         start = pose.look_at((0, -1.2, 1), (0, 1, 1))
         along = (1.0, 0.0, 0.2)
     return scene, trajectories.translation(start, tuple(way_m * part for part in along), share)
-
-
-def _ball():
-    mi = backend.mitsuba()
-    radiance = {"type": "bitmap", "bitmap": mi.Bitmap(silhouette_scenes.smooth(5, cycles=8)), "raw": True}
-    return render.MitsubaScene(
-        {"ball": {"type": "sphere", "radius": 0.35, "emitter": {"type": "area", "radiance": radiance}}}
-    )

@@ -19,13 +19,14 @@ import torch
 from codesign import lens, render
 from codesign.errors import DomainError
 from codesign.events import SensorModel, SensorState, simulate
-from codesign.flow_files import read_flow
+from codesign.flow.files import read_flow
 from codesign.pose import inverse, look_at, se3_exp
 from codesign.render import Camera
 from codesign.render.moving import MovingScene, at_frames
 from codesign.render.truth import flow_and_occlusion, view
 from scenes import dataset_motion as motions
 from scenes import worlds
+from scenes.stages import Stage, make_world
 from scenes.tum import read_tum
 from studies.frame.run import main
 from studies.make_dataset import __main__ as study
@@ -168,7 +169,7 @@ def test_segments_are_the_shapes_of_the_scene():
 @pytest.mark.parametrize("world", list(worlds.WORLDS))
 def test_every_world_has_a_clear_path_of_every_family(world):
     with torch.no_grad():
-        scene, stage = study.make_world(world, "emissive")
+        scene, stage = make_world(world)
         cam = camera(size=16)
         for family in motions.FAMILIES:
             one, two = (
@@ -267,7 +268,7 @@ def test_events_are_those_of_the_stored_frames_whatever_the_chunks(dataset):
 
 
 def test_flow_files_hold_the_flow_and_the_truth_is_the_renderers(dataset):
-    scene, _ = study.make_world("room", "emissive")
+    scene, _ = make_world("room")
     cam = camera()
     for name in names(dataset):
         with store.h5(dataset / name / "frames.h5") as frames:
@@ -402,9 +403,7 @@ def test_impossible_options_end_with_one_sentence(options, sentence, tmp_path, c
 
 
 def test_paths_that_cannot_keep_clear_are_refused():
-    stage = motions.Stage(
-        low_m=(0.0, 1.99, 1.0), high_m=(0.0, 1.995, 1.0), target_m=(0.0, 3.0, 1.0)
-    )  # at the wall
+    stage = Stage(low_m=(0.0, 1.99, 1.0), high_m=(0.0, 1.995, 1.0), target_m=(0.0, 3.0, 1.0))  # at the wall
     with pytest.raises(DomainError, match="none of 200 radial paths"):
         motions.motion("radial", stage, worlds.room(), camera(size=16), 1.0, torch.Generator().manual_seed(0))
 
