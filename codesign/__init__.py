@@ -1,7 +1,64 @@
-"""Differentiable co-design: lens, render, event camera, event flow."""
+"""Differentiable co-design: lens, render, event camera, event flow.
 
+`import codesign` is all that is needed: its rooms (`codesign.lens`, `codesign.flow`, …) are imported when they
+are first asked for.
+"""
+
+import importlib
 import os
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from codesign import (
+        backend,
+        errors,
+        events,
+        flow,
+        grad,
+        graph,
+        lens,
+        optimise,
+        place,
+        pose,
+        render,
+        report,
+        state,
+        types,
+    )
 
 # Torch's OpenMP threads would busy-wait after each operation on the core that drjit's thread pool needs (a
 # render step took 2x the CPU).
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+__all__ = [
+    "backend",
+    "errors",
+    "events",
+    "flow",
+    "grad",
+    "graph",
+    "lens",
+    "optimise",
+    "place",
+    "pose",
+    "render",
+    "report",
+    "state",
+    "types",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        return importlib.import_module(f"codesign.{name}")
+    if name == "__version__":
+        try:
+            return version("codesign")
+        except PackageNotFoundError:
+            return "unknown"  # run from a checkout that was never installed
+    raise AttributeError(f"module 'codesign' has no attribute '{name}'; it has {', '.join(__all__)}.")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__, "__version__"])

@@ -1,0 +1,52 @@
+"""`import codesign`: quick, without LLVM, with everything behind it."""
+
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+import codesign
+
+ROOT = Path(__file__).resolve().parents[1]
+PRIVATE = {"__init__", "__main__", "atomic", "doctor", "interrupt"}  # for the toolkit itself
+
+
+def test_the_import_alone_loads_nothing_heavy():
+    script = (
+        "import sys, codesign; "
+        "print([m for m in ('torch', 'numpy', 'drjit', 'mitsuba', 'kornia', 'matplotlib') if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout == "[]\n"
+
+
+def test_every_room_is_reachable_from_the_package():
+    standing = {
+        path.stem
+        for path in (ROOT / "codesign").iterdir()
+        if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
+    assert set(codesign.__all__) == standing - PRIVATE
+    assert set(codesign.__all__) <= set(dir(codesign))
+    script = "import codesign; print(codesign.errors.DomainError.__name__, codesign.lens.load.__name__)"
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True, timeout=120
+    )
+    assert done.stdout == "DomainError load\n"
+
+
+def test_the_version_is_that_of_the_installed_package():
+    assert codesign.__version__ == version("codesign")
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'lenses'; it has backend, errors"):
+        _ = codesign.lenses  # pyright: ignore
+
+
+def test_annotations_are_announced():
+    assert (ROOT / "codesign" / "py.typed").read_text() == ""
