@@ -1,8 +1,9 @@
 """A ray-traced lens whose curvatures, thicknesses, conics, asphere terms and indices carry gradients."""
 
-import copy
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import torch
 from torch import nn
@@ -10,10 +11,13 @@ from torch import nn
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.lens import paraxial
 from codesign.lens.aiming import aim_at_stop
+from codesign.lens.analysis.spots import spots
 from codesign.lens.glass import AIR, WAVELENGTH_UM
 from codesign.lens.pinhole import ThinLens
+from codesign.lens.replaceable import Replaceable, settled
 from codesign.lens.surface import scaled
 from codesign.lens.trace import Prescription, Status, trace
+from codesign.lens.variables import Bound, Kind, checked_step
 from codesign.types import Rays
 
 LEARNABLES = (
@@ -28,21 +32,41 @@ LEARNABLES = (
 )
 
 
-class GeoLens(nn.Module):
+class GeoLens(Replaceable):
     """Sequential lens. First vertex at z = 0, light along +z, flat image plane behind the last thickness.
+
+    >>> geo = lens.load("cooke-triplet")
+    >>> optimiser = torch.optim.Adam(geo.variables("curvature", "focus"), lr=0.1)
+    >>> geo.focus_at(2.0).thickness_mm[-1] > geo.thickness_mm[-1]
+    tensor(True)
 
     Learnables (nn.Parameter, one row per surface): curvature_per_mm [S], thickness_mm [S], conic [S], asphere
       [S, A],
-    index_offset [S] (added to the index behind each surface, dimensionless, zero at first), phase [S, P]
-    (radians per mm^2, mm^4, ...).
+    index_offset [S] (added to the index of the glass behind each surface, dimensionless, zero at first; rows of
+    air and of mirrors do nothing and have no gradient), phase [S, P] (radians per mm^2, mm^4, ...).
+    ``variables`` turns the named ones into functions of dimensionless variables and holds the others.
     Errors of assembly (buffers, with gradients after ``requires_grad_`` or through ``replace``): decentre_mm
     [S, 2], tilt_rad [S, 2].
     half_field_deg: the half field the lens is made for, or None where nobody said.
     """
 
+    tensor_names = LEARNABLES
+    parameter_names = LEARNABLES[:6]
+    solved_tensors: ClassVar = {
+        "efl_mm": "curvature_per_mm",
+        "efl_surface": "curvature_per_mm",
+        "focus_m": "thickness_mm",
+    }
+    curvature_per_mm: torch.Tensor
+    thickness_mm: torch.Tensor
+    conic: torch.Tensor
+    asphere: torch.Tensor
+    index_offset: torch.Tensor
+    phase: torch.Tensor
     semi_aperture_mm: torch.Tensor
     decentre_mm: torch.Tensor
     tilt_rad: torch.Tensor
+    glass: torch.Tensor
 
     def __init__(
         self,
@@ -98,38 +122,162 @@ class GeoLens(nn.Module):
         self.register_buffer(
             "semi_aperture_mm", torch.tensor([s.semi_aperture_mm for s in surfaces], dtype=dtype)
         )
+        glass = [s.medium not in (None, AIR) and not s.mirror for s in surfaces]
+        self.register_buffer("glass", torch.tensor(glass), persistent=False)
 
     @property
     def dtype(self):
-        return self.curvature_per_mm.dtype
+        return self.semi_aperture_mm.dtype
 
-    def replace(self, **tensors):
-        """A lens that shares everything with this one except the named tensors, which may depend on other
-        tensors.
+    def variables(
+        self,
+        *names: str,
+        step_mm: float | None = None,
+        bounds: Mapping[str, tuple[Bound, Bound]] | None = None,
+        mask: Mapping[str, Sequence[bool]] | None = None,
+        hold_efl: bool | float = False,
+        focus_at_m: float | None = None,
+        fields_rad: Sequence[float] | None = None,
+        wavelength_um: float = WAVELENGTH_UM["d"],
+    ) -> list[nn.Parameter]:
+        """Make the named numbers variables for torch.optim; every other number of the lens is held.
 
-        The way to optimise: build curvatures and thicknesses from a design vector, put them in, trace, and go
-          backward.
+        From then on the lens's tensors are functions of these Parameters: trace, render, go backward, and step.
+        They are dimensionless, zero now, and a unit of each moves the rays of a bundle on the film by ``step_mm``
+        RMS, so one learning rate suits them all, whatever the lens's size. Another call starts anew from the
+        lens as it then is.
+
+        >>> geo = lens.load("cooke-triplet")
+        >>> [v.shape[0] for v in geo.variables("curvature", "thickness", "focus", hold_efl=True)]
+        [5, 5, 1]
+        >>> curvature, focus = geo.variables("curvature", "focus", bounds={"focus": (40.0, 45.0)})
+
+        Args:
+          names: of "curvature", "thickness" (all gaps but the last), "focus" (the last), "conic", "asphere"
+            (coefficients, surface after surface), "index" (offset of every glass), "phase". Numbers that move no
+            ray (the curvature of a stop in air, the conic of a plane) and thicknesses of 0 are left out.
+          step_mm: the natural step, for example the pixel pitch; None is 1/1000 of the focal length.
+          bounds: (low, high) per name, numbers or one per entry, None for no bound; reached only in the limit.
+            Thicknesses and focus stay above 0 unless others are given.
+          mask: per name, which of its entries (one per surface, gap, coefficient or glass) may vary.
+          hold_efl: True or a focal length, mm: the curvature of ``design.solves.holding_surface`` is solved for
+            it. focus_at_m: the last thickness is solved so that this distance is in focus, see ``focus_at``.
+          fields_rad: fields of the bundle; None is 0, 0.7 and 1 of the half field (10 degrees where unknown).
+        A number so weak that its natural step would be out of proportion (0.1 focal lengths of a thickness, a
+        sag slope of 0.1 at the rim for a shape, 0.05 of an index) gets that as its unit.
+        Returns: one Parameter [K] per name.
+        Raises: DomainError for unknown names, values outside their bounds, and names with nothing to vary.
         """
-        twin = copy.copy(self)
-        twin._parameters = dict(self._parameters)
-        for name, value in tensors.items():
-            if name not in LEARNABLES:
-                raise DomainError(f"a lens has no tensor '{name}'; it has {', '.join(LEARNABLES)}.")
-            if value.shape != getattr(self, name).shape:
-                raise ShapeError(
-                    f"{name} has shape {tuple(getattr(self, name).shape)}, got {tuple(value.shape)}."
-                )
-            twin._parameters.pop(name, None)
-            object.__setattr__(twin, name, value)
-        return twin
+        settled_lens = self.replace()
+        held = {}
+        if hold_efl:
+            from codesign.lens.design.solves import holding_surface  # it is built on this class
 
-    def freeze(self, *names):
-        """Stop the gradient to the named tensors (all when none is named); returns the lens."""
-        for name in names or tuple(self._parameters):
-            if name not in LEARNABLES:
-                raise DomainError(f"a lens has no tensor '{name}'; it has {', '.join(LEARNABLES)}.")
-            getattr(self, name).requires_grad_(False)
-        return self
+            efl = settled_lens.first_order().efl_mm if hold_efl is True else hold_efl
+            held["efl_mm"] = torch.as_tensor(efl, dtype=torch.float64).detach()
+            held["efl_surface"] = torch.tensor(holding_surface(settled_lens))
+        if focus_at_m is not None:
+            held["focus_m"] = torch.as_tensor(focus_at_m, dtype=torch.float64)
+            settled_lens = settled_lens.focus_at(focus_at_m)
+        if step_mm is None:
+            step_mm = 1e-3 * abs(float(settled_lens.first_order().efl_mm.detach()))
+        if fields_rad is None:
+            half = math.radians(self.half_field_deg or 10.0)
+            fields_rad = (0.0, 0.7 * half, half)
+        return self._make_variables(
+            names,
+            step_mm=checked_step(step_mm),
+            bounds=bounds or {},
+            mask=mask or {},
+            fields_rad=fields_rad,
+            wavelength_um=wavelength_um,
+            held=held,
+        )
+
+    def _kinds(self, held):
+        count = len(self.surfaces)
+        efl = abs(float(self.first_order().efl_mm.detach()))
+        rim = self.semi_aperture_mm.clamp_max(efl)
+        order = 2 * torch.arange(1, self.asphere.shape[1] + 1, dtype=self.dtype)
+        orders = 2 * torch.arange(1, self.phase.shape[1] + 1, dtype=self.dtype)
+        bend = (self.curvature_per_mm.detach() * rim).square().clamp_min(1e-12)
+        every = torch.arange(count)
+        gap = torch.full((count,), 0.1 * efl, dtype=self.dtype)
+        kinds = {
+            "curvature": Kind("curvature_per_mm", every, 0.1 / rim),
+            "thickness": Kind("thickness_mm", every[:-1], gap[:-1], 0.0),
+            "focus": Kind("thickness_mm", every[-1:], gap[-1:], 0.0),
+            "conic": Kind("conic", every, 0.1 / bend),
+            "asphere": Kind(
+                "asphere", torch.arange(self.asphere.numel()), (0.1 * rim[:, None] ** (1 - order)).reshape(-1)
+            ),
+            "index": Kind(
+                "index_offset",
+                every[self.glass],
+                torch.full((int(self.glass.sum()),), 0.05, dtype=self.dtype),
+            ),
+            "phase": Kind(
+                "phase", torch.arange(self.phase.numel()), (300 * rim[:, None] ** (1 - orders)).reshape(-1)
+            ),
+        }
+        if "efl_surface" in held:
+            kinds["curvature"] = kinds["curvature"].part(every != int(held["efl_surface"]))
+        if "focus_m" in held:
+            del kinds["focus"]
+        return kinds
+
+    def _solved(self, tensors, held):
+        if not held:
+            return tensors
+        from codesign.lens.design.solves import hold_efl  # it is built on this class
+
+        twin = self._with(tensors)
+        if "efl_mm" in held:
+            twin = hold_efl(twin, held["efl_mm"], int(held["efl_surface"]))
+        if "focus_m" in held:
+            twin = twin.focus_at(held["focus_m"])
+        return tensors | {name: getattr(twin, name) for name in ("curvature_per_mm", "thickness_mm")}
+
+    def _landing(self, fields_rad, wavelength_um):
+        return spots(self, fields_rad, wavelength_um, grid=8)
+
+    @settled
+    def focus_at(self, distance_m, wavelength_um=WAVELENGTH_UM["d"]) -> "GeoLens":
+        """The lens with its film where a point of the axis at ``distance_m`` is imaged: a solve of the last
+        thickness in closed form.
+
+        >>> geo = lens.load("cooke-triplet")
+        >>> near, far = geo.focus_at(1.0), geo.focus_at(float("inf"))
+        >>> float(near.thickness_mm[-1] - far.thickness_mm[-1]) > 2.5
+        True
+
+        Args: distance_m: number or scalar tensor, metres before the camera's origin (the entrance pupil of the d
+          line); inf is allowed. wavelength_um: whose paraxial rays meet on the film.
+        Returns: a lens as from ``replace``; this one stays as it is. Gradient: to every lens tensor that bends
+          or moves light, and to the distance.
+        Raises: DomainError for a point inside the focal length, inside the lens, or not before it.
+        """
+        f = self.first_order(wavelength_um)
+        distance_mm = 1e3 * torch.as_tensor(distance_m, dtype=self.dtype, device=self.semi_aperture_mm.device)
+        before = distance_mm - self._origin_z_mm(f, wavelength_um)  # of the first vertex
+        if not float(distance_mm.detach()) > 0 or not float(before.detach()) > 0:
+            raise DomainError(
+                f"{self.name}: a point {float(distance_mm.detach()) * 1e-3:.6g} m before the entrance pupil does "
+                "not lie before the lens; give a larger distance, inf for parallel light."
+            )
+        index = self.index(wavelength_um)
+        one = torch.ones_like(before)
+        heights, angles = paraxial.yu_trace(
+            self.surface_power(wavelength_um), self.thickness_mm, index, one, index[0] / before
+        )
+        if not float(angles[-1].detach()) < -1e-12:
+            raise DomainError(
+                f"{self.name}: a point {float(distance_mm.detach()) * 1e-3:.6g} m away lies inside the focal "
+                f"length ({float(f.efl_mm.detach()):.6g} mm), so its light leaves the lens without meeting; give "
+                "a larger distance, or a stronger lens."
+            )
+        image = -heights[-1] * index[-1] / angles[-1]
+        return self.replace(thickness_mm=torch.cat([self.thickness_mm[:-1], image.reshape(1)]))
 
     def scaled(self, factor):
         """A new lens with all lengths multiplied by ``factor`` (same f-number and angles), from the current
@@ -144,6 +292,7 @@ class GeoLens(nn.Module):
             self.half_field_deg,
         )
 
+    @settled
     def to_surfaces(self):
         """The current values as a tuple of Surface; index offsets go into the media. A curvature or tilt that
         never changed keeps its value to the last bit."""
@@ -152,7 +301,8 @@ class GeoLens(nn.Module):
         tilts = torch.tensor(
             [[math.radians(a) for a in s.tilt_deg] for s in self.surfaces], dtype=self.dtype
         ).tolist()
-        columns = (getattr(self, name).tolist() for name in LEARNABLES)
+        now = self._now() | {"index_offset": torch.where(self.glass, self.index_offset, 0)}
+        columns = (now[name].tolist() for name in LEARNABLES)
         for old, first, tilted, c, t, k, a, shift, phase, decentre, tilt in zip(
             self.surfaces, at_first, tilts, *columns, strict=True
         ):
@@ -175,8 +325,9 @@ class GeoLens(nn.Module):
         """Indices [S + 1] at a wavelength, the first before the lens (air). Behind a mirror it is the index
         before it."""
         values = [1.0, *[1.0 if s.medium is None else s.medium.index(wavelength_um) for s in self.surfaces]]
-        base = torch.tensor(values, dtype=self.dtype, device=self.curvature_per_mm.device)
-        found = base + torch.cat([torch.zeros_like(self.index_offset[:1]), self.index_offset])
+        base = torch.tensor(values, dtype=self.dtype, device=self.semi_aperture_mm.device)
+        offset = torch.where(self.glass, self.index_offset, 0)
+        found = base + torch.cat([torch.zeros_like(offset[:1]), offset])
         if not any(self.mirrors):
             return found
         source = list(range(len(values)))
@@ -193,6 +344,7 @@ class GeoLens(nn.Module):
         )
         return self.phase * (orders * (wavelength_um * 1e-3 / (2 * math.pi)))[:, None]
 
+    @settled
     def surface_power(self, wavelength_um=WAVELENGTH_UM["d"]):
         """Paraxial power of each surface, [S] per mm: vertex curvature (with the r^2 asphere term) times
         bending, and diffraction."""
@@ -202,6 +354,7 @@ class GeoLens(nn.Module):
         power = vertex * paraxial.bending(self.index(wavelength_um), self.mirrors)
         return power - 2 * self.path_mm(wavelength_um)[:, 0] if self.phase.shape[1] else power
 
+    @settled
     def first_order(self, wavelength_um=WAVELENGTH_UM["d"]):
         """Paraxial figures (FirstOrder) at a wavelength, differentiable."""
         return paraxial.first_order(
@@ -212,6 +365,7 @@ class GeoLens(nn.Module):
             self.entrance_pupil_diameter_mm,
         )
 
+    @settled
     def prescription(self, wavelength_um=WAVELENGTH_UM["d"]):
         """The numbers the ray-trace kernel needs."""
         shape = (self.curvature_per_mm, self.thickness_mm, self.conic, self.asphere)
@@ -230,6 +384,7 @@ class GeoLens(nn.Module):
             efficiency,
         )
 
+    @settled
     def trace(self, origin_mm, direction, wavelength_um=WAVELENGTH_UM["d"]):
         """Trace rays to the image plane: origins [N, 3] relative to the first vertex, unit directions [N, 3]
         -> TraceResult.
@@ -256,6 +411,7 @@ class GeoLens(nn.Module):
             )
         return trace(self.prescription(wavelength_um), origin_mm, direction)
 
+    @settled
     def thin(self, wavelength_um=WAVELENGTH_UM["d"]):
         """The paraxial level of this lens: same focal length, pupil and defocus, no aberrations."""
         f = self.first_order(wavelength_um)
@@ -263,6 +419,7 @@ class GeoLens(nn.Module):
             f.efl_mm, self.entrance_pupil_diameter_mm, f.efl_mm + self.thickness_mm[-1] - f.bfl_mm
         )
 
+    @settled
     def camera_rays(self, film_mm, pupil, wavelength_um=WAVELENGTH_UM["d"], aim=False):
         """Rays from image points through the lens towards the scene.
 
@@ -314,6 +471,7 @@ class GeoLens(nn.Module):
             )
         return Rays(out.position_mm * 1e-3, out.direction, out.weight, spread * direction[:, 2] ** 4)
 
+    @settled
     def film_points(self, points_mm, pupil, wavelength_um=WAVELENGTH_UM["d"]):
         """Where light from points of space meets the film, through points of the paraxial entrance pupil; the
         other way of ``camera_rays``.

@@ -1,0 +1,259 @@
+"""Numbers of a lens as dimensionless variables whose unit is a natural step: one that moves the rays on the film
+by a set distance."""
+
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from codesign.errors import DomainError, ShapeError
+
+BEND = 5.0  # a bound on one side bends the map within about this part of the room that the start leaves
+TRIAL = 1e-4  # of a reach: the step of the differences that measure how rays move
+DEAD = 1e-6  # of the natural step: a number whose whole reach moves the rays by less is no variable
+
+Bound = float | Sequence[float] | Tensor | None
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Numbers of a lens that go by one name.
+
+    tensor: name of the tensor they are in. places: [K] their places in it, flattened. reach: [K] the largest
+    change that a unit of a variable may make, for numbers that hardly move a ray. low: least value where no
+      other bound is given.
+    """
+
+    tensor: str
+    places: Tensor
+    reach: Tensor
+    low: float = -math.inf
+
+    def part(self, keep):
+        """The numbers where ``keep`` [K] is true."""
+        return Kind(self.tensor, self.places[keep], self.reach[keep], self.low)
+
+
+class Variables(nn.Module):
+    """Tensors of a lens as functions of variables: value = bound(start + unit u).
+
+    For every kind a Parameter [K] of its name, zero at the values that ``tensors`` hold. Where bounds are given
+    on both sides the value is middle + half tanh(.), where on one side it is bound ± width log(1 + exp(.));
+    their slope at the start is in the unit, so that a step means the same with bounds and without.
+    Raises: DomainError for a start that does not lie strictly inside its bounds.
+    """
+
+    def __init__(self, tensors: Mapping[str, Tensor], kinds: Mapping[str, Kind], units, bounds, held):
+        super().__init__()
+        self.tensor_of = {name: kind.tensor for name, kind in kinds.items()}
+        for name, value in tensors.items():
+            self.register_buffer(f"start_{name}", value.detach().clone())
+        for name, value in held.items():
+            self.register_buffer(f"held_{name}", value.detach().clone())
+        for name, kind in kinds.items():
+            value = tensors[kind.tensor].detach().reshape(-1)[kind.places]
+            low, high = bounds[name]
+            width = _width(value, low, high)
+            table = {"low": low, "high": high, "width": width, "places": kind.places}
+            start = _unbounded(value, low, high, width)
+            table |= {"start": start, "unit": units[name] / _slope(start, low, high, width)}
+            for label, entry in table.items():
+                self.register_buffer(f"{name}_{label}", entry.detach().clone())
+            self.register_parameter(name, nn.Parameter(torch.zeros_like(value)))
+
+    def makes(self, tensor: str) -> bool:
+        """Whether a tensor of this name comes from here."""
+        return f"start_{tensor}" in self._buffers
+
+    @property
+    def held(self) -> dict[str, Tensor]:
+        """What solves hold, by name."""
+        return {name[5:]: value for name, value in self._buffers.items() if name.startswith("held_")}
+
+    def forward(self) -> dict[str, Tensor]:
+        """The tensors at the variables as they are, by name. Gradient: exact, to the variables."""
+        made = {name[6:]: value for name, value in self._buffers.items() if name.startswith("start_")}
+        for name, tensor in self.tensor_of.items():
+            low, high, width, places, start, unit = (
+                self._buffers[f"{name}_{label}"]
+                for label in ("low", "high", "width", "places", "start", "unit")
+            )
+            values = _bounded(start + unit * self._parameters[name], low, high, width)
+            flat = made[tensor].reshape(-1).index_put((places,), values)
+            made[tensor] = flat.reshape(made[tensor].shape)
+        return made
+
+
+def ray_motion(ahead, behind):
+    """How rays move on the film between two states of a lens: [fields, M, 2] mm, and [fields, M] 1 for rays that
+    arrive in both, else 0.
+
+    Args: ahead, behind: positions [fields, M, 2] and weights [fields, M], as from ``spots``.
+    """
+    weight = ahead[1] * behind[1]
+    return (ahead[0] - behind[0]) * weight[..., None], weight
+
+
+def natural_units(land, values: Tensor, reach: Tensor, step_mm: float):
+    """Change of each number [K] that moves the rays by ``step_mm`` RMS over the bundle, at most its ``reach``;
+    and whether it moves them at all, [K] bool.
+
+    Args: land: numbers [K] -> (positions [fields, M, 2] mm, weights [fields, M]).
+    """
+    moves = []
+    for i in range(values.numel()):
+        trial = torch.zeros_like(values)
+        trial[i] = TRIAL * reach[i]
+        with torch.no_grad():
+            moved, weight = ray_motion(land(values + trial), land(values - trial))
+        rms = torch.linalg.vector_norm(moved) / weight.sum().clamp_min(1).sqrt()
+        moves.append(rms / (2 * TRIAL))  # over the whole reach
+    moves = torch.stack(moves)
+    return reach / (moves / step_mm).clamp_min(1), moves > DEAD * step_mm
+
+
+def checked_step(step_mm: float) -> float:
+    """The natural step as a number. Raises: DomainError unless it is positive and finite."""
+    if not 0 < step_mm < math.inf:
+        raise DomainError(
+            f"natural step {step_mm} mm must be positive and finite; the pixel pitch is a good one."
+        )
+    return float(step_mm)
+
+
+def checked_bounds(name, kind, value, given: tuple[Bound, Bound] | None, rows):
+    """Lower and upper bounds [R] of the numbers at ``rows`` of one kind; infinite where there is none.
+
+    Raises: ShapeError; DomainError for a number that does not lie strictly inside.
+    """
+    given = (kind.low, math.inf) if given is None else given
+    if len(given) != 2:
+        raise ShapeError(
+            f"bounds of {name} are (low, high), got {len(given)} entries; None leaves one side free."
+        )
+    sides = []
+    for side, free in zip(given, (-math.inf, math.inf), strict=True):
+        side = torch.as_tensor(free if side is None else side, dtype=value.dtype, device=value.device)
+        if side.numel() not in (1, value.numel()):
+            raise ShapeError(f"a bound of {name} is a number or {value.numel()} of them, got {side.numel()}.")
+        sides.append(side.reshape(-1).expand_as(value)[rows])
+    low, high = sides
+    for i, at, least, most in zip(
+        rows.tolist(), value[rows].tolist(), low.tolist(), high.tolist(), strict=True
+    ):
+        if not least < at < most:
+            raise DomainError(
+                f"{name} {i + 1} is {at:.6g}, not strictly inside its bounds {least:.6g} to {most:.6g}; widen "
+                "them, start elsewhere, or mask it."
+            )
+    return low, high
+
+
+def _width(value, low, high):
+    room = torch.where(low.isfinite(), value - low, high - value) / BEND
+    width = torch.where(low.isfinite() & high.isfinite(), (high - low) / 2, room)
+    return torch.where(low.isfinite() | high.isfinite(), width, 1.0)
+
+
+def _sides(low, high):
+    """Masks of bounds on both sides, below only, above only; and the bounds, 0 where there is none."""
+    below = low.isfinite()
+    above = high.isfinite()
+    return (
+        (below & above, below & ~above, above & ~below),
+        torch.where(below, low, 0),
+        torch.where(above, high, 0),
+    )
+
+
+def _bounded(x, low, high, width):
+    (both, below, above), low, high = _sides(low, high)
+    x = x / width
+    zero = torch.zeros_like(x)
+    value = torch.where(both, (low + high) / 2 + width * torch.tanh(x), width * x)
+    value = torch.where(below, low + width * torch.logaddexp(x, zero), value)
+    return torch.where(above, high - width * torch.logaddexp(-x, zero), value)
+
+
+def _unbounded(value, low, high, width):
+    (both, below, above), low, high = _sides(low, high)
+    offset = torch.where(both, (value - (low + high) / 2) / width, 0.0)
+    room = torch.where(below, value - low, torch.where(above, high - value, width)) / width
+    one_side = room + torch.log(-torch.expm1(-room))  # log(exp(room) - 1)
+    x = torch.where(both, torch.atanh(offset), value / width)
+    x = torch.where(below, one_side, x)
+    return torch.where(above, -one_side, x) * width
+
+
+def _slope(x, low, high, width):
+    """Derivative of ``_bounded``."""
+    (both, below, above), _, _ = _sides(low, high)
+    x = x / width
+    slope = torch.where(both, 1 - torch.tanh(x).square(), 1.0)
+    slope = torch.where(below, torch.sigmoid(x), slope)
+    return torch.where(above, torch.sigmoid(-x), slope)
+
+
+def make_variables(lens, names, step_mm, bounds, mask, fields_rad, wavelength_um, held) -> Variables:
+    """Variables of the named kinds around a lens as it is now; see ``GeoLens.variables``.
+
+    The lens says what it has: ``_kinds(held)`` -> {name: Kind}, ``_solved(tensors, held)`` -> tensors,
+    ``_landing(fields_rad, wavelength_um)`` -> positions and weights of a bundle of rays on the film,
+    ``solved_tensors``: which tensor a solve makes.
+    """
+    exact = copy.deepcopy(lens.replace()).double()
+    kinds = exact._kinds(held)
+    for label, found in (("variables", names), ("bounds of", bounds), ("mask of", mask)):
+        unknown = [name for name in found if name not in (kinds if label == "variables" else names)]
+        if unknown or len(set(found)) < len(found):
+            raise DomainError(
+                f"{lens}: {label} {', '.join(map(repr, unknown or found))}: name each once, of "
+                f"{', '.join(kinds if label == 'variables' else names)}."
+            )
+    if not names:
+        raise DomainError(f"{lens}: name the numbers that become variables, of {', '.join(kinds)}.")
+    tensors = {t: v.detach() for t, v in exact._now().items()}
+    values = {name: tensors[kinds[name].tensor].reshape(-1)[kinds[name].places] for name in names}
+    keep = {name: _kept(name, kinds[name], values[name], bounds, mask) for name in names}
+    places = [(kinds[name].tensor, kinds[name].places[keep[name]]) for name in names]
+    counts = [at.numel() for _, at in places]
+
+    def land(numbers):
+        moved = dict(tensors)
+        for (tensor, at), part in zip(places, numbers.split(counts), strict=True):
+            moved[tensor] = moved[tensor].reshape(-1).index_put((at,), part).reshape(moved[tensor].shape)
+        return exact._with(exact._solved(moved, held))._landing(fields_rad, wavelength_um)
+
+    start = torch.cat([values[name][keep[name]] for name in names])
+    reach = torch.cat([kinds[name].reach[keep[name]] for name in names])
+    units, alive = natural_units(land, start, reach, step_mm)
+    chosen = {}
+    chosen_units = {}
+    chosen_bounds = {}
+    for name, unit, live in zip(names, units.split(counts), alive.split(counts), strict=True):
+        if not bool(live.any()):
+            raise DomainError(
+                f"{lens}: no {name} moves a ray (none is there, or all are masked), so it cannot be a variable; "
+                "leave it out."
+            )
+        rows = keep[name].nonzero()[:, 0][live]
+        chosen[name] = kinds[name].part(rows)
+        chosen_units[name] = unit[live]
+        chosen_bounds[name] = checked_bounds(name, kinds[name], values[name], bounds.get(name), rows)
+    made = {kind.tensor for kind in chosen.values()} | {exact.solved_tensors[name] for name in held}
+    start_tensors = {name: tensors[name] for name in sorted(made)}
+    return Variables(start_tensors, chosen, chosen_units, chosen_bounds, held).to(lens.dtype)
+
+
+def _kept(name, kind, value, bounds, mask):
+    """Which numbers of a kind may be variables, [K] bool."""
+    keep = torch.ones_like(value, dtype=torch.bool) if name in bounds else value > kind.low
+    if name in mask:
+        asked = torch.as_tensor(mask[name], dtype=torch.bool, device=value.device)
+        if asked.shape != value.shape:
+            raise ShapeError(f"the mask of {name} needs {value.numel()} entries, got {tuple(asked.shape)}.")
+        keep = keep & asked
+    return keep

@@ -1,0 +1,211 @@
+"""Lenses as torch Modules: what they own, what they share, what conversions, copies and saved states keep."""
+
+import copy
+import math
+
+import pytest
+import torch
+
+from codesign import lens
+from codesign.errors import DomainError
+from codesign.lens import GeoLens, Glass, Pinhole, Surface, ThinLens
+
+D = torch.float64
+GLASS = Glass.from_indices(1.51, 1.5, 1.49, "g")
+
+
+def rays(dtype=D):
+    points = torch.tensor([[1.0, 2.0, -5.0], [-3.0, 0.5, -5.0]], dtype=dtype)
+    return points, torch.tensor([[0.0, 0.0, 1.0]] * 2, dtype=dtype)
+
+
+def tensors(module):
+    return {name: value.clone() for name, value in module.state_dict().items()}
+
+
+def same(found, wanted):
+    assert found.keys() == wanted.keys()
+    for name, value in wanted.items():
+        assert found[name].dtype == value.dtype, name
+        assert torch.equal(found[name], value), name
+
+
+def test_air_is_no_variable(tmp_path):
+    geo = lens.load("cooke-triplet")
+    optimiser = torch.optim.Adam(geo.parameters(), lr=1e-5)
+    for _ in range(40):
+        optimiser.zero_grad()
+        origin, direction = rays()
+        geo.trace(origin, direction).position_mm.square().sum().backward()
+        optimiser.step()
+    moved = geo.index_offset.detach() != 0
+    assert moved.tolist() == [True, False, True, False, True, False]
+    lens.save(geo, tmp_path / "a.json")
+    assert [s.medium and s.medium.name for s in lens.load(tmp_path / "a.json").surfaces] == [
+        s.medium and s.medium.name for s in geo.surfaces
+    ]
+    assert [s.medium is None for s in lens.load(tmp_path / "a.json").surfaces] == [False, True] * 3
+
+
+@pytest.mark.parametrize("medium", [None, Glass.named("air")])
+def test_an_offset_of_air_or_of_a_mirror_does_nothing(medium):
+    surfaces = [
+        Surface(50.0, 5.0, GLASS, 10.0),
+        Surface(-80.0, 20.0, medium, 10.0),
+        Surface(-300.0, 30.0, medium, 10.0, mirror=True),
+    ]
+    geo = GeoLens(surfaces, 8.0)
+    offset = torch.tensor([0.01, 0.3, 0.2], dtype=D, requires_grad=True)
+    shifted = geo.replace(index_offset=offset)
+    assert shifted.index().tolist() == pytest.approx([1.0, 1.51, 1.0, 1.0], abs=1e-15)
+    f = shifted.first_order()
+    path = shifted.trace(*rays()).optical_path_mm.sum()
+    (slope,) = torch.autograd.grad(f.efl_mm + f.bfl_mm + path, offset)
+    assert slope[0] != 0
+    assert slope[1:].tolist() == [0.0, 0.0]
+    assert [s.medium for s in shifted.to_surfaces()[1:]] == [medium, medium]
+
+
+@pytest.mark.parametrize("change", [torch.nn.Module.float, lambda m: m.to(torch.float32)])
+def test_a_twin_and_its_original_are_converted_apart(change):
+    geo = lens.load("la1509")
+    twin = geo.replace(thickness_mm=geo.thickness_mm * 2)
+    first = tensors(geo)
+    change(twin)
+    same(tensors(geo), first)
+    exact = geo.trace(*rays()).position_mm
+    assert exact.dtype == D
+    out = twin.trace(*rays(torch.float32))
+    assert {v.dtype for n, v in twin.state_dict().items()} == {torch.float32}
+    gradient = torch.autograd.grad(out.position_mm[:, :2].square().sum(), geo.curvature_per_mm)[0]
+    assert gradient.dtype == D
+    wanted = torch.autograd.grad(
+        geo.replace(thickness_mm=geo.thickness_mm * 2).trace(*rays()).position_mm[:, :2].square().sum(),
+        geo.curvature_per_mm,
+    )[0]
+    torch.testing.assert_close(gradient, wanted, rtol=1e-3, atol=0)  # float32 rays of 1e-6 at spots of 1e-3
+    other = lens.load("la1509")
+    kept = other.replace(thickness_mm=other.thickness_mm * 2)
+    change(other)
+    assert kept.trace(*rays()).position_mm.dtype == D
+    assert other.trace(*rays(torch.float32)).position_mm.dtype == torch.float32
+
+
+def test_the_state_of_a_twin_holds_every_tensor_and_is_its_own():
+    geo = lens.load("la1509")
+    twin = geo.replace(thickness_mm=geo.thickness_mm * 2)
+    assert tensors(twin).keys() == tensors(geo).keys()
+    assert list(twin.parameters()) == []
+    first = tensors(geo)
+    twin.load_state_dict({name: value + 0.01 for name, value in first.items()})
+    same(tensors(geo), first)
+    same(tensors(twin), {name: value + 0.01 for name, value in first.items()})
+    twin = geo.replace(thickness_mm=geo.thickness_mm * 2)
+    twin.freeze()
+    assert all(p.requires_grad for p in geo.parameters())
+    assert not twin.trace(*rays()).position_mm.requires_grad
+
+
+def test_a_new_buffer_on_a_twin_stays_there():
+    geo = lens.load("la1509")
+    twin = geo.replace()
+    twin.register_buffer("mark", torch.zeros(1))
+    twin.add_module("part", torch.nn.Identity())
+    assert not hasattr(geo, "mark")
+    assert not hasattr(geo, "part")
+
+
+def test_a_copy_owns_its_numbers():
+    geo = lens.load("la1509")
+    twin = geo.replace(thickness_mm=geo.thickness_mm * 2)
+    for source in (geo, twin):
+        found = copy.deepcopy(source)
+        same(tensors(found), tensors(source))
+        assert {n for n, _ in found.named_parameters()} == {n for n, _ in geo.named_parameters()}
+        found.trace(*rays()).position_mm.sum().backward()
+        assert geo.curvature_per_mm.grad is None
+        with torch.no_grad():
+            found.curvature_per_mm.mul_(2)
+        assert float(geo.curvature_per_mm[0].detach()) == pytest.approx(1 / 51.5, rel=1e-15)
+    assert copy.deepcopy(geo.freeze("conic")).conic.requires_grad is False
+
+
+def test_a_state_goes_through_a_file_without_pickle(tmp_path):
+    changed = lens.load("cooke-triplet")
+    with torch.no_grad():
+        changed.curvature_per_mm.mul_(1.01)
+    for module, fresh in (
+        (changed, lens.load("cooke-triplet")),
+        (ThinLens(50.0, 10.0, 51.0), ThinLens(40.0, 10.0, 40.0)),
+        (Pinhole(5.0), Pinhole(6.0)),
+    ):
+        torch.save(module.state_dict(), tmp_path / "state.pt")
+        fresh.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+        same(tensors(fresh), tensors(module))
+
+
+def test_conversion_keeps_values_flags_and_gradients():
+    geo = lens.load("la1509").freeze("conic")
+    geo.first_order().efl_mm.backward()
+    single = copy.deepcopy(geo).float()
+    assert single.dtype == torch.float32
+    assert not single.conic.requires_grad
+    assert single.curvature_per_mm.requires_grad
+    before = geo.curvature_per_mm.grad.clone()
+    geo.float()
+    torch.testing.assert_close(geo.curvature_per_mm.grad, before.float(), rtol=0, atol=0)
+    back = geo.double().curvature_per_mm.detach()
+    torch.testing.assert_close(back, lens.load("la1509").curvature_per_mm.detach(), rtol=1e-7, atol=0)
+    parameter = geo.thickness_mm
+    assert geo.double().thickness_mm is parameter  # nothing to convert: optimisers keep what they hold
+
+
+def test_thin_lenses_are_modules():
+    thin = ThinLens(50.0, 10.0, 51.0)
+    assert [n for n, _ in thin.named_parameters()] == ["efl_mm", "image_distance_mm"]
+    thin.requires_grad_()
+    film = torch.tensor([[0.3, -0.2]], dtype=D)
+    pupil = torch.tensor([[0.5, 0.1]], dtype=D)
+    out = thin.camera_rays(film, pupil).direction
+    slope = out[:, :2] / out[:, 2:]
+    q = 5 * pupil
+    torch.testing.assert_close(slope, (q + film) / 51 - q / 50, rtol=1e-14, atol=0)
+    slope[0, 0].backward()
+    assert float(thin.efl_mm.grad) == pytest.approx(2.5 / 50**2, rel=1e-12)
+    assert float(thin.image_distance_mm.grad) == pytest.approx(-2.8 / 51**2, rel=1e-12)
+    assert thin.float().camera_rays(film.float(), pupil.float()).direction.dtype == torch.float32
+    assert copy.deepcopy(thin).double().dtype == D
+
+
+def test_the_film_of_a_pinhole_follows_its_focal_length():
+    pinhole = Pinhole(5.0)
+    assert [n for n, _ in pinhole.named_parameters()] == ["efl_mm"]
+    optimiser = torch.optim.SGD(pinhole.requires_grad_().parameters(), lr=1.0)
+    pinhole.image_distance_mm.backward()
+    optimiser.step()
+    assert float(pinhole.image_distance_mm.detach()) == 4.0
+    assert float(copy.deepcopy(pinhole).image_distance_mm.detach()) == 4.0
+    twin = pinhole.replace(efl_mm=torch.tensor(7.0, dtype=D))  # names one length, moves one length
+    assert (float(twin.efl_mm), float(twin.image_distance_mm.detach())) == (7.0, 4.0)
+
+
+def test_gradients_reach_the_tensors_a_thin_lens_is_given():
+    leaf = torch.tensor(50.0, dtype=D, requires_grad=True)
+    thin = ThinLens(leaf * 1.0, 10.0, leaf * 1.02)
+    assert list(thin.parameters()) == []
+    film = torch.tensor([[0.3, -0.2]], dtype=D)
+    out = thin.camera_rays(film, torch.zeros(1, 2, dtype=D)).direction
+    (slope,) = torch.autograd.grad(out[0, 0] / out[0, 2], leaf)
+    assert float(slope) == pytest.approx(-0.3 / (1.02 * 50**2), rel=1e-12)
+    kept = torch.nn.Parameter(torch.tensor(50.0, dtype=D))
+    assert ThinLens(kept, 10.0).efl_mm is kept
+
+
+def test_what_cannot_be_replaced_or_frozen_gets_a_sentence():
+    with pytest.raises(DomainError, match="no tensor 'radius'; it has efl_mm, image_distance_mm"):
+        ThinLens(50.0, 10.0).replace(radius=torch.tensor(1.0))
+    geo = lens.load("la1509")
+    geo.variables("curvature")
+    with pytest.raises(DomainError, match="made from variables"):
+        geo.freeze("curvature_per_mm")
+    assert not math.isnan(float(geo.freeze().first_order().efl_mm))
