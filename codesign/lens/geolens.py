@@ -12,12 +12,15 @@ from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.lens import paraxial
 from codesign.lens.aiming import aim_at_stop
 from codesign.lens.analysis.spots import spots
+from codesign.lens.focus import image_distance_mm
 from codesign.lens.glass import AIR, WAVELENGTH_UM
+from codesign.lens.hold_efl import hold_efl, holding_surface
+from codesign.lens.numbers import kinds
 from codesign.lens.pinhole import ThinLens
 from codesign.lens.replaceable import Replaceable, settled
 from codesign.lens.surface import scaled
 from codesign.lens.trace import Prescription, Status, trace
-from codesign.lens.variables import Bound, Kind, checked_step
+from codesign.lens.variables import Bound, checked_step
 from codesign.types import Rays
 
 LEARNABLES = (
@@ -135,7 +138,7 @@ class GeoLens(Replaceable):
         step_mm: float | None = None,
         bounds: Mapping[str, tuple[Bound, Bound]] | None = None,
         mask: Mapping[str, Sequence[bool]] | None = None,
-        hold_efl: bool | float = False,
+        keep_efl: bool = False,
         focus_at_m: float | None = None,
         fields_rad: Sequence[float] | None = None,
         wavelength_um: float = WAVELENGTH_UM["d"],
@@ -148,7 +151,7 @@ class GeoLens(Replaceable):
         lens as it then is.
 
         >>> geo = lens.load("cooke-triplet")
-        >>> [v.shape[0] for v in geo.variables("curvature", "thickness", "focus", hold_efl=True)]
+        >>> [v.shape[0] for v in geo.variables("curvature", "thickness", "focus", keep_efl=True)]
         [5, 5, 1]
         >>> curvature, focus = geo.variables("curvature", "focus", bounds={"focus": (40.0, 45.0)})
 
@@ -160,27 +163,23 @@ class GeoLens(Replaceable):
           bounds: (low, high) per name, numbers or one per entry, None for no bound; reached only in the limit.
             Thicknesses and focus stay above 0 unless others are given.
           mask: per name, which of its entries (one per surface, gap, coefficient or glass) may vary.
-          hold_efl: True or a focal length, mm: the curvature of ``design.solves.holding_surface`` is solved for
-            it. focus_at_m: the last thickness is solved so that this distance is in focus, see ``focus_at``.
+          keep_efl: whether the curvature of ``design.solves.holding_surface`` is solved for today's focal length.
+          focus_at_m: the distance that stays in focus, the last thickness being solved for it; see ``focus_at``.
           fields_rad: fields of the bundle; None is 0, 0.7 and 1 of the half field (10 degrees where unknown).
         A number so weak that its natural step would be out of proportion (0.1 focal lengths of a thickness, a
         sag slope of 0.1 at the rim for a shape, 0.05 of an index) gets that as its unit.
         Returns: one Parameter [K] per name.
         Raises: DomainError for unknown names, values outside their bounds, and names with nothing to vary.
         """
-        settled_lens = self.replace()
+        efl = self.first_order().efl_mm.detach()
         held = {}
-        if hold_efl:
-            from codesign.lens.design.solves import holding_surface  # it is built on this class
-
-            efl = settled_lens.first_order().efl_mm if hold_efl is True else hold_efl
-            held["efl_mm"] = torch.as_tensor(efl, dtype=torch.float64).detach()
-            held["efl_surface"] = torch.tensor(holding_surface(settled_lens))
+        if keep_efl:
+            held["efl_mm"] = efl
+            held["efl_surface"] = torch.tensor(holding_surface(self.replace()))
         if focus_at_m is not None:
             held["focus_m"] = torch.as_tensor(focus_at_m, dtype=torch.float64)
-            settled_lens = settled_lens.focus_at(focus_at_m)
         if step_mm is None:
-            step_mm = 1e-3 * abs(float(settled_lens.first_order().efl_mm.detach()))
+            step_mm = 1e-3 * abs(float(efl))
         if fields_rad is None:
             half = math.radians(self.half_field_deg or 10.0)
             fields_rad = (0.0, 0.7 * half, half)
@@ -195,42 +194,11 @@ class GeoLens(Replaceable):
         )
 
     def _kinds(self, held):
-        count = len(self.surfaces)
-        efl = abs(float(self.first_order().efl_mm.detach()))
-        rim = self.semi_aperture_mm.clamp_max(efl)
-        order = 2 * torch.arange(1, self.asphere.shape[1] + 1, dtype=self.dtype)
-        orders = 2 * torch.arange(1, self.phase.shape[1] + 1, dtype=self.dtype)
-        bend = (self.curvature_per_mm.detach() * rim).square().clamp_min(1e-12)
-        every = torch.arange(count)
-        gap = torch.full((count,), 0.1 * efl, dtype=self.dtype)
-        kinds = {
-            "curvature": Kind("curvature_per_mm", every, 0.1 / rim),
-            "thickness": Kind("thickness_mm", every[:-1], gap[:-1], 0.0),
-            "focus": Kind("thickness_mm", every[-1:], gap[-1:], 0.0),
-            "conic": Kind("conic", every, 0.1 / bend),
-            "asphere": Kind(
-                "asphere", torch.arange(self.asphere.numel()), (0.1 * rim[:, None] ** (1 - order)).reshape(-1)
-            ),
-            "index": Kind(
-                "index_offset",
-                every[self.glass],
-                torch.full((int(self.glass.sum()),), 0.05, dtype=self.dtype),
-            ),
-            "phase": Kind(
-                "phase", torch.arange(self.phase.numel()), (300 * rim[:, None] ** (1 - orders)).reshape(-1)
-            ),
-        }
-        if "efl_surface" in held:
-            kinds["curvature"] = kinds["curvature"].part(every != int(held["efl_surface"]))
-        if "focus_m" in held:
-            del kinds["focus"]
-        return kinds
+        return kinds(self, held)
 
     def _solved(self, tensors, held):
         if not held:
             return tensors
-        from codesign.lens.design.solves import hold_efl  # it is built on this class
-
         twin = self._with(tensors)
         if "efl_mm" in held:
             twin = hold_efl(twin, held["efl_mm"], int(held["efl_surface"]))
@@ -242,42 +210,29 @@ class GeoLens(Replaceable):
         return spots(self, fields_rad, wavelength_um, grid=8)
 
     @settled
-    def focus_at(self, distance_m, wavelength_um=WAVELENGTH_UM["d"]) -> "GeoLens":
+    def focus_at(
+        self,
+        distance_m: float | torch.Tensor,
+        wavelength_um: float = WAVELENGTH_UM["d"],
+        spot_grid: int | None = None,
+    ) -> "GeoLens":
         """The lens with its film where a point of the axis at ``distance_m`` is imaged: a solve of the last
         thickness in closed form.
 
         >>> geo = lens.load("cooke-triplet")
         >>> near, far = geo.focus_at(1.0), geo.focus_at(float("inf"))
-        >>> float(near.thickness_mm[-1] - far.thickness_mm[-1]) > 2.5
+        >>> bool(near.thickness_mm[-1] > far.thickness_mm[-1])
         True
 
         Args: distance_m: number or scalar tensor, metres before the camera's origin (the entrance pupil of the d
-          line); inf is allowed. wavelength_um: whose paraxial rays meet on the film.
-        Returns: a lens as from ``replace``; this one stays as it is. Gradient: to every lens tensor that bends
-          or moves light, and to the distance.
-        Raises: DomainError for a point inside the focal length, inside the lens, or not before it.
+          line); inf is allowed. wavelength_um: whose paraxial rays meet on the film. spot_grid: pupil samples
+          across, for the film of the least RMS spot of the point in place of the paraxial one.
+        Returns: a lens as from ``replace``; this one stays as it is. Its last thickness is the image distance.
+        Gradient: to every lens tensor that bends or moves light, and to the distance.
+        Raises: DomainError for a point that does not lie before the lens and beyond its front focal plane.
         """
-        f = self.first_order(wavelength_um)
-        distance_mm = 1e3 * torch.as_tensor(distance_m, dtype=self.dtype, device=self.semi_aperture_mm.device)
-        before = distance_mm - self._origin_z_mm(f, wavelength_um)  # of the first vertex
-        if not float(distance_mm.detach()) > 0 or not float(before.detach()) > 0:
-            raise DomainError(
-                f"{self.name}: a point {float(distance_mm.detach()) * 1e-3:.6g} m before the entrance pupil does "
-                "not lie before the lens; give a larger distance, inf for parallel light."
-            )
-        index = self.index(wavelength_um)
-        one = torch.ones_like(before)
-        heights, angles = paraxial.yu_trace(
-            self.surface_power(wavelength_um), self.thickness_mm, index, one, index[0] / before
-        )
-        if not float(angles[-1].detach()) < -1e-12:
-            raise DomainError(
-                f"{self.name}: a point {float(distance_mm.detach()) * 1e-3:.6g} m away lies inside the focal "
-                f"length ({float(f.efl_mm.detach()):.6g} mm), so its light leaves the lens without meeting; give "
-                "a larger distance, or a stronger lens."
-            )
-        image = -heights[-1] * index[-1] / angles[-1]
-        return self.replace(thickness_mm=torch.cat([self.thickness_mm[:-1], image.reshape(1)]))
+        image_mm = image_distance_mm(self, distance_m, wavelength_um, spot_grid)
+        return self.replace(thickness_mm=torch.cat([self.thickness_mm[:-1], image_mm.reshape(1)]))
 
     def scaled(self, factor):
         """A new lens with all lengths multiplied by ``factor`` (same f-number and angles), from the current

@@ -10,6 +10,7 @@ from codesign.lens.analysis import rms_spot_mm, spots
 from codesign.lens.design.solves import hold_efl, holding_surface
 from codesign.lens.geolens import LEARNABLES, GeoLens
 from codesign.lens.surface import sag_mm
+from codesign.lens.variables import ray_motion
 
 
 def edge_thickness_mm(lens):
@@ -113,14 +114,11 @@ def _motion(design, variable, fields_rad, step=1e-4):
     """Ray motion about the mean of each spot per unit of one variable, RMS-normalised: [rays * 2] mm."""
     shift = torch.zeros_like(design.basis[0])
     shift[variable] = step
-    (ahead, arrived), (behind, also) = (
-        spots(design.lens(shift), fields_rad),
-        spots(design.lens(-shift), fields_rad),
-    )
-    weight = (arrived * also)[..., None]
-    moved = (ahead - behind) / (2 * step)
-    moved = weight * (
-        moved - (moved * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1)
+    moved, weight = ray_motion(spots(design.lens(shift), fields_rad), spots(design.lens(-shift), fields_rad))
+    moved = moved / (2 * step)
+    weight = weight[..., None]
+    moved = moved - weight * moved.sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(
+        1
     )  # a shift of the whole spot does not blur
     return moved.reshape(-1) / (moved.shape[0] * moved.shape[1]) ** 0.5
 
