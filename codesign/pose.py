@@ -81,6 +81,8 @@ def check_poses(transform):
             f"poses must be [T >= 1, 4, 4], or [..., T >= 1, 4, 4] for several trajectories, got "
             f"{tuple(transform.shape)}."
         )
+    if transform.dtype not in (torch.float32, torch.float64):
+        raise DomainError(f"poses are {transform.dtype}; give float32 or float64, as by .double().")
     check_finite(transform, "poses")
     fixed = transform.detach().double()
     rotation = fixed[..., :3, :3]

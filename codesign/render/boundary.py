@@ -59,6 +59,11 @@ def boundary_term(camera, scene, T_world_cam, per_px=2.5):
             "gradient 'boundary' is there for cameras without aim, spectrum and falloff; drop these, or use "
             "'difference'."
         )
+    if not hasattr(camera.lens, "film_points"):
+        raise DomainError(
+            f"gradient 'boundary' needs a lens that says where points of space meet the film, but a "
+            f"{type(camera.lens).__name__} has no film_points; write it as GeoLens has it, or use 'interior'."
+        )
     shape = (*T_world_cam.shape[:-2], *camera.film.shape)
     frames_each = T_world_cam.shape[-3]
     T_world_cam = T_world_cam.reshape(-1, 4, 4)

@@ -1,11 +1,12 @@
 """A camera: a lens before a pixel grid. Makes camera-space rays and projects points."""
 
 import copy
+import math
 from dataclasses import dataclass, fields, replace
 
 import torch
 
-from codesign.errors import DomainError, check_finite
+from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.render.sampling import film_pupil_pattern
 from codesign.types import Rays
 
@@ -14,6 +15,8 @@ _STEP_MM = 1e-4
 # a first guess beyond the lens's field is drawn towards the axis this often, by this factor
 _SHRINK_STEPS = 3
 _SHRINK = 0.85
+CHECKED_ACROSS = 32
+CHECKED_RAYS = 16
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,20 @@ class Film:
         return (corners[:, None] + base).reshape(-1, 2)
 
 
+def coarse_pixels(film, every_px):
+    """Pixel coordinates [N, 2] on a grid over every window of the film, its last rows and columns
+    included."""
+    rows, columns = (
+        torch.linspace(0, n - 1, max(1, math.ceil((n - 1) / every_px)) + 1, dtype=torch.float64)
+        if n > 1
+        else torch.zeros(1, dtype=torch.float64)
+        for n in (film.height_px, film.width_px)
+    )
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
+    return (corners[:, None] + torch.stack([x.reshape(-1), y.reshape(-1)], 1)).reshape(-1, 2)
+
+
 def _check_whole(label, value):
     if not (value >= 1 and value % 1 == 0):
         raise DomainError(f"camera: {label} = {value} must be a whole number of at least 1.")
@@ -119,6 +136,11 @@ class Camera:
                 f"camera: {samples_per_pixel} samples per pixel cannot be shared equally by "
                 f"{len(spectrum.wavelengths_um)} wavelengths; make the one a multiple of the other."
             )
+        if not hasattr(lens, "camera_rays"):
+            raise DomainError(
+                f"camera: a {type(lens).__name__} has no camera_rays, so it is no lens; give a GeoLens, ThinLens, "
+                "Pinhole, or an object of your own with camera_rays and film_points as GeoLens has them."
+            )
         self.lens = lens
         self.samples_per_pixel = int(samples_per_pixel)
         self.seed = int(seed)
@@ -139,9 +161,46 @@ class Camera:
         twin.seed = int(seed)
         return twin
 
+    def check(self):
+        """Raise DomainError when some pixels of the film get no light at all through the lens; returns the
+        camera.
+
+        Pixels on a grid of about CHECKED_ACROSS across the film are looked at, by CHECKED_RAYS rays each; no
+        gradient. To be asked once per lens, before the first step of a design.
+        """
+        every_px = max(1, math.ceil(max(self.film.width_px, self.film.height_px) / CHECKED_ACROSS))
+        pixels = coarse_pixels(self.film, every_px)
+        _, pupil = film_pupil_pattern(CHECKED_RAYS, self.seed)
+        at = torch.cat([self.film.middle_px[None], pixels.repeat_interleave(CHECKED_RAYS, 0)])
+        with torch.no_grad():  # the axial ray goes along: a lens that passes nothing at all is another error
+            rays = self.rays_through(at, torch.cat([pupil.new_zeros(1, 2), pupil.repeat(len(pixels), 1)]))
+        dark = (rays.weight[1:].reshape(-1, CHECKED_RAYS) > 0).logical_not().all(1).cpu()
+        if bool(dark.any()):
+            radius_mm = self.film_mm(pixels).norm(dim=1)
+            lit_mm = float(radius_mm[~dark].max()) if not bool(dark.all()) else 0.0
+            raise DomainError(
+                f"camera: about {float(dark.double().mean()):.0%} of the film's pixels get no light: it comes as "
+                f"far as {lit_mm:.3g} mm from the axis, the film reaches {float(radius_mm.max()):.3g} mm; make "
+                "the film or its pixels smaller, or give a lens with a larger image circle."
+            )
+        return self
+
     def film_mm(self, pixels):
         """Upright image position in millimetres of pixel coordinates [N, 2]."""
         return (pixels - self.film.middle_px.to(pixels)) * self.film.pixel_pitch_mm
+
+    def given(self, rays):
+        """The same rays, or newly traced ones for None. Raises: ShapeError unless they are as many as this
+        camera has."""
+        if rays is None:
+            return self.rays()
+        count = math.prod(self.film.shape) * self.samples_per_pixel
+        if rays.weight.numel() != count:
+            raise ShapeError(
+                f"{rays.weight.numel()} rays for a camera of {math.prod(self.film.shape)} pixels with "
+                f"{self.samples_per_pixel} samples each; give the rays of this camera, camera.rays()."
+            )
+        return rays
 
     def rays(self):
         """All rays of one frame, pixel after pixel, samples_per_pixel each: Rays with N = pixels x samples,
@@ -177,7 +236,7 @@ class Camera:
 
     def _rays(self, offset, pupil, **wavelength):
         pixels = self.film.pixels()
-        dtype = self.lens.dtype
+        dtype = getattr(self.lens, "dtype", torch.float64)
         points = (pixels[:, None] + offset).reshape(-1, 2)
         return self.lens.camera_rays(
             self.film_mm(points).to(dtype),

@@ -5,8 +5,8 @@ from dataclasses import replace
 import torch
 
 from codesign.errors import DomainError
+from codesign.render.camera import coarse_pixels
 from codesign.render.moving import at_frames, cameras_in_parts, in_one_row
-from codesign.render.time import coarse_pixels
 from codesign.render.truth import first_hits
 from codesign.render.wavefront import shade
 

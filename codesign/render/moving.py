@@ -98,9 +98,27 @@ def parts(scene):
     return scene.scenes if isinstance(scene, MovingScene) else (scene,)
 
 
-def in_one_row(scene, T_world_cam):
+def scenes_and_poses(scene, T_world_cam):
+    """Pairs of a scene and the poses it is seen from, along the first axis of T_world_cam [W, ..., T, 4, 4],
+    where ``scene`` is a list or tuple of W scenes; None for a single scene."""
+    if not isinstance(scene, list | tuple):
+        return None
+    if T_world_cam.ndim < 4 or len(scene) != T_world_cam.shape[0]:
+        raise ShapeError(
+            f"{len(scene)} scenes for poses {tuple(T_world_cam.shape)}: give one scene for all trajectories, "
+            "or one for each entry of the first axis of poses [scenes, ..., T, 4, 4]."
+        )
+    return list(zip(scene, T_world_cam, strict=True))
+
+
+def in_one_row(scene, T_world_cam, rays=None):
     """The frames of a batch of trajectories [..., T, 4, 4] as one sequence: the scene for it, and poses
-    [N, 4, 4]."""
+    [N, 4, 4]; on one device with the rays."""
+    if rays is not None and rays.weight.device != T_world_cam.device:
+        raise DomainError(
+            f"poses are on {T_world_cam.device}, the rays of the camera on {rays.weight.device}; move one to "
+            "the other with .to(device)."
+        )
     check_poses(T_world_cam)
     if isinstance(scene, MovingScene):
         scene = scene.in_one_row(T_world_cam.shape[:-2])

@@ -15,7 +15,7 @@ import torch
 from codesign.errors import DomainError
 from codesign.pose import inverse, se3_exp
 from codesign.render.boundary import boundary_term
-from codesign.render.moving import at_frames, in_one_row
+from codesign.render.moving import at_frames, in_one_row, scenes_and_poses
 from codesign.render.wavefront import shade
 
 Way = Literal["interior", "boundary", "difference", "auto"]
@@ -47,34 +47,47 @@ class Choice:
         return f"{self.way}: relative error against differences: {measured}; the differences themselves {self.noise:.1%}"
 
 
-def frames(camera, scene, T_world_cam, gradient: Way = "interior", per_px=2.5):
+def frames(camera, scene, T_world_cam, gradient: Way = "interior", per_px=2.5, *, rays=None):
     """Frames of a scene along a trajectory, or along several.
 
-    Args: camera: Camera. scene: anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane).
+    Args: camera: Camera, before any lens with ``camera_rays`` (and ``film_points`` for "boundary"). scene:
+      anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane, MovingScene), or a list of scenes,
+      one for each entry of the first axis of T_world_cam.
       T_world_cam: [..., T, 4, 4], several trajectories in one batch as if each were rendered by itself.
       gradient: "interior", "boundary", "difference" or "auto", see the top of this file; the frames are the
         same. per_px: samples per pixel length of
-      silhouettes and edges for "boundary".
+      silhouettes and edges for "boundary". rays: ``camera.rays()`` where they are traced already (one trace
+      for many calls) or recorded, for "interior" and "boundary"; the boundary term traces its own points
+      through the camera's lens.
     Returns: [..., T, H, W] (or [..., T, windows, H, W] behind a Film with windows) linear irradiance in the scene's units, box-filtered over each
       pixel.
     Gradient: lens and poses; "interior" leaves out the motion of silhouettes.
-    Raises: DomainError for an unknown way, or a scene whose silhouettes are not known.
+    Raises: DomainError for an unknown way, rays that it cannot use, or a scene whose silhouettes are not
+      known; ShapeError for rays of another camera, or numbers of scenes and poses that differ.
     """
     if gradient not in WAYS:
         raise DomainError(f"gradient = {gradient!r} is not known; choose one of {', '.join(WAYS)}.")
+    if rays is not None and gradient not in PROVEN:
+        raise DomainError(
+            f"gradient {gradient!r} traces the lens at other values than the given rays have; leave rays out, "
+            "or choose 'interior' or 'boundary'."
+        )
+    if pairs := scenes_and_poses(scene, T_world_cam):
+        rays = camera.given(rays) if gradient in PROVEN else None
+        return torch.stack([frames(camera, s, poses, gradient, per_px, rays=rays) for s, poses in pairs])
     if gradient in ("auto", "difference"):
         row = in_one_row(scene, T_world_cam)
         if gradient == "auto":
             gradient = settled(camera, *row)
         if gradient == "difference":
             return by_differences(camera, *row).reshape(*T_world_cam.shape[:-2], *camera.film.shape)
-    found = image(camera, scene, T_world_cam)
+    found = image(camera, scene, T_world_cam, rays)
     return found + boundary_term(camera, scene, T_world_cam, per_px) if gradient == "boundary" else found
 
 
-def image(camera, scene, T_world_cam):
+def image(camera, scene, T_world_cam, rays=None):
     """Frames [..., T, *film.shape] with their interior gradient."""
-    return shade(camera.rays(), scene, T_world_cam, camera.samples_per_pixel).reshape(
+    return shade(camera.given(rays), scene, T_world_cam, camera.samples_per_pixel).reshape(
         *T_world_cam.shape[:-2], *camera.film.shape
     )
 
@@ -94,7 +107,9 @@ def by_differences(camera, scene, T_world_cam):
         for k in range(6):
             slope = pose_difference(camera, scene, T_world_cam, k)
             found = found + slope * twist[:, k].to(first).reshape(-1, *[1] * (first.ndim - 1))
-    for name, tensor in lens_tensors(camera.lens).items():
+    known = lens_tensors(camera.lens)
+    _check_known(camera.lens, known)
+    for name, tensor in known.items():
         for i in range(tensor.numel()):
             slope = lens_difference(camera, scene, T_world_cam, name, i)
             value = tensor.reshape(-1)[i]
@@ -140,6 +155,19 @@ def lens_tensors(lens):
     return {name: t for name, t in found.items() if torch.is_tensor(t) and t.requires_grad and t.numel()}
 
 
+def _check_known(lens, known):
+    """Raise DomainError when a lens of the user's own asks for gradients to parameters, none of which
+    differences know."""
+    if known or not isinstance(lens, torch.nn.Module):
+        return
+    for name, tensor in lens.named_parameters():
+        if tensor.requires_grad and tensor.numel():
+            raise DomainError(
+                f"differences know no step for the lens's parameter '{name}'; freeze it, or choose gradient "
+                "'interior' or 'boundary'."
+            )
+
+
 def lens_difference(camera, scene, T_world_cam, name, i):
     """Change of the frames per unit of one number of the lens, by central differences."""
     if name not in LENS_STEP:
@@ -170,6 +198,7 @@ def settled(camera, scene, T_world_cam):
     lens = lens_tensors(camera.lens)
     groups = [*(["pose"] if T_world_cam.requires_grad else []), *lens]
     if not groups:
+        _check_known(camera.lens, lens)
         return "interior"
     memory = scene.__dict__.setdefault("_ways", {})
     key = (tuple(groups), camera.film, camera.samples_per_pixel, type(camera.lens).__name__)

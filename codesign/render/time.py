@@ -14,6 +14,7 @@ import torch
 
 from codesign.errors import DomainError, check_finite
 from codesign.pose import check_poses
+from codesign.render.camera import coarse_pixels
 from codesign.render.moving import MovingScene, at_frames, in_one_row
 from codesign.render.truth import track
 from codesign.render.wavefront import shade
@@ -173,20 +174,6 @@ def crossing_error_px(largest_px, period_px, slope=1.0):
             f"slope = {slope} in 0..1."
         )
     return 2 * math.pi / period_px * largest_px**2 / (8 * slope)
-
-
-def coarse_pixels(film, every_px):
-    """Pixel coordinates [N, 2] on a grid over every window of the film, its last rows and columns
-    included."""
-    rows, columns = (
-        torch.linspace(0, n - 1, max(1, math.ceil((n - 1) / every_px)) + 1, dtype=torch.float64)
-        if n > 1
-        else torch.zeros(1, dtype=torch.float64)
-        for n in (film.height_px, film.width_px)
-    )
-    y, x = torch.meshgrid(rows, columns, indexing="ij")
-    corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
-    return (corners[:, None] + torch.stack([x.reshape(-1), y.reshape(-1)], 1)).reshape(-1, 2)
 
 
 def _displacement_px(camera, scene, trajectory, ends, grids, largest_px):

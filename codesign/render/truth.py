@@ -1,7 +1,7 @@
 """Ground truth through the current lens: points, depth, objects, flow and occlusion, in float64 with
 gradients."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from torch import Tensor
 from codesign.errors import ShapeError
 from codesign.pose import apply, check_poses, inverse
 from codesign.render.camera import project
-from codesign.render.moving import cameras_in_parts, in_one_row, parts, poses_of_parts
+from codesign.render.moving import cameras_in_parts, in_one_row, parts, poses_of_parts, scenes_and_poses
 
 # of lengths: 32 units in the last place of a float32, for a ray moved into an object's axes and met with its
 # surface
@@ -131,14 +131,18 @@ def true_flow(camera, scene, T_world_cam, stride=1):
     """Flow of every pixel centre from each pose to the one ``stride`` later, through the camera's current
     lens; points move with their object.
 
-    Args: camera with ``chief_rays`` and ``film``; scene with ``hit``, or a MovingScene; T_world_cam
-      [..., T, 4, 4], several trajectories in one batch.
+    Args: camera with ``chief_rays`` and ``film``; scene with ``hit``, a MovingScene, or a list of scenes, one
+      for each entry of the first axis of the poses; T_world_cam [..., T, 4, 4], several trajectories in one
+      batch.
     Returns: flow [..., T - stride, 2, *film.shape] px, +x right, +y down; valid [..., T - stride,
       *film.shape], False where the ray meets nothing or the point leaves the field of the lens (the flow is 0
       there).
     Gradient: to lens, camera and object poses. Occlusion at the later time is left to ``flow_and_occlusion``.
     Raises: ShapeError when there are not more poses than ``stride``.
     """
+    if pairs := scenes_and_poses(scene, T_world_cam):
+        found = [true_flow(camera, each, poses, stride) for each, poses in pairs]
+        return torch.stack([flow for flow, _ in found]), torch.stack([valid for _, valid in found])
     tracks, _, _ = _tracks(camera, scene, T_world_cam, stride)
     batch = _batch(T_world_cam, stride)
     return _flow(camera, tracks, batch), _mask(camera, [t.valid for t in tracks], batch)
@@ -152,6 +156,9 @@ def flow_and_occlusion(camera, scene, T_world_cam, stride=1):
     geometry, divided by the cosine at which the ray meets the point's own surface, since a ray aside by as
     much meets it earlier or later by that.
     """
+    if pairs := scenes_and_poses(scene, T_world_cam):
+        found = [flow_and_occlusion(camera, each, poses, stride) for each, poses in pairs]
+        return FlowTruth(*(torch.stack([getattr(f, n.name) for f in found]) for n in fields(FlowTruth)))
     tracks, scene, poses = _tracks(camera, scene, T_world_cam, stride)
     batch = _batch(T_world_cam, stride)
     return FlowTruth(
@@ -212,15 +219,15 @@ def _hidden(camera, scene, T_world_cam, found):
 def _tracks(camera, scene, T_world_cam, stride):
     """Tracks of all pairs of frames of all trajectories, and scene and poses [N, 4, 4] of the frames in one
     row."""
-    scene, poses = in_one_row(scene, T_world_cam)
+    pixels = camera.film.pixels()
+    rays = camera.chief_rays(pixels)
+    scene, poses = in_one_row(scene, T_world_cam, rays)
     length = T_world_cam.shape[-3]
     if not 1 <= stride < length:
         raise ShapeError(
             f"true flow over {stride} pose(s) ahead needs a stride of at least 1 and more poses than that, "
             f"got {length}; give more poses."
         )
-    pixels = camera.film.pixels()
-    rays = camera.chief_rays(pixels)
     starts = [first + now for first in range(0, poses.shape[0], length) for now in range(length - stride)]
     return [track(camera, scene, poses, now, now + stride, pixels, rays) for now in starts], scene, poses
 

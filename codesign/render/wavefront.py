@@ -14,7 +14,7 @@ def shade(rays, scene, T_world_cam, samples_per_pixel):
       silhouettes is not in it.
     """
     batch = T_world_cam.shape[:-2]
-    scene, T_world_cam = in_one_row(scene, T_world_cam)
+    scene, T_world_cam = in_one_row(scene, T_world_cam, rays)
     count = rays.weight.numel()
     poses = T_world_cam.shape[0]
     if not samples_per_pixel >= 1:

@@ -118,12 +118,8 @@ class PlacementTask:
 
     def frames(self, T_body_cam):
         """[T, B, H, W] of mounts [B, 4, 4]."""
-        rays = self.camera.rays()
         poses = self.poses(T_body_cam).unflatten(0, (len(self.worlds), -1))
-        parts = [
-            render.shade(rays, world, each, SAMPLES) for world, each in zip(self.worlds, poses, strict=True)
-        ]
-        return torch.cat(parts).unflatten(-1, self.camera.film.shape).transpose(0, 1)
+        return render.frames(self.camera, self.worlds, poses).flatten(0, 1).transpose(0, 1)
 
     def volume(self, frames, layer="memory"):
         """Event volume of frames [T, B, H, W]. layer: "memory" (hard counts, straight-through), "counts"
