@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import torch
 
+from codesign import backend
 from codesign.errors import DomainError
 from codesign.events.entry import check_frames
 
@@ -89,6 +90,21 @@ class FrontEnd:
     def accepts(self, dr, frames):
         """Mask of drjit values that may enter: finite, and >= 0 where they are linear."""
         return dr.isfinite(frames) if self.log_input else (frames >= 0) & (frames < math.inf)
+
+
+def kernel_levels(frames, front_end):
+    """Log levels of frames by the arithmetic of the kernels, which rounds alike on every processor (torch's
+    logarithm does not); also whether one may not enter (then the levels mean nothing). No gradient."""
+    import drjit as dr
+
+    arr = backend.arrays(frames.device.type, frames.dtype)
+    values = arr.Float(frames.detach().contiguous().reshape(-1))
+    with dr.suspend_grad():
+        found = front_end.traced(dr, values)[0]
+        bad = dr.any(~front_end.accepts(dr, values))
+        dr.eval(found, bad)
+    dr.sync_thread()
+    return found.torch().reshape(frames.shape).clone(), bool(bad[0])
 
 
 def log_levels(frames, log_input, minimum):

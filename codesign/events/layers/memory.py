@@ -6,7 +6,7 @@ from torch.autograd.function import once_differentiable
 
 from codesign.errors import ShapeError
 from codesign.events.entry import check_frames, check_layout, check_theta
-from codesign.events.intensity import FrontEnd, log_levels
+from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
 from codesign.events.layers import memory_kernel as kernel
 
 
@@ -83,7 +83,7 @@ class _MemorisedCounts(Function):
         # the first level comes by the arithmetic of the kernel: a static scene then differs from it by
         # nothing
         start = (
-            kernel.levels(frames[:1], front_end)[0].expand(2, *frames.shape[1:]) if state is None else state
+            kernel_levels(frames[:1], front_end)[0].expand(2, *frames.shape[1:]) if state is None else state
         )
         ctx.front_end = front_end
         ctx.first = int(state is None)

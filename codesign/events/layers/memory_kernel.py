@@ -19,21 +19,6 @@ import torch
 from codesign import backend
 
 
-def levels(frames, front_end):
-    """Log levels of frames by the arithmetic of the kernels; also whether one may not enter (then the levels
-    mean nothing)."""
-    import drjit as dr
-
-    arr = backend.arrays(frames.device.type, frames.dtype)
-    values = arr.Float(frames.detach().contiguous().reshape(-1))
-    with dr.suspend_grad():
-        found = front_end.traced(dr, values)[0]
-        bad = dr.any(~front_end.accepts(dr, values))
-        dr.eval(found, bad)
-    dr.sync_thread()
-    return found.torch().reshape(frames.shape).clone(), bool(bad[0])
-
-
 class _Run:
     """Frames, thresholds and the loop over time, in chunks."""
 

@@ -8,7 +8,7 @@ import torch
 from codesign import backend
 from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import check_frames, check_layout, check_times
-from codesign.events.intensity import FrontEnd
+from codesign.events.intensity import FrontEnd, kernel_levels
 from codesign.events.sensor import crossing, v2e
 from codesign.events.sensor.sinks import DenseCounts, EventKeys, KeyLayout
 from codesign.events.sensor.state import SensorState, begin
@@ -118,11 +118,10 @@ def _open(frames, t_s, sensor, generator, state, front_end):
     frames = frames.detach()
     if fresh:
         check_frames(frames[:1], 1, non_negative=not front_end.log_input)
-        level = (
-            v2e.front_end(frames[:1])
-            if sensor.timing == "v2e" and front_end == FrontEnd()
-            else front_end.level(frames[:1])
-        )
+        if sensor.timing == "v2e":
+            level = v2e.front_end(frames[:1]) if front_end == FrontEnd() else front_end.level(frames[:1])
+        else:
+            level, _ = kernel_levels(frames[:1], front_end)  # as those of all later frames
         begin(
             state,
             sensor,
