@@ -73,7 +73,8 @@ def study(run: Run[Config]):
                 "seconds_total",
                 "seconds_per_step",
             ):
-                run.record(**{f"{objective}_seed{seed}_{key}": m[key]})
+                if key in m:
+                    run.record(**{f"{objective}_seed{seed}_{key}": m[key]})
             run.record(
                 **{
                     f"{objective}_seed{seed}_edge_energy_ratio": m["edge_energy_hard_optimised"]

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shlex
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -61,8 +62,8 @@ def read_config(path: Path, study: str, kind: type[Config]) -> Config:
         ) from error
     if owner != study:
         raise FileFormatError(
-            f"'{path.parent}' is a run of the study '{owner}', not of '{study}'; resume it with 'python -m "
-            f"studies.{owner} --resume {path.parent}'."
+            f"'{path.parent}' is a run of the study '{owner}', not of '{study}'; resume it with: "
+            f"{resume_command(owner, path.parent)}"
         )
     known = {field.name for field in dataclasses.fields(kind)}
     if known != set(stored):
@@ -72,6 +73,11 @@ def read_config(path: Path, study: str, kind: type[Config]) -> Config:
         )
     hints = typing.get_type_hints(kind)
     return kind(**{name: _typed(value, hints[name]) for name, value in stored.items()})
+
+
+def resume_command(study: str, folder: Path) -> str:
+    """The line that goes on with the run in ``folder``, fit to be pasted into a shell."""
+    return f"python -m studies.{study} --resume {shlex.quote(str(folder))}"
 
 
 def configured(kind: type[Config], quick: bool, **given: Any) -> Config:

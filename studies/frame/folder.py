@@ -6,6 +6,7 @@ from pathlib import Path
 
 from codesign.atomic import write_atomic
 from codesign.errors import CodesignError
+from studies.frame.config import resume_command
 
 REMEDY = "choose a folder you may write to with --out"
 
@@ -26,8 +27,8 @@ def fresh(study: str, out: Path | None):
     if holds and (holds != ["config.json"] or owner(folder) != study):
         if owner(folder) == study:
             raise CodesignError(
-                f"'{folder}' already holds a run of this study; go on with it by --resume {folder}, or "
-                "choose another folder with --out."
+                f"'{folder}' already holds a run of this study; choose another folder with --out, or go on "
+                f"with it: {resume_command(study, folder)}"
             )
         raise CodesignError(
             f"the output folder '{folder}' holds other things "

@@ -2,11 +2,35 @@
 step and every few seconds."""
 
 import time
+from dataclasses import asdict, dataclass
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 SECONDS_BETWEEN_LINES = 5.0
+
+
+@dataclass
+class Pace:
+    """Seconds and number of the timed steps of one loop, over all sessions: the first step of each session,
+    which compiles kernels, apart from the others."""
+
+    seconds: float = 0.0
+    steps: int = 0
+    first_seconds: float = 0.0
+    first_steps: int = 0
+
+    def to_json(self):
+        """Plain values that ``Pace(**values)`` takes back."""
+        return asdict(self)
+
+    @property
+    def seconds_per_step(self):
+        """Mean seconds of a step; of first steps only where there were no others, None where there were
+        none."""
+        if self.steps:
+            return self.seconds / self.steps
+        return self.first_seconds / self.first_steps if self.first_steps else None
 
 
 class StepProgress:
@@ -18,17 +42,17 @@ class StepProgress:
       description: what the loop does, one or two words.
       done: steps already made, 0 for a fresh loop.
       interruption: codesign.interrupt.Interruption whose safe point every advance is.
+      pace: what earlier sessions measured; goes on to be filled.
     """
 
-    def __init__(self, console: Console, total: int, description: str, done: int, interruption):
+    def __init__(self, console: Console, total: int, description: str, done: int, interruption, pace: Pace):
         self.total = total
         self.description = description
         self.done = done
         self._console = console
         self._interruption = interruption
-        self._first_done: tuple[float, int] | None = (
-            None  # the first step compiles kernels and would spoil the rate
-        )
+        self._pace = pace
+        self._fresh = True  # no step of this session yet
         self._last_line = self._last_step = time.monotonic()
         self._bar = None
         if console.is_terminal:
@@ -60,16 +84,12 @@ class StepProgress:
         """One more whole step was made; ``numbers`` (loss=…) are shown. A pressed Ctrl-C takes effect here,
         after saving."""
         self.done += 1
-        self._last_step = time.monotonic()
-        if self._first_done is None:
-            self._first_done = (self._last_step, self.done)
+        first = self._fresh
+        self._time_step(first)
         shown = "  ".join(f"{name} {float(value):.4g}" for name, value in numbers.items())
         if self._bar:
             self._bar.update(self._task, completed=self.done, numbers=shown)
-        elif (
-            self.done in (self._first_done[1], self.total)
-            or self._last_step - self._last_line >= SECONDS_BETWEEN_LINES
-        ):
+        elif first or self.done == self.total or self._last_step - self._last_line >= SECONDS_BETWEEN_LINES:
             self._last_line = self._last_step
             self._console.print(
                 f"{self.description}  {self.done}/{self.total}  {shown}  {self._time_left()}".rstrip(),
@@ -79,17 +99,26 @@ class StepProgress:
             )
         self._interruption.safe_point()
 
+    def _time_step(self, first):
+        now = time.monotonic()
+        if first:
+            self._pace.first_seconds += now - self._last_step
+            self._pace.first_steps += 1
+        else:
+            self._pace.seconds += now - self._last_step
+            self._pace.steps += 1
+        self._last_step = now
+        self._fresh = False
+
     @property
     def seconds_per_step(self):
-        """Mean wall-clock seconds of a step of this session, the first (which compiles kernels) left out;
-        None before the second."""
-        if self._first_done is None or self.done <= self._first_done[1]:
-            return None
-        return (self._last_step - self._first_done[0]) / (self.done - self._first_done[1])
+        """Mean wall-clock seconds of a step over all sessions of the run whose state was stored, the first
+        step of each (which compiles kernels) left out where there are others; None where no step was timed."""
+        return self._pace.seconds_per_step
 
     def _time_left(self):
         each = self.seconds_per_step
-        if each is None or self.done >= self.total:
+        if each is None or not self._pace.steps or self.done >= self.total:
             return ""
         minutes, seconds = divmod(round(each * (self.total - self.done)), 60)
         return f"{minutes}:{seconds:02d} left"

@@ -19,8 +19,8 @@ import inspect
 import io
 import json
 import math
-import shlex
 import sys
+import time
 from collections.abc import Callable
 from numbers import Integral, Real
 from pathlib import Path
@@ -39,12 +39,13 @@ from codesign.interrupt import Interruption
 from codesign.report import page, prose
 from studies.frame import folder as folders
 from studies.frame import machine
-from studies.frame.config import Config, StudyConfig, read_config, resolved, to_json
-from studies.frame.progress import StepProgress
+from studies.frame.config import Config, StudyConfig, read_config, resolved, resume_command, to_json
+from studies.frame.progress import Pace, StepProgress
 
 __all__ = ["Run", "StudyConfig", "main", "open_run"]
 
 RESERVED = ("versions", "hardware")
+TIMES = "times"  # of the frame itself, among the numbers of state.npz
 
 
 class Run(Generic[Config]):
@@ -75,6 +76,12 @@ class Run(Generic[Config]):
         self._machine = {"versions": machine.versions(), "hardware": machine.hardware()}
         self._cards: list[page.Card] = []
         self._sections = [page.Section("")]
+        self._paces: dict[str, Pace] = {}
+        self._began = time.monotonic()
+        self._earlier_s = 0.0
+        if resumed and (stored := self._stored()) is not None:
+            self._earlier_s = stored.numbers[TIMES]["seconds"]
+            self._paces = {name: Pace(**pace) for name, pace in stored.numbers[TIMES]["loops"].items()}
         if resumed and (folder / "metrics.json").exists():
             self.metrics = _read_metrics(folder / "metrics.json")
 
@@ -88,9 +95,15 @@ class Run(Generic[Config]):
 
         Args:
           total: number of steps, those of earlier sessions included. done: how many earlier sessions made.
-        Returns: StepProgress, with ``seconds_per_step``.
+        Returns: StepProgress, with ``seconds_per_step``, which counts the steps of earlier sessions too.
         """
-        return StepProgress(self._console, total, description, done, self._interruption)
+        pace = self._paces.setdefault(description, Pace())
+        return StepProgress(self._console, total, description, done, self._interruption, pace)
+
+    @property
+    def seconds(self):
+        """Wall-clock seconds of this session, and of the earlier ones up to their last stored state."""
+        return self._earlier_s + time.monotonic() - self._began
 
     def on_interrupt(self, save: Callable[[], object]):
         """Call ``save`` when Ctrl-C was pressed, at the next ``advance``, where a step is whole. The last one
@@ -99,15 +112,20 @@ class Run(Generic[Config]):
 
     def save_state(self, tensors: dict[str, torch.Tensor], numbers: dict[str, Any]):
         """Store what is needed to go on, exactly, in one atomic write (see
-        codesign.state.write_state)."""
-        state.write_state(self.folder / "state.npz", tensors, numbers)
+        codesign.state.write_state), with the times of the loops and of the run."""
+        times = {
+            "seconds": self.seconds,
+            "loops": {name: pace.to_json() for name, pace in self._paces.items()},
+        }
+        state.write_state(self.folder / "state.npz", tensors, {"numbers": numbers, TIMES: times})
 
     def load_state(self):
         """State(tensors, numbers) stored by an earlier session, on the CPU; None for a fresh run.
 
         Raises: FileFormatError when the file is damaged.
         """
-        return state.read_state(self.folder / "state.npz")
+        stored = self._stored()
+        return stored and state.State(stored.tensors, stored.numbers["numbers"])
 
     def record(self, **numbers: float):
         """Add to metrics.json, written at once: flat names with their unit, finite numbers (0-d tensors too).
@@ -179,6 +197,13 @@ class Run(Generic[Config]):
         self.say(f"Done: {path}")
         return path
 
+    def _stored(self):
+        path = self.folder / "state.npz"
+        stored = state.read_state(path)
+        if stored is not None and stored.numbers.keys() != {"numbers", TIMES}:
+            raise FileFormatError(f"'{path}' was written by another version of this study; start a new run.")
+        return stored
+
     def _show(self, kind, block):
         self._sections[-1].blocks.append((kind, block))
 
@@ -233,9 +258,7 @@ def main(study: Callable[[Run[Config]], None], kind: type[Config], arguments: li
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        again = (
-            f"; go on with: python -m studies.{name} --resume {shlex.quote(str(run.folder))}" if run else ""
-        )
+        again = f"; go on with: {resume_command(name, run.folder)}" if run else ""
         print(f"interrupted{again}", file=sys.stderr)
         return 130
     return 0

@@ -9,7 +9,6 @@ sensor.
 """
 
 import sys
-import time
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
@@ -66,7 +65,6 @@ def study(run: Run[Config]):
         )
     steps = config.steps
     cases = config.cases
-    started = time.perf_counter()
     task = make_task(config.lens, config.seed, config.detuned_px)
     pool = make_worlds(TRAINING)
     chain = task.chain(config.samples, objective=config.objective)
@@ -140,7 +138,7 @@ def study(run: Run[Config]):
             f"{error} Optimisation stopped at step {len(history.loss) + 1}; the last good design is "
             f"{run.path('lens_optimised.json')}."
         ) from error
-    _finish(run, task, chain, descent, history, scored[0], config.judged, seconds, started)
+    _finish(run, task, chain, descent, history, scored[0], config.judged, seconds)
 
 
 def _restore(run, task, config):
@@ -166,7 +164,7 @@ def _restore(run, task, config):
     return descent, History(**numbers), first
 
 
-def _finish(run, task, chain, descent, history, probe, judged, seconds, started):
+def _finish(run, task, chain, descent, history, probe, judged, seconds):
     """Judge nominal, detuned and optimised lenses on held-out cases, record, and write the page."""
     optimised = lens.load(run.path("lens_optimised.json")).freeze()
     lenses = {"nominal": task.nominal, "detuned": task.design.reference, "optimised": optimised}
@@ -221,9 +219,10 @@ def _finish(run, task, chain, descent, history, probe, judged, seconds, started)
         loss_first=history.score[0],
         loss_last=descent.best_score,
         steps=len(history.loss),
-        seconds_per_step=seconds,
-        seconds_total=time.perf_counter() - started,
+        seconds_total=run.seconds,
     )
+    if seconds is not None:  # unknown when the run was killed before a timed step was stored
+        run.record(seconds_per_step=seconds)
     lens_opt_page.write(run, task, lenses, history, rows, probe, found)
 
 

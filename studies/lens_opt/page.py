@@ -132,7 +132,8 @@ def write(run, task, lenses, history, junctions, case, found):
     )
     control = f"Control without texture: detuned {m['flow_error_mrad_hard_control_detuned']:.2f} mrad, optimised {m['flow_error_mrad_hard_control_optimised']:.2f} mrad."
     run.text(control)
-    lead = f"{run.config.lens}, seed {run.config.seed}, objective {run.config.objective}: {m['steps']} steps at {m['seconds_per_step']:.2f} s."
+    pace = f" at {m['seconds_per_step']:.2f} s" if "seconds_per_step" in m else ""
+    lead = f"{run.config.lens}, seed {run.config.seed}, objective {run.config.objective}: {m['steps']} steps{pace}."
     run.finish("Lens optimisation for event flow", lead)
     run.say(
         f"flow error {m['flow_error_mrad_hard_detuned']:.3f} -> {m['flow_error_mrad_hard_optimised']:.3f} "

@@ -82,12 +82,13 @@ def show(run, names, spent, wall_s, frames_made):
         disk_mb=disk_mb,
         sequences=len(names),
         session_wall_s=wall_s,
-        session_frames_per_s=frames_made / wall_s,
     )
     run.record(**{f"session_{part.replace(' ', '_')}_s": seconds for part, seconds in spent.items()})
     run.card("Frames", f"{frames}", f"in {len(names)} sequences")
     run.card("Events", f"{events / 1e6:.2f} million", f"{events / max(frames - len(names), 1):.0f} per frame")
-    run.card("Speed", f"{frames_made / wall_s:.1f} frames/s", f"{wall_s:.0f} s in this session")
+    if frames_made:  # else the figures of the session that made the last ones stay
+        run.record(session_frames_per_s=frames_made / wall_s)
+        run.card("Speed", f"{frames_made / wall_s:.1f} frames/s", f"{wall_s:.0f} s in this session")
     run.card("Disk", f"{disk_mb:.0f} MB", f"{1e3 * disk_mb / frames:.0f} kB per frame, everything")
     run.section(
         "Contact sheet",

@@ -14,7 +14,6 @@ of one draw's error changes sign from pixel to pixel.
 
 import math
 import sys
-import time
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -55,7 +54,6 @@ def checked(config):
 
 def study(run: Run[Config]):
     size = checked(run.config)
-    began = time.monotonic()
     if run.device.type != "cpu":
         run.say("This study computes on the CPU; the device asked for stays unused.")
     task = make_task(TRAINING, size.motions, run.config.seed)
@@ -87,8 +85,7 @@ def study(run: Run[Config]):
         )
         for k, (mount, draw) in enumerate(zip(starts, draws, strict=True), 1)
     ]
-    seconds = found.seconds_before + time.monotonic() - began
-    report(run, size, task, held_out, grid, descents, randoms, seconds)
+    report(run, size, task, held_out, grid, descents, randoms)
 
 
 class Found:
@@ -98,8 +95,6 @@ class Found:
         self.run = run
         stored = run.load_state()
         self.tensors = dict(stored.tensors) if stored else {}
-        self.seconds_before = float(stored.numbers["seconds"]) if stored else 0.0
-        self._began = time.monotonic()
 
     def search(self, name, make, total):
         """Path of the search ``name``; ``make`` gets the function to call after each of its ``total``
@@ -112,9 +107,7 @@ class Found:
                 f"{name}/error": path.error,
                 f"{name}/renders": path.renders,
             }
-            self.run.save_state(
-                self.tensors, {"seconds": self.seconds_before + time.monotonic() - self._began}
-            )
+            self.run.save_state(self.tensors, {})
         return Path(*(self.tensors[f"{name}/{part}"] for part in ("T_body_cam", "error", "renders")))
 
 
@@ -156,7 +149,7 @@ def controls(task, best):
     }, sentence
 
 
-def report(run, size, task, held_out, grid, descents, randoms, seconds):
+def report(run, size, task, held_out, grid, descents, randoms):
     best = float(grid.error.min())
     finals = [float(p.error.min()) for p in descents]
     random_finals = [float(p.error.min()) for p in randoms]
@@ -183,7 +176,7 @@ def report(run, size, task, held_out, grid, descents, randoms, seconds):
         starts=len(finals),
         starts_within_10_percent_held_out_sensor=held_within,
         random_within_10_percent=sum(e <= 1.1 * best for e in random_finals),
-        seconds=seconds,
+        seconds=run.seconds,
         renders_per_search=int(descents[0].renders[-1]),
         samples=task.samples,
         renders=int(grid.renders[-1] + sum(p.renders[-1] for p in descents + randoms)),

@@ -4,6 +4,7 @@ nothing."""
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -192,6 +193,70 @@ def test_second_interrupt_ends_at_once(run):
     assert not saved, "in the middle of a step the state is not whole"
 
 
+def counted(run: Run[Config]):
+    """A study of ``sizes[0]`` steps of 20 ms, the first of every session 60 ms longer, and some judging, which
+    ends with Ctrl-C where limit is 9."""
+    stored = run.load_state()
+    done = first = stored.numbers["done"] if stored else 0
+    run.on_interrupt(lambda: run.save_state({}, {"done": done}))
+    with run.progress(run.config.sizes[0], "stepping", done=first) as bar:
+        while done < run.config.sizes[0]:
+            clock.now += 0.02 + 0.06 * (done == first)
+            done += 1
+            bar.advance()
+            if done == run.config.sizes[1] and not run.resumed:
+                signal.raise_signal(signal.SIGINT)
+    with run.progress(2, "judging") as judging:
+        for _ in range(2):
+            clock.now += 0.5
+            if run.config.limit == 9 and not run.resumed:
+                signal.raise_signal(signal.SIGINT)
+            judging.advance()
+    run.record(seconds_per_step=bar.seconds_per_step, seconds=run.seconds)
+    run.finish("Steps", "They were counted.")
+
+
+class Clock:
+    """Stands in for time.monotonic."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+clock = Clock()
+
+
+@pytest.mark.parametrize(
+    ("steps", "stop_at", "seconds_per_step", "seconds"),
+    [
+        (10, 4, 0.02, 10 * 0.02 + 2 * 0.06 + 1.0),  # stopped between steps (after the next one)
+        (10, None, 0.02, 10 * 0.02 + 0.06 + 1.5),  # stopped while judging: nothing is left but to judge again
+        (1, None, 0.08, 0.08 + 1.5),  # one step alone: it is all that was timed
+    ],
+)
+def test_time_per_step_counts_every_session(
+    tmp_path, capsys, monkeypatch, steps, stop_at, seconds_per_step, seconds
+):
+    monkeypatch.setattr("studies.frame.progress.time.monotonic", clock)
+    limit = "1" if stop_at else "9"
+    out = str(tmp_path / "out")
+    options = ["--out", out, "--sizes", str(steps), str(stop_at or 0), "--limit", limit]
+    assert main(counted, Config, options) == 130
+    assert f"--resume {out}" in capsys.readouterr().err
+    clock.now += 1000.0  # between the sessions
+    assert main(counted, Config, ["--resume", out]) == 0
+    found = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert found["seconds_per_step"] == pytest.approx(seconds_per_step, rel=1e-9)
+    assert found["seconds"] == pytest.approx(seconds, rel=1e-9)
+    # a run that is complete can be resumed as well, and writes its page again
+    (tmp_path / "out" / "report.html").unlink()
+    assert main(counted, Config, ["--resume", out]) == 0
+    assert (tmp_path / "out" / "report.html").exists()
+
+
 def test_command_leaves_what_the_contract_names(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(record_one, Config, ["--limit", "0.5", "--sizes", "3", "4", "5"]) == 0
@@ -282,6 +347,21 @@ def test_resume_needs_a_run_of_the_same_study(tmp_path, capsys):
     )
     assert main(record_one, Config, ["--resume", str(tmp_path / "other")]) == 2
     assert "another version of this study (fields that differ: colour)" in capsys.readouterr().err
+
+
+def test_hints_can_be_pasted_into_a_shell(tmp_path, capsys):
+    """Read back by a shell's rules, the command of a hint names the folder as it is."""
+    folder = tmp_path / "it's a folder; rm"
+    open_run("test_run", Config(out=folder)).record(number=1)
+    assert main(record_one, Config, ["--out", str(folder)]) == 2
+    first = capsys.readouterr().err
+    stored = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps({**stored, "study": "other"}))
+    assert main(record_one, Config, ["--resume", str(folder)]) == 2
+    second = capsys.readouterr().err
+    for complaint, study in ((first, "test_run"), (second, "other")):
+        command = complaint[complaint.index("python -m") :]
+        assert shlex.split(command) == ["python", "-m", f"studies.{study}", "--resume", str(folder)]
 
 
 def test_resume_takes_the_stored_configuration(tmp_path):

@@ -2,6 +2,7 @@
 frame interval or several, and the frames."""
 
 import json
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -211,8 +212,8 @@ def _places(folder, names):
         files = {name: entry["bytes"] for name, entry in manifest["files"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise FileFormatError(
-            f"{folder} is no data set: its manifest.json is missing or malformed, so it was not finished "
-            "('python -m studies.make_dataset --resume' does)."
+            f"{folder} is no data set: its manifest.json is missing or malformed, so it was not finished; "
+            f"finish it with: python -m studies.make_dataset --resume {shlex.quote(str(folder))}"
         ) from error
     if kind != FORMAT:
         raise FileFormatError(f"{path} says format {kind!r}; {FORMAT!r} is read.")
