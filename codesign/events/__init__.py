@@ -12,10 +12,11 @@ from codesign.events.layers.by_name import LAYERS, layer
 from codesign.events.layers.dense import dense
 from codesign.events.layers.expected import annealed, expected
 from codesign.events.layers.layer import ComparatorLayer, EventLayer, PhysicalLayer
-from codesign.events.layers.low_pass import low_pass
 from codesign.events.layers.memory import memory, soft_counts
 from codesign.events.layers.physical import PhysicalState, sensor_counts
+from codesign.events.layers.positive import PositiveValues
 from codesign.events.layers.soft import soft
+from codesign.events.low_pass import low_pass, one_pole
 from codesign.events.sensor.model import PRESETS, SensorModel, draw_shot_counts, draw_thresholds
 from codesign.events.sensor.naive import naive
 from codesign.events.sensor.simulate import dense_counts, simulate
@@ -46,6 +47,7 @@ __all__ = [
     "Laplace",
     "PhysicalLayer",
     "PhysicalState",
+    "PositiveValues",
     "RecordedFrames",
     "SensorModel",
     "SensorState",
@@ -75,6 +77,7 @@ __all__ = [
     "low_pass",
     "memory",
     "naive",
+    "one_pole",
     "open_frames",
     "picture",
     "rates",

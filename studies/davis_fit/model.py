@@ -1,18 +1,16 @@
 """The sensor whose parameters are fitted: dark offset, blur, low-pass, two thresholds on a memorised level,
 and noise that fades with light."""
 
-import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 import torch
-import torch.nn.functional as F
+from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
 from codesign import events
 
 BLUR_SIGMA_PX = 1.0
-BLUR_RADIUS_PX = 4
+BLUR_TAPS = 9
 START = {
     "theta_on": 0.2,
     "theta_off": 0.2,
@@ -46,42 +44,38 @@ def clip(frames, step_s, per_interval):
 
 
 class FittedSensor(torch.nn.Module):
-    """Sensor with unconstrained parameters; ``values()`` are the physical ones, exp of the stored: theta_on,
-    theta_off (natural log units),
-    dark_offset (units of the 0-255 scale), blur_odds (share s of the blurred picture as s/(1-s)),
-    time_constant_s, noise_on_hz, noise_off_hz
-    (events per pixel and second in the dark).
+    """Sensor that is fitted: an event layer with learnt thresholds, and what stands before and behind it.
+
+    ``values()`` are: theta_on, theta_off (natural log units), dark_offset (units of the 0-255 scale),
+    blur_odds (share s of the blurred picture as s/(1-s)), time_constant_s, noise_on_hz, noise_off_hz (events
+    per pixel and second in the dark). A unit step of a parameter is a tenth of its value.
     """
 
     def __init__(self, **start: float):
         super().__init__()
-        self.raw = torch.nn.ParameterDict(
-            {
-                name: torch.nn.Parameter(torch.tensor(math.log(value)))
-                for name, value in {**START, **start}.items()
-            }
-        )
+        begun = {**START, **start}
+        sensor = events.SensorModel(begun.pop("theta_on"), begun.pop("theta_off"))
+        self.pixel = events.layer("memory", sensor, log_input=True)
+        self.others = events.PositiveValues(begun)
 
     def values(self):
         """Dictionary of the physical values, 0-d tensors with gradients."""
-        return {name: raw.exp() for name, raw in self.raw.items()}
+        return {name: part[name] for part in (self.pixel.learnt, self.others) for name in part}
 
     def levels(self, clip):
         """Level that the comparators see, [(T-1) n + 1, H, W]: low-pass of ln((1 - s) sharp + s blurred +
         dark_offset)."""
-        now = self.values()
-        share = now["blur_odds"] / (1 + now["blur_odds"])
-        return low_pass(
-            (torch.lerp(clip.sharp, clip.blurred, share) + now["dark_offset"]).log(),
-            clip.step_s,
-            now["time_constant_s"],
-        )
+        share = self.others["blur_odds"] / (1 + self.others["blur_odds"])
+        level = (
+            torch.lerp(clip.sharp, clip.blurred, share.to(clip.sharp)) + self.others["dark_offset"]
+        ).log()
+        pace = clip.step_s / self.others["time_constant_s"]
+        return events.one_pole(level, pace.to(level).expand(len(level) - 1))
 
     def signal(self, clip):
         """Hard counts per recorded interval, [T-1, 2, H, W], with the straight-through gradient of
         ``events.memory``."""
-        now = self.values()
-        counts, _ = events.memory(self.levels(clip), now["theta_on"], now["theta_off"], log_input=True)
+        counts = self.pixel(self.levels(clip), torch.arange(len(clip.sharp)) * clip.step_s)
         return counts.unflatten(0, (-1, clip.per_interval)).sum(1)
 
     def noise(self, clip):
@@ -109,25 +103,7 @@ class FittedSensor(torch.nn.Module):
         return self.signal(clip) + torch.poisson(self.noise(clip), generator=generator)
 
 
-def low_pass(level, step_s, time_constant_s):
-    """One-pole low-pass of a level that runs linearly between its samples, exact.
-
-    Args: level: [T, ...]. step_s: time between samples. time_constant_s: tensor > 0.
-    Returns: [T, ...], starting at rest: y' = (L - y)/tau, y(0) = L(0). A steady ramp comes out tau later.
-    Gradient: level, time_constant_s.
-    """
-    fade = torch.exp(-step_s / time_constant_s)
-    out = [level[0]]
-    for before, now in pairwise(level):
-        lag = (now - before) * (time_constant_s / step_s)
-        out.append(now - lag + (out[-1] - before + lag) * fade)
-    return torch.stack(out)
-
-
 def blur(frames):
     """Gaussian blur of 1 px, edges repeated. frames: [T, H, W]."""
-    place = torch.arange(-BLUR_RADIUS_PX, BLUR_RADIUS_PX + 1, dtype=frames.dtype)
-    weight = torch.exp(-place.square() / (2 * BLUR_SIGMA_PX**2))
-    weight = weight / weight.sum()
-    wide = F.pad(frames[:, None], (BLUR_RADIUS_PX,) * 4, mode="replicate")
-    return F.conv2d(F.conv2d(wide, weight[None, None, :, None]), weight[None, None, None, :])[:, 0]
+    size = (BLUR_TAPS, BLUR_TAPS)
+    return gaussian_blur2d(frames[:, None], size, (BLUR_SIGMA_PX, BLUR_SIGMA_PX), "replicate")[:, 0]

@@ -8,7 +8,7 @@ from codesign import events
 from studies.davis_fit.loss import match
 from studies.davis_fit.score import correlation, signed
 
-LEARNING_RATE = 0.1  # of logarithms: a step of at most a tenth of each parameter, which falls to 0 on a line
+LEARNING_RATE = 1.0  # a step of about a tenth of each value, which falls to 0 on a line
 NAIVE_THETAS = [0.03 * 1.25**k for k in range(14)]  # to 0.55
 NAIVE_DARK_OFFSETS = (2.5, 5.0, 10.0, 20.0, 40.0)
 

@@ -69,70 +69,70 @@ def test_a_layer_is_its_function(name, dtype):
 @pytest.mark.parametrize("name", SMOOTH)
 def test_gradients_of_smooth_layers_are_differences(name):
     frames, t_s = drifting(1, 2, frames=5)
-    learnt = layer(name, NOISY, learn=("theta_on", "theta_off", "cutoff_hz"))
-    names, variables = zip(*learnt.named_parameters(), strict=True)
+    made = layer(name, NOISY, learn=("theta_on", "theta_off", "cutoff_hz"))
+    names, variables = zip(*made.named_parameters(), strict=True)
 
     def counts(frames, *values):
         given = dict(zip(names, values, strict=True))
-        return torch.func.functional_call(learnt, given, (frames, t_s))
+        return torch.func.functional_call(made, given, (frames, t_s))
 
-    assert names == ("variables.theta_on", "variables.theta_off", "variables.cutoff_hz")
+    assert names == ("learnt.raw.theta_on", "learnt.raw.theta_off", "learnt.raw.cutoff_hz")
     assert torch.autograd.gradcheck(counts, (frames.requires_grad_(), *variables))
 
 
 def test_the_memory_layer_has_the_slope_of_the_mean_count():
     # a climb of D: mean ON count (D - w/2)/C with the play w = (C + C_off)/2 round the first level
     level = torch.tensor([4.0, 4.35, 4.9], dtype=D).requires_grad_()
-    learnt = layer("memory", PLAIN, log_input=True)
-    learnt(level[:, None, None], torch.arange(3.0))[:, 0].sum().backward()
+    made = layer("memory", PLAIN, log_input=True)
+    made(level[:, None, None], torch.arange(3.0))[:, 0].sum().backward()
     torch.testing.assert_close(level.grad, torch.tensor([-1 / 0.15, 0, 1 / 0.15], dtype=D))
     slope_on = -(0.9 - 0.175 / 2) / 0.15**2 - 1 / (4 * 0.15)
     slope_off = -1 / (4 * 0.15)
     tenth = 0.1  # of a threshold, per unit of its variable
-    assert float(learnt.variables["theta_on"].grad) == pytest.approx(tenth * 0.15 * slope_on)
-    assert float(learnt.variables["theta_off"].grad) == pytest.approx(tenth * 0.2 * slope_off)
+    assert float(made.learnt.raw["theta_on"].grad) == pytest.approx(tenth * 0.15 * slope_on)
+    assert float(made.learnt.raw["theta_off"].grad) == pytest.approx(tenth * 0.2 * slope_off)
 
 
 def test_the_spiking_layer_has_the_slope_of_its_surrogate():
     # one step d of the level: u = d for ON, -d for OFF; fast sigmoid of the width of the mean threshold w
     level = torch.tensor([4.0, 4.13], dtype=D).requires_grad_()
-    learnt = layer("srm", PLAIN, log_input=True)
-    counts = learnt(level[:, None, None], torch.arange(2.0))
+    made = layer("srm", PLAIN, log_input=True)
+    counts = made(level[:, None, None], torch.arange(2.0))
     assert counts.flatten().tolist() == [0, 0]
     (counts * torch.tensor([1.0, 2.0])[:, None, None]).sum().backward()
     width = 0.175
     on, off = (1 / (2 * width * (1 + abs(u - c) / width) ** 2) for u, c in ((0.13, 0.15), (-0.13, 0.2)))
     torch.testing.assert_close(level.grad, torch.tensor([-1, 1], dtype=D) * (on - 2 * off))
-    assert float(learnt.variables["theta_on"].grad) == pytest.approx(-0.1 * 0.15 * on)
-    assert float(learnt.variables["theta_off"].grad) == pytest.approx(-0.1 * 0.2 * 2 * off)
+    assert float(made.learnt.raw["theta_on"].grad) == pytest.approx(-0.1 * 0.15 * on)
+    assert float(made.learnt.raw["theta_off"].grad) == pytest.approx(-0.1 * 0.2 * 2 * off)
 
 
 @pytest.mark.parametrize("sensor", [PLAIN, NOISY], ids=["plain", "noisy"])
 @pytest.mark.parametrize("name", LAYERS)
 def test_a_batch_is_its_samples_one_by_one(name, sensor):
     frames, t_s = drifting(2, 3, 4, 5, frames=12)
-    learnt = layer(name, sensor)
+    made = layer(name, sensor)
     together = seeded(7)
     alone = seeded(7)
-    counts = learnt(frames, t_s, together)
-    singles = [learnt(sample, t_s, alone) for sample in frames.flatten(0, 1)]
+    counts = made(frames, t_s, together)
+    singles = [made(sample, t_s, alone) for sample in frames.flatten(0, 1)]
     assert counts.shape == (2, 3, 11, 2, 4, 5)
     torch.testing.assert_close(counts.flatten(0, 1), torch.stack(singles), rtol=1e-12, atol=1e-12)
     assert torch.equal(together.get_state(), alone.get_state())
-    each = learnt(frames, t_s, [seeded(k) for k in range(6)])
-    torch.testing.assert_close(each[1, 2], learnt(frames[1, 2], t_s, seeded(5)), rtol=1e-12, atol=1e-12)
+    each = made(frames, t_s, [seeded(k) for k in range(6)])
+    torch.testing.assert_close(each[1, 2], made(frames[1, 2], t_s, seeded(5)), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", LAYERS)
 def test_gradients_of_a_batch_are_those_of_its_samples(name):
     frames, t_s = drifting(3, 4, 5, frames=12)
     weight = torch.randn(3, 11, 2, 4, 5, generator=seeded(2), dtype=D)
-    learnt = layer(name, SensorModel(0.15, 0.2, cutoff_hz=60.0))
+    made = layer(name, SensorModel(0.15, 0.2, cutoff_hz=60.0))
     frames.requires_grad_()
-    inputs = (frames, *learnt.parameters())
-    whole = torch.autograd.grad((weight * learnt(frames, t_s)).sum(), inputs)
+    inputs = (frames, *made.parameters())
+    whole = torch.autograd.grad((weight * made(frames, t_s)).sum(), inputs)
     parts = [
-        torch.autograd.grad((w * learnt(f, t_s)).sum(), inputs) for w, f in zip(weight, frames, strict=True)
+        torch.autograd.grad((w * made(f, t_s)).sum(), inputs) for w, f in zip(weight, frames, strict=True)
     ]
     for found, *each in zip(whole, *parts, strict=True):
         torch.testing.assert_close(found, sum(each))
@@ -142,12 +142,12 @@ def test_gradients_of_a_batch_are_those_of_its_samples(name):
 @pytest.mark.parametrize("name", LAYERS)
 def test_chunks_are_the_whole(name, batch):
     frames, t_s = drifting(*batch, 6, 5)
-    learnt = layer(name, NOISY)
-    whole = learnt(frames, t_s)
+    made = layer(name, NOISY)
+    whole = made(frames, t_s)
     parts = []
     state = None
     for start, stop in ((0, 10), (10, 11), (11, 30)):
-        counts, state = learnt.advance(frames[..., start:stop, :, :], t_s[start:stop], state)
+        counts, state = made.advance(frames[..., start:stop, :, :], t_s[start:stop], state)
         parts.append(counts)
     torch.testing.assert_close(torch.cat(parts, -4), whole, rtol=0, atol=1e-12)
 
@@ -181,22 +181,22 @@ def test_the_physical_layer_gives_the_events_of_the_sensor():
 def test_a_unit_step_of_a_variable_is_a_tenth_and_moves_every_pixel():
     frames, t_s = drifting(6, 5)
     sensor = SensorModel(0.15, 0.2, 0.03, 60.0)
-    learnt = layer("memory", sensor, learn=("theta_on", "cutoff_hz"))
-    assert learnt.fitted() == sensor
+    made = layer("memory", sensor, learn=("theta_on", "cutoff_hz"))
+    assert made.fitted() == sensor
     with torch.no_grad():
-        learnt.variables["theta_on"] += 2
-        learnt.variables["cutoff_hz"] -= 1
+        made.learnt.raw["theta_on"] += 2
+        made.learnt.raw["cutoff_hz"] -= 1
     theta_on = 0.15 * math.exp(0.2)
-    moved = learnt.fitted()
+    moved = made.fitted()
     assert moved.theta_on == pytest.approx(theta_on, rel=1e-15)
     assert moved.cutoff_hz == pytest.approx(60 * math.exp(-0.1), rel=1e-15)
     assert (moved.theta_off, moved.theta_sigma) == (0.2, 0.03)
     on, off = draw_deviates((6, 5), seeded(0), dtype=D)
     level = events.low_pass(events.lin_log(frames), frames, t_s.diff(), moved.cutoff_hz)
     truth, _ = events.memory(level, theta_on + 0.03 * on, 0.2 + 0.03 * off, log_input=True)
-    assert torch.equal(learnt(frames, t_s), truth)
+    assert torch.equal(made(frames, t_s), truth)
     again = layer("memory", SensorModel(0.4, cutoff_hz=1.0), learn=("theta_on", "cutoff_hz"))
-    again.load_state_dict(learnt.state_dict())
+    again.load_state_dict(made.state_dict())
     assert again.fitted().theta_on == moved.theta_on
     assert again.fitted().cutoff_hz == moved.cutoff_hz
 
@@ -209,15 +209,15 @@ def test_learnt_thresholds_find_those_behind_the_counts(name):
     wave = (0.4 * x[:, None] + 0.23 * x + 40 * t_s[:, None, None]).sin()
     level = 4.2 + 0.7 * wave + 0.3 * (0.3 * x - 25 * t_s[:, None, None]).cos()
     truth, _ = events.memory(level, 0.17, 0.23, log_input=True)
-    learnt = layer(name, SensorModel(0.3, 0.3), log_input=True)
-    optimiser = torch.optim.Adam(learnt.parameters(), lr=0.5)  # of a tenth
+    made = layer(name, SensorModel(0.3, 0.3), log_input=True)
+    optimiser = torch.optim.Adam(made.parameters(), lr=0.5)  # of a tenth
     for step in range(80):
         optimiser.param_groups[0]["lr"] = 0.5 * 0.95**step
         optimiser.zero_grad()
-        ((learnt(level, t_s).sum(0) - truth.sum(0)) ** 2).mean().backward()
+        ((made(level, t_s).sum(0) - truth.sum(0)) ** 2).mean().backward()
         optimiser.step()
-    assert learnt.fitted().theta_on == pytest.approx(0.17, rel=0.02)
-    assert learnt.fitted().theta_off == pytest.approx(0.23, rel=0.02)
+    assert made.fitted().theta_on == pytest.approx(0.17, rel=0.02)
+    assert made.fitted().theta_off == pytest.approx(0.23, rel=0.02)
 
 
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])

@@ -3,13 +3,11 @@ are known."""
 
 import json
 import math
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import solve_ivp
 
 from codesign import events
 from codesign.errors import DomainError, FileFormatError, ShapeError
@@ -18,7 +16,7 @@ from studies.davis_fit import __main__ as study
 from studies.davis_fit.compare import judge
 from studies.davis_fit.limits import cancelled_share, median_motion_px, still_events
 from studies.davis_fit.loss import LOSSES, match
-from studies.davis_fit.model import Clip, FittedSensor, blur, clip, low_pass
+from studies.davis_fit.model import Clip, FittedSensor, blur, clip
 from studies.davis_fit.recording import Recording, load
 from studies.davis_fit.score import (
     block_sums,
@@ -170,25 +168,6 @@ def test_still_pixels_and_motion_are_counted_as_by_hand():
     assert median_motion_px(flow, counts) == pytest.approx(
         [2.0]
     )  # of 5 and 2, the two that fired twice; torch takes the lower
-
-
-def test_low_pass_follows_the_differential_equation(generator):
-    t_s = torch.arange(8, dtype=D) * 0.01
-    level = torch.randn(8, 3, dtype=D, generator=generator)
-    tau_s = torch.tensor(0.007, dtype=D)
-    truth = [level[0].numpy()]
-    out = low_pass(level, 0.01, tau_s)
-    for before, now in pairwise(level.numpy()):  # one smooth piece at a time
-        piece = (lambda t, y, a, b: (a + (b - a) * t / 0.01 - y) / 0.007), (0, 0.01), truth[-1]
-        truth.append(solve_ivp(*piece, args=(before, now), method="DOP853", rtol=1e-11, atol=1e-12).y[:, -1])
-    assert (
-        np.abs(out.numpy() - np.array(truth)).max() < 1e-9
-    )  # the solver's tolerance over seven pieces, with room
-    ramp = low_pass((3 * t_s)[:, None], 0.01, tau_s)[:, 0]
-    assert torch.allclose(ramp, 3 * (t_s - tau_s * (1 - torch.exp(-t_s / tau_s))), atol=1e-14)
-    assert torch.autograd.gradcheck(
-        lambda level, tau_s: low_pass(level, 0.01, tau_s), (level.requires_grad_(), tau_s.requires_grad_())
-    )
 
 
 def test_blur_is_a_gaussian_of_one_pixel():

@@ -6,7 +6,7 @@ frames [T, ...] give counts [T-1, 2, ...], ON first, and with a state of an earl
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -36,7 +36,7 @@ class Sigmoid:
     """``events.soft``: sigmoid of the step between two frames, no memory. sharpness: k, or None for 5/theta."""
 
     sharpness: float | None = None
-    mismatched: ClassVar[bool] = False
+    mismatched = False
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -51,7 +51,7 @@ class Sigmoid:
 class SoftCounts:
     """``events.soft_counts``: |dL|/theta between two frames, no memory."""
 
-    mismatched: ClassVar[bool] = True
+    mismatched = True
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -65,7 +65,7 @@ class Dense:
     """``events.dense``: at most one event per frame and polarity. sharpness: b of the surrogate slope."""
 
     sharpness: float = 5.0
-    mismatched: ClassVar[bool] = True
+    mismatched = True
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -77,7 +77,7 @@ class Dense:
 class Memory:
     """``events.memory``: hard counts against the memorised level."""
 
-    mismatched: ClassVar[bool] = True
+    mismatched = True
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -91,7 +91,7 @@ class Expected:
     thresholds, in place of a drawn one; assign to anneal it (see ``events.annealed``)."""
 
     spread: float = 0.15
-    mismatched: ClassVar[bool] = False
+    mismatched = False
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -104,7 +104,7 @@ class Spikes:
     """``events.srm`` with step kernels and coupled polarities, fed with steps of the log level: at most one
     event per frame and polarity, the rest of a step stays for the frames after it."""
 
-    mismatched: ClassVar[bool] = True
+    mismatched = True
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Any, log_input: bool

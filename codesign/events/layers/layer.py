@@ -12,21 +12,21 @@ from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import check_layout, check_times
 from codesign.events.intensity import log_levels
 from codesign.events.layers.comparators import Comparator
-from codesign.events.layers.low_pass import low_pass
 from codesign.events.layers.physical import DESIGN, sensor_counts
+from codesign.events.layers.positive import PositiveValues
+from codesign.events.low_pass import low_pass
 from codesign.events.sensor.model import SensorModel, draw_deviates, draw_shot_counts, mismatched
 from codesign.events.volumes.volume import from_counts
 from codesign.types import EventVolume
 
-STEP = 0.1  # a unit step of a variable changes its value by a tenth: exp(0.1) - 1 = 10.5 %
 THRESHOLDS = ("theta_on", "theta_off")
 
 
 class EventLayer(nn.Module):
     """What all event layers share; ``events.layer(name)`` makes one.
 
-    sensor: SensorModel that it starts from. learn: fields of the sensor to learn, each a variable v = 0 at
-      first with the value exp(0.1 v) times the sensor's: positive, and a unit step is about 10 %.
+    sensor: SensorModel that it starts from. learn: fields of the sensor to learn, kept in
+      ``learnt`` as unconstrained variables; a unit step of one is about 10 % of its value.
     log_input: frames are log levels instead of linear intensity.
     """
 
@@ -51,24 +51,16 @@ class EventLayer(nn.Module):
                 raise DomainError(
                     f"{name} is 0 in the sensor, so it is switched off; give a value above 0 to learn it."
                 )
-        self.variables = nn.ParameterDict(
-            [(name, nn.Parameter(torch.zeros((), dtype=torch.float64))) for name in learn]
-        )
-        for name in learn:  # buffers, so that a saved layer is complete
-            start = torch.tensor(getattr(self.sensor, name), dtype=torch.float64)
-            self.register_buffer(f"start_{name}", start)
+        self.learnt = PositiveValues({name: getattr(self.sensor, name) for name in learn})
 
     def value(self, name: str) -> Tensor | float:
         """A field of the sensor as it is now: a 0-dim tensor with a gradient where it is learnt, a number
         otherwise."""
-        if name in self.variables:
-            return getattr(self, f"start_{name}") * (STEP * self.variables[name]).exp()
-        return getattr(self.sensor, name)
+        return self.learnt[name] if name in self.learnt else getattr(self.sensor, name)
 
     def fitted(self) -> SensorModel:
         """The sensor with all values as they are now, for ``events.simulate``."""
-        now = {name: float(torch.as_tensor(self.value(name)).detach()) for name in self.variables}
-        return replace(self.sensor, **now)
+        return replace(self.sensor, **{name: float(self.learnt[name].detach()) for name in self.learnt})
 
     def forward(
         self, frames: Tensor, t_s: Tensor, generator: Generator | Sequence[Generator] | None = None
@@ -224,7 +216,7 @@ class PhysicalLayer(EventLayer):
 
     def _count(self, frames, t_s, state, generators):
         samples = frames.reshape(len(frames), -1, *frames.shape[-2:]).unbind(1)
-        design = {name: self.value(name) for name in self.variables}
+        design = {name: self.value(name) for name in self.learnt}
         counts, states = zip(
             *(
                 sensor_counts(

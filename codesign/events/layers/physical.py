@@ -9,8 +9,8 @@ from torch import Tensor
 from codesign.errors import DomainError
 from codesign.events.entry import check_frames, check_times
 from codesign.events.intensity import FrontEnd
-from codesign.events.layers.low_pass import low_pass
 from codesign.events.layers.memory import memory
+from codesign.events.low_pass import low_pass
 from codesign.events.sensor.model import mismatched
 from codesign.events.sensor.simulate import dense_counts
 from codesign.events.sensor.state import SensorState

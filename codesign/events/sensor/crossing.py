@@ -15,6 +15,7 @@ import torch
 
 from codesign import backend
 from codesign.events.intensity import light_share
+from codesign.events.low_pass import coefficients, passed
 from codesign.events.sensor.random_bits import exponential, hashed, normal_pair, uniform
 
 # of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop counting
@@ -147,7 +148,8 @@ class _Step:
             light = None
             before = now["level"]
         if sensor.cutoff_hz > 0:
-            now["level"] = self._low_passed(light * self.omega * dt_s, level, now)
+            fade, mean = coefficients(light * self.omega * dt_s, dr.exp, dr.select)
+            now["level"] = passed(now["level"], now["input_level"], level, fade, mean)
             now["input_level"] = level
         else:
             now["level"] = level
@@ -168,18 +170,6 @@ class _Step:
             rise = self.leak_hz * dt_s
             base = base - (rise * (1 - self.jitter * gauss[1]) if self.jitters else rise) * self.theta_on
         return now, self._fire(index, dt_s, light, start, signal, base, now)
-
-    def _low_passed(self, share, level, now):
-        """Exact answer of the one-pole filter to an input that is linear over the interval; ``share``:
-        interval over time constant."""
-        dr = self.dr
-        fade = dr.exp(-share)
-        mean = dr.select(
-            share < 0.05,
-            1 - share * (0.5 - share * (1 / 6 - share / 24)),
-            (1 - fade) / dr.maximum(share, 0.05),
-        )  # (1 - e^-a)/a without loss
-        return level + (now["level"] - now["input_level"]) * fade - (level - now["input_level"]) * mean
 
     def _fire(self, index, dt_s, light, start, signal, base, now):
         """All events of the interval in order of time; moves the reference, the dead time and the hazard on.

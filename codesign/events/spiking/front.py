@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from codesign.events.intensity import light_share
-from codesign.events.layers.low_pass import fading_mean
+from codesign.events.low_pass import coefficients, passed
 
 KNOTS = 6
 # log levels between which the tone curve bends
@@ -67,7 +67,7 @@ class Bandwidth(nn.Module):
         intensity: mean over the interval."""
         light = light_share(intensity)
         pace = (2 * math.pi * interval_s) * torch.exp(self.log_cutoff + self.power * light.log())
-        return now + (filtered - before) * torch.exp(-pace) - (now - before) * fading_mean(pace)
+        return passed(filtered, before, now, *coefficients(pace, torch.exp, torch.where))
 
     def mixed(self, level, filtered):
         return level + self.gate * (filtered - level)

@@ -1,0 +1,71 @@
+"""The one-pole low-pass of a level that runs linearly between its samples: one formula for the hard sensor's
+kernel, the differentiable layers and Spike-ESIM."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from codesign.events.intensity import light_share
+
+SERIES = 0.05  # below it (1 - e^-a)/a comes from a series: its first term left out is below 5e-10
+
+
+def coefficients(pace, exp, select):
+    """What an interval of a = ``pace`` time constants does: e^-a, and the mean of e^-s over 0 < s < a, that is
+    (1 - e^-a)/a, for small a without loss, value and derivative.
+
+    Tensors and drjit arrays alike: ``exp`` and ``select`` are those of their library.
+    """
+    fade = exp(-pace)
+    small = pace < SERIES
+    series = 1 - pace * (0.5 - pace * (1 / 6 - pace * (1 / 24 - pace / 120)))
+    return fade, select(small, series, (1 - fade) / select(small, 1.0, pace))
+
+
+def passed(filtered, before, now, fade, mean):
+    """The filter behind an interval over which its input runs from ``before`` to ``now``: the exact answer
+    to y' = (L - y)/tau, stable for every pace.
+
+    Args: filtered: y at the start of the interval. fade, mean: from ``coefficients``.
+    """
+    return now + (filtered - before) * fade - (now - before) * mean
+
+
+def one_pole(level: Tensor, pace: Tensor, start: Tensor | None = None) -> Tensor:
+    """A level behind a one-pole filter, exact for input that is linear between its samples.
+
+    Args:
+      level: [T, ...]. pace: [T-1, ...] > 0, length of each interval over the time constant, broadcasting.
+      start: [...] filtered level at the first sample; None: the level itself.
+    Returns: [T, ...] filtered levels, the start included. A steady ramp comes out a time constant later.
+    Gradient: level, pace, start; exact.
+    """
+    filtered = [level[0] if start is None else start]
+    steps = zip(level[:-1], level[1:], *coefficients(pace, torch.exp, torch.where), strict=True)
+    for step in steps:
+        filtered.append(passed(filtered[-1], *step))
+    return torch.stack(filtered)
+
+
+def low_pass(
+    level: Tensor,
+    intensity: Tensor,
+    interval_s: Tensor,
+    cutoff_hz: Tensor | float,
+    start: Tensor | None = None,
+) -> Tensor:
+    """The photoreceptor's low-pass of log levels: ``one_pole`` with a bandwidth that follows intensity.
+
+    Its pace is a = 2 pi f (I + 20)/275 dt, I the mean intensity of the two frames of an interval.
+
+    Args:
+      level: [T, ...] log levels. intensity: [T, ...] on the 0-255 scale. interval_s: [T-1] seconds.
+        cutoff_hz: > 0, number or 0-dim tensor.
+      start: [...] filtered level at the first frame; None: the level itself.
+    Returns: [T, ...] filtered levels, the start included.
+    Gradient: level, intensity, cutoff_hz, start; exact.
+    """
+    light = light_share(0.5 * (intensity[1:] + intensity[:-1]))
+    interval_s = interval_s.to(level).reshape(-1, *[1] * (level.ndim - 1))
+    return one_pole(level, light * (2 * math.pi * cutoff_hz) * interval_s, start)

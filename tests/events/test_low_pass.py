@@ -1,0 +1,68 @@
+"""The one-pole low-pass: a differential equation solved, closed forms, and its twin in the hard sensor's
+kernel."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from codesign.events import SensorModel, SensorState, low_pass, one_pole, simulate
+from codesign.events.low_pass import coefficients
+
+D = torch.float64
+
+
+def test_a_one_pole_filter_follows_the_differential_equation(generator):
+    t_s = torch.arange(8, dtype=D) * 0.01
+    level = torch.randn(8, 3, dtype=D, generator=generator)
+    tau_s = torch.tensor(0.007, dtype=D)
+    truth = [level[0].numpy()]
+    out = one_pole(level, (0.01 / tau_s).expand(7))
+    for before, now in pairwise(level.numpy()):  # one smooth piece at a time
+        piece = (lambda t, y, a, b: (a + (b - a) * t / 0.01 - y) / 0.007), (0, 0.01), truth[-1]
+        truth.append(solve_ivp(*piece, args=(before, now), method="DOP853", rtol=1e-11, atol=1e-12).y[:, -1])
+    assert (
+        np.abs(out.numpy() - np.array(truth)).max() < 1e-9
+    )  # the solver's tolerance over seven pieces, with room
+    ramp = one_pole((3 * t_s)[:, None], (0.01 / tau_s).expand(7))[:, 0]
+    assert torch.allclose(ramp, 3 * (t_s - tau_s * (1 - torch.exp(-t_s / tau_s))), atol=1e-14)
+    assert torch.autograd.gradcheck(
+        lambda level, tau_s: one_pole(level, (0.01 / tau_s).expand(7)),
+        (level.requires_grad_(), tau_s.requires_grad_()),
+    )
+
+
+def drifting(frames, *pixels):
+    drift = torch.randn(frames, *pixels, generator=torch.Generator().manual_seed(1), dtype=D).cumsum(0) * 0.1
+    return (4 + drift).exp(), torch.arange(frames, dtype=D) * 2e-3
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, D])
+def test_coefficients_hold_for_every_pace(dtype):
+    pace = torch.cat((torch.tensor([0.0]), torch.logspace(-12, 3, 4001), torch.tensor([0.05]))).to(dtype)
+    fade, mean = coefficients(pace, torch.exp, torch.where)
+    exact = pace.numpy().astype(np.float64)
+    truth = np.where(exact == 0, 1.0, -np.expm1(-exact) / np.where(exact == 0, 1.0, exact))
+    # beyond the series 1 - e^-a loses eps/0.05; the series ends with an error of 0.05^5/720
+    assert np.abs(mean.numpy() / truth - 1).max() < max(40 * torch.finfo(dtype).eps, 5e-10)
+    torch.testing.assert_close(fade, torch.from_numpy(np.exp(-exact)).to(dtype))
+
+
+@pytest.mark.parametrize("cutoff_hz", [40.0, 1e-4])  # the second is in the series for small paces
+def test_gradients_are_differences(cutoff_hz):
+    frames, t_s = drifting(5, 2)
+    cutoff = torch.tensor(cutoff_hz, dtype=D, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda f, c: low_pass(f.log(), f, t_s.diff(), c), (frames.requires_grad_(), cutoff), atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("cutoff_hz", [0.5, 45.0, 5000.0])
+def test_the_low_pass_is_that_of_the_hard_sensor(cutoff_hz):
+    frames, t_s = drifting(30, 6, 5)
+    state = SensorState()
+    simulate(frames, t_s, SensorModel(cutoff_hz=cutoff_hz), state=state)
+    filtered = low_pass(frames.log(), frames, t_s.diff(), cutoff_hz)[-1]
+    torch.testing.assert_close(filtered, state.level, rtol=0, atol=1e-12)
