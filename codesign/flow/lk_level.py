@@ -16,7 +16,8 @@ z)^4): nearly 1 for texture, 1/82 where all is noise.
 import math
 
 import torch
-from torch.nn.functional import avg_pool2d, conv1d, conv2d, grid_sample, pad
+from kornia.filters import gaussian_blur2d, get_gaussian_kernel1d
+from torch.nn.functional import avg_pool2d, conv1d, grid_sample, pad
 
 # the factor 3 and the power 4 = 2^2 above
 DOUBT = 3.0
@@ -189,17 +190,12 @@ def _blurred(images, sigma_px):
     Returns: images at the centres of the squares, and the whole kernel along one axis, taps of 1 px.
     """
     step = stride(sigma_px)
-    reach = _radius(sigma_px)
-    taps = torch.exp(-torch.arange(-reach, reach + 1).to(images).square() / (2 * _spread(sigma_px) ** 2))
-    taps = taps / taps.sum()
+    size = 2 * _radius(sigma_px) + 1
     pooled = avg_pool2d(images, step) if step > 1 else images
-    bins = pooled.shape[1]
-    each = taps.expand(
-        bins, 1, 1, -1
-    ).contiguous()  # bins as channels: one image at a time takes eight times as long
-    flat = pad(pooled, (reach, reach, reach, reach), mode="reflect")
-    found = conv2d(conv2d(flat, each, groups=bins), each.mT.contiguous(), groups=bins)
-    spaced = pad(taps[:, None], (0, step - 1)).flatten()
+    spread = _spread(sigma_px)
+    found = gaussian_blur2d(pooled, (size, size), (spread, spread))
+    taps = get_gaussian_kernel1d(size, spread, device=images.device, dtype=images.dtype)
+    spaced = pad(taps[0][:, None], (0, step - 1)).flatten()
     kernel = conv1d(spaced[None, None], torch.full((1, 1, step), 1 / step).to(images), padding=step - 1)[0, 0]
     return found, kernel
 

@@ -1,7 +1,8 @@
 """Optical flow between two frames, both ways, from coarse to fine."""
 
 import torch
-from torch.nn.functional import conv2d, interpolate, pad
+from kornia.filters import gaussian_blur2d
+from torch.nn.functional import interpolate
 
 from codesign.events.upsampling.match import with_matches
 from codesign.events.upsampling.tvl1 import refined
@@ -70,11 +71,5 @@ def _halved(levels):
 
 def blurred(field, deviation_px):
     """Gaussian blur of [B, 1, H, W], the border repeated."""
-    reach = int(3 * deviation_px + 0.5)
-    kernel = torch.exp(
-        -torch.arange(-reach, reach + 1, dtype=field.dtype, device=field.device).square()
-        / (2 * deviation_px**2)
-    )
-    kernel = kernel / kernel.sum()
-    across = conv2d(pad(field, (reach, reach, 0, 0), mode="replicate"), kernel.reshape(1, 1, 1, -1))
-    return conv2d(pad(across, (0, 0, reach, reach), mode="replicate"), kernel.reshape(1, 1, -1, 1))
+    size = 2 * int(3 * deviation_px + 0.5) + 1
+    return gaussian_blur2d(field, (size, size), (deviation_px, deviation_px), "replicate")
