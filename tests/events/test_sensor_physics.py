@@ -172,6 +172,31 @@ def test_noise_events_scale_with_thresholds_and_reset_the_memorised_level():
     assert float((state.level - state.reference).mean()) == pytest.approx(0.19 / rate_hz, rel=0.06)
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_noise_events_and_crossings_come_in_order_of_time(sign):
+    """Level 4 +- 1 per second: a threshold of 0.2 is crossed 0.2 s after the start, the last crossing or the last
+    noise event, which set the memorised level; so no pixel waits longer, and what comes earlier is noise."""
+    level = (4 + sign * torch.arange(2) + torch.zeros(60, 60, 2)).permute(2, 0, 1)
+    rate_hz = 2.0
+    events = simulate(
+        level, [0.0, 1.0], SensorModel(shot_rate_hz=rate_hz), torch.Generator().manual_seed(6), log_input=True
+    )
+    noise = 0
+    for pixel in (events.y * 60 + events.x).unique():
+        mine = events.y * 60 + events.x == pixel
+        gap_us = torch.diff(events.t_us[mine], prepend=torch.zeros(1, dtype=torch.int64))
+        assert int(gap_us.max()) <= 200_001
+        assert 1_000_000 - int(events.t_us[mine][-1]) <= 200_001
+        crossing = (gap_us - 200_000).abs() <= 1
+        noise += int((~crossing).sum())
+        assert bool((events.p[mine][crossing] == sign).all())
+    light = (0.5 * (math.exp(4) + math.exp(4 + sign)) + 20) / 275
+    expected = 3600 * rate_hz * (1 - 0.75 * light)
+    assert abs(noise - expected) < 4 * math.sqrt(expected)
+    against = int((events.p == -sign).sum())  # half of the noise: crossings have the ramp's own polarity
+    assert abs(against - noise / 2) < 4 * math.sqrt(noise / 4)
+
+
 def test_hot_pixels_fire_on_at_their_rate_and_others_are_silent():
     sensor = SensorModel(hot_pixel_share=0.1, hot_pixel_rate_hz=50.0)
     events = simulate(

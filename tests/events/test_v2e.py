@@ -138,3 +138,21 @@ def test_a_noise_filter_that_would_not_converge_is_refused():
         simulate(torch.full((3, 2, 2), 50.0), [0.0, 0.01, 0.02], sensor)
     with pytest.raises(DomainError, match="needs cutoff_hz and shot_rate_hz"):
         SensorModel(photoreceptor_noise=True)
+
+
+def test_a_noise_event_of_either_polarity_resets_the_memorised_level():
+    # a rise of 0.15 below the threshold of 0.2: whatever fires is noise, and where nothing fires the memorised
+    # level stays where it was
+    frames = torch.tensor([80.0, 80.0 * math.exp(0.15)])[:, None, None].expand(2, 40, 50)
+    state = SensorState()
+    sensor = SensorModel(shot_rate_hz=1.0, timing="v2e")
+    events = simulate(frames, [0.0, 0.8], sensor, torch.Generator().manual_seed(3), state)
+    assert int((events.p > 0).sum()) > 100
+    assert int((events.p < 0).sum()) > 100
+    for polarity in (1, -1):
+        fired = events.p == polarity
+        at = state.reference[events.y[fired], events.x[fired]]
+        assert at.tolist() == pytest.approx([math.log(80) + 0.15] * len(at), abs=1e-6)
+    quiet = torch.ones(40, 50, dtype=torch.bool)
+    quiet[events.y, events.x] = False
+    assert state.reference[quiet].tolist() == pytest.approx([math.log(80)] * int(quiet.sum()), abs=1e-6)

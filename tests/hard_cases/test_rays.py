@@ -312,6 +312,34 @@ def test_the_far_half_of_a_sphere_is_not_a_surface():
     assert out.deficit.item() > 0.1
 
 
+@pytest.mark.parametrize("conic", [3.0, 0.5, -0.5])
+def test_the_far_half_of_an_ellipsoid_is_not_a_surface(conic):
+    """Half axes: R / (1 + k) along the axis, where its middle lies too, and R / sqrt(1 + k) across. A ray that
+    crosses the axis 1.3 half axes behind the vertex, nearly at right angles, meets the far half only."""
+    radius = 10.0
+    deep = radius / (1 + conic)
+    wide = radius / math.sqrt(1 + conic)
+    geo = GeoLens([Surface(radius, 5.0, GLASS, 4.0, conic=conic), Surface(INF, 10.0, None, 4.0)], 4.0)
+    start = f64([[3 * wide, 0.0, 1.3 * deep - 0.02 * 3 * wide]])
+    out = geo.trace(start, unit([(-1.0, 0.0, 0.02)]))
+    assert (out.status.item(), out.failed_surface.item()) == (Status.MISS, 0)
+
+
+@pytest.mark.parametrize("conic", [3.0, 0.5, -0.5, -1.0, -2.0])
+def test_deep_conics_are_met_at_their_sag(conic):
+    """Rays parallel to the axis, to 0.99 of the rim of an ellipsoid and to two radii on a paraboloid or
+    hyperboloid; r^2 = 2 R z - (1 + k) z^2 at the point that is met."""
+    radius = 10.0
+    reach = 0.99 * radius / math.sqrt(1 + conic) if conic > -1 else 2 * radius
+    surface = GeoLens([Surface(radius, 5.0, GLASS, 4.0, conic=conic)], 4.0).prescription().until(0)
+    heights = [share * reach for share in (0.1, 0.4, 0.7, 1.0)]
+    out = trace(surface, f64([(0.0, r, -5.0) for r in heights]), f64([(0, 0, 1.0)] * len(heights)))
+    assert out.status.tolist() == [Status.OK] * len(heights)
+    for r, z in zip(heights, out.position_mm[:, 2].tolist(), strict=True):
+        assert 2 * radius * z - (1 + conic) * z * z == pytest.approx(r * r, rel=1e-12)
+        assert z < (radius / (1 + conic) if conic > -1 else math.inf)  # the half that holds the vertex
+
+
 def test_flat_surfaces_have_the_derivatives_of_slightly_bent_ones():
     """At zero curvature the sphere has no centre, but the ray and its derivative do: central differences over
     1e-6 per mm err by their square."""

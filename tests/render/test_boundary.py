@@ -10,6 +10,7 @@ import torch
 from codesign import backend, pose, render
 from codesign.errors import DomainError
 from codesign.render import MitsubaScene
+from codesign.render.boundary import _places
 from codesign.render.outline import Cylinders, Segments, Spheres, mesh_edges, outlines
 from scenes import silhouettes as silhouette_scenes
 from studies.silhouettes import STEPS, Task
@@ -112,6 +113,30 @@ def test_auto_takes_the_cheapest_way_that_agrees():
     expected = render.frames(camera, scene, path, gradient="boundary")
     (found,), (truth,) = (torch.autograd.grad(f.square().mean(), path) for f in (frames, expected))
     torch.testing.assert_close(found, truth, rtol=1e-5, atol=1e-5 * float(truth.norm()))
+
+
+@pytest.mark.parametrize(
+    "lengths_px", [(0.3, 0.05, 1e-4, 0.39), (5.0, 0.01, 0.19, 0.7, 0.3), (2.0, 3.3), (0.01,)]
+)
+def test_points_on_curves_stand_for_their_whole_length(lengths_px, generator):
+    """Shares times lengths add up to the length of all pieces, however short, since what is constant along them is
+    to be summed exactly; points on the short ones lie evenly along their total length."""
+    length = torch.tensor(lengths_px, dtype=F64).repeat(30)
+    piece, inside, share = _places(length, 2.5, generator)
+    assert bool(((inside >= 0) & (inside <= 1)).all())
+    assert float((share * length[piece]).sum()) == pytest.approx(float(length.sum()), rel=1e-12)
+    short = length < 0.4
+    of_long = torch.zeros_like(length).index_add(0, piece, share)[~short]
+    torch.testing.assert_close(of_long, torch.ones_like(of_long), rtol=1e-12, atol=0)
+    if bool(short.any()):
+        before = torch.where(short, length, 0).cumsum(0) - length
+        mine = short[piece]
+        at = (before[piece] + inside * length[piece])[mine]
+        assert len(at) == math.ceil(2.5 * float(length[short].sum()) - 1e-9)
+        gaps = at.sort().values.diff()
+        torch.testing.assert_close(
+            gaps, torch.full_like(gaps, float(length[short].sum()) / len(at)), rtol=0, atol=1e-9
+        )
 
 
 def test_outlines_of_spheres_and_cylinders_are_tangent_to_the_view():
