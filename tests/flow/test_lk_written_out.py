@@ -5,7 +5,6 @@ import math
 
 import numpy as np
 import pytest
-import torch
 from scipy.ndimage import correlate1d
 
 from codesign.flow import estimate_lk
