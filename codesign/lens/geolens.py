@@ -38,6 +38,7 @@ LEARNABLES = (
 class GeoLens(Replaceable):
     """Sequential lens. First vertex at z = 0, light along +z, flat image plane behind the last thickness.
 
+    >>> from codesign import lens
     >>> geo = lens.load("cooke-triplet")
     >>> optimiser = torch.optim.Adam(geo.variables("curvature", "focus"), lr=0.1)
     >>> geo.focus_at(2.0).thickness_mm[-1] > geo.thickness_mm[-1]
@@ -150,6 +151,7 @@ class GeoLens(Replaceable):
         RMS, so one learning rate suits them all, whatever the lens's size. Another call starts anew from the
         lens as it then is.
 
+        >>> from codesign import lens
         >>> geo = lens.load("cooke-triplet")
         >>> [v.shape[0] for v in geo.variables("curvature", "thickness", "focus", keep_efl=True)]
         [5, 5, 1]
@@ -219,6 +221,7 @@ class GeoLens(Replaceable):
         """The lens with its film where a point of the axis at ``distance_m`` is imaged: a solve of the last
         thickness in closed form.
 
+        >>> from codesign import lens
         >>> geo = lens.load("cooke-triplet")
         >>> near, far = geo.focus_at(1.0), geo.focus_at(float("inf"))
         >>> bool(near.thickness_mm[-1] > far.thickness_mm[-1])

@@ -18,6 +18,7 @@ from codesign.types import Rays
 class ThinLens(Replaceable):
     """Ideal lens of focal length efl_mm and pupil diameter, with the film image_distance_mm behind it.
 
+    >>> from codesign import lens
     >>> thin = lens.ThinLens(50.0, 10.0)
     >>> float(thin.focus_at(1.0).image_distance_mm)  # 1 / (1 / 50 - 1 / 1000)
     52.631578947368425
@@ -85,6 +86,7 @@ class ThinLens(Replaceable):
 
         The lengths stay positive. Where the image distance follows the focal length, "efl" alone moves both.
 
+        >>> from codesign import lens
         >>> pinhole = lens.Pinhole(5.0)
         >>> (efl,) = pinhole.variables("efl", step_mm=0.01)
         >>> efl.shape
@@ -155,6 +157,7 @@ class ThinLens(Replaceable):
 class Pinhole(ThinLens):
     """All rays through one point: no blur, no distortion.
 
+    >>> from codesign import lens
     >>> rays = lens.Pinhole(5.0).camera_rays(torch.tensor([[3.0, 4.0]]).double(), torch.zeros(1, 2).double())
     >>> rays.direction[0, :2] / rays.direction[0, 2]
     tensor([0.6000, 0.8000], dtype=torch.float64)

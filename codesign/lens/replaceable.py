@@ -135,11 +135,11 @@ class Replaceable(nn.Module):
         return twin
 
     def _with(self, tensors):
-        """This lens with these tensors as buffers, without Parameters and variables."""
+        """This lens with these tensors as buffers, without variables."""
         twin = self._shell()
-        twin._buffers.update(tensors)
-        for name in self.tensor_names:
+        for name in tensors:
             twin._parameters.pop(name, None)
+        twin._buffers.update(tensors)
         twin._modules.pop(DRIVER, None)
         return twin
 
@@ -156,16 +156,20 @@ class Replaceable(nn.Module):
     def _make_variables(self, names, **options):
         """Make the named numbers variables, hold all others, and return the variables."""
         driver = make_variables(self, names, **options)
-        now = self._now()
-        for name in self.parameter_names:
-            missing = self._parameters.pop(name, None) is None and self._buffers.pop(name, None) is None
-            if not driver.makes(name):
-                self.register_buffer(
-                    name, None if missing and DRIVER not in self._modules else now[name].detach()
-                )
+        made = self._made() if DRIVER in self._modules else {}
         self._modules.pop(DRIVER, None)
+        for name in self.parameter_names:
+            parameter = self._parameters.pop(name, None)
+            value = made.get(name, parameter if parameter is not None else self._buffers.pop(name, None))
+            if not driver.makes(name):
+                self._buffers[name] = None if value is None else value.detach()
         self.add_module(DRIVER, driver)
         return [getattr(driver, name) for name in names]
+
+    def _fixed(self):
+        """A copy at the values of the variables as they are now."""
+        made = self._made() if DRIVER in self._modules else {}
+        return copy.deepcopy(self._with(made))
 
     def _solved(self, tensors, held):
         """Tensors after the solves that hold something."""

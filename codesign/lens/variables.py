@@ -1,7 +1,6 @@
 """Numbers of a lens as dimensionless variables whose unit is a natural step: one that moves the rays on the film
 by a set distance."""
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -111,7 +110,7 @@ def natural_units(land, values: Tensor, reach: Tensor, step_mm: float):
             moved, weight = ray_motion(land(values + trial), land(values - trial))
         rms = torch.linalg.vector_norm(moved) / weight.sum().clamp_min(1).sqrt()
         moves.append(rms / (2 * TRIAL))  # over the whole reach
-    moves = torch.stack(moves)
+    moves = torch.stack(moves) if moves else values
     return reach / (moves / step_mm).clamp_min(1), moves > DEAD * step_mm
 
 
@@ -204,7 +203,7 @@ def make_variables(lens, names, step_mm, bounds, mask, fields_rad, wavelength_um
     ``_landing(fields_rad, wavelength_um)`` -> positions and weights of a bundle of rays on the film,
     ``solved_tensors``: which tensor a solve makes.
     """
-    exact = copy.deepcopy(lens.replace()).double()
+    exact = lens._fixed().double()
     kinds = exact._kinds(held)
     for label, found in (("variables", names), ("bounds of", bounds), ("mask of", mask)):
         unknown = [name for name in found if name not in (kinds if label == "variables" else names)]
@@ -222,7 +221,9 @@ def make_variables(lens, names, step_mm, bounds, mask, fields_rad, wavelength_um
     counts = [at.numel() for _, at in places]
 
     def land(numbers):
-        moved = dict(tensors)
+        moved = {kind.tensor: tensors[kind.tensor] for kind in map(kinds.get, names)} | {
+            solved: tensors[solved] for solved in map(exact.solved_tensors.get, held)
+        }
         for (tensor, at), part in zip(places, numbers.split(counts), strict=True):
             moved[tensor] = moved[tensor].reshape(-1).index_put((at,), part).reshape(moved[tensor].shape)
         return exact._with(exact._solved(moved, held))._landing(fields_rad, wavelength_um)
