@@ -76,13 +76,13 @@ class Kernel:
         o = dr.unravel(arr.Array3, origin)
         d = dr.unravel(arr.Array3, direction)
         # 8 x surface + status of the failure
-        fate = arr.Int32(-8)
+        packed_status = arr.Int32(-8)
         inside = dr.full(arr.Bool, True, count)
-        ahead = d.z > FORWARD
+        travels_forward = d.z > FORWARD
         start = dr.select(
-            ahead, -o.z / dr.select(ahead, d.z, 1), 0
+            travels_forward, -o.z / dr.select(travels_forward, d.z, 1), 0
         )  # to the first vertex plane: far objects would drown the quadratic in rounding
-        o = arr.Array3(o.x + d.x * start, o.y + d.y * start, dr.select(ahead, 0, o.z))
+        o = arr.Array3(o.x + d.x * start, o.y + d.y * start, dr.select(travels_forward, 0, o.z))
         path = path + n[0] * start
         for i, work in enumerate(self.works):
             frame = _Frame(decentre, cosines, sines, i) if work.moved else None
@@ -90,7 +90,7 @@ class Kernel:
                 o, d = frame.enter(o, d)
             conic = k[i] if work.conic else None
             asphere = terms[i * self.asphere_width :][: work.asphere]
-            step, now, lack = _intersect(arr, o, d, c[i], conic, asphere, alive)
+            step, now, shortfall = _intersect(arr, o, d, c[i], conic, asphere, alive)
             o = o + d * step
             path = path + n[i] * step
             r2 = dr.square(o.x) + dr.square(o.y)
@@ -117,11 +117,11 @@ class Kernel:
                     else:
                         d, kept, lost = _refract(d, normal, ratio[i], now)
                     here = dr.select(now, arr.Int32(8 * i + Status.TOTAL_REFLECTION), here)
-                    lack = dr.select(now, lost, lack)
+                    shortfall = dr.select(now, lost, shortfall)
                     now = kept
             fails = alive & ~now
-            fate = dr.select(fails, here, fate)
-            deficit = dr.select(fails, lack, deficit)
+            packed_status = dr.select(fails, here, packed_status)
+            deficit = dr.select(fails, shortfall, deficit)
             alive = now
             if frame:
                 o, d = frame.leave(o, d)
@@ -133,7 +133,7 @@ class Kernel:
         S = len(self.works)
         forward = alive & (d.z > FORWARD)
         fails = alive & ~forward
-        fate = dr.select(fails, arr.Int32(8 * S + Status.MISS), fate)
+        packed_status = dr.select(fails, arr.Int32(8 * S + Status.MISS), packed_status)
         deficit = dr.select(fails, FORWARD - d.z, deficit)
         position = o
         if self.to_plane:
@@ -145,7 +145,7 @@ class Kernel:
             dr.ravel(d),
             path,
             dr.select(forward, weight, 0),
-            dr.select(inside, fate + 4, fate),
+            dr.select(inside, packed_status + 4, packed_status),
             deficit,
         )
 
@@ -186,19 +186,19 @@ class _Frame:
 
 
 def _intersect(arr, o, d, c, conic, asphere, alive):
-    """Distance along the ray to the surface, whether it is met, and the lack of the radicand where it is not
-    (elsewhere it means nothing)."""
+    """Distance along the ray to the surface, whether it is met, and the shortfall of the radicand where it
+    is not (elsewhere it means nothing)."""
     import drjit as dr
 
     square = dr.squared_norm(o)
-    along = dr.dot(d, o)
+    d_dot_o = dr.dot(d, o)
     A = c
     if conic is not None:
         square = square + conic * dr.square(o.z)
-        along = along + conic * d.z * o.z
+        d_dot_o = d_dot_o + conic * d.z * o.z
         A = c * (1 + conic * dr.square(d.z))
     F = c * square - 2 * o.z
-    G = d.z - c * along
+    G = d.z - c * d_dot_o
     radicand = G * G - A * F
     near = (
         G > 0
@@ -209,11 +209,11 @@ def _intersect(arr, o, d, c, conic, asphere, alive):
     root = dr.sqrt(dr.select(hit, radicand, 1))
     step = dr.select(near, F, G - root) / dr.select(hit, dr.select(near, G + root, A), 1)
     side = 1 - (c if conic is None else c * (1 + conic)) * (o.z + d.z * step)
-    lack = dr.select(radicand > GRAZING, dr.select(hit, GRAZING - side, GRAZING - G), GRAZING - radicand)
+    shortfall = dr.select(radicand > GRAZING, dr.select(hit, GRAZING - side, GRAZING - G), GRAZING - radicand)
     hit &= side > GRAZING  # the half (or sheet) that holds the vertex
     step = dr.select(hit, step, 0)
     if not asphere:
-        return step, hit, lack
+        return step, hit, shortfall
     start = dr.select(hit, dr.detach(step), dr.detach(-o.z / dr.select(dr.abs(d.z) > 1e-6, d.z, 1)))
     with dr.suspend_grad():
         t = start
@@ -231,9 +231,10 @@ def _intersect(arr, o, d, c, conic, asphere, alive):
         )
         t = dr.select(hit, t, 0)
         slope = dr.select(hit, slope, 1)
-    lack = dr.select(lack > 0, lack, 1)  # the conic is met but no point of the asphere was found
+    # 1 where the conic is met but no point of the asphere was found
+    shortfall = dr.select(shortfall > 0, shortfall, 1)
     value, _, _ = _implicit(arr, dr.select(hit, o + d * t, 0), d, c, conic, asphere)
-    return dr.select(hit, t - value / slope, 0), hit, lack
+    return dr.select(hit, t - value / slope, 0), hit, shortfall
 
 
 def _implicit(arr, p, d, c, conic, asphere):
@@ -286,8 +287,8 @@ def _soft_edge(x):
 
 
 def _refract(d, normal, ratio, alive):
-    """Direction after the surface, whether light passes, and the lack of the radicand where it is totally
-    reflected."""
+    """Direction after the surface, whether light passes, and the shortfall of the radicand where it is
+    totally reflected."""
     import drjit as dr
 
     cosine = dr.dot(d, normal)

@@ -110,32 +110,33 @@ class TraceResult:
 
     position_mm: [N, 3] relative to the plane's centre (z = 0). direction: [N, 3] unit. optical_path_mm: [N].
     weight: [N] product of the soft aperture edges; 0 for failed rays. deficit: [N] >= 0, dimensionless.
-    fate: [N] int, status, hard mask and failed surface packed into one number; read them by their names.
+    packed_status: [N] int, status, hard mask and failed surface packed into one number; read
+      them by their names.
     """
 
     position_mm: Tensor
     direction: Tensor
     optical_path_mm: Tensor
     weight: Tensor
-    fate: Tensor
+    packed_status: Tensor
     deficit: Tensor
 
     @property
     def status(self):
         """What became of each ray, [N] int, see Status."""
-        return self.fate & 3
+        return self.packed_status & 3
 
     @property
     def inside(self):
         """The hard mask: whether each ray lies within every clear aperture it reached and outside every
         obstruction, [N] bool."""
-        return (self.fate & 4) != 0
+        return (self.packed_status & 4) != 0
 
     @property
     def failed_surface(self):
         """First surface (from 0) where each ray failed, S where it failed to leave forwards, -1 if nowhere,
         [N] int."""
-        return self.fate >> 3
+        return self.packed_status >> 3
 
 
 def trace(prescription, origin_mm, direction):

@@ -20,7 +20,7 @@ def decoded(path, words):
     """Events of EVT 2.0 words.
 
     Args: path: for messages. words: [N] uint32.
-    Returns: t_us, x, y, p (0 or 1) in file order, and the number of events ahead of the first time-high word,
+    Returns: t_us, x, y, p (0 or 1) in file order, and the number of events before the first time-high word,
       which have no time and are left out.
     Raises: FileFormatError for a word of a reserved type.
     """

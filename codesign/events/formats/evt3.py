@@ -32,7 +32,7 @@ def decoded(path, words):
     """Events of EVT 3.0 words.
 
     Args: path: for messages. words: [N] uint16.
-    Returns: t_us, x, y, p (0 or 1) in file order, and the number of events ahead of the first word that gives
+    Returns: t_us, x, y, p (0 or 1) in file order, and the number of events before the first word that gives
       their time, row or column base; they are
       left out.
     Raises: FileFormatError for a word of a reserved type, and for a vector that leaves the 11 bits of a
@@ -48,14 +48,14 @@ def decoded(path, words):
     load = words & 0xFFF
     is_vector = (kind == VECT_12) | (kind == VECT_8)
     emits = is_vector | (kind == ADDR_X)
-    # ahead: how many words have emitted events up to each
+    # emitted: how many words have emitted events up to each
     where = np.flatnonzero(emits)
-    ahead = np.cumsum(emits)
-    column, mask, on, lost = _columns(kind, load, is_vector, where, ahead)
+    emitted = np.cumsum(emits)
+    column, mask, on, lost = _columns(kind, load, is_vector, where, emitted)
     at, since_us = _times(kind, load)
-    t_us, untimed = held(ahead[at], since_us, len(where))
+    t_us, untimed = held(emitted[at], since_us, len(where))
     at = np.flatnonzero(kind == ADDR_Y)
-    row, rowless = held(ahead[at], load[at] & 0x7FF, len(where))
+    row, rowless = held(emitted[at], load[at] & 0x7FF, len(where))
     first = max(untimed, rowless)
     lost += int(BIT_COUNT[mask[:first]].sum(dtype=np.int64))
     t_us = t_us[first - untimed :]
@@ -91,7 +91,7 @@ def _times(kind, load):
     return at, (high[ordinal] << 12) + np.where(low_at > moved_at, load[at[low_at]], 0)
 
 
-def _columns(kind, load, is_vector, where, ahead):
+def _columns(kind, load, is_vector, where, emitted):
     """First column, mask of columns and polarity of each emitting word, and how many events of vectors are
     left out for want of a base."""
     vector = is_vector[where]
@@ -101,8 +101,8 @@ def _columns(kind, load, is_vector, where, ahead):
         ([0], np.cumsum(STEP[kind_there]))
     )  # columns that vectors have moved the base by, ahead of each emitting word
     at = np.flatnonzero(kind == BASE_X)
-    base, baseless = held(ahead[at], (load[at] & 0x7FF) - passed[ahead[at]], len(where))
-    on, _ = held(ahead[at], load[at] >> 11, len(where))
+    base, baseless = held(emitted[at], (load[at] & 0x7FF) - passed[emitted[at]], len(where))
+    on, _ = held(emitted[at], load[at] >> 11, len(where))
     base, on = (np.concatenate((np.zeros(baseless, values.dtype), values)) for values in (base, on))
     column = np.where(vector, base + passed[:-1], load_there & 0x7FF)
     mask = np.where(vector, load_there & LOAD[kind_there], np.uint16(1))

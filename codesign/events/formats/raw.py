@@ -25,7 +25,7 @@ def read_raw(path, height_px=None, width_px=None):
     """Read events from ``path``; the sensor size is the header's, else the caller's, else the smallest that
     holds the events.
 
-    Events ahead of the first word that gives a time or row are left out with a warning: recordings may start
+    Events before the first word that gives a time or row are left out with a warning: recordings may start
     amid the camera's words.
     Raises: FileFormatError for another encoding, a damaged header or word, a file cut amid a word, or time
       going back (see arrival).
@@ -41,7 +41,7 @@ def read_raw(path, height_px=None, width_px=None):
     t_us, x, y, p, lost = encoding.decoded(path, np.frombuffer(data, encoding.WORD, offset=start))
     if lost:
         warnings.warn(
-            f"{path}: {lost} events ahead of the first time, row or column base are left out; the file "
+            f"{path}: {lost} events before the first time, row or column base are left out; the file "
             "starts amid the camera's words.",
             stacklevel=2,
         )

@@ -72,7 +72,7 @@ class Linear:
 
     constant: Tensor
     gradient: Tensor
-    along: Tensor
+    step: Tensor
     most: Tensor
     least: Tensor
 
@@ -103,7 +103,7 @@ def _iterate(flow, dual_x, dual_y, data, buffers):
     torch.add(dual_x, dual_y, out=divergence)
     divergence[..., 1:] -= dual_x[..., :-1]
     divergence[..., 1:, :] -= dual_y[..., :-1, :]
-    flow.addcmul_(residual, data.along, value=-1).add_(divergence, alpha=COUPLING)
+    flow.addcmul_(residual, data.step, value=-1).add_(divergence, alpha=COUPLING)
     torch.sub(flow[..., 1:], flow[..., :-1], out=across[..., :-1])
     torch.sub(flow[..., 1:, :], flow[..., :-1, :], out=down[..., :-1, :])
     torch.mul(across, across, out=size).addcmul_(down, down).sqrt_().mul_(DUAL_STEP / COUPLING).add_(1)

@@ -99,11 +99,11 @@ def psf_on_pixels(
                 f"{lens.name}: {pixels} pixels of {pixel_mm:g} mm are wider than the {period:.3g} mm that "
                 f"{n} pupil cells resolve; give fewer pixels or a finer pupil grid."
             )
-        along = [
+        phases = [
             torch.polar(torch.ones_like(a), a)
             for a in (2 * math.pi / pupil.wavelength_mm * r * at[:, None] * line for r in pupil.cosine_radius)
         ]
-        amplitude = along[1] @ pupil.field @ along[0].T
+        amplitude = phases[1] @ pupil.field @ phases[0].T
         cell = (2 / n) ** 2 * pupil.cosine_radius.prod()  # solid angle of a pupil cell in direction cosines
         density = (amplitude.real.square() + amplitude.imag.square()) * cell / pupil.wavelength_mm**2
         total = (

@@ -155,12 +155,12 @@ def _to_sphere(rays, centre, bend):
     """Signed distance along each ray to the reference sphere, plus its radius: free of cancellation, and
     regular when the sphere is a plane."""
     away = torch.cat([rays.position_mm - centre, torch.zeros_like(rays.position_mm[:, :1])], 1)
-    along = (away * rays.direction).sum(1)
-    across = away.square().sum(1) - along.square()
+    axial = (away * rays.direction).sum(1)
+    across = away.square().sum(1) - axial.square()
     radicand = 1 - across * bend.square()
     if bool((radicand.detach()[rays.weight.detach() > 0] <= 0).any()):
         raise DomainError(
             "rays pass further from the image point than the reference sphere's radius; the aberration is "
             "too large for a wavefront, use spots instead."
         )
-    return across * bend / (1 + radicand.clamp_min(1e-12).sqrt()) - along
+    return across * bend / (1 + radicand.clamp_min(1e-12).sqrt()) - axial

@@ -67,8 +67,8 @@ class LensDesign:
     def penalty(self, lens):
         """Smooth hinge on edge thicknesses below their floors, in units of 1 % of the focal length squared; 0
         when all hold."""
-        lack = (self.edge_floor_mm - edge_thickness_mm(lens)).clamp_min(0) / (0.01 * self.efl_mm)
-        return lack.square().sum()
+        shortfall = (self.edge_floor_mm - edge_thickness_mm(lens)).clamp_min(0) / (0.01 * self.efl_mm)
+        return shortfall.square().sum()
 
 
 def make_design(lens, fields_rad, step_mm, floors=None, floor_share=0.6):
