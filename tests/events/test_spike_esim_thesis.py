@@ -45,19 +45,6 @@ def test_network_of_the_thesis_equals_the_reference(shared, through_reset, name)
     assert (found - torch.from_numpy(data[name])).abs().max() <= 1e-9  # values up to 340
 
 
-def test_chunks_of_the_network_equal_the_whole(shared):
-    data = dict(np.load(shared("refs/srm/z_spike_esim.npz")))
-    network = of_thesis(data, "off")
-    frames = steps_first(data["I"])
-    whole, _, _ = network(frames)
-    parts = []
-    state = None
-    for first, last in ((0, 5), (5, 6), (6, 30), (30, 41)):
-        spikes, _, state = network(frames[first:last], state)
-        parts.append(spikes)
-    assert torch.equal(torch.cat(parts), whole)
-
-
 def test_smoothing_is_the_alpha_response_of_the_drive_and_its_delay_two_time_constants():
     tau = 10.0
     network = TwoBranchSpikes(1, theta=1.0, smoothing_tau=tau).double()

@@ -13,10 +13,10 @@ from codesign.events.entry import check_frames, check_times
 from codesign.events.intensity import lin_log
 from codesign.events.spiking.comparators import COMPARATORS
 from codesign.events.spiking.front import Bandwidth, Prefilter, ToneCurve
-from codesign.events.spiking.grouped import grouped
 from codesign.events.spiking.noise import NoiseRate
 from codesign.events.spiking.residual import ResidualBranch
 from codesign.events.spiking.saved import read_generator, write_generator
+from codesign.events.spiking.stepwise import stepwise
 
 SLOW_S = 0.05  # time constant of the slow level that the residual branch compares with
 
@@ -125,7 +125,8 @@ class SpikeEsim(nn.Module):
           theta_scale: factor on both thresholds for this call, a number or [2] tensor (ON, OFF): sensitivity
             at test time.
         Returns: counts [T-1, 2, ...] whole numbers, ON first; state to carry on. Chunks equal the whole bit
-          for bit.
+          for bit on one machine with one number of threads: every step sees the same calls on the same
+          shapes. Batches equal their sequences but for levels within rounding of a threshold.
         Gradient: every parameter but the noise rates, and frames; through the comparator.
         Raises: ShapeError, DomainError for frames, times or scales that cannot be (NaN and infinity among
           them).
@@ -180,7 +181,7 @@ class SpikeEsim(nn.Module):
         log_level = torch.stack(
             [lin_log(picture[None])[0] for picture in intensity]
         )  # one by one: logarithms of vectors round by their place
-        levels = grouped(lambda pictures: self.tone(self.prefilter(pictures)), log_level[:, :, None])
+        levels = stepwise(lambda pictures: self.tone(self.prefilter(pictures)), log_level[:, :, None])
         if state is None:
             filtered = levels[0]
             slow = levels[0]
@@ -204,7 +205,7 @@ class SpikeEsim(nn.Module):
         pictures = torch.cat(
             (levels / 4 - 1, 4 * (levels - low), 2 * (levels - mean)), dim=2
         )  # of the order of 1
-        seen = self.bandwidth.mixed(levels, low) + grouped(self.branch, pictures)
+        seen = self.bandwidth.mixed(levels, low) + stepwise(self.branch, pictures)
         return seen.reshape(frames.shape), (before, filtered, slow)
 
 

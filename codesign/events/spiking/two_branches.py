@@ -11,6 +11,7 @@ from codesign.events.entry import check_frames
 from codesign.events.spiking.srm import srm
 from codesign.events.spiking.srm_scale import drive_scale
 from codesign.events.spiking.srm_state import SrmState
+from codesign.events.spiking.stepwise import stepwise
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ class TwoBranchSpikes(nn.Module):
             steps.
           theta: threshold for this call; None: the one of the network.
         Returns: spikes and potential [T-1, 2, H, W] ([T, 2, H, W] with a state), ON first; BranchState to
-          carry on. Chunks equal the whole.
+          carry on. Chunks equal the whole bit for bit on one machine with one number of threads.
         Gradient: weights and frames, by the surrogate.
         Raises: ShapeError for other shapes or too few frames; DomainError for NaN or infinity.
         """
@@ -128,12 +129,8 @@ class TwoBranchSpikes(nn.Module):
             )
         steps = (frames if state is None else torch.cat((state.frame[None], frames))).diff(dim=0)
         weights = (self.weight_on, -self.weight_off)
-        # one step at a time: a convolution of another batch size may round differently, and chunks are to
-        # equal the whole
-        drive = torch.stack(
-            [
-                torch.cat([torch.conv2d(step[None], w[None].to(step), padding=1)[0] for w in weights])
-                for step in steps
-            ]
-        )
-        return drive, frames[-1]
+
+        def convolved(pictures):
+            return torch.cat([torch.conv2d(pictures, w[None].to(pictures), padding=1) for w in weights], 1)
+
+        return stepwise(convolved, steps[:, None])[:, 0], frames[-1]
