@@ -145,7 +145,7 @@ def test_events_that_come_before_their_time_or_row_are_left_out_with_a_warning(t
     path.write_bytes(
         evt3((0x0, 1), (0x2, 4), (0x5, 0b11), (0x8, 0), (0x2, 5))
     )  # one event without a time, two without a column base
-    with pytest.warns(UserWarning, match="3 events ahead"):
+    with pytest.warns(UserWarning, match="3 events before"):
         assert rows(read(path)) == [(0, 5, 1, -1)]
     path.write_bytes(evt2(evt2_event(1, 2, 3, 1), 0x80000000, evt2_event(1, 2, 3, 1)))
     with pytest.warns(UserWarning, match="1 events ahead"):

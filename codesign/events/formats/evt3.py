@@ -99,7 +99,7 @@ def _columns(kind, load, is_vector, where, emitted):
     load_there = load[where]
     passed = np.concatenate(
         ([0], np.cumsum(STEP[kind_there]))
-    )  # columns that vectors have moved the base by, ahead of each emitting word
+    )  # columns that vectors have moved the base by, before each emitting word
     at = np.flatnonzero(kind == BASE_X)
     base, baseless = held(emitted[at], (load[at] & 0x7FF) - passed[emitted[at]], len(where))
     on, _ = held(emitted[at], load[at] >> 11, len(where))
