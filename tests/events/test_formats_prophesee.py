@@ -148,7 +148,7 @@ def test_events_that_come_before_their_time_or_row_are_left_out_with_a_warning(t
     with pytest.warns(UserWarning, match="3 events before"):
         assert rows(read(path)) == [(0, 5, 1, -1)]
     path.write_bytes(evt2(evt2_event(1, 2, 3, 1), 0x80000000, evt2_event(1, 2, 3, 1)))
-    with pytest.warns(UserWarning, match="1 events ahead"):
+    with pytest.warns(UserWarning, match="1 events before"):
         assert rows(read(path)) == [(1, 2, 3, 1)]
 
 
