@@ -1,30 +1,33 @@
-"""`python -m codesign`: look after the installation. The studies are run as `python -m studies.NAME`."""
+"""`codesign`, or `python -m codesign`: list and run the studies, look after the installation."""
 
 import argparse
+import runpy
 import sys
-from importlib.metadata import PackageNotFoundError, version
 
-STUDIES = """
-what to run:
+import codesign
+
+EXAMPLES = """
+for example:
+  codesign list                    every study with its question
+  codesign run lens_opt --quick    the same as python -m studies.lens_opt --quick
   make lens-opt                    set everything up and optimise a lens for event flow
-  python -m studies.NAME --help    a study and its options (lens_opt, placement, gradient_flow, speed_error, stability)
 """
 
 
-def main(arguments=None):
-    """Parse the command line and run it. Returns the exit code."""
-    try:
-        installed = version("codesign")
-    except PackageNotFoundError:
-        installed = "(not installed)"
+def main(arguments: list[str] | None = None) -> int:
+    """Parse the command line and run it. Returns the exit code; a study ends by itself (SystemExit)."""
     parser = argparse.ArgumentParser(
-        prog="python -m codesign",
+        prog="codesign",
         description="Differentiable co-design of a lens, its mount, an event camera and event flow.",
-        epilog=STUDIES,
+        epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=f"codesign {installed}")
+    parser.add_argument("--version", action="version", version=f"codesign {codesign.__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    commands.add_parser("list", help="every study with its question")
+    run = commands.add_parser("run", help="run a study: codesign run NAME [OPTIONS]")
+    run.add_argument("name", metavar="NAME", help="a study out of the list")
+    run.add_argument("options", nargs=argparse.REMAINDER, metavar="OPTIONS", help="what the study is told")
     doctor = commands.add_parser(
         "doctor", help="what is installed, what is missing, what to do; exit 0 only when a render works"
     )
@@ -35,9 +38,25 @@ def main(arguments=None):
     if chosen.command is None:
         parser.print_help()
         return 0
-    from codesign.doctor import main as run_doctor  # imports drjit, which --help does without
+    if chosen.command == "doctor":
+        from codesign.doctor import main as run_doctor  # imports drjit, which the rest does without
 
-    return run_doctor(chosen.device)
+        return run_doctor(chosen.device)
+    from studies.frame import listing
+
+    if chosen.command == "list":
+        print(listing.show())
+        return 0
+    return _run(chosen.name, chosen.options, listing.refusal(chosen.name))
+
+
+def _run(name, options, refusal):
+    if refusal:
+        print(f"error: {refusal}", file=sys.stderr)
+        return 2
+    sys.argv = [f"studies.{name}", *options]
+    runpy.run_module(f"studies.{name}", run_name="__main__", alter_sys=True)
+    return 0
 
 
 if __name__ == "__main__":

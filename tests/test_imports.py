@@ -23,6 +23,7 @@ FLOORS = (
     {"__main__"},
 )
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
+COMMANDS = ("codesign", "__main__")  # the command line, which starts the studies too
 DOOR = "codesign"  # the package itself, which names its rooms and imports them when asked
 MITSUBA = {
     "codesign.render": "makes pictures with it",
@@ -73,6 +74,8 @@ def room(module):
 def allowed(importer, imported):
     """Whether a room may import another."""
     if importer == imported:
+        return True
+    if importer == COMMANDS:
         return True
     (top, name), (other_top, other) = importer, imported
     if top == "studies":
