@@ -7,12 +7,16 @@ looks straight down), roll turns the image about the view; at zero the camera lo
 with level rows.
 """
 
+import math
+
 import torch
 from torch import nn
 
 from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.place.observability import chief_lines, flow_of_points
 from codesign.pose import se3_exp
 
+MOST_PIXELS = 255  # of a film, spread over it, at which the motion of the image is measured
 AXES_BODY_CAM = torch.tensor(
     [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64
 )  # of a level camera that looks forward
@@ -21,15 +25,20 @@ AXES_BODY_CAM = torch.tensor(
 class Mount(nn.Module):
     """Pose T_body_cam of a camera on a body.
 
+    >>> mount = Mount(nominal_m=(0.2, 0.0, 0.4), half_range_m=(0.1, 0.1, 0.2), pitch_rad=1.0)
+    >>> mount()[:3, 3].tolist()
+    [0.2, 0.0, 0.4]
+    >>> optimiser = torch.optim.Adam(mount.parameters(), lr=0.05)
+
     Args:
       nominal_m: three numbers, body axes: middle of the box of allowed positions. half_range_m: half its size
         per axis, >= 0 (0 holds that axis).
       yaw_rad, pitch_rad, roll_rad: attitude where the rotation part of ``numbers`` is zero. position_m: where
         to start, strictly inside the box; None starts in the middle.
-    numbers: [6] float64, learnable, unconstrained. position = nominal + half_range tanh(numbers[:3]);
-      rotation = start attitude times exp(numbers[3:]),
-      a rotation vector in camera axes (so looking straight down, where yaw and roll turn about one axis, is a
-      pose like any other).
+    numbers: [6] float64, learnable, unconstrained; with x = unit numbers, position = nominal + half_range
+      tanh(x[:3]) and rotation = start attitude times exp(x[3:]), a rotation vector in camera axes (so looking
+      straight down, where yaw and roll turn about one axis, is a pose like any other).
+    unit: [6], 1 until ``variables`` makes a unit of every number move the image by a natural step.
     Raises: DomainError when a number is not finite, a range is negative, or the start lies outside the box;
       ShapeError for other than three numbers.
     """
@@ -37,6 +46,7 @@ class Mount(nn.Module):
     start_attitude: torch.Tensor
     nominal_m: torch.Tensor
     half_range_m: torch.Tensor
+    unit: torch.Tensor
 
     def __init__(self, nominal_m, half_range_m, *, yaw_rad=0.0, pitch_rad=0.0, roll_rad=0.0, position_m=None):
         super().__init__()
@@ -49,6 +59,7 @@ class Mount(nn.Module):
             )
         self.register_buffer("nominal_m", nominal)
         self.register_buffer("half_range_m", half)
+        self.register_buffer("unit", torch.ones(6, dtype=torch.float64))
         self.register_buffer("start_attitude", attitude(yaw_rad, pitch_rad, roll_rad))
         start = torch.zeros(6, dtype=torch.float64)
         start[:3] = self._unbounded(nominal if position_m is None else _three(position_m, "position_m"))
@@ -79,6 +90,7 @@ class Mount(nn.Module):
                 f"mount: its numbers are [..., 6] (position, rotation), got {tuple(numbers.shape)}."
             )
         check_finite(numbers, "mount numbers", "go back to the last finite ones")
+        numbers = self.unit * numbers
         position = self.nominal_m + self.half_range_m * torch.tanh(numbers[..., :3])
         turn = se3_exp(torch.cat([torch.zeros_like(numbers[..., 3:]), numbers[..., 3:]], -1))[..., :3, :3]
         top = torch.cat([self.start_attitude @ turn, position[..., None]], -1)
@@ -86,6 +98,58 @@ class Mount(nn.Module):
             *top.shape[:-2], 1, 4
         )
         return torch.cat([top, last], -2)
+
+    def variables(self, camera, depth_m: float | torch.Tensor, step_px: float = 1.0) -> list[nn.Parameter]:
+        """Rescale ``numbers`` so that a unit of each moves the image of what the camera sees by ``step_px`` RMS;
+        the pose stays. Then one learning rate suits the mount, the lens's variables and a network.
+
+        Args:
+          camera: has ``chief_rays`` and ``film`` (see render.Camera). depth_m: depth of the scene along the view,
+            one number or one per pixel [P]; pixels without a surface carry one that is not finite or not
+            positive. step_px: the natural step.
+        A number that hardly moves the image (a narrow box far from the scene) keeps 1 of its map's argument as
+        unit, as does one that is held.
+        Returns: [numbers], the mount's one Parameter, for torch.optim.
+        Raises: DomainError when no pixel sees a surface, or the step is not positive and finite; ShapeError.
+        """
+        if not 0 < step_px < math.inf:
+            raise DomainError(
+                f"mount: step_px is {step_px}; a natural step is positive and finite, such as 1."
+            )
+        numbers = self.numbers.detach()
+        with torch.no_grad():
+            per_unit = self._image_motion(camera, depth_m)
+            unit = (self.unit * step_px / per_unit.clamp_min(1e-300)).clamp_max(1.0)
+            self.numbers.copy_(numbers * (self.unit / unit))
+            self.unit = unit
+        return [self.numbers]
+
+    def _image_motion(self, camera, depth_m):
+        """RMS motion of the image, px per unit of each number, [6]."""
+        pixels = camera.film.pixels()
+        depth = torch.as_tensor(depth_m, dtype=torch.float64)
+        if depth.shape not in ((), (1,), pixels.shape[:1]):
+            raise ShapeError(
+                f"mount: depth_m is one number or [{pixels.shape[0]}] (one per pixel), got {tuple(depth.shape)}."
+            )
+        at = torch.linspace(0, pixels.shape[0] - 1, min(MOST_PIXELS, pixels.shape[0])).round().long()
+        depth = depth.expand(pixels.shape[0])[at]
+        seen = depth.isfinite() & (depth > 0) & (camera.chief_rays(pixels[at]).weight > 0)
+        if not bool(seen.any()):
+            raise DomainError(
+                "mount: no pixel sees a surface in front of the camera, so no step moves the image; give depths "
+                "> 0 in metres."
+            )
+        pixels = pixels[at][seen]
+        depth = depth[seen][:, None]
+        base, slope, base_step, slope_step = chief_lines(camera, pixels)
+        point = torch.cat([base + slope * depth, depth, torch.ones_like(depth)], 1)
+        pose = self()
+        change = torch.autograd.functional.jacobian(self.forward, self.numbers.detach())  # [4, 4, 6]
+        # X_cam = T^-1 X_body, so dX_cam = -T^-1 dT X_cam
+        velocity = -torch.einsum("ij,jkn,pk->pin", torch.linalg.inv(pose), change, point)[:, :3]
+        motion = flow_of_points(velocity, slope, base_step + slope_step * depth[..., None])
+        return motion.square().sum(1).mean(0).sqrt()
 
     def in_world(self, T_world_body, numbers=None):
         """T_world_cam = T_world_body T_body_cam for body poses [..., 4, 4]; gradient to both."""

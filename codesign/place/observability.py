@@ -42,12 +42,11 @@ def planar_flow(camera, depth_m, T_body_cam):
     depth = depth_m.double()
     seen = depth.detach().isfinite() & (depth.detach() > 0)
     depth = torch.where(seen, depth, 1.0)[..., None]
-    base, slope, base_step, slope_step = _chief_lines(camera, pixels)
+    base, slope, base_step, slope_step = chief_lines(camera, pixels)
     across = base + slope * depth
     point = torch.cat([across, depth], -1)  # [..., P, 3]
     moving = _point_velocity(point, T_body_cam.double())  # [..., P, 3, 3]
-    sideways = moving[..., :2, :] - slope[..., None] * moving[..., 2:, :]
-    flow = torch.linalg.solve(base_step + slope_step * depth[..., None], sideways)
+    flow = flow_of_points(moving, slope, base_step + slope_step * depth[..., None])
     return torch.where(seen[..., None, None], flow, 0.0), seen
 
 
@@ -92,7 +91,7 @@ def information(camera, depth_m, T_body_cam, weight=None, prior=None):
     return _normal_matrix(*_weighted_rows(camera, depth_m, T_body_cam, weight), prior)
 
 
-def _chief_lines(camera, pixels):
+def chief_lines(camera, pixels):
     """Chief rays as lines x(z) = base + slope z, [P, 2] each, and their change per pixel, [P, 2, 2] (last
     axis: pixel x, y)."""
     step = (
@@ -110,6 +109,16 @@ def _chief_lines(camera, pixels):
         return torch.stack([v[1] - v[2], v[3] - v[4]], -1) / (2 * _STEP_PX)
 
     return base[0], slope[0], change(base), change(slope)
+
+
+def flow_of_points(velocity, slope, step):
+    """Image motion [..., P, 2, K] px per unit of K motions of the points under pixels.
+
+    Args: velocity: [..., P, 3, K] m of the points, in camera axes. slope: [P, 2] of the chief rays. step:
+      [..., P, 2, 2] m by which a pixel's ray moves sideways at the point, last axis: pixel x, y.
+    """
+    sideways = velocity[..., :2, :] - slope[..., None] * velocity[..., 2:, :]
+    return torch.linalg.solve(step, sideways)
 
 
 def _point_velocity(point, T_body_cam):

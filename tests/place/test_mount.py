@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from codesign import lens, pose, render
 from codesign.errors import DomainError, ShapeError
 from codesign.place import Mount
 from codesign.place.mount import yaw_pitch_roll_rad
@@ -91,6 +92,89 @@ def test_a_moving_body_carries_its_camera():
     torch.testing.assert_close(
         pose[:3, 1], torch.tensor([0.0, -1, 0], dtype=D), rtol=0, atol=1e-15
     )  # image down is backward
+
+
+def far_points(camera, mount, depth_m):
+    """Points in body axes under a lattice of pixels."""
+    pixels = camera.film.pixels()[::7]
+    rays = camera.chief_rays(pixels)
+    length = (depth_m - rays.origin_m[:, 2:]) / rays.direction[:, 2:]
+    return pose.apply(mount(), rays.origin_m + length * rays.direction).detach()
+
+
+@pytest.mark.parametrize("optics", ["pinhole", "cooke-triplet"])
+@pytest.mark.parametrize("depth_m", [0.8, 3.0])
+@pytest.mark.parametrize("position_m", [NOMINAL, (0.25, -0.09, 0.3)])
+@torch.no_grad()
+def test_a_unit_of_every_number_moves_the_image_by_the_natural_step(optics, depth_m, position_m):
+    optic = lens.Pinhole(11.0) if optics == "pinhole" else lens.load(optics).scaled(0.22)
+    camera = render.Camera(optic, 48, 36, 0.15, 1)
+    mount = Mount(NOMINAL, HALF, yaw_rad=0.4, pitch_rad=0.6, position_m=position_m)
+    mount.numbers[3:] = torch.tensor([0.2, -0.1, 0.3], dtype=D)
+    before = mount().clone()
+    assert mount.variables(camera, depth_m, step_px=0.1)[0] is mount.numbers
+    torch.testing.assert_close(mount(), before, rtol=0, atol=1e-15)
+    points = far_points(camera, mount, depth_m)
+    base = render.project(camera, pose.apply(pose.inverse(mount()), points))
+    for i in range(6):
+        mount.numbers[i] += 1
+        moved = render.project(camera, pose.apply(pose.inverse(mount()), points)) - base
+        mount.numbers[i] -= 1
+        assert float(moved.square().sum(1).nanmean().sqrt()) == pytest.approx(
+            0.1, rel=0.1
+        )  # a larger step meets the walls of the box
+
+
+def test_one_learning_rate_serves_lens_and_mount():
+    camera = render.Camera(lens.load("cooke-triplet").scaled(0.22), 32, 24, 0.2, 1)
+    mount = Mount(NOMINAL, HALF, pitch_rad=0.6)
+    wanted = render.project(camera, torch.tensor([[0.1, 0.2, 1.0], [-0.2, 0.1, 1.5]], dtype=D)).detach() + 0.8
+    variables = [*camera.lens.variables("curvature", "focus", step_mm=0.2), *mount.variables(camera, 1.2)]
+    points = pose.apply(mount(), torch.tensor([[0.1, 0.2, 1.0], [-0.2, 0.1, 1.5]], dtype=D)).detach()
+    optimiser = torch.optim.Adam(variables, lr=0.05)
+
+    def loss():
+        return (render.project(camera, pose.apply(pose.inverse(mount()), points)) - wanted).square().mean()
+
+    start = float(loss().detach())
+    for _ in range(50):
+        optimiser.zero_grad()
+        loss().backward()
+        optimiser.step()
+    assert float(loss().detach()) < 1e-2 * start
+    assert all(float(v.detach().abs().max()) > 0.01 for v in variables)
+
+
+def test_held_and_weak_numbers_keep_their_unit():
+    camera = render.Camera(lens.Pinhole(11.0), 8, 8, 0.5, 1)
+    mount = Mount(NOMINAL, (0.1, 0.0, 1e-6))
+    mount.variables(camera, 100.0)
+    assert mount.unit[1:3].tolist() == [1.0, 1.0]
+    other = Mount(NOMINAL, (0.1, 0.0, 1e-6))
+    other.load_state_dict(mount.state_dict())
+    assert torch.equal(other(), mount())
+    assert torch.equal(other.unit, mount.unit)
+
+
+def test_depths_of_a_picture_count_where_there_is_a_surface():
+    camera = render.Camera(lens.Pinhole(11.0), 8, 8, 0.5, 1)
+    depth = torch.full((64,), 2.0, dtype=D)
+    depth[:20] = math.nan
+    depth[20:24] = -1.0
+    found = Mount(NOMINAL, (0.4, 0.3, 0.2))
+    found.variables(camera, depth)
+    same = Mount(NOMINAL, (0.4, 0.3, 0.2))
+    same.variables(camera, 2.0)
+    # a shift across the view moves every pixel alike
+    torch.testing.assert_close(found.unit[1:3], same.unit[1:3], rtol=1e-9, atol=0)
+    # pixels per metre at 2 m: 11 mm / 0.5 mm / 2 m
+    assert same.unit[1:3].tolist() == pytest.approx([1 / (11 * 0.3), 1 / (11 * 0.2)], rel=1e-6)
+    with pytest.raises(DomainError, match="no pixel sees a surface"):
+        Mount(NOMINAL, HALF).variables(camera, torch.zeros(64, dtype=D))
+    with pytest.raises(ShapeError, match=r"one number or \[64\]"):
+        Mount(NOMINAL, HALF).variables(camera, depth[:5])
+    with pytest.raises(DomainError, match="step_px is 0"):
+        Mount(NOMINAL, HALF).variables(camera, 1.0, step_px=0)
 
 
 @pytest.mark.parametrize(
