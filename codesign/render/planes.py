@@ -94,8 +94,8 @@ class TexturedPlane:
     def hit(self, origin_m, direction):
         """Where world rays [N, 3] meet the plane: point, normal, valid (see MitsubaScene.hit)."""
         normal = self.T_world_plane[:3, 2].to(origin_m)
-        height = (origin_m.detach() - self.T_world_plane[:3, 3].to(origin_m)) @ normal
-        falling = direction.detach() @ normal
+        height = ((origin_m.detach() - self.T_world_plane[:3, 3].to(origin_m)) * normal).sum(-1)
+        falling = (direction.detach() * normal).sum(-1)
         valid = (height * falling < 0) & (falling.abs() > 1e-9)
         t = torch.where(valid, -height / torch.where(valid, falling, 1.0), 1.0)
         return origin_m.detach() + direction.detach() * t[:, None], normal.expand_as(origin_m), valid

@@ -1,9 +1,12 @@
 """Depth, objects, flow and occlusion of many frames at once, without gradients.
 
 The same truth as codesign.render's view and flow_and_occlusion, which trace rays through the lens for every
-frame; here chief rays are traced once and
-points are projected by a table (make_dataset_chart), and all rays of a chunk of frames meet the scene
-together.
+frame; here chief rays are traced once and points are projected by a table (make_dataset.chart), and all rays
+of a chunk of frames meet the scene together.
+
+A frame's truth is the same to the last bit whatever chunk it is in, on one machine with one number of
+threads: poses turn rays by products and sums in an order of ours, and the table, a matrix product, sees one
+frame per call.
 """
 
 from dataclasses import dataclass
@@ -74,25 +77,25 @@ def truth_of_frames(chart, chief_rays, scene, T_world_cam, count, segments):
     hit = hit[:pairs]
     back = inverse(cameras[:, 1 : pairs + 1])  # from every part's axes to the later camera
     own = back[owner, torch.arange(pairs)[:, None]] if len(back) > 1 else back[0][:, None]
-    ahead = (own[..., :3, :3] @ local[..., None])[..., 0] + own[..., :3, 3]
+    ahead = _turned(own, local) + own[..., :3, 3]
     seen = hit & (ahead[..., 2] > NEAREST_M)
-    to, base, slope = (
-        v.reshape(*seen.shape, 2)
-        for v in chart(
-            torch.where(seen[..., None], ahead, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)).reshape(
-                -1, 3
-            )
-        )
-    )
+    points = torch.where(seen[..., None], ahead, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    to, base, slope = (torch.stack(v) for v in zip(*map(chart, points), strict=True))
     seen &= to.isfinite().all(-1)
     flow = torch.where(seen[..., None], to - chart.camera.film.pixels(), 0.0).mT
     towards = torch.nn.functional.normalize(torch.cat([slope, torch.ones_like(slope[..., :1])], -1), dim=-1)
     start = torch.cat([base, torch.zeros_like(base[..., :1])], -1)
     nearer = _first(scene, cameras[:, 1 : pairs + 1], start, towards, seen)[3]
     reach = (ahead - start).norm(dim=-1)
-    cosine = ((own[..., :3, :3].mT @ towards[..., None])[..., 0] * normal).sum(-1).abs().clamp_min(GRAZING)
+    cosine = (towards * _turned(own, normal)).sum(-1).abs().clamp_min(GRAZING)
     hidden = seen & (nearer < reach - ROUNDING * (reach + local.norm(dim=-1)) / cosine)
     return Truth(fit(depth), fit(part), fit(segment), flow.reshape(pairs, 2, *shape), fit(seen), fit(hidden))
+
+
+def _turned(pose, vectors):
+    """Vectors [..., 3] turned by the rotations of poses [..., 4, 4], each sum from left to right."""
+    x, y, z = vectors[..., None].unbind(-2)
+    return x * pose[..., :3, 0] + y * pose[..., :3, 1] + z * pose[..., :3, 2]
 
 
 def _first(scene, cameras, origin_cam, direction_cam, usable):
@@ -103,8 +106,8 @@ def _first(scene, cameras, origin_cam, direction_cam, usable):
     normal = torch.zeros_like(origin_cam)
     owner = torch.full(nearest.shape, -1)
     for number, (surface, pose) in enumerate(zip(parts(scene), cameras, strict=True)):
-        origin = origin_cam @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
-        direction = direction_cam @ pose[:, :3, :3].mT
+        origin = _turned(pose[:, None], origin_cam) + pose[:, None, :3, 3]
+        direction = _turned(pose[:, None], direction_cam)
         point, across, valid = (
             v.reshape(*nearest.shape, *v.shape[1:])
             for v in surface.hit(origin.reshape(-1, 3), direction.reshape(-1, 3))
@@ -144,8 +147,8 @@ class Segments:
             if not shapes or not bool(met.any()):
                 found = torch.where(met, first, found)
                 continue
-            origin = origin_cam @ pose[:, :3, :3].mT + pose[:, None, :3, 3]
-            direction = direction_cam @ pose[:, :3, :3].mT
+            origin = _turned(pose[:, None], origin_cam) + pose[:, None, :3, 3]
+            direction = _turned(pose[:, None], direction_cam)
             found = torch.where(
                 met,
                 first

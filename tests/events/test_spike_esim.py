@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 import torch
-from torch.overrides import TorchFunctionMode
 
 from codesign import events
 from codesign.errors import DomainError, FileFormatError, ShapeError
 from codesign.events import SensorModel, lin_log, spiking
 from codesign.events.spiking.spike_esim import SpikeEsim
 from codesign.events.spiking.two_branches import TwoBranchSpikes
+from tests.rounding_case import RoundsByPlace
 
 D = torch.float64
 
@@ -63,18 +63,6 @@ def test_spiking_comparator_is_the_ideal_sensor_where_no_step_holds_two_events()
     truth = events.dense_counts(lin_log(frames), t_s, SensorModel(0.25, 0.25), log_input=True)
     assert truth.sum() > 100
     assert torch.equal(counts, truth)
-
-
-class RoundsByPlace(TorchFunctionMode):
-    """A processor whose convolutions round by a picture's place among others and by its address, and far more
-    coarsely than any does."""
-
-    def __torch_function__(self, func, types, args=(), kwargs=None):
-        found = func(*args, **(kwargs or {}))
-        if func is not torch.conv2d:
-            return found
-        place = torch.arange(len(args[0])) + args[0].data_ptr() % 64
-        return found * (1 + 1e-4 * place.to(found))[:, None, None, None]
 
 
 @pytest.mark.bits
