@@ -1,6 +1,19 @@
 """Optimisers and the loop around them."""
 
 from codesign.optimise.adam import ScaledAdam
+from codesign.optimise.descent import Descent
+from codesign.optimise.gradients import clipped_mean, sample_gradients
 from codesign.optimise.least_squares import DampedLeastSquares, StopRules
+from codesign.optimise.loop import Loop, Record, check_parameters
 
-__all__ = ["DampedLeastSquares", "ScaledAdam", "StopRules"]
+__all__ = [
+    "DampedLeastSquares",
+    "Descent",
+    "Loop",
+    "Record",
+    "ScaledAdam",
+    "StopRules",
+    "check_parameters",
+    "clipped_mean",
+    "sample_gradients",
+]

@@ -1,61 +1,74 @@
-"""Stochastic descent for objectives whose gradients have heavy tails: clipped, averaged, with the best point
-kept."""
+"""Momentum descent for noisy gradients, as a torch optimiser."""
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Iterable
+from typing import Any
 
 import torch
 
-# variables stay on a grid: parallel sums in the backward pass differ in their last bits, and a run must
-# repeat to the same numbers
+from codesign.errors import DomainError
+
+# parameters stay on a grid of 1/GRAIN: parallel sums in a backward pass differ in their last bits, and a run
+# must repeat to the same numbers
 GRAIN = 256
 
 
-@dataclass
-class Descent:
-    """Momentum steps on clipped sample gradients, scored now and then on fixed cases; a worse score goes back
-    and halves the step.
+class Descent(torch.optim.Optimizer):
+    """Steps along a running mean of the gradient, on a grid, with a weak pull towards 0.
 
-    Straight-through gradients of a flow error are noisy: single samples point anywhere, and some are tens of
-      times too long. Each
-    sample is clipped to ``clip``, the mean enters a momentum average, and a weak pull towards 0 (the start)
-    keeps the variables
-    that the objective does not see from wandering. ``check`` keeps the best point on a fixed set.
+    For parameters in natural units, where 0 is the start and a unit is a sensible step. The pull keeps those that
+    the objective does not see from wandering. velocity <- momentum velocity + (1 - momentum)(gradient + pull
+    parameter); parameter <- parameter - lr velocity.
+
+    Args: params: as for any torch optimiser. lr: length of a step per unit of velocity. momentum: 0 to below 1.
+      pull: >= 0. normalised: make every step of length lr, whatever the velocity's. grain: 1 over the spacing of
+      the grid; 0 for none.
+    Raises: DomainError for numbers outside these ranges.
+
+    >>> import torch
+    >>> x = torch.nn.Parameter(torch.zeros(2))
+    >>> optimiser = Descent([x], lr=0.5, momentum=0.0, pull=0.0)
+    >>> x.grad = torch.tensor([1.0, -2.0]); optimiser.step(); x.tolist()
+    [-0.5, 1.0]
     """
 
-    variables: torch.Tensor
-    step_size: float
-    momentum: float = 0.9
-    clip: float = 1.5
-    pull: float = 0.02
-    velocity: torch.Tensor = field(default_factory=lambda: torch.empty(0))
-    best: torch.Tensor = field(default_factory=lambda: torch.empty(0))
-    best_score: float = float("inf")
-
-    def __post_init__(self):
-        if not self.velocity.numel():
-            self.velocity = torch.zeros_like(self.variables)
-            self.best = self.variables.clone()
-
-    def step(self, gradients):
-        """One step from a list of sample gradients [V]. Returns their unclipped norms."""
-        norms = [float(g.norm()) for g in gradients]
-        mean = torch.stack(
-            [g * min(1.0, self.clip / max(n, 1e-30)) for g, n in zip(gradients, norms, strict=True)]
-        ).mean(0)
-        self.velocity = self.momentum * self.velocity + (1 - self.momentum) * (
-            mean + self.pull * self.variables
+    def __init__(
+        self,
+        params: Iterable[Any],
+        lr: float,
+        momentum: float = 0.9,
+        pull: float = 0.02,
+        normalised: bool = False,
+        grain: int = GRAIN,
+    ):
+        if not (0 < lr < math.inf and 0 <= momentum < 1 and pull >= 0 and grain >= 0):
+            raise DomainError(
+                f"descent: lr {lr} must be positive and finite, momentum {momentum} in [0, 1), pull {pull} and "
+                f"grain {grain} at least 0."
+            )
+        super().__init__(
+            params, {"lr": lr, "momentum": momentum, "pull": pull, "normalised": normalised, "grain": grain}
         )
-        self.variables = ((self.variables - self.step_size * self.velocity) * GRAIN).round() / GRAIN
-        return norms
 
-    def check(self, score):
-        """Keep the point when its score is the best so far; otherwise go back to the best and halve the step.
-        Returns whether it was kept."""
-        if score <= self.best_score:
-            self.best = self.variables.clone()
-            self.best_score = score
-            return True
-        self.variables = self.best.clone()
-        self.velocity = torch.zeros_like(self.velocity)
-        self.step_size = self.step_size / 2
-        return False
+    @torch.no_grad()
+    def step(self, closure: Any = None) -> Any:
+        """One step from the gradients in ``.grad``; parameters without one only feel pull and momentum."""
+        value = None if closure is None else closure()
+        for group in self.param_groups:
+            velocities = [self._velocity(p, group) for p in group["params"]]
+            length = math.sqrt(sum(float(v.square().sum()) for v in velocities))
+            reach = group["lr"] / max(length, 1e-300) if group["normalised"] else group["lr"]
+            for parameter, velocity in zip(group["params"], velocities, strict=True):
+                moved = parameter - reach * velocity
+                grain = group["grain"]
+                parameter.copy_((moved * grain).round() / grain if grain else moved)
+        return value
+
+    def _velocity(self, parameter: torch.Tensor, group: dict[str, Any]) -> torch.Tensor:
+        state = self.state[parameter]
+        if "velocity" not in state:
+            state["velocity"] = torch.zeros_like(parameter)
+        slope = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+        pulled = slope + group["pull"] * parameter
+        state["velocity"] = group["momentum"] * state["velocity"] + (1 - group["momentum"]) * pulled
+        return state["velocity"]

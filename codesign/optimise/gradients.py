@@ -1,0 +1,57 @@
+"""Gradients of samples, one by one: clipped before they are averaged, because a few are tens of times too long."""
+
+from collections.abc import Iterable, Sequence
+
+import torch
+from torch import Tensor
+
+from codesign.errors import GradientError, NonFiniteError
+
+
+def sample_gradients(losses: Iterable[Tensor], parameters: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Values and gradients of sample losses, each taken as soon as it is made, so that one graph lives at a time.
+
+    Args: losses: scalars, S of them; a generator makes each when it is needed. parameters: leaves that ask for
+      gradients, of any shapes.
+    Returns: values [S] float64; gradients [S, V] float64, the parameters' numbers in order.
+    Raises: GradientError when a loss does not depend on any of the parameters; NonFiniteError when a loss or
+      gradient is not finite.
+    """
+    values = []
+    rows = []
+    for loss in losses:
+        if not loss.requires_grad:
+            raise GradientError("a sample's loss has no gradient; the graph is cut before the objective.")
+        grads = torch.autograd.grad(loss, list(parameters), allow_unused=True)
+        if all(g is None for g in grads):
+            raise GradientError("a sample's loss does not depend on any parameter that is optimised.")
+        row = torch.cat([_flat(g, p) for g, p in zip(grads, parameters, strict=True)])
+        value = float(loss.detach())
+        if not (bool(row.isfinite().all()) and value == value and abs(value) != float("inf")):
+            raise NonFiniteError("a sample's loss or its gradient is infinite or NaN.")
+        values.append(value)
+        rows.append(row)
+    return torch.tensor(values, dtype=torch.float64), torch.stack(rows)
+
+
+def clipped_mean(gradients: Tensor, limit: float | None) -> tuple[Tensor, Tensor]:
+    """Mean of gradients [S, V], those longer than ``limit`` cut to it; None cuts to the median length.
+
+    Returns: mean [V], and the lengths [S] before the cut.
+    """
+    lengths = gradients.norm(dim=1)
+    felt = lengths[lengths > 0]
+    longest = limit if limit is not None else float(felt.median()) if felt.numel() else 1.0
+    return (gradients * (longest / lengths.clamp_min(1e-300)).clamp(max=1.0)[:, None]).mean(0), lengths
+
+
+def assign(parameters: Sequence[Tensor], gradient: Tensor) -> None:
+    """Put a flat gradient [V] where torch's optimisers look for it."""
+    sizes = [p.numel() for p in parameters]
+    for parameter, part in zip(parameters, gradient.split(sizes), strict=True):
+        parameter.grad = part.reshape(parameter.shape).to(parameter)
+
+
+def _flat(gradient: Tensor | None, parameter: Tensor) -> Tensor:
+    found = torch.zeros_like(parameter) if gradient is None else gradient
+    return found.detach().reshape(-1).double().cpu()

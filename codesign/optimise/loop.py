@@ -1,0 +1,229 @@
+"""The loop around an optimiser: draw samples, clip, step, judge now and then, keep the best, save, resume."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
+from codesign.optimise.gradients import assign, clipped_mean, sample_gradients
+
+
+@dataclass
+class Record:
+    """What happened: loss and gradient length by step; step, score and whether it was kept by judgement."""
+
+    loss: list[float] = field(default_factory=list)
+    gradient: list[float] = field(default_factory=list)
+    judged_step: list[int] = field(default_factory=list)
+    score: list[float] = field(default_factory=list)
+    kept: list[bool] = field(default_factory=list)
+
+
+class Loop:
+    """Steps of any torch optimiser on clipped sample gradients; the best point by judgement is kept.
+
+    Straight-through gradients are noisy: single samples point anywhere, and some are tens of times too long. So
+    samples are clipped one by one, and what counts is a score on fixed cases, such as the hard sensor's.
+
+    Args:
+      optimiser: torch.optim.Optimizer over what is optimised.
+      samples: step number -> the samples' scalar losses, best as a generator.
+      clip: longest gradient of a sample, over all parameters; None clips to the median length of the samples.
+      judge: () -> score, the lower the better, at the parameters as they are; without one the last point is the
+        best. judge_every: steps between judgements; the start and the end are judged too.
+      patience: worse judgements borne in a row before the loop goes back to the best point with its step sizes
+        times ``shrink``; None never goes back.
+      schedule: step number -> factor of the first step sizes (warm-up, decay).
+    record: Record. best, best_score: clones of the parameters at the best judgement, and its score.
+    Raises: DomainError for numbers that make no sense; GradientError for a frozen parameter.
+
+    >>> import torch
+    >>> x = torch.nn.Parameter(torch.zeros(1))
+    >>> loop = Loop(torch.optim.SGD([x], lr=0.5), lambda step: [(x - 2).square().sum()], clip=10.0)
+    >>> round(float(loop.run(20)[0]), 3)
+    2.0
+    """
+
+    def __init__(
+        self,
+        optimiser: torch.optim.Optimizer,
+        samples: Callable[[int], Iterable[Tensor]],
+        *,
+        clip: float | None = 1.5,
+        judge: Callable[[], float] | None = None,
+        judge_every: int = 5,
+        patience: int | None = 0,
+        shrink: float = 0.5,
+        schedule: Callable[[int], float] | None = None,
+    ):
+        if (clip is not None and not clip > 0) or judge_every < 1 or not 0 < shrink <= 1:
+            raise DomainError(
+                f"loop: clip {clip} must be above 0 (or None), judge_every {judge_every} at least 1, shrink "
+                f"{shrink} above 0 and at most 1."
+            )
+        self.optimiser = optimiser
+        self.samples = samples
+        self.clip = clip
+        self.judge = judge
+        self.judge_every = judge_every
+        self.patience = patience
+        self.shrink = shrink
+        self.schedule = schedule
+        self.parameters = [p for group in optimiser.param_groups for p in group["params"]]
+        check_parameters(self.parameters)
+        self.record = Record()
+        self.best = self._now()
+        self.best_score = math.inf
+        self._first_lr = [float(group["lr"]) for group in optimiser.param_groups]
+        self._shrunk = 1.0
+        self._worse = 0
+
+    @property
+    def step_number(self) -> int:
+        """Steps made, those before a resume included."""
+        return len(self.record.loss)
+
+    def run(
+        self,
+        steps: int,
+        advance: Callable[..., object] | None = None,
+        save: Callable[[], object] | None = None,
+    ) -> list[Tensor]:
+        """Go on until ``steps`` are made in all, and leave the parameters at the best point.
+
+        Args: advance: called after every step with loss= and score=; may raise to stop. save: called after every
+          judgement.
+        Returns: the best point, one tensor per parameter.
+        Raises: NonFiniteError when a loss or gradient is not finite; the parameters are then at the best point.
+        """
+        try:
+            while self.step_number < steps:
+                if self.step_number % self.judge_every == 0 and not self._judged():
+                    self._judgement(save)
+                self._step()
+                if advance is not None:
+                    shown = {"score": self.record.score[-1]} if self.record.score else {}
+                    advance(loss=self.record.loss[-1], **shown)
+            if not self._judged():
+                self._judgement(save)
+        except NonFiniteError as error:
+            self._go(self.best)
+            raise NonFiniteError(
+                f"{error} Optimisation stopped at step {self.step_number + 1}; the parameters are back at the "
+                "best point so far."
+            ) from error
+        self._go(self.best)
+        return self.best
+
+    def _step(self) -> None:
+        values, gradients = sample_gradients(self.samples(self.step_number), self.parameters)
+        mean, lengths = clipped_mean(gradients, self.clip)
+        assign(self.parameters, mean)
+        factor = self._shrunk * (1.0 if self.schedule is None else self.schedule(self.step_number))
+        for group, lr in zip(self.optimiser.param_groups, self._first_lr, strict=True):
+            group["lr"] = lr * factor
+        self.optimiser.step()
+        self.record.loss.append(float(values.mean()))
+        self.record.gradient.append(float(lengths.mean()))
+
+    def _judged(self) -> bool:
+        return bool(self.record.judged_step) and self.record.judged_step[-1] == self.step_number
+
+    def _judgement(self, save: Callable[[], object] | None) -> None:
+        with torch.no_grad():
+            score = 0.0 if self.judge is None else float(self.judge())
+        if not math.isfinite(score):
+            raise NonFiniteError(f"the score is {score}.")
+        kept = self.judge is None or score <= self.best_score
+        self.record.judged_step.append(self.step_number)
+        self.record.score.append(score)
+        self.record.kept.append(kept)
+        if kept:
+            self.best = self._now()
+            self.best_score = score
+            self._worse = 0
+        else:
+            self._worse += 1
+            if self.patience is not None and self._worse > self.patience:
+                self._go(self.best)
+                self.optimiser.state.clear()
+                self._shrunk *= self.shrink
+                self._worse = 0
+        if save is not None:
+            save()
+
+    def _now(self) -> list[Tensor]:
+        return [p.detach().clone() for p in self.parameters]
+
+    @torch.no_grad()
+    def _go(self, point: Sequence[Tensor]) -> None:
+        for parameter, value in zip(self.parameters, point, strict=True):
+            parameter.copy_(value)
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Everything needed to go on: tensors by name, and plain numbers (see codesign.state)."""
+        tensors = {f"now_{i}": p.detach() for i, p in enumerate(self.parameters)}
+        tensors |= {f"best_{i}": b for i, b in enumerate(self.best)}
+        numbers: dict[str, Any] = {
+            "best_score": self.best_score if math.isfinite(self.best_score) else None,
+            "shrunk": self._shrunk,
+            "worse": self._worse,
+            "record": vars(self.record),
+        }
+        for i, parameter in enumerate(self.parameters):
+            for name, value in self.optimiser.state.get(parameter, {}).items():
+                if torch.is_tensor(value):
+                    tensors[f"optimiser_{i}_{name}"] = value
+        return tensors, numbers
+
+    @torch.no_grad()
+    def resume(self, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> "Loop":
+        """Go on from ``state()``; the same steps follow as without the break.
+
+        Raises: ShapeError when the state is of other parameters.
+        """
+        shapes = [
+            tuple(tensors[f"now_{i}"].shape) for i in range(len(self.parameters)) if f"now_{i}" in tensors
+        ]
+        if shapes != [tuple(p.shape) for p in self.parameters]:
+            raise ShapeError(
+                f"the state has parameters of shapes {shapes}, this loop {[tuple(p.shape) for p in self.parameters]}; "
+                "give the state of the same problem."
+            )
+        self._go([tensors[f"now_{i}"] for i in range(len(self.parameters))])
+        self.best = [tensors[f"best_{i}"].to(p).clone() for i, p in enumerate(self.parameters)]
+        self.best_score = math.inf if numbers["best_score"] is None else numbers["best_score"]
+        self._shrunk = numbers["shrunk"]
+        self._worse = numbers["worse"]
+        self.record = Record(**numbers["record"])
+        self.optimiser.state.clear()
+        for name, value in tensors.items():
+            if name.startswith("optimiser_"):
+                _, index, entry = name.split("_", 2)
+                parameter = self.parameters[int(index)]
+                self.optimiser.state[parameter][entry] = (
+                    value.clone() if entry == "step" else value.to(parameter)
+                )
+        return self
+
+
+def check_parameters(parameters: Sequence[Tensor]) -> None:
+    """Raise GradientError for parameters that cannot be optimised: none at all, frozen, or not leaves."""
+    if not parameters:
+        raise GradientError(
+            "the optimiser has no parameters; give it those of lens, mount, sensor or network."
+        )
+    for index, parameter in enumerate(parameters):
+        if not parameter.requires_grad:
+            raise GradientError(
+                f"parameter {index} of the optimiser, of shape {tuple(parameter.shape)}, is frozen; thaw it with "
+                "requires_grad_(True), or leave it out."
+            )
+        if not parameter.is_leaf:
+            raise GradientError(
+                f"parameter {index} of the optimiser is computed from others; give what it is computed from."
+            )

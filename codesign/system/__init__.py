@@ -1,0 +1,8 @@
+"""One system of camera, mount, event layer and estimator, with a probe at every junction."""
+
+from codesign.system.batch import Batch
+from codesign.system.check import check
+from codesign.system.result import JUNCTIONS, Result
+from codesign.system.system import System
+
+__all__ = ["JUNCTIONS", "Batch", "Result", "System", "check"]

@@ -1,0 +1,304 @@
+"""The system on plain algebra, where every junction's gradient is known: probes, recordings, names, refusals."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch import nn
+
+from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
+from codesign.system import Batch, System, check
+from codesign.types import EventVolume, FlowField, Rays
+
+ONE = torch.ones(1)
+T_S = torch.tensor([0.0, 1.0], dtype=torch.float64)
+BATCH = Batch(torch.eye(4, dtype=torch.float64).expand(2, 4, 4), T_S, scene="wall")
+
+
+class Glass(nn.Module):
+    """A lens with one number."""
+
+    def __init__(self, a=0.5):
+        super().__init__()
+        self.efl_mm = nn.Parameter(torch.tensor(a))
+
+
+class ToyCamera:
+    """Rays in the direction of the lens's number."""
+
+    seed = 7
+    film = SimpleNamespace(shape=(1, 1))
+
+    def __init__(self, lens):
+        self.lens = lens
+
+    def with_seed(self, seed):
+        twin = ToyCamera(self.lens)
+        twin.seed = seed
+        return twin
+
+    def rays(self):
+        a = self.lens.efl_mm
+        return Rays(torch.zeros(1, 3), torch.stack([a, 0 * a, 0 * a]).reshape(1, 3), ONE)
+
+
+def volume_of(frames):
+    return EventVolume(frames.reshape(1, 1, 1, 1, 1), torch.zeros(1), ONE)
+
+
+def field_of(flow):
+    return FlowField(flow, torch.ones(1, 1, 1, dtype=torch.bool), 1.0)
+
+
+def render_sum(rays):
+    return rays.direction.sum(1).reshape(1, 1, 1)
+
+
+def doubled(frames):
+    return volume_of(2 * frames)
+
+
+def tripled(volume):
+    return field_of(3 * volume.counts[:, 0])
+
+
+def square(field):
+    return field.flow_px.square().sum()
+
+
+def toy(**parts):
+    """loss = (3 * 2 * a)^2 with a = 0.5."""
+    usual = {"camera": ToyCamera(Glass()), "render": render_sum, "events": doubled, "flow": tripled}
+    return System(**{**usual, "objectives": {"square": square}, **parts})
+
+
+def test_gradient_at_every_junction_is_that_of_the_algebra():
+    result = toy()(BATCH, probe=True)
+    result.backward()
+    assert result.loss.item() == pytest.approx(9.0)  # (6 * 0.5)^2
+    grad = {row["junction"]: row["gradient_norm"] for row in result.table()}
+    assert list(grad) == ["lens", "pose", "rays", "frames", "events", "flow"]
+    assert grad["flow"] == pytest.approx(6.0)  # 2 * 3
+    assert grad["events"] == pytest.approx(18.0)
+    assert grad["frames"] == pytest.approx(36.0)
+    assert grad["lens"] == pytest.approx(36.0)
+
+
+def test_table_counts_zero_gradients():
+    result = toy(render=lambda rays: rays.direction[:, 0].reshape(1, 1, 1))(BATCH, probe=True)
+    result.backward()
+    row = next(r for r in result.table() if r["junction"] == "rays")
+    assert row["gradient_norm"] == pytest.approx(36.0)
+    assert row["zero_share"] == pytest.approx(2 / 3)  # of three direction components only x reaches the loss
+
+
+def test_without_a_probe_nothing_is_kept_and_nothing_looked_at():
+    result = toy(render=lambda rays: render_sum(rays) / 0)(BATCH)
+    assert result.junctions is None
+    assert result.loss.item() == float("inf")
+    with pytest.raises(DomainError, match=r"kept nothing; run system\(batch, probe=True\)"):
+        result.table()
+
+
+def test_several_objectives_share_one_pass_and_add_up_by_weight():
+    rendered = []
+
+    def counted(rays):
+        rendered.append(1)
+        return render_sum(rays)
+
+    lens = Glass()
+    system = toy(
+        camera=ToyCamera(lens),
+        render=counted,
+        objectives={"square": square, "sum": lambda volume: volume.counts.sum()},
+    )
+    result = system(BATCH)
+    assert len(rendered) == 1
+    result.backward({"square": 0.5, "sum": 10.0})
+    assert lens.efl_mm.grad.item() == pytest.approx(0.5 * 36 + 10 * 2)  # d(36 a^2)/da = 36, d(2 a)/da = 2
+    assert set(system(BATCH, objectives=("sum",)).objectives) == {"sum"}
+    with pytest.raises(DomainError, match="no objective 'cube'; there are square, sum"):
+        system(BATCH, objectives=("cube",))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "loss"),
+    [
+        ("frames", torch.ones(1, 1, 1), 36.0),
+        ("events", EventVolume(torch.ones(1, 1, 1, 1, 1), torch.zeros(1), ONE), 9.0),
+        ("flow", field_of(torch.full((1, 1, 1, 1), 2.0)), 4.0),
+    ],
+)
+def test_recorded_junctions_replace_what_is_before_them(name, value, loss):
+    def never(rays):
+        raise AssertionError("the render stage ran although a later junction was recorded")
+
+    assert toy(render=never)(BATCH, recorded={name: value}).loss.item() == pytest.approx(loss)
+
+
+def test_unknown_recorded_junction_is_refused():
+    with pytest.raises(
+        DomainError, match=r"\['lenses'\] cannot be replaced; rays, frames, events, flow, estimate can"
+    ):
+        toy()(BATCH, recorded={"lenses": None})
+
+
+def test_a_bad_value_is_named_by_its_junction():
+    with pytest.raises(NonFiniteError, match="junction 'frames'"):
+        toy(render=lambda rays: render_sum(rays) / 0)(BATCH, probe=True)
+
+
+def test_a_bad_gradient_is_named_by_its_junction():
+    # sqrt(|x|) at 0 has a finite value and an infinite slope: the frames are the first junction from the loss
+    # back to see it
+    system = toy(
+        render=lambda rays: rays.direction[:, 1].reshape(1, 1, 1),
+        events=lambda frames: volume_of(frames.abs().sqrt()),
+        objectives={"sum": lambda field: field.flow_px.sum()},
+    )
+    with pytest.raises(NonFiniteError, match="junction 'frames'"):
+        system(BATCH, probe=True).backward()
+
+
+def test_a_stage_gets_what_its_signature_names():
+    seen = {}
+
+    def events(frames, t_s, camera, generator, theta=0.2):
+        seen.update(t_s=t_s, camera=camera, draw=torch.rand(3, generator=generator), theta=theta)
+        return volume_of(2 * frames)
+
+    toy(events=events)(Batch(BATCH.T_world_body, T_S, "wall", seed=5))
+    assert seen["t_s"] is T_S
+    assert seen["camera"].seed == 5
+    assert seen["theta"] == 0.2
+    torch.testing.assert_close(seen["draw"], torch.rand(3, generator=torch.Generator().manual_seed(5)))
+
+
+def test_a_stage_that_asks_for_what_is_not_there_is_refused_at_once():
+    with pytest.raises(
+        DomainError,
+        match="stage 'events' asks for 'theta', which a system does not have; it has batch, camera",
+    ):
+        toy(events=lambda frames, theta: frames)
+
+
+def test_parameters_of_every_part_are_the_systems():
+    class Layer(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.gain = nn.Parameter(torch.tensor(2.0))
+
+        def forward(self, frames):
+            return volume_of(self.gain * frames)
+
+    class Mount(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.numbers = nn.Parameter(torch.zeros(6))
+
+        def forward(self):
+            return torch.eye(4, dtype=torch.float64)
+
+    system = toy(events=Layer(), mount=Mount())
+    assert {name for name, _ in system.named_parameters()} == {"lens.efl_mm", "events.gain", "mount.numbers"}
+    twin = system.replaced(events=doubled)
+    assert {name for name, _ in twin.named_parameters()} == {"lens.efl_mm", "mount.numbers"}
+    assert twin.lens is system.lens
+
+
+def test_estimator_and_bins_must_fit():
+    class Network(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.config = {"bins": 5}
+
+        def forward(self, volume):
+            return tripled(volume)
+
+    assert toy(flow=Network()).bins == 5
+    with pytest.raises(
+        DomainError, match=r"stage 'flow' \(Network\) was built for 5 time bins and the system makes 9"
+    ):
+        toy(flow=Network(), bins=9)
+
+
+def test_counts_of_the_event_stage_must_belong_to_the_frames():
+    with pytest.raises(
+        ShapeError, match=r"stage 'events' returned counts of shape \(1, 3, 2, 1, 1\); \[N, 1, 2, H, W\]"
+    ):
+        toy(events=lambda frames: torch.zeros(1, 3, 2, 1, 1))(BATCH)
+
+
+@pytest.mark.parametrize(
+    ("batch", "kind", "sentence"),
+    [
+        (
+            Batch(torch.eye(4).expand(3, 4, 4), T_S, "wall"),
+            ShapeError,
+            "poses at 3 times .* give one time per pose",
+        ),
+        (Batch(torch.eye(3), T_S, "wall"), ShapeError, r"must be \[..., T, 4, 4\], got \(3, 3\)"),
+        (Batch(None, T_S, "wall"), DomainError, "no poses and the system no trajectory"),
+        (Batch(BATCH.T_world_body, T_S), DomainError, "no scene; give Batch"),
+        (Batch(BATCH.T_world_body, T_S, ("a", "b")), ShapeError, "2 scenes and poses of shape"),
+    ],
+)
+def test_batches_that_do_not_fit_are_refused(batch, kind, sentence):
+    with pytest.raises(kind, match=sentence):
+        toy(render=lambda rays, T_world_cam: render_sum(rays))(batch)
+
+
+def test_scenes_each_see_their_own_poses():
+    poses = torch.eye(4, dtype=torch.float64).expand(2, 1, 2, 4, 4)
+
+    def render(scene, T_world_cam):
+        return float(scene) * T_world_cam[..., 0, 0, None, None]
+
+    counts = toy(render=render, events=lambda frames: frames[:, 1:, None].expand(-1, -1, 2, -1, -1))
+    volume = counts.replaced(bins=1).begin(Batch(poses, T_S, ("3", "4")))["volume"]
+    assert volume.counts[:, 0, 0, 0, 0].tolist() == [3.0, 4.0]
+
+
+def test_windows_of_a_film_become_samples():
+    camera = ToyCamera(Glass())
+    camera.film = SimpleNamespace(shape=(3, 1, 1))
+    poses = torch.eye(4, dtype=torch.float64).expand(2, 2, 4, 4)
+
+    def render(T_world_cam):  # [trajectory 2, T 2, window 3, 1, 1]: 100 trajectory + 10 time + window
+        shape = torch.arange(2.0)[:, None, None] * 100 + torch.arange(2.0)[:, None] * 10 + torch.arange(3.0)
+        return shape[..., None, None]
+
+    seen = []
+
+    def events(frames):
+        seen.append(frames[..., 0, 0])
+        return frames[:, 1:, None].expand(-1, -1, 2, -1, -1)
+
+    toy(camera=camera, render=render, events=events, bins=1)(Batch(poses, T_S, "wall"))
+    assert seen[0].tolist() == [[0, 10], [1, 11], [2, 12], [100, 110], [101, 111], [102, 112]]
+
+
+def test_check_finds_a_frozen_variable_one_that_no_objective_sees_and_a_cut_graph():
+    system = toy()
+    lens = system.lens
+    assert check(system, BATCH, torch.optim.SGD([lens.efl_mm], lr=0.1)).loss.item() == pytest.approx(9.0)
+    stray = nn.Parameter(torch.zeros(2))
+    with pytest.raises(GradientError, match=r"no objective \(square\) depends on variable 1; leave it out"):
+        check(system, BATCH, [lens.efl_mm, stray])
+    with pytest.raises(
+        GradientError,
+        match="depends on none of the variables; the graph is cut in the stage before junction 'events'",
+    ):
+        check(system.replaced(events=lambda frames: doubled(frames.detach())), BATCH, [lens.efl_mm])
+    lens.efl_mm.requires_grad_(False)
+    with pytest.raises(
+        GradientError, match=r"variable 'lens.efl_mm' is frozen but was handed to the optimiser"
+    ):
+        check(system, BATCH, [lens.efl_mm])
+
+
+def test_check_wants_scalars():
+    system = toy(objectives={"each": lambda field: field.flow_px.reshape(1, 1).expand(2, 1)})
+    with pytest.raises(ShapeError, match=r"objective 'each' has shape \(2, 1\); reduce it to one number"):
+        check(system, BATCH)
