@@ -11,6 +11,7 @@ from codesign.events.intensity import lin_log
 from codesign.events.layers.by_name import LAYERS, layer
 from codesign.events.layers.dense import dense
 from codesign.events.layers.expected import annealed, expected
+from codesign.events.layers.hard import HardSensor
 from codesign.events.layers.layer import ComparatorLayer, EventLayer, PhysicalLayer
 from codesign.events.layers.memory import memory, soft_counts
 from codesign.events.layers.physical import PhysicalState, sensor_counts
@@ -43,6 +44,7 @@ __all__ = [
     "PRESETS",
     "ComparatorLayer",
     "EventLayer",
+    "HardSensor",
     "FastSigmoid",
     "Laplace",
     "PhysicalLayer",

@@ -89,8 +89,7 @@ class System(nn.Module):
 
     def _stage(self, name: str, part: Callable[..., Any], inputs: int) -> None:
         self._stages[name] = Stage(name, part, inputs)
-        if isinstance(part, nn.Module):
-            self.add_module(name, part)
+        setattr(self, name, part)  # a Module's parameters are the system's
 
     def forward(
         self,
@@ -220,18 +219,22 @@ class Pass(Mapping):
         return self._at("frames", self._rendered)
 
     def _rendered(self):
-        parts = []
-        for scene, poses in scenes_of(self["scene"], self["T_world_cam"]):
-            if "render" in self.stages:
-                parts.append(
-                    self.stages["render"]({**_asked(self, "render"), "scene": scene, "T_world_cam": poses})
-                )
-            else:
-                rays = self["rays"]
-                parts.append(
-                    render_stage.frames(self["camera"], scene, poses, self.system.gradient, rays=rays)
-                )
-        return parts[0] if not isinstance(self["scene"], (tuple, list)) else torch.stack(parts)
+        parts = [self._one_scene(*pair) for pair in scenes_of(self["scene"], self["T_world_cam"])]
+        return torch.stack(parts) if isinstance(self["scene"], (tuple, list)) else parts[0]
+
+    def _one_scene(self, scene, poses):
+        if "render" in self.stages:
+            asked = {
+                name: self[name]
+                for name in self.stages["render"].asked
+                if name not in ("scene", "T_world_cam")
+            }
+            return self.stages["render"]({**asked, "scene": scene, "T_world_cam": poses})
+        camera = self["camera"]
+        if self.system.gradient != "interior" and "rays" not in self.recorded:
+            return render_stage.frames(camera, scene, poses, self.system.gradient)
+        seen = render_stage.shade(self["rays"], scene, poses, camera.samples_per_pixel)
+        return seen.reshape(*poses.shape[:-2], *camera.film.shape)
 
     def _volume(self) -> EventVolume:
         return self._at("events", self._events)
@@ -278,11 +281,6 @@ class Pass(Mapping):
         valid = torch.stack([valid for _, valid in ends])
         interval_s = float(self["t_s"][-1] - self["t_s"][0])
         return FlowField(self._samples(flow, 1)[:, 0], self._samples(valid)[:, 0], interval_s)
-
-
-def _asked(run: Pass, stage: str) -> dict[str, Any]:
-    """What a stage asks for, but scene and poses, which go one scene at a time."""
-    return {name: run[name] for name in run.stages[stage].asked if name not in ("scene", "T_world_cam")}
 
 
 def _order(item: tuple[str, Any]) -> int:

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from codesign import events
+from codesign import events, render
 from codesign.report import chain_figures, lens_figures
 from scenes import worlds
 from studies.lens_opt.task import FIELDS, PITCH_MM, SENSOR
@@ -14,9 +14,12 @@ def blank_wall():
     return worlds.wall(np.full((64, 64), 60.0, dtype=np.float32), texel_m=0.003)
 
 
-def write(run, task, lenses, history, junctions, case, found):
+def write(run, job, lenses, history, junctions, found):
     """Fill and finish the run's page."""
     m = run.metrics
+    task = job.task
+    case = job.probe
+    record = job.loop.record
     run.card(
         "Flow error, hard events",
         f"{m['flow_error_mrad_hard_optimised']:.2f} mrad",
@@ -65,10 +68,10 @@ def write(run, task, lenses, history, junctions, case, found):
     )
     _seed_emulator(run, task, lenses["optimised"], case)
     run.section("The way there")
-    done = list(range(1, len(history.loss) + 1))
+    done = list(range(1, len(record.loss) + 1))
     losses = {
-        "each step, its own cases": (done, history.loss),
-        "fixed training cases": (history.checked_step, history.score),
+        "each step, its own cases": (done, record.loss),
+        "fixed training cases": (record.judged_step, record.score),
     }
     run.figure(
         chain_figures.curves(losses, _loss_label(run.config.objective)),
@@ -78,7 +81,7 @@ def write(run, task, lenses, history, junctions, case, found):
     run.figure(
         chain_figures.curves(
             {
-                f"field {h:g}": (history.checked_step, [row[k] for row in history.spot_um])
+                f"field {h:g}": (record.judged_step, [row[k] for row in history.spot_um])
                 for k, h in enumerate(FIELDS)
             },
             "RMS spot (µm)",
@@ -89,7 +92,7 @@ def write(run, task, lenses, history, junctions, case, found):
     for name, unit in (("curvature", "1/mm"), ("thickness", "mm")):
         rows = np.array(getattr(history, name))
         series = {
-            f"surface {k + 1}": (history.checked_step, rows[:, k] - rows[0, k]) for k in range(rows.shape[1])
+            f"surface {k + 1}": (record.judged_step, rows[:, k] - rows[0, k]) for k in range(rows.shape[1])
         }
         run.figure(
             chain_figures.curves(series, f"change of {name} ({unit})"),
@@ -132,8 +135,13 @@ def write(run, task, lenses, history, junctions, case, found):
     )
     control = f"Control without texture: detuned {m['flow_error_mrad_hard_control_detuned']:.2f} mrad, optimised {m['flow_error_mrad_hard_control_optimised']:.2f} mrad."
     run.text(control)
+    config = run.config
+    trained = ", the network trained with the lens" if config.train_network else ""
     pace = f" at {m['seconds_per_step']:.2f} s" if "seconds_per_step" in m else ""
-    lead = f"{run.config.lens}, seed {run.config.seed}, objective {run.config.objective}: {m['steps']} steps{pace}."
+    lead = (
+        f"{config.lens}, seed {config.seed}, objective {config.objective}, events {config.events}, flow "
+        f"{config.flow}{trained}: {m['steps']} steps{pace}."
+    )
     run.finish("Lens optimisation for event flow", lead)
     run.say(
         f"flow error {m['flow_error_mrad_hard_detuned']:.3f} -> {m['flow_error_mrad_hard_optimised']:.3f} "
@@ -147,12 +155,11 @@ def _seed_emulator(run, task, optics, case):
     """The seed project's view of the same scene: naive frame-difference events as CSV, and their
     exponential-decay video."""
     with torch.no_grad():
-        frames = task.frames(
-            task.camera(optics, run.config.samples, case.seed).rays(), case, run.config.samples
+        frames = render.frames(
+            task.camera(optics, run.config.samples, case.seed), case.scene, case.T_world_body
         )
-    stream = events.naive(
-        frames.reshape(frames.shape[0], -1, frames.shape[-1]), case.t_s, SENSOR.theta_on
-    )  # the windows above one another
+    tall = frames.reshape(frames.shape[0], -1, frames.shape[-1])  # the windows above one another
+    stream = events.naive(tall, case.t_s, SENSOR.theta_on)
     events.write(run.path("events_naive.csv"), stream)
     events.decay_video(run.path("events_decay.mp4"), stream, case.t_s, 0.015, fps=8)
     run.video(
@@ -173,7 +180,7 @@ def _seen(task, lenses, case, samples):
     for name in ("detuned", "optimised"):
         with torch.no_grad():
             camera = task.camera(lenses[name], samples, case.seed)
-            frames = task.frames(camera.rays(), case, samples)
+            frames = render.frames(camera, case.scene, case.T_world_body)
             counts, _ = events.memory(frames, SENSOR.theta_on, SENSOR.theta_off)
         total = counts.sum(0)
         rows += [list(frames[0].numpy()), list((total[0] - total[1]).numpy())]

@@ -3,14 +3,17 @@ walls, random motions."""
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
-from kornia.filters import spatial_gradient
+from torch import nn
 
-from codesign import events, flow, graph, lens, pose, render
+from codesign import events, lens, pose, render
 from codesign.errors import DomainError
+from codesign.events import HardSensor
 from codesign.lens.design import LensDesign, detune, make_design
+from codesign.system import Batch, System
+from codesign.system.objectives import angular_error_mrad, edge_energy, edge_objective
 from scenes import textures, trajectories, worlds
 
 # DAVIS346: 346 x 260 pixels of 18.5 um
@@ -31,16 +34,6 @@ MOTION = torch.tensor(
 
 
 @dataclass(frozen=True)
-class Case:
-    """One sample: a world, poses [T, 4, 4] at times t_s [T], and a seed for film samples and sensor noise."""
-
-    world: object
-    poses: torch.Tensor
-    t_s: torch.Tensor
-    seed: int
-
-
-@dataclass(frozen=True)
 class LensTask:
     """A nominal lens scaled to the sensor, and the design variables around its detuned twin (the start,
     variables = 0)."""
@@ -50,7 +43,7 @@ class LensTask:
     fields_rad: tuple[float, ...]
 
     @cached_property
-    def film(self):
+    def film(self) -> render.Film:
         """Three windows on the sensor's diagonal, at fields 0, 0.7 and as far out as a window fits."""
         half = WINDOW_PX / 2
         room = [n / 2 - half for n in SENSOR_PX]
@@ -60,118 +53,66 @@ class LensTask:
         )
         return render.Film(*SENSOR_PX, WINDOW_PX, WINDOW_PX, PITCH_MM, corners)
 
-    @cached_property
-    def lattice(self):
-        """Indices of 8 x 8 pixels of every window, where flow errors are measured."""
-        line = torch.arange(4, WINDOW_PX, 8)
-        inside = (line[:, None] * WINDOW_PX + line).reshape(-1)
-        return (torch.arange(len(FIELDS))[:, None] * WINDOW_PX**2 + inside).reshape(-1)
-
-    def camera(self, optics, samples, seed):
+    def camera(self, optics, samples: int, seed: int = 0) -> render.Camera:
         return render.Camera(optics, WINDOW_PX, WINDOW_PX, PITCH_MM, samples, seed, self.film)
 
-    def rms_spot_um(self, optics):
+    def rms_spot_um(self, optics) -> torch.Tensor:
         """RMS spot at the three fields, d line, [3] um."""
         return lens.rms_spot_mm(optics, self.fields_rad) * 1e3
 
-    def angular_error_mrad(self, field, camera, case):
-        """Mean angle by which flow misses the world points under the lattice pixels, [fields] mrad over the
-        interval."""
-        pixels = self.film.pixels()[self.lattice]
-        motion = field.flow_px.permute(0, 2, 3, 1).reshape(-1, 2)[self.lattice].double()
-        points, _, valid = render.truth.world_points(camera.chief_rays(pixels), case.world, case.poses[0])
-        if not bool(valid.all()):
-            raise DomainError("some window pixels see no surface; the wall must fill the view.")
-        later = pose.apply(pose.inverse(case.poses[-1]), points)
-        return 1e3 * render.angular_miss_rad(camera, pixels + motion, later).reshape(len(FIELDS), -1).mean(1)
+    def system(self, camera, layer, flow, objective: str = "flow", every_px: int = 8) -> System:
+        """System of a camera (or what makes one), an event stage and a flow stage.
 
-    def chain(self, samples, layer="memory", objective="flow", optics=None, sensor=SENSOR):
-        """Chain over designs {"variables": [V], "case": Case}; ``optics`` maps a design to a lens (default:
-        the variables through the lens design).
-
-        layer: "memory" (hard counts, straight-through), "counts" (the same without quantisation) or "sigmoid"
-          (the seed project's). objective: "flow" or "edge".
+        objective: "flow" (mean log angular error over the windows) or "edge" (the seed project's). every_px:
+          spacing of the pixels whose flow counts.
         """
-        optics = optics or (lambda design: self.design.lens(design["variables"]))
-        objectives = {
-            "flow": lambda field, camera, design: (
-                self.angular_error_mrad(field, camera, design["case"]).log().mean()
-            ),
-            "edge": lambda score, camera, design: score.flow_px,
-        }
-        estimators = {
-            "flow": lambda volume, design: flow.estimate_lk(volume),
-            "edge": lambda volume, design: _EdgeScore(edge_objective(volume)),
-        }
-        return graph.Chain(
-            lens=lambda design: self.camera(optics(design), samples, design["case"].seed),
-            render=lambda rays, design: self.frames(rays, design["case"], samples),
-            events=lambda frames, design: self.volume(frames, design["case"], layer, sensor),
-            flow=estimators[objective],
-            objective=objectives[objective],
+        error = partial(angular_error_mrad, every_px=every_px)
+
+        def mean_log_error(field, camera, scene, T_world_cam):
+            return error(field, camera, scene, T_world_cam).log().mean()
+
+        found = {"flow": mean_log_error, "edge": lambda volume: edge_objective(volume)}[objective]
+        return System(
+            camera=camera, events=layer, flow=flow, objectives={objective: found}, bins=bins_of(flow)
         )
 
-    def frames(self, rays, case, samples):
-        return render.shade(rays, case.world, case.poses, samples).reshape(
-            case.poses.shape[0], *self.film.shape
-        )
-
-    def volume(self, frames, case, layer, sensor=SENSOR):
-        """Event volume of a case, with the sensor's threshold mismatch and shot noise drawn from the case's
-        seed."""
-        noise = torch.Generator().manual_seed(case.seed)
-        thresholds = events.draw_thresholds(sensor, self.film.shape, noise, dtype=frames.dtype)
-        shot = events.draw_shot_counts(sensor, self.film.shape, case.t_s.diff(), noise, dtype=frames.dtype)
-        if layer == "memory":
-            counts, _ = events.memory(frames, *thresholds)
-        elif layer == "counts":
-            counts = events.soft_counts(frames, *thresholds)
-        else:
-            counts = events.soft(frames, sensor.theta_on)
-        return events.from_counts(counts + shot, case.t_s, BINS)
-
-    def judge(self, optics, case, samples=32):
-        """Errors of a lens on one case with hard events: the physical sensor with true timestamps, no
-        surrogate anywhere.
+    def judge(self, optics, case: Batch, flow, samples: int = 32) -> dict[str, float]:
+        """Errors of a lens on one case with hard events: the physical sensor with true timestamps, no surrogate
+        anywhere.
 
         Returns: dict of flow_error_mrad, edge_energy, events_per_pixel.
         """
+        hard = HardSensor(SENSOR, bins_of(flow))
         with torch.no_grad():
-            camera = self.camera(optics, samples, case.seed)
-            frames = self.frames(camera.rays(), case, samples)
-            tall = frames.reshape(frames.shape[0], -1, WINDOW_PX)  # the windows stacked, as one sensor
-            stream = events.simulate(tall, case.t_s, SENSOR, torch.Generator().manual_seed(case.seed))
-            volume = events.from_stream(stream, 0, round(DURATION_S * 1e6), BINS)
-            counts = (
-                volume.counts.reshape(2, BINS, len(FIELDS), WINDOW_PX, WINDOW_PX)
-                .permute(2, 0, 1, 3, 4)
-                .contiguous()
-            )
-            volume = type(volume)(counts, volume.centroid_s, volume.collected_s)
-            error = self.angular_error_mrad(flow.estimate_lk(volume), camera, case)
-            return {
-                "flow_error_mrad": float(error.mean()),
-                "edge_energy": float(edge_energy(volume)),
-                "events_per_pixel": len(stream) / tall[0].numel(),
-            }
+            seen = self.system(self.camera(optics, samples), hard, flow).begin(case)
+            error = angular_error_mrad(seen["field"], seen["camera"], seen["scene"], seen["T_world_cam"])
+            counts = seen["volume"].counts
+        return {
+            "flow_error_mrad": float(error.mean()),
+            "edge_energy": float(edge_energy(seen["volume"])),
+            "events_per_pixel": float(counts.sum()) / counts[:, 0, 0].numel(),
+        }
 
 
-@dataclass(frozen=True)
-class _EdgeScore:
-    """Stands where the flow field stands when the objective reads event frames only."""
+class DesignedCamera(nn.Module):
+    """The camera of a task at learnable design variables, zero at the detuned start."""
 
-    flow_px: torch.Tensor
+    def __init__(self, task: LensTask, samples: int):
+        super().__init__()
+        self.task = task
+        self.samples = samples
+        self.variables = nn.Parameter(torch.zeros(task.design.basis.shape[1], dtype=torch.float64))
+
+    def optics(self) -> lens.GeoLens:
+        return self.task.design.lens(self.variables)
+
+    def forward(self) -> render.Camera:
+        return self.task.camera(self.optics(), self.samples)
 
 
-def edge_energy(volume):
-    """Mean squared Sobel gradient of the signed event frames (one per bin), events^2 per pixel^2."""
-    signed = volume.counts[:, 0] - volume.counts[:, 1]
-    return spatial_gradient(signed, mode="sobel", normalized=True).square().sum(2).mean()
-
-
-def edge_objective(volume, activity_weight=0.01):
-    """The seed project's objective: -(edge energy of event frames - weight * events per pixel and bin)."""
-    return activity_weight * volume.counts.sum(1).mean() - edge_energy(volume)
+def bins_of(flow) -> int:
+    """Time bins that an estimator takes: those a network was built for, or BINS."""
+    return getattr(flow, "config", {}).get("bins", BINS)
 
 
 def make_task(source, seed, detuned_px=2.2):
@@ -228,4 +169,4 @@ def draw_case(pool, seed, frames=9):
         (float(place[0]), -DISTANCE_M, float(place[1])), (float(place[0]), 0.0, float(place[1]))
     )
     t_s = torch.linspace(0, DURATION_S, frames, dtype=torch.float64)
-    return Case(world, trajectories.body_twist(start, MOTION * motion / DURATION_S, t_s), t_s, seed)
+    return Batch(trajectories.body_twist(start, MOTION * motion / DURATION_S, t_s), t_s, world, seed)

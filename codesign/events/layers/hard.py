@@ -1,0 +1,41 @@
+"""The hard sensor where an event layer stands: single events with their times, no gradient. The judge of designs."""
+
+import torch
+from torch import Generator, Tensor, nn
+
+from codesign.errors import ShapeError
+from codesign.events.sensor.model import SensorModel
+from codesign.events.sensor.simulate import simulate
+from codesign.events.volumes.volume import from_stream
+from codesign.types import EventVolume
+
+
+class HardSensor(nn.Module):
+    """``events.simulate`` and ``events.from_stream`` called like an event layer.
+
+    Args: sensor: SensorModel. bins: time bins of the volume.
+    """
+
+    def __init__(self, sensor: SensorModel, bins: int):
+        super().__init__()
+        self.sensor = sensor
+        self.bins = bins
+
+    @torch.no_grad()
+    def forward(self, frames: Tensor, t_s: Tensor, generator: Generator | None = None) -> EventVolume:
+        """Events of frames [N, T, H, W] at t_s [T] in time bins, [N, 2, bins, H, W].
+
+        generator: one for all samples, which stand above one another as one tall sensor; None: seed 0.
+        Raises: ShapeError for other shapes; DomainError as ``simulate``.
+        """
+        if frames.ndim != 4:
+            raise ShapeError(f"the hard sensor takes frames [N, T, H, W], got {tuple(frames.shape)}.")
+        count, times, height, width = frames.shape
+        tall = frames.movedim(1, 0).reshape(times, count * height, width)
+        stream = simulate(
+            tall, t_s, self.sensor, Generator().manual_seed(0) if generator is None else generator
+        )
+        start_us, end_us = (round(float(t) * 1e6) for t in (t_s[0], t_s[-1]))
+        volume = from_stream(stream, start_us, end_us, self.bins)
+        counts = volume.counts.reshape(2, self.bins, count, height, width).permute(2, 0, 1, 3, 4).contiguous()
+        return EventVolume(counts, volume.centroid_s, volume.collected_s)
