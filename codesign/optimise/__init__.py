@@ -2,7 +2,7 @@
 
 from codesign.optimise.adam import ScaledAdam
 from codesign.optimise.descent import Descent
-from codesign.optimise.gradients import clipped_mean, sample_gradients
+from codesign.optimise.gradients import SampleGradients, clipped_mean, sample_gradients
 from codesign.optimise.least_squares import DampedLeastSquares, StopRules
 from codesign.optimise.loop import Loop, Record, check_parameters
 
@@ -11,6 +11,7 @@ __all__ = [
     "Descent",
     "Loop",
     "Record",
+    "SampleGradients",
     "ScaledAdam",
     "StopRules",
     "check_parameters",

@@ -1,21 +1,29 @@
 """Gradients of samples, one by one: clipped before they are averaged, because a few are tens of times too long."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from codesign.errors import GradientError, NonFiniteError
+from codesign.errors import GradientError
 
 
-def sample_gradients(losses: Iterable[Tensor], parameters: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+@dataclass(frozen=True)
+class SampleGradients:
+    """Losses [S] of samples, and their gradients [S, V] to the parameters' numbers in order."""
+
+    values: Tensor
+    gradients: Tensor
+
+
+def sample_gradients(losses: Iterable[Tensor], parameters: Sequence[Tensor]) -> SampleGradients:
     """Values and gradients of sample losses, each taken as soon as it is made, so that one graph lives at a time.
 
     Args: losses: scalars, S of them; a generator makes each when it is needed. parameters: leaves that ask for
       gradients, of any shapes.
-    Returns: values [S] float64; gradients [S, V] float64, the parameters' numbers in order.
-    Raises: GradientError when a loss does not depend on any of the parameters; NonFiniteError when a loss or
-      gradient is not finite.
+    Returns: SampleGradients, float64.
+    Raises: GradientError when a loss does not depend on any of the parameters.
     """
     values = []
     rows = []
@@ -25,24 +33,17 @@ def sample_gradients(losses: Iterable[Tensor], parameters: Sequence[Tensor]) -> 
         grads = torch.autograd.grad(loss, list(parameters), allow_unused=True)
         if all(g is None for g in grads):
             raise GradientError("a sample's loss does not depend on any parameter that is optimised.")
-        row = torch.cat([_flat(g, p) for g, p in zip(grads, parameters, strict=True)])
-        value = float(loss.detach())
-        if not (bool(row.isfinite().all()) and value == value and abs(value) != float("inf")):
-            raise NonFiniteError("a sample's loss or its gradient is infinite or NaN.")
-        values.append(value)
-        rows.append(row)
-    return torch.tensor(values, dtype=torch.float64), torch.stack(rows)
+        values.append(float(loss.detach()))
+        rows.append(torch.cat([_flat(g, p) for g, p in zip(grads, parameters, strict=True)]))
+    return SampleGradients(torch.tensor(values, dtype=torch.float64), torch.stack(rows))
 
 
-def clipped_mean(gradients: Tensor, limit: float | None) -> tuple[Tensor, Tensor]:
-    """Mean of gradients [S, V], those longer than ``limit`` cut to it; None cuts to the median length.
-
-    Returns: mean [V], and the lengths [S] before the cut.
-    """
+def clipped_mean(gradients: Tensor, limit: float | None) -> Tensor:
+    """Mean [V] of gradients [S, V], those longer than ``limit`` cut to it; None cuts to the median length."""
     lengths = gradients.norm(dim=1)
     felt = lengths[lengths > 0]
     longest = limit if limit is not None else float(felt.median()) if felt.numel() else 1.0
-    return (gradients * (longest / lengths.clamp_min(1e-300)).clamp(max=1.0)[:, None]).mean(0), lengths
+    return (gradients * (longest / lengths.clamp_min(1e-300)).clamp(max=1.0)[:, None]).mean(0)
 
 
 def assign(parameters: Sequence[Tensor], gradient: Tensor) -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
-from codesign.optimise.gradients import assign, clipped_mean, sample_gradients
+from codesign.optimise.gradients import SampleGradients, assign, clipped_mean, sample_gradients
 
 
 @dataclass
@@ -31,8 +31,8 @@ class Loop:
 
     Args:
       optimiser: torch.optim.Optimizer over what is optimised.
-      samples: step number -> the samples' scalar losses, best as a generator.
-      clip: longest gradient of a sample, over all parameters; None clips to the median length of the samples.
+      samples: step number -> the samples' scalar losses, best as a generator; or their SampleGradients.
+      clip: longest gradient of a sample within a parameter group; None clips to the median length of the samples.
       judge: () -> score, the lower the better, at the parameters as they are; without one the last point is the
         best. judge_every: steps between judgements; the start and the end are judged too.
       patience: worse judgements borne in a row before the loop goes back to the best point with its step sizes
@@ -51,7 +51,7 @@ class Loop:
     def __init__(
         self,
         optimiser: torch.optim.Optimizer,
-        samples: Callable[[int], Iterable[Tensor]],
+        samples: Callable[[int], Iterable[Tensor] | SampleGradients],
         *,
         clip: float | None = 1.5,
         judge: Callable[[], float] | None = None,
@@ -120,15 +120,23 @@ class Loop:
         return self.best
 
     def _step(self) -> None:
-        values, gradients = sample_gradients(self.samples(self.step_number), self.parameters)
-        mean, lengths = clipped_mean(gradients, self.clip)
-        assign(self.parameters, mean)
+        found = self.samples(self.step_number)
+        if not isinstance(found, SampleGradients):
+            found = sample_gradients(found, self.parameters)
+        if not bool(found.values.isfinite().all() and found.gradients.isfinite().all()):
+            raise NonFiniteError("a sample's loss or its gradient is infinite or NaN.")
+        assign(self.parameters, self._clipped(found.gradients))
         factor = self._shrunk * (1.0 if self.schedule is None else self.schedule(self.step_number))
         for group, lr in zip(self.optimiser.param_groups, self._first_lr, strict=True):
             group["lr"] = lr * factor
         self.optimiser.step()
-        self.record.loss.append(float(values.mean()))
-        self.record.gradient.append(float(lengths.mean()))
+        self.record.loss.append(float(found.values.mean()))
+        self.record.gradient.append(float(found.gradients.norm(dim=1).mean()))
+
+    def _clipped(self, gradients: Tensor) -> Tensor:
+        """Mean of the samples' gradients, clipped group by group: weights and lenses have no common unit."""
+        sizes = [sum(p.numel() for p in group["params"]) for group in self.optimiser.param_groups]
+        return torch.cat([clipped_mean(part, self.clip) for part in gradients.split(sizes, 1)])
 
     def _judged(self) -> bool:
         return bool(self.record.judged_step) and self.record.judged_step[-1] == self.step_number

@@ -21,7 +21,7 @@ from codesign.optimise import Descent, Loop
 from codesign.system import System, check
 from studies.frame.run import Run, StudyConfig, main
 from studies.lens_opt import page as lens_opt_page
-from studies.lens_opt.stages import ESTIMATORS, estimator, event_layer, weights_of
+from studies.lens_opt.stages import estimator, event_layer, weights_of
 from studies.lens_opt.task import (
     HELD_OUT,
     SENSOR,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from codesign.errors import NonFiniteError
+from codesign.optimise import Descent, Loop, SampleGradients
 from codesign.place import Mount
 from studies.placement.task import HALF_RANGE_M, NOMINAL_M
 
@@ -52,72 +52,63 @@ def draw_mount(generator):
 
 
 def descend(task, mount, steps, advance=lambda error: None):
-    """Gradient steps of set length with momentum from ``mount``; after PATIENCE steps without a new best,
-    back to the best with half the length.
+    """Steps of set length from ``mount`` along the averaged gradient; after PATIENCE steps without a new best, back
+    to the best with shorter ones.
 
-    Steps follow the gradient of the error to be expected (task.expected); what counts as best is the task
-    error with hard events.
+    Steps follow the gradient of the error to be expected (task.expected); what counts as best is the task error
+      with hard events. Single samples' gradients are heavy-tailed, so each is cut to the median length.
     Returns: Path of all mounts tried, steps + 1 long. Raises: NonFiniteError when a gradient is not finite.
     """
-    now = mount.numbers.detach().clone()
-    best = now
-    best_error = math.inf
-    best_way = torch.zeros_like(now)
-    momentum = torch.zeros_like(now)
-    length = FIRST_STEP
-    since = 0
-    poses = []
-    errors = []
-    for _ in range(steps + 1):
-        error, way = downhill(task, mount, now)
-        poses.append(mount(now).detach())
-        errors.append(error)
-        if error < best_error:
-            best = now
-            best_error = error
-            best_way = way
-            since = 0
-        else:
-            since += 1
-        if since > PATIENCE:
-            now, way, momentum, length, since = best, best_way, torch.zeros_like(now), SHRINK * length, 0
-        momentum = MOMENTUM * momentum + way
-        now = now + length * torch.nn.functional.normalize(momentum, dim=0) * UNIT
-        advance(error)
-    return Path(
-        torch.stack(poses),
-        torch.tensor(errors, dtype=torch.float64),
-        RENDERS_PER_STEP * (torch.arange(steps + 1) + 1),
+    here = Here(task, mount)
+    optimiser = Descent([here.steps], FIRST_STEP, MOMENTUM, pull=0.0, normalised=True)
+    loop = Loop(
+        optimiser, here.downhill, clip=None, judge=here.judge, judge_every=1, patience=PATIENCE, shrink=SHRINK
     )
+    loop.run(steps, save=lambda: advance(loop.record.score[-1]))
+    errors = torch.tensor(loop.record.score, dtype=torch.float64)
+    return Path(torch.stack(here.tried), errors, RENDERS_PER_STEP * (torch.arange(steps + 1) + 1))
 
 
-def downhill(task, mount, numbers):
-    """Task error with hard events, and the direction [6] of steepest descent of the expected error, per UNIT
-    (length about 1, or 0 where no sample feels the mount).
+class Here:
+    """A mount at natural steps from its start: error, and gradient of the expected error, out of one render.
 
-    Single samples' gradients are heavy-tailed, so each is cut to the median length before they are averaged.
+    steps: [6] parameter; the mount's numbers are those of the start + UNIT * steps. tried: mounts judged so far.
     """
-    copies = numbers.expand(task.samples, 6).clone().requires_grad_()
-    poses = mount(copies)
-    frames = task.frames(poses)
-    expected = task.expected(poses, frames=frames)
-    (grads,) = torch.autograd.grad(expected.square().mean().sqrt(), copies)
-    if not bool(grads.isfinite().all()):
-        raise NonFiniteError(
-            "the gradient of the expected error became infinite or NaN at junction 'mount'; finished "
-            "searches are kept."
-        )
-    grads = grads * UNIT
-    lengths = grads.norm(dim=1)
-    limit = lengths[lengths > 0].median() if bool((lengths > 0).any()) else 1.0
-    cut = grads * (limit / lengths.clamp(min=1e-300)).clamp(max=1)[:, None]
-    with torch.no_grad():
-        error = float(task.errors(mount(numbers), frames=frames.detach()).task)
-    way = -torch.nn.functional.normalize(cut.sum(0), dim=0)
-    return (
-        error,
-        (16 * way).round() / 16,
-    )  # the backward pass sums in any order (1e-5): without rounding no run would repeat another's path
+
+    def __init__(self, task, mount):
+        self.task = task
+        self.mount = mount
+        self.start = mount.numbers.detach().clone()
+        self.steps = torch.nn.Parameter(torch.zeros(6, dtype=torch.float64))
+        self.tried = []
+        self._rendered = None
+
+    def _render(self):
+        """Copies of the steps, one per sample, and the frames behind them; remembered until the steps change."""
+        now = self.steps.detach().clone()
+        if self._rendered is None or not torch.equal(self._rendered[0], now):
+            copies = now.expand(self.task.samples, 6).clone().requires_grad_()
+            with torch.enable_grad():
+                mounts = self.mount(self.start + UNIT * copies)
+                frames = self.task.begin(mounts)["frames"]
+            self._rendered = now, copies, mounts, frames
+        return self._rendered
+
+    def judge(self):
+        """Task error with hard events."""
+        _, _, mounts, frames = self._render()
+        self.tried.append(mounts[0].detach())
+        return self.task.errors(mounts.detach(), frames=frames.detach()).task
+
+    def downhill(self, step):
+        """Gradient of every sample's share in the expected error."""
+        _, copies, mounts, frames = self._render()
+        with torch.enable_grad():
+            expected = self.task.expected(mounts, frames=frames)
+            loss = expected.square().mean().sqrt()
+        (gradients,) = torch.autograd.grad(loss, copies)
+        self._rendered = None
+        return SampleGradients(expected.detach(), gradients)
 
 
 def random_search(task, mount, count, generator, advance=lambda error: None):

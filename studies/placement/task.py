@@ -23,7 +23,7 @@ held instead, every turn of the camera by a pixel shows new texture, and the gra
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -31,6 +31,7 @@ from kornia.filters import gaussian_blur2d, spatial_gradient
 
 from codesign import events, flow, lens, place, render
 from codesign.pose import se3_exp
+from codesign.system import Batch, System
 from codesign.types import EventVolume
 from scenes import textures, worlds
 
@@ -101,110 +102,128 @@ class PlacementTask:
     def samples(self):
         return self.velocity.shape[0] * self.velocity.shape[1]
 
-    def poses(self, T_body_cam):
-        """T_world_cam [B, T, 4, 4] of mounts [B, 4, 4], one per sample (world by world)."""
+    def batch(self):
+        """All worlds and motions; the poses follow from the mount (``driven``)."""
+        return Batch(None, self.t_s, self.worlds, 1000 * self.seed)
+
+    def driven(self, T_body_cam):
+        """T_world_body [W, M, T, 4, 4] of drives that lead mounts [W, M, 4, 4] past each sample's patch."""
         velocity = self.velocity.reshape(-1, 3)
         zero = torch.zeros(self.samples, dtype=torch.float64)
         twist = torch.stack([velocity[:, 0], velocity[:, 1], zero, zero, zero, velocity[:, 2]], 1)
         moving = se3_exp((self.t_s - DURATION_S / 2)[:, None] * twist[:, None])
         patch = self.patch.reshape(-1, 3)
-        looked_at, heading = footprint(T_body_cam)
+        looked_at, heading = footprint(T_body_cam.reshape(-1, 4, 4))
         start = (
             planar(patch[:, :2], patch[:, 2])
             @ planar(zero[:, None].expand(-1, 2), -heading)
             @ planar(-looked_at, zero)
         )
-        return start[:, None] @ moving @ T_body_cam[:, None]
+        return (start[:, None] @ moving).reshape(*self.velocity.shape[:2], FRAMES, 4, 4)
 
-    def frames(self, T_body_cam):
-        """[T, B, H, W] of mounts [B, 4, 4]."""
-        poses = self.poses(T_body_cam).unflatten(0, (len(self.worlds), -1))
-        return render.frames(self.camera, self.worlds, poses).flatten(0, 1).transpose(0, 1)
+    def system(self, T_body_cam, layer="memory"):
+        """System behind mounts [4, 4] or [B, 4, 4], one per sample (world by world).
 
-    def volume(self, frames, layer="memory"):
-        """Event volume of frames [T, B, H, W]. layer: "memory" (hard counts, straight-through), "counts"
-        (smooth, no noise) or "sensor" (single
-        events with their times, no gradient). Mismatch is the same for all samples, as they share one
-        sensor."""
-        if layer == "counts":
-            return events.from_counts(
-                events.soft_counts(frames, SENSOR.theta_on, SENSOR.theta_off), self.t_s, BINS
-            )
-        if layer == "sensor":
-            volumes = [self._recorded(frames[:, k], k) for k in range(frames.shape[1])]
-            return EventVolume(
-                torch.cat([v.counts for v in volumes]), volumes[0].centroid_s, volumes[0].collected_s
-            )
-        counts, _ = events.memory(
-            frames,
-            *events.draw_thresholds(SENSOR, self.camera.film.shape, self._noise(0), dtype=frames.dtype),
-        )
-        return events.from_counts(counts + self._shots.to(counts), self.t_s, BINS)
-
-    def _noise(self, extra):
-        return torch.Generator().manual_seed(1000 * self.seed + extra)
-
-    @cached_property
-    def _shots(self):
-        return events.draw_shot_counts(
-            SENSOR, (self.samples, *self.camera.film.shape), self.t_s.diff(), self._noise(1)
+        layer: "memory" (hard counts, straight-through), "counts" (smooth, no noise) or "sensor" (single events
+          with their times, no gradient).
+        """
+        mounts = T_body_cam.expand(self.samples, 4, 4).reshape(*self.velocity.shape[:2], 4, 4)
+        return System(
+            camera=self.camera,
+            mount=lambda: mounts,
+            trajectory=self.driven,
+            events=LAYERS[layer],
+            flow=near_flow,
+            estimate=near_velocity,
+            objectives={"task": lambda estimate: self.scored(estimate).task, "expected": expected_error},
+            bins=BINS,
         )
 
-    def _recorded(self, frames, index):
-        stream = events.simulate(frames, self.t_s, SENSOR, self._noise(2 + index))
-        return events.from_stream(stream, 0, round(DURATION_S * 1e6), BINS)
+    def scored(self, estimate):
+        """Errors of estimated velocities [B, 3]."""
+        return Errors(estimate - self.velocity.reshape(-1, 3))
+
+    def begin(self, T_body_cam, layer="memory", frames=None):
+        """A pass behind mounts, to read from by name; ``frames`` of an earlier pass saves rendering them again."""
+        recorded = {} if frames is None else {"frames": frames}
+        return self.system(T_body_cam, layer).begin(self.batch(), recorded)
+
+    def poses(self, T_body_cam):
+        """T_world_cam [B, T, 4, 4] of mounts, one per sample (world by world)."""
+        return self.begin(T_body_cam)["T_world_cam"].flatten(0, 1)
 
     def depth_m(self, T_body_cam):
-        """True depth [B, P] of the ground z = 0 under every pixel; infinite where a pixel sees the sky.
-        Planar motion leaves it as it is."""
-        direction = self.camera.chief_rays(self.camera.film.pixels()).direction
-        slope = direction / direction[:, 2:]
-        falling = -(slope @ T_body_cam[..., 2, :3, None])[..., 0]
-        meets = falling.detach() > 1e-6
-        return torch.where(meets, T_body_cam[..., 2, 3, None] / torch.where(meets, falling, 1.0), torch.inf)
+        """True depth [B, P] of the ground under every pixel of mounts [B, 4, 4], see ``ground_depth_m``."""
+        return ground_depth_m(self.camera, T_body_cam)
 
-    def estimate(self, T_body_cam, layer="memory", frames=None):
-        """Velocities [B, 3] estimated behind mounts [4, 4] or [B, 4, 4]; ``frames`` saves rendering them
-        again.
+    def errors(self, T_body_cam, layer="memory", frames=None):
+        """Errors of the velocities estimated behind mounts.
 
         Gradient: mounts (straight-through for "memory", exact for "counts").
         """
-        mounts = T_body_cam.expand(self.samples, 4, 4)
-        depth = self.depth_m(mounts)
-        near = nearness(depth)
-        volume = self.volume(self.frames(mounts) if frames is None else frames, layer)
-        faded = volume.counts * near.to(volume.counts).reshape(-1, 1, 1, *self.camera.film.shape)
-        field = flow.estimate_lk(
-            EventVolume(faded, volume.centroid_s, volume.collected_s), model="affine", prior_px=PRIOR_PX
+        return self.scored(self.begin(T_body_cam, layer, frames)["estimate"])
+
+    def expected(self, T_body_cam, frames=None):
+        """Task error [B] to be expected from event noise alone, see ``expected_error``. Gradient: mounts."""
+        return expected_error(
+            **{name: self.begin(T_body_cam, "counts", frames)[name] for name in SEEN_BY_BOUND}
         )
-        weight = near * (DURATION_S / FLOW_NOISE_PX) ** 2
-        return place.velocity_from_flow(field.flow_px / DURATION_S, self.camera, depth, mounts, weight, PRIOR)
 
-    def errors(self, T_body_cam, layer="memory", frames=None):
-        return Errors(self.estimate(T_body_cam, layer, frames) - self.velocity.reshape(-1, 3))
 
-    def expected(self, T_body_cam, layer="counts", frames=None):
-        """Task error [B] to be expected from event noise alone: the Cramér-Rao bound of the velocity, given
-        the edges that the events draw.
+LAYERS = {
+    "memory": events.layer("memory", SENSOR, learn=()),
+    "counts": events.layer("counts", replace(SENSOR, theta_sigma=0.0, shot_rate_hz=0.0), learn=()),
+    "sensor": events.HardSensor(SENSOR, BINS),
+}
+SEEN_BY_BOUND = ("volume", "camera", "T_body_cam")
 
-        A pixel's event rate V ties one component of the velocity, by grad V . flow = -V_t with noise
-        NOISE_RATE; place.planar_flow makes it a row.
-        Squares summed over thousands of pixels: unlike the error of one draw it has no sign that changes when
-          the image shifts by a pixel, and
-        its gradient points where the task error falls. Gradient: mounts, as for ``estimate``.
-        """
-        mounts = T_body_cam.expand(self.samples, 4, 4)
-        depth = self.depth_m(mounts)
-        counts = self.volume(self.frames(mounts) if frames is None else frames, layer).counts.sum(2)
-        rate = gaussian_blur2d(counts[:, :1] - counts[:, 1:], (7, 7), (1.0, 1.0))
-        edges = spatial_gradient(rate, mode="diff")[:, 0].flatten(2).double()  # [B, 2, P]
-        flow_rows, _ = place.planar_flow(self.camera, depth, mounts)
-        rows = (
-            torch.einsum("bcp,bpck->bpk", edges, flow_rows)
-            * (nearness(depth) * DURATION_S / NOISE_RATE)[..., None]
-        )
-        normal = rows.mT @ rows + torch.diag(torch.tensor(PRIOR, dtype=torch.float64) ** -2)
-        return (torch.linalg.inv(normal).diagonal(dim1=1, dim2=2) / SCALES**2).mean(1).sqrt()
+
+def ground_depth_m(camera, T_body_cam):
+    """True depth [B, P] of the ground z = 0 under every pixel; infinite where a pixel sees the sky. Planar
+    motion leaves it as it is."""
+    direction = camera.chief_rays(camera.film.pixels()).direction
+    slope = direction / direction[:, 2:]
+    falling = -(slope @ T_body_cam[..., 2, :3, None])[..., 0]
+    meets = falling.detach() > 1e-6
+    return torch.where(meets, T_body_cam[..., 2, 3, None] / torch.where(meets, falling, 1.0), torch.inf)
+
+
+def near_flow(volume, camera, T_body_cam):
+    """Affine flow of events on near ground."""
+    near = nearness(ground_depth_m(camera, T_body_cam.flatten(0, -3)))
+    faded = volume.counts * near.to(volume.counts).reshape(-1, 1, 1, *camera.film.shape)
+    return flow.estimate_lk(
+        EventVolume(faded, volume.centroid_s, volume.collected_s), model="affine", prior_px=PRIOR_PX
+    )
+
+
+def near_velocity(field, camera, T_body_cam):
+    """Velocities [B, 3] of the body by weighted least squares, near ground first."""
+    mounts = T_body_cam.flatten(0, -3)
+    depth = ground_depth_m(camera, mounts)
+    weight = nearness(depth) * (DURATION_S / FLOW_NOISE_PX) ** 2
+    return place.velocity_from_flow(field.flow_px / DURATION_S, camera, depth, mounts, weight, PRIOR)
+
+
+def expected_error(volume, camera, T_body_cam):
+    """Task error [B] to be expected from event noise alone: the Cramér-Rao bound of the velocity, given the
+    edges that the events draw.
+
+    A pixel's event rate V ties one component of the velocity, by grad V . flow = -V_t with noise NOISE_RATE;
+    place.planar_flow makes it a row. Squares summed over thousands of pixels: unlike the error of one draw it has
+    no sign that changes when the image shifts by a pixel, and its gradient points where the task error falls.
+    Gradient: mounts, and events.
+    """
+    mounts = T_body_cam.flatten(0, -3)
+    depth = ground_depth_m(camera, mounts)
+    counts = volume.counts.sum(2)
+    rate = gaussian_blur2d(counts[:, :1] - counts[:, 1:], (7, 7), (1.0, 1.0))
+    edges = spatial_gradient(rate, mode="diff")[:, 0].flatten(2).double()  # [B, 2, P]
+    flow_rows, _ = place.planar_flow(camera, depth, mounts)
+    rows = torch.einsum("bcp,bpck->bpk", edges, flow_rows)
+    rows = rows * (nearness(depth) * DURATION_S / NOISE_RATE)[..., None]
+    normal = rows.mT @ rows + torch.diag(torch.tensor(PRIOR, dtype=torch.float64) ** -2)
+    return (torch.linalg.inv(normal).diagonal(dim1=1, dim2=2) / SCALES**2).mean(1).sqrt()
 
 
 def nearness(depth_m):

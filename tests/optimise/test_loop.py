@@ -66,14 +66,21 @@ def test_normalised_descent_steps_as_far_as_told_over_all_parameters_and_stays_o
 def test_sample_gradients_are_clipped_one_by_one():
     x = nn.Parameter(torch.zeros(2, dtype=torch.float64))
     slopes = torch.tensor([[3.0, 4.0], [0.3, 0.4], [0.0, -1.0]], dtype=torch.float64)
-    values, gradients = sample_gradients(((x * s).sum() + 1 for s in slopes), [x])
-    assert values.tolist() == [1.0, 1.0, 1.0]
-    torch.testing.assert_close(gradients, slopes)
-    mean, lengths = clipped_mean(gradients, 1.0)
-    torch.testing.assert_close(lengths, torch.tensor([5.0, 0.5, 1.0], dtype=torch.float64))
+    found = sample_gradients(((x * s).sum() + 1 for s in slopes), [x])
+    assert found.values.tolist() == [1.0, 1.0, 1.0]
+    torch.testing.assert_close(found.gradients, slopes)
+    mean = clipped_mean(found.gradients, 1.0)
     torch.testing.assert_close(mean, torch.tensor([0.9 / 3, 0.2 / 3], dtype=torch.float64))
-    median, _ = clipped_mean(gradients, None)  # the median length is 1
-    torch.testing.assert_close(median, mean)
+    torch.testing.assert_close(clipped_mean(found.gradients, None), mean)  # the median length is 1
+
+
+def test_groups_are_clipped_by_themselves():
+    x = nn.Parameter(torch.zeros(1, dtype=torch.float64))
+    y = nn.Parameter(torch.zeros(1, dtype=torch.float64))
+    optimiser = torch.optim.SGD([{"params": [x], "lr": 1.0}, {"params": [y], "lr": 1.0}])
+    Loop(optimiser, lambda step: [100 * x.sum() + 0.5 * y.sum()], clip=1.0).run(1)
+    assert x.item() == pytest.approx(-1.0)
+    assert y.item() == pytest.approx(-0.5)
 
 
 def test_a_worse_score_goes_back_to_the_best_with_smaller_steps():
