@@ -16,7 +16,6 @@ if TYPE_CHECKING:
         events,
         flow,
         grad,
-        graph,
         lens,
         optimise,
         place,
@@ -24,20 +23,22 @@ if TYPE_CHECKING:
         render,
         report,
         state,
+        system,
         types,
     )
+    from codesign.system import System
 
 # Torch's OpenMP threads would busy-wait after each operation on the core that drjit's thread pool needs (a
 # render step took 2x the CPU).
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 __all__ = [
+    "System",
     "backend",
     "errors",
     "events",
     "flow",
     "grad",
-    "graph",
     "lens",
     "optimise",
     "place",
@@ -45,11 +46,14 @@ __all__ = [
     "render",
     "report",
     "state",
+    "system",
     "types",
 ]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "System":
+        return importlib.import_module("codesign.system").System
     if name in __all__:
         return importlib.import_module(f"codesign.{name}")
     if name == "__version__":

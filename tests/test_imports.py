@@ -15,7 +15,7 @@ FLOORS = (
     {"state"},
     {"lens", "render", "events", "place"},  # none imports another: what one needs is passed in
     {"flow"},
-    {"graph", "system"},
+    {"system"},
     {"report"},
     {"optimise"},
     {"train", "task"},

@@ -2,6 +2,7 @@
 required figures."""
 
 import math
+from dataclasses import replace
 
 import torch
 
@@ -213,12 +214,11 @@ def _final(task, case_list, layer, samples, sensor=SENSOR):
             (torch.tensor(CURVES),), p["curvature"].to(base.curvature_per_mm)
         )
         optics = base.replace(curvature_per_mm=base.curvature_per_mm + change)
-        chain = task.chain(samples, layer, optics=lambda design: optics, sensor=sensor)
-        losses = []
-        for case in cases:
-            moved = type(case)(case.world, case.poses @ pose.se3_exp(p["pose"]), case.t_s, case.seed)
-            losses.append(chain({"case": moved}).loss)
-        return torch.stack(losses).mean()
+        system = task.system(
+            task.camera(optics, samples), events.layer(layer, sensor, learn=()), flow.estimate_lk
+        )
+        moved = [replace(case, T_world_body=case.T_world_body @ pose.se3_exp(p["pose"])) for case in cases]
+        return torch.stack([system(case).loss for case in moved]).mean()
 
     unit = task.design.basis[:5, -1].abs().max() * torch.ones(
         3, dtype=torch.float64

@@ -123,7 +123,9 @@ def test_steps_from_a_poor_start_lower_the_error(task):
 
 def test_nothing_to_see_gives_zero_velocity(task):
     sky = mount_at(-60)().detach()
-    assert float(task.begin(sky)["estimate"].abs().max()) < 0.02  # events of noise alone, against a prior of 1
+    assert (
+        float(task.begin(sky)["estimate"].abs().max()) < 0.02
+    )  # events of noise alone, against a prior of 1
 
 
 def test_drawn_and_grid_mounts_are_where_they_should_be(generator):
