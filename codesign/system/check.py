@@ -34,6 +34,9 @@ def check(
                 f"{_name(names, variable, number)} is frozen but was handed to the optimiser; thaw it with "
                 "requires_grad_(True), or leave it out."
             )
+    run = system.begin(batch)
+    if hasattr(run["camera"], "check"):
+        run["camera"].check()
     result = system(batch, objectives=objectives, probe=True)
     reached = [False] * len(wanted)
     for name, value in result.objectives.items():

@@ -219,22 +219,16 @@ class Pass(Mapping):
         return self._at("frames", self._rendered)
 
     def _rendered(self):
-        parts = [self._one_scene(*pair) for pair in scenes_of(self["scene"], self["T_world_cam"])]
-        return torch.stack(parts) if isinstance(self["scene"], (tuple, list)) else parts[0]
-
-    def _one_scene(self, scene, poses):
-        if "render" in self.stages:
-            asked = {
-                name: self[name]
-                for name in self.stages["render"].asked
-                if name not in ("scene", "T_world_cam")
-            }
-            return self.stages["render"]({**asked, "scene": scene, "T_world_cam": poses})
-        camera = self["camera"]
-        if self.system.gradient != "interior" and "rays" not in self.recorded:
-            return render_stage.frames(camera, scene, poses, self.system.gradient)
-        seen = render_stage.shade(self["rays"], scene, poses, camera.samples_per_pixel)
-        return seen.reshape(*poses.shape[:-2], *camera.film.shape)
+        scene = self["scene"]
+        poses = self["T_world_cam"]
+        if "render" not in self.stages:
+            way = self.system.gradient
+            rays = self["rays"] if way in render_stage.sequence.PROVEN or "rays" in self.recorded else None
+            return render_stage.frames(self["camera"], scene, poses, way, rays=rays)
+        stage = self.stages["render"]
+        asked = {name: self[name] for name in stage.asked if name not in ("scene", "T_world_cam")}
+        parts = [stage({**asked, "scene": one, "T_world_cam": its}) for one, its in scenes_of(scene, poses)]
+        return torch.stack(parts) if isinstance(scene, (tuple, list)) else parts[0]
 
     def _volume(self) -> EventVolume:
         return self._at("events", self._events)
