@@ -378,6 +378,52 @@ def test_grazing_rays_have_the_steep_but_true_derivatives_of_the_closed_form(dis
     )
 
 
+def test_the_soft_edge_is_a_cubic_step_in_the_square_of_the_radius():
+    """3 u^2 - 2 u^3 with u = 1/2 at the aperture, u falling by r / (edge x aperture) per radius: flat where it
+    begins and where it ends, so that gradients have no jump."""
+    semi = 9.5
+    edge = 0.4
+    geo = GeoLens([Surface(INF, 10.0, None, semi)], 4.0, soft_edge_mm=edge)
+    share = f64([0.0, 0.1, 0.25, 0.6, 0.9, 1.0])
+    radius = (semi**2 - (2 * share - 1) * edge * semi).sqrt().requires_grad_()
+    origin = torch.stack([0 * radius, radius, 0 * radius], 1)
+    weight = geo.trace(origin, f64([(0, 0, 1.0)] * len(share))).weight
+    torch.testing.assert_close(weight.detach(), 3 * share**2 - 2 * share**3, rtol=0, atol=1e-12)
+    (slope,) = torch.autograd.grad(weight.sum(), radius)
+    truth = -6 * share * (1 - share) * radius.detach() / (edge * semi)
+    torch.testing.assert_close(slope, truth, rtol=1e-11, atol=1e-11)
+
+
+def test_a_ray_that_meets_the_vertex_plane_but_not_the_asphere_has_deficit_one():
+    # z = r^2 from (20, 0, -1) along (0.1, 0, 1): s - 1 = (20 + 0.1 s)^2 has no root (its discriminant is 9 - 16.04)
+    bowl = GeoLens([Surface(INF, 5.0, GLASS, 4.0, asphere=(1.0,)), Surface(INF, 10.0, None, 9.0)], 4.0)
+    out = bowl.trace(f64([(20.0, 0.0, -1.0)]), unit([(0.1, 0.0, 1.0)]))
+    assert (out.status.item(), out.failed_surface.item()) == (Status.MISS, 0)
+    assert out.deficit.item() == 1.0
+
+
+@pytest.mark.parametrize("fourth", [2e-3, -2e-3, 1e-2])
+def test_steep_aspheres_are_met_far_from_their_vertex_plane(fourth):
+    """z = a r^4, some millimetres deep: the point that is met solves it, found here by bisection in plain numbers."""
+    surface = GeoLens([Surface(INF, 5.0, GLASS, 4.0, asphere=(0.0, fourth))], 4.0).prescription().until(0)
+    origin = (0.3, 5.5, -5.0)
+    direction = unit([(0.05, -0.25, 1.0)])
+
+    def above(s):
+        x, y, z = (o + s * d for o, d in zip(origin, direction[0].tolist(), strict=True))
+        return z - fourth * (x * x + y * y) ** 2
+
+    low = 0.0
+    high = 20.0
+    assert above(low) < 0 < above(high)
+    for _ in range(80):
+        middle = (low + high) / 2
+        low, high = (middle, high) if above(middle) < 0 else (low, middle)
+    out = trace(surface, f64([origin]), direction)
+    assert out.status.item() == Status.OK
+    assert out.optical_path_mm.item() == pytest.approx(low, abs=1e-12)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_when_all_rays_are_blocked_the_loss_is_zero_and_so_are_its_gradients(dtype):
     """Weights of blocked rays are exactly 0, the hard mask says so, and the merit of what arrives has the

@@ -73,9 +73,19 @@ def test_wide_fields_are_reached_from_the_axis():
     )
 
 
-def test_rays_that_cannot_be_aimed_are_told():
+def test_rays_that_cannot_be_aimed_are_told_and_keep_their_paraxial_aim():
+    geo = wide_angle()
+    field = math.radians(85.0)
+    pupil = pupil_grid(4)
     with pytest.warns(UserWarning, match=r"rays cannot be aimed at the stop .* keep their paraxial aim"):
-        aimed_rays(wide_angle(), math.radians(85.0), pupil_grid(4))
+        origin, direction = aimed_rays(geo, field, pupil)
+    first = geo.first_order()
+    wanted = pupil * first.stop_semi_aperture_mm
+    lost = ((at_stop(geo, origin, direction) - wanted).norm(dim=1) > 1e-6).detach()
+    assert bool(lost.any())
+    crossing = origin + direction * ((first.entrance_pupil_z_mm - origin[:, 2:]) / direction[:, 2:])
+    guess = pupil * first.entrance_pupil_diameter_mm / 2  # on the plane of the paraxial entrance pupil
+    torch.testing.assert_close(crossing[lost, :2].detach(), guess[lost].detach(), rtol=0, atol=1e-9)
 
 
 def test_the_gradient_of_aimed_rays_is_that_of_the_implicit_function():

@@ -8,7 +8,13 @@ import torch
 from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens import GeoLens, Glass, Surface, ThinLens
-from codesign.lens.paraxial import cardinal_points, circle_of_confusion_mm, paraxial_rays, system_matrix
+from codesign.lens.paraxial import (
+    cardinal_points,
+    circle_of_confusion_mm,
+    first_order,
+    paraxial_rays,
+    system_matrix,
+)
 
 D = torch.float64
 
@@ -80,6 +86,31 @@ def test_an_eye_has_its_nodal_points_apart_from_its_principal_points():
     assert float(points.front_focal_length_mm.detach()) == pytest.approx(R / (n - 1), rel=1e-13)
     assert float(points.rear_focal_z_mm.detach()) == pytest.approx(n * R / (n - 1), rel=1e-13)
     assert float(points.front_focal_z_mm.detach()) == pytest.approx(-R / (n - 1), rel=1e-13)
+
+
+@pytest.mark.parametrize("before", [1.0, 4 / 3])
+def test_pupils_of_a_stop_between_two_surfaces_by_gauss(before):
+    # n' / s' - n / s = power at each surface, s and s' of the stop and its image from the vertex; the image is
+    # n s' / (n' s) times as large
+    n = 1.6
+    after = 1.2
+    front, back = 6.0, 9.0
+    powers = [(n - before) / 40.0, (after - n) / -25.0]
+    entrance = before / (n / front - powers[0])
+    exit_z = after / (powers[1] - n / back)
+    found = first_order(
+        torch.tensor([powers[0], 0.0, powers[1]], dtype=D),
+        torch.tensor([front, back, 50.0], dtype=D),
+        torch.tensor([before, n, n, after], dtype=D),
+        1,
+        10.0,
+    )
+    stop = 5.0 / abs(n * entrance / (before * front))
+    assert float(found.entrance_pupil_z_mm) == pytest.approx(entrance, rel=1e-13)
+    assert float(found.stop_semi_aperture_mm) == pytest.approx(stop, rel=1e-13)
+    assert float(found.exit_pupil_z_mm) == pytest.approx(exit_z, rel=1e-13)
+    size = abs(n * exit_z / (after * back))
+    assert float(found.exit_pupil_diameter_mm) == pytest.approx(2 * stop * size, rel=1e-13)
 
 
 def test_what_has_no_paraxial_figures_is_refused():

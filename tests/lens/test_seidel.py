@@ -190,6 +190,20 @@ def test_a_flat_diffractive_lens():
     assert float(sums.axial_colour.sum().detach()) == pytest.approx(y * y / f / abbe, rel=1e-12)
 
 
+def test_lateral_colour_of_a_diffractive_lens_behind_its_stop():
+    # a thin lens: C_II = C_I times the chief ray's height over the marginal ray's (Welford, ch. 10)
+    f = 100.0
+    distance = 12.0
+    y = 5.0
+    u = math.tan(0.05)
+    flat = Surface(math.inf, f, None, 9.0, phase=Phase((-math.pi / (0.5875618e-3 * f),)))
+    geo = GeoLens([Surface(math.inf, distance, None, 9.0, is_stop=True), flat], 2 * y)
+    sums = seidel_sums(geo, 0.05)
+    abbe = 0.5875618 / (0.4861327 - 0.6562725)
+    assert float(sums.axial_colour.sum().detach()) == pytest.approx(y * y / f / abbe, rel=1e-12)
+    assert float(sums.lateral_colour.sum().detach()) == pytest.approx(y * distance * u / f / abbe, rel=1e-12)
+
+
 def test_axial_colour_of_a_thin_lens():
     glass = Glass.named("N-BK7")
     n = glass.index(0.5875618)

@@ -123,6 +123,37 @@ def test_light_goes_back_the_way_it_came(make):
     torch.testing.assert_close(found.optical_path_mm, out.optical_path_mm, rtol=0, atol=1e-11)
 
 
+def test_rays_that_end_on_a_diffractive_surface_are_not_bent_by_it():
+    """As when the stop carries the phase: ``until`` stops on the surface, with the geometric path alone."""
+    plate = GeoLens(
+        [Surface(math.inf, 4.0, GLASS, 9.0), Surface(math.inf, 30.0, None, 9.0, phase=Phase((-40.0, 0.3)))],
+        6.0,
+    )
+    origin, direction = parallel_rays([(1.0, 3.0), (-2.0, 0.5)], angle=0.2)
+    out = trace(plate.prescription().until(1), origin, direction)
+    sine = math.sin(0.2) / 1.6
+    cosine = math.sqrt(1 - sine**2)
+    truth = torch.tensor([0.0, sine, cosine], dtype=F64).expand(2, 3)
+    torch.testing.assert_close(out.direction, truth, rtol=0, atol=1e-15)
+    path = 1 / math.cos(0.2) + 1.6 * 4 / cosine
+    torch.testing.assert_close(out.optical_path_mm, torch.full((2,), path, dtype=F64), rtol=1e-14, atol=0)
+
+
+def test_the_path_back_out_of_glass_is_the_path_in():
+    """A film in glass: the reversed lens begins in it, and light takes the same path both ways (Fermat)."""
+    eye = GeoLens(
+        [Surface(20.0, 4.0, GLASS, 9.0), Surface(35.0, 30.0, Glass.from_indices(1.4, 1.4, 1.4), 9.0)], 6.0
+    )
+    origin, direction = parallel_rays([(0.5, 0.0), (0.0, 3.0), (-2.0, 2.5)], angle=0.05)
+    out = eye.trace(origin, direction)
+    back = eye.prescription().reversed(torch.ones((), dtype=F64))
+    flip = torch.tensor([1.0, 1.0, -1.0], dtype=F64)
+    start = out.position_mm - torch.tensor([0.0, 0.0, 1.0], dtype=F64) * eye.thickness_mm[-1]
+    found = trace(back, start.detach(), (-out.direction * flip).detach())
+    torch.testing.assert_close(found.position_mm[:, :2], origin[:, :2], rtol=0, atol=1e-12)
+    torch.testing.assert_close(found.optical_path_mm, out.optical_path_mm, rtol=0, atol=1e-11)
+
+
 def test_the_grating_equation_on_a_plane():
     """sin(out) = sin(in) + m w dphi/dr / (2 pi), and the optical path gains m w phi / (2 pi)."""
     coefficients = (-30.0, 0.04)

@@ -163,6 +163,22 @@ def test_nearest_of_several_objects_and_the_background_where_nothing_is_met():
     )
 
 
+@pytest.mark.parametrize("order", [(2.0, 3.0, 2.5), (3.0, 2.0, 2.5), (2.5, 3.0, 2.0), (3.0, 2.5, 2.0)])
+def test_the_nearest_of_many_is_seen_whatever_their_order(order):
+    still = torch.eye(4, dtype=D)[None]
+    cards = {}
+    for number, distance_m in enumerate(order):
+        pose = still.clone()
+        pose[0, 2, 3] = distance_m
+        flat = TexturedPlane([[1.0, 0.0]], [0.0], [0.0], mean=100.0 * distance_m)
+        cards[str(number)] = (flat, pose)
+    wall = torch.eye(4, dtype=D)
+    wall[2, 3] = 9.0
+    scene = MovingScene(TexturedPlane([[1.0, 0.0]], [0.0], [0.0], mean=1.0, T_world_plane=wall), cards)
+    image = render.frames(camera(5, 4), scene, still)
+    torch.testing.assert_close(image, torch.full_like(image, 200.0), rtol=1e-12, atol=0)
+
+
 def test_gradients_to_object_poses_camera_poses_and_lens_in_double_precision(generator):
     geo = lens.load("cooke-triplet").scaled(0.08)
     weights = torch.randn(2, 8, 12, generator=generator, dtype=D)
