@@ -1,0 +1,115 @@
+"""Single edges of the boundary term against closed forms: edges that recede, light that an aperture takes away,
+the tangent on the film, the rims of a cylinder."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from codesign import backend, lens, pose, render
+from codesign.lens import GeoLens, Glass, Pinhole, Surface
+from codesign.render import MitsubaScene
+from codesign.render.boundary import _on_film
+from codesign.render.camera import project
+from codesign.render.outline import Circles, outlines
+
+F64 = torch.float64
+RADIANCE = 100.0
+
+
+def card(right_m, distance_m, tilt_deg=0.0, half_height_m=0.3):
+    """A bright rectangle that reaches far to the left, its right edge at x = right_m, turned about the x axis."""
+    T = backend.mitsuba().ScalarTransform4f
+    place = T().translate([right_m - 5.0, 0, distance_m]).rotate([1, 0, 0], tilt_deg).rotate([0, 1, 0], 180)
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": RADIANCE}}
+    return MitsubaScene(
+        {
+            "card": {
+                "type": "rectangle",
+                "to_world": place.scale([5.0, half_height_m, 1.0]),
+                "emitter": emitter,
+            }
+        }
+    )
+
+
+def sideways(camera, scene):
+    """Derivative of the sum of all pixels to the motion of the camera along +x, per metre."""
+    twist = torch.zeros(6, dtype=F64, requires_grad=True)
+    path = torch.eye(4, dtype=F64)[None] @ pose.se3_exp(twist[None])
+    image = render.frames(camera, scene, path, gradient="boundary")
+    (found,) = torch.autograd.grad(image.double().sum(), twist)
+    return float(found[0])
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 50.0, -65.0])
+def test_an_edge_that_recedes_sweeps_by_its_depth_at_every_point(tilt_deg):
+    """Seen at x_f = f X / Z, y_f = f Y / Z, a point of the edge moves by -f / Z per metre; what the card loses is
+    the integral of that over y_f. The other edges are level, or out of the picture."""
+    focal_px = 11.0 / 0.25
+    camera = render.Camera(Pinhole(11.0), 40, 40, 0.25, 1)
+    half = 0.3
+    s = np.linspace(-half, half, 20001)
+    y, z = s * math.cos(math.radians(tilt_deg)), 2.0 + s * math.sin(math.radians(tilt_deg))
+    y_film = focal_px * y / z
+    assert np.abs(y_film).max() < 19.0
+    truth = -RADIANCE * np.sum((focal_px / z)[:-1] * np.diff(y_film))
+    # two to three points per pixel of edge, each in the middle of its part or aside: their errors are independent
+    assert sideways(camera, card(0.35, 2.0, tilt_deg, half)) == pytest.approx(truth, rel=3e-3)
+
+
+def test_an_edge_counts_with_the_light_that_passes_the_apertures():
+    """A small stop 3 mm before a plane that clips the field softly: the chief ray of film height h crosses it at
+    2 h / 97 (tests/render/test_camera.py), where the aperture passes 3 u^2 - 2 u^3."""
+    glass = Glass.from_indices(1.5, 1.5, 1.5)
+    semi, edge = 0.08, 0.07
+    front = Surface(math.inf, 3.0, glass, 9.0, is_stop=True)
+    back = Surface(400.0, 95.0, None, semi)
+    geo = GeoLens([front, back], 1e-3, soft_edge_mm=edge)
+    camera = render.Camera(geo, 120, 120, 0.1, 1)
+    slope_per_px = camera.slope_per_px()
+    distance = 4.0
+    x = 0.02
+    rows = np.linspace(-40.0, 40.0, 4001)
+    scene = card(x * distance, distance, 0.0, 40.0 * slope_per_px * distance)
+    height_mm = 0.1 * np.hypot(rows, x / slope_per_px)
+    u = 0.5 + (semi**2 - (2 * height_mm / 97) ** 2) / (2 * edge * semi)
+    passed = np.where(u > 0, 3 * u**2 - 2 * u**3, 0) * (u < 1) + (u >= 1)
+    assert 0.05 < passed.min() < 0.3 < 0.8 < passed.max() < 1
+    truth = -RADIANCE * passed.mean() * 80.0 / (slope_per_px * distance)
+    assert sideways(camera, scene) == pytest.approx(truth, rel=1e-2)
+
+
+def test_the_tangent_on_the_film_is_that_through_one_point_of_the_pupil(generator):
+    """Against the projection of both points through the pupil point that the first one's ray reaches."""
+    camera = render.Camera(lens.load("cooke-triplet"), 240, 180, 0.1, 1)
+    count = 24
+    y = torch.rand(count, 3, generator=generator, dtype=F64) - 0.5
+    y = y * torch.tensor([0.4, 0.3, 0.6], dtype=F64) + torch.tensor([0.0, 0.0, 1.0], dtype=F64)
+    on = y + 1e-5 * torch.randn(count, 3, generator=generator, dtype=F64)
+    pupil = 1.2 * (torch.rand(count, 2, generator=generator, dtype=F64) - 0.5)
+    with torch.no_grad():
+        at, reached, tangent, passes = _on_film(camera, y, on, pupil)
+        assert bool(passes.all())
+        first, then = project(camera, y, reached), project(camera, on, reached)
+    torch.testing.assert_close(at, first, rtol=0, atol=1e-6)
+    assert float((tangent - (then - first)).norm() / tangent.norm()) <= 1e-5
+
+
+def test_both_rims_of_a_cylinder_are_circles_about_its_axis():
+    mi = backend.mitsuba()
+    start, end, radius = np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.4, 1.3]), 0.15
+    found = outlines(
+        mi,
+        mi.load_dict(
+            {"type": "scene", "tube": {"type": "cylinder", "p0": start, "p1": end, "radius": radius}}
+        ),
+    )
+    rims = next(curve for curve in found if isinstance(curve, Circles))
+    axis = torch.tensor((end - start) / np.linalg.norm(end - start))
+    s = torch.linspace(0, 0.95, 20, dtype=F64)
+    for number, centre in enumerate((start, end)):
+        out = rims.points(torch.full((20,), number), s, None) - torch.tensor(centre)
+        torch.testing.assert_close(out.norm(dim=1), torch.full((20,), radius, dtype=F64), rtol=1e-5, atol=0)
+        torch.testing.assert_close(out @ axis, torch.zeros(20, dtype=F64), rtol=0, atol=1e-6)
