@@ -145,7 +145,7 @@ def test_samples_of_a_batch_do_not_touch_each_other():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, D])
-def test_no_events_give_zero_flow_and_a_finite_gradient(dtype):
+def test_no_events_give_zero_flow_and_a_zero_gradient(dtype):
     volume, _ = moving(0, steps=10)
     empty = EventVolume(
         torch.zeros(1, 2, 5, 32, 40, dtype=dtype, requires_grad=True), volume.centroid_s, volume.collected_s
@@ -154,7 +154,7 @@ def test_no_events_give_zero_flow_and_a_finite_gradient(dtype):
     assert not field.flow_px.any()
     assert not field.valid.any()
     (grad,) = torch.autograd.grad(field.flow_px.sum(), empty.counts)
-    assert bool(grad.isfinite().all())
+    assert not grad.any()  # the pull is quadratic in the counts
     (grad,) = torch.autograd.grad(estimate_lk(empty).flow_px.square().sum(), empty.counts)
     assert not grad.any()
 

@@ -80,7 +80,9 @@ def test_a_paraboloid_is_perfect_on_its_axis():
     (gradient,) = torch.autograd.grad(
         rms_waves(wavefront(paraboloid().replace(curvature_per_mm=leaf), 0.0)), leaf
     )
-    assert bool(gradient.isfinite().all())  # the norm of a vector that is nearly 0
+    # the rms has a kink here, k |c - c0|: any slope between -k and k is one
+    aside = rms_waves(wavefront(paraboloid().replace(curvature_per_mm=leaf.detach() + 1e-9), 0.0))
+    assert abs(float(gradient)) <= 1.01 * float(aside.detach()) / 1e-9
 
 
 @pytest.mark.parametrize("shift", [-0.3, 0.05, 2.0])

@@ -216,7 +216,6 @@ def test_interpenetrating_objects_and_unknown_ways_are_refused():
             torch.eye(4, dtype=F64)[None],
             gradient="boundary",
         )
-    assert math.isfinite(float(render.frames(camera, scene, torch.eye(4, dtype=F64)[None]).sum()))
 
 
 def test_moving_objects_keep_their_own_gradient_or_are_refused_one():
