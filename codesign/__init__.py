@@ -1,7 +1,7 @@
 """Differentiable co-design: lens, render, event camera, event flow.
 
-`import codesign` is all that is needed: its rooms (`codesign.lens`, `codesign.flow`, …) are imported when they
-are first asked for.
+`import codesign` is all that is needed: its rooms (`codesign.lens`, `codesign.flow`, …) are imported when
+they are first asked for.
 """
 
 import importlib
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         report,
         state,
         system,
+        train,
         types,
     )
     from codesign.system import System
@@ -47,6 +48,7 @@ __all__ = [
     "report",
     "state",
     "system",
+    "train",
     "types",
 ]
 

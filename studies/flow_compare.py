@@ -18,10 +18,10 @@ import matplotlib.pyplot as plt
 from codesign import flow
 from codesign.errors import CodesignError, DomainError
 from codesign.flow.refiner import Refiner
+from codesign.train.validation import batches, score
 from scenes.flow_worlds import ALL, WorldWindows
 from studies.frame.run import Run, StudyConfig, main
 from studies.train_flow.sources import UNSEEN, VALIDATION, Shape
-from studies.train_flow.validate import batches, score
 
 NAMES = {"refiner": "refiner", "flownet-events": "FlowNetEvents", "spike-flownet": "spiking encoder"}
 RIVALS = ("flownet-events", "spike-flownet")

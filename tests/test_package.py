@@ -16,7 +16,8 @@ PRIVATE = {"__init__", "__main__", "atomic", "doctor", "interrupt"}  # for the t
 def test_the_import_alone_loads_nothing_heavy():
     script = (
         "import sys, codesign; "
-        "print([m for m in ('torch', 'numpy', 'drjit', 'mitsuba', 'kornia', 'matplotlib') if m in sys.modules])"
+        "heavy = ('torch', 'numpy', 'drjit', 'mitsuba', 'kornia', 'matplotlib'); "
+        "print([name for name in heavy if name in sys.modules])"
     )
     done = subprocess.run(
         [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60

@@ -5,8 +5,8 @@ import numpy as np
 import torch
 
 from codesign import flow
+from codesign.train.batches import to_device
 from studies.make_dataset.page import flow_colours
-from studies.train_flow.sources import to_device
 
 OURS = "#1b6ca8"
 CLOSED = "firebrick"

@@ -11,23 +11,26 @@ import torch
 from codesign.errors import DomainError, FileFormatError
 from codesign.flow import checkpoint
 from codesign.flow.sources import open_windows
-from studies.train_flow.loss import check_windows, objective
-from studies.train_flow.sources import VALIDATION, Batches, Part, Shape, training_parts
-from studies.train_flow.state import Learner, Progress, load
+from codesign.train import Batches, Contrast, Learner, Part, Photometric, Progress, Supervised, adamw
+from codesign.train import checkpoint as training
+from codesign.train.batches import probe
+from studies.train_flow.sources import VALIDATION, Shape, training_parts
 
-HELD_OUT = (
-    10  # the last window in so many of a data set is judged on: whole stretches, since neighbours look alike
-)
+# the last window in so many of a data set is judged on: whole stretches, since neighbours look alike
+HELD_OUT = 10
+LOSSES = {
+    "supervised": lambda config: Supervised(config.unit, config.claim_weight),
+    "contrast": lambda config: Contrast(config.smoothness),
+    "photometric": lambda config: Photometric(config.smoothness),
+}
 
 
 @dataclass
 class Job:
-    """Network and optimiser, batches by step, objective, what to judge on (by name: source and number of
-    windows at most), and what is done already."""
+    """Learner, batches by step, what to judge on (sources by name), and what is done already."""
 
     learner: Learner
     batches: Batches
-    objective: Any
     validation: dict[str, Any]
     progress: Progress
     facts: dict[str, Any]
@@ -88,7 +91,7 @@ def prepare(config, folder, resumed, ranks, clock):
     Raises: CodesignError with one sentence for every unfit option, file or data set.
     """
     check_numbers(config, ranks.count)
-    aim = objective(config)
+    loss = objective(config)
     network = build_network(config)
     if config.start is not None:
         start(network, config)
@@ -96,26 +99,44 @@ def prepare(config, folder, resumed, ranks, clock):
     shape = Shape(config.height_px, config.width_px, config.bins)
     with clock("data"):
         parts, validation = sources(config, shape)
-        probes = [
-            source.batch(
-                sorted({0, len(source) // 2, len(source) - 1}) if hasattr(source, "__len__") else [0]
-            )
-            for _, source in parts
-        ]
-    for probe in probes:
-        check_windows(config.loss, probe)
-        if probe.volume.counts.shape[2] != config.bins:
+        probes = [probe(source) for _, source in parts]
+    for windows in probes:
+        loss.check(windows)
+        if windows.volume.counts.shape[2] != config.bins:
             raise DomainError(
-                f"the windows have {probe.volume.counts.shape[2]} time bins, the network {config.bins}; "
-                f"give --bins {probe.volume.counts.shape[2]}."
+                f"the windows have {windows.volume.counts.shape[2]} time bins, the network {config.bins}; "
+                f"give --bins {windows.volume.counts.shape[2]}."
             )
-    learner = Learner(config.network, network, config.learning_rate, config.weight_decay, config.average)
-    facts = {"seed": config.seed, "schedule": schedule_facts(config), "torch": torch.__version__}
-    progress = None
-    if resumed:
-        progress = load(folder / "checkpoint", learner, facts)
+    learner = Learner(
+        network,
+        loss,
+        adamw(network, config.learning_rate, config.weight_decay),
+        clip=config.clip,
+        average=config.average,
+        ranks=ranks,
+        seed=config.seed,
+        mixed_precision=config.mixed_precision,
+    )
+    facts = {
+        "network": config.network,
+        "config": dict(network.config),
+        "seed": config.seed,
+        "schedule": schedule_facts(config),
+        "torch": torch.__version__,
+    }
+    progress = training.load(folder / "checkpoint", learner, facts) if resumed else None
     batches = Batches(parts, config.batch, config.reuse, mine=ranks.mine)
-    return Job(learner, batches, aim, validation, progress or Progress(), facts)
+    return Job(learner, batches, validation, progress or Progress(), facts)
+
+
+def objective(config):
+    """The loss that --loss names.
+
+    Raises: DomainError for an unknown name.
+    """
+    if config.loss not in LOSSES:
+        raise DomainError(f"--loss {config.loss} is unknown; choose one of {', '.join(LOSSES)}.")
+    return LOSSES[config.loss](config)
 
 
 def schedule_facts(config):

@@ -10,8 +10,9 @@ from torch.utils.tensorboard import SummaryWriter
 
 from codesign import flow
 from codesign.flow import checkpoint
-from studies.train_flow import page, state
-from studies.train_flow.validate import batches, score
+from codesign.train import checkpoint as training
+from codesign.train.validation import batches, score
+from studies.train_flow import page
 
 RECENT = 50  # steps over which the shown loss is averaged
 
@@ -68,7 +69,7 @@ class Watch:
 
     def save(self):
         """Write the checkpoint."""
-        state.save(self.run.path("checkpoint"), self.job.learner, self.job.progress, self.job.facts)
+        training.save(self.run.path("checkpoint"), self.job.learner, self.job.progress, self.job.facts)
 
     def validate(self):
         """Judge the network on the first windows of every set, and keep the figures."""
@@ -109,10 +110,17 @@ class Watch:
                 bar.advance()
         progress.validation_s = self._earlier_s + self.clock.spent["validation"]
         figures = {
-            "steps": progress.step, "windows_shown": progress.step * config.batch, "weights": sum(p.numel() for p in learner.network.parameters()),
-            "loss_last": statistics.fmean(progress.loss[-RECENT:]), "gradient_norm_largest": max(progress.norm), "clipped_steps": progress.clipped, "windows_without_truth": progress.blind,
-            "cpu_data_minutes": progress.data_s / 60, "cpu_training_minutes": progress.training_s / 60, "cpu_validation_minutes": progress.validation_s / 60,
-        }  # fmt: skip
+            "steps": progress.step,
+            "windows_shown": progress.step * config.batch,
+            "weights": sum(p.numel() for p in learner.network.parameters()),
+            "loss_last": statistics.fmean(progress.loss[-RECENT:]),
+            "gradient_norm_largest": max(progress.norm),
+            "clipped_steps": progress.clipped,
+            "windows_without_truth": progress.blind,
+            "cpu_data_minutes": progress.data_s / 60,
+            "cpu_training_minutes": progress.training_s / 60,
+            "cpu_validation_minutes": progress.validation_s / 60,
+        }
         for name, (ours, closed) in scores.items():
             for who, found in (("", ours), ("closed_form_", closed)):
                 figures |= {

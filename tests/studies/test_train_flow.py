@@ -15,7 +15,6 @@ from codesign.flow import checkpoint, losses
 from studies.frame.run import main
 from studies.train_flow import __main__ as train_flow
 from studies.train_flow import setup as train_flow_setup
-from studies.train_flow import state as train_flow_state
 from tests.flow_training_case import (
     BASE,
     TRUE_WEIGHTS,
@@ -236,18 +235,6 @@ def test_processor_time_is_a_budget(tmp_path):
     found = metrics_of(tmp_path / "run")
     assert 0.01 <= found["cpu_data_minutes"] + found["cpu_training_minutes"] < 0.011
     assert found["steps"] > 5
-
-
-def test_the_running_average_spans_a_tenth_of_the_steps_at_first():
-    network = Linear()
-    learner = train_flow_state.Learner("linear", network, 1e-3, 0.0, average=0.5)
-    expected = network.layer.weight.detach().clone()
-    for step, decay in enumerate((0.1, 2 / 11, 0.25, 4 / 13, 5 / 14, 0.4, 7 / 16, 8 / 17, 0.5, 0.5)):
-        with torch.no_grad():
-            network.layer.weight.add_(step + 1.0)
-        expected = decay * expected + (1 - decay) * network.layer.weight.detach()
-        learner.follow(step)
-    assert torch.allclose(learner.tensors()["average/layer.weight"], expected, rtol=1e-6)
 
 
 @pytest.mark.usefixtures("undrawn")

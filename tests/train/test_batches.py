@@ -1,15 +1,10 @@
-"""Parts of the training of flow networks: which windows are shown when and how they are turned, the schedule,
-the scores."""
-
-import math
+"""Which windows are shown when, and how they are turned."""
 
 import pytest
 import torch
 
+from codesign.train.batches import Batches, pick, probe, shuffled, to_device, turned, without_truth
 from codesign.types import EventVolume, FlowField, FlowWindows
-from studies.train_flow import __main__ as train_flow
-from studies.train_flow.sources import Batches, pick, shuffled, turned
-from studies.train_flow.validate import batches, score
 
 
 class Made:
@@ -29,24 +24,6 @@ class Made:
             EventVolume(counts, torch.tensor([0.25, 0.75]), torch.tensor([0.5, 0.5])),
             FlowField(flow, valid, 1.0),
         )
-
-
-def test_the_schedule_is_a_ramp_and_a_half_cosine():
-    config = train_flow.Config(learning_rate=2e-3, warm_up=0.2, steps=40)
-
-    def rate(share):
-        return train_flow.learning_rate(config, share)
-
-    assert rate(0.0) == pytest.approx(2e-5)
-    assert rate(0.1) == pytest.approx((2e-5 + 2e-3) / 2)
-    assert rate(0.2) == pytest.approx(2e-3)
-    assert rate(0.6) == pytest.approx((2e-5 + 2e-3) / 2)
-    assert rate(1.0) == pytest.approx(2e-5)
-    assert rate(0.4) == pytest.approx(2e-5 + (2e-3 - 2e-5) * math.cos(math.pi / 8) ** 2)
-    assert train_flow.share_done(config, 10, 1e9) == 0.25
-    assert train_flow.share_done(train_flow.Config(), 10, 600.0) == 0.5
-    assert train_flow.share_done(train_flow.Config(steps=40, cpu_minutes=1.0), 10, 59.0) == 0.25
-    assert train_flow.share_done(train_flow.Config(steps=40, cpu_minutes=1.0), 10, 60.0) == 1.0
 
 
 @pytest.mark.parametrize("way", range(16))
@@ -115,28 +92,31 @@ def test_a_finite_source_is_shown_whole_and_in_another_order_each_time():
     assert first != second
 
 
-def test_scores_are_those_worked_out_by_hand():
-    """Two windows: true flow (3, 4) on 2 pixels and (0, 1) on 1. The estimate (3, 0) is 4, 4 and sqrt(10)
-    off; zero flow 5, 5 and 1."""
-    flow = torch.zeros(2, 2, 1, 2)
-    valid = torch.tensor([[[True, True]], [[False, True]]])
-    flow[0, 0], flow[0, 1], flow[1, 1] = 3, 4, 1
-    windows = FlowWindows(
-        EventVolume(torch.zeros(2, 2, 2, 1, 2), torch.tensor([0.0, 1.0]), torch.tensor([0.5, 0.5])),
-        FlowField(flow, valid, 1.0),
-    )
-    guess = torch.zeros(2, 2, 1, 2)
-    guess[:, 0] = 3
-    found = score(lambda volume: FlowField(guess, valid, 1.0), [windows, windows])
-    assert found.aee_px == pytest.approx((8 + math.sqrt(10)) / 3)
-    assert found.zero_flow_px == pytest.approx(11 / 3)
-    assert found.ratio == pytest.approx((8 + math.sqrt(10)) / 11)
-    assert (found.worse_percent, found.windows) == (50.0, 4)
-
-
-def test_validation_takes_no_more_than_there_is():
+def test_a_finite_source_is_looked_at_from_end_to_end():
     class Short(Made):
         def __len__(self):
             return 19
 
-    assert [len(part.volume.counts) for part in batches(Short(), 40)] == [16, 3]
+    made = []
+    probe(Made(made.append))
+    probe(Short(made.append))
+    assert made == [[0], [0, 9, 18]]
+
+
+def test_everything_in_a_batch_moves_to_the_device():
+    windows = Made().batch([0])
+    meta = torch.device("meta")
+    moved = to_device({"a": [windows, (torch.ones(2), "kept")]}, meta)
+    found, (ones, kept) = moved["a"]
+    assert isinstance(found, FlowWindows)
+    tensors = (found.volume.counts, found.volume.centroid_s, found.truth.flow_px, found.truth.valid, ones)
+    assert {tensor.device for tensor in tensors} == {meta}
+    assert (found.frames, found.truth.interval_s, kept) == (None, 1.0, "kept")
+
+
+def test_windows_without_any_true_flow_are_counted():
+    windows = Made().batch([0, 1, 2])
+    windows.truth.valid[1] = False
+    windows.truth.valid[2, 1:] = False
+    assert without_truth(windows) == 1
+    assert without_truth((torch.zeros(3), torch.zeros(3))) == 0

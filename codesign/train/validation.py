@@ -1,11 +1,15 @@
 """How well an estimator does on windows that no network was trained on, beside zero flow."""
 
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+from torch import nn
 
 from codesign.flow.metrics import endpoint_error
-from studies.train_flow.sources import to_device
+from codesign.train.batches import Source, to_device
+from codesign.types import EventVolume, FlowField, FlowWindows
 
 TOGETHER = 16  # windows judged at a time
 
@@ -15,8 +19,8 @@ class Score:
     """Figures of one estimator on one set.
 
     aee_px, zero_flow_px: mean endpoint error over all valid pixels, of the estimate and of zero flow.
-      worse_percent: share of the windows on which the
-    estimate's own mean error is above zero flow's. windows: how many were judged.
+      worse_percent: share of the windows on which the estimate's own mean error is above zero flow's.
+      windows: how many were judged.
     """
 
     aee_px: float
@@ -25,21 +29,26 @@ class Score:
     windows: int
 
     @property
-    def ratio(self):
+    def ratio(self) -> float:
         """Error as a share of that of zero flow."""
         return self.aee_px / self.zero_flow_px
 
 
-def batches(source, count):
+def batches(source: Source, count: int) -> Iterator[FlowWindows]:
     """The first ``count`` windows of a source, or all of a shorter one, some at a time."""
+    sized: Any = source
     if hasattr(source, "__len__"):
-        count = min(count, len(source))
+        count = min(count, len(sized))
     return (source.batch(range(first, min(first + TOGETHER, count))) for first in range(0, count, TOGETHER))
 
 
 @torch.no_grad()
-def score(estimator, found, device=None):
-    """Score of ``estimator`` on an iterable of FlowWindows. Windows without a valid pixel count for
+def score(
+    estimator: Callable[[EventVolume], FlowField],
+    found: Iterable[FlowWindows],
+    device: torch.device | None = None,
+) -> Score:
+    """Score of ``estimator`` on windows, computed on ``device``. Windows without a valid pixel count for
     nothing."""
     device = device or torch.device("cpu")
     sums = torch.zeros(3, dtype=torch.float64)  # error, error of zero flow, pixels
@@ -59,3 +68,16 @@ def score(estimator, found, device=None):
         judged += int((pixels > 0).sum())
     error, zero, pixels = sums.tolist()
     return Score(error / max(pixels, 1.0), zero / max(pixels, 1.0), 100 * worse / max(judged, 1), judged)
+
+
+def error_ratio(source: Source, count: int = 48) -> Callable[[nn.Module], float]:
+    """A judge for ``fit``: error of a flow network over that of zero flow, on the first ``count`` windows of
+    a source, which are made once."""
+    windows = []
+
+    def judge(network: nn.Module) -> float:
+        if not windows:
+            windows.extend(batches(source, count))
+        return score(network, windows, next(network.parameters()).device).ratio
+
+    return judge

@@ -1,12 +1,14 @@
 """One or several processes that train the same network, each on its share of every batch."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from typing import Any
 
 import torch
 import torch.distributed as dist
+from torch import Tensor
 
 from codesign.errors import DomainError
 
@@ -19,11 +21,11 @@ class Ranks:
     count: int
     device: torch.device
 
-    def mine(self, indices):
+    def mine(self, indices: Sequence[int]) -> Sequence[int]:
         """This process's share of the sample numbers of a batch."""
         return indices[self.rank :: self.count]
 
-    def sum(self, *numbers):
+    def sum(self, *numbers: float) -> list[float]:
         """Sums over all processes, the same on each."""
         if self.count == 1:
             return list(numbers)
@@ -31,17 +33,17 @@ class Ranks:
         dist.all_reduce(total)
         return total.tolist()
 
-    def average_gradients(self, parameters):
-        """Replace every gradient by its mean over all processes."""
+    def average_gradients(self, parameters: Sequence[Tensor]) -> None:
+        """Replace every gradient by its mean over all processes; each has the same ones."""
         if self.count == 1:
             return
-        flat = torch.cat([parameter.grad.reshape(-1) for parameter in parameters])
+        gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+        flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
         dist.all_reduce(flat)
         flat /= self.count
-        for parameter, part in zip(
-            parameters, flat.split([parameter.numel() for parameter in parameters]), strict=True
-        ):
-            parameter.grad = part.view_as(parameter)
+        parts = flat.split([gradient.numel() for gradient in gradients])
+        for gradient, part in zip(gradients, parts, strict=True):
+            gradient.copy_(part.view_as(gradient))
 
     def tell(self, value: Any = None) -> Any:
         """What the first process gives, on every process."""
@@ -51,7 +53,7 @@ class Ranks:
         dist.broadcast_object_list(held, src=0, device=torch.device("cpu"))
         return held[0]
 
-    def on(self, device_type):
+    def on(self, device_type: str) -> "Ranks":
         """The same process with its device: the processor, or the graphics card of its number on this
         machine.
 
@@ -68,25 +70,28 @@ class Ranks:
         torch.cuda.set_device(local)
         return replace(self, device=torch.device("cuda", local))
 
-    def leave(self):
+    def leave(self) -> None:
         """End the connection."""
         if self.count > 1:
             dist.barrier()  # nobody hangs up while another still speaks
             dist.destroy_process_group()
 
 
-def place():
+ALONE = Ranks(0, 1, torch.device("cpu"))
+"""The one process of a training that is not shared."""
+
+
+def place() -> tuple[int, int]:
     """(rank, number of processes) that torchrun gave this process; (0, 1) without torchrun."""
     return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
 
 
-def join():
+def join() -> Ranks:
     """Connect to the other processes that torchrun started: gloo for tensors on the processor, nccl for those
     on CUDA. Device: the processor, until ``on``."""
     rank, count = place()
     if count > 1:
         backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and dist.is_nccl_available() else "gloo"
-        dist.init_process_group(
-            backend, timeout=timedelta(hours=1)
-        )  # the first process validates and draws alone meanwhile
+        # the first process validates and draws alone meanwhile
+        dist.init_process_group(backend, timeout=timedelta(hours=1))
     return Ranks(rank, count, torch.device("cpu"))

@@ -1,0 +1,301 @@
+"""Training in one call: what is learnt, kept, resumed and refused, alone and in two processes."""
+
+import doctest
+import importlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from codesign import train
+from codesign.errors import DomainError, FileFormatError
+from codesign.flow import checkpoint
+from tests.flow_training_case import TRUE_WEIGHTS, Linear, Made
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def linear() -> Any:
+    torch.manual_seed(0)
+    return Linear()
+
+
+def adam(network, rate=0.05):
+    return torch.optim.Adam(network.parameters(), rate)
+
+
+def distance(network: Any):
+    return float((network.layer.weight.detach()[:, :, 0, 0] - TRUE_WEIGHTS).abs().max())
+
+
+@pytest.mark.parametrize("name", ["fit", "loop"])
+def test_examples_run(name):
+    found = doctest.testmod(importlib.import_module(f"codesign.train.{name}"))
+    assert found.failed == 0
+    assert found.attempted > 0
+
+
+def test_a_flow_network_finds_the_known_answer():
+    """At the end of a falling schedule Adam is within about its last step sizes of the answer: 1e-2 of
+    weights of order 1."""
+    network = linear().eval()
+    made = train.fit(network, Made(), steps=250, batch=4, optimiser=adam(network))
+    assert distance(network) < 1e-2
+    assert made.step == len(made.loss) == len(made.norm) == len(made.rate) == 250
+    assert made.rate[0] == pytest.approx(0.0005)
+    assert max(made.rate) == pytest.approx(0.05, rel=0.05)
+    assert not network.training, "left in the mode it came in"
+
+
+def test_a_network_without_earlier_predictions_and_a_mix_are_enough():
+    class Plain(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.inner = linear()
+
+        def forward(self, volume):
+            return self.inner(volume)
+
+    asked: dict[str, int] = {"a": 0, "b": 0}
+
+    def count(name):
+        def before(indices):
+            asked[name] += len(indices)
+
+        return Made(seed=0, before=before)
+
+    network = Plain()
+    train.fit(network, [(0.75, count("a")), (0.25, count("b"))], steps=40, batch=4, optimiser=adam(network))
+    assert (asked["a"], asked["b"]) == (
+        pytest.approx(121, abs=4),
+        pytest.approx(41, abs=4),
+    )  # one looked at each
+
+
+def test_the_best_weights_are_what_remains():
+    """A step that is far too long in the second half leaves the answer again."""
+    network = linear()
+    scores = {}
+
+    def judge(network):
+        scores[len(scores)] = distance(network)
+        return distance(network)
+
+    def schedule(share):
+        return 1.0 if share < 0.5 else 40.0
+
+    made = train.fit(
+        network,
+        Made(),
+        steps=60,
+        batch=4,
+        optimiser=adam(network),
+        schedule=schedule,
+        validate=judge,
+        validate_every=7,
+    )
+    assert [entry["step"] for entry in made.validation] == [7, 14, 21, 28, 35, 42, 49, 56, 60]
+    assert [entry["score"] for entry in made.validation] == list(scores.values())
+    assert distance(network) == min(scores.values())
+    assert scores[8] > min(scores.values())
+
+
+class Noisy(nn.Module):
+    """A network that draws, and has running statistics."""
+
+    def __init__(self):
+        super().__init__()
+        torch.manual_seed(3)
+        self.layers = nn.Sequential(nn.Linear(2, 8), nn.BatchNorm1d(8), nn.Dropout(0.4), nn.Linear(8, 1))
+
+    def forward(self, x):
+        return self.layers(x)
+
+
+def noisy_fit(folder, network, **options):
+    def batches(step):
+        return torch.randn(16, 2, generator=torch.Generator().manual_seed(step))
+
+    return train.fit(
+        network,
+        batches,
+        **{"steps": 8, **options},
+        predict=lambda network, x: network(x),
+        loss=lambda y, x: (y - x[:, :1]).square().mean(),
+        average=0.9,
+        validate=lambda network: float((network(batches(1000)) - 1).square().mean()),
+        validate_every=3,
+        save_to=folder,
+        save_every=2,
+    )
+
+
+def state_of(folder):
+    (path,) = folder.glob("step_*.safetensors")
+    return {name: tensor.tolist() for name, tensor in checkpoint.read_tensors(path)[0].items()}
+
+
+def test_interrupted_and_resumed_is_uninterrupted_bit_for_bit(tmp_path):
+    whole = Noisy()
+    expected = noisy_fit(tmp_path / "whole", whole)
+
+    def stop(step, loss):
+        if step == 5:
+            signal.raise_signal(signal.SIGINT)
+
+    earlier = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        noisy_fit(tmp_path / "parts", Noisy(), progress=stop)
+    assert signal.getsignal(signal.SIGINT) == earlier
+    stored = json.loads((tmp_path / "parts" / "checkpoint.json").read_text())
+    assert stored["progress"]["step"] == 5, "saved at a whole step, between those that are saved anyway"
+    told = []
+    parts: Any = Noisy()
+    found = noisy_fit(tmp_path / "parts", parts, progress=lambda step, loss: told.append((step, loss)))
+    assert told == [(step, expected.loss[step - 1]) for step in (6, 7, 8)]
+    assert (found.loss, found.norm, found.rate) == (expected.loss, expected.norm, expected.rate)
+    assert found.validation == expected.validation
+    assert state_of(tmp_path / "parts") == state_of(tmp_path / "whole")
+    for name, tensor in whole.state_dict().items():
+        assert torch.equal(tensor, parts.state_dict()[name]), name
+    done: Any = Noisy()
+    assert noisy_fit(tmp_path / "parts", done).step == 8
+    assert torch.equal(done.layers[0].weight, parts.layers[0].weight), "nothing is left to do"
+
+
+def test_a_killed_training_goes_on_from_its_last_checkpoint(tmp_path):
+    def killed(step, loss):
+        if step == 5:
+            raise MemoryError("killed")
+
+    noisy_fit(tmp_path / "whole", Noisy())
+    with pytest.raises(MemoryError):
+        noisy_fit(tmp_path / "parts", Noisy(), progress=killed)
+    noisy_fit(tmp_path / "parts", Noisy())
+    assert state_of(tmp_path / "parts") == state_of(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"steps": 9}, "written with steps 8, this run has 9"),
+        ({"seed": 2}, "written with seed 0, this run has 2"),
+        ({"clip": 1.0}, "written with clip inf, this run has 1.0"),
+    ],
+)
+def test_another_training_is_not_resumed(tmp_path, options, sentence):
+    noisy_fit(tmp_path, Noisy())
+    with pytest.raises(FileFormatError, match=sentence):
+        noisy_fit(tmp_path, Noisy(), **options)
+    assert noisy_fit(tmp_path, Noisy(), **options, resume=False).step == options.get("steps", 8)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"steps": 0}, "steps is 0; at least 1"),
+        ({"batch": 0}, "batch is 0; at least 1"),
+        ({"save_every": 0}, "save_every is 0"),
+        ({"clip": 0.0}, "clip 0.0"),
+        ({"average": 1.0}, "average 1.0"),
+        (
+            {"batch": 3, "ranks": train.Ranks(0, 2, torch.device("cpu"))},
+            "batch 3 cannot be shared evenly by 2",
+        ),
+        ({"loss": train.Photometric()}, "needs frames, and these windows have none"),
+    ],
+)
+def test_what_is_unfit_is_refused_before_the_first_step(options, sentence):
+    asked = []
+    network = linear()
+    with pytest.raises(DomainError, match=sentence):
+        train.fit(network, Made(frames=False, before=asked.append), **{"steps": 2, **options})
+    assert asked in ([], [[0]]), "one window may be looked at, no more"
+    assert torch.equal(network.layer.weight, linear().layer.weight)
+
+
+def test_windows_without_any_true_flow_are_refused():
+    class Blind(Made):
+        def batch(self, indices):
+            windows = super().batch(indices)
+            windows.truth.valid[:] = False
+            return windows
+
+    with pytest.raises(DomainError, match="needs true flow, and the windows looked at have none"):
+        train.fit(linear(), Blind(), steps=2)
+
+
+SHARED = """
+import sys, torch
+from codesign import train
+from tests.flow_training_case import Made
+from tests.train.test_fit import adam, distance, linear
+ranks = train.join()
+network = linear()
+made = train.fit(network, Made(), steps=6, batch=4, optimiser=adam(network, 0.01), average=0.5, ranks=ranks,
+    validate=distance if ranks.rank == 0 else lambda network: 1 / 0, validate_every=2, save_to=sys.argv[1])
+torch.save((network.layer.weight, made.loss, len(made.validation)), f"{sys.argv[1]}.{ranks.rank}")
+ranks.leave()
+"""
+
+
+def test_two_processes_learn_what_one_does(tmp_path):
+    """Halves of a batch are averaged in another order: float32 sums of 1024 terms differ by 1e-5 at most, and
+    Adam takes steps of at most 1e-2 times the relative change of a gradient."""
+    network = linear()
+    alone = train.fit(
+        network,
+        Made(),
+        steps=6,
+        batch=4,
+        optimiser=adam(network, 0.01),
+        average=0.5,
+        validate=distance,
+        validate_every=2,
+    )
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "OMP_NUM_THREADS": "1",
+        "WORLD_SIZE": "2",
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+    }
+    folder = str(tmp_path / "two")
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", SHARED, folder],
+            env={**environment, "RANK": str(rank)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for rank in (0, 1)
+    ]
+    try:
+        said = [process.communicate(timeout=90)[0] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    assert [Path(f"{folder}.{rank}").exists() for rank in (0, 1)] == [True, True], said
+    found = [torch.load(f"{folder}.{rank}") for rank in (0, 1)]
+    assert torch.equal(found[0][0], found[1][0]), "the best weights reach every process"
+    assert torch.allclose(found[0][0], network.layer.weight, atol=1e-5, rtol=0)
+    assert not torch.equal(network.layer.weight, linear().layer.weight)
+    for _, loss, _ in found:
+        assert loss == pytest.approx(alone.loss, rel=1e-5)
+    assert [judged for *_, judged in found] == [3, 0]
+    assert [path.name for path in (tmp_path / "two").iterdir() if path.suffix == ".json"] == [
+        "checkpoint.json"
+    ]

@@ -1,0 +1,52 @@
+"""Scores of estimators, against sums worked out by hand."""
+
+import math
+
+import pytest
+import torch
+
+from codesign.train.validation import batches, error_ratio, score
+from codesign.types import EventVolume, FlowField, FlowWindows
+from tests.flow_training_case import TRUE_WEIGHTS, Linear, Made
+
+
+def test_scores_are_those_worked_out_by_hand():
+    """Two windows: true flow (3, 4) on 2 pixels and (0, 1) on 1. The estimate (3, 0) is 4, 4 and sqrt(10)
+    off; zero flow 5, 5 and 1."""
+    flow = torch.zeros(2, 2, 1, 2)
+    valid = torch.tensor([[[True, True]], [[False, True]]])
+    flow[0, 0], flow[0, 1], flow[1, 1] = 3, 4, 1
+    windows = FlowWindows(
+        EventVolume(torch.zeros(2, 2, 2, 1, 2), torch.tensor([0.0, 1.0]), torch.tensor([0.5, 0.5])),
+        FlowField(flow, valid, 1.0),
+    )
+    guess = torch.zeros(2, 2, 1, 2)
+    guess[:, 0] = 3
+    found = score(lambda volume: FlowField(guess, valid, 1.0), [windows, windows])
+    assert found.aee_px == pytest.approx((8 + math.sqrt(10)) / 3)
+    assert found.zero_flow_px == pytest.approx(11 / 3)
+    assert found.ratio == pytest.approx((8 + math.sqrt(10)) / 11)
+    assert (found.worse_percent, found.windows) == (50.0, 4)
+
+
+class Short(Made):
+    """A source with an end, that says what it is asked for."""
+
+    def __len__(self):
+        return 19
+
+
+def test_validation_takes_no_more_than_there_is():
+    assert [len(part.volume.counts) for part in batches(Short(), 40)] == [16, 3]
+
+
+def test_the_judge_of_a_fit_is_the_ratio_on_windows_made_once():
+    made = []
+    judge = error_ratio(Short(before=made.append), 20)
+    network = Linear()
+    with torch.no_grad():
+        network.layer.weight.zero_()
+        assert judge(network) == 1.0
+        network.layer.weight.copy_(TRUE_WEIGHTS[:, :, None, None])
+    assert judge(network) < 1e-6
+    assert [list(each) for each in made] == [list(range(16)), [16, 17, 18]]
