@@ -31,7 +31,8 @@ def test_every_room_is_reachable_from_the_package():
         for path in (ROOT / "codesign").iterdir()
         if path.suffix == ".py" or (path / "__init__.py").exists()
     }
-    assert set(codesign.__all__) == standing - PRIVATE
+    rooms = {name for name in codesign.__all__ if name.islower()}  # classes are shown there beside them
+    assert rooms == standing - PRIVATE
     assert set(codesign.__all__) <= set(dir(codesign))
     script = "import codesign; print(codesign.errors.DomainError.__name__, codesign.lens.load.__name__)"
     done = subprocess.run(
@@ -45,7 +46,7 @@ def test_the_version_is_that_of_the_installed_package():
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="no attribute 'lenses'; it has backend, errors"):
+    with pytest.raises(AttributeError, match="no attribute 'lenses'; it has .*backend, errors"):
         _ = codesign.lenses  # pyright: ignore
 
 
