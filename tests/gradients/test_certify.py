@@ -1,12 +1,20 @@
 """The certificate itself: it must pass right gradients and fail wrong ones, by amounts that are known."""
 
+import doctest
+import json
 import math
+import sys
+from pathlib import Path
 
 import pytest
 import torch
 
-from codesign.errors import GradientError
+from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
 from codesign.grad import certify, plateau
+from codesign.grad.differences import Ladder, rounding_noise
+from studies import certify_precision
+from studies.certify_precision import KINDS, judged
+from studies.frame.run import main
 
 D = torch.float64
 
@@ -75,3 +83,209 @@ def test_plateau_of_a_cubic():
     )
     assert found.value == pytest.approx(3 + (1e-4 + 1e-6) / 2, abs=1e-9)
     assert found.noise == pytest.approx((1e-4 - 1e-6) / 2, rel=1e-6)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize(
+    "name", ["three logarithms", "logarithms 12x12", "logsumexp 12x12", "squares 64x64", "contrast 64x64"]
+)
+def test_right_gradients_pass_and_wrong_ones_fail_at_any_size(name, dtype):
+    assert {judged(name, dtype, seed, None).verdict for seed in range(40)} == {"pass"}
+    assert {judged(name, dtype, 100 + seed, KINDS[seed % 4]).verdict for seed in range(40)} == {"fail"}
+
+
+def test_a_thousand_numbers_in_single_precision():
+    assert judged("thousand logarithms", "float32", 0, None).verdict == "pass"
+    assert [judged("thousand logarithms", "float32", 1, kind).verdict for kind in KINDS] == ["fail"] * 4
+
+
+def test_the_weights_of_a_network_with_kinks():
+    assert {judged("weights of a network", "float32", seed, None).verdict for seed in range(3)} == {"pass"}
+    assert [judged("weights of a network", "float32", 1, kind).verdict for kind in KINDS] == ["fail"] * 4
+
+
+def test_a_small_signal_on_a_large_constant_is_noise_and_never_judged_wrongly():
+    # one unit in the last place of 1000 is 6e-5; the mean of 144 squares moves by some 1e-4 along a random
+    # direction of length 0.1, so four directions know the gradient to some ten percent and no better
+    right = [judged("squares 12x12 on 1000", "float32", seed, None) for seed in range(40)]
+    assert {row.verdict for row in right} <= {"pass", "noise"}
+    assert all(row.noise_floor > 0.01 for row in right)
+    # a wrong length shows along the gradient itself, where the signal is twelve times as large
+    wrong = [judged("squares 12x12 on 1000", "float32", seed, "longer") for seed in range(40)]
+    assert "pass" not in {row.verdict for row in wrong}
+    decided = [row for row in wrong if row.verdict == "fail"]
+    assert len(decided) >= 30
+    # the floor along the gradient is below 2 %, so three of them are 0.06
+    assert all(
+        row.length_bias == pytest.approx(0.3, abs=0.06) for row in decided if row.length_bias is not None
+    )
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_noise_floor_is_the_size_of_the_error(seed):
+    # single precision against the derivative in closed form, d/dx log(x+1)^2 = 2 log(x+1) / (x+1): the
+    # squared error of 4 independent normal numbers exceeds 4 x 3^2 of their variance once in 3 million times
+    generator = torch.Generator().manual_seed(seed)
+    x = torch.rand(64, 64, generator=generator)
+    (row,) = certify(lambda p: (p["x"] + 1).log().square().sum(), {"x": x}, directions=4, generator=generator)
+    generator = torch.Generator().manual_seed(seed)
+    torch.rand(64, 64, generator=generator)
+    torch.randn(64, 64, generator=generator, dtype=D)  # the line on which rounding is measured
+    lines = torch.randn(4, 64, 64, generator=generator, dtype=D)
+    lines /= lines.flatten(1).norm(dim=1)[:, None, None]
+    truth = (lines.float().double() * 2 * (x.double() + 1).log() / (x.double() + 1)).sum((1, 2))
+    found = torch.tensor(row.difference, dtype=D)
+    assert float((found - truth).norm() / found.norm()) <= 3 * row.noise_floor
+    assert row.noise_floor < 0.01
+
+
+@pytest.mark.parametrize("directions", [None, 4])
+@pytest.mark.parametrize(
+    ("fn", "at"), [(torch.relu, -1.0), (torch.square, 0.0), (lambda x: 1e3 + x.square(), 0.0)]
+)
+def test_nothing_against_nothing_passes(fn, at, directions):
+    (row,) = certify(lambda p: fn(p["x"]).sum(), {"x": torch.full((3,), at)}, directions=directions)
+    assert row.verdict == "pass"
+    assert (row.relative_error, row.cosine, row.signed_bias) == (0.0, 1.0, 0.0)
+
+
+def test_a_gradient_where_the_function_stands_still_fails():
+    def straight_through(p):
+        return (p["x"].round() + p["x"] - p["x"].detach()).sum()
+
+    (row,) = certify(straight_through, {"x": torch.full((3,), 0.2)})
+    assert (row.verdict, row.relative_error, row.signed_bias) == ("fail", 1.0, math.inf)
+
+
+def test_rounding_noise_is_measured():
+    # rounding to multiples of 1e-3, many of them apart: errors uniform in +-5e-4, 2.9e-4 rms; nine points
+    # tell it within a factor of two
+    def rounded(x):
+        return (1e3 * (x.square().sum() + x.sum())).round() / 1e3
+
+    found = rounding_noise(rounded, torch.ones(3, dtype=D), torch.ones(3, dtype=D), 0.0137)
+    assert found == pytest.approx(1e-3 / 12**0.5, rel=1.0, abs=0)
+    assert found > 1e-3 / 12**0.5 / 2
+    assert (
+        rounding_noise(lambda x: x.pow(3).sum(), torch.ones(3, dtype=D), torch.ones(3, dtype=D), 1e-3) < 1e-14
+    )
+
+
+def test_ladder_of_a_cubic_is_exact():
+    # differences of x^3 are 3 + h^2, and two of them free of h^2
+    ladder = Ladder(lambda x: x.pow(3).sum(), torch.ones(1, dtype=D), torch.ones(1, dtype=D))
+    ladder.take((1e-1, 1e-2, 1e-3))
+    found = ladder.difference()
+    assert found.value == pytest.approx(3, abs=1e-12)
+    assert [d for _, d in found.ladder] == pytest.approx([3.01, 3.0001, 3.000001], abs=1e-12)
+    assert abs(found.value - 3) <= 3 * found.noise
+
+
+def test_exact_zeros_are_no_plateau_unless_all_are():
+    # 1000 + x in single precision: steps below half a unit in the last place, 3e-5, do not move it
+    one = torch.ones(1)
+    found = plateau(lambda x: 1e3 + x.sum(), torch.zeros(1), one, (1e-1, 1e-2, 1e-5, 1e-6))
+    assert found.value == pytest.approx(1.0, abs=1e-2)
+    assert plateau(lambda x: 0 * x.sum(), torch.zeros(1), one, (1e-1, 1e-2)).value == 0
+
+
+def test_steps_out_of_the_domain_are_left_out_and_named():
+    (row,) = certify(lambda p: p["x"].sqrt().sum(), {"x": torch.full((2,), 5e-3, dtype=D)})
+    assert row.left_out == (0.01,)
+    assert row.verdict == "pass"
+    with pytest.raises(NonFiniteError, match="at any step"):
+        certify(lambda p: p["x"].sqrt().sum(), {"x": torch.full((2,), 5e-3, dtype=D)}, ladder=(0.1, 0.05))
+
+
+def test_groups_of_two_precisions_in_one_function():
+    params = {"lens": torch.rand(3, dtype=D) + 1, "image": torch.rand(12, 12)}
+    rows = certify(
+        lambda p: (p["image"] * p["lens"].prod().float()).square().sum(),
+        params,
+        scales={"lens": torch.full((3,), 0.1, dtype=D), "image": torch.tensor(0.5, dtype=D)},
+        directions=4,
+    )
+    assert [row.verdict for row in rows] == ["pass", "pass"]
+
+
+def test_directions_are_the_same_at_every_call():
+    x = {"x": torch.rand(20, dtype=D)}
+    first, again = (certify(lambda p: p["x"].exp().sum(), x, directions=3)[0] for _ in range(2))
+    assert first == again
+    assert len(first.difference) == 3
+
+
+def test_random_numbers_that_differ_between_calls_are_refused():
+    generator = torch.Generator().manual_seed(0)
+
+    def loss(p):
+        return (p["x"] * torch.rand(3, generator=generator, dtype=D)).sum()
+
+    with pytest.raises(GradientError, match="seed your generator inside the function"):
+        certify(loss, {"x": torch.ones(3, dtype=D)})
+
+
+X = {"x": torch.ones(2, dtype=D)}
+
+
+@pytest.mark.parametrize(
+    ("fn", "params", "options", "error", "words"),
+    [
+        (lambda p: p["x"], X, {}, GradientError, r"got shape \(2,\)"),
+        (lambda p: p["x"].detach().sum(), X, {}, GradientError, "without a graph"),
+        (lambda p: 1.0, X, {}, GradientError, "returned a float"),
+        (lambda p: p["x"].log().sum(), {"x": -torch.ones(2)}, {}, NonFiniteError, "gradient|loss"),
+        (
+            lambda p: p["x"].sqrt().sum(),
+            {"x": torch.zeros(2)},
+            {},
+            NonFiniteError,
+            "gradient with respect to 'x'",
+        ),
+        (lambda p: p["x"].sum(), {"x": torch.ones(2, dtype=torch.int64)}, {}, DomainError, "torch.int64"),
+        (lambda p: p["x"].sum(), {"x": torch.ones(0)}, {}, DomainError, "non-empty"),
+        (lambda p: p["x"].sum(), {"x": 1.0}, {}, DomainError, "a float"),
+        (lambda p: p["x"].sum(), {}, {}, DomainError, "no parameters"),
+        (lambda p: p["x"].sum(), X, {"scales": {"y": 1.0}}, DomainError, "no parameter"),
+        (lambda p: p["x"].sum(), X, {"scales": {"x": 0.0}}, DomainError, "positive"),
+        (lambda p: p["x"].sum(), X, {"scales": {"x": torch.ones(3)}}, ShapeError, r"shape \(3,\)"),
+        (lambda p: p["x"].sum(), X, {"ladder": ()}, DomainError, "ladder"),
+        (lambda p: p["x"].sum(), X, {"ladder": (0.1, 0.1)}, DomainError, "ladder"),
+        (lambda p: p["x"].sum(), X, {"tolerance": 0.0}, DomainError, "tolerance"),
+        (lambda p: p["x"].sum(), X, {"directions": 0}, DomainError, "directions"),
+        (lambda p: p["x"].sum(), X, {"difference_fn": lambda p: p["x"]}, GradientError, "got shape"),
+    ],
+)
+def test_bad_input_is_refused_in_one_sentence(fn, params, options, error, words):
+    with pytest.raises(error, match=words):
+        certify(fn, params, **options)
+
+
+def test_the_example_runs():
+    assert doctest.testmod(sys.modules[certify.__module__]).failed == 0
+    assert doctest.testmod(sys.modules[certify.__module__]).attempted >= 3
+
+
+def test_the_stages_of_the_page_are_certified():
+    # docs/certify.md: an event layer, a lens layer and a network; test_chain has a chain
+    page = (Path(__file__).parents[2] / "docs" / "certify.md").read_text(encoding="utf-8")
+    blocks = page.split("```python\n")[1:4]
+    names = {}
+    for block in blocks:
+        exec(block.split("```")[0], names)
+        if "rows" in names:
+            assert {row.verdict for row in names["rows"]} == {"pass"}
+    assert [row.name for row in names["rows"]] == ["0.weight", "0.bias", "2.weight", "2.bias", "input"]
+
+
+def test_the_study_counts_verdicts(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        certify_precision, "FUNCTIONS", {"three logarithms": certify_precision.FUNCTIONS["three logarithms"]}
+    )
+    out = tmp_path / "run"
+    assert main(certify_precision.study, certify_precision.Config, ["--cases", "5", "--out", str(out)]) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["cases"] == 20
+    assert metrics["three_logarithms_float32_right_pass"] == 5
+    assert metrics["three_logarithms_float64_wrong_fail"] == 5
+    assert (metrics["right_failed"], metrics["wrong_passed"]) == (0, 0)
