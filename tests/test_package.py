@@ -46,7 +46,7 @@ def test_the_version_is_that_of_the_installed_package():
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="no attribute 'lenses'; it has .*backend, errors"):
+    with pytest.raises(AttributeError, match=r"no attribute 'lenses'; it has .*backend, errors"):
         _ = codesign.lenses  # pyright: ignore
 
 
