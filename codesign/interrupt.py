@@ -21,13 +21,13 @@ class Interruption:
         self.save: Callable[[], object] | None = None
         self._earlier = None
 
-    def __enter__(self):
+    def __enter__(self) -> "Interruption":
         # signal handlers belong to the main thread; in another one Ctrl-C never arrives
         if threading.current_thread() is threading.main_thread():
             self._earlier = signal.signal(signal.SIGINT, self._handle)
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         if self._earlier is not None:
             signal.signal(signal.SIGINT, self._earlier)
 
@@ -37,7 +37,7 @@ class Interruption:
         self.requested = True
         os.write(2, NOTICE)  # print is not safe in a signal handler
 
-    def safe_point(self):
+    def safe_point(self) -> None:
         """Called by a loop after each whole step: saves and raises KeyboardInterrupt when Ctrl-C was
         pressed."""
         if self.requested:
