@@ -1,14 +1,20 @@
 """What may enter an event layer: frames, thresholds, times. Everything else is refused with a sentence."""
 
 import math
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
 
+Times = Tensor | Sequence[float] | np.ndarray  # seconds
 
-def check_frames(frames, minimum=2, *, name="frames", non_negative=True):
+
+def check_frames(
+    frames: Tensor, minimum: int = 2, *, name: str = "frames", non_negative: bool = True
+) -> Tensor:
     """Return ``frames`` unchanged when they are a float32 or float64 tensor [T, ...] of finite values.
 
     Args:
@@ -31,7 +37,7 @@ def check_frames(frames, minimum=2, *, name="frames", non_negative=True):
     return frames
 
 
-def check_layout(frames, minimum=2, *, name="frames"):
+def check_layout(frames: Tensor, minimum: int = 2, *, name: str = "frames") -> None:
     """The part of ``check_frames`` that reads no value: type, number of frames, pixels. For kernels that look
     at the values themselves."""
     if not isinstance(frames, Tensor) or frames.dtype not in (torch.float32, torch.float64):
@@ -50,7 +56,7 @@ def check_layout(frames, minimum=2, *, name="frames"):
         raise ShapeError(f"{name} have shape {list(frames.shape)}, which holds no pixel; give at least one.")
 
 
-def check_theta(theta, name, frames):
+def check_theta(theta: Tensor | float, name: str, frames: Tensor) -> Tensor:
     """Return a contrast threshold as a tensor of the frames' dtype and device that broadcasts over one frame.
 
     Args:
@@ -82,7 +88,7 @@ def check_theta(theta, name, frames):
     return theta
 
 
-def check_times(t_s, count):
+def check_times(t_s: Times, count: int) -> Tensor:
     """Return frame times as a float64 tensor [count] on the CPU, strictly increasing.
 
     Raises: ShapeError when the number of times differs; DomainError when they do not increase strictly or are

@@ -11,6 +11,7 @@ from codesign.events.formats.hdf5 import read_hdf5, write_hdf5
 from codesign.events.formats.npz import read_npz, write_npz
 from codesign.events.formats.raw import read_raw, write_raw
 from codesign.events.formats.text import read_csv, write_csv
+from codesign.types import EventStream
 
 READERS = {
     ".aedat": read_aedat2,
@@ -34,7 +35,7 @@ WRITERS = {
 }
 
 
-def read(path, *, height_px=None, width_px=None):
+def read(path: str | Path, *, height_px: int | None = None, width_px: int | None = None) -> EventStream:
     """Read an event stream.
 
     Args:
@@ -45,6 +46,14 @@ def read(path, *, height_px=None, width_px=None):
     Returns: EventStream sorted by (t, y, x, p), times as the file gives them.
     Raises: FileFormatError when the file is missing, malformed (with the line or event where there is one) or
       of another kind.
+
+    Example:
+    >>> import torch
+    >>> from codesign import events
+    >>> frames = torch.tensor([50.0, 100.0]).reshape(2, 1, 1)
+    >>> events.write("brighter.npz", events.simulate(frames, [0.0, 0.01], events.SensorModel()))
+    >>> events.read("brighter.npz").t_us.tolist()
+    [2885, 5771, 8656]
     """
     path = Path(path)
     reader = _choose(READERS, path, "read")
@@ -56,7 +65,7 @@ def read(path, *, height_px=None, width_px=None):
         raise FileFormatError(f"cannot read {path}: {error.strerror or error}.") from error
 
 
-def write(path, stream, *, evt=None):
+def write(path: str | Path, stream: EventStream, *, evt: int | None = None) -> None:
     """Write an event stream; the file appears whole or not at all, and an earlier one stays when writing
     fails.
 
@@ -67,6 +76,13 @@ def write(path, stream, *, evt=None):
       evt: encoding of .raw files, 2 or 3 (the default); for no other.
     Raises: FileFormatError for an unknown extension, a stream that the format cannot hold, or a folder that
       is missing or not writable.
+
+    Example:
+    >>> import torch
+    >>> from codesign import events
+    >>> frames = torch.tensor([50.0, 100.0]).reshape(2, 1, 1)
+    >>> stream = events.simulate(frames, [0.0, 0.01], events.SensorModel())
+    >>> events.write("brighter.raw", stream, evt=2)
     """
     writer = _choose(WRITERS, Path(path), "written")
     if evt is not None and writer is not write_raw:

@@ -2,8 +2,10 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from codesign import backend
 from codesign.errors import DomainError
@@ -13,7 +15,7 @@ JOINT = 20.0  # intensity on the 0-255 scale where the linear part meets the log
 DARK_SLOPE = math.log(JOINT) / JOINT
 
 
-def lin_log(frames):
+def lin_log(frames: Tensor) -> Tensor:
     """Log intensity with a linear part for dark pixels.
 
     Args:
@@ -36,7 +38,7 @@ def _lin_log(frames):
     return torch.where(frames <= JOINT, frames * DARK_SLOPE, frames.clamp(min=JOINT).log())
 
 
-def light_share(intensity):
+def light_share(intensity: Any) -> Any:
     """How far the photoreceptor's speed and noise are from dark to full light: (I + 20)/275, 1 at I = 255.
     Tensors and drjit arrays. Source: v2e."""
     return (intensity + 20) / 275
@@ -107,7 +109,7 @@ def kernel_levels(frames, front_end):
     return found.torch().reshape(frames.shape).clone(), bool(bad[0])
 
 
-def log_levels(frames, log_input, minimum):
+def log_levels(frames: Tensor, log_input: bool, minimum: int) -> Tensor:
     """Check frames and bring them to log intensity; ``log_input`` says that they already are."""
     check_frames(frames, minimum, non_negative=not log_input)
     return FrontEnd(log_input).level(frames)

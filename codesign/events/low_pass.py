@@ -2,6 +2,8 @@
 kernel, the differentiable layers and Spike-ESIM."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,7 +13,9 @@ from codesign.events.intensity import light_share
 SERIES = 0.05  # below it (1 - e^-a)/a comes from a series: its first term left out is below 5e-10
 
 
-def coefficients(pace, exp, select):
+def coefficients(
+    pace: Any, exp: Callable[[Any], Any], select: Callable[[Any, Any, Any], Any]
+) -> tuple[Any, Any]:
     """What an interval of a = ``pace`` time constants does: e^-a, and the mean of e^-s over 0 < s < a, that is
     (1 - e^-a)/a, for small a without loss, value and derivative.
 
@@ -23,7 +27,7 @@ def coefficients(pace, exp, select):
     return fade, select(small, series, (1 - fade) / select(small, 1.0, pace))
 
 
-def passed(filtered, before, now, fade, mean):
+def passed(filtered: Any, before: Any, now: Any, fade: Any, mean: Any) -> Any:
     """The filter behind an interval over which its input runs from ``before`` to ``now``: the exact answer
     to y' = (L - y)/tau, stable for every pace.
 

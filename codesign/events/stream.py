@@ -1,13 +1,16 @@
 """Event streams: put in order, joined, and counted per frame interval."""
 
+from collections.abc import Iterable
+
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import check_times
+from codesign.events.entry import Times, check_times
 from codesign.types import EventStream
 
 
-def ordered(t_us, x, y, p, height_px, width_px):
+def ordered(t_us: Tensor, x: Tensor, y: Tensor, p: Tensor, height_px: int, width_px: int) -> EventStream:
     """EventStream of the given events, sorted by (t, y, x, p).
 
     Args:
@@ -34,7 +37,7 @@ def ordered(t_us, x, y, p, height_px, width_px):
     return EventStream(t_us[rank], x[rank], y[rank], p[rank], int(height_px), int(width_px))
 
 
-def concatenate(streams):
+def concatenate(streams: Iterable[EventStream]) -> EventStream:
     """One ordered stream of several from the same sensor (for example of consecutive chunks)."""
     sizes = {(stream.height_px, stream.width_px) for stream in streams}
     if len(sizes) != 1:
@@ -48,7 +51,7 @@ def concatenate(streams):
     return ordered(t_us, x, y, p, *sizes.pop())
 
 
-def to_counts(stream, t_s, *, dtype=torch.float32):
+def to_counts(stream: EventStream, t_s: Times, *, dtype: torch.dtype = torch.float32) -> Tensor:
     """Count the events of each interval between given times.
 
     Args:

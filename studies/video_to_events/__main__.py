@@ -191,7 +191,9 @@ def check_outputs(run, config, height, width):
 def write_outputs(run, config, log):
     """Write the event files; returns their paths."""
     paths = [run.path(name) for name in config.events]
-    stream = log.read(0, log.count) if paths else None
+    if not paths:
+        return paths
+    stream = log.read(0, log.count)
     for path in paths:
         events.write(path, stream)
         run.say(f"Written: {path}")

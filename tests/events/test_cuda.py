@@ -28,7 +28,7 @@ def test_differentiable_layers_and_volumes():
         given = frames().to(device).requires_grad_()
         hard, _ = memory(given, 0.2, 0.3)
         layers = (hard, soft_counts(given, 0.2, 0.3), soft(given, 0.2))
-        volume = from_counts(sum(layers), T_S, 4)
+        volume = from_counts(torch.stack(layers).sum(0), T_S, 4)
         (gradient,) = torch.autograd.grad((volume.counts**2).sum(), given)
         results.append([*layers, volume.counts, volume.centroid_s, gradient])
     # double precision; a logarithm may differ in its last digit, which moves no count of random frames

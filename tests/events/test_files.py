@@ -153,6 +153,6 @@ def test_a_failed_write_leaves_the_earlier_file(tmp_path):
     write(path, random_events(3))
     before = path.read_bytes()
     with pytest.raises(AttributeError):
-        write(path, None)
+        write(path, None)  # pyright: ignore[reportArgumentType]
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]

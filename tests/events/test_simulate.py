@@ -204,4 +204,4 @@ def test_bad_frames_and_times_are_refused_and_the_state_stays():
     with pytest.raises(DomainError, match="interval_s"):
         draw_shot_counts(sensor, (2, 2), [0.1, 0.0], torch.Generator())
     with pytest.raises(ShapeError, match="interval_s"):
-        draw_shot_counts(sensor, (2, 2), 0.1, torch.Generator())
+        draw_shot_counts(sensor, (2, 2), torch.tensor(0.1), torch.Generator())

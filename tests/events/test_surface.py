@@ -154,10 +154,10 @@ def test_bad_input_is_refused_with_a_reason():
             (surface_from_counts, (ones, [0, 1, 2])),
         ):
             with pytest.raises(DomainError, match="tau_s"):
-                function(*arguments, tau_s)
+                function(*arguments, tau_s)  # pyright: ignore[reportArgumentType]
     for at_us in ([], [5, 5], [6, 5], [0.5], 7):
         with pytest.raises(DomainError, match="whole microseconds"):
-            surface_from_stream(stream, at_us, 1.0)
+            surface_from_stream(stream, at_us, 1.0)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ShapeError, match="the sensor's"):
         decay_from_stream(stream, [5], 1.0, start=(torch.zeros(2, 4, 3), 0))
     for counts, error, words in (

@@ -148,7 +148,7 @@ def test_bad_input_is_refused_with_a_reason():
     stream = random_stream(5, 3, 3, 10)
     for window in ((0, 0), (5, 2), (0.5, 2)):
         with pytest.raises(DomainError, match="interval"):
-            from_stream(stream, *window, 2)
+            from_stream(stream, *window, 2)  # pyright: ignore[reportArgumentType]
     with pytest.raises(DomainError, match="bins"):
         from_stream(stream, 0, 10, -1)
 
@@ -213,7 +213,7 @@ def test_bad_spikes_are_refused_with_a_reason():
         ((0, 1, True), "steps"),
     ):
         with pytest.raises(DomainError, match=words):
-            spikes_from_stream(stream, *arguments)
+            spikes_from_stream(stream, *arguments)  # pyright: ignore[reportArgumentType]
     for spikes, error, words in (
         (torch.zeros(2, 3, 3), ShapeError, "W, H, T"),
         (torch.full((2, 1, 1, 1), 0.5), DomainError, "other than 0 and 1"),

@@ -41,7 +41,7 @@ class RecordedFrames:
     exposure_end_us: Tensor
 
 
-def read_frames(path):
+def read_frames(path: str | Path) -> RecordedFrames:
     """Read the frames of an AEDAT 4.0 file.
 
     Args: path: file ending in .aedat4.

@@ -32,6 +32,8 @@ def layer(name: str = "memory", sensor: SensorModel | None = None, **options: An
     Raises: DomainError for an unknown name, with the nearest one, or a value that cannot be learnt.
 
     Example:
+    >>> import torch
+    >>> from codesign import events
     >>> sensor = events.layer("memory", events.SensorModel(theta_on=0.2, theta_off=0.3))
     >>> frames = torch.tensor([40.0, 100.0, 30.0]).reshape(3, 1, 1)
     >>> sensor(frames, torch.tensor([0.0, 0.01, 0.02])).flatten(1).tolist()  # ON: ln(100/40)/0.2

@@ -2,13 +2,22 @@
 and frame."""
 
 import torch
+from torch import Tensor
 from torch.autograd import Function
 
 from codesign.events.entry import check_theta
 from codesign.events.intensity import log_levels
 
 
-def dense(frames, theta_on, theta_off, *, sharpness=5.0, state=None, log_input=False):
+def dense(
+    frames: Tensor,
+    theta_on: Tensor | float,
+    theta_off: Tensor | float,
+    *,
+    sharpness: float = 5.0,
+    state: Tensor | None = None,
+    log_input: bool = False,
+) -> tuple[Tensor, Tensor]:
     """Events of a comparator that looks once per frame; a pixel that fires memorises the level it sees.
 
     With u = (L - r)/theta_on - 1 an ON event is the step H(u), likewise OFF; then r := L where one fired. In

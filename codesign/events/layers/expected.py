@@ -4,6 +4,7 @@ spread is annealed to zero."""
 import math
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.events.entry import check_theta
@@ -16,7 +17,15 @@ LEAST_SPREAD = 0.01
 MOST_SPREAD = 1.0
 
 
-def expected(frames, theta_on, theta_off, spread, *, state=None, log_input=False):
+def expected(
+    frames: Tensor,
+    theta_on: Tensor | float,
+    theta_off: Tensor | float,
+    spread: Tensor | float,
+    *,
+    state: Tensor | None = None,
+    log_input: bool = False,
+) -> tuple[Tensor, Tensor]:
     """Mean counts of pixels whose thresholds scatter log-normally, with the mean memorised level carried on.
 
     With D = L - r, median threshold C and relative spread s: n = sum_k P(k theta <= |D|) = sum_k
@@ -52,7 +61,7 @@ def expected(frames, theta_on, theta_off, spread, *, state=None, log_input=False
     return torch.stack(counts), reference
 
 
-def annealed(step, steps, first=0.5, last=0.02):
+def annealed(step: int, steps: int, first: float = 0.5, last: float = 0.02) -> float:
     """Spread at a step of an optimisation, falling geometrically from ``first`` at step 0 to ``last`` at the
     end."""
     return first * (last / first) ** (min(max(step, 0), steps) / max(steps, 1))

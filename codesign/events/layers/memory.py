@@ -1,6 +1,7 @@
 """The default event layer: counts against a per-pixel memorised level, with a straight-through gradient."""
 
 import torch
+from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
@@ -10,7 +11,14 @@ from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
 from codesign.events.layers import memory_kernel as kernel
 
 
-def memory(frames, theta_on, theta_off, *, state=None, log_input=False):
+def memory(
+    frames: Tensor,
+    theta_on: Tensor | float,
+    theta_off: Tensor | float,
+    *,
+    state: Tensor | None = None,
+    log_input: bool = False,
+) -> tuple[Tensor, Tensor]:
     """Event counts per pixel and interval against the memorised log level r of each pixel.
 
     Per interval, with L the new log level and C = theta_on where L > r, else theta_off: n = trunc((L - r) /
@@ -43,6 +51,13 @@ def memory(frames, theta_on, theta_off, *, state=None, log_input=False):
     Cost: one pass over the frames forward, one backward; no memory beside counts and gradients.
     Source: Rebecq et al., ESIM, CoRL 2018; v2e (Hu et al., CVPR-W 2021), memorised brightness; Bengio et al.
       2013, straight-through; the play is ours.
+
+    Example:
+    >>> from codesign import events
+    >>> frames = torch.tensor([50.0, 100.0, 60.0]).reshape(3, 1, 1)  # a pixel brightens and darkens
+    >>> counts, state = events.memory(frames, theta_on=0.2, theta_off=0.2)
+    >>> counts.flatten(1).tolist()  # ln 2 / 0.2 = 3.5; then from 3 thresholds up back to ln 1.2
+    [[3.0, 0.0], [0.0, 2.0]]
     """
     front_end = FrontEnd(log_input)
     check_layout(frames, minimum=2 if state is None else 1)
@@ -57,7 +72,9 @@ def memory(frames, theta_on, theta_off, *, state=None, log_input=False):
     return _MemorisedCounts.apply(frames, theta_on, theta_off, state, front_end)
 
 
-def soft_counts(frames, theta_on, theta_off, *, log_input=False):
+def soft_counts(
+    frames: Tensor, theta_on: Tensor | float, theta_off: Tensor | float, *, log_input: bool = False
+) -> Tensor:
     """Counts without quantisation or memory: the smooth twin of ``memory``.
 
     Args: as for ``memory``.
@@ -69,6 +86,13 @@ def soft_counts(frames, theta_on, theta_off, *, log_input=False):
     Gradient: frames, thetas; exact, but at dL = 0, where both polarities get half their slope (the central
       difference).
     Raises: as ``memory``.
+
+    Example:
+    >>> from codesign import events
+    >>> frames = torch.tensor([50.0, 100.0, 60.0]).reshape(3, 1, 1)
+    >>> counts = events.soft_counts(frames, theta_on=0.2, theta_off=0.2)
+    >>> [[round(count, 3) for count in step] for step in counts.flatten(1).tolist()]
+    [[3.466, 0.0], [0.0, 2.554]]
     """
     level = log_levels(frames, log_input, minimum=2)
     theta_on = check_theta(theta_on, "theta_on", level)

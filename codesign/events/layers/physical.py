@@ -2,16 +2,17 @@
 the same physics."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 from codesign.errors import DomainError
-from codesign.events.entry import check_frames, check_times
+from codesign.events.entry import Times, check_frames, check_times
 from codesign.events.intensity import FrontEnd
 from codesign.events.layers.memory import memory
 from codesign.events.low_pass import low_pass
-from codesign.events.sensor.model import mismatched
+from codesign.events.sensor.model import SensorModel, mismatched
 from codesign.events.sensor.simulate import dense_counts
 from codesign.events.sensor.state import SensorState
 
@@ -39,7 +40,16 @@ class PhysicalState:
     time_s: float
 
 
-def sensor_counts(frames, t_s, sensor, *, generator=None, state=None, log_input=False, **design):
+def sensor_counts(
+    frames: Tensor,
+    t_s: Times,
+    sensor: SensorModel,
+    *,
+    generator: Generator | None = None,
+    state: PhysicalState | None = None,
+    log_input: bool = False,
+    **design: Tensor | float,
+) -> tuple[Tensor, PhysicalState]:
     """Event counts of the physical sensor with gradients to frames and to the sensor's own parameters.
 
     Forward: exactly the counts of ``simulate``, noise and all. Backward: the low-pass is linear and exact;
@@ -70,7 +80,7 @@ def sensor_counts(frames, t_s, sensor, *, generator=None, state=None, log_input=
     hard_sensor = replace(
         sensor, **{name: float(torch.as_tensor(value).detach()) for name, value in design.items()}
     )
-    value = {name: design.get(name, getattr(sensor, name)) for name in DESIGN}
+    value: dict[str, Any] = {name: design.get(name, getattr(sensor, name)) for name in DESIGN}
     check_frames(frames, 2 if state is None else 1, non_negative=not log_input)
     times_s = check_times(t_s, len(frames))
     hard_state = SensorState(generator=generator) if state is None else replace(state.sensor)

@@ -3,6 +3,7 @@
 import math
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.events.entry import check_theta
@@ -11,7 +12,9 @@ from codesign.events.intensity import log_levels
 GHOST_LOGIT = -5.0  # a pixel without change fires sigmoid(-5) = 0.67 % of an event per polarity and frame
 
 
-def soft(frames, theta, *, sharpness=None, log_input=False):
+def soft(
+    frames: Tensor, theta: Tensor | float, *, sharpness: float | None = None, log_input: bool = False
+) -> Tensor:
     """Soft events of consecutive frames, without memory and capped at one per pixel, polarity and frame.
 
     Args:
@@ -24,14 +27,18 @@ def soft(frames, theta, *, sharpness=None, log_input=False):
     Gradient: frames and theta, exact.
     Raises: ShapeError for fewer than two frames; DomainError for theta or sharpness <= 0, NaN, infinite or
       negative input.
+
+    Example:
+    >>> from codesign import events
+    >>> frames = torch.tensor([50.0, 100.0, 60.0]).reshape(3, 1, 1)
+    >>> counts = events.soft(frames, theta=0.2)
+    >>> [[round(count, 3) for count in step] for step in counts.flatten(1).tolist()]
+    [[1.0, 0.0], [0.0, 1.0]]
     """
     level = log_levels(frames, log_input, minimum=2)
     theta = check_theta(theta, "theta", level)
-    if sharpness is None:
-        sharpness = -GHOST_LOGIT / theta
-    elif not (0 < sharpness < math.inf):
+    if sharpness is not None and not (0 < sharpness < math.inf):
         raise DomainError(f"sharpness is {sharpness!r}; a finite number > 0 is needed (None gives 5/theta).")
+    k = -GHOST_LOGIT / theta if sharpness is None else sharpness
     step = level.diff(dim=0)
-    return torch.stack(
-        (torch.sigmoid(sharpness * (step - theta)), torch.sigmoid(sharpness * (-step - theta))), dim=1
-    )
+    return torch.stack((torch.sigmoid(k * (step - theta)), torch.sigmoid(k * (-step - theta))), dim=1)

@@ -2,9 +2,11 @@
 layers share."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
+from torch import Generator, Tensor
 
 from codesign.errors import DomainError, ShapeError
 
@@ -38,6 +40,13 @@ class SensorModel:
       are lost (ESIM). "v2e": the frame-wide time slots of v2e, where events inside the dead time are
       deferred.
     Source: v2e (Hu, Liu, Delbruck, CVPR-W 2021); Rebecq et al., ESIM, CoRL 2018.
+
+    Example:
+    >>> from codesign import events
+    >>> sensor = events.SensorModel(theta_on=0.18, theta_off=0.22, theta_sigma=0.03, refractory_s=5e-4)
+    >>> theta_on, theta_off = events.draw_thresholds(sensor, (180, 240), torch.Generator().manual_seed(0))
+    >>> theta_on.shape, round(float(theta_on.mean()), 2), round(float(theta_on.std()), 2)
+    (torch.Size([180, 240]), 0.18, 0.03)
     """
 
     theta_on: float = 0.2
@@ -89,16 +98,16 @@ class SensorModel:
             )
 
     @property
-    def leaks(self):
+    def leaks(self) -> bool:
         """Whether the memorised level drifts by itself."""
         return self.leak_rate_hz > 0 or self.hot_pixel_share * self.hot_pixel_rate_hz > 0
 
     @property
-    def has_shots(self):
+    def has_shots(self) -> bool:
         """Whether separate noise events are drawn."""
         return self.shot_rate_hz > 0 and not self.photoreceptor_noise
 
-    def noise_level(self):
+    def noise_level(self) -> float:
         """Standard deviation of the photoreceptor noise at the comparator, natural log units; 0 without
         ``photoreceptor_noise``.
 
@@ -146,7 +155,14 @@ PRESETS = {
 }  # v2e's presets and the defaults of its command line
 
 
-def draw_thresholds(sensor, pixels, generator, *, dtype=torch.float32, device="cpu"):
+def draw_thresholds(
+    sensor: SensorModel,
+    pixels: Sequence[int],
+    generator: Generator,
+    *,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> tuple[Tensor, ...]:
     """Contrast thresholds of every pixel.
 
     Args:
@@ -166,7 +182,9 @@ def draw_thresholds(sensor, pixels, generator, *, dtype=torch.float32, device="c
     )
 
 
-def draw_deviates(pixels, generator, *, dtype=torch.float32):
+def draw_deviates(
+    pixels: Sequence[int], generator: Generator, *, dtype: torch.dtype = torch.float32
+) -> Tensor:
     """Standard normal numbers behind the thresholds of every pixel, [2, *pixels] on the generator's device:
     first all ON, then all OFF."""
     shape = tuple(pixels)
@@ -175,13 +193,20 @@ def draw_deviates(pixels, generator, *, dtype=torch.float32):
     )
 
 
-def mismatched(theta, sigma, deviate):
+def mismatched(theta: Tensor | float, sigma: Tensor | float, deviate: Tensor) -> Tensor:
     """Thresholds of every pixel: theta + sigma deviate, at least 0.01. Gradient: theta and sigma, none where
     the minimum holds."""
     return (theta + sigma * deviate).clamp(min=THETA_MINIMUM)
 
 
-def draw_leak_rates(sensor, pixels, generator, *, dtype=torch.float32, device="cpu"):
+def draw_leak_rates(
+    sensor: SensorModel,
+    pixels: Sequence[int],
+    generator: Generator,
+    *,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> Tensor:
     """Leak of every pixel in ON thresholds per second, [*pixels]: log-normal spread around leak_rate_hz, plus
     the rate of hot pixels.
 
@@ -202,7 +227,15 @@ def draw_leak_rates(sensor, pixels, generator, *, dtype=torch.float32, device="c
     return rate_hz.to(device)
 
 
-def draw_shot_counts(sensor, pixels, interval_s, generator, *, dtype=torch.float32, device="cpu"):
+def draw_shot_counts(
+    sensor: SensorModel,
+    pixels: Sequence[int],
+    interval_s: Tensor | Sequence[float],
+    generator: Generator,
+    *,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> Tensor:
     """Noise events per pixel and interval: Poisson, shot_rate_hz/2 per polarity. Add them to the counts of
     any event layer.
 

@@ -1,15 +1,17 @@
 """The naive emulator: the difference of consecutive frames against a threshold."""
 
 import torch
+from torch import Tensor
 
 from codesign.errors import ShapeError
-from codesign.events.entry import check_theta, check_times
+from codesign.events.entry import Times, check_theta, check_times
 from codesign.events.intensity import log_levels
 from codesign.events.stream import ordered
+from codesign.types import EventStream
 
 
 @torch.no_grad()
-def naive(frames, t_s, theta, *, log_input=False):
+def naive(frames: Tensor, t_s: Times, theta: Tensor | float, *, log_input: bool = False) -> EventStream:
     """At most one event per pixel and frame: ON when dL >= theta, OFF when dL <= -theta between consecutive
     frames.
 

@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Generator, Tensor
 
 from codesign import backend
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import check_frames, check_layout, check_times
+from codesign.events.entry import Times, check_frames, check_layout, check_times
 from codesign.events.intensity import FrontEnd, kernel_levels
 from codesign.events.sensor import crossing, v2e
+from codesign.events.sensor.model import SensorModel
 from codesign.events.sensor.sinks import DenseCounts, EventKeys, KeyLayout
 from codesign.events.sensor.state import SensorState, begin
 from codesign.events.stream import ordered
@@ -20,7 +22,16 @@ KEY_BITS = 63
 
 
 @torch.no_grad()
-def simulate(frames, t_s, sensor, generator=None, state=None, *, log_input=False, log_eps=None):
+def simulate(
+    frames: Tensor,
+    t_s: Times,
+    sensor: SensorModel,
+    generator: Generator | None = None,
+    state: SensorState | None = None,
+    *,
+    log_input: bool = False,
+    log_eps: float | None = None,
+) -> EventStream:
     """Events of a sensor that sees the frames one after the other; log level runs linearly between them.
 
     Per interval a pixel fires each time its level crosses its memorised level by one more threshold, as many
@@ -49,6 +60,13 @@ def simulate(frames, t_s, sensor, generator=None, state=None, *, log_input=False
       The state is then as before.
     Source: Rebecq et al., ESIM, CoRL 2018 (linear interpolation of log intensity); v2e (Hu, Liu, Delbruck,
       CVPR-W 2021), docs/events.md.
+
+    Example:
+    >>> from codesign import events
+    >>> frames = torch.tensor([50.0, 100.0]).reshape(2, 1, 1)  # a pixel brightens over 10 ms
+    >>> stream = events.simulate(frames, [0.0, 0.01], events.SensorModel(theta_on=0.2))
+    >>> stream.t_us.tolist(), stream.p.tolist()  # 0.2, 0.4 and 0.6 of ln 2
+    ([2885, 5771, 8656], [1, 1, 1])
     """
     state = SensorState() if state is None else state
     moved = replace(state)
@@ -81,7 +99,16 @@ def simulate(frames, t_s, sensor, generator=None, state=None, *, log_input=False
 
 
 @torch.no_grad()
-def dense_counts(frames, t_s, sensor, generator=None, state=None, *, log_input=False, log_eps=None):
+def dense_counts(
+    frames: Tensor,
+    t_s: Times,
+    sensor: SensorModel,
+    generator: Generator | None = None,
+    state: SensorState | None = None,
+    *,
+    log_input: bool = False,
+    log_eps: float | None = None,
+) -> Tensor:
     """The events of ``simulate`` as counts per interval, without the list between; any pixel shape.
 
     Args: as for ``simulate``, but frames: [T, ...]; timing "interpolated" only.
@@ -156,7 +183,8 @@ def _v2e_events(frames, times_s, sensor, generator, state, front_end):
                 frame.exp() if front_end.log_input else frame, level, time_s, sensor, generator, state
             )
         )
-    return ordered(*(torch.cat(column) for column in zip(*parts, strict=True)), *frames.shape[1:])
+    t_us, x, y, p = (torch.cat(column) for column in zip(*parts, strict=True))
+    return ordered(t_us, x, y, p, *frames.shape[1:])
 
 
 def _interpolated_keys(frames, times_s, sensor, generator, state, front_end, layout, density):

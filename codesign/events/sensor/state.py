@@ -42,7 +42,7 @@ class SensorState:
     key: Tensor | None = None
     shots: Tensor | None = None
 
-    def tensors(self):
+    def tensors(self) -> dict[str, Tensor]:
         """Name -> tensor of everything remembered per pixel (for storing)."""
         named = ((field.name, getattr(self, field.name)) for field in fields(self))
         return {name: value for name, value in named if isinstance(value, Tensor)}

@@ -1,8 +1,12 @@
 """From the level that a pixel sees to its events: the memorised-reference layer, the coupled spike response
 layer, or a pixel with dead time."""
 
-import torch
+from typing import Any
 
+import torch
+from torch import Tensor
+
+from codesign.events.entry import Times
 from codesign.events.layers.memory import memory
 from codesign.events.layers.physical import sensor_counts
 from codesign.events.sensor.model import SensorModel
@@ -10,7 +14,9 @@ from codesign.events.spiking.srm import srm
 from codesign.events.spiking.surrogate import FastSigmoid
 
 
-def count_memorised(level, t_s, theta, state, refractory_s):
+def count_memorised(
+    level: Tensor, t_s: Times, theta: Tensor, state: Any, refractory_s: Tensor | None
+) -> tuple[Tensor, Any]:
     """Counts of ``events.memory``, or, with a dead time, those of ``events.sensor_counts``.
 
     Args: level: [T, ...]. t_s: [T]. theta: [2]. state: what an earlier call returned, or None. refractory_s:
@@ -32,7 +38,9 @@ def count_memorised(level, t_s, theta, state, refractory_s):
     )
 
 
-def count_spikes(level, t_s, theta, state, refractory_s):
+def count_spikes(
+    level: Tensor, t_s: Times | None, theta: Tensor, state: Any, refractory_s: Tensor | None
+) -> tuple[Tensor, Any]:
     """At most one event per step and polarity: a spike response layer with step kernels and coupled
     polarities, which memorises the same level.
 

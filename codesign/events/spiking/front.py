@@ -5,7 +5,7 @@ import math
 
 import torch
 import torch.nn.functional as F
-from torch import nn
+from torch import Tensor, nn
 
 from codesign.events.intensity import light_share
 from codesign.events.low_pass import coefficients, passed
@@ -24,7 +24,7 @@ class Prefilter(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.zeros(3, 3))
 
-    def forward(self, level):
+    def forward(self, level: Tensor) -> Tensor:
         """level: [B, 1, H, W]; edges repeated."""
         delta = torch.zeros(3, 3, dtype=level.dtype, device=level.device)
         delta[1, 1] = 1
@@ -40,7 +40,7 @@ class ToneCurve(nn.Module):
         super().__init__()
         self.log_slope = nn.Parameter(torch.zeros(KNOTS))
 
-    def forward(self, level):
+    def forward(self, level: Tensor) -> Tensor:
         """level: [B, 1, H, W] log level; same shape."""
         width = (BRIGHTEST - DARKEST) / KNOTS
         edges = torch.arange(KNOTS, dtype=level.dtype, device=level.device) * width + DARKEST
@@ -56,18 +56,20 @@ class Bandwidth(nn.Module):
     (photocurrent sets the bandwidth).
     """
 
-    def __init__(self, cutoff_hz=100.0):
+    def __init__(self, cutoff_hz: float = 100.0):
         super().__init__()
         self.gate = nn.Parameter(torch.zeros(()))
         self.log_cutoff = nn.Parameter(torch.tensor(math.log(cutoff_hz)))
         self.power = nn.Parameter(torch.ones(()))
 
-    def advance(self, filtered, before, now, intensity, interval_s):
+    def advance(
+        self, filtered: Tensor, before: Tensor, now: Tensor, intensity: Tensor, interval_s: float
+    ) -> Tensor:
         """The filter after an interval over which the level runs linearly from ``before`` to ``now``;
         intensity: mean over the interval."""
         light = light_share(intensity)
         pace = (2 * math.pi * interval_s) * torch.exp(self.log_cutoff + self.power * light.log())
         return passed(filtered, before, now, *coefficients(pace, torch.exp, torch.where))
 
-    def mixed(self, level, filtered):
+    def mixed(self, level: Tensor, filtered: Tensor) -> Tensor:
         return level + self.gate * (filtered - level)

@@ -2,12 +2,13 @@
 counts."""
 
 import torch.nn.functional as F
+from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
 from codesign.events.spiking.srm_scale import alpha_response
 
 
-def van_rossum(found, target, *, tau_s, dt=1.0):
+def van_rossum(found: Tensor, target: Tensor, *, tau_s: Tensor | float, dt: float = 1.0) -> Tensor:
     """Van Rossum distance 1/2 int (eps * (s - s^))^2 dt with eps(t) = t/tau exp(1 - t/tau), summed over
     pixels and polarities.
 
@@ -25,7 +26,7 @@ def van_rossum(found, target, *, tau_s, dt=1.0):
     return response.square().sum() * (dt / 2)
 
 
-def count_loss(found, target, *, side_px=8, steps=10):
+def count_loss(found: Tensor, target: Tensor, *, side_px: int = 8, steps: int = 10) -> Tensor:
     """Half the chi-square of counts pooled over blocks of space and time: 1/2 sum (n - n^)^2 / (n^ + 1), per
     polarity.
 

@@ -2,7 +2,7 @@
 give in number."""
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from codesign.events.intensity import light_share
 
@@ -19,7 +19,7 @@ class NoiseRate(nn.Module):
         self.amplitude_hz = nn.Parameter(torch.zeros(2))
         self.fade = nn.Parameter(torch.ones(()))
 
-    def forward(self, intensity):
+    def forward(self, intensity: Tensor) -> Tensor:
         """intensity: [T, ...]; returns [T, 2, ...], ON first."""
         shape = torch.exp(-self.fade * light_share(intensity))
         on, off = self.amplitude_hz + (self.amplitude_hz.clamp(min=0) - self.amplitude_hz).detach()

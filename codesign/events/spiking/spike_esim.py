@@ -3,13 +3,14 @@ one does differently."""
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import check_frames, check_times
+from codesign.events.entry import Times, check_frames, check_times
 from codesign.events.intensity import lin_log
 from codesign.events.spiking.comparators import COMPARATORS
 from codesign.events.spiking.front import Bandwidth, Prefilter, ToneCurve
@@ -54,15 +55,15 @@ class SpikeEsim(nn.Module):
 
     def __init__(
         self,
-        theta_on=0.2,
-        theta_off=0.2,
+        theta_on: float = 0.2,
+        theta_off: float = 0.2,
         *,
-        refractory_s=0.0,
-        cutoff_hz=100.0,
-        comparator="memory",
-        width=6,
-        depth=1,
-        seed=0,
+        refractory_s: float = 0.0,
+        cutoff_hz: float = 100.0,
+        comparator: str = "memory",
+        width: int = 6,
+        depth: int = 1,
+        seed: int = 0,
     ):
         super().__init__()
         if comparator not in COMPARATORS:
@@ -104,18 +105,25 @@ class SpikeEsim(nn.Module):
         self.branch = ResidualBranch(width, depth, seed)
         self.noise_rate = NoiseRate()
 
-    def thetas(self):
+    def thetas(self) -> Tensor:
         """Thresholds ON and OFF as they are now: [2] float64, natural log units."""
         return (
             torch.tensor((self.settings["theta_on"], self.settings["theta_off"]), dtype=torch.float64)
             * self.log_gain.exp()
         )
 
-    def refractory_s(self):
+    def refractory_s(self) -> Tensor | None:
         """Dead time as it is now, 0-dim tensor, or None when there is none."""
         return None if self.log_dead is None else self.settings["refractory_s"] * self.log_dead.exp()
 
-    def forward(self, frames, t_s, state=None, *, theta_scale=1.0):
+    def forward(
+        self,
+        frames: Tensor,
+        t_s: Times,
+        state: SpikeEsimState | None = None,
+        *,
+        theta_scale: Tensor | float = 1.0,
+    ) -> tuple[Tensor, SpikeEsimState]:
         """Events of the frames, without noise.
 
         Args:
@@ -148,7 +156,7 @@ class SpikeEsim(nn.Module):
         )
         return counts, SpikeEsimState(*after, frames[-1], float(times_s[-1]), comparator)
 
-    def expected_noise(self, frames, t_s, state=None):
+    def expected_noise(self, frames: Tensor, t_s: Times, state: SpikeEsimState | None = None) -> Tensor:
         """Mean number of noise events per interval, [T-1, 2, ...] ([T, 2, ...] with a state), ON first.
         Gradient: the noise rates, frames."""
         frames, times_s = _checked(frames, t_s, state)
@@ -158,19 +166,27 @@ class SpikeEsim(nn.Module):
         return self.noise_rate((frames[1:] + frames[:-1]) / 2) * interval_s[:, None]
 
     @torch.no_grad()
-    def draw(self, frames, t_s, generator, state=None, *, theta_scale=1.0):
+    def draw(
+        self,
+        frames: Tensor,
+        t_s: Times,
+        generator: Generator,
+        state: SpikeEsimState | None = None,
+        *,
+        theta_scale: Tensor | float = 1.0,
+    ) -> tuple[Tensor, SpikeEsimState]:
         """Hard events with noise: ``forward`` plus a Poisson draw of ``expected_noise``. Returns counts and
         state."""
         noise = torch.poisson(self.expected_noise(frames, t_s, state), generator=generator)
         counts, after = self(frames, t_s, state, theta_scale=theta_scale)
         return counts + noise, after
 
-    def save(self, path):
+    def save(self, path: str | Path) -> None:
         """Write settings and parameters as an .npz file."""
         write_generator(path, self.settings, self.state_dict())
 
     @classmethod
-    def load(cls, path):
+    def load(cls, path: str | Path) -> "SpikeEsim":
         """A generator that ``save`` wrote. Raises: FileFormatError when the file is missing, damaged or of
         another kind."""
         return read_generator(path, cls)

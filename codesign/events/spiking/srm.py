@@ -20,24 +20,24 @@ NONFINITE = ("raise", "zero")
 
 
 def srm(
-    drive,
+    drive: Tensor,
     *,
-    theta,
-    tau_s=None,
-    tau_r=None,
-    dt=1.0,
-    kernel="slayer",
-    state=None,
-    response="none",
-    reset_scale=2.0,
-    coupled=False,
-    surrogate=None,
-    through_reset="off",
-    smooth=False,
-    segment=None,
-    truncation=None,
-    nonfinite="raise",
-):
+    theta: Tensor | float,
+    tau_s: Tensor | float | None = None,
+    tau_r: Tensor | float | None = None,
+    dt: float = 1.0,
+    kernel: str = "slayer",
+    state: SrmState | None = None,
+    response: str = "none",
+    reset_scale: float = 2.0,
+    coupled: bool = False,
+    surrogate: Surrogate | None = None,
+    through_reset: str = "off",
+    smooth: bool = False,
+    segment: int | None = None,
+    truncation: float | None = None,
+    nonfinite: str = "raise",
+) -> tuple[Tensor, Tensor, SrmState]:
     """Spikes s_t = [u_t >= theta] of the potential u_t = (response of the drive)_t + sum over k >= 1 of nu_k
     s_{t-k}; a tie u_t = theta spikes.
 
@@ -84,6 +84,13 @@ def srm(
       "full" breaks max rho * sum|nu| < 1.
     Source: Gerstner and Kistler, Spiking Neuron Models, 2002, section 4.2; Shrestha and Orchard, SLAYER,
       NeurIPS 2018.
+
+    Example:
+    >>> from codesign import events
+    >>> drive = torch.full((6, 1), 1.2)  # a neuron driven above its threshold in every step
+    >>> spikes, potential, state = events.srm(drive, theta=1.0, tau_r=1.0, kernel="exp", reset_scale=1.0)
+    >>> spikes.flatten().tolist()  # it rests until the reset has faded to less than 0.2: e^-2
+    [1.0, 0.0, 0.0, 1.0, 0.0, 0.0]
     """
     drive = _checked_drive(drive, nonfinite, truncation)
     pixels = drive.shape[1:]
@@ -163,7 +170,7 @@ def srm(
     )
 
 
-def per_pixel(value, name, drive):
+def per_pixel(value: Tensor | float | None, name: str, drive: Tensor) -> Tensor:
     """A positive parameter as float64 tensor that broadcasts over one frame of the drive.
 
     Raises: DomainError when it is not a positive finite number; ShapeError when it does not broadcast.

@@ -1,12 +1,16 @@
 """The response of the spike response model alone, and a factor for the drive that avoids a dead start."""
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.events.spiking.srm import per_pixel, srm
+from codesign.events.spiking.srm_state import SrmState
 
 
-def alpha_response(signal, *, tau_s, dt=1.0, state=None):
+def alpha_response(
+    signal: Tensor, *, tau_s: Tensor | float, dt: float = 1.0, state: SrmState | None = None
+) -> tuple[Tensor, SrmState]:
     """The alpha kernel applied to a signal, exactly: y_t = sum over k >= 1 of (k h) exp(1 - k h) signal_{t-k}
     with h = dt / tau_s.
 
@@ -22,7 +26,15 @@ def alpha_response(signal, *, tau_s, dt=1.0, state=None):
     return response, state
 
 
-def drive_scale(drive, *, theta, tau_s=None, dt=1.0, response="none", share=0.05):
+def drive_scale(
+    drive: Tensor,
+    *,
+    theta: Tensor | float,
+    tau_s: Tensor | float | None = None,
+    dt: float = 1.0,
+    response: str = "none",
+    share: float = 0.05,
+) -> float:
     """Factor for the drive that lifts a share of all potentials to their threshold before any reset, so that
     training does not start dead or saturated.
 

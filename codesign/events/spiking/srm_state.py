@@ -21,7 +21,7 @@ class SrmState:
     response: Tensor
     reset: Tensor
 
-    def detach(self):
+    def detach(self) -> "SrmState":
         """The same state without its graph."""
         return SrmState(self.response.detach(), self.reset.detach())
 

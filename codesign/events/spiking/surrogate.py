@@ -1,6 +1,8 @@
 """Surrogate derivatives of the spike, with the antiderivative that makes an exact smooth twin of the layer.
 
 A surrogate is the density rho(x) that stands in for the derivative of the step at x = u - theta. Its integral
+from torch import Tensor
+from typing import Self
 from -infinity replaces the step in the smooth
 twin, whose gradient is therefore exact. All three have their largest value 1/alpha at the threshold and the
 width 1/beta.
@@ -9,9 +11,10 @@ width 1/beta.
 import math
 from collections.abc import Callable
 from dataclasses import astuple, dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
 
@@ -52,26 +55,26 @@ class Surrogate:
                 )
 
     @classmethod
-    def unit(cls, width):
+    def unit(cls, width: float) -> Self:
         """The surrogate of the given width in potential units whose integral is 1, like that of the step's
         true derivative."""
         return cls(cls.mass * width, 1 / width)
 
     @staticmethod
-    def density(operations, x, alpha, beta) -> Any:
+    def density(operations: Operations, x: Any, alpha: Any, beta: Any) -> Any:
         """rho(x), for arrays of the library that ``operations`` belongs to."""
         raise NotImplementedError
 
     @staticmethod
-    def integral(operations, x, alpha, beta) -> Any:
+    def integral(operations: Operations, x: Any, alpha: Any, beta: Any) -> Any:
         """Integral of rho from -infinity to x: the smooth spike."""
         raise NotImplementedError
 
-    def torch_density(self, x):
+    def torch_density(self, x: Tensor) -> Tensor:
         """rho(x) of a torch tensor."""
         return self.density(TORCH, x, *astuple(self))
 
-    def torch_integral(self, x):
+    def torch_integral(self, x: Tensor) -> Tensor:
         """Integral of rho up to a torch tensor x, differentiable."""
         return self.integral(TORCH, x, *astuple(self))
 
@@ -85,13 +88,13 @@ class Laplace(Surrogate):
     mass = 2.0
 
     @staticmethod
-    def density(operations, x, alpha, beta):
+    def density(operations: Operations, x: Any, alpha: Any, beta: Any) -> Any:
         return (
             operations.exp2(-LOG2_E * beta * operations.abs(x)) / alpha
         )  # exp2: drjit's exp takes twice as long
 
     @staticmethod
-    def integral(operations, x, alpha, beta):
+    def integral(operations: Operations, x: Any, alpha: Any, beta: Any) -> Any:
         tail = operations.exp2(-LOG2_E * beta * operations.abs(x))
         return operations.select(x < 0, tail, 2 - tail) / (alpha * beta)
 
@@ -105,12 +108,12 @@ class FastSigmoid(Surrogate):
     mass = 2.0
 
     @staticmethod
-    def density(operations, x, alpha, beta):
+    def density(operations: Operations, x: Any, alpha: Any, beta: Any) -> Any:
         flank = 1 + beta * operations.abs(x)
         return 1 / (alpha * flank * flank)
 
     @staticmethod
-    def integral(operations, x, alpha, beta):
+    def integral(operations: Operations, x: Any, alpha: Any, beta: Any) -> Any:
         tail = 1 / (1 + beta * operations.abs(x))
         return operations.select(x < 0, tail, 2 - tail) / (alpha * beta)
 
@@ -124,11 +127,11 @@ class Triangular(Surrogate):
     mass = 1.0
 
     @staticmethod
-    def density(operations, x, alpha, beta):
+    def density(operations: Operations, x: Any, alpha: Any, beta: Any) -> Any:
         return operations.maximum(1 - beta * operations.abs(x), 0.0) / alpha
 
     @staticmethod
-    def integral(operations, x, alpha, beta):
+    def integral(operations: Operations, x: Any, alpha: Any, beta: Any) -> Any:
         rest = operations.maximum(1 - beta * operations.abs(x), 0.0)
         tail = rest * rest / 2
         return operations.select(x < 0, tail, 1 - tail) / (alpha * beta)

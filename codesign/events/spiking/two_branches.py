@@ -12,6 +12,7 @@ from codesign.events.spiking.srm import srm
 from codesign.events.spiking.srm_scale import drive_scale
 from codesign.events.spiking.srm_state import SrmState
 from codesign.events.spiking.stepwise import stepwise
+from codesign.events.spiking.surrogate import Surrogate
 
 
 @dataclass(frozen=True)
@@ -42,16 +43,16 @@ class TwoBranchSpikes(nn.Module):
 
     def __init__(
         self,
-        channels=3,
+        channels: int = 3,
         *,
-        theta=1.0,
-        tau_r=1.0,
-        dt=1.0,
-        smoothing_tau=None,
-        kernel="slayer",
-        surrogate=None,
-        through_reset="off",
-        seed=0,
+        theta: Tensor | float = 1.0,
+        tau_r: Tensor | float = 1.0,
+        dt: float = 1.0,
+        smoothing_tau: Tensor | float | None = None,
+        kernel: str = "slayer",
+        surrogate: Surrogate | None = None,
+        through_reset: str = "off",
+        seed: int = 0,
     ):
         super().__init__()
         if isinstance(channels, bool) or not isinstance(channels, int) or channels < 1:
@@ -69,7 +70,9 @@ class TwoBranchSpikes(nn.Module):
             "through_reset": through_reset,
         }
 
-    def forward(self, frames, state=None, *, theta=None):
+    def forward(
+        self, frames: Tensor, state: BranchState | None = None, *, theta: Tensor | float | None = None
+    ) -> tuple[Tensor, Tensor, BranchState]:
         """Spikes of the frames.
 
         Args:
@@ -95,7 +98,7 @@ class TwoBranchSpikes(nn.Module):
         return spikes, potential, BranchState(last, neurons)
 
     @torch.no_grad()
-    def wake(self, frames, share=0.05):
+    def wake(self, frames: Tensor, share: float = 0.05) -> None:
         """Scale the weights of either branch so that ``share`` of its potentials reaches the threshold on
         these frames: training never starts dead.
 

@@ -2,11 +2,14 @@
 optical flow."""
 
 import math
+from collections.abc import Iterable, Iterator
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import check_frames, check_times
+from codesign.events.entry import Times, check_frames, check_times
 from codesign.events.intensity import lin_log
 from codesign.events.upsampling.between import between, visibility
 from codesign.events.upsampling.flow import flow_both_ways, flow_levels
@@ -16,7 +19,14 @@ from codesign.events.upsampling.steps import largest, largest_change, shares, st
 MAX_STEPS = 256
 
 
-def upsample(frames, t_s, *, max_displacement_px=1.0, max_log_change=None, max_steps=MAX_STEPS):
+def upsample(
+    frames: Tensor,
+    t_s: Times,
+    *,
+    max_displacement_px: float = 1.0,
+    max_log_change: float | None = None,
+    max_steps: int = MAX_STEPS,
+) -> tuple[Tensor, Tensor]:
     """Put frames between the frames of a video until nothing moves further than a bound from one to the next.
 
     Frames are taken as instantaneous: blur of an exposure is moved along and not undone. Motion is straight
@@ -54,7 +64,14 @@ def upsample(frames, t_s, *, max_displacement_px=1.0, max_log_change=None, max_s
     return torch.cat([piece for piece, _ in pieces]), torch.cat([times_s for _, times_s in pieces])
 
 
-def upsample_stream(frames, t_s, *, max_displacement_px=1.0, max_log_change=None, max_steps=MAX_STEPS):
+def upsample_stream(
+    frames: Iterable[Tensor],
+    t_s: Iterable[Any],
+    *,
+    max_displacement_px: float = 1.0,
+    max_log_change: float | None = None,
+    max_steps: int = MAX_STEPS,
+) -> Iterator[tuple[Tensor, Tensor]]:
     """``upsample`` of frames that come one after the other, in the memory of one interval.
 
     Args: frames: anything that yields frames [H, W]. t_s: anything that yields as many times. The rest as for

@@ -1,14 +1,18 @@
 """Pictures to MP4 or GIF, one by one, and the exponential-decay video of events."""
 
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as iio
 import imageio_ffmpeg
 import numpy as np
+from torch import Tensor
 
 from codesign.atomic import replacing
 from codesign.errors import DomainError, FileFormatError, ShapeError
+from codesign.events.entry import Times
 from codesign.events.stream import to_counts
 from codesign.events.views.view import picture
 from codesign.events.volumes.traces import decay
@@ -20,7 +24,7 @@ LEAST_SIDE_PX = (
 LARGEST_SIDE_PX = 1280  # unless the longer one would exceed this
 
 
-def write_video(path, pictures, fps):
+def write_video(path: str | Path, pictures: Iterable[Any], fps: float) -> None:
     """Write pictures as a video; small ones are enlarged by whole factors, odd sizes get one more row or
     column of their edge.
 
@@ -46,7 +50,12 @@ def write_video(path, pictures, fps):
             size = (first.shape[1], first.shape[0])
             with closing(
                 imageio_ffmpeg.write_frames(
-                    str(temporary), size, fps=fps, codec="libx264", quality=8, macro_block_size=2
+                    str(temporary),
+                    size,
+                    fps=fps,  # pyright: ignore[reportArgumentType]  (it takes any number)
+                    codec="libx264",
+                    quality=8,
+                    macro_block_size=2,
                 )
             ) as file:
                 file.send(None)
@@ -57,7 +66,15 @@ def write_video(path, pictures, fps):
             iio.imwrite(temporary, np.stack([first, *ready]), plugin="pillow", duration=1000 / fps, loop=0)
 
 
-def decay_video(path, events, t_s, tau_s, *, fps=25, full_scale=None):
+def decay_video(
+    path: str | Path,
+    events: EventStream | Tensor,
+    t_s: Times,
+    tau_s: float,
+    *,
+    fps: float = 25,
+    full_scale: float | None = None,
+) -> None:
     """Write the exponential-decay video of events: red ON and blue OFF traces that fade.
 
     Args:

@@ -3,12 +3,13 @@
 import math
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import check_times
+from codesign.events.entry import Times, check_times
 
 
-def picture(counts, full_scale=None):
+def picture(counts: Tensor, full_scale: float | None = None) -> Tensor:
     """Event frames as colour pictures: white where nothing happened, red for ON, blue for OFF, purple for
     both.
 
@@ -24,7 +25,7 @@ def picture(counts, full_scale=None):
     return (255 * (1 - strength[..., None] * (1 - colour))).round().to(torch.uint8)
 
 
-def gray_picture(counts, full_scale=None):
+def gray_picture(counts: Tensor, full_scale: float | None = None) -> Tensor:
     """Event frames as gray pictures: middle gray where ON and OFF balance, white for ON, black for OFF.
 
     Args: as for ``picture``.
@@ -34,7 +35,7 @@ def gray_picture(counts, full_scale=None):
     return (128 + 127 * ((on - off) / full).clamp(-1, 1)).round().to(torch.uint8)
 
 
-def rates(counts, t_s):
+def rates(counts: Tensor, t_s: Times) -> tuple[Tensor, Tensor]:
     """Event rate of the whole picture over time, per polarity.
 
     Args: counts: [T-1, 2, H, W]. t_s: [T] seconds, strictly increasing.

@@ -2,12 +2,16 @@
 networks take them."""
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.events.stream import ordered
+from codesign.types import EventStream
 
 
-def spikes_from_stream(stream, t0_us, step_us, steps, *, dtype=torch.float32):
+def spikes_from_stream(
+    stream: EventStream, t0_us: int, step_us: int, steps: int, *, dtype: torch.dtype = torch.float32
+) -> Tensor:
     """Spike tensor of a stream.
 
     Args:
@@ -35,7 +39,7 @@ def spikes_from_stream(stream, t0_us, step_us, steps, *, dtype=torch.float32):
     return spikes
 
 
-def stream_from_spikes(spikes, t0_us, step_us):
+def stream_from_spikes(spikes: Tensor, t0_us: int, step_us: int) -> EventStream:
     """Stream with one event per spike, at the start of its step; ``spikes_from_stream`` of it gives the same
     spikes.
 
@@ -55,7 +59,7 @@ def stream_from_spikes(spikes, t0_us, step_us):
     return ordered(t0_us + step * step_us, x, y, 1 - 2 * off, spikes.shape[2], spikes.shape[1])
 
 
-def spikes_from_counts(counts):
+def spikes_from_counts(counts: Tensor) -> Tensor:
     """Spike tensor of counts per interval, one step per interval: min(count, 1).
 
     Args: counts: [T, 2, H, W] hard or soft counts >= 0, ON first, of intervals of equal length.

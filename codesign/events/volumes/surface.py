@@ -1,16 +1,22 @@
 """Time surfaces: how long ago the last event was, per pixel and polarity, as exp(-(t_ref - t_last) / tau); 0
 where none was yet."""
 
+from collections.abc import Sequence
+
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.events.entry import check_times
+from codesign.events.entry import Times, check_times
 from codesign.events.volumes.traces import check_tau, segments
+from codesign.types import EventStream
 
 NEVER_US = torch.iinfo(torch.int64).min
 
 
-def surface_from_stream(stream, at_us, tau_s, *, dtype=torch.float32):
+def surface_from_stream(
+    stream: EventStream, at_us: Tensor | Sequence[int], tau_s: float, *, dtype: torch.dtype = torch.float32
+) -> Tensor:
     """Time surface of a stream at given times.
 
     Args:
@@ -41,7 +47,16 @@ def surface_from_stream(stream, at_us, tau_s, *, dtype=torch.float32):
     return torch.stack(surfaces)
 
 
-def surface_from_times(t_s, x, y, p, height_px, width_px, at_s, tau_s):
+def surface_from_times(
+    t_s: Tensor,
+    x: Tensor,
+    y: Tensor,
+    p: Tensor,
+    height_px: int,
+    width_px: int,
+    at_s: Tensor | Sequence[float],
+    tau_s: float,
+) -> Tensor:
     """Time surface of events whose times are real numbers, such as analytic crossing times.
 
     Args:
@@ -91,7 +106,7 @@ def surface_from_times(t_s, x, y, p, height_px, width_px, at_s, tau_s):
     return torch.stack(surfaces)
 
 
-def surface_from_counts(counts, t_s, tau_s):
+def surface_from_counts(counts: Tensor, t_s: Times, tau_s: float) -> Tensor:
     """Time surface after every frame interval, from hard or soft counts.
 
     The events of an interval of length d sit at its middle. With m = min(count, 1): S <- (1 - m) S exp(-d /

@@ -1,14 +1,17 @@
 """Exponential decay: traces that grow by one with every event and fade between them."""
 
 import math
+from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import check_times
+from codesign.events.entry import Times, check_times
+from codesign.types import EventStream
 
 
-def decay(counts, t_s, tau_s):
+def decay(counts: Tensor, t_s: Times, tau_s: float) -> Tensor:
     """Exponentially fading sum of events, per polarity, after every frame interval.
 
     Args:
@@ -28,7 +31,14 @@ def decay(counts, t_s, tau_s):
     return torch.stack(traces)
 
 
-def decay_from_stream(stream, at_us, tau_s, *, start=None, dtype=torch.float32):
+def decay_from_stream(
+    stream: EventStream,
+    at_us: Tensor | Sequence[int],
+    tau_s: float,
+    *,
+    start: tuple[Tensor, int] | None = None,
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
     """Exponentially fading sum of single events at given times: sum over t <= t_ref of exp(-(t_ref - t) /
     tau).
 
