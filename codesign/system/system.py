@@ -42,7 +42,7 @@ class System(nn.Module):
     >>> import torch
     >>> from codesign import System, events, flow, lens, render
     >>> camera = render.Camera(lens.ThinLens(8.0, 2.0), 32, 32, 0.05, samples_per_pixel=4)
-    >>> system = System(camera=camera, events=events.soft_counts_layer(), flow=flow.estimate_lk,
+    >>> system = System(camera=camera, events=events.layer("counts"), flow=flow.estimate_lk,
     ...     objectives={"error": lambda field, truth: (field.flow_px - truth.flow_px).square().mean()})
     """
 
