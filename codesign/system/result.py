@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from codesign.errors import DomainError, NonFiniteError
 from codesign.types import EventVolume, FlowField, Rays
@@ -99,8 +99,9 @@ def _norm(tensors: list[Tensor]) -> float:
 def tensors_of(junction: str, value: Any) -> tuple[Tensor, ...]:
     """The tensors that stand at a junction."""
     if junction == "lens":
-        found = [getattr(value, name, None) for name in _LENS]
-        return tuple(t for t in found if torch.is_tensor(t) and t.requires_grad)
+        learnt = [p for p in value.parameters() if p.requires_grad] if isinstance(value, nn.Module) else []
+        made = [getattr(value, name, None) for name in _LENS]
+        return tuple(learnt or [t for t in made if torch.is_tensor(t) and t.requires_grad])
     if isinstance(value, Rays):
         return (value.origin_m, value.direction, value.weight)
     if isinstance(value, EventVolume):
