@@ -126,7 +126,7 @@ def certificate(system: System, batch: Batch, directions: int):
         for row in certify(
             lambda p, name=name: fn({**params, **p}),
             {name: params[name]},
-            scales=scales,
+            scales={name: scales[name]},
             ladder=LADDER if name in ("lens", "mount") else (0.1, 0.03, 0.01),
             tolerance=ASKED_ERROR,
             directions=directions if name == "network" else None,

@@ -14,7 +14,7 @@ def system():
 
 @pytest.fixture(scope="module")
 def batch():
-    return joint_design.draw_batch(2, 1000)
+    return joint_design.draw_batch(4, 1000)
 
 
 def test_every_group_has_the_gradient_of_differences(system, batch):
