@@ -4,95 +4,73 @@ SHELL := bash
 .DEFAULT_GOAL := help
 PYTHON ?=
 ARGS ?=
+STUDY :=
 RUN := .venv/bin/python
+INSTALL := $(RUN) -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable
+STUDIES := lens-opt lens-report lens-scratch lens-tolerance lens-bench silhouettes dataset video-to-events \
+	event-gradient event-bench srm-bench davis train-flow flow-quality flow-compare flow-cost flow-recording \
+	placement speed-error stability gradcheck
 
-.PHONY: help setup lens-opt lens-report lens-scratch lens-tolerance lens-bench silhouettes dataset video-to-events event-gradient event-bench srm-bench davis train-flow flow-quality flow-compare flow-cost flow-recording placement speed-error stability gradcheck test lint doctor clean
+.PHONY: help setup test lint core-check doctor clean $(STUDIES)
 
 help: ## this list
-	@sed -n 's/^\([a-z-]*\):.*## /  make \1|/p' Makefile | awk -F'|' '{printf "%-20s %s\n", $$1, $$2}'
+	@sed -n 's/^\([a-z-]*\):.*## /  make \1|/p' Makefile | awk -F'|' '{printf "%-24s %s\n", $$1, $$2}'
 
-setup: .venv/installed.stamp .venv/llvm.stamp ## environment, packages and LLVM (only what has changed)
+setup: .venv/with-dev.stamp .venv/llvm.stamp ## environment, every package and LLVM (only what has changed)
 
-.venv/installed.stamp: pyproject.toml constraints.txt setup/make_venv.sh
+# the core, and each extra of pyproject.toml when a target wants it
+.venv/core.stamp: pyproject.toml constraints.txt setup/make_venv.sh
 	@setup/make_venv.sh .venv "$(PYTHON)"
 	@echo "installing the packages of pyproject.toml into .venv (some minutes the first time)"
-	@$(RUN) -m pip install --disable-pip-version-check --quiet --editable ".[dev]" --constraint constraints.txt
+	@$(INSTALL) .
 	@touch $@
 
-.venv/llvm.stamp: .venv/installed.stamp setup/install_llvm.sh
+.venv/with-%.stamp: .venv/core.stamp
+	@$(INSTALL) ".[$*]"
+	@touch $@
+
+.venv/llvm.stamp: .venv/core.stamp setup/install_llvm.sh
 	@if setup/install_llvm.sh $(RUN); then touch $@; fi
 
-lens-opt: setup ## optimise a lens for event flow, the main job
-	@$(RUN) -m studies.lens_opt $(ARGS)
+# a study: the target's name with _ for -, or what STUDY says; more prerequisites stand with the target below
+$(STUDIES): .venv/core.stamp .venv/llvm.stamp
+	@$(RUN) -m studies.$(or $(STUDY),$(subst -,_,$@)) $(ARGS)
 
-lens-report: setup ## everything about one lens: make lens-report ARGS="--lens double-gauss"
-	@$(RUN) -m studies.lens_report $(ARGS)
-
-lens-scratch: setup ## triplets designed from flat plates
-	@$(RUN) -m studies.lens_scratch $(ARGS)
-
-lens-tolerance: setup ## what errors of making and mounting do to a lens
-	@$(RUN) -m studies.lens_tolerance $(ARGS)
-
-lens-bench: setup ## speed and error against other ray tracers (installs them)
-	@$(RUN) -m pip install --disable-pip-version-check --quiet --editable ".[bench]" --constraint constraints.txt
-	@$(RUN) -m studies.lens_bench $(ARGS)
-
-silhouettes: setup ## gradients where objects hide one another
-	@$(RUN) -m studies.silhouettes $(ARGS)
-
-dataset: setup ## render trajectories with events and ground truth
-	@$(RUN) -m studies.make_dataset $(ARGS)
-
-video-to-events: setup ## events out of a video: make video-to-events ARGS="--input clip.mp4"
-	@$(RUN) -m studies.video_to_events $(ARGS)
-
-event-gradient: setup ## gradients of the event layers against differences of hard counts
-	@$(RUN) -m studies.event_gradient $(ARGS)
-
-event-bench: setup ## speed and memory of the event stage
-	@$(RUN) -m studies.event_bench $(ARGS)
-
-srm-bench: setup ## the spiking layer against a convolution and two spiking libraries (installs them)
-	@$(RUN) -m pip install --disable-pip-version-check --quiet --editable ".[bench]" --constraint constraints.txt
-	@$(RUN) -m studies.srm_bench $(ARGS)
-
-davis: setup ## a sensor fitted to a real recording, judged on its other half
-	@$(RUN) -m studies.davis_fit $(ARGS)
-
-train-flow: setup ## train a flow network: make train-flow ARGS="--network refiner --cpu-minutes 20"
-	@$(RUN) -m studies.train_flow $(ARGS)
-
-flow-quality: setup ## error of the delivered refiner and of the closed form on unseen textures and worlds
-	@$(RUN) -m studies.flow_quality $(ARGS)
-
-flow-compare: setup ## the refiner against networks of its size, same windows and budget
-	@$(RUN) -m studies.flow_compare $(ARGS)
-
-flow-cost: setup ## time and memory of flow estimators
-	@$(RUN) -m studies.flow_cost $(ARGS)
-
-flow-recording: setup ## flow of a recording: make flow-recording ARGS="--recording FOLDER"
-	@$(RUN) -m studies.flow_recording $(ARGS)
-
-placement: setup ## where to mount the camera on a robot
-	@$(RUN) -m studies.placement $(ARGS)
-
-speed-error: setup ## time and error of every fidelity level
-	@$(RUN) -m studies.speed_error $(ARGS)
-
-stability: setup ## hard cases: outcome expected and seen
-	@$(RUN) -m studies.stability $(ARGS)
-
-gradcheck: setup ## autograd against differences, junction by junction
-	@$(RUN) -m studies.gradient_flow $(ARGS)
+lens-opt: .venv/with-video.stamp ## optimise a lens for event flow, the main job
+lens-report: ## everything about one lens: make lens-report ARGS="--lens double-gauss"
+lens-scratch: ## triplets designed from flat plates
+lens-tolerance: ## what errors of making and mounting do to a lens
+lens-bench: .venv/with-bench.stamp ## speed and error against other ray tracers (installs them)
+silhouettes: ## gradients where objects hide one another
+dataset: .venv/with-event-files.stamp ## render trajectories with events and ground truth
+dataset: STUDY := make_dataset
+video-to-events: .venv/with-event-files.stamp .venv/with-video.stamp ## events out of a video: make video-to-events ARGS="--input clip.mp4"
+event-gradient: ## gradients of the event layers against differences of hard counts
+event-bench: ## speed and memory of the event stage
+srm-bench: .venv/with-bench.stamp ## the spiking layer against a convolution and two spiking libraries (installs them)
+davis: .venv/with-event-files.stamp ## a sensor fitted to a real recording, judged on its other half
+davis: STUDY := davis_fit
+train-flow: .venv/with-event-files.stamp .venv/with-training-logs.stamp ## train a flow network: make train-flow ARGS="--network refiner --cpu-minutes 20"
+flow-quality: ## error of the delivered refiner and of the closed form on unseen textures and worlds
+flow-compare: .venv/with-training-logs.stamp ## the refiner against networks of its size, same windows and budget
+flow-cost: ## time and memory of flow estimators
+flow-recording: .venv/with-event-files.stamp ## flow of a recording: make flow-recording ARGS="--recording FOLDER"
+placement: ## where to mount the camera on a robot
+speed-error: ## time and error of every fidelity level
+stability: ## hard cases: outcome expected and seen
+gradcheck: ## autograd against differences, junction by junction
+gradcheck: STUDY := gradient_flow
 
 test: setup ## all tests
 	@$(RUN) -m pytest $(ARGS)
 
-lint: setup ## ruff and pyright
+lint: setup ## format, ruff and pyright
+	@$(RUN) -m ruff format --check .
 	@$(RUN) -m ruff check .
 	@$(RUN) -m pyright $(ARGS)
+
+core-check: ## an environment of its own with the core alone: everything is imported, lens_opt runs
+	@setup/core_check.sh "$(PYTHON)"
 
 doctor: setup ## what is installed, what is missing, what to do
 	@$(RUN) -m codesign doctor

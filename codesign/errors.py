@@ -17,6 +17,10 @@ class FileFormatError(CodesignError, ValueError):
     """A file is missing, malformed, or of a kind this function does not read."""
 
 
+class MissingPackageError(CodesignError, ImportError):
+    """A package that the core does without is not installed; the message names the extra that brings it."""
+
+
 class BackendError(CodesignError, RuntimeError):
     """A system component that rendering needs (LLVM, a Mitsuba variant, CUDA) is missing or unfit."""
 

@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import PIL.Image
 import torch
 from scipy.ndimage import gaussian_filter
 
@@ -27,37 +28,71 @@ LIFT = 2.0  # the darkest radiance of a photograph: no real wall is perfectly bl
 def photo(source, size_px=512):
     """A photograph as linear luminance.
 
-    Args: source: a name out of PHOTOS (CC0 and public-domain pictures that come with scikit-image) or a path
-      to an image file.
-    Returns: [H, W] float32, from LIFT to 255, cut to at most size_px square.
+    Args:
+      source: a name out of PHOTOS (CC0 and public-domain pictures that come with scikit-image) or a path to an
+        image file.
+      size_px: most rows and columns. A file that has more is averaged over areas, in linear light, until its
+        longer side has as many: all of it is there, in its own proportions. Of a picture out of PHOTOS the
+        first rows and columns are taken, texel by texel.
+    Returns: [H, W] float32, from LIFT to 255.
     Raises: FileFormatError when there is no such picture.
     """
     if str(source) in PHOTOS:
         import skimage.data
 
-        picture = getattr(skimage.data, str(source))()
-    else:
-        import imageio.v3 as imageio
+        stored = getattr(skimage.data, str(source))()[:size_px, :size_px]
+        return _radiance(_linear(stored), str(source))
+    linear = _linear(_stored(source))
+    longest = max(linear.shape)
+    if longest > size_px:
+        for axis, size in enumerate(linear.shape):
+            linear = _averaged(linear, max(1, round(size * size_px / longest)), axis)
+    return _radiance(linear, str(source))
 
-        if not Path(source).is_file():
-            raise FileFormatError(
-                f"texture '{source}' is neither a file nor one of {', '.join(PHOTOS)}; give the path of a "
-                "PNG or JPEG."
-            )
-        try:
-            picture = imageio.imread(
-                source, plugin="pillow"
-            )  # the only one asked: trying them all leaves files open
-        except (OSError, ValueError) as error:
-            raise FileFormatError(
-                f"texture {source} is not a readable image ({str(error)[:120]}); convert it to PNG."
-            ) from error
-    scale = 65535.0 if picture.dtype == np.uint16 else 255.0 if picture.dtype == np.uint8 else 1.0
-    values = np.asarray(picture, dtype=np.float64)[:size_px, :size_px] / scale
+
+def _stored(path):
+    """Values of an image file as they are stored: [H, W] or [H, W, 3]."""
+    if not Path(path).is_file():
+        raise FileFormatError(
+            f"texture '{path}' is neither a file nor one of {', '.join(PHOTOS)}; give the path of a "
+            "PNG or JPEG."
+        )
+    try:
+        with PIL.Image.open(path) as image:
+            if image.mode == "I":
+                raise ValueError("it holds whole numbers of 32 bits, whose white is not known")
+            gray = image.mode in ("L", "F") or image.mode.startswith("I;16")
+            return np.asarray(image if gray else image.convert("RGB"))
+    except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:
+        raise FileFormatError(
+            f"texture {path} is not a readable image ({str(error)[:120]}); convert it to PNG."
+        ) from error
+
+
+def _linear(stored):
+    """Linear luminance 0..1, [H, W] float64, of values coded by the sRGB gamma."""
+    scale = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1.0
+    values = np.asarray(stored, dtype=np.float64) / scale
     linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
     if linear.ndim == 3:
         linear = linear[..., :3] @ [0.2126, 0.7152, 0.0722] if linear.shape[2] >= 3 else linear[..., 0]
-    return check_texture(LIFT + (255 - LIFT) * linear, str(source))
+    return linear
+
+
+def _averaged(values, size, axis):
+    """``values`` averaged along ``axis`` over ``size`` equal lengths, of texels that are constant inside: the
+    differences of their integral."""
+    values = np.moveaxis(values, axis, 0)
+    count = len(values)
+    integral = np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, 0)])
+    at = np.linspace(0, count, size + 1)
+    whole = np.minimum(at.astype(int), count - 1)
+    part = (at - whole).reshape(-1, *[1] * (values.ndim - 1))
+    return np.moveaxis(np.diff(integral[whole] + part * values[whole], axis=0) * (size / count), 0, axis)
+
+
+def _radiance(linear, name):
+    return check_texture(LIFT + (255 - LIFT) * linear, name)
 
 
 def shrunk(texture, factor):

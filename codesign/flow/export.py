@@ -12,6 +12,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 from codesign.atomic import replacing
 from codesign.errors import DomainError
+from codesign.optional import require
 from codesign.types import EventVolume
 
 
@@ -34,7 +35,7 @@ def export(network, path, height_px, width_px, batch=1):
       network: flow network with ``config["bins"]``. path: .pt2 (torch.export) or .onnx.
       height_px, width_px, batch: of the counts [batch, 2, bins, H, W] that the program takes; it returns flow
         [batch, 2, H, W] and confidence [batch, H, W].
-    Raises: DomainError for another extension, for ONNX without its packages, and for a network with an
+    Raises: MissingPackageError for ONNX without its packages; DomainError for another extension, and for a network with an
       operation that ONNX lacks; FileFormatError when the
       file cannot be written.
 
@@ -138,13 +139,8 @@ PLAIN = {
 def _onnx(program, name):
     """Bytes of an ONNX model with its weights inside. The small systems that flow networks solve are positive
     definite."""
-    try:
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise DomainError(
-            "ONNX needs the packages onnx and onnxscript ('pip install onnx onnxscript'); or give a name "
-            "that ends in .pt2."
-        ) from error
+    for module in ("onnx", "onnxscript"):
+        require(module, "export", "writing .onnx (.pt2 needs nothing more)")
     log = logging.getLogger("torch.onnx")
     level = log.level
     with (

@@ -25,6 +25,7 @@ from codesign.errors import DomainError
 from codesign.events import SensorModel, SensorState, simulate
 from codesign.flow.files import write_flow
 from codesign.lens import catalogue
+from codesign.optional import require
 from codesign.render import Camera, shade
 from codesign.render.moving import at_frames
 from scenes.dataset_motion import FAMILIES, LEAD_S, motion
@@ -97,6 +98,7 @@ class Clock:
 
 @torch.no_grad()
 def study(run: Run[Config]) -> None:
+    require("h5py", "event-files", "a data set")
     config = checked(run.config)
     scene, stage = make_world(config.world, config.light)
     camera = make_camera(config)

@@ -15,13 +15,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import torch
 
 from codesign.atomic import replacing, write_atomic
 from codesign.errors import FileFormatError
 from codesign.events import SensorState
+from codesign.events.formats.hdf5_chunks import h5py
 from codesign.types import EventStream
 
 PARTS = "parts"

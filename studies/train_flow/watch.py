@@ -6,14 +6,14 @@ import statistics
 import sys
 from typing import Any
 
-from torch.utils.tensorboard import SummaryWriter
-
 from codesign import flow
 from codesign.flow import checkpoint
+from codesign.optional import optional
 from codesign.train import checkpoint as training
 from codesign.train.validation import batches, score
 from studies.train_flow import page
 
+tensorboard = optional("torch.utils.tensorboard", "training-logs", "the log of a training")
 RECENT = 50  # steps over which the shown loss is averaged
 
 
@@ -28,7 +28,7 @@ class Watch:
         self._earlier_s = job.progress.validation_s
         self._kept = {}
         self._closed_form = {}
-        self._log = SummaryWriter(
+        self._log = tensorboard.SummaryWriter(
             str(run.path("tensorboard")), purge_step=job.progress.step + 1 if run.resumed else None
         )
         self._units = 0

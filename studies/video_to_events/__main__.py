@@ -24,6 +24,7 @@ import torch
 from codesign import events
 from codesign.errors import DomainError
 from codesign.events.sources.opening import open_frames
+from codesign.optional import require
 from codesign.types import EventStream
 from studies.frame.run import Run, StudyConfig, main
 from studies.video_to_events import page as pages
@@ -180,8 +181,10 @@ def checked(config):
 
 def check_outputs(run, config, height, width):
     """Write and remove a file of one event in every format asked for, so that one that cannot be is told now
-    and not after the simulation."""
+    and not after the simulation; likewise what the preview needs."""
     zero = torch.zeros(1, dtype=torch.int64)
+    if config.preview:
+        require("imageio_ffmpeg", "video", "a preview (--no-preview leaves it out)")
     for name in config.events:
         path = run.path(name)
         events.write(path, EventStream(zero, zero, zero, zero + 1, height, width))

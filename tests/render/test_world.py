@@ -176,6 +176,35 @@ def test_a_photograph_is_linearised_as_srgb(tmp_path):
     )  # luminance is a sum of linear light
 
 
+@pytest.mark.parametrize(("size_px", "shape"), [(4, (2, 4)), (9, (4, 9)), (10, (5, 10)), (12, (6, 12))])
+def test_a_large_picture_is_averaged_not_cut(tmp_path, size_px, shape):
+    """Every texel repeated as often as the new picture has rows (columns), and means of as many as the old one
+    has: averages over areas without a fraction of a texel."""
+    import imageio.v3 as imageio
+
+    values = np.random.default_rng(3).integers(0, 256, (6, 12), dtype=np.uint8)
+    imageio.imwrite(tmp_path / "noise.png", values)
+    coded = values / 255
+    linear = np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+    fine = linear.repeat(shape[0], 0).repeat(shape[1], 1)
+    expected = fine.reshape(shape[0], 6, shape[1], 12).mean((1, 3))
+    found = textures.photo(tmp_path / "noise.png", size_px)
+    assert found.shape == shape
+    np.testing.assert_allclose(found, 2 + 253 * expected, rtol=1e-6)  # float32
+    if shape[0] * 2 == shape[1]:  # equal scales: light is kept as well
+        assert found.mean(dtype=np.float64) == pytest.approx(2 + 253 * linear.mean(), rel=1e-6)
+
+
+def test_a_tall_picture_keeps_its_proportions(tmp_path):
+    import imageio.v3 as imageio
+
+    imageio.imwrite(tmp_path / "tall.png", np.full((40, 7), 60000, dtype=np.uint16))
+    found = textures.photo(tmp_path / "tall.png", 20)
+    assert found.shape == (20, 4)  # 3.5 columns, rounded
+    np.testing.assert_allclose(found, 2 + 253 * ((60000 / 65535 + 0.055) / 1.055) ** 2.4, rtol=2e-6)
+    assert textures.photo(tmp_path / "tall.png").shape == (40, 7), "a small one stays as it is"
+
+
 def test_speckle_keeps_its_band_and_contrast():
     field = np.log(
         textures.speckle(5, 256, finest_px=4.0, coarsest_px=32.0, contrast=0.3).astype(np.float64) / 60

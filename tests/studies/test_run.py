@@ -212,6 +212,7 @@ def counted(run: Run[Config]):
             if run.config.limit == 9 and not run.resumed:
                 signal.raise_signal(signal.SIGINT)
             judging.advance()
+    assert bar.seconds_per_step is not None
     run.record(seconds_per_step=bar.seconds_per_step, seconds=run.seconds)
     run.finish("Steps", "They were counted.")
 

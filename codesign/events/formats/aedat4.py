@@ -5,12 +5,11 @@ Source: iniVation documentation, "AEDAT file formats", AEDAT 4.0 (the container 
 
 import struct
 
-import lz4.frame
 import numpy as np
 
 from codesign.errors import FileFormatError
 from codesign.events.formats import flatbuffer
-from codesign.events.formats.aedat4_container import LZ4, MAGIC, read_container
+from codesign.events.formats.aedat4_container import LZ4, MAGIC, lz4_frame, read_container
 from codesign.events.formats.arrival import arranged, columns
 
 EVENT = np.dtype(
@@ -124,7 +123,7 @@ def write_aedat4(path, stream):
 
 
 def _packed(body):
-    return lz4.frame.compress(body, content_checksum=True)
+    return lz4_frame.compress(body, content_checksum=True)
 
 
 def _packet(events):

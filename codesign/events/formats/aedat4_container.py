@@ -11,11 +11,12 @@ import struct
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 
-import lz4.frame
-import zstandard
-
 from codesign.errors import FileFormatError
 from codesign.events.formats import flatbuffer
+from codesign.optional import optional
+
+lz4_frame = optional("lz4.frame", "event-files", "reading and writing .aedat4")
+zstandard = optional("zstandard", "event-files", "reading .aedat4 packed by Zstandard")
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 NONE, LZ4, LZ4_HIGH, ZSTD, ZSTD_HIGH = range(5)
@@ -86,28 +87,33 @@ def unpacked(path, data, compression):
         return data
     try:
         if compression in (LZ4, LZ4_HIGH):
-            unpacker = lz4.frame.LZ4FrameDecompressor()
+            unpacker = lz4_frame.LZ4FrameDecompressor()
             body = unpacker.decompress(data, max_length=limit)
-            whole = unpacker.eof and not unpacker.unused_data
         else:
-            unpacker = zstandard.ZstdDecompressor(max_window_size=2**27).decompressobj()
-            if zstandard.frame_content_size(data) > limit:
-                raise FileFormatError(
-                    f"{path}: a block of {len(data)} bytes claims to hold more than {limit} bytes; the file "
-                    "is damaged."
-                )
-            body = unpacker.decompress(data)
-            whole = unpacker.eof and not unpacker.unused_data
-    except (RuntimeError, EOFError, zstandard.ZstdError) as error:
+            body, unpacker = _from_zstandard(path, data, limit)
+    except (RuntimeError, EOFError) as error:
         raise FileFormatError(
             f"{path}: a block of {len(data)} bytes does not decompress: {error}; the file is damaged."
         ) from error
-    if not whole:
+    if not unpacker.eof or unpacker.unused_data:
         raise FileFormatError(
             f"{path}: a block of {len(data)} bytes ends early, goes on too long, or holds more than {limit} "
             "bytes; the file is damaged."
         )
     return body
+
+
+def _from_zstandard(path, data, limit):
+    try:
+        unpacker = zstandard.ZstdDecompressor(max_window_size=2**27).decompressobj()
+        if zstandard.frame_content_size(data) > limit:
+            raise FileFormatError(
+                f"{path}: a block of {len(data)} bytes claims to hold more than {limit} bytes; the file is "
+                "damaged."
+            )
+        return unpacker.decompress(data), unpacker
+    except zstandard.ZstdError as error:
+        raise RuntimeError(str(error)) from error
 
 
 def _places(path, data, at, stop):

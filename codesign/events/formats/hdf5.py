@@ -2,11 +2,9 @@
 
 import zlib
 
-import h5py
-
 from codesign.errors import FileFormatError
 from codesign.events.formats.dsec import from_dsec, to_dsec
-from codesign.events.formats.hdf5_chunks import values
+from codesign.events.formats.hdf5_chunks import h5py, values
 from codesign.events.formats.v2e_hdf5 import from_v2e
 
 # all that h5py raises on damaged files

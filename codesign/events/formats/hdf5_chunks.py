@@ -12,11 +12,13 @@ import math
 import struct
 import zlib
 
-import h5py
-import hdf5plugin  # noqa: F401  (registers the Blosc filter that DSEC's published files use)
 import numpy as np
 
 from codesign.errors import FileFormatError
+from codesign.optional import optional
+
+# hdf5plugin registers the Blosc filter that DSEC's published files use
+h5py = optional("h5py", "event-files", "reading and writing HDF5 files", "hdf5plugin")
 
 GZIP = 1
 SHUFFLE = 2

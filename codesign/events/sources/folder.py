@@ -2,11 +2,13 @@
 
 import re
 
-import imageio.v3 as iio
 import numpy as np
 
 from codesign.errors import FileFormatError
 from codesign.events.sources.frames import PICTURES, FrameSource, same_size
+from codesign.optional import optional
+
+iio = optional("imageio.v3", "video", "reading pictures")
 
 BROKEN = (
     OSError,

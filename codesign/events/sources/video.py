@@ -6,12 +6,14 @@ import subprocess
 import tempfile
 from contextlib import closing
 
-import imageio_ffmpeg
 import numpy as np
 import torch
 
 from codesign.errors import FileFormatError
 from codesign.events.sources.frames import FrameSource, same_size
+from codesign.optional import optional
+
+imageio_ffmpeg = optional("imageio_ffmpeg", "video", "reading videos")
 
 
 def open_video(path):

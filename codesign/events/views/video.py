@@ -5,8 +5,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
-import imageio_ffmpeg
 import numpy as np
 from torch import Tensor
 
@@ -16,7 +14,11 @@ from codesign.events.entry import Times
 from codesign.events.stream import to_counts
 from codesign.events.views.view import picture
 from codesign.events.volumes.traces import decay
+from codesign.optional import optional
 from codesign.types import EventStream
+
+iio = optional("imageio.v3", "video", "writing .gif")
+imageio_ffmpeg = optional("imageio_ffmpeg", "video", "writing .mp4")
 
 LEAST_SIDE_PX = (
     256  # small frames are enlarged until their shorter side reaches this, so that single pixels can be seen,

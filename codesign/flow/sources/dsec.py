@@ -10,11 +10,11 @@ Source: Gehrig et al., "DSEC: A Stereo Event Camera Dataset for Driving Scenario
 import re
 from pathlib import Path
 
-import h5py
 import numpy as np
 import torch
 
 from codesign.errors import FileFormatError
+from codesign.events.formats.hdf5_chunks import h5py
 from codesign.flow.files import read_flow
 from codesign.flow.sources.collate import Crop, Sample, check_indices, check_lengths, collate
 from codesign.flow.sources.folders import natural

@@ -4,12 +4,12 @@ have (see codesign.events.formats.hdf5_chunks)."""
 from contextlib import contextmanager
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from codesign.errors import FileFormatError
 from codesign.events.formats import hdf5_chunks as chunks
 from codesign.events.formats.hdf5 import LIBRARY_ERRORS
+from codesign.events.formats.hdf5_chunks import h5py
 
 
 @contextmanager

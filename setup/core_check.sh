@@ -1,0 +1,20 @@
+#!/usr/bin/env bash
+# Install the core alone, as a stranger would with `pip install .`, into an environment of its own, and use it there.
+# usage: setup/core_check.sh [PYTHON]
+set -euo pipefail
+cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.."
+place=$(mktemp -d)
+trap 'rm -rf "$place"' EXIT
+setup/make_venv.sh "$place/venv" "${1:-}"
+python=$place/venv/bin/python
+# a copy: building in place would leave a folder build/ and take in what an earlier build left there
+mkdir "$place/source"
+cp -r pyproject.toml README.md LICENSE codesign scenes studies "$place/source"
+"$python" -m pip install --disable-pip-version-check --quiet "$place/source" --constraint constraints.txt
+cp setup/core_check.py "$place"
+cd "$place" # where no checkout is found
+"$python" core_check.py
+"$place/venv/bin/codesign" list >/dev/null
+"$place/venv/bin/codesign" run lens_opt --quick --steps 2 --cases 1 --judged 1 --out optimised
+grep -q "needs imageio-ffmpeg; install it with" optimised/report.html
+echo "core check: imports, renders, optimises"
