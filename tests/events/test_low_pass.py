@@ -1,6 +1,7 @@
 """The one-pole low-pass: a differential equation solved, closed forms, and its twin in the hard sensor's
 kernel."""
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -66,3 +67,16 @@ def test_the_low_pass_is_that_of_the_hard_sensor(cutoff_hz):
     simulate(frames, t_s, SensorModel(cutoff_hz=cutoff_hz), state=state)
     filtered = low_pass(frames.log(), frames, t_s.diff(), cutoff_hz)[-1]
     torch.testing.assert_close(filtered, state.level, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("pace", [0.0, 1e-9, 1e-4, 0.01, 0.03, 0.0499, 0.0501, 0.3, 2.0])
+def test_the_mean_of_the_fading_and_its_slope_are_those_of_their_power_series(pace):
+    """(1 - e^-a) / a = sum of (-a)^k / (k + 1)!, free of the cancellation of small a."""
+    a = torch.tensor(pace, dtype=torch.float64, requires_grad=True)
+    _, mean = coefficients(a, torch.exp, torch.where)
+    (slope,) = torch.autograd.grad(mean, a)
+    truth = sum((-pace) ** k / math.factorial(k + 1) for k in range(40))
+    by_pace = sum(-k * (-pace) ** (k - 1) / math.factorial(k + 1) for k in range(1, 40))
+    # below 0.05 the term a^5 / 720 is left out: 4e-10 of the value, 4e-8 of the slope
+    assert mean.item() == pytest.approx(truth, rel=5e-10)
+    assert slope.item() == pytest.approx(by_pace, rel=1e-7)

@@ -29,7 +29,7 @@ def clip(frames=30, dtype=torch.float32):
     ) * 2e-3
 
 
-@pytest.mark.parametrize("cutoff_hz", [0.01, 30.0, 2000.0])
+@pytest.mark.parametrize("cutoff_hz", [0.01, 3.0, 30.0, 2000.0])
 def test_the_low_pass_solves_its_differential_equation(cutoff_hz):
     frames, t_s = clip(dtype=torch.float64)
     state = SensorState()
@@ -195,6 +195,58 @@ def test_noise_events_and_crossings_come_in_order_of_time(sign):
     assert abs(noise - expected) < 4 * math.sqrt(expected)
     against = int((events.p == -sign).sum())  # half of the noise: crossings have the ramp's own polarity
     assert abs(against - noise / 2) < 4 * math.sqrt(noise / 4)
+
+
+def test_noise_events_start_no_dead_time():
+    """Level 4 + 1 per second and a dead time of 0.3 s: the first crossing comes 0.2 s after the start or after the
+    noise event that set the memorised level, and no crossing came before it."""
+    level = (4 + torch.arange(2) + torch.zeros(80, 80, 2)).permute(2, 0, 1)
+    sensor = SensorModel(shot_rate_hz=3.0, refractory_s=0.3)
+    events = simulate(level, [0.0, 1.0], sensor, torch.Generator().manual_seed(6), log_input=True)
+    seen = 0
+    for pixel in (events.y * 80 + events.x).unique():
+        t_us = events.t_us[events.y * 80 + events.x == pixel]
+        if (
+            int(t_us[0]) < 199_000
+        ):  # a noise event; the crossing behind it is due, unless another one comes first
+            following = int(t_us[1]) - int(t_us[0]) if len(t_us) > 1 else 10**6
+            assert following <= 200_001
+            seen += abs(following - 200_000) <= 1
+    assert seen > 200
+
+
+def test_photoreceptor_noise_grows_to_its_strength_and_fades_as_the_photoreceptor():
+    """A first-order process from 0: of the variance ``noise_level`` squared, 1 - q^2k is there after k frames, and
+    q = exp(-2 pi f dt) of the noise is left after one. 40,000 pixels: 0.35 % standard error of a deviation."""
+    sensor = SensorModel(cutoff_hz=60.0, shot_rate_hz=5.0, photoreceptor_noise=True)
+    step_s = 2e-3
+    still = torch.full((6, 200, 200), 90.0, dtype=torch.float64)
+    t_s = torch.arange(6, dtype=torch.float64) * step_s
+    state = SensorState(generator=torch.Generator().manual_seed(1))
+    q = math.exp(-2 * math.pi * 60.0 * step_s)
+    noise = []
+    for chunk in (slice(0, 2), slice(2, 5), slice(5, 6)):
+        simulate(still[chunk], t_s[chunk], sensor, state=state)
+        noise.append(state.noise.double().flatten().clone())
+        k = chunk.stop - 1
+        assert float(noise[-1].std()) == pytest.approx(
+            sensor.noise_level() * math.sqrt(1 - q ** (2 * k)), rel=0.015
+        )
+    together = float((noise[1] * noise[2]).mean()) / float((noise[1] ** 2).mean())
+    assert together == pytest.approx(q, abs=0.02)
+
+
+@pytest.mark.parametrize("thetas", [(0.2, 0.2), (0.15, 0.25), (0.3, 0.1)])
+def test_photoreceptor_noise_is_as_strong_as_the_mean_of_the_smaller_threshold_asks(thetas):
+    # E min(a, b) of two normal numbers by integration over their tails
+    sigma = 0.03
+    x = np.linspace(-0.2, 0.8, 200_001)
+    above = [0.5 * np.vectorize(math.erfc)((x - theta) / (sigma * math.sqrt(2))) for theta in thetas]
+    smaller = -0.2 + np.sum(above[0] * above[1]) * (x[1] - x[0])
+    given = {"cutoff_hz": 60.0, "shot_rate_hz": 5.0, "photoreceptor_noise": True}
+    found = SensorModel(*thetas, sigma, **given).noise_level()
+    sharp = SensorModel(*thetas, 0.0, **given).noise_level()
+    assert found / sharp == pytest.approx(smaller / min(thetas), rel=1e-4)
 
 
 def test_hot_pixels_fire_on_at_their_rate_and_others_are_silent():

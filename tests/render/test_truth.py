@@ -1,15 +1,17 @@
 """Ground truth through the lens: closed-form flow, points under pixels, gradients, and where there is no
 truth."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
-from codesign import lens, render
+from codesign import backend, lens, render
 from codesign.errors import DomainError, ShapeError
 from codesign.pose import apply, inverse, look_at, se3_exp
-from codesign.render import Camera, TexturedPlane, true_flow
-from codesign.render.truth import world_points
+from codesign.render import Camera, MitsubaScene, TexturedPlane, true_flow
+from codesign.render.truth import flow_and_occlusion, view, world_points
 from scenes import textures, worlds
 from scenes.build import GAP_M
 
@@ -243,3 +245,33 @@ def test_angles_of_the_field_survive_the_world(generator):
     a, _, _ = world_points(rays, plane, start())
     b, _, _ = world_points(rays, moved, pose @ start())
     torch.testing.assert_close(apply(inverse(pose), b), a, rtol=0, atol=1e-13)
+
+
+def test_points_of_one_flat_ground_never_hide_each_other():
+    """Seen from 2 cm above it, out to cosines of incidence of a few thousandths, where single precision moves the
+    point that a ray meets along the ground by its rounding over that cosine."""
+    mi = backend.mitsuba()
+    ground = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([200, 200, 1])}
+    scene = MitsubaScene({"ground": ground})
+    poses = torch.stack([look_at((0.03 * k, 0.01 * k, 0.02), (8.0, 0.3 * k, 0.0)) for k in range(4)])
+    camera = Camera(lens.Pinhole(8.0), 48, 40, 0.1, 1)
+    for stride in (1, 3):
+        truth = flow_and_occlusion(camera, scene, poses, stride)
+        assert int(truth.valid.sum()) > 0.3 * truth.valid.numel()
+        assert not truth.occluded.any()
+
+
+def test_nothing_is_seen_where_an_aperture_lets_no_light_through():
+    """The chief ray of film height h crosses the last surface at 2 h / 97 mm (tests/render/test_camera.py)."""
+    glass = lens.Glass.from_indices(1.5, 1.5, 1.5)
+    front = lens.Surface(50.0, 3.0, glass, 9.0, is_stop=True)
+    back = lens.Surface(math.inf, 95.0, None, 0.02)
+    camera = Camera(lens.GeoLens([front, back], 4.0, soft_edge_mm=1e-6), 33, 25, 0.1, 1)
+    path = torch.stack(
+        [look_at((0.01 * k, 0.0, 2.0), (0.01 * k, 0.0, 0.0), down=(0, 1, 0)) for k in range(2)]
+    )
+    height_mm = camera.film_mm(camera.film.pixels()).norm(dim=1).reshape(25, 33)
+    lit = 2 * height_mm / 97 < 0.02
+    assert 0 < int(lit.sum()) < lit.numel()
+    scene = TexturedPlane([[1.0, 0.0]], [0.0], [0.0])
+    assert torch.equal(view(camera, scene, path[:1], 0).valid, lit)
