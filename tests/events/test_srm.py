@@ -6,6 +6,7 @@ import torch
 
 from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
 from codesign.events.layers.memory import memory
+from codesign.events.spiking import srm_kernels
 from codesign.events.spiking.srm import srm
 from codesign.events.spiking.srm_scale import alpha_response, drive_scale
 from codesign.events.spiking.srm_state import SrmState
@@ -438,3 +439,28 @@ def test_other_numbers_and_lengths_compile_no_new_kernel():
         step(17, 0.9, 3.0, 0.5, None)
         compiled = [entry for entry in dr.kernel_history([dr.KernelType.JIT]) if not entry["cache_hit"]]
     assert not compiled
+
+
+@pytest.mark.parametrize(
+    ("kind", "a"),
+    [
+        ("pair", 0.3),
+        ("pair", 0.9),
+        ("late", 0.3),
+        ("late", 0.9),
+        ("late", 1.0),
+        ("early", 0.9),
+        ("early", 1.0),
+    ],
+)
+def test_the_absolute_sum_of_a_kernel_is_that_of_its_answer_to_one_spike(kind, a):
+    m = -0.7
+    steps = 50 if a == 1.0 else 4000
+    states = [0.0] * srm_kernels.STATES[kind]
+    total = 0.0
+    for k in range(steps + 1):
+        y, states = srm_kernels.advance(kind, states, a, m)
+        total += abs(y)
+        states[0] = states[0] + (k == 0)
+    given = (torch.tensor(v, dtype=torch.float64) for v in (a, m))
+    assert float(srm_kernels.absolute_sum(kind, *given, steps)) == pytest.approx(total, rel=1e-12)

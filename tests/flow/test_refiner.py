@@ -1,11 +1,14 @@
 """The refining network: where it stands still, what it does to sizes, gradients against differences, and what
 a few steps of training do."""
 
+import math
+
+import numpy as np
 import pytest
 import torch
 
 from codesign.errors import DomainError, ShapeError
-from codesign.flow.refiner import Refiner
+from codesign.flow.refiner import Refiner, _local_flow
 from codesign.flow.warp import along_flow, pixel_grid
 from codesign.types import EventVolume
 from scenes.flow_windows import RenderedWindows, planes
@@ -188,3 +191,29 @@ def test_a_wrong_correction_hardly_counts():
 
     assert error(made.predictions(windows.volume)[-1].flow_px) > 3.5
     assert error(made(windows.volume).flow_px) < 0.5
+
+
+def test_the_local_flow_solves_the_damped_normal_equations(generator):
+    """V_t + u V_x + v V_y = 0 in least squares over some slopes, with 2 % of the mean square slope and a part of the
+    motion's energy on the diagonal; long answers bend towards ``reach``."""
+    slopes = (
+        torch.randn(3, 40, 5, 6, generator=generator, dtype=D)
+        * torch.tensor([1.0, 0.3, 2.0], dtype=D)[:, None, None, None]
+    )
+    pairs = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
+    products = torch.stack([(slopes[i] * slopes[j]).mean(0) for i, j in pairs])[None]
+    reach = 1.5
+    found = _local_flow(products, reach)[0]
+    xx, xy, yy, xs, ys, ss = products[0]
+    for row in range(5):
+        for column in range(6):
+            at = (row, column)
+            damping = 0.02 * float((xx + yy).mean()) + 0.02 * float(ss[at]) * (2 / 8.0) ** 2 + 1e-6
+            matrix = np.array([[xx[at] + damping, xy[at]], [xy[at], yy[at] + damping]])
+            flow = np.linalg.solve(matrix, -np.array([xs[at], ys[at]]))
+            flow /= math.sqrt(1 + flow @ flow / reach**2)
+            assert found[:2, row, column].tolist() == pytest.approx(flow.tolist(), rel=1e-10)
+            assert float(found[2, row, column]) == pytest.approx(
+                (matrix[0, 0] - matrix[1, 1]) / np.trace(matrix)
+            )
+            assert float(found[3, row, column]) == pytest.approx(2 * matrix[0, 1] / np.trace(matrix))
