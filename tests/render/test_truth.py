@@ -249,14 +249,16 @@ def test_angles_of_the_field_survive_the_world(generator):
 
 def test_points_of_one_flat_ground_never_hide_each_other():
     """Seen from 2 cm above it, out to cosines of incidence of a few thousandths, where single precision moves the
-    point that a ray meets along the ground by its rounding over that cosine."""
+    point that a ray meets along the ground by its rounding over that cosine; the ground lies askew, so that all its
+    coordinates round."""
     mi = backend.mitsuba()
-    ground = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([200, 200, 1])}
-    scene = MitsubaScene({"ground": ground})
+    T_world_ground = se3_exp(torch.tensor([3.0, -2.0, 1.5, 0.5, 0.3, -0.4], dtype=D))
+    to_world = mi.ScalarTransform4f(T_world_ground.numpy()).scale([200, 200, 1])
+    scene = MitsubaScene({"ground": {"type": "rectangle", "to_world": to_world}})
     poses = torch.stack([look_at((0.03 * k, 0.01 * k, 0.02), (8.0, 0.3 * k, 0.0)) for k in range(4)])
     camera = Camera(lens.Pinhole(8.0), 48, 40, 0.1, 1)
     for stride in (1, 3):
-        truth = flow_and_occlusion(camera, scene, poses, stride)
+        truth = flow_and_occlusion(camera, scene, T_world_ground @ poses, stride)
         assert int(truth.valid.sum()) > 0.3 * truth.valid.numel()
         assert not truth.occluded.any()
 
