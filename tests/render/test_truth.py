@@ -2,6 +2,7 @@
 truth."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -277,3 +278,22 @@ def test_nothing_is_seen_where_an_aperture_lets_no_light_through():
     assert 0 < int(lit.sum()) < lit.numel()
     scene = TexturedPlane([[1.0, 0.0]], [0.0], [0.0])
     assert torch.equal(view(camera, scene, path[:1], 0).valid, lit)
+
+
+def test_depth_is_measured_from_the_origin_of_the_camera_wherever_rays_start():
+    class LongHood(lens.Pinhole):
+        """Its rays start 5 cm before the pinhole."""
+
+        def camera_rays(self, *args, **options):
+            rays = super().camera_rays(*args, **options)
+            return replace(rays, origin_m=rays.origin_m + 0.05 * rays.direction / rays.direction[:, 2:])
+
+    poses = motions([0.1, 0.0, 0.2, 0.0, 0.3, 0.1])
+    plain, hooded = (
+        view(Camera(kind(8.0), 12, 10, 0.5, 1), upright_plane(), poses, 0)
+        for kind in (lens.Pinhole, LongHood)
+    )
+    truth = apply(inverse(poses[0]), hooded.points_world_m[hooded.valid])[:, 2]
+    assert int(hooded.valid.sum()) > 60
+    torch.testing.assert_close(hooded.depth_m[hooded.valid], truth, rtol=1e-12, atol=0)
+    torch.testing.assert_close(hooded.depth_m, plain.depth_m, rtol=1e-12, atol=0)
