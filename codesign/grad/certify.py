@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import torch
 
@@ -129,11 +130,11 @@ class _Group:
         size = math.hypot(*(f.value for f in found))
         if not self.extend or SIGMAS * math.hypot(*(f.noise for f in found)) <= self.tolerance * size:
             return slopes, found
-        for ladder in ladders:
+        for ladder, step in product(ladders, LARGER_STEPS):
             try:
-                ladder.take(LARGER_STEPS)
+                ladder.take((step,))
             except (ArithmeticError, RuntimeError, ValueError):  # nobody asked for steps as large as these
-                ladder.left_out.extend(LARGER_STEPS)
+                ladder.left_out.append(step)
         return slopes, [ladder.difference() for ladder in ladders]
 
 

@@ -122,8 +122,8 @@ class Ladder:
         """The derivative, from the pair of neighbouring rungs that can be trusted most.
 
         Rungs h1 > h2 give (h1^2 D2 - h2^2 D1) / (h1^2 - h2^2), free of h^2; by how much that moves D2 stands
-        for what truncation is left. The pair with the smallest sum of that and of rounding wins; one that its
-        neighbour contradicts beyond rounding pays for that too.
+        for what truncation is left. The pair with the smallest sum of that and of rounding wins; one that the
+        next two contradict beyond rounding pays for that too.
 
         Raises: NonFiniteError when no rung is left.
         Source: Ridders, Accurate computation of F'(x) and F'(x)F''(x), Adv. Eng. Softw. 4(2), 1982.
@@ -146,9 +146,11 @@ class Ladder:
             bends[0] = abs(values[1] - values[0])
         spreads = []
         for k in range(len(rungs)):
-            other = k + 1 if k + 1 < len(rungs) else max(k - 1, 0)
-            allowed = NEIGHBOURS * math.hypot(sigmas[k], sigmas[other])
-            contradicted = max(0.0, abs(values[k] - values[other]) - allowed)
+            others = range(k + 1, min(k + 3, len(rungs))) or range(max(k - 1, 0), k)
+            contradicted = 0.0
+            for other in others:
+                beyond = abs(values[k] - values[other]) - NEIGHBOURS * math.hypot(sigmas[k], sigmas[other])
+                contradicted = max(contradicted, beyond)
             spreads.append(math.hypot(sigmas[k], bends[k], contradicted))
         best = min(range(len(rungs)), key=spreads.__getitem__)
         return Difference(

@@ -12,6 +12,7 @@ import torch
 from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
 from codesign.grad import certify, plateau
 from codesign.grad.differences import Ladder, rounding_noise
+from codesign.grad.row import verdict
 from studies import certify_precision
 from studies.certify_precision import KINDS, judged
 from studies.frame.run import main
@@ -155,6 +156,7 @@ def test_a_gradient_where_the_function_stands_still_fails():
 
     (row,) = certify(straight_through, {"x": torch.full((3,), 0.2)})
     assert (row.verdict, row.relative_error, row.signed_bias) == ("fail", 1.0, math.inf)
+    assert row.noise_floor == 0  # every value is exactly zero
 
 
 def test_rounding_noise_is_measured():
@@ -289,3 +291,71 @@ def test_the_study_counts_verdicts(tmp_path, monkeypatch):
     assert metrics["three_logarithms_float32_right_pass"] == 5
     assert metrics["three_logarithms_float64_wrong_fail"] == 5
     assert (metrics["right_failed"], metrics["wrong_passed"]) == (0, 0)
+
+
+def test_the_best_pair_weighs_rounding_against_what_is_left_of_truncation():
+    # (4 x 1.01 - 1.04) / 3 = 1, known to hypot(4 x 0.02, 0.02) / 3 by rounding; it moved 1.01 by 0.01
+    ladder = Ladder(torch.sum, torch.ones(1, dtype=D), torch.ones(1, dtype=D))
+    ladder.rungs = [(0.2, 1.04, 0.02), (0.1, 1.01, 0.02)]
+    found = ladder.difference()
+    assert (found.value, found.step) == (pytest.approx(1.0), 0.1)
+    assert found.noise == pytest.approx(math.hypot(0.02 * 17**0.5 / 3, 0.01))
+
+
+def test_rungs_that_agree_by_accident_are_contradicted_by_smaller_ones():
+    # differences of x + c x^3 + e x^5 at 0 are 1 + c h^2 + e h^4, alike at 0.4 and 0.2 for
+    # c = -e (0.4^2 + 0.2^2); there they are 1 - e 0.4^2 0.2^2 = 0.968
+    ladder = Ladder(lambda x: (x - x**3 + 5 * x**5).sum(), torch.zeros(1, dtype=D), torch.ones(1, dtype=D))
+    ladder.take((0.4, 0.2, 0.1, 0.05))
+    found = ladder.difference()
+    assert [d for _, d in found.ladder[:2]] == pytest.approx([0.968, 0.968])
+    assert abs(found.value - 1) <= found.noise < 0.01
+
+
+@pytest.mark.parametrize(
+    ("gap", "noise", "tolerance", "expected"),
+    [
+        (0.02, 0.0, 0.01, "fail"),  # plainly above the tolerance
+        (0.05, 0.013, 0.01, "fail"),  # by more than three noise floors
+        (0.05, 0.014, 0.01, "pass"),  # by less, and 0.05 + 0.042 is below ten tolerances
+        (0.05, 0.017, 0.01, "noise"),  # 0.05 + 0.051 is above them
+        (0.0, 0.034, 0.01, "noise"),
+        (0.0, 0.033, 0.01, "pass"),
+        (0.0, 0.034, 0.05, "noise"),  # ten tolerances are 0.5, of which no more than 0.1 count
+        (0.1, 0.03, 0.2, "pass"),
+        (0.1, 0.034, 0.2, "noise"),  # above a tolerance of 0.2
+        (0.0, 1e-5, 1e-6, "noise"),
+        (1.0, 0.5, 0.01, "noise"),
+    ],
+)
+def test_the_verdict_is_a_statement_at_three_noise_floors(gap, noise, tolerance, expected):
+    assert verdict(gap, 1.0, noise, tolerance) == expected
+    assert verdict(10 * gap, 10.0, 10 * noise, tolerance) == expected
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_rounding_inside_a_double_precision_loss_is_noticed(seed):
+    # the sum is in single precision, where 1000 has 6e-5 per last digit: steps of 0.03 and 0.01 know a
+    # gradient of about 1 to 1e-3, not to the 1e-5 asked for
+    x = torch.rand(3, generator=torch.Generator().manual_seed(seed), dtype=D)
+    (row,) = certify(
+        lambda p: (1e3 + p["x"].square().sum().float()).double(),
+        {"x": x},
+        ladder=(0.03, 0.01),
+        tolerance=1e-5,
+    )
+    assert row.verdict == "noise"
+    assert row.relative_error <= 3 * row.noise_floor
+
+
+def test_larger_steps_that_the_function_refuses_are_left_out():
+    def loss(p):
+        if bool((p["x"] - 0.5).abs().max() > 0.02):
+            raise ValueError("out of range")
+        return 1e4 + p["x"].square().sum()
+
+    (row,) = certify(loss, {"x": torch.full((2,), 0.5)})
+    assert row.left_out == pytest.approx((10**-1.0, 10**-1.5))
+    assert row.verdict != "fail"
+    with pytest.raises(ValueError, match="out of range"):
+        certify(loss, {"x": torch.full((2,), 0.5)}, ladder=(0.1, 0.01))  # these were asked for
