@@ -359,3 +359,12 @@ def test_larger_steps_that_the_function_refuses_are_left_out():
     assert row.verdict != "fail"
     with pytest.raises(ValueError, match="out of range"):
         certify(loss, {"x": torch.full((2,), 0.5)}, ladder=(0.1, 0.01))  # these were asked for
+
+
+def test_a_step_is_what_rounding_of_the_parameter_leaves_of_it():
+    # numbers near 1000 are 6.1e-5 apart in single precision: 1e-4 becomes twice that, and 1e-5 nothing
+    ladder = Ladder(lambda x: x.double().sum(), torch.full((1,), 1e3), torch.ones(1))
+    ladder.take((1e-4, 1e-5))
+    found = ladder.difference()
+    assert found.value == pytest.approx(1.0, abs=1e-9)
+    assert found.left_out == (1e-5,)
