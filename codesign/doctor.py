@@ -3,9 +3,10 @@ nothing else does."""
 
 import os
 import platform
+import re
 import sys
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
 PYTHON_NEEDED = (3, 11)
@@ -36,6 +37,7 @@ def diagnose(device="cpu"):
     yield _llvm(device)
     yield _cuda(device)
     yield _threads()
+    yield _extras()
     yield _render(device)
 
 
@@ -159,6 +161,28 @@ def _threads():
         )
     except Exception as error:  # noqa: BLE001 - see _package
         return Finding("threads", None, f"{cores} usable cores ({_sentence(error)})")
+
+
+def _extras():
+    """What pyproject.toml offers beside the core, without what only collects (all, dev) or compares (bench)."""
+    try:
+        wanted = [line.split(";") for line in requires("codesign") or ()]
+    except PackageNotFoundError:
+        return Finding("extras", None, "codesign itself is not installed, only its folder is used")
+    missing = set()
+    for package, *conditions in wanted:
+        extra = re.search(r"extra == ['\"]([\w-]+)['\"]", "".join(conditions))
+        if extra and extra[1] not in ("all", "dev", "bench"):
+            try:
+                version(re.split(r"[^\w.-]", package.strip())[0])
+            except PackageNotFoundError:
+                missing.add(extra[1])
+    if not missing:
+        return Finding("extras", None, "every one is installed")
+    names = ",".join(sorted(missing))
+    return Finding(
+        "extras", None, f"not installed: {names}", f"pip install 'codesign[{names}]', if you need them"
+    )
 
 
 def _render(device):

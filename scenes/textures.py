@@ -193,8 +193,8 @@ def sky(
     noise = gaussian_filter(
         np.random.default_rng(seed).standard_normal((height_px, width)),
         (height_px / 48, height_px / 20),
-        mode=["nearest", "wrap"],
-    )  # pyright: ignore[reportArgumentType]
+        mode=["nearest", "wrap"],  # pyright: ignore[reportArgumentType]
+    )
     clouds = 25 * np.tanh(1.5 * noise / noise.std()) * np.clip(2 * elevation, 0, 1)
     up = np.clip(elevation / (np.pi / 2), 0, 1)
     clear = horizon + (zenith - horizon) * up**0.6 + clouds

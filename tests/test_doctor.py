@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from codesign import backend
+from codesign import backend, doctor
 
 LLVM_15 = Path("/usr/lib/x86_64-linux-gnu/libLLVM-15.so")
 
@@ -47,6 +47,7 @@ def test_doctor_approves_a_machine_that_renders():
         "LLVM",
         "CUDA",
         "threads",
+        "extras",
         "render",
     ]
     assert lines[-1].startswith("Ready")
@@ -54,6 +55,22 @@ def test_doctor_approves_a_machine_that_renders():
     found = backend.llvm_version()
     assert found is not None
     assert ".".join(map(str, found)) in done.stdout
+
+
+def test_doctor_names_the_extras_that_are_missing(monkeypatch):
+    offered = [
+        "torch>=2.6",
+        'pip; extra == "video"',
+        'no-such-package>=1; extra == "event-files"',
+        "absent[part]; extra == 'export'",
+        'absent; extra == "dev"',
+    ]
+    monkeypatch.setattr(doctor, "requires", lambda name: offered)
+    finding = doctor._extras()
+    assert (finding.ok, finding.found) == (None, "not installed: event-files,export")
+    assert finding.remedy.startswith("pip install 'codesign[event-files,export]'")
+    monkeypatch.setattr(doctor, "requires", lambda name: offered[:2])
+    assert doctor._extras().found == "every one is installed"
 
 
 def test_doctor_refuses_an_unfit_llvm(unfit):

@@ -79,7 +79,9 @@ def _contents(path, file):
             attributes,
         )
     frames = _own(path, file, "frame") if "frame" in file else None
-    size = frames.shape[1:] if isinstance(frames, h5py.Dataset) and frames.ndim == 3 else ()
+    size = ()
+    if frames is not None and isinstance(frames, h5py.Dataset) and frames.ndim == 3:
+        size = frames.shape[1:]
     return (
         from_v2e,
         {"events": values(path, events, "events")},
