@@ -11,11 +11,11 @@ import torch
 from codesign import flow
 from codesign.errors import DomainError
 from codesign.flow.metrics import endpoint_error
+from codesign.report.flow_colours import flow_colours
 from codesign.train.validation import batches
 from scenes.flow_worlds import ALL, WorldWindows
 from studies.flow_closed_form.score import Score
 from studies.frame.run import Run, StudyConfig, main
-from studies.make_dataset.page import flow_colours
 from studies.train_flow.sources import UNSEEN, VALIDATION, Shape
 
 SEED = 77  # of what is judged here: windows that guided no choice

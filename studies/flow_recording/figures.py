@@ -4,7 +4,7 @@ import torch
 from matplotlib.figure import Figure
 
 from codesign.flow.contrast import count_image, stream_tracks
-from studies.make_dataset.page import flow_colours
+from codesign.report.flow_colours import flow_colours
 
 BRIGHT = 0.99  # quantile of the counts of the still events that is shown white
 

@@ -7,9 +7,9 @@ import math
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
-from matplotlib.colors import hsv_to_rgb
 
 from codesign.events import picture, to_counts
+from codesign.report.flow_colours import flow_colours
 from codesign.types import EventStream
 from studies.make_dataset.store import h5
 
@@ -161,23 +161,6 @@ def contact_sheet(root, names):
     y, x = np.mgrid[-1:1:128j, -1:1:128j]
     axes[-1, 2].imshow(np.where((np.hypot(x, y) <= 1)[..., None], flow_colours(np.stack([x, y]), 1.0), 1.0))
     return figure
-
-
-def flow_colours(flow_px, full_px=None):
-    """RGB picture [H, W, 3] of a flow [2, H, W]: hue the direction (red right, then yellow, green down),
-    saturation the length, full at ``full_px``."""
-    length = np.hypot(*flow_px)
-    full = full_px or max(float(length.max()), 1e-9)
-    return hsv_to_rgb(
-        np.stack(
-            [
-                np.mod(np.arctan2(flow_px[1], flow_px[0]) / (2 * np.pi), 1),
-                np.clip(length / full, 0, 1),
-                np.ones_like(length),
-            ],
-            -1,
-        )
-    )
 
 
 def _pictures(folder):

@@ -5,8 +5,8 @@ import numpy as np
 import torch
 
 from codesign import flow
+from codesign.report.flow_colours import flow_colours
 from codesign.train.batches import to_device
-from studies.make_dataset.page import flow_colours
 
 OURS = "#1b6ca8"
 CLOSED = "firebrick"

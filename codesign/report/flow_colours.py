@@ -1,0 +1,21 @@
+"""Flow as colour: hue says where to, saturation how far."""
+
+import numpy as np
+from matplotlib.colors import hsv_to_rgb
+
+
+def flow_colours(flow_px: np.ndarray, full_px: float | None = None) -> np.ndarray:
+    """RGB picture [H, W, 3] of a flow [2, H, W]: hue the direction (red right, then yellow, green down),
+    saturation the length, full at ``full_px``."""
+    length = np.hypot(*flow_px)
+    full = full_px or max(float(length.max()), 1e-9)
+    return hsv_to_rgb(
+        np.stack(
+            [
+                np.mod(np.arctan2(flow_px[1], flow_px[0]) / (2 * np.pi), 1),
+                np.clip(length / full, 0, 1),
+                np.ones_like(length),
+            ],
+            -1,
+        )
+    )

@@ -1,0 +1,101 @@
+"""One pass of the whole chain as one picture: lens, frame, events, estimated and true flow.
+
+    lens ──rays──▶ frames ──▶ events ──▶ flow
+
+A traced lens on a drifting, turning robot looks into a room with crates and a ball. The picture is the one that the README
+shows (docs/chain.png).
+"""
+
+import sys
+from dataclasses import dataclass
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+
+from codesign import events, flow, lens, pose, render
+from codesign.report.flow_colours import flow_colours
+from codesign.report.lens_layout import draw_layout
+from codesign.system import Batch, System
+from scenes import trajectories, worlds
+from studies.frame.run import Run, StudyConfig, main
+
+PITCH_MM = 0.0185
+DURATION_S = 0.05
+
+
+@dataclass(frozen=True)
+class Config(StudyConfig):
+    lens: str = "double-gauss"
+    """Lens in front of the sensor, scaled to 11 mm."""
+    width_px: int = 346
+    """Columns of the sensor."""
+    height_px: int = 260
+    """Rows of the sensor."""
+    samples: int = 32
+    """Rays per pixel."""
+
+
+def study(run: Run[Config]):
+    config = run.config
+    published = lens.load(config.lens)
+    geo = published.scaled(11.0 / float(published.first_order().efl_mm.detach())).freeze()
+    system = System(
+        camera=render.Camera(geo, config.width_px, config.height_px, PITCH_MM, config.samples, config.seed),
+        events=events.HardSensor(events.SensorModel(theta_on=0.15, theta_off=0.15), 8),
+        flow=flow.load("refiner"),
+        objectives={
+            "endpoint error": lambda field, truth: flow.metrics.aee(field.flow_px, truth.flow_px, truth.valid)
+        },
+        scene=worlds.room(),
+    )
+    t_s = torch.linspace(0, DURATION_S, 33, dtype=torch.float64)
+    twist = torch.tensor(
+        [0.5, -0.1, 1.0, 0.0, 0.1, 0.25], dtype=torch.float64
+    )  # m/s and rad/s in camera axes
+    batch = Batch(trajectories.body_twist(pose.look_at((0.1, -1.5, 0.7), (0.0, 1.0, 0.35)), twist, t_s), t_s)
+    with run.progress(1, "one pass") as bar, torch.no_grad():
+        seen = system.begin(batch)
+        error = float(flow.metrics.aee(seen["field"].flow_px, seen["truth"].flow_px, seen["truth"].valid))
+        bar.advance(error_px=error)
+    true = seen["truth"]
+    moved = float(true.flow_px.square().sum(1).sqrt()[true.valid].mean())
+    run.record(endpoint_error_px=error, true_motion_px=moved, events=float(seen["volume"].counts.sum()))
+    run.card("Endpoint error", f"{error:.2f} px", f"true motion {moved:.2f} px in {DURATION_S * 1e3:g} ms")
+    run.figure(
+        draw(geo, seen), "chain", "Lens, first frame, signed events, flow as estimated and as it is.", dpi=110
+    )
+    run.finish("The chain in one picture", "One pass from glass to flow, with the hard sensor.")
+
+
+def draw(geo, seen):
+    """Figure of one pass: what stands at every junction."""
+    figure, axes = plt.subplots(
+        1, 5, figsize=(17, 2.9), layout="constrained", width_ratios=[1.25, 1, 1, 1, 1]
+    )
+    draw_layout(axes[0], geo, [0.0, np.radians(10.0), np.radians(14.0)])
+    axes[0].set_title("lens", fontsize=11)
+    axes[0].axis("off")
+    frame = seen["frames"][0].numpy()
+    counts = seen["volume"].counts[0].sum(1).numpy()
+    estimated = seen["field"].flow_px[0].numpy()
+    true = seen["truth"].flow_px[0].numpy()
+    longest = float(np.quantile(np.hypot(*true), 0.98))
+    pictures = {
+        "frames": np.clip(frame / np.quantile(frame, 0.99), 0, 1) ** (1 / 2.2),
+        "events": counts[0] - counts[1],
+        "flow, estimated": flow_colours(estimated, longest),
+        "flow, true": flow_colours(true, longest),
+    }
+    for axis, (title, picture) in zip(axes[1:], pictures.items(), strict=True):
+        signed = title == "events"
+        colours = {"cmap": "RdBu_r", "vmin": -3, "vmax": 3} if signed else {"cmap": "gray"}
+        axis.imshow(picture, **colours)
+        axis.set_title(title, fontsize=11)
+        axis.set_xticks([])
+        axis.set_yticks([])
+    return figure
+
+
+if __name__ == "__main__":
+    sys.exit(main(study, Config))
