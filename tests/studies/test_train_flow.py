@@ -313,7 +313,7 @@ sys.exit(train_flow.run_here({arguments!r}))
 
     processes = [start(0), start(1)]  # with the variables that torchrun sets
     try:
-        said = [process.communicate(timeout=90)[0] for process in processes]
+        said = [process.communicate(timeout=300)[0] for process in processes]
     finally:
         for process in processes:
             process.kill()

@@ -233,23 +233,41 @@ def test_windows_without_any_true_flow_are_refused():
         train.fit(linear(), Blind(), steps=2)
 
 
+def nearness(network):
+    """A score that the first weights judged win, not the last."""
+    return -distance(network)
+
+
 SHARED = """
-import sys, torch
+import signal, sys, torch
 from codesign import train
 from tests.flow_training_case import Made
-from tests.train.test_fit import adam, distance, linear
+from tests.train.test_fit import adam, linear, nearness
 ranks = train.join()
-network = linear()
-made = train.fit(network, Made(), steps=6, batch=4, optimiser=adam(network, 0.01), average=0.5, ranks=ranks,
-    validate=distance if ranks.rank == 0 else lambda network: 1 / 0, validate_every=2, save_to=sys.argv[1])
-torch.save((network.layer.weight, made.loss, len(made.validation)), f"{sys.argv[1]}.{ranks.rank}")
+asked = []
+def before(indices):
+    asked.append(indices)
+    if ranks.rank == 1 and len(asked) == 4:  # one look at the windows, then three steps
+        signal.raise_signal(signal.SIGINT)
+def run():
+    network = linear()
+    judge = nearness if ranks.rank == 0 else lambda network: 1 / 0
+    made = train.fit(network, Made(before=before), steps=6, batch=4, optimiser=adam(network, 0.01),
+        average=0.5, ranks=ranks, validate=judge, validate_every=2, save_to=sys.argv[1])
+    return network.layer.weight, made.loss, len(made.validation)
+try:
+    run()
+except KeyboardInterrupt:
+    ranks.tell()  # the first process has saved
+    torch.save((*run(), len(asked)), f"{sys.argv[1]}.{ranks.rank}")
 ranks.leave()
 """
 
 
-def test_two_processes_learn_what_one_does(tmp_path):
-    """Halves of a batch are averaged in another order: float32 sums of 1024 terms differ by 1e-5 at most, and
-    Adam takes steps of at most 1e-2 times the relative change of a gradient."""
+def test_two_processes_interrupted_and_resumed_learn_what_one_does(tmp_path):
+    """One of them is asked to stop, both do, after the same step. Halves of a batch are averaged in another
+    order: float32 sums of 1024 terms differ by 1e-5 at most, and Adam takes steps of at most 1e-2 times the
+    relative change of a gradient."""
     network = linear()
     alone = train.fit(
         network,
@@ -258,7 +276,7 @@ def test_two_processes_learn_what_one_does(tmp_path):
         batch=4,
         optimiser=adam(network, 0.01),
         average=0.5,
-        validate=distance,
+        validate=nearness,
         validate_every=2,
     )
     with socket.socket() as free:
@@ -284,7 +302,7 @@ def test_two_processes_learn_what_one_does(tmp_path):
         for rank in (0, 1)
     ]
     try:
-        said = [process.communicate(timeout=90)[0] for process in processes]
+        said = [process.communicate(timeout=300)[0] for process in processes]
     finally:
         for process in processes:
             process.kill()
@@ -293,9 +311,10 @@ def test_two_processes_learn_what_one_does(tmp_path):
     assert torch.equal(found[0][0], found[1][0]), "the best weights reach every process"
     assert torch.allclose(found[0][0], network.layer.weight, atol=1e-5, rtol=0)
     assert not torch.equal(network.layer.weight, linear().layer.weight)
-    for _, loss, _ in found:
+    for _, loss, _, asked in found:
         assert loss == pytest.approx(alone.loss, rel=1e-5)
-    assert [judged for *_, judged in found] == [3, 0]
+        assert asked == 8, "one look and three steps, twice"
+    assert found[0][2] == 3
     assert [path.name for path in (tmp_path / "two").iterdir() if path.suffix == ".json"] == [
         "checkpoint.json"
     ]
