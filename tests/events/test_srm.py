@@ -462,5 +462,5 @@ def test_the_absolute_sum_of_a_kernel_is_that_of_its_answer_to_one_spike(kind, a
         y, states = srm_kernels.advance(kind, states, a, m)
         total += abs(y)
         states[0] = states[0] + (k == 0)
-    given = (torch.tensor(v, dtype=torch.float64) for v in (a, m))
-    assert float(srm_kernels.absolute_sum(kind, *given, steps)) == pytest.approx(total, rel=1e-12)
+    found = srm_kernels.absolute_sum(kind, torch.tensor(a, dtype=F64), torch.tensor(m, dtype=F64), steps)
+    assert float(found) == pytest.approx(total, rel=1e-12)

@@ -10,6 +10,7 @@ from scipy.ndimage import correlate1d
 
 from codesign.flow import estimate_lk
 from codesign.flow.lk_field import Polynomials
+from tests.certain_case import certain
 from tests.flow.test_lk import moving
 
 PRIOR_PX = 3.0
@@ -133,7 +134,7 @@ def test_one_step_is_that_of_the_formulas_written_out(model, terms, sigma_px, pe
     # plenty of events and large motion, where the step is limited; a hundredth of an event per pixel, where the
     # prior and the few events of the start decide
     volume, _ = moving(3, ((0.02, -0.03), (0.01, 0.04)), (5.0, -4.0), per_pixel, steps=20)
-    field = estimate_lk(volume, model, PRIOR_PX, (sigma_px,), 1, FLOOR)
+    field = certain(estimate_lk(volume, model, PRIOR_PX, (sigma_px,), 1, FLOOR))
     flow, covariance = one_step(volume, terms, sigma_px)
     found = field.flow_px[0].numpy()
     # the estimator adds ridges of 1e-6 and stops its fixed point after four rounds, each a factor of 0.04
