@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import nn
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.errors import DomainError
 from codesign.lens import paraxial
 from codesign.lens.aiming import aim_at_stop
 from codesign.lens.analysis.spots import spots
@@ -19,7 +19,7 @@ from codesign.lens.numbers import kinds
 from codesign.lens.pinhole import ThinLens
 from codesign.lens.replaceable import Replaceable, settled
 from codesign.lens.surface import scaled
-from codesign.lens.trace import Prescription, Status, trace
+from codesign.lens.trace import Prescription, Status, check_rays, trace
 from codesign.lens.variables import Bound, checked_step
 from codesign.types import Rays
 
@@ -160,7 +160,8 @@ class GeoLens(Replaceable):
         Args:
           names: of "curvature", "thickness" (all gaps but the last), "focus" (the last), "conic", "asphere"
             (coefficients, surface after surface), "index" (offset of every glass), "phase". Numbers that move no
-            ray (the curvature of a stop in air, the conic of a plane) and thicknesses of 0 are left out.
+            ray (the curvature of a stop in air, the conic of a plane, what a solve makes) and thicknesses of 0
+            are left out.
           step_mm: the natural step, for example the pixel pitch; None is 1/1000 of the focal length.
           bounds: (low, high) per name, numbers or one per entry, None for no bound; reached only in the limit.
             Thicknesses and focus stay above 0 unless others are given.
@@ -195,8 +196,8 @@ class GeoLens(Replaceable):
             held=held,
         )
 
-    def _kinds(self, held):
-        return kinds(self, held)
+    def _kinds(self):
+        return kinds(self)
 
     def _solved(self, tensors, held):
         if not held:
@@ -350,23 +351,7 @@ class GeoLens(Replaceable):
         Raises: ShapeError; DomainError for origins that are not finite or directions that are not unit
           vectors.
         """
-        for label, value in (("origin_mm", origin_mm), ("direction", direction)):
-            if value.ndim != 2 or value.shape[1] != 3 or value.shape[0] == 0:
-                raise ShapeError(f"{label} must be [N >= 1, 3], got {tuple(value.shape)}.")
-        if origin_mm.shape != direction.shape:
-            raise ShapeError(
-                f"{origin_mm.shape[0]} origins but {direction.shape[0]} directions were given; give one of "
-                "each per ray."
-            )
-        if not all(map(math.isfinite, _range(origin_mm, lambda rows: rows))):
-            check_finite(origin_mm, "origin_mm")
-        ones = direction.new_ones(3)
-        shortest, longest = _range(direction, lambda rows: torch.mv(rows.square(), ones))
-        if not (shortest > 0.9998 and longest < 1.0002):
-            raise DomainError(
-                f"direction: squared lengths lie between {shortest:.6g} and {longest:.6g}; give finite unit "
-                "vectors (torch.nn.functional.normalize)."
-            )
+        check_rays(origin_mm, direction)
         return trace(self.prescription(wavelength_um), origin_mm, direction)
 
     @settled
@@ -481,13 +466,6 @@ class GeoLens(Replaceable):
 
     def extra_repr(self):
         return f"{self.name}, {len(self.surfaces)} surfaces, entrance pupil {self.entrance_pupil_diameter_mm:g} mm"
-
-
-def _range(rows, function):
-    """Least and largest value of a function of rows [N, 3], in blocks that stay in the cache; NaN where there
-    is one."""
-    found = torch.stack([torch.stack(torch.aminmax(function(part))) for part in rows.detach().split(65_536)])
-    return found[:, 0].min().item(), found[:, 1].max().item()
 
 
 def _towards(film_mm, at_mm, last_mm, exit_z_mm):

@@ -11,16 +11,15 @@ INDEX = 0.05
 PHASE = 300.0  # radians at the rim, over its radius
 
 
-def kinds(lens, held):
-    """{name: Kind} of a GeoLens. Args: held: what solves hold (see Variables); the numbers they solve are left
-    out."""
-    rows = torch.arange(len(lens.surfaces))
+def kinds(lens):
+    """{name: Kind} of a GeoLens."""
+    rows = torch.arange(len(lens.surfaces), device=lens.semi_aperture_mm.device)
     efl = lens.first_order().efl_mm.detach().abs()
     rim = lens.semi_aperture_mm.minimum(efl)
     gap = (GAP * efl).expand(rows.shape)
     turn = (lens.curvature_per_mm.detach() * rim).square().clamp_min(1e-12)
     index = torch.full_like(rim, INDEX)[lens.glass]
-    found = {
+    return {
         "curvature": Kind("curvature_per_mm", rows, BEND / rim),
         "thickness": Kind("thickness_mm", rows[:-1], gap[:-1], 0.0),
         "focus": Kind("thickness_mm", rows[-1:], gap[-1:], 0.0),
@@ -29,14 +28,13 @@ def kinds(lens, held):
         "index": Kind("index_offset", rows[lens.glass], index),
         "phase": _polynomial("phase", lens.phase, PHASE, rim),
     }
-    if "efl_surface" in held:
-        found["curvature"] = found["curvature"].part(rows != int(held["efl_surface"]))
-    if "focus_m" in held:
-        del found["focus"]
-    return found
 
 
 def _polynomial(name, table, slope, rim):
     """Coefficients [S, A] of r^2, r^4, ...: each may add that much per millimetre at the rim."""
-    power = 2 * torch.arange(1, table.shape[1] + 1, dtype=rim.dtype)
-    return Kind(name, torch.arange(table.numel()), (slope * rim[:, None] ** (1 - power)).reshape(-1))
+    power = 2 * torch.arange(1, table.shape[1] + 1, dtype=rim.dtype, device=rim.device)
+    return Kind(
+        name,
+        torch.arange(table.numel(), device=rim.device),
+        (slope * rim[:, None] ** (1 - power)).reshape(-1),
+    )

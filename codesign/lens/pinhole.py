@@ -118,14 +118,14 @@ class ThinLens(Replaceable):
             )
         return self.replace(efl_mm=efl, image_distance_mm=1 / (1 / efl - 1 / distance_mm))
 
-    def _kinds(self, held):
-        at = torch.zeros(1, dtype=torch.int64)
+    def _kinds(self):
+        at = torch.zeros(1, dtype=torch.int64, device=self.efl_mm.device)
         reach = 0.1 * self.efl_mm.detach().reshape(1)
         return {"efl": Kind("efl_mm", at, reach, 0.0), "focus": Kind("image_distance_mm", at, reach, 0.0)}
 
     def _landing(self, fields_rad, wavelength_um):
-        q = pupil_grid(8, self.dtype) * (self.entrance_pupil_diameter_mm / 2)
-        slope = torch.tensor([[0.0, math.tan(f)] for f in fields_rad], dtype=self.dtype)[:, None]
+        q = pupil_grid(8).to(self.efl_mm.detach()) * (self.entrance_pupil_diameter_mm / 2)
+        slope = torch.tensor([[0.0, math.tan(f)] for f in fields_rad]).to(q)[:, None]
         landing = (slope + q / self.efl_mm) * self.image_distance_mm - q
         return landing, torch.ones_like(landing[..., 0])
 

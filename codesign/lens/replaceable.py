@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from codesign.errors import DomainError, ShapeError
-from codesign.lens.variables import make_variables
+from codesign.lens.variables import Variables, make_variables
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -43,10 +43,14 @@ class Replaceable(nn.Module):
 
     def __getattr__(self, name: str) -> Any:
         if name in type(self).tensor_names:
-            driver = self.__dict__.get("_modules", {}).get(DRIVER)
+            driver = self._driver
             if driver is not None and driver.makes(name):
-                return self._made()[name]
+                return self._made(driver)[name]
         return super().__getattr__(name)
+
+    @property
+    def _driver(self) -> Variables | None:
+        return self.__dict__.get("_modules", {}).get(DRIVER)
 
     def replace(self, **tensors: Tensor) -> Self:
         """A lens that shares everything with this one except the named tensors, which may depend on other
@@ -58,15 +62,15 @@ class Replaceable(nn.Module):
         """
         for name, value in tensors.items():
             self._known(name)
-            now = getattr(self, name)
-            if value.shape != now.shape:
-                raise ShapeError(f"{name} has shape {tuple(now.shape)}, got {tuple(value.shape)}.")
+            shape = getattr(self, name).shape
+            if value.shape != shape:
+                raise ShapeError(f"{name} has shape {tuple(shape)}, got {tuple(value.shape)}.")
         return self._with(self._now() | tensors)
 
     def freeze(self, *names: str) -> Self:
         """Stop the gradient to the named tensors (all Parameters and variables when none is named); returns the
         lens."""
-        driver = self._modules.get(DRIVER)
+        driver = self._driver
         if driver is not None and not names:
             driver.requires_grad_(False)
         for name in names or [n for n in self.parameter_names if driver is None or not driver.makes(n)]:
@@ -76,10 +80,12 @@ class Replaceable(nn.Module):
                     f"{name} is made from variables, so it cannot be frozen by itself; leave it out of "
                     "variables(...), or freeze all with freeze()."
                 )
-            if name in self._parameters:
-                self._parameters[name].requires_grad_(False)
-            elif name in self._buffers:
-                self._buffers[name] = self._buffers[name].detach()
+            parameter = self._parameters.get(name)
+            buffer = self._buffers.get(name)
+            if parameter is not None:
+                parameter.requires_grad_(False)
+            elif buffer is not None:
+                self._buffers[name] = buffer.detach()
         return self
 
     def __deepcopy__(self, memo):
@@ -89,15 +95,11 @@ class Replaceable(nn.Module):
             if key not in ("_parameters", "_buffers"):
                 twin.__dict__[key] = copy.deepcopy(value, memo)
         twin._parameters = {name: copy.deepcopy(p, memo) for name, p in self._parameters.items()}
-        twin._buffers = {
-            name: b if b is None else b.detach().clone().requires_grad_(b.requires_grad)
-            for name, b in self._buffers.items()
-        }
-        if DRIVER not in self._modules:
-            for name in self.parameter_names:
-                if twin._buffers.get(name) is not None:
-                    value = twin._buffers.pop(name)
-                    twin._parameters[name] = nn.Parameter(value.detach(), value.requires_grad)
+        twin._buffers = {name: _own(b) for name, b in self._buffers.items()}
+        for name in self.parameter_names if self._driver is None else ():
+            value = twin._buffers.pop(name, None)
+            if value is not None:
+                twin._parameters[name] = nn.Parameter(value.detach(), value.requires_grad)
         return twin
 
     def _apply(self, fn, recurse=True):
@@ -107,17 +109,14 @@ class Replaceable(nn.Module):
                     moved = fn(old)
                     slope = None if old.grad is None else fn(old.grad)
                 if moved is not old:
-                    self._parameters[name] = nn.Parameter(moved, old.requires_grad)
-                    self._parameters[name].grad = slope
+                    new = nn.Parameter(moved, old.requires_grad)
+                    new.grad = slope
+                    self._parameters[name] = new
         return super()._apply(fn, recurse)
 
     def _load_from_state_dict(self, state_dict, prefix, *rest):
-        for (
-            name,
-            value,
-        ) in self._buffers.items():  # values are copied in place, so they must be this lens's own
-            if value is not None:
-                self._buffers[name] = value.detach().clone().requires_grad_(value.requires_grad)
+        # values are copied in place, so the buffers must be this lens's own
+        self._buffers.update({name: _own(value) for name, value in self._buffers.items()})
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def _known(self, name):
@@ -145,32 +144,35 @@ class Replaceable(nn.Module):
 
     def _now(self):
         """All tensors as they are now, by name."""
-        made = self._made() if DRIVER in self._modules else {}
+        made = self._made(self._driver)
         return {name: made[name] if name in made else getattr(self, name) for name in self.tensor_names}
 
-    def _made(self):
-        """The tensors that variables make, by name."""
-        driver = self._modules[DRIVER]
-        return self._solved(driver(), driver.held)
+    def _made(self, driver):
+        """The tensors that variables make, by name; none without variables."""
+        return {} if driver is None else self._solved(driver(), driver.held)
 
     def _make_variables(self, names, **options):
         """Make the named numbers variables, hold all others, and return the variables."""
+        made = self._made(self._driver)
         driver = make_variables(self, names, **options)
-        made = self._made() if DRIVER in self._modules else {}
         self._modules.pop(DRIVER, None)
         for name in self.parameter_names:
-            parameter = self._parameters.pop(name, None)
-            value = made.get(name, parameter if parameter is not None else self._buffers.pop(name, None))
+            held = [found.pop(name, None) for found in (made, self._parameters, self._buffers)]
+            value = next((v for v in held if v is not None), None)
             if not driver.makes(name):
                 self._buffers[name] = None if value is None else value.detach()
         self.add_module(DRIVER, driver)
-        return [getattr(driver, name) for name in names]
+        return [driver.get_parameter(name) for name in names]
 
     def _fixed(self):
         """A copy at the values of the variables as they are now."""
-        made = self._made() if DRIVER in self._modules else {}
-        return copy.deepcopy(self._with(made))
+        return copy.deepcopy(self._with(self._made(self._driver)))
 
     def _solved(self, tensors, held):
         """Tensors after the solves that hold something."""
         return tensors
+
+
+def _own(tensor):
+    """The same values in memory of their own, without a history."""
+    return None if tensor is None else tensor.detach().clone().requires_grad_(tensor.requires_grad)

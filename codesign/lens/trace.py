@@ -1,5 +1,6 @@
 """Sequential ray trace: the numbers of a lens, rays in, rays out. The kernel is in kernel.py."""
 
+import math
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -7,6 +8,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from codesign.backend import run_kernel
+from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.lens.kernel import Kernel, Status, Works
 
 
@@ -139,6 +141,35 @@ class TraceResult:
         return self.packed_status >> 3
 
 
+def check_rays(origin_mm, direction):
+    """Raise ShapeError unless both are [N >= 1, 3]; DomainError for origins that are not finite or directions that
+    are not unit vectors."""
+    for label, value in (("origin_mm", origin_mm), ("direction", direction)):
+        if value.ndim != 2 or value.shape[1] != 3 or value.shape[0] == 0:
+            raise ShapeError(f"{label} must be [N >= 1, 3], got {tuple(value.shape)}.")
+    if origin_mm.shape != direction.shape:
+        raise ShapeError(
+            f"{origin_mm.shape[0]} origins but {direction.shape[0]} directions were given; give one of "
+            "each per ray."
+        )
+    if not all(map(math.isfinite, _range(origin_mm, lambda rows: rows))):
+        check_finite(origin_mm, "origin_mm")
+    ones = direction.new_ones(3)
+    shortest, longest = _range(direction, lambda rows: torch.mv(rows.square(), ones))
+    if not (shortest > 0.9998 and longest < 1.0002):
+        raise DomainError(
+            f"direction: squared lengths lie between {shortest:.6g} and {longest:.6g}; give finite unit "
+            "vectors (torch.nn.functional.normalize)."
+        )
+
+
+def _range(rows, function):
+    """Least and largest value of a function of rows [N, 3], in blocks that stay in the cache; NaN where there
+    is one."""
+    found = torch.stack([torch.stack(torch.aminmax(function(part))) for part in rows.detach().split(65_536)])
+    return found[:, 0].min().item(), found[:, 1].max().item()
+
+
 def trace(prescription, origin_mm, direction):
     """Trace rays from points relative to the first vertex to the plane behind the last thickness.
 
@@ -222,4 +253,4 @@ def _active(table):
     return [max((i + 1 for i, v in enumerate(row) if v != 0), default=0) for row in table.tolist()]
 
 
-__all__ = ["Prescription", "Status", "TraceResult", "sum_over_chunks", "trace"]
+__all__ = ["Prescription", "Status", "TraceResult", "check_rays", "sum_over_chunks", "trace"]

@@ -70,20 +70,27 @@ class Variables(nn.Module):
     @property
     def held(self) -> dict[str, Tensor]:
         """What solves hold, by name."""
-        return {name[5:]: value for name, value in self._buffers.items() if name.startswith("held_")}
+        return self._labelled("held_")
 
     def forward(self) -> dict[str, Tensor]:
         """The tensors at the variables as they are, by name. Gradient: exact, to the variables."""
-        made = {name[6:]: value for name, value in self._buffers.items() if name.startswith("start_")}
+        made = self._labelled("start_")
         for name, tensor in self.tensor_of.items():
             low, high, width, places, start, unit = (
-                self._buffers[f"{name}_{label}"]
+                self.get_buffer(f"{name}_{label}")
                 for label in ("low", "high", "width", "places", "start", "unit")
             )
-            values = _bounded(start + unit * self._parameters[name], low, high, width)
+            values = _bounded(start + unit * self.get_parameter(name), low, high, width)
             flat = made[tensor].reshape(-1).index_put((places,), values)
             made[tensor] = flat.reshape(made[tensor].shape)
         return made
+
+    def _labelled(self, prefix):
+        return {
+            name.removeprefix(prefix): value
+            for name, value in self._buffers.items()
+            if value is not None and name.startswith(prefix)
+        }
 
 
 def ray_motion(ahead, behind):
@@ -199,12 +206,12 @@ def _slope(x, low, high, width):
 def make_variables(lens, names, step_mm, bounds, mask, fields_rad, wavelength_um, held) -> Variables:
     """Variables of the named kinds around a lens as it is now; see ``GeoLens.variables``.
 
-    The lens says what it has: ``_kinds(held)`` -> {name: Kind}, ``_solved(tensors, held)`` -> tensors,
+    The lens says what it has: ``_kinds()`` -> {name: Kind}, ``_solved(tensors, held)`` -> tensors,
     ``_landing(fields_rad, wavelength_um)`` -> positions and weights of a bundle of rays on the film,
     ``solved_tensors``: which tensor a solve makes.
     """
     exact = lens._fixed().double()
-    kinds = exact._kinds(held)
+    kinds = exact._kinds()
     for label, found in (("variables", names), ("bounds of", bounds), ("mask of", mask)):
         unknown = [name for name in found if name not in (kinds if label == "variables" else names)]
         if unknown or len(set(found)) < len(found):

@@ -114,6 +114,9 @@ def test_a_unit_of_every_number_moves_the_image_by_the_natural_step(optics, dept
     before = mount().clone()
     assert mount.variables(camera, depth_m, step_px=0.1)[0] is mount.numbers
     torch.testing.assert_close(mount(), before, rtol=0, atol=1e-15)
+    unit = mount.unit.clone()
+    mount.variables(camera, depth_m, step_px=0.1)  # asked again it says the same
+    torch.testing.assert_close(mount.unit, unit, rtol=1e-12, atol=0)
     points = far_points(camera, mount, depth_m)
     base = render.project(camera, pose.apply(pose.inverse(mount()), points))
     for i in range(6):
