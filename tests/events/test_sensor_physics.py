@@ -227,6 +227,7 @@ def test_photoreceptor_noise_grows_to_its_strength_and_fades_as_the_photorecepto
     noise = []
     for chunk in (slice(0, 2), slice(2, 5), slice(5, 6)):
         simulate(still[chunk], t_s[chunk], sensor, state=state)
+        assert state.noise is not None
         noise.append(state.noise.double().flatten().clone())
         k = chunk.stop - 1
         assert float(noise[-1].std()) == pytest.approx(
@@ -243,9 +244,12 @@ def test_photoreceptor_noise_is_as_strong_as_the_mean_of_the_smaller_threshold_a
     x = np.linspace(-0.2, 0.8, 200_001)
     above = [0.5 * np.vectorize(math.erfc)((x - theta) / (sigma * math.sqrt(2))) for theta in thetas]
     smaller = -0.2 + np.sum(above[0] * above[1]) * (x[1] - x[0])
-    given = {"cutoff_hz": 60.0, "shot_rate_hz": 5.0, "photoreceptor_noise": True}
-    found = SensorModel(*thetas, sigma, **given).noise_level()
-    sharp = SensorModel(*thetas, 0.0, **given).noise_level()
+    found, sharp = (
+        SensorModel(
+            thetas[0], thetas[1], spread, cutoff_hz=60.0, shot_rate_hz=5.0, photoreceptor_noise=True
+        ).noise_level()
+        for spread in (sigma, 0.0)
+    )
     assert found / sharp == pytest.approx(smaller / min(thetas), rel=1e-4)
 
 

@@ -456,11 +456,11 @@ def test_other_numbers_and_lengths_compile_no_new_kernel():
 def test_the_absolute_sum_of_a_kernel_is_that_of_its_answer_to_one_spike(kind, a):
     m = -0.7
     steps = 50 if a == 1.0 else 4000
-    states = [0.0] * srm_kernels.STATES[kind]
+    states = [torch.zeros((), dtype=F64)] * srm_kernels.STATES[kind]
     total = 0.0
     for k in range(steps + 1):
-        y, states = srm_kernels.advance(kind, states, a, m)
-        total += abs(y)
+        y, states = srm_kernels.advance(kind, states, a, m, 0.0)
+        total += abs(float(y))  # pyright: ignore[reportArgumentType]
         states[0] = states[0] + (k == 0)
     found = srm_kernels.absolute_sum(kind, torch.tensor(a, dtype=F64), torch.tensor(m, dtype=F64), steps)
     assert float(found) == pytest.approx(total, rel=1e-12)
