@@ -14,8 +14,7 @@ class Rays:
     direction: [N, 3] unit vectors.
     weight: [N] share of the light that passes all apertures, 0 to 1; 0 for a ray that failed.
     irradiance: [N] what an unvignetted ray adds to the irradiance of its image point, relative to the axis
-      (for an ideal lens cos^4 of the
-      angle at the film); None where nobody computed it.
+      (for an ideal lens cos^4 of the angle at the film); None where nobody computed it.
     """
 
     origin_m: Tensor

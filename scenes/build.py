@@ -1,8 +1,8 @@
 """What worlds are made of: painted shapes and lamps, and the light levels at which they can be shown.
 
 A world is described once. At the level "emissive" every surface shows its picture as radiance; at "baked" and
-"path" the same pictures are albedo
-and the world's lamps light them (see codesign.render.light). Metres, z up, radiance on the 0..255 scale.
+"path" the same pictures are albedo and the world's lamps light them (see codesign.render.light). Metres, z
+up, radiance on the 0..255 scale.
 """
 
 from collections.abc import Callable

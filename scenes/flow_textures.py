@@ -18,10 +18,9 @@ def pool(name):
     """Textures of a kind, as a tuple of [H, W] float32 radiances (0..255 scale).
 
     "procedural": speckle of many spectra and piles of discs and bars with smooth areas between; what networks
-    are trained on.
-    "fine": gravel, grass, brick and three speckles with seeds of their own: detail everywhere. "mixed":
-    camera, chelsea, coffee, astronaut, rocket:
-    photographs with large smooth areas. No photograph is in "procedural".
+    are trained on. "fine": gravel, grass, brick and three speckles with seeds of their own: detail
+    everywhere. "mixed": camera, chelsea, coffee, astronaut, rocket: photographs with large smooth areas. No
+    photograph is in "procedural".
     """
     if name == "fine":
         return tuple(textures.photo(source) for source in ("gravel", "grass", "brick")) + tuple(

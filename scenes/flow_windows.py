@@ -27,11 +27,10 @@ class Draws:
     textures: pool of scenes.flow_textures. motion: "similarity" (one plane; rotation, zoom, translation) or
       "camera" (tilted planes, perspective).
     layers: planes before the background. flow_px: see scenes.flow_motion. theta: contrast threshold, drawn
-      evenly in its logarithm. mismatch: relative
-    spread of thresholds over pixels. noise: background events per pixel, polarity and eighth of the window,
-      evenly in the logarithm. contrast: factor on
-    log radiance. scale: texels per pixel. blur_px: Gaussian defocus, standard deviation. distortion: radial,
-      relative at the corner.
+      evenly in its logarithm. mismatch: relative spread of thresholds over pixels. noise: background events
+      per pixel, polarity and eighth of the window, evenly in the logarithm. contrast: factor on log radiance.
+      scale: texels per pixel. blur_px: Gaussian defocus, standard deviation. distortion: radial, relative at
+      the corner.
     """
 
     textures: str = "procedural"

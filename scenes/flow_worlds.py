@@ -23,9 +23,8 @@ class WorldWindows:
     A window of interval 1 starts somewhere on a path of one of five families, and lasts until the root mean
     square flow is ``flow_px`` (drawn evenly).
     Args: names: worlds, taken in turn. seed: other seeds give other paths. size_px: width and height.
-      flow_px: (least, most). theta: threshold, or
-    (least, most). noise: background events per pixel, polarity and eighth of the window, (least, most),
-      evenly in the logarithm. fov_deg: horizontal field.
+      flow_px: (least, most). theta: threshold, or (least, most). noise: background events per pixel, polarity
+      and eighth of the window, (least, most), evenly in the logarithm. fov_deg: horizontal field.
     """
 
     def __init__(

@@ -16,11 +16,10 @@ class Stage:
     """Where a camera may move in a world, metres.
 
     target_m: what it looks at. low_m, high_m: box of the camera. orbit_m: radius and height of orbits, about
-      centre_m (the target when None); sweep_rad: how
-    far round they may go. start_m, yaw_rad, turn_rad_s, height_m: how the robot starts, its mean turn rate,
-    and the height of its body. aside_rad: to which
-    side of the robot's way its camera looks. pitch_rad: how far down cameras on the robot and the quadrotor
-    look.
+      centre_m (the target when None); sweep_rad: how far round they may go. start_m, yaw_rad, turn_rad_s,
+      height_m: how the robot starts, its mean turn rate, and the height of its body. aside_rad: to which side
+      of the robot's way its camera looks. pitch_rad: how far down cameras on the robot and the quadrotor
+      look.
     """
 
     target_m: tuple[float, float, float] = (0.0, 0.6, 0.7)

@@ -2,8 +2,8 @@
 through recorded poses.
 
 Lines that begin with # and empty lines are skipped; numbers are separated by spaces or tabs. Source: the file
-formats of the TUM RGB-D benchmark
-(Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012).
+formats of the TUM RGB-D benchmark (Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS
+2012).
 """
 
 import re
@@ -47,8 +47,8 @@ def read_tum(path):
 
     Returns: t_s [n] float64 seconds, poses [n, 4, 4] float64. Quaternions are normalised.
     Raises: FileFormatError, with the line, for anything but eight finite numbers, times that do not increase,
-      or a quaternion whose length is not 1 to 0.001; for
-      files that are missing, empty, or larger than 64 MB or a million poses.
+      or a quaternion whose length is not 1 to 0.001; for files that are missing, empty, or larger than 64 MB
+      or a million poses.
     """
     path = Path(path)
     rows = []

@@ -2,12 +2,10 @@
 argument.
 
 Worlds with a ``light`` argument can be shown at three levels (scenes.build.LEVELS): emissive (their pictures
-as radiance), baked and path (their pictures
-as albedo under their own lamps). Things that rest on each other keep a gap of 1 mm, and no two shapes
-interpenetrate.
-Pictures may be arrays, paths, names of textures.PHOTOS, or "speckle-<seed>"; those from files are softened by
-two texels, because at the grain of a
-photograph bilinear texels have kinks and gradients, though right, are as rough as the grain.
+as radiance), baked and path (their pictures as albedo under their own lamps). Things that rest on each other
+keep a gap of 1 mm, and no two shapes interpenetrate. Pictures may be arrays, paths, names of textures.PHOTOS,
+or "speckle-<seed>"; those from files are softened by two texels, because at the grain of a photograph
+bilinear texels have kinks and gradients, though right, are as rough as the grain.
 """
 
 import math
@@ -91,9 +89,8 @@ def room(
     ``objects``.
 
     Every picture fades to one wall colour at its border, so walls meet without a jump of radiance; without
-    objects the image
-    has no discontinuities that move, and its interior gradient is the whole gradient. Where it is lit, its
-    ceiling is the lamp.
+    objects the image has no discontinuities that move, and its interior gradient is the whole gradient. Where
+    it is lit, its ceiling is the lamp.
     """
     mi = backend.mitsuba(device)
     pictures = [textures.faded_to(textures.picture(p), PAINT) for p in photos]
@@ -111,7 +108,7 @@ def blank_room(level=PAINT, size_m=(4.0, 4.0, 2.6), device="cpu", light=emissive
     event.
 
     Where it is lit it stays so: its walls reflect a half and emit the other half of their radiance (a white
-      furnace).
+    furnace).
     """
     even = Paint(
         np.full((8, 8), level, dtype=np.float32),
@@ -199,9 +196,8 @@ def outdoor(
     Args: photo: picture of the ground. environment: path of an equirectangular .hdr or .exr map; None is a
       procedural sky with a sun.
       meshes: robot bodies as (path, x, y, turn_deg) or (path, x, y, turn_deg, scale), each resting on the
-        ground.
-    Where it is lit, the sky lights it, with a sun of its own when the sky is procedural. The sky lies at
-    infinity: no point of it has a depth.
+        ground. Where it is lit, the sky lights it, with a sun of its own when the sky is procedural. The sky
+        lies at infinity: no point of it has a depth.
     """
     mi = backend.mitsuba(device)
     random = np.random.default_rng(seed)

@@ -1,9 +1,8 @@
 """How fast: tracing rays through a double Gauss, and one step of the render with lens and pose gradients.
 
 Tracing goes through the public interface and is set beside a copy of the same arrays in the same run, since
-machines differ and are shared; processor
-time stands beside the clock. The render step is timed after the first one, which compiles, and its memory is
-watched over many steps.
+machines differ and are shared; processor time stands beside the clock. The render step is timed after the
+first one, which compiles, and its memory is watched over many steps.
 """
 
 import sys
@@ -99,8 +98,8 @@ def tracing(kind, dtype, count, seed):
     """The work of one repeat, a copy of the same arrays, and the number of surfaces.
 
     Returns: function that traces ``count`` rays once ("forward") or traces them and goes back to all
-      curvatures and thicknesses ("forward_backward");
-      function that copies origins and directions; surfaces of the lens.
+      curvatures and thicknesses ("forward_backward"); function that copies origins and directions; surfaces
+      of the lens.
     """
     geo = lens.load("double-gauss", dtype).freeze("conic", "asphere", "index_offset")
     across = 20 * torch.rand(count, 2, generator=torch.Generator().manual_seed(seed), dtype=dtype) - 10

@@ -2,9 +2,8 @@
 the frames, in one run.
 
 Frames of a drifting texture at 1,000 frames per second, at two speeds: calm (about 2 events per 100 pixels
-and frame) and busy (about 25). What a pixel
-costs depends on how often it fires, so both are told. The last part streams frames through a sensor with
-every kind of noise and watches the memory.
+and frame) and busy (about 25). What a pixel costs depends on how often it fires, so both are told. The last
+part streams frames through a sensor with every kind of noise and watches the memory.
 """
 
 import sys

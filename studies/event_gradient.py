@@ -2,13 +2,11 @@
 by layer, frame rate and direction.
 
 A camera passes a textured plane behind a thin lens. Counts are pooled over blocks, quarters of the time and
-polarity; one direction each changes the
-contrast of the scene, the focus of the lens, or the pose of the camera, by enough to move log levels by about
-a threshold. The derivative of every
-pooled count along the direction, averaged over the step, is set beside the difference of the hard counts over
-the step. A pixel's count is a whole number
-that depends on where inside its threshold it began; the differences are means over random beginnings, the
-same on both sides.
+polarity; one direction each changes the contrast of the scene, the focus of the lens, or the pose of the
+camera, by enough to move log levels by about a threshold. The derivative of every pooled count along the
+direction, averaged over the step, is set beside the difference of the hard counts over the step. A pixel's
+count is a whole number that depends on where inside its threshold it began; the differences are means over
+random beginnings, the same on both sides.
 """
 
 import itertools

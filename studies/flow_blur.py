@@ -2,9 +2,8 @@
 several levels of background noise.
 
 Fine textures (a plane with rotation, zoom and translation up to 6 px, 64 x 64, scenes.flow_windows.planes),
-blurred by a Gaussian of 0 to 3 px before the events, beside the
-0.4 px of the pixel itself. The closed form, a plain damped least-squares solve, zero flow, and the refiner
-network where one is installed.
+blurred by a Gaussian of 0 to 3 px before the events, beside the 0.4 px of the pixel itself. The closed form,
+a plain damped least-squares solve, zero flow, and the refiner network where one is installed.
 """
 
 import sys

@@ -2,8 +2,7 @@
 time, several seeds.
 
 Every training is a run of studies.train_flow in a folder below; those that are done are kept when the study
-goes on with --resume. Then all networks are
-judged on the same windows.
+goes on with --resume. Then all networks are judged on the same windows.
 """
 
 import statistics

@@ -4,8 +4,8 @@ programs.
 Three published lenses (Cooke triplet, double Gauss, a plano-convex singlet) are traced in float64 and
 float32. The truth is a folder of reference
 files: 54 rays per lens traced with 30 digits, focal lengths, nine spot diagrams by a public ray tracer, and
-  derivatives of rays with respect to
-curvatures, thicknesses and indices with 32 digits, and Seidel sums of every surface by the same ray tracer.
+  derivatives of rays with respect to curvatures, thicknesses and indices with 32 digits, and Seidel sums of
+  every surface by the same ray tracer.
 """
 
 import json

@@ -2,8 +2,8 @@
 those their makers claim.
 
 Every .json, .zmx, .seq and .txt file of a folder is loaded. Where a header, title, catalogue number, patent
-or file note claims a focal length, it is
-compared with the paraxial one of the loaded lens, at the wavelength of the claim.
+or file note claims a focal length, it is compared with the paraxial one of the loaded lens, at the wavelength
+of the claim.
 """
 
 import json

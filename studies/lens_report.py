@@ -2,8 +2,8 @@
 distortion and field curvature on one page.
 
 Any lens that `codesign.lens.load` reads. The object is at infinity; apertures clip. Where a lens names no
-half field, the largest field up to 10 degrees
-whose chief ray and at least half of whose rays arrive is taken, and the page says so.
+half field, the largest field up to 10 degrees whose chief ray and at least half of whose rays arrive is
+taken, and the page says so.
 """
 
 import math

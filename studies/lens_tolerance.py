@@ -1,10 +1,9 @@
 """What manufacturing errors do to a lens: forecast from derivatives, judged by Monte Carlo.
 
 Radii, thicknesses, indices, decentres and tilts of every surface err independently. Focal lengths, distortion
-and image shift are forecast
-linearly. The spot is not linear near an optimum, so its square is forecast by the quadratic form of the ray
-errors, with the image plane fixed
-and refocused. Trials draw the same errors for both, so forecast and truth are compared lens by lens.
+and image shift are forecast linearly. The spot is not linear near an optimum, so its square is forecast by
+the quadratic form of the ray errors, with the image plane fixed and refocused. Trials draw the same errors
+for both, so forecast and truth are compared lens by lens.
 """
 
 import dataclasses

@@ -2,8 +2,8 @@
 error against the next finer level.
 
 Levels: emissive (pictures as radiance), baked (Lambertian light worked out once), path (paths traced for
-  every camera ray). A camera moves past each
-world; costs are CPU seconds, errors are shares of the radiance with the noise of path tracing taken out.
+  every camera ray). A camera moves past each world; costs are CPU seconds, errors are shares of the radiance
+  with the noise of path tracing taken out.
 """
 
 import inspect

@@ -116,8 +116,8 @@ def lens_cost(repeats):
 
 def pose_cost(repeats, fewer):
     """CPU seconds of 20 frames with the gradient of a loss to the pose: our wavefront; one differentiable
-    Mitsuba render per frame, of emission only as ours; the same
-    with Mitsuba's own default of light paths, which does more than ours."""
+    Mitsuba render per frame, of emission only as ours; the same with Mitsuba's own default of light paths,
+    which does more than ours."""
     import drjit as dr
 
     scene = worlds.room(objects=False)

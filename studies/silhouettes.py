@@ -2,9 +2,9 @@
 and to the lens.
 
 The loss is a fixed smooth weighting of one frame. Its differences, with many samples and common random
-numbers at several seeds, are the truth and tell their own noise;
-beside them stand the interior gradient (plain automatic differentiation), and the one with the boundary term,
-with many samples and with the usual 16.
+numbers at several seeds, are the truth and tell their own noise; beside them stand the interior gradient
+(plain automatic differentiation), and the one with the boundary term, with many samples and with the usual
+16.
 """
 
 import math

@@ -23,7 +23,7 @@ def lin_log(frames: Tensor) -> Tensor:
         are).
     Returns:
       [T, ...] natural log units: I ln(20)/20 for I <= 20, ln I above. Continuous; v2e's rounding to 1e-8 is
-        left out.
+      left out.
     Gradient: frames. Slope ln(20)/20 = 0.1498 up to and including I = 20, 1/I above (it drops to 0.05 at the
       joint, as in v2e).
     Raises: DomainError for NaN, infinite or negative values.

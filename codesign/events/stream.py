@@ -57,9 +57,8 @@ def to_counts(stream: EventStream, t_s: Times, *, dtype: torch.dtype = torch.flo
     Args:
       stream: EventStream.
       t_s: [T] times, seconds, strictly increasing, used to the nearest microsecond. An event at a time
-        belongs to the interval that ends there;
-        one at the first time belongs to the first interval. Events before the first and after the last time
-        are not asked for.
+        belongs to the interval that ends there; one at the first time belongs to the first interval. Events
+        before the first and after the last time are not asked for.
     Returns: [T-1, 2, H, W] counts, ON first.
     Gradient: none.
     """

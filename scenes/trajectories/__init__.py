@@ -2,8 +2,8 @@
 time.
 
 Functions (``orbit``, ``radial``, ...) give poses T_world_cam at times. Trajectories (``Orbital``,
-``Swinging.radial``, ``Swinging.vertical``, ``Driving``, ``Flying``) are called with any
-times and give T_world_body; ``mounted`` puts a camera on one.
+``Swinging.radial``, ``Swinging.vertical``, ``Driving``, ``Flying``) are called with any times and give
+T_world_body; ``mounted`` puts a camera on one.
 """
 
 from scenes.trajectories.driving import Driving

@@ -17,11 +17,10 @@ class Driving(Trajectory):
     """Pose of the body of a robot that drives on the plane z = 0.
 
     The wheels turn at speeds v -/+ w track / 2 (left, right), with speed v and turn rate w smooth random
-    functions of time. Over the ground a wheel
-    moves slower, by its slip (a share, at most ``slip``); in a turn the robot slides outwards at
-    ``side_slip_s`` times its sideways acceleration. Without
-    slip the velocity has no sideways part (the nonholonomic constraint) and heading and distance are those
-    the wheels count.
+    functions of time. Over the ground a wheel moves slower, by its slip (a share, at most ``slip``); in a
+    turn the robot slides outwards at ``side_slip_s`` times its sideways acceleration. Without slip the
+    velocity has no sideways part (the nonholonomic constraint) and heading and distance are those the wheels
+    count.
 
     Args:
       generator: torch.Generator. duration_s: poses exist from 0 to there.

@@ -1,9 +1,8 @@
 """Polynomial paths of least snap (fourth derivative) through points at given times, by one linear system.
 
 The path of least integral of squared snap with given points, and with velocity, acceleration and jerk of 0 at
-both ends, has degree 7 between points and
-six continuous derivatives at them (the Euler-Lagrange equation x^(8) = 0 with its natural conditions). That
-is 8 conditions per segment for 8 coefficients.
+both ends, has degree 7 between points and six continuous derivatives at them (the Euler-Lagrange equation
+x^(8) = 0 with its natural conditions). That is 8 conditions per segment for 8 coefficients.
 Source: Mellinger and Kumar, Minimum snap trajectory generation and control for quadrotors, ICRA 2011.
 """
 

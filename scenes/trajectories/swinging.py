@@ -15,9 +15,8 @@ class Orbital(Trajectory):
       centre_m: the point looked at. radius_m, height_m: mean distance from the axis; height above the centre.
       rate_rad_s: mean angular rate, of either sign, not 0. phase_rad: bearing at time 0.
       radius_swing, rate_swing: shares (below 1) by which radius and rate go up and down; radius_period_s,
-        rate_period_s: in which time.
-    Angular rate: rate (1 + rate_swing cos(2 pi t / period)). Radius: radius (1 + radius_swing sin(2 pi t /
-      period)).
+        rate_period_s: in which time. Angular rate: rate (1 + rate_swing cos(2 pi t / period)). Radius: radius
+        (1 + radius_swing sin(2 pi t / period)).
     """
 
     def __init__(

@@ -2,8 +2,7 @@
 mounted on one.
 
 Body axes: x forward, y left, z up. A velocity is a twist in body axes: [n, 6], metres per second, then
-  radians per second, so that
-T(t + dt) is T(t) exp(dt velocity(t)) to first order.
+radians per second, so that T(t + dt) is T(t) exp(dt velocity(t)) to first order.
 """
 
 from abc import ABC, abstractmethod

@@ -2,11 +2,10 @@
 judged on the other.
 
 The recording (DAVIS346, a Newton's cradle) has 13 frames at 25 per second and 320,000 events. Events are
-simulated from the frames, at mid-exposure
-times, by the naive emulator, by the memorised-reference sensor as published, and by the same sensor with
-parameters fitted by gradient (thresholds,
-dark offset, blur, low-pass, noise). Judged per pixel (signed counts) and per polarity (rates), on the half of
-the recording that was not fitted.
+simulated from the frames, at mid-exposure times, by the naive emulator, by the memorised-reference sensor as
+published, and by the same sensor with parameters fitted by gradient (thresholds, dark offset, blur, low-pass,
+noise). Judged per pixel (signed counts) and per polarity (rates), on the half of the recording that was not
+fitted.
 """
 
 import sys

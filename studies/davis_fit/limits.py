@@ -37,9 +37,8 @@ def self_curve(recording, offsets_s, intervals, side_px=1):
 
 def still_events(recording):
     """Events where the frames show no motion, as metrics by name: share of pixels that are still, their share
-    of all events, their events per pixel and
-    second (ON, OFF), and the same, both together, in the interval with the fewest events. Without still
-    pixels there is only their share, 0.
+    of all events, their events per pixel and second (ON, OFF), and the same, both together, in the interval
+    with the fewest events. Without still pixels there is only their share, 0.
     """
     still = recording.frames.std(0) < STILL_SD
     found = {"still_pixel_share": float(still.double().mean())}

@@ -8,9 +8,8 @@ def match(simulated, recorded):
     and polarity.
 
     The correlation does not see a common factor of the counts and the ratio sees little else, so neither is
-    paid for with the other. A squared
-    error or a likelihood makes counts too few where edges are predicted a pixel off (see docs/davis_fit.md
-    for their figures).
+    paid for with the other. A squared error or a likelihood makes counts too few where edges are predicted a
+    pixel off (see docs/davis_fit.md for their figures).
     """
     signed, truth = (counts[:, 0] - counts[:, 1] for counts in (simulated, recorded))
     signed = signed - signed.mean()

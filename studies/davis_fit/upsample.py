@@ -1,8 +1,8 @@
 """Frames between frames: both neighbours moved along their optical flow and blended.
 
 Between two frames 40 ms apart an edge passes over many pixels: each sees ON and OFF, and the difference of
-the two frames shows neither. Linear
-interpolation in time changes no count of a memorised level; moving the picture does.
+the two frames shows neither. Linear interpolation in time changes no count of a memorised level; moving the
+picture does.
 """
 
 import numpy as np

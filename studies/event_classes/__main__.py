@@ -2,10 +2,9 @@
 generators, tested on a physical sensor's events.
 
 Every generator sees the same pictures as video; a small residual network is trained on voxels of its events
-and tested on those of the physical sensor
-(mismatch, bandwidth, leak, shot noise, dead time), which sees the motion itself. Best thresholds and fitted
-generators come from recordings of other
-pictures. In the manner of N-MNIST and N-Caltech101: three saccades along a triangle.
+and tested on those of the physical sensor (mismatch, bandwidth, leak, shot noise, dead time), which sees the
+motion itself. Best thresholds and fitted generators come from recordings of other pictures. In the manner of
+N-MNIST and N-Caltech101: three saccades along a triangle.
 """
 
 import math

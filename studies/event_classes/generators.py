@@ -1,9 +1,8 @@
 """What makes events of moved pictures: the physical sensor, the emulators of it, and the voxels of either.
 
 A generator is a function ``generate(frames, t_s, generator)`` of frames [T, N, H, W] of N pictures, their
-times and a torch.Generator. It returns an EventStream
-of the pictures stacked on one tall sensor, [N H, W], or counts [T-1, 2, N, H, W] where it knows no times
-within an interval.
+times and a torch.Generator. It returns an EventStream of the pictures stacked on one tall sensor, [N H, W],
+or counts [T-1, 2, N, H, W] where it knows no times within an interval.
 """
 
 from collections.abc import Callable
@@ -26,8 +25,7 @@ PICTURES_AT_ONCE = 50
 @dataclass(frozen=True)
 class Source:
     """A generator as the study lists it. key: in metrics.json. label: on the page. make: the generator; with
-    ``searched`` instead a function from a
-    threshold to one. rate: "video" or "sensor", which frames it sees.
+    ``searched`` instead a function from a threshold to one. rate: "video" or "sensor", which frames it sees.
     """
 
     key: str

@@ -40,8 +40,8 @@ class Classifier(nn.Module):
     """Voxels [N, 2, bins, H, W] to scores [N, CLASSES]; 78 thousand weights for 6 bins.
 
     scale: every voxel is divided by this number, the root mean square of the voxels trained on. Nothing is
-      normalised per recording: how many events
-    there are is part of what is learnt, as it would be for a network that meets a real sensor.
+      normalised per recording: how many events there are is part of what is learnt, as it would be for a
+      network that meets a real sensor.
     """
 
     def __init__(self, bins, scale, generator):

@@ -16,8 +16,8 @@ def position_px(t_s):
     """Where the picture has moved to.
 
     Three legs of an equilateral triangle, back to the start, each with the smooth course of a real saccade:
-    10 u^3 - 15 u^4 + 6 u^5 of the way
-    after a share u of the time (fastest in the middle, 15/8 of the mean speed).
+    10 u^3 - 15 u^4 + 6 u^5 of the way after a share u of the time (fastest in the middle, 15/8 of the mean
+    speed).
     Args: t_s: [T] seconds, 0 to DURATION_S.
     Returns: [T, 2] float64 pixels (x right, y down), (0, 0) at the start.
     Source: triangle: Orchard et al., N-MNIST, 2015. Course: minimum jerk, Flash and Hogan 1985.

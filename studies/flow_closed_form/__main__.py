@@ -2,9 +2,9 @@
 several levels of background noise.
 
 64 x 64 pixels, rotation, zoom and translation up to 6 px, 3 % threshold mismatch
-(scenes.flow_windows.planes), textures no network was trained on. Beside it
-a plain damped least-squares solve and zero flow. Error ratio: mean endpoint error over that of zero flow, all
-samples; intervals: 95 %, bootstrap over samples.
+(scenes.flow_windows.planes), textures no network was trained on. Beside it a plain damped least-squares solve
+and zero flow. Error ratio: mean endpoint error over that of zero flow, all samples; intervals: 95 %,
+bootstrap over samples.
 """
 
 import sys

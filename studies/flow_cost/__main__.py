@@ -2,9 +2,8 @@
 how it grows from 128 to 1024 pixels a side.
 
 Time of one call, batch of one, float32, the estimators in turns; memory in a process of its own that gives
-freed blocks back. Networks are untrained: the
-same arithmetic. The spiking network runs as fast as its form allows (docs/flow_baselines.md), on the volume
-of 8 bins that the others get; its published 10 are beside it.
+freed blocks back. Networks are untrained: the same arithmetic. The spiking network runs as fast as its form
+allows (docs/flow_baselines.md), on the volume of 8 bins that the others get; its published 10 are beside it.
 """
 
 import json

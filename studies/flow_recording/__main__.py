@@ -2,9 +2,8 @@
 warped events always.
 
 Recordings in the layout of the Event-Camera Dataset (events.txt with imu.txt, groundtruth.txt, calib.txt),
-packets of events with flow files, and every event
-file the package reads (docs/flow_recordings.md). Without --recording a small synthetic one is made and used,
-and the page says so.
+packets of events with flow files, and every event file the package reads (docs/flow_recordings.md). Without
+--recording a small synthetic one is made and used, and the page says so.
 """
 
 import statistics

@@ -1,6 +1,5 @@
 """A recording to run on where there is none: a camera that turns in a rendered room, written in the layout of
-the Event-Camera Dataset (events.txt, imu.txt,
-groundtruth.txt, calib.txt)."""
+the Event-Camera Dataset (events.txt, imu.txt, groundtruth.txt, calib.txt)."""
 
 import math
 

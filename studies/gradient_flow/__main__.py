@@ -2,10 +2,9 @@
 numbers.
 
 One row per junction and parameter group: lens rays and spots in float64, frames (textured room, no
-  silhouettes) with respect to
-lens and pose, event counts, flow, and the final loss with respect to three curvatures and all six pose
-components, once with the
-smooth event layer and once with the straight-through layer against differences of the hard loss.
+silhouettes) with respect to lens and pose, event counts, flow, and the final loss with respect to three
+curvatures and all six pose components, once with the smooth event layer and once with the straight-through
+layer against differences of the hard loss.
 """
 
 import sys

@@ -231,9 +231,8 @@ def loss_rows(seed):
     """The final loss with the smooth counts layer, whole chain, scene in float32.
 
     Without noise the smooth layer lets the closed-form flow come within hundredths of a pixel, and the
-    gradient is that of rounding;
-    shot noise of 40 Hz gives an error that the optics can change. Band-limited textures, since texel borders
-    are kinks.
+    gradient is that of rounding; shot noise of 40 Hz gives an error that the optics can change. Band-limited
+    textures, since texel borders are kinks.
     """
     task = make_task("cooke-triplet", seed, 1.0)
     walls = [
@@ -250,12 +249,10 @@ def hard_rows(seed, count):
     """Straight-through gradient against central differences of the hard loss.
 
     Steps of half a pixel of ray motion and 1 to 2 pixels of image motion move several counts per pixel row.
-    Single cases are
-    noisy on both sides, so both are averaged over motions and textures before they are compared; the noise
-    floor is the standard
-    error of the mean difference. On walls that look alike everywhere the mean loss hardly depends on the
-    pose: there the floor is
-    above 1, and the differences themselves say nothing.
+    Single cases are noisy on both sides, so both are averaged over motions and textures before they are
+    compared; the noise floor is the standard error of the mean difference. On walls that look alike
+    everywhere the mean loss hardly depends on the pose: there the floor is above 1, and the differences
+    themselves say nothing.
     """
     task = make_task("cooke-triplet", seed)
     pool = make_worlds(TRAINING)

@@ -2,9 +2,9 @@
 rays.
 
 Every case runs in a process of its own, in turns with the others, so that memory is counted apart and a
-change of the machine's load meets all. The error is that of
-256 of the timed rays against a trace with 30 digits. A second part shows how our time and memory grow with
-rays and surfaces. Peers: pip install ".[bench]".
+change of the machine's load meets all. The error is that of 256 of the timed rays against a trace with 30
+digits. A second part shows how our time and memory grow with rays and surfaces. Peers: pip install
+".[bench]".
 """
 
 import importlib.util

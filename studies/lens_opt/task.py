@@ -77,8 +77,8 @@ class LensTask:
         )
 
     def judge(self, optics, case: Batch, flow, samples: int = 32) -> dict[str, float]:
-        """Errors of a lens on one case with hard events: the physical sensor with true timestamps, no surrogate
-        anywhere.
+        """Errors of a lens on one case with hard events: the physical sensor with true timestamps, no
+        surrogate anywhere.
 
         Returns: dict of flow_error_mrad, edge_energy, events_per_pixel.
         """

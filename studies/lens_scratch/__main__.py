@@ -2,12 +2,10 @@
 each method take?
 
 Three plates of N-SK16, F2 and N-SK16, plane but for radii of some two metres drawn from the seed, become a 50
-mm f/5 triplet of 40 degrees
-by real rays alone: ray errors in F, d and C and hinges on centres, edges, gaps, length and back focus, in one
-  damped least-squares problem
-of 11 variables. The yardstick is the published Cooke triplet: success is a mean RMS spot within twice its
-own, over fields 0, 0.7 and 1 with
-the whole unvignetted pupil, every ray passing and every limit held.
+mm f/5 triplet of 40 degrees by real rays alone: ray errors in F, d and C and hinges on centres, edges, gaps,
+length and back focus, in one damped least-squares problem of 11 variables. The yardstick is the published
+Cooke triplet: success is a mean RMS spot within twice its own, over fields 0, 0.7 and 1 with the whole
+unvignetted pupil, every ray passing and every limit held.
 """
 
 import dataclasses

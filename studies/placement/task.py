@@ -2,24 +2,20 @@
 off event flow.
 
 Modelled: a camera of 64 x 64 pixels and 70 degrees on a body that moves in the plane with constant forward,
-  lateral and yaw rate over 40 ms;
-ground with photographs and patterns of several scales; the event sensor's mismatch and shot noise (one fixed
-draw); affine flow over the image;
-weighted least squares with the true depth. Since the depth is known, events of ground farther than a few
-metres are faded out: a pixel covers
-whole patterns there, and what it fires follows no motion.
+  lateral and yaw rate over 40 ms; ground with photographs and patterns of several scales; the event sensor's
+  mismatch and shot noise (one fixed draw); affine flow over the image; weighted least squares with the true
+  depth. Since the depth is known, events of ground farther than a few metres are faded out: a pixel covers
+  whole patterns there, and what it fires follows no motion.
 What makes one mount better than another: near ground moves fast and is seen in detail, but flow beyond the
-  reach of the estimator is lost, and more
-ground in view means more evidence; a turn of the body and a slip to the side look alike unless near and far
-ground or both sides of the turn are seen;
-flow over ground that recedes is less affine; the sky shows nothing.
+reach of the estimator is lost, and more ground in view means more evidence; a turn of the body and a slip to
+the side look alike unless near and far ground or both sides of the turn are seen; flow over ground that
+recedes is less affine; the sky shows nothing.
 Not modelled: the robot's own body in view, uneven ground, errors of the depth, lighting.
 
 Common random numbers go with the texture: a sample fixes which patch of ground the camera looks at and how it
-  lies in the image, whatever the mount.
-On ground that looks alike everywhere this changes no expectation, and it makes the errors of neighbouring
-mounts vary together; with the body's place
-held instead, every turn of the camera by a pixel shows new texture, and the gradient is that of the draw.
+lies in the image, whatever the mount. On ground that looks alike everywhere this changes no expectation, and
+it makes the errors of neighbouring mounts vary together; with the body's place held instead, every turn of
+the camera by a pixel shows new texture, and the gradient is that of the draw.
 """
 
 import math

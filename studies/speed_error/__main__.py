@@ -2,9 +2,8 @@
 good enough.
 
 Stages: lens (pinhole, thin, traced), samples per pixel, scene (bitmap, analytic), event layers and frame
-  rates, time bins, flow models. A level's time
-is the median of several repeats; its error is measured against the finest level of the stage or against the
-truth.
+  rates, time bins, flow models. A level's time is the median of several repeats; its error is measured
+  against the finest level of the stage or against the truth.
 """
 
 import sys

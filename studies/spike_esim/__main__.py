@@ -2,10 +2,9 @@
 ESIM with its best threshold, and ours.
 
 Trained on rendered sequences with hard events of a noisy, slow, unequal sensor, and on the first half of a
-real DAVIS recording; judged on motions and
-worlds never seen and on the second half. Judged are total rates, rates over time per polarity, van Rossum
-distance, flicker, patches, medians, delays, and
-what happens to all of it when thresholds, noise, chunks or the kind of data change.
+real DAVIS recording; judged on motions and worlds never seen and on the second half. Judged are total rates,
+rates over time per polarity, van Rossum distance, flicker, patches, medians, delays, and what happens to all
+of it when thresholds, noise, chunks or the kind of data change.
 """
 
 import sys

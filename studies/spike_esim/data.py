@@ -44,8 +44,7 @@ UNSEEN_WORLD = [
 @dataclass(frozen=True)
 class Sequence:
     """frames: [T, H, W], 0-255 scale. t_s: [T] float64. counts: [T-1, 2, H, W] of the physical sensor. again:
-    the same with another draw of thresholds and
-    noise, None for a recording. name: world and motion."""
+    the same with another draw of thresholds and noise, None for a recording. name: world and motion."""
 
     name: str
     frames: Tensor

@@ -26,8 +26,8 @@ PICTURE_S = 0.03
 @dataclass(frozen=True)
 class Results:
     """Everything the page shows. sets: sequences by set. trained: generators by kind of training data. found:
-    figures by (set, generator). crossed: (loss, rate
-    ratio) by (training, set, generator). losses: training losses by name. met: rows of the goals."""
+    figures by (set, generator). crossed: (loss, rate ratio) by (training, set, generator). losses: training
+    losses by name. met: rows of the goals."""
 
     sets: dict[str, list]
     trained: dict[str, Any]

@@ -2,8 +2,7 @@
 slowing down towards its neighbouring intervals.
 
 Even motion within an interval makes the event rate jump where the next one begins; a cubic through both ends
-with the mean speed of the two intervals
-there does not.
+with the mean speed of the two intervals there does not.
 """
 
 from itertools import pairwise

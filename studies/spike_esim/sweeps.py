@@ -17,8 +17,7 @@ GENERATORS = ("thesis", "smoothed", "esim", "ours")
 @dataclass(frozen=True)
 class Sweeps:
     """Rows of tables. theta: (scale, rate ratio). frame_noise: (sigma, name, loss, rate ratio). shot: (rate,
-    name, loss, that of two draws). chunks: (size, events that
-    differ of ours, of the thesis network)."""
+    name, loss, that of two draws). chunks: (size, events that differ of ours, of the thesis network)."""
 
     theta: list
     frame_noise: list

@@ -2,9 +2,8 @@
 two-state cells, and a memory copy, in one run.
 
 2 x 128 x 128 pixels in float32, forward alone and with the gradient of the drive. Every layer runs in a
-process of its own, in turns with the others, with two
-threads; each of its repeats follows a timed copy of input, spikes and potential, the measure of what moving
-the data costs. Peers: pip install ".[bench]".
+process of its own, in turns with the others, with two threads; each of its repeats follows a timed copy of
+input, spikes and potential, the measure of what moving the data costs. Peers: pip install ".[bench]".
 """
 
 import importlib.util

@@ -1,9 +1,8 @@
 """Hard cases: what theory expects of values and gradients, and what is seen.
 
 Flat and black scenes, rays that are lost, poses that do not move, images without events, flows too small to
-see, thresholds at both ends of their
-range, one pixel, strong surfaces, far objects. A miss is listed and shown, not hidden, and does not make the
-study fail.
+see, thresholds at both ends of their range, one pixel, strong surfaces, far objects. A miss is listed and
+shown, not hidden, and does not make the study fail.
 """
 
 import sys

@@ -2,9 +2,8 @@
 
 The budget is processor time (--cpu-minutes, all threads, making the data included) or a number of steps
 (--steps). With --steps the result depends on the options and the seed alone, and a resumed run gives the same
-numbers bit for bit on the same machine and number of threads. Several processes share every batch:
-
-    torchrun --nproc-per-node 2 -m studies.train_flow ...
+numbers bit for bit on the same machine and number of threads. Several processes share every batch: torchrun
+--nproc-per-node 2 -m studies.train_flow ...
 """
 
 import os

@@ -1,9 +1,8 @@
 """How true are events of a video that was upsampled, against events of the frames that were left out of it?
 
 Sequences are rendered at a high rate, every k-th frame is kept, and events of the upsampled frames
-(codesign.events.upsampling.upsample) are compared with events of
-all frames. Controls: frames between by linear blending, and the kept frames alone. High-speed recordings
-  likewise, with the frames that were dropped.
+(codesign.events.upsampling.upsample) are compared with events of all frames. Controls: frames between by
+linear blending, and the kept frames alone. High-speed recordings likewise, with the frames that were dropped.
 Frames are instantaneous, here and in the method.
 """
 

@@ -21,8 +21,7 @@ LOOKED_AT = 2  # intervals whose frames are compared
 
 class EventErrors(NamedTuple):
     """correlation: of the total counts of pixels, both polarities side by side. on, off: events over true
-    events. wrong: sum of absolute differences of counts in POOL_PX squares
-    and POOL_S, per true event."""
+    events. wrong: sum of absolute differences of counts in POOL_PX squares and POOL_S, per true event."""
 
     correlation: float
     on: float

@@ -30,8 +30,7 @@ SAMPLES = 16
 @dataclass(frozen=True)
 class Sequence:
     """frames: [T, H, W]. truth: {stride: (flow, seen)} between the frames 0, stride, 2 stride, ...: true flow
-    [n, 2, H, W], px, and whether a point is in
-    the later frame and not hidden there, [n, H, W] bool."""
+    [n, 2, H, W], px, and whether a point is in the later frame and not hidden there, [n, H, W] bool."""
 
     frames: Tensor
     truth: dict

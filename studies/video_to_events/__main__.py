@@ -5,9 +5,8 @@ Time: t of the events is that of the frames: of the container, of --fps, or of -
   values are taken as intensities, as v2e does;
 --linear undoes the sRGB gamma first. Colour becomes luminance (0.2126 red, 0.7152 green, 0.0722 blue).
 Memory: frames are read, simulated and stored in chunks, so memory does not grow with the video. Event files
-  are written whole at the end, which takes
-0.05 GB of memory per million events (0.13 GB for .raw), and 13 MB of disk until then; with --events and no
-name nothing grows. See docs/event_views.md.
+  are written whole at the end, which takes 0.05 GB of memory per million events (0.13 GB for .raw), and 13 MB
+  of disk until then; with --events and no name nothing grows. See docs/event_views.md.
 """
 
 import math

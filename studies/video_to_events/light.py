@@ -30,9 +30,8 @@ class Light:
         has number ``first``.
 
         Red, green and blue are weighted as in BT.709, after the gamma is undone where that is asked for. A
-        new size is reached by bilinear
-        interpolation that averages all pixels it covers, on intensities. Raises: DomainError naming the frame
-        that holds NaN, infinity or a negative value.
+        new size is reached by bilinear interpolation that averages all pixels it covers, on intensities.
+        Raises: DomainError naming the frame that holds NaN, infinity or a negative value.
         """
         values = np.stack(frames)
         if values.dtype.kind == "f":

@@ -130,9 +130,8 @@ def test_gradient_is_the_slope_of_the_mean_hard_count():
     """d(weighted counts)/d(contrast) of moving textures against differences of whole counts, 2000 phases.
 
     Rounding leaves an error of half an event per pixel and end, evenly spread: 0.4/sqrt(2000) of an event
-    against slopes of some 10 events per unit
-    times a step of 0.8: 0.2 %; that of the step's curvature (turning points move with the phase only) is
-      below it.
+    against slopes of some 10 events per unit times a step of 0.8: 0.2 %; that of the step's curvature
+    (turning points move with the phase only) is below it.
     """
     generator = torch.Generator().manual_seed(5)
     phase = torch.rand(2000, generator=generator, dtype=torch.float64) * 2 * math.pi
@@ -151,8 +150,8 @@ def test_gradient_is_the_slope_of_the_mean_hard_count():
 
 def test_threshold_gradient_follows_the_hard_count():
     # the total count of a pixel that swings by S (many thresholds) is about S/C: d/dC = -S/C^2 = -(counts)/C.
-    # The hard count over a 25 % wider
-    # and narrower threshold gives -S/(C^2 (1 - 0.0625)): 7 % steeper; rounding adds under 1 % at 2000 pixels.
+    # The hard count over a 25 % wider and narrower threshold gives -S/(C^2 (1 - 0.0625)): 7 % steeper;
+    # rounding adds under 1 % at 2000 pixels.
     generator = torch.Generator().manual_seed(6)
     swing = 3 + torch.rand(2000, generator=generator, dtype=torch.float64)
     level = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None] * swing

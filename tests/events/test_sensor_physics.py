@@ -54,8 +54,8 @@ def test_the_low_pass_solves_its_differential_equation(cutoff_hz):
 @pytest.mark.parametrize(("fps", "error"), [(400, 0.02), (2000, 1e-3)])
 def test_a_sinusoid_through_the_low_pass_has_its_textbook_amplitude(fps, error):
     # so small that the bandwidth is that of exp(4); gain 1/sqrt(1 + (f/fc)^2), times sinc^2 for the chords
-    # between frames. What the chords add at
-    # fps - 40 Hz folds back: (40/360)^2 = 1.2 % of it at 400 fps, (40/1960)^2 at 2000
+    # between frames. What the chords add at fps - 40 Hz folds back: (40/360)^2 = 1.2 % of it at 400 fps,
+    # (40/1960)^2 at 2000
     bandwidth_hz = 50 * (math.exp(4) + 20) / 275
     t_s = torch.arange(0, 0.2, 1 / fps, dtype=torch.float64)
     level = (4 + 0.01 * torch.sin(2 * math.pi * 40 * t_s))[:, None, None]

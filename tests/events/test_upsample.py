@@ -37,8 +37,8 @@ def test_a_moving_pattern_is_where_it_should_be_in_between(shift):
     made, t_s = upsample(frames, [0.0, 0.01])
     truth = moving([(float(t) / 0.01 * shift[0], float(t) / 0.01 * shift[1]) for t in t_s])
     # Light of period 9 px and more: the cubic kernel is off by at most 0.5 % of the swing (30) there, and 0.1
-    # px of wrong flow by 0.1 * 2 pi / 9 of it,
-    # 2; the straight line between the frames, the control, is off by more than ten times that.
+    # px of wrong flow by 0.1 * 2 pi / 9 of it, 2; the straight line between the frames, the control, is off
+    # by more than ten times that.
     error, blended = (
         inner(each - truth).square().mean().sqrt()
         for each in (made, frames[0] + (t_s[:, None, None] / 0.01).float() * (frames[1] - frames[0]))
@@ -75,8 +75,8 @@ def test_a_still_video_stays_bit_for_bit_and_makes_no_event():
 
 def test_light_that_grows_is_shared_evenly_and_kept_within_the_bound():
     # nothing moves: between the frames intensity is a straight line, by conservation of the weights; ln 2 in
-    # steps of at most 0.1 takes ten:
-    # the first of n equal steps of intensity is ln(1 + 1/n), 0.095 at n = 10 and 0.105 at 9
+    # steps of at most 0.1 takes ten: the first of n equal steps of intensity is ln(1 + 1/n), 0.095 at n = 10
+    # and 0.105 at 9
     frames = torch.full((2, 24, 32), 100.0)
     frames[1] *= 2
     made, t_s = upsample(frames, [0.0, 1.0], max_log_change=0.1)
@@ -129,9 +129,8 @@ def test_events_of_the_upsampled_video_are_those_of_the_true_one():
     found = simulate(*upsample(*kept, max_displacement_px=0.5), sensor)
     control = simulate(*kept, sensor)
     # 4.3 px between frames, half of the finest period: a straight line loses what rises and falls within; at
-    # 0.5 px a sinusoid of 9 px is cut by
-    # 1 - cos(pi 0.5 / 9) = 1.5 % at its peaks, and borders, 1/8 of the picture, are unknown for up to half of
-    # the motion
+    # 0.5 px a sinusoid of 9 px is cut by 1 - cos(pi 0.5 / 9) = 1.5 % at its peaks, and borders, 1/8 of the
+    # picture, are unknown for up to half of the motion
     assert 0.9 < len(found) / len(truth) < 1.1
     assert len(control) < 0.8 * len(truth)
     for polarity in (-1, 1):
@@ -154,8 +153,7 @@ def test_gradients_to_the_frames_are_those_of_differences():
     weight = torch.rand(3, 24, 30, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     (upsample(frames, [0.0, 1.0], max_displacement_px=1.6)[0][:3] * weight).sum().backward()
     # for light that is scaled as a whole flow and visibility stay (but for the offset of the dark), and the
-    # result is linear in the frames:
-    # the sum of gradient times frames is the weighted sum itself (Euler)
+    # result is linear in the frames: the sum of gradient times frames is the weighted sum itself (Euler)
     made = upsample(frames.detach(), [0.0, 1.0], max_displacement_px=1.6)[0][:3]
     assert frames.grad is not None
     assert float((frames.grad * frames.detach()).sum()) == pytest.approx(

@@ -83,8 +83,7 @@ def test_a_stream_uses_exact_time_stamps_and_both_ends_of_the_interval():
 @pytest.mark.parametrize("zoom", [0.2, -0.2])
 def test_tracks_are_carried_back_to_the_pixel_they_start_from(zoom):
     # flow zoom x0 of the start: at time tau the point is at x = x0 (1 + tau zoom), so its flow is zoom x / (1
-    # + tau zoom); k steps give the
-    # geometric series to order k, whose next term is zoom x (tau zoom)^(k + 1)
+    # + tau zoom); k steps give the geometric series to order k, whose next term is zoom x (tau zoom)^(k + 1)
     height = width = 17
     y, x = torch.meshgrid(*[torch.arange(17, dtype=D) - 8] * 2, indexing="ij")
     flow = zoom * torch.stack([x, y])[None]

@@ -31,8 +31,7 @@ def moving(seed, matrix=((0.0, 0.0), (0.0, 0.0)), shift=(0.0, 0.0), per_pixel=8.
     are at mid-interval, and the flow [2, H, W].
 
     A point seen at a at the start is at x with a = x - (matrix x + shift) / 2 at mid-interval, so the flow on
-    the pixels of the start is
-    matrix (1 - matrix / 2)^-1 (a + shift / 2) + shift.
+    the pixels of the start is matrix (1 - matrix / 2)^-1 (a + shift / 2) + shift.
     """
     matrix = torch.tensor(matrix, dtype=D)
     shift = torch.tensor(shift, dtype=D)
@@ -61,8 +60,8 @@ def length(flow):
 
 
 # relative error allowed: bilinear warping has the slope of a chord over two pixels, sin(k)/k = 0.83 of the
-# true one at a period of
-# 6 px and 0.99 at 24 px, so small flows come out some 6 % too long; over whole pixels that averages out
+# true one at a period of 6 px and 0.99 at 24 px, so small flows come out some 6 % too long; over whole pixels
+# that averages out
 @pytest.mark.parametrize(
     ("shift", "relative"),
     [
@@ -266,8 +265,8 @@ def test_small_images_work_with_finer_levels():
 
 def test_flow_belongs_to_the_pixels_of_the_start():
     # a zoom by 1 + m about the centre while shifting by s: a point seen at a is at (1 + m/2)/(1 - m/2) a + s'
-    # at the end, so flow at the centre pixel is
-    # s / (1 - m/2) (worked out in ``moving``); taken on the pixels of mid-interval it would be s, 0.2 px less
+    # at the end, so flow at the centre pixel is s / (1 - m/2) (worked out in ``moving``); taken on the pixels
+    # of mid-interval it would be s, 0.2 px less
     volume, truth = moving(2, ((0.1, 0.0), (0.0, 0.1)), (4.0, 0.0))
     centre = (
         estimate_lk(volume).flow_px[0, 0, SIZE // 2 - 1 : SIZE // 2 + 1, SIZE // 2 - 1 : SIZE // 2 + 1].mean()

@@ -57,9 +57,8 @@ def _square_mean(shape, parameters):
 
 def test_scattered_events_give_the_slopes_that_the_noise_model_says(generator):
     # unit noise per pixel behind a level's kernel: variance of a central difference, 160 x 160 samples;
-    # neighbours within 4 pi sigma^2 are alike, so at
-    # sigma = 1 some 2000 and at sigma = 2 some 500 independent samples of 8 bins: 1 to 2 % in the variance,
-    # tested at 5 standard errors
+    # neighbours within 4 pi sigma^2 are alike, so at sigma = 1 some 2000 and at sigma = 2 some 500
+    # independent samples of 8 bins: 1 to 2 % in the variance, tested at 5 standard errors
     for sigma in (1.0, 2.0):
         noise = torch.randn(1, 8, 160, 160, generator=generator, dtype=D)
         blurred, kernel = lk_level._blurred(noise, sigma)
@@ -74,8 +73,8 @@ def test_scattered_events_give_the_slopes_that_the_noise_model_says(generator):
 
 def test_squared_errors_are_those_of_the_covariance():
     # windows of photographs and speckle with hard events. Errors have tails (a wrong texture is a wrong
-    # flow), so the mean is known to some 20 %;
-    # over kinds it runs from 0.4 to 1.7 (docs/flow_closed_form.md): within a factor of 3 either way
+    # flow), so the mean is known to some 20 %; over kinds it runs from 0.4 to 1.7 (docs/flow_closed_form.md):
+    # within a factor of 3 either way
     for kind in ("fine", "mixed"):
         windows = RenderedWindows(planes(kind, 0.2, (0.002, 0.002)), seed=11).batch(range(48))
         with torch.no_grad():

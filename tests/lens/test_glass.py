@@ -72,9 +72,8 @@ def test_every_entry_has_the_published_index_and_abbe_number(name):
     *_, (nd, abbe), _, source = ROWS[name]
     glass = Glass.named(name)
     # Five printed decimals, and the makers quote 5e-6 for their formulas. Sumita, Zeon and Osaka Gas print
-    # measured values beside a fit:
-    # two or three units of the fifth decimal, of the third for the polyesters (spread between lots), and Vd
-    # with at most one decimal.
+    # measured values beside a fit: two or three units of the fifth decimal, of the third for the polyesters
+    # (spread between lots), and Vd with at most one decimal.
     index, number = {"Sumita": (2.5e-5, 0.25), "Zeon": (2.5e-5, 0.06), "Osaka": (1e-3, 0.3)}.get(
         re.split("[, ]", source)[0], (6e-6, 0.01)
     )

@@ -20,8 +20,8 @@ from codesign.lens.analysis import (
 D = torch.float64
 LINES = (0.5875618, 0.4861327, 0.6562725)
 # Cooke triplet, d line: share of the 20 degree field, tangential MTF at 20, 50 and 100 / mm. Computed with
-# optiland's FFT (256 rays across);
-# its sagittal values off the axis are left out, as they take one f-number for both directions
+# optiland's FFT (256 rays across); its sagittal values off the axis are left out, as they take one f-number
+# for both directions
 PEER = {
     0.0: (0.8406794014456553, 0.41187756706890327, 0.027946421159544373),
     0.7: (0.336200636043009, 0.026627558839844315, 0.009064087984148234),

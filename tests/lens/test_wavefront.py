@@ -24,9 +24,8 @@ from codesign.lens.seidel import seidel_sums
 
 D = torch.float64
 # d line, 740 rays of a 32 x 32 grid over [-1, 1] with its ends, fields 0, 0.7 and 1 of the half field:
-# standard deviation and mean of
-# the optical path difference in waves. Computed with optiland (release of 2026) from the same indices; its
-# sign is the same.
+# standard deviation and mean of the optical path difference in waves. Computed with optiland (release of
+# 2026) from the same indices; its sign is the same.
 PEER = {
     "cooke-triplet": (
         (0.209454595832, -0.529330646764),

@@ -2,13 +2,11 @@
 traced lens, within Monte Carlo error.
 
 Statistic: Mitsuba renders K independent images with a box filter; z = (ours - their mean) / standard error of
-  the difference, per pixel, where ours is
-the mean of K images with independent sample seeds. With K = 16 on each side z follows Student's t to a good
-approximation (Welch, 15 to 30 degrees of
-freedom), whose mean square is d / (d - 2), 1.07 to 1.15. Over n pixels the mean of z^2 has a standard
-deviation of about 1.9 / sqrt(n); five of those are
-allowed around 1.1, and five standard errors for the mean of the whole image. A turn by a quarter pixel breaks
-the first, which the last test shows.
+  the difference, per pixel, where ours is the mean of K images with independent sample seeds. With K = 16 on
+  each side z follows Student's t to a good approximation (Welch, 15 to 30 degrees of freedom), whose mean
+  square is d / (d - 2), 1.07 to 1.15. Over n pixels the mean of z^2 has a standard deviation of about 1.9 /
+  sqrt(n); five of those are allowed around 1.1, and five standard errors for the mean of the whole image. A
+  turn by a quarter pixel breaks the first, which the last test shows.
 """
 
 import math
@@ -110,17 +108,15 @@ def test_pinhole_against_perspective(room):
 @pytest.mark.parametrize(("aperture_mm", "focus_m"), [(20.0, 2.0), (60.0, 1.2)])
 def test_thin_lens_against_thinlens(room, aperture_mm, focus_m):
     # Mitsuba keeps the field of view whatever the focus: its film lies at 1, ours at the image distance. A
-    # focal length f with image distance EFL
-    # focuses at 1 / focus = 1 / f - 1 / EFL.
+    # focal length f with image distance EFL focuses at 1 / focus = 1 / f - 1 / EFL.
     optics = lens.ThinLens(1 / (1 / EFL_MM + 1 / (1e3 * focus_m)), aperture_mm, EFL_MM)
     assert_the_same(own_images(room, optics), mitsuba_images(room, "thinlens", aperture_mm, focus_m))
 
 
 def test_a_traced_lens_stopped_down_against_perspective():
     # Focused at infinity (last thickness = back focal length) a triplet's chief rays near the axis are those
-    # of a pinhole of its focal length: the corner
-    # of this film is 2.3 degrees off axis, where third-order distortion (about 1 % at 20 degrees) is 1e-4 of
-    # the height, 0.003 pixels.
+    # of a pinhole of its focal length: the corner of this film is 2.3 degrees off axis, where third-order
+    # distortion (about 1 % at 20 degrees) is 1e-4 of the height, 0.003 pixels.
     geo = lens.load("cooke-triplet")
     first = geo.first_order()
     thickness = geo.thickness_mm.detach().clone()

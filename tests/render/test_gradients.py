@@ -104,9 +104,8 @@ def relative(found, truth):
 @pytest.mark.parametrize("view", ROOM_VIEWS)
 def test_photometric_loss_in_the_textured_room(view, room):
     # One per cent is asked for; 0.1 to 0.3 % is found. Bilinear texels have kinks that differences straddle
-    # (noise that grows as the
-    # root of the step), and float32 poses of 1 m round to 1e-7 (noise that falls as its inverse): steps of
-    # 0.1 to 0.3 mm lie between.
+    # (noise that grows as the root of the step), and float32 poses of 1 m round to 1e-7 (noise that falls as
+    # its inverse): steps of 0.1 to 0.3 mm lie between.
     loss = photometric(room, Camera(triplet(), 48, 48, 0.0555, 16), view)
     at = leaves()
     found = torch.autograd.grad(loss(*at), at)
@@ -117,8 +116,8 @@ def test_photometric_loss_in_the_textured_room(view, room):
 
 def test_the_mean_gradient_along_a_step_is_its_difference_even_on_grainy_photographs():
     # The fundamental theorem holds whatever the kinks: the mean of the derivative over a step is the
-    # difference quotient.
-    # On unsoftened grain a single point misses by some per cent; the mean of eight keeps a tenth of that.
+    # difference quotient. On unsoftened grain a single point misses by some per cent; the mean of eight keeps
+    # a tenth of that.
     grainy = worlds.room(
         photos=[textures.photo(p) for p in ("brick", "gravel", "grass", "camera", "coffee", "astronaut")],
         objects=False,

@@ -167,8 +167,8 @@ def test_waves_stay_inside_their_band():
 
 def test_mitsuba_renders_the_same_picture():
     """The plane in closed form against the same pattern as a bitmap of 2048 texels under Mitsuba: bilinear
-    interpolation errs by (2 pi / (texels per wave))^2 / 8 of the
-    pattern's log amplitude, 1e-5 here; float32 rays at 2 m move the pattern by 1e-7 m."""
+    interpolation errs by (2 pi / (texels per wave))^2 / 8 of the pattern's log amplitude, 1e-5 here; float32
+    rays at 2 m move the pattern by 1e-7 m."""
     import numpy as np
 
     from codesign import backend, lens, pose, render

@@ -313,9 +313,8 @@ def test_crossings_between_adaptive_frames_are_timed_within_the_bound(largest_px
 
 def test_events_of_adaptive_frames_are_timed_within_the_bound():
     # against events of closed-form intensities 5e-3 px apart, which time themselves ten thousand times
-    # better. A maximum that no frame hits may lose the
-    # events of its tip: pixels with as many events in both are compared, at slopes that stay away from 0
-    # within the step
+    # better. A maximum that no frame hits may lose the events of its tip: pixels with as many events in both
+    # are compared, at slopes that stay away from 0 within the step
     period = 16.0
     speed = 120.0
     contrast = 0.8

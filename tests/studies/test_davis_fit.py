@@ -235,9 +235,8 @@ def test_the_fit_recovers_thresholds_that_are_known():
     descend(sensor, seen, recorded, slice(0, 8), match, 120, lambda loss: None)
     found = {name: float(value.detach()) for name, value in sensor.values().items()}
     # A swing between turning points is some 8 thresholds, of which whole ones count: with the known
-    # parameters the 8 intervals' event numbers are off by
-    # up to 2 % where 20 ms samples move a turning point. The dark offset moves with the thresholds, and is
-    # known less well.
+    # parameters the 8 intervals' event numbers are off by up to 2 % where 20 ms samples move a turning point.
+    # The dark offset moves with the thresholds, and is known less well.
     assert found["theta_on"] == pytest.approx(thetas[0], rel=0.04)
     assert found["theta_off"] == pytest.approx(thetas[1], rel=0.04)
     assert found["dark_offset"] == pytest.approx(dark_offset, rel=0.12)

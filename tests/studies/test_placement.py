@@ -85,9 +85,8 @@ def test_gradient_with_smooth_events_is_that_of_the_whole_chain(task):
     """From the six numbers of the mount to the task's error, with soft counts.
 
     The error has kinks (texels, rounding of float32 frames) closer than any step of a difference, so a step
-    is compared with the mean of the
-    gradients along it, which it equals for any loss without jumps; twelve points per step leave 1 % of the
-    length.
+    is compared with the mean of the gradients along it, which it equals for any loss without jumps; twelve
+    points per step leave 1 % of the length.
     """
     mount = mount_at(62)
     start = mount.numbers.detach()

@@ -279,8 +279,8 @@ def test_the_last_tenth_of_a_data_set_is_judged_on_alone(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("undrawn")
 def test_two_processes_learn_what_one_does(tmp_path):
     """Halves of a batch are averaged in another order: float32 sums of 1024 terms differ by 1e-5 at most, and
-    AdamW takes steps of at most
-    1e-2 times the relative change of a gradient, so three steps stay within 1e-5."""
+    AdamW takes steps of at most 1e-2 times the relative change of a gradient, so three steps stay within
+    1e-5."""
     assert train(tmp_path / "one", "--steps", "3", "--learning-rate", "0.01") == 0
     arguments = [*BASE, "--steps", "3", "--learning-rate", "0.01", "--out", str(tmp_path / "two")]
     script = f"""

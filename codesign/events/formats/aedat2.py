@@ -2,8 +2,7 @@
 address and 32-bit microseconds.
 
 Bits of the address: 22 to 30 the row, counted from the bottom; 12 to 21 the column, counted from the right;
-  11 the polarity; 31 (frame sample) and
-10 (external) are zero for an event of a pixel.
+11 the polarity; 31 (frame sample) and 10 (external) are zero for an event of a pixel.
 Source: iniVation documentation, "AEDAT file formats", AEDAT 2.0; jAER, DavisBaseCamera (mirrored columns);
   v2e, aedat2_output.
 """
@@ -26,8 +25,7 @@ def write_aedat2(path, stream):
     """Write events to ``path``.
 
     Where the first event would begin with the byte of '#', which readers take for one more header line, an
-    external record at the same time (bit 10 set;
-    no event of a pixel) goes ahead of it.
+    external record at the same time (bit 10 set; no event of a pixel) goes ahead of it.
     Raises: FileFormatError for other sensors than 346 x 260 and 240 x 180, and for times outside 0 to 2^31 -
       1 us.
     """

@@ -1,8 +1,8 @@
 """The container of AEDAT 4.0: header, streams, packets, and the table of packets at the end.
 
 Layout: the line ``#!AER-DAT4.0``, an IOHeader (FlatBuffer: compression, position of the table, XML that names
-  the streams), packets of (stream, size)
-and a compressed FlatBuffer each, and a compressed FileDataTable that lists the packets once more.
+  the streams), packets of (stream, size) and a compressed FlatBuffer each, and a compressed FileDataTable
+  that lists the packets once more.
 Source: iniVation documentation, "AEDAT file formats", AEDAT 4.0; FlatBuffers schemas of dv-processing.
 """
 

@@ -12,8 +12,8 @@ def unwrapped(ticks, loop):
     """Count the loops of a clock.
 
     A fall by three quarters of the loop or more is a new loop; a smaller fall is time going back, which the
-    caller judges. (A single wrong bit changes
-    a reading by at most half a loop, so it never passes for a new one.)
+    caller judges. (A single wrong bit changes a reading by at most half a loop, so it never passes for a new
+    one.)
 
     Args: ticks: [N] int64 readings, 0 to loop - 1. loop: number of readings.
     Returns: [N] int64 readings plus ``loop`` for each new loop so far.

@@ -2,9 +2,8 @@
 time and packed x, y, polarity.
 
 The time starts again at 2^32 us; loops are counted when reading. A stream that starts beyond the first loop
-is written with those whole loops in the
-header, under a keyword of ours that other readers pass over. Loops between events cannot be told, so silences
-as long as a loop are refused.
+is written with those whole loops in the header, under a keyword of ours that other readers pass over. Loops
+between events cannot be told, so silences as long as a loop are refused.
 Source: Prophesee Metavision documentation, "DAT File Format".
 """
 

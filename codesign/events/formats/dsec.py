@@ -2,8 +2,8 @@
 ms_to_idx of milliseconds.
 
 t is uint32 microseconds since t_offset (int64), x and y uint16, p uint8 (1 ON, 0 OFF); ms_to_idx[k] is the
-first event with t >= 1000 k. What is written
-carries the sensor size as attributes height_px and width_px of the group; published files have none.
+first event with t >= 1000 k. What is written carries the sensor size as attributes height_px and width_px of
+the group; published files have none.
 Source: Gehrig et al., "DSEC: A Stereo Event Camera Dataset for Driving Scenarios", RA-L 2021; its published
   description of the data format.
 """
@@ -22,8 +22,7 @@ def from_dsec(path, arrays, attributes, height_px, width_px):
     Args: arrays: t, x, y, p, t_offset, and where present ms_to_idx (integers of any width). attributes: the
       sensor size, or empty.
     Raises: FileFormatError for lists of unequal length, times beyond 61 bits, an unknown polarity, an index
-      that is not that of the times, and what
-      arrival refuses.
+      that is not that of the times, and what arrival refuses.
     """
     t, x, y, p = (arrays[name] for name in ("t", "x", "y", "p"))
     if not (t.shape == x.shape == y.shape == p.shape == (t.size,)):

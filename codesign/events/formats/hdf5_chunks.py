@@ -1,9 +1,8 @@
 """Values of an HDF5 dataset from a file nobody vouches for.
 
 The library trusts its filters: a block that unpacks to fewer bytes than its chunk, or a filter without its
-  parameters, ends the process. So gzip blocks are
-unpacked and measured here, and Blosc blocks are handed on only when their headers say what the chunk needs;
-other filters are refused.
+parameters, ends the process. So gzip blocks are unpacked and measured here, and Blosc blocks are handed on
+only when their headers say what the chunk needs; other filters are refused.
 Source: HDF5 File Format Specification 3.0, "Data Object Header Messages: Filter Pipeline"; c-blosc,
   README_CHUNK_FORMAT.
 """

@@ -1,8 +1,8 @@
 """Prophesee RAW files: an ASCII header, then EVT 2.0 or EVT 3.0 words, little-endian.
 
 Times are those of the file: nothing is subtracted. A stream that starts beyond the first loop of the format's
-  clock (EVT 2.0: 2^34 us, EVT 3.0: 2^24 us)
-is written with those whole loops in the header, under a keyword of ours that other readers pass over.
+clock (EVT 2.0: 2^34 us, EVT 3.0: 2^24 us) is written with those whole loops in the header, under a keyword of
+ours that other readers pass over.
 Source: Prophesee Metavision documentation, "RAW File Format".
 """
 

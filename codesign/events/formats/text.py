@@ -23,8 +23,8 @@ def read_csv(path, height_px=None, width_px=None):
     """Read events from ``path``; the sensor size is the smallest that holds them unless given.
 
     Raises: FileFormatError naming the first line that is not four whole numbers, goes back in time, or has a
-      negative pixel or unknown polarity
-      (+1 and -1, or 1 and 0, are read as ON and OFF); also without events and without a size.
+      negative pixel or unknown polarity (+1 and -1, or 1 and 0, are read as ON and OFF); also without events
+      and without a size.
     """
     try:
         with open(path, encoding="ascii", newline=None) as file:

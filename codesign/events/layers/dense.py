@@ -21,14 +21,12 @@ def dense(
     """Events of a comparator that looks once per frame; a pixel that fires memorises the level it sees.
 
     With u = (L - r)/theta_on - 1 an ON event is the step H(u), likewise OFF; then r := L where one fired. In
-    the manner of SENPI: the physics of the
-    pixel forward, a surrogate only for the step.
+    the manner of SENPI: the physics of the pixel forward, a surrogate only for the step.
 
     Args:
       frames: [T, ...] linear intensity on the 0-255 scale, or log levels with ``log_input``. theta_on,
-        theta_off: thresholds > 0, scalar or broadcasting
-      over one frame. sharpness: b of the surrogate slope b/(1 + b |u|)^2, > 0. state: [...] memorised level
-        of an earlier chunk.
+        theta_off: thresholds > 0, scalar or broadcasting over one frame. sharpness: b of the surrogate slope
+        b/(1 + b |u|)^2, > 0. state: [...] memorised level of an earlier chunk.
     Returns: counts [T-1, 2, ...] of 0 and 1 ([T, 2, ...] with a state), ON first; state [...].
     Gradient: frames, thetas, state; surrogate slope at the step, exact elsewhere, through the memory.
     Raises: ShapeError, DomainError as ``memory``.

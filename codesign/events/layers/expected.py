@@ -29,15 +29,13 @@ def expected(
     """Mean counts of pixels whose thresholds scatter log-normally, with the mean memorised level carried on.
 
     With D = L - r, median threshold C and relative spread s: n = sum_k P(k theta <= |D|) = sum_k
-    Phi(ln(|D|/(k C))/s), and r moves by the mean of
-    theta times its count, sum_k C e^(s^2/2) Phi(ln(|D|/(k C))/s - s). A level at rest gives exactly nothing;
-    s -> 0 gives the hard count.
+    Phi(ln(|D|/(k C))/s), and r moves by the mean of theta times its count, sum_k C e^(s^2/2) Phi(ln(|D|/(k
+    C))/s - s). A level at rest gives exactly nothing; s -> 0 gives the hard count.
 
     Args:
       frames: [T, ...] linear intensity on the 0-255 scale, or log levels with ``log_input``. theta_on,
-        theta_off: median thresholds > 0, scalar or
-      broadcasting over one frame. spread: s, relative standard deviation (sigma/theta), 0.01 to 1; see
-        ``annealed``. state: [...] as for ``memory``.
+        theta_off: median thresholds > 0, scalar or broadcasting over one frame. spread: s, relative standard
+        deviation (sigma/theta), 0.01 to 1; see ``annealed``. state: [...] as for ``memory``.
     Returns: counts [T-1, 2, ...] >= 0 ([T, 2, ...] with a state), ON first; state [...].
     Gradient: frames, thetas, spread, state: exact, smooth for D other than 0, where all derivatives vanish.
     Raises: ShapeError, DomainError as ``memory``, and for a spread outside its range.

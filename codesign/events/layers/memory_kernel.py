@@ -5,13 +5,11 @@ Forward, with L the log level, r the memorised level and C the threshold on the 
 r|/C), r += C n.
 
 Backward follows the mean of n over where in its threshold a pixel happens to stand. After a turn of the
-signal r lies anywhere within one C of the turning
-point, so on average nothing fires until the way back exceeds C, and 1/C per unit of level from then on: a
-play (backlash) of width w = (C_on + C_off)/2,
-centre m. It moves only where L leaves it, by as much as L does: n_on = (L - m - w/2)/C_on, n_off = (m - w/2 -
-L)/C_off, and the edge then stands at L.
-So an engaged step pulls at its own level, and pushes at the level of the step engaged before: the loop
-forward in time writes both.
+signal r lies anywhere within one C of the turning point, so on average nothing fires until the way back
+exceeds C, and 1/C per unit of level from then on: a play (backlash) of width w = (C_on + C_off)/2, centre m.
+It moves only where L leaves it, by as much as L does: n_on = (L - m - w/2)/C_on, n_off = (m - w/2 - L)/C_off,
+and the edge then stands at L. So an engaged step pulls at its own level, and pushes at the level of the step
+engaged before: the loop forward in time writes both.
 """
 
 import torch
@@ -127,8 +125,7 @@ def count(frames, start, theta_on, theta_off, front_end):
 
 def adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end, *, first, wants_thetas):
     """Adjoint of ``count``: gradients of the frames [first + T, ...] (rows before ``first`` are left to the
-    caller), start, theta_on, theta_off [...] (zero
-    unless wanted).
+    caller), start, theta_on, theta_off [...] (zero unless wanted).
 
     Args: grad_end: [...] of the memorised level and the play's centre together; the start's is theirs
       together, too.

@@ -28,9 +28,8 @@ DESIGN = (
 @dataclass(frozen=True)
 class PhysicalState:
     """What ``sensor_counts`` carries over chunks. sensor: SensorState of the hard sensor; reference, level:
-    [...] of the smooth account (their graph is
-    kept); frame: [...] last frame; draws: [2, ...] standard normal numbers of the thresholds; time_s: time of
-    the last frame."""
+    [...] of the smooth account (their graph is kept); frame: [...] last frame; draws: [2, ...] standard
+    normal numbers of the thresholds; time_s: time of the last frame."""
 
     sensor: SensorState
     reference: Tensor
@@ -53,11 +52,9 @@ def sensor_counts(
     """Event counts of the physical sensor with gradients to frames and to the sensor's own parameters.
 
     Forward: exactly the counts of ``simulate``, noise and all. Backward: the low-pass is linear and exact;
-      thresholds are C = theta + sigma e with the
-    drawn e held fixed; leakage adds a known ramp; counts follow ``memory`` (slope 1/C through the memorised
-    level); dead time T thins n events of
-    smooth rate r to n / max(1, r T + 1/2), the mean of regular arrivals over all phases. Noise events have no
-    gradient.
+      thresholds are C = theta + sigma e with the drawn e held fixed; leakage adds a known ramp; counts follow
+      ``memory`` (slope 1/C through the memorised level); dead time T thins n events of smooth rate r to n /
+      max(1, r T + 1/2), the mean of regular arrivals over all phases. Noise events have no gradient.
 
     Args:
       frames: [T, ...] intensity on the 0-255 scale, or its natural logarithm with ``log_input``. t_s: [T]

@@ -2,11 +2,10 @@
 noise events, dead time.
 
 Between frames the signal s (the low-passed log level plus noise) and the leak are linear in time, so D = s -
-M, with M the memorised level, crosses a
-threshold at a time known in closed form, and all crossings of an interval lie on one side. Noise events are a
-Poisson process in continuous time: a
-pixel carries the hazard that must still pass until its next one, so nothing depends on the frame rate or on
-chunks, and nothing is drawn in vain.
+M, with M the memorised level, crosses a threshold at a time known in closed form, and all crossings of an
+interval lie on one side. Noise events are a Poisson process in continuous time: a pixel carries the hazard
+that must still pass until its next one, so nothing depends on the frame rate or on chunks, and nothing is
+drawn in vain.
 """
 
 import math
@@ -40,8 +39,8 @@ def run(frames, front_end, dt_s, interval_key, sensor, state, sink):
       interval_key: [T] int32, random. sensor: SensorModel. state: SensorState (read only).
       sink: ``EventKeys`` or ``DenseCounts``; takes every event.
     Returns: dict of the carried tensors after the chunk; what was wrong: 0 nothing, 1 a value that is not
-      finite or negative, 2 a pixel with more than
-      ``MOST_EVENTS`` events in an interval (then everything else is void).
+      finite or negative, 2 a pixel with more than ``MOST_EVENTS`` events in an interval (then everything else
+      is void).
     """
     import drjit as dr
 

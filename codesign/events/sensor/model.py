@@ -112,9 +112,8 @@ class SensorModel:
         ``photoreceptor_noise``.
 
         Source: v2e's fit of the threshold-to-noise ratio that gives a wanted noise rate R at bandwidth f:
-          with x = log10(R / 2 f), the smaller of the
-        two thresholds over 10^y, y = -0.0026 x^3 - 0.036 x^2 - 0.1949 x + 0.321. The mean of the smaller one
-        is exact here (v2e draws 300).
+          with x = log10(R / 2 f), the smaller of the two thresholds over 10^y, y = -0.0026 x^3 - 0.036 x^2 -
+          0.1949 x + 0.321. The mean of the smaller one is exact here (v2e draws 300).
         """
         if not self.photoreceptor_noise:
             return 0.0

@@ -2,8 +2,7 @@
 interval.
 
 A sink gives ``tally`` (what it carries through the events of one interval of a pixel), ``take`` (one event),
-``close`` (the end of the interval) and
-``arrays`` (what to evaluate).
+``close`` (the end of the interval) and ``arrays`` (what to evaluate).
 """
 
 from dataclasses import dataclass
@@ -18,8 +17,7 @@ class EventKeys:
 
     def __init__(self, dr, arr, start_s, end_s, layout, capacity):
         """Args: start_s, end_s: lists, ends of every interval, seconds. layout: KeyLayout. capacity: room for
-        so many events; ``found`` tells how many
-        there were."""
+        so many events; ``found`` tells how many there were."""
         start_us, end_us = ([round(time_s * 1e6) for time_s in times] for times in (start_s, end_s))
         length_us = [(end - start) * 1e6 for start, end in zip(start_s, end_s, strict=True)]
         # single precision resolves a microsecond of intervals up to a second to better than a tenth

@@ -16,13 +16,11 @@ class SensorState:
     reference: [H, W] memorised log level. level: [H, W] log level behind the low-pass. theta_on, theta_off:
       [H, W] drawn thresholds.
     start_s, time_s: times of the first and the last frame. generator: used when none is passed; starts at
-      seed 0.
-    Only where the sensor needs them: input_level, input: [H, W] last log level before the low-pass, last
-      intensity; noise: [H, W] photoreceptor
-    noise; leak_hz: [H, W]; last_event_s: [H, W] time of the last event (since the first frame for timing
-    "v2e", since the last frame otherwise,
-    so <= 0); hazard: [H, W] noise still to pass until the next noise event; key, shots: [H, W] int32 random
-    key and noise events so far.
+      seed 0. Only where the sensor needs them: input_level, input: [H, W] last log level before the low-pass,
+      last intensity; noise: [H, W] photoreceptor noise; leak_hz: [H, W]; last_event_s: [H, W] time of the
+      last event (since the first frame for timing "v2e", since the last frame otherwise, so <= 0); hazard:
+      [H, W] noise still to pass until the next noise event; key, shots: [H, W] int32 random key and noise
+      events so far.
     """
 
     # Any: filled by the first frame, and used as tensors and numbers from then on
@@ -52,7 +50,7 @@ def begin(state, sensor, frame, level, time_s, generator):
     """Fill an empty state at the first frame, which gives no event.
 
     Draws, in this order and only what the sensor has: thresholds, leak rates, hot pixels, first noise
-      hazards, keys.
+    hazards, keys.
     Args: frame: [H, W] intensity. level: [H, W] its log level.
     """
     pixels = level.shape

@@ -1,8 +1,7 @@
 """Frames of a Photron high-speed camera: raw values in .mraw, their description beside it in .cihx or .cih.
 
 Source: the published reader pyMRAW (github.com/ladisk/pyMRAW) for the names of the fields and the packing of
-  12 bits: two values in three bytes,
-the first in byte 0 and the upper half of byte 1.
+  12 bits: two values in three bytes, the first in byte 0 and the upper half of byte 1.
 """
 
 import re

@@ -15,10 +15,9 @@ def open_frames(path: str | Path) -> FrameSource:
 
     Args:
       path: .mp4, .avi, .mov, .mkv, .webm, .gif …; a folder of PNG, JPEG, TIFF or BMP of 8 or 16 bits, taken
-        in natural order (2 before 10);
-        .npy [T, H, W] or [T, H, W, 3]; .npz with one such array (called ``frames`` if there are several) and,
-        if wanted, its times as ``t_s`` or ``t_us``;
-        .mraw with its .cihx or .cih beside it.
+        in natural order (2 before 10); .npy [T, H, W] or [T, H, W, 3]; .npz with one such array (called
+        ``frames`` if there are several) and, if wanted, its times as ``t_s`` or ``t_us``; .mraw with its
+        .cihx or .cih beside it.
     Returns: FrameSource.
     Raises: FileFormatError when there is nothing at the path, or nothing that can be read as at least two
       frames of one size.

@@ -21,8 +21,8 @@ def open_video(path):
     decoded again when they are asked for.
 
     Times are exact multiples of the container's time base, also where the frame rate varies. Frames are those
-    that FFmpeg decodes, in colour of 8 bits,
-    or of 16 for videos of more than 8; none is repeated or left out to reach an even rate.
+    that FFmpeg decodes, in colour of 8 bits, or of 16 for videos of more than 8; none is repeated or left out
+    to reach an even rate.
     Raises: FileFormatError when FFmpeg finds no video in the file, or fewer than two frames.
     """
     t_s, complaint = _times(path)

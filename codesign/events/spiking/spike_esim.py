@@ -47,10 +47,9 @@ class SpikeEsim(nn.Module):
     identity or at zero effect.
 
     theta_on, theta_off: contrast thresholds > 0, natural log units. refractory_s: dead time, 0 for none;
-      learnt when above 0. cutoff_hz: corner frequency
-      at full light that the bandwidth starts to learn from. comparator: "memory" (any number of events per
-      interval) or "srm" (coupled spike response
-      layer, at most one per step and polarity). width, depth: of the residual branch. seed: of its weights.
+      learnt when above 0. cutoff_hz: corner frequency at full light that the bandwidth starts to learn from.
+      comparator: "memory" (any number of events per interval) or "srm" (coupled spike response layer, at most
+      one per step and polarity). width, depth: of the residual branch. seed: of its weights.
     """
 
     def __init__(

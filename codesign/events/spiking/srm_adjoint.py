@@ -63,8 +63,7 @@ def scan_back(plan, wanted, grid, numbers, surrogate, arrays, carried, span, ori
       numbers: per channel, by name: as in ``scan``, and response_a_h, response_m_h, reset_a_h, reset_m_h,
         reset_m_theta, limit.
       arrays: flat arrays by name: drive, grad_spikes, grad_potential, grad_drive (scattered into) and spikes
-        hold all steps; potential begins at step
-        ``origin`` (opaque). None: no such gradient.
+        hold all steps; potential begins at step ``origin`` (opaque). None: no such gradient.
       carried: loop variables after the last step.
       span: first step and end, opaque.
     Returns: loop variables before the first step.

@@ -8,8 +8,8 @@ states.
     none     y = z
 
 No sum is cut: the recursion is the whole kernel. ``retreat`` is the adjoint of ``advance``, and its
-  derivative with respect to one parameter of a and m is
-``retreat_tangent``; all three work on numbers and on arrays of any library.
+derivative with respect to one parameter of a and m is ``retreat_tangent``; all three work on numbers and on
+arrays of any library.
 """
 
 import math

@@ -29,14 +29,13 @@ class TwoBranchSpikes(nn.Module):
     and branch, no bias, no shared weight.
 
     It has no memory of brightness: a change that is too slow to reach the threshold within the reset's time
-      never gives an event.
+    never gives an event.
 
     channels: 3 for RGB, 1 for monochrome frames. theta: threshold > 0. tau_r: time constant of the reset, in
       the unit of dt. dt: length of a step.
     smoothing_tau: None for the network itself; else time constant of an alpha response of the drive before
-      the threshold (temporal smoothing): weak
-      changes add up over a few tau, and events come later, by 2 tau for a short change. kernel, surrogate,
-      through_reset: as for ``events.srm``.
+      the threshold (temporal smoothing): weak changes add up over a few tau, and events come later, by 2 tau
+      for a short change. kernel, surrogate, through_reset: as for ``events.srm``.
     seed: of the weights, uniform in 0 to 1 over their number, so that ON starts as brighter and OFF as
       darker.
     """

@@ -35,8 +35,8 @@ def between(first, second, flows, seen, share):
       first, second: [H, W] linear intensity. flows: [2, 2, H, W] from ``flow_both_ways``. seen: [2, H, W]
         from ``visibility``. share: 0..1.
     Returns: [H, W]. What the bicubic kernel makes darker or brighter than all nine pixels around is set to
-      the darkest or brightest of them: next to a
-      sharp edge its overshoot would be many thresholds of a dark pixel.
+      the darkest or brightest of them: next to a sharp edge its overshoot would be many thresholds of a dark
+      pixel.
     Gradient: first and second (piecewise linear in them), for fixed flows.
     Source: flow carried forward to the time asked for, Baker et al., A database and evaluation methodology
       for optical flow, 2011, section 3.3.

@@ -27,8 +27,8 @@ def refined(first, second, flow, warps, iterations):
         solver in between.
     Returns: [B, 2, H, W]. Where the flow leaves the picture it follows its neighbours.
     Source: Zach, Pock and Bischof, A duality based approach for realtime TV-L1 optical flow, DAGM 2007;
-      gradients averaged over both pictures and
-      a median filter between warps as in Wedel et al., An improved algorithm for TV-L1 optical flow, 2009.
+      gradients averaged over both pictures and a median filter between warps as in Wedel et al., An improved
+      algorithm for TV-L1 optical flow, 2009.
     """
     dual_x = torch.zeros_like(flow)
     dual_y = torch.zeros_like(flow)

@@ -30,8 +30,8 @@ def upsample(
     """Put frames between the frames of a video until nothing moves further than a bound from one to the next.
 
     Frames are taken as instantaneous: blur of an exposure is moved along and not undone. Motion is straight
-      and even between two frames, and light
-    changes evenly along it. Each interval gets as many steps as its own motion asks for.
+    and even between two frames, and light changes evenly along it. Each interval gets as many steps as its
+    own motion asks for.
 
     Args:
       frames: [T, H, W] linear intensity on the 0-255 scale, finite, >= 0.
@@ -44,8 +44,8 @@ def upsample(
       equal, nothing is put between.
     Gradient: frames, for the flow, visibility and number of steps found, which are held fixed; none to times.
     Raises: ShapeError for fewer than two frames or other shapes; DomainError for NaN, infinite or negative
-      frames, times that do not increase, bounds that
-      are not positive, or an interval that needs more than max_steps.
+      frames, times that do not increase, bounds that are not positive, or an interval that needs more than
+      max_steps.
     Source: Gehrig et al., Video to Events, CVPR 2020 (upsampling before event generation); Rebecq et al.,
       ESIM, CoRL 2018 (both bounds).
     """
@@ -77,8 +77,7 @@ def upsample_stream(
     Args: frames: anything that yields frames [H, W]. t_s: anything that yields as many times. The rest as for
       ``upsample``.
     Returns: iterator over (frames [n, H, W], times [n] float64): first the first frame alone, then for each
-      later frame those that lead to it, and itself.
-      Joined they are what ``upsample`` gives, bit for bit.
+      later frame those that lead to it, and itself. Joined they are what ``upsample`` gives, bit for bit.
     Raises: as ``upsample``; bounds at once, frames and times when they come.
     """
     for name, bound in (("max_displacement_px", max_displacement_px), ("max_log_change", max_log_change)):

@@ -19,8 +19,7 @@ def sampled(pictures, displacement_px, mode="bicubic"):
     """Pictures read at every pixel plus its displacement; outside, the nearest edge.
 
     Args: pictures: [B, C, H, W]. displacement_px: [B, 2, H, W], +x right, +y down. mode: "bicubic" (Keys'
-      kernel with -0.75: sharp, and off by at most 0.048 px on a slope),
-        "bilinear" or "nearest".
+      kernel with -0.75: sharp, and off by at most 0.048 px on a slope), "bilinear" or "nearest".
     Gradient: pictures (linear in them), and the displacement.
     """
     height, width = pictures.shape[-2:]

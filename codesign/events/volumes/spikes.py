@@ -19,10 +19,9 @@ def spikes_from_stream(
       t0_us: start of step 0, whole microseconds. step_us: length of a step, whole microseconds, > 0. steps:
         number of steps T, >= 1.
     Returns: [2, W, H, T]: 1 where at least one event lies in [t0 + k step, t0 + (k + 1) step), else 0. Events
-      of one pixel, polarity and step become one
-      spike (the number of events less the sum of the tensor says how many went into others); those outside
-      the T steps are not asked for.
-      Neurons of ``events.srm``: ``spikes.flatten(0, 2).T`` is [T, N].
+      of one pixel, polarity and step become one spike (the number of events less the sum of the tensor says
+      how many went into others); those outside the T steps are not asked for. Neurons of ``events.srm``:
+      ``spikes.flatten(0, 2).T`` is [T, N].
     Gradient: none (timestamps are integers).
     Raises: DomainError for times or numbers that are not whole, or not positive.
     Source: layout of Gehrig et al., Event-Based Angular Velocity Regression with Spiking Networks, ICRA 2020,

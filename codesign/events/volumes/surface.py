@@ -110,8 +110,8 @@ def surface_from_counts(counts: Tensor, t_s: Times, tau_s: float) -> Tensor:
     """Time surface after every frame interval, from hard or soft counts.
 
     The events of an interval of length d sit at its middle. With m = min(count, 1): S <- (1 - m) S exp(-d /
-    tau) + m exp(-d / (2 tau)). Whole counts give
-    the surface of such events exactly; a count between 0 and 1 is the share of an event, and mixes the two.
+    tau) + m exp(-d / (2 tau)). Whole counts give the surface of such events exactly; a count between 0 and 1
+    is the share of an event, and mixes the two.
 
     Args:
       counts: [T-1, 2, ..., H, W] counts >= 0, ON first. t_s: [T] seconds, strictly increasing. tau_s:

@@ -1,9 +1,8 @@
 """Event volumes: counts on a grid of time bins, shared linearly between the two nearest bins.
 
 With n bins the nodes are n equally spaced times from the start to the end of the interval. An event between
-two nodes is shared in proportion to its
-nearness, so nothing is lost. The end bins collect from one side only: half as much as the others, centred a
-third of a node spacing inside.
+two nodes is shared in proportion to its nearness, so nothing is lost. The end bins collect from one side
+only: half as much as the others, centred a third of a node spacing inside.
 """
 
 import torch
