@@ -41,7 +41,18 @@ GROUPS = {
         "flow_cost",
         "flow_recording",
     ),
-    "whole chain": ("lens_opt", "lens_opt_seeds", "placement", "gradient_flow", "speed_error", "stability"),
+    "whole chain": (
+        "lens_opt",
+        "lens_opt_seeds",
+        "combinations",
+        "joint_design",
+        "placement",
+        "gradient_flow",
+        "certify_precision",
+        "speed_error",
+        "stability",
+        "chain_picture",
+    ),
 }
 OTHERS = "others"  # where a study is listed that no group names
 RUNS = re.compile(r'^if __name__ == "__main__":', re.M)
