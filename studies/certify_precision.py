@@ -8,6 +8,7 @@ Counted: right gradients that fail, wrong ones that pass, and how many of each a
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
@@ -26,6 +27,7 @@ Drawn = tuple[Function, torch.Tensor, int | None]
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
+    QUICK: ClassVar = {"cases": 4}
     cases: int = 40
     """Right gradients per function and precision, and as many wrong ones."""
 
@@ -33,7 +35,7 @@ class Config(StudyConfig):
 def study(run: Run[Config]) -> None:
     if run.config.cases < 1:
         raise DomainError(f"cases = {run.config.cases} must be at least 1.")
-    count = 4 if run.config.quick else run.config.cases
+    count = run.config.cases
     jobs = [(name, dtype) for name in FUNCTIONS for dtype in DTYPES]
     table = []
     with run.progress(len(jobs), "certifying") as progress:
