@@ -75,7 +75,7 @@ def load(folder: Path, learner: Learner, facts: dict[str, Any]) -> Progress | No
         curves = {name: tensors.pop(f"curve/{name}").tolist() for name in CURVES}
     except (KeyError, TypeError) as error:
         raise _damaged(path, error) from error
-    if content.get("step") != progress.step or any(len(curve) != progress.step for curve in curves.values()):
+    if content.get("step") != progress.step:
         raise FileFormatError(f"'{path}' and '{file}' are of different steps; start a new run.")
     learner.load_state_dict(tensors, folder / file)
     progress.loss = curves["loss"]

@@ -254,7 +254,7 @@ def run():
     judge = nearness if ranks.rank == 0 else lambda network: 1 / 0
     made = train.fit(network, Made(before=before), steps=6, batch=4, optimiser=adam(network, 0.01),
         average=0.5, ranks=ranks, validate=judge, validate_every=2, save_to=sys.argv[1])
-    return network.layer.weight, made.loss, len(made.validation)
+    return network.layer.weight, made.loss, made.norm, len(made.validation)
 try:
     run()
 except KeyboardInterrupt:
@@ -311,10 +311,11 @@ def test_two_processes_interrupted_and_resumed_learn_what_one_does(tmp_path):
     assert torch.equal(found[0][0], found[1][0]), "the best weights reach every process"
     assert torch.allclose(found[0][0], network.layer.weight, atol=1e-5, rtol=0)
     assert not torch.equal(network.layer.weight, linear().layer.weight)
-    for _, loss, _, asked in found:
+    for _, loss, norm, _, asked in found:
         assert loss == pytest.approx(alone.loss, rel=1e-5)
+        assert norm == pytest.approx(alone.norm, rel=1e-5)
         assert asked == [1, 2, 2, 2] * 2, "one look and three steps on half a batch, twice"
-    assert found[0][2] == 3
+    assert found[0][3] == 3
     assert [path.name for path in (tmp_path / "two").iterdir() if path.suffix == ".json"] == [
         "checkpoint.json"
     ]

@@ -12,7 +12,7 @@ from tests.flow_training_case import TRUE_WEIGHTS, Linear, Made
 
 def test_scores_are_those_worked_out_by_hand():
     """Two windows: true flow (3, 4) on 2 pixels and (0, 1) on 1. The estimate (3, 0) is 4, 4 and sqrt(10)
-    off; zero flow 5, 5 and 1."""
+    off; zero flow 5, 5 and 1. Then the first window once more."""
     flow = torch.zeros(2, 2, 1, 2)
     valid = torch.tensor([[[True, True]], [[False, True]]])
     flow[0, 0], flow[0, 1], flow[1, 1] = 3, 4, 1
@@ -22,11 +22,20 @@ def test_scores_are_those_worked_out_by_hand():
     )
     guess = torch.zeros(2, 2, 1, 2)
     guess[:, 0] = 3
-    found = score(lambda volume: FlowField(guess, valid, 1.0), [windows, windows])
-    assert found.aee_px == pytest.approx((8 + math.sqrt(10)) / 3)
-    assert found.zero_flow_px == pytest.approx(11 / 3)
-    assert found.ratio == pytest.approx((8 + math.sqrt(10)) / 11)
-    assert (found.worse_percent, found.windows) == (50.0, 4)
+    first = FlowWindows(
+        EventVolume(windows.volume.counts[:1], torch.tensor([0.0, 1.0]), torch.tensor([0.5, 0.5])),
+        FlowField(flow[:1], valid[:1], 1.0),
+    )
+
+    def guessed(volume):
+        return FlowField(guess[: len(volume.counts)], valid, 1.0)
+
+    found = score(guessed, [windows, first])
+    assert found.aee_px == pytest.approx((16 + math.sqrt(10)) / 5)
+    assert found.zero_flow_px == pytest.approx(21 / 5)
+    assert found.ratio == pytest.approx((16 + math.sqrt(10)) / 21)
+    assert found.worse_percent == pytest.approx(100 / 3)
+    assert found.windows == 3
 
 
 class Short(Made):
