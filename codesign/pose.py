@@ -1,13 +1,16 @@
 """Rigid motions: SE(3) exponential, composition, inverse. T_world_cam maps camera points to the world and
 reads right to left."""
 
+from collections.abc import Sequence
+
 import torch
 from kornia.geometry.liegroup import Se3
+from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
 
 
-def se3_exp(twist):
+def se3_exp(twist: Tensor) -> Tensor:
     """Rigid transform of a twist.
 
     Args: twist [..., 6]: translation part (m) then rotation vector (rad), in the frame on the right of the
@@ -24,20 +27,26 @@ def se3_exp(twist):
     )  # kornia wraps constants in parameters that would ask for gradients
 
 
-def inverse(transform):
+def inverse(transform: Tensor) -> Tensor:
     """Inverse of rigid transforms [..., 4, 4]."""
     rotation = transform[..., :3, :3]
     translation = transform[..., :3, 3:]
-    top = torch.cat([rotation.mT, -rotation.mT @ translation], -1)
+    # written out by element: a matrix product may round differently in another batch
+    x, y, z = (rotation[..., k, :, None] * translation[..., k : k + 1, :] for k in range(3))
+    top = torch.cat([rotation.mT, -(x + y + z)], -1)
     return torch.cat([top, transform[..., 3:, :]], -2)
 
 
-def apply(transform, points):
+def apply(transform: Tensor, points: Tensor) -> Tensor:
     """Transform points [..., N, 3] by [..., 4, 4]."""
     return points @ transform[..., :3, :3].mT + transform[..., None, :3, 3]
 
 
-def look_at(origin_m, target_m, down=(0.0, 0.0, -1.0)):
+def look_at(
+    origin_m: Sequence[float] | Tensor,
+    target_m: Sequence[float] | Tensor,
+    down: Sequence[float] | Tensor = (0.0, 0.0, -1.0),
+) -> Tensor:
     """T_world_cam of a camera (x right, y down, z forward) at ``origin_m`` facing ``target_m``; ``down`` is
     the image's down direction in the world.
 
@@ -66,14 +75,14 @@ def look_at(origin_m, target_m, down=(0.0, 0.0, -1.0)):
     return pose
 
 
-def check_pose(transform):
+def check_pose(transform: Tensor) -> Tensor:
     """Raise unless the tensor is one rigid transform [4, 4]; returns it."""
     if transform.shape != (4, 4):
         raise ShapeError(f"a pose must be [4, 4], got {tuple(transform.shape)}.")
     return check_poses(transform[None])[0]
 
 
-def check_poses(transform):
+def check_poses(transform: Tensor) -> Tensor:
     """Raise unless the tensor holds rigid transforms [..., T >= 1, 4, 4], a trajectory or a batch of them;
     returns it."""
     if transform.ndim < 3 or transform.shape[-2:] != (4, 4) or transform.numel() == 0:

@@ -7,8 +7,7 @@ import torch
 
 from codesign.errors import DomainError
 from codesign.place import Mount
-from codesign.render.truth import first_hits
-from codesign.types import Rays
+from codesign.render.hits import first_hits
 from scenes.trajectories import Driving, Flying, Orbital, Swinging, body_at, mounted
 
 FAMILIES = ("orbital", "radial", "vertical", "driving", "flying")
@@ -98,9 +97,7 @@ def _keeps_clear(T_world_cam, scene, camera):
     """Whether a coarse grid of chief rays meets something, but nothing too near, at every pose."""
     pixels = camera.film.pixels()
     rays = camera.chief_rays(pixels[:: max(1, len(pixels) // 97)])
-    rays = Rays(rays.origin_m.detach(), rays.direction.detach(), rays.weight.detach())
-    for pose in T_world_cam:
-        hits = first_hits(rays, scene, [pose])
-        if float((hits.part >= 0).double().mean()) < SEEN or float(hits.distance_m.min()) < CLEAR_M:
-            return False
-    return True
+    with torch.no_grad():
+        hits = first_hits(rays.origin_m, rays.direction, rays.weight > 0, scene, T_world_cam[None])
+    seen = (hits.part >= 0).double().mean(1)
+    return bool(((seen >= SEEN) & (hits.distance_m.amin(1) >= CLEAR_M)).all())

@@ -21,6 +21,9 @@ FIRST_MET = {  # modules whose examples a user meets first
     "codesign.events.sensor.simulate",
     "codesign.events.spiking.srm",
     "codesign.events.volumes.volume",
+    "codesign.render.camera",
+    "codesign.render.sequence",
+    "codesign.render.truth",
 }
 
 

@@ -1,10 +1,12 @@
 """Cameras, scenes and frames: one wavefront for all frames, ground truth through the current lens."""
 
-from codesign.render import truth
-from codesign.render.camera import Camera, Film, angular_miss_rad, project
+from codesign.render import sequence, truth
+from codesign.render.camera import Camera, angular_miss_rad, project
 from codesign.render.check import check_view
+from codesign.render.film import Film
 from codesign.render.moving import MovingScene
 from codesign.render.planes import TexturedPlane
+from codesign.render.projection import ProjectionTable
 from codesign.render.sequence import frames
 from codesign.render.time import (
     adaptive_times,
@@ -14,7 +16,15 @@ from codesign.render.time import (
     gauss_legendre,
     midpoints,
 )
-from codesign.render.truth import FlowTruth, View, flow_and_occlusion, true_flow, view
+from codesign.render.truth import (
+    FlowTruth,
+    FramesTruth,
+    View,
+    flow_and_occlusion,
+    true_flow,
+    truth_of_frames,
+    view,
+)
 from codesign.render.velocity import camera_velocity
 from codesign.render.wavefront import shade
 from codesign.render.world import MitsubaScene
@@ -23,8 +33,10 @@ __all__ = [
     "Camera",
     "Film",
     "FlowTruth",
+    "FramesTruth",
     "MitsubaScene",
     "MovingScene",
+    "ProjectionTable",
     "TexturedPlane",
     "View",
     "adaptive_times",
@@ -39,8 +51,10 @@ __all__ = [
     "gauss_legendre",
     "midpoints",
     "project",
+    "sequence",
     "shade",
     "true_flow",
     "truth",
+    "truth_of_frames",
     "view",
 ]

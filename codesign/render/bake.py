@@ -7,6 +7,7 @@ coarse light map; albedo and emission are read at their own resolution; the prod
 """
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,8 +32,16 @@ INVISIBLE = ("point", "directional", "spot")  # lamps that no camera ray meets
 
 
 def bake(
-    description, device="cpu", *, texel_m=0.05, samples=64, seed=0, max_depth=8, max_texels=512, fine=10
-):
+    description: Mapping[str, Any],
+    device: str = "cpu",
+    *,
+    texel_m: float = 0.05,
+    samples: int = 64,
+    seed: int = 0,
+    max_depth: int = 8,
+    max_texels: int = 512,
+    fine: int = 10,
+) -> MitsubaScene:
     """A MitsubaScene whose emissive textures are the outgoing radiance of a Lambertian scene.
 
     Args:

@@ -14,6 +14,7 @@ Reynolds' transport theorem.
 
 import math
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,6 +22,7 @@ from torch import Tensor
 from codesign.backend import arrays
 from codesign.errors import DomainError
 from codesign.pose import apply, inverse
+from codesign.render.camera import Camera
 from codesign.render.sampling import film_pupil_pattern
 
 # where the two radiances are read, either side of a curve; a float32 ray is good to a hundredth of that
@@ -46,7 +48,7 @@ class CurvePoints:
     frame: Tensor
 
 
-def boundary_term(camera, scene, T_world_cam, per_px=2.5):
+def boundary_term(camera: Camera, scene: Any, T_world_cam: Tensor, per_px: float = 2.5) -> Tensor:
     """Zero-valued image [..., T, *film.shape] whose gradient is that of moving silhouettes and edges.
 
     Args: camera, scene, T_world_cam as for ``frames``; scene with ``outline()`` and

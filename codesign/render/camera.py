@@ -2,11 +2,15 @@
 
 import copy
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.render.film import Film, check_whole, coarse_pixels
+from codesign.render.kinds import Lens
 from codesign.render.sampling import film_pupil_pattern
 from codesign.types import Rays
 
@@ -19,92 +23,13 @@ CHECKED_ACROSS = 32
 CHECKED_RAYS = 16
 
 
-@dataclass(frozen=True)
-class Film:
-    """Pixels of a sensor, or of rectangular windows on it.
-
-    windows_px: tuple of (left, top); each window has height_px rows and width_px columns. A pixel's
-      coordinate is that of its
-    centre: column 0 of the full sensor is x = 0, and the lens axis is at the sensor's middle.
-    """
-
-    sensor_width_px: int
-    sensor_height_px: int
-    width_px: int
-    height_px: int
-    pixel_pitch_mm: float
-    windows_px: tuple[tuple[int, int], ...] | None = None
-
-    def check(self):
-        """Raise DomainError unless there are pixels and every window lies on the sensor; returns the film."""
-        for label in ("sensor_width_px", "sensor_height_px", "width_px", "height_px"):
-            _check_whole(label, getattr(self, label))
-        if not 0 < self.pixel_pitch_mm < float("inf"):
-            raise DomainError(f"camera: pixel_pitch_mm = {self.pixel_pitch_mm} must be positive and finite.")
-        if self.windows_px is not None and len(self.windows_px) == 0:
-            raise DomainError(
-                "camera: there is no window on the film; give at least one, or None for the whole sensor."
-            )
-        for left, top in self.windows_px or ((0, 0),):
-            if not (
-                0 <= left <= self.sensor_width_px - self.width_px
-                and 0 <= top <= self.sensor_height_px - self.height_px
-            ):
-                raise DomainError(
-                    f"camera: the window ({left}, {top}) of {self.width_px} x {self.height_px} pixels does "
-                    f"not lie on the sensor of {self.sensor_width_px} x {self.sensor_height_px}; move or "
-                    "shrink it."
-                )
-        return self
-
-    @property
-    def shape(self):
-        """Shape of one image: (H, W) for the whole sensor, (windows, H, W) for windows (one window too)."""
-        return (
-            (self.height_px, self.width_px)
-            if self.windows_px is None
-            else (len(self.windows_px), self.height_px, self.width_px)
-        )
-
-    @property
-    def middle_px(self):
-        return torch.tensor(
-            [(self.sensor_width_px - 1) / 2, (self.sensor_height_px - 1) / 2], dtype=torch.float64
-        )
-
-    def pixels(self):
-        """Coordinates (x, y) of all pixel centres on the full sensor, [P, 2] float64, in image order."""
-        y, x = torch.meshgrid(
-            torch.arange(self.height_px, dtype=torch.float64),
-            torch.arange(self.width_px, dtype=torch.float64),
-            indexing="ij",
-        )
-        base = torch.stack([x.reshape(-1), y.reshape(-1)], 1)
-        corners = torch.tensor(self.windows_px or ((0, 0),), dtype=torch.float64)
-        return (corners[:, None] + base).reshape(-1, 2)
-
-
-def coarse_pixels(film, every_px):
-    """Pixel coordinates [N, 2] on a grid over every window of the film, its last rows and columns
-    included."""
-    rows, columns = (
-        torch.linspace(0, n - 1, max(1, math.ceil((n - 1) / every_px)) + 1, dtype=torch.float64)
-        if n > 1
-        else torch.zeros(1, dtype=torch.float64)
-        for n in (film.height_px, film.width_px)
-    )
-    y, x = torch.meshgrid(rows, columns, indexing="ij")
-    corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
-    return (corners[:, None] + torch.stack([x.reshape(-1), y.reshape(-1)], 1)).reshape(-1, 2)
-
-
-def _check_whole(label, value):
-    if not (value >= 1 and value % 1 == 0):
-        raise DomainError(f"camera: {label} = {value} must be a whole number of at least 1.")
-
-
 class Camera:
     """A lens (GeoLens, ThinLens or Pinhole: anything with ``camera_rays``) before a film.
+
+    >>> from codesign import lens, render
+    >>> camera = render.Camera(lens.load("cooke-triplet").scaled(0.2), 8, 8, pixel_pitch_mm=0.5, samples_per_pixel=4)
+    >>> camera.check().rays().weight.shape  # 8 x 8 pixels x 4 samples
+    torch.Size([256])
 
     The same seed gives the same film and pupil samples in every frame and for every lens state (common random
     numbers).
@@ -118,19 +43,19 @@ class Camera:
 
     def __init__(
         self,
-        lens,
-        width_px,
-        height_px,
-        pixel_pitch_mm,
-        samples_per_pixel=16,
-        seed=0,
-        film=None,
+        lens: Lens,
+        width_px: int,
+        height_px: int,
+        pixel_pitch_mm: float,
+        samples_per_pixel: int = 16,
+        seed: int = 0,
+        film: Film | None = None,
         *,
-        spectrum=None,
-        falloff=False,
-        aim=False,
+        spectrum: Any = None,
+        falloff: bool = False,
+        aim: bool = False,
     ):
-        _check_whole("samples_per_pixel", samples_per_pixel)
+        check_whole("samples_per_pixel", samples_per_pixel)
         if spectrum is not None and samples_per_pixel % len(spectrum.wavelengths_um):
             raise DomainError(
                 f"camera: {samples_per_pixel} samples per pixel cannot be shared equally by "
@@ -141,7 +66,7 @@ class Camera:
                 f"camera: a {type(lens).__name__} has no camera_rays, so it is no lens; give a GeoLens, ThinLens, "
                 "Pinhole, or an object of your own with camera_rays and film_points as GeoLens has them."
             )
-        self.lens = lens
+        self.lens: Any = lens
         self.samples_per_pixel = int(samples_per_pixel)
         self.seed = int(seed)
         self.film = (film or Film(width_px, height_px, width_px, height_px, pixel_pitch_mm)).check()
@@ -149,19 +74,19 @@ class Camera:
         self.falloff = falloff
         self.aim = aim
 
-    def with_lens(self, lens):
+    def with_lens(self, lens: Lens) -> "Camera":
         """The same film and samples behind another lens."""
         twin = copy.copy(self)
         twin.lens = lens
         return twin
 
-    def with_seed(self, seed):
+    def with_seed(self, seed: int) -> "Camera":
         """The same lens and film with other samples."""
         twin = copy.copy(self)
         twin.seed = int(seed)
         return twin
 
-    def check(self):
+    def check(self) -> "Camera":
         """Raise DomainError when some pixels of the film get no light at all through the lens; returns the
         camera.
 
@@ -185,11 +110,11 @@ class Camera:
             )
         return self
 
-    def film_mm(self, pixels):
+    def film_mm(self, pixels: Tensor) -> Tensor:
         """Upright image position in millimetres of pixel coordinates [N, 2]."""
         return (pixels - self.film.middle_px.to(pixels)) * self.film.pixel_pitch_mm
 
-    def given(self, rays):
+    def given(self, rays: Rays | None) -> Rays:
         """The same rays, or newly traced ones for None. Raises: ShapeError unless they are as many as this
         camera has."""
         if rays is None:
@@ -202,7 +127,7 @@ class Camera:
             )
         return rays
 
-    def rays(self):
+    def rays(self) -> Rays:
         """All rays of one frame, pixel after pixel, samples_per_pixel each: Rays with N = pixels x samples,
         in the lens's dtype. Gradient: to the lens."""
         offset, pupil = film_pupil_pattern(self.samples_per_pixel, self.seed)
@@ -250,11 +175,11 @@ class Camera:
         pixels = self.film.pixels().shape[0]
         return torch.cat([part.reshape(pixels, -1, *part.shape[1:]) for part in parts], 1).flatten(0, 1)
 
-    def chief_rays(self, pixels):
+    def chief_rays(self, pixels: Tensor) -> Rays:
         """Rays through the pupil's centre for pixel coordinates [N, 2]: Rays, float64."""
         return self.lens.camera_rays(self.film_mm(pixels), torch.zeros_like(pixels))
 
-    def slope_per_px(self):
+    def slope_per_px(self) -> float:
         """Slope of a chief ray per pixel, near the axis; no gradient."""
         with torch.no_grad():
             rays = self.chief_rays(
@@ -264,12 +189,12 @@ class Camera:
             rays.direction[1, 0] / rays.direction[1, 2] - rays.direction[0, 0] / rays.direction[0, 2]
         )
 
-    def rays_through(self, pixels, pupil):
+    def rays_through(self, pixels: Tensor, pupil: Tensor) -> Rays:
         """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil: Rays, float64."""
         return self.lens.camera_rays(self.film_mm(pixels), pupil, aim=self.aim)
 
 
-def project(camera, points_cam_m, pupil=None):
+def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -> Tensor:
     """Pixel coordinates whose ray through a point of the pupil (the centre when none is given) passes through
     points of space.
 
@@ -277,6 +202,13 @@ def project(camera, points_cam_m, pupil=None):
       disc, or None for chief rays.
     Returns: [..., N, 2] px (the centre of the first pixel is 0, 0), float64; NaN for points that no such ray
       reaches (outside the lens's field).
+
+    >>> from codesign import lens, render
+    >>> camera = render.Camera(lens.Pinhole(8.0), 8, 8, pixel_pitch_mm=0.5)
+    >>> points = torch.tensor([[0.0, 0.0, 2.0], [0.125, 0.0, 2.0]])  # metres; 8 / 2000 / 0.5 px per millimetre
+    >>> render.project(camera, points).tolist()
+    [[3.5, 3.5], [4.5, 3.5]]
+
     Gradient: to the points and to the lens, by the implicit function theorem (one Newton step with gradients
       at the solution); 0 to NaN points.
     Raises: DomainError when a point is not finite or not in front of the camera.
@@ -335,7 +267,7 @@ def _miss(camera, pixels, points_cam_m, pupil):
     return origin[:, :2] + direction[:, :2] * ahead - points_cam_m[:, :2], passes
 
 
-def angular_miss_rad(camera, pixels, points_cam_m):
+def angular_miss_rad(camera: Camera, pixels: Tensor, points_cam_m: Tensor) -> Tensor:
     """Angle by which the chief rays of pixel coordinates [N, 2] miss points [N, 3] given in camera axes: [N]
     rad.
 

@@ -3,18 +3,22 @@
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.render.camera import coarse_pixels
-from codesign.render.moving import at_frames, cameras_in_parts, in_one_row
-from codesign.render.truth import first_hits
+from codesign.render.camera import Camera
+from codesign.render.film import coarse_pixels
+from codesign.render.hits import dot, of_part, turned
+from codesign.render.kinds import Scene
+from codesign.render.moving import MovingScene, in_one_row
+from codesign.render.truth import cameras_of, hits_of
 from codesign.render.wavefront import shade
 
 CLOSEST_M = 1e-5  # for lenses without an aperture
 BACKS = 0.5  # of the rays of a frame
 
 
-def check_view(camera, scene, T_world_cam, every_px=8):
+def check_view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Tensor, every_px: int = 8) -> None:
     """Raise DomainError, with the number of the first frame, when a sequence of views is not one a camera
     could have.
 
@@ -41,28 +45,28 @@ def check_view(camera, scene, T_world_cam, every_px=8):
                 f"frame {frame} has a radiance of {float(light[frame, ray]):.3g} at pixel "
                 f"({_place(pixels[ray])}); make every radiance of the scene finite and at least 0."
             )
-        nearest = max(CLOSEST_M, getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2)
+        nearest_m = max(CLOSEST_M, getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2)
+        cameras = cameras_of(scene, T_world_cam)
+        hits = hits_of(rays, scene, cameras)
+        along = dot(turned(of_part(hits, cameras), rays.direction.double()), hits.normal)
         for frame in range(T_world_cam.shape[0]):
-            _check_frame(frame, rays, at_frames(scene, [frame]), T_world_cam[[frame]], light[frame], nearest)
+            _check_frame(
+                frame, hits.part[frame] >= 0, hits.distance_m[frame], along[frame], light[frame], nearest_m
+            )
 
 
-def _check_frame(frame, rays, scene, pose, light, nearest_m):
-    cameras = [poses[0].double() for poses in cameras_in_parts(scene, pose)]
-    hits = first_hits(rays, scene, cameras)
-    met = hits.part >= 0
+def _check_frame(frame, met, distance_m, along, light, nearest_m):
     if not bool(met.any()):
         raise DomainError(
             f"frame {frame} is empty: no ray of the camera meets anything; turn the camera towards the "
             "scene or move it there."
         )
-    closest = float(hits.distance_m.min())
+    closest = float(distance_m.min())
     if closest < nearest_m:
         raise DomainError(
             f"frame {frame}: a surface lies {closest * 1e3:.3g} mm before the camera, which is less than "
             f"the radius of its entrance pupil ({nearest_m * 1e3:.3g} mm); move the camera away from it."
         )
-    turn = torch.stack(cameras)[hits.part.clamp_min(0), :3, :3]
-    along = ((turn @ rays.direction.double()[..., None])[..., 0] * hits.normal).sum(1)
     backs = float((met & (along > 0) & (light == 0)).double().sum() / met.double().sum())
     if backs > BACKS:
         raise DomainError(

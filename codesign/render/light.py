@@ -9,6 +9,7 @@ have ``radiance``, ``hit`` and ``dtype``.
 
 import copy
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,9 @@ from torch import Tensor
 
 from codesign.errors import DomainError, GradientError
 from codesign.render.bake import bake
+from codesign.render.camera import Camera
+from codesign.render.kinds import Scene
+from codesign.render.moving import MovingScene
 from codesign.render.sequence import frames
 from codesign.render.world import MitsubaScene
 
@@ -41,7 +45,15 @@ class PathScene(MitsubaScene):
     of their mean; asking for it raises GradientError.
     """
 
-    def __init__(self, description, device="cpu", *, samples=16, max_depth=8, seed=0):
+    def __init__(
+        self,
+        description: Mapping[str, Any],
+        device: str = "cpu",
+        *,
+        samples: int = 16,
+        max_depth: int = 8,
+        seed: int = 0,
+    ):
         if not samples >= 1:
             raise DomainError(f"path light: samples = {samples} per ray must be at least 1.")
         if max_depth != -1 and not max_depth >= 1:
@@ -53,13 +65,13 @@ class PathScene(MitsubaScene):
         self.seed = int(seed)
         self.integrator = self.mi.load_dict({"type": "path", "max_depth": int(max_depth), "rr_depth": 64})
 
-    def with_seed(self, seed):
+    def with_seed(self, seed: int) -> "PathScene":
         """The same scene with other random numbers."""
         twin = copy.copy(self)
         twin.seed = int(seed)
         return twin
 
-    def radiance(self, arr, origin, direction):
+    def radiance(self, arr: Any, origin: Any, direction: Any) -> Any:
         """Mean radiance of ``samples`` paths along each world ray. Raises: GradientError when a gradient is
         asked for."""
         import drjit as dr
@@ -107,7 +119,12 @@ class LevelError:
     noise: Tensor
 
 
-def level_error(scene_cheap, scene_reference, camera, T_world_cam):
+def level_error(
+    scene_cheap: Scene | MovingScene,
+    scene_reference: Any,
+    camera: Camera,
+    T_world_cam: Tensor,
+) -> LevelError:
     """Relative radiance error of a cheap scene against a reference, seen by a camera along poses [T, 4, 4].
 
     The error of a pixel is relative to the reference there, or to FLOOR of the frame's mean where that is
@@ -169,7 +186,9 @@ class Choice:
     cpu_s: dict[str, float]
 
 
-def choose(levels, camera, T_world_cam, tolerance, after_gain=False):
+def choose(
+    levels: Mapping[str, Any], camera: Camera, T_world_cam: Tensor, tolerance: float, after_gain: bool = False
+) -> Choice:
     """The cheapest light level whose RMS radiance error against the last one stays within a tolerance in
     every frame.
 

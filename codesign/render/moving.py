@@ -1,10 +1,16 @@
 """A world with objects that move: every object is a scene in its own frame, with a pose per frame of the
 sequence."""
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
 from codesign.pose import check_poses, inverse
+from codesign.render.kinds import Scene
+from codesign.types import Rays
 
 
 class MovingScene:
@@ -22,7 +28,7 @@ class MovingScene:
       numbers of poses differ.
     """
 
-    def __init__(self, static, objects):
+    def __init__(self, static: Scene, objects: Mapping[str, tuple[Scene, Tensor]]):
         self.static = static
         self.names = tuple(objects)
         self.scenes = (static, *(scene for scene, _ in objects.values()))
@@ -45,7 +51,7 @@ class MovingScene:
             torch.float32 if any(scene.dtype == torch.float32 for scene in self.scenes) else torch.float64
         )
 
-    def during(self, frames):
+    def during(self, frames: slice | Sequence[int]) -> "MovingScene":
         """The same scene for some of the frames only: a slice or a list of frame numbers."""
         return MovingScene(
             self.static,
@@ -55,7 +61,7 @@ class MovingScene:
             },
         )
 
-    def check_length(self, count):
+    def check_length(self, count: int) -> None:
         """Raise ShapeError unless every object has ``count`` poses."""
         for name, poses in zip(self.names, self.T_world_object, strict=True):
             if poses.shape[-3] != count:
@@ -64,7 +70,7 @@ class MovingScene:
                     "per frame, or cut the scene with ``during``."
                 )
 
-    def in_one_row(self, batch):
+    def in_one_row(self, batch: Sequence[int]) -> "MovingScene":
         """The same scene for the frames of all trajectories of a batch of shape (..., T), one after the
         other: every object has as many poses as there are frames in all."""
         self.check_length(batch[-1])
@@ -85,7 +91,7 @@ class MovingScene:
             },
         )
 
-    def outline(self):
+    def outline(self) -> Any:
         """Raise DomainError: the boundary term holds scenes still."""
         raise DomainError(
             "the outlines of moving objects carry no gradient; ask for gradient 'interior', or for a scene "
@@ -93,12 +99,12 @@ class MovingScene:
         )
 
 
-def parts(scene):
+def parts(scene: Any) -> tuple[Any, ...]:
     """The scenes a scene is made of: itself, or the static one and then the objects in order."""
     return scene.scenes if isinstance(scene, MovingScene) else (scene,)
 
 
-def scenes_and_poses(scene, T_world_cam):
+def scenes_and_poses(scene: Any, T_world_cam: Tensor) -> list[tuple[Any, Tensor]] | None:
     """Pairs of a scene and the poses it is seen from, along the first axis of T_world_cam [W, ..., T, 4, 4],
     where ``scene`` is a list or tuple of W scenes; None for a single scene."""
     if not isinstance(scene, list | tuple):
@@ -111,7 +117,7 @@ def scenes_and_poses(scene, T_world_cam):
     return list(zip(scene, T_world_cam, strict=True))
 
 
-def in_one_row(scene, T_world_cam, rays=None):
+def in_one_row(scene: Any, T_world_cam: Tensor, rays: Rays | None = None) -> tuple[Any, Tensor]:
     """The frames of a batch of trajectories [..., T, 4, 4] as one sequence: the scene for it, and poses
     [N, 4, 4]; on one device with the rays."""
     if rays is not None and rays.weight.device != T_world_cam.device:
@@ -125,7 +131,7 @@ def in_one_row(scene, T_world_cam, rays=None):
     return scene, T_world_cam.reshape(-1, 4, 4)
 
 
-def poses_of_parts(scene, count):
+def poses_of_parts(scene: Any, count: int) -> Tensor:
     """T_world_part [parts, T, 4, 4], float64: the identity for the static scene. Raises: ShapeError unless
     every object has ``count`` poses."""
     still = torch.eye(4, dtype=torch.float64).expand(count, 4, 4)
@@ -135,14 +141,21 @@ def poses_of_parts(scene, count):
     return torch.stack([still, *(poses.double() for poses in scene.T_world_object)])
 
 
-def cameras_in_parts(scene, T_world_cam):
+def cameras_in_parts(scene: Any, T_world_cam: Tensor) -> list[Tensor]:
     """Poses of the camera [T, 4, 4] in the axes of every part: as given for the static one, float64 for
     objects."""
     objects = poses_of_parts(scene, T_world_cam.shape[0])[1:]
-    return [T_world_cam, *(inverse(poses.to(T_world_cam.device)) @ T_world_cam.double() for poses in objects)]
+    cameras = T_world_cam.double()
+    return [T_world_cam, *(_product(inverse(poses.to(cameras.device)), cameras) for poses in objects)]
 
 
-def at_frames(scene, frames):
+def _product(a, b):
+    """a b [..., 4, 4] written out by element: a matrix product may round differently in another batch."""
+    x, y, z, w = (a[..., :, k : k + 1] * b[..., k : k + 1, :] for k in range(4))
+    return x + y + z + w
+
+
+def at_frames(scene: Any, frames: slice | Sequence[int]) -> Any:
     """A scene for some frames of a sequence: moving ones are cut, still ones are what they are."""
     return scene.during(frames) if isinstance(scene, MovingScene) else scene
 

@@ -1,6 +1,10 @@
 """A textured plane in closed form: band-limited texture, float32 or float64, for checks and smooth scenes."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.pose import check_pose
@@ -18,7 +22,13 @@ class TexturedPlane:
     """
 
     def __init__(
-        self, frequency_per_m, amplitude, phase_rad, mean=100.0, T_world_plane=None, dtype=torch.float64
+        self,
+        frequency_per_m: Tensor | Sequence[Sequence[float]],
+        amplitude: Tensor | Sequence[float],
+        phase_rad: Tensor | Sequence[float],
+        mean: float = 100.0,
+        T_world_plane: Tensor | None = None,
+        dtype: torch.dtype = torch.float64,
     ):
         for label, value in (
             ("frequency_per_m", frequency_per_m),
@@ -65,11 +75,11 @@ class TexturedPlane:
         )
         return opaque(self.T_world_plane[:3]), waves, dr.opaque(arr.Float, self.mean)
 
-    def radiance(self, arr, origin, direction):
+    def radiance(self, arr: Any, origin: Any, direction: Any) -> Any:
         """Radiance along world rays (drjit arrays). Gradient: exact, to the rays."""
         return self.radiance_and_distance(arr, origin, direction)[0]
 
-    def radiance_and_distance(self, arr, origin, direction):
+    def radiance_and_distance(self, arr: Any, origin: Any, direction: Any) -> Any:
         """Radiance as above, and the distance to the plane (infinite where it is not met), which carries no
         gradient."""
         import drjit as dr
@@ -91,7 +101,7 @@ class TexturedPlane:
             total += a * dr.cos((2 * dr.pi) * (fx * x + fy * y) + phase)
         return mean * dr.select(meets, dr.exp(total), 1), dr.select(meets, dr.detach(t), dr.inf)
 
-    def hit(self, origin_m, direction):
+    def hit(self, origin_m: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Where world rays [N, 3] meet the plane: point, normal, valid (see MitsubaScene.hit)."""
         normal = self.T_world_plane[:3, 2].to(origin_m)
         height = ((origin_m.detach() - self.T_world_plane[:3, 3].to(origin_m)) * normal).sum(-1)

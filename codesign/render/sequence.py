@@ -7,16 +7,21 @@ three that agrees with differences, asked once
 per scene, camera and group of parameters.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.pose import inverse, se3_exp
 from codesign.render.boundary import boundary_term
-from codesign.render.moving import at_frames, in_one_row, scenes_and_poses
+from codesign.render.camera import Camera
+from codesign.render.kinds import Scene
+from codesign.render.moving import MovingScene, at_frames, in_one_row, scenes_and_poses
 from codesign.render.wavefront import shade
+from codesign.types import Rays
 
 Way = Literal["interior", "boundary", "difference", "auto"]
 WAYS: tuple[Way, ...] = ("interior", "boundary", "difference", "auto")
@@ -47,8 +52,23 @@ class Choice:
         return f"{self.way}: relative error against differences: {measured}; the differences themselves {self.noise:.1%}"
 
 
-def frames(camera, scene, T_world_cam, gradient: Way = "interior", per_px=2.5, *, rays=None):
+def frames(
+    camera: Camera,
+    scene: Scene | MovingScene | Sequence[Scene | MovingScene],
+    T_world_cam: Tensor,
+    gradient: Way = "interior",
+    per_px: float = 2.5,
+    *,
+    rays: Rays | None = None,
+) -> Tensor:
     """Frames of a scene along a trajectory, or along several.
+
+    >>> from codesign import lens, pose, render
+    >>> camera = render.Camera(lens.Pinhole(8.0), 8, 8, pixel_pitch_mm=0.5, samples_per_pixel=4)
+    >>> poses = pose.look_at((0, -2, 1), (0, 0, 0)).repeat(3, 5, 1, 1)  # three trajectories of five poses
+    >>> plane = render.TexturedPlane([[2.0, 1.0]], [0.5], [0.0])  # one wave of two by one periods per metre
+    >>> render.frames(camera, plane, poses).shape
+    torch.Size([3, 5, 8, 8])
 
     Args: camera: Camera, before any lens with ``camera_rays`` (and ``film_points`` for "boundary"). scene:
       anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane, MovingScene), or a list of scenes,
@@ -85,14 +105,14 @@ def frames(camera, scene, T_world_cam, gradient: Way = "interior", per_px=2.5, *
     return found + boundary_term(camera, scene, T_world_cam, per_px) if gradient == "boundary" else found
 
 
-def image(camera, scene, T_world_cam, rays=None):
+def image(camera: Camera, scene: Any, T_world_cam: Tensor, rays: Rays | None = None) -> Tensor:
     """Frames [..., T, *film.shape] with their interior gradient."""
     return shade(camera.given(rays), scene, T_world_cam, camera.samples_per_pixel).reshape(
         *T_world_cam.shape[:-2], *camera.film.shape
     )
 
 
-def by_differences(camera, scene, T_world_cam):
+def by_differences(camera: Camera, scene: Any, T_world_cam: Tensor) -> Tensor:
     """Frames whose gradient to poses and lens tensors is that of central differences with common random
     numbers."""
     if any(pose.requires_grad for pose in getattr(scene, "T_world_object", ())):
@@ -125,7 +145,7 @@ def _twist(T_world_cam):
     return torch.stack([*small[:, :3, 3].unbind(1), turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], 1)
 
 
-def pose_difference(camera, scene, T_world_cam, k):
+def pose_difference(camera: Camera, scene: Any, T_world_cam: Tensor, k: int) -> Tensor:
     """Change of the frames per unit of the k-th component of the twist of every pose, by central
     differences."""
     step = torch.zeros(6, dtype=torch.float64)
@@ -137,7 +157,7 @@ def pose_difference(camera, scene, T_world_cam, k):
     return (ahead - behind) / (2 * POSE_STEP[k])
 
 
-def lens_tensors(lens):
+def lens_tensors(lens: Any) -> dict[str, Tensor]:
     """Tensors of a lens that ask for gradients, by name."""
     names = (
         "curvature_per_mm",
@@ -168,7 +188,7 @@ def _check_known(lens, known):
             )
 
 
-def lens_difference(camera, scene, T_world_cam, name, i):
+def lens_difference(camera: Camera, scene: Any, T_world_cam: Tensor, name: str, i: int) -> Tensor:
     """Change of the frames per unit of one number of the lens, by central differences."""
     if name not in LENS_STEP:
         raise DomainError(
@@ -190,7 +210,7 @@ def lens_difference(camera, scene, T_world_cam, name, i):
     return (ahead - behind) / (2 * step)
 
 
-def settled(camera, scene, T_world_cam):
+def settled(camera: Camera, scene: Any, T_world_cam: Tensor) -> Way:
     """The way ``choose`` found for this scene, camera and set of parameters; asked once and remembered by the
     scene."""
     if any(pose.requires_grad for pose in getattr(scene, "T_world_object", ())):
@@ -208,7 +228,7 @@ def settled(camera, scene, T_world_cam):
     return max((choice.way for choice in memory[key].values()), key=order.__getitem__)
 
 
-def choose(camera, scene, T_world_cam, seed=0):
+def choose(camera: Camera, scene: Any, T_world_cam: Tensor, seed: int = 0) -> dict[str, Choice]:
     """Choice per group of parameters ("pose" and each lens tensor that asks for gradients): the cheapest way
     that agrees with differences.
 

@@ -8,13 +8,17 @@ MovingScene with n poses per object.
 """
 
 import math
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError, check_finite
 from codesign.pose import check_poses
-from codesign.render.camera import coarse_pixels
+from codesign.render.camera import Camera
+from codesign.render.film import coarse_pixels
+from codesign.render.kinds import Scene, Trajectory
 from codesign.render.moving import MovingScene, at_frames, in_one_row
 from codesign.render.truth import track
 from codesign.render.wavefront import shade
@@ -27,7 +31,7 @@ COARSE = 8  # times the spacing of pixels, for the search of a step; the step fo
 SMALLEST_STEP = 1e-9  # of the interval
 
 
-def midpoints(samples):
+def midpoints(samples: int) -> tuple[Tensor, Tensor]:
     """Times in -1/2..1/2 and weights of equal shares of an exposure, two float64 tensors [samples]: edges
     blur to equal steps."""
     return (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5, torch.full(
@@ -35,14 +39,22 @@ def midpoints(samples):
     )
 
 
-def gauss_legendre(samples):
+def gauss_legendre(samples: int) -> tuple[Tensor, Tensor]:
     """As ``midpoints``, by Gauss-Legendre quadrature: exact for what changes as a polynomial of degree 2
     samples - 1 over the exposure."""
     nodes, weights = np.polynomial.legendre.leggauss(samples)
     return torch.from_numpy(nodes) / 2, torch.from_numpy(weights) / 2
 
 
-def exposed_frames(camera, scene, trajectory, t_s, exposure_s, samples=8, rule=midpoints):
+def exposed_frames(
+    camera: Camera,
+    scene: Scene | MovingScene | Callable[[Tensor], MovingScene],
+    trajectory: Trajectory,
+    t_s: Tensor | Sequence[float],
+    exposure_s: float,
+    samples: int = 8,
+    rule: Callable[[int], tuple[Tensor, Tensor]] = midpoints,
+) -> Tensor:
     """Frames averaged over an exposure centred on each time: motion blur.
 
     Args: camera: Camera. scene, trajectory: see the top of this file. t_s: [T]. exposure_s: length of the
@@ -66,7 +78,9 @@ def exposed_frames(camera, scene, trajectory, t_s, exposure_s, samples=8, rule=m
     return total.reshape(*total.shape[:-1], *camera.film.shape)
 
 
-def frame_chunks(camera, scene, T_world_cam, frames_per_chunk):
+def frame_chunks(
+    camera: Camera, scene: Scene | MovingScene, T_world_cam: Tensor, frames_per_chunk: int
+) -> Iterator[Tensor]:
     """Generator of the frames of a long sequence, some at a time: [..., <= frames_per_chunk, *film.shape]
     each, in bounded memory. T_world_cam: [..., T, 4, 4]; a chunk holds those frames of every trajectory.
 
@@ -101,7 +115,15 @@ def _chunks(camera, scene, T_world_cam, pieces):
         )
 
 
-def adaptive_times(camera, scene, trajectory, start_s, end_s, largest_px, every_px=1):
+def adaptive_times(
+    camera: Camera,
+    scene: Scene | MovingScene | Callable[[Tensor], MovingScene],
+    trajectory: Trajectory,
+    start_s: float,
+    end_s: float,
+    largest_px: float,
+    every_px: int = 1,
+) -> Tensor:
     """Frame times between which no pixel's point moves by more than a given distance in the image, on any of
     the trajectories.
 
@@ -156,7 +178,7 @@ def adaptive_times(camera, scene, trajectory, start_s, end_s, largest_px, every_
     return torch.tensor(times, dtype=torch.float64)
 
 
-def crossing_error_px(largest_px, period_px, slope=1.0):
+def crossing_error_px(largest_px: float, period_px: float, slope: float = 1.0) -> float:
     """How far a pattern has moved at most between the true and the linearly interpolated time at which a
     pixel crosses a threshold.
 
@@ -181,17 +203,17 @@ def _displacement_px(camera, scene, trajectory, ends, grids, largest_px):
     asked only when the coarse one finds no more than allowed."""
     at = torch.tensor([ends[0], (ends[0] + ends[1]) / 2, ends[1]], dtype=torch.float64)
     shown, poses = in_one_row(_at(scene, at), trajectory(at))
-    firsts = range(0, poses.shape[0], at.numel())
+    firsts = torch.arange(0, poses.shape[0], at.numel())[:, None]
     largest = 0.0
     for (pixels, rays), pairs in zip(grids, (((0, 1), (0, 2), (2, 0)), ((0, 2), (2, 0))), strict=True):
-        for now, later in [(first + a, first + b) for first in firsts for a, b in pairs]:
-            found = track(camera, shown, poses, now, later, pixels, rays)
-            lost = (found.hits.part >= 0) & ~found.valid
-            largest = max(
-                largest,
-                float((found.to_px - pixels).norm(dim=1).max()),
-                _lost_px(camera, found, rays, lost) if bool(lost.any()) else 0.0,
-            )
+        now, later = ((firsts + torch.tensor(column)).reshape(-1) for column in zip(*pairs, strict=True))
+        found = track(camera, shown, poses, now, later, pixels, rays)
+        lost = (found.hits.part >= 0) & ~found.valid
+        largest = max(
+            largest,
+            float((found.to_px - pixels).norm(dim=-1).max()),
+            _lost_px(camera, found, rays, lost) if bool(lost.any()) else 0.0,
+        )
         if largest > largest_px:
             break
     return largest
@@ -206,7 +228,7 @@ def _lost_px(camera, found, rays, lost):
         camera.film.middle_px + torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
     ).direction
     slope_per_px = float(axis[1, 0] / axis[1, 2] - axis[0, 0] / axis[0, 2])
-    before = rays.direction[lost].double()
+    before = rays.direction.double().expand(*lost.shape, 3)[lost]
     after = found.points_cam_m[lost]
     return (
         float((after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:]).norm(dim=1).max()) / slope_per_px

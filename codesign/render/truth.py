@@ -1,30 +1,41 @@
 """Ground truth through the current lens: points, depth, objects, flow and occlusion, in float64 with
-gradients."""
+gradients; the rays of many frames meet the scene together.
 
+A frame's truth is the same to the last bit whatever frames are beside it, on one machine with one number of
+threads, where images are read from a table; where they are traced, to 1e-10 px.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from codesign.errors import ShapeError
-from codesign.pose import apply, check_poses, inverse
-from codesign.render.camera import project
-from codesign.render.moving import cameras_in_parts, in_one_row, parts, poses_of_parts, scenes_and_poses
+from codesign.pose import inverse
+from codesign.render.camera import Camera, project
+from codesign.render.hits import Hits, carried, dot, first_hits, of_part, turned
+from codesign.render.kinds import Scene
+from codesign.render.moving import MovingScene, cameras_in_parts, in_one_row, poses_of_parts, scenes_and_poses
+from codesign.render.projection import ProjectionTable
+from codesign.types import Rays
 
 # of lengths: 32 units in the last place of a float32, for a ray moved into an object's axes and met with its
 # surface
 ROUNDING = 2e-6
 GRAZING = 1e-3  # cosines of incidence below this count as this
+NEAREST_M = 1e-6  # points closer to the plane of the pupil have no image
+TOGETHER = 2**17  # points that are followed at once
 
 
 @dataclass(frozen=True)
 class View:
     """What lies under the pixel centres of one frame; zero (object_id -1) where not valid.
 
-    points_world_m, normal: [*film.shape, 3] in world axes, the normal of unit length and as the surface has
-      it. depth_m: [*film.shape] along the
-    camera's z axis. object_id: [*film.shape] int64, 0 for the static scene, then the moving objects in order.
-    valid: [*film.shape] bool.
+    points_world_m, normal: [..., *film.shape, 3] in world axes, the normal of unit length and as the surface
+      has it. depth_m: [..., *film.shape] along the camera's z axis. object_id: [..., *film.shape] int64, 0 for
+      the static scene, then the moving objects in order. valid: [..., *film.shape] bool.
     """
 
     points_world_m: Tensor
@@ -45,48 +56,17 @@ class FlowTruth:
 
 
 @dataclass(frozen=True)
-class Hits:
-    """First surfaces along rays: local_m, normal [N, 3] in the axes of the part [N] that is met (-1 for
-    none), distance_m [N] (infinite for none)."""
+class FramesTruth(FlowTruth):
+    """Of F frames of one trajectory, the flow to the frame behind each; and depth_m [F, *film.shape], 0 where
+    nothing is seen, object_id [F, *film.shape] int64 (0 static, then moving objects, -1 nothing)."""
 
-    local_m: Tensor
-    normal: Tensor
-    part: Tensor
-    distance_m: Tensor
+    depth_m: Tensor
+    object_id: Tensor
 
 
-def first_hits(rays, scene, cameras):
-    """The nearest surface of all parts of a scene along rays given in camera space.
-
-    Args: rays: Rays [N]. cameras: pose [4, 4] of the camera in the axes of every part. Rays that carry no
-      light meet nothing.
-    Gradient: to rays and poses, surfaces taken as their tangent planes.
-    """
-    origin_cam = rays.origin_m.double()
-    direction_cam = rays.direction.double()
-    lit = rays.weight.detach() > 0
-    nearest = torch.full(lit.shape, torch.inf, dtype=torch.float64)
-    local = normal = torch.zeros_like(origin_cam)
-    part = torch.full(lit.shape, -1)
-    for number, (scene_of_part, pose) in enumerate(zip(parts(scene), cameras, strict=True)):
-        origin = apply(pose.double(), origin_cam)
-        direction = direction_cam @ pose[:3, :3].double().mT
-        point, across, valid = scene_of_part.hit(origin, direction)
-        falling = (direction * across).sum(1)
-        usable = valid & (falling.detach().abs() > 1e-9) & lit
-        distance = ((point - origin) * across).sum(1) / torch.where(usable, falling, torch.ones_like(falling))
-        distance = torch.where(usable, distance, torch.ones_like(distance))
-        closer = usable & (distance.detach() < nearest.detach())
-        nearest = torch.where(closer, distance, nearest)
-        local, normal = (
-            torch.where(closer[:, None], new, old)
-            for new, old in ((origin + direction * distance[:, None], local), (across.double(), normal))
-        )
-        part = torch.where(closer, number, part)
-    return Hits(local, normal, part, nearest)
-
-
-def world_points(rays, scene, T_world_cam):
+def world_points(
+    rays: Rays, scene: Scene | MovingScene, T_world_cam: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """World points under rays given in camera space, from one pose.
 
     Args: rays: Rays [N] (chief rays). scene: anything with ``hit``, or a MovingScene of one frame.
@@ -94,42 +74,56 @@ def world_points(rays, scene, T_world_cam):
     Returns: points [N, 3] metres, depth [N] along the camera's z axis, valid [N].
     Gradient: to rays and poses, the surface taken as its tangent plane at the hit.
     """
-    hits = first_hits(rays, scene, [poses[0] for poses in cameras_in_parts(scene, T_world_cam[None])])
-    valid = hits.part >= 0
-    return _carried(hits, poses_of_parts(scene, 1)[:, 0]), _depth(rays, hits), valid
+    hits = hits_of(rays, scene, cameras_of(scene, T_world_cam[None]))
+    return carried(hits, poses_of_parts(scene, 1))[0], _depth(rays, hits)[0], hits.part[0] >= 0
 
 
-def view(camera, scene, T_world_cam, frame):
-    """View of one frame of a sequence: T_world_cam [T, 4, 4], frame a number. Gradient: points and depth to
-    the lens, camera and object poses."""
-    check_poses(T_world_cam)
-    count = T_world_cam.shape[0]
+def view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Tensor, frame: int) -> View:
+    """View of one frame of a sequence, or of several: T_world_cam [..., T, 4, 4], frame a number.
+
+    Gradient: points and depth to the lens, camera and object poses.
+    """
+    batch = T_world_cam.shape[:-3]
+    count = T_world_cam.shape[-3] if T_world_cam.ndim > 2 else 0
+    rays = camera.chief_rays(camera.film.pixels())
+    scene, poses = in_one_row(scene, T_world_cam, rays)
     if not -count <= frame < count:
         raise ShapeError(f"view: frame {frame} of a sequence of {count}; give a number below that.")
-    rays = camera.chief_rays(camera.film.pixels())
-    hits = first_hits(rays, scene, [poses[frame] for poses in cameras_in_parts(scene, T_world_cam)])
+    rows = torch.arange(frame % count, poses.shape[0], count)
+    hits = hits_of(rays, scene, cameras_of(scene, poses)[:, rows])
     valid = hits.part >= 0
-    T_world_part = poses_of_parts(scene, count)[:, frame]
-    turn = T_world_part[hits.part.clamp_min(0), :3, :3]
+    T_world_part = poses_of_parts(scene, poses.shape[0])[:, rows]
 
     def shaped(f):
-        return torch.where(valid if f.ndim == 1 else valid[:, None], f, 0).reshape(
-            *camera.film.shape, *f.shape[1:]
-        )
+        kept = torch.where(valid if f.ndim == 2 else valid[..., None], f, 0)
+        return kept.reshape(*batch, *camera.film.shape, *f.shape[2:])
 
-    normal = (turn @ hits.normal[..., None])[..., 0]
     return View(
-        shaped(_carried(hits, T_world_part)),
+        shaped(carried(hits, T_world_part)),
         shaped(_depth(rays, hits)),
-        shaped(normal),
-        hits.part.reshape(camera.film.shape),
-        valid.reshape(camera.film.shape),
+        shaped(turned(of_part(hits, T_world_part), hits.normal)),
+        hits.part.reshape(*batch, *camera.film.shape),
+        valid.reshape(*batch, *camera.film.shape),
     )
 
 
-def true_flow(camera, scene, T_world_cam, stride=1):
+def true_flow(
+    camera: Camera,
+    scene: Scene | MovingScene | Sequence[Scene | MovingScene],
+    T_world_cam: Tensor,
+    stride: int = 1,
+) -> tuple[Tensor, Tensor]:
     """Flow of every pixel centre from each pose to the one ``stride`` later, through the camera's current
     lens; points move with their object.
+
+    >>> from codesign import lens, pose, render
+    >>> from scenes import worlds
+    >>> camera = render.Camera(lens.Pinhole(8.0), 8, 8, pixel_pitch_mm=0.5)
+    >>> poses = pose.look_at((0, -2, 0), (0, 0, 0)).repeat(2, 1, 1)
+    >>> poses[1, 0, 3] -= 0.25  # to the left by two pixels: the world moves to the right
+    >>> flow_px, valid = render.true_flow(camera, worlds.wall(torch.ones(8, 8).numpy()), poses)
+    >>> [round(float(component), 3) for component in flow_px[0, :, 4, 4]]
+    [2.0, 0.0]
 
     Args: camera with ``chief_rays`` and ``film``; scene with ``hit``, a MovingScene, or a list of scenes, one
       for each entry of the first axis of the poses; T_world_cam [..., T, 4, 4], several trajectories in one
@@ -143,13 +137,26 @@ def true_flow(camera, scene, T_world_cam, stride=1):
     if pairs := scenes_and_poses(scene, T_world_cam):
         found = [true_flow(camera, each, poses, stride) for each, poses in pairs]
         return torch.stack([flow for flow, _ in found]), torch.stack([valid for _, valid in found])
-    tracks, _, _ = _tracks(camera, scene, T_world_cam, stride)
-    batch = _batch(T_world_cam, stride)
-    return _flow(camera, tracks, batch), _mask(camera, [t.valid for t in tracks], batch)
+    found = _flow_truth(camera, scene, T_world_cam, stride, occlusion=False)
+    return found.flow_px, found.valid
 
 
-def flow_and_occlusion(camera, scene, T_world_cam, stride=1):
+def flow_and_occlusion(
+    camera: Camera,
+    scene: Scene | MovingScene | Sequence[Scene | MovingScene],
+    T_world_cam: Tensor,
+    stride: int = 1,
+) -> FlowTruth:
     """As ``true_flow``, and which of the points are hidden at the later time by something nearer: FlowTruth.
+
+    >>> from codesign import lens, pose, render
+    >>> from scenes import worlds
+    >>> camera = render.Camera(lens.Pinhole(4.0), 8, 8, pixel_pitch_mm=0.5)
+    >>> poses = pose.look_at((0.1, -1, 1.1), (0, 0.8, 0.5)).repeat(2, 1, 1)
+    >>> poses[1, 0, 3] += 0.4  # to the right, past crates and a ball
+    >>> truth = render.flow_and_occlusion(camera, worlds.room(), poses)
+    >>> bool(truth.occluded.any()), bool(truth.valid[truth.occluded].all())
+    (True, True)
 
     A point is hidden when the later chief ray through its image meets a surface before it by more than
     rounding: 32 units in the last place of float32
@@ -159,66 +166,115 @@ def flow_and_occlusion(camera, scene, T_world_cam, stride=1):
     if pairs := scenes_and_poses(scene, T_world_cam):
         found = [flow_and_occlusion(camera, each, poses, stride) for each, poses in pairs]
         return FlowTruth(*(torch.stack([getattr(f, n.name) for f in found]) for n in fields(FlowTruth)))
-    tracks, scene, poses = _tracks(camera, scene, T_world_cam, stride)
-    batch = _batch(T_world_cam, stride)
-    return FlowTruth(
-        _flow(camera, tracks, batch),
-        _mask(camera, [t.valid for t in tracks], batch),
-        _mask(camera, [_hidden(camera, scene, poses, t) for t in tracks], batch),
+    return _flow_truth(camera, scene, T_world_cam, stride, occlusion=True)
+
+
+@torch.no_grad()
+def truth_of_frames(
+    table: ProjectionTable,
+    scene: Scene | MovingScene,
+    T_world_cam: Tensor,
+    count: int,
+    rays: Rays | None = None,
+) -> FramesTruth:
+    """Truth of the first ``count`` frames of a long sequence, without gradients: images are read from a table
+    of the camera's lens (to 1e-6 px) instead of traced.
+
+    Args: table: ProjectionTable of the camera. scene: as for ``true_flow``. T_world_cam: [T >= count, 4, 4];
+      flow where there is a frame behind (of ``count`` - 1 frames where T = count). rays: the camera's chief rays
+      through all pixel centres, where they are traced already.
+    """
+    camera = table.camera
+    shape = camera.film.shape
+    rays = camera.chief_rays(camera.film.pixels()) if rays is None else rays
+    cameras = cameras_of(scene, T_world_cam)
+    hits = hits_of(rays, scene, cameras[:, :count])
+    pairs = min(count, T_world_cam.shape[0] - 1)
+    later = cameras[:, 1 : pairs + 1]
+    if pairs:
+        found = follow(table, hits[:pairs], later, camera.film.pixels())
+        flow = (found.to_px - found.from_px).mT
+        valid = found.valid
+        hidden = _hidden(camera, scene, later, found)
+    else:
+        flow = torch.zeros(0, dtype=torch.float64)
+        valid = hidden = torch.zeros(0, dtype=torch.bool)
+    return FramesTruth(
+        flow.reshape(pairs, 2, *shape),
+        valid.reshape(pairs, *shape),
+        hidden.reshape(pairs, *shape),
+        torch.where(hits.part >= 0, _depth(rays, hits), 0.0).reshape(count, *shape),
+        hits.part.reshape(count, *shape),
     )
 
 
 @dataclass(frozen=True)
 class Track:
-    """Points under pixels at one frame, and where they are at a later one: hits of the first, points_cam_m
-    [N, 3] and to_px [N, 2] of the later.
+    """Points under pixels [P] of F frames, and where they are at a later frame each: hits of the first,
+    points_cam_m [F, P, 3] and to_px [F, P, 2] of the later (the pixel itself where not valid).
 
-    in_front: [N] bool, the point lies before the later camera (points_cam_m is (0, 0, 1) elsewhere). valid:
-      [N] bool, it is in the field of the lens too.
+    in_front: [F, P] bool, the point lies before the later camera (points_cam_m is (0, 0, 1) elsewhere). valid:
+      [F, P] bool, it is in the field of the lens too. chief: the later chief rays to the points, base and slope
+      [F, P, 2], where a table gave them.
     """
 
-    later: int
     hits: Hits
     points_cam_m: Tensor
     from_px: Tensor
     to_px: Tensor
     in_front: Tensor
     valid: Tensor
+    chief: tuple[Tensor, Tensor] | None = None
 
 
-def track(camera, scene, T_world_cam, now, later, pixels, rays):
-    """Track of the pixel coordinates [N, 2] and their chief rays from frame ``now`` to frame ``later`` of a
-    sequence."""
-    cameras = cameras_in_parts(scene, T_world_cam)
-    hits = first_hits(rays, scene, [poses[now] for poses in cameras])
-    ahead = _carried(hits, torch.stack([inverse(poses[later].double()) for poses in cameras]))
-    in_front = (hits.part >= 0) & (ahead.detach()[:, 2] > 1e-6)
-    ahead = torch.where(in_front[:, None], ahead, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-    to = project(camera, ahead)
-    valid = in_front & ~to.detach().isnan().any(1)
-    return Track(later, hits, ahead, pixels, torch.where(valid[:, None], to, pixels), in_front, valid)
+def track(
+    camera: Camera, scene: Any, T_world_cam: Tensor, now: Tensor, later: Tensor, pixels: Tensor, rays: Rays
+) -> Track:
+    """Track of the pixel coordinates [P, 2] and their chief rays from frames ``now`` to frames ``later`` (numbers
+    [F]) of a sequence."""
+    cameras = cameras_of(scene, T_world_cam)
+    return follow(camera, hits_of(rays, scene, cameras[:, now]), cameras[:, later], pixels)
+
+
+def follow(optics: Camera | ProjectionTable, hits: Hits, later: Tensor, pixels: Tensor) -> Track:
+    """Track of points that were hit to cameras ``later`` [parts, F, 4, 4]; optics: a Camera, or its
+    ProjectionTable."""
+    points = carried(hits, inverse(later))
+    in_front = (hits.part >= 0) & (points.detach()[..., 2] > NEAREST_M)
+    points = torch.where(in_front[..., None], points, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    chief = None
+    if isinstance(optics, ProjectionTable):
+        # a matrix product rounds by its shape: one frame per call keeps a frame's bits in any company
+        to, base, slope = (torch.stack(v) for v in zip(*map(optics, points), strict=True))
+        chief = (base, slope)
+    else:
+        to = project(optics, points)
+    valid = in_front & ~to.detach().isnan().any(-1)
+    return Track(hits, points, pixels, torch.where(valid[..., None], to, pixels), in_front, valid, chief)
 
 
 @torch.no_grad()
-def _hidden(camera, scene, T_world_cam, found):
-    """Whether something is nearer than the tracked points at the later frame: [N] bool."""
-    cameras = [poses[found.later].double() for poses in cameras_in_parts(scene, T_world_cam)]
-    rays = camera.chief_rays(torch.where(found.valid[:, None], found.to_px, camera.film.middle_px))
-    reach = (found.points_cam_m - rays.origin_m).norm(dim=1)
-    turn = torch.stack(cameras)[found.hits.part.clamp_min(0), :3, :3]
-    cosine = (
-        ((turn @ rays.direction.double()[..., None])[..., 0] * found.hits.normal)
-        .sum(1)
-        .abs()
-        .clamp_min(GRAZING)
-    )
-    size = reach + found.hits.local_m.norm(dim=1)  # float32 coordinates round by their own size
-    return found.valid & (first_hits(rays, scene, cameras).distance_m < reach - ROUNDING * size / cosine)
+def _hidden(camera, scene, later, found):
+    """Whether something is nearer than the tracked points at the later frames [parts, F, 4, 4]: [F, P] bool."""
+    if found.chief is None:
+        at = torch.where(found.valid[..., None], found.to_px, camera.film.middle_px)
+        rays = camera.chief_rays(at.reshape(-1, 2))
+        origin, direction = (v.double().reshape(*at.shape[:-1], 3) for v in (rays.origin_m, rays.direction))
+    else:
+        base, slope = found.chief
+        origin = torch.cat([base, torch.zeros_like(base[..., :1])], -1)
+        direction = torch.cat([slope, torch.ones_like(slope[..., :1])], -1)
+        direction = direction / dot(direction, direction).sqrt()[..., None]
+    between = found.points_cam_m - origin
+    reach = dot(between, between).sqrt()
+    cosine = dot(turned(of_part(found.hits, later), direction), found.hits.normal).abs().clamp_min(GRAZING)
+    # float32 coordinates round by their own size
+    size = reach + dot(found.hits.local_m, found.hits.local_m).sqrt()
+    nearer = first_hits(origin, direction, found.valid, scene, later).distance_m
+    return found.valid & (nearer < reach - ROUNDING * size / cosine)
 
 
-def _tracks(camera, scene, T_world_cam, stride):
-    """Tracks of all pairs of frames of all trajectories, and scene and poses [N, 4, 4] of the frames in one
-    row."""
+def _flow_truth(camera, scene, T_world_cam, stride, occlusion):
     pixels = camera.film.pixels()
     rays = camera.chief_rays(pixels)
     scene, poses = in_one_row(scene, T_world_cam, rays)
@@ -228,27 +284,30 @@ def _tracks(camera, scene, T_world_cam, stride):
             f"true flow over {stride} pose(s) ahead needs a stride of at least 1 and more poses than that, "
             f"got {length}; give more poses."
         )
-    starts = [first + now for first in range(0, poses.shape[0], length) for now in range(length - stride)]
-    return [track(camera, scene, poses, now, now + stride, pixels, rays) for now in starts], scene, poses
+    cameras = cameras_of(scene, poses)
+    starts = torch.arange(poses.shape[0]).reshape(-1, length)[:, : length - stride].reshape(-1)
+    flows = []
+    for some in starts.split(max(1, TOGETHER // len(pixels))):
+        later = cameras[:, some + stride]
+        found = follow(camera, hits_of(rays, scene, cameras[:, some]), later, pixels)
+        hidden = _hidden(camera, scene, later, found) if occlusion else torch.zeros_like(found.valid)
+        flows.append(((found.to_px - pixels).mT, found.valid, hidden))
+    flow, valid, hidden = (torch.cat(column) for column in zip(*flows, strict=True))
+    batch = (*T_world_cam.shape[:-3], length - stride)
+    shape = camera.film.shape
+    return FlowTruth(
+        flow.reshape(*batch, 2, *shape), valid.reshape(*batch, *shape), hidden.reshape(*batch, *shape)
+    )
 
 
-def _batch(T_world_cam, stride):
-    return (*T_world_cam.shape[:-3], T_world_cam.shape[-3] - stride)
+def cameras_of(scene: Any, T_world_cam: Tensor) -> Tensor:
+    """Poses of the camera in the axes of every part, [parts, T, 4, 4] float64."""
+    return torch.stack([poses.double() for poses in cameras_in_parts(scene, T_world_cam)])
 
 
-def _flow(camera, tracks, batch):
-    moved = torch.stack([(t.to_px - t.from_px).T for t in tracks])
-    return moved.reshape(*batch, 2, *camera.film.shape)
-
-
-def _mask(camera, rows, batch):
-    return torch.stack(rows).reshape(*batch, *camera.film.shape)
-
-
-def _carried(hits, transforms):
-    """Points that were hit, from the axes of their part by the part's transform [parts, 4, 4]."""
-    own = transforms[hits.part.clamp_min(0)]
-    return (own[:, :3, :3] @ hits.local_m[..., None])[..., 0] + own[:, :3, 3]
+def hits_of(rays: Rays, scene: Any, cameras: Tensor) -> Hits:
+    """Hits of the same rays in every frame of cameras [parts, F, 4, 4]."""
+    return first_hits(rays.origin_m, rays.direction, rays.weight.detach() > 0, scene, cameras)
 
 
 def _depth(rays, hits):

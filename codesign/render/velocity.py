@@ -1,8 +1,10 @@
 """Ground truth of ego-motion: the velocity of a camera in six degrees of freedom, from its poses."""
 
 import math
+from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.pose import check_poses, inverse, se3_exp
@@ -11,7 +13,7 @@ LARGEST_TURN_RAD = 3.0  # towards half a turn the axis of a rotation is lost
 SMALL = 1e-4  # squared angle below which series are used; their next term is 1e-17
 
 
-def camera_velocity(T_world_cam, t_s):
+def camera_velocity(T_world_cam: Tensor, t_s: Tensor | Sequence[float]) -> tuple[Tensor, Tensor]:
     """Mean velocity of a camera between its poses: the constant twist that leads from each pose to the next.
 
     Args: T_world_cam: [..., T >= 2, 4, 4]. t_s: [T] times, increasing, the same for all trajectories.
@@ -43,7 +45,7 @@ def camera_velocity(T_world_cam, t_s):
     return body, world.reshape(body.shape)
 
 
-def se3_log(transform):
+def se3_log(transform: Tensor) -> Tensor:
     """Twists [N, 6] of rigid transforms [N, 4, 4], the inverse of ``pose.se3_exp`` for turns of at most 3
     rad.
 

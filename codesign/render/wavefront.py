@@ -1,11 +1,15 @@
 """All frames of all trajectories in one wavefront: camera-space rays x poses -> pixel means."""
 
+from torch import Tensor
+
 from codesign.backend import run_kernel
 from codesign.errors import DomainError, ShapeError
-from codesign.render.moving import cameras_in_parts, in_one_row, parts
+from codesign.render.kinds import Scene
+from codesign.render.moving import MovingScene, cameras_in_parts, in_one_row, parts
+from codesign.types import Rays
 
 
-def shade(rays, scene, T_world_cam, samples_per_pixel):
+def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Tensor, samples_per_pixel: int) -> Tensor:
     """Pixel means [..., T, P] of the radiance along rays given in camera space, seen from every pose.
 
     Args: rays: Rays with N = P x samples_per_pixel. scene: anything with ``radiance`` and ``dtype``, or a

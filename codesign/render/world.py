@@ -1,6 +1,10 @@
 """Emissive textured geometry in Mitsuba: one ray cast and one texture lookup per ray."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
+from torch import Tensor
 
 from codesign import backend
 from codesign.errors import CodesignError, DomainError
@@ -18,7 +22,7 @@ class MitsubaScene:
 
     dtype = torch.float32
 
-    def __init__(self, description, device="cpu", *, merge=True):
+    def __init__(self, description: Mapping[str, Any], device: str = "cpu", *, merge: bool = True):
         self.mi = backend.mitsuba(device)
         self._outline = None
         try:
@@ -30,12 +34,12 @@ class MitsubaScene:
                 f"Mitsuba cannot build the scene: {str(error).splitlines()[0][:200]}"
             ) from error
 
-    def radiance(self, arr, origin, direction):
+    def radiance(self, arr: Any, origin: Any, direction: Any) -> Any:
         """Radiance along world rays (drjit arrays), 0 where nothing is hit. Gradient: to the rays, inside
         surfaces."""
         return self.radiance_and_distance(arr, origin, direction)[0]
 
-    def radiance_and_distance(self, arr, origin, direction):
+    def radiance_and_distance(self, arr: Any, origin: Any, direction: Any) -> Any:
         """Radiance as above, and the distance to what is hit (infinite where nothing is), which carries no
         gradient."""
         import drjit as dr
@@ -53,13 +57,13 @@ class MitsubaScene:
             si.wi = dr.select(si.is_valid(), si.wi, -ray.d)
         return si.emitter(self.scene).eval(si)[0], found.t
 
-    def outline(self):
+    def outline(self) -> Any:
         """Curves where radiance may jump, see codesign.render.outline; worked out once."""
         if self._outline is None:
             self._outline = outlines(self.mi, self.scene)
         return self._outline
 
-    def hit(self, origin_m, direction):
+    def hit(self, origin_m: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """First surface met by world rays [N, 3]: point [N, 3], normal [N, 3], valid [N]; no gradient,
         float64 out of float32 geometry."""
         mi = self.mi

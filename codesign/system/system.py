@@ -65,7 +65,7 @@ class System(nn.Module):
         self._parts = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         if not objectives:
             raise DomainError("a system needs at least one objective; give objectives={'name': function}.")
-        self.gradient = gradient
+        self.gradient: render_stage.sequence.Way = gradient
         self.scene = scene
         self.bins = _bins(flow, bins)
         self._stages: dict[str, Stage] = {}

@@ -28,6 +28,8 @@ from codesign.lens import catalogue
 from codesign.optional import require
 from codesign.render import Camera, shade
 from codesign.render.moving import at_frames
+from codesign.render.projection import ProjectionTable
+from codesign.render.truth import truth_of_frames
 from scenes.dataset_motion import FAMILIES, LEAD_S, motion
 from scenes.stages import make_world
 from scenes.trajectories import times
@@ -36,8 +38,7 @@ from studies.frame.run import Run, StudyConfig, main
 from studies.frame.timing import resident_mb as resident_mb_now
 from studies.make_dataset import page as pages
 from studies.make_dataset import store
-from studies.make_dataset.chart import Chart
-from studies.make_dataset.truth import Segments, truth_of_frames
+from studies.make_dataset.segments import Segments
 
 FIELD_SHARE = 0.95  # of the lens's field that the picture's diagonal takes
 PIXELS_PER_CHUNK = 2**19  # fewer frames than asked for are worked on together where pictures are large
@@ -113,7 +114,7 @@ def study(run: Run[Config]) -> None:
         name: chunks if store.is_done(run.folder / name) else store.parts_done(run.folder / name)
         for name in names
     }
-    chart = Chart(camera)
+    table = ProjectionTable(camera)
     rays = camera.rays()
     chief = camera.chief_rays(camera.film.pixels())
     segments = Segments(scene)
@@ -124,7 +125,7 @@ def study(run: Run[Config]) -> None:
             if store.is_done(run.folder / name):
                 continue
             sequence = Sequence(
-                config, index, run.folder / name, scene, stage, camera, chart, rays, chief, segments, clock
+                config, index, run.folder / name, scene, stage, camera, table, rays, chief, segments, clock
             )
             for chunk in range(ready[name], chunks):
                 events = sequence.make(chunk, size)
@@ -198,13 +199,13 @@ def make_camera(config):
 class Sequence:
     """One sequence in the making."""
 
-    def __init__(self, config, index, folder, scene, stage, camera, chart, rays, chief, segments, clock):
+    def __init__(self, config, index, folder, scene, stage, camera, table, rays, chief, segments, clock):
         self.config = config
         self.folder = folder
         self.scene = scene
         self.camera = camera
         self.clock = clock
-        self.chart = chart
+        self.table = table
         self.rays = rays
         self.chief = chief
         self.segments = segments
@@ -263,25 +264,23 @@ class Sequence:
         for start in range(first, last, step):
             stop = min(start + step, last)
             some = slice(start, min(stop + 1, self.config.frames))
-            found.append(
-                truth_of_frames(
-                    self.chart,
-                    self.chief,
-                    at_frames(self.scene, some),
-                    self.poses[some],
-                    stop - start,
-                    self.segments,
-                )
+            scene = at_frames(self.scene, some)
+            count = stop - start
+            truth = truth_of_frames(self.table, scene, self.poses[some], count, self.chief)
+            segments = self.segments.at(
+                self.chief, at_frames(scene, slice(count)), self.poses[start:stop], truth.object_id
             )
-        names = {
-            "depth": "depth_m",
-            "object_id": "object_id",
-            "segment_id": "segment_id",
-            "flow": "flow_px",
-            "valid": "valid",
-            "occluded": "occluded",
-        }
-        return {name: torch.cat([getattr(part, field) for part in found]) for name, field in names.items()}
+            found.append(
+                {
+                    "depth": truth.depth_m,
+                    "object_id": truth.object_id,
+                    "segment_id": segments,
+                    "flow": truth.flow_px,
+                    "valid": truth.valid,
+                    "occluded": truth.occluded,
+                }
+            )
+        return {name: torch.cat([part[name] for part in found]) for name in found[0]}
 
     def finish(self, count):
         """Join the parts and write what describes the sequence; last of all the file that says so."""

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from codesign import lens, render
-from codesign.errors import ShapeError
+from codesign.errors import DomainError, ShapeError
 from codesign.pose import apply, inverse, look_at, se3_exp
 from codesign.render import Camera, Film, MovingScene, TexturedPlane
 from codesign.render.time import adaptive_times
@@ -154,6 +154,29 @@ def test_truth_of_a_batch_is_that_of_each_trajectory(stride):
     assert torch.equal(both.valid, valid)
     torch.testing.assert_close(both.flow_px, flow, rtol=0, atol=1e-10)
     assert not both.occluded.any()
+
+
+@pytest.mark.parametrize("frame", [1, -1])
+def test_views_of_a_batch_are_those_of_each_trajectory(frame):
+    cards = paths(4, BATCH, torch.eye(4, dtype=D)) + 0
+    cards[..., 2, 3] += 0.4
+    cam = camera()
+    found = render.view(cam, MovingScene(plane(2), {"card": (plane(1), cards)}), paths(), frame)
+    assert found.points_world_m.shape == (*BATCH, *cam.film.shape, 3)
+    for index in ((0, 1), (1, 2)):
+        alone = MovingScene(plane(2), {"card": (plane(1), cards[index])})
+        truth = render.view(cam, alone, paths()[index], frame)
+        assert torch.equal(found.object_id[index], truth.object_id)
+        for name in ("points_world_m", "depth_m", "normal"):
+            torch.testing.assert_close(getattr(found, name)[index], getattr(truth, name), rtol=0, atol=1e-13)
+
+
+def test_a_bad_view_of_a_batch_is_named_by_its_frame():
+    poses = paths(2, (2,))
+    render.check_view(camera(), plane(), poses)
+    poses[1, 0] = look_at((0.0, 0.0, 2.0), (0.0, 0.0, 4.0), down=(0, 1, 0))
+    with pytest.raises(DomainError, match="frame 2 is empty"):
+        render.check_view(camera(), plane(), poses)
 
 
 def test_points_project_in_any_batch(generator):

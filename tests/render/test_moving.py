@@ -265,7 +265,7 @@ def test_moving_scenes_that_cannot_be_are_refused():
     with pytest.raises(ShapeError, match="'card' has 3 poses for 2 frames"):
         render.true_flow(camera(), scene, path(2))
     with pytest.raises(DomainError, match="itself a moving scene"):
-        MovingScene(plane(2), {"world": (scene, good)})
+        MovingScene(plane(2), {"world": (scene, good)})  # pyright: ignore[reportArgumentType]
     with pytest.raises(DomainError, match="part 'lit', a PathScene, does not say how far"):
         MovingScene(plane(2), {"lit": (PathScene({"ball": shape(1.0, type="sphere")}), good)})
     with pytest.raises(DomainError, match="outlines of moving objects"):

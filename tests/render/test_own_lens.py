@@ -98,7 +98,7 @@ def test_truth_goes_through_a_lens_of_ones_own():
 def test_lenses_that_lack_what_a_gradient_needs_are_refused():
     scene, pose = cubes()
     with pytest.raises(DomainError, match="a Linear has no camera_rays, so it is no lens"):
-        Camera(torch.nn.Linear(2, 2), 8, 8, 0.1, 1)
+        Camera(torch.nn.Linear(2, 2), 8, 8, 0.1, 1)  # pyright: ignore[reportArgumentType]
     for way in ("difference", "auto"):
         with pytest.raises(DomainError, match="no step for the lens's parameter 'efl_mm_'"):
             render.frames(Camera(Barrel(), 8, 8, 1.0, 1), scene, pose, gradient=way)
@@ -129,7 +129,7 @@ def test_given_rays_make_the_same_frames_and_gradients(way, generator):
     assert torch.equal(render.frames(camera, scene, pose, way, rays=rays), alone)
     # two calls that share one trace, going backward through it together
     both = [render.frames(camera, scene, pose, way, rays=rays) for _ in range(2)]
-    found = torch.autograd.grad(sum((each * weights).sum() for each in both), inputs)
+    found = torch.autograd.grad((torch.stack(both) * weights).sum(), inputs)
     for one, two in zip(truth, found, strict=True):
         # float32 sums over 12 x 12 pixels x 4 samples in any order
         assert float((two / 2 - one).norm() / one.norm()) <= 256 * 2**-24
@@ -145,8 +145,8 @@ def test_recorded_rays_end_the_gradient_at_themselves(generator):
     frames = render.frames(camera, plane(), above(), rays=Rays(*recorded))
     junction = torch.autograd.grad((frames * weights).sum(), recorded)
     # the chain rule, by hand: what arrives at the rays times what the lens makes of it
-    onward = sum(((getattr(traced, n) * g).sum() for n, g in zip(names, junction, strict=True)))
-    (found,) = torch.autograd.grad(onward, geo.curvature_per_mm)
+    products = [(getattr(traced, n) * g).sum() for n, g in zip(names, junction, strict=True)]
+    (found,) = torch.autograd.grad(torch.stack(products).sum(), geo.curvature_per_mm)
     (truth,) = torch.autograd.grad(
         (render.frames(camera, plane(), above()) * weights).sum(), geo.curvature_per_mm
     )

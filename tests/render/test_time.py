@@ -3,6 +3,7 @@ the whole."""
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,8 @@ from codesign.render import (
     exposed_frames,
     frame_chunks,
 )
-from codesign.render.time import coarse_pixels, gauss_legendre, midpoints
+from codesign.render.film import coarse_pixels
+from codesign.render.time import gauss_legendre, midpoints
 from codesign.types import Rays
 from scenes import textures, trajectories, worlds
 
@@ -189,12 +191,12 @@ def test_exposures_that_cannot_be_are_refused(change, sentence):
 # ---- adaptive times
 
 
-def dense_displacement_px(cam, scene, trajectory, times):
+def dense_displacement_px(cam, scene: Any, trajectory, times):
     """Largest motion of any pixel between successive times, forwards and backwards, over all pixels."""
     found = []
     for a, b in itertools.pairwise(times):
         for pair in (torch.stack([a, b]), torch.stack([b, a])):
-            shown = scene(pair) if callable(scene) else scene
+            shown: Any = scene(pair) if callable(scene) else scene
             with torch.no_grad():
                 flow, valid = render.true_flow(cam, shown, trajectory(pair))
             found.append(float(flow.norm(dim=1)[valid].max()))

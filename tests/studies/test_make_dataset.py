@@ -23,9 +23,9 @@ from codesign.errors import DomainError
 from codesign.events import SensorModel, SensorState, simulate
 from codesign.flow.files import read_flow
 from codesign.pose import inverse, look_at, se3_exp
-from codesign.render import Camera
 from codesign.render.moving import MovingScene, at_frames
-from codesign.render.truth import flow_and_occlusion, view
+from codesign.render.projection import TOLERANCE_PX, ProjectionTable
+from codesign.render.truth import flow_and_occlusion, truth_of_frames, view
 from scenes import dataset_motion as motions
 from scenes import worlds
 from scenes.stages import Stage, make_world
@@ -33,8 +33,7 @@ from scenes.tum import read_tum
 from studies.frame.run import main
 from studies.make_dataset import __main__ as study
 from studies.make_dataset import store
-from studies.make_dataset.chart import TOLERANCE_PX, Chart
-from studies.make_dataset.truth import Segments, truth_of_frames
+from studies.make_dataset.segments import Segments
 from tests.rounding_case import RoundsByPlace
 
 D = torch.float64
@@ -66,44 +65,6 @@ def poses(count):
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "level"),
-    [
-        ("cooke-triplet", "traced"),
-        ("double-gauss", "traced"),
-        ("cooke-triplet", "thin"),
-        ("cooke-triplet", "pinhole"),
-    ],
-)
-def test_the_chart_projects_as_traced_rays_do(name, level):
-    with torch.no_grad():
-        cam = camera(name, level=level)
-        chart = Chart(cam)
-        assert chart.series is not None
-        draw = torch.rand(400, 3, generator=torch.Generator().manual_seed(0), dtype=D)
-        depth = 0.3 * 100 ** draw[:, 2:]
-        points = torch.cat([(draw[:, :2] - 0.5) * 0.9 * depth, depth], 1)  # within and beyond the field
-        pixels, base, slope = chart(points)
-        truth = render.project(cam, points)
-        assert torch.equal(pixels.isnan(), truth.isnan())
-        seen = truth.isfinite().all(1)
-        assert 0.2 < float(seen.double().mean()) <= 1
-        torch.testing.assert_close(pixels[seen], truth[seen], rtol=0, atol=TOLERANCE_PX)
-        # the ray it names passes through the point: 1e-6 px of a 250 px focal length
-        torch.testing.assert_close(
-            base[seen] + slope[seen] * points[seen, 2:], points[seen, :2], rtol=0, atol=1e-8 * 30
-        )
-
-
-def test_a_film_larger_than_the_field_is_projected_by_tracing():
-    with torch.no_grad():
-        cam = Camera(lens.load("double-gauss").freeze(), 12, 12, 12.0, 1)
-        chart = Chart(cam)
-        assert chart.series is None
-        points = torch.tensor([[0.1, 0.2, 2.0], [0.0, 0.0, 1.0]], dtype=D)
-        torch.testing.assert_close(chart(points)[0], render.project(cam, points), rtol=0, atol=0)
-
-
 @pytest.mark.bits
 @pytest.mark.parametrize("moving", [False, True])
 def test_the_truth_of_many_frames_is_that_of_each(moving):
@@ -126,9 +87,8 @@ def test_the_truth_of_many_frames_is_that_of_each(moving):
                 },
             )
         chief = cam.chief_rays(cam.film.pixels())
-        segments = Segments(scene)
-        chart = Chart(cam)
-        found = truth_of_frames(chart, chief, scene, T, 5, segments)
+        table = ProjectionTable(cam)
+        found = truth_of_frames(table, scene, T, 5, chief)
         slow = flow_and_occlusion(cam, scene, T)
         assert found.flow_px.shape == (4, 2, 40, 40)
         assert torch.equal(found.valid, slow.valid)
@@ -144,14 +104,13 @@ def test_the_truth_of_many_frames_is_that_of_each(moving):
         assert set(found.object_id.unique().tolist()) == ({0, 1} if moving else {0})
         for processor in (nullcontext(), RoundsByPlace(1e-12)):
             with processor:
-                whole = truth_of_frames(chart, chief, scene, T, 5, segments)
-                part = truth_of_frames(chart, chief, at_frames(scene, slice(2, 4)), T[2:4], 1, segments)
+                whole = truth_of_frames(table, scene, T, 5, chief)
+                part = truth_of_frames(table, at_frames(scene, slice(2, 4)), T[2:4], 1, chief)
             for name in (field.name for field in fields(part)):
                 assert torch.equal(getattr(part, name)[0], getattr(whole, name)[2]), name
-        assert (
-            truth_of_frames(chart, chief, at_frames(scene, slice(4, 5)), T[4:], 1, segments).flow_px.shape[0]
-            == 0
-        )
+        last = truth_of_frames(table, at_frames(scene, slice(4, 5)), T[4:], 1)
+        assert last.flow_px.shape == (0, 2, 40, 40)
+        assert torch.equal(last.depth_m[0], found.depth_m[4])
 
 
 def test_segments_are_the_shapes_of_the_scene():
@@ -160,17 +119,18 @@ def test_segments_are_the_shapes_of_the_scene():
         scene = worlds.room()
         T = poses(1)
         segments = Segments(scene)
-        found = truth_of_frames(Chart(cam), cam.chief_rays(cam.film.pixels()), scene, T, 1, segments)
+        object_id = view(cam, scene, T, 0).object_id[None]
+        segment_id = segments.at(cam.chief_rays(cam.film.pixels()), scene, T, object_id)
         points = view(cam, scene, T, 0).points_world_m
         assert segments.names == sorted(segments.names)
         index = {name: number for number, name in enumerate(segments.names)}
         distance = (points - torch.tensor([0.1, 0.5, 0.25], dtype=D)).norm(dim=2)
-        on_ball = found.segment_id[0] == index["static/ball"]
+        on_ball = segment_id[0] == index["static/ball"]
         assert bool(on_ball.any())
         assert float((distance[on_ball] - 0.25).abs().max()) < 5e-3  # it rests a gap of 1 mm above the ground
-        on_floor = found.segment_id[0] == index["static/floor"]
+        on_floor = segment_id[0] == index["static/floor"]
         assert torch.equal(on_floor, points[..., 2].abs() < 1e-5)
-        assert torch.equal(found.segment_id[0] == index["static/north"], (points[..., 1] - 2).abs() < 1e-5)
+        assert torch.equal(segment_id[0] == index["static/north"], (points[..., 1] - 2).abs() < 1e-5)
 
 
 @pytest.mark.parametrize("world", list(worlds.WORLDS))

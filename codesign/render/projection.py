@@ -9,8 +9,9 @@ Chebyshev series in both components of s, interpolated at their nodes and checke
 """
 
 import torch
+from torch import Tensor
 
-from codesign.render import project
+from codesign.render.camera import Camera, project
 
 FAR_M = 1e9  # at which a point is its direction
 DEGREES = (8, 12, 16, 20)
@@ -20,14 +21,16 @@ STEPS = 3
 BLOCK = 2048  # points at a time: their series stay in the cache
 
 
-class Chart:
+class ProjectionTable:
     """``project`` for one camera, from a table; also gives the chief ray that leads to the point.
 
     Where the lens has no such polynomials to 1e-6 px, and for points outside the table, rays are traced as in
     codesign.render.project.
     """
 
-    def __init__(self, camera):
+    @torch.no_grad()
+    def __init__(self, camera: Camera):
+        """camera: Camera, whose lens is read as it is now."""
         self.camera = camera
         self.series = None
         rays = camera.chief_rays(_border(camera.film))
@@ -47,7 +50,8 @@ class Chart:
                     return
                 self.series = None
 
-    def __call__(self, points_cam_m):
+    @torch.no_grad()
+    def __call__(self, points_cam_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Image and chief ray of points [N, 3] in camera axes with z > 0.
 
         Returns: pixels [N, 2] (NaN where there is no image), base [N, 2] metres and slope [N, 2] of the chief

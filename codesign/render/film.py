@@ -1,0 +1,94 @@
+"""Pixels of a sensor: their grid, and windows on it."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from codesign.errors import DomainError
+
+
+@dataclass(frozen=True)
+class Film:
+    """Pixels of a sensor, or of rectangular windows on it.
+
+    windows_px: tuple of (left, top); each window has height_px rows and width_px columns. A pixel's
+      coordinate is that of its
+    centre: column 0 of the full sensor is x = 0, and the lens axis is at the sensor's middle.
+    """
+
+    sensor_width_px: int
+    sensor_height_px: int
+    width_px: int
+    height_px: int
+    pixel_pitch_mm: float
+    windows_px: tuple[tuple[int, int], ...] | None = None
+
+    def check(self) -> "Film":
+        """Raise DomainError unless there are pixels and every window lies on the sensor; returns the film."""
+        for label in ("sensor_width_px", "sensor_height_px", "width_px", "height_px"):
+            check_whole(label, getattr(self, label))
+        if not 0 < self.pixel_pitch_mm < float("inf"):
+            raise DomainError(f"camera: pixel_pitch_mm = {self.pixel_pitch_mm} must be positive and finite.")
+        if self.windows_px is not None and len(self.windows_px) == 0:
+            raise DomainError(
+                "camera: there is no window on the film; give at least one, or None for the whole sensor."
+            )
+        for left, top in self.windows_px or ((0, 0),):
+            if not (
+                0 <= left <= self.sensor_width_px - self.width_px
+                and 0 <= top <= self.sensor_height_px - self.height_px
+            ):
+                raise DomainError(
+                    f"camera: the window ({left}, {top}) of {self.width_px} x {self.height_px} pixels does "
+                    f"not lie on the sensor of {self.sensor_width_px} x {self.sensor_height_px}; move or "
+                    "shrink it."
+                )
+        return self
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one image: (H, W) for the whole sensor, (windows, H, W) for windows (one window too)."""
+        return (
+            (self.height_px, self.width_px)
+            if self.windows_px is None
+            else (len(self.windows_px), self.height_px, self.width_px)
+        )
+
+    @property
+    def middle_px(self) -> Tensor:
+        return torch.tensor(
+            [(self.sensor_width_px - 1) / 2, (self.sensor_height_px - 1) / 2], dtype=torch.float64
+        )
+
+    def pixels(self) -> Tensor:
+        """Coordinates (x, y) of all pixel centres on the full sensor, [P, 2] float64, in image order."""
+        y, x = torch.meshgrid(
+            torch.arange(self.height_px, dtype=torch.float64),
+            torch.arange(self.width_px, dtype=torch.float64),
+            indexing="ij",
+        )
+        base = torch.stack([x.reshape(-1), y.reshape(-1)], 1)
+        corners = torch.tensor(self.windows_px or ((0, 0),), dtype=torch.float64)
+        return (corners[:, None] + base).reshape(-1, 2)
+
+
+def coarse_pixels(film: Film, every_px: int) -> Tensor:
+    """Pixel coordinates [N, 2] on a grid over every window of the film, its last rows and columns
+    included."""
+    rows, columns = (
+        torch.linspace(0, n - 1, max(1, math.ceil((n - 1) / every_px)) + 1, dtype=torch.float64)
+        if n > 1
+        else torch.zeros(1, dtype=torch.float64)
+        for n in (film.height_px, film.width_px)
+    )
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
+    return (corners[:, None] + torch.stack([x.reshape(-1), y.reshape(-1)], 1)).reshape(-1, 2)
+
+
+def check_whole(label: str, value: float) -> None:
+    """Raise DomainError unless a count is a whole number of at least 1."""
+    if not (value >= 1 and value % 1 == 0):
+        raise DomainError(f"camera: {label} = {value} must be a whole number of at least 1.")
