@@ -116,6 +116,9 @@ class Loop:
                 f"{error} Optimisation stopped at step {self.step_number + 1}; the parameters are back at the "
                 "best point so far."
             ) from error
+        finally:
+            for group, lr in zip(self.optimiser.param_groups, self._first_lr, strict=True):
+                group["lr"] = lr
         self._go(self.best)
         return self.best
 

@@ -170,17 +170,22 @@ def prepare(config: Config) -> Job:
     def score():
         return sum(float(hard(case).loss) for case in scored) / len(scored) + float(penalty())
 
-    return Job(task, camera, system, Loop(_optimiser(config, camera, stage), samples, judge=score), scored[0])
+    return Job(
+        task, camera, system, Loop(_optimiser(config, system, scored[0]), samples, judge=score), scored[0]
+    )
 
 
-def _optimiser(config, camera, stage):
+def _optimiser(config, system, case):
+    """Descent on the design; with a network, Adam on both, for the weights that the objective sees."""
+    variables = system.camera.variables
     if not config.train_network:
-        return Descent([camera.variables], config.step_size)
-    groups = [
-        {"params": [camera.variables], "lr": config.step_size / 6},
-        {"params": weights_of(stage), "lr": config.learning_rate},
-    ]
-    return torch.optim.Adam(groups)
+        return Descent([variables], config.step_size)
+    weights = weights_of(system.flow)
+    slopes = torch.autograd.grad(system(case).loss, weights, allow_unused=True)
+    seen = [weight for weight, slope in zip(weights, slopes, strict=True) if slope is not None]
+    return torch.optim.Adam(
+        [{"params": [variables], "lr": config.step_size / 6}, {"params": seen, "lr": config.learning_rate}]
+    )
 
 
 def _finish(run, job, history, seconds):
