@@ -239,9 +239,7 @@ def track(
 def follow(optics: Camera | ProjectionTable, hits: Hits, later: Tensor, pixels: Tensor) -> Track:
     """Track of points that were hit to cameras ``later`` [parts, F, 4, 4]; optics: a Camera, or its
     ProjectionTable."""
-    points = carried(hits, inverse(later))
-    in_front = (hits.part >= 0) & (points.detach()[..., 2] > NEAREST_M)
-    points = torch.where(in_front[..., None], points, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    points, in_front = _before(hits, later)
     chief = None
     if isinstance(optics, ProjectionTable):
         # a matrix product rounds by its shape: one frame per call keeps a frame's bits in any company
@@ -251,6 +249,31 @@ def follow(optics: Camera | ProjectionTable, hits: Hits, later: Tensor, pixels: 
         to = project(optics, points)
     valid = in_front & ~to.detach().isnan().any(-1)
     return Track(hits, points, pixels, torch.where(valid[..., None], to, pixels), in_front, valid, chief)
+
+
+def later_points(rays: Rays, scene: Any, T_world_cam: Tensor) -> tuple[Tensor, Tensor]:
+    """Points under rays at the first pose of each trajectory, as they lie before the camera at its last.
+
+    Args: rays: Rays [P] (chief rays). scene: as for ``true_flow``; points move with their object. T_world_cam:
+      [..., T, 4, 4].
+    Returns: points [B, P, 3] metres in the axes of the last camera, B trajectories; seen [B, P] bool: it met a
+      surface, and lies before the last camera (the point is (0, 0, 1) elsewhere).
+    Gradient: to rays, camera and object poses, the surface taken as its tangent plane at the hit.
+    """
+    scene, poses = in_one_row(scene, T_world_cam, rays)
+    length = T_world_cam.shape[-3]
+    cameras = cameras_of(scene, poses)
+    first = torch.arange(0, poses.shape[0], length)
+    return _before(hits_of(rays, scene, cameras[:, first]), cameras[:, first + length - 1])
+
+
+def _before(hits, later):
+    """Points that were hit in the axes of cameras ``later`` [parts, F, 4, 4], and whether they lie before them."""
+    points = carried(hits, inverse(later))
+    in_front = (hits.part >= 0) & (points.detach()[..., 2] > NEAREST_M)
+    return torch.where(
+        in_front[..., None], points, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    ), in_front
 
 
 @torch.no_grad()

@@ -4,7 +4,7 @@ import torch
 from kornia.filters import spatial_gradient
 from torch import Tensor
 
-from codesign import pose, render
+from codesign import render
 from codesign.errors import DomainError
 from codesign.system.batch import scenes_of
 from codesign.types import EventVolume, FlowField
@@ -32,22 +32,15 @@ def angular_error_mrad(
     motion = field.flow_px[..., every_px // 2 :: every_px, every_px // 2 :: every_px].double()
     motion = motion.movedim(1, -1).reshape(-1, pixels.shape[0], 2)  # [trajectories, pixels of all windows, 2]
     rays = camera.chief_rays(pixels)
-    misses = []
-    seen = []
-    for one_scene, poses in scenes_of(scene, T_world_cam):
-        for one in poses.reshape(-1, *poses.shape[-3:]):
-            points, _, valid = render.truth.world_points(rays, one_scene, one[0])
-            later = pose.apply(pose.inverse(one[-1]), points)
-            ahead = valid & (later.detach()[:, 2] > 0)
-            later = torch.where(ahead[:, None], later, later.new_tensor([0.0, 0.0, 1.0]))
-            misses.append(render.angular_miss_rad(camera, pixels + motion[len(misses)], later))
-            seen.append(ahead)
-    weight = torch.stack(seen).reshape(len(motion) * windows, -1).double()
+    found = [render.truth.later_points(rays, *pair) for pair in scenes_of(scene, T_world_cam)]
+    points = torch.cat([points for points, _ in found])  # [trajectories, pixels of all windows, 3]
+    weight = torch.cat([seen for _, seen in found]).reshape(len(points) * windows, -1).double()
     if bool((weight.sum(1) == 0).any()):
         raise DomainError(
             "some sample sees no surface at any pixel, so its flow has no error; turn the camera."
         )
-    return 1e3 * (torch.stack(misses).reshape(weight.shape) * weight).sum(1) / weight.sum(1)
+    miss = render.angular_miss_rad(camera, (pixels + motion).reshape(-1, 2), points.reshape(-1, 3))
+    return 1e3 * (miss.reshape(weight.shape) * weight).sum(1) / weight.sum(1)
 
 
 def edge_energy(volume: EventVolume) -> Tensor:
