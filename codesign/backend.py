@@ -6,6 +6,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from codesign.errors import BackendError, GradientError
 
@@ -37,12 +39,12 @@ print('render ok')
 """
 
 
-def install_hint():
+def install_hint() -> str:
     """One line that says how to get a good LLVM on this system."""
     return INSTALL_LLVM.get(platform.system(), INSTALL_LLVM["Linux"])
 
 
-def llvm_version():
+def llvm_version() -> tuple[int, int, int] | None:
     """Version of the LLVM that drjit found, as (major, minor, patch), or None when it found none."""
     import drjit as dr
 
@@ -50,7 +52,7 @@ def llvm_version():
     return None if found[0] < 0 else found
 
 
-def check_version(device="cpu"):
+def check_version(device: str = "cpu") -> None:
     """Raise BackendError unless the compiler drjit needs for ``device`` is present and fit. Costs
     milliseconds."""
     if device.startswith("cuda"):
@@ -74,13 +76,13 @@ def check_version(device="cpu"):
         )
 
 
-def variant(device="cpu"):
+def variant(device: str = "cpu") -> str:
     """Name of the Mitsuba variant used on ``device``: one radiance channel, because event sensors are
     monochrome."""
     return "cuda_ad_mono" if device.startswith("cuda") else "llvm_ad_mono"
 
 
-def trial_render(device="cpu", timeout_s=180):
+def trial_render(device: str = "cpu", timeout_s: float = 180) -> tuple[bool, str]:
     """Render a tiny scene in a subprocess, since a bad LLVM aborts the process. Returns (worked, message)."""
     command = [sys.executable, "-c", _TRIAL.format(variant=variant(device))]
     try:
@@ -111,7 +113,7 @@ def _machine_key(device):
 
 
 @lru_cache(maxsize=4)
-def require_renderer(device="cpu"):
+def require_renderer(device: str = "cpu") -> None:
     """Check once that rendering works; raise BackendError with one sentence otherwise.
 
     The version check runs in every process; the trial render runs once per machine and set of versions, and
@@ -136,7 +138,7 @@ def require_renderer(device="cpu"):
 
 
 @lru_cache(maxsize=4)
-def mitsuba(device="cpu") -> Any:
+def mitsuba(device: str = "cpu") -> Any:
     """The Mitsuba module with the variant of ``device`` set, after the renderer check."""
     require_renderer(device)
     import mitsuba as mi
@@ -157,7 +159,7 @@ class Arrays:
 
 
 @lru_cache(maxsize=8)
-def arrays(device="cpu", dtype=torch.float32):
+def arrays(device: str = "cpu", dtype: torch.dtype = torch.float32) -> Arrays:
     """drjit types that match a torch device and dtype (float32 or float64)."""
     check_version(device)
     if device.startswith("cuda"):
@@ -171,7 +173,7 @@ def arrays(device="cpu", dtype=torch.float32):
     raise GradientError(f"kernels compute in float32 or float64, not {dtype}; convert the tensor first.")
 
 
-def widen(arr, parameters, count, width):
+def widen(arr: Arrays, parameters: Any, count: int, width: int) -> list[Any]:
     """The ``count`` scalars of a flat array, each gathered into a full-width array where its gradient is
     wanted.
 
@@ -190,14 +192,16 @@ def widen(arr, parameters, count, width):
     return found
 
 
-def frames_per_kernel(pixels):
+def frames_per_kernel(pixels: int) -> int:
     """How many frames of so many pixels one loop over time should take: few frames read memory in few
     streams, which the processor fetches ahead;
     many save calls."""
     return max(32, (1 << 22) // pixels)
 
 
-def run_kernel(kernel, inputs, out_shapes):
+def run_kernel(
+    kernel: Callable[..., tuple[Any, ...]], inputs: Iterable[Tensor], out_shapes: Iterable[Sequence[int]]
+) -> tuple[Tensor, ...]:
     """Run a drjit kernel on torch tensors, with first derivatives.
 
     Args:
@@ -305,10 +309,10 @@ class NoSecondDerivative(torch.autograd.Function):
     GradientError with ``sentence``."""
 
     @staticmethod
-    def forward(ctx, sentence, count, *tensors):
+    def forward(ctx: Any, sentence: str, count: int, *tensors: Tensor) -> tuple[Tensor, ...]:
         ctx.sentence = sentence
         return tuple(t.clone() for t in tensors[:count])
 
     @staticmethod
-    def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, *grads: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         raise GradientError(ctx.sentence)

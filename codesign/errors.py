@@ -1,5 +1,10 @@
 """One small family of exceptions. Every message says what was given, what is allowed, and what to do."""
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:  # sentences cost no import of torch
+    from torch import Tensor
+
 
 class CodesignError(Exception):
     """Anything the user can mend. Commands print the message alone and exit with code 2."""
@@ -33,7 +38,9 @@ class NonFiniteError(CodesignError, ArithmeticError):
     """A value or gradient became infinite or NaN; the message names the junction where it appeared."""
 
 
-def check_finite(tensor, name, remedy="remove or repair the non-finite entries"):
+def check_finite(
+    tensor: "Tensor", name: str, remedy: str = "remove or repair the non-finite entries"
+) -> "Tensor":
     """Raise DomainError when ``tensor`` holds NaN or infinity; return it unchanged otherwise."""
     if bool(tensor.detach().sum().isfinite()):  # one pass, and no finite entry can hide another that is not
         return tensor

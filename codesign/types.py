@@ -2,6 +2,7 @@
 learn flow from."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 from torch import Tensor
 
@@ -89,3 +90,22 @@ class FlowWindows:
     volume: EventVolume
     truth: FlowField
     frames: Tensor | None = None
+
+
+class PixelGrid(Protocol):
+    """The pixels of a film, as render.Film has them."""
+
+    def pixels(self) -> Tensor:
+        """Coordinates (x, y) of all pixel centres, [P, 2], in image order."""
+        ...
+
+
+class ChiefRayCamera(Protocol):
+    """What placement needs of a camera, as render.Camera has it: pixels, and a ray through each."""
+
+    @property
+    def film(self) -> PixelGrid: ...
+
+    def chief_rays(self, pixels: Tensor, /) -> Rays:
+        """Rays through the pupil's centre for pixel coordinates [N, 2]: Rays, float64."""
+        ...

@@ -8,14 +8,15 @@ FileFormatError, before any number is computed.
 import hashlib
 import importlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import safetensors.torch
 import torch
 from safetensors import SafetensorError, safe_open
-from torch import Tensor
+from torch import Tensor, nn
 
 from codesign.atomic import replacing
 from codesign.errors import CodesignError, DomainError, FileFormatError
@@ -40,7 +41,7 @@ class NetworkFile:
     metadata: dict[str, Any]
 
 
-def network_class(name):
+def network_class(name: str) -> type[nn.Module]:
     """Class of the network called ``name``.
 
     Raises: DomainError for a name that is not in NETWORKS.
@@ -51,7 +52,7 @@ def network_class(name):
     return getattr(importlib.import_module(module), kind)
 
 
-def network_name(network):
+def network_name(network: nn.Module) -> str:
     """The name under which a network's class stands in NETWORKS.
 
     Raises: DomainError when it stands under none.
@@ -68,7 +69,7 @@ def network_name(network):
     )
 
 
-def save(network, path, metadata=None):
+def save(network: nn.Module, path: str | Path, metadata: Mapping[str, Any] | None = None) -> None:
     """Write a network to ``path`` (.safetensors), whole or not at all.
 
     Args:
@@ -86,7 +87,7 @@ def save(network, path, metadata=None):
     content = {
         "kind": "network",
         "network": network_name(network),
-        "config": dict(network.config),
+        "config": dict(cast(Any, network).config),
         "metadata": metadata or {},
         "torch": torch.__version__,
     }
@@ -99,7 +100,7 @@ def save(network, path, metadata=None):
     write_tensors(path, weights, content)
 
 
-def load(name_or_path):
+def load(name_or_path: str | Path) -> nn.Module:
     """A trained network, in evaluation mode, on the CPU.
 
     Args: name_or_path: "refiner", the one delivered with the package, or the path of a file that ``save``
@@ -120,7 +121,7 @@ def load(name_or_path):
     return build(read(path), path).eval()
 
 
-def read(path):
+def read(path: str | Path) -> NetworkFile:
     """NetworkFile of a file that ``save`` wrote.
 
     Raises: FileFormatError when it is missing, damaged, of another version or another kind.
@@ -137,7 +138,7 @@ def read(path):
     return NetworkFile(content["network"], content["config"], weights, content.get("metadata", {}))
 
 
-def build(stored, path):
+def build(stored: NetworkFile, path: str | Path) -> nn.Module:
     """The network of a NetworkFile; ``path`` is named in errors.
 
     Raises: FileFormatError when class, configuration and weights do not fit each other.
@@ -153,7 +154,7 @@ def build(stored, path):
     return network
 
 
-def fill(network, weights, path):
+def fill(network: nn.Module, weights: Mapping[str, Tensor], path: str | Path) -> None:
     """Copy weights into a network of the same form.
 
     Raises: FileFormatError naming the first weight that is missing, unknown, of another shape, or not finite.
@@ -175,7 +176,7 @@ def fill(network, weights, path):
     network.load_state_dict(weights)
 
 
-def write_tensors(path, tensors, content):
+def write_tensors(path: str | Path, tensors: Mapping[str, Tensor], content: Mapping[str, Any]) -> None:
     """Write tensors and a JSON dictionary with a checksum over both, whole or not at all.
 
     Raises: FileFormatError when the file cannot be written.
@@ -188,7 +189,7 @@ def write_tensors(path, tensors, content):
         temporary.write_bytes(safetensors.torch.save(plain, header))
 
 
-def read_tensors(path):
+def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and content that ``write_tensors`` stored.
 
     Raises: FileFormatError when the file is missing, cut short, changed, or of another version.

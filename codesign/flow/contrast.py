@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.types import EventStream, EventVolume
 
 
 @dataclass(frozen=True)
@@ -35,13 +36,13 @@ class EventTracks:
     height_px: int
     width_px: int
 
-    def positions(self, at):
+    def positions(self, at: float | Tensor) -> tuple[Tensor, Tensor]:
         """Places (x, y), [B, N] each, at the time ``at``."""
         moved = (at - self.time) * self.flow_px
         return self.x_px + moved[:, 0], self.y_px + moved[:, 1]
 
 
-def volume_tracks(volume, flow_px, carry_steps=0):
+def volume_tracks(volume: EventVolume, flow_px: Tensor, carry_steps: int = 0) -> EventTracks:
     """Tracks of the contents of an event volume, each bin at its centroid.
 
     Args:
@@ -69,12 +70,14 @@ def volume_tracks(volume, flow_px, carry_steps=0):
     )
 
 
-def volume_times(volume, like):
+def volume_times(volume: EventVolume, like: Tensor) -> Tensor:
     """[bins] centroids as shares of the window, in the type of ``like``."""
     return (volume.centroid_s / volume.collected_s.sum()).to(like)
 
 
-def stream_tracks(stream, flow_px, t0_us, t1_us, carry_steps=0):
+def stream_tracks(
+    stream: EventStream, flow_px: Tensor, t0_us: int, t1_us: int, carry_steps: int = 0
+) -> EventTracks:
     """Tracks of the single events from t0 to t1, both included, at their time stamps.
 
     Args:
@@ -113,7 +116,7 @@ def stream_tracks(stream, flow_px, t0_us, t1_us, carry_steps=0):
     )
 
 
-def count_image(tracks, at):
+def count_image(tracks: EventTracks, at: float | Tensor) -> Tensor:
     """Image [B, 2, H, W] of the events moved to the time ``at``, each shared between the four pixels around
     it in proportion to its nearness.
 
@@ -124,13 +127,13 @@ def count_image(tracks, at):
     return _shared(tracks, tracks.count, at)
 
 
-def time_image(tracks, at):
+def time_image(tracks: EventTracks, at: float | Tensor) -> Tensor:
     """Mean time [B, 2, H, W] of the events that share in a pixel, 0 where there are none. Gradient: as in
     count_image, but without bound where a count goes to 0."""
     return _ratio(_shared(tracks, tracks.count * tracks.time, at), _shared(tracks, tracks.count, at))
 
 
-def nearest_images(tracks, at):
+def nearest_images(tracks: EventTracks, at: float | Tensor) -> tuple[Tensor, Tensor]:
     """Counts and mean times, [B, 2, H, W] each, with every event on the pixel nearest to it (a tie goes right
     and down). Gradient: none in the flow."""
     column, row = (torch.floor(value.detach() + 0.5).long() for value in tracks.positions(at))
@@ -141,12 +144,12 @@ def nearest_images(tracks, at):
     return counts, _ratio(sums, counts)
 
 
-def leaving(tracks, at):
+def leaving(tracks: EventTracks, at: float | Tensor) -> Tensor:
     """[B] number of events that are outside the image at the time ``at`` (shares of events in part)."""
     return tracks.count.sum((1, 2)) - count_image(tracks, at).sum((1, 2, 3))
 
 
-def smooth_image(tracks, at, weight=None):
+def smooth_image(tracks: EventTracks, at: float | Tensor, weight: Tensor | None = None) -> Tensor:
     """Like count_image, with each event spread over the nine pixels around it by the quadratic B-spline
     (Gaussian-like, variance 1/4 px^2).
 
@@ -157,14 +160,14 @@ def smooth_image(tracks, at, weight=None):
     """
     x, y = tracks.positions(at)
     column, row = (value.detach().add(0.5).floor() for value in (x, y))
-    across = _spline(x - column)
-    along = _spline(y - row)
+    share_x = _spline(x - column)
+    share_y = _spline(y - row)
     count = tracks.count if weight is None else tracks.count * weight[:, None]
-    parts = ((i - 1, k - 1, count * (across[i] * along[k])[:, None]) for i in range(3) for k in range(3))
+    parts = ((i - 1, k - 1, count * (share_x[i] * share_y[k])[:, None]) for i in range(3) for k in range(3))
     return _gathered(tracks, column.long(), row.long(), parts)
 
 
-def still_image(counts):
+def still_image(counts: Tensor) -> Tensor:
     """What smooth_image gives at zero flow, for counts [B, 2, bins, H, W], much faster."""
     image = counts.sum(2)
     for axis in (2, 3):
@@ -176,7 +179,9 @@ def still_image(counts):
     return image
 
 
-def warp_jacobian(tracks, bins, at):
+def warp_jacobian(
+    tracks: EventTracks, bins: int, at: float | Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Jacobian of the warp to the time ``at`` at each pixel of each bin of a volume, by central differences
     over the flow of its tracks.
 
@@ -193,7 +198,7 @@ def warp_jacobian(tracks, bins, at):
     return 1 + span * by_x[:, 0], span * by_y[:, 0], span * by_x[:, 1], 1 + span * by_y[:, 1]
 
 
-def area_change(jacobian):
+def area_change(jacobian: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
     """Factor by which a warp with this Jacobian changes a small area; negative where it folds over.
 
     Source: Shiba, Aoki, Gallego, Event collapse in contrast maximization frameworks, Sensors 2022, sec.
@@ -203,7 +208,7 @@ def area_change(jacobian):
     return xx * yy - xy * yx
 
 
-def sharpness(image):
+def sharpness(image: Tensor) -> Tensor:
     """Mean squared slope of the image, both polarities added.
 
     Args: image: [B, 2, H, W] counts.
@@ -273,19 +278,19 @@ def _gathered(tracks, column, row, parts):
     height = tracks.height_px
     width = tracks.width_px
     margin = 3
-    across = width + 2 * margin
-    cell = (row.clamp(-2, height + 1) + margin) * across + column.clamp(-2, width + 1) + margin
+    padded_width = width + 2 * margin
+    cell = (row.clamp(-2, height + 1) + margin) * padded_width + column.clamp(-2, width + 1) + margin
     image = torch.zeros(
         *tracks.count.shape[:2],
-        (height + 2 * margin) * across,
+        (height + 2 * margin) * padded_width,
         dtype=torch.result_type(tracks.count, tracks.flow_px),
         device=cell.device,
     )
     for step_x, step_y, values in parts:
         image = image.scatter_add(
-            2, (cell + (step_y * across + step_x))[:, None].expand_as(values), values.to(image.dtype)
+            2, (cell + (step_y * padded_width + step_x))[:, None].expand_as(values), values.to(image.dtype)
         )
-    return image.unflatten(2, (height + 2 * margin, across))[..., margin:-margin, margin:-margin]
+    return image.unflatten(2, (height + 2 * margin, padded_width))[..., margin:-margin, margin:-margin]
 
 
 def _ratio(sums, counts):

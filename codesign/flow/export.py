@@ -6,8 +6,10 @@ import io
 import logging
 import warnings
 from pathlib import Path
+from typing import Any, cast
 
 import torch
+from torch import Tensor, nn
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from codesign.atomic import replacing
@@ -16,7 +18,7 @@ from codesign.optional import require
 from codesign.types import EventVolume
 
 
-def evenly_timed(counts, interval_s=1.0):
+def evenly_timed(counts: Tensor, interval_s: float = 1.0) -> EventVolume:
     """EventVolume of counts [B, 2, bins, H, W] whose bins are those of codesign.events.from_stream: equally
     spaced nodes, the two at the ends collecting half."""
     bins = counts.shape[2]
@@ -28,7 +30,7 @@ def evenly_timed(counts, interval_s=1.0):
     return EventVolume(counts, centroid_s, collected_s)
 
 
-def export(network, path, height_px, width_px, batch=1):
+def export(network: nn.Module, path: str | Path, height_px: int, width_px: int, batch: int = 1) -> None:
     """Write a network as a program for one size of input.
 
     Args:
@@ -61,7 +63,7 @@ def export(network, path, height_px, width_px, batch=1):
             temporary.write_bytes(_onnx(program, type(network).__name__))
 
 
-def trace(network, height_px, width_px, batch=1):
+def trace(network: nn.Module, height_px: int, width_px: int, batch: int = 1) -> torch.export.ExportedProgram:
     """torch.export's ExportedProgram of a network, in evaluation mode.
 
     What depends on the bins' times alone becomes a constant. The program looks at no value and so refuses
@@ -72,9 +74,10 @@ def trace(network, height_px, width_px, batch=1):
         field = network(evenly_timed(counts))
         return field.flow_px, field.valid.to(field.flow_px) if field.confidence is None else field.confidence
 
+    config: dict[str, Any] = cast(Any, network).config
     was_training = network.training
     network.eval()
-    counts = torch.zeros(batch, 2, network.config["bins"], height_px, width_px)
+    counts = torch.zeros(batch, 2, config["bins"], height_px, width_px)
     try:
         with torch.no_grad():
             # traced with values, since torch.export alone cannot follow a check for finite input or a number
@@ -101,7 +104,7 @@ def _tidy(graph):
     graph.recompile()
 
 
-def eliminate(matrix, right):
+def eliminate(matrix: Tensor, right: Tensor) -> Tensor:
     """Solution [..., n, m] of positive definite systems [..., n, n] by Gauss-Jordan elimination, which needs
     no exchange of rows there: plain operations alone."""
     size = matrix.shape[-1]

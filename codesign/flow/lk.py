@@ -12,14 +12,23 @@ events put into it, so that few events mean small steps, and the spread of what 
 flow.
 """
 
+from collections.abc import Sequence
+
 import torch
 
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.flow import lk_field, lk_level
-from codesign.types import FlowField
+from codesign.types import EventVolume, FlowField
 
 
-def estimate_lk(volume, model="affine", prior_px=3.0, levels_px=(4.0, 2.0, 1.0), steps=3, noise_floor=0.02):
+def estimate_lk(
+    volume: EventVolume,
+    model: str = "affine",
+    prior_px: float = 3.0,
+    levels_px: Sequence[float] = (4.0, 2.0, 1.0),
+    steps: int = 3,
+    noise_floor: float = 0.02,
+) -> FlowField:
     """Flow over the volume's interval, with its uncertainty.
 
     Args:

@@ -7,6 +7,7 @@ Parameters are [B, 2K]: p_1..p_K, q_1..q_K.
 """
 
 import torch
+from torch import Tensor
 
 TERMS = {"constant": 1, "affine": 3, "quadratic": 6}
 # expected flow at the border from these terms, over that of the constant: cameras mostly shift, turn and
@@ -20,21 +21,21 @@ FIXED_POINT_STEPS = 4  # each gains a factor of half the flow's gradient, some 0
 class Polynomials:
     """Fields of one model over an image of height x width pixels."""
 
-    def __init__(self, model, height, width):
+    def __init__(self, model: str, height: int, width: int) -> None:
         self.terms = TERMS[model]
         self.height = height
         self.width = width
         self.half = max(height, width) / 2
 
-    def scaled(self, x_px, y_px):
+    def scaled(self, x_px: Tensor, y_px: Tensor) -> tuple[Tensor, Tensor]:
         """Pixel coordinates to coordinates of the polynomials."""
         return (x_px - (self.width - 1) / 2) / self.half, (y_px - (self.height - 1) / 2) / self.half
 
-    def basis(self, u, v, dim=0):
+    def basis(self, u: Tensor, v: Tensor, dim: int = 0) -> Tensor:
         """[..., K at dim, ...]."""
         return torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v][: self.terms], dim)
 
-    def prior_precision(self, prior_px):
+    def prior_precision(self, prior_px: float) -> Tensor:
         """Inverse covariance [2K, 2K] of the parameters, per px^2: constant, divergence, rotation, two
         shears, quadratic terms, all independent."""
         k = self.terms
@@ -58,7 +59,7 @@ class Polynomials:
             precision += torch.outer(direction, direction) / (relative * prior_px) ** 2
         return precision
 
-    def mean_square(self, parameters):
+    def mean_square(self, parameters: Tensor) -> Tensor:
         """Mean squared length [B] of the flow over the square [-1, 1]^2."""
         p = parameters.reshape(len(parameters), 2, self.terms)
         second = p.new_tensor(
@@ -73,7 +74,7 @@ class Polynomials:
         )
         return torch.einsum("bck,kl,bcl->b", p, second[: self.terms, : self.terms], p)
 
-    def at_start(self, parameters):
+    def at_start(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """From the field at mid-interval to the flow on the pixels of the start, by fixed point: w(x) = v(x +
         w(x) / 2).
 
@@ -90,7 +91,7 @@ class Polynomials:
             flow = (p @ places.flatten(2)).unflatten(2, u.shape[1:])
         return flow, places
 
-    def covariance(self, covariance, places):
+    def covariance(self, covariance: Tensor, places: Tensor) -> Tensor:
         """Covariance [B, 3, H, W] (xx, xy, yy) of the flow from that of the parameters [B, 2K, 2K]."""
         k = self.terms
         at = places.flatten(2)

@@ -17,7 +17,11 @@ import math
 
 import torch
 from kornia.filters import gaussian_blur2d, get_gaussian_kernel1d
+from torch import Tensor
 from torch.nn.functional import avg_pool2d, conv1d, grid_sample, pad
+
+from codesign.flow.lk_field import Polynomials
+from codesign.types import EventVolume
 
 # the factor 3 and the power 4 = 2^2 above
 DOUBT = 3.0
@@ -30,17 +34,17 @@ CALIBRATION = 3.0
 TINY = 1e-12
 
 
-def stride(sigma_px):
+def stride(sigma_px: float) -> int:
     """Spacing of a level's grid, px: the largest power of two up to sigma, at least 1."""
     return 2 ** math.floor(math.log2(max(sigma_px, 1.0)))
 
 
-def least_px(sigma_px):
+def least_px(sigma_px: float) -> int:
     """Smallest side of an image that the level's kernel fits into."""
     return max(int(3 * sigma_px + 0.5) + 1, (_radius(sigma_px) + 1) * stride(sigma_px))
 
 
-def signed_rate(volume):
+def signed_rate(volume: EventVolume) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
     """(weight [n], time [n]) of the bins, events per interval [B, n, H, W] as if each bin ran over all of it,
     and events of both signs per pixel [B, H, W].
 
@@ -57,7 +61,15 @@ class Level:
     """The volume blurred by a Gaussian of sigma_px, sampled at the centres of squares of ``stride`` x
     ``stride`` pixels."""
 
-    def __init__(self, rate, density, times, shape, sigma_px, noise_floor):
+    def __init__(
+        self,
+        rate: Tensor,
+        density: Tensor,
+        times: tuple[Tensor, Tensor],
+        shape: Polynomials,
+        sigma_px: float,
+        noise_floor: float,
+    ) -> None:
         self.sigma = sigma_px
         self.shape = shape
         self.noise_floor = noise_floor
@@ -91,7 +103,7 @@ class Level:
             -1,
         ).flatten(0, 1)
 
-    def evidence(self, parameters):
+    def evidence(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Precision [B, 2K, 2K] that the data add at these parameters, and their pull [B, 2K] on them:
         precision times the distance to the best fit."""
         batch = len(parameters)
@@ -104,15 +116,15 @@ class Level:
         )
         sx = seen * dx
         sy = seen * dy
-        xx, xy, yy, crowd = (
+        xx, xy, yy, event_products = (
             (torch.stack([sx * dx, sx * dy, sy * dy, seen * self.density], 1) @ self.products)
             .unflatten(2, (k, k))
             .unbind(1)
         )
         normal = torch.cat([torch.cat([xx, xy], 2), torch.cat([xy, yy], 2)], 1)
         scattered = (
-            torch.block_diag(torch.ones(k, k), torch.ones(k, k)).to(crowd)
-            * crowd.repeat(1, 2, 2)
+            torch.block_diag(torch.ones(k, k), torch.ones(k, k)).to(event_products)
+            * event_products.repeat(1, 2, 2)
             * self.texture_noise
         )
         right = -(torch.stack([sx * slope, sy * slope], 1) @ self.basis).flatten(1)
@@ -122,7 +134,7 @@ class Level:
             * OVERLAP
             * self.sigma**2
             / self.stride**2
-            * self._noise(normal, right, crowd[:, 0, 0], (seen * slope.square()).sum(1))
+            * self._noise(normal, right, event_products[:, 0, 0], (seen * slope.square()).sum(1))
         )[:, None, None]
         return normal @ trust / scale, (right[:, None] @ trust / scale)[:, 0]
 

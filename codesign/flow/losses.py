@@ -6,6 +6,8 @@ loss of the whole. They are smooth (C1) in the flow unless the docstring says ot
 predictions show as a non-finite loss.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
@@ -19,6 +21,7 @@ from codesign.flow.contrast import (
     volume_tracks,
     warp_jacobian,
 )
+from codesign.types import EventVolume, FlowField
 
 REFERENCES = (
     (0.0, 0.25),
@@ -33,13 +36,19 @@ _FREE = 1.5
 _MOST = 2.5
 
 
-def charbonnier(squared, epsilon, exponent=0.5):
+def charbonnier(squared: Tensor, epsilon: float, exponent: float = 0.5) -> Tensor:
     """(s + epsilon^2)^exponent - epsilon^(2 exponent) of squared lengths s: 0 at 0, smooth, s^exponent far
     away. Source: Charbonnier et al., ICIP 1994; Sun et al., IJCV 2014."""
     return (squared + epsilon**2) ** exponent - epsilon ** (2 * exponent)
 
 
-def supervised_loss(predictions, truth, gamma=0.8, epsilon=0.01, unit_per_px: float | Tensor = 1.0):
+def supervised_loss(
+    predictions: Sequence[FlowField],
+    truth: FlowField,
+    gamma: float = 0.8,
+    epsilon: float = 0.01,
+    unit_per_px: float | Tensor = 1.0,
+) -> Tensor:
     """Charbonnier loss on the endpoint error of a list of predictions, coarse or early first.
 
     Args:
@@ -66,7 +75,13 @@ def supervised_loss(predictions, truth, gamma=0.8, epsilon=0.01, unit_per_px: fl
     )
 
 
-def likelihood_loss(predictions, truth, gamma=0.8, floor_px=0.1, prior_px=8.0):
+def likelihood_loss(
+    predictions: Sequence[FlowField],
+    truth: FlowField,
+    gamma: float = 0.8,
+    floor_px: float = 0.1,
+    prior_px: float = 8.0,
+) -> Tensor:
     """Negative log likelihood of the error under the covariance that each prediction claims for itself, a
     Gaussian less its constant ln 2 pi.
 
@@ -97,7 +112,7 @@ def likelihood_loss(predictions, truth, gamma=0.8, floor_px=0.1, prior_px=8.0):
     return _over_predictions(predictions, truth, gamma, nll)
 
 
-def relative_unit(truth, floor_px=1.0):
+def relative_unit(truth: FlowField, floor_px: float = 1.0) -> Tensor:
     """[B] 1 / sqrt(mean squared length of the valid true flow + floor_px^2): turns an error in px into a
     share of the sample's motion. Gradient: none."""
     squared = _known(truth).detach().square().sum(1).flatten(1).sum(1) / truth.valid.flatten(1).sum(
@@ -106,7 +121,7 @@ def relative_unit(truth, floor_px=1.0):
     return (squared + floor_px**2).rsqrt()
 
 
-def require_valid(truth):
+def require_valid(truth: FlowField) -> FlowField:
     """Raise DomainError when a sample of the truth has no valid pixel; return the truth unchanged
     otherwise."""
     empty = (~truth.valid.flatten(1).any(1)).nonzero().flatten().tolist()
@@ -118,7 +133,12 @@ def require_valid(truth):
     return truth
 
 
-def contrast_loss(volume, flow_px, carry_steps=1, references=REFERENCES):
+def contrast_loss(
+    volume: EventVolume,
+    flow_px: Tensor,
+    carry_steps: int = 1,
+    references: Sequence[tuple[float, float]] = REFERENCES,
+) -> Tensor:
     """Contrast maximisation without event collapse: zero-flow sharpness of the events over their sharpness
     when warped.
 
@@ -149,7 +169,12 @@ def contrast_loss(volume, flow_px, carry_steps=1, references=REFERENCES):
     return total.mean()
 
 
-def plain_contrast_loss(volume, flow_px, carry_steps=0, references=REFERENCES):
+def plain_contrast_loss(
+    volume: EventVolume,
+    flow_px: Tensor,
+    carry_steps: int = 0,
+    references: Sequence[tuple[float, float]] = REFERENCES,
+) -> Tensor:
     """The objective as published, zero-flow sharpness over mean sharpness, without a guard: a flow into one
     point beats the true one.
 
@@ -160,7 +185,12 @@ def plain_contrast_loss(volume, flow_px, carry_steps=0, references=REFERENCES):
     return ((sharpness(still_image(volume.counts)) + _FAINT) / (moved + _FAINT)).mean()
 
 
-def collapse_penalty(volume, flow_px, least=0.8, references=REFERENCES):
+def collapse_penalty(
+    volume: EventVolume,
+    flow_px: Tensor,
+    least: float = 0.8,
+    references: Sequence[tuple[float, float]] = REFERENCES,
+) -> Tensor:
     """Mean over the events of max(0, least - area change of the warp)^2: the published guard, to be added to
     plain_contrast_loss with a weight.
 
@@ -181,7 +211,9 @@ def collapse_penalty(volume, flow_px, least=0.8, references=REFERENCES):
     return (total / (events.sum((1, 2, 3)) + _FAINT)).mean()
 
 
-def photometric_loss(frames, flow_px, epsilon=1e-3, exponent=0.45):
+def photometric_loss(
+    frames: Tensor | None, flow_px: Tensor, epsilon: float = 1e-3, exponent: float = 0.45
+) -> Tensor:
     """Charbonnier difference between the start frame and the end frame read where the flow leads.
 
     Args: frames: [B, 2, H, W] intensity at the start and at the end, 0..255. flow_px: [B, 2, H, W] pixels per
@@ -218,7 +250,13 @@ def photometric_loss(frames, flow_px, epsilon=1e-3, exponent=0.45):
     return (inside * moved + (1 - inside) * still).mean()
 
 
-def smoothness_loss(flow_px, frame=None, epsilon=1e-3, exponent=0.45, edge=0.1):
+def smoothness_loss(
+    flow_px: Tensor,
+    frame: Tensor | None = None,
+    epsilon: float = 1e-3,
+    exponent: float = 0.45,
+    edge: float = 0.1,
+) -> Tensor:
     """Charbonnier difference between the flows of neighbours in a row and in a column.
 
     Args: flow_px: [B, 2, H, W]. frame: [B, H, W] intensity 0..255; a difference d (in units of 255) between

@@ -6,12 +6,14 @@ all samples together.
 """
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
 from codesign.flow.contrast import nearest_images, stream_tracks
+from codesign.types import EventStream, EventVolume, FlowField
 
 
-def endpoint_error(flow, truth):
+def endpoint_error(flow: Tensor, truth: Tensor) -> Tensor:
     """Length of the difference of two flows [..., 2, H, W] -> [..., H, W] px."""
     _check(flow, truth)
     return torch.linalg.vector_norm(flow - truth, dim=-3)  # its gradient at zero error is 0, not NaN
@@ -45,18 +47,20 @@ def _masked(values, mask):
     return values.flatten()
 
 
-def aee(flow, truth, mask=None):
+def aee(flow: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
     """Average endpoint error, px. Source: Baker et al., IJCV 2011."""
     return _masked(endpoint_error(flow, truth), mask).mean()
 
 
-def zero_flow_error(truth, mask=None):
+def zero_flow_error(truth: Tensor, mask: Tensor | None = None) -> Tensor:
     """Average endpoint error of the estimate "nothing moves", px: the mean true length, which every error
     should be compared with."""
     return aee(torch.zeros_like(truth), truth, mask)
 
 
-def outlier_percent(flow, truth, mask=None, pixels=3.0, share=0.05):
+def outlier_percent(
+    flow: Tensor, truth: Tensor, mask: Tensor | None = None, pixels: float = 3.0, share: float = 0.05
+) -> Tensor:
     """Share of pixels, in percent, whose endpoint error is above ``pixels`` AND above ``share`` of the true
     length (KITTI 2015: 3 px and 5 %)."""
     error = endpoint_error(flow, truth)
@@ -66,14 +70,14 @@ def outlier_percent(flow, truth, mask=None, pixels=3.0, share=0.05):
     return 100 * ((error > pixels) & (error > share * length)).to(error.dtype).mean()
 
 
-def npe(flow, truth, pixels, mask=None):
+def npe(flow: Tensor, truth: Tensor, pixels: float, mask: Tensor | None = None) -> Tensor:
     """Share of pixels, in percent, whose endpoint error is above ``pixels`` (DSEC's 1PE, 2PE, 3PE; what event
     papers on MVSEC call outliers is ``pixels=3``)."""
     error = _masked(endpoint_error(flow, truth), mask)
     return 100 * (error > pixels).to(error.dtype).mean()
 
 
-def angular_error_deg(flow, truth, mask=None):
+def angular_error_deg(flow: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
     """Mean angle in space-time between (u, v, 1) and the truth, degrees (Barron et al., 1994), by atan2 for
     accuracy at small angles."""
     _check(flow, truth)
@@ -83,7 +87,7 @@ def angular_error_deg(flow, truth, mask=None):
     ).mean()
 
 
-def ray_error_mrad(flow, truth, direction, mask=None):
+def ray_error_mrad(flow: Tensor, truth: Tensor, direction: Tensor, mask: Tensor | None = None) -> Tensor:
     """Mean angle between the rays at the estimated and the true end of each pixel's motion, milliradians per
     window.
 
@@ -100,7 +104,7 @@ def ray_error_mrad(flow, truth, direction, mask=None):
     return 1000 * _masked(_angle(_ray_at(plane, flow), _ray_at(plane, truth)), mask).mean()
 
 
-def mrad_per_pixel(direction):
+def mrad_per_pixel(direction: Tensor) -> Tensor:
     """Angle that one pixel spans, milliradians [H, W]: the root of its solid angle, from rays [H, W, 3] by
     central differences. Gradient: direction."""
     x, y = _slopes(direction, direction)
@@ -108,7 +112,13 @@ def mrad_per_pixel(direction):
     return 1000 * ((x_by_x * y_by_y - x_by_y * y_by_x).abs() * (1 + x.square() + y.square()) ** -1.5).sqrt()
 
 
-def pinhole_directions(height_px, width_px, focal_px, centre_px=None, dtype=torch.float64):
+def pinhole_directions(
+    height_px: int,
+    width_px: int,
+    focal_px: float,
+    centre_px: tuple[float, float] | None = None,
+    dtype: torch.dtype = torch.float64,
+) -> Tensor:
     """Directions [H, W, 3], z = 1, of a pinhole camera; centre_px: (x, y) of the axis, the image's middle
     when None."""
     centre_x, centre_y = ((width_px - 1) / 2, (height_px - 1) / 2) if centre_px is None else centre_px
@@ -120,12 +130,12 @@ def pinhole_directions(height_px, width_px, focal_px, centre_px=None, dtype=torc
     return torch.stack([x / focal_px, y / focal_px, torch.ones_like(x)], -1)
 
 
-def event_mask(volume):
+def event_mask(volume: EventVolume) -> Tensor:
     """Pixels [B, H, W] with at least a part of an event of either polarity in the window."""
     return (volume.counts.detach() > 0).flatten(1, 2).any(1)
 
 
-def masks(volume, truth):
+def masks(volume: EventVolume, truth: FlowField) -> dict[str, Tensor]:
     """The three masks that errors are reported under: {"valid", "events", "both"}, each [B, H, W] bool."""
     events = event_mask(volume)
     valid = truth.valid
@@ -136,7 +146,9 @@ def masks(volume, truth):
     return {"valid": valid, "events": events, "both": valid & events}
 
 
-def fwl(stream, flow_px, t0_us, t1_us, at=1.0, carry_steps=0):
+def fwl(
+    stream: EventStream, flow_px: Tensor, t0_us: int, t1_us: int, at: float = 1.0, carry_steps: int = 0
+) -> float:
     """Flow warp loss: variance of the image of warped events over its variance at zero flow. Above 1 the flow
     makes the events sharper.
 
@@ -162,7 +174,7 @@ def fwl(stream, flow_px, t0_us, t1_us, at=1.0, carry_steps=0):
     return float(moved / still)
 
 
-def rsat(stream, flow_px, t0_us, t1_us, carry_steps=0):
+def rsat(stream: EventStream, flow_px: Tensor, t0_us: int, t1_us: int, carry_steps: int = 0) -> float:
     """Ratio of the squared average time stamps, warped to t1 over unwarped. Below 1 the flow aligns the
     events.
 

@@ -2,7 +2,7 @@
 moves says what to add."""
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, pad, silu, unfold
 
 from codesign.errors import DomainError
@@ -10,7 +10,7 @@ from codesign.flow.entry import check_bins, check_volume, pad_to, presence
 from codesign.flow.layers import GROUPS, Layer
 from codesign.flow.lk import estimate_lk
 from codesign.flow.warp import along_flow
-from codesign.types import FlowField
+from codesign.types import EventVolume, FlowField
 
 STRIDE = 16  # sizes are padded to multiples of this
 # pixels a side over which the volume is averaged before anything else: no coarser than the closed form's
@@ -38,7 +38,7 @@ class Refiner(nn.Module):
     truth does.
     """
 
-    def __init__(self, bins: int = 8, width: int = 28, steps: int = 2):
+    def __init__(self, bins: int = 8, width: int = 28, steps: int = 2) -> None:
         super().__init__()
         check_bins(bins)
         if steps < 1 or width < GROUPS or width % GROUPS:
@@ -63,7 +63,7 @@ class Refiner(nn.Module):
             for parameter in last.parameters():
                 nn.init.zeros_(parameter)
 
-    def forward(self, volume):
+    def forward(self, volume: EventVolume) -> FlowField:
         """Flow of an EventVolume [B, 2, bins, H, W] of any H, W.
 
         The corrected flow counts where it leaves less that moves than the start does, over windows of 26 px;
@@ -81,7 +81,7 @@ class Refiner(nn.Module):
         share = misfits[0].square() / (misfits[0].square() + misfits[1].square())
         return _field(start_px + _larger(share[:, None], POOL) * (flow_px - start_px), doubt, volume)
 
-    def predictions(self, volume, start_px=None):
+    def predictions(self, volume: EventVolume, start_px: Tensor | None = None) -> list[FlowField]:
         """FlowFields after each correction, by themselves: what training looks at. start_px: [B, 2, H, W]
         flow to begin with instead of the closed form's."""
         bins = _Bins(volume, self.config["bins"])
@@ -179,8 +179,8 @@ class _Bins:
         """Mean over the bins of ON less OFF, and its slope over time per window, [B, h, w] each."""
         signed = rates[:, 0] - rates[:, 1]
         centred = self.time - (self.share * self.time).sum()
-        lean = self.share * centred / (self.share * centred.square()).sum()
-        return (signed * self.share[:, None, None]).sum(1), (signed * lean[:, None, None]).sum(1)
+        slope_weight = self.share * centred / (self.share * centred.square()).sum()
+        return (signed * self.share[:, None, None]).sum(1), (signed * slope_weight[:, None, None]).sum(1)
 
     def misfit(self, flow_px):
         """Mean square of what still moves along a flow [B, 2, H, W] px, over windows, [B, h, w], on a small
@@ -213,8 +213,10 @@ def _evidence(mean, moving, warped):
         if scale < CELL:
             products = avg_pool2d(products, CELL // scale)
         products = avg_pool2d(products, 3, stride=1, padding=1, count_include_pad=False)
-        told = _local_flow(products, 4.0 * scale)
-        found.append(interpolate(told, scale_factor=scale // CELL, mode="nearest") if scale > CELL else told)
+        local = _local_flow(products, 4.0 * scale)
+        found.append(
+            interpolate(local, scale_factor=scale // CELL, mode="nearest") if scale > CELL else local
+        )
     return torch.cat(found, 1)
 
 

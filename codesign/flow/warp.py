@@ -1,10 +1,11 @@
 """Bins of an event volume looked up along a flow, and pixel grids."""
 
 import torch
+from torch import Tensor
 from torch.nn.functional import grid_sample
 
 
-def pixel_grid(height, width, like):
+def pixel_grid(height: int, width: int, like: Tensor) -> Tensor:
     """Pixel positions [2, H, W], (x, y) with the origin at the first pixel's centre."""
     y, x = torch.meshgrid(
         torch.arange(height, dtype=like.dtype, device=like.device),
@@ -14,7 +15,7 @@ def pixel_grid(height, width, like):
     return torch.stack([x, y])
 
 
-def along_flow(bins, flow_px, time):
+def along_flow(bins: Tensor, flow_px: Tensor, time: Tensor) -> Tensor:
     """What each bin holds where a point of the start has got to.
 
     Args: bins: [B, T, H, W], or [B, C, T, H, W] with polarities or the like. flow_px: [B, 2, H, W] px per

@@ -11,7 +11,7 @@ from codesign.errors import DomainError
 Jacobian = Callable[[Callable[[Tensor], Tensor], Tensor, Tensor], Tensor]
 
 
-def by_autograd(residuals, variables, value):
+def by_autograd(residuals: Callable[[Tensor], Tensor], variables: Tensor, value: Tensor) -> Tensor:
     """Jacobian [M, V] by one backward pass per residual: exact; for few residuals, or as a reference."""
     at = variables.detach().requires_grad_()
     with torch.enable_grad():
@@ -22,7 +22,7 @@ def by_autograd(residuals, variables, value):
     return torch.stack([torch.zeros_like(variables) if row is None else row for row in rows]).detach()
 
 
-def by_differences(step, central=False):
+def by_differences(step: float | Tensor, central: bool = False) -> Jacobian:
     """A Jacobian by differences of the variables: V more evaluations, 2 V when ``central``.
 
     Args: step: a number or [V]; the error is about step (step^2 when central) times curvature, plus rounding
@@ -50,21 +50,21 @@ def _slope(residuals, variables, value, at, step, central):
         shifted[at] += by
         return residuals(shifted), float(shifted[at] - variables[at])  # the step that rounding leaves
 
-    ahead, forward = moved(step)
-    if finite(ahead) and not central:
-        return (ahead - value) / forward
-    behind, back = moved(-step)
-    if not finite(ahead):
-        return (behind - value) / back
-    return (ahead - behind) / (forward - back) if finite(behind) else (ahead - value) / forward
+    plus, plus_step = moved(step)
+    if finite(plus) and not central:
+        return (plus - value) / plus_step
+    minus, minus_step = moved(-step)
+    if not finite(plus):
+        return (minus - value) / minus_step
+    return (plus - minus) / (plus_step - minus_step) if finite(minus) else (plus - value) / plus_step
 
 
-def finite(value):
+def finite(value: Tensor) -> bool:
     """Whether every entry is a finite number."""
     return bool(value.isfinite().all())
 
 
-def column_scales(jacobian: Tensor, limit: float | Tensor = math.inf):
+def column_scales(jacobian: Tensor, limit: float | Tensor = math.inf) -> Tensor:
     """Step per variable [V] that changes the residuals by 1: one over the column norms, at most ``limit``.
 
     Args: jacobian [M, V]; limit: number or [V], for variables the residuals hardly see.
@@ -75,7 +75,7 @@ def column_scales(jacobian: Tensor, limit: float | Tensor = math.inf):
     )
 
 
-def principal_modes(jacobian, limit=math.inf):
+def principal_modes(jacobian: Tensor, limit: float = math.inf) -> Tensor:
     """Basis [V, V] whose columns are directions with effects at right angles, each of which changes the
     residuals by 1.
 

@@ -3,6 +3,7 @@ measured in. Resumable."""
 
 import math
 from collections.abc import Callable
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -41,7 +42,7 @@ class ScaledAdam:
         basis: Tensor | None = None,
         step_size: float = 0.1,
         betas: tuple[float, float] = (0.9, 0.999),
-    ):
+    ) -> None:
         self.loss = loss
         self.start = check_start(start)
         self.basis = torch.ones_like(self.start) if basis is None else basis.detach().to(self.start)
@@ -70,10 +71,10 @@ class ScaledAdam:
         self.best_loss = value
 
     @property
-    def variables(self):
+    def variables(self) -> Tensor:
         return self.start + self._spread(self.units)
 
-    def step(self):
+    def step(self) -> Entry:
         """One step. Returns its Entry, with the loss before it."""
         units, value, slope = self._good
         b1, b2 = self.betas
@@ -86,8 +87,8 @@ class ScaledAdam:
             / ((self.square / (1 - b2**self.count)).sqrt() + 1e-12)
         )
         trial = units + step
-        ahead, next_slope = self._evaluate(trial)
-        accepted = math.isfinite(ahead) and finite(next_slope) and finite(trial)
+        next_value, next_slope = self._evaluate(trial)
+        accepted = math.isfinite(next_value) and finite(next_slope) and finite(trial)
         entry = Entry(
             value,
             float(slope.norm()),
@@ -97,10 +98,10 @@ class ScaledAdam:
         )
         if accepted:
             self.units = trial
-            self._good = (trial, ahead, next_slope)
-            if ahead < self.best_loss:
+            self._good = (trial, next_value, next_slope)
+            if next_value < self.best_loss:
                 self.best = self.variables
-                self.best_loss = ahead
+                self.best_loss = next_value
         else:
             zero = torch.zeros_like(self.mean)
             self.mean = zero
@@ -110,7 +111,9 @@ class ScaledAdam:
         self.history.add(entry)
         return entry
 
-    def run(self, steps: int, progress: Callable[[Entry], object] | None = None, gradient: float = 0.0):
+    def run(
+        self, steps: int, progress: Callable[[Entry], object] | None = None, gradient: float = 0.0
+    ) -> Tensor:
         """``steps`` more, or until the gradient's norm (in units of the basis) is at most ``gradient``.
         Returns the best variables."""
         for _ in range(steps):
@@ -121,7 +124,7 @@ class ScaledAdam:
                 break
         return self.best
 
-    def state(self):
+    def state(self) -> dict[str, Any]:
         """Everything needed to go on, as numbers and lists that JSON and torch.save keep to the last bit."""
         vectors = {name: getattr(self, name).tolist() for name in ("units", "mean", "square", "best")}
         return {
@@ -132,7 +135,7 @@ class ScaledAdam:
             "history": self.history.rows(),
         }
 
-    def resume(self, state: dict):
+    def resume(self, state: dict[str, Any]) -> Self:
         """Go on from ``state``; the same steps follow as without the break. Raises: ShapeError when it
         belongs to other variables."""
         if len(state["units"]) != self.start.numel():

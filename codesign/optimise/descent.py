@@ -40,7 +40,7 @@ class Descent(torch.optim.Optimizer):
         pull: float = 0.02,
         normalised: bool = False,
         grain: int = GRAIN,
-    ):
+    ) -> None:
         if not (0 < lr < math.inf and 0 <= momentum < 1 and pull >= 0 and grain >= 0):
             raise DomainError(
                 f"descent: lr {lr} must be positive and finite, momentum {momentum} in [0, 1), pull {pull} and "

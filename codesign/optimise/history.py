@@ -1,7 +1,9 @@
 """What the optimisers share: the record of their steps, and the check of a start."""
 
 import dataclasses
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from torch import Tensor
 
@@ -26,26 +28,26 @@ class History:
 
     entries: list[Entry] = field(default_factory=list)
 
-    def add(self, entry):
+    def add(self, entry: Entry) -> None:
         self.entries.append(entry)
 
-    def column(self, name):
+    def column(self, name: str) -> list[Any]:
         """One field of every step, a list."""
         return [getattr(entry, name) for entry in self.entries]
 
-    def rows(self):
+    def rows(self) -> list[list[Any]]:
         """Plain lists for a state file."""
         return [list(dataclasses.astuple(entry)) for entry in self.entries]
 
     @staticmethod
-    def of(rows):
+    def of(rows: Iterable[Sequence[Any]]) -> "History":
         """The history that ``rows`` came from."""
         return History([Entry(*row) for row in rows])
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.entries)
 
-    def __getitem__(self, at):
+    def __getitem__(self, at: int) -> Entry:
         return self.entries[at]
 
 

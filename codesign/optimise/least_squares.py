@@ -6,7 +6,7 @@ units of the variables
 do not matter. The gain ratio (what the sum of squares lost over what the linear model promised) multiplies
 the damping down after a
 good step and up after a bad one. Constraints beyond bounds are residual rows of their own, such as weight *
-max(0, lack).
+max(0, shortfall).
 Source: Marquardt, SIAM J. Appl. Math. 11 (1963); Nielsen, Damping parameter in Marquardt's method,
   IMM-REP-1999-05 (update of the damping);
 More, The Levenberg-Marquardt algorithm, LNM 630 (1978) (scaling).
@@ -15,6 +15,7 @@ More, The Levenberg-Marquardt algorithm, LNM 630 (1978) (scaling).
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -68,7 +69,7 @@ class DampedLeastSquares:
         upper: Tensor | None = None,
         damping: float = 1e-3,
         stop: StopRules | None = None,
-    ):
+    ) -> None:
         self.residuals = residuals
         self.jacobian = jacobian
         self.stop = stop or StopRules()
@@ -87,11 +88,11 @@ class DampedLeastSquares:
         self._slopes: Tensor | None = None
 
     @property
-    def loss(self):
+    def loss(self) -> float:
         """Half the sum of squares at the variables."""
         return float(self._value.square().sum()) / 2
 
-    def step(self):
+    def step(self) -> Entry:
         """One trial step, accepted or not. Returns its Entry; ``stopped`` says whether a rule ended the
         run."""
         J = self._slopes = self._jacobian() if self._slopes is None else self._slopes
@@ -130,7 +131,7 @@ class DampedLeastSquares:
         self.stopped = self._why(steepest, moved, size, before, after, accepted)
         return entry
 
-    def run(self, steps: int | None = None, progress: Callable[[Entry], object] | None = None):
+    def run(self, steps: int | None = None, progress: Callable[[Entry], object] | None = None) -> Tensor:
         """Step until a rule ends it, or for ``steps`` more. ``progress`` is called after each step. Returns
         the variables."""
         self.stopped = ""
@@ -143,7 +144,7 @@ class DampedLeastSquares:
         self.stopped = "steps"
         return self.variables
 
-    def state(self):
+    def state(self) -> dict[str, Any]:
         """Everything needed to go on, as numbers and lists that JSON and torch.save keep to the last bit."""
         return {
             "variables": self.variables.tolist(),
@@ -153,7 +154,7 @@ class DampedLeastSquares:
             "history": self.history.rows(),
         }
 
-    def resume(self, state: dict):
+    def resume(self, state: dict[str, Any]) -> Self:
         """Go on from ``state``; the same steps follow as without the break. Raises: ShapeError when it
         belongs to other variables."""
         found = torch.tensor(state["variables"], dtype=self.variables.dtype, device=self.variables.device)

@@ -59,7 +59,7 @@ class Loop:
         patience: int | None = 0,
         shrink: float = 0.5,
         schedule: Callable[[int], float] | None = None,
-    ):
+    ) -> None:
         if (clip is not None and not clip > 0) or judge_every < 1 or not 0 < shrink <= 1:
             raise DomainError(
                 f"loop: clip {clip} must be above 0 (or None), judge_every {judge_every} at least 1, shrink "

@@ -8,13 +8,15 @@ with level rows.
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.place.observability import chief_lines, flow_of_points
 from codesign.pose import se3_exp
+from codesign.types import ChiefRayCamera
 
 MOST_PIXELS = 255  # of a film, spread over it, at which the motion of the image is measured
 AXES_BODY_CAM = torch.tensor(
@@ -43,12 +45,21 @@ class Mount(nn.Module):
       ShapeError for other than three numbers.
     """
 
-    start_attitude: torch.Tensor
-    nominal_m: torch.Tensor
-    half_range_m: torch.Tensor
-    unit: torch.Tensor
+    start_attitude: Tensor
+    nominal_m: Tensor
+    half_range_m: Tensor
+    unit: Tensor
 
-    def __init__(self, nominal_m, half_range_m, *, yaw_rad=0.0, pitch_rad=0.0, roll_rad=0.0, position_m=None):
+    def __init__(
+        self,
+        nominal_m: Sequence[float] | Tensor,
+        half_range_m: Sequence[float] | Tensor,
+        *,
+        yaw_rad: float = 0.0,
+        pitch_rad: float = 0.0,
+        roll_rad: float = 0.0,
+        position_m: Sequence[float] | Tensor | None = None,
+    ) -> None:
         super().__init__()
         nominal = _three(nominal_m, "nominal_m")
         half = _three(half_range_m, "half_range_m")
@@ -78,7 +89,7 @@ class Mount(nn.Module):
             )
         return torch.atanh(torch.where(free, offset / torch.where(free, half, 1.0), 0.0))
 
-    def forward(self, numbers=None):
+    def forward(self, numbers: Tensor | None = None) -> Tensor:
         """T_body_cam [..., 4, 4] of ``numbers`` [..., 6]; the mount's own when None. Gradient: exact, to the
         numbers.
 
@@ -99,7 +110,9 @@ class Mount(nn.Module):
         )
         return torch.cat([top, last], -2)
 
-    def variables(self, camera, depth_m: float | torch.Tensor, step_px: float = 1.0) -> list[nn.Parameter]:
+    def variables(
+        self, camera: ChiefRayCamera, depth_m: float | Tensor, step_px: float = 1.0
+    ) -> list[nn.Parameter]:
         """Rescale ``numbers`` so that a unit of each moves the image of what the camera sees by ``step_px`` RMS;
         the pose stays. Then one learning rate suits the mount, the lens's variables and a network.
 
@@ -151,12 +164,12 @@ class Mount(nn.Module):
         motion = flow_of_points(velocity, slope, base_step + slope_step * depth[..., None])
         return motion.square().sum(1).mean(0).sqrt()
 
-    def in_world(self, T_world_body, numbers=None):
+    def in_world(self, T_world_body: Tensor, numbers: Tensor | None = None) -> Tensor:
         """T_world_cam = T_world_body T_body_cam for body poses [..., 4, 4]; gradient to both."""
         return T_world_body @ self(numbers)
 
 
-def attitude(yaw_rad, pitch_rad, roll_rad):
+def attitude(yaw_rad: float, pitch_rad: float, roll_rad: float) -> Tensor:
     """Rotation [3, 3] from camera to body axes: Rz(yaw) Ry(pitch) Rx(roll) after the axes of a level camera.
     Raises: DomainError when not finite."""
     turn = torch.eye(3, dtype=torch.float64)
@@ -173,7 +186,7 @@ def attitude(yaw_rad, pitch_rad, roll_rad):
     return turn @ AXES_BODY_CAM
 
 
-def yaw_pitch_roll_rad(T_body_cam):
+def yaw_pitch_roll_rad(T_body_cam: Tensor) -> Tensor:
     """Angles [..., 3] of a mount, the inverse of ``attitude``: yaw and roll in (-pi, pi], pitch in [-pi/2,
     pi/2].
 

@@ -8,9 +8,13 @@ any lens that has chief rays.
 The flow is linear in (forward m/s, lateral m/s to the left, yaw rate rad/s to the left) of the body's origin.
 """
 
+from collections.abc import Sequence
+
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.types import ChiefRayCamera
 
 _STEP_PX = (
     1e-3  # central differences of chief rays: exact for a pinhole, 1e-6 of the third derivative otherwise
@@ -20,7 +24,7 @@ _SMALLEST_RATIO = (
 )
 
 
-def planar_flow(camera, depth_m, T_body_cam):
+def planar_flow(camera: ChiefRayCamera, depth_m: Tensor, T_body_cam: Tensor) -> tuple[Tensor, Tensor]:
     """Flow that each unit of planar body velocity makes in every pixel.
 
     Args:
@@ -43,14 +47,20 @@ def planar_flow(camera, depth_m, T_body_cam):
     seen = depth.detach().isfinite() & (depth.detach() > 0)
     depth = torch.where(seen, depth, 1.0)[..., None]
     base, slope, base_step, slope_step = chief_lines(camera, pixels)
-    across = base + slope * depth
-    point = torch.cat([across, depth], -1)  # [..., P, 3]
+    point = torch.cat([base + slope * depth, depth], -1)  # [..., P, 3]
     moving = _point_velocity(point, T_body_cam.double())  # [..., P, 3, 3]
     flow = flow_of_points(moving, slope, base_step + slope_step * depth[..., None])
     return torch.where(seen[..., None, None], flow, 0.0), seen
 
 
-def velocity_from_flow(flow_px_s, camera, depth_m, T_body_cam, weight=None, prior=None):
+def velocity_from_flow(
+    flow_px_s: Tensor,
+    camera: ChiefRayCamera,
+    depth_m: Tensor,
+    T_body_cam: Tensor,
+    weight: Tensor | None = None,
+    prior: Sequence[float] | Tensor | None = None,
+) -> Tensor:
     """Planar velocity of the body by weighted least squares.
 
     Args:
@@ -79,7 +89,13 @@ def velocity_from_flow(flow_px_s, camera, depth_m, T_body_cam, weight=None, prio
     return torch.linalg.solve(normal.expand(*right.shape, 3), right)
 
 
-def information(camera, depth_m, T_body_cam, weight=None, prior=None):
+def information(
+    camera: ChiefRayCamera,
+    depth_m: Tensor,
+    T_body_cam: Tensor,
+    weight: Tensor | None = None,
+    prior: Sequence[float] | Tensor | None = None,
+) -> Tensor:
     """Information matrix of (forward m/s, lateral m/s, yaw rate rad/s) in a flow field: sum over pixels of
     weight J^T J.
 
@@ -91,7 +107,7 @@ def information(camera, depth_m, T_body_cam, weight=None, prior=None):
     return _normal_matrix(*_weighted_rows(camera, depth_m, T_body_cam, weight), prior)
 
 
-def chief_lines(camera, pixels):
+def chief_lines(camera: ChiefRayCamera, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Chief rays as lines x(z) = base + slope z, [P, 2] each, and their change per pixel, [P, 2, 2] (last
     axis: pixel x, y)."""
     step = (
@@ -111,7 +127,7 @@ def chief_lines(camera, pixels):
     return base[0], slope[0], change(base), change(slope)
 
 
-def flow_of_points(velocity, slope, step):
+def flow_of_points(velocity: Tensor, slope: Tensor, step: Tensor) -> Tensor:
     """Image motion [..., P, 2, K] px per unit of K motions of the points under pixels.
 
     Args: velocity: [..., P, 3, K] m of the points, in camera axes. slope: [P, 2] of the chief rays. step:

@@ -1,10 +1,16 @@
 """Pictures of what passes along the chain: frames, event frames, curves, junction table."""
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 
-def strips(rows, titles, signed, labels):
+def strips(
+    rows: Sequence[Sequence[np.ndarray]], titles: Sequence[str], signed: Sequence[bool], labels: Sequence[str]
+) -> Figure:
     """Figure of image rows: rows [R][C] of [H, W] arrays; ``signed`` rows are drawn red (ON) and blue (OFF),
     others in grey."""
     figure, axes = plt.subplots(
@@ -26,7 +32,9 @@ def strips(rows, titles, signed, labels):
     return figure
 
 
-def curves(series, ylabel, xlabel="step", logarithmic=False):
+def curves(
+    series: Mapping[str, tuple[Any, Any]], ylabel: str, xlabel: str = "step", logarithmic: bool = False
+) -> Figure:
     """Figure of named curves: dict label -> (x, y)."""
     figure, axis = plt.subplots(figsize=(7, 3.4))
     for label, (x, y) in series.items():
@@ -41,7 +49,7 @@ def curves(series, ylabel, xlabel="step", logarithmic=False):
     return figure
 
 
-def heat_map(values, rows, columns, label):
+def heat_map(values: Any, rows: Sequence[str], columns: Sequence[str], label: str) -> Figure:
     """Figure of a labelled matrix on a logarithmic colour scale; NaN cells stay empty."""
     from matplotlib.colors import LogNorm
 

@@ -2,13 +2,18 @@
 through focus, Seidel sums."""
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 
 from codesign.lens import analysis
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.seidel import SeidelSums
 from codesign.report.lens_figures import COLOURS, VISIBLE_UM
 
 SEIDEL_NAMES = (
@@ -22,7 +27,9 @@ SEIDEL_COLOURS = ("#1b6ca8", "#2e8b57", "#d68910", "#8e44ad", "#c0392b")
 
 
 @torch.no_grad()
-def field_errors(lens, half_field_rad, light: object = VISIBLE_UM, mapping="f-tan", count=21):
+def field_errors(
+    lens: GeoLens, half_field_rad: float, light: Any = VISIBLE_UM, mapping: str = "f-tan", count: int = 21
+) -> Figure:
     """Figure over the field: tangential and sagittal focus, distortion, and lateral colour against the first
     wavelength."""
     reference, *others = analysis.spectral_lines(light)[0]
@@ -57,14 +64,14 @@ def field_errors(lens, half_field_rad, light: object = VISIBLE_UM, mapping="f-ta
 
 @torch.no_grad()
 def through_focus(
-    lens,
-    fields_rad,
-    defocus_mm,
-    frequency_per_mm,
-    light: object = WAVELENGTH_UM["d"],
-    vignetting=False,
-    method="geometric",
-):
+    lens: GeoLens,
+    fields_rad: Sequence[float],
+    defocus_mm: Sequence[float] | np.ndarray,
+    frequency_per_mm: float,
+    light: Any = WAVELENGTH_UM["d"],
+    vignetting: bool = False,
+    method: str = "geometric",
+) -> Figure:
     """Figure over the position of the image plane: RMS spot, and MTF at one frequency."""
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     z = np.asarray(defocus_mm, dtype=float)
@@ -87,7 +94,7 @@ def through_focus(
     return figure
 
 
-def seidel_bars(sums, wavelength_um=WAVELENGTH_UM["d"]):
+def seidel_bars(sums: SeidelSums, wavelength_um: float = WAVELENGTH_UM["d"]) -> Figure:
     """Figure of Seidel sums (``SeidelSums``) per surface and, on a scale of its own, in total; in waves."""
     values = sums.per_surface.detach().numpy() / (wavelength_um * 1e-3)
     total = sums.total.detach().numpy() / (wavelength_um * 1e-3)
@@ -110,7 +117,9 @@ def seidel_bars(sums, wavelength_um=WAVELENGTH_UM["d"]):
 
 
 @torch.no_grad()
-def encircled_curves(lens, fields_rad, light: object = WAVELENGTH_UM["d"], vignetting=False):
+def encircled_curves(
+    lens: GeoLens, fields_rad: Sequence[float], light: Any = WAVELENGTH_UM["d"], vignetting: bool = False
+) -> Figure:
     """Figure of encircled energy (rays, about their mean) over the radius, a curve per field."""
     figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
     largest = max(

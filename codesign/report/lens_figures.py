@@ -2,13 +2,19 @@
 a matplotlib Figure."""
 
 import math
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from torch import Tensor
 
 from codesign.lens import analysis
+from codesign.lens.analysis.psf import Psf
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.report.lens_layout import COLOURS, draw_layout, layouts, lens_layout
 
@@ -36,7 +42,7 @@ LINE_COLOURS = (
 )  # of wavelengths; the first is the reference
 
 
-def spot_diagrams(lenses, fields_rad, pixel_mm):
+def spot_diagrams(lenses: Mapping[str, GeoLens], fields_rad: Sequence[float], pixel_mm: float) -> Figure:
     """Figure of spot diagrams: a row per lens (dict title -> lens), a column per field, one scale, the pixel
     drawn in."""
     figure, axes = plt.subplots(
@@ -71,7 +77,13 @@ def spot_diagrams(lenses, fields_rad, pixel_mm):
 
 
 @torch.no_grad()
-def spots_by_wavelength(lens, fields_rad, light: object = VISIBLE_UM, grid=24, vignetting=False):
+def spots_by_wavelength(
+    lens: GeoLens,
+    fields_rad: Sequence[float],
+    light: Any = VISIBLE_UM,
+    grid: int = 24,
+    vignetting: bool = False,
+) -> Figure:
     """Figure of spots of each field about the chief ray of the first wavelength, a colour per wavelength,
     with the Airy disc."""
     wavelengths, _ = analysis.spectral_lines(light)
@@ -114,7 +126,9 @@ def spots_by_wavelength(lens, fields_rad, light: object = VISIBLE_UM, grid=24, v
 
 
 @torch.no_grad()
-def ray_fans(lens, fields_rad, light: object = VISIBLE_UM, vignetting=False):
+def ray_fans(
+    lens: GeoLens, fields_rad: Sequence[float], light: Any = VISIBLE_UM, vignetting: bool = False
+) -> Figure:
     """Figure of ray fans: transverse aberration (upper) and optical path difference (lower) over the pupil, a
     pair of columns per field, relative to the first wavelength's chief ray."""
     wavelengths, _ = analysis.spectral_lines(light)
@@ -164,7 +178,13 @@ def ray_fans(lens, fields_rad, light: object = VISIBLE_UM, vignetting=False):
 
 
 @torch.no_grad()
-def opd_maps(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"], grid=96, vignetting=False):
+def opd_maps(
+    lens: GeoLens,
+    fields_rad: Sequence[float],
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    grid: int = 96,
+    vignetting: bool = False,
+) -> Figure:
     """Figure of optical path difference maps over the pupil, piston and tilt removed, one scale in waves."""
     pupil = analysis.pupil_grid(grid, lens.dtype)
     fronts = [
@@ -200,7 +220,7 @@ def opd_maps(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"], grid=96, vignet
     return figure
 
 
-def psf_pictures(psfs, titles, floor=1e-4):
+def psf_pictures(psfs: Sequence[Psf], titles: Sequence[str], floor: float = 1e-4) -> Figure:
     """Figure of point spreads (list of ``Psf``), each over its own peak on a logarithmic scale. Axes in µm
     about the reference point."""
     figure, axes = plt.subplots(
@@ -224,7 +244,9 @@ def psf_pictures(psfs, titles, floor=1e-4):
     return figure
 
 
-def mtf_curves(frequency_per_mm, curves, ideal=None, title=""):
+def mtf_curves(
+    frequency_per_mm: Tensor, curves: Mapping[str, Tensor], ideal: Tensor | None = None, title: str = ""
+) -> Figure:
     """Figure of MTFs. Args: frequency_per_mm [K]; curves: dict title -> [2, K] tangential (full line),
     sagittal (dashed); ideal [K] or None."""
     figure, axis = plt.subplots(figsize=(7, 3.8), layout="constrained")

@@ -1,12 +1,16 @@
 """Cross-section of a lens: surfaces, glass, stop, and the rays of a few fields, in millimetres."""
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
 
 from codesign.errors import FileFormatError
 from codesign.lens.analysis.rays import source_rays
@@ -21,7 +25,9 @@ MIRROR = "#5f6b76"
 ENDINGS = (".svg", ".png", ".pdf")
 
 
-def lens_layout(lens, fields_rad=None, path=None, rays=5):
+def lens_layout(
+    lens: GeoLens, fields_rad: Sequence[float] | None = None, path: str | Path | None = None, rays: int = 5
+) -> Figure:
     """Figure of a lens's cross-section with meridional rays.
 
     Args: fields_rad: angles; None takes 0, 0.7 and 1 of the lens's half field (10 degrees where none is
@@ -48,7 +54,7 @@ def lens_layout(lens, fields_rad=None, path=None, rays=5):
     return figure
 
 
-def layouts(lenses, fields_rad):
+def layouts(lenses: Mapping[str, GeoLens], fields_rad: Sequence[float]) -> Figure:
     """Figure of several lenses above one another: dict title -> lens."""
     figure, axes = plt.subplots(len(lenses), 1, figsize=(9, 3.0 * len(lenses)), sharex=True, squeeze=False)
     for axis, (title, lens) in zip(axes[:, 0], lenses.items(), strict=True):
@@ -58,7 +64,7 @@ def layouts(lenses, fields_rad):
     return figure
 
 
-def draw_layout(axis, lens, fields_rad, rays=5):
+def draw_layout(axis: Axes, lens: GeoLens, fields_rad: Sequence[float], rays: int = 5) -> None:
     """Draw the cross-section of a lens with meridional rays of each field into a matplotlib axis. Lengths in
     mm."""
     surfaces = lens.to_surfaces()
@@ -123,7 +129,7 @@ def draw_layout(axis, lens, fields_rad, rays=5):
         )
 
 
-def ray_paths(lens, field_rad, pupil, start_z_mm):
+def ray_paths(lens: GeoLens, field_rad: float, pupil: Tensor, start_z_mm: float) -> list[np.ndarray]:
     """Polylines [points, 2] (z, y) in mm of the rays of a field that arrive, found by tracing the lens cut
     off behind each surface."""
     surfaces = lens.to_surfaces()

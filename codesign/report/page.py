@@ -1,6 +1,7 @@
 """The page of a run: one HTML file that holds everything it shows and loads nothing."""
 
 import base64
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 from pathlib import Path
@@ -54,7 +55,7 @@ class Section:
     blocks: list[tuple[str, Any]] = field(default_factory=list)
 
 
-def picture(path, caption):
+def picture(path: str | Path, caption: str) -> Picture:
     """Inline the image or video at ``path``.
 
     Raises: FileFormatError when it is missing or not PNG, GIF or MP4.
@@ -71,7 +72,7 @@ def picture(path, caption):
         ) from error
 
 
-def table(title, columns, rows, caption=""):
+def table(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]], caption: str = "") -> Table:
     """Table of numbers, text and None (shown as a dash). A column of numbers is right-aligned; floats show
     four digits.
 
@@ -92,7 +93,7 @@ def table(title, columns, rows, caption=""):
     return Table(title, columns, tuple(tuple(map(cell, row)) for row in rows), numeric, caption)
 
 
-def cell(value):
+def cell(value: Any) -> str:
     """Text of a table cell: four digits of a float, all of an integer, yes or no, a dash for None."""
     if value is None:
         return "–"
@@ -109,7 +110,13 @@ def cell(value):
     )
 
 
-def render_page(title, lead, cards, sections, facts):
+def render_page(
+    title: str,
+    lead: str,
+    cards: Sequence[Card],
+    sections: Sequence[Section],
+    facts: Mapping[str, Mapping[str, object]],
+) -> str:
     """HTML text of the page.
 
     Args:

@@ -12,7 +12,7 @@ _MARKS = (
 )
 
 
-def to_html(text):
+def to_html(text: str) -> Markup:
     """HTML of ``text``; blank lines separate paragraphs, and a block whose lines all start with "- " is a
     list. Markup in it is shown, not used."""
     return Markup(
@@ -20,7 +20,7 @@ def to_html(text):
     )
 
 
-def inline(text):
+def inline(text: object) -> Markup:
     """HTML of one run of text, without a paragraph around it."""
     html = str(escape(str(text)))
     for pattern, replacement in _MARKS:
@@ -28,7 +28,7 @@ def inline(text):
     return Markup(html)
 
 
-def plain(text):
+def plain(text: str) -> str:
     """The text without its marks, for places that hold no markup."""
     for pattern, _ in _MARKS:
         text = re.sub(pattern, r"\1", str(text))

@@ -67,7 +67,10 @@ def test_equal_networks_are_equal_files(tmp_path, path):
 
 def test_a_name_stands_for_the_delivered_file(monkeypatch, tmp_path, path):
     monkeypatch.setitem(checkpoint.DELIVERED, "refiner", path)
-    assert torch.equal(checkpoint.load("refiner").layer.weight, checkpoint.load(path).layer.weight)
+    assert torch.equal(
+        checkpoint.load("refiner").get_parameter("layer.weight"),
+        checkpoint.load(path).get_parameter("layer.weight"),
+    )
     monkeypatch.setitem(checkpoint.DELIVERED, "refiner", tmp_path / "gone.safetensors")
     with pytest.raises(FileFormatError, match="does not exist"):
         checkpoint.load("refiner")

@@ -30,7 +30,7 @@ class FlowNetEvents(nn.Module):
       SiLU.
     """
 
-    def __init__(self, bins: int = 8, width: float = 32.0, hidden: int | None = None, seed: int = 0):
+    def __init__(self, bins: int = 8, width: float = 32.0, hidden: int | None = None, seed: int = 0) -> None:
         super().__init__()
         check_bins(bins)
         check_sizes(width, hidden)

@@ -1,9 +1,11 @@
 """The input of a spiking encoder: the former and the latter half of a window, each in fine time steps."""
 
+from torch import Tensor
+
 from codesign.errors import ShapeError
 
 
-def to_halves(counts):
+def to_halves(counts: Tensor) -> Tensor:
     """Bins of a volume as Spike-FlowNet takes them.
 
     Args:
@@ -26,7 +28,7 @@ def to_halves(counts):
     return split.flatten(1, 2).permute(0, 1, 3, 4, 2)
 
 
-def from_halves(halves):
+def from_halves(halves: Tensor) -> Tensor:
     """Counts [B, 2, 2 k, H, W] of [B, 4, H, W, k]: the inverse of ``to_halves``.
 
     Raises: ShapeError.

@@ -1,9 +1,11 @@
 """Integrate-and-fire neurons over a few time steps, with a gradient below the threshold too."""
 
 import torch
+from torch import Tensor
 
 from codesign.backend import NoSecondDerivative
 from codesign.errors import DomainError, ShapeError
+from codesign.events.spiking.surrogate import Surrogate
 
 _FIRST_ONLY = "a surrogate stands for the first derivative of a spike only; a second one through integrate-and-fire neurons was asked for. Use differences of gradients instead."
 
@@ -46,7 +48,7 @@ def _run(current, threshold, potential):
     return spikes
 
 
-def integrate_and_fire(current, threshold, surrogate):
+def integrate_and_fire(current: Tensor, threshold: float, surrogate: Surrogate) -> Tensor:
     """Spikes of neurons without leak that fall back to 0 when they fire: u_t = u_{t-1} (1 - s_{t-1}) + I_t,
     s_t = [u_t >= threshold].
 

@@ -1,12 +1,13 @@
 """Flow on another pixel grid: the vectors are rescaled whenever the field is."""
 
 import torch
+from torch import Tensor
 from torch.nn.functional import interpolate
 
 from codesign.errors import ShapeError
 
 
-def rescale_flow(flow_px, size):
+def rescale_flow(flow_px: Tensor, size: tuple[int, int] | torch.Size) -> Tensor:
     """The same motion on a grid of ``size`` (height, width) pixels over the same image.
 
     Args:

@@ -44,7 +44,7 @@ class SpikeFlowNet(nn.Module):
         threshold: float = 0.75,
         surrogate_width: float = 0.75,
         seed: int = 0,
-    ):
+    ) -> None:
         super().__init__()
         check_bins(bins, even=True)
         check_sizes(width, hidden)

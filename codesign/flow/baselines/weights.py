@@ -1,21 +1,24 @@
 """How many weights a baseline has, where they start, and the widths that fill a budget."""
 
+from collections.abc import Callable, Iterable
+
 import torch
+from torch import nn
 
 from codesign.errors import DomainError
 
 
-def channels(width, factor=1.0):
+def channels(width: float, factor: float = 1.0) -> int:
     """Channels of a layer ``factor`` times as wide as the first: the nearest multiple of 4, at least 4."""
     return max(4, 4 * round(width * factor / 4))
 
 
-def count_weights(module):
+def count_weights(module: nn.Module) -> int:
     """Number of learned numbers of a module."""
     return sum(p.numel() for p in module.parameters())
 
 
-def start(module, seed, variance, heads=()):
+def start(module: nn.Module, seed: int, variance: float, heads: Iterable[nn.Module] = ()) -> None:
     """Draw convolutions from a normal distribution of variance ``variance`` / inputs of a weight (a hundredth
     of that in ``heads``), biases 0.
 
@@ -37,7 +40,7 @@ def start(module, seed, variance, heads=()):
                     part.bias.zero_()
 
 
-def fill_budget(build, weights):
+def fill_budget(build: Callable[..., nn.Module], weights: int) -> tuple[float, int]:
     """Arguments (width, hidden) of the network with the fewest weights that is not below the budget.
 
     Args: build: function of width and hidden (channels inside the residual blocks, None for the usual number)

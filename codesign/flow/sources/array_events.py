@@ -19,7 +19,9 @@ NAMES = {
 }
 
 
-def read_array_events(path, size=None, time_unit="auto"):
+def read_array_events(
+    path: str | Path, size: tuple[int, int] | None = None, time_unit: str = "auto"
+) -> EventColumns:
     """Read events from .npz or .npy.
 
     Args: size: (height, width) of the sensor, or None. time_unit: as for text; "auto": seconds where a time

@@ -25,7 +25,7 @@ class Attitude:
     position_m: np.ndarray | None
     name: str
 
-    def turn(self, t0_s, t1_s):
+    def turn(self, t0_s: float, t1_s: float) -> np.ndarray:
         """R_later_earlier [3, 3]: takes directions in the camera's axes at t0 to those at t1.
 
         Raises: FileFormatError when the window is not covered by samples, or lies across a gap of more than
@@ -47,7 +47,7 @@ class Attitude:
         turns = Slerp(self.t_s[first : last + 1], self.turns[first : last + 1])(np.array([t0_s, t1_s]))
         return (turns[1].inv() * turns[0]).as_matrix()
 
-    def moved_m(self, t0_s, t1_s):
+    def moved_m(self, t0_s: float, t1_s: float) -> float | None:
         """Distance between the camera's places at both times, metres; None where nobody recorded it. Linear
         between samples."""
         if self.position_m is None:
@@ -56,7 +56,7 @@ class Attitude:
         return float(np.linalg.norm(places[:, 1] - places[:, 0]))
 
 
-def read_gyroscope(path, axes=None):
+def read_gyroscope(path: str | Path, axes: np.ndarray | None = None) -> Attitude:
     """Attitude of ``t ax ay az gx gy gz`` (seconds, m/s^2, rad/s): rates integrated from sample to sample,
     each interval at the mean of its ends.
 
@@ -73,7 +73,7 @@ def read_gyroscope(path, axes=None):
     return Attitude(t_s, Rotation.concatenate(turns), None, str(path))
 
 
-def read_poses(path):
+def read_poses(path: str | Path) -> Attitude:
     """Attitude of ``t px py pz qx qy qz qw`` (seconds, metres, quaternion of R_world_camera)."""
     table = _table(path, 8, "t px py pz qx qy qz qw")
     length = np.linalg.norm(table[:, 4:], axis=1)

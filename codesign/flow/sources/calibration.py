@@ -22,7 +22,7 @@ class Calibration:
     centre_px: tuple[float, float]
     distortion: tuple[float, ...] = (0.0,) * 5
 
-    def distorted(self, slopes):
+    def distorted(self, slopes: np.ndarray) -> np.ndarray:
         """Image slopes [..., 2] (x/z, y/z) to those the lens makes of them."""
         k1, k2, p1, p2, k3 = self.distortion
         x = slopes[..., 0]
@@ -37,13 +37,13 @@ class Calibration:
             -1,
         )
 
-    def project(self, directions):
+    def project(self, directions: np.ndarray) -> np.ndarray:
         """Pixels [..., 2] of directions [..., 3] in camera axes (x right, y down, z forward); NaN behind the
         camera."""
         z = np.where(directions[..., 2:] > 0, directions[..., 2:], np.nan)
         return self.distorted(directions[..., :2] / z) * self.focal_px + self.centre_px
 
-    def directions(self, height_px, width_px):
+    def directions(self, height_px: int, width_px: int) -> np.ndarray:
         """Direction with z = 1 of every pixel, [H, W, 3]; NaN where the distortion has no inverse."""
         x, y = np.meshgrid(np.arange(width_px, dtype=np.float64), np.arange(height_px, dtype=np.float64))
         wanted = (np.stack([x, y], -1) - self.centre_px) / self.focal_px
@@ -55,7 +55,9 @@ class Calibration:
         slopes[~(error_px < RESIDUAL_PX)] = np.nan
         return np.concatenate([slopes, np.ones_like(slopes[..., :1])], -1)
 
-    def rotation_flow(self, R_later_earlier, height_px, width_px):
+    def rotation_flow(
+        self, R_later_earlier: np.ndarray, height_px: int, width_px: int
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Flow of a camera that turns before a scene so far that its translation does not matter.
 
         Args: R_later_earlier: [3, 3], takes directions in the camera's axes at the start to those at the end.
@@ -64,11 +66,11 @@ class Calibration:
         rays = self.directions(height_px, width_px)
         x, y = np.meshgrid(np.arange(width_px), np.arange(height_px))
         flow = (self.project(rays @ np.asarray(R_later_earlier).T) - np.stack([x, y], -1)).transpose(2, 0, 1)
-        valid = np.isfinite(flow).all(0)
+        valid = np.asarray(np.isfinite(flow).all(0))
         return np.where(valid, flow, 0.0), valid
 
 
-def read_calibration(path):
+def read_calibration(path: str | Path) -> Calibration:
     """Calibration of a text file: fx fy cx cy, and where given k1 k2 p1 p2 and k3.
 
     Raises: FileFormatError for anything else.
@@ -89,7 +91,7 @@ def read_calibration(path):
     return Calibration((values[0], values[1]), (values[2], values[3]), tuple((values[4:] + [0.0] * 5)[:5]))
 
 
-def signed_axes(text):
+def signed_axes(text: str) -> np.ndarray:
     """[3, 3] matrix of axes such as "xyz" or "-y+xz": row k says which of the sensor's axes is the camera's
     k-th.
 

@@ -28,7 +28,7 @@ class CameraFit:
     Raises: FileFormatError when rays point backwards or the fit is worse than 0.01 px.
     """
 
-    def __init__(self, direction, origin_m, name="the camera"):
+    def __init__(self, direction: np.ndarray, origin_m: np.ndarray, name: str = "the camera") -> None:
         direction = np.asarray(direction, np.float64)
         origin = np.asarray(origin_m, np.float64)
         if (
@@ -69,7 +69,7 @@ class CameraFit:
                 "px is used for flow."
             )
 
-    def project(self, points_m):
+    def project(self, points_m: np.ndarray) -> np.ndarray:
         """Pixels [N, 2] of points [N, 3] in camera axes; NaN for points behind the camera."""
         points = np.asarray(points_m, np.float64)
         origin = np.zeros_like(points)

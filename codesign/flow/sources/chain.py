@@ -1,6 +1,7 @@
 """Flow over a long window from flows over the parts of it, one after the other."""
 
 import torch
+from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from codesign.errors import ShapeError
@@ -8,7 +9,7 @@ from codesign.errors import ShapeError
 EDGE_PX = 0.75  # flows of the four pixels around a place that differ by more belong to different surfaces
 
 
-def chained(flows_px, valid, hidden=None):
+def chained(flows_px: Tensor, valid: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Follow every pixel of the first instant through all flows.
 
     Args:

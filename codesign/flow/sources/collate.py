@@ -1,5 +1,6 @@
 """Samples of a batch put together, and pieces cut out of large pictures."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -31,7 +32,7 @@ class Crop:
     size_px: tuple[int, int] | None
     seed: int = 0
 
-    def check(self, height_px, width_px):
+    def check(self, height_px: int, width_px: int) -> None:
         """Raise ShapeError unless the piece fits."""
         if self.size_px is not None and not (
             0 < self.size_px[0] <= height_px and 0 < self.size_px[1] <= width_px
@@ -41,7 +42,7 @@ class Crop:
                 f"{width_px} x {height_px}."
             )
 
-    def __call__(self, index, sample):
+    def __call__(self, index: int, sample: Sample) -> Sample:
         """The piece of sample ``index``."""
         if self.size_px is None:
             return sample
@@ -62,7 +63,7 @@ class Crop:
         )
 
 
-def collate(samples):
+def collate(samples: Sequence[Sample]) -> FlowWindows:
     """FlowWindows of samples. Flows stay those of each sample's own window; the times of the bins are those
     of the mean window.
 
@@ -88,7 +89,7 @@ def collate(samples):
     return FlowWindows(volume, truth, torch.stack(frames) if len(frames) == len(samples) else None)
 
 
-def bin_times(bins, seconds):
+def bin_times(bins: int, seconds: float) -> tuple[Tensor, Tensor]:
     """(centroid_s, collected_s) [bins] of an even event rate, as events.from_stream has them."""
     if bins == 1:
         return torch.tensor([seconds / 2], dtype=torch.float64), torch.tensor([seconds], dtype=torch.float64)
@@ -99,7 +100,7 @@ def bin_times(bins, seconds):
     return node * seconds, collected
 
 
-def check_indices(indices, count):
+def check_indices(indices: Iterable[int] | Tensor, count: int) -> list[int]:
     """The indices as whole numbers from 0 to count - 1. Raises: DomainError."""
     found = [int(index) for index in indices]
     if any(not 0 <= index < count for index in found):
@@ -110,7 +111,7 @@ def check_indices(indices, count):
     return found
 
 
-def check_lengths(seconds, name):
+def check_lengths(seconds: Sequence[float], name: str) -> None:
     """Raise DomainError unless all windows of a source last alike within 5 percent of their median."""
     middle = sorted(seconds)[len(seconds) // 2]
     worst = max(seconds, key=lambda value: abs(value - middle))

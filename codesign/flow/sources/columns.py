@@ -1,6 +1,7 @@
 """Events of a long recording in few bytes each, from which windows are cut as event streams."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -35,10 +36,10 @@ class EventColumns:
     width_px: int
     size_from: str
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.t_us)
 
-    def window(self, t0_us, t1_us):
+    def window(self, t0_us: int, t1_us: int) -> EventStream:
         """EventStream of the events from t0_us to t1_us, both included."""
         first, last = np.searchsorted(self.t_us, [t0_us, t1_us + 1])
         t, x, y, on = (
@@ -48,7 +49,7 @@ class EventColumns:
         return ordered(t, x, y, 2 * on - 1, self.height_px, self.width_px)
 
 
-def from_stream(stream: EventStream, size_from="the file"):
+def from_stream(stream: EventStream, size_from: str = "the file") -> EventColumns:
     """EventColumns of an EventStream."""
     if max(stream.height_px, stream.width_px) > LIMIT_PX:
         raise FileFormatError(
@@ -60,7 +61,14 @@ def from_stream(stream: EventStream, size_from="the file"):
     )
 
 
-def settled_size(path, x, y, given=None, told=None, told_by="the file"):
+def settled_size(
+    path: str | Path,
+    x: np.ndarray,
+    y: np.ndarray,
+    given: tuple[int, int] | None = None,
+    told: tuple[int, int] | None = None,
+    told_by: str = "the file",
+) -> tuple[int, int, str]:
     """(height_px, width_px, phrase that says where they are from).
 
     Args: path: for messages. x, y: [N] columns and rows of the events. given: (height_px, width_px) of the

@@ -8,10 +8,12 @@ Source: Gehrig et al., "DSEC: A Stereo Event Camera Dataset for Driving Scenario
 """
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from codesign.errors import FileFormatError
 from codesign.events.formats.hdf5_chunks import h5py
@@ -20,6 +22,7 @@ from codesign.flow.sources.collate import Crop, Sample, check_indices, check_len
 from codesign.flow.sources.folders import natural
 from codesign.flow.sources.rectified import splatted
 from codesign.flow.sources.rows import Rows, reading
+from codesign.types import FlowWindows
 
 SIZE_PX = (480, 640)
 PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -40,7 +43,14 @@ class DsecWindows:
       fit together.
     """
 
-    def __init__(self, folder, bins=8, crop_px=None, seed=0, size_px=SIZE_PX):
+    def __init__(
+        self,
+        folder: str | Path,
+        bins: int = 8,
+        crop_px: tuple[int, int] | None = None,
+        seed: int = 0,
+        size_px: tuple[int, int] = SIZE_PX,
+    ) -> None:
         self.bins = bins
         self.crop = Crop(crop_px, seed)
         self.size_px = (int(size_px[0]), int(size_px[1]))
@@ -54,10 +64,10 @@ class DsecWindows:
             f"DSEC in {folder}",
         )
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.windows)
 
-    def batch(self, indices):
+    def batch(self, indices: Iterable[int] | Tensor) -> FlowWindows:
         """FlowWindows of these samples, without frames; each depends on its index and the seed alone."""
         return collate(
             [
@@ -84,7 +94,7 @@ class Sequence:
     """One sequence. files: its flow files. spans_us: [(from, to)] of each, on the clock of the events with
     t_offset added."""
 
-    def __init__(self, events, flow, size_px):
+    def __init__(self, events: Path, flow: Path, size_px: tuple[int, int]) -> None:
         self.path = events / "events.h5"
         self.size_px = size_px
         for path in (self.path, events / "rectify_map.h5"):
@@ -120,7 +130,7 @@ class Sequence:
                 f"run from {self.offset_us} to about {end_us} us."
             )
 
-    def rectified(self, t0_us, t1_us):
+    def rectified(self, t0_us: int, t1_us: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(t_us, x_px, y_px, on) of the events of a window, on the rectified picture."""
         first = (t0_us - self.offset_us) // 1000
         last = (t1_us - self.offset_us) // 1000 + 1

@@ -4,6 +4,7 @@ archives are unpacked for as long as they are needed."""
 import re
 import tempfile
 import zipfile
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -29,7 +30,7 @@ MOST_BYTES = 40_000_000_000
 
 
 @contextmanager
-def opened(path):
+def opened(path: str | Path) -> Iterator[Path]:
     """Yield ``path`` itself, or the folder that a zip archive holds, which is removed afterwards.
 
     Raises: FileFormatError when there is nothing, or the archive is damaged or out of all proportion.
@@ -69,12 +70,12 @@ def opened(path):
         yield inside
 
 
-def natural(path):
+def natural(path: str | Path) -> list[int | str]:
     """Sort key: names with numbers in order of the numbers."""
     return [int(word) if word.isdigit() else word for word in re.split(r"(\d+)", str(path).lower())]
 
 
-def event_files(path):
+def event_files(path: Path) -> list[Path]:
     """[event file] of a recording: the file itself; events.* of a folder; otherwise one per packet, from the
     folder or its subfolders, in natural order.
 
@@ -105,7 +106,7 @@ def event_files(path):
     )
 
 
-def flow_files(folder):
+def flow_files(folder: Path) -> list[Path]:
     """[flow file] of a folder that holds nothing else of these kinds, in natural order; flow/forward inside
     where there is one."""
     folder = Path(folder)
@@ -132,7 +133,7 @@ def flow_files(folder):
     raise FileFormatError(f"{folder} holds no flow files ({', '.join(sorted(FLOW_SUFFIXES))}).")
 
 
-def truth_beside(events, alone):
+def truth_beside(events: Path, alone: bool) -> Path | None:
     """The flow file that lies beside a packet's event file: its name with flow or truth in it, or the same
     number; None when there is none.
 
@@ -160,7 +161,7 @@ def truth_beside(events, alone):
     return _one_kind(named)[0] if named else None
 
 
-def truth_folder(events):
+def truth_folder(events: Path) -> Path | None:
     """The folder of flow files beside an event file or beside its folder; None when there is none."""
     for place in (events.parent, events.parent.parent):
         for entry in sorted(
@@ -175,7 +176,7 @@ def truth_folder(events):
     return None
 
 
-def side_file(events, name):
+def side_file(events: Path, name: str) -> Path | None:
     """A file such as imu.txt in the folder of an event file, or in the one above; None when there is none."""
     return next(
         (folder / name for folder in (events.parent, events.parent.parent) if (folder / name).is_file()), None

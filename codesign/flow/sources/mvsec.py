@@ -10,10 +10,12 @@ Sources: Zhu et al., "The Multivehicle Stereo Event Camera Dataset", RA-L 2018; 
 2018 (dt = 1, 4).
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError, FileFormatError
 from codesign.events.stream import ordered
@@ -22,6 +24,7 @@ from codesign.flow.sources import npz_member
 from codesign.flow.sources.chain import chained
 from codesign.flow.sources.collate import ALIKE, Crop, Sample, check_indices, collate
 from codesign.flow.sources.rows import Rows
+from codesign.types import EventStream, FlowWindows
 
 DATA = "_data.hdf5"
 FLOW = "_gt_flow_dist.npz"
@@ -43,7 +46,15 @@ class MvsecWindows:
     Windows that last longer or shorter than the median by 5 percent are not used: ``left_out`` counts them.
     """
 
-    def __init__(self, folder, frames=1, bins=8, crop_px=None, seed=0, span_s=None):
+    def __init__(
+        self,
+        folder: str | Path,
+        frames: int = 1,
+        bins: int = 8,
+        crop_px: tuple[int, int] | None = None,
+        seed: int = 0,
+        span_s: tuple[float, float] | None = None,
+    ) -> None:
         if frames < 0:
             raise DomainError(
                 f"frames is {frames}; 1 or 4 grey frames per window, or 0 for the intervals of the true "
@@ -68,10 +79,10 @@ class MvsecWindows:
         for sequence in self.sequences:
             self.crop.check(*sequence.size_px)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.windows)
 
-    def batch(self, indices):
+    def batch(self, indices: Iterable[int] | Tensor) -> FlowWindows:
         """FlowWindows of these samples, without frames; each depends on its index and the seed alone."""
         return collate(
             [
@@ -93,7 +104,7 @@ class Sequence:
     """One sequence. flow_s: [N] times of the true flows. frame_s: [M] times of the grey frames. size_px:
     (height, width)."""
 
-    def __init__(self, data, truth):
+    def __init__(self, data: Path, truth: Path) -> None:
         self.truth = truth
         shapes = npz_member.shapes(truth, ("x_flow_dist", "y_flow_dist", "timestamps"))
         self.flow_s = np.asarray(npz_member.array(truth, "timestamps"), np.float64)
@@ -120,7 +131,7 @@ class Sequence:
             )
         self.ends_s = float(self.events[0][2]), float(self.events[len(self.events) - 1][2])
 
-    def windows(self, frames, span_s):
+    def windows(self, frames: int, span_s: tuple[float, float] | None) -> list[tuple[float, float]]:
         """[(from, to)] seconds."""
         ends = (self.flow_s, 1) if frames == 0 else (self.frame_s, frames)
         first = max(self.flow_s[0], self.ends_s[0])
@@ -134,7 +145,7 @@ class Sequence:
             if first <= t0 and t1 <= last
         ]
 
-    def flow(self, t0_s, t1_s):
+    def flow(self, t0_s: float, t1_s: float) -> tuple[Tensor, Tensor]:
         """(flow_px [2, H, W], valid [H, W]) on the pixels of t0_s, to t1_s."""
         if self.fields is None:
             self.fields = [npz_member.array(self.truth, name) for name in ("x_flow_dist", "y_flow_dist")]
@@ -151,7 +162,7 @@ class Sequence:
             first += 1
         return chained(torch.stack(parts), torch.stack(masks))
 
-    def stream(self, t0_us, t1_us):
+    def stream(self, t0_us: int, t1_us: int) -> EventStream:
         """EventStream of the events from t0_us to t1_us, both included."""
         low = self._place(t0_us * 1e-6 - 1e-6)
         high = self._place(t1_us * 1e-6 + 1e-6)

@@ -4,7 +4,9 @@ needed where the file is not packed."""
 import math
 import struct
 import zipfile
+from collections.abc import Iterable
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 
@@ -14,7 +16,7 @@ HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.re
 LOCAL_HEADER_BYTES = 30  # PKWARE, .ZIP File Format Specification, 4.3.7
 
 
-def shapes(path, names):
+def shapes(path: str | Path, names: Iterable[str]) -> dict[str, tuple[int, ...]]:
     """{name: shape} of arrays of numbers, after checking that the file holds what they claim. Raises:
     FileFormatError."""
     with _archive(path, names) as archive:
@@ -35,7 +37,7 @@ def shapes(path, names):
         return found
 
 
-def array(path, name):
+def array(path: str | Path, name: str) -> np.ndarray:
     """One array: left on the disk (read-only) where the archive holds it as it is, read into memory as
     float32 or less where it is packed."""
     with _archive(path, [name]) as archive:

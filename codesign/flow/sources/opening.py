@@ -8,7 +8,13 @@ from codesign.flow.sources.mvsec import DATA, MvsecWindows
 from codesign.flow.sources.rendered import DatasetWindows
 
 
-def open_windows(folder, bins=8, window_frames=1, crop_px=None, seed=0):
+def open_windows(
+    folder: str | Path,
+    bins: int = 8,
+    window_frames: int = 1,
+    crop_px: tuple[int, int] | None = None,
+    seed: int = 0,
+) -> DatasetWindows | DsecWindows | MvsecWindows:
     """The source of windows that a folder is: one of our data sets, DSEC, or MVSEC.
 
     Args: bins: of the volumes. window_frames: frame intervals per window (our data sets), or grey frames

@@ -14,6 +14,7 @@ from codesign.flow.sources import columns, folders, truth
 from codesign.flow.sources.array_events import read_array_events
 from codesign.flow.sources.attitude import read_gyroscope, read_poses
 from codesign.flow.sources.calibration import read_calibration, signed_axes
+from codesign.flow.sources.columns import EventColumns
 from codesign.flow.sources.text_events import read_text_events
 from codesign.types import EventStream, FlowField
 
@@ -62,7 +63,9 @@ class PacketOptions:
     calibration: Path | None = None
 
 
-def read_packets(path, truth_path=None, options=None):
+def read_packets(
+    path: str | Path, truth_path: str | Path | None = None, options: PacketOptions | None = None
+) -> list[Packet]:
     """Read a recording and its true flow.
 
     Args:
@@ -97,7 +100,7 @@ def read_packets(path, truth_path=None, options=None):
         return _cut(files[0], truth_path, options)
 
 
-def read_events(path, options, truth_path=None):
+def read_events(path: Path, options: PacketOptions, truth_path: Path | None = None) -> EventColumns:
     """EventColumns of one event file of any kind."""
     path = Path(path)
     size = options.size_px

@@ -1,12 +1,23 @@
 """Event volumes of events that lie between pixels, as rectification leaves them."""
 
 import torch
+from torch import Tensor
 
 from codesign.errors import ShapeError
 from codesign.events.volumes.volume import check_bins
 
 
-def splatted(t_us, x_px, y_px, on, t0_us, t1_us, bins, height_px, width_px):
+def splatted(
+    t_us: Tensor,
+    x_px: Tensor,
+    y_px: Tensor,
+    on: Tensor,
+    t0_us: int,
+    t1_us: int,
+    bins: int,
+    height_px: int,
+    width_px: int,
+) -> Tensor:
     """Counts [2, bins, H, W] float32 of events at fractional places, shared bilinearly by four pixels and
     linearly by two bins.
 

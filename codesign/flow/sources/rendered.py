@@ -3,10 +3,12 @@ frame interval or several, and the frames."""
 
 import json
 import shlex
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError, FileFormatError
 from codesign.events.volumes.volume import from_stream
@@ -14,7 +16,7 @@ from codesign.flow.sources.camera_fit import CameraFit
 from codesign.flow.sources.chain import chained
 from codesign.flow.sources.collate import Crop, Sample, check_indices, collate
 from codesign.flow.sources.rows import Rows
-from codesign.types import EventStream
+from codesign.types import EventStream, FlowWindows
 
 FORMAT = "codesign-dataset/1"
 DONE = "sequence.json"
@@ -39,8 +41,15 @@ class DatasetWindows:
     """
 
     def __init__(
-        self, folder, bins=8, window_frames=1, stride_frames=None, crop_px=None, seed=0, sequences=None
-    ):
+        self,
+        folder: str | Path,
+        bins: int = 8,
+        window_frames: int = 1,
+        stride_frames: int | None = None,
+        crop_px: tuple[int, int] | None = None,
+        seed: int = 0,
+        sequences: Iterable[str] | None = None,
+    ) -> None:
         if window_frames < 1 or (stride_frames is not None and stride_frames < 1):
             raise DomainError(
                 f"window_frames is {window_frames}, stride_frames {stride_frames}; whole numbers from 1 are "
@@ -64,10 +73,10 @@ class DatasetWindows:
         for sequence in self.sequences:
             self.crop.check(*sequence.size_px)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.windows)
 
-    def batch(self, indices):
+    def batch(self, indices: Iterable[int] | Tensor) -> FlowWindows:
         """FlowWindows of these samples; each depends on its index and the seed alone."""
         return collate(
             [
@@ -89,7 +98,7 @@ class DatasetWindows:
 class Sequence:
     """One sequence folder. times_us: [T] frame times. size_px: (height, width). count: T."""
 
-    def __init__(self, folder, sizes=None):
+    def __init__(self, folder: Path, sizes: dict | None = None) -> None:
         self.folder = folder
         for name in ("frames.h5", "events.h5", "camera.h5"):
             if not (folder / name).is_file():
@@ -143,7 +152,7 @@ class Sequence:
         self.rays = camera
         self.fit = None
 
-    def stream(self, t0_us, t1_us):
+    def stream(self, t0_us: int, t1_us: int) -> EventStream:
         """EventStream of the events from t0_us to t1_us, both included."""
         low = self.ms_to_idx[t0_us // 1000]
         high = self.ms_to_idx[min(t1_us // 1000 + 1, len(self.ms_to_idx) - 1)]
@@ -162,7 +171,7 @@ class Sequence:
             )
         return EventStream(t, x, y, 2 * p - 1, height, width)
 
-    def flow(self, first, last):
+    def flow(self, first: int, last: int) -> tuple[Tensor, Tensor]:
         """(flow_px [2, H, W] float32, valid [H, W]) on the pixels of frame ``first``, to frame ``last``."""
         if last == first + 1:
             return torch.from_numpy(self.rows["flow"][first]), torch.from_numpy(self.rows["valid"][first])
@@ -172,12 +181,12 @@ class Sequence:
             flows, valid, occluded = (
                 torch.from_numpy(self.rows[name].read(first, last)) for name in ("flow", "valid", "occluded")
             )
-            along, followed = chained(flows.double(), valid, occluded)
-            flow = torch.where(moving, along, flow)
+            moving_flow, followed = chained(flows.double(), valid, occluded)
+            flow = torch.where(moving, moving_flow, flow)
             seen = torch.where(moving, followed, seen)
         return flow.float(), seen
 
-    def carried(self, first, last):
+    def carried(self, first: int, last: int) -> tuple[Tensor, Tensor]:
         """Flow of points at rest, by their depth, both poses and the camera's rays: [2, H, W] float64, valid
         [H, W]."""
         if self.fit is None:

@@ -1,6 +1,7 @@
 """Rows of large HDF5 datasets, block by block, with the guard against damaged files that the event readers
 have (see codesign.events.formats.hdf5_chunks)."""
 
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from codesign.events.formats.hdf5_chunks import h5py
 
 
 @contextmanager
-def reading(path):
+def reading(path: str | Path) -> Iterator[None]:
     """Context in which all that h5py raises on a missing or damaged file becomes one FileFormatError that
     names it."""
     try:
@@ -36,7 +37,9 @@ class Rows:
       or kept in other files.
     """
 
-    def __init__(self, path, name, columns=None, count=None):
+    def __init__(
+        self, path: str | Path, name: str, columns: Sequence[int] | None = None, count: int | None = None
+    ) -> None:
         self.path = Path(path)
         self.name = name
         self.block_shape = None
@@ -54,7 +57,7 @@ class Rows:
             self.shape = dataset.shape
             self._find_blocks(dataset)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return self.shape[0]
 
     @contextmanager
@@ -100,7 +103,7 @@ class Rows:
                 "Blosc alone are read; write it anew with gzip."
             )
 
-    def read(self, first, last):
+    def read(self, first: int, last: int) -> np.ndarray:
         """Rows first to last - 1 as a numpy array, in the file's type. Raises: FileFormatError for a range
         outside, and for damaged blocks."""
         if not 0 <= first <= last <= len(self):
@@ -129,7 +132,7 @@ class Rows:
                     ]
             return found
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: int) -> np.ndarray:
         """One row."""
         return self.read(index, index + 1)[0]
 

@@ -38,7 +38,14 @@ UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
-def read_text_events(path, size=None, told=None, told_by="the file", columns="auto", time_unit="auto"):
+def read_text_events(
+    path: str | Path,
+    size: tuple[int, int] | None = None,
+    told: tuple[int, int] | None = None,
+    told_by: str = "the file",
+    columns: str = "auto",
+    time_unit: str = "auto",
+) -> EventColumns:
     """Read events from a text file, eight megabytes at a time.
 
     Args:

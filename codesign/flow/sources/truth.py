@@ -63,7 +63,7 @@ class TrueFlow:
     name: str
 
 
-def read_truth(path, size_px):
+def read_truth(path: str | Path, size_px: tuple[int, int]) -> list[TrueFlow]:
     """Read the flow fields of a file or folder, in order.
 
     Args:
@@ -98,7 +98,7 @@ def read_truth(path, size_px):
     return flows
 
 
-def size_of(path):
+def size_of(path: str | Path) -> tuple[int, int] | None:
     """(height, width) of the flow at a path, or None where it cannot tell by itself (tables of text)."""
     path = Path(path)
     file = folders.flow_files(path)[0] if path.is_dir() else path
