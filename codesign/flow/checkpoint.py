@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import safetensors.torch
 import torch
@@ -20,6 +20,12 @@ from torch import Tensor, nn
 
 from codesign.atomic import replacing
 from codesign.errors import CodesignError, DomainError, FileFormatError
+
+if TYPE_CHECKING:
+    from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
+    from codesign.flow.refiner import Refiner
+
+    Network = Refiner | FlowNetEvents | SpikeFlowNet  # the classes of NETWORKS
 
 VERSION = 1
 NETWORKS = {
@@ -41,7 +47,7 @@ class NetworkFile:
     metadata: dict[str, Any]
 
 
-def network_class(name: str) -> type[nn.Module]:
+def network_class(name: str) -> type[Any]:
     """Class of the network called ``name``.
 
     Raises: DomainError for a name that is not in NETWORKS.
@@ -100,7 +106,7 @@ def save(network: nn.Module, path: str | Path, metadata: Mapping[str, Any] | Non
     write_tensors(path, weights, content)
 
 
-def load(name_or_path: str | Path) -> nn.Module:
+def load(name_or_path: str | Path) -> "Network":
     """A trained network, in evaluation mode, on the CPU.
 
     Args: name_or_path: "refiner", the one delivered with the package, or the path of a file that ``save``
@@ -138,7 +144,7 @@ def read(path: str | Path) -> NetworkFile:
     return NetworkFile(content["network"], content["config"], weights, content.get("metadata", {}))
 
 
-def build(stored: NetworkFile, path: str | Path) -> nn.Module:
+def build(stored: NetworkFile, path: str | Path) -> "Network":
     """The network of a NetworkFile; ``path`` is named in errors.
 
     Raises: FileFormatError when class, configuration and weights do not fit each other.

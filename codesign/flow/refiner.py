@@ -1,6 +1,8 @@
 """A small network that corrects the closed form: the volume is warped along the flow so far, and what still
 moves says what to add."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, pad, silu, unfold
@@ -46,7 +48,7 @@ class Refiner(nn.Module):
                 f"width = {width}, steps = {steps}; a width that is a multiple of {GROUPS} and at least 1 "
                 "step are needed."
             )
-        self.config = {"bins": bins, "width": width, "steps": steps}
+        self.config: dict[str, Any] = {"bins": bins, "width": width, "steps": steps}
         c = width
         self.texture = Layer(4 * bins + 2, c)
         self.fine = Layer(c, 2 * c, stride=2)

@@ -65,7 +65,7 @@ def test_training_finds_the_known_answer(tmp_path):
         == 0
     )
     network = checkpoint.load(tmp_path / "run" / "network.safetensors")
-    assert torch.allclose(network.layer.weight[:, :, 0, 0], TRUE_WEIGHTS, atol=1e-2)
+    assert torch.allclose(network.get_parameter("layer.weight")[:, :, 0, 0], TRUE_WEIGHTS, atol=1e-2)
     found = metrics_of(tmp_path / "run")
     assert found["steps"] == 250
     assert found["windows_shown"] == 1000
@@ -321,7 +321,8 @@ sys.exit(train_flow.run_here({arguments!r}))
     assert "Done: " in said[0]
     assert said[1] == "", "one process speaks"
     one, two = (
-        checkpoint.load(tmp_path / name / "network.safetensors").layer.weight for name in ("one", "two")
+        checkpoint.load(tmp_path / name / "network.safetensors").get_parameter("layer.weight")
+        for name in ("one", "two")
     )
     assert torch.allclose(one, two, atol=1e-5, rtol=0)
     assert not torch.equal(one, Linear().layer.weight)

@@ -1,5 +1,7 @@
 """A plain convolutional encoder-decoder on event volumes."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, silu
@@ -34,7 +36,7 @@ class FlowNetEvents(nn.Module):
         super().__init__()
         check_bins(bins)
         check_sizes(width, hidden)
-        self.config = {"bins": bins, "width": width, "hidden": hidden, "seed": seed}
+        self.config: dict[str, Any] = {"bins": bins, "width": width, "hidden": hidden, "seed": seed}
         inside = channels(width, 8) if hidden is None else hidden
         down = [channels(width, factor) for factor in (1, 2, 4, 8)]
         up = [channels(width, factor) for factor in (4, 2, 1, 0.5)]

@@ -1,5 +1,7 @@
 """A network with a spiking encoder and an analogue decoder, in the form of Spike-FlowNet."""
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv_transpose2d, leaky_relu
@@ -50,7 +52,7 @@ class SpikeFlowNet(nn.Module):
         check_sizes(width, hidden)
         if not threshold > 0:
             raise DomainError(f"threshold is {threshold}; a number > 0 is needed.")
-        self.config = {
+        self.config: dict[str, Any] = {
             "bins": bins,
             "width": width,
             "hidden": hidden,
@@ -141,8 +143,10 @@ class SpikeFlowNet(nn.Module):
             # neck and head are linear, one after the other: their product is one transposed convolution to 2
             # channels
             head = torch.einsum(
-                "on,inhw->iohw", self.heads[level].weight[:, :, 0, 0], self.necks[level].weight
-            )  # pyright: ignore[reportIndexIssue, reportArgumentType]
+                "on,inhw->iohw",
+                self.heads[level].get_parameter("weight")[:, :, 0, 0],
+                self.necks[level].get_parameter("weight"),
+            )
             change = conv_transpose2d(x, head, stride=2, padding=1)
             flows.append(rescale_flow(flows[-1], change.shape[2:]) + change if flows else change)
             if level < 3:
