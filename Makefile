@@ -11,7 +11,7 @@ STUDIES := lens-opt lens-report lens-scratch lens-tolerance lens-bench silhouett
 	event-gradient event-bench srm-bench davis train-flow flow-quality flow-compare flow-cost flow-recording \
 	placement speed-error stability gradcheck
 
-.PHONY: help setup test lint core-check doctor clean $(STUDIES)
+.PHONY: help setup test test-bits lint core-check doctor clean $(STUDIES)
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1|/p' Makefile | awk -F'|' '{printf "%-24s %s\n", $$1, $$2}'
@@ -61,8 +61,19 @@ stability: ## hard cases: outcome expected and seen
 gradcheck: ## autograd against differences, junction by junction
 gradcheck: STUDY := gradient_flow
 
-test: setup ## all tests
-	@$(RUN) -m pytest $(ARGS)
+test: setup ## all tests, on all cores
+	@$(RUN) -m pytest -n auto --maxprocesses 8 $(ARGS)
+
+test-bits: setup ## tests that promise equal bits, as other processors and numbers of threads round
+	@failed=0; for how in \
+	    "CODESIGN_TEST_ROUNDING=place" \
+	    "MKL_CBWR=COMPATIBLE ATEN_CPU_CAPABILITY=default CODESIGN_TEST_THREADS=2" \
+	    "MKL_CBWR=AVX2 ATEN_CPU_CAPABILITY=avx2" \
+	    "MKL_CBWR=AVX512 CODESIGN_TEST_THREADS=2"; do \
+	  echo "== $$how"; \
+	  env $$how $(RUN) -m pytest -q -n auto --maxprocesses 8 -m bits $(ARGS) \
+	    $$(grep -rl --include='test_*.py' 'mark\.bits' tests) || failed=1; \
+	done; exit $$failed
 
 lint: setup ## format, ruff and pyright
 	@$(RUN) -m ruff format --check .

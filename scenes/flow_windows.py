@@ -2,7 +2,7 @@
 events, sensor noise.
 
 Every sample is drawn from its own random numbers (seed, index), so it is the same in any batch, on any
-process.
+process: frames, events and flow to the last bit on one machine, the volume to the rounding of its sums.
 """
 
 from dataclasses import dataclass
@@ -89,17 +89,16 @@ class RenderedWindows:
         """Samples of these numbers: FlowWindows of interval 1 s, truth on the pixels of the start, exact and
         valid everywhere (also where the point gets hidden)."""
         drawn = [self._draw(index) for index in indices]
-        still = self._undistorted([sample["distortion"] for sample in drawn])  # [B, H, W, 2]
         frames = []
+        levels = []
         truth = []
-        for sample, points in zip(drawn, still, strict=True):
+        for sample in drawn:  # one by one: products and logarithms may round by the place in a batch
+            points = self._undistorted([sample["distortion"]])[0]  # [H, W, 2]
             frames.append(_compose(sample, points))
+            levels.append(frames[-1].clamp_min(1e-3).log_() * sample["contrast"])
             truth.append(self._truth(sample, points))
         frames = torch.stack(frames, 1)  # [T, B, H, W]
-        log_level = (
-            frames.clamp_min(1e-3).log_()
-            * torch.tensor([sample["contrast"] for sample in drawn])[:, None, None]
-        )
+        log_level = torch.stack(levels, 1)
         theta = torch.stack([sample["theta"] for sample in drawn], 1)  # [2, B, H, W]
         counts, _ = memory(log_level, theta[0], theta[1], log_input=True)
         counts = counts[LEAD:]

@@ -1,6 +1,7 @@
 """What every test may ask for: reference data, a seeded generator, a screenless matplotlib."""
 
 import os
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -9,8 +10,15 @@ import codesign  # noqa: F401  (first: it sets OpenMP's wait policy before torch
 
 import torch  # isort: skip
 
+from tests.rounding_case import RoundsByPlace  # isort: skip
+
 os.environ.setdefault("MPLBACKEND", "Agg")
-torch.set_num_threads(1)  # small tensors: a second thread costs more than it gives
+# small tensors: a second thread costs more than it gives
+torch.set_num_threads(int(os.environ.get("CODESIGN_TEST_THREADS", "1")))
+if "CODESIGN_TEST_THREADS" in os.environ:
+    import drjit
+
+    drjit.set_thread_count(torch.get_num_threads())
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = next((folder for folder in (ROOT / "shared", ROOT.parent / "shared") if folder.is_dir()), None)
 SUBSET = ROOT / "tests" / "data"  # of the reference values; see its README.md
@@ -37,3 +45,11 @@ def shared():
 def generator():
     """A torch generator with a fixed seed of its own; the global one is never seeded."""
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def _processor(request):
+    """With CODESIGN_TEST_ROUNDING=place, tests of equal bits run on a processor that rounds by place."""
+    rounds = os.environ.get("CODESIGN_TEST_ROUNDING") == "place" and request.node.get_closest_marker("bits")
+    with RoundsByPlace() if rounds else nullcontext():
+        yield

@@ -3,31 +3,49 @@
 import math
 
 import torch
-from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
 
-PRODUCTS = {torch.conv2d, torch.matmul, torch.Tensor.matmul, torch.Tensor.__matmul__}
-SMALL = 400  # batches of smaller products are plain loops of torch's own
+aten = torch.ops.aten
+PRODUCTS = {
+    aten.mm,
+    aten.bmm,
+    aten.addmm,
+    aten.baddbmm,
+    aten.mv,
+    aten.addmv,
+    aten.dot,
+    aten.convolution,
+}
+TRANSCENDENTAL = {
+    aten.log,
+    aten.log_,
+    aten.exp,
+    aten.exp_,
+    aten.log1p,
+    aten.expm1,
+    aten.sin,
+    aten.cos,
+    aten.tanh,
+}
+LOOPS = 400  # batches of smaller matrices are multiplied by plain loops of torch's own
+PERIOD = 7
 
 
-class RoundsByPlace(TorchFunctionMode):
-    """Matrix products and convolutions round by the place of a number in the result and by the address of
-    what is multiplied, as BLAS may, and more coarsely.
+class RoundsByPlace(TorchDispatchMode):
+    """Matrix products, convolutions and functions such as log round by the place of a number in the result
+    and by where in memory their input begins, as the libraries behind them may: by up to 6 eps.
 
-    What keeps its bits under it gives every product the same shapes at the same alignment.
+    What keeps its bits under it gives each of these operations the same shapes at the same alignment.
     """
 
-    def __init__(self, coarseness=1e-4):
-        super().__init__()
-        self.coarseness = coarseness
-
-    def __torch_function__(self, func, types, args=(), kwargs=None):
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         found = func(*args, **(kwargs or {}))
-        if func not in PRODUCTS or (
-            found.ndim > 2
-            and math.prod(found.shape[-2:]) * args[0].shape[-1] < SMALL
-            and func is not torch.conv2d
-        ):
+        packet = func.overloadpacket
+        if packet not in PRODUCTS | TRANSCENDENTAL or not found.is_floating_point():
             return found
-        place = torch.arange(found.numel()).reshape(found.shape) % 97
-        aside = sum(value.data_ptr() % 64 for value in args[:2])
-        return found * (1 + self.coarseness * (place + aside).to(found))
+        if packet is aten.bmm and math.prod(found.shape[-2:]) * args[0].shape[-1] < LOOPS:
+            return found
+        aside = sum(value.data_ptr() % 64 for value in args if isinstance(value, torch.Tensor))
+        place = (torch.arange(found.numel(), device=found.device) + aside) % PERIOD
+        eps = torch.finfo(found.dtype).eps
+        return found.mul_(1 + eps * place.reshape(found.shape).to(found))

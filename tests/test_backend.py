@@ -62,6 +62,7 @@ def test_gradient_equals_torch(inputs):
         )  # sums of ten terms of order one
 
 
+@pytest.mark.bits
 def test_second_backward_gives_the_same_numbers(inputs):
     outputs = call(*inputs)
     total = outputs[0].sum() + (outputs[1] ** 2).sum()

@@ -137,6 +137,7 @@ def written_out(levels, t_s, theta_on, theta_off, refractory_s):
     return found
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("refractory_s", [0.0, 0.4e-3, 5e-3])
 @pytest.mark.parametrize("thetas", [(0.2, 0.2), (0.1, 0.35)])
 def test_dead_time_and_unequal_thresholds_equal_the_algorithm_written_out(refractory_s, thetas):

@@ -55,6 +55,7 @@ FUNCTIONS = {
 }
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("dtype", [torch.float32, D])
 @pytest.mark.parametrize("name", LAYERS)
 def test_a_layer_is_its_function(name, dtype):
@@ -107,6 +108,7 @@ def test_the_spiking_layer_has_the_slope_of_its_surrogate():
     assert float(made.learnt.raw["theta_off"].grad) == pytest.approx(-0.1 * 0.2 * 2 * off)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("sensor", [PLAIN, NOISY], ids=["plain", "noisy"])
 @pytest.mark.parametrize("name", LAYERS)
 def test_a_batch_is_its_samples_one_by_one(name, sensor):
@@ -138,6 +140,7 @@ def test_gradients_of_a_batch_are_those_of_its_samples(name):
         torch.testing.assert_close(found, sum(each))
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("batch", [(), (2,)])
 @pytest.mark.parametrize("name", LAYERS)
 def test_chunks_are_the_whole(name, batch):
@@ -172,6 +175,7 @@ def test_noise_is_that_of_the_drawing_functions():
     assert torch.equal(counts, events.memory(frames, *thetas)[0] + shots)
 
 
+@pytest.mark.bits
 def test_the_physical_layer_gives_the_events_of_the_sensor():
     frames, t_s = drifting(6, 5)
     hard = events.simulate(frames, t_s, NOISY, seeded(3))

@@ -117,6 +117,7 @@ def test_expected_counts_pass_gradcheck():
     assert torch.autograd.gradcheck(lambda *a: expected(*a), (frames, *thetas))
 
 
+@pytest.mark.bits
 def test_the_physical_layer_gives_the_events_of_the_sensor():
     frames, t_s = drifting()
     events = simulate(frames, t_s, PHYSICAL, torch.Generator().manual_seed(3))

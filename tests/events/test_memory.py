@@ -94,6 +94,7 @@ def test_one_big_step_gives_many_events_and_signs_stay_positive():
     assert abs(float(state[0]) + 0.1) < 2e-3
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("cut", [1, 2, 13, 29])
 def test_chunks_equal_the_whole_bit_for_bit_gradients_included(cut):
     whole, parts = (random_walk(dtype=torch.float32).requires_grad_() for _ in range(2))
@@ -179,6 +180,7 @@ def test_a_still_scene_is_silent_and_changes_below_the_threshold_have_no_gradien
         torch.testing.assert_close(level.grad, torch.tensor(slopes, dtype=torch.float64))
 
 
+@pytest.mark.bits
 def test_soft_counts_gradient_against_finite_differences_and_sum_against_memory():
     level = random_walk(8, (3, 2))
     thetas = [
@@ -194,8 +196,10 @@ def test_soft_counts_gradient_against_finite_differences_and_sum_against_memory(
     assert torch.equal(soft.floor(), hard)
 
 
+@pytest.mark.bits
 def test_memory_applies_the_lin_log_front_end():
     frames = torch.rand(6, 4, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(8)) * 200
+    # two logarithms, 1e-15 apart: no level of these comes nearer than 1e-6 to a threshold
     assert torch.equal(memory(frames, 0.2, 0.2)[0], memory(lin_log(frames), 0.2, 0.2, log_input=True)[0])
 
 

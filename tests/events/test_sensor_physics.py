@@ -74,6 +74,7 @@ def test_a_sinusoid_through_the_low_pass_has_its_textbook_amplitude(fps, error):
     )
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("timing", ["interpolated", "v2e"])
 def test_any_chunking_gives_the_events_of_the_whole_with_everything_on(timing):
     frames, t_s = clip()
@@ -96,6 +97,7 @@ def test_any_chunking_gives_the_events_of_the_whole_with_everything_on(timing):
         assert not same(whole, simulate(frames, t_s, sensor, torch.Generator().manual_seed(6)))
 
 
+@pytest.mark.bits
 def test_dense_counts_are_the_counts_of_the_events():
     frames, t_s = clip()
     events = simulate(frames, t_s, EVERYTHING, torch.Generator().manual_seed(5))

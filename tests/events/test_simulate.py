@@ -75,6 +75,7 @@ def test_a_sinusoid_fires_when_its_closed_form_crosses():
     assert (events.t_us - 1e6 * torch.tensor(up + down + again, dtype=torch.float64)).abs().max() < 4
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("sequence", ["edge", "grating", "flicker"])
 @pytest.mark.parametrize("configuration", ["ideal", "asym"])
 def test_counts_equal_v2e_in_every_pixel_and_frame(shared, sequence, configuration):
@@ -98,6 +99,7 @@ def test_counts_equal_v2e_in_every_pixel_and_frame(shared, sequence, configurati
     assert int((moved != 0).sum()) <= 1e-4 * len(stream)
 
 
+@pytest.mark.bits
 def test_hard_counts_are_those_of_the_memory_layer_with_the_same_mismatch():
     frames = torch.rand(12, 7, 6, generator=torch.Generator().manual_seed(1)) * 255
     t_s = torch.arange(12, dtype=torch.float64) / 240

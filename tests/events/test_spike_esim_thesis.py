@@ -31,6 +31,7 @@ def of_thesis(data, through_reset):
     return network
 
 
+@pytest.mark.bits
 @pytest.mark.filterwarnings("ignore:max rho:RuntimeWarning")
 @pytest.mark.parametrize(("through_reset", "name"), [("off", "gw_slayer"), ("full", "gw_bptt")])
 def test_network_of_the_thesis_equals_the_reference(shared, through_reset, name):

@@ -52,6 +52,7 @@ def test_one_spike_leaves_the_reset_kernel(kernel, formula):
         assert (potential[4:, pixel] - torch.tensor(truth, dtype=F64)).abs().max() < 1e-13
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("kernel", ["slayer", "thesis", "exp", "step"])
 @pytest.mark.parametrize("response", ["none", "alpha", "step"])
 def test_recursion_equals_the_finite_kernels_step_by_step_when_nothing_is_cut(kernel, response):
@@ -126,6 +127,7 @@ def test_the_smooth_twin_passes_gradcheck_in_every_input(surrogate, kernel, resp
     assert torch.autograd.gradcheck(layer, (drive, theta, tau_s, tau_r, *start))
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("cuts", [[1] * 40, [13, 27], [39, 1]])
 @pytest.mark.parametrize("truncation", [None, 0.01])
 @pytest.mark.parametrize("dtype", [torch.float32, F64])
@@ -175,6 +177,7 @@ def test_chunks_give_the_whole_bit_for_bit_and_the_same_gradient(cuts, truncatio
         ) * (1 + whole.abs().max())
 
 
+@pytest.mark.bits
 def test_segments_change_no_gradient():
     found = []
     for segment in (None, 1, 7, 100):
@@ -216,6 +219,7 @@ def test_float32_spikes_equal_float64_over_1e5_steps():
         assert 0.01 < float(truth.mean()) < 0.99
 
 
+@pytest.mark.bits
 def test_gradient_through_the_reset_explodes_in_full_and_not_when_bounded():
     drive = torch.full((200, 1), 1.0, dtype=F64, requires_grad=True)
     settings = {

@@ -34,6 +34,7 @@ def steps_first(array):
     return torch.from_numpy(np.moveaxis(array, -1, 0).astype(np.float64).copy())
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("segment", [None, 13])
 def test_spikes_potentials_and_gradients_equal_the_reference(shared, case, segment):
@@ -104,6 +105,7 @@ def network(data, settings, through_reset, smooth):
     return loss.detach(), spikes.detach(), potential.detach(), of_spikes, torch.stack(of_weights)
 
 
+@pytest.mark.bits
 @pytest.mark.filterwarnings("ignore:max rho:RuntimeWarning")
 def test_loss_and_weight_gradients_of_the_spiking_network_equal_the_reference(shared):
     data = dict(np.load(shared("refs/srm/z_spike_esim.npz")))

@@ -49,6 +49,7 @@ def test_a_moving_pattern_is_where_it_should_be_in_between(shift):
     assert len(made) - 1 in (math.ceil(math.hypot(*shift)), math.ceil(math.hypot(*shift) + 0.3))
 
 
+@pytest.mark.bits
 def test_given_frames_and_times_stay_exactly():
     frames = moving([(0, 0), (2.5, 1), (2.5, 1), (7, 3)])
     times = torch.tensor([1e9, 1e9 + 0.013, 1e9 + 0.02, 1e9 + 0.09], dtype=torch.float64)
@@ -64,6 +65,7 @@ def test_given_frames_and_times_stay_exactly():
     )  # even, to the 0.1 us that seconds since the epoch resolve
 
 
+@pytest.mark.bits
 def test_a_still_video_stays_bit_for_bit_and_makes_no_event():
     frame = torch.rand(30, 40, generator=torch.Generator().manual_seed(0)) * 255
     frames = frame.repeat(4, 1, 1)
@@ -137,6 +139,7 @@ def test_events_of_the_upsampled_video_are_those_of_the_true_one():
         assert 0.9 < int((found.p == polarity).sum()) / int((truth.p == polarity).sum()) < 1.1
 
 
+@pytest.mark.bits
 def test_the_stream_gives_the_whole_bit_for_bit():
     frames = moving([(0, 0), (2, 1), (5, 1), (5.5, 0)])
     times = [0.0, 0.1, 0.3, 0.4]

@@ -42,6 +42,7 @@ def sensor_of(given, timing):
     )
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("sequence", ["edge", "grating", "flicker"])
 @pytest.mark.parametrize("configuration", CONFIGURATIONS)
 def test_every_event_of_v2e_to_the_microsecond(shared, sequence, configuration):

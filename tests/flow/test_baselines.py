@@ -36,6 +36,7 @@ def small(network, **options):
     return network(bins=BINS, width=8.0, **options).double()
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("size", [(37, 53), (16, 16), (5, 90), (1, 1)])
 def test_any_size_is_padded_with_emptiness_and_cropped_back(network, size):
@@ -157,6 +158,7 @@ def test_weights_of_the_plain_network_by_hand():
     assert count_weights(FlowNetEvents(bins, 16.0)) == encoder + residual + decoder + norms + heads
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("network", NETWORKS)
 def test_configuration_and_weights_make_the_same_network(network):
     net = small(network, seed=3)

@@ -62,6 +62,7 @@ def rendered(dataset):
         return flow_and_occlusion(camera, worlds.room(), T[[3, 9]])
 
 
+@pytest.mark.bits
 def test_windows_of_one_interval_are_what_is_stored(dataset):
     assert isinstance(open_windows(dataset, window_frames=2), DatasetWindows)
     source = DatasetWindows(dataset, bins=4)
@@ -125,6 +126,7 @@ def test_flow_followed_from_frame_to_frame_is_near_the_renderers(dataset, render
     assert float(error.quantile(0.95)) < 0.3
 
 
+@pytest.mark.bits
 def test_pieces_depend_on_seed_and_number_alone(dataset):
     whole = DatasetWindows(dataset)
     source = DatasetWindows(dataset, crop_px=(16, 24), seed=5)

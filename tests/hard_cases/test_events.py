@@ -53,6 +53,7 @@ CASES = {
 }
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("theta", THETAS)
 @pytest.mark.parametrize("case", CASES)
 def test_counts_are_those_of_the_definition_and_gradients_are_finite(case, theta):

@@ -201,6 +201,7 @@ def test_penalty_by_hand_and_its_slope():
     assert slope.tolist() == pytest.approx([-2 * 0.25 / 0.5**2, 0.0], rel=1e-12)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_detuning_reaches_its_target_and_keeps_the_other_thicknesses(design, seed):
     geo = detune(design, FIELDS, 0.05, torch.Generator().manual_seed(seed))

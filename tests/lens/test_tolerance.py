@@ -265,6 +265,7 @@ def test_worst_offenders_share_the_whole_variance(triplet):
     assert all(abs(change) <= 1e-12 for name, change, _ in every if "decentre" in name)
 
 
+@pytest.mark.bits
 def test_trials_repeat_and_failures_are_counted(triplet):
     def make(seed):
         return monte_carlo(triplet, ALL, efl, 5, torch.Generator().manual_seed(seed))

@@ -102,6 +102,7 @@ def test_a_worse_score_goes_back_to_the_best_with_smaller_steps():
     assert loop.best_score == 1.0
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("optimiser", [lambda p: Descent(p, 0.3), lambda p: torch.optim.Adam(p, lr=0.2)])
 def test_resumed_equals_uninterrupted(optimiser):
     # element-wise operations on two numbers, so the same bits by construction

@@ -166,6 +166,7 @@ class TestDampedLeastSquares:
                 units * other.variables, plain.variables, rtol=1e-9, atol=1e-12
             )  # the same in exact arithmetic
 
+    @pytest.mark.bits
     @pytest.mark.parametrize("route", ["json", "torch"])
     def test_a_resumed_run_repeats_the_uninterrupted_one_to_the_last_bit(self, route):
         def make():
@@ -239,6 +240,7 @@ class TestScaledAdam:
         truth = float((target - A @ (A.T @ target)).square().sum())
         assert float(loss(best)) == pytest.approx(truth, rel=1e-4)
 
+    @pytest.mark.bits
     @pytest.mark.parametrize("route", ["json", "torch"])
     def test_a_resumed_run_repeats_the_uninterrupted_one_to_the_last_bit(self, route):
         def make():

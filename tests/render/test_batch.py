@@ -44,6 +44,7 @@ def camera(samples=4, film=None, optics=None):
     return Camera(optics or lens.Pinhole(8.0), 12, 8, 0.1, samples, seed=3, film=film)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("film", [None, Film(20, 16, 6, 5, 0.1, ((0, 0), (13, 8)))])
 @pytest.mark.parametrize("world", ["plane", "room"])
 def test_frames_of_a_batch_are_those_of_each_trajectory(world, film):
@@ -111,6 +112,7 @@ def test_gradients_to_a_batch_of_poses_are_differences(quantity, generator):
     assert float(((found * direction).sum((-2, -1)) - truth).norm() / truth.norm()) <= 1e-7
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("own", [False, True])
 def test_objects_move_the_same_for_all_trajectories_or_each_its_own_way(own):
     # float64 throughout; products of 4 x 4 matrices may round differently in another batch
@@ -139,6 +141,7 @@ def test_objects_move_the_same_for_all_trajectories_or_each_its_own_way(own):
     )
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("stride", [1, 2])
 def test_truth_of_a_batch_is_that_of_each_trajectory(stride):
     cam = camera(
@@ -156,6 +159,7 @@ def test_truth_of_a_batch_is_that_of_each_trajectory(stride):
     assert not both.occluded.any()
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("frame", [1, -1])
 def test_views_of_a_batch_are_those_of_each_trajectory(frame):
     cards = paths(4, BATCH, torch.eye(4, dtype=D)) + 0
@@ -203,6 +207,7 @@ def test_velocities_of_a_batch_are_those_of_each_trajectory():
         torch.testing.assert_close(found[k], truth, rtol=0, atol=1e-13)
 
 
+@pytest.mark.bits
 def test_exposures_chunks_and_times_take_several_trajectories():
     cam = camera()
     twist = torch.tensor([[0.2, 0.1, 0, 0, 0, 0], [0.4, 0.2, 0, 0, 0, 0.5]], dtype=D)

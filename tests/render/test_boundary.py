@@ -42,6 +42,7 @@ def test_lens_gradients_with_occluders():
     assert float((whole - truth).norm() / truth.norm()) < 0.06
 
 
+@pytest.mark.bits
 def test_the_boundary_term_changes_no_frame():
     scene = silhouette_scenes.build("cubes")
     camera = render.Camera(Task(scene, "traced").lens, 16, 16, 0.5, 4)

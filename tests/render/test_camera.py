@@ -258,6 +258,7 @@ def test_the_thin_twin_of_a_lens_has_its_focal_length_pupil_and_focus():
 # ---- films
 
 
+@pytest.mark.bits
 def test_windows_equal_the_crops_of_the_full_frame():
     corners = ((0, 0), (17, 5), (40, 30))
     whole = Film(64, 48, 64, 48, 0.1)

@@ -292,6 +292,7 @@ def test_the_sky_is_the_same_at_every_level():
     assert float(seen[0].std()) > 5  # and it is not plain
 
 
+@pytest.mark.bits
 def test_equal_seeds_give_equal_frames_and_others_do_not(still_life):
     scene = light.PathScene(still_life, samples=2)
     camera = Camera(lens.Pinhole(6.0), 8, 6, 0.6, 2)

@@ -133,6 +133,7 @@ def test_a_ball_moved_by_its_poses_is_the_ball_built_there():
         assert int(((found[t] - truth).abs() > 0.01).sum()) <= 1
 
 
+@pytest.mark.bits
 def test_nearest_of_several_objects_and_the_background_where_nothing_is_met():
     away = look_at((0, 0, 2.0), (0, 0, 5.0), down=(0, 1, 0))[None]
 
@@ -241,6 +242,7 @@ def test_gradients_to_the_pose_of_a_textured_mesh_object(generator):
     assert float((found - truth).norm() / truth.norm()) <= 0.01
 
 
+@pytest.mark.bits
 def test_a_scene_cut_to_some_frames_is_that_part_of_the_sequence():
     scene = MovingScene(plane(2, -3.0), {"card": (plane(1), motion(5))})
     whole = render.frames(camera(), scene, path(5))

@@ -116,6 +116,7 @@ def test_lenses_that_lack_what_a_gradient_needs_are_refused():
 # ---- rays that are traced once
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("way", ["interior", "boundary"])
 def test_given_rays_make_the_same_frames_and_gradients(way, generator):
     scene, pose = cubes()
@@ -166,6 +167,7 @@ def test_rays_that_do_not_fit_are_refused():
 # ---- several worlds
 
 
+@pytest.mark.bits
 def test_a_list_of_worlds_is_each_with_its_own_poses():
     worlds = [plane(), TexturedPlane(*textures.waves(5, finest_period_m=0.3))]
     poses = torch.stack([above(3), above(3).flip(0)])[:, None].repeat(1, 2, 1, 1, 1)

@@ -388,6 +388,7 @@ def test_the_coarse_grid_spans_every_window():
 # ---- chunks
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("kind", ["room", "plane", "moving"])
 @pytest.mark.parametrize("size", [1, 3, 7, 20])
 def test_chunks_joined_are_the_sequence_bit_for_bit(kind, size):

@@ -87,6 +87,7 @@ def test_texels_have_the_size_they_are_given():
     assert {10.0, 200.0} <= {round(v, 3) for v in row.tolist()}
 
 
+@pytest.mark.bits
 def test_a_static_camera_sees_equal_frames_and_the_seed_decides_the_samples():
     scene = worlds.room()
     pose = look_at((0.5, -1.2, 1.4), (0, 1, 0.8))

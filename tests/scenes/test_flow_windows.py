@@ -66,11 +66,15 @@ def test_camera_motion_obeys_the_plane_homography():
     assert abs(np.sqrt(np.square(flow).sum(1).mean()) - 3.0) < 0.15
 
 
+@pytest.mark.bits
 def test_samples_do_not_depend_on_their_batch(layered):
     together = layered.batch([2, 5, 9])
     alone = layered.batch([5])
-    assert torch.equal(together.volume.counts[1], alone.volume.counts[0])
     assert torch.equal(together.truth.flow_px[1], alone.truth.flow_px[0])
+    assert torch.equal(together.frames[1], alone.frames[0])
+    # a volume is a matrix product: sums of at most 32 terms >= 0, each rounded twice by half an eps
+    eps = torch.finfo(torch.float32).eps
+    torch.testing.assert_close(together.volume.counts[1], alone.volume.counts[0], rtol=2 * 32 * eps, atol=0)
 
 
 def test_noise_is_as_frequent_as_asked():

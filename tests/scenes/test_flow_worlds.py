@@ -49,6 +49,7 @@ def test_events_are_counted_by_their_time(windows):
     torch.testing.assert_close(whole, whole.round(), rtol=1e-5, atol=0)  # shares of an event add up to one
 
 
+@pytest.mark.bits
 def test_a_sample_does_not_depend_on_its_batch():
     source = WorldWindows(("room",), seed=4, size_px=32, intervals=8, samples=1)
     assert torch.equal(source.batch([1, 2]).volume.counts[1], source.batch([2]).volume.counts[0])

@@ -141,6 +141,7 @@ def test_poses_are_rigid_and_the_velocity_leads_from_one_to_the_next(family):
     torch.testing.assert_close(ahead, path(t + step / 2), rtol=0, atol=1e-9)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_same_seed_gives_the_same_path_and_order_of_times_does_not_matter(family):
     t = torch.linspace(0, 4.9, 31, dtype=D)
@@ -148,7 +149,8 @@ def test_the_same_seed_gives_the_same_path_and_order_of_times_does_not_matter(fa
     two = FAMILIES[family]()
     assert torch.equal(one(t), two(t))
     shuffled = torch.randperm(31, generator=seeded())
-    torch.testing.assert_close(one(t[shuffled]), one(t)[shuffled], rtol=0, atol=1e-15)
+    # metres up to 5 and turns: sums of some ten products and waves, each within eps = 2.2e-16 of 5
+    torch.testing.assert_close(one(t[shuffled]), one(t)[shuffled], rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize(

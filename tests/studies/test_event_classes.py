@@ -153,6 +153,7 @@ def separable(count, generator):
     return voxels.reshape(count, 2, 5, 32, 32), labels
 
 
+@pytest.mark.bits
 def test_a_trivially_separable_set_is_learnt_completely_and_training_repeats_from_its_seed(generator):
     voxels, labels = separable(200, generator)
     unseen, truth = separable(50, generator)
@@ -210,6 +211,7 @@ def test_a_filter_of_stacked_pictures_sees_no_neighbour(generator):
         assert torch.allclose(together[:, k], alone, atol=1e-14)
 
 
+@pytest.mark.bits
 def test_spiking_generators_see_each_picture_alone_and_are_judged_against_silence():
     pictures = draw_pictures(3, "training", 5)
     t_s = frame_times(50.0)
@@ -227,9 +229,10 @@ def test_spiking_generators_see_each_picture_alone_and_are_judged_against_silenc
     together = thesis.generate(seen, t_s, torch.Generator())
     assert float(together.sum()) > 0
     for k in range(3):
-        assert torch.equal(
-            together[:, :, k : k + 1], thesis.generate(seen[:, k : k + 1], t_s, torch.Generator())
-        )
+        alone = thesis.generate(seen[:, k : k + 1], t_s, torch.Generator())
+        # a convolution of three pictures may round differently from one of one, by 9 products of 1e-7: as
+        # above, a spike so near its threshold comes a step later
+        assert int((together[:, :, k : k + 1] != alone).sum()) <= 1e-3 * alone.numel()
     assert float(spiking.objective(target, target, 0.02, 0.1)) == 0
     assert float(spiking.objective(torch.zeros_like(target), target, 0.02, 0.1)) == pytest.approx(1.1)
 

@@ -102,7 +102,7 @@ def test_the_truth_of_many_frames_is_that_of_each(moving):
             assert torch.equal(found.object_id[k], each.object_id)
             torch.testing.assert_close(found.depth_m[k], each.depth_m, rtol=0, atol=1e-12)
         assert set(found.object_id.unique().tolist()) == ({0, 1} if moving else {0})
-        for processor in (nullcontext(), RoundsByPlace(1e-12)):
+        for processor in (nullcontext(), RoundsByPlace()):
             with processor:
                 whole = truth_of_frames(table, scene, T, 5, chief)
                 part = truth_of_frames(table, at_frames(scene, slice(2, 4)), T[2:4], 1, chief)
@@ -196,6 +196,7 @@ def test_the_manifest_holds_the_hash_of_every_file(dataset):
     } == expected
 
 
+@pytest.mark.bits
 def test_events_are_those_of_the_stored_frames_whatever_the_chunks(dataset):
     for index, name in enumerate(names(dataset)):
         with (

@@ -77,6 +77,7 @@ def test_training_finds_the_known_answer(tmp_path):
     assert list((tmp_path / "run" / "tensorboard").iterdir())
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize(
     "more", [(), ("--average", "0.9", "--reuse", "3")], ids=["plain", "average and reuse"]
 )

@@ -61,6 +61,7 @@ def test_the_sixteen_ways_differ():
     assert len({turned(given, way).volume.counts.numpy().tobytes() for way in range(16)}) == 16
 
 
+@pytest.mark.bits
 def test_windows_are_shown_as_often_as_told_and_resumed_alike():
     made = []
     parts = [(1.0, Made(before=lambda indices: made.append(tuple(indices))))]

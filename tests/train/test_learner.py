@@ -115,6 +115,7 @@ def test_chance_within_a_step_is_the_seed_and_the_number_of_the_step():
     assert [other.step(batch).loss for _ in range(40)] != first
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize(
     "make",
     [

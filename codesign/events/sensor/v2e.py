@@ -100,13 +100,20 @@ def _photoreceptor(level, light, dt_s, sensor, generator, state):
 
 
 def _slots(before_s, now_s, dt_s, count):
-    """[count] times of the frame's slots since the first frame, seconds."""
-    return torch.linspace(
-        before_s + dt_s / count,
-        now_s,
-        count,
-        dtype=torch.float32 if now_s < EXACT_SINGLE_S else torch.float64,
-    )
+    """[count] times of the frame's slots since the first frame, seconds.
+
+    In single precision they are torch.linspace as v2e's processor made it, from the nearer end and rounded
+    once (a fused multiply-add); without AVX2 torch rounds twice, and a dead time that ends at a slot ends
+    later.
+    """
+    if now_s >= EXACT_SINGLE_S:
+        return torch.linspace(before_s + dt_s / count, now_s, count, dtype=torch.float64)
+    first, last = torch.tensor([before_s + dt_s / count, now_s], dtype=torch.float32)
+    step = ((last - first) / max(count - 1, 1)).double()
+    nth = torch.arange(count, dtype=torch.float64)
+    rising = first.double() + step * nth
+    falling = last.double() - step * (count - 1 - nth)
+    return torch.where(nth < max(count // 2, 1), rising, falling).float()
 
 
 def _with_dead_time(on, off, times, refractory_s, state):
