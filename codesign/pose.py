@@ -16,6 +16,9 @@ def se3_exp(twist: Tensor) -> Tensor:
     Args: twist [..., 6]: translation part (m) then rotation vector (rad), in the frame on the right of the
       product.
     Returns: [..., 4, 4]. Gradient: exact, also at zero. Source: kornia.geometry.liegroup.Se3.
+
+    >>> se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.0, 0.0, 0.0]))[:3, 3].tolist()
+    [1.0, 2.0, 3.0]
     """
     if twist.shape[-1] != 6:
         raise ShapeError(
@@ -28,7 +31,12 @@ def se3_exp(twist: Tensor) -> Tensor:
 
 
 def inverse(transform: Tensor) -> Tensor:
-    """Inverse of rigid transforms [..., 4, 4]."""
+    """Inverse of rigid transforms [..., 4, 4].
+
+    >>> pose = look_at((0.0, 0.0, 1.0), (2.0, 0.0, 0.0))
+    >>> torch.allclose(inverse(pose) @ pose, torch.eye(4, dtype=pose.dtype))
+    True
+    """
     rotation = transform[..., :3, :3]
     translation = transform[..., :3, 3:]
     # written out by element: a matrix product may round differently in another batch
@@ -52,6 +60,9 @@ def look_at(
 
     Args: sequences of three numbers. Returns: [4, 4] float64, without gradient.
     Raises: DomainError when the two points are one, the view is along ``down``, or a number is not finite.
+
+    >>> look_at((0.0, 0.0, 1.0), (2.0, 0.0, 1.0))[:3, 2].tolist()  # the camera's z axis, in the world
+    [1.0, 0.0, 0.0]
     """
     origin, target, down = (
         check_finite(torch.as_tensor(v, dtype=torch.float64), "look_at", "give finite points")

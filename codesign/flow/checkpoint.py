@@ -83,6 +83,11 @@ def save(network: nn.Module, path: str | Path, metadata: Mapping[str, Any] | Non
       metadata: plain JSON values to keep with it (seed, steps, figures, command), or None.
     Raises: DomainError for a network without name, weights that are not finite, and metadata that JSON cannot
       hold; FileFormatError when the file cannot be written.
+
+    >>> network = load("refiner")
+    >>> save(network, "again.safetensors", {"note": "as delivered"})
+    >>> read("again.safetensors").metadata
+    {'note': 'as delivered'}
     """
     weights = network.state_dict()
     bad = [name for name, tensor in weights.items() if not bool(tensor.isfinite().all())]
@@ -115,6 +120,11 @@ def load(name_or_path: str | Path) -> "Network":
       ``requires_grad_(False)`` saves their cost.
     Raises: FileFormatError when the file is missing, damaged, of another version, or does not fit its
       network.
+
+    >>> from codesign.flow.export import evenly_timed
+    >>> network = load("refiner")
+    >>> network(evenly_timed(torch.zeros(1, 2, network.config["bins"], 64, 96))).flow_px.shape
+    torch.Size([1, 2, 64, 96])
     """
     path = Path(name_or_path)
     if str(name_or_path) in DELIVERED:

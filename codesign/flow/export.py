@@ -43,6 +43,12 @@ def export(network: nn.Module, path: str | Path, height_px: int, width_px: int, 
 
     Load .pt2 by ``torch.export.load(path).module()``, .onnx by any ONNX runtime (input "counts", outputs
     "flow_px", "confidence").
+
+    >>> from codesign.flow import FlowNetEvents
+    >>> export(FlowNetEvents(bins=2, width=4.0), "network.pt2", height_px=32, width_px=32)
+    >>> flow_px, confidence = torch.export.load("network.pt2").module()(torch.ones(1, 2, 2, 32, 32))
+    >>> flow_px.shape
+    torch.Size([1, 2, 32, 32])
     """
     path = Path(path)
     if path.suffix not in (".pt2", ".onnx"):

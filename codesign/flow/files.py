@@ -37,6 +37,11 @@ def write_flow(path: str | Path, flow_px: torch.Tensor, valid: torch.Tensor | No
       everything when None.
     Raises: ShapeError; DomainError when a valid flow is not finite or does not fit the format;
       FileFormatError for another extension or a folder not writable.
+
+    >>> write_flow("flow.png", torch.full((2, 4, 6), 1.5))
+    >>> flow_px, valid = read_flow("flow.png")
+    >>> flow_px.shape, float(flow_px.max()), bool(valid.all())
+    (torch.Size([2, 4, 6]), 1.5, True)
     """
     path = Path(path)
     encode = _choose({".png": _to_png, ".flo": _to_flo}, path, "written")
@@ -60,6 +65,11 @@ def read_flow(path: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
 
     Returns: flow_px [2, H, W] float32, 0 where not valid; valid [H, W] bool.
     Raises: FileFormatError with one sentence when the file is missing, damaged or of another kind.
+
+    >>> write_flow("flow.flo", torch.zeros(2, 4, 6), valid=torch.eye(4, 6, dtype=torch.bool))
+    >>> flow_px, valid = read_flow("flow.flo")
+    >>> int(valid.sum())
+    4
     """
     path = Path(path)
     decode = _choose({".png": _from_png, ".flo": _from_flo}, path, "read")

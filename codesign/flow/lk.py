@@ -47,6 +47,14 @@ def estimate_lk(
     Gradient: counts, of flow, covariance and confidence.
     Raises: ShapeError, DomainError.
     Cost: linear in pixels and bins; a level of blur s works on a grid of spacing 2^floor(log2 s) px.
+
+    >>> from codesign.flow.export import evenly_timed
+    >>> y, x = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
+    >>> times = (0.0, 0.25, 0.5, 0.75, 1.0)
+    >>> rate = torch.stack([torch.sin((x - 2 * t) / 4) + torch.sin((y - t) / 5) for t in times])
+    >>> counts = torch.stack([rate.clamp(min=0), (-rate).clamp(min=0)])[None]
+    >>> estimate_lk(evenly_timed(counts)).flow_px[0, :, 24, 32].round(decimals=0).tolist()
+    [2.0, 1.0]
     """
     counts = volume.counts
     if counts.ndim != 5 or counts.shape[1] != 2 or counts.shape[2] < 2:

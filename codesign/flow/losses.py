@@ -65,6 +65,11 @@ def supervised_loss(
     Gradient: flow_px of the predictions.
     Raises: ShapeError.
     Source: the weights are those of Teed and Deng, RAFT, ECCV 2020, sec. 3.4.
+
+    >>> valid = torch.ones(1, 8, 8, dtype=torch.bool)
+    >>> still, right = (FlowField(torch.full((1, 2, 8, 8), v), valid, 0.1) for v in (0.0, 3.0))
+    >>> round(float(supervised_loss([still, still], right)), 2), float(supervised_loss([right], right))
+    (4.23, 0.0)
     """
     unit = _per_pixel(unit_per_px, truth.flow_px)
     return _over_predictions(

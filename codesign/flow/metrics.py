@@ -48,7 +48,12 @@ def _masked(values, mask):
 
 
 def aee(flow: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Average endpoint error, px. Source: Baker et al., IJCV 2011."""
+    """Average endpoint error, px. Source: Baker et al., IJCV 2011.
+
+    >>> truth = torch.tensor([3.0, 4.0])[:, None, None].expand(2, 8, 8)
+    >>> float(aee(torch.zeros(2, 8, 8), truth))
+    5.0
+    """
     return _masked(endpoint_error(flow, truth), mask).mean()
 
 
@@ -62,7 +67,12 @@ def outlier_percent(
     flow: Tensor, truth: Tensor, mask: Tensor | None = None, pixels: float = 3.0, share: float = 0.05
 ) -> Tensor:
     """Share of pixels, in percent, whose endpoint error is above ``pixels`` AND above ``share`` of the true
-    length (KITTI 2015: 3 px and 5 %)."""
+    length (KITTI 2015: 3 px and 5 %).
+
+    >>> truth = torch.full((2, 1, 4), 100.0)
+    >>> float(outlier_percent(truth + torch.tensor([0.0, 2.0, 5.0, 9.0]), truth))  # 7.1 px is 5 % of 141 px
+    25.0
+    """
     error = endpoint_error(flow, truth)
     length = truth.square().sum(-3).sqrt()
     error = _masked(error, mask)
@@ -72,14 +82,24 @@ def outlier_percent(
 
 def npe(flow: Tensor, truth: Tensor, pixels: float, mask: Tensor | None = None) -> Tensor:
     """Share of pixels, in percent, whose endpoint error is above ``pixels`` (DSEC's 1PE, 2PE, 3PE; what event
-    papers on MVSEC call outliers is ``pixels=3``)."""
+    papers on MVSEC call outliers is ``pixels=3``).
+
+    >>> error = torch.tensor([0.0, 0.5, 1.5, 4.0]).expand(2, 1, 4) * torch.tensor([1.0, 0.0])[:, None, None]
+    >>> float(npe(error, torch.zeros(2, 1, 4), pixels=1.0))
+    50.0
+    """
     error = _masked(endpoint_error(flow, truth), mask)
     return 100 * (error > pixels).to(error.dtype).mean()
 
 
 def angular_error_deg(flow: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
     """Mean angle in space-time between (u, v, 1) and the truth, degrees (Barron et al., 1994), by atan2 for
-    accuracy at small angles."""
+    accuracy at small angles.
+
+    >>> flow = torch.tensor([1.0, 0.0])[:, None, None].expand(2, 8, 8)
+    >>> round(float(angular_error_deg(flow, torch.zeros(2, 8, 8))), 3)
+    45.0
+    """
     _check(flow, truth)
     one = torch.ones_like(flow[..., :1, :, :])
     return _masked(

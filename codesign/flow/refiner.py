@@ -38,6 +38,11 @@ class Refiner(nn.Module):
     scales; it adds to the flow on cells of 8 and of 4 px.
     Warping looks bins up at q + t flow(q), so the flow belongs to the pixels of the window's start, as the
     truth does.
+
+    >>> from codesign.flow.export import evenly_timed
+    >>> network = Refiner(bins=4, width=8, steps=1)
+    >>> network(evenly_timed(torch.ones(1, 2, 4, 32, 48))).flow_px.shape
+    torch.Size([1, 2, 32, 48])
     """
 
     def __init__(self, bins: int = 8, width: int = 28, steps: int = 2) -> None:

@@ -28,6 +28,10 @@ def by_differences(step: float | Tensor, central: bool = False) -> Jacobian:
     Args: step: a number or [V]; the error is about step (step^2 when central) times curvature, plus rounding
       over step.
     Where the far side is not finite the other side is used; where neither is, the Jacobian is not finite.
+
+    >>> x = torch.tensor([1.0, 2.0], dtype=torch.float64)
+    >>> by_differences(1e-4, central=True)(torch.square, x, x.square()).round(decimals=6).tolist()
+    [[2.0, 0.0], [0.0, 4.0]]
     """
 
     def jacobian(residuals, variables, value):

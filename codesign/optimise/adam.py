@@ -33,6 +33,11 @@ class ScaledAdam:
     Raises: ShapeError; DomainError when the start is not finite; NonFiniteError when the loss or gradient at
       the start is not.
     Source: Kingma and Ba, Adam, ICLR 2015, algorithm 1.
+
+    >>> start = torch.zeros(2, dtype=torch.float64)
+    >>> adam = ScaledAdam(lambda x: (x - torch.tensor([1.0, -2.0])).square().sum(), start)
+    >>> adam.run(200).round(decimals=2).tolist()
+    [1.0, -2.0]
     """
 
     def __init__(

@@ -58,6 +58,11 @@ class DampedLeastSquares:
     variables, loss: where it stands. history: History. stopped: why the last run ended, "" while it has not.
     Raises: ShapeError, DomainError for a start that is not finite, outside its bounds, or has residuals that
       are not finite.
+
+    >>> start = torch.tensor([-1.2, 1.0], dtype=torch.float64)
+    >>> solver = DampedLeastSquares(lambda x: torch.stack([10 * (x[1] - x[0] ** 2), 1 - x[0]]), start)
+    >>> solver.run().round(decimals=6).tolist()  # Rosenbrock's valley
+    [1.0, 1.0]
     """
 
     def __init__(

@@ -30,6 +30,10 @@ class FlowNetEvents(nn.Module):
     Raises: ShapeError, DomainError.
     Source: Zhu et al., EV-FlowNet, RSS 2018, fig. 4, with group normalisation (Wu and He, ECCV 2018) and
       SiLU.
+
+    >>> from codesign.flow.export import evenly_timed
+    >>> FlowNetEvents(bins=4, width=4.0)(evenly_timed(torch.ones(1, 2, 4, 32, 48))).flow_px.shape
+    torch.Size([1, 2, 32, 48])
     """
 
     def __init__(self, bins: int = 8, width: float = 32.0, hidden: int | None = None, seed: int = 0) -> None:

@@ -36,6 +36,10 @@ class SpikeFlowNet(nn.Module):
     Gradient: counts and weights, through spikes by the surrogate. First derivatives only.
     Raises: ShapeError, DomainError.
     Source: Lee et al., Spike-FlowNet, ECCV 2020, sec. 3 and fig. 4.
+
+    >>> from codesign.flow.export import evenly_timed
+    >>> SpikeFlowNet(bins=4, width=4.0)(evenly_timed(torch.ones(1, 2, 4, 32, 48))).flow_px.shape
+    torch.Size([1, 2, 32, 48])
     """
 
     def __init__(
