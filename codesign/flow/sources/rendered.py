@@ -98,7 +98,7 @@ class DatasetWindows:
 class Sequence:
     """One sequence folder. times_us: [T] frame times. size_px: (height, width). count: T."""
 
-    def __init__(self, folder: Path, sizes: dict | None = None) -> None:
+    def __init__(self, folder: Path, sizes: dict[str, int] | None = None) -> None:
         self.folder = folder
         for name in ("frames.h5", "events.h5", "camera.h5"):
             if not (folder / name).is_file():
