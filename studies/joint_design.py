@@ -158,10 +158,11 @@ def descend(system: System, config: Config) -> list[float]:
 
 def by_hand(system: System, batch: Batch) -> torch.Tensor:
     """The same loss by the stages alone."""
-    camera = system.camera.with_seed(batch.seed)
+    seed = batch.seed or 0
+    camera = system.camera.with_seed(seed)
     poses = batch.T_world_body @ system.mount()
     frames = render.frames(camera, system.scene, poses, rays=camera.rays())
-    counts = system.events(frames, batch.t_s, torch.Generator().manual_seed(batch.seed))
+    counts = system.events(frames, batch.t_s, torch.Generator().manual_seed(seed))
     volume = events.from_counts(counts.permute(1, 2, 0, 3, 4), batch.t_s, BINS)
     field = system.flow(volume)
     found, valid = render.true_flow(camera, system.scene, poses[:, [0, -1]])

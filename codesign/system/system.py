@@ -46,6 +46,15 @@ class System(nn.Module):
     ...     objectives={"error": lambda field, truth: (field.flow_px - truth.flow_px).square().mean()})
     """
 
+    camera: Any
+    lens: Any
+    mount: Any
+    trajectory: Any
+    render: Any
+    events: Any
+    flow: Any
+    estimate: Any
+
     def __init__(
         self,
         *,

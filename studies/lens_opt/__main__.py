@@ -119,7 +119,7 @@ def study(run: Run[Config]):
         if job.loop.record.kept[-1]:
             lens.save(optics, run.path("lens_optimised.json"))
             if config.train_network:
-                checkpoint.save(job.system.get_submodule("flow"), run.path("network.safetensors"))
+                checkpoint.save(job.system.flow, run.path("network.safetensors"))
         save()
 
     run.on_interrupt(save)

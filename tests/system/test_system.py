@@ -116,6 +116,7 @@ def test_several_objectives_share_one_pass_and_add_up_by_weight():
     result = system(BATCH)
     assert len(rendered) == 1
     result.backward({"square": 0.5, "sum": 10.0})
+    assert lens.efl_mm.grad is not None
     assert lens.efl_mm.grad.item() == pytest.approx(0.5 * 36 + 10 * 2)  # d(36 a^2)/da = 36, d(2 a)/da = 2
     assert set(system(BATCH, objectives=("sum",)).objectives) == {"sum"}
     with pytest.raises(DomainError, match="no objective 'cube'; there are square, sum"):
