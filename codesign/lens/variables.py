@@ -77,10 +77,10 @@ class Variables(nn.Module):
         made = self._labelled("start_")
         for name, tensor in self.tensor_of.items():
             low, high, width, places, start, unit = (
-                self.get_buffer(f"{name}_{label}")
+                getattr(self, f"{name}_{label}")
                 for label in ("low", "high", "width", "places", "start", "unit")
             )
-            values = _bounded(start + unit * self.get_parameter(name), low, high, width)
+            values = _bounded(start + unit * getattr(self, name), low, high, width)
             flat = made[tensor].reshape(-1).index_put((places,), values)
             made[tensor] = flat.reshape(made[tensor].shape)
         return made

@@ -330,3 +330,31 @@ def test_a_pinhole_has_one_variable():
 def test_what_cannot_vary_gets_a_sentence(make, error, sentence):
     with pytest.raises(error, match=sentence):
         make(lens.load("cooke-triplet"))
+
+
+def test_variables_are_replaced_by_a_functional_call():
+    # what a certificate of a Module does: plain tensors stand where Parameters were
+    geo = lens.load("cooke-triplet")
+    geo.variables("curvature", "focus")
+    name = next(n for n, _ in geo.named_parameters() if n.endswith("focus"))
+    step = torch.tensor([3.0], dtype=D, requires_grad=True)
+    before = geo.thickness_mm[-1].detach()
+
+    def image_distance(shift):
+        return torch.func.functional_call(_Last(geo), {f"geo.{name}": shift}, ())
+
+    moved = image_distance(step)
+    (slope,) = torch.autograd.grad(moved, step)
+    assert float((moved - before).detach()) == pytest.approx(
+        3 * float(slope), rel=0.05
+    )  # a bound far away bends it a little
+    assert float(geo.thickness_mm[-1].detach()) == float(before)
+
+
+class _Last(torch.nn.Module):
+    def __init__(self, geo):
+        super().__init__()
+        self.geo = geo
+
+    def forward(self):
+        return self.geo.thickness_mm[-1]

@@ -148,8 +148,8 @@ class SpikeFlowNet(nn.Module):
             # channels
             head = torch.einsum(
                 "on,inhw->iohw",
-                self.heads[level].get_parameter("weight")[:, :, 0, 0],
-                self.necks[level].get_parameter("weight"),
+                self.heads[level].weight[:, :, 0, 0],  # pyright: ignore[reportIndexIssue, reportArgumentType]
+                self.necks[level].weight,  # pyright: ignore[reportArgumentType]
             )
             change = conv_transpose2d(x, head, stride=2, padding=1)
             flows.append(rescale_flow(flows[-1], change.shape[2:]) + change if flows else change)
