@@ -8,13 +8,15 @@ miss falls; rays that do not get there are led to their field from the axis in s
 """
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from codesign.lens.glass import WAVELENGTH_UM
-from codesign.lens.trace import Status, trace
+from codesign.lens.trace import Prescription, Status, trace
+from codesign.lens.traced import TracedLens
 
 NEWTON_STEPS = 12
 HALVINGS = 6
@@ -37,7 +39,13 @@ class Aim:
     found: Tensor
 
 
-def aim_at_stop(rays, until_stop, pupil, stop_radius_mm, pupil_radius_mm):
+def aim_at_stop(
+    rays: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
+    until_stop: Prescription,
+    pupil: Tensor,
+    stop_radius_mm: Tensor,
+    pupil_radius_mm: Tensor,
+) -> Aim:
     """Solve for the points of the pupil plane whose rays meet the stop at the targets.
 
     Args:
@@ -89,7 +97,13 @@ def aim_at_stop(rays, until_stop, pupil, stop_radius_mm, pupil_radius_mm):
     return Aim(at - change, torch.linalg.det(jacobian), found)
 
 
-def aimed_rays(lens, field_rad, pupil, wavelength_um=WAVELENGTH_UM["d"], start_z_mm=-5.0):
+def aimed_rays(
+    lens: TracedLens,
+    field_rad: float | Tensor,
+    pupil: Tensor,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    start_z_mm: float = -5.0,
+) -> tuple[Tensor, Tensor]:
     """Parallel rays of one field angle (in +y) that meet the real stop at points of its disc.
 
     Args: field_rad scalar; pupil [M, 2] on the unit disc, in units of the stop's paraxial radius. Returns:

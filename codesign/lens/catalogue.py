@@ -57,7 +57,7 @@ LENSES = {
 }
 
 
-def named_surfaces(name):
+def named_surfaces(name: str) -> tuple[list[Surface], float]:
     """Surfaces and entrance pupil diameter (mm) of a published lens."""
     diameter, _, stop, rows = LENSES[name]
     surfaces = [
@@ -67,6 +67,6 @@ def named_surfaces(name):
     return surfaces, diameter
 
 
-def half_field_deg(name):
+def half_field_deg(name: str) -> float:
     """Published half field of view, degrees."""
     return LENSES[name][1]

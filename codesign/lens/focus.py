@@ -1,15 +1,22 @@
 """Where the image of a point lies: by the paraxial rays of a finite distance, and by the least RMS spot."""
 
 import torch
+from torch import Tensor
 from torch.nn.functional import normalize
 
 from codesign.errors import DomainError
 from codesign.lens import paraxial
 from codesign.lens.analysis.rays import pupil_grid
 from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.traced import TracedLens
 
 
-def image_distance_mm(lens, distance_m, wavelength_um=WAVELENGTH_UM["d"], spot_grid=None):
+def image_distance_mm(
+    lens: TracedLens,
+    distance_m: float | Tensor,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    spot_grid: int | None = None,
+) -> Tensor:
     """Distance from the last vertex of a GeoLens to the image of an axial point, scalar mm; see
     ``GeoLens.focus_at``."""
     origin_z = lens.first_order().entrance_pupil_z_mm
@@ -41,7 +48,7 @@ def image_distance_mm(lens, distance_m, wavelength_um=WAVELENGTH_UM["d"], spot_g
     )
 
 
-def least_spot_shift(position, slope, weight):
+def least_spot_shift(position: Tensor, slope: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """How far behind their plane rays of several spots have the least mean square distance from their spot's
     mean, scalar mm; and the mean square slope that says how sharp that place is.
 

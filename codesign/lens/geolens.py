@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import ClassVar
 
 import torch
@@ -18,8 +18,8 @@ from codesign.lens.hold_efl import hold_efl, holding_surface
 from codesign.lens.numbers import kinds
 from codesign.lens.pinhole import ThinLens
 from codesign.lens.replaceable import Replaceable, settled
-from codesign.lens.surface import scaled
-from codesign.lens.trace import Prescription, Status, check_rays, trace
+from codesign.lens.surface import Surface, scaled
+from codesign.lens.trace import Prescription, Status, TraceResult, check_rays, trace
 from codesign.lens.variables import Bound, checked_step
 from codesign.types import Rays
 
@@ -74,13 +74,13 @@ class GeoLens(Replaceable):
 
     def __init__(
         self,
-        surfaces,
-        entrance_pupil_diameter_mm,
-        dtype=torch.float64,
-        soft_edge_mm=0.2,
-        name="lens",
-        half_field_deg=None,
-    ):
+        surfaces: Iterable[Surface],
+        entrance_pupil_diameter_mm: float,
+        dtype: torch.dtype = torch.float64,
+        soft_edge_mm: float = 0.2,
+        name: str = "lens",
+        half_field_deg: float | None = None,
+    ) -> None:
         super().__init__()
         surfaces = tuple(surfaces)
         if not surfaces:
@@ -130,7 +130,7 @@ class GeoLens(Replaceable):
         self.register_buffer("glass", torch.tensor(glass), persistent=False)
 
     @property
-    def dtype(self):
+    def dtype(self) -> torch.dtype:
         return self.semi_aperture_mm.dtype
 
     def variables(
@@ -238,7 +238,7 @@ class GeoLens(Replaceable):
         image_mm = image_distance_mm(self, distance_m, wavelength_um, spot_grid)
         return self.replace(thickness_mm=torch.cat([self.thickness_mm[:-1], image_mm.reshape(1)]))
 
-    def scaled(self, factor):
+    def scaled(self, factor: float) -> "GeoLens":
         """A new lens with all lengths multiplied by ``factor`` (same f-number and angles), from the current
         values."""
         surfaces = [scaled(s, factor) for s in self.to_surfaces()]
@@ -252,7 +252,7 @@ class GeoLens(Replaceable):
         )
 
     @settled
-    def to_surfaces(self):
+    def to_surfaces(self) -> tuple[Surface, ...]:
         """The current values as a tuple of Surface; index offsets go into the media. A curvature or tilt that
         never changed keeps its value to the last bit."""
         found = []
@@ -280,7 +280,7 @@ class GeoLens(Replaceable):
             )
         return tuple(found)
 
-    def index(self, wavelength_um=WAVELENGTH_UM["d"]):
+    def index(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> torch.Tensor:
         """Indices [S + 1] at a wavelength, the first before the lens (air). Behind a mirror it is the index
         before it."""
         values = [1.0, *[1.0 if s.medium is None else s.medium.index(wavelength_um) for s in self.surfaces]]
@@ -294,7 +294,7 @@ class GeoLens(Replaceable):
             source[i + 1] = source[i] if mirror else i + 1
         return found[source]
 
-    def path_mm(self, wavelength_um=WAVELENGTH_UM["d"]):
+    def path_mm(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> torch.Tensor:
         """Optical path that the diffractive phases add, as coefficients [S, P] of r^2, r^4, ... in mm."""
         orders = torch.tensor(
             [s.phase.order if s.phase else 0 for s in self.surfaces],
@@ -304,7 +304,7 @@ class GeoLens(Replaceable):
         return self.phase * (orders * (wavelength_um * 1e-3 / (2 * math.pi)))[:, None]
 
     @settled
-    def surface_power(self, wavelength_um=WAVELENGTH_UM["d"]):
+    def surface_power(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> torch.Tensor:
         """Paraxial power of each surface, [S] per mm: vertex curvature (with the r^2 asphere term) times
         bending, and diffraction."""
         vertex = (
@@ -314,8 +314,15 @@ class GeoLens(Replaceable):
         return power - 2 * self.path_mm(wavelength_um)[:, 0] if self.phase.shape[1] else power
 
     @settled
-    def first_order(self, wavelength_um=WAVELENGTH_UM["d"]):
-        """Paraxial figures (FirstOrder) at a wavelength, differentiable."""
+    def first_order(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> paraxial.FirstOrder:
+        """Paraxial figures (FirstOrder) at a wavelength, differentiable.
+
+        Example:
+        >>> from codesign import lens
+        >>> figures = lens.load("cooke-triplet").first_order()
+        >>> round(figures.efl_mm.item(), 1), round(figures.fno.item(), 1)
+        (50.0, 5.0)
+        """
         return paraxial.first_order(
             self.surface_power(wavelength_um),
             self.thickness_mm,
@@ -325,7 +332,7 @@ class GeoLens(Replaceable):
         )
 
     @settled
-    def prescription(self, wavelength_um=WAVELENGTH_UM["d"]):
+    def prescription(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> Prescription:
         """The numbers the ray-trace kernel needs."""
         shape = (self.curvature_per_mm, self.thickness_mm, self.conic, self.asphere)
         efficiency = math.prod(s.phase.efficiency(wavelength_um) for s in self.surfaces if s.phase)
@@ -344,18 +351,28 @@ class GeoLens(Replaceable):
         )
 
     @settled
-    def trace(self, origin_mm, direction, wavelength_um=WAVELENGTH_UM["d"]):
+    def trace(
+        self, origin_mm: torch.Tensor, direction: torch.Tensor, wavelength_um: float = WAVELENGTH_UM["d"]
+    ) -> TraceResult:
         """Trace rays to the image plane: origins [N, 3] relative to the first vertex, unit directions [N, 3]
         -> TraceResult.
 
         Raises: ShapeError; DomainError for origins that are not finite or directions that are not unit
           vectors.
+
+        Example:
+        >>> from codesign import lens
+        >>> geo = lens.load("cooke-triplet")
+        >>> rays = geo.trace(*lens.aimed_rays(geo, 0.1, lens.pupil_grid(8)))  # 0.1 rad off the axis
+        >>> height = rays.position_mm[:, 1].mean() / geo.first_order().efl_mm
+        >>> round(height.item(), 2)
+        0.1
         """
         check_rays(origin_mm, direction)
         return trace(self.prescription(wavelength_um), origin_mm, direction)
 
     @settled
-    def thin(self, wavelength_um=WAVELENGTH_UM["d"]):
+    def thin(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> ThinLens:
         """The paraxial level of this lens: same focal length, pupil and defocus, no aberrations."""
         f = self.first_order(wavelength_um)
         return ThinLens(
@@ -363,7 +380,13 @@ class GeoLens(Replaceable):
         )
 
     @settled
-    def camera_rays(self, film_mm, pupil, wavelength_um=WAVELENGTH_UM["d"], aim=False):
+    def camera_rays(
+        self,
+        film_mm: torch.Tensor,
+        pupil: torch.Tensor,
+        wavelength_um: float = WAVELENGTH_UM["d"],
+        aim: bool = False,
+    ) -> Rays:
         """Rays from image points through the lens towards the scene.
 
         Args:
@@ -415,7 +438,9 @@ class GeoLens(Replaceable):
         return Rays(out.position_mm * 1e-3, out.direction, out.weight, spread * direction[:, 2] ** 4)
 
     @settled
-    def film_points(self, points_mm, pupil, wavelength_um=WAVELENGTH_UM["d"]):
+    def film_points(
+        self, points_mm: torch.Tensor, pupil: torch.Tensor, wavelength_um: float = WAVELENGTH_UM["d"]
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Where light from points of space meets the film, through points of the paraxial entrance pupil; the
         other way of ``camera_rays``.
 
@@ -464,7 +489,7 @@ class GeoLens(Replaceable):
             else " (most before they leave the first surface forwards)"
         )
 
-    def extra_repr(self):
+    def extra_repr(self) -> str:
         return f"{self.name}, {len(self.surfaces)} surfaces, entrance pupil {self.entrance_pupil_diameter_mm:g} mm"
 
 

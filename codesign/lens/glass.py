@@ -5,6 +5,7 @@ import functools
 import math
 import re
 from dataclasses import dataclass, replace
+from typing import Any
 
 from codesign.errors import DomainError
 from codesign.lens import glass_catalogue
@@ -104,12 +105,12 @@ class Glass:
 
     name: str
     model: str
-    coefficients: tuple
-    range_um: tuple = _LINES_RANGE_UM
+    coefficients: tuple[float, ...]
+    range_um: tuple[float, float] = _LINES_RANGE_UM
     source: str = ""
     offset: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if (
             not isinstance(self.name, str)
             or not 0 < len(self.name) <= LONGEST_NAME
@@ -154,7 +155,7 @@ class Glass:
             self.index(wavelength_um)
 
     @staticmethod
-    def from_indices(F, d, C, name="custom"):
+    def from_indices(F: float, d: float, C: float, name: str = "custom") -> "Glass":
         """Glass from its indices at the F, d and C lines, each in [1, 5); exact there, valid from 0.36 to 1.1
         um.
 
@@ -170,7 +171,7 @@ class Glass:
         return Glass(name, "lines", (F, d, C))
 
     @staticmethod
-    def from_abbe(nd, Vd, name=None):
+    def from_abbe(nd: float, Vd: float, name: str | None = None) -> "Glass":
         """Glass from nd and the Abbe number Vd = (nd - 1) / (nF - nC), which it has exactly.
 
         The third condition is the partial dispersion (nF - nd) / (nF - nC) = 0.6831 + 0.7828 / Vd, the
@@ -194,13 +195,19 @@ class Glass:
         return Glass.from_indices(index_F, nd, index_F - spread, name or f"{nd:.6g}/{Vd:.5g}")
 
     @staticmethod
-    def named(name):
+    def named(name: str) -> "Glass":
         """Glass by its catalogue name; case, "-", "_", spaces and a manufacturer suffix (NBK7_SCHOTT) do not
         matter.
 
         What looks like a code stands for nd and Vd, as in ``from_abbe``: 517642, 517.642, 517642.251,
         517000.642000, 1.5168/64.17.
         Raises: DomainError that offers the three nearest names.
+
+        Example:
+        >>> from codesign import lens
+        >>> glass = lens.Glass.named("nbk7_schott")
+        >>> glass.name, round(glass.index_d, 5), round(glass.abbe_number, 2)
+        ('N-BK7', 1.5168, 64.17)
         """
         if not isinstance(name, str) or len(name) > LONGEST_NAME:
             raise DomainError(f"glass name {_cut(name)} must be a text of at most {LONGEST_NAME} characters.")
@@ -225,7 +232,7 @@ class Glass:
         return glass
 
     @staticmethod
-    def from_dict(page):
+    def from_dict(page: dict[str, Any]) -> "Glass":
         """Glass from what ``to_dict`` gave, or from {"name", "F", "d", "C"}; anything else is a
         DomainError."""
         if not isinstance(page, dict):
@@ -252,7 +259,7 @@ class Glass:
                 )
         return Glass(**page) if "model" in page else Glass.from_indices(**page)
 
-    def to_dict(self):
+    def to_dict(self) -> dict[str, Any]:
         """Plain JSON types that ``from_dict`` turns into an equal glass, to the last bit."""
         return {
             "name": self.name,
@@ -263,11 +270,11 @@ class Glass:
             "offset": self.offset,
         }
 
-    def shifted(self, offset):
+    def shifted(self, offset: float) -> "Glass":
         """The same medium with its index larger by ``offset`` at every wavelength."""
         return replace(self, offset=self.offset + offset)
 
-    def index(self, wavelength_um):
+    def index(self, wavelength_um: float) -> float:
         """Index at a wavelength in micrometres. Raises: DomainError outside the range of the glass, or where
         the model leaves [1, 5)."""
         first, last = self.range_um
@@ -285,25 +292,25 @@ class Glass:
         return value
 
     @property
-    def index_F(self):
+    def index_F(self) -> float:
         return self.index(WAVELENGTH_UM["F"])
 
     @property
-    def index_d(self):
+    def index_d(self) -> float:
         return self.index(WAVELENGTH_UM["d"])
 
     @property
-    def index_C(self):
+    def index_C(self) -> float:
         return self.index(WAVELENGTH_UM["C"])
 
     @property
-    def abbe_number(self):
+    def abbe_number(self) -> float:
         """Vd = (nd - 1) / (nF - nC); infinite without dispersion."""
         spread = self.index_F - self.index_C
         return (self.index_d - 1) / spread if spread else math.inf
 
 
-def names():
+def names() -> tuple[str, ...]:
     """The names of the catalogue, in its order."""
     return tuple(dict.fromkeys(glass.name for glass in _by_key().values()))
 

@@ -10,6 +10,8 @@ Coefficients are facts of the makers' catalogues; read from the refractiveindex.
 catalogue files.
 """
 
+from collections.abc import Iterator
+
 # other spellings in use -> row; CODE V's manufacturer suffixes and all of "-", "_" and " " are dropped before
 # a name is looked up
 ALIASES = {
@@ -30,7 +32,7 @@ ALIASES = {
 }
 
 
-def rows():
+def rows() -> Iterator[tuple[str, str, tuple[float, float], tuple[float, float], tuple[float, ...], str]]:
     """Name, model, range in um, published (nd, Vd), coefficients and source of each entry."""
     source = ""
     for line in TABLE.strip().splitlines():

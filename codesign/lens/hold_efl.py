@@ -1,15 +1,21 @@
 """The focal length held by a curvature: a solve in closed form, differentiable."""
 
+from typing import TypeVar
+
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.paraxial import bending, yu_trace
+from codesign.lens.traced import TracedLens
+
+L = TypeVar("L", bound=TracedLens)
 
 FLAT = 1e-12  # per mm; a curvature below this is a plane
 NO_POWER = 1e-9  # index step, or ray height in mm, below which a curvature cannot bend the ray
 
 
-def holding_surface(lens):
+def holding_surface(lens: TracedLens) -> int:
     """Index of the surface whose curvature holds the focal length: the last that bends light and is not the
     face of a plane-parallel plate.
 
@@ -39,7 +45,7 @@ def holding_surface(lens):
     return next((i for i in reversed(bends) if has_shape(i)), bends[-1])
 
 
-def hold_efl(lens, efl_mm, surface=None):
+def hold_efl(lens: L, efl_mm: float | Tensor, surface: int | None = None) -> L:
     """The lens with one curvature solved so that the focal length is ``efl_mm`` exactly.
 
     Args: efl_mm: not 0, at the d line. surface: index of the curvature to solve; ``holding_surface(lens)``

@@ -13,6 +13,7 @@ far its radicand fell below zero; 1 where Newton steps found no point of an asph
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 from codesign.backend import widen
 
@@ -57,11 +58,11 @@ class Kernel:
     to_plane: bool
 
     @property
-    def special(self):
+    def special(self) -> bool:
         """Whether any surface diffracts, is moved, or carries an obstruction."""
         return any(w.path or w.moved or w.obstructed for w in self.works)
 
-    def __call__(self, arr, origin, direction, *prescription):
+    def __call__(self, arr: Any, origin: Any, direction: Any, *prescription: Any) -> tuple[Any, ...]:
         import drjit as dr
 
         count = dr.width(origin) // 3
@@ -154,9 +155,9 @@ class Kernel:
 class _Frame:
     """Axes of a decentred and tilted surface: shifted by (x, y), turned about x, then about its own y."""
 
-    decentre: list
-    cosines: list
-    sines: list
+    decentre: list[Any]
+    cosines: list[Any]
+    sines: list[Any]
     row: int
 
     def enter(self, o, d):

@@ -2,6 +2,7 @@
 
 import torch
 
+from codesign.lens.traced import TracedLens
 from codesign.lens.variables import Kind
 
 # largest natural steps, for numbers that hardly move a ray
@@ -11,7 +12,7 @@ INDEX = 0.05
 PHASE = 300.0  # radians at the rim, over its radius
 
 
-def kinds(lens):
+def kinds(lens: TracedLens) -> dict[str, Kind]:
     """{name: Kind} of a GeoLens."""
     rows = torch.arange(len(lens.surfaces), device=lens.semi_aperture_mm.device)
     efl = lens.first_order().efl_mm.detach().abs()

@@ -2,13 +2,26 @@
 term, mirrors and diffraction count."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.glass import WAVELENGTH_UM
+
+
+class IdealLens(Protocol):
+    """A focal length, a film behind it and a pupil; ThinLens is one."""
+
+    efl_mm: Tensor
+    image_distance_mm: Tensor
+    entrance_pupil_diameter_mm: float
+
+    @property
+    def dtype(self) -> torch.dtype: ...
 
 
 @dataclass(frozen=True)
@@ -30,7 +43,20 @@ class FirstOrder:
     stop_semi_aperture_mm: Tensor
 
 
-def bending(index, mirrors):
+class ParaxialLens(Protocol):
+    """A lens of surfaces with powers, gaps and indices; GeoLens is one."""
+
+    name: str
+    thickness_mm: Tensor
+
+    def index(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> Tensor: ...
+
+    def surface_power(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> Tensor: ...
+
+    def first_order(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> FirstOrder: ...
+
+
+def bending(index: Tensor, mirrors: Sequence[bool]) -> Tensor:
     """Change of surface power per vertex curvature, [S]: n' - n where light passes, -2 n where it is
     reflected (unfolded axis).
 
@@ -41,7 +67,15 @@ def bending(index, mirrors):
     return torch.where(torch.tensor(mirrors, device=index.device), -2 * index[:-1], index[1:] - index[:-1])
 
 
-def yu_trace(power, thickness_mm, index, y, nu, first=0, last=None):
+def yu_trace(
+    power: Tensor,
+    thickness_mm: Tensor,
+    index: Tensor,
+    y: Tensor,
+    nu: Tensor,
+    first: int = 0,
+    last: int | None = None,
+) -> tuple[list[Tensor], list[Tensor]]:
     """Paraxial height and reduced angle (n u) just after each surface from ``first`` to before ``last``.
 
     Args: power [S] per mm, thickness_mm [S], index [S + 1]; y at surface ``first`` and nu before it.
@@ -58,7 +92,9 @@ def yu_trace(power, thickness_mm, index, y, nu, first=0, last=None):
     return heights, angles
 
 
-def first_order(power, thickness_mm, index, stop, entrance_pupil_diameter_mm):
+def first_order(
+    power: Tensor, thickness_mm: Tensor, index: Tensor, stop: int, entrance_pupil_diameter_mm: float | Tensor
+) -> FirstOrder:
     """First-order figures. Gradient: to every tensor. Raises: DomainError for an afocal lens or a stop that
     no ray images.
 
@@ -93,7 +129,7 @@ def first_order(power, thickness_mm, index, stop, entrance_pupil_diameter_mm):
     return FirstOrder(efl, bfl, efl / diameter, entrance_z, diameter, exit_z, exit_diameter, semi_stop)
 
 
-def system_matrix(lens, wavelength_um=WAVELENGTH_UM["d"]):
+def system_matrix(lens: ParaxialLens, wavelength_um: float = WAVELENGTH_UM["d"]) -> Tensor:
     """Matrix [[A, B], [C, D]] from the plane of the first vertex to that of the last, for columns (y in mm, n
     u). Its determinant is 1.
 
@@ -129,7 +165,7 @@ class CardinalPoints:
     rear_focal_length_mm: Tensor
 
 
-def cardinal_points(lens, wavelength_um=WAVELENGTH_UM["d"]):
+def cardinal_points(lens: ParaxialLens, wavelength_um: float = WAVELENGTH_UM["d"]) -> CardinalPoints:
     """CardinalPoints of a lens. Focal lengths are n / power and n' / power, both positive for a converging
     lens.
 
@@ -176,7 +212,9 @@ class ParaxialRays:
     invariant_mm: Tensor
 
 
-def paraxial_rays(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"]):
+def paraxial_rays(
+    lens: ParaxialLens, field_rad: float, wavelength_um: float = WAVELENGTH_UM["d"]
+) -> ParaxialRays:
     """ParaxialRays for an object at infinity.
 
     Args: field_rad: half field, whose tangent is the slope of the chief ray in object space; a number below
@@ -211,7 +249,7 @@ def paraxial_rays(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"]):
     return ParaxialRays(y, angles, y_bar, chief_angles, starts[1][1] * starts[0][0])
 
 
-def circle_of_confusion_mm(thin, distance_m):
+def circle_of_confusion_mm(thin: IdealLens, distance_m: float | Tensor) -> Tensor:
     """Diameter on the film of the blur of an axial object point, D |s (1/f - 1/d) - 1| for pupil D, film
     distance s and object distance d from the lens.
 

@@ -3,7 +3,7 @@ lens."""
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -41,7 +41,7 @@ class ThinLens(Replaceable):
         efl_mm: float | Tensor,
         entrance_pupil_diameter_mm: float,
         image_distance_mm: float | Tensor | None = None,
-    ):
+    ) -> None:
         super().__init__()
         efl = torch.as_tensor(efl_mm, dtype=None if torch.is_tensor(efl_mm) else torch.float64)
         self._hold("efl_mm", efl)
@@ -67,12 +67,12 @@ class ThinLens(Replaceable):
         else:
             self.register_parameter(name, nn.Parameter(value, requires_grad=False))
 
-    def __getattr__(self, name):
+    def __getattr__(self, name: str) -> Any:
         found = super().__getattr__(name)
         return self.efl_mm if found is None and name == "image_distance_mm" else found
 
     @property
-    def dtype(self):
+    def dtype(self) -> torch.dtype:
         return self.efl_mm.dtype
 
     def variables(
@@ -130,7 +130,9 @@ class ThinLens(Replaceable):
         return landing, torch.ones_like(landing[..., 0])
 
     @settled
-    def camera_rays(self, film_mm, pupil, wavelength_um=None, aim=False):
+    def camera_rays(
+        self, film_mm: Tensor, pupil: Tensor, wavelength_um: float | None = None, aim: bool = False
+    ) -> Rays:
         """Rays towards the scene; see GeoLens.camera_rays (the pupil is ideal, so aiming changes nothing).
         Paraxial refraction: slope out = slope in - q / f."""
         q = pupil * (self.entrance_pupil_diameter_mm / 2)
@@ -146,7 +148,9 @@ class ThinLens(Replaceable):
         )
 
     @settled
-    def film_points(self, points_mm, pupil, wavelength_um=None):
+    def film_points(
+        self, points_mm: Tensor, pupil: Tensor, wavelength_um: float | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Where light from points of space meets the film; see GeoLens.film_points (here the pupil points
         stay as they are)."""
         q = pupil * (self.entrance_pupil_diameter_mm / 2)
@@ -163,5 +167,5 @@ class Pinhole(ThinLens):
     tensor([0.6000, 0.8000], dtype=torch.float64)
     """
 
-    def __init__(self, efl_mm: float | Tensor):
+    def __init__(self, efl_mm: float | Tensor) -> None:
         super().__init__(efl_mm, 0.0)

@@ -1,14 +1,20 @@
 """How much light a lens brings to each field point."""
 
+from collections.abc import Sequence
+
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.aiming import aimed_rays
 from codesign.lens.analysis import pupil_grid
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
 
-def relative_illumination(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"], grid=24):
+def relative_illumination(
+    lens: GeoLens, fields_rad: Sequence[float], wavelength_um: float = WAVELENGTH_UM["d"], grid: int = 24
+) -> Tensor:
     """Irradiance of the image of a uniform world at each field, relative to the axis, vignetting included.
 
     Args: fields_rad: angles from the axis; grid: pupil points across the stop.
@@ -27,6 +33,7 @@ def relative_illumination(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"], gr
     rays = lens.camera_rays(
         -film, pupil.repeat(len(fields), 1), wavelength_um, aim=True
     )  # camera rays take points as seen upright
+    assert rays.irradiance is not None  # GeoLens gives it
     light = (rays.weight * rays.irradiance).reshape(len(fields), -1).mean(1)
     return light[1:] / light[0]
 

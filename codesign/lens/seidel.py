@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.paraxial import ParaxialRays, bending, paraxial_rays
 
@@ -41,19 +42,23 @@ class SeidelSums:
     invariant_mm: Tensor
 
     @property
-    def per_surface(self):
+    def per_surface(self) -> Tensor:
         """[S, 5] mm: S_I to S_V of each surface."""
         return torch.stack([getattr(self, name) for name in NAMES], 1)
 
     @property
-    def total(self):
+    def total(self) -> Tensor:
         """[5] mm: S_I to S_V of the lens."""
         return self.per_surface.sum(0)
 
 
 def seidel_sums(
-    lens, field_rad, wavelength_um=WAVELENGTH_UM["d"], short_um=WAVELENGTH_UM["F"], long_um=WAVELENGTH_UM["C"]
-):
+    lens: GeoLens,
+    field_rad: float,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    short_um: float = WAVELENGTH_UM["F"],
+    long_um: float = WAVELENGTH_UM["C"],
+) -> SeidelSums:
     """SeidelSums of a lens for an object at infinity.
 
     Spheres, conics, the r^2 and r^4 asphere terms, mirrors, and the first two diffractive terms; decentres

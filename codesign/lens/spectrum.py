@@ -1,11 +1,15 @@
 """Wavelengths and their shares of the signal: spectral lines, and what a sensor sees of an illuminant."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from codesign.errors import DomainError, ShapeError
+
+Curve = tuple[NDArray[np.float64], NDArray[np.float64]]  # wavelengths in um, values
 
 # Fraunhofer's letters, wavelengths in air. Source: ISO 7944 and Schott TIE-29
 LINE_UM = {
@@ -133,12 +137,19 @@ class Spectrum:
     """Wavelengths (um) and weights (shares of the signal, at least 0, sum 1); both become tuples of floats.
 
     Raises: ShapeError when the two differ in number; DomainError for what cannot be.
+
+    Example:
+    >>> from codesign import lens
+    >>> light = lens.Spectrum.visible_FdC((1.0, 2.0, 1.0))
+    >>> light.weights
+    (0.25, 0.5, 0.25)
+    >>> positions, weights = lens.analysis.polychromatic_spot(lens.load("cooke-triplet"), 0.1, light)
     """
 
-    wavelengths_um: tuple
-    weights: tuple
+    wavelengths_um: tuple[float, ...]
+    weights: tuple[float, ...]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         wavelengths = _floats(self.wavelengths_um)
         weights = _floats(self.weights)
         if len(wavelengths) != len(weights) or not 0 < len(wavelengths) <= MOST_WAVELENGTHS:
@@ -161,7 +172,7 @@ class Spectrum:
         object.__setattr__(self, "weights", weights)
 
     @staticmethod
-    def weighted(wavelengths_um, weights):
+    def weighted(wavelengths_um: Iterable[float], weights: Iterable[float]) -> "Spectrum":
         """Spectrum from weights of any positive sum, for example those of a lens file."""
         weights = _floats(weights)
         total = math.fsum(weights) if all(map(math.isfinite, weights)) else math.nan
@@ -169,15 +180,15 @@ class Spectrum:
             raise DomainError(
                 f"weights of a spectrum must be finite, at least 0 and not all 0; their sum is {total:g}."
             )
-        return Spectrum(wavelengths_um, tuple(w / total for w in weights))
+        return Spectrum(_floats(wavelengths_um), tuple(w / total for w in weights))
 
     @staticmethod
-    def monochromatic(wavelength_um):
+    def monochromatic(wavelength_um: float) -> "Spectrum":
         """One wavelength with all the weight."""
         return Spectrum((wavelength_um,), (1.0,))
 
     @staticmethod
-    def line(letter):
+    def line(letter: str) -> "Spectrum":
         """One spectral line by its letter (``LINE_UM``)."""
         if letter not in LINE_UM:
             raise DomainError(
@@ -186,13 +197,15 @@ class Spectrum:
         return Spectrum.monochromatic(LINE_UM[letter])
 
     @staticmethod
-    def visible_FdC(weights=(1.0, 1.0, 1.0)):
+    def visible_FdC(weights: Iterable[float] = (1.0, 1.0, 1.0)) -> "Spectrum":
         """The F, d and C lines, the classical visible spectrum of lens design, equally weighted unless
         ``weights`` says otherwise."""
         return Spectrum.weighted(tuple(LINE_UM[letter] for letter in "FdC"), weights)
 
     @staticmethod
-    def from_curves(response, illuminant, count):
+    def from_curves(
+        response: tuple[ArrayLike, ArrayLike], illuminant: tuple[ArrayLike, ArrayLike], count: int
+    ) -> "Spectrum":
         """``count`` wavelengths of equal weight for what a sensor sees of an illuminant.
 
         The product of the curves (linear between their points, over the range they share) is cut into
@@ -291,7 +304,7 @@ def _curve(curve, name):
     return wavelength_um, value
 
 
-def blackbody(temperature_k):
+def blackbody(temperature_k: float) -> Curve:
     """Planck's radiance per wavelength, 0.30 to 1.20 um in steps of 5 nm, largest value 1: (wavelength_um,
     value).
 
@@ -307,13 +320,13 @@ def blackbody(temperature_k):
     return wavelength_um, value / value.max()
 
 
-def daylight_d65():
+def daylight_d65() -> Curve:
     """CIE standard illuminant D65 (radiant energy, 100 at 560 nm), 0.30 to 0.83 um: (wavelength_um,
     value)."""
     return np.linspace(0.30, 0.83, len(_D65)), np.array(_D65)
 
 
-def silicon_response(depth_um=5.0):
+def silicon_response(depth_um: float = 5.0) -> Curve:
     """Response of a generic monochrome silicon sensor per unit of radiant energy, 0.36 to 1.10 um, largest
     value 1: (wavelength_um, value).
 

@@ -2,6 +2,7 @@
 gap."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from torch import Tensor
@@ -26,7 +27,7 @@ class Phase:
     order: int = 1
     blaze_um: float | None = None
 
-    def check(self, label):
+    def check(self, label: str) -> None:
         """Raise DomainError when the phase cannot exist."""
         if (
             not self.coefficients
@@ -40,7 +41,7 @@ class Phase:
         if self.blaze_um is not None and not 0 < self.blaze_um < math.inf:
             raise DomainError(f"{label}: blaze wavelength {self.blaze_um} um must be positive.")
 
-    def efficiency(self, wavelength_um):
+    def efficiency(self, wavelength_um: float) -> float:
         """Scalar efficiency of the order at a wavelength: sinc^2(m (blaze / w) - m) for a surface blazed for
         order m, without the dispersion of its material."""
         if self.blaze_um is None:
@@ -68,6 +69,14 @@ class Surface:
     decentre_mm: (x, y) of the vertex; tilt_deg: about x, then about y, around that vertex. Later surfaces
       stay where they were.
     inner_semi_aperture_mm: half the diameter of a central obstruction, 0 for none.
+
+    Example:
+    >>> from codesign import lens
+    >>> front = lens.Surface(51.68, 4.0, lens.Glass.named("N-BK7"), semi_aperture_mm=10.0)
+    >>> back = lens.Surface(float("inf"), 97.4, None, semi_aperture_mm=10.0)
+    >>> singlet = lens.GeoLens([front, back], entrance_pupil_diameter_mm=15.0)
+    >>> round(singlet.first_order().efl_mm.item(), 3)  # 51.68 / (n - 1)
+    100.0
     """
 
     radius_mm: float
@@ -84,10 +93,10 @@ class Surface:
     inner_semi_aperture_mm: float = 0.0
 
     @property
-    def curvature_per_mm(self):
+    def curvature_per_mm(self) -> float:
         return 0.0 if math.isinf(self.radius_mm) else 1.0 / self.radius_mm
 
-    def check(self, label):
+    def check(self, label: str) -> "Surface":
         """Raise DomainError naming the value and the remedy when the surface cannot exist."""
         numbers = (
             self.thickness_mm,
@@ -134,7 +143,7 @@ class Surface:
         return self
 
 
-def scaled(surface, factor):
+def scaled(surface: Surface, factor: float) -> Surface:
     """The same surface with all lengths multiplied by ``factor``."""
     asphere = tuple(a * factor ** (1 - 2 * (i + 1)) for i, a in enumerate(surface.asphere))
     phase = surface.phase and replace(
@@ -154,7 +163,12 @@ def scaled(surface, factor):
     )
 
 
-def sag_mm(height_mm: Tensor, curvature_per_mm, conic, asphere):
+def sag_mm(
+    height_mm: Tensor,
+    curvature_per_mm: float | Tensor,
+    conic: float | Tensor,
+    asphere: Sequence[float | Tensor],
+) -> Tensor:
     """Depth of a surface at heights [...] from the axis, mm.
 
     Args: curvature_per_mm, conic, and each coefficient of r^2, r^4, ... in ``asphere``: numbers, or tensors

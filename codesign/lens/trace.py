@@ -1,6 +1,7 @@
 """Sequential ray trace: the numbers of a lens, rays in, rays out. The kernel is in kernel.py."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import torch
@@ -44,7 +45,7 @@ class Prescription:
     efficiency: float = 1.0
     to_plane: bool = True
 
-    def reversed(self, last_gap_mm):
+    def reversed(self, last_gap_mm: Tensor) -> "Prescription":
         """The same lens seen from the image side; ``last_gap_mm`` is the distance of the plane where the rays
         end."""
         gaps = torch.cat([self.thickness_mm[:-1].flip(0), last_gap_mm.reshape(1)])
@@ -69,7 +70,7 @@ class Prescription:
             **same,
         )
 
-    def until(self, surface):
+    def until(self, surface: int) -> "Prescription":
         """The part of the lens up to a surface (counted from 0), where rays end unbent."""
         rows = {
             f.name: getattr(self, f.name)[: surface + 1]
@@ -80,18 +81,18 @@ class Prescription:
         rows["path_mm"], rows["mirrors"] = rows["path_mm"] * keep[:, None], (*self.mirrors[:surface], False)
         return replace(self, **rows, index=self.index[[*range(surface + 1), surface]], to_plane=False)
 
-    def opened(self, surface):
+    def opened(self, surface: int) -> "Prescription":
         """The same lens with one aperture that clips nothing: rays that are placed on the stop are not to be
         weighed by its edge."""
         apertures = self.semi_aperture_mm.clone()
         apertures[surface] = 1e6
         return replace(self, semi_aperture_mm=apertures)
 
-    def to(self, dtype):
+    def to(self, dtype: torch.dtype) -> "Prescription":
         """The same numbers in another precision; gradients flow through."""
         return self._each(lambda tensor: tensor.to(dtype))
 
-    def detached(self):
+    def detached(self) -> "Prescription":
         """The same numbers without gradients."""
         return self._each(Tensor.detach)
 
@@ -124,24 +125,24 @@ class TraceResult:
     deficit: Tensor
 
     @property
-    def status(self):
+    def status(self) -> Tensor:
         """What became of each ray, [N] int, see Status."""
         return self.packed_status & 3
 
     @property
-    def inside(self):
+    def inside(self) -> Tensor:
         """The hard mask: whether each ray lies within every clear aperture it reached and outside every
         obstruction, [N] bool."""
         return (self.packed_status & 4) != 0
 
     @property
-    def failed_surface(self):
+    def failed_surface(self) -> Tensor:
         """First surface (from 0) where each ray failed, S where it failed to leave forwards, -1 if nowhere,
         [N] int."""
         return self.packed_status >> 3
 
 
-def check_rays(origin_mm, direction):
+def check_rays(origin_mm: Tensor, direction: Tensor) -> None:
     """Raise ShapeError unless both are [N >= 1, 3]; DomainError for origins that are not finite or directions that
     are not unit vectors."""
     for label, value in (("origin_mm", origin_mm), ("direction", direction)):
@@ -170,7 +171,7 @@ def _range(rows, function):
     return found[:, 0].min().item(), found[:, 1].max().item()
 
 
-def trace(prescription, origin_mm, direction):
+def trace(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> TraceResult:
     """Trace rays from points relative to the first vertex to the plane behind the last thickness.
 
     Args: origin_mm [N, 3], direction [N, 3] unit, both of the prescription's dtype.
@@ -230,7 +231,7 @@ def trace(prescription, origin_mm, direction):
     return found if p.efficiency == 1 else replace(found, weight=found.weight * p.efficiency)
 
 
-def sum_over_chunks(function, *rays, rows=262_144):
+def sum_over_chunks(function: Callable[..., Tensor], *rays: Tensor, rows: int = 262_144) -> Tensor:
     """Sum of ``function(*chunk)`` over chunks of rays, in bounded memory: a chunk is traced again when its
     gradient is due.
 

@@ -2,8 +2,9 @@
 by a set distance."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -31,7 +32,7 @@ class Kind:
     reach: Tensor
     low: float = -math.inf
 
-    def part(self, keep):
+    def part(self, keep: Tensor) -> "Kind":
         """The numbers where ``keep`` [K] is true."""
         return Kind(self.tensor, self.places[keep], self.reach[keep], self.low)
 
@@ -45,7 +46,14 @@ class Variables(nn.Module):
     Raises: DomainError for a start that does not lie strictly inside its bounds.
     """
 
-    def __init__(self, tensors: Mapping[str, Tensor], kinds: Mapping[str, Kind], units, bounds, held):
+    def __init__(
+        self,
+        tensors: Mapping[str, Tensor],
+        kinds: Mapping[str, Kind],
+        units: Mapping[str, Tensor],
+        bounds: Mapping[str, tuple[Tensor, Tensor]],
+        held: Mapping[str, Tensor],
+    ) -> None:
         super().__init__()
         self.tensor_of = {name: kind.tensor for name, kind in kinds.items()}
         for name, value in tensors.items():
@@ -93,7 +101,7 @@ class Variables(nn.Module):
         }
 
 
-def ray_motion(ahead, behind):
+def ray_motion(ahead: tuple[Tensor, Tensor], behind: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """How rays move on the film between two states of a lens: [fields, M, 2] mm, and [fields, M] 1 for rays that
     arrive in both, else 0.
 
@@ -103,7 +111,9 @@ def ray_motion(ahead, behind):
     return (ahead[0] - behind[0]) * weight[..., None], weight
 
 
-def natural_units(land, values: Tensor, reach: Tensor, step_mm: float):
+def natural_units(
+    land: Callable[[Tensor], tuple[Tensor, Tensor]], values: Tensor, reach: Tensor, step_mm: float
+) -> tuple[Tensor, Tensor]:
     """Change of each number [K] that moves the rays by ``step_mm`` RMS over the bundle, at most its ``reach``;
     and whether it moves them at all, [K] bool.
 
@@ -130,7 +140,9 @@ def checked_step(step_mm: float) -> float:
     return float(step_mm)
 
 
-def checked_bounds(name, kind, value, given: tuple[Bound, Bound] | None, rows):
+def checked_bounds(
+    name: str, kind: Kind, value: Tensor, given: tuple[Bound, Bound] | None, rows: Tensor
+) -> tuple[Tensor, Tensor]:
     """Lower and upper bounds [R] of the numbers at ``rows`` of one kind; infinite where there is none.
 
     Raises: ShapeError; DomainError for a number that does not lie strictly inside.
@@ -203,7 +215,16 @@ def _slope(x, low, high, width):
     return torch.where(above, torch.sigmoid(-x), slope)
 
 
-def make_variables(lens, names, step_mm, bounds, mask, fields_rad, wavelength_um, held) -> Variables:
+def make_variables(
+    lens: Any,
+    names: Sequence[str],
+    step_mm: float,
+    bounds: Mapping[str, tuple[Bound, Bound]],
+    mask: Mapping[str, Sequence[bool]],
+    fields_rad: Sequence[float],
+    wavelength_um: float | None,
+    held: Mapping[str, Tensor],
+) -> Variables:
     """Variables of the named kinds around a lens as it is now; see ``GeoLens.variables``.
 
     The lens says what it has: ``_kinds()`` -> {name: Kind}, ``_solved(tensors, held)`` -> tensors,

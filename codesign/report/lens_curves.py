@@ -3,7 +3,6 @@ through focus, Seidel sums."""
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -28,7 +27,11 @@ SEIDEL_COLOURS = ("#1b6ca8", "#2e8b57", "#d68910", "#8e44ad", "#c0392b")
 
 @torch.no_grad()
 def field_errors(
-    lens: GeoLens, half_field_rad: float, light: Any = VISIBLE_UM, mapping: str = "f-tan", count: int = 21
+    lens: GeoLens,
+    half_field_rad: float,
+    light: analysis.Light = VISIBLE_UM,
+    mapping: str = "f-tan",
+    count: int = 21,
 ) -> Figure:
     """Figure over the field: tangential and sagittal focus, distortion, and lateral colour against the first
     wavelength."""
@@ -68,7 +71,7 @@ def through_focus(
     fields_rad: Sequence[float],
     defocus_mm: Sequence[float] | np.ndarray,
     frequency_per_mm: float,
-    light: Any = WAVELENGTH_UM["d"],
+    light: analysis.Light = WAVELENGTH_UM["d"],
     vignetting: bool = False,
     method: str = "geometric",
 ) -> Figure:
@@ -118,7 +121,10 @@ def seidel_bars(sums: SeidelSums, wavelength_um: float = WAVELENGTH_UM["d"]) -> 
 
 @torch.no_grad()
 def encircled_curves(
-    lens: GeoLens, fields_rad: Sequence[float], light: Any = WAVELENGTH_UM["d"], vignetting: bool = False
+    lens: GeoLens,
+    fields_rad: Sequence[float],
+    light: analysis.Light = WAVELENGTH_UM["d"],
+    vignetting: bool = False,
 ) -> Figure:
     """Figure of encircled energy (rays, about their mean) over the radius, a curve per field."""
     figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")

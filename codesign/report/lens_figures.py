@@ -3,7 +3,6 @@ a matplotlib Figure."""
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -80,7 +79,7 @@ def spot_diagrams(lenses: Mapping[str, GeoLens], fields_rad: Sequence[float], pi
 def spots_by_wavelength(
     lens: GeoLens,
     fields_rad: Sequence[float],
-    light: Any = VISIBLE_UM,
+    light: analysis.Light = VISIBLE_UM,
     grid: int = 24,
     vignetting: bool = False,
 ) -> Figure:
@@ -127,7 +126,7 @@ def spots_by_wavelength(
 
 @torch.no_grad()
 def ray_fans(
-    lens: GeoLens, fields_rad: Sequence[float], light: Any = VISIBLE_UM, vignetting: bool = False
+    lens: GeoLens, fields_rad: Sequence[float], light: analysis.Light = VISIBLE_UM, vignetting: bool = False
 ) -> Figure:
     """Figure of ray fans: transverse aberration (upper) and optical path difference (lower) over the pupil, a
     pair of columns per field, relative to the first wavelength's chief ray."""

@@ -150,7 +150,7 @@ def _bins(flow: Any, bins: int | None) -> int:
     return bins or wanted or BINS
 
 
-class Pass(Mapping):
+class Pass(Mapping[str, Any]):
     """One pass: everything that stages may ask for, made when it is first asked for."""
 
     def __init__(self, system: System, batch: Any, recorded: dict[str, Any], probed: bool):

@@ -262,10 +262,10 @@ def test_wavelengths_outside_the_range_are_refused():
 def test_glasses_that_cannot_be_are_refused():
     for bad in (0.99, 5.0, math.nan, math.inf, "1.5", True, 10**400):
         with pytest.raises(DomainError, match=r"must lie in \[1, 5\)"):
-            Glass.from_indices(1.5, bad, 1.5)
+            Glass.from_indices(1.5, bad, 1.5)  # pyright: ignore[reportArgumentType]
     for nd, abbe in ((1.0, 50), (1.5, 0), (1.5, math.nan), (math.inf, 50), (1.5, -50), ("1.5", 50)):
         with pytest.raises(DomainError, match=r"nd must lie in \(1, 5\)"):
-            Glass.from_abbe(nd, abbe)
+            Glass.from_abbe(nd, abbe)  # pyright: ignore[reportArgumentType]
     with pytest.raises(DomainError, match=r"index 0\.9 at 0\.486133 um must lie"):
         AIR.shifted(-0.1)
 

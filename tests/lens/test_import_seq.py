@@ -84,6 +84,7 @@ def test_the_first_surface_is_the_stop_where_none_is_named(tmp_path):
 )
 def test_glass_codes(word, index, abbe, tmp_path):
     glass = load(tmp_path, SINGLET.replace("NBK7_SCHOTT", word)).to_surfaces()[0].medium
+    assert glass is not None
     assert (glass.index_d, glass.abbe_number) == pytest.approx((index, abbe), rel=1e-13)
 
 
@@ -94,6 +95,7 @@ def test_private_glasses_have_their_tabulated_indices(tmp_path):
     glass = (
         load(tmp_path, SINGLET.replace("SO", table).replace("NBK7_SCHOTT", "'MINE'")).to_surfaces()[0].medium
     )
+    assert glass is not None
     assert (glass.index_F, glass.index_d, glass.index_C) == pytest.approx((1.53, 1.52, 1.51), rel=1e-12)
     with pytest.raises(CodesignError, match="glass OTHER is given by a formula"):
         load(tmp_path, SINGLET.replace("SO", table).replace("NBK7_SCHOTT", "'OTHER'"))

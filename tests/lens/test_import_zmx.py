@@ -287,6 +287,7 @@ def test_a_model_glass_has_its_index_and_abbe_number(tmp_path):
         ),
     )
     glass = geo.to_surfaces()[0].medium
+    assert glass is not None
     assert (glass.index_d, glass.abbe_number) == pytest.approx((1.6123, 44.1), rel=1e-13)
 
 

@@ -186,5 +186,10 @@ def test_wrong_questions_are_refused():
         through_focus_mtf(geo, 0.0, 10.0, [0.0], method="fast")
     with pytest.raises(DomainError, match="at least one positive wavelength"):
         analysis.spectral_lines([])
+
+    class Dark:
+        wavelengths_um = (0.5,)
+        weights = (0.0,)
+
     with pytest.raises(DomainError, match="with a positive sum"):
-        analysis.spectral_lines(type("Light", (), {"wavelengths_um": (0.5,), "weights": (0.0,)}))
+        analysis.spectral_lines(Dark())

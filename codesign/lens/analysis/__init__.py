@@ -10,6 +10,7 @@ from codesign.lens.analysis.psf import Psf, diffraction_psf, geometric_psf, psf_
 from codesign.lens.analysis.pupil import PupilFunction, pupil_function
 from codesign.lens.analysis.rays import (
     ImageRays,
+    Light,
     chief_ray,
     field_rays,
     pupil_grid,
@@ -37,6 +38,7 @@ from codesign.lens.analysis.wavefront import (
 
 __all__ = [
     "ImageRays",
+    "Light",
     "Psf",
     "PupilFunction",
     "RayFan",

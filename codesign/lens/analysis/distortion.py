@@ -1,17 +1,22 @@
 """Distortion: where the chief ray meets the image plane, against an ideal mapping of field angles."""
 
 import math
+from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis.rays import chief_ray
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
 MAPPINGS = {"f-tan": math.tan, "f-theta": float}
 
 
-def chief_height_mm(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"]):
+def chief_height_mm(
+    lens: GeoLens, fields_rad: Sequence[float], wavelength_um: float = WAVELENGTH_UM["d"]
+) -> Tensor:
     """Height y of the real chief ray on the image plane, [F] mm. Gradient: to every lens tensor. Raises:
     DomainError when one does not arrive."""
     return torch.stack(
@@ -19,7 +24,12 @@ def chief_height_mm(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"]):
     )
 
 
-def distortion_percent(lens, fields_rad, mapping="f-tan", wavelength_um=WAVELENGTH_UM["d"]):
+def distortion_percent(
+    lens: GeoLens,
+    fields_rad: Sequence[float],
+    mapping: str = "f-tan",
+    wavelength_um: float = WAVELENGTH_UM["d"],
+) -> Tensor:
     """100 (y / (f m(field)) - 1) of the real chief ray, [F] percent; 0 on the axis.
 
     Args: mapping: "f-tan" (a picture without distortion) or "f-theta" (a scan lens or fisheye). f is the

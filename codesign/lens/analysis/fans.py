@@ -7,6 +7,7 @@ from torch import Tensor
 
 from codesign.lens.analysis.rays import chief_ray, trace_field
 from codesign.lens.analysis.wavefront import path_difference_mm
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
 
@@ -31,14 +32,14 @@ class RayFan:
 
 
 def ray_fan(
-    lens,
-    field_rad,
-    wavelength_um=WAVELENGTH_UM["d"],
-    count=33,
-    vignetting=False,
-    reference_mm=None,
-    defocus_mm=0.0,
-):
+    lens: GeoLens,
+    field_rad: float,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    count: int = 33,
+    vignetting: bool = False,
+    reference_mm: Tensor | None = None,
+    defocus_mm: float | Tensor = 0.0,
+) -> RayFan:
     """RayFan of one field and wavelength.
 
     Args:

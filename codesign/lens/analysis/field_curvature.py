@@ -1,12 +1,18 @@
 """Field curvature and astigmatism: where thin bundles about the chief ray come to focus."""
 
+from collections.abc import Sequence
+
 import torch
+from torch import Tensor
 
 from codesign.lens.analysis.rays import trace_field
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
 
-def focus_shift_mm(lens, fields_rad, wavelength_um=WAVELENGTH_UM["d"], reach=1e-3):
+def focus_shift_mm(
+    lens: GeoLens, fields_rad: Sequence[float], wavelength_um: float = WAVELENGTH_UM["d"], reach: float = 1e-3
+) -> Tensor:
     """Tangential and sagittal focus of each field, along z from the image plane; the difference is the
     astigmatism.
 

@@ -7,17 +7,23 @@ one that varies along x.
 import math
 
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis.pupil import pupil_function
-from codesign.lens.analysis.rays import chief_ray, spectral_lines
+from codesign.lens.analysis.rays import Light, Values, chief_ray, spectral_lines
 from codesign.lens.analysis.spots import polychromatic_spot
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
 PADDING = 2  # the line spread is then free of aliasing up to the cut-off
 
 
-def ideal_mtf(frequency_per_mm, fno, wavelength_um=WAVELENGTH_UM["d"]):
+def ideal_mtf(
+    frequency_per_mm: float | Values,
+    fno: float | Tensor,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+) -> Tensor:
     """MTF of a perfect lens with a round pupil, (2 / pi) (acos v - v sqrt(1 - v^2)), v = frequency x
     wavelength x f-number. Shape of the frequency; 0 beyond v = 1."""
     v = (torch.as_tensor(frequency_per_mm) * (wavelength_um * 1e-3 * fno)).abs().clamp_max(1.0)
@@ -25,14 +31,14 @@ def ideal_mtf(frequency_per_mm, fno, wavelength_um=WAVELENGTH_UM["d"]):
 
 
 def diffraction_mtf(
-    lens,
-    field_rad,
-    frequency_per_mm,
-    light: object = WAVELENGTH_UM["d"],
-    grid=None,
-    vignetting=False,
-    defocus_mm=0.0,
-):
+    lens: GeoLens,
+    field_rad: float,
+    frequency_per_mm: Values,
+    light: Light = WAVELENGTH_UM["d"],
+    grid: int | None = None,
+    vignetting: bool = False,
+    defocus_mm: float | Tensor = 0.0,
+) -> Tensor:
     """MTF with diffraction of one field, from the Fourier transform of the point spread.
 
     Several wavelengths add as complex transfer functions about one image point, so that lateral colour
@@ -59,14 +65,14 @@ def diffraction_mtf(
 
 
 def geometric_mtf(
-    lens,
-    field_rad,
-    frequency_per_mm,
-    light: object = WAVELENGTH_UM["d"],
-    grid=64,
-    vignetting=False,
-    defocus_mm=0.0,
-):
+    lens: GeoLens,
+    field_rad: float,
+    frequency_per_mm: Values,
+    light: Light = WAVELENGTH_UM["d"],
+    grid: int = 64,
+    vignetting: bool = False,
+    defocus_mm: float | Tensor = 0.0,
+) -> Tensor:
     """MTF of the rays alone, |mean of exp(-2 pi i frequency x)|, [2, K] tangential, sagittal. Arguments and
     gradient as for ``diffraction_mtf``.
 

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis.pupil import pupil_function
-from codesign.lens.analysis.rays import chief_ray, spectral_lines
+from codesign.lens.analysis.rays import Light, chief_ray, spectral_lines
 from codesign.lens.analysis.spots import polychromatic_spot
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
 
@@ -29,15 +30,15 @@ class Psf:
 
 
 def diffraction_psf(
-    lens,
-    field_rad,
-    wavelength_um=WAVELENGTH_UM["d"],
-    grid=None,
-    padding=4,
-    vignetting=False,
-    defocus_mm=0.0,
-    reference_mm=None,
-):
+    lens: GeoLens,
+    field_rad: float,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    grid: int | None = None,
+    padding: int = 4,
+    vignetting: bool = False,
+    defocus_mm: float | Tensor = 0.0,
+    reference_mm: Tensor | None = None,
+) -> Psf:
     """Psf by a Fourier transform of the pupil, zero-padded from n to n * padding cells.
 
     The pixel is then wavelength / (2 r padding), r the pupil's radius in direction cosines: a quarter of the
@@ -64,15 +65,15 @@ def diffraction_psf(
 
 
 def psf_on_pixels(
-    lens,
-    field_rad,
-    pixel_mm,
-    pixels=64,
-    light: object = WAVELENGTH_UM["d"],
-    grid=None,
-    vignetting=False,
-    defocus_mm=0.0,
-):
+    lens: GeoLens,
+    field_rad: float,
+    pixel_mm: float,
+    pixels: int = 64,
+    light: Light = WAVELENGTH_UM["d"],
+    grid: int | None = None,
+    vignetting: bool = False,
+    defocus_mm: float | Tensor = 0.0,
+) -> Psf:
     """Psf of one or several wavelengths by diffraction, on a pixel grid of one's own, about the chief ray of
     the first wavelength.
 
@@ -114,15 +115,15 @@ def psf_on_pixels(
 
 
 def geometric_psf(
-    lens,
-    field_rad,
-    pixel_mm,
-    pixels=64,
-    light: object = WAVELENGTH_UM["d"],
-    grid=128,
-    vignetting=False,
-    defocus_mm=0.0,
-):
+    lens: GeoLens,
+    field_rad: float,
+    pixel_mm: float,
+    pixels: int = 64,
+    light: Light = WAVELENGTH_UM["d"],
+    grid: int = 128,
+    vignetting: bool = False,
+    defocus_mm: float | Tensor = 0.0,
+) -> Psf:
     """Psf by rays: each ray's weight is shared bilinearly among the four pixel centres around it. About the
     chief ray of the first wavelength.
 

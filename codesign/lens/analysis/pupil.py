@@ -8,6 +8,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis.wavefront import wavefront
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
 # cells across the pupil when the number is found from the aberration
@@ -33,24 +34,24 @@ class PupilFunction:
     wavelength_um: float
 
     @property
-    def wavelength_mm(self):
+    def wavelength_mm(self) -> float:
         return self.wavelength_um * 1e-3
 
     @property
-    def cutoff_per_mm(self):
+    def cutoff_per_mm(self) -> Tensor:
         """[2] (x, y) spatial frequency where the diffraction MTF ends, line pairs per mm."""
         return 2 * self.cosine_radius / self.wavelength_mm
 
 
 def pupil_function(
-    lens,
-    field_rad,
-    wavelength_um=WAVELENGTH_UM["d"],
-    grid=None,
-    vignetting=False,
-    defocus_mm=0.0,
-    reference_mm=None,
-):
+    lens: GeoLens,
+    field_rad: float,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    grid: int | None = None,
+    vignetting: bool = False,
+    defocus_mm: float | Tensor = 0.0,
+    reference_mm: Tensor | None = None,
+) -> PupilFunction:
     """PupilFunction of one field: amplitude times exp(-2 pi i OPD / wavelength).
 
     Points that are even over the entrance pupil are taken as even in the direction cosines towards the image
@@ -118,7 +119,7 @@ def _largest_step(opd, lit):
     return float(torch.stack(steps).max())
 
 
-def _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, reference_mm):
+def _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, reference_mm) -> int:
     """Power of two for which neighbours differ by at most a third of a wave, from a coarse look at the
     wavefront."""
     line = torch.linspace(-1, 1, 65, dtype=lens.dtype, device=lens.curvature_per_mm.device)

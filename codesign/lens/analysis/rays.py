@@ -2,17 +2,34 @@
 plane."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
 from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.traced import TracedLens
 
 
-def pupil_grid(count, dtype=torch.float64, device="cpu"):
+class SpectralLines(Protocol):
+    """Wavelengths (um) and their weights; Spectrum is one."""
+
+    @property
+    def wavelengths_um(self) -> Sequence[float]: ...
+
+    @property
+    def weights(self) -> Sequence[float]: ...
+
+
+Values = Sequence[float] | Tensor | np.ndarray
+Light = float | Values | SpectralLines  # wavelengths in um, of equal weight where they come alone
+
+
+def pupil_grid(count: int, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
     """Cell centres of a count x count grid over [-1, 1]^2 that lie in the unit disc, [M, 2]."""
     line = (torch.arange(count, dtype=dtype, device=device) + 0.5) / count * 2 - 1
     y, x = torch.meshgrid(line, line, indexing="ij")
@@ -20,7 +37,13 @@ def pupil_grid(count, dtype=torch.float64, device="cpu"):
     return points[points.square().sum(1) <= 1]
 
 
-def field_rays(lens, field_rad, pupil, wavelength_um=WAVELENGTH_UM["d"], start_z_mm=-5.0):
+def field_rays(
+    lens: TracedLens,
+    field_rad: float,
+    pupil: Tensor,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    start_z_mm: float = -5.0,
+) -> tuple[Tensor, Tensor]:
     """Parallel rays of one field angle (in +y) through points of the paraxial entrance pupil.
 
     Args: field_rad scalar; pupil [M, 2] on the unit disc (placed at the pupil of the d line). Returns:
@@ -37,7 +60,9 @@ def field_rays(lens, field_rad, pupil, wavelength_um=WAVELENGTH_UM["d"], start_z
     return at + direction * ((start_z_mm - at[:, 2:]) / direction[:, 2:]), direction.contiguous()
 
 
-def source_rays(lens, field_rad, pupil, wavelength_um):
+def source_rays(
+    lens: TracedLens, field_rad: float, pupil: Tensor, wavelength_um: float
+) -> tuple[Tensor, Tensor]:
     """The rays all analyses start with; the one place that decides where pupil points lie (now: on the
     paraxial entrance pupil)."""
     return field_rays(lens, field_rad, pupil, wavelength_um)
@@ -59,7 +84,7 @@ class ImageRays:
     weight: Tensor
     index: Tensor
 
-    def shifted(self, defocus_mm):
+    def shifted(self, defocus_mm: float | Tensor) -> "ImageRays":
         """The same rays on a plane ``defocus_mm`` further along +z (scalar, may carry a gradient); rays of
         weight 0 stay where they failed."""
         arrived = self.weight > 0
@@ -71,7 +96,14 @@ class ImageRays:
         )
 
 
-def trace_field(lens, field_rad, pupil, wavelength_um=WAVELENGTH_UM["d"], vignetting=False, defocus_mm=0.0):
+def trace_field(
+    lens: TracedLens,
+    field_rad: float,
+    pupil: Tensor,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    vignetting: bool = False,
+    defocus_mm: float | Tensor = 0.0,
+) -> ImageRays:
     """Trace one field (object at infinity, in +y) through pupil points to the image plane.
 
     Args:
@@ -100,7 +132,12 @@ def trace_field(lens, field_rad, pupil, wavelength_um=WAVELENGTH_UM["d"], vignet
     return ImageRays(out.position_mm[:, :2], out.direction, path, weight, index[-1]).shifted(defocus_mm)
 
 
-def chief_ray(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"], defocus_mm=0.0):
+def chief_ray(
+    lens: TracedLens,
+    field_rad: float,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    defocus_mm: float | Tensor = 0.0,
+) -> ImageRays:
     """The ray through the centre of the pupil, as ImageRays with M = 1. Raises: DomainError when it does not
     arrive."""
     return trace_field(
@@ -112,17 +149,18 @@ def chief_ray(lens, field_rad, wavelength_um=WAVELENGTH_UM["d"], defocus_mm=0.0)
     )
 
 
-def spectral_lines(light: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def spectral_lines(light: Light) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Wavelengths (um) and weights that sum to 1, from a wavelength, a list of them (equal weights), or
     anything with wavelengths_um and weights.
 
     Raises: DomainError for no wavelength, one that is not positive, or weights that are negative or sum to 0.
     """
-    if hasattr(light, "wavelengths_um"):
-        wavelengths = [float(w) for w in light.wavelengths_um]
-        weights = [float(w) for w in light.weights]
+    given: Any = light
+    if hasattr(given, "wavelengths_um"):
+        wavelengths = [float(w) for w in given.wavelengths_um]
+        weights = [float(w) for w in given.weights]
     else:
-        wavelengths = [float(light)] if isinstance(light, (int, float)) else [float(w) for w in light]
+        wavelengths = [float(given)] if isinstance(given, (int, float)) else [float(w) for w in given]
         weights = [1.0] * len(wavelengths)
     if not wavelengths or len(wavelengths) != len(weights) or not all(0 < w < math.inf for w in wavelengths):
         raise DomainError(

@@ -1,19 +1,28 @@
 """How spot and MTF change when the image plane moves."""
 
+from collections.abc import Sequence
+
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis.mtf import diffraction_mtf, geometric_mtf
-from codesign.lens.analysis.rays import pupil_grid, spectral_lines, trace_field
+from codesign.lens.analysis.rays import Light, Values, pupil_grid, spectral_lines, trace_field
 from codesign.lens.analysis.spots import spot_radius_mm
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
 METHODS = {"diffraction": diffraction_mtf, "geometric": geometric_mtf}
 
 
 def through_focus_spot_mm(
-    lens, fields_rad, defocus_mm, light: object = WAVELENGTH_UM["d"], grid=32, vignetting=False
-):
+    lens: GeoLens,
+    fields_rad: Sequence[float],
+    defocus_mm: Values,
+    light: Light = WAVELENGTH_UM["d"],
+    grid: int = 32,
+    vignetting: bool = False,
+) -> Tensor:
     """RMS spot about its mean for each field and plane, [F, Z] mm. Args: defocus_mm: [Z], positive further
     from the lens. Gradient: to every lens tensor."""
     pupil = pupil_grid(grid, lens.dtype, lens.curvature_per_mm.device)
@@ -34,15 +43,15 @@ def through_focus_spot_mm(
 
 
 def through_focus_mtf(
-    lens,
-    field_rad,
-    frequency_per_mm,
-    defocus_mm,
-    light: object = WAVELENGTH_UM["d"],
-    method="diffraction",
-    grid=None,
-    vignetting=False,
-):
+    lens: GeoLens,
+    field_rad: float,
+    frequency_per_mm: float,
+    defocus_mm: Values,
+    light: Light = WAVELENGTH_UM["d"],
+    method: str = "diffraction",
+    grid: int | None = None,
+    vignetting: bool = False,
+) -> Tensor:
     """MTF at one frequency on several planes, [2, Z] tangential, sagittal. Args: method: "diffraction" or
     "geometric". Gradient: to every lens tensor."""
     if method not in METHODS:

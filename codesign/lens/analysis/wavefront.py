@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.lens.analysis.rays import chief_ray, pupil_grid, trace_field
+from codesign.lens.analysis.rays import ImageRays, chief_ray, pupil_grid, trace_field
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
 
@@ -38,12 +39,19 @@ class Wavefront:
     wavelength_um: float
 
     @property
-    def waves(self):
+    def waves(self) -> Tensor:
         """[M] optical path differences in wavelengths (in vacuum)."""
         return self.opd_mm / (self.wavelength_um * 1e-3)
 
 
-def path_difference_mm(lens, rays, chief, wavelength_um, reference_mm=None, defocus_mm=0.0):
+def path_difference_mm(
+    lens: GeoLens,
+    rays: ImageRays,
+    chief: ImageRays,
+    wavelength_um: float,
+    reference_mm: Tensor | None = None,
+    defocus_mm: float | Tensor = 0.0,
+) -> Tensor:
     """Optical path of the chief ray minus that of each ray, both up to the reference sphere, [M] mm.
 
     Args: rays, chief: ImageRays of the lens on the plane ``defocus_mm`` behind its image plane. reference_mm:
@@ -54,15 +62,15 @@ def path_difference_mm(lens, rays, chief, wavelength_um, reference_mm=None, defo
 
 
 def wavefront(
-    lens,
-    field_rad,
-    wavelength_um=WAVELENGTH_UM["d"],
-    grid=64,
-    vignetting=False,
-    defocus_mm=0.0,
-    reference_mm=None,
-    pupil=None,
-):
+    lens: GeoLens,
+    field_rad: float,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    grid: int = 64,
+    vignetting: bool = False,
+    defocus_mm: float | Tensor = 0.0,
+    reference_mm: Tensor | None = None,
+    pupil: Tensor | None = None,
+) -> Wavefront:
     """Wavefront of one field.
 
     Args:
@@ -81,7 +89,7 @@ def wavefront(
     return Wavefront(pupil, torch.where(rays.weight > 0, opd, 0), rays.weight, slope, wavelength_um)
 
 
-def remove_fit(front, tilt=True, focus=False):
+def remove_fit(front: Wavefront, tilt: bool = True, focus: bool = False) -> Wavefront:
     """The wavefront without piston, and as asked without tilt and focus (x^2 + y^2), by a weighted
     least-squares fit. Differentiable."""
     x, y = front.pupil.unbind(1)
@@ -94,7 +102,7 @@ def remove_fit(front, tilt=True, focus=False):
     return replace(front, opd_mm=front.opd_mm - (basis @ fit)[:, 0])
 
 
-def rms_waves(front):
+def rms_waves(front: Wavefront) -> Tensor:
     """RMS of the optical path difference about its mean, in waves; scalar. Gradient: to opd and weights; 0
     for a perfect wavefront."""
     w = front.weight / front.weight.sum()
@@ -102,13 +110,13 @@ def rms_waves(front):
     return torch.linalg.vector_norm(away * torch.where(w > 0, w, 1).sqrt() * (w > 0))
 
 
-def peak_to_valley_waves(front):
+def peak_to_valley_waves(front: Wavefront) -> Tensor:
     """Largest minus smallest optical path difference where light passes, waves; scalar."""
     seen = front.waves[front.weight > 0]
     return seen.max() - seen.min()
 
 
-def strehl_direct(front):
+def strehl_direct(front: Wavefront) -> Tensor:
     """Strehl ratio |mean of exp(-i k W)|^2 at the centre of the reference sphere; scalar in [0, 1]. Remove
     the tilt first to follow the peak."""
     w = front.weight / front.weight.sum()
@@ -116,7 +124,7 @@ def strehl_direct(front):
     return (w * phase.cos()).sum().square() + (w * phase.sin()).sum().square()
 
 
-def strehl_marechal(front):
+def strehl_marechal(front: Wavefront) -> Tensor:
     """Strehl ratio exp(-(2 pi sigma)^2) from the RMS in waves; good above about 0.3. Source: Mahajan, JOSA 73
     (1983)."""
     return torch.exp(-(2 * math.pi * rms_waves(front)).square())

@@ -11,6 +11,7 @@ where it holds,
 so values and slopes are continuous. Surfaces are counted from 1.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import torch
@@ -19,6 +20,7 @@ from torch import Tensor
 from codesign.errors import DomainError
 from codesign.lens.design import glass_map
 from codesign.lens.design.hits import rim_rays, surface_hits
+from codesign.lens.geolens import GeoLens
 from codesign.lens.surface import sag_mm
 
 
@@ -41,26 +43,26 @@ class Constraint:
     can_bind: bool = True
 
     @property
-    def slack(self):
+    def slack(self) -> Tensor:
         """How far the value stays inside its bound, in its unit; negative when violated. Differentiable."""
         return self.value - self.bound if self.at_least else self.bound - self.value
 
     @property
-    def violation(self):
+    def violation(self) -> Tensor:
         """max(0, -slack), in its unit."""
         return (-self.slack).clamp_min(0)
 
     @property
-    def row(self):
+    def row(self) -> Tensor:
         """violation / scale: a residual for least squares."""
         return self.violation / self.scale
 
     @property
-    def penalty(self):
+    def penalty(self) -> Tensor:
         """(violation / scale)^2, dimensionless."""
         return self.row.square()
 
-    def state(self, tolerance=1e-3):
+    def state(self, tolerance: float = 1e-3) -> str:
         """One of "violated", "binds" (within tolerance * scale of its bound on either side) and "free"."""
         share = float(self.slack.detach()) / self.scale
         if self.can_bind and abs(share) <= tolerance:
@@ -100,7 +102,7 @@ class Limits:
     scale_mm: float = 0.5
     scale_deg: float = 5.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if (self.incidence_deg is not None or self.rays) and not self.fields_rad:
             raise DomainError(
                 "limits on angles of incidence and on rays need fields_rad, the field angles whose rays "
@@ -112,7 +114,7 @@ class Limits:
             )
 
 
-def gap_mm(lens, heights, semi_aperture_mm=None):
+def gap_mm(lens: GeoLens, heights: Tensor, semi_aperture_mm: Tensor | None = None) -> Tensor:
     """Distance along the axis between neighbouring surfaces, [S - 1, H] mm, at ``heights`` [H], shares of the
     larger of their semi-apertures."""
     a = lens.semi_aperture_mm if semi_aperture_mm is None else semi_aperture_mm
@@ -129,7 +131,7 @@ def gap_mm(lens, heights, semi_aperture_mm=None):
     return lens.thickness_mm[:-1, None] + sag(slice(1, None)) - sag(slice(None, -1))
 
 
-def evaluate(lens, limits, semi_aperture_mm=None):
+def evaluate(lens: GeoLens, limits: Limits, semi_aperture_mm: Tensor | None = None) -> list[Constraint]:
     """All constraints that ``limits`` asks for, a list of Constraint.
 
     Args: semi_aperture_mm: [S] where edges and gaps are measured (may carry a gradient); the lens's own when
@@ -147,12 +149,12 @@ def evaluate(lens, limits, semi_aperture_mm=None):
     ]
 
 
-def penalty(constraints):
+def penalty(constraints: Collection[Constraint]) -> Tensor:
     """Sum of the penalties; exactly 0 when all hold."""
     return rows(constraints).square().sum()
 
 
-def rows(constraints):
+def rows(constraints: Collection[Constraint]) -> Tensor:
     """violation / scale of every constraint, [C]: residual rows for least squares whose squares sum to
     ``penalty``."""
     if not constraints:
@@ -160,13 +162,13 @@ def rows(constraints):
     return torch.stack([c.row for c in constraints])
 
 
-def active(constraints, tolerance=1e-3):
+def active(constraints: Collection[Constraint], tolerance: float = 1e-3) -> list[Constraint]:
     """The constraints that are violated or bind (within tolerance * scale), the worst first."""
     found = [c for c in constraints if c.state(tolerance) != "free"]
     return sorted(found, key=lambda c: float(c.slack.detach()) / c.scale)
 
 
-def report(constraints, tolerance=1e-3):
+def report(constraints: Collection[Constraint], tolerance: float = 1e-3) -> str:
     """A printable table: every constraint with value, bound, slack and state, the tightest first."""
     ordered = sorted(constraints, key=lambda c: float(c.slack.detach()) / c.scale)
     lines = [("constraint", "value", "bound", "slack", "unit", "state")]
@@ -191,7 +193,7 @@ def report(constraints, tolerance=1e-3):
     )
 
 
-def is_glass(lens):
+def is_glass(lens: GeoLens) -> list[bool]:
     """Whether each gap [S] is filled with more than air, judged by its index at the d line."""
     return [n > 1.001 for n in lens.index()[1:].tolist()]
 

@@ -1,15 +1,19 @@
 """The glass map: where (nd, Vd) of a lens's glasses lie, and how far inside a convex region of real
 glasses."""
 
+from collections.abc import Sequence
+
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
 VD_PER_ND = 100.0  # an Abbe number of 1 counts like an index of 0.01
 
 
-def places(lens):
+def places(lens: GeoLens) -> dict[int, tuple[Tensor, Tensor]]:
     """(nd, Vd) of every medium but air, by surface index: a dictionary of pairs of scalar tensors. Gradient:
     to index_offset.
 
@@ -27,7 +31,7 @@ def places(lens):
     return {i: (nd[i], (nd[i] - 1) / (nF[i] - nC[i])) for i in glass}
 
 
-def inside(nd, vd, polygon):
+def inside(nd: Tensor, vd: Tensor, polygon: Sequence[tuple[float, float]]) -> Tensor:
     """Signed distance of a glass to the nearest side of a convex polygon, positive inside, in units of nd
     (100 of Vd count as 1).
 

@@ -1,5 +1,6 @@
 """Where rays meet each surface and how steeply: clear apertures and angles of incidence."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -8,6 +9,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis import field_rays
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.paraxial import yu_trace
 from codesign.lens.trace import trace
@@ -25,7 +27,9 @@ class Hits:
     passed: Tensor
 
 
-def surface_hits(lens, origin_mm, direction, wavelength_um=WAVELENGTH_UM["d"]):
+def surface_hits(
+    lens: GeoLens, origin_mm: Tensor, direction: Tensor, wavelength_um: float = WAVELENGTH_UM["d"]
+) -> Hits:
     """Trace rays once per surface, up to it, and once to the image. Args: origin_mm, direction [N, 3], see
     GeoLens.trace. Returns: Hits.
 
@@ -64,7 +68,7 @@ def surface_hits(lens, origin_mm, direction, wavelength_um=WAVELENGTH_UM["d"]):
     return Hits(torch.stack(heights), torch.stack(cosines), torch.stack(passed))
 
 
-def rim_rays(lens, fields_rad, count=16):
+def rim_rays(lens: GeoLens, fields_rad: Sequence[float], count: int = 16) -> tuple[Tensor, Tensor]:
     """The chief ray and ``count`` rays on the rim of the entrance pupil, for each field. Returns: origins and
     directions [fields * (count + 1), 3]."""
     turn = (
@@ -76,7 +80,9 @@ def rim_rays(lens, fields_rad, count=16):
     return torch.cat([o for o, _ in rays]), torch.cat([d for _, d in rays])
 
 
-def traced_semi_aperture_mm(lens, fields_rad, margin=0.05, count=16):
+def traced_semi_aperture_mm(
+    lens: GeoLens, fields_rad: Sequence[float], margin: float = 0.05, count: int = 16
+) -> Tensor:
     """Semi-aperture that lets the full pupil of all fields pass, [S] mm: the largest height of a rim ray,
     times 1 + margin.
 
@@ -91,7 +97,7 @@ def traced_semi_aperture_mm(lens, fields_rad, margin=0.05, count=16):
     return hits.height_mm.amax(1) * (1 + margin)
 
 
-def paraxial_semi_aperture_mm(lens, half_field_rad, margin=0.05):
+def paraxial_semi_aperture_mm(lens: GeoLens, half_field_rad: float | Tensor, margin: float = 0.05) -> Tensor:
     """The same from the paraxial marginal and chief ray, |y| + |y_chief|, [S] mm: defined for every lens,
     without tracing. Differentiable."""
     f = lens.first_order()

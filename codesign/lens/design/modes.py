@@ -1,5 +1,6 @@
 """A lens design as free variables: curvatures but one, which holds the focal length, and all thicknesses."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,7 +14,7 @@ from codesign.lens.surface import sag_mm
 from codesign.lens.variables import ray_motion
 
 
-def edge_thickness_mm(lens):
+def edge_thickness_mm(lens: GeoLens) -> Tensor:
     """Gap between neighbouring surfaces at the larger of their semi-apertures, [S - 1] mm. Gradient:
     curvatures, thicknesses, conics."""
     a = torch.maximum(lens.semi_aperture_mm[:-1], lens.semi_aperture_mm[1:])
@@ -42,7 +43,7 @@ class LensDesign:
     floor_mm: Tensor
     edge_floor_mm: Tensor
 
-    def lens(self, variables):
+    def lens(self, variables: Tensor) -> GeoLens:
         """The lens at dimensionless variables [V]; gradients flow back to them.
 
         Thicknesses stay above their floors by a smooth bend that is the identity a few hundredths of the
@@ -50,7 +51,7 @@ class LensDesign:
         """
         return self.changed(self.basis @ variables.to(self.basis))
 
-    def changed(self, change):
+    def changed(self, change: Tensor) -> GeoLens:
         """The lens with curvatures and thicknesses changed by [V] (per mm, then mm) from the reference."""
         count = self.reference.curvature_per_mm.numel()
         at = holding_surface(self.reference)
@@ -64,14 +65,20 @@ class LensDesign:
             self.reference.replace(curvature_per_mm=curvature, thickness_mm=thickness), self.efl_mm, at
         )
 
-    def penalty(self, lens):
+    def penalty(self, lens: GeoLens) -> Tensor:
         """Smooth hinge on edge thicknesses below their floors, in units of 1 % of the focal length squared; 0
         when all hold."""
         shortfall = (self.edge_floor_mm - edge_thickness_mm(lens)).clamp_min(0) / (0.01 * self.efl_mm)
         return shortfall.square().sum()
 
 
-def make_design(lens, fields_rad, step_mm, floors=None, floor_share=0.6):
+def make_design(
+    lens: GeoLens,
+    fields_rad: Sequence[float],
+    step_mm: float,
+    floors: LensDesign | None = None,
+    floor_share: float = 0.6,
+) -> LensDesign:
     """LensDesign around ``lens`` whose variables are the principal modes of ray motion.
 
     With J the motion of the rays about each spot's mean per scaled curvature and thickness, the variables are
@@ -123,7 +130,9 @@ def _motion(design, variable, fields_rad, step=1e-4):
     return moved.reshape(-1) / (moved.shape[0] * moved.shape[1]) ** 0.5
 
 
-def detune(design, fields_rad, target_mm, generator):
+def detune(
+    design: LensDesign, fields_rad: Sequence[float], target_mm: float, generator: torch.Generator
+) -> GeoLens:
     """The reference lens with errors in curvatures and focus that bring its mean RMS spot to ``target_mm``,
     focal length held.
 

@@ -1,7 +1,10 @@
 """Solves: the focal length held by a curvature, focus held by the last thickness. Closed forms,
 differentiable."""
 
+from collections.abc import Sequence
+
 import torch
+from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis import field_rays, pupil_grid
@@ -13,7 +16,9 @@ from codesign.lens.hold_efl import hold_efl, holding_surface
 __all__ = ["focus_paraxial", "focus_rays", "hold_efl", "holding_surface"]
 
 
-def focus_paraxial(lens, wavelength_um=WAVELENGTH_UM["d"], defocus_mm=0.0):
+def focus_paraxial(
+    lens: GeoLens, wavelength_um: float = WAVELENGTH_UM["d"], defocus_mm: float | Tensor = 0.0
+) -> GeoLens:
     """The lens with its image plane at the paraxial focus, or ``defocus_mm`` (number or scalar tensor) behind
     it. Differentiable.
 
@@ -23,7 +28,12 @@ def focus_paraxial(lens, wavelength_um=WAVELENGTH_UM["d"], defocus_mm=0.0):
     return _last_thickness(lens, lens.first_order(wavelength_um).bfl_mm + defocus_mm)
 
 
-def focus_rays(lens, fields_rad, wavelengths_um=(WAVELENGTH_UM["d"],), grid=16):
+def focus_rays(
+    lens: GeoLens,
+    fields_rad: Sequence[float],
+    wavelengths_um: Sequence[float] = (WAVELENGTH_UM["d"],),
+    grid: int = 16,
+) -> GeoLens:
     """The lens with its image plane where the mean square spot over fields and wavelengths is least.
 
     Spots of one field share their mean over the wavelengths; see ``focus.least_spot_shift``.
@@ -32,6 +42,14 @@ def focus_rays(lens, fields_rad, wavelengths_um=(WAVELENGTH_UM["d"],), grid=16):
       Failed rays are left out.
     Gradient: through the rays to every lens tensor. Raises: DomainError when no ray of a field arrives or
       none converges.
+
+    Example:
+    >>> from codesign import lens
+    >>> geo = lens.load("cooke-triplet")
+    >>> sharp = lens.design.focus_rays(geo, (0.0, 0.2))
+    >>> before, after = (lens.rms_spot_mm(g, (0.0, 0.2)).square().mean() for g in (geo, sharp))
+    >>> bool(after < before)
+    True
     """
     pupil = pupil_grid(grid, lens.dtype, lens.curvature_per_mm.device)
     found = []

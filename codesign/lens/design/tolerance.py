@@ -11,16 +11,20 @@ Tolerances is one standard deviation.
 """
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
-from codesign.grad.jacobian import by_differences, finite
+from codesign.grad.jacobian import Jacobian, by_differences, finite
 from codesign.lens.analysis import spots
 from codesign.lens.design.constraints import is_glass
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
+
+Figures = Callable[[GeoLens], Tensor]
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,7 @@ class Tolerances:
     decentre_mm: float = 0.0
     tilt_deg: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not 0 <= value < math.inf:
                 raise DomainError(
@@ -65,7 +69,7 @@ class Error:
     deviation: float
 
 
-def errors_of(lens, tolerances):
+def errors_of(lens: GeoLens, tolerances: Tolerances) -> list[Error]:
     """The independent errors of a lens under ``tolerances``, a list of Error. A plane keeps its radius but
     not its fringes.
 
@@ -102,7 +106,7 @@ def errors_of(lens, tolerances):
     return [error for error in found if error.deviation > 0]
 
 
-def perturbed(lens, errors, amounts):
+def perturbed(lens: GeoLens, errors: Sequence[Error], amounts: Tensor) -> GeoLens:
     """The lens with errors of ``amounts`` [P] standard deviations. Gradient: to the amounts and to the
     lens."""
     if amounts.shape != (len(errors),):
@@ -117,7 +121,12 @@ def perturbed(lens, errors, amounts):
     return lens.replace(**tensors)
 
 
-def linear_figures(half_field_rad, wavelength_um=WAVELENGTH_UM["d"], compensate=None, grid=8):
+def linear_figures(
+    half_field_rad: float,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    compensate: Callable[[GeoLens], GeoLens] | None = None,
+    grid: int = 8,
+) -> Figures:
     """Figures that errors change in proportion: the function lens -> [5] of EFL, BFL, distortion at the field
     (relative), and the x and y of the
     axial spot's mean point; lengths in mm. Names: LINEAR_FIGURES.
@@ -142,7 +151,9 @@ def linear_figures(half_field_rad, wavelength_um=WAVELENGTH_UM["d"], compensate=
 LINEAR_FIGURES = ("EFL (mm)", "BFL (mm)", "distortion", "image shift x (mm)", "image shift y (mm)")
 
 
-def sensitivities(lens, tolerances, figures, jacobian=None):
+def sensitivities(
+    lens: GeoLens, tolerances: Tolerances, figures: Figures, jacobian: Jacobian | None = None
+) -> Tensor:
     """Change of every figure per standard deviation of every error, [K, P]. The columns are in the order of
     ``errors_of``.
 
@@ -173,13 +184,20 @@ class Trials:
     nominal: Tensor
     failed: int
 
-    def quantiles(self, shares=(0.05, 0.5, 0.95)):
+    def quantiles(self, shares: Sequence[float] = (0.05, 0.5, 0.95)) -> Tensor:
         """Quantiles of every figure over the trials that worked, [len(shares), K]."""
         good = self.figures[self.figures.isfinite().all(1)]
         return torch.quantile(good, torch.tensor(shares, dtype=good.dtype), dim=0)
 
 
-def monte_carlo(lens, tolerances, figures, count, generator, progress=None):
+def monte_carlo(
+    lens: GeoLens,
+    tolerances: Tolerances,
+    figures: Figures,
+    count: int,
+    generator: torch.Generator,
+    progress: Callable[[], object] | None = None,
+) -> Trials:
     """Trials of ``count`` lenses with random errors. A compensator belongs into ``figures``: it sees the
     faulty lens.
 
@@ -219,7 +237,7 @@ class Comparison:
     bias: Tensor
 
 
-def compare(slopes, trials):
+def compare(slopes: Tensor, trials: Trials) -> Comparison:
     """Comparison of ``sensitivities`` [K, P] with trials of the same lens and tolerances. A figure that
     nothing changes has correlation 1."""
     good = trials.figures.isfinite().all(1)
@@ -242,7 +260,9 @@ def compare(slopes, trials):
     )
 
 
-def worst_offenders(lens, tolerances, slopes, figure, most=10):
+def worst_offenders(
+    lens: GeoLens, tolerances: Tolerances, slopes: Tensor, figure: int, most: int = 10
+) -> list[tuple[str, float, float]]:
     """The errors that change one figure most: a list of (name, change per standard deviation, share of the
     forecast variance)."""
     errors = errors_of(lens, tolerances)

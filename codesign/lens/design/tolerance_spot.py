@@ -9,6 +9,7 @@ r.r + tr(A^T A) and variance 4 |A^T r|^2 + 2 tr((A^T A)^2). What is left out is 
 themselves, r . d2r / de2.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis import spots
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
 
@@ -31,21 +33,21 @@ class SpotForecast:
     square: Tensor
 
     @property
-    def mean(self):
+    def mean(self) -> Tensor:
         """Expected squared RMS spot, [F] mm^2."""
         return self.nominal + self.added.sum(1)
 
     @property
-    def deviation(self):
+    def deviation(self) -> Tensor:
         """Standard deviation of the squared RMS spot, [F] mm^2."""
         return (self.linear.square().sum(1) + 2 * self.square.square().sum((1, 2))).sqrt()
 
     @property
-    def linear_deviation(self):
+    def linear_deviation(self) -> Tensor:
         """The same from the slope alone; far too small near an optimum."""
         return torch.linalg.vector_norm(self.linear, dim=1)
 
-    def at(self, amounts):
+    def at(self, amounts: Tensor) -> Tensor:
         """Squared RMS spot forecast for errors of ``amounts`` [N, P] standard deviations, [N, F] mm^2."""
         return (
             self.nominal
@@ -54,7 +56,12 @@ class SpotForecast:
         )
 
 
-def spot_errors(fields_rad, wavelengths_um=(WAVELENGTH_UM["d"],), compensate=None, grid=12):
+def spot_errors(
+    fields_rad: Sequence[float],
+    wavelengths_um: Sequence[float] = (WAVELENGTH_UM["d"],),
+    compensate: Callable[[GeoLens], GeoLens] | None = None,
+    grid: int = 12,
+) -> Callable[[GeoLens], Tensor]:
     """The figure lens -> [F * M * 2]: ray errors about the mean point of their field over all wavelengths,
     mm, divided by the root of the ray count.
 
@@ -77,12 +84,12 @@ def spot_errors(fields_rad, wavelengths_um=(WAVELENGTH_UM["d"],), compensate=Non
     return figure
 
 
-def squared_spots(errors, fields):
+def squared_spots(errors: Tensor, fields: int) -> Tensor:
     """Squared RMS spots [F] mm^2 out of what ``spot_errors`` gives."""
     return errors.reshape(fields, -1).square().sum(1)
 
 
-def forecast_spot(nominal, slopes, fields):
+def forecast_spot(nominal: Tensor, slopes: Tensor, fields: int) -> SpotForecast:
     """SpotForecast from ray errors [F * M * 2] and their sensitivities [F * M * 2, P]."""
     r = nominal.reshape(fields, -1)
     A = slopes.reshape(fields, -1, slopes.shape[1])

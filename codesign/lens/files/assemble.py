@@ -7,6 +7,7 @@ import math
 import torch
 
 from codesign.errors import FileFormatError
+from codesign.lens.files.system import FileLens
 from codesign.lens.files.text import MOST_SURFACES
 from codesign.lens.files.unfold import unfold
 from codesign.lens.geolens import GeoLens
@@ -19,7 +20,7 @@ MARGIN = 1.05
 EDGE = 5e-3
 
 
-def assemble(lens, dtype=torch.float64):
+def assemble(lens: FileLens, dtype: torch.dtype = torch.float64) -> GeoLens:
     """GeoLens of a FileLens.
 
     Returns: the lens; its soft edges are 2 % of the entrance pupil wide, 0.2 mm at most. A field given as a
@@ -54,13 +55,13 @@ def assemble(lens, dtype=torch.float64):
 class Paraxial:
     """Paraxial rays through a lens at one wavelength, as plain numbers in mm."""
 
-    def __init__(self, draft, wavelength_um):
+    def __init__(self, draft: GeoLens, wavelength_um: float) -> None:
         self.power = draft.surface_power(wavelength_um).tolist()
         self.thickness = draft.thickness_mm.tolist()
         self.index = draft.index(wavelength_um).tolist()
         self.stop = draft.stop_index
 
-    def trace(self, y, u):
+    def trace(self, y: float, u: float) -> tuple[list[float], float]:
         """Heights at the surfaces, and the angle behind the last, of a ray that meets the first at height y
         with slope u (in air)."""
         heights = []
@@ -71,7 +72,7 @@ class Paraxial:
             y += thickness * nu / index
         return heights, nu / self.index[-1]
 
-    def focal_length(self):
+    def focal_length(self) -> float:
         _, u = self.trace(1.0, 0.0)
         if abs(u) < 1e-12:
             raise FileFormatError(
@@ -80,11 +81,11 @@ class Paraxial:
             )
         return -1 / u
 
-    def focus(self):
+    def focus(self) -> float:
         heights, u = self.trace(1.0, 0.0)
         return heights[-1] * self.focal_length()
 
-    def entrance_pupil_mm(self):
+    def entrance_pupil_mm(self) -> float:
         """Where the entrance pupil lies, from the first vertex."""
         parallel = self.trace(1.0, 0.0)[0][self.stop]
         slanted = self.trace(0.0, 1.0)[0][self.stop]

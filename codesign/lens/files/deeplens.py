@@ -1,9 +1,12 @@
 """Reader of DeepLens JSON files."""
 
 import re
+from collections.abc import Sequence
+from typing import Any, cast
 
 from codesign.errors import FileFormatError
 from codesign.lens.files import page as p
+from codesign.lens.files.page import Page
 from codesign.lens.files.system import FileLens, FileSurface
 from codesign.lens.files.text import at, number, shown, title
 from codesign.lens.glass import Glass
@@ -32,7 +35,7 @@ FITS_MM = 1e-3  # positions are written in single precision
 EQUAL = 1e-6  # two spellings of one number in a file agree to this share
 
 
-def is_deeplens(page):
+def is_deeplens(page: Any) -> bool:
     """Whether a JSON page is of this format."""
     return (
         isinstance(page, dict)
@@ -42,7 +45,7 @@ def is_deeplens(page):
     )
 
 
-def read_deeplens(page, name):
+def read_deeplens(page: Page, name: str) -> FileLens:
     """FileLens of a page. The stop is the surface of type Stop or Aperture, else the one with the smallest
     aperture (as that program has it); its radius sets the pupil.
 
@@ -95,9 +98,9 @@ def _check_places(page, surfaces):
         z += surface.thickness if surface else 0.0
 
 
-def smallest(surfaces):
+def smallest(surfaces: Sequence[FileSurface]) -> int:
     """Index of the surface with the smallest aperture, the first of equals."""
-    return min(range(len(surfaces)), key=lambda i: surfaces[i].semi_aperture)
+    return min(range(len(surfaces)), key=lambda i: cast(float, surfaces[i].semi_aperture))
 
 
 def _surface(row, label):

@@ -9,7 +9,7 @@ from codesign.lens.glass import Glass
 AIR = ("AIR", "VACUUM", "OCCLUDER")
 
 
-def read_diffoptics(text, name):
+def read_diffoptics(text: str, name: str) -> FileLens:
     """FileLens of the text of a table.
 
     The distance of a row leads to it from the row before; radius 0 is a plane; the numbers behind the

@@ -1,9 +1,13 @@
 """The native JSON format: what a GeoLens is, to the last bit."""
 
 import math
+from typing import Any
+
+import torch
 
 from codesign.errors import FileFormatError
 from codesign.lens.files import page as p
+from codesign.lens.files.page import Page
 from codesign.lens.files.text import at, shown, title
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import Glass
@@ -12,7 +16,7 @@ from codesign.lens.surface import Phase, Surface
 SCHEMAS = ("codesign-lens/1", "codesign-lens/2")
 
 
-def read_native(page, name, dtype):
+def read_native(page: Any, name: str, dtype: torch.dtype) -> GeoLens:
     """GeoLens of a page. Raises: FileFormatError or DomainError naming surface and field."""
     if not isinstance(page, dict) or page.get("schema") not in SCHEMAS:
         raise FileFormatError(
@@ -100,7 +104,7 @@ def _pair(row, key):
     return (pair[0], pair[1]) if pair else (0.0, 0.0)
 
 
-def to_page(lens):
+def to_page(lens: GeoLens) -> Page:
     """The page of a lens: plain JSON types. Raises: DomainError for values that ``read_native`` would
     refuse."""
     rows = []

@@ -1,9 +1,11 @@
 """Reader of optiland JSON files."""
 
 import math
+from typing import Any
 
 from codesign.errors import FileFormatError
 from codesign.lens.files import page as p
+from codesign.lens.files.page import Page
 from codesign.lens.files.system import FileLens, FileSurface
 from codesign.lens.files.text import at, shown, title
 from codesign.lens.glass import Glass
@@ -39,12 +41,12 @@ SURFACE = {
 }
 
 
-def is_optiland(page):
+def is_optiland(page: Any) -> bool:
     """Whether a JSON page is of this format."""
     return isinstance(page, dict) and isinstance(page.get("surface_group"), dict)
 
 
-def read_optiland(page, name):
+def read_optiland(page: Page, name: str) -> FileLens:
     """FileLens of a page; solves and pickups keep the stored values. Raises: FileFormatError naming surface
     and field."""
     entries = []
@@ -177,7 +179,7 @@ def _surface(row, label, thickness, place):
     )
 
 
-def boolean_mirror(row):
+def boolean_mirror(row: Page) -> bool:
     """Whether the surface reflects, in the older or the newer spelling."""
     model = row.get("interaction_model")
     if model is None:

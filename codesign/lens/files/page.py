@@ -2,14 +2,18 @@
 
 import json
 import math
+from collections.abc import Container
+from typing import Any
 
 from codesign.errors import FileFormatError
 from codesign.lens.files.text import MOST_SURFACES, shown
 
+Page = dict[str, Any]
+
 DEEPEST = 30
 
 
-def parse(text):
+def parse(text: str) -> Any:
     """The object a JSON text holds. Raises: FileFormatError when it is not JSON, nests deeper than 30, or has
     a key twice."""
     try:
@@ -48,7 +52,7 @@ def _depth(page):
     return depth
 
 
-def number(row, key, default=None, infinite=False):
+def number(row: Page, key: str, default: float | None = None, infinite: bool = False) -> float:
     """The number under a key, finite unless ``infinite``. Raises: FileFormatError when it is missing, of
     another kind, or not finite."""
     if key not in row and default is not None:
@@ -65,13 +69,13 @@ def number(row, key, default=None, infinite=False):
     return value
 
 
-def present(row, key):
+def present(row: Page, key: str) -> Any:
     if key not in row:
         raise FileFormatError(f"the field '{key}' is missing; add it.")
     return row[key]
 
 
-def boolean(row, key):
+def boolean(row: Page, key: str) -> bool:
     """The truth under a key, false when it is missing or null."""
     value = row.get(key)
     if value is not None and not isinstance(value, bool):
@@ -79,7 +83,7 @@ def boolean(row, key):
     return bool(value)
 
 
-def numbers(row, key, most=16):
+def numbers(row: Page, key: str, most: int = 16) -> tuple[float, ...]:
     """The list of at most ``most`` finite numbers under a key, empty when it is missing or null."""
     value = row.get(key)
     value = [] if value is None else value
@@ -90,7 +94,7 @@ def numbers(row, key, most=16):
     return tuple(number({key: v}, key) for v in value)
 
 
-def entry(row, key):
+def entry(row: Page, key: str) -> Page:
     """The object under a key."""
     value = present(row, key)
     if not isinstance(value, dict):
@@ -98,7 +102,7 @@ def entry(row, key):
     return value
 
 
-def rows(page, key):
+def rows(page: Page, key: str) -> list[Any]:
     """The list of 1 to MOST_SURFACES objects under a key."""
     value = page.get(key)
     if not isinstance(value, list) or not 0 < len(value) <= MOST_SURFACES:
@@ -106,7 +110,7 @@ def rows(page, key):
     return value
 
 
-def only(row, known):
+def only(row: Page, known: Container[str]) -> None:
     """Raise for a key that says something (not null, false, zero or empty) and is not known."""
     strange = [
         key for key, value in row.items() if key not in known and value not in (None, False, 0, "", [], {})

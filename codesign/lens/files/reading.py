@@ -21,7 +21,7 @@ from codesign.lens.geolens import GeoLens
 TEXTS = {".zmx": read_zmx, ".seq": read_seq, ".txt": read_diffoptics}
 
 
-def load(source, dtype=torch.float64):
+def load(source: str | Path, dtype: torch.dtype = torch.float64) -> GeoLens:
     """Lens from a catalogue name (cooke-triplet, double-gauss, la1509) or a file; docs/lens_files.md says
     what is read of each.
 
@@ -30,6 +30,12 @@ def load(source, dtype=torch.float64):
     Returns: GeoLens. Files are parsed, never executed; at most 2 MB and 500 surfaces are read.
     Raises: FileFormatError or DomainError, one sentence naming file, place, fault and remedy; nothing is half
       loaded or dropped.
+
+    Example:
+    >>> from codesign import lens
+    >>> geo = lens.load("cooke-triplet")
+    >>> len(geo.surfaces), geo.half_field_deg
+    (6, 20.0)
     """
     if str(source) in catalogue.LENSES:
         surfaces, diameter = catalogue.named_surfaces(str(source))

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Iterator
 
 from codesign.errors import FileFormatError
 from codesign.lens.files.seq_glass import PrivateGlasses
@@ -16,7 +17,7 @@ WORD = re.compile(r"'[^']*'|\"[^\"]*\"|\S+")
 FAR = 1e9  # an object beyond this counts as infinitely far
 
 
-def read_seq(text, name):
+def read_seq(text: str, name: str) -> FileLens:
     """FileLens of the text of a .seq file.
 
     Without RDM, the first number of S is a curvature; without STO, the first surface is the stop (the
@@ -31,7 +32,7 @@ def read_seq(text, name):
     return system.finish()
 
 
-def statements(text):
+def statements(text: str) -> Iterator[tuple[int, list[str]]]:
     """Statements of a .seq file as (line number, words): comments from ! dropped, lines ending in & joined,
     statements parted at ;."""
     held = ""
@@ -74,7 +75,7 @@ def _split(line):
 class System:
     """What has been read so far."""
 
-    def __init__(self, name):
+    def __init__(self, name: str) -> None:
         self.lens = FileLens(name)
         self.surfaces: list[SeqSurface] = []
         self.object = SeqSurface(0)
@@ -86,7 +87,7 @@ class System:
         self.fields: dict[str, list[float]] = {}
         self.glasses = PrivateGlasses()
 
-    def take(self, words):
+    def take(self, words: list[str]) -> None:
         if self.glasses.open:
             self.glasses.take(words)
             return
@@ -184,7 +185,7 @@ class System:
                 f"command '{shown(command)}' is not understood; delete it if it changes no ray."
             )
 
-    def finish(self):
+    def finish(self) -> FileLens:
         """FileLens of all that was read."""
         lens = self.lens
         stops = [s.label for s in self.surfaces if s.is_stop]

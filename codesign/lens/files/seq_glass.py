@@ -13,12 +13,12 @@ CODE = re.compile(r"(\d{3,9})\.(\d{3,9})", re.ASCII)
 class PrivateGlasses:
     """The private catalogue of a file; ``open`` while its lines are being read."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.open = False
         self.waves_um: list[float] = []
         self.tables: dict[str, list[float] | str] = {}
 
-    def take(self, words):
+    def take(self, words: list[str]) -> None:
         """Take one line of the catalogue."""
         if words[0].upper() == "END":
             self.open = False
@@ -29,7 +29,7 @@ class PrivateGlasses:
         else:
             self.tables[_plain(words[0])] = [number(w, f"an index of {shown(words[0])}") for w in words[1:]]
 
-    def named(self, word):
+    def named(self, word: str) -> Glass | None:
         """Glass (or None for air) by the word behind a surface."""
         name = _plain(word)
         if name.upper() == "AIR":

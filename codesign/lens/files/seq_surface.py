@@ -134,7 +134,7 @@ class SeqSurface:
     path: dict[int, float] = field(default_factory=dict)
     glasses: PrivateGlasses = field(default_factory=PrivateGlasses)
 
-    def shape(self, values, radius_mode, glasses):
+    def shape(self, values: list[str], radius_mode: bool, glasses: PrivateGlasses) -> None:
         """The numbers behind S: radius or curvature, thickness, and glass or REFL."""
         self.glasses = glasses
         self.curvature = _curvature(values[0], radius_mode) if values else 0.0
@@ -150,7 +150,7 @@ class SeqSurface:
         else:
             self.medium = self.glasses.named(word)
 
-    def take(self, command, values):
+    def take(self, command: str, values: list[str]) -> None:
         """Take one command. Raises: FileFormatError for what cannot be traced."""
         first = values[0].upper() if values else ""
         if command in REFUSED:
@@ -241,18 +241,18 @@ class SeqSurface:
                 raise FileFormatError("HCO C0 is not understood; coefficients count from C1.")
             self.path[term] = number(values[1], "HCO")
 
-    def check_image(self):
+    def check_image(self) -> None:
         if self.curvature or self.medium is not None or self.mirror or any(self.moves.values()):
             raise FileFormatError(
                 "the image surface is curved, tilted, shifted or followed by glass; only a flat image plane "
                 "across the axis is read."
             )
 
-    def check_object(self):
+    def check_object(self) -> None:
         if self.medium is not None or self.mirror:
             raise FileFormatError("the object does not lie in air; only objects in air are read.")
 
-    def finish(self, unit_mm):
+    def finish(self, unit_mm: float) -> FileSurface:
         """FileSurface of this surface, for a file in units of ``unit_mm``."""
         moved = any(
             v for name, v in self.moves.items() if name != "CDE"

@@ -5,7 +5,9 @@ import math
 import os
 import re
 import stat
+from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from codesign.errors import CodesignError, FileFormatError
 
@@ -16,7 +18,7 @@ NUMBER = re.compile(r"[+-]?(\d{1,40}\.?\d{0,40}|\.\d{1,40})([eE][+-]?\d{1,4})?",
 CONTROL = re.compile(r"[\x00-\x08\x0b\x0e-\x1f\x7f]")
 
 
-def read_text(path):
+def read_text(path: str | Path) -> str:
     """The text of a file in UTF-8, UTF-16 (either byte order) or Latin-1; at most LARGEST_BYTES + 1 bytes are
     read.
 
@@ -70,12 +72,12 @@ def _encoding(content):
         return "latin-1"
 
 
-def lines(text):
+def lines(text: str) -> Iterator[tuple[int, str]]:
     """The lines of a text, with their numbers from 1."""
     return enumerate(re.split(r"\r\n|\r|\n", text), 1)
 
 
-def number(word, what):
+def number(word: str, what: str) -> float:
     """The finite number a word spells. Raises: FileFormatError naming what it stands for."""
     value = float(word) if NUMBER.fullmatch(word) else math.nan
     if not math.isfinite(value):
@@ -83,7 +85,7 @@ def number(word, what):
     return value
 
 
-def whole(word, what, most=10_000):
+def whole(word: str, what: str, most: int = 10_000) -> int:
     """The whole number from 0 to ``most`` a word spells."""
     if not re.fullmatch(r"\d{1,6}", word, re.ASCII) or int(word) > most:
         raise FileFormatError(
@@ -92,18 +94,18 @@ def whole(word, what, most=10_000):
     return int(word)
 
 
-def shown(value):
+def shown(value: object) -> str:
     """A value of a file as it may stand in a sentence: short, on one line."""
     return "".join(c if c.isprintable() else "?" for c in " ".join(str(value)[:60].split())[:40])
 
 
-def title(value, otherwise):
+def title(value: object, otherwise: str) -> str:
     """A name on one line of at most 80 printable characters; ``otherwise`` where there is none."""
     return "".join(c for c in " ".join(str(value).split()) if c.isprintable())[:80].strip() or otherwise
 
 
 @contextmanager
-def at(place):
+def at(place: str) -> Iterator[None]:
     """Put the place in front of the sentence of any error of the block."""
     try:
         yield

@@ -5,13 +5,15 @@ import dataclasses
 import math
 
 from codesign.errors import FileFormatError
+from codesign.lens.files.system import FileLens, FileSurface
+from codesign.lens.glass import Glass
 
 ROUNDING = (
     1e-9  # of a length in the file's unit; a gap negative by less is a rounding error and counts as none
 )
 
 
-def unfold(lens):
+def unfold(lens: FileLens) -> list[FileSurface]:
     """The surfaces with lengths in millimetres and all signs along the light; dummy planes at which the light
     steps back are folded away.
 
@@ -38,7 +40,7 @@ def unfold(lens):
     return _without_steps_back(found)
 
 
-def in_mm(surface, unit_mm, sign):
+def in_mm(surface: FileSurface, unit_mm: float, sign: float) -> FileSurface:
     """The surface in millimetres, its shape and tilt mirrored in z where ``sign`` is -1; its thickness is
     left alone."""
     asphere = tuple(sign * a * unit_mm ** (-1 - 2 * i) for i, a in enumerate(surface.asphere))
@@ -61,7 +63,7 @@ def in_mm(surface, unit_mm, sign):
     )
 
 
-def is_dummy(surface, medium_before):
+def is_dummy(surface: FileSurface, medium_before: Glass | None) -> bool:
     """Whether a surface does nothing to any ray: a plane within one medium that neither stops nor turns
     light."""
     plain = (

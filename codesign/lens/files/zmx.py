@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 from codesign.errors import FileFormatError
 from codesign.lens.files.system import FileLens, FileSurface
@@ -12,7 +13,7 @@ UNITS_MM = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "INCH": 25.4, "M": 1000.0, "METER
 FIELDS = ("angle", "object height", "image height", "image height")
 
 
-def read_zmx(text, name):
+def read_zmx(text: str, name: str) -> FileLens:
     """FileLens of the text of a .zmx file.
 
     Outside the surfaces only mode, unit, pupil, field, wavelengths and telecentric or afocal spaces are read:
@@ -71,7 +72,7 @@ class Header:
     waves: dict[int, float] = dataclasses.field(default_factory=dict)
     primary: int = 1
 
-    def take(self, keyword, words):
+    def take(self, keyword: str, words: list[str]) -> None:
         def numbers():
             return [number(w, keyword) for w in words]
 
@@ -140,7 +141,7 @@ class Header:
                 "(seventh number of FTYP)."
             )
 
-    def finish(self, entries):
+    def finish(self, entries: Sequence[Entry]) -> FileLens:
         """FileLens of this header and the entries of the surfaces, object and image included."""
         if len(entries) < 3:
             raise FileFormatError(

@@ -99,7 +99,7 @@ class Entry:
     extra: dict[int, float] = field(default_factory=dict)
     seen: set[str] = field(default_factory=set)
 
-    def take(self, keyword, words):
+    def take(self, keyword: str, words: list[str]) -> None:
         """Take one line. Raises: FileFormatError when it is not understood, comes twice, or asks for what
         cannot be traced."""
         if keyword in IDLE:
@@ -190,19 +190,19 @@ class Entry:
     def _take_xdat(self, words):
         self.extra[whole(words[0], "XDAT")] = number(words[1], f"XDAT {shown(words[0])}")
 
-    def check_object(self):
+    def check_object(self) -> None:
         if self.glass:
             raise FileFormatError(
                 f"the object lies in '{shown(self.glass[0])}'; only objects in air are read."
             )
 
-    def check_image(self):
+    def check_image(self) -> None:
         if self.curvature or self.kind not in TYPES or any(self.parameters.values()):
             raise FileFormatError(
                 f"surface {self.label} is a curved or special image surface; only a flat image plane is read."
             )
 
-    def surface(self):
+    def surface(self) -> FileSurface:
         """FileSurface of this entry."""
         moved = any(v for i, v in self.parameters.items() if i != 6)  # 6: the order of shifts and tilts
         if self.kind not in TYPES and (self.kind != "COORDBRK" or moved):

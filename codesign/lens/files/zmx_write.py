@@ -1,6 +1,7 @@
 """Writer of OpticStudio .zmx files."""
 
 from codesign.errors import CodesignError, FileFormatError
+from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import AIR, WAVELENGTH_UM, Glass, names
 
 MOST_TERMS = 8  # of an even asphere
@@ -12,7 +13,7 @@ MOST_ABBE = 150
 SAME_INDEX = 1e-8
 
 
-def to_zmx(lens):
+def to_zmx(lens: GeoLens) -> str:
     """The text of a .zmx file of the lens's current values; numbers keep all their digits.
 
     Kept: curvatures, thicknesses and aspheres with their signs along a fixed axis, conics, stop, apertures

@@ -1,0 +1,35 @@
+"""What the parts that GeoLens is built on ask of a traced lens; GeoLens is one."""
+
+from typing import Protocol, Self
+
+import torch
+from torch import Tensor
+
+from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.paraxial import ParaxialLens
+from codesign.lens.surface import Surface
+from codesign.lens.trace import Prescription, TraceResult
+
+
+class TracedLens(ParaxialLens, Protocol):
+    """A lens whose rays can be traced and whose tensors can be replaced; see GeoLens for what each name holds."""
+
+    surfaces: tuple[Surface, ...]
+    mirrors: tuple[bool, ...]
+    stop_index: int
+    curvature_per_mm: Tensor
+    asphere: Tensor
+    phase: Tensor
+    glass: Tensor
+    semi_aperture_mm: Tensor
+
+    @property
+    def dtype(self) -> torch.dtype: ...
+
+    def prescription(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> Prescription: ...
+
+    def trace(
+        self, origin_mm: Tensor, direction: Tensor, wavelength_um: float = WAVELENGTH_UM["d"]
+    ) -> TraceResult: ...
+
+    def replace(self, **tensors: Tensor) -> Self: ...
