@@ -178,9 +178,8 @@ def widen(arr: Arrays, parameters: Any, count: int, width: int) -> list[Any]:
     wanted.
 
     A scalar used by a million lanes would make one full recomputation per use in the backward pass; a gather
-    makes one reduction.
-    Without a gradient a gather per lane only costs time, and the scalars stay scalars (evaluated, so that
-    other values need no new kernel).
+    makes one reduction. Without a gradient a gather per lane only costs time, and the scalars stay scalars
+    (evaluated, so that other values need no new kernel).
     """
     import drjit as dr
 
@@ -194,8 +193,7 @@ def widen(arr: Arrays, parameters: Any, count: int, width: int) -> list[Any]:
 
 def frames_per_kernel(pixels: int) -> int:
     """How many frames of so many pixels one loop over time should take: few frames read memory in few
-    streams, which the processor fetches ahead;
-    many save calls."""
+    streams, which the processor fetches ahead; many save calls."""
     return max(32, (1 << 22) // pixels)
 
 

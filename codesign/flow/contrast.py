@@ -2,11 +2,10 @@
 image sharp.
 
 Time runs from 0 at the start of the window to 1 at its end. An event at pixel x and time tau lies at x + (at
-- tau) flow at time ``at``. Its flow is that of its
-own pixel (``carry_steps=0``, what the literature does), or, since a FlowField lives on the pixels of the
-window's start, that of the pixel it came from:
-x0 = x - tau flow(x0), by fixed-point steps from x0 = x, bilinear between pixels. Each step leaves an error
-one order higher in the slope of the flow.
+- tau) flow at time ``at``. Its flow is that of its own pixel (``carry_steps=0``, what the literature does),
+or, since a FlowField lives on the pixels of the window's start, that of the pixel it came from: x0 = x - tau
+flow(x0), by fixed-point steps from x0 = x, bilinear between pixels. Each step leaves an error one order
+higher in the slope of the flow.
 """
 
 from dataclasses import dataclass
@@ -121,8 +120,7 @@ def count_image(tracks: EventTracks, at: float | Tensor) -> Tensor:
     it in proportion to its nearness.
 
     A share that falls on no pixel is lost: the image and ``leaving`` add up to all events. Gradient: counts
-      and flow; piecewise smooth, with a kink where an
-    event crosses the centre line of a pixel.
+    and flow; piecewise smooth, with a kink where an event crosses the centre line of a pixel.
     """
     return _shared(tracks, tracks.count, at)
 
@@ -154,9 +152,8 @@ def smooth_image(tracks: EventTracks, at: float | Tensor, weight: Tensor | None 
     (Gaussian-like, variance 1/4 px^2).
 
     The spread is alike wherever an event falls, so the image is no sharper for whole-pixel motion (bilinear
-    shares have a variance between 0 and 1/4), and its
-    gradient has no jumps. weight: [B, N] factor per event, or None. Gradient: counts, flow and weight;
-      continuous.
+    shares have a variance between 0 and 1/4), and its gradient has no jumps. weight: [B, N] factor per event,
+    or None. Gradient: counts, flow and weight; continuous.
     """
     x, y = tracks.positions(at)
     column, row = (value.detach().add(0.5).floor() for value in (x, y))
@@ -273,7 +270,7 @@ def _gathered(tracks, column, row, parts):
     from whole pixels [B, N].
 
     What is outside falls on a margin that is cut off: places beyond are held two pixels from the image, so
-      that no step leads back to it.
+    that no step leads back to it.
     """
     height = tracks.height_px
     width = tracks.width_px

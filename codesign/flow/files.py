@@ -1,13 +1,11 @@
 """Flow fields to and from files: 16-bit PNG as in DSEC, and Middlebury .flo. The extension says which.
 
 DSEC: three channels of 16 bits. The first two are round(128 v) + 2^15 for the flow v to the right and down
-  (px), the third is 1 where it is valid, else 0.
-Flows from -256 to 255.99 px fit, to 1/256 px; larger valid ones are refused, never clipped. Invalid pixels
-are written as 0, 0, 0 and read as flow 0.
+  (px), the third is 1 where it is valid, else 0. Flows from -256 to 255.99 px fit, to 1/256 px; larger valid
+  ones are refused, never clipped. Invalid pixels are written as 0, 0, 0 and read as flow 0.
 Middlebury: the float32 202021.25, width and height as int32, then (right, down) float32 pixel by pixel, all
-  little-endian. Invalid pixels hold 1e10, and
-components above 1e9 in size read as invalid. Sources: the DSEC data format page; Baker et al., A database and
-  evaluation methodology for optical flow, IJCV 2011.
+  little-endian. Invalid pixels hold 1e10, and components above 1e9 in size read as invalid. Sources: the DSEC
+  data format page; Baker et al., A database and evaluation methodology for optical flow, IJCV 2011.
 """
 
 import struct

@@ -1,15 +1,11 @@
 """Closed-form event flow: coarse-to-fine Bayesian least squares on event volumes.
 
 The signed event rate of a moving texture moves with it, so the volume obeys V_t + u V_x + v V_y = 0 (Lucas
-and Kanade, 1981,
-with event rate in place of intensity). The volume is warped back along the current flow; per pixel, the
-regression of the
-bins over time gives V_t and their mean gives V_x, V_y; all pixels together pull at the parameters of an
-affine or quadratic
-field (lk_level). A Gaussian prior on the field (lk_field) holds against the pull, which is weighed by the
-noise that scattered
-events put into it, so that few events mean small steps, and the spread of what is left is returned with the
-flow.
+and Kanade, 1981, with event rate in place of intensity). The volume is warped back along the current flow;
+per pixel, the regression of the bins over time gives V_t and their mean gives V_x, V_y; all pixels together
+pull at the parameters of an affine or quadratic field (lk_level). A Gaussian prior on the field (lk_field)
+holds against the pull, which is weighed by the noise that scattered events put into it, so that few events
+mean small steps, and the spread of what is left is returned with the flow.
 """
 
 from collections.abc import Sequence

@@ -2,8 +2,7 @@
 start, the spread of the flow.
 
 A field is u = sum p_k b_k(x, y), v = sum q_k b_k(x, y) with b = 1, x, y, x^2, xy, y^2 on coordinates that
-reach from -1 to 1 along the longer side.
-Parameters are [B, 2K]: p_1..p_K, q_1..q_K.
+reach from -1 to 1 along the longer side. Parameters are [B, 2K]: p_1..p_K, q_1..q_K.
 """
 
 import torch

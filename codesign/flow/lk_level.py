@@ -5,12 +5,11 @@ Noise. Events scattered at random, rho per pixel and window, put into a volume b
 - temporal slopes of variance rho / (sum w t^2) / (4 pi sigma^2), w the share of the window in a bin and t its
   time, and
 - slopes of the mean of variance kappa rho, about rho / (8 pi sigma^4), which look like texture and are none.
-The first sets how much the pull of the data can be trusted; how far real events are from Poisson is read off
-the residual. The second is an error in
-the regressors (Fuller, Measurement Error Models, 1987): with N = sum g g^T the normal matrix of the slopes
-  seen and Z what scattered events alone would
-add to it, a direction of the parameters in which Z makes up the share z counts by (1 - z)^4 / ((1 - z)^4 + (3
-z)^4): nearly 1 for texture, 1/82 where all is noise.
+  The first sets how much the pull of the data can be trusted; how far real events are from Poisson is read
+  off the residual. The second is an error in the regressors (Fuller, Measurement Error Models, 1987): with N
+  = sum g g^T the normal matrix of the slopes seen and Z what scattered events alone would add to it, a
+  direction of the parameters in which Z makes up the share z counts by (1 - z)^4 / ((1 - z)^4 + (3 z)^4):
+  nearly 1 for texture, 1/82 where all is noise.
 """
 
 import math

@@ -1,9 +1,8 @@
 """Losses to learn flow with: from true flow, from the events alone, and from frames.
 
 Every loss is a mean over the samples of a batch of a mean over the pixels of the sample, so that equal shares
-of a batch, on several machines, average to the
-loss of the whole. They are smooth (C1) in the flow unless the docstring says otherwise. Non-finite
-predictions show as a non-finite loss.
+of a batch, on several machines, average to the loss of the whole. They are smooth (C1) in the flow unless the
+docstring says otherwise. Non-finite predictions show as a non-finite loss.
 """
 
 from collections.abc import Sequence
@@ -92,8 +91,7 @@ def likelihood_loss(
 
     Args:
       predictions, truth, gamma: as in supervised_loss. Each prediction has covariance_px2, or else confidence
-        c, read as the share of the prior that the events
-        have removed: variance prior_px^2 (1 - c) per axis.
+        c, read as the share of the prior that the events have removed: variance prior_px^2 (1 - c) per axis.
       floor_px: standard deviation added to every claim (in squares), so that no claim is exact and the loss
         stays bounded below by 2 ln floor_px.
     Returns: scalar, (m^2 + ln det S) / 2 with S = covariance + floor_px^2 and m^2 = e^T S^-1 e, over the
@@ -155,11 +153,10 @@ def contrast_loss(
     Returns: scalar mean over the batch of the weighted mean of the ratios; 1 for zero flow, less for flow
       that explains the events; 1 for a sample without events.
     Guard: an event counts as much as the warp stretches the area around it (from 0 where it folds or turns
-      over to 2.5). Squeezing the events into less space then
-      leaves the mean squared slope of their image unchanged (in two dimensions it is invariant under change
-      of scale), so only alignment pays; and ratios are
-      averaged, not sharpnesses, so that one very sharp image does not make up for blurred others. What leaves
-      the image is lost, which costs sharpness.
+      over to 2.5). Squeezing the events into less space then leaves the mean squared slope of their image
+      unchanged (in two dimensions it is invariant under change of scale), so only alignment pays; and ratios
+      are averaged, not sharpnesses, so that one very sharp image does not make up for blurred others. What
+      leaves the image is lost, which costs sharpness.
     Gradient: counts and flow; 0 in both for an empty volume.
     Raises: as volume_tracks.
     Source: Shiba, Aoki, Gallego, Secrets of event-based optical flow, ECCV 2022, sec. 3.2; area change: Shiba
@@ -224,8 +221,7 @@ def photometric_loss(
     Args: frames: [B, 2, H, W] intensity at the start and at the end, 0..255. flow_px: [B, 2, H, W] pixels per
       window.
     Returns: scalar, differences in units of 255. A pixel that leaves the image keeps its zero-flow
-      difference, so that leaving never pays; over the last pixel
-      before the border one blends into the other.
+      difference, so that leaving never pays; over the last pixel before the border one blends into the other.
     Gradient: frames and flow; bilinear reading makes it piecewise smooth, with kinks where the flow leads to
       a pixel's centre line.
     Raises: ShapeError.

@@ -173,12 +173,10 @@ def fwl(
     makes the events sharper.
 
     Args: stream: EventStream. flow_px: [2, H, W] pixels from t0 to t1. t0_us, t1_us: whole microseconds, both
-      ends included. at: time the events are moved
-      to, 0 for t0, 1 for t1. carry_steps: see contrast; 0 gives each event the flow of its own pixel, as
-        published.
+      ends included. at: time the events are moved to, 0 for t0, 1 for t1. carry_steps: see contrast; 0 gives
+      each event the flow of its own pixel, as published.
     Returns: float. Polarities added, every event on its nearest pixel, variance over all pixels of the
-      sensor. Events that leave the image count in the
-      denominator only.
+      sensor. Events that leave the image count in the denominator only.
     Gradient: none. Raises: DomainError for an interval without events, or with equally many events on every
       pixel. Source: Stoffregen et al., ECCV 2020, sec. 4.1.
     """
@@ -199,8 +197,8 @@ def rsat(stream: EventStream, flow_px: Tensor, t0_us: int, t1_us: int, carry_ste
     events.
 
     Args: as fwl. Returns: float; of either image, the sum over pixels and polarities of the squared mean time
-      (0 at t0, 1 at t1) over the number of pixels with events of any
-      polarity. Every event on its nearest pixel; events that leave the image are lost from the warped one.
+      (0 at t0, 1 at t1) over the number of pixels with events of any polarity. Every event on its nearest
+      pixel; events that leave the image are lost from the warped one.
     Gradient: none. Raises: DomainError for an interval without events, or when all leave the image, or lie at
       t0. Source: Hagenaars et al., NeurIPS 2021.
     """

@@ -74,8 +74,7 @@ class Refiner(nn.Module):
         """Flow of an EventVolume [B, 2, bins, H, W] of any H, W.
 
         The corrected flow counts where it leaves less that moves than the start does, over windows of 26 px;
-        the start where it does not. So the answer stays
-        near the closed form where that is right already.
+        the start where it does not. So the answer stays near the closed form where that is right already.
         Returns: FlowField with confidence and covariance (the same along x and y). An empty sample has flow
           0, confidence 0 and no gradient.
         Gradient: counts and weights.

@@ -2,9 +2,8 @@
 rotation.
 
 Body axes: x forward, y left, z up. Camera axes: x right, y down, z forward. Yaw turns the view to the left,
-  pitch tilts it down (90 degrees
-looks straight down), roll turns the image about the view; at zero the camera looks along the body's x axis
-with level rows.
+pitch tilts it down (90 degrees looks straight down), roll turns the image about the view; at zero the camera
+looks along the body's x axis with level rows.
 """
 
 import math

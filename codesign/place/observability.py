@@ -2,10 +2,9 @@
 known depth.
 
 A static point X in camera axes moves as X' = -(v + w x X) when the camera moves with velocity v and rotation
-rate w (Longuet-Higgins and
-Prazdny, 1980). The pixel that images it moves so that its chief ray goes on passing through the point, for
-any lens that has chief rays.
-The flow is linear in (forward m/s, lateral m/s to the left, yaw rate rad/s to the left) of the body's origin.
+rate w (Longuet-Higgins and Prazdny, 1980). The pixel that images it moves so that its chief ray goes on
+passing through the point, for any lens that has chief rays. The flow is linear in (forward m/s, lateral m/s
+to the left, yaw rate rad/s to the left) of the body's origin.
 """
 
 from collections.abc import Sequence

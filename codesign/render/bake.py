@@ -1,9 +1,8 @@
 """Light of a Lambertian scene, computed once by path tracing and kept as emissive textures.
 
 Outgoing radiance of a Lambertian surface is emission + albedo x irradiance / pi, the same from every side.
-Irradiance is smooth, so it is estimated on a
-coarse light map; albedo and emission are read at their own resolution; the product is the texture of a
-``MitsubaScene``.
+Irradiance is smooth, so it is estimated on a coarse light map; albedo and emission are read at their own
+resolution; the product is the texture of a ``MitsubaScene``.
 """
 
 import itertools
@@ -46,9 +45,8 @@ def bake(
 
     Args:
       description: Mitsuba scene dictionary of rectangles, disks, spheres, cylinders, cubes and meshes
-        (dictionaries, or mi.Mesh objects) with 'diffuse'
-        BSDFs, area emitters where they glow, and lamps of any kind. Environment maps stay in the scene, seen
-        and lighting.
+        (dictionaries, or mi.Mesh objects) with 'diffuse' BSDFs, area emitters where they glow, and lamps of
+        any kind. Environment maps stay in the scene, seen and lighting.
       texel_m: size of light-map texels, from 4 to max_texels along each side of a shape. samples: paths per
         texel; seed: of all of them.
       max_depth: longest path. fine: texels of a finished texture per light-map texel along each side, unless
@@ -58,8 +56,8 @@ def bake(
     Error: noise of about 1 / sqrt(samples) of what arrives indirectly, light smeared over a texel at contact
       shadows; see light.level_error.
     Raises: DomainError for surfaces that are not diffuse (their radiance depends on the side one looks from),
-      two-sided ones (one texture per surface),
-      shapes without known charts, texture coordinates that overlap or leave the unit square.
+      two-sided ones (one texture per surface), shapes without known charts, texture coordinates that overlap
+      or leave the unit square.
     """
     if not (texel_m > 0 and samples >= 1 and max_texels >= 4 and fine >= 1):
         raise DomainError(

@@ -2,14 +2,11 @@
 across the film.
 
 With pupil point q fixed, the film is cut by curves where radiance jumps. When such a curve moves by v along
-its normal n, a pixel gains
-(L- - L+) v per length of curve, L- and L+ the radiances before and behind it along n. The term is estimated
-by points on the curves, and enters as
-w (x(y, q) . n), whose value is taken out again and whose gradient is that of the film position x of the world
-point y: through the lens and the pose,
-whatever they depend on. Sources: Li et al., Differentiable Monte Carlo ray tracing through edge sampling,
-  SIGGRAPH Asia 2018 (the term);
-Reynolds' transport theorem.
+its normal n, a pixel gains (L- - L+) v per length of curve, L- and L+ the radiances before and behind it
+along n. The term is estimated by points on the curves, and enters as w (x(y, q) . n), whose value is taken
+out again and whose gradient is that of the film position x of the world point y: through the lens and the
+pose, whatever they depend on. Sources: Li et al., Differentiable Monte Carlo ray tracing through edge
+sampling, SIGGRAPH Asia 2018 (the term); Reynolds' transport theorem.
 """
 
 import math
@@ -97,8 +94,8 @@ def boundary_term(camera: Camera, scene: Any, T_world_cam: Tensor, per_px: float
 @dataclass(frozen=True)
 class Jumps:
     """Seen points of curves with a jump of radiance: world [n, 3], frame [n], film position [n, 2] px, pupil
-    [n, 2], pixel [n] of the sequence, weight [n],
-    and the motion along the curve's normal on the film per miss of the ray in space, [n, 2] px/m."""
+    [n, 2], pixel [n] of the sequence, weight [n], and the motion along the curve's normal on the film per
+    miss of the ray in space, [n, 2] px/m."""
 
     world_m: Tensor
     frame: Tensor
@@ -181,8 +178,7 @@ def _places(length, per_px, generator):
     share of the piece each stands for [n].
 
     A piece longer than the spacing of points is cut into equal parts with a point in each, so that what is
-    constant along it is summed exactly;
-    shorter ones are thinned together, evenly along their total length.
+    constant along it is summed exactly; shorter ones are thinned together, evenly along their total length.
     """
     long = torch.nonzero(length * per_px >= 1)[:, 0]
     count = (length[long] * per_px).ceil().long()
@@ -282,9 +278,8 @@ def _look(scene, origin, direction):
 
 def _on_film(camera, y, on, pupil):
     """Points y [n, 3] in camera axes seen through points of the exit pupil: film position [n, 2] px, the
-    pupil point reached [n, 2] (the one asked for but for the square
-    of the pupil's aberration), the tangent [n, 2] px towards ``on`` [n, 3] at one pupil point, and whether
-    light passes [n]."""
+    pupil point reached [n, 2] (the one asked for but for the square of the pupil's aberration), the tangent
+    [n, 2] px towards ``on`` [n, 3] at one pupil point, and whether light passes [n]."""
     film = camera.film
     step = PUPIL_STEP * torch.eye(2, dtype=y.dtype)
 

@@ -272,7 +272,7 @@ def angular_miss_rad(camera: Camera, pixels: Tensor, points_cam_m: Tensor) -> Te
     rad.
 
     A flow error in task units: zero when the pixel images the point, whatever the focal length and
-      distortion.
+    distortion.
     Gradient: to the pixels, the points and the lens; smooth at zero, where the value is 1e-6 rad instead of
       0.
     """

@@ -2,9 +2,8 @@
 integrator on the same camera rays.
 
 The cheap level is ``MitsubaScene``: every surface shows its own radiance. ``bake`` (codesign.render.bake)
-  computes the light of a Lambertian scene once
-and returns such a ``MitsubaScene``. ``PathScene`` traces paths for every camera ray: the reference. All three
-have ``radiance``, ``hit`` and ``dtype``.
+computes the light of a Lambertian scene once and returns such a ``MitsubaScene``. ``PathScene`` traces paths
+for every camera ray: the reference. All three have ``radiance``, ``hit`` and ``dtype``.
 """
 
 import copy
@@ -37,12 +36,10 @@ class PathScene(MitsubaScene):
       description: a Mitsuba scene dictionary. samples: paths per camera ray, on top of the camera's samples
         per pixel.
       max_depth: longest path; 1 sees emitters only, 2 one reflection, -1 any length. seed: of the random
-        numbers; equal calls give equal frames.
-    Noise is independent from ray to ray, so a camera at rest sees frames that differ by it: raise samples
-    until events of noise are rare.
+        numbers; equal calls give equal frames. Noise is independent from ray to ray, so a camera at rest sees
+        frames that differ by it: raise samples until events of noise are rare.
     Gradient: none. A path's light behind a moved ray jumps wherever the path changes, and differentiating the
-      numbers one by one is not the gradient
-    of their mean; asking for it raises GradientError.
+      numbers one by one is not the gradient of their mean; asking for it raises GradientError.
     """
 
     def __init__(
@@ -128,9 +125,8 @@ def level_error(
     """Relative radiance error of a cheap scene against a reference, seen by a camera along poses [T, 4, 4].
 
     The error of a pixel is relative to the reference there, or to FLOOR of the frame's mean where that is
-    more. A reference with ``with_seed``
-    (PathScene) is rendered twice with independent numbers; any other counts as free of noise. No gradient.
-    Returns: LevelError.
+    more. A reference with ``with_seed`` (PathScene) is rendered twice with independent numbers; any other
+    counts as free of noise. No gradient. Returns: LevelError.
     Raises: DomainError when a frame of the reference is black.
     """
     with torch.no_grad():

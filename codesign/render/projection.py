@@ -2,10 +2,9 @@
 instead of ray traces.
 
 A chief ray that leaves with slope s (dx/dz, dy/dz) starts at base B(s) on the plane of the entrance pupil and
-comes from the pixel U(s). The image of a point
-(X, Y, z) is U(s) with s = (X, Y)/z - B(s)/z, an equation that fixed-point steps solve, since B is a part of a
-millimetre and z is metres. U and B are
-Chebyshev series in both components of s, interpolated at their nodes and checked against traced rays.
+comes from the pixel U(s). The image of a point (X, Y, z) is U(s) with s = (X, Y)/z - B(s)/z, an equation that
+fixed-point steps solve, since B is a part of a millimetre and z is metres. U and B are Chebyshev series in
+both components of s, interpolated at their nodes and checked against traced rays.
 """
 
 import torch

@@ -233,8 +233,8 @@ def choose(camera: Camera, scene: Any, T_world_cam: Tensor, seed: int = 0) -> di
     that agrees with differences.
 
     A random smooth weighting of the pixels stands for the loss; differences are taken at two seeds of the
-    camera, whose disagreement is their noise.
-    A way passes within PASSES plus that noise, of which no more than PASSES counts. Two frames are looked at.
+    camera, whose disagreement is their noise. A way passes within PASSES plus that noise, of which no more
+    than PASSES counts. Two frames are looked at.
     """
     which = [0, -1] if T_world_cam.shape[0] > 1 else [0]
     scene = at_frames(scene, which)

@@ -183,12 +183,10 @@ def crossing_error_px(largest_px: float, period_px: float, slope: float = 1.0) -
     pixel crosses a threshold.
 
     Args: largest_px: motion between frames, at constant speed. period_px: the finest period in the image.
-      slope: of the level at the crossing, as a share
-      of its largest slope, within the step, in 0..1.
+      slope: of the level at the crossing, as a share of its largest slope, within the step, in 0..1.
     Between frames a chord misses a level L by at most h^2 max|L''| / 8, hence the crossing by that over |L'|;
-    for a sinusoid of wave number
-    k = 2 pi / period that moves by d per step this is k d^2 / (8 slope) pixels of motion. Divided by the
-    speed in px/s it is the error in seconds.
+    for a sinusoid of wave number k = 2 pi / period that moves by d per step this is k d^2 / (8 slope) pixels
+    of motion. Divided by the speed in px/s it is the error in seconds.
     """
     if not (largest_px > 0 and period_px > 0 and 0 < slope <= 1):
         raise DomainError(

@@ -31,8 +31,8 @@ def lens_layout(
     """Figure of a lens's cross-section with meridional rays.
 
     Args: fields_rad: angles; None takes 0, 0.7 and 1 of the lens's half field (10 degrees where none is
-      known). path: where to save,
-    .svg, .png or .pdf, or None. rays: per field. Mirrors are drawn along the unfolded axis.
+      known). path: where to save, .svg, .png or .pdf, or None. rays: per field. Mirrors are drawn along the
+      unfolded axis.
     Returns: matplotlib Figure. Raises: FileFormatError for another ending or a place that is not writable.
     """
     if path is not None and Path(path).suffix.lower() not in ENDINGS:

@@ -2,9 +2,8 @@
 families of trajectories.
 
 Every sequence is a folder with events and frames in HDF5 (laid out as in DSEC), flow as 16-bit PNG, poses as
-text, and the camera's calibration. A run
-that was stopped or killed goes on with --resume, and ends with the same bytes. The layout is described in
-docs/datasets.md.
+text, and the camera's calibration. A run that was stopped or killed goes on with --resume, and ends with the
+same bytes. The layout is described in docs/datasets.md.
 """
 
 import io

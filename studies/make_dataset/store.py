@@ -2,9 +2,8 @@
 end.
 
 A part holds what a chunk of frames gave, and the sensor's state behind it, and appears whole or not at all; a
-run that was killed goes on behind the last
-one. Joined files depend on the parts alone, so they are the same to the last bit however often the run was
-killed.
+run that was killed goes on behind the last one. Joined files depend on the parts alone, so they are the same
+to the last bit however often the run was killed.
 """
 
 import hashlib

@@ -11,9 +11,8 @@ def to_halves(counts: Tensor) -> Tensor:
     Args:
       counts: [B, 2, 2 k, H, W] events per bin, ON first.
     Returns: [B, 4, H, W, k] view: ON and OFF of the former half, ON and OFF of the latter; nothing is lost or
-      added.
-      The bins keep their shared borders, so an event that crosses one, also the middle of the window, changes
-      the input continuously.
+      added. The bins keep their shared borders, so an event that crosses one, also the middle of the window,
+      changes the input continuously.
     Gradient: counts.
     Raises: ShapeError for an odd number of bins.
     Source: Lee et al., Spike-FlowNet, ECCV 2020, sec. 3.1.

@@ -2,9 +2,8 @@
 data set).
 
 Pixels are fitted as a polynomial of the rays' slopes, and the rays' origins as one of the pixels, so that
-points between pixels, and a little beside the
-picture, can be projected without the lens. The worst error of the fit is known, and what is worse than asked
-is refused.
+points between pixels, and a little beside the picture, can be projected without the lens. The worst error of
+the fit is known, and what is worse than asked is refused.
 """
 
 import numpy as np

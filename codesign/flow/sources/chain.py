@@ -18,8 +18,8 @@ def chained(flows_px: Tensor, valid: Tensor, hidden: Tensor | None = None) -> tu
       hidden: [K, H, W] bool: the point is hidden by something at the end of the part, so that the next flow
         read there would be that of another surface.
     Returns: flow_px [2, H, W] on the pixels of the first instant, 0 where not valid; valid [H, W]: every part
-      was, the place stayed in the picture up to the
-      last one, was not hidden before it, and never between surfaces whose flows differ by more than 0.75 px.
+      was, the place stayed in the picture up to the last one, was not hidden before it, and never between
+      surfaces whose flows differ by more than 0.75 px.
     Gradient: flows_px.
     """
     if (

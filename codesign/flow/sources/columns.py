@@ -72,8 +72,7 @@ def settled_size(
     """(height_px, width_px, phrase that says where they are from).
 
     Args: path: for messages. x, y: [N] columns and rows of the events. given: (height_px, width_px) of the
-      caller, or None. told: the same from the
-      data, or None; told_by: what told them.
+      caller, or None. told: the same from the data, or None; told_by: what told them.
     A recording that says nothing is taken to be of the smallest sensor of SENSORS_PX that holds its events.
     Raises: FileFormatError for sizes that disagree, and for an event outside, with its number.
     """

@@ -2,12 +2,11 @@
 (x_flow_dist, y_flow_dist, timestamps).
 
 A flow of the file leads from its own time to the next one's, on the raw (distorted) pixels of the left
-camera; (0, 0) means that nothing was measured. The usual
-tests take windows between grey frames: dt = 1 from one to the next, dt = 4 to the fourth. There the flow is
-  followed from its time on, whole
-intervals and linear parts of them (see chain), and is not valid where it leads out of what was measured.
+camera; (0, 0) means that nothing was measured. The usual tests take windows between grey frames: dt = 1 from
+one to the next, dt = 4 to the fourth. There the flow is followed from its time on, whole intervals and linear
+parts of them (see chain), and is not valid where it leads out of what was measured.
 Sources: Zhu et al., "The Multivehicle Stereo Event Camera Dataset", RA-L 2018; Zhu et al., EV-FlowNet, RSS
-2018 (dt = 1, 4).
+  2018 (dt = 1, 4).
 """
 
 from collections.abc import Iterable
@@ -36,14 +35,13 @@ class MvsecWindows:
 
     Args:
       folder: where NAME_data.hdf5 and NAME_gt_flow_dist.npz lie. frames: 1 or 4 grey frames per window (the
-        dt of the literature); 0: the intervals of the
-        true flow itself. bins: of the volumes. crop_px: (height, width) of a piece at a random place, or
-          None. seed: of that place.
+        dt of the literature); 0: the intervals of the true flow itself. bins: of the volumes. crop_px:
+        (height, width) of a piece at a random place, or None. seed: of that place.
       span_s: (from, to) part of the sequences in seconds after their first true flow, or None; published
         tests leave out the start and the landing.
     Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or do not
-      fit together.
-    Windows that last longer or shorter than the median by 5 percent are not used: ``left_out`` counts them.
+      fit together. Windows that last longer or shorter than the median by 5 percent are not used:
+      ``left_out`` counts them.
     """
 
     def __init__(

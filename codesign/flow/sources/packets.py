@@ -72,8 +72,8 @@ def read_packets(
       path: folder with events.txt (Event-Camera Dataset), folder or subfolders of numbered packets, one event
         file of any kind, or a zip archive.
       truth_path: flow file or folder (see read_truth), imu.txt or groundtruth.txt. None: what lies beside the
-        events, flow files before the gyroscope
-        before poses. The last two need calib.txt and give the flow of rotation alone.
+        events, flow files before the gyroscope before poses. The last two need calib.txt and give the flow of
+        rotation alone.
     Returns: [Packet], at least one. A flow over another time than its packet's is scaled linearly, and a note
       says so.
     Raises: FileFormatError, DomainError.

@@ -35,9 +35,8 @@ class DatasetWindows:
       fit together; DomainError for sequences too short.
 
     Flow over one interval is the stored one. Over several, points of the static world are carried there by
-    depth and poses through the camera's rays (exact
-    to the fit of the camera, CameraFit.error_px); points of moving objects, whose poses are not stored, along
-    the flows in between (see chain).
+    depth and poses through the camera's rays (exact to the fit of the camera, CameraFit.error_px); points of
+    moving objects, whose poses are not stored, along the flows in between (see chain).
     """
 
     def __init__(

@@ -1,9 +1,8 @@
 """Events as text, one per line: ``t x y p`` as in the Event-Camera Dataset, or what a header line says.
 
 Times with a fraction are seconds, whole ones microseconds; p is 1 and 0, or +1 and -1. Numbers are separated
-by blanks or commas. A first line of two whole
-numbers is the sensor's width and height; lines that begin with # are skipped at the top. Source: Mueggler et
-al., IJRR 2017 (layout of events.txt).
+by blanks or commas. A first line of two whole numbers is the sensor's width and height; lines that begin with
+# are skipped at the top. Source: Mueggler et al., IJRR 2017 (layout of events.txt).
 """
 
 import io

@@ -53,8 +53,8 @@ class TrueFlow:
     """One flow as its file has it.
 
     flow: [2, H, W], right and down, in the file's unit. valid: [H, W] bool. span_s: (from, to) seconds on the
-      recording's clock; None where the file has no
-    times, or one time only. name: the file, and which of its flows.
+      recording's clock; None where the file has no times, or one time only. name: the file, and which of its
+      flows.
     """
 
     flow: np.ndarray
@@ -68,10 +68,9 @@ def read_truth(path: str | Path, size_px: tuple[int, int]) -> list[TrueFlow]:
 
     Args:
       path: .flo, .png (16 bits as in DSEC), .npy, .npz or .mat (up to version 7) ([2, H, W] or [H, W, 2], or
-        several along a first axis; .npz also as a pair of components and with
-        valid and timestamps, the layout of MVSEC among them), .txt or .csv (see docs/flow_recordings.md); or
-        a folder of such files, with their times in
-        timestamps.txt or forward_timestamps.txt.
+        several along a first axis; .npz also as a pair of components and with valid and timestamps, the
+        layout of MVSEC among them), .txt or .csv (see docs/flow_recordings.md); or a folder of such files,
+        with their times in timestamps.txt or forward_timestamps.txt.
       size_px: (height, width) of the recording, which tables of text need; every flow must have it.
     Returns: [TrueFlow]. Flows that are not finite are not valid; in MVSEC's layout neither are those of
       exactly (0, 0).
