@@ -1,10 +1,9 @@
 """Ray aiming: rays that meet the real stop at given points, and the image irradiance that follows from them.
 
 Paraxial pupils are where thin pencils near the axis see the stop; off the axis the real pupil moves, tilts
-and shrinks. Aiming solves, ray by
-ray, for the point of the paraxial pupil plane through which the ray must start: Newton steps with the exact
-derivative of each ray, halved until the
-miss falls; rays that do not get there are led to their field from the axis in small steps.
+and shrinks. Aiming solves, ray by ray, for the point of the paraxial pupil plane through which the ray must
+start: Newton steps with the exact derivative of each ray, halved until the miss falls; rays that do not get
+there are led to their field from the axis in small steps.
 """
 
 import warnings
@@ -50,8 +49,7 @@ def aim_at_stop(
 
     Args:
       rays: function (points [K N, 2], share [K N, 1]) -> origin, direction [K N, 3], for the N rays K times
-        over; share scales the field from the axis (0)
-        to where it is wanted (1).
+        over; share scales the field from the axis (0) to where it is wanted (1).
       until_stop: Prescription that ends on the stop. pupil: [N, 2] points of the unit disc; the radii give it
         its size on the stop and on the pupil plane.
     Returns: Aim. Gradient: point_mm and determinant to every tensor behind ``rays``, ``until_stop`` and the

@@ -447,8 +447,8 @@ class GeoLens(Replaceable):
         Args: points_mm [N, 3] in camera axes, millimetres from the entrance pupil's centre; pupil [N, 2] on
           the unit disc, aimed at the entrance pupil.
         Returns: film_mm [N, 2] as seen upright; pupil [N, 2], the point of the exit pupil that the light
-          passed, so that ``camera_rays(film_mm, pupil)``
-          goes back to the point; passes [N] bool. Gradient: to points, pupil and lens.
+          passed, so that ``camera_rays(film_mm, pupil)`` goes back to the point; passes [N] bool. Gradient:
+          to points, pupil and lens.
         """
         f = self.first_order(wavelength_um)
         dtype = points_mm.dtype

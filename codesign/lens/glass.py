@@ -160,7 +160,7 @@ class Glass:
         um.
 
         Errors over the catalogue, median and 95th percentile: 2e-5, 1.5e-4 from 0.45 to 0.70 um; 7e-5, 1.4e-4
-          at 0.85 um.
+        at 0.85 um.
         Source: Conrady's three-term formula. Raises: DomainError.
         """
         if not all(_is_number(n) and LEAST_INDEX <= n < INDEX_LIMIT for n in (F, d, C)):
@@ -175,14 +175,11 @@ class Glass:
         """Glass from nd and the Abbe number Vd = (nd - 1) / (nF - nC), which it has exactly.
 
         The third condition is the partial dispersion (nF - nd) / (nF - nC) = 0.6831 + 0.7828 / Vd, the
-        least-squares line over 429
-        glasses of the catalogue: they scatter about it by 0.0019 (about a line in Vd by 0.0028). Errors over
-          these glasses, median,
-        95th percentile and worst: 1.6e-5, 5e-5, 3.3e-4 at F and C; 6e-5, 1.7e-4, 7e-4 from 0.45 to 0.70 um;
-          9e-5, 2.8e-4, 6e-4 at
-        g (0.4358 um); 1.1e-4, 3.7e-4, 2.2e-3 at 0.85 um. The normal line P_gF = 0.6438 - 0.001682 Vd in its
-        place has the same medians,
-        but 3.0e-4 and 1.5e-3 from 0.45 to 0.70 um: dense flints lie far from it.
+        least-squares line over 429 glasses of the catalogue: they scatter about it by 0.0019 (about a line in
+        Vd by 0.0028). Errors over these glasses, median, 95th percentile and worst: 1.6e-5, 5e-5, 3.3e-4 at F
+        and C; 6e-5, 1.7e-4, 7e-4 from 0.45 to 0.70 um; 9e-5, 2.8e-4, 6e-4 at g (0.4358 um); 1.1e-4, 3.7e-4,
+        2.2e-3 at 0.85 um. The normal line P_gF = 0.6438 - 0.001682 Vd in its place has the same medians, but
+        3.0e-4 and 1.5e-3 from 0.45 to 0.70 um: dense flints lie far from it.
         Args: nd in (1, 5); Vd from 10 to 150. Raises: DomainError.
         """
         if not (_is_number(nd) and _is_number(Vd) and LEAST_INDEX < nd < INDEX_LIMIT and 10 <= Vd <= 150):

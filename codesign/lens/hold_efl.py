@@ -20,10 +20,9 @@ def holding_surface(lens: TracedLens) -> int:
     face of a plane-parallel plate.
 
     A stop in air and a cover glass behind the lens are passed over; the plane side of a plano-convex lens is
-    not. When all are plane
-    (a design from scratch) it is the last that bends light. It goes by today's curvatures: where those of a
-    cover glass vary, name the
-    surface instead. Raises: DomainError when none does.
+    not. When all are plane (a design from scratch) it is the last that bends light. It goes by today's
+    curvatures: where those of a cover glass vary, name the surface instead. Raises: DomainError when none
+    does.
     """
     step = bending(lens.index(), lens.mirrors).detach().abs().tolist()
     curved = [abs(c) > FLAT for c in lens.curvature_per_mm.tolist()]
@@ -54,8 +53,7 @@ def hold_efl(lens: L, efl_mm: float | Tensor, surface: int | None = None) -> L:
       it is a tensor.
     Raises: DomainError when that curvature cannot do it.
     Source: the y-u trace solved for one refraction, n'u' = n u - y phi, with the surfaces behind it as a
-      linear map
-      of (y, n'u') (Smith, Modern Optical Engineering, ch. 2).
+      linear map of (y, n'u') (Smith, Modern Optical Engineering, ch. 2).
     """
     c = lens.curvature_per_mm
     t = lens.thickness_mm

@@ -1,14 +1,11 @@
 """The ray-trace kernel: one fused drjit program for a whole lens.
 
 Intersection with a conic in the form t = F / (G + sqrt(G^2 - A F)), regular at zero curvature (Welford,
-Aberrations of
-Optical Systems, ch. 4); even aspheres by Newton steps from the conic, the last one differentiable, so that
-the gradient is
-that of the implicit function; vector forms of Snell's law, reflection and the local grating equation. A ray
-that fails is frozen
-where it failed: its square roots keep safe inputs, so gradients stay finite, and it carries weight 0, a
-  status and a deficit (how
-far its radicand fell below zero; 1 where Newton steps found no point of an asphere).
+Aberrations of Optical Systems, ch. 4); even aspheres by Newton steps from the conic, the last one
+differentiable, so that the gradient is that of the implicit function; vector forms of Snell's law, reflection
+and the local grating equation. A ray that fails is frozen where it failed: its square roots keep safe inputs,
+so gradients stay finite, and it carries weight 0, a status and a deficit (how far its radicand fell below
+zero; 1 where Newton steps found no point of an asphere).
 """
 
 from dataclasses import dataclass

@@ -134,7 +134,7 @@ def system_matrix(lens: ParaxialLens, wavelength_um: float = WAVELENGTH_UM["d"])
     u). Its determinant is 1.
 
     C is minus the power per mm. Gradient: to every lens tensor that bends or moves light. Source: Gerrard and
-      Burch, Matrix Methods in Optics, ch. 2.
+    Burch, Matrix Methods in Optics, ch. 2.
     """
     power = lens.surface_power(wavelength_um)
     thickness_mm = lens.thickness_mm
@@ -200,9 +200,8 @@ class ParaxialRays:
     of the field through the centre of the stop).
 
     marginal_height_mm, chief_height_mm: [S] on each surface. marginal_angle, chief_angle: [S + 1] slopes
-      before the first surface
-    and behind each surface. invariant_mm: scalar n (chief slope x marginal height - marginal slope x chief
-      height), the same everywhere.
+      before the first surface and behind each surface. invariant_mm: scalar n (chief slope x marginal height
+      - marginal slope x chief height), the same everywhere.
     """
 
     marginal_height_mm: Tensor

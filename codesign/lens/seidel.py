@@ -1,15 +1,12 @@
 """Third-order aberrations of each surface: the Seidel sums, and the first-order colour sums.
 
 Conventions: an object at infinity; wavefront coefficients in mm, positive where the wavefront is ahead of its
-  reference sphere. With
-pupil and field coordinates rho and h that are 1 at the rims, the wavefront is
+  reference sphere. With pupil and field coordinates rho and h that are 1 at the rims, the wavefront is
     S_I rho^4 / 8 + S_II h rho^3 cos / 2 + S_III h^2 rho^2 cos^2 / 2 + (S_III + S_IV) h^2 rho^2 / 4 + S_V h^3
-    rho cos / 2.
-Undercorrected spherical aberration and the field curvature of a converging lens are positive. Field angles
-enter by their tangent.
+    rho cos / 2. Undercorrected spherical aberration and the field curvature of a converging lens are
+    positive. Field angles enter by their tangent.
 Sources: Welford, Aberrations of Optical Systems, ch. 8 to 10 (spheres, aspheres, colour; S_V in the form
-without a quotient); Sweatt,
-JOSA 67 (1977), for diffractive surfaces as thin layers of infinite index.
+  without a quotient); Sweatt, JOSA 67 (1977), for diffractive surfaces as thin layers of infinite index.
 """
 
 from dataclasses import dataclass
@@ -27,9 +24,8 @@ NAMES = ("spherical", "coma", "astigmatism", "petzval", "distortion")
 @dataclass(frozen=True)
 class SeidelSums:
     """Contributions per surface, [S] mm of wavefront each: S_I spherical, S_II coma, S_III astigmatism, S_IV
-    Petzval, S_V distortion,
-    C_I axial and C_II lateral colour (between the two outer wavelengths). ``invariant_mm``: Lagrange
-    invariant.
+    Petzval, S_V distortion, C_I axial and C_II lateral colour (between the two outer wavelengths).
+    ``invariant_mm``: Lagrange invariant.
     """
 
     spherical: Tensor

@@ -209,12 +209,11 @@ class Spectrum:
         """``count`` wavelengths of equal weight for what a sensor sees of an illuminant.
 
         The product of the curves (linear between their points, over the range they share) is cut into
-        ``count`` strata of equal
-        signal; each is represented by its signal-weighted mean wavelength, so the mean wavelength of the
-        whole is exact.
+        ``count`` strata of equal signal; each is represented by its signal-weighted mean wavelength, so the
+        mean wavelength of the whole is exact.
         Args: response, illuminant: pairs (wavelength_um [N], value [N]), increasing wavelengths, values >= 0
-          of any scale; the
-        response per unit of radiant energy (A/W) when the illuminant is in energy. count: 1 to 1000.
+          of any scale; the response per unit of radiant energy (A/W) when the illuminant is in energy. count:
+          1 to 1000.
         Raises: ShapeError, DomainError.
         """
         if isinstance(count, bool) or not isinstance(count, int) or not 0 < count <= MOST_WAVELENGTHS:
@@ -331,9 +330,8 @@ def silicon_response(depth_um: float = 5.0) -> Curve:
     value 1: (wavelength_um, value).
 
     An approximation: every photon absorbed within ``depth_um`` counts, w (1 - exp(-4 pi k depth / w));
-      reflection, the cover glass and
-    losses at the surface are left out, so a real sensor falls faster in the blue. Five micrometres is a usual
-    epitaxial layer.
+    reflection, the cover glass and losses at the surface are left out, so a real sensor falls faster in the
+    blue. Five micrometres is a usual epitaxial layer.
     Args: depth_um from 0.01 to 1000. Raises: DomainError.
     Source: Beer and Lambert's law with the extinction coefficient of Green, 2008.
     """

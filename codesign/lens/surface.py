@@ -17,8 +17,7 @@ class Phase:
     in one order.
 
     The ray gains the path m w phi / (2 pi), so a negative first coefficient converges light. blaze_um:
-    wavelength at which the
-    grating is blazed for its order; it sets ``efficiency``, None leaves that at 1.
+    wavelength at which the grating is blazed for its order; it sets ``efficiency``, None leaves that at 1.
     Source: Buralli, Morris and Rogers, Optical performance of holographic kinoforms, Applied Optics 28
       (1989).
     """

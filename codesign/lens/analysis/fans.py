@@ -17,9 +17,8 @@ class RayFan:
     was given).
 
     pupil: [M] in [-1, 1]. tangential_mm: [M] transverse aberration in y of rays (0, pupil); sagittal_mm: [M]
-      that in x of rays
-    (pupil, 0). tangential_waves, sagittal_waves: [M] optical path differences. tangential_weight,
-      sagittal_weight: [M], 0 where no ray arrives.
+      that in x of rays (pupil, 0). tangential_waves, sagittal_waves: [M] optical path differences.
+      tangential_weight, sagittal_weight: [M], 0 where no ray arrives.
     """
 
     pupil: Tensor
@@ -44,8 +43,8 @@ def ray_fan(
 
     Args:
       count: rays per diameter, odd to hold the chief ray. reference_mm: [2] image point to which both
-        aberrations refer; None is
-      the chief ray of this wavelength. Give that of a middle wavelength to see lateral colour.
+        aberrations refer; None is the chief ray of this wavelength. Give that of a middle wavelength to see
+        lateral colour.
     Gradient: aberrations to every lens tensor. Raises: DomainError when no ray, or not the chief ray,
       arrives.
     """

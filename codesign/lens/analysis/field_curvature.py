@@ -17,9 +17,8 @@ def focus_shift_mm(
     astigmatism.
 
     Rays at +-reach and +-2 reach of the pupil radius stand for the infinitely thin bundle of Coddington's
-    equations; four points
-    cancel the terms of third order in the reach, so what is left is rounding (below 1e-8 of the focal
-    length).
+    equations; four points cancel the terms of third order in the reach, so what is left is rounding (below
+    1e-8 of the focal length).
 
     Args: fields_rad: F angles. reach: share of the pupil radius.
     Returns: [F, 2] mm, tangential (rays displaced in y) then sagittal (in x); positive behind the image

@@ -42,9 +42,8 @@ def diffraction_psf(
     """Psf by a Fourier transform of the pupil, zero-padded from n to n * padding cells.
 
     The pixel is then wavelength / (2 r padding), r the pupil's radius in direction cosines: a quarter of the
-    Airy scale wavelength
-    times f-number per unit of padding 4. The picture repeats with n wavelength times f-number. Energy sums to
-    1.
+    Airy scale wavelength times f-number per unit of padding 4. The picture repeats with n wavelength times
+    f-number. Energy sums to 1.
 
     Args: grid, vignetting, defocus_mm, reference_mm: see ``pupil_function``. padding: >= 2, so that the
       energy is not aliased.
@@ -78,9 +77,8 @@ def psf_on_pixels(
     the first wavelength.
 
     The Fourier integral is summed for each pixel centre (two matrix products), so wavelengths share the grid
-    and their lateral
-    colour is in it. The energy of a pixel is the density at its centre times its area; the sum tells the
-    share that falls on the grid.
+    and their lateral colour is in it. The energy of a pixel is the density at its centre times its area; the
+    sum tells the share that falls on the grid.
 
     Args: pixel_mm: size of a square pixel. pixels: rows and columns. light: see ``spectral_lines``.
     Gradient: to every lens tensor. Raises: DomainError, see ``pupil_function``, and when the grid is wider

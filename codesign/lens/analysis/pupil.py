@@ -22,9 +22,8 @@ class PupilFunction:
     """Field on the reference sphere of one field and wavelength.
 
     field: [n, n] complex, rows along y, columns along x, on the cell centres of [-1, 1]^2 in units of
-      ``cosine_radius``, in the order of
-      rising direction cosines of the light that goes to the image point (so a point high in the pupil stands
-      at a low y); 0 outside the pupil.
+      ``cosine_radius``, in the order of rising direction cosines of the light that goes to the image point
+      (so a point high in the pupil stands at a low y); 0 outside the pupil.
     cosine_radius: [2] (x, y) half width of the pupil in direction cosines times index, as seen from the image
       point: 1 / (2 f-number).
     """
@@ -55,10 +54,9 @@ def pupil_function(
     """PupilFunction of one field: amplitude times exp(-2 pi i OPD / wavelength).
 
     Points that are even over the entrance pupil are taken as even in the direction cosines towards the image
-    point (Abbe's sine
-    condition); their scale in x and y, which holds the foreshortening off the axis, is fitted to the traced
-    rays. A cell counts when
-    its centre lies in the disc; the staircase at the rim costs about 1e-3 of MTF at 64 cells and 3e-4 at 128.
+    point (Abbe's sine condition); their scale in x and y, which holds the foreshortening off the axis, is
+    fitted to the traced rays. A cell counts when its centre lies in the disc; the staircase at the rim costs
+    about 1e-3 of MTF at 64 cells and 3e-4 at 128.
 
     Args: grid: cells across; None picks a power of two from the aberration. reference_mm: see ``wavefront``.
     Gradient: to every lens tensor. Raises: DomainError when neighbouring cells differ by more than half a

@@ -73,9 +73,8 @@ class ImageRays:
     """Rays of one field and wavelength on a plane across the axis near the image.
 
     position_mm: [M, 2] (x, y). direction: [M, 3] unit. path_mm: [M] optical path from a plane wavefront of
-      the field (one for
-    all rays) to the plane. weight: [M] >= 0, 0 for rays that do not arrive. index: refractive index in image
-      space.
+      the field (one for all rays) to the plane. weight: [M] >= 0, 0 for rays that do not arrive. index:
+      refractive index in image space.
     """
 
     position_mm: Tensor
@@ -108,8 +107,8 @@ def trace_field(
 
     Args:
       field_rad: scalar angle. pupil: [M, 2] on the unit disc. vignetting: weigh rays by the apertures' soft
-        edges; otherwise
-      every ray that arrives weighs 1. defocus_mm: distance of the plane behind the lens's own image plane.
+        edges; otherwise every ray that arrives weighs 1. defocus_mm: distance of the plane behind the lens's
+        own image plane.
     Returns: ImageRays.
     Gradient: positions, directions and paths to every lens tensor; with vignetting the weights too.
     Raises: DomainError when no ray arrives.

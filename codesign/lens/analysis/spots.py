@@ -79,8 +79,7 @@ def polychromatic_spot(
     Args: light: see ``spectral_lines``. grid: pupil cells across. vignetting, defocus_mm: see
       ``trace_field``.
     Returns: positions [W, M, 2] mm on the image plane, and weights [W, M] that sum to 1 (rays of one
-      wavelength share its weight
-      as far as they arrive).
+      wavelength share its weight as far as they arrive).
     Gradient: positions (with vignetting also weights) to every lens tensor. Raises: DomainError when no ray
       of a wavelength arrives.
     """

@@ -2,11 +2,9 @@
 ratio.
 
 The object is at infinity, so paths count from one plane wavefront across the field direction. The reference
-sphere is centred on
-the chief ray's image point (or another given point) and passes through the centre of the paraxial exit pupil.
-An optical path
-difference is positive where the wavefront is ahead of the sphere, so that undercorrected spherical aberration
-is positive (W040 = S_I / 8).
+sphere is centred on the chief ray's image point (or another given point) and passes through the centre of the
+paraxial exit pupil. An optical path difference is positive where the wavefront is ahead of the sphere, so
+that undercorrected spherical aberration is positive (W040 = S_I / 8).
 Source: Welford, Aberrations of Optical Systems, ch. 7; Born and Wolf, ch. 9.
 """
 
@@ -27,9 +25,8 @@ class Wavefront:
     """Optical path differences over the pupil.
 
     pupil: [M, 2] points of the unit disc (entrance pupil). opd_mm: [M], positive where the wavefront is
-      ahead. weight: [M], 0 where
-    no light passes. slope: [M, 2] direction cosines times index from the ray's point on the reference sphere
-      to its centre, minus those of the chief ray.
+      ahead. weight: [M], 0 where no light passes. slope: [M, 2] direction cosines times index from the ray's
+      point on the reference sphere to its centre, minus those of the chief ray.
     """
 
     pupil: Tensor

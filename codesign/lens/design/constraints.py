@@ -7,8 +7,7 @@ penalties and as a report.
     print(report(found))
 
 Every Constraint is a value, a bound and a side. Its penalty is (violation / scale)^2: zero with zero slope
-where it holds,
-so values and slopes are continuous. Surfaces are counted from 1.
+where it holds, so values and slopes are continuous. Surfaces are counted from 1.
 """
 
 from collections.abc import Collection
@@ -30,8 +29,7 @@ class Constraint:
 
     value: scalar tensor with its gradient. at_least: True for value >= bound, False for value <= bound.
     scale: the violation that costs a penalty of 1, in the unit of the value. can_bind: False where the bound
-      is also the best value
-    there is (no failed ray), so that it holds or is violated but never binds.
+      is also the best value there is (no failed ray), so that it holds or is violated but never binds.
     """
 
     name: str
@@ -135,8 +133,7 @@ def evaluate(lens: GeoLens, limits: Limits, semi_aperture_mm: Tensor | None = No
     """All constraints that ``limits`` asks for, a list of Constraint.
 
     Args: semi_aperture_mm: [S] where edges and gaps are measured (may carry a gradient); the lens's own when
-      left out. See hits for
-      semi-apertures sized by rays.
+      left out. See hits for semi-apertures sized by rays.
     Gradient: to every lens tensor the figure depends on. A least gap has that of its narrowest place.
     """
     apertures = lens.semi_aperture_mm if semi_aperture_mm is None else semi_aperture_mm

@@ -18,9 +18,8 @@ from codesign.lens.trace import trace
 @dataclass(frozen=True)
 class Hits:
     """Rays at every surface. height_mm: [S, N] distance from the vertex across the axis. cosine: [S, N] of
-    the angle of incidence, 1 where
-    the surface does not bend light. passed: [S, N], False from the surface on where a ray failed; its numbers
-      then mean nothing."""
+    the angle of incidence, 1 where the surface does not bend light. passed: [S, N], False from the surface on
+    where a ray failed; its numbers then mean nothing."""
 
     height_mm: Tensor
     cosine: Tensor

@@ -82,14 +82,12 @@ def make_design(
     """LensDesign around ``lens`` whose variables are the principal modes of ray motion.
 
     With J the motion of the rays about each spot's mean per scaled curvature and thickness, the variables are
-    the eigenvectors of
-    J^T J, each scaled to move the rays by ``step_mm`` RMS, or to change no curvature or thickness by more
-    than a tenth of its size.
-    Defocus, coma, astigmatism and so on then have separate step sizes, which a step per curvature has not.
+    the eigenvectors of J^T J, each scaled to move the rays by ``step_mm`` RMS, or to change no curvature or
+    thickness by more than a tenth of its size. Defocus, coma, astigmatism and so on then have separate step
+    sizes, which a step per curvature has not.
 
     Args: fields_rad: angles at which ray motion is measured. floors: another LensDesign whose thickness
-      floors to keep; by default
-      they are ``floor_share`` of today's centre and edge thicknesses.
+      floors to keep; by default they are ``floor_share`` of today's centre and edge thicknesses.
     """
     lens = lens.replace(
         **{name: getattr(lens, name).detach().clone() for name in LEARNABLES}
@@ -137,9 +135,8 @@ def detune(
     focal length held.
 
     Every curvature but the one that holds the focal length and the image distance get independent Gaussian
-    errors of one
-    common relative size, which is raised until the target is met. Raises: DomainError when 50 % is not
-    enough.
+    errors of one common relative size, which is raised until the target is met. Raises: DomainError when 50 %
+    is not enough.
     """
     count = design.reference.curvature_per_mm.numel()
     at = holding_surface(design.reference)

@@ -2,8 +2,7 @@
 to judge it.
 
     tolerances = Tolerances(radius_relative=1e-3, thickness_mm=0.02, index=5e-4, decentre_mm=0.01,
-    tilt_deg=0.02)
-    J = sensitivities(geo, tolerances, linear_figures(0.3))
+    tilt_deg=0.02) J = sensitivities(geo, tolerances, linear_figures(0.3))
     trials = monte_carlo(geo, tolerances, linear_figures(0.3), 1000, torch.Generator().manual_seed(0))
 
 A figure is a function from a lens to a vector [K]. Errors are independent, normal, and each number of
@@ -32,9 +31,8 @@ class Tolerances:
     """Standard deviations of independent normal errors, all at least 0; 0 leaves that kind out.
 
     radius_relative: of every radius, as a share. radius_mm: of every radius, mm. fringes: rings of Newton's
-      power fringes over the
-    semi-aperture, at 546 nm (N rings change the curvature by N wavelength / semi-aperture^2). The three add
-    in squares.
+      power fringes over the semi-aperture, at 546 nm (N rings change the curvature by N wavelength /
+      semi-aperture^2). The three add in squares.
     thickness_mm: of every thickness but the last, which is the focus. index: of every glass, the same at
       every wavelength.
     decentre_mm: of every surface, in x and in y. tilt_deg: of every surface, about x and about y.
@@ -128,8 +126,7 @@ def linear_figures(
     grid: int = 8,
 ) -> Figures:
     """Figures that errors change in proportion: the function lens -> [5] of EFL, BFL, distortion at the field
-    (relative), and the x and y of the
-    axial spot's mean point; lengths in mm. Names: LINEAR_FIGURES.
+    (relative), and the x and y of the axial spot's mean point; lengths in mm. Names: LINEAR_FIGURES.
 
     Args: compensate: lens -> lens applied first, such as solves.focus_paraxial; None changes nothing.
     """
@@ -158,9 +155,8 @@ def sensitivities(
     ``errors_of``.
 
     Args: figures: lens -> [K]. jacobian: optimise.by_autograd for analytic gradients (K backward passes, best
-      for few figures), or
-      optimise.by_differences(step), step in standard deviations; central differences of 0.1 when left out (2
-      P evaluations).
+      for few figures), or optimise.by_differences(step), step in standard deviations; central differences of
+      0.1 when left out (2 P evaluations).
     Gradient: none.
     """
     errors = errors_of(lens, tolerances)
@@ -227,9 +223,8 @@ def monte_carlo(
 @dataclass(frozen=True)
 class Comparison:
     """Linear forecast against trials, each [K]: standard deviations forecast and simulated, the correlation
-    of the changes forecast and simulated
-    trial by trial, and how far the mean moved, in simulated standard deviations (0 for a figure that is
-    linear)."""
+    of the changes forecast and simulated trial by trial, and how far the mean moved, in simulated standard
+    deviations (0 for a figure that is linear)."""
 
     forecast: Tensor
     simulated: Tensor

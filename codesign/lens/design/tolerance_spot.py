@@ -2,11 +2,9 @@
 ray errors themselves stay linear.
 
 With r the ray errors of the nominal lens about their spot's mean (divided by the root of the ray count, so
-that r.r is the squared RMS
-spot) and A their change per standard deviation of each error, an error e gives |r + A e|^2. For independent
-normal e this has mean
-r.r + tr(A^T A) and variance 4 |A^T r|^2 + 2 tr((A^T A)^2). What is left out is the curvature of the rays
-themselves, r . d2r / de2.
+that r.r is the squared RMS spot) and A their change per standard deviation of each error, an error e gives |r
++ A e|^2. For independent normal e this has mean r.r + tr(A^T A) and variance 4 |A^T r|^2 + 2 tr((A^T A)^2).
+What is left out is the curvature of the rays themselves, r . d2r / de2.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,8 +22,8 @@ from codesign.lens.glass import WAVELENGTH_UM
 @dataclass(frozen=True)
 class SpotForecast:
     """Per field: nominal [F] squared RMS spot, linear [F, P] its slope 2 A^T r, added [F, P] the diagonal of
-    A^T A (mean square that each error
-    adds), square [F, P, P] all of A^T A. In mm^2 and per standard deviation."""
+    A^T A (mean square that each error adds), square [F, P, P] all of A^T A. In mm^2 and per standard
+    deviation."""
 
     nominal: Tensor
     linear: Tensor

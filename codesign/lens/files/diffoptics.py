@@ -13,9 +13,8 @@ def read_diffoptics(text: str, name: str) -> FileLens:
     """FileLens of the text of a table.
 
     The distance of a row leads to it from the row before; radius 0 is a plane; the numbers behind the
-    material are the conic constant and the
-    coefficients of r^4, r^6, ... The row A is the stop, else the surface with the smallest diameter. Raises:
-    FileFormatError naming the row.
+    material are the conic constant and the coefficients of r^4, r^6, ... The row A is the stop, else the
+    surface with the smallest diameter. Raises: FileFormatError naming the row.
     """
     table = [(i, line.split()) for i, line in lines(text) if line.strip()]
     if len(table) < 4 or [w.lower() for w in table[1][1][:3]] != ["type", "distance", "roc"]:

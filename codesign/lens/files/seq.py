@@ -21,9 +21,8 @@ def read_seq(text: str, name: str) -> FileLens:
     """FileLens of the text of a .seq file.
 
     Without RDM, the first number of S is a curvature; without STO, the first surface is the stop (the
-    program's own defaults).
-    Solves and pickups keep the stored values; PIM is solved again. Raises: FileFormatError naming surface or
-    line for what is not understood.
+    program's own defaults). Solves and pickups keep the stored values; PIM is solved again. Raises:
+    FileFormatError naming surface or line for what is not understood.
     """
     system = System(name)
     for line, words in statements(text):

@@ -17,9 +17,9 @@ def to_zmx(lens: GeoLens) -> str:
     """The text of a .zmx file of the lens's current values; numbers keep all their digits.
 
     Kept: curvatures, thicknesses and aspheres with their signs along a fixed axis, conics, stop, apertures
-      and central obstructions, mirrors, diffractive phases,
-    entrance pupil diameter, half field, name. A glass of the catalogue keeps its name; any other becomes a
-    model glass of nd and Vd. Not kept: the width of the soft edges.
+      and central obstructions, mirrors, diffractive phases, entrance pupil diameter, half field, name. A
+      glass of the catalogue keeps its name; any other becomes a model glass of nd and Vd. Not kept: the width
+      of the soft edges.
     Raises: DomainError for values that cannot be; FileFormatError for what a centred .zmx surface cannot
       hold.
     """
