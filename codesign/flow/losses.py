@@ -36,8 +36,8 @@ _MOST = 2.5
 
 
 def charbonnier(squared: Tensor, epsilon: float, exponent: float = 0.5) -> Tensor:
-    """(s + epsilon^2)^exponent - epsilon^(2 exponent) of squared lengths s: 0 at 0, smooth, s^exponent far
-    away. Source: Charbonnier et al., ICIP 1994; Sun et al., IJCV 2014."""
+    """(s + epsilon^2)^exponent - epsilon^(2 exponent) of squared lengths s: 0 at 0 to rounding, smooth,
+    s^exponent far away. Source: Charbonnier et al., ICIP 1994; Sun et al., IJCV 2014."""
     return (squared + epsilon**2) ** exponent - epsilon ** (2 * exponent)
 
 
