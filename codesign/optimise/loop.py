@@ -60,10 +60,15 @@ class Loop:
         shrink: float = 0.5,
         schedule: Callable[[int], float] | None = None,
     ) -> None:
-        if (clip is not None and not clip > 0) or judge_every < 1 or not 0 < shrink <= 1:
+        if (
+            (clip is not None and not clip > 0)
+            or judge_every < 1
+            or not 0 < shrink <= 1
+            or (patience or 0) < 0
+        ):
             raise DomainError(
                 f"loop: clip {clip} must be above 0 (or None), judge_every {judge_every} at least 1, shrink "
-                f"{shrink} above 0 and at most 1."
+                f"{shrink} above 0 and at most 1, patience {patience} at least 0 (or None)."
             )
         self.optimiser = optimiser
         self.samples = samples
@@ -73,6 +78,10 @@ class Loop:
         self.patience = patience
         self.shrink = shrink
         self.schedule = schedule
+        if isinstance(optimiser, torch.optim.LBFGS):
+            raise DomainError(
+                "loop: LBFGS asks for the loss several times a step; choose an optimiser that asks once."
+            )
         self.parameters = [p for group in optimiser.param_groups for p in group["params"]]
         check_parameters(self.parameters)
         self.record = Record()

@@ -1,7 +1,7 @@
 """Placement: a camera mount on a robot body, and what the camera can tell from there about the body's
 motion."""
 
-from codesign.place.mount import Mount
+from codesign.place.mount import Mount, yaw_pitch_roll_rad
 from codesign.place.observability import information, planar_flow, velocity_from_flow
 
-__all__ = ["Mount", "information", "planar_flow", "velocity_from_flow"]
+__all__ = ["Mount", "information", "planar_flow", "velocity_from_flow", "yaw_pitch_roll_rad"]

@@ -236,6 +236,12 @@ def choose(camera: Camera, scene: Any, T_world_cam: Tensor, seed: int = 0) -> di
     camera, whose disagreement is their noise. A way passes within PASSES plus that noise, of which no more
     than PASSES counts. Two frames are looked at.
     """
+    # a lens with variables makes its tensors anew whenever it is asked: differentiate one that holds them
+    held = {
+        name: value.detach().clone().requires_grad_() for name, value in lens_tensors(camera.lens).items()
+    }
+    if held and hasattr(camera.lens, "replace"):
+        camera = camera.with_lens(camera.lens.replace(**held))
     which = [0, -1] if T_world_cam.shape[0] > 1 else [0]
     scene = at_frames(scene, which)
     poses = T_world_cam.detach()[which]

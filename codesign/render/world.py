@@ -22,6 +22,9 @@ class MitsubaScene:
 
     dtype = torch.float32
 
+    def __deepcopy__(self, memo):
+        return self  # a scene is never changed, so copies of what holds it share it
+
     def __init__(self, description: Mapping[str, Any], device: str = "cpu", *, merge: bool = True):
         self.mi = backend.mitsuba(device)
         self._outline = None

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
@@ -42,12 +43,15 @@ def check_batch(batch: Any, scene: Any, has_trajectory: bool) -> None:
                 "System(trajectory=...)."
             )
         return
+    if not torch.is_tensor(poses):
+        raise ShapeError(f"the batch's poses are a {type(poses).__name__}; give a tensor [..., T, 4, 4].")
     if poses.ndim < 3 or poses.shape[-2:] != (4, 4):
         raise ShapeError(f"the batch's poses must be [..., T, 4, 4], got {tuple(poses.shape)}.")
-    if batch.t_s.ndim != 1 or poses.shape[-3] != batch.t_s.numel():
+    times = torch.as_tensor(batch.t_s)
+    if times.ndim != 1 or poses.shape[-3] != times.numel():
         raise ShapeError(
             f"the batch has poses at {poses.shape[-3]} times (shape {tuple(poses.shape)}) and t_s of shape "
-            f"{tuple(batch.t_s.shape)}; give one time per pose."
+            f"{tuple(times.shape)}; give one time per pose."
         )
 
 

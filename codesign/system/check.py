@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import GradientError, ShapeError
+from codesign.errors import GradientError, NonFiniteError, ShapeError
 from codesign.system.result import JUNCTIONS, Result
 from codesign.system.system import System
 
@@ -37,31 +37,62 @@ def check(
     run = system.begin(batch)
     if hasattr(run["camera"], "check"):
         run["camera"].check()
+    _check_fresh(system)
     result = system(batch, objectives=objectives, probe=True)
+    cut = _where_cut(result)
     reached = [False] * len(wanted)
     for name, value in result.objectives.items():
         if value.numel() != 1:
             raise ShapeError(
                 f"objective '{name}' has shape {tuple(value.shape)}; reduce it to one number, for example by mean()."
             )
+        if not bool(value.detach().isfinite()):
+            raise NonFiniteError(
+                f"objective '{name}' is {float(value.detach())}; the objective itself has the cause."
+            )
         if not wanted:
             continue
+        if cut is not None:
+            raise GradientError(
+                f"objective '{name}' cannot see what lies before junction '{cut}': the stage that makes it passes no "
+                "gradient on (a detach, a no_grad, or a hard sensor); exchange that stage."
+            )
         found = [None] * len(wanted)
         if value.requires_grad:
             found = torch.autograd.grad(value, wanted, retain_graph=True, allow_unused=True)
         if all(g is None for g in found):
             raise GradientError(
-                f"objective '{name}' depends on none of the variables; {_where_cut(result)} Leave it out, or "
-                "optimise something that it sees."
+                f"objective '{name}' depends on none of the variables; optimise something that it sees, and make the "
+                "optimiser after the variables (geo.variables, mount.variables)."
+            )
+        if all(g is None or not bool(g.any()) for g in found):
+            raise GradientError(
+                f"the gradient of objective '{name}' is exactly 0 for every variable: nothing moves or nothing is seen "
+                "in this batch, or no event comes about; give motion, texture, or lower thresholds."
             )
         reached = [yes or g is not None for yes, g in zip(reached, found, strict=True)]
-    for number, variable in enumerate(wanted):
+    for number, variable in enumerate(wanted if variables is not None else []):
         if not reached[number]:
+            stale = (
+                "" if id(variable) in names else " (no parameter of the system: made before its variables?)"
+            )
             raise GradientError(
-                f"no objective ({', '.join(result.objectives)}) depends on {_name(names, variable, number)}; leave "
-                "it out of the optimiser, or add an objective that sees it."
+                f"no objective ({', '.join(result.objectives)}) depends on {_name(names, variable, number)}{stale}; "
+                "leave it out of the optimiser, or add an objective that sees it."
             )
     return result
+
+
+def _check_fresh(system: System) -> None:
+    """Raise GradientError for a lens whose tensors were computed once from variables: a second backward pass would
+    go through a graph that is gone."""
+    lens = system.camera.lens if hasattr(system.camera, "rays") else None
+    buffers = list(lens.buffers()) if isinstance(lens, torch.nn.Module) else []
+    if any(tensor.grad_fn is not None for tensor in buffers):
+        raise GradientError(
+            "stage 'camera': its lens was computed once from other tensors (focus_at, replace), so only one step could "
+            "go back through it; use variables(..., focus_at_m=...), or give camera as a function that makes it anew."
+        )
 
 
 def _tensors(system: System, variables: Any) -> list[Tensor]:
@@ -76,18 +107,14 @@ def _name(names: dict[int, str], variable: Tensor, number: int) -> str:
     return f"variable '{names[id(variable)]}'" if id(variable) in names else f"variable {number}"
 
 
-def _where_cut(result: Result) -> str:
-    """A sentence that names the first junction without a gradient behind one that has it."""
+def _where_cut(result: Result) -> str | None:
+    """The first junction behind the lens without a gradient whose predecessor has one; None where there is none."""
     junctions = result.junctions or {}
-    present = [name for name in JUNCTIONS if junctions.get(name)]
-    had = False
-    for name in present:
+    made = [name for name in JUNCTIONS[2:] if junctions.get(name)]
+    had = any(t.requires_grad for name in JUNCTIONS[:2] for t in junctions.get(name, ()))
+    for name in made:
         has = any(t.requires_grad for t in junctions[name])
-        if had and not has and name != "pose":
-            return f"the graph is cut in the stage before junction '{name}'."
+        if had and not has:
+            return name
         had = had or has
-    return (
-        "no junction carries a gradient."
-        if not had
-        else "the objective itself does not use what carries one."
-    )
+    return None

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from codesign.errors import DomainError, NonFiniteError
+from codesign.errors import DomainError, NonFiniteError, ShapeError
 from codesign.types import EventVolume, FlowField, Rays
 
 JUNCTIONS = ("lens", "pose", "rays", "frames", "events", "flow", "estimate")
@@ -61,7 +61,15 @@ class Result:
             raise DomainError(
                 f"there is no objective '{unknown[0]}'; there are {', '.join(self.objectives)}."
             )
-        torch.stack([weight * self.objectives[name] for name, weight in weights.items()]).sum().backward()
+        if not weights:
+            raise DomainError(f"no objective is given a weight; there are {', '.join(self.objectives)}.")
+        for name in weights:
+            if self.objectives[name].numel() != 1:
+                raise ShapeError(
+                    f"objective '{name}' has shape {tuple(self.objectives[name].shape)}; reduce it to one number, "
+                    "for example by mean()."
+                )
+        sum(weight * self.objectives[name].reshape(()) for name, weight in weights.items()).backward()
         for name in reversed(JUNCTIONS):
             grads = [t.grad for t in (self.junctions or {}).get(name, ()) if t.grad is not None]
             if any(not bool(g.isfinite().all()) for g in grads):

@@ -36,6 +36,10 @@ class Stage:
     """
 
     def __init__(self, name: str, call: Callable[..., Any], inputs: int):
+        if inspect.isclass(call):
+            raise DomainError(
+                f"stage '{name}' is the class {call.__name__}; give an instance: {call.__name__}()."
+            )
         if not callable(call):
             raise DomainError(f"stage '{name}' is a {type(call).__name__}; give a Module or a function.")
         self.name = name

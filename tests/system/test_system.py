@@ -1,5 +1,7 @@
 """The system on plain algebra, where every junction's gradient is known: probes, recordings, names, refusals."""
 
+import copy
+import math
 from types import SimpleNamespace
 
 import pytest
@@ -36,6 +38,9 @@ class ToyCamera:
         twin = ToyCamera(self.lens)
         twin.seed = seed
         return twin
+
+    def with_lens(self, lens):
+        return ToyCamera(lens)
 
     def rays(self):
         a = self.lens.efl_mm
@@ -285,11 +290,13 @@ def test_check_finds_a_frozen_variable_one_that_no_objective_sees_and_a_cut_grap
     lens = system.lens
     assert check(system, BATCH, torch.optim.SGD([lens.efl_mm], lr=0.1)).loss.item() == pytest.approx(9.0)
     stray = nn.Parameter(torch.zeros(2))
-    with pytest.raises(GradientError, match=r"no objective \(square\) depends on variable 1; leave it out"):
+    with pytest.raises(
+        GradientError, match=r"no objective \(square\) depends on variable 1 \(no parameter of the system"
+    ):
         check(system, BATCH, [lens.efl_mm, stray])
     with pytest.raises(
         GradientError,
-        match="depends on none of the variables; the graph is cut in the stage before junction 'events'",
+        match="cannot see what lies before junction 'events'",
     ):
         check(system.replaced(events=lambda frames: doubled(frames.detach())), BATCH, [lens.efl_mm])
     lens.efl_mm.requires_grad_(False)
@@ -303,3 +310,69 @@ def test_check_wants_scalars():
     system = toy(objectives={"each": lambda field: field.flow_px.reshape(1, 1).expand(2, 1)})
     with pytest.raises(ShapeError, match=r"objective 'each' has shape \(2, 1\); reduce it to one number"):
         check(system, BATCH)
+
+
+def test_a_copy_is_independent_and_whole():
+    system = toy()
+    twin = copy.deepcopy(system)
+    with torch.no_grad():
+        twin.lens.efl_mm.mul_(2)
+    assert system(BATCH).loss.item() == pytest.approx(9.0)
+    assert twin(BATCH).loss.item() == pytest.approx(36.0)
+    twin(BATCH).backward()
+    assert system.lens.efl_mm.grad is None
+
+
+def test_parts_can_be_exchanged_in_place_and_are_looked_at():
+    system = toy()
+    system.events = volume_of
+    assert system(BATCH).loss.item() == pytest.approx(2.25)  # (3 * 0.5)^2
+    system.lens = Glass(1.0)
+    assert system(BATCH).loss.item() == pytest.approx(9.0)
+    system.camera = ToyCamera(Glass(2.0))
+    assert system(BATCH).loss.item() == pytest.approx(36.0)
+    with pytest.raises(DomainError, match="stage 'flow' asks for 'gain'"):
+        system.flow = lambda volume, gain: volume
+    with pytest.raises(DomainError, match="is the class Linear; give an instance"):
+        system.flow = nn.Linear
+    with pytest.raises(DomainError, match="no part 'event', did you mean 'events'"):
+        system.replaced(event=doubled)
+
+
+def test_samples_that_are_not_those_of_the_batch_are_refused():
+    poses = torch.eye(4, dtype=torch.float64).expand(3, 2, 4, 4)
+    with pytest.raises(ShapeError, match=r"'events' holds 1 sample\(s\) and the batch has 3"):
+        toy()(Batch(poses, T_S, "wall"), recorded={"frames": torch.ones(1, 1, 1, 1)})
+    one = field_of(torch.ones(1, 2, 1, 1))
+    three = toy(
+        render=lambda: torch.ones(3, 2, 1, 1),
+        events=lambda frames: frames[:, 1:, None].expand(-1, -1, 2, -1, -1),
+    )
+    seen = {"error": lambda field, truth: (field.flow_px - truth.flow_px).sum()}
+    with pytest.raises(ShapeError, match=r"'truth' holds 1 sample\(s\)"):
+        three.replaced(objectives=seen, bins=1)(Batch(poses, T_S, "wall", truth=one))
+
+
+def test_objectives_are_scalar_tensors():
+    with pytest.raises(DomainError, match="objective 'square' returned a float"):
+        toy(objectives={"square": lambda field: 1.0})(BATCH)
+    vector = toy(objectives={"each": lambda field: field.flow_px.expand(1, 1, 1, 2)})(BATCH)
+    with pytest.raises(ShapeError, match=r"objective 'each' has shape \(1, 1, 1, 2\)"):
+        vector.backward()
+    with pytest.raises(DomainError, match="asks for 'estimate', but the system has no such stage"):
+        toy(objectives={"task": lambda estimate: estimate})
+
+
+def test_check_finds_nan_a_flow_that_passes_no_gradient_and_a_lens_computed_once():
+    with pytest.raises(NonFiniteError, match="objective 'nan' is nan"):
+        check(toy(objectives={"nan": lambda field: field.flow_px.sum() * math.nan}), BATCH)
+    system = toy(flow=torch.no_grad()(tripled))
+    through_truth = {"error": lambda field, camera: field.flow_px.sum() + camera.lens.efl_mm}
+    with pytest.raises(GradientError, match="cannot see what lies before junction 'flow'"):
+        check(system.replaced(objectives=through_truth), BATCH, [system.lens.efl_mm])
+    with pytest.raises(GradientError, match="exactly 0 for every variable"):
+        check(toy(flow=lambda volume: field_of(0 * volume.counts[:, 0])), BATCH)
+    once = toy()
+    once.lens.register_buffer("made", 2 * once.lens.efl_mm)
+    with pytest.raises(GradientError, match="computed once from other tensors"):
+        check(once, BATCH)
