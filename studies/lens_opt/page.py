@@ -72,7 +72,7 @@ def write(run, job, lenses, history, junctions, found):
     done = list(range(1, len(record.loss) + 1))
     losses = {
         "each step, its own cases": (done, record.loss),
-        "fixed training cases": (record.judged_step, record.score),
+        "fixed training cases, hard sensor": (record.judged_step, record.score),
     }
     run.figure(
         chain_figures.curves(losses, _loss_label(run.config.objective)),
