@@ -22,7 +22,7 @@ class Descent(torch.optim.Optimizer):
 
     Args: params: as for any torch optimiser. lr: length of a step per unit of velocity. momentum: 0 to below 1.
       pull: >= 0. normalised: make every step of length lr, whatever the velocity's. grain: 1 over the spacing of
-      the grid; 0 for none.
+      the grid, on which steps below half its spacing do nothing; 0 for none.
     Raises: DomainError for numbers outside these ranges.
 
     >>> import torch

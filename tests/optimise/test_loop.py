@@ -171,3 +171,7 @@ def test_what_cannot_be_optimised_is_refused_before_the_first_step():
         Loop(torch.optim.SGD([y], lr=1.0), lambda step: []).resume(*other.state())
     with pytest.raises(DomainError, match=r"momentum 1\.0 in"):
         Descent([y], lr=0.1, momentum=1.0)
+    with pytest.raises(DomainError, match="LBFGS asks for the loss several times"):
+        Loop(torch.optim.LBFGS([y]), lambda step: [])
+    with pytest.raises(DomainError, match="patience -1 at least 0"):
+        Loop(torch.optim.SGD([y], lr=1.0), lambda step: [], patience=-1)
