@@ -162,7 +162,7 @@ def detune(
             if high > 0.5:
                 raise DomainError(
                     f"detuning along this direction never reaches an RMS spot of {target_mm:.4g} mm; choose "
-                    "another seed."
+                    "another seed, or a smaller spot."
                 )
         for _ in range(40):
             middle = (low + high) / 2
