@@ -32,6 +32,7 @@ SCORES = (
     "error_first_mrad",
     "error_last_mrad",
     "seconds_per_step",
+    "cpu_seconds_per_step",
     "certificate_error",
     "certificate_cosine",
 )

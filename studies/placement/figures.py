@@ -135,7 +135,7 @@ def scatter(held_out, path, best):
         ("start", path.T_body_cam[0], "0.6", "o"),
         ("end", best, "#d62728", "o"),
     ):
-        estimate = held_out.estimate(mount, "sensor")
+        estimate = held_out.begin(mount, "sensor")["estimate"]
         for k, axis in enumerate(axes):
             axis.plot(
                 truth[:, k], estimate[:, k], marker, color=colour, ms=5, mec="white", mew=0.5, label=label

@@ -1,6 +1,7 @@
 """Pieces of the placement study: poses, depth, gradients against differences, and a search that gets
 somewhere."""
 
+import json
 import math
 
 import pytest
@@ -10,6 +11,8 @@ from codesign.grad import certify
 from codesign.place import Mount
 from codesign.pose import check_poses
 from codesign.render.truth import world_points
+from studies.frame.run import main
+from studies.placement import __main__ as placement
 from studies.placement.search import descend, draw_mount, grid_mounts
 from studies.placement.task import HALF_RANGE_M, NOMINAL_M, footprint, make_task, nearness, planar
 
@@ -139,3 +142,12 @@ def test_drawn_and_grid_mounts_are_where_they_should_be(generator):
         rtol=0,
         atol=1e-7,
     )
+
+
+def test_the_study_runs_to_its_page(tmp_path):
+    sizes = ["--starts", "1", "--steps", "1", "--motions", "1", "--pitches", "1", "--yaws", "2"]
+    assert main(placement.study, placement.Config, [*sizes, "--out", str(tmp_path / "run")]) == 0
+    found = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert found["grid_mounts"] == 2
+    assert found["control_no_texture_error"] > 1  # nothing to see: no better than answering zero
+    assert (tmp_path / "run" / "report.html").exists()
