@@ -21,7 +21,8 @@ class Descent(torch.optim.Optimizer):
     parameter); parameter <- parameter - lr velocity.
 
     Args: params: as for any torch optimiser. lr: length of a step per unit of velocity. momentum: 0 to below 1.
-      pull: >= 0. normalised: make every step of length lr, whatever the velocity's. grain: 1 over the spacing of
+      pull: >= 0. normalised: every gradient counts by its direction alone, and
+      every step has length lr. grain: 1 over the spacing of
       the grid, on which steps below half its spacing do nothing; 0 for none.
     Raises: DomainError for numbers outside these ranges.
 
@@ -55,20 +56,26 @@ class Descent(torch.optim.Optimizer):
         """One step from the gradients in ``.grad``; parameters without one only feel pull and momentum."""
         value = None if closure is None else closure()
         for group in self.param_groups:
-            velocities = [self._velocity(p, group) for p in group["params"]]
-            length = math.sqrt(sum(float(v.square().sum()) for v in velocities))
-            reach = group["lr"] / max(length, 1e-300) if group["normalised"] else group["lr"]
+            slopes = [torch.zeros_like(p) if p.grad is None else p.grad for p in group["params"]]
+            share = 1 / _length(slopes) if group["normalised"] else 1.0
+            velocities = [
+                self._velocity(p, share * g, group) for p, g in zip(group["params"], slopes, strict=True)
+            ]
+            reach = group["lr"] / _length(velocities) if group["normalised"] else group["lr"]
             for parameter, velocity in zip(group["params"], velocities, strict=True):
                 moved = parameter - reach * velocity
                 grain = group["grain"]
                 parameter.copy_((moved * grain).round() / grain if grain else moved)
         return value
 
-    def _velocity(self, parameter: torch.Tensor, group: dict[str, Any]) -> torch.Tensor:
+    def _velocity(self, parameter: torch.Tensor, slope: torch.Tensor, group: dict[str, Any]) -> torch.Tensor:
         state = self.state[parameter]
         if "velocity" not in state:
             state["velocity"] = torch.zeros_like(parameter)
-        slope = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
         pulled = slope + group["pull"] * parameter
         state["velocity"] = group["momentum"] * state["velocity"] + (1 - group["momentum"]) * pulled
         return state["velocity"]
+
+
+def _length(vectors: list[torch.Tensor]) -> float:
+    return max(math.sqrt(sum(float(v.square().sum()) for v in vectors)), 1e-300)

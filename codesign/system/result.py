@@ -69,7 +69,8 @@ class Result:
                     f"objective '{name}' has shape {tuple(self.objectives[name].shape)}; reduce it to one number, "
                     "for example by mean()."
                 )
-        sum(weight * self.objectives[name].reshape(()) for name, weight in weights.items()).backward()
+        parts = [weight * self.objectives[name].reshape(()) for name, weight in weights.items()]
+        torch.stack(parts).sum().backward()
         for name in reversed(JUNCTIONS):
             grads = [t.grad for t in (self.junctions or {}).get(name, ()) if t.grad is not None]
             if any(not bool(g.isfinite().all()) for g in grads):

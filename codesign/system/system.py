@@ -107,7 +107,7 @@ class System(nn.Module):
                     f"stage '{name}' is a lens; put it into a camera: render.Camera(lens, ...)."
                 )
             Stage(name, value, PARTS[name])  # refuses what it cannot call
-        super().__setattr__(name, value)
+        super().__setattr__(name, value)  # pyright: ignore[reportArgumentType] - None and functions are parts too
 
     def forward(
         self,
