@@ -21,9 +21,8 @@ class Descent(torch.optim.Optimizer):
     parameter); parameter <- parameter - lr velocity.
 
     Args: params: as for any torch optimiser. lr: length of a step per unit of velocity. momentum: 0 to below 1.
-      pull: >= 0. normalised: every gradient counts by its direction alone, and
-      every step has length lr. grain: 1 over the spacing of
-      the grid, on which steps below half its spacing do nothing; 0 for none.
+      pull: >= 0. normalised: every gradient counts by its direction alone, and every step has length lr. grain:
+      1 over the spacing of the grid, on which steps below half its spacing do nothing; 0 for none.
     Raises: DomainError for numbers outside these ranges.
 
     >>> import torch
