@@ -28,7 +28,6 @@ from studies.lens_opt.task import (
     TRAINING,
     DesignedCamera,
     LensTask,
-    bins_of,
     draw_case,
     make_task,
     make_worlds,
@@ -157,7 +156,7 @@ def prepare(config: Config) -> Job:
     camera = DesignedCamera(task, config.samples)
     every_px = 2 if config.train_network else 8  # a network is taught at more pixels than a lens needs
     system = task.system(camera, layer, stage, config.objective, every_px)
-    hard = system.replaced(events=HardSensor(SENSOR, bins_of(stage)))
+    hard = system.replaced(events=HardSensor(SENSOR, system.bins))
     scored = [draw_case(pool, 7_000_000 + i) for i in range(config.scored)]
 
     def penalty():
