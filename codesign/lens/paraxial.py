@@ -248,6 +248,27 @@ def paraxial_rays(
     return ParaxialRays(y, angles, y_bar, chief_angles, starts[1][1] * starts[0][0])
 
 
+def focused_image(
+    lens: ParaxialLens, vergence_per_mm: float | Tensor = 0.0, wavelength_um: float = WAVELENGTH_UM["d"]
+) -> tuple[Tensor, Tensor]:
+    """Height and reduced angle (n u) behind the last vertex of the ray of an axial point that crosses the
+    first vertex plane at height 1, so that its image lies -height n / angle behind the last vertex.
+
+    Args: vergence_per_mm: 1 / distance of the point from the entrance pupil of the d line, scalar or [D].
+    Returns: two tensors of the shape of the vergence. Gradient: to it, and to every lens tensor that bends or
+      moves light.
+    """
+    power = lens.surface_power(wavelength_um)
+    index = lens.index(wavelength_um)
+    vergence = torch.as_tensor(vergence_per_mm, dtype=power.dtype, device=power.device)
+    # seen from the first vertex
+    vergence = vergence / (1 - vergence * lens.first_order().entrance_pupil_z_mm)
+    heights, angles = yu_trace(
+        power, lens.thickness_mm, index, torch.ones_like(vergence), index[0] * vergence
+    )
+    return heights[-1], angles[-1]
+
+
 def circle_of_confusion_mm(thin: IdealLens, distance_m: float | Tensor) -> Tensor:
     """Diameter on the film of the blur of an axial object point, D |s (1/f - 1/d) - 1| for pupil D, film
     distance s and object distance d from the lens.

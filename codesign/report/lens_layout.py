@@ -13,9 +13,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from codesign.errors import FileFormatError
-from codesign.lens.analysis.rays import source_rays
+from codesign.lens.analysis.rays import field_rays
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.surface import sag_mm
 
 COLOURS = ("#1b6ca8", "#2e8b57", "#c0392b", "#8e44ad")
@@ -134,7 +133,7 @@ def ray_paths(lens: GeoLens, field_rad: float, pupil: Tensor, start_z_mm: float)
     off behind each surface."""
     surfaces = lens.to_surfaces()
     with torch.no_grad():
-        origin, direction = source_rays(lens, field_rad, pupil, WAVELENGTH_UM["d"])
+        origin, direction = field_rays(lens, field_rad, pupil)
         origin = origin + direction * ((start_z_mm - origin[:, 2:]) / direction[:, 2:])
         points = [torch.stack([origin[:, 2], origin[:, 1]], 1)]
         z = 0.0

@@ -1,5 +1,4 @@
-"""The rays every analysis of a lens is made of: one field of an object at infinity, traced to the image
-plane."""
+"""The rays every analysis of a lens is made of: the light of object points, traced to the image plane."""
 
 import math
 from collections.abc import Sequence
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
+from codesign.lens.distance import PARALLEL, Distances, vergence_per_mm
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.traced import TracedLens
 
@@ -37,44 +37,85 @@ def pupil_grid(count: int, dtype: torch.dtype = torch.float64, device: torch.dev
     return points[points.square().sum(1) <= 1]
 
 
+@dataclass(frozen=True)
+class SourceRays:
+    """Rays of object points before the lens, with leading axes [...] of distances and fields.
+
+    origin_mm, direction: [..., M, 3]. path_mm: [..., M] distance from the wavefront of the object point that
+      passes through the centre of the entrance pupil; a sphere, or the plane of parallel light.
+    """
+
+    origin_mm: Tensor
+    direction: Tensor
+    path_mm: Tensor
+
+
+def source_rays(
+    lens: TracedLens,
+    fields_rad: float | Sequence[float] | Tensor,
+    pupil: Tensor,
+    at_m: Distances = PARALLEL,
+    start_z_mm: float = -5.0,
+) -> SourceRays:
+    """The rays all analyses start with; the one place that decides where pupil points lie (on the paraxial
+    entrance pupil of the d line) and where object points do.
+
+    The object point of a field lies on the plane ``at_m`` before the entrance pupil and is seen under the field
+    angle from the pupil's centre. Its light reaches the pupil point q along (q / distance + (0, tan field), 1),
+    which holds for parallel light too.
+
+    Args: fields_rad: an angle in +y, or F of them. pupil: [M, 2] on the unit disc. at_m: a distance, or D of them;
+      see ``vergence_per_mm``. start_z_mm: plane on which the rays are given, from the first vertex.
+    Returns: SourceRays with the axes [D, F], as far as several were given.
+    Gradient: to the lens, whose pupil moves, and to at_m. Raises: DomainError for a distance inside the lens.
+    """
+    if pupil.ndim != 2 or pupil.shape[1] != 2 or pupil.shape[0] == 0:
+        raise ShapeError(f"pupil points must be [M >= 1, 2], got {tuple(pupil.shape)}.")
+    f = lens.first_order()
+    fields = torch.as_tensor(fields_rad, dtype=torch.float64)
+    sine, cosine = fields.sin().to(pupil), fields.cos().to(pupil)
+    vergence = vergence_per_mm(lens, at_m, f.entrance_pupil_z_mm).reshape(-1, *[1] * fields.ndim)
+    towards = torch.stack([torch.zeros_like(sine), sine, cosine], -1)[..., None, :]
+    near = (vergence * cosine)[..., None]  # 1 / distance of the object point from the pupil's centre
+    point = torch.nn.functional.pad(pupil * (f.entrance_pupil_diameter_mm / 2), (0, 1))
+    along = towards + near[..., None] * point
+    length = torch.linalg.vector_norm(along, dim=-1)
+    direction = along / length[..., None]
+    centre = torch.nn.functional.pad(f.entrance_pupil_z_mm.reshape(1), (2, 0))
+    back = (start_z_mm - f.entrance_pupil_z_mm) / direction[..., 2]
+    # distance of the pupil point from the object, less that of the pupil's centre, free of cancellation
+    beyond = (2 * (towards * point).sum(-1) + near * point.square().sum(-1)) / (length + 1)
+    shape = (*torch.as_tensor(at_m).shape, *fields.shape, pupil.shape[0])
+    origin = (centre + point + direction * back[..., None]).reshape(*shape, 3)
+    return SourceRays(origin, direction.reshape(*shape, 3), (beyond + back).reshape(shape))
+
+
 def field_rays(
     lens: TracedLens,
     field_rad: float,
     pupil: Tensor,
     wavelength_um: float = WAVELENGTH_UM["d"],
     start_z_mm: float = -5.0,
+    at_m: float | Tensor = PARALLEL,
 ) -> tuple[Tensor, Tensor]:
-    """Parallel rays of one field angle (in +y) through points of the paraxial entrance pupil.
+    """Rays of one object point, at one field angle (in +y), through points of the paraxial entrance pupil.
 
-    Args: field_rad scalar; pupil [M, 2] on the unit disc (placed at the pupil of the d line). Returns:
-      origins and directions [M, 3].
-    Gradient: origins to the lens, since the pupil moves with it.
+    Args: field_rad scalar; pupil [M, 2] on the unit disc (placed at the pupil of the d line for every
+      wavelength); at_m: see ``source_rays``. Returns: origins and directions [M, 3].
+    Gradient: to the lens, since the pupil moves with it, and to at_m.
     """
-    f = lens.first_order()
-    at = torch.cat(
-        [pupil * (f.entrance_pupil_diameter_mm / 2), f.entrance_pupil_z_mm.expand(pupil.shape[0], 1)], 1
-    )
-    direction = torch.tensor(
-        [0.0, math.sin(field_rad), math.cos(field_rad)], dtype=pupil.dtype, device=pupil.device
-    ).expand(pupil.shape[0], 3)
-    return at + direction * ((start_z_mm - at[:, 2:]) / direction[:, 2:]), direction.contiguous()
-
-
-def source_rays(
-    lens: TracedLens, field_rad: float, pupil: Tensor, wavelength_um: float
-) -> tuple[Tensor, Tensor]:
-    """The rays all analyses start with; the one place that decides where pupil points lie (now: on the
-    paraxial entrance pupil)."""
-    return field_rays(lens, field_rad, pupil, wavelength_um)
+    rays = source_rays(lens, field_rad, pupil, at_m, start_z_mm)
+    return rays.origin_mm, rays.direction
 
 
 @dataclass(frozen=True)
 class ImageRays:
-    """Rays of one field and wavelength on a plane across the axis near the image.
+    """Rays of one wavelength on a plane across the axis near the image, with leading axes [...] of distances and
+    fields.
 
-    position_mm: [M, 2] (x, y). direction: [M, 3] unit. path_mm: [M] optical path from a plane wavefront of
-      the field (one for all rays) to the plane. weight: [M] >= 0, 0 for rays that do not arrive. index:
-      refractive index in image space.
+    position_mm: [..., M, 2] (x, y). direction: [..., M, 3] unit. path_mm: [..., M] optical path to the plane from
+      the wavefront of the object point through the centre of the entrance pupil. weight: [..., M] >= 0, 0 for
+      rays that do not arrive. index: refractive index in image space.
     """
 
     position_mm: Tensor
@@ -87,55 +128,72 @@ class ImageRays:
         """The same rays on a plane ``defocus_mm`` further along +z (scalar, may carry a gradient); rays of
         weight 0 stay where they failed."""
         arrived = self.weight > 0
-        length = torch.where(arrived, defocus_mm / torch.where(arrived, self.direction[:, 2], 1), 0)
+        length = torch.where(arrived, defocus_mm / torch.where(arrived, self.direction[..., 2], 1), 0)
         return replace(
             self,
-            position_mm=self.position_mm + self.direction[:, :2] * length[:, None],
+            position_mm=self.position_mm + self.direction[..., :2] * length[..., None],
             path_mm=self.path_mm + self.index * length,
         )
 
 
 def trace_field(
     lens: TracedLens,
-    field_rad: float,
+    field_rad: float | Sequence[float] | Tensor,
     pupil: Tensor,
     wavelength_um: float = WAVELENGTH_UM["d"],
     vignetting: bool = False,
     defocus_mm: float | Tensor = 0.0,
+    at_m: Distances = PARALLEL,
 ) -> ImageRays:
-    """Trace one field (object at infinity, in +y) through pupil points to the image plane.
+    """Trace object points through pupil points to the image plane, in one trace.
 
     Args:
-      field_rad: scalar angle. pupil: [M, 2] on the unit disc. vignetting: weigh rays by the apertures' soft
-        edges; otherwise every ray that arrives weighs 1. defocus_mm: distance of the plane behind the lens's
-        own image plane.
-    Returns: ImageRays.
-    Gradient: positions, directions and paths to every lens tensor; with vignetting the weights too.
-    Raises: DomainError when no ray arrives.
+      field_rad: an angle in +y, or F of them. pupil: [M, 2] on the unit disc. vignetting: weigh rays by the
+        apertures' soft edges; otherwise every ray that arrives weighs 1. defocus_mm: distance of the plane behind
+        the lens's own image plane. at_m: metres from the entrance pupil to the object plane, or D of them; see
+        ``source_rays``.
+    Returns: ImageRays with the axes [D, F, M], D and F as far as several were given.
+    Gradient: positions, directions and paths to every lens tensor and to at_m; with vignetting the weights too.
+    Raises: DomainError when no ray of a field arrives, or for a distance inside the lens.
     """
-    if pupil.ndim != 2 or pupil.shape[1] != 2 or pupil.shape[0] == 0:
-        raise ShapeError(f"pupil points must be [M >= 1, 2], got {tuple(pupil.shape)}.")
-    origin, direction = source_rays(lens, field_rad, pupil, wavelength_um)
-    out = lens.trace(origin, direction, wavelength_um)
-    arrived = (out.status == 0).to(out.weight.dtype)
-    weight = out.weight * arrived if vignetting else arrived
-    if not bool((weight.detach() > 0).any()):
+    source = source_rays(lens, field_rad, pupil, at_m)
+    rays = trace_source(lens, source, wavelength_um, vignetting)
+    dark = ~(rays.weight.detach() > 0).any(-1)
+    if bool(dark.any()):
+        fields = torch.as_tensor(field_rad, dtype=torch.float64).expand(dark.shape)
+        names = ", ".join(sorted({f"{math.degrees(f):.4g}" for f in fields[dark.cpu()].tolist()}))
         raise DomainError(
-            f"{lens.name}: no ray arrives at field {math.degrees(field_rad):.4g} degrees; use a smaller "
+            f"{lens.name}: no ray arrives at field {names} degrees; use a smaller "
             "field, weaker curvatures or larger apertures."
         )
+    return rays.shifted(defocus_mm)
+
+
+def trace_source(
+    lens: TracedLens, source: SourceRays, wavelength_um: float, vignetting: bool = False
+) -> ImageRays:
+    """ImageRays of source rays on the lens's own image plane; weights as in ``trace_field``, no ray need
+    arrive."""
+    shape = source.path_mm.shape
+    out = lens.trace(source.origin_mm.reshape(-1, 3), source.direction.reshape(-1, 3), wavelength_um)
+    arrived = (out.status == 0).to(out.weight.dtype)
+    weight = out.weight * arrived if vignetting else arrived
     index = lens.index(wavelength_um)
-    path = out.optical_path_mm + index[0] * (origin * direction).sum(
-        1
-    )  # from the plane wavefront through the first vertex
-    return ImageRays(out.position_mm[:, :2], out.direction, path, weight, index[-1]).shifted(defocus_mm)
+    return ImageRays(
+        out.position_mm[:, :2].reshape(*shape, 2),
+        out.direction.reshape(*shape, 3),
+        out.optical_path_mm.reshape(shape) + index[0] * source.path_mm,
+        weight.reshape(shape),
+        index[-1],
+    )
 
 
 def chief_ray(
     lens: TracedLens,
-    field_rad: float,
+    field_rad: float | Sequence[float] | Tensor,
     wavelength_um: float = WAVELENGTH_UM["d"],
     defocus_mm: float | Tensor = 0.0,
+    at_m: Distances = PARALLEL,
 ) -> ImageRays:
     """The ray through the centre of the pupil, as ImageRays with M = 1. Raises: DomainError when it does not
     arrive."""
@@ -145,6 +203,7 @@ def chief_ray(
         torch.zeros(1, 2, dtype=lens.dtype, device=lens.curvature_per_mm.device),
         wavelength_um,
         defocus_mm=defocus_mm,
+        at_m=at_m,
     )
 
 

@@ -1,4 +1,4 @@
-"""Spot diagrams and encircled energy of a lens for objects at infinity."""
+"""Spot diagrams and encircled energy of a lens."""
 
 import math
 from collections.abc import Sequence
@@ -15,54 +15,65 @@ from codesign.lens.analysis.rays import (
     source_rays,
     spectral_lines,
     trace_field,
+    trace_source,
 )
+from codesign.lens.distance import PARALLEL, Distances
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.traced import TracedLens
 
 
 def spots(
-    lens: TracedLens, fields_rad: Sequence[float], wavelength_um: float = WAVELENGTH_UM["d"], grid: int = 32
+    lens: TracedLens,
+    fields_rad: Sequence[float],
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    grid: int = 32,
+    at_m: Distances = PARALLEL,
 ) -> tuple[Tensor, Tensor]:
     """Spot diagrams: ray positions on the image plane, [fields, M, 2] mm, and weights [fields, M] (1, or 0
-    for failed rays).
+    for failed rays). All fields and distances are one trace.
 
-    Equal weights over a square pupil grid, no clipping by apertures. Gradient: positions to every lens
-    tensor.
+    Equal weights over a square pupil grid, no clipping by apertures.
+    Args: at_m: metres from the entrance pupil to the object plane, inf for parallel light; of D distances the
+      results are [D, fields, M, 2] and [D, fields, M].
+    Gradient: positions to every lens tensor and to at_m. Raises: DomainError for a distance inside the lens.
     """
     pupil = pupil_grid(grid, lens.curvature_per_mm.dtype, lens.curvature_per_mm.device)
-    rays = [source_rays(lens, float(f), pupil, wavelength_um) for f in fields_rad]
-    out = lens.trace(torch.cat([o for o, _ in rays]), torch.cat([d for _, d in rays]), wavelength_um)
-    shape = (len(rays), pupil.shape[0])
-    return out.position_mm[:, :2].reshape(*shape, 2), (out.status == 0).to(pupil.dtype).reshape(shape)
+    rays = trace_source(lens, source_rays(lens, fields_rad, pupil, at_m), wavelength_um)
+    return rays.position_mm, rays.weight
 
 
 def rms_spot_mm(
-    lens: TracedLens, fields_rad: Sequence[float], wavelength_um: float = WAVELENGTH_UM["d"], grid: int = 32
+    lens: TracedLens,
+    fields_rad: Sequence[float],
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    grid: int = 32,
+    at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """RMS distance of rays from their mean point, [fields] mm. Raises DomainError where no ray of a field
-    arrives.
+    """RMS distance of rays from their mean point, [fields] mm; [D, fields] for D distances ``at_m``, see ``spots``.
+    Raises DomainError where no ray of a field arrives.
 
     Example:
     >>> from codesign import lens
     >>> geo = lens.load("cooke-triplet")
     >>> [round(spot, 3) for spot in lens.rms_spot_mm(geo, (0.0, 0.2)).tolist()]
     [0.005, 0.012]
+    >>> [round(spot, 3) for spot in lens.rms_spot_mm(geo.focus_at(1.0), (0.0,), at_m=(0.5, 1.0, 2.0))[:, 0].tolist()]
+    [0.197, 0.004, 0.093]
     """
-    positions, weight = spots(lens, fields_rad, wavelength_um, grid)
-    total = weight.sum(1)
+    positions, weight = spots(lens, fields_rad, wavelength_um, grid, at_m)
+    total = weight.sum(-1)
     if bool((total == 0).any()):
+        dark = (total == 0).reshape(-1, len(fields_rad)).any(0).tolist()
         dead = [
-            round(math.degrees(float(f)), 2)
-            for f, n in zip(fields_rad, total.tolist(), strict=True)
-            if n == 0
+            round(math.degrees(float(f)), 2) for f, nothing in zip(fields_rad, dark, strict=True) if nothing
         ]
         raise DomainError(
             f"{lens.name}: no ray arrives at field {dead} degrees; use a smaller field or weaker curvatures."
         )
     w = weight[..., None]
-    centre = (positions * w).sum(1, keepdim=True) / total[:, None, None]
+    centre = (positions * w).sum(-2, keepdim=True) / total[..., None, None]
     return (
-        torch.linalg.vector_norm((positions - centre) * w, dim=(1, 2)) / total.sqrt()
+        torch.linalg.vector_norm((positions - centre) * w, dim=(-2, -1)) / total.sqrt()
     )  # weights are 0 or 1; the gradient at a point image is 0
 
 

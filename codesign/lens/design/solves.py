@@ -6,26 +6,44 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError
-from codesign.lens.analysis import field_rays, pupil_grid
+from codesign.errors import DomainError, ShapeError
+from codesign.lens.analysis.rays import pupil_grid, source_rays, trace_source
+from codesign.lens.distance import PARALLEL, Distances, vergence_per_mm
 from codesign.lens.focus import least_spot_shift
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.hold_efl import hold_efl, holding_surface
+from codesign.lens.paraxial import focused_image
 
 __all__ = ["focus_paraxial", "focus_rays", "hold_efl", "holding_surface"]
 
 
 def focus_paraxial(
-    lens: GeoLens, wavelength_um: float = WAVELENGTH_UM["d"], defocus_mm: float | Tensor = 0.0
+    lens: GeoLens,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    defocus_mm: float | Tensor = 0.0,
+    at_m: float | Tensor = PARALLEL,
 ) -> GeoLens:
-    """The lens with its image plane at the paraxial focus, or ``defocus_mm`` (number or scalar tensor) behind
-    it. Differentiable.
+    """The lens with its image plane at the paraxial image of an axial point, or ``defocus_mm`` (number or scalar
+    tensor) behind it. Differentiable.
 
-    Raises: DomainError for an afocal lens. A focus inside the lens gives a negative last thickness, which
-      constraints must push back.
+    Args: at_m: metres from the entrance pupil to the point, inf for parallel light. ``GeoLens.focus_at`` does the
+      same and refuses images that are not real.
+    Raises: DomainError for light that leaves the lens parallel, or a distance inside the lens. A focus inside the
+      lens gives a negative last thickness, which constraints must push back.
     """
-    return _last_thickness(lens, lens.first_order(wavelength_um).bfl_mm + defocus_mm)
+    height, angle = focused_image(lens, vergence_per_mm(lens, at_m), wavelength_um)
+    if angle.ndim:
+        raise ShapeError(
+            f"{lens.name}: a paraxial focus is that of one distance, got {angle.numel()}; focus_rays "
+            "takes several."
+        )
+    if abs(float(angle.detach())) < 1e-12:
+        raise DomainError(
+            f"{lens.name}: the light of a point {float(torch.as_tensor(at_m)):.6g} m away leaves the lens parallel, "
+            "so it has no focus; the lens is afocal for it: change a curvature or the distance."
+        )
+    return _last_thickness(lens, -height * lens.index(wavelength_um)[-1] / angle + defocus_mm)
 
 
 def focus_rays(
@@ -33,39 +51,34 @@ def focus_rays(
     fields_rad: Sequence[float],
     wavelengths_um: Sequence[float] = (WAVELENGTH_UM["d"],),
     grid: int = 16,
+    at_m: Distances = PARALLEL,
 ) -> GeoLens:
-    """The lens with its image plane where the mean square spot over fields and wavelengths is least.
+    """The lens with its image plane where the mean square spot over fields, distances and wavelengths is least.
 
-    Spots of one field share their mean over the wavelengths; see ``focus.least_spot_shift``.
+    Spots of one object point share their mean over the wavelengths; see ``focus.least_spot_shift``.
 
     Args: fields_rad: angles; wavelengths_um; grid: pupil samples across, without clipping by apertures.
-      Failed rays are left out.
-    Gradient: through the rays to every lens tensor. Raises: DomainError when no ray of a field arrives or
-      none converges.
+      Failed rays are left out. at_m: metres from the entrance pupil to the object plane, or several that share the
+      image plane; inf for parallel light.
+    Gradient: through the rays to every lens tensor and to at_m. Raises: DomainError when no ray of a field arrives,
+      none converges, or a distance lies inside the lens.
 
     Example:
     >>> from codesign import lens
     >>> geo = lens.load("cooke-triplet")
-    >>> sharp = lens.design.focus_rays(geo, (0.0, 0.2))
-    >>> before, after = (lens.rms_spot_mm(g, (0.0, 0.2)).square().mean() for g in (geo, sharp))
+    >>> sharp = lens.design.focus_rays(geo, (0.0, 0.2), at_m=(0.5, 2.0))
+    >>> before, after = (lens.rms_spot_mm(g, (0.0, 0.2), at_m=(0.5, 2.0)).square().mean() for g in (geo, sharp))
     >>> bool(after < before)
     True
     """
     pupil = pupil_grid(grid, lens.dtype, lens.curvature_per_mm.device)
+    source = source_rays(lens, fields_rad, pupil, at_m)
     found = []
     for wavelength in wavelengths_um:
-        rays = [field_rays(lens, float(f), pupil) for f in fields_rad]
-        out = lens.trace(torch.cat([o for o, _ in rays]), torch.cat([d for _, d in rays]), wavelength)
-        found.append(
-            [
-                v.reshape(len(rays), pupil.shape[0], -1)
-                for v in (
-                    out.position_mm[:, :2],
-                    out.direction[:, :2] / out.direction[:, 2:],
-                    (out.status == 0).to(lens.dtype),
-                )
-            ]
-        )
+        rays = trace_source(lens, source, wavelength)
+        slope = rays.direction[..., :2] / rays.direction[..., 2:]
+        columns = (rays.position_mm, slope, rays.weight[..., None])
+        found.append([v.reshape(-1, pupil.shape[0], v.shape[-1]) for v in columns])
     position, slope, weight = (torch.cat(columns, 1) for columns in zip(*found, strict=True))
     total = weight.sum(1, keepdim=True)
     if bool((total == 0).any()):
