@@ -2,7 +2,16 @@
 motion."""
 
 from codesign.lens.design.constraints import Limits
+from codesign.lens.design.glass_map import neighbour_glasses
 from codesign.lens.design.modes import LensDesign, detune, edge_thickness_mm, make_design
+from codesign.lens.design.moves import (
+    elements,
+    flattened,
+    groups,
+    with_glass,
+    without_element,
+    without_surface,
+)
 from codesign.lens.design.solves import focus_paraxial, focus_rays, hold_efl
 from codesign.lens.design.tolerance import Tolerances
 
@@ -12,8 +21,15 @@ __all__ = [
     "Tolerances",
     "detune",
     "edge_thickness_mm",
+    "elements",
+    "flattened",
     "focus_paraxial",
     "focus_rays",
+    "groups",
     "hold_efl",
     "make_design",
+    "neighbour_glasses",
+    "with_glass",
+    "without_element",
+    "without_surface",
 ]

@@ -1,14 +1,16 @@
-"""The glass map: where (nd, Vd) of a lens's glasses lie, and how far inside a convex region of real
-glasses."""
+"""The glass map: where (nd, Vd) of a lens's glasses lie, how far inside a convex region of real glasses, and
+which glasses of the catalogue are nearest to one."""
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
+from codesign.lens import glass
 from codesign.lens.geolens import GeoLens
-from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.glass import WAVELENGTH_UM, Glass
 
 VD_PER_ND = 100.0  # an Abbe number of 1 counts like an index of 0.01
 
@@ -21,14 +23,14 @@ def places(lens: GeoLens) -> dict[int, tuple[Tensor, Tensor]]:
     in proportion to nd - 1.
     """
     nd, nF, nC = (lens.index(WAVELENGTH_UM[line])[1:] for line in "dFC")
-    glass = [i for i, s in enumerate(lens.surfaces) if not s.mirror and float(nd[i].detach()) > 1.001]
-    flat = [i + 1 for i in glass if float((nF[i] - nC[i]).detach()) <= 0]
+    filled = [i for i, s in enumerate(lens.surfaces) if not s.mirror and float(nd[i].detach()) > 1.001]
+    flat = [i + 1 for i in filled if float((nF[i] - nC[i]).detach()) <= 0]
     if flat:
         raise DomainError(
             f"{lens.name}: the media behind surfaces {flat} have no dispersion, so they have no place on "
             "the glass map; leave the glass limits out."
         )
-    return {i: (nd[i], (nd[i] - 1) / (nF[i] - nC[i])) for i in glass}
+    return {i: (nd[i], (nd[i] - 1) / (nF[i] - nC[i])) for i in filled}
 
 
 def inside(nd: Tensor, vd: Tensor, polygon: Sequence[tuple[float, float]]) -> Tensor:
@@ -49,3 +51,39 @@ def inside(nd: Tensor, vd: Tensor, polygon: Sequence[tuple[float, float]]) -> Te
     away = torch.stack([nd, vd / VD_PER_ND]) - corners
     cross = (side[:, 0] * away[:, 1] - side[:, 1] * away[:, 0]) * torch.sign(turn[0])
     return (cross / torch.linalg.vector_norm(side, dim=1)).amin()
+
+
+def neighbour_glasses(
+    medium: Glass | str, count: int = 4, apart: float = 2e-3, among: Sequence[str] | None = None
+) -> list[Glass]:
+    """The catalogue's glasses nearest to one on the (nd, Vd) map, the nearest first.
+
+    The distance is hypot(nd difference, Vd difference / 100), see VD_PER_ND.
+    Args: medium: a Glass, or a name of the catalogue. apart: least distance; other makers' versions of the same
+      glass lie closer and are left out. among: names of the catalogue to choose from, None for all.
+    Returns: at most ``count`` glasses. Raises: DomainError for a name the catalogue does not know, or a medium
+      without dispersion.
+
+    >>> from codesign import lens
+    >>> [glass.name for glass in lens.design.neighbour_glasses("F2", 3)]
+    ['F4', 'F1', 'S-TIM1']
+    """
+    given = Glass.named(medium) if isinstance(medium, str) else medium
+    if count < 1:
+        raise DomainError(f"{count} neighbours of {given.name} were asked for; give at least 1.")
+    if math.isinf(given.abbe_number):
+        raise DomainError(
+            f"medium {given.name} has no dispersion, so it has no place on the glass map and no neighbours."
+        )
+    chosen = map(Glass.named, glass.names() if among is None else among)
+    found = [
+        (math.hypot(g.index_d - given.index_d, (g.abbe_number - given.abbe_number) / VD_PER_ND), g)
+        for g in chosen
+        if _covers_lines(g)
+    ]
+    found = [entry for entry in found if entry[0] >= apart and not math.isinf(entry[0])]
+    return [g for _, g in sorted(found, key=lambda entry: entry[0])[:count]]
+
+
+def _covers_lines(g):
+    return g.range_um[0] <= WAVELENGTH_UM["F"] and g.range_um[1] >= WAVELENGTH_UM["C"]

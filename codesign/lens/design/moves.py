@@ -1,0 +1,215 @@
+"""Moves between lens forms: a surface or an element taken out, or a glass exchanged for another.
+
+Every move leaves all other surfaces where they are, keeps the focal length and the f-number, and the
+image plane as far from the paraxial focus as it was. Elements are single pieces of glass: a cemented doublet is two.
+Re-optimisation around these moves is in ``codesign.optimise.lens_moves``.
+"""
+
+import math
+from dataclasses import replace
+
+import torch
+
+from codesign.errors import DomainError
+from codesign.lens.design.solves import focus_paraxial, hold_efl
+from codesign.lens.geolens import GeoLens
+from codesign.lens.glass import WAVELENGTH_UM, Glass
+from codesign.lens.surface import Surface
+
+SAME_INDEX = 1e-9
+
+
+def elements(lens: GeoLens) -> tuple[tuple[int, int], ...]:
+    """Front and back surface (counted from 0) of every element, from the object: one pair per piece of glass, so
+    that neighbours in a cemented group share a surface.
+
+    >>> from codesign import lens
+    >>> lens.design.elements(lens.load("cooke-triplet"))
+    ((0, 1), (2, 3), (4, 5))
+    """
+    return tuple((i, i + 1) for i, filled in enumerate(lens.glass.tolist()[:-1]) if filled)
+
+
+def groups(lens: GeoLens) -> tuple[tuple[int, int], ...]:
+    """First and last surface (counted from 0) of every group: elements that share no surface with another, and
+    cemented ones as a whole."""
+    found: list[tuple[int, int]] = []
+    for front, back in elements(lens):
+        if found and found[-1][1] == front:
+            front = found.pop()[0]
+        found.append((front, back))
+    return tuple(found)
+
+
+def without_element(lens: GeoLens, element: int) -> GeoLens:
+    """The lens without one element; air takes its place.
+
+    An element that is cemented to another leaves the cemented face to that one. Where the stop was on a face that
+    goes, a plane stop stays in its place.
+    Args: element: its number in ``elements(lens)``, counted from 0; from the last when negative.
+    Returns: a lens of its own, built from today's values. Its focal length is the old one, held by
+      ``hold_efl``. A semi-aperture beyond the reach of its surface becomes that reach.
+    Raises: DomainError for an element that is not there, is the only one, or touches a mirror; and when the rest
+      cannot have the focal length with the image behind it.
+
+    >>> from codesign import lens
+    >>> dialyte = lens.design.without_element(lens.load("cooke-triplet"), 1)
+    >>> len(lens.design.elements(dialyte)), round(dialyte.first_order().fno.item(), 3)
+    (2, 5.002)
+    """
+    pairs = elements(lens)
+    front, back = _element_faces(lens, pairs, element)
+    if len(pairs) == 1 and not any(lens.mirrors):
+        raise DomainError(
+            f"{lens.name}: element 1 is its only one, and without it nothing bends light; add an element first."
+        )
+    filled = lens.glass.tolist()
+    surfaces = _surfaces(lens)
+    if filled[back]:
+        gone = [front]
+    else:
+        surfaces[front] = replace(surfaces[front], medium=surfaces[back].medium)
+        gone = [back] if front > 0 and filled[front - 1] else [back, front]
+    for at in gone:
+        surfaces = _without(surfaces, at, keep_stop=True)
+    return _held(lens, surfaces, f"without element {range(len(pairs))[element] + 1}")
+
+
+def without_surface(lens: GeoLens, surface: int) -> GeoLens:
+    """The lens without one surface, a dummy in air or the face between two glasses; the gap in front of it grows
+    over it, with its medium.
+
+    A stop on that surface moves to the nearer neighbour.
+    Args: surface: counted from 0; from the last when negative. Returns, Raises: as ``without_element``; DomainError
+      too for a face between glass and air, whose element would have no end.
+    """
+    count = len(lens.surfaces)
+    if not -count <= surface < count:
+        raise DomainError(f"{lens.name}: there is no surface {surface}; it has 0 to {count - 1}.")
+    at = range(count)[surface]
+    if lens.mirrors[at]:
+        raise DomainError(
+            f"{lens.name}: surface {at + 1} is a mirror, and without it the light turns no more."
+        )
+    filled = [False, *lens.glass.tolist()]
+    if filled[at] != filled[at + 1] and not _same_medium(lens, at):
+        raise DomainError(
+            f"{lens.name}: surface {at + 1} lies between glass and air, so the glass would have no face; take its "
+            "element out with without_element."
+        )
+    if count == 1:
+        raise DomainError(f"{lens.name}: surface 1 is its only one; a lens needs at least one.")
+    return _held(lens, _without(_surfaces(lens), at, keep_stop=False), f"without surface {at + 1}")
+
+
+def flattened(lens: GeoLens, element: int, share: float) -> GeoLens:
+    """The lens on its way to ``without_element``: at ``share`` 1 the element is a plane-parallel plate, or a shell
+    of equal curvatures where it is cemented to another; at 0 it is as now.
+
+    Gradient: to the lens tensors. Focal length and focus are left alone.
+    """
+    front, back = _element_faces(lens, elements(lens), element)
+    filled = lens.glass.tolist()
+    c = lens.curvature_per_mm
+    cemented = [front > 0 and filled[front - 1], filled[back]]
+    target = c.clone()
+    if not any(cemented):
+        target = target.index_fill(0, torch.tensor([front, back], device=c.device), 0.0)
+    elif cemented[1]:
+        target[front] = c[back]
+    else:
+        target[back] = c[front]
+    return lens.replace(curvature_per_mm=c + share * (target - c))
+
+
+def with_glass(lens: GeoLens, surface: int, medium: Glass) -> GeoLens:
+    """The lens with another glass behind a surface (counted from 0), focal length, f-number and defocus as before.
+
+    Returns, Raises: as ``without_element``; DomainError for a gap that holds no glass.
+    """
+    if surface not in [front for front, _ in elements(lens)]:
+        fronts = ", ".join(str(front) for front, _ in elements(lens))
+        raise DomainError(
+            f"{lens.name}: there is no glass behind surface {surface} to exchange; there is behind {fronts or 'none'}."
+        )
+    surfaces = _surfaces(lens)
+    surfaces[surface] = replace(surfaces[surface], medium=medium)
+    return _held(lens, surfaces, f"with {medium.name} behind surface {surface + 1}")
+
+
+def _element_faces(lens, pairs, element):
+    if not pairs:
+        raise DomainError(f"{lens.name}: it has no element, as no gap between its surfaces is of glass.")
+    if not -len(pairs) <= element < len(pairs):
+        raise DomainError(f"{lens.name}: there is no element {element}; it has 0 to {len(pairs) - 1}.")
+    front, back = pairs[element]
+    if lens.mirrors[front] or lens.mirrors[back]:
+        raise DomainError(
+            f"{lens.name}: element {range(len(pairs))[element] + 1} touches a mirror, and without that the light "
+            "turns no more; choose another."
+        )
+    return front, back
+
+
+def _same_medium(lens, surface):
+    return all(
+        abs(float(n[surface + 1] - n[surface])) <= SAME_INDEX
+        for n in (lens.index(w).detach() for w in WAVELENGTH_UM.values())
+    )
+
+
+def _surfaces(lens):
+    """Today's surfaces as a list, the stop marked."""
+    return [replace(s, is_stop=i == lens.stop_index) for i, s in enumerate(lens.to_surfaces())]
+
+
+def _without(surfaces, at, keep_stop):
+    """The list without a surface, the gap in front of it longer; a plane stop in its place when the stop is to
+    stay."""
+    found = list(surfaces)
+    gone = found.pop(at)
+    if gone.is_stop and keep_stop:
+        medium = found[at - 1].medium if at else None
+        found.insert(at, Surface(math.inf, gone.thickness_mm, medium, gone.semi_aperture_mm, is_stop=True))
+        return found
+    if gone.is_stop:
+        ahead = at > 0 and (at == len(found) or found[at - 1].thickness_mm < gone.thickness_mm)
+        heir = at - 1 if ahead else at
+        found[heir] = replace(found[heir], is_stop=True)
+    if at:
+        found[at - 1] = replace(found[at - 1], thickness_mm=found[at - 1].thickness_mm + gone.thickness_mm)
+    return found
+
+
+def _held(lens, surfaces, label):
+    """A lens of these surfaces with the focal length and the defocus of ``lens``."""
+    f = lens.first_order()
+    defocus = float((lens.thickness_mm[-1] - f.bfl_mm).detach())
+    made = GeoLens(
+        map(_within_reach, surfaces),
+        lens.entrance_pupil_diameter_mm,
+        lens.dtype,
+        lens.soft_edge_mm,
+        lens.name,
+        lens.half_field_deg,
+    )
+    with torch.no_grad():
+        held = focus_paraxial(hold_efl(made, float(f.efl_mm)), defocus_mm=defocus)
+        image = float(held.thickness_mm[-1])
+        if not image > 0:
+            raise DomainError(
+                f"{lens.name} {label}: at its focal length of {float(f.efl_mm):.6g} mm the image lies {-image:.4g} mm "
+                "before the last surface; flatten the element in steps and re-optimise in between, or take out another."
+            )
+        made.curvature_per_mm.copy_(held.curvature_per_mm)
+        made.thickness_mm.copy_(held.thickness_mm)
+    return made
+
+
+def _within_reach(surface):
+    """The surface, not wider than its own sphere or ellipsoid."""
+    square = (1 + surface.conic) * surface.curvature_per_mm**2
+    most = 1 / math.sqrt(square) if square > 0 else math.inf
+    return (
+        surface if surface.semi_aperture_mm <= most else replace(surface, semi_aperture_mm=most * (1 - 1e-9))
+    )
