@@ -45,3 +45,11 @@ def vergence_per_mm(lens: ParaxialLens, at_m: Distances, origin_z_mm: Tensor | N
             f"before the lens; give distances above {nearest:.6g} m, inf for parallel light."
         )
     return 1 / (1e3 * at)
+
+
+def one_distance(at_m: Distances) -> Distances:
+    """The distance itself, where a result is that of one: ShapeError for several."""
+    count = torch.as_tensor(at_m).shape
+    if count:
+        raise ShapeError(f"this is a figure of one object distance, got {tuple(count)}; call it for each.")
+    return at_m

@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError
 from codesign.lens import paraxial
 from codesign.lens.analysis.rays import pupil_grid, source_rays, trace_source
-from codesign.lens.distance import vergence_per_mm
+from codesign.lens.distance import one_distance, vergence_per_mm
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.traced import TracedLens
 
@@ -19,11 +19,7 @@ def image_distance_mm(
 ) -> Tensor:
     """Distance from the last vertex of a GeoLens to the image of an axial point, scalar mm; see
     ``GeoLens.focus_at``."""
-    vergence = vergence_per_mm(lens, distance_m)
-    if vergence.ndim:
-        raise ShapeError(
-            f"{lens.name}: a film focuses on one distance, got {vergence.numel()}; give one number."
-        )
+    vergence = vergence_per_mm(lens, one_distance(distance_m))
     height, angle = paraxial.focused_image(lens, vergence, wavelength_um)
     if not float(angle.detach()) < -1e-12:
         raise DomainError(

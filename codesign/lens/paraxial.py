@@ -12,6 +12,8 @@ from torch import Tensor
 from codesign.errors import DomainError
 from codesign.lens.glass import WAVELENGTH_UM
 
+D_LINE = WAVELENGTH_UM["d"]
+
 
 class IdealLens(Protocol):
     """A focal length, a film behind it and a pupil; ThinLens is one."""
@@ -212,14 +214,19 @@ class ParaxialRays:
 
 
 def paraxial_rays(
-    lens: ParaxialLens, field_rad: float, wavelength_um: float = WAVELENGTH_UM["d"]
+    lens: ParaxialLens,
+    field_rad: float,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+    vergence_per_mm: float | Tensor = 0.0,
 ) -> ParaxialRays:
-    """ParaxialRays for an object at infinity.
+    """ParaxialRays of an object plane.
 
-    Args: field_rad: half field, whose tangent is the slope of the chief ray in object space; a number below
-      90 degrees.
-    Gradient: to every lens tensor that bends or moves light. Raises: DomainError for a field of 90 degrees
-      and more, or an entrance pupil at infinity.
+    Args: field_rad: half field, whose tangent is the slope of the d line's chief ray in object space; a number
+      below 90 degrees. vergence_per_mm: 1 / distance of the object from the entrance pupil of the d line, a
+      number or scalar tensor (see ``distance.vergence_per_mm``); 0 is parallel light. The diameter of the entrance
+      pupil is the lens's at every distance.
+    Gradient: to every lens tensor that bends or moves light, and to the vergence. Raises: DomainError for a field
+      of 90 degrees and more, or an entrance pupil at infinity.
     """
     if not abs(field_rad) < math.pi / 2:
         raise DomainError(
@@ -235,9 +242,13 @@ def paraxial_rays(
     power = lens.surface_power(wavelength_um)
     thickness_mm = lens.thickness_mm
     index = lens.index(wavelength_um)
-    slope = torch.full_like(power[0], math.tan(field_rad))
+    vergence = torch.as_tensor(vergence_per_mm, dtype=power.dtype, device=power.device)
+    # colours have pupils of their own, and one object plane
+    shift = f.entrance_pupil_z_mm - (f if wavelength_um == D_LINE else lens.first_order()).entrance_pupil_z_mm
+    slope = math.tan(field_rad) / (1 + vergence * shift)
+    spread = vergence / (1 + vergence * shift) * (f.entrance_pupil_diameter_mm / 2)
     starts = (
-        (f.entrance_pupil_diameter_mm / 2, torch.zeros_like(slope)),
+        (f.entrance_pupil_diameter_mm / 2 - spread * f.entrance_pupil_z_mm, spread * index[0]),
         (-slope * f.entrance_pupil_z_mm, slope * index[0]),
     )
     (y, nu), (y_bar, nu_bar) = (
@@ -245,7 +256,7 @@ def paraxial_rays(
     )
     angles = torch.cat([starts[0][1].reshape(1), nu]) / index
     chief_angles = torch.cat([starts[1][1].reshape(1), nu_bar]) / index
-    return ParaxialRays(y, angles, y_bar, chief_angles, starts[1][1] * starts[0][0])
+    return ParaxialRays(y, angles, y_bar, chief_angles, slope * index[0] * (f.entrance_pupil_diameter_mm / 2))
 
 
 def focused_image(
@@ -267,6 +278,27 @@ def focused_image(
         power, lens.thickness_mm, index, torch.ones_like(vergence), index[0] * vergence
     )
     return heights[-1], angles[-1]
+
+
+def image_place_mm(
+    lens: ParaxialLens, vergence_per_mm: float | Tensor = 0.0, wavelength_um: float = D_LINE
+) -> Tensor:
+    """Distance from the last vertex to the paraxial image of an axial point, mm: the back focal length for parallel
+    light. Negative where the image lies in the lens or is virtual, infinite where the light leaves parallel. Shape
+    of the vergence; gradient as for ``focused_image``."""
+    height, angle = focused_image(lens, vergence_per_mm, wavelength_um)
+    return -height * lens.index(wavelength_um)[-1] / angle
+
+
+def image_scale_mm(
+    lens: ParaxialLens, vergence_per_mm: float | Tensor = 0.0, wavelength_um: float = D_LINE
+) -> Tensor:
+    """Height of the paraxial image per tangent of the field, mm: the focal length for parallel light, and
+    magnification x distance otherwise. Shape of the vergence; gradient as for ``focused_image``."""
+    pupil_z = lens.first_order().entrance_pupil_z_mm
+    _, angle = focused_image(lens, vergence_per_mm, wavelength_um)
+    # Lagrange's invariant of the chief ray and of this one, whose height at the pupil is 1 / (1 - vergence z)
+    return -lens.index(wavelength_um)[0] / ((1 - vergence_per_mm * pupil_z) * angle)
 
 
 def circle_of_confusion_mm(thin: IdealLens, distance_m: float | Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """Third-order aberrations of each surface: the Seidel sums, and the first-order colour sums.
 
-Conventions: an object at infinity; wavefront coefficients in mm, positive where the wavefront is ahead of its
+Conventions: wavefront coefficients in mm, positive where the wavefront is ahead of its
   reference sphere. With pupil and field coordinates rho and h that are 1 at the rims, the wavefront is
     S_I rho^4 / 8 + S_II h rho^3 cos / 2 + S_III h^2 rho^2 cos^2 / 2 + (S_III + S_IV) h^2 rho^2 / 4 + S_V h^3
     rho cos / 2. Undercorrected spherical aberration and the field curvature of a converging lens are
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from codesign.lens.distance import PARALLEL, one_distance, vergence_per_mm
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.paraxial import ParaxialRays, bending, paraxial_rays
@@ -54,17 +55,20 @@ def seidel_sums(
     wavelength_um: float = WAVELENGTH_UM["d"],
     short_um: float = WAVELENGTH_UM["F"],
     long_um: float = WAVELENGTH_UM["C"],
+    at_m: float | Tensor = PARALLEL,
 ) -> SeidelSums:
-    """SeidelSums of a lens for an object at infinity.
+    """SeidelSums of a lens for an object plane.
 
     Spheres, conics, the r^2 and r^4 asphere terms, mirrors, and the first two diffractive terms; decentres
     and tilts do not count.
 
     Args: field_rad: half field. wavelength_um: of the monochromatic sums; short_um and long_um: ends of the
-      colour sums.
-    Gradient: to every lens tensor. Raises: DomainError, see ``paraxial_rays``.
+      colour sums. at_m: metres from the entrance pupil to the object, inf for parallel light; the pupil's diameter
+      is the lens's at every distance.
+    Gradient: to every lens tensor and to at_m. Raises: DomainError, see ``paraxial_rays`` and
+      ``distance.vergence_per_mm``.
     """
-    rays = paraxial_rays(lens, field_rad, wavelength_um)
+    rays = paraxial_rays(lens, field_rad, wavelength_um, vergence_per_mm(lens, one_distance(at_m)))
     index = lens.index(wavelength_um)
     path = _column(lens.path_mm(wavelength_um), 0), _column(lens.path_mm(wavelength_um), 1)
     power = -2 * path[0]  # of the diffractive layer, in the medium before the surface

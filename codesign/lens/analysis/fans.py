@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from codesign.lens.analysis.rays import chief_ray, trace_field
+from codesign.lens.analysis.rays import trace_with_chief
 from codesign.lens.analysis.wavefront import path_difference_mm
+from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
@@ -38,22 +39,22 @@ def ray_fan(
     vignetting: bool = False,
     reference_mm: Tensor | None = None,
     defocus_mm: float | Tensor = 0.0,
+    at_m: float | Tensor = PARALLEL,
 ) -> RayFan:
-    """RayFan of one field and wavelength.
+    """RayFan of one object point and wavelength.
 
     Args:
       count: rays per diameter, odd to hold the chief ray. reference_mm: [2] image point to which both
         aberrations refer; None is the chief ray of this wavelength. Give that of a middle wavelength to see
-        lateral colour.
-    Gradient: aberrations to every lens tensor. Raises: DomainError when no ray, or not the chief ray,
+        lateral colour. vignetting, defocus_mm, at_m (one distance): see ``trace_field``.
+    Gradient: aberrations to every lens tensor and to at_m. Raises: DomainError when no ray, or not the chief ray,
       arrives.
     """
     like = lens.curvature_per_mm
     line = torch.linspace(-1, 1, count, dtype=like.dtype, device=like.device)
     zero = torch.zeros(count, dtype=like.dtype, device=like.device)
     pupil = torch.cat([torch.stack([zero, line], 1), torch.stack([line, zero], 1)])
-    rays = trace_field(lens, field_rad, pupil, wavelength_um, vignetting, defocus_mm)
-    chief = chief_ray(lens, field_rad, wavelength_um, defocus_mm)
+    rays, chief = trace_with_chief(lens, field_rad, pupil, wavelength_um, vignetting, defocus_mm, at_m)
     centre = chief.position_mm[0] if reference_mm is None else reference_mm
     away = rays.position_mm - centre
     waves = path_difference_mm(lens, rays, chief, wavelength_um, reference_mm, defocus_mm) / (

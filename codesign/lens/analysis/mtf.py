@@ -13,6 +13,7 @@ from codesign.errors import DomainError
 from codesign.lens.analysis.pupil import pupil_function
 from codesign.lens.analysis.rays import Light, Values, chief_ray, spectral_lines
 from codesign.lens.analysis.spots import polychromatic_spot
+from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
@@ -38,20 +39,21 @@ def diffraction_mtf(
     grid: int | None = None,
     vignetting: bool = False,
     defocus_mm: float | Tensor = 0.0,
+    at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
     """MTF with diffraction of one field, from the Fourier transform of the point spread.
 
     Several wavelengths add as complex transfer functions about one image point, so that lateral colour
     counts.
 
-    Args: frequency_per_mm: [K] line pairs per mm in the image. light, grid, vignetting, defocus_mm: see
+    Args: frequency_per_mm: [K] line pairs per mm in the image. light, grid, vignetting, defocus_mm, at_m: see
       ``psf_on_pixels``.
     Returns: [2, K] tangential, sagittal, in [0, 1]; exactly 0 beyond the cut-off.
     Gradient: to every lens tensor. Raises: DomainError for a negative frequency, and see ``pupil_function``.
     """
     frequency = _frequencies(lens, frequency_per_mm)
     wavelengths, shares = spectral_lines(light)
-    reference = chief_ray(lens, field_rad, wavelengths[0], defocus_mm).position_mm[0]
+    reference = chief_ray(lens, field_rad, wavelengths[0], defocus_mm, at_m).position_mm[0]
     total = torch.zeros(
         2,
         frequency.numel(),
@@ -59,7 +61,7 @@ def diffraction_mtf(
         device=frequency.device,
     )
     for wavelength_um, share in zip(wavelengths, shares, strict=True):
-        pupil = pupil_function(lens, field_rad, wavelength_um, grid, vignetting, defocus_mm, reference)
+        pupil = pupil_function(lens, field_rad, wavelength_um, grid, vignetting, defocus_mm, reference, at_m)
         total = total + share * torch.stack([_transfer(pupil, axis, frequency) for axis in (1, 0)])
     return total.abs()
 
@@ -72,6 +74,7 @@ def geometric_mtf(
     grid: int = 64,
     vignetting: bool = False,
     defocus_mm: float | Tensor = 0.0,
+    at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
     """MTF of the rays alone, |mean of exp(-2 pi i frequency x)|, [2, K] tangential, sagittal. Arguments and
     gradient as for ``diffraction_mtf``.
@@ -79,7 +82,7 @@ def geometric_mtf(
     Multiply by ``ideal_mtf`` for the usual estimate between the two limits.
     """
     frequency = _frequencies(lens, frequency_per_mm)
-    positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm)
+    positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
     lit = weight.reshape(-1).detach() > 0
     points = positions.reshape(-1, 2)[lit]
     weight = weight.reshape(-1)[lit]

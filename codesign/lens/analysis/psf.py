@@ -11,6 +11,7 @@ from codesign.errors import DomainError
 from codesign.lens.analysis.pupil import pupil_function
 from codesign.lens.analysis.rays import Light, chief_ray, spectral_lines
 from codesign.lens.analysis.spots import polychromatic_spot
+from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
@@ -38,6 +39,7 @@ def diffraction_psf(
     vignetting: bool = False,
     defocus_mm: float | Tensor = 0.0,
     reference_mm: Tensor | None = None,
+    at_m: float | Tensor = PARALLEL,
 ) -> Psf:
     """Psf by a Fourier transform of the pupil, zero-padded from n to n * padding cells.
 
@@ -45,18 +47,18 @@ def diffraction_psf(
     Airy scale wavelength times f-number per unit of padding 4. The picture repeats with n wavelength times
     f-number. Energy sums to 1.
 
-    Args: grid, vignetting, defocus_mm, reference_mm: see ``pupil_function``. padding: >= 2, so that the
+    Args: grid, vignetting, defocus_mm, reference_mm, at_m: see ``pupil_function``. padding: >= 2, so that the
       energy is not aliased.
     Gradient: energy and pitch to every lens tensor. Raises: DomainError, see ``pupil_function``.
     """
     if int(padding) != padding or padding < 2:
         raise DomainError(f"padding {padding} must be a whole number of at least 2.")
-    pupil = pupil_function(lens, field_rad, wavelength_um, grid, vignetting, defocus_mm, reference_mm)
+    pupil = pupil_function(lens, field_rad, wavelength_um, grid, vignetting, defocus_mm, reference_mm, at_m)
     count = pupil.field.shape[0] * int(padding)
     amplitude = torch.fft.fftshift(torch.fft.ifft2(pupil.field, s=(count, count)))
     energy = amplitude.real.square() + amplitude.imag.square()
     centre = (
-        chief_ray(lens, field_rad, wavelength_um, defocus_mm).position_mm[0]
+        chief_ray(lens, field_rad, wavelength_um, defocus_mm, at_m).position_mm[0]
         if reference_mm is None
         else torch.as_tensor(reference_mm)
     )
@@ -72,6 +74,7 @@ def psf_on_pixels(
     grid: int | None = None,
     vignetting: bool = False,
     defocus_mm: float | Tensor = 0.0,
+    at_m: float | Tensor = PARALLEL,
 ) -> Psf:
     """Psf of one or several wavelengths by diffraction, on a pixel grid of one's own, about the chief ray of
     the first wavelength.
@@ -80,16 +83,17 @@ def psf_on_pixels(
     and their lateral colour is in it. The energy of a pixel is the density at its centre times its area; the
     sum tells the share that falls on the grid.
 
-    Args: pixel_mm: size of a square pixel. pixels: rows and columns. light: see ``spectral_lines``.
+    Args: pixel_mm: size of a square pixel. pixels: rows and columns. light: see ``spectral_lines``. at_m: metres to the
+      object plane, see ``wavefront``.
     Gradient: to every lens tensor. Raises: DomainError, see ``pupil_function``, and when the grid is wider
       than the sampled pupil's period.
     """
     wavelengths, shares = spectral_lines(light)
-    reference = chief_ray(lens, field_rad, wavelengths[0], defocus_mm).position_mm[0]
+    reference = chief_ray(lens, field_rad, wavelengths[0], defocus_mm, at_m).position_mm[0]
     at = (torch.arange(pixels, dtype=lens.dtype, device=reference.device) - pixels // 2) * pixel_mm
     total = torch.zeros(pixels, pixels, dtype=lens.dtype, device=reference.device)
     for wavelength_um, share in zip(wavelengths, shares, strict=True):
-        pupil = pupil_function(lens, field_rad, wavelength_um, grid, vignetting, defocus_mm, reference)
+        pupil = pupil_function(lens, field_rad, wavelength_um, grid, vignetting, defocus_mm, reference, at_m)
         n = pupil.field.shape[0]
         line = (torch.arange(n, dtype=lens.dtype, device=reference.device) + 0.5) / n * 2 - 1
         period = n * pupil.wavelength_mm / (2 * float(pupil.cosine_radius.detach().max()))
@@ -121,16 +125,17 @@ def geometric_psf(
     grid: int = 128,
     vignetting: bool = False,
     defocus_mm: float | Tensor = 0.0,
+    at_m: float | Tensor = PARALLEL,
 ) -> Psf:
     """Psf by rays: each ray's weight is shared bilinearly among the four pixel centres around it. About the
     chief ray of the first wavelength.
 
-    Args: grid: pupil cells across. Rays beyond the grid are lost: the sum of ``energy`` is the share that
+    Args: grid: pupil cells across. at_m: metres to the object plane, see ``wavefront``. Rays beyond the grid are lost: the sum of ``energy`` is the share that
       falls on it.
     Gradient: energy to every lens tensor, piecewise linear in the ray positions.
     """
-    positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm)
-    reference = chief_ray(lens, field_rad, spectral_lines(light)[0][0], defocus_mm).position_mm[0]
+    positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
+    reference = chief_ray(lens, field_rad, spectral_lines(light)[0][0], defocus_mm, at_m).position_mm[0]
     place = (positions.reshape(-1, 2) - reference) / pixel_mm + pixels // 2  # x, y in pixels
     low = place.detach().floor()
     share = place - low

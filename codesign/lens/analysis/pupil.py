@@ -8,6 +8,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis.wavefront import wavefront
+from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
@@ -50,26 +51,27 @@ def pupil_function(
     vignetting: bool = False,
     defocus_mm: float | Tensor = 0.0,
     reference_mm: Tensor | None = None,
+    at_m: float | Tensor = PARALLEL,
 ) -> PupilFunction:
-    """PupilFunction of one field: amplitude times exp(-2 pi i OPD / wavelength).
+    """PupilFunction of one object point: amplitude times exp(-2 pi i OPD / wavelength).
 
     Points that are even over the entrance pupil are taken as even in the direction cosines towards the image
     point (Abbe's sine condition); their scale in x and y, which holds the foreshortening off the axis, is
     fitted to the traced rays. A cell counts when its centre lies in the disc; the staircase at the rim costs
     about 1e-3 of MTF at 64 cells and 3e-4 at 128.
 
-    Args: grid: cells across; None picks a power of two from the aberration. reference_mm: see ``wavefront``.
-    Gradient: to every lens tensor. Raises: DomainError when neighbouring cells differ by more than half a
+    Args: grid: cells across; None picks a power of two from the aberration. reference_mm, at_m: see ``wavefront``.
+    Gradient: to every lens tensor and to at_m. Raises: DomainError when neighbouring cells differ by more than half a
       wave, or no ray arrives.
     """
     if grid is None:
-        grid = _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, reference_mm)
+        grid = _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, reference_mm, at_m)
     like = lens.curvature_per_mm
     line = (torch.arange(grid, dtype=like.dtype, device=like.device) + 0.5) / grid * 2 - 1
     y, x = torch.meshgrid(line, line, indexing="ij")
     seen = x * x + y * y <= 1
     points = torch.stack([x, y], -1)[seen]
-    front = wavefront(lens, field_rad, wavelength_um, 0, vignetting, defocus_mm, reference_mm, points)
+    front = wavefront(lens, field_rad, wavelength_um, 0, vignetting, defocus_mm, reference_mm, points, at_m)
     scale = _cosine_radius(front)
     phase = 2 * math.pi * front.waves
     amplitude = torch.where(front.weight > 0, front.weight, 1).sqrt() * (front.weight > 0)
@@ -117,7 +119,7 @@ def _largest_step(opd, lit):
     return float(torch.stack(steps).max())
 
 
-def _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, reference_mm) -> int:
+def _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, reference_mm, at_m) -> int:
     """Power of two for which neighbours differ by at most a third of a wave, from a coarse look at the
     wavefront."""
     line = torch.linspace(-1, 1, 65, dtype=lens.dtype, device=lens.curvature_per_mm.device)
@@ -133,6 +135,7 @@ def _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, refere
             defocus_mm,
             reference_mm,
             torch.stack([x, y], -1)[inside],
+            at_m,
         )
     opd = torch.zeros_like(x).masked_scatter(inside, front.waves)
     lit = torch.zeros_like(inside).masked_scatter(inside, front.weight > 0)

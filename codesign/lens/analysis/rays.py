@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
-from codesign.lens.distance import PARALLEL, Distances, vergence_per_mm
+from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_per_mm
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.traced import TracedLens
 
@@ -115,7 +115,8 @@ class ImageRays:
 
     position_mm: [..., M, 2] (x, y). direction: [..., M, 3] unit. path_mm: [..., M] optical path to the plane from
       the wavefront of the object point through the centre of the entrance pupil. weight: [..., M] >= 0, 0 for
-      rays that do not arrive. index: refractive index in image space.
+      rays that do not arrive. index: refractive index in image space. transmission: [..., M] what the apertures'
+      soft edges let pass.
     """
 
     position_mm: Tensor
@@ -123,6 +124,22 @@ class ImageRays:
     path_mm: Tensor
     weight: Tensor
     index: Tensor
+    transmission: Tensor
+
+    def vignetted(self) -> "ImageRays":
+        """The same rays weighed by the apertures too."""
+        return replace(self, weight=self.weight * self.transmission)
+
+    def part(self, rays: slice) -> "ImageRays":
+        """Some of the rays."""
+        return ImageRays(
+            self.position_mm[..., rays, :],
+            self.direction[..., rays, :],
+            self.path_mm[..., rays],
+            self.weight[..., rays],
+            self.index,
+            self.transmission[..., rays],
+        )
 
     def shifted(self, defocus_mm: float | Tensor) -> "ImageRays":
         """The same rays on a plane ``defocus_mm`` further along +z (scalar, may carry a gradient); rays of
@@ -156,8 +173,12 @@ def trace_field(
     Gradient: positions, directions and paths to every lens tensor and to at_m; with vignetting the weights too.
     Raises: DomainError when no ray of a field arrives, or for a distance inside the lens.
     """
-    source = source_rays(lens, field_rad, pupil, at_m)
-    rays = trace_source(lens, source, wavelength_um, vignetting)
+    rays = trace_source(lens, source_rays(lens, field_rad, pupil, at_m), wavelength_um).shifted(defocus_mm)
+    return _lit(lens, rays.vignetted() if vignetting else rays, field_rad)
+
+
+def _lit(lens, rays, field_rad):
+    """The rays, of which some of every field must arrive."""
     dark = ~(rays.weight.detach() > 0).any(-1)
     if bool(dark.any()):
         fields = torch.as_tensor(field_rad, dtype=torch.float64).expand(dark.shape)
@@ -166,26 +187,40 @@ def trace_field(
             f"{lens.name}: no ray arrives at field {names} degrees; use a smaller "
             "field, weaker curvatures or larger apertures."
         )
-    return rays.shifted(defocus_mm)
+    return rays
 
 
-def trace_source(
-    lens: TracedLens, source: SourceRays, wavelength_um: float, vignetting: bool = False
-) -> ImageRays:
-    """ImageRays of source rays on the lens's own image plane; weights as in ``trace_field``, no ray need
-    arrive."""
+def trace_source(lens: TracedLens, source: SourceRays, wavelength_um: float) -> ImageRays:
+    """ImageRays of source rays on the lens's own image plane, of weight 1 where they arrive; none need do so."""
     shape = source.path_mm.shape
     out = lens.trace(source.origin_mm.reshape(-1, 3), source.direction.reshape(-1, 3), wavelength_um)
-    arrived = (out.status == 0).to(out.weight.dtype)
-    weight = out.weight * arrived if vignetting else arrived
     index = lens.index(wavelength_um)
     return ImageRays(
         out.position_mm[:, :2].reshape(*shape, 2),
         out.direction.reshape(*shape, 3),
         out.optical_path_mm.reshape(shape) + index[0] * source.path_mm,
-        weight.reshape(shape),
+        (out.status == 0).to(out.weight.dtype).reshape(shape),
         index[-1],
+        out.weight.reshape(shape),
     )
+
+
+def trace_with_chief(
+    lens: TracedLens,
+    field_rad: float,
+    pupil: Tensor,
+    wavelength_um: float,
+    vignetting: bool,
+    defocus_mm: float | Tensor,
+    at_m: float | Tensor,
+) -> tuple[ImageRays, ImageRays]:
+    """The rays of one field as from ``trace_field``, and its ``chief_ray``, in one trace."""
+    one_distance(at_m)
+    points = torch.cat([pupil, torch.zeros_like(pupil[:1])])
+    both = trace_source(lens, source_rays(lens, field_rad, points, at_m), wavelength_um).shifted(defocus_mm)
+    rays = both.part(slice(-1))
+    chief = both.part(slice(-1, None))
+    return _lit(lens, rays.vignetted() if vignetting else rays, field_rad), _lit(lens, chief, field_rad)
 
 
 def chief_ray(

@@ -17,7 +17,7 @@ from codesign.lens.analysis.rays import (
     trace_field,
     trace_source,
 )
-from codesign.lens.distance import PARALLEL, Distances
+from codesign.lens.distance import PARALLEL, Distances, one_distance
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.traced import TracedLens
 
@@ -85,19 +85,21 @@ def polychromatic_spot(
     grid: int = 32,
     vignetting: bool = False,
     defocus_mm: float | Tensor = 0.0,
+    at_m: float | Tensor = PARALLEL,
 ) -> tuple[Tensor, Tensor]:
-    """Spot of one field in light of several wavelengths, lateral colour included.
+    """Spot of one object point in light of several wavelengths, lateral colour included.
 
-    Args: light: see ``spectral_lines``. grid: pupil cells across. vignetting, defocus_mm: see
+    Args: light: see ``spectral_lines``. grid: pupil cells across. vignetting, defocus_mm, at_m (one distance): see
       ``trace_field``.
     Returns: positions [W, M, 2] mm on the image plane, and weights [W, M] that sum to 1 (rays of one
       wavelength share its weight as far as they arrive).
-    Gradient: positions (with vignetting also weights) to every lens tensor. Raises: DomainError when no ray
-      of a wavelength arrives.
+    Gradient: positions (with vignetting also weights) to every lens tensor and to at_m. Raises: DomainError when
+      no ray of a wavelength arrives.
     """
+    one_distance(at_m)
     pupil = pupil_grid(grid, lens.dtype, lens.curvature_per_mm.device)
     wavelengths, shares = spectral_lines(light)
-    rays = [trace_field(lens, field_rad, pupil, w, vignetting, defocus_mm) for w in wavelengths]
+    rays = [trace_field(lens, field_rad, pupil, w, vignetting, defocus_mm, at_m) for w in wavelengths]
     weight = torch.stack([r.weight * share for r, share in zip(rays, shares, strict=True)])
     return torch.stack([r.position_mm for r in rays]), weight / weight.sum()
 
@@ -124,13 +126,14 @@ def encircled_energy(
     vignetting: bool = False,
     defocus_mm: float | Tensor = 0.0,
     about_chief: bool = False,
+    at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
     """Share of rays within circles about the spot's mean point (or the chief ray of the first wavelength).
 
-    Args: radii_mm: [K] increasing or not. Returns: [K] in [0, 1], geometric, without diffraction. Gradient:
+    Args: radii_mm: [K] increasing or not; the others as for ``polychromatic_spot``. Returns: [K] in [0, 1], geometric, without diffraction. Gradient:
       none (a count).
     """
-    distance, weight = _distances(lens, field_rad, light, grid, vignetting, defocus_mm, about_chief)
+    distance, weight = _distances(lens, field_rad, light, grid, vignetting, defocus_mm, about_chief, at_m)
     radii = torch.as_tensor(radii_mm, dtype=distance.dtype, device=distance.device).reshape(-1)
     order = distance.detach().argsort()
     energy = torch.cat([torch.zeros_like(weight[:1]), weight.detach()[order].cumsum(0)])
@@ -146,12 +149,13 @@ def encircled_radius_mm(
     vignetting: bool = False,
     defocus_mm: float | Tensor = 0.0,
     about_chief: bool = False,
+    at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
     """Radius that holds a share of the rays, scalar mm. Gradient: that of the ray on the rim. Raises:
     DomainError for a share outside (0, 1]."""
     if not 0 < share <= 1:
         raise DomainError(f"share {share} of encircled energy must lie in (0, 1].")
-    distance, weight = _distances(lens, field_rad, light, grid, vignetting, defocus_mm, about_chief)
+    distance, weight = _distances(lens, field_rad, light, grid, vignetting, defocus_mm, about_chief, at_m)
     order = distance.detach().argsort()
     reached = weight.detach()[order].cumsum(0)
     at = int(
@@ -162,12 +166,12 @@ def encircled_radius_mm(
     return distance[order[at]]
 
 
-def _distances(lens, field_rad, light, grid, vignetting, defocus_mm, about_chief):
-    positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm)
+def _distances(lens, field_rad, light, grid, vignetting, defocus_mm, about_chief, at_m):
+    positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
     points = positions.reshape(-1, 2)
     weight = weight.reshape(-1)
     if about_chief:
-        centre = chief_ray(lens, field_rad, spectral_lines(light)[0][0], defocus_mm).position_mm
+        centre = chief_ray(lens, field_rad, spectral_lines(light)[0][0], defocus_mm, at_m).position_mm
     else:
         centre = (points * weight[:, None]).sum(0)
     kept = weight.detach() > 0

@@ -9,6 +9,7 @@ from codesign.errors import DomainError
 from codesign.lens.analysis.mtf import diffraction_mtf, geometric_mtf
 from codesign.lens.analysis.rays import Light, Values, pupil_grid, spectral_lines, trace_field
 from codesign.lens.analysis.spots import spot_radius_mm
+from codesign.lens.distance import PARALLEL, one_distance
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
@@ -22,24 +23,20 @@ def through_focus_spot_mm(
     light: Light = WAVELENGTH_UM["d"],
     grid: int = 32,
     vignetting: bool = False,
+    at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
     """RMS spot about its mean for each field and plane, [F, Z] mm. Args: defocus_mm: [Z], positive further
-    from the lens. Gradient: to every lens tensor."""
+    from the lens; at_m: metres to the object plane. Gradient: to every lens tensor."""
     pupil = pupil_grid(grid, lens.dtype, lens.curvature_per_mm.device)
     wavelengths, shares = spectral_lines(light)
-    rows = []
-    for field in fields_rad:
-        rays = [trace_field(lens, float(field), pupil, w, vignetting) for w in wavelengths]
-        weight = torch.stack([r.weight * share for r, share in zip(rays, shares, strict=True)])
-        rows.append(
-            torch.stack(
-                [
-                    spot_radius_mm(torch.stack([r.shifted(float(z)).position_mm for r in rays]), weight)
-                    for z in defocus_mm
-                ]
-            )
-        )
-    return torch.stack(rows)
+    one_distance(at_m)
+    rays = [trace_field(lens, fields_rad, pupil, w, vignetting, at_m=at_m) for w in wavelengths]
+    weight = torch.stack([r.weight * share for r, share in zip(rays, shares, strict=True)], 1)
+    columns = []
+    for z in defocus_mm:
+        positions = torch.stack([r.shifted(float(z)).position_mm for r in rays], 1)
+        columns.append(torch.stack([spot_radius_mm(p, w) for p, w in zip(positions, weight, strict=True)]))
+    return torch.stack(columns, 1)
 
 
 def through_focus_mtf(
@@ -51,9 +48,10 @@ def through_focus_mtf(
     method: str = "diffraction",
     grid: int | None = None,
     vignetting: bool = False,
+    at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
     """MTF at one frequency on several planes, [2, Z] tangential, sagittal. Args: method: "diffraction" or
-    "geometric". Gradient: to every lens tensor."""
+    "geometric"; at_m: metres to the object plane. Gradient: to every lens tensor."""
     if method not in METHODS:
         raise DomainError(f"method '{method}' is not known; known methods: {', '.join(METHODS)}.")
     options = {} if grid is None else {"grid": grid}
@@ -66,6 +64,7 @@ def through_focus_mtf(
                 light,
                 vignetting=vignetting,
                 defocus_mm=float(z),
+                at_m=at_m,
                 **options,
             )
             for z in defocus_mm

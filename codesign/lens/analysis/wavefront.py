@@ -1,8 +1,8 @@
 """Wavefront error of a lens: optical path differences from the reference sphere, their RMS, and the Strehl
 ratio.
 
-The object is at infinity, so paths count from one plane wavefront across the field direction. The reference
-sphere is centred on the chief ray's image point (or another given point) and passes through the centre of the
+Paths count from the object point, that is from its spherical wavefront through the centre of the entrance pupil (a
+plane for parallel light). The reference sphere is centred on the chief ray's image point (or another given point) and passes through the centre of the
 paraxial exit pupil. An optical path difference is positive where the wavefront is ahead of the sphere, so
 that undercorrected spherical aberration is positive (W040 = S_I / 8).
 Source: Welford, Aberrations of Optical Systems, ch. 7; Born and Wolf, ch. 9.
@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.lens.analysis.rays import ImageRays, chief_ray, pupil_grid, trace_field
+from codesign.lens.analysis.rays import ImageRays, pupil_grid, trace_with_chief
+from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
@@ -67,21 +68,21 @@ def wavefront(
     defocus_mm: float | Tensor = 0.0,
     reference_mm: Tensor | None = None,
     pupil: Tensor | None = None,
+    at_m: float | Tensor = PARALLEL,
 ) -> Wavefront:
-    """Wavefront of one field.
+    """Wavefront of one object point.
 
     Args:
       grid: pupil cells across (the points are those of ``pupil_grid``), unless ``pupil`` [M, 2] gives the
         points themselves.
-      vignetting, defocus_mm: see ``trace_field``. reference_mm: [2] centre of the reference sphere; None is
+      vignetting, defocus_mm, at_m (one distance): see ``trace_field``. reference_mm: [2] centre of the reference sphere; None is
         the chief ray's point.
     Returns: Wavefront.
-    Gradient: opd_mm to every lens tensor. Raises: DomainError when no ray, or not the chief ray, arrives.
+    Gradient: opd_mm to every lens tensor and to at_m. Raises: DomainError when no ray, or not the chief ray, arrives.
     """
     like = lens.curvature_per_mm
     pupil = pupil_grid(grid, like.dtype, like.device) if pupil is None else pupil
-    rays = trace_field(lens, field_rad, pupil, wavelength_um, vignetting, defocus_mm)
-    chief = chief_ray(lens, field_rad, wavelength_um, defocus_mm)
+    rays, chief = trace_with_chief(lens, field_rad, pupil, wavelength_um, vignetting, defocus_mm, at_m)
     opd, slope = _on_sphere(lens, rays, chief, wavelength_um, reference_mm, defocus_mm)
     return Wavefront(pupil, torch.where(rays.weight > 0, opd, 0), rays.weight, slope, wavelength_um)
 

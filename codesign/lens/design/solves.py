@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError
 from codesign.lens.analysis.rays import pupil_grid, source_rays, trace_source
-from codesign.lens.distance import PARALLEL, Distances, vergence_per_mm
+from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_per_mm
 from codesign.lens.focus import least_spot_shift
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
@@ -32,12 +32,7 @@ def focus_paraxial(
     Raises: DomainError for light that leaves the lens parallel, or a distance inside the lens. A focus inside the
       lens gives a negative last thickness, which constraints must push back.
     """
-    height, angle = focused_image(lens, vergence_per_mm(lens, at_m), wavelength_um)
-    if angle.ndim:
-        raise ShapeError(
-            f"{lens.name}: a paraxial focus is that of one distance, got {angle.numel()}; focus_rays "
-            "takes several."
-        )
+    height, angle = focused_image(lens, vergence_per_mm(lens, one_distance(at_m)), wavelength_um)
     if abs(float(angle.detach())) < 1e-12:
         raise DomainError(
             f"{lens.name}: the light of a point {float(torch.as_tensor(at_m)):.6g} m away leaves the lens parallel, "
