@@ -50,11 +50,11 @@ class GeoLens(Replaceable):
     air and of mirrors do nothing and have no gradient), phase [S, P] (radians per mm^2, mm^4, ...).
     ``variables`` turns the named ones into functions of dimensionless variables and holds the others.
     Errors of assembly (buffers, with gradients after ``requires_grad_`` or through ``replace``): decentre_mm
-    [S, 2], tilt_rad [S, 2].
+    [S, 2], tilt_rad [S, 2]; and semi_aperture_mm [S], the same way.
     half_field_deg: the half field the lens is made for, or None where nobody said.
     """
 
-    tensor_names = LEARNABLES
+    tensor_names = (*LEARNABLES, "semi_aperture_mm")
     parameter_names = LEARNABLES[:6]
     solved_tensors: ClassVar = {
         "efl_mm": "curvature_per_mm",
@@ -261,8 +261,8 @@ class GeoLens(Replaceable):
             [[math.radians(a) for a in s.tilt_deg] for s in self.surfaces], dtype=self.dtype
         ).tolist()
         now = self._now() | {"index_offset": torch.where(self.glass, self.index_offset, 0)}
-        columns = (now[name].tolist() for name in LEARNABLES)
-        for old, first, tilted, c, t, k, a, shift, phase, decentre, tilt in zip(
+        columns = (now[name].tolist() for name in self.tensor_names)
+        for old, first, tilted, c, t, k, a, shift, phase, decentre, tilt, semi_aperture in zip(
             self.surfaces, at_first, tilts, *columns, strict=True
         ):
             found.append(
@@ -270,6 +270,7 @@ class GeoLens(Replaceable):
                     old,
                     radius_mm=old.radius_mm if c == first else 1 / c if c else math.inf,
                     thickness_mm=t,
+                    semi_aperture_mm=semi_aperture,
                     conic=k,
                     asphere=tuple(a) if any(a) or old.asphere else (),
                     medium=(old.medium or AIR).shifted(shift) if shift else old.medium,

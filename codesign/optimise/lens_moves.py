@@ -30,6 +30,7 @@ from codesign.lens.design.moves import (
     without_element,
 )
 from codesign.lens.design.solves import focus_paraxial, hold_efl, holding_surface
+from codesign.lens.glass import AIR
 from codesign.lens.variables import Bound
 from codesign.optimise.least_squares import DampedLeastSquares
 
@@ -150,7 +151,7 @@ def exchange_glasses(
     log = []
     for front, _ in pairs:
         best = now
-        medium = now.lens.to_surfaces()[front].medium
+        medium = now.lens.to_surfaces()[front].medium or AIR
         for candidate in neighbour_glasses(medium, count, among=among):
             label = f"{medium.name} behind surface {front + 1} -> {candidate.name}"
             try:

@@ -3,6 +3,7 @@ motion."""
 
 from codesign.lens.design.constraints import Limits
 from codesign.lens.design.glass_map import neighbour_glasses
+from codesign.lens.design.hits import fit_apertures
 from codesign.lens.design.modes import LensDesign, detune, edge_thickness_mm, make_design
 from codesign.lens.design.moves import (
     elements,
@@ -22,6 +23,7 @@ __all__ = [
     "detune",
     "edge_thickness_mm",
     "elements",
+    "fit_apertures",
     "flattened",
     "focus_paraxial",
     "focus_rays",

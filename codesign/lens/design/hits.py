@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.lens.analysis import field_rays
+from codesign.lens.analysis.rays import source_rays
+from codesign.lens.distance import PARALLEL, Distances
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.paraxial import yu_trace
@@ -67,33 +68,64 @@ def surface_hits(
     return Hits(torch.stack(heights), torch.stack(cosines), torch.stack(passed))
 
 
-def rim_rays(lens: GeoLens, fields_rad: Sequence[float], count: int = 16) -> tuple[Tensor, Tensor]:
-    """The chief ray and ``count`` rays on the rim of the entrance pupil, for each field. Returns: origins and
-    directions [fields * (count + 1), 3]."""
+def rim_rays(
+    lens: GeoLens, fields_rad: Sequence[float], count: int = 16, at_m: Distances = PARALLEL
+) -> tuple[Tensor, Tensor]:
+    """The chief ray and ``count`` rays on the rim of the entrance pupil, for each field and distance. Returns:
+    origins and directions [distances * fields * (count + 1), 3]."""
     turn = (
         torch.arange(count, dtype=lens.dtype, device=lens.curvature_per_mm.device) * (2 * torch.pi / count)
         + torch.pi / 2
     )
     pupil = torch.cat([torch.zeros_like(turn[:1]).expand(1, 2), torch.stack([turn.cos(), turn.sin()], 1)])
-    rays = [field_rays(lens, float(f), pupil) for f in fields_rad]
-    return torch.cat([o for o, _ in rays]), torch.cat([d for _, d in rays])
+    rays = source_rays(lens, fields_rad, pupil, at_m)
+    return rays.origin_mm.reshape(-1, 3), rays.direction.reshape(-1, 3)
 
 
 def traced_semi_aperture_mm(
-    lens: GeoLens, fields_rad: Sequence[float], margin: float = 0.05, count: int = 16
+    lens: GeoLens,
+    fields_rad: Sequence[float],
+    margin: float = 0.05,
+    count: int = 16,
+    at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """Semi-aperture that lets the full pupil of all fields pass, [S] mm: the largest height of a rim ray,
-    times 1 + margin.
+    """Semi-aperture that lets the full pupil of all fields and distances pass, [S] mm: the largest height of a rim
+    ray, times 1 + margin.
 
     Gradient: of the highest ray. Raises: DomainError when a rim ray fails.
     """
-    hits = surface_hits(lens, *rim_rays(lens, fields_rad, count))
-    if not bool(hits.passed[-1].all()):
+    rays = rim_rays(lens, fields_rad, count, at_m)
+    failed = lens.trace(*rays).status != 0
+    if bool(failed.any()):
         raise DomainError(
-            f"{lens.name}: {int((~hits.passed[-1]).sum())} of {hits.passed.shape[1]} rim rays fail, so its "
+            f"{lens.name}: {int(failed.sum())} of {failed.numel()} rim rays fail, so its "
             "apertures cannot be sized; use a smaller field or weaker curvatures."
         )
-    return hits.height_mm.amax(1) * (1 + margin)
+    whole = lens.prescription()
+    reached = [trace(whole.until(i), *rays).position_mm for i in range(len(lens.surfaces))]
+    return torch.stack([torch.linalg.vector_norm(p[:, :2], dim=1).amax() for p in reached]) * (1 + margin)
+
+
+def fit_apertures(
+    lens: GeoLens, fields_rad: Sequence[float], at_m: Distances = PARALLEL, margin: float = 0.05
+) -> GeoLens:
+    """The lens with the semi-apertures that its rays need, so that edges and gaps of a design that changed are
+    judged, and its light clipped, where its glass would really end.
+
+    Args: fields_rad, at_m: whose full pupil passes; give both signs of a field for a lens with decentres or tilts.
+      margin: share added to the highest ray, as far as the surface reaches.
+    Returns: a lens as from ``replace``. Gradient: semi_aperture_mm follows the highest rays.
+    Raises: DomainError when a rim ray fails.
+
+    >>> from codesign import lens
+    >>> geo = lens.load("double-gauss")
+    >>> lens.design.fit_apertures(geo, (0.0, 0.1)).semi_aperture_mm.amax() < geo.semi_aperture_mm.amax()
+    tensor(True)
+    """
+    wanted = traced_semi_aperture_mm(lens, fields_rad, margin, at_m=at_m)
+    square = (1 + lens.conic) * lens.curvature_per_mm.square()
+    reach = (1 - 1e-9) * square.clamp_min(1e-24).rsqrt()  # a sphere ends at its radius
+    return lens.replace(semi_aperture_mm=torch.minimum(wanted, reach))
 
 
 def paraxial_semi_aperture_mm(lens: GeoLens, half_field_rad: float | Tensor, margin: float = 0.05) -> Tensor:
