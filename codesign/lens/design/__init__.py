@@ -2,6 +2,7 @@
 motion."""
 
 from codesign.lens.design.constraints import Limits
+from codesign.lens.design.element_errors import moved_element
 from codesign.lens.design.glass_map import neighbour_glasses
 from codesign.lens.design.hits import fit_apertures
 from codesign.lens.design.modes import LensDesign, detune, edge_thickness_mm, make_design
@@ -30,6 +31,7 @@ __all__ = [
     "groups",
     "hold_efl",
     "make_design",
+    "moved_element",
     "neighbour_glasses",
     "with_glass",
     "without_element",
