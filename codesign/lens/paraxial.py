@@ -215,22 +215,23 @@ class ParaxialRays:
 
 def paraxial_rays(
     lens: ParaxialLens,
-    field_rad: float,
+    field_rad: float | Tensor,
     wavelength_um: float = WAVELENGTH_UM["d"],
     vergence_per_mm: float | Tensor = 0.0,
 ) -> ParaxialRays:
     """ParaxialRays of an object plane.
 
-    Args: field_rad: half field, whose tangent is the slope of the d line's chief ray in object space; a number
-      below 90 degrees. vergence_per_mm: 1 / distance of the object from the entrance pupil of the d line, a
+    Args: field_rad: half field, whose tangent is the slope of the d line's chief ray in object space; a number or
+      scalar tensor, below 90 degrees. vergence_per_mm: 1 / distance of the object from the entrance pupil of the d line, a
       number or scalar tensor (see ``distance.vergence_per_mm``); 0 is parallel light. The diameter of the entrance
       pupil is the lens's at every distance.
     Gradient: to every lens tensor that bends or moves light, and to the vergence. Raises: DomainError for a field
       of 90 degrees and more, or an entrance pupil at infinity.
     """
-    if not abs(field_rad) < math.pi / 2:
+    field = torch.as_tensor(field_rad, dtype=torch.float64)
+    if not abs(float(field.detach())) < math.pi / 2:
         raise DomainError(
-            f"{lens.name}: a paraxial chief ray at {math.degrees(field_rad):.4g} degrees has no slope; give "
+            f"{lens.name}: a paraxial chief ray at {math.degrees(float(field)):.4g} degrees has no slope; give "
             "a field below 90 degrees."
         )
     f = lens.first_order(wavelength_um)
@@ -245,7 +246,7 @@ def paraxial_rays(
     vergence = torch.as_tensor(vergence_per_mm, dtype=power.dtype, device=power.device)
     # colours have pupils of their own, and one object plane
     shift = f.entrance_pupil_z_mm - (f if wavelength_um == D_LINE else lens.first_order()).entrance_pupil_z_mm
-    slope = math.tan(field_rad) / (1 + vergence * shift)
+    slope = field.tan().to(power) / (1 + vergence * shift)
     spread = vergence / (1 + vergence * shift) * (f.entrance_pupil_diameter_mm / 2)
     starts = (
         (f.entrance_pupil_diameter_mm / 2 - spread * f.entrance_pupil_z_mm, spread * index[0]),

@@ -10,6 +10,7 @@ import torch
 from matplotlib.figure import Figure
 
 from codesign.lens import analysis
+from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.seidel import SeidelSums
@@ -32,26 +33,27 @@ def field_errors(
     light: analysis.Light = VISIBLE_UM,
     mapping: str = "f-tan",
     count: int = 21,
+    at_m: float = PARALLEL,
 ) -> Figure:
     """Figure over the field: tangential and sagittal focus, distortion, and lateral colour against the first
-    wavelength."""
+    wavelength. at_m, here as in the other curves: metres to the object plane, inf for parallel light."""
     reference, *others = analysis.spectral_lines(light)[0]
     fields = [half_field_rad * i / (count - 1) for i in range(count)]
     degrees = np.degrees(fields)
     figure, axes = plt.subplots(1, 3, figsize=(10, 3.8), sharey=True, layout="constrained")
-    shifts = analysis.focus_shift_mm(lens, fields, reference).numpy()
+    shifts = analysis.focus_shift_mm(lens, fields, reference, at_m=at_m).numpy()
     axes[0].plot(shifts[:, 0], degrees, color=COLOURS[0], label="tangential")
     axes[0].plot(shifts[:, 1], degrees, color=COLOURS[0], ls="--", label="sagittal")
     axes[0].set(xlabel="focus shift (mm)", ylabel="field (degrees)", title="Field curvature")
     axes[0].legend(frameon=False, fontsize=8)
     axes[1].plot(
-        analysis.distortion_percent(lens, fields[1:], mapping, reference).numpy(),
+        analysis.distortion_percent(lens, fields[1:], mapping, reference, at_m).numpy(),
         degrees[1:],
         color=COLOURS[2],
     )  # on the axis it is 0 by definition
     axes[1].set(xlabel=f"distortion (%), {mapping}", title="Distortion")
     if others:
-        colour = analysis.lateral_colour_mm(lens, fields, others, reference).numpy() * 1e3
+        colour = analysis.lateral_colour_mm(lens, fields, others, reference, at_m).numpy() * 1e3
         for k, wavelength in enumerate(others):
             axes[2].plot(colour[:, k], degrees, color=COLOURS[1:][k % 3], label=f"{wavelength * 1e3:.0f} nm")
         axes[2].legend(frameon=False, fontsize=8)
@@ -74,16 +76,17 @@ def through_focus(
     light: analysis.Light = WAVELENGTH_UM["d"],
     vignetting: bool = False,
     method: str = "geometric",
+    at_m: float = PARALLEL,
 ) -> Figure:
     """Figure over the position of the image plane: RMS spot, and MTF at one frequency."""
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
     z = np.asarray(defocus_mm, dtype=float)
-    sizes = analysis.through_focus_spot_mm(lens, fields_rad, z, light, 24, vignetting) * 1e3
+    sizes = analysis.through_focus_spot_mm(lens, fields_rad, z, light, 24, vignetting, at_m) * 1e3
     for field, row, colour in zip(fields_rad, sizes, COLOURS * len(fields_rad), strict=False):
         label = f"{math.degrees(field):.3g}°"
         axes[0].plot(z, row.numpy(), color=colour, label=label)
         curves = analysis.through_focus_mtf(
-            lens, field, frequency_per_mm, z, light, method, vignetting=vignetting
+            lens, field, frequency_per_mm, z, light, method, vignetting=vignetting, at_m=at_m
         ).numpy()
         axes[1].plot(z, curves[0], color=colour, label=f"{label}, tangential")
         axes[1].plot(z, curves[1], color=colour, ls="--", label=f"{label}, sagittal")
@@ -125,22 +128,48 @@ def encircled_curves(
     fields_rad: Sequence[float],
     light: analysis.Light = WAVELENGTH_UM["d"],
     vignetting: bool = False,
+    at_m: float = PARALLEL,
 ) -> Figure:
     """Figure of encircled energy (rays, about their mean) over the radius, a curve per field."""
     figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
     largest = max(
-        float(analysis.encircled_radius_mm(lens, field, 1.0, light, 48, vignetting)) for field in fields_rad
+        float(analysis.encircled_radius_mm(lens, field, 1.0, light, 48, vignetting, at_m=at_m))
+        for field in fields_rad
     )
     radii = torch.linspace(0, 1.02 * largest, 200, dtype=lens.dtype)
     for field, colour in zip(fields_rad, COLOURS * len(fields_rad), strict=False):
         axis.plot(
             radii.numpy() * 1e3,
-            analysis.encircled_energy(lens, field, radii, light, 48, vignetting).numpy(),
+            analysis.encircled_energy(lens, field, radii, light, 48, vignetting, at_m=at_m).numpy(),
             color=colour,
             label=f"{math.degrees(field):.3g}°",
         )
     axis.set(xlabel="radius (µm)", ylabel="share of rays inside", ylim=(0, 1.02))
     axis.set_xlim(left=0)
     axis.grid(alpha=0.3)
+    axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+@torch.no_grad()
+def depth_curves(
+    lens: GeoLens,
+    fields_rad: Sequence[float],
+    near_m: float,
+    far_m: float,
+    blur_mm: float,
+    wavelength_um: float = WAVELENGTH_UM["d"],
+) -> Figure:
+    """Figure over the distance of the object, even in 1 / distance: RMS spot of each field with the film where it is,
+    and the RMS radius of a disc ``blur_mm`` across as a dashed line."""
+    vergence = torch.linspace(1 / far_m, 1 / near_m, 129, dtype=lens.dtype)
+    sizes = analysis.rms_spot_mm(lens, fields_rad, wavelength_um, 16, 1 / vergence) * 1e3
+    figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
+    for field, column, colour in zip(fields_rad, sizes.T, COLOURS * len(fields_rad), strict=False):
+        axis.plot(vergence.numpy(), column.numpy(), color=colour, label=f"{math.degrees(field):.3g}°")
+    axis.axhline(1e3 * blur_mm / math.sqrt(8), color="0.4", ls="--", lw=1)
+    ticks = np.linspace(vergence[0], vergence[-1], 7)
+    axis.set_xticks(ticks, [f"{1 / t:.3g}" if t > 0 else "∞" for t in ticks])
+    axis.set(xlabel="distance of the object (m)", ylabel="RMS spot (µm)", ylim=(0, None))
     axis.legend(frameon=False, fontsize=8)
     return figure

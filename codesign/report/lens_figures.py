@@ -13,6 +13,7 @@ from torch import Tensor
 
 from codesign.lens import analysis
 from codesign.lens.analysis.psf import Psf
+from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.report.lens_layout import COLOURS, draw_layout, layouts, lens_layout
@@ -41,9 +42,11 @@ LINE_COLOURS = (
 )  # of wavelengths; the first is the reference
 
 
-def spot_diagrams(lenses: Mapping[str, GeoLens], fields_rad: Sequence[float], pixel_mm: float) -> Figure:
+def spot_diagrams(
+    lenses: Mapping[str, GeoLens], fields_rad: Sequence[float], pixel_mm: float, at_m: float = PARALLEL
+) -> Figure:
     """Figure of spot diagrams: a row per lens (dict title -> lens), a column per field, one scale, the pixel
-    drawn in."""
+    drawn in. at_m, here as in the other pictures: metres to the object plane, inf for parallel light."""
     figure, axes = plt.subplots(
         len(lenses),
         len(fields_rad),
@@ -54,7 +57,7 @@ def spot_diagrams(lenses: Mapping[str, GeoLens], fields_rad: Sequence[float], pi
     )
     for row, (title, lens) in zip(axes, lenses.items(), strict=True):
         with torch.no_grad():
-            points, weight = analysis.spots(lens, fields_rad, grid=24)
+            points, weight = analysis.spots(lens, fields_rad, grid=24, at_m=at_m)
         for axis, p, w, field in zip(row, points, weight, fields_rad, strict=True):
             p = p[w > 0]
             centre = p.mean(0)
@@ -82,6 +85,7 @@ def spots_by_wavelength(
     light: analysis.Light = VISIBLE_UM,
     grid: int = 24,
     vignetting: bool = False,
+    at_m: float = PARALLEL,
 ) -> Figure:
     """Figure of spots of each field about the chief ray of the first wavelength, a colour per wavelength,
     with the Airy disc."""
@@ -97,8 +101,8 @@ def spots_by_wavelength(
     )
     airy = 1.22 * wavelengths[0] * float(lens.first_order(wavelengths[0]).fno.abs())
     for axis, field in zip(axes[0], fields_rad, strict=True):
-        points, weight = analysis.polychromatic_spot(lens, field, light, grid, vignetting)
-        centre = analysis.chief_ray(lens, field, wavelengths[0]).position_mm[0]
+        points, weight = analysis.polychromatic_spot(lens, field, light, grid, vignetting, at_m=at_m)
+        centre = analysis.chief_ray(lens, field, wavelengths[0], at_m=at_m).position_mm[0]
         for p, w, wavelength, colour in zip(
             points, weight, wavelengths, LINE_COLOURS * len(wavelengths), strict=False
         ):
@@ -126,7 +130,11 @@ def spots_by_wavelength(
 
 @torch.no_grad()
 def ray_fans(
-    lens: GeoLens, fields_rad: Sequence[float], light: analysis.Light = VISIBLE_UM, vignetting: bool = False
+    lens: GeoLens,
+    fields_rad: Sequence[float],
+    light: analysis.Light = VISIBLE_UM,
+    vignetting: bool = False,
+    at_m: float = PARALLEL,
 ) -> Figure:
     """Figure of ray fans: transverse aberration (upper) and optical path difference (lower) over the pupil, a
     pair of columns per field, relative to the first wavelength's chief ray."""
@@ -141,9 +149,9 @@ def ray_fans(
         layout="constrained",
     )
     for k, field in enumerate(fields_rad):
-        reference = analysis.chief_ray(lens, field, wavelengths[0]).position_mm[0]
+        reference = analysis.chief_ray(lens, field, wavelengths[0], at_m=at_m).position_mm[0]
         for wavelength, colour in zip(wavelengths, LINE_COLOURS * len(wavelengths), strict=False):
-            fan = analysis.ray_fan(lens, field, wavelength, 65, vignetting, reference)
+            fan = analysis.ray_fan(lens, field, wavelength, 65, vignetting, reference, at_m=at_m)
             rows = (fan.tangential_mm * 1e3, fan.sagittal_mm * 1e3, fan.tangential_waves, fan.sagittal_waves)
             weights = (fan.tangential_weight, fan.sagittal_weight) * 2
             for axis, values, weight in zip(
@@ -183,11 +191,12 @@ def opd_maps(
     wavelength_um: float = WAVELENGTH_UM["d"],
     grid: int = 96,
     vignetting: bool = False,
+    at_m: float = PARALLEL,
 ) -> Figure:
     """Figure of optical path difference maps over the pupil, piston and tilt removed, one scale in waves."""
     pupil = analysis.pupil_grid(grid, lens.dtype)
     fronts = [
-        analysis.remove_fit(analysis.wavefront(lens, field, wavelength_um, grid, vignetting))
+        analysis.remove_fit(analysis.wavefront(lens, field, wavelength_um, grid, vignetting, at_m=at_m))
         for field in fields_rad
     ]
     limit = max(float(f.waves[f.weight > 0].abs().max()) for f in fronts) or 1e-12

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from codesign.errors import FileFormatError
 from codesign.lens.analysis.rays import field_rays
+from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.surface import sag_mm
 
@@ -25,13 +26,17 @@ ENDINGS = (".svg", ".png", ".pdf")
 
 
 def lens_layout(
-    lens: GeoLens, fields_rad: Sequence[float] | None = None, path: str | Path | None = None, rays: int = 5
+    lens: GeoLens,
+    fields_rad: Sequence[float] | None = None,
+    path: str | Path | None = None,
+    rays: int = 5,
+    at_m: float = PARALLEL,
 ) -> Figure:
     """Figure of a lens's cross-section with meridional rays.
 
     Args: fields_rad: angles; None takes 0, 0.7 and 1 of the lens's half field (10 degrees where none is
-      known). path: where to save, .svg, .png or .pdf, or None. rays: per field. Mirrors are drawn along the
-      unfolded axis.
+      known). path: where to save, .svg, .png or .pdf, or None. rays: per field. at_m: metres
+      from the entrance pupil to the object plane. Mirrors are drawn along the unfolded axis.
     Returns: matplotlib Figure. Raises: FileFormatError for another ending or a place that is not writable.
     """
     if path is not None and Path(path).suffix.lower() not in ENDINGS:
@@ -41,7 +46,7 @@ def lens_layout(
     if fields_rad is None:
         fields_rad = [math.radians(lens.half_field_deg or 10.0) * h for h in (0.0, 0.7, 1.0)]
     figure, axis = plt.subplots(figsize=(9, 4), layout="constrained")
-    draw_layout(axis, lens, fields_rad, rays)
+    draw_layout(axis, lens, fields_rad, rays, at_m)
     axis.set_title(lens.name, loc="left")
     if path is not None:
         try:
@@ -63,7 +68,9 @@ def layouts(lenses: Mapping[str, GeoLens], fields_rad: Sequence[float]) -> Figur
     return figure
 
 
-def draw_layout(axis: Axes, lens: GeoLens, fields_rad: Sequence[float], rays: int = 5) -> None:
+def draw_layout(
+    axis: Axes, lens: GeoLens, fields_rad: Sequence[float], rays: int = 5, at_m: float = PARALLEL
+) -> None:
     """Draw the cross-section of a lens with meridional rays of each field into a matplotlib axis. Lengths in
     mm."""
     surfaces = lens.to_surfaces()
@@ -93,7 +100,7 @@ def draw_layout(axis: Axes, lens: GeoLens, fields_rad: Sequence[float], rays: in
         pupil = torch.stack(
             [torch.zeros(rays, dtype=lens.dtype), torch.linspace(-1, 1, rays, dtype=lens.dtype)], 1
         )
-        paths = ray_paths(lens, field, pupil, start)
+        paths = ray_paths(lens, field, pupil, start, at_m)
         for k, path in enumerate(paths):
             axis.plot(
                 path[:, 0],
@@ -128,13 +135,14 @@ def draw_layout(axis: Axes, lens: GeoLens, fields_rad: Sequence[float], rays: in
         )
 
 
-def ray_paths(lens: GeoLens, field_rad: float, pupil: Tensor, start_z_mm: float) -> list[np.ndarray]:
+def ray_paths(
+    lens: GeoLens, field_rad: float, pupil: Tensor, start_z_mm: float, at_m: float = PARALLEL
+) -> list[np.ndarray]:
     """Polylines [points, 2] (z, y) in mm of the rays of a field that arrive, found by tracing the lens cut
     off behind each surface."""
     surfaces = lens.to_surfaces()
     with torch.no_grad():
-        origin, direction = field_rays(lens, field_rad, pupil)
-        origin = origin + direction * ((start_z_mm - origin[:, 2:]) / direction[:, 2:])
+        origin, direction = field_rays(lens, field_rad, pupil, start_z_mm=start_z_mm, at_m=at_m)
         points = [torch.stack([origin[:, 2], origin[:, 1]], 1)]
         z = 0.0
         for i, s in enumerate(surfaces):

@@ -1,7 +1,13 @@
-"""What a lens does to light of an object at infinity: spots, fans, wavefront, point spread, MTF, distortion,
-field curvature, colour."""
+"""What a lens does to the light of an object at any distance: spots, fans, wavefront, point spread, MTF, distortion,
+field curvature, colour, depth of field."""
 
 from codesign.lens.analysis.chromatic import chromatic_focus_shift_mm, lateral_colour_mm
+from codesign.lens.analysis.depth_of_field import (
+    DepthOfField,
+    depth_of_field,
+    hyperfocal_m,
+    traced_depth_of_field,
+)
 from codesign.lens.analysis.distortion import chief_height_mm, distortion_percent
 from codesign.lens.analysis.fans import RayFan, ray_fan
 from codesign.lens.analysis.field_curvature import focus_shift_mm
@@ -37,6 +43,7 @@ from codesign.lens.analysis.wavefront import (
 )
 
 __all__ = [
+    "DepthOfField",
     "ImageRays",
     "Light",
     "Psf",
@@ -46,6 +53,7 @@ __all__ = [
     "chief_height_mm",
     "chief_ray",
     "chromatic_focus_shift_mm",
+    "depth_of_field",
     "diffraction_mtf",
     "diffraction_psf",
     "distortion_percent",
@@ -55,6 +63,7 @@ __all__ = [
     "focus_shift_mm",
     "geometric_mtf",
     "geometric_psf",
+    "hyperfocal_m",
     "ideal_mtf",
     "lateral_colour_mm",
     "peak_to_valley_waves",
@@ -74,5 +83,6 @@ __all__ = [
     "through_focus_mtf",
     "through_focus_spot_mm",
     "trace_field",
+    "traced_depth_of_field",
     "wavefront",
 ]

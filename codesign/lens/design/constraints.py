@@ -19,6 +19,7 @@ from torch import Tensor
 from codesign.errors import DomainError
 from codesign.lens.design import glass_map
 from codesign.lens.design.hits import rim_rays, surface_hits
+from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.surface import sag_mm
 
@@ -82,6 +83,7 @@ class Limits:
     rays: whether every rim and chief ray of ``fields_rad`` must arrive.
     glass_polygon: corners (nd, Vd) of a convex region of the glass map, see glass_map. index_range: least and
       most nd of any glass.
+    at_m: distance of the object whose rays count, metres from the entrance pupil, or several; inf is parallel light.
     scale_mm, scale_deg: violations that cost 1.
     """
 
@@ -99,6 +101,7 @@ class Limits:
     index_range: tuple[float, float] | None = None
     scale_mm: float = 0.5
     scale_deg: float = 5.0
+    at_m: float | tuple[float, ...] = PARALLEL
 
     def __post_init__(self) -> None:
         if (self.incidence_deg is not None or self.rays) and not self.fields_rad:
@@ -234,7 +237,7 @@ def _steepness(lens, limits, apertures):
 def _rays(lens, limits):
     if limits.incidence_deg is None and not limits.rays:
         return []
-    origin, direction = rim_rays(lens, limits.fields_rad)
+    origin, direction = rim_rays(lens, limits.fields_rad, at_m=limits.at_m)
     found = []
     if limits.incidence_deg is not None:
         hits = surface_hits(lens, origin, direction)

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis.rays import source_rays
-from codesign.lens.distance import PARALLEL, Distances
+from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_per_mm
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
-from codesign.lens.paraxial import yu_trace
+from codesign.lens.paraxial import paraxial_rays
 from codesign.lens.trace import trace
 
 
@@ -128,17 +128,13 @@ def fit_apertures(
     return lens.replace(semi_aperture_mm=torch.minimum(wanted, reach))
 
 
-def paraxial_semi_aperture_mm(lens: GeoLens, half_field_rad: float | Tensor, margin: float = 0.05) -> Tensor:
-    """The same from the paraxial marginal and chief ray, |y| + |y_chief|, [S] mm: defined for every lens,
-    without tracing. Differentiable."""
-    f = lens.first_order()
-    n = lens.index()
-    t = lens.thickness_mm
-    power = lens.surface_power()
-    count = power.numel()
-    slope = torch.tan(torch.as_tensor(half_field_rad, dtype=lens.dtype, device=power.device))
-    marginal, _ = yu_trace(
-        power, t, n, f.entrance_pupil_diameter_mm / 2, torch.zeros_like(power[0]), last=count
-    )
-    chief, _ = yu_trace(power, t, n, -f.entrance_pupil_z_mm * slope, slope * n[0], last=count)
-    return (torch.stack(marginal).abs() + torch.stack(chief).abs()) * (1 + margin)
+def paraxial_semi_aperture_mm(
+    lens: GeoLens,
+    half_field_rad: float | Tensor,
+    margin: float = 0.05,
+    at_m: float | Tensor = PARALLEL,
+) -> Tensor:
+    """The same from the paraxial marginal and chief ray of one distance, |y| + |y_chief|, [S] mm: defined for every
+    lens, without tracing. Differentiable."""
+    rays = paraxial_rays(lens, half_field_rad, vergence_per_mm=vergence_per_mm(lens, one_distance(at_m)))
+    return (rays.marginal_height_mm.abs() + rays.chief_height_mm.abs()) * (1 + margin)

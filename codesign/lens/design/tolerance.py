@@ -20,8 +20,10 @@ from codesign.errors import DomainError, ShapeError
 from codesign.grad.jacobian import Jacobian, by_differences, finite
 from codesign.lens.analysis import spots
 from codesign.lens.design.constraints import is_glass
+from codesign.lens.distance import PARALLEL, one_distance, vergence_per_mm
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.paraxial import image_scale_mm
 
 Figures = Callable[[GeoLens], Tensor]
 
@@ -124,22 +126,26 @@ def linear_figures(
     wavelength_um: float = WAVELENGTH_UM["d"],
     compensate: Callable[[GeoLens], GeoLens] | None = None,
     grid: int = 8,
+    at_m: float = PARALLEL,
 ) -> Figures:
     """Figures that errors change in proportion: the function lens -> [5] of EFL, BFL, distortion at the field
     (relative), and the x and y of the axial spot's mean point; lengths in mm. Names: LINEAR_FIGURES.
 
-    Args: compensate: lens -> lens applied first, such as solves.focus_paraxial; None changes nothing.
+    Args: compensate: lens -> lens applied first, such as solves.focus_paraxial; None changes nothing. at_m: metres
+      from the (faulty) lens's entrance pupil to the object of the spots and of the distortion.
     """
+    one_distance(at_m)
 
     def figures(lens):
         lens = compensate(lens) if compensate else lens
         f = lens.first_order(wavelength_um)
-        position, arrived = spots(lens, (0.0, half_field_rad), wavelength_um, grid)
+        position, arrived = spots(lens, (0.0, half_field_rad), wavelength_um, grid, at_m)
+        scale = image_scale_mm(lens, vergence_per_mm(lens, at_m), wavelength_um)
         weight = arrived[..., None] / arrived.sum(1)[:, None, None]
         mean = (position * weight).sum(1)
         shift = mean[1, 1] - mean[0, 1]
         return torch.stack(
-            [f.efl_mm, f.bfl_mm, shift / (f.efl_mm * math.tan(half_field_rad)) - 1, mean[0, 0], mean[0, 1]]
+            [f.efl_mm, f.bfl_mm, shift / (scale * math.tan(half_field_rad)) - 1, mean[0, 0], mean[0, 1]]
         )
 
     return figures

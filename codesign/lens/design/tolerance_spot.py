@@ -15,6 +15,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis import spots
+from codesign.lens.distance import PARALLEL, Distances
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 
@@ -59,19 +60,21 @@ def spot_errors(
     wavelengths_um: Sequence[float] = (WAVELENGTH_UM["d"],),
     compensate: Callable[[GeoLens], GeoLens] | None = None,
     grid: int = 12,
+    at_m: Distances = PARALLEL,
 ) -> Callable[[GeoLens], Tensor]:
     """The figure lens -> [F * M * 2]: ray errors about the mean point of their field over all wavelengths,
     mm, divided by the root of the ray count.
 
-    Args: compensate: lens -> lens applied first, such as a refocus by solves.focus_rays. Raises: DomainError
+    Args: compensate: lens -> lens applied first, such as a refocus by solves.focus_rays. at_m: metres to the object
+      plane; of D distances each counts as so many more fields, [D * F * M * 2]. Raises: DomainError
       when a ray fails.
     """
 
     def figure(lens):
         lens = compensate(lens) if compensate else lens
-        found = [spots(lens, fields_rad, w, grid) for w in wavelengths_um]
-        position = torch.cat([p for p, _ in found], 1)
-        arrived = torch.cat([a for _, a in found], 1)
+        found = [spots(lens, fields_rad, w, grid, at_m) for w in wavelengths_um]
+        position = torch.cat([p.flatten(0, -3) for p, _ in found], 1)
+        arrived = torch.cat([a.flatten(0, -2) for _, a in found], 1)
         if not bool(arrived.bool().all()):
             raise DomainError(
                 f"{lens.name}: {int((arrived == 0).sum())} rays fail; the forecast needs every ray, so use "
@@ -83,7 +86,7 @@ def spot_errors(
 
 
 def squared_spots(errors: Tensor, fields: int) -> Tensor:
-    """Squared RMS spots [F] mm^2 out of what ``spot_errors`` gives."""
+    """Squared RMS spots [F] mm^2 out of what ``spot_errors`` gives; fields: their number, times that of distances."""
     return errors.reshape(fields, -1).square().sum(1)
 
 

@@ -1,8 +1,8 @@
 """What a lens can do: first-order figures, Seidel sums, layout, spots, fans, wavefront, point spread, MTF,
 distortion and field curvature on one page.
 
-Any lens that `codesign.lens.load` reads. The object is at infinity; apertures clip. Where a lens names no
-half field, the largest field up to 10 degrees whose chief ray and at least half of whose rays arrive is
+Any lens that `codesign.lens.load` reads. The object is at infinity, or at the distances of --at-m; apertures
+clip. Where a lens names no half field, the largest field up to 10 degrees whose chief ray and at least half of whose rays arrive is
 taken, and the page says so.
 """
 
@@ -16,10 +16,12 @@ import torch
 from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens import analysis
-from codesign.lens.paraxial import cardinal_points
+from codesign.lens.distance import vergence_per_mm
+from codesign.lens.paraxial import cardinal_points, image_scale_mm
 from codesign.lens.seidel import seidel_sums
 from codesign.report import lens_curves, lens_figures
 from studies.frame.run import Run, StudyConfig, main
+from studies.lens_report.depth import depth
 
 SHARES = (0.0, 0.7, 1.0)
 WIDEST_DEG = 10.0  # where a lens does not say
@@ -35,32 +37,46 @@ class Config(StudyConfig):
     """Half field, degrees; that of the lens when left out."""
     wavelengths_um: tuple[float, ...] = lens_figures.VISIBLE_UM
     """Wavelengths of equal weight; the first is the reference."""
+    at_m: tuple[float, ...] = ()
+    """Distances of the object, metres from the entrance pupil; pictures are those of the first. Left out: infinity."""
+    focus_m: float | None = None
+    """Distance the film is focused on; the first of --at-m, or as in the lens file where that is left out too."""
+    blur_um: float = 20.0
+    """Diameter of the blur that the depth of field allows, micrometres."""
 
 
 def study(run: Run[Config]) -> None:
     start = time.perf_counter()
     geo = lens.load(run.config.lens).requires_grad_(False)
+    distances = run.config.at_m or (math.inf,)
+    vergence_per_mm(geo, distances)
+    focus_m = run.config.focus_m or (distances[0] if run.config.at_m else None)
+    geo = geo if focus_m is None else geo.focus_at(focus_m)
+    at_m = distances[0]
     light = run.config.wavelengths_um
     quick = run.config.quick
     analysis.spectral_lines(light)
-    half_deg, why = half_field(geo, run.config.half_field_deg, light[0])
-    fields, left_out = arriving([math.radians(half_deg) * h for h in SHARES], geo, light[0])
+    half_deg, why = half_field(geo, run.config.half_field_deg, light[0], at_m)
+    fields, left_out = arriving([math.radians(half_deg) * h for h in SHARES], geo, light[0], at_m)
     notes = [
         why,
+        f"The object lies at {names_of(distances)}; the film "
+        + ("stands as in the lens file." if focus_m is None else f"is focused on {focus_m:g} m."),
         *(
             f"The field of {math.degrees(f):.3g}° is left out: fewer than {FEWEST:.0%} of its rays arrive."
             for f in left_out
         ),
     ]
-    first_order(run, geo, light, half_deg)
-    seidel(run, geo, math.radians(half_deg), light[0])
-    pictures(run, geo, fields, light, quick)
-    sharpness(run, geo, fields, light, quick)
+    first_order(run, geo, light, half_deg, at_m)
+    seidel(run, geo, math.radians(half_deg), light[0], at_m)
+    pictures(run, geo, fields, light, quick, at_m)
+    sharpness(run, geo, fields, light, quick, at_m)
+    depth(run, geo, fields, light[0], distances)
     run.record(half_field_deg=half_deg, seconds=time.perf_counter() - start)
     run.finish(f"Lens report: {geo.name}", " ".join(notes))
 
 
-def half_field(geo, wanted_deg, wavelength_um):
+def half_field(geo, wanted_deg, wavelength_um, at_m=math.inf):
     """Half field in degrees, and a sentence that says where it comes from."""
     if wanted_deg is not None:
         if not 0 < wanted_deg < 90:
@@ -69,7 +85,7 @@ def half_field(geo, wanted_deg, wavelength_um):
     if geo.half_field_deg is not None:
         return geo.half_field_deg, f"Half field {geo.half_field_deg:.4g}°, that of the lens."
     degrees = WIDEST_DEG
-    while degrees > 0.1 and arrival(geo, math.radians(degrees), wavelength_um) < 0.5:
+    while degrees > 0.1 and arrival(geo, math.radians(degrees), wavelength_um, at_m) < 0.5:
         degrees /= 1.25
     return (
         degrees,
@@ -78,22 +94,22 @@ def half_field(geo, wanted_deg, wavelength_um):
     )
 
 
-def arrival(geo, field_rad, wavelength_um):
+def arrival(geo, field_rad, wavelength_um, at_m=math.inf):
     """Share of the pupil's light that arrives at a field, 0 when its chief ray does not."""
     try:
-        analysis.chief_ray(geo, field_rad, wavelength_um)
+        analysis.chief_ray(geo, field_rad, wavelength_um, at_m=at_m)
         return float(
             analysis.trace_field(
-                geo, field_rad, analysis.pupil_grid(32, geo.dtype), wavelength_um, vignetting=True
+                geo, field_rad, analysis.pupil_grid(32, geo.dtype), wavelength_um, True, at_m=at_m
             ).weight.mean()
         )
     except DomainError:
         return 0.0
 
 
-def arriving(fields, geo, wavelength_um):
+def arriving(fields, geo, wavelength_um, at_m=math.inf):
     """Fields that can be shown, and those that cannot. Raises: DomainError when none can."""
-    good = [field for field in fields if arrival(geo, field, wavelength_um) >= FEWEST]
+    good = [field for field in fields if arrival(geo, field, wavelength_um, at_m) >= FEWEST]
     if not good:
         raise DomainError(
             f"{geo.name}: hardly a ray of the fields {[round(math.degrees(f), 2) for f in fields]} degrees "
@@ -102,7 +118,7 @@ def arriving(fields, geo, wavelength_um):
     return good, [field for field in fields if field not in good]
 
 
-def first_order(run, geo, light, half_deg):
+def first_order(run, geo, light, half_deg, at_m):
     """Focal length, pupils and cardinal points."""
     f = geo.first_order(light[0])
     points = cardinal_points(geo, light[0])
@@ -125,14 +141,17 @@ def first_order(run, geo, light, half_deg):
         ("front principal point, from the first vertex", points.front_principal_z_mm),
         ("rear principal point, from the last vertex", points.rear_principal_z_mm),
         ("rear nodal point, from the last vertex", points.rear_nodal_z_mm),
-        (f"image height at {half_deg:.4g}°, paraxial", f.efl_mm * math.tan(math.radians(half_deg))),
+        (
+            f"image height at {half_deg:.4g}°, paraxial",
+            image_scale_mm(geo, vergence_per_mm(geo, at_m), light[0]) * math.tan(math.radians(half_deg)),
+        ),
     ]
     run.table(
         f"Paraxial figures at {light[0] * 1e3:.1f} nm, mm",
         ("figure", "mm"),
         [(name, f"{float(value):.6g}") for name, value in rows],
     )
-    colour = analysis.chromatic_focus_shift_mm(geo, light, light[0])
+    colour = analysis.chromatic_focus_shift_mm(geo, light, light[0], at_m)
     if len(light) > 1:
         run.table(
             "Paraxial focus by wavelength",
@@ -141,9 +160,9 @@ def first_order(run, geo, light, half_deg):
         )
 
 
-def seidel(run, geo, half_rad, wavelength_um):
+def seidel(run, geo, half_rad, wavelength_um, at_m):
     """Seidel sums, where the lens has paraxial rays."""
-    sums = seidel_sums(geo, half_rad, wavelength_um)
+    sums = seidel_sums(geo, half_rad, wavelength_um, at_m=at_m)
     run.section(
         "Seidel sums",
         "Wavefront coefficients in waves at the rims of pupil and field; positive spherical aberration is "
@@ -174,44 +193,46 @@ def seidel(run, geo, half_rad, wavelength_um):
     )
 
 
-def pictures(run, geo, fields, light, quick):
+def pictures(run, geo, fields, light, quick, at_m):
     """Layout, spots, fans, field errors."""
     run.section("Layout")
     run.figure(
-        lens_figures.lens_layout(geo, fields),
+        lens_figures.lens_layout(geo, fields, at_m=at_m),
         "layout",
         "Cross-section with meridional rays; only rays that pass all apertures are drawn.",
     )
     run.section("Rays")
     run.figure(
-        lens_figures.spots_by_wavelength(geo, fields, light, 16 if quick else 24, True),
+        lens_figures.spots_by_wavelength(geo, fields, light, 16 if quick else 24, True, at_m),
         "spots",
         f"Spots about the chief ray at {light[0] * 1e3:.0f} nm; the circle is the Airy disc.",
     )
     run.figure(
-        lens_figures.ray_fans(geo, fields, light, True),
+        lens_figures.ray_fans(geo, fields, light, True, at_m),
         "fans",
         "Ray fans: transverse aberration and optical path difference over the pupil.",
     )
     run.figure(
-        lens_curves.encircled_curves(geo, fields, light, True),
+        lens_curves.encircled_curves(geo, fields, light, True, at_m),
         "encircled_energy",
         "Encircled energy of the rays about their mean.",
     )
     run.section("Over the field")
     run.figure(
-        lens_curves.field_errors(geo, fields[-1] or math.radians(0.5), light, count=9 if quick else 21),
+        lens_curves.field_errors(
+            geo, fields[-1] or math.radians(0.5), light, count=9 if quick else 21, at_m=at_m
+        ),
         "field_errors",
         "Field curvature of thin bundles, distortion against f tan, and lateral colour of the chief ray.",
     )
     rows = []
     for field in fields:
-        positions, weight = analysis.polychromatic_spot(geo, field, light, 32, True)
-        shift = analysis.focus_shift_mm(geo, [field], light[0])[0]
+        positions, weight = analysis.polychromatic_spot(geo, field, light, 32, True, at_m=at_m)
+        shift = analysis.focus_shift_mm(geo, [field], light[0], at_m=at_m)[0]
         name = f"{math.degrees(field):.3g}".replace(".", "p")
         radius = 1e3 * float(analysis.spot_radius_mm(positions, weight))
-        distortion = float(analysis.distortion_percent(geo, [field], wavelength_um=light[0])[0])
-        passed = arrival(geo, field, light[0])
+        distortion = float(analysis.distortion_percent(geo, [field], wavelength_um=light[0], at_m=at_m)[0])
+        passed = arrival(geo, field, light[0], at_m)
         run.record(
             **{
                 f"rms_spot_um_{name}deg": radius,
@@ -243,19 +264,19 @@ def pictures(run, geo, fields, light, quick):
     )
 
 
-def sharpness(run, geo, fields, light, quick):
+def sharpness(run, geo, fields, light, quick, at_m):
     """Wavefront, point spread, MTF."""
     run.section(
         "Wavefront", f"At {light[0] * 1e3:.0f} nm, against the sphere about the chief ray's image point."
     )
     run.figure(
-        lens_figures.opd_maps(geo, fields, light[0], 48 if quick else 96, True),
+        lens_figures.opd_maps(geo, fields, light[0], 48 if quick else 96, True, at_m),
         "wavefront",
         "Optical path difference over the entrance pupil, piston and tilt removed.",
     )
     rows = []
     for field in fields:
-        front = analysis.wavefront(geo, field, light[0], 64, True)
+        front = analysis.wavefront(geo, field, light[0], 64, True, at_m=at_m)
         flat = analysis.remove_fit(front)
         rms = float(analysis.rms_waves(front))
         run.record(**{f"rms_waves_{math.degrees(field):.3g}".replace(".", "p") + "deg": rms})
@@ -275,7 +296,7 @@ def sharpness(run, geo, fields, light, quick):
     )
     fno = float(geo.first_order(light[0]).fno.abs())
     widest = max(
-        float(analysis.encircled_radius_mm(geo, field, 0.99, light, 48, True, about_chief=True))
+        float(analysis.encircled_radius_mm(geo, field, 0.99, light, 48, True, about_chief=True, at_m=at_m))
         for field in fields
     )
     pixels = 64 if quick else 96
@@ -287,21 +308,23 @@ def sharpness(run, geo, fields, light, quick):
     curves = {}
     for field in fields:
         title = f"{math.degrees(field):.3g}°"
-        steep = not sampled(geo, field, light)
+        steep = not sampled(geo, field, light, at_m)
         if (
             steep or 1.2 * pixels * pixel > MOST_CELLS * min(light) * 1e-3 * fno
         ):  # the picture repeats with the number of cells
-            psfs.append(analysis.geometric_psf(geo, field, pixel, pixels, light, 256, True))
+            psfs.append(analysis.geometric_psf(geo, field, pixel, pixels, light, 256, True, at_m=at_m))
             titles.append(f"{title}, rays")
         else:
-            psfs.append(analysis.psf_on_pixels(geo, field, pixel, pixels, light, MOST_CELLS, True))
+            psfs.append(analysis.psf_on_pixels(geo, field, pixel, pixels, light, MOST_CELLS, True, at_m=at_m))
             titles.append(f"{title}, diffraction")
         if steep:
-            curve = analysis.geometric_mtf(geo, field, frequency, light, 96, True) * analysis.ideal_mtf(
-                frequency, fno, light[0]
-            )
+            curve = analysis.geometric_mtf(
+                geo, field, frequency, light, 96, True, at_m=at_m
+            ) * analysis.ideal_mtf(frequency, fno, light[0])
         else:
-            curve = analysis.diffraction_mtf(geo, field, frequency, light, 256 if quick else MOST_CELLS, True)
+            curve = analysis.diffraction_mtf(
+                geo, field, frequency, light, 256 if quick else MOST_CELLS, True, at_m=at_m
+            )
         curves[f"{title}{', rays' if steep else ''}"] = curve
         run.record(
             **{
@@ -331,20 +354,25 @@ def sharpness(run, geo, fields, light, quick):
     depth = max(8 * light[0] * 1e-3 * fno**2, 2 * widest * fno)
     shifts = torch.linspace(-depth, depth, 11 if quick else 31).tolist()
     run.figure(
-        lens_curves.through_focus(geo, fields, shifts, float(frequency[10]), light, True),
+        lens_curves.through_focus(geo, fields, shifts, float(frequency[10]), light, True, at_m=at_m),
         "through_focus",
         f"RMS spot, and geometric MTF at {float(frequency[10]):g} line pairs per mm, over the place of the "
         "image plane.",
     )
 
 
-def sampled(geo, field, light):
+def names_of(distances):
+    """Distances in words."""
+    return ", ".join("infinity" if math.isinf(d) else f"{d:g} m" for d in distances)
+
+
+def sampled(geo, field, light, at_m):
     """Whether the wavefront of a field is gentle enough for ``MOST_CELLS`` pupil cells at every
     wavelength."""
     try:
         for wavelength_um in light:
             analysis.pupil_function(
-                geo, field, wavelength_um, MOST_CELLS // 2, True
+                geo, field, wavelength_um, MOST_CELLS // 2, True, at_m=at_m
             )  # half the cells: a lens that just passes has room
     except DomainError:
         return False
