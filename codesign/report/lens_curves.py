@@ -168,7 +168,7 @@ def depth_curves(
     for field, column, colour in zip(fields_rad, sizes.T, COLOURS * len(fields_rad), strict=False):
         axis.plot(vergence.numpy(), column.numpy(), color=colour, label=f"{math.degrees(field):.3g}°")
     axis.axhline(1e3 * blur_mm / math.sqrt(8), color="0.4", ls="--", lw=1)
-    ticks = np.linspace(vergence[0], vergence[-1], 7)
+    ticks = np.linspace(1 / far_m, 1 / near_m, 7)
     axis.set_xticks(ticks, [f"{1 / t:.3g}" if t > 0 else "∞" for t in ticks])
     axis.set(xlabel="distance of the object (m)", ylabel="RMS spot (µm)", ylim=(0, None))
     axis.legend(frameon=False, fontsize=8)

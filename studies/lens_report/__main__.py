@@ -40,7 +40,7 @@ class Config(StudyConfig):
     at_m: tuple[float, ...] = ()
     """Distances of the object, metres from the entrance pupil; pictures are those of the first. Left out: infinity."""
     focus_m: float | None = None
-    """Distance the film is focused on; the first of --at-m, or as in the lens file where that is left out too."""
+    """Distance of the axial point whose RMS spot is least on the film; the first of --at-m, or as in the lens file where that is left out too."""
     blur_um: float = 20.0
     """Diameter of the blur that the depth of field allows, micrometres."""
 
@@ -48,14 +48,14 @@ class Config(StudyConfig):
 def study(run: Run[Config]) -> None:
     start = time.perf_counter()
     geo = lens.load(run.config.lens).requires_grad_(False)
-    distances = run.config.at_m or (math.inf,)
-    vergence_per_mm(geo, distances)
-    focus_m = run.config.focus_m or (distances[0] if run.config.at_m else None)
-    geo = geo if focus_m is None else geo.focus_at(focus_m)
-    at_m = distances[0]
     light = run.config.wavelengths_um
     quick = run.config.quick
     analysis.spectral_lines(light)
+    distances = run.config.at_m or (math.inf,)
+    vergence_per_mm(geo, distances)
+    at_m = distances[0]
+    focus_m = run.config.focus_m or (at_m if run.config.at_m else None)
+    geo = geo if focus_m is None else geo.focus_at(focus_m, light[0], spot_grid=16)
     half_deg, why = half_field(geo, run.config.half_field_deg, light[0], at_m)
     fields, left_out = arriving([math.radians(half_deg) * h for h in SHARES], geo, light[0], at_m)
     notes = [

@@ -17,8 +17,8 @@ from codesign.lens import GeoLens, Surface, analysis
 from codesign.lens.seidel import seidel_sums
 from codesign.report import lens_curves, lens_figures
 from codesign.report.lens_layout import ray_paths
-from studies.lens_report import __main__ as lens_report
 from studies.frame.run import main
+from studies.lens_report import __main__ as lens_report
 
 D = torch.float64
 

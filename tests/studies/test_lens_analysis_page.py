@@ -14,7 +14,7 @@ PAGE = (Path(__file__).resolve().parents[2] / "docs" / "lens_analysis.md").read_
 def test_the_examples_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", PAGE, re.S)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     names = {}
     exec("\n".join(blocks), names)
     assert float(names["front"].weight.sum()) == names["front"].pupil.shape[0]
@@ -32,7 +32,6 @@ def test_the_page_names_every_function():
         "field_rays",
         "pupil_grid",
         "spectral_lines",
-        "trace_field",
     ]  # what the others are made of
     named = re.findall(r"`(paraxial|seidel)\.(\w+)\(", PAGE)
     assert named
