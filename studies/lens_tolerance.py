@@ -10,6 +10,7 @@ import dataclasses
 import math
 import sys
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import matplotlib.pyplot as plt
@@ -21,15 +22,15 @@ from codesign.lens import WAVELENGTH_UM
 from codesign.lens.design.solves import focus_rays
 from codesign.lens.design.tolerance import (
     LINEAR_FIGURES,
-    Tolerances,
     Trials,
     compare,
-    errors_of,
+    compensated,
     linear_figures,
     monte_carlo,
     sensitivities,
     worst_offenders,
 )
+from codesign.lens.design.tolerance_errors import Tolerances, errors_of
 from codesign.lens.design.tolerance_spot import forecast_spot, spot_errors, squared_spots
 from studies.frame.run import Run, StudyConfig, main
 
@@ -74,9 +75,10 @@ def study(run: Run[Config]):
     )
     angles = tuple(share * half_field for share in FIELDS)
     linear = linear_figures(half_field)
+    refocus = partial(focus_rays, fields_rad=angles, wavelengths_um=LINES, grid=8)
     rays = {
-        "fixed": spot_errors(angles, LINES),
-        "refocused": spot_errors(angles, LINES, lambda faulty: focus_rays(faulty, angles, LINES, grid=8)),
+        name: compensated(spot_errors(angles, LINES), compensate)
+        for name, compensate in (("fixed", None), ("refocused", refocus))
     }
     slopes = sensitivities(geo, tolerances, linear)
     forecasts = {

@@ -1,6 +1,7 @@
 """Tolerances against closed forms, the statistics of normal errors, and trials of the lens itself."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -9,19 +10,18 @@ from codesign import lens
 from codesign.errors import DomainError, ShapeError
 from codesign.grad.jacobian import by_autograd
 from codesign.lens import GeoLens, Glass, Surface
+from codesign.lens.design import groups, moved_element
 from codesign.lens.design.solves import focus_paraxial, focus_rays
 from codesign.lens.design.tolerance import (
     LINEAR_FIGURES,
-    Error,
-    Tolerances,
     compare,
-    errors_of,
+    compensated,
     linear_figures,
     monte_carlo,
-    perturbed,
     sensitivities,
     worst_offenders,
 )
+from codesign.lens.design.tolerance_errors import Error, Tolerances, errors_of, perturbed
 from codesign.lens.design.tolerance_spot import forecast_spot, spot_errors, squared_spots
 
 D = torch.float64
@@ -200,14 +200,14 @@ def test_linear_forecast_and_trials_agree(triplet):
 def test_a_refocus_takes_the_shift_of_the_image_plane_out(triplet):
     """With the image plane at the paraxial focus the back focal length still varies, but no error of the last
     thickness does."""
-    figures = linear_figures(FIELD, compensate=focus_paraxial)
+    figures = linear_figures(FIELD)
     t = Tolerances(radius_relative=1e-3)
-    plain = sensitivities(triplet, t, linear_figures(FIELD))
-    solved = sensitivities(triplet, t, figures)
+    plain = sensitivities(triplet, t, figures)
+    solved = sensitivities(triplet, t, figures, compensate=focus_paraxial)
     torch.testing.assert_close(plain[:2], solved[:2], rtol=1e-9, atol=1e-12)
     fixed, refocused = (
         squared_spots(
-            sensitivities(triplet, t, spot_errors((0.0,), compensate=c)).square().sum(1).sqrt(), 1
+            sensitivities(triplet, t, spot_errors((0.0,)), compensate=c).square().sum(1).sqrt(), 1
         ).item()
         for c in (None, focus_paraxial)
     )
@@ -216,11 +216,17 @@ def test_a_refocus_takes_the_shift_of_the_image_plane_out(triplet):
 
 @pytest.mark.parametrize("refocus", [False, True])
 def test_the_quadratic_forecast_of_the_spot_agrees_with_trials(triplet, refocus):
-    compensate = (lambda faulty: focus_rays(faulty, FIELDS, grid=8)) if refocus else None
-    figure = spot_errors(FIELDS, compensate=compensate, grid=8)
-    forecast = forecast_spot(figure(triplet), sensitivities(triplet, ALL, figure), 3)
+    compensate = partial(focus_rays, fields_rad=FIELDS, grid=8) if refocus else None
+    figure = spot_errors(FIELDS, grid=8)
+    nominal = compensated(figure, compensate)(triplet)
+    forecast = forecast_spot(nominal, sensitivities(triplet, ALL, figure, compensate=compensate), 3)
     trials = monte_carlo(
-        triplet, ALL, lambda faulty: squared_spots(figure(faulty), 3), 200, torch.Generator().manual_seed(1)
+        triplet,
+        ALL,
+        lambda faulty: squared_spots(figure(faulty), 3),
+        200,
+        torch.Generator().manual_seed(1),
+        compensate=compensate,
     )
     predicted = forecast.at(trials.amounts)
     # lens by lens: what is left out is the bend of the rays, some 1 % of the spot here
@@ -297,3 +303,32 @@ def test_wrong_input_is_refused(triplet):
         compare(
             torch.zeros(1, 38, dtype=D), monte_carlo(triplet, ALL, efl, 2, torch.Generator().manual_seed(0))
         )
+
+
+def test_tolerances_of_elements_move_them_as_bodies():
+    geo = lens.load("double-gauss").freeze()
+    t = Tolerances(element_decentre_mm=0.01, element_tilt_deg=0.02, element_wedge_deg=0.03)
+    errors = errors_of(geo, t)
+    assert [e.name for e in errors[:6]] == [
+        "decentre of element 1-2 in x",
+        "decentre of element 1-2 in y",
+        "tilt of element 1-2 about x",
+        "tilt of element 1-2 about y",
+        "wedge of element 1-2 about x",
+        "wedge of element 1-2 about y",
+    ]
+    assert len(errors) == 6 * len(groups(geo)) == 24
+    amounts = torch.zeros(24, dtype=D)
+    amounts[[6, 9, 16]] = torch.tensor([2.0, -1.0, 3.0], dtype=D)
+    assert [errors[k].name for k in (6, 9, 16)] == [
+        "decentre of element 3-5 in x",
+        "tilt of element 3-5 about y",
+        "wedge of element 7-9 about x",
+    ]
+    wanted = moved_element(
+        geo, (2, 4), torch.tensor([0.02, 0.0], dtype=D), torch.tensor([0.0, -math.radians(0.02)], dtype=D)
+    )
+    wanted = moved_element(wanted, (6, 8), wedge_rad=torch.tensor([3 * math.radians(0.03), 0.0], dtype=D))
+    found = perturbed(geo, errors, amounts)
+    for tensor in ("decentre_mm", "tilt_rad", "thickness_mm"):
+        torch.testing.assert_close(getattr(found, tensor), getattr(wanted, tensor), rtol=1e-12, atol=1e-16)

@@ -15,7 +15,7 @@ from codesign.lens.design.moves import (
     without_surface,
 )
 from codesign.lens.design.solves import focus_paraxial, focus_rays, hold_efl
-from codesign.lens.design.tolerance import Tolerances
+from codesign.lens.design.tolerance_errors import Tolerances
 
 __all__ = [
     "LensDesign",

@@ -1,12 +1,12 @@
-"""What manufacturing errors do to a lens: sensitivities, their linear and quadratic forecast, and Monte Carlo
-to judge it.
+"""What manufacturing errors do to a lens: sensitivities, their linear forecast, and Monte Carlo to judge it.
 
-    tolerances = Tolerances(radius_relative=1e-3, thickness_mm=0.02, index=5e-4, decentre_mm=0.01,
-    tilt_deg=0.02) J = sensitivities(geo, tolerances, linear_figures(0.3))
+    tolerances = Tolerances(radius_relative=1e-3, thickness_mm=0.02, index=5e-4, element_decentre_mm=0.01)
+    J = sensitivities(geo, tolerances, linear_figures(0.3))
     trials = monte_carlo(geo, tolerances, linear_figures(0.3), 1000, torch.Generator().manual_seed(0))
 
 A figure is a function from a lens to a vector [K]. Errors are independent, normal, and each number of
-Tolerances is one standard deviation.
+Tolerances is one standard deviation. A compensator is a function from the faulty lens to the one that is used, such
+as ``functools.partial(solves.focus_rays, fields_rad=(0.0, 0.3), grid=8)``; every function takes it the same way.
 """
 
 import math
@@ -16,128 +16,33 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError
 from codesign.grad.jacobian import Jacobian, by_differences, finite
 from codesign.lens.analysis import spots
-from codesign.lens.design.constraints import is_glass
+from codesign.lens.design.tolerance_errors import Error, Tolerances, errors_of, perturbed
 from codesign.lens.distance import PARALLEL, one_distance, vergence_per_mm
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.paraxial import image_scale_mm
 
 Figures = Callable[[GeoLens], Tensor]
-
-
-@dataclass(frozen=True)
-class Tolerances:
-    """Standard deviations of independent normal errors, all at least 0; 0 leaves that kind out.
-
-    radius_relative: of every radius, as a share. radius_mm: of every radius, mm. fringes: rings of Newton's
-      power fringes over the semi-aperture, at 546 nm (N rings change the curvature by N wavelength /
-      semi-aperture^2). The three add in squares.
-    thickness_mm: of every thickness but the last, which is the focus. index: of every glass, the same at
-      every wavelength.
-    decentre_mm: of every surface, in x and in y. tilt_deg: of every surface, about x and about y.
-    """
-
-    radius_relative: float = 0.0
-    radius_mm: float = 0.0
-    fringes: float = 0.0
-    thickness_mm: float = 0.0
-    index: float = 0.0
-    decentre_mm: float = 0.0
-    tilt_deg: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0 <= value < math.inf:
-                raise DomainError(
-                    f"tolerance {name} is {value}; it is a standard deviation, a finite number of at least 0."
-                )
-        if not any(vars(self).values()):
-            raise DomainError("all tolerances are 0, so nothing varies; give at least one.")
-
-
-@dataclass(frozen=True)
-class Error:
-    """One independent error: a name with the surface counted from 1, the lens tensor and entry it changes,
-    and its standard deviation."""
-
-    name: str
-    tensor: str
-    at: tuple[int, ...]
-    deviation: float
-
-
-def errors_of(lens: GeoLens, tolerances: Tolerances) -> list[Error]:
-    """The independent errors of a lens under ``tolerances``, a list of Error. A plane keeps its radius but
-    not its fringes.
-
-    Surfaces that do not bend light (a stop in air) have no shape or place to get wrong.
-    """
-    found = []
-    glass = is_glass(lens)
-    t = tolerances
-    index = lens.index().tolist()
-    for i, (c, a) in enumerate(
-        zip(lens.curvature_per_mm.tolist(), lens.semi_aperture_mm.tolist(), strict=True)
-    ):
-        where = f"surface {i + 1}"
-        bends = index[i] != index[i + 1] or lens.mirrors[i]
-        curvature = (
-            math.hypot(c * t.radius_relative, c * c * t.radius_mm, t.fringes * 0.546074e-3 / a**2)
-            if bends
-            else 0.0
-        )
-        found.append(Error(f"curvature of {where}", "curvature_per_mm", (i,), curvature))
-        if i + 1 < len(glass):
-            found.append(Error(f"thickness behind {where}", "thickness_mm", (i,), t.thickness_mm))
-        if glass[i] and not lens.mirrors[i]:
-            found.append(Error(f"index behind {where}", "index_offset", (i,), t.index))
-        for axis, label in enumerate("xy"):
-            found.append(
-                Error(f"decentre of {where} in {label}", "decentre_mm", (i, axis), t.decentre_mm * bends)
-            )
-            found.append(
-                Error(
-                    f"tilt of {where} about {label}", "tilt_rad", (i, axis), math.radians(t.tilt_deg) * bends
-                )
-            )
-    return [error for error in found if error.deviation > 0]
-
-
-def perturbed(lens: GeoLens, errors: Sequence[Error], amounts: Tensor) -> GeoLens:
-    """The lens with errors of ``amounts`` [P] standard deviations. Gradient: to the amounts and to the
-    lens."""
-    if amounts.shape != (len(errors),):
-        raise ShapeError(f"{len(errors)} errors need as many amounts, got shape {tuple(amounts.shape)}.")
-    tensors = {}
-    for name in dict.fromkeys(e.tensor for e in errors):
-        mine = [k for k, e in enumerate(errors) if e.tensor == name]
-        base = getattr(lens, name)
-        places = tuple(torch.tensor(axis) for axis in zip(*(errors[k].at for k in mine), strict=True))
-        sizes = torch.tensor([errors[k].deviation for k in mine], dtype=base.dtype, device=base.device)
-        tensors[name] = base.index_put(places, sizes * amounts[mine], accumulate=True)
-    return lens.replace(**tensors)
+Compensator = Callable[[GeoLens], GeoLens]
 
 
 def linear_figures(
     half_field_rad: float,
     wavelength_um: float = WAVELENGTH_UM["d"],
-    compensate: Callable[[GeoLens], GeoLens] | None = None,
     grid: int = 8,
     at_m: float = PARALLEL,
 ) -> Figures:
     """Figures that errors change in proportion: the function lens -> [5] of EFL, BFL, distortion at the field
     (relative), and the x and y of the axial spot's mean point; lengths in mm. Names: LINEAR_FIGURES.
 
-    Args: compensate: lens -> lens applied first, such as solves.focus_paraxial; None changes nothing. at_m: metres
-      from the (faulty) lens's entrance pupil to the object of the spots and of the distortion.
+    Args: at_m: metres from the (faulty) lens's entrance pupil to the object of the spots and of the distortion.
     """
     one_distance(at_m)
 
     def figures(lens):
-        lens = compensate(lens) if compensate else lens
         f = lens.first_order(wavelength_um)
         position, arrived = spots(lens, (0.0, half_field_rad), wavelength_um, grid, at_m)
         scale = image_scale_mm(lens, vergence_per_mm(lens, at_m), wavelength_um)
@@ -154,18 +59,34 @@ def linear_figures(
 LINEAR_FIGURES = ("EFL (mm)", "BFL (mm)", "distortion", "image shift x (mm)", "image shift y (mm)")
 
 
+def compensated(figures: Figures, compensate: Compensator | None) -> Figures:
+    """The figures of a lens after a compensator has done what it can; as they are for None."""
+    if compensate is None:
+        return figures
+
+    def after(lens):
+        return figures(compensate(lens))
+
+    return after
+
+
 def sensitivities(
-    lens: GeoLens, tolerances: Tolerances, figures: Figures, jacobian: Jacobian | None = None
+    lens: GeoLens,
+    tolerances: Tolerances | Sequence[Error],
+    figures: Figures,
+    jacobian: Jacobian | None = None,
+    compensate: Compensator | None = None,
 ) -> Tensor:
     """Change of every figure per standard deviation of every error, [K, P]. The columns are in the order of
     ``errors_of``.
 
     Args: figures: lens -> [K]. jacobian: optimise.by_autograd for analytic gradients (K backward passes, best
       for few figures), or optimise.by_differences(step), step in standard deviations; central differences of
-      0.1 when left out (2 P evaluations).
+      0.1 when left out (2 P evaluations). compensate: applied to the faulty lens first.
     Gradient: none.
     """
     errors = errors_of(lens, tolerances)
+    figures = compensated(figures, compensate)
     still = torch.zeros(len(errors), dtype=lens.dtype, device=lens.curvature_per_mm.device)
 
     def function(amounts):
@@ -194,22 +115,24 @@ class Trials:
 
 def monte_carlo(
     lens: GeoLens,
-    tolerances: Tolerances,
+    tolerances: Tolerances | Sequence[Error],
     figures: Figures,
     count: int,
     generator: torch.Generator,
     progress: Callable[[], object] | None = None,
+    compensate: Compensator | None = None,
 ) -> Trials:
-    """Trials of ``count`` lenses with random errors. A compensator belongs into ``figures``: it sees the
-    faulty lens.
+    """Trials of ``count`` lenses with random errors.
 
-    Args: generator: torch.Generator (CPU). progress: called after every trial, or None.
+    Args: generator: torch.Generator (CPU). progress: called after every trial, or None. compensate: applied to every
+      faulty lens, and to the nominal one.
     A lens that raises DomainError (no ray arrives, no focal length) is a failed trial: counted, never dropped
     in silence.
     """
     if count < 1:
         raise DomainError(f"{count} trials were asked for; give at least 1.")
     errors = errors_of(lens, tolerances)
+    figures = compensated(figures, compensate)
     amounts = torch.randn(count, len(errors), generator=generator, dtype=lens.dtype)
     with torch.no_grad():
         nominal = figures(lens)
@@ -262,7 +185,7 @@ def compare(slopes: Tensor, trials: Trials) -> Comparison:
 
 
 def worst_offenders(
-    lens: GeoLens, tolerances: Tolerances, slopes: Tensor, figure: int, most: int = 10
+    lens: GeoLens, tolerances: Tolerances | Sequence[Error], slopes: Tensor, figure: int, most: int = 10
 ) -> list[tuple[str, float, float]]:
     """The errors that change one figure most: a list of (name, change per standard deviation, share of the
     forecast variance)."""

@@ -58,20 +58,17 @@ class SpotForecast:
 def spot_errors(
     fields_rad: Sequence[float],
     wavelengths_um: Sequence[float] = (WAVELENGTH_UM["d"],),
-    compensate: Callable[[GeoLens], GeoLens] | None = None,
     grid: int = 12,
     at_m: Distances = PARALLEL,
 ) -> Callable[[GeoLens], Tensor]:
     """The figure lens -> [F * M * 2]: ray errors about the mean point of their field over all wavelengths,
     mm, divided by the root of the ray count.
 
-    Args: compensate: lens -> lens applied first, such as a refocus by solves.focus_rays. at_m: metres to the object
-      plane; of D distances each counts as so many more fields, [D * F * M * 2]. Raises: DomainError
-      when a ray fails.
+    Args: at_m: metres to the object plane; of D distances each counts as so many more fields, [D * F * M * 2].
+    Raises: DomainError when a ray fails.
     """
 
     def figure(lens):
-        lens = compensate(lens) if compensate else lens
         found = [spots(lens, fields_rad, w, grid, at_m) for w in wavelengths_um]
         position = torch.cat([p.flatten(0, -3) for p, _ in found], 1)
         arrived = torch.cat([a.flatten(0, -2) for _, a in found], 1)
