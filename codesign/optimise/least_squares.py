@@ -7,6 +7,13 @@ do not matter. The gain ratio (what the sum of squares lost over what the linear
 the damping down after a
 good step and up after a bad one. Constraints beyond bounds are residual rows of their own, such as weight *
 max(0, shortfall).
+
+A variable the residuals hardly see (a null mode) has a column about 0, hence a D about 0 and a step of any
+length: the linear model holds nowhere along it, and the damping that would hold it also holds all others. Its
+own column cannot tell it from a variable in small units, so D follows Marquardt as long as steps succeed. After
+``REJECTED`` failures in a row, when some D lies below ``FLOOR`` of the largest, D is raised to that floor for
+the rest of the run, and the damping goes back to what it was before them. Problems whose steps succeed keep
+their independence of units to the last bit; the others keep it within 1 / FLOOR.
 Source: Marquardt, SIAM J. Appl. Math. 11 (1963); Nielsen, Damping parameter in Marquardt's method,
   IMM-REP-1999-05 (update of the damping);
 More, The Levenberg-Marquardt algorithm, LNM 630 (1978) (scaling).
@@ -26,6 +33,9 @@ from codesign.optimise.history import Entry, History, check_start
 
 __all__ = ["DampedLeastSquares", "StopRules"]
 
+FLOOR = 1e-3  # of the largest D: a variable a thousand times weaker than the strongest is damped as if it were not
+REJECTED = 3  # failures in a row raise the damping 64-fold, which a step of the right shape does not need
+
 
 @dataclass(frozen=True)
 class StopRules:
@@ -34,7 +44,8 @@ class StopRules:
     steps: most steps of a run. gradient: largest cosine between a column of J and r (0 at a minimum).
     step: length of a step over that of the variables, both in units of D. loss: relative decrease by an
       accepted step.
-    damping: largest damping, reached when no step of any size helps.
+    damping: largest damping, reached when no step of any size helps. stall: share that the last ``trials`` steps
+      together gained of what the linear model promised for them, below which they lead nowhere.
     """
 
     steps: int = 100
@@ -42,6 +53,8 @@ class StopRules:
     step: float = 1e-12
     loss: float = 1e-12
     damping: float = 1e16
+    stall: float = 1e-3
+    trials: int = 30
 
 
 class DampedLeastSquares:
@@ -55,7 +68,8 @@ class DampedLeastSquares:
       lower, upper: [V] bounds, or None. A variable on a bound that wants to leave is held; steps are cut at
         bounds.
       damping: first damping, relative to D^2.
-    variables, loss: where it stands. history: History. stopped: why the last run ended, "" while it has not.
+    variables, loss: where it stands. history: History. stopped: why the last run ended: a name of StopRules
+      ("stall": it did not converge), "" while it has not.
     Raises: ShapeError, DomainError for a start that is not finite, outside its bounds, or has residuals that
       are not finite.
 
@@ -84,7 +98,9 @@ class DampedLeastSquares:
             raise DomainError(f"damping {damping} must be positive and finite; 1e-3 suits most starts.")
         self.damping = float(damping)
         self.growth = 2.0
+        self.floor = 0.0
         self.scale = torch.zeros_like(self.variables)
+        self.promises: list[tuple[float, float]] = []
         self.history = History()
         self.stopped = ""
         self._value = check_finite(
@@ -106,7 +122,7 @@ class DampedLeastSquares:
         gradient = J.T @ r
         free = ~(((x <= self.lower) & (gradient > 0)) | ((x >= self.upper) & (gradient < 0)))
         self.scale = torch.maximum(self.scale, torch.linalg.vector_norm(J, dim=0))
-        D = torch.where(self.scale > 0, self.scale, 1.0)
+        D = torch.where(self.scale > 0, self.scale, 1.0).clamp_min(self.floor * float(self.scale.max()))
         step = torch.zeros_like(x)
         step[free] = _solve(J[:, free], r, self.damping**0.5 * D[free])
         trial = torch.minimum(torch.maximum(x + step, self.lower), self.upper)
@@ -121,6 +137,8 @@ class DampedLeastSquares:
         gain = (before - after) / promised if accepted else 0.0
         steepest = _cosine(J, r, gradient, free)
         entry = Entry(before, float(gradient.norm()), float(step.norm()), self.damping, accepted)
+        self.promises = [*self.promises, (before - after if accepted else 0.0, max(promised, 0.0))]
+        self.promises = self.promises[-self.stop.trials :]
         moved = float((D * step).norm())
         size = float((D * x).norm())
         if accepted:
@@ -132,6 +150,14 @@ class DampedLeastSquares:
         else:
             self.damping = self.damping * self.growth
             self.growth = self.growth * 2
+            if (
+                not self.floor
+                and self.growth == 2.0 ** (REJECTED + 1)
+                and float(D.min()) < FLOOR * float(D.max())
+            ):
+                self.floor = FLOOR
+                self.damping = entry.damping / 2.0 ** (REJECTED * (REJECTED - 1) // 2)
+                self.growth = 2.0
         self.history.add(entry)
         self.stopped = self._why(steepest, moved, size, before, after, accepted)
         return entry
@@ -156,6 +182,8 @@ class DampedLeastSquares:
             "scale": self.scale.tolist(),
             "damping": self.damping,
             "growth": self.growth,
+            "floor": self.floor,
+            "promises": self.promises,
             "history": self.history.rows(),
         }
 
@@ -172,6 +200,8 @@ class DampedLeastSquares:
         self.scale = torch.tensor(state["scale"], dtype=found.dtype, device=found.device)
         self.damping = float(state["damping"])
         self.growth = float(state["growth"])
+        self.floor = float(state["floor"])
+        self.promises = [(float(gain), float(promise)) for gain, promise in state["promises"]]
         self.history = History.of(state["history"])
         self._value = self._residuals(found)
         self._slopes = None
@@ -205,7 +235,10 @@ class DampedLeastSquares:
             return "step"
         if accepted and before - after <= stop.loss * before:
             return "loss"
-        return "damping" if self.damping > stop.damping else ""
+        if self.damping > stop.damping:
+            return "damping"
+        gained, promised = map(sum, zip(*self.promises, strict=True))
+        return "stall" if len(self.promises) == stop.trials and gained < stop.stall * promised else ""
 
 
 def _solve(J, r, damping):

@@ -11,8 +11,11 @@ import pytest
 import scipy.optimize
 import torch
 
+from codesign import lens
 from codesign.errors import DomainError, NonFiniteError, ShapeError
 from codesign.grad.jacobian import by_autograd, by_differences, column_scales, principal_modes
+from codesign.lens.design.modes import make_design
+from codesign.optimise import least_squares
 from codesign.optimise.adam import ScaledAdam
 from codesign.optimise.history import Entry, History
 from codesign.optimise.least_squares import DampedLeastSquares, StopRules
@@ -165,6 +168,58 @@ class TestDampedLeastSquares:
             torch.testing.assert_close(
                 units * other.variables, plain.variables, rtol=1e-9, atol=1e-12
             )  # the same in exact arithmetic
+
+    @pytest.mark.parametrize(("problem", "start"), [(rosenbrock, (-1.2, 1.0)), (decay, (1.0, 1.0, 0.0))])
+    def test_no_floor_where_steps_succeed_however_the_units_differ(self, problem, start):
+        start = vector(*start)
+        units = vector(1e-4, 1e4, 1.0)[: start.numel()]
+        plain = DampedLeastSquares(problem, start)
+        other = DampedLeastSquares(lambda u: problem(units * u), start / units)
+        plain.run(200)
+        other.run(200)
+        assert other.floor == 0
+        assert other.loss == pytest.approx(plain.loss, rel=1e-9, abs=1e-20)  # the same minimum
+
+    def test_a_null_mode_does_not_hold_the_others(self):
+        """The column of z is 1e-6, its step -1e6, and z^2 grows at once: by its own damping x and y wait for
+        1e6 of it. The minimum is at z = -5e-7 where the derivative of (1 + 1e-6 z + z^2)^2 is 0."""
+
+        def residuals(v):
+            x, y, z = v
+            return torch.stack([x - 1, 10 * (y - 2) + (x - 1) ** 2, 1 + 1e-6 * z + z * z])
+
+        solver = DampedLeastSquares(residuals, vector(3, 3, 0))
+        found = solver.run(40)
+        torch.testing.assert_close(found, vector(1, 2, -5e-7), rtol=0, atol=3e-5)
+        assert solver.loss == pytest.approx(
+            0.5, rel=1e-9
+        )  # x - 1 within (2e-9 / 2)^0.5; 0.509 without the floor
+
+    def test_modes_of_a_lens_that_no_ray_sees_do_not_stall_it(self, monkeypatch):
+        """The double Gauss has a plane stop in air: its curvature, and how the gap around it is shared, blur
+        nothing. Without the floor this loss falls by 0.1 % in 30 steps, and the run ends as a stall."""
+        geo = lens.load("double-gauss")
+        fields = (0.0, 0.12, 0.22)
+        design = make_design(geo, fields, 0.005)
+
+        def residuals(x):
+            candidate = design.lens(x)
+            points, weight = lens.spots(candidate, fields, grid=6)
+            weight = weight[..., None]
+            blur = points - (points * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
+            return torch.cat([(blur * weight).reshape(-1) / 0.05, 3 * design.penalty(candidate).reshape(1)])
+
+        def solve():
+            solver = DampedLeastSquares(residuals, torch.zeros(21, dtype=D), by_differences(1e-6))
+            solver.run(40)
+            return solver
+
+        solver = solve()
+        assert solver.loss < 0.02 * solver.history[0].loss
+        monkeypatch.setattr(least_squares, "FLOOR", 0.0)
+        stalled = solve()
+        assert stalled.loss > 0.99 * solver.history[0].loss
+        assert stalled.stopped == "stall"
 
     @pytest.mark.bits
     @pytest.mark.parametrize("route", ["json", "torch"])
