@@ -13,8 +13,9 @@ from codesign.lens import paraxial
 from codesign.lens.aiming import aim_at_stop
 from codesign.lens.analysis.spots import spots
 from codesign.lens.focus import image_distance_mm
-from codesign.lens.glass import AIR, WAVELENGTH_UM
+from codesign.lens.glass import AIR, WAVELENGTH_UM, Glass
 from codesign.lens.hold_efl import hold_efl, holding_surface
+from codesign.lens.media import with_medium
 from codesign.lens.numbers import kinds
 from codesign.lens.pinhole import ThinLens
 from codesign.lens.replaceable import Replaceable, settled
@@ -196,6 +197,13 @@ class GeoLens(Replaceable):
             held=held,
         )
 
+    def _known(self, name):
+        if name in ("medium", "glass"):
+            raise DomainError(
+                f"{self.name}: a {name} is no tensor; exchange it with replace_glass(surface, glass)."
+            )
+        super()._known(name)
+
     def _kinds(self):
         return kinds(self)
 
@@ -237,6 +245,31 @@ class GeoLens(Replaceable):
         """
         image_mm = image_distance_mm(self, distance_m, wavelength_um, spot_grid)
         return self.replace(thickness_mm=torch.cat([self.thickness_mm[:-1], image_mm.reshape(1)]))
+
+    def replace_glass(self, surface: int, glass: Glass | str | None) -> "GeoLens":
+        """The lens with another medium behind a surface; shapes, gaps and apertures stay, the focal length does not
+        (``design.with_glass`` holds it).
+
+        >>> from codesign import lens
+        >>> geo = lens.load("cooke-triplet").replace_glass(2, "SF2")
+        >>> round(geo.index()[3].item(), 5)
+        1.64769
+
+        Args: surface: counted from 0, from the last when negative. glass: a Glass, a name or code as
+          ``Glass.named`` takes, None for air.
+        Returns: a lens as from ``replace``, without Parameters and variables of its own; this one stays as it is.
+        Gradient: to every tensor of this lens but the index offset of that surface, which belonged to the glass
+          that went: the new one has 0.
+        Raises: DomainError for a surface that is not there or a mirror, and for a name the catalogue does not know,
+          with the nearest it knows.
+        """
+        surfaces = with_medium(self.name, self.surfaces, surface, glass)
+        row = torch.arange(len(surfaces), device=self.glass.device) == range(len(surfaces))[surface]
+        now = self._now()
+        twin = self._with(now | {"index_offset": torch.where(row, 0, now["index_offset"])})
+        twin.surfaces = surfaces
+        twin.glass = torch.where(row, surfaces[surface].medium is not None, self.glass)
+        return twin
 
     def scaled(self, factor: float) -> "GeoLens":
         """A new lens with all lengths multiplied by ``factor`` (same f-number and angles), from the current

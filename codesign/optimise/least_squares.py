@@ -33,7 +33,9 @@ from codesign.optimise.history import Entry, History, check_start
 
 __all__ = ["DampedLeastSquares", "StopRules"]
 
-FLOOR = 1e-3  # of the largest D: a variable a thousand times weaker than the strongest is damped as if it were not
+FLOOR = (
+    1e-3  # of the largest D: a variable 1000 times weaker than the strongest is damped like one that is not
+)
 REJECTED = 3  # failures in a row raise the damping 64-fold, which a step of the right shape does not need
 
 
