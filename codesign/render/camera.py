@@ -171,7 +171,9 @@ class Camera:
         )
 
     def _joined(self, parts):
-        """Rays of several colours, pixel after pixel."""
+        """What rays of several colours have, pixel after pixel; None where they do not say."""
+        if any(part is None for part in parts):
+            return None
         pixels = self.film.pixels().shape[0]
         return torch.cat([part.reshape(pixels, -1, *part.shape[1:]) for part in parts], 1).flatten(0, 1)
 

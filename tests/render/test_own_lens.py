@@ -232,3 +232,13 @@ def test_a_window_in_the_dark_is_named_too():
     film = Film(200, 200, 8, 8, 0.4, ((96, 96), (0, 0)))
     with pytest.raises(DomainError, match="about 50% of the film's pixels get no light"):
         Camera(lens.load("cooke-triplet"), 8, 8, 0.4, 4, film=film).check()
+
+
+def test_a_lens_that_says_nothing_of_illumination_takes_light_of_several_colours():
+    """Its rays have no irradiance; the same lens in every colour gives the picture of one colour."""
+    pose = look_at((0.2, 0.1, 2.0), (0.0, 0.0, 0.0), down=(0, 1, 0))[None]
+    mono, poly = (
+        render.frames(Camera(Barrel(), 8, 8, 0.2, samples_per_pixel=6, spectrum=light), plane(), pose)
+        for light in (None, lens.Spectrum.visible_FdC())
+    )
+    assert torch.allclose(mono, poly, rtol=1e-6)
