@@ -44,6 +44,7 @@ GROUPS = {
     "whole chain": (
         "lens_opt",
         "lens_opt_seeds",
+        "flow_needs",
         "combinations",
         "joint_design",
         "placement",
