@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from codesign.lens.glass import WAVELENGTH_UM
-from codesign.lens.trace import Prescription, Status, trace
+from codesign.lens.plated import trace
+from codesign.lens.trace import Prescription, Status
 from codesign.lens.traced import TracedLens
 
 NEWTON_STEPS = 12

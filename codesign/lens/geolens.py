@@ -18,9 +18,10 @@ from codesign.lens.hold_efl import hold_efl, holding_surface
 from codesign.lens.media import with_medium
 from codesign.lens.numbers import kinds
 from codesign.lens.pinhole import ThinLens
+from codesign.lens.plated import trace
 from codesign.lens.replaceable import Replaceable, settled
 from codesign.lens.surface import Surface, scaled
-from codesign.lens.trace import Prescription, Status, TraceResult, check_rays, trace
+from codesign.lens.trace import PlateAt, Prescription, Status, TraceResult, check_rays
 from codesign.lens.variables import Bound, checked_step
 from codesign.types import Rays
 
@@ -53,6 +54,7 @@ class GeoLens(Replaceable):
     Errors of assembly (buffers, with gradients after ``requires_grad_`` or through ``replace``): decentre_mm
     [S, 2], tilt_rad [S, 2]; and semi_aperture_mm [S], the same way.
     half_field_deg: the half field the lens is made for, or None where nobody said.
+    plate: a phase plate, see ``plates.with_plate``; plate_at: the surface it follows, and mm behind its vertex.
     """
 
     tensor_names = (*LEARNABLES, "semi_aperture_mm")
@@ -112,6 +114,8 @@ class GeoLens(Replaceable):
         self.soft_edge_mm = float(soft_edge_mm)
         self.half_field_deg = half_field_deg
         self.mirrors = tuple(s.mirror for s in surfaces)
+        self.plate: nn.Module | None = None
+        self.plate_at = (0, 0.0)
 
         def column(values):
             return torch.tensor(values, dtype=dtype)
@@ -287,7 +291,12 @@ class GeoLens(Replaceable):
     @settled
     def to_surfaces(self) -> tuple[Surface, ...]:
         """The current values as a tuple of Surface; index offsets go into the media. A curvature or tilt that
-        never changed keeps its value to the last bit."""
+        never changed keeps its value to the last bit. Raises: DomainError for a lens with a phase plate."""
+        if self.plate is not None:
+            raise DomainError(
+                f"{self.name}: its phase plate is no surface, so files, drawings and copies by surfaces cannot hold "
+                "it; take it out with plates.with_plate(lens, None)."
+            )
         found = []
         at_first = torch.tensor([s.curvature_per_mm for s in self.surfaces], dtype=self.dtype).tolist()
         tilts = torch.tensor(
@@ -382,6 +391,8 @@ class GeoLens(Replaceable):
             self.mirrors,
             inner,
             efficiency,
+            plate=self.plate
+            and PlateAt(self.plate.look, *self.plate_at, self.plate.mm_per_rad(wavelength_um)),
         )
 
     @settled

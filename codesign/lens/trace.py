@@ -14,6 +14,27 @@ from codesign.lens.kernel import Kernel, Status, Works
 
 
 @dataclass(frozen=True)
+class PlateAt:
+    """A phase plate on a plane of a lens, for one wavelength; ``plated.trace`` sends rays through it.
+
+    look: points [N, 2] mm -> phase [N] rad, its slope [N, 2] rad/mm, whether the plate reaches there [N] bool.
+    gap: the surface it follows, -1 before the first. after_mm: from that surface's vertex (from the first where
+      gap is -1). mm_per_rad: optical path of a radian.
+    """
+
+    look: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
+    gap: int
+    after_mm: float | Tensor
+    mm_per_rad: float
+
+    def reversed(self, thickness_mm: Tensor) -> "PlateAt":
+        """The plate in the reversed lens, whose thicknesses [S] were these."""
+        inner = 0 <= self.gap < len(thickness_mm) - 1
+        after = thickness_mm[self.gap] - self.after_mm if inner else -self.after_mm
+        return replace(self, gap=len(thickness_mm) - 2 - self.gap, after_mm=after)
+
+
+@dataclass(frozen=True)
 class Prescription:
     """Numbers the kernel needs, for one wavelength. Tensors of one dtype and device; gradients flow to all of
     them.
@@ -28,6 +49,7 @@ class Prescription:
       Surface).
     inner_semi_aperture_mm: S numbers, radii of central obstructions (0: none).
     to_plane: whether rays go on to the plane behind the last thickness, or end on the last surface itself.
+    plate: a phase plate between the surfaces, or None; of no concern to ``trace``, see ``plated.trace``.
     """
 
     curvature_per_mm: Tensor
@@ -44,6 +66,7 @@ class Prescription:
     inner_semi_aperture_mm: tuple[float, ...]
     efficiency: float = 1.0
     to_plane: bool = True
+    plate: PlateAt | None = None
 
     def reversed(self, last_gap_mm: Tensor) -> "Prescription":
         """The same lens seen from the image side; ``last_gap_mm`` is the distance of the plane where the rays
@@ -66,20 +89,29 @@ class Prescription:
             thickness_mm=gaps,
             mirrors=self.mirrors[::-1],
             inner_semi_aperture_mm=self.inner_semi_aperture_mm[::-1],
+            plate=self.plate and self.plate.reversed(self.thickness_mm),
             **shapes,
             **same,
         )
 
     def until(self, surface: int) -> "Prescription":
         """The part of the lens up to a surface (counted from 0), where rays end unbent."""
-        rows = {
-            f.name: getattr(self, f.name)[: surface + 1]
-            for f in fields(self)
-            if f.name not in ("index", "soft_edge_mm", "efficiency", "to_plane")
-        }
+        part = self.part(0, surface + 1)
         keep = torch.arange(surface + 1, device=self.path_mm.device) < surface
-        rows["path_mm"], rows["mirrors"] = rows["path_mm"] * keep[:, None], (*self.mirrors[:surface], False)
-        return replace(self, **rows, index=self.index[[*range(surface + 1), surface]], to_plane=False)
+        return replace(
+            part,
+            path_mm=part.path_mm * keep[:, None],
+            mirrors=(*self.mirrors[:surface], False),
+            index=self.index[[*range(surface + 1), surface]],
+            to_plane=False,
+            plate=self.plate if self.plate and self.plate.gap < surface else None,
+        )
+
+    def part(self, first: int, stop: int) -> "Prescription":
+        """The surfaces from ``first`` to before ``stop``, without a plate."""
+        whole = ("index", "soft_edge_mm", "efficiency", "to_plane", "plate")
+        rows = {f.name: getattr(self, f.name)[first:stop] for f in fields(self) if f.name not in whole}
+        return replace(self, **rows, index=self.index[first : stop + 1], plate=None)
 
     def opened(self, surface: int) -> "Prescription":
         """The same lens with one aperture that clips nothing: rays that are placed on the stop are not to be

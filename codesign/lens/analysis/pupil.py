@@ -1,16 +1,18 @@
 """The complex pupil of a field, sampled on a square grid for Fourier transforms."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
+from codesign.lens.analysis.rays import chief_ray
 from codesign.lens.analysis.wavefront import wavefront
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.plates.place import cells_for_plate, plate_waves, with_plate
 
 # cells across the pupil when the number is found from the aberration
 COARSEST = 128
@@ -58,21 +60,37 @@ def pupil_function(
     Points that are even over the entrance pupil are taken as even in the direction cosines towards the image
     point (Abbe's sine condition); their scale in x and y, which holds the foreshortening off the axis, is
     fitted to the traced rays. A cell counts when its centre lies in the disc; the staircase at the rim costs
-    about 1e-3 of MTF at 64 cells and 3e-4 at 128.
+    about 1e-3 of MTF at 64 cells and 3e-4 at 128. A phase plate adds its phase where the rays of the bare lens meet
+    it, as a thin element does to a field.
 
     Args: grid: cells across; None picks a power of two from the aberration. reference_mm, at_m: see ``wavefront``.
     Gradient: to every lens tensor and to at_m. Raises: DomainError when neighbouring cells differ by more than half a
-      wave, or no ray arrives.
+      wave, a phase plate is finer than the cells, or no ray arrives.
     """
+    if lens.plate is not None and reference_mm is None:
+        reference_mm = chief_ray(lens, field_rad, wavelength_um, defocus_mm, at_m).position_mm[0]
     if grid is None:
         grid = _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, reference_mm, at_m)
+    finest = cells_for_plate(lens, wavelength_um)
+    if grid < finest:
+        raise DomainError(
+            f"{lens.name}: the phase plate is finer than {grid} cells across the pupil resolve (its phase may step by "
+            f"half a wave from cell to cell, and has detail of {lens.plate.finest_mm:.3g} mm); give a grid of at least "
+            f"{finest}, or a smoother plate."
+        )
     like = lens.curvature_per_mm
     line = (torch.arange(grid, dtype=like.dtype, device=like.device) + 0.5) / grid * 2 - 1
     y, x = torch.meshgrid(line, line, indexing="ij")
     seen = x * x + y * y <= 1
     points = torch.stack([x, y], -1)[seen]
-    front = wavefront(lens, field_rad, wavelength_um, 0, vignetting, defocus_mm, reference_mm, points, at_m)
+    bare = with_plate(lens, None)
+    front = wavefront(bare, field_rad, wavelength_um, 0, vignetting, defocus_mm, reference_mm, points, at_m)
     scale = _cosine_radius(front)
+    if lens.plate is not None:
+        waves, reaches = plate_waves(lens, field_rad, points, wavelength_um, at_m)
+        front = replace(
+            front, opd_mm=front.opd_mm - waves * (wavelength_um * 1e-3), weight=front.weight * reaches
+        )
     phase = 2 * math.pi * front.waves
     amplitude = torch.where(front.weight > 0, front.weight, 1).sqrt() * (front.weight > 0)
     opd = torch.zeros_like(x).masked_scatter(seen, front.waves.detach())
@@ -127,7 +145,7 @@ def _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, refere
     inside = x * x + y * y <= 1
     with torch.no_grad():
         front = wavefront(
-            lens,
+            with_plate(lens, None),
             field_rad,
             wavelength_um,
             0,
@@ -139,5 +157,5 @@ def _enough_cells(lens, field_rad, wavelength_um, vignetting, defocus_mm, refere
         )
     opd = torch.zeros_like(x).masked_scatter(inside, front.waves)
     lit = torch.zeros_like(inside).masked_scatter(inside, front.weight > 0)
-    needed = 64 * _largest_step(opd, lit) / (LARGEST_STEP_WAVES / 1.5)
+    needed = 64 * _largest_step(opd, lit) / (LARGEST_STEP_WAVES / 1.5) + cells_for_plate(lens, wavelength_um)
     return min(max(2 ** math.ceil(math.log2(max(needed, 1.0))), COARSEST), FINEST)

@@ -13,7 +13,7 @@ from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_p
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.paraxial import paraxial_rays
-from codesign.lens.trace import trace
+from codesign.lens.plated import trace
 
 
 @dataclass(frozen=True)
