@@ -2,16 +2,52 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from codesign import lens
 from codesign.errors import DomainError, ShapeError
+from codesign.lens import analysis
 from codesign.lens.analysis import field_rays, pupil_grid
-from codesign.lens.design import focus_paraxial, focus_rays
+from codesign.lens.design import Limits, focus_paraxial, focus_rays
+from codesign.lens.design.constraints import evaluate
+from codesign.lens.design.hits import paraxial_semi_aperture_mm, traced_semi_aperture_mm
+from codesign.lens.design.tolerance import linear_figures
+from codesign.lens.design.tolerance_spot import spot_errors, squared_spots
+from codesign.lens.seidel import seidel_sums
+from studies.lens_accuracy import longdouble as ld
+from studies.lens_accuracy.draw import draw
+from studies.lens_accuracy.finite import compare
 
 D = torch.float64
 FIELDS = (0.0, 0.15)
+NEAR = 1e-9  # what is asked of every figure; float64 paths of some 100 mm leave 1e-10 of a wavefront
+
+
+def test_every_figure_of_fifty_random_lenses_against_a_long_double_lens():
+    worst = {}
+    for seed in range(50):
+        for name, value in compare(*draw(seed)).items():
+            worst[name] = max(worst.get(name, 0.0), value if value == value else math.inf)
+    assert len(worst) == 21
+    assert {name: value for name, value in worst.items() if value > NEAR} == {}
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3, 5])
+def test_the_judge_agrees_with_the_third_order(seed):
+    """Axial path differences of the long-double lens tend to S_I / 8 rho^4 with a paraxially focused film."""
+    system, at_m = draw(seed)
+    numbers = vars(system)
+    thickness = system.thickness.copy()
+    thickness[-1] = ld.image_place(system, 1e3 * at_m)
+    found = []
+    for share in (0.1, 0.05):
+        small = ld.System(**numbers | {"thickness": thickness, "diameter": system.diameter * share})
+        rim, chief = (ld.field_rays(small, "d", 0.0, np.array([[0.0, h]]), 1e3 * at_m) for h in (1.0, 0.0))
+        found.append(ld.path_differences(small, "d", rim, chief)[0][0] / ld.L(share) ** 4)
+    limit = (4 * found[1] - found[0]) / 3  # the next order goes as the square
+    assert float(limit) == pytest.approx(float(ld.seidel(system, 0.1, 1e3 * at_m)[0].sum() / 8), rel=2e-5)
 
 
 @pytest.mark.parametrize("name", ["cooke-triplet", "double-gauss", "la1509"])
@@ -98,3 +134,153 @@ def test_distances_that_cannot_be_get_a_sentence(bad):
             call()
     with pytest.raises(ShapeError, match="one number or a list"):
         lens.spots(geo, FIELDS, at_m=[[1.0]])
+
+
+FIGURES = {
+    "wavefront": lambda geo, at_m: analysis.rms_waves(analysis.wavefront(geo, 0.15, grid=16, at_m=at_m)),
+    "fan": lambda geo, at_m: analysis.ray_fan(geo, 0.15, count=7, at_m=at_m).tangential_mm.square().sum(),
+    "seidel": lambda geo, at_m: seidel_sums(geo, 0.15, at_m=at_m).per_surface.square().sum(),
+    "distortion": lambda geo, at_m: analysis.distortion_percent(geo, [0.15], at_m=at_m).sum(),
+    "field curvature": lambda geo, at_m: analysis.focus_shift_mm(geo, [0.15], at_m=at_m).sum(),
+    "axial colour": lambda geo, at_m: analysis.chromatic_focus_shift_mm(geo, [0.48], at_m=at_m).sum(),
+    "encircled": lambda geo, at_m: analysis.encircled_radius_mm(geo, 0.15, grid=8, at_m=at_m),
+    "geometric MTF": lambda geo, at_m: analysis.geometric_mtf(geo, 0.15, [5.0], grid=8, at_m=at_m).sum(),
+    "through focus": lambda geo, at_m: analysis.through_focus_spot_mm(
+        geo, FIELDS, [0.1], grid=8, at_m=at_m
+    ).sum(),
+    "point spread": lambda geo, at_m: analysis.psf_on_pixels(
+        geo.focus_at(1.0), 0.0, 0.004, 8, grid=128, at_m=at_m
+    ).energy[4, 4],
+    "MTF": lambda geo, at_m: analysis.diffraction_mtf(
+        geo.focus_at(1.0), 0.0, [20.0], grid=128, at_m=at_m
+    ).sum(),
+    "depth of field": lambda geo, at_m: analysis.depth_of_field(geo, 0.02, at_m).near_m,
+    "apertures": lambda geo, at_m: paraxial_semi_aperture_mm(geo, 0.15, at_m=at_m).sum(),
+}
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_gradients_of_figures_to_the_distance_are_those_of_differences(name):
+    geo = lens.load("cooke-triplet").requires_grad_(False)
+    at_m = torch.tensor(0.9, dtype=D, requires_grad=True)
+    FIGURES[name](geo, at_m).backward()
+    step = 1e-4
+    with torch.no_grad():
+        values = [FIGURES[name](geo, 0.9 + k * step) for k in (-2, -1, 1, 2)]
+    difference = float(8 * (values[2] - values[1]) - (values[3] - values[0])) / (12 * step)
+    assert float(at_m.grad) == pytest.approx(difference, rel=1e-6)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", [n for n in FIGURES if n not in ("point spread", "MTF", "depth of field")])
+def test_figures_tend_to_those_of_parallel_light(name):
+    geo = lens.load("cooke-triplet")
+    parallel, far, farther = (float(FIGURES[name](geo, at_m)) for at_m in (math.inf, 1e5, 1e6))
+    assert far == pytest.approx(parallel, rel=1e-2)
+    assert abs(farther - parallel) <= 0.11 * abs(far - parallel) + 1e-11 * abs(parallel)
+
+
+@torch.no_grad()
+def test_figures_of_several_distances_are_those_of_each():
+    geo = lens.load("double-gauss")
+    distances = (0.4, 3.0, math.inf)
+    for figure in (
+        lambda at_m: analysis.distortion_percent(geo, FIELDS, at_m=at_m),
+        lambda at_m: analysis.focus_shift_mm(geo, FIELDS, at_m=at_m),
+        lambda at_m: analysis.lateral_colour_mm(geo, FIELDS, [0.48, 0.65], at_m=at_m),
+        lambda at_m: analysis.chromatic_focus_shift_mm(geo, [0.48, 0.65], at_m=at_m),
+        lambda at_m: analysis.trace_field(geo, 0.1, pupil_grid(6), at_m=at_m).path_mm,
+    ):
+        each = torch.stack([figure(d) for d in distances])
+        torch.testing.assert_close(figure(distances), each, rtol=1e-10, atol=1e-13)
+    widest = traced_semi_aperture_mm(geo, FIELDS, at_m=distances)
+    each = torch.stack([traced_semi_aperture_mm(geo, FIELDS, at_m=d) for d in distances])
+    torch.testing.assert_close(widest, each.amax(0), rtol=1e-12, atol=0)
+    errors = spot_errors(FIELDS, at_m=(0.4, 3.0))(geo)
+    sizes = lens.rms_spot_mm(geo, FIELDS, grid=12, at_m=(0.4, 3.0)).square().reshape(-1)
+    torch.testing.assert_close(squared_spots(errors, 4), sizes, rtol=1e-10, atol=0)
+
+
+@torch.no_grad()
+def test_limits_and_tolerances_see_the_distance():
+    geo = lens.load("cooke-triplet")
+    near, far = (
+        {c.name: float(c.value) for c in evaluate(geo, Limits(incidence_deg=40.0, fields_rad=FIELDS, at_m=d))}
+        for d in (0.2, math.inf)
+    )
+    assert near["incidence on surface 1"] != pytest.approx(far["incidence on surface 1"], rel=1e-3)
+    focused = geo.focus_at(0.5)
+    found = linear_figures(0.15, at_m=0.5)(focused)[2]
+    # the mean point of a spot lies near the chief ray, whose distortion this is
+    assert 100 * float(found) == pytest.approx(
+        float(analysis.distortion_percent(focused, [0.15], at_m=0.5)), abs=0.15
+    )
+
+
+@pytest.mark.parametrize("focus_m", [0.5, 4.0, math.inf])
+@torch.no_grad()
+def test_depth_of_field_of_a_thin_lens_is_that_of_its_circle_of_confusion(focus_m):
+    glass = lens.Glass.from_indices(1.5, 1.5, 1.5)
+    surfaces = [
+        lens.Surface(50.0, 0.0, glass, 10.0, is_stop=True),  # no thickness: all at the pupil
+        lens.Surface(-50.0, 50.0, None, 10.0),
+    ]
+    geo = lens.GeoLens(surfaces, 10.0)
+    found = analysis.depth_of_field(geo, 0.05, focus_m)
+    thin = geo.focus_at(focus_m).thin()
+    for limit in (found.near_m, found.far_m):
+        if bool(limit.isfinite()):
+            blur = lens.paraxial.circle_of_confusion_mm(thin, float(limit))
+            assert float(blur) == pytest.approx(0.05, rel=1e-10)
+    hyperfocal = analysis.hyperfocal_m(geo, 0.05)
+    assert float(hyperfocal) == pytest.approx((50.0**2 / (5.0 * 0.05) + 50.0) / 1e3, rel=1e-12)
+    wide = analysis.depth_of_field(geo, 0.05 * (1 + 1e-9), float(hyperfocal))
+    assert math.isinf(float(wide.far_m))
+    assert float(wide.near_m) == pytest.approx(float(hyperfocal) / 2, rel=1e-6)  # half of it, for a thin lens
+
+
+@torch.no_grad()
+def test_traced_depth_of_field_has_the_limit_at_its_ends():
+    geo = lens.load("cooke-triplet").focus_at(0.6, spot_grid=16)
+    found = analysis.traced_depth_of_field(geo, 0.06)
+    for limit in (found.near_m, found.far_m):
+        assert float(lens.rms_spot_mm(geo, [0.0], grid=16, at_m=float(limit))) == pytest.approx(
+            0.06 / math.sqrt(8), rel=1e-5
+        )
+    assert found.near_m < 0.6 < found.far_m
+    assert float(found.focus_m) == pytest.approx(0.6, rel=2e-3)
+
+
+@torch.no_grad()
+def test_depth_of_field_refuses_what_it_cannot_answer():
+    geo = lens.load("cooke-triplet")
+    for blur in (0.0, -1.0, math.nan, math.inf):
+        with pytest.raises(DomainError, match="give a positive diameter"):
+            analysis.depth_of_field(geo, blur)
+    with pytest.raises(DomainError, match=r"above the .* of a disc of 0\.005 mm; allow more blur"):
+        analysis.traced_depth_of_field(geo, 0.005, 1.0)
+    short = geo.replace(thickness_mm=geo.thickness_mm * torch.tensor([1.0] * 5 + [0.9], dtype=D))
+    with pytest.raises(DomainError, match=r"no point before the lens has a blur of 0\.02 mm or less"):
+        analysis.depth_of_field(short, 0.02)
+
+
+def test_figures_of_one_distance_refuse_several():
+    geo = lens.load("cooke-triplet")
+    several = (0.5, 1.0)
+    for call in (
+        lambda: analysis.wavefront(geo, 0.1, at_m=several),
+        lambda: analysis.ray_fan(geo, 0.1, at_m=several),
+        lambda: analysis.polychromatic_spot(geo, 0.1, 0.58, at_m=several),
+        lambda: analysis.through_focus_spot_mm(geo, [0.1], [0.0], at_m=several),
+        lambda: analysis.diffraction_mtf(geo, 0.1, [10.0], at_m=several),
+        lambda: seidel_sums(geo, 0.1, at_m=several),
+        lambda: focus_paraxial(geo, at_m=several),
+    ):
+        with pytest.raises(ShapeError, match="figure of one object distance"):
+            call()
+
+
+@pytest.mark.parametrize("function", ["wavefront", "ray_fan", "diffraction_psf", "pupil_function"])
+def test_every_analysis_refuses_a_distance_in_the_lens(function):
+    with pytest.raises(DomainError, match="not lie before the lens"):
+        getattr(analysis, function)(lens.load("cooke-triplet"), 0.1, at_m=0.01)

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from codesign.errors import DomainError
-from studies import lens_accuracy
 from studies.frame.run import main
 from studies.frame.timing import measure
+from studies.lens_accuracy import __main__ as lens_accuracy
 from studies.speed_error import __main__ as speed_error
 from studies.speed_error.__main__ import Measured, cheapest
 from studies.stability import __main__ as stability
