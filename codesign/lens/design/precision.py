@@ -1,0 +1,231 @@
+"""What precision each surface needs: tolerances out of a budget, the other way round.
+
+A figure is forecast to second order in the errors, F(e) = F0 + s.e + e.Q e, with e in units of the deviations that
+the errors have so far. With factors f on these deviations its increase has the mean sum Q_ii f_i^2 and the variance
+sum s_i^2 f_i^2 + 2 sum Q_ij^2 f_i^2 f_j^2. The budget is the increase that a share of all lenses stays within. With v
+= f^2 and w the slope of mean + z deviation over v (z the normal quantile of the share), equal contributions mean
+w v alike for all, and the cheapest tolerances at costs c / f have f proportional to (c / w)^(1/3) (Lagrange). Where
+Q = 0 that is the closed form of a root sum of squares; else w depends on v, and both are a fixed point. The scale of
+all factors follows from the distribution of the quadratic form itself, not from its normal approximation.
+
+    forecast = of_spot(forecast_spot(nominal, slopes, 3))
+    needed = cheapest(forecast, errors, 0.21 * forecast.nominal)  # the RMS spot grows by 10 % at most
+    trials = monte_carlo(geo, needed.errors, figures, 400, generator)
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from statistics import NormalDist
+
+import torch
+from torch import Tensor
+
+from codesign.errors import DomainError, ShapeError
+from codesign.lens.design.tolerance import Compensator, Figures, compensated
+from codesign.lens.design.tolerance_errors import Error, perturbed
+from codesign.lens.design.tolerance_spot import SpotForecast
+from codesign.lens.geolens import GeoLens
+
+NODES = 2048  # of the sum over the characteristic function
+FARTHEST = (
+    25.0  # standard deviations from the mean that no lens reaches; the sum repeats itself after twice as many
+)
+ROUNDS = 40  # of the fixed point and of a bisection
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """A figure to second order in P independent errors of one standard deviation each: nominal + linear . e + e .
+    square e, with a number, [P] and [P, P] symmetric."""
+
+    nominal: float
+    linear: Tensor
+    square: Tensor
+
+    def at(self, amounts: Tensor) -> Tensor:
+        """The figure at errors [N, P], [N]."""
+        return (
+            self.nominal + amounts @ self.linear + torch.einsum("np,pq,nq->n", amounts, self.square, amounts)
+        )
+
+    def moments(self, factors: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the increase when every error has its factor [P] times the deviation."""
+        v = factors.square()
+        mean = self.square.diagonal() @ v
+        return mean, (self.linear.square() @ v + 2 * v @ self.square.square() @ v).sqrt()
+
+    def share_within(self, increase: float, factors: Tensor) -> float:
+        """Share of lenses whose figure grows by at most ``increase``, of errors with factors [P].
+
+        Source: Davies, Numerical inversion of a characteristic function, Biometrika 60 (1973): a sum over the
+          characteristic function, here of a quadratic form in its principal axes.
+        """
+        mean, deviation = self.moments(factors)
+        away = float(increase - mean)
+        if abs(away) >= FARTHEST * float(deviation):
+            return float(away >= 0)
+        size, axes = torch.linalg.eigh(factors[:, None] * self.square * factors)
+        slope = axes.T @ (factors * self.linear)
+        node = torch.arange(NODES, dtype=size.dtype) + 0.5
+        t = node * (math.pi / FARTHEST) / deviation
+        bent = 1 - 2j * t[:, None] * size
+        log = (-0.5 * bent.log() - 0.5 * (t[:, None] * slope).square() / bent).sum(1) - 1j * t * increase
+        return 0.5 - float((log.exp().imag / node).sum()) / math.pi
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Tolerances that spend a budget. errors: with the deviations needed. factors: [P], of these over those given;
+    one for both axes of a tolerance. shares: [P] of the budget that each error takes. cost: sum of cost / factor."""
+
+    errors: tuple[Error, ...]
+    factors: Tensor
+    shares: Tensor
+    cost: float
+
+
+def of_spot(forecast: SpotForecast) -> Forecast:
+    """The squared RMS spot, mean over the fields, as one figure."""
+    return Forecast(float(forecast.nominal.mean()), forecast.linear.mean(0), forecast.square.mean(0))
+
+
+def fitted(
+    figure: Figures,
+    lens: GeoLens,
+    errors: Sequence[Error],
+    steps: Tensor | float = 1.0,
+    compensate: Compensator | None = None,
+) -> Forecast:
+    """Forecast of a figure without useful derivatives, such as a flow error: a parabola through the lens itself and
+    each error at plus and minus its step, 2 P + 1 evaluations; errors do not mix in it.
+
+    Args: figure: lens -> one number; draw the same random numbers in every call. steps: in standard deviations, a
+      number or [P]; large enough for the figure to rise above its noise.
+    """
+    figure = compensated(figure, compensate)
+    sizes = torch.as_tensor(steps, dtype=torch.float64).expand(len(errors))
+    if not bool((sizes > 0).all()):
+        raise DomainError(f"steps of errors must be positive, got {sizes.tolist()}.")
+    with torch.no_grad():
+        nominal = float(figure(lens))
+        sides = torch.tensor(
+            [
+                [float(figure(perturbed(lens, errors, sign * row))) for sign in (1.0, -1.0)]
+                for row in torch.diag(sizes).to(lens.dtype)
+            ],
+            dtype=torch.float64,
+        )
+    plus, minus = sides.unbind(1)
+    return Forecast(
+        nominal, (plus - minus) / (2 * sizes), torch.diag((plus + minus - 2 * nominal) / (2 * sizes.square()))
+    )
+
+
+def equal_shares(
+    forecast: Forecast, errors: Sequence[Error], budget: float, share: float = 0.9, most: float = math.inf
+) -> Precision:
+    """Tolerances of which each takes the same part of the budget; see ``cheapest``."""
+    return _solved(forecast, errors, budget, share, most, _costs(errors, None), power=1.0)
+
+
+def cheapest(
+    forecast: Forecast,
+    errors: Sequence[Error],
+    budget: float,
+    share: float = 0.9,
+    most: float = math.inf,
+    costs: Mapping[str, float] | None = None,
+) -> Precision:
+    """Tolerances of the least total cost, each costing c over its factor, with which a share of all lenses keeps the
+    figure's increase within the budget.
+
+    Args:
+      errors: those of the forecast, in its order, as from ``errors_of``. Errors that one tolerance of a drawing
+        covers (x and y) get one factor.
+      budget: > 0, in the unit of the figure. share: of lenses, above a half and below 1. most: largest factor.
+      costs: c by name of a tolerance (``Error.drawn``) or by its first word ("tilt"); 1 where neither is named.
+    Raises: DomainError for a budget or share out of range, an unknown cost, a tolerance that the figure does not
+      grow with and ``most`` does not bound, and a budget that is not spent when all are at ``most``.
+    """
+    return _solved(forecast, errors, budget, share, most, _costs(errors, costs), power=2 / 3)
+
+
+def _solved(forecast, errors, budget, share, most, costs, power):
+    count = len(errors)
+    if forecast.linear.shape != (count,):
+        raise ShapeError(f"the forecast is of {forecast.linear.numel()} errors, but {count} were given.")
+    if not (0 < budget < math.inf and 0.5 < share < 1 and most > 0):
+        raise DomainError(
+            f"budget {budget}, share {share} and largest factor {most}: the budget must be a positive increase of the "
+            "figure, the share lie between 0.5 and 1, and the factor be positive."
+        )
+    names = list(dict.fromkeys(e.drawn for e in errors))
+    member = torch.tensor([names.index(e.drawn) for e in errors])
+    z = NormalDist().inv_cdf(share)
+    factors = torch.ones(len(names), dtype=forecast.linear.dtype)
+
+    def slopes():
+        """Slope of mean + z deviation over the squared factor of every tolerance, [names], and of every error."""
+        v = factors[member].square()
+        deviation = forecast.moments(factors[member])[1]
+        w = forecast.square.diagonal() + z / (2 * deviation) * (
+            forecast.linear.square() + 4 * forecast.square.square() @ v
+        )
+        return torch.zeros_like(factors).index_add(0, member, w), w
+
+    def normal(trial):
+        mean, deviation = forecast.moments(trial)
+        return bool(mean + z * deviation <= budget)
+
+    def exact(trial):
+        return forecast.share_within(budget, trial) >= share
+
+    aim = factors
+    for _ in range(ROUNDS):
+        w, _ = slopes()
+        if not bool((w > 0).all()) and math.isinf(most):
+            flat = ", ".join(names[k] for k in (w <= 0).nonzero()[:, 0].tolist())
+            raise DomainError(
+                f"the figure does not grow with {flat}, so give the largest factor it may have."
+            )
+        aim = torch.where(w > 0, (costs / w.clamp_min(1e-300)) ** (power / 2), 1e30)
+        before = factors
+        factors = (_largest(aim, member, most, normal) * before).sqrt()
+        if float((factors / before - 1).abs().max()) < 1e-7:
+            break
+    factors = _largest(aim, member, most, exact)
+    spent = slopes()[1] * factors[member].square()
+    found = tuple(
+        replace(e, deviation=e.deviation * f) for e, f in zip(errors, factors[member].tolist(), strict=True)
+    )
+    return Precision(found, factors[member], spent / spent.sum(), float((costs / factors).sum()))
+
+
+def _largest(shape, member, most, keeps):
+    """The largest factors in proportion to ``shape`` [names], none above ``most``, of which the budget keeps."""
+    low, high = -30.0, 30.0
+    if keeps((shape * math.exp(high)).clamp_max(most)[member]):
+        raise DomainError(
+            f"even at {most:g} times the deviations given the budget is not spent; allow larger factors, or start from "
+            "larger deviations."
+        )
+    for _ in range(ROUNDS):
+        middle = (low + high) / 2
+        inside = keeps((shape * math.exp(middle)).clamp_max(most)[member])
+        low, high = (middle, high) if inside else (low, middle)
+    return (shape * math.exp(low)).clamp_max(most)
+
+
+def _costs(errors, given):
+    names = list(dict.fromkeys(e.drawn for e in errors))
+    given = given or {}
+    known = {*names, *(name.split()[0] for name in names)}
+    wrong = [f"{k} {v}" for k, v in given.items() if k not in known or not 0 < v < math.inf]
+    if wrong:
+        raise DomainError(
+            f"costs {', '.join(wrong)}: name tolerances out of {', '.join(sorted(known))}, with positive numbers."
+        )
+    return torch.tensor(
+        [given.get(name, given.get(name.split()[0], 1.0)) for name in names], dtype=torch.float64
+    )

@@ -1,0 +1,193 @@
+"""Tolerances from a budget, against closed forms, draws of the forecast, and trials of the lens itself."""
+
+import math
+from functools import partial
+from statistics import NormalDist
+
+import pytest
+import torch
+
+from codesign import lens
+from codesign.errors import DomainError, ShapeError
+from codesign.lens.design.precision import Forecast, cheapest, equal_shares, fitted, of_spot
+from codesign.lens.design.solves import focus_rays
+from codesign.lens.design.tolerance import compensated, monte_carlo, sensitivities
+from codesign.lens.design.tolerance_errors import Error, Tolerances, errors_of, perturbed
+from codesign.lens.design.tolerance_spot import forecast_spot, spot_errors, squared_spots
+
+D = torch.float64
+FIELDS = (0.0, 0.3)
+SHARE = 0.9
+Z = NormalDist().inv_cdf(SHARE)
+MOUNTED = Tolerances(radius_relative=1e-3, thickness_mm=0.02, element_decentre_mm=0.01, element_tilt_deg=0.02)
+
+
+def named(count):
+    return [Error(f"curvature of surface {i + 1}", "curvature_per_mm", (i,), 0.5) for i in range(count)]
+
+
+def plain(slopes):
+    return Forecast(3.0, slopes, torch.zeros(len(slopes), len(slopes), dtype=D))
+
+
+@pytest.fixture
+def slopes(generator):
+    return torch.rand(6, dtype=D, generator=generator) + 0.1
+
+
+def test_equal_shares_of_a_linear_figure(slopes):
+    """Each takes budget / z / sqrt(P) of a standard deviation."""
+    found = equal_shares(plain(slopes), named(6), 0.2, SHARE)
+    torch.testing.assert_close(found.factors, 0.2 / Z / math.sqrt(6) / slopes, rtol=1e-7, atol=0)
+    torch.testing.assert_close(found.shares, torch.full((6,), 1 / 6, dtype=D), rtol=1e-6, atol=0)
+    assert [e.deviation for e in found.errors] == pytest.approx((0.5 * found.factors).tolist(), rel=1e-12)
+
+
+def test_cheapest_tolerances_of_a_linear_figure(slopes):
+    """Lagrange: (c / s^2)^(1/3), scaled so that the root sum of squares is budget / z."""
+    costs = {f"curvature of surface {i + 1}": c for i, c in enumerate((1.0, 5.0, 0.3, 2.0, 1.0, 8.0))}
+    c = torch.tensor(list(costs.values()), dtype=D)
+    found = cheapest(plain(slopes), named(6), 0.2, SHARE, costs=costs)
+    shape = (c / slopes.square()) ** (1 / 3)
+    wanted = shape * (0.2 / Z) / torch.linalg.vector_norm(shape * slopes)
+    torch.testing.assert_close(found.factors, wanted, rtol=1e-6, atol=0)
+    assert found.cost == pytest.approx(float((c / wanted).sum()), rel=1e-6)
+    assert found.cost < float((c / equal_shares(plain(slopes), named(6), 0.2, SHARE).factors).sum())
+
+
+def test_the_share_of_one_square_is_that_of_chi_squared():
+    """F = x^2: P(x^2 <= y) = erf(sqrt(y / 2)); a single square has the slowest characteristic function of all."""
+    forecast = Forecast(0.0, torch.zeros(1, dtype=D), torch.ones(1, 1, dtype=D))
+    for y in (0.5, 1.0, 2.7, 6.0):
+        truth = math.erf(math.sqrt(y / 2))
+        # the sum leaves off after 2048 terms that fall as k^-1.5: some 1e-4
+        assert forecast.share_within(y, torch.ones(1, dtype=D)) == pytest.approx(truth, abs=3e-4)
+
+
+def test_the_share_of_several_squares_and_of_a_slope():
+    """Ten squares: chi squared of ten degrees, 1 - exp(-y/2) sum (y/2)^k / k! over k < 5; a slope: the normal."""
+    ten = Forecast(0.0, torch.zeros(10, dtype=D), torch.eye(10, dtype=D))
+    for y in (5.0, 12.0, 25.0):
+        truth = 1 - math.exp(-y / 2) * sum((y / 2) ** k / math.factorial(k) for k in range(5))
+        assert ten.share_within(y, torch.ones(10, dtype=D)) == pytest.approx(truth, abs=1e-9)
+    one = plain(torch.tensor([2.0], dtype=D))
+    assert one.share_within(3.0, torch.tensor([0.5], dtype=D)) == pytest.approx(
+        NormalDist().cdf(3.0), abs=1e-9
+    )
+    assert one.share_within(1e9, torch.ones(1, dtype=D)) == 1.0
+
+
+@pytest.fixture(scope="module")
+def spot():
+    """Forecast of the refocused triplet's squared spot under mounted elements, with its errors and figure."""
+    geo = lens.load("cooke-triplet").freeze()
+    compensate = partial(focus_rays, fields_rad=FIELDS, grid=6)
+    figure = spot_errors(FIELDS, grid=6)
+    slopes = sensitivities(geo, MOUNTED, figure, compensate=compensate)
+    forecast = of_spot(forecast_spot(compensated(figure, compensate)(geo), slopes, len(FIELDS)))
+    return geo, errors_of(geo, MOUNTED), forecast, figure, compensate
+
+
+@pytest.mark.parametrize("solve", [equal_shares, cheapest])
+def test_ninety_percent_of_drawn_errors_keep_the_budget(spot, solve, generator):
+    _, errors, forecast, _, _ = spot
+    budget = 0.21 * forecast.nominal
+    found = solve(forecast, errors, budget, SHARE)
+    draws = torch.randn(200_000, len(errors), generator=generator, dtype=D) * found.factors
+    inside = (forecast.at(draws) - forecast.nominal <= budget).double().mean()
+    # 2e5 draws know the share to 0.0007, four of which; x and y of a tolerance have one factor
+    assert float(inside) == pytest.approx(SHARE, abs=0.003)
+    ties = {e.drawn: f for e, f in zip(errors, found.factors.tolist(), strict=True)}
+    assert [ties[e.drawn] for e in errors] == found.factors.tolist()
+
+
+def test_the_cheapest_is_a_minimum(spot, generator):
+    """Any other factors that keep the budget cost more."""
+    _, errors, forecast, _, _ = spot
+    budget = 0.21 * forecast.nominal
+    names = list(dict.fromkeys(e.drawn for e in errors))
+    member = torch.tensor([names.index(e.drawn) for e in errors])
+    found = cheapest(forecast, errors, budget, SHARE)
+    best = torch.zeros(len(names), dtype=D).index_copy(0, member, found.factors)
+    for _ in range(5):
+        other = best * (0.2 * torch.randn(len(names), generator=generator, dtype=D)).exp()
+        low, high = 0.1, 10.0
+        for _ in range(30):
+            middle = math.sqrt(low * high)
+            inside = forecast.share_within(budget, (other * middle)[member]) >= SHARE
+            low, high = (middle, high) if inside else (low, middle)
+        # at the minimum a change of 20 % costs its square; the normal approximation of the shape costs far less
+        assert float((1 / (other * low)).sum()) > found.cost * (1 + 1e-3)
+
+
+def test_ninety_percent_of_lenses_keep_the_budget(spot):
+    geo, errors, forecast, figure, compensate = spot
+    found = cheapest(forecast, errors, 0.21 * forecast.nominal, SHARE)
+    trials = monte_carlo(
+        geo,
+        found.errors,
+        lambda faulty: squared_spots(figure(faulty), len(FIELDS)).mean().reshape(1),
+        200,
+        torch.Generator().manual_seed(0),
+        compensate=compensate,
+    )
+    inside = (trials.figures[:, 0] <= 1.21 * trials.nominal[0]).double().mean()
+    assert float(inside) == pytest.approx(SHARE, abs=4 * math.sqrt(0.09 / 200))
+
+
+def test_a_parabola_is_fitted_to_a_figure_without_derivatives(spot):
+    geo, errors, _, _, _ = spot
+    slope = torch.linspace(-1, 1, len(errors), dtype=D)
+    bend = torch.linspace(0.5, 2, len(errors), dtype=D)
+
+    def amounts(faulty):
+        """The errors read back from the lens, as far as they stand alone in one tensor."""
+        change = faulty.curvature_per_mm - geo.curvature_per_mm
+        return torch.stack([change[e.at[0]] / e.deviation for e in errors if e.tensor == "curvature_per_mm"])
+
+    mine = [k for k, e in enumerate(errors) if e.tensor == "curvature_per_mm"]
+
+    def figure(faulty):
+        e = amounts(faulty)
+        return 7.0 + e @ slope[mine] + e.square() @ bend[mine]
+
+    found = fitted(figure, geo, errors, steps=0.5)
+    wanted = torch.zeros(len(errors), dtype=D).index_copy(0, torch.tensor(mine), slope[mine])
+    # amounts are read back from curvatures to 1e-16 / 1e-5
+    torch.testing.assert_close(found.linear, wanted, rtol=1e-8, atol=1e-9)
+    wanted = wanted.index_copy(0, torch.tensor(mine), bend[mine])
+    torch.testing.assert_close(found.square, torch.diag(wanted), rtol=1e-8, atol=1e-8)
+    assert found.nominal == 7.0
+    moved = torch.zeros(len(errors), dtype=D)
+    moved[mine[2]] = 1.7
+    assert float(found.at(moved[None])) == pytest.approx(
+        float(figure(perturbed(geo, errors, moved))), rel=1e-8
+    )
+
+
+def test_a_tolerance_that_does_not_matter_stays_at_the_largest_factor(slopes):
+    slopes[2] = 0.0
+    with pytest.raises(
+        DomainError, match="does not grow with curvature of surface 3, so give the largest factor"
+    ):
+        cheapest(plain(slopes), named(6), 0.2)
+    found = cheapest(plain(slopes), named(6), 0.2, most=4.0)
+    assert float(found.factors[2]) == 4.0
+    assert float(found.factors.max()) == 4.0
+
+
+def test_wrong_questions_are_refused(slopes):
+    with pytest.raises(DomainError, match="budget must be a positive increase"):
+        cheapest(plain(slopes), named(6), -0.1)
+    with pytest.raises(DomainError, match=r"share lie between 0\.5 and 1"):
+        equal_shares(plain(slopes), named(6), 0.1, share=0.4)
+    with pytest.raises(ShapeError, match="of 6 errors, but 5 were given"):
+        cheapest(plain(slopes), named(5), 0.1)
+    with pytest.raises(DomainError, match="costs roughness 2: name tolerances out of curvature,"):
+        cheapest(plain(slopes), named(6), 0.1, costs={"roughness": 2})
+    with pytest.raises(
+        DomainError, match=r"even at 0\.001 times the deviations given the budget is not spent"
+    ):
+        cheapest(plain(slopes), named(6), 10.0, most=0.001)
+    with pytest.raises(DomainError, match="steps of errors must be positive"):
+        fitted(lambda geo: torch.ones(()), lens.load("la1509"), named(2), steps=0.0)
