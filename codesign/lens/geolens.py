@@ -1,6 +1,7 @@
 """A ray-traced lens whose curvatures, thicknesses, conics, asphere terms and indices carry gradients."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import ClassVar
@@ -380,6 +381,9 @@ class GeoLens(Replaceable):
         shape = (self.curvature_per_mm, self.thickness_mm, self.conic, self.asphere)
         efficiency = math.prod(s.phase.efficiency(wavelength_um) for s in self.surfaces if s.phase)
         inner = tuple(s.inner_semi_aperture_mm for s in self.surfaces)
+        filled = [False, *self.glass.tolist()]
+        for i, mirror in enumerate(self.mirrors):
+            filled[i + 1] = filled[i] if mirror else filled[i + 1]
         return Prescription(
             *shape,
             self.index(wavelength_um),
@@ -390,6 +394,7 @@ class GeoLens(Replaceable):
             self.tilt_rad,
             self.mirrors,
             inner,
+            tuple(before or behind for before, behind in itertools.pairwise(filled)),
             efficiency,
             plate=self.plate
             and PlateAt(self.plate.look, *self.plate_at, self.plate.mm_per_rad(wavelength_um)),

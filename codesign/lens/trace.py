@@ -48,6 +48,8 @@ class Prescription:
     decentre_mm, tilt_rad: [S, 2] each. mirrors: S booleans; the axis is unfolded behind a mirror (see
       Surface).
     inner_semi_aperture_mm: S numbers, radii of central obstructions (0: none).
+    borders_glass: S booleans, surfaces whose index step may change: where the step is 0 today, a derivative to
+      ``index`` still needs the refraction. False for a surface in air, whose step stays 0.
     to_plane: whether rays go on to the plane behind the last thickness, or end on the last surface itself.
     plate: a phase plate between the surfaces, or None; of no concern to ``trace``, see ``plated.trace``.
     """
@@ -64,6 +66,7 @@ class Prescription:
     tilt_rad: Tensor
     mirrors: tuple[bool, ...]
     inner_semi_aperture_mm: tuple[float, ...]
+    borders_glass: tuple[bool, ...]
     efficiency: float = 1.0
     to_plane: bool = True
     plate: PlateAt | None = None
@@ -90,6 +93,7 @@ class Prescription:
             mirrors=self.mirrors[::-1],
             inner_semi_aperture_mm=self.inner_semi_aperture_mm[::-1],
             plate=self.plate and self.plate.reversed(self.thickness_mm),
+            borders_glass=self.borders_glass[::-1],
             **shapes,
             **same,
         )
@@ -102,6 +106,7 @@ class Prescription:
             part,
             path_mm=part.path_mm * keep[:, None],
             mirrors=(*self.mirrors[:surface], False),
+            borders_glass=(*self.borders_glass[:surface], False),
             index=self.index[[*range(surface + 1), surface]],
             to_plane=False,
             plate=self.plate if self.plate and self.plate.gap < surface else None,
@@ -217,7 +222,11 @@ def trace(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> T
     conics = [
         p.conic.requires_grad or k != 0 for k in p.conic.tolist()
     ]  # its value matters, or its derivative is wanted
-    refracts = [a != b for a, b in zip(p.index[:-1].tolist(), p.index[1:].tolist(), strict=True)]
+    index = p.index.tolist()
+    refracts = [
+        a != b or (varies and p.index.requires_grad)
+        for a, b, varies in zip(index[:-1], index[1:], p.borders_glass, strict=True)
+    ]
     moved = [any(row) for row in torch.cat([p.decentre_mm, p.tilt_rad], 1).tolist()]
     if p.decentre_mm.requires_grad or p.tilt_rad.requires_grad:
         moved = [True] * len(moved)

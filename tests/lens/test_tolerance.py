@@ -45,6 +45,23 @@ def singlet():
     ).freeze()
 
 
+def test_a_surface_between_equal_glasses_can_be_wrong():
+    """At the d line a buried surface bends nothing, at other wavelengths it does; a stop in air never."""
+    crown = Glass.from_indices(1.52, 1.51, 1.505, "crown")
+    flint = Glass.from_indices(1.53, 1.51, 1.50, "flint")
+    geo = GeoLens(
+        [
+            Surface(50.0, 3.0, crown, 8.0),
+            Surface(-40.0, 3.0, flint, 8.0),
+            Surface(-90.0, 2.0, None, 8.0),
+            Surface(math.inf, 50.0, None, 5.0, is_stop=True),
+        ],
+        8.0,
+    )
+    names = [e.name for e in errors_of(geo, Tolerances(radius_relative=1e-3, fringes=1.0))]
+    assert names == [f"curvature of surface {i}" for i in (1, 2, 3)]
+
+
 def efl(geo):
     return geo.first_order().efl_mm.reshape(1)
 

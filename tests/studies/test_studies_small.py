@@ -10,6 +10,7 @@ from studies.lens_accuracy import __main__ as lens_accuracy
 from studies.speed_error import __main__ as speed_error
 from studies.speed_error.__main__ import Measured, cheapest
 from studies.stability import __main__ as stability
+from studies.stability.systems import KINDS, differences, draw_system, errors_of_systems, worst_error
 
 LEVELS = [
     Measured("pinhole", 1.0, 1.0, 0.2),
@@ -40,6 +41,22 @@ def test_where_none_is_good_enough_the_best_is_named_as_such():
     assert (best.name, enough) == ("quick and good", False)
     with pytest.raises(DomainError, match="no level"):
         cheapest([], 0.1)
+
+
+def test_gradients_of_random_lenses_with_coincidences_agree_with_differences():
+    """Equal neighbours, flats, concentric surfaces, zeros: what has no effect today has a derivative."""
+    errors = errors_of_systems(100, torch.Generator().manual_seed(1), alone_every=60)
+    assert max(errors.values()) <= 1e-6
+
+
+def test_the_differences_see_a_wrong_gradient():
+    """Every kind's gradient moves the scalar: one that is left out, as the index of equal neighbours once was,
+    is an error of 1."""
+    system = draw_system(torch.Generator().manual_seed(2), "geaso")
+    truth = differences(system) | {"glass": system.lens.glass.numpy()}
+    for name in KINDS:
+        if truth[name].size:
+            assert worst_error({name: 0 * truth[name]}, truth)[name] == pytest.approx(1, rel=1e-12)
 
 
 @pytest.mark.parametrize("name", stability.CASES)

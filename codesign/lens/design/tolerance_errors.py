@@ -79,12 +79,13 @@ def errors_of(lens: GeoLens, tolerances: Tolerances | Sequence[Error]) -> list[E
     found = []
     glass = is_glass(lens)
     t = tolerances
-    index = lens.index().tolist()
     for i, (c, a) in enumerate(
         zip(lens.curvature_per_mm.tolist(), lens.semi_aperture_mm.tolist(), strict=True)
     ):
         where = f"surface {i + 1}"
-        bends = index[i] != index[i + 1] or lens.mirrors[i]
+        bends = (
+            glass[i] or (i > 0 and glass[i - 1]) or lens.mirrors[i]
+        )  # even where both have one index today
         curvature = (
             math.hypot(c * t.radius_relative, c * c * t.radius_mm, t.fringes * 0.546074e-3 / a**2)
             if bends
