@@ -229,7 +229,7 @@ BAD = {
     "strange circle": ("CIR 7", "CIR FOO 3", "CIR FOO 3 is not understood"),
     "fresnel": ("CIR 7", "CUF 0.1", "Fresnel"),
     "unknown command": ("CIR 7", "WOB 7", "command 'WOB' is not understood; delete it"),
-    "zoom": ("CIR 7", "ZOO 3", "command 'ZOO' is not understood"),
+    "zoom": ("CIR 7", "ZOO 3", r"it is a zoom \(ZOO 3\), and only one lens at a time"),
     "before any surface": ("DIM M", "CIR 7", "stands before any surface"),
     "unknown glass": (
         "NBK7_SCHOTT",

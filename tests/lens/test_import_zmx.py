@@ -485,6 +485,10 @@ BAD = {
     ),
     "no surface": (text(surfaces=(OBJECT, IMAGE[:1])).replace("SURF 3", "SURF 1"), "it has 2 surfaces"),
     "too many surfaces": ("\n".join([*HEAD, *(f"SURF {i}" for i in range(600))]), "more than 500 surfaces"),
+    "configurations": (
+        text() + "\nMNUM 3 1\nMOFF 0 1",
+        r"it holds 3 configurations \(MNUM\), and only one lens at a time is read; save the one you want",
+    ),
     "not sequential": (head("MODE", "MODE NSC"), "mode 'NSC'"),
     "unit unknown": (head("UNIT", "UNIT FURLONG"), "unit 'FURLONG' is not known; known are MM"),
     "unit missing": (head("UNIT"), "names no unit"),

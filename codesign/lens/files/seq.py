@@ -153,6 +153,11 @@ class System:
                 f"command '{shown(command)}' has no value, or is not understood; delete it if it changes no "
                 "ray."
             )
+        elif command == "ZOO":
+            raise FileFormatError(
+                f"it is a zoom (ZOO {shown(values[0])}), and only one lens at a time is read; save the position you "
+                "want as a lens of its own."
+            )
         elif command == "DIM":
             if values[0].upper() not in UNITS_MM:
                 raise FileFormatError(

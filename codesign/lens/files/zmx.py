@@ -17,7 +17,7 @@ def read_zmx(text: str, name: str) -> FileLens:
     """FileLens of the text of a .zmx file.
 
     Outside the surfaces only mode, unit, pupil, field, wavelengths and telecentric or afocal spaces are read:
-    all else there describes analyses.
+    all else there describes analyses. Several configurations (a zoom) are refused.
     Raises: FileFormatError naming surface and reason for anything in a surface that is not understood, or
       that no GeoLens can be.
     """
@@ -26,6 +26,11 @@ def read_zmx(text: str, name: str) -> FileLens:
     ended = False
     for at_line, line in lines(text):
         keyword, *words = line.split() or [""]
+        if keyword == "MNUM" and words and whole(words[0], keyword) > 1:
+            raise FileFormatError(
+                f"it holds {whole(words[0], keyword)} configurations (MNUM), and only one lens at a time is read; save "
+                "the one you want as a lens of its own."
+            )
         if keyword == "SURF":
             if ended or len(entries) > MOST_SURFACES + 1:
                 raise FileFormatError(
