@@ -1,48 +1,48 @@
-"""Optimise a lens for event flow, from glass to the flow error.
+"""What does an event-flow objective buy a lens designer over the best spot-size designer?
 
-A published lens is scaled to a DAVIS346-like sensor, detuned in curvatures and focus by a stated seed, and optimised by
-gradients through rays, frames, events and flow. Focal length and f-number are held, centre and edge thicknesses kept.
-What counts is judged on textures and motions never optimised on, with a hard event sensor.
+A published lens is scaled to a DAVIS346-like sensor and focused on the wall it looks at; a stated seed detunes its
+curvatures, and it is focused again, so that what is left no focusing takes away. From there it is optimised by
+gradients through rays, frames, events and flow, beside rivals with the same free variables, focal length, f-number and
+limits: refocused alone, damped least squares on spots, and the seed project's edge energy. All are judged on textures
+and motions never optimised on, with a hard event sensor, case by case.
 
 The event layer and the flow estimator can be any of the toolkit's; a network can be trained together with the lens.
 """
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
-import torch
-
-from codesign import lens
+from codesign import flow, lens
 from codesign.errors import DomainError, NonFiniteError
-from codesign.events import HardSensor
 from codesign.flow import checkpoint
-from codesign.optimise import Descent, Loop
-from codesign.system import System, check
+from codesign.lens.design import edge_thickness_mm
+from codesign.system import check
 from studies.frame.run import Run, StudyConfig, main
 from studies.lens_opt import page as lens_opt_page
-from studies.lens_opt.stages import estimator, event_layer, weights_of
-from studies.lens_opt.task import (
-    HELD_OUT,
-    SENSOR,
-    TRAINING,
-    DesignedCamera,
-    LensTask,
-    draw_case,
-    make_task,
-    make_worlds,
-)
-
-PENALTY = 10.0  # of edges thinner than allowed, against the log error
+from studies.lens_opt import rivals
+from studies.lens_opt.descend import JUDGED, Job, development_error, prepare
+from studies.lens_opt.paired import paired
+from studies.lens_opt.task import HELD_OUT, LIGHT, draw_case, make_worlds
 
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
-    QUICK: ClassVar = {"steps": 10, "cases": 2, "judged": 4, "scored": 3}
+    QUICK: ClassVar = {
+        "steps": 10,
+        "after_steps": 2,
+        "cases": 2,
+        "judged": 4,
+        "scored": 3,
+        "developed": 1,
+        "spot_steps": 8,
+        "spot_starts": 1,
+    }
     lens: str = "cooke-triplet"
     """Lens to start from: cooke-triplet, double-gauss, la1509, or a lens .json file."""
     objective: Literal["flow", "edge"] = "flow"
-    """flow: log angular error of event flow; edge: the seed project's edge energy of event frames."""
+    """flow: log angular error of event flow; edge: the seed project's edge energy of event frames. The other of the
+    two is a rival."""
     events: str = "memory"
     """Event layer: memory, sigmoid, counts, dense, expected, srm or physical."""
     flow: str = "closed-form"
@@ -53,174 +53,199 @@ class Config(StudyConfig):
     """Weights of a flownet or spiking network."""
     learning_rate: float = 1e-3
     """Step size of the network's weights (Adam); the lens then goes by Adam too."""
-    steps: int = 50
-    """Optimisation steps."""
+    steps: int = 40
+    """Optimisation steps of either objective."""
+    after_steps: int = 12
+    """Steps of the flow objective from the spot designer's lens."""
     cases: int = 4
     """Samples (texture, motion, noise) per step."""
     samples: int = 16
-    """Rays per pixel while optimising; twice as many when judging."""
+    """Rays per pixel while optimising, a multiple of the 4 wavelengths; twice as many when judging."""
     step_size: float = 0.3
-    """Length of a step in pixels of ray motion per unit of clipped gradient."""
-    detuned_px: float = 2.2
-    """Mean RMS spot of the detuned start, pixels."""
+    """Flow objective: length of a step in pixels of ray motion."""
+    edge_step_size: float = 0.3
+    """Edge objective: length of a step in pixels of ray motion."""
+    spot_steps: int = 60
+    """Most steps of the spot designer from one start."""
+    spot_starts: int = 2
+    """Starts of the spot designer."""
+    detuned_px: float = 1.5
+    """Mean RMS spot of the detuned lens at its best focus, pixels."""
     scored: int = 8
     """Training cases on which the hard sensor decides which lens is kept."""
-    judged: int = 12
+    developed: int = 6
+    """Development cases on which the rivals choose their settings."""
+    judged: int = 24
     """Held-out cases for the final figures."""
 
 
-@dataclass
-class History:
-    """Curves for the page, by judgement: spots, curvatures, thicknesses of the best lens."""
-
-    spot_um: list[list[float]] = field(default_factory=list)
-    curvature: list[list[float]] = field(default_factory=list)
-    thickness: list[list[float]] = field(default_factory=list)
+AFTER_PART = 0.5  # of the step size, for the flow steps from the spot designer's lens
+MEANS = ("flow_error_mrad", "edge_energy", "events_per_pixel")
 
 
-@dataclass(frozen=True)
-class Job:
-    """The task, the camera at its variables, the smooth system and its optimisation."""
+class Course:
+    """How far a run has come: what the rivals chose, the designs by gradients, what was judged. All of it is
+    stored."""
 
-    task: LensTask
-    camera: DesignedCamera
-    system: System
-    loop: Loop
-    probe: Any
+    def __init__(self, run: Run[Config]):
+        stored = run.load_state()
+        self.run = run
+        self.fresh = stored is None
+        self.jobs: dict[str, Job] = {}
+        self.choices: dict[str, list[dict[str, Any]]] = {} if stored is None else stored.numbers["choices"]
+        self.found: dict[str, list[dict[str, float]]] = {} if stored is None else stored.numbers["found"]
+        self._left = {} if stored is None else stored.numbers["jobs"]
+        self._tensors = {} if stored is None else stored.tensors
 
-    def optics(self, variables: torch.Tensor) -> lens.GeoLens:
-        return self.task.design.lens(variables)
+    def add(self, name: str, job: Job):
+        """A design by gradients, which goes on from where the stored run left it."""
+        self.jobs[name] = job
+        if name in self._left:
+            mine = f"{name}."
+            own = {k.removeprefix(mine): v for k, v in self._tensors.items() if k.startswith(mine)}
+            job.resume(own, self._left[name])
+
+    def save(self):
+        tensors = {}
+        numbers = {}
+        for name, job in self.jobs.items():
+            own, numbers[name] = job.state()
+            tensors |= {f"{name}.{key}": value for key, value in own.items()}
+        self.run.save_state(tensors, {"choices": self.choices, "found": self.found, "jobs": numbers})
 
 
 def study(run: Run[Config]):
     config = run.config
     _check(config)
     job = prepare(config)
-    history = History()
-    stored = run.load_state()
-    if stored is None:
+    course = Course(run)
+    if course.fresh:
         lens.save(job.task.nominal, run.path("lens_nominal.json"))
         lens.save(job.task.design.reference, run.path("lens_detuned.json"))
         check(job.system, job.probe, job.loop.optimiser)
-    else:
-        history = History(**stored.numbers.pop("history"))
-        job.loop.resume(stored.tensors, stored.numbers)
-
-    def save():
-        tensors, numbers = job.loop.state()
-        run.save_state(tensors, {**numbers, "history": vars(history)})
-
-    def judged():
-        optics = job.optics(job.loop.best[0])
-        history.spot_um.append(job.task.rms_spot_um(optics).tolist())
-        history.curvature.append(optics.curvature_per_mm.tolist())
-        history.thickness.append(optics.thickness_mm.tolist())
-        if job.loop.record.kept[-1]:
-            lens.save(optics, run.path("lens_optimised.json"))
-            if config.train_network:
-                checkpoint.save(job.system.flow, run.path("network.safetensors"))
-        save()
-
-    run.on_interrupt(save)
-    label = f"optimising {config.lens} for {config.objective}"
-    try:
-        with run.progress(config.steps, label, done=job.loop.step_number) as bar:
-
-            def advance(loss, score):
-                bar.advance(loss=loss, spot_um=sum(history.spot_um[-1]) / 3)
-
-            job.loop.run(config.steps, advance, judged)
-            seconds = bar.seconds_per_step
-    except NonFiniteError as error:
-        raise NonFiniteError(f"{error} The last good lens is {run.path('lens_optimised.json')}.") from error
-    _finish(run, job, history, seconds)
+    made = designed_without_frames(course, job)
+    other = "edge" if config.objective == "flow" else "flow"
+    course.add("optimised", job)
+    course.add(other, prepare(config, job.task, other, job.system.flow))
+    if not config.train_network:
+        begun = replace(job.task, design=job.task.around(made["spots"]))
+        course.add("after_spots", prepare(config, begun, "flow", job.system.flow, part=AFTER_PART))
+    run.on_interrupt(course.save)
+    seconds = {name: descend(course, name) for name in course.jobs}
+    lenses = {
+        "nominal": job.task.nominal,
+        "defocused": job.task.defocused,
+        "detuned": job.task.design.reference,
+        **made,
+        **{name: done.best() for name, done in course.jobs.items()},
+    }
+    _finish(run, course, lenses, seconds["optimised"])
 
 
 def _check(config):
-    for name in ("steps", "cases", "samples", "scored", "judged", "weights"):
+    for name in (
+        "steps",
+        "after_steps",
+        "cases",
+        "samples",
+        "scored",
+        "developed",
+        "judged",
+        "weights",
+        "spot_steps",
+        "spot_starts",
+    ):
         if getattr(config, name) < 1:
-            raise DomainError(f"--{name} is {getattr(config, name)}; at least 1 is needed.")
-    if not (config.step_size > 0 and config.learning_rate > 0 and config.detuned_px > 0):
-        raise DomainError("--step-size, --learning-rate and --detuned-px must be above 0.")
+            raise DomainError(f"--{name.replace('_', '-')} is {getattr(config, name)}; at least 1 is needed.")
+    if config.samples % len(LIGHT.weights):
+        raise DomainError(
+            f"--samples is {config.samples}; the light has {len(LIGHT.weights)} wavelengths, so give a multiple of that."
+        )
+    for name in ("step_size", "edge_step_size", "learning_rate", "detuned_px"):
+        if not getattr(config, name) > 0:
+            raise DomainError(f"--{name.replace('_', '-')} must be above 0.")
 
 
-def prepare(config: Config) -> Job:
-    """Everything a run of lens_opt needs before its first step.
-
-    Raises: DomainError for an event layer and an estimator that make no sense together, with the reason.
-    """
-    layer = event_layer(config.events)
-    stage = estimator(config.flow, config.train_network, config.objective, config.weights, config.seed)
-    task = make_task(config.lens, config.seed, config.detuned_px)
-    pool = make_worlds(TRAINING)
-    camera = DesignedCamera(task, config.samples)
-    every_px = 2 if config.train_network else 8  # a network is taught at more pixels than a lens needs
-    system = task.system(camera, layer, stage, config.objective, every_px)
-    hard = system.replaced(events=HardSensor(SENSOR, system.bins))
-    scored = [draw_case(pool, 7_000_000 + i) for i in range(config.scored)]
-
-    def penalty():
-        return PENALTY * task.design.penalty(camera.optics())
-
-    def samples(step):
-        first = (config.seed + 1) * 100_000 + step * config.cases
-        return (system(draw_case(pool, first + k)).loss + penalty() for k in range(config.cases))
-
-    def score():
-        return sum(float(hard(case).loss) for case in scored) / len(scored) + float(penalty())
-
-    return Job(
-        task, camera, system, Loop(_optimiser(config, system, scored[0]), samples, judge=score), scored[0]
-    )
+def designed_without_frames(course, job):
+    """The refocused lens and the spot designer's, stored as files; what they chose from goes into the course."""
+    run = course.run
+    config = run.config
+    names = ("refocused", "spots")
+    if not course.choices:
+        # a network that is yet to be trained cannot choose
+        stage = flow.estimate_lk if config.train_network else job.system.flow
+        error = development_error(job.task, stage, config.developed, config.samples)
+        run.say("refocusing, and shrinking spots by damped least squares; settings by development cases")
+        found = (
+            rivals.refocus(job.task, error),
+            rivals.shrink_spots(job.task, error, config.spot_steps, config.spot_starts, config.seed),
+        )
+        for name, variants in zip(names, found, strict=True):
+            best = rivals.least(variants)
+            run.say(f"{name}: {best.setting}, {best.error_mrad:.3f} mrad on development cases")
+            if best.complaint:
+                run.say(f"note: {best.complaint}")
+            lens.save(best.optics, run.path(f"lens_{name}.json"))
+            course.choices[name] = [v.numbers() for v in variants]
+        course.save()
+    return {name: lens.load(run.path(f"lens_{name}.json")).freeze() for name in names}
 
 
-def _optimiser(config, system, case):
-    """Descent on the design; with a network, Adam on both, for the weights that the objective sees."""
-    variables = system.camera.variables
-    if not config.train_network:
-        return Descent([variables], config.step_size)
-    weights = weights_of(system.flow)
-    slopes = torch.autograd.grad(system(case).loss, weights, allow_unused=True)
-    seen = [weight for weight, slope in zip(weights, slopes, strict=True) if slope is not None]
-    return torch.optim.Adam(
-        [{"params": [variables], "lr": config.step_size / 6}, {"params": seen, "lr": config.learning_rate}]
-    )
+def descend(course, name):
+    """Take the steps of a design by gradients that are still to be made. Returns: seconds per step, None when none
+    was timed."""
+    run = course.run
+    config = run.config
+    job = course.jobs[name]
+    steps = config.after_steps if name == "after_spots" else config.steps
+
+    def judged():
+        job.history.add(job.task, job.best())
+        if job.loop.record.kept[-1]:
+            lens.save(job.best(), run.path(f"lens_{name}.json"))
+            if config.train_network and name == "optimised":
+                checkpoint.save(job.system.flow, run.path("network.safetensors"))
+        course.save()
+
+    label = f"optimising {config.lens}: {lens_opt_page.label(name, config.objective)}"
+    try:
+        with run.progress(steps, label, done=job.loop.step_number) as bar:
+
+            def advance(loss, score):
+                bar.advance(loss=loss, spot_um=sum(job.history.spot_um[-1]) / 3)
+
+            job.loop.run(steps, advance, judged)
+            return bar.seconds_per_step
+    except NonFiniteError as error:
+        raise NonFiniteError(f"{error} The last good lens is {run.path(f'lens_{name}.json')}.") from error
 
 
-def _finish(run, job, history, seconds):
-    """Judge nominal, detuned and optimised lenses on held-out cases, record, and write the page."""
+def _finish(run, course, lenses, seconds):
+    """Judge every lens on held-out cases, record, and write the page."""
+    job = course.jobs["optimised"]
     task = job.task
-    optimised = lens.load(run.path("lens_optimised.json")).freeze()
-    lenses = {"nominal": task.nominal, "detuned": task.design.reference, "optimised": optimised}
-    found = judge_all(run, job, lenses)
-    judged = run.config.judged
+    found = judge_all(course, lenses)
     for name, optics in lenses.items():
-        mean = {key: sum(row[key] for row in found[name]) / judged for key in found[name][0]}
         first_order = optics.first_order()
+        thin = (task.design.edge_floor_mm - edge_thickness_mm(optics)).clamp_min(0).max()
         run.record(
             **{
                 f"rms_spot_um_{name}": task.rms_spot_um(optics).mean(),
-                f"flow_error_mrad_hard_{name}": mean["flow_error_mrad"],
-                f"edge_energy_hard_{name}": mean["edge_energy"],
-                f"events_per_pixel_hard_{name}": mean["events_per_pixel"],
+                **{f"{key}_hard_{name}": _mean(found[name], key) for key in MEANS},
                 f"efl_mm_{name}": first_order.efl_mm.detach(),
                 f"fno_{name}": first_order.fno.detach(),
+                f"edge_below_floor_mm_{name}": thin.detach(),
             }
         )
-    blank = draw_case([lens_opt_page.blank_wall()], 9_000_000, frames=17)
+    for name, design, rival in pairs_of(lenses):
+        pair = paired(*([row["flow_error_mrad"] for row in found[n]] for n in (design, rival)))
+        run.record(**{f"log_ratio_{name}": pair.mean})
+        if pair.cases > 1:
+            run.record(**{f"log_ratio_{name}_low": pair.low, f"log_ratio_{name}_high": pair.high})
+    blank = draw_case([lens_opt_page.blank_wall()], JUDGED, frames=17)
     for name in ("detuned", "optimised"):
         error = task.judge(lenses[name], blank, job.system.flow)["flow_error_mrad"]
         run.record(**{f"flow_error_mrad_hard_control_{name}": error})
-    m = run.metrics
-    for key, label in (("flow_error_mrad_hard", "flow_error"), ("rms_spot_um", "rms_spot")):
-        lost = m[f"{key}_detuned"] - m[f"{key}_nominal"]
-        won = m[f"{key}_detuned"] - m[f"{key}_optimised"]
-        run.record(
-            **{
-                f"{label}_recovered_share": won / lost,
-                f"{label}_lost_share_of_nominal": lost / m[f"{key}_nominal"],
-            }
-        )
     result = job.system(job.probe, probe=True)
     result.backward()
     rows = result.table()
@@ -240,19 +265,35 @@ def _finish(run, job, history, seconds):
     )
     if seconds is not None:  # unknown when the run was killed before a timed step was stored
         run.record(seconds_per_step=seconds)
-    lens_opt_page.write(run, job, lenses, history, rows, found)
+    lens_opt_page.write(run, course, lenses, rows)
 
 
-def judge_all(run, job, lenses):
+def pairs_of(lenses):
+    """(name, design, rival) of the pairs that are compared: the design with every other lens, and the spot designer's
+    lens after flow steps with itself before."""
+    found = [(rival, "optimised", rival) for rival in lenses if rival != "optimised"]
+    return [*found, ("after_spots_over_spots", "after_spots", "spots")] if "after_spots" in lenses else found
+
+
+def _mean(rows, key):
+    return sum(row[key] for row in rows) / len(rows)
+
+
+def judge_all(course, lenses):
     """Hard errors of every lens on the held-out cases, by name: list of dict (see LensTask.judge)."""
+    run = course.run
+    job = course.jobs["optimised"]
     pool = make_worlds(HELD_OUT)
-    found = {name: [] for name in lenses}
-    with run.progress(run.config.judged * len(lenses), "judging on held-out textures and motions") as bar:
-        for i in range(run.config.judged):
-            case = draw_case(pool, 9_000_000 + i, frames=17)
+    found = course.found
+    done = min((len(found.get(name, [])) for name in lenses), default=0)
+    with run.progress(run.config.judged, "judging on held-out textures and motions", done=done) as bar:
+        for i in range(done, run.config.judged):
+            case = draw_case(pool, JUDGED + i, frames=17)
             for name, optics in lenses.items():
-                found[name].append(job.task.judge(optics, case, job.system.flow, 2 * run.config.samples))
-                bar.advance()
+                row = job.task.judge(optics, case, job.system.flow, 2 * run.config.samples)
+                found.setdefault(name, []).append(row)
+            bar.advance()
+    course.save()
     return found
 
 

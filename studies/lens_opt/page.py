@@ -1,5 +1,6 @@
-"""The page of a lens_opt run: layouts, spots, frames, event frames, curves, junction table."""
+"""The page of a lens_opt run: who wins, the rivals, layouts, spots, frames, event frames, curves, junction table."""
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
@@ -7,7 +8,8 @@ from codesign import events, render
 from codesign.errors import MissingPackageError
 from codesign.report import chain_figures, lens_figures
 from scenes import worlds
-from studies.lens_opt.task import FIELDS, PITCH_MM, SENSOR
+from studies.lens_opt.paired import paired, verdict
+from studies.lens_opt.task import DISTANCE_M, FIELDS, PITCH_MM, SENSOR
 
 
 def blank_wall():
@@ -15,91 +17,252 @@ def blank_wall():
     return worlds.wall(np.full((64, 64), 60.0, dtype=np.float32), texel_m=0.003)
 
 
-def write(run, job, lenses, history, junctions, found):
+DESIGNS = {"flow": "the flow design", "edge": "the edge design"}
+RIVALS = {
+    "refocused": "refocusing alone",
+    "spots": "the spot designer",
+    "edge": "the edge objective",
+    "flow": "the flow objective",
+}
+LENSES = {
+    "nominal": "published lens, in focus",
+    "defocused": "detuned, with its focus error",
+    "detuned": "detuned, in focus: the start",
+    "after_spots": "flow steps after the spot designer",
+}
+
+
+def label(name, objective):
+    """What a lens is called on the page."""
+    if name == "optimised":
+        return DESIGNS[objective].removeprefix("the ")
+    return LENSES.get(name) or RIVALS[name].removeprefix("the ")
+
+
+def write(run, course, lenses, junctions):
     """Fill and finish the run's page."""
+    config = run.config
+    job = course.jobs["optimised"]
+    found = course.found
+    design = DESIGNS[config.objective]
+    errors = {name: [row["flow_error_mrad"] for row in rows] for name, rows in found.items()}
+    pairs = {name: paired(errors["optimised"], errors[name]) for name in RIVALS if name in lenses}
+    said = verdict(design, {RIVALS[name]: pair for name, pair in pairs.items()})
+    complaints = {v["complaint"] for rows in course.choices.values() for v in rows if v["complaint"]}
+    _cards(run, pairs)
+    _who_wins(run, course, lenses, errors, complaints)
+    _rivals(run, course)
+    _lenses(run, job.task, lenses)
+    _seen_by_the_sensor(run, job, lenses)
+    _way(run, course)
+    _junctions(run, junctions)
+    _cases(run, errors, lenses)
     m = run.metrics
-    task = job.task
-    case = job.probe
-    record = job.loop.record
-    run.card(
-        "Flow error, hard events",
-        f"{m['flow_error_mrad_hard_optimised']:.2f} mrad",
-        f"detuned {m['flow_error_mrad_hard_detuned']:.2f}, nominal {m['flow_error_mrad_hard_nominal']:.2f}",
+    trained = ", the network trained with the lens" if config.train_network else ""
+    pace = f" at {m['seconds_per_step']:.2f} s" if "seconds_per_step" in m else ""
+    lead = (
+        f"**{said}**\n\nAsked: what does an event-flow objective buy a lens designer over the best spot-size designer? "
+        f"{config.lens}, curvatures detuned by seed {config.seed} and refocused, objective {config.objective}, events "
+        f"{config.events}, flow {config.flow}{trained}: {m['steps']} steps{pace}. Changes are of the geometric mean "
+        "flow error, case by case, with 95 % intervals of Student's t."
     )
-    run.card(
-        "Flow recovered",
-        f"{100 * m['flow_error_recovered_share']:.0f} %",
-        "of what the detuning lost, on unseen textures and motions",
-    )
-    run.card(
-        "RMS spot",
-        f"{m['rms_spot_um_optimised']:.1f} µm",
-        f"detuned {m['rms_spot_um_detuned']:.1f}, nominal {m['rms_spot_um_nominal']:.1f}; a pixel is "
-        f"{PITCH_MM * 1e3:g} µm",
-    )
-    run.card(
-        "Focal length held",
-        f"{m['efl_mm_optimised']:.4f} mm",
-        f"detuned {m['efl_mm_detuned']:.4f} mm, f/{m['fno_optimised']:.2f}",
-    )
+    run.finish("Lens optimisation for event flow", lead)
+    run.say(said)
+
+
+def _cards(run, pairs):
+    m = run.metrics
+    for name in ("optimised", *pairs):
+        change = (
+            f"the design against it: {pairs[name].percent()}" if name in pairs else "mean of held-out cases"
+        )
+        run.card(
+            f"Flow error, {label(name, run.config.objective)}",
+            f"{m[f'flow_error_mrad_hard_{name}']:.3f} mrad",
+            f"RMS spot {m[f'rms_spot_um_{name}']:.1f} µm; {change}",
+        )
+
+
+def _who_wins(run, course, lenses, errors, complaints):
+    """Table of pairs, over all windows and by window, and their figure."""
+    objective = run.config.objective
+    design = label("optimised", objective)
     run.section(
-        "The lens",
-        "Detuned and optimised lens with meridional rays at the three fields; the published design, scaled "
-        "to the sensor, for comparison.",
+        "Who wins",
+        "Hard events from the physical sensor, textures and motions never optimised on, the same cases for every "
+        f"lens. A change below 0 says that the {design} errs less than the lens of the row; where the interval holds "
+        "0, the two tie. All lenses have the same free variables, focal length, f-number and floors of thickness; the "
+        "published lens is a yardstick that no design here knows.",
     )
+    for complaint in sorted(complaints):
+        run.text(f"**Note**: {complaint}")
+    found = course.found
+    m = run.metrics
+    rows = []
+    for name in lenses:
+        row = [label(name, objective), m[f"flow_error_mrad_hard_{name}"], m[f"rms_spot_um_{name}"]]
+        pair = None if name == "optimised" else paired(errors["optimised"], errors[name])
+        rows.append([*row, m[f"edge_below_floor_mm_{name}"], *_change(pair)])
+    run.table(
+        "Lenses on held-out cases",
+        [
+            "lens",
+            "flow error (mrad)",
+            "RMS spot (µm)",
+            "edge below its floor (mm)",
+            f"change by the {design}",
+            "it",
+        ],
+        rows,
+        f"RMS spot: mean over three fields of a wall at {DISTANCE_M:g} m, four wavelengths; a pixel is "
+        f"{PITCH_MM * 1e3:g} µm.",
+    )
+    if "after_spots" in lenses:
+        pair = paired(errors["after_spots"], errors["spots"])
+        run.text(
+            f"{run.config.after_steps} steps of the flow objective from the spot designer's lens change its flow error "
+            f"by {pair.percent()}: that {_JUDGED[pair.outcome]}."
+        )
+    rivals = [name for name in RIVALS if name in lenses]
+    rows = []
+    for h in FIELDS:
+        key = f"flow_error_mrad_field_{h:g}"
+        own = [row[key] for row in found["optimised"]]
+        changes = [paired(own, [row[key] for row in found[name]]).percent() for name in rivals]
+        rows.append([f"{h:g}", sum(own) / len(own), *changes])
+    run.table(
+        "Where: by window",
+        [
+            "window, of the way to the corner",
+            f"{design} (mrad)",
+            *(label(name, objective) for name in rivals),
+        ],
+        rows,
+        "Change of flow error by the design against each rival, in one window.",
+    )
+    shown = [name for name in ("detuned", *rivals, "after_spots") if name in lenses]
     run.figure(
-        lens_figures.layouts(lenses, task.fields_rad),
+        _pair_figure({label(name, objective): (errors["optimised"], errors[name]) for name in shown}, design),
+        "pairs",
+        f"Flow error of the {design} over that of each lens, a dot per held-out case; bars: mean and 95 % interval.",
+    )
+
+
+_JUDGED = {"wins": "is better", "loses": "is worse", "ties": "is a tie"}
+
+
+def _change(pair):
+    return ["", ""] if pair is None else [pair.percent(), pair.outcome]
+
+
+def _pair_figure(pairs, design):
+    figure, axis = plt.subplots(figsize=(9, 0.8 + 0.6 * len(pairs)))
+    for at, (own, rival) in enumerate(pairs.values()):
+        ratios = np.array(own) / np.array(rival)
+        axis.plot(ratios, np.full(len(ratios), at), "o", color="#1b6ca8", alpha=0.35, ms=4)
+        pair = paired(own, rival)
+        low, mean, high = np.exp([pair.low if pair.cases > 1 else pair.mean, pair.mean, min(pair.high, 50.0)])
+        if pair.cases > 1:
+            axis.plot([low, high], [at, at], "-", color="#c0392b", lw=3)
+        axis.plot([mean], [at], "|", color="#c0392b", ms=14, mew=3)
+    axis.axvline(1.0, color="0.4", lw=1)
+    axis.set_xscale("log")
+    axis.set_yticks(range(len(pairs)), list(pairs))
+    axis.invert_yaxis()
+    axis.set_xlabel(f"flow error of the {design} / flow error of the lens")
+    figure.tight_layout()
+    return figure
+
+
+def _rivals(run, course):
+    config = run.config
+    run.section(
+        "The rivals at their best",
+        f"Refocusing moves the film alone. The spot designer minimises the weighted mean square spot of the wall in the "
+        f"camera's own light by damped least squares, from {config.spot_starts} starts. Both choose among the settings "
+        f"below by the geometric mean flow error on {config.developed} development cases, of other textures than those "
+        "optimised on and those judged on. The other gradient objective runs from the same start, for as many steps, "
+        "with a clip and a step size of its own, which `lens_opt_seeds --scan` compares on development cases.",
+    )
+    for name, rows in course.choices.items():
+        least = min(rows, key=lambda row: row["error_mrad"])
+        run.table(
+            f"Settings: {label(name, config.objective)}",
+            ["setting", "flow error on development cases (mrad)", ""],
+            [[r["setting"], r["error_mrad"], "chosen" if r is least else ""] for r in rows],
+        )
+
+
+def _lenses(run, task, lenses):
+    run.section("The lenses", "Cross-sections with meridional rays at the three fields, and their spots.")
+    named = {
+        label(name, run.config.objective): optics
+        for name, optics in lenses.items()
+        if name in ("nominal", "detuned", "spots", "optimised")
+    }
+    run.figure(
+        lens_figures.layouts(named, task.fields_rad),
         "lens_layout",
-        "Cross-sections; light comes from the left. Colours are fields 0, 0.7 and 1 of the half diagonal.",
+        "Light comes from the left. Colours are fields 0, 0.7 and 1 of the half diagonal.",
     )
     run.figure(
-        lens_figures.spot_diagrams(lenses, task.fields_rad, PITCH_MM),
+        lens_figures.spot_diagrams(named, task.fields_rad, PITCH_MM, DISTANCE_M),
         "spot_diagrams",
-        "Spots at 587.6 nm about their mean; the red square is one pixel.",
+        f"Spots of the wall at {DISTANCE_M:g} m and 587.6 nm about their mean; the red square is one pixel.",
     )
+
+
+def _seen_by_the_sensor(run, job, lenses):
     run.section(
         "What the sensor sees",
-        "One training scene through the detuned and the optimised lens: first frame and signed event counts "
-        "over the whole interval, at the three windows.",
+        "One training scene through the detuned, the spot designer's and the optimised lens: first frame and signed "
+        "event counts over the whole interval, at the three windows.",
     )
     run.figure(
-        _seen(task, lenses, case, run.config.samples),
+        _seen(
+            job.task,
+            {name: lenses[name] for name in ("detuned", "spots", "optimised")},
+            job.probe,
+            run.config,
+        ),
         "frames_and_events",
         "Top of each pair: frame; below: ON minus OFF events (red minus blue).",
     )
-    _seed_emulator(run, task, lenses["optimised"], case)
+    _seed_emulator(run, job.task, lenses["optimised"], job.probe)
+
+
+def _way(run, course):
     run.section("The way there")
-    done = list(range(1, len(record.loss) + 1))
-    losses = {
-        "each step, its own cases": (done, record.loss),
-        "fixed training cases, hard sensor": (record.judged_step, record.score),
-    }
+    for name, job in course.jobs.items():
+        objective = "flow" if name == "after_spots" else run.config.objective if name == "optimised" else name
+        record = job.loop.record
+        done = list(range(1, len(record.loss) + 1))
+        losses = {
+            "each step, its own cases": (done, record.loss),
+            "fixed training cases, hard sensor": (record.judged_step, record.score),
+        }
+        run.figure(
+            chain_figures.curves(losses, _loss_label(objective)),
+            f"loss_curve_{name}",
+            f"Loss while optimising: {label(name, run.config.objective)}.",
+        )
+    job = course.jobs["optimised"]
+    steps = job.loop.record.judged_step
+    spots = {f"field {h:g}": (steps, [row[k] for row in job.history.spot_um]) for k, h in enumerate(FIELDS)}
     run.figure(
-        chain_figures.curves(losses, _loss_label(run.config.objective)),
-        "loss_curve",
-        "Loss while optimising.",
-    )
-    run.figure(
-        chain_figures.curves(
-            {
-                f"field {h:g}": (record.judged_step, [row[k] for row in history.spot_um])
-                for k, h in enumerate(FIELDS)
-            },
-            "RMS spot (µm)",
-        ),
-        "spot_curve",
-        "RMS spot of the best design so far.",
+        chain_figures.curves(spots, "RMS spot (µm)"), "spot_curve", "RMS spot of the best design so far."
     )
     for name, unit in (("curvature", "1/mm"), ("thickness", "mm")):
-        rows = np.array(getattr(history, name))
-        series = {
-            f"surface {k + 1}": (record.judged_step, rows[:, k] - rows[0, k]) for k in range(rows.shape[1])
-        }
+        rows = np.array(getattr(job.history, name))
+        series = {f"surface {k + 1}": (steps, rows[:, k] - rows[0, k]) for k in range(rows.shape[1])}
         run.figure(
             chain_figures.curves(series, f"change of {name} ({unit})"),
             f"{name}_curves",
             f"Change of each {name} since the detuned start; the last curvature holds the focal length.",
         )
+
+
+def _junctions(run, junctions):
     run.section(
         "Gradient at every junction",
         "One pass at the end point: norms of value and gradient, and the share of gradient entries that are "
@@ -110,45 +273,29 @@ def write(run, job, lenses, history, junctions, found):
         ["junction", "value norm", "gradient norm", "zero share"],
         [[r["junction"], r["value_norm"], r["gradient_norm"], r["zero_share"]] for r in junctions],
     )
-    run.section(
-        "Judged on held-out cases",
-        "Hard events from the physical sensor, textures and motions never optimised on; the control is a "
-        "wall without texture, where no lens can help.",
-    )
-    rows = [
-        [i + 1, *(round(found[name][i]["flow_error_mrad"], 3) for name in lenses)]
-        for i in range(len(found["nominal"]))
-    ]
-    run.table("Angular flow error per case (mrad)", ["case", *lenses], rows)
+
+
+def _cases(run, errors, lenses):
+    m = run.metrics
+    objective = run.config.objective
+    run.section("Case by case", "The control is a wall without texture, where no lens can help.")
+    rows = [[i + 1, *(round(errors[name][i], 3) for name in lenses)] for i in range(len(errors["optimised"]))]
+    names = [label(name, objective) for name in lenses]
+    run.table("Angular flow error per held-out case (mrad)", ["case", *names], rows)
     run.table(
         "Means",
-        ["lens", "flow error (mrad)", "RMS spot (µm)", "edge energy", "events per pixel"],
+        ["lens", "edge energy", "events per pixel", "focal length (mm)", "f-number"],
         [
             [
-                n,
-                m[f"flow_error_mrad_hard_{n}"],
-                m[f"rms_spot_um_{n}"],
-                m[f"edge_energy_hard_{n}"],
-                m[f"events_per_pixel_hard_{n}"],
+                label(n, objective),
+                *(m[f"{key}_{n}"] for key in ("edge_energy_hard", "events_per_pixel_hard", "efl_mm", "fno")),
             ]
             for n in lenses
         ],
     )
-    control = f"Control without texture: detuned {m['flow_error_mrad_hard_control_detuned']:.2f} mrad, optimised {m['flow_error_mrad_hard_control_optimised']:.2f} mrad."
-    run.text(control)
-    config = run.config
-    trained = ", the network trained with the lens" if config.train_network else ""
-    pace = f" at {m['seconds_per_step']:.2f} s" if "seconds_per_step" in m else ""
-    lead = (
-        f"{config.lens}, seed {config.seed}, objective {config.objective}, events {config.events}, flow "
-        f"{config.flow}{trained}: {m['steps']} steps{pace}."
-    )
-    run.finish("Lens optimisation for event flow", lead)
-    run.say(
-        f"flow error {m['flow_error_mrad_hard_detuned']:.3f} -> {m['flow_error_mrad_hard_optimised']:.3f} "
-        f"mrad (nominal {m['flow_error_mrad_hard_nominal']:.3f}), "
-        f"RMS spot {m['rms_spot_um_detuned']:.1f} -> {m['rms_spot_um_optimised']:.1f} um (nominal "
-        f"{m['rms_spot_um_nominal']:.1f})"
+    run.text(
+        f"Control without texture: detuned {m['flow_error_mrad_hard_control_detuned']:.2f} mrad, optimised "
+        f"{m['flow_error_mrad_hard_control_optimised']:.2f} mrad."
     )
 
 
@@ -179,17 +326,17 @@ def _loss_label(objective):
     return "mean log angular error (log mrad)" if objective == "flow" else "−(edge energy − λ activity)"
 
 
-def _seen(task, lenses, case, samples):
+def _seen(task, lenses, case, config):
     rows = []
     labels = []
     signed = []
-    for name in ("detuned", "optimised"):
+    for name, optics in lenses.items():
         with torch.no_grad():
-            camera = task.camera(lenses[name], samples, case.seed)
+            camera = task.camera(optics, config.samples, case.seed)
             frames = render.frames(camera, case.scene, case.T_world_body)
             counts, _ = events.memory(frames, SENSOR.theta_on, SENSOR.theta_off)
         total = counts.sum(0)
         rows += [list(frames[0].numpy()), list((total[0] - total[1]).numpy())]
-        labels += [f"{name}: frame", f"{name}: events"]
+        labels += [f"{label(name, config.objective)}: {what}" for what in ("frame", "events")]
         signed += [False, True]
     return chain_figures.strips(rows, [f"field {h:g}" for h in FIELDS], signed, labels)

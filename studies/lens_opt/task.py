@@ -2,7 +2,7 @@
 walls, random motions."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import torch
@@ -11,10 +11,12 @@ from torch import nn
 from codesign import events, lens, pose, render
 from codesign.errors import DomainError
 from codesign.events import HardSensor
-from codesign.lens.design import LensDesign, detune, make_design
+from codesign.lens.design import LensDesign, detune, edge_thickness_mm, make_design
+from codesign.lens.spectrum import daylight_d65, silicon_response
 from codesign.system import Batch, System
 from codesign.system.objectives import angular_error_mrad, edge_energy, edge_objective
 from scenes import textures, trajectories, worlds
+from studies.lens_opt.spots import refocused, spot_rays
 
 # DAVIS346: 346 x 260 pixels of 18.5 um
 SENSOR_PX = (346, 260)
@@ -25,8 +27,13 @@ FIELDS = (0.0, 0.7, 1.0)
 DISTANCE_M = 2.0
 DURATION_S = 0.05
 BINS = 5
+DIRECTIONS = 10  # of detuning that are tried
+FLOOR_SHARE = 0.6  # of the thicknesses of the published lens, which no design may go below
 SENSOR = events.SensorModel(theta_on=0.2, theta_off=0.2, theta_sigma=0.03, shot_rate_hz=1.0)
+# daylight as a silicon sensor sees it, in four wavelengths of equal weight
+LIGHT = lens.Spectrum.from_curves(silicon_response(), daylight_d65(), 4)
 TRAINING = ("gravel", "grass", "gravel:2", "grass:2", "speckle-1")
+DEVELOPMENT = ("coffee", "chelsea", "rocket")  # on which settings are chosen
 HELD_OUT = ("brick", "astronaut", "hubble_deep_field")
 MOTION = torch.tensor(
     [0.012, 0.012, 0.02, 0.001, 0.001, 0.006], dtype=torch.float64
@@ -35,12 +42,21 @@ MOTION = torch.tensor(
 
 @dataclass(frozen=True)
 class LensTask:
-    """A nominal lens scaled to the sensor, and the design variables around its detuned twin (the start,
-    variables = 0)."""
+    """What a lens is designed for, and from where: the design variables around the detuned start (variables = 0),
+    which is in best focus.
+
+    nominal: the published lens scaled to the sensor and focused on the wall. defocused: the detuned lens with the
+      focus error that its curvature errors make.
+    """
 
     nominal: lens.GeoLens
+    defocused: lens.GeoLens
     design: LensDesign
     fields_rad: tuple[float, ...]
+
+    def around(self, optics: lens.GeoLens) -> LensDesign:
+        """The same free variables and limits, in steps around another lens."""
+        return make_design(optics, self.fields_rad, PITCH_MM, self.design)
 
     @cached_property
     def film(self) -> render.Film:
@@ -54,11 +70,11 @@ class LensTask:
         return render.Film(*SENSOR_PX, WINDOW_PX, WINDOW_PX, PITCH_MM, corners)
 
     def camera(self, optics, samples: int, seed: int = 0) -> render.Camera:
-        return render.Camera(optics, WINDOW_PX, WINDOW_PX, PITCH_MM, samples, seed, self.film)
+        return render.Camera(optics, WINDOW_PX, WINDOW_PX, PITCH_MM, samples, seed, self.film, spectrum=LIGHT)
 
     def rms_spot_um(self, optics) -> torch.Tensor:
-        """RMS spot at the three fields, d line, [3] um."""
-        return lens.rms_spot_mm(optics, self.fields_rad) * 1e3
+        """RMS spot of points of the wall at the three fields, all wavelengths together, [3] um."""
+        return spot_rays(optics, self.fields_rad, DISTANCE_M, LIGHT).rms_mm() * 1e3
 
     def system(self, camera, layer, flow, objective: str = "flow", every_px: int = 8) -> System:
         """System of a camera (or what makes one), an event stage and a flow stage.
@@ -80,7 +96,8 @@ class LensTask:
         """Errors of a lens on one case with hard events: the physical sensor with true timestamps, no
         surrogate anywhere.
 
-        Returns: dict of flow_error_mrad, edge_energy, events_per_pixel.
+        Returns: dict of flow_error_mrad, edge_energy, events_per_pixel, and the flow error of each window,
+          flow_error_mrad_field_0 and so on.
         """
         hard = HardSensor(SENSOR, bins_of(flow))
         with torch.no_grad():
@@ -91,6 +108,7 @@ class LensTask:
             "flow_error_mrad": float(error.mean()),
             "edge_energy": float(edge_energy(seen["volume"])),
             "events_per_pixel": float(counts.sum()) / counts[:, 0, 0].numel(),
+            **{f"flow_error_mrad_field_{h:g}": float(e) for h, e in zip(FIELDS, error, strict=True)},
         }
 
 
@@ -115,12 +133,12 @@ def bins_of(flow) -> int:
     return getattr(flow, "config", {}).get("bins", BINS)
 
 
-def make_task(source, seed, detuned_px=2.2):
-    """Load a lens, scale it so that its published field fills the sensor's diagonal, and detune it by
-    ``seed``.
+def make_task(source, seed, detuned_px=1.5):
+    """Load a lens, scale it so that its published field fills the sensor's diagonal, focus it on the wall, and
+    detune its curvatures by ``seed``.
 
-    Args: source: catalogue name or file. detuned_px: mean RMS spot of the detuned start, in pixels (above
-      two, so that the flow suffers).
+    Args: source: catalogue name or file. detuned_px: mean RMS spot of the detuned lens in pixels, at its best focus
+      (above one, so that the flow suffers).
     """
     published = lens.load(source)
     if str(source) in lens.catalogue.LENSES:
@@ -131,15 +149,55 @@ def make_task(source, seed, detuned_px=2.2):
         HALF_DIAGONAL_MM / (float(published.first_order().efl_mm.detach()) * math.tan(half_field))
     ).freeze()
     fields = tuple(math.atan(h * HALF_DIAGONAL_MM / float(nominal.first_order().efl_mm)) for h in FIELDS)
-    published_px = float(lens.rms_spot_mm(nominal, fields).mean()) / PITCH_MM
+    nominal = in_focus(nominal, fields).freeze()
+    published_px = float(mean_spot_mm(nominal, fields)) / PITCH_MM
     if published_px > 0.5 * detuned_px:
         raise DomainError(
             f"lens {source}: its mean RMS spot is {published_px:.3g} pixels before any detuning, so there "
             "is little to win back; give a sharper lens or a larger --detuned-px."
         )
-    around = make_design(nominal, fields, PITCH_MM)
-    start = detune(around, fields, detuned_px * PITCH_MM, torch.Generator().manual_seed(seed))
-    return LensTask(nominal, make_design(start, fields, PITCH_MM, floors=around), fields)
+    around = make_design(nominal, fields, PITCH_MM, floor_share=FLOOR_SHARE)
+    defocused = _detuned(around, fields, detuned_px * PITCH_MM, torch.Generator().manual_seed(seed))
+    start = in_focus(defocused, fields)
+    # the start is within its limits: where it is thinner than the published lens allows, they give way to it
+    floors = replace(
+        around,
+        floor_mm=torch.minimum(around.floor_mm, FLOOR_SHARE * start.thickness_mm),
+        edge_floor_mm=torch.minimum(around.edge_floor_mm, edge_thickness_mm(start)),
+    )
+    return LensTask(nominal, defocused, make_design(start, fields, PITCH_MM, floors), fields)
+
+
+def _detuned(around, fields, target_mm, generator):
+    """Detuned so that the spot at best focus has the target; where a direction changes little but the focus, or makes
+    a lens without edges, another is drawn."""
+
+    def spot_in_focus(made):
+        rays = spot_rays(made, fields, DISTANCE_M, LIGHT, grid=8)
+        return rays.shifted(rays.best_focus_mm()).rms_mm().mean()
+
+    for last in range(DIRECTIONS - 1, -1, -1):
+        try:
+            made = detune(around, fields, target_mm, generator, spot_in_focus)
+        except DomainError:
+            if not last:
+                raise
+            continue
+        if bool((edge_thickness_mm(made) > around.edge_floor_mm.clamp_max(0)).all()):
+            return made
+    raise DomainError(
+        f"{DIRECTIONS} detunings leave no edge to some element; choose another seed, or a smaller --detuned-px."
+    )
+
+
+def mean_spot_mm(optics, fields_rad):
+    """Mean RMS spot of the wall over the fields, scalar mm."""
+    return spot_rays(optics, fields_rad, DISTANCE_M, LIGHT).rms_mm().mean()
+
+
+def in_focus(optics, fields_rad):
+    """The lens with its film at the best focus of the wall, over all fields and wavelengths."""
+    return refocused(optics, fields_rad, DISTANCE_M, LIGHT)
 
 
 def make_worlds(names):

@@ -1,18 +1,137 @@
-"""The main job with other event layers and estimators: what goes together, and a run that is resumed after its end."""
+"""The main job: its start, its rivals' limits, who wins, what goes together, and a run that is resumed after its end."""
 
+import html
 import json
+import math
+from statistics import stdev
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from codesign import events, flow
-from codesign.errors import DomainError
+from codesign import events, flow, lens
+from codesign.errors import DomainError, ShapeError
+from codesign.lens.analysis import polychromatic_spot, spot_radius_mm
+from codesign.lens.design import edge_thickness_mm
 from studies.frame.config import configured
 from studies.frame.run import main
 from studies.lens_opt import __main__ as lens_opt
+from studies.lens_opt import rivals
+from studies.lens_opt.paired import of_differences, paired, pooled, verdict
+from studies.lens_opt.spots import spot_rays
 from studies.lens_opt.stages import estimator, weights_of
+from studies.lens_opt.task import DISTANCE_M, LIGHT, PITCH_MM, make_task
 
-SMALL = ["--quick", "--steps", "2", "--cases", "1", "--scored", "1", "--judged", "1"]
+SMALL = ["--quick", *(f"--{name}=1" for name in ("after-steps", "cases", "scored", "spot-steps"))]
+SMALL += ["--steps=2", "--judged=2", "--samples=4"]
+
+
+@pytest.fixture(scope="module")
+def task():
+    return make_task("cooke-triplet", 0)
+
+
+def squared_spot(optics, shift_mm, task):
+    moved = optics.replace(
+        thickness_mm=optics.thickness_mm + shift_mm * torch.eye(len(optics.thickness_mm)).double()[-1]
+    )
+    return float(spot_rays(moved, task.fields_rad, DISTANCE_M, LIGHT).rms_mm().square().sum())
+
+
+def test_the_start_is_in_best_focus_at_the_asked_spot_and_the_shown_twin_is_not(task):
+    start = task.design.lens(torch.zeros(task.design.basis.shape[1], dtype=torch.float64))
+    here = squared_spot(start, 0.0, task)
+    for shift_mm in (-0.1, -0.002, 0.002, 0.1):
+        assert squared_spot(start, shift_mm, task) > here
+    spots = spot_rays(task.defocused, task.fields_rad, DISTANCE_M, LIGHT, grid=8)
+    in_focus = spots.shifted(spots.best_focus_mm()).rms_mm()  # by the rays that the search looks at
+    assert float(in_focus.mean()) == pytest.approx(1.5 * PITCH_MM, rel=1e-9)
+    assert torch.equal(start.curvature_per_mm[:-1], task.defocused.curvature_per_mm[:-1])
+    assert squared_spot(task.defocused, 0.0, task) > 4 * here
+
+
+def test_spots_of_the_wall_agree_with_those_of_the_lens_package():
+    geo = lens.load("cooke-triplet").scaled(0.22).freeze()
+    fields = (0.0, 0.1)  # where the soft edges of the apertures take away less than 1e-7 of the light
+    green = lens.Spectrum.line("d")
+    ours = spot_rays(geo, fields, 2.0, green, grid=32).rms_mm()
+    assert torch.allclose(ours, lens.rms_spot_mm(geo, fields, at_m=2.0), rtol=1e-9)
+    ours = spot_rays(geo, fields, math.inf, LIGHT, grid=32).rms_mm()
+    for rms_mm, field in zip(ours, fields, strict=True):
+        theirs = spot_radius_mm(*polychromatic_spot(geo, field, LIGHT))
+        assert float(rms_mm) == pytest.approx(float(theirs), rel=1e-7)
+
+
+def test_rivals_keep_focal_length_aperture_and_floors_of_the_design(task):
+    def judge(optics):
+        return float(task.rms_spot_um(optics).mean())
+
+    design = task.design
+    start_um = judge(design.reference)
+    refocused = rivals.refocus(task, judge)
+    spots = rivals.shrink_spots(task, judge, 4, 1, 0)
+    assert rivals.least(spots).error_mrad < 0.7 * start_um
+    for variant in (*refocused, *spots):
+        made = variant.optics
+        assert float(made.first_order().efl_mm) == pytest.approx(design.efl_mm, rel=1e-9)
+        assert float(made.first_order().fno) == pytest.approx(float(task.nominal.first_order().fno), rel=1e-9)
+        assert bool((made.thickness_mm >= design.floor_mm).all())
+        assert bool(
+            (edge_thickness_mm(made) > design.edge_floor_mm - 0.002).all()
+        )  # the hinge gives way a little
+    for variant in refocused:  # nothing but the film has moved
+        assert torch.equal(variant.optics.curvature_per_mm, design.reference.curvature_per_mm)
+        assert torch.equal(variant.optics.thickness_mm[:-1], design.reference.thickness_mm[:-1])
+    assert all("has not converged in 4 steps" in variant.complaint for variant in spots)
+
+
+def test_a_spot_designer_that_finds_nothing_is_refused(task, monkeypatch):
+    monkeypatch.setattr(rivals, "_solved", lambda *_: SimpleNamespace(loss=math.inf))
+    with pytest.raises(DomainError, match="finds no smaller spot from 2 starts in 5 steps"):
+        rivals.shrink_spots(task, None, 5, 2, 0)
+
+
+def test_paired_differences_of_a_made_up_table():
+    logs = [-0.2, -0.1, 0.0, 0.1]
+    rival = [0.5, 3.0, 0.7, 1.1]
+    pair = paired([r * math.exp(x) for r, x in zip(rival, logs, strict=True)], rival)
+    half = 3.182446 * stdev(logs) / 2  # Student's t, three degrees of freedom, two-sided 95 %
+    assert (pair.mean, pair.low, pair.high) == pytest.approx((-0.05, -0.05 - half, -0.05 + half), rel=1e-6)
+    assert pair.cases == 4
+    assert pair.outcome == "ties"
+    assert paired([1.0, 1.1], [2.0, 2.2]).outcome == "wins"
+    assert paired([1.0], [2.0]).percent() == "-50.0 % (-100.0 to inf %)"  # one case says nothing
+    with pytest.raises(ShapeError, match="1 and 2 errors"):
+        paired([1.0], [1.0, 2.0])
+    with pytest.raises(DomainError, match="above 0"):
+        paired([0.0], [1.0])
+
+
+def test_the_pooled_interval_is_the_wider_of_cases_and_seeds():
+    over_seeds = torch.tensor(
+        [[0.3, 0.3, 0.3], [-0.1, -0.1, -0.1]], dtype=torch.float64
+    )  # seeds alone differ
+    half = 12.7062 * stdev([0.3, -0.1]) / math.sqrt(2)  # one degree of freedom
+    pair = pooled(over_seeds)
+    assert (pair.mean, pair.high - pair.mean, pair.cases) == pytest.approx((0.1, half, 3), rel=1e-5)
+    over_cases = over_seeds.T
+    assert pooled(over_cases).high - 0.1 == pytest.approx(half, rel=1e-5)
+    assert pooled(over_seeds[:1]) == of_differences(over_seeds[0])
+
+
+@pytest.mark.parametrize(
+    ("flow_mrad", "first_words"),
+    [
+        ([0.40, 0.41, 0.39], "The flow design wins: its flow error is -20"),
+        ([0.50, 0.49, 0.51], "The spot designer ties: "),
+        ([0.60, 0.61, 0.59], "The spot designer wins: the flow error of the flow design over its own is +20"),
+    ],
+)
+def test_the_first_words_say_who_wins(flow_mrad, first_words):
+    rivals_mrad = {"the spot designer": [0.5, 0.51, 0.49], "refocusing alone": [0.8, 0.82, 0.79]}
+    said = verdict("the flow design", {name: paired(flow_mrad, row) for name, row in rivals_mrad.items()})
+    assert said.startswith(first_words)
+    assert said.endswith("3 unseen cases.")
 
 
 @pytest.mark.parametrize(
@@ -46,18 +165,33 @@ def test_every_event_layer_hands_the_lens_a_gradient(layer):
     assert layer in events.LAYERS
 
 
-def test_a_run_resumed_after_its_last_step_ends_with_the_same_figures(tmp_path, capsys):
+def test_a_run_resumed_after_its_last_step_ends_with_the_same_figures(tmp_path, capsys, monkeypatch):
     folder = tmp_path / "a run"
     assert main(lens_opt.study, lens_opt.Config, [*SMALL, "--out", str(folder)]) == 0
     first = json.loads((folder / "metrics.json").read_text())
+    said = capsys.readouterr().out.splitlines()[-1]
+    lead = (folder / "report.html").read_text().split('<div class="lead">')[1]
+    assert html.unescape(lead).startswith(f"<p><strong>{said}</strong></p>")
+    monkeypatch.setattr(rivals, "refocus", None)  # the rivals are stored: nobody makes them again
+    monkeypatch.setattr(rivals, "shrink_spots", None)
     (folder / "report.html").unlink()
     assert main(lens_opt.study, lens_opt.Config, ["--resume", str(folder)]) == 0
     again = json.loads((folder / "metrics.json").read_text())
     assert (folder / "report.html").exists()
-    for name in ("flow_error_mrad_hard_optimised", "rms_spot_um_optimised", "steps", "seconds_per_step"):
+    for name in (
+        "flow_error_mrad_hard_optimised",
+        "rms_spot_um_optimised",
+        "steps",
+        "seconds_per_step",
+        "rms_spot_um_spots",
+        "log_ratio_edge",
+        "log_ratio_after_spots_over_spots_high",
+    ):
         assert again[name] == pytest.approx(first[name], rel=1e-6)
 
 
 def test_sizes_below_one_are_refused(tmp_path, capsys):
     assert main(lens_opt.study, lens_opt.Config, ["--steps", "0", "--out", str(tmp_path / "x")]) == 2
     assert "--steps is 0; at least 1 is needed" in capsys.readouterr().err
+    assert main(lens_opt.study, lens_opt.Config, ["--samples", "6", "--out", str(tmp_path / "y")]) == 2
+    assert "--samples is 6; the light has 4 wavelengths" in capsys.readouterr().err

@@ -1,6 +1,6 @@
 """A lens design as free variables: curvatures but one, which holds the focal length, and all thicknesses."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -129,14 +129,19 @@ def _motion(design, variable, fields_rad, step=1e-4):
 
 
 def detune(
-    design: LensDesign, fields_rad: Sequence[float], target_mm: float, generator: torch.Generator
+    design: LensDesign,
+    fields_rad: Sequence[float],
+    target_mm: float,
+    generator: torch.Generator,
+    spot_mm: Callable[[GeoLens], Tensor] | None = None,
 ) -> GeoLens:
     """The reference lens with errors in curvatures and focus that bring its mean RMS spot to ``target_mm``,
     focal length held.
 
     Every curvature but the one that holds the focal length and the image distance get independent Gaussian
-    errors of one common relative size, which is raised until the target is met. Raises: DomainError when 50 %
-    is not enough.
+    errors of one common relative size, which is raised until the target is met. spot_mm: what is raised to the
+    target, a scalar; None is the mean RMS spot in the d line. One that refocuses first asks for errors that no
+    focusing takes away. Raises: DomainError when 50 % is not enough.
     """
     count = design.reference.curvature_per_mm.numel()
     at = holding_surface(design.reference)
@@ -152,7 +157,8 @@ def detune(
     with torch.no_grad():
 
         def spot(size):
-            return float(rms_spot_mm(design.changed(direction * size), fields_rad).mean())
+            made = design.changed(direction * size)
+            return float(rms_spot_mm(made, fields_rad).mean() if spot_mm is None else spot_mm(made))
 
         low = 0.0
         high = 0.0
