@@ -4,11 +4,16 @@ those their makers claim.
 Every .json, .zmx, .seq and .txt file of a folder is loaded. Where a header, title, catalogue number, patent
 or file note claims a focal length, it is compared with the paraxial one of the loaded lens, at the wavelength
 of the claim.
+
+Where optiland is installed (``pip install codesign[bench]``), six lenses are written as .zmx and opened there:
+focal lengths and spots must be the same.
 """
 
+import importlib.util
 import json
 import math
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,11 +22,23 @@ import torch
 from codesign import lens
 from codesign.atomic import write_atomic
 from codesign.errors import CodesignError, FileFormatError
+from codesign.lens.analysis.rays import field_rays
 from studies.frame.run import Run, StudyConfig, main
 
 EXTENSIONS = (".json", ".zmx", ".seq", ".txt")
 ALLOWED = 0.005  # relative difference of focal lengths up to which a claim counts as met
 D_UM = 0.5875618
+# names or files that optiland opens again
+ROUND_TRIPS = (
+    "cooke-triplet",
+    "double-gauss",
+    "la1509",
+    "optiland/heliar.json",
+    "rayoptics/US05331467-1.zmx",
+    "deeplens/camera/ef35mm_f2.0.zmx",
+)
+ROUND_TRIP_EFL = 1e-5  # relative differences allowed
+ROUND_TRIP_SPOT = 0.01
 
 
 @dataclass(frozen=True)
@@ -100,7 +117,102 @@ def study(run: Run[Config]) -> None:
         for path in files:
             outcomes.append(examine(path, folder))
             progress.advance(refused=sum(bool(o.reason) for o in outcomes))
-    show(run, outcomes)
+    trips = round_trips(folder) if importlib.util.find_spec("optiland") else None
+    show(run, outcomes, trips)
+
+
+@dataclass(frozen=True)
+class RoundTrip:
+    """One lens opened in optiland from our .zmx: relative differences of the focal length, of the RMS spots at the d
+    line, and of those at F and C; whether all its glasses are named."""
+
+    lens: str
+    named: bool
+    efl_mm: float
+    efl: float
+    spot_d: float
+    spot_lines: float
+
+
+def round_trips(folder):
+    """RoundTrips of those of ROUND_TRIPS that are there."""
+    there = [name for name in ROUND_TRIPS if "/" not in name or (folder / name).is_file()]
+    return [round_trip(lens.load(folder / name if "/" in name else name).freeze(), name) for name in there]
+
+
+def round_trip(geo, name):
+    """RoundTrip of a lens: the same points of the entrance pupil, at 0, 0.7 and 1 of its half field."""
+    import numpy as np
+    from optiland.fileio import load_zemax_file  # pyright: ignore[reportMissingImports]
+
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place) / "lens.zmx"
+        lens.save(geo, path)
+        content = path.read_text()
+        optic = load_zemax_file(str(path))
+    pupil = lens.pupil_grid(8)
+    shares = (0.0, 0.7, 1.0) if geo.half_field_deg else (0.0,)
+    miss = {}
+    for line, w in lens.WAVELENGTH_UM.items():
+        spots = []
+        for share in shares:
+            field = share * math.radians(geo.half_field_deg or 0.0)
+            ours = geo.trace(*field_rays(geo, field, pupil, w), w)
+            rays = optic.trace_generic(0.0, share, pupil[:, 0].numpy(), pupil[:, 1].numpy(), w)
+            theirs = torch.from_numpy(np.stack([np.ravel(rays.x), np.ravel(rays.y)], 1))
+            both = (ours.status == 0) & theirs.isfinite().all(1)
+            spots.append([_rms(points[both]) for points in (ours.position_mm[:, :2], theirs)])
+        miss[line] = max(abs(their / our - 1) for our, their in spots)
+    efl = efl_mm(geo)
+    their_efl = float(np.ravel(np.asarray(optic.paraxial.f2()))[0])
+    return RoundTrip(
+        name, "___BLANK" not in content, efl, abs(their_efl / efl - 1), miss["d"], max(miss["F"], miss["C"])
+    )
+
+
+def _rms(points):
+    return float((points - points.mean(0)).square().sum(1).mean().sqrt())
+
+
+def show_round_trips(run, trips):
+    """Metrics and table of the lenses opened elsewhere."""
+    run.section("Opened in optiland")
+    if trips is None:
+        run.text(
+            "optiland is not installed, so no lens was opened there; pip install 'codesign[bench]' and run again."
+        )
+        run.record(round_trips=0)
+        return
+    named = [trip for trip in trips if trip.named]
+    model = [trip for trip in trips if not trip.named]
+    run.record(
+        round_trips=len(trips),
+        round_trip_efl_relative_error=max(trip.efl for trip in trips),
+        round_trip_spot_relative_error_d=max(trip.spot_d for trip in trips),
+        round_trip_spot_relative_error_named_glasses=max(max(t.spot_d, t.spot_lines) for t in named),
+        round_trips_missed=sum(
+            trip.efl > ROUND_TRIP_EFL
+            or trip.spot_d > ROUND_TRIP_SPOT
+            or (trip.named and trip.spot_lines > ROUND_TRIP_SPOT)
+            for trip in trips
+        ),
+        **(
+            {"round_trip_spot_relative_error_model_glasses": max(t.spot_lines for t in model)}
+            if model
+            else {}
+        ),
+    )
+    run.table(
+        "Written as .zmx and opened in optiland: relative differences",
+        ("lens", "glasses", "EFL mm", "EFL", "spots at d", "spots at F and C"),
+        [
+            (t.lens, "named" if t.named else "model", f"{t.efl_mm:.6g}", f"{t.efl:.1e}", f"{t.spot_d:.1e}")
+            + (f"{t.spot_lines:.1e}",)
+            for t in trips
+        ],
+        "RMS spots of 52 rays at 0, 0.7 and 1 of the half field. A model glass gives nd and Vd alone: what it is at F "
+        "and C each program works out for itself.",
+    )
 
 
 def default_folder():
@@ -187,7 +299,7 @@ def edge_focal_length_mm(geo, radius_mm):
     )
 
 
-def show(run, outcomes):
+def show(run, outcomes, trips):
     """Metrics, table.md and the page."""
     loaded = [o for o in outcomes if not o.reason]
     claims = [(o.file, claim, found) for o in loaded for claim, found in o.claims if found is not None]
@@ -234,6 +346,7 @@ def show(run, outcomes):
         rows,
         "EFL: paraxial focal length at the wavelength of the claim, at 0.5876 µm where there is none.",
     )
+    show_round_trips(run, trips)
     run.finish(
         "Lens files",
         f"{len(loaded)} of {len(outcomes)} published lens files load; {met} of {len(claims)} claimed focal "

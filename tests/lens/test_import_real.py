@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from codesign import lens
-from codesign.errors import CodesignError, DomainError
+from codesign.errors import CodesignError, DomainError, FileFormatError
 from studies import lens_files
 from studies.frame.run import main
 from studies.lens_files import ALLOWED, CLAIMS, examine
@@ -228,6 +228,10 @@ def test_double_gauss_of_the_program_that_sells_it_and_of_the_catalogue(shared):
 @pytest.mark.parametrize("extension", ["json", "zmx"])
 def test_real_lenses_survive_a_round_trip(name, extension, shared, tmp_path):
     before = lens.load(shared(f"{FOLDER}/{name}"))
+    if extension == "zmx" and before.phase.numel():
+        with pytest.raises(FileFormatError, match="diffractive phase"):
+            lens.save(before, tmp_path / "a.zmx")
+        return
     lens.save(before, tmp_path / f"a.{extension}")
     after = lens.load(tmp_path / f"a.{extension}")
     for a, b in zip(before.to_surfaces(), after.to_surfaces(), strict=True):

@@ -352,7 +352,6 @@ def test_all_a_zmx_file_can_hold_is_written(tmp_path):
             conic=-0.7,
             asphere=(1e-4, -2.2e-6),
             is_stop=True,
-            phase=Phase((-3.3, 0.01), order=2),
         ),
         Surface(-180.3, 21.0, None, 9.0, conic=-1.1, mirror=True, inner_semi_aperture_mm=1.25),
         Surface(250.0, 3.0, Glass.named("F2"), 9.0, asphere=(0.0, 1e-7)),
@@ -363,7 +362,9 @@ def test_all_a_zmx_file_can_hold_is_written(tmp_path):
     content = (tmp_path / "a.zmx").read_text()
     assert "DISZ -21.0" in content  # the axis is folded again
     assert "GLAS ___BLANK 1 0 1.6123" in content
-    assert "GLAS F2 0 0 " in content
+    flint = Glass.named("F2")
+    assert f"GLAS F2 0 0 {flint.index_d!r} {flint.abbe_number!r} " in content
+    assert "GCAT SCHOTT\n" in content
     after = lens.load(tmp_path / "a.zmx")
     for old, new in zip(surfaces, after.to_surfaces(), strict=True):
         assert new.radius_mm == pytest.approx(old.radius_mm, rel=3e-16)
@@ -375,7 +376,6 @@ def test_all_a_zmx_file_can_hold_is_written(tmp_path):
             "conic",
             "is_stop",
             "mirror",
-            "phase",
             "inner_semi_aperture_mm",
         ):
             assert getattr(new, name) == getattr(old, name), name
@@ -386,13 +386,26 @@ def test_all_a_zmx_file_can_hold_is_written(tmp_path):
     assert after.first_order().efl_mm.item() == pytest.approx(before.first_order().efl_mm.item(), rel=1e-12)
 
 
+def test_catalogues_are_those_of_the_glasses(tmp_path):
+    used = ["S-LAH65", "N-BK7", "F-SILICA", "N-SK16"]
+    gaps = [Surface(50.0, 2.0, Glass.named(name), 5.0) for name in used]
+    lens.save(GeoLens([*gaps, Surface(-50.0, 40.0, None, 5.0)], 5.0), tmp_path / "a.zmx")
+    content = (tmp_path / "a.zmx").read_text()
+    assert "GCAT OHARA SCHOTT\n" in content
+    assert f"GLAS ___BLANK 1 0 {Glass.named('F-SILICA').index_d!r} " in content  # its name differs by program
+    model = Glass.from_abbe(1.6, 50.0)
+    plain = [Surface(50.0, 4.0, model, 5.0), Surface(-50.0, 40.0, None, 5.0)]
+    lens.save(GeoLens(plain, 5.0), tmp_path / "b.zmx")
+    assert "GCAT" not in (tmp_path / "b.zmx").read_text()
+
+
 def test_what_a_zmx_file_cannot_hold_is_not_written(tmp_path):
     plain = Surface(50.0, 40.0, None, 5.0)
     for rare, reason in (
         (Surface(50.0, 4.0, None, 5.0, tilt_deg=(1.0, 0.0)), "decentred or tilted"),
         (Surface(50.0, 4.0, None, 5.0, asphere=(0.0,) * 8 + (1e-20,)), "9 asphere terms"),
         (Surface(50.0, 4.0, Glass.from_indices(1.5, 1.5, 1.5, "flat"), 5.0), "Abbe number inf"),
-        (Surface(50.0, 4.0, None, 5.0, phase=Phase((-1.0,), blaze_um=0.5)), "blaze wavelength"),
+        (Surface(50.0, 4.0, None, 5.0, phase=Phase((-1.0,))), "diffractive phase"),
     ):
         with pytest.raises(FileFormatError, match=f"surface 1: .*{reason}.*save the lens as .json"):
             lens.save(GeoLens([rare, plain], 5.0), tmp_path / "a.zmx")

@@ -11,15 +11,27 @@ MOST_ABBE = 150
 # a glass goes by its catalogue name when its indices at F, d and C are the catalogue's to this; published
 # tables round to 1e-9
 SAME_INDEX = 1e-8
+# how a glass's source begins -> the catalogue that every program has. Names of plastics and crystals stand for
+# other media elsewhere (COC of one program is 3 % of a focal length from that of another), so they are not written
+CATALOGUES = {
+    "Schott, optical glass": "SCHOTT",
+    "Schott, earlier glasses": "SCHOTT",
+    "Ohara, optical glass": "OHARA",
+    "Hoya, optical glass": "HOYA",
+    "Hikari (Nikon), optical glass": "HIKARI",
+    "Sumita, optical glass": "SUMITA",
+    "CDGM, optical glass": "CDGM",
+}
 
 
 def to_zmx(lens: GeoLens) -> str:
     """The text of a .zmx file of the lens's current values; numbers keep all their digits.
 
     Kept: curvatures, thicknesses and aspheres with their signs along a fixed axis, conics, stop, apertures
-      and central obstructions, mirrors, diffractive phases, entrance pupil diameter, half field, name. A
-      glass of the catalogue keeps its name; any other becomes a model glass of nd and Vd. Not kept: the width
-      of the soft edges.
+      and central obstructions, mirrors, entrance pupil diameter, half field, name. A glass of the catalogue keeps
+      its name, with its true nd and Vd beside it and its maker among the catalogues, so that a program that has
+      another glass of that name can tell; any other, plastics among them, becomes a model glass of nd and Vd. Not kept: the width of the
+      soft edges.
     Raises: DomainError for values that cannot be; FileFormatError for what a centred .zmx surface cannot
       hold.
     """
@@ -32,7 +44,7 @@ def to_zmx(lens: GeoLens) -> str:
         "UNIT MM X W X CM MR CPMM",
         f"ENPD {lens.entrance_pupil_diameter_mm!r}",
         "ENVD 20 1 0",
-        "GCAT SCHOTT OHARA HOYA HIKARI SUMITA CDGM CORNING MISC",
+        *_catalogues(surfaces),
         "FTYP 0 0 2 3 0 0 0",
         "XFLN 0 0",
         f"YFLN 0 {field!r}",
@@ -59,10 +71,10 @@ def _surface(surface, sign, label, is_stop):
         raise FileFormatError(
             f"{label}: it is decentred or tilted, which is not written to .zmx; save the lens as .json."
         )
-    if surface.phase is not None and surface.phase.blaze_um is not None:
+    if surface.phase is not None:
         raise FileFormatError(
-            f"{label}: its blaze wavelength has no place in a .zmx file; save the lens as .json, or set "
-            "blaze_um to None."
+            f"{label}: programs that read .zmx refuse its diffractive phase or leave it out without a word; save the "
+            "lens as .json."
         )
     terms = [sign * a + 0.0 for a in surface.asphere]
     if any(terms[MOST_TERMS:]):
@@ -70,17 +82,10 @@ def _surface(surface, sign, label, is_stop):
             f"{label}: it has {len(terms)} asphere terms, a .zmx file holds {MOST_TERMS}; save the lens as "
             ".json."
         )
-    kind = "BINARY_2" if surface.phase else "EVENASPH" if any(terms) else "STANDARD"
+    kind = "EVENASPH" if any(terms) else "STANDARD"
     behind = -sign if surface.mirror else sign
     lines = ["STOP"] if is_stop else []
     lines += [f"TYPE {kind}", f"CURV {sign * surface.curvature_per_mm + 0.0!r}"]
-    if surface.phase:
-        lines += [
-            f"PARM 0 {surface.phase.order}",
-            f"XDAT 1 {len(surface.phase.coefficients)}",
-            "XDAT 2 1.0",
-            *(f"XDAT {i} {a!r}" for i, a in enumerate(surface.phase.coefficients, 3)),
-        ]
     if kind != "STANDARD":
         lines += [f"PARM {i} {a!r}" for i, a in enumerate(terms[:MOST_TERMS], 1)]
     lines += [f"DISZ {behind * surface.thickness_mm + 0.0!r}", *_glass(surface, label)]
@@ -100,13 +105,24 @@ def _glass(surface, label):
     if glass is None or glass == AIR:
         return []
     if _is_named(glass):
-        return [f"GLAS {glass.name} 0 0 1.5 40 0 0 0 0 0 0"]  # what that program writes for the unused model
+        return [f"GLAS {glass.name} 0 0 {glass.index_d!r} {glass.abbe_number!r} 0 0 0 0 0 0"]
     if not LEAST_ABBE <= glass.abbe_number <= MOST_ABBE:
         raise FileFormatError(
             f"{label}: its medium {glass.name} has the Abbe number {glass.abbe_number:.4g}, model glasses "
             f"{LEAST_ABBE} to {MOST_ABBE}; save the lens as .json."
         )
     return [f"GLAS ___BLANK 1 0 {glass.index_d!r} {glass.abbe_number!r} 0 0 0 0 0 0"]
+
+
+def _catalogues(surfaces):
+    """The line of the catalogues that hold the named glasses, in the order of their use; none without such."""
+    used = [s.medium for s in surfaces if s.medium not in (None, AIR) and _is_named(s.medium)]
+    makers = dict.fromkeys(_catalogue(Glass.named(glass.name)) for glass in used)
+    return [f"GCAT {' '.join(makers)}"] if makers else []
+
+
+def _catalogue(known):
+    return next((name for begins, name in CATALOGUES.items() if known.source.startswith(begins)), "")
 
 
 def _is_named(glass):
@@ -116,7 +132,10 @@ def _is_named(glass):
     except CodesignError:
         return False
     return (
-        same and known.name in names() and not any(c.isspace() for c in glass.name)
+        same
+        and known.name in names()
+        and bool(_catalogue(known))
+        and not any(c.isspace() for c in glass.name)
     )  # 1.6123/44.1 is a name too, but only here
 
 
