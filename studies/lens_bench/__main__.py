@@ -3,7 +3,7 @@ rays.
 
 Every case runs in a process of its own, in turns with the others, so that memory is counted apart and a
 change of the machine's load meets all. The error is that of 256 of the timed rays against a trace with 30
-digits. A second part shows how our time and memory grow with rays and surfaces. Peers: pip install
+digits. Analysis functions and a design step follow against optiland's own. A second part shows how our time and memory grow with rays and surfaces. Peers: pip install
 ".[bench]".
 """
 
@@ -26,6 +26,7 @@ from codesign import lens
 from codesign.errors import DomainError
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.timing import Timing, measure
+from studies.lens_bench.compared import show_analyses, time_analyses
 from studies.lens_bench.tracers import SURFACES, make_rays, tracing_work
 
 PEERS = {"optiland-torch": "optiland", "optiland-numpy": "optiland", "rayoptics": "rayoptics"}
@@ -60,7 +61,13 @@ SLOW = 200  # rayoptics traces ray by ray in Python: it gets this many times few
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
-    QUICK: ClassVar = {"rays": 100_000, "repeats": 3, "rounds": 1, "most_rays": 1_000_000}
+    QUICK: ClassVar = {
+        "rays": 100_000,
+        "repeats": 3,
+        "rounds": 1,
+        "most_rays": 1_000_000,
+        "analysis_rounds": 3,
+    }
     rays: int = 1_000_000
     """Rays of the comparison."""
     repeats: int = 7
@@ -69,14 +76,22 @@ class Config(StudyConfig):
     """Times that every tracer gets its turn."""
     most_rays: int = 10_000_000
     """Largest number of rays of the growth curves."""
+    analysis_rounds: int = 11
+    """Timed turns of the analysis functions."""
 
 
 def study(run: Run[Config]) -> None:
     config = run.config
-    if config.rays < 1000 or config.repeats < 3 or config.rounds < 1 or config.most_rays < 20_000:
+    if (
+        config.rays < 1000
+        or config.repeats < 3
+        or config.rounds < 1
+        or config.most_rays < 20_000
+        or config.analysis_rounds < 1
+    ):
         raise DomainError(
             f"rays {config.rays}, repeats {config.repeats}, rounds {config.rounds}, most_rays "
-            f"{config.most_rays}: give at least 1000, 3, 1 and 20000."
+            f"{config.most_rays}, analysis_rounds {config.analysis_rounds}: give at least 1000, 3, 1, 20000 and 1."
         )
     rays = config.rays
     most = config.most_rays
@@ -84,7 +99,7 @@ def study(run: Run[Config]) -> None:
     counts = [n for n in (10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000, 10_000_000) if n <= most]
     found: dict[tuple, list[dict]] = {case: [] for case in cases}
     with run.progress(
-        config.rounds * len(cases) + 2 * len(counts) + 2 * len(LONGER) + 4, "timing"
+        config.rounds * len(cases) + 2 * len(counts) + 2 * len(LONGER) + 4 + 2, "timing"
     ) as progress:
         for _ in range(config.rounds):
             for case in cases:
@@ -97,6 +112,7 @@ def study(run: Run[Config]) -> None:
                     )
                 )
                 progress.advance()
+        analyses = time_analyses(config.analysis_rounds, progress)
         growth = growth_in_rays(counts, config.seed, progress)
         longer = growth_in_surfaces(config.seed, progress)
         memory = {}
@@ -106,6 +122,7 @@ def study(run: Run[Config]) -> None:
                 progress.advance()
     missing = sorted({package for tracer, package in PEERS.items() if not importlib.util.find_spec(package)})
     show(run, compare(run, found, rays, config.seed), missing)
+    show_analyses(run, analyses)
     show_growth(run, counts, growth, longer)
     show_memory(run, memory)
     run.finish(

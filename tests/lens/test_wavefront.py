@@ -122,7 +122,12 @@ def disc(waves, count=200):
     pupil = pupil_grid(count)
     r2 = pupil.square().sum(1)
     return Wavefront(
-        pupil, waves(pupil, r2) * 0.5875618e-3, torch.ones_like(r2), torch.zeros_like(pupil), 0.5875618
+        pupil,
+        waves(pupil, r2) * 0.5875618e-3,
+        torch.ones_like(r2),
+        torch.zeros_like(pupil),
+        0.5875618,
+        torch.zeros(2, dtype=pupil.dtype),
     )
 
 
@@ -159,6 +164,7 @@ def test_fits_take_away_what_they_fit():
         (tilted.pupil[:, 0] <= 0.5).double(),
         tilted.slope,
         0.5875618,
+        tilted.reference_mm,
     )
     assert float(rms_waves(remove_fit(blocked, focus=True))) <= 1e-12  # what no light passes does not count
 

@@ -55,14 +55,13 @@ def diffraction_psf(
         raise DomainError(f"padding {padding} must be a whole number of at least 2.")
     pupil = pupil_function(lens, field_rad, wavelength_um, grid, vignetting, defocus_mm, reference_mm, at_m)
     count = pupil.field.shape[0] * int(padding)
-    amplitude = torch.fft.fftshift(torch.fft.ifft2(pupil.field, s=(count, count)))
+    # signs in a chequer put the reference point into the middle; columns of padding alone need no transform
+    sign = 1 - 2 * (torch.arange(pupil.field.shape[0], device=pupil.field.device) % 2)
+    field = pupil.field * (sign * sign[:, None])
+    amplitude = torch.fft.ifft(torch.fft.ifft(field, n=count, dim=0), n=count, dim=1)
     energy = amplitude.real.square() + amplitude.imag.square()
-    centre = (
-        chief_ray(lens, field_rad, wavelength_um, defocus_mm, at_m).position_mm[0]
-        if reference_mm is None
-        else torch.as_tensor(reference_mm)
-    )
-    return Psf(energy / energy.sum(), pupil.wavelength_mm / (2 * pupil.cosine_radius * int(padding)), centre)
+    pitch = pupil.wavelength_mm / (2 * pupil.cosine_radius * int(padding))
+    return Psf(energy / energy.sum(), pitch, pupil.reference_mm)
 
 
 def psf_on_pixels(

@@ -28,12 +28,13 @@ class PupilFunction:
       ``cosine_radius``, in the order of rising direction cosines of the light that goes to the image point
       (so a point high in the pupil stands at a low y); 0 outside the pupil.
     cosine_radius: [2] (x, y) half width of the pupil in direction cosines times index, as seen from the image
-      point: 1 / (2 f-number).
+      point: 1 / (2 f-number). reference_mm: [2] the image point, centre of the reference sphere.
     """
 
     field: Tensor
     cosine_radius: Tensor
     wavelength_um: float
+    reference_mm: Tensor
 
     @property
     def wavelength_mm(self) -> float:
@@ -113,7 +114,7 @@ def pupil_function(
     mirrored = [
         axis for axis, value in ((1, scale[0]), (0, scale[1])) if float(value.detach()) < 0
     ]  # light from above goes down
-    return PupilFunction(field.flip(mirrored), scale.abs(), wavelength_um)
+    return PupilFunction(field.flip(mirrored), scale.abs(), wavelength_um, front.reference_mm)
 
 
 def _cosine_radius(front):

@@ -75,19 +75,21 @@ def source_rays(
     fields = torch.as_tensor(fields_rad, dtype=torch.float64)
     sine, cosine = fields.sin().to(pupil), fields.cos().to(pupil)
     vergence = vergence_per_mm(lens, at_m, f.entrance_pupil_z_mm).reshape(-1, *[1] * fields.ndim)
-    towards = torch.stack([torch.zeros_like(sine), sine, cosine], -1)[..., None, :]
     near = (vergence * cosine)[..., None]  # 1 / distance of the object point from the pupil's centre
-    point = torch.nn.functional.pad(pupil * (f.entrance_pupil_diameter_mm / 2), (0, 1))
-    along = towards + near[..., None] * point
-    length = torch.linalg.vector_norm(along, dim=-1)
-    direction = along / length[..., None]
-    centre = torch.nn.functional.pad(f.entrance_pupil_z_mm.reshape(1), (2, 0))
+    x, y = (pupil * (f.entrance_pupil_diameter_mm / 2)).unbind(1)
+    # towards q from the point at distance 1 / near along (0, sine, cosine), whose square is 1
+    lean = 2 * sine[..., None] * y + near * (x * x + y * y)
+    length = (1 + near * lean).sqrt()
+    along = (near * x, sine[..., None] + near * y, cosine[..., None])
+    direction = torch.stack([(part / length).expand(length.shape) for part in along], -1)
     back = (start_z_mm - f.entrance_pupil_z_mm) / direction[..., 2]
-    # distance of the pupil point from the object, less that of the pupil's centre, free of cancellation
-    beyond = (2 * (towards * point).sum(-1) + near * point.square().sum(-1)) / (length + 1)
+    start = (x + direction[..., 0] * back, y + direction[..., 1] * back, torch.full_like(back, start_z_mm))
+    # lean / (length + 1): distance of q from the object, less that of the pupil's centre, free of cancellation
+    path = lean / (length + 1) + back
     shape = (*torch.as_tensor(at_m).shape, *fields.shape, pupil.shape[0])
-    origin = (centre + point + direction * back[..., None]).reshape(*shape, 3)
-    return SourceRays(origin, direction.reshape(*shape, 3), (beyond + back).reshape(shape))
+    return SourceRays(
+        torch.stack(start, -1).reshape(*shape, 3), direction.reshape(*shape, 3), path.reshape(shape)
+    )
 
 
 def field_rays(
@@ -144,6 +146,8 @@ class ImageRays:
     def shifted(self, defocus_mm: float | Tensor) -> "ImageRays":
         """The same rays on a plane ``defocus_mm`` further along +z (scalar, may carry a gradient); rays of
         weight 0 stay where they failed."""
+        if isinstance(defocus_mm, (int, float)) and defocus_mm == 0:
+            return self
         arrived = self.weight > 0
         length = torch.where(arrived, defocus_mm / torch.where(arrived, self.direction[..., 2], 1), 0)
         return replace(

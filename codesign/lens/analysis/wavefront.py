@@ -27,7 +27,8 @@ class Wavefront:
 
     pupil: [M, 2] points of the unit disc (entrance pupil). opd_mm: [M], positive where the wavefront is
       ahead. weight: [M], 0 where no light passes. slope: [M, 2] direction cosines times index from the ray's
-      point on the reference sphere to its centre, minus those of the chief ray.
+      point on the reference sphere to its centre, minus those of the chief ray. reference_mm: [2] that centre, on
+      the image plane.
     """
 
     pupil: Tensor
@@ -35,6 +36,7 @@ class Wavefront:
     weight: Tensor
     slope: Tensor
     wavelength_um: float
+    reference_mm: Tensor
 
     @property
     def waves(self) -> Tensor:
@@ -83,8 +85,10 @@ def wavefront(
     like = lens.curvature_per_mm
     pupil = pupil_grid(grid, like.dtype, like.device) if pupil is None else pupil
     rays, chief = trace_with_chief(lens, field_rad, pupil, wavelength_um, vignetting, defocus_mm, at_m)
+    reference_mm = chief.position_mm[0] if reference_mm is None else torch.as_tensor(reference_mm)
     opd, slope = _on_sphere(lens, rays, chief, wavelength_um, reference_mm, defocus_mm)
-    return Wavefront(pupil, torch.where(rays.weight > 0, opd, 0), rays.weight, slope, wavelength_um)
+    opd = torch.where(rays.weight > 0, opd, 0)
+    return Wavefront(pupil, opd, rays.weight, slope, wavelength_um, reference_mm)
 
 
 def remove_fit(front: Wavefront, tilt: bool = True, focus: bool = False) -> Wavefront:
@@ -160,9 +164,9 @@ def _sphere_curvature(lens, centre, wavelength_um, defocus_mm):
 def _to_sphere(rays, centre, bend):
     """Signed distance along each ray to the reference sphere, plus its radius: free of cancellation, and
     regular when the sphere is a plane."""
-    away = torch.cat([rays.position_mm - centre, torch.zeros_like(rays.position_mm[:, :1])], 1)
-    axial = (away * rays.direction).sum(1)
-    across = away.square().sum(1) - axial.square()
+    x, y = (rays.position_mm - centre).unbind(1)  # on the plane, so that z is 0
+    axial = x * rays.direction[:, 0] + y * rays.direction[:, 1]
+    across = x * x + y * y - axial.square()
     radicand = 1 - across * bend.square()
     if bool((radicand.detach()[rays.weight.detach() > 0] <= 0).any()):
         raise DomainError(
