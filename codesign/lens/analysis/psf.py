@@ -57,11 +57,12 @@ def diffraction_psf(
     count = pupil.field.shape[0] * int(padding)
     # signs in a chequer put the reference point into the middle; columns of padding alone need no transform
     sign = 1 - 2 * (torch.arange(pupil.field.shape[0], device=pupil.field.device) % 2)
-    field = pupil.field * (sign * sign[:, None])
+    light = (pupil.field.real.square() + pupil.field.imag.square()).sum()
+    field = pupil.field * (sign * sign[:, None]) * (count / light.sqrt())  # so that the energy sums to 1 (Parseval)
     amplitude = torch.fft.ifft(torch.fft.ifft(field, n=count, dim=0), n=count, dim=1)
     energy = amplitude.real.square() + amplitude.imag.square()
     pitch = pupil.wavelength_mm / (2 * pupil.cosine_radius * int(padding))
-    return Psf(energy / energy.sum(), pitch, pupil.reference_mm)
+    return Psf(energy, pitch, pupil.reference_mm)
 
 
 def psf_on_pixels(
