@@ -16,6 +16,7 @@ GROUPS = {
         "lens_report",
         "lens_scratch",
         "lens_tolerance",
+        "phase_plate",
         "lens_accuracy",
         "lens_files",
         "lens_bench",

@@ -1,5 +1,6 @@
 """Phase plates: their polynomials and splines, rays and light through them, and plates found by gradient."""
 
+import copy
 import math
 
 import numpy as np
@@ -163,6 +164,40 @@ def test_rays_of_the_camera_go_the_same_way_back():
             out = plated.trace(start.detach(), -rays.direction.detach() * flip)
             torch.testing.assert_close(-out.position_mm[:, :2], film, rtol=0, atol=1e-8)
             assert (rays.direction - geo.camera_rays(film, pupil, aim=aim).direction).norm(dim=1).min() > 1e-6
+
+
+def test_gradients_of_the_cameras_rays_reach_the_plate():
+    geo = landscape()
+    film = torch.tensor([[1.0, 2.0], [0.3, -4.0]], dtype=D)
+    pupil = torch.tensor([[0.3, 0.2], [-0.4, 0.6]], dtype=D)
+    for where in ({"z_mm": 1.0}, {"surface": -1, "z_mm": 20.0}):
+        plate = ZernikePlate({7: 2.0, 11: 1.0}, 5.0)
+        plated = with_plate(geo, plate, **where)
+
+        def slope(plated=plated):
+            rays = plated.camera_rays(film, pupil, aim=True)
+            return (rays.direction[:, :2] / rays.direction[:, 2:]).sum() + rays.origin_m.sum()
+
+        (found,) = torch.autograd.grad(slope(), plate.coefficients_rad)
+        for i in range(2):
+            values = []
+            for step in (1e-3, -2e-3, 1e-3):
+                plate.coefficients_rad.data[i] += step
+                values.append(float(slope().detach()))
+            assert float(found[i]) == pytest.approx((values[0] - values[1]) / 2e-3, rel=1e-6)
+
+
+def test_copies_own_their_plate_and_replacements_share_it():
+    plate = ZernikePlate({4: 1.0}, 4.0)
+    plated = with_plate(landscape(), plate, z_mm=1.0)
+    assert plated.replace().plate is plate
+    assert [name for name, _ in plated.named_parameters()] == ["plate.coefficients_rad"]
+    twin = copy.deepcopy(plated)
+    with torch.no_grad():
+        twin.plate.coefficients_rad.fill_(9.0)
+    assert plate.coefficients_rad.tolist() == [1.0]
+    plated.load_state_dict(twin.state_dict())
+    assert plate.coefficients_rad.tolist() == [9.0]
 
 
 def test_what_a_plate_stops_is_said():
