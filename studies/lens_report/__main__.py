@@ -47,6 +47,8 @@ class Config(StudyConfig):
 
 def study(run: Run[Config]) -> None:
     start = time.perf_counter()
+    if not run.config.blur_um > 0:
+        raise DomainError(f"a blur of {run.config.blur_um:g} um cannot be; give a positive diameter.")
     geo = lens.load(run.config.lens).requires_grad_(False)
     light = run.config.wavelengths_um
     quick = run.config.quick
@@ -54,7 +56,7 @@ def study(run: Run[Config]) -> None:
     distances = run.config.at_m or (math.inf,)
     vergence_per_mm(geo, distances)
     at_m = distances[0]
-    focus_m = run.config.focus_m or (at_m if run.config.at_m else None)
+    focus_m = at_m if run.config.focus_m is None and run.config.at_m else run.config.focus_m
     geo = geo if focus_m is None else geo.focus_at(focus_m, light[0], spot_grid=16)
     half_deg, why = half_field(geo, run.config.half_field_deg, light[0], at_m)
     fields, left_out = arriving([math.radians(half_deg) * h for h in SHARES], geo, light[0], at_m)

@@ -153,3 +153,33 @@ def test_the_report_refuses_what_cannot_be(tmp_path, capsys):
         == 2
     )
     assert "a half field of 95.0 degrees cannot be" in capsys.readouterr().err
+
+
+def test_the_report_of_near_objects(tmp_path):
+    command = ["--quick", "--half-field-deg", "8", "--at-m", "0.5", "2", "--out", str(tmp_path / "run")]
+    assert main(lens_report.study, lens_report.Config, command) == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    geo = lens.load("cooke-triplet").requires_grad_(False).focus_at(0.5, spot_grid=16)
+    spots = 1e3 * lens.rms_spot_mm(geo, [0.0, math.radians(8.0)], at_m=(0.5, 2.0))
+    names = ("0deg_at_0p5m", "8deg_at_0p5m", "0deg_at_2m", "8deg_at_2m")
+    found = [metrics[f"rms_spot_um_{name}"] for name in names]
+    assert found == pytest.approx(spots.reshape(-1).tolist(), rel=1e-9)
+    assert metrics["depth_of_field_near_m_traced"] < 0.5 < metrics["depth_of_field_far_m_traced"]
+    assert metrics["seidel_spherical_waves"] == pytest.approx(
+        float(seidel_sums(geo, math.radians(8.0), at_m=0.5).total[0]) / 0.5875618e-3, rel=1e-9
+    )
+    assert metrics["hyperfocal_m"] == pytest.approx(float(analysis.hyperfocal_m(geo, 0.02)), rel=1e-12)
+    assert "is focused on 0.5 m" in (tmp_path / "run" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--at-m", "0.5", "-1"], "an object -1 m before the entrance pupil does not lie before the lens"),
+        (["--focus-m", "0"], "does not lie before the lens"),
+        (["--blur-um", "0"], "a blur of 0 um cannot be"),
+    ],
+)
+def test_the_report_refuses_distances_that_cannot_be(options, sentence, tmp_path, capsys):
+    assert main(lens_report.study, lens_report.Config, [*options, "--out", str(tmp_path / "run")]) == 2
+    assert sentence in capsys.readouterr().err

@@ -35,7 +35,7 @@ def focus_paraxial(
     height, angle = focused_image(lens, vergence_per_mm(lens, one_distance(at_m)), wavelength_um)
     if abs(float(angle.detach())) < 1e-12:
         raise DomainError(
-            f"{lens.name}: the light of a point {float(torch.as_tensor(at_m)):.6g} m away leaves the lens parallel, "
+            f"{lens.name}: the light of a point {float(torch.as_tensor(at_m).detach()):.6g} m away leaves the lens parallel, "
             "so it has no focus; the lens is afocal for it: change a curvature or the distance."
         )
     return _last_thickness(lens, -height * lens.index(wavelength_um)[-1] / angle + defocus_mm)
