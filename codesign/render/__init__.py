@@ -7,6 +7,8 @@ from codesign.render.film import Film
 from codesign.render.moving import MovingScene
 from codesign.render.planes import TexturedPlane
 from codesign.render.projection import ProjectionTable
+from codesign.render.psf_frames import psf_frames
+from codesign.render.psf_map import PsfMap, psf_map
 from codesign.render.sequence import frames
 from codesign.render.time import (
     adaptive_times,
@@ -37,6 +39,7 @@ __all__ = [
     "MitsubaScene",
     "MovingScene",
     "ProjectionTable",
+    "PsfMap",
     "TexturedPlane",
     "View",
     "adaptive_times",
@@ -51,6 +54,8 @@ __all__ = [
     "gauss_legendre",
     "midpoints",
     "project",
+    "psf_frames",
+    "psf_map",
     "sequence",
     "shade",
     "true_flow",

@@ -38,7 +38,7 @@ class MovingScene:
                     f"moving scene: part '{name}' is itself a moving scene; give its objects one by one, "
                     "with poses in the world."
                 )
-            if not _says_distance(type(scene)):
+            if not says_distance(type(scene)):
                 raise DomainError(
                     f"moving scene: part '{name}', a {type(scene).__name__}, does not say how far away its "
                     "light comes from; give a MitsubaScene or a TexturedPlane."
@@ -160,7 +160,7 @@ def at_frames(scene: Any, frames: slice | Sequence[int]) -> Any:
     return scene.during(frames) if isinstance(scene, MovingScene) else scene
 
 
-def _says_distance(kind):
+def says_distance(kind):
     """Whether a class has a ``radiance_and_distance`` beside its ``radiance``: one inherited from further up
     would tell of other light."""
     owner = next((base for base in kind.__mro__ if "radiance" in vars(base)), None)

@@ -80,8 +80,8 @@ class TexturedPlane:
         return self.radiance_and_distance(arr, origin, direction)[0]
 
     def radiance_and_distance(self, arr: Any, origin: Any, direction: Any) -> Any:
-        """Radiance as above, and the distance to the plane (infinite where it is not met), which carries no
-        gradient."""
+        """Radiance as above, and the distance to the plane (infinite where it is not met). Gradient: to the
+        rays."""
         import drjit as dr
 
         m, waves, mean = self._constants(arr)
@@ -99,7 +99,7 @@ class TexturedPlane:
         total = arr.Float(0)
         for fx, fy, a, phase in waves:
             total += a * dr.cos((2 * dr.pi) * (fx * x + fy * y) + phase)
-        return mean * dr.select(meets, dr.exp(total), 1), dr.select(meets, dr.detach(t), dr.inf)
+        return mean * dr.select(meets, dr.exp(total), 1), dr.select(meets, t, dr.inf)
 
     def hit(self, origin_m: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Where world rays [N, 3] meet the plane: point, normal, valid (see MitsubaScene.hit)."""

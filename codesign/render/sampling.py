@@ -17,10 +17,10 @@ def film_pupil_pattern(samples, seed):
     if samples == 1:
         return torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
     points = torch.quasirandom.SobolEngine(4, scramble=True, seed=seed).draw(samples, dtype=torch.float64)
-    return points[:, :2] - 0.5, _concentric_disc(points[:, 2:])
+    return points[:, :2] - 0.5, concentric_disc(points[:, 2:])
 
 
-def _concentric_disc(unit):
+def concentric_disc(unit):
     """Unit square to unit disc, area-preserving (Shirley and Chiu, 1997)."""
     a, b = (2 * unit - 1).unbind(1)
     wide = a.abs() > b.abs()

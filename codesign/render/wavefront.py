@@ -5,7 +5,7 @@ from torch import Tensor
 from codesign.backend import run_kernel
 from codesign.errors import DomainError, ShapeError
 from codesign.render.kinds import Scene
-from codesign.render.moving import MovingScene, cameras_in_parts, in_one_row, parts
+from codesign.render.moving import MovingScene, cameras_in_parts, in_one_row, parts, says_distance
 from codesign.types import Rays
 
 
@@ -42,6 +42,31 @@ def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Tensor, samples_p
     return image.reshape(*batch, -1)
 
 
+def light_and_nearness(rays: Rays, scene: Scene | MovingScene, T_world_cam: Tensor) -> tuple[Tensor, Tensor]:
+    """Radiance [T, N] along rays [N] given in camera space, seen from poses [T, 4, 4], and 1 / depth [T, N] per
+    metre of what they meet, along the camera's axis; 0 where they meet nothing. The rays' weights do not count.
+
+    Gradient: of both to the rays, the poses and the poses of moving objects, as ``shade``; depth through the
+    tangent plane of what is met.
+    Raises: DomainError for a scene that does not say how far away its light comes from.
+    """
+    for part in parts(scene):
+        if not says_distance(type(part)):
+            raise DomainError(
+                f"a {type(part).__name__} does not say how far away its light comes from, which a picture by "
+                "depth needs; give a MitsubaScene or a TexturedPlane, or render traced frames."
+            )
+    poses = T_world_cam.shape[0]
+    count = rays.weight.numel()
+    columns = [*rays.origin_m.unbind(1), *rays.direction.unbind(1)]
+    inputs = [c.to(scene.dtype) for c in columns] + [
+        pose[:, :3].to(scene.dtype) for pose in cameras_in_parts(scene, T_world_cam)
+    ]
+    kernel = _Depths(parts(scene), count, poses, 1)
+    light, nearness = run_kernel(kernel, inputs, [(poses, count)] * 2)
+    return light, nearness
+
+
 class _Wavefront:
     """The kernel: rays into every part's own frame, and the light of the part that is met first."""
 
@@ -54,17 +79,11 @@ class _Wavefront:
     def __call__(self, arr, ox, oy, oz, dx, dy, dz, weight, *poses):
         import drjit as dr
 
-        lane = dr.arange(arr.UInt32, self.count * self.poses)
-        frame = lane // self.count
-        ray = lane - frame * self.count
-        o, d = (
-            arr.Array3(*[dr.gather(arr.Float, v, ray) for v in part]) for part in ((ox, oy, oz), (dx, dy, dz))
-        )
-        placed = [_placed(arr, o, d, pose, frame) for pose in poses]
+        ray, o, d, placed = self._lanes(arr, (ox, oy, oz), (dx, dy, dz), poses)
         seen = (
             self.scenes[0].radiance(arr, *placed[0])
             if len(placed) == 1
-            else _nearest(arr, self.scenes, placed)
+            else _nearest(arr, self.scenes, placed)[0]
         )
         light = seen * dr.gather(arr.Float, weight, ray)
         if dr.grad_enabled(
@@ -72,6 +91,29 @@ class _Wavefront:
         ):  # the adjoint of the sum needs no values of light: without this it would be rendered twice
             light = dr.replace_grad(dr.zeros(arr.Float, dr.width(light)), light)
         return (dr.block_sum(light, self.samples) / self.samples,)
+
+    def _lanes(self, arr, origin, direction, poses):
+        """Number of the ray of every lane, its origin and direction before the camera, and those in each part."""
+        import drjit as dr
+
+        lane = dr.arange(arr.UInt32, self.count * self.poses)
+        frame = lane // self.count
+        ray = lane - frame * self.count
+        o, d = (arr.Array3(*[dr.gather(arr.Float, v, ray) for v in part]) for part in (origin, direction))
+        return ray, o, d, [_placed(arr, o, d, pose, frame) for pose in poses]
+
+
+class _Depths(_Wavefront):
+    """The kernel of light and 1 / depth, ray by ray."""
+
+    def __call__(self, arr, ox, oy, oz, dx, dy, dz, *poses):
+        import drjit as dr
+
+        _, o, d, placed = self._lanes(arr, (ox, oy, oz), (dx, dy, dz), poses)
+        light, distance = _nearest(arr, self.scenes, placed)
+        met = dr.isfinite(distance)
+        depth = o.z + d.z * dr.select(met, distance, 1)
+        return light, dr.select(met & (depth > 0), 1 / dr.select(depth > 0, depth, 1), 0)
 
 
 def _placed(arr, o, d, pose, frame):
@@ -86,7 +128,7 @@ def _placed(arr, o, d, pose, frame):
 
 
 def _nearest(arr, scenes, placed):
-    """Radiance of the part met first; where nothing is met, what the first part says."""
+    """Radiance of the part met first and its distance; where nothing is met, what the first part says."""
     import drjit as dr
 
     light, nearest = scenes[0].radiance_and_distance(arr, *placed[0])
@@ -94,4 +136,4 @@ def _nearest(arr, scenes, placed):
         other, distance = scene.radiance_and_distance(arr, *rays)
         light = dr.select(distance < nearest, other, light)
         nearest = dr.minimum(distance, nearest)
-    return light
+    return light, nearest

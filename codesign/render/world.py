@@ -43,8 +43,8 @@ class MitsubaScene:
         return self.radiance_and_distance(arr, origin, direction)[0]
 
     def radiance_and_distance(self, arr: Any, origin: Any, direction: Any) -> Any:
-        """Radiance as above, and the distance to what is hit (infinite where nothing is), which carries no
-        gradient."""
+        """Radiance as above, and the distance to what is hit (infinite where nothing is). Gradient: to the rays,
+        the surface taken as its tangent plane."""
         import drjit as dr
 
         mi = self.mi
@@ -58,7 +58,14 @@ class MitsubaScene:
             self.scene.environment() is not None
         ):  # a sky is looked up by the direction, which these flags leave out where nothing is met
             si.wi = dr.select(si.is_valid(), si.wi, -ray.d)
-        return si.emitter(self.scene).eval(si)[0], found.t
+        light = si.emitter(self.scene).eval(si)[0]
+        if not dr.grad_enabled(ray.o, ray.d):
+            return light, found.t
+        met = si.is_valid()
+        normal = dr.detach(si.n)
+        falling = dr.dot(ray.d, normal)
+        along = dr.dot(dr.detach(si.p) - ray.o, normal) / dr.select(met & (falling != 0), falling, 1)
+        return light, dr.replace_grad(found.t, dr.select(met, along, 0))
 
     def outline(self) -> Any:
         """Curves where radiance may jump, see codesign.render.outline; worked out once."""

@@ -22,7 +22,7 @@ GROUPS = {
         "lens_bench",
         "benchmark",
     ),
-    "render": ("render_truth", "render_quality", "silhouettes", "light_levels", "make_dataset"),
+    "render": ("render_truth", "render_quality", "psf_level", "silhouettes", "light_levels", "make_dataset"),
     "events": (
         "video_to_events",
         "upsampling",

@@ -1,0 +1,300 @@
+"""Point spread functions of a camera over field and depth, as tensors with gradients.
+
+The rays of a pixel through the pupil do not depend on what they meet. So one trace, of pupil points for the
+nodes of a grid over the film, says for every distance which places of the sharp picture (that of the chief
+rays) the pixel gathers light from: where the ray meets the plane at that distance, in pixels of the chief rays
+around it. That is the point spread function mirrored, exact for a plane across the axis, whatever the lens
+(vignetting, decentred elements, colour).
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from codesign.errors import DomainError
+from codesign.render.camera import Camera
+from codesign.render.film import coarse_pixels
+from codesign.render.sampling import concentric_disc
+from codesign.types import Rays
+
+LARGEST_PX = 32  # radius of a blur up to which pictures are convolved
+LAYER_PX = 1.0  # of blur's radius, from one layer of depth to the next
+PUPIL_PX = 1.0  # spacing of the pupil's points in the widest blur, about
+ACROSS = 32  # film points across the sensor whose light is traced
+APART_PX = 0.5  # of the chief rays that give the scale of the picture, on either side
+SIDE = 2  # chief rays of the sharp picture per side of a pixel
+# a pixel's weights reach beyond the blur by the quartic splines and, until it has fallen below 0.5 %, the ringing
+# of the interpolation, in spacings of the sharp picture
+TAIL_PX = math.ceil((2.5 + (SIDE - 1) / 2 + 4) / SIDE)
+
+
+@dataclass(frozen=True)
+class PsfMap:
+    """Rays of a camera from which its point spread functions follow, made by ``psf_map``.
+
+    camera: Camera. nearest_m: least distance it is made for. nodes_px: [N, 2] film points, pixel coordinates;
+      ``grid`` = (windows, rows, columns) of them, N in all, cells of ``cell_px`` (rows, columns) pixels between.
+    transmission: [windows, H, W] share of the light that passes, as in the traced frames. radius_px: how far the
+      light of a pixel comes from. step_per_m: of 1 / distance, over which blur grows by LAYER_PX at most. sharp:
+      chief rays, SIDE x SIDE per pixel of the film and a margin of radius_px around it, window after window.
+      transfers: what ``psf_frames`` keeps for its next call.
+    base_m, slope: [N, M, 2] where rays through pupil points meet the entrance pupil's plane, and their slopes,
+      both relative to the chief ray; share: [N, M] of the light, sum 1. base_m_per_px, slope_per_px: [N, 2, 2] the
+      same of neighbouring chief rays, per pixel.
+    """
+
+    camera: Camera
+    nearest_m: float
+    nodes_px: Tensor
+    grid: tuple[int, int, int]
+    cell_px: tuple[int, int]
+    transmission: Tensor
+    base_m: Tensor
+    slope: Tensor
+    share: Tensor
+    base_m_per_px: Tensor
+    slope_per_px: Tensor
+    radius_px: int
+    step_per_m: float
+    sharp: Rays
+    transfers: dict[tuple[Any, ...], Tensor] = field(default_factory=dict, repr=False, compare=False)
+
+    def offsets_px(self, per_m: Tensor) -> Tensor:
+        """Where the light of a point ends up, relative to its chief ray: [D, N, M, 2] px, for 1 / distance [D].
+
+        Gradient: to the lens and to per_m.
+        """
+        v = per_m.to(self.base_m)[:, None, None, None]
+        return -_solved(self.slope_per_px + v * self.base_m_per_px, self.slope + v * self.base_m)
+
+    def energy(self, distance_m: Tensor, size_px: int | None = None) -> Tensor:
+        """The point spread functions, [D, N, K, K]: share of a point's light per pixel, rows along +y (down),
+        columns along +x, the chief ray on the middle pixel; the sum is 1.
+
+        >>> from codesign import lens, render
+        >>> camera = render.Camera(lens.ThinLens(10.0, 4.0).focus_at(1.0), 96, 64, pixel_pitch_mm=0.005)
+        >>> psf = render.psf_map(camera, nearest_m=0.5)
+        >>> blur = psf.energy(torch.tensor([0.5, 1.0, float("inf")]))
+        >>> blur.shape  # three distances, nodes, rows and columns
+        torch.Size([3, 6, 11, 11])
+        >>> [round(float(part.max()), 2) for part in blur[:, 0]]  # sharp at 1 m
+        [0.02, 1.0, 0.02]
+
+        Args: distance_m: [D] along the camera's axis from the entrance pupil, inf allowed. size_px: rows and
+          columns, odd; None is as many as the widest blur needs. A ray is shared bilinearly among four pixels.
+        Gradient: to every tensor of the lens and to the distances, piecewise linear in the rays' positions.
+        Raises: DomainError for distances nearer than ``nearest_m``, or a size that does not hold the blur.
+        """
+        distance_m = torch.as_tensor(distance_m, dtype=torch.float64)
+        if not bool((distance_m.detach() >= self.nearest_m * (1 - 1e-9)).all()):
+            raise DomainError(
+                f"psf map: distance {float(distance_m.detach().min()):.4g} m is nearer than the {self.nearest_m:g} m "
+                "that the map is made for; give psf_map a smaller nearest_m."
+            )
+        needed = 2 * (self.radius_px - TAIL_PX) + 3
+        size = needed if size_px is None else size_px
+        if size < needed or size % 2 == 0:
+            raise DomainError(
+                f"psf map: {size} x {size} pixels do not hold the blur about a middle pixel; give an odd number of "
+                f"at least {needed}."
+            )
+        at = self.offsets_px(1 / distance_m)[..., None] - (torch.arange(size).to(self.base_m) - size // 2)
+        return _shared((1 - at.abs()).clamp_min(0), self.share)
+
+    def weights(self, per_m: Tensor) -> Tensor:
+        """What pixels gather from the sharp picture at 1 / distance [J]: [J, N, S, S, K, K], by which the
+        picture of each of a pixel's S x S chief rays is convolved; K = 2 radius_px + 1, all of a node sum to 1.
+
+        The sharp picture is taken as the cubic spline through its values, and integrated over the pixel and the
+        blur in closed form: quartic splines. Source: Unser, IEEE Signal Processing Magazine 16, 1999.
+        """
+        dtype = per_m.dtype
+        share = self.share.to(dtype)
+        spacings = torch.arange(-SIDE * self.radius_px, SIDE * (self.radius_px + 1), dtype=dtype)
+        gathered = -SIDE * self.offsets_px(per_m).to(dtype)
+        far = gathered[..., None] - (spacings - (SIDE - 1) / 2)
+        splines = sum(_quartic(far + shift - (SIDE - 1) / 2) for shift in range(SIDE)) / SIDE
+        inverse = torch.linalg.inv(_cubic(spacings[:, None] - spacings))
+        found = inverse @ _shared(splines, share) @ inverse
+        found = (
+            (found / found.sum((-2, -1), keepdim=True)).unflatten(-1, (-1, SIDE)).unflatten(-3, (-1, SIDE))
+        )
+        return found.permute(0, 1, 3, 5, 2, 4).flip((-2, -1))
+
+
+def psf_map(camera: Camera, nearest_m: float = 0.3, cell_px: int = 64) -> PsfMap:
+    """Trace what the point spread functions of a camera at all distances from ``nearest_m`` on follow from.
+
+    Args: camera: before any lens with ``camera_rays``; its spectrum, falloff and aim count, its samples do not.
+      nearest_m: metres from the entrance pupil. cell_px: largest spacing of the film points between which
+      point spread functions are interpolated.
+    Gradient: to the lens. To be made anew for every state of the lens.
+    Raises: DomainError when the blur is wider than LARGEST_PX, or no light reaches the film.
+    """
+    if not 0 < nearest_m < math.inf:
+        raise DomainError(f"psf map: nearest_m = {nearest_m} must be a positive, finite distance in metres.")
+    if not cell_px >= 2:
+        raise DomainError(f"psf map: cell_px = {cell_px} must be at least 2 pixels.")
+    nodes, grid, cell = _nodes(camera, cell_px)
+    chief = _lines(camera.chief_rays(_around(nodes)))
+    base, slope = (part.reshape(-1, 5, 2) for part in chief)
+    scale = [
+        torch.stack([part[:, 1] - part[:, 2], part[:, 3] - part[:, 4]], -1) / (2 * APART_PX)
+        for part in (base, slope)
+    ]
+    found = _gathered(camera, nodes, 16, base, slope, scale)
+    reach = _reach(*found[:2], scale, 1 / nearest_m)
+    if reach > LARGEST_PX:
+        raise DomainError(
+            f"psf map: between {nearest_m:g} m and infinity the blur reaches {reach:.0f} pixels from its chief ray, "
+            f"more than {LARGEST_PX}; focus the lens, give a larger nearest_m, or render traced frames."
+        )
+    across = 2 ** math.ceil(math.log2(max(16.0, 2 * reach / PUPIL_PX)))
+    if across > 16:
+        found = _gathered(camera, nodes, across, base, slope, scale)
+    offset, lean, share = found
+    with torch.no_grad():
+        change = _solved(scale[1], offset).norm(dim=-1)[share > 0].max()
+    step = 2.0 ** math.floor(math.log2(LAYER_PX / max(float(change), LAYER_PX * nearest_m)))
+    return PsfMap(
+        camera,
+        float(nearest_m),
+        nodes,
+        grid,
+        cell,
+        _transmission(camera),
+        offset,
+        lean,
+        share,
+        *scale,
+        math.ceil(reach) + TAIL_PX,
+        step,
+        camera.chief_rays(_places(camera.film, math.ceil(reach) + TAIL_PX)),
+    )
+
+
+def _nodes(camera, cell_px):
+    """Film points at the corners of equal cells over every window: [N, 2] px, how many, and pixels of a cell."""
+    film = camera.film
+    corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
+    lines = []
+    cell = []
+    for length in (film.height_px, film.width_px):
+        count = math.ceil(length / cell_px)
+        cell.append(math.ceil(length / count))
+        lines.append((torch.arange(count + 1.0, dtype=torch.float64) * cell[-1]).clamp_max(length - 1))
+    y, x = torch.meshgrid(*lines, indexing="ij")
+    nodes = corners[:, None] + torch.stack([x.reshape(-1), y.reshape(-1)], 1)
+    return nodes.reshape(-1, 2), (len(corners), len(lines[0]), len(lines[1])), tuple(cell)
+
+
+def _around(nodes):
+    """Every node and its neighbours in +x, -x, +y, -y: [5 N, 2] px."""
+    steps = torch.tensor([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=nodes.dtype)
+    return (nodes[:, None] + APART_PX * steps).reshape(-1, 2)
+
+
+def _lines(rays: Rays) -> tuple[Tensor, Tensor]:
+    """Rays as x, y at the entrance pupil's plane [N, 2] metres and slopes [N, 2]."""
+    ahead = rays.direction[:, 2:]
+    slope = rays.direction[:, :2] / torch.where(ahead.detach() > 1e-6, ahead, 1)
+    return rays.origin_m[:, :2] - rays.origin_m[:, 2:] * slope, slope
+
+
+def _through_pupil(camera, places, across):
+    """Rays of film points [P, 2] px through ``across`` x ``across`` equal parts of the pupil, colour after colour:
+    at the entrance pupil's plane and slopes [P, M, 2], and their light [P, M], 1 in all where nothing stops it."""
+    line = (torch.arange(across, dtype=torch.float64) + 0.5) / across
+    pupil = concentric_disc(torch.cartesian_prod(line, line))
+    film = camera.film_mm(places).repeat_interleave(len(pupil), 0)
+    lines = camera.spectrum
+    colours = [({}, 1.0)]
+    if lines is not None:
+        colours = [
+            ({"wavelength_um": w}, s) for w, s in zip(lines.wavelengths_um, lines.weights, strict=True)
+        ]
+    parts = []
+    for colour, weight in colours:
+        rays = camera.lens.camera_rays(film, pupil.repeat(len(places), 1), aim=camera.aim, **colour)
+        light = weight / len(pupil) * rays.weight
+        if camera.falloff:
+            if rays.irradiance is None:
+                raise DomainError(
+                    "psf map: this lens does not say how illumination falls off; leave falloff=False."
+                )
+            light = light * rays.irradiance
+        parts.append([v.double().unflatten(0, (len(places), -1)) for v in (*_lines(rays), light)])
+    return [torch.cat(column, 1) for column in zip(*parts, strict=True)]
+
+
+def _gathered(camera, nodes, across, base, slope, scale):
+    """Rays through the pupil relative to the chief rays: base and slope [N, M, 2], and shares of the light [N, M]."""
+    meets, leans, light = _through_pupil(camera, nodes, across)
+    total = light.sum(1, keepdim=True)
+    if not bool((total.detach() > 0).any()):
+        raise DomainError("psf map: no light reaches the film; open the apertures or make the film smaller.")
+    usable = (light.detach() > 0)[..., None] & (torch.linalg.det(scale[1].detach()) != 0)[:, None, None]
+    share = torch.where(total > 0, light / torch.where(total > 0, total, 1), 1 / light.shape[1])
+    return (
+        torch.where(usable, meets - base[:, :1], 0),
+        torch.where(usable, leans - slope[:, :1], 0),
+        share,
+    )
+
+
+def _transmission(camera):
+    """Share of the light that passes, [windows, H, W], linear between film points on a grid."""
+    film = camera.film
+    every_px = math.ceil(max(film.sensor_width_px, film.sensor_height_px) / ACROSS)
+    light = _through_pupil(camera, coarse_pixels(film, every_px), 16)[2].sum(1)
+    size = [math.ceil((n - 1) / every_px) + 1 for n in (film.height_px, film.width_px)]
+    grid = light.reshape(-1, 1, *size)
+    return interpolate(grid, size=film.shape[-2:], mode="bilinear", align_corners=True)[:, 0]
+
+
+def _reach(base, slope, scale, nearest_per_m):
+    """Radius of the widest blur at infinity and at the nearest distance, px; between them it is smaller."""
+    with torch.no_grad():
+        ends = [_solved(scale[1] + v * scale[0], slope + v * base) for v in (0.0, nearest_per_m)]
+        return float(torch.stack(ends).abs().max())
+
+
+def _solved(matrix, vectors):
+    """matrix^-1 [..., N, 2, 2] times vectors [..., N, M, 2], written out; nodes without chief rays give 0."""
+    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
+    determinant = a * d - b * c
+    inverse = torch.where(determinant != 0, 1 / torch.where(determinant != 0, determinant, 1), 0)[..., None]
+    x, y = vectors.unbind(-1)
+    a, b, c, d = (v[..., None] for v in (a, b, c, d))
+    return torch.stack([(d * x - b * y) * inverse, (a * y - c * x) * inverse], -1)
+
+
+def _places(film, margin):
+    """Pixel coordinates of SIDE x SIDE equal parts of every pixel of the windows and a margin around them."""
+    lines = [torch.arange(-margin, n + margin, dtype=torch.float64) for n in (film.height_px, film.width_px)]
+    corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
+    parts = (torch.arange(SIDE, dtype=torch.float64) + 0.5) / SIDE - 0.5
+    at = corners[:, None] + torch.cartesian_prod(*lines).flip(1)
+    return (at[:, :, None] + torch.cartesian_prod(parts, parts).flip(1)).reshape(-1, 2)
+
+
+def _shared(at, share):
+    """[..., K, K] of weights [..., M, 2, K] along x and y of points with shares [..., M]."""
+    return (at[..., 1, :] * share[..., None]).mT @ at[..., 0, :]
+
+
+def _cubic(at):
+    """Cubic B-spline of unit spacing."""
+    far = at.abs()
+    return ((2 - far).clamp_min(0) ** 3 - 4 * (1 - far).clamp_min(0) ** 3) / 6
+
+
+def _quartic(at):
+    """Quartic B-spline, the cubic one averaged over a unit."""
+    far = at.abs()
+    parts = [(reach - far).clamp_min(0).square().square() for reach in (2.5, 1.5, 0.5)]
+    return (parts[0] - 5 * parts[1] + 10 * parts[2]) / 24

@@ -1,0 +1,275 @@
+"""Point spread functions of a camera, and frames by them, against closed forms, forward traces and traced frames."""
+
+import math
+
+import pytest
+import torch
+
+from codesign import System, events, flow, lens, render
+from codesign.errors import DomainError, ShapeError
+from codesign.pose import look_at, se3_exp
+from codesign.render.wavefront import light_and_nearness
+from codesign.system import Batch
+from scenes import textures, worlds
+
+D = torch.float64
+PITCH_MM = 0.02
+THIN = lens.ThinLens(10.0, 2.0).focus_at(1.0)
+FRONT = look_at((0.0, 0.0, 2.0), (0, 0, 0), down=(0, 1, 0))  # of planes in z = 0
+
+
+def triplet():
+    return lens.load("cooke-triplet").scaled(0.22)
+
+
+def camera(optics, width=48, height=40, samples=256, pitch_mm=PITCH_MM, **more):
+    return render.Camera(optics, width, height, pitch_mm, samples, **more)
+
+
+def waves(seed=0, finest_period_m=0.02, **more):
+    return render.TexturedPlane(
+        *textures.waves(seed, finest_period_m=finest_period_m, coarsest_period_m=0.2), **more
+    )
+
+
+def rms_share(found, truth):
+    """RMS difference over the RMS contrast of the truth."""
+    return float(((found - truth).square().mean().sqrt() / truth.std()).detach())
+
+
+def moved(z):
+    stand = torch.eye(4, dtype=D)
+    stand[2, 3] = z
+    return stand
+
+
+def test_blur_of_a_thin_lens_is_the_circle_of_confusion():
+    psf = render.psf_map(camera(THIN), nearest_m=0.4)
+    distance_m = torch.tensor([0.4, 0.5, 1.0, 3.0, math.inf], dtype=D)
+    behind_mm = 1 / (1 / 10.0 - 1 / 1000.0)
+    radius_px = 1.0 * behind_mm * (1 / (1e3 * distance_m) - 1 / 1000.0).abs() / PITCH_MM
+    offsets = psf.offsets_px(1 / distance_m)
+    # points in the middle of 16 x 16 equal parts of a disc: the outermost lie at 15/16 of its radius
+    torch.testing.assert_close(offsets.norm(dim=-1).amax(2), (radius_px * 15 / 16)[:, None].expand(5, 4))
+    # the second moment of a disc is its radius squared over 4; the parts' middles have 2 / 16^2 less of it
+    second = radius_px**2 / 4 * (1 - 2 / 256)
+    torch.testing.assert_close(
+        offsets.square().mean(2), second[:, None, None].expand(5, 4, 2), rtol=1e-6, atol=1e-9
+    )
+    energy = psf.energy(distance_m)
+    at = torch.arange(energy.shape[-1], dtype=D) - energy.shape[-1] // 2
+    found = (energy.sum(-1) * at**2).sum(-1)
+    # a bilinear share adds the mean of f (1 - f), which is at most 1/4
+    assert bool(((found >= second[:, None] - 1e-9) & (found <= second[:, None] + 0.25)).all())
+    torch.testing.assert_close(energy.sum((-2, -1)), torch.ones(5, 4, dtype=D))
+
+
+def test_blur_of_a_traced_lens_is_that_of_light_traced_forwards():
+    """A point under a node's chief ray, through points of the entrance pupil onto the film."""
+    optics = triplet().focus_at(0.8)
+    cam = camera(optics, 240, 160)
+    psf = render.psf_map(cam)
+    distance_m = torch.tensor([0.3, 0.8, 4.0], dtype=D)
+    found = psf.offsets_px(1 / distance_m)
+    chief = cam.chief_rays(psf.nodes_px)
+    pupil = lens.pupil_grid(24)
+    for d, z in enumerate(distance_m):
+        reach = (z - chief.origin_m[:, 2:]) / chief.direction[:, 2:]
+        points_mm = 1e3 * (chief.origin_m + chief.direction * reach)
+        film, _, _ = optics.film_points(
+            points_mm.repeat_interleave(len(pupil), 0), pupil.repeat(len(points_mm), 1)
+        )
+        offsets = (film.reshape(len(points_mm), -1, 2) - cam.film_mm(psf.nodes_px)[:, None]) / PITCH_MM
+        # the two sample the pupil differently (entrance and exit pupil), the more so off the axis
+        forward = (offsets - offsets.mean(1, keepdim=True)).norm(dim=-1).square().mean(1).sqrt()
+        ours = (found[d] - found[d].mean(1, keepdim=True)).norm(dim=-1).square().mean(1).sqrt()
+        torch.testing.assert_close(ours, forward, rtol=0.08, atol=0.02)
+        assert float((offsets.mean(1) - found[d].mean(1)).norm(dim=-1).max().detach()) < 0.1
+
+
+def test_lateral_colour_is_in_it():
+    optics = triplet()
+    lines = lens.Spectrum((0.4861327, 0.6562725), (0.5, 0.5))
+    psf = render.psf_map(camera(optics, 240, 160, spectrum=lines, samples=16))
+    found = psf.offsets_px(torch.zeros(1, dtype=D))[0].unflatten(1, (2, -1)).mean(2)  # [N, colours, 2]
+    node = psf.nodes_px[0]
+    back = [
+        optics.camera_rays(psf.camera.film_mm(node[None]), torch.zeros(1, 2, dtype=D), w).direction
+        for w in lines.wavelengths_um
+    ]
+    slope = [d[0, :2] / d[0, 2] for d in back]
+    per_px = psf.slope_per_px[0]
+    chief = torch.linalg.solve(per_px, slope[1] - slope[0])
+    # coma differs a little between the colours, so the mean of the blur is not quite its chief ray's
+    torch.testing.assert_close(found[0, 0] - found[0, 1], chief, atol=0.05, rtol=0.1)
+
+
+@pytest.mark.parametrize("optics", [triplet().focus_at(0.7), THIN, lens.Pinhole(10.0)])
+def test_a_constant_stays_constant_whatever_the_depths(optics):
+    even = worlds.blank_room(60.0)
+    cam = camera(optics, 150, 100, pitch_mm=0.04)
+    found = render.psf_frames(cam, even, look_at((0.5, -1, 1), (0, 2, 1))[None])
+    torch.testing.assert_close(found, torch.full_like(found, 60.0), rtol=1e-5, atol=0)
+
+
+def test_vignetting_is_that_of_traced_frames():
+    even = render.TexturedPlane([[1.0, 0.0]], [0.0], [0.0])
+    optics = lens.load("double-gauss").scaled(0.11)
+    cam = camera(optics, 60, 45, 256, pitch_mm=0.1)
+    traced = render.frames(cam, even, FRONT[None]).detach()
+    assert float(traced.min()) < 0.7 * float(traced.max())
+    found = render.psf_frames(cam, even, FRONT[None]).detach()
+    # an aperture's hard edge passes over the 16 x 16 points of the pupil up to a row at a time, 1/16 of the light
+    away = (found - traced).abs() / traced.max()
+    assert float(away.max()) < 1 / 16
+    assert float(away.square().mean().sqrt()) < 0.01
+
+
+@pytest.mark.parametrize(
+    "optics", [triplet(), triplet().focus_at(0.4), THIN], ids=["sharp", "blurred", "thin"]
+)
+def test_a_wall_is_as_traced(optics):
+    cam = camera(optics)
+    pose = (FRONT @ se3_exp(torch.tensor([0.1, 0.05, 0, 0.1, 0.05, 0.2], dtype=D)))[None]
+    found = render.psf_frames(cam, waves(), pose)
+    assert (
+        rms_share(found, render.frames(cam, waves(), pose)) < 0.005
+    )  # 2 % are asked where blur changes slowly
+
+
+def test_windows_trajectories_and_lists_of_scenes_have_the_shapes_of_frames():
+    film = render.Film(120, 80, 24, 20, PITCH_MM, ((0, 0), (90, 55)))
+    cam = render.Camera(THIN, 24, 20, PITCH_MM, 256, film=film)
+    poses = FRONT.repeat(2, 3, 1, 1) @ se3_exp(0.02 * torch.arange(36, dtype=D).reshape(2, 3, 6) / 36)
+    scenes = [waves(0), waves(1)]
+    found = render.psf_frames(cam, scenes, poses)
+    assert found.shape == (2, 3, 2, 20, 24)
+    assert rms_share(found, render.frames(cam, scenes, poses)) < 0.005
+
+
+def half_before(front, behind):
+    """A card left of x = 0 at z = 1 before a wall at z = 0, both of one radiance."""
+    mi = worlds.backend.mitsuba()
+
+    def card(level, x, z, half):
+        return {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([x, 0, z]).scale(half),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": level}},
+        }
+
+    return render.MitsubaScene({"front": card(front, -2.0, 1.0, 2.0), "behind": card(behind, 0, 0, 4.0)})
+
+
+@pytest.mark.parametrize("blurred", ["front", "behind"])
+def test_the_edge_of_a_near_card(blurred):
+    """A blurred card before a sharp wall: the integral of a disc; a sharp card before a blurred wall: a sharp
+    edge, nothing of the wall on the card."""
+    pose = look_at((0.0, 0.0, 1.5), (0, 0, 0), down=(0, 1, 0))
+    cam = camera(lens.ThinLens(10.0, 2.0).focus_at(1.5 if blurred == "front" else 0.5), 41, 8)
+    row = render.psf_frames(cam, half_before(100.0, 50.0), pose[None])[0, 4]
+    row = row if float(row[0]) > 75 else row.flip(0)
+    x = torch.arange(41.0) - 20
+    share = (row - 50) / 50
+    if blurred == "behind":
+        torch.testing.assert_close(share[x < -1], torch.ones(19), atol=0.01, rtol=0)
+        torch.testing.assert_close(share[x > 1], torch.zeros(19), atol=0.01, rtol=0)
+        return
+    behind_mm = 1 / (1 / 10.0 - 1 / 1500.0)
+    radius_px = behind_mm * (1 / 500.0 - 1 / 1500.0) / PITCH_MM
+    t = (x / radius_px).clamp(-1, 1)
+    disc = 0.5 - (t * (1 - t * t).sqrt() + t.asin()) / math.pi
+    # a pupil of 64 x 64 points, a pixel of finite size
+    torch.testing.assert_close(share, disc, atol=0.02, rtol=0)
+
+
+def functional(make, weights):
+    """Scalar of frames of a slanted plane as a function of relative changes of curvature and thickness, and a
+    twist; and its leaves."""
+    nominal = triplet().focus_at(0.9)
+    c = nominal.curvature_per_mm.detach()
+    t = nominal.thickness_mm.detach()
+    world = waves(3, 0.05)
+    start = FRONT @ se3_exp(torch.tensor([0.1, 0, 0.6, 0.4, 0.2, 0.1], dtype=D))
+
+    def loss(curvature, thickness, twist):
+        optics = nominal.replace(curvature_per_mm=c * (1 + curvature), thickness_mm=t * (1 + thickness))
+        return (make(camera(optics, 24, 20), world, (start @ se3_exp(twist))[None]) * weights).sum()
+
+    return loss, [torch.zeros(6, dtype=D, requires_grad=True) for _ in range(3)]
+
+
+def test_gradients_are_those_of_differences_and_near_those_of_traced_frames(generator):
+    coarse = torch.randn(1, 1, 4, 4, generator=generator, dtype=D)
+    weights = torch.nn.functional.interpolate(coarse, size=(20, 24), mode="bilinear", align_corners=True)[0]
+    loss, at = functional(lambda *stage: render.psf_frames(*stage), weights)
+    found = torch.autograd.grad(loss(*at), at)
+    for k, (gradient, step) in enumerate(zip(found, (1e-6, 1e-6, 1e-6), strict=True)):
+        along = torch.randn(6, generator=generator, dtype=D)
+        ends = [
+            float(
+                loss(*[sign * step * along if n == k else torch.zeros(6, dtype=D) for n in range(3)]).detach()
+            )
+            for sign in (1, -1)
+        ]
+        truth = (ends[0] - ends[1]) / (2 * step)
+        assert float((gradient @ along - truth).abs()) < 1e-5 * float(gradient.norm() * along.norm())
+    traced, at = functional(lambda cam, *rest: render.frames(cam, *rest), weights)
+    for gradient, other in zip(found, torch.autograd.grad(traced(*at), at), strict=True):
+        assert float((gradient - other).norm()) < 0.02 * float(other.norm())
+
+
+def test_depth_of_mitsuba_scenes_has_the_gradient_of_tangent_planes():
+    scene = worlds.room()
+    pose = look_at((0.1, -1, 1.1), (0, 0.8, 0.5))
+    rays = camera(THIN, 12, 8, 1, 0.5).rays()
+    twist = torch.zeros(6, dtype=D, requires_grad=True)
+    _, per_m = light_and_nearness(rays, scene, (pose @ se3_exp(twist))[None])
+    points, depth, valid = render.truth.world_points(rays, scene, pose @ se3_exp(twist))
+    assert bool(valid.all())
+    torch.testing.assert_close(1 / per_m[0].double(), depth, rtol=1e-5, atol=0)
+    found, truth = (torch.autograd.grad(v.sum(), twist)[0] for v in (1 / per_m[0].double(), depth))
+    torch.testing.assert_close(found, truth, rtol=1e-4, atol=1e-4 * float(truth.norm()))
+
+
+def test_a_system_takes_it_as_its_render_stage():
+    system = System(
+        camera=camera(THIN),
+        events=events.layer("counts"),
+        flow=flow.estimate_lk,
+        objectives={"error": lambda field, truth: (field.flow_px - truth.flow_px).square().mean()},
+        render=render.psf_frames,
+        scene=waves(),
+    )
+    poses = FRONT @ se3_exp(
+        torch.tensor([0.01, 0, 0, 0, 0, 0], dtype=D) * torch.linspace(0, 1, 5, dtype=D)[:, None]
+    )
+    run = system.begin(Batch(poses, torch.linspace(0, 0.02, 5, dtype=D)))
+    torch.testing.assert_close(run["frames"], render.psf_frames(camera(THIN), waves(), poses))
+
+
+def test_refusals():
+    psf = render.psf_map(camera(THIN), nearest_m=1.0)
+    with pytest.raises(DomainError, match=r"0.5 m is nearer than the 1 m.*smaller nearest_m"):
+        psf.energy(torch.tensor([0.5]))
+    with pytest.raises(DomainError, match=r"3 x 3 pixels do not hold the blur.*odd number of at least 5"):
+        psf.energy(torch.tensor([2.0]), size_px=3)
+    with pytest.raises(DomainError, match=r"0.5 m away, nearer than the 1 m of the map"):
+        render.psf_frames(camera(THIN), waves(), look_at((0, 0, 0.5), (0, 0, 0), down=(0, 1, 0))[None], psf)
+    with pytest.raises(DomainError, match=r"blur reaches .* pixels .* larger nearest_m, or render traced"):
+        render.psf_map(camera(lens.ThinLens(10.0, 5.0)), nearest_m=0.02)
+    with pytest.raises(DomainError, match=r"nearest_m = -1"):
+        render.psf_map(camera(THIN), nearest_m=-1)
+    with pytest.raises(DomainError, match=r"cell_px = 1"):
+        render.psf_map(camera(THIN), cell_px=1)
+    with pytest.raises(ShapeError, match="make the map of this camera"):
+        render.psf_frames(camera(THIN, 20), waves(), FRONT[None], psf)
+
+    class Glow:
+        dtype = D
+
+        def radiance(self, arr, origin, direction):
+            return arr.Float(1)
+
+    with pytest.raises(DomainError, match="a Glow does not say how far away"):
+        render.psf_frames(camera(THIN), Glow(), FRONT[None], psf)
