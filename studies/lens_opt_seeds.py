@@ -14,7 +14,7 @@ from codesign.errors import DomainError
 from studies.frame.config import configured
 from studies.frame.run import Run, StudyConfig, main, open_run
 from studies.lens_opt import __main__ as lens_opt
-from studies.lens_opt.page import DESIGNS, RIVALS
+from studies.lens_opt.comparison import DESIGNS, RIVALS, label
 from studies.lens_opt.paired import log_ratios, of_differences, pooled, verdict
 from studies.lens_opt.scan import scan
 
@@ -96,7 +96,7 @@ def _lenses(run, parts):
     run.section("Flow error and spots of every lens")
     for key, title in (("flow_error_mrad_hard", "Flow error (mrad)"), ("rms_spot_um", "Mean RMS spot (µm)")):
         rows = [[seed, *(part.metrics[f"{key}_{name}"] for name in names)] for seed, part in parts.items()]
-        run.table(title, ["seed", *(lens_opt.lens_opt_page.label(name, "flow") for name in names)], rows)
+        run.table(title, ["seed", *(label(name, "flow") for name in names)], rows)
         for seed, part in parts.items():
             run.record(**{f"seed{seed}_{key}_{name}": part.metrics[f"{key}_{name}"] for name in names})
 

@@ -21,6 +21,7 @@ from codesign.system import check
 from studies.frame.run import Run, StudyConfig, main
 from studies.lens_opt import page as lens_opt_page
 from studies.lens_opt import rivals
+from studies.lens_opt.comparison import label
 from studies.lens_opt.descend import JUDGED, Job, development_error, prepare
 from studies.lens_opt.paired import paired
 from studies.lens_opt.task import HELD_OUT, LIGHT, draw_case, make_worlds
@@ -207,9 +208,9 @@ def descend(course, name):
                 checkpoint.save(job.system.flow, run.path("network.safetensors"))
         course.save()
 
-    label = f"optimising {config.lens}: {lens_opt_page.label(name, config.objective)}"
+    title = f"optimising {config.lens}: {label(name, config.objective)}"
     try:
-        with run.progress(steps, label, done=job.loop.step_number) as bar:
+        with run.progress(steps, title, done=job.loop.step_number) as bar:
 
             def advance(loss, score):
                 bar.advance(loss=loss, spot_um=sum(job.history.spot_um[-1]) / 3)

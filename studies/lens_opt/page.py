@@ -1,6 +1,5 @@
 """The page of a lens_opt run: who wins, the rivals, layouts, spots, frames, event frames, curves, junction table."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
@@ -8,6 +7,8 @@ from codesign import events, render
 from codesign.errors import MissingPackageError
 from codesign.report import chain_figures, lens_figures
 from scenes import worlds
+from studies.lens_opt import comparison
+from studies.lens_opt.comparison import DESIGNS, RIVALS, label
 from studies.lens_opt.paired import paired, verdict
 from studies.lens_opt.task import DISTANCE_M, FIELDS, PITCH_MM, SENSOR
 
@@ -15,28 +16,6 @@ from studies.lens_opt.task import DISTANCE_M, FIELDS, PITCH_MM, SENSOR
 def blank_wall():
     """A wall without texture: the negative control."""
     return worlds.wall(np.full((64, 64), 60.0, dtype=np.float32), texel_m=0.003)
-
-
-DESIGNS = {"flow": "the flow design", "edge": "the edge design"}
-RIVALS = {
-    "refocused": "refocusing alone",
-    "spots": "the spot designer",
-    "edge": "the edge objective",
-    "flow": "the flow objective",
-}
-LENSES = {
-    "nominal": "published lens, in focus",
-    "defocused": "detuned, with its focus error",
-    "detuned": "detuned, in focus: the start",
-    "after_spots": "flow steps after the spot designer",
-}
-
-
-def label(name, objective):
-    """What a lens is called on the page."""
-    if name == "optimised":
-        return DESIGNS[objective].removeprefix("the ")
-    return LENSES.get(name) or RIVALS[name].removeprefix("the ")
 
 
 def write(run, course, lenses, junctions):
@@ -49,9 +28,9 @@ def write(run, course, lenses, junctions):
     pairs = {name: paired(errors["optimised"], errors[name]) for name in RIVALS if name in lenses}
     said = verdict(design, {RIVALS[name]: pair for name, pair in pairs.items()})
     complaints = {v["complaint"] for rows in course.choices.values() for v in rows if v["complaint"]}
-    _cards(run, pairs)
-    _who_wins(run, course, lenses, errors, complaints)
-    _rivals(run, course)
+    comparison.cards(run, pairs)
+    comparison.who_wins(run, course, lenses, errors, complaints)
+    comparison.settings(run, course)
     _lenses(run, job.task, lenses)
     _seen_by_the_sensor(run, job, lenses)
     _way(run, course)
@@ -68,129 +47,6 @@ def write(run, course, lenses, junctions):
     )
     run.finish("Lens optimisation for event flow", lead)
     run.say(said)
-
-
-def _cards(run, pairs):
-    m = run.metrics
-    for name in ("optimised", *pairs):
-        change = (
-            f"the design against it: {pairs[name].percent()}" if name in pairs else "mean of held-out cases"
-        )
-        run.card(
-            f"Flow error, {label(name, run.config.objective)}",
-            f"{m[f'flow_error_mrad_hard_{name}']:.3f} mrad",
-            f"RMS spot {m[f'rms_spot_um_{name}']:.1f} µm; {change}",
-        )
-
-
-def _who_wins(run, course, lenses, errors, complaints):
-    """Table of pairs, over all windows and by window, and their figure."""
-    objective = run.config.objective
-    design = label("optimised", objective)
-    run.section(
-        "Who wins",
-        "Hard events from the physical sensor, textures and motions never optimised on, the same cases for every "
-        f"lens. A change below 0 says that the {design} errs less than the lens of the row; where the interval holds "
-        "0, the two tie. All lenses have the same free variables, focal length, f-number and floors of thickness; the "
-        "published lens is a yardstick that no design here knows.",
-    )
-    for complaint in sorted(complaints):
-        run.text(f"**Note**: {complaint}")
-    found = course.found
-    m = run.metrics
-    rows = []
-    for name in lenses:
-        row = [label(name, objective), m[f"flow_error_mrad_hard_{name}"], m[f"rms_spot_um_{name}"]]
-        pair = None if name == "optimised" else paired(errors["optimised"], errors[name])
-        rows.append([*row, m[f"edge_below_floor_mm_{name}"], *_change(pair)])
-    run.table(
-        "Lenses on held-out cases",
-        [
-            "lens",
-            "flow error (mrad)",
-            "RMS spot (µm)",
-            "edge below its floor (mm)",
-            f"change by the {design}",
-            "it",
-        ],
-        rows,
-        f"RMS spot: mean over three fields of a wall at {DISTANCE_M:g} m, four wavelengths; a pixel is "
-        f"{PITCH_MM * 1e3:g} µm.",
-    )
-    if "after_spots" in lenses:
-        pair = paired(errors["after_spots"], errors["spots"])
-        run.text(
-            f"{run.config.after_steps} steps of the flow objective from the spot designer's lens change its flow error "
-            f"by {pair.percent()}: that {_JUDGED[pair.outcome]}."
-        )
-    rivals = [name for name in RIVALS if name in lenses]
-    rows = []
-    for h in FIELDS:
-        key = f"flow_error_mrad_field_{h:g}"
-        own = [row[key] for row in found["optimised"]]
-        changes = [paired(own, [row[key] for row in found[name]]).percent() for name in rivals]
-        rows.append([f"{h:g}", sum(own) / len(own), *changes])
-    run.table(
-        "Where: by window",
-        [
-            "window, of the way to the corner",
-            f"{design} (mrad)",
-            *(label(name, objective) for name in rivals),
-        ],
-        rows,
-        "Change of flow error by the design against each rival, in one window.",
-    )
-    shown = [name for name in ("detuned", *rivals, "after_spots") if name in lenses]
-    run.figure(
-        _pair_figure({label(name, objective): (errors["optimised"], errors[name]) for name in shown}, design),
-        "pairs",
-        f"Flow error of the {design} over that of each lens, a dot per held-out case; bars: mean and 95 % interval.",
-    )
-
-
-_JUDGED = {"wins": "is better", "loses": "is worse", "ties": "is a tie"}
-
-
-def _change(pair):
-    return ["", ""] if pair is None else [pair.percent(), pair.outcome]
-
-
-def _pair_figure(pairs, design):
-    figure, axis = plt.subplots(figsize=(9, 0.8 + 0.6 * len(pairs)))
-    for at, (own, rival) in enumerate(pairs.values()):
-        ratios = np.array(own) / np.array(rival)
-        axis.plot(ratios, np.full(len(ratios), at), "o", color="#1b6ca8", alpha=0.35, ms=4)
-        pair = paired(own, rival)
-        low, mean, high = np.exp([pair.low if pair.cases > 1 else pair.mean, pair.mean, min(pair.high, 50.0)])
-        if pair.cases > 1:
-            axis.plot([low, high], [at, at], "-", color="#c0392b", lw=3)
-        axis.plot([mean], [at], "|", color="#c0392b", ms=14, mew=3)
-    axis.axvline(1.0, color="0.4", lw=1)
-    axis.set_xscale("log")
-    axis.set_yticks(range(len(pairs)), list(pairs))
-    axis.invert_yaxis()
-    axis.set_xlabel(f"flow error of the {design} / flow error of the lens")
-    figure.tight_layout()
-    return figure
-
-
-def _rivals(run, course):
-    config = run.config
-    run.section(
-        "The rivals at their best",
-        f"Refocusing moves the film alone. The spot designer minimises the weighted mean square spot of the wall in the "
-        f"camera's own light by damped least squares, from {config.spot_starts} starts. Both choose among the settings "
-        f"below by the geometric mean flow error on {config.developed} development cases, of other textures than those "
-        "optimised on and those judged on. The other gradient objective runs from the same start, for as many steps, "
-        "with a clip and a step size of its own, which `lens_opt_seeds --scan` compares on development cases.",
-    )
-    for name, rows in course.choices.items():
-        least = min(rows, key=lambda row: row["error_mrad"])
-        run.table(
-            f"Settings: {label(name, config.objective)}",
-            ["setting", "flow error on development cases (mrad)", ""],
-            [[r["setting"], r["error_mrad"], "chosen" if r is least else ""] for r in rows],
-        )
 
 
 def _lenses(run, task, lenses):

@@ -91,11 +91,11 @@ def verdict(design: str, rivals: Mapping[str, Paired]) -> str:
         word = "ties"
     else:
         return (
-            f"{_capital(design)} wins: its flow error is {closest.percent()} of that of its best rival, {name}, on "
+            f"{_capital(design)} wins: its flow error against its best rival, {name}, is {closest.percent()} on "
             f"{closest.cases} unseen cases."
         )
     return (
-        f"{_capital(name)} {word}: the flow error of {design} over its own is {closest.percent()} on {closest.cases} "
+        f"{_capital(name)} {word}: the flow error of {design} against it is {closest.percent()} on {closest.cases} "
         "unseen cases."
     )
 

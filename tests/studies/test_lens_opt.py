@@ -122,9 +122,12 @@ def test_the_pooled_interval_is_the_wider_of_cases_and_seeds():
 @pytest.mark.parametrize(
     ("flow_mrad", "first_words"),
     [
-        ([0.40, 0.41, 0.39], "The flow design wins: its flow error is -20"),
+        (
+            [0.40, 0.41, 0.39],
+            "The flow design wins: its flow error against its best rival, the spot designer, is -20",
+        ),
         ([0.50, 0.49, 0.51], "The spot designer ties: "),
-        ([0.60, 0.61, 0.59], "The spot designer wins: the flow error of the flow design over its own is +20"),
+        ([0.60, 0.61, 0.59], "The spot designer wins: the flow error of the flow design against it is +20"),
     ],
 )
 def test_the_first_words_say_who_wins(flow_mrad, first_words):
