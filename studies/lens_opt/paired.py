@@ -77,27 +77,24 @@ def pooled(logs: torch.Tensor) -> Paired:
 
 
 def verdict(design: str, rivals: Mapping[str, Paired]) -> str:
-    """One sentence that says first who wins: a rival, nobody, or the design.
+    """One sentence that says first who wins: the rivals that do, those that tie, or the design where it beats all.
 
     Args: design: what it is called, "the flow design". rivals: what each is called -> Paired of the design over it.
     """
-    name, closest = max(rivals.items(), key=lambda item: item[1].mean)
-    lost = {n: p for n, p in rivals.items() if p.outcome == "loses"}
-    if lost:
-        name, closest = max(lost.items(), key=lambda item: item[1].mean)
-        word = "wins"
-    elif tied := {n: p for n, p in rivals.items() if p.outcome == "ties"}:
-        name, closest = max(tied.items(), key=lambda item: item[1].mean)
-        word = "ties"
-    else:
-        return (
-            f"{_capital(design)} wins: its flow error against its best rival, {name}, is {closest.percent()} on "
-            f"{closest.cases} unseen cases."
-        )
-    return (
-        f"{_capital(name)} {word}: the flow error of {design} against it is {closest.percent()} on {closest.cases} "
-        "unseen cases."
-    )
+    said = []
+    for outcome, words in (("loses", ("wins", "win")), ("ties", ("ties", "tie"))):
+        found = {name: pair for name, pair in rivals.items() if pair.outcome == outcome}
+        if found:
+            several = len(found) > 1
+            said.append(
+                f"{' and '.join(found)} {words[several]}: the flow error of {design} against "
+                f"{'them' if several else 'it'} is {' and '.join(pair.percent() for pair in found.values())}"
+            )
+    if not said:
+        name, closest = max(rivals.items(), key=lambda item: item[1].mean)
+        said.append(f"{design} wins: its flow error against its best rival, {name}, is {closest.percent()}")
+    cases = next(iter(rivals.values())).cases
+    return f"{_capital('; '.join(said))} on {cases} unseen cases."
 
 
 def _capital(text):

@@ -137,6 +137,19 @@ def test_the_first_words_say_who_wins(flow_mrad, first_words):
     assert said.endswith("3 unseen cases.")
 
 
+def test_several_rivals_that_win_or_tie_are_all_named_those_that_win_first():
+    flow_mrad = [0.60, 0.62, 0.59]
+    rows = {
+        "refocusing alone": [0.59, 0.62, 0.60],
+        "the spot designer": [0.5, 0.51, 0.49],
+        "the edge": flow_mrad,
+    }
+    said = verdict("the flow design", {name: paired(flow_mrad, row) for name, row in rows.items()})
+    assert said.startswith("The spot designer wins: the flow error of the flow design against it is +20")
+    assert "; refocusing alone and the edge tie: the flow error of the flow design against them is +0" in said
+    assert said.endswith("and +0.0 % (+0.0 to +0.0 %) on 3 unseen cases.")
+
+
 @pytest.mark.parametrize(
     ("name", "train", "objective", "sentence"),
     [
