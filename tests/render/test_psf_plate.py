@@ -1,0 +1,52 @@
+"""A lens with a phase plate, rendered by its point spread functions."""
+
+import pytest
+import torch
+
+from codesign import lens, render
+from codesign.lens import plates
+from codesign.lens.analysis import geometric_psf
+
+D = torch.float64
+PITCH = 0.00486
+
+
+def moments(energy):
+    """Mean [2] and central second moments [2] of a point spread about its middle pixel, px."""
+    at = torch.arange(energy.shape[-1], dtype=D) - energy.shape[-1] // 2
+    lines = [energy.sum(axis) / energy.sum() for axis in (0, 1)]
+    mean = torch.stack([(line * at).sum() for line in lines])
+    return mean, torch.stack([(line * at**2).sum() for line in lines]) - mean**2
+
+
+def plated_map(plate):
+    geo = lens.load("cooke-triplet").scaled(0.22).requires_grad_(False).focus_at(0.56)
+    plated = plates.with_plate(geo, plate, z_mm=0.3)
+    camera = render.Camera(plated, 33, 33, pixel_pitch_mm=PITCH)
+    return plated, render.psf_map(camera, nearest_m=0.3)
+
+
+def test_the_map_of_a_plated_lens_is_that_of_its_rays():
+    plate = plates.ZernikePlate({4: 0.3, 7: 0.8, 8: 0.9, 9: -0.6, 10: 0.6}, 0.9).requires_grad_(False)
+    plated, found = plated_map(plate)
+    for at_m in (0.3, 5.0):
+        mean, square = moments(found.energy(torch.tensor([at_m]))[0, 0])
+        # rays the other way, on the axis; the picture is upright, the film is not
+        truth, truth_square = moments(geometric_psf(plated, 0.0, PITCH, 64, at_m=at_m, grid=64).energy)
+        torch.testing.assert_close(mean, -truth, rtol=0, atol=0.02)
+        torch.testing.assert_close(square, truth_square, rtol=0.05, atol=0.02)
+
+
+def test_its_gradient_reaches_the_plate():
+    plate = plates.ZernikePlate({7: 0.8, 11: 0.5}, 0.9)
+
+    def mean():
+        return moments(plated_map(plate)[1].energy(torch.tensor([0.3]))[0, 0])[0].sum()
+
+    (found,) = torch.autograd.grad(mean(), plate.coefficients_rad)
+    values = []
+    for step in (1e-3, -2e-3):
+        plate.coefficients_rad.data[0] += step
+        values.append(float(mean().detach()))
+    # the mean of bilinear shares is that of the rays, so it is smooth
+    assert float(found[0]) == pytest.approx((values[0] - values[1]) / 2e-3, rel=1e-4)
