@@ -32,8 +32,7 @@ def psf_frames(
     T_world_cam: Tensor,
     psf: PsfMap | None = None,
 ) -> Tensor:
-    """Frames as ``render.frames`` has them, by convolution: four rays per pixel whatever the blur, no sampling
-    noise.
+    """Frames as ``render.frames`` has them, by convolution: four rays per pixel whatever the blur.
 
     >>> from codesign import lens, pose, render
     >>> camera = render.Camera(lens.ThinLens(8.0, 1.0).focus_at(1.0), 16, 16, pixel_pitch_mm=0.05)
@@ -99,8 +98,10 @@ def _frame(psf, light, per_m, lit, numbers, step):
     place = torch.tensor(list(numbers))[:, None].to(per_m)
     share = (1 - (per_m / step - place).abs()).clamp_min(0) * lit
     size = (film.height_px + 2 * psf.radius_px, film.width_px + 2 * psf.radius_px)
-    layers = torch.stack([share * light, share], 1).reshape(len(numbers), 2, -1, *size, SIDE * SIDE)
-    layers = layers.movedim(-1, 2)
+    layers = torch.stack([share * light, share], 1).reshape(
+        len(numbers), 2, -1, *size, SIDE * SIDE, psf.fine**2
+    )
+    layers = layers.mean(-1).movedim(-1, 2)
     if (len(numbers) - 1) * step > psf.step_per_m:  # otherwise blur changes by less than a pixel
         layers = _filled(layers, 2 * psf.radius_px + 1)
     blurred = _convolved(psf, layers, [number * step for number in numbers])

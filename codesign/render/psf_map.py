@@ -26,7 +26,7 @@ LAYER_PX = 1.0  # of blur's radius, from one layer of depth to the next
 PUPIL_PX = 1.0  # spacing of the pupil's points in the widest blur, about
 ACROSS = 32  # film points across the sensor whose light is traced
 APART_PX = 0.5  # of the chief rays that give the scale of the picture, on either side
-SIDE = 2  # chief rays of the sharp picture per side of a pixel
+SIDE = 2  # values of the sharp picture per side of a pixel
 # a pixel's weights reach beyond the blur by the quartic splines and, until it has fallen below 0.5 %, the ringing
 # of the interpolation, in spacings of the sharp picture
 TAIL_PX = math.ceil((2.5 + (SIDE - 1) / 2 + 4) / SIDE)
@@ -40,7 +40,8 @@ class PsfMap:
       ``grid`` = (windows, rows, columns) of them, N in all, cells of ``cell_px`` (rows, columns) pixels between.
     transmission: [windows, H, W] share of the light that passes, as in the traced frames. radius_px: how far the
       light of a pixel comes from. step_per_m: of 1 / distance, over which blur grows by LAYER_PX at most. sharp:
-      chief rays, SIDE x SIDE per pixel of the film and a margin of radius_px around it, window after window.
+      chief rays of the film's pixels and a margin of radius_px around them, window after window, SIDE x SIDE values a
+      pixel of ``fine`` x ``fine`` rays each.
       transfers: what ``psf_frames`` keeps for its next call.
     base_m, slope: [N, M, 2] where rays through pupil points meet the entrance pupil's plane, and their slopes,
       both relative to the chief ray; share: [N, M] of the light, sum 1. base_m_per_px, slope_per_px: [N, 2, 2] the
@@ -61,6 +62,7 @@ class PsfMap:
     radius_px: int
     step_per_m: float
     sharp: Rays
+    fine: int
     transfers: dict[tuple[Any, ...], Tensor] = field(default_factory=dict, repr=False, compare=False)
 
     def offsets_px(self, per_m: Tensor) -> Tensor:
@@ -107,17 +109,19 @@ class PsfMap:
 
     def weights(self, per_m: Tensor) -> Tensor:
         """What pixels gather from the sharp picture at 1 / distance [J]: [J, N, S, S, K, K], by which the
-        picture of each of a pixel's S x S chief rays is convolved; K = 2 radius_px + 1, all of a node sum to 1.
+        picture of each of a pixel's S x S values is convolved; K = 2 radius_px + 1, all of a node sum to 1.
 
-        The sharp picture is taken as the cubic spline through its values, and integrated over the pixel and the
-        blur in closed form: quartic splines. Source: Unser, IEEE Signal Processing Magazine 16, 1999.
+        The sharp picture is taken as the cubic spline through its values. Values of one ray each are integrated
+        over the pixel in closed form (quartic splines); those of several are means over their part of it already.
+        Source: Unser, IEEE Signal Processing Magazine 16, 1999.
         """
         dtype = per_m.dtype
         share = self.share.to(dtype)
         spacings = torch.arange(-SIDE * self.radius_px, SIDE * (self.radius_px + 1), dtype=dtype)
         gathered = -SIDE * self.offsets_px(per_m).to(dtype)
         far = gathered[..., None] - (spacings - (SIDE - 1) / 2)
-        splines = sum(_quartic(far + shift - (SIDE - 1) / 2) for shift in range(SIDE)) / SIDE
+        spline = _quartic if self.fine == 1 else _cubic
+        splines = sum(spline(far + shift - (SIDE - 1) / 2) for shift in range(SIDE)) / SIDE
         inverse = torch.linalg.inv(_cubic(spacings[:, None] - spacings))
         found = inverse @ _shared(splines, share) @ inverse
         found = (
@@ -126,12 +130,12 @@ class PsfMap:
         return found.permute(0, 1, 3, 5, 2, 4).flip((-2, -1))
 
 
-def psf_map(camera: Camera, nearest_m: float = 0.3, cell_px: int = 64) -> PsfMap:
+def psf_map(camera: Camera, nearest_m: float = 0.3, cell_px: int = 64, rays_per_px: int = 4) -> PsfMap:
     """Trace what the point spread functions of a camera at all distances from ``nearest_m`` on follow from.
 
     Args: camera: before any lens with ``camera_rays``; its spectrum, falloff and aim count, its samples do not.
       nearest_m: metres from the entrance pupil. cell_px: largest spacing of the film points between which
-      point spread functions are interpolated.
+      point spread functions are interpolated. rays_per_px: 4, or for scenes full of hard edges 16, 36, 64, ...
     Gradient: to the lens. To be made anew for every state of the lens.
     Raises: DomainError when the blur is wider than LARGEST_PX, or no light reaches the film.
     """
@@ -139,6 +143,11 @@ def psf_map(camera: Camera, nearest_m: float = 0.3, cell_px: int = 64) -> PsfMap
         raise DomainError(f"psf map: nearest_m = {nearest_m} must be a positive, finite distance in metres.")
     if not cell_px >= 2:
         raise DomainError(f"psf map: cell_px = {cell_px} must be at least 2 pixels.")
+    fine = math.isqrt(max(0, rays_per_px)) // SIDE
+    if fine < 1 or (SIDE * fine) ** 2 != rays_per_px:
+        raise DomainError(
+            f"psf map: rays_per_px = {rays_per_px} must be 4, 16, 36 or another square of an even number."
+        )
     nodes, grid, cell = _nodes(camera, cell_px)
     chief = _lines(camera.chief_rays(_around(nodes)))
     base, slope = (part.reshape(-1, 5, 2) for part in chief)
@@ -173,7 +182,8 @@ def psf_map(camera: Camera, nearest_m: float = 0.3, cell_px: int = 64) -> PsfMap
         *scale,
         math.ceil(reach) + TAIL_PX,
         step,
-        camera.chief_rays(_places(camera.film, math.ceil(reach) + TAIL_PX)),
+        camera.chief_rays(_places(camera.film, math.ceil(reach) + TAIL_PX, fine)),
+        fine,
     )
 
 
@@ -273,13 +283,16 @@ def _solved(matrix, vectors):
     return torch.stack([(d * x - b * y) * inverse, (a * y - c * x) * inverse], -1)
 
 
-def _places(film, margin):
-    """Pixel coordinates of SIDE x SIDE equal parts of every pixel of the windows and a margin around them."""
+def _places(film, margin, fine):
+    """Pixel coordinates of ``fine`` x ``fine`` points in each of SIDE x SIDE equal parts of every pixel of the windows
+    and a margin around them."""
     lines = [torch.arange(-margin, n + margin, dtype=torch.float64) for n in (film.height_px, film.width_px)]
     corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
-    parts = (torch.arange(SIDE, dtype=torch.float64) + 0.5) / SIDE - 0.5
+    count = SIDE * fine
+    inside = ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5).reshape(SIDE, fine)
+    y, x = torch.broadcast_tensors(inside[:, None, :, None], inside[None, :, None, :])
     at = corners[:, None] + torch.cartesian_prod(*lines).flip(1)
-    return (at[:, :, None] + torch.cartesian_prod(parts, parts).flip(1)).reshape(-1, 2)
+    return (at[:, :, None] + torch.stack([x.reshape(-1), y.reshape(-1)], 1)).reshape(-1, 2)
 
 
 def _shared(at, share):

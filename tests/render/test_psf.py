@@ -147,6 +147,22 @@ def test_windows_trajectories_and_lists_of_scenes_have_the_shapes_of_frames():
     assert rms_share(found, render.frames(cam, scenes, poses)) < 0.005
 
 
+def test_more_rays_per_pixel_for_hard_edges():
+    """The edge of a card before a pinhole: 16 rays per pixel are the means of the parts they lie in."""
+    pose = look_at((0.0, 0.0, 1.5), (0, 0, 0), down=(0, 1, 0)) @ se3_exp(
+        torch.tensor([0, 0, 0, 0, 0, 0.3], dtype=D)
+    )
+    cam = camera(lens.Pinhole(10.0), 24, 20)
+    card = half_before(100.0, 50.0)
+    truth = render.frames(cam, card, pose[None])
+    few, many = (
+        render.psf_frames(cam, card, pose[None], render.psf_map(cam, rays_per_px=n)) for n in (4, 64)
+    )
+    # the share of a pixel behind an edge is known to half a row of points, 1 / 16, with 64 in a square
+    assert float((many - truth).abs().max()) < 50 / 16 + 0.5
+    assert float((many - truth).norm()) < 0.5 * float((few - truth).norm())
+
+
 def half_before(front, behind):
     """A card left of x = 0 at z = 1 before a wall at z = 0, both of one radiance."""
     mi = worlds.backend.mitsuba()
@@ -262,6 +278,8 @@ def test_refusals():
         render.psf_map(camera(THIN), nearest_m=-1)
     with pytest.raises(DomainError, match=r"cell_px = 1"):
         render.psf_map(camera(THIN), cell_px=1)
+    with pytest.raises(DomainError, match="rays_per_px = 9"):
+        render.psf_map(camera(THIN), rays_per_px=9)
     with pytest.raises(ShapeError, match="make the map of this camera"):
         render.psf_frames(camera(THIN, 20), waves(), FRONT[None], psf)
 
