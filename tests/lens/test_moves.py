@@ -214,7 +214,7 @@ def test_neighbours_are_the_nearest_of_all(name):
 
 
 def test_an_exchanged_glass_keeps_focal_length_and_defocus(triplet):
-    other = with_glass(triplet, 2, Glass.named("SF1"))
+    other = with_glass(triplet, 2, "SF1")
     assert efl(other) == pytest.approx(efl(triplet), rel=1e-12)
     assert [s.medium and s.medium.name for s in other.to_surfaces()][2] == "SF1"
     assert torch.equal(other.curvature_per_mm[:5], triplet.curvature_per_mm[:5])

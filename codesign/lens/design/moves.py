@@ -122,9 +122,11 @@ def flattened(lens: GeoLens, element: int, share: float) -> GeoLens:
     return lens.replace(curvature_per_mm=c + share * (target - c))
 
 
-def with_glass(lens: GeoLens, surface: int, medium: Glass) -> GeoLens:
-    """The lens with another glass behind a surface (counted from 0), focal length, f-number and defocus as before.
+def with_glass(lens: GeoLens, surface: int, medium: Glass | str) -> GeoLens:
+    """The lens with another glass behind a surface (counted from 0), focal length, f-number and defocus as before;
+    ``GeoLens.replace_glass`` leaves them as they come.
 
+    Args: medium: a Glass, or a name of the catalogue.
     Returns, Raises: as ``without_element``; DomainError for a gap that holds no glass.
     """
     if surface not in [front for front, _ in elements(lens)]:
@@ -132,9 +134,9 @@ def with_glass(lens: GeoLens, surface: int, medium: Glass) -> GeoLens:
         raise DomainError(
             f"{lens.name}: there is no glass behind surface {surface} to exchange; there is behind {fronts or 'none'}."
         )
-    surfaces = _surfaces(lens)
-    surfaces[surface] = replace(surfaces[surface], medium=medium)
-    return _held(lens, surfaces, f"with {medium.name} behind surface {surface + 1}")
+    name = medium if isinstance(medium, str) else medium.name
+    other = lens.replace_glass(surface, medium)
+    return _held(lens, _surfaces(other), f"with {name} behind surface {surface + 1}")
 
 
 def _element_faces(lens, pairs, element):
