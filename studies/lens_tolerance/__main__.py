@@ -45,7 +45,7 @@ DRAWS = 20000  # of the quadratic form, for its quantiles
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
-    QUICK: ClassVar = {"trials": 150, "flow_lenses": 4, "flow_cases": 1, "flow_fresh": 1}
+    QUICK: ClassVar = {"trials": 150, "flow_lenses": 3, "flow_cases": 1, "flow_fresh": 0}
     lens: str = "cooke-triplet"
     """Lens: cooke-triplet, double-gauss, la1509, or a lens file."""
     trials: int = 1000
