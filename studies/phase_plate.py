@@ -20,7 +20,7 @@ from torch import Tensor
 from codesign import events, lens
 from codesign.errors import DomainError
 from codesign.lens import WAVELENGTH_UM, GeoLens, wave
-from codesign.lens.analysis import psf_on_pixels
+from codesign.lens.analysis import Light, psf_on_pixels
 from codesign.lens.plates import ZernikePlate, with_plate
 from scenes import textures
 from studies.frame.run import Run, StudyConfig, main
@@ -30,8 +30,8 @@ CYCLES_PER_PX = (1 / 8, 1 / 4)
 DIRECTIONS = 8  # of the half circle
 FINER = 2  # samples of the point spread per pixel
 SAMPLES = 64
-TERMS = (4, 7, 8, 9, 10, 11, 22)
-STARTS = {  # radians RMS; the cubic is x^3 + y^3
+TERMS: tuple[int, ...] = (4, 7, 8, 9, 10, 11, 22)
+STARTS: dict[str, dict[int, float]] = {  # radians RMS; the cubic is x^3 + y^3
     "cubic": {7: 0.7, 8: 0.7, 9: -0.7, 10: 0.7},
     "round": {11: 0.8},
 }
@@ -154,11 +154,11 @@ def closed_forms(run, quick):
 
 
 def contrast(
-    config: Config, geo: GeoLens, at_m: float | Tensor, share: float, light=WAVELENGTH_UM["d"]
+    config: Config, geo: GeoLens, at_m: float | Tensor, share: float, light: Light = WAVELENGTH_UM["d"]
 ) -> Tensor:
     """Contrast [frequencies] of a point spread: the root mean square of its transfer over all directions."""
     fine_mm = config.pixel_um * 1e-3 / FINER
-    field_rad = math.radians(share * geo.half_field_deg)
+    field_rad = math.radians(share * (geo.half_field_deg or 0.0))
     energy = psf_on_pixels(geo, field_rad, fine_mm, SAMPLES, light, at_m=at_m).energy
     turn = torch.arange(DIRECTIONS, dtype=D) * (math.pi / DIRECTIONS)
     cycles = torch.tensor(CYCLES_PER_PX, dtype=D)[:, None] / FINER
@@ -213,7 +213,7 @@ def design(run, geo, per_m):
             done.append(best[1])
             run.save_state({"coefficients": torch.stack(done)}, {"losses": losses})
     name = min(losses, key=lambda n: min(losses[n]))
-    found = dict(zip(TERMS, done[list(losses).index(name)].tolist(), strict=True))
+    found: dict[int, float] = dict(zip(TERMS, done[list(losses).index(name)].tolist(), strict=True))
     run.card("Plate", name, f"the better of {len(losses)} starts")
     run.section("The plate", "Noll's terms, radians RMS over 1.1 times the stop's radius.")
     run.table("Coefficients", ("term", "rad"), [(str(t), f"{v:+.3f}") for t, v in found.items()])

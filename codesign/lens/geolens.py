@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import nn
@@ -115,8 +115,8 @@ class GeoLens(Replaceable):
         self.soft_edge_mm = float(soft_edge_mm)
         self.half_field_deg = half_field_deg
         self.mirrors = tuple(s.mirror for s in surfaces)
-        self.plate: nn.Module | None = None
-        self.plate_at = (0, 0.0)
+        self.plate: Any = None
+        self.plate_at: tuple[int, float] = (0, 0.0)
 
         def column(values):
             return torch.tensor(values, dtype=dtype)

@@ -155,8 +155,8 @@ def test_rays_of_the_camera_go_the_same_way_back():
     film = torch.tensor([[1.0, 2.0], [0.3, -4.0], [5.0, 0.0]], dtype=D)
     pupil = torch.tensor([[0.3, 0.2], [-0.4, 0.6], [0.0, 0.0]], dtype=D)
     flip = torch.tensor([1.0, 1.0, -1.0], dtype=D)
-    for where in ({"z_mm": 1.0}, {"surface": -1, "z_mm": 5.0}):
-        plated = with_plate(geo, bumpy(15, 1.0), **where)
+    for surface, z_mm in ((None, 1.0), (-1, 5.0)):
+        plated = with_plate(geo, bumpy(15, 1.0), surface, z_mm)
         for aim in (False, True):
             rays = plated.camera_rays(film, pupil, aim=aim)
             start = (rays.origin_m + rays.direction) * 1e3 * flip
@@ -170,9 +170,9 @@ def test_gradients_of_the_cameras_rays_reach_the_plate():
     geo = landscape()
     film = torch.tensor([[1.0, 2.0], [0.3, -4.0]], dtype=D)
     pupil = torch.tensor([[0.3, 0.2], [-0.4, 0.6]], dtype=D)
-    for where in ({"z_mm": 1.0}, {"surface": -1, "z_mm": 20.0}):
+    for surface, z_mm in ((None, 1.0), (-1, 20.0)):
         plate = ZernikePlate({7: 2.0, 11: 1.0}, 5.0)
-        plated = with_plate(geo, plate, **where)
+        plated = with_plate(geo, plate, surface, z_mm)
 
         def slope(plated=plated):
             rays = plated.camera_rays(film, pupil, aim=True)

@@ -1,7 +1,6 @@
 """Where a phase plate stands in a lens, and how finely light has to be sampled to see it."""
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -72,7 +71,7 @@ def cells_for_plate(lens: GeoLens, wavelength_um: float) -> int:
 
     The beam is that of the axis in parallel light, by its paraxial marginal ray.
     """
-    plate: Any = lens.plate
+    plate = lens.plate
     if plate is None:
         return 0
     gap, after = lens.plate_at
@@ -105,10 +104,13 @@ def plate_waves(
     to second order of the angle. Gradient: to the plate, the lens and at_m.
     """
     p = lens.prescription(wavelength_um)
+    placed = p.plate
+    if placed is None:
+        raise DomainError(f"{lens.name} has no phase plate; give it one with plates.with_plate.")
     source = source_rays(lens, field_rad, pupil, at_m)
-    rays = to_plate(p, p.plate, source.origin_mm, source.direction)
-    phase, _, reaches = p.plate.look(rays.position_mm[:, :2])
-    return phase * (p.plate.mm_per_rad / (wavelength_um * 1e-3)), reaches
+    rays = to_plate(p, placed, source.origin_mm, source.direction)
+    phase, _, reaches = placed.look(rays.position_mm[:, :2])
+    return phase * (placed.mm_per_rad / (wavelength_um * 1e-3)), reaches
 
 
 def _reach(lens, surface, sign):

@@ -92,6 +92,8 @@ class GridPlate(Plate):
     phase_rad: [N, N] Parameter.
     """
 
+    spline: Tensor
+
     def __init__(
         self,
         phase_rad: Tensor | Sequence[Sequence[float]],
