@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from codesign.lens.kernel import FORWARD, GRAZING
-from codesign.lens.trace import PlateAt, Prescription, Status, TraceResult
+from codesign.lens.trace import PlateAt, Prescription, Status, TraceResult, joined, onward
 from codesign.lens.trace import trace as trace_surfaces
 
 
@@ -27,25 +27,14 @@ def trace(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> T
     after = torch.as_tensor(placed.after_mm).to(p.thickness_mm)
     index = p.index[gap + 1]
     here = _turned(to_plate(p, placed, origin_mm, direction), placed, index, max(gap, 0))
-    alive = here.status == Status.OK
     if gap == last:
         rest = straight(here.position_mm, here.direction, p.thickness_mm[last] - after, index)
     else:
         depth = after - p.thickness_mm[gap] if gap >= 0 else after
-        at = torch.cat([here.position_mm[:, :2], depth.expand(len(alive), 1)], 1)
-        axis = torch.tensor([0.0, 0.0, 1.0], dtype=at.dtype, device=at.device)
-        safe = torch.where(alive[:, None], here.direction, axis)
+        at, safe = onward(here)
+        at = torch.cat([at[:, :2], depth.expand(len(at), 1)], 1)
         rest = trace_surfaces(replace(p.part(gap + 1, last + 1), efficiency=1.0), at, safe)
-    inside = (here.packed_status & 4) & (rest.packed_status & 4)
-    failed = torch.where(rest.failed_surface < 0, -1, rest.failed_surface + gap + 1)
-    return TraceResult(
-        torch.where(alive[:, None], rest.position_mm, here.position_mm),
-        torch.where(alive[:, None], rest.direction, here.direction),
-        torch.where(alive, here.optical_path_mm + rest.optical_path_mm, here.optical_path_mm),
-        torch.where(alive, here.weight * rest.weight, 0),
-        torch.where(alive, 8 * failed + rest.status + inside, here.packed_status),
-        torch.where(alive, rest.deficit, here.deficit),
-    )
+    return joined(here, rest, gap + 1)
 
 
 def to_plate(

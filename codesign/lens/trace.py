@@ -34,6 +34,10 @@ class PlateAt:
         return replace(self, gap=len(thickness_mm) - 2 - self.gap, after_mm=after)
 
 
+LONGEST = 16  # surfaces of one kernel
+SEGMENT = 8
+
+
 @dataclass(frozen=True)
 class Prescription:
     """Numbers the kernel needs, for one wavelength. Tensors of one dtype and device; gradients flow to all of
@@ -215,9 +219,13 @@ def trace(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> T
     Returns: TraceResult.
     Gradient: position, direction, optical path, weight and deficit, to rays and to every tensor of the
       prescription.
+    Lenses of more than LONGEST surfaces are traced in segments, each a kernel of its own: the time to compile one
+      grows with the square of its length, and segments alike share one.
     """
     p = prescription
     count = origin_mm.shape[0]
+    if len(p.mirrors) > LONGEST:
+        return _in_segments(p, origin_mm, direction)
     edge = max(p.soft_edge_mm, 1e-6)
     conics = [
         p.conic.requires_grad or k != 0 for k in p.conic.tolist()
@@ -270,6 +278,55 @@ def trace(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> T
         ]
     found = TraceResult(*run_kernel(kernel, columns, [(count, 3), (count, 3), *[(count,)] * 4]))
     return found if p.efficiency == 1 else replace(found, weight=found.weight * p.efficiency)
+
+
+def _in_segments(p, origin_mm, direction):
+    """Trace through SEGMENT surfaces at a time, from vertex plane to vertex plane."""
+    count = len(p.mirrors)
+    found = None
+    for first in range(0, count, SEGMENT):
+        stop = min(first + SEGMENT, count)
+        segment = replace(
+            p.part(first, stop),
+            to_plane=p.to_plane or stop < count,
+            efficiency=1.0 if found else p.efficiency,
+        )
+        if found is None:
+            found = trace(segment, origin_mm, direction)
+        else:
+            found = joined(found, trace(segment, *onward(found)), first)
+    return found
+
+
+def onward(rays: TraceResult) -> tuple[Tensor, Tensor]:
+    """Origins and directions [N, 3] to trace on with; along the axis for rays that failed, which ``joined`` drops."""
+    alive = rays.packed_status < 0
+    if bool(alive.all()):
+        return rays.position_mm, rays.direction
+    axis = rays.direction.new_tensor([0.0, 0.0, 1.0])
+    return rays.position_mm, torch.where(alive[:, None], rays.direction, axis)
+
+
+def joined(front: TraceResult, rest: TraceResult, surfaces: int) -> TraceResult:
+    """Rays through the first ``surfaces`` of a lens and then through the rest, as one TraceResult."""
+    alive = front.packed_status < 0  # no surface where they failed
+    packed = torch.where(rest.packed_status < 0, rest.packed_status, rest.packed_status + 8 * surfaces)
+    packed = packed & (front.packed_status | ~4)  # inside both
+    if bool(alive.all()):  # the same as below, in a third of the time
+        return replace(
+            rest,
+            optical_path_mm=front.optical_path_mm + rest.optical_path_mm,
+            weight=front.weight * rest.weight,
+            packed_status=packed,
+        )
+    return TraceResult(
+        torch.where(alive[:, None], rest.position_mm, front.position_mm),
+        torch.where(alive[:, None], rest.direction, front.direction),
+        torch.where(alive, front.optical_path_mm + rest.optical_path_mm, front.optical_path_mm),
+        torch.where(alive, front.weight * rest.weight, 0),
+        torch.where(alive, packed, front.packed_status),
+        torch.where(alive, rest.deficit, front.deficit),
+    )
 
 
 def sum_over_chunks(function: Callable[..., Tensor], *rays: Tensor, rows: int = 262_144) -> Tensor:

@@ -26,6 +26,7 @@ from codesign import lens
 from codesign.errors import DomainError
 from studies.frame.run import Run, StudyConfig, main
 from studies.frame.timing import Timing, measure
+from studies.lens_bench import compiling
 from studies.lens_bench.compared import show_analyses, time_analyses
 from studies.lens_bench.tracers import SURFACES, make_rays, tracing_work
 
@@ -99,7 +100,7 @@ def study(run: Run[Config]) -> None:
     counts = [n for n in (10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000, 10_000_000) if n <= most]
     found: dict[tuple, list[dict]] = {case: [] for case in cases}
     with run.progress(
-        config.rounds * len(cases) + 2 * len(counts) + 2 * len(LONGER) + 4 + 2, "timing"
+        config.rounds * len(cases) + 2 * len(counts) + 2 * len(LONGER) + 4 + 2 + len(COLD), "timing"
     ) as progress:
         for _ in range(config.rounds):
             for case in cases:
@@ -120,11 +121,16 @@ def study(run: Run[Config]) -> None:
             for count in (most // 10, most):
                 memory[way, count] = in_process(way, "float32", "forward_backward", count, 1, config.seed)
                 progress.advance()
+        cold = {}
+        for kind, count in COLD:
+            cold[kind, count] = compiling.measure(count, kind)
+            progress.advance()
     missing = sorted({package for tracer, package in PEERS.items() if not importlib.util.find_spec(package)})
     show(run, compare(run, found, rays, config.seed), missing)
     show_analyses(run, analyses)
     show_growth(run, counts, growth, longer)
     show_memory(run, memory)
+    compiling.show(run, cold)
     run.finish(
         "Ray tracers",
         "Time, memory and error of ray tracers on the same lens and rays, in one run."
@@ -335,6 +341,7 @@ def _dot(a, b):
 
 
 LONGER = (1, 2, 4, 8)  # times the surfaces of a double Gauss
+COLD = tuple((kind, count) for kind in compiling.KINDS for count in compiling.SURFACES)
 KINDS = ("forward", "forward_backward")
 ROUNDS = 8
 
