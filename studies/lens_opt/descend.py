@@ -87,12 +87,12 @@ def prepare(
     if stage is None:
         stage = estimator(config.flow, config.train_network, config.objective, config.weights, config.seed)
     task = task or make_task(config.lens, config.seed, config.detuned_px)
-    objective = objective or config.objective
+    chosen: str = objective or config.objective
     pool = make_worlds(TRAINING)
     camera = DesignedCamera(task, config.samples)
-    train = config.train_network and objective == "flow"
+    train = config.train_network and chosen == "flow"
     every_px = 2 if train else 8  # a network is taught at more pixels than a lens needs
-    system = task.system(camera, layer, stage, objective, every_px)
+    system = task.system(camera, layer, stage, chosen, every_px)
     hard = system.replaced(events=HardSensor(SENSOR, system.bins))
     scored = [draw_case(pool, TRAINED + i) for i in range(config.scored)]
 
@@ -106,7 +106,7 @@ def prepare(
     def score():
         return fmean(float(hard(case).loss) for case in scored) + float(penalty())
 
-    optimiser = _optimiser(config, system, objective, train, part, scored[0])
+    optimiser = _optimiser(config, system, chosen, train, part, scored[0])
     return Job(task, camera, system, Loop(optimiser, samples, clip=None, judge=score), scored[0], History())
 
 
