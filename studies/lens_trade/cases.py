@@ -137,4 +137,3 @@ def hard_log_error(geo: GeoLens, case: Batch, light: Light, fno: float, samples:
 
 def smooth_layer(light: Light):
     return events.layer("memory", light.sensor, learn=())
-

@@ -1,0 +1,5 @@
+"""The page of the trade study."""
+
+
+def write(run, tables):
+    pass
