@@ -36,15 +36,15 @@ class Config(StudyConfig):
     """Which trades: track, elements, aperture, tolerance, field."""
     starts: int = 5
     """Random starts of every trade."""
-    steps: int = 12
+    steps: int = 10
     """Steps of the flow designer from every start."""
-    batch: int = 6
+    batch: int = 5
     """Cases per step."""
-    tries: int = 40
+    tries: int = 24
     """Lenses that the search without gradients tries after the descents."""
-    development: int = 12
+    development: int = 10
     """Cases by which both designers choose among their lenses."""
-    judged: int = 56
+    judged: int = 52
     """Held-out cases."""
     workers: int = 2
     """Processes at a time, one thread each."""

@@ -37,7 +37,9 @@ def write(run, tables):
     won = [name for name, outcome in found.items() if outcome.reaches_asked]
     for name, outcome in found.items():
         outcome.record(run)
-        run.card(TRADES[name].label, outcome.headline(), "at the spot designer's error in the middle of the range")
+        run.card(
+            TRADES[name].label, outcome.headline(), "at the spot designer's error in the middle of the range"
+        )
     run.record(trades_won=len(won), trades=len(found), points_failed=len(failed))
     run.section("The answer", _answer(found, won))
     for name, outcome in found.items():
@@ -73,7 +75,9 @@ def write(run, tables):
     )
     run.record(**{f"error_variance_explained_by_spot_{name}": share for name, share in shared.items()})
     if failed:
-        run.section("What could not be worked out", "\n".join(f"- {r['trade']}: {r['error']}" for r in failed))
+        run.section(
+            "What could not be worked out", "\n".join(f"- {r['trade']}: {r['error']}" for r in failed)
+        )
     run.finish("Five trades of a lens for event flow", _lead(found, won))
 
 
@@ -86,11 +90,11 @@ class Outcome:
         self.values = [row["value"] for row in rows]
         if not rows:
             return
-        errors = {d: torch.tensor([row[d]["held_out"] for row in rows], dtype=torch.float64) for d in DESIGNERS}
+        errors = {
+            d: torch.tensor([row[d]["held_out"] for row in rows], dtype=torch.float64) for d in DESIGNERS
+        }
         self.errors = errors
-        self.ratios = [
-            paired(row["spots"]["held_out"], row["flow"]["held_out"], generator) for row in rows
-        ]
+        self.ratios = [paired(row["spots"]["held_out"], row["flow"]["held_out"], generator) for row in rows]
         self.over_textbook = [
             paired(row["textbook"]["held_out"], row["flow"]["held_out"], generator) for row in rows
         ]
@@ -115,7 +119,11 @@ class Outcome:
             return f"{gain:+.2f} elements"
         if self.name == "aperture":
             return f"{gain / (math.log(2) / 2):+.2f} stops"
-        return f"{100 * (math.exp(gain) - 1):+.1f} %" if self.name != "track" else f"{100 * (1 - math.exp(-gain)):+.1f} %"
+        return (
+            f"{100 * (math.exp(gain) - 1):+.1f} %"
+            if self.name != "track"
+            else f"{100 * (1 - math.exp(-gain)):+.1f} %"
+        )
 
     def record(self, run):
         for row, ratio, gain in zip(self.rows, self.ratios, self.gains, strict=True):
@@ -162,13 +170,15 @@ class Outcome:
             )
         middle = self.errors["spots"].mean(1)
         low, high = (
-            torch.tensor([getattr(r, side) for r in self.ratios], dtype=torch.float64) for side in ("low", "high")
+            torch.tensor([getattr(r, side) for r in self.ratios], dtype=torch.float64)
+            for side in ("low", "high")
         )
         axis.fill_between(
             self.values, (middle + low).exp(), (middle + high).exp(), color=COLOURS["flow"], alpha=0.2
         )
         axis.set(
-            xlabel=TRADES[self.name].label + (f" ({TRADES[self.name].unit})" if TRADES[self.name].unit else ""),
+            xlabel=TRADES[self.name].label
+            + (f" ({TRADES[self.name].unit})" if TRADES[self.name].unit else ""),
             ylabel="flow error on held-out cases (mrad)",
         )
         axis.set_yscale("log")
@@ -268,6 +278,11 @@ def _scatter(found):
                 markersize=5 if flow else 3,
                 label=None if flow else f"{name} ({100 * outcome.explained():.0f} % explained)",
             )
-    axis.set(xlabel="RMS spot over field and depth (px)", ylabel="flow error over its trade's mean", xscale="log", yscale="log")
+    axis.set(
+        xlabel="RMS spot over field and depth (px)",
+        ylabel="flow error over its trade's mean",
+        xscale="log",
+        yscale="log",
+    )
     axis.legend(frameon=False)
     return figure
