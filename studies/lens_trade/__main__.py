@@ -40,9 +40,9 @@ class Config(StudyConfig):
     """Steps of the flow designer from every start."""
     batch: int = 5
     """Cases per step."""
-    tries: int = 24
+    tries: int = 16
     """Lenses that the search without gradients tries after the descents."""
-    development: int = 10
+    development: int = 20
     """Cases by which both designers choose among their lenses."""
     judged: int = 52
     """Held-out cases."""

@@ -79,14 +79,28 @@ def walls(name: str, octave: int):
     )
 
 
-def draw_case(names: tuple[str, ...], seed: int, efl_mm: float = 11.0) -> Batch:
+def judged_cases(names: tuple[str, ...], first: int, count: int, efl_mm: float) -> list[Batch]:
+    """Cases whose distances are spread evenly over the range, one in each of ``count`` strata, and whose textures take
+    turns: fewer of them tell two lenses apart."""
+    strata = torch.randperm(count, generator=torch.Generator().manual_seed(first)).tolist()
+    return [
+        draw_case((names[i % len(names)],), first + i, efl_mm, (strata[i] + 0.5) / count)
+        for i in range(count)
+    ]
+
+
+def draw_case(
+    names: tuple[str, ...], seed: int, efl_mm: float = 11.0, distance_share: float | None = None
+) -> Batch:
     """A texture out of ``names``, a distance even in its logarithm, a slant and a motion, all from one seed.
 
-    The motion covers the same pixels at every distance and focal length.
+    The motion covers the same pixels at every distance and focal length. distance_share: where on the way from near to
+    far, in the logarithm, instead of a random place.
     """
     generator = torch.Generator().manual_seed(seed)
     name = names[int(torch.randint(len(names), (1,), generator=generator))]
     share, slant, turn, x, z = torch.rand(5, generator=generator, dtype=torch.float64).tolist()
+    share = share if distance_share is None else distance_share
     motion = MOTION * torch.randn(6, generator=generator, dtype=torch.float64)
     distance = NEAR_M * (FAR_M / NEAR_M) ** share
     world = walls(name, min(int(share * OCTAVES), OCTAVES - 1))

@@ -16,7 +16,7 @@ from studies.lens_trade.problem import STEP, Problem, Weights
 PENALTY = 10.0
 SAMPLES = 15  # rays per pixel while optimising; twice as many when judging
 DRAWS = (11, 12, 13, 14)  # errors of manufacture that a spot designer looks at
-SCORED = 8
+SCORED = 10
 LEAST_GAP = 0.005  # between surfaces, in focal lengths
 
 
@@ -67,7 +67,7 @@ def by_flow(
     training cases along the way."""
     seen_by = DesignedCamera(problem, start)
     system = cases.system(seen_by, cases.smooth_layer(light), light, problem.fno)
-    fixed = [cases.draw_case(cases.TRAINING, 7_000_000 + i, problem.efl_mm) for i in range(SCORED)]
+    fixed = cases.judged_cases(cases.TRAINING, 7_000_000, SCORED, problem.efl_mm)
 
     def penalty():
         return PENALTY * problem.limit_rows(seen_by.optics()).square().sum()
@@ -92,7 +92,7 @@ def by_search(problem: Problem, light: cases.Light, start: Tensor, tries: int, s
     """The same without gradients, as a check on them: a (1 + 1) evolution strategy over the modes on the hard score of
     fixed training cases, with the one-fifth rule (Rechenberg 1973)."""
     seen_by = DesignedCamera(problem, start)
-    fixed = [cases.draw_case(cases.TRAINING, 7_000_000 + i, problem.efl_mm) for i in range(2 * SCORED)]
+    fixed = cases.judged_cases(cases.TRAINING, 7_100_000, 2 * SCORED, problem.efl_mm)
     generator = torch.Generator().manual_seed(seed)
 
     def score(z):

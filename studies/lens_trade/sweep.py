@@ -21,7 +21,8 @@ from studies.lens_trade.trades import TRADES, Trade, owned, spot_chain
 
 # what the spot designer may weigh: corners less, near less or more
 WEIGHTS = (Weights(0.4, 0.0), Weights(1.0, -0.5), Weights(1.0, -1.0), Weights(0.4, -0.5), Weights(1.0, 0.5))
-REWEIGHED = 2  # starts that get all weights: the best by development cases
+REWEIGHED = 1  # starts that get all weights: the best by development cases
+DESCENTS = 3  # starts that the flow designer goes on from: the best by development cases
 REFINE = 25  # steps after a change of weights
 DESIGNERS = ("textbook", "spots", "flow")
 
@@ -61,7 +62,7 @@ def point_job(folder: Path, trade: str, at: int, effort: Effort) -> dict[str, An
     """Both designers at one value of a trade, judged on the same held-out cases.
 
     textbook: the start of the least flat spot. spots: of all starts and weights the best on the development cases.
-    flow: of descents from every start, and a search without gradients from the best of those, the best on them.
+    flow: of descents from the best starts, and a search without gradients from the best of those, the best on them.
     """
     found = TRADES[trade]
     value = found.values[at]
@@ -78,6 +79,7 @@ def point_job(folder: Path, trade: str, at: int, effort: Effort) -> dict[str, An
     best = sorted(flat, key=lambda c: c.development)[:REWEIGHED]
     spots = flat + [judge.reweighed(c, weights) for c in best for weights in WEIGHTS]
     leaders = [min((c for c in spots if c.start == f.start), key=lambda c: c.development) for f in flat]
+    leaders = sorted(leaders, key=lambda c: c.development)[:DESCENTS]
     flows = [judge.descended(c, k) for k, c in enumerate(leaders)]
     flows.append(judge.searched(min(flows, key=lambda c: c.development)))
     chosen = {
@@ -137,7 +139,7 @@ class _Judge:
 
     def cases(self, names, first, count):
         efl_mm = self.problem(self.trade.template(self.value)).efl_mm
-        return [cases.draw_case(names, first + i, efl_mm) for i in range(count)]
+        return cases.judged_cases(names, first, count, efl_mm)
 
     def candidate(self, geo: GeoLens, weights: Weights, start: str) -> _Candidate:
         problem = self.problem(geo)

@@ -138,13 +138,16 @@ def test_descent_and_search_are_never_worse_than_their_start_on_their_own_score(
     monkeypatch.setattr(designers, "SCORED", 2)
     found, x = start()
     light = TRACK.light
-    fixed = [cases.draw_case(cases.TRAINING, 7_000_000 + i, found.efl_mm) for i in range(4)]
+    fixed = {
+        count: cases.judged_cases(cases.TRAINING, first, count, found.efl_mm)
+        for count, first in ((2, 7_000_000), (4, 7_100_000))
+    }
 
     def score(v, count):
         with torch.no_grad():
             geo = found.lens(v)
             penalty = designers.PENALTY * float(found.limit_rows(geo).square().sum())
-            return designers.mean_log_error(found, light, geo, fixed[:count], designers.SAMPLES) + penalty
+            return designers.mean_log_error(found, light, geo, fixed[count], designers.SAMPLES) + penalty
 
     assert score(designers.by_flow(found, light, x, steps=2, batch=1, seed=0), 2) <= score(x, 2) + 1e-9
     assert score(designers.by_search(found, light, x, tries=2, seed=0), 4) <= score(x, 4) + 1e-9
@@ -159,6 +162,14 @@ def test_cases_lie_at_the_distances_they_claim():
         assert NEAR_M - 1e-9 <= distance <= FAR_M + 1e-9
         slant = math.acos(min(1.0, float(forward[1].abs())))
         assert slant <= cases.MOST_SLANT_RAD + 1e-9
+
+
+def test_judged_cases_cover_all_distances_and_textures_once():
+    names = ("speckle-1", "speckle-2")
+    drawn = cases.judged_cases(names, 0, 8, 11.0)
+    distances = sorted(float(-c.T_world_body[0, 1, 3] / c.T_world_body[0, 1, 2]) for c in drawn)
+    wanted = [NEAR_M * (FAR_M / NEAR_M) ** ((k + 0.5) / 8) for k in range(8)]
+    assert distances == pytest.approx(wanted, rel=1e-9)
 
 
 def test_light_falls_with_the_square_of_the_f_number():
@@ -242,7 +253,7 @@ def test_page_of_a_raw_table_says_who_wins(tmp_path, factor, wins):
     assert ("wins clearly in 1 of 1" in text) is wins
     assert ("is not beaten in any of 1" in text) is not wins
     assert run.metrics["trades_won"] == int(wins)
-    assert run.metrics["flow_over_spots_percent_track_1_1"] == pytest.approx(100 * (factor - 1), abs=1e-6)
+    assert run.metrics["flow_over_spots_percent_track_1_2"] == pytest.approx(100 * (factor - 1), abs=1e-6)
 
 
 def test_a_foreign_raw_table_is_refused(tmp_path):
