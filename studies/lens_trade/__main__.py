@@ -11,7 +11,7 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from codesign.atomic import write_atomic
 from codesign.errors import DomainError, FileFormatError
@@ -53,9 +53,13 @@ class Config(StudyConfig):
 
 
 def study(run: Run[Config]) -> None:
-    config = run.config
+    trade(run, run.config)
+
+
+def trade(run: Run[Any], config: Config) -> None:
+    """The study within a run, which may be that of ``lens_opt --trade``."""
     effort = _check(config)
-    rows = _earlier(run)
+    rows = _earlier(run, config)
     folder = run.folder / "lenses"
     folder.mkdir(exist_ok=True)
 
@@ -104,18 +108,18 @@ def _check(config):
     return Effort(config.starts, config.steps, config.batch, config.tries, config.development, config.judged)
 
 
-def _earlier(run):
+def _earlier(run, config):
     """Rows of the session before, or of the table that was given."""
     stored = run.load_state()
     if stored is not None:
         return stored.numbers["rows"]
-    if not run.config.raw:
+    if not config.raw:
         return {}
     try:
-        rows = json.loads(Path(run.config.raw).read_text())
+        rows = json.loads(Path(config.raw).read_text())
         return {_key(row["trade"], row["at"]): row for row in rows.values()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise FileFormatError(f"--raw {run.config.raw} is no raw table of this study ({error}).") from error
+        raise FileFormatError(f"--raw {config.raw} is no raw table of this study ({error}).") from error
 
 
 def _key(name, at):

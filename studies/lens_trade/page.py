@@ -8,8 +8,9 @@ import torch
 from codesign import lens
 from codesign.errors import DomainError
 from codesign.report import lens_figures
+from studies.lens_opt.paired import of_differences
 from studies.lens_trade.problem import PITCH_MM
-from studies.lens_trade.summary import gains, paired
+from studies.lens_trade.summary import gains
 from studies.lens_trade.sweep import DESIGNERS, lens_file
 from studies.lens_trade.trades import TRADES
 
@@ -53,8 +54,7 @@ def write(run, tables):
                 "RMS spot, flow (px)",
                 "error, spots (mrad)",
                 "error, flow (mrad)",
-                "flow over spots (%)",
-                "95 %",
+                "flow over spots",
                 "gain at equal error",
                 "95 % of it",
             ],
@@ -94,10 +94,8 @@ class Outcome:
             d: torch.tensor([row[d]["held_out"] for row in rows], dtype=torch.float64) for d in DESIGNERS
         }
         self.errors = errors
-        self.ratios = [paired(row["spots"]["held_out"], row["flow"]["held_out"], generator) for row in rows]
-        self.over_textbook = [
-            paired(row["textbook"]["held_out"], row["flow"]["held_out"], generator) for row in rows
-        ]
+        self.ratios = [of_differences(e) for e in errors["flow"] - errors["spots"]]
+        self.over_textbook = [of_differences(e) for e in errors["flow"] - errors["textbook"]]
         self.gains = gains(self.values, errors["spots"], errors["flow"], generator, name != "elements")
 
     @property
@@ -130,7 +128,7 @@ class Outcome:
             at = f"{self.name}_{row['value']:g}".replace(".", "_")
             run.record(
                 **{
-                    f"flow_over_spots_percent_{at}": 100 * math.expm1(ratio.value),
+                    f"flow_over_spots_percent_{at}": 100 * math.expm1(ratio.mean),
                     f"flow_over_spots_low95_percent_{at}": 100 * math.expm1(ratio.low),
                     f"flow_over_spots_high95_percent_{at}": 100 * math.expm1(ratio.high),
                     f"gain_{at}": gain.value,
@@ -149,8 +147,7 @@ class Outcome:
                 row["flow"]["rms_px"],
                 _error(row["spots"]),
                 _error(row["flow"]),
-                round(100 * math.expm1(ratio.value), 1),
-                f"{100 * math.expm1(ratio.low):+.1f} to {100 * math.expm1(ratio.high):+.1f}",
+                ratio.percent(),
                 self.shown(gain.value),
                 f"{self.shown(gain.low)} to {self.shown(gain.high)}",
             ]
@@ -232,10 +229,10 @@ def _lead(found, won):
 
 
 def _answer(found, won):
-    better = sum(r.high < 0 for o in found.values() for r in o.ratios)
-    worse = sum(r.low > 0 for o in found.values() for r in o.ratios)
+    better = sum(r.outcome == "wins" for o in found.values() for r in o.ratios)
+    worse = sum(r.outcome == "loses" for o in found.values() for r in o.ratios)
     count = sum(len(o.ratios) for o in found.values())
-    over = sum(r.high < 0 for o in found.values() for r in o.over_textbook)
+    over = sum(r.outcome == "wins" for o in found.values() for r in o.over_textbook)
     lines = [
         _lead(found, won),
         f"Of {count} values in all trades the flow designer's lens has the smaller held-out error in {better} (95 % "

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
@@ -45,7 +45,7 @@ class Trade:
     values: tuple[float, ...]
     problem: Callable[[float, GeoLens], Problem]
     template: Callable[[float], GeoLens]
-    light: Light = Light()
+    light: Light = field(default_factory=Light)
     removes: bool = False
 
 
