@@ -17,7 +17,7 @@ from codesign.grad.jacobian import by_differences
 from codesign.lens.design import edge_thickness_mm
 from codesign.optimise import DampedLeastSquares, StopRules
 from studies.lens_opt.spots import refocused, spot_rays
-from studies.lens_opt.task import DISTANCE_M, HALF_DIAGONAL_MM, LIGHT, PITCH_MM, LensTask
+from studies.lens_opt.task import DISTANCE_M, HALF_DIAGONAL_MM, LIGHT, PITCH_MM, LensTask, film
 
 HEIGHTS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # of the half diagonal
 EDGE_WEIGHT = 10.0  # pixels of spot per hundredth of the focal length that an edge is too thin
@@ -45,8 +45,8 @@ class Variant:
 
 def field_weights(task: LensTask) -> dict[str, tuple[float, ...]]:
     """Weights of HEIGHTS by name, sum 1. "windows" are the shares of the pixels that are looked at."""
-    film = task.film
-    radius = (film.pixels() - film.middle_px).norm(dim=1) * PITCH_MM / HALF_DIAGONAL_MM
+    seen = film()
+    radius = (seen.pixels() - seen.middle_px).norm(dim=1) * PITCH_MM / HALF_DIAGONAL_MM
     nearest = (radius[:, None] - torch.tensor(HEIGHTS, dtype=radius.dtype)).abs().argmin(1)
     counts = torch.bincount(nearest, minlength=len(HEIGHTS)).double()
     height = torch.tensor(HEIGHTS, dtype=torch.float64)

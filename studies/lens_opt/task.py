@@ -2,11 +2,12 @@
 walls, random motions."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from codesign import events, lens, pose, render
 from codesign.errors import DomainError
@@ -40,6 +41,27 @@ MOTION = torch.tensor(
 )  # m and rad over the interval, standard deviations
 
 
+@cache
+def film() -> render.Film:
+    """Three windows on the sensor's diagonal, at fields 0, 0.7 and as far out as a window fits."""
+    half = WINDOW_PX / 2
+    room = [n / 2 - half for n in SENSOR_PX]
+    corners = tuple(
+        (round(SENSOR_PX[0] / 2 + h * room[0] - half), round(SENSOR_PX[1] / 2 + h * room[1] - half))
+        for h in FIELDS
+    )
+    return render.Film(*SENSOR_PX, WINDOW_PX, WINDOW_PX, PITCH_MM, corners)
+
+
+def log_error(every_px: int = 8) -> Callable[..., Tensor]:
+    """The objective: mean log angular error over the windows, at pixels ``every_px`` apart."""
+
+    def mean_log_error(field, camera, scene, T_world_cam):
+        return angular_error_mrad(field, camera, scene, T_world_cam, every_px).log().mean()
+
+    return mean_log_error
+
+
 @dataclass(frozen=True)
 class LensTask:
     """What a lens is designed for, and from where: the design variables around the detuned start (variables = 0),
@@ -58,19 +80,8 @@ class LensTask:
         """The same free variables and limits, in steps around another lens."""
         return make_design(optics, self.fields_rad, PITCH_MM, self.design)
 
-    @cached_property
-    def film(self) -> render.Film:
-        """Three windows on the sensor's diagonal, at fields 0, 0.7 and as far out as a window fits."""
-        half = WINDOW_PX / 2
-        room = [n / 2 - half for n in SENSOR_PX]
-        corners = tuple(
-            (round(SENSOR_PX[0] / 2 + h * room[0] - half), round(SENSOR_PX[1] / 2 + h * room[1] - half))
-            for h in FIELDS
-        )
-        return render.Film(*SENSOR_PX, WINDOW_PX, WINDOW_PX, PITCH_MM, corners)
-
     def camera(self, optics, samples: int, seed: int = 0) -> render.Camera:
-        return render.Camera(optics, WINDOW_PX, WINDOW_PX, PITCH_MM, samples, seed, self.film, spectrum=LIGHT)
+        return render.Camera(optics, WINDOW_PX, WINDOW_PX, PITCH_MM, samples, seed, film(), spectrum=LIGHT)
 
     def rms_spot_um(self, optics) -> torch.Tensor:
         """RMS spot of points of the wall at the three fields, all wavelengths together, [3] um."""
@@ -82,12 +93,7 @@ class LensTask:
         objective: "flow" (mean log angular error over the windows) or "edge" (the seed project's). every_px:
           spacing of the pixels whose flow counts.
         """
-        error = partial(angular_error_mrad, every_px=every_px)
-
-        def mean_log_error(field, camera, scene, T_world_cam):
-            return error(field, camera, scene, T_world_cam).log().mean()
-
-        found = {"flow": mean_log_error, "edge": lambda volume: edge_objective(volume)}[objective]
+        found = {"flow": log_error(every_px), "edge": lambda volume: edge_objective(volume)}[objective]
         return System(
             camera=camera, events=layer, flow=flow, objectives={objective: found}, bins=bins_of(flow)
         )

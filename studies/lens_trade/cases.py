@@ -10,34 +10,24 @@ from codesign import events, flow, lens, pose, render
 from codesign.events import HardSensor
 from codesign.lens import WAVELENGTH_UM, GeoLens
 from codesign.system import Batch, System
-from codesign.system.objectives import angular_error_mrad
 from scenes import textures, trajectories, worlds
-from studies.lens_trade.problem import FAR_M, LINES, NEAR_M, PITCH_MM
+from studies.lens_opt.task import BINS, DURATION_S, PITCH_MM, SENSOR, WINDOW_PX, film, log_error
+from studies.lens_trade.problem import FAR_M, LINES, NEAR_M
 
-SENSOR_PX = (346, 260)
-WINDOW_PX = 64
-HALF_DIAGONAL_MM = math.hypot(*SENSOR_PX) / 2 * PITCH_MM
-WINDOWS = (0.0, 0.7, 1.0)
-BINS = 5
 FRAMES = 9
-DURATION_S = 0.05
 MOST_SLANT_RAD = math.radians(45)
-EVERY_PX = 8
 # standard deviations over the interval: sideways, up and along, in distances to the wall; pitch, yaw and roll, radians
 MOTION = torch.tensor([0.006, 0.006, 0.01, 0.001, 0.001, 0.006], dtype=torch.float64)
-# textures: to optimise on, to choose among designs, to judge
-TRAINING = ("gravel", "grass", "gravel:2", "grass:2", "speckle-1")
+# textures on which designs are chosen
 DEVELOPMENT = ("camera", "coffee", "speckle-2:0.7")
-HELD_OUT = ("brick", "astronaut", "hubble_deep_field")
 OCTAVES = 4  # walls per texture: texels grow with distance, so that they keep their size in pixels
-BRIGHT = events.SensorModel(theta_on=0.2, theta_off=0.2, theta_sigma=0.03, shot_rate_hz=1.0)
 
 
 @dataclass(frozen=True)
 class Light:
     """What the sensor makes of the light: its model, and the radiance at f/2.8 over that of daylight."""
 
-    sensor: events.SensorModel = BRIGHT
+    sensor: events.SensorModel = SENSOR
     share: float = 1.0
     at_fno: float = 2.8
 
@@ -50,18 +40,6 @@ class Light:
 def spectrum() -> lens.Spectrum:
     """The three lines of the spots, of equal signal."""
     return lens.Spectrum(tuple(WAVELENGTH_UM[line] for line in LINES), (1 / 3,) * 3)
-
-
-@cache
-def film() -> render.Film:
-    """Three windows on the sensor's diagonal, at fields 0, 0.7 and as far out as a window fits."""
-    half = WINDOW_PX / 2
-    room = [n / 2 - half for n in SENSOR_PX]
-    corners = tuple(
-        (round(SENSOR_PX[0] / 2 + h * room[0] - half), round(SENSOR_PX[1] / 2 + h * room[1] - half))
-        for h in WINDOWS
-    )
-    return render.Film(*SENSOR_PX, WINDOW_PX, WINDOW_PX, PITCH_MM, corners)
 
 
 @cache
@@ -130,15 +108,12 @@ def system(seen_by, layer, light: Light, fno: float) -> System:
     def shown(camera, scene, T_world_cam, rays):
         return gain * render.frames(camera, scene, T_world_cam, rays=rays)
 
-    def mean_log_error(field, camera, scene, T_world_cam):
-        return angular_error_mrad(field, camera, scene, T_world_cam, EVERY_PX).log().mean()
-
     return System(
         camera=seen_by,
         render=shown,
         events=layer,
         flow=flow.estimate_lk,
-        objectives={"flow": mean_log_error},
+        objectives={"flow": log_error()},
         bins=BINS,
     )
 

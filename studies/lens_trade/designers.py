@@ -10,6 +10,7 @@ from codesign.grad.jacobian import by_differences
 from codesign.lens import GeoLens
 from codesign.optimise import DampedLeastSquares, Descent, Loop, StopRules
 from codesign.system import Batch
+from studies.lens_opt.task import TRAINING
 from studies.lens_trade import cases
 from studies.lens_trade.problem import STEP, Problem, Weights
 
@@ -67,7 +68,7 @@ def by_flow(
     training cases along the way."""
     seen_by = DesignedCamera(problem, start)
     system = cases.system(seen_by, cases.smooth_layer(light), light, problem.fno)
-    fixed = cases.judged_cases(cases.TRAINING, 7_000_000, SCORED, problem.efl_mm)
+    fixed = cases.judged_cases(TRAINING, 7_000_000, SCORED, problem.efl_mm)
 
     def penalty():
         return PENALTY * problem.limit_rows(seen_by.optics()).square().sum()
@@ -75,7 +76,7 @@ def by_flow(
     def samples(step):
         for k in range(batch):
             seen_by.draw = (seed + 1) * 100_000 + step * batch + k
-            case = cases.draw_case(cases.TRAINING, seen_by.draw, problem.efl_mm)
+            case = cases.draw_case(TRAINING, seen_by.draw, problem.efl_mm)
             yield system(case).loss + penalty()
 
     def score():
@@ -92,7 +93,7 @@ def by_search(problem: Problem, light: cases.Light, start: Tensor, tries: int, s
     """The same without gradients, as a check on them: a (1 + 1) evolution strategy over the modes on the hard score of
     fixed training cases, with the one-fifth rule (Rechenberg 1973)."""
     seen_by = DesignedCamera(problem, start)
-    fixed = cases.judged_cases(cases.TRAINING, 7_100_000, 2 * SCORED, problem.efl_mm)
+    fixed = cases.judged_cases(TRAINING, 7_100_000, 2 * SCORED, problem.efl_mm)
     generator = torch.Generator().manual_seed(seed)
 
     def score(z):

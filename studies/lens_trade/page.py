@@ -9,7 +9,7 @@ from codesign import lens
 from codesign.errors import DomainError
 from codesign.report import lens_figures
 from studies.lens_opt.paired import of_differences
-from studies.lens_trade.problem import PITCH_MM
+from studies.lens_opt.task import PITCH_MM
 from studies.lens_trade.summary import gains
 from studies.lens_trade.sweep import DESIGNERS, lens_file
 from studies.lens_trade.trades import TRADES
@@ -96,6 +96,11 @@ class Outcome:
         self.errors = errors
         self.ratios = [of_differences(e) for e in errors["flow"] - errors["spots"]]
         self.over_textbook = [of_differences(e) for e in errors["flow"] - errors["textbook"]]
+        self.declined = sum(
+            min(c["development"] for c in row["candidates"]["spots"])
+            <= min(c["development"] for c in row["candidates"]["flow"])
+            for row in rows
+        )
         self.gains = gains(self.values, errors["spots"], errors["flow"], generator, name != "elements")
 
     @property
@@ -237,7 +242,9 @@ def _answer(found, won):
         _lead(found, won),
         f"Of {count} values in all trades the flow designer's lens has the smaller held-out error in {better} (95 % "
         f"interval beyond 0), the best spot designer's in {worse}; the others are ties. Over the least spot at even weights, "
-        f"which knows nothing of flow, the flow designer wins in {over}.",
+        f"which knows nothing of flow, the flow designer wins in {over}. In "
+        f"{sum(o.declined for o in found.values())} of {count} its own development cases would rather keep the spot "
+        "designer's lens that it began from.",
         "Gains at the spot designer's error in the middle of each range: "
         + "; ".join(
             f"{TRADES[n].label} {o.headline()} ({o.shown(o.gains[o.middle].low)} to {o.shown(o.gains[o.middle].high)})"

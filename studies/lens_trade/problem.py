@@ -22,8 +22,8 @@ from codesign.lens.design.constraints import Constraint, Limits, evaluate, rows
 from codesign.lens.design.hits import paraxial_semi_aperture_mm
 from codesign.lens.design.tolerance import errors_of, perturbed
 from codesign.lens.hold_efl import holding_surface
+from studies.lens_opt.task import PITCH_MM
 
-PITCH_MM = 18.5e-3  # of a DAVIS346
 LINES = ("F", "d", "C")
 NEAR_M, FAR_M = 0.3, 5.0
 # three Gauss-Legendre nodes over the logarithm of distance, in which depths are even

@@ -14,6 +14,7 @@ import torch
 from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens import GeoLens
+from studies.lens_opt.task import HELD_OUT
 from studies.lens_trade import cases
 from studies.lens_trade.designers import SAMPLES, by_flow, by_search, by_spots, log_errors, mean_log_error
 from studies.lens_trade.problem import FLAT, Problem, Weights
@@ -111,7 +112,7 @@ def point_job(folder: Path, trade: str, at: int, effort: Effort) -> dict[str, An
             "violation": problem.violation(candidate.geo),
             "track_mm": float(candidate.geo.thickness_mm.sum()),
             "held_out": log_errors(
-                problem, light, candidate.geo, judge.cases(cases.HELD_OUT, 9_000_000, effort.judged)
+                problem, light, candidate.geo, judge.cases(HELD_OUT, 9_000_000, effort.judged)
             ),
         }
     return row

@@ -10,7 +10,8 @@ from codesign.errors import DomainError
 from codesign.events import SensorModel
 from codesign.lens import GeoLens
 from codesign.lens.design import Limits, Tolerances, elements, without_element
-from studies.lens_trade.cases import HALF_DIAGONAL_MM, Light
+from studies.lens_opt.task import HALF_DIAGONAL_MM
+from studies.lens_trade.cases import Light
 from studies.lens_trade.designers import by_spots
 from studies.lens_trade.problem import FLAT, Problem, scaled_triplet
 

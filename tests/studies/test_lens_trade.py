@@ -13,10 +13,11 @@ from codesign.lens import WAVELENGTH_UM
 from codesign.lens.analysis import pupil_grid
 from codesign.lens.design.tolerance import errors_of
 from studies.frame.run import open_run
+from studies.lens_opt.task import PITCH_MM, TRAINING
 from studies.lens_trade import __main__ as lens_trade
 from studies.lens_trade import cases, designers
 from studies.lens_trade.designers import by_spots
-from studies.lens_trade.problem import DEPTHS_M, FAR_M, FIELDS, FLAT, LINES, NEAR_M, PITCH_MM, Weights
+from studies.lens_trade.problem import DEPTHS_M, FAR_M, FIELDS, FLAT, LINES, NEAR_M, Weights
 from studies.lens_trade.summary import gains, reach
 from studies.lens_trade.trades import DIM, TRADES, owned
 
@@ -140,7 +141,7 @@ def test_descent_and_search_are_never_worse_than_their_start_on_their_own_score(
     found, x = start()
     light = TRACK.light
     fixed = {
-        count: cases.judged_cases(cases.TRAINING, first, count, found.efl_mm)
+        count: cases.judged_cases(TRAINING, first, count, found.efl_mm)
         for count, first in ((2, 7_000_000), (4, 7_100_000))
     }
 
