@@ -46,7 +46,7 @@ class Draws:
     distortion: tuple[float, float] = (-0.04, 0.04)
 
 
-def planes(textures="fine", theta=0.2, noise=(0.0005, 0.01), blur_px=0.0):
+def planes(textures="fine", theta=0.2, noise=(0.0005, 0.01)):
     """The plain test case: one plane, rotation, zoom and translation up to 6 px, nothing else varied."""
     return Draws(
         textures,
@@ -58,7 +58,7 @@ def planes(textures="fine", theta=0.2, noise=(0.0005, 0.01), blur_px=0.0):
         noise,
         (1.0, 1.0),
         (0.8, 1.2),
-        (blur_px, blur_px),
+        (0.0, 0.0),
         (0.0, 0.0),
     )
 

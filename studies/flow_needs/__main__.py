@@ -44,7 +44,7 @@ class Unit:
 
 
 def units(quick: bool) -> Iterator[Unit]:
-    """All the work in order, nothing twice; with ``quick`` every second step of every fault, the base view alone, and
+    """All the work in order, nothing twice; with ``quick`` every third step of every fault, the base view alone, and
     no triplets."""
     named = set()
     few = {BASE: SENSORS[BASE]}

@@ -60,10 +60,9 @@ VIEWS = (
     View("coarse"),
     View("rooms"),
     View(speed_px=0.5),
-    View(speed_px=1.0),
     FAST,
 )
-FEW_VIEWS = (BASE_VIEW, View("fine"), View("rooms"), View(speed_px=0.5), FAST)
+FEW_VIEWS = (BASE_VIEW, View("fine"), FAST)
 
 
 def sensors_of(view: View) -> dict[str, Sensor]:
@@ -128,8 +127,6 @@ FAULTS = (
         "falloff",
         "% of the light lost in the corner",
         (30.0, 50.0, 70.0, 80.0, 90.0),
-        views=(BASE_VIEW, View("fine"), FAST),
     ),
     Fault("lateral colour", "px from F to C in the corner", (0.5, 1.0, 1.5, 2.0, 3.0, 4.0), coloured=True),
 )
-DISTORTIONS = ("barrel", "pincushion")

@@ -35,7 +35,6 @@ GROUPS = {
     ),
     "flow": (
         "flow_closed_form",
-        "flow_blur",
         "train_flow",
         "flow_quality",
         "flow_compare",
