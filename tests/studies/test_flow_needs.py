@@ -12,12 +12,14 @@ from codesign.errors import DomainError, ShapeError
 from codesign.lens import Pinhole
 from codesign.lens.spectrum import LINE_UM, Spectrum
 from codesign.render.sampling import film_pupil_pattern
+from codesign.system.objectives import angular_error_mrad
+from codesign.types import FlowField
 from scenes import worlds
 from studies.flow_needs import cases, page, real_lenses
 from studies.flow_needs.__main__ import Config, study, units
 from studies.flow_needs.conditions import BASE_VIEW, FAULTS
 from studies.flow_needs.faulty_lens import FaultyLens
-from studies.flow_needs.measure import camera_of
+from studies.flow_needs.measure import MRAD_PER_PX, Targets, camera_of
 from studies.flow_needs.predictors import (
     bearable,
     left_out_residual,
@@ -152,6 +154,18 @@ def test_motions_have_the_length_asked_for(speed_px):
         flow_px, _ = render.true_flow(pixel, scene, poses, stride=cases.FRAMES - 1)
         # the approach of 0.5 % per pixel of motion, standard deviation, brings the wall nearer
         assert float(flow_px.norm()) == pytest.approx(speed_px, rel=4 * cases.APPROACH * speed_px)
+
+
+@pytest.mark.parametrize("texture", ["photos", "rooms"])
+def test_errors_are_those_of_the_angular_objective(texture):
+    camera = camera_of(FaultyLens(cases.EFL_MM, cases.EDGE_MM, distortion_percent=-10.0), "corner")
+    (batch,) = cases.batches(texture, 2.0, 2, seed=4)
+    judge = Targets.of(camera, batch)
+    generator = torch.Generator().manual_seed(0)
+    flow_px = 2 * torch.randn(2, 2, 64, 64, generator=generator, dtype=torch.float64)
+    field = FlowField(flow_px, torch.ones(2, 64, 64, dtype=torch.bool), cases.DURATION_S)
+    expected = angular_error_mrad(field, camera, batch.scene, batch.T_world_body, every_px=8)
+    assert torch.allclose(judge.error_px(field) * MRAD_PER_PX, expected, rtol=1e-12)
 
 
 def test_the_limit_of_a_made_up_table_is_found():
