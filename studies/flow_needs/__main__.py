@@ -16,7 +16,7 @@ from torch import Tensor
 from codesign import flow, render
 from codesign.errors import DomainError
 from studies.flow_needs import page, real_lenses, results
-from studies.flow_needs.conditions import BASE, BASE_VIEW, FAULTS, SENSORS, Sensor, View, sensors_of
+from studies.flow_needs.conditions import BASE, BASE_VIEW, FAULTS, SENSORS, Sensor, View
 from studies.flow_needs.measure import camera_of, flow_errors_px
 from studies.flow_needs.predictors import point_images_px, predictors
 from studies.frame.run import Run, StudyConfig, main
@@ -47,11 +47,10 @@ def units(quick: bool) -> Iterator[Unit]:
     """All the work in order, nothing twice; with ``quick`` every third step of every fault, the base view alone, and
     no triplets."""
     named = set()
-    few = {BASE: SENSORS[BASE]}
     for fault in FAULTS:
         levels = fault.levels[1::3] if quick else fault.levels
         for view in (BASE_VIEW,) if quick else fault.views:
-            sensors = sensors_of(view) if len(fault.views) > 1 else few
+            sensors = fault.sensors_of(view)
             for level in (0.0, *levels):
                 name = fault.unit(level, view)
                 if name not in named:
@@ -61,7 +60,7 @@ def units(quick: bool) -> Iterator[Unit]:
                     yield Unit(name, camera, view, sensors, distorted, fault.window == "centre" and level > 0)
     for family, blur_px, optics in () if quick else real_lenses.judged():
         camera = camera_of(optics, "centre")
-        yield Unit(results.triplet(family, blur_px), camera, BASE_VIEW, few, blurred=True)
+        yield Unit(results.triplet(family, blur_px), camera, BASE_VIEW, {BASE: SENSORS[BASE]}, blurred=True)
 
 
 def study(run: Run[Config]) -> None:

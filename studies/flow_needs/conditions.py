@@ -62,12 +62,8 @@ VIEWS = (
     View(speed_px=0.5),
     FAST,
 )
+FEW_SENSORS = (BASE, "theta 0.4", "dim light")
 FEW_VIEWS = (BASE_VIEW, View("fine"), FAST)
-
-
-def sensors_of(view: View) -> dict[str, Sensor]:
-    """Every sensor before the view that all are compared on, the usual one before the others."""
-    return SENSORS if view == BASE_VIEW else {BASE: SENSORS[BASE]}
 
 
 def condition(view: View, sensor: str) -> str:
@@ -81,8 +77,8 @@ def condition(view: View, sensor: str) -> str:
 class Fault:
     """A fault in rising steps.
 
-    scale, levels: what the steps are in, and the steps, above 0. window, views: where it is judged. coloured: in
-    daylight instead of the d line.
+    scale, levels: what the steps are in, and the steps, above 0. window, views: where it is judged. sensors: names of
+    those it is judged by in the base view, others by the base sensor. coloured: in daylight instead of the d line.
     """
 
     name: str
@@ -90,12 +86,17 @@ class Fault:
     levels: tuple[float, ...]
     window: str = "corner"
     views: tuple[View, ...] = FEW_VIEWS
+    sensors: tuple[str, ...] = FEW_SENSORS
     coloured: bool = False
 
     def unit(self, level: float, view: View) -> str:
         """Name of what is measured at a level; without a fault one for all faults of the window."""
         what = f"{self.name} {level:g}" if level else "none"
         return f"{what} / {self.window} / {view.name}"
+
+    def sensors_of(self, view: View) -> dict[str, Sensor]:
+        """The sensors before a view, by name."""
+        return {name: SENSORS[name] for name in (self.sensors if view == BASE_VIEW else (BASE,))}
 
     def lens(self, level: float) -> FaultyLens:
         """The lens with the fault at a level; 0 is none."""
@@ -118,9 +119,9 @@ class Fault:
 
 BLUR = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0)
 FAULTS = (
-    Fault("blur", "RMS radius, px", BLUR, "centre", VIEWS),
-    Fault("gaussian blur", "RMS radius, px", BLUR[1:], "centre", (BASE_VIEW,)),
-    Fault("flare", "RMS radius, px", BLUR[1:], "centre", (BASE_VIEW,)),
+    Fault("blur", "RMS radius, px", BLUR, "centre", VIEWS, tuple(SENSORS)),
+    Fault("gaussian blur", "RMS radius, px", BLUR[1:], "centre", (BASE_VIEW,), (BASE,)),
+    Fault("flare", "RMS radius, px", BLUR[1:], "centre", (BASE_VIEW,), (BASE,)),
     Fault("barrel", "% at the corner", (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)),
     Fault("pincushion", "% at the corner", (1.0, 2.0, 4.0, 8.0, 16.0), views=(BASE_VIEW, FAST)),
     Fault(

@@ -18,10 +18,10 @@ PANELS = {  # title -> fault, way it is judged, conditions
     "barrel distortion, ignored": (
         "barrel",
         "ignored",
-        (BASE_NAME, "theta 0.1", "theta 0.4", "fine", "4 px"),
+        (BASE_NAME, "theta 0.4", "dim light", "fine", "4 px"),
     ),
-    "falloff": ("falloff", "", (BASE_NAME, "no noise", "dim light", "fine", "4 px")),
-    "lateral colour": ("lateral colour", "", (BASE_NAME, "theta 0.1", "theta 0.4", "fine", "4 px")),
+    "falloff": ("falloff", "", (BASE_NAME, "theta 0.4", "dim light", "fine", "4 px")),
+    "lateral colour": ("lateral colour", "", (BASE_NAME, "theta 0.4", "dim light", "fine", "4 px")),
 }
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from studies.flow_needs.conditions import BASE, BASE_VIEW, FAULTS, SENSORS, Fault, View, condition, sensors_of
+from studies.flow_needs.conditions import BASE, BASE_VIEW, FAULTS, Fault, View, condition
 from studies.flow_needs.predictors import bearable, left_out_residual
 from studies.flow_needs.summary import Curve, Limit
 
@@ -81,8 +81,7 @@ class Results:
     def _conditions(self, fault):
         for view in fault.views:
             if any(fault.unit(level, view) in self.numbers for level in fault.levels):
-                sensors = sensors_of(view) if len(fault.views) > 1 else {BASE: SENSORS[BASE]}
-                yield from ((view, sensor) for sensor in sensors)
+                yield from ((view, sensor) for sensor in fault.sensors_of(view))
 
     def lenses(self) -> dict[str, str]:
         """Unit -> family, of every lens with a point image of its own under the base condition."""

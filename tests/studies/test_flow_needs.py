@@ -281,7 +281,7 @@ def test_the_page_shows_the_limits_of_its_errors(tmp_path):
     start = "blur_photos_theta_0.2_2_px_closed_form_at_plus"
     assert run.metrics[f"{start}_10_percent"] == pytest.approx(0.5)
     assert run.metrics[f"{start}_25_percent_low"] == pytest.approx(1.25)
-    assert "falloff_no_noise_closed_form_at_plus_10_percent_is_beyond" in run.metrics
+    assert "falloff_dim_light_closed_form_at_plus_10_percent_is_beyond" in run.metrics
     assert run.metrics["blur_theta_0.4_closed_form_error_without_px"] == pytest.approx(float(sharp.mean()))
     assert (tmp_path / "run" / "report.html").is_file()
 
