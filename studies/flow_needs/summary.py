@@ -5,10 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
 
 from codesign.errors import DomainError, ShapeError
 
 DRAWS = 1000
+FIRM = 1e9  # weight of the first point of a curve, which is no measurement
 INTERVAL = (0.025, 0.975)
 Array = NDArray[np.float64]
 
@@ -65,9 +67,10 @@ class Curve:
         return np.quantile(self._draws(seed), INTERVAL, axis=0)
 
     def limit(self, rise: float, seed: int) -> Limit:
-        """Where the ratio, joined by straight lines, first exceeds 1 + ``rise``; interval by bootstrap over cases."""
-        value = first_above(self.levels, self.ratio[None], 1 + rise)[0]
-        drawn = first_above(self.levels, self._draws(seed), 1 + rise)
+        """Where the rising curve nearest to the ratios, joined by straight lines, exceeds 1 + ``rise``; interval by
+        bootstrap over cases. One step that is high by chance is then no limit."""
+        value = first_above(self.levels, rising(self.ratio[None]), 1 + rise)[0]
+        drawn = first_above(self.levels, rising(self._draws(seed)), 1 + rise)
         low, high = np.quantile(drawn, INTERVAL, method="nearest")  # between infinities there is no mean
         return Limit(float(value), float(low), float(high))
 
@@ -80,6 +83,13 @@ class Curve:
         picked = np.random.default_rng(seed).integers(0, count, (DRAWS, count))
         share = np.stack([np.bincount(row, minlength=count) for row in picked]) / count
         return np.exp(share @ self._log.T)
+
+
+def rising(ratios: Array) -> Array:
+    """Rising curves [K, L] nearest to curves of ratios [K, L] in the mean square of their logarithms; each begins at 1."""
+    weights = np.ones(ratios.shape[1])
+    weights[0] = FIRM
+    return np.exp([isotonic_regression(row, weights=weights).x for row in np.log(ratios)])
 
 
 def first_above(levels: Sequence[float], ratios: Array, bound: float) -> Array:

@@ -29,7 +29,7 @@ from studies.flow_needs.predictors import (
     rms_px,
 )
 from studies.flow_needs.results import Results
-from studies.flow_needs.summary import Curve, Limit, first_above
+from studies.flow_needs.summary import Curve, Limit, first_above, rising
 from studies.frame.run import main, open_run
 
 EFL_MM = 11.0
@@ -196,6 +196,17 @@ def test_the_interval_of_a_limit_is_as_wide_as_its_spread():
     assert limit.high == pytest.approx(
         math.log(1.1) / (0.1 - slope), rel=0.05
     )  # 1000 draws know a 2.5 % tail to 10 %
+
+
+def test_a_step_that_is_high_by_chance_is_no_limit():
+    """Logarithms 0.12, -0.06, 0.03 have the rising fit 0.03, 0.03, 0.03; 0.1 lies on the way to 0.3."""
+    logs = [0.0, 0.12, -0.06, 0.03, 0.3]
+    curve = Curve((0.0, 1.0, 2.0, 3.0, 4.0), np.exp(np.outer(logs, np.ones(5))))
+    at = 3 + (1.1 - math.exp(0.03)) / (math.exp(0.3) - math.exp(0.03))
+    assert curve.limit(0.1, seed=0).value == pytest.approx(at, rel=1e-6)
+    assert rising(np.exp([[0.0, -0.2, 0.1]]))[0].tolist() == pytest.approx(
+        [1.0, 1.0, math.exp(0.1)], rel=1e-6
+    )
 
 
 def test_a_curve_that_falls_again_has_the_first_limit():
