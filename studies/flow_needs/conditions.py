@@ -54,16 +54,16 @@ SENSORS = {
 BASE = "theta 0.2"
 BASE_VIEW = View()
 FAST = View(speed_px=4.0)
+FINE = View("fine")
 VIEWS = (
     BASE_VIEW,
-    View("fine"),
+    FINE,
     View("coarse"),
     View("rooms"),
     View(speed_px=0.5),
     FAST,
 )
 FEW_SENSORS = (BASE, "theta 0.4", "dim light")
-FEW_VIEWS = (BASE_VIEW, View("fine"), FAST)
 
 
 def condition(view: View, sensor: str) -> str:
@@ -85,7 +85,7 @@ class Fault:
     scale: str
     levels: tuple[float, ...]
     window: str = "corner"
-    views: tuple[View, ...] = FEW_VIEWS
+    views: tuple[View, ...] = (BASE_VIEW,)
     sensors: tuple[str, ...] = FEW_SENSORS
     coloured: bool = False
 
@@ -120,14 +120,21 @@ class Fault:
 BLUR = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0)
 FAULTS = (
     Fault("blur", "RMS radius, px", BLUR, "centre", VIEWS, tuple(SENSORS)),
-    Fault("gaussian blur", "RMS radius, px", BLUR[1:], "centre", (BASE_VIEW,), (BASE,)),
-    Fault("flare", "RMS radius, px", BLUR[1:], "centre", (BASE_VIEW,), (BASE,)),
-    Fault("barrel", "% at the corner", (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)),
+    Fault("gaussian blur", "RMS radius, px", BLUR[1:], "centre", sensors=(BASE,)),
+    Fault("flare", "RMS radius, px", BLUR[1:], "centre", sensors=(BASE,)),
+    Fault("barrel", "% at the corner", (1.0, 2.0, 4.0, 8.0, 16.0, 32.0), views=(BASE_VIEW, FAST)),
     Fault("pincushion", "% at the corner", (1.0, 2.0, 4.0, 8.0, 16.0), views=(BASE_VIEW, FAST)),
     Fault(
         "falloff",
         "% of the light lost in the corner",
         (30.0, 50.0, 70.0, 80.0, 90.0),
+        views=(BASE_VIEW, FINE),
     ),
-    Fault("lateral colour", "px from F to C in the corner", (0.5, 1.0, 1.5, 2.0, 3.0, 4.0), coloured=True),
+    Fault(
+        "lateral colour",
+        "px from F to C in the corner",
+        (0.5, 1.0, 1.5, 2.0, 3.0, 4.0),
+        views=(BASE_VIEW, FINE),
+        coloured=True,
+    ),
 )

@@ -15,13 +15,9 @@ PANELS = {  # title -> fault, way it is judged, conditions
     "blur, by texture": ("blur", "", (BASE_NAME, "fine", "coarse", "rooms")),
     "blur, by sensor and light": ("blur", "", (BASE_NAME, "theta 0.1", "theta 0.4", "no noise", "dim light")),
     "blur, by speed": ("blur", "", ("0.5 px", BASE_NAME, "4 px")),
-    "barrel distortion, ignored": (
-        "barrel",
-        "ignored",
-        (BASE_NAME, "theta 0.4", "dim light", "fine", "4 px"),
-    ),
-    "falloff": ("falloff", "", (BASE_NAME, "theta 0.4", "dim light", "fine", "4 px")),
-    "lateral colour": ("lateral colour", "", (BASE_NAME, "theta 0.4", "dim light", "fine", "4 px")),
+    "barrel distortion, ignored": ("barrel", "ignored", (BASE_NAME, "theta 0.4", "dim light", "4 px")),
+    "falloff": ("falloff", "", (BASE_NAME, "theta 0.4", "dim light", "fine")),
+    "lateral colour": ("lateral colour", "", (BASE_NAME, "theta 0.4", "dim light", "fine")),
 }
 
 
