@@ -9,7 +9,7 @@ from studies.flow_needs.conditions import BASE, BASE_VIEW, FAULTS, condition
 from studies.flow_needs.results import RISES, TRIPLET, Results, Row
 from studies.frame.run import Run
 
-DPI = 72  # of the figure that is committed
+DPI = 66  # of the figure that is committed
 BASE_NAME = condition(BASE_VIEW, BASE)
 PANELS = {  # title -> fault, way it is judged, conditions
     "blur, by texture": ("blur", "", (BASE_NAME, "fine", "coarse", "rooms")),
