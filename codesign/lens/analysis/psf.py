@@ -58,7 +58,9 @@ def diffraction_psf(
     # signs in a chequer put the reference point into the middle; columns of padding alone need no transform
     sign = 1 - 2 * (torch.arange(pupil.field.shape[0], device=pupil.field.device) % 2)
     light = (pupil.field.real.square() + pupil.field.imag.square()).sum()
-    field = pupil.field * (sign * sign[:, None]) * (count / light.sqrt())  # so that the energy sums to 1 (Parseval)
+    field = (
+        pupil.field * (sign * sign[:, None]) * (count / light.sqrt())
+    )  # so that the energy sums to 1 (Parseval)
     amplitude = torch.fft.ifft(torch.fft.ifft(field, n=count, dim=0), n=count, dim=1)
     energy = amplitude.real.square() + amplitude.imag.square()
     pitch = pupil.wavelength_mm / (2 * pupil.cosine_radius * int(padding))
