@@ -117,7 +117,7 @@ TRADES = {
             "tolerance",
             "errors of manufacture",
             "x",
-            (2.0, 4.0, 8.0),
+            (2.0, 8.0, 16.0),
             lambda value, template: _problem(template, made=_precision(value)),
             lambda value: _triplet(),
         ),
