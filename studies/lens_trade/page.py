@@ -119,7 +119,7 @@ class Outcome:
     def shown(self, gain):
         """A gain in words."""
         if self.name == "elements":
-            return f"{gain:+.2f} elements"
+            return f"{gain + 0.0:+.2f} elements fewer"
         if self.name == "aperture":
             return f"{gain / (math.log(2) / 2):+.2f} stops"
         return (

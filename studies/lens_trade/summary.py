@@ -26,38 +26,40 @@ def gains(
     generator: torch.Generator,
     logarithmic: bool = True,
 ) -> list[Interval]:
-    """How far beyond each value the flow designer gets at the rival's error there.
+    """How much further towards tight the flow designer gets than the rival, at the rival's error at each value.
 
+    Where an error falls towards tight (light gained by a larger aperture), the rival gets further than the value
+    himself: both are asked how far they reach.
     Args: values: [K] from loose to tight. rival, flow: [K, cases] log errors of the same cases. logarithmic: whether
       the gain is that of the logarithm of the value (a share), or of the value itself.
     Returns: K Intervals, positive towards tight; bounded by the values that were looked at.
     """
     places = [math.log(v) if logarithmic else float(v) for v in values]
     sign = 1.0 if places[-1] > places[0] else -1.0
+
+    def further(by_flow, by_rival, k):
+        return sign * (reach(places, by_flow, by_rival[k]) - reach(places, by_rival, by_rival[k]))
+
     picks = torch.randint(rival.shape[1], (DRAWS, rival.shape[1]), generator=generator)
+    drawn = [errors[:, picks].mean(2).T.tolist() for errors in (flow, rival)]
+    means = [errors.mean(1).tolist() for errors in (flow, rival)]
     found = []
-    for k, place in enumerate(places):
-        value = sign * (reach(places, flow.mean(1).tolist(), float(rival[k].mean())) - place)
-        draws = [
-            sign * (reach(places, row, wanted) - place)
-            for row, wanted in zip(
-                flow[:, picks].mean(2).T.tolist(), rival[k][picks].mean(1).tolist(), strict=True
-            )
-        ]
-        found.append(_interval(value, torch.tensor(draws)))
+    for k in range(len(places)):
+        draws = [further(*pair, k) for pair in zip(*drawn, strict=True)]
+        found.append(_interval(further(*means, k), torch.tensor(draws)))
     return found
 
 
 def reach(places: Sequence[float], errors: Sequence[float], wanted: float) -> float:
-    """The tightest place (the last of them first) whose error is at most ``wanted``, linear between places; the loosest
-    where none is."""
+    """The tightest place (the last of them first) whose error is at most ``wanted``, linear between places; that of
+    the least error where none is."""
     for k in range(len(places) - 1, -1, -1):
         if errors[k] <= wanted:
             if k == len(places) - 1:
                 return places[k]
             share = (wanted - errors[k]) / (errors[k + 1] - errors[k])
             return places[k] + share * (places[k + 1] - places[k])
-    return places[0]
+    return places[errors.index(min(errors))]
 
 
 def _interval(value, draws):

@@ -200,6 +200,12 @@ def test_gains_of_a_table_made_up():
     assert found[-1].value == 0  # beyond what was looked at nothing is claimed
 
 
+def test_an_error_that_falls_towards_tight_is_no_gain_of_the_flow_designer():
+    errors = torch.tensor([[3.0] * 4, [1.0] * 4, [2.0] * 4], dtype=torch.float64)
+    found = gains((4.0, 2.0, 1.0), errors, errors, torch.Generator().manual_seed(0))
+    assert [(gain.value, gain.low, gain.high) for gain in found] == [(0.0, 0.0, 0.0)] * 3
+
+
 def made_up(trade, factor):
     """Rows whose flow errors are ``factor`` times the rival's, case by case, with errors that rise towards tight."""
     rows = {}
