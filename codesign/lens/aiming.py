@@ -16,12 +16,13 @@ from torch import Tensor
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.plated import trace
 from codesign.lens.trace import Prescription, Status
-from codesign.lens.traced import TracedLens
+from codesign.lens.traced import TracedLens, in_float64
 
 NEWTON_STEPS = 12
 HALVINGS = 6
 FIELD_STEPS = 16
 REACHED = 1e-11  # miss at the stop, relative to the stop's radius: where rounding of a float64 trace begins
+SINGULAR = 1e-12  # determinant at the stop of rays that stay where they are
 # step of the derivative that goes into the irradiance, relative to the pupil's size; its error is the square
 DIFFERENCE = 1e-3
 
@@ -30,12 +31,10 @@ DIFFERENCE = 1e-3
 class Aim:
     """Where rays cross the paraxial pupil's plane to meet the stop.
 
-    point_mm: [N, 2]. determinant: [N], area at the stop per area of the pupil plane. found: [N] bool; where
-      False, no ray meets the stop there and the point is the paraxial one.
+    point_mm: [N, 2]. found: [N] bool; where False, no ray meets the stop there and the point is the paraxial one.
     """
 
     point_mm: Tensor
-    determinant: Tensor
     found: Tensor
 
 
@@ -53,15 +52,14 @@ def aim_at_stop(
         over; share scales the field from the axis (0) to where it is wanted (1).
       until_stop: Prescription that ends on the stop. pupil: [N, 2] points of the unit disc; the radii give it
         its size on the stop and on the pupil plane.
-    Returns: Aim. Gradient: point_mm and determinant to every tensor behind ``rays``, ``until_stop`` and the
-      radii, by the implicit function theorem.
+    Returns: Aim. Gradient: point_mm to every tensor behind ``rays``, ``until_stop`` and the radii, by the
+      implicit function theorem.
     Warns: when some rays cannot be aimed; they keep their guess.
     """
     target_mm = pupil * stop_radius_mm
     with torch.no_grad():
         fixed = until_stop.detached()
         guess_mm = pupil * pupil_radius_mm
-        size = pupil_radius_mm.detach()
         scale = stop_radius_mm.detach()
         full = torch.ones_like(guess_mm[:, :1])
         at, found = _newton(rays, fixed, target_mm, guess_mm.clone(), full, scale)
@@ -75,25 +73,40 @@ def aim_at_stop(
                     "takes that way); they keep their paraxial aim.",
                     stacklevel=3,
                 )
-    shifts = (
-        DIFFERENCE
-        * size
-        * torch.tensor(
-            [[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]], dtype=at.dtype, device=at.device
-        )
-    )
-    stop = (
-        _meet(rays, until_stop, (at[None] + shifts[:, None]).reshape(-1, 2), full.repeat(5, 1))
-        .position_mm[:, :2]
-        .reshape(5, -1, 2)
-    )
-    jacobian = torch.stack([stop[1] - stop[2], stop[3] - stop[4]], -1) / (
-        2 * DIFFERENCE * size
-    )  # [N, stop, pupil]
-    usable = found & (torch.linalg.det(jacobian.detach()).abs() > 1e-12)
-    jacobian = torch.where(usable[:, None, None], jacobian, torch.eye(2, dtype=at.dtype, device=at.device))
-    change = torch.linalg.solve(jacobian.detach(), torch.where(usable[:, None], stop[0] - target_mm, 0))
-    return Aim(at - change, torch.linalg.det(jacobian), found)
+    met = _meet(rays, until_stop, at, full).position_mm[:, :2]
+    jacobian = _jacobian(rays, fixed, at, full, slice(None))
+    still = ~found | (torch.linalg.det(jacobian).abs() <= SINGULAR)
+    jacobian = _or_identity(jacobian, still)
+    change = torch.linalg.solve(jacobian, torch.where(still[:, None], 0, met - target_mm))
+    return Aim(at - change, found)
+
+
+def area_at_stop(
+    rays: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
+    until_stop: Prescription,
+    aim: Aim,
+    pupil_radius_mm: Tensor,
+) -> Tensor:
+    """Area that aimed rays cover at the stop per area of the pupil's plane, [N], with its sign; 1 where no ray was
+    found.
+
+    Args: as for ``aim_at_stop``, which returns ``aim``.
+    Gradient: to every tensor behind ``rays`` and ``until_stop``, and through the aimed points.
+    """
+    size = pupil_radius_mm.detach()
+    line = torch.tensor([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]).to(aim.point_mm)
+    points = aim.point_mm[None] + DIFFERENCE * size * line[:, None]
+    full = torch.ones_like(points[..., :1])
+    met = _meet(rays, until_stop, points.reshape(-1, 2), full.reshape(-1, 1)).position_mm[:, :2]
+    stop = met.reshape(4, -1, 2)
+    jacobian = torch.stack([stop[0] - stop[1], stop[2] - stop[3]], -1) / (2 * DIFFERENCE * size)
+    still = torch.linalg.det(jacobian.detach()).abs() <= SINGULAR
+    return torch.linalg.det(_or_identity(jacobian, still | ~aim.found))
+
+
+def _or_identity(jacobian, rows):
+    """The Jacobians [N, 2, 2] (at the stop, on the pupil's plane), the identity in some rows."""
+    return torch.where(rows[:, None, None], torch.eye(2).to(jacobian), jacobian)
 
 
 def aimed_rays(
@@ -106,9 +119,11 @@ def aimed_rays(
     """Parallel rays of one field angle (in +y) that meet the real stop at points of its disc.
 
     Args: field_rad scalar; pupil [M, 2] on the unit disc, in units of the stop's paraxial radius. Returns:
-      origins and directions [M, 3], lens axes.
+      origins and directions [M, 3], lens axes, in the lens's precision; solved in float64.
     Gradient: origins to the lens. Warns: when some rays cannot be aimed.
     """
+    dtype = lens.dtype
+    lens = in_float64(lens)
     f = lens.first_order(wavelength_um)
     pupil = pupil.to(lens.dtype)
     tangent = torch.tan(torch.as_tensor(field_rad, dtype=lens.dtype))
@@ -126,7 +141,8 @@ def aimed_rays(
         f.stop_semi_aperture_mm,
         f.entrance_pupil_diameter_mm / 2,
     )
-    return rays(aim.point_mm, torch.ones_like(pupil[:, :1]))
+    origin, direction = rays(aim.point_mm, torch.ones_like(pupil[:, :1]))
+    return origin.to(dtype), direction.to(dtype)
 
 
 def _meet(rays, until_stop, points, share):
@@ -143,7 +159,7 @@ def _newton(rays, until_stop, target, at, share, scale):
             break
         jacobian = _jacobian(rays, until_stop, at, share, active)
         step = torch.zeros_like(at)
-        solvable = torch.linalg.det(jacobian).abs() > 1e-12
+        solvable = torch.linalg.det(jacobian).abs() > SINGULAR
         step[active[solvable]] = torch.linalg.solve(jacobian[solvable], miss[active[solvable]])
         before = at.clone()
         for halving in range(HALVINGS):

@@ -11,7 +11,7 @@ from torch import nn
 
 from codesign.errors import DomainError
 from codesign.lens import paraxial
-from codesign.lens.aiming import aim_at_stop
+from codesign.lens.aiming import aim_at_stop, area_at_stop
 from codesign.lens.analysis.spots import spots
 from codesign.lens.focus import image_distance_mm
 from codesign.lens.glass import AIR, WAVELENGTH_UM, Glass
@@ -23,6 +23,7 @@ from codesign.lens.plated import trace
 from codesign.lens.replaceable import Replaceable, settled
 from codesign.lens.surface import Surface, scaled
 from codesign.lens.trace import PlateAt, Prescription, Status, TraceResult, check_rays
+from codesign.lens.traced import in_float64
 from codesign.lens.variables import Bound, checked_step
 from codesign.types import Rays
 
@@ -443,13 +444,15 @@ class GeoLens(Replaceable):
           film_mm: [N, 2] image points as seen upright (x right, y down), millimetres from the axis; their
             dtype is that of the computation.
           pupil: [N, 2] points of the unit disc; (0, 0) is the chief ray. They lie on the paraxial exit pupil,
-            or with ``aim`` on the real stop.
+            or with ``aim`` on the real stop, which is solved for in float64.
         Returns: Rays in camera axes, origins on the plane of the entrance pupil of the d line (the camera's
           origin), in metres.
         Gradient: to every lens tensor. The pupil sampling itself is the stop; the other surfaces clip with
           soft edges.
         Raises: DomainError when no ray passes or a pupil lies at infinity.
         """
+        if aim and self.dtype != torch.float64:
+            return in_float64(self).camera_rays(film_mm, pupil, wavelength_um, aim)
         f = self.first_order(wavelength_um)
         if not (math.isfinite(f.exit_pupil_z_mm.item()) and math.isfinite(f.entrance_pupil_z_mm.item())):
             raise DomainError(
@@ -469,11 +472,11 @@ class GeoLens(Replaceable):
             def field(q, share):
                 return towards(film.repeat(q.shape[0] // film.shape[0], 1) * share, q)
 
-            at = aim_at_stop(
-                field, back.until(at_stop), pupil.to(self.dtype), f.stop_semi_aperture_mm, radius
-            )
+            until = back.until(at_stop)
+            at = aim_at_stop(field, until, pupil.to(self.dtype), f.stop_semi_aperture_mm, radius)
+            area = area_at_stop(field, until, at, radius)
             start, direction = (v.to(film_mm.dtype) for v in towards(film, at.point_mm))
-            spread = ((f.stop_semi_aperture_mm / radius).square() / at.determinant.abs()).to(film_mm.dtype)
+            spread = ((f.stop_semi_aperture_mm / radius).square() / area.abs()).to(film_mm.dtype)
         else:
             start, direction = (
                 v.to(film_mm.dtype) for v in towards(film_mm, pupil * radius.to(film_mm.dtype))

@@ -10,6 +10,7 @@ from codesign.lens.aiming import aimed_rays
 from codesign.lens.analysis import pupil_grid
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.traced import in_float64
 
 
 def relative_illumination(
@@ -18,12 +19,14 @@ def relative_illumination(
     """Irradiance of the image of a uniform world at each field, relative to the axis, vignetting included.
 
     Args: fields_rad: angles from the axis; grid: pupil points across the stop.
-    Returns: [fields]. For an ideal lens of small aperture without distortion it is cos^4 of the field angle.
+    Returns: [fields], computed in float64 and given in the lens's precision. For an ideal lens of small aperture without distortion it is cos^4 of the field angle.
     Gradient: to every lens tensor.
     Raises: DomainError for a field that no ray passes.
     Source: E = integral of radiance over image-space direction cosines (Slyusarev; Rimmer, Relative
       illumination calculations, Proc. SPIE 655, 1986).
     """
+    dtype = lens.dtype
+    lens = in_float64(lens)
     pupil = pupil_grid(grid)
     fields = [0.0, *map(float, fields_rad)]
     heights = [_image_height(lens, field, wavelength_um) for field in fields]
@@ -35,7 +38,7 @@ def relative_illumination(
     )  # camera rays take points as seen upright
     assert rays.irradiance is not None  # GeoLens gives it
     light = (rays.weight * rays.irradiance).reshape(len(fields), -1).mean(1)
-    return light[1:] / light[0]
+    return (light[1:] / light[0]).to(dtype)
 
 
 def _image_height(lens, field_rad, wavelength_um):

@@ -1,6 +1,6 @@
 """What the parts that GeoLens is built on ask of a traced lens; GeoLens is one."""
 
-from typing import Protocol, Self
+from typing import Protocol, Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from codesign.lens.trace import Prescription, TraceResult
 class TracedLens(ParaxialLens, Protocol):
     """A lens whose rays can be traced and whose tensors can be replaced; see GeoLens for what each name holds."""
 
+    tensor_names: tuple[str, ...]
     surfaces: tuple[Surface, ...]
     mirrors: tuple[bool, ...]
     stop_index: int
@@ -33,3 +34,15 @@ class TracedLens(ParaxialLens, Protocol):
     ) -> TraceResult: ...
 
     def replace(self, **tensors: Tensor) -> Self: ...
+
+
+L = TypeVar("L", bound=TracedLens)
+
+
+def in_float64(lens: L) -> L:
+    """The lens with its numbers in float64, for figures that float32 would drown in rounding; the lens itself where
+    they are that already. Gradient: to every tensor of the lens."""
+    if lens.dtype == torch.float64:
+        return lens
+    lens = lens.replace()
+    return lens.replace(**{name: getattr(lens, name).double() for name in lens.tensor_names})

@@ -213,3 +213,54 @@ def test_colours_share_the_samples_of_a_pixel():
     )
     with pytest.raises(Exception, match="cannot be shared equally by 2 wavelengths"):
         render.Camera(geo, 3, 2, 0.5, 7, spectrum=spectrum)
+
+
+def by_differences(function, start, step):
+    """Central differences of a scalar function of a vector; the second derivative leaves about step^2."""
+    moved = torch.eye(len(start), dtype=F64) * step
+    return torch.stack([(function(start + by) - function(start - by)) / (2 * step) for by in moved]).detach()
+
+
+@pytest.mark.parametrize("name", ["curvature_per_mm", "thickness_mm"])
+def test_the_gradient_of_irradiance_counts_the_motion_of_the_aimed_rays(name):
+    geo = lens.load("cooke-triplet").freeze()
+    pupil = pupil_grid(4)
+    film = torch.tensor([[0.0, 10.0]], dtype=F64).expand(len(pupil), 2)
+
+    def irradiance(value):
+        rays = geo.replace(**{name: value}).camera_rays(film, pupil, aim=True)
+        return rays.irradiance.mean()
+
+    def illumination(value):
+        return relative_illumination(geo.replace(**{name: value}), [0.2], grid=8)[0]
+
+    start = getattr(geo, name).detach()
+    for figure in (irradiance, illumination):
+        at = start.clone().requires_grad_()
+        (found,) = torch.autograd.grad(figure(at), at)
+        truth = by_differences(figure, start, 1e-6 if name == "curvature_per_mm" else 1e-4)
+        # the derivative at the stop is a difference of rays, 1e-6 of it
+        torch.testing.assert_close(found, truth, rtol=0, atol=1e-5 * float(truth.abs().max()))
+
+
+@pytest.mark.parametrize("name", ["cooke-triplet", "double-gauss"])
+@pytest.mark.filterwarnings("error")
+def test_a_float32_lens_is_aimed_and_lit_as_in_float64(name):
+    geo = lens.load(name).freeze()
+    single = lens.load(name).float().freeze()
+    # its numbers are rounded to 6e-8 of themselves
+    torch.testing.assert_close(
+        relative_illumination(single, [0.1, 0.2], grid=8),
+        relative_illumination(geo, [0.1, 0.2], grid=8).float(),
+        rtol=0,
+        atol=1e-5,
+    )
+    pupil = pupil_grid(4)
+    origin, direction = aimed_rays(single, 0.2, pupil.float())
+    assert origin.dtype == direction.dtype == torch.float32
+    torch.testing.assert_close(origin, aimed_rays(geo, 0.2, pupil)[0].float(), rtol=0, atol=2e-5)
+    film = torch.tensor([[0.0, 5.0]], dtype=F64).expand(len(pupil), 2)
+    close = single.camera_rays(film.float(), pupil.float(), aim=True)
+    truth = geo.camera_rays(film, pupil, aim=True)
+    assert close.irradiance.dtype == torch.float32
+    torch.testing.assert_close(close.irradiance, truth.irradiance.float(), rtol=1e-5, atol=0)

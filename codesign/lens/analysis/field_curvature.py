@@ -9,6 +9,7 @@ from codesign.lens.analysis.rays import trace_field
 from codesign.lens.distance import PARALLEL, Distances
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.traced import in_float64
 
 
 def focus_shift_mm(
@@ -27,9 +28,11 @@ def focus_shift_mm(
 
     Args: fields_rad: F angles. reach: share of the pupil radius. at_m: metres to the object plane, or D of them.
     Returns: [F, 2] or [D, F, 2] mm, tangential (rays displaced in y) then sagittal (in x); positive behind the image
-      plane.
+      plane. Computed in float64, as the rays lie so close together, and given in the lens's precision.
     Gradient: to every lens tensor and to at_m. Raises: DomainError when a field does not arrive.
     """
+    dtype = lens.dtype
+    lens = in_float64(lens)
     line = torch.tensor([-2.0, -1.0, 1.0, 2.0], dtype=lens.dtype, device=lens.curvature_per_mm.device) * reach
     zero = torch.zeros_like(line)
     pupil = torch.cat([torch.stack([zero, line], 1), torch.stack([line, zero], 1)])
@@ -39,7 +42,7 @@ def focus_shift_mm(
         -_slope_at_zero(rays.position_mm[..., half, axis]) / _slope_at_zero(slope[..., half, axis])
         for half, axis in ((slice(4), 1), (slice(4, 8), 0))
     )
-    return torch.stack([tangential, sagittal], -1)
+    return torch.stack([tangential, sagittal], -1).to(dtype)
 
 
 def _slope_at_zero(values):

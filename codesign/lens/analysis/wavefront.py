@@ -19,6 +19,7 @@ from codesign.lens.analysis.rays import ImageRays, pupil_grid, trace_with_chief
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
+from codesign.lens.traced import in_float64
 
 
 @dataclass(frozen=True)
@@ -79,16 +80,20 @@ def wavefront(
         points themselves.
       vignetting, defocus_mm, at_m (one distance): see ``trace_field``. reference_mm: [2] centre of the reference sphere; None is
         the chief ray's point.
-    Returns: Wavefront.
+    Returns: Wavefront, in the lens's precision; paths of many wavelengths are computed in float64.
     Gradient: opd_mm to every lens tensor and to at_m. Raises: DomainError when no ray, or not the chief ray, arrives.
     """
     like = lens.curvature_per_mm
-    pupil = pupil_grid(grid, like.dtype, like.device) if pupil is None else pupil
+    lens = in_float64(lens)
+    pupil = pupil_grid(grid, torch.float64, like.device) if pupil is None else pupil.double()
     rays, chief = trace_with_chief(lens, field_rad, pupil, wavelength_um, vignetting, defocus_mm, at_m)
     reference_mm = chief.position_mm[0] if reference_mm is None else torch.as_tensor(reference_mm)
     opd, slope = _on_sphere(lens, rays, chief, wavelength_um, reference_mm, defocus_mm)
     opd = torch.where(rays.weight > 0, opd, 0)
-    return Wavefront(pupil, opd, rays.weight, slope, wavelength_um, reference_mm)
+    pupil, opd, weight, slope, reference_mm = (
+        v.to(like.dtype) for v in (pupil, opd, rays.weight, slope, reference_mm)
+    )
+    return Wavefront(pupil, opd, weight, slope, wavelength_um, reference_mm)
 
 
 def remove_fit(front: Wavefront, tilt: bool = True, focus: bool = False) -> Wavefront:
