@@ -111,6 +111,7 @@ def test_lateral_colour_is_the_difference_of_heights_in_c_and_f_light():
     assert height_mm("d") == pytest.approx(EDGE_MM, rel=1e-12)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("light", [None, Spectrum.visible_FdC()])
 def test_without_faults_the_picture_is_a_pinholes_bit_for_bit(light):
     batch = next(cases.batches("photos", 2.0, 1, seed=0))

@@ -104,6 +104,7 @@ def _errors(found, geo):
     return errors, torch.randn(len(errors), generator=torch.Generator().manual_seed(3), dtype=geo.dtype)
 
 
+@pytest.mark.bits
 def test_errors_of_manufacture_repeat_by_seed_and_are_refocused():
     trade = TRADES["tolerance"]
     found = problem(8.0, trade)
