@@ -55,9 +55,15 @@ def _least_spot(lens, distance_m, image_mm, wavelength_um, grid):
     rays = trace_source(placed, source_rays(lens, [0.0], pupil, distance_m), wavelength_um)
     if not bool(rays.weight.any()):
         raise DomainError(f"{lens.name}: no ray of the axial point arrives; leave spot_grid out.")
-    return least_spot_shift(
+    shift, sharpness = least_spot_shift(
         rays.position_mm, rays.direction[..., :2] / rays.direction[..., 2:], rays.weight[..., None]
-    )[0]
+    )
+    if not float(sharpness.detach()) >= 1e-16:
+        raise DomainError(
+            f"{lens.name}: {len(pupil)} rays of a pupil of {grid} samples across do not converge, so no spot is the "
+            "least; give a spot_grid of at least 2, or leave it out."
+        )
+    return shift
 
 
 def _remedy(lens):

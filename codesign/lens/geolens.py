@@ -247,7 +247,8 @@ class GeoLens(Replaceable):
           across, for the film of the least RMS spot of the point in place of the paraxial one.
         Returns: a lens as from ``replace``; this one stays as it is. Its last thickness is the image distance.
         Gradient: to every lens tensor that bends or moves light, and to the distance.
-        Raises: DomainError for a point that does not lie before the lens and beyond its front focal plane.
+        Raises: DomainError for a point that does not lie before the lens and beyond its front focal plane, and for
+          a spot of a single ray.
         """
         image_mm = image_distance_mm(self, distance_m, wavelength_um, spot_grid)
         return self.replace(thickness_mm=torch.cat([self.thickness_mm[:-1], image_mm.reshape(1)]))
@@ -266,7 +267,8 @@ class GeoLens(Replaceable):
         Returns: a lens as from ``replace``, without Parameters and variables of its own; this one stays as it is.
         Gradient: to every tensor of this lens but the index offset of that surface, which belonged to the glass
           that went: the new one has 0.
-        Raises: DomainError for a surface that is not there or a mirror, and for a name the catalogue does not know,
+        Raises: DomainError for a surface that is not there or a mirror, for glass that the light passes again behind a
+          mirror, and for a name the catalogue does not know,
           with the nearest it knows.
         """
         surfaces = with_medium(self.name, self.surfaces, surface, glass)

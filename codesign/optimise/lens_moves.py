@@ -66,10 +66,16 @@ def reoptimise(
       residuals: lens -> [M]; limits enter as rows, see ``constraints.rows``. Values that are not finite, and a
         DomainError, make a failed step.
       names, bounds: as in ``GeoLens.variables``; thicknesses stay above 0.
-      held: surfaces (from 0) whose curvature is not to change. steps: most steps.
+      held: surfaces (from 0, from the last when negative) whose curvature is not to change. steps: most steps.
     Returns: Redesign; the lens given stays as it is.
-    Raises: DomainError when the residuals of the lens given are not finite, or nothing can vary.
+    Raises: DomainError when the residuals of the lens given are not finite, a held surface is not there, or
+      nothing can vary.
     """
+    count = len(lens.surfaces)
+    missing = [i for i in held if not -count <= i < count]
+    if missing:
+        raise DomainError(f"{lens.name}: there is no surface {missing[0]} to hold; it has 0 to {count - 1}.")
+    held = [i % count for i in held]
     work = copy.deepcopy(lens)
     efl = float(work.first_order().efl_mm.detach())
     at = _holder(work, held)

@@ -267,6 +267,46 @@ def test_incidence_is_differentiable():
         assert abs(float(slope[i]) - truth) <= 1e-5 * float(slope.abs().max())
 
 
+def test_a_face_between_equal_glasses_is_met_at_its_own_angle():
+    crown = Glass.named("N-BK7")
+    doublet = GeoLens(
+        [Surface(40.0, 3.0, crown, 6.0), Surface(-12.0, 3.0, crown, 6.0), Surface(-60.0, 60.0, None, 6.0)],
+        8.0,
+    ).freeze()
+    limits = Limits(incidence_deg=30.0, fields_rad=(0.0, 0.2))
+
+    def incidence(c):
+        found = named(evaluate(doublet.replace(curvature_per_mm=c), limits))
+        return found["incidence on surface 2"].value
+
+    truth = max(
+        snell(doublet, o, d)[1][1]
+        for o, d in zip(*(v.tolist() for v in rim_rays(doublet, (0.0, 0.2))), strict=True)
+    )
+    assert truth > 20
+    c = doublet.curvature_per_mm.clone().requires_grad_()
+    found = incidence(c)
+    assert found.item() == pytest.approx(truth, abs=1e-9)
+    (slope,) = torch.autograd.grad(found, c)
+    step = 1e-6 * torch.eye(3, dtype=D)
+    differences = torch.stack([incidence(c.detach() + by) - incidence(c.detach() - by) for by in step]) / 2e-6
+    torch.testing.assert_close(slope, differences, rtol=0, atol=1e-5 * float(differences.abs().max()))
+
+
+def test_a_stop_in_air_has_no_angle_of_incidence():
+    geo = GeoLens(
+        [
+            Surface(INF, 5.0, None, 5.0, is_stop=True),
+            Surface(40.0, 3.0, GLASS, 6.0),
+            Surface(-40.0, 38.0, None, 6.0),
+        ],
+        4.0,
+    ).freeze()
+    hits = surface_hits(geo, *rim_rays(geo, (0.2,)))
+    assert bool((hits.cosine[0] == 1).all())
+    assert bool((hits.cosine[1] < 1).all())
+
+
 def test_mirrors_reflect_at_the_angle_of_incidence():
     mirror = GeoLens([Surface(-100.0, 50.0, None, 10.0, mirror=True)], 10.0).freeze()
     origin, direction = field_rays(mirror, 0.1, torch.tensor([[0.0, 0.0], [0.0, 1.0]], dtype=D))

@@ -100,5 +100,8 @@ def test_rays_that_fail_and_wrong_shapes_are_refused():
     geo = lens.load("cooke-triplet").freeze()
     with pytest.raises(DomainError, match="rim rays fail, so its apertures cannot be sized"):
         fit_apertures(geo, (1.2,))
+    for margin in (-2.0, math.nan, INF):
+        with pytest.raises(DomainError, match="give a finite number of at least 0"):
+            fit_apertures(geo, (0.1,), margin=margin)
     with pytest.raises(ShapeError, match="semi_aperture_mm has shape"):
         geo.replace(semi_aperture_mm=torch.ones(3, dtype=D))

@@ -112,6 +112,10 @@ def test_the_least_spot_is_the_least(distance_m):
             "does not converge.*it needs more than 0.0[0-9]+ m",
         ),
         (lambda: lens.load("cooke-triplet").focus_at(0.005), "does not lie before the lens"),
+        (
+            lambda: lens.load("cooke-triplet").focus_at(1.0, spot_grid=1),
+            "1 rays of a pupil of 1 samples across do not converge",
+        ),
         (lambda: lens.load("cooke-triplet").focus_at(-1.0), "does not lie before the lens"),
         (
             lambda: lens.GeoLens(

@@ -17,6 +17,7 @@ from codesign.lens.design import (
     without_element,
     without_surface,
 )
+from codesign.lens.design.tolerance_errors import Tolerances, errors_of
 from codesign.lens.glass import names
 
 FIELDS = (0.0, 0.2)
@@ -230,6 +231,7 @@ def test_an_exchanged_glass_keeps_focal_length_and_defocus(triplet):
         (lambda t: without_surface(t, 7), "there is no surface 7; it has 0 to 5"),
         (lambda t: without_surface(t, 1), "between glass and air.*without_element"),
         (lambda t: with_glass(t, 1, FLINT), "no glass behind surface 1 to exchange; there is behind 0, 2, 4"),
+        (lambda t: with_glass(t, 0, "air"), "air is no glass; .*without_element"),
         (lambda t: neighbour_glasses("N-BK77"), "'N-BK77' is not in the catalogue; the nearest names are"),
         (lambda t: neighbour_glasses(Glass.from_indices(1.5, 1.5, 1.5)), "no dispersion"),
         (lambda t: neighbour_glasses("F2", 0), "at least 1"),
@@ -253,6 +255,30 @@ def test_mirrors_stay():
         without_surface(mangin, 1)
     with pytest.raises(DomainError, match="touches a mirror"):
         without_element(mangin, 0)
+
+
+def test_glass_on_both_ways_of_a_mirror_stays():
+    """A crown plate in front of a mangin mirror, passed on the way there and back."""
+    there = [Surface(-60.0, 3.0, FLINT, 10.0, is_stop=True), Surface(-90.0, 5.0, None, 10.0)]
+    mangin = [Surface(-80.0, 4.0, CROWN, 10.0), Surface(-120.0, 4.0, CROWN, 10.0, mirror=True)]
+    back = [Surface(80.0, 5.0, None, 10.0), Surface(90.0, 3.0, FLINT, 10.0), Surface(60.0, 60.0, None, 10.0)]
+    geo = GeoLens([*there, *mangin, *back], 10.0)
+    first, last = 0, len(elements(geo)) - 1
+    for element in (first, last):
+        with pytest.raises(DomainError, match=r"the light passes element \d again behind surface"):
+            without_element(geo, element)
+    for surface in (0, 5):
+        with pytest.raises(DomainError, match="the light passes the glass behind it again behind surface"):
+            with_glass(geo, surface, "SF1")
+        with pytest.raises(DomainError, match="the light passes the glass behind it again behind surface"):
+            geo.replace_glass(surface, "SF1")
+    both = geo.replace_glass(2, "SF1").index()  # glass on the mirror is one gap for both ways
+    assert both[3] == both[4] == Glass.named("SF1").index(0.5875618)
+    for errors in (Tolerances(element_decentre_mm=0.1), Tolerances(element_tilt_deg=0.1)):
+        with pytest.raises(DomainError, match="element 1-2 holds a mirror or is passed twice"):
+            errors_of(geo, errors)
+        with pytest.raises(DomainError, match="element 1-2 holds a mirror or is passed twice"):
+            errors_of(GeoLens([*mangin, back[0]], 10.0), errors)
 
 
 def test_a_rest_that_images_inside_itself_is_refused(gauss):

@@ -118,6 +118,10 @@ def test_held_surfaces_keep_their_curvature(triplet):
     same = (found.lens.curvature_per_mm == triplet.curvature_per_mm).tolist()
     assert [same[0], same[5], any(same[1:5])] == [True, True, False]
     assert found.after < found.before
+    last = reoptimise(triplet, spot_errors, ("curvature", "focus"), held=(-1,), steps=1).lens
+    assert last.curvature_per_mm[5] == triplet.curvature_per_mm[5]
+    with pytest.raises(DomainError, match="there is no surface 99 to hold; it has 0 to 5"):
+        reoptimise(triplet, spot_errors, held=(99,))
 
 
 def test_a_ray_that_fails_is_a_failed_step_and_a_bad_start_is_refused(triplet):

@@ -1,7 +1,8 @@
 """Where rays meet each surface and how steeply: clear apertures and angles of incidence."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
@@ -14,12 +15,15 @@ from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.paraxial import paraxial_rays
 from codesign.lens.plated import trace
+from codesign.lens.trace import onward
+
+DENSER = 1.5  # index behind a surface whose normal is looked for: no ray is totally reflected
 
 
 @dataclass(frozen=True)
 class Hits:
     """Rays at every surface. height_mm: [S, N] distance from the vertex across the axis. cosine: [S, N] of
-    the angle of incidence, 1 where the surface does not bend light. passed: [S, N], False from the surface on
+    the angle of incidence, 1 on a dummy that borders no glass. passed: [S, N], False from the surface on
     where a ray failed; its numbers then mean nothing."""
 
     height_mm: Tensor
@@ -33,8 +37,8 @@ def surface_hits(
     """Trace rays once per surface, up to it, and once to the image. Args: origin_mm, direction [N, 3], see
     GeoLens.trace. Returns: Hits.
 
-    The normal is read off the change of direction, n'd' - n d = const N, so shapes, decentres and tilts need
-    no second formula.
+    The normal is read off the change of direction at the same surface before denser glass, n'd' - n d = const N, so
+    shapes, decentres and tilts need no second formula, and equal indices on both sides have a normal too.
     Gradient: heights and cosines to rays and to every lens tensor. Raises: DomainError for a lens with
       diffractive phases, which bend off the normal.
     """
@@ -54,15 +58,20 @@ def surface_hits(
     passed = []
     for i, (here, next_) in enumerate(pairwise(traced)):
         before = here.direction
-        after = next_.direction
-        if lens.mirrors[i]:
-            after = after * after.new_tensor([1.0, 1.0, -1.0])  # the trace unfolds the axis behind a mirror
-        bend = whole.index[i + 1] * after - whole.index[i] * before
         ok = next_.status == 0
-        length2 = bend.square().sum(1)
-        bends = ok & (length2 > 1e-18)
-        length = torch.where(bends, length2, 1.0).sqrt()
-        cosines.append(torch.where(bends, ((bend * before).sum(1) / length).abs(), 1.0))
+        if lens.mirrors[i] or whole.borders_glass[i]:
+            surface = replace(
+                whole.part(i, i + 1),
+                index=whole.index.new_tensor([1.0, DENSER]),
+                mirrors=(False,),
+                to_plane=False,
+                efficiency=1.0,
+            )
+            bend = DENSER * trace(surface, *onward(here)).direction - before
+            length = torch.where(ok, bend.square().sum(1), 1.0).sqrt()
+            cosines.append(torch.where(ok, ((bend * before).sum(1) / length).abs(), 1.0))
+        else:
+            cosines.append(torch.ones_like(before[:, 0]))
         heights.append(torch.linalg.vector_norm(here.position_mm[:, :2], dim=1))
         passed.append(ok)
     return Hits(torch.stack(heights), torch.stack(cosines), torch.stack(passed))
@@ -92,8 +101,12 @@ def traced_semi_aperture_mm(
     """Semi-aperture that lets the full pupil of all fields and distances pass, [S] mm: the largest height of a rim
     ray, times 1 + margin.
 
-    Gradient: of the highest ray. Raises: DomainError when a rim ray fails.
+    Gradient: of the highest ray. Raises: DomainError when a rim ray fails, or for a margin below 0.
     """
+    if not 0 <= margin < math.inf:
+        raise DomainError(
+            f"{lens.name}: margin {margin} is added to semi-apertures as a share; give a finite number of at least 0."
+        )
     rays = rim_rays(lens, fields_rad, count, at_m)
     failed = lens.trace(*rays).status != 0
     if bool(failed.any()):
@@ -115,7 +128,7 @@ def fit_apertures(
     Args: fields_rad, at_m: whose full pupil passes; give both signs of a field for a lens with decentres or tilts.
       margin: share added to the highest ray, as far as the surface reaches.
     Returns: a lens as from ``replace``. Gradient: semi_aperture_mm follows the highest rays.
-    Raises: DomainError when a rim ray fails.
+    Raises: DomainError when a rim ray fails, or for a margin below 0.
 
     >>> from codesign import lens
     >>> geo = lens.load("double-gauss")

@@ -14,6 +14,7 @@ from codesign.errors import DomainError
 from codesign.lens.design.solves import focus_paraxial, hold_efl
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM, Glass
+from codesign.lens.media import passes_of
 from codesign.lens.surface import Surface
 
 SAME_INDEX = 1e-9
@@ -127,7 +128,7 @@ def with_glass(lens: GeoLens, surface: int, medium: Glass | str) -> GeoLens:
     ``GeoLens.replace_glass`` leaves them as they come.
 
     Args: medium: a Glass, or a name of the catalogue.
-    Returns, Raises: as ``without_element``; DomainError for a gap that holds no glass.
+    Returns, Raises: as ``without_element``; DomainError for a gap that holds no glass, and for air in its place.
     """
     if surface not in [front for front, _ in elements(lens)]:
         fronts = ", ".join(str(front) for front, _ in elements(lens))
@@ -136,6 +137,10 @@ def with_glass(lens: GeoLens, surface: int, medium: Glass | str) -> GeoLens:
         )
     name = medium if isinstance(medium, str) else medium.name
     other = lens.replace_glass(surface, medium)
+    if other.surfaces[surface].medium is None:
+        raise DomainError(
+            f"{lens.name}: {name} is no glass; give one, or take the element out with without_element."
+        )
     return _held(lens, _surfaces(other), f"with {name} behind surface {surface + 1}")
 
 
@@ -149,6 +154,12 @@ def _element_faces(lens, pairs, element):
         raise DomainError(
             f"{lens.name}: element {range(len(pairs))[element] + 1} touches a mirror, and without that the light "
             "turns no more; choose another."
+        )
+    passes = passes_of(lens.to_surfaces(), front)
+    if passes:
+        raise DomainError(
+            f"{lens.name}: the light passes element {range(len(pairs))[element] + 1} again behind surface "
+            f"{passes[0] + 1}, as a mirror sends it back, and only one pass would change; choose another."
         )
     return front, back
 

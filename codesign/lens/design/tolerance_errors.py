@@ -13,6 +13,7 @@ from codesign.lens.design.constraints import is_glass
 from codesign.lens.design.element_errors import moved_element
 from codesign.lens.design.moves import groups
 from codesign.lens.geolens import GeoLens
+from codesign.lens.media import passes_of
 
 OF_ELEMENT = "element "  # before the argument of ``moved_element``
 
@@ -73,6 +74,7 @@ def errors_of(lens: GeoLens, tolerances: Tolerances | Sequence[Error]) -> list[E
     element; errors given as such stay as they are. A plane keeps its radius but not its fringes.
 
     Surfaces that do not bend light (a stop in air) have no shape or place to get wrong.
+    Raises: DomainError for tolerances of elements with a mirror in them, or that the light passes twice.
     """
     if not isinstance(tolerances, Tolerances):
         return list(tolerances)
@@ -105,7 +107,9 @@ def errors_of(lens: GeoLens, tolerances: Tolerances | Sequence[Error]) -> list[E
                     f"tilt of {where} about {label}", "tilt_rad", (i, axis), math.radians(t.tilt_deg) * bends
                 )
             )
-    for g, (first, last) in enumerate(groups(lens)):
+    of_elements = t.element_decentre_mm or t.element_tilt_deg or t.element_wedge_deg
+    for g, (first, last) in enumerate(groups(lens) if of_elements else ()):
+        _check_body(lens, first, last)
         for kind, deviation in (
             ("decentre_mm", t.element_decentre_mm),
             ("tilt_rad", math.radians(t.element_tilt_deg)),
@@ -117,6 +121,15 @@ def errors_of(lens: GeoLens, tolerances: Tolerances | Sequence[Error]) -> list[E
                 name = f"{noun} of element {first + 1}-{last + 1} {side} {label}"
                 found.append(Error(name, OF_ELEMENT + kind, (g, axis), deviation))
     return [error for error in found if error.deviation > 0]
+
+
+def _check_body(lens, first, last):
+    surfaces = lens.to_surfaces()
+    if any(lens.mirrors[first : last + 1]) or any(passes_of(surfaces, i) for i in range(first, last)):
+        raise DomainError(
+            f"{lens.name}: element {first + 1}-{last + 1} holds a mirror or is passed twice by the light, and moving it "
+            "as a body is not modelled; give tolerances of surfaces instead of elements."
+        )
 
 
 def perturbed(lens: GeoLens, errors: Sequence[Error], amounts: Tensor) -> GeoLens:
