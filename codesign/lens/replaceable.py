@@ -40,6 +40,7 @@ class Replaceable(nn.Module):
 
     tensor_names: tuple[str, ...] = ()
     parameter_names: tuple[str, ...] = ()
+    borrows = False  # whether its plate is that of the lens it was made from
 
     def __getattr__(self, name: str) -> Any:
         if name in type(self).tensor_names:
@@ -94,6 +95,7 @@ class Replaceable(nn.Module):
         for key, value in vars(self).items():
             if key not in ("_parameters", "_buffers"):
                 twin.__dict__[key] = copy.deepcopy(value, memo)
+        twin.borrows = False
         twin._parameters = {name: copy.deepcopy(p, memo) for name, p in self._parameters.items()}
         twin._buffers = {name: _own(b) for name, b in self._buffers.items()}
         for name in self.parameter_names if self._driver is None else ():
@@ -103,6 +105,9 @@ class Replaceable(nn.Module):
         return twin
 
     def _apply(self, fn, recurse=True):
+        for name, child in self._modules.items():
+            if isinstance(child, Replaceable):
+                self._modules[name] = child._shell()
         for name, old in self._parameters.items():
             if old is not None:
                 with torch.no_grad():
@@ -115,8 +120,12 @@ class Replaceable(nn.Module):
         return super()._apply(fn, recurse)
 
     def _load_from_state_dict(self, state_dict, prefix, *rest):
-        # values are copied in place, so the buffers must be this lens's own
+        # values are copied in place, so the buffers, and a plate of another lens, must be this lens's own
         self._buffers.update({name: _own(value) for name, value in self._buffers.items()})
+        if self.borrows:
+            parts = {name: child for name, child in self._modules.items() if isinstance(child, Replaceable)}
+            self._modules.update(copy.deepcopy(parts))
+            self.borrows = False
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def _known(self, name):
@@ -140,6 +149,7 @@ class Replaceable(nn.Module):
             twin._parameters.pop(name, None)
         twin._buffers.update(tensors)
         twin._modules.pop(DRIVER, None)
+        twin.borrows = True
         return twin
 
     def _now(self):

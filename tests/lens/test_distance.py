@@ -8,7 +8,7 @@ import torch
 
 from codesign import lens
 from codesign.errors import DomainError, ShapeError
-from codesign.lens import analysis
+from codesign.lens import analysis, plates
 from codesign.lens.analysis import field_rays, pupil_grid
 from codesign.lens.design import Limits, focus_paraxial, focus_rays
 from codesign.lens.design.constraints import evaluate
@@ -249,6 +249,21 @@ def test_traced_depth_of_field_has_the_limit_at_its_ends():
         )
     assert found.near_m < 0.6 < found.far_m
     assert float(found.focus_m) == pytest.approx(0.6, rel=2e-3)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("defocus_rad", [10.0, -50.0, -80.0])
+def test_traced_depth_of_field_is_found_where_a_plate_moves_it(defocus_rad):
+    geo = lens.load("cooke-triplet").focus_at(2.0)
+    plated = plates.with_plate(geo, plates.ZernikePlate({4: defocus_rad}, 6.0), z_mm=1.0)
+    found = analysis.traced_depth_of_field(plated, 0.1, grid=8)
+    at = torch.linspace(1 / 50, 1 / 0.5, 4001, dtype=D)  # 1 / m
+    sizes = lens.rms_spot_mm(plated, [0.0], grid=8, at_m=1 / at)[:, 0]
+    sharp = at[sizes <= 0.1 / math.sqrt(8)]
+    step = float(at[1] - at[0])
+    assert 1 / float(found.far_m) == pytest.approx(float(sharp[0]), abs=step)
+    assert 1 / float(found.near_m) == pytest.approx(float(sharp[-1]), abs=step)
+    assert 1 / float(found.focus_m) == pytest.approx(float(at[sizes.argmin()]), abs=step)
 
 
 @torch.no_grad()

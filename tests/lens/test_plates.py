@@ -200,6 +200,20 @@ def test_copies_own_their_plate_and_replacements_share_it():
     assert plate.coefficients_rad.tolist() == [9.0]
 
 
+@pytest.mark.parametrize("plate", [ZernikePlate({4: 1.0}, 4.0), GridPlate(torch.ones(6, 6), 2.0)])
+def test_loading_and_converting_a_replacement_leave_the_plate_alone(plate):
+    plated = with_plate(landscape(), plate, z_mm=1.0)
+    (first,) = plate.parameters()
+    twin = plated.replace()
+    twin.load_state_dict({name: value * 0 for name, value in twin.state_dict().items()})
+    assert float(next(twin.plate.parameters()).detach().abs().max()) == 0
+    for other in (plated.replace(), plated):
+        assert next(other.float().plate.parameters()).dtype == torch.float32
+    assert next(plate.parameters()) is first
+    assert first.dtype == D
+    assert float(first.detach().min()) == 1.0
+
+
 def test_what_a_plate_stops_is_said():
     geo = landscape()
     start = torch.tensor([[0.0, 0.0, -5.0], [3.5, 0.0, -5.0], [7.0, 0.0, -5.0]], dtype=D)

@@ -21,6 +21,7 @@ from codesign.lens.paraxial import yu_trace
 RMS_OF_DISC = 1 / (2 * math.sqrt(2))  # RMS radius of an evenly filled disc over its diameter
 SAMPLES = 33  # vergences of one trace
 ROUNDS = 5  # of traces, each looking into one step of the one before
+CLOSEST_PER_MM = 1e3  # to a pupil that has no surface before it
 
 
 @dataclass(frozen=True)
@@ -100,21 +101,40 @@ def traced_depth_of_field(
 
     Aberrations share the blur: this range is the smaller the more of the limit they take. Args as for
     ``depth_of_field``; fields_rad: angles whose mean square counts. Gradient: none (limits are searched, to 1e-6).
-    Raises: DomainError as there, and when aberrations alone exceed the limit.
+    Raises: DomainError for a limit that is not positive, and when aberrations alone exceed it.
     """
     lens = lens if focus_m is None else lens.focus_at(focus_m, wavelength_um)
-    wide = depth_of_field(lens, blur_mm, wavelength_um=wavelength_um)
-    low, high = 1e-3 / float(wide.far_m), 1e-3 / float(wide.near_m)
+    limit = float(_checked(lens, blur_mm)) * RMS_OF_DISC
+    (at_parallel, _), (per_vergence, _) = _film_heights(lens, wavelength_um)
+    sharpest = float(-at_parallel / per_vergence)
+    width = 3 * float(blur_mm) / float(lens.first_order().entrance_pupil_diameter_mm * per_vergence.abs())
     nearest = _nearest(lens)
-    low, high = max(0.0, 2 * low - high), 2 * high - low
-    high = min(high, 0.999 / nearest) if nearest else high
+    top = 0.999 / nearest if nearest else CLOSEST_PER_MM
+    centre = min(max(sharpest, 0.0), top)
 
     def rms(vergences):
         spots = rms_spot_mm(lens, fields_rad, wavelength_um, grid, 1e-3 / vergences)
         return spots.square().mean(1).sqrt()
 
-    limit = float(blur_mm) * RMS_OF_DISC
-    at = torch.linspace(low, high, 8 * SAMPLES, dtype=lens.dtype, device=lens.thickness_mm.device)
+    def line(low, high):
+        return torch.linspace(low, high, 8 * SAMPLES, dtype=lens.dtype, device=lens.thickness_mm.device)
+
+    while True:  # aberrations, or a plate, may move the sharpest place far from the paraxial one
+        low, high = max(0.0, centre - width), min(top, centre + width)
+        at = line(low, high)
+        found = rms(at)
+        best = int(found.argmin())
+        ends_low = low == 0 or (best > 0 and float(found[0]) > limit)
+        ends_high = high == top or (best < len(at) - 1 and float(found[-1]) > limit)
+        if ends_low and ends_high:
+            break
+        width *= 2
+    least = at[max(best - 1, 0) : best + 2]
+    for _ in range(ROUNDS):  # the range within the limit may be narrower than a step
+        least = line(float(least[0]), float(least[-1]))
+        k = int(rms(least).argmin())
+        least = least[max(k - 1, 0) : k + 2]
+    at = torch.cat([at, least]).unique()  # in order
     found = rms(at)
     best = int(found.argmin())
     if not float(found[best]) <= limit:

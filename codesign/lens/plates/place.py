@@ -30,12 +30,14 @@ def with_plate(lens: GeoLens, plate: Plate | None, surface: int | None = None, z
 
     Args: plate: None takes the lens's plate out. surface: from 0; None is the stop, -1 the last surface. z_mm:
       distance of the plate's plane from that surface's vertex, negative before the stop.
-    Returns: a lens as from ``replace``, which shares tensors and plate; everything that traces rays sees the plate.
+    Returns: a lens as from ``replace``, which shares tensors and plate (a converted one has a plate of its own);
+      everything that traces rays sees the plate.
       First-order figures and Seidel sums are those of the lens alone.
     Raises: DomainError for another surface, in glass, or where the plane meets a surface.
     """
     twin = lens.replace()
     twin.plate = plate
+    twin.borrows = False
     if plate is None:
         return twin
     last = len(lens.surfaces) - 1

@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.plates.zernike import noll, zernike
+from codesign.lens.replaceable import Replaceable
 
 
-class Plate(nn.Module):
+class Plate(Replaceable):
     """What all plates are: a phase over (x, y) that adds optical path, positive phase more of it.
 
     wavelength_um: where the phase holds. diffractive: whether the phase is the same at every wavelength (the first
@@ -65,10 +66,11 @@ class ZernikePlate(Plate):
             raise DomainError(
                 f"plate: give at least one Zernike term and a positive radius, got {radius_mm} mm."
             )
+        values = torch.tensor(list(coefficients_rad.values()), dtype=torch.float64)
         self.terms = tuple(coefficients_rad)
         self.radius_mm = float(radius_mm)
         self.coefficients_rad = nn.Parameter(
-            torch.tensor(list(coefficients_rad.values()), dtype=torch.float64)
+            check_finite(values, "plate coefficients", "give finite radians")
         )
         self.finest_mm = self.radius_mm / max(1, *(noll(term)[0] for term in self.terms))
 
