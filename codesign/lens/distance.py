@@ -3,6 +3,7 @@ is 0 and needs no branch."""
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,7 +25,7 @@ def vergence_per_mm(lens: ParaxialLens, at_m: Distances, origin_z_mm: Tensor | N
       one axis or none given.
     """
     like = lens.thickness_mm
-    at = torch.as_tensor(at_m, dtype=like.dtype, device=like.device)
+    at = real_numbers(at_m, "object distances").to(like)
     if at.ndim > 1 or at.numel() == 0:
         raise ShapeError(
             f"object distances must be one number or a list of them, got a tensor of shape {tuple(at.shape)}."
@@ -47,9 +48,32 @@ def vergence_per_mm(lens: ParaxialLens, at_m: Distances, origin_z_mm: Tensor | N
     return 1 / (1e3 * at)
 
 
+def real_numbers(values: Any, name: str) -> Tensor:
+    """The values as a tensor: DomainError where they are no real numbers."""
+    try:
+        found = (
+            torch.as_tensor(values)
+            if isinstance(values, Tensor)
+            else torch.as_tensor(values, dtype=torch.float64)
+        )
+    except (TypeError, ValueError, RuntimeError):
+        found = None
+    if found is None or found.is_complex():
+        raise DomainError(f"{name}: {values!r} is no real number and no list of them; give numbers.")
+    return found
+
+
+def real_number(value: Any, name: str) -> Tensor:
+    """One finite real number as a float64 scalar tensor, with its gradient: DomainError for anything else."""
+    found = real_numbers(value, name)
+    if found.ndim or not bool(found.isfinite()):
+        raise DomainError(f"{name}: {value} is not one finite number; give one.")
+    return found.double()
+
+
 def one_distance(at_m: Distances) -> Distances:
     """The distance itself, where a result is that of one: ShapeError for several."""
-    count = torch.as_tensor(at_m).shape
+    count = real_numbers(at_m, "object distances").shape
     if count:
         raise ShapeError(f"this is a figure of one object distance, got {tuple(count)}; call it for each.")
     return at_m

@@ -13,6 +13,7 @@ from codesign.errors import DomainError
 from codesign.lens import paraxial
 from codesign.lens.aiming import aim_at_stop, area_at_stop
 from codesign.lens.analysis.spots import spots
+from codesign.lens.distance import real_numbers
 from codesign.lens.focus import image_distance_mm
 from codesign.lens.glass import AIR, WAVELENGTH_UM, Glass
 from codesign.lens.hold_efl import hold_efl, holding_surface
@@ -187,7 +188,7 @@ class GeoLens(Replaceable):
             held["efl_mm"] = efl
             held["efl_surface"] = torch.tensor(holding_surface(self.replace()))
         if focus_at_m is not None:
-            held["focus_m"] = torch.as_tensor(focus_at_m, dtype=torch.float64)
+            held["focus_m"] = real_numbers(focus_at_m, "object distances").double()
         if step_mm is None:
             step_mm = 1e-3 * abs(float(efl))
         if fields_rad is None:

@@ -8,7 +8,7 @@ import torch
 
 from codesign import lens
 from codesign.errors import DomainError, ShapeError
-from codesign.lens import analysis, plates
+from codesign.lens import analysis, plates, wave
 from codesign.lens.analysis import field_rays, pupil_grid
 from codesign.lens.design import Limits, focus_paraxial, focus_rays
 from codesign.lens.design.constraints import evaluate
@@ -274,9 +274,32 @@ def test_depth_of_field_refuses_what_it_cannot_answer():
             analysis.depth_of_field(geo, blur)
     with pytest.raises(DomainError, match=r"above the .* of a disc of 0\.005 mm; allow more blur"):
         analysis.traced_depth_of_field(geo, 0.005, 1.0)
+    with pytest.raises(DomainError, match=r"limit of blur: .* is not one finite number"):
+        analysis.depth_of_field(geo, [0.1, 0.2])
+    with pytest.raises(ShapeError, match="fields_rad must be a list of angles"):
+        analysis.traced_depth_of_field(geo, 0.1, fields_rad=0.1)
     short = geo.replace(thickness_mm=geo.thickness_mm * torch.tensor([1.0] * 5 + [0.9], dtype=D))
     with pytest.raises(DomainError, match=r"no point before the lens has a blur of 0\.02 mm or less"):
         analysis.depth_of_field(short, 0.02)
+
+
+@pytest.mark.parametrize("bad", ["0.5", None, 1j, [0.5, "a"]])
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda geo, bad: lens.rms_spot_mm(geo, [0.0], at_m=bad),
+        lambda geo, bad: geo.focus_at(bad),
+        lambda geo, bad: focus_paraxial(geo, at_m=bad),
+        lambda geo, bad: seidel_sums(geo, 0.1, at_m=bad),
+        lambda geo, bad: geo.variables("curvature", focus_at_m=bad or "a"),
+        lambda geo, bad: wave.before_image(geo, 1.0, 0.001, 8, at_m=bad),
+    ],
+)
+def test_distances_that_are_no_numbers_get_a_sentence(call, bad):
+    with pytest.raises(
+        DomainError, match=r"distances: .* is no real number and no list of them; give numbers"
+    ):
+        call(lens.load("cooke-triplet"), bad)
 
 
 def test_figures_of_one_distance_refuse_several():

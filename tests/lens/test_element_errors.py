@@ -184,3 +184,20 @@ def test_wrong_elements_are_refused():
         moved_element(geo, (2, 6))
     with pytest.raises(ShapeError, match=r"tilt_rad is \[2\]"):
         moved_element(geo, (2, 3), tilt_rad=torch.zeros(3))
+    with pytest.raises(ShapeError, match=r"decentre_mm is \[2\]"):
+        moved_element(geo, (2, 3), 0.1)
+    for errors in ({"decentre_mm": torch.tensor([math.nan, 0.0])}, {"tilt_rad": [INF, 0.0]}):
+        with pytest.raises(DomainError, match="1 of 2 values are NaN or infinite"):
+            moved_element(geo, (2, 3), **errors)
+    for faces in ((0,), (0, 1.5), (0, 1, 2)):
+        with pytest.raises(DomainError, match="must be two whole numbers"):
+            moved_element(geo, faces)
+
+
+@torch.no_grad()
+def test_a_list_is_as_good_as_a_tensor():
+    geo = lens.load("cooke-triplet")
+    listed, given = (
+        moved_element(geo, (0, 1), error) for error in ([0.1, 0.0], torch.tensor([0.1, 0.0], dtype=D))
+    )
+    assert torch.equal(listed.decentre_mm, given.decentre_mm)

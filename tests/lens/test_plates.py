@@ -443,6 +443,11 @@ def test_other_refusals():
         ZernikePlate({0: 1.0}, 4.0)
     with pytest.raises(DomainError, match="at least one Zernike term"):
         ZernikePlate({}, 4.0)
+    for value in (math.nan, math.inf):
+        with pytest.raises(DomainError, match=r"plate coefficients: 1 of 2 values .* give finite radians"):
+            ZernikePlate({4: 1.0, 5: value}, 4.0)
+        with pytest.raises(DomainError, match=f"a plate {value} mm from a surface cannot be"):
+            with_plate(triplet, plate, -1, value)
     with pytest.raises(DomainError, match="wavelength 0"):
         ZernikePlate({4: 1.0}, 4.0, wavelength_um=0)
     with pytest.raises(ShapeError, match=r"\[N, N\] with N of at least 4, got \(3, 4\)"):

@@ -6,6 +6,7 @@ import pytest
 import torch
 from scipy import special
 
+from codesign import lens
 from codesign.errors import DomainError, ShapeError
 from codesign.lens import wave
 from codesign.lens.wave import Field, angular_spectrum, disc, fresnel, rectangle
@@ -168,7 +169,7 @@ def test_what_a_grid_cannot_hold_is_refused():
     )  # what it asks for is enough
     with pytest.raises(DomainError, match=r"after which it repeats .* a pitch of .* mm is needed"):
         fresnel(narrow, 1.0, 0.01, 256)
-    with pytest.raises(DomainError, match="neither it nor the focus 0"):
+    with pytest.raises(DomainError, match="neither of them 0"):
         fresnel(narrow, 0.0, 0.01, 8)
     with pytest.raises(DomainError, match="padding 0"):
         angular_spectrum(narrow, 1.0, padding=0)
@@ -176,3 +177,40 @@ def test_what_a_grid_cannot_hold_is_refused():
         Field(torch.ones(4, 4), 0.1, 0.5)
     with pytest.raises(DomainError, match="must be positive"):
         wave.Field(torch.ones(4, 4, dtype=torch.complex128), 0.0, 0.5)
+
+
+BEAM = Field(torch.ones(16, 16, dtype=torch.complex128), 0.01, 0.5)
+NAN, INF = math.nan, math.inf
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: Field(torch.full((4, 4), NAN * 1j), 0.1, 0.5), "field: 16 of 16 values are NaN"),
+        (lambda: fresnel(BEAM, 10.0, 0.001, 8, focus_mm=NAN), "focus nan mm must be single numbers"),
+        (lambda: fresnel(BEAM, 10.0, 0.001, -3), "a grid of -3 samples"),
+        (lambda: fresnel(BEAM, 10.0, NAN, 8), "8 samples, nan mm apart"),
+        (lambda: disc(32, 0.1, -1), "half widths of an opening .* got -1 mm"),
+        (lambda: disc(32, 0.1, NAN), "half widths of an opening .* got nan mm"),
+        (lambda: rectangle(32, 0.1, (0.1, -0.1)), "half widths of an opening .* got 0.1, -0.1 mm"),
+        (lambda: angular_spectrum(BEAM, NAN), "distance in mm: nan is not one finite number"),
+        (lambda: angular_spectrum(BEAM, -INF), "distance in mm: -inf is not one finite number"),
+        (lambda: angular_spectrum(BEAM, torch.ones(2)), "is not one finite number"),
+        (lambda: angular_spectrum(BEAM, 1.0, padding=NAN), "padding nan must be a whole number"),
+        (lambda: angular_spectrum(BEAM, 1.0, padding=INF), "padding inf must be a whole number"),
+        (lambda: wave.before_image(lens.load("la1509"), NAN, 0.001, 8), "distance in mm: nan"),
+        (lambda: wave.before_image(lens.load("la1509"), INF, 0.001, 8), "distance in mm: inf"),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused(call, said):
+    with pytest.raises(DomainError, match=said):
+        call()
+
+
+def test_no_light_stays_no_light():
+    beam = gaussian(64, 0.004, 0.02, 0.0)
+    found = angular_spectrum(Field(torch.stack([beam, 0 * beam]), 0.004, 0.5), 1.0)
+    alone = angular_spectrum(Field(beam, 0.004, 0.5), 1.0)
+    torch.testing.assert_close(found.amplitude[0], alone.amplitude, rtol=1e-12, atol=1e-15)
+    assert float(found.energy[1]) == 0
+    assert float(angular_spectrum(Field(0 * beam, 0.004, 0.5), 1.0).energy) == 0

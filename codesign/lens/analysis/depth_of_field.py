@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, ShapeError
 from codesign.lens.analysis.spots import rms_spot_mm
+from codesign.lens.distance import real_numbers
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.paraxial import yu_trace
@@ -103,6 +104,8 @@ def traced_depth_of_field(
     ``depth_of_field``; fields_rad: angles whose mean square counts. Gradient: none (limits are searched, to 1e-6).
     Raises: DomainError for a limit that is not positive, and when aberrations alone exceed it.
     """
+    if torch.as_tensor(fields_rad).ndim != 1:
+        raise ShapeError(f"fields_rad must be a list of angles in radians, got {fields_rad}.")
     lens = lens if focus_m is None else lens.focus_at(focus_m, wavelength_um)
     limit = float(_checked(lens, blur_mm)) * RMS_OF_DISC
     (at_parallel, _), (per_vergence, _) = _film_heights(lens, wavelength_um)
@@ -189,7 +192,9 @@ def _metres(vergence_per_mm):
 
 def _checked(lens, blur_mm):
     """The limit as a tensor. Raises: DomainError unless it is positive and finite."""
-    blur = torch.as_tensor(blur_mm, dtype=lens.dtype, device=lens.thickness_mm.device)
+    blur = real_numbers(blur_mm, "limit of blur").to(lens.thickness_mm)
+    if blur.ndim:
+        raise DomainError(f"limit of blur: {blur_mm} is not one finite number; give a diameter in mm.")
     if not 0 < float(blur.detach()) < math.inf:
         raise DomainError(
             f"a limit of {float(blur):.4g} mm of blur cannot be; give a positive diameter in mm."

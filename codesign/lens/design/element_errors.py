@@ -5,19 +5,22 @@ face, so that those behind it move sideways and along the axis, and turns every 
 their axes, so two angles say where an axis points.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.lens.distance import real_numbers
 from codesign.lens.geolens import GeoLens
 
 
 def moved_element(
     lens: GeoLens,
     faces: tuple[int, int],
-    decentre_mm: Tensor | None = None,
-    tilt_rad: Tensor | None = None,
-    wedge_rad: Tensor | None = None,
+    decentre_mm: Tensor | Sequence[float] | None = None,
+    tilt_rad: Tensor | Sequence[float] | None = None,
+    wedge_rad: Tensor | Sequence[float] | None = None,
 ) -> GeoLens:
     """The lens with the surfaces of one element moved as a rigid body; exact, however large the angles.
 
@@ -31,8 +34,13 @@ def moved_element(
     Gradient: to the errors and to every tensor of the lens.
     Raises: DomainError for faces that are not there or a mirror between them, whose axis is unfolded; ShapeError.
     """
-    first, last = faces
     count = len(lens.surfaces)
+    if len(faces) != 2 or not all(isinstance(face, int) for face in faces):
+        raise DomainError(
+            f"{lens.name}: faces {faces} of an element must be two whole numbers; give a pair out of elements(lens) or "
+            "groups(lens)."
+        )
+    first, last = faces
     if not 0 <= first < last < count or any(lens.mirrors[first : last + 1]):
         raise DomainError(
             f"{lens.name}: surfaces {first} to {last} are no element without mirrors; give a pair out of "
@@ -41,10 +49,10 @@ def moved_element(
     like = lens.thickness_mm
     errors = []
     for label, value in (("decentre_mm", decentre_mm), ("tilt_rad", tilt_rad), ("wedge_rad", wedge_rad)):
-        value = like.new_zeros(2) if value is None else value.to(like)
+        value = like.new_zeros(2) if value is None else real_numbers(value, label).to(like)
         if value.shape != (2,):
             raise ShapeError(f"{label} is [2], x and y, got shape {tuple(value.shape)}.")
-        errors.append(value)
+        errors.append(check_finite(value, label))
     decentre, tilt, wedge = errors
     rows = slice(first, last + 1)
     turn = _rotation(tilt)

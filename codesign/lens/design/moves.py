@@ -135,19 +135,19 @@ def with_glass(lens: GeoLens, surface: int, medium: Glass | str) -> GeoLens:
         raise DomainError(
             f"{lens.name}: there is no glass behind surface {surface} to exchange; there is behind {fronts or 'none'}."
         )
-    name = medium if isinstance(medium, str) else medium.name
     other = lens.replace_glass(surface, medium)
     if other.surfaces[surface].medium is None:
         raise DomainError(
-            f"{lens.name}: {name} is no glass; give one, or take the element out with without_element."
+            f"{lens.name}: {medium} is no glass; give one, or take the element out with without_element."
         )
+    name = other.surfaces[surface].medium.name
     return _held(lens, _surfaces(other), f"with {name} behind surface {surface + 1}")
 
 
 def _element_faces(lens, pairs, element):
     if not pairs:
         raise DomainError(f"{lens.name}: it has no element, as no gap between its surfaces is of glass.")
-    if not -len(pairs) <= element < len(pairs):
+    if not isinstance(element, int) or not -len(pairs) <= element < len(pairs):
         raise DomainError(f"{lens.name}: there is no element {element}; it has 0 to {len(pairs) - 1}.")
     front, back = pairs[element]
     if lens.mirrors[front] or lens.mirrors[back]:

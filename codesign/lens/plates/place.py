@@ -40,6 +40,10 @@ def with_plate(lens: GeoLens, plate: Plate | None, surface: int | None = None, z
     twin.borrows = False
     if plate is None:
         return twin
+    if not math.isfinite(z_mm):
+        raise DomainError(
+            f"{lens.name}: a plate {z_mm} mm from a surface cannot be; give a finite distance in mm."
+        )
     last = len(lens.surfaces) - 1
     at = lens.stop_index if surface is None else surface % (last + 1) if -1 <= surface <= last else surface
     if at not in (lens.stop_index, last) or (z_mm < 0 and at != lens.stop_index):

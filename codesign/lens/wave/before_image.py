@@ -7,10 +7,10 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis.pupil import LARGEST_STEP_WAVES, pupil_function
-from codesign.lens.distance import PARALLEL
+from codesign.lens.distance import PARALLEL, real_number
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
-from codesign.lens.wave.field import Field
+from codesign.lens.wave.field import Field, check_grid
 
 
 def before_image(
@@ -42,10 +42,12 @@ def before_image(
     Raises: DomainError when the pupil's cells are too coarse for the distance or the size of the result, the pitch
       for the lens's f-number, or as ``pupil_function``; it names what is needed.
     """
+    check_grid(count, pitch_mm)
+    distance = real_number(distance_mm, "distance in mm")
     pupil = pupil_function(lens, 0.0, wavelength_um, grid, at_m=at_m)
     cells = pupil.field.shape[0]
     like = pupil.cosine_radius
-    distance = torch.as_tensor(distance_mm, dtype=torch.float64, device=like.device)
+    distance = distance.to(like.device)
     radius = float(like.detach().max())
     coarsest = pupil.wavelength_mm / (2 * radius)
     steepest = abs(float(distance.detach())) * radius / math.sqrt(1 - radius**2)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError, ShapeError, check_finite
 
 STRIPS = 64  # per cell, in which the rim of a disc is summed
 
@@ -41,6 +41,8 @@ class Field:
                 f"pitch {self.pitch_mm} mm and wavelength {self.wavelength_um} um of a field must be positive."
             )
 
+        check_finite(self.amplitude, "field")
+
     @property
     def count(self) -> int:
         """Samples across."""
@@ -74,6 +76,7 @@ class Field:
 
 def rectangle(count: int, pitch_mm: float, half_mm: tuple[float, float]) -> Tensor:
     """Transmission of an opening |x| < half_mm[0], |y| < half_mm[1], [N, N] float64; see ``disc``."""
+    _check_opening(count, pitch_mm, *half_mm)
     at = torch.arange(count, dtype=torch.float64) - count // 2
     x, y = (_passed(half / pitch_mm - at) - _passed(-half / pitch_mm - at) for half in half_mm)
     return x * y[:, None]
@@ -87,12 +90,30 @@ def disc(count: int, pitch_mm: float, radius_mm: float) -> Tensor:
     integrals over the opening itself, to third order of the pitch; at the rim they lie a little outside of [0, 1].
     Source: Keys, Cubic convolution interpolation, IEEE Trans. ASSP 29 (1981).
     """
+    _check_opening(count, pitch_mm, radius_mm)
     at = torch.arange(count, dtype=torch.float64) - count // 2
     strips = (torch.arange((count + 3) * STRIPS, dtype=torch.float64) + 0.5) / STRIPS - count // 2 - 2
     half = ((radius_mm / pitch_mm) ** 2 - strips.square()).clamp_min(0).sqrt()[:, None]  # of the chord
     chords = _passed(half - at) - _passed(-half - at)
     weights = _passed(torch.arange(4 * STRIPS + 1, dtype=torch.float64) / STRIPS - 2).diff()
     return torch.nn.functional.conv1d(chords.T[:, None], weights[None, None], stride=STRIPS)[:, 0].T
+
+
+def check_grid(count: int, pitch_mm: float) -> None:
+    """Raise DomainError unless there can be a grid of ``count`` samples ``pitch_mm`` apart."""
+    if not isinstance(count, int) or count < 2 or not 0 < pitch_mm < math.inf:
+        raise DomainError(
+            f"a grid of {count} samples, {pitch_mm} mm apart, cannot be; give a whole number of at least 2 and a "
+            "positive, finite pitch."
+        )
+
+
+def _check_opening(count, pitch_mm, *halves_mm):
+    check_grid(count, pitch_mm)
+    if not all(0 <= half < math.inf for half in halves_mm):
+        raise DomainError(
+            f"half widths of an opening must be finite and at least 0, got {', '.join(map(str, halves_mm))} mm."
+        )
 
 
 def _passed(s):

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.lens.wave.field import Field
+from codesign.lens.distance import real_number, real_numbers
+from codesign.lens.wave.field import Field, check_grid
 
 LOST = 1e-2  # share of the light that may leave the grid unless more is allowed
 # a field is taken as undersampled when more than the second share of its light lies beyond the first of the
@@ -39,7 +40,7 @@ def angular_spectrum(
       it names the size that is needed.
     Source: Matsushima and Shimobaba, Band-limited angular spectrum method, Optics Express 17 (2009).
     """
-    if int(padding) != padding or padding < 1:
+    if not isinstance(padding, int) or padding < 1:
         raise DomainError(f"padding {padding} must be a whole number of at least 1 (1: periodic).")
     count = field.count
     wide = count * int(padding)
@@ -52,7 +53,7 @@ def angular_spectrum(
     check_resolved(power, field)
     cosine2 = 1 - step.square() - step[:, None].square()
     axial = cosine2.abs().clamp_min(1e-12).sqrt()
-    length = torch.as_tensor(distance_mm, dtype=torch.float64, device=real.device)
+    length = real_number(distance_mm, "distance in mm").to(real.device)
     k = 2 * math.pi / field.wavelength_mm
     travels = cosine2 > 0
     transfer = torch.polar(
@@ -95,14 +96,12 @@ def fresnel(
     Source: Goodman, Introduction to Fourier Optics, ch. 4.
     """
     real = field.amplitude.real
-    length, focus = (
-        torch.as_tensor(v, dtype=torch.float64, device=real.device) for v in (distance_mm, focus_mm)
-    )
-    if not (
-        float(length.detach()) != 0 and math.isfinite(float(length.detach())) and float(focus.detach()) != 0
-    ):
+    check_grid(count, pitch_mm)
+    length = real_number(distance_mm, "distance in mm").to(real.device)
+    focus = real_numbers(focus_mm, "focus in mm").to(length)
+    if focus.ndim or float(length.detach()) == 0 or float(focus.detach()) == 0 or bool(focus.isnan()):
         raise DomainError(
-            f"distance {float(length.detach())} mm must be finite, and neither it nor the focus 0; use "
+            f"distance {distance_mm} mm and focus {focus_mm} mm must be single numbers, neither of them 0; use "
             "angular_spectrum for short distances."
         )
     at = field.places_mm().double()
@@ -160,7 +159,9 @@ def _stays(step, axial, length, size_mm, padded_mm):
 def _check_kept(field, found, power, step, length, may_leave):
     """Raise DomainError when more light than allowed is not on the grid any more."""
     before = field.energy.detach()
-    left = float((1 - found.energy.detach() / before.clamp_min(1e-300)).max())
+    left = float(
+        torch.where(before > 0, 1 - found.energy.detach() / before, 0).max()
+    )  # a dark one loses none
     if left <= may_leave:
         return
     along = power.sum(-1) + power.sum(-2)
