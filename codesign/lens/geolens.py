@@ -487,10 +487,7 @@ class GeoLens(Replaceable):
             spread = torch.ones_like(film_mm[:, 0])
         out = trace(back.to(film_mm.dtype).opened(at_stop), start, direction)
         if bool((out.weight.detach() <= 0).all()):
-            raise DomainError(
-                f"{self.name}: every ray fails{self._where(out)}; weaken the curvatures or open the "
-                "apertures."
-            )
+            raise DomainError(f"{self.name}: every ray fails{self._where(out)}.")
         return Rays(out.position_mm * 1e-3, out.direction, out.weight, spread * direction[:, 2] ** 4)
 
     @settled
@@ -536,14 +533,19 @@ class GeoLens(Replaceable):
     def _where(self, out):
         """What became of most rays of a backward trace, in words; surfaces are counted from the object."""
         failed = out.failed_surface[out.status != Status.OK]
+        if failed.numel() == 0 and any(s.inner_semi_aperture_mm for s in self.surfaces):
+            return (
+                " (all of them are stopped by the edges of the apertures or by the central obstruction, which chief rays "
+                "meet; point spread maps need chief rays, so render traced frames)"
+            )
         if failed.numel() == 0:
-            return " (all of them are stopped by the edges of the apertures)"
+            return " (all of them are stopped by the edges of the apertures); open the apertures"
         at = len(self.surfaces) - int(failed.mode().values)
         return (
             f" (most at surface {at} of {len(self.surfaces)}, counted from the object)"
             if at
             else " (most before they leave the first surface forwards)"
-        )
+        ) + "; weaken the curvatures or open the apertures"
 
     def extra_repr(self) -> str:
         return f"{self.name}, {len(self.surfaces)} surfaces, entrance pupil {self.entrance_pupil_diameter_mm:g} mm"

@@ -105,6 +105,10 @@ class Surface:
             *self.decentre_mm,
             *self.tilt_deg,
         )
+        if self.medium is not None and not isinstance(self.medium, Glass):
+            raise DomainError(
+                f"{label}: medium {self.medium!r} is no glass; give Glass.named({str(self.medium)!r}), or None for air."
+            )
         if math.isnan(self.radius_mm) or self.radius_mm == 0 or not all(math.isfinite(v) for v in numbers):
             raise DomainError(
                 f"{label}: radius {self.radius_mm} mm, thickness {self.thickness_mm} mm, conic {self.conic} "

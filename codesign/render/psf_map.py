@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, ShapeError
 from codesign.render.camera import Camera
 from codesign.render.film import coarse_pixels
 from codesign.render.sampling import concentric_disc
@@ -68,8 +68,19 @@ class PsfMap:
     def offsets_px(self, per_m: Tensor) -> Tensor:
         """Where the light of a point ends up, relative to its chief ray: [D, N, M, 2] px, for 1 / distance [D].
 
-        Gradient: to the lens and to per_m.
+        Gradient: to the lens and to per_m. Raises: DomainError for distances nearer than ``nearest_m``.
         """
+        per_m = torch.as_tensor(per_m, dtype=torch.float64)
+        if per_m.ndim != 1:
+            raise ShapeError(f"psf map: distances must be a list [D], got shape {tuple(per_m.shape)}.")
+        if not bool(((per_m.detach() >= 0) & (per_m.detach() <= (1 + 1e-9) / self.nearest_m)).all()):
+            raise DomainError(
+                f"psf map: 1 / distance {per_m.tolist()} must lie between 0 and {1 / self.nearest_m:g} per metre, as the "
+                f"map is made for {self.nearest_m:g} m and beyond; give psf_map a smaller nearest_m."
+            )
+        return self._offsets_px(per_m)
+
+    def _offsets_px(self, per_m):
         v = per_m.to(self.base_m)[:, None, None, None]
         return -_solved(self.slope_per_px + v * self.base_m_per_px, self.slope + v * self.base_m)
 
@@ -92,6 +103,8 @@ class PsfMap:
         Raises: DomainError for distances nearer than ``nearest_m``, or a size that does not hold the blur.
         """
         distance_m = torch.as_tensor(distance_m, dtype=torch.float64)
+        if distance_m.ndim != 1:
+            raise ShapeError(f"psf map: distances must be a list [D], got shape {tuple(distance_m.shape)}.")
         if not bool((distance_m.detach() >= self.nearest_m * (1 - 1e-9)).all()):
             raise DomainError(
                 f"psf map: distance {float(distance_m.detach().min()):.4g} m is nearer than the {self.nearest_m:g} m "
@@ -99,7 +112,7 @@ class PsfMap:
             )
         needed = 2 * (self.radius_px - TAIL_PX) + 3
         size = needed if size_px is None else size_px
-        if size < needed or size % 2 == 0:
+        if not size >= needed or size % 2 != 1:
             raise DomainError(
                 f"psf map: {size} x {size} pixels do not hold the blur about a middle pixel; give an odd number of "
                 f"at least {needed}."
@@ -118,7 +131,7 @@ class PsfMap:
         dtype = per_m.dtype
         share = self.share.to(dtype)
         spacings = torch.arange(-SIDE * self.radius_px, SIDE * (self.radius_px + 1), dtype=dtype)
-        gathered = -SIDE * self.offsets_px(per_m).to(dtype)
+        gathered = -SIDE * self._offsets_px(per_m).to(dtype)
         far = gathered[..., None] - (spacings - (SIDE - 1) / 2)
         spline = _quartic if self.fine == 1 else _cubic
         splines = sum(spline(far + shift - (SIDE - 1) / 2) for shift in range(SIDE)) / SIDE
@@ -141,9 +154,9 @@ def psf_map(camera: Camera, nearest_m: float = 0.3, cell_px: int = 64, rays_per_
     """
     if not 0 < nearest_m < math.inf:
         raise DomainError(f"psf map: nearest_m = {nearest_m} must be a positive, finite distance in metres.")
-    if not cell_px >= 2:
-        raise DomainError(f"psf map: cell_px = {cell_px} must be at least 2 pixels.")
-    fine = math.isqrt(max(0, rays_per_px)) // SIDE
+    if not 2 <= cell_px < math.inf:
+        raise DomainError(f"psf map: cell_px = {cell_px} must be a finite number of at least 2 pixels.")
+    fine = math.isqrt(max(0, rays_per_px)) // SIDE if isinstance(rays_per_px, int) else 0
     if fine < 1 or (SIDE * fine) ** 2 != rays_per_px:
         raise DomainError(
             f"psf map: rays_per_px = {rays_per_px} must be 4, 16, 36 or another square of an even number."

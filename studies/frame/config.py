@@ -116,7 +116,9 @@ def resolved(study: str, kind: type[Config], parse: Callable[[Config], Config]) 
 
 def _plain(name, value) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
-        raise DomainError(f"option --{name.replace('_', '-')} is {value}; give a finite number.")
+        raise DomainError(
+            f"option --{name.replace('_', '-')} is {value}; give a finite number, or leave the option out."
+        )
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, Path):

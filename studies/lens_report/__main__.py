@@ -38,7 +38,7 @@ class Config(StudyConfig):
     wavelengths_um: tuple[float, ...] = lens_figures.VISIBLE_UM
     """Wavelengths of equal weight; the first is the reference."""
     at_m: tuple[float, ...] = ()
-    """Distances of the object, metres from the entrance pupil; pictures are those of the first. Left out: infinity."""
+    """Distances of the object, metres from the entrance pupil; pictures are those of the first. Left out: parallel light."""
     focus_m: float | None = None
     """Distance of the axial point whose RMS spot is least on the film; the first of --at-m, or as in the lens file where that is left out too."""
     blur_um: float = 20.0

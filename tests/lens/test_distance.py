@@ -302,6 +302,21 @@ def test_distances_that_are_no_numbers_get_a_sentence(call, bad):
         call(lens.load("cooke-triplet"), bad)
 
 
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda geo: lens.rms_spot_mm(geo, [0.0], grid=-1), "pupil grid of -1 samples"),
+        (lambda geo: focus_rays(geo, [0.0], grid=0), "pupil grid of 0 samples"),
+        (lambda geo: geo.focus_at(1.0, spot_grid=-1), "pupil grid of -1 samples"),
+        (lambda geo: focus_rays(geo, [0.0], wavelengths_um=()), "no wavelength was given"),
+        (lambda geo: lens.GeoLens([lens.Surface(20.0, 2.0, "N-BK7", 5.0)], 4.0), "give Glass.named"),
+    ],
+)
+def test_counts_and_names_that_cannot_be_get_a_sentence(call, said):
+    with pytest.raises(DomainError, match=said):
+        call(lens.load("cooke-triplet"))
+
+
 def test_figures_of_one_distance_refuse_several():
     geo = lens.load("cooke-triplet")
     several = (0.5, 1.0)

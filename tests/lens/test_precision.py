@@ -191,3 +191,31 @@ def test_wrong_questions_are_refused(slopes):
         cheapest(plain(slopes), named(6), 10.0, most=0.001)
     with pytest.raises(DomainError, match="steps of errors must be positive"):
         fitted(lambda geo: torch.ones(()), lens.load("la1509"), named(2), steps=0.0)
+
+
+FLAT = Forecast(1.0, torch.zeros(2, dtype=D), torch.zeros(2, 2, dtype=D))
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: cheapest(Forecast(1.0, torch.zeros(0), torch.zeros(0, 0)), [], 0.3), "no errors were given"),
+        (lambda: fitted(lambda g: g.thickness_mm.sum(), lens.load("la1509"), []), "no errors were given"),
+        (lambda: cheapest(FLAT, named(2), 0.3), "the figure has no slope in any error"),
+        (lambda: cheapest(plain(torch.tensor([1.0, math.nan])), named(2), 0.3), "forecast: 1 of 2 values"),
+        (lambda: cheapest(plain(torch.ones(2, dtype=D)), named(2), True), "budget True"),
+        (lambda: cheapest(plain(torch.ones(2, dtype=D)), named(2), 0.3, costs=[1]), "give a mapping"),
+        (lambda: fitted(torch.sum, lens.load("la1509"), named(2), math.inf), "positive and finite"),
+        (lambda: fitted(torch.sum, lens.load("la1509"), named(2), [1.0] * 3), "3 steps were given for 2"),
+        (lambda: fitted(lambda g: math.nan, lens.load("la1509"), named(2)), "figure of the lens: 1 of 1"),
+    ],
+)
+def test_what_has_no_answer_gets_a_sentence(call, said):
+    with pytest.raises((DomainError, ShapeError), match=said):
+        call()
+
+
+def test_a_forecast_in_float32_is_that_in_float64(slopes):
+    forecast = Forecast(3.0, slopes.float(), torch.zeros(6, 6))
+    wanted = cheapest(plain(slopes.float().double()), named(6), 0.2)
+    torch.testing.assert_close(cheapest(forecast, named(6), 0.2).factors, wanted.factors, rtol=1e-12, atol=0)

@@ -1,5 +1,6 @@
 """Point spread functions of a camera, and frames by them, against closed forms, forward traces and traced frames."""
 
+import dataclasses
 import math
 
 import pytest
@@ -280,6 +281,22 @@ def test_refusals():
         render.psf_map(camera(THIN), cell_px=1)
     with pytest.raises(DomainError, match="rays_per_px = 9"):
         render.psf_map(camera(THIN), rays_per_px=9)
+    for options in ({"cell_px": math.inf}, {"cell_px": math.nan}, {"rays_per_px": 16.0}):
+        with pytest.raises(DomainError, match=r"cell_px|rays_per_px"):
+            render.psf_map(camera(THIN), **options)
+    for single in (2.0, torch.tensor(1.0)):
+        with pytest.raises(ShapeError, match=r"distances must be a list \[D\]"):
+            psf.energy(single)
+    with pytest.raises(DomainError, match="nan x nan pixels do not hold"):
+        psf.energy(torch.tensor([2.0]), size_px=math.nan)
+    for per_m in (math.nan, -1.0, 1.1):
+        with pytest.raises(DomainError, match="must lie between 0 and 1 per metre"):
+            psf.offsets_px([per_m])
+    assert torch.equal(psf.offsets_px([0.5]), psf.offsets_px(torch.tensor([0.5], dtype=D)))
+    front, back = lens.load("la1509").to_surfaces()
+    hollow = lens.GeoLens([dataclasses.replace(front, inner_semi_aperture_mm=2.0), back], 20.0)
+    with pytest.raises(DomainError, match=r"central obstruction, which chief rays meet; .* traced frames"):
+        render.psf_map(camera(hollow, pitch_mm=0.001))
     with pytest.raises(ShapeError, match="make the map of this camera"):
         render.psf_frames(camera(THIN, 20), waves(), FRONT[None], psf)
 

@@ -31,6 +31,10 @@ Light = float | Values | SpectralLines  # wavelengths in um, of equal weight whe
 
 def pupil_grid(count: int, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
     """Cell centres of a count x count grid over [-1, 1]^2 that lie in the unit disc, [M, 2]."""
+    if not isinstance(count, int) or count < 1:
+        raise DomainError(
+            f"a pupil grid of {count} samples across cannot be; give a whole number of at least 1."
+        )
     line = (torch.arange(count, dtype=dtype, device=device) + 0.5) / count * 2 - 1
     y, x = torch.meshgrid(line, line, indexing="ij")
     points = torch.stack([x.reshape(-1), y.reshape(-1)], 1)

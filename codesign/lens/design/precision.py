@@ -21,10 +21,11 @@ from statistics import NormalDist
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.lens.design.tolerance import Compensator, Figures, compensated
 from codesign.lens.design.tolerance_errors import Error, perturbed
 from codesign.lens.design.tolerance_spot import SpotForecast
+from codesign.lens.distance import real_numbers
 from codesign.lens.geolens import GeoLens
 
 NODES = 2048  # of the sum over the characteristic function
@@ -104,9 +105,15 @@ def fitted(
       number or [P]; large enough for the figure to rise above its noise.
     """
     figure = compensated(figure, compensate)
-    sizes = torch.as_tensor(steps, dtype=torch.float64).expand(len(errors))
-    if not bool((sizes > 0).all()):
-        raise DomainError(f"steps of errors must be positive, got {sizes.tolist()}.")
+    _check_some(errors)
+    sizes = real_numbers(steps, "steps").double()
+    if sizes.shape not in ((), (len(errors),)):
+        raise ShapeError(
+            f"{sizes.numel()} steps were given for {len(errors)} errors; give one, or one for each."
+        )
+    sizes = sizes.expand(len(errors))
+    if not bool(((sizes > 0) & sizes.isfinite()).all()):
+        raise DomainError(f"steps of errors must be positive and finite, got {sizes.tolist()}.")
     with torch.no_grad():
         nominal = float(figure(lens))
         sides = torch.tensor(
@@ -116,6 +123,8 @@ def fitted(
             ],
             dtype=torch.float64,
         )
+    check_finite(torch.tensor(nominal), "figure of the lens", "give a figure that is a number there")
+    check_finite(sides, "figures at plus and minus a step of each error", "take smaller steps")
     plus, minus = sides.unbind(1)
     return Forecast(
         nominal, (plus - minus) / (2 * sizes), torch.diag((plus + minus - 2 * nominal) / (2 * sizes.square()))
@@ -153,9 +162,17 @@ def cheapest(
 
 def _solved(forecast, errors, budget, share, most, costs, power):
     count = len(errors)
+    _check_some(errors)
+    for part in (forecast.linear, forecast.square):
+        check_finite(part, "forecast", "look for what makes the figure NaN or infinite")
+    forecast = Forecast(forecast.nominal, forecast.linear.double(), forecast.square.double())
     if forecast.linear.shape != (count,):
         raise ShapeError(f"the forecast is of {forecast.linear.numel()} errors, but {count} were given.")
-    if not (0 < budget < math.inf and 0.5 < share < 1 and most > 0):
+    if not any(bool(part.any()) for part in (forecast.linear, forecast.square)):
+        raise DomainError(
+            "the figure has no slope in any error; larger steps, or another figure, may show one."
+        )
+    if isinstance(budget, bool) or not (0 < budget < math.inf and 0.5 < share < 1 and most > 0):
         raise DomainError(
             f"budget {budget}, share {share} and largest factor {most}: the budget must be a positive increase of the "
             "figure, the share lie between 0.5 and 1, and the factor be positive."
@@ -217,9 +234,16 @@ def _largest(shape, member, most, keeps):
     return (shape * math.exp(low)).clamp_max(most)
 
 
+def _check_some(errors):
+    if not errors:
+        raise DomainError("no errors were given; give at least one, as errors_of makes them.")
+
+
 def _costs(errors, given):
     names = list(dict.fromkeys(e.drawn for e in errors))
     given = given or {}
+    if not isinstance(given, Mapping):
+        raise DomainError(f"costs {given}: give a mapping from the names of tolerances to their costs.")
     known = {*names, *(name.split()[0] for name in names)}
     wrong = [f"{k} {v}" for k, v in given.items() if k not in known or not 0 < v < math.inf]
     if wrong:

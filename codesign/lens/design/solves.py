@@ -66,6 +66,8 @@ def focus_rays(
     >>> bool(after < before)
     True
     """
+    if len(wavelengths_um) == 0:
+        raise DomainError(f"{lens.name}: no wavelength was given; give at least one, in um.")
     pupil = pupil_grid(grid, lens.dtype, lens.curvature_per_mm.device)
     source = source_rays(lens, fields_rad, pupil, at_m)
     found = []
