@@ -416,7 +416,7 @@ def test_wrong_options_exit_with_two(capsys, monkeypatch):
             main(record_one, Config, arguments)
         assert ended.value.code == 2
     assert main(record_one, Config, ["--limit", "inf"]) == 2
-    assert "--limit is inf; give a finite number" in capsys.readouterr().err
+    assert "--limit is inf; give a finite number, or leave the option out." in capsys.readouterr().err
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert main(record_one, Config, ["--device", "cuda"]) == 2
     assert "no CUDA device" in capsys.readouterr().err
