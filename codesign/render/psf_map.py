@@ -21,6 +21,7 @@ from codesign.render.film import coarse_pixels
 from codesign.render.sampling import concentric_disc
 from codesign.types import Rays
 
+ROUNDING = 1e-6  # of distances given in float32
 LARGEST_PX = 32  # radius of a blur up to which pictures are convolved
 LAYER_PX = 1.0  # of blur's radius, from one layer of depth to the next
 PUPIL_PX = 1.0  # spacing of the pupil's points in the widest blur, about
@@ -73,7 +74,7 @@ class PsfMap:
         per_m = torch.as_tensor(per_m, dtype=torch.float64)
         if per_m.ndim != 1:
             raise ShapeError(f"psf map: distances must be a list [D], got shape {tuple(per_m.shape)}.")
-        if not bool(((per_m.detach() >= 0) & (per_m.detach() <= (1 + 1e-9) / self.nearest_m)).all()):
+        if not bool(((per_m.detach() >= 0) & (per_m.detach() <= (1 + ROUNDING) / self.nearest_m)).all()):
             raise DomainError(
                 f"psf map: 1 / distance {per_m.tolist()} must lie between 0 and {1 / self.nearest_m:g} per metre, as the "
                 f"map is made for {self.nearest_m:g} m and beyond; give psf_map a smaller nearest_m."
@@ -105,7 +106,7 @@ class PsfMap:
         distance_m = torch.as_tensor(distance_m, dtype=torch.float64)
         if distance_m.ndim != 1:
             raise ShapeError(f"psf map: distances must be a list [D], got shape {tuple(distance_m.shape)}.")
-        if not bool((distance_m.detach() >= self.nearest_m * (1 - 1e-9)).all()):
+        if not bool((distance_m.detach() >= self.nearest_m * (1 - ROUNDING)).all()):
             raise DomainError(
                 f"psf map: distance {float(distance_m.detach().min()):.4g} m is nearer than the {self.nearest_m:g} m "
                 "that the map is made for; give psf_map a smaller nearest_m."
