@@ -73,7 +73,7 @@ def trade(run: Run[Any], config: Config) -> None:
     chains = [
         ((name, seed), chain_job, (folder, name, seed))
         for name in dict.fromkeys(name for name, _ in missing)
-        for seed in range(config.seed, config.seed + config.starts)
+        for seed in effort.starts
         if not lens_file(folder, name, len(TRADES[name].values) - 1, f"start{seed}").exists()
     ]
     with run.progress(len(chains), "spot optima of the random starts") as bar:
@@ -105,7 +105,14 @@ def _check(config):
     for name in ("starts", "steps", "batch", "tries", "development", "judged", "workers"):
         if getattr(config, name) < 1:
             raise DomainError(f"--{name} is {getattr(config, name)}; at least 1 is needed.")
-    return Effort(config.starts, config.steps, config.batch, config.tries, config.development, config.judged)
+    return Effort(
+        tuple(range(config.seed, config.seed + config.starts)),
+        config.steps,
+        config.batch,
+        config.tries,
+        config.development,
+        config.judged,
+    )
 
 
 def _earlier(run, config):

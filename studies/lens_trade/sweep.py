@@ -5,6 +5,7 @@ A job is a pure function of plain values to plain values; lenses lie as files in
 
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import cached_property
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import torch
 from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens import GeoLens
+from codesign.system import Batch
 from studies.lens_opt.task import HELD_OUT
 from studies.lens_trade import cases
 from studies.lens_trade.designers import SAMPLES, by_flow, by_search, by_spots, log_errors, mean_log_error
@@ -30,9 +32,10 @@ DESIGNERS = ("textbook", "spots", "flow")
 
 @dataclass(frozen=True)
 class Effort:
-    """How much of everything: random starts, flow steps and cases per step, tries of the search, cases of development and judgement."""
+    """How much of everything: seeds of the random starts, flow steps and cases per step, tries of the search, cases of
+    development and judgement."""
 
-    starts: int
+    starts: tuple[int, ...]
     steps: int
     batch: int
     tries: int
@@ -70,7 +73,7 @@ def point_job(folder: Path, trade: str, at: int, effort: Effort) -> dict[str, An
     light = found.light
     starts = [
         lens.load(path).freeze()
-        for seed in range(effort.starts)
+        for seed in effort.starts
         if (path := lens_file(folder, trade, at, f"start{seed}")).exists()
     ]
     if not starts:
@@ -138,14 +141,17 @@ class _Judge:
     def problem(self, geo: GeoLens) -> Problem:
         return self.trade.problem(self.value, geo)
 
+    @cached_property
+    def development(self) -> list[Batch]:
+        return self.cases(cases.DEVELOPMENT, 5_000_000, self.effort.development)
+
     def cases(self, names, first, count):
         efl_mm = self.problem(self.trade.template(self.value)).efl_mm
         return cases.judged_cases(names, first, count, efl_mm)
 
     def candidate(self, geo: GeoLens, weights: Weights, start: str) -> _Candidate:
         problem = self.problem(geo)
-        judged = self.cases(cases.DEVELOPMENT, 5_000_000, self.effort.development)
-        error = mean_log_error(problem, self.trade.light, geo, judged, SAMPLES)
+        error = mean_log_error(problem, self.trade.light, geo, self.development, SAMPLES)
         return _Candidate(geo, start, weights, problem.rms_px(geo), error)
 
     def reweighed(self, candidate: _Candidate, weights: Weights) -> _Candidate:

@@ -36,8 +36,8 @@ PRECISION = {
 class Trade:
     """What is traded against the flow error.
 
-    label, unit: of the axis. values: from loose to tight. problem: value and template -> Problem; start: value of the
-    apertures through which a design is led there.
+    label, unit: of the axis. values: from loose to tight. problem: value and template -> Problem. template: value ->
+    the lens whose glasses and aperture are designed around. removes: whether tighter means one element less.
     """
 
     name: str

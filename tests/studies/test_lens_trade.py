@@ -263,6 +263,12 @@ def test_a_foreign_raw_table_is_refused(tmp_path):
         lens_trade.study(open_run("lens_trade", config))
 
 
+def test_the_starts_that_are_judged_are_those_that_were_made():
+    """Starts go by the run's seed: with another seed a value must look for other files."""
+    effort = lens_trade._check(lens_trade.Config(seed=7, starts=2))
+    assert effort.starts == (7, 8)
+
+
 def test_unknown_trades_are_refused(tmp_path):
     with pytest.raises(DomainError, match="choose out of track, elements"):
         lens_trade.study(open_run("lens_trade", lens_trade.Config(trades=("weight",), out=tmp_path / "run")))
