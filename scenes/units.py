@@ -1,0 +1,36 @@
+"""Whether a size looks like metres: files rarely say which unit their numbers are in."""
+
+import warnings
+from collections.abc import Sequence
+
+LARGE_M = 100.0  # rooms and robots are smaller, and so are most outdoor worlds
+SMALL_M = 0.01
+UNITS = (("centimetres", 0.01), ("millimetres", 0.001))
+
+
+def hint(
+    low_m: Sequence[float], high_m: Sequence[float], what: str = "the world", unit_m: float = 1.0
+) -> str | None:
+    """A sentence when a box of these two corners, sequences of three numbers in metres, is too large or too small
+    for a room or a robot, also given as a UserWarning; None when it is not.
+
+    Args: what: name of what the box holds, with its file. unit_m: metres per unit of the file that the corners
+      were reckoned with.
+
+    >>> hint((0, 0, 0), (4, 5, 2.6)) is None
+    True
+    """
+    size_m = max(float(high) - float(low) for low, high in zip(low_m, high_m, strict=True))
+    if SMALL_M <= size_m <= LARGE_M or not size_m > 0:
+        return None
+    units = size_m / unit_m
+    if size_m > LARGE_M:
+        other = " or ".join(
+            f"unit_m={metres:g} ({name}: {units * metres:.3g} m)" for name, metres in UNITS if metres < unit_m
+        )
+        remedy = f"if its file is not in units of {unit_m:g} m, give {other or 'a smaller unit_m'}"
+    else:
+        remedy = f"if its file is not in units of {unit_m:g} m, give a larger unit_m"
+    sentence = f"{what} is {size_m:.3g} m wide; {remedy}."
+    warnings.warn(sentence, UserWarning, stacklevel=3)
+    return sentence
