@@ -11,7 +11,7 @@ from codesign import backend, pose, render
 from codesign.errors import DomainError
 from codesign.render import MitsubaScene
 from codesign.render.boundary import _places
-from codesign.render.outline import Cylinders, Segments, Spheres, mesh_edges, outlines
+from codesign.render.outline import Segments, mesh_edges, outlines
 from scenes import silhouettes as silhouette_scenes
 from studies.silhouettes import STEPS, Task
 
@@ -138,26 +138,6 @@ def test_points_on_curves_stand_for_their_whole_length(lengths_px, generator):
         torch.testing.assert_close(
             gaps, torch.full_like(gaps, float(length[short].sum()) / len(at)), rtol=0, atol=1e-9
         )
-
-
-def test_outlines_of_spheres_and_cylinders_are_tangent_to_the_view():
-    eye = torch.tensor([0.3, -2.0, 0.4], dtype=F64)
-    s = torch.linspace(0, 0.99, 20, dtype=F64)
-    ball = Spheres(torch.tensor([[0.1, 0.2, 0.3]], dtype=F64), torch.tensor([0.5], dtype=F64))
-    y = ball.points(torch.zeros(20, dtype=torch.long), s, eye.expand(20, 3))
-    outward = y - ball.centre
-    torch.testing.assert_close(outward.norm(dim=1), torch.full((20,), 0.5, dtype=F64))
-    torch.testing.assert_close((outward * (y - eye)).sum(1), torch.zeros(20, dtype=F64), rtol=0, atol=1e-12)
-    tube = Cylinders(
-        torch.tensor([[0.0, 0.0, -1.0]], dtype=F64),
-        torch.tensor([[0.2, 0.1, 1.0]], dtype=F64),
-        torch.tensor([0.1], dtype=F64),
-    )
-    y = tube.points(torch.zeros(20, dtype=torch.long), 2 * s, eye.expand(20, 3))
-    axis = torch.nn.functional.normalize(tube.end - tube.start, dim=1)
-    outward = (y - tube.start) - ((y - tube.start) * axis).sum(1, keepdim=True) * axis
-    torch.testing.assert_close(outward.norm(dim=1), torch.full((20,), 0.1, dtype=F64))
-    torch.testing.assert_close((outward * (y - eye)).sum(1), torch.zeros(20, dtype=F64), rtol=0, atol=1e-12)
 
 
 def test_flat_diagonals_are_no_edges_and_inner_edges_count_at_silhouettes_only():

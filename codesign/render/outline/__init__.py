@@ -1,17 +1,11 @@
 """Curves in a scene where radiance may jump: edges of meshes, rims, and the outlines of spheres and cylinders
-as seen from a point.
-
-A curve is cut into pieces [s0, s1] of its parameter; a piece becomes a point of the world once a parameter
-and a viewpoint are given.
-"""
-
-from dataclasses import dataclass
+as seen from a point."""
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from codesign.errors import DomainError
+from codesign.render.outline.curves import Circles, Cylinders, Segments, Spheres
 
 SAME_PLACE_M = 1e-4  # edges of different shapes whose ends are nearer than this are one
 SAME_POINT = 1e-5  # vertices nearer than this share of the mesh's size are one
@@ -19,111 +13,9 @@ SAME_POINT = 1e-5  # vertices nearer than this share of the mesh's size are one
 # radiances
 FLAT = 1 - 1e-6
 SHARP = 0.98
-ROUND = 96  # pieces of a full circle
 INSIDE = (
     1e-3  # share of an edge left out at either end when it is looked along: there it may touch its neighbours
 )
-
-
-@dataclass(frozen=True)
-class Segments:
-    """Straight edges. start, end: [E, 3]. normals: [E, 2, 3] of the two faces; always: [E] bool, True where
-    it counts from every side (rims, seams, sharp creases)."""
-
-    start: Tensor
-    end: Tensor
-    normals: Tensor
-    always: Tensor
-
-    def pieces(self, viewpoint, angle):
-        """Indices and parameters [n], [n, 2] of pieces that subtend at most ``angle`` from the viewpoint [3]
-        and may be outlines there."""
-        towards = viewpoint - self.start
-        turned = (self.normals * towards[:, None]).sum(2)
-        kept = torch.nonzero(self.always | (turned[:, 0] * turned[:, 1] <= 0))[:, 0]
-        a = self.start[kept] - viewpoint
-        b = self.end[kept] - viewpoint
-        along = b - a
-        length = along.norm(dim=1)
-        nearest = (-(a * along).sum(1) / length.square()).clamp(0, 1)
-        distance = (a + nearest[:, None] * along).norm(dim=1).clamp_min(1e-6)
-        return _cut(kept, (length / (distance * angle)).ceil().clamp(1, 4096).long())
-
-    def points(self, index, s, viewpoint):
-        return self.start[index] + s[:, None] * (self.end - self.start)[index]
-
-
-@dataclass(frozen=True)
-class Circles:
-    """Rims of disks and cylinders: centre + cos u + sin v, with u and v of the rim's radius; [C, 3] each."""
-
-    centre: Tensor
-    u: Tensor
-    v: Tensor
-
-    def pieces(self, viewpoint, angle):
-        return _cut(torch.arange(self.centre.shape[0]), torch.full(self.centre.shape[:1], ROUND))
-
-    def points(self, index, s, viewpoint):
-        turn = 2 * torch.pi * s[:, None]
-        return self.centre[index] + turn.cos() * self.u[index] + turn.sin() * self.v[index]
-
-
-@dataclass(frozen=True)
-class Spheres:
-    """Outlines of spheres: the circle where rays from the viewpoint are tangent. centre: [C, 3]; radius:
-    [C]."""
-
-    centre: Tensor
-    radius: Tensor
-
-    def pieces(self, viewpoint, angle):
-        outside = torch.nonzero((self.centre - viewpoint).norm(dim=1) > self.radius * (1 + 1e-6))[:, 0]
-        return _cut(outside, torch.full(outside.shape, ROUND))
-
-    def points(self, index, s, viewpoint):
-        centre = self.centre[index]
-        radius = self.radius[index]
-        towards = viewpoint - centre
-        distance = towards.norm(dim=1, keepdim=True)
-        axis = towards / distance
-        share = radius[:, None] / distance
-        u, v = _across(axis)
-        turn = 2 * torch.pi * s[:, None]
-        return centre + radius[:, None] * (
-            share * axis + (1 - share.square()).clamp_min(0).sqrt() * (turn.cos() * u + turn.sin() * v)
-        )
-
-
-@dataclass(frozen=True)
-class Cylinders:
-    """Outlines of cylinders without caps: the two lines where rays from the viewpoint are tangent. start,
-    end: [C, 3] of the axis; radius: [C]. Parameter 0..1 and 1..2."""
-
-    start: Tensor
-    end: Tensor
-    radius: Tensor
-
-    def pieces(self, viewpoint, angle):
-        count = self.start.shape[0]
-        index, s = _cut(torch.arange(count).repeat_interleave(2), torch.full((2 * count,), ROUND // 2))
-        return index, s + (torch.arange(s.shape[0]) // (ROUND // 2) % 2)[:, None]
-
-    def points(self, index, s, viewpoint):
-        start = self.start[index]
-        along = (self.end - self.start)[index]
-        axis = torch.nn.functional.normalize(along, dim=1)
-        towards = viewpoint - start
-        towards = towards - (towards * axis).sum(1, keepdim=True) * axis
-        distance = towards.norm(dim=1, keepdim=True)
-        share = (self.radius[index][:, None] / distance).clamp_max(1)
-        out = towards / distance
-        aside = torch.linalg.cross(axis, out) * torch.where(s < 1, 1.0, -1.0).to(s)[:, None]
-        return (
-            start
-            + (s % 1)[:, None] * along
-            + self.radius[index][:, None] * (share * out + (1 - share.square()).sqrt() * aside)
-        )
 
 
 def outlines(mi, scene):
@@ -167,7 +59,7 @@ def outlines(mi, scene):
     def tensor(rows):
         return torch.tensor(np.array(rows), dtype=torch.float64)
 
-    kinds = ((Segments, edges), (Circles, rims), (Spheres, spheres), (Cylinders, tubes))
+    kinds = ((Segments, edges), (Circles, rims), (Spheres, spheres), (Cylinders.of, tubes))
     return [
         kind(
             *[
@@ -266,21 +158,6 @@ def mesh_edges(vertices, faces):
                 )
             )
     return rows
-
-
-def _cut(index, count):
-    """Cut the parameter 0..1 of each curve into ``count`` pieces: indices [n], bounds [n, 2]."""
-    which = torch.repeat_interleave(torch.arange(index.shape[0]), count)
-    first = torch.cumsum(count, 0) - count
-    k = torch.arange(which.shape[0]) - first[which]
-    return index[which], torch.stack([k / count[which], (k + 1) / count[which]], 1).double()
-
-
-def _across(axis):
-    """Two unit vectors [n, 3] across unit vectors [n, 3]."""
-    helper = torch.eye(3, dtype=axis.dtype)[axis.abs().argmin(1)]
-    u = torch.nn.functional.normalize(torch.linalg.cross(axis, helper), dim=1)
-    return u, torch.linalg.cross(axis, u)
 
 
 def _transform(parameters, points):
