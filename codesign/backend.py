@@ -137,13 +137,13 @@ def require_renderer(device: str = "cpu") -> None:
             return  # an unwritable cache costs a trial render per process, nothing else
 
 
-@lru_cache(maxsize=4)
 def mitsuba(device: str = "cpu") -> Any:
     """The Mitsuba module with the variant of ``device`` set, after the renderer check."""
     require_renderer(device)
     import mitsuba as mi
 
-    mi.set_variant(variant(device))
+    if mi.variant() != variant(device):  # the user's own code may have chosen another meanwhile
+        mi.set_variant(variant(device))
     return mi
 
 

@@ -16,6 +16,7 @@ from codesign import backend
 from codesign.render import MitsubaScene, TexturedPlane
 from scenes import bodies, textures
 from scenes.build import GAP_M, Paint, World, ball, block, emissive, pole, rectangle, sky
+from scenes.foreign import from_mitsuba, view_of
 from scenes.tabletop import tabletop
 
 PAINT = 60.0  # the wall colour that pictures fade to
@@ -29,11 +30,13 @@ __all__ = [
     "checkerboard",
     "corridor",
     "dark_room",
+    "from_mitsuba",
     "ground",
     "outdoor",
     "room",
     "smooth_plane",
     "tabletop",
+    "view_of",
     "wall",
 ]
 

@@ -33,23 +33,25 @@ class PathScene(MitsubaScene):
     """A Mitsuba scene of any surfaces and lights, seen by path tracing along the camera's own rays.
 
     Args:
-      description: a Mitsuba scene dictionary. samples: paths per camera ray, on top of the camera's samples
-        per pixel.
+      description: a Mitsuba scene dictionary, or an mi.Scene. samples: paths per camera ray, on top of the
+        camera's samples per pixel.
       max_depth: longest path; 1 sees emitters only, 2 one reflection, -1 any length. seed: of the random
         numbers; equal calls give equal frames. Noise is independent from ray to ray, so a camera at rest sees
-        frames that differ by it: raise samples until events of noise are rare.
+        frames that differ by it: raise samples until events of noise are rare. integrator: a Mitsuba
+        SamplingIntegrator instead of path tracing to max_depth.
     Gradient: none. A path's light behind a moved ray jumps wherever the path changes, and differentiating the
       numbers one by one is not the gradient of their mean; asking for it raises GradientError.
     """
 
     def __init__(
         self,
-        description: Mapping[str, Any],
+        description: Mapping[str, Any] | Any,
         device: str = "cpu",
         *,
         samples: int = 16,
         max_depth: int = 8,
         seed: int = 0,
+        integrator: Any = None,
     ):
         if not samples >= 1:
             raise DomainError(f"path light: samples = {samples} per ray must be at least 1.")
@@ -60,7 +62,9 @@ class PathScene(MitsubaScene):
         super().__init__(description, device)
         self.samples = int(samples)
         self.seed = int(seed)
-        self.integrator = self.mi.load_dict({"type": "path", "max_depth": int(max_depth), "rr_depth": 64})
+        self.integrator = integrator or self.mi.load_dict(
+            {"type": "path", "max_depth": int(max_depth), "rr_depth": 64}
+        )
 
     def with_seed(self, seed: int) -> "PathScene":
         """The same scene with other random numbers."""
@@ -94,6 +98,13 @@ class PathScene(MitsubaScene):
         )  # opaque: another seed needs no new kernel
         light, _, _ = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(o, mi.Vector3f(d)))
         return dr.block_sum(light[0], self.samples) / self.samples
+
+    def radiance_and_distance(self, arr: Any, origin: Any, direction: Any) -> Any:
+        """Radiance as above, and the distance to the first surface (infinite where there is none)."""
+        mi = self.mi
+        light = self.radiance(arr, origin, direction)
+        ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
+        return light, self.scene.ray_intersect_preliminary(ray, coherent=True).t
 
 
 @dataclass(frozen=True)

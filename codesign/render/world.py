@@ -14,8 +14,8 @@ from codesign.render.outline import outlines
 class MitsubaScene:
     """A Mitsuba scene whose radiance is read directly from its emitters.
 
-    Args: description: a Mitsuba scene dictionary; every shape carries an area emitter. device: "cpu" or
-      "cuda".
+    Args: description: a Mitsuba scene dictionary; every shape carries an area emitter. Also an mi.Scene that
+      is loaded already. device: "cpu" or "cuda".
       merge: whether Mitsuba may join meshes that look alike into one.
     Computes in float32. Raises: DomainError when Mitsuba refuses the description.
     """
@@ -25,9 +25,12 @@ class MitsubaScene:
     def __deepcopy__(self, memo):
         return self  # a scene is never changed, so copies of what holds it share it
 
-    def __init__(self, description: Mapping[str, Any], device: str = "cpu", *, merge: bool = True):
+    def __init__(self, description: Mapping[str, Any] | Any, device: str = "cpu", *, merge: bool = True):
         self.mi = backend.mitsuba(device)
         self._outline = None
+        if isinstance(description, self.mi.Scene):
+            self.scene: Any = description
+            return
         try:
             self.scene = self.mi.load_dict({"type": "scene", **description}, optimize=merge)
         except CodesignError:

@@ -11,7 +11,6 @@ from codesign import backend, lens, render
 from codesign.errors import DomainError, ShapeError
 from codesign.pose import inverse, look_at, se3_exp
 from codesign.render import Camera, MitsubaScene, MovingScene, TexturedPlane
-from codesign.render.light import PathScene
 from scenes import textures
 
 D = torch.float64
@@ -250,6 +249,13 @@ def test_a_scene_cut_to_some_frames_is_that_part_of_the_sequence():
         assert torch.equal(render.frames(camera(), scene.during(frames), path(5)[frames]), whole[frames])
 
 
+class Brighter(MitsubaScene):
+    """Twice the radiance, whose distances would tell of the plain scene."""
+
+    def radiance(self, arr, origin, direction):
+        return 2 * super().radiance(arr, origin, direction)
+
+
 def test_moving_scenes_that_cannot_be_are_refused():
     card = plane(1)
     good = motion(3)
@@ -268,7 +274,7 @@ def test_moving_scenes_that_cannot_be_are_refused():
         render.true_flow(camera(), scene, path(2))
     with pytest.raises(DomainError, match="itself a moving scene"):
         MovingScene(plane(2), {"world": (scene, good)})  # pyright: ignore[reportArgumentType]
-    with pytest.raises(DomainError, match="part 'lit', a PathScene, does not say how far"):
-        MovingScene(plane(2), {"lit": (PathScene({"ball": shape(1.0, type="sphere")}), good)})
+    with pytest.raises(DomainError, match="part 'lit', a Brighter, does not say how far"):
+        MovingScene(plane(2), {"lit": (Brighter({"ball": shape(1.0, type="sphere")}), good)})
     with pytest.raises(DomainError, match="outlines of moving objects"):
         scene.outline()

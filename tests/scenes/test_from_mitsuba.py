@@ -1,0 +1,243 @@
+"""Worlds from Mitsuba scenes: the same picture as Mitsuba's own sensor, units and axes, and what is refused."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from codesign import backend, lens, render
+from codesign.errors import DomainError, FileFormatError, GradientError
+from codesign.pose import look_at
+from codesign.render import Camera
+from scenes import worlds
+
+XML = """<scene version="3.0.0">
+    <default name="bright" value="2"/>
+    <integrator type="path"><integer name="max_depth" value="4"/></integrator>
+    <sensor type="perspective">
+        <float name="fov" value="50"/>
+        <transform name="to_world"><lookat origin="1.5, 2, 4" target="0.2, 0.5, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="24"/><integer name="height" value="16"/></film>
+    </sensor>
+    <shape type="rectangle">
+        <transform name="to_world"><rotate x="1" angle="-90"/><scale value="2"/></transform>
+        <bsdf type="twosided"><bsdf type="roughplastic"/></bsdf>
+    </shape>
+    <shape type="sphere">
+        <point name="center" x="0" y="0.6" z="0"/><float name="radius" value="0.5"/>
+        <bsdf type="principled"><rgb name="base_color" value="0.8, 0.3, 0.2"/></bsdf>
+    </shape>
+    <emitter type="constant"><rgb name="radiance" value="$bright"/></emitter>
+    <emitter type="point"><point name="position" x="2" y="3" z="1"/><rgb name="intensity" value="20"/></emitter>
+</scene>"""
+
+
+def described(mi, bright=2.0) -> dict[str, Any]:
+    """The scene of XML as a dictionary."""
+    T = mi.ScalarTransform4f()
+    plastic = {"type": "twosided", "bsdf": {"type": "roughplastic"}}
+    red = {"type": "principled", "base_color": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 4},
+        "sensor": {
+            "type": "perspective",
+            "fov": 50,
+            "to_world": T.look_at(origin=[1.5, 2, 4], target=[0.2, 0.5, 0], up=[0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 24, "height": 16},
+        },
+        "floor": {"type": "rectangle", "to_world": T.scale(2).rotate([1, 0, 0], -90), "bsdf": plastic},
+        "ball": {"type": "sphere", "center": [0, 0.6, 0], "radius": 0.5, "bsdf": red},
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": bright}},
+        "lamp": {"type": "point", "position": [2, 3, 1], "intensity": {"type": "rgb", "value": 20.0}},
+    }
+
+
+@pytest.fixture
+def path(tmp_path):
+    file = tmp_path / "scene.xml"
+    file.write_text(XML)
+    return file
+
+
+def seen(world, view, samples=4, **options):
+    return render.frames(view.camera(samples, **options), world, view.T_world_cam[None])[0].double()
+
+
+def test_a_file_a_dictionary_and_a_loaded_scene_are_one_world(path):
+    mi = backend.mitsuba()
+    view = worlds.view_of(path)
+    images = [
+        seen(worlds.from_mitsuba(source, samples=2, **more), view)
+        for source, more in (
+            (path, {"bright": "3"}),
+            (str(path), {"bright": 3}),
+            (described(mi, 3.0), {}),
+            (mi.load_dict(described(mi, 3.0)), {}),
+        )
+    ]
+    for other in images[1:]:  # the file's turn by 90 degrees is rounded otherwise than the dictionary's
+        torch.testing.assert_close(images[0], other, rtol=1e-4, atol=1e-5)
+    assert not torch.equal(images[0], seen(worlds.from_mitsuba(path, samples=2), view))
+
+
+def test_the_picture_from_the_file_s_own_view_is_mitsuba_s(path):
+    mi = backend.mitsuba()
+    scene = mi.load_file(str(path))
+    view = worlds.view_of(scene)
+    film = {"type": "hdrfilm", "width": 24, "height": 16, "rfilter": {"type": "box"}}
+    own = mi.traverse(scene.sensors()[0])["to_world"].matrix
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": 50,
+            "to_world": mi.ScalarTransform4f(np.array(own)[..., 0]),
+            "film": film,
+        }
+    )
+    theirs = [np.array(mi.render(scene, sensor=sensor, spp=256, seed=k))[..., 0] for k in range(4)]
+    theirs = torch.from_numpy(np.stack(theirs)).double()
+    world = worlds.from_mitsuba(scene, samples=1)
+    camera = view.camera(256)
+    ours = torch.stack(
+        [
+            render.frames(camera.with_seed(k), world.with_seed(k), view.T_world_cam[None])[0].double()
+            for k in range(4)
+        ]
+    )
+    error = ((ours.var(0) + theirs.var(0)) / 4).sqrt() + 1e-5
+    z = (ours.mean(0) - theirs.mean(0)) / error
+    # Student's t of about 6 degrees of freedom has a mean square of 6 / 4 and a fourth moment of 3 * 36 / 8: over 384
+    # pixels the mean of z^2 spreads by 3 / sqrt(384) = 0.15
+    assert float(z.square().mean()) < 1.5 + 5 * 0.15
+    assert float(ours.mean()) == pytest.approx(float(theirs.mean()), rel=2e-3)
+
+
+@pytest.mark.parametrize(("unit_m", "up"), [(0.01, "y"), (1.0, "z"), (0.25, "z")])
+def test_units_and_the_up_axis_change_where_the_camera_stands_and_not_what_it_sees(path, unit_m, up):
+    view = worlds.view_of(path, unit_m=unit_m, up=up)
+    plain = worlds.view_of(path, up="z")
+    eye = [1.5, 2, 4] if up == "z" else [1.5, -4, 2]
+    torch.testing.assert_close(view.T_world_cam[:3, 3], unit_m * torch.tensor(eye, dtype=torch.float64))
+    world = worlds.from_mitsuba(path, unit_m=unit_m, up=up, gain=3.0, samples=2)
+    torch.testing.assert_close(
+        seen(world, view), 3 * seen(worlds.from_mitsuba(path, up="z", samples=2), plain), rtol=0.02, atol=0
+    )
+    point, normal, valid = world.hit(
+        unit_m * torch.tensor([[0.0, -1.0, 1.5] if up == "z" else [0.0, -1.5, -1.0]]).double(),
+        torch.tensor([[0.0, 1.0, 0.0] if up == "z" else [0.0, 0.0, 1.0]]).double(),
+    )
+    assert bool(valid)  # the floor at height 0, from below
+    assert float(point.norm()) == pytest.approx(1.5 * unit_m, rel=1e-5)
+    assert abs(float(normal[0, 1 if up == "z" else 2])) == pytest.approx(1)
+
+
+def test_a_window_of_the_film_is_a_window_of_the_camera(path):
+    mi = backend.mitsuba()
+    scene = described(mi)
+    whole = worlds.view_of(scene)
+    scene["sensor"]["film"] |= {
+        "crop_offset_x": 4,
+        "crop_offset_y": 2,
+        "crop_width": 6,
+        "crop_height": 5,
+    }
+    view = worlds.view_of(scene)
+    world = worlds.from_mitsuba(scene, samples=1, max_depth=1)
+    image = seen(world, view)
+    assert image.shape == (1, 5, 6)
+    torch.testing.assert_close(image[0], seen(world, whole)[2:7, 4:10], rtol=1e-5, atol=1e-5)
+
+
+def test_a_room_in_centimetres_is_told(path):
+    with pytest.warns(UserWarning, match=r"scene.xml' is 400 m wide; .* give unit_m=0.01"):
+        worlds.from_mitsuba(path, unit_m=100.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ('"principled"', '"chrome"', "chrome"),
+        ("</scene>", "", "Start-end tags mismatch"),
+        ('<shape type="sphere">', '<shape type="ply"><string name="filename" value="no.ply"/>', "no.ply"),
+        ('name="radius"', 'name="girth"', "girth"),
+        ('"$bright"', '"$dark"', r"\$dark"),
+    ],
+)
+def test_a_file_that_mitsuba_cannot_load_is_one_sentence_with_its_path(path, old, new, sentence):
+    path.write_text(XML.replace(old, new, 1))
+    with pytest.raises(FileFormatError, match=sentence) as found:
+        worlds.from_mitsuba(path)
+    assert str(path) in str(found.value)
+    assert "\n" not in str(found.value)
+    assert ".cpp" not in str(found.value)
+
+
+def test_a_missing_picture_is_named(path):
+    picture = '<texture type="bitmap" name="base_color"><string name="filename" value="no.png"/></texture>'
+    path.write_text(XML.replace('<rgb name="base_color" value="0.8, 0.3, 0.2"/>', picture))
+    with pytest.raises(FileFormatError, match=r"scene\.xml.*no\.png"):
+        worlds.from_mitsuba(path)
+
+
+def test_what_is_no_scene_is_refused(path, tmp_path):
+    mi = backend.mitsuba()
+    sphere = {"ball": {"type": "sphere"}}
+    (tmp_path / "one.xml").write_text('<shape version="3.0.0" type="sphere"/>')
+    (tmp_path / "a.obj").write_text("")
+    for source, sentence in (
+        (tmp_path / "none.xml", "none.xml' is not a file"),
+        (tmp_path / "a.obj", "ends in '.obj'"),
+        (tmp_path / "one.xml", "not a scene"),
+        (3, "not a int"),
+        ({"sky": {"type": "constant"}}, "has no shapes"),
+        (sphere, "has no light"),
+        ({"ball": {"type": "balloon"}}, "balloon"),
+    ):
+        with pytest.raises((DomainError, FileFormatError), match=sentence) as found:
+            worlds.from_mitsuba(source)
+        assert "\n" not in str(found.value)
+    for options, sentence in (
+        ({"light": "dim"}, "light = 'dim' is not known"),
+        ({"up": "x"}, "up = 'x' is not known"),
+        ({"unit_m": 0.0}, "unit_m = 0.0 must be positive"),
+        ({"gain": math.nan}, "gain = nan must be positive"),
+    ):
+        with pytest.raises(DomainError, match=sentence):
+            worlds.from_mitsuba(path, **options)
+    with pytest.raises(DomainError, match="'colour' is no argument"):
+        worlds.from_mitsuba(sphere, colour=1)
+    with pytest.raises(DomainError, match="has 0 sensors"):
+        worlds.view_of(sphere)
+    with pytest.raises(DomainError, match="not a perspective one"):
+        worlds.view_of({**sphere, "sensor": {"type": "orthographic"}})
+    off = {"type": "perspective", "principal_point_offset_x": 0.1}
+    with pytest.raises(DomainError, match="principal point"):
+        worlds.view_of({**sphere, "sensor": off})
+    mirrored = {"type": "perspective", "to_world": mi.ScalarTransform4f().scale([-1, 1, 1])}
+    with pytest.raises(DomainError, match="mirrors its picture"):
+        worlds.view_of({**sphere, "sensor": mirrored})
+
+
+def test_a_scene_of_another_variant_is_refused_with_what_to_do():
+    mi = backend.mitsuba()
+    mi.set_variant("scalar_rgb")
+    try:
+        scene = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "sky": {"type": "constant"}})
+    finally:
+        mi.set_variant(backend.variant())
+    for source in (scene, {"ball": scene.shapes()[0]}):
+        with pytest.raises(DomainError, match=r"scalar_rgb.*mi.set_variant\('llvm_ad_mono'\)"):
+            worlds.from_mitsuba(source)
+
+
+def test_paths_have_no_gradient(path):
+    poses = look_at((1.5, -4, 2), (0, 0, 0))[None].requires_grad_()
+    camera = Camera(lens.Pinhole(8.0), 4, 4, 1.0, 1)
+    world = worlds.from_mitsuba(path, samples=1)
+    with pytest.raises(GradientError, match="no gradient"):
+        render.frames(camera, world, poses).sum().backward()
+    with pytest.raises(GradientError, match="no outline"):
+        world.outline()
