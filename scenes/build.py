@@ -5,6 +5,7 @@ A world is described once. At the level "emissive" every surface shows its pictu
 up, radiance on the 0..255 scale.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -40,12 +41,15 @@ class Paint:
 @dataclass(frozen=True)
 class World:
     """Shapes (name -> (geometry, Paint)) that every level shows; background: sky that every level shows;
-    lamps: Mitsuba lights of the lit levels; texel_m: size of baked light-map texels that suits its things."""
+    lamps: Mitsuba lights of the lit levels; texel_m: size of baked light-map texels that suits its things.
+    two_sided: whether surfaces show from behind what they show from in front (not where light is baked, which
+    holds the front's light)."""
 
     shapes: dict[str, tuple[Any, Paint]]
     background: dict[str, Any] = field(default_factory=dict)
     lamps: dict[str, Any] = field(default_factory=dict)
     texel_m: float = 0.08  # of baked light
+    two_sided: bool = False
 
 
 Light = Callable[[World, str], Any]
@@ -58,11 +62,11 @@ def emissive(world, device="cpu"):
     shapes = {}
     for name, (geometry, paint) in world.shapes.items():
         if isinstance(geometry, bodies.Body):
-            radiance = _level(name, paint) * bodies.skylight(geometry)
-            shapes[name] = emissive_mesh(mi, geometry.vertices_m, geometry.faces, radiance)
+            shapes[name] = _glowing(mi, name, geometry, paint)
         else:
             shapes[name] = {**geometry, "emitter": {"type": "area", "radiance": _bitmap(mi, paint, 1.0)}}
-    return MitsubaScene({**shapes, **world.background}, device)
+    scene = MitsubaScene({**shapes, **world.background}, device)
+    return scene.two_sided() if world.two_sided else scene
 
 
 def baked(world, device="cpu", **options):
@@ -72,29 +76,22 @@ def baked(world, device="cpu", **options):
 
 def path(world, device="cpu", **options):
     """The world lit by its lamps, by path tracing for every camera ray; options go to light.PathScene."""
-    return light.PathScene(lit(world, device), device, **options)
+    return light.PathScene(lit(world, device, world.two_sided), device, **options)
 
 
 LEVELS: dict[str, Light] = {"emissive": emissive, "baked": baked, "path": path}
 
 
-def lit(world, device="cpu"):
-    """Mitsuba description of the world as Lambertian surfaces with lamps."""
+def lit(world, device="cpu", two_sided=False):
+    """Mitsuba description of the world as Lambertian surfaces with lamps; meshes reflect on both sides where
+    ``two_sided``."""
     mi = backend.mitsuba(device)
     shapes = {}
     for name, (geometry, paint) in world.shapes.items():
         if isinstance(geometry, bodies.Body):
-            grey = {
-                "type": "diffuse",
-                "reflectance": {"type": "rgb", "value": paint.albedo * _level(name, paint) / 255},
-            }
-            shapes[name] = emissive_mesh(mi, geometry.vertices_m, geometry.faces, None, bsdf=grey)
+            shapes[name] = _lit_body(mi, name, geometry, paint, two_sided)
             continue
-        brightest = paint.albedo * float(np.max(paint.picture)) / 255
-        if not 0 <= brightest <= 1:
-            raise DomainError(
-                f"shape '{name}': its brightest texel would have albedo {brightest:.3g}; albedos lie in 0..1."
-            )
+        _check_albedo(name, paint.albedo * float(np.max(paint.picture)) / 255)
         shapes[name] = {
             **geometry,
             "bsdf": {"type": "diffuse", "reflectance": _bitmap(mi, paint, paint.albedo / 255)},
@@ -107,8 +104,50 @@ def lit(world, device="cpu"):
     return {**shapes, **world.background, **world.lamps}
 
 
+def _check_albedo(name, brightest):
+    if not 0 <= brightest <= 1:
+        raise DomainError(
+            f"shape '{name}': its brightest texel would have albedo {brightest:.3g}; albedos lie in 0..1."
+        )
+
+
+def _glowing(mi, name, body, paint):
+    """A body as it shows its paint: by its texture coordinates, or, where it has none, shaded by a plain sky."""
+    if body.uv is not None:
+        source = {"type": "area", "radiance": _bitmap(mi, paint, 1.0)}
+        return emissive_mesh(mi, body.vertices_m, body.faces, source, body.uv)
+    level = _level(name, paint) * body.tint
+    if not body.smooth:
+        return emissive_mesh(mi, body.vertices_m, body.faces, level * bodies.skylight(body))
+    source = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_radiance"}}
+    mesh = emissive_mesh(mi, body.vertices_m, body.faces, source)
+    mesh.add_attribute("vertex_radiance", 1, np.float32(level * bodies.skylight(body)))
+    return mesh
+
+
+def _lit_body(mi, name, body, paint, two_sided):
+    if body.uv is not None:
+        _check_albedo(name, paint.albedo * float(np.max(paint.picture)) / 255)
+        reflectance = _bitmap(mi, paint, paint.albedo / 255)
+    else:
+        albedo = paint.albedo * _level(name, paint) / 255 * body.tint
+        _check_albedo(name, float(np.max(albedo)))
+        attribute = "vertex_albedo" if body.smooth else "face_albedo"
+        reflectance = (
+            {"type": "rgb", "value": float(albedo)}
+            if np.ndim(albedo) == 0
+            else {"type": "mesh_attribute", "name": attribute}
+        )
+    bsdf = {"type": "diffuse", "reflectance": reflectance}
+    bsdf = {"type": "twosided", "material": bsdf} if two_sided else bsdf
+    mesh = emissive_mesh(mi, body.vertices_m, body.faces, None, body.uv, bsdf=bsdf)
+    if body.uv is None and np.ndim(albedo):
+        mesh.add_attribute(attribute, 1, np.float32(albedo))
+    return mesh
+
+
 def _level(name, paint):
-    """The one radiance of a body, which has no texture coordinates."""
+    """The one radiance of a body without texture coordinates."""
     picture = textures.check_texture(paint.picture, f"of '{name}'")
     return float(picture.mean())
 
@@ -180,3 +219,15 @@ def sky(mi, picture):
     values = textures.check_texture(picture, "of the sky")
     bitmap = mi.Bitmap(np.ascontiguousarray(np.repeat(values[..., None], 3, 2)))
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90)}
+
+
+def sun(irradiance, elevation_deg=40.0, azimuth_deg=200.0):
+    """Parallel light from a height over the horizon and a direction on the compass (0 is +y, 90 is +x)."""
+    elevation = math.radians(elevation_deg)
+    azimuth = math.radians(azimuth_deg)
+    towards = [
+        -math.cos(elevation) * math.sin(azimuth),
+        -math.cos(elevation) * math.cos(azimuth),
+        -math.sin(elevation),
+    ]
+    return {"type": "directional", "direction": towards, "irradiance": {"type": "rgb", "value": irradiance}}

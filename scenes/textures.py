@@ -1,6 +1,7 @@
 """Photographs and procedural patterns as linear radiance textures on the 0..255 scale."""
 
 import math
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from codesign import backend
 from codesign.errors import DomainError, FileFormatError
+from codesign.events.sources.video import open_video
 
 PHOTOS = (
     "brick",
@@ -23,6 +25,9 @@ PHOTOS = (
     "hubble_deep_field",
 )
 LIFT = 2.0  # the darkest radiance of a photograph: no real wall is perfectly black
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue: ITU-R BT.709
+HDR = (".hdr", ".exr")
+HDR_MEAN = 80.0
 
 
 def photo(source, size_px=512):
@@ -34,20 +39,18 @@ def photo(source, size_px=512):
       size_px: most rows and columns. A file that has more is averaged over areas, in linear light, until its
         longer side has as many: all of it is there, in its own proportions. Of a picture out of PHOTOS the
         first rows and columns are taken, texel by texel.
-    Returns: [H, W] float32, from LIFT to 255.
+    Returns: [H, W] float32, from LIFT to 255; of an .hdr or .exr, whose white is not known, scaled to a mean of
+      HDR_MEAN, with lights as far above 255 as they are in the file.
     Raises: FileFormatError when there is no such picture.
     """
     if str(source) in PHOTOS:
         import skimage.data
 
         stored = getattr(skimage.data, str(source))()[:size_px, :size_px]
-        return _radiance(_linear(stored), str(source))
-    linear = _linear(_stored(source))
-    longest = max(linear.shape)
-    if longest > size_px:
-        for axis, size in enumerate(linear.shape):
-            linear = _averaged(linear, max(1, round(size * size_px / longest)), axis)
-    return _radiance(linear, str(source))
+        return _radiance(linear(stored), str(source))
+    if Path(source).suffix.lower() in HDR:
+        return _scaled(reduced(_unscaled(source, "texture"), size_px), 1.0, HDR_MEAN, f"texture {source}")
+    return _radiance(reduced(linear(_stored(source)), size_px), str(source))
 
 
 def _stored(path):
@@ -55,28 +58,43 @@ def _stored(path):
     if not Path(path).is_file():
         raise FileFormatError(
             f"texture '{path}' is neither a file nor one of {', '.join(PHOTOS)}; give the path of a "
-            "PNG or JPEG."
+            "PNG, JPEG, HDR or EXR."
         )
     try:
         with PIL.Image.open(path) as image:
-            if image.mode == "I":
-                raise ValueError("it holds whole numbers of 32 bits, whose white is not known")
-            gray = image.mode in ("L", "F") or image.mode.startswith("I;16")
-            return np.asarray(image if gray else image.convert("RGB"))
+            return stored_values(image)
     except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:
         raise FileFormatError(
             f"texture {path} is not a readable image ({str(error)[:120]}); convert it to PNG."
         ) from error
 
 
-def _linear(stored):
-    """Linear luminance 0..1, [H, W] float64, of values coded by the sRGB gamma."""
+def stored_values(image: PIL.Image.Image) -> np.ndarray:
+    """Values of a picture as they are stored: [H, W] or [H, W, 3]. Raises: ValueError where white is not known."""
+    if image.mode == "I":
+        raise ValueError("it holds whole numbers of 32 bits, whose white is not known")
+    gray = image.mode in ("L", "F") or image.mode.startswith("I;16")
+    return np.asarray(image if gray else image.convert("RGB"))
+
+
+def linear(stored: np.ndarray) -> np.ndarray:
+    """Linear luminance 0..1, [H, W] float64, of values coded by the sRGB gamma: [H, W] or [H, W, 3], whole numbers
+    or 0..1."""
     scale = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1.0
     values = np.asarray(stored, dtype=np.float64) / scale
-    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
-    if linear.ndim == 3:
-        linear = linear[..., :3] @ [0.2126, 0.7152, 0.0722] if linear.shape[2] >= 3 else linear[..., 0]
-    return linear
+    light = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    if light.ndim == 3:
+        light = light[..., :3] @ LUMINANCE if light.shape[2] >= 3 else light[..., 0]
+    return light
+
+
+def reduced(values: np.ndarray, size_px: int) -> np.ndarray:
+    """A picture [H, W] averaged over areas until its longer side has ``size_px`` at most."""
+    longest = max(values.shape)
+    if longest > size_px:
+        for axis, size in enumerate(values.shape):
+            values = _averaged(values, max(1, round(size * size_px / longest)), axis)
+    return values
 
 
 def _averaged(values, size, axis):
@@ -107,12 +125,12 @@ def shrunk(texture, factor):
     )
 
 
-def softened(texture, texels):
+def softened(texture, texels, mode="nearest"):
     """The texture blurred by a Gaussian of this standard deviation, so that the kinks between bilinear texels
-    become small."""
-    return gaussian_filter(
-        check_texture(texture, "to soften").astype(np.float64), texels, mode="nearest"
-    ).astype(np.float32)
+    become small; beside its border it goes on as SciPy's ``mode`` says."""
+    return gaussian_filter(check_texture(texture, "to soften").astype(np.float64), texels, mode=mode).astype(
+        np.float32
+    )
 
 
 def speckle(seed, size_px=512, finest_px=6.0, coarsest_px=64.0, contrast=0.5):
@@ -206,6 +224,27 @@ def sky(
     return check_texture(np.clip(bright + (ground - bright) * below, 0, 255), "of the procedural sky")
 
 
+def video_frame(path: str | Path, time_s: float, size_px: int = 512) -> np.ndarray:
+    """The frame that a video shows at a time since its first one, as ``photo`` gives a picture: [H, W] float32.
+
+    Raises: FileFormatError when it is no video or its clock is damaged, DomainError for a time outside it,
+      MissingPackageError without the extra ``video``.
+    """
+    source = open_video(Path(path))
+    if source.t_s is None:
+        raise FileFormatError(
+            f"{path}: its times do not grow, so no frame is known by its time; convert it anew."
+        )
+    last = float(source.t_s[-1])
+    if not 0 <= time_s <= last:
+        raise DomainError(
+            f"{path}: time_s = {time_s} lies outside the video, which has frames from 0 to {last:g} s."
+        )
+    index = int((source.t_s <= time_s).sum()) - 1
+    with closing(source.read(index)) as frames:
+        return _radiance(reduced(linear(next(frames)), size_px), str(path))
+
+
 def environment(path, mean=80.0):
     """Luminance of an equirectangular HDR file (.hdr, .exr, or any picture Mitsuba reads), scaled to a mean
     radiance over the sphere: [H, W] float32.
@@ -213,13 +252,15 @@ def environment(path, mean=80.0):
     Bright lamps and suns stay as far above 255 as they are in the file. Raises: FileFormatError when it is
     missing or unreadable, DomainError for bad values.
     """
+    values = _unscaled(path, "environment map")
+    weight = np.sin((np.arange(len(values)) + 0.5) * np.pi / len(values))[:, None]
+    return _scaled(values, weight / weight.mean(), mean, f"environment map {path}")
+
+
+def _unscaled(path, what):
+    """Luminance [H, W] float64 of a picture in linear light, in the units of its file."""
     if not Path(path).is_file():
-        raise FileFormatError(
-            f"environment map '{path}' is not a file; give the path of an equirectangular .hdr or .exr "
-            "picture."
-        )
-    if not 0 < mean < math.inf:
-        raise DomainError(f"environment map {path}: mean = {mean} must be positive and finite.")
+        raise FileFormatError(f"{what} '{path}' is not a file; give the path of an .hdr or .exr picture.")
     mi = backend.mitsuba("cpu")
     try:
         values = np.array(
@@ -228,15 +269,18 @@ def environment(path, mean=80.0):
         )
     except Exception as error:  # Mitsuba raises plain RuntimeErrors of many lines
         raise FileFormatError(
-            f"environment map '{path}' cannot be read ({str(error).splitlines()[-1][:120]}); convert it to "
-            ".exr or .hdr."
+            f"{what} '{path}' cannot be read ({str(error).splitlines()[-1][:120]}); convert it to .exr or .hdr."
         ) from error
-    values = check_texture(values.reshape(values.shape[0], -1), str(path)).astype(np.float64)
-    weight = np.sin((np.arange(len(values)) + 0.5) * np.pi / len(values))[:, None]
-    level = (values * weight).mean() / weight.mean()
+    return check_texture(values.reshape(values.shape[0], -1), str(path)).astype(np.float64)
+
+
+def _scaled(values, weight, mean, name):
+    if not 0 < mean < math.inf:
+        raise DomainError(f"{name}: mean = {mean} must be positive and finite.")
+    level = (values * weight).mean()
     if level <= 0:
-        raise DomainError(f"environment map {path} is black; give one with light in it.")
-    return check_texture(values * (mean / level), str(path))
+        raise DomainError(f"{name} is black; give one with light in it.")
+    return check_texture(values * (mean / level), name)
 
 
 def waves(seed, count=24, finest_period_m=0.05, coarsest_period_m=0.5, log_contrast=0.4):

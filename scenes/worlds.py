@@ -15,8 +15,9 @@ import numpy as np
 from codesign import backend
 from codesign.render import MitsubaScene, TexturedPlane
 from scenes import bodies, textures
-from scenes.build import GAP_M, Paint, World, ball, block, emissive, pole, rectangle, sky
+from scenes.build import GAP_M, Paint, World, ball, block, emissive, pole, rectangle, sky, sun
 from scenes.foreign import from_mitsuba, view_of
+from scenes.from_mesh import from_mesh
 from scenes.tabletop import tabletop
 
 PAINT = 60.0  # the wall colour that pictures fade to
@@ -30,6 +31,7 @@ __all__ = [
     "checkerboard",
     "corridor",
     "dark_room",
+    "from_mesh",
     "from_mitsuba",
     "ground",
     "outdoor",
@@ -43,7 +45,7 @@ __all__ = [
 
 def wall(texture, texel_m=0.002, half_width_m=8.0, wrap="mirror", device="cpu") -> MitsubaScene:
     """One endless-looking wall, the plane y = 0 seen from y < 0, tiled (wrap "mirror" or "repeat") with a
-    texture at ``texel_m`` per texel."""
+    picture (an array, a path such as "photo.jpg", or a name) at ``texel_m`` per texel."""
     return _plane("wall", texture, texel_m, half_width_m, (0, -1, 0), (0, 0, 1), wrap, device)
 
 
@@ -58,7 +60,7 @@ def ground(texture, texel_m=0.004, half_width_m=12.0, device="cpu"):
 
 
 def _plane(name, texture, texel_m, half_width_m, towards, up, wrap, device):
-    texture = textures.check_texture(texture, "of the scene")
+    texture = textures.picture(texture)
     repeat = (
         2 * half_width_m / (texel_m * texture.shape[1]),
         2 * half_width_m / (texel_m * texture.shape[0]),
@@ -247,19 +249,8 @@ def outdoor(
         if environment is None
         else textures.environment(environment)
     )
-    lamps = {"sun": _sun(800.0)} if environment is None else {}
+    lamps = {"sun": sun(800.0, SUN_ELEVATION_DEG, SUN_AZIMUTH_DEG)} if environment is None else {}
     return light(World(shapes, {"sky": sky(mi, above)}, lamps, texel_m=0.08), device)
-
-
-def _sun(irradiance):
-    elevation = math.radians(SUN_ELEVATION_DEG)
-    azimuth = math.radians(SUN_AZIMUTH_DEG)
-    towards = [
-        -math.cos(elevation) * math.sin(azimuth),
-        -math.cos(elevation) * math.cos(azimuth),
-        -math.sin(elevation),
-    ]
-    return {"type": "directional", "direction": towards, "irradiance": {"type": "rgb", "value": irradiance}}
 
 
 def dark_room(seed=0, spots=10, dark=1.5, bright=255.0, size_m=(4.0, 4.0, 2.6), device="cpu", light=emissive):

@@ -1,5 +1,6 @@
 """Emissive textured geometry in Mitsuba: one ray cast and one texture lookup per ray."""
 
+import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -21,6 +22,7 @@ class MitsubaScene:
     """
 
     dtype = torch.float32
+    both_sides = False  # whether surfaces glow on both sides; see ``two_sided``
 
     def __deepcopy__(self, memo):
         return self  # a scene is never changed, so copies of what holds it share it
@@ -40,6 +42,13 @@ class MitsubaScene:
                 f"Mitsuba cannot build the scene: {str(error).splitlines()[0][:200]}"
             ) from error
 
+    def two_sided(self) -> "MitsubaScene":
+        """The same scene with surfaces that show from behind what they show from in front, as sheets and meshes
+        of unknown winding need; otherwise they are black there."""
+        twin = copy.copy(self)
+        twin.both_sides = True
+        return twin
+
     def radiance(self, arr: Any, origin: Any, direction: Any) -> Any:
         """Radiance along world rays (drjit arrays), 0 where nothing is hit. Gradient: to the rays, inside
         surfaces."""
@@ -56,7 +65,8 @@ class MitsubaScene:
         si = found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.Minimal)
         # emission is one-sided by the face: vertex normals are stored to 1 % only and would blacken faces
         # seen nearly edge-on
-        si.wi = mi.Vector3f(0, 0, -dr.dot(si.n, ray.d))
+        facing = -dr.dot(si.n, ray.d)
+        si.wi = mi.Vector3f(0, 0, dr.abs(facing) if self.both_sides else facing)
         if (
             self.scene.environment() is not None
         ):  # a sky is looked up by the direction, which these flags leave out where nothing is met

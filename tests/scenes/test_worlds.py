@@ -186,11 +186,13 @@ def test_files_that_are_no_meshes_are_refused(tmp_path):
     (tmp_path / "broken.stl").write_bytes(bytes(100))
     (tmp_path / "broken.obj").write_text("f 1 2 3\n")
     (tmp_path / "robot.dae").write_text("<xml/>")
+    (tmp_path / "robot.step").write_text("ISO-10303-21;")
     for name, sentence in (
         ("nowhere.stl", "is not a file"),
-        ("broken.stl", "is not an STL file"),
-        ("broken.obj", "cannot be read as OBJ|no faces"),
-        ("robot.dae", "convert it"),
+        ("broken.stl", "no faces"),
+        ("broken.obj", "no faces"),
+        ("robot.dae", "cannot be read as DAE"),
+        ("robot.step", "convert it"),
     ):
         with pytest.raises(FileFormatError, match=sentence):
             bodies.read(tmp_path / name)

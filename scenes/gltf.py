@@ -1,0 +1,153 @@
+"""glTF 2.0 as trimesh reads it, with what trimesh leaves out: exact factors, how pictures go on, and which
+extensions a file needs.
+
+Source: Khronos Group, glTF 2.0 Specification, 2021.
+"""
+
+import base64
+import io
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+
+from codesign.errors import FileFormatError
+from scenes import textures
+from scenes.mesh_folder import Folder
+
+MAGIC = b"glTF"
+WRAPS = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
+REPEAT = 10497  # where no sampler says
+FLOAT = 5126
+OWN_BUFFER = "codesign:the binary chunk"
+LIGHT_ONLY = (
+    "KHR_materials_",
+    "KHR_lights_",
+    "KHR_xmp",
+)  # extensions that change neither shape nor base colour
+UNREAD = (
+    "EXT_mesh_gpu_instancing",
+    "KHR_texture_transform",
+)  # which change what is seen even where not required
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Base colour: linear luminance ``factor`` times ``picture`` [H, W] (first row at the top) or 1."""
+
+    factor: float
+    picture: np.ndarray | None = None
+    wrap: str = "repeat"
+
+
+def luminance(image: Any) -> np.ndarray:
+    """Linear luminance [H, W], 0..1, of a PIL picture coded in sRGB; transparency is left out."""
+    return textures.linear(textures.stored_values(image))
+
+
+def opened(path: Path, folder: Folder, materials: bool) -> tuple[bytes, dict[str, Surface]]:
+    """A .gltf, or the same in a .glb, as text that trimesh reads with ``folder``, and its materials by the names
+    that the text gives them: their numbers. Raises: FileFormatError for what is damaged or not read."""
+    try:
+        tree = _tree(path.read_bytes(), folder)
+        if str(tree["asset"]["version"]).split(".")[0] != "2":
+            raise ValueError(f"version {tree['asset']['version']}")
+        _check_read(path, tree)
+        surfaces = _surfaces(tree, folder) if materials else {}
+    except FileFormatError:
+        folder.check()
+        raise
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+        raise FileFormatError(
+            f"mesh '{path}' cannot be read as glTF 2.0 ({str(error)[:100]}); export it anew."
+        ) from error
+    tree.pop("images", None)
+    for number, material in enumerate(tree.get("materials", [])):
+        material["name"] = str(number)
+    return json.dumps(tree).encode(), surfaces
+
+
+def _tree(data, folder):
+    """The header, as the standard lays it out; the binary chunk of a .glb goes to the folder."""
+    if data[:4] != MAGIC:
+        return json.loads(data.decode("utf-8"))
+    at = 12
+    chunks = []
+    while at + 8 <= len(data):
+        size = int.from_bytes(data[at : at + 4], "little")
+        if at + 8 + size > len(data):
+            raise ValueError("it ends early")
+        chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + size]))
+        at += 8 + size
+    if not chunks or chunks[0][0] != b"JSON":
+        raise ValueError("it has no header")
+    tree = json.loads(chunks[0][1].decode("utf-8"))
+    binary = [chunk for kind, chunk in chunks[1:] if kind == b"BIN\0"]
+    if binary and tree.get("buffers") and "uri" not in tree["buffers"][0]:
+        folder.given[OWN_BUFFER] = binary[0]
+        tree["buffers"][0]["uri"] = OWN_BUFFER
+    return tree
+
+
+def _check_read(path, tree):
+    used = {name for name in tree.get("extensionsRequired", []) if not name.startswith(LIGHT_ONLY)} | {
+        name for name in tree.get("extensionsUsed", []) if name in UNREAD
+    }
+    if used:
+        raise FileFormatError(
+            f"mesh '{path}' needs {', '.join(sorted(used))}, which is not read here; export it without compression, "
+            "instancing and texture transforms."
+        )
+    for mesh in tree.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            for attribute in ("POSITION", "TEXCOORD_0"):
+                number = primitive["attributes"].get(attribute)
+                if number is not None and tree["accessors"][number]["componentType"] != FLOAT:
+                    raise FileFormatError(
+                        f"mesh '{path}' has its {attribute} in whole numbers; export it without quantisation."
+                    )
+
+
+def _surfaces(tree, folder):
+    """Surfaces by the number of their material."""
+    pictures: dict[int, np.ndarray] = {}
+    found = {}
+    for number, material in enumerate(tree.get("materials", [])):
+        base = material.get("pbrMetallicRoughness", {})
+        factor = float(np.asarray(base.get("baseColorFactor", [1, 1, 1, 1]))[:3] @ textures.LUMINANCE)
+        texture = base.get("baseColorTexture")
+        if texture is None:
+            found[str(number)] = Surface(factor)
+            continue
+        if texture.get("texCoord", 0) != 0:
+            raise ValueError("a base colour is laid out by TEXCOORD_1, and TEXCOORD_0 alone is read")
+        entry = tree["textures"][texture["index"]]
+        source = entry["source"]
+        if source not in pictures:
+            pictures[source] = _picture(tree, tree["images"][source], folder)
+        sampler = tree["samplers"][entry["sampler"]] if "sampler" in entry else {}
+        wraps = {sampler.get(key, REPEAT) for key in ("wrapS", "wrapT")}
+        if len(wraps) > 1:
+            raise ValueError("a picture goes on in one way along u and in another along v")
+        found[str(number)] = Surface(factor, pictures[source], WRAPS[wraps.pop()])
+    return found
+
+
+def _picture(tree, image, folder):
+    if "bufferView" in image:
+        view = tree["bufferViews"][image["bufferView"]]
+        start = view.get("byteOffset", 0)
+        data = _bytes(tree["buffers"][view["buffer"]]["uri"], folder)[start : start + view["byteLength"]]
+    else:
+        data = _bytes(image["uri"], folder)
+    with PIL.Image.open(io.BytesIO(data)) as picture:
+        return luminance(picture)
+
+
+def _bytes(uri, folder):
+    if uri.startswith("data:"):
+        return base64.b64decode(uri.partition("base64,")[2], validate=True)
+    return folder.get(uri)

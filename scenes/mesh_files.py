@@ -1,0 +1,309 @@
+"""Mesh files as parts: triangles with their colours, in metres and z up. .obj with its .mtl, .ply, .stl, .dae,
+.gltf and .glb, read by trimesh.
+
+Files are data: nothing in them is run, nothing is fetched over a network, and other files that they name (materials,
+pictures, buffers) are read from their own folder, or from the folder given as ``root``, alone. A part that a file
+cannot give whole is refused in a sentence.
+"""
+
+import re
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codesign.errors import DomainError, FileFormatError
+from codesign.optional import optional
+from scenes import gltf, textures
+from scenes.mesh_folder import Folder
+
+trimesh = optional("trimesh", "worlds", "reading meshes")
+collada = optional("collada", "worlds", "reading .dae")
+
+KINDS = (".obj", ".ply", ".stl", ".dae", ".gltf", ".glb")
+MOST_FACES = 4_000_000  # some 10 s to read; their silhouettes take minutes and GiB
+MOST_BYTES = 1 << 30
+UNCOLOURED = 0.5  # linear luminance of what says none
+# rows: the axes x, y, z here in terms of the file's; x_up and y_up as COLLADA 1.4 names right, up and in
+AXES = {
+    "x": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
+    "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "z": np.eye(3),
+}
+
+
+@dataclass(frozen=True)
+class Part:
+    """Triangles of one material.
+
+    name: of the mesh in its file. vertices_m: [V, 3]; faces: [F, 3]. colour: linear luminance 0..1 (white is
+    1) as a picture [H, W] (first row at the top, looked up at ``uv`` [V, 2], v up), as one number per face [F]
+    where ``uv`` is None, or per vertex [V] where ``smooth``. wrap: how the picture goes on beside the unit square.
+    """
+
+    name: str
+    vertices_m: np.ndarray
+    faces: np.ndarray
+    colour: np.ndarray
+    uv: np.ndarray | None = None
+    smooth: bool = False
+    wrap: str = "repeat"
+
+
+def read(
+    path: str | Path,
+    unit_m: float | None = None,
+    up: str | None = None,
+    *,
+    root: str | Path | None = None,
+    materials: bool = True,
+) -> list[Part]:
+    """Every mesh of a file, at its place in the file's scene.
+
+    Args:
+      path: .obj, .ply, .stl, .dae, .gltf or .glb.
+      unit_m: metres per unit of the file. None: what a .dae says, 1 otherwise (glTF is in metres by its standard;
+        .obj, .ply and .stl do not say).
+      up: axis of the file that points up, "x", "y" or "z". None: what a .dae says, "y" for glTF by its standard,
+        "z" for .obj, .ply and .stl, which do not say.
+      root: folder that the files it names must lie in; None is its own.
+      materials: whether materials and colours are read; otherwise all is of one colour and no other file is asked
+        for but buffers.
+    Returns: parts, in the order of the file's scene; faces without area are left out, points and lines too.
+    Raises: FileFormatError for a file that is missing, of another kind, too large, empty or damaged, that names
+      files which are missing or elsewhere, or uses what is not read here; DomainError for a unit or an axis that
+      cannot be.
+    """
+    path = Path(path)
+    kind = _checked_kind(path, unit_m, up)
+    folder = Folder(path, root)
+    if kind == ".dae":
+        said = _dae_says(path)
+        unit_m, up = said[0] if unit_m is None else unit_m, up or said[1]
+    axes = (unit_m or 1.0) * AXES[up or ("y" if kind in (".gltf", ".glb") else "z")]
+    surfaces = None
+    if kind in (".gltf", ".glb"):
+        data, surfaces = gltf.opened(path, folder, materials)
+    else:
+        data = path.read_bytes()
+    _check_count(path, _faces_told(kind, data))
+    if kind == ".obj":
+        _check_obj(path, data)
+    scene = _loaded(path, data, folder, ".gltf" if surfaces is not None else kind, materials)
+    if materials:
+        folder.check()
+    parts = list(_parts(path, scene, axes, surfaces if materials else None, materials))
+    if not parts:
+        raise FileFormatError(
+            f"mesh '{path}' has no faces that can be read: it is cut short, damaged, or holds points and lines alone; "
+            "export it anew, with triangles."
+        )
+    return parts
+
+
+def _checked_kind(path, unit_m, up):
+    if unit_m is not None and not 0 < unit_m < float("inf"):
+        raise DomainError(
+            f"mesh {path}: unit_m = {unit_m} must be positive and finite, such as 0.001 for mm."
+        )
+    if up is not None and up not in AXES:
+        raise DomainError(f"mesh {path}: up = '{up}' is no axis; give 'x', 'y' or 'z'.")
+    if not path.is_file():
+        raise FileFormatError(
+            f"mesh '{path}' is not a file; give the path of one ending in {', '.join(KINDS)}."
+        )
+    kind = path.suffix.lower()
+    if kind not in KINDS:
+        raise FileFormatError(
+            f"mesh '{path}' ends in '{kind}'; {', '.join(KINDS)} are read, so convert it, in Blender for instance."
+        )
+    size = path.stat().st_size
+    if size == 0:
+        raise FileFormatError(f"mesh '{path}' is empty; export it anew.")
+    if size > MOST_BYTES:
+        raise FileFormatError(
+            f"mesh '{path}' has {size / 2**30:.1f} GiB, more than {MOST_BYTES / 2**30:.0f}; decimate it, in Blender "
+            "for instance."
+        )
+    return kind
+
+
+def _dae_says(path):
+    """Metres per unit and the axis that is up, of a COLLADA file."""
+    try:
+        with path.open("rb") as file:
+            asset = collada.Collada(file, ignore=[collada.DaeError]).assetInfo
+    except Exception as error:  # whatever an XML of another kind brings up
+        raise _damaged(path, error) from error
+    return asset.unitmeter or 1.0, (asset.upaxis or "Y_UP")[0].lower()
+
+
+def _faces_told(kind, data):
+    """Number of faces that a file announces, before it is parsed; 0 where it would have to be."""
+    if kind == ".stl" and data[:5] != b"solid":
+        return (len(data) - 84) // 50
+    if kind == ".ply":
+        said = re.search(rb"element\s+face\s+(\d+)", data[:10_000])
+        return int(said[1]) if said else 0
+    return data.count(b"\nf ") if kind == ".obj" else 0
+
+
+def _check_count(path, count):
+    if count > MOST_FACES:
+        raise FileFormatError(
+            f"mesh '{path}' has {count:,} faces, more than {MOST_FACES:,}; decimate it, in Blender for instance."
+        )
+
+
+def _check_obj(path, data):
+    """What trimesh would read as something else: indices of 0, and those that count back from the line."""
+    wrong = re.search(rb"^f(?=[ \t])[^\n]*?[ \t/](-\d+|0+)(?=[ \t/\r\n]|$)", data, re.MULTILINE)
+    if wrong:
+        raise FileFormatError(
+            f"mesh '{path}' has a face with index {wrong[1].decode()}; indices must count from 1, so export it anew."
+        )
+
+
+def _loaded(path, data, folder, kind, materials):
+    options: dict = {"process": False, "validate": False}
+    if kind in (".obj", ".gltf"):
+        options["skip_materials"] = not materials
+    elif kind == ".ply":
+        options["skip_texture"] = not materials
+    elif kind == ".dae":
+        options["ignore_broken"] = False
+    try:
+        with warnings.catch_warnings():  # numpy reads numbers as far as it can, and only warns
+            warnings.filterwarnings("error", message=".*could not be read to its end")
+            return trimesh.load_scene(
+                trimesh.util.wrap_as_stream(data), file_type=kind[1:], resolver=folder, **options
+            )
+    except FileFormatError:
+        raise
+    except Exception as error:  # trimesh raises whatever a damaged file brings up
+        folder.check()
+        raise _damaged(path, error) from error
+
+
+def _damaged(path, error):
+    said = " ".join(str(error).split())[:120] or type(error).__name__
+    return FileFormatError(
+        f"mesh '{path}' cannot be read as {path.suffix[1:].upper()} ({said}); export it anew."
+    )
+
+
+def _parts(path, scene, axes, surfaces, materials) -> Iterator[Part]:
+    count = sum(
+        len(getattr(scene.geometry[scene.graph[n][1]], "faces", ())) for n in scene.graph.nodes_geometry
+    )
+    _check_count(path, count)
+    for node in scene.graph.nodes_geometry:
+        frame, name = scene.graph[node]
+        mesh = scene.geometry[name]
+        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+            continue  # points and lines, which have no surface
+        frame = np.asarray(frame, dtype=np.float64)
+        vertices = np.asarray(mesh.vertices, dtype=np.float64)
+        faces = np.asarray(mesh.faces)
+        if not np.isfinite(vertices).all() or not np.isfinite(frame).all():
+            raise FileFormatError(f"mesh '{path}', '{name}': vertices are not all finite; export it anew.")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise FileFormatError(
+                f"mesh '{path}', '{name}': a face asks for vertex {int(faces.max())} of {len(vertices)}; export it anew."
+            )
+        turn = axes @ frame[:3, :3]
+        vertices = vertices @ turn.T + axes @ frame[:3, 3]
+        if np.linalg.det(turn) < 0:  # a mirrored instance: keep its outside outside
+            faces = faces[:, ::-1]
+        yield from _coloured(path, str(name), vertices, faces, mesh.visual, surfaces, materials)
+
+
+def _coloured(path, name, vertices, faces, visual, surfaces, materials):
+    corners = vertices[faces]
+    whole = (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) ** 2).sum(1) > 0
+    faces = faces[whole]
+    if not len(faces):
+        return
+    plain = np.full(len(faces), UNCOLOURED)
+    kind = visual.kind if materials else None
+    if kind == "face":
+        of_face = textures.linear(np.asarray(visual.face_colors)[whole][:, None, :3])[:, 0]
+        yield _merged(Part(name, vertices, faces, of_face))
+    elif kind == "vertex":
+        of_vertex = _vertex_colour(visual.vertex_colors, surfaces is not None)
+        yield _merged(Part(name, vertices, faces, of_vertex, smooth=True))
+    elif kind == "texture":
+        surface = surfaces[visual.material.name] if surfaces else _surface(visual.material)
+        tint = visual.vertex_attributes.get("color") if surfaces is not None else None
+        if surface.picture is None and tint is not None:
+            of_vertex = surface.factor * _vertex_colour(tint, True)
+            yield _merged(Part(name, vertices, faces, of_vertex, smooth=True))
+        elif surface.picture is None:
+            yield _merged(Part(name, vertices, faces, plain * 0 + surface.factor))
+        else:
+            uv = visual.uv
+            if uv is None or len(uv) != len(vertices) or not np.isfinite(uv).all():
+                raise FileFormatError(
+                    f"mesh '{path}', '{name}': it has a picture but no texture coordinates for every vertex; unwrap it, "
+                    "or give radiance= and no picture is read."
+                )
+            if tint is not None and not np.allclose(_vertex_colour(tint, True), 1, atol=0.01):
+                raise FileFormatError(
+                    f"mesh '{path}', '{name}': its picture is tinted by vertex colours, which is not read; bake them "
+                    "into the picture."
+                )
+            picture = surface.factor * surface.picture
+            uv = np.asarray(uv, dtype=np.float64)
+            yield _merged(Part(name, vertices, faces, picture, uv, wrap=surface.wrap))
+    else:
+        yield _merged(Part(name, vertices, faces, plain))
+
+
+def _vertex_colour(values, is_linear):
+    """Luminance [V] of colours [V, 3 or 4], of whole numbers of 8 or 16 bits or of 0..1."""
+    values = np.asarray(values)[:, :3]
+    if not is_linear:
+        return textures.linear(values[:, None])[:, 0]
+    scale = np.iinfo(values.dtype).max if values.dtype.kind == "u" else 1.0
+    return values.astype(np.float64) / scale @ textures.LUMINANCE
+
+
+def _surface(material: Any) -> gltf.Surface:
+    """Of an .obj, .ply or .dae: a picture in sRGB times a linear factor."""
+    picture = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+    said = getattr(material, "kwargs", {}).get("kd")  # as the .mtl has it, before it is rounded to 8 bits
+    if said is None:
+        rounded = getattr(material, "baseColorFactor", None)
+        said = None if rounded is None else np.asarray(rounded, dtype=np.float64)[:3] / 255
+    elif np.size(said) != 3:
+        said = np.full(3, np.ravel(said)[0])
+    whole = 1.0 if picture is not None or said is not None else UNCOLOURED
+    factor = whole if said is None else float(np.asarray(said, dtype=np.float64) @ textures.LUMINANCE)
+    return gltf.Surface(factor, None if picture is None else gltf.luminance(picture))
+
+
+def _merged(part):
+    """The part with vertices of one place, colour and texture coordinate as one, where faces share none: an edge
+    between faces that do not share its vertices would count as a seam."""
+    if len(part.vertices_m) < 3 * len(part.faces):
+        return part
+    columns = [part.vertices_m]
+    columns += [part.uv] if part.uv is not None else []
+    columns += [part.colour[:, None]] if part.smooth else []
+    rows = np.ascontiguousarray(np.concatenate(columns, 1)) + 0.0  # no negative zeros
+    _, first, index = np.unique(
+        rows.view([("", rows.dtype)] * rows.shape[1]).reshape(-1), return_index=True, return_inverse=True
+    )
+    faces = index.reshape(-1)[part.faces]
+    return Part(
+        part.name,
+        part.vertices_m[first],
+        faces,
+        part.colour[first] if part.smooth else part.colour,
+        None if part.uv is None else part.uv[first],
+        part.smooth,
+        part.wrap,
+    )

@@ -1,0 +1,426 @@
+"""Worlds from mesh files: what a camera reads back of them against the numbers that were written."""
+
+import base64
+import json
+from functools import partial
+
+import numpy as np
+import PIL.Image
+import pytest
+import torch
+
+from codesign import lens, render
+from codesign.errors import DomainError, FileFormatError
+from codesign.pose import look_at, se3_exp
+from scenes import bodies, build, mesh_files, textures, worlds
+
+PICTURE = np.array([[0, 64], [128, 255]], dtype=np.uint8)  # first row at the top; no two alike
+CAMERA = render.Camera(lens.Pinhole(8.0), 32, 32, 0.2, samples_per_pixel=4)
+
+
+def radiance_of(code):
+    """Of an 8-bit sRGB value, by IEC 61966-2-1."""
+    value = code / 255
+    linear = value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4
+    return 2 + 253 * linear
+
+
+def seen(scene, point, eye=(0.0, -2.5, 0.0)):
+    """Radiance of one ray from the eye to a point."""
+    from codesign.backend import arrays
+
+    arr = arrays("cpu", torch.float32)
+    origin = torch.tensor([eye], dtype=torch.float64)
+    direction = torch.nn.functional.normalize(torch.tensor([point], dtype=torch.float64) - origin, dim=1)
+    ray = [arr.Array3(*[arr.Float(v.float()) for v in part.unbind(1)]) for part in (origin, direction)]
+    return float(scene.radiance(arr, *ray).numpy()[0])
+
+
+def write_obj(folder, vertices, faces, name="q.obj", kd="1 1 1", picture="p.png"):
+    """A square or another mesh with texture coordinates 0, 0; 1, 0; 1, 1; 0, 1 at its first four corners."""
+    PIL.Image.fromarray(PICTURE).save(folder / "p.png")
+    map_kd = f"map_Kd {picture}\n" if picture else ""
+    (folder / "q.mtl").write_text(f"newmtl m\nKd {kd}\n{map_kd}")
+    (folder / name).write_text(
+        "mtllib q.mtl\n"
+        + "".join(f"v {x} {y} {z}\n" for x, y, z in vertices)
+        + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl m\n"
+        + "".join("f " + " ".join(f"{i}/{i}" for i in face) + "\n" for face in faces)
+    )
+    return folder / name
+
+
+UPRIGHT = [(-1, 0, -1), (1, 0, -1), (1, 0, 1), (-1, 0, 1)]  # z up, facing -y
+SQUARE = [(1, 2, 3, 4)]
+CORNERS = {(-0.5, 0, 0.5): 0, (0.5, 0, 0.5): 64, (-0.5, 0, -0.5): 128, (0.5, 0, -0.5): 255}  # texel centres
+
+
+def write_gltf(folder, kind, sampler=None, uv=((0, 1), (1, 1), (1, 0), (0, 0)), **changes):
+    """The upright square in glTF's axes (y up, towards +z), v down, with a node that moves it 0.5 m up."""
+    blob = np.array([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], dtype="<f4").tobytes()
+    blob += np.array(uv, dtype="<f4").tobytes() + np.array([0, 1, 2, 0, 2, 3], dtype="<u2").tobytes()
+    PIL.Image.fromarray(PICTURE).save(folder / "p.png")
+    tree = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"translation": [0, 0.5, 0], "children": [1]}, {"mesh": 0}],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 0, "TEXCOORD_0": 1}, "indices": 2, "material": 0}]}
+        ],
+        "materials": [
+            {
+                "pbrMetallicRoughness": {
+                    "baseColorTexture": {"index": 0},
+                    "baseColorFactor": [0.5, 0.5, 0.5, 1],
+                }
+            }
+        ],
+        "textures": [{"source": 0, **({} if sampler is None else {"sampler": 0})}],
+        "samplers": [sampler or {}],
+        "images": [{"uri": "p.png"}],
+        "buffers": [{"byteLength": len(blob), "uri": "data:;base64," + base64.b64encode(blob).decode()}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": 48},
+            {"buffer": 0, "byteOffset": 48, "byteLength": 32},
+            {"buffer": 0, "byteOffset": 80, "byteLength": 12},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5126, "count": 4, "type": "VEC2"},
+            {"bufferView": 2, "componentType": 5123, "count": 6, "type": "SCALAR"},
+        ],
+        **changes,
+    }
+    path = folder / f"q.{kind}"
+    if kind == "gltf":
+        path.write_text(json.dumps(tree))
+        return path
+    del tree["buffers"][0]["uri"]
+    picture = (folder / "p.png").read_bytes()
+    tree["images"] = [{"bufferView": 3, "mimeType": "image/png"}]
+    tree["bufferViews"].append({"buffer": 0, "byteOffset": 92, "byteLength": len(picture)})
+    blob += picture
+    tree["buffers"][0]["byteLength"] = len(blob)
+    chunks = b""
+    for tag, data, pad in ((b"JSON", json.dumps(tree).encode(), b" "), (b"BIN\0", blob, b"\0")):
+        data += pad * (-len(data) % 4)
+        chunks += len(data).to_bytes(4, "little") + tag + data
+    path.write_bytes(b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks)
+    return path
+
+
+def test_the_corners_of_a_picture_on_an_obj_are_read_back(tmp_path):
+    scene = worlds.from_mesh(write_obj(tmp_path, UPRIGHT, SQUARE, kd="0.25 0.5 0.75"))
+    factor = 0.2126 * 0.25 + 0.7152 * 0.5 + 0.0722 * 0.75  # BT.709, of linear values
+    for point, code in CORNERS.items():
+        # a 32-bit float ray falls within 1e-6 of the texel's middle
+        assert seen(scene, point) == pytest.approx(2 + factor * (radiance_of(code) - 2), rel=1e-5)
+    # from behind the sheet too
+    assert seen(scene, (0.5, 0, -0.5), (0, 2.5, 0)) == pytest.approx(2 + factor * 253, rel=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["gltf", "glb"])
+def test_the_corners_of_a_picture_on_a_gltf_are_read_back(tmp_path, kind):
+    scene = worlds.from_mesh(write_gltf(tmp_path, kind))
+    for (x, y, z), code in CORNERS.items():
+        at = (x, y, z + 0.5)  # the node's translation, y up in the file
+        assert seen(scene, at) == pytest.approx(2 + 0.5 * (radiance_of(code) - 2), rel=1e-5)
+
+
+@pytest.mark.parametrize(("wrap", "expected"), [(None, 0), (10497, 0), (33071, 64), (33648, 64)])
+def test_a_picture_goes_on_as_its_sampler_says(tmp_path, wrap, expected):
+    sampler = None if wrap is None else {"wrapS": wrap, "wrapT": wrap}
+    twice = ((0, 1), (2, 1), (2, 0), (0, 0))  # two pictures side by side
+    scene = worlds.from_mesh(write_gltf(tmp_path, "gltf", sampler, twice))
+    # u = 1.25, the middle of the second picture's first column, in the upper row
+    assert seen(scene, (0.25, 0, 1.0)) == pytest.approx(2 + 0.5 * (radiance_of(expected) - 2), rel=1e-4)
+
+
+def test_axes_and_units(tmp_path):
+    path = write_obj(tmp_path, [(0, 0, 0), (1, 0, 0), (1, 2, 0), (0, 2, 3)], SQUARE)
+    given = {up: mesh_files.read(path, 0.01, up)[0].vertices_m for up in "xyz"}
+    np.testing.assert_allclose(given["z"][3], [0, 0.02, 0.03])
+    np.testing.assert_allclose(given["y"][3], [0, -0.03, 0.02])  # y up, z towards the viewer, who is at -y
+    np.testing.assert_allclose(given["x"][1], [0, 0, 0.01])
+    for axes in mesh_files.AXES.values():
+        assert np.linalg.det(axes) == 1  # turned, never mirrored
+
+
+def dae(folder, unit, up):
+    """A tetrahedron of 1, 1 and 2 units, red 0.5."""
+    path = folder / "t.dae"
+    path.write_text(f"""<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><created>2020-01-01T00:00:00</created><modified>2020-01-01T00:00:00</modified>
+<unit name="u" meter="{unit}"/><up_axis>{up}</up_axis></asset>
+<library_effects><effect id="e"><profile_COMMON><technique sid="c"><lambert><diffuse><color>1 0 0 1</color></diffuse>
+</lambert></technique></profile_COMMON></effect></library_effects>
+<library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="a" count="12">0 0 0 1 0 0 0 1 0 0 0 2</float_array><technique_common>
+<accessor source="#a" count="4" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="4" material="s"><input semantic="VERTEX" source="#v" offset="0"/>
+<p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles></mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="w"><node><instance_geometry url="#g"><bind_material><technique_common>
+<instance_material symbol="s" target="#m"/></technique_common></bind_material></instance_geometry></node>
+</visual_scene></library_visual_scenes><scene><instance_visual_scene url="#w"/></scene></COLLADA>""")
+    return path
+
+
+def test_a_dae_says_its_unit_and_its_axis(tmp_path):
+    [part] = mesh_files.read(dae(tmp_path, 0.01, "Z_UP"))
+    np.testing.assert_allclose(part.vertices_m.max(0), [0.01, 0.01, 0.02])
+    np.testing.assert_allclose(part.colour, 0.2126, rtol=1e-6)  # red of BT.709
+    assert len(part.vertices_m) == 4  # one vertex for each place
+    [part] = mesh_files.read(dae(tmp_path, 1, "Y_UP"))
+    np.testing.assert_allclose([part.vertices_m.min(0), part.vertices_m.max(0)], [[0, -2, 0], [1, 0, 1]])
+    [part] = mesh_files.read(tmp_path / "t.dae", 2.0, "z")
+    np.testing.assert_allclose(part.vertices_m.max(0), [2, 2, 4])
+
+
+def write_ply(path, per_vertex="", per_face="", vertices=UPRIGHT, faces=((0, 1, 2), (0, 2, 3)), colours=()):
+    names = ("red", "green", "blue")
+    rgb = "".join(f"property uchar {name}\n" for name in names)
+    path.write_text(
+        f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\nproperty float x\nproperty float y\n"
+        f"property float z\n{rgb if per_vertex else ''}element face {len(faces)}\n"
+        f"property list uchar int vertex_indices\n{rgb if per_face else ''}end_header\n"
+        + "".join(
+            f"{x} {y} {z}{f' {c} {c} {c}' if per_vertex else ''}\n"
+            for (x, y, z), c in zip(vertices, [*colours, *[0] * 9], strict=False)
+        )
+        + "".join(
+            f"3 {a} {b} {c}{f' {g} {g} {g}' if per_face else ''}\n"
+            for (a, b, c), g in zip(faces, [*colours, *[0] * 9], strict=False)
+        )
+    )
+    return path
+
+
+def test_colours_of_faces_and_vertices_are_shown_in_the_light_of_a_plain_sky(tmp_path):
+    # the upright square faces -y: its sky share, by the constants of scenes.bodies
+    share = 0.6 * 0.6 + 0.4 * 0.5 / np.sqrt(0.3**2 + 0.5**2 + 0.81**2)
+    path = write_ply(tmp_path / "f.ply", per_face=True, colours=(200, 40))
+    scene = worlds.from_mesh(path)
+    assert seen(scene, (0.5, 0, -0.5)) == pytest.approx(share * radiance_of(200), rel=1e-5)
+    assert seen(scene, (-0.5, 0, 0.5)) == pytest.approx(share * radiance_of(40), rel=1e-5)
+    scene = worlds.from_mesh(write_ply(tmp_path / "v.ply", per_vertex=True, colours=(255, 0, 0, 0)))
+    # barycentric: a quarter along the diagonal from the bright corner
+    expected = 0.75 * radiance_of(255) + 0.25 * radiance_of(0)
+    assert seen(scene, (-0.5, 0, -0.5)) == pytest.approx(share * expected, rel=1e-4)
+    scene = worlds.from_mesh(path, radiance=100.0)
+    assert seen(scene, (0.5, 0, -0.5)) == pytest.approx(share * 100, rel=1e-5)
+
+
+def cube(folder, kind, size=0.5):
+    """A cube whose three lower coordinates are 0, facing outwards, written by hand as .obj or by trimesh."""
+    import trimesh
+
+    mesh = trimesh.creation.box(extents=[size] * 3)
+    mesh.apply_translation([size / 2] * 3)
+    mesh.export(folder / f"c.{kind}")
+    return folder / f"c.{kind}"
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply", "stl", "dae", "glb"])
+def test_volume_and_area_of_a_cube_in_every_format(tmp_path, kind):
+    options = {"up": "z"} if kind in ("dae", "glb") else {}
+    [part] = mesh_files.read(cube(tmp_path, kind), 0.1, **options)
+    corners = part.vertices_m[part.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    # outwards: the divergence theorem gives a positive volume
+    assert np.einsum("ij,ij->", corners[:, 0], across) / 6 == pytest.approx(0.05**3, rel=1e-6)
+    assert np.linalg.norm(across, axis=1).sum() / 2 == pytest.approx(6 * 0.05**2, rel=1e-6)
+
+
+def test_a_mirrored_node_keeps_its_outside_outside(tmp_path):
+    nodes = [{"scale": [-1, 1, 1], "children": [1]}, {"mesh": 0}]
+    [part] = mesh_files.read(write_gltf(tmp_path, "gltf", nodes=nodes))
+    corners = part.vertices_m[part.faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (normal[:, 1] < 0).all()  # towards the viewer, as before
+
+
+def test_the_silhouette_gradient_of_a_loaded_mesh_against_differences(tmp_path):
+    scene = worlds.from_mesh(cube(tmp_path, "obj"), background=30.0)
+    camera = render.Camera(lens.Pinhole(8.0), 24, 24, 0.3, samples_per_pixel=256)
+    pose = look_at((0.6, -1.4, 0.7), (0.25, 0.25, 0.25))
+    weight = torch.linspace(0.2, 1.4, 24, dtype=torch.float64)[:, None] * torch.linspace(1.3, 0.1, 24)
+
+    def loss(twist, gradient="interior"):
+        return (
+            render.frames(camera, scene, (pose @ se3_exp(twist))[None], gradient=gradient)[0] * weight
+        ).mean()
+
+    twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    loss(twist, "boundary").backward()
+    found = twist.grad
+    step = 0.01
+    with torch.no_grad():
+        expected = torch.stack([loss(step * e) - loss(-step * e) for e in torch.eye(6).double()]) / (2 * step)
+    # 256 samples per pixel over some 60 px of outline: a few per cent of noise; leaving it out loses nearly all,
+    # since faces of one radiance have no gradient inside
+    assert float((found - expected).norm() / expected.norm()) < 0.05
+    twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    loss(twist).backward()
+    assert float(twist.grad.norm()) < 0.01 * float(expected.norm())
+
+
+def test_lit_levels_of_a_mesh_agree_on_a_white_furnace(tmp_path):
+    """Under an even sky a convex body of albedo a sends a times the sky's radiance, whichever way it is computed."""
+    path = write_ply(tmp_path / "f.ply", per_face=True, colours=(255, 188))
+    levels = (partial(build.path, samples=30000), partial(build.baked, samples=4000))
+    for level in levels:
+        scene = worlds.from_mesh(path, light=level, background=100.0)
+        for point, code in (((0.5, 0, -0.5), 255), ((-0.5, 0, 0.5), 188)):
+            # half the energy of a path is noise of choosing light or surface: 0.5 / sqrt(30000) = 0.3 %
+            assert seen(scene, point) == pytest.approx(100 * 0.95 * radiance_of(code) / 255, rel=0.01)
+    under_the_sun = worlds.from_mesh(path, light="path")
+    assert seen(under_the_sun, (0.5, 0, -0.5)) > seen(under_the_sun, (0.5, 0, -0.5), (0, 2.5, 0)) > 10
+
+
+def test_files_that_are_no_whole_meshes_are_refused(tmp_path):
+    cases = {
+        "nowhere.obj": (None, "is not a file"),
+        "a.step": ("x", "ends in '.step'"),
+        "empty.ply": ("", "is empty"),
+        "nan.obj": ("v 0 0 0\nv 1 0 nan\nv 0 1 0\nf 1 2 3\n", "not all finite"),
+        "high.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "cannot be read|asks for vertex"),
+        "zero.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "index 0"),
+        "back.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n", "index -3"),
+        "points.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
+        "line.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no faces"),
+        "text.stl": (
+            "solid t\nfacet\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 x 0\nendsolid t\n",
+            "cannot be read as STL",
+        ),
+        "cut.stl": ("solid t\nfacet\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n", "no faces"),
+        "large.ply": ("ply\nformat ascii 1.0\nelement face 10000000\n", "10,000,000 faces, more than"),
+        "short.stl": (bytes(80) + (9).to_bytes(4, "little") + bytes(50), "no faces"),
+        "other.dae": ("<xml/>", "cannot be read as DAE"),
+        "half.dae": ("<COLLADA>", "cannot be read as DAE"),
+        "other.gltf": ("{}", "cannot be read as glTF"),
+        "one.gltf": ('{"asset": {"version": "1.0"}}', "version 1.0"),
+        "other.glb": (b"glTF" + bytes(30), "cannot be read as glTF"),
+        "short.ply": (
+            "ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\nend_header\n1\n",
+            "read as PLY|no faces",
+        ),
+    }
+    for name, (content, sentence) in cases.items():
+        path = tmp_path / name
+        if content is not None:
+            path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        with pytest.raises(FileFormatError, match=sentence) as told:
+            mesh_files.read(path)
+        assert name in str(told.value)
+        assert "\n" not in str(told.value)
+    with pytest.raises(FileFormatError, match="asks for vertex 7 of 4"):
+        mesh_files.read(write_ply(tmp_path / "index.ply", faces=((0, 1, 7),)))
+
+
+@pytest.mark.parametrize(
+    ("picture", "sentence"),
+    [
+        ("lost.png", "'lost.png' is missing"),
+        ("../secret.png", "lies outside"),
+        ("/etc/passwd", "lies outside"),
+        ("http://127.0.0.1:9/p.png", "lies on a network"),
+        ("q.mtl.png", "is not a readable picture"),
+    ],
+)
+def test_pictures_that_cannot_be_had_are_named(tmp_path, picture, sentence):
+    PIL.Image.fromarray(PICTURE).save(tmp_path / "secret.png")
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "q.mtl.png").write_text("no picture")
+    path = write_obj(tmp_path / "in", UPRIGHT, SQUARE, picture=picture)
+    with pytest.raises(FileFormatError, match=sentence) as told:
+        worlds.from_mesh(path)
+    assert str(path) in str(told.value)
+    assert worlds.from_mesh(path, radiance=50.0).scene.shapes()  # nothing else is asked for
+    changed = write_gltf(tmp_path / "in", "gltf", images=[{"uri": picture}])
+    with pytest.raises(FileFormatError, match=sentence if "mtl" not in picture else "cannot be read"):
+        worlds.from_mesh(changed)
+
+
+def test_a_wider_folder_is_named_by_root(tmp_path):
+    PIL.Image.fromarray(PICTURE).save(tmp_path / "wall.png")
+    (tmp_path / "meshes").mkdir()
+    path = write_obj(tmp_path / "meshes", UPRIGHT, SQUARE, picture="../wall.png")
+    assert seen(worlds.from_mesh(path, root=tmp_path), (0.5, 0, -0.5)) == pytest.approx(255, rel=1e-5)
+
+
+def test_gltf_that_would_be_read_in_part_is_refused(tmp_path):
+    def refused(sentence, **changes):
+        with pytest.raises(FileFormatError, match=sentence):
+            mesh_files.read(write_gltf(tmp_path, "gltf", **changes))
+
+    refused("KHR_draco_mesh_compression", extensionsRequired=["KHR_draco_mesh_compression"])
+    refused("KHR_texture_transform", extensionsUsed=["KHR_texture_transform"])
+    refused("lies on a network", buffers=[{"byteLength": 92, "uri": "https://127.0.0.1:9/a.bin"}])
+    refused("'a.bin' is missing", buffers=[{"byteLength": 92, "uri": "a.bin"}])
+    second = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1}}}
+    refused("TEXCOORD_1", materials=[second])
+    refused("one way along u", samplers=[{"wrapS": 33071}], textures=[{"source": 0, "sampler": 0}])
+
+
+def test_arguments_that_cannot_be_are_refused(tmp_path):
+    path = write_obj(tmp_path, UPRIGHT, SQUARE)
+    for options, sentence in (
+        ({"unit_m": 0}, "unit_m = 0"),
+        ({"unit_m": float("nan")}, "unit_m = nan"),
+        ({"up": "w"}, "up = 'w'"),
+        ({"light": "glossy"}, "light = 'glossy'"),
+        ({"radiance": -1.0}, "radiance = -1"),
+        ({"texture_px": 0}, "texture_px = 0"),
+        ({"background": -1.0}, "background = -1"),
+    ):
+        with pytest.raises(DomainError, match=sentence):
+            worlds.from_mesh(path, **options)
+
+
+def test_a_file_in_centimetres_gets_a_hint(tmp_path):
+    wide = [(400 * x, y, 260 * z) for x, y, z in UPRIGHT]
+    with pytest.warns(UserWarning, match=r"800 m wide.*unit_m=0.01"):
+        worlds.from_mesh(write_obj(tmp_path, wide, SQUARE))
+
+
+def test_pictures_are_textures_in_one_line(tmp_path):
+    PIL.Image.fromarray(np.full((16, 16), 188, dtype=np.uint8)).save(tmp_path / "grey.png")
+    scene = worlds.wall(tmp_path / "grey.png")
+    assert seen(scene, (0.3, 0, 0.2)) == pytest.approx(radiance_of(188), rel=1e-5)
+    from codesign import backend
+
+    mi = backend.mitsuba()
+    values = np.ones((8, 16, 3), dtype=np.float32)
+    values[:, 8:] = 3
+    for kind in ("exr", "hdr"):
+        mi.Bitmap(values).write(str(tmp_path / f"a.{kind}"))
+        picture = textures.photo(tmp_path / f"a.{kind}")
+        np.testing.assert_allclose(picture[:, [0, 15]], [[40.0, 120.0]] * 8, rtol=1e-5)  # mean 80
+
+
+def test_a_frame_of_a_video_is_found_by_its_time(tmp_path):
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    writer = imageio_ffmpeg.write_frames(str(tmp_path / "a.mp4"), (32, 32), fps=10, macro_block_size=16)
+    writer.send(None)
+    for level in (0, 128, 255):
+        writer.send(np.full((32, 32, 3), level, dtype=np.uint8))
+    writer.close()
+    for time_s, level in ((0.0, 0), (0.15, 128), (0.2, 255)):
+        picture = textures.video_frame(tmp_path / "a.mp4", time_s)
+        # H.264 keeps an even grey within a few of 255 levels
+        assert abs(float(picture.mean()) - radiance_of(level)) < 6
+    with pytest.raises(DomainError, match="lies outside the video"):
+        textures.video_frame(tmp_path / "a.mp4", 0.5)
+
+
+def test_real_robot_bodies_are_read(shared):
+    [part] = mesh_files.read(shared("data/robot_meshes/jackal/jackal-wheel.stl"))
+    assert len(part.vertices_m) < len(part.faces)  # merged: a closed surface has about half as many
+    parts = mesh_files.read(shared("data/robot_meshes/crazyflie/cf2_assembly_with_props.dae"))
+    size = np.ptp(np.concatenate([part.vertices_m for part in parts]), axis=0)
+    assert 0.05 < size.max() < 0.3  # a quadrotor of a hand's width
+    assert bodies.read(shared("data/robot_meshes/crazyflie/cf2_assembly.stl"), 1.0).faces.shape[1] == 3
