@@ -9,6 +9,7 @@ bilinear texels have kinks and gradients, though right, are as rough as the grai
 """
 
 import math
+from pathlib import Path
 
 import numpy as np
 
@@ -60,7 +61,8 @@ def ground(texture, texel_m=0.004, half_width_m=12.0, device="cpu"):
 
 
 def _plane(name, texture, texel_m, half_width_m, towards, up, wrap, device):
-    texture = textures.picture(texture)
+    named = isinstance(texture, str | Path)
+    texture = textures.picture(texture) if named else textures.check_texture(texture, "of the scene")
     repeat = (
         2 * half_width_m / (texel_m * texture.shape[1]),
         2 * half_width_m / (texel_m * texture.shape[0]),
