@@ -9,7 +9,7 @@ cannot give whole is refused in a sentence.
 import re
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,7 @@ class Part:
     name: of the mesh in its file. vertices_m: [V, 3]; faces: [F, 3]. colour: linear luminance 0..1 (white is
     1) as a picture [H, W] (first row at the top, looked up at ``uv`` [V, 2], v up), as one number per face [F]
     where ``uv`` is None, or per vertex [V] where ``smooth``. wrap: how the picture goes on beside the unit square.
+    coloured: whether the file says a colour.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Part:
     uv: np.ndarray | None = None
     smooth: bool = False
     wrap: str = "repeat"
+    coloured: bool = True
 
 
 def read(
@@ -259,7 +261,7 @@ def _coloured(path, name, vertices, faces, visual, surfaces, materials):
             uv = np.asarray(uv, dtype=np.float64)
             yield _merged(Part(name, vertices, faces, picture, uv, wrap=surface.wrap))
     else:
-        yield _merged(Part(name, vertices, faces, plain))
+        yield _merged(Part(name, vertices, faces, plain, coloured=False))
 
 
 def _vertex_colour(values, is_linear):
@@ -297,13 +299,10 @@ def _merged(part):
     _, first, index = np.unique(
         rows.view([("", rows.dtype)] * rows.shape[1]).reshape(-1), return_index=True, return_inverse=True
     )
-    faces = index.reshape(-1)[part.faces]
-    return Part(
-        part.name,
-        part.vertices_m[first],
-        faces,
-        part.colour[first] if part.smooth else part.colour,
-        None if part.uv is None else part.uv[first],
-        part.smooth,
-        part.wrap,
+    return replace(
+        part,
+        vertices_m=part.vertices_m[first],
+        faces=index.reshape(-1)[part.faces],
+        colour=part.colour[first] if part.smooth else part.colour,
+        uv=None if part.uv is None else part.uv[first],
     )

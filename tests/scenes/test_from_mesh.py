@@ -3,6 +3,7 @@
 import base64
 import json
 from functools import partial
+from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -180,7 +181,9 @@ def test_a_dae_says_its_unit_and_its_axis(tmp_path):
     np.testing.assert_allclose(part.vertices_m.max(0), [2, 2, 4])
 
 
-def write_ply(path, per_vertex="", per_face="", vertices=UPRIGHT, faces=((0, 1, 2), (0, 2, 3)), colours=()):
+def write_ply(
+    path, per_vertex=False, per_face=False, vertices=UPRIGHT, faces=((0, 1, 2), (0, 2, 3)), colours=()
+):
     names = ("red", "green", "blue")
     rgb = "".join(f"property uchar {name}\n" for name in names)
     path.write_text(
@@ -226,8 +229,8 @@ def cube(folder, kind, size=0.5):
 
 @pytest.mark.parametrize("kind", ["obj", "ply", "stl", "dae", "glb"])
 def test_volume_and_area_of_a_cube_in_every_format(tmp_path, kind):
-    options = {"up": "z"} if kind in ("dae", "glb") else {}
-    [part] = mesh_files.read(cube(tmp_path, kind), 0.1, **options)
+    up = "z" if kind in ("dae", "glb") else None
+    [part] = mesh_files.read(cube(tmp_path, kind), 0.1, up)
     corners = part.vertices_m[part.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     # outwards: the divergence theorem gives a positive volume
@@ -249,7 +252,7 @@ def test_the_silhouette_gradient_of_a_loaded_mesh_against_differences(tmp_path):
     pose = look_at((0.6, -1.4, 0.7), (0.25, 0.25, 0.25))
     weight = torch.linspace(0.2, 1.4, 24, dtype=torch.float64)[:, None] * torch.linspace(1.3, 0.1, 24)
 
-    def loss(twist, gradient="interior"):
+    def loss(twist, gradient: Any = "interior"):
         return (
             render.frames(camera, scene, (pose @ se3_exp(twist))[None], gradient=gradient)[0] * weight
         ).mean()
@@ -368,7 +371,7 @@ def test_gltf_that_would_be_read_in_part_is_refused(tmp_path):
 
 def test_arguments_that_cannot_be_are_refused(tmp_path):
     path = write_obj(tmp_path, UPRIGHT, SQUARE)
-    for options, sentence in (
+    cases: list[tuple[dict[str, Any], str]] = [
         ({"unit_m": 0}, "unit_m = 0"),
         ({"unit_m": float("nan")}, "unit_m = nan"),
         ({"up": "w"}, "up = 'w'"),
@@ -376,7 +379,8 @@ def test_arguments_that_cannot_be_are_refused(tmp_path):
         ({"radiance": -1.0}, "radiance = -1"),
         ({"texture_px": 0}, "texture_px = 0"),
         ({"background": -1.0}, "background = -1"),
-    ):
+    ]
+    for options, sentence in cases:
         with pytest.raises(DomainError, match=sentence):
             worlds.from_mesh(path, **options)
 
