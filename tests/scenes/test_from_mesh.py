@@ -260,6 +260,7 @@ def test_the_silhouette_gradient_of_a_loaded_mesh_against_differences(tmp_path):
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     loss(twist, "boundary").backward()
     found = twist.grad
+    assert found is not None
     step = 0.01
     with torch.no_grad():
         expected = torch.stack([loss(step * e) - loss(-step * e) for e in torch.eye(6).double()]) / (2 * step)
@@ -268,6 +269,7 @@ def test_the_silhouette_gradient_of_a_loaded_mesh_against_differences(tmp_path):
     assert float((found - expected).norm() / expected.norm()) < 0.05
     twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     loss(twist).backward()
+    assert twist.grad is not None
     assert float(twist.grad.norm()) < 0.01 * float(expected.norm())
 
 
