@@ -22,7 +22,15 @@ GROUPS = {
         "lens_bench",
         "benchmark",
     ),
-    "render": ("render_truth", "render_quality", "psf_level", "silhouettes", "light_levels", "make_dataset"),
+    "render": (
+        "render_truth",
+        "render_quality",
+        "psf_level",
+        "silhouettes",
+        "light_levels",
+        "robot_view",
+        "make_dataset",
+    ),
     "events": (
         "video_to_events",
         "upsampling",
