@@ -1,0 +1,175 @@
+"""Worlds in which gradients at silhouettes once were wrong without a word, one by one: each a scene and where the
+camera stands. Radiances are constant or smooth, so that the silhouettes are what is tested."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codesign import backend, pose
+from codesign.render import MitsubaScene
+from codesign.render.charts import emissive_mesh
+from scenes.random_shapes import frame, icosphere
+
+RADIUS_M = 0.01  # of the cylinders that are seen from afar
+
+
+@dataclass(frozen=True)
+class World:
+    """scene: what is seen. T_world_cam: [4, 4]. nearest_m: how far away its things are. focus_m, lens_scale: of a
+    lens with an aperture; over one of 11 mm at f/5. narrow: how much less than the usual field the film takes
+    in."""
+
+    scene: MitsubaScene
+    T_world_cam: Tensor
+    nearest_m: float
+    focus_m: float = 2.0
+    lens_scale: float = 1.0
+    narrow: float = 1.0
+    kinds: tuple[str, ...] = ("pinhole", "traced")
+
+
+def _light(value):
+    return {"type": "area", "radiance": {"type": "rgb", "value": float(value)}}
+
+
+def _ahead(roll=0.3):
+    """A camera at the origin that looks along +y, rolled by some radians."""
+    turn = torch.tensor([0, 0, 0, 0, 0, roll], dtype=torch.float64)
+    return pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)) @ pose.se3_exp(turn)
+
+
+def _wall(mi, distance_m, emitter):
+    placed = frame([0.15, -1.0, 0.1], (0, distance_m, 0), 0.4)
+    matrix = mi.ScalarTransform4f(placed @ np.diag([2 * distance_m, 2 * distance_m, 1, 1]))
+    return {"type": "rectangle", "to_world": matrix, "emitter": emitter}
+
+
+def poles() -> World:
+    """Five poles 5 to 8 mm thick, 1 m away, with their ends in view."""
+    mi = backend.mitsuba("cpu")
+    shapes: dict[str, Any] = {"wall": _wall(mi, 2.5, _light(120))}
+    for k in range(5):
+        x = -0.22 + 0.11 * k
+        shapes[f"pole{k}"] = {
+            "type": "cylinder",
+            "p0": [x - 0.03, 1.0 + 0.02 * k, -0.16 + 0.02 * k],
+            "p1": [x + 0.05, 1.05, 0.15 + 0.01 * k],
+            "radius": 0.0025 + 0.0004 * k,
+            "emitter": _light(20 + 45 * k),
+        }
+    return World(MitsubaScene(shapes), _ahead(), 1.0)
+
+
+def far_pole(ratio: float) -> World:
+    """A cylinder seen from ``ratio`` times its radius, its ends out of view, through a film that is narrower where
+    it is further."""
+    mi = backend.mitsuba("cpu")
+    distance = ratio * RADIUS_M
+    half = 0.5 * distance
+    shapes = {
+        "wall": _wall(mi, 1.5 * distance, _light(40)),
+        "pole": {
+            "type": "cylinder",
+            "p0": [-0.17 * half, distance, -half],
+            "p1": [0.17 * half, distance, half],
+            "radius": RADIUS_M,
+            "emitter": _light(200),
+        },
+    }
+    narrow = min(1.0, 20.0 / ratio)
+    return World(
+        MitsubaScene(shapes), _ahead(), distance, focus_m=distance, narrow=narrow, kinds=("pinhole",)
+    )
+
+
+def facets() -> World:
+    """A ball of 5,120 faces with one radiance per face, as bodies and baked meshes have."""
+    mi = backend.mitsuba("cpu")
+    vertices, faces = icosphere(4)
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    light = 30 + 180 * np.maximum(across @ np.array([0.5, -0.6, 0.6]), 0)
+    ball = emissive_mesh(mi, 0.3 * vertices + [0.05, 1.2, 0.02], faces, light)
+    return World(MitsubaScene({"wall": _wall(mi, 2.5, _light(120)), "ball": ball}), _ahead(), 0.9)
+
+
+def t_junction() -> World:
+    """One edge of a floor against the lower edges of two walls."""
+    mi = backend.mitsuba("cpu")
+    T = mi.ScalarTransform4f
+    shapes = {
+        "floor": {
+            "type": "rectangle",
+            "to_world": T().translate([0, 1.0, -0.3]).scale([2, 1, 1]),
+            "emitter": _light(60),
+        }
+    }
+    for name, left, right, value in (("left", -2.0, 0.15, 150), ("right", 0.15, 2.0, 220)):
+        half = (right - left) / 2
+        place = T().translate([left + half, 2.0, 0.7]).rotate([1, 0, 0], 90).scale([half, 1, 1])
+        shapes[name] = {"type": "rectangle", "to_world": place, "emitter": _light(value)}
+    return World(MitsubaScene(shapes), _ahead(), 0.6)
+
+
+def _floor(mi):
+    T = mi.ScalarTransform4f
+    place = T().translate([0, 1.5, -0.3]).scale([3, 3, 1])
+    return {"type": "rectangle", "to_world": place, "emitter": _light(60)}
+
+
+def sphere_in_floor() -> World:
+    """A ball that sticks in a floor by half its radius."""
+    mi = backend.mitsuba("cpu")
+    ball = {"type": "sphere", "center": [0.03, 1.2, -0.2], "radius": 0.2, "emitter": _light(200)}
+    return World(MitsubaScene({"floor": _floor(mi), "ball": ball}), _ahead(), 0.8)
+
+
+def cylinder_in_floor() -> World:
+    """A leaning cylinder that passes through a floor."""
+    mi = backend.mitsuba("cpu")
+    pole = {
+        "type": "cylinder",
+        "p0": [-0.05, 1.2, -0.5],
+        "p1": [0.15, 1.3, 0.15],
+        "radius": 0.08,
+        "emitter": _light(200),
+    }
+    return World(MitsubaScene({"floor": _floor(mi), "pole": pole}), _ahead(), 0.8)
+
+
+def crossing_mesh() -> World:
+    """Two balls of one mesh that pass through each other, each of one radiance."""
+    mi = backend.mitsuba("cpu")
+    vertices, faces = icosphere(3)
+    both = np.concatenate([0.2 * vertices + [-0.1, 1.2, 0], 0.16 * vertices + [0.12, 1.15, 0.05]])
+    joined = np.concatenate([faces, faces + len(vertices)])
+    light = np.repeat([60.0, 210.0], len(faces))
+    mesh = emissive_mesh(mi, both, joined, light)
+    return World(MitsubaScene({"wall": _wall(mi, 2.5, _light(120)), "mesh": mesh}), _ahead(), 1.0)
+
+
+def defocus() -> World:
+    """A card just beside the film's border, whose blur reaches far into it."""
+    mi = backend.mitsuba("cpu")
+    placed = frame([0.0, -1.0, 0.0], (0.155, 0.4, 0.02), 0.1) @ np.diag([0.1, 0.1, 1, 1])
+    card = {"type": "rectangle", "to_world": mi.ScalarTransform4f(placed), "emitter": _light(220)}
+    world = MitsubaScene({"wall": _wall(mi, 8.0, _light(60)), "card": card})
+    return World(world, _ahead(), 0.4, focus_m=8.0, lens_scale=15.0, narrow=0.3, kinds=("thin", "traced"))
+
+
+CASES: dict[str, Callable[[], World]] = {
+    "poles": poles,
+    **{f"far_pole_{ratio}": (lambda ratio=ratio: far_pole(ratio)) for ratio in (20, 100, 250, 500, 600)},
+    "facets": facets,
+    "t_junction": t_junction,
+    "sphere_in_floor": sphere_in_floor,
+    "cylinder_in_floor": cylinder_in_floor,
+    "crossing_mesh": crossing_mesh,
+    "defocus": defocus,
+}
+CROSSING = ("sphere_in_floor", "cylinder_in_floor", "crossing_mesh")  # where a refusal is an answer too

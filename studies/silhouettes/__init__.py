@@ -1,0 +1,3 @@
+from studies.silhouettes.task import STEPS, Task
+
+__all__ = ["STEPS", "Task"]

@@ -1,0 +1,216 @@
+"""Is the pose gradient of one frame right? Central differences with common random numbers are the judge, with
+their own noise known.
+
+The loss is a smooth weighting of the frame. A difference over a step is the mean of the derivative along it,
+whatever kinks lie on the way (an edge that passes from one row of pixels to the next, a thing that comes into
+view): the gradient that is judged is averaged over poses along the same step. What is left is noise of sampling,
+and both sides tell their standard error over seeds. More samples and seeds are taken until that is small enough,
+or the last round is done.
+"""
+
+import time
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from codesign import lens, pose, render
+from codesign.errors import DomainError
+from codesign.render.sequence import Way
+
+LENSES = ("pinhole", "thin", "traced")
+RIGHT, WRONG = 0.05, 0.10  # relative errors, beside the noise
+ENOUGH = 0.03  # noise at which no more samples are taken
+HIGHEST = 0.10  # noise above which nothing passes
+STEP_PX = 0.3  # motion of the nearest thing on the film, to either side
+COARSE = 7  # random numbers across the weighting of the pixels
+Verdict = Literal["right", "near", "wrong", "noisy", "doubtful", "refused", "empty"]
+
+
+@dataclass(frozen=True)
+class Effort:
+    """samples: per pixel of the differences; the gradient takes a quarter of them at each of so many poses along
+    every step. per_px: samples per pixel length of curve. seeds: of either side, more in every round for the side
+    that needs them."""
+
+    samples: int = 256
+    poses: int = 4
+    per_px: float = 8.0
+    seeds: tuple[int, ...] = (4, 12, 36)
+
+
+USUAL = Effort()
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene before a camera at T_world_cam [4, 4]; nearest_m: how near the nearest thing in view is."""
+
+    scene: Any
+    optics: Any
+    T_world_cam: Tensor
+    pitch_mm: float
+    width_px: int
+    nearest_m: float
+    seed: int = 0
+
+    def camera(self, samples: int, seed: int) -> render.Camera:
+        """The camera with so many samples per pixel."""
+        return render.Camera(self.optics, self.width_px, self.width_px, self.pitch_mm, samples, seed)
+
+    @property
+    def weight(self) -> Tensor:
+        """What the pixels count in the loss: [H, W], smooth and random."""
+        generator = torch.Generator().manual_seed(self.seed)
+        coarse = torch.randn(1, 1, COARSE, COARSE, generator=generator)
+        return torch.nn.functional.interpolate(coarse, size=(self.width_px,) * 2, mode="bicubic")[0, 0]
+
+    @property
+    def steps(self) -> Tensor:
+        """Of the six components [6], metres and radians: STEP_PX of motion on the film each, to either side."""
+        turn = STEP_PX * self.camera(1, 0).slope_per_px()
+        return torch.tensor([turn * self.nearest_m] * 3 + [turn] * 3, dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What was found about one case. error: relative L2 over the six components, each in units of its own step;
+    noise: of both sides together, noise_of_gradient: of what is judged; interior: error where silhouettes are left
+    out; truth, found: [6]; seeds: of differences and of the gradient."""
+
+    verdict: Verdict
+    error: float | None = None
+    noise: float | None = None
+    noise_of_gradient: float | None = None
+    interior: float | None = None
+    sentence: str = ""
+    truth: list[float] = field(default_factory=list)
+    found: list[float] = field(default_factory=list)
+    seeds: tuple[int, int] = (0, 0)
+    cpu_s: float = 0.0
+
+    def row(self) -> dict[str, Any]:
+        """Plain values for a raw table."""
+        return asdict(self)
+
+
+def optics_of(kind: str, scale: float = 1.0, focus_m: float = 2.0) -> Any:
+    """One of LENSES of 11 mm times ``scale``, at f/5 where it has an aperture, focused at a distance."""
+    if kind == "pinhole":
+        return lens.Pinhole(11.0 * scale)
+    if kind == "thin":
+        return lens.ThinLens(11.0 * scale, 2.2 * scale).focus_at(focus_m)
+    return lens.load("cooke-triplet").scaled(0.22 * scale).focus_at(focus_m).freeze()
+
+
+def judge(case: Case, way: Way = "boundary", effort: Effort = USUAL) -> Judged:
+    """The verdict on one way to the pose gradient: right within RIGHT + 2 x noise, wrong beyond WRONG + noise, near
+    between the two, noisy where that of the gradient stays above HIGHEST, doubtful where that of the differences
+    does, refused with the sentence, empty where nothing
+    in view changes."""
+    began = time.process_time()
+    plain = gradient(case, effort, 0, "interior")
+    truth = torch.zeros(0, 6, dtype=torch.float64)
+    got = truth
+    found = Judged("empty")
+    for seeds in effort.seeds:
+        if _share(got, truth) > ENOUGH / 2**0.5:
+            try:
+                more = [gradient(case, effort, k, way) for k in range(len(got), seeds)]
+            except DomainError as error:
+                return Judged("refused", sentence=str(error), cpu_s=time.process_time() - began)
+            got = torch.cat([got, torch.stack(more)])
+        if _share(truth, truth) > ENOUGH / 2**0.5:
+            more = [differences(case, effort, 1000 + k) for k in range(len(truth), seeds)]
+            truth = torch.cat([truth, torch.stack(more)])
+        found = compared(truth, got, plain, time.process_time() - began)
+        if found.noise is None or found.noise < ENOUGH:
+            break
+    return found
+
+
+def compared(truth: Tensor, got: Tensor, plain: Tensor, cpu_s: float = 0.0) -> Judged:
+    """Judged out of differences [seeds, 6], the gradient [seeds, 6] and the interior one [6], all in units of the
+    steps."""
+    if float(truth.abs().max()) < 1e-9 and float(got.abs().max()) < 1e-9:
+        return Judged("empty", cpu_s=cpu_s)
+    mean = truth.mean(0)
+    size = max(float(mean.norm()), 1e-30)
+    error = float((got.mean(0) - mean).norm()) / size
+    noise = float((_spread(truth).square() + _spread(got).square()).sum().sqrt()) / size
+    return Judged(
+        verdict(error, noise, _share(got, truth)),
+        error,
+        noise,
+        _share(got, truth),
+        float((plain - mean).norm()) / size,
+        "",
+        mean.tolist(),
+        got.mean(0).tolist(),
+        (len(truth), len(got)),
+        cpu_s,
+    )
+
+
+def _spread(estimates):
+    return estimates.std(0) / estimates.shape[0] ** 0.5
+
+
+def _share(estimates, truth):
+    """Standard error of the mean of estimates [seeds, 6] over the size of the truth's; infinite without any."""
+    if not len(estimates) or not len(truth):
+        return float("inf")
+    return float(_spread(estimates).norm() / truth.mean(0).norm().clamp_min(1e-30))
+
+
+def verdict(error: float, noise: float, noise_of_gradient: float) -> Verdict:
+    """What an error means beside its noise."""
+    if noise > HIGHEST:
+        if error > WRONG + 3 * noise:
+            return "wrong"
+        return "noisy" if noise_of_gradient > HIGHEST else "doubtful"
+    if error <= RIGHT + 2 * noise:
+        return "right"
+    return "wrong" if error > WRONG + noise else "near"
+
+
+def differences(case: Case, effort: Effort, seed: int) -> Tensor:
+    """Central differences [6] of the loss, in units of the steps; one launch for all of them."""
+    steps = torch.diag(case.steps)
+    poses = (case.T_world_cam.double() @ pose.se3_exp(torch.cat([steps, -steps])))[:, None]
+    with torch.no_grad():
+        frames = render.frames(case.camera(effort.samples, seed), case.scene, poses)[:, 0]
+    ahead, behind = (frames.double() * case.weight).mean((1, 2)).reshape(2, 6)
+    return (ahead - behind) / 2
+
+
+def gradient(case: Case, effort: Effort, seed: int, way: Way) -> Tensor:
+    """The gradient [6] of the loss by one way, in units of the steps: every component is the mean over poses along
+    its own step, one in each of ``effort.poses`` equal parts."""
+    generator = torch.Generator().manual_seed(seed)
+    at = torch.rand(6, effort.poses, generator=generator, dtype=torch.float64)
+    at = 2 * (at + torch.arange(effort.poses)) / effort.poses - 1
+    offsets = (at[..., None] * torch.diag(case.steps)[:, None]).reshape(-1, 6)
+    twist = torch.zeros_like(offsets, requires_grad=True)
+    frames = render.frames(
+        case.camera(effort.samples // 4, seed),
+        case.scene,
+        case.T_world_cam.double() @ pose.se3_exp(offsets) @ pose.se3_exp(twist),
+        gradient=way,
+        per_px=effort.per_px,
+    )
+    (found,) = torch.autograd.grad((frames.double() * case.weight).sum() / case.width_px**2, twist)
+    own = found.reshape(6, effort.poses, 6).mean(1).diagonal()
+    return own * case.steps
+
+
+def nearest_m(scene: Any, optics: Any, T_world_cam: Tensor, pitch_mm: float, width_px: int) -> float:
+    """Distance of the nearest thing that the chief rays of the film meet, 1 where they meet none."""
+    camera = render.Camera(optics, 4 * width_px, 4 * width_px, pitch_mm / 4, 1)
+    rays = camera.rays()
+    turned = rays.direction.double() @ T_world_cam[:3, :3].T
+    start = pose.apply(T_world_cam, rays.origin_m.double())
+    point, _, met = scene.hit(start, torch.nn.functional.normalize(turned, dim=1))
+    away = (point - start).norm(dim=1)[met]
+    return float(away.min()) if away.numel() else 1.0

@@ -1,0 +1,90 @@
+"""Worlds in which gradients at silhouettes once were wrong without a word: each judged, or refused where its shapes
+pass through each other."""
+
+from typing import Any
+
+import torch
+
+from codesign import pose
+from scenes import outline_cases, silhouettes
+from studies.silhouettes.judge import (
+    RIGHT,
+    USUAL,
+    Case,
+    Effort,
+    Judged,
+    compared,
+    differences,
+    gradient,
+    judge,
+    optics_of,
+)
+
+WIDTH_PX = 28
+HALF_SLOPE = 4 / 11
+
+
+def case_of(world: outline_cases.World, kind: str) -> Case:
+    """A listed world before one of the lenses."""
+    scale = 1.0 if kind == "pinhole" else world.lens_scale
+    pitch_mm = 2 * 11.0 * scale * HALF_SLOPE * world.narrow / WIDTH_PX
+    optics = optics_of(kind, scale, world.focus_m)
+    return Case(world.scene, optics, world.T_world_cam, pitch_mm, WIDTH_PX, world.nearest_m)
+
+
+def listed(run: Any, effort: Effort = USUAL) -> list[str]:
+    """Judge all listed worlds, record and show them; returns what is not as asked."""
+    rows = []
+    missed = []
+    cases = [(name, kind) for name, build in outline_cases.CASES.items() for kind in build().kinds]
+    with run.progress(len(cases) + 1, "listed worlds") as progress:
+        for name, kind in cases:
+            rows.append((name, kind, judge(case_of(outline_cases.CASES[name](), kind), effort=effort)))
+            progress.advance()
+        rows.append(("auto_after_wall", "pinhole", auto_after_wall(effort)))
+        progress.advance()
+    for name, kind, found in rows:
+        label = f"listed_{name}_{kind}"
+        if found.verdict == "refused":
+            run.record(**{f"{label}_refused": 1})
+        else:
+            run.record(**{f"{label}_error": found.error or 0.0, f"{label}_noise": found.noise or 0.0})
+        if not passes(name, found):
+            missed.append(f"{name}, {kind}: {found.verdict}" + (f" {found.error:.1%}" if found.error else ""))
+    run.record(listed_missed=len(missed))
+    table = [
+        (name, kind, found.verdict, found.error, found.noise, found.interior, found.sentence)
+        for name, kind, found in rows
+    ]
+    columns = ("world", "lens", "verdict", "error", "noise", "interior only", "refused with")
+    run.table("Worlds that once were wrong", columns, table)
+    return missed
+
+
+def passes(name: str, found: Judged) -> bool:
+    """Within RIGHT + twice the noise, or refused where shapes pass through each other."""
+    if found.verdict == "refused":
+        return name in outline_cases.CROSSING
+    return (
+        found.error is not None
+        and found.verdict not in ("noisy", "doubtful")
+        and found.error <= RIGHT + 2 * (found.noise or 0)
+    )
+
+
+def auto_after_wall(effort: Effort = USUAL) -> Judged:
+    """gradient="auto" before the boxes, with a scene that was asked first where it shows nothing but its wall."""
+    scene = silhouettes.build("cubes")
+    boxes = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7))
+    wall = pose.look_at((0.0, 0.0, 2.4), (0.0, 2.5, 2.4)) @ pose.se3_exp(
+        torch.tensor([0, 0, 0, 0, 0, 0.2], dtype=torch.float64)
+    )
+    optics = optics_of("pinhole")
+    pitch_mm = 2 * 11.0 * HALF_SLOPE / WIDTH_PX
+    before = Case(scene, optics, wall, pitch_mm, WIDTH_PX, 3.0)
+    gradient(before, effort, 0, "auto")
+    case = Case(scene, optics, boxes, pitch_mm, WIDTH_PX, 1.0)
+    seeds = range(effort.seeds[0])
+    truth = torch.stack([differences(case, effort, 1000 + k) for k in seeds])
+    got = torch.stack([gradient(case, effort, k, "auto") for k in seeds])
+    return compared(truth, got, gradient(case, effort, 0, "interior"))

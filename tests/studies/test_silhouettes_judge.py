@@ -1,0 +1,175 @@
+"""Random worlds and their judge: shapes told apart by closed forms, a square whose frames are known, and gradients
+that are right and wrong."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from codesign import backend, lens, pose
+from codesign.render import MitsubaScene
+from scenes import outline_cases, random_shapes, random_worlds
+from scenes.random_shapes import gap_m
+from studies.silhouettes import judge, listed, randoms
+
+QUICK = judge.Effort(seeds=(4,))
+
+
+def at(x, y=0.0, z=0.0, axis=(0, 0, 1), turn=0.0):
+    return random_shapes.frame(axis, (x, y, z), turn)
+
+
+def test_gaps_between_hulls_are_proofs_and_nearly_as_long_as_they_are():
+    ball = random_shapes.ball("ball", at(0), 0.5, 1.0, 1.0).hull
+    others = {
+        0.25: random_shapes.ball("b", at(1.0), 0.25, 1.0, 1.0),
+        0.5: random_shapes.box("c", at(1.5), np.array([0.5, 0.5, 0.2]), 1.0, 1.0),
+        1.5: random_shapes.tube("d", at(2.5, -1.0, axis=(0, 1, 0)), 3.0, 0.5, 1.0, 1.0),
+        2.5: random_shapes.disc("e", at(3.0, axis=(1, 0, 0)), 0.7, 1.0, 1.0),
+        math.sqrt(5) - 1.5: random_shapes.disc("f", at(2.0, 1.0), 1.0, 1.0, 1.0),
+    }
+    for distance, other in others.items():
+        found = gap_m(ball, other.hull)
+        assert 0.85 * distance < found <= distance + 1e-12
+        assert gap_m(other.hull, ball) <= distance + 1e-12
+    for inside in (
+        random_shapes.ball("b", at(0.7), 0.25, 1.0, 1.0),
+        random_shapes.box("c", at(0.9), np.array([0.5, 0.3, 0.2]), 1.0, 1.0),
+        random_shapes.tube("d", at(0.9, -1.0, axis=(0, 1, 0)), 3.0, 0.5, 1.0, 1.0),
+    ):
+        assert gap_m(ball, inside.hull) == 0
+
+
+def test_meshes_are_closed_and_wound_outwards():
+    """Volumes by the divergence theorem: of a ball 4 pi / 3 from below, of a ring 2 pi^2 R r^2 from below."""
+
+    def volume(vertices, faces):
+        a, b, c = (vertices[faces[:, k]] for k in range(3))
+        return float((np.cross(a, b) * c).sum()) / 6
+
+    vertices, faces = random_shapes.icosphere(4)
+    assert len(faces) == 5120
+    assert 0.99 * 4 / 3 * math.pi < volume(vertices, faces) < 4 / 3 * math.pi
+    vertices, faces = random_shapes.torus(96, 48, 0.4)
+    ring = 2 * math.pi**2 * 0.4**2 / 1.4**3
+    assert 0.99 * ring < volume(vertices, faces) < ring
+    assert volume(*random_shapes.random_hull(np.random.default_rng(3))) > 0
+
+
+def test_draws_are_the_same_every_time_and_cover_what_they_promise():
+    draws = [random_worlds.draw(seed) for seed in range(80)]
+    again = random_worlds.draw(7)
+    assert again.facts == draws[7].facts
+    assert torch.equal(again.T_world_cam, draws[7].T_world_cam)
+    kinds = {shape.kind for draw in draws for shape in draw.shapes}
+    assert kinds == {"cube", "cylinder", "sphere", "disk", "rectangle", "mesh"}
+    assert {draw.facts["background"] for draw in draws} == set(random_worlds.BACKGROUNDS)
+    sizes = [shape.px for draw in draws for shape in draw.shapes if shape.px != 99]
+    assert min(sizes) < 0.3
+    assert max(sizes) > 12
+    for fact in ("crosses", "border", "behind", "touches", "sky"):
+        assert 2 <= sum(draw.facts[fact] for draw in draws) <= 60
+    assert sum(draw.facts["far_m"] > 0 for draw in draws) >= 3
+
+
+def test_things_of_a_draw_are_apart_unless_it_says_that_they_cross():
+    """Corners and middles of every thing, put into every ball: exact where the hulls are searched."""
+    looked = 0
+    for seed in range(40):
+        draw = random_worlds.draw(seed)
+        for one in draw.shapes:
+            if one.kind != "sphere" or draw.crosses:
+                continue
+            for other in draw.shapes:
+                if other is not one and other.kind in ("cube", "mesh"):
+                    away = np.linalg.norm(other.hull.centres - one.hull.centres[0], axis=1)
+                    assert away.min() > one.hull.radii[0]
+                    looked += 1
+    assert looked > 10
+
+
+def test_a_square_is_judged_by_its_closed_form():
+    """A bright rectangle along the pixels: coverage of every pixel is a product of two overlaps, so that the
+    difference over a step to the side and ahead is known exactly; the boundary gradient is right, the interior one
+    wrong."""
+    mi = backend.mitsuba()
+    T = mi.ScalarTransform4f
+    half = 0.21
+    square = {
+        "type": "rectangle",
+        "to_world": T().translate([0.013, 0.021, 2.0]).rotate([0, 1, 0], 180).scale(half),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 100.0}},
+    }
+    eye = torch.eye(4, dtype=torch.float64)
+    case = judge.Case(MitsubaScene({"square": square}), lens.Pinhole(11.0), eye, 0.25, 24, 2.0, 5)
+    px = 11.0 / 0.25
+
+    def loss(dx, dz):
+        def overlap(centre):
+            low, high = (11.5 + px * (centre + sign * half) / (2 - dz) for sign in (-1, 1))
+            edge = torch.arange(24, dtype=torch.float64)
+            return ((edge + 0.5).clamp(max=high) - (edge - 0.5).clamp(min=low)).clamp(0, 1)
+
+        image = 100 * overlap(0.021)[:, None] * overlap(0.013 - dx)
+        return float((image * case.weight).mean())
+
+    step = float(case.steps[0])
+    assert step * px / 2 == pytest.approx(judge.STEP_PX)
+    truth = {
+        0: (loss(step, 0) - loss(-step, 0)) / 2,
+        2: (loss(0, step) - loss(0, -step)) / 2,
+    }
+    effort = dataclasses.replace(QUICK, samples=512, poses=8)
+    differences = torch.stack([judge.differences(case, effort, k) for k in range(4)]).mean(0)
+    whole = torch.stack([judge.gradient(case, effort, k, "boundary") for k in range(4)]).mean(0)
+    for k, value in truth.items():
+        assert float(differences[k]) == pytest.approx(value, rel=0.02)
+        assert float(whole[k]) == pytest.approx(value, rel=0.02)
+    assert judge.judge(case, effort=QUICK).verdict == "right"
+    left_out = judge.judge(case, "interior", QUICK)
+    assert left_out.verdict == "wrong"
+    assert left_out.error == pytest.approx(1, abs=1e-6)
+
+
+def test_a_verdict_weighs_errors_by_their_noise():
+    truth = torch.ones(4, 6, dtype=torch.float64)
+    assert judge.compared(truth, 1.04 * truth, 0 * truth[0]).verdict == "right"
+    assert judge.compared(truth, 1.08 * truth, 0 * truth[0]).verdict == "near"
+    assert judge.compared(truth, 0.88 * truth, 0 * truth[0]).verdict == "wrong"
+    assert judge.compared(0 * truth, 0 * truth, 0 * truth[0]).verdict == "empty"
+    shaken = truth * torch.tensor([0.4, 1.5, 0.7, 1.4], dtype=torch.float64)[:, None]
+    assert judge.compared(shaken, truth, 0 * truth[0]).verdict == "doubtful"
+    assert judge.compared(truth, shaken, 0 * truth[0]).verdict == "noisy"
+    found = judge.compared(truth, shaken, 0 * truth[0])
+    spread = float(torch.tensor([0.4, 1.5, 0.7, 1.4]).std()) / 2
+    assert found.noise == pytest.approx(spread, rel=1e-6)
+
+
+def test_a_few_random_worlds_are_judged_through_all_lenses():
+    rows = randoms.judged_draw(4, ("pinhole",), QUICK) + randoms.judged_draw(9, effort=QUICK)
+    assert [row["verdict"] for row in rows] == ["right"] * 4
+    found = randoms.counted(rows)
+    assert found["random_draws"] == 2
+    assert found["random_pinhole_right_count"] == 2
+    assert found["random_thin_right_count"] == 1
+    assert found["random_traced_worst_error"] == max(row["error"] for row in rows if row["lens"] == "traced")
+    assert all(row["interior"] > 0.5 for row in rows)
+
+
+def test_a_listed_world_is_told_from_a_wrong_gradient():
+    case = listed.case_of(outline_cases.far_pole(20), "pinhole")
+    assert listed.passes("far_pole_20", judge.judge(case, effort=QUICK))
+    assert not listed.passes("far_pole_20", judge.judge(case, "interior", QUICK))
+    refused = judge.Judged("refused", sentence="two shapes pass through each other")
+    assert listed.passes("sphere_in_floor", refused)
+    assert not listed.passes("poles", refused)
+
+
+def test_the_camera_of_a_listed_world_looks_along_y_and_is_rolled():
+    world = outline_cases.sphere_in_floor()
+    forward = world.T_world_cam[:3, 2]
+    torch.testing.assert_close(forward, torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
+    turned = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))[:3, 0] @ world.T_world_cam[:3, 0]
+    assert float(turned) == pytest.approx(math.cos(0.3))
