@@ -36,7 +36,7 @@ def test_gaps_between_hulls_are_proofs_and_nearly_as_long_as_they_are():
         assert gap_m(other.hull, ball) <= distance + 1e-12
     for inside in (
         random_shapes.ball("b", at(0.7), 0.25, 1.0, 1.0),
-        random_shapes.box("c", at(0.9), np.array([0.5, 0.3, 0.2]), 1.0, 1.0),
+        random_shapes.box("c", at(0.7), np.array([0.5, 0.3, 0.2]), 1.0, 1.0),
         random_shapes.tube("d", at(0.9, -1.0, axis=(0, 1, 0)), 3.0, 0.5, 1.0, 1.0),
     ):
         assert gap_m(ball, inside.hull) == 0
