@@ -4,9 +4,9 @@ across the film.
 With pupil point q fixed, the film is cut by curves where radiance jumps. When such a curve moves by v along
 its normal n, a pixel gains (L- - L+) v per length of curve, L- and L+ the radiances before and behind it
 along n. The term is estimated by points on the curves, and enters as w (x(y, q) . n), whose value is taken
-out again and whose gradient is that of the film position x of the world point y: through the lens and the
-pose, whatever they depend on. Sources: Li et al., Differentiable Monte Carlo ray tracing through edge
-sampling, SIGGRAPH Asia 2018 (the term); Reynolds' transport theorem.
+out again and whose gradient is that of the film position x of the world point y: through the lens, the pose of
+the camera and that of the object, whatever they depend on. Sources: Li et al., Differentiable Monte Carlo ray
+tracing through edge sampling, SIGGRAPH Asia 2018 (the term); Reynolds' transport theorem.
 """
 
 import math
@@ -20,70 +20,64 @@ from codesign.backend import arrays
 from codesign.errors import DomainError
 from codesign.pose import apply, inverse
 from codesign.render.camera import Camera
-from codesign.render.sampling import film_pupil_pattern
+from codesign.render.curve_points import IN_FRONT_M, CurvePoints, curve_points
+from codesign.render.moving import cameras_in_parts, in_one_row, parts
+from codesign.render.wavefront import nearest
 
-# where the two radiances are read, either side of a curve; a float32 ray is good to a hundredth of that
-ASIDE_RAD = 1e-5
-WIDER = 1.15  # a lens with this much distortion still finds the points at the film's edge
 # a point is hidden when something beside it is nearer by this share; a curved surface falls away by less
 HIDDEN = 5e-3
-# of a piece, for its tangent on the film; of the pupil, for the motion at one point of it
-STEP = 1e-4
-PUPIL_STEP = 1e-3
+# px, of the film position for the derivative of a ray; the change up to which its root is taken as found, since the
+# next would be of its square
+STEP_PX = 1e-3
+FOUND_PX = 0.02
+TURNS = 6
 _AHEAD = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
-class CurvePoints:
-    """Sampled points of curves: world [n, 3], pupil point [n, 2], frame [n], the same curve a little further
-    on [n, 3], and how many such steps each point stands for [n]."""
+class Jumps:
+    """Seen points of curves with a jump of radiance, in the axes of their part: world [n, 3], frame and part [n],
+    film position [n, 2] px, pupil [n, 2], colour [n], pixel [n] of the sequence, weight [n], and the motion along
+    the curve's normal on the film per miss of the ray in space, [n, 2] px/m."""
 
     world_m: Tensor
-    ahead_m: Tensor
-    share: Tensor
-    pupil: Tensor
     frame: Tensor
+    part: Tensor
+    film_px: Tensor
+    pupil: Tensor
+    colour: Tensor
+    pixel: Tensor
+    weight: Tensor
+    per_miss: Tensor
+
+    def __getitem__(self, rows: Any) -> "Jumps":
+        return Jumps(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 def boundary_term(camera: Camera, scene: Any, T_world_cam: Tensor, per_px: float = 2.5) -> Tensor:
     """Zero-valued image [..., T, *film.shape] whose gradient is that of moving silhouettes and edges.
 
-    Args: camera, scene, T_world_cam as for ``frames``; scene with ``outline()`` and
+    Args: camera, scene, T_world_cam as for ``frames``; every part of the scene with ``outline()`` and
       ``radiance_and_distance``. per_px: samples per pixel length of curve.
-    Gradient: lens and poses. The curves' own world points do not move (rigid scenes).
-    Raises: DomainError for cameras with a spectrum or aimed pupils, whose boundary is not implemented.
+    Gradient: lens, poses, and poses of moving objects, each of which is rigid.
+    Raises: DomainError for a scene that does not know its curves.
     """
-    if camera.aim or camera.spectrum is not None or camera.falloff:
-        raise DomainError(
-            "gradient 'boundary' is there for cameras without aim, spectrum and falloff; drop these, or use "
-            "'difference'."
-        )
-    if not hasattr(camera.lens, "film_points"):
-        raise DomainError(
-            f"gradient 'boundary' needs a lens that says where points of space meet the film, but a "
-            f"{type(camera.lens).__name__} has no film_points; write it as GeoLens has it, or use 'interior'."
-        )
     shape = (*T_world_cam.shape[:-2], *camera.film.shape)
     frames_each = T_world_cam.shape[-3]
-    T_world_cam = T_world_cam.reshape(-1, 4, 4)
+    scene, T_world_cam = in_one_row(scene, T_world_cam)
+    cameras = torch.stack([pose.double() for pose in cameras_in_parts(scene, T_world_cam)])
+    curves = [_curves(part) for part in parts(scene)]
     with torch.no_grad():
-        px_per_slope = 1 / camera.slope_per_px()
-        found = _jumps(
-            camera,
-            scene,
-            T_world_cam.double(),
-            _sample(camera, scene, T_world_cam, frames_each, per_px, px_per_slope),
-            ASIDE_RAD * px_per_slope,
-        )
+        points = curve_points(camera, curves, cameras.detach(), frames_each, per_px)
+        found = None if points is None else jumps(camera, scene, cameras.detach(), points)
     if found is None or found.frame.numel() == 0:
         return torch.zeros(shape, dtype=scene.dtype)
-    back = inverse(T_world_cam.double())[found.frame]
+    back = inverse(cameras)[found.part, found.frame]
     y = apply(back, found.world_m[:, None])[:, 0]
-    rays = camera.rays_through(found.film_px, found.pupil)
-    ahead = (y[:, 2:] - rays.origin_m[:, 2:]) / rays.direction[:, 2:]
-    miss = (
-        rays.origin_m[:, :2] + rays.direction[:, :2] * ahead - y[:, :2]
-    )  # zero; how it changes tells how the film position must
+    origin, direction, _ = _rays(camera, found.film_px, found.pupil, found.colour)
+    ahead = (y[:, 2:] - origin[:, 2:]) / direction[:, 2:]
+    # zero; how it changes tells how the film position must
+    miss = origin[:, :2] + direction[:, :2] * ahead - y[:, :2]
     along = -(miss * found.per_miss).sum(1)
     image = torch.zeros(math.prod(shape), dtype=torch.float64).index_add(
         0, found.pixel, found.weight * (along - along.detach())
@@ -91,222 +85,162 @@ def boundary_term(camera: Camera, scene: Any, T_world_cam: Tensor, per_px: float
     return image.reshape(shape).to(scene.dtype)
 
 
-@dataclass(frozen=True)
-class Jumps:
-    """Seen points of curves with a jump of radiance: world [n, 3], frame [n], film position [n, 2] px, pupil
-    [n, 2], pixel [n] of the sequence, weight [n], and the motion along the curve's normal on the film per
-    miss of the ray in space, [n, 2] px/m."""
-
-    world_m: Tensor
-    frame: Tensor
-    film_px: Tensor
-    pupil: Tensor
-    pixel: Tensor
-    weight: Tensor
-    per_miss: Tensor
-
-    def __getitem__(self, rows):
-        return Jumps(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-
-def _sample(camera, scene, T_world_cam, frames_each, per_px, px_per_slope):
-    """Points on all curves that may fall on the film, about ``per_px`` per pixel length, stratified along
-    each frame's curves; every trajectory, of ``frames_each`` frames, draws the same numbers."""
-    film = camera.film
-    parts = []
-    centre = T_world_cam[:, :3, 3].double()
-    aperture_m = getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2
-    _, pupils = film_pupil_pattern(4096, camera.seed)
-    generator = torch.Generator()
-    for frame, eye in enumerate(centre):
-        if frame % frames_each == 0:
-            generator.manual_seed(camera.seed)
-        back = inverse(T_world_cam[frame : frame + 1].double())[0]
-        for curve in scene.outline():
-            index, bounds = curve.pieces(eye, 8 / px_per_slope)
-            if index.numel() == 0:
-                continue
-            ends = [_flat(back, curve.points(index, bounds[:, i], eye), px_per_slope) for i in (0, 1)]
-            middle = (ends[0][0] + ends[1][0]) / 2
-            half = torch.tensor([film.sensor_width_px, film.sensor_height_px], dtype=torch.float64) / 2
-            reach = WIDER * half + 1 + (ends[1][0] - ends[0][0]).abs()
-            ahead = ends[0][1] & ends[1][1] & (middle.abs() < reach).all(1)
-            index = index[ahead]
-            bounds = bounds[ahead]
-            length = (ends[1][0] - ends[0][0])[ahead].norm(dim=1)
-            if not index.numel():
-                continue
-            piece, inside, fraction = _places(length, per_px, generator)
-            flat = (
-                ends[0][0][ahead][piece] + inside[:, None] * (ends[1][0] - ends[0][0])[ahead][piece]
-            ).abs()
-            near = torch.nonzero((flat < WIDER * half + 1).all(1))[:, 0]
-            piece = piece[near]
-            inside = inside[near]
-            fraction = fraction[near]
-            if not piece.numel():
-                continue
-            count = piece.numel()
-            wide = (bounds[:, 1] - bounds[:, 0])[piece]
-            s = bounds[piece, 0] + inside * wide
-            pupil = (
-                pupils[(torch.arange(count) + torch.randint(4096, (1,), generator=generator)) % 4096]
-                if aperture_m
-                else torch.zeros(count, 2, dtype=torch.float64)
-            )
-            view = apply(
-                T_world_cam[frame].double(),
-                torch.cat([pupil * aperture_m, torch.zeros(count, 1, dtype=torch.float64)], 1),
-            )
-            step = STEP * wide
-            y = curve.points(index[piece], s, view)
-            on = curve.points(index[piece], s + step, view)
-            parts.append(CurvePoints(y, on, fraction / STEP, pupil, torch.full((count,), frame)))
-    if not parts:
-        empty = torch.zeros(0, 3, dtype=torch.float64)
-        return CurvePoints(empty, empty, empty[:, 0], empty[:, :2], torch.zeros(0, dtype=torch.long))
-    return CurvePoints(
-        *(
-            torch.cat([getattr(p, name) for p in parts])
-            for name in ("world_m", "ahead_m", "share", "pupil", "frame")
+def _curves(scene):
+    if not hasattr(scene, "outline"):
+        raise DomainError(
+            f"gradient 'boundary' needs a scene that lists the curves where its radiance jumps, but a "
+            f"{type(scene).__name__} has no outline(); give it one as MitsubaScene has it (an empty list where nothing "
+            "jumps), or use 'difference'."
         )
-    )
+    return list(scene.outline())
 
 
-def _places(length, per_px, generator):
-    """Where points lie on pieces of the given lengths [m] px: piece [n], position within it [n] 0..1, and
-    share of the piece each stands for [n].
-
-    A piece longer than the spacing of points is cut into equal parts with a point in each, so that what is
-    constant along it is summed exactly; shorter ones are thinned together, evenly along their total length.
-    """
-    long = torch.nonzero(length * per_px >= 1)[:, 0]
-    count = (length[long] * per_px).ceil().long()
-    which = torch.repeat_interleave(torch.arange(long.numel()), count)
-    k = torch.arange(which.numel()) - (count.cumsum(0) - count)[which]
-    inside = (k + torch.rand(k.numel(), generator=generator, dtype=torch.float64)) / count[which]
-    short = torch.nonzero(length * per_px < 1)[:, 0]
-    total = length[short].cumsum(0)
-    few = int(torch.ceil(total[-1] * per_px)) if short.numel() else 0
-    if few == 0:
-        return long[which], inside, 1 / count[which].double()
-    at = (torch.arange(few) + torch.rand(1, generator=generator, dtype=torch.float64)) / few * total[-1]
-    piece = torch.searchsorted(total, at).clamp_max(short.numel() - 1)
-    size = length[short[piece]].clamp_min(1e-12)
-    within = (1 - (total[piece] - at) / size).clamp(0, 1)
-    return (
-        torch.cat([long[which], short[piece]]),
-        torch.cat([inside, within]),
-        torch.cat([1 / count[which].double(), total[-1] / few / size]),
-    )
-
-
-def _flat(back, world_m, px_per_slope):
-    """Rough film position [n, 2] px from the axis, and whether the point lies in front of the camera."""
-    y = apply(back, world_m)
-    front = y[:, 2] > 1e-3
-    return y[:, :2] / torch.where(front, y[:, 2], 1.0)[:, None] * px_per_slope, front
-
-
-def _jumps(camera, scene, T_world_cam, points, aside):
-    """Jumps at the points that are seen, or None; radiances are read ``aside`` px from the curves."""
-    film = camera.film
-    back = inverse(T_world_cam)[points.frame]
+def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> Jumps | None:
+    """The points that are seen, with their jumps of radiance; None for none. cameras: [parts, F, 4, 4]."""
+    back = inverse(cameras)[points.part, points.frame]
     y, on = apply(back, torch.stack([points.world_m, points.ahead_m], 1)).unbind(1)
-    front = (y[:, 2] > 1e-3) & (on[:, 2] > 1e-3)
-    if not bool(front.any()):
+    rows = torch.nonzero((y[:, 2] > IN_FRONT_M) & (on[:, 2] > IN_FRONT_M))[:, 0]
+    if not rows.numel():
         return None
-    y = torch.where(front[:, None], y, _AHEAD)
-    on = torch.where(front[:, None], on, _AHEAD)
-    x, q, tangent, passes = _on_film(camera, y, on, points.pupil)
-    usable = front & passes
+    points, y, on = points[rows], y[rows], on[rows]
+    x, per_px, slope, passes = _on_film(camera, y, points)
+    pixel = _pixels(camera.film, x, points.window)
+    moved = (on - y)[:, :2] - slope * (on - y)[:, 2:]
+    fine = passes & (pixel >= 0)
+    per_m = torch.linalg.inv(torch.where(fine[:, None, None], per_px, torch.eye(2, dtype=y.dtype)))
+    tangent = (per_m @ moved[..., None])[..., 0]
     length = tangent.norm(dim=1)
-    pixel = _pixels(film, x)
-    rows = torch.nonzero(usable & (pixel >= 0) & (length > 0))[:, 0]
-    if rows.numel() == 0:
+    rows = torch.nonzero(fine & (length > 0))[:, 0]
+    if not rows.numel():
         return None
-    x = x[rows]
-    q = q[rows]
-    y = y[rows]
-    on = on[rows]
-    tangent = tangent[rows]
-    length = length[rows]
-    frame = points.frame[rows]
-    share = points.share[rows]
-    normal = torch.stack([-tangent[:, 1], tangent[:, 0]], 1) / length[:, None]
-    rays = camera.rays_through(torch.cat([x - aside * normal, x + aside * normal]), q.repeat(2, 1))
-    origin = rays.origin_m.reshape(2, -1, 3)
-    direction = rays.direction.reshape(2, -1, 3)
-    weight = rays.weight.reshape(2, -1)
-    pose = T_world_cam[frame]
-    world = [(pose[:, :3, :3] @ part[..., None])[..., 0] for part in (origin, direction)]
-    start = (world[0] + pose[:, :3, 3]).reshape(-1, 3)
-    along = world[1].reshape(-1, 3)
-    light, distance = (v.reshape(2, -1) for v in _look(scene, start, along))
-    reach = (y - origin[0]).norm(dim=1)
-    jump = (
-        (weight[0] * light[0] - weight[1] * light[1])
-        * length
-        * share
-        * (distance.amin(0) > reach * (1 - HIDDEN))
+    points, y, x, per_m, tangent, length, pixel = (
+        v[rows] for v in (points, y, x, per_m, tangent, length, pixel)
     )
-    # where the ray meets the depth of the point, per film position across the curve and along it
-    here = origin + direction * ((y[:, 2:] - origin[..., 2:]) / direction[..., 2:])
-    middle = (direction[0] + direction[1]) / 2
-    across = (here[1] - here[0])[:, :2] / (2 * aside)
-    moved = (on - y)[:, :2] - middle[:, :2] / middle[:, 2:] * (on - y)[:, 2:]
-    jacobian = torch.stack([across, moved / length[:, None]], -1)  # [n, space, (normal, tangent)]
-    fine = (torch.linalg.det(jacobian).abs() > 1e-16) & (jump != 0)
-    per_miss = torch.linalg.inv(torch.where(fine[:, None, None], jacobian, torch.eye(2, dtype=y.dtype)))[:, 0]
-    pixel = pixel[rows] + frame * math.prod(film.shape)
-    return Jumps(points.world_m[rows], frame, x, q, pixel, jump, per_miss)[torch.nonzero(fine)[:, 0]]
+    normal = torch.stack([-tangent[:, 1], tangent[:, 0]], 1) / length[:, None]
+    aside = (points.aside_rad / camera.slope_per_px())[:, None] * normal
+    q, colour = (v.repeat(2, *[1] * (v.ndim - 1)) for v in (points.pupil, points.colour))
+    origin, direction, weight = _rays(camera, torch.cat([x - aside, x + aside]), q, colour)
+    light, distance = (
+        v.reshape(2, -1)
+        for v in look(scene, cameras[:, points.frame.repeat(2)], origin, direction)
+    )
+    before, behind = weight.reshape(2, -1) * light
+    reach = (y - origin[: len(y)]).norm(dim=1)
+    seen = distance.amin(0) > reach * (1 - HIDDEN)
+    jump = (before - behind) * length * points.share * seen
+    found = Jumps(
+        points.world_m,
+        points.frame,
+        points.part,
+        x,
+        points.pupil,
+        points.colour,
+        pixel + points.frame * math.prod(camera.film.shape),
+        jump,
+        (normal[:, None] @ per_m)[:, 0],
+    )
+    return found[torch.nonzero(jump != 0)[:, 0]]
 
 
-def _look(scene, origin, direction):
-    """Radiance [n] and distance [n] along world rays [n, 3], float64 without gradient."""
+def _rays(camera, film_px, pupil, colour):
+    """Origins and directions [n, 3] in camera axes of rays through film positions and pupil points, and the share of
+    a sample's light [n] that they carry, each in its own colour."""
+    if camera.spectrum is None:
+        return _of_rays(camera, camera.rays_through(film_px, pupil), 1.0)
+    count = len(camera.spectrum.wavelengths_um)
+    found = []
+    order = []
+    for number, (wavelength, weight) in enumerate(
+        zip(camera.spectrum.wavelengths_um, camera.spectrum.weights, strict=True)
+    ):
+        rows = torch.nonzero(colour == number)[:, 0]
+        order.append(rows)
+        rays = camera.rays_through(film_px[rows], pupil[rows], wavelength)
+        found.append(_of_rays(camera, rays, weight * count))
+    back = torch.cat(order).argsort()
+    return [torch.cat(column)[back] for column in zip(*found, strict=True)]
+
+
+def _of_rays(camera, rays, share):
+    light = rays.weight.detach() * share
+    if camera.falloff:
+        light = light * rays.irradiance.detach()
+    return rays.origin_m.double(), rays.direction.double(), light.double()
+
+
+def look(scene: Any, cameras: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Radiance [n] and distance [n] along rays [n, 3] in camera axes, seen from poses [parts, n, 4, 4] of the camera;
+    float64 without gradient."""
     import drjit as dr
 
     arr = arrays(origin.device.type, scene.dtype)
-    o, d = (
-        arr.Array3(*[arr.Float(c.to(scene.dtype).contiguous()) for c in part.unbind(1)])
-        for part in (origin, direction)
-    )
-    light, distance = scene.radiance_and_distance(arr, o, d)
+
+    def columns(vectors):
+        return arr.Array3(*[arr.Float(c.to(scene.dtype).contiguous()) for c in vectors.unbind(1)])
+
+    placed = [
+        (columns((pose[:, :3, :3] @ origin[..., None])[..., 0] + pose[:, :3, 3]), columns((pose[:, :3, :3] @ direction[..., None])[..., 0]))
+        for pose in cameras
+    ]
+    light, distance = nearest(arr, parts(scene), placed)
     dr.eval(light, distance)
-    return [torch.as_tensor(v.numpy()).double() for v in (arr.Float(light), arr.Float(distance))]
+    light, distance = (torch.as_tensor(arr.Float(v).numpy()).double() for v in (light, distance))
+    return light, distance
 
 
-def _on_film(camera, y, on, pupil):
-    """Points y [n, 3] in camera axes seen through points of the exit pupil: film position [n, 2] px, the
-    pupil point reached [n, 2] (the one asked for but for the square of the pupil's aberration), the tangent
-    [n, 2] px towards ``on`` [n, 3] at one pupil point, and whether light passes [n]."""
+def _on_film(camera, y, points):
+    """Where points y [n, 3] in camera axes are seen through points of the pupil: film position [n, 2] px, change of
+    the place at that depth per pixel of it [n, 2, 2] m/px, slope of the ray there [n, 2], and whether light passes
+    [n]. Newton's method on the rays of the camera, from where the lens says light of the point goes."""
     film = camera.film
-    step = PUPIL_STEP * torch.eye(2, dtype=y.dtype)
-
-    def trace(points, aims):
-        x, q, passes = camera.lens.film_points(1e3 * torch.cat(points), torch.cat(aims))
-        return (
-            (x / film.pixel_pitch_mm + film.middle_px).reshape(len(points), -1, 2),
-            q.reshape(len(points), -1, 2),
-            passes.reshape(len(points), -1).all(0),
+    steps = STEP_PX * torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], dtype=y.dtype)
+    x = _first_guess(camera, y, points)
+    q, colour = points.pupil.repeat(3, 1), points.colour.repeat(3)
+    axial = camera.film.middle_px[None]
+    for _ in range(TURNS):
+        at = (x + steps[:, None]).reshape(-1, 2)
+        # the axial ray goes along: a lens that passes nothing at all is an error
+        origin, direction, light = _rays(
+            camera,
+            torch.cat([axial, at]),
+            torch.cat([torch.zeros_like(axial), q]),
+            torch.cat([colour[:1], colour]),
         )
+        origin, direction = (v[1:].reshape(3, -1, 3) for v in (origin, direction))
+        passes = ((light[1:].reshape(3, -1) > 0) & (direction[..., 2] > 1e-6)).all(0)
+        slope = direction[..., :2] / torch.where(passes[:, None], direction[..., 2:], 1.0)
+        here = origin[..., :2] + slope * (y[:, 2:] - origin[..., 2:])
+        per_px = torch.stack([here[1] - here[0], here[2] - here[0]], -1) / STEP_PX
+        passes &= torch.linalg.det(per_px).abs() > 1e-12 * per_px.square().sum((1, 2))
+        safe = torch.where(passes[:, None, None], per_px, torch.eye(2, dtype=y.dtype))
+        change = torch.linalg.solve(safe, torch.where(passes[:, None], here[0] - y[:, :2], 0.0))
+        x = x - change
+        far = change.abs().amax(1)
+        if not bool((far > FOUND_PX).any()):
+            break
+    return x, safe, slope[0], passes & (far < FOUND_PX)
 
-    x, q, passes = trace([y, y, y], [pupil, pupil + step[0], pupil + step[1]])
-    by_aim_x, by_aim_q = (torch.stack([v[1] - v[0], v[2] - v[0]], -1) / PUPIL_STEP for v in (x, q))
-    passes &= torch.linalg.det(by_aim_q).abs() > 1e-6
-    back = torch.linalg.inv(torch.where(passes[:, None, None], by_aim_q, step / PUPIL_STEP))
-    aim = pupil + (back @ (pupil - q[0])[..., None])[..., 0]
-    x, q, also = trace([y, on], [aim, aim])
-    return x[0], q[0], x[1] - x[0] - (by_aim_x @ (back @ (q[1] - q[0])[..., None]))[..., 0], passes & also
+
+def _first_guess(camera, y, points):
+    """Film position [n, 2] px of points y [n, 3]: as the lens sends light there, or else along the chief ray of the
+    axis's scale."""
+    film = camera.film
+    if not hasattr(camera.lens, "film_points"):
+        return film.middle_px + y[:, :2] / y[:, 2:] / camera.slope_per_px()
+    if camera.spectrum is None:
+        x, _, _ = camera.lens.film_points(1e3 * y, points.pupil)
+        return x / film.pixel_pitch_mm + film.middle_px
+    x = torch.zeros_like(y[:, :2])
+    for number, wavelength in enumerate(camera.spectrum.wavelengths_um):
+        rows = points.colour == number
+        x[rows] = camera.lens.film_points(1e3 * y[rows], points.pupil[rows], wavelength)[0].to(x)
+    return x / film.pixel_pitch_mm + film.middle_px
 
 
-def _pixels(film, x):
-    """Flat number of the pixel of the (first) window that holds each position, -1 outside."""
-    found = torch.full(x.shape[:1], -1)
-    size = film.width_px * film.height_px
-    for number, (left, top) in reversed(list(enumerate(film.windows_px or ((0, 0),)))):
-        column = (x[:, 0] - left + 0.5).floor()
-        row = (x[:, 1] - top + 0.5).floor()
-        inside = (column >= 0) & (column < film.width_px) & (row >= 0) & (row < film.height_px)
-        found = torch.where(inside, (number * size + row * film.width_px + column).long(), found)
-    return found
+def _pixels(film, x, window):
+    """Flat number of the pixel of the given windows [n] that holds each position [n, 2], -1 outside."""
+    corner = torch.tensor(film.windows_px or ((0, 0),), dtype=x.dtype)[window]
+    column, row = (x - corner + 0.5).floor().unbind(1)
+    inside = (column >= 0) & (column < film.width_px) & (row >= 0) & (row < film.height_px)
+    number = window * (film.width_px * film.height_px) + row * film.width_px + column
+    return torch.where(inside, number, -1.0).long()

@@ -191,9 +191,11 @@ class Camera:
             rays.direction[1, 0] / rays.direction[1, 2] - rays.direction[0, 0] / rays.direction[0, 2]
         )
 
-    def rays_through(self, pixels: Tensor, pupil: Tensor) -> Rays:
-        """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil: Rays, float64."""
-        return self.lens.camera_rays(self.film_mm(pixels), pupil, aim=self.aim)
+    def rays_through(self, pixels: Tensor, pupil: Tensor, wavelength_um: float | None = None) -> Rays:
+        """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil, of one colour (the d line when none is
+        given): Rays, float64."""
+        colour = {} if wavelength_um is None else {"wavelength_um": wavelength_um}
+        return self.lens.camera_rays(self.film_mm(pixels), pupil, aim=self.aim, **colour)
 
 
 def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -> Tensor:

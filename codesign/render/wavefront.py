@@ -1,5 +1,8 @@
 """All frames of all trajectories in one wavefront: camera-space rays x poses -> pixel means."""
 
+from collections.abc import Sequence
+from typing import Any
+
 from torch import Tensor
 
 from codesign.backend import run_kernel
@@ -83,7 +86,7 @@ class _Wavefront:
         seen = (
             self.scenes[0].radiance(arr, *placed[0])
             if len(placed) == 1
-            else _nearest(arr, self.scenes, placed)[0]
+            else nearest(arr, self.scenes, placed)[0]
         )
         light = seen * dr.gather(arr.Float, weight, ray)
         if dr.grad_enabled(
@@ -110,7 +113,7 @@ class _Depths(_Wavefront):
         import drjit as dr
 
         _, o, d, placed = self._lanes(arr, (ox, oy, oz), (dx, dy, dz), poses)
-        light, distance = _nearest(arr, self.scenes, placed)
+        light, distance = nearest(arr, self.scenes, placed)
         met = dr.isfinite(distance)
         depth = o.z + d.z * dr.select(met, distance, 1)
         return light, dr.select(met & (depth > 0), 1 / dr.select(depth > 0, depth, 1), 0)
@@ -127,13 +130,13 @@ def _placed(arr, o, d, pose, frame):
     return origin, arr.Array3(*[m[4 * r] * d.x + m[4 * r + 1] * d.y + m[4 * r + 2] * d.z for r in range(3)])
 
 
-def _nearest(arr, scenes, placed):
+def nearest(arr: Any, scenes: Sequence[Any], placed: Sequence[Any]) -> tuple[Any, Any]:
     """Radiance of the part met first and its distance; where nothing is met, what the first part says."""
     import drjit as dr
 
-    light, nearest = scenes[0].radiance_and_distance(arr, *placed[0])
+    light, least = scenes[0].radiance_and_distance(arr, *placed[0])
     for scene, rays in zip(scenes[1:], placed[1:], strict=True):
         other, distance = scene.radiance_and_distance(arr, *rays)
-        light = dr.select(distance < nearest, other, light)
-        nearest = dr.minimum(distance, nearest)
-    return light, nearest
+        light = dr.select(distance < least, other, light)
+        least = dr.minimum(distance, least)
+    return light, least

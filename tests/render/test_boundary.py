@@ -10,7 +10,7 @@ import torch
 from codesign import backend, pose, render
 from codesign.errors import DomainError
 from codesign.render import MitsubaScene
-from codesign.render.boundary import _places
+from codesign.render.curve_points import places as _places
 from codesign.render.outline import Segments, mesh_edges, outlines
 from scenes import silhouettes as silhouette_scenes
 from studies.silhouettes import STEPS, Task

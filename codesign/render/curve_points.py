@@ -1,0 +1,216 @@
+"""Points on the curves of a scene that fall on the film, for every frame: where the boundary term is sampled.
+
+A curve is cut into short pieces that are nearly straight on the film; each is clipped to the film, widened by what
+a lens out of focus spreads, and what is left gets points evenly along its length.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from codesign.errors import DomainError
+from codesign.pose import apply, inverse
+from codesign.render.camera import Camera
+from codesign.render.sampling import concentric_disc, film_pupil_pattern
+
+PIECE_PX = 8.0  # length of a piece on the film, at most
+MARGIN_PX = 1.0  # beyond the film, on top of the blur
+WIDER = 1.02  # of the film's field, for what chief rays of the border do not say: colour, pupil aberration
+IN_FRONT_M = 1e-3
+STEP = 1e-4  # of a piece, for the direction of its curve
+PUPILS = 4096
+FLOAT32_RAD = 5e-7  # by how much a float32 ray may miss, per length of its coordinates over the distance
+
+
+@dataclass(frozen=True)
+class CurvePoints:
+    """Sampled points of curves, in the axes of the part of the scene that the curve belongs to.
+
+    world_m, ahead_m [n, 3]: the point, and the same curve a little further on. share [n]: how many such steps each
+    point stands for. aside_rad [n]: how far to the sides radiance is safely read. pupil [n, 2]; colour, frame, part,
+    window [n]: numbers of the wavelength, the frame, the part of the scene and the window of the film.
+    """
+
+    world_m: Tensor
+    ahead_m: Tensor
+    share: Tensor
+    aside_rad: Tensor
+    pupil: Tensor
+    colour: Tensor
+    frame: Tensor
+    part: Tensor
+    window: Tensor
+
+    def __getitem__(self, rows: Any) -> "CurvePoints":
+        return CurvePoints(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+def curve_points(
+    camera: Camera, curves: Sequence[Sequence[Any]], cameras: Tensor, frames_each: int, per_px: float
+) -> CurvePoints | None:
+    """Points on all curves that may fall on the film, about ``per_px`` per pixel length; None for none.
+
+    Args: curves: of every part of the scene, in its own axes. cameras [parts, F, 4, 4]: the camera in the axes of
+      every part. frames_each: frames of a trajectory; every trajectory draws the same numbers.
+    """
+    view = _Views(camera)
+    generator = torch.Generator()
+    found = []
+    for frame in range(cameras.shape[1]):
+        if frame % frames_each == 0:
+            generator.manual_seed(camera.seed)
+        for part, of_part in enumerate(curves):
+            pose = cameras[part, frame]
+            back = inverse(pose)
+            for curve in of_part:
+                index, bounds = curve.pieces(pose[:3, 3], PIECE_PX / view.px_per_slope)
+                if not index.numel():
+                    continue
+                ends = [apply(back, curve.points(index, bounds[:, i], pose[:3, 3])) for i in (0, 1)]
+                for window in range(len(view.low)):
+                    rows, clip = view.clipped(window, *ends)
+                    if not rows.numel():
+                        continue
+                    found.append(
+                        _on_pieces(view, curve, index[rows], bounds[rows], clip, pose, per_px, generator)
+                        + [(frame, part, window)]
+                    )
+    if not found:
+        return None
+    columns = list(zip(*found, strict=True))
+    numbers = torch.cat(
+        [torch.tensor(own).expand(len(y), 3) for own, y in zip(columns[-1], columns[0], strict=True)]
+    )
+    return CurvePoints(*(torch.cat(column) for column in columns[:-1]), *numbers.unbind(1))
+
+
+def _on_pieces(view, curve, index, bounds, clip, pose, per_px, generator):
+    """Columns world_m .. colour of points on pieces of one curve, each clipped to [n, 2] of itself and with a
+    length in px."""
+    start, end, length = clip
+    piece, inside, fraction = places(length, per_px, generator)
+    wide = (bounds[:, 1] - bounds[:, 0])[piece]
+    kept = (end - start)[piece]
+    s = bounds[piece, 0] + (start[piece] + inside * kept) * wide
+    count = len(piece)
+    turn = torch.randint(PUPILS, (2,), generator=generator)
+    number = torch.arange(count)
+    pupil = view.pupils[(number + turn[0]) % PUPILS]
+    viewpoint = apply(pose, torch.cat([pupil * view.aperture_m, torch.zeros(count, 1, dtype=torch.float64)], 1))
+    y = curve.points(index[piece], s, viewpoint)
+    on = curve.points(index[piece], s + STEP * wide, viewpoint)
+    distance = (y - viewpoint).norm(dim=1)
+    coordinates = torch.maximum(y.abs().amax(1), pose[:3, 3].abs().amax())
+    aside = torch.maximum(curve.aside_rad(index[piece], viewpoint), FLOAT32_RAD * coordinates / distance)
+    return [y, on, fraction * kept / STEP, aside, pupil, (number + turn[1]) % view.colours]
+
+
+class _Views:
+    """What of space falls on the windows of a film, in rough pixels: slopes from the pupil's centre over the slope
+    of a pixel at the axis, in which straight lines are straight whatever the distortion."""
+
+    def __init__(self, camera):
+        self.px_per_slope = 1 / camera.slope_per_px()
+        self.colours = 1 if camera.spectrum is None else len(camera.spectrum.wavelengths_um)
+        self.aperture_m = getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2
+        _, pupils = film_pupil_pattern(PUPILS, camera.seed)
+        self.pupils = pupils * (self.aperture_m > 0)
+        film = camera.film
+        sides = torch.linspace(-0.5, 0.5, 9, dtype=torch.float64)
+        border = torch.cat(
+            [torch.stack([a, b], 1) for e in (-0.5, 0.5) for a, b in ((sides, 0 * sides + e), (0 * sides + e, sides))]
+        )
+        size = torch.tensor([film.width_px, film.height_px], dtype=torch.float64)
+        boxes = []
+        for corner in film.windows_px or ((0, 0),):
+            middle = torch.tensor(corner, dtype=torch.float64) + (size - 1) / 2
+            boxes.append(self._box(camera, middle + border * size))
+        self.low, self.high = (torch.stack(side) for side in zip(*boxes, strict=True))
+        self.spread, self.shift = self._blur(camera)
+
+    def _box(self, camera, pixels):
+        """Lowest and highest rough pixel of film positions; the axis scale where no chief ray reaches the film."""
+        rays = camera.chief_rays(pixels)
+        at = rays.direction[:, :2] / rays.direction[:, 2:] * self.px_per_slope
+        straight = pixels - camera.film.middle_px
+        at = torch.where(((rays.weight > 0) & at.isfinite().all(1))[:, None], at, 1.15 * straight)
+        middle = (at.amin(0) + at.amax(0)) / 2
+        half = WIDER * (at.amax(0) - at.amin(0)) / 2 + MARGIN_PX
+        return middle - half, middle + half
+
+    def _blur(self, camera):
+        """Differences of slope [k, 2] and of place at the pupil [k, 2] m between rays of a film point through the
+        pupil's rim and the straight line from its middle to where its chief ray points."""
+        if not self.aperture_m:
+            return torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
+        angle = torch.arange(8, dtype=torch.float64) * (math.pi / 4)
+        rim = torch.stack([angle.cos(), angle.sin()], 1)
+        size = torch.tensor([camera.film.sensor_width_px, camera.film.sensor_height_px], dtype=torch.float64)
+        fields = camera.film.middle_px + size * torch.tensor(
+            [[0, 0], [0.25, 0.25], [-0.5, 0.5], [0.5, 0], [0, -0.5]], dtype=torch.float64
+        )
+        chief = camera.chief_rays(fields)
+        rays = camera.rays_through(fields.repeat_interleave(8, 0), rim.repeat(5, 1))
+        passes = (rays.weight > 0) & (chief.weight > 0).repeat_interleave(8)
+        straight = (chief.direction[:, :2] / chief.direction[:, 2:]).repeat_interleave(8, 0)
+        slope = rays.direction[:, :2] / rays.direction[:, 2:]
+        base = rays.origin_m[:, :2] - slope * rays.origin_m[:, 2:]
+        if not bool(passes.any()):
+            return torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
+        return (slope - straight)[passes], base[passes]
+
+    def _blur_px(self, depth_m):
+        """Radius [n] px of the blur of points at depths [n]; the larger of two ends bounds all between them."""
+        near = 1 / depth_m
+        return (self.spread[:, None] + self.shift[:, None] * near[:, None]).norm(dim=2).amax(0) * self.px_per_slope
+
+    def clipped(self, window, start_cam_m, end_cam_m):
+        """Of pieces from [n, 3] to [n, 3] in camera axes, the rows that touch a window, and for these (start, end
+        [m] shares within the piece, length [m] px that is left)."""
+        front = torch.nonzero((start_cam_m[:, 2] > IN_FRONT_M) & (end_cam_m[:, 2] > IN_FRONT_M))[:, 0]
+        a, b = (p[front] for p in (start_cam_m, end_cam_m))
+        margin = torch.maximum(self._blur_px(a[:, 2]), self._blur_px(b[:, 2]))[:, None]
+        a, b = (p[:, :2] / p[:, 2:] * self.px_per_slope for p in (a, b))
+        along = b - a
+        still = along.abs() < 1e-12
+        slower = torch.where(still, 1.0, along)
+        first, last = ((edge - a) / slower for edge in (self.low[window] - margin, self.high[window] + margin))
+        within = (a >= self.low[window] - margin) & (a <= self.high[window] + margin)
+        enter = torch.where(still, torch.where(within, 0.0, 2.0), torch.minimum(first, last)).amax(1).clamp_min(0)
+        leave = torch.where(still, 1.0, torch.maximum(first, last)).amin(1).clamp_max(1)
+        rows = torch.nonzero(leave > enter)[:, 0]
+        enter, leave = enter[rows], leave[rows]
+        return front[rows], (enter, leave, along[rows].norm(dim=1) * (leave - enter))
+
+
+def places(length_px: Tensor, per_px: float, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
+    """Where points lie on pieces of the given lengths [m] px: piece [n], position within it [n] 0..1, and
+    share of the piece each stands for [n].
+
+    A piece longer than the spacing of points is cut into equal parts with a point in each, so that what is
+    constant along it is summed exactly; shorter ones are thinned together, evenly along their total length.
+    """
+    long = torch.nonzero(length_px * per_px >= 1)[:, 0]
+    count = (length_px[long] * per_px).ceil().long()
+    which = torch.repeat_interleave(torch.arange(long.numel()), count)
+    k = torch.arange(which.numel()) - (count.cumsum(0) - count)[which]
+    inside = (k + torch.rand(k.numel(), generator=generator, dtype=torch.float64)) / count[which]
+    short = torch.nonzero(length_px * per_px < 1)[:, 0]
+    total = length_px[short].cumsum(0)
+    few = int(torch.ceil(total[-1] * per_px)) if short.numel() else 0
+    if few == 0:
+        return long[which], inside, 1 / count[which].double()
+    at = (torch.arange(few) + torch.rand(1, generator=generator, dtype=torch.float64)) / few * total[-1]
+    piece = torch.searchsorted(total, at).clamp_max(short.numel() - 1)
+    size = length_px[short[piece]].clamp_min(1e-12)
+    within = (1 - (total[piece] - at) / size).clamp(0, 1)
+    return (
+        torch.cat([long[which], short[piece]]),
+        torch.cat([inside, within]),
+        torch.cat([1 / count[which].double(), total[-1] / few / size]),
+    )
+
