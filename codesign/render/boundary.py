@@ -16,29 +16,30 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.backend import arrays
 from codesign.errors import DomainError
 from codesign.pose import apply, inverse
 from codesign.render.camera import Camera
 from codesign.render.curve_points import IN_FRONT_M, CurvePoints, curve_points
 from codesign.render.moving import cameras_in_parts, in_one_row, parts
-from codesign.render.wavefront import nearest
+from codesign.render.unlisted import check_listed
+from codesign.render.wavefront import HIDDEN, look
 
-# a point is hidden when something beside it is nearer by this share; a curved surface falls away by less
-HIDDEN = 5e-3
 # px, of the film position for the derivative of a ray; the change up to which its root is taken as found, since the
 # next would be of its square
 STEP_PX = 1e-3
 FOUND_PX = 0.02
 TURNS = 6
+# for the question whether there are jumps at all: points per pixel of curve, and share of the light
+GLANCE_PER_PX = 0.3
+CONTRAST = 0.02
 _AHEAD = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 
 @dataclass(frozen=True)
 class Jumps:
     """Seen points of curves with a jump of radiance, in the axes of their part: world [n, 3], frame and part [n],
-    film position [n, 2] px, pupil [n, 2], colour [n], pixel [n] of the sequence, weight [n], and the motion along
-    the curve's normal on the film per miss of the ray in space, [n, 2] px/m."""
+    film position [n, 2] px, pupil [n, 2], colour [n], pixel [n] of the sequence, weight [n], contrast [n] of the two
+    radiances, and the motion along the curve's normal on the film per miss of the ray in space, [n, 2] px/m."""
 
     world_m: Tensor
     frame: Tensor
@@ -48,6 +49,7 @@ class Jumps:
     colour: Tensor
     pixel: Tensor
     weight: Tensor
+    contrast: Tensor
     per_miss: Tensor
 
     def __getitem__(self, rows: Any) -> "Jumps":
@@ -68,6 +70,7 @@ def boundary_term(camera: Camera, scene: Any, T_world_cam: Tensor, per_px: float
     cameras = torch.stack([pose.double() for pose in cameras_in_parts(scene, T_world_cam)])
     curves = [_curves(part) for part in parts(scene)]
     with torch.no_grad():
+        check_listed(camera, scene, curves, cameras.detach())
         points = curve_points(camera, curves, cameras.detach(), frames_each, per_px)
         found = None if points is None else jumps(camera, scene, cameras.detach(), points)
     if found is None or found.frame.numel() == 0:
@@ -83,6 +86,20 @@ def boundary_term(camera: Camera, scene: Any, T_world_cam: Tensor, per_px: float
         0, found.pixel, found.weight * (along - along.detach())
     )
     return image.reshape(shape).to(scene.dtype)
+
+
+def radiance_jumps(camera: Camera, scene: Any, T_world_cam: Tensor) -> bool:
+    """Whether any frame [..., T, 4, 4] shows an edge or outline at which radiance jumps by more than CONTRAST of what
+    is seen there; looked at by few points. Raises: as ``boundary_term``."""
+    frames_each = T_world_cam.shape[-3]
+    with torch.no_grad():
+        scene, T_world_cam = in_one_row(scene, T_world_cam)
+        cameras = torch.stack([pose.double() for pose in cameras_in_parts(scene, T_world_cam)])
+        curves = [_curves(part) for part in parts(scene)]
+        check_listed(camera, scene, curves, cameras)
+        points = curve_points(camera, curves, cameras, frames_each, GLANCE_PER_PX)
+        found = None if points is None else jumps(camera, scene, cameras, points)
+    return found is not None and bool((found.contrast > CONTRAST).any())
 
 
 def _curves(scene):
@@ -121,8 +138,7 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
     q, colour = (v.repeat(2, *[1] * (v.ndim - 1)) for v in (points.pupil, points.colour))
     origin, direction, weight = _rays(camera, torch.cat([x - aside, x + aside]), q, colour)
     light, distance = (
-        v.reshape(2, -1)
-        for v in look(scene, cameras[:, points.frame.repeat(2)], origin, direction)
+        v.reshape(2, -1) for v in look(scene, cameras[:, points.frame.repeat(2)], origin, direction)
     )
     before, behind = weight.reshape(2, -1) * light
     reach = (y - origin[: len(y)]).norm(dim=1)
@@ -137,6 +153,7 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
         points.colour,
         pixel + points.frame * math.prod(camera.film.shape),
         jump,
+        (before - behind).abs() / torch.maximum(before, behind).clamp_min(1e-30),
         (normal[:, None] @ per_m)[:, 0],
     )
     return found[torch.nonzero(jump != 0)[:, 0]]
@@ -168,46 +185,18 @@ def _of_rays(camera, rays, share):
     return rays.origin_m.double(), rays.direction.double(), light.double()
 
 
-def look(scene: Any, cameras: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Radiance [n] and distance [n] along rays [n, 3] in camera axes, seen from poses [parts, n, 4, 4] of the camera;
-    float64 without gradient."""
-    import drjit as dr
-
-    arr = arrays(origin.device.type, scene.dtype)
-
-    def columns(vectors):
-        return arr.Array3(*[arr.Float(c.to(scene.dtype).contiguous()) for c in vectors.unbind(1)])
-
-    placed = [
-        (columns((pose[:, :3, :3] @ origin[..., None])[..., 0] + pose[:, :3, 3]), columns((pose[:, :3, :3] @ direction[..., None])[..., 0]))
-        for pose in cameras
-    ]
-    light, distance = nearest(arr, parts(scene), placed)
-    dr.eval(light, distance)
-    light, distance = (torch.as_tensor(arr.Float(v).numpy()).double() for v in (light, distance))
-    return light, distance
-
-
 def _on_film(camera, y, points):
     """Where points y [n, 3] in camera axes are seen through points of the pupil: film position [n, 2] px, change of
     the place at that depth per pixel of it [n, 2, 2] m/px, slope of the ray there [n, 2], and whether light passes
     [n]. Newton's method on the rays of the camera, from where the lens says light of the point goes."""
-    film = camera.film
     steps = STEP_PX * torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], dtype=y.dtype)
     x = _first_guess(camera, y, points)
     q, colour = points.pupil.repeat(3, 1), points.colour.repeat(3)
-    axial = camera.film.middle_px[None]
     for _ in range(TURNS):
         at = (x + steps[:, None]).reshape(-1, 2)
-        # the axial ray goes along: a lens that passes nothing at all is an error
-        origin, direction, light = _rays(
-            camera,
-            torch.cat([axial, at]),
-            torch.cat([torch.zeros_like(axial), q]),
-            torch.cat([colour[:1], colour]),
-        )
-        origin, direction = (v[1:].reshape(3, -1, 3) for v in (origin, direction))
-        passes = ((light[1:].reshape(3, -1) > 0) & (direction[..., 2] > 1e-6)).all(0)
+        origin, direction, light = _rays(camera, at, q, colour)
+        origin, direction = (v.reshape(3, -1, 3) for v in (origin, direction))
+        passes = ((light.reshape(3, -1) > 0) & (direction[..., 2] > 1e-6)).all(0)
         slope = direction[..., :2] / torch.where(passes[:, None], direction[..., 2:], 1.0)
         here = origin[..., :2] + slope * (y[:, 2:] - origin[..., 2:])
         per_px = torch.stack([here[1] - here[0], here[2] - here[0]], -1) / STEP_PX

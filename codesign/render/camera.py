@@ -96,10 +96,9 @@ class Camera:
         every_px = max(1, math.ceil(max(self.film.width_px, self.film.height_px) / CHECKED_ACROSS))
         pixels = coarse_pixels(self.film, every_px)
         _, pupil = film_pupil_pattern(CHECKED_RAYS, self.seed)
-        at = torch.cat([self.film.middle_px[None], pixels.repeat_interleave(CHECKED_RAYS, 0)])
-        with torch.no_grad():  # the axial ray goes along: a lens that passes nothing at all is another error
-            rays = self.rays_through(at, torch.cat([pupil.new_zeros(1, 2), pupil.repeat(len(pixels), 1)]))
-        dark = (rays.weight[1:].reshape(-1, CHECKED_RAYS) > 0).logical_not().all(1).cpu()
+        with torch.no_grad():
+            rays = self.rays_through(pixels.repeat_interleave(CHECKED_RAYS, 0), pupil.repeat(len(pixels), 1))
+        dark = (rays.weight.reshape(-1, CHECKED_RAYS) > 0).logical_not().all(1).cpu()
         if bool(dark.any()):
             radius_mm = self.film_mm(pixels).norm(dim=1)
             lit_mm = float(radius_mm[~dark].max()) if not bool(dark.all()) else 0.0
@@ -193,9 +192,12 @@ class Camera:
 
     def rays_through(self, pixels: Tensor, pupil: Tensor, wavelength_um: float | None = None) -> Rays:
         """Rays of pixel coordinates [N, 2] through points [N, 2] of the pupil, of one colour (the d line when none is
-        given): Rays, float64."""
+        given): Rays, float64. The axial ray goes along: only a lens that passes nothing at all is an error."""
         colour = {} if wavelength_um is None else {"wavelength_um": wavelength_um}
-        return self.lens.camera_rays(self.film_mm(pixels), pupil, aim=self.aim, **colour)
+        at = torch.cat([self.film.middle_px[None].to(pixels), pixels])
+        through = torch.cat([pupil.new_zeros(1, 2), pupil])
+        rays = self.lens.camera_rays(self.film_mm(at), through, aim=self.aim, **colour)
+        return Rays(*(None if v is None else v[1:] for v in (getattr(rays, f.name) for f in fields(Rays))))
 
 
 def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -> Tensor:
@@ -261,12 +263,10 @@ def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -
 def _miss(camera, pixels, points_cam_m, pupil):
     """Where rays pass the depth of the points, minus the points: [N, 2] metres; and whether light takes them:
     [N]."""
-    rays = camera.rays_through(
-        torch.cat([camera.film.middle_px.reshape(1, 2), pixels]), torch.cat([pupil.new_zeros(1, 2), pupil])
-    )  # the axial ray goes along: a lens that passes nothing at all is an error
-    origin = rays.origin_m[1:]
-    direction = rays.direction[1:]
-    passes = (rays.weight.detach()[1:] > 0) & (direction.detach()[:, 2] > 1e-6)
+    rays = camera.rays_through(pixels, pupil)
+    origin = rays.origin_m
+    direction = rays.direction
+    passes = (rays.weight.detach() > 0) & (direction.detach()[:, 2] > 1e-6)
     ahead = (points_cam_m[:, 2:] - origin[:, 2:]) / torch.where(passes[:, None], direction[:, 2:], 1)
     return origin[:, :2] + direction[:, :2] * ahead - points_cam_m[:, :2], passes
 

@@ -12,10 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError
 from codesign.pose import apply, inverse
 from codesign.render.camera import Camera
-from codesign.render.sampling import concentric_disc, film_pupil_pattern
+from codesign.render.sampling import film_pupil_pattern
 
 PIECE_PX = 8.0  # length of a piece on the film, at most
 MARGIN_PX = 1.0  # beyond the film, on top of the blur
@@ -91,22 +90,28 @@ def curve_points(
 def _on_pieces(view, curve, index, bounds, clip, pose, per_px, generator):
     """Columns world_m .. colour of points on pieces of one curve, each clipped to [n, 2] of itself and with a
     length in px."""
-    start, end, length = clip
+    start, end, length, depths = clip
     piece, inside, fraction = places(length, per_px, generator)
     wide = (bounds[:, 1] - bounds[:, 0])[piece]
     kept = (end - start)[piece]
-    s = bounds[piece, 0] + (start[piece] + inside * kept) * wide
+    at = start[piece] + inside * kept  # evenly along the film, so in perspective along the piece
+    near, far = depths[piece].unbind(1)
+    sight = (1 - at) * far + at * near
+    s = bounds[piece, 0] + at * near / sight * wide
+    fraction = fraction * kept * near * far / sight.square()
     count = len(piece)
     turn = torch.randint(PUPILS, (2,), generator=generator)
     number = torch.arange(count)
     pupil = view.pupils[(number + turn[0]) % PUPILS]
-    viewpoint = apply(pose, torch.cat([pupil * view.aperture_m, torch.zeros(count, 1, dtype=torch.float64)], 1))
+    viewpoint = apply(
+        pose, torch.cat([pupil * view.aperture_m, torch.zeros(count, 1, dtype=torch.float64)], 1)
+    )
     y = curve.points(index[piece], s, viewpoint)
     on = curve.points(index[piece], s + STEP * wide, viewpoint)
     distance = (y - viewpoint).norm(dim=1)
     coordinates = torch.maximum(y.abs().amax(1), pose[:3, 3].abs().amax())
     aside = torch.maximum(curve.aside_rad(index[piece], viewpoint), FLOAT32_RAD * coordinates / distance)
-    return [y, on, fraction * kept / STEP, aside, pupil, (number + turn[1]) % view.colours]
+    return [y, on, fraction / STEP, aside, pupil, (number + turn[1]) % view.colours]
 
 
 class _Views:
@@ -122,7 +127,11 @@ class _Views:
         film = camera.film
         sides = torch.linspace(-0.5, 0.5, 9, dtype=torch.float64)
         border = torch.cat(
-            [torch.stack([a, b], 1) for e in (-0.5, 0.5) for a, b in ((sides, 0 * sides + e), (0 * sides + e, sides))]
+            [
+                torch.stack([a, b], 1)
+                for e in (-0.5, 0.5)
+                for a, b in ((sides, 0 * sides + e), (0 * sides + e, sides))
+            ]
         )
         size = torch.tensor([film.width_px, film.height_px], dtype=torch.float64)
         boxes = []
@@ -134,7 +143,7 @@ class _Views:
 
     def _box(self, camera, pixels):
         """Lowest and highest rough pixel of film positions; the axis scale where no chief ray reaches the film."""
-        rays = camera.chief_rays(pixels)
+        rays = camera.rays_through(pixels, torch.zeros_like(pixels))
         at = rays.direction[:, :2] / rays.direction[:, 2:] * self.px_per_slope
         straight = pixels - camera.film.middle_px
         at = torch.where(((rays.weight > 0) & at.isfinite().all(1))[:, None], at, 1.15 * straight)
@@ -153,7 +162,7 @@ class _Views:
         fields = camera.film.middle_px + size * torch.tensor(
             [[0, 0], [0.25, 0.25], [-0.5, 0.5], [0.5, 0], [0, -0.5]], dtype=torch.float64
         )
-        chief = camera.chief_rays(fields)
+        chief = camera.rays_through(fields, torch.zeros_like(fields))
         rays = camera.rays_through(fields.repeat_interleave(8, 0), rim.repeat(5, 1))
         passes = (rays.weight > 0) & (chief.weight > 0).repeat_interleave(8)
         straight = (chief.direction[:, :2] / chief.direction[:, 2:]).repeat_interleave(8, 0)
@@ -166,25 +175,32 @@ class _Views:
     def _blur_px(self, depth_m):
         """Radius [n] px of the blur of points at depths [n]; the larger of two ends bounds all between them."""
         near = 1 / depth_m
-        return (self.spread[:, None] + self.shift[:, None] * near[:, None]).norm(dim=2).amax(0) * self.px_per_slope
+        return (self.spread[:, None] + self.shift[:, None] * near[:, None]).norm(dim=2).amax(
+            0
+        ) * self.px_per_slope
 
     def clipped(self, window, start_cam_m, end_cam_m):
         """Of pieces from [n, 3] to [n, 3] in camera axes, the rows that touch a window, and for these (start, end
-        [m] shares within the piece, length [m] px that is left)."""
+        [m] shares of its length on the film, length [m] px that is left, depths of its ends [m, 2])."""
         front = torch.nonzero((start_cam_m[:, 2] > IN_FRONT_M) & (end_cam_m[:, 2] > IN_FRONT_M))[:, 0]
         a, b = (p[front] for p in (start_cam_m, end_cam_m))
+        depths = torch.stack([a[:, 2], b[:, 2]], 1)
         margin = torch.maximum(self._blur_px(a[:, 2]), self._blur_px(b[:, 2]))[:, None]
         a, b = (p[:, :2] / p[:, 2:] * self.px_per_slope for p in (a, b))
         along = b - a
         still = along.abs() < 1e-12
         slower = torch.where(still, 1.0, along)
-        first, last = ((edge - a) / slower for edge in (self.low[window] - margin, self.high[window] + margin))
+        first, last = (
+            (edge - a) / slower for edge in (self.low[window] - margin, self.high[window] + margin)
+        )
         within = (a >= self.low[window] - margin) & (a <= self.high[window] + margin)
-        enter = torch.where(still, torch.where(within, 0.0, 2.0), torch.minimum(first, last)).amax(1).clamp_min(0)
+        enter = (
+            torch.where(still, torch.where(within, 0.0, 2.0), torch.minimum(first, last)).amax(1).clamp_min(0)
+        )
         leave = torch.where(still, 1.0, torch.maximum(first, last)).amin(1).clamp_max(1)
         rows = torch.nonzero(leave > enter)[:, 0]
         enter, leave = enter[rows], leave[rows]
-        return front[rows], (enter, leave, along[rows].norm(dim=1) * (leave - enter))
+        return front[rows], (enter, leave, along[rows].norm(dim=1) * (leave - enter), depths[rows])
 
 
 def places(length_px: Tensor, per_px: float, generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:
@@ -213,4 +229,3 @@ def places(length_px: Tensor, per_px: float, generator: torch.Generator) -> tupl
         torch.cat([inside, within]),
         torch.cat([1 / count[which].double(), total[-1] / few / size]),
     )
-

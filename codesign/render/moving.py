@@ -23,7 +23,7 @@ class MovingScene:
         of a sequence has its objects at pose t. Before cameras on several trajectories [..., T, 4, 4] objects
         move the same way for each, or, with poses [..., T, 4, 4] too, their own way.
     Computes in float32 when one of the scenes does, otherwise in float64.
-    Gradient: to T_world_object, for what moves inside surfaces; silhouettes are left out.
+    Gradient: to T_world_object, as to the camera's poses; silhouettes with gradient "boundary".
     Raises: DomainError when poses are not rigid or a scene cannot say how far away it is; ShapeError when the
       numbers of poses differ.
     """
@@ -89,13 +89,6 @@ class MovingScene:
                 name: (scene, poses.expand(*batch, 4, 4).reshape(-1, 4, 4))
                 for name, scene, poses in zip(self.names, self.scenes[1:], self.T_world_object, strict=True)
             },
-        )
-
-    def outline(self) -> Any:
-        """Raise DomainError: the boundary term holds scenes still."""
-        raise DomainError(
-            "the outlines of moving objects carry no gradient; ask for gradient 'interior', or for a scene "
-            "without objects."
         )
 
 

@@ -75,6 +75,10 @@ class TexturedPlane:
         )
         return opaque(self.T_world_plane[:3]), waves, dr.opaque(arr.Float, self.mean)
 
+    def outline(self) -> list[Any]:
+        """No curves: its radiance jumps nowhere."""
+        return []
+
     def radiance(self, arr: Any, origin: Any, direction: Any) -> Any:
         """Radiance along world rays (drjit arrays). Gradient: exact, to the rays."""
         return self.radiance_and_distance(arr, origin, direction)[0]

@@ -3,8 +3,7 @@
 interior: what moves inside surfaces (plain automatic differentiation). boundary: with the motion of
   silhouettes and edges. difference: central differences
 with common random numbers, twelve renders for the poses and two per lens number. auto: the cheapest of the
-three that agrees with differences, asked once
-per scene, camera and group of parameters.
+three that is right for the frames at hand.
 """
 
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.pose import inverse, se3_exp
-from codesign.render.boundary import boundary_term
+from codesign.render.boundary import boundary_term, radiance_jumps
 from codesign.render.camera import Camera
 from codesign.render.kinds import Scene
 from codesign.render.moving import MovingScene, at_frames, in_one_row, scenes_and_poses
@@ -118,7 +117,7 @@ def by_differences(camera: Camera, scene: Any, T_world_cam: Tensor) -> Tensor:
     if any(pose.requires_grad for pose in getattr(scene, "T_world_object", ())):
         raise DomainError(
             "gradient 'difference' goes to camera and lens only, but the pose of an object asks for one; "
-            "use 'interior'."
+            "use 'boundary'."
         )
     with torch.no_grad():
         found = first = image(camera, scene, T_world_cam)
@@ -211,21 +210,19 @@ def lens_difference(camera: Camera, scene: Any, T_world_cam: Tensor, name: str, 
 
 
 def settled(camera: Camera, scene: Any, T_world_cam: Tensor) -> Way:
-    """The way ``choose`` found for this scene, camera and set of parameters; asked once and remembered by the
-    scene."""
-    if any(pose.requires_grad for pose in getattr(scene, "T_world_object", ())):
-        return "interior"  # the only way that reaches objects
-    lens = lens_tensors(camera.lens)
-    groups = [*(["pose"] if T_world_cam.requires_grad else []), *lens]
-    if not groups:
-        _check_known(camera.lens, lens)
+    """The cheapest way that is right for these very frames: "interior" where no edge or outline in them parts two
+    radiances, "boundary" where one does, "difference" where the scene does not list them."""
+    lens = camera.lens.parameters() if isinstance(camera.lens, torch.nn.Module) else ()
+    asked = [T_world_cam, *lens_tensors(camera.lens).values(), *lens]
+    objects = any(pose.requires_grad for pose in getattr(scene, "T_world_object", ()))
+    if not (objects or any(tensor.requires_grad for tensor in asked)):
         return "interior"
-    memory = scene.__dict__.setdefault("_ways", {})
-    key = (tuple(groups), camera.film, camera.samples_per_pixel, type(camera.lens).__name__)
-    if key not in memory:
-        memory[key] = choose(camera, scene, T_world_cam)
-    order = {way: i for i, way in enumerate(WAYS)}
-    return max((choice.way for choice in memory[key].values()), key=order.__getitem__)
+    try:
+        return "boundary" if radiance_jumps(camera, scene, T_world_cam) else "interior"
+    except DomainError:
+        if objects:  # which differences do not reach
+            raise
+        return "difference"
 
 
 def choose(camera: Camera, scene: Any, T_world_cam: Tensor, seed: int = 0) -> dict[str, Choice]:

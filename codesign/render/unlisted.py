@@ -5,6 +5,7 @@ the larger difference is halved again and again, until what is left is a jump or
 exactly one listed curve. What is neither makes the gradient of the boundary term wrong, and is refused.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,14 +15,15 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.pose import apply, inverse
-from codesign.render.boundary import HIDDEN, look
 from codesign.render.camera import Camera
 from codesign.render.curve_points import IN_FRONT_M, PIECE_PX
+from codesign.render.film import coarse_pixels
 from codesign.render.moving import parts
 from codesign.render.sampling import film_pupil_pattern
+from codesign.render.wavefront import HIDDEN, look
 
-LINES = 24  # each way across the film
-RAYS_PER_PX = 4
+LINES = 16  # each way across the film
+RAYS_PER_PX = 3
 HALVINGS = 14
 CONTRAST = 0.02  # of a frame's range: what is less is no jump worth the name
 NEAR_PX = 0.5  # between a jump and the chord of a piece that may hold it
@@ -29,6 +31,10 @@ ON_PX = 0.05  # between a jump and the curve it lies on
 SAME_RAD = 3e-5  # between curves that are one, at float32's precision
 STEPS = 24  # of the search along a piece
 WRONG = 0.05  # share of all jumps up to which a view is taken as listed
+# another view needs no look of its own as long as the camera has moved by less than this share of the distance to what
+# it sees, and turned by less than this share of half its field
+MOVED = 0.2
+TURNED = 0.5
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,9 @@ class Listing:
     crossings: int
 
 
-def listing(camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor, seed: int = 0) -> Listing:
+def listing(
+    camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor, seed: int = 0
+) -> Listing:
     """Whether the jumps of one view lie on the listed curves. cameras: [parts, 4, 4], the camera in the axes of every
     part; curves: of every part."""
     with torch.no_grad():
@@ -64,20 +72,51 @@ def listing(camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], cameras
 
 
 def check_listed(camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor) -> None:
-    """Raise DomainError when a view shows jumps of radiance that the scene does not list, or lists twice. cameras:
-    [parts, 4, 4]."""
-    found = listing(camera, scene, curves, cameras)
-    for share, what in (
-        (found.unlisted, "lie on no edge or outline that the scene lists"),
-        (found.doubled, "lie on several of its edges at once"),
-    ):
-        if share > WRONG:
-            at = ", ".join(f"{v:.3g}" for v in found.place_m or ())
-            raise DomainError(
-                f"gradient 'boundary': {share:.0%} of the jumps of radiance in this view {what}, the largest near "
-                f"({at}) m: surfaces that lie in one another, textures with hard texels, or shapes that are not "
-                "known; move them apart, smooth the texture, or use 'difference'."
-            )
+    """Raise DomainError when the first or the last frame of a sequence shows jumps of radiance that the scene does not
+    list, or lists twice. Views near one that was found right are not looked at again. cameras: [parts, F, 4, 4]."""
+    own = parts(scene)
+    seen = own[0].__dict__.setdefault("_listed", {}).setdefault((own, camera.film), [])
+    field = _half_field_rad(camera)
+    for frame in {0, cameras.shape[1] - 1}:
+        view = cameras[:, frame]
+        if any(_covers(old, reach_m, view, field) for old, reach_m in seen):
+            continue
+        found = listing(camera, scene, curves, view)
+        for share, what in (
+            (found.unlisted, "lie on no edge or outline that the scene lists"),
+            (found.doubled, "lie on several of its edges at once"),
+        ):
+            if share > WRONG:
+                at = ", ".join(f"{v:.3g}" for v in found.place_m or ())
+                raise DomainError(
+                    f"gradient 'boundary': {share:.0%} of the jumps of radiance in frame {frame} {what}, the largest near "
+                    f"({at}) m: parts of a moving scene that touch, textures with hard texels, or shapes that are not "
+                    "known; move them apart, smooth the texture, or use 'difference'."
+                )
+        seen.append((view.clone(), _reach_m(camera, scene, view)))
+
+
+def _half_field_rad(camera):
+    film = camera.film
+    return math.atan(max(film.sensor_width_px, film.sensor_height_px) / 2 * abs(camera.slope_per_px()))
+
+
+def _covers(old, reach_m, view, field_rad):
+    """Whether the camera [parts, 4, 4] is near where it was before, seen from every part."""
+    moved = (view[:, :3, 3] - old[:, :3, 3]).norm(dim=1)
+    straight = (view[:, :3, 2] * old[:, :3, 2]).sum(1)
+    return bool((moved < MOVED * reach_m).all() and (straight > math.cos(TURNED * field_rad)).all())
+
+
+def _reach_m(camera, scene, cameras):
+    """Median distance of what a view shows."""
+    pixels = coarse_pixels(camera.film, 8)
+    rays = camera.rays_through(pixels, torch.zeros_like(pixels))
+    _, distance = look(
+        scene, cameras[:, None].expand(-1, len(pixels), 4, 4), rays.origin_m.double(), rays.direction.double()
+    )
+    met = distance[distance.isfinite()]
+    return float(met.median()) if len(met) else 1.0
 
 
 def _crossings(camera, scene, cameras, seed):
@@ -88,7 +127,9 @@ def _crossings(camera, scene, cameras, seed):
     _, pupils = film_pupil_pattern(64, seed + 1)
     low, high, pupil = [], [], []
     for left, top in film.windows_px or ((0, 0),):
-        for axis, (along, across) in enumerate(((film.width_px, film.height_px), (film.height_px, film.width_px))):
+        for axis, (along, across) in enumerate(
+            ((film.width_px, film.height_px), (film.height_px, film.width_px))
+        ):
             lines = min(LINES, across)
             shift = torch.rand(lines, generator=generator, dtype=torch.float64)
             level = (torch.arange(lines) + shift) / lines * across - 0.5
@@ -114,7 +155,9 @@ def _crossings(camera, scene, cameras, seed):
     lit = torch.cat([first, second])
     least = CONTRAST * float(lit.amax() - lit.amin())
     rows = torch.nonzero(((first - second).abs() > least) & begins & ends)[:, 0]
-    low, high, pupil, first, second, near, far = (v[rows] for v in (low, high, pupil, first, second, near, far))
+    low, high, pupil, first, second, near, far = (
+        v[rows] for v in (low, high, pupil, first, second, near, far)
+    )
     for _ in range(HALVINGS):
         if not len(low):
             break
@@ -165,7 +208,6 @@ def _close(ends, origin, direction, near):
     """Pairs (ray, piece) whose angle is at most ``near`` and a tenth of the piece's length: ends [2, pieces, 3]."""
     a, b = ends
     rays, pieces = [], []
-    along = b - a
     for block in torch.arange(len(origin)).split(256):
         o, d = origin[block, None], direction[block, None]
         depth = ((a - o) * d).sum(2).clamp_min(1e-6)

@@ -3,13 +3,17 @@
 from collections.abc import Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from codesign.backend import run_kernel
+from codesign.backend import arrays, run_kernel
 from codesign.errors import DomainError, ShapeError
 from codesign.render.kinds import Scene
 from codesign.render.moving import MovingScene, cameras_in_parts, in_one_row, parts, says_distance
 from codesign.types import Rays
+
+# a point is hidden when something beside it is nearer by this share; a curved surface falls away by less
+HIDDEN = 5e-3
 
 
 def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Tensor, samples_per_pixel: int) -> Tensor:
@@ -68,6 +72,29 @@ def light_and_nearness(rays: Rays, scene: Scene | MovingScene, T_world_cam: Tens
     kernel = _Depths(parts(scene), count, poses, 1)
     light, nearness = run_kernel(kernel, inputs, [(poses, count)] * 2)
     return light, nearness
+
+
+def look(scene: Any, cameras: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Radiance [n] and distance [n] along rays [n, 3] in camera axes, seen from poses [parts, n, 4, 4] of the camera;
+    float64 without gradient."""
+    import drjit as dr
+
+    arr = arrays(origin.device.type, scene.dtype)
+
+    def columns(vectors):
+        return arr.Array3(*[arr.Float(c.to(scene.dtype).contiguous()) for c in vectors.unbind(1)])
+
+    placed = [
+        (
+            columns((pose[:, :3, :3] @ origin[..., None])[..., 0] + pose[:, :3, 3]),
+            columns((pose[:, :3, :3] @ direction[..., None])[..., 0]),
+        )
+        for pose in cameras
+    ]
+    light, distance = nearest(arr, parts(scene), placed)
+    dr.eval(light, distance)
+    light, distance = (torch.as_tensor(arr.Float(v).numpy()).double() for v in (light, distance))
+    return light, distance
 
 
 class _Wavefront:

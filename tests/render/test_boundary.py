@@ -103,13 +103,17 @@ def test_auto_takes_the_cheapest_way_that_agrees():
     task = Task(scene, "pinhole")
     camera = render.Camera(task.lens, 24, 24, 0.33, 64)
     path = (task.pose @ pose.se3_exp(torch.zeros(1, 6, dtype=F64))).detach().requires_grad_(True)
-    from codesign.render.sequence import choose
+    from codesign.render.sequence import choose, settled
 
     assert choose(camera, wall, path)["pose"].way == "interior"
     choice = choose(camera, scene, path)["pose"]
     assert choice.way == "boundary"
     assert choice.errors["interior"] > 0.2
     assert "relative error against differences" in str(choice)
+    # a look at a bare wall says nothing about another view of the same scene
+    behind = pose.look_at((0.05, -1.2, 1.0), (0.0, -3.0, 1.0))[None].requires_grad_(True)
+    assert settled(camera, scene, behind) == "interior"
+    assert settled(camera, wall, path) == "interior"
     frames = render.frames(camera, scene, path, gradient="auto")
     expected = render.frames(camera, scene, path, gradient="boundary")
     (found,), (truth,) = (torch.autograd.grad(f.square().mean(), path) for f in (frames, expected))
@@ -190,32 +194,15 @@ def test_interpenetrating_objects_and_unknown_ways_are_refused():
     camera = render.Camera(render_pinhole(), 4, 4, 1.0, 1)
     with pytest.raises(DomainError, match="choose one of interior, boundary, difference, auto"):
         render.frames(camera, scene, torch.eye(4, dtype=F64)[None], gradient="exact")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(DomainError, match="without aim, spectrum and falloff"):
-        render.frames(
-            render.Camera(render_pinhole(), 4, 4, 1.0, 1, falloff=True),
-            scene,
-            torch.eye(4, dtype=F64)[None],
-            gradient="boundary",
-        )
 
 
-def test_moving_objects_keep_their_own_gradient_or_are_refused_one():
-    card = silhouette_scenes.build("cubes")
+def test_differences_reach_no_object():
     wall = silhouette_scenes.build("wall")
-    still = torch.eye(4, dtype=F64).expand(3, 4, 4)
-    path = Task(wall, "pinhole").pose.expand(3, 4, 4).clone().requires_grad_(True)
-    camera = render.Camera(render_pinhole(), 8, 8, 1.0, 4)
-    asks = render.MovingScene(wall, {"card": (card, still.clone().requires_grad_(True))})
+    path = Task(wall, "pinhole").pose.expand(3, 4, 4)
+    asks = torch.eye(4, dtype=F64).expand(3, 4, 4).clone().requires_grad_(True)
+    moving = render.MovingScene(wall, {"card": (silhouette_scenes.build("cubes"), asks)})
     with pytest.raises(DomainError, match="the pose of an object asks for one"):
-        render.frames(camera, asks, path, gradient="difference")
-    assert torch.equal(render.frames(camera, asks, path, gradient="auto"), render.frames(camera, asks, path))
-    moving = render.MovingScene(wall, {"card": (card, still)})
-    frames = render.frames(
-        camera, moving, path, gradient="auto"
-    )  # outlines of moving objects are not known: differences
-    (found,) = torch.autograd.grad(frames.sum(), path)
-    (truth,) = torch.autograd.grad(render.frames(camera, moving, path, gradient="difference").sum(), path)
-    torch.testing.assert_close(found, truth, rtol=1e-5, atol=1e-5 * float(truth.norm()))
+        render.frames(render.Camera(render_pinhole(), 8, 8, 1.0, 4), moving, path, gradient="difference")
 
 
 def test_a_seam_of_two_walls_counts_once():

@@ -12,6 +12,7 @@ from codesign.lens import GeoLens, Glass, Pinhole, Surface
 from codesign.render import MitsubaScene
 from codesign.render.boundary import _on_film
 from codesign.render.camera import project
+from codesign.render.curve_points import CurvePoints
 from codesign.render.outline import Circles, outlines
 
 F64 = torch.float64
@@ -81,20 +82,26 @@ def test_an_edge_counts_with_the_light_that_passes_the_apertures():
     assert sideways(camera, scene) == pytest.approx(truth, rel=1e-2)
 
 
-def test_the_tangent_on_the_film_is_that_through_one_point_of_the_pupil(generator):
-    """Against the projection of both points through the pupil point that the first one's ray reaches."""
+def test_points_are_found_on_the_film_through_their_own_point_of_the_pupil(generator):
+    """Against the projection of points through the same pupil points, and its differences."""
     camera = render.Camera(lens.load("cooke-triplet"), 240, 180, 0.1, 1)
     count = 24
     y = torch.rand(count, 3, generator=generator, dtype=F64) - 0.5
     y = y * torch.tensor([0.4, 0.3, 0.6], dtype=F64) + torch.tensor([0.0, 0.0, 1.0], dtype=F64)
-    on = y + 1e-5 * torch.randn(count, 3, generator=generator, dtype=F64)
+    moved = 1e-5 * torch.randn(count, 2, generator=generator, dtype=F64)
     pupil = 1.2 * (torch.rand(count, 2, generator=generator, dtype=F64) - 0.5)
+    none = torch.zeros(count, dtype=torch.long)
+    asks = torch.zeros(count, dtype=F64)
+    points = CurvePoints(y, y, asks, asks, pupil, none, none, none, none)
     with torch.no_grad():
-        at, reached, tangent, passes = _on_film(camera, y, on, pupil)
+        at, per_px, _, passes = _on_film(camera, y, points)
         assert bool(passes.all())
-        first, then = project(camera, y, reached), project(camera, on, reached)
-    torch.testing.assert_close(at, first, rtol=0, atol=1e-6)
-    assert float((tangent - (then - first)).norm() / tangent.norm()) <= 1e-5
+        truth = project(camera, y, pupil)
+        ahead = torch.cat([y[:, :2] + moved, y[:, 2:]], 1)
+        then = project(camera, ahead, pupil)
+    torch.testing.assert_close(at, truth, rtol=0, atol=1e-6)
+    step = torch.linalg.solve(per_px, moved)
+    assert float((step - (then - truth)).norm() / step.norm()) <= 1e-5
 
 
 def test_both_rims_of_a_cylinder_are_circles_about_its_axis():

@@ -276,5 +276,3 @@ def test_moving_scenes_that_cannot_be_are_refused():
         MovingScene(plane(2), {"world": (scene, good)})  # pyright: ignore[reportArgumentType]
     with pytest.raises(DomainError, match="part 'lit', a Brighter, does not say how far"):
         MovingScene(plane(2), {"lit": (Brighter({"ball": shape(1.0, type="sphere")}), good)})
-    with pytest.raises(DomainError, match="outlines of moving objects"):
-        scene.outline()

@@ -1,0 +1,193 @@
+"""The boundary term where the chain needs it: objects that move, the robot's own body before its camera, cameras with
+aimed pupils, spectrum and falloff, windows on the film and batches of trajectories. Differences with common random
+numbers are the judge."""
+
+import pytest
+import torch
+
+from codesign import backend, lens, pose, render
+from codesign.errors import DomainError
+from codesign.render import MitsubaScene
+from scenes import silhouettes as silhouette_scenes
+
+F64 = torch.float64
+SIZE_PX = 24
+STEP = 2e-3
+WEIGHT = torch.nn.functional.interpolate(
+    torch.randn(1, 1, 5, 5, generator=torch.Generator().manual_seed(3)),
+    size=(SIZE_PX, SIZE_PX),
+    mode="bicubic",
+)[0, 0]
+START = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7))
+
+
+def triplet():
+    return lens.load("cooke-triplet").scaled(0.22).freeze()
+
+
+def judged(loss, many=512, seeds=(11, 12), per_px=12.0):
+    """Relative L2 error of the boundary and the interior gradient of loss(twist [6], samples, seed, way, per_px)
+    against differences, and the noise of these."""
+    truths = []
+    for seed in seeds:
+        with torch.no_grad():
+            ends = [
+                [loss(sign * step, many, seed, "interior", per_px) for sign in (1, -1)]
+                for step in STEP * torch.eye(6, dtype=F64)
+            ]
+        truths.append(torch.stack([(ahead - behind) / (2 * STEP) for ahead, behind in ends]))
+    truth = torch.stack(truths).mean(0)
+    noise = float(torch.stack(truths).std(0).norm() / len(seeds) ** 0.5 / truth.norm())
+
+    def error(way):
+        found = []
+        for seed in seeds:
+            twist = torch.zeros(6, dtype=F64, requires_grad=True)
+            found.append(torch.autograd.grad(loss(twist, many, seed + 10, way, per_px), twist)[0])
+        return float((torch.stack(found).mean(0) - truth).norm() / truth.norm())
+
+    return error("boundary"), error("interior"), noise
+
+
+def frames_loss(optics, scene, path=START, film=None, **options):
+    def loss(twist, samples, seed, way, per_px):
+        size = (SIZE_PX, SIZE_PX) if film is None else (film.width_px, film.height_px)
+        camera = render.Camera(optics, *size, 8.0 / SIZE_PX, samples, seed, film=film, **options)
+        frames = render.frames(camera, scene, path[None] @ pose.se3_exp(twist[None]), way, per_px)
+        return (WEIGHT[: size[1], : size[0]] * frames).double().mean()
+
+    return loss
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"aim": True},
+        {"falloff": True},
+        {"spectrum": lens.Spectrum.visible_FdC((1.0, 2.0, 1.0))},
+    ],
+    ids=["aim", "falloff", "spectrum"],
+)
+def test_cameras_with_more_than_one_colour_and_a_real_pupil(options):
+    many = (
+        192 if "aim" in options else 384
+    )  # each ray is aimed by several traces; a multiple of three colours
+    whole, plain, noise = judged(frames_loss(triplet(), silhouette_scenes.build("cubes"), **options), many)
+    assert noise < 0.02
+    assert whole < 0.05
+    assert plain > 0.2
+
+
+def test_windows_on_the_film_each_have_their_own_edges():
+    """Two windows that overlap, off the middle of a sensor: the edges of each count in each."""
+    film = render.Film(48, 36, 16, 14, 8.0 / SIZE_PX, ((6, 8), (14, 12)))
+    whole, plain, noise = judged(frames_loss(triplet(), silhouette_scenes.build("cubes"), film=film))
+    assert noise < 0.02
+    assert whole < 0.05
+    assert plain > 0.2
+
+
+def body():
+    """A robot's body about the origin: a bright box and a mast, cut by the border of the view."""
+    mi = backend.mitsuba()
+    T = mi.ScalarTransform4f
+
+    def light(seed, **options):
+        radiance = {
+            "type": "bitmap",
+            "bitmap": mi.Bitmap(silhouette_scenes.smooth(seed, cycles=2, **options)),
+            "raw": True,
+        }
+        return {"type": "area", "radiance": radiance}
+
+    deck = T().translate([0.0, 0.15, -0.12]).rotate([1, 0.3, 0.2], 9).scale([0.11, 0.22, 0.03])
+    mast = {"type": "cylinder", "p0": [0.08, 0.5, -0.06], "p1": [0.1, 0.47, 0.25], "radius": 0.015}
+    return MitsubaScene(
+        {
+            "deck": {"type": "cube", "to_world": deck, "emitter": light(7, darkest=120)},
+            "mast": {**mast, "emitter": light(8, brightest=90)},
+        }
+    )
+
+
+@pytest.mark.parametrize("optics", [lens.Pinhole(11.0), triplet()], ids=["pinhole", "traced"])
+def test_the_mount_of_a_camera_that_sees_its_robot(optics):
+    """The robot stands in the world with the camera on it; what is asked for is the pose of the mount, under which
+    the world moves and the robot's own body too."""
+    scene, robot = silhouette_scenes.build("cubes"), body()
+    T_world_robot = pose.se3_exp(torch.tensor([[0.05, -1.2, 1.0, 0.0, 0.0, 0.1]], dtype=F64))
+    T_robot_cam = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, -0.15))
+
+    def loss(twist, samples, seed, way, per_px):
+        camera = render.Camera(optics, SIZE_PX, SIZE_PX, 8.0 / SIZE_PX, samples, seed)
+        world = render.MovingScene(scene, {"robot": (robot, T_world_robot)})
+        mounted = T_world_robot @ (T_robot_cam @ pose.se3_exp(twist[None]))
+        return (WEIGHT * render.frames(camera, world, mounted, way, per_px)[0]).double().mean()
+
+    whole, plain, noise = judged(loss)
+    assert noise < 0.02
+    assert whole < 0.05
+    assert plain > 0.2
+
+
+def test_the_pose_of_an_object_that_moves():
+    """Twist of the object about its own axes, before a camera that rests."""
+    wall, robot = silhouette_scenes.build("wall"), body()
+    optics = triplet()
+
+    def loss(twist, samples, seed, way, per_px):
+        camera = render.Camera(optics, SIZE_PX, SIZE_PX, 8.0 / SIZE_PX, samples, seed)
+        place = pose.se3_exp(torch.tensor([[-0.1, -0.1, 0.95, 0.6, 0.2, 0.5]], dtype=F64))
+        world = render.MovingScene(wall, {"robot": (robot, place @ pose.se3_exp(twist[None]))})
+        return (WEIGHT * render.frames(camera, world, START[None], way, per_px)[0]).double().mean()
+
+    whole, plain, noise = judged(loss, seeds=(11, 12, 13, 14))
+    assert noise < 0.03
+    assert whole < 0.05
+    assert plain > 0.2
+
+
+def test_a_batch_has_the_gradients_of_its_trajectories():
+    scene = silhouette_scenes.build("cubes")
+    camera = render.Camera(lens.Pinhole(11.0), 16, 16, 0.5, 4)
+    shift = torch.tensor([[0.0] * 6, [0.02, 0.01, 0, 0, 0, 0.03], [0.04, 0, 0.02, 0.01, 0, 0]], dtype=F64)
+    paths = torch.stack([START @ pose.se3_exp(shift), START @ pose.se3_exp(-shift)])
+
+    def gradient(poses):
+        poses = poses.clone().requires_grad_(True)
+        frames = render.frames(camera, scene, poses, gradient="boundary")
+        return torch.autograd.grad(frames.square().sum(), poses)[0]
+
+    both = gradient(paths)
+    alone = torch.stack([gradient(path) for path in paths])
+    torch.testing.assert_close(both, alone, rtol=1e-5, atol=1e-5 * float(alone.norm()))
+
+
+def test_jumps_that_no_shape_lists_are_refused_and_views_elsewhere_are_not():
+    """Two parts of a moving scene that stick in each other; a picture with hard texels."""
+    mi = backend.mitsuba()
+    ball = silhouette_scenes.ball()
+    wall = silhouette_scenes.build("wall")
+    camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.25, 4)
+    sunk = torch.eye(4, dtype=F64)[None].clone()
+    sunk[0, :3, 3] = torch.tensor([0.1, 2.45, 0.7])
+    with pytest.raises(DomainError, match="of the jumps of radiance in frame 0 lie on no edge or outline"):
+        render.frames(
+            camera, render.MovingScene(wall, {"ball": (ball, sunk)}), START[None], gradient="boundary"
+        )
+    hard = {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(silhouette_scenes.smooth(3, size=16)),
+        "raw": True,
+        "filter_type": "nearest",
+    }
+    board = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([0, 1, 0.7]).rotate([1, 0, 0], 90).scale(0.7),
+        "emitter": {"type": "area", "radiance": hard},
+    }
+    scene = MitsubaScene({"board": board})
+    with pytest.raises(DomainError, match="textures with hard texels"):
+        render.frames(camera, scene, START[None], gradient="boundary")
+    away = pose.look_at((0.05, -1.2, 1.0), (0.0, -3.0, 1.0))
+    assert float(render.frames(camera, scene, away[None], gradient="boundary").abs().max()) == 0.0
