@@ -3,7 +3,6 @@ against closed forms."""
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
@@ -11,7 +10,6 @@ from codesign import backend, pose, render
 from codesign.errors import DomainError
 from codesign.render import MitsubaScene
 from codesign.render.curve_points import places as _places
-from codesign.render.outline import Segments, mesh_edges, outlines
 from scenes import silhouettes as silhouette_scenes
 from studies.silhouettes import STEPS, Task
 
@@ -144,52 +142,7 @@ def test_points_on_curves_stand_for_their_whole_length(lengths_px, generator):
         )
 
 
-def test_flat_diagonals_are_no_edges_and_inner_edges_count_at_silhouettes_only():
-    corners = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
-    faces = np.array(
-        [
-            [0, 1, 3],
-            [0, 3, 2],
-            [4, 6, 7],
-            [4, 7, 5],
-            [0, 4, 5],
-            [0, 5, 1],
-            [2, 3, 7],
-            [2, 7, 6],
-            [0, 2, 6],
-            [0, 6, 4],
-            [1, 5, 7],
-            [1, 7, 3],
-        ]
-    )
-    assert len(mesh_edges(corners, faces)) == 12
-    angle = np.linspace(0, 2 * np.pi, 65)[:-1]
-    ring = np.concatenate([np.stack([np.cos(angle), np.sin(angle), 0 * angle + z], 1) for z in (0.0, 1.0)])
-    sides = np.array(
-        [[i, (i + 1) % 64, 64 + i] for i in range(64)]
-        + [[(i + 1) % 64, 64 + (i + 1) % 64, 64 + i] for i in range(64)]
-    )
-    rows = mesh_edges(ring, sides)
-    assert sum(row[3] for row in rows) == 128  # the open ends
-    start, end, normals, always = (torch.tensor(np.array(c)) for c in zip(*rows, strict=True))
-    index, _ = Segments(start, end, normals, always.bool()).pieces(
-        torch.tensor([5.0, 0.1, 0.5], dtype=F64), 10.0
-    )
-    assert int((~always.bool()[index]).sum()) == 2  # of 64 inner edges, the two where the tube turns away
-
-
-def test_interpenetrating_objects_and_unknown_ways_are_refused():
-    mi = backend.mitsuba()
-    T = mi.ScalarTransform4f
-    light = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
-    two = MitsubaScene(
-        {
-            "a": {"type": "cube", "emitter": light},
-            "b": {"type": "cube", "to_world": T().translate([0.9, 0.8, 0.7]), "emitter": light},
-        }
-    )
-    with pytest.raises(DomainError, match=r"an edge of shape '[ab]' passes through another shape"):
-        outlines(mi, two.scene)
+def test_unknown_ways_are_refused():
     scene = silhouette_scenes.build("wall")
     camera = render.Camera(render_pinhole(), 4, 4, 1.0, 1)
     with pytest.raises(DomainError, match="choose one of interior, boundary, difference, auto"):
@@ -203,22 +156,3 @@ def test_differences_reach_no_object():
     moving = render.MovingScene(wall, {"card": (silhouette_scenes.build("cubes"), asks)})
     with pytest.raises(DomainError, match="the pose of an object asks for one"):
         render.frames(render.Camera(render_pinhole(), 8, 8, 1.0, 4), moving, path, gradient="difference")
-
-
-def test_a_seam_of_two_walls_counts_once():
-    mi = backend.mitsuba()
-    T = mi.ScalarTransform4f
-    light = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
-    scene = MitsubaScene(
-        {
-            "floor": {"type": "rectangle", "emitter": light},
-            "wall": {
-                "type": "rectangle",
-                "to_world": T().translate([0, 1, 1]).rotate([1, 0, 0], 90),
-                "emitter": light,
-            },
-        }
-    )
-    (edges,) = scene.outline()
-    assert isinstance(edges, Segments)
-    assert edges.start.shape[0] == 7  # two rectangles of four edges, one shared

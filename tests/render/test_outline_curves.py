@@ -7,6 +7,7 @@ import torch
 
 from codesign import backend
 from codesign.errors import DomainError
+from codesign.render.charts import emissive_mesh
 from codesign.render.outline.curves import DEEPEST, EPS, PARTS, Circles, Cylinders, Segments, Spheres
 
 F64 = torch.float64
@@ -158,22 +159,34 @@ def test_what_float32_rays_cannot_find_is_refused(ratio):
             curve.aside_rad(index, eye)
 
 
-def test_straight_edges_and_rims_are_read_close_by():
-    """1e-5 rad, and what rounding of coordinates to 24 bits makes of it: 0.05 m at 100 m from the origin."""
-    zero = torch.zeros(1).long()
-    start = torch.tensor([[0.0, 1.0, 0.0]], dtype=F64)
-    end = torch.tensor([[0.0, 1.0, 1.0]], dtype=F64)
+@pytest.mark.parametrize(
+    ("offset_m", "distance_m", "size_m"), [(0, 1, 0.1), (3, 1, 1), (0, 0.1, 3), (100, 1, 1)]
+)
+def test_float32_rays_find_straight_edges_within_the_reading_angle(offset_m, distance_m, size_m):
+    """By bisection, from viewpoints that float32 does not hold, at points anywhere on an edge of a triangle."""
+    mi = backend.mitsuba()
+    rng = np.random.default_rng(4)
     always = torch.ones(1, dtype=torch.bool)
-    edge = Segments(start, end, torch.zeros(1, 2, 3, dtype=F64), always)
-    assert float(edge.aside_rad(zero, torch.zeros(3, dtype=F64))) == pytest.approx(1e-5, rel=0.05)
-    far = torch.tensor([100.0, 0.0, 0.0], dtype=F64)
-    edge = Segments(start + far, end + far, edge.normals, always)
-    near = float(edge.aside_rad(zero, far + torch.tensor([0.05, 1.0, 0.5], dtype=F64)))
-    assert near > 2 * 100 * 2**-24 / 0.05  # the viewpoint alone moves by half a unit in the last place
-    rim = Circles(
-        *(torch.tensor([v], dtype=F64) for v in ((0.0, 1.0, 0.0), (0.1, 0.0, 0.0), (0.0, 0.0, 0.1)))
-    )
-    assert float(rim.aside_rad(zero, torch.zeros(3, dtype=F64))) == pytest.approx(1e-5 + 20 * EPS, rel=0.1)
+    for _ in range(4):
+        corners = np.float32(offset_m * _units(rng, 1) + size_m * _units(rng, 3)).astype(np.float64)
+        mesh = emissive_mesh(mi, corners, np.array([[0, 1, 2]]), np.ones(1))
+        scene = mi.load_dict({"type": "scene", "triangle": mesh})
+        start, end = torch.tensor(corners[:1]), torch.tensor(corners[1:2])
+        curve = Segments(start, end, torch.zeros(1, 2, 3, dtype=F64), always, torch.zeros(1, dtype=F64))
+        place = corners[0] + rng.uniform(0.1, 0.9, (64, 1)) * (corners[1] - corners[0])
+        eyes = place + distance_m * _units(rng, 64)
+        along = (place - eyes) / distance_m
+        aside = np.cross(along, corners[1] - corners[0])
+        aside *= (np.sign(((corners[2] - eyes) * aside).sum(1)) / np.linalg.norm(aside, axis=1))[:, None]
+        low, high = np.full(64, -1e-3), np.full(64, 1e-3)
+        fair = _hits(scene, eyes, along + 1e-3 * aside) & ~_hits(scene, eyes, along - 1e-3 * aside)
+        for _ in range(26):
+            middle = (low + high) / 2
+            hit = _hits(scene, eyes, along + middle[:, None] * aside)
+            low, high = np.where(hit, low, middle), np.where(hit, middle, high)
+        reading = [float(curve.aside_rad(torch.zeros(1).long(), torch.tensor(eye))) for eye in eyes]
+        assert fair.mean() > 0.5
+        assert (np.abs(low) < np.array(reading))[fair].all()
 
 
 @pytest.mark.parametrize("eye", [(0.3, 0.4, 0.9), (3.0, 0.4, 1e-3), (0.5, 0.2, 1e-4), (0.0, 0.0, 2.0)])
@@ -181,7 +194,8 @@ def test_no_piece_of_a_rim_turns_back(eye):
     """A piece that went out and came back would look short: seen from the viewpoint, no piece bends by more than a
     quarter turn, however nearly edge-on, and together they are the whole rim."""
     rim = Circles(
-        *(torch.tensor([v], dtype=F64) for v in ((0.1, 0.0, 0.0), (0.2, 0.1, 0.0), (-0.15, 0.3, 0.0)))
+        *(torch.tensor([v], dtype=F64) for v in ((0.1, 0.0, 0.0), (0.2, 0.1, 0.0), (-0.15, 0.3, 0.0))),
+        torch.zeros(1),
     )
     eye = torch.tensor(eye, dtype=F64)
     index, bounds = rim.pieces(eye, 0.01)

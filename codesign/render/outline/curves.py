@@ -3,13 +3,14 @@ and cylinders.
 
 A curve is cut into pieces [s0, s1] of its parameter; a piece becomes a point of the world once a parameter
 and a viewpoint are given. ``aside_rad`` says how far to either side of the true curve the radiances before and
-behind it are read.
+behind it are read, and ``covered`` whether surfaces lie at its own distance on both its sides.
 
 Rays are cast in float32. Mitsuba finds a sphere or cylinder of radius r at distance d by the sign of
 b^2 - 4 a c, of size (r / d)^2 of its terms; an error of one part in 2^23 of these moves the edge by
 2^-23 d / r rad. Measured by bisection at d / r from 1.2 to 5000, coordinates up to 100 m from the origin: at
 most 1.05 times that for both, and 2^-23 times coordinate over distance where that is larger (cylinders, whose
-matrix is inverted in float32). Readings lie at twice that, never deeper in the shape than half its radius;
+matrix is inverted in float32). A straight edge moves by 2^-23 times 2 or less times the distance of its furthest
+end over that of the ray's point. Readings lie at twice that, never deeper in the shape than half its radius;
 where the edge itself may lie there (beyond some 2,000 radii) the curve is refused.
 """
 
@@ -20,30 +21,36 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 
-ASIDE_RAD = 1e-5  # of straight edges and rims; a float32 ray is good to a hundredth of that
+ASIDE_RAD = 1e-5  # of round curves; rays through a float32 lens are good to a tenth of that
+STRAIGHT_RAD = 3e-6  # of straight edges, near whose corners a wider reading would see the next edge
 EPS = 2.0**-23
 SAFETY = 2.0
 DEEPEST = 0.5  # share of the radius seen at which the reading inside a curved shape lies at most
+LONG = 2.0  # units in the last place by which a straight edge moves per share of its furthest end
 ROUND = 96  # pieces of a full circle
 PARTS = 16  # parts of a cylinder's length that tell their own distance
 
 
 @dataclass(frozen=True)
 class Segments:
-    """Straight edges. start, end: [E, 3]. normals: [E, 2, 3] of the two faces; always: [E] bool, True where
-    it counts from every side (rims, seams, sharp creases)."""
+    """Straight edges. start, end: [E, 3]. normals: [E, 2, 3] of the two faces, on the side that shines, 0 where
+    none is known; always: [E] bool, True where it counts from every side but that from which both faces are black (rims, seams, sharp creases). width_m: [E], how far apart edges lie that count as
+    this one."""
 
     start: Tensor
     end: Tensor
     normals: Tensor
     always: Tensor
+    width_m: Tensor
 
     def pieces(self, viewpoint, angle):
         """Indices and parameters [n], [n, 2] of pieces that subtend at most ``angle`` from the viewpoint [3]
         and may be outlines there."""
         towards = viewpoint - self.start
-        turned = (self.normals * towards[:, None]).sum(2)
-        kept = torch.nonzero(self.always | (turned[:, 0] * turned[:, 1] <= 0))[:, 0]
+        facing = (self.normals * towards[:, None]).sum(2)
+        outline = facing.prod(1) <= 0
+        black = (facing < 0).all(1)
+        kept = torch.nonzero((self.always | outline) & ~black)[:, 0]
         return _cut(kept, _count(self.start[kept] - viewpoint, self.end[kept] - viewpoint, angle))
 
     def points(self, index, s, viewpoint):
@@ -54,17 +61,30 @@ class Segments:
         """Angle [n] from the viewpoint [3] at which radiances beside the curves ``index`` [n] are read."""
         start = self.start[index]
         end = self.end[index]
-        distance = _nearest(start - viewpoint, end - viewpoint)
-        return ASIDE_RAD + _rounding(viewpoint, torch.maximum(start.norm(dim=1), end.norm(dim=1)), distance)
+        a = start - viewpoint
+        b = end - viewpoint
+        distance = _nearest(a, b)
+        furthest = torch.maximum(a.norm(dim=1), b.norm(dim=1))
+        size = torch.maximum(start.norm(dim=1), end.norm(dim=1))
+        rays = STRAIGHT_RAD + SAFETY * LONG * EPS * furthest / distance.clamp_min(1e-6)
+        return rays + _rounding(viewpoint, size, distance) + _wide(self.width_m[index], distance)
+
+    def covered(self, index, viewpoint):
+        """Whether [n] surfaces lie at the curve's own distance on both its sides, seen from the viewpoint [3]:
+        creases of which both faces are seen. A reading from much farther away has then missed them."""
+        facing = (self.normals[index] * (viewpoint - self.start[index])[:, None]).sum(2)
+        return (facing > 0).all(1)
 
 
 @dataclass(frozen=True)
 class Circles:
-    """Rims of disks and cylinders: centre + cos u + sin v, with u and v of the rim's radius; [C, 3] each."""
+    """Rims of disks and cylinders: centre + cos u + sin v, with u and v of the rim's radius; [C, 3] each.
+    width_m: [C], how far apart rims lie that count as this one."""
 
     centre: Tensor
     u: Tensor
     v: Tensor
+    width_m: Tensor
 
     def pieces(self, viewpoint, angle):
         """As for Segments; all of every rim, cut where it turns back as seen from the viewpoint: a piece that went
@@ -98,9 +118,15 @@ class Circles:
         radius = torch.minimum(self.u[index].norm(dim=1), self.v[index].norm(dim=1))
         distance = torch.maximum((centre - viewpoint).norm(dim=1), radius)
         wide = ASIDE_RAD + SAFETY * EPS * distance / radius
-        return torch.minimum(wide, DEEPEST * radius / distance) + _rounding(
-            viewpoint, centre.norm(dim=1), distance
+        return (
+            torch.minimum(wide, DEEPEST * radius / distance)
+            + _rounding(viewpoint, centre.norm(dim=1), distance)
+            + _wide(self.width_m[index], distance)
         )
+
+    def covered(self, index, viewpoint):
+        """As for Segments: nowhere."""
+        return torch.zeros_like(index, dtype=torch.bool)
 
 
 @dataclass(frozen=True)
@@ -135,6 +161,10 @@ class Spheres:
         centre = self.centre[index]
         distance = (centre - viewpoint).norm(dim=1)
         return _beside_round("sphere", centre, self.radius[index], distance, distance, viewpoint)
+
+    def covered(self, index, viewpoint):
+        """As for Segments: nowhere."""
+        return torch.zeros_like(index, dtype=torch.bool)
 
 
 @dataclass(frozen=True)
@@ -190,6 +220,10 @@ class Cylinders:
         distance = (middle - viewpoint).norm(dim=1)
         return _beside_round("cylinder", middle, self.radius[index], towards.norm(dim=1), distance, viewpoint)
 
+    def covered(self, index, viewpoint):
+        """As for Segments: nowhere."""
+        return torch.zeros_like(index, dtype=torch.bool)
+
     def _across(self, viewpoint, index=slice(None)):
         """From the axis to the viewpoint, across the axis [n, 3], and the axis' direction [n, 3]."""
         axis = torch.nn.functional.normalize((self.end - self.start)[index], dim=1)
@@ -219,6 +253,11 @@ def _beside_round(kind, place, radius, across, distance, viewpoint):
 def _rounding(viewpoint, size, distance):
     """Angle [n] that rounding of coordinates of the given size [n] m and of the viewpoint may make."""
     return SAFETY * EPS * (viewpoint.norm() + size) / distance.clamp_min(1e-6)
+
+
+def _wide(width_m, distance):
+    """Angle [n] beyond curves that lie ``width_m`` apart and count as one."""
+    return SAFETY * width_m / distance.clamp_min(1e-6)
 
 
 def _nearest(a, b):

@@ -1,0 +1,146 @@
+"""What a Mitsuba scene is made of, as its outline needs it: triangles with what their radiance is looked up by,
+spheres, disks and cylinders. World axes, metres, float64 out of Mitsuba's float32."""
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from codesign.errors import DomainError
+
+EVEN = 1e-4  # axes of a sphere or cylinder may differ in length and angle by this share
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """vertices: [V, 3]; faces: [F, 3], normals on the side that shines; values: [F, 3, k] by which radiance is looked up at every corner
+    (texture coordinates, colours, radiance of a face), None where it is one for all."""
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    values: np.ndarray | None
+
+    def corners(self):
+        """Points [N, 3] whose box holds the shape."""
+        return self.vertices
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A sphere: centre [3], radius."""
+
+    name: str
+    centre: np.ndarray
+    radius: float
+
+    def corners(self):
+        """Points [N, 3] whose box holds the shape."""
+        return self.centre + self.radius * np.array([[-1.0], [1.0]])
+
+
+@dataclass(frozen=True)
+class Disk:
+    """A disk: centre [3] and half axes u, v [3] at right angles."""
+
+    name: str
+    centre: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+
+    def corners(self):
+        """Points [N, 3] whose box holds the shape."""
+        reach = np.hypot(self.u, self.v)
+        return np.stack([self.centre - reach, self.centre + reach])
+
+
+@dataclass(frozen=True)
+class Tube:
+    """A cylinder without caps: ends of its axis [3], half axes u, v [3] of one length at right angles."""
+
+    name: str
+    start: np.ndarray
+    end: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+
+    @property
+    def radius(self):
+        """Radius, metres."""
+        return float(np.linalg.norm(self.u))
+
+    def corners(self):
+        """Points [N, 3] whose box holds the shape."""
+        reach = np.hypot(self.u, self.v)
+        return np.stack([p + k * reach for p in (self.start, self.end) for k in (-1, 1)])
+
+
+Shape = Mesh | Ball | Disk | Tube
+
+
+def read(mi: Any, shape: Any) -> Shape:
+    """A Mitsuba shape as Mesh, Ball, Disk or Tube. Raises: DomainError for shapes whose outline is not
+    known."""
+    kind = shape.shape_type()
+    name = shape.id()
+    parameters = mi.traverse(shape)
+    if kind == int(mi.ShapeType.Rectangle):
+        corners = _place(parameters, [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+        return Mesh(name, corners, _wound(shape, np.array([[0, 1, 2], [0, 2, 3]])), None)
+    if kind == int(mi.ShapeType.Sphere):
+        centre, *ends = _place(parameters, [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+        _check_even(name, "sphere", *(end - centre for end in ends))
+        return Ball(name, centre, float(np.linalg.norm(ends[0] - centre)))
+    if kind == int(mi.ShapeType.Disk):
+        centre, u, v = _place(parameters, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+        return Disk(name, centre, u - centre, v - centre)
+    if kind == int(mi.ShapeType.Cylinder):
+        start, end, u, v = _place(parameters, [[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0]])
+        _check_even(name, "cylinder", u - start, v - start)
+        return Tube(name, start, end, u - start, v - start)
+    if shape.is_mesh() and "vertex_positions" in parameters:
+        vertices = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+        faces = np.array(parameters["faces"], dtype=np.int64).reshape(-1, 3)
+        faces = _wound(shape, faces)
+        return Mesh(name, vertices, faces, _values(shape, parameters, faces, len(vertices)))
+    raise DomainError(
+        f"the outline of shape '{name}' is not known; use meshes, rectangles, cubes, spheres, disks and "
+        "cylinders, or ask for gradient 'difference'."
+    )
+
+
+def _wound(shape, faces):
+    """Faces [F, 3] wound so that their normals point to the side that shines."""
+    return faces[:, ::-1] if shape.has_flipped_normals() else faces
+
+
+def _values(shape, parameters, faces, count):
+    emitter = str(shape.emitter()) if shape.is_emitter() else ""
+    attribute = re.search(r'MeshAttribute\[\s*name = "((face|vertex)_[^"]*)"', emitter)
+    if attribute:
+        value = np.array(parameters[attribute[1]], dtype=np.float64)
+        if attribute[2] == "face":
+            return np.repeat(value.reshape(len(faces), 1, -1), 3, 1)
+        return value.reshape(count, -1)[faces]
+    if "vertex_texcoords" in parameters and "Uniform" not in emitter and shape.has_vertex_texcoords():
+        return np.array(parameters["vertex_texcoords"], dtype=np.float64).reshape(-1, 2)[faces]
+    return None
+
+
+def _place(parameters, points):
+    matrix = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    return np.array(points, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _check_even(name, kind, *axes):
+    lengths = [float(np.linalg.norm(axis)) for axis in axes]
+    even = max(lengths) - min(lengths) <= EVEN * max(lengths)
+    square = all(
+        abs(float(a @ b)) <= EVEN * max(lengths) ** 2 for i, a in enumerate(axes) for b in axes[i + 1 :]
+    )
+    if not (even and square):
+        raise DomainError(
+            f"{kind} '{name}' is scaled unequally (half axes {', '.join(f'{v:.3g}' for v in lengths)} m) or "
+            "sheared, and the outline of such a shape is not known; scale it equally, or give it as a mesh."
+        )
