@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import BackendError, GradientError
+from codesign.errors import BackendError, DomainError, GradientError
 
 MINIMUM_LLVM = (
     19  # 15 and 16 abort the process while compiling Mitsuba 3.9 kernels; 14 is refused; 19 and 22 work
@@ -52,10 +52,18 @@ def llvm_version() -> tuple[int, int, int] | None:
     return None if found[0] < 0 else found
 
 
+def device_name(device: Any) -> str:
+    """ "cpu" or "cuda" for a device that kernels run on, also as torch.device; DomainError for any other."""
+    found = str(device)
+    if found not in ("cpu", "cuda", "cuda:0"):
+        raise DomainError(f"device {found!r} is not known here; choose 'cpu' or 'cuda' (the first GPU).")
+    return found.removesuffix(":0")
+
+
 def check_version(device: str = "cpu") -> None:
     """Raise BackendError unless the compiler drjit needs for ``device`` is present and fit. Costs
-    milliseconds."""
-    if device.startswith("cuda"):
+    milliseconds. Also DomainError for an unknown device."""
+    if device_name(device) == "cuda":
         if not torch.cuda.is_available():
             raise BackendError(
                 "device 'cuda' was asked for but torch sees no CUDA device; use --device cpu, or install a "
@@ -79,7 +87,7 @@ def check_version(device: str = "cpu") -> None:
 def variant(device: str = "cpu") -> str:
     """Name of the Mitsuba variant used on ``device``: one radiance channel, because event sensors are
     monochrome."""
-    return "cuda_ad_mono" if device.startswith("cuda") else "llvm_ad_mono"
+    return "cuda_ad_mono" if device_name(device) == "cuda" else "llvm_ad_mono"
 
 
 def trial_render(device: str = "cpu", timeout_s: float = 180) -> tuple[bool, str]:
@@ -162,7 +170,7 @@ class Arrays:
 def arrays(device: str = "cpu", dtype: torch.dtype = torch.float32) -> Arrays:
     """drjit types that match a torch device and dtype (float32 or float64)."""
     check_version(device)
-    if device.startswith("cuda"):
+    if device_name(device) == "cuda":
         import drjit.cuda.ad as ad
     else:
         import drjit.llvm.ad as ad
@@ -171,6 +179,15 @@ def arrays(device: str = "cpu", dtype: torch.dtype = torch.float32) -> Arrays:
     if dtype == torch.float64:
         return Arrays(ad.Float64, ad.UInt32, ad.Int, ad.Bool, ad.Array3f64)
     raise GradientError(f"kernels compute in float32 or float64, not {dtype}; convert the tensor first.")
+
+
+@lru_cache(maxsize=1)
+def memory_bytes() -> int:
+    """Memory of this machine, bytes: 64 GiB where the system does not say."""
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return 2**36
 
 
 def widen(arr: Arrays, parameters: Any, count: int, width: int) -> list[Any]:

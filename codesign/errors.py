@@ -1,6 +1,6 @@
 """One small family of exceptions. Every message says what was given, what is allowed, and what to do."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # sentences cost no import of torch
     from torch import Tensor
@@ -36,6 +36,32 @@ class GradientError(CodesignError, RuntimeError):
 
 class NonFiniteError(CodesignError, ArithmeticError):
     """A value or gradient became infinite or NaN; the message names the junction where it appeared."""
+
+
+def as_number(value: Any, name: str) -> float:
+    """A real number as a float, NaN and infinity too; DomainError for text, lists, complex numbers, None."""
+    try:
+        if isinstance(value, str):
+            raise TypeError
+        return float(value)
+    except (TypeError, ValueError, RuntimeError):
+        raise DomainError(f"{name} = {value!r} is no number; give one.") from None
+
+
+def check_whole(value: Any, name: str) -> int:
+    """A whole number of at least 1 as an int; DomainError for anything else."""
+    number = as_number(value, name)
+    if not (1 <= number < float("inf") and number % 1 == 0):
+        raise DomainError(f"{name} = {value} must be a whole number of at least 1.")
+    return int(value)
+
+
+def check_seed(value: Any, name: str, bits: int = 63) -> int:
+    """A seed as an int, whole and below 2 ** bits in size; DomainError for anything else."""
+    number = as_number(value, name)
+    if not (abs(number) < 2**bits and number % 1 == 0):
+        raise DomainError(f"{name} = {value} must be a whole number between -2^{bits} and 2^{bits}.")
+    return int(value)
 
 
 def check_finite(

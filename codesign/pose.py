@@ -2,12 +2,17 @@
 reads right to left."""
 
 from collections.abc import Sequence
+from typing import Any, TypeAlias
 
+import numpy as np
 import torch
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
+
+# [..., T, 4, 4], or [4, 4] where one pose is asked for; numbers other than tensors are taken in float64
+Poses: TypeAlias = Tensor | np.ndarray | Sequence[Any]
 
 
 def se3_exp(twist: Tensor) -> Tensor:
@@ -86,20 +91,51 @@ def look_at(
     return pose
 
 
-def check_pose(transform: Tensor) -> Tensor:
-    """Raise unless the tensor is one rigid transform [4, 4]; returns it."""
+def as_poses(poses: Poses) -> Tensor:
+    """Poses as a tensor: tensors as they are, numbers of numpy arrays and lists in float64, a list of tensors
+    stacked.
+
+    >>> as_poses([look_at((0.0, 0.0, 1.0), (2.0, 0.0, 0.0))] * 3).shape
+    torch.Size([3, 4, 4])
+
+    Gradient: to tensors, in a list too. Raises: DomainError for what are no numbers or complex ones;
+      ShapeError for a list of tensors that differ in shape.
+    """
+    if isinstance(poses, Tensor):
+        return poses
+    if isinstance(poses, list | tuple) and poses and all(isinstance(pose, Tensor) for pose in poses):
+        if len(shapes := {tuple(pose.shape) for pose in poses}) > 1:
+            raise ShapeError(f"poses are a list of tensors {sorted(shapes)}; give each the shape [4, 4].")
+        return torch.stack(list(poses))
+    try:
+        values = np.asarray(poses)
+        if values.dtype.kind not in "iuf":
+            raise TypeError
+    except (TypeError, ValueError, RuntimeError):
+        raise DomainError(
+            f"poses are a {type(poses).__name__} that holds no real numbers [T, 4, 4]; give a tensor, a numpy "
+            "array or nested lists."
+        ) from None
+    return torch.from_numpy(values.astype(np.float64))
+
+
+def check_pose(transform: Poses) -> Tensor:
+    """Raise unless the tensor (or array, or nested list) is one rigid transform [4, 4]; returns it as a
+    tensor."""
+    transform = as_poses(transform)
     if transform.shape != (4, 4):
         raise ShapeError(f"a pose must be [4, 4], got {tuple(transform.shape)}.")
     return check_poses(transform[None])[0]
 
 
-def check_poses(transform: Tensor) -> Tensor:
-    """Raise unless the tensor holds rigid transforms [..., T >= 1, 4, 4], a trajectory or a batch of them;
-    returns it."""
+def check_poses(transform: Poses) -> Tensor:
+    """Raise unless the tensor (or array, or nested list) holds rigid transforms [..., T >= 1, 4, 4], a
+    trajectory or a batch of them; returns it as a tensor."""
+    transform = as_poses(transform)
     if transform.ndim < 3 or transform.shape[-2:] != (4, 4) or transform.numel() == 0:
         raise ShapeError(
             f"poses must be [T >= 1, 4, 4], or [..., T >= 1, 4, 4] for several trajectories, got "
-            f"{tuple(transform.shape)}."
+            f"{tuple(transform.shape)}{'; for one pose give pose[None]' if transform.shape == (4, 4) else ''}."
         )
     if transform.dtype not in (torch.float32, torch.float64):
         raise DomainError(f"poses are {transform.dtype}; give float32 or float64, as by .double().")

@@ -64,7 +64,7 @@ def bake(
             f"bake: texel_m = {texel_m}, samples = {samples}, max_texels = {max_texels}, fine = {fine}: "
             "sizes must be positive, samples and fine at least 1, max_texels at least 4."
         )
-    lit = MitsubaScene(description, device, merge=False)  # every shape keeps its name
+    lit = MitsubaScene(description, device, merge=False, emissive=False)  # every shape keeps its name
     mi = lit.mi
     _check_surfaces(mi, lit.scene, description)
     work = _Bake(

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.render.film import Film, check_whole, coarse_pixels
+from codesign.errors import DomainError, ShapeError, check_finite, check_seed, check_whole
+from codesign.render.film import Film, check_memory, coarse_pixels
 from codesign.render.kinds import Lens
 from codesign.render.sampling import film_pupil_pattern
 from codesign.types import Rays
@@ -55,21 +55,30 @@ class Camera:
         falloff: bool = False,
         aim: bool = False,
     ):
-        check_whole("samples_per_pixel", samples_per_pixel)
+        samples_per_pixel = check_whole(samples_per_pixel, "camera: samples_per_pixel")
+        if spectrum is not None and not (
+            hasattr(spectrum, "wavelengths_um") and hasattr(spectrum, "weights")
+        ):
+            raise DomainError(
+                f"camera: a {type(spectrum).__name__} is no spectrum; give a lens.Spectrum, or None for the d line."
+            )
         if spectrum is not None and samples_per_pixel % len(spectrum.wavelengths_um):
             raise DomainError(
                 f"camera: {samples_per_pixel} samples per pixel cannot be shared equally by "
                 f"{len(spectrum.wavelengths_um)} wavelengths; make the one a multiple of the other."
             )
-        if not hasattr(lens, "camera_rays"):
+        if not hasattr(lens, "camera_rays") or isinstance(lens, type):
             raise DomainError(
                 f"camera: a {type(lens).__name__} has no camera_rays, so it is no lens; give a GeoLens, ThinLens, "
                 "Pinhole, or an object of your own with camera_rays and film_points as GeoLens has them."
             )
         self.lens: Any = lens
-        self.samples_per_pixel = int(samples_per_pixel)
-        self.seed = int(seed)
+        if film is not None and not isinstance(film, Film):
+            raise DomainError(f"camera: a {type(film).__name__} is no film; give a render.Film, or None.")
+        self.samples_per_pixel = samples_per_pixel
+        self.seed = check_seed(seed, "camera: seed")
         self.film = (film or Film(width_px, height_px, width_px, height_px, pixel_pitch_mm)).check()
+        check_memory(self.film, self.samples_per_pixel)
         self.spectrum = spectrum
         self.falloff = falloff
         self.aim = aim
@@ -83,7 +92,7 @@ class Camera:
     def with_seed(self, seed: int) -> "Camera":
         """The same lens and film with other samples."""
         twin = copy.copy(self)
-        twin.seed = int(seed)
+        twin.seed = check_seed(seed, "camera: seed")
         return twin
 
     def check(self) -> "Camera":
@@ -119,6 +128,10 @@ class Camera:
         if rays is None:
             return self.rays()
         count = math.prod(self.film.shape) * self.samples_per_pixel
+        if not isinstance(rays, Rays):
+            raise DomainError(
+                f"a {type(rays).__name__} was given as rays; give those of this camera, camera.rays()."
+            )
         if rays.weight.numel() != count:
             raise ShapeError(
                 f"{rays.weight.numel()} rays for a camera of {math.prod(self.film.shape)} pixels with "
@@ -217,8 +230,11 @@ def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -
 
     Gradient: to the points and to the lens, by the implicit function theorem (one Newton step with gradients
       at the solution); 0 to NaN points.
-    Raises: DomainError when a point is not finite or not in front of the camera.
+    Raises: DomainError when a point is not finite or not in front of the camera; ShapeError.
     """
+    points_cam_m = torch.as_tensor(points_cam_m)
+    if points_cam_m.ndim < 2 or points_cam_m.shape[-1] != 3:
+        raise ShapeError(f"points to project are [..., N, 3], got {tuple(points_cam_m.shape)}.")
     check_finite(points_cam_m, "points to project", "drop them first")
     shape = (*points_cam_m.shape[:-1], 2)
     points_cam_m = points_cam_m.reshape(-1, 3).double()

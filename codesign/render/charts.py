@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, ShapeError
+from codesign.render.soundness import checked_mesh
 
 # texels around each face of a cube's texture that repeat its border, so that interpolation sees no neighbour
 CUBE_GAP = 2
@@ -124,7 +125,14 @@ def emitter(mi, texture):
 
 def emissive_mesh(mi, vertices, faces, light, uv=None, flip=False, bsdf=None):
     """A Mitsuba mesh of flat faces: ``light`` is an emitter dictionary, an array [F] of radiance per face, or
-    None; ``bsdf`` a dictionary or None."""
+    None; ``bsdf`` a dictionary or None. Raises: DomainError and ShapeError for a mesh that cannot be."""
+    vertices, faces = checked_mesh("mesh", vertices, faces)
+    for label, values, count in (
+        ("radiance per face", None if isinstance(light, dict) else light, len(faces)),
+        ("texture coordinates", uv, len(vertices)),
+    ):
+        if values is not None and len(values) != count:  # Mitsuba would read beyond their end
+            raise ShapeError(f"mesh: {len(values)} values of {label} for {count}; give one for each.")
     properties = mi.Properties()
     if light is not None:
         source = (

@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, check_whole
+from codesign.pose import Poses
 from codesign.render.camera import Camera
 from codesign.render.film import coarse_pixels
 from codesign.render.hits import dot, of_part, turned
@@ -18,7 +18,7 @@ CLOSEST_M = 1e-5  # for lenses without an aperture
 BACKS = 0.5  # of the rays of a frame
 
 
-def check_view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Tensor, every_px: int = 8) -> None:
+def check_view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Poses, every_px: int = 8) -> None:
     """Raise DomainError, with the number of the first frame, when a sequence of views is not one a camera
     could have.
 
@@ -34,7 +34,7 @@ def check_view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Tensor, 
     """
     scene, T_world_cam = in_one_row(scene, T_world_cam)
     with torch.no_grad():
-        pixels = coarse_pixels(camera.film, int(every_px))
+        pixels = coarse_pixels(camera.film, check_whole(every_px, "every_px"))
         rays = camera.chief_rays(pixels)
         rays = replace(rays, weight=(rays.weight > 0).to(rays.weight))
         light = shade(rays, scene, T_world_cam, 1)

@@ -6,7 +6,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError
+from codesign.backend import memory_bytes
+from codesign.errors import DomainError, as_number, check_whole
+
+# origin, direction and weight of a ray in float64, and its film and pupil position; tracing takes more
+BYTES_PER_RAY = 88
 
 
 @dataclass(frozen=True)
@@ -28,14 +32,21 @@ class Film:
     def check(self) -> "Film":
         """Raise DomainError unless there are pixels and every window lies on the sensor; returns the film."""
         for label in ("sensor_width_px", "sensor_height_px", "width_px", "height_px"):
-            check_whole(label, getattr(self, label))
-        if not 0 < self.pixel_pitch_mm < float("inf"):
+            check_whole(getattr(self, label), f"camera: {label}")
+        if not 0 < as_number(self.pixel_pitch_mm, "camera: pixel_pitch_mm") < float("inf"):
             raise DomainError(f"camera: pixel_pitch_mm = {self.pixel_pitch_mm} must be positive and finite.")
         if self.windows_px is not None and len(self.windows_px) == 0:
             raise DomainError(
                 "camera: there is no window on the film; give at least one, or None for the whole sensor."
             )
-        for left, top in self.windows_px or ((0, 0),):
+        for window in self.windows_px or ((0, 0),):
+            if not (isinstance(window, tuple | list) and len(window) == 2):
+                raise DomainError(
+                    f"camera: the window {window!r} is no pair (left, top) of pixels; give one."
+                )
+            left, top = window
+            for edge in window:
+                as_number(edge, "camera: the edge of a window")
             if not (
                 0 <= left <= self.sensor_width_px - self.width_px
                 and 0 <= top <= self.sensor_height_px - self.height_px
@@ -74,6 +85,18 @@ class Film:
         return (corners[:, None] + base).reshape(-1, 2)
 
 
+def check_memory(film: Film, samples_per_pixel: int) -> None:
+    """Raise DomainError when the rays of one frame cannot be in this machine's memory, BYTES_PER_RAY each."""
+    count = math.prod(film.shape) * samples_per_pixel
+    needed = count * BYTES_PER_RAY
+    if needed > memory_bytes():
+        raise DomainError(
+            f"camera: {math.prod(film.shape):.3g} pixels of {samples_per_pixel} samples are {count:.3g} rays per "
+            f"frame, at least {needed / 2**30:.3g} GiB; this machine has {memory_bytes() / 2**30:.3g} GiB: make "
+            "the film smaller, look at windows of it (render.Film), or take fewer samples."
+        )
+
+
 def coarse_pixels(film: Film, every_px: int) -> Tensor:
     """Pixel coordinates [N, 2] on a grid over every window of the film, its last rows and columns
     included."""
@@ -86,9 +109,3 @@ def coarse_pixels(film: Film, every_px: int) -> Tensor:
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
     return (corners[:, None] + torch.stack([x.reshape(-1), y.reshape(-1)], 1)).reshape(-1, 2)
-
-
-def check_whole(label: str, value: float) -> None:
-    """Raise DomainError unless a count is a whole number of at least 1."""
-    if not (value >= 1 and value % 1 == 0):
-        raise DomainError(f"camera: {label} = {value} must be a whole number of at least 1.")

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, GradientError
+from codesign.errors import DomainError, GradientError, as_number, check_seed, check_whole
 from codesign.render.bake import bake
 from codesign.render.camera import Camera
 from codesign.render.kinds import Scene
@@ -53,15 +53,14 @@ class PathScene(MitsubaScene):
         seed: int = 0,
         integrator: Any = None,
     ):
-        if not samples >= 1:
-            raise DomainError(f"path light: samples = {samples} per ray must be at least 1.")
-        if max_depth != -1 and not max_depth >= 1:
+        samples = check_whole(samples, "path light: samples per ray")
+        if max_depth != -1 and not as_number(max_depth, "path light: max_depth") >= 1:
             raise DomainError(
                 f"path light: max_depth = {max_depth} must be at least 1, or -1 for any length."
             )
-        super().__init__(description, device)
-        self.samples = int(samples)
-        self.seed = int(seed)
+        super().__init__(description, device, emissive=False)
+        self.samples = samples
+        self.seed = _path_seed(seed)
         self.integrator = integrator or self.mi.load_dict(
             {"type": "path", "max_depth": int(max_depth), "rr_depth": 64}
         )
@@ -69,7 +68,7 @@ class PathScene(MitsubaScene):
     def with_seed(self, seed: int) -> "PathScene":
         """The same scene with other random numbers."""
         twin = copy.copy(self)
-        twin.seed = int(seed)
+        twin.seed = _path_seed(seed)
         return twin
 
     def radiance(self, arr: Any, origin: Any, direction: Any) -> Any:
@@ -105,6 +104,10 @@ class PathScene(MitsubaScene):
         light = self.radiance(arr, origin, direction)
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
         return light, self.scene.ray_intersect_preliminary(ray, coherent=True).t
+
+
+def _path_seed(seed):
+    return check_seed(seed, "path light: seed", bits=31) % 2**32
 
 
 @dataclass(frozen=True)
@@ -206,7 +209,7 @@ def choose(
     """
     if not levels:
         raise DomainError("light.choose: there is no level to choose from; give at least one.")
-    if not 0 < tolerance < float("inf"):
+    if not 0 < as_number(tolerance, "light.choose: tolerance") < float("inf"):
         raise DomainError(
             f"light.choose: tolerance = {tolerance} must be positive and finite, such as 0.05 for 5 %."
         )

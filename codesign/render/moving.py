@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
-from codesign.pose import check_poses, inverse
-from codesign.render.kinds import Scene
+from codesign.pose import Poses, as_poses, check_poses, inverse
+from codesign.render.kinds import Scene, check_kind
 from codesign.types import Rays
 
 
@@ -28,7 +28,16 @@ class MovingScene:
       numbers of poses differ.
     """
 
-    def __init__(self, static: Scene, objects: Mapping[str, tuple[Scene, Tensor]]):
+    def __init__(self, static: Scene, objects: Mapping[str, tuple[Scene, Poses]]):
+        if not isinstance(objects, Mapping) or not all(
+            isinstance(pair, tuple | list) and len(pair) == 2 for pair in objects.values()
+        ):
+            raise DomainError(
+                "moving scene: objects are a dictionary {name: (scene, T_world_object [T, 4, 4])}; give a scene "
+                "and poses for each name."
+            )
+        for part in (static, *(scene for scene, _ in objects.values())):
+            check_kind(part.static if isinstance(part, MovingScene) else part)
         self.static = static
         self.names = tuple(objects)
         self.scenes = (static, *(scene for scene, _ in objects.values()))
@@ -97,11 +106,12 @@ def parts(scene: Any) -> tuple[Any, ...]:
     return scene.scenes if isinstance(scene, MovingScene) else (scene,)
 
 
-def scenes_and_poses(scene: Any, T_world_cam: Tensor) -> list[tuple[Any, Tensor]] | None:
+def scenes_and_poses(scene: Any, T_world_cam: Poses) -> list[tuple[Any, Tensor]] | None:
     """Pairs of a scene and the poses it is seen from, along the first axis of T_world_cam [W, ..., T, 4, 4],
     where ``scene`` is a list or tuple of W scenes; None for a single scene."""
     if not isinstance(scene, list | tuple):
         return None
+    T_world_cam = as_poses(T_world_cam)
     if T_world_cam.ndim < 4 or len(scene) != T_world_cam.shape[0]:
         raise ShapeError(
             f"{len(scene)} scenes for poses {tuple(T_world_cam.shape)}: give one scene for all trajectories, "
@@ -110,9 +120,12 @@ def scenes_and_poses(scene: Any, T_world_cam: Tensor) -> list[tuple[Any, Tensor]
     return list(zip(scene, T_world_cam, strict=True))
 
 
-def in_one_row(scene: Any, T_world_cam: Tensor, rays: Rays | None = None) -> tuple[Any, Tensor]:
+def in_one_row(scene: Any, T_world_cam: Poses, rays: Rays | None = None) -> tuple[Any, Tensor]:
     """The frames of a batch of trajectories [..., T, 4, 4] as one sequence: the scene for it, and poses
-    [N, 4, 4]; on one device with the rays."""
+    [N, 4, 4]; on one device with the rays. Raises: DomainError for what is no scene."""
+    for part in parts(scene):
+        check_kind(part)
+    T_world_cam = as_poses(T_world_cam)
     if rays is not None and rays.weight.device != T_world_cam.device:
         raise DomainError(
             f"poses are on {T_world_cam.device}, the rays of the camera on {rays.weight.device}; move one to "
@@ -162,6 +175,6 @@ def says_distance(kind):
 
 def _checked(name, poses):
     try:
-        return check_poses(torch.as_tensor(poses))
+        return check_poses(poses)
     except (DomainError, ShapeError) as error:
         raise type(error)(f"moving scene: object '{name}': {error}") from error

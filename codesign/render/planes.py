@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError
-from codesign.pose import check_pose
+from codesign.errors import DomainError, as_number
+from codesign.pose import Poses, check_pose
 
 
 class TexturedPlane:
@@ -27,7 +27,7 @@ class TexturedPlane:
         amplitude: Tensor | Sequence[float],
         phase_rad: Tensor | Sequence[float],
         mean: float = 100.0,
-        T_world_plane: Tensor | None = None,
+        T_world_plane: Poses | None = None,
         dtype: torch.dtype = torch.float64,
     ):
         for label, value in (
@@ -35,9 +35,13 @@ class TexturedPlane:
             ("amplitude", amplitude),
             ("phase_rad", phase_rad),
         ):
-            if not bool(torch.isfinite(torch.as_tensor(value)).all()):
+            try:
+                found = torch.as_tensor(value, dtype=torch.float64)
+            except (TypeError, ValueError, RuntimeError):
+                raise DomainError(f"textured plane: {label} holds no numbers; give one per wave.") from None
+            if not bool(found.isfinite().all()):
                 raise DomainError(f"textured plane: {label} holds NaN or infinite entries; remove them.")
-        if not 0 <= mean < float("inf"):
+        if not 0 <= as_number(mean, "textured plane: mean") < float("inf"):
             raise DomainError(
                 f"textured plane: mean = {mean} must be finite and at least 0; give a radiance on the "
                 "0..255 scale."
@@ -54,7 +58,7 @@ class TexturedPlane:
                 "given; give one of each per wave."
             )
         self.T_world_plane = (
-            torch.eye(4, dtype=torch.float64) if T_world_plane is None else check_pose(T_world_plane.double())
+            torch.eye(4, dtype=torch.float64) if T_world_plane is None else check_pose(T_world_plane).double()
         )
 
     def _constants(self, arr):

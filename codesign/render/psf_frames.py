@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from codesign.errors import DomainError, ShapeError
+from codesign.pose import Poses, as_poses
 from codesign.render.camera import Camera
 from codesign.render.kinds import Scene
 from codesign.render.moving import MovingScene, in_one_row, scenes_and_poses
@@ -29,7 +30,7 @@ FINEST = 4  # times that their step is halved at most
 def psf_frames(
     camera: Camera,
     scene: Scene | MovingScene | Sequence[Scene | MovingScene],
-    T_world_cam: Tensor,
+    T_world_cam: Poses,
     psf: PsfMap | None = None,
 ) -> Tensor:
     """Frames as ``render.frames`` has them, by convolution: four rays per pixel whatever the blur.
@@ -60,6 +61,7 @@ def psf_frames(
             f"psf frames: the map is of the film {psf.camera.film}, the camera has {camera.film}; make the map of "
             "this camera, psf_map(camera)."
         )
+    T_world_cam = as_poses(T_world_cam)
     if pairs := scenes_and_poses(scene, T_world_cam):
         return torch.stack([psf_frames(camera, one, poses, psf) for one, poses in pairs])
     row, poses = in_one_row(scene, T_world_cam, psf.sharp)

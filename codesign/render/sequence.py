@@ -6,6 +6,7 @@ with common random numbers, twelve renders for the poses and two per lens number
 three that is right for the frames at hand.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -13,8 +14,8 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError
-from codesign.pose import inverse, se3_exp
+from codesign.errors import DomainError, as_number
+from codesign.pose import Poses, as_poses, inverse, se3_exp
 from codesign.render.boundary import boundary_term, radiance_jumps
 from codesign.render.camera import Camera
 from codesign.render.kinds import Scene
@@ -54,7 +55,7 @@ class Choice:
 def frames(
     camera: Camera,
     scene: Scene | MovingScene | Sequence[Scene | MovingScene],
-    T_world_cam: Tensor,
+    T_world_cam: Poses,
     gradient: Way = "interior",
     per_px: float = 2.5,
     *,
@@ -91,6 +92,15 @@ def frames(
             f"gradient {gradient!r} traces the lens at other values than the given rays have; leave rays out, "
             "or choose 'interior' or 'boundary'."
         )
+    if not 0 < as_number(per_px, "per_px") < math.inf:
+        raise DomainError(
+            f"per_px = {per_px} samples per pixel length of silhouettes must be positive and finite, such as 2.5."
+        )
+    if not isinstance(camera, Camera):
+        raise DomainError(
+            f"the camera is a {type(camera).__name__}; give a render.Camera, which has a lens and a film."
+        )
+    T_world_cam = as_poses(T_world_cam)
     if pairs := scenes_and_poses(scene, T_world_cam):
         rays = camera.given(rays) if gradient in PROVEN else None
         return torch.stack([frames(camera, s, poses, gradient, per_px, rays=rays) for s, poses in pairs])

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, check_finite
-from codesign.pose import check_poses
+from codesign.errors import DomainError, as_number, check_finite, check_whole
+from codesign.pose import Poses, check_poses
 from codesign.render.camera import Camera
 from codesign.render.film import coarse_pixels
 from codesign.render.kinds import Scene, Trajectory
@@ -66,20 +66,19 @@ def exposed_frames(
     Raises: DomainError on a negative exposure, fewer than one sample, or poses that are not rigid.
     """
     t_s = check_finite(torch.as_tensor(t_s, dtype=torch.float64).reshape(-1), "times of the frames")
-    if not 0 <= exposure_s < math.inf:
+    if not 0 <= as_number(exposure_s, "exposure_s") < math.inf:
         raise DomainError(f"exposure_s = {exposure_s} must be finite and at least 0 seconds.")
-    if not (samples >= 1 and samples % 1 == 0):
-        raise DomainError(f"an exposure of {samples} time samples: give a whole number of at least 1.")
+    samples = check_whole(samples, "time samples of an exposure")
     rays = camera.rays()
     total = torch.zeros(())
-    for node, weight in zip(*(column.tolist() for column in rule(int(samples))), strict=True):
+    for node, weight in zip(*(column.tolist() for column in rule(samples)), strict=True):
         at = t_s + node * exposure_s
         total = total + weight * shade(rays, _at(scene, at), trajectory(at), camera.samples_per_pixel)
     return total.reshape(*total.shape[:-1], *camera.film.shape)
 
 
 def frame_chunks(
-    camera: Camera, scene: Scene | MovingScene, T_world_cam: Tensor, frames_per_chunk: int
+    camera: Camera, scene: Scene | MovingScene, T_world_cam: Poses, frames_per_chunk: int
 ) -> Iterator[Tensor]:
     """Generator of the frames of a long sequence, some at a time: [..., <= frames_per_chunk, *film.shape]
     each, in bounded memory. T_world_cam: [..., T, 4, 4]; a chunk holds those frames of every trajectory.
@@ -89,9 +88,8 @@ def frame_chunks(
       from one chunk at a time needs
     ``retain_graph=True`` where the lens is learned.
     """
-    check_poses(T_world_cam)
-    if not (frames_per_chunk >= 1 and frames_per_chunk % 1 == 0):
-        raise DomainError(f"frames_per_chunk = {frames_per_chunk} must be a whole number of at least 1.")
+    T_world_cam = check_poses(T_world_cam)
+    each = check_whole(frames_per_chunk, "frames_per_chunk")
     count = T_world_cam.shape[-3]
     if isinstance(scene, MovingScene):
         scene.check_length(count)
@@ -99,10 +97,7 @@ def frame_chunks(
         camera,
         scene,
         T_world_cam,
-        [
-            slice(first, min(first + int(frames_per_chunk), count))
-            for first in range(0, count, int(frames_per_chunk))
-        ],
+        [slice(first, min(first + each, count)) for first in range(0, count, each)],
     )
 
 
@@ -142,22 +137,20 @@ def adaptive_times(
     Source: Rebecq, Gehrig and Scaramuzza, ESIM: an open event camera simulator, CoRL 2018 (adaptive sampling
       by the largest displacement).
     """
+    start_s, end_s = as_number(start_s, "start_s"), as_number(end_s, "end_s")
     if not (math.isfinite(start_s) and math.isfinite(end_s) and start_s < end_s):
         raise DomainError(
             f"adaptive times: from {start_s} to {end_s} s is no interval; give finite times, the end after "
             "the start."
         )
-    if not 0 < largest_px < math.inf:
+    if not 0 < as_number(largest_px, "largest_px") < math.inf:
         raise DomainError(f"adaptive times: largest_px = {largest_px} must be positive and finite.")
-    if not (every_px >= 1 and every_px % 1 == 0):
-        raise DomainError(f"adaptive times: every_px = {every_px} must be a whole number of at least 1.")
+    every_px = check_whole(every_px, "adaptive times: every_px")
     shortest = SMALLEST_STEP * (end_s - start_s)
     with torch.no_grad():
         grids = [
             (pixels, camera.chief_rays(pixels))
-            for pixels in (
-                coarse_pixels(camera.film, int(spacing)) for spacing in (COARSE * every_px, every_px)
-            )
+            for pixels in (coarse_pixels(camera.film, spacing) for spacing in (COARSE * every_px, every_px))
         ]
         times = [float(start_s)]
         step = FIRST_STEP * (end_s - start_s)

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.errors import ShapeError
-from codesign.pose import inverse
+from codesign.errors import ShapeError, as_number
+from codesign.pose import Poses, as_poses, check_poses, inverse
 from codesign.render.camera import Camera, project
 from codesign.render.hits import Hits, carried, dot, first_hits, of_part, turned
 from codesign.render.kinds import Scene
@@ -78,16 +78,17 @@ def world_points(
     return carried(hits, poses_of_parts(scene, 1))[0], _depth(rays, hits)[0], hits.part[0] >= 0
 
 
-def view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Tensor, frame: int) -> View:
+def view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Poses, frame: int) -> View:
     """View of one frame of a sequence, or of several: T_world_cam [..., T, 4, 4], frame a number.
 
     Gradient: points and depth to the lens, camera and object poses.
     """
+    T_world_cam = as_poses(T_world_cam)
     batch = T_world_cam.shape[:-3]
     count = T_world_cam.shape[-3] if T_world_cam.ndim > 2 else 0
     rays = camera.chief_rays(camera.film.pixels())
     scene, poses = in_one_row(scene, T_world_cam, rays)
-    if not -count <= frame < count:
+    if not -count <= as_number(frame, "view: frame") < count:
         raise ShapeError(f"view: frame {frame} of a sequence of {count}; give a number below that.")
     rows = torch.arange(frame % count, poses.shape[0], count)
     hits = hits_of(rays, scene, cameras_of(scene, poses)[:, rows])
@@ -110,7 +111,7 @@ def view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Tensor, frame:
 def true_flow(
     camera: Camera,
     scene: Scene | MovingScene | Sequence[Scene | MovingScene],
-    T_world_cam: Tensor,
+    T_world_cam: Poses,
     stride: int = 1,
 ) -> tuple[Tensor, Tensor]:
     """Flow of every pixel centre from each pose to the one ``stride`` later, through the camera's current
@@ -144,7 +145,7 @@ def true_flow(
 def flow_and_occlusion(
     camera: Camera,
     scene: Scene | MovingScene | Sequence[Scene | MovingScene],
-    T_world_cam: Tensor,
+    T_world_cam: Poses,
     stride: int = 1,
 ) -> FlowTruth:
     """As ``true_flow``, and which of the points are hidden at the later time by something nearer: FlowTruth.
@@ -173,7 +174,7 @@ def flow_and_occlusion(
 def truth_of_frames(
     table: ProjectionTable,
     scene: Scene | MovingScene,
-    T_world_cam: Tensor,
+    T_world_cam: Poses,
     count: int,
     rays: Rays | None = None,
 ) -> FramesTruth:
@@ -184,6 +185,7 @@ def truth_of_frames(
       flow where there is a frame behind (of ``count`` - 1 frames where T = count). rays: the camera's chief rays
       through all pixel centres, where they are traced already.
     """
+    T_world_cam = check_poses(T_world_cam)
     camera = table.camera
     shape = camera.film.shape
     rays = camera.chief_rays(camera.film.pixels()) if rays is None else rays
@@ -251,7 +253,7 @@ def follow(optics: Camera | ProjectionTable, hits: Hits, later: Tensor, pixels: 
     return Track(hits, points, pixels, torch.where(valid[..., None], to, pixels), in_front, valid, chief)
 
 
-def later_points(rays: Rays, scene: Any, T_world_cam: Tensor) -> tuple[Tensor, Tensor]:
+def later_points(rays: Rays, scene: Any, T_world_cam: Poses) -> tuple[Tensor, Tensor]:
     """Points under rays at the first pose of each trajectory, as they lie before the camera at its last.
 
     Args: rays: Rays [P] (chief rays). scene: as for ``true_flow``; points move with their object. T_world_cam:
@@ -260,6 +262,7 @@ def later_points(rays: Rays, scene: Any, T_world_cam: Tensor) -> tuple[Tensor, T
       surface, and lies before the last camera (the point is (0, 0, 1) elsewhere).
     Gradient: to rays, camera and object poses, the surface taken as its tangent plane at the hit.
     """
+    T_world_cam = as_poses(T_world_cam)
     scene, poses = in_one_row(scene, T_world_cam, rays)
     length = T_world_cam.shape[-3]
     cameras = cameras_of(scene, poses)
@@ -300,6 +303,7 @@ def _hidden(camera, scene, later, found):
 def _flow_truth(camera, scene, T_world_cam, stride, occlusion):
     pixels = camera.film.pixels()
     rays = camera.chief_rays(pixels)
+    T_world_cam = as_poses(T_world_cam)
     scene, poses = in_one_row(scene, T_world_cam, rays)
     length = T_world_cam.shape[-3]
     if not 1 <= stride < length:

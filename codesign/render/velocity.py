@@ -7,13 +7,13 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.pose import check_poses, inverse, se3_exp
+from codesign.pose import Poses, check_poses, inverse, se3_exp
 
 LARGEST_TURN_RAD = 3.0  # towards half a turn the axis of a rotation is lost
 SMALL = 1e-4  # squared angle below which series are used; their next term is 1e-17
 
 
-def camera_velocity(T_world_cam: Tensor, t_s: Tensor | Sequence[float]) -> tuple[Tensor, Tensor]:
+def camera_velocity(T_world_cam: Poses, t_s: Tensor | Sequence[float]) -> tuple[Tensor, Tensor]:
     """Mean velocity of a camera between its poses: the constant twist that leads from each pose to the next.
 
     Args: T_world_cam: [..., T >= 2, 4, 4]. t_s: [T] times, increasing, the same for all trajectories.
@@ -24,7 +24,7 @@ def camera_velocity(T_world_cam: Tensor, t_s: Tensor | Sequence[float]) -> tuple
     Raises: DomainError when times do not increase or the camera turns by more than 3 rad from one pose to the
       next; ShapeError.
     """
-    check_poses(T_world_cam)
+    T_world_cam = check_poses(T_world_cam)
     t_s = check_finite(torch.as_tensor(t_s, dtype=torch.float64), "times of the poses")
     if t_s.shape != T_world_cam.shape[-3:-2] or t_s.numel() < 2:
         raise ShapeError(

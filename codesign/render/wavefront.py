@@ -6,8 +6,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.backend import arrays, run_kernel
-from codesign.errors import DomainError, ShapeError
+from codesign.backend import arrays, memory_bytes, run_kernel
+from codesign.errors import DomainError, ShapeError, check_whole
+from codesign.pose import Poses, as_poses
 from codesign.render.kinds import Scene
 from codesign.render.moving import MovingScene, cameras_in_parts, in_one_row, parts, says_distance
 from codesign.types import Rays
@@ -16,7 +17,7 @@ from codesign.types import Rays
 HIDDEN = 5e-3
 
 
-def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Tensor, samples_per_pixel: int) -> Tensor:
+def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Poses, samples_per_pixel: int) -> Tensor:
     """Pixel means [..., T, P] of the radiance along rays given in camera space, seen from every pose.
 
     Args: rays: Rays with N = P x samples_per_pixel. scene: anything with ``radiance`` and ``dtype``, or a
@@ -24,12 +25,12 @@ def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Tensor, samples_p
     Gradient: to the rays (weights included), the poses and the poses of moving objects; the motion of
       silhouettes is not in it.
     """
+    T_world_cam = as_poses(T_world_cam)
     batch = T_world_cam.shape[:-2]
     scene, T_world_cam = in_one_row(scene, T_world_cam, rays)
     count = rays.weight.numel()
     poses = T_world_cam.shape[0]
-    if not samples_per_pixel >= 1:
-        raise DomainError(f"samples_per_pixel = {samples_per_pixel} must be at least 1.")
+    samples_per_pixel = check_whole(samples_per_pixel, "samples_per_pixel")
     if count % samples_per_pixel:
         raise ShapeError(
             f"{count} rays are not a whole number of pixels at {samples_per_pixel} samples each."
@@ -39,7 +40,19 @@ def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Tensor, samples_p
             f"{count * poses} rays ({count} for each of {poses} frames) do not fit into one launch; render "
             "fewer frames at a time (frame_chunks)."
         )
+    for part in parts(scene):
+        if not hasattr(part, "radiance") or not hasattr(part, "dtype"):
+            raise DomainError(
+                f"a {type(part).__name__} lacks ``radiance`` or ``dtype``, so it cannot be rendered; write them "
+                "as TexturedPlane has them."
+            )
     dtype = scene.dtype
+    if (needed := count * poses * dtype.itemsize) > memory_bytes():
+        raise DomainError(
+            f"{count * poses:.3g} rays ({count} for each of {poses} frames) bring {needed / 2**30:.3g} GiB of light "
+            f"at once, this machine has {memory_bytes() / 2**30:.3g} GiB; render fewer frames at a time "
+            "(frame_chunks)."
+        )
     columns = [*rays.origin_m.unbind(1), *rays.direction.unbind(1), rays.weight]
     inputs = [c.to(dtype) for c in columns] + [
         pose[:, :3].to(dtype) for pose in cameras_in_parts(scene, T_world_cam)

@@ -10,15 +10,19 @@ from torch import Tensor
 from codesign import backend
 from codesign.errors import CodesignError, DomainError
 from codesign.render.outline import outlines
+from codesign.render.soundness import check_description, check_scene
 
 
 class MitsubaScene:
     """A Mitsuba scene whose radiance is read directly from its emitters.
 
-    Args: description: a Mitsuba scene dictionary; every shape carries an area emitter. Also an mi.Scene that
-      is loaded already. device: "cpu" or "cuda".
-      merge: whether Mitsuba may join meshes that look alike into one.
-    Computes in float32. Raises: DomainError when Mitsuba refuses the description.
+    Args: description: a Mitsuba scene dictionary; every shape carries an area emitter (of radiance 0 where it
+      is black). Also an mi.Scene that is loaded already. device: "cpu" or "cuda".
+      merge: whether Mitsuba may join meshes that look alike into one. emissive: whether every shape must have
+      an emitter; False for a scene whose geometry alone is asked for.
+    Computes in float32. Raises: DomainError when Mitsuba refuses the description, a shape has no emitter, a
+      mesh has no faces, vertices that are not finite or faces of vertices that are not there, a radiance is
+      negative or not finite.
     """
 
     dtype = torch.float32
@@ -27,14 +31,28 @@ class MitsubaScene:
     def __deepcopy__(self, memo):
         return self  # a scene is never changed, so copies of what holds it share it
 
-    def __init__(self, description: Mapping[str, Any] | Any, device: str = "cpu", *, merge: bool = True):
+    def __init__(
+        self,
+        description: Mapping[str, Any] | Any,
+        device: str = "cpu",
+        *,
+        merge: bool = True,
+        emissive: bool = True,
+    ):
         self.mi = backend.mitsuba(device)
         self._outline = None
         if isinstance(description, self.mi.Scene):
             self.scene: Any = description
-            return
+        else:
+            check_description(self.mi, description)
+            self.scene = self._built(description, merge)
+            if emissive and merge and not all(shape.is_emitter() for shape in self.scene.shapes()):
+                self.scene = self._built(description, False)  # joined meshes have lost their names
+        check_scene(self.mi, self.scene, emissive)
+
+    def _built(self, description, merge):
         try:
-            self.scene = self.mi.load_dict({"type": "scene", **description}, optimize=merge)
+            return self.mi.load_dict({"type": "scene", **description}, optimize=merge)
         except CodesignError:
             raise
         except Exception as error:  # Mitsuba raises plain RuntimeErrors of many lines

@@ -174,8 +174,8 @@ def test_no_exposure_is_the_frame_and_the_lens_keeps_its_gradient(generator):
     [
         ({"exposure_s": -1.0}, "exposure_s = -1.0"),
         ({"exposure_s": math.nan}, "exposure_s = nan"),
-        ({"samples": 0}, "exposure of 0"),
-        ({"samples": 1.5}, "exposure of 1.5"),
+        ({"samples": 0}, "exposure = 0 must"),
+        ({"samples": 1.5}, "exposure = 1.5 must"),
         ({"t_s": [math.nan]}, "times of the frames"),
     ],
 )

@@ -255,7 +255,7 @@ def test_points_of_one_flat_ground_never_hide_each_other():
     mi = backend.mitsuba()
     T_world_ground = se3_exp(torch.tensor([3.0, -2.0, 1.5, 0.5, 0.3, -0.4], dtype=D))
     to_world = mi.ScalarTransform4f(T_world_ground.numpy()).scale([200, 200, 1])
-    scene = MitsubaScene({"ground": {"type": "rectangle", "to_world": to_world}})
+    scene = MitsubaScene({"ground": {"type": "rectangle", "to_world": to_world}}, emissive=False)
     poses = torch.stack([look_at((0.03 * k, 0.01 * k, 0.02), (8.0, 0.3 * k, 0.0)) for k in range(4)])
     camera = Camera(lens.Pinhole(8.0), 48, 40, 0.1, 1)
     for stride in (1, 3):

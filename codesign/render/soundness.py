@@ -1,0 +1,126 @@
+"""Scenes that cannot be: refused where they are built, before Mitsuba renders them wrong or black, or ends the
+process."""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from codesign.errors import DomainError, ShapeError
+
+FILES_UNCHECKED = ("ply", "serialized")  # Mitsuba itself follows their faces to vertices that are not there
+RADIANCE = ("value", "data", "scale")  # last part of the names of what an emitter shines with
+OWN = ("positions", "normals", "texcoords")  # of a mesh, beside the attributes its user has given it
+NAMED = 3  # shapes that a sentence names
+
+
+def checked_mesh(name: str, vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and faces [F, 3] of a mesh as arrays; ShapeError and DomainError, by its name, for a mesh
+    without faces, vertices that are not finite and faces of vertices that are not there."""
+    vertices = np.asarray(vertices)
+    faces = np.asarray(faces)
+    for label, array in (("vertices", vertices), ("faces", faces)):
+        if array.ndim != 2 or array.shape[1] != 3 or len(array) == 0:
+            raise ShapeError(f"mesh '{name}': its {label} are {array.shape}; give at least one, [N, 3].")
+    finite = np.isfinite(vertices).all(1)
+    if not finite.all():
+        raise DomainError(
+            f"mesh '{name}': {int((~finite).sum())} of {len(finite)} vertices are NaN or infinite (first number "
+            f"{int(np.argmin(finite))}); repair or remove them."
+        )
+    low, high = int(faces.min()), int(faces.max())
+    if low < 0 or high >= len(vertices):
+        raise DomainError(
+            f"mesh '{name}': its faces name vertices {low} to {high}, but it has {len(vertices)}, counted from 0; "
+            "repair the faces."
+        )
+    return vertices, faces
+
+
+def check_description(mi: Any, description: Any) -> None:
+    """Raise DomainError or ShapeError for a description that is none, or that holds a mesh which would end the
+    process when Mitsuba builds the scene."""
+    if not isinstance(description, Mapping):
+        raise DomainError(
+            f"a scene is described by a dictionary of shapes as Mitsuba has it, got a {type(description).__name__}; "
+            "give one, or ask worlds.from_mitsuba for a file."
+        )
+    for name, entry in description.items():
+        if isinstance(entry, Mapping) and entry.get("type") in FILES_UNCHECKED:
+            try:
+                shape = mi.load_dict({**_file_of(entry), "face_normals": True})
+            except (
+                RuntimeError,
+                TypeError,
+                ValueError,
+            ):  # what cannot be read at all is told where the scene is built
+                continue
+            _check_shape(mi, name, shape)
+        elif isinstance(entry, mi.Mesh):
+            _check_shape(mi, name, entry)
+
+
+def check_scene(mi: Any, scene: Any, emissive: bool) -> None:
+    """Raise DomainError or ShapeError when a shape of a built scene is not finite, has no faces, or, where it must be
+    ``emissive``, has no emitter; or when an emitter's radiance is negative or not finite."""
+    black = []
+    for number, shape in enumerate(scene.shapes()):
+        name = shape.id() or f"number {number}"
+        _check_shape(mi, name, shape)
+        if not shape.is_emitter():
+            black.append(name)
+    if emissive and black:
+        more = f" and {len(black) - NAMED} more" if len(black) > NAMED else ""
+        raise DomainError(
+            f"shape {', '.join(map(repr, black[:NAMED]))}{more} has no emitter, so it would be black: give it one "
+            "of type 'area' (of radiance 0 where black is meant), or let light.bake or light.PathScene work out "
+            "its light."
+        )
+    for emitter in scene.emitters():
+        shape = emitter.get_shape()
+        parameters = mi.traverse(emitter)
+        values = ((key, parameters[key]) for key, _ in parameters if key.rsplit(".", 1)[-1] in RADIANCE)
+        _check_radiance(emitter.id() if shape is None else shape.id(), values)
+        if shape is not None:
+            _check_attributes(shape, emitter)
+
+
+def _check_attributes(shape, emitter):
+    for name in re.findall(r'MeshAttribute\[\s*name = "(\w+)"', str(emitter)):
+        if not bool(shape.has_attribute(name)[0]):
+            raise DomainError(
+                f"radiance of '{shape.id()}': the mesh has no attribute '{name}', so it would be black; add it "
+                "(mesh.add_attribute), or name one that is there."
+            )
+
+
+def _file_of(entry):
+    return {key: value for key, value in entry.items() if key in ("type", "filename", "shape_index")}
+
+
+def _check_shape(mi, name, shape):
+    parameters = mi.traverse(shape)
+    if shape.is_mesh() and "vertex_positions" in parameters:
+        checked_mesh(
+            name, *(np.array(parameters[key]).reshape(-1, 3) for key in ("vertex_positions", "faces"))
+        )
+        attributes = (
+            key for key, _ in parameters if key.startswith(("vertex_", "face_")) and not key.endswith(OWN)
+        )
+        _check_radiance(name, ((key, parameters[key]) for key in attributes))
+        return
+    box = shape.bbox()
+    if not np.isfinite(np.array([box.min, box.max], dtype=float)).all():
+        raise DomainError(f"shape '{name}': its place or size is NaN or infinite; repair its to_world.")
+
+
+def _check_radiance(name, values):
+    for key, value in values:
+        array = np.array(value, dtype=np.float32)
+        if array.size and not (array.min() >= 0 and array.max() < np.inf):
+            wrong = array[~(np.isfinite(array) & (array >= 0))]
+            raise DomainError(
+                f"radiance of '{name}': {key} holds {wrong.size} values that are negative, NaN or infinite (first "
+                f"{wrong.flat[0]:.3g}); make every one finite and at least 0."
+            )
