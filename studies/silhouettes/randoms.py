@@ -211,7 +211,7 @@ def _sheet(rows):
         camera = render.Camera(lens.Pinhole(11.0), SHEET_PX, SHEET_PX, pitch_mm, 16)
         with torch.no_grad():
             frame = render.frames(camera, draw.scene(), draw.T_world_cam[None])[0]
-        axis.imshow(frame.sqrt(), cmap="gray", vmin=0, vmax=16)
+        axis.imshow(frame.sqrt().numpy(), cmap="gray", vmin=0, vmax=16)
         verdicts = {row["verdict"] for row in rows if row["seed"] == seed}
         worst = next(name for name in order if name in verdicts)
         axis.set_title(f"{seed} {worst}", fontsize=6, color=COLOURS[worst], pad=2)

@@ -2,6 +2,7 @@
 that are right and wrong."""
 
 import dataclasses
+import json
 import math
 
 import numpy as np
@@ -12,7 +13,9 @@ from codesign import backend, lens, pose
 from codesign.render import MitsubaScene
 from scenes import outline_cases, random_shapes, random_worlds
 from scenes.random_shapes import gap_m
+from studies.frame.run import main
 from studies.silhouettes import judge, listed, randoms
+from studies.silhouettes.__main__ import Config, study
 
 QUICK = judge.Effort(seeds=(4,))
 
@@ -156,6 +159,39 @@ def test_a_few_random_worlds_are_judged_through_all_lenses():
     assert found["random_thin_right_count"] == 1
     assert found["random_traced_worst_error"] == max(row["error"] for row in rows if row["lens"] == "traced")
     assert all(row["interior"] > 0.5 for row in rows)
+
+
+def test_rows_of_earlier_runs_are_taken_over_and_verdicts_counted(tmp_path, monkeypatch, capsys):
+    """Judging is replaced by made-up rows: what is judged anew, what is recorded, and what a broken table says."""
+    asked = []
+
+    def made_up(seed, effort):
+        asked.append(seed)
+        row = judge.Judged("wrong", 0.4, 0.01, 0.005, 1.0).row()
+        shy = judge.Judged("refused", sentence="too thin").row()
+        facts = random_worlds.draw(seed).facts
+        return [
+            {"seed": seed, "lens": kind, **(shy if kind == "thin" else row), "facts": facts}
+            for kind in judge.LENSES
+        ]
+
+    monkeypatch.setattr(randoms, "judged_draw", made_up)
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert main(study, Config, ["--random", "2", "--first", "3", "--out", str(first)]) == 0
+    table = str(first / "random.json")
+    assert main(study, Config, ["--random", "3", "--first", "2", "--raw", table, "--out", str(second)]) == 0
+    assert asked == [3, 4, 2]
+    metrics = json.loads((second / "metrics.json").read_text())
+    assert metrics["random_draws"] == 3
+    assert metrics["random_pinhole_wrong_count"] == metrics["random_thin_refused_count"] == 3
+    assert metrics["random_pinhole_worst_error"] == 0.4
+    assert metrics["random_thin_apart_refused_share"] == 1.0
+    assert "too thin" in (second / "report.html").read_text()
+    capsys.readouterr()
+    (tmp_path / "broken.json").write_text("[1]")
+    broken = ["--random", "1", "--raw", str(tmp_path / "broken.json"), "--out", str(tmp_path / "third")]
+    assert main(study, Config, broken) == 2
+    assert "is no raw table of this study" in capsys.readouterr().err
 
 
 def test_a_listed_world_is_told_from_a_wrong_gradient():
