@@ -227,5 +227,5 @@ def test_a_pole_and_its_lid_have_one_rim():
     u = np.array([[1.0, 0, 0], [0.6, 0.8, 0], [0.5, 0, 0]])
     v = np.array([[0.0, 1, 0], [0.8, -0.6, 0], [0.0, 0.5, 0]])
     assert (
-        len(rims_once(turned, u, v, 1e-4)[0]) == 2
+        len(rims_once(turned, u, v, np.zeros(3), 1e-4)[0]) == 2
     )  # the same circle turned and mirrored, and a smaller one

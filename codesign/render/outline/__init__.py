@@ -1,29 +1,39 @@
-"""Curves in a scene where radiance may jump: edges of meshes, rims, and the outlines of spheres and cylinders
-as seen from a point."""
+"""Curves in a scene where radiance may jump: edges of meshes, rims, the outlines of spheres and cylinders as seen
+from a point, and where shapes pass through each other."""
 
 from typing import Any
 
 import numpy as np
 import torch
 
+from codesign.render.outline.crossings import find_crossings
 from codesign.render.outline.curves import Circles, Cylinders, Segments, Spheres
-from codesign.render.outline.edges import mesh_edges
+from codesign.render.outline.edges import mesh_edges, segments
+from codesign.render.outline.intersections import on_surfaces
 from codesign.render.outline.joints import edges_once, rims_once, tolerance
 from codesign.render.outline.shapes import Ball, Disk, Mesh, Tube, read
 
 
 def outlines(mi: Any, scene: Any) -> list[Any]:
-    """All curves of a Mitsuba scene: a list of Segments, Circles, Spheres, Cylinders. Raises: DomainError for
-    shapes whose outline is not known."""
+    """All curves of a Mitsuba scene: a list of Segments, Circles, Spheres, Cylinders, Intersections. Raises:
+    DomainError for shapes whose outline is not known."""
     shapes = [read(mi, shape) for shape in scene.shapes()]
     if not shapes:
         return []
     apart_m = tolerance(np.concatenate([shape.corners() for shape in shapes]))
+    crossed = find_crossings(shapes)
+    flat = np.array([isinstance(s, Mesh | Disk) for s in shapes])[crossed.shapes].all(1)
+    curved, width_m = on_surfaces(crossed[~flat], shapes, apart_m)
     edges = [mesh_edges(s.vertices, s.faces, s.values) for s in shapes if isinstance(s, Mesh)]
+    edges.append(segments(crossed.start[flat], crossed.end[flat]))
     balls = [(s.centre, s.radius) for s in shapes if isinstance(s, Ball)]
     tubes = [(s.start, s.end, s.radius) for s in shapes if isinstance(s, Tube)]
-    rims = [(s.centre, s.u, s.v) for s in shapes if isinstance(s, Disk)]
-    rims += [(end, s.u, s.v) for s in shapes if isinstance(s, Tube) for end in (s.start, s.end)]
+    rims = [
+        (centre, s.u, s.v, wide)
+        for s, both in zip(shapes, width_m, strict=True)
+        if isinstance(s, Disk | Tube)
+        for centre, wide in zip((s.centre,) if isinstance(s, Disk) else (s.start, s.end), both, strict=False)
+    ]
     found = []
     if any(map(len, edges)):
         once = edges_once(edges, apart_m)
@@ -34,6 +44,8 @@ def outlines(mi: Any, scene: Any) -> list[Any]:
         found.append(Spheres(*_tensors(*_columns(balls))))
     if tubes:
         found.append(Cylinders.of(*_tensors(*_columns(tubes))))
+    if curved is not None:
+        found.append(curved)
     return found
 
 

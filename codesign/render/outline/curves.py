@@ -51,14 +51,14 @@ class Segments:
         outline = facing.prod(1) <= 0
         black = (facing < 0).all(1)
         kept = torch.nonzero((self.always | outline) & ~black)[:, 0]
-        return _cut(kept, _count(self.start[kept] - viewpoint, self.end[kept] - viewpoint, angle))
+        return cut(kept, pieces_of(self.start[kept] - viewpoint, self.end[kept] - viewpoint, angle))
 
     def points(self, index, s, viewpoint):
         """Points [n, 3] of the curves ``index`` [n] at parameters s [n]."""
         return self.start[index] + s[:, None] * (self.end - self.start)[index]
 
     def aside_rad(self, index, viewpoint):
-        """Angle [n] from the viewpoint [3] at which radiances beside the curves ``index`` [n] are read."""
+        """Angle [n] from the viewpoint [3] or [n, 3] at which radiances beside the curves ``index`` [n] are read."""
         start = self.start[index]
         end = self.end[index]
         a = start - viewpoint
@@ -67,11 +67,11 @@ class Segments:
         furthest = torch.maximum(a.norm(dim=1), b.norm(dim=1))
         size = torch.maximum(start.norm(dim=1), end.norm(dim=1))
         rays = STRAIGHT_RAD + SAFETY * LONG * EPS * furthest / distance.clamp_min(1e-6)
-        return rays + _rounding(viewpoint, size, distance) + _wide(self.width_m[index], distance)
+        return rays + rounding_rad(viewpoint, size, distance) + _wide(self.width_m[index], distance)
 
     def covered(self, index, viewpoint):
-        """Whether [n] surfaces lie at the curve's own distance on both its sides, seen from the viewpoint [3]:
-        creases of which both faces are seen. A reading from much farther away has then missed them."""
+        """Whether [n] surfaces lie at the curve's own distance on both its sides, seen from the viewpoint [3]
+        or [n, 3]: creases of which both faces are seen. A reading from much farther away has then missed them."""
         facing = (self.normals[index] * (viewpoint - self.start[index])[:, None]).sum(2)
         return (facing > 0).all(1)
 
@@ -91,7 +91,7 @@ class Circles:
         out and came back would look short and be long."""
         first, share = self._facing(viewpoint)
         arcs = torch.stack([share, 1 - share], 1).reshape(-1)
-        index, s = _cut(torch.arange(arcs.numel()), (arcs * ROUND).ceil().clamp_min(1).long())
+        index, s = cut(torch.arange(arcs.numel()), (arcs * ROUND).ceil().clamp_min(1).long())
         begin = torch.stack([first, first + share], 1).reshape(-1)
         return index // 2, begin[index, None] + arcs[index, None] * s
 
@@ -120,7 +120,7 @@ class Circles:
         wide = ASIDE_RAD + SAFETY * EPS * distance / radius
         return (
             torch.minimum(wide, DEEPEST * radius / distance)
-            + _rounding(viewpoint, centre.norm(dim=1), distance)
+            + rounding_rad(viewpoint, centre.norm(dim=1), distance)
             + _wide(self.width_m[index], distance)
         )
 
@@ -140,7 +140,7 @@ class Spheres:
     def pieces(self, viewpoint, angle):
         """As for Segments; none for a sphere around the viewpoint."""
         outside = torch.nonzero((self.centre - viewpoint).norm(dim=1) > self.radius * (1 + 1e-6))[:, 0]
-        return _cut(outside, torch.full(outside.shape, ROUND))
+        return cut(outside, torch.full(outside.shape, ROUND))
 
     def points(self, index, s, viewpoint):
         """As for Segments; viewpoint [3] or [n, 3]."""
@@ -198,7 +198,7 @@ class Cylinders:
             self.points(kept, torch.full(kept.shape, s, dtype=torch.float64), viewpoint) - viewpoint
             for s in (0.0, 1.0)
         )
-        return _cut(kept, _count(start, end, angle))
+        return cut(kept, pieces_of(start, end, angle))
 
     def points(self, index, s, viewpoint):
         """As for Segments; viewpoint [3] or [n, 3]."""
@@ -236,7 +236,7 @@ def _beside_round(kind, place, radius, across, distance, viewpoint):
     ``distance`` [n] along the ray; see the head of this file."""
     slant = across / distance  # what lies along the axis is seen foreshortened
     error = EPS * across / radius * slant
-    coordinates = _rounding(viewpoint, place.norm(dim=1), distance)
+    coordinates = rounding_rad(viewpoint, place.norm(dim=1), distance)
     deepest = DEEPEST * torch.asin((radius / across).clamp_max(1)) * slant
     lost = torch.nonzero(error + coordinates / SAFETY > deepest)[:, 0]
     if lost.numel():
@@ -250,9 +250,9 @@ def _beside_round(kind, place, radius, across, distance, viewpoint):
     return torch.minimum(ASIDE_RAD + SAFETY * error + coordinates, deepest)
 
 
-def _rounding(viewpoint, size, distance):
+def rounding_rad(viewpoint, size, distance):
     """Angle [n] that rounding of coordinates of the given size [n] m and of the viewpoint may make."""
-    return SAFETY * EPS * (viewpoint.norm() + size) / distance.clamp_min(1e-6)
+    return SAFETY * EPS * (viewpoint.norm(dim=-1) + size) / distance.clamp_min(1e-6)
 
 
 def _wide(width_m, distance):
@@ -267,13 +267,13 @@ def _nearest(a, b):
     return (a + share[:, None] * along).norm(dim=1)
 
 
-def _count(a, b, angle):
+def pieces_of(a, b, angle):
     """Number [n] of pieces of segments a to b [n, 3] that subtend at most ``angle`` from the origin."""
     pieces = (b - a).norm(dim=1) / (_nearest(a, b).clamp_min(1e-6) * angle)
     return pieces.ceil().clamp(1, 4096).long()
 
 
-def _cut(index, count):
+def cut(index, count):
     """Cut the parameter 0..1 of each curve into ``count`` pieces: indices [n], bounds [n, 2]."""
     which = torch.repeat_interleave(torch.arange(index.shape[0]), count)
     first = torch.cumsum(count, 0) - count

@@ -1,0 +1,160 @@
+"""Where shapes pass through each other, and a mesh through itself: segments along which two triangles cross.
+
+Round shapes stand as fine triangles here; their segments are carried onto the true curve in ``intersections``.
+"""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from codesign.render.outline.edges import ROUNDING, welded
+from codesign.render.outline.pairs import touching
+from codesign.render.outline.shapes import Ball, Disk, Mesh, Shape
+
+AROUND = 96  # triangles around a round shape
+BLOCK = 1_000_000  # pairs at a time
+
+
+@dataclass(frozen=True)
+class Triangles:
+    """corners: [N, 3, 3]; place: [N, 3], equal for corners of one shape at one place; shape: [N], its number."""
+
+    corners: np.ndarray
+    place: np.ndarray
+    shape: np.ndarray
+
+    def __getitem__(self, rows):
+        return Triangles(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """Segments start, end [n, 3] along which two triangles cross; normals: [n, 2, 3] of these; shapes: [n, 2],
+    their numbers."""
+
+    start: np.ndarray
+    end: np.ndarray
+    normals: np.ndarray
+    shapes: np.ndarray
+
+    def __getitem__(self, rows):
+        return Crossings(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+
+def find_crossings(shapes: list[Shape]) -> Crossings:
+    """All segments along which the shapes cross each other, and meshes themselves."""
+    triangles = _near_others(shapes)
+    pairs = touching(triangles.corners, 0.0)
+    own = triangles.shape[pairs[:, 0]] == triangles.shape[pairs[:, 1]]
+    mesh = np.array([isinstance(shape, Mesh) for shape in shapes])[triangles.shape[pairs[:, 0]]]
+    pairs = pairs[~own | mesh]
+    found = [_crossing(triangles, pairs[k : k + BLOCK]) for k in range(0, max(len(pairs), 1), BLOCK)]
+    return Crossings(*(np.concatenate([getattr(part, f.name) for part in found]) for f in fields(Crossings)))
+
+
+def _near_others(shapes):
+    """Triangles of all shapes: of meshes all, since they may cross themselves; of others those within the box of
+    another shape."""
+    boxes = [(s.corners().min(0), s.corners().max(0)) for s in shapes]
+    parts = []
+    for number, shape in enumerate(shapes):
+        vertices, faces = tessellated(shape)
+        corners = vertices[faces]
+        kept = np.full(len(faces), isinstance(shape, Mesh))
+        if not kept.all():
+            low = corners.min(1)
+            high = corners.max(1)
+            for other, (other_low, other_high) in enumerate(boxes):
+                if other != number:
+                    kept |= ((low <= other_high) & (high >= other_low)).all(1)
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        kept &= np.linalg.norm(across, axis=1) > 0
+        place = welded(vertices, 0.0)[faces] if kept.any() else faces
+        parts.append(Triangles(corners[kept], place[kept], np.full(int(kept.sum()), number)))
+    return Triangles(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Triangles)))
+
+
+def tessellated(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and faces [F, 3] of a shape; round ones lie half within and half beyond their triangles."""
+    if isinstance(shape, Mesh):
+        return shape.vertices, shape.faces
+    turn = 2 * np.pi * np.arange(AROUND) / AROUND
+    k = np.arange(AROUND)
+    following = (k + 1) % AROUND
+    wider = 1 + (np.pi / AROUND) ** 2 / 4  # between the circle and the polygon around it
+    if isinstance(shape, Ball):
+        rise = np.pi * np.arange(AROUND // 2 + 1) / (AROUND // 2)
+        ring = np.stack([np.cos(turn), np.sin(turn), 0 * turn], 1)
+        grid = np.sin(rise)[:, None, None] * ring + np.cos(rise)[:, None, None] * np.array([0.0, 0.0, 1.0])
+        row = AROUND * np.arange(AROUND // 2)[:, None]
+        lower = np.stack([row + k, row + AROUND + k, row + AROUND + following], -1).reshape(-1, 3)
+        upper = np.stack([row + k, row + AROUND + following, row + following], -1).reshape(-1, 3)
+        return shape.centre + wider * shape.radius * grid.reshape(-1, 3), np.concatenate([lower, upper])
+    around = np.cos(turn)[:, None] * shape.u + np.sin(turn)[:, None] * shape.v
+    if isinstance(shape, Disk):
+        rim = shape.centre + (1 + (np.pi / AROUND) ** 2) * around
+        return np.concatenate([rim, shape.centre[None]]), np.stack([k, following, 0 * k + AROUND], 1)
+    ring = wider * around
+    sides = np.concatenate(
+        [np.stack([k, following, AROUND + k], 1), np.stack([following, AROUND + following, AROUND + k], 1)]
+    )
+    return np.concatenate([shape.start + ring, shape.end + ring]), sides
+
+
+def _crossing(triangles, pairs):
+    """Crossings of pairs [n, 2] of triangles. A corner on the other's plane counts as above it, so that an edge that
+    lies in a face is found from one of its sides at most."""
+    pair = [triangles[pairs[:, side]] for side in (0, 1)]
+    shared = (pair[0].place[:, :, None] == pair[1].place[:, None]).any((1, 2))
+    kept = ~(shared & (pair[0].shape == pair[1].shape))
+    pair = [side[kept] for side in pair]
+    normals = [_normals(side.corners) for side in pair]
+    height = [
+        ((this.corners - other.corners[:, :1]) * n[:, None]).sum(2)
+        for this, other, n in ((pair[0], pair[1], normals[1]), (pair[1], pair[0], normals[0]))
+    ]
+    noise = ROUNDING * max((float(np.abs(side.corners).max(initial=0)) for side in pair), default=0.0)
+    cut = np.ones(len(pair[0].shape), dtype=bool)
+    for h in height:
+        cut &= (
+            (h.min(1, initial=np.inf) < 0)
+            & (h.max(1, initial=-np.inf) >= 0)
+            & (np.abs(h).max(1, initial=0) > noise)
+        )
+    rows = np.nonzero(cut)[0]
+    normals = [n[rows] for n in normals]
+    along = np.cross(*normals)
+    size = np.linalg.norm(along, axis=1)
+    along /= np.maximum(size, 1e-300)[:, None]
+    ends = [
+        _on_plane(side.corners[rows], h[rows]) for side, h in zip(pair, height, strict=True)
+    ]  # [n, 2, 3] each
+    origin = ends[0][:, :1]
+    at = [np.sort(((end - origin) * along[:, None]).sum(2), axis=1) for end in ends]
+    first = np.maximum(at[0][:, 0], at[1][:, 0])
+    last = np.minimum(at[0][:, 1], at[1][:, 1])
+    real = np.nonzero((last - first > noise) & (size > 1e-9))[0]
+    start, end = (origin[real, 0] + v[real, None] * along[real] for v in (first, last))
+    numbers = np.stack([side.shape[rows][real] for side in pair], 1)
+    return Crossings(start, end, np.stack([n[real] for n in normals], 1), numbers)
+
+
+def _normals(corners):
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return across / np.linalg.norm(across, axis=1, keepdims=True)
+
+
+def _on_plane(corners, height):
+    """The two points [n, 2, 3] where sides of triangles [n, 3, 3] meet a plane over which corners are ``height``
+    [n, 3]: one corner lies on one side, the two others on the other."""
+    above = height >= 0
+    lone = np.where(above.sum(1) == 1, above.argmax(1), (~above).argmax(1))
+    rows = np.arange(len(corners))
+    found = []
+    for step in (1, 2):
+        other = (lone + step) % 3
+        a = height[rows, lone]
+        b = height[rows, other]
+        share = (a / (a - b))[:, None]
+        found.append(corners[rows, lone] + share * (corners[rows, other] - corners[rows, lone]))
+    return np.stack(found, 1)

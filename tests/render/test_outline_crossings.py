@@ -1,0 +1,230 @@
+"""Curves along which shapes pass through each other: closed forms, and gradients against differences."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from codesign import backend
+from codesign.render import MitsubaScene
+from codesign.render.charts import emissive_mesh
+from codesign.render.outline import Segments, outlines
+from codesign.render.outline.crossings import find_crossings
+from codesign.render.outline.intersections import Intersections
+from codesign.render.outline.pairs import touching
+from codesign.render.outline.shapes import Mesh
+from scenes.silhouettes import smooth
+from studies.silhouettes.task import STEPS, Task
+
+F64 = torch.float64
+EYE = torch.tensor([0.3, -4.0, 2.0], dtype=F64)
+LIGHT = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
+CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+CUBE = np.array([face for a, b, c, d in SIDES for face in ((a, b, c), (a, c, d))])
+
+
+def place():
+    return backend.mitsuba().ScalarTransform4f()
+
+
+def curves(**shapes):
+    mi = backend.mitsuba()
+    return outlines(mi, mi.load_dict({"type": "scene", **shapes}, optimize=False))
+
+
+def intersection(**shapes):
+    """Points [n, 3] along the one curve on round shapes, in order of pieces, and its length."""
+    (found,) = [curve for curve in curves(**shapes) if isinstance(curve, Intersections)]
+    index, bounds = found.pieces(EYE, 0.05)
+    s = bounds[:, :1] + torch.linspace(0, 1, 9, dtype=F64) * (bounds[:, 1:] - bounds[:, :1])
+    y = found.points(index[:, None].expand(s.shape).reshape(-1), s.reshape(-1), EYE).reshape(*s.shape, 3)
+    assert bool((found.aside_rad(index, EYE) > 0.9e-5).all())
+    return y.reshape(-1, 3), float((y[:, 1:] - y[:, :-1]).norm(dim=2).sum())
+
+
+def total_length(found):
+    (edges,) = [curve for curve in found if isinstance(curve, Segments)]
+    return float((edges.end - edges.start).norm(dim=1).sum())
+
+
+@pytest.mark.parametrize("height", [0.0, 0.3, -0.77])
+def test_a_sphere_through_a_floor_meets_it_in_a_circle(height):
+    ball = {"type": "sphere", "center": [0.1, 0.2, height], "radius": 0.8}
+    y, length = intersection(ball=ball, floor={"type": "rectangle", "to_world": place().scale(3)})
+    radius = math.sqrt(0.8**2 - height**2)
+    torch.testing.assert_close(y[:, 2], torch.zeros(len(y), dtype=F64), rtol=0, atol=1e-9)
+    away = (y[:, :2] - torch.tensor([0.1, 0.2], dtype=F64)).norm(dim=1)
+    torch.testing.assert_close(away, torch.full_like(away, radius), rtol=1e-6, atol=0)
+    assert length == pytest.approx(2 * math.pi * radius, rel=1e-4)
+
+
+def test_two_spheres_meet_in_a_circle():
+    y, length = intersection(
+        a={"type": "sphere", "radius": 0.5}, b={"type": "sphere", "center": [0.0, 0.6, 0.0], "radius": 0.4}
+    )
+    level = (0.6**2 + 0.5**2 - 0.4**2) / (2 * 0.6)
+    torch.testing.assert_close(y[:, 1], torch.full((len(y),), level, dtype=F64), rtol=0, atol=1e-7)
+    assert length == pytest.approx(2 * math.pi * math.sqrt(0.5**2 - level**2), rel=1e-4)
+
+
+def test_a_leaning_pole_meets_a_floor_in_an_ellipse():
+    """Half axes r and r / cos of the lean; the circumference by quadrature."""
+    lean = math.radians(35)
+    end = np.array([math.sin(lean), 0.0, math.cos(lean)])
+    pole = {"type": "cylinder", "p0": (-end).tolist(), "p1": end.tolist(), "radius": 0.2}
+    y, length = intersection(pole=pole, floor={"type": "rectangle", "to_world": place().scale(3)})
+    share = torch.hypot(y[:, 0] * math.cos(lean) / 0.2, y[:, 1] / 0.2)
+    torch.testing.assert_close(share, torch.ones_like(share), rtol=1e-6, atol=0)
+    t = (np.arange(10000) + 0.5) / 10000 * 2 * np.pi
+    around = np.hypot(0.2 / math.cos(lean) * np.sin(t), 0.2 * np.cos(t)).mean() * 2 * np.pi
+    assert length == pytest.approx(around, rel=1e-4)
+
+
+def test_two_poles_at_right_angles_meet_in_steinmetz_curves():
+    """Equal radii r, axes x and z: two ellipses in the planes x = +z and x = -z, half axes r and r sqrt(2)."""
+    y, length = intersection(
+        a={"type": "cylinder", "p0": [-1.0, 0, 0], "p1": [1.0, 0, 0], "radius": 0.3},
+        b={"type": "cylinder", "p0": [0, 0, -1.0], "p1": [0, 0, 1.0], "radius": 0.3},
+    )
+    torch.testing.assert_close(
+        y[:, 0].abs(), y[:, 2].abs(), rtol=0, atol=1e-4
+    )  # they cross where surfaces touch
+    t = (np.arange(10000) + 0.5) / 10000 * 2 * np.pi
+    around = 0.3 * np.hypot(math.sqrt(2) * np.sin(t), np.cos(t)).mean() * 2 * np.pi
+    assert length == pytest.approx(2 * around, rel=0.01)
+
+
+def test_a_box_through_a_floor_and_through_a_box():
+    floor = {"type": "rectangle", "to_world": place().scale(3)}
+    box = {
+        "type": "cube",
+        "to_world": place().translate([0.2, 0.1, 0.3]).rotate([0, 0, 1], 20).scale([0.4, 0.6, 0.5]),
+    }
+    assert total_length(curves(box=box, floor=floor)) == pytest.approx(24 + 8 * 1.5 + 4 * 1.0, abs=1e-4)
+    other = {"type": "cube", "to_world": place().translate([0.9, 0.8, 0.7])}
+    # cubes of side 2 whose corners overlap by 1.1 x 1.2 x 1.3 m: three pairs of faces cross along each of these
+    assert total_length(curves(a={"type": "cube"}, b=other)) == pytest.approx(
+        48 + 2 * (1.1 + 1.2 + 1.3), abs=1e-4
+    )
+
+
+@pytest.mark.parametrize("sunk_m", [0.0, 1e-7, -1e-7, 5e-5])
+def test_what_stands_on_a_floor_has_its_edges_once(sunk_m):
+    """A box and a pole that touch the floor, to rounding or to a hair: no curve beside the box's edges and the rim,
+    which are read from beyond the hair."""
+    floor = {"type": "rectangle", "to_world": place().scale(3)}
+    box = {"type": "cube", "to_world": place().translate([0.5, 0.1, 0.5 - sunk_m]).scale([0.2, 0.3, 0.5])}
+    pole = {"type": "cylinder", "p0": [-0.5, 0.0, -sunk_m], "p1": [-0.5, 0.0, 1.0], "radius": 0.1}
+    found = curves(floor=floor, box=box, pole=pole)
+    assert total_length(found) == pytest.approx(24 + 4 * (0.4 + 0.6 + 1.0), abs=1e-3)
+    assert not any(isinstance(curve, Intersections) for curve in found)
+    widest = max(float(curve.width_m.max()) for curve in found if hasattr(curve, "width_m"))
+    assert widest == pytest.approx(abs(sunk_m), abs=3e-7)
+
+
+def test_half_a_ball_of_triangles_sunk_to_its_very_equator_has_it_as_an_edge():
+    """A smooth mesh with a ring of vertices in the floor's plane: its edges there are no creases, and count."""
+    n = 24
+    turn = 2 * np.pi * np.arange(n) / n
+    ring = np.stack([np.cos(turn), np.sin(turn), 0 * turn], 1)
+    below, above = (np.stack([0.9 * ring[:, 0], 0.9 * ring[:, 1], 0 * turn + z], 1) for z in (-0.5, 0.5))
+    k = np.arange(n)
+    faces = np.concatenate(
+        [
+            np.concatenate(
+                [np.stack([k, (k + 1) % n, k + m], 1), np.stack([(k + 1) % n, (k + 1) % n + m, k + m], 1)]
+            )
+            for m in (n, 2 * n)
+        ]
+    )
+    drum = Mesh("drum", np.concatenate([ring, below, above]), faces, None)
+    floor = Mesh(
+        "floor",
+        np.array([[-3.0, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+        None,
+    )
+    found = find_crossings([drum, floor])
+    length = np.linalg.norm(found.end - found.start, axis=1).sum()
+    assert length == pytest.approx(n * 2 * math.sin(math.pi / n), rel=1e-9)
+
+
+def test_meshes_that_do_not_cross_themselves_have_no_crossing():
+    """A bumpy sheet: neighbours touch along edges and at corners only; and a cube inside another."""
+    n = 30
+    x, y = (v.reshape(-1) for v in np.meshgrid(np.arange(n), np.arange(n), indexing="xy"))
+    z = np.random.default_rng(0).normal(size=n * n)
+    row, column = (v.reshape(-1) for v in np.divmod(np.arange((n - 1) ** 2), n - 1))
+    a = row * n + column
+    sheet = Mesh(
+        "sheet",
+        np.stack([x, y, z], 1),
+        np.stack([a, a + 1, a + n + 1, a, a + n + 1, a + n], 1).reshape(-1, 3),
+        None,
+    )
+    assert len(find_crossings([sheet]).start) == 0
+    nested = Mesh("nested", np.concatenate([CORNERS, 0.5 * CORNERS]), np.concatenate([CUBE, CUBE + 8]), None)
+    assert len(find_crossings([nested]).start) == 0
+
+
+def test_pairs_of_boxes_that_touch_are_all_found(generator):
+    corners = torch.rand(200, 1, 3, generator=generator, dtype=F64) + 0.2 * torch.rand(
+        200, 3, 3, generator=generator
+    )
+    low, high = corners.amin(1), corners.amax(1)
+    meet = ((low[:, None] <= high) & (low <= high[:, None])).all(2)
+    truth = {(i, j) for i, j in torch.nonzero(meet).tolist() if i < j}
+    found = touching(corners.numpy(), 0.0)
+    assert {tuple(pair) for pair in found.tolist()} == truth
+    assert len(found) == len(truth)
+
+
+def sunk(name):
+    """Worlds of shapes that stick in a floor, in each other, or in themselves."""
+    mi = backend.mitsuba()
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(smooth(3, cycles=3)), "raw": True}
+    turned = place().translate([0, 0.6, 0.3]).rotate([0, 0, 1], 5).rotate([1, 0, 0], 4).scale([3, 2, 1])
+    floor = {"type": "rectangle", "to_world": turned, "emitter": {"type": "area", "radiance": texture}}
+    bright = {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": 200.0}}}
+    if name == "sphere":
+        return {
+            "floor": floor,
+            "ball": {"type": "sphere", "center": [0.1, 0.5, 0.45], "radius": 0.4, **bright},
+        }
+    if name == "cylinder":
+        pole = {"type": "cylinder", "p0": [-0.3, 0.4, 0.0], "p1": [0.1, 0.6, 1.5], "radius": 0.2, **bright}
+        return {"floor": floor, "pole": pole}
+    if name == "box":
+        box = (
+            place()
+            .translate([0, 0.5, 0.4])
+            .rotate([0, 0, 1], 30)
+            .rotate([1, 0, 0], 10)
+            .scale([0.3, 0.3, 0.4])
+        )
+        return {"floor": floor, "box": {"type": "cube", "to_world": box, **bright}}
+    turn, other = (
+        np.array(place().rotate(axis, 30).matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
+        for axis in ([1, 1, 0], [0, 1, 1])
+    )
+    vertices = np.concatenate(
+        [
+            CORNERS * [0.3, 0.3, 0.5] @ turn.T + [0, 0.5, 0.8],
+            CORNERS * [0.5, 0.2, 0.2] @ other.T + [0.1, 0.35, 0.8],
+        ]
+    )
+    light = np.concatenate([np.linspace(40, 120, 6), np.linspace(240, 150, 6)]).repeat(2)
+    return {"both": emissive_mesh(mi, vertices, np.concatenate([CUBE, CUBE + 8]), light)}
+
+
+@pytest.mark.parametrize("name", ["sphere", "cylinder", "box", "mesh"])
+def test_gradients_of_what_sticks_in_something(name):
+    """Differences with 512 samples at two seeds know the truth to 1 %."""
+    task = Task(MitsubaScene(sunk(name)), "pinhole")
+    scale = torch.tensor(STEPS["pose"], dtype=F64)
+    truth = torch.stack([task.differences("pose", 512, seed) for seed in (11, 12)]).mean(0) * scale
+    plain, whole = (task.gradient("pose", 512, 13, way, 16.0) * scale for way in ("interior", "boundary"))
+    assert float((plain - truth).norm() / truth.norm()) > 0.1
+    assert float((whole - truth).norm() / truth.norm()) < 0.04
