@@ -60,7 +60,14 @@ def opened(path: Path, folder: Folder, materials: bool) -> tuple[bytes, dict[str
     except FileFormatError:
         folder.check()
         raise
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
+    except (
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        OSError,
+        PIL.Image.DecompressionBombError,
+    ) as error:
         raise FileFormatError(
             f"mesh '{path}' cannot be read as glTF 2.0 ({str(error)[:100]}); export it anew."
         ) from error
@@ -125,6 +132,8 @@ def _surfaces(tree, folder):
         if texture.get("texCoord", 0) != 0:
             raise ValueError("a base colour is laid out by TEXCOORD_1, and TEXCOORD_0 alone is read")
         entry = tree["textures"][texture["index"]]
+        if "source" not in entry:
+            raise ValueError("a picture is neither PNG nor JPEG")
         source = entry["source"]
         if source not in pictures:
             pictures[source] = _picture(tree, tree["images"][source], folder)

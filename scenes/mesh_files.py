@@ -91,13 +91,14 @@ def read(
         data, surfaces = gltf.opened(path, folder, materials)
     else:
         data = path.read_bytes()
-    _check_count(path, _faces_told(kind, data))
+    told = _faces_told(kind, data)
+    _check_count(path, told)
     if kind == ".obj":
         _check_obj(path, data)
     scene = _loaded(path, data, folder, ".gltf" if surfaces is not None else kind, materials)
     if materials:
         folder.check()
-    parts = list(_parts(path, scene, axes, surfaces if materials else None, materials))
+    parts = list(_parts(path, scene, told, axes, surfaces if materials else None, materials))
     if not parts:
         raise FileFormatError(
             f"mesh '{path}' has no faces that can be read: it is cut short, damaged, or holds points and lines alone; "
@@ -197,11 +198,15 @@ def _damaged(path, error):
     )
 
 
-def _parts(path, scene, axes, surfaces, materials) -> Iterator[Part]:
+def _parts(path, scene, told, axes, surfaces, materials) -> Iterator[Part]:
     count = sum(
         len(getattr(scene.geometry[scene.graph[n][1]], "faces", ())) for n in scene.graph.nodes_geometry
     )
     _check_count(path, count)
+    if 0 < count < told:
+        raise FileFormatError(
+            f"mesh '{path}' has {told} faces, of which {told - count} cannot be read; export it anew."
+        )
     for node in scene.graph.nodes_geometry:
         frame, name = scene.graph[node]
         mesh = scene.geometry[name]
@@ -210,6 +215,10 @@ def _parts(path, scene, axes, surfaces, materials) -> Iterator[Part]:
         frame = np.asarray(frame, dtype=np.float64)
         vertices = np.asarray(mesh.vertices, dtype=np.float64)
         faces = np.asarray(mesh.faces)
+        if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+            raise FileFormatError(
+                f"mesh '{path}', '{name}': vertices have {vertices.shape[1]} coordinates; export it anew."
+            )
         if not np.isfinite(vertices).all() or not np.isfinite(frame).all():
             raise FileFormatError(f"mesh '{path}', '{name}': vertices are not all finite; export it anew.")
         if faces.min() < 0 or faces.max() >= len(vertices):

@@ -138,7 +138,7 @@ def _model(path):
             f"robot '{path}' cannot be read as URDF ({said}); correct or export it anew."
         ) from error
     names = {link.name for link in model.robot.links}
-    lost = sorted({end for joint in model.robot.joints for end in (joint.parent, joint.child)} - names)
+    lost = sorted({str(end) for joint in model.robot.joints for end in (joint.parent, joint.child)} - names)
     if lost or model.base_link is None:
         what = f"joints name links that are not there: {', '.join(lost)}" if lost else "it has no root link"
         raise FileFormatError(f"robot '{path}' is no tree of links: {what}; correct it.")

@@ -295,6 +295,8 @@ def test_files_that_are_no_whole_meshes_are_refused(tmp_path):
         "high.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "cannot be read|asks for vertex"),
         "zero.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "index 0"),
         "back.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n", "index -3"),
+        "two.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2\n", "2 faces, of which 1 cannot be read"),
+        "flat.obj": ("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", "cannot be read|2 coordinates"),
         "points.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no faces"),
         "line.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no faces"),
         "text.stl": (
@@ -365,6 +367,8 @@ def test_gltf_that_would_be_read_in_part_is_refused(tmp_path):
     refused("KHR_draco_mesh_compression", extensionsRequired=["KHR_draco_mesh_compression"])
     refused("KHR_texture_transform", extensionsUsed=["KHR_texture_transform"])
     refused("lies on a network", buffers=[{"byteLength": 92, "uri": "https://127.0.0.1:9/a.bin"}])
+    refused("neither PNG nor JPEG", textures=[{"extensions": {"EXT_texture_webp": {"source": 0}}}])
+    refused("cannot be read as glTF", images=[{"uri": "data:image/png;base64,AAAA"}])
     refused("'a.bin' is missing", buffers=[{"byteLength": 92, "uri": "a.bin"}])
     second = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1}}}
     refused("TEXCOORD_1", materials=[second])
@@ -397,15 +401,14 @@ def test_pictures_are_textures_in_one_line(tmp_path):
     PIL.Image.fromarray(np.full((16, 16), 188, dtype=np.uint8)).save(tmp_path / "grey.png")
     scene = worlds.wall(tmp_path / "grey.png")
     assert seen(scene, (0.3, 0, 0.2)) == pytest.approx(radiance_of(188), rel=1e-5)
-    from codesign import backend
-
-    mi = backend.mitsuba()
-    values = np.ones((8, 16, 3), dtype=np.float32)
-    values[:, 8:] = 3
-    for kind in ("exr", "hdr"):
-        mi.Bitmap(values).write(str(tmp_path / f"a.{kind}"))
-        picture = textures.photo(tmp_path / f"a.{kind}")
-        np.testing.assert_allclose(picture[:, [0, 15]], [[40.0, 120.0]] * 8, rtol=1e-5)  # mean 80
+    # the format of Greg Ward's Radiance: mantissas of 8 bits with one exponent, 128 / 256 * 2^(e - 128)
+    row = bytes([128, 128, 128, 129]) * 2 + bytes([192, 192, 192, 130]) * 2
+    header = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 4\n"
+    (tmp_path / "a.hdr").write_bytes(header + row * 2)  # 1 1 3 3, twice
+    picture = textures.photo(tmp_path / "a.hdr")
+    np.testing.assert_allclose(picture, [[40.0, 40, 120, 120]] * 2, rtol=1e-5)  # mean 80
+    environment = worlds.outdoor(clutter=0, environment=tmp_path / "a.hdr")
+    assert environment.scene.environment() is not None
 
 
 def test_a_frame_of_a_video_is_found_by_its_time(tmp_path):
