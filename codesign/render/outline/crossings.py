@@ -47,9 +47,19 @@ def find_crossings(shapes: list[Shape]) -> Crossings:
     pairs = touching(triangles.corners, 0.0)
     own = triangles.shape[pairs[:, 0]] == triangles.shape[pairs[:, 1]]
     mesh = np.array([isinstance(shape, Mesh) for shape in shapes])[triangles.shape[pairs[:, 0]]]
-    pairs = pairs[~own | mesh]
+    pairs = pairs[~own | (mesh & ~_neighbours(triangles.place, pairs))]
     found = [_crossing(triangles, pairs[k : k + BLOCK]) for k in range(0, max(len(pairs), 1), BLOCK)]
     return Crossings(*(np.concatenate([getattr(part, f.name) for part in found]) for f in fields(Crossings)))
+
+
+def _neighbours(place, pairs):
+    """Whether pairs [n, 2] of triangles with corners at places [N, 3] share one."""
+    columns = [[np.ascontiguousarray(place[:, k])[pairs[:, side]] for k in range(3)] for side in (0, 1)]
+    shared = np.zeros(len(pairs), dtype=bool)
+    for a in columns[0]:
+        for b in columns[1]:
+            shared |= a == b
+    return shared
 
 
 def _near_others(shapes):
@@ -105,9 +115,6 @@ def _crossing(triangles, pairs):
     """Crossings of pairs [n, 2] of triangles. A corner on the other's plane counts as above it, so that an edge that
     lies in a face is found from one of its sides at most."""
     pair = [triangles[pairs[:, side]] for side in (0, 1)]
-    shared = (pair[0].place[:, :, None] == pair[1].place[:, None]).any((1, 2))
-    kept = ~(shared & (pair[0].shape == pair[1].shape))
-    pair = [side[kept] for side in pair]
     normals = [_normals(side.corners) for side in pair]
     height = [
         ((this.corners - other.corners[:, :1]) * n[:, None]).sum(2)

@@ -112,11 +112,24 @@ def _differ(values, one, other, forward):
 
 def welded(points: np.ndarray, apart_m: float) -> np.ndarray:
     """Numbers [N] of places: points [N, 3] nearer than ``apart_m``, or than float32 rounding, share one."""
-    unique, where = np.unique(points, axis=0, return_inverse=True)
+    order, number = _equal(points)
+    unique = points[order[np.nonzero(np.diff(number, prepend=-1))[0]]]
+    place = np.empty(len(points), dtype=np.int64)
+    place[order] = number
     apart_m = max(float(apart_m), float(np.abs(points).max(initial=0)) * ROUNDING)
     pairs = cKDTree(unique, balanced_tree=False).query_pairs(apart_m, output_type="ndarray")
     if not len(pairs):
-        return where.reshape(-1)
+        return place
     size = len(unique)
     graph = coo_matrix((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
-    return connected_components(graph, directed=False)[1][where.reshape(-1)]
+    return connected_components(graph, directed=False)[1][place]
+
+
+def _equal(points):
+    """An order of points [N, 3] with equal ones side by side, and their numbers [N] in it: sorted by a mixture of
+    their coordinates, since sorting rows takes ten times as long. Should two places have one mixture, equal points
+    may get several numbers."""
+    mixed = points[:, 0] + np.pi * points[:, 1] + np.e * points[:, 2]
+    order = np.argsort(mixed)
+    ordered = points[order]
+    return order, np.cumsum(np.append(False, (ordered[1:] != ordered[:-1]).any(1)))[: len(points)]

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from codesign.render.outline.edges import ROUNDING, Edges, joined, welded
 
 SAME_PLACE_M = 1e-4  # curves nearer than this are one; they are read from farther aside by as much
+FEW = 32  # edges of a shape up to which each is held against those of others
 SHORT = 4  # edges shorter than this many such distances are left as they are
 
 
@@ -36,10 +37,8 @@ def edges_once(parts: list[Edges], apart_m: float) -> Edges:
     cut = cut[whole]
     off = off[whole]
     place = np.sort(place[:, whole], axis=0)
-    _, first, which, count = np.unique(
-        place, axis=1, return_index=True, return_inverse=True, return_counts=True
-    )
-    which = which.reshape(-1)
+    both = place[0] * (place.max(initial=0) + 1) + place[1]
+    _, first, which, count = np.unique(both, return_index=True, return_inverse=True, return_counts=True)
     middle = (cut.start + cut.end) / 2
     apart = np.maximum(_from_line(middle, cut[first][which]), off)
     width = np.zeros(len(first))
@@ -52,26 +51,28 @@ def edges_once(parts: list[Edges], apart_m: float) -> Edges:
 
 
 def _beside_others(parts, apart_m):
-    """Edges [E] whose boxes touch the box of all edges of another shape."""
-    boxes = [
-        (np.minimum(p.start, p.end).min(0) - apart_m, np.maximum(p.start, p.end).max(0) + apart_m)
-        for p in parts
-    ]
+    """Edges [E] whose boxes touch those of another shape's edges: of each of them where these are few, of all
+    together where they are many."""
+    low = [np.minimum(p.start, p.end) - apart_m for p in parts]
+    high = [np.maximum(p.start, p.end) + apart_m for p in parts]
+    boxes = [(a.min(0), b.max(0)) for a, b in zip(low, high, strict=True)]
     found = []
-    for i, part in enumerate(parts):
-        touched = np.zeros(len(part), dtype=bool)
-        low = np.minimum(part.start, part.end)
-        high = np.maximum(part.start, part.end)
+    for i, (own_low, own_high) in enumerate(boxes):
+        touched = np.zeros(len(parts[i]), dtype=bool)
         for j, (other_low, other_high) in enumerate(boxes):
-            if i != j and (boxes[i][0] <= other_high).all() and (boxes[i][1] >= other_low).all():
-                touched |= ((low <= other_high) & (high >= other_low)).all(1)
+            if i == j or (own_low > other_high).any() or (own_high < other_low).any():
+                continue
+            each = zip(low[j], high[j], strict=True) if len(low[j]) <= FEW else [(other_low, other_high)]
+            for a, b in each:
+                touched |= ((low[i] <= b) & (high[i] >= a)).all(1)
         found.append(touched)
     return np.concatenate(found)
 
 
 def _cut_at_ends(edges, apart_m):
     """Edges cut where ends of others lie on them, and how far off [E] these lay."""
-    points = np.unique(np.concatenate([edges.start, edges.end]), axis=0)
+    points = np.concatenate([edges.start, edges.end])
+    points = points[np.unique(welded(points, 0.0), return_index=True)[1]]
     tree = cKDTree(points)
     middle = (edges.start + edges.end) / 2
     half = edges.length_m / 2

@@ -12,24 +12,25 @@ def touching(corners: np.ndarray, margin_m: float) -> np.ndarray:
         return np.zeros((0, 2), dtype=np.int64)
     order = np.argsort(_along_curve(corners.mean(1)))
     size = 1 << (count - 1).bit_length()
-    low = np.full((size, 3), np.inf)
-    high = np.full((size, 3), -np.inf)
-    low[:count] = corners[order].min(1) - margin_m / 2
-    high[:count] = corners[order].max(1) + margin_m / 2
+    low = np.full((3, size), np.inf)
+    high = np.full((3, size), -np.inf)
+    low[:, :count] = corners[order].min(1).T - margin_m / 2
+    high[:, :count] = corners[order].max(1).T + margin_m / 2
     levels = [(low, high)]
-    while len(levels[-1][0]) > 1:
+    while levels[-1][0].shape[1] > 1:
         low, high = levels[-1]
-        levels.append((np.minimum(low[::2], low[1::2]), np.maximum(high[::2], high[1::2])))
-    a = b = np.zeros(1, dtype=np.int64)
+        levels.append((np.minimum(low[:, ::2], low[:, 1::2]), np.maximum(high[:, ::2], high[:, 1::2])))
+    a = b = np.zeros(1, dtype=np.int32)
     for low, high in reversed(levels[:-1]):
-        apart = a != b
+        apart = np.nonzero(a != b)[0]
         a, b = (
             np.concatenate([2 * a, 2 * a, 2 * a + 1, 2 * a[apart] + 1]),
             np.concatenate([2 * b, 2 * b + 1, 2 * b + 1, 2 * b[apart]]),
         )
-        near = ((low[a] <= high[b]) & (low[b] <= high[a])).all(1)
-        a = a[near]
-        b = b[near]
+        for axis in range(3):
+            near = np.nonzero((low[axis][a] <= high[axis][b]) & (low[axis][b] <= high[axis][a]))[0]
+            a = a[near]
+            b = b[near]
     different = a != b
     return np.sort(order[np.stack([a[different], b[different]], 1)], axis=1)
 
