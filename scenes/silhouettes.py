@@ -102,6 +102,40 @@ def build(name, device="cpu"):
     return MitsubaScene(shapes, device)
 
 
+def room(seed=0, device="cpu"):
+    """A room of 5 x 6 x 3 m with two leaning boxes that touch nothing, for a camera near (0, -1.2, 1) that looks
+    along +y."""
+    mi = backend.mitsuba(device)
+    T = mi.ScalarTransform4f
+
+    def light(number, **options):
+        bitmap = mi.Bitmap(smooth(3 * seed + number, **options))
+        return {
+            "type": "area",
+            "radiance": {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "repeat"},
+        }
+
+    shapes: dict = {
+        "walls": {
+            "type": "cube",
+            "flip_normals": True,
+            "to_world": T().translate([0, 0, 1]).scale([2.5, 3.0, 1.5]),
+            "emitter": light(1000, cycles=6, darkest=50, brightest=200),
+        },
+        "near": {
+            "type": "cube",
+            "to_world": T().translate([-0.5, 0.6, 0.95]).rotate([1, 1, 0], 50).scale(0.3),
+            "emitter": light(1001, cycles=2, darkest=40, brightest=110),
+        },
+        "far": {
+            "type": "cube",
+            "to_world": T().translate([0.6, 0.9, 0.6]).rotate([0, 1, 1], 50).scale([0.3, 0.5, 0.3]),
+            "emitter": light(1002, cycles=2, darkest=110, brightest=240),
+        },
+    }
+    return MitsubaScene(shapes, device)
+
+
 def ball(device="cpu"):
     """A ball of 0.35 m about the origin, to be moved before another scene."""
     mi = backend.mitsuba(device)

@@ -27,6 +27,7 @@ GROUPS = {
         "render_quality",
         "psf_level",
         "silhouettes",
+        "silhouettes_chain",
         "light_levels",
         "robot_view",
         "make_dataset",
