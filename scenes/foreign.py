@@ -8,7 +8,7 @@ a little off from the luminance of a colour rendering.
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +21,8 @@ from torch import Tensor
 from codesign import backend, lens
 from codesign.errors import CodesignError, DomainError, FileFormatError
 from codesign.render import Camera, Film
-from codesign.render.light import PathScene
-from codesign.render.placed import PlacedScene
+from codesign.render.light import PathScene, bake
+from codesign.render.placed import PlacedScene, Placement
 from scenes import units
 
 Up = Literal["y", "z"]
@@ -30,8 +30,9 @@ UP: dict[str, list[list[float]]] = {  # from the axes of a file with this up axi
     "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
     "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
 }
-Level = Literal["path"]
-LEVELS: tuple[Level, ...] = ("path",)
+Level = Literal["auto", "emissive", "baked", "path"]
+LEVELS: tuple[Level, ...] = ("auto", "emissive", "baked", "path")
+TEXELS = 60_000  # of baked light, in all, where no size is given
 INTEGRATORS = (
     "PathIntegrator",
     "DirectIntegrator",
@@ -43,48 +44,78 @@ LONGEST = 300  # letters of Mitsuba's own words in a sentence
 
 def from_mitsuba(
     source: str | Path | Mapping[str, Any] | Any,
-    light: Level = "path",
+    light: Level = "auto",
     device: str = "cpu",
     *,
     unit_m: float = 1.0,
     up: Up = "y",
     gain: float = 1.0,
-    samples: int = 16,
+    samples: int | None = None,
     seed: int = 0,
     max_depth: int | None = None,
+    texel_m: float | None = None,
+    towards_m: Sequence[float] | None = None,
+    matte: bool = False,
     **parameters: Any,
 ) -> Any:
     """A world out of a Mitsuba scene.
 
     Args:
       source: path of an .xml file, a dictionary as mi.load_dict takes it, or an mi.Scene loaded in the variant of
-        ``backend.variant(device)``. light: "path", what Mitsuba renders (see PathScene: no gradient).
+        ``backend.variant(device)``.
+      light: "path", what Mitsuba renders, by ``samples`` (16) paths per camera ray, without gradient (PathScene);
+        "baked", light worked out once (light.bake); "emissive", without light: what glows shows its emission, and
+        anything else its albedo, as radiance;
+        "auto", emissive where every surface is an emitter, otherwise baked.
       unit_m: metres per unit of the scene's lengths. up: the axis that points up in it; worlds have z up.
       gain: factor on its radiance; 255 brings pictures made for a white of 1 to the scale of the other worlds.
-      samples: paths per camera ray; seed: of their random numbers. max_depth: longest path; None takes the
-        integrator of the scene itself where it samples camera rays, and any length where there is none.
+      samples: paths per camera ray, or per texel (64); seed: of their random numbers. max_depth: longest path; None
+        takes the integrator of the scene itself where it samples camera rays, and any length where there is none.
+      texel_m: size of the texels of baked light, None for as large as makes TEXELS of them. towards_m, matte: of
+        surfaces that shine, mirror or let light through, as in ``light.bake``.
       parameters: values of $parameters in an .xml file.
-    Returns: a scene for ``render.frames`` with ``radiance``, ``radiance_and_distance`` and ``hit``.
+    Returns: a scene for ``render.frames`` with ``radiance``, ``radiance_and_distance``, ``hit`` and ``outline``.
+    Gradient: baked and emissive worlds, as MitsubaScene.
     Warns: UserWarning when the scene is more than 100 m or less than 1 cm wide (scenes.units).
     Raises: FileFormatError for a file that is missing or that Mitsuba cannot load (an unknown plugin, a missing
-      picture); DomainError for a dictionary it cannot load, a scene without shapes or light, an unknown level, unit
-      or axis.
+      picture); DomainError for a dictionary it cannot load, a scene without shapes or light, what cannot be baked
+      (light.bake), an unknown level, unit or axis.
     """
     if light not in LEVELS:
         raise DomainError(f"light = {light!r} is not known; choose one of {', '.join(LEVELS)}.")
     mi = backend.mitsuba(device)
-    R_world_file = _axes(up, unit_m)
-    scene = loaded(mi, source, parameters)
+    place = Placement(_axes(up, unit_m), unit_m, gain)
+    scene = loaded(mi, source, parameters, merge=light == "path")
     name = f"the scene '{source}'" if isinstance(source, (str, Path)) else "the scene"
     if not scene.shapes():
         raise DomainError(f"{name} has no shapes, so there is nothing to see; give one that has.")
-    if not scene.emitters():
-        raise DomainError(f"{name} has no light, so it is black at the level '{light}'; add an emitter.")
+    if light == "auto":
+        light = "emissive" if all(shape.is_emitter() for shape in scene.shapes()) else "baked"
+    if light != "emissive" and not scene.emitters():
+        raise DomainError(
+            f"{name} has no light, so it is black at the level '{light}'; add an emitter, or choose 'emissive'."
+        )
     units.hint(
         *([unit_m * v for v in corner] for corner in (scene.bbox().min, scene.bbox().max)), name, unit_m
     )
-    paths = PathScene(scene, device, samples=samples, seed=seed, integrator=_integrator(mi, scene, max_depth))
-    return PlacedScene(paths, R_world_file, unit_m, gain)
+    integrator = _integrator(mi, scene, max_depth)
+    if light == "path":
+        return PlacedScene(
+            PathScene(scene, device, samples=samples or 16, seed=seed, integrator=integrator), place
+        )
+    area_m2 = unit_m**2 * sum(float(shape.surface_area()[0]) for shape in scene.shapes())
+    return bake(
+        scene,
+        device,
+        texel_m=math.sqrt(area_m2 / TEXELS) if texel_m is None else texel_m,
+        samples=samples or 64,
+        seed=seed,
+        towards_m=towards_m,
+        matte=matte,
+        integrator=integrator if light == "baked" else None,
+        lit=light == "baked",
+        placement=place,
+    )
 
 
 def _integrator(mi, scene, max_depth):
@@ -255,7 +286,7 @@ def _check_variants(mi, entry, place):
     for key, value in entry.items():
         if isinstance(value, Mapping):
             _check_variants(mi, value, f"{place}{key}.")
-        elif hasattr(value, "variant_name") and value.variant_name() != mi.variant():
+        elif getattr(value, "variant_name", str)() not in ("", mi.variant()):
             raise DomainError(
                 f"'{place}{key}' of the scene was made in Mitsuba's variant {value.variant_name()}, but worlds are "
                 f"made in {mi.variant()}; call mi.set_variant('{mi.variant()}') before you make it."

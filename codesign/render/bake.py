@@ -1,20 +1,27 @@
-"""Light of a Lambertian scene, computed once by path tracing and kept as emissive textures.
+"""Light of a scene, computed once by path tracing and kept as emissive textures.
 
 Outgoing radiance of a Lambertian surface is emission + albedo x irradiance / pi, the same from every side.
 Irradiance is smooth, so it is estimated on a coarse light map; albedo and emission are read at their own
-resolution; the product is the texture of a ``MitsubaScene``.
+resolution; the product is the texture of a ``MitsubaScene``. Of surfaces that shine, whose radiance depends on where
+they are seen from, it is the mean over directions (weighted by their cosine, so that the energy is right), or the
+radiance towards one point. Surfaces that reflect on both sides have a texture for each.
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.ndimage import distance_transform_edt, zoom
 
 from codesign.errors import DomainError
-from codesign.render.charts import Faces, charts_of, placed
+from codesign.render.atlas import Nodes
+from codesign.render.charts import Chart, placed
+from codesign.render.placed import Placement
+from codesign.render.sided import SidedScene
+from codesign.render.surfaces import Surface, surfaces_of
 from codesign.render.world import MitsubaScene
 
 # of (1 m + distance from the origin): height over the surface from which a texel is looked at; about half of
@@ -25,13 +32,14 @@ SIZES = (
     1 << 17,
     1 << 20,
 )  # of launches: a new size is a new kernel, so points are padded to one of these
-FACE = 8  # times the samples of a texel for a face, since faces are larger than texels
 DARK = 1e-4  # an albedo below this shows no light worth measuring
-INVISIBLE = ("point", "directional", "spot")  # lamps that no camera ray meets
+SHINE = 0.2  # least albedo that light is divided by where part of it is not coloured by the albedo
+GRAZING = 0.05  # cosine of the flattest direction that shiny surfaces are looked at from
+MAX_FINE = 1 << 24  # texels of a finished texture
 
 
 def bake(
-    description: Mapping[str, Any],
+    description: Mapping[str, Any] | Any,
     device: str = "cpu",
     *,
     texel_m: float = 0.05,
@@ -40,240 +48,264 @@ def bake(
     max_depth: int = 8,
     max_texels: int = 512,
     fine: int = 10,
+    towards_m: Sequence[float] | None = None,
+    matte: bool = False,
+    integrator: Any = None,
+    lit: bool = True,
+    placement: Placement | None = None,
 ) -> MitsubaScene:
-    """A MitsubaScene whose emissive textures are the outgoing radiance of a Lambertian scene.
+    """A MitsubaScene whose emissive textures are the outgoing radiance of a scene.
 
     Args:
-      description: Mitsuba scene dictionary of rectangles, disks, spheres, cylinders, cubes and meshes
-        (dictionaries, or mi.Mesh objects) with 'diffuse' BSDFs, area emitters where they glow, and lamps of
-        any kind. Environment maps stay in the scene, seen and lighting.
-      texel_m: size of light-map texels, from 4 to max_texels along each side of a shape. samples: paths per
-        texel; seed: of all of them.
-      max_depth: longest path. fine: texels of a finished texture per light-map texel along each side, unless
-        its picture is coarser than that.
-    Returns: MitsubaScene. Meshes without texture coordinates get one radiance per face, cubes a texture of
-      six parts.
+      description: Mitsuba scene dictionary, or an mi.Scene, of rectangles, disks, spheres, cylinders and meshes, area
+        emitters where they glow, and lamps of any kind. Environment maps stay in the scene, seen and lighting.
+      texel_m: size of light-map texels, from 4 to max_texels along each side of a shape; larger on a mesh that would
+        need more than two million. samples: paths per texel; seed: of all of them.
+      max_depth: longest path. integrator: a Mitsuba SamplingIntegrator instead. fine: texels of a finished texture
+        per light-map texel along each side, unless its picture is coarser than that.
+      towards_m: place from which shiny surfaces look as they are; None shows the mean over directions.
+      matte: whether mirrors, glass and masks are shown as if they were matte, in their mean radiance.
+      lit: whether there is light at all; without it what glows shows its emission, anything else its albedo.
+      placement: of the scene in the world; texel_m and towards_m are the world's.
+    Returns: MitsubaScene. Meshes have textures of their own, whatever texture coordinates they come with; those
+      finer than their texels have radiance at vertices.
     Error: noise of about 1 / sqrt(samples) of what arrives indirectly, light smeared over a texel at contact
-      shadows; see light.level_error.
-    Raises: DomainError for surfaces that are not diffuse (their radiance depends on the side one looks from),
-      two-sided ones (one texture per surface), shapes without known charts, texture coordinates that overlap
-      or leave the unit square.
+      shadows, pictures read bilinearly, gloss from one direction; see light.level_error.
+    Raises: DomainError for mirrors, glass and masks unless ``matte``; media; shapes without known charts; of a
+      dictionary, shapes of which nothing can be seen from their front.
     """
     if not (texel_m > 0 and samples >= 1 and max_texels >= 4 and fine >= 1):
         raise DomainError(
             f"bake: texel_m = {texel_m}, samples = {samples}, max_texels = {max_texels}, fine = {fine}: "
             "sizes must be positive, samples and fine at least 1, max_texels at least 4."
         )
-    lit = MitsubaScene(description, device, merge=False, emissive=False)  # every shape keeps its name
-    mi = lit.mi
-    _check_surfaces(mi, lit.scene, description)
-    work = _Bake(
+    world = MitsubaScene(description, device, merge=False, emissive=False)  # every shape keeps its name
+    mi = world.mi
+    if lit and integrator is None:
+        integrator = mi.load_dict({"type": "path", "max_depth": int(max_depth), "rr_depth": 64})
+    place = placement or Placement(torch.eye(3))
+    work = Bake(
         mi,
-        lit.scene,
-        mi.load_dict({"type": "path", "max_depth": int(max_depth), "rr_depth": 64}),
+        world.scene,
+        integrator if lit else None,
         np.random.default_rng(seed),
         int(samples),
-        float(texel_m),
+        texel_m / place.unit_m,
         int(max_texels),
         int(fine),
+        None if towards_m is None else (np.array(towards_m) @ place.R_world_scene.numpy()) / place.unit_m,
     )
-    shapes = {shape.id(): shape for shape in lit.scene.shapes()}
-    kept = {}
-    found = {}
-    for name, entry in description.items():
-        kind = entry.get("type") if isinstance(entry, dict) else None
-        if kind in ("envmap", "constant", "sunsky"):
-            kept[name] = entry
-        elif isinstance(entry, mi.Shape) or name in shapes:
-            shape = entry if kind is None else shapes[name]
-            found[name] = (entry, shape, charts_of(mi, name, entry, shape))
-        elif kind not in INVISIBLE and isinstance(entry, dict):
-            raise DomainError(
-                f"bake: '{name}' of type '{kind}' is neither a shape nor a light that is known here; leave "
-                "it out."
-            )
-    textures = work.textures(
-        [
-            (name, entry, chart)
-            for name, (entry, _, charts) in found.items()
-            if not isinstance(charts, Faces)
-            for chart in charts
-        ]
-    )
-    radiance = {
-        name: work.faces(charts) if isinstance(charts, Faces) else [next(textures) for _ in charts]
-        for name, (_, _, charts) in found.items()
-    }
-    return MitsubaScene(
-        {
-            **{
-                name: placed(mi, entry, shape, charts, radiance[name])
-                for name, (entry, shape, charts) in found.items()
-            },
-            **kept,
-        },
-        device,
-    )  # made last: each new object would mean new kernels
+    surfaces = surfaces_of(mi, world.scene, work.texel, work.fine, matte)
+    light = work.radiance(surfaces, strict=isinstance(description, Mapping))
+    return shown(world, surfaces, light, place, device)
 
 
-def _check_surfaces(mi, scene, description):
-    for shape in scene.shapes():
-        bsdf = shape.bsdf()
-        if bsdf is None:
-            continue
-        flags = bsdf.flags()
-        name = shape.id()
-        lambertian = (
-            int(mi.BSDFFlags.DiffuseReflection)
-            | int(mi.BSDFFlags.FrontSide)
-            | int(mi.BSDFFlags.SpatiallyVarying)
-        )
-        if int(flags) & int(mi.BSDFFlags.BackSide):
-            raise DomainError(
-                f"bake: shape '{name}' reflects on both sides, and one texture holds one; use a plain "
-                "'diffuse' surface on a closed shape."
-            )
-        if int(flags) & ~lambertian:
-            raise DomainError(
-                f"bake: shape '{name}' is not Lambertian, so its radiance depends on where it is seen from; "
-                "use 'diffuse', or PathScene."
-            )
+def shown(
+    world: MitsubaScene, surfaces: Sequence[Surface], light: Any, place: Placement, device: str
+) -> MitsubaScene:
+    """The scene of these surfaces with their light, a list per surface of one array per side, as emission, and the
+    sky of the scene they come from."""
+    mi = world.mi
+    to_world = np.eye(4)
+    to_world[:3, :3] = place.unit_m * place.R_world_scene.numpy()
+    sky = world.scene.environment()
+    description: dict[str, Any] = {} if sky is None else {"sky": sky}
+    backs = {}
+    # made last: each new object would mean new kernels
+    for surface, sides in zip(surfaces, light, strict=True):
+        shape, back = placed(mi, surface.chart, to_world, sides)
+        shape.set_id(surface.name)
+        description[surface.name] = shape
+        if back is not None:
+            backs[surface.name] = back
+    plain = (
+        not backs and place.gain == 1 and (sky is None or bool((place.R_world_scene == torch.eye(3)).all()))
+    )
+    return MitsubaScene(description, device) if plain else SidedScene(description, backs, place, device)
 
 
 @dataclass(frozen=True)
-class _Bake:
+class Bake:
+    """The estimates. texel, towards: in the scene's unit and axes; integrator None takes light to be 1 everywhere,
+    which leaves albedo and emission."""
+
     mi: Any
     scene: Any
     integrator: Any
     random: np.random.Generator
     samples: int
-    texel_m: float
+    texel: float
     max_texels: int
     fine: int
+    towards: np.ndarray | None = None
 
-    def textures(self, jobs):
-        """Outgoing radiance [H, W] of each (name, entry, chart), in order."""
-        coarse = [self._coarse(chart) for _, _, chart in jobs]
-        fine = [self._fine(entry, chart) for _, entry, chart in jobs]
+    def radiance(self, surfaces: Sequence[Surface], strict: bool) -> list[list[np.ndarray]]:
+        """Outgoing radiance of every side of every surface: textures [H, W], or values [N] of nodes. strict: whether
+        a surface that nothing can be seen of from its front is an error."""
+        jobs = [(surface, side) for surface in surfaces for side in (1, -1)[: surface.sides]]
+        found = {}
+        for kind, estimate in ((Chart, self._textures(jobs, strict)), (Nodes, self._values(jobs))):
+            for (surface, _), value in zip(
+                (job for job in jobs if isinstance(job[0].chart, kind)), estimate, strict=True
+            ):
+                found.setdefault(surface.name, []).append(value)
+        return [found[surface.name] for surface in surfaces]
+
+    def _textures(self, jobs, strict):
+        """Outgoing radiance [H, W] of each (surface, side) with a chart, in order."""
+        jobs = [job for job in jobs if isinstance(job[0].chart, Chart)]
+        coarse = [self._coarse(surface.chart) for surface, _ in jobs]
+        fine = [self._fine(surface) for surface, _ in jobs]
         total, count = ([np.zeros(rows * columns) for rows, columns in coarse] for _ in range(2))
+        if self.integrator is None:
+            total = [
+                np.full(rows * columns, _unlit(job))
+                for job, (rows, columns) in zip(jobs, coarse, strict=True)
+            ]
+            count = [np.ones_like(part) for part in total]
         there = [False] * len(jobs)
-        for (k, texel, inside), light, albedo, _, seen in self._stream(
-            self._coarse_points(jobs, coarse), True
-        ):
-            seen &= inside
+        for (k, texel), light, albedo, _, seen in self._stream(self._coarse_points(jobs, coarse), True):
             there[k] |= bool(seen.any())
             seen &= albedo > DARK
             total[k] += np.bincount(texel, np.where(seen, light, 0), len(total[k]))
             count[k] += np.bincount(texel, seen, len(total[k]))
-        for k, (name, _, _) in enumerate(jobs):
-            if not there[k]:
+        for k, (surface, side) in enumerate(jobs):
+            if strict and self.integrator and side > 0 and not there[k]:
                 raise DomainError(
-                    f"bake: nothing of shape '{name}' can be seen from its front; another shape covers it, "
+                    f"bake: nothing of shape '{surface.name}' can be seen from its front; another shape covers it, "
                     "or its normals point inwards."
                 )
-        for (k, inside), _, albedo, emission, seen in self._stream(self._fine_points(jobs, fine), False):
-            light = _filled(
-                (total[k] / np.maximum(count[k], 1)).reshape(coarse[k]), (count[k] > 0).reshape(coarse[k])
-            )
-            seen = (seen & inside).reshape(fine[k])
-            albedo, emission = (_filled(part.reshape(fine[k]), seen) for part in (albedo, emission))
-            yield (emission + albedo * _resized(light, fine[k])).astype(np.float32)
+        values = None
+        for (k, texel, last), _, albedo, emission, seen in self._stream(self._fine_points(jobs, fine), False):
+            size = fine[k][0] * fine[k][1]
+            values = np.zeros((3, size)) if values is None else values
+            values[:, texel[seen]] = np.stack([albedo, emission, seen])[:, seen]
+            if last:
+                light = _filled(
+                    (total[k] / np.maximum(count[k], 1)).reshape(coarse[k]), (count[k] > 0).reshape(coarse[k])
+                )
+                albedo, emission, known = values.reshape(3, *fine[k])
+                albedo, emission = (_filled(part, known > 0) for part in (albedo, emission))
+                yield (emission + albedo * _resized(light, fine[k])).astype(np.float32)
+                values = None
 
     def _coarse_points(self, jobs, sizes):
-        """Random points within light-map texels: points, normals, (job, texel, on the surface), in blocks."""
+        """Random points within light-map texels: points, normals, shiny, (job, texel), in blocks."""
+        if self.integrator is None:
+            return
         block = max(1, SIZES[-1] // self.samples)
-        for k, ((_, _, chart), (rows, columns)) in enumerate(zip(jobs, sizes, strict=True)):
+        for k, ((surface, side), (rows, columns)) in enumerate(zip(jobs, sizes, strict=True)):
             for start in range(0, rows * columns, block):
                 texel = np.repeat(np.arange(start, min(start + block, rows * columns)), self.samples)
                 shift = self.random.random((2, texel.size))
-                points, normals, inside = chart.at(
+                points, normals, inside = surface.chart.at(
                     (texel % columns + shift[0]) / columns, (texel // columns + shift[1]) / rows
                 )
-                yield points, normals, (k, texel, inside)
+                if inside.any():
+                    yield points[inside], side * normals[inside], surface.shiny, (k, texel[inside])
 
     def _fine_points(self, jobs, sizes):
-        """Centres of the texels of finished textures: points, normals, (job, on the surface)."""
-        for k, ((_, _, chart), (rows, columns)) in enumerate(zip(jobs, sizes, strict=True)):
-            v, u = np.divmod(np.arange(rows * columns), columns)
-            points, normals, inside = chart.at((u + 0.5) / columns, (v + 0.5) / rows)
-            yield points, normals, (k, inside)
+        """Centres of the texels of finished textures: points, normals, shiny, (job, texel, whether the last)."""
+        for k, ((surface, side), (rows, columns)) in enumerate(zip(jobs, sizes, strict=True)):
+            for start in range(0, rows * columns, SIZES[-1]):
+                end = min(start + SIZES[-1], rows * columns)
+                v, u = np.divmod(np.arange(start, end), columns)
+                points, normals, inside = surface.chart.at((u + 0.5) / columns, (v + 0.5) / rows)
+                texel = np.arange(start, end)[inside]
+                yield points[inside], side * normals[inside], surface.shiny, (k, texel, end == rows * columns)
 
     def _stream(self, requests, paths):
-        """Answers of ``_look`` to (points, normals, tag), as (tag, *answers) in order; small requests share a
+        """Answers of ``_look`` to (points, normals, shiny, tag), as (tag, *answers) in order; small requests share a
         launch, since setting one up costs a tenth of a second."""
         waiting = []
         lanes = 0
         for request in itertools.chain(requests, [None]):
             if waiting and (request is None or lanes + len(request[0]) > SIZES[-1]):
                 points, normals = (np.concatenate([np.float32(row[k]) for row in waiting]) for k in (0, 1))
+                shiny = np.repeat([row[2] for row in waiting], [len(row[0]) for row in waiting])
                 ends = np.cumsum([len(row[0]) for row in waiting])[:-1]
-                for (_, _, tag), *answers in zip(
-                    waiting,
-                    *(np.split(part, ends) for part in self._look(points, normals, paths)),
-                    strict=True,
-                ):
-                    yield tag, *answers
+                answers = self._look(points, normals, shiny, paths)
+                for row, *parts in zip(waiting, *(np.split(part, ends) for part in answers), strict=True):
+                    yield row[3], *parts
                 waiting = []
                 lanes = 0
             if request is not None:
                 waiting.append(request)
                 lanes += len(request[0])
 
-    def _fine(self, entry, chart):
-        """Texels (rows, columns) of the finished texture: those of the pictures on the shape, but no more
-        than ``fine`` per light-map texel."""
-        coarse = np.array(self._coarse(chart))
-        wanted = [2 * coarse]
-        for surface, slot in (("bsdf", "reflectance"), ("emitter", "radiance")):
-            picture = (
-                entry.get(surface, {}).get(slot)
-                if isinstance(entry, dict) and isinstance(entry.get(surface), dict)
-                else None
-            )
-            if isinstance(picture, dict) and picture.get("type") == "bitmap" and "bitmap" in picture:
-                columns, rows = picture["bitmap"].size()
-                scale = np.array(picture["to_uv"].matrix, dtype=float) if "to_uv" in picture else np.eye(3)
-                wanted.append(np.ceil([rows * abs(scale[1, 1]), columns * abs(scale[0, 0])]))
-        return tuple(int(n) for n in np.minimum(np.max(wanted, 0), np.maximum(self.fine, 2) * coarse))
+    def _values(self, jobs):
+        """Outgoing radiance [N] of each (surface, side) with nodes: the mean near each; where nothing is seen that of
+        the others."""
+        jobs = [job for job in jobs if isinstance(job[0].chart, Nodes)]
+        total, count = ([np.zeros(len(surface.chart.vertices)) for surface, _ in jobs] for _ in range(2))
+        lit = self.integrator is not None
+        for (k, node), light, albedo, emission, seen in self._stream(self._node_points(jobs), lit):
+            out = emission + albedo * (np.where(albedo > DARK, light, 0) if lit else _unlit(jobs[k]))
+            total[k] += np.bincount(node, np.where(seen, out, 0), len(total[k]))
+            count[k] += np.bincount(node, seen, len(total[k]))
+        for sums, times in zip(total, count, strict=True):
+            mean = sums / np.maximum(times, 1)
+            yield np.where(times > 0, mean, mean[times > 0].mean() if times.any() else 0.0)
+
+    def _node_points(self, jobs):
+        """Random points near nodes: points, normals, shiny, (job, node), in blocks."""
+        block = max(1, SIZES[1] // self.samples)
+        for k, (surface, side) in enumerate(jobs):
+            for start in range(0, len(surface.chart.vertices), block):
+                node = np.arange(start, min(start + block, len(surface.chart.vertices))).repeat(self.samples)
+                points, normals = surface.chart.points(self.random, node)
+                yield points, side * normals, surface.shiny, (k, node)
 
     def _coarse(self, chart):
-        return tuple(
-            int(n) for n in np.clip(np.ceil(np.array(chart.size_m)[::-1] / self.texel_m), 4, self.max_texels)
-        )
+        """Rows and columns of a light map."""
+        if chart.atlas is not None:
+            return chart.atlas.texels
+        wanted = np.ceil(np.array(chart.size)[::-1] / self.texel)
+        return tuple(int(n) for n in np.clip(wanted, 4, self.max_texels))
 
-    def faces(self, charts):
-        """Outgoing radiance [F] of faces."""
-        points, normals = charts.points(self.random, FACE * self.samples)
-        light, albedo, emission, seen = (
-            part.reshape(points.shape[:2])
-            for part in self._look(points.reshape(-1, 3), np.repeat(normals, FACE * self.samples, 0), True)
-        )
-        return (np.where(seen, emission + albedo * light, 0).sum(1) / np.maximum(seen.sum(1), 1)).astype(
-            np.float32
-        )
+    def _fine(self, surface):
+        """Texels (rows, columns) of the finished texture: those of the pictures on the shape, but no more than
+        ``fine`` per light-map texel."""
+        chart = surface.chart
+        coarse = np.array(self._coarse(chart))
+        pictures = np.array(surface.texels_per_uv)
+        if chart.atlas is not None:  # the same factor both ways, since its cells lie in all directions
+            per_uv = float(np.sqrt(pictures.prod()))
+            per_texel = (
+                per_uv * chart.uv_per_unit * chart.size[0] / coarse[1] if np.isfinite(per_uv) else per_uv
+            )
+            wanted = max(1, np.ceil(min(per_texel, self.fine))) * coarse
+        else:
+            wanted = np.minimum(np.maximum(2 * coarse, np.ceil(pictures)), max(self.fine, 2) * coarse)
+        most = np.sqrt(MAX_FINE / np.prod(wanted))
+        return tuple(int(n) for n in np.maximum(coarse, wanted * min(1.0, most)))
 
-    def _look(self, points, normals, paths):
-        """Light (irradiance / pi), albedo, emission and whether the surface is there, for points just before
-        a surface; numpy [N]."""
+    def _look(self, points, normals, shiny, paths):
+        """Light (irradiance / pi), albedo, emission and whether the surface is there, for points on a surface; numpy
+        [N]. Where it is ``shiny`` light comes towards one direction, and albedo is no less than SHINE."""
         import drjit as dr
 
         mi = self.mi
-        parts = []
+        parts = [[np.zeros(0)] * 3 + [np.zeros(0, dtype=bool)]]
         for start in range(0, len(points), SIZES[-1]):
-            p = points[start : start + SIZES[-1]]
-            n = normals[start : start + SIZES[-1]]
+            p, n, loose = (part[start : start + SIZES[-1]] for part in (points, normals, shiny))
+            out = self._directions(p, n, loose)
             count = len(p)
             width = next(size for size in SIZES if size >= len(p))
-            p, n = (np.concatenate([part, np.broadcast_to(part[-1], (width - count, 3))]) for part in (p, n))
             lift = LIFT * (1 + np.abs(p).max(1))
+            reach = lift / np.maximum((out * n).sum(1), GRAZING)
+            p, out, reach, loose = (
+                np.concatenate([part, np.broadcast_to(part[-1], (width - count, *part.shape[1:]))])
+                for part in (p, out, reach, loose)
+            )
             ray = mi.RayDifferential3f(
-                mi.Point3f(*_columns(mi, p + lift[:, None] * n)), mi.Vector3f(*_columns(mi, -n))
+                mi.Point3f(*_columns(mi, p + reach[:, None] * out)), mi.Vector3f(*_columns(mi, -out))
             )
             si = self.scene.ray_intersect(mi.Ray3f(ray.o, ray.d))
-            bsdf = si.bsdf()
-            albedo = bsdf.eval_diffuse_reflectance(si)[0]
+            albedo = si.bsdf().eval_diffuse_reflectance(si)[0]
+            albedo = dr.select(mi.Bool(loose), dr.clip(albedo, SHINE, 1), albedo)
             emission = si.emitter(self.scene).eval(si)[0]
-            height = mi.Float(lift.astype(np.float32))
+            height = mi.Float(reach.astype(np.float32))
             seen = si.is_valid() & (si.t > 0.5 * height) & (si.t < 2 * height)
             light = mi.Float(0)
             if paths:
@@ -291,6 +323,29 @@ class _Bake:
                 ]
             )
         return [np.concatenate(column) for column in zip(*parts, strict=True)]
+
+    def _directions(self, points, normals, shiny):
+        """Where each point is looked at from: along its normal, or where it shines from ``towards``, or from anywhere
+        with the density of the cosine."""
+        if not shiny.any():
+            return normals
+        cosine = np.sqrt(self.random.uniform(GRAZING**2, 1, len(points)))[:, None]
+        turn = 2 * np.pi * self.random.random((len(points), 1))
+        helper = np.where(np.abs(normals[:, :1]) < 0.7, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+        u = np.cross(normals, helper)
+        u /= np.linalg.norm(u, axis=1, keepdims=True)
+        across = np.cos(turn) * u + np.sin(turn) * np.cross(normals, u)
+        out = cosine * normals + np.sqrt(1 - cosine**2) * across
+        if self.towards is not None:
+            there = self.towards - points
+            there /= np.maximum(np.linalg.norm(there, axis=1, keepdims=True), 1e-12)
+            out = np.where(((there * normals).sum(1) > GRAZING)[:, None], there, out)
+        return np.where(shiny[:, None], out, normals)
+
+
+def _unlit(job):
+    """What stands for light at the level without it: what glows shows its emission alone."""
+    return 0.0 if job[0].shape.is_emitter() else 1.0
 
 
 def _columns(mi, rows):

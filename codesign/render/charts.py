@@ -8,106 +8,92 @@ from typing import Any
 import numpy as np
 
 from codesign.errors import DomainError, ShapeError
+from codesign.render.atlas import Atlas, Nodes, atlas_of, cells_of, nodes_of
 from codesign.render.soundness import checked_mesh
 
-# texels around each face of a cube's texture that repeat its border, so that interpolation sees no neighbour
-CUBE_GAP = 2
-OVERLAP = 1.02  # area of all triangles in texture space over the area they cover
+FINE_MESH = 0.5  # of a texel: meshes whose pieces are smaller on the average have their light at vertices
+MAX_CELLS = 200_000
 
 
 @dataclass(frozen=True)
 class Chart:
     """A map from the unit square to a surface: ``at`` takes u, v [N] (v up) and gives points [N, 3], normals
-    [N, 3], on the surface [N]. size_m: its extent along u and v."""
+    [N, 3], on the surface [N]. size: its extent along u and v, in the scene's unit. matrix, kind, flip: of the
+    Mitsuba shape that it is; atlas: the layout of a mesh, whose texture coordinates are its own; uv_per_unit:
+    lengths of that mesh's former ones on its surface."""
 
-    size_m: tuple[float, float]
+    size: tuple[float, float]
     at: Callable[[Any, Any], tuple[Any, Any, Any]]
+    kind: str = ""
+    matrix: Any = None
+    flip: float = 1.0
+    atlas: Atlas | None = None
+    uv_per_unit: float = 0.0
 
 
-@dataclass(frozen=True)
-class Faces:
-    """A triangle mesh without texture coordinates: corners [F, 3, 3]; flip: -1 where normals point to the
-    other side."""
+def chart_of(mi: Any, shape: Any, texel: float, detail: float | None) -> Chart | Nodes:
+    """The chart of a Mitsuba shape, or nodes for a mesh that is finer than its texels.
 
-    corners: np.ndarray
-    flip: float
-
-    def points(self, random, samples):
-        """Uniform points [F, samples, 3] on every face, and the faces' normals [F, 3]."""
-        s = np.sqrt(random.random((len(self.corners), samples)))
-        t = random.random((len(self.corners), samples))
-        weights = np.stack([1 - s, s * (1 - t), s * t], -1)
-        across = np.cross(self.corners[:, 1] - self.corners[:, 0], self.corners[:, 2] - self.corners[:, 0])
-        return weights @ self.corners, self.flip * across / np.maximum(
-            np.linalg.norm(across, axis=1, keepdims=True), 1e-30
-        )
-
-
-def charts_of(mi, name, entry, shape) -> Any:
-    """Charts of a Mitsuba shape, or Faces. Raises: DomainError for a shape that has neither."""
+    Args: texel: of light; detail: of the pictures on it, None where there are none. Raises: DomainError for a shape
+      that has no chart here.
+    """
     kind = shape.shape_type()
-    flip = -1.0 if shape.has_flipped_normals() else 1.0
     parameters = mi.traverse(shape)
-    if kind == int(mi.ShapeType.Rectangle):
-        return [_rectangle(_matrix(parameters), flip)]
-    if kind == int(mi.ShapeType.Disk):
-        return [_disk(_matrix(parameters), flip)]
-    if kind == int(mi.ShapeType.Sphere):
-        return [_sphere(_matrix(parameters), flip)]
-    if kind == int(mi.ShapeType.Cylinder):
-        return [_cylinder(_matrix(parameters), flip)]
-    if not shape.is_mesh():
+    for known, chart in ((mi.ShapeType.Rectangle, _rectangle), (mi.ShapeType.Disk, _disk)) + (
+        (mi.ShapeType.Sphere, _sphere),
+        (mi.ShapeType.Cylinder, _cylinder),
+    ):
+        if kind == int(known):
+            return chart(_matrix(parameters), -1.0 if shape.has_flipped_normals() else 1.0)
+    if not shape.is_mesh() or "faces" not in parameters:
         raise DomainError(
-            f"bake: shape '{name}' has no texture chart here; use meshes, rectangles, cubes, spheres, disks "
-            "and cylinders, or PathScene."
+            f"bake: shape '{shape.id()}', a {shape.class_name()}, has no texture chart here; use meshes, rectangles, "
+            "cubes, spheres, disks and cylinders (copies instead of instances), or PathScene."
         )
-    vertices, faces = mesh_arrays(parameters)
-    if isinstance(entry, dict) and entry.get("type") == "cube":
-        return [_rectangle(frame, 1.0) for frame in cube_frames(_cube_matrix(entry))]
-    if not shape.has_vertex_texcoords():
-        return Faces(vertices[faces], flip)
-    return [
-        _unwrapped(
-            mi,
-            name,
-            shape,
-            vertices,
-            faces,
-            np.array(parameters["vertex_texcoords"], dtype=float).reshape(-1, 2),
-            flip,
+    vertices, faces, uv = mesh_arrays(parameters)
+    if shape.has_flipped_normals():
+        faces = faces[:, ::-1]
+    area = _areas(vertices[faces])
+    faces = faces[area > 0]
+    if not len(faces):
+        raise DomainError(f"bake: mesh '{shape.id()}' has no faces with an area; leave it out.")
+    cells = cells_of(vertices, faces)
+    piece = np.sqrt(area.sum() / len(cells.origin))
+    if (piece < FINE_MESH * texel and (detail is None or piece < detail)) or len(cells.origin) > MAX_CELLS:
+        return nodes_of(vertices, faces)
+    covered = _areas(np.pad(uv[faces], ((0, 0), (0, 0), (0, 1)))).sum() if uv is not None else 0.0
+    atlas = atlas_of(cells, texel)
+    size = (texel * atlas.texels[1], texel * atlas.texels[0])
+    return Chart(size, atlas.at, atlas=atlas, uv_per_unit=float(np.sqrt(covered / area.sum())))
+
+
+def _areas(corners):
+    return np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+
+
+def placed(mi: Any, chart: Chart | Nodes, to_world: np.ndarray, light: list[np.ndarray]) -> tuple[Any, Any]:
+    """The shape moved by a similarity [4, 4], with its light as emission: textures [H, W] of a Chart, values [N] of
+    Nodes, of its front and, where there are two, of its back. Returns the shape and the emitter of its back or
+    None."""
+    if isinstance(chart, Nodes):
+        back = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_back"}}
+        shape = emissive_mesh(
+            mi, _to_world(to_world, chart.vertices), chart.faces, light[0], attribute="vertex_front"
         )
-    ]
-
-
-def placed(mi, entry, shape, charts, textures):
-    """The shape as dictionary or mesh with its textures as emission."""
-    if isinstance(charts, Faces):
-        vertices, faces = mesh_arrays(mi.traverse(shape))
-        return emissive_mesh(mi, vertices, faces, textures, flip=charts.flip < 0)
-    if len(charts) == 6:
-        atlas, vertices, faces, uv = cube_atlas(cube_frames(_cube_matrix(entry)), textures)
-        return emissive_mesh(mi, vertices, faces, emitter(mi, atlas), uv)
-    if isinstance(entry, dict):
-        return {
-            **{
-                key: value
-                for key, value in entry.items()
-                if key not in ("bsdf", "emitter") and not _is_surface(value)
-            },
-            "emitter": emitter(mi, textures[0]),
-        }
-    parameters = mi.traverse(shape)
-    return emissive_mesh(
-        mi,
-        *mesh_arrays(parameters),
-        emitter(mi, textures[0]),
-        np.array(parameters["vertex_texcoords"]).reshape(-1, 2),
-        flip=shape.has_flipped_normals(),
-    )
-
-
-def _is_surface(value):
-    return isinstance(value, dict) and value.get("type") in ("diffuse", "twosided", "area")
+        if len(light) > 1:
+            shape.add_attribute("vertex_back", 1, np.ascontiguousarray(light[1], dtype=np.float32))
+    else:
+        front, back = (emitter(mi, part) for part in (light[0], light[-1]))
+        if chart.atlas is not None:
+            vertices, faces, uv = chart.atlas.mesh()
+            shape = emissive_mesh(mi, _to_world(to_world, vertices), faces, front, uv)
+        else:
+            frame = mi.ScalarTransform4f(to_world @ chart.matrix)
+            flipped = chart.flip < 0
+            shape = mi.load_dict(
+                {"type": chart.kind, "to_world": frame, "flip_normals": flipped, "emitter": front}
+            )
+    return shape, mi.load_dict(back) if len(light) > 1 else None
 
 
 def emitter(mi, texture):
@@ -123,12 +109,18 @@ def emitter(mi, texture):
     }
 
 
-def emissive_mesh(mi, vertices, faces, light, uv=None, flip=False, bsdf=None):
-    """A Mitsuba mesh of flat faces: ``light`` is an emitter dictionary, an array [F] of radiance per face, or
-    None; ``bsdf`` a dictionary or None. Raises: DomainError and ShapeError for a mesh that cannot be."""
+def emissive_mesh(mi, vertices, faces, light, uv=None, bsdf=None, attribute="face_radiance"):
+    """A Mitsuba mesh of flat faces: ``light`` is an emitter dictionary, an array of radiance, [F] per face or, for an
+    ``attribute`` that begins with vertex_, [V] per vertex, or None; ``bsdf`` a dictionary or None. Raises: DomainError
+    and ShapeError for a mesh that cannot be."""
     vertices, faces = checked_mesh("mesh", vertices, faces)
+    per = "vertex" if attribute.startswith("vertex_") else "face"
     for label, values, count in (
-        ("radiance per face", None if isinstance(light, dict) else light, len(faces)),
+        (
+            f"radiance per {per}",
+            None if isinstance(light, dict) else light,
+            len(vertices if per == "vertex" else faces),
+        ),
         ("texture coordinates", uv, len(vertices)),
     ):
         if values is not None and len(values) != count:  # Mitsuba would read beyond their end
@@ -138,16 +130,14 @@ def emissive_mesh(mi, vertices, faces, light, uv=None, flip=False, bsdf=None):
         source = (
             light
             if isinstance(light, dict)
-            else {"type": "area", "radiance": {"type": "mesh_attribute", "name": "face_radiance"}}
+            else {"type": "area", "radiance": {"type": "mesh_attribute", "name": attribute}}
         )
         properties["mesh_emitter"] = mi.load_dict(source)
     if bsdf is not None:
         properties["mesh_bsdf"] = mi.load_dict(bsdf)
-    if flip:
-        properties["flip_normals"] = True
     mesh = mi.Mesh("mesh", len(vertices), len(faces), props=properties, has_vertex_texcoords=uv is not None)
     if light is not None and not isinstance(light, dict):
-        mesh.add_attribute("face_radiance", 1, np.asarray(light, dtype=np.float32).reshape(-1))
+        mesh.add_attribute(attribute, 1, np.asarray(light, dtype=np.float32).reshape(-1))
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices, dtype=np.float32).reshape(-1))
     parameters["faces"] = mi.UInt32(np.ascontiguousarray(faces, dtype=np.uint32).reshape(-1))
@@ -158,10 +148,14 @@ def emissive_mesh(mi, vertices, faces, light, uv=None, flip=False, bsdf=None):
 
 
 def mesh_arrays(parameters):
-    """Vertices [V, 3] float64 and faces [F, 3] of a mesh."""
-    return np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3), np.array(
-        parameters["faces"]
-    ).reshape(-1, 3)
+    """Vertices [V, 3] float64, faces [F, 3] and texture coordinates [V, 2] of a mesh, None where it has none."""
+    vertices = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    uv = (
+        np.array(parameters["vertex_texcoords"], dtype=np.float64)
+        if "vertex_texcoords" in parameters
+        else np.empty(0)
+    )
+    return vertices, np.array(parameters["faces"]).reshape(-1, 3), uv.reshape(-1, 2) if uv.size else None
 
 
 # ---- the map of each shape; texture coordinates as Mitsuba has them
@@ -184,7 +178,8 @@ def _rectangle(matrix, flip):
         points = _to_world(matrix, np.stack([2 * u - 1, 2 * v - 1, 0 * u], -1))
         return points, np.broadcast_to(normal, points.shape), np.ones(len(points), dtype=bool)
 
-    return Chart((2 * float(np.linalg.norm(axes[:, 0])), 2 * float(np.linalg.norm(axes[:, 1]))), at)
+    size = (2 * float(np.linalg.norm(axes[:, 0])), 2 * float(np.linalg.norm(axes[:, 1])))
+    return Chart(size, at, "rectangle", matrix, flip)
 
 
 def _disk(matrix, flip):
@@ -196,7 +191,7 @@ def _disk(matrix, flip):
         y = u * np.sin(2 * np.pi * v)
         return flat.at((x + 1) / 2, (y + 1) / 2)
 
-    return Chart((radius, 2 * np.pi * radius), at)
+    return Chart((radius, 2 * np.pi * radius), at, "disk", matrix, flip)
 
 
 def _sphere(matrix, flip):
@@ -212,7 +207,7 @@ def _sphere(matrix, flip):
             np.ones(len(local), dtype=bool),
         )
 
-    return Chart((2 * np.pi * radius, np.pi * radius), at)
+    return Chart((2 * np.pi * radius, np.pi * radius), at, "sphere", matrix, flip)
 
 
 def _cylinder(matrix, flip):
@@ -228,95 +223,4 @@ def _cylinder(matrix, flip):
             np.ones(len(around), dtype=bool),
         )
 
-    return Chart((2 * np.pi * radius, length), at)
-
-
-def _unwrapped(mi, name, shape, vertices, faces, uv, flip):
-    """A mesh with texture coordinates that cover each place at most once."""
-    if uv.min() < -1e-6 or uv.max() > 1 + 1e-6:
-        raise DomainError(
-            f"bake: texture coordinates of mesh '{name}' leave the unit square, where one texel would hold "
-            "several places; unwrap it anew."
-        )
-    a, b, c = (uv[faces[:, k]] for k in range(3))
-    area = 0.5 * np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]).sum()
-    side = 512
-    v, u = np.divmod(np.arange(side * side), side)
-
-    def look(u, v):
-        return shape.eval_parameterization(mi.Point2f(mi.Float(np.float32(u)), mi.Float(np.float32(v))))
-
-    covered = float(np.array(look((u + 0.5) / side, (v + 0.5) / side).is_valid()).mean())
-    if area > OVERLAP * covered + 4 / side:
-        raise DomainError(
-            f"bake: texture coordinates of mesh '{name}' overlap (triangles of area {area:.3g} cover "
-            f"{covered:.3g}); unwrap it so that no two places share a texel."
-        )
-    world = (
-        0.5
-        * np.linalg.norm(
-            np.cross(
-                vertices[faces[:, 1]] - vertices[faces[:, 0]], vertices[faces[:, 2]] - vertices[faces[:, 0]]
-            ),
-            axis=1,
-        ).sum()
-    )
-    size = float(np.sqrt(world / max(area, 1e-9)))
-
-    def at(u, v):
-        si = look(u, v)
-        inside = np.array(si.is_valid()).astype(bool)
-        points, normals = (
-            np.where(inside[:, None], np.array(part, dtype=np.float64).T, fallback)
-            for part, fallback in ((si.p, 0.0), (si.n, 1.0))
-        )
-        return points, normals, inside
-
-    return Chart((size, size), at)
-
-
-# ---- cubes: six rectangles in one texture, since Mitsuba's cube has the same texture coordinates on every
-# face
-
-
-def _cube_matrix(entry):
-    frame = entry.get("to_world")
-    return np.eye(4) if frame is None else np.array(frame.matrix, dtype=np.float64).reshape(4, 4)
-
-
-def cube_frames(matrix):
-    """Rectangle frames [4, 4] of a cube's faces, normals outwards."""
-    frames = []
-    for axis in range(3):
-        for sign in (-1.0, 1.0):
-            local = np.zeros((4, 4))
-            first, second = ((axis + 1) % 3, (axis + 2) % 3) if sign > 0 else ((axis + 2) % 3, (axis + 1) % 3)
-            local[first, 0] = local[second, 1] = 1
-            local[axis, 2] = local[axis, 3] = sign
-            local[3, 3] = 1
-            frames.append(matrix @ local)
-    return frames
-
-
-def cube_atlas(frames, textures):
-    """One texture of six, three beside each other in two rows, with the mesh that uses it.
-
-    Returns: atlas [H, W], vertices [24, 3], faces [12, 3], uv [24, 2]; each face of the cube has four
-      vertices of its own.
-    """
-    rows, columns = (max(t.shape[k] for t in textures) + 2 * CUBE_GAP for k in (0, 1))
-    atlas = np.zeros((2 * rows, 3 * columns), dtype=np.float32)
-    vertices = []
-    faces = []
-    uv = []
-    for k, (frame, texture) in enumerate(zip(frames, textures, strict=True)):
-        top, left, (h, w) = k // 3 * rows, k % 3 * columns, texture.shape
-        padded = np.pad(
-            texture, ((CUBE_GAP, rows - h - CUBE_GAP), (CUBE_GAP, columns - w - CUBE_GAP)), mode="edge"
-        )
-        atlas[top : top + rows, left : left + columns] = padded
-        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=float)
-        vertices.append(_to_world(frame, np.column_stack([2 * corners - 1, np.zeros(4)])))
-        uv.append((corners * [w, h] + [left + CUBE_GAP, top + CUBE_GAP]) / [3 * columns, 2 * rows])
-        faces += [[4 * k, 4 * k + 1, 4 * k + 2], [4 * k, 4 * k + 2, 4 * k + 3]]
-    return atlas, np.concatenate(vertices), np.array(faces), np.concatenate(uv)
+    return Chart((2 * np.pi * radius, length), at, "cylinder", matrix, flip)

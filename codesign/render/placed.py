@@ -1,6 +1,7 @@
 """A scene that keeps its own axes and unit of length, placed in the world: the rays go to the scene."""
 
 import copy
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -9,32 +10,47 @@ from torch import Tensor
 from codesign.errors import DomainError, GradientError, check_finite
 
 
-class PlacedScene:
-    """A scene in axes and units of its own, seen by cameras in the world's metres.
+@dataclass(frozen=True)
+class Placement:
+    """How a scene of its own axes and unit stands in the world. R_world_scene: [3, 3] rotation from its axes to the
+    world's; unit_m: metres per unit of its lengths; gain: factor on its radiance.
 
-    Args: scene: with ``radiance``, ``radiance_and_distance`` and ``hit``, such as a PathScene. R_world_scene:
-      [3, 3] rotation from its axes to the world's. unit_m: metres per unit of its lengths. gain: factor on its
-      radiance.
-    Nothing of the scene is changed, so what depends on its size (media, bumps, point lamps) looks as in itself.
-    Gradient: that of the scene. Raises: DomainError for a matrix that is no rotation, or a unit or gain that is
-      not positive.
+    Raises: DomainError for a matrix that is no rotation, or a unit or gain that is not positive.
     """
 
-    def __init__(self, scene: Any, R_world_scene: Tensor, unit_m: float = 1.0, gain: float = 1.0):
-        R = check_finite(torch.as_tensor(R_world_scene, dtype=torch.float64), "placed scene: R_world_scene")
+    R_world_scene: Tensor
+    unit_m: float = 1.0
+    gain: float = 1.0
+
+    def __post_init__(self):
+        R = check_finite(self.R_world_scene, "placement: R_world_scene").double()
         if (
             R.shape != (3, 3)
             or float((R @ R.mT - torch.eye(3)).abs().max()) > 1e-6
             or torch.linalg.det(R) < 0
         ):
-            raise DomainError(f"placed scene: R_world_scene must be a rotation [3, 3], got {R.tolist()}.")
-        for name, value in (("unit_m", unit_m), ("gain", gain)):
-            if not 0 < value < float("inf"):
-                raise DomainError(f"placed scene: {name} = {value} must be positive and finite.")
+            raise DomainError(f"placement: R_world_scene must be a rotation [3, 3], got {R.tolist()}.")
+        for name in ("unit_m", "gain"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise DomainError(f"placement: {name} = {getattr(self, name)} must be positive and finite.")
+
+    def in_scene(self, arr: Any, direction: Any) -> Any:
+        """World directions (drjit arrays) in the scene's axes."""
+        rows = self.R_world_scene.mT.tolist()
+        return arr.Array3(*[r[0] * direction.x + r[1] * direction.y + r[2] * direction.z for r in rows])
+
+
+class PlacedScene:
+    """A scene in axes and units of its own, seen by cameras in the world's metres.
+
+    Args: scene: with ``radiance``, ``radiance_and_distance`` and ``hit``, such as a PathScene. placement: of it.
+    Nothing of the scene is changed, so what depends on its size (media, bumps, point lamps) looks as in itself.
+    Gradient: that of the scene.
+    """
+
+    def __init__(self, scene: Any, placement: Placement):
         self.scene = scene
-        self.R_world_scene = R
-        self.unit_m = float(unit_m)
-        self.gain = float(gain)
+        self.placement = placement
         self.dtype = scene.dtype
 
     @property
@@ -50,27 +66,24 @@ class PlacedScene:
 
     def radiance(self, arr: Any, origin: Any, direction: Any) -> Any:
         """Radiance along world rays (drjit arrays)."""
-        return self.gain * self.scene.radiance(arr, *self._in_scene(arr, origin, direction))
+        return self.placement.gain * self.scene.radiance(arr, *self._in_scene(arr, origin, direction))
 
     def radiance_and_distance(self, arr: Any, origin: Any, direction: Any) -> Any:
         """Radiance as above, and the distance in metres to what is hit."""
         light, distance = self.scene.radiance_and_distance(arr, *self._in_scene(arr, origin, direction))
-        return self.gain * light, self.unit_m * distance
+        return self.placement.gain * light, self.placement.unit_m * distance
 
     def _in_scene(self, arr, origin, direction):
-        rows = self.R_world_scene.mT.tolist()
-
-        def turned(v):
-            return arr.Array3(*[r[0] * v.x + r[1] * v.y + r[2] * v.z for r in rows])
-
-        return turned(origin) / self.unit_m, turned(direction)
+        place = self.placement
+        return place.in_scene(arr, origin) / place.unit_m, place.in_scene(arr, direction)
 
     def hit(self, origin_m: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """First surface met by world rays [N, 3]: point [N, 3], normal [N, 3], valid [N], as MitsubaScene has
         it."""
-        R = self.R_world_scene.to(origin_m)
-        point, normal, valid = self.scene.hit((origin_m @ R) / self.unit_m, direction @ R.to(direction))
-        return self.unit_m * (point @ R.mT.to(point)), normal @ R.mT.to(normal), valid
+        R = self.placement.R_world_scene.to(origin_m)
+        unit_m = self.placement.unit_m
+        point, normal, valid = self.scene.hit((origin_m @ R) / unit_m, direction @ R.to(direction))
+        return unit_m * (point @ R.mT.to(point)), normal @ R.mT.to(normal), valid
 
     def outline(self) -> Any:
         """Raises GradientError: curves are known of scenes in the world's own axes."""

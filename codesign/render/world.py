@@ -81,6 +81,20 @@ class MitsubaScene:
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
         found = self.scene.ray_intersect_preliminary(ray, coherent=True)
         si = found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.Minimal)
+        light = self.emitted(arr, si, ray)
+        if not dr.grad_enabled(ray.o, ray.d):
+            return light, found.t
+        met = si.is_valid()
+        normal = dr.detach(si.n)
+        falling = dr.dot(ray.d, normal)
+        along = dr.dot(dr.detach(si.p) - ray.o, normal) / dr.select(met & (falling != 0), falling, 1)
+        return light, dr.replace_grad(found.t, dr.select(met, along, 0))
+
+    def emitted(self, arr: Any, si: Any, ray: Any) -> Any:
+        """Radiance towards a ray (drjit arrays) of the surface that it meets, of the sky where it meets none."""
+        import drjit as dr
+
+        mi = self.mi
         # emission is one-sided by the face: vertex normals are stored to 1 % only and would blacken faces
         # seen nearly edge-on
         facing = -dr.dot(si.n, ray.d)
@@ -89,14 +103,7 @@ class MitsubaScene:
             self.scene.environment() is not None
         ):  # a sky is looked up by the direction, which these flags leave out where nothing is met
             si.wi = dr.select(si.is_valid(), si.wi, -ray.d)
-        light = si.emitter(self.scene).eval(si)[0]
-        if not dr.grad_enabled(ray.o, ray.d):
-            return light, found.t
-        met = si.is_valid()
-        normal = dr.detach(si.n)
-        falling = dr.dot(ray.d, normal)
-        along = dr.dot(dr.detach(si.p) - ray.o, normal) / dr.select(met & (falling != 0), falling, 1)
-        return light, dr.replace_grad(found.t, dr.select(met, along, 0))
+        return si.emitter(self.scene).eval(si)[0]
 
     def outline(self) -> Any:
         """Curves where radiance may jump, see codesign.render.outline; worked out once."""

@@ -12,7 +12,7 @@ from codesign import backend, lens, render
 from codesign.errors import DomainError, GradientError
 from codesign.pose import look_at
 from codesign.render import Camera, MitsubaScene, light
-from codesign.render.charts import charts_of, emissive_mesh
+from codesign.render.charts import chart_of, emissive_mesh
 from codesign.render.outline import Segments
 from codesign.types import Rays
 from scenes import textures, worlds
@@ -206,45 +206,40 @@ def baked_still_life(still_life):
 def test_baked_light_is_path_traced_light_on_every_kind_of_shape(still_life, baked_still_life):
     mi = backend.mitsuba()
     reference = light.PathScene(still_life, samples=256)
-    shapes = {
-        shape.id(): shape for shape in MitsubaScene(still_life, merge=False, emissive=False).scene.shapes()
-    }
-    for name in ("floor", "cube", "ball", "tube", "cap", "lamp"):
-        for chart in charts_of(mi, name, still_life[name], shapes[name]):
-            u, v = np.random.default_rng(0).random((2, 512))
-            points, normals, _ = chart.at(u, v)
+    for name in ("floor", "ball", "tube", "cap", "lamp", "cube"):
+        shape = mi.load_dict(still_life[name])
+        u, v = np.random.default_rng(0).random((2, 4096 if name == "cube" else 512))
+        points, normals, inside = chart_of(mi, shape, 0.04, None).at(u, v)
+        for face in np.unique(normals[inside].round(3), axis=0) if name == "cube" else [None]:
+            there = inside if face is None else inside & (np.abs(normals - face).max(1) < 0.01)
             ours, theirs = (
-                radiance_at(scene, points, normals, 5e-4) for scene in (baked_still_life, reference)
+                radiance_at(scene, points[there], normals[there], 5e-4)
+                for scene in (baked_still_life, reference)
             )
             # 131,072 paths per face, 16 to 6000 texels of 256 paths: below 0.5 %. Under the cube, 1 mm over
             # the floor, there is next to no light
             assert abs(float((ours - theirs).mean())) < 0.01 * max(float(theirs.mean()), 5.0), name
 
 
-def test_meshes_without_texture_coordinates_show_the_mean_light_of_each_face_and_others_their_texture(
-    still_life, baked_still_life
+@pytest.mark.parametrize("name", ["bare", "unwrapped"])
+def test_faces_of_a_mesh_show_their_light_whatever_texture_coordinates_it_has(
+    still_life, baked_still_life, name
 ):
     mi = backend.mitsuba()
     reference = light.PathScene(still_life, samples=128)
-    random = np.random.default_rng(0)
-    points, normals = charts_of(mi, "bare", still_life["bare"], still_life["bare"]).points(random, 256)
-    for face in range(4):
-        ours, theirs = (
-            radiance_at(scene, points[face], np.tile(normals[face], (256, 1)), 5e-4)
-            for scene in (baked_still_life, reference)
-        )
-        # 2048 and 32,768 paths of a relative spread of 0.5 to 1: 1 to 2 %
-        assert float(ours.std()) < 1e-3
-        assert float(ours.mean()) == pytest.approx(
-            float(theirs.mean()), rel=0.05, abs=0.5
-        )  # the face over the floor has next to no light
-    (chart,) = charts_of(mi, "unwrapped", still_life["unwrapped"], still_life["unwrapped"])
-    points, normals, inside = chart.at(*random.random((2, 4096)))
-    ours, theirs = (
-        radiance_at(scene, points[inside], normals[inside], 5e-4) for scene in (baked_still_life, reference)
+    points, normals, inside = chart_of(mi, still_life[name], 0.04, None).at(
+        *np.random.default_rng(0).random((2, 4096))
     )
-    assert 0.3 < inside.mean() < 0.5  # four triangles of a tenth of the unit square each
-    assert float(ours.mean()) == pytest.approx(float(theirs.mean()), rel=0.02)
+    for face in np.unique(normals[inside].round(3), axis=0):
+        there = inside & (np.abs(normals - face).max(1) < 0.01)
+        ours, theirs = (
+            radiance_at(scene, points[there], normals[there], 5e-4) for scene in (baked_still_life, reference)
+        )
+        # some 200 points x 128 paths and 50 texels x 256 paths of a relative spread of 0.5 to 1: below 1 %; light
+        # that falls off within a texel towards the floor is smeared
+        assert float(ours.mean()) == pytest.approx(
+            float(theirs.mean()), rel=0.03, abs=0.5
+        )  # the face over the floor has next to no light
 
 
 def test_frames_of_baked_light_are_frames_of_path_tracing_within_its_noise(still_life, baked_still_life):
@@ -348,24 +343,21 @@ def test_the_cheapest_level_within_the_tolerance_is_chosen_and_says_why():
 
 
 def test_what_cannot_be_is_refused_in_a_sentence(still_life):
-    mi = backend.mitsuba()
     sheet = square((0, 0, 0), (0, 0, 1))
-    with pytest.raises(DomainError, match="reflects on both sides"):
-        light.bake({"a": {**sheet, "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}})
-    with pytest.raises(DomainError, match="not Lambertian"):
-        light.bake({"a": {**sheet, "bsdf": {"type": "roughconductor"}}})
-    overlapping = np.tile([[0, 0], [1, 0], [0, 1]], (2, 1)).astype(float)
-    outside = np.array([[0, 0], [2, 0], [0, 1], [0, 0], [2, 0], [0, 1]], dtype=float)
-    triangles = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]], dtype=float)
-    for uv, sentence in ((overlapping, "overlap"), (outside, "leave the unit square")):
-        with pytest.raises(DomainError, match=sentence):
-            light.bake(
-                {
-                    "a": emissive_mesh(
-                        mi, triangles, np.arange(6).reshape(2, 3), None, uv, bsdf=grey(0.5)["bsdf"]
-                    )
-                }
-            )
+    clear = {"type": "mask", "bsdf": {"type": "diffuse"}}
+    for bsdf in ({"type": "conductor"}, {"type": "dielectric"}, clear):
+        with pytest.raises(DomainError, match=r"shape 'a', a .*, lies behind it or before it"):
+            light.bake({"a": {**sheet, "bsdf": bsdf}})
+    with pytest.raises(DomainError, match="shape 'a' holds a medium"):
+        light.bake({"a": {**sheet, "interior": {"type": "homogeneous"}}})
+    copies = {
+        "group": {"type": "shapegroup", "one": sheet},
+        "a": {"type": "instance", "of": {"type": "ref", "id": "group"}},
+    }
+    with pytest.raises(
+        DomainError, match=r"shape 'a', a Instance, has no texture chart here; .*copies instead"
+    ):
+        light.bake(copies)
     with pytest.raises(DomainError, match="nothing of shape 'a' can be seen"):
         light.bake(
             {"a": {**sheet, **grey(0.5)}, "b": square((0, 0, 4.5e-5), (0, 0, 1), 2.0, **grey(0.5))}, samples=1

@@ -10,7 +10,8 @@ import torch
 from codesign import backend, lens, render
 from codesign.errors import DomainError, FileFormatError, GradientError
 from codesign.pose import look_at
-from codesign.render import Camera
+from codesign.render import Camera, light
+from codesign.render.charts import emissive_mesh
 from scenes import worlds
 
 XML = """<scene version="3.0.0">
@@ -70,7 +71,7 @@ def test_a_file_a_dictionary_and_a_loaded_scene_are_one_world(path):
     mi = backend.mitsuba()
     view = worlds.view_of(path)
     images = [
-        seen(worlds.from_mitsuba(source, samples=2, **more), view)
+        seen(worlds.from_mitsuba(source, "path", samples=2, **more), view)
         for source, more in (
             (path, {"bright": "3"}),
             (str(path), {"bright": 3}),
@@ -80,7 +81,7 @@ def test_a_file_a_dictionary_and_a_loaded_scene_are_one_world(path):
     ]
     for other in images[1:]:  # the file's turn by 90 degrees is rounded otherwise than the dictionary's
         torch.testing.assert_close(images[0], other, rtol=1e-4, atol=1e-5)
-    assert not torch.equal(images[0], seen(worlds.from_mitsuba(path, samples=2), view))
+    assert not torch.equal(images[0], seen(worlds.from_mitsuba(path, "path", samples=2), view))
 
 
 def test_the_picture_from_the_file_s_own_view_is_mitsuba_s(path):
@@ -99,7 +100,7 @@ def test_the_picture_from_the_file_s_own_view_is_mitsuba_s(path):
     )
     theirs = [np.array(mi.render(scene, sensor=sensor, spp=256, seed=k))[..., 0] for k in range(4)]
     theirs = torch.from_numpy(np.stack(theirs)).double()
-    world = worlds.from_mitsuba(scene, samples=1)
+    world = worlds.from_mitsuba(scene, "path", samples=1)
     camera = view.camera(256)
     ours = torch.stack(
         [
@@ -121,9 +122,12 @@ def test_units_and_the_up_axis_change_where_the_camera_stands_and_not_what_it_se
     plain = worlds.view_of(path, up="z")
     eye = [1.5, 2, 4] if up == "z" else [1.5, -4, 2]
     torch.testing.assert_close(view.T_world_cam[:3, 3], unit_m * torch.tensor(eye, dtype=torch.float64))
-    world = worlds.from_mitsuba(path, unit_m=unit_m, up=up, gain=3.0, samples=2)
+    world = worlds.from_mitsuba(path, "path", unit_m=unit_m, up=up, gain=3.0, samples=2)
     torch.testing.assert_close(
-        seen(world, view), 3 * seen(worlds.from_mitsuba(path, up="z", samples=2), plain), rtol=0.02, atol=0
+        seen(world, view),
+        3 * seen(worlds.from_mitsuba(path, "path", up="z", samples=2), plain),
+        rtol=0.02,
+        atol=0,
     )
     point, normal, valid = world.hit(
         unit_m * torch.tensor([[0.0, -1.0, 1.5] if up == "z" else [0.0, -1.5, -1.0]]).double(),
@@ -145,7 +149,7 @@ def test_a_window_of_the_film_is_a_window_of_the_camera(path):
         "crop_height": 5,
     }
     view = worlds.view_of(scene)
-    world = worlds.from_mitsuba(scene, samples=1, max_depth=1)
+    world = worlds.from_mitsuba(scene, "path", samples=1, max_depth=1)
     image = seen(world, view)
     assert image.shape == (1, 5, 6)
     torch.testing.assert_close(image[0], seen(world, whole)[2:7, 4:10], rtol=1e-5, atol=1e-5)
@@ -153,7 +157,7 @@ def test_a_window_of_the_film_is_a_window_of_the_camera(path):
 
 def test_a_room_in_centimetres_is_told(path):
     with pytest.warns(UserWarning, match=r"scene.xml' is 400 m wide; .* give unit_m=0.01"):
-        worlds.from_mitsuba(path, unit_m=100.0)
+        worlds.from_mitsuba(path, "path", unit_m=100.0)
 
 
 @pytest.mark.parametrize(
@@ -236,8 +240,201 @@ def test_a_scene_of_another_variant_is_refused_with_what_to_do():
 def test_paths_have_no_gradient(path):
     poses = look_at((1.5, -4, 2), (0, 0, 0))[None].requires_grad_()
     camera = Camera(lens.Pinhole(8.0), 4, 4, 1.0, 1)
-    world = worlds.from_mitsuba(path, samples=1)
+    world = worlds.from_mitsuba(path, "path", samples=1)
     with pytest.raises(GradientError, match="no gradient"):
         render.frames(camera, world, poses).sum().backward()
     with pytest.raises(GradientError, match="no outline"):
         world.outline()
+
+
+# ---- baked
+
+
+GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.6}}
+BOTH = {"type": "twosided", "bsdf": GREY}
+
+
+def sheets(mi) -> dict[str, Any]:
+    """Things of one or two faces in z = 0, and a box of no height, whose faces are looked at from outside."""
+    return {
+        "rectangle": {"type": "rectangle"},
+        "disk": {"type": "disk"},
+        "cube": {"type": "cube", "to_world": mi.ScalarTransform4f().scale([1, 1, 1e-3])},
+    }
+
+
+def from_above_and_below(world):
+    """Frames [2, 4, 4] of the sheet in z = 0 from either side."""
+    camera = Camera(lens.Pinhole(8.0), 4, 4, 0.2, 1)
+    eyes = ((0.1, 0.2, 2.0), (0.1, 0.2, -2.0))
+    poses = torch.stack([look_at(eye, (0.1, 0.2, 0), down=(0, -1, 0)) for eye in eyes])
+    return render.frames(camera, world, poses)
+
+
+@pytest.mark.parametrize("name", ["rectangle", "disk", "cube"])
+def test_in_a_white_furnace_both_sides_show_their_albedo(name):
+    scene = {
+        "sheet": {**sheets(backend.mitsuba())[name], "bsdf": BOTH},
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 5.0}},
+    }
+    world = worlds.from_mitsuba(scene, "baked", up="z", texel_m=0.5, samples=1024)
+    image = from_above_and_below(world)
+    # one path, by the lamp or by the surface, has a relative spread of 0.2: 0.6 %
+    torch.testing.assert_close(image, torch.full_like(image, 0.6 * 5.0), rtol=0.03, atol=0)
+
+
+@pytest.mark.parametrize("name", ["rectangle", "disk", "cube"])
+@pytest.mark.parametrize("side", [0, 1])
+def test_each_side_of_a_sheet_shows_the_light_that_falls_on_it(name, side):
+    mi = backend.mitsuba()
+    sun = {
+        "type": "directional",
+        "direction": [0, 0, 2 * side - 1],
+        "irradiance": {"type": "rgb", "value": 30.0},
+    }
+    for bsdf in (BOTH, GREY):
+        scene = {"sheet": {**sheets(mi)[name], "bsdf": bsdf}, "sun": sun}
+        image = from_above_and_below(worlds.from_mitsuba(scene, "baked", up="z", texel_m=0.2, samples=1))
+        lit = bsdf is BOTH or side == 0 or name == "cube"
+        truth = torch.zeros_like(image)
+        truth[side] = 0.6 * 30 / math.pi * lit  # a sun of one direction makes no noise
+        torch.testing.assert_close(image, truth, rtol=1e-4, atol=1e-5)
+
+
+def grid(mi, n, bsdf):
+    """A unit square of n x n cells in z = 0 as a mesh whose texture coordinates all lie on each other."""
+    at = np.linspace(-0.5, 0.5, n + 1)
+    vertices = np.stack([*(v.reshape(-1) for v in np.meshgrid(at, at)), np.zeros((n + 1) ** 2)], 1)
+    corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).reshape(-1)
+    faces = np.concatenate(
+        [
+            corner[:, None] + [0, 1, n + 2],
+            corner[:, None] + [0, n + 2, n + 1],
+        ]
+    )
+    return emissive_mesh(mi, vertices, faces, None, vertices[:, :2] % 1, bsdf=bsdf)
+
+
+@pytest.mark.parametrize("cells", [1, 4, 64])
+def test_a_mesh_of_any_fineness_shows_the_falloff_of_a_lamp(cells):
+    mi = backend.mitsuba()
+    intensity, height, albedo = 5.0, 0.8, 0.5
+    scene = {
+        "mesh": grid(
+            mi, cells, {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}
+        ),  # 64: finer than the texels, so light at vertices
+        "lamp": {
+            "type": "point",
+            "position": [0, 0, height],
+            "intensity": {"type": "rgb", "value": intensity},
+        },
+    }
+    world = worlds.from_mitsuba(scene, "baked", up="z", texel_m=0.04, samples=16)
+    camera = Camera(lens.Pinhole(8.0), 24, 24, 0.25, 4)
+    pose = look_at((0, 0, 1.0), (0, 0, 0), down=(0, -1, 0))
+    image = render.frames(camera, world, pose[None])[0].double()
+    pixel = (torch.arange(24) - 11.5) * 0.25 / 8
+    square = pixel[:, None] ** 2 + pixel[None] ** 2
+    truth = albedo / math.pi * intensity * height / (square + height**2) ** 1.5
+    inside = (pixel[:, None].abs() < 0.47) & (pixel[None].abs() < 0.47)
+    # 16 points per texel, over which light changes by less than 6 %: 0.4 %, and bilinear between texels
+    assert float((image / truth - 1)[inside].abs().max()) < 0.02
+
+
+def test_a_baked_scene_in_centimetres_stands_where_its_paths_do(path):
+    options = {"unit_m": 0.25, "up": "y", "gain": 3.0}
+    view = worlds.view_of(path, unit_m=0.25)
+    matte = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
+    mi = backend.mitsuba()
+    scene = described(mi) | {
+        "sky": {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(np.float32(np.linspace(0.5, 3, 16 * 32).reshape(16, 32, 1)).repeat(3, 2)),
+        },
+    }
+    scene["floor"]["bsdf"] = scene["ball"]["bsdf"] = matte
+    baked = worlds.from_mitsuba(scene, "baked", texel_m=0.03, **options)
+    paths = worlds.from_mitsuba(scene, "path", samples=32, **options)
+    error = light.level_error(baked, paths, view.camera(8), view.T_world_cam[None])
+    assert float(error.rms) < 0.04  # 64 paths per texel: 3 % of what the sky gives, and the edge of a shadow
+    origin = torch.tensor([[0.0, -0.2, 0.5]], dtype=torch.float64)
+    down = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64)
+    for one, other in zip(baked.hit(origin, down), paths.hit(origin, down), strict=True):
+        torch.testing.assert_close(one.double(), other.double(), rtol=1e-5, atol=1e-6)
+
+
+def test_gloss_is_as_it_is_from_the_place_it_is_baked_towards():
+    mi = backend.mitsuba()
+    eye = (0.0, -1.5, 1.0)
+    scene = {
+        "floor": {
+            "type": "rectangle",
+            "bsdf": {
+                "type": "roughplastic",
+                "alpha": 0.3,
+                "diffuse_reflectance": {"type": "rgb", "value": 0.1},
+            },
+        },
+        "lamp": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f()
+            .look_at(origin=[0, 1.5, 1], target=[0, 0, 0], up=[0, 0, 1])
+            .scale(0.3),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 30.0}},
+        },
+    }
+    camera = Camera(lens.Pinhole(8.0), 24, 16, 0.3, 4)
+    pose = look_at(eye, (0, 0, 0))[None]
+    paths = worlds.from_mitsuba(scene, "path", up="z", samples=64)
+    mean, there = (
+        light.level_error(
+            worlds.from_mitsuba(scene, "baked", up="z", towards_m=place, texel_m=0.05), paths, camera, pose
+        )
+        for place in (None, eye)
+    )
+    # 64 paths per texel; the highlight is as wide as many texels
+    assert float(there.rms) < 0.05
+    assert float(mean.rms) > 0.2
+
+
+def test_emissive_shows_albedo_and_emission_and_auto_takes_it_where_all_is_emission():
+    mi = backend.mitsuba()
+    camera = Camera(lens.Pinhole(8.0), 4, 4, 0.2, 1)
+    pose = look_at((0.1, 0.2, 2), (0.1, 0.2, 0), down=(0, -1, 0))[None]
+    lit = {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": 7.0}}}
+    dark = {"bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.25}}}
+    for surface, level, value in (
+        (dark, "emissive", 0.25),
+        (lit, "auto", 7.0),
+        (lit | dark, "emissive", 7.0),
+    ):
+        world = worlds.from_mitsuba({"sheet": {"type": "rectangle", **surface}}, level, up="z")
+        image = render.frames(camera, world, pose)
+        torch.testing.assert_close(image, torch.full_like(image, value), rtol=1e-5, atol=0)
+    bitmap = mi.Bitmap(np.float32([[[1.0], [2.0]], [[3.0], [4.0]]]))
+    picture = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest"}
+    world = worlds.from_mitsuba(
+        {"sheet": {"type": "rectangle", "emitter": {"type": "area", "radiance": picture}}}, up="z"
+    )
+    point = look_at((0.5, 0.5, 2), (0.5, 0.5, 0), down=(0, -1, 0))[None]
+    assert float(render.frames(camera, world, point).mean()) == pytest.approx(4.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("bsdf", ["conductor", "thindielectric", "mask"])
+def test_mirrors_glass_and_masks_name_the_level_to_choose_and_may_be_matte(bsdf):
+    scene = {
+        "sheet": {
+            "type": "rectangle",
+            "bsdf": {"type": bsdf} | ({"b": {"type": "diffuse"}} if bsdf == "mask" else {}),
+        },
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 2.0}},
+    }
+    with pytest.raises(DomainError, match=r"shape 'sheet', a .*; use the level 'path', or matte=True"):
+        worlds.from_mitsuba(scene, up="z")
+    world = worlds.from_mitsuba(scene, up="z", matte=True, texel_m=0.5, samples=256)
+    image = render.frames(
+        Camera(lens.Pinhole(8.0), 4, 4, 0.2, 1), world, look_at((0, 0, 2), (0, 0, 0), down=(0, -1, 0))[None]
+    )
+    # an even sky of 2 is 2 in a perfect mirror and through glass; a mask shows half of it and half of albedo 0.5
+    low, high = {"conductor": (1.99, 2.01), "thindielectric": (1.99, 2.01), "mask": (1.4, 1.6)}[bsdf]
+    assert low < float(image.mean()) < high
