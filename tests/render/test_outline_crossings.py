@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from codesign import backend
+from codesign import backend, pose, render
+from codesign.errors import DomainError
+from codesign.lens import Pinhole
 from codesign.render import MitsubaScene
 from codesign.render.charts import emissive_mesh
 from codesign.render.outline import Segments, outlines
 from codesign.render.outline.crossings import find_crossings
 from codesign.render.outline.intersections import Intersections
+from codesign.render.outline.overlaps import Overlaps, overlaps
 from codesign.render.outline.pairs import touching
 from codesign.render.outline.shapes import Mesh
 from scenes.silhouettes import smooth
@@ -146,7 +149,7 @@ def test_half_a_ball_of_triangles_sunk_to_its_very_equator_has_it_as_an_edge():
         np.array([[0, 1, 2], [0, 2, 3]]),
         None,
     )
-    found = find_crossings([drum, floor])
+    found, _ = find_crossings([drum, floor])
     length = np.linalg.norm(found.end - found.start, axis=1).sum()
     assert length == pytest.approx(n * 2 * math.sin(math.pi / n), rel=1e-9)
 
@@ -164,9 +167,9 @@ def test_meshes_that_do_not_cross_themselves_have_no_crossing():
         np.stack([a, a + 1, a + n + 1, a, a + n + 1, a + n], 1).reshape(-1, 3),
         None,
     )
-    assert len(find_crossings([sheet]).start) == 0
+    assert len(find_crossings([sheet])[0].start) == 0
     nested = Mesh("nested", np.concatenate([CORNERS, 0.5 * CORNERS]), np.concatenate([CUBE, CUBE + 8]), None)
-    assert len(find_crossings([nested]).start) == 0
+    assert len(find_crossings([nested])[0].start) == 0
 
 
 def test_pairs_of_boxes_that_touch_are_all_found(generator):
@@ -179,6 +182,83 @@ def test_pairs_of_boxes_that_touch_are_all_found(generator):
     found = touching(corners.numpy(), 0.0)
     assert {tuple(pair) for pair in found.tolist()} == truth
     assert len(found) == len(truth)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e-7])
+def test_faces_in_one_plane_are_refused_where_they_are_seen(shift):
+    """A picture hung into the plane of its wall; not where both show one radiance, or are tiles side by side, or seen
+    from behind, or out of view."""
+    T = place()
+
+    def tile(x, value, half=0.5, height=0.0):
+        to_world = T.translate([x, 0.2, height]).rotate([0, 0, 1], 20).scale([half, half, 1])
+        light = {"type": "area", "radiance": {"type": "rgb", "value": value}}
+        return {"type": "rectangle", "to_world": to_world, "emitter": light}
+
+    def seen(picture, eye):
+        over = [c for c in curves(wall=tile(0.0, 1.0), picture=picture) if isinstance(c, Overlaps)]
+        index = [curve.pieces(torch.tensor(eye, dtype=F64), 0.1)[0] for curve in over]
+        return bool(index) and index[0].numel() > 0
+
+    assert seen(tile(0.1, 2.0, 0.1, shift), [0.0, 0.0, 3.0])
+    assert not seen(tile(0.1, 2.0, 0.1, shift), [0.0, 0.0, -3.0])
+    assert not seen(tile(0.1, 1.0, 0.1, shift), [0.0, 0.0, 3.0])
+    assert not seen(tile(0.1, 2.0, 0.1, 1e-3), [0.0, 0.0, 3.0])
+    beside = tile(0.0, 2.0)
+    beside["to_world"] = (
+        T.translate([0.0, 0.2, shift]).rotate([0, 0, 1], 20).translate([1.0, 0.3, 0]).scale([0.5, 0.5, 1])
+    )
+    assert not seen(beside, [0.0, 0.0, 3.0])
+    scene = MitsubaScene({"wall": tile(0.0, 1.0), "picture": tile(0.1, 2.0, 0.1, shift)}, merge=False)
+    camera = render.Camera(Pinhole(11.0), 16, 16, 0.5, 4)
+    above = pose.look_at((0.0, -0.3, 2.0), (0.0, 0.2, 0.0))[None].requires_grad_(True)
+    with pytest.raises(
+        DomainError, match=r"faces of shapes '(wall|picture)' and '(wall|picture)' lie in one plane near"
+    ):
+        render.frames(camera, scene, above, gradient="boundary")
+    away = pose.look_at((0.0, -0.3, 2.0), (0.0, -9.0, 2.0))[None].requires_grad_(True)
+    assert (
+        torch.autograd.grad(render.frames(camera, scene, away, gradient="boundary").sum(), away)[0]
+        .abs()
+        .sum()
+        == 0
+    )
+
+
+def test_what_two_triangles_in_a_plane_share_has_its_middle_where_a_clipper_puts_it(generator):
+    """Against the polygon cut out by half planes one after the other."""
+    p, q = (torch.rand(60, 3, 2, generator=generator, dtype=F64).numpy() for _ in range(2))
+    normal = np.tile([0.0, 0.0, 1.0], (60, 1))
+    rows, middle, end = overlaps(*(np.pad(v, ((0, 0), (0, 0), (0, 1))) for v in (p, q)), normal, 1e-6)
+    for k in range(60):
+        polygon = clipped(p[k], q[k])
+        assert (k in rows) == (len(polygon) > 2)
+        if k in rows:
+            at = int(np.nonzero(rows == k)[0][0])
+            corners = np.unique(np.round(polygon, 9), axis=0)
+            np.testing.assert_allclose(middle[at, :2], corners.mean(0), atol=1e-6)
+            assert np.linalg.norm(corners - end[at, :2], axis=1).min() < 1e-6
+
+
+def clipped(polygon, by):
+    """Corners of a polygon [n, 2] within a triangle [3, 2], side after side."""
+    (a, b, c) = by
+    if (b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0] < 0:
+        by = by[::-1]
+    for k in range(3):
+        base, along = by[k], by[(k + 1) % 3] - by[k]
+        height = [along[0] * (p - base)[1] - along[1] * (p - base)[0] for p in polygon]
+        kept = []
+        for i, p in enumerate(polygon):
+            j = (i + 1) % len(polygon)
+            if height[i] >= 0:
+                kept.append(p)
+            if (height[i] >= 0) != (height[j] >= 0):
+                kept.append(p + height[i] / (height[i] - height[j]) * (polygon[j] - p))
+        polygon = kept
+        if not polygon:
+            return []
+    return polygon
 
 
 def sunk(name):

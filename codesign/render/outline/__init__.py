@@ -15,13 +15,13 @@ from codesign.render.outline.shapes import Ball, Disk, Mesh, Tube, read
 
 
 def outlines(mi: Any, scene: Any) -> list[Any]:
-    """All curves of a Mitsuba scene: a list of Segments, Circles, Spheres, Cylinders, Intersections. Raises:
-    DomainError for shapes whose outline is not known."""
+    """All curves of a Mitsuba scene: a list of Segments, Circles, Spheres, Cylinders, Intersections, and of Overlaps
+    that refuse to be seen. Raises: DomainError for shapes whose outline is not known."""
     shapes = [read(mi, shape) for shape in scene.shapes()]
     if not shapes:
         return []
     apart_m = tolerance(np.concatenate([shape.corners() for shape in shapes]))
-    crossed = find_crossings(shapes)
+    crossed, over = find_crossings(shapes, apart_m)
     flat = np.array([isinstance(s, Mesh | Disk) for s in shapes])[crossed.shapes].all(1)
     curved, width_m = on_surfaces(crossed[~flat], shapes, apart_m)
     edges = [mesh_edges(s.vertices, s.faces, s.values) for s in shapes if isinstance(s, Mesh)]
@@ -46,6 +46,8 @@ def outlines(mi: Any, scene: Any) -> list[Any]:
         found.append(Cylinders.of(*_tensors(*_columns(tubes))))
     if curved is not None:
         found.append(curved)
+    if over is not None:
+        found.append(over)
     return found
 
 

@@ -6,8 +6,10 @@ Round shapes stand as fine triangles here; their segments are carried onto the t
 from dataclasses import dataclass, fields
 
 import numpy as np
+import torch
 
 from codesign.render.outline.edges import ROUNDING, welded
+from codesign.render.outline.overlaps import Overlaps, overlaps
 from codesign.render.outline.pairs import touching
 from codesign.render.outline.shapes import Ball, Disk, Mesh, Shape
 
@@ -17,11 +19,12 @@ BLOCK = 1_000_000  # pairs at a time
 
 @dataclass(frozen=True)
 class Triangles:
-    """corners: [N, 3, 3]; place: [N, 3], equal for corners of one shape at one place; shape: [N], its number."""
+    """corners: [N, 3, 3]; place: [N, 3], equal for corners of one shape at one place; shape, face: [N], numbers."""
 
     corners: np.ndarray
     place: np.ndarray
     shape: np.ndarray
+    face: np.ndarray
 
     def __getitem__(self, rows):
         return Triangles(*(getattr(self, f.name)[rows] for f in fields(self)))
@@ -41,15 +44,41 @@ class Crossings:
         return Crossings(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
-def find_crossings(shapes: list[Shape]) -> Crossings:
-    """All segments along which the shapes cross each other, and meshes themselves."""
+def find_crossings(shapes: list[Shape], apart_m: float = 0.0) -> tuple[Crossings, Overlaps | None]:
+    """All segments along which the shapes cross each other, and meshes themselves; and where faces of different
+    radiance lie in one plane and overlap by more than ``apart_m``."""
     triangles = _near_others(shapes)
-    pairs = touching(triangles.corners, 0.0)
+    noise = ROUNDING * float(np.abs(triangles.corners).max(initial=0))
+    pairs = touching(triangles.corners, noise)
     own = triangles.shape[pairs[:, 0]] == triangles.shape[pairs[:, 1]]
     mesh = np.array([isinstance(shape, Mesh) for shape in shapes])[triangles.shape[pairs[:, 0]]]
     pairs = pairs[~own | (mesh & ~_neighbours(triangles.place, pairs))]
-    found = [_crossing(triangles, pairs[k : k + BLOCK]) for k in range(0, max(len(pairs), 1), BLOCK)]
-    return Crossings(*(np.concatenate([getattr(part, f.name) for part in found]) for f in fields(Crossings)))
+    found = [_crossing(triangles, pairs[k : k + BLOCK], noise) for k in range(0, max(len(pairs), 1), BLOCK)]
+    crossed = [part for part, _ in found]
+    return (
+        Crossings(*(np.concatenate([getattr(part, f.name) for part in crossed]) for f in fields(Crossings))),
+        _overlaps(shapes, triangles, np.concatenate([level for _, level in found]), apart_m),
+    )
+
+
+def _overlaps(shapes, triangles, pairs, apart_m):
+    """Overlaps of pairs [n, 2] of triangles in one plane that face one way, or None."""
+    one, other = (triangles[pairs[:, side]] for side in (0, 1))
+    normal = _normals(one.corners)
+    rows, middle, end = overlaps(one.corners, other.corners, normal, apart_m)
+    light = [
+        [shapes[k].light_of(f) for k, f in zip(side.shape[rows], side.face[rows], strict=True)]
+        for side in (one, other)
+    ]
+    kept = [k for k, (a, b) in enumerate(zip(*light, strict=True)) if a is None or a != b]
+    if not kept:
+        return None
+    names = [
+        (shapes[a].name, shapes[b].name) for a, b in zip(one.shape[rows], other.shape[rows], strict=True)
+    ]
+    return Overlaps(
+        *(torch.tensor(v[kept]) for v in (middle, end, normal[rows])), tuple(names[k] for k in kept)
+    )
 
 
 def _neighbours(place, pairs):
@@ -80,7 +109,9 @@ def _near_others(shapes):
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         kept &= np.linalg.norm(across, axis=1) > 0
         place = welded(vertices, 0.0)[faces] if kept.any() else faces
-        parts.append(Triangles(corners[kept], place[kept], np.full(int(kept.sum()), number)))
+        parts.append(
+            Triangles(corners[kept], place[kept], np.full(int(kept.sum()), number), np.nonzero(kept)[0])
+        )
     return Triangles(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Triangles)))
 
 
@@ -111,16 +142,18 @@ def tessellated(shape: Shape) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([shape.start + ring, shape.end + ring]), sides
 
 
-def _crossing(triangles, pairs):
-    """Crossings of pairs [n, 2] of triangles. A corner on the other's plane counts as above it, so that an edge that
-    lies in a face is found from one of its sides at most."""
+def _crossing(triangles, pairs, noise):
+    """Crossings of pairs [n, 2] of triangles, and the pairs [m, 2] that lie in one plane and face one way. A corner on
+    the other's plane counts as above it, so that an edge that lies in a face is found from one of its sides at most."""
     pair = [triangles[pairs[:, side]] for side in (0, 1)]
     normals = [_normals(side.corners) for side in pair]
     height = [
         ((this.corners - other.corners[:, :1]) * n[:, None]).sum(2)
         for this, other, n in ((pair[0], pair[1], normals[1]), (pair[1], pair[0], normals[0]))
     ]
-    noise = ROUNDING * max((float(np.abs(side.corners).max(initial=0)) for side in pair), default=0.0)
+    level = ((normals[0] * normals[1]).sum(1) > 0) & (
+        np.maximum(*(np.abs(h).max(1, initial=0) for h in height)) <= noise
+    )
     cut = np.ones(len(pair[0].shape), dtype=bool)
     for h in height:
         cut &= (
@@ -143,7 +176,7 @@ def _crossing(triangles, pairs):
     real = np.nonzero((last - first > noise) & (size > 1e-9))[0]
     start, end = (origin[real, 0] + v[real, None] * along[real] for v in (first, last))
     numbers = np.stack([side.shape[rows][real] for side in pair], 1)
-    return Crossings(start, end, np.stack([n[real] for n in normals], 1), numbers)
+    return Crossings(start, end, np.stack([n[real] for n in normals], 1), numbers), pairs[level]
 
 
 def _normals(corners):

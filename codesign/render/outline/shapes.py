@@ -15,16 +15,25 @@ EVEN = 1e-4  # axes of a sphere or cylinder may differ in length and angle by th
 @dataclass(frozen=True)
 class Mesh:
     """vertices: [V, 3]; faces: [F, 3], normals on the side that shines; values: [F, 3, k] by which radiance is looked up at every corner
-    (texture coordinates, colours, radiance of a face), None where it is one for all."""
+    (texture coordinates, colours, radiance of a face), None where it is one for all; light: that one radiance, None
+    where it changes or is not known."""
 
     name: str
     vertices: np.ndarray
     faces: np.ndarray
     values: np.ndarray | None
+    light: float | None = None
 
     def corners(self):
         """Points [N, 3] whose box holds the shape."""
         return self.vertices
+
+    def light_of(self, face):
+        """The one radiance of a face, None where it changes over the face or is not known."""
+        if self.values is None or self.light is not None:
+            return self.light
+        own = self.values[face]
+        return float(own[0, 0]) if own.shape[1] == 1 and (own == own[0]).all() else None
 
 
 @dataclass(frozen=True)
@@ -34,6 +43,11 @@ class Ball:
     name: str
     centre: np.ndarray
     radius: float
+    light: float | None = None
+
+    def light_of(self, face):
+        """The one radiance of the shape, None where it changes over it."""
+        return self.light
 
     def corners(self):
         """Points [N, 3] whose box holds the shape."""
@@ -48,6 +62,11 @@ class Disk:
     centre: np.ndarray
     u: np.ndarray
     v: np.ndarray
+    light: float | None = None
+
+    def light_of(self, face):
+        """The one radiance of the shape, None where it changes over it."""
+        return self.light
 
     def corners(self):
         """Points [N, 3] whose box holds the shape."""
@@ -64,11 +83,16 @@ class Tube:
     end: np.ndarray
     u: np.ndarray
     v: np.ndarray
+    light: float | None = None
 
     @property
     def radius(self):
         """Radius, metres."""
         return float(np.linalg.norm(self.u))
+
+    def light_of(self, face):
+        """The one radiance of the shape, None where it changes over it."""
+        return self.light
 
     def corners(self):
         """Points [N, 3] whose box holds the shape."""
@@ -84,30 +108,39 @@ def read(mi: Any, shape: Any) -> Shape:
     known."""
     kind = shape.shape_type()
     name = shape.id()
+    light = _light(shape)
     parameters = mi.traverse(shape)
     if kind == int(mi.ShapeType.Rectangle):
         corners = _place(parameters, [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-        return Mesh(name, corners, _wound(shape, np.array([[0, 1, 2], [0, 2, 3]])), None)
+        return Mesh(name, corners, _wound(shape, np.array([[0, 1, 2], [0, 2, 3]])), None, light)
     if kind == int(mi.ShapeType.Sphere):
         centre, *ends = _place(parameters, [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
         _check_even(name, "sphere", *(end - centre for end in ends))
-        return Ball(name, centre, float(np.linalg.norm(ends[0] - centre)))
+        return Ball(name, centre, float(np.linalg.norm(ends[0] - centre)), light)
     if kind == int(mi.ShapeType.Disk):
         centre, u, v = _place(parameters, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-        return Disk(name, centre, u - centre, v - centre)
+        return Disk(name, centre, u - centre, v - centre, light)
     if kind == int(mi.ShapeType.Cylinder):
         start, end, u, v = _place(parameters, [[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0]])
         _check_even(name, "cylinder", u - start, v - start)
-        return Tube(name, start, end, u - start, v - start)
+        return Tube(name, start, end, u - start, v - start, light)
     if shape.is_mesh() and "vertex_positions" in parameters:
         vertices = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
         faces = np.array(parameters["faces"], dtype=np.int64).reshape(-1, 3)
         faces = _wound(shape, faces)
-        return Mesh(name, vertices, faces, _values(shape, parameters, faces, len(vertices)))
+        return Mesh(name, vertices, faces, _values(shape, parameters, faces, len(vertices)), light)
     raise DomainError(
         f"the outline of shape '{name}' is not known; use meshes, rectangles, cubes, spheres, disks and "
         "cylinders, or ask for gradient 'difference'."
     )
+
+
+def _light(shape):
+    """The one radiance of a shape, None where it has a texture."""
+    if not shape.is_emitter():
+        return 0.0
+    uniform = re.search(r"radiance = UniformSpectrum\[value=\[([^\]]*)\]\]", str(shape.emitter()))
+    return float(uniform[1]) if uniform else None
 
 
 def _wound(shape, faces):
