@@ -21,6 +21,7 @@ from codesign.pose import apply, inverse
 from codesign.render.camera import Camera
 from codesign.render.curve_points import IN_FRONT_M, CurvePoints, curve_points
 from codesign.render.moving import cameras_in_parts, in_one_row, parts
+from codesign.render.rays import coloured_rays
 from codesign.render.unlisted import check_listed
 from codesign.render.wavefront import HIDDEN, look
 
@@ -77,7 +78,7 @@ def boundary_term(camera: Camera, scene: Any, T_world_cam: Tensor, per_px: float
         return torch.zeros(shape, dtype=scene.dtype)
     back = inverse(cameras)[found.part, found.frame]
     y = apply(back, found.world_m[:, None])[:, 0]
-    origin, direction, _ = _rays(camera, found.film_px, found.pupil, found.colour)
+    origin, direction, _ = coloured_rays(camera, found.film_px, found.pupil, found.colour)
     ahead = (y[:, 2:] - origin[:, 2:]) / direction[:, 2:]
     # zero; how it changes tells how the film position must
     miss = origin[:, :2] + direction[:, :2] * ahead - y[:, :2]
@@ -136,11 +137,11 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
     normal = torch.stack([-tangent[:, 1], tangent[:, 0]], 1) / length[:, None]
     aside = (points.aside_rad / camera.slope_per_px())[:, None] * normal
     q, colour = (v.repeat(2, *[1] * (v.ndim - 1)) for v in (points.pupil, points.colour))
-    origin, direction, weight = _rays(camera, torch.cat([x - aside, x + aside]), q, colour)
+    origin, direction, weight = coloured_rays(camera, torch.cat([x - aside, x + aside]), q, colour)
     light, distance = (
         v.reshape(2, -1) for v in look(scene, cameras[:, points.frame.repeat(2)], origin, direction)
     )
-    before, behind = weight.reshape(2, -1) * light
+    before, behind = weight.detach().reshape(2, -1) * light
     reach = (y - origin[: len(y)]).norm(dim=1)
     seen = distance.amin(0) > reach * (1 - HIDDEN)
     jump = (before - behind) * length * points.share * seen
@@ -159,32 +160,6 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
     return found[torch.nonzero(jump != 0)[:, 0]]
 
 
-def _rays(camera, film_px, pupil, colour):
-    """Origins and directions [n, 3] in camera axes of rays through film positions and pupil points, and the share of
-    a sample's light [n] that they carry, each in its own colour."""
-    if camera.spectrum is None:
-        return _of_rays(camera, camera.rays_through(film_px, pupil), 1.0)
-    count = len(camera.spectrum.wavelengths_um)
-    found = []
-    order = []
-    for number, (wavelength, weight) in enumerate(
-        zip(camera.spectrum.wavelengths_um, camera.spectrum.weights, strict=True)
-    ):
-        rows = torch.nonzero(colour == number)[:, 0]
-        order.append(rows)
-        rays = camera.rays_through(film_px[rows], pupil[rows], wavelength)
-        found.append(_of_rays(camera, rays, weight * count))
-    back = torch.cat(order).argsort()
-    return [torch.cat(column)[back] for column in zip(*found, strict=True)]
-
-
-def _of_rays(camera, rays, share):
-    light = rays.weight.detach() * share
-    if camera.falloff:
-        light = light * rays.irradiance.detach()
-    return rays.origin_m.double(), rays.direction.double(), light.double()
-
-
 def _on_film(camera, y, points):
     """Where points y [n, 3] in camera axes are seen through points of the pupil: film position [n, 2] px, change of
     the place at that depth per pixel of it [n, 2, 2] m/px, slope of the ray there [n, 2], and whether light passes
@@ -194,7 +169,7 @@ def _on_film(camera, y, points):
     q, colour = points.pupil.repeat(3, 1), points.colour.repeat(3)
     for _ in range(TURNS):
         at = (x + steps[:, None]).reshape(-1, 2)
-        origin, direction, light = _rays(camera, at, q, colour)
+        origin, direction, light = coloured_rays(camera, at, q, colour)
         origin, direction = (v.reshape(3, -1, 3) for v in (origin, direction))
         passes = ((light.reshape(3, -1) > 0) & (direction[..., 2] > 1e-6)).all(0)
         slope = direction[..., :2] / torch.where(passes[:, None], direction[..., 2:], 1.0)

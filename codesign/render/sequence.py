@@ -8,7 +8,7 @@ three that is right for the frames at hand.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -20,6 +20,7 @@ from codesign.render.boundary import boundary_term, radiance_jumps
 from codesign.render.camera import Camera
 from codesign.render.kinds import Scene
 from codesign.render.moving import MovingScene, at_frames, in_one_row, scenes_and_poses
+from codesign.render.rim import rim_term
 from codesign.render.wavefront import shade
 from codesign.types import Rays
 
@@ -35,6 +36,7 @@ LENS_STEP = {
     "efl_mm": 1e-2,
     "image_distance_mm": 2e-3,
 }
+RIM_SAMPLES = 4  # points per pixel on the edges of apertures, for "boundary"
 PASSES = 0.05  # relative L2 distance from differences up to which a way is kept
 
 
@@ -110,8 +112,24 @@ def frames(
             gradient = settled(camera, *row)
         if gradient == "difference":
             return by_differences(camera, *row).reshape(*T_world_cam.shape[:-2], *camera.film.shape)
-    found = image(camera, scene, T_world_cam, rays)
-    return found + boundary_term(camera, scene, T_world_cam, per_px) if gradient == "boundary" else found
+    if gradient == "interior":
+        return image(camera, scene, T_world_cam, rays)
+    rays = camera.given(rays)
+    taken = None
+    if rays.weight.requires_grad:
+        taken = rim_term(camera, scene, T_world_cam, max(RIM_SAMPLES, camera.samples_per_pixel // 8))
+    if taken is not None:
+        rays = _with_still_rims(camera, rays)
+    found = image(camera, scene, T_world_cam, rays) + boundary_term(camera, scene, T_world_cam, per_px)
+    return found if taken is None else found + taken
+
+
+def _with_still_rims(camera, rays):
+    """The same rays; no gradient goes to the light that apertures take away."""
+    weight = rays.weight.detach()
+    if camera.falloff:
+        weight = weight * (rays.irradiance / rays.irradiance.detach())
+    return replace(rays, weight=weight)
 
 
 def image(camera: Camera, scene: Any, T_world_cam: Tensor, rays: Rays | None = None) -> Tensor:

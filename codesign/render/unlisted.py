@@ -29,6 +29,7 @@ CONTRAST = 0.02  # of a frame's range: what is less is no jump worth the name
 NEAR_PX = 0.5  # between a jump and the chord of a piece that may hold it
 ON_PX = 0.05  # between a jump and the curve it lies on
 SAME_RAD = 3e-5  # between curves that are one, at float32's precision
+MEETING = 20  # times that from their ends, curves that run together are one listed twice
 STEPS = 24  # of the search along a piece
 WRONG = 0.05  # share of all jumps up to which a view is taken as listed
 # another view needs no look of its own as long as the camera has moved by less than this share of the distance to what
@@ -59,9 +60,9 @@ def listing(
             return Listing(0.0, 0.0, None, 0)
         rays = camera.rays_through(x, q)
         origin, direction = rays.origin_m.double(), rays.direction.double()
-        count = _on_curves(camera, curves, cameras, origin, direction, distance)
+        count, along = _on_curves(camera, curves, cameras, origin, direction, distance)
     total = float(size.sum())
-    none, many = count == 0, count > 1
+    none, many = count == 0, along > 1
     place = None
     if bool((none | many).any()):
         worst = int((size * (none | many)).argmax())
@@ -173,7 +174,8 @@ def _crossings(camera, scene, cameras, seed):
 
 
 def _on_curves(camera, curves, cameras, origin, direction, distance):
-    """On how many listed curves the edge lies that each ray [n, 3] of the camera meets at a distance [n]."""
+    """On how many listed curves the edge lies that each ray [n, 3] of the camera meets at a distance [n], and on how
+    many of them away from their ends, where curves may meet without being one."""
     slope_per_px = camera.slope_per_px()
     found = []
     names = 0
@@ -190,18 +192,22 @@ def _on_curves(camera, curves, cameras, origin, direction, distance):
             front = torch.nonzero((ends[..., 2] > IN_FRONT_M).all(0))[:, 0]
             ray, piece = _close(ends[:, front], origin, direction, NEAR_PX * slope_per_px)
             piece = front[piece]
-            away, reach = _angle(curve, index[piece], bounds[piece], o[ray], d[ray])
+            away, reach, apart = _angle(curve, index[piece], bounds[piece], o[ray], d[ray])
             within = curve.aside_rad(index[piece], eye).clamp_min(ON_PX * slope_per_px)
             rows = (away < within) & (reach < distance[ray] * (1 + HIDDEN))
-            found.append((ray[rows], away[rows], names + index[piece][rows]))
+            found.append((ray[rows], away[rows], apart[rows], names + index[piece][rows]))
             names += int(index.max()) + 1
     if not found:
-        return torch.zeros(len(origin), dtype=torch.long)
-    ray, away, name = (torch.cat(column) for column in zip(*found, strict=True))
+        return torch.zeros(2, len(origin), dtype=torch.long)
+    ray, away, apart, name = (torch.cat(column) for column in zip(*found, strict=True))
     least = torch.full((len(origin),), torch.inf, dtype=torch.float64).scatter_reduce(0, ray, away, "amin")
     same = away < least[ray] + SAME_RAD
-    pairs = torch.unique(torch.stack([ray[same], name[same]]), dim=1)  # pieces of one curve are one
-    return torch.bincount(pairs[0], minlength=len(origin))
+
+    def count(rows):
+        pairs = torch.unique(torch.stack([ray[rows], name[rows]]), dim=1)  # pieces of one curve are one
+        return torch.bincount(pairs[0], minlength=len(origin))
+
+    return torch.stack([count(same), count(same & (apart > MEETING * SAME_RAD))])
 
 
 def _close(ends, origin, direction, near):
@@ -225,11 +231,9 @@ def _close(ends, origin, direction, near):
 
 
 def _angle(curve, index, bounds, origin, direction):
-    """Least angle [n] between rays and pieces of curves, and the distance [n] m there; by golden sections along the
-    piece."""
+    """Least angle [n] between rays and pieces of curves, the distance [n] m there, and the angle [n] from there to the
+    nearer end of the piece; by golden sections along the piece."""
     low, high = bounds.unbind(1)
-    wide = high - low
-    low, high = low - 0.02 * wide, high + 0.02 * wide
 
     def away(s):
         y = curve.points(index, s, origin) - origin
@@ -244,4 +248,6 @@ def _angle(curve, index, bounds, origin, direction):
         low, high = torch.where(lower, low, a), torch.where(lower, b, high)
         a, b = high - share * (high - low), low + share * (high - low)
         (at_a, _), (at_b, reach) = away(a), away(b)
-    return torch.minimum(at_a, at_b), reach
+    here = curve.points(index, (a + b) / 2, origin)
+    ends = torch.stack([(curve.points(index, s, origin) - here).norm(dim=1) for s in bounds.unbind(1)])
+    return torch.minimum(at_a, at_b), reach, ends.amin(0) / reach

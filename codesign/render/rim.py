@@ -1,0 +1,133 @@
+"""The gradient of the light that the rims of apertures take away, sampled where it is.
+
+Within the pupil the share of light W that passes falls from one to nothing over the soft edge of an aperture, and only
+there does it change with the lens. Samples spread over the whole pupil meet that edge now and then, each with a large
+derivative: most of the noise of a gradient to the lens. Points of the edge alone, weighted by its width, have the same
+mean: d/dp of the mean of W L over the disc is the mean over angles of 2 (b - a) r dW/dp L with r uniform in [a, b], where
+b - a is the edge at that angle and field point.
+"""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from codesign.render.camera import Camera
+from codesign.render.moving import cameras_in_parts, in_one_row
+from codesign.render.rays import coloured_rays
+from codesign.render.wavefront import look
+
+FIELDS = 6  # cells across the sensor, in each of which the edge is looked for
+ANGLES = 16
+RADII = 32
+HALVINGS = 12
+DARK = 1e-9
+WHOLE = 1 - 1e-9  # share of light from which nothing is taken away
+
+
+def rim_term(camera: Camera, scene: Any, T_world_cam: Tensor, frames: Tensor, samples: int) -> Tensor | None:
+    """Zero-valued image [..., T, *film.shape] whose gradient is that of the light which apertures take away; None where
+    the edge cannot be found so (an obstruction in the pupil's middle).
+
+    Args: camera, scene, T_world_cam as for ``frames``; samples: points of the edge per pixel, for those pixels whose
+      pupil has one.
+    Gradient: to what the camera's lens says of ``Rays.weight``.
+    """
+    shape = (*T_world_cam.shape[:-2], *camera.film.shape)
+    with torch.no_grad():
+        found = _edge_points(camera, samples)
+    if found is None:
+        return None
+    film_px, pupil, colour, pixel, size = found
+    if not len(pixel):
+        return torch.zeros(shape, dtype=scene.dtype)
+    origin, direction, weight = coloured_rays(camera, film_px, pupil, colour)
+    with torch.no_grad():
+        scene, T_world_cam = in_one_row(scene, T_world_cam)
+        cameras = torch.stack([pose.double() for pose in cameras_in_parts(scene, T_world_cam)])
+        count = cameras.shape[1]
+        light, _ = look(
+            scene,
+            cameras.repeat_interleave(len(pixel), 1),
+            origin.detach().repeat(count, 1),
+            direction.detach().repeat(count, 1),
+        )
+        light = light.reshape(count, -1) * (size / samples)
+    taken = light * (weight - weight.detach())
+    image = torch.zeros(count, math.prod(camera.film.shape), dtype=taken.dtype).index_add(1, pixel, taken)
+    return image.reshape(shape).to(scene.dtype)
+
+
+def _edge_points(camera, samples):
+    """Film positions [n, 2] px, pupil points [n, 2], colours and pixels [n], and what share of its pixel's disc each
+    point stands for [n]; None where the edge is no single one."""
+    edge = _edge(camera)
+    if edge is None:
+        return None
+    low, high, corner, cell = edge
+    pixels = camera.film.pixels()
+    at = torch.quasirandom.SobolEngine(4, scramble=True, seed=camera.seed).draw(
+        len(pixels) * samples, dtype=torch.float64
+    )
+    film_px = pixels.repeat_interleave(samples, 0) + at[:, :2] - 0.5
+    column, row = ((film_px - corner) / cell).floor().long().clamp(0, FIELDS - 1).unbind(1)
+    sector = (at[:, 2] * ANGLES).long().clamp_max(ANGLES - 1)
+    first, last = low[row, column, sector], high[row, column, sector]
+    rows = torch.nonzero(last > first)[:, 0]
+    angle = 2 * torch.pi * at[rows, 2]
+    spoke = torch.stack([angle.cos(), angle.sin()], 1)
+    colour = rows % (1 if camera.spectrum is None else len(camera.spectrum.wavelengths_um))
+
+    def radius_at(least):
+        """The largest radius [n] at which at least that share of the light passes."""
+        inner, outer = first[rows], last[rows]
+        for _ in range(HALVINGS):
+            middle = (inner + outer) / 2
+            passes = coloured_rays(camera, film_px[rows], middle[:, None] * spoke, colour, False)[2] >= least
+            inner, outer = torch.where(passes, middle, inner), torch.where(passes, outer, middle)
+        return inner, outer
+
+    begin, end = radius_at(WHOLE)[0], radius_at(DARK)[1]
+    radius = begin + at[rows, 3] * (end - begin)
+    return film_px[rows], radius[:, None] * spoke, colour, rows // samples, 2 * (end - begin) * radius
+
+
+def _edge(camera):
+    """Least and largest radius [FIELDS, FIELDS, ANGLES] of the edge within each cell of the sensor and each sector of
+    the pupil, the cells' first corner [2] px and size [2] px; None where light falls and rises again on the way out."""
+    film = camera.film
+    size = torch.tensor([film.sensor_width_px, film.sensor_height_px], dtype=torch.float64)
+    k = torch.arange(FIELDS + 1, dtype=torch.float64) / FIELDS
+    y, x = torch.meshgrid(k, k, indexing="ij")
+    fields = torch.stack([x, y], -1).reshape(-1, 2) * size - 0.5
+    turn = torch.arange(ANGLES, dtype=torch.float64) * (2 * math.pi / ANGLES)
+    radius = torch.arange(RADII + 1, dtype=torch.float64) / RADII
+    disc = (radius[:, None, None] * torch.stack([turn.cos(), turn.sin()], 1)).reshape(-1, 2)
+    passed = None
+    colours = [None] if camera.spectrum is None else camera.spectrum.wavelengths_um
+    for wavelength in colours:
+        rays = camera.rays_through(
+            fields.repeat_interleave(len(disc), 0), disc.repeat(len(fields), 1), wavelength
+        )
+        share = rays.weight.reshape(FIELDS + 1, FIELDS + 1, RADII + 1, ANGLES).double()
+        if bool((share.diff(dim=2) > 1e-9).any()) or bool((share[:, :, 0] < WHOLE).any()):
+            return None
+        passed = (
+            torch.stack([share, share])
+            if passed is None
+            else torch.stack([torch.minimum(passed[0], share), torch.maximum(passed[1], share)])
+        )
+    whole = (passed[0] >= WHOLE).sum(2) - 2  # the last radius at which all passes, and one before
+    some = (passed[1] > 0).sum(2) + 1
+    whole, some = whole.clamp(0, RADII), some.clamp(0, RADII)
+    whole = torch.where((passed[0] >= WHOLE).all(2), RADII, whole)
+    low, high = (_over_cells(v, f) / RADII for v, f in ((whole, torch.minimum), (some, torch.maximum)))
+    return low, high, torch.full((2,), -0.5, dtype=torch.float64), size / FIELDS
+
+
+def _over_cells(values, of):
+    """[F + 1, F + 1, A] at the corners and spokes to [F, F, A] of cells and sectors."""
+    values = of(values[1:], values[:-1])
+    values = of(values[:, 1:], values[:, :-1])
+    return of(values, values.roll(-1, 2)).double()
