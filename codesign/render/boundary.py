@@ -143,7 +143,12 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
     )
     before, behind = weight.detach().reshape(2, -1) * light
     reach = (y - origin[: len(y)]).norm(dim=1)
-    seen = distance.amin(0) > reach * (1 - HIDDEN)
+    seen = distance.amax(0) > reach * (
+        1 - HIDDEN
+    )  # of a face nearly edge-on, the near side may be much nearer
+    seen &= ~points.covered | (
+        distance.amax(0) < reach * (1 + HIDDEN)
+    )  # else a ray slipped between two faces
     jump = (before - behind) * length * points.share * seen
     found = Jumps(
         points.world_m,

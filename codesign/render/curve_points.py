@@ -30,7 +30,8 @@ class CurvePoints:
     """Sampled points of curves, in the axes of the part of the scene that the curve belongs to.
 
     world_m, ahead_m [n, 3]: the point, and the same curve a little further on. share [n]: how many such steps each
-    point stands for. aside_rad [n]: how far to the sides radiance is safely read. pupil [n, 2]; colour, frame, part,
+    point stands for. aside_rad [n]: how far to the sides radiance is safely read. covered [n]: whether surfaces lie at
+    the point's own distance on both sides. pupil [n, 2]; colour, frame, part,
     window [n]: numbers of the wavelength, the frame, the part of the scene and the window of the film.
     """
 
@@ -38,6 +39,7 @@ class CurvePoints:
     ahead_m: Tensor
     share: Tensor
     aside_rad: Tensor
+    covered: Tensor
     pupil: Tensor
     colour: Tensor
     frame: Tensor
@@ -111,7 +113,8 @@ def _on_pieces(view, curve, index, bounds, clip, pose, per_px, generator):
     distance = (y - viewpoint).norm(dim=1)
     coordinates = torch.maximum(y.abs().amax(1), pose[:3, 3].abs().amax())
     aside = torch.maximum(curve.aside_rad(index[piece], viewpoint), FLOAT32_RAD * coordinates / distance)
-    return [y, on, fraction / STEP, aside, pupil, (number + turn[1]) % view.colours]
+    covered = curve.covered(index[piece], viewpoint)
+    return [y, on, fraction / STEP, aside, covered, pupil, (number + turn[1]) % view.colours]
 
 
 class _Views:

@@ -26,7 +26,7 @@ DARK = 1e-9
 WHOLE = 1 - 1e-9  # share of light from which nothing is taken away
 
 
-def rim_term(camera: Camera, scene: Any, T_world_cam: Tensor, frames: Tensor, samples: int) -> Tensor | None:
+def rim_term(camera: Camera, scene: Any, T_world_cam: Tensor, samples: int) -> Tensor | None:
     """Zero-valued image [..., T, *film.shape] whose gradient is that of the light which apertures take away; None where
     the edge cannot be found so (an obstruction in the pupil's middle).
 

@@ -50,12 +50,12 @@ class Listing:
 
 
 def listing(
-    camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor, seed: int = 0
+    camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor, lines: int = LINES
 ) -> Listing:
     """Whether the jumps of one view lie on the listed curves. cameras: [parts, 4, 4], the camera in the axes of every
-    part; curves: of every part."""
+    part; curves: of every part; lines: each way across the film, at most."""
     with torch.no_grad():
-        x, q, size, distance = _crossings(camera, scene, cameras, seed)
+        x, q, size, distance = _crossings(camera, scene, cameras, lines)
         if not len(x):
             return Listing(0.0, 0.0, None, 0)
         rays = camera.rays_through(x, q)
@@ -83,6 +83,8 @@ def check_listed(camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], ca
         if any(_covers(old, reach_m, view, field) for old, reach_m in seen):
             continue
         found = listing(camera, scene, curves, view)
+        if max(found.unlisted, found.doubled) > WRONG:  # a few crossings say little: look closer
+            found = listing(camera, scene, curves, view, 8 * LINES)
         for share, what in (
             (found.unlisted, "lie on no edge or outline that the scene lists"),
             (found.doubled, "lie on several of its edges at once"),
@@ -120,18 +122,18 @@ def _reach_m(camera, scene, cameras):
     return float(met.median()) if len(met) else 1.0
 
 
-def _crossings(camera, scene, cameras, seed):
+def _crossings(camera, scene, cameras, most):
     """Jumps along lines: film position [n, 2] px, pupil point [n, 2], size of the jump [n], and distance [n] m of the
     nearer of its sides."""
     film = camera.film
-    generator = torch.Generator().manual_seed(seed)
-    _, pupils = film_pupil_pattern(64, seed + 1)
+    generator = torch.Generator().manual_seed(most)
+    _, pupils = film_pupil_pattern(64, most)
     low, high, pupil = [], [], []
     for left, top in film.windows_px or ((0, 0),):
         for axis, (along, across) in enumerate(
             ((film.width_px, film.height_px), (film.height_px, film.width_px))
         ):
-            lines = min(LINES, across)
+            lines = min(most, 4 * across)
             shift = torch.rand(lines, generator=generator, dtype=torch.float64)
             level = (torch.arange(lines) + shift) / lines * across - 0.5
             cells = along * RAYS_PER_PX

@@ -92,7 +92,7 @@ def test_points_are_found_on_the_film_through_their_own_point_of_the_pupil(gener
     pupil = 1.2 * (torch.rand(count, 2, generator=generator, dtype=F64) - 0.5)
     none = torch.zeros(count, dtype=torch.long)
     asks = torch.zeros(count, dtype=F64)
-    points = CurvePoints(y, y, asks, asks, pupil, none, none, none, none)
+    points = CurvePoints(y, y, asks, asks, asks > 0, pupil, none, none, none, none)
     with torch.no_grad():
         at, per_px, _, passes = _on_film(camera, y, points)
         assert bool(passes.all())

@@ -11,12 +11,13 @@ from codesign.render.outline.curves import Circles, Cylinders, Segments, Spheres
 from codesign.render.outline.edges import mesh_edges, segments
 from codesign.render.outline.intersections import on_surfaces
 from codesign.render.outline.joints import edges_once, rims_once, tolerance
+from codesign.render.outline.meridians import Meridians
 from codesign.render.outline.shapes import Ball, Disk, Mesh, Tube, read
 
 
 def outlines(mi: Any, scene: Any) -> list[Any]:
-    """All curves of a Mitsuba scene: a list of Segments, Circles, Spheres, Cylinders, Intersections, and of Overlaps
-    that refuse to be seen. Raises: DomainError for shapes whose outline is not known."""
+    """All curves of a Mitsuba scene: a list of Segments, Circles, Spheres, Cylinders, Meridians, Intersections, and of
+    Overlaps that refuse to be seen. Raises: DomainError for shapes whose outline is not known."""
     shapes = [read(mi, shape) for shape in scene.shapes()]
     if not shapes:
         return []
@@ -26,6 +27,7 @@ def outlines(mi: Any, scene: Any) -> list[Any]:
     curved, width_m = on_surfaces(crossed[~flat], shapes, apart_m)
     edges = [mesh_edges(s.vertices, s.faces, s.values) for s in shapes if isinstance(s, Mesh)]
     edges.append(segments(crossed.start[flat], crossed.end[flat]))
+    edges.append(_seams(shapes))
     balls = [(s.centre, s.radius) for s in shapes if isinstance(s, Ball)]
     tubes = [(s.start, s.end, s.radius) for s in shapes if isinstance(s, Tube)]
     rims = [
@@ -33,6 +35,9 @@ def outlines(mi: Any, scene: Any) -> list[Any]:
         for s, both in zip(shapes, width_m, strict=True)
         if isinstance(s, Disk | Tube)
         for centre, wide in zip((s.centre,) if isinstance(s, Disk) else (s.start, s.end), both, strict=False)
+    ]
+    meridians = [
+        (s.centre, *s.seam) for s in shapes if isinstance(s, Ball) and s.light is None and s.seam is not None
     ]
     found = []
     if any(map(len, edges)):
@@ -44,11 +49,20 @@ def outlines(mi: Any, scene: Any) -> list[Any]:
         found.append(Spheres(*_tensors(*_columns(balls))))
     if tubes:
         found.append(Cylinders.of(*_tensors(*_columns(tubes))))
+    if meridians:
+        found.append(Meridians(*_tensors(*_columns(meridians))))
     if curved is not None:
         found.append(curved)
     if over is not None:
         found.append(over)
     return found
+
+
+def _seams(shapes):
+    """Straight lines on which pictures of cylinders and disks begin: their last column need not go on in the first."""
+    lines = [(s.start + s.u, s.end + s.u) for s in shapes if isinstance(s, Tube) and s.light is None]
+    lines += [(s.centre, s.centre + s.u) for s in shapes if isinstance(s, Disk) and s.light is None]
+    return segments(*(_columns(lines) if lines else (np.zeros((0, 3)), np.zeros((0, 3)))))
 
 
 def _columns(rows):

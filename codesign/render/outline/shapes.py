@@ -38,12 +38,14 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Ball:
-    """A sphere: centre [3], radius."""
+    """A sphere: centre [3], radius; seam: half axes [2, 3] of the circle on
+    which its picture begins."""
 
     name: str
     centre: np.ndarray
     radius: float
     light: float | None = None
+    seam: np.ndarray | None = None
 
     def light_of(self, face):
         """The one radiance of the shape, None where it changes over it."""
@@ -116,7 +118,8 @@ def read(mi: Any, shape: Any) -> Shape:
     if kind == int(mi.ShapeType.Sphere):
         centre, *ends = _place(parameters, [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
         _check_even(name, "sphere", *(end - centre for end in ends))
-        return Ball(name, centre, float(np.linalg.norm(ends[0] - centre)), light)
+        seam = np.stack([ends[0] - centre, ends[2] - centre])
+        return Ball(name, centre, float(np.linalg.norm(ends[0] - centre)), light, seam)
     if kind == int(mi.ShapeType.Disk):
         centre, u, v = _place(parameters, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
         return Disk(name, centre, u - centre, v - centre, light)
