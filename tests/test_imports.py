@@ -30,6 +30,7 @@ MITSUBA = {
     "scenes": "describe worlds to it",
     "studies.render_truth": "compares with its sensors",
     "studies.render_quality": "compares with its sensors",
+    "studies.foreign_scenes": "compares with its sensors",
 }
 
 

@@ -29,6 +29,7 @@ GROUPS = {
         "silhouettes",
         "silhouettes_chain",
         "light_levels",
+        "foreign_scenes",
         "robot_view",
         "make_dataset",
     ),
