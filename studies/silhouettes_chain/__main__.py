@@ -18,11 +18,11 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from studies.frame.run import Run, StudyConfig, main
-from studies.silhouettes_chain.case import GROUPS, WIDE, Case
+from studies.silhouettes_chain.case import GROUPS, Case
 
 ASKED = {"smooth": 0.05, "noise": 0.10, "cosine": 0.9}
 USUAL = 16  # samples per pixel of one estimate as an optimiser takes it
-PER_PX = 16.0  # of the precise ones
+PER_PX = 64.0  # of the precise ones
 LOSSES = ("smooth counts", "smooth flow", "hard counts", "hard flow", "hard flow, one place")
 KINDS = ("difference", "interior", "boundary", "single")
 
@@ -87,15 +87,9 @@ def study(run: Run[Config]) -> None:
 def measured(case: Case, config: Config, seed: int) -> Tensor:
     """Differences and gradients at one seed of the camera and one draw of places: [KINDS, LOSSES, 9]."""
     losses = case.losses(case.places(config.places, seed))
-    kinds = {name: {key: losses[key] for key in LOSSES if key.startswith(name)} for name in WIDE}
-    differences = {
-        key: value
-        for name, wide in WIDE.items()
-        for key, value in case.differences(kinds[name], config.samples, seed, wide).items()
-    }
     half = config.samples // 2
     ways = (
-        differences,
+        case.differences(losses, config.samples, seed),
         case.gradients(losses, half, seed, "interior", PER_PX),
         case.gradients(losses, half, seed, "boundary", PER_PX),
         case.gradients(losses, USUAL, seed + 50, "boundary", 2.5),

@@ -23,8 +23,6 @@ STEPS = torch.tensor([*(4e-3,) * 3, *(2e-3,) * 3, 2e-4, 2e-4, 2e-2], dtype=torch
 GROUPS = {"pose": slice(0, 6), "lens": slice(6, 9)}
 CURVATURES = (0, 2)
 FOCUS = 5
-# of STEPS: a loss of smooth counts bends within more, hard counts change too few of themselves within less
-WIDE = {"smooth": 1.0, "hard": 2.0}
 Losses = dict[str, Callable[[Tensor], Tensor]]
 
 
@@ -128,11 +126,11 @@ class Case:
         return found
 
     @torch.no_grad()
-    def differences(self, losses: Losses, samples: int, seed: int, wide: float) -> dict[str, Tensor]:
-        """Central differences [9] over ``wide`` steps of every number, per step."""
+    def differences(self, losses: Losses, samples: int, seed: int) -> dict[str, Tensor]:
+        """Central differences [9] over a step of every number either way, per step."""
         found: dict[str, list[Tensor]] = {name: [] for name in losses}
-        for step in torch.diag(wide * STEPS):
+        for step in torch.diag(STEPS):
             ahead, behind = (self.frames(sign * step, samples, seed) for sign in (1, -1))
             for name, loss in losses.items():
-                found[name].append((loss(ahead) - loss(behind)) / (2 * wide))
+                found[name].append((loss(ahead) - loss(behind)) / 2)
         return {name: torch.stack(values) for name, values in found.items()}

@@ -69,7 +69,7 @@ def test_the_pose_gradient_of_counts_needs_the_boundary_term(case):
     losses = {k: v for k, v in case.losses(case.places(8, 0)).items() if k.endswith("counts")}
     pose = GROUPS["pose"]
     seeds = range(4)
-    truth = [case.differences(losses, 64, seed, 1.0) for seed in seeds]
+    truth = [case.differences(losses, 64, seed) for seed in seeds]
     found = {
         way: [case.gradients(losses, 64, seed, way, 16.0) for seed in seeds]
         for way in ("interior", "boundary")
