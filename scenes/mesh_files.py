@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from codesign.errors import DomainError, FileFormatError
+from codesign.errors import CodesignError, DomainError, FileFormatError
 from codesign.optional import optional
 from scenes import gltf, textures
 from scenes.mesh_folder import Folder
@@ -139,6 +139,8 @@ def _dae_says(path):
     try:
         with path.open("rb") as file:
             asset = collada.Collada(file, ignore=[collada.DaeError]).assetInfo
+    except CodesignError:
+        raise
     except Exception as error:  # whatever an XML of another kind brings up
         raise _damaged(path, error) from error
     return asset.unitmeter or 1.0, (asset.upaxis or "Y_UP")[0].lower()
@@ -184,7 +186,7 @@ def _loaded(path, data, folder, kind, materials):
             return trimesh.load_scene(
                 trimesh.util.wrap_as_stream(data), file_type=kind[1:], resolver=folder, **options
             )
-    except FileFormatError:
+    except CodesignError:
         raise
     except Exception as error:  # trimesh raises whatever a damaged file brings up
         folder.check()

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, FileFormatError
+from codesign.errors import CodesignError, DomainError, FileFormatError
 from codesign.optional import optional
 from codesign.render import MitsubaScene
 from scenes import mesh_files, textures, units
@@ -132,6 +132,8 @@ def _model(path):
         if tree.tag != "robot":
             raise ValueError(f"its first element is <{tree.tag}> instead of <robot>")
         model = yourdfpy.URDF.load(io.BytesIO(data), load_meshes=False)
+    except CodesignError:
+        raise
     except Exception as error:  # lxml and yourdfpy raise whatever a damaged file brings up
         said = " ".join(str(error).split())[:120]
         raise FileFormatError(

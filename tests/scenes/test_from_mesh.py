@@ -2,6 +2,7 @@
 
 import base64
 import json
+import sys
 from functools import partial
 from typing import Any
 
@@ -11,9 +12,9 @@ import pytest
 import torch
 
 from codesign import lens, render
-from codesign.errors import DomainError, FileFormatError
+from codesign.errors import DomainError, FileFormatError, MissingPackageError
 from codesign.pose import look_at, se3_exp
-from scenes import bodies, build, mesh_files, textures, worlds
+from scenes import bodies, build, mesh_files, robots, textures, worlds
 
 PICTURE = np.array([[0, 64], [128, 255]], dtype=np.uint8)  # first row at the top; no two alike
 CAMERA = render.Camera(lens.Pinhole(8.0), 32, 32, 0.2, samples_per_pixel=4)
@@ -389,6 +390,20 @@ def test_arguments_that_cannot_be_are_refused(tmp_path):
     for options, sentence in cases:
         with pytest.raises(DomainError, match=sentence):
             worlds.from_mesh(path, **options)
+
+
+@pytest.mark.parametrize(
+    ("package", "name", "distribution"),
+    [("trimesh", "q.obj", "trimesh"), ("collada", "t.dae", "pycollada"), ("yourdfpy", "r.urdf", "yourdfpy")],
+)
+def test_a_missing_package_is_named_when_it_is_asked_for(tmp_path, monkeypatch, package, name, distribution):
+    write_obj(tmp_path, UPRIGHT, SQUARE)
+    dae(tmp_path, 1, "Z_UP")
+    (tmp_path / "r.urdf").write_text('<robot name="r"><link name="a"/></robot>')
+    monkeypatch.setitem(sys.modules, package, None)
+    read = robots.from_urdf if package == "yourdfpy" else mesh_files.read
+    with pytest.raises(MissingPackageError, match=rf"needs {distribution}; .*codesign\[worlds\]"):
+        read(tmp_path / name)
 
 
 def test_a_file_in_centimetres_gets_a_hint(tmp_path):
