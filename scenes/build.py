@@ -42,8 +42,7 @@ class Paint:
 class World:
     """Shapes (name -> (geometry, Paint)) that every level shows; background: sky that every level shows;
     lamps: Mitsuba lights of the lit levels; texel_m: size of baked light-map texels that suits its things.
-    two_sided: whether surfaces show from behind what they show from in front (not where light is baked, which
-    holds the front's light)."""
+    two_sided: whether surfaces show from behind what they show from in front, or where it is lit reflect there too."""
 
     shapes: dict[str, tuple[Any, Paint]]
     background: dict[str, Any] = field(default_factory=dict)
@@ -71,7 +70,7 @@ def emissive(world, device="cpu"):
 
 def baked(world, device="cpu", **options):
     """The world lit by its lamps, worked out once; options go to light.bake."""
-    return light.bake(lit(world, device), device, **{"texel_m": world.texel_m, **options})
+    return light.bake(lit(world, device, world.two_sided), device, **{"texel_m": world.texel_m, **options})
 
 
 def path(world, device="cpu", **options):

@@ -46,7 +46,7 @@ def from_mesh(
       background: what lies at infinity: a number (radiance), a picture [H, W] or the path of an equirectangular
         .hdr or .exr; None is nothing (radiance 0) where ``light`` is "emissive", else a procedural sky.
       lamps: Mitsuba lights for "baked" and "path"; None is a sun where the sky is the procedural one.
-    Returns: a scene for ``render.frames``; z up, metres. Surfaces show on both sides, but where light is baked.
+    Returns: a scene for ``render.frames``; z up, metres. Surfaces show on both sides.
     Gradient: to the camera's lens and poses, with silhouettes by gradient="boundary" (not at "path").
     Raises: FileFormatError and DomainError as ``mesh_files.read`` and the light level do. Warns in a sentence where
       the size is hardly in metres.

@@ -14,6 +14,8 @@ class SidedScene(MitsubaScene):
       placement: turn of the scene's sky and factor on all its radiance; its shapes stand in the world already.
     """
 
+    both_sides = True
+
     def __init__(
         self,
         description: Mapping[str, Any],

@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from codesign import backend
 from codesign.errors import CodesignError, DomainError
 from codesign.render.outline import outlines
+from codesign.render.outline.curves import Segments
 from codesign.render.soundness import check_description, check_scene
 
 
@@ -65,6 +67,7 @@ class MitsubaScene:
         of unknown winding need; otherwise they are black there."""
         twin = copy.copy(self)
         twin.both_sides = True
+        twin._outline = None
         return twin
 
     def radiance(self, arr: Any, origin: Any, direction: Any) -> Any:
@@ -108,7 +111,8 @@ class MitsubaScene:
     def outline(self) -> Any:
         """Curves where radiance may jump, see codesign.render.outline; worked out once."""
         if self._outline is None:
-            self._outline = outlines(self.mi, self.scene)
+            curves = outlines(self.mi, self.scene)
+            self._outline = [_never_black(curve) for curve in curves] if self.both_sides else curves
         return self._outline
 
     def hit(self, origin_m: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -128,3 +132,11 @@ class MitsubaScene:
         normal = torch.as_tensor(si.n.numpy()).double()
         t = torch.where(valid, t, torch.ones_like(t))
         return origin_m.detach() + direction.detach() * t[:, None], normal.T, valid
+
+
+def _never_black(curve):
+    """Curves of surfaces that show on both sides: an edge that counts from every side counts also from that which its
+    faces turn away from."""
+    if not isinstance(curve, Segments):
+        return curve
+    return replace(curve, normals=torch.where(curve.always[:, None, None], 0.0, curve.normals))
