@@ -31,8 +31,8 @@ class CurvePoints:
 
     world_m, ahead_m [n, 3]: the point, and the same curve a little further on. share [n]: how many such steps each
     point stands for. aside_rad [n]: how far to the sides radiance is safely read. covered [n]: whether surfaces lie at
-    the point's own distance on both sides. pupil [n, 2]; colour, frame, part,
-    window [n]: numbers of the wavelength, the frame, the part of the scene and the window of the film.
+    the point's own distance on both sides. pupil [n, 2]; colour, window,
+    frame, part [n]: numbers of the wavelength, the window of the film, the frame and the part of the scene.
     """
 
     world_m: Tensor
@@ -42,9 +42,9 @@ class CurvePoints:
     covered: Tensor
     pupil: Tensor
     colour: Tensor
+    window: Tensor
     frame: Tensor
     part: Tensor
-    window: Tensor
 
     def __getitem__(self, rows: Any) -> "CurvePoints":
         return CurvePoints(*(getattr(self, field.name)[rows] for field in fields(self)))
@@ -59,62 +59,81 @@ def curve_points(
       every part. frames_each: frames of a trajectory; every trajectory draws the same numbers.
     """
     view = _Views(camera)
-    generator = torch.Generator()
+    count = cameras.shape[1]
     found = []
-    for frame in range(cameras.shape[1]):
-        if frame % frames_each == 0:
-            generator.manual_seed(camera.seed)
+    for start in range(0, count, frames_each):
+        generator = torch.Generator().manual_seed(camera.seed)
+        frames = range(start, min(start + frames_each, count))
         for part, of_part in enumerate(curves):
-            pose = cameras[part, frame]
-            back = inverse(pose)
             for curve in of_part:
-                index, bounds = curve.pieces(pose[:3, 3], PIECE_PX / view.px_per_slope)
-                if not index.numel():
-                    continue
-                ends = [apply(back, curve.points(index, bounds[:, i], pose[:3, 3])) for i in (0, 1)]
-                for window in range(len(view.low)):
-                    rows, clip = view.clipped(window, *ends)
-                    if not rows.numel():
-                        continue
-                    found.append(
-                        _on_pieces(view, curve, index[rows], bounds[rows], clip, pose, per_px, generator)
-                        + [(frame, part, window)]
-                    )
-    if not found:
-        return None
-    columns = list(zip(*found, strict=True))
-    numbers = torch.cat(
-        [torch.tensor(own).expand(len(y), 3) for own, y in zip(columns[-1], columns[0], strict=True)]
-    )
-    return CurvePoints(*(torch.cat(column) for column in columns[:-1]), *numbers.unbind(1))
+                pieces = _in_view(view, curve, cameras[part], frames)
+                if pieces is not None:
+                    points = _on_pieces(view, curve, pieces, cameras[part], per_px, generator)
+                    found.append((*points, torch.full_like(points[-1], part)))
+    return CurvePoints(*(torch.cat(column) for column in zip(*found, strict=True))) if found else None
 
 
-def _on_pieces(view, curve, index, bounds, clip, pose, per_px, generator):
-    """Columns world_m .. colour of points on pieces of one curve, each clipped to [n, 2] of itself and with a
-    length in px."""
-    start, end, length, depths = clip
-    piece, inside, fraction = places(length, per_px, generator)
-    wide = (bounds[:, 1] - bounds[:, 0])[piece]
-    kept = (end - start)[piece]
-    at = start[piece] + inside * kept  # evenly along the film, so in perspective along the piece
-    near, far = depths[piece].unbind(1)
+@dataclass(frozen=True)
+class _Pieces:
+    """Pieces of one curve that touch a window in a frame: index [n], bounds [n, 2], what is left of their length on
+    the film: start and end share [n], length px [n], depths of their ends [n, 2]; frame and window [n]."""
+
+    index: Tensor
+    bounds: Tensor
+    start: Tensor
+    end: Tensor
+    length_px: Tensor
+    depths_m: Tensor
+    frame: Tensor
+    window: Tensor
+
+
+def _in_view(view, curve, cameras, frames):
+    found = []
+    for frame in frames:
+        pose = cameras[frame]
+        eye = pose[:3, 3]
+        index, bounds = curve.pieces(eye, PIECE_PX / view.px_per_slope)
+        if not index.numel():
+            continue
+        back = inverse(pose)
+        ends = [apply(back, curve.points(index, bounds[:, i], eye)) for i in (0, 1)]
+        for window in range(len(view.low)):
+            rows, clip = view.clipped(window, *ends)
+            if rows.numel():
+                numbers = (torch.full_like(rows, n) for n in (frame, window))
+                found.append((index[rows], bounds[rows], *clip, *numbers))
+    return _Pieces(*(torch.cat(column) for column in zip(*found, strict=True))) if found else None
+
+
+def _on_pieces(view, curve, pieces, cameras, per_px, generator):
+    """Columns world_m .. frame, window of points on pieces of one curve."""
+    piece, inside, fraction = places(pieces.length_px, per_px, generator)
+    index = pieces.index[piece]
+    low, high = pieces.bounds[piece].unbind(1)
+    start = pieces.start[piece]
+    kept = pieces.end[piece] - start
+    at = start + inside * kept  # evenly along the film, so in perspective along the piece
+    near, far = pieces.depths_m[piece].unbind(1)
     sight = (1 - at) * far + at * near
-    s = bounds[piece, 0] + at * near / sight * wide
-    fraction = fraction * kept * near * far / sight.square()
+    s = low + at * near / sight * (high - low)
+    share = fraction * kept * near * far / sight.square() / STEP
     count = len(piece)
     turn = torch.randint(PUPILS, (2,), generator=generator)
     number = torch.arange(count)
     pupil = view.pupils[(number + turn[0]) % PUPILS]
-    viewpoint = apply(
-        pose, torch.cat([pupil * view.aperture_m, torch.zeros(count, 1, dtype=torch.float64)], 1)
-    )
-    y = curve.points(index[piece], s, viewpoint)
-    on = curve.points(index[piece], s + STEP * wide, viewpoint)
+    frame = pieces.frame[piece]
+    pose = cameras[frame]
+    eye = pose[:, :3, 3]
+    viewpoint = eye + (pose[:, :3, :2] @ (pupil * view.aperture_m)[..., None])[..., 0]
+    y = curve.points(index, s, viewpoint)
+    on = curve.points(index, s + STEP * (high - low), viewpoint)
     distance = (y - viewpoint).norm(dim=1)
-    coordinates = torch.maximum(y.abs().amax(1), pose[:3, 3].abs().amax())
-    aside = torch.maximum(curve.aside_rad(index[piece], viewpoint), FLOAT32_RAD * coordinates / distance)
-    covered = curve.covered(index[piece], viewpoint)
-    return [y, on, fraction / STEP, aside, covered, pupil, (number + turn[1]) % view.colours]
+    coordinates = torch.maximum(y.abs().amax(1), eye.abs().amax(1))
+    aside = torch.maximum(curve.aside_rad(index, viewpoint), FLOAT32_RAD * coordinates / distance)
+    covered = curve.covered(index, viewpoint)
+    colour = (number + turn[1]) % view.colours
+    return y, on, share, aside, covered, pupil, colour, pieces.window[piece], frame
 
 
 class _Views:

@@ -21,7 +21,7 @@ from codesign.render.wavefront import look
 FIELDS = 6  # cells across the sensor, in each of which the edge is looked for
 ANGLES = 16
 RADII = 32
-HALVINGS = 12
+HALVINGS = 4
 DARK = 1e-9
 WHOLE = 1 - 1e-9  # share of light from which nothing is taken away
 
@@ -79,16 +79,16 @@ def _edge_points(camera, samples):
     spoke = torch.stack([angle.cos(), angle.sin()], 1)
     colour = rows % (1 if camera.spectrum is None else len(camera.spectrum.wavelengths_um))
 
-    def radius_at(least):
-        """The largest radius [n] at which at least that share of the light passes."""
-        inner, outer = first[rows], last[rows]
-        for _ in range(HALVINGS):
-            middle = (inner + outer) / 2
-            passes = coloured_rays(camera, film_px[rows], middle[:, None] * spoke, colour, False)[2] >= least
-            inner, outer = torch.where(passes, middle, inner), torch.where(passes, outer, middle)
-        return inner, outer
-
-    begin, end = radius_at(WHOLE)[0], radius_at(DARK)[1]
+    # the edge lies between the largest radius at which all light passes and the smallest at which none does; both at once
+    inner, outer = (v[rows].repeat(2, 1) for v in (first, last))
+    least = torch.tensor([[WHOLE], [DARK]], dtype=torch.float64)
+    for _ in range(HALVINGS):
+        middle = (inner + outer) / 2
+        q = (middle[..., None] * spoke).reshape(-1, 2)
+        share = coloured_rays(camera, film_px[rows].repeat(2, 1), q, colour.repeat(2), False)[2]
+        passes = share.reshape(2, -1) >= least
+        inner, outer = torch.where(passes, middle, inner), torch.where(passes, outer, middle)
+    begin, end = inner[0], outer[1]
     radius = begin + at[rows, 3] * (end - begin)
     return film_px[rows], radius[:, None] * spoke, colour, rows // samples, 2 * (end - begin) * radius
 

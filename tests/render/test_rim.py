@@ -1,0 +1,63 @@
+"""Light that apertures take away, sampled at their edges: its gradient against plain samples of the whole pupil, many
+of them, and how much less it scatters with few."""
+
+import pytest
+import torch
+
+from codesign import lens, pose, render
+from codesign.render.rim import rim_term
+from scenes import silhouettes as silhouette_scenes
+
+F64 = torch.float64
+START = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7))[None]
+WEIGHT = torch.nn.functional.interpolate(
+    torch.randn(1, 1, 5, 5, generator=torch.Generator().manual_seed(3)), size=(32, 32), mode="bicubic"
+)[0, 0]
+
+
+def gradient(way, samples, seed, **options):
+    """To the six thicknesses of a triplet whose film reaches beyond its field, before a textured wall."""
+    optics = lens.load("cooke-triplet").scaled(0.22).freeze()
+    held = optics.thickness_mm.detach().clone().requires_grad_()
+    camera = render.Camera(optics.replace(thickness_mm=held), 32, 32, 0.25, samples, seed, **options)
+    frames = render.frames(camera, silhouette_scenes.build("wall"), START, way)
+    return torch.autograd.grad((WEIGHT * frames).double().mean(), held)[0]
+
+
+def several(way, samples, count, **options):
+    return torch.stack([gradient(way, samples, 20 + k, **options) for k in range(count)])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"falloff": True}, {"spectrum": lens.Spectrum.visible_FdC((1.0, 2.0, 1.0))}],
+    ids=["plain", "falloff", "spectrum"],
+)
+def test_the_edge_of_the_light_has_the_gradient_of_the_whole_pupil(options):
+    truth = several("interior", 768, 4, **options)
+    found = several("boundary", 24, 16, **options)
+    error = (truth.std(0).square() / 4 + found.std(0).square() / 16).sum().sqrt() / truth.mean(0).norm()
+    assert float(error) < 0.03
+    assert float((found.mean(0) - truth.mean(0)).norm() / truth.mean(0).norm()) < 3 * float(error)
+
+
+def test_it_scatters_by_less_than_half():
+    plain, edges = several("interior", 16, 12), several("boundary", 16, 12)
+    assert float(edges.std(0).norm()) < 0.5 * float(plain.std(0).norm())
+
+
+def test_a_lens_with_no_edge_in_its_pupil_has_none_and_an_obstructed_one_is_left_to_plain_samples():
+    scene = silhouette_scenes.build("wall")
+    narrow = render.Camera(lens.load("cooke-triplet").scaled(0.22), 8, 8, 0.1, 4)
+    term = rim_term(narrow, scene, START, 4)
+    assert term is not None
+    assert float(term.abs().max()) == 0.0
+    assert not term.requires_grad
+
+    class Ring(lens.ThinLens):
+        def camera_rays(self, film_mm, pupil, **options):
+            rays = super().camera_rays(film_mm, pupil, **options)
+            share = 1 / (1 + torch.exp(40 * (0.3 - pupil.norm(dim=1))))
+            return type(rays)(rays.origin_m, rays.direction, share.to(rays.weight), rays.irradiance)
+
+    assert rim_term(render.Camera(Ring(11.0, 2.2), 8, 8, 0.1, 4), scene, START, 4) is None
