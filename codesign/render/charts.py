@@ -12,7 +12,7 @@ from codesign.render.atlas import Atlas, Nodes, atlas_of, cells_of, nodes_of
 from codesign.render.soundness import checked_mesh
 
 FINE_MESH = 0.5  # of a texel: meshes whose pieces are smaller on the average have their light at vertices
-MAX_CELLS = 200_000
+MAX_FACES = 400_000  # of a mesh that is cut into cells
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,11 @@ def chart_of(mi: Any, shape: Any, texel: float, detail: float | None) -> Chart |
     faces = faces[area > 0]
     if not len(faces):
         raise DomainError(f"bake: mesh '{shape.id()}' has no faces with an area; leave it out.")
-    cells = cells_of(vertices, faces)
-    piece = np.sqrt(area.sum() / len(cells.origin))
-    if (piece < FINE_MESH * texel and (detail is None or piece < detail)) or len(cells.origin) > MAX_CELLS:
+    piece = np.sqrt(2 * area.sum() / len(faces))  # of two triangles
+    if (piece < FINE_MESH * texel and (detail is None or piece < detail)) or len(faces) > MAX_FACES:
         return nodes_of(vertices, faces)
     covered = _areas(np.pad(uv[faces], ((0, 0), (0, 0), (0, 1)))).sum() if uv is not None else 0.0
-    atlas = atlas_of(cells, texel)
+    atlas = atlas_of(cells_of(vertices, faces), texel)
     size = (texel * atlas.texels[1], texel * atlas.texels[0])
     return Chart(size, atlas.at, atlas=atlas, uv_per_unit=float(np.sqrt(covered / area.sum())))
 
