@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from codesign import backend, pose
-from codesign.render import MitsubaScene
+from codesign.render import MitsubaScene, MovingScene
 from codesign.render.charts import emissive_mesh
+from scenes import silhouettes
 from scenes.random_shapes import frame, icosphere
 
 RADIUS_M = 0.01  # of the cylinders that are seen from afar
@@ -23,7 +24,7 @@ class World:
     lens with an aperture; over one of 11 mm at f/5. narrow: how much less than the usual field the film takes
     in."""
 
-    scene: MitsubaScene
+    scene: MitsubaScene | MovingScene
     T_world_cam: Tensor
     nearest_m: float
     focus_m: float = 2.0
@@ -162,6 +163,15 @@ def defocus() -> World:
     return World(world, _ahead(), 0.4, focus_m=8.0, lens_scale=15.0, narrow=0.3, kinds=("thin", "traced"))
 
 
+def robot_body() -> World:
+    """A robot in the room with two boxes, with its own deck and mast before the camera that stands on it: motions of
+    the camera are those of its mount, under which both the room and the robot move in the picture."""
+    T_world_robot = pose.se3_exp(torch.tensor([[0.05, -1.2, 1.0, 0.0, 0.0, 0.1]], dtype=torch.float64))
+    T_robot_cam = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, -0.15))
+    world = MovingScene(silhouettes.room(), {"robot": (silhouettes.robot(), T_world_robot)})
+    return World(world, T_world_robot[0] @ T_robot_cam, 0.4)
+
+
 CASES: dict[str, Callable[[], World]] = {
     "poles": poles,
     **{f"far_pole_{ratio}": (lambda ratio=ratio: far_pole(ratio)) for ratio in (20, 100, 250, 500, 600)},
@@ -171,5 +181,6 @@ CASES: dict[str, Callable[[], World]] = {
     "cylinder_in_floor": cylinder_in_floor,
     "crossing_mesh": crossing_mesh,
     "defocus": defocus,
+    "robot_body": robot_body,
 }
 CROSSING = ("sphere_in_floor", "cylinder_in_floor", "crossing_mesh")  # where a refusal is an answer too

@@ -142,3 +142,24 @@ def ball(device="cpu"):
     radiance = {"type": "bitmap", "bitmap": mi.Bitmap(smooth(5, cycles=8)), "raw": True}
     shape = {"type": "sphere", "radius": 0.35, "emitter": {"type": "area", "radiance": radiance}}
     return MitsubaScene({"ball": shape}, device)
+
+
+def robot(device="cpu"):
+    """A robot's deck and mast in the axes of the camera's mount (x right, y ahead, z up), so near that they cross the
+    border of its view."""
+    mi = backend.mitsuba(device)
+    T = mi.ScalarTransform4f
+
+    def light(seed, **options):
+        picture = mi.Bitmap(smooth(seed, cycles=2, **options))
+        return {"type": "area", "radiance": {"type": "bitmap", "bitmap": picture, "raw": True}}
+
+    deck = T().translate([0.0, 0.15, -0.12]).rotate([1, 0.3, 0.2], 9).scale([0.11, 0.22, 0.03])
+    mast = {"type": "cylinder", "p0": [0.08, 0.5, -0.06], "p1": [0.1, 0.47, 0.25], "radius": 0.015}
+    return MitsubaScene(
+        {
+            "deck": {"type": "cube", "to_world": deck, "emitter": light(7, darkest=120)},
+            "mast": {**mast, "emitter": light(8, brightest=90)},
+        },
+        device,
+    )

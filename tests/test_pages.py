@@ -6,7 +6,14 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", "docs/chain.md", "docs/diffraction.md", "docs/your_own.md", "docs/placement.md", "docs/worlds.md")
+PAGES = (
+    "README.md",
+    "docs/chain.md",
+    "docs/diffraction.md",
+    "docs/your_own.md",
+    "docs/placement.md",
+    "docs/worlds.md",
+)
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -196,11 +196,11 @@ def gradient(case: Case, effort: Effort, seed: int, way: Way) -> Tensor:
     frames = render.frames(
         case.camera(effort.samples // 4, seed),
         case.scene,
-        case.T_world_cam.double() @ pose.se3_exp(offsets) @ pose.se3_exp(twist),
+        (case.T_world_cam.double() @ pose.se3_exp(offsets) @ pose.se3_exp(twist))[:, None],
         gradient=way,
         per_px=effort.per_px,
     )
-    (found,) = torch.autograd.grad((frames.double() * case.weight).sum() / case.width_px**2, twist)
+    (found,) = torch.autograd.grad((frames[:, 0].double() * case.weight).sum() / case.width_px**2, twist)
     own = found.reshape(6, effort.poses, 6).mean(1).diagonal()
     return own * case.steps
 

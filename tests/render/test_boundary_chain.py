@@ -87,34 +87,11 @@ def test_windows_on_the_film_each_have_their_own_edges():
     assert plain > 0.2
 
 
-def body():
-    """A robot's body about the origin: a bright box and a mast, cut by the border of the view."""
-    mi = backend.mitsuba()
-    T = mi.ScalarTransform4f
-
-    def light(seed, **options):
-        radiance = {
-            "type": "bitmap",
-            "bitmap": mi.Bitmap(silhouette_scenes.smooth(seed, cycles=2, **options)),
-            "raw": True,
-        }
-        return {"type": "area", "radiance": radiance}
-
-    deck = T().translate([0.0, 0.15, -0.12]).rotate([1, 0.3, 0.2], 9).scale([0.11, 0.22, 0.03])
-    mast = {"type": "cylinder", "p0": [0.08, 0.5, -0.06], "p1": [0.1, 0.47, 0.25], "radius": 0.015}
-    return MitsubaScene(
-        {
-            "deck": {"type": "cube", "to_world": deck, "emitter": light(7, darkest=120)},
-            "mast": {**mast, "emitter": light(8, brightest=90)},
-        }
-    )
-
-
 @pytest.mark.parametrize("optics", [lens.Pinhole(11.0), triplet()], ids=["pinhole", "traced"])
 def test_the_mount_of_a_camera_that_sees_its_robot(optics):
     """The robot stands in the world with the camera on it; what is asked for is the pose of the mount, under which
     the world moves and the robot's own body too."""
-    scene, robot = silhouette_scenes.build("cubes"), body()
+    scene, robot = silhouette_scenes.build("cubes"), silhouette_scenes.robot()
     T_world_robot = pose.se3_exp(torch.tensor([[0.05, -1.2, 1.0, 0.0, 0.0, 0.1]], dtype=F64))
     T_robot_cam = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, -0.15))
 
@@ -132,7 +109,7 @@ def test_the_mount_of_a_camera_that_sees_its_robot(optics):
 
 def test_the_pose_of_an_object_that_moves():
     """Twist of the object about its own axes, before a camera that rests."""
-    wall, robot = silhouette_scenes.build("wall"), body()
+    wall, robot = silhouette_scenes.build("wall"), silhouette_scenes.robot()
     optics = triplet()
 
     def loss(twist, samples, seed, way, per_px):
