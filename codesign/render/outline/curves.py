@@ -3,7 +3,8 @@ and cylinders.
 
 A curve is cut into pieces [s0, s1] of its parameter; a piece becomes a point of the world once a parameter
 and a viewpoint are given. ``aside_rad`` says how far to either side of the true curve the radiances before and
-behind it are read, and ``covered`` whether surfaces lie at its own distance on both its sides.
+behind it are read, ``counts`` whether the curve is one from a place of the pupil, and ``covered`` whether surfaces lie at its
+own distance on both its sides.
 
 Rays are cast in float32. Mitsuba finds a sphere or cylinder of radius r at distance d by the sign of
 b^2 - 4 a c, of size (r / d)^2 of its terms; an error of one part in 2^23 of these moves the edge by
@@ -43,15 +44,25 @@ class Segments:
     always: Tensor
     width_m: Tensor
 
-    def pieces(self, viewpoint, angle):
+    def pieces(self, viewpoint, angle, within_m=0.0):
         """Indices and parameters [n], [n, 2] of pieces that subtend at most ``angle`` from the viewpoint [3]
-        and may be outlines there."""
-        towards = viewpoint - self.start
-        facing = (self.normals * towards[:, None]).sum(2)
-        outline = facing.prod(1) <= 0
-        black = (facing < 0).all(1)
+        and may be outlines from there or from a place at most ``within_m`` away."""
+        facing = self._facing(slice(None), viewpoint)
+        outline = (facing.amin(1) <= within_m) & (facing.amax(1) >= -within_m)
+        black = (facing < -within_m).all(1)
         kept = torch.nonzero((self.always | outline) & ~black)[:, 0]
         return cut(kept, pieces_of(self.start[kept] - viewpoint, self.end[kept] - viewpoint, angle))
+
+    def counts(self, index, viewpoint):
+        """Whether [n] the curves ``index`` [n] are outlines from the viewpoint [3] or [n, 3] itself: next to an outline
+        lie edges that are one from elsewhere in the pupil, and would be counted with it."""
+        facing = self._facing(index, viewpoint)
+        outline = (facing.amin(1) <= 0) & (facing.amax(1) >= 0)
+        return (self.always[index] | outline) & ~(facing < 0).all(1)
+
+    def _facing(self, index, viewpoint):
+        """Height [n, 2] of the viewpoint over both faces, metres."""
+        return (self.normals[index] * (viewpoint - self.start[index])[:, None]).sum(2)
 
     def points(self, index, s, viewpoint):
         """Points [n, 3] of the curves ``index`` [n] at parameters s [n]."""
@@ -72,8 +83,7 @@ class Segments:
     def covered(self, index, viewpoint):
         """Whether [n] surfaces lie at the curve's own distance on both its sides, seen from the viewpoint [3]
         or [n, 3]: creases of which both faces are seen. A reading from much farther away has then missed them."""
-        facing = (self.normals[index] * (viewpoint - self.start[index])[:, None]).sum(2)
-        return (facing > 0).all(1)
+        return (self._facing(index, viewpoint) > 0).all(1)
 
 
 @dataclass(frozen=True)
@@ -86,7 +96,7 @@ class Circles:
     v: Tensor
     width_m: Tensor
 
-    def pieces(self, viewpoint, angle):
+    def pieces(self, viewpoint, angle, within_m=0.0):
         """As for Segments; all of every rim, cut where it turns back as seen from the viewpoint: a piece that went
         out and came back would look short and be long."""
         first, share = self._facing(viewpoint)
@@ -124,6 +134,10 @@ class Circles:
             + _wide(self.width_m[index], distance)
         )
 
+    def counts(self, index, viewpoint):
+        """As for Segments: always."""
+        return torch.ones_like(index, dtype=torch.bool)
+
     def covered(self, index, viewpoint):
         """As for Segments: nowhere."""
         return torch.zeros_like(index, dtype=torch.bool)
@@ -137,7 +151,7 @@ class Spheres:
     centre: Tensor
     radius: Tensor
 
-    def pieces(self, viewpoint, angle):
+    def pieces(self, viewpoint, angle, within_m=0.0):
         """As for Segments; none for a sphere around the viewpoint."""
         outside = torch.nonzero((self.centre - viewpoint).norm(dim=1) > self.radius * (1 + 1e-6))[:, 0]
         return cut(outside, torch.full(outside.shape, ROUND))
@@ -161,6 +175,10 @@ class Spheres:
         centre = self.centre[index]
         distance = (centre - viewpoint).norm(dim=1)
         return _beside_round("sphere", centre, self.radius[index], distance, distance, viewpoint)
+
+    def counts(self, index, viewpoint):
+        """As for Segments: always."""
+        return torch.ones_like(index, dtype=torch.bool)
 
     def covered(self, index, viewpoint):
         """As for Segments: nowhere."""
@@ -190,7 +208,7 @@ class Cylinders:
             torch.tensor([1.0, -1.0], dtype=torch.float64).repeat_interleave(count),
         )
 
-    def pieces(self, viewpoint, angle):
+    def pieces(self, viewpoint, angle, within_m=0.0):
         """As for Segments; none where the viewpoint lies within the radius of the axis."""
         towards, _ = self._across(viewpoint)
         kept = torch.nonzero(towards.norm(dim=1) > self.radius * (1 + 1e-6))[:, 0]
@@ -219,6 +237,10 @@ class Cylinders:
         middle = (self.start + self.end)[index] / 2
         distance = (middle - viewpoint).norm(dim=1)
         return _beside_round("cylinder", middle, self.radius[index], towards.norm(dim=1), distance, viewpoint)
+
+    def counts(self, index, viewpoint):
+        """As for Segments: always."""
+        return torch.ones_like(index, dtype=torch.bool)
 
     def covered(self, index, viewpoint):
         """As for Segments: nowhere."""

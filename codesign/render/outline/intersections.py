@@ -29,7 +29,7 @@ class Intersections:
     curve: Tensor
     radius: Tensor
 
-    def pieces(self, viewpoint, angle):
+    def pieces(self, viewpoint, angle, within_m=0.0):
         """As for Segments; all of every curve."""
         index, s = cut(
             torch.arange(len(self.start)), pieces_of(self.start - viewpoint, self.end - viewpoint, angle)
@@ -69,6 +69,10 @@ class Intersections:
         ratio = distance / radius
         aside = torch.minimum(ASIDE_RAD + SAFETY * EPS * ratio, DEEPEST / ratio)
         return aside + rounding_rad(viewpoint, middle[index].norm(dim=1), distance)
+
+    def counts(self, index, viewpoint):
+        """As for Segments: always."""
+        return torch.ones_like(index, dtype=torch.bool)
 
     def covered(self, index, viewpoint):
         """As for Segments: nowhere."""

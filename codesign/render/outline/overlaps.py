@@ -20,7 +20,7 @@ class Overlaps:
     normal: Tensor
     names: tuple[tuple[str, str], ...]
 
-    def pieces(self, viewpoint, angle):
+    def pieces(self, viewpoint, angle, within_m=0.0):
         """As for Segments; none of faces that turn away, which are black."""
         kept = torch.nonzero(((viewpoint - self.start) * self.normal).sum(1) > 0)[:, 0]
         return cut(kept, pieces_of(self.start[kept] - viewpoint, self.end[kept] - viewpoint, angle))
@@ -39,6 +39,10 @@ class Overlaps:
             f"faces of shapes '{first}' and '{second}' lie in one plane near ({at}) m, one over the other, and rounding "
             "decides which is seen; move one of them by a millimetre."
         )
+
+    def counts(self, index, viewpoint):
+        """As for Segments: always."""
+        return torch.ones_like(index, dtype=torch.bool)
 
     def covered(self, index, viewpoint):
         """As for Segments: nowhere."""
