@@ -93,7 +93,7 @@ def _in_view(view, curve, cameras, frames):
     for frame in frames:
         pose = cameras[frame]
         eye = pose[:3, 3]
-        index, bounds = curve.pieces(eye, PIECE_PX / view.px_per_slope)
+        index, bounds = curve.pieces(eye, PIECE_PX / view.px_per_slope, view.aperture_m)
         if not index.numel():
             continue
         back = inverse(pose)
@@ -132,6 +132,7 @@ def _on_pieces(view, curve, pieces, cameras, per_px, generator):
     coordinates = torch.maximum(y.abs().amax(1), eye.abs().amax(1))
     aside = torch.maximum(curve.aside_rad(index, viewpoint), FLOAT32_RAD * coordinates / distance)
     covered = curve.covered(index, viewpoint)
+    share = share * curve.counts(index, viewpoint)
     colour = (number + turn[1]) % view.colours
     return y, on, share, aside, covered, pupil, colour, pieces.window[piece], frame
 

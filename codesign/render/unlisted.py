@@ -55,12 +55,12 @@ def listing(
     """Whether the jumps of one view lie on the listed curves. cameras: [parts, 4, 4], the camera in the axes of every
     part; curves: of every part; lines: each way across the film, at most."""
     with torch.no_grad():
-        x, q, size, distance = _crossings(camera, scene, cameras, lines)
+        x, q, size, distance, furthest = _crossings(camera, scene, cameras, lines)
         if not len(x):
             return Listing(0.0, 0.0, None, 0)
         rays = camera.rays_through(x, q)
         origin, direction = rays.origin_m.double(), rays.direction.double()
-        count, along = _on_curves(camera, curves, cameras, origin, direction, distance)
+        count, along = _on_curves(camera, curves, cameras, origin, direction, distance, furthest)
     total = float(size.sum())
     none, many = count == 0, along > 1
     place = None
@@ -123,8 +123,8 @@ def _reach_m(camera, scene, cameras):
 
 
 def _crossings(camera, scene, cameras, most):
-    """Jumps along lines: film position [n, 2] px, pupil point [n, 2], size of the jump [n], and distance [n] m of the
-    nearer of its sides."""
+    """Jumps along lines: film position [n, 2] px, pupil point [n, 2], size of the jump [n], and distances [n] m of the
+    nearer and the further of its sides."""
     film = camera.film
     generator = torch.Generator().manual_seed(most)
     _, pupils = film_pupil_pattern(64, most)
@@ -172,13 +172,21 @@ def _crossings(camera, scene, cameras, most):
         near, far = torch.where(left, near, depth), torch.where(left, depth, far)
     size = (second - first).abs()
     jump = torch.nonzero(size > least)[:, 0]
-    return ((low + high) / 2)[jump], pupil[jump], size[jump], torch.minimum(near, far)[jump]
+    return (
+        ((low + high) / 2)[jump],
+        pupil[jump],
+        size[jump],
+        torch.minimum(near, far)[jump],
+        torch.maximum(near, far)[jump],
+    )
 
 
-def _on_curves(camera, curves, cameras, origin, direction, distance):
-    """On how many listed curves the edge lies that each ray [n, 3] of the camera meets at a distance [n], and on how
-    many of them away from their ends, where curves may meet without being one."""
+def _on_curves(camera, curves, cameras, origin, direction, distance, furthest):
+    """On how many listed curves the edge lies that each ray [n, 3] of the camera meets at a distance [n], behind which
+    the light comes from ``furthest`` [n], and on how many of them away from their ends, where curves may meet without
+    being one."""
     slope_per_px = camera.slope_per_px()
+    aperture_m = getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2
     found = []
     names = 0
     for pose, of_part in zip(cameras, curves, strict=True):
@@ -187,7 +195,7 @@ def _on_curves(camera, curves, cameras, origin, direction, distance):
         o = apply(pose, origin)
         d = direction @ pose[:3, :3].T
         for curve in of_part:
-            index, bounds = curve.pieces(eye, PIECE_PX * slope_per_px)
+            index, bounds = curve.pieces(eye, PIECE_PX * slope_per_px, aperture_m)
             if not index.numel():
                 continue
             ends = torch.stack([apply(back, curve.points(index, bounds[:, i], eye)) for i in (0, 1)])
@@ -197,6 +205,11 @@ def _on_curves(camera, curves, cameras, origin, direction, distance):
             away, reach, apart = _angle(curve, index[piece], bounds[piece], o[ray], d[ray])
             within = curve.aside_rad(index[piece], eye).clamp_min(ON_PX * slope_per_px)
             rows = (away < within) & (reach < distance[ray] * (1 + HIDDEN))
+            rows &= curve.counts(index[piece], o[ray])
+            beside = curve.covered(
+                index[piece], o[ray]
+            )  # by surfaces on both sides: not where one is far behind
+            rows &= ~beside | (furthest[ray] < reach * (1 + HIDDEN))
             found.append((ray[rows], away[rows], apart[rows], names + index[piece][rows]))
             names += int(index.max()) + 1
     if not found:

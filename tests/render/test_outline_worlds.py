@@ -1,4 +1,5 @@
-"""Worlds whose gradient was once wrong without a word: thin poles near and far, an edge of a floor against two walls. Against closed forms and differences with common random numbers."""
+"""Worlds whose gradient was once wrong without a word: thin poles near and far, a mesh with one radiance per face,
+an edge of a floor against two walls. Against closed forms and differences with common random numbers."""
 
 import math
 
@@ -8,6 +9,7 @@ import torch
 
 from codesign import backend, pose
 from codesign.render import MitsubaScene
+from codesign.render.charts import emissive_mesh
 from scenes.silhouettes import smooth
 from studies.silhouettes.task import PITCH_MM, SIZE_PX, STEPS, Task
 
@@ -123,6 +125,49 @@ def test_poles_with_their_ends_in_view():
     assert float((single - whole).norm(dim=1).max() / whole.norm()) < 0.3
 
 
+def ball_of_triangles(divisions):
+    """Vertices and faces of a ball about the origin from an icosahedron, 20 * 4^divisions faces."""
+    g = (1 + math.sqrt(5)) / 2
+    corners = np.array([[0.0, a, b * g] for a in (-1, 1) for b in (-1, 1)])
+    corners = np.concatenate([np.roll(corners, k, axis=1) for k in range(3)])
+    near = np.linalg.norm(corners[:, None] - corners, axis=2) < 2.1
+    trios = [
+        (i, j, k)
+        for i in range(12)
+        for j in range(i)
+        for k in range(j)
+        if near[i, j] and near[j, k] and near[i, k]
+    ]
+    faces = corners[np.array(trios)]
+    inwards = (np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0]) * faces[:, 0]).sum(1) < 0
+    faces[inwards] = faces[inwards, ::-1]
+    for _ in range(divisions):
+        a, b, c = faces.transpose(1, 0, 2)
+        d, e, f = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        faces = np.concatenate([np.stack(trio, 1) for trio in ((a, d, f), (d, b, e), (f, e, c), (d, e, f))])
+    points = faces / np.linalg.norm(faces, axis=2, keepdims=True)
+    vertices, index = np.unique(points.reshape(-1, 3).round(9), axis=0, return_inverse=True)
+    return vertices, index.reshape(-1, 3)
+
+
+def test_a_ball_of_5120_faces_with_one_radiance_each():
+    vertices, faces = ball_of_triangles(4)
+    assert len(faces) == 5120
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    shade = 120 + 100 * (normal @ [0.3, -0.5, 0.8])
+    ball = emissive_mesh(backend.mitsuba(), 0.45 * vertices + [0, 0.6, 0.8], faces, shade)
+    check(MitsubaScene({"wall": wall(), "ball": ball}), 0.3)
+
+
+def test_the_outline_of_a_fine_mesh_through_a_wide_pupil():
+    """An aperture of 5 mm sees the outline of a ball of 20,480 faces move over edges next to it."""
+    vertices, faces = ball_of_triangles(5)
+    ball = emissive_mesh(backend.mitsuba(), 0.3 * vertices + [0, 0.1, 0.9], faces, np.full(len(faces), 200.0))
+    check(MitsubaScene({"wall": wall(), "ball": ball}), 0.3, "thin")
+
+
 def test_an_edge_of_a_floor_against_two_edges_of_walls():
     T = backend.mitsuba().ScalarTransform4f
     turned = T().translate([0, 0.4, 0.6]).rotate([0, 1, 0], 17).rotate([0, 0, 1], 9)
@@ -134,10 +179,10 @@ def test_an_edge_of_a_floor_against_two_edges_of_walls():
     check(MitsubaScene(shapes), 0.3)
 
 
-def check(scene, without):
+def check(scene, without, kind="pinhole"):
     """The gradient is that of differences to 5 % and twice their noise; without its edges it is off by ``without`` at
     least."""
-    task = Task(scene, "pinhole")
+    task = Task(scene, kind)
     truth = torch.stack([task.differences("pose", 256, seed) for seed in (11, 12)]) * SCALE
     noise = float((truth[0] - truth[1]).norm() / 2 / truth.mean(0).norm())
     plain, whole = (task.gradient("pose", 256, 13, way, 16.0) * SCALE for way in ("interior", "boundary"))

@@ -21,7 +21,7 @@ class Meridians:
     u: Tensor
     v: Tensor
 
-    def pieces(self, viewpoint: Tensor, angle: float) -> tuple[Tensor, Tensor]:
+    def pieces(self, viewpoint: Tensor, angle: float, within_m: float = 0.0) -> tuple[Tensor, Tensor]:
         """As for Segments; those that face the viewpoint [3]."""
         index, s = cut(torch.arange(len(self.centre)), torch.full((len(self.centre),), ROUND // 2))
         seen = torch.ones(len(index), dtype=torch.bool)
@@ -41,6 +41,10 @@ class Meridians:
         """As for Segments: texture coordinates follow the point that is met, good to float32 of its distance."""
         distance = (self.centre[index] - viewpoint).norm(dim=1)
         return 1e-5 + 1e-6 * distance / self.u[index].norm(dim=1)
+
+    def counts(self, index: Tensor, viewpoint: Any) -> Tensor:
+        """As for Segments: always."""
+        return torch.ones_like(index, dtype=torch.bool)
 
     def covered(self, index: Tensor, viewpoint: Any) -> Tensor:
         """As for Segments: everywhere."""
