@@ -33,6 +33,8 @@ class Config(StudyConfig):
     """Samples per pixel of the differences and of the precise gradients."""
     seeds: int = 4
     """Seeds of the differences; as many of the single estimates."""
+    only_listed: bool = False
+    """Judge the listed worlds, which once were wrong, and nothing else."""
     random: int = 0
     """Judge so many random worlds instead of the others."""
     first: int = 0
@@ -49,7 +51,17 @@ def study(run: Run[Config]) -> None:
         raise DomainError(f"random = {config.random} and first = {config.first} must be at least 0.")
     effort = Effort(seeds=(4,)) if config.quick else USUAL
     if config.random:
-        return sweep(run, config.random, config.first, config.raw, effort)
+        sweep(run, config.random, config.first, config.raw, effort)
+        return
+    if config.only_listed:
+        missed = listed(run, effort)
+        told = (
+            f"**Missed:** {'; '.join(missed)}."
+            if missed
+            else "All are right, or refused where that is an answer."
+        )
+        run.finish("Gradients at silhouettes of listed worlds", told)
+        return
     cases = [
         (scene, kind)
         for scene in silhouette_scenes.NAMES

@@ -37,7 +37,7 @@ class Effort:
     samples: int = 256
     poses: int = 4
     per_px: float = 8.0
-    seeds: tuple[int, ...] = (4, 12, 36)
+    seeds: tuple[int, ...] = (4, 12, 24)
 
 
 USUAL = Effort()
