@@ -3,8 +3,8 @@ and cylinders.
 
 A curve is cut into pieces [s0, s1] of its parameter; a piece becomes a point of the world once a parameter
 and a viewpoint are given. ``aside_rad`` says how far to either side of the true curve the radiances before and
-behind it are read, ``counts`` whether the curve is one from a place of the pupil, and ``covered`` whether surfaces lie at its
-own distance on both its sides.
+behind it are read, ``counts`` whether the curve is one from a place of the pupil, and ``covered`` whether surfaces
+lie at its own distance on both its sides.
 
 Rays are cast in float32. Mitsuba finds a sphere or cylinder of radius r at distance d by the sign of
 b^2 - 4 a c, of size (r / d)^2 of its terms; an error of one part in 2^23 of these moves the edge by
@@ -35,8 +35,8 @@ PARTS = 16  # parts of a cylinder's length that tell their own distance
 @dataclass(frozen=True)
 class Segments:
     """Straight edges. start, end: [E, 3]. normals: [E, 2, 3] of the two faces, on the side that shines, 0 where
-    none is known; always: [E] bool, True where it counts from every side but that from which both faces are black (rims, seams, sharp creases). width_m: [E], how far apart edges lie that count as
-    this one."""
+    none is known; always: [E] bool, True where it counts from every side but that from which both faces are black
+    (rims, seams, sharp creases). width_m: [E], how far apart edges lie that count as this one."""
 
     start: Tensor
     end: Tensor

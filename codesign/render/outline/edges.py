@@ -18,9 +18,9 @@ SHARP = 0.98
 
 @dataclass(frozen=True)
 class Edges:
-    """start, end: [E, 3]. normals: [E, 2, 3] of the two faces, the side that shines. always: [E], True where an edge counts from
-    every side. free: [E], True where not just two faces of one mesh meet. width_m: [E], how far apart edges lie
-    that count as this one."""
+    """start, end: [E, 3]. normals: [E, 2, 3] of the two faces, the side that shines. always: [E], True where an
+    edge counts from every side. free: [E], True where not just two faces of one mesh meet. width_m: [E], how far
+    apart edges lie that count as this one."""
 
     start: np.ndarray
     end: np.ndarray

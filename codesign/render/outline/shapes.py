@@ -14,9 +14,9 @@ EVEN = 1e-4  # axes of a sphere or cylinder may differ in length and angle by th
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices: [V, 3]; faces: [F, 3], normals on the side that shines; values: [F, 3, k] by which radiance is looked up at every corner
-    (texture coordinates, colours, radiance of a face), None where it is one for all; light: that one radiance, None
-    where it changes or is not known."""
+    """vertices: [V, 3]; faces: [F, 3], normals on the side that shines; values: [F, 3, k] by which radiance is
+    looked up at every corner (texture coordinates, colours, radiance of a face), None where it is one for all; light:
+    that one radiance, None where it changes or is not known."""
 
     name: str
     vertices: np.ndarray
