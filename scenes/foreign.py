@@ -103,11 +103,11 @@ def from_mitsuba(
         return PlacedScene(
             PathScene(scene, device, samples=samples or 16, seed=seed, integrator=integrator), place
         )
-    area_m2 = unit_m**2 * sum(float(shape.surface_area()[0]) for shape in scene.shapes())
+    area_m2 = unit_m**2 * sum(_area(shape) for shape in scene.shapes())
     return bake(
         scene,
         device,
-        texel_m=math.sqrt(area_m2 / TEXELS) if texel_m is None else texel_m,
+        texel_m=math.sqrt(max(area_m2, 1e-12) / TEXELS) if texel_m is None else texel_m,
         samples=samples or 64,
         seed=seed,
         towards_m=towards_m,
@@ -116,6 +116,14 @@ def from_mitsuba(
         lit=light == "baked",
         placement=place,
     )
+
+
+def _area(shape):
+    """In the scene's unit; 0 for a shape that does not know its own, as an instance."""
+    try:
+        return float(shape.surface_area()[0])
+    except RuntimeError:
+        return 0.0
 
 
 def _integrator(mi, scene, max_depth):

@@ -438,3 +438,17 @@ def test_mirrors_glass_and_masks_name_the_level_to_choose_and_may_be_matte(bsdf)
     # an even sky of 2 is 2 in a perfect mirror and through glass; a mask shows half of it and half of albedo 0.5
     low, high = {"conductor": (1.99, 2.01), "thindielectric": (1.99, 2.01), "mask": (1.4, 1.6)}[bsdf]
     assert low < float(image.mean()) < high
+
+
+def test_instances_are_named_with_the_level_that_shows_them():
+    copies = {
+        "group": {"type": "shapegroup", "one": {"type": "rectangle"}},
+        "copy": {"type": "instance", "of": {"type": "ref", "id": "group"}},
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 2.0}},
+    }
+    with pytest.raises(
+        DomainError, match=r"shape 'copy', a Instance, has no texture chart here; .* PathScene"
+    ):
+        worlds.from_mitsuba(copies, up="z")
+    image = from_above_and_below(worlds.from_mitsuba(copies, "path", up="z", samples=256))
+    assert float(image[0].mean()) == pytest.approx(0.5 * 2, rel=0.02)  # albedo 0.5, 16 x 4096 paths
