@@ -131,9 +131,8 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
     rows = torch.nonzero(fine & (length > 0))[:, 0]
     if not rows.numel():
         return None
-    points, y, x, per_m, tangent, length, pixel = (
-        v[rows] for v in (points, y, x, per_m, tangent, length, pixel)
-    )
+    points = points[rows]
+    y, x, per_m, tangent, length, pixel = (v[rows] for v in (y, x, per_m, tangent, length, pixel))
     normal = torch.stack([-tangent[:, 1], tangent[:, 0]], 1) / length[:, None]
     aside = (points.aside_rad / camera.slope_per_px())[:, None] * normal
     q, colour = (v.repeat(2, *[1] * (v.ndim - 1)) for v in (points.pupil, points.colour))
@@ -143,12 +142,9 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
     )
     before, behind = weight.detach().reshape(2, -1) * light
     reach = (y - origin[: len(y)]).norm(dim=1)
-    seen = distance.amax(0) > reach * (
-        1 - HIDDEN
-    )  # of a face nearly edge-on, the near side may be much nearer
-    seen &= ~points.covered | (
-        distance.amax(0) < reach * (1 + HIDDEN)
-    )  # else a ray slipped between two faces
+    # of a face nearly edge-on the near side may be much nearer; between two faces that are seen a ray may slip through
+    seen = distance.amax(0) > reach * (1 - HIDDEN)
+    seen &= ~points.covered | (distance.amax(0) < reach * (1 + HIDDEN))
     jump = (before - behind) * length * points.share * seen
     found = Jumps(
         points.world_m,

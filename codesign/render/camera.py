@@ -210,7 +210,8 @@ class Camera:
         at = torch.cat([self.film.middle_px[None].to(pixels), pixels])
         through = torch.cat([pupil.new_zeros(1, 2), pupil])
         rays = self.lens.camera_rays(self.film_mm(at), through, aim=self.aim, **colour)
-        return Rays(*(None if v is None else v[1:] for v in (getattr(rays, f.name) for f in fields(Rays))))
+        irradiance = None if rays.irradiance is None else rays.irradiance[1:]
+        return Rays(rays.origin_m[1:], rays.direction[1:], rays.weight[1:], irradiance)
 
 
 def project(camera: Camera, points_cam_m: Tensor, pupil: Tensor | None = None) -> Tensor:

@@ -104,7 +104,7 @@ def _edge(camera):
     turn = torch.arange(ANGLES, dtype=torch.float64) * (2 * math.pi / ANGLES)
     radius = torch.arange(RADII + 1, dtype=torch.float64) / RADII
     disc = (radius[:, None, None] * torch.stack([turn.cos(), turn.sin()], 1)).reshape(-1, 2)
-    passed = None
+    least = most = torch.ones(0)
     colours = [None] if camera.spectrum is None else camera.spectrum.wavelengths_um
     for wavelength in colours:
         rays = camera.rays_through(
@@ -113,15 +113,13 @@ def _edge(camera):
         share = rays.weight.reshape(FIELDS + 1, FIELDS + 1, RADII + 1, ANGLES).double()
         if bool((share.diff(dim=2) > 1e-9).any()) or bool((share[:, :, 0] < WHOLE).any()):
             return None
-        passed = (
-            torch.stack([share, share])
-            if passed is None
-            else torch.stack([torch.minimum(passed[0], share), torch.maximum(passed[1], share)])
-        )
-    whole = (passed[0] >= WHOLE).sum(2) - 2  # the last radius at which all passes, and one before
-    some = (passed[1] > 0).sum(2) + 1
-    whole, some = whole.clamp(0, RADII), some.clamp(0, RADII)
-    whole = torch.where((passed[0] >= WHOLE).all(2), RADII, whole)
+        least = torch.minimum(least, share) if least.numel() else share
+        most = torch.maximum(most, share) if most.numel() else share
+    whole = ((least >= WHOLE).sum(2) - 2).clamp(
+        0, RADII
+    )  # the last radius at which all passes, and one before
+    some = ((most > 0).sum(2) + 1).clamp(0, RADII)
+    whole = torch.where((least >= WHOLE).all(2), RADII, whole)
     low, high = (_over_cells(v, f) / RADII for v, f in ((whole, torch.minimum), (some, torch.maximum)))
     return low, high, torch.full((2,), -0.5, dtype=torch.float64), size / FIELDS
 
