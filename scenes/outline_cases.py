@@ -163,6 +163,16 @@ def defocus() -> World:
     return World(world, _ahead(), 0.4, focus_m=8.0, lens_scale=15.0, narrow=0.3, kinds=("thin", "traced"))
 
 
+def ball_ahead() -> World:
+    """A ball cut by the film's border, straight along a diagonal of the axes: where its outline begins must not depend on
+    the point of the pupil it is seen from."""
+    mi = backend.mitsuba("cpu")
+    ball = {"type": "sphere", "center": [0.2, 1.5, 0.2], "radius": 0.3, "emitter": _light(200)}
+    world = MitsubaScene({"wall": _wall(mi, 3.0, _light(60)), "ball": ball})
+    ahead = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+    return World(world, ahead, 1.2, kinds=("pinhole", "thin", "traced"))
+
+
 def robot_body() -> World:
     """A robot in the room with two boxes, with its own deck and mast before the camera that stands on it: motions of
     the camera are those of its mount, under which both the room and the robot move in the picture."""
@@ -181,6 +191,7 @@ CASES: dict[str, Callable[[], World]] = {
     "cylinder_in_floor": cylinder_in_floor,
     "crossing_mesh": crossing_mesh,
     "defocus": defocus,
+    "ball_ahead": ball_ahead,
     "robot_body": robot_body,
 }
 CROSSING = ("sphere_in_floor", "cylinder_in_floor", "crossing_mesh")  # where a refusal is an answer too

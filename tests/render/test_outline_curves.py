@@ -205,3 +205,18 @@ def test_no_piece_of_a_rim_turns_back(eye):
     seen = torch.nn.functional.normalize(y - eye, dim=2)
     length = (seen[:, 1:] - seen[:, :-1]).norm(dim=2).sum(1)
     assert float(((seen[:, -1] - seen[:, 0]).norm(dim=1) / length).min()) > 0.7
+
+
+@pytest.mark.parametrize(
+    "towards", [(0.2, 1.5, 0.2), (0.0, 1.0, 0.0), (1.0, 1.0, 1.0), (0.0, 0.0, -1.0), (-2.0, 0.3, 0.3)]
+)
+def test_a_place_on_a_sphere_has_one_name_from_all_points_of_a_pupil(towards, generator):
+    """A pupil of 2 mm before a ball of 0.3 m: the same parameters are the same places, to some millimetres."""
+    eye = torch.tensor([0.3, -0.2, 0.1], dtype=F64)
+    ball = Spheres((eye + torch.tensor(towards, dtype=F64))[None], torch.tensor([0.3], dtype=F64))
+    index, s = ball.pieces(eye, 0.1)
+    middle = s.mean(1)
+    seen = ball.points(index, middle, eye)
+    for _ in range(20):
+        aside = 2e-3 * (torch.rand(len(index), 3, generator=generator, dtype=F64) - 0.5)
+        assert float((ball.points(index, middle, eye + aside) - seen).norm(dim=1).max()) < 4e-3

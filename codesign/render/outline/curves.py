@@ -146,15 +146,18 @@ class Circles:
 @dataclass(frozen=True)
 class Spheres:
     """Outlines of spheres: the circle where rays from the viewpoint are tangent. centre: [C, 3]; radius:
-    [C]."""
+    [C]. Parameters run over 0..1, 2..3 or 4..5: where on the circle they begin is told from the first, second or third
+    axis, the one farthest from the view, so that they name the same place from all points of a pupil."""
 
     centre: Tensor
     radius: Tensor
 
     def pieces(self, viewpoint, angle, within_m=0.0):
         """As for Segments; none for a sphere around the viewpoint."""
-        outside = torch.nonzero((self.centre - viewpoint).norm(dim=1) > self.radius * (1 + 1e-6))[:, 0]
-        return cut(outside, torch.full(outside.shape, ROUND))
+        towards = viewpoint - self.centre
+        outside = torch.nonzero(towards.norm(dim=1) > self.radius * (1 + 1e-6))[:, 0]
+        index, s = cut(outside, torch.full(outside.shape, ROUND))
+        return index, s + 2 * towards.abs().argmin(1)[index, None]
 
     def points(self, index, s, viewpoint):
         """As for Segments; viewpoint [3] or [n, 3]."""
@@ -164,8 +167,8 @@ class Spheres:
         distance = towards.norm(dim=1, keepdim=True)
         axis = towards / distance
         share = radius[:, None] / distance
-        u, v = _across(axis)
-        turn = 2 * torch.pi * s[:, None]
+        u, v = _across(axis, (s / 2).floor().long())
+        turn = 2 * torch.pi * (s % 2)[:, None]
         return centre + radius[:, None] * (
             share * axis + (1 - share.square()).clamp_min(0).sqrt() * (turn.cos() * u + turn.sin() * v)
         )
@@ -303,8 +306,8 @@ def cut(index, count):
     return index[which], torch.stack([k / count[which], (k + 1) / count[which]], 1).double()
 
 
-def _across(axis):
-    """Two unit vectors [n, 3] across unit vectors [n, 3]."""
-    helper = torch.eye(3, dtype=axis.dtype)[axis.abs().argmin(1)]
+def _across(axis, beside):
+    """Two unit vectors [n, 3] across unit vectors [n, 3], the first across the coordinate axis ``beside`` [n] too."""
+    helper = torch.eye(3, dtype=axis.dtype)[beside]
     u = torch.nn.functional.normalize(torch.linalg.cross(axis, helper), dim=1)
     return u, torch.linalg.cross(axis, u)
