@@ -62,7 +62,7 @@ def sweep(run: Any, count: int, first: int, raw: tuple[str, ...], effort: Effort
 
     def save():
         run.save_state({}, {"rows": rows})
-        write_atomic(run.path("random.json"), json.dumps(_rounded(rows), indent=0).encode())
+        write_atomic(run.path("random.json"), _text(rows).encode())
 
     run.on_interrupt(save)
     wanted = range(first, first + count)
@@ -88,10 +88,16 @@ def _earlier(run, raw):
     return rows
 
 
+def _text(rows):
+    """The raw table: a line for every draw, in their order."""
+    lines = [f'"{seed}": {json.dumps(_rounded(rows[seed]))}' for seed in sorted(rows, key=int)]
+    return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
 def _rounded(value):
-    """The same plain values with floats to five digits."""
+    """The same plain values with floats to four digits."""
     if isinstance(value, float):
-        return float(f"{value:.5g}")
+        return float(f"{value:.4g}")
     if isinstance(value, dict):
         return {key: _rounded(v) for key, v in value.items()}
     return [_rounded(v) for v in value] if isinstance(value, list) else value
