@@ -57,7 +57,7 @@ def judged_draw(seed: int, kinds: tuple[str, ...] = LENSES, effort: Effort = USU
 
 def sweep(run: Any, count: int, first: int, raw: tuple[str, ...], effort: Effort = USUAL) -> None:
     """Judge ``count`` draws from number ``first`` on, those of earlier sessions and given tables excepted, and
-    show all."""
+    show them with all that these hold."""
     rows = _earlier(run, raw)
 
     def save():
@@ -73,7 +73,7 @@ def sweep(run: Any, count: int, first: int, raw: tuple[str, ...], effort: Effort
             save()
             progress.advance()
     save()
-    show(run, [row for seed in wanted for row in rows[str(seed)]])
+    show(run, [row for seed in sorted(rows, key=int) for row in rows[seed]])
 
 
 def _earlier(run, raw):
