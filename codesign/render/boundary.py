@@ -28,8 +28,9 @@ from codesign.render.wavefront import HIDDEN, look
 # px, of the film position for the derivative of a ray; the change up to which its root is taken as found, since the
 # next would be of its square
 STEP_PX = 1e-3
-FOUND_PX = 0.02
+FOUND_PX = 1e-4
 TURNS = 6
+SLIPPED = 5e-3  # a ray that goes on by this share of the distance has missed the faces beside the edge
 # for the question whether there are jumps at all: points per pixel of curve, and share of the light
 GLANCE_PER_PX = 0.3
 CONTRAST = 0.02
@@ -144,7 +145,7 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
     reach = (y - origin[: len(y)]).norm(dim=1)
     # of a face nearly edge-on the near side may be much nearer; between two faces that are seen a ray may slip through
     seen = distance.amax(0) > reach * (1 - HIDDEN)
-    seen &= ~points.covered | (distance.amax(0) < reach * (1 + HIDDEN))
+    seen &= ~points.covered | (distance.amax(0) < reach * (1 + SLIPPED))
     jump = (before - behind) * length * points.share * seen
     found = Jumps(
         points.world_m,
@@ -167,23 +168,31 @@ def _on_film(camera, y, points):
     [n]. Newton's method on the rays of the camera, from where the lens says light of the point goes."""
     steps = STEP_PX * torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], dtype=y.dtype)
     x = _first_guess(camera, y, points)
-    q, colour = points.pupil.repeat(3, 1), points.colour.repeat(3)
+    per_px = torch.eye(2, dtype=y.dtype).repeat(len(y), 1, 1)
+    slope = torch.zeros_like(x)
+    found = torch.zeros(len(y), dtype=torch.bool)
+    rows = torch.arange(len(y))
     for _ in range(TURNS):
-        at = (x + steps[:, None]).reshape(-1, 2)
+        at = (x[rows] + steps[:, None]).reshape(-1, 2)
+        q, colour = points.pupil[rows].repeat(3, 1), points.colour[rows].repeat(3)
         origin, direction, light = coloured_rays(camera, at, q, colour)
         origin, direction = (v.reshape(3, -1, 3) for v in (origin, direction))
         passes = ((light.reshape(3, -1) > 0) & (direction[..., 2] > 1e-6)).all(0)
-        slope = direction[..., :2] / torch.where(passes[:, None], direction[..., 2:], 1.0)
-        here = origin[..., :2] + slope * (y[:, 2:] - origin[..., 2:])
-        per_px = torch.stack([here[1] - here[0], here[2] - here[0]], -1) / STEP_PX
-        passes &= torch.linalg.det(per_px).abs() > 1e-12 * per_px.square().sum((1, 2))
-        safe = torch.where(passes[:, None, None], per_px, torch.eye(2, dtype=y.dtype))
-        change = torch.linalg.solve(safe, torch.where(passes[:, None], here[0] - y[:, :2], 0.0))
-        x = x - change
-        far = change.abs().amax(1)
-        if not bool((far > FOUND_PX).any()):
+        slopes = direction[..., :2] / torch.where(passes[:, None], direction[..., 2:], 1.0)
+        here = origin[..., :2] + slopes * (y[rows, 2:] - origin[..., 2:])
+        change_per_px = torch.stack([here[1] - here[0], here[2] - here[0]], -1) / STEP_PX
+        passes &= torch.linalg.det(change_per_px).abs() > 1e-12 * change_per_px.square().sum((1, 2))
+        rows, change_per_px = rows[passes], change_per_px[passes]
+        change = torch.linalg.solve(change_per_px, here[0, passes] - y[rows, :2])
+        x[rows] -= change
+        per_px[rows] = change_per_px
+        slope[rows] = slopes[0, passes]
+        near = change.abs().amax(1) < FOUND_PX
+        found[rows] = near
+        rows = rows[~near]
+        if not rows.numel():
             break
-    return x, safe, slope[0], passes & (far < FOUND_PX)
+    return x, per_px, slope, found
 
 
 def _first_guess(camera, y, points):

@@ -16,7 +16,9 @@ from codesign.pose import apply, inverse
 from codesign.render.camera import Camera
 from codesign.render.sampling import film_pupil_pattern
 
-PIECE_PX = 8.0  # length of a piece on the film, at most
+# length of a piece on the film, and its angle, at most: one that reaches behind the camera is left out
+PIECE_PX = 8.0
+PIECE_RAD = 0.1
 MARGIN_PX = 1.0  # beyond the film, on top of the blur
 WIDER = 1.02  # of the film's field, for what chief rays of the border do not say: colour, pupil aberration
 IN_FRONT_M = 1e-3
@@ -93,7 +95,7 @@ def _in_view(view, curve, cameras, frames):
     for frame in frames:
         pose = cameras[frame]
         eye = pose[:3, 3]
-        index, bounds = curve.pieces(eye, PIECE_PX / view.px_per_slope, view.aperture_m)
+        index, bounds = curve.pieces(eye, piece_rad(1 / view.px_per_slope), view.aperture_m)
         if not index.numel():
             continue
         back = inverse(pose)
@@ -135,6 +137,11 @@ def _on_pieces(view, curve, pieces, cameras, per_px, generator):
     share = share * curve.counts(index, viewpoint)
     colour = (number + turn[1]) % view.colours
     return y, on, share, aside, covered, pupil, colour, pieces.window[piece], frame
+
+
+def piece_rad(slope_per_px: float) -> float:
+    """Largest angle of a piece for a camera with so much slope per pixel."""
+    return min(PIECE_PX * slope_per_px, PIECE_RAD)
 
 
 class _Views:

@@ -20,7 +20,7 @@ from codesign.render.wavefront import look
 
 FIELDS = 6  # cells across the sensor, in each of which the edge is looked for
 ANGLES = 16
-RADII = 32
+RADII = 16
 HALVINGS = 4
 DARK = 1e-9
 WHOLE = 1 - 1e-9  # share of light from which nothing is taken away

@@ -19,15 +19,17 @@ from codesign.pose import Poses, as_poses, inverse, se3_exp
 from codesign.render.boundary import boundary_term, radiance_jumps
 from codesign.render.camera import Camera
 from codesign.render.kinds import Scene
-from codesign.render.moving import MovingScene, at_frames, in_one_row, scenes_and_poses
+from codesign.render.moving import MovingScene, at_frames, cameras_in_parts, in_one_row, scenes_and_poses
 from codesign.render.rim import rim_term
+from codesign.render.unlisted import reach_m
 from codesign.render.wavefront import shade
 from codesign.types import Rays
 
 Way = Literal["interior", "boundary", "difference", "auto"]
 WAYS: tuple[Way, ...] = ("interior", "boundary", "difference", "auto")
 PROVEN: tuple[Way, ...] = ("interior", "boundary")  # those that differences judge
-POSE_STEP = (2e-3, 2e-3, 2e-3, 2e-3, 2e-3, 2e-3)  # metres and radians
+POSE_STEP = 2e-3  # metres and radians, but never more than STEP_PX on the film
+STEP_PX = 0.3
 LENS_STEP = {
     "curvature_per_mm": 2e-5,
     "thickness_mm": 5e-3,
@@ -151,8 +153,9 @@ def by_differences(camera: Camera, scene: Any, T_world_cam: Tensor) -> Tensor:
         found = first = image(camera, scene, T_world_cam)
     if T_world_cam.requires_grad:
         twist = _twist(T_world_cam)
+        steps = pose_steps(camera, scene, T_world_cam)
         for k in range(6):
-            slope = pose_difference(camera, scene, T_world_cam, k)
+            slope = pose_difference(camera, scene, T_world_cam, k, steps[k])
             found = found + slope * twist[:, k].to(first).reshape(-1, *[1] * (first.ndim - 1))
     known = lens_tensors(camera.lens)
     _check_known(camera.lens, known)
@@ -172,16 +175,25 @@ def _twist(T_world_cam):
     return torch.stack([*small[:, :3, 3].unbind(1), turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], 1)
 
 
-def pose_difference(camera: Camera, scene: Any, T_world_cam: Tensor, k: int) -> Tensor:
+def pose_steps(camera: Camera, scene: Any, T_world_cam: Tensor) -> list[float]:
+    """Steps of differences to the six components of a twist, metres and radians: at most STEP_PX of motion on the film,
+    for translations at the median distance of what the first frame shows."""
+    with torch.no_grad():
+        turn = STEP_PX * abs(camera.slope_per_px())
+        move = turn * reach_m(camera, scene, cameras_in_parts(at_frames(scene, [0]), T_world_cam[:1]))
+    return 3 * [min(POSE_STEP, move)] + 3 * [min(POSE_STEP, turn)]
+
+
+def pose_difference(camera: Camera, scene: Any, T_world_cam: Tensor, k: int, size: float) -> Tensor:
     """Change of the frames per unit of the k-th component of the twist of every pose, by central
-    differences."""
+    differences over ``size`` either way."""
     step = torch.zeros(6, dtype=torch.float64)
-    step[k] = POSE_STEP[k]
+    step[k] = size
     with torch.no_grad():
         ahead, behind = (
             image(camera, scene, T_world_cam.double() @ se3_exp(sign * step[None])) for sign in (1, -1)
         )
-    return (ahead - behind) / (2 * POSE_STEP[k])
+    return (ahead - behind) / (2 * size)
 
 
 def lens_tensors(lens: Any) -> dict[str, Tensor]:
@@ -302,8 +314,9 @@ def choose(camera: Camera, scene: Any, T_world_cam: Tensor, seed: int = 0) -> di
 
 def _by_group(camera, scene, poses, group, weight):
     if group == "pose":
+        steps = pose_steps(camera, scene, poses)
         return torch.stack(
-            [(pose_difference(camera, scene, poses, k) * weight).sum((-2, -1)) for k in range(6)]
+            [(pose_difference(camera, scene, poses, k, steps[k]) * weight).sum((-2, -1)) for k in range(6)]
         ).double()
     return torch.stack(
         [

@@ -16,9 +16,9 @@ from torch import Tensor
 from codesign.errors import DomainError
 from codesign.pose import apply, inverse
 from codesign.render.camera import Camera
-from codesign.render.curve_points import IN_FRONT_M, PIECE_PX
+from codesign.render.curve_points import IN_FRONT_M, piece_rad
 from codesign.render.film import coarse_pixels
-from codesign.render.moving import parts
+from codesign.render.moving import parts, says_distance
 from codesign.render.sampling import film_pupil_pattern
 from codesign.render.wavefront import HIDDEN, look
 
@@ -96,7 +96,7 @@ def check_listed(camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], ca
                     f"({at}) m: parts of a moving scene that touch, textures with hard texels, or shapes that are not "
                     "known; move them apart, smooth the texture, or use 'difference'."
                 )
-        seen.append((view.clone(), _reach_m(camera, scene, view)))
+        seen.append((view.clone(), reach_m(camera, scene, view)))
 
 
 def _half_field_rad(camera):
@@ -111,12 +111,16 @@ def _covers(old, reach_m, view, field_rad):
     return bool((moved < MOVED * reach_m).all() and (straight > math.cos(TURNED * field_rad)).all())
 
 
-def _reach_m(camera, scene, cameras):
-    """Median distance of what a view shows."""
+def reach_m(camera: Camera, scene: Any, cameras: Tensor | Sequence[Tensor]) -> float:
+    """Median distance of what a view shows, 1 where it shows nothing or a scene that does not say. cameras: the camera
+    [4, 4] or [1, 4, 4] in the axes of every part."""
+    if not all(says_distance(type(part)) for part in parts(scene)):
+        return 1.0
     pixels = coarse_pixels(camera.film, 8)
     rays = camera.rays_through(pixels, torch.zeros_like(pixels))
+    poses = torch.stack([pose.double().reshape(1, 4, 4) for pose in cameras])
     _, distance = look(
-        scene, cameras[:, None].expand(-1, len(pixels), 4, 4), rays.origin_m.double(), rays.direction.double()
+        scene, poses.expand(-1, len(pixels), 4, 4), rays.origin_m.double(), rays.direction.double()
     )
     met = distance[distance.isfinite()]
     return float(met.median()) if len(met) else 1.0
@@ -195,7 +199,7 @@ def _on_curves(camera, curves, cameras, origin, direction, distance, furthest):
         o = apply(pose, origin)
         d = direction @ pose[:3, :3].T
         for curve in of_part:
-            index, bounds = curve.pieces(eye, PIECE_PX * slope_per_px, aperture_m)
+            index, bounds = curve.pieces(eye, piece_rad(slope_per_px), aperture_m)
             if not index.numel():
                 continue
             ends = torch.stack([apply(back, curve.points(index, bounds[:, i], eye)) for i in (0, 1)])

@@ -13,7 +13,7 @@ from codesign.render.kinds import Scene
 from codesign.render.moving import MovingScene, cameras_in_parts, in_one_row, parts, says_distance
 from codesign.types import Rays
 
-# a point is hidden when something beside it is nearer by this share; a curved surface falls away by less
+# an edge is hidden when all beside it is nearer by this share; a face next to it comes nearer by less
 HIDDEN = 5e-3
 
 

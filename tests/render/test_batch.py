@@ -76,8 +76,7 @@ def gradients(cam, scene, poses, way, weights):
 
 @pytest.mark.parametrize("way", ["interior", "boundary", "auto", "difference"])
 def test_gradients_of_a_batch_are_those_of_each_trajectory(way, generator):
-    # float32 frames, whose adjoints are sums over 8 x 8 pixels x 4 samples in any order; "auto" settles for one
-    # way from two frames, which is the same for both here because the scene remembers it
+    # float32 frames, whose adjoints are sums over 8 x 8 pixels x 4 samples in any order; "auto" finds edges in all
     scene = silhouettes.build("cubes")
     cam = Camera(lens.load("cooke-triplet").scaled(0.11).freeze(), 8, 8, 1.0, 4)
     poses = paths(2, (2, 2), look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7)))

@@ -156,3 +156,36 @@ def test_differences_reach_no_object():
     moving = render.MovingScene(wall, {"card": (silhouette_scenes.build("cubes"), asks)})
     with pytest.raises(DomainError, match="the pose of an object asks for one"):
         render.frames(render.Camera(render_pinhole(), 8, 8, 1.0, 4), moving, path, gradient="difference")
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-3])
+def test_differences_step_by_a_share_of_a_pixel_in_small_scenes(scale):
+    """A cube before a wall, in metres and in millimetres: the same picture, so gradients to translations are as one
+    over the scale, and turns alike."""
+    mi = backend.mitsuba()
+    T = mi.ScalarTransform4f().scale(scale)
+
+    def light(seed):
+        picture = mi.Bitmap(silhouette_scenes.smooth(seed, cycles=2))
+        return {"type": "area", "radiance": {"type": "bitmap", "bitmap": picture, "raw": True}}
+
+    wall = T @ mi.ScalarTransform4f().translate([0, 0, 3]).rotate([1, 0, 0], 180).scale(4)
+    cube = T @ mi.ScalarTransform4f().translate([0.1, 0.2, 2]).rotate([1, 2, 0.5], 40).scale(0.3)
+    scene = MitsubaScene(
+        {
+            "wall": {"type": "rectangle", "to_world": wall, "emitter": light(1)},
+            "cube": {"type": "cube", "to_world": cube, "emitter": light(2)},
+        }
+    )
+    camera = render.Camera(render_pinhole(), 24, 24, 0.33, 256)
+    coarse = torch.randn(1, 1, 5, 5, generator=torch.Generator().manual_seed(3))
+    weight = torch.nn.functional.interpolate(coarse, size=(24, 24), mode="bicubic")[0, 0].double()
+    unit = torch.tensor([scale] * 3 + [1.0] * 3, dtype=F64)
+
+    def gradient(way):
+        twist = torch.zeros(6, dtype=F64, requires_grad=True)
+        frames = render.frames(camera, scene, pose.se3_exp(twist[None]), way)
+        return torch.autograd.grad((frames[0].double() * weight).sum(), twist)[0] * unit
+
+    found, truth = gradient("difference"), gradient("boundary")
+    assert float((found - truth).norm() / truth.norm()) < 0.1
