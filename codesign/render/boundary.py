@@ -33,7 +33,7 @@ TURNS = 6
 SLIPPED = 5e-3  # a ray that goes on by this share of the distance has missed the faces beside the edge
 # for the question whether there are jumps at all: points per pixel of curve, and share of the light
 GLANCE_PER_PX = 0.3
-CONTRAST = 0.02
+CONTRAST = 1e-3
 _AHEAD = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 

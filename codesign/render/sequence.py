@@ -252,8 +252,9 @@ def lens_difference(camera: Camera, scene: Any, T_world_cam: Tensor, name: str, 
 def settled(camera: Camera, scene: Any, T_world_cam: Tensor) -> Way:
     """The cheapest way that is right for these very frames: "interior" where no edge or outline in them parts two
     radiances, "boundary" where one does, "difference" where the scene does not list them."""
-    lens = camera.lens.parameters() if isinstance(camera.lens, torch.nn.Module) else ()
-    asked = [T_world_cam, *lens_tensors(camera.lens).values(), *lens]
+    middle = camera.film.middle_px[None]
+    ray = camera.rays_through(middle, torch.zeros_like(middle))
+    asked = [T_world_cam, ray.origin_m, ray.direction, ray.weight, *lens_tensors(camera.lens).values()]
     objects = any(pose.requires_grad for pose in getattr(scene, "T_world_object", ()))
     if not (objects or any(tensor.requires_grad for tensor in asked)):
         return "interior"

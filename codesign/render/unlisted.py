@@ -35,6 +35,7 @@ WRONG = 0.05  # share of all jumps up to which a view is taken as listed
 # another view needs no look of its own as long as the camera has moved by less than this share of the distance to what
 # it sees, and turned by less than this share of half its field
 MOVED = 0.2
+WIDER = 1.2
 TURNED = 0.5
 
 
@@ -73,14 +74,14 @@ def listing(
 
 
 def check_listed(camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor) -> None:
-    """Raise DomainError when the first or the last frame of a sequence shows jumps of radiance that the scene does not
-    list, or lists twice. Views near one that was found right are not looked at again. cameras: [parts, F, 4, 4]."""
-    own = parts(scene)
-    seen = own[0].__dict__.setdefault("_listed", {}).setdefault((own, camera.film), [])
+    """Raise DomainError when a frame of a sequence shows jumps of radiance that the scene does not list, or lists
+    twice. Views near one that was found right are not looked at again. cameras: [parts, F, 4, 4]."""
+    known = _known_views(parts(scene), camera.film)
     field = _half_field_rad(camera)
-    for frame in {0, cameras.shape[1] - 1}:
+    pupil_m = getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3
+    for frame in range(cameras.shape[1]):
         view = cameras[:, frame]
-        if any(_covers(old, reach_m, view, field) for old, reach_m in seen):
+        if any(old.covers(view, field, pupil_m) for old in known):
             continue
         found = listing(camera, scene, curves, view)
         if max(found.unlisted, found.doubled) > WRONG:  # a few crossings say little: look closer
@@ -96,19 +97,37 @@ def check_listed(camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], ca
                     f"({at}) m: parts of a moving scene that touch, textures with hard texels, or shapes that are not "
                     "known; move them apart, smooth the texture, or use 'difference'."
                 )
-        seen.append((view.clone(), reach_m(camera, scene, view)))
+        known.append(_View(view.clone(), reach_m(camera, scene, view), field, pupil_m))
+
+
+def _known_views(own, film):
+    """The views of these parts on such a film that were found right: a list, kept by the first part where it can
+    keep anything, with the other parts, so that none of them makes way for another of its name."""
+    kept = getattr(own[0], "__dict__", {}).setdefault("_listed", {})
+    return kept.setdefault((tuple(map(id, own)), film), (own, []))[1]
+
+
+@dataclass(frozen=True)
+class _View:
+    """A view that was found right: the camera [parts, 4, 4], the distance of what it showed, half its field and the
+    diameter of its pupil."""
+
+    cameras: Tensor
+    reach_m: float
+    field_rad: float
+    pupil_m: float
+
+    def covers(self, cameras, field_rad, pupil_m):
+        """Whether the camera is near where it was, seen from every part, through a lens that shows little more."""
+        moved = (cameras[:, :3, 3] - self.cameras[:, :3, 3]).norm(dim=1)
+        straight = (cameras[:, :3, 2] * self.cameras[:, :3, 2]).sum(1)
+        near = (moved < MOVED * self.reach_m).all() and (straight > math.cos(TURNED * self.field_rad)).all()
+        return bool(near) and field_rad <= WIDER * self.field_rad and pupil_m <= WIDER * self.pupil_m
 
 
 def _half_field_rad(camera):
     film = camera.film
     return math.atan(max(film.sensor_width_px, film.sensor_height_px) / 2 * abs(camera.slope_per_px()))
-
-
-def _covers(old, reach_m, view, field_rad):
-    """Whether the camera [parts, 4, 4] is near where it was before, seen from every part."""
-    moved = (view[:, :3, 3] - old[:, :3, 3]).norm(dim=1)
-    straight = (view[:, :3, 2] * old[:, :3, 2]).sum(1)
-    return bool((moved < MOVED * reach_m).all() and (straight > math.cos(TURNED * field_rad)).all())
 
 
 def reach_m(camera: Camera, scene: Any, cameras: Tensor | Sequence[Tensor]) -> float:

@@ -2,6 +2,8 @@
 aimed pupils, spectrum and falloff, windows on the film and batches of trajectories. Differences with common random
 numbers are the judge."""
 
+from dataclasses import dataclass
+
 import pytest
 import torch
 
@@ -168,3 +170,70 @@ def test_jumps_that_no_shape_lists_are_refused_and_views_elsewhere_are_not():
         render.frames(camera, scene, START[None], gradient="boundary")
     away = pose.look_at((0.05, -1.2, 1.0), (0.0, -3.0, 1.0))
     assert float(render.frames(camera, scene, away[None], gradient="boundary").abs().max()) == 0.0
+
+
+def test_every_frame_is_looked_at_and_again_through_a_wider_lens():
+    """A ball that sinks into the wall in the second of three frames; a picture with hard texels that only the wider of
+    two lenses sees."""
+    mi = backend.mitsuba()
+    wall, ball = silhouette_scenes.build("wall"), silhouette_scenes.ball()
+    camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.25, 4)
+    places = torch.eye(4, dtype=F64).repeat(3, 1, 1)
+    places[:, :3, 3] = torch.tensor([[0.1, 1.6, 0.7], [0.1, 2.45, 0.7], [0.1, 1.6, 0.7]])
+    world = render.MovingScene(wall, {"ball": (ball, places)})
+    with pytest.raises(DomainError, match="of the jumps of radiance in frame 1 lie on no edge"):
+        render.frames(camera, world, START.expand(3, 4, 4), gradient="boundary")
+    picture = mi.Bitmap(silhouette_scenes.smooth(3, size=16))
+    hard = {"type": "bitmap", "bitmap": picture, "raw": True, "filter_type": "nearest"}
+    place = mi.ScalarTransform4f().translate([0.55, 1, 0.7]).rotate([1, 0, 0], 90).scale(0.2)
+    board = {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": hard}}
+    scene = MitsubaScene({"board": board})
+    narrow = camera.with_lens(lens.Pinhole(60.0))
+    render.frames(narrow, scene, START[None], gradient="boundary")
+    with pytest.raises(DomainError, match="textures with hard texels"):
+        render.frames(camera, scene, START[None], gradient="boundary")
+
+
+def test_auto_sees_faint_edges_and_asks_the_rays_of_any_lens():
+    """A card of one per cent more radiance than what is behind it; a lens that is no module and holds its focal length
+    under a name of its own; a scene that cannot be a key."""
+
+    class Plain:
+        dtype = F64
+
+        def __init__(self, focal_mm):
+            self.focal_mm = focal_mm
+
+        def camera_rays(self, film_mm, pupil, **options):
+            return lens.Pinhole(self.focal_mm).camera_rays(film_mm, pupil)
+
+    @dataclass
+    class Own:
+        scene: MitsubaScene
+        dtype = torch.float32
+
+        def radiance(self, arr, origin, direction):
+            return self.scene.radiance(arr, origin, direction)
+
+        def radiance_and_distance(self, arr, origin, direction):
+            return self.scene.radiance_and_distance(arr, origin, direction)
+
+        def outline(self):
+            return self.scene.outline()
+
+    T = backend.mitsuba().ScalarTransform4f
+
+    def sheet(level, away, scale):
+        place = T().translate([0.05, away, 0.7]).rotate([1, 0.1, 0.2], 90).scale(scale)
+        emitter = {"type": "area", "radiance": {"type": "rgb", "value": level}}
+        return {"type": "rectangle", "to_world": place, "emitter": emitter}
+
+    scene = Own(MitsubaScene({"card": sheet(101.0, 1.0, 0.3), "wall": sheet(100.0, 2.0, 5.0)}))
+    focal_mm = torch.tensor(11.0, dtype=F64, requires_grad=True)
+    camera = render.Camera(Plain(focal_mm), 16, 16, 0.5, 4)
+    found, truth = (
+        torch.autograd.grad(render.frames(camera, scene, START[None], way).square().sum(), focal_mm)[0]
+        for way in ("auto", "boundary")
+    )
+    assert float(truth.abs()) > 0
+    torch.testing.assert_close(found, truth, rtol=1e-5, atol=0)
