@@ -133,9 +133,11 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
     if not rows.numel():
         return None
     points = points[rows]
-    y, x, per_m, tangent, length, pixel = (v[rows] for v in (y, x, per_m, tangent, length, pixel))
+    y, x, per_px, slope, per_m, tangent, length, pixel = (
+        v[rows] for v in (y, x, per_px, slope, per_m, tangent, length, pixel)
+    )
     normal = torch.stack([-tangent[:, 1], tangent[:, 0]], 1) / length[:, None]
-    aside = (points.aside_rad / camera.slope_per_px())[:, None] * normal
+    aside = (points.aside_rad / _rad_per_px(y, per_px, slope, normal))[:, None] * normal
     q, colour = (v.repeat(2, *[1] * (v.ndim - 1)) for v in (points.pupil, points.colour))
     origin, direction, weight = coloured_rays(camera, torch.cat([x - aside, x + aside]), q, colour)
     light, distance = (
@@ -160,6 +162,14 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
         (normal[:, None] @ per_m)[:, 0],
     )
     return found[torch.nonzero(jump != 0)[:, 0]]
+
+
+def _rad_per_px(y, per_px, slope, normal):
+    """Angle [n] that a ray to y [n, 3] turns by per pixel along ``normal`` [n, 2] on the film."""
+    ray = torch.cat([slope, torch.ones_like(slope[:, :1])], 1)
+    moved = (per_px @ normal[..., None])[..., 0]
+    moved = torch.cat([moved, torch.zeros_like(moved[:, :1])], 1)
+    return torch.linalg.cross(moved, ray).norm(dim=1) / (y[:, 2] * ray.square().sum(1))
 
 
 def _on_film(camera, y, points):
