@@ -70,11 +70,7 @@ def boundary_term(camera: Camera, scene: Any, T_world_cam: Tensor, per_px: float
     frames_each = T_world_cam.shape[-3]
     scene, T_world_cam = in_one_row(scene, T_world_cam)
     cameras = torch.stack([pose.double() for pose in cameras_in_parts(scene, T_world_cam)])
-    curves = [_curves(part) for part in parts(scene)]
-    with torch.no_grad():
-        check_listed(camera, scene, curves, cameras.detach())
-        points = curve_points(camera, curves, cameras.detach(), frames_each, per_px)
-        found = None if points is None else jumps(camera, scene, cameras.detach(), points)
+    found = _seen(camera, scene, cameras.detach(), frames_each, per_px)
     if found is None or found.frame.numel() == 0:
         return torch.zeros(shape, dtype=scene.dtype)
     back = inverse(cameras)[found.part, found.frame]
@@ -94,14 +90,19 @@ def radiance_jumps(camera: Camera, scene: Any, T_world_cam: Tensor) -> bool:
     """Whether any frame [..., T, 4, 4] shows an edge or outline at which radiance jumps by more than CONTRAST of what
     is seen there; looked at by few points. Raises: as ``boundary_term``."""
     frames_each = T_world_cam.shape[-3]
-    with torch.no_grad():
-        scene, T_world_cam = in_one_row(scene, T_world_cam)
-        cameras = torch.stack([pose.double() for pose in cameras_in_parts(scene, T_world_cam)])
-        curves = [_curves(part) for part in parts(scene)]
-        check_listed(camera, scene, curves, cameras)
-        points = curve_points(camera, curves, cameras, frames_each, GLANCE_PER_PX)
-        found = None if points is None else jumps(camera, scene, cameras, points)
+    scene, T_world_cam = in_one_row(scene, T_world_cam)
+    cameras = torch.stack([pose.detach().double() for pose in cameras_in_parts(scene, T_world_cam)])
+    found = _seen(camera, scene, cameras, frames_each, GLANCE_PER_PX)
     return found is not None and bool((found.contrast > CONTRAST).any())
+
+
+@torch.no_grad()
+def _seen(camera, scene, cameras, frames_each, per_px):
+    """Jumps at points on the curves of all parts, of views that are certified; None for none."""
+    curves = [_curves(part) for part in parts(scene)]
+    check_listed(camera, scene, curves, cameras)
+    points = curve_points(camera, curves, cameras, frames_each, per_px)
+    return None if points is None else jumps(camera, scene, cameras, points)
 
 
 def _curves(scene):

@@ -70,7 +70,7 @@ class Camera:
         if not hasattr(lens, "camera_rays") or isinstance(lens, type):
             raise DomainError(
                 f"camera: a {type(lens).__name__} has no camera_rays, so it is no lens; give a GeoLens, ThinLens, "
-                "Pinhole, or an object of your own with camera_rays and film_points as GeoLens has them."
+                "Pinhole, or an object of your own with camera_rays as GeoLens has it."
             )
         self.lens: Any = lens
         if film is not None and not isinstance(film, Film):

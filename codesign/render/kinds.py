@@ -12,8 +12,8 @@ from codesign.types import Rays
 
 class Lens(Protocol):
     """camera_rays(film_mm [N, 2], pupil [N, 2], aim=...) -> Rays [N], as GeoLens has it; ``dtype`` where it is
-    not float64, ``film_points`` where gradients of silhouettes are asked for, ``entrance_pupil_diameter_mm``
-    where there is an aperture."""
+    not float64, ``film_points`` for a first guess where gradients of silhouettes are asked for,
+    ``entrance_pupil_diameter_mm`` where there is an aperture."""
 
     @property
     def camera_rays(self) -> Callable[..., Rays]: ...

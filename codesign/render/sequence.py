@@ -74,7 +74,7 @@ def frames(
     >>> render.frames(camera, plane, poses).shape
     torch.Size([3, 5, 8, 8])
 
-    Args: camera: Camera, before any lens with ``camera_rays`` (and ``film_points`` for "boundary"). scene:
+    Args: camera: Camera, before any lens with ``camera_rays``. scene:
       anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane, MovingScene), or a list of scenes,
       one for each entry of the first axis of T_world_cam.
       T_world_cam: [..., T, 4, 4], several trajectories in one batch as if each were rendered by itself.
