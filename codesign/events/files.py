@@ -33,6 +33,7 @@ WRITERS = {
     ".npz": write_npz,
     ".raw": write_raw,
 }
+OPTIONS = {"evt": (".raw",), "t0_us": (".dat", ".raw")}  # of the writers, and who knows them
 
 
 def read(path: str | Path, *, height_px: int | None = None, width_px: int | None = None) -> EventStream:
@@ -65,7 +66,7 @@ def read(path: str | Path, *, height_px: int | None = None, width_px: int | None
         raise FileFormatError(f"cannot read {path}: {error.strerror or error}.") from error
 
 
-def write(path: str | Path, stream: EventStream, *, evt: int | None = None) -> None:
+def write(path: str | Path, stream: EventStream, *, evt: int | None = None, t0_us: int | None = None) -> None:
     """Write an event stream; the file appears whole or not at all, and an earlier one stays when writing
     fails.
 
@@ -74,6 +75,9 @@ def write(path: str | Path, stream: EventStream, *, evt: int | None = None) -> N
         existing folder.
       stream: EventStream.
       evt: encoding of .raw files, 2 or 3 (the default); for no other.
+      t0_us: start time, microseconds, that .raw and .dat files keep in their header (``% t0``) while their
+        clocks of few bits count from there; 0 by default, for no other format. ``events.read`` and faery add
+        it back, other readers give the times less t0_us.
     Raises: FileFormatError for an unknown extension, a stream that the format cannot hold, or a folder that
       is missing or not writable.
 
@@ -85,13 +89,15 @@ def write(path: str | Path, stream: EventStream, *, evt: int | None = None) -> N
     >>> events.write("brighter.raw", stream, evt=2)
     """
     writer = _choose(WRITERS, Path(path), "written")
-    if evt is not None and writer is not write_raw:
-        raise FileFormatError(
-            f"evt={evt!r} was given for {path}; it chooses the encoding of .raw files alone."
-        )
+    options = {name: value for name, value in (("evt", evt), ("t0_us", t0_us)) if value is not None}
+    for name, value in options.items():
+        if Path(path).suffix.lower() not in OPTIONS[name]:
+            raise FileFormatError(
+                f"{name}={value!r} was given for {path}; it is for {' and '.join(OPTIONS[name])} files alone."
+            )
     with replacing(path) as temporary:
         try:
-            writer(temporary, stream, *(() if evt is None else (evt,)))
+            writer(temporary, stream, **options)
         except FileFormatError as error:  # writers know what does not fit, not where the file will lie
             raise FileFormatError(f"cannot write {path}: {error}") from error
 

@@ -36,6 +36,10 @@ def dat(*events):
     return DAT + np.array([(t_us, p << 28 | y << 14 | x) for t_us, x, y, p in events], "<u4").tobytes()
 
 
+def words_of(path, dtype):
+    return np.frombuffer(path.read_bytes().split(b"% end\n")[1], dtype).tolist()
+
+
 def stream_of(*events, height_px=480, width_px=640):
     t_us, x, y, p = torch.tensor(events).unbind(1)
     return ordered(t_us, x, y, p, height_px, width_px)
@@ -119,7 +123,8 @@ def test_clocks_start_again_and_go_on(tmp_path):
 def test_what_is_written_is_what_the_layout_says(tmp_path):
     stream = stream_of((4096 * 3 + 70, 9, 4, 1), (4096 * 3 + 70, 10, 4, -1))
     write(tmp_path / "e.raw", stream)
-    assert np.frombuffer((tmp_path / "e.raw").read_bytes().split(b"% end\n")[1], "<u2").tolist() == [
+    assert words_of(tmp_path / "e.raw", "<u2") == [
+        0x8000,
         0x8003,
         0x6046,
         0x0004,
@@ -128,16 +133,78 @@ def test_what_is_written_is_what_the_layout_says(tmp_path):
     ]
     write(tmp_path / "e.raw", stream, evt=2)
     words = [
+        0x80000000,
         0x80000000 | (4096 * 3 + 70) // 64,
         *(evt2_event(4096 * 3 + 70, x, 4, p) for x, p in ((9, 1), (10, 0))),
     ]
-    assert np.frombuffer((tmp_path / "e.raw").read_bytes().split(b"% end\n")[1], "<u4").tolist() == words
+    assert words_of(tmp_path / "e.raw", "<u4") == words
     write(tmp_path / "e.dat", stream)
     assert (
         (tmp_path / "e.dat")
         .read_bytes()
         .endswith(dat((4096 * 3 + 70, 9, 4, 1), (4096 * 3 + 70, 10, 4, 0))[len(DAT) - 2 :])
     )
+
+
+@pytest.mark.parametrize(
+    "times_us", [[0, 2**24 - 1, 2**24], [4094 * 4096, 2**26 + 5], [2**32 + 9], [2**23, 2**36]]
+)
+def test_every_way_of_counting_loops_of_evt3_gives_the_written_times(tmp_path, times_us):
+    """The strictest reader, faery, counts a loop only from 4095 to 0 and passes over jumps of 4094 or more;
+    Prophesee's takes the first time-high word, less one, off all times."""
+    write(tmp_path / "e.raw", stream_of(*((t_us, 1, 1, 1) for t_us in times_us)))
+    high, low, loops, found = 0, 0, 0, []
+    words = words_of(tmp_path / "e.raw", "<u2")
+    assert words[0] == 0x8000
+    for word in words:
+        kind, load = word >> 12, word & 0xFFF
+        if kind == 0x8:
+            assert load >= high or (high, load) == (4095, 0)
+            assert load - high < 4094
+            loops += load < high
+            low = low if load == high else 0
+            high = load
+        elif kind == 0x6:
+            low = load
+        elif kind == 0x2:
+            found.append(loops << 24 | high << 12 | low)
+    assert found == times_us
+
+
+@pytest.mark.parametrize(
+    "line",
+    [b"% t0 1643243628737093\n", b"% T0 1643243628737093\n", b"% codesign_t_offset_us 1643243628737093\n"],
+)
+def test_the_start_time_of_the_header_is_added(tmp_path, line):
+    start_us = 1_643_243_628_737_093
+    for name, header, content in (
+        ("e.dat", DAT[:-2], dat((7, 5, 1, 0))),
+        ("e.raw", EVT2.removesuffix(b"% end\n"), evt2(0x80000000, evt2_event(7, 5, 1, 0))),
+        ("e.raw", EVT3.removesuffix(b"% end\n"), evt3((0x8, 0), (0x6, 7), (0x0, 1), (0x2, 5))),
+    ):
+        (tmp_path / name).write_bytes(header + line + content.removeprefix(header))
+        assert rows(read(tmp_path / name)) == [(start_us + 7, 5, 1, -1)]
+
+
+def test_a_start_time_is_written_where_faery_looks_for_it(tmp_path):
+    stream = stream_of((2**50 + 7, 5, 1, -1))
+    write(tmp_path / "e.dat", stream, t0_us=2**50)
+    assert (tmp_path / "e.dat").read_bytes() == DAT[:-2] + b"% T0 1125899906842624\n\x0c\x08" + dat(
+        (7, 5, 1, 0)
+    )[len(DAT) :]
+    write(tmp_path / "e.raw", stream, t0_us=2**50)
+    assert b"% t0 1125899906842624\n% end\n" in (tmp_path / "e.raw").read_bytes()
+    assert words_of(tmp_path / "e.raw", "<u2") == [0x8000, 0x6007, 0x0001, 0x2005]
+    write(tmp_path / "e.raw", stream_of((7, 5, 1, -1)))
+    assert b"t0" not in (tmp_path / "e.raw").read_bytes()
+
+
+def test_a_dat_header_with_nothing_behind_it_is_an_empty_stream(tmp_path):
+    path = tmp_path / "e.dat"
+    for content in (DAT[:-2], DAT, b"% Version 2\n% Width 640\n% Height 480\n"):
+        path.write_bytes(content)
+        events = read(path)
+        assert (rows(events), events.height_px, events.width_px) == ([], 480, 640)
 
 
 def test_events_that_come_before_their_time_or_row_are_left_out_with_a_warning(tmp_path):
@@ -192,6 +259,10 @@ def test_small_disorder_is_sorted_and_more_is_refused(tmp_path):
         ("e.dat", DAT.replace(b"Version 2", b"Version 1"), "version '1'"),
         ("e.dat", DAT[:-2] + b"\x0e\x08", "0e 08"),
         ("e.dat", DAT[:-1], "type and size are 0c"),
+        ("e.dat", b"", "version 'none'"),
+        ("e.dat", b"% t0 -5\n" + DAT, r"start time \(t0\) as '-5'"),
+        ("e.raw", b"% t0 1e6\n" + EVT3, r"start time \(t0\) as '1e6'"),
+        ("e.raw", b"% t0 5\n% T0 6\n" + EVT3, "5 and as 6"),
         ("e.dat", DAT + b"1234567", "amid an event"),
         ("e.dat", dat((1, 2, 3, 2)), "polarity 2"),
         ("e.dat", dat((1, 640, 3, 1)), "x = 640"),
@@ -223,10 +294,11 @@ def test_sizes_come_from_the_header_the_caller_or_the_events(tmp_path):
     [
         ("e.raw", stream_of((0, 1, 1, 1), width_px=2049), 3, "at most 2048 x 2048"),
         ("e.raw", stream_of((-1, 1, 1, 1)), 2, "times span -1"),
-        ("e.raw", stream_of((0, 1, 1, 1), (2**46, 1, 1, 1)), 3, "starts again 4194304 times"),
+        ("e.raw", stream_of((0, 1, 1, 1), (2**44, 1, 1, 1)), 3, "0 to 17592186044415; pass .* t0_us"),
+        ("e.raw", stream_of((2**34, 1, 1, 1)), 2, "0 to 17179869183; pass .* t0_us"),
         ("e.raw", stream_of((0, 1, 1, 1)), 4, "evt=4"),
         ("e.dat", stream_of((0, 1, 1, 1)), 3, "evt=3"),
-        ("e.dat", stream_of((0, 1, 1, 1), (2**32 + 5, 1, 1, 1)), None, "32-bit clock"),
+        ("e.dat", stream_of((0, 1, 1, 1), (2**32, 1, 1, 1)), None, "0 to 4294967295; pass .* t0_us"),
         ("e.dat", stream_of((0, 1, 1, 1), width_px=2**14 + 1), None, "16384 x 16384"),
     ],
 )
@@ -236,8 +308,23 @@ def test_streams_a_format_cannot_hold_are_refused(tmp_path, name, stream, evt, w
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("name", "t0_us", "words"),
+    [
+        ("e.raw", 2**40 + 1, "times less t0_us 1099511627777 span -1 to 0"),
+        ("e.dat", -1, "t0_us is -1"),
+        ("e.dat", 1.0, "t0_us is 1.0"),
+        ("e.dat", 2**63, "t0_us is 9223372036854775808"),
+        ("e.npz", 5, r"t0_us=5 was given .* \.dat and \.raw files alone"),
+    ],
+)
+def test_start_times_that_do_not_fit_are_refused(tmp_path, name, t0_us, words):
+    with pytest.raises(FileFormatError, match=words):
+        write(tmp_path / name, stream_of((2**40, 1, 1, 1), (2**40 + 1, 1, 1, 1)), t0_us=t0_us)
+    assert not list(tmp_path.iterdir())
+
+
 def test_long_silences_and_late_starts_survive(tmp_path):
-    stream = stream_of((2**50 + 3, 1, 1, 1), (2**50 + 2**36, 2, 1, -1))  # 4096 loops of EVT 3.0, 4 of EVT 2.0
-    for evt in (2, 3):
-        write(tmp_path / "e.raw", stream, evt=evt)
-        assert rows(read(tmp_path / "e.raw")) == rows(stream)
+    stream = stream_of((2**40 + 3, 1, 1, 1), (2**40 + 2**36, 2, 1, -1))  # 65536 loops, then 4096 more
+    write(tmp_path / "e.raw", stream)
+    assert rows(read(tmp_path / "e.raw")) == rows(stream)

@@ -21,15 +21,24 @@ def random_stream(first_us, span_us):
     return ordered(first_us + t_us, x, y, 2 * p - 1, 480, 640)
 
 
-@pytest.mark.parametrize(("first_us", "span_us"), [(EPOCH_US, 10_000_000), (2**32 - 1000, 2**34)])
 @pytest.mark.parametrize(
-    ("name", "evt"), [("e.h5", None), ("e.aedat4", None), ("e.raw", 3), ("e.raw", 2), ("e.dat", None)]
+    ("name", "first_us", "span_us", "options"),
+    [
+        ("e.h5", EPOCH_US, 10_000_000, {}),
+        ("e.h5", EPOCH_US, 2**32, {}),
+        ("e.aedat4", EPOCH_US, 10_000_000, {}),
+        ("e.aedat4", 2**32 - 1000, 2**34, {}),
+        ("e.raw", EPOCH_US, 10_000_000, {"evt": 3, "t0_us": EPOCH_US - 5}),
+        ("e.raw", 2**32 - 1000, 2**34, {"evt": 3}),
+        ("e.raw", EPOCH_US, 2**34, {"evt": 2, "t0_us": EPOCH_US}),
+        ("e.raw", 2**32 - 1000, 2**33, {"evt": 2}),
+        ("e.dat", EPOCH_US, 2**32, {"t0_us": EPOCH_US}),
+        ("e.dat", 5000, 2**31, {}),
+    ],
 )
-def test_a_million_events_come_back_exactly(tmp_path, name, evt, first_us, span_us):
-    if name == "e.h5":
-        span_us = 10_000_000  # its times have 32 bits from the first event on
+def test_a_million_events_come_back_exactly(tmp_path, name, first_us, span_us, options):
     stream = random_stream(first_us, span_us)
-    write(tmp_path / name, stream, evt=evt)
+    write(tmp_path / name, stream, **options)
     back = read(tmp_path / name)
     assert all(torch.equal(getattr(stream, field), getattr(back, field)) for field in ("t_us", "x", "y", "p"))
     assert (back.height_px, back.width_px) == (480, 640)
@@ -41,11 +50,11 @@ def test_a_million_events_come_back_exactly(tmp_path, name, evt, first_us, span_
 )
 @pytest.mark.parametrize("count", [0, 1])
 def test_no_event_and_one_event_come_back_with_the_sensor_size(tmp_path, name, evt, count):
-    t_us, x, y, p = (torch.tensor([value] * count, dtype=torch.int64) for value in (EPOCH_US, 3, 5, -1))
+    t_us, x, y, p = (torch.tensor([value] * count, dtype=torch.int64) for value in (2**32 - 1, 3, 5, -1))
     stream = ordered(t_us, x, y, p, 480, 640)
     write(tmp_path / name, stream, evt=evt)
     back = read(tmp_path / name)
     assert [getattr(back, field).tolist() for field in ("t_us", "x", "y", "p")] == [
-        [value] * count for value in (EPOCH_US, 3, 5, -1)
+        [value] * count for value in (2**32 - 1, 3, 5, -1)
     ]
     assert (back.height_px, back.width_px) == (480, 640)

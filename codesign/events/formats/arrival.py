@@ -97,11 +97,12 @@ def _tensor(values):
     return torch.from_numpy(np.asarray(values, np.int64))
 
 
-def columns(stream, *, height_limit_px, width_limit_px, first_us, last_us, name):
-    """t_us, x, y, p of a stream as int64 arrays, after checking that a format can hold it.
+def columns(stream, *, height_limit_px, width_limit_px, first_us, last_us, name, t0_us=None):
+    """t_us (less t0_us), x, y, p of a stream as int64 arrays, after checking that a format can hold it.
 
     Args: height_limit_px, width_limit_px: largest sensor. first_us, last_us: first and last time the format
-      can hold. name: the format, for messages.
+      can hold. name: the format, for messages. t0_us: start time that the file tells, or None where the
+      format has no place for one.
     Raises: FileFormatError naming what does not fit and what to do.
     """
     if stream.height_px > height_limit_px or stream.width_px > width_limit_px:
@@ -114,9 +115,12 @@ def columns(stream, *, height_limit_px, width_limit_px, first_us, last_us, name)
         raise FileFormatError(
             "the times of the stream go back; order it with codesign.events.stream.ordered."
         )
-    if t_us.size and (int(t_us[0]) < first_us or int(t_us[-1]) > last_us):
+    # as Python integers, which do not wrap
+    span_us = [int(t_us[at]) - (t0_us or 0) for at in (0, -1)] if t_us.size else []
+    if any(not first_us <= time_us <= last_us for time_us in span_us):
+        remedy = "shift the times" if t0_us is None else "pass another start time t0_us, kept in the header,"
         raise FileFormatError(
-            f"times span {int(t_us[0])} to {int(t_us[-1])} us; {name} holds {first_us} to {last_us}; shift "
-            "the times or write .npz instead."
+            f"times{f' less t0_us {t0_us}' if t0_us else ''} span {span_us[0]} to {span_us[1]} us; {name} "
+            f"holds {first_us} to {last_us}; {remedy} or write .npz instead."
         )
-    return t_us, x, y, p
+    return t_us - (t0_us or 0), x, y, p

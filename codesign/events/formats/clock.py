@@ -3,10 +3,6 @@ them."""
 
 import numpy as np
 
-from codesign.errors import FileFormatError
-
-LIMIT_LOOPS = 2**20  # of the clock, told in one file
-
 
 def unwrapped(ticks, loop):
     """Count the loops of a clock.
@@ -31,28 +27,3 @@ def held(starts, values, count):
     """
     first = int(starts[0]) if len(starts) else count
     return np.repeat(values, np.diff(starts, append=count)), first
-
-
-def with_loops_told(words, starts, loops, last_reading, first_reading):
-    """Put a word at the clock's last reading and one at its first ahead of the events that come loops later,
-    so that no silence hides a loop.
-
-    Args:
-      words: [M] words of all events. starts: [N] index of each event's first word.
-      loops: [N] int64 clock loops between each event and the one before it.
-      last_reading, first_reading: the two words.
-    Raises: FileFormatError when that would take more than LIMIT_LOOPS loops.
-    """
-    count = int(loops.sum())
-    if count > LIMIT_LOOPS:
-        raise FileFormatError(
-            f"the clock of the format starts again {count} times between the events, {LIMIT_LOOPS} at most; "
-            "write .npz instead."
-        )
-    if not count:
-        return words
-    return np.insert(
-        words,
-        np.repeat(starts, 2 * loops),
-        np.tile(np.array([last_reading, first_reading], words.dtype), count),
-    )

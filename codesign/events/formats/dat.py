@@ -1,10 +1,9 @@
 """Prophesee DAT files: an ASCII header, a byte each for event type and size, then 8-byte events of a 32-bit
 time and packed x, y, polarity.
 
-The time starts again at 2^32 us; loops are counted when reading. A stream that starts beyond the first loop
-is written with those whole loops in the header, under a keyword of ours that other readers pass over. Loops
-between events cannot be told, so silences as long as a loop are refused.
-Source: Prophesee Metavision documentation, "DAT File Format".
+The time starts again at 2^32 us. Loops are counted when reading, but not by Prophesee's own readers, so none is
+written; the start time ``% T0`` that faery and we write where asked to is added to all times.
+Source: Prophesee Metavision documentation, "DAT File Format"; faery (``T0``).
 """
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from codesign.errors import FileFormatError
 from codesign.events.formats.arrival import arranged, columns
 from codesign.events.formats.clock import unwrapped
-from codesign.events.formats.percent_header import OFFSET_KEY, parsed, time_offset_us, whole_number
+from codesign.events.formats.percent_header import checked_start_us, parsed, start_us, whole_number
 
 EVENT = np.dtype([("t", "<u4"), ("address", "<u4")])
 TYPES = (0x00, 0x0C)  # generic events of pixels, and contrast detection
@@ -22,7 +21,7 @@ SIDE_PX = 2**14
 
 def read_dat(path, height_px=None, width_px=None):
     """Read events from ``path``; the sensor size is the header's, else the caller's, else the smallest that
-    holds the events.
+    holds the events. A header with nothing behind it, as faery writes for no events, is an empty stream.
 
     Raises: FileFormatError for another version or event type, a damaged header, a file cut amid an event, an
       unknown polarity, or time going back.
@@ -33,16 +32,17 @@ def read_dat(path, height_px=None, width_px=None):
         raise FileFormatError(
             f"{path}: the header gives version {fields.get('Version', 'none')!r}; DAT version 2 is read."
         )
-    if len(data) < start + 2 or data[start] not in TYPES or data[start + 1] != EVENT.itemsize:
+    body = data[start:] or bytes((TYPES[0], EVENT.itemsize))
+    if len(body) < 2 or body[0] not in TYPES or body[1] != EVENT.itemsize:
         raise FileFormatError(
-            f"{path}: event type and size are {data[start : start + 2].hex(' ') or 'absent'}; 0c 08 "
+            f"{path}: event type and size are {body[:2].hex(' ')}; 0c 08 "
             "(contrast detection) or 00 08 is read."
         )
-    if (len(data) - start - 2) % EVENT.itemsize:
+    if (len(body) - 2) % EVENT.itemsize:
         raise FileFormatError(
             f"{path} ends amid an event of {EVENT.itemsize} bytes; it was cut, copy it again."
         )
-    events = np.frombuffer(data, EVENT, offset=start + 2)
+    events = np.frombuffer(body, EVENT, offset=2)
     address = events["address"].astype(np.int64)
     on = address >> 28
     if on.size and int(on.max()) > 1:
@@ -50,7 +50,7 @@ def read_dat(path, height_px=None, width_px=None):
         raise FileFormatError(
             f"{path}: event {at} has polarity {int(on[at])}; 0 or 1 is allowed, the file is damaged."
         )
-    t_us = unwrapped(events["t"].astype(np.int64), LOOP_US) + time_offset_us(path, fields, LOOP_US)
+    t_us = unwrapped(events["t"].astype(np.int64), LOOP_US) + start_us(path, fields)
     return arranged(
         path,
         t_us,
@@ -63,25 +63,34 @@ def read_dat(path, height_px=None, width_px=None):
     )
 
 
-def write_dat(path, stream):
-    """Write events to ``path`` as contrast-detection events, version 2.
+def write_dat(path, stream, *, t0_us=0):
+    """Write events to ``path`` as contrast-detection events, version 2, their times less ``t0_us``, which the
+    header tells.
 
-    Raises: FileFormatError for a sensor beyond 16384 x 16384, negative times, or silences that hide a loop of
-      the 32-bit clock.
+    Raises: FileFormatError for a sensor beyond 16384 x 16384, and times (less t0_us) below 0 or beyond 2^32
+      us.
     """
     t_us, x, y, p = columns(
-        stream, height_limit_px=SIDE_PX, width_limit_px=SIDE_PX, first_us=0, last_us=2**62, name="DAT"
+        stream,
+        height_limit_px=SIDE_PX,
+        width_limit_px=SIDE_PX,
+        first_us=0,
+        last_us=LOOP_US - 1,
+        name="DAT",
+        t0_us=checked_start_us(t0_us),
     )
-    offset_us = int(t_us[0]) // LOOP_US * LOOP_US if t_us.size else 0
     events = np.empty(len(t_us), EVENT)
-    events["t"] = t_us % LOOP_US
-    if not np.array_equal(unwrapped(t_us % LOOP_US, LOOP_US) + offset_us, t_us):
-        raise FileFormatError(
-            "a silence hides a loop of DAT's 32-bit clock (2^32 us, 71 minutes); write .raw or .npz instead."
-        )
+    events["t"] = t_us
     events["address"] = (p > 0).astype(np.int64) << 28 | y << 14 | x
-    header = f"% Data file containing CD events\n% Version 2\n% Width {stream.width_px}\n% Height {stream.height_px}\n% {OFFSET_KEY} {offset_us}\n"
-    path.write_bytes(header.encode("ascii") + bytes((0x0C, EVENT.itemsize)) + events.tobytes())
+    lines = (
+        "Data file containing CD events",
+        "Version 2",
+        f"Width {stream.width_px}",
+        f"Height {stream.height_px}",
+        *([f"T0 {t0_us}"] if t0_us else []),
+    )
+    header = "".join(f"% {line}\n" for line in lines)
+    path.write_bytes(header.encode("ascii") + bytes((TYPES[-1], EVENT.itemsize)) + events.tobytes())
 
 
 def _size(path, fields):

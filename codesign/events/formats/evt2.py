@@ -7,10 +7,11 @@ Source: Prophesee Metavision documentation, "EVT 2.0 Format".
 import numpy as np
 
 from codesign.errors import FileFormatError
-from codesign.events.formats.clock import held, unwrapped, with_loops_told
+from codesign.events.formats.clock import held, unwrapped
 
 WORD = np.dtype("<u4")
 LOOP_US = 2**34
+LIMIT_US = LOOP_US  # readers disagree on how loops are counted, so none is written
 TIME_HIGH = 0x8
 OTHER_TYPES = (0xA, 0xE, 0xF)  # triggers, counters and what continues them: no events of pixels
 LAST_HIGH = 2**28 - 1
@@ -44,19 +45,13 @@ def decoded(path, words):
 
 
 def encoded(t_us, x, y, p):
-    """EVT 2.0 words of ordered events; t_us counts from the start of the file's clock."""
+    """EVT 2.0 words of ordered events.
+
+    The first word sets the clock to zero: Prophesee's reader takes the first time-high word off all times.
+    """
     high = t_us >> 6
-    moved = np.diff(high, prepend=-1) != 0
     word = np.stack(
-        (
-            TIME_HIGH << 28 | high & LAST_HIGH,
-            (p > 0).astype(np.int64) << 28 | (t_us & 0x3F) << 22 | x << 11 | y,
-        ),
-        axis=1,
+        (TIME_HIGH << 28 | high, (p > 0).astype(np.int64) << 28 | (t_us & 0x3F) << 22 | x << 11 | y), axis=1
     )
-    present = np.stack((moved, np.ones_like(moved)), axis=1)
-    starts = np.cumsum(1 + moved) - (1 + moved)
-    loops = np.diff(t_us // LOOP_US, prepend=0)
-    return with_loops_told(
-        word[present].astype(WORD), starts, loops, TIME_HIGH << 28 | LAST_HIGH, TIME_HIGH << 28
-    )
+    present = np.stack((np.diff(high, prepend=0) != 0, np.ones_like(high, dtype=bool)), axis=1)
+    return np.insert(word[present], 0, [TIME_HIGH << 28] * bool(len(t_us))).astype(WORD)

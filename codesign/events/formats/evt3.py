@@ -7,10 +7,11 @@ Source: Prophesee Metavision documentation, "EVT 3.0 Format".
 import numpy as np
 
 from codesign.errors import FileFormatError
-from codesign.events.formats.clock import held, unwrapped, with_loops_told
+from codesign.events.formats.clock import held, unwrapped
 
 WORD = np.dtype("<u2")
 LOOP_US = 2**24
+LIMIT_US = LOOP_US * 2**20  # loops are told, four words each: 8 MB at most
 ADDR_Y = 0x0
 ADDR_X = 0x2
 BASE_X = 0x3
@@ -112,10 +113,14 @@ def _columns(kind, load, is_vector, where, emitted):
 
 
 def encoded(t_us, x, y, p):
-    """EVT 3.0 words of ordered events, one column word per event; t_us counts from the start of the file's
-    clock."""
+    """EVT 3.0 words of ordered events, one column word per event.
+
+    The first word sets the clock to zero: Prophesee's reader takes the first time-high word off all times.
+    Each half loop that passes is told by its last and the next reading, so that no silence hides a loop and
+    no jump is as long as those that readers take for damage (faery: 4094 of 4096 readings).
+    """
+    high_moved = np.diff(t_us >> 12, prepend=0) != 0
     moved = np.diff(t_us, prepend=-1) != 0
-    high_moved = np.diff(t_us >> 12, prepend=-1) != 0
     word = np.stack(
         (
             TIME_HIGH << 12 | t_us >> 12 & 0xFFF,
@@ -127,7 +132,8 @@ def encoded(t_us, x, y, p):
     )
     present = np.stack((high_moved, moved, np.diff(y, prepend=-1) != 0, np.ones_like(moved)), axis=1)
     count = present.sum(axis=1)
-    loops = np.diff(t_us // LOOP_US, prepend=0)
-    return with_loops_told(
-        word[present].astype(WORD), np.cumsum(count) - count, loops, TIME_HIGH << 12 | 0xFFF, TIME_HIGH << 12
-    )
+    halves = np.diff(t_us // (LOOP_US // 2), prepend=0)
+    passed = 0x800 * np.arange(1, int(halves.sum()) + 1)  # high part at the start of each half
+    told = TIME_HIGH << 12 | np.stack((passed - 1, passed), axis=1).ravel() & 0xFFF
+    words = np.insert(word[present], np.repeat(np.cumsum(count) - count, 2 * halves), told)
+    return np.insert(words, 0, [TIME_HIGH << 12] * bool(len(t_us))).astype(WORD)

@@ -6,8 +6,9 @@ Source: Prophesee Metavision documentation, "RAW File Format" and "DAT File Form
 from codesign.errors import FileFormatError
 
 LIMIT_BYTES = 65536
-# ours: multiples of the format's time loop before the first event; other readers pass over it
-OFFSET_KEY = "codesign_t_offset_us"
+# microseconds to add to every time: faery writes "t0" in .raw and "T0" in .dat, versions of codesign before
+# it "codesign_t_offset_us"
+START_KEYS = ("t0", "T0", "codesign_t_offset_us")
 
 
 def parsed(path, data):
@@ -53,13 +54,24 @@ def whole_number(path, text, name, low, high):
     return int(text)
 
 
-def time_offset_us(path, fields, loop_us):
-    """Time that a file of ours adds to what its words say: whole loops of the format's clock; 0 in other
-    files."""
-    offset_us = whole_number(path, fields.get(OFFSET_KEY, "0"), OFFSET_KEY, 0, 2**62)
-    if offset_us % loop_us:
+def start_us(path, fields):
+    """Time at which the clock of a file starts, which its words do not count: the header's ``t0``, or 0.
+
+    Raises: FileFormatError when it is no whole number from 0 to 2^62, or said twice in two ways.
+    """
+    said = {fields[key] for key in START_KEYS if key in fields}
+    if len(said) > 1:
         raise FileFormatError(
-            f"{path}: {OFFSET_KEY} is {offset_us}; it must be a multiple of {loop_us}, the loop of the "
-            "format's clock."
+            f"{path}: the header gives the start time as {' and as '.join(sorted(said))}; keep the right one."
         )
-    return offset_us
+    return whole_number(path, said.pop(), "the start time (t0)", 0, 2**62) if said else 0
+
+
+def checked_start_us(t0_us):
+    """``t0_us`` as a header can hold it.
+
+    Raises: FileFormatError when it is no whole number from 0 to 2^62.
+    """
+    if isinstance(t0_us, bool) or not isinstance(t0_us, int) or not 0 <= t0_us <= 2**62:
+        raise FileFormatError(f"t0_us is {t0_us!r}; a whole number of microseconds from 0 to 2^62 is needed.")
+    return t0_us

@@ -1,9 +1,9 @@
 """Prophesee RAW files: an ASCII header, then EVT 2.0 or EVT 3.0 words, little-endian.
 
-Times are those of the file: nothing is subtracted. A stream that starts beyond the first loop of the format's
-clock (EVT 2.0: 2^34 us, EVT 3.0: 2^24 us) is written with those whole loops in the header, under a keyword of
-ours that other readers pass over.
-Source: Prophesee Metavision documentation, "RAW File Format".
+Times are those of the file, plus the start time ``% t0`` that faery and we write where asked to. Times beyond
+the first loop of the clock are told in EVT 3.0 by time words, which every reader counts; EVT 2.0's readers
+disagree, so its times end with the first loop.
+Source: Prophesee Metavision documentation, "RAW File Format"; faery (``t0``).
 """
 
 import re
@@ -14,7 +14,7 @@ import numpy as np
 from codesign.errors import FileFormatError
 from codesign.events.formats import evt2, evt3
 from codesign.events.formats.arrival import arranged, columns
-from codesign.events.formats.percent_header import OFFSET_KEY, parsed, time_offset_us, whole_number
+from codesign.events.formats.percent_header import checked_start_us, parsed, start_us, whole_number
 
 ENCODINGS = {2: evt2, 3: evt3}
 SIDE_PX = 2048  # 11 bits
@@ -45,17 +45,18 @@ def read_raw(path, height_px=None, width_px=None):
             "starts amid the camera's words.",
             stacklevel=2,
         )
-    t_us += time_offset_us(path, fields, encoding.LOOP_US)
+    t_us += start_us(path, fields)
     return arranged(
         path, t_us, x, y, p, size=_size(path, fields, options), height_px=height_px, width_px=width_px
     )
 
 
-def write_raw(path, stream, evt=3):
-    """Write events to ``path`` as EVT 3.0 or (evt=2) EVT 2.0.
+def write_raw(path, stream, *, evt=3, t0_us=0):
+    """Write events to ``path`` as EVT 3.0 or (evt=2) EVT 2.0, their times less ``t0_us``, which the header
+    tells.
 
-    Raises: FileFormatError for a sensor beyond 2048 x 2048, negative times, another ``evt``, or silences of
-      very many loops of the clock.
+    Raises: FileFormatError for a sensor beyond 2048 x 2048, another ``evt``, or times (less t0_us) below 0 or
+      beyond 2^44 us (EVT 2.0: 2^34 us).
     """
     if evt not in ENCODINGS:
         raise FileFormatError(f"evt={evt!r} was given; 2 (EVT 2.0) and 3 (EVT 3.0) are written.")
@@ -65,15 +66,21 @@ def write_raw(path, stream, evt=3):
         height_limit_px=SIDE_PX,
         width_limit_px=SIDE_PX,
         first_us=0,
-        last_us=2**62,
+        last_us=encoding.LIMIT_US - 1,
         name=f"EVT {evt}.0",
+        t0_us=checked_start_us(t0_us),
     )
-    offset_us = int(t_us[0]) // encoding.LOOP_US * encoding.LOOP_US if t_us.size else 0
-    words = encoding.encoded(t_us - offset_us, x, y, p)
     height_px = stream.height_px
     width_px = stream.width_px
-    header = f"% evt {evt}.0\n% format EVT{evt};height={height_px};width={width_px}\n% geometry {width_px}x{height_px}\n% {OFFSET_KEY} {offset_us}\n% end\n"
-    path.write_bytes(header.encode("ascii") + words.tobytes())
+    lines = (
+        f"evt {evt}.0",
+        f"format EVT{evt};height={height_px};width={width_px}",
+        f"geometry {width_px}x{height_px}",
+        *([f"t0 {t0_us}"] if t0_us else []),
+        "end",
+    )
+    header = "".join(f"% {line}\n" for line in lines)
+    path.write_bytes(header.encode("ascii") + encoding.encoded(t_us, x, y, p).tobytes())
 
 
 def _format(path, fields):
