@@ -1,0 +1,85 @@
+"""The memory layer with unequal thresholds: textures and curves, pixels without and with a history."""
+
+from codesign import events
+from studies.event_gradient import compare, curves
+from studies.event_gradient.case import DIRECTIONS, FEW, times
+from studies.event_gradient.judge import Judge
+from studies.event_gradient.topic import Asked, Topic
+
+PAIRS = ((0.1, 0.3), (0.155, 0.172), (0.17, 0.23))
+BEGINNINGS = ("no history", "history")
+ASKED = Asked(0.99, (0.95, 1.05))
+
+
+def maps(on, off, beginning):
+    """Derivative and truth of a sensor's counts, as the pair that ``compare.pairs`` takes."""
+    judge = Judge(events.SensorModel(on, off))
+
+    def layer(frames, t_s):
+        return events.memory(frames, on, off)[0]
+
+    makers = [
+        lambda observe: compare.of_layer(layer, observe),
+        lambda observe: compare.of_judge(judge, observe),
+    ]
+    return [compare.with_history(make) if beginning == "history" else make(compare.parts) for make in makers]
+
+
+def jobs(quick):
+    rates = (240,) if quick else (60, 240, 1000)
+    return [
+        (on, off, beginning, rate_hz)
+        for on, off in PAIRS[: 1 if quick else None]
+        for beginning in BEGINNINGS
+        for rate_hz in rates
+    ]
+
+
+def measure(cases, on, off, beginning, rate_hz):
+    layer, truth = maps(on, off, beginning)
+    for direction in DIRECTIONS if rate_hz == 240 else FEW:
+        found = compare.pairs(cases, rate_hz, direction, layer, truth)
+        yield compare.row((f"{on}/{off}", beginning, direction.name, f"{rate_hz}fps"), found)
+
+
+def curve_jobs(quick):
+    pairs = PAIRS[: 1 if quick else None]
+    kinds = list(curves.KINDS)[:: 3 if quick else 1]
+    return [(on, off, beginning, kind) for on, off in pairs for beginning in BEGINNINGS for kind in kinds]
+
+
+def measure_curves(cases, on, off, beginning, kind, rate_hz=240):
+    layer, truth = maps(on, off, beginning)
+    for parameter in curves.PARAMETERS:
+        found = [
+            compare.pair(curves.along(kind, rate_hz, parameter, case.seed), times(rate_hz), layer, truth)
+            for case in cases
+        ]
+        yield compare.row((f"{on}/{off}", beginning, kind, parameter), found)
+
+
+TEXT = (
+    "Without a history a pixel's level begins anywhere from half a threshold below its memorised level to half a "
+    "threshold above. With one it comes from far above or far below, turns anywhere near its first level, and goes to it; "
+    "the layer is given the same frames."
+)
+TOPIC = Topic(
+    "Unequal thresholds: textures",
+    TEXT,
+    ("thresholds ON/OFF", "beginning", "direction", "frames per second"),
+    jobs,
+    measure,
+    lambda row: ASKED,
+    "thresholds",
+)
+CURVES = Topic(
+    "Unequal thresholds: curves",
+    TEXT
+    + " Ramps, turns, sines, random walks and moving edges, 240 frames per second; their amplitude, their phase, and "
+    "the step behind the first frame.",
+    ("thresholds ON/OFF", "beginning", "curve", "parameter"),
+    curve_jobs,
+    measure_curves,
+    lambda row: ASKED,
+    "curves",
+)
