@@ -97,7 +97,7 @@ def test_the_memory_layer_has_the_slope_of_the_mean_count():
 def test_the_spiking_layer_has_the_slope_of_its_surrogate():
     # one step d of the level: u = d for ON, -d for OFF; fast sigmoid of the width of the mean threshold w
     level = torch.tensor([4.0, 4.13], dtype=D).requires_grad_()
-    made = layer("srm", PLAIN, log_input=True)
+    made = layer("srm", PLAIN, log_input=True, gradient="surrogate")
     counts = made(level[:, None, None], torch.arange(2.0))
     assert counts.flatten().tolist() == [0, 0]
     (counts * torch.tensor([1.0, 2.0])[:, None, None]).sum().backward()

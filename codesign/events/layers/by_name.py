@@ -28,7 +28,7 @@ def layer(name: str = "memory", sensor: SensorModel | None = None, **options: An
         straight-through counts: the default), "expected" (mean counts under threshold mismatch), "srm"
         (spike response model, at most one event per frame), "physical" (the full sensor).
       sensor: SensorModel to start from. options: learn, log_input (see ``EventLayer``), and spread of
-        "expected", sharpness of "sigmoid" and "dense".
+        "expected", sharpness of "sigmoid" and "dense", gradient of "srm" ("play" or "surrogate").
     Raises: DomainError for an unknown name, with the nearest one, or a value that cannot be learnt.
 
     Example:
@@ -47,5 +47,5 @@ def layer(name: str = "memory", sensor: SensorModel | None = None, **options: An
             f"there is no event layer {name!r}{f', did you mean {near[0]!r}?' if near else ''}; event layers "
             f"are {', '.join(map(repr, LAYERS))}."
         )
-    own = {key: options.pop(key) for key in ("spread", "sharpness") if key in options}
+    own = {key: options.pop(key) for key in ("spread", "sharpness", "gradient") if key in options}
     return ComparatorLayer(COMPARATORS[name](**own), sensor, **options)

@@ -11,12 +11,14 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from codesign.errors import DomainError
 from codesign.events.intensity import log_levels
 from codesign.events.layers.dense import dense
 from codesign.events.layers.expected import expected
 from codesign.events.layers.memory import memory, soft_counts
 from codesign.events.layers.soft import soft
 from codesign.events.spiking.comparators import count_spikes
+from codesign.events.spiking.srm import GRADIENTS
 
 
 class Comparator(Protocol):
@@ -102,15 +104,25 @@ class Expected:
 @dataclass
 class Spikes:
     """``events.srm`` with step kernels and coupled polarities, fed with steps of the log level: at most one
-    event per frame and polarity, the rest of a step stays for the frames after it."""
+    event per frame and polarity, the rest of a step stays for the frames after it. gradient: "play" (of the
+    mean count, as ``events.memory``) or "surrogate" (of a fast sigmoid)."""
 
+    gradient: str = "play"
     mismatched = True
+
+    def __post_init__(self):
+        if self.gradient not in GRADIENTS:
+            raise DomainError(
+                f"gradient is {self.gradient!r}; choose one of {', '.join(map(repr, GRADIENTS))}."
+            )
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Any, log_input: bool
     ) -> tuple[Tensor, Any]:
         level = log_levels(frames, log_input, minimum=2 if state is None else 1)
-        return count_spikes(level, None, torch.stack((theta_on, theta_off)), state, None)
+        return count_spikes(
+            level, None, torch.stack((theta_on, theta_off)), state, None, gradient=self.gradient
+        )
 
 
 def _with_last(frames, last):

@@ -11,6 +11,7 @@ from codesign.events.layers.memory import memory
 from codesign.events.layers.physical import sensor_counts
 from codesign.events.sensor.model import SensorModel
 from codesign.events.spiking.srm import srm
+from codesign.events.spiking.srm_play import with_play
 from codesign.events.spiking.surrogate import FastSigmoid
 
 
@@ -39,30 +40,41 @@ def count_memorised(
 
 
 def count_spikes(
-    level: Tensor, t_s: Times | None, theta: Tensor, state: Any, refractory_s: Tensor | None
+    level: Tensor,
+    t_s: Times | None,
+    theta: Tensor,
+    state: Any,
+    refractory_s: Tensor | None,
+    gradient: str = "play",
 ) -> tuple[Tensor, Any]:
     """At most one event per step and polarity: a spike response layer with step kernels and coupled
     polarities, which memorises the same level.
 
     Args: as for ``count_memorised``. theta: [2], or [2, ...] of every pixel. It has no dead time; refractory_s
-      must be None.
-    Gradient: by a fast sigmoid of width theta, through the reset where it cannot grow.
+      must be None. gradient: "play" or "surrogate".
+    Gradient: "play": of the mean count over places inside the threshold, with the cap of one event per step
+      (``events.srm``). "surrogate": by a fast sigmoid of width theta, through the reset where it cannot grow.
     """
-    start, neurons = (level[:1], None) if state is None else (state[0][None], state[1])
+    start, neurons, play = (level[:1], None, None) if state is None else (state[0][None], *state[1:])
     step = torch.cat((start, level if state is not None else level[1:])).diff(dim=0)
     thetas = theta.to(level)[(..., *[None] * (level.ndim - theta.ndim))]
-    spikes, _, neurons = srm(
-        torch.stack((step, -step), 1),
-        theta=thetas,
-        kernel="step",
-        response="step",
-        reset_scale=1.0,
-        coupled=True,
-        state=neurons,
-        surrogate=FastSigmoid.unit(float(theta.detach().mean())),
-        through_reset="bounded",
-    )
-    return spikes, (level[-1], neurons)
+    with torch.set_grad_enabled(torch.is_grad_enabled() and gradient == "surrogate"):
+        spikes, _, neurons = srm(
+            torch.stack((step, -step), 1),
+            theta=thetas,
+            kernel="step",
+            response="step",
+            reset_scale=1.0,
+            coupled=True,
+            state=neurons,
+            surrogate=FastSigmoid.unit(float(theta.detach().mean())),
+            through_reset="bounded",
+        )
+    if gradient == "play" and torch.is_grad_enabled():
+        # a chunk that kept no gradient carries no play on: it begins again at the last level
+        begun = level if play is not None or state is None else torch.cat((start, level))
+        spikes, play = with_play(spikes, begun, thetas[0], thetas[1], play)
+    return spikes, (level[-1], neurons, play)
 
 
 COMPARATORS = {"memory": count_memorised, "srm": count_spikes}

@@ -3,6 +3,7 @@ constants, explicit state."""
 
 import math
 import warnings
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -11,10 +12,12 @@ from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.events.spiking.srm_forward import Plan
 from codesign.events.spiking.srm_gradient import Setup, reset_sum, run
 from codesign.events.spiking.srm_kernels import RESETS, RESPONSES, STATES
+from codesign.events.spiking.srm_play import check_play, played
 from codesign.events.spiking.srm_state import SrmState, entering_state
 from codesign.events.spiking.srm_truncated import run_truncated
 from codesign.events.spiking.surrogate import Laplace, Surrogate
 
+GRADIENTS = ("surrogate", "play")
 THROUGH_RESET = ("off", "full", "bounded")
 NONFINITE = ("raise", "zero")
 
@@ -31,6 +34,7 @@ def srm(
     response: str = "none",
     reset_scale: float = 2.0,
     coupled: bool = False,
+    gradient: str = "surrogate",
     surrogate: Surrogate | None = None,
     through_reset: str = "off",
     smooth: bool = False,
@@ -59,6 +63,8 @@ def srm(
         the other. With ``kernel="step"``,
         ``response="step"``, ``reset_scale=1`` and log-intensity steps as drive (ON +, OFF -) this is the
         memorised-reference event model.
+      gradient: "surrogate", or for that event model "play": the gradient of the mean count over where inside
+        its threshold a pixel may have begun, as ``events.memory``, with one event per step.
       surrogate: Laplace, FastSigmoid or Triangular; None: Laplace of unit mass and width mean(theta), that is
         alpha = 2 theta, beta = 1 / theta.
       through_reset: gradient of a spike by way of the resets it causes: "off" (as SLAYER), "full", or
@@ -77,7 +83,8 @@ def srm(
         whole bit for bit.
     Gradient: drive, theta, tau_s, tau_r, state; spikes by the surrogate. theta and tau_r act through the
       reset amplitude with spikes held, also when
-      through_reset is "off". Second derivatives raise.
+      through_reset is "off". With ``gradient="play"`` spikes carry a gradient to drive, theta and state.play, and
+      the potential none. Second derivatives raise.
     Raises: ShapeError for T = 0, no pixel, shapes that do not fit; DomainError for thresholds, time constants
       or dt that are not positive, unknown
       names, NaN or infinite drive; NonFiniteError when a finite drive overflows. Warns (RuntimeWarning) when
@@ -102,11 +109,28 @@ def srm(
     _choice("kernel", kernel, RESETS)
     _choice("response", response, RESPONSES)
     _choice("through_reset", through_reset, THROUGH_RESET)
+    _choice("gradient", gradient, GRADIENTS)
     dt = _number("dt", dt, least=0, strict=True)
     reset_scale = _number("reset_scale", reset_scale, least=0)
     theta = per_pixel(theta, "theta", drive)
     tau_s = per_pixel(tau_s, "tau_s", drive) if response == "alpha" else None
     tau_r = per_pixel(tau_r, "tau_r", drive) if kernel != "step" else torch.ones_like(theta)
+    if gradient == "play":
+        check_play(drive, kernel, response, reset_scale, coupled, state)
+        given = (drive, theta, state)
+        with torch.no_grad():
+            spikes, potential, after = srm(
+                drive,
+                theta=theta,
+                kernel=kernel,
+                state=state,
+                response=response,
+                reset_scale=reset_scale,
+                coupled=True,
+                truncation=truncation,
+            )
+        spikes, play = played(spikes, *given)
+        return spikes, potential, replace(after, play=play)
     if surrogate is None:
         surrogate = Laplace.unit(float(theta.detach().mean()))
     elif not isinstance(surrogate, Surrogate):

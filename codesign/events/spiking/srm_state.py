@@ -9,6 +9,20 @@ from codesign.errors import DomainError, ShapeError, check_finite
 
 
 @dataclass(frozen=True)
+class PlayState:
+    """What ``gradient="play"`` carries on. memory: state of ``events.memory``. centre: [...] centre of the play
+    that holds the level back to a threshold per step. level: [...] sum of the drive so far."""
+
+    memory: Tensor
+    centre: Tensor
+    level: Tensor
+
+    def detach(self) -> "PlayState":
+        """The same state without its graph."""
+        return PlayState(self.memory.detach(), self.centre.detach(), self.level.detach())
+
+
+@dataclass(frozen=True)
 class SrmState:
     """State after the last step of a chunk. It keeps its graph: ``detach`` it to cut the gradient between
     chunks.
@@ -16,14 +30,17 @@ class SrmState:
     response: [states, ...] of the response kernel, float64 whatever the drive (0 to 2 states; the last taps -
       1 drives with ``srm_truncated``).
     reset: [states, ...] of the reset kernel, likewise (1 or 2 states; the last taps - 1 spikes).
+    play: PlayState with ``gradient="play"``, else None.
     """
 
     response: Tensor
     reset: Tensor
+    play: PlayState | None = None
 
     def detach(self) -> "SrmState":
         """The same state without its graph."""
-        return SrmState(self.response.detach(), self.reset.detach())
+        play = None if self.play is None else self.play.detach()
+        return SrmState(self.response.detach(), self.reset.detach(), play)
 
 
 def entering_state(state, counts, pixels, device, dtype=torch.float64):
