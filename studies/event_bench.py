@@ -3,7 +3,8 @@ the frames, in one run.
 
 Frames of a drifting texture at 1,000 frames per second, at two speeds: calm (about 2 events per 100 pixels
 and frame) and busy (about 25). What a pixel costs depends on how often it fires, so both are told. The last
-part streams frames through a sensor with every kind of noise and watches the memory.
+parts stream frames through a sensor with every kind of noise and watch the memory, and set the times of
+float32 frames beside those of the same frames in float64.
 """
 
 import sys
@@ -73,6 +74,17 @@ def study(run: Run[Config]) -> None:
                 progress.advance()
         memory = stream(run.config.seed, streamed)
         progress.advance()
+    other, times = precision(run.config.seed)
+    run.record(float32_other_counts_share=other)
+    for low, high, off_us in times:
+        speed = f"{low:g}_to_{high:g}_per_s".replace(".", "p")
+        run.record(
+            **{
+                f"float32_off_{speed}_p99_us": float(np.quantile(off_us, 0.99)),
+                f"float32_off_{speed}_max_us": float(off_us.max()),
+                f"float32_off_{speed}_above_1us_share": float(np.mean(off_us > 1)),
+            }
+        )
     missed = []
     for size, pace, name, rate, cpu, copies, fired in rows:
         key = f"{name.replace(',', '').replace(' + ', '_').replace(' ', '_')}_{pace}_{size}"
@@ -185,6 +197,41 @@ def stream(seed, count, chunk=500):
         events.simulate(base, t_s, NOISE, state=state)
         memory.append(resident_mb())
     return memory
+
+
+def precision(seed, cases=40, pixels=2048, count=120):
+    """float32 frames beside their float64 copies: the share of pixels with another count, and for the others
+    (speed from, to, |time off| of every event, us) by the speed of the log level at the event, 1/s."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def drawn(low, high, *shape):
+        uniform = torch.rand(shape or (1,), dtype=torch.float64, generator=generator)
+        return low * (high / low) ** uniform
+
+    other, speeds, off_us = 0, [], []
+    for case in range(cases):
+        t_s = torch.arange(count, dtype=torch.float64)[:, None] / drawn(60, 1000)
+        per_s = drawn(0.05, 20, 1, pixels)
+        swing = (
+            torch.sin(per_s * t_s + drawn(0.01, 6.3, 1, pixels)) if case % 2 else (per_s * t_s).clamp(max=2.9)
+        )
+        frames = (drawn(20, 5000, 1, pixels).log() + swing).exp().float()[:, None]
+        levels = events.lin_log(frames[:, 0].double()).numpy()
+        single, double = (
+            events.simulate(f, t_s[:, 0], events.SensorModel(THETA, THETA)) for f in (frames, frames.double())
+        )
+        same = torch.bincount(single.x, minlength=pixels) == torch.bincount(double.x, minlength=pixels)
+        other += int((~same).sum()) / (cases * pixels)
+        first, second = (s.t_us[s.x.argsort(stable=True)][same[s.x.sort().values]] for s in (single, double))
+        x = double.x.sort().values[same[double.x.sort().values]].numpy()
+        frame = np.clip(np.searchsorted(t_s[:, 0].numpy(), second.numpy() / 1e6), 1, count - 1)
+        speeds.append(np.abs(levels[frame, x] - levels[frame - 1, x]) / float(t_s[1]))
+        off_us.append((first - second).abs().numpy())
+    speeds, off_us = np.concatenate(speeds), np.concatenate(off_us)
+    return other, [
+        (low, high, off_us[(speeds >= low) & (speeds < high)])
+        for low, high in ((0.01, 0.1), (0.1, 1), (1, 100))
+    ]
 
 
 def figure(memory, count):

@@ -177,6 +177,35 @@ def test_sensor_refuses_zero_thresholds_and_other_timings():
         SensorModel(timing="exact")
 
 
+def test_single_precision_keeps_the_times_of_long_ramps():
+    """Each event once rounded the memorised level alike: microseconds too early or late after some dozens."""
+    generator = torch.Generator().manual_seed(0)
+    speed = (5 + 5 * torch.rand(40, dtype=torch.float64, generator=generator)) * torch.tensor(
+        [1.0, -1.0]
+    ).repeat(20)
+    t_s = torch.arange(31, dtype=torch.float64) / 60
+    frames = intensity(7.5 + speed * (t_s[:, None] - 0.25)).float()[:, None]
+    events = simulate(frames, t_s, SensorModel(0.05, 0.05))
+    levels = np.log(frames[:, 0].double().numpy())  # of the frames as they are, in double precision
+    for x in range(40):
+        gone = np.abs(levels[:, x] - levels[0, x])
+        truth_us = np.interp(0.05 * np.arange(1, int(gone[-1] / 0.05) + 1), gone, t_s.numpy()) * 1e6
+        # half a microsecond of rounding, and half a last digit of two levels below 16 at 5 per second: 0.2 us
+        assert np.abs(events.t_us[events.x == x].numpy() - truth_us).max() < 0.75
+
+
+def test_a_leak_below_the_last_digit_of_a_level_still_leaks():
+    # 10 thresholds of 0.001 per second, 1e-7 per frame: half of what single precision tells at a level of 5.3
+    frames = torch.full((25_001, 1, 1), 200.0)
+    events = simulate(
+        frames, torch.arange(25_001, dtype=torch.float64) / 1e5, SensorModel(1e-3, 1e-3, leak_rate_hz=10.0)
+    )
+    assert events.p.tolist() == [1, 1]
+    assert (
+        np.abs(events.t_us.numpy() - np.array([100_000, 200_000])).max() <= 20
+    )  # a last digit of the level: 48 us
+
+
 def test_bad_frames_and_times_are_refused_and_the_state_stays():
     good = torch.full((3, 4, 5), 50.0)
     t_s = [0.0, 0.1, 0.2]

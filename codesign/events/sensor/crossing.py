@@ -21,6 +21,7 @@ from codesign.events.sensor.random_bits import exponential, hashed, normal_pair,
 MOST_EVENTS = 1e6
 CARRIED = (
     "reference",
+    "reference_rest",
     "level",
     "input_level",
     "input",
@@ -86,6 +87,14 @@ def _load(arr, tensor):
 
 def _unload(arr, value, like):
     return (arr.Int32(value) if like.dtype == torch.int32 else value).torch().reshape(like.shape).clone()
+
+
+def exact_sum(first, second):
+    """The rounded sum of two floats, and what rounding took from it. Source: Knuth, TAOCP 2, 4.2.2,
+    theorem B."""
+    total = first + second
+    part = total - first
+    return total, (first - (total - part)) + (second - part)
 
 
 def reaches(dr, distance, theta, count):
@@ -164,15 +173,21 @@ class _Step:
             now["noise"] = keep * now["noise"] + dr.sqrt(1 - keep * keep) * self.noise_level * gauss[0]
             signal = signal + now["noise"]
         base = now["reference"]
-        start = before - base
-        if self.leak_hz is not None:
+        rest = now["reference_rest"]
+        start = (before - base) - rest
+        if self.leak_hz is not None:  # per frame it may be less than the last digit of the memorised level
             rise = self.leak_hz * dt_s
-            base = base - (rise * (1 - self.jitter * gauss[1]) if self.jitters else rise) * self.theta_on
+            leak = (rise * (1 - self.jitter * gauss[1]) if self.jitters else rise) * self.theta_on
+            base, now["reference_rest"] = exact_sum(base, rest - leak)
         return now, self._fire(index, dt_s, light, start, signal, base, now)
 
     def _fire(self, index, dt_s, light, start, signal, base, now):
         """All events of the interval in order of time; moves the reference, the dead time and the hazard on.
-        Returns where there were too many."""
+        Returns where there were too many.
+
+        Whether the level fires is decided by the rounded reference, as in v2e and ``memory``; when, by the
+        reference with what its rounding took, which adds up over the events of a ramp.
+        """
         dr = self.dr
         arr = self.arr
         sensor = self.sensor
@@ -193,7 +208,8 @@ class _Step:
         )
         end = dr.select(too_many, 0, end)
         pace = dr.select(too_many, 0, pace)
-        slope = end - start
+        rest = now["reference_rest"]
+        slope = (end - rest) - start
         rising = end > 0
         hazard = now.get("hazard", arr.Float(0))
         drawn = now.get("shots", arr.UInt32(0))
@@ -247,7 +263,8 @@ class _Step:
             begun, going, event, mode="symbolic"
         )
         self.sink.close(dr, arr, index, self.lane, tally)
-        now["reference"] = base + nth * dr.select(rising, self.theta_on, -self.theta_off)
+        now["reference"], lost = exact_sum(base, nth * dr.select(rising, self.theta_on, -self.theta_off))
+        now["reference_rest"] = lost + (dr.select(drawn == now["shots"], rest, 0) if shots else rest)
         if dead:
             now["last_event_s"] = dr.maximum(last_s - dt_s, -1e6)
         if shots:

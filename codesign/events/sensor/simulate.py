@@ -53,7 +53,9 @@ def simulate(
       log_eps: level is ln(I + log_eps) instead of lin-log, for linear frames of high dynamic range (ESIM:
         1e-3 with frames 0 to 1; where speed or noise
         depends on intensity, scale frames so that 255 is full light).
-    Returns: EventStream sorted by (t, y, x, p), int64 microseconds. The first frame gives no event.
+    Returns: EventStream sorted by (t, y, x, p), int64 microseconds. The first frame gives no event. float32
+      frames time events to the microsecond where the log level moves by 1 per second or more; slower ones to
+      about 6e-8 |level| over its speed (float64 frames to the microsecond).
     Gradient: none (see ``sensor_counts`` for one).
     Raises: ShapeError for too few frames or a size that changed; DomainError for NaN, infinite or negative
       frames, or times that do not increase.

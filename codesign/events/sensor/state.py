@@ -16,7 +16,8 @@ class SensorState:
     reference: [H, W] memorised log level. level: [H, W] log level behind the low-pass. theta_on, theta_off:
       [H, W] drawn thresholds.
     start_s, time_s: times of the first and the last frame. generator: used when none is passed; starts at
-      seed 0. Only where the sensor needs them: input_level, input: [H, W] last log level before the low-pass,
+      seed 0. Only where the sensor needs them: reference_rest: [H, W] what rounding took from the memorised
+      level (not for timing "v2e"); input_level, input: [H, W] last log level before the low-pass,
       last intensity; noise: [H, W] photoreceptor noise; leak_hz: [H, W]; last_event_s: [H, W] time of the
       last event (since the first frame for timing "v2e", since the last frame otherwise, so <= 0); hazard:
       [H, W] noise still to pass until the next noise event; key, shots: [H, W] int32 random key and noise
@@ -31,6 +32,7 @@ class SensorState:
     start_s: Any = None
     time_s: Any = None
     generator: torch.Generator | None = None
+    reference_rest: Tensor | None = None
     input_level: Tensor | None = None
     input: Tensor | None = None
     noise: Tensor | None = None
@@ -63,6 +65,8 @@ def begin(state, sensor, frame, level, time_s, generator):
     )
     state.reference = level.clone()
     state.level = level.clone()
+    if sensor.timing == "interpolated":
+        state.reference_rest = torch.zeros_like(level)
     state.start_s = state.time_s = time_s
     if sensor.leaks:
         state.leak_hz = draw_leak_rates(sensor, pixels, generator, **place)
