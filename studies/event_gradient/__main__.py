@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from codesign.errors import DomainError
-from studies.event_gradient import layers, thresholds
+from studies.event_gradient import flow_of_events, layers, pointwise, sensors, thresholds
 from studies.event_gradient.case import DIRECTIONS, Case
 from studies.event_gradient.compare import Row
 from studies.event_gradient.topic import Topic, label
@@ -28,6 +28,9 @@ TOPICS: dict[str, Topic] = {
     "counts": layers.COUNTS,
     "thresholds": thresholds.TOPIC,
     "curves": thresholds.CURVES,
+    "pointwise": pointwise.TOPIC,
+    "sensors": sensors.TOPIC,
+    "flow": flow_of_events.TOPIC,
 }
 
 
