@@ -15,6 +15,7 @@ MODULES = sorted(
 FIRST_MET = {  # modules whose examples a user meets first
     "codesign.events.files",
     "codesign.events.layers.by_name",
+    "codesign.events.level_path",
     "codesign.events.layers.memory",
     "codesign.events.layers.soft",
     "codesign.events.sensor.model",

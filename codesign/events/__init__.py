@@ -17,6 +17,7 @@ from codesign.events.layers.memory import memory, soft_counts
 from codesign.events.layers.physical import PhysicalState, sensor_counts
 from codesign.events.layers.positive import PositiveValues
 from codesign.events.layers.soft import soft
+from codesign.events.level_path import finer
 from codesign.events.low_pass import low_pass, one_pole
 from codesign.events.sensor.model import PRESETS, SensorModel, draw_shot_counts, draw_thresholds
 from codesign.events.sensor.naive import naive
@@ -71,6 +72,7 @@ __all__ = [
     "draw_thresholds",
     "drive_scale",
     "expected",
+    "finer",
     "from_counts",
     "from_stream",
     "gray_picture",

@@ -69,6 +69,15 @@ class FrontEnd:
             return frames
         return _lin_log(frames) if self.log_eps is None else (frames + self.log_eps).log()
 
+    def frames(self, level):
+        """Frames [...] whose level a tensor is, the inverse of ``level``; a linear one is never below 0."""
+        if self.log_input:
+            return level
+        if self.log_eps is not None:
+            return (level.exp() - self.log_eps).clamp(min=0)
+        dark = level <= math.log(JOINT)
+        return torch.where(dark, level.clamp(min=0) / DARK_SLOPE, level.clamp(min=math.log(JOINT)).exp())
+
     def slope(self, frames):
         """Derivative of the level to the frame."""
         if self.log_input:

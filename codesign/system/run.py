@@ -11,7 +11,7 @@ from codesign import render as render_stage
 from codesign.errors import DomainError, ShapeError
 from codesign.system.batch import check_batch, scenes_of
 from codesign.system.result import JUNCTIONS, RECORDABLE, Result, probe
-from codesign.system.stage import Stage
+from codesign.system.stage import Stage, event_call
 from codesign.types import EventVolume, FlowField, Rays
 
 
@@ -88,6 +88,9 @@ class Pass(Mapping[str, Any]):
         scene = getattr(self["batch"], "scene", None)
         return self.system.scene if scene is None else scene
 
+    def _bins(self):
+        return self.system.bins
+
     def _generator(self):
         return torch.Generator().manual_seed(self["camera"].seed if self.seed is None else self.seed)
 
@@ -152,7 +155,7 @@ class Pass(Mapping[str, Any]):
         return volume
 
     def _events(self):
-        found = self._call("events", self.system.events, self._samples(self["frames"]))
+        found = self._call("events", event_call(self.system.events), self._samples(self["frames"]))
         if not torch.is_tensor(found):
             return found
         count = self["t_s"].numel() - 1

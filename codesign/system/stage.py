@@ -17,6 +17,7 @@ OFFERED = (
     "T_world_body",
     "T_world_cam",
     "t_s",
+    "bins",
     "generator",
     "frames",
     "volume",
@@ -24,6 +25,15 @@ OFFERED = (
     "estimate",
     "truth",
 )
+
+
+def event_call(part: Any) -> Any:
+    """What is called of an event stage: its ``volume``, where it has one, which knows when events come between
+    frames; otherwise the stage itself."""
+    volume = getattr(part, "volume", None)
+    return volume if callable(volume) else part
+
+
 _NAMED = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
 
 

@@ -11,7 +11,7 @@ from codesign.errors import DomainError
 from codesign.system.batch import Batch
 from codesign.system.result import Result
 from codesign.system.run import Pass
-from codesign.system.stage import Stage
+from codesign.system.stage import Stage, event_call
 
 BINS = 5  # time bins where neither the estimator nor the user says
 # the parts, and how many inputs each takes by position
@@ -22,12 +22,14 @@ class System(nn.Module):
     """Camera, mount, event layer, estimator and named objectives in one graph.
 
     Every part is a Module or a plain function. A stage gets its input first and, by name, whatever else its
-    signature asks for out of: batch, camera, scene, rays, T_body_cam, T_world_body, T_world_cam, t_s,
+    signature asks for out of: batch, camera, scene, rays, T_body_cam, T_world_body, T_world_cam, t_s, bins,
     generator (of the batch's seed), frames, volume, field, estimate, truth (FlowField through the lens).
 
     Args:
       camera: render.Camera (its lens is registered here when it is a Module), or a function that makes one.
-      events: frames [N, T, H, W] -> counts [N, T-1, 2, H, W] or EventVolume.
+      events: frames [N, T, H, W] -> counts [N, T-1, 2, H, W] or EventVolume. Of a part that has ``volume``
+        (every ``events.layer``) that is called: it knows when events come between two frames. Counts have theirs
+        in the middle of an interval (``events.from_counts``).
       flow: EventVolume -> FlowField, or what else the objectives take.
       objectives: name -> function, all by name, -> tensor; a scalar each to go backward by ``Result.backward``.
       mount: () -> T_body_cam [..., 4, 4]; None: the batch's poses are the camera's.
@@ -106,7 +108,9 @@ class System(nn.Module):
                 raise DomainError(
                     f"stage '{name}' is a lens; put it into a camera: render.Camera(lens, ...)."
                 )
-            Stage(name, value, PARTS[name])  # refuses what it cannot call
+            Stage(
+                name, event_call(value) if name == "events" else value, PARTS[name]
+            )  # refuses what it cannot call
         super().__setattr__(name, value)  # pyright: ignore[reportArgumentType] - None and functions are parts too
 
     def forward(

@@ -2,7 +2,9 @@
 
 Each is a small object with ``comparator(frames, theta_on, theta_off, state, log_input) -> counts, state``:
 frames [T, ...] give counts [T-1, 2, ...], ON first, and with a state of an earlier call [T, 2, ...].
-``mismatched`` says whether it takes the thresholds of every pixel, or the nominal ones.
+``mismatched`` says whether it takes the thresholds of every pixel, or the nominal ones. ``refines`` says
+whether it may be asked between frames, for the times of events: whether it counts the same events, or more of
+the sensor's, the more often it looks. Without it the events of an interval are spread evenly.
 """
 
 from dataclasses import dataclass
@@ -28,6 +30,9 @@ class Comparator(Protocol):
     @property
     def mismatched(self) -> bool: ...
 
+    @property
+    def refines(self) -> bool: ...
+
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Any, log_input: bool, /
     ) -> tuple[Tensor, Any]: ...
@@ -39,6 +44,7 @@ class Sigmoid:
 
     sharpness: float | None = None
     mismatched = False
+    refines = False
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -54,6 +60,7 @@ class SoftCounts:
     """``events.soft_counts``: |dL|/theta between two frames, no memory."""
 
     mismatched = True
+    refines = True
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -68,6 +75,7 @@ class Dense:
 
     sharpness: float = 5.0
     mismatched = True
+    refines = False
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -80,6 +88,7 @@ class Memory:
     """``events.memory``: hard counts against the memorised level."""
 
     mismatched = True
+    refines = True
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -94,6 +103,7 @@ class Expected:
 
     spread: float = 0.15
     mismatched = False
+    refines = False
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -109,6 +119,7 @@ class Spikes:
 
     gradient: str = "play"
     mismatched = True
+    refines = True
 
     def __post_init__(self):
         if self.gradient not in GRADIENTS:

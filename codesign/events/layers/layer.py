@@ -14,12 +14,17 @@ from codesign.events.intensity import log_levels
 from codesign.events.layers.comparators import Comparator
 from codesign.events.layers.physical import DESIGN, sensor_counts
 from codesign.events.layers.positive import PositiveValues
+from codesign.events.level_path import finer, parts
 from codesign.events.low_pass import low_pass
 from codesign.events.sensor.model import SensorModel, draw_deviates, draw_shot_counts, mismatched
-from codesign.events.volumes.volume import from_counts
+from codesign.events.volumes.surface import surface_from_counts
+from codesign.events.volumes.traces import check_tau
+from codesign.events.volumes.volume import check_bins, from_counts
 from codesign.types import EventVolume
 
 THRESHOLDS = ("theta_on", "theta_off")
+PARTS_PER_BIN = 4  # intervals, from one node of a volume to the next, from which on finer ones change nothing
+PARTS_PER_TAU = 8  # the same for the time in which a surface fades
 
 
 class EventLayer(nn.Module):
@@ -31,6 +36,7 @@ class EventLayer(nn.Module):
     """
 
     learnable: tuple[str, ...] = ()
+    refines = False  # whether it may be asked between frames, see ``events.layers.comparators``
 
     def __init__(
         self,
@@ -92,9 +98,7 @@ class EventLayer(nn.Module):
           T frames give T intervals. None: the first chunk.
         Returns: counts [..., T-1, 2, H, W] ([..., T, 2, H, W] with a state); state to carry on, with its graph.
         """
-        if not isinstance(frames, Tensor) or frames.ndim < 3:
-            given = list(frames.shape) if isinstance(frames, Tensor) else type(frames).__name__
-            raise ShapeError(f"frames are {given}; a tensor [T, H, W] or [..., T, H, W] is needed.")
+        _check_axes(frames)
         if state is not None and generator is not None:
             raise DomainError(
                 "a generator and a state are given; the state carries the generator of its first chunk on: "
@@ -105,6 +109,37 @@ class EventLayer(nn.Module):
         counts, state = self._count(frames, t_s, state, _generators(generator, frames.shape[1:-2]))
         return counts.movedim((0, 1), (-4, -3)), state
 
+    def finely(
+        self,
+        frames: Tensor,
+        t_s: Tensor,
+        longest_s: float,
+        generator: Generator | Sequence[Generator] | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Event counts in intervals no longer than asked for: when events come, and not only between which
+        frames.
+
+        A layer that can (``refines``) is asked on the way of the log level between frames (``events.finer``);
+        another one has the events of an interval spread evenly over it.
+
+        Args: as for ``forward``. longest_s: length of the longest interval, seconds, > 0.
+        Returns: counts [..., T'-1, 2, H, W], times [T'] float64, those of the frames among them. Frames that
+          are dense enough are taken as they are: then these are the counts of ``forward``.
+        Gradient: as ``forward``, also for when events come.
+        Raises: as ``forward``; DomainError for a length that is not positive.
+        """
+        _check_axes(frames)
+        if self.refines:
+            fine, times_s = finer(frames.movedim(-3, 0), t_s, longest_s, log_input=self.log_input)
+            return self(fine.movedim(0, -3), times_s, generator), times_s
+        counts = self(frames, t_s, generator)
+        interval, share, times_s = parts(check_times(t_s, counts.shape[-4] + 1), longest_s)
+        if len(interval) == counts.shape[-4]:
+            return counts, times_s
+        alike = torch.bincount(interval)[interval]
+        alike = alike.to(counts).reshape(-1, 1, 1, 1)
+        return counts.index_select(-4, interval.to(counts.device)) / alike, times_s
+
     def volume(
         self,
         frames: Tensor,
@@ -112,13 +147,39 @@ class EventLayer(nn.Module):
         bins: int,
         generator: Generator | Sequence[Generator] | None = None,
     ) -> EventVolume:
-        """Events of the frames in time bins, see ``events.from_counts``.
+        """Events of the frames in time bins, each near its own time however few the frames are (``finely``).
 
         Args: as for ``forward``. bins: number of bins.
-        Returns: EventVolume of counts [B, 2, bins, H, W]; several batch axes come as one.
-        Gradient: as ``forward``.
+        Returns: EventVolume of counts [B, 2, bins, H, W], see ``events.from_counts``; several batch axes come
+          as one.
+        Gradient: as ``forward``, also for when events come.
         """
-        return from_counts(self(frames, t_s, generator).movedim((-4, -3), (0, 1)), t_s, bins)
+        check_bins(bins)
+        _check_axes(frames)
+        given_s = check_times(t_s, frames.shape[-3])
+        longest_s = float(given_s[-1] - given_s[0]) / (bins - 1) / PARTS_PER_BIN if bins > 1 else math.inf
+        counts, times_s = self.finely(frames, t_s, longest_s, generator)
+        return from_counts(counts.movedim((-4, -3), (0, 1)), times_s, bins)
+
+    def surface(
+        self,
+        frames: Tensor,
+        t_s: Tensor,
+        tau_s: float,
+        generator: Generator | Sequence[Generator] | None = None,
+    ) -> Tensor:
+        """Time surface at every frame but the first, each event near its own time (``finely``).
+
+        Args: as for ``forward``. tau_s: time in which the surface fades to 1/e, seconds, > 0.
+        Returns: [..., T-1, 2, H, W] in 0 to 1, ON first, see ``events.surface_from_counts``.
+        Gradient: as ``surface_from_counts`` of these counts.
+        Raises: as ``forward``; DomainError for tau.
+        """
+        check_tau(tau_s)
+        counts, times_s = self.finely(frames, t_s, tau_s / PARTS_PER_TAU, generator)
+        surface = surface_from_counts(counts.movedim((-4, -3), (0, 1)), times_s, tau_s)
+        at = torch.searchsorted(times_s, check_times(t_s, frames.shape[-3])[1:]) - 1  # parts end at frames
+        return surface[at.to(surface.device)].movedim((0, 1), (-4, -3))
 
     def _count(self, frames, t_s, state, generators):
         """Counts [T-1, 2, ..., H, W] of frames [T, ..., H, W], and the state to carry on."""
@@ -155,6 +216,7 @@ class ComparatorLayer(EventLayer):
     def __init__(self, comparator: Comparator, sensor: SensorModel | None = None, **options: Any):
         super().__init__(sensor, **options)
         self.comparator = comparator
+        self.refines = getattr(comparator, "refines", False)
 
     def _count(self, frames, t_s, state, generators):
         times_s = _times(frames, t_s, None if state is None else state.time_s)
@@ -213,6 +275,7 @@ class PhysicalLayer(EventLayer):
     the sensor. A batch is one sample after the other."""
 
     learnable = DESIGN
+    refines = True
 
     def _count(self, frames, t_s, state, generators):
         samples = frames.reshape(len(frames), -1, *frames.shape[-2:]).unbind(1)
@@ -235,6 +298,12 @@ class PhysicalLayer(EventLayer):
             strict=True,
         )
         return torch.stack(counts, 2).reshape(-1, 2, *frames.shape[1:]), states
+
+
+def _check_axes(frames):
+    if not isinstance(frames, Tensor) or frames.ndim < 3:
+        given = list(frames.shape) if isinstance(frames, Tensor) else type(frames).__name__
+        raise ShapeError(f"frames are {given}; a tensor [T, H, W] or [..., T, H, W] is needed.")
 
 
 def _generators(generator, batch):
