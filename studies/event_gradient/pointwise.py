@@ -9,7 +9,7 @@ from studies.event_gradient.topic import Asked, Topic
 
 THETA = 0.15
 RATE_HZ = 240
-MANY = 512  # beginnings: a small step moves few counts
+MANY = 256  # beginnings: a small step moves few counts
 WIDTHS = (24, 12, 4)  # of a step with two places, in sections
 NEAR = 0.01  # half of the smallest step, around one place
 

@@ -26,7 +26,7 @@ def maps(on, off, beginning):
 
 
 def jobs(quick):
-    rates = (240,) if quick else (60, 240, 1000)
+    rates = (60,) if quick else (60, 240, 1000)
     return [
         (on, off, beginning, rate_hz)
         for on, off in PAIRS[: 1 if quick else None]

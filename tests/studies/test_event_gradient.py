@@ -9,7 +9,7 @@ import torch
 
 from codesign import events
 from studies.event_gradient import __main__ as study
-from studies.event_gradient import compare, curves, judge
+from studies.event_gradient import compare, curves, judge, sensors
 from studies.frame.run import main
 
 T_S = torch.tensor([0.0, 0.01, 0.02], dtype=torch.float64)
@@ -142,3 +142,24 @@ def test_the_memory_layer_points_the_way_of_the_hard_sensor(tmp_path):
         for row in rows:
             assert row.numbers["cosine"] > 0.99
             assert row.numbers["scale"] == pytest.approx(1, abs=0.05)
+
+
+def test_a_number_that_all_pixels_share_is_differentiated_block_by_block():
+    weights = torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    value = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
+    found = sensors.of_number(weights * value**2, value)
+    torch.testing.assert_close(found, 1.4 * compare.blocks(weights))
+
+
+def test_a_physical_layer_and_its_judge_draw_the_same_thresholds():
+    """Thresholds spread by a third; a rise of 1.503 gives floor((1.503 + D)/C_on) events from a distance D at the start."""
+    frames = climbing(16, 1.503, 0.0)
+    sensor = events.SensorModel(0.15, 0.15, theta_sigma=0.05)
+    on, off = events.draw_thresholds(sensor, (16, 16), torch.Generator().manual_seed(0), dtype=torch.float64)
+    layer, truth = sensors.maps(sensor)
+    torch.testing.assert_close(layer(frames, T_S)[0], (1.503 / on).floor(), rtol=0, atol=0)
+    place = (torch.arange(4000, dtype=torch.float64)[:, None, None] + 0.5) / 4000
+    exact = ((1.503 + place * (on + off) / 2 - off / 2) / on).floor().mean(0)
+    # the mean over evenly spread places is off by at most one of them for every place where the count jumps
+    jumps = ((on + off) / 2 / on).ceil()
+    assert ((truth(frames, T_S)[0] - exact).abs() <= jumps / judge.BEGINNINGS + 0.001).all()
