@@ -49,7 +49,9 @@ def test_counts_and_all_gradients_equal_a_plain_autograd_loop(per_pixel, with_st
     inputs.append((0.3 + 0.05 * torch.rand(shape, generator=generator, dtype=torch.float64)).requires_grad_())
     if with_state:
         inputs.append(torch.zeros(5, 4, dtype=torch.float64, requires_grad=True))
-    counts, state = memory(*inputs[:3], state=inputs[3] if with_state else None, log_input=True)
+    counts, state = memory(
+        *inputs[:3], state=inputs[3] if with_state else None, log_input=True, gradient="play"
+    )
     truth, reference, centre = plain_loop(*inputs)
     torch.testing.assert_close(counts, truth, rtol=0, atol=1e-12)  # n + (s - s) rounds
     torch.testing.assert_close(state.detach(), torch.stack((reference, centre)).detach(), rtol=0, atol=1e-13)
@@ -99,13 +101,13 @@ def test_one_big_step_gives_many_events_and_signs_stay_positive():
 def test_chunks_equal_the_whole_bit_for_bit_gradients_included(cut):
     whole, parts = (random_walk(dtype=torch.float32).requires_grad_() for _ in range(2))
     theta = torch.tensor(0.2)
-    counts, state = memory(whole, theta, 0.25, log_input=True)
+    counts, state = memory(whole, theta, 0.25, log_input=True, gradient="play")
     if cut == 1:  # a single first frame needs no call: it is the state
-        second, state_two = memory(parts[1:], theta, 0.25, state=parts[0], log_input=True)
+        second, state_two = memory(parts[1:], theta, 0.25, state=parts[0], log_input=True, gradient="play")
         first = second[:0]
     else:
-        first, middle = memory(parts[:cut], theta, 0.25, log_input=True)
-        second, state_two = memory(parts[cut:], theta, 0.25, state=middle, log_input=True)
+        first, middle = memory(parts[:cut], theta, 0.25, log_input=True, gradient="play")
+        second, state_two = memory(parts[cut:], theta, 0.25, state=middle, log_input=True, gradient="play")
     joined = torch.cat((first, second))
     assert torch.equal(counts, joined)
     assert torch.equal(state, state_two)
@@ -140,7 +142,8 @@ def test_gradient_is_the_slope_of_the_mean_hard_count():
     weight = torch.cos(math.pi * time[1:])  # sees when events come, so the memory matters
 
     def loss(contrast):
-        counts, _ = memory(contrast * torch.sin(2 * math.pi * time + phase), 0.15, 0.2, log_input=True)
+        level = contrast * torch.sin(2 * math.pi * time + phase)
+        counts, _ = memory(level, 0.15, 0.2, log_input=True, gradient="play")
         return (weight * (counts[:, 0] + 0.5 * counts[:, 1])).sum() + counts.sum()
 
     contrast = torch.tensor(2.0, dtype=torch.float64, requires_grad=True)

@@ -85,15 +85,16 @@ class Dense:
 
 @dataclass
 class Memory:
-    """``events.memory``: hard counts against the memorised level."""
+    """``events.memory``: hard counts against the memorised level. gradient: "exact", "play" or None, as there."""
 
+    gradient: str | None = None
     mismatched = True
     refines = True
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
     ) -> tuple[Tensor, Tensor]:
-        return memory(frames, theta_on, theta_off, state=state, log_input=log_input)
+        return memory(frames, theta_on, theta_off, state=state, log_input=log_input, gradient=self.gradient)
 
 
 @dataclass

@@ -1,14 +1,20 @@
 """The default event layer: counts against a per-pixel memorised level, with a straight-through gradient."""
 
+import warnings
+
 import torch
 from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from codesign.errors import ShapeError
+from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import check_frames, check_layout, check_theta
 from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
-from codesign.events.layers import memory_kernel as kernel
+from codesign.events.layers import memory_kernel as play
+from codesign.events.layers import turns_kernel as turns
+
+GRADIENTS = ("exact", "play")
+MOST_RATIO = 4  # of the two thresholds, up to which gradients were set beside differences
 
 
 def memory(
@@ -18,6 +24,7 @@ def memory(
     *,
     state: Tensor | None = None,
     log_input: bool = False,
+    gradient: str | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Event counts per pixel and interval against the memorised log level r of each pixel.
 
@@ -37,20 +44,28 @@ def memory(
       counts: [T-1, 2, ...] ([T, 2, ...] with a state), ON first, whole numbers >= 0.
       state: [2, ...] the memorised level, and the centre of its play (below), to carry on. It keeps its
         graph: detach it to cut the gradient between chunks.
-    Gradient: frames, thetas, state: of the mean count over all places of a pixel inside its threshold
-      (straight through the rounding). After a turn of the
-      signal the mean count stays 0 until the way back exceeds a threshold, then grows by 1/C per unit of
-      level: a play of width (theta_on + theta_off)/2.
-      A level inside the play has no gradient, so scenes that never reach a threshold have none: start those
-      with ``soft_counts``. Second derivatives raise.
+    Gradient: frames, thetas, state: of the mean count over all places of a pixel inside its thresholds (straight
+      through the rounding): D = L - r begins evenly from -theta_off/2 to theta_on/2. After a turn of the signal
+      the mean count stays 0 until the way back exceeds the threshold of that side. For equal thresholds this is
+      a play, exactly. For unequal ones:
+        "exact": of the ideal sensor, by pairs of pixels followed from every turn. Slopes beat against the
+          thresholds: a wide step's mean slope is met only over many pixels or places. To the thresholds as "play".
+        "play": of width (theta_on + theta_off)/2, the mean over the scatter of real thresholds; smooth.
+        None: "exact" where all pixels share one pair of unequal thresholds, else "play". docs/events.md has both
+          in figures.
+      Scenes that never reach half a threshold have no gradient: start those with ``soft_counts``. Chunks have
+      the gradient of the whole with "play"; with "exact" each begins evenly around the play's centre. Second
+      derivatives raise.
     Numerics: the count is the exact floor of the quotient of the two floats. In float32 a level within about
       1e-7 |L| of a crossing may fall
       to either side; it is then counted in a later frame, never lost.
     Raises: ShapeError for too few frames or shapes that do not fit; DomainError for theta <= 0, NaN, infinite
       or negative input.
-    Cost: one pass over the frames forward, one backward; no memory beside counts and gradients.
+    Warns: RuntimeWarning where a gradient may be asked for and thresholds differ by more than a factor of 4.
+    Cost: one pass over the frames forward, one backward; no memory beside counts and gradients. "exact" takes
+      2.5 times as long backward.
     Source: Rebecq et al., ESIM, CoRL 2018; v2e (Hu et al., CVPR-W 2021), memorised brightness; Bengio et al.
-      2013, straight-through; the play is ours.
+      2013, straight-through; the mean count's play and pairs are ours.
 
     Example:
     >>> from codesign import events
@@ -69,7 +84,9 @@ def memory(
         given = f"{state.dtype} {list(state.shape)}"
         wanted = f"{frames.dtype} {list(frames.shape[1:])}"
         raise ShapeError(f"state is {given}, one frame is {wanted}; pass the state of the same sensor.")
-    return _MemorisedCounts.apply(frames, theta_on, theta_off, state, front_end)
+    steers = torch.is_grad_enabled() and any(x.requires_grad for x in (frames, theta_on, theta_off))
+    gradient = _gradient(gradient, theta_on, theta_off, steers)
+    return _MemorisedCounts.apply(frames, theta_on, theta_off, state, front_end, gradient)
 
 
 def soft_counts(
@@ -101,17 +118,38 @@ def soft_counts(
     return torch.stack(((step.abs() + step) / (2 * theta_on), (step.abs() - step) / (2 * theta_off)), dim=1)
 
 
+def _gradient(name, theta_on, theta_off, steers):
+    """ "exact" or "play": what the thresholds [...] ask for where the caller leaves it open. steers: whether a gradient may
+    be asked for."""
+    if name not in (None, *GRADIENTS):
+        raise DomainError(f"gradient is {name!r}; allowed: {', '.join(map(repr, GRADIENTS))}, or None.")
+    if name is not None:
+        return name
+    if theta_on.numel() > 1 or theta_off.numel() > 1:
+        return "play"
+    on, off = float(theta_on.detach()), float(theta_off.detach())
+    if steers and max(on, off) > MOST_RATIO * min(on, off):
+        warnings.warn(
+            f"theta_on is {on:g} and theta_off {off:g}; gradients of counts are measured up to a ratio of "
+            f"{MOST_RATIO} (docs/events.md): check yours against differences.",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+    return "play" if on == off else "exact"
+
+
 class _MemorisedCounts(Function):
     @staticmethod
-    def forward(ctx, frames, theta_on, theta_off, state, front_end):
+    def forward(ctx, frames, theta_on, theta_off, state, front_end, gradient):
         # the first level comes by the arithmetic of the kernel: a static scene then differs from it by
         # nothing
         start = (
             kernel_levels(frames[:1], front_end)[0].expand(2, *frames.shape[1:]) if state is None else state
         )
         ctx.front_end = front_end
+        ctx.gradient = gradient
         ctx.first = int(state is None)
-        counts, end, bad = kernel.count(frames[ctx.first :], start, theta_on, theta_off, front_end)
+        counts, end, bad = play.count(frames[ctx.first :], start, theta_on, theta_off, front_end)
         if bad or ctx.first:
             check_frames(frames if bad else frames[:1], 1, non_negative=not front_end.log_input)
         ctx.save_for_backward(frames, theta_on, theta_off, start)
@@ -121,23 +159,21 @@ class _MemorisedCounts(Function):
     @once_differentiable
     def backward(ctx, *grads):
         frames, theta_on, theta_off, start = ctx.saved_tensors
-        grad_counts, grad_end = grads
-        grad_frames, grad_start, *grad_thetas = kernel.adjoint(
-            frames[ctx.first :],
-            start,
-            theta_on,
-            theta_off,
-            ctx.front_end,
-            grad_counts,
-            grad_end.sum(0),
-            first=ctx.first,
-            wants_thetas=any(ctx.needs_input_grad[1:3]),
-        )
+        call = frames[ctx.first :], start, theta_on, theta_off, ctx.front_end, grads[0], grads[1].sum(0)
+        wants_thetas = any(ctx.needs_input_grad[1:3])
+        grad_thetas = [None, None]
+        if ctx.gradient == "play" or wants_thetas:
+            grad_frames, grad_start, *grad_thetas = play.adjoint(
+                *call, first=ctx.first, wants_thetas=wants_thetas
+            )
+        if ctx.gradient == "exact":
+            grad_frames, grad_start = turns.adjoint(*call, first=ctx.first)
         needed = zip(grad_thetas, (theta_on, theta_off), ctx.needs_input_grad[1:3], strict=True)
         grad_thetas = [grad.sum_to_size(theta.shape) if needs else None for grad, theta, needs in needed]
         if ctx.first:
             grad_frames[0] = grad_start * ctx.front_end.slope(frames[0])
-            return grad_frames, *grad_thetas, None, None
-        # the play alone carries the gradient: what reaches the memorised level reaches it through the play's
-        # centre
-        return grad_frames, *grad_thetas, torch.stack((torch.zeros_like(grad_start), grad_start)), None
+            return grad_frames, *grad_thetas, None, None, None
+        # the mean count alone carries the gradient: what reaches the memorised level reaches it through the
+        # place of the pixels that may be meant
+        grad_state = torch.stack((torch.zeros_like(grad_start), grad_start))
+        return grad_frames, *grad_thetas, grad_state, None, None
