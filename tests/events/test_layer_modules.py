@@ -84,7 +84,7 @@ def test_gradients_of_smooth_layers_are_differences(name):
 def test_the_memory_layer_has_the_slope_of_the_mean_count():
     # a climb of D: mean ON count (D - w/2)/C with the play w = (C + C_off)/2 round the first level
     level = torch.tensor([4.0, 4.35, 4.9], dtype=D).requires_grad_()
-    made = layer("memory", PLAIN, log_input=True)
+    made = layer("memory", PLAIN, log_input=True, gradient="play")
     made(level[:, None, None], torch.arange(3.0))[:, 0].sum().backward()
     torch.testing.assert_close(level.grad, torch.tensor([-1 / 0.15, 0, 1 / 0.15], dtype=D))
     slope_on = -(0.9 - 0.175 / 2) / 0.15**2 - 1 / (4 * 0.15)

@@ -91,6 +91,7 @@ def test_the_slope_to_the_threshold_is_that_of_the_mean():
     assert float(theta.grad) == pytest.approx(float(up - down) / (0.001 * THETA), abs=2 * 144 / wide / 2e-4)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("cut", [1, 7, 15])
 def test_chunks_give_the_spikes_and_the_gradient_of_the_whole(cut):
     level = walk(6)
