@@ -14,7 +14,7 @@ LAYERS = {
     "expected": lambda frames, t_s: events.expected(frames, THETA, THETA, 0.15)[0],
     "memory": lambda frames, t_s: events.memory(frames, THETA, THETA)[0],
 }
-# the others are loops of torch over frames: compared up to this rate
+# the others are loops of torch over frames: compared up to this rate, in few directions
 FAST = ("sigmoid", "memory")
 SLOW_HZ = 240
 REFERENCE_HZ = 5000
@@ -32,7 +32,7 @@ def jobs(quick):
         (layer, rate_hz, direction.name)
         for rate_hz in rates
         for direction in directions(quick)
-        for layer in (LAYERS if rate_hz <= SLOW_HZ and not quick else FAST)
+        for layer in (LAYERS if rate_hz <= SLOW_HZ and direction in FEW and not quick else FAST)
     ]
 
 
