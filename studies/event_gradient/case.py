@@ -59,7 +59,7 @@ class Case:
             0.4 * float(torch.randn((), generator=generator)),
             1.2 * math.sin(angle),
         )
-        self._along: dict[tuple[float, str], Tensor] = {}
+        self._along: dict[tuple[float, str, int], Tensor] = {}
 
     @cached_property
     def plane(self) -> render.TexturedPlane:
@@ -90,11 +90,11 @@ class Case:
         level = frames.log()
         return (level.mean() + (1 + direction.contrast * s) * (level - level.mean())).exp()
 
-    def along(self, rate_hz: float, direction: Direction) -> Tensor:
-        """[SECTIONS + 1, T, H, W] frames at the ends of the sections of a step, float32; rendered once."""
-        key = (rate_hz, direction.name)
+    def along(self, rate_hz: float, direction: Direction, sections: int = SECTIONS) -> Tensor:
+        """[sections + 1, T, H, W] frames at the ends of the sections of a step, float32; rendered once."""
+        key = (rate_hz, direction.name, sections)
         if key not in self._along:
-            places = (2 * k / SECTIONS - 1 for k in range(SECTIONS + 1))
+            places = (2 * k / sections - 1 for k in range(sections + 1))
             self._along[key] = torch.stack([self.frames(rate_hz, direction, s).float() for s in places])
         return self._along[key]
 

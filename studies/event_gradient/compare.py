@@ -94,12 +94,12 @@ def pairs(
     truth: Maps,
     sections: int = SECTIONS,
 ) -> list[Pair]:
-    """The derivative over a step beside the difference, for every case. sections: places of the step where the
-    derivative is taken, a divisor of SECTIONS."""
+    """The derivative over a step beside the difference, for every case. sections: of the step, in
+    each of which the derivative is taken once."""
     t_s = times(rate_hz)
     found = []
     for case in cases:
-        ends = case.along(rate_hz, direction)[:: SECTIONS // sections]
+        ends = case.along(rate_hz, direction, sections)
         found.append(pair(ends, t_s, layer, truth))
     return found
 
