@@ -4,6 +4,7 @@ from pathlib import Path
 
 from codesign.atomic import replacing
 from codesign.errors import FileFormatError
+from codesign.events.entry import check_whole
 from codesign.events.formats.aedat2 import read_aedat2, write_aedat2
 from codesign.events.formats.aedat4 import read_aedat4, write_aedat4
 from codesign.events.formats.dat import read_dat, write_dat
@@ -11,6 +12,7 @@ from codesign.events.formats.hdf5 import read_hdf5, write_hdf5
 from codesign.events.formats.npz import read_npz, write_npz
 from codesign.events.formats.raw import read_raw, write_raw
 from codesign.events.formats.text import read_csv, write_csv
+from codesign.events.stream import check_stream
 from codesign.types import EventStream
 
 READERS = {
@@ -56,7 +58,10 @@ def read(path: str | Path, *, height_px: int | None = None, width_px: int | None
     >>> events.read("brighter.npz").t_us.tolist()
     [2885, 5771, 8656]
     """
-    path = Path(path)
+    path = _path(path)
+    for name, size in (("height_px", height_px), ("width_px", width_px)):
+        if size is not None:
+            check_whole(size, name, 1)
     reader = _choose(READERS, path, "read")
     if not path.is_file():
         raise FileFormatError(f"no event file at {path}; check the path.")
@@ -79,7 +84,8 @@ def write(path: str | Path, stream: EventStream, *, evt: int | None = None, t0_u
         clocks of few bits count from there; 0 by default, for no other format. ``events.read`` and faery add
         it back, other readers give the times less t0_us.
     Raises: FileFormatError for an unknown extension, a stream that the format cannot hold, or a folder that
-      is missing or not writable.
+      is missing or not writable; DomainError, ShapeError for what is no stream (times that go back, pixels
+      beyond the sensor, other polarities).
 
     Example:
     >>> import torch
@@ -88,10 +94,12 @@ def write(path: str | Path, stream: EventStream, *, evt: int | None = None, t0_u
     >>> stream = events.simulate(frames, [0.0, 0.01], events.SensorModel())
     >>> events.write("brighter.raw", stream, evt=2)
     """
-    writer = _choose(WRITERS, Path(path), "written")
+    path = _path(path)
+    writer = _choose(WRITERS, path, "written")
+    check_stream(stream)
     options = {name: value for name, value in (("evt", evt), ("t0_us", t0_us)) if value is not None}
     for name, value in options.items():
-        if Path(path).suffix.lower() not in OPTIONS[name]:
+        if path.suffix.lower() not in OPTIONS[name]:
             raise FileFormatError(
                 f"{name}={value!r} was given for {path}; it is for {' and '.join(OPTIONS[name])} files alone."
             )
@@ -100,6 +108,14 @@ def write(path: str | Path, stream: EventStream, *, evt: int | None = None, t0_u
             writer(temporary, stream, **options)
         except FileFormatError as error:  # writers know what does not fit, not where the file will lie
             raise FileFormatError(f"cannot write {path}: {error}") from error
+
+
+def _path(path):
+    if not isinstance(path, (str, Path)):
+        raise FileFormatError(
+            f"the path is {path!r} ({type(path).__name__}); a str or pathlib.Path is needed."
+        )
+    return Path(path)
 
 
 def _choose(table, path, verb):

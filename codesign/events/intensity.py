@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from codesign import backend
-from codesign.errors import DomainError
+from codesign.errors import DomainError, as_number
 from codesign.events.entry import check_frames
 
 JOINT = 20.0  # intensity on the 0-255 scale where the linear part meets the logarithm
@@ -56,7 +56,13 @@ class FrontEnd:
     log_eps: float | None = None
 
     def __post_init__(self):
-        if self.log_eps is not None and (self.log_input or not 0 < self.log_eps < math.inf):
+        if not isinstance(self.log_input, bool):
+            raise DomainError(
+                f"log_input is {self.log_input!r}; True (frames are log levels) or False is needed."
+            )
+        if self.log_eps is not None and (
+            self.log_input or not 0 < as_number(self.log_eps, "log_eps") < math.inf
+        ):
             given = "log_input is set" if self.log_input else f"log_eps is {self.log_eps!r}"
             raise DomainError(
                 f"{given}; give frames of log levels, or a finite log_eps > 0 in the unit of linear frames, "
@@ -120,5 +126,6 @@ def kernel_levels(frames, front_end):
 
 def log_levels(frames: Tensor, log_input: bool, minimum: int) -> Tensor:
     """Check frames and bring them to log intensity; ``log_input`` says that they already are."""
+    front_end = FrontEnd(log_input)
     check_frames(frames, minimum, non_negative=not log_input)
-    return FrontEnd(log_input).level(frames)
+    return front_end.level(frames)

@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from codesign.errors import DomainError, ShapeError, as_number
+from codesign.events.entry import check_layout
 from codesign.events.intensity import light_share
 
 SERIES = 0.05  # below it (1 - e^-a)/a comes from a series: its first term left out is below 5e-10
@@ -44,7 +46,14 @@ def one_pole(level: Tensor, pace: Tensor, start: Tensor | None = None) -> Tensor
       start: [...] filtered level at the first sample; None: the level itself.
     Returns: [T, ...] filtered levels, the start included. A steady ramp comes out a time constant later.
     Gradient: level, pace, start; exact.
+    Raises: ShapeError when there are not as many paces as intervals; DomainError for levels of another type.
     """
+    check_layout(level, name="levels")
+    if pace.ndim == 0 or len(pace) != len(level) - 1:
+        raise ShapeError(
+            f"pace has shape {list(pace.shape)} for {len(level)} levels; one per interval is needed, "
+            f"[{len(level) - 1}, ...]."
+        )
     filtered = [level[0] if start is None else start]
     steps = zip(level[:-1], level[1:], *coefficients(pace, torch.exp, torch.where), strict=True)
     for step in steps:
@@ -69,7 +78,17 @@ def low_pass(
       start: [...] filtered level at the first frame; None: the level itself.
     Returns: [T, ...] filtered levels, the start included.
     Gradient: level, intensity, cutoff_hz, start; exact.
+    Raises: ShapeError, DomainError as ``one_pole``; DomainError for a bandwidth that is not one number above 0.
     """
+    check_layout(level, name="levels")
+    number = cutoff_hz.detach() if isinstance(cutoff_hz, Tensor) else cutoff_hz
+    if not 0 < as_number(number, "cutoff_hz") < math.inf:
+        raise DomainError(f"cutoff_hz is {number!r}; a finite number above 0 is needed.")
+    if intensity.shape != level.shape or interval_s.shape != (len(level) - 1,):
+        raise ShapeError(
+            f"levels {list(level.shape)}, intensity {list(intensity.shape)} and interval_s "
+            f"{list(interval_s.shape)} do not fit; [T, ...] twice and [T-1] are needed."
+        )
     light = light_share(0.5 * (intensity[1:] + intensity[:-1]))
     interval_s = interval_s.to(level).reshape(-1, *[1] * (level.ndim - 1))
     return one_pole(level, light * (2 * math.pi * cutoff_hz) * interval_s, start)

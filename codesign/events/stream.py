@@ -18,6 +18,10 @@ def ordered(t_us: Tensor, x: Tensor, y: Tensor, p: Tensor, height_px: int, width
       height_px, width_px: sensor size.
     Raises: ShapeError when lengths differ; DomainError for events outside the sensor or another polarity.
     """
+    for values, name in ((t_us, "t_us"), (x, "x"), (y, "y"), (p, "p")):
+        if not isinstance(values, Tensor) or values.is_floating_point() or values.is_complex():
+            given = values.dtype if isinstance(values, Tensor) else type(values).__name__
+            raise DomainError(f"{name} is {given}; a tensor of whole numbers is needed: round it first.")
     t_us, x, y, p = (values.to(torch.int64) for values in (t_us, x, y, p))
     if not (t_us.shape == x.shape == y.shape == p.shape == (t_us.numel(),)):
         raise ShapeError(
@@ -37,8 +41,49 @@ def ordered(t_us: Tensor, x: Tensor, y: Tensor, p: Tensor, height_px: int, width
     return EventStream(t_us[rank], x[rank], y[rank], p[rank], int(height_px), int(width_px))
 
 
+def check_stream(stream: EventStream, part: slice = slice(None)) -> EventStream:
+    """Return ``stream`` when it is one: lists of int64 of equal length and, in ``part``, times that do not go
+    back, pixels of the sensor, polarities +1 and -1; DomainError, ShapeError otherwise."""
+    if not isinstance(stream, EventStream):
+        raise DomainError(
+            f"the events are a {type(stream).__name__}; an EventStream is needed, as events.read, "
+            "events.simulate and codesign.events.stream.ordered give it."
+        )
+    columns = (stream.t_us, stream.x, stream.y, stream.p)
+    if not all(isinstance(values, Tensor) and values.dtype == torch.int64 for values in columns):
+        given = [
+            str(values.dtype) if isinstance(values, Tensor) else type(values).__name__ for values in columns
+        ]
+        raise DomainError(f"t_us, x, y, p of the stream are {given}; tensors of int64 are needed.")
+    if not all(values.shape == (len(stream),) for values in columns):
+        raise ShapeError(
+            f"t_us, x, y, p of the stream have shapes {[list(v.shape) for v in columns]}; four lists of equal "
+            "length are needed."
+        )
+    t_us, x, y, p = (values[part] for values in columns)
+    if not len(t_us):
+        return stream
+    if bool((t_us[1:] < t_us[:-1]).any()):
+        raise DomainError("the times of the stream go back; order it with codesign.events.stream.ordered.")
+    for values, name, size in ((x, "x", stream.width_px), (y, "y", stream.height_px)):
+        low, high = (int(bound) for bound in values.aminmax())
+        if low < 0 or high >= size:
+            raise DomainError(
+                f"{name} spans {low} to {high}; the sensor has {size} pixels there (0 to {size - 1})."
+            )
+    if bool((p.abs() != 1).any()):
+        raise DomainError(f"polarity {int(p[p.abs() != 1][0])} found; +1 (ON) or -1 (OFF) is allowed.")
+    return stream
+
+
 def concatenate(streams: Iterable[EventStream]) -> EventStream:
-    """One ordered stream of several from the same sensor (for example of consecutive chunks)."""
+    """One ordered stream of several from the same sensor (for example of consecutive chunks).
+
+    Raises: ShapeError for none, or for sensors of several sizes; DomainError for anything but streams.
+    """
+    if not isinstance(streams, Iterable):
+        raise DomainError(f"the streams are {streams!r}; a list of EventStreams is needed.")
+    streams = [check_stream(stream, slice(0)) for stream in streams]
     sizes = {(stream.height_px, stream.width_px) for stream in streams}
     if len(sizes) != 1:
         raise ShapeError(
@@ -62,7 +107,8 @@ def to_counts(stream: EventStream, t_s: Times, *, dtype: torch.dtype = torch.flo
     Returns: [T-1, 2, H, W] counts, ON first.
     Gradient: none.
     """
-    times_us = (check_times(t_s, len(t_s)) * 1e6).round().long()
+    check_stream(stream)
+    times_us = (check_times(t_s) * 1e6).round().long()
     if len(times_us) < 2 or bool((times_us.diff() <= 0).any()):
         raise DomainError(
             f"t_s holds {len(times_us)} times; at least two, a microsecond or more apart, are needed."

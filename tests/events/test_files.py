@@ -149,10 +149,11 @@ def test_unknown_extensions_and_missing_places_are_refused(tmp_path):
 
 
 def test_a_failed_write_leaves_the_earlier_file(tmp_path):
-    path = tmp_path / "e.csv"
-    write(path, random_events(3))
+    path = tmp_path / "e.dat"
+    event = [torch.tensor([value]) for value in (7, 0, 0, 1)]
+    write(path, ordered(*event, 260, 346))
     before = path.read_bytes()
-    with pytest.raises(AttributeError):
-        write(path, None)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(FileFormatError, match="times span 4294967296"):
+        write(path, ordered(event[0] + 2**32 - 7, *event[1:], 260, 346))
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]

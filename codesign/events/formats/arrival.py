@@ -111,10 +111,6 @@ def columns(stream, *, height_limit_px, width_limit_px, first_us, last_us, name,
             f"{width_limit_px} x {height_limit_px}; write .npz instead."
         )
     t_us, x, y, p = (values.cpu().numpy() for values in (stream.t_us, stream.x, stream.y, stream.p))
-    if bool((t_us[1:] < t_us[:-1]).any()):
-        raise FileFormatError(
-            "the times of the stream go back; order it with codesign.events.stream.ordered."
-        )
     # as Python integers, which do not wrap
     span_us = [int(t_us[at]) - (t0_us or 0) for at in (0, -1)] if t_us.size else []
     if any(not first_us <= time_us <= last_us for time_us in span_us):

@@ -1,6 +1,7 @@
 """Event layers by name: what a command line or a study's configuration says."""
 
 import difflib
+from dataclasses import fields
 from typing import Any
 
 from codesign.errors import DomainError
@@ -29,7 +30,8 @@ def layer(name: str = "memory", sensor: SensorModel | None = None, **options: An
         (spike response model, at most one event per frame), "physical" (the full sensor).
       sensor: SensorModel to start from. options: learn, log_input (see ``EventLayer``), and spread of
         "expected", sharpness of "sigmoid" and "dense", gradient of "srm" ("play" or "surrogate").
-    Raises: DomainError for an unknown name, with the nearest one, or a value that cannot be learnt.
+    Raises: DomainError for an unknown name, with the nearest one, an unknown option, or a value that cannot be
+      learnt. A warning names what the sensor has and the layer does not know (leak, dead time, ...).
 
     Example:
     >>> import torch
@@ -39,13 +41,19 @@ def layer(name: str = "memory", sensor: SensorModel | None = None, **options: An
     >>> sensor(frames, torch.tensor([0.0, 0.01, 0.02])).flatten(1).tolist()  # ON: ln(100/40)/0.2
     [[4.0, 0.0], [0.0, 3.0]]
     """
-    if name == "physical":
-        return PhysicalLayer(sensor, **options)
-    if name not in COMPARATORS:
+    if name not in LAYERS:
         near = difflib.get_close_matches(str(name), LAYERS, n=1)
         raise DomainError(
             f"there is no event layer {name!r}{f', did you mean {near[0]!r}?' if near else ''}; event layers "
             f"are {', '.join(map(repr, LAYERS))}."
         )
-    own = {key: options.pop(key) for key in ("spread", "sharpness", "gradient") if key in options}
-    return ComparatorLayer(COMPARATORS[name](**own), sensor, **options)
+    own = () if name == "physical" else tuple(field.name for field in fields(COMPARATORS[name]))
+    known = ("learn", "log_input", *own)
+    if unknown := [option for option in options if option not in known]:
+        raise DomainError(
+            f"the event layer {name!r} has no option {unknown[0]!r}; its options are {', '.join(known)}."
+        )
+    if name == "physical":
+        return PhysicalLayer(sensor, **options)
+    values = {option: options.pop(option) for option in own if option in options}
+    return ComparatorLayer(COMPARATORS[name](**values), sensor, **options)

@@ -7,6 +7,8 @@ whether it may be asked between frames, for the times of events: whether it coun
 the sensor's, the more often it looks. Without it the events of an interval are spread evenly.
 """
 
+import warnings
+from collections.abc import Container
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -19,6 +21,7 @@ from codesign.events.layers.dense import dense
 from codesign.events.layers.expected import expected
 from codesign.events.layers.memory import memory, soft_counts
 from codesign.events.layers.soft import soft
+from codesign.events.sensor.model import SensorModel
 from codesign.events.spiking.comparators import count_spikes
 from codesign.events.spiking.srm import GRADIENTS
 
@@ -140,3 +143,31 @@ class Spikes:
 def _with_last(frames, last):
     """The frames, behind the last one of the chunk before where there is one."""
     return frames if last is None else torch.cat((last[None], frames))
+
+
+def check_comparator(comparator: object, sensor: SensorModel, learnt: Container[str]) -> None:
+    """Refuse what is no comparator, or takes no mismatch that is to be learnt; warn of what the sensor has and no
+    comparator knows."""
+    if not callable(comparator) or not hasattr(comparator, "mismatched"):
+        raise DomainError(
+            f"the comparator is {comparator!r}; it is called (frames, theta_on, theta_off, state, log_input) "
+            "and has an attribute mismatched, see codesign.events.layers.comparators."
+        )
+    name = type(comparator).__name__
+    if "theta_sigma" in learnt and not comparator.mismatched:
+        raise DomainError(
+            f"theta_sigma has no gradient in the comparator {name}, which takes nominal thresholds; leave it "
+            "out of learn."
+        )
+    asked = {
+        "leak_rate_hz": sensor.leak_rate_hz,
+        "hot pixels": sensor.hot_pixel_share * sensor.hot_pixel_rate_hz,
+        "refractory_s": sensor.refractory_s,
+        "photoreceptor_noise": sensor.photoreceptor_noise,
+    }
+    if left_out := [what for what, value in asked.items() if value]:
+        warnings.warn(
+            f"the comparator {name} knows no {', '.join(left_out)}: the sensor is taken without. The layer "
+            "'physical' has them all; dataclasses.replace(sensor, ...) with zeros says that you mean it.",
+            stacklevel=4,
+        )

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
-from codesign.events.entry import check_theta
+from codesign.events.entry import check_level, check_positive, check_theta
 from codesign.events.intensity import log_levels
 
 
@@ -35,7 +35,8 @@ def dense(
     level = log_levels(frames, log_input, minimum=2 if state is None else 1)
     theta_on = check_theta(theta_on, "theta_on", level)
     theta_off = check_theta(theta_off, "theta_off", level)
-    reference = level[0] if state is None else state
+    check_positive(sharpness, "sharpness")
+    reference = level[0] if state is None else check_level(state, level)
     counts = []
     for now in level[1:] if state is None else level:
         difference = now - reference

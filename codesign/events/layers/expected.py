@@ -6,8 +6,8 @@ import math
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError
-from codesign.events.entry import check_theta
+from codesign.errors import DomainError, as_number
+from codesign.events.entry import check_level, check_theta
 from codesign.events.intensity import log_levels
 
 # beyond a spread of so many events the sum over events equals its integral less a half, to exp(-2 pi^2 1.2^2)
@@ -43,13 +43,14 @@ def expected(
     level = log_levels(frames, log_input, minimum=2 if state is None else 1)
     theta_on = check_theta(theta_on, "theta_on", level)
     theta_off = check_theta(theta_off, "theta_off", level)
-    spread = torch.as_tensor(spread, dtype=level.dtype, device=level.device)
-    if spread.ndim or not LEAST_SPREAD <= float(spread.detach()) <= MOST_SPREAD:
+    number = spread.detach() if isinstance(spread, Tensor) else spread
+    if not LEAST_SPREAD <= as_number(number, "spread") <= MOST_SPREAD:
         raise DomainError(
-            f"spread is {spread.tolist()!r}; one relative standard deviation from {LEAST_SPREAD:g} to "
+            f"spread is {float(number)!r}; one relative standard deviation from {LEAST_SPREAD:g} to "
             f"{MOST_SPREAD:g} is needed (0.15 is typical)."
         )
-    reference = level[0] if state is None else state
+    spread = torch.as_tensor(spread, dtype=level.dtype, device=level.device)
+    reference = level[0] if state is None else check_level(state, level)
     counts = []
     for now in level[1:] if state is None else level:
         on, on_move = _mean_count((now - reference).clamp(min=0), theta_on, spread)

@@ -4,9 +4,10 @@ import torch
 from torch import Generator, Tensor, nn
 
 from codesign.errors import ShapeError
-from codesign.events.sensor.model import SensorModel
+from codesign.events.entry import check_layout, check_times
+from codesign.events.sensor.model import SensorModel, check_sensor
 from codesign.events.sensor.simulate import simulate
-from codesign.events.volumes.volume import from_stream
+from codesign.events.volumes.volume import check_bins, from_stream
 from codesign.types import EventVolume
 
 
@@ -18,7 +19,8 @@ class HardSensor(nn.Module):
 
     def __init__(self, sensor: SensorModel, bins: int):
         super().__init__()
-        self.sensor = sensor
+        check_bins(bins)
+        self.sensor = check_sensor(sensor)
         self.bins = bins
 
     @torch.no_grad()
@@ -28,6 +30,7 @@ class HardSensor(nn.Module):
         generator: one for all samples, which stand above one another as one tall sensor; None: seed 0.
         Raises: ShapeError for other shapes; DomainError as ``simulate``.
         """
+        check_layout(frames, 1)
         if frames.ndim != 4:
             raise ShapeError(f"the hard sensor takes frames [N, T, H, W], got {tuple(frames.shape)}.")
         count, times, height, width = frames.shape
@@ -35,7 +38,7 @@ class HardSensor(nn.Module):
         stream = simulate(
             tall, t_s, self.sensor, Generator().manual_seed(0) if generator is None else generator
         )
-        start_us, end_us = (round(float(t) * 1e6) for t in (t_s[0], t_s[-1]))
+        start_us, end_us = (round(float(time_s) * 1e6) for time_s in check_times(t_s, times)[[0, -1]])
         volume = from_stream(stream, start_us, end_us, self.bins)
         counts = volume.counts.reshape(2, self.bins, count, height, width).permute(2, 0, 1, 3, 4).contiguous()
         return EventVolume(counts, volume.centroid_s, volume.collected_s)

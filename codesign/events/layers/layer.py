@@ -10,13 +10,20 @@ from torch import Generator, Tensor, nn
 
 from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import check_layout, check_times
-from codesign.events.intensity import log_levels
-from codesign.events.layers.comparators import Comparator
-from codesign.events.layers.physical import DESIGN, sensor_counts
+from codesign.events.intensity import FrontEnd, log_levels
+from codesign.events.layers.comparators import Comparator, check_comparator
+from codesign.events.layers.physical import DESIGN, PhysicalState, sensor_counts
 from codesign.events.layers.positive import PositiveValues
 from codesign.events.level_path import finer, parts
 from codesign.events.low_pass import low_pass
-from codesign.events.sensor.model import SensorModel, draw_deviates, draw_shot_counts, mismatched
+from codesign.events.sensor.model import (
+    SensorModel,
+    check_generator,
+    check_sensor,
+    draw_deviates,
+    draw_shot_counts,
+    mismatched,
+)
 from codesign.events.volumes.surface import surface_from_counts
 from codesign.events.volumes.traces import check_tau
 from codesign.events.volumes.volume import check_bins, from_counts
@@ -46,12 +53,15 @@ class EventLayer(nn.Module):
         log_input: bool = False,
     ):
         super().__init__()
-        self.sensor = sensor or SensorModel()
-        self.log_input = log_input
+        self.sensor = SensorModel() if sensor is None else check_sensor(sensor)
+        self.log_input = FrontEnd(log_input).log_input
+        if isinstance(learn, str) or not isinstance(learn, Sequence):
+            raise DomainError(f"learn is {learn!r}; a list of names is needed, such as {THRESHOLDS}, or ().")
         for name in learn:
             if name not in self.learnable:
                 raise DomainError(
-                    f"a {type(self).__name__} cannot learn {name!r}; it learns {', '.join(self.learnable)}."
+                    f"a {type(self).__name__} cannot learn {name!r}, which has no gradient there; it learns "
+                    f"{', '.join(self.learnable)} (the layer 'physical' {', '.join(DESIGN)})."
                 )
             if getattr(self.sensor, name) <= 0:
                 raise DomainError(
@@ -193,6 +203,7 @@ class LayerState:
     comparator: state of the comparator. level, frame: [..., H, W] level behind the low-pass and last frame,
       None without a low-pass. deviates: [2, ..., H, W] standard normal numbers of the thresholds, None without
       mismatch. time_s: time of the last frame. generators: of the noise still to come, one per sample.
+    shape, dtype: of a frame [..., H, W].
     """
 
     comparator: Any
@@ -201,13 +212,16 @@ class LayerState:
     deviates: Tensor | None
     time_s: float
     generators: Sequence[Generator]
+    shape: torch.Size
+    dtype: torch.dtype
 
 
 class ComparatorLayer(EventLayer):
     """Low-pass (where the sensor has a bandwidth), thresholds (with mismatch), a comparator, noise events.
 
     Of the sensor it uses theta_on, theta_off, theta_sigma, cutoff_hz and shot_rate_hz (Poisson, as
-    ``draw_shot_counts``, without gradient); leak, dead time and hot pixels are those of ``PhysicalLayer``.
+    ``draw_shot_counts``, without gradient); leak, dead time, hot pixels and photoreceptor noise are those of
+    ``PhysicalLayer``: a sensor that has them is taken without, and a warning names them.
     comparator: one of ``events.layers.comparators``, or your own of the same call.
     """
 
@@ -215,13 +229,21 @@ class ComparatorLayer(EventLayer):
 
     def __init__(self, comparator: Comparator, sensor: SensorModel | None = None, **options: Any):
         super().__init__(sensor, **options)
+        check_comparator(comparator, self.sensor, self.learnt)
         self.comparator = comparator
         self.refines = getattr(comparator, "refines", False)
 
     def _count(self, frames, t_s, state, generators):
+        if state is not None and not isinstance(state, LayerState):
+            raise DomainError(f"the state is a {type(state).__name__}; pass what this layer returned.")
+        if state is not None and (state.shape, state.dtype) != (frames.shape[1:], frames.dtype):
+            raise ShapeError(
+                f"{frames.dtype} frames of {list(frames.shape[1:])} follow {state.dtype} frames of "
+                f"{list(state.shape)}; a sensor keeps its size and type, a batch its samples."
+            )
         times_s = _times(frames, t_s, None if state is None else state.time_s)
         if state is None:
-            state = LayerState(None, None, None, None, 0.0, generators)
+            state = LayerState(None, None, None, None, 0.0, generators, frames.shape[1:], frames.dtype)
         deviates, shots = self._noise(frames, times_s.diff(), state)
         seen, level = self._seen(frames, times_s.diff(), state)
         on, off = (None, None) if deviates is None else deviates
@@ -233,7 +255,9 @@ class ComparatorLayer(EventLayer):
             counts = counts + shots
         frame = None if level is None else frames[-1]
         time_s = float(times_s[-1])
-        return counts, LayerState(comparator, level, frame, deviates, time_s, state.generators)
+        return counts, replace(
+            state, comparator=comparator, level=level, frame=frame, deviates=deviates, time_s=time_s
+        )
 
     def _noise(self, frames, interval_s, state):
         """Deviates of the thresholds [2, ..., H, W] and noise events [T-1, 2, ..., H, W], None each where the
@@ -279,6 +303,14 @@ class PhysicalLayer(EventLayer):
 
     def _count(self, frames, t_s, state, generators):
         samples = frames.reshape(len(frames), -1, *frames.shape[-2:]).unbind(1)
+        if state is not None and not (
+            isinstance(state, tuple) and all(isinstance(before, PhysicalState) for before in state)
+        ):
+            raise DomainError(f"the state is a {type(state).__name__}; pass what this layer returned.")
+        if state is not None and len(state) != len(samples):
+            raise ShapeError(
+                f"{len(samples)} samples follow {len(state)}; a batch keeps its samples over the chunks."
+            )
         design = {name: self.value(name) for name in self.learnt}
         counts, states = zip(
             *(
@@ -311,8 +343,11 @@ def _generators(generator, batch):
     count = math.prod(batch)
     if generator is None:
         return [Generator().manual_seed(0) for _ in range(count)]
-    if isinstance(generator, Generator):
+    if isinstance(generator, Generator) or not isinstance(generator, Sequence):
+        check_generator(generator)
         return [generator] * count
+    for each in generator:
+        check_generator(each)
     if len(generator) != count:
         raise ShapeError(
             f"{len(generator)} generators are given for a batch of {count}; give one, or one per sample."

@@ -5,6 +5,8 @@ from collections.abc import Iterator, Mapping
 import torch
 from torch import Tensor, nn
 
+from codesign.events.entry import check_positive
+
 STEP = 0.1  # a unit step of a variable changes its value by a tenth: exp(0.1) - 1 = 10.5 %
 
 
@@ -16,6 +18,7 @@ class PositiveValues(nn.Module):
 
     def __init__(self, start: Mapping[str, float]):
         super().__init__()
+        start = {name: check_positive(value, name) for name, value in start.items()}
         zeros = [(name, nn.Parameter(torch.zeros((), dtype=torch.float64))) for name in start]
         self.raw = nn.ParameterDict(zeros)
         for name, value in start.items():  # buffers, so that what is saved is complete

@@ -1,12 +1,9 @@
 """The sigmoid per frame pair: the named baseline that the memory layer is measured against."""
 
-import math
-
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError
-from codesign.events.entry import check_theta
+from codesign.events.entry import check_positive, check_theta
 from codesign.events.intensity import log_levels
 
 GHOST_LOGIT = -5.0  # a pixel without change fires sigmoid(-5) = 0.67 % of an event per polarity and frame
@@ -37,8 +34,6 @@ def soft(
     """
     level = log_levels(frames, log_input, minimum=2)
     theta = check_theta(theta, "theta", level)
-    if sharpness is not None and not (0 < sharpness < math.inf):
-        raise DomainError(f"sharpness is {sharpness!r}; a finite number > 0 is needed (None gives 5/theta).")
-    k = -GHOST_LOGIT / theta if sharpness is None else sharpness
+    k = -GHOST_LOGIT / theta if sharpness is None else check_positive(sharpness, "sharpness")
     step = level.diff(dim=0)
     return torch.stack((torch.sigmoid(k * (step - theta)), torch.sigmoid(k * (-step - theta))), dim=1)

@@ -82,9 +82,14 @@ class SensorModel:
                 or value < 0
                 or (positive and value == 0)
             ):
+                hint = (
+                    "; for its gradient pass it to events.sensor_counts, or name it in learn of events.layer"
+                    if isinstance(value, Tensor)
+                    else ""
+                )
                 raise DomainError(
-                    f"SensorModel.{field.name} is {value!r}; a finite number "
-                    f"{'> 0' if positive else '>= 0'} is needed."
+                    f"SensorModel.{field.name} is {value!r} ({type(value).__name__}); a finite Python number "
+                    f"{'> 0' if positive else '>= 0'} is needed{hint}."
                 )
         if self.hot_pixel_share > 1:
             raise DomainError(
@@ -152,6 +157,24 @@ PRESETS = {
     "noisy": NOISY,
     "default": DAVIS,
 }  # v2e's presets and the defaults of its command line
+
+
+def check_sensor(sensor: object) -> SensorModel:
+    """Return ``sensor`` when it is a SensorModel; DomainError otherwise."""
+    if not isinstance(sensor, SensorModel):
+        raise DomainError(
+            f"the sensor is {sensor!r}; an events.SensorModel is needed, or one of events.PRESETS "
+            f"({', '.join(map(repr, PRESETS))})."
+        )
+    return sensor
+
+
+def check_generator(generator: object) -> None:
+    """Raise DomainError unless ``generator`` is a torch.Generator."""
+    if not isinstance(generator, Generator):
+        raise DomainError(
+            f"the generator is {generator!r}; a torch.Generator is needed: torch.Generator().manual_seed(0)."
+        )
 
 
 def draw_thresholds(

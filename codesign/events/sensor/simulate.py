@@ -11,9 +11,9 @@ from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import Times, check_frames, check_layout, check_times
 from codesign.events.intensity import FrontEnd, kernel_levels
 from codesign.events.sensor import crossing, v2e
-from codesign.events.sensor.model import SensorModel
+from codesign.events.sensor.model import SensorModel, check_generator, check_sensor
 from codesign.events.sensor.sinks import DenseCounts, EventKeys, KeyLayout
-from codesign.events.sensor.state import SensorState, begin
+from codesign.events.sensor.state import SensorState, begin, check_state
 from codesign.events.stream import ordered
 from codesign.types import EventStream
 
@@ -71,6 +71,7 @@ def simulate(
     ([2885, 5771, 8656], [1, 1, 1])
     """
     state = SensorState() if state is None else state
+    check_state(state, check_sensor(sensor))
     moved = replace(state)
     front_end = FrontEnd(log_input, log_eps)
     check_layout(frames, minimum=1)
@@ -116,12 +117,13 @@ def dense_counts(
     Args: as for ``simulate``, but frames: [T, ...]; timing "interpolated" only.
     Returns: [T-1, 2, ...] ([T, 2, ...] for a later chunk), ON first.
     """
-    if sensor.timing != "interpolated":
+    if check_sensor(sensor).timing != "interpolated":
         raise DomainError(
             f"dense counts come from timing 'interpolated', the sensor has {sensor.timing!r}; use simulate "
             "and to_counts."
         )
     state = SensorState() if state is None else state
+    check_state(state, sensor)
     moved = replace(state)
     front_end = FrontEnd(log_input, log_eps)
     frames, times_s, generator = _open(frames, t_s, sensor, generator, moved, front_end)
@@ -144,6 +146,7 @@ def _open(frames, t_s, sensor, generator, state, front_end):
     if state.generator is None:
         state.generator = torch.Generator().manual_seed(0)
     generator = state.generator if generator is None else generator
+    check_generator(generator)
     frames = frames.detach()
     if fresh:
         check_frames(frames[:1], 1, non_negative=not front_end.log_input)

@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from codesign.errors import DomainError
 from codesign.events.sensor.model import draw_leak_rates, draw_thresholds
 
 
@@ -46,6 +47,30 @@ class SensorState:
         """Name -> tensor of everything remembered per pixel (for storing)."""
         named = ((field.name, getattr(self, field.name)) for field in fields(self))
         return {name: value for name, value in named if isinstance(value, Tensor)}
+
+
+def check_state(state, sensor):
+    """Raise DomainError unless ``state`` is empty, or holds what the sensor carries on."""
+    if not isinstance(state, SensorState):
+        raise DomainError(f"the state is a {type(state).__name__}; an events.SensorState is needed.")
+    if state.level is None:
+        return
+    needs = {
+        "timing='interpolated'": ("reference_rest", sensor.timing == "interpolated"),
+        "a leak": ("leak_hz", sensor.leaks),
+        "a dead time": ("last_event_s", sensor.refractory_s > 0),
+        "a bandwidth": ("input_level", sensor.cutoff_hz > 0),
+        "noise events": ("input", sensor.has_shots),
+        "photoreceptor noise": ("noise", sensor.photoreceptor_noise),
+    }
+    lacks = [what for what, (name, asked) in needs.items() if asked and getattr(state, name) is None]
+    if sensor.timing == "v2e" and state.reference_rest is not None:
+        lacks.append("timing='v2e'")
+    if lacks:
+        raise DomainError(
+            f"the sensor has {' and '.join(lacks)}, the one that began the state had not; pass the sensor of "
+            "the first chunk, or an empty state."
+        )
 
 
 def begin(state, sensor, frame, level, time_s, generator):

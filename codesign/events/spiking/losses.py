@@ -5,6 +5,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
+from codesign.events.entry import check_whole
 from codesign.events.spiking.srm_scale import alpha_response
 
 
@@ -37,6 +38,7 @@ def count_loss(found: Tensor, target: Tensor, *, side_px: int = 8, steps: int = 
     Raises: ShapeError when the two differ in shape or hold no whole block.
     """
     _difference(found, target)
+    side_px, steps = check_whole(side_px, "side_px"), check_whole(steps, "steps")
     if min(side_px, steps) < 1 or len(found) < steps or min(found.shape[-2:]) < side_px:
         raise ShapeError(
             f"blocks of {steps} steps and {side_px} x {side_px} px do not fit into counts of shape "
@@ -52,6 +54,11 @@ def _pooled(counts, side_px, steps):
 
 
 def _difference(found, target):
+    for counts in (found, target):
+        if not isinstance(counts, Tensor):
+            raise DomainError(
+                f"counts are {type(counts).__name__}; tensors [T, 2, ...] are needed, ON first."
+            )
     if found.shape != target.shape:
         raise ShapeError(
             f"counts of shape {list(found.shape)} and {list(target.shape)} have no distance; give the same "

@@ -4,8 +4,9 @@ networks take them."""
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.events.stream import ordered
+from codesign.errors import DomainError, ShapeError
+from codesign.events.entry import check_counts, check_whole
+from codesign.events.stream import check_stream, ordered
 from codesign.types import EventStream
 
 
@@ -27,9 +28,10 @@ def spikes_from_stream(
     Source: layout of Gehrig et al., Event-Based Angular Velocity Regression with Spiking Networks, ICRA 2020,
       and of SLAYER (Shrestha, Orchard 2018).
     """
-    t0_us = _whole(t0_us, "t0_us")
-    step_us = _whole(step_us, "step_us", 1)
-    steps = _whole(steps, "steps", 1)
+    t0_us = check_whole(t0_us, "t0_us")
+    step_us = check_whole(step_us, "step_us", 1)
+    steps = check_whole(steps, "steps", 1)
+    check_stream(stream)
     step = torch.div(stream.t_us - t0_us, step_us, rounding_mode="floor")
     inside = (step >= 0) & (step < steps)
     shape = (2, stream.width_px, stream.height_px, steps)
@@ -46,8 +48,8 @@ def stream_from_spikes(spikes: Tensor, t0_us: int, step_us: int) -> EventStream:
       spikes: [2, W, H, T] of 0 and 1, ON first. t0_us, step_us: as for ``spikes_from_stream``.
     Raises: ShapeError for another shape; DomainError for values other than 0 and 1.
     """
-    t0_us = _whole(t0_us, "t0_us")
-    step_us = _whole(step_us, "step_us", 1)
+    t0_us = check_whole(t0_us, "t0_us")
+    step_us = check_whole(step_us, "step_us", 1)
     if spikes.ndim != 4 or spikes.shape[0] != 2 or 0 in spikes.shape:
         raise ShapeError(f"spikes have shape {list(spikes.shape)}; [2, W, H, T] is needed (ON first).")
     if not bool(((spikes == 0) | (spikes == 1)).all()):
@@ -66,21 +68,7 @@ def spikes_from_counts(counts: Tensor) -> Tensor:
     Gradient: counts up to and including 1; none above.
     Raises: ShapeError for another shape; DomainError for counts that are negative or not finite.
     """
-    if counts.ndim != 4 or counts.shape[1] != 2 or 0 in counts.shape:
-        raise ShapeError(
-            f"counts have shape {list(counts.shape)}; [T, 2, H, W] is needed (ON first on axis 1)."
-        )
-    check_finite(counts, "counts")
-    if bool((counts < 0).any()):
-        raise DomainError(
-            f"counts reach down to {float(counts.detach().min()):g}; numbers of events are 0 or more."
-        )
+    check_counts(counts, non_negative=True)
+    if counts.ndim != 4:
+        raise ShapeError(f"counts have shape {list(counts.shape)}; [T, 2, H, W] is needed, without a batch.")
     return counts.clamp(max=1).permute(1, 3, 2, 0).contiguous()
-
-
-def _whole(value, name, least=None):
-    if isinstance(value, bool) or int(value) != value or (least is not None and value < least):
-        raise DomainError(
-            f"{name} is {value!r}; a whole number{'' if least is None else f' >= {least}'} is needed."
-        )
-    return int(value)

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.events.entry import Times, check_times
+from codesign.events.entry import Times, check_counts, check_times
+from codesign.events.stream import check_stream
 from codesign.events.volumes.traces import check_tau, segments
 from codesign.types import EventStream
 
@@ -31,6 +32,7 @@ def surface_from_stream(
     Source: Lagorce et al., HOTS, PAMI 2017, eq. 2 and 3.
     """
     check_tau(tau_s)
+    check_stream(stream)
     height = stream.height_px
     width = stream.width_px
     last_us = torch.full((2 * height * width,), NEVER_US, device=stream.t_us.device)
@@ -77,6 +79,8 @@ def surface_from_times(
             f"t_s, x, y, p are {given}; four lists of equal length are needed, t_s of floating-point seconds."
         )
     check_finite(t_s, "t_s")
+    if any(values.is_floating_point() for values in (x, y, p)):
+        raise DomainError("x, y and p hold fractions; tensors of whole numbers are needed.")
     outside = (x < 0) | (x >= width_px) | (y < 0) | (y >= height_px) | (p.abs() != 1)
     if bool(outside.any()):
         at = int(outside.nonzero()[0])
@@ -121,15 +125,7 @@ def surface_from_counts(counts: Tensor, t_s: Times, tau_s: float) -> Tensor:
     Raises: ShapeError, DomainError as ``from_counts``; DomainError for negative counts and for tau.
     """
     check_tau(tau_s)
-    if counts.ndim < 4 or counts.shape[0] < 1 or counts.shape[1] != 2:
-        raise ShapeError(
-            f"counts have shape {list(counts.shape)}; [T-1, 2, ..., H, W] is needed (ON first on axis 1)."
-        )
-    check_finite(counts, "counts")
-    if bool((counts < 0).any()):
-        raise DomainError(
-            f"counts reach down to {float(counts.detach().min()):g}; numbers of events are 0 or more."
-        )
+    check_counts(counts, non_negative=True)
     fade = torch.exp(check_times(t_s, len(counts) + 1).diff() / -tau_s).tolist()
     share = counts.clamp(max=1)
     surface = torch.zeros_like(counts[0])

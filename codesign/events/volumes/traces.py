@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import Times, check_times
+from codesign.events.entry import Times, check_layout, check_positive, check_times
+from codesign.events.stream import check_stream
 from codesign.types import EventStream
 
 
@@ -22,6 +23,7 @@ def decay(counts: Tensor, t_s: Times, tau_s: float) -> Tensor:
     Gradient: counts (the sum is linear in them).
     """
     check_tau(tau_s)
+    check_layout(counts, 1, name="counts")
     fade = torch.exp(check_times(t_s, len(counts) + 1).diff() / -tau_s).tolist()
     trace = torch.zeros_like(counts[0])
     traces = []
@@ -55,6 +57,7 @@ def decay_from_stream(
       a trace of another size.
     """
     check_tau(tau_s)
+    check_stream(stream)
     height = stream.height_px
     width = stream.width_px
     trace = torch.zeros(2 * height * width, dtype=torch.float64, device=stream.t_us.device)
@@ -84,7 +87,10 @@ def segments(stream, at_us):
     A cell is the place of (polarity, row, column) in a flattened [2, H, W]. Raises: DomainError for times
     that are not whole or do not increase.
     """
-    times_us = torch.as_tensor(at_us)
+    try:
+        times_us = torch.as_tensor(at_us)
+    except (TypeError, ValueError, RuntimeError):
+        times_us = torch.empty(0)
     if (
         times_us.ndim != 1
         or not len(times_us)
@@ -104,5 +110,4 @@ def segments(stream, at_us):
 
 def check_tau(tau_s):
     """Raise DomainError unless a fading time is a finite number of seconds > 0."""
-    if not (0 < tau_s < math.inf):
-        raise DomainError(f"tau_s is {tau_s!r}; a finite time > 0 s is needed.")
+    check_positive(tau_s, "tau_s", " s")

@@ -8,8 +8,9 @@ only: half as much as the others, centred a third of a node spacing inside.
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.events.entry import Times, check_times
+from codesign.errors import DomainError
+from codesign.events.entry import Times, check_counts, check_times, check_whole
+from codesign.events.stream import check_stream
 from codesign.types import EventStream, EventVolume
 
 
@@ -58,12 +59,7 @@ def from_counts(counts: Tensor, t_s: Times, bins: int) -> EventVolume:
     >>> volume.counts.shape, volume.counts[0, 0, :, 0, 0].tolist()  # the end bins collect from one side
     (torch.Size([1, 2, 3, 4, 6]), [2.0, 4.0, 2.0])
     """
-    if counts.ndim < 4 or counts.shape[0] < 1 or counts.shape[1] != 2:
-        raise ShapeError(
-            f"counts have shape {list(counts.shape)}; [T-1, 2, H, W] or [T-1, 2, K, H, W] is needed (ON "
-            "first on axis 1)."
-        )
-    check_finite(counts, "counts")
+    check_counts(counts)
     times_s = check_times(t_s, counts.shape[0] + 1)
     middle_s = (times_s[1:] + times_s[:-1]) / 2 - times_s[0]
     shares = bin_shares(middle_s / (times_s[-1] - times_s[0]), bins)
@@ -104,7 +100,8 @@ def from_stream(
     >>> events.from_stream(stream, 0, 10_000, bins=2).counts[0, 0, :, 0, 0]  # shared with the ends in time
     tensor([1.2688, 1.7312])
     """
-    if int(t0_us) != t0_us or int(t1_us) != t1_us or t1_us <= t0_us:
+    check_stream(stream, slice(0))
+    if check_whole(t1_us, "end of the interval t1_us") <= check_whole(t0_us, "start of the interval t0_us"):
         raise DomainError(
             f"the interval is {t0_us!r} to {t1_us!r} us; whole microseconds with t1 > t0 are needed."
         )
@@ -113,6 +110,7 @@ def from_stream(
     first, last = torch.searchsorted(
         stream.t_us, torch.tensor([int(t0_us), int(t1_us) + 1], device=stream.t_us.device)
     ).tolist()
+    check_stream(stream, slice(first, last))
     t_us, x, y, p = (column[first:last] for column in (stream.t_us, stream.x, stream.y, stream.p))
     height = stream.height_px
     width = stream.width_px
