@@ -35,19 +35,20 @@ def maps(on, off, beginning, gradient):
 def jobs(quick):
     rates = (60,) if quick else (60, 240, 1000)
     return [
-        (on, off, beginning, rate_hz)
+        (on, off, beginning, rate_hz, gradient)
         for on, off in PAIRS[: 1 if quick else None]
         for beginning in BEGINNINGS
         for rate_hz in rates
+        for gradient in GRADIENTS[: 2 if rate_hz == 240 else 1]
     ]
 
 
-def measure(cases, on, off, beginning, rate_hz):
-    layer, truth = maps(on, off, beginning)
+def measure(cases, on, off, beginning, rate_hz, gradient):
+    layer, truth = maps(on, off, beginning, gradient)
     sections = SECTIONS if rate_hz <= 240 else case.SECTIONS
     for direction in DIRECTIONS if rate_hz == 240 else FEW:
         found = compare.pairs(cases, rate_hz, direction, layer, truth, sections)
-        yield compare.row((f"{on}/{off}", beginning, direction.name, f"{rate_hz}fps"), found)
+        yield compare.row((f"{on}/{off}", gradient, beginning, direction.name, f"{rate_hz}fps"), found)
 
 
 def curve_jobs(quick):
@@ -70,7 +71,7 @@ TEXT = (
     "Without a history a pixel's level begins anywhere from half a threshold below its memorised level to half a "
     "threshold above. With one it comes from far above or far below, turns anywhere near its first level, and goes to it; "
     "the layer is given the same frames. The exact gradient is that of the mean count itself, whose slopes beat against "
-    "the thresholds: over 24 places and few pixels that is noise. The play is smooth, and off where swings are small."
+    "the thresholds: over some dozens of places and few pixels that is noise. The play is smooth, and off where swings are small."
 )
 TOPIC = Topic(
     "Unequal thresholds: textures",
