@@ -49,10 +49,10 @@ def one_pole(level: Tensor, pace: Tensor, start: Tensor | None = None) -> Tensor
     Raises: ShapeError when there are not as many paces as intervals; DomainError for levels of another type.
     """
     check_layout(level, name="levels")
-    if pace.ndim == 0 or len(pace) != len(level) - 1:
+    if not 1 <= pace.ndim <= level.ndim or len(pace) != len(level) - 1:
         raise ShapeError(
             f"pace has shape {list(pace.shape)} for {len(level)} levels; one per interval is needed, "
-            f"[{len(level) - 1}, ...]."
+            f"[{len(level) - 1}, ...] of at most {level.ndim} axes."
         )
     filtered = [level[0] if start is None else start]
     steps = zip(level[:-1], level[1:], *coefficients(pace, torch.exp, torch.where), strict=True)

@@ -44,6 +44,10 @@ TAKE_COUNTS = {
 }
 
 
+def designed(**design):
+    return events.sensor_counts(FRAMES, T_S, SensorModel(), **design)
+
+
 def stream_of(t_us=(5, 9), x=(1, 2), y=(3, 0), p=(1, -1)):
     return EventStream(*(torch.tensor(column) for column in (t_us, x, y, p)), 4, 6)
 
@@ -178,6 +182,33 @@ WRONG = {
         lambda: layer("expected", SensorModel(theta_sigma=0.03), learn=("theta_sigma",)),
         "theta_sigma has no gradient in the comparator Expected",
     ),
+    "pictures of counts": (lambda: events.picture([1]), "counts are list"),
+    "full scale": (lambda: events.picture(COUNTS, full_scale="x"), "full_scale"),
+    "pictures per second": (lambda: events.write_video("e.gif", [], "x"), "fps"),
+    "frames of nothing": (lambda: events.open_frames(None), "the path is None"),
+    "pixels": (
+        lambda: events.draw_thresholds(SensorModel(theta_sigma=0.1), 4, torch.Generator()),
+        "pixels is 4",
+    ),
+    "intervals": (
+        lambda: events.draw_shot_counts(SensorModel(), (2, 2), "x", torch.Generator()),
+        "interval_s is 'x'",
+    ),
+    "axes of a pace": (lambda: events.one_pole(FRAMES[:, 0, 0], torch.ones(4, 1, 1)), "at most 1 axes"),
+    "state of Spike-ESIM": (lambda: events.SpikeEsim()(FRAMES, T_S, state=3), "the state is a int"),
+    "design of a leak": (lambda: designed(leak_rate_hz=torch.tensor(0.1)), "'leak_rate_hz' cannot carry"),
+    "design of each pixel": (
+        lambda: designed(theta_on=torch.full((4, 6), 0.2)),
+        r"theta_on is .* \[4, 6\]; one",
+    ),
+    "design of text": (lambda: designed(cutoff_hz="x"), "cutoff_hz"),
+    **{
+        f"{name} that is switched off": (
+            lambda name=name: designed(**{name: torch.tensor(0.0, requires_grad=True)}),
+            f"{name} is 0, which switches it off",
+        )
+        for name in ("theta_sigma", "cutoff_hz", "refractory_s")
+    },
     "comparator": (lambda: events.ComparatorLayer(None), "the comparator is None"),
 }
 STREAM_INTS = (STREAM.x[:1], STREAM.y[:1], STREAM.p[:1])

@@ -7,12 +7,11 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from codesign.errors import DomainError
 from codesign.events.entry import Times, check_frames, check_times
 from codesign.events.intensity import FrontEnd
 from codesign.events.layers.memory import memory
 from codesign.events.low_pass import low_pass
-from codesign.events.sensor.model import SensorModel, mismatched
+from codesign.events.sensor.model import SensorModel, mismatched, with_design
 from codesign.events.sensor.simulate import dense_counts
 from codesign.events.sensor.state import SensorState
 
@@ -68,15 +67,7 @@ def sensor_counts(
     Raises: DomainError for other names in ``design`` or values outside the sensor's domain, and as
       ``simulate``.
     """
-    unknown = set(design) - set(DESIGN)
-    if unknown:
-        raise DomainError(
-            f"{sorted(unknown)} cannot carry a gradient; design variables of the sensor are "
-            f"{', '.join(DESIGN)}."
-        )
-    hard_sensor = replace(
-        sensor, **{name: float(torch.as_tensor(value).detach()) for name, value in design.items()}
-    )
+    hard_sensor = with_design(sensor, design, DESIGN)
     value: dict[str, Any] = {name: design.get(name, getattr(sensor, name)) for name in DESIGN}
     check_frames(frames, 2 if state is None else 1, non_negative=not log_input)
     times_s = check_times(t_s, len(frames))

@@ -2,13 +2,14 @@
 layers share."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+import operator
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Generator, Tensor
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError, ShapeError, as_number
 
 THETA_MINIMUM = 0.01  # no drawn threshold falls below, as in v2e
 TIMINGS = ("interpolated", "v2e")
@@ -169,6 +170,34 @@ def check_sensor(sensor: object) -> SensorModel:
     return sensor
 
 
+def with_design(
+    sensor: SensorModel, design: Mapping[str, Tensor | float], allowed: Sequence[str]
+) -> SensorModel:
+    """The sensor with the numbers of design variables in place of its own.
+
+    Args: design: numbers or 0-dim tensors by name. allowed: names that may carry a gradient.
+    Raises: DomainError for another name, a value that is no number or outside the sensor's domain, and one of 0
+      that requires a gradient: what is switched off has none.
+    """
+    values = {}
+    for name, value in design.items():
+        if name not in allowed:
+            raise DomainError(
+                f"{name!r} cannot carry a gradient; design variables of the sensor are {', '.join(allowed)}."
+            )
+        if isinstance(value, Tensor) and (value.ndim or value.is_complex()):
+            raise DomainError(
+                f"{name} is {value.dtype} {list(value.shape)}; one real number, a 0-dim tensor, is needed."
+            )
+        values[name] = as_number(value.detach() if isinstance(value, Tensor) else value, name)
+        if isinstance(value, Tensor) and value.requires_grad and values[name] == 0:
+            raise DomainError(
+                f"{name} is 0, which switches it off, and requires a gradient, which is then none; start above "
+                "0."
+            )
+    return replace(check_sensor(sensor), **values)
+
+
 def check_generator(generator: object) -> None:
     """Raise DomainError unless ``generator`` is a torch.Generator."""
     if not isinstance(generator, Generator):
@@ -194,7 +223,8 @@ def draw_thresholds(
       to 0.01; first all ON, then all OFF.
     Source: v2e (Hu et al., CVPR-W 2021), threshold mismatch.
     """
-    nominal = (sensor.theta_on, sensor.theta_off)
+    nominal = (check_sensor(sensor).theta_on, sensor.theta_off)
+    pixels = _shape(pixels)
     if sensor.theta_sigma == 0:
         return tuple(torch.tensor(theta, dtype=dtype, device=device).expand(pixels) for theta in nominal)
     deviates = draw_deviates(pixels, generator, dtype=dtype)
@@ -209,7 +239,7 @@ def draw_deviates(
 ) -> Tensor:
     """Standard normal numbers behind the thresholds of every pixel, [2, *pixels] on the generator's device:
     first all ON, then all OFF."""
-    shape = tuple(pixels)
+    shape = _shape(pixels)
     return torch.stack(
         [torch.randn(shape, generator=generator, dtype=dtype, device=generator.device) for _ in range(2)]
     )
@@ -271,7 +301,12 @@ def draw_shot_counts(
         draws; untouched when the rate is 0.
     Returns: [T-1, 2, *pixels] whole numbers >= 0, ON first.
     """
-    interval_s = torch.as_tensor(interval_s, dtype=torch.float64)
+    check_generator(generator)
+    pixels = _shape(pixels)
+    try:
+        interval_s = torch.as_tensor(interval_s, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        raise DomainError(f"interval_s is {interval_s!r}; a list of lengths in seconds is needed.") from None
     if interval_s.ndim != 1:
         raise ShapeError(
             f"interval_s has shape {list(interval_s.shape)}; one length per interval is needed, [T-1]."
@@ -289,3 +324,11 @@ def draw_shot_counts(
         for index, length_s in enumerate(interval_s.tolist()):
             counts[index] = torch.poisson(rate_hz * length_s, generator=generator).to(counts)
     return counts
+
+
+def _shape(pixels):
+    """A shape as a tuple of whole numbers."""
+    try:
+        return tuple(operator.index(side) for side in pixels)
+    except TypeError:
+        raise DomainError(f"pixels is {pixels!r}; the shape of one frame is needed, (H, W).") from None

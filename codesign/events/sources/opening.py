@@ -25,6 +25,10 @@ def open_frames(path: str | Path) -> FrameSource:
     # readers are imported when they are asked for, with the decoders that they need
     from codesign.events.sources import folder, mraw, stack, video
 
+    if not isinstance(path, (str, Path)):
+        raise FileFormatError(
+            f"the path is {path!r} ({type(path).__name__}); a str or pathlib.Path is needed."
+        )
     path = Path(path)
     if path.is_dir():
         return folder.open_folder(path)

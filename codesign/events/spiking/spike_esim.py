@@ -235,6 +235,8 @@ def _checked(frames, t_s, state):
     times_s = check_times(t_s, len(frames))
     if state is None:
         return frames, times_s
+    if not isinstance(state, SpikeEsimState):
+        raise DomainError(f"the state is a {type(state).__name__}; pass the one that was returned.")
     if state.frame.shape != frames.shape[1:] or state.frame.dtype != frames.dtype:
         given = f"{frames.dtype} {list(frames.shape[1:])}"
         wanted = f"{state.frame.dtype} {list(state.frame.shape)}"

@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from codesign.atomic import replacing
-from codesign.errors import DomainError, FileFormatError, ShapeError
+from codesign.errors import DomainError, FileFormatError, ShapeError, as_number
 from codesign.events.entry import Times
 from codesign.events.stream import to_counts
 from codesign.events.views.view import picture
@@ -39,7 +39,7 @@ def write_video(path: str | Path, pictures: Iterable[Any], fps: float) -> None:
       for anything but such pictures.
     """
     path = Path(path)
-    if not 0 < fps <= 1000:
+    if not 0 < as_number(fps, "fps") <= 1000:
         raise DomainError(f"fps is {fps!r}; pictures per second, above 0 and up to 1000, are needed.")
     if path.suffix.lower() not in (".mp4", ".gif"):
         raise FileFormatError(f"{path} ends in {path.suffix or 'nothing'!r}; videos end in .mp4 or .gif.")
