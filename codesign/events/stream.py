@@ -14,14 +14,18 @@ def ordered(t_us: Tensor, x: Tensor, y: Tensor, p: Tensor, height_px: int, width
     """EventStream of the given events, sorted by (t, y, x, p).
 
     Args:
-      t_us, x, y, p: [N] integer tensors: microseconds, column, row, polarity +1 or -1.
+      t_us, x, y, p: [N] tensors of whole numbers: microseconds, column, row, polarity +1 or -1.
       height_px, width_px: sensor size.
-    Raises: ShapeError when lengths differ; DomainError for events outside the sensor or another polarity.
+    Raises: ShapeError when lengths differ; DomainError for fractions, events outside the sensor or another
+      polarity.
     """
     for values, name in ((t_us, "t_us"), (x, "x"), (y, "y"), (p, "p")):
-        if not isinstance(values, Tensor) or values.is_floating_point() or values.is_complex():
+        if not isinstance(values, Tensor) or values.is_complex():
             given = values.dtype if isinstance(values, Tensor) else type(values).__name__
-            raise DomainError(f"{name} is {given}; a tensor of whole numbers is needed: round it first.")
+            raise DomainError(f"{name} is {given}; a tensor of whole numbers is needed.")
+        if values.is_floating_point() and bool((values != values.round()).any()):
+            first = float(values[values != values.round()][0])
+            raise DomainError(f"{name} holds {first!r}; whole numbers are needed: round them first.")
     t_us, x, y, p = (values.to(torch.int64) for values in (t_us, x, y, p))
     if not (t_us.shape == x.shape == y.shape == p.shape == (t_us.numel(),)):
         raise ShapeError(

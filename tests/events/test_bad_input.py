@@ -135,7 +135,7 @@ def test_streams_that_are_none(tmp_path, stream, words):
 
 
 WRONG = {
-    "fractions as times": (lambda: ordered(torch.ones(1), *STREAM_INTS, 4, 6), "t_us is torch.float32"),
+    "fractions as times": (lambda: ordered(torch.full((1,), 0.5), *STREAM_INTS, 4, 6), "t_us holds 0.5"),
     "no streams": (lambda: events.concatenate(None), "None"),
     "path": (lambda: events.read(3), "the path is 3"),
     "height": (lambda: events.read("e.npz", height_px="4"), "height_px"),
