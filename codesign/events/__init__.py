@@ -35,6 +35,7 @@ from codesign.events.stream import concatenate, to_counts
 from codesign.events.upsampling.upsample import upsample, upsample_stream
 from codesign.events.views.video import decay_video, write_video
 from codesign.events.views.view import gray_picture, picture, rates
+from codesign.events.volumes.hard_surface import surface_from_hard_counts
 from codesign.events.volumes.spikes import spikes_from_counts, spikes_from_stream, stream_from_spikes
 from codesign.events.volumes.surface import surface_from_counts, surface_from_stream, surface_from_times
 from codesign.events.volumes.traces import decay, decay_from_stream
@@ -96,6 +97,7 @@ __all__ = [
     "srm",
     "stream_from_spikes",
     "surface_from_counts",
+    "surface_from_hard_counts",
     "surface_from_stream",
     "surface_from_times",
     "to_counts",

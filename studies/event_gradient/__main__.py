@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from codesign.errors import DomainError
-from studies.event_gradient import flow_of_events, layers, pointwise, sensors, thresholds
+from studies.event_gradient import flow_of_events, layers, pointwise, sensors, thresholds, timing
 from studies.event_gradient.case import DIRECTIONS, Case
 from studies.event_gradient.compare import Row
 from studies.event_gradient.topic import Topic, label
@@ -31,6 +31,7 @@ TOPICS: dict[str, Topic] = {
     "pointwise": pointwise.TOPIC,
     "sensors": sensors.TOPIC,
     "flow": flow_of_events.TOPIC,
+    "timing": timing.TOPIC,
 }
 
 

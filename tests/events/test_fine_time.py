@@ -228,3 +228,40 @@ def test_what_does_not_fit_is_refused():
         layer.surface(frames, [0.0, 1.0, 2.0], 0)
     with pytest.raises(DomainError, match="intensities are 0 or more"):
         layer.volume(-frames, [0.0, 1.0, 2.0], 5)
+
+
+def test_a_surface_of_hard_counts_is_that_of_the_stream():
+    generator = torch.Generator().manual_seed(2)
+    counts = (torch.rand(30, 2, 3, 4, 5, generator=generator, dtype=D) * 1.3).floor()
+    t_s = torch.linspace(0, 0.3, 31, dtype=D)
+    found = events.surface_from_hard_counts(counts, t_s, t_s[[10, 11, 30]], 0.05)
+    torch.testing.assert_close(found, events.surface_from_counts(counts, t_s, 0.05)[[9, 10, 29]])
+
+
+@pytest.mark.parametrize("move", MOVES)
+def test_a_surface_steers_as_the_mean_over_beginnings(move):
+    """Against the stream of single events, from forty intervals: what the gradient of the surface itself is worth."""
+    tau_s = 0.03
+
+    def surface(level):
+        stream = events.simulate(level, times(1000), SENSOR, log_input=True)
+        found = events.surface_from_stream(stream, [50_000, 100_000], tau_s, dtype=D)
+        return found[:, :, 0] @ GROUPS.T
+
+    step = 0.2  # wide: a surface is the last event alone, so pixels are few for its noise
+    truth = (surface(MOVES[move](1000, step)) - surface(MOVES[move](1000, -step))) / (2 * step)
+    level = waves(40).requires_grad_()
+    found = events.layer("memory", SENSOR, log_input=True).surface(level, times(40), tau_s)[[19, 39]]
+    tangent = (MOVES[move](40, step) - MOVES[move](40, -step)) / (2 * step)
+    slopes = [
+        (torch.autograd.grad(one, level, retain_graph=True)[0] * tangent).sum()
+        for one in (found[:, :, 0] @ GROUPS.T).flatten()
+    ]
+    cosine, scale = cosine_and_scale(torch.stack(slopes), truth.flatten())
+    assert cosine >= 0.9
+    assert 0.8 <= scale <= 1.25
+
+
+def test_shares_of_events_are_no_hard_counts():
+    with pytest.raises(DomainError, match=r"counts hold 0\.5; whole numbers of events are needed"):
+        events.surface_from_hard_counts(torch.full((2, 2, 1, 1), 0.5), times(2), [0.1], 0.02)

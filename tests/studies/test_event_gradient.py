@@ -9,7 +9,7 @@ import torch
 
 from codesign import events
 from studies.event_gradient import __main__ as study
-from studies.event_gradient import compare, curves, judge, sensors
+from studies.event_gradient import case, compare, curves, judge, sensors, timing
 from studies.frame.run import main
 
 T_S = torch.tensor([0.0, 0.01, 0.02], dtype=torch.float64)
@@ -163,3 +163,26 @@ def test_a_physical_layer_and_its_judge_draw_the_same_thresholds():
     # the mean over evenly spread places is off by at most one of them for every place where the count jumps
     jumps = ((on + off) / 2 / on).ceil()
     assert ((truth(frames, T_S)[0] - exact).abs() <= jumps / judge.BEGINNINGS + 0.001).all()
+
+
+def test_the_timing_judge_sees_what_the_stream_shows(generator):
+    """Sums, volume and surface at the end, from counts per tenth of a millisecond, beside those of single events."""
+    level = 4 + 0.3 * torch.randn(3, 4, 4, generator=generator, dtype=torch.float64).cumsum(0)
+    t_s = case.times(timing.TRUTH_HZ)
+    share = torch.linspace(0, 2, len(t_s), dtype=torch.float64)
+    path = torch.cat(
+        [torch.lerp(level[k], level[k + 1], (share[share.floor() == k] - k)[:, None, None]) for k in (0, 1)]
+        + [level[2:]]
+    )
+    counts = events.dense_counts(path, t_s, timing.SENSOR, log_input=True)
+    stream = events.simulate(path, t_s, timing.SENSOR, log_input=True)
+    found = timing.observed(counts[:, :, None], t_s, timing.hard_surface)[:, 0]
+    end_us = round(case.DURATION_S * 1e6)
+    volume = events.from_stream(stream, 0, end_us, timing.BINS, dtype=torch.float64).counts[0]
+    surface = events.surface_from_stream(stream, [end_us], timing.TAU_S, dtype=torch.float64)[0]
+    assert torch.equal(found[:2], volume.sum(1).round())
+    # times are off by at most half a tenth of a millisecond
+    assert (
+        float((found[2:-2] - volume.flatten(0, 1)).abs().max()) <= float(volume.sum(1).max()) * 5e-5 / 0.025
+    )
+    assert float((found[-2:] - surface).abs().max()) <= 5.1e-5 / timing.TAU_S

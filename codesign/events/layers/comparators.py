@@ -5,6 +5,7 @@ frames [T, ...] give counts [T-1, 2, ...], ON first, and with a state of an earl
 ``mismatched`` says whether it takes the thresholds of every pixel, or the nominal ones. ``refines`` says
 whether it may be asked between frames, for the times of events: whether it counts the same events, or more of
 the sensor's, the more often it looks. Without it the events of an interval are spread evenly.
+``whole`` says whether it counts whole events.
 """
 
 import warnings
@@ -36,6 +37,9 @@ class Comparator(Protocol):
     @property
     def refines(self) -> bool: ...
 
+    @property
+    def whole(self) -> bool: ...
+
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Any, log_input: bool, /
     ) -> tuple[Tensor, Any]: ...
@@ -48,6 +52,7 @@ class Sigmoid:
     sharpness: float | None = None
     mismatched = False
     refines = False
+    whole = False
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -64,6 +69,7 @@ class SoftCounts:
 
     mismatched = True
     refines = True
+    whole = False
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -79,6 +85,7 @@ class Dense:
     sharpness: float = 5.0
     mismatched = True
     refines = False
+    whole = True
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -93,6 +100,7 @@ class Memory:
     gradient: str | None = None
     mismatched = True
     refines = True
+    whole = True
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -108,6 +116,7 @@ class Expected:
     spread: float = 0.15
     mismatched = False
     refines = False
+    whole = False
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
@@ -124,6 +133,7 @@ class Spikes:
     gradient: str = "play"
     mismatched = True
     refines = True
+    whole = True
 
     def __post_init__(self):
         if self.gradient not in GRADIENTS:

@@ -24,6 +24,7 @@ from codesign.events.sensor.model import (
     draw_shot_counts,
     mismatched,
 )
+from codesign.events.volumes.hard_surface import surface_from_hard_counts
 from codesign.events.volumes.surface import surface_from_counts
 from codesign.events.volumes.traces import check_tau
 from codesign.events.volumes.volume import check_bins, from_counts
@@ -44,6 +45,7 @@ class EventLayer(nn.Module):
 
     learnable: tuple[str, ...] = ()
     refines = False  # whether it may be asked between frames, see ``events.layers.comparators``
+    whole = False  # whether it counts whole events
 
     def __init__(
         self,
@@ -181,15 +183,21 @@ class EventLayer(nn.Module):
         """Time surface at every frame but the first, each event near its own time (``finely``).
 
         Args: as for ``forward``. tau_s: time in which the surface fades to 1/e, seconds, > 0.
-        Returns: [..., T-1, 2, H, W] in 0 to 1, ON first, see ``events.surface_from_counts``.
-        Gradient: as ``surface_from_counts`` of these counts.
+        Returns: [..., T-1, 2, H, W] in 0 to 1, ON first.
+        Gradient: of layers that count whole events as ``surface_from_hard_counts`` of these counts, of others as
+          ``surface_from_counts``.
         Raises: as ``forward``; DomainError for tau.
         """
         check_tau(tau_s)
         counts, times_s = self.finely(frames, t_s, tau_s / PARTS_PER_TAU, generator)
-        surface = surface_from_counts(counts.movedim((-4, -3), (0, 1)), times_s, tau_s)
-        at = torch.searchsorted(times_s, check_times(t_s, frames.shape[-3])[1:]) - 1  # parts end at frames
-        return surface[at.to(surface.device)].movedim((0, 1), (-4, -3))
+        counts = counts.movedim((-4, -3), (0, 1))
+        given_s = check_times(t_s, frames.shape[-3])[1:]
+        if self.refines and self.whole:
+            surface = surface_from_hard_counts(counts, times_s, given_s, tau_s)
+        else:
+            at = torch.searchsorted(times_s, given_s) - 1  # parts end at frames
+            surface = surface_from_counts(counts, times_s, tau_s)[at.to(counts.device)]
+        return surface.movedim((0, 1), (-4, -3))
 
     def _count(self, frames, t_s, state, generators):
         """Counts [T-1, 2, ..., H, W] of frames [T, ..., H, W], and the state to carry on."""
@@ -232,6 +240,7 @@ class ComparatorLayer(EventLayer):
         check_comparator(comparator, self.sensor, self.learnt)
         self.comparator = comparator
         self.refines = getattr(comparator, "refines", False)
+        self.whole = getattr(comparator, "whole", False)
 
     def _count(self, frames, t_s, state, generators):
         if state is not None and not isinstance(state, LayerState):
@@ -300,6 +309,7 @@ class PhysicalLayer(EventLayer):
 
     learnable = DESIGN
     refines = True
+    whole = True
 
     def _count(self, frames, t_s, state, generators):
         samples = frames.reshape(len(frames), -1, *frames.shape[-2:]).unbind(1)

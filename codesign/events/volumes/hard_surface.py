@@ -1,0 +1,94 @@
+"""Time surfaces of hard counts, with the gradient of their mean over where pixels stand inside their thresholds.
+
+A surface shows the last event of a pixel alone. In the mean over places inside a threshold C it is (1/C) times the
+integral of exp(-age/tau) over the last C of level that the pixel went through: later crossings hide what fired more
+than a threshold before. The gradient needs that window. One hard pixel does not know where it ends, but its own last
+event lies evenly in it and the one before evenly in the threshold behind, so the mean of the windows that begin at
+either is right to first order in their length. Reading the last event alone takes half of the window.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.events.entry import Times, check_times
+from codesign.events.volumes.traces import check_tau
+
+
+def surface_from_hard_counts(
+    counts: Tensor, t_s: Times, at_s: Tensor | Sequence[float], tau_s: float
+) -> Tensor:
+    """Time surface at given times of events that sit at the middles of their intervals.
+
+    Args:
+      counts: [T-1, 2, ..., H, W] whole numbers >= 0, ON first, of short intervals (``EventLayer.finely``). t_s:
+        [T] seconds, strictly increasing. at_s: [K] reference times, seconds, strictly increasing; an interval
+        belongs to those at or after its end. tau_s: seconds, > 0.
+    Returns: [K, 2, ..., H, W] exp(-age/tau) of the last event, 0 where none was yet.
+    Gradient: counts: made for counts that carry the slope of their mean (``memory``), then that of the mean
+      surface over beginnings, to first order in exp(-age/tau) per threshold, and where a level did not turn since.
+      None for the surface as a function of a count.
+    Raises: ShapeError, DomainError as ``from_counts``; DomainError for counts that are not whole, and for tau.
+    Source: the surface: Lagorce et al., HOTS, PAMI 2017; the gradient is ours.
+    """
+    check_tau(tau_s)
+    if counts.ndim < 4 or counts.shape[0] < 1 or counts.shape[1] != 2:
+        raise ShapeError(
+            f"counts have shape {list(counts.shape)}; [T-1, 2, ..., H, W] is needed (ON first on axis 1)."
+        )
+    check_finite(counts, "counts")
+    times_s = check_times(t_s, len(counts) + 1)
+    wrong = counts.detach()[(counts.detach() < 0) | (counts.detach() % 1 != 0)]
+    if len(wrong):
+        raise DomainError(
+            f"counts hold {float(wrong[0]):g}; whole numbers of events are needed (surface_from_counts takes "
+            "shares of events)."
+        )
+    return _LastEvents.apply(counts, times_s, check_times(at_s, len(at_s)), tau_s)
+
+
+class _LastEvents(Function):
+    @staticmethod
+    def forward(ctx, counts, times_s, at_s, tau_s):
+        middle_s = (times_s[1:] + times_s[:-1]) / 2
+        seen = torch.searchsorted(times_s[1:], at_s, right=True).tolist()
+        # 1 + index of the interval of the last event, and of the one before it; 0: none was
+        last = torch.zeros(counts.shape[1:], dtype=torch.long, device=counts.device)
+        before = torch.zeros_like(last)
+        lasts = []
+        befores = []
+        shown = []
+        start = 0
+        for stop, time_s in zip(seen, at_s, strict=True):
+            for index in range(start, stop):
+                fired = counts[index] > 0
+                before = torch.where(counts[index] > 1, index + 1, torch.where(fired, last, before))
+                last = torch.where(fired, index + 1, last)
+            start = max(start, stop)
+            lasts.append(last)
+            befores.append(before)
+            shown.append(
+                torch.cat((torch.zeros(1, dtype=middle_s.dtype), torch.exp((middle_s - time_s) / tau_s)))
+            )
+        shown = torch.stack(shown).to(counts)
+        last = torch.stack(lasts)
+        before = torch.stack(befores)
+        ctx.seen = seen
+        ctx.save_for_backward(last, before, shown)
+        return torch.stack([row[index] for row, index in zip(shown, last, strict=True)])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
+        last, before, shown = ctx.saved_tensors
+        pull = torch.zeros(shown.shape[1] - 1, *grad.shape[1:], dtype=grad.dtype, device=grad.device)
+        for one, newest, older, row, stop in zip(grad, last, before, shown, ctx.seen, strict=True):
+            index = torch.arange(1, stop + 1, device=grad.device).reshape(-1, *[1] * newest.ndim)
+            now = row[1 : stop + 1].reshape(index.shape)
+            for begun in (newest, older):
+                pull[:stop] += one / 2 * torch.where(index > begun, now - row[begun], 0)
+        return pull, None, None, None
