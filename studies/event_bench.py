@@ -178,6 +178,9 @@ def timed(frames, repeats):
     works["hard, v2e timing"] = lambda: events.simulate(frames, t_s, events.SensorModel(timing="v2e"))
     works["memory, forward"] = lambda: events.memory(frames, THETA, THETA)
     works["memory, forward + backward"] = lambda: differentiated(lambda f: events.memory(f, THETA, THETA)[0])
+    works["memory of unequal thresholds, forward + backward"] = lambda: differentiated(
+        lambda f: events.memory(f, THETA, 1.2 * THETA)[0]
+    )
     works["sigmoid, forward + backward"] = lambda: differentiated(lambda f: events.soft(f, THETA))
     works["dense, forward + backward"] = lambda: differentiated(lambda f: events.dense(f, THETA, THETA)[0])
     for name, work in works.items():
