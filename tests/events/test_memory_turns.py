@@ -45,7 +45,7 @@ def test_the_gradient_of_random_turns_is_that_of_enumeration(theta_on, theta_off
     level = path(turns=3, steps=3, seed=seed)
     generator = torch.Generator().manual_seed(100 + seed)
     weight = torch.randn(len(level) - 1, 2, generator=generator, dtype=torch.float64)
-    slopes = gradient(level, theta_on, theta_off, weight)
+    slopes = gradient(level, theta_on, theta_off, weight, gradient="exact")
     # the mean is piecewise linear in every level; its grid of beginnings leaves some 1e-5 of an event in each
     # count, so that a difference over 4e-4 is good to some 0.1 where slopes are 5 to 20
     step = 2e-4
@@ -120,7 +120,7 @@ def test_a_sine_of_one_threshold_follows_hard_counts_in_amplitude_and_phase(thet
         for k in range(sections):
             first, last = (move(2 * (k + j) / sections - 1) for j in (0, 1))
             level = ((first + last) / 2).requires_grad_()
-            counts = pooled(memory(level, theta_on, theta_off, log_input=True)[0])
+            counts = pooled(memory(level, theta_on, theta_off, log_input=True, gradient="exact")[0])
             for part in range(8):
                 for polarity in (0, 1):
                     (slope,) = torch.autograd.grad(counts[part, polarity].sum(), level, retain_graph=True)
@@ -128,6 +128,17 @@ def test_a_sine_of_one_threshold_follows_hard_counts_in_amplitude_and_phase(thet
         cosine = (total * difference).sum() / (total.norm() * difference.norm())
         assert cosine > 0.99
         assert float((total * difference).sum() / difference.square().sum()) == pytest.approx(1, abs=0.05)
+
+
+@pytest.mark.parametrize(("theta_off", "taken"), [(0.2, "play"), (0.24, "play"), (0.26, "exact")])
+def test_which_gradient_is_taken_depends_on_the_thresholds(theta_off, taken):
+    level = (0.2 * torch.randn(30, 9, generator=torch.Generator().manual_seed(2))).cumsum(0)
+    slopes = {}
+    for name in (None, "exact", "play"):
+        leaf = level.clone().requires_grad_()
+        memory(leaf, 0.2, theta_off, log_input=True, gradient=name)[0].square().sum().backward()
+        slopes[name] = leaf.grad
+    torch.testing.assert_close(slopes[None], slopes[taken], rtol=0, atol=0)
 
 
 def test_an_unknown_gradient_is_refused():

@@ -14,6 +14,7 @@ from codesign.events.layers import memory_kernel as play
 from codesign.events.layers import turns_kernel as turns
 
 GRADIENTS = ("exact", "play")
+PLAY_RATIO = 1.25  # of the two thresholds: up to it the play met all that was asked of the exact gradient
 MOST_RATIO = 4  # of the two thresholds, up to which gradients were set beside differences
 
 
@@ -51,8 +52,8 @@ def memory(
         "exact": of the ideal sensor, by pairs of pixels followed from every turn. Slopes beat against the
           thresholds: a wide step's mean slope is met only over many pixels or places. To the thresholds as "play".
         "play": of width (theta_on + theta_off)/2, the mean over the scatter of real thresholds; smooth.
-        None: "exact" where all pixels share one pair of unequal thresholds, else "play". docs/events.md has both
-          in figures.
+        None: "exact" where all pixels share one pair of thresholds that differ by more than a quarter, else
+          "play". docs/events.md has both in figures.
       Scenes that never reach half a threshold have no gradient: start those with ``soft_counts``. Chunks have
       the gradient of the whole with "play"; with "exact" each begins evenly around the play's centre. Second
       derivatives raise.
@@ -135,7 +136,7 @@ def _gradient(name, theta_on, theta_off, steers):
             RuntimeWarning,
             stacklevel=3,
         )
-    return "play" if on == off else "exact"
+    return "exact" if max(on, off) > PLAY_RATIO * min(on, off) else "play"
 
 
 class _MemorisedCounts(Function):
