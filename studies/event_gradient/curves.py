@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from studies.event_gradient.case import DURATION_S, SECTIONS, times
+from studies.event_gradient.case import DURATION_S, times
 
 SIDE_PX = 48  # pixels are a square, so that they pool like a picture
 BASE = 4.5  # natural logarithm of an intensity in the middle of the scale, where the level is the logarithm
 AMPLITUDE_LOG = 0.3  # either way
-PHASE = 0.06  # of the duration, either way
+PHASE = 0.03  # of the duration, either way
+SECTIONS = 48  # every pixel has its kinks at other places of the step
 OFFSET = 0.1  # either way, behind the first frame
 PARAMETERS = ("amplitude", "phase", "offset")
 
