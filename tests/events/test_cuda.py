@@ -4,9 +4,11 @@ import pytest
 import torch
 
 from codesign.events import (
+    LAYERS,
     SensorModel,
     from_counts,
     from_stream,
+    layer,
     memory,
     simulate,
     soft,
@@ -34,6 +36,21 @@ def test_differentiable_layers_and_volumes():
     # double precision; a logarithm may differ in its last digit, which moves no count of random frames
     for first, second in zip(*results, strict=True):
         torch.testing.assert_close(first, second.cpu(), rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_layers_and_their_sensors(name):
+    dead_s = 1e-3 if name == "physical" else 0.0
+    sensor = SensorModel(0.2, 0.25, theta_sigma=0.03, cutoff_hz=60.0, refractory_s=dead_s)
+    results = []
+    for device in ("cpu", "cuda"):
+        given = frames().to(device).requires_grad_()
+        made = layer(name, sensor, learn=("theta_on", "theta_off", "cutoff_hz")).to(device)
+        counts = made(given, T_S, torch.Generator().manual_seed(1))
+        gradients = torch.autograd.grad((counts**2).sum(), [given, *made.parameters()])
+        results.append([counts.detach(), *gradients])
+    for first, second in zip(*results, strict=True):
+        torch.testing.assert_close(first, second.cpu(), rtol=1e-9, atol=1e-9)
 
 
 def test_hard_sensor_with_noise_from_one_generator():
