@@ -7,11 +7,11 @@ Frames of a moving scene are samples of smooth curves. A straight line between t
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, as_number
 from codesign.events.entry import Times, check_layout, check_times
 from codesign.events.intensity import FrontEnd, log_levels
 
-ROUNDING = 1e-9  # of a part: what rounding of times adds makes no part more
+ROUNDING = 1e-3  # of a part: what rounding of times (float32, or seconds since 1970) adds makes no part more
 
 
 def finer(frames: Tensor, t_s: Times, longest_s: float, *, log_input: bool = False) -> tuple[Tensor, Tensor]:
@@ -19,7 +19,8 @@ def finer(frames: Tensor, t_s: Times, longest_s: float, *, log_input: bool = Fal
 
     Args:
       frames: [T, ...] linear intensity on the 0-255 scale, or log levels with ``log_input``. t_s: [T] seconds,
-        strictly increasing. longest_s: > 0; an interval longer than that is cut into equal parts.
+        strictly increasing. longest_s: > 0; an interval longer than that by more than a thousandth is cut
+        into equal parts.
     Returns: frames [T', ...] of the same kind and times [T'] float64, the given ones among them exactly; the
       given frames themselves where no interval is too long.
       Between two frames the log level is the cubic with the slopes of parabolas through three frames each: a
@@ -58,10 +59,11 @@ def parts(times_s: Tensor, longest_s: float) -> tuple[Tensor, Tensor, Tensor]:
       [K + 1] float64 of all ends, the given ones among them exactly.
     Raises: DomainError for a length that is not positive.
     """
-    if not longest_s > 0:
+    longest = as_number(longest_s, "longest_s")
+    if not longest > 0:
         raise DomainError(f"the longest interval is {longest_s!r} s; a length > 0 s is needed.")
     duration_s = times_s.diff()
-    count = (duration_s / longest_s - ROUNDING).ceil().clamp(min=1).long()
+    count = (duration_s / longest - ROUNDING).ceil().clamp(min=1).long()
     interval = torch.repeat_interleave(count)
     first = (count.cumsum(0) - count)[interval]
     share = (torch.arange(1, len(interval) + 1) - first) / count[interval].double()

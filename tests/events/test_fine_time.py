@@ -154,6 +154,21 @@ def test_enough_frames_are_taken_as_they_are():
     assert torch.equal(times_s, times(32))
 
 
+@pytest.mark.parametrize(
+    "t_s",
+    [torch.linspace(0, 0.1, 17), 10 + torch.arange(17) / 100, 1.7e9 + torch.arange(17, dtype=D) / 1000],
+    ids=["float32", "float32 of ten seconds", "seconds since 1970"],
+)
+def test_rounded_times_make_no_part_more(t_s):
+    # 17 frames are four intervals from one node of five bins to the next, in exact times
+    frames = 30 + 99 * torch.rand(17, 2, 2, generator=torch.Generator().manual_seed(0))
+    layer = events.layer()
+    counts = layer(frames, t_s)
+    longest_s = float(t_s.to(D)[-1] - t_s.to(D)[0]) / 16
+    assert torch.equal(layer.finely(frames, t_s, longest_s)[0], counts)
+    assert layer.finely(frames, t_s, longest_s / 2)[0].shape[0] == 32
+
+
 def test_the_way_between_frames_has_its_gradient():
     generator = torch.Generator().manual_seed(1)
     t_s = torch.tensor([0.0, 0.1, 0.25, 0.3, 0.5], dtype=D)
@@ -220,6 +235,8 @@ def test_what_does_not_fit_is_refused():
     frames = torch.rand(3, 4, 5)
     with pytest.raises(DomainError, match="a length > 0 s is needed"):
         layer.finely(frames, [0.0, 1.0, 2.0], 0.0)
+    with pytest.raises(DomainError, match="longest_s"):
+        layer.finely(frames, [0.0, 1.0, 2.0], "short")
     with pytest.raises(ShapeError, match=r"a tensor \[T, H, W\]"):
         layer.volume(torch.rand(4, 5), [0.0, 1.0], 5)
     with pytest.raises(ShapeError, match="one time per frame"):
