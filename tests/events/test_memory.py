@@ -252,5 +252,10 @@ def test_a_state_of_another_sensor_is_refused():
             memory(GOOD, 0.2, 0.2, state=state)
 
 
+def test_a_state_that_is_no_tensor_is_refused():
+    with pytest.raises(DomainError, match="state is int"):
+        memory(GOOD, 0.2, 0.2, state=3)
+
+
 def test_log_input_may_be_negative():
     assert memory(torch.tensor([[-3.0], [-3.5]]), 0.2, 0.2, log_input=True)[0][0, 1] == 2

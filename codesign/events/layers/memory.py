@@ -79,6 +79,8 @@ def memory(
     check_layout(frames, minimum=2 if state is None else 1)
     theta_on = check_theta(theta_on, "theta_on", frames)
     theta_off = check_theta(theta_off, "theta_off", frames)
+    if state is not None and not isinstance(state, Tensor):
+        raise DomainError(f"state is {type(state).__name__}; pass the tensor that an earlier call returned.")
     if state is not None and state.shape == frames.shape[1:]:
         state = torch.stack((state, state))
     if state is not None and (state.shape != (2, *frames.shape[1:]) or state.dtype != frames.dtype):
