@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from codesign.errors import DomainError
-from studies.event_gradient import flow_of_events, layers, pointwise, sensors, thresholds, timing
+from studies.event_gradient import flow_of_events, layers, pointwise, sensors, spiking, thresholds, timing
 from studies.event_gradient.case import DIRECTIONS, Case
 from studies.event_gradient.compare import Row
 from studies.event_gradient.topic import Topic, label
@@ -32,6 +32,7 @@ TOPICS: dict[str, Topic] = {
     "sensors": sensors.TOPIC,
     "flow": flow_of_events.TOPIC,
     "timing": timing.TOPIC,
+    "spiking": spiking.TOPIC,
 }
 
 

@@ -106,13 +106,18 @@ def pairs(
 
 def pair(ends: Tensor, t_s: Tensor, layer: Maps, truth: Maps) -> Pair:
     """As ``pairs`` for frames [sections + 1, T, H, W] at the ends of the sections of a step of 2."""
+    difference = blocks(truth(ends[-1], t_s) - truth(ends[0], t_s)) / 2
+    return Pair(slope(ends, t_s, layer), difference.double())
+
+
+def slope(ends: Tensor, t_s: Tensor, layer: Maps) -> Tensor:
+    """[K, blocks] derivative of a layer along a step of 2, averaged over it; ends as for ``pair``."""
     # to second order, the derivative over a section is that at the mean of its ends, along their difference
     slopes = [
         derivative(layer, (first + second) / 2, second - first, t_s)
         for first, second in itertools.pairwise(ends)
     ]
-    difference = blocks(truth(ends[-1], t_s) - truth(ends[0], t_s)) / 2
-    return Pair(torch.stack(slopes).sum(0).double() / 2, difference.double())
+    return torch.stack(slopes).sum(0).double() / 2
 
 
 def derivative(layer: Maps, frames: Tensor, tangent: Tensor, t_s: Tensor) -> Tensor:

@@ -10,12 +10,14 @@ from codesign.errors import DomainError
 from studies.lens_opt.task import SENSOR
 
 WEIGHTS = {"flownet": flow.FlowNetEvents, "spiking": flow.SpikeFlowNet}
+SPIKING_STEPS = 8  # of the spiking layer per interval: so many events it can give there
 ESTIMATORS = ("closed-form", "refiner", *WEIGHTS)
 
 
 def event_layer(name: str) -> events.EventLayer:
     """The event layer of that name with the task's sensor, thresholds held."""
-    return events.layer(name, SENSOR, learn=())
+    options = {"steps": SPIKING_STEPS} if name == "srm" else {}
+    return events.layer(name, SENSOR, learn=(), **options)
 
 
 def estimator(name: str, train: bool, objective: str, weights: int, seed: int) -> Any:

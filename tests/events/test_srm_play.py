@@ -128,6 +128,31 @@ def test_the_event_layer_goes_on_in_chunks():
     torch.testing.assert_close(by_chunks, by_whole, rtol=1e-12, atol=1e-12)
 
 
+def test_enough_steps_per_frame_give_the_counts_and_gradients_of_the_memory_layer():
+    level = walk(10, frames=12, size=0.4).requires_grad_()  # up to six thresholds between two frames
+    t_s = torch.arange(12, dtype=D)
+    seeds = torch.rand(11, 2, 1, 6, generator=torch.Generator().manual_seed(11), dtype=D)
+    sensor = events.SensorModel(THETA, THETA)
+    found = []
+    for name, options in (("memory", {}), ("srm", {"steps": 16})):
+        counts = events.layer(name, sensor, log_input=True, **options)(level[:, None], t_s)
+        found.append((counts.detach(), torch.autograd.grad((counts * seeds).sum(), level)[0]))
+    assert float((level.detach().diff(dim=0).abs() / THETA).max()) > 3
+    assert torch.equal(found[0][0], found[1][0])
+    torch.testing.assert_close(found[1][1], found[0][1], rtol=1e-9, atol=1e-9)
+
+
+def test_several_steps_per_frame_go_on_in_chunks():
+    level = walk(12, frames=10, size=0.4)
+    t_s = torch.arange(10, dtype=D)
+    made = events.layer("srm", events.SensorModel(THETA, THETA), log_input=True, steps=3)
+    first, state = made.advance(level[:4, None], t_s[:4])
+    second, _ = made.advance(level[4:, None], t_s[4:], state)
+    assert torch.equal(torch.cat((first, second)), made(level[:, None], t_s))
+    with pytest.raises(DomainError, match="steps is 0; give a whole number >= 1"):
+        events.layer("srm", steps=0)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -29,7 +29,8 @@ def layer(name: str = "memory", sensor: SensorModel | None = None, **options: An
         straight-through counts: the default), "expected" (mean counts under threshold mismatch), "srm"
         (spike response model, at most one event per frame), "physical" (the full sensor).
       sensor: SensorModel to start from. options: learn, log_input (see ``EventLayer``), and spread of
-        "expected", sharpness of "sigmoid" and "dense", gradient of "srm" ("play" or "surrogate").
+        "expected", sharpness of "sigmoid" and "dense", gradient ("play" or "surrogate") and steps (per frame
+        interval) of "srm".
     Raises: DomainError for an unknown name, with the nearest one, an unknown option, or a value that cannot be
       learnt. A warning names what the sensor has and the layer does not know (leak, dead time, ...).
 

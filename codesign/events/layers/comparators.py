@@ -128,9 +128,11 @@ class Expected:
 class Spikes:
     """``events.srm`` with step kernels and coupled polarities, fed with steps of the log level: at most one
     event per frame and polarity, the rest of a step stays for the frames after it. gradient: "play" (of the
-    mean count, as ``events.memory``) or "surrogate" (of a fast sigmoid)."""
+    mean count, as ``events.memory``) or "surrogate" (of a fast sigmoid). steps: of the neurons per frame
+    interval, over which the level runs linearly: the most events that an interval can give."""
 
     gradient: str = "play"
+    steps: int = 1
     mismatched = True
     refines = True
     whole = True
@@ -140,14 +142,29 @@ class Spikes:
             raise DomainError(
                 f"gradient is {self.gradient!r}; choose one of {', '.join(map(repr, GRADIENTS))}."
             )
+        if isinstance(self.steps, bool) or not isinstance(self.steps, int) or self.steps < 1:
+            raise DomainError(
+                f"steps is {self.steps!r}; give a whole number >= 1 of steps per frame interval."
+            )
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Any, log_input: bool
     ) -> tuple[Tensor, Any]:
         level = log_levels(frames, log_input, minimum=2 if state is None else 1)
-        return count_spikes(
-            level, None, torch.stack((theta_on, theta_off)), state, None, gradient=self.gradient
-        )
+        if self.steps > 1:
+            level = _between(_with_last(level, None if state is None else state[0]), self.steps)
+            level = level if state is None else level[1:]
+        thetas = torch.stack((theta_on, theta_off))
+        spikes, state = count_spikes(level, None, thetas, state, None, gradient=self.gradient)
+        return spikes.unflatten(0, (-1, self.steps)).sum(1) if self.steps > 1 else spikes, state
+
+
+def _between(level, steps):
+    """Levels [T, ...] with steps - 1 more between two, on a straight line: [(T - 1) * steps + 1, ...]."""
+    share = torch.arange(1, steps + 1, dtype=level.dtype, device=level.device) / steps
+    share = share.reshape(-1, *[1] * (level.ndim - 1))
+    line = level[:-1, None] + share * level.diff(dim=0)[:, None]
+    return torch.cat((level[:1], line.flatten(0, 1)))
 
 
 def _with_last(frames, last):

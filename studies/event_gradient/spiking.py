@@ -1,0 +1,142 @@
+"""Spike response layers: the coupled step layer by its play and by surrogates, and alpha responses of the steps of
+the log level, ON and OFF apart, with a reset that fades, by surrogates."""
+
+import itertools
+import warnings
+
+import torch
+
+from codesign import events
+from studies.event_gradient import compare
+from studies.event_gradient.case import DIRECTIONS, times
+from studies.event_gradient.judge import distance, offsets
+from studies.event_gradient.topic import Asked, Topic
+
+THETA = 0.15  # of the coupled step layer
+BEGINNINGS = 32
+ALPHA_THETA = 0.2
+TAU_S = 0.010  # s; with TAU_R, some 6 to 13 spikes per pixel in the 0.1 s
+TAU_R = 0.005
+KERNELS = ("step", "slayer", "exp")
+SURROGATES = {"Laplace": events.Laplace, "FastSigmoid": events.FastSigmoid, "Triangular": events.Triangular}
+THROUGH_RESET = ("off", "full", "bounded")
+RATES_HZ = (240, 1000)
+WHERE = tuple(d for d in DIRECTIONS if d.name in ("focus", "shift_x"))
+PLAY = "play"
+ASKED = Asked(0.95, (0.8, 1.25))
+
+
+def drives(frames):
+    """Steps of the log level, [T-1, 2, ...], ON first."""
+    step = events.lin_log(frames).diff(dim=0)
+    return torch.stack((step, -step), 1)
+
+
+def options(kernel, t_s):
+    """Arguments of ``events.srm``; times in frames."""
+    if kernel == "step":
+        return {"theta": THETA, "kernel": "step", "response": "step", "reset_scale": 1.0, "coupled": True}
+    frame_s = float(t_s[1] - t_s[0])
+    tau = {"tau_s": TAU_S / frame_s, "tau_r": TAU_R / frame_s}
+    return {"theta": ALPHA_THETA, "kernel": kernel, "response": "alpha", **tau}
+
+
+def layer_of(kernel, name, through_reset):
+    """Spikes by one gradient, as maps for ``compare``."""
+
+    def layer(frames, t_s):
+        given = options(kernel, t_s)
+        if name == PLAY:
+            given["gradient"] = PLAY
+        else:
+            given |= {
+                "surrogate": SURROGATES[name].unit(given["theta"]),
+                "through_reset": through_reset,
+            }
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # "full" may grow without bound, and does
+            return events.srm(drives(frames), **given)[0]
+
+    return compare.of_layer(layer)
+
+
+@torch.no_grad()
+def truth(kernel, frames, t_s):
+    """Mean of the hard spikes over beginnings: of the memorised level anywhere in its threshold, or of a pixel that
+    fired last at a random time, three time constants ago on average."""
+    drive = drives(frames)
+    places = offsets(tuple(drive.shape[2:]), BEGINNINGS)
+    generator = torch.Generator().manual_seed(0)
+    total = 0.0
+    for place in places:
+        if kernel == "step":
+            spikes = coupled(drive, distance(place, THETA, THETA))
+        else:
+            spikes = events.srm(drive, **options(kernel, t_s), state=fired(kernel, drive, t_s, generator))[0]
+        total = total + compare.parts(spikes)
+    return total / len(places)
+
+
+def coupled(drive, above):
+    """The event model, written out: a level that begins ``above`` its memorised one."""
+    spikes = torch.empty_like(drive)
+    for now, found in zip(drive[:, 0], spikes, strict=True):
+        above = above + now
+        found[0] = above >= THETA
+        found[1] = -above >= THETA
+        above = above - THETA * (found[0] - found[1])
+    return spikes
+
+
+def fired(kernel, drive, t_s, generator):
+    """The state of pixels that fired last at a random time."""
+    age = (
+        -3 * torch.rand(drive.shape[1:], generator=generator, dtype=torch.float64).log()
+    )  # in time constants
+    left = (-age).exp()
+    tau = TAU_R / float(t_s[1] - t_s[0])
+    reset = torch.stack((left, age * tau * left)) if kernel == "slayer" else left[None]
+    return events.SrmState(torch.zeros(2, *drive.shape[1:], dtype=torch.float64), reset)
+
+
+def jobs(quick):
+    kernels = KERNELS[:1] if quick else KERNELS
+    rates = RATES_HZ[:1] if quick else RATES_HZ
+    return [(kernel, rate, d.name) for kernel in kernels for rate in rates for d in WHERE]
+
+
+def gradients(kernel, rate_hz):
+    """(name, through_reset) of what is compared; at many frames per second the best of the surrogates only."""
+    found = list(
+        itertools.product(SURROGATES, THROUGH_RESET if rate_hz == RATES_HZ[0] else THROUGH_RESET[-1:])
+    )
+    return [(PLAY, "exact"), *found] if kernel == "step" else found
+
+
+def measure(cases, kernel, rate_hz, name):
+    direction = next(d for d in WHERE if d.name == name)
+    t_s = times(rate_hz)
+    ends = [case.along(rate_hz, direction) for case in cases]
+    differences = [
+        compare.blocks(truth(kernel, one[-1], t_s) - truth(kernel, one[0], t_s)).double() / 2 for one in ends
+    ]
+    for gradient, through_reset in gradients(kernel, rate_hz):
+        layer = layer_of(kernel, gradient, through_reset)
+        found = [
+            compare.Pair(compare.slope(one, t_s, layer), difference)
+            for one, difference in zip(ends, differences, strict=True)
+        ]
+        yield compare.row((kernel, gradient, through_reset, name, f"{rate_hz}fps"), found)
+
+
+TOPIC = Topic(
+    "Spike response layers",
+    f"step: coupled polarities, theta {THETA}, at most one event per frame. slayer, exp: the alpha response of the steps "
+    f"of the log level (tau_s {1000 * TAU_S:g} ms), theta {ALPHA_THETA}, reset of twice theta that fades with tau_r "
+    f"{1000 * TAU_R:g} ms. Surrogates have unit mass and the width theta.",
+    ("reset", "gradient", "through_reset", "direction", "frames per second"),
+    jobs,
+    measure,
+    lambda row: ASKED if row.names[1] == PLAY else None,
+    "srm",
+)
