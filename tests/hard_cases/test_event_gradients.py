@@ -99,7 +99,8 @@ def expected(seen, on, off):
 
 
 def srm(seen, on, off):
-    """The slopes of the memory layer for a level that leaves its play by a threshold per step at most."""
+    """The slopes of the memory layer for a level that leaves its play by a threshold per step at most; of equal
+    thresholds."""
     half = (on + off) / 4
     centre = seen[0]
     held = [seen[0]]
@@ -130,7 +131,8 @@ def test_every_layer_is_here():
 @pytest.mark.parametrize("kind", LAYERS)
 def test_gradients_of_every_layer_on_the_worst_clip_are_those_of_its_account(kind, generator):
     clip = torch.tensor(SLOWER_CLIP if kind == "srm" else CLIP, dtype=D)
-    sensor = SensorModel(0.2, 0.25, cutoff_hz=50.0, refractory_s=DEAD_S if kind == "physical" else 0.0)
+    theta_off = 0.2 if kind == "srm" else 0.25
+    sensor = SensorModel(0.2, theta_off, cutoff_hz=50.0, refractory_s=DEAD_S if kind == "physical" else 0.0)
     names = ("theta_on", "theta_off", "cutoff_hz")
     learnt = layer(kind, sensor, learn=names)
     frames = clip[:, None, None].expand(-1, 2, 3).clone().requires_grad_()
