@@ -13,7 +13,7 @@ CLIP = (0.0, 255.0, 0.0, 1e4, 1e-6, 20.0, 20.0, 300.0)
 # for the layer of one event per step, which after those jumps only hurries after the level
 SLOWER_CLIP = (100.0, 255.0, 300.0, 255.0, 1e-6, 20.0, 20.0, 300.0)
 STEP_S = 1e-3
-DEAD_S = 1e-3
+DEAD_S = 1e-4  # short beside the frames: taken as local
 SPREAD = 0.15
 
 

@@ -9,6 +9,7 @@ from torch import Generator, Tensor
 
 from codesign.events.entry import Times, check_frames, check_times
 from codesign.events.intensity import FrontEnd
+from codesign.events.layers import dead_time
 from codesign.events.layers.memory import memory
 from codesign.events.low_pass import low_pass
 from codesign.events.sensor.model import SensorModel, mismatched, with_design
@@ -28,7 +29,7 @@ DESIGN = (
 class PhysicalState:
     """What ``sensor_counts`` carries over chunks. sensor: SensorState of the hard sensor; reference, level:
     [...] of the smooth account (their graph is kept); frame: [...] last frame; draws: [2, ...] standard
-    normal numbers of the thresholds; time_s: time of the last frame."""
+    normal numbers of the thresholds; time_s: time of the last frame; dead: state of the dead time's account."""
 
     sensor: SensorState
     reference: Tensor
@@ -36,6 +37,7 @@ class PhysicalState:
     frame: Tensor
     draws: Tensor | None
     time_s: float
+    dead: Any = None
 
 
 def sensor_counts(
@@ -52,8 +54,10 @@ def sensor_counts(
 
     Forward: exactly the counts of ``simulate``, noise and all. Backward: the low-pass is linear and exact;
       thresholds are C = theta + sigma e with the drawn e held fixed; leakage adds a known ramp; counts follow
-      ``memory`` (slope 1/C through the memorised level); dead time T thins n events of smooth rate r to n /
-      max(1, r T + 1/2), the mean of regular arrivals over all phases. Noise events have no gradient.
+      ``memory`` (slope 1/C through the memorised level); dead time passes what it would pass on average over
+      where events stand in the threshold, over frames, turns and polarities (``layers.dead_time``; one
+      shorter than an eighth of an interval thins n events of rate r to n / max(1, r T + 1/2)). Noise events
+      have no gradient, and block none in it.
 
     Args:
       frames: [T, ...] intensity on the 0-255 scale, or its natural logarithm with ``log_input``. t_s: [T]
@@ -63,9 +67,11 @@ def sensor_counts(
       design: tensors that replace fields of the sensor and receive gradients: theta_on, theta_off,
         theta_sigma, cutoff_hz, refractory_s (0-dim).
     Returns: counts [T-1, 2, ...] whole numbers, ON first; PhysicalState.
-    Gradient: frames and design, as above; docs/events.md has each against differences of the hard counts.
-    Raises: DomainError for other names in ``design`` or values outside the sensor's domain, and as
-      ``simulate``.
+    Gradient: frames and design, as above; docs/events.md has each against differences of the hard counts, with
+      its range of validity.
+    Warns: UserWarning where rate x dead time leaves that range.
+    Raises: DomainError for other names in ``design`` (they have no gradient) or values outside the sensor's
+      domain, and as ``simulate``.
     """
     hard_sensor = with_design(sensor, design, DESIGN)
     value: dict[str, Any] = {name: design.get(name, getattr(sensor, name)) for name in DESIGN}
@@ -98,15 +104,18 @@ def sensor_counts(
             * hard_state.leak_hz
             * thetas[0]
         )
-    smooth, reference = memory(
-        seen[1:], *thetas, state=seen[0] if state is None else state.reference, log_input=True
-    )
-    if hard_sensor.refractory_s > 0:
-        smooth = smooth * _passing(seen.diff(dim=0), thetas, interval_s, value["refractory_s"])[:, None]
+    dead = value["refractory_s"] if hard_sensor.refractory_s > 0 else None
+    smooth, reference, dead_state = _mean_counts(seen, thetas, interval_s, dead, state)
     counts = hard + (smooth - smooth.detach())
     ramp = (seen[-1] - level[-1]).detach()
     return counts, PhysicalState(
-        hard_state, reference - ramp, level[-1], frames[-1], draws, float(times_s[-1])
+        hard_state,
+        reference - ramp,
+        level[-1],
+        frames[-1],
+        draws,
+        float(times_s[-1]),
+        None if dead_state is None else dead_state.sunk(ramp),
     )
 
 
@@ -130,9 +139,23 @@ def _drawn(theta, sigma, draw, level):
     return mismatched(theta, torch.as_tensor(sigma, dtype=level.dtype, device=level.device), draw)
 
 
-def _passing(step, thetas, interval_s, refractory_s):
-    """Share of regularly arriving events that dead time lets pass, [T-1, ...]: one in ceil(r T), averaged
-    over phases."""
-    theta = torch.where(step > 0, thetas[0], thetas[1])
-    rate_hz = step.abs() / theta / interval_s.to(step).reshape(-1, *[1] * (step.ndim - 1))
-    return 1 / (rate_hz * refractory_s + 0.5).clamp(min=1)
+def _mean_counts(seen, thetas, interval_s, refractory_s, state):
+    """Counts with the slopes of their mean over places inside the threshold and behind the dead time, [T-1, 2,
+    ...]; the states of ``memory`` and of the dead time after them."""
+    start = seen[0] if state is None else state.reference
+    if refractory_s is not None:
+        dead_time.warn_beyond(seen, thetas, interval_s, refractory_s)
+    dead_s = 0.0 if refractory_s is None else float(torch.as_tensor(refractory_s).detach())
+    if refractory_s is None or not dead_time.reaches(interval_s, dead_s):
+        smooth, reference = memory(seen[1:], *thetas, state=start, log_input=True)
+        if refractory_s is not None:
+            share = dead_time.local_share(seen.diff(dim=0), thetas, interval_s, refractory_s)
+            smooth = smooth * share[:, None]
+        return smooth, reference, None
+    before = None if state is None else state.dead
+    grid = dead_time.SubIntervals(interval_s, dead_s)
+    fine = grid.levels(seen)
+    # the play's slopes, as its values are what the recursion sees
+    smooth, reference = memory(fine[1:], *thetas, state=start, log_input=True, gradient="play")
+    passed, dead = dead_time.pass_play(fine, smooth, thetas, grid.interval_s, refractory_s, before)
+    return grid.sums(passed), reference, dead
