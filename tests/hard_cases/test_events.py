@@ -53,6 +53,8 @@ CASES = {
 }
 
 
+# a pixel brighter than any film fires a thousand times in a second, which is beyond the measured dead times
+@pytest.mark.filterwarnings("ignore:rate x dead time")
 @pytest.mark.bits
 @pytest.mark.parametrize("theta", THETAS)
 @pytest.mark.parametrize("case", CASES)
