@@ -17,7 +17,7 @@ from codesign.events.layers.pixel_loop import Loop
 def count(frames, start, theta_on, theta_off, front_end):
     """Counts [T, 2, ...] of frames [T, ...] from a start [2, ...] (memorised level, centre of the play); the
     state after them; whether a value may not enter."""
-    loop = Loop(frames, theta_on, theta_off, front_end)
+    loop = Loop(frames, theta_on, theta_off)
     target = loop.fresh(2 * frames.numel())
 
     def step(index, value, bad, reference, centre):
@@ -38,7 +38,7 @@ def adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end
     Args: grad_end: [...] of the memorised level and the play's centre together; the start's is theirs
       together, too.
     """
-    loop = Loop(frames, theta_on, theta_off, front_end)
+    loop = Loop(frames, theta_on, theta_off)
     dr = loop.dr
     arr = loop.arr
     seed = loop.load(grad_counts)

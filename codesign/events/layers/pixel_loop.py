@@ -8,7 +8,7 @@ from codesign import backend
 class Loop:
     """Frames, thresholds and the loop over time, in chunks."""
 
-    def __init__(self, frames, theta_on, theta_off, front_end):
+    def __init__(self, frames, theta_on, theta_off):
         import drjit as dr
 
         self.dr = dr

@@ -33,7 +33,7 @@ def adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end
 
     Args: as for ``memory_kernel.adjoint``; the box lies from centre - theta_on/2 to centre + theta_off/2.
     """
-    loop = Loop(frames, theta_on, theta_off, front_end)
+    loop = Loop(frames, theta_on, theta_off)
     dr = loop.dr
     arr = loop.arr
     seed = loop.load(grad_counts)

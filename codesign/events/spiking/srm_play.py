@@ -13,10 +13,10 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from codesign import backend
 from codesign.errors import DomainError
 from codesign.events.entry import check_theta
 from codesign.events.layers.memory import memory
+from codesign.events.layers.pixel_loop import Loop
 from codesign.events.spiking.srm_state import PlayState, SrmState
 
 NEVER = 0xFFFFFFFF
@@ -100,13 +100,13 @@ class _Limited(Function):
     @staticmethod
     def forward(ctx, level, centre, theta_on, theta_off):
         ctx.save_for_backward(level, centre, theta_on, theta_off)
-        return _Loop(level, theta_on, theta_off).forward(centre)
+        return _Play(level, theta_on, theta_off).forward(centre)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads):
         level, centre, theta_on, theta_off = ctx.saved_tensors
-        grad_level, grad_centre, *grad_thetas = _Loop(level, theta_on, theta_off).adjoint(centre, *grads)
+        grad_level, grad_centre, *grad_thetas = _Play(level, theta_on, theta_off).adjoint(centre, *grads)
         thetas = (theta_on, theta_off)
         return (
             grad_level,
@@ -115,88 +115,51 @@ class _Limited(Function):
         )
 
 
-class _Loop:
+class _Play:
     """The play in one drjit loop over time per pixel."""
 
     def __init__(self, level, theta_on, theta_off):
-        import drjit as dr
-
-        self.dr = dr
-        self.arr = backend.arrays(level.device.type, level.dtype)
+        self.loop = Loop(level, theta_on, theta_off)
         self.level = level
-        self.pixels = level.shape[1:]
-        self.width = level[0].numel()
-        self.lane = dr.arange(self.arr.UInt32, self.width)
-        self.theta_on, self.theta_off = (
-            self.load(theta if theta.numel() == 1 else theta.expand(self.pixels))
-            for theta in (theta_on, theta_off)
-        )
-
-    def load(self, tensor):
-        return self.arr.Float(tensor.detach().contiguous().reshape(-1))
-
-    def tensor(self, value, shape):
-        return value.torch().reshape(shape).clone()
 
     def advance(self, level, centre):
         """Whether the play is pushed up, down, and either by more than a threshold; and its centre after."""
-        half = (self.theta_on + self.theta_off) * 0.25
-        rise = level - centre - half
-        fall = centre - half - level
-        is_on = rise > 0
-        is_off = fall > 0
-        late = (rise > self.theta_on) | (fall > self.theta_off)
-        up = self.dr.minimum(self.dr.maximum(rise, 0), self.theta_on)
-        down = self.dr.minimum(self.dr.maximum(fall, 0), self.theta_off)
-        return is_on, is_off, late, centre + (up - down), half
-
-    def run(self, step, carried, target):
-        dr = self.dr
-        arr = self.arr
-        values = self.load(self.level)
-        size = backend.frames_per_kernel(self.width)
-        pixels = dr.opaque(arr.UInt32, self.width)
-        with dr.suspend_grad():
-            for first in range(0, len(self.level), size):
-                begin = dr.opaque(arr.UInt32, first, self.width)
-                end = dr.opaque(arr.UInt32, min(first + size, len(self.level)))
-
-                def body(index, *carried):
-                    place = index * pixels + self.lane
-                    return index + 1, *step(place, dr.gather(arr.Float, values, place), *carried)
-
-                _, *carried = dr.while_loop(
-                    (begin, *carried), lambda index, *_, end=end: index < end, body, mode="symbolic"
-                )
-                dr.eval(carried, target)
-        dr.sync_thread()
-        return carried
+        dr = self.loop.dr
+        rise, fall = self.loop.beyond(level, centre)
+        late = (rise > self.loop.theta_on) | (fall > self.loop.theta_off)
+        after = centre + (dr.minimum(rise, self.loop.theta_on) - dr.minimum(fall, self.loop.theta_off))
+        return rise > 0, fall > 0, late, after
 
     def forward(self, centre):
-        dr = self.dr
-        target = dr.empty(self.arr.Float, self.level.numel())
-        dr.eval(target)
+        loop = self.loop
+        dr = loop.dr
+        target = loop.fresh(self.level.numel())
+        half = (loop.theta_on + loop.theta_off) * 0.25
 
-        def step(place, level, centre):
-            is_on, _, late, after, half = self.advance(level, centre)
+        def step(index, level, centre):
+            is_on, _, late, after = self.advance(level, centre)
             edge = after + dr.select(is_on, half, -half)
+            place = index * loop.pixels + loop.lane
             dr.scatter(target, dr.select(late, edge, level), place, mode=dr.ReduceMode.NoConflicts)
             return (after,)
 
-        (after,) = self.run(step, (self.load(centre),), target)
-        return self.tensor(target, self.level.shape), self.tensor(after, self.pixels)
+        (after,) = loop(step, (loop.load(centre),), target)
+        dr.sync_thread()
+        shape = self.level.shape
+        return loop.tensor(target, shape), loop.tensor(after, shape[1:])
 
     def adjoint(self, centre, grad_slow, grad_after):
         """Gradients of the level, the centre, theta_on and theta_off. What reaches a level that was held back
         goes to the step at whose level the edge stood, or to the centre of the start."""
-        dr = self.dr
-        arr = self.arr
-        seeds = self.load(grad_slow)
-        target = dr.empty(arr.Float, self.level.numel())
-        dr.eval(target)
+        loop = self.loop
+        dr = loop.dr
+        arr = loop.arr
+        seeds = loop.load(grad_slow)
+        target = loop.fresh(self.level.numel())
 
-        def step(place, level, centre, held, engaged, mine, by_on, by_off, grad_centre, grad_on, grad_off):
-            is_on, is_off, late, after, _ = self.advance(level, centre)
+        def step(index, level, centre, held, engaged, mine, by_on, by_off, grad_centre, grad_on, grad_off):
+            is_on, is_off, late, after = self.advance(level, centre)
+            place = index * loop.pixels + loop.lane
             seed = dr.gather(arr.Float, seeds, place)
             free = (is_on | is_off) & ~late
             dr.scatter(target, dr.select(late, 0, seed), place, mode=dr.ReduceMode.NoConflicts)
@@ -214,15 +177,15 @@ class _Loop:
             mine = dr.select(free, seed, mine)
             return after, held, engaged, mine, by_on, by_off, grad_centre, grad_on, grad_off
 
-        zero = dr.zeros(arr.Float, self.width)
+        zero = dr.zeros(arr.Float, loop.width)
         begun = (
-            self.load(centre),
+            loop.load(centre),
             zero,
-            dr.full(arr.UInt32, NEVER, self.width),
+            dr.full(arr.UInt32, NEVER, loop.width),
             *([zero] * 6),
         )
-        _, held, engaged, mine, by_on, by_off, grad_centre, grad_on, grad_off = self.run(step, begun, target)
-        end = self.load(grad_after)
+        _, held, engaged, mine, by_on, by_off, grad_centre, grad_on, grad_off = loop(step, begun, target)
+        end = loop.load(grad_after)
         known = engaged != NEVER
         held = held + end
         dr.scatter(target, mine + held, engaged, active=known, mode=dr.ReduceMode.NoConflicts)
@@ -230,4 +193,6 @@ class _Loop:
         dr.sync_thread()
         grad_centre = grad_centre + dr.select(known, 0, held)
         grads = (grad_centre, grad_on + end * by_on, grad_off + end * by_off)
-        return self.tensor(target, self.level.shape), *(self.tensor(grad, self.pixels) for grad in grads)
+        return loop.tensor(target, self.level.shape), *(
+            loop.tensor(grad, self.level.shape[1:]) for grad in grads
+        )
