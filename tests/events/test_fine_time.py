@@ -1,5 +1,6 @@
 """When events come between two frames: against curves known in closed form, and the hard sensor at 10 kHz."""
 
+import itertools
 import math
 from functools import cache
 from types import SimpleNamespace
@@ -277,6 +278,36 @@ def test_a_surface_steers_as_the_mean_over_beginnings(move):
     cosine, scale = cosine_and_scale(torch.stack(slopes), truth.flatten())
     assert cosine >= 0.9
     assert 0.8 <= scale <= 1.25
+
+
+def test_the_gradient_of_a_surface_is_that_of_the_two_windows_behind_its_events():
+    generator = torch.Generator().manual_seed(4)
+    intervals = 25
+    t_s = (0.05 + torch.rand(intervals + 1, generator=generator, dtype=D)).cumsum(0)
+    counts = (torch.rand(intervals, 2, 1, 3, generator=generator, dtype=D) * 1.7).square().floor()
+    # before the first interval ends, two in one interval, at an end, and behind all
+    at_s = [
+        float(t_s[0]) + 0.01,
+        *torch.lerp(t_s[6], t_s[7], torch.tensor([0.2, 0.7], dtype=D)),
+        t_s[18],
+        t_s[-1] + 1,
+    ]
+    weight = torch.randn(len(at_s), 2, 1, 3, generator=generator, dtype=D)
+    tau_s = 2.0
+    middle_s = (t_s[1:] + t_s[:-1]) / 2
+    wanted = torch.zeros_like(counts)
+    for number, time_s in enumerate(at_s):
+        for cell in itertools.product(*map(range, counts.shape[1:])):
+            seen = [k for k in range(intervals) if t_s[k + 1] <= time_s]
+            fired = [k for k in seen for _ in range(int(counts[(k, *cell)]))]
+            for begun in [[-1, *fired][-1], [-1, -1, *fired][-2]]:
+                base = math.exp((middle_s[begun] - time_s) / tau_s) if begun >= 0 else 0
+                for k in range(begun + 1, len(seen)):
+                    shown = math.exp((middle_s[k] - time_s) / tau_s)
+                    wanted[(k, *cell)] += weight[(number, *cell)] * (shown - base) / 2
+    counts.requires_grad_()
+    surface = events.surface_from_hard_counts(counts, t_s, at_s, tau_s)
+    torch.testing.assert_close(torch.autograd.grad(surface, counts, weight)[0], wanted)
 
 
 def test_shares_of_events_are_no_hard_counts():

@@ -7,6 +7,7 @@ event lies evenly in it and the one before evenly in the threshold behind, so th
 either is right to first order in their length. Reading the last event alone takes half of the window.
 """
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -59,9 +60,8 @@ class _LastEvents(Function):
         # 1 + index of the interval of the last event, and of the one before it; 0: none was
         last = torch.zeros(counts.shape[1:], dtype=torch.long, device=counts.device)
         before = torch.zeros_like(last)
-        lasts = []
-        befores = []
-        shown = []
+        surface = []
+        older = []
         start = 0
         for stop, time_s in zip(seen, at_s, strict=True):
             for index in range(start, stop):
@@ -69,26 +69,45 @@ class _LastEvents(Function):
                 before = torch.where(counts[index] > 1, index + 1, torch.where(fired, last, before))
                 last = torch.where(fired, index + 1, last)
             start = max(start, stop)
-            lasts.append(last)
-            befores.append(before)
-            shown.append(
-                torch.cat((torch.zeros(1, dtype=middle_s.dtype), torch.exp((middle_s - time_s) / tau_s)))
-            )
-        shown = torch.stack(shown).to(counts)
-        last = torch.stack(lasts)
-        before = torch.stack(befores)
-        ctx.seen = seen
-        ctx.save_for_backward(last, before, shown)
-        return torch.stack([row[index] for row, index in zip(shown, last, strict=True)])
+            shown = torch.cat((torch.zeros(1, dtype=middle_s.dtype), ((middle_s - time_s) / tau_s).exp()))
+            shown = shown.to(counts)
+            surface.append(shown[last])
+            older.append(shown[before])
+        ctx.course = seen, middle_s, at_s, tau_s
+        surface = torch.stack(surface)
+        ctx.save_for_backward(counts.clamp(max=2).to(torch.uint8), surface, torch.stack(older))
+        return surface
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
-        last, before, shown = ctx.saved_tensors
-        pull = torch.zeros(shown.shape[1] - 1, *grad.shape[1:], dtype=grad.dtype, device=grad.device)
-        for one, newest, older, row, stop in zip(grad, last, before, shown, ctx.seen, strict=True):
-            index = torch.arange(1, stop + 1, device=grad.device).reshape(-1, *[1] * newest.ndim)
-            now = row[1 : stop + 1].reshape(index.shape)
-            for begun in (newest, older):
-                pull[:stop] += one / 2 * torch.where(index > begun, now - row[begun], 0)
+        """Once back through time. A surface joins in at the last interval that it sees; its windows leave at the
+        event that they begin at, the last one or the one before it."""
+        counts, last, before = ctx.saved_tensors
+        seen, middle_s, at_s, tau_s = ctx.course
+        pull = torch.zeros(counts.shape, dtype=grad.dtype, device=grad.device)
+        # of the surfaces whose last event is not met yet, and of those with one event met: what an event now would
+        # show, less what the windows' beginnings show
+        now = torch.zeros_like(pull[0])
+        begun = now
+        begun_before = now
+        now_past = now
+        begun_past = now
+        number = len(seen) - 1
+        for index in range(len(counts) - 1, -1, -1):
+            if index + 1 < len(counts):
+                fade = math.exp(float(middle_s[index] - middle_s[index + 1]) / tau_s)
+                now = now * fade
+                now_past = now_past * fade
+            while number >= 0 and seen[number] > index:
+                now = now + grad[number] * math.exp(float(middle_s[index] - at_s[number]) / tau_s)
+                begun = begun + grad[number] * last[number]
+                begun_before = begun_before + grad[number] * before[number]
+                number -= 1
+            once = counts[index] == 1
+            quiet = counts[index] == 0
+            now_past = torch.where(quiet, now_past, torch.where(once, now, 0))
+            begun_past = torch.where(quiet, begun_past, torch.where(once, begun_before, 0))
+            now, begun, begun_before = (torch.where(quiet, value, 0) for value in (now, begun, begun_before))
+            pull[index] = now + (now_past - begun - begun_before - begun_past) / 2
         return pull, None, None, None
