@@ -54,6 +54,7 @@ def memory(
         "play": of width (theta_on + theta_off)/2, the mean over the scatter of real thresholds; smooth.
         None: "exact" where all pixels share one pair of thresholds that differ by more than a quarter, else
           "play". docs/events.md has both in figures.
+      Thresholds: that of the play, exact for equal ones that change together, else approximate.
       Scenes that never reach half a threshold have no gradient: start those with ``soft_counts``. Chunks have
       the gradient of the whole with "play"; with "exact" each begins evenly around the play's centre. Second
       derivatives raise.
