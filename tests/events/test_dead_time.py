@@ -184,3 +184,16 @@ def test_gradients_follow_differences_of_hard_counts_over_beginnings(name, dead_
     truth = (counted(1.0, judge) - counted(-1.0, judge)) / 2
     assert float(found @ truth / (found.norm() * truth.norm())) > cosine
     assert low < float(found @ truth / (truth @ truth)) < 1.1
+
+
+def test_without_gradients_the_counts_are_the_hard_sensor_s_and_no_mean_is_computed(monkeypatch):
+    sensor = SensorModel(0.15, 0.15, refractory_s=0.004)
+    t_s = torch.arange(40) * 1e-3
+    level = (0.1 * torch.randn(40, 8, generator=torch.Generator().manual_seed(0))).cumsum(0)
+    wanted = sensor_counts(level.clone().requires_grad_(), t_s, sensor, log_input=True)[0].detach()
+    monkeypatch.setattr("codesign.events.layers.dead_time.pass_play", None)
+    with torch.no_grad():
+        bare, _ = sensor_counts(level.clone().requires_grad_(), t_s, sensor, log_input=True)
+    plain, _ = sensor_counts(level, t_s, sensor, log_input=True)
+    torch.testing.assert_close(bare, wanted, rtol=0, atol=1e-6)  # n + (s - s) rounds
+    torch.testing.assert_close(plain, wanted, rtol=0, atol=1e-6)

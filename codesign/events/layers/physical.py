@@ -146,6 +146,9 @@ def _mean_counts(seen, thetas, interval_s, refractory_s, state):
     if refractory_s is not None:
         dead_time.warn_beyond(seen, thetas, interval_s, refractory_s)
     dead_s = 0.0 if refractory_s is None else float(torch.as_tensor(refractory_s).detach())
+    slopes = [seen, start, *thetas, refractory_s]
+    if not (torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in slopes)):
+        refractory_s = None  # the values are the hard sensor's: nobody asks for what the mean passes
     if refractory_s is None or not dead_time.reaches(interval_s, dead_s):
         smooth, reference = memory(seen[1:], *thetas, state=start, log_input=True)
         if refractory_s is not None:
