@@ -22,6 +22,8 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+from codesign.events.level_path import parts
+
 PHASES = 6
 WIDTH = 2 / PHASES  # of a count: every phase belongs to two groups
 GOLDEN = (5**0.5 - 1) / 2  # its multiples spread evenly: neighbouring pixels stand at different phases
@@ -230,9 +232,7 @@ def reaches(interval_s: Tensor, refractory_s: float) -> bool:
 def warn_beyond(
     level: Tensor, thetas: Sequence[Tensor], interval_s: Tensor, refractory_s: Tensor | float
 ) -> None:
-    """Warn where a gradient is asked and rate x dead time is beyond ``MOST_LOAD``, the mean over events."""
-    if not (torch.is_grad_enabled() and (level.requires_grad or _asks(*thetas, refractory_s))):
-        return
+    """Warn where rate x dead time is beyond ``MOST_LOAD``, the mean over events."""
     with torch.no_grad():
         step = level.diff(dim=0)
         moved = (step.clamp(min=0) / thetas[0] + (-step).clamp(min=0) / thetas[1]).sum(0)
@@ -248,10 +248,6 @@ def warn_beyond(
         )
 
 
-def _asks(*values):
-    return any(isinstance(value, Tensor) and value.requires_grad for value in values)
-
-
 def local_share(
     step: Tensor, thetas: Sequence[Tensor], interval_s: Tensor, refractory_s: Tensor | float
 ) -> Tensor:
@@ -262,55 +258,21 @@ def local_share(
     return 1 / (rate_hz * refractory_s + 0.5).clamp(min=1)
 
 
-class SubIntervals:
-    """Intervals cut into equal parts of at most a fifth of the dead time."""
-
-    def __init__(self, interval_s: Tensor, refractory_s: float):
-        parts = (interval_s * (STEPS / refractory_s)).ceil().clamp(min=1).long()
-        self.count = len(interval_s)
-        self.frame = torch.repeat_interleave(torch.arange(self.count), parts)
-        first = (parts.cumsum(0) - parts)[self.frame]
-        self.share = (torch.arange(len(self.frame)) - first + 1) / parts[self.frame].double()
-        self.interval_s = (interval_s / parts)[self.frame]
-
-    def levels(self, level: Tensor) -> Tensor:
-        """Levels [T, ...] at all ends of parts, linear between frames."""
-        share = self.share.to(level).reshape(-1, *[1] * (level.ndim - 1))
-        frame = self.frame.to(level.device)
-        return torch.cat((level[:1], torch.lerp(level[frame], level[frame + 1], share)))
-
-    def sums(self, counts: Tensor) -> Tensor:
-        """Counts of the parts [N, ...] summed over intervals, [T-1, ...]."""
-        total = counts.new_zeros(self.count, *counts.shape[1:])
-        return total.index_add(0, self.frame.to(counts.device), counts)
-
-
-@dataclass(frozen=True)
-class PlayState:
-    """centre: [...] of the play; dead: DeadTimeState."""
-
-    centre: Tensor
-    dead: DeadTimeState
-
-    def sunk(self, ramp: Tensor) -> "PlayState":
-        """The same beneath a level that has sunk by a ramp."""
-        return PlayState(self.centre - ramp, self.dead)
-
-
 def pass_play(
     level: Tensor,
     counts: Tensor,
+    centre: Tensor,
     thetas: Sequence[Tensor],
     interval_s: Tensor,
     refractory_s: Tensor | float,
-    state: PlayState | None,
-) -> tuple[Tensor, PlayState]:
+    state: DeadTimeState | None,
+) -> tuple[Tensor, DeadTimeState]:
     """Mean counts behind a dead time, of ``memory``'s counts: values from a play, slopes from the layer.
 
-    Args: level: [N + 1, ...]. counts: [N, 2, ...] of ``memory``. thetas: ON, OFF. interval_s: [N].
-    Returns: [N, 2, ...]; PlayState. Gradient: counts and refractory_s.
+    Args: level: [N + 1, ...]. counts: [N, 2, ...] of ``memory``. centre: [...] of the play at the first level.
+      thetas: ON, OFF. interval_s: [N].
+    Returns: [N, 2, ...]; DeadTimeState. Gradient: counts and refractory_s.
     """
-    centre = level[0].detach() if state is None else state.centre
     mean = torch.empty_like(counts, requires_grad=False)
     theta_on, theta_off = (theta.detach() for theta in thetas)
     half = (theta_on + theta_off) / 4
@@ -321,10 +283,26 @@ def pass_play(
             centre = centre + rise - fall
             pair[0] = rise / theta_on
             pair[1] = fall / theta_off
-    passed, dead = pass_dead_time(
+    return pass_dead_time(
         mean + (counts - counts.detach()),
         interval_s,
         torch.as_tensor(refractory_s, dtype=torch.float64),
-        None if state is None else state.dead,
+        state,
     )
-    return passed, PlayState(centre, dead)
+
+
+def finely(level: Tensor, interval_s: Tensor, refractory_s: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Levels at the ends of parts of at most a fifth of the dead time, linear between frames.
+
+    Args: level: [T, ...]. interval_s: [T-1].
+    Returns: levels [N + 1, ...]; lengths [N] of the parts; the interval [N] that each lies in.
+    """
+    ends_s = torch.cat((interval_s.new_zeros(1), interval_s.cumsum(0)))
+    interval, share, fine_s = parts(ends_s, refractory_s / STEPS)
+    share = share.to(level).reshape(-1, *[1] * (level.ndim - 1))
+    frame = interval.to(level.device)
+    return (
+        torch.cat((level[:1], torch.lerp(level[frame], level[frame + 1], share))),
+        fine_s.diff(),
+        frame,
+    )

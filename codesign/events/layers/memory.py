@@ -123,8 +123,8 @@ def soft_counts(
 
 
 def _gradient(name, theta_on, theta_off, steers):
-    """ "exact" or "play": what the thresholds [...] ask for where the caller leaves it open. steers: whether a gradient may
-    be asked for."""
+    """The gradient that the thresholds [...] ask for where the caller leaves it open. steers: whether one may be
+    asked for at all."""
     if name not in (None, *GRADIENTS):
         raise DomainError(f"gradient is {name!r}; allowed: {', '.join(map(repr, GRADIENTS))}, or None.")
     if name is not None:

@@ -29,7 +29,8 @@ DESIGN = (
 class PhysicalState:
     """What ``sensor_counts`` carries over chunks. sensor: SensorState of the hard sensor; reference, level:
     [...] of the smooth account (their graph is kept); frame: [...] last frame; draws: [2, ...] standard
-    normal numbers of the thresholds; time_s: time of the last frame; dead: state of the dead time's account."""
+    normal numbers of the thresholds; time_s: time of the last frame; dead: state of the dead time's account,
+    None where no gradient was asked."""
 
     sensor: SensorState
     reference: Tensor
@@ -37,7 +38,7 @@ class PhysicalState:
     frame: Tensor
     draws: Tensor | None
     time_s: float
-    dead: Any = None
+    dead: dead_time.DeadTimeState | None = None
 
 
 def sensor_counts(
@@ -115,7 +116,7 @@ def sensor_counts(
         frames[-1],
         draws,
         float(times_s[-1]),
-        None if dead_state is None else dead_state.sunk(ramp),
+        dead_state,
     )
 
 
@@ -143,22 +144,21 @@ def _mean_counts(seen, thetas, interval_s, refractory_s, state):
     """Counts with the slopes of their mean over places inside the threshold and behind the dead time, [T-1, 2,
     ...]; the states of ``memory`` and of the dead time after them."""
     start = seen[0] if state is None else state.reference
-    if refractory_s is not None:
-        dead_time.warn_beyond(seen, thetas, interval_s, refractory_s)
-    dead_s = 0.0 if refractory_s is None else float(torch.as_tensor(refractory_s).detach())
     slopes = [seen, start, *thetas, refractory_s]
     if not (torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in slopes)):
         refractory_s = None  # the values are the hard sensor's: nobody asks for what the mean passes
-    if refractory_s is None or not dead_time.reaches(interval_s, dead_s):
+    if refractory_s is None:
+        return *memory(seen[1:], *thetas, state=start, log_input=True), None
+    dead_time.warn_beyond(seen, thetas, interval_s, refractory_s)
+    dead_s = float(torch.as_tensor(refractory_s).detach())
+    if not dead_time.reaches(interval_s, dead_s):
         smooth, reference = memory(seen[1:], *thetas, state=start, log_input=True)
-        if refractory_s is not None:
-            share = dead_time.local_share(seen.diff(dim=0), thetas, interval_s, refractory_s)
-            smooth = smooth * share[:, None]
-        return smooth, reference, None
-    before = None if state is None else state.dead
-    grid = dead_time.SubIntervals(interval_s, dead_s)
-    fine = grid.levels(seen)
+        share = dead_time.local_share(seen.diff(dim=0), thetas, interval_s, refractory_s)
+        return smooth * share[:, None], reference, None
+    fine, part_s, interval = dead_time.finely(seen, interval_s, dead_s)
     # the play's slopes, as its values are what the recursion sees
     smooth, reference = memory(fine[1:], *thetas, state=start, log_input=True, gradient="play")
-    passed, dead = dead_time.pass_play(fine, smooth, thetas, grid.interval_s, refractory_s, before)
-    return grid.sums(passed), reference, dead
+    centre, before = (start, None) if state is None else (start[1], state.dead)
+    passed, dead = dead_time.pass_play(fine, smooth, centre.detach(), thetas, part_s, refractory_s, before)
+    total = passed.new_zeros(len(interval_s), *passed.shape[1:])
+    return total.index_add(0, interval, passed), reference, dead
