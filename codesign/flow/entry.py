@@ -1,12 +1,20 @@
-"""What every network does around its layers: check the volume, normalise it, pad it to the stride, and fade
-the flow in with the events."""
+"""What every network does around its layers: check the volume and bring it to the weights' type, normalise it,
+pad it to the stride, and fade the flow in with the events."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 from torch import Tensor
 from torch.nn.functional import pad
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.errors import DomainError
+from codesign.flow.checks import check_flow, check_volume
 from codesign.types import EventVolume, FlowField
 
+Given = ParamSpec("Given")
+Found = TypeVar("Found")
 FEW = 10.0  # events of a sample at which half of the flow is believed
 
 
@@ -24,18 +32,49 @@ def check_sizes(width: float, hidden: int | None) -> None:
         raise DomainError(f"hidden is {hidden!r}; a multiple of 4, or None for 8 times the width, is needed.")
 
 
-def check_volume(volume: EventVolume, bins: int) -> Tensor:
-    """Counts [B, 2, bins, H, W] of a volume that a network built for ``bins`` can take.
+def takes_volume(
+    method: Callable[Concatenate[Any, EventVolume, Given], Found],
+) -> Callable[Concatenate[Any, EventVolume, Given], Found]:
+    """Make a network's method of an EventVolume refuse what is none, and compute in the type of the weights.
 
-    Raises: ShapeError, DomainError.
+    The counts (and a flow ``start_px``) are converted to the weights' type, float32 as delivered; the flow,
+    confidence and covariance that come back have the type of the counts, so a chain in float64 stays in
+    float64, to the precision of the weights.
+    Raises: as check_volume, for another number of bins than ``config["bins"]`` too; DomainError for events and
+      weights on different devices.
     """
-    counts = volume.counts
-    if counts.ndim != 5 or counts.shape[1] != 2 or counts.shape[2] != bins or min(counts.shape) < 1:
-        raise ShapeError(
-            f"this network takes event volumes [B, 2, {bins}, H, W], got {tuple(counts.shape)}; make the "
-            f"volume with {bins} bins or build the network for others."
-        )
-    return check_finite(counts, "event volume")
+
+    @wraps(method)
+    def checked(network: Any, volume: EventVolume, *more: Given.args, **named: Given.kwargs) -> Found:
+        counts = check_volume(volume, network.config["bins"])
+        weight = next(network.parameters())
+        if weight.device != counts.device:
+            raise DomainError(
+                f"the events are on {counts.device}, the weights of the network on {weight.device}; move one "
+                "with .to()."
+            )
+
+        def start(flow_px):
+            wanted = (counts.shape[0], 2, *counts.shape[3:])
+            return (
+                None if flow_px is None else check_flow(flow_px, wanted, "the flow to start from").to(weight)
+            )
+
+        own = replace(volume, counts=counts.to(weight.dtype))
+        starts = [start(flow_px) for flow_px in more]
+        named_starts = {name: start(flow_px) for name, flow_px in named.items()}
+        found = cast(Any, method)(network, own, *starts, **named_starts)
+        return cast(Found, _in_type(found, counts.dtype))
+
+    return checked
+
+
+def _in_type(found, dtype):
+    """A FlowField, or a list of them, in a floating-point type."""
+    if isinstance(found, list):
+        return [_in_type(field, dtype) for field in found]
+    parts = {name: getattr(found, name) for name in ("flow_px", "confidence", "covariance_px2")}
+    return replace(found, **{name: part.to(dtype) for name, part in parts.items() if part is not None})
 
 
 def normalise(counts: Tensor) -> Tensor:

@@ -12,8 +12,9 @@ from collections.abc import Sequence
 
 import torch
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.errors import DomainError, ShapeError
 from codesign.flow import lk_field, lk_level
+from codesign.flow.checks import check_number, check_volume
 from codesign.types import EventVolume, FlowField
 
 
@@ -52,14 +53,10 @@ def estimate_lk(
     >>> estimate_lk(evenly_timed(counts)).flow_px[0, :, 24, 32].round(decimals=0).tolist()
     [2.0, 1.0]
     """
-    counts = volume.counts
-    if counts.ndim != 5 or counts.shape[1] != 2 or counts.shape[2] < 2:
-        raise ShapeError(f"an event volume is [B, 2, bins >= 2, H, W], got {tuple(counts.shape)}.")
+    counts = check_volume(volume, least_bins=2)
     if model not in lk_field.TERMS:
         raise DomainError(f"flow model '{model}' is unknown; choose one of {', '.join(lk_field.TERMS)}.")
-    if not prior_px > 0:
-        raise DomainError(f"prior_px is {prior_px}; a standard deviation > 0 px is needed.")
-    check_finite(counts, "event volume")
+    check_number(prior_px, "prior_px", above=0.0)
     batch, _, _, height, width = counts.shape
     least = max(lk_level.least_px(blur_px) for blur_px in levels_px)
     if min(height, width) < least:

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, pad, silu, unfold
 
 from codesign.errors import DomainError
-from codesign.flow.entry import check_bins, check_volume, pad_to, presence
+from codesign.flow.entry import check_bins, pad_to, presence, takes_volume
 from codesign.flow.layers import GROUPS, Layer
 from codesign.flow.lk import estimate_lk
 from codesign.flow.warp import along_flow
@@ -70,6 +70,7 @@ class Refiner(nn.Module):
             for parameter in last.parameters():
                 nn.init.zeros_(parameter)
 
+    @takes_volume
     def forward(self, volume: EventVolume) -> FlowField:
         """Flow of an EventVolume [B, 2, bins, H, W] of any H, W.
 
@@ -87,6 +88,7 @@ class Refiner(nn.Module):
         share = misfits[0].square() / (misfits[0].square() + misfits[1].square())
         return _field(start_px + _larger(share[:, None], POOL) * (flow_px - start_px), doubt, volume)
 
+    @takes_volume
     def predictions(self, volume: EventVolume, start_px: Tensor | None = None) -> list[FlowField]:
         """FlowFields after each correction, by themselves: what training looks at. start_px: [B, 2, H, W]
         flow to begin with instead of the closed form's."""
@@ -160,7 +162,7 @@ class _Bins:
     """
 
     def __init__(self, volume, bins):
-        counts = check_volume(volume, bins)
+        counts = volume.counts
         span = volume.collected_s.sum()
         self.share, self.time = (
             (values / span).to(counts) for values in (volume.collected_s, volume.centroid_s)

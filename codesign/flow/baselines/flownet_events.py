@@ -8,7 +8,7 @@ from torch.nn.functional import interpolate, silu
 
 from codesign.flow.baselines.rescale import rescale_flow
 from codesign.flow.baselines.weights import channels, fill_budget, start
-from codesign.flow.entry import check_bins, check_sizes, check_volume, normalise, pad_to, to_field
+from codesign.flow.entry import check_bins, check_sizes, normalise, pad_to, takes_volume, to_field
 from codesign.flow.layers import Layer
 from codesign.types import EventVolume, FlowField
 
@@ -27,6 +27,7 @@ class FlowNetEvents(nn.Module):
     Called with an EventVolume [B, 2, bins, H, W] of any H, W: FlowField, px per interval at full resolution.
       Its confidence only says whether the sample had events.
     Gradient: counts and weights; smooth, so any order.
+    Computed in the type of the weights, returned in that of the counts.
     Raises: ShapeError, DomainError.
     Source: Zhu et al., EV-FlowNet, RSS 2018, fig. 4, with group normalisation (Wu and He, ECCV 2018) and
       SiLU.
@@ -63,9 +64,11 @@ class FlowNetEvents(nn.Module):
         width, hidden = fill_budget(lambda **sizes: cls(bins, **sizes), weights)
         return cls(bins, width, hidden, seed)
 
+    @takes_volume
     def forward(self, volume: EventVolume) -> FlowField:
         return self._finish(volume, self._levels(volume)[-1])
 
+    @takes_volume
     def predictions(self, volume: EventVolume) -> list[FlowField]:
         """Flow of every decoding layer at full resolution, in pixels there, coarse first; the last is what a
         call returns."""
@@ -73,7 +76,7 @@ class FlowNetEvents(nn.Module):
 
     def _levels(self, volume) -> list[Tensor]:
         """Flow at 1/8, 1/4, 1/2 and all of the padded resolution, in pixels of each."""
-        counts = check_volume(volume, self.config["bins"])
+        counts = volume.counts
         x = pad_to(normalise(counts).flatten(1, 2), STRIDE).contiguous(memory_format=torch.channels_last)
         skips = []
         flows = []

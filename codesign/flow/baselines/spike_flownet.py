@@ -12,7 +12,7 @@ from codesign.flow.baselines.halves import to_halves
 from codesign.flow.baselines.neuron import integrate_and_fire
 from codesign.flow.baselines.rescale import rescale_flow
 from codesign.flow.baselines.weights import channels, fill_budget, start
-from codesign.flow.entry import check_bins, check_sizes, check_volume, normalise, pad_to, to_field
+from codesign.flow.entry import check_bins, check_sizes, normalise, pad_to, takes_volume, to_field
 from codesign.types import EventVolume, FlowField
 
 STRIDE = 16
@@ -34,6 +34,7 @@ class SpikeFlowNet(nn.Module):
     Called with an EventVolume [B, 2, bins, H, W] of any H, W: FlowField, px per interval at full resolution.
       Its confidence only says whether the sample had events.
     Gradient: counts and weights, through spikes by the surrogate. First derivatives only.
+    Computed in the type of the weights, returned in that of the counts.
     Raises: ShapeError, DomainError.
     Source: Lee et al., Spike-FlowNet, ECCV 2020, sec. 3 and fig. 4.
 
@@ -97,9 +98,11 @@ class SpikeFlowNet(nn.Module):
         width, hidden = fill_budget(lambda **sizes: cls(bins, **sizes), weights)
         return cls(bins, width, hidden, seed=seed)
 
+    @takes_volume
     def forward(self, volume: EventVolume) -> FlowField:
         return self._finish(volume, self._levels(volume)[-1])
 
+    @takes_volume
     def predictions(self, volume: EventVolume) -> list[FlowField]:
         """Flow of every decoding layer at full resolution, in pixels there, coarse first; the last is what a
         call returns."""
@@ -158,7 +161,7 @@ class SpikeFlowNet(nn.Module):
         return flows
 
     def _levels(self, volume):
-        counts = check_volume(volume, self.config["bins"])
+        counts = volume.counts
         halves = to_halves(pad_to(normalise(counts), STRIDE))
         with torch.autocast(
             halves.device.type, enabled=False
