@@ -2,6 +2,15 @@
 motion."""
 
 from codesign.place.mount import Mount, yaw_pitch_roll_rad
-from codesign.place.observability import information, planar_flow, velocity_from_flow
+from codesign.place.observability import FREE, PLANAR, body_flow, information, planar_flow, velocity_from_flow
 
-__all__ = ["Mount", "information", "planar_flow", "velocity_from_flow", "yaw_pitch_roll_rad"]
+__all__ = [
+    "FREE",
+    "PLANAR",
+    "Mount",
+    "body_flow",
+    "information",
+    "planar_flow",
+    "velocity_from_flow",
+    "yaw_pitch_roll_rad",
+]

@@ -1,10 +1,11 @@
-"""The body's planar velocity from image flow, and how well a mount can tell it: weighted least squares with
-known depth.
+"""The body's velocity from image flow, and how well a mount can tell it: weighted least squares with known
+depth.
 
 A static point X in camera axes moves as X' = -(v + w x X) when the camera moves with velocity v and rotation
 rate w (Longuet-Higgins and Prazdny, 1980). The pixel that images it moves so that its chief ray goes on
-passing through the point, for any lens that has chief rays. The flow is linear in (forward m/s, lateral m/s
-to the left, yaw rate rad/s to the left) of the body's origin.
+passing through the point, for any lens that has chief rays. The flow is linear in the twist of the body:
+velocity of its origin (forward, left, up; m/s) and rotation rate (about the same axes; rad/s). A body in the
+plane has three of these six: forward, lateral, yaw rate.
 """
 
 from collections.abc import Sequence
@@ -23,17 +24,13 @@ _SMALLEST_RATIO = (
 )
 
 
-def planar_flow(camera: ChiefRayCamera, depth_m: Tensor, T_body_cam: Tensor) -> tuple[Tensor, Tensor]:
-    """Flow that each unit of planar body velocity makes in every pixel.
+PLANAR = (0, 1, 5)  # of the six: forward, lateral, yaw rate
+FREE = (0, 1, 2, 3, 4, 5)
 
-    Args:
-      camera: has ``chief_rays`` and ``film`` (see render.Camera). depth_m: [..., P] true depth along the
-        camera's z axis per pixel, film order.
-      T_body_cam: [..., 4, 4]. Pixels without a surface carry a depth that is not finite or not positive.
-    Returns: flow [..., P, 2, 3] px/s per (m/s, m/s, rad/s); 0 where there is no surface. seen [..., P] bool.
-    Gradient: depth, mount, and the lens behind the chief rays.
-    Raises: ShapeError when the depths are not one per pixel, or the mount is not [..., 4, 4]; DomainError
-      when the mount is not finite.
+
+def planar_flow(camera: ChiefRayCamera, depth_m: Tensor, T_body_cam: Tensor) -> tuple[Tensor, Tensor]:
+    """Flow that each unit of planar body velocity makes in every pixel: ``body_flow`` of a body on the ground,
+    [..., P, 2, 3] px/s per (m/s, m/s, rad/s).
 
     >>> from codesign import lens, place, render
     >>> camera = render.Camera(lens.ThinLens(8.0, 2.0), 16, 12, 0.05)
@@ -42,10 +39,34 @@ def planar_flow(camera: ChiefRayCamera, depth_m: Tensor, T_body_cam: Tensor) -> 
     >>> [round(v) for v in flow[0, :, 0].tolist()]  # px/s per m/s forward: 160 px of focal length over 2 m
     [0, 80]
     """
+    flow, seen = body_flow(camera, depth_m, T_body_cam)
+    return flow[..., list(PLANAR)], seen
+
+
+def body_flow(camera: ChiefRayCamera, depth_m: Tensor, T_body_cam: Tensor) -> tuple[Tensor, Tensor]:
+    """Flow that each unit of a body's twist makes in every pixel.
+
+    Args:
+      camera: has ``chief_rays`` and ``film`` (see render.Camera). depth_m: [..., P] true depth along the
+        camera's z axis per pixel, film order.
+      T_body_cam: [..., 4, 4]. Pixels without a surface carry a depth that is not finite or not positive.
+    Returns: flow [..., P, 2, 6] px/s per m/s forward, left, up of the body's origin and per rad/s about these
+      axes; 0 where there is no surface. seen [..., P] bool.
+    Gradient: depth, mount, and the lens behind the chief rays.
+    Raises: ShapeError when the depths are not one per pixel, or the mount is not [..., 4, 4]; DomainError
+      when the mount is not finite.
+
+    >>> from codesign import lens, place, render
+    >>> camera = render.Camera(lens.ThinLens(8.0, 2.0), 16, 12, 0.05)
+    >>> ahead = place.Mount((0.0, 0.0, 1.0), (0.0, 0.0, 0.0))().detach()
+    >>> flow, seen = body_flow(camera, torch.full((192,), 2.0), ahead)
+    >>> [round(v) for v in flow[0, 1].tolist()]  # down in the image: 160 px over 2 m for a metre up per second
+    [-3, 0, 80, 7, -163, 0]
+    """
     pixels = camera.film.pixels()
     if depth_m.shape[-1:] != pixels.shape[:1] or T_body_cam.shape[-2:] != (4, 4):
         raise ShapeError(
-            f"planar flow needs depths [..., {pixels.shape[0]}] (one per pixel) and a mount [..., 4, 4], "
+            f"the flow of a body needs depths [..., {pixels.shape[0]}] (one per pixel) and a mount [..., 4, 4], "
             f"got {tuple(depth_m.shape)} and {tuple(T_body_cam.shape)}."
         )
     check_finite(T_body_cam, "T_body_cam")
@@ -66,16 +87,18 @@ def velocity_from_flow(
     T_body_cam: Tensor,
     weight: Tensor | None = None,
     prior: Sequence[float] | Tensor | None = None,
+    axes: Sequence[int] = PLANAR,
 ) -> Tensor:
-    """Planar velocity of the body by weighted least squares.
+    """Velocity of the body by weighted least squares.
 
     Args:
       flow_px_s: [B, 2, H, W] image flow, px per second. camera, depth_m [P] or [B, P], T_body_cam [4, 4] or
-        [B, 4, 4]: as for planar_flow.
+        [B, 4, 4]: as for ``body_flow``.
       weight: [P] or [B, P] >= 0, inverse variance of the flow per pixel, s^2/px^2; equal weights when None.
-      prior: [3] standard deviations expected of (m/s, m/s, rad/s) around zero; what the image does not show
+      prior: [K] standard deviations expected of the K velocities around zero; what the image does not show
         then stays near zero. None: no prior.
-    Returns: [B, 3] forward m/s, lateral m/s (left), yaw rate rad/s (left), float64.
+      axes: which K of the six velocities the body has (``body_flow``); ``PLANAR``, or ``FREE``.
+    Returns: [B, K] float64; of a body in the plane: forward m/s, lateral m/s (left), yaw rate rad/s (left).
     Gradient: flow, depth, mount, weight, lens.
     Raises: ShapeError; DomainError for NaN in flow, negative weights, and (without a prior) when no pixel
       sees a surface or the velocity is not observable.
@@ -92,7 +115,7 @@ def velocity_from_flow(
     if flow_px_s.ndim != 4 or flow_px_s.shape[1] != 2:
         raise ShapeError(f"velocity_from_flow needs flow [B, 2, H, W], got {tuple(flow_px_s.shape)}.")
     check_finite(flow_px_s, "flow")
-    rows, weight = _weighted_rows(camera, depth_m, T_body_cam, weight)
+    rows, weight = _weighted_rows(camera, depth_m, T_body_cam, weight, axes)
     measured = flow_px_s.double().flatten(2).mT  # [B, P, 2]
     if measured.shape[1] != rows.shape[-3]:
         raise ShapeError(
@@ -101,7 +124,7 @@ def velocity_from_flow(
         )
     normal = _normal_matrix(rows, weight, prior)
     right = torch.einsum("...pck,...p,...pc->...k", rows, weight, measured)
-    return torch.linalg.solve(normal.expand(*right.shape, 3), right)
+    return torch.linalg.solve(normal.expand(*right.shape, right.shape[-1]), right)
 
 
 def information(
@@ -110,13 +133,13 @@ def information(
     T_body_cam: Tensor,
     weight: Tensor | None = None,
     prior: Sequence[float] | Tensor | None = None,
+    axes: Sequence[int] = PLANAR,
 ) -> Tensor:
-    """Information matrix of (forward m/s, lateral m/s, yaw rate rad/s) in a flow field: sum over pixels of
-    weight J^T J.
+    """Information matrix of the body's velocity in a flow field: sum over pixels of weight J^T J.
 
     Args: as for velocity_from_flow, with or without a batch axis. With weight = 1 / variance of the flow
       (s^2/px^2) its inverse is the covariance of the velocity.
-    Returns: [3, 3] (or [B, 3, 3]), float64. Gradient: depth, mount, weight, lens.
+    Returns: [K, K] (or [B, K, K]), float64. Gradient: depth, mount, weight, lens.
     Raises: as velocity_from_flow.
 
     >>> from codesign import lens, place, render
@@ -126,7 +149,7 @@ def information(
     >>> round(float(found.inverse()[0, 0].sqrt()), 5)  # m/s: 0.5 px/s of noise over 80 px/s, in 192 pixels
     0.00045
     """
-    return _normal_matrix(*_weighted_rows(camera, depth_m, T_body_cam, weight), prior)
+    return _normal_matrix(*_weighted_rows(camera, depth_m, T_body_cam, weight, axes), prior)
 
 
 def chief_lines(camera: ChiefRayCamera, pixels: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -160,25 +183,25 @@ def flow_of_points(velocity: Tensor, slope: Tensor, step: Tensor) -> Tensor:
 
 
 def _point_velocity(point, T_body_cam):
-    """Velocity in camera axes of static points [..., P, 3] per unit of planar body velocity: [..., P, 3
-    (axis), 3 (unit)]."""
-    rotation = T_body_cam[..., :3, :3]
+    """Velocity in camera axes of static points [..., P, 3] per unit of the body's twist: [..., P, 3 (axis), 6]."""
+    to_camera = T_body_cam[..., :3, :3].mT  # columns: the body's axes as the camera has them
     position = T_body_cam[..., :3, 3]
-    zero = torch.zeros_like(position[..., 0])
-    one = torch.ones_like(position[..., 0])
-    lever = torch.stack(
-        [-position[..., 1], position[..., 0], zero], -1
-    )  # z x position: velocity of the camera when the body turns
-    units = torch.stack([torch.stack([one, zero, zero], -1), torch.stack([zero, one, zero], -1), lever], -1)
-    velocity = rotation.mT @ units  # of the camera, in camera axes
-    up = rotation[..., 2, :, None].mT.expand_as(point)  # the body's z axis in camera axes
-    turning = torch.linalg.cross(up, point)
-    still = torch.zeros_like(turning)
-    return -(velocity[..., None, :, :] + torch.stack([still, still, turning], -1))
+    lever = torch.linalg.cross(
+        torch.eye(3).to(position), position[..., None, :]
+    ).mT  # of the camera, body axes
+    shift = torch.cat([to_camera, to_camera @ lever], -1)
+    axes = to_camera.mT[..., None, :, :].expand(*point.shape[:-1], 3, 3)
+    turning = torch.linalg.cross(axes, point[..., None, :]).mT
+    return -(shift[..., None, :, :] + torch.cat([torch.zeros_like(turning), turning], -1))
 
 
-def _weighted_rows(camera, depth_m, T_body_cam, weight):
-    rows, seen = planar_flow(camera, depth_m, T_body_cam)
+def _weighted_rows(camera, depth_m, T_body_cam, weight, axes):
+    if not axes or not set(axes) <= set(FREE):
+        raise DomainError(
+            f"axes = {tuple(axes)}; choose from 0 to 5: forward, left, up, and turns about these."
+        )
+    rows, seen = body_flow(camera, depth_m, T_body_cam)
+    rows = rows[..., list(axes)]
     if weight is None:
         return rows, seen.to(rows)
     check_finite(weight, "flow weight")
@@ -194,10 +217,10 @@ def _normal_matrix(rows, weight, prior):
     normal = torch.einsum("...pck,...p,...pcl->...kl", rows, weight, rows)
     if prior is not None:
         deviation = torch.as_tensor(prior, dtype=rows.dtype, device=rows.device)
-        if deviation.shape != (3,) or not bool(((deviation > 0) & deviation.isfinite()).all()):
+        if deviation.shape != rows.shape[-1:] or not bool(((deviation > 0) & deviation.isfinite()).all()):
             raise DomainError(
-                f"prior is {deviation.tolist()}; three finite standard deviations > 0 (m/s, m/s, rad/s) are "
-                "needed."
+                f"prior is {deviation.tolist()}; {rows.shape[-1]} finite standard deviations > 0 (m/s, rad/s), "
+                "one per velocity, are needed."
             )
         return normal + torch.diag(deviation**-2)
     fixed = normal.detach()
@@ -207,7 +230,7 @@ def _normal_matrix(rows, weight, prior):
             "turn the camera towards the ground, or give a prior."
         )
     eigenvalues = torch.linalg.eigvalsh(fixed)
-    if bool((eigenvalues[..., 0] <= _SMALLEST_RATIO * eigenvalues[..., 2]).any()):
+    if bool((eigenvalues[..., 0] <= _SMALLEST_RATIO * eigenvalues[..., -1]).any()):
         raise DomainError(
             "the velocity is not observable: some motion of the body leaves the flow of all weighted pixels "
             "as it is; see more of the ground, or give a prior."

@@ -39,9 +39,10 @@ def mount_of(yaw, pitch, roll, position):
 
 
 def body_at(velocity, t_s):
-    """T_world_body of a body that leaves the origin with constant planar velocity."""
-    forward, lateral, rate = velocity.tolist()
-    return pose.se3_exp(t_s * torch.tensor([forward, lateral, 0, 0, 0, rate], dtype=D))
+    """T_world_body of a body that leaves the origin with constant velocity: planar [3], or a twist [6]."""
+    twist = torch.zeros(6, dtype=D)
+    twist[list(place.PLANAR if len(velocity) == 3 else place.FREE)] = velocity
+    return pose.se3_exp(t_s * twist)
 
 
 def ground(camera, T_body_cam):
@@ -75,6 +76,16 @@ def test_exact_flow_gives_back_the_velocity(camera, placed, velocity):
     # averaged over hundreds of pixels
     found = place.velocity_from_flow(flow, camera, depth, T_body_cam)
     torch.testing.assert_close(found[0], velocity, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("placed", MOUNTS)
+def test_all_six_velocities_of_a_free_body(camera, placed, generator):
+    T_body_cam = mount_of(*placed)
+    twist = torch.randn(6, generator=generator, dtype=D)
+    flow, depth = exact_flow(camera, T_body_cam, twist)
+    found = place.velocity_from_flow(flow, camera, depth, T_body_cam, axes=place.FREE)
+    # as above, in a system that tells turning from shifting ten to a hundred times less well
+    torch.testing.assert_close(found[0], twist, rtol=0, atol=1e-7)
 
 
 def test_weights_do_not_move_an_exact_answer(camera, generator):
@@ -191,6 +202,10 @@ def test_degenerate_mounts_and_bad_input_get_a_sentence(camera):
         place.velocity_from_flow(torch.full((1, 2, 16, 24), torch.nan), camera, flat, down)
     with pytest.raises(DomainError, match="prior"):
         place.information(camera, flat, down, prior=(1.0, 0.0, 1.0))
+    with pytest.raises(DomainError, match="axes = "):
+        place.information(camera, flat, down, axes=(0, 6))
+    with pytest.raises(DomainError, match="6 finite standard deviations"):
+        place.information(camera, flat, down, prior=(1.0, 1.0, 1.0), axes=place.FREE)
     with pytest.raises(ShapeError, match="one per pixel"):
         place.information(camera, flat[:7], down)
     with pytest.raises(ShapeError, match=r"\[B, 2, H, W\]"):
