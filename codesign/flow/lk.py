@@ -29,7 +29,8 @@ def estimate_lk(
     """Flow over the volume's interval, with its uncertainty.
 
     Args:
-      volume: EventVolume, counts [B, 2, bins >= 2, H, W].
+      volume: EventVolume, counts [B, 2, bins >= 2, H >= 2, W >= 2]. Hot pixels are weighed down
+        (lk_level.cool).
       model: "constant", "affine" or "quadratic" field over the image.
       prior_px: standard deviation expected of each component of the flow at the image centre, px per
         interval; weak evidence leaves the flow near zero.
@@ -38,7 +39,8 @@ def estimate_lk(
         counts without quantisation or noise.
     Returns: FlowField on the pixels of the start of the interval: flow_px [B, 2, H, W] px per interval;
       covariance_px2 [B, 3, H, W] of its error by
-      the posterior of the parameters; confidence [B, H, W] = 1 - trace(covariance) / trace(prior covariance);
+      the posterior of the parameters; confidence [B, H, W] = 1 - trace(covariance) / trace(prior covariance), in
+      0..1;
       valid is False for samples without
       events, whose flow and confidence are 0 and whose covariance is the prior's.
     Gradient: counts, of flow, covariance and confidence.
@@ -58,30 +60,32 @@ def estimate_lk(
         raise DomainError(f"flow model '{model}' is unknown; choose one of {', '.join(lk_field.TERMS)}.")
     check_number(prior_px, "prior_px", above=0.0)
     batch, _, _, height, width = counts.shape
-    least = max(lk_level.least_px(blur_px) for blur_px in levels_px)
-    if min(height, width) < least:
+    if min(height, width) < 2:
         raise ShapeError(
-            f"an event volume of {height} x {width} pixels is smaller than the blur of {max(levels_px)} px "
-            f"needs ({least} x {least}); give larger images or finer levels_px."
+            f"an event volume of {height} x {width} pixels has no slopes both ways; give at least 2 x 2."
         )
-    shape = lk_field.Polynomials(model, height, width)
-    prior = shape.prior_precision(prior_px).to(counts)
-    parameters = torch.zeros(batch, 2 * shape.terms, dtype=counts.dtype, device=counts.device)
+    shape = lk_field.Polynomials(model, height, width, prior_px, counts.device)
+    one = torch.eye(2 * shape.terms, dtype=torch.float64, device=counts.device)
+    found = one.new_zeros(batch, 2 * shape.terms)  # in units of the prior: parameters = unit found
+    parameters = counts.new_zeros(batch, 2 * shape.terms)
+    precision = one.expand(batch, -1, -1)
     times, rate, density = lk_level.signed_rate(volume)
-    precision = prior.expand(batch, -1, -1)
     for blur_px in levels_px:
         level = lk_level.Level(rate, density, times, shape, blur_px, noise_floor)
         for _ in range(steps):
             evidence, pull = level.evidence(parameters)
-            precision = prior + evidence
-            change = torch.linalg.solve(precision, pull - parameters @ prior)
-            moved = shape.mean_square(change)
-            parameters = (
-                parameters + change * (1 + moved / (2 * blur_px) ** 2).rsqrt()[:, None]
+            precision = one + evidence
+            change = torch.linalg.solve(precision, pull - found)
+            moved = shape.mean_square(change @ shape.unit.T)
+            found = (
+                found + change * (1 + moved / (2 * blur_px) ** 2).rsqrt()[:, None]
             )  # no step beyond the reach of the linearisation
+            parameters = (found @ shape.unit.T).to(counts)
     flow, places = shape.at_start(parameters)
-    covariance = shape.covariance(torch.linalg.inv(precision), places)
-    widest = shape.covariance(torch.linalg.inv(prior.expand(batch, -1, -1)), places)
+    spread = shape.unit @ torch.linalg.inv(precision) @ shape.unit.T
+    covariance = shape.covariance(spread.to(counts), places)
+    widest = shape.covariance((shape.unit @ shape.unit.T).to(counts)[None], places)
     confidence = 1 - (covariance[:, 0] + covariance[:, 2]) / (widest[:, 0] + widest[:, 2])
+    confidence = confidence.clamp(0, 1)  # rounding alone leaves them
     valid = (counts.detach().sum((1, 2, 3, 4)) > 0)[:, None, None].expand(batch, height, width)
     return FlowField(flow, valid, float(volume.collected_s.sum()), confidence, covariance)

@@ -20,11 +20,15 @@ FIXED_POINT_STEPS = 4  # each gains a factor of half the flow's gradient, some 0
 class Polynomials:
     """Fields of one model over an image of height x width pixels."""
 
-    def __init__(self, model: str, height: int, width: int) -> None:
+    def __init__(
+        self, model: str, height: int, width: int, prior_px: float = 1.0, device: torch.device | None = None
+    ) -> None:
         self.terms = TERMS[model]
         self.height = height
         self.width = width
         self.half = max(height, width) / 2
+        # [2K, 2K]: parameters = unit @ numbers that are independent and of variance 1
+        self.unit = torch.linalg.cholesky(torch.linalg.inv(self.prior_precision(prior_px))).to(device)
 
     def scaled(self, x_px: Tensor, y_px: Tensor) -> tuple[Tensor, Tensor]:
         """Pixel coordinates to coordinates of the polynomials."""

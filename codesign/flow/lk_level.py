@@ -30,22 +30,23 @@ OVERLAP = 4 * math.pi  # blurred white noise is alike over 4 pi sigma^2 pixels
 # for what makes errors larger than that: bins share events, thresholds quantise, fields warp imperfectly
 # (docs/flow_closed_form.md)
 CALIBRATION = 3.0
-TINY = 1e-12
+# of the mean diagonal: above the rounding of sums in float32
+RIDGE = 1e-5
+# the factor 4 and m of ``cool``: they take 0.05 % off the events of moving textures at most
+LONELY = 4.0
+HOT_EVENTS = 5.0
+TINY = 2.0**-100  # keeps empty samples solvable, far below a millionth of an event
 
 
-def stride(sigma_px: float) -> int:
-    """Spacing of a level's grid, px: the largest power of two up to sigma, at least 1."""
-    return 2 ** math.floor(math.log2(max(sigma_px, 1.0)))
-
-
-def least_px(sigma_px: float) -> int:
-    """Smallest side of an image that the level's kernel fits into."""
-    return max(int(3 * sigma_px + 0.5) + 1, (_radius(sigma_px) + 1) * stride(sigma_px))
+def stride(sigma_px: float, shortest_px: int = 2**30) -> int:
+    """Spacing of a level's grid, px: the largest power of two up to sigma, at least 1, of which two fit into
+    the shorter side."""
+    return 2 ** math.floor(math.log2(max(min(sigma_px, shortest_px / 2), 1.0)))
 
 
 def signed_rate(volume: EventVolume) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
     """(weight [n], time [n]) of the bins, events per interval [B, n, H, W] as if each bin ran over all of it,
-    and events of both signs per pixel [B, H, W].
+    and events of both signs per pixel [B, H, W]; hot pixels weighed down.
 
     Weights are the shares of the interval; time is 0 at mid-interval, in intervals.
     """
@@ -53,7 +54,25 @@ def signed_rate(volume: EventVolume) -> tuple[tuple[Tensor, Tensor], Tensor, Ten
     span = volume.collected_s.sum()
     weight = (volume.collected_s / span).to(counts)
     time = (volume.centroid_s / span).to(counts) - 0.5
-    return (weight, time), (counts[:, 0] - counts[:, 1]) / weight[:, None, None], counts.sum((1, 2))
+    events = counts.sum((1, 2))
+    kept = cool(events)
+    rate = kept[:, None] * (counts[:, 0] - counts[:, 1]) / weight[:, None, None]
+    return (weight, time), rate, kept * events
+
+
+def cool(events: Tensor) -> Tensor:
+    """Weight of each pixel, 1 / (1 + x^2), where its events exceed what its surroundings explain.
+
+    x = max(0, n - 4 q - m) / (q + m): n events of the pixel, q the mean of the 24 pixels around it, m = 5
+    events. Moving texture puts events on several pixels; a hot pixel has them alone.
+    Args: events [B, H, W]. Returns: [B, H, W].
+    """
+    side = 5
+    padded = pad(torch.stack([events, torch.ones_like(events)]), (side // 2,) * 4)
+    total, number = side**2 * avg_pool2d(padded, side, 1)
+    around = (total - events).clamp_min(0) / (number - 1)
+    excess = (events - LONELY * around - HOT_EVENTS).clamp_min(0) / (around + HOT_EVENTS)
+    return 1 / (1 + excess.square())
 
 
 class Level:
@@ -72,8 +91,8 @@ class Level:
         self.sigma = sigma_px
         self.shape = shape
         self.noise_floor = noise_floor
-        self.stride = stride(sigma_px)
-        self.rate, kernel = _blurred(rate, sigma_px)
+        self.stride = stride(sigma_px, min(shape.height, shape.width))
+        self.rate, kernel = _blurred(rate, sigma_px, self.stride)
         self.density = (avg_pool2d(density, self.stride) if self.stride > 1 else density).flatten(1)
         self.rows, self.columns = self.rate.shape[-2:]
         first = (self.stride - 1) / 2
@@ -127,23 +146,20 @@ class Level:
             * self.texture_noise
         )
         right = -(torch.stack([sx * slope, sy * slope], 1) @ self.basis).flatten(1)
-        trust = _trust(normal, scattered)
-        scale = (
-            CALIBRATION
-            * OVERLAP
-            * self.sigma**2
-            / self.stride**2
-            * self._noise(normal, right, event_products[:, 0, 0], (seen * slope.square()).sum(1))
-        )[:, None, None]
-        return normal @ trust / scale, (right[:, None] @ trust / scale)[:, 0]
+        unit = self.shape.unit
+        kept, weighed, explained = _trusted(
+            unit.T @ normal.double() @ unit, unit.T @ scattered.double() @ unit, right.double() @ unit
+        )
+        scale = (CALIBRATION * OVERLAP * self.sigma**2 / self.stride**2) * self._noise(
+            explained, event_products[:, 0, 0].double(), (seen * slope.square()).sum(1).double()
+        )
+        return kept / scale[:, None, None], weighed / scale[:, None]
 
-    def _noise(self, normal, right, events, energy):
-        """Variance [B] of the temporal slopes: what the best fit leaves of their energy, on a floor, per
-        sample of the grid."""
-        ridge = (1e-6 * normal.diagonal(dim1=1, dim2=2).mean(1)[:, None] + TINY).expand_as(right)
-        explained = (right * torch.linalg.solve(normal + torch.diag_embed(ridge), right)).sum(1)
+    def _noise(self, explained, events, energy):
+        """Variance [B] of the temporal slopes: what the fit leaves of their energy, on a floor, per sample of
+        the grid."""
         left = torch.sqrt(
-            (energy - explained).square() + (1e-6 * energy).square() + TINY**2
+            (energy - explained).square() + (1e-6 * energy).square() + TINY
         )  # positive and smooth
         few = FEW_EVENTS / self.stride**2 * self.slope_noise
         expected = events * self.slope_noise
@@ -168,43 +184,47 @@ class Level:
         return warped.reshape(batch, bins, -1), window[:, 0] * window[:, 1]
 
 
-def _trust(normal, scattered):
-    """N^-1 times the part of N that is texture (see above), [B, 2K, 2K]; powers of the share of noise (N +
-    Z)^-1 Z, whose eigenvalues are 0 to 1."""
+def _trusted(normal, scattered, right):
+    """What of the normal equations N p = r is texture (see above), and how much of the slopes' energy it
+    explains.
+
+    Args: N, Z [B, 2K, 2K], r [B, 2K], float64, in units in which all parameters are expected to be alike. A
+      ridge, relative to N + Z, counts as noise: directions in which nothing was seen are not trusted.
+    Returns: with N + Z = L L^T, S = L^-1 Z L^-T, whose eigenvalues z are the shares of noise, and t(z) the
+      trust: L t(S) (1 - S) L^T (symmetric, no eigenvalue below 0), L t(S) L^-1 r, and what a step
+      x = (N + Z)^-1 r takes off the energy, 2 r x - x N x.
+    """
     unit = torch.eye(normal.shape[-1]).to(normal)
-    noise = torch.linalg.solve(normal + scattered + TINY * unit, scattered + TINY * unit)
-    texture = unit - noise
+    ridge = (RIDGE * (normal + scattered).diagonal(dim1=1, dim2=2).mean(1) + TINY)[:, None, None] * unit
+    root = torch.linalg.cholesky(normal + scattered + ridge)
+    half = torch.linalg.solve_triangular(root, scattered + ridge, upper=False)
+    noise = torch.linalg.solve_triangular(root, half.mT, upper=False)
     doubt = DOUBT * noise
+    texture = unit - noise
+    trust = texture
     for _ in range(DOUBLINGS):
-        texture = texture @ texture
+        trust = trust @ trust
         doubt = doubt @ doubt
-    return torch.linalg.solve(texture + doubt, texture)
+    trust = torch.linalg.solve(trust + doubt, trust)
+    seen = torch.linalg.solve_triangular(root, right[:, :, None], upper=False)
+    explained = (seen * (seen + noise @ seen)).sum((1, 2))
+    kept = root @ (trust @ texture) @ root.mT
+    return (kept + kept.mT) / 2, (root @ (trust @ seen))[..., 0], explained
 
 
-def _radius(sigma_px):
-    """Taps on each side, in samples of the level's grid."""
-    step = stride(sigma_px)
-    return int((3.0 if step == 1 else 2.5) * _spread(sigma_px) + 0.5)
-
-
-def _spread(sigma_px):
-    """Standard deviation, in samples of the grid, of the Gaussian that follows averaging over squares
-    (variance (step^2 - 1) / 12)."""
-    step = stride(sigma_px)
-    return math.sqrt(sigma_px**2 - (step**2 - 1) / 12) / step
-
-
-def _blurred(images, sigma_px):
+def _blurred(images, sigma_px, step):
     """[B, n, H, W] averaged over squares, then through a Gaussian, together of standard deviation sigma;
-    mirrored at the border.
+    mirrored at the border, continued by it where the kernel is longer than the image.
 
     Returns: images at the centres of the squares, and the whole kernel along one axis, taps of 1 px.
     """
-    step = stride(sigma_px)
-    size = 2 * _radius(sigma_px) + 1
+    # in samples: the averages have variance (step^2 - 1) / 12 px^2
+    spread = math.sqrt(sigma_px**2 - (step**2 - 1) / 12) / step
+    radius = int((3.0 if step == 1 else 2.5) * spread + 0.5)
+    size = 2 * radius + 1
     pooled = avg_pool2d(images, step) if step > 1 else images
-    spread = _spread(sigma_px)
-    found = gaussian_blur2d(pooled, (size, size), (spread, spread))
+    border = "reflect" if radius < min(pooled.shape[-2:]) else "replicate"
+    found = gaussian_blur2d(pooled, (size, size), (spread, spread), border)
     taps = get_gaussian_kernel1d(size, spread, device=images.device, dtype=images.dtype)
     spaced = pad(taps[0][:, None], (0, step - 1)).flatten()
     kernel = conv1d(spaced[None, None], torch.full((1, 1, step), 1 / step).to(images), padding=step - 1)[0, 0]

@@ -61,8 +61,8 @@ def test_scattered_events_give_the_slopes_that_the_noise_model_says(generator):
     # independent samples of 8 bins: 1 to 2 % in the variance, tested at 5 standard errors
     for sigma in (1.0, 2.0):
         noise = torch.randn(1, 8, 160, 160, generator=generator, dtype=D)
-        blurred, kernel = lk_level._blurred(noise, sigma)
         step = lk_level.stride(sigma)
+        blurred, kernel = lk_level._blurred(noise, sigma, step)
         dy, dx = torch.gradient(blurred[..., 3:-3, 3:-3], dim=(2, 3))
         found = float(((dx.square() + dy.square()) / 2)[..., 1:-1, 1:-1].mean()) / step**2
         assert found == pytest.approx(lk_level._slope_of_noise(kernel, step), rel=0.1)

@@ -90,10 +90,14 @@ def evidence(volume, terms, sigma_px):
     right = -np.einsum("yx,iyx,yx->i", fade, g, slope)
     crowd = np.einsum("yx,yx,iyx,jyx->ij", fade, density, b, b)
     scattered = np.kron(np.eye(2), crowd) * slope_of_white_noise(taps, step)
+    # directions in which nothing is seen count as noise
+    prior = prior_precision(terms)
+    scattered = scattered + 1e-5 * np.trace(np.linalg.solve(prior, normal + scattered)) / (2 * terms) * prior
     z, vectors = np.linalg.eig(np.linalg.solve(normal + scattered, scattered))
     trust = (vectors * ((1 - z) ** 4 / ((1 - z) ** 4 + (3 * z) ** 4))) @ np.linalg.inv(vectors)
     per_event = 1 / (spread * 4 * math.pi * sigma_px**2)
-    left = (fade * slope**2).sum() - right @ np.linalg.solve(normal, right)
+    step_to_fit = np.linalg.solve(normal + scattered, right)
+    left = (fade * slope**2).sum() - 2 * right @ step_to_fit + step_to_fit @ normal @ step_to_fit
     few = 10 / step**2 * per_event  # ten events' worth, on samples that stand for step^2 pixels
     expected = (fade * density).sum() * per_event
     noise = per_event * (left + FLOOR * expected + few) / (expected + few)
