@@ -164,6 +164,7 @@ class Arrays:
     Int32: Any
     Bool: Any
     Array3: Any
+    Array4: Any
 
 
 @lru_cache(maxsize=8)
@@ -175,9 +176,9 @@ def arrays(device: str = "cpu", dtype: torch.dtype = torch.float32) -> Arrays:
     else:
         import drjit.llvm.ad as ad
     if dtype == torch.float32:
-        return Arrays(ad.Float, ad.UInt32, ad.Int, ad.Bool, ad.Array3f)
+        return Arrays(ad.Float, ad.UInt32, ad.Int, ad.Bool, ad.Array3f, ad.Array4f)
     if dtype == torch.float64:
-        return Arrays(ad.Float64, ad.UInt32, ad.Int, ad.Bool, ad.Array3f64)
+        return Arrays(ad.Float64, ad.UInt32, ad.Int, ad.Bool, ad.Array3f64, ad.Array4f64)
     raise GradientError(f"kernels compute in float32 or float64, not {dtype}; convert the tensor first.")
 
 

@@ -1,0 +1,114 @@
+"""The dear part of the closed form as drjit kernels with adjoints of their own: bins read along a flow and compared
+over time (lk_warp_kernel), products of their slopes summed over cells (lk_sums_kernel). They know nothing of the
+field that the flow comes from."""
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+from torch.nn.functional import pad
+
+from codesign.backend import NoSecondDerivative
+from codesign.errors import DomainError, ShapeError
+from codesign.flow import lk_sums_kernel, lk_warp_kernel
+from codesign.flow.lk_lanes import Grid
+
+_FIRST_ONLY = (
+    "the kernels of the closed form give first derivatives only; a second derivative through event flow was asked "
+    "for. Use differences of gradients instead."
+)
+
+
+def moving(
+    rate: Tensor, flow_px: Tensor, time: Tensor, contrast: Tensor, grid: Grid, fade_px: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Bins carried back to time 0 along a flow: their mean and their slope over time.
+
+    Args:
+      rate: [B, n, h, w] bins on the samples of ``grid``, float32 or float64.
+      flow_px: [B, 2, h, w] flow of the samples at time 0, px per unit of time.
+      time: [n] of the bins, in order. contrast: [2, n] share of each bin in the mean and in the slope.
+      fade_px: the windows below fall smoothly from 1 to 0 over this distance to the border, px.
+    Returns:
+      mean, slope: [B, h, w]. Bins are read bilinearly; beyond the outermost samples, as there.
+      seen: [B, h, w] in [0, 1], product of the windows along x and y where the first and the last bin are read.
+    Gradient: rate, flow_px; exact, the first one. The flow has none through bins that it reads beyond the outermost
+      samples.
+    Raises: ShapeError where shapes do not fit; GradientError for a second derivative.
+    Cost: one pass forward, two backward; nothing of n bins is stored forward. Backward four values per sample and
+      bin, or ``lk_warp_kernel.MOST_VALUES`` where that is less, in each thread.
+    Source: Lucas and Kanade, 1981; Jaderberg et al., Spatial Transformer Networks, NeurIPS 2015, for the reading.
+    """
+    batch, bins = rate.shape[:2]
+    if rate.shape[2:] != grid.shape or flow_px.shape != (batch, 2, *grid.shape):
+        raise ShapeError(
+            f"bins are {list(rate.shape)}, their flow is {list(flow_px.shape)}, samples are {list(grid.shape)}; give "
+            "[B, n, h, w] and [B, 2, h, w]."
+        )
+    if time.shape != (bins,) or contrast.shape != (2, bins):
+        raise ShapeError(
+            f"{bins} bins have times {list(time.shape)} and shares {list(contrast.shape)}; give [n] and [2, n]."
+        )
+    return _Moving.apply(rate, flow_px, torch.cat([time[None], contrast]).to(rate), grid, fade_px)
+
+
+def cell_sums(
+    mean: Tensor, slope: Tensor, seen: Tensor, density: Tensor, grid: Grid, cell: int = 1
+) -> Tensor:
+    """Products of slopes, summed over squares of cell x cell samples.
+
+    Args:
+      mean, slope, seen: [B, h, w] as from ``moving``, on the samples of ``grid``. density: [B, h, w].
+      cell: side of the squares in samples, >= 1; those at the lower and right border hold what is left.
+    Returns: [B, 8, ceil(h / cell), ceil(w / cell)], sums over samples of seen times x x, x y, y y, x s, y s, s s, 1,
+      density, where x and y are the slopes of the mean per px (central differences, one-sided at the border; 0 where
+      there is one sample) and s is the slope over time.
+    Gradient: mean, slope, seen, density; exact, the first one.
+    Raises: ShapeError where shapes do not fit; DomainError where cell < 1; GradientError for a second derivative.
+    """
+    shapes = [list(x.shape) for x in (mean, slope, seen, density)]
+    if any(shape != [len(mean), *grid.shape] for shape in shapes):
+        raise ShapeError(
+            f"mean, slope, seen and density are {', '.join(map(str, shapes))}; give [B, {grid.shape[0]}, "
+            f"{grid.shape[1]}] for all."
+        )
+    if cell < 1:
+        raise DomainError(f"cell is {cell}; give a side of at least 1 sample.")
+    return _Sums.apply(mean, slope, seen, density, grid, cell)
+
+
+class _Moving(Function):
+    @staticmethod
+    def forward(ctx, rate, flow_px, weights, grid, fade_px):
+        ctx.save_for_backward(rate, flow_px, weights)
+        ctx.rest = grid, fade_px
+        return tuple(lk_warp_kernel.forward(rate, flow_px, weights, grid, fade_px))
+
+    @staticmethod
+    def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
+        found = lk_warp_kernel.adjoint(*ctx.saved_tensors, *ctx.rest, grads, ctx.needs_input_grad[0])
+        return *_first_only(found, *ctx.saved_tensors[:2], *grads), None, None, None
+
+
+class _Sums(Function):
+    @staticmethod
+    def forward(ctx, mean, slope, seen, density, grid, cell):
+        ctx.save_for_backward(mean, slope, seen, density)
+        ctx.rest = grid, cell
+        columns = lk_sums_kernel.forward(mean, slope, seen, density, grid, cell)
+        if cell == 1:
+            return columns
+        return pad(columns, (0, -columns.shape[3] % cell)).unflatten(3, (-1, cell)).sum(4)
+
+    @staticmethod
+    def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
+        found = lk_sums_kernel.adjoint(*ctx.saved_tensors, *ctx.rest, grad)
+        return *_first_only(found, *ctx.saved_tensors, grad), None, None
+
+
+def _first_only(found, *sources):
+    """Gradients as they are, sealed where a graph of them is asked for."""
+    if not torch.is_grad_enabled():
+        return found
+    live = [grad for grad in found if grad is not None]
+    sealed = iter(NoSecondDerivative.apply(_FIRST_ONLY, len(live), *live, *sources))
+    return [None if grad is None else next(sealed) for grad in found]
