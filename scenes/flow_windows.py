@@ -206,7 +206,7 @@ class RenderedWindows:
             if flow is None:
                 flow = moved
             else:
-                cover = _lookup(crop[None, 1:], _apply(place, points)[None])[0, 0, 0]
+                cover = _lookup(crop[None, 1:], _apply(place, points)[None])[0, 0]
                 flow = torch.where(cover > 0.5, moved, flow)
         return flow
 
