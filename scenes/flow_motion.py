@@ -52,9 +52,7 @@ def camera(draw, t, width_px, height_px, flow_px, layers):
         _twist(draw, focal, max(width_px, height_px)) if layer and draw.random() < 1 / 4 else still
         for layer in range(layers)
     ]
-    x = np.array([-1, 1, -1, 1, 0]) * width_px / 2
-    y = np.array([-1, -1, 1, 1, 0]) * height_px / 2
-    probe = np.stack([x, y, np.ones(5)])
+    probe = np.stack([*_corners(width_px, height_px), np.ones(5)])
     wanted = draw.uniform(*flow_px)
     size = 1.0
 
@@ -76,6 +74,60 @@ def camera(draw, t, width_px, height_px, flow_px, layers):
         size *= wanted / max(np.sqrt(np.square(flow).sum(1).mean()), 1e-9)
         size = min(size, 0.4 / max(np.abs(np.concatenate([turn, move])).max(), 1e-9))
     return motion(t)
+
+
+def rotation(draw, t, width_px, height_px, flow_px):
+    """A pinhole camera with a random focal length that turns about its centre, at a steady rate.
+
+    H(t) = K R(t) K^-1, whatever the depth. flow_px: (least, most), as in camera.
+    Returns: [1, T, 3, 3].
+    """
+    focal = draw.uniform(0.6, 2.5) * max(width_px, height_px)
+    turn = draw.normal(0, 1, 3) * np.array([1, 1, 2 * focal / max(width_px, height_px)])
+    k = np.diag([focal, focal, 1.0])
+    probe = np.stack([*_corners(width_px, height_px), np.ones(5)])
+    size = 1.0 / focal
+    wanted = draw.uniform(*flow_px)
+
+    def motion(times):
+        return (k @ _rotations(size * turn, times) @ np.linalg.inv(k))[None]
+
+    for _ in range(3):
+        seen = motion(np.ones(1))[0, 0] @ probe
+        flow = seen[:2] / seen[2:] - probe[:2]
+        size *= wanted / max(np.sqrt(np.square(flow).sum(0).mean()), 1e-9)
+    return motion(t)
+
+
+def vibration(draw, t, width_px, height_px, flow_px):
+    """A shaking camera: shifts along x and y and roll swing, each with its own frequency of 0.1 to 0.5 periods
+    per window, over a slow drift.
+
+    flow_px: (least, most) amplitude of a shift, drawn evenly. Returns: [1, T, 3, 3].
+    """
+    reach = np.hypot(width_px, height_px) / 2
+    amplitude = draw.uniform(*flow_px, 3) * np.array([1, 1, 0.3 / reach])
+    frequency = 2 * np.pi * draw.uniform(0.1, 0.5, 3)
+    phase = draw.uniform(0, 2 * np.pi, 3)
+    drift = amplitude * draw.normal(0, 0.3, 3)
+    t = np.asarray(t)[:, None]
+    x, y, roll = (amplitude * (np.sin(frequency * t + phase) - np.sin(phase)) + drift * t).T
+    out = np.zeros((1, len(t), 3, 3))
+    out[0, :, 0, 0] = out[0, :, 1, 1] = np.cos(roll)
+    out[0, :, 1, 0] = np.sin(roll)
+    out[0, :, 0, 1] = -np.sin(roll)
+    out[0, :, 0, 2] = x
+    out[0, :, 1, 2] = y
+    out[0, :, 2, 2] = 1
+    return out
+
+
+def _corners(width_px, height_px):
+    """x and y [5] of the corners and the centre."""
+    return (
+        np.array([-1, 1, -1, 1, 0]) * width_px / 2,
+        np.array([-1, -1, 1, 1, 0]) * height_px / 2,
+    )
 
 
 def _twist(draw, focal, width_px):

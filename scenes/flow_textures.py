@@ -10,7 +10,8 @@ from scenes import textures
 
 SIZE = 512
 PROCEDURAL_COUNT = 48
-POOLS = ("procedural", "fine", "mixed")
+EVERYDAY_PILES = 5
+POOLS = ("procedural", "fine", "mixed", "everyday")
 
 
 @lru_cache(maxsize=4)
@@ -19,8 +20,9 @@ def pool(name):
 
     "procedural": speckle of many spectra and piles of discs and bars with smooth areas between; what networks
     are trained on. "fine": gravel, grass, brick and three speckles with seeds of their own: detail
-    everywhere. "mixed": camera, chelsea, coffee, astronaut, rocket: photographs with large smooth areas. No
-    photograph is in "procedural".
+    everywhere. "mixed": camera, chelsea, coffee, astronaut, rocket: photographs with large smooth areas.
+    "everyday": those and as many piles of few, mostly smooth shapes with seeds of their own: what a camera
+    sees in rooms. No photograph is in "procedural".
     """
     if name == "fine":
         return tuple(textures.photo(source) for source in ("gravel", "grass", "brick")) + tuple(
@@ -29,6 +31,10 @@ def pool(name):
     if name == "mixed":
         return tuple(
             textures.photo(source) for source in ("camera", "chelsea", "coffee", "astronaut", "rocket")
+        )
+    if name == "everyday":
+        return pool("mixed") + tuple(
+            pile(np.random.default_rng((90_100, k)), shapes=150) for k in range(EVERYDAY_PILES)
         )
     if name == "procedural":
         return tuple(_procedural(seed) for seed in range(PROCEDURAL_COUNT))

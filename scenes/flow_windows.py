@@ -9,28 +9,36 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch.nn.functional import grid_sample
 
 from codesign.errors import DomainError
 from codesign.events import from_counts, memory
 from codesign.types import FlowField, FlowWindows
 from scenes import flow_motion, flow_textures
+from scenes.flow_layers import Plane, apply, compose, cover, gaussian, lookup, mirrored
+from scenes.flow_warps import warps
 
 LEAD = 8  # frames before the window, over which the memorised levels settle
 BLUR_LEAST_PX = 0.4  # the pixel's own area
+ONE_PLANE = {
+    "similarity": flow_motion.similarity,
+    "rotation": flow_motion.rotation,
+    "vibration": flow_motion.vibration,
+}
+MOTIONS = (*ONE_PLANE, "camera", "warps")
 
 
 @dataclass(frozen=True)
 class Draws:
     """Ranges (least, most) from which a sample is drawn.
 
-    textures: pool of scenes.flow_textures. motion: "similarity" (one plane; rotation, zoom, translation) or
-      "camera" (tilted planes, perspective).
+    textures: pool of scenes.flow_textures. motion: "similarity" (one plane; rotation, zoom, translation),
+      "rotation" (a camera that turns), "vibration" (one that shakes), "camera" (tilted planes, perspective) or
+      "warps" (layers that bend).
     layers: planes before the background. flow_px: see scenes.flow_motion. theta: contrast threshold, drawn
       evenly in its logarithm. mismatch: relative spread of thresholds over pixels. noise: background events
       per pixel, polarity and eighth of the window, evenly in the logarithm. contrast: factor on log radiance.
       scale: texels per pixel. blur_px: Gaussian defocus, standard deviation. distortion: radial, relative at
-      the corner.
+      the corner. on_over_off: ratio of the thresholds, evenly in the logarithm, half of it to either.
     """
 
     textures: str = "procedural"
@@ -44,6 +52,7 @@ class Draws:
     scale: tuple[float, float] = (0.7, 1.6)
     blur_px: tuple[float, float] = (0.0, 0.8)
     distortion: tuple[float, float] = (-0.04, 0.04)
+    on_over_off: tuple[float, float] = (1.0, 1.0)
 
 
 def planes(textures="fine", theta=0.2, noise=(0.0005, 0.01)):
@@ -77,10 +86,12 @@ class RenderedWindows:
         self.width_px = width_px
         self.bins = bins
         self.intervals = intervals
-        if self.draws.motion not in ("similarity", "camera"):
-            raise DomainError(f"motion is {self.draws.motion!r}; 'similarity' and 'camera' are possible.")
-        if self.draws.motion == "similarity" and self.draws.layers[1] > 0:
-            raise DomainError("motion 'similarity' has one plane; give layers=(0, 0), or motion='camera'.")
+        if self.draws.motion not in MOTIONS:
+            raise DomainError(f"motion is {self.draws.motion!r}; {', '.join(MOTIONS)} are possible.")
+        if self.draws.motion in ONE_PLANE and self.draws.layers[1] > 0:
+            raise DomainError(
+                f"motion {self.draws.motion!r} has one plane; give layers=(0, 0), or motion='camera'."
+            )
         self.textures = flow_textures.pool(self.draws.textures)
         self.crop = int(1.5 * max(height_px, width_px) * self.draws.scale[1]) + 16
         self.t = np.concatenate([np.arange(-LEAD, 0), np.arange(intervals + 1)]) / intervals
@@ -88,19 +99,19 @@ class RenderedWindows:
     def batch(self, indices):
         """Samples of these numbers: FlowWindows of interval 1 s, truth on the pixels of the start, exact and
         valid everywhere (also where the point gets hidden)."""
-        drawn = [self._draw(index) for index in indices]
+        drawn = [self._draw(index, self._times(index)) for index in indices]
         frames = []
         levels = []
         truth = []
         for sample in drawn:  # one by one: products and logarithms may round by the place in a batch
             points = self._undistorted([sample["distortion"]])[0]  # [H, W, 2]
-            frames.append(_compose(sample, points))
-            levels.append(frames[-1].clamp_min(1e-3).log_() * sample["contrast"])
+            frames.append(compose(sample, points))
+            levels.append(log_level(frames[-1], sample))
             truth.append(self._truth(sample, points))
         frames = torch.stack(frames, 1)  # [T, B, H, W]
-        log_level = torch.stack(levels, 1)
+        level = torch.stack(levels, 1)
         theta = torch.stack([sample["theta"] for sample in drawn], 1)  # [2, B, H, W]
-        counts, _ = memory(log_level, theta[0], theta[1], log_input=True)
+        counts, _ = memory(level, theta[0], theta[1], log_input=True)
         counts = counts[LEAD:]
         for number, sample in enumerate(drawn):
             time, polarity, row, column = sample["noise"]
@@ -117,15 +128,27 @@ class RenderedWindows:
             frames[[LEAD, -1]].transpose(0, 1),
         )
 
-    def _draw(self, index):
+    def _times(self, index):
+        """Times of the frames of a sample, those before the window among them; the motion drawn lasts from 0
+        to 1."""
+        del index
+        return self.t
+
+    def _draw(self, index, t):
         d = self.draws
         draw = np.random.default_rng((self.seed, int(index)))
         shape = (self.height_px, self.width_px)
         extra = int(draw.integers(d.layers[0], d.layers[1] + 1))
-        if d.motion == "similarity":
-            motion = flow_motion.similarity(draw, self.t, self.width_px, self.height_px, d.flow_px)
+        size = (self.width_px, self.height_px)
+        if d.motion == "warps":
+            motion = warps(draw, t, *size, d.flow_px, 1 + extra)
         else:
-            motion = flow_motion.camera(draw, self.t, self.width_px, self.height_px, d.flow_px, 1 + extra)
+            matrices = (
+                flow_motion.camera(draw, t, *size, d.flow_px, 1 + extra)
+                if d.motion == "camera"
+                else ONE_PLANE[d.motion](draw, t, *size, d.flow_px)
+            )
+            motion = [Plane(layer) for layer in torch.from_numpy(matrices).float()]
         blur_px = np.hypot(BLUR_LEAST_PX, draw.uniform(d.blur_px[0], d.blur_px[1]))
         crops, places = zip(*[self._layer(draw, layer, blur_px) for layer in range(1 + extra)], strict=True)
         theta = _log_uniform(draw, *d.theta)
@@ -133,12 +156,16 @@ class RenderedWindows:
         rate = _log_uniform(draw, *d.noise) * 8 if d.noise[1] > 0 else 0.0
         count = draw.poisson(rate * 2 * shape[0] * shape[1])
         noise = np.stack([draw.integers(0, high, count) for high in (self.intervals, 2, *shape)])
+        distortion = draw.uniform(d.distortion[0], d.distortion[1])
+        contrast = float(draw.uniform(d.contrast[0], d.contrast[1]))
+        ratio = _log_uniform(draw, *d.on_over_off) ** 0.5
+        thetas *= np.array([ratio, 1 / ratio])[:, None, None]
         return {
-            "motion": torch.from_numpy(motion).float(),
+            "motion": motion,
             "crop": torch.stack(crops),
             "place": torch.from_numpy(np.stack(places)).float(),
-            "distortion": draw.uniform(d.distortion[0], d.distortion[1]),
-            "contrast": float(draw.uniform(d.contrast[0], d.contrast[1])),
+            "distortion": distortion,
+            "contrast": contrast,
             "theta": torch.from_numpy(thetas).float(),
             "noise": torch.from_numpy(noise),
         }
@@ -152,13 +179,13 @@ class RenderedWindows:
         piece = torch.zeros(2, self.crop, self.crop)
         piece[1] = 1.0
         values = torch.from_numpy(np.ascontiguousarray(texture[top : top + size, left : left + size]))
-        piece[0] = _mirrored(values, self.crop)
+        piece[0] = mirrored(values, self.crop)
         scale = draw.uniform(*self.draws.scale)
         angle = draw.uniform(0, 2 * np.pi)
         flip = draw.choice([-1.0, 1.0])
         if layer:
-            piece[1] = _cover(draw, self.crop, scale, min(self.height_px, self.width_px))
-        piece = _gaussian(
+            piece[1] = cover(draw, self.crop, scale, min(self.height_px, self.width_px))
+        piece = gaussian(
             piece * torch.stack([piece[1], torch.ones_like(piece[1])]), blur_px * scale
         )  # radiance weighted with cover
         turn = scale * np.array(
@@ -201,96 +228,20 @@ class RenderedWindows:
         pixels = self._pixels()
         flow = None
         for motion, crop, place in zip(sample["motion"], sample["crop"], sample["place"], strict=True):
-            end = _apply(motion[-1], points).movedim(0, -1)
-            moved = (self._distorted(end[None], [sample["distortion"]])[0] - pixels).movedim(-1, 0)
+            end = self._distorted(motion.end(points)[None], [sample["distortion"]])[0]
+            moved = (end - pixels).movedim(-1, 0)
             if flow is None:
                 flow = moved
             else:
-                cover = _lookup(crop[None, 1:], _apply(place, points)[None])[0, 0]
-                flow = torch.where(cover > 0.5, moved, flow)
+                covered = lookup(crop[None, 1:], apply(place, points)[None])[0, 0]
+                flow = torch.where(covered > 0.5, moved, flow)
         return flow
+
+
+def log_level(frames, sample):
+    """Log radiance [T, H, W] of a sample's frames, with its contrast."""
+    return frames.clamp_min(1e-3).log_() * sample["contrast"]
 
 
 def _log_uniform(draw, least, most):
     return float(np.exp(draw.uniform(np.log(least), np.log(most))))
-
-
-def _mirrored(values, size):
-    """[H, W] continued by reflection to [size, size]."""
-    rows, columns = (torch.arange(size) % (2 * extent - 2) for extent in values.shape)
-    rows, columns = (
-        torch.where(at < extent, at, 2 * extent - 2 - at)
-        for at, extent in zip((rows, columns), values.shape, strict=True)
-    )
-    return values[rows][:, columns]
-
-
-def _cover(draw, size, scale, image_px):
-    """A few blobs or bars, 0 or 1 [size, size], of 0.15 to 0.7 of the image across."""
-    y, x = np.mgrid[:size, :size] - (size - 1) / 2
-    cover = np.zeros((size, size), bool)
-    for _ in range(int(draw.integers(1, 4))):
-        cx, cy = draw.uniform(-0.5, 0.5, 2) * image_px * scale
-        radius = draw.uniform(0.08, 0.35) * image_px * scale
-        angle = draw.uniform(0, np.pi)
-        dx = x - cx
-        dy = y - cy
-        along = dx * np.cos(angle) + dy * np.sin(angle)
-        across = dy * np.cos(angle) - dx * np.sin(angle)
-        shape = draw.integers(3)
-        flat = draw.uniform(0.15, 1.0)
-        if shape == 0:
-            bearing = np.arctan2(across, along)
-            wave = sum(
-                draw.normal(0, 0.15) * np.cos(n * bearing + draw.uniform(0, 2 * np.pi)) for n in (2, 3, 5)
-            )
-            cover |= np.hypot(along, across) < radius * (1 + wave)
-        elif shape == 1:
-            cover |= (np.abs(along) < radius) & (np.abs(across) < flat * radius)
-        else:
-            cover |= (np.abs(across) < flat * radius / 2) & (
-                np.abs(along) < 4 * radius
-            )  # a post across the image
-    return torch.from_numpy(cover.astype(np.float32))
-
-
-def _gaussian(images, sigma):
-    """[N, S, S] blurred (periodic) by a Gaussian of this standard deviation, through the Fourier
-    transform."""
-    size = images.shape[-1]
-    fx = torch.fft.rfftfreq(size)
-    fy = torch.fft.fftfreq(size)
-    low_pass = torch.exp(-2 * np.pi**2 * sigma**2 * (fy[:, None].square() + fx.square()))
-    return torch.fft.irfft2(torch.fft.rfft2(images) * low_pass, s=(size, size)).clamp_min(0)
-
-
-def _apply(homography, points):
-    """Homographies [..., 3, 3] on centred points [H, W, 2] -> [..., 2, H, W]."""
-    height, width, _ = points.shape
-    columns = torch.cat([points.reshape(-1, 2).T, torch.ones(1, height * width)])
-    moved = (homography.reshape(-1, 3) @ columns).reshape(*homography.shape[:-2], 3, height, width)
-    return moved[..., :2, :, :] / moved[..., 2:, :, :]
-
-
-def _lookup(crop, units):
-    """A texture [1, C, S, S] at grid_sample's units [T, 2, H, W] -> [T, C, H, W]; mirrored beyond the
-    border."""
-    times, _, height, width = units.shape
-    grid = units.permute(0, 2, 3, 1).reshape(1, times * height, width, 2)
-    found = grid_sample(crop, grid, padding_mode="reflection", align_corners=False)
-    return found.reshape(-1, times, height, width).transpose(0, 1)
-
-
-def _compose(sample, points):
-    """Frames [T, H, W]: each layer over those behind it."""
-    frames = torch.zeros(())
-    for layer, (motion, crop, place) in enumerate(
-        zip(sample["motion"], sample["crop"], sample["place"], strict=True)
-    ):
-        units = _apply(place @ torch.linalg.inv(motion), points)
-        if layer == 0:
-            frames = _lookup(crop[None, :1], units)[:, 0]
-        else:
-            seen, cover = _lookup(crop[None], units).unbind(1)
-            frames = seen + (1 - cover) * frames
-    return frames
