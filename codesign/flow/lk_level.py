@@ -17,9 +17,12 @@ import math
 import torch
 from kornia.filters import gaussian_blur2d, get_gaussian_kernel1d
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, conv1d, grid_sample, pad
+from torch.nn.functional import avg_pool2d, conv1d, pad
 
 from codesign.flow.lk_field import Polynomials
+from codesign.flow.lk_kernel import cell_sums, moving
+from codesign.flow.lk_lanes import Grid
+from codesign.flow.lk_moments import Moments
 from codesign.types import EventVolume
 
 # the factor 3 and the power 4 = 2^2 above
@@ -93,65 +96,39 @@ class Level:
         self.noise_floor = noise_floor
         self.stride = stride(sigma_px, min(shape.height, shape.width))
         self.rate, kernel = _blurred(rate, sigma_px, self.stride)
-        self.density = (avg_pool2d(density, self.stride) if self.stride > 1 else density).flatten(1)
-        self.rows, self.columns = self.rate.shape[-2:]
-        first = (self.stride - 1) / 2
-        x, y = (torch.arange(count).to(rate) * self.stride + first for count in (self.columns, self.rows))
-        places = shape.scaled(x.expand(self.rows, -1), y[:, None].expand(-1, self.columns))
-        self.basis = shape.basis(*places).flatten(1).T.contiguous()  # [P, K]
-        self.products = (self.basis[:, :, None] * self.basis[:, None]).flatten(1)  # [P, K K]
-        weight, time = times
-        centred = time - weight @ time
+        self.density = avg_pool2d(density, self.stride) if self.stride > 1 else density
+        self.grid = Grid(shape.height, shape.width, self.stride)
+        self.moments = Moments(shape, self.grid, rate)
+        weight, self.time = times
+        centred = self.time - weight @ self.time
         spread = weight @ centred.square()
         self.contrast = torch.stack([weight, weight * centred / spread])  # mean over bins, slope over time
         self.slope_noise = 1 / (float(spread) * OVERLAP * sigma_px**2)
         self.texture_noise = _slope_of_noise(kernel, self.stride)
-        # in grid_sample's units, -1 and 1 at the outermost samples
-        self.half = torch.stack([x[-1] - first, y[-1] - first]) / 2
-        self.middle = (torch.tensor([shape.width, shape.height]).to(rate) - 1 - 2 * first) / (
-            2 * self.half
-        ) - 1
-        self.reach = torch.tensor([shape.width, shape.height]).to(rate) / 2 - 0.5
-        self.speed = time[:, None, None] / self.half
-        self.grid = torch.stack(
-            [
-                ((x - first) / self.half[0] - 1).expand(self.rows, -1),
-                ((y - first) / self.half[1] - 1)[:, None].expand(-1, self.columns),
-            ],
-            -1,
-        ).flatten(0, 1)
 
     def evidence(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Precision [B, 2K, 2K] that the data add at these parameters, and their pull [B, 2K] on them:
         precision times the distance to the best fit."""
-        batch = len(parameters)
         k = self.shape.terms
-        warped, seen = self._warped(self.basis @ parameters.reshape(batch, 2, k).mT)
-        mean, slope = (self.contrast @ warped).unbind(1)
-        dy, dx = (
-            d.flatten(1) / self.stride
-            for d in torch.gradient(mean.unflatten(1, (self.rows, self.columns)), dim=(1, 2))
+        flow = self.moments.flow(parameters)
+        mean, slope, seen = moving(
+            self.rate, flow, self.time, self.contrast, self.grid, fade_px=1 + self.sigma
         )
-        sx = seen * dx
-        sy = seen * dy
-        xx, xy, yy, event_products = (
-            (torch.stack([sx * dx, sx * dy, sy * dy, seen * self.density], 1) @ self.products)
-            .unflatten(2, (k, k))
-            .unbind(1)
-        )
+        sums = self.moments.sums(cell_sums(mean, slope, seen, self.density, self.grid))
+        xx, xy, yy, event_products = self.moments.by_products(sums[:, [0, 1, 2, 7]]).unbind(1)
         normal = torch.cat([torch.cat([xx, xy], 2), torch.cat([xy, yy], 2)], 1)
         scattered = (
             torch.block_diag(torch.ones(k, k), torch.ones(k, k)).to(event_products)
             * event_products.repeat(1, 2, 2)
             * self.texture_noise
         )
-        right = -(torch.stack([sx * slope, sy * slope], 1) @ self.basis).flatten(1)
+        right = -self.moments.by_basis(sums[:, 3:5]).flatten(1)
         unit = self.shape.unit
         kept, weighed, explained = _trusted(
             unit.T @ normal.double() @ unit, unit.T @ scattered.double() @ unit, right.double() @ unit
         )
         scale = (CALIBRATION * OVERLAP * self.sigma**2 / self.stride**2) * self._noise(
-            explained, event_products[:, 0, 0].double(), (seen * slope.square()).sum(1).double()
+            explained, event_products[:, 0, 0].double(), sums[:, 5, 0, 0].double()
         )
         return kept / scale[:, None, None], weighed / scale[:, None]
 
@@ -164,24 +141,6 @@ class Level:
         few = FEW_EVENTS / self.stride**2 * self.slope_noise
         expected = events * self.slope_noise
         return self.slope_noise * (left + self.noise_floor * expected + few) / (expected + few)
-
-    def _warped(self, flow):
-        """Bins carried back to mid-interval along the flow [B, P, 2], as [B, n, P], and a smooth window [B,
-        P] that fades where they leave the image."""
-        batch, bins = self.rate.shape[:2]
-        at = self.grid + self.speed * flow[:, None]
-        warped = grid_sample(
-            self.rate.flatten(0, 1)[:, None],
-            at.reshape(batch * bins, self.rows, self.columns, 2),
-            padding_mode="border",
-            align_corners=True,
-        )
-        inside = ((self.reach - (at[:, [0, -1]] - self.middle).abs() * self.half) / (1 + self.sigma)).clamp(
-            0, 1
-        )
-        window = (inside.square() * (3 - 2 * inside)).unbind(3)
-        window = window[0] * window[1]
-        return warped.reshape(batch, bins, -1), window[:, 0] * window[:, 1]
 
 
 def _trusted(normal, scattered, right):
