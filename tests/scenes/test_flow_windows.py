@@ -40,14 +40,14 @@ def test_every_pixel_has_the_flow_of_the_layer_it_shows():
     y, x = np.mgrid[:40, :56]
     points = np.stack([(x - 27.5).ravel(), (y - 19.5).ravel(), np.ones(x.size)])
     for index in range(4):
-        sample = source._draw(index)
+        sample = source._draw(index, source.t)
         expected = np.zeros((2, points.shape[1]))
         sure = np.ones(points.shape[1], bool)
         for motion, crop, place in zip(sample["motion"], sample["crop"], sample["place"], strict=True):
             size = crop.shape[-1]
             on_texture = ((place.double().numpy() @ points)[1::-1] * size + size - 1) / 2  # row, column
             cover = map_coordinates(crop[1].double().numpy(), on_texture, order=1, mode="reflect")
-            end = motion[-1].double().numpy() @ points
+            end = motion.homographies[-1].double().numpy() @ points
             expected = np.where(cover > 0.5, end[:2] / end[2] - points[:2], expected)
             sure &= abs(cover - 0.5) > 1e-3  # where rounding does not choose the layer
         found = source.batch([index]).truth.flow_px[0].flatten(1).double().numpy()
