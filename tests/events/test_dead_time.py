@@ -1,4 +1,5 @@
-"""Mean counts behind a dead time against every phase written out, closed forms, and differences of the hard sensor."""
+"""Mean counts behind a dead time against the recursion and every phase written out, closed forms, and differences of
+the hard sensor."""
 
 import itertools
 import math
@@ -6,37 +7,50 @@ import math
 import pytest
 import torch
 
+from codesign.errors import DomainError
 from codesign.events import SensorModel, dense_counts, sensor_counts
-from codesign.events.layers.dead_time import pass_dead_time
+from codesign.events.layers.dead_time import mean_counts
 from codesign.events.sensor.state import SensorState, begin
+from tests.dead_time_case import written_out
 
 D = torch.float64
+ONE = (torch.ones((), dtype=D),) * 2
 
 
-def mean_counts(generator, steps=60, pixels=40):
-    """Bursts and pauses of either polarity: [T, 2, P] counts and [T] lengths."""
-    lengths = 1e-3 * (0.5 + torch.rand(steps, generator=generator, dtype=D))
-    pace = 400 * torch.rand(steps // 6, pixels, generator=generator, dtype=D)
+def bursts(generator, steps=120, pixels=40):
+    """Bursts and pauses of either polarity: [T, P] counts, OFF negative, and [T] lengths below a fifth of 4 ms."""
+    lengths = 0.5e-3 * (0.5 + torch.rand(steps, generator=generator, dtype=D))
+    pace = 800 * (torch.rand(steps // 12, pixels, generator=generator, dtype=D) - 0.5)
     pace = pace * (torch.rand(pace.shape, generator=generator) > 0.3)
-    polarity = torch.rand(pace.shape, generator=generator) > 0.5
-    pair = torch.stack((pace * polarity, pace * ~polarity), 1).repeat_interleave(6, 0)
-    return pair * lengths[:, None, None], lengths
+    return pace.repeat_interleave(12, 0) * lengths[:, None], lengths
 
 
-def every_phase(counts, interval_s, dead_s, phases):
+def behind(signed, interval_s, dead_s, centre=None, state=None):
+    """Kept counts [T, 2, P], centre and state of thresholds of 1 and a level whose play counts these [T, P], OFF
+    negative; where there is none, it rests in the middle of its play."""
+    centre = signed.new_zeros(signed.shape[1]) if centre is None else centre
+    levels = [centre]
+    middle = centre
+    for one in signed:
+        levels.append(middle + one + one.sign() / 2)
+        middle = middle + one
+    return mean_counts(torch.stack(levels), centre, ONE, interval_s, dead_s, state)
+
+
+def every_phase(signed, interval_s, dead_s, phases):
     """The same mean by its definition: events at I = i + u, one after the other, for many u."""
     ends = interval_s.cumsum(0)
     due = 1 - ((torch.arange(phases, dtype=D) + 0.5) / phases)[:, None]
-    due = due.expand(-1, counts.shape[-1])
+    due = due.expand(-1, signed.shape[-1])
     last = torch.full_like(due, -math.inf)
-    kept = torch.zeros_like(counts)
-    for index, (on, off) in enumerate(counts):
-        pace = on + off
+    kept = signed.new_zeros(len(signed), 2, signed.shape[1])
+    for index, counts in enumerate(signed):
+        pace = counts.abs()
         while bool((due <= pace).any()):
             when = ends[index] - interval_s[index] * (1 - due / pace)
             takes = (due <= pace) & (when - last >= dead_s)
             last = torch.where(takes, when, last)
-            kept[index] += torch.stack((takes & (on > 0), takes & (off > 0))).to(D).mean(1)
+            kept[index] += torch.stack((takes & (counts > 0), takes & (counts < 0))).to(D).mean(1)
             due = torch.where(due <= pace, due + 1, due)
         due = due - pace
     return kept
@@ -45,61 +59,102 @@ def every_phase(counts, interval_s, dead_s, phases):
 @pytest.mark.parametrize("seed", range(3))
 def test_kept_counts_are_the_mean_over_every_phase(seed):
     generator = torch.Generator().manual_seed(seed)
-    counts, lengths = mean_counts(generator, pixels=100)
+    counts, lengths = bursts(generator, pixels=100)
     dead_s = 5e-3 + 15e-3 * torch.rand((), generator=generator, dtype=D)
     truth = every_phase(counts, lengths, float(dead_s), 100)
-    kept, _ = pass_dead_time(counts, lengths, dead_s)
-    # groups are half a count wide and mixed within: at most an eighth of an event too early or late on average,
+    kept, *_ = behind(counts, lengths, dead_s)
+    # groups are a third of a count wide and mixed within: at most an eighth of an event too early or late on average,
     # which hardly adds up over time
     apart = (kept - truth).cumsum(0).sum(1)
     assert float(apart.square().mean().sqrt()) < 0.125
     assert float(kept.sum()) == pytest.approx(float(truth.sum()), rel=0.02)
-    assert float(truth.sum()) < 0.6 * float(counts.sum())
+    assert float(truth.sum()) < 0.6 * float(counts.abs().sum())
 
 
 @pytest.mark.parametrize("load", [0.3, 1.5, 2.5, 4.5])
 def test_regular_events_pass_one_in_ceil_of_rate_times_dead_time(load):
-    counts = torch.zeros(4000, 2, 8, dtype=D)
-    counts[:, 0] = 0.1
+    counts = torch.full((4000, 8), 0.1, dtype=D)
     lengths = torch.full((4000,), 1e-3, dtype=D)
-    kept, _ = pass_dead_time(counts, lengths, torch.tensor(load * 1e-2, dtype=D))
-    assert float(kept[2000:].mean()) == pytest.approx(0.05 / math.ceil(load), rel=0.02)
+    kept, *_ = behind(counts, lengths, torch.tensor(load * 1e-2, dtype=D))
+    assert float(kept[2000:, 0].mean()) == pytest.approx(0.1 / math.ceil(load), rel=0.02)
 
 
 def test_the_first_event_is_never_lost_and_nothing_follows_within_a_long_dead_time():
-    counts = torch.zeros(40, 2, 5, dtype=D)
-    counts[:10, 0] = 0.17
-    counts[10:20, 1] = 0.33
-    counts[30:, 1] = torch.tensor([0.02, 0.05, 0.1, 0.15, 0.2], dtype=D)
+    counts = torch.zeros(40, 5, dtype=D)
+    counts[:10] = 0.17
+    counts[10:20] = -0.33
+    counts[30:] = -torch.tensor([0.02, 0.05, 0.1, 0.15, 0.2], dtype=D)
     lengths = torch.full((40,), 1e-3, dtype=D)
-    kept, _ = pass_dead_time(counts, lengths, torch.tensor(27e-3, dtype=D))
+    kept, *_ = behind(counts, lengths, torch.tensor(27e-3, dtype=D))
     # the first event comes before I = 1, at 5.9 ms, and blocks either polarity for 27 ms
     torch.testing.assert_close(kept[:20].sum((0, 1)), torch.ones(5, dtype=D), rtol=0, atol=1e-12)
-    short, _ = pass_dead_time(counts, lengths, torch.tensor(9e-3, dtype=D))
+    short, *_ = behind(counts, lengths, torch.tensor(9e-3, dtype=D))
     # half a count after the pause: no phase has had two events, and all before are 9 ms away
-    torch.testing.assert_close(short[30:, :, :2], counts[30:, :, :2], rtol=0, atol=1e-12)
+    torch.testing.assert_close(short[30:, 1, :2], -counts[30:, :2], rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_gradients_are_those_of_the_smooth_mean(seed):
     generator = torch.Generator().manual_seed(seed)
-    counts, lengths = mean_counts(generator, 24, 3)
-    counts = (counts + 1e-2 * (counts.sum(1, keepdim=True) == 0)).requires_grad_()
-    dead_s = (4e-3 + 8e-3 * torch.rand((), generator=generator, dtype=D)).requires_grad_()
-    _, state = pass_dead_time(counts.detach()[:9], lengths[:9], dead_s.detach())
+    counts, lengths = bursts(generator, 24, 3)
+    counts = counts + 1e-2 * (counts == 0)
+    dead_s = 4e-3 + 8e-3 * torch.rand((), generator=generator, dtype=D)
+    _, centre, state = behind(counts[:9], lengths[:9], dead_s)
     weights = torch.randn(15, 2, 3, generator=generator, dtype=D)
 
-    def loss(late, dead):  # in two chunks, so that the state's gradient is seen too
-        first, middle = pass_dead_time(late[:7], lengths[9:16], dead, state)
-        second, _ = pass_dead_time(late[7:], lengths[16:], dead, middle)
+    def loss(late, dead_s):  # in two chunks, so that the state's gradient is seen too
+        first, *before = behind(late[:7], lengths[9:16], dead_s, centre, state)
+        second, *_ = behind(late[7:], lengths[16:], dead_s, *before)
         return (weights * torch.cat((first, second))).sum()
 
-    late = counts.detach()[9:].clone().requires_grad_()
+    late = counts[9:].clone().requires_grad_()
     # a step of 1e-7 of a count, or 1e-10 s, is far from the kinks where a group's event ends
-    assert torch.autograd.gradcheck(lambda x: loss(x, dead_s.detach()), (late,), eps=1e-7, atol=1e-5)
+    assert torch.autograd.gradcheck(lambda x: loss(x, dead_s), (late,), eps=1e-7, atol=1e-5)
     assert torch.autograd.gradcheck(
-        lambda x: loss(late.detach(), x), (dead_s,), eps=1e-9, atol=1e-2, rtol=1e-5
+        lambda x: loss(late.detach(), x), (dead_s.requires_grad_(),), eps=1e-9, atol=1e-2, rtol=1e-5
     )
+
+
+# intervals longer than parts, several blocks, a look over many rows, one interval, a dead time beyond the window
+@pytest.mark.parametrize(
+    ("frames", "interval_ms", "dead_ms"),
+    [(30, 4, 20), (25, 4, 2), (150, 1, 5), (90, 1, 45), (1, 1, 5), (12, 1, 1000)],
+)
+def test_the_kernel_is_the_recursion_written_out(frames, interval_ms, dead_ms, generator):
+    interval_s = 1e-3 * interval_ms * (0.5 + torch.rand(frames, generator=generator, dtype=D))
+    level = (0.3 * torch.randn(frames + 1, 5, generator=generator, dtype=D)).cumsum(0)
+    theta_on = 0.15 + 0.1 * torch.rand(5, generator=generator, dtype=D)  # of every pixel
+    given = (
+        level,
+        level[0] + 0.02,
+        theta_on,
+        torch.tensor(0.2, dtype=D),
+        torch.tensor(1e-3 * dead_ms, dtype=D),
+    )
+    found = []
+    for ours in (True, False):
+        leaves = [tensor.clone().requires_grad_() for tensor in given]
+        level, centre, on, off, dead_s = leaves
+        if ours:
+            kept, centre, state = mean_counts(level, centre, (on, off), interval_s, dead_s)
+            position = state.position
+        else:
+            kept, centre, position = written_out(level, centre, (on, off), interval_s, dead_s)
+            position = position - position.detach().floor()
+        outputs = [kept, centre, position]
+        weigh = torch.Generator().manual_seed(1)
+        loss = sum((one * torch.randn(one.shape, generator=weigh, dtype=D)).sum() for one in outputs)
+        found.append(
+            [*(one.detach() for one in outputs), *torch.autograd.grad(loss, leaves, materialize_grads=True)]
+        )
+    for kernel, torch_form in zip(*found, strict=True):
+        # a look whose weight is near 1/step = 1e3 to 1e4 per second magnifies rounding
+        torch.testing.assert_close(kernel, torch_form, rtol=1e-10, atol=1e-10 * float(torch_form.abs().max()))
+
+
+def test_a_dead_time_over_too_many_intervals_is_refused():
+    with pytest.raises(DomainError, match="reaches over 3000 intervals"):
+        behind(torch.full((3100, 1), 0.1, dtype=D), torch.full((3100,), 1e-3, dtype=D), torch.tensor(3.0))
 
 
 def sines(generator, pixels, frames=61):
@@ -191,7 +246,7 @@ def test_without_gradients_the_counts_are_the_hard_sensor_s_and_no_mean_is_compu
     t_s = torch.arange(40) * 1e-3
     level = (0.1 * torch.randn(40, 8, generator=torch.Generator().manual_seed(0))).cumsum(0)
     wanted = sensor_counts(level.clone().requires_grad_(), t_s, sensor, log_input=True)[0].detach()
-    monkeypatch.setattr("codesign.events.layers.dead_time.pass_play", None)
+    monkeypatch.setattr("codesign.events.layers.dead_time.mean_counts", None)
     with torch.no_grad():
         bare, _ = sensor_counts(level.clone().requires_grad_(), t_s, sensor, log_input=True)
     plain, _ = sensor_counts(level, t_s, sensor, log_input=True)

@@ -1,5 +1,5 @@
 """What dead time lets pass of mean counts: the expectation over where events stand in a pixel's threshold, as a
-smooth function of the counts and the dead time.
+smooth function of the levels, the thresholds and the dead time.
 
 A pixel's events come one by one as its mean count I grows by one, at I = i + u, with a phase u that is as good
 as random. Event i is kept unless one kept before lies less than T back, and no two kept ones do:
@@ -15,25 +15,29 @@ dead time reaches over frames, turns and polarities. What the mixing costs is in
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+from codesign.errors import DomainError
+from codesign.events.layers import dead_time_kernel as kernel
+from codesign.events.layers.dead_time_part import PHASES, Parts
 from codesign.events.level_path import parts
 
-PHASES = 6
-WIDTH = 2 / PHASES  # of a count: every phase belongs to two groups
 GOLDEN = (5**0.5 - 1) / 2  # its multiples spread evenly: neighbouring pixels stand at different phases
+STEPS = 5  # of the recursion in a dead time, at least
+MOST_ROWS = 2000  # of the recursion in a dead time: they lie in the memory of a thread
+MOST_LOAD = 5.0  # rate x dead time up to which gradients were measured to point right
+FEWEST = 8  # dead times shorter than an interval over this are taken as local
 
 
 @dataclass(frozen=True)
 class DeadTimeState:
-    """What ``pass_dead_time`` carries over chunks. position: [P] mean count so far, modulo 1. begun:
-    [PHASES, P] what a group had kept when its last event began. kept: [N, PHASES, P] what it had kept at ago_s:
-    [N] seconds before the end, the last one 0. All keep their graph."""
+    """What ``mean_counts`` carries over chunks. position: [...] mean count so far, modulo 1. begun: [PHASES, ...]
+    what a group had kept when its last event began. kept: [N, PHASES, ...] what it had kept at ago_s: [N] seconds
+    before the end, the last one 0. All keep their graph."""
 
     position: Tensor
     begun: Tensor
@@ -41,187 +45,105 @@ class DeadTimeState:
     ago_s: Tensor
 
 
-def pass_dead_time(
-    counts: Tensor, interval_s: Tensor, refractory_s: Tensor, state: DeadTimeState | None = None
-) -> tuple[Tensor, DeadTimeState]:
-    """Mean counts behind a dead time.
+def mean_counts(
+    level: Tensor,
+    centre: Tensor,
+    thetas: Sequence[Tensor],
+    interval_s: Tensor,
+    refractory_s: Tensor | float,
+    state: DeadTimeState | None = None,
+) -> tuple[Tensor, Tensor, DeadTimeState]:
+    """Mean counts behind a dead time, of levels linear between frames.
 
     Args:
-      counts: [T, 2, ...] mean counts per interval without dead time, >= 0, evenly spread over the interval.
-      interval_s: [T] float64 lengths, at most a third of the dead time. refractory_s: 0-dim, > 0.
-      state: DeadTimeState of an earlier chunk.
-    Returns: kept counts [T, 2, ...], in [0, counts]; DeadTimeState.
-    Gradient: counts, refractory_s, state; exact.
+      level: [T + 1, ...] log levels. centre: [...] of the play at the first one. thetas: ON, OFF, 0-dim or [...].
+      interval_s: [T] float64 lengths. refractory_s: 0-dim, > 0. state: DeadTimeState of an earlier chunk.
+    Returns: kept counts [T, 2, ...], ON first; the play's centre [...]; DeadTimeState.
+    Gradient: level, centre, thetas, refractory_s, state; exact, of the recursion.
+    Raises: DomainError for a dead time that reaches over more than MOST_ROWS intervals.
+    Cost: one pass forward and two backward; beside counts and gradients some 15 numbers per part (a fifth of the
+      dead time, or an interval) and pixel.
     """
-    flat = counts.flatten(2)
+    dead_s = torch.as_tensor(refractory_s, dtype=torch.float64)
+    thetas = [torch.as_tensor(theta).to(level) for theta in thetas]
     if state is None:
-        pixels = torch.arange(flat.shape[-1], dtype=torch.float64)
-        nothing = flat.new_zeros(PHASES, flat.shape[-1])
-        position = ((0.37 + GOLDEN * pixels) % 1).to(flat)
+        pixels = torch.arange(level[0].numel(), dtype=torch.float64)
+        nothing = level.new_zeros(PHASES, *level.shape[1:])
+        position = ((0.37 + GOLDEN * pixels) % 1).to(level).reshape(level.shape[1:])
         state = DeadTimeState(position, nothing, nothing[None], interval_s.new_zeros(1))
-    rows_s = torch.cat((-state.ago_s, interval_s.cumsum(0)))
-    passed, kept, begun, position = _Passed.apply(
-        flat, refractory_s, state.kept, state.begun, state.position, rows_s
+    cut, rows_s = _cut(interval_s, float(dead_s.detach()), state.ago_s)
+    missing = cut.reach - len(state.kept)
+    rows = state.kept[-cut.reach :]
+    if missing > 0:
+        rows = torch.cat((rows.new_zeros(missing, *rows.shape[1:]), rows))
+    passed, centre, position, begun, rows = _Kept.apply(
+        level, *thetas, dead_s, centre, state.position, state.begun, rows, cut
     )
     ago_s = rows_s[-1] - rows_s
-    # the rows that the next chunk looks back at, one more for the interval in which the dead time begins
-    first = max(0, int((ago_s > float(refractory_s.detach())).sum()) - 1)
+    kept = rows[-_wanted(ago_s, float(dead_s.detach())) :]
     base = kept[-1].detach()
     after = DeadTimeState(
-        position - position.detach().floor(), begun - base, kept[first:] - base, ago_s[first:]
+        position - position.detach().floor(), begun - base, kept - base, ago_s[-len(kept) :]
     )
-    return passed.reshape(counts.shape), after
+    return passed, centre, after
 
 
-class _Passed(Function):
+class _Kept(Function):
     @staticmethod
-    def forward(ctx, counts, refractory_s, kept, begun, position, rows_s):
-        run = _Steps(counts, refractory_s, len(kept), rows_s)
-        history = torch.cat((kept, counts.new_empty(len(counts), *kept.shape[1:])))
-        passed = torch.empty_like(counts)
-        begins = [begun]
-        positions = [position]
-        for index in range(len(counts)):
-            step = run.step(index, history, begins[-1], positions[-1])
-            passed[index] = counts[index] * run.share(index, step.added)
-            history[run.first + index + 1] = step.before + step.added
-            begins.append(step.begun)
-            positions.append(step.position)
-        ctx.save_for_backward(
-            counts, refractory_s, history, torch.stack(begins), torch.stack(positions), rows_s
-        )
-        return passed, history, begins[-1], positions[-1]
+    def forward(ctx, level, theta_on, theta_off, dead_s, centre, position, begun, rows, cut):
+        passed, after, stored = kernel.forward(cut, level, theta_on, theta_off, centre, position, begun, rows)
+        ctx.cut = cut
+        ctx.stored = stored
+        ctx.save_for_backward(level, theta_on, theta_off)
+        return passed, *after
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *grads):
-        counts, refractory_s, history, begins, positions, rows_s = ctx.saved_tensors
-        seed, grad_history, grad_begun, grad_position = grads
-        grad_history = grad_history.clone()
-        grad_counts = torch.empty_like(counts)
-        grad_dead = counts.new_zeros(())
-        run = _Steps(counts, refractory_s, len(history) - len(counts), rows_s)
-        for index in reversed(range(len(counts))):
-            step = run.step(index, history, begins[index], positions[index])
-            row = run.first + index
-            # passed = counts * mean(added) / total
-            share = run.share(index, step.added)
-            pull = (seed[index] * counts[index]).sum(0) / run.total[index].clamp(min=run.tiny)
-            added = pull / PHASES + grad_history[row + 1]
-            # the event begun before this step, and the one that begins in it
-            late = added * step.late
-            late_mass = added * step.kept_late
-            grad_begun = grad_begun - late * (step.kept_late < 1)
-            looked = late * (step.kept_late < 1)
-            middle = torch.where(step.begins, grad_begun, 0)
-            grad_begun = torch.where(step.begins, 0, grad_begun)
-            early = (added + middle) * step.early
-            early_mass = (added + middle) * step.kept_early
-            grad_begun = grad_begun - early * (step.kept_early < 1)
-            looked = looked + early * (step.kept_early < 1)
-            grad_history[row] += grad_history[row + 1] + middle
-            at, part, slope = run.look[index]
-            grad_history[at] += (1 - part) * looked
-            grad_history[at + 1] += part * looked
-            grad_dead = grad_dead - slope * (looked * (history[at + 1] - history[at])).sum()
-            end = torch.where(step.begins, late_mass * step.single, early_mass) * step.fills_after
-            start = early_mass * step.fills_before
-            grad_position = grad_position + end.sum(0)
-            grad_counts[index] = seed[index] * share - share * pull + grad_position
-            grad_position = grad_position - start.sum(0)
-        kept = grad_history[: run.first + 1]
-        return grad_counts, grad_dead.to(refractory_s), kept, grad_begun, grad_position, None
-
-
-@dataclass(frozen=True)
-class _Step:
-    """One step of every group: masses of the event begun before it (early) and of the one that begins in it
-    (late), the share of each that is kept, what is kept more, and the state after."""
-
-    before: Tensor
-    early: Tensor
-    late: Tensor
-    kept_early: Tensor
-    kept_late: Tensor
-    added: Tensor
-    begins: Tensor
-    begun: Tensor
-    position: Tensor
-    fills_before: Tensor
-    fills_after: Tensor
-    single: Tensor
-
-
-class _Steps:
-    """The recursion's arithmetic, for both directions of time."""
-
-    def __init__(self, counts, refractory_s, rows, rows_s):
-        self.total = counts.sum(1)
-        self.tiny = torch.finfo(counts.dtype).tiny
-        self.first = rows - 1
-        self.offset = torch.arange(PHASES, dtype=counts.dtype, device=counts.device)[:, None] / PHASES
-        self.look = _looks(rows_s, self.first, float(refractory_s.detach()))
-
-    def share(self, index, added):
-        """Kept over all, [P]."""
-        return added.mean(0) / self.total[index].clamp(min=self.tiny)
-
-    def step(self, index, history, begun, position) -> Any:
-        before = history[self.first + index]
-        at, part, _ = self.look[index]
-        free = torch.lerp(history[at], history[at + 1], part) if part else history[at]
-        start = position + self.offset
-        after = position + self.total[index]
-        end = after + self.offset
-        filled, fills_before = _filled(start)
-        filled_after, fills_after = _filled(end)
-        begins = end.floor() > start.floor()
-        border = start.floor() + 1
-        early = torch.where(begins, border, filled_after) - filled
-        grown = torch.where(begins, filled_after - border, 0)
-        late = grown.clamp(max=1)  # further ones of this step are lost to it
-        kept_early = (1 - (begun - free)).clamp(max=1)
-        middle = before + kept_early * early
-        begun = torch.where(begins, middle, begun)
-        kept_late = (1 - (begun - free)).clamp(max=1)
-        added = kept_early * early + kept_late * late
-        return _Step(
-            before,
-            early,
-            late,
-            kept_early,
-            kept_late,
-            added,
-            begins,
-            begun,
-            after,
-            fills_before,
-            fills_after,
-            grown <= 1,
+        level, theta_on, theta_off = ctx.saved_tensors
+        of_level, of_on, of_off, of_dead, *of_state = kernel.adjoint(
+            ctx.cut, level, theta_on, theta_off, ctx.stored, grads[0], grads[1:]
+        )
+        return (
+            of_level,
+            of_on.sum_to_size(theta_on.shape),
+            of_off.sum_to_size(theta_off.shape),
+            of_dead.sum(dtype=torch.float64),
+            *of_state,
+            None,
         )
 
 
-def _filled(position):
-    """Mass of a group's events up to a position, and its slope."""
-    whole = position.floor()
-    share = (position - whole) / WIDTH
-    return whole + share.clamp(max=1), torch.where(share < 1, 1 / WIDTH, 0.0)
-
-
-def _looks(rows_s, first, refractory_s):
-    """For the middle of every step a dead time ago: row before, part of the way to the next, 1/step in 1/s."""
+def _cut(interval_s, refractory_s, ago_s):
+    """Parts of the intervals, at most a fifth of the dead time long, as the kernel wants them; the times [rows] that
+    it knows what was kept at, of the state's rows and of the ends of parts."""
+    ends_s = torch.cat((interval_s.new_zeros(1), interval_s.cumsum(0)))
+    interval, share, fine_s = parts(ends_s, refractory_s / STEPS)
+    first = len(ago_s) - 1
+    rows_s = torch.cat((-ago_s, fine_s[1:]))
+    # what had been kept a dead time before the middle of every part
     middle = (rows_s[first:-1] + rows_s[first + 1 :]) / 2 - refractory_s
-    at = (torch.searchsorted(rows_s, middle, right=True) - 1).clamp(0, max(0, len(rows_s) - 2))
+    now = first + torch.arange(len(middle))
+    at = torch.searchsorted(rows_s, middle, right=True) - 1
+    at = torch.minimum(at.clamp(min=0), now - 1)  # -1 where nothing was before
     step = rows_s[at + 1] - rows_s[at]
-    part = (middle - rows_s[at]) / step
-    inside = (part > 0) & (part <= 1)
+    blend = (middle - rows_s[at]) / step
+    inside = (blend > 0) & (blend <= 1)
+    back = now - at
+    reach = max(int(back.max()) + 1, _wanted(rows_s[-1] - rows_s, refractory_s))
+    if reach > MOST_ROWS:
+        raise DomainError(
+            f"the dead time of {refractory_s:g} s reaches over {int(back.max())} intervals; its gradient over fewer "
+            f"than {MOST_ROWS}: give fewer frames per second."
+        )
+    reach = -(-reach // 4) * 4  # few sizes, and so few kernels
     slope = torch.where(inside, 1 / step, 0)
-    return list(zip(at.tolist(), part.clamp(0, 1).tolist(), slope.tolist(), strict=True))
+    return Parts(interval, share, back, blend.clamp(0, 1), slope, reach), rows_s
 
 
-MOST_LOAD = 5.0  # rate x dead time up to which gradients were measured to point right
-STEPS = 5  # of the recursion in a dead time
-FEWEST = 8  # dead times shorter than an interval over this are taken as local
+def _wanted(ago_s, refractory_s):
+    """How many rows the next chunk looks back at: one more for the interval in which the dead time begins."""
+    return len(ago_s) - max(0, int((ago_s > refractory_s).sum()) - 1)
 
 
 def reaches(interval_s: Tensor, refractory_s: float) -> bool:
@@ -229,18 +151,28 @@ def reaches(interval_s: Tensor, refractory_s: float) -> bool:
     return refractory_s * FEWEST >= float(interval_s.max())
 
 
+@torch.no_grad()
+def load(
+    level: Tensor,
+    thetas: Sequence[Tensor | float],
+    interval_s: Tensor,
+    refractory_s: Tensor | float,
+) -> float:
+    """Rate x dead time, the mean over events. level: [T, ...]. interval_s: [T-1]."""
+    step = level.diff(dim=0)
+    moved = (step.clamp(min=0) / thetas[0] + (-step).clamp(min=0) / thetas[1]).sum(0)
+    rate_hz = moved / float(interval_s.sum())
+    return float((rate_hz * moved).sum() / moved.sum().clamp(min=1e-30)) * float(refractory_s)
+
+
 def warn_beyond(
     level: Tensor, thetas: Sequence[Tensor], interval_s: Tensor, refractory_s: Tensor | float
 ) -> None:
     """Warn where rate x dead time is beyond ``MOST_LOAD``, the mean over events."""
-    with torch.no_grad():
-        step = level.diff(dim=0)
-        moved = (step.clamp(min=0) / thetas[0] + (-step).clamp(min=0) / thetas[1]).sum(0)
-        rate_hz = moved / float(interval_s.sum())
-        load = float((rate_hz * moved).sum() / moved.sum().clamp(min=1e-30)) * float(refractory_s)
-    if load > MOST_LOAD:
+    most = load(level, thetas, interval_s, refractory_s)
+    if most > MOST_LOAD:
         warnings.warn(
-            f"rate x dead time is {load:.2g} for the average event, of which about one in {load + 0.5:.2g} is "
+            f"rate x dead time is {most:.2g} for the average event, of which about one in {most + 0.5:.2g} is "
             f"kept; gradients are measured up to {MOST_LOAD:g} (docs/events.md). Beyond, which event is kept "
             "depends on each one before, and the gradient of a shift is lost first (cosine below 0.9 against "
             "differences): shorten the dead time or raise the thresholds.",
@@ -256,53 +188,3 @@ def local_share(
     theta = torch.where(step > 0, thetas[0], thetas[1])
     rate_hz = step.abs() / theta / interval_s.to(step).reshape(-1, *[1] * (step.ndim - 1))
     return 1 / (rate_hz * refractory_s + 0.5).clamp(min=1)
-
-
-def pass_play(
-    level: Tensor,
-    counts: Tensor,
-    centre: Tensor,
-    thetas: Sequence[Tensor],
-    interval_s: Tensor,
-    refractory_s: Tensor | float,
-    state: DeadTimeState | None,
-) -> tuple[Tensor, DeadTimeState]:
-    """Mean counts behind a dead time, of ``memory``'s counts: values from a play, slopes from the layer.
-
-    Args: level: [N + 1, ...]. counts: [N, 2, ...] of ``memory``. centre: [...] of the play at the first level.
-      thetas: ON, OFF. interval_s: [N].
-    Returns: [N, 2, ...]; DeadTimeState. Gradient: counts and refractory_s.
-    """
-    mean = torch.empty_like(counts, requires_grad=False)
-    theta_on, theta_off = (theta.detach() for theta in thetas)
-    half = (theta_on + theta_off) / 4
-    with torch.no_grad():
-        for now, pair in zip(level[1:], mean, strict=True):
-            rise = (now - centre - half).clamp(min=0)
-            fall = (centre - half - now).clamp(min=0)
-            centre = centre + rise - fall
-            pair[0] = rise / theta_on
-            pair[1] = fall / theta_off
-    return pass_dead_time(
-        mean + (counts - counts.detach()),
-        interval_s,
-        torch.as_tensor(refractory_s, dtype=torch.float64),
-        state,
-    )
-
-
-def finely(level: Tensor, interval_s: Tensor, refractory_s: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Levels at the ends of parts of at most a fifth of the dead time, linear between frames.
-
-    Args: level: [T, ...]. interval_s: [T-1].
-    Returns: levels [N + 1, ...]; lengths [N] of the parts; the interval [N] that each lies in.
-    """
-    ends_s = torch.cat((interval_s.new_zeros(1), interval_s.cumsum(0)))
-    interval, share, fine_s = parts(ends_s, refractory_s / STEPS)
-    share = share.to(level).reshape(-1, *[1] * (level.ndim - 1))
-    frame = interval.to(level.device)
-    return (
-        torch.cat((level[:1], torch.lerp(level[frame], level[frame + 1], share))),
-        fine_s.diff(),
-        frame,
-    )

@@ -72,7 +72,7 @@ def sensor_counts(
       its range of validity.
     Warns: UserWarning where rate x dead time leaves that range.
     Raises: DomainError for other names in ``design`` (they have no gradient) or values outside the sensor's
-      domain, and as ``simulate``.
+      domain, or a dead time that its gradient cannot follow over thousands of intervals; and as ``simulate``.
     """
     hard_sensor = with_design(sensor, design, DESIGN)
     value: dict[str, Any] = {name: design.get(name, getattr(sensor, name)) for name in DESIGN}
@@ -155,10 +155,6 @@ def _mean_counts(seen, thetas, interval_s, refractory_s, state):
         smooth, reference = memory(seen[1:], *thetas, state=start, log_input=True)
         share = dead_time.local_share(seen.diff(dim=0), thetas, interval_s, refractory_s)
         return smooth * share[:, None], reference, None
-    fine, part_s, interval = dead_time.finely(seen, interval_s, dead_s)
-    # the play's slopes, as its values are what the recursion sees
-    smooth, reference = memory(fine[1:], *thetas, state=start, log_input=True, gradient="play")
     centre, before = (start, None) if state is None else (start[1], state.dead)
-    passed, dead = dead_time.pass_play(fine, smooth, centre.detach(), thetas, part_s, refractory_s, before)
-    total = passed.new_zeros(len(interval_s), *passed.shape[1:])
-    return total.index_add(0, interval, passed), reference, dead
+    passed, centre, dead = dead_time.mean_counts(seen, centre, thetas, interval_s, refractory_s, before)
+    return passed, torch.stack((centre, centre)), dead
