@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from codesign.errors import DomainError
+from scenes.flow_sensors import Sensors, SensorWindows
 from scenes.flow_windows import Draws, RenderedWindows, planes
 
 UNSEEN = 1_000_000  # added to the seed of what networks are judged on
@@ -28,10 +29,42 @@ class Shape:
             bins=self.bins,
         )
 
+    def seen_by(self, sensors, draws, seed, side_px=None):
+        """Windows of this size, or square ones of another, seen by sensors that all differ."""
+        return SensorWindows(
+            draws,
+            sensors,
+            seed=seed,
+            height_px=side_px or self.height_px,
+            width_px=side_px or self.width_px,
+            bins=self.bins,
+        )
+
 
 DENSE = Draws(flow_px=(0.5, 7.0), contrast=(0.8, 1.8), theta=(0.08, 0.25))
 FLAT = Draws(motion="similarity", layers=(0, 0), flow_px=(0.0, 7.0), contrast=(0.7, 1.6), theta=(0.08, 0.25))
 WIDE = Draws(layers=(1, 4), flow_px=(1.0, 9.0), contrast=(0.8, 1.8), theta=(0.08, 0.25))
+
+LENSES: dict[str, Any] = {"blur_px": (0.0, 1.2), "distortion": (-0.06, 0.06)}
+SHORT = Draws(motion="similarity", layers=(0, 0), flow_px=(0.0, 2.5), **LENSES)
+PLANES = Draws(motion="similarity", layers=(0, 0), flow_px=(1.0, 7.0), **LENSES)
+DEPTHS = Draws(layers=(0, 3), flow_px=(0.5, 8.0), **LENSES)
+SHORT_DEPTHS = Draws(layers=(1, 4), flow_px=(0.2, 3.0), **LENSES)
+FAST_DEPTHS = Draws(layers=(0, 3), flow_px=(1.0, 10.0), **LENSES)
+STIFF = Sensors()
+BENDING = Sensors(bend=0.4)
+
+
+def real(shape, seed):
+    """Windows as real sensors give them: planes, layers that bend, short and long flows."""
+    return [
+        (0.2, shape.seen_by(STIFF, SHORT, seed)),
+        (0.15, shape.seen_by(STIFF, PLANES, seed + 1)),
+        (0.35, shape.seen_by(BENDING, DEPTHS, seed + 2)),
+        (0.1, shape.seen_by(BENDING, SHORT_DEPTHS, seed + 3)),
+        (0.2, shape.seen_by(BENDING, FAST_DEPTHS, seed + 4, 96)),
+    ]
+
 
 TRAINING: dict[str, Callable[[Shape, int], list]] = {
     "delivered": lambda shape, seed: [
@@ -39,6 +72,7 @@ TRAINING: dict[str, Callable[[Shape, int], list]] = {
         (0.25, shape(FLAT, seed + 1)),
         (0.2, shape(WIDE, seed + 2, 96, 96)),
     ],
+    "real": real,
     "layers": lambda shape, seed: [(1.0, shape(Draws(), seed))],
     "planes": lambda shape, seed: [(1.0, shape(Draws(layers=(0, 0)), seed))],
 }
