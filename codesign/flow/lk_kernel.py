@@ -1,6 +1,8 @@
 """The dear part of the closed form as drjit kernels with adjoints of their own: bins read along a flow and compared
-over time (lk_warp_kernel), products of their slopes summed over cells (lk_sums_kernel). They know nothing of the
-field that the flow comes from."""
+over time (lk_warp_kernel), products of their slopes summed over cells (lk_sums_kernel), and the blur before both
+(lk_blur_kernel). They know nothing of the field that the flow comes from."""
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -9,7 +11,7 @@ from torch.nn.functional import pad
 
 from codesign.backend import NoSecondDerivative
 from codesign.errors import DomainError, ShapeError
-from codesign.flow import lk_sums_kernel, lk_warp_kernel
+from codesign.flow import lk_blur_kernel, lk_sums_kernel, lk_warp_kernel
 from codesign.flow.lk_lanes import Grid
 
 _FIRST_ONLY = (
@@ -76,6 +78,25 @@ def cell_sums(
     return _Sums.apply(mean, slope, seen, density, grid, cell)
 
 
+def blurred(images: Tensor, grid: Grid, taps: Sequence[float]) -> Tensor:
+    """Images averaged over the squares of a grid, then blurred along both axes.
+
+    Args:
+      images: [B, n, H, W], the image that ``grid`` samples.
+      taps: of a symmetric kernel, in samples: the middle one, then those to one side.
+    Returns: [B, n, h, w]. Beyond the outermost samples the image is continued by its mirror image, again and again
+      where the kernel is longer.
+    Gradient: images; exact, the first one.
+    Raises: ShapeError where images and grid do not fit; GradientError for a second derivative.
+    """
+    if images.ndim != 4 or images.shape[2:] != (grid.height, grid.width) or 0 in grid.shape:
+        raise ShapeError(
+            f"images are {list(images.shape)}, the grid has {grid.height} x {grid.width} pixels and {grid.shape[0]} "
+            f"x {grid.shape[1]} samples; give [B, n, {grid.height}, {grid.width}] and at least one sample."
+        )
+    return _Blurred.apply(images, grid, tuple(taps))
+
+
 class _Moving(Function):
     @staticmethod
     def forward(ctx, rate, flow_px, weights, grid, fade_px):
@@ -103,6 +124,19 @@ class _Sums(Function):
     def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
         found = lk_sums_kernel.adjoint(*ctx.saved_tensors, *ctx.rest, grad)
         return *_first_only(found, *ctx.saved_tensors, grad), None, None
+
+
+class _Blurred(Function):
+    @staticmethod
+    def forward(ctx, images, grid, taps):
+        ctx.save_for_backward(images)
+        ctx.rest = grid, taps
+        return lk_blur_kernel.forward(images.flatten(0, 1), grid, taps).unflatten(0, images.shape[:2])
+
+    @staticmethod
+    def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
+        found = lk_blur_kernel.adjoint(grad.flatten(0, 1), *ctx.rest).unflatten(0, grad.shape[:2])
+        return *_first_only([found], *ctx.saved_tensors, grad), None, None
 
 
 def _first_only(found, *sources):

@@ -15,12 +15,11 @@ Noise. Events scattered at random, rho per pixel and window, put into a volume b
 import math
 
 import torch
-from kornia.filters import gaussian_blur2d, get_gaussian_kernel1d
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, conv1d, pad
+from torch.nn.functional import avg_pool2d, pad
 
 from codesign.flow.lk_field import Polynomials
-from codesign.flow.lk_kernel import cell_sums, moving
+from codesign.flow.lk_kernel import blurred, cell_sums, moving
 from codesign.flow.lk_lanes import Grid
 from codesign.flow.lk_moments import Moments
 from codesign.types import EventVolume
@@ -95,9 +94,9 @@ class Level:
         self.shape = shape
         self.noise_floor = noise_floor
         self.stride = stride(sigma_px, min(shape.height, shape.width))
-        self.rate, kernel = _blurred(rate, sigma_px, self.stride)
-        self.density = avg_pool2d(density, self.stride) if self.stride > 1 else density
         self.grid = Grid(shape.height, shape.width, self.stride)
+        self.rate, kernel = _blurred(rate, sigma_px, self.grid)
+        self.density = avg_pool2d(density, self.stride) if self.stride > 1 else density
         self.moments = Moments(shape, self.grid, rate)
         weight, self.time = times
         centred = self.time - weight @ self.time
@@ -171,23 +170,22 @@ def _trusted(normal, scattered, right):
     return (kept + kept.mT) / 2, (root @ (trust @ seen))[..., 0], explained
 
 
-def _blurred(images, sigma_px, step):
+def _blurred(images, sigma_px, grid):
     """[B, n, H, W] averaged over squares, then through a Gaussian, together of standard deviation sigma;
-    mirrored at the border, continued by it where the kernel is longer than the image.
+    mirrored at the border.
 
-    Returns: images at the centres of the squares, and the whole kernel along one axis, taps of 1 px.
+    Returns: images on the samples of ``grid``, and the whole kernel along one axis, taps of 1 px.
     """
+    step = grid.stride
     # in samples: the averages have variance (step^2 - 1) / 12 px^2
     spread = math.sqrt(sigma_px**2 - (step**2 - 1) / 12) / step
     radius = int((3.0 if step == 1 else 2.5) * spread + 0.5)
-    size = 2 * radius + 1
-    pooled = avg_pool2d(images, step) if step > 1 else images
-    border = "reflect" if radius < min(pooled.shape[-2:]) else "replicate"
-    found = gaussian_blur2d(pooled, (size, size), (spread, spread), border)
-    taps = get_gaussian_kernel1d(size, spread, device=images.device, dtype=images.dtype)
-    spaced = pad(taps[0][:, None], (0, step - 1)).flatten()
-    kernel = conv1d(spaced[None, None], torch.full((1, 1, step), 1 / step).to(images), padding=step - 1)[0, 0]
-    return found, kernel
+    taps = torch.exp(-torch.arange(-radius, radius + 1, dtype=torch.float64).square() / (2 * spread**2))
+    taps = taps / taps.sum()
+    kernel = torch.zeros(2 * radius * step + step, dtype=torch.float64)
+    for shift in range(step):
+        kernel[shift : shift + 2 * radius * step + 1 : step] += taps / step
+    return blurred(images, grid, taps[radius:].tolist()), kernel
 
 
 def _slope_of_noise(kernel, step):

@@ -1,9 +1,11 @@
-"""The kernels of the closed form against the same written down in torch (lk_reference), against differences, and
-against a plane that moves."""
+"""The kernels of the closed form against the same written down in torch (lk_reference) and scipy, against
+differences, and against a plane that moves."""
 
 import drjit as dr
+import numpy as np
 import pytest
 import torch
+from scipy.ndimage import correlate1d
 
 from codesign.errors import DomainError, GradientError, ShapeError
 from codesign.flow import lk_kernel, lk_warp_kernel
@@ -100,6 +102,35 @@ def test_a_plane_carried_back_along_its_flow_stands_still():
     torch.testing.assert_close(sums, torch.cat([squares, 2 * window[None].square()]))
 
 
+@pytest.mark.parametrize("dtype", [D, torch.float32])
+@pytest.mark.parametrize(
+    ("shape", "stride"), [((2, 3, 150, 21), 1), ((1, 2, 31, 42), 4), ((1, 2, 3, 2), 1), ((3, 1, 1, 5), 1)]
+)
+def test_the_blur_is_that_of_scipy_and_so_is_its_adjoint(shape, stride, dtype, generator):
+    # more rows than a lane goes down; squares cut off; images smaller than the kernel
+    taps = (0.4, 0.15, 0.1, 0.05)
+    images, others = torch.randn(2, *shape, generator=generator, dtype=dtype).requires_grad_()
+    grid = Grid(*shape[2:], stride)
+    rows, columns = grid.shape
+
+    def truth(images):
+        cut = images.detach().double().numpy()[..., : rows * stride, : columns * stride]
+        found = cut.reshape(*shape[:2], rows, stride, columns, stride).mean((3, 5))
+        for axis in (2, 3):
+            found = correlate1d(found, np.array([*taps[:0:-1], *taps]), axis, mode="mirror")
+        return torch.from_numpy(found)
+
+    found = lk_kernel.blurred(images, grid, taps)
+    rounding = 20 * torch.finfo(dtype).eps  # seven products both ways, means of 16
+    torch.testing.assert_close(found.double(), truth(images), rtol=0, atol=4 * rounding)
+    seed = torch.randn(found.shape, generator=generator, dtype=dtype)
+    (pull,) = torch.autograd.grad((found * seed).sum(), images)
+    forward = (seed.double() * truth(others)).sum()
+    backward = (pull.double() * others.double()).sum()
+    size = seed.double().norm() * others.detach().double().norm()
+    assert abs(float((forward - backward).detach())) <= rounding * float(size)
+
+
 def test_bins_read_far_outside_are_the_border_and_pull_at_no_flow(generator):
     grid, _, rate, _ = drawn((1, 2, 6, 7, 1, 1), generator)
     time = torch.tensor([0.5, 1.0], dtype=D)
@@ -133,12 +164,14 @@ def test_other_sizes_need_no_new_kernel(generator):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
             both(lk_kernel, grid, cell, rate, flow, rate[:, 0], rate[:, :3].unbind(1))
+            (images,) = leaves(torch.rand(*case[:2], grid.height, grid.width, dtype=D))
+            torch.autograd.grad(lk_kernel.blurred(images, grid, (0.5, 0.25)).sum(), images)
             history = dr.kernel_history()
         return {entry["hash"] for entry in history if entry["type"] == dr.KernelType.JIT}
 
-    first = kernels((1, 3, 8, 9, 1, 2))
-    assert len(first) >= 5
-    assert kernels((3, 7, 30, 21, 2, 5)) <= first
+    first = kernels((1, 3, 8, 9, 2, 2))
+    assert len(first) >= 9
+    assert kernels((3, 7, 80, 21, 4, 5)) <= first
 
 
 def test_a_second_derivative_is_refused(generator):
@@ -161,6 +194,8 @@ def test_what_does_not_fit_is_named(generator):
         lk_kernel.moving(rate, flow, time[1:], contrast, grid, FADE_PX)
     with pytest.raises(ShapeError, match="mean, slope, seen and density"):
         lk_kernel.cell_sums(rate[:, 0], rate[:, 0], rate[:, 0], rate, grid)
+    with pytest.raises(ShapeError, match="the grid has 4 x 5 pixels and 2 x 2 samples"):
+        lk_kernel.blurred(rate[..., 1:], Grid(4, 5, 2), (0.5, 0.25))
     with pytest.raises(DomainError, match="cell is 0"):
         lk_kernel.cell_sums(*[rate[:, 0]] * 4, grid, 0)
 

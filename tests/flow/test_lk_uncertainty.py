@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from codesign.flow import estimate_lk, lk_field, lk_level
+from codesign.flow.lk_lanes import Grid
 from codesign.types import EventVolume
 from scenes.flow_windows import RenderedWindows, planes
 from tests.certain_case import certain
@@ -62,7 +63,7 @@ def test_scattered_events_give_the_slopes_that_the_noise_model_says(generator):
     for sigma in (1.0, 2.0):
         noise = torch.randn(1, 8, 160, 160, generator=generator, dtype=D)
         step = lk_level.stride(sigma)
-        blurred, kernel = lk_level._blurred(noise, sigma, step)
+        blurred, kernel = lk_level._blurred(noise, sigma, Grid(160, 160, step))
         dy, dx = torch.gradient(blurred[..., 3:-3, 3:-3], dim=(2, 3))
         found = float(((dx.square() + dy.square()) / 2)[..., 1:-1, 1:-1].mean()) / step**2
         assert found == pytest.approx(lk_level._slope_of_noise(kernel, step), rel=0.1)
