@@ -100,14 +100,14 @@ def rotation(draw, t, width_px, height_px, flow_px):
 
 
 def vibration(draw, t, width_px, height_px, flow_px):
-    """A shaking camera: shifts along x and y and roll swing, each with its own frequency of 0.1 to 0.5 periods
+    """A shaking camera: shifts along x and y and roll swing, each with its own frequency of 0.05 to 0.3 periods
     per window, over a slow drift.
 
     flow_px: (least, most) amplitude of a shift, drawn evenly. Returns: [1, T, 3, 3].
     """
     reach = np.hypot(width_px, height_px) / 2
     amplitude = draw.uniform(*flow_px, 3) * np.array([1, 1, 0.3 / reach])
-    frequency = 2 * np.pi * draw.uniform(0.1, 0.5, 3)
+    frequency = 2 * np.pi * draw.uniform(0.05, 0.3, 3)
     phase = draw.uniform(0, 2 * np.pi, 3)
     drift = amplitude * draw.normal(0, 0.3, 3)
     t = np.asarray(t)[:, None]

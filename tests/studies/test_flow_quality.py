@@ -1,46 +1,137 @@
-"""Figures of the study of the refiner's quality, against numbers worked out by hand; and its quick form from
-the command line."""
+"""Measures of the study of flow's quality, against numbers worked out by hand; and its quick form from the
+command line."""
 
 import json
+import math
 
 import numpy as np
 import pytest
+import torch
 
+from codesign.events.stream import ordered
+from codesign.flow import metrics
 from codesign.flow.checkpoint import DELIVERED
-from studies import flow_quality
-from studies.frame.run import main, open_run
+from codesign.flow.export import evenly_timed
+from codesign.types import FlowField, FlowWindows
+from studies.flow_quality.__main__ import Config, study
+from studies.flow_quality.measures import SHARES, join, measure, sparsified, spearman, warp_loss
+from studies.frame.run import main
 
 
-def test_figures_of_a_set(tmp_path):
-    """Two windows: zero flow 2 and 4 px, closed form 1 and 5 px, refiner 0.5 and 1 px with squared errors
-    0.25 and 4 times the claim."""
-    run = open_run("flow_quality", flow_quality.Config(out=tmp_path))
-    row = flow_quality._row(run, "set", np.array([[2.0, 1.0, 0.5, 0.25], [4.0, 5.0, 1.0, 4.0]]))
-    assert run.metrics["set_closed_form_ratio"] == pytest.approx(1.0)
-    assert run.metrics["set_refiner_ratio"] == pytest.approx(0.25)
-    assert run.metrics["set_refiner_over_closed_form"] == pytest.approx(0.25)
-    assert run.metrics["set_closed_form_worse_percent"] == 50.0
-    assert run.metrics["set_refiner_worse_percent"] == 0.0
-    assert run.metrics["set_error_over_claimed"] == pytest.approx(2.125**0.5)
-    assert run.metrics["set_refiner_ratio_low"] == pytest.approx(
-        0.25
-    )  # the ratio is 0.25 in both windows, so in every draw
-    assert run.metrics["set_refiner_ratio_high"] == pytest.approx(0.25)
-    assert row[0] == "set"
+def one_window(error_px, confidence=None, variance_px2=None, truth_px=2.0):
+    """A window [1, H, W] whose estimate is too long by error_px in x, truth along x."""
+    truth = torch.zeros(1, 2, *error_px.shape)
+    truth[:, 0] = truth_px
+    flow = truth.clone()
+    flow[:, 0] += error_px
+    covariance = None
+    if variance_px2 is not None:
+        covariance = torch.stack([variance_px2, torch.zeros_like(variance_px2), variance_px2])[None]
+    valid = torch.ones(1, *error_px.shape, dtype=torch.bool)
+    field = FlowField(flow, valid, 1.0, None if confidence is None else confidence[None], covariance)
+    counts = torch.zeros(1, 2, 4, *error_px.shape)
+    return field, FlowWindows(evenly_timed(counts), FlowField(truth, valid, 1.0))
+
+
+def test_errors_claims_and_ranks_of_two_windows():
+    """Errors 0.5, 1, 1.5, 2 of a flow of 2 px; then 6 px everywhere: 5 / 4 and 6 / 2 of zero flow."""
+    error = torch.tensor([[0.5, 1.0], [1.5, 2.0]])
+    variance = error.square() / 2 / 4  # errors are twice what is claimed
+    rising = measure(*one_window(error, 1 - error / 10, variance))
+    even = measure(*one_window(torch.full((2, 2), 6.0), torch.full((2, 2), 0.5), torch.full((2, 2), 18.0)))
+    both = join([rising, even])
+    assert rising.ratio == pytest.approx(1.25 / 2)
+    assert both.ratio == pytest.approx((1.25 + 6) / 4)
+    assert both.worse_percent == 50.0
+    low, high = both.ratio_interval()
+    # draws of two windows from two: both the first, both the second, with a probability of 1/4 each
+    assert low == pytest.approx(1.25 / 2)
+    assert high == pytest.approx(3.0)
+    assert rising.error_over_claimed == pytest.approx(2.0)
+    assert both.error_over_claimed == pytest.approx(((4 + 1) / 2) ** 0.5)
+    # medians 2 and 1 over the windows, over that of a two-dimensional Gaussian's length
+    assert both.error_over_claimed_median == pytest.approx(1.5 / math.log(2) ** 0.5)
+    assert rising.rank_correlation == pytest.approx(1.0)
+    assert math.isnan(even.spearman[0])
+    assert both.rank_correlation == pytest.approx(1.0)  # the even window has none
+    assert rising.ause == pytest.approx(0.0, abs=1e-12)
+    assert rising.sharpness is None
+
+
+def test_without_claim_or_confidence():
+    plain = measure(*one_window(torch.tensor([[0.5, 1.0]])))
+    assert plain.error_over_claimed is None
+    assert plain.error_over_claimed_median is None
+    assert plain.rank_correlation is None
+
+
+def test_rank_correlation_of_five():
+    # d = 0, 2, 1, -1, -2: 1 - 6 * 10 / (5 * 24)
+    assert spearman(np.array([1.0, 4, 4.5, 3.5, 2]), np.array([10.0, 20, 40, 50, 60])) == pytest.approx(
+        1 - 6 * (0 + 4 + 4 + 1 + 9) / (5 * 24)
+    )
+
+
+def test_sparsification_by_hand():
+    """Ten pixels of error 1 to 10: taking out the largest half leaves a mean of 3, the smallest half 8; equal
+    doubt leaves the mean whatever the share."""
+    error = np.arange(1.0, 11)
+    half = int(np.argmin(abs(SHARES - 0.5)))
+    assert sparsified(error, error)[half] == pytest.approx(3.0)
+    assert sparsified(error, -error)[half] == pytest.approx(8.0)
+    np.testing.assert_allclose(sparsified(error, np.zeros(10)), 5.5)
+    assert sparsified(error, error)[0] == pytest.approx(5.5)
+
+
+def test_area_of_a_confidence_that_knows_nothing():
+    """For many errors even on 0..1 the oracle's curve is 1 - s, chance's is 1: the area to s = 0.95 is 0.95^2
+    / 2."""
+    error = torch.linspace(0, 1, 4000).reshape(40, 100)
+    chance = measure(*one_window(error, torch.full((40, 100), 0.5)))
+    assert chance.ause == pytest.approx(0.95**2 / 2, rel=2e-3)
+
+
+def test_warp_loss_of_bins_is_that_of_their_events():
+    """Events at the centroids of bins, so that a volume holds what the stream does."""
+    generator = torch.Generator().manual_seed(0)
+    bins = 4
+    volume = evenly_timed(torch.zeros(1, 2, bins, 12, 16))
+    total = float(volume.collected_s.sum())
+    pick = torch.randint(bins, (300,), generator=generator)
+    t_us = (volume.centroid_s[pick] / total * 1e6).round().long()
+    x, y = (torch.randint(size, (300,), generator=generator) for size in (16, 12))
+    p = torch.randint(2, (300,), generator=generator) * 2 - 1
+    stream = ordered(t_us, x, y, p, 12, 16)
+    volume.counts.index_put_(
+        (torch.zeros_like(x), (p < 0).long(), pick, y, x), torch.ones(300), accumulate=True
+    )
+    flow_px = torch.zeros(1, 2, 12, 16)
+    flow_px[:, 0] = 3.3
+    flow_px[:, 1] = -1.7
+    assert warp_loss(volume, flow_px, 0) == pytest.approx(metrics.fwl(stream, flow_px, 0, 10**6), rel=1e-6)
+    assert math.isnan(warp_loss(evenly_timed(torch.zeros(1, 2, bins, 12, 16)), flow_px, 0))
 
 
 @pytest.mark.skipif(not DELIVERED["refiner"].exists(), reason="no trained refiner in this checkout")
 def test_quick_form(tmp_path):
     """The delivered refiner beats zero flow on fine textures and in the worlds by far: a broken file or a
     wrong convention would not."""
-    assert main(flow_quality.study, flow_quality.Config, ["--quick", "--out", str(tmp_path)]) == 0
+    chosen = ["--sets", "fine_theta_0.1", "worlds", "layers_0.3"]
+    assert main(study, Config, ["--quick", *chosen, "--out", str(tmp_path)]) == 0
     found = json.loads((tmp_path / "metrics.json").read_text(encoding="utf-8"))
     assert found["fine_theta_0.1_refiner_ratio"] < 0.2
     assert found["worlds_refiner_ratio"] < 0.8
     assert found["worlds_windows"] == 5
+    # 0.3 of the scene, up to 15 % of noise on top
+    assert found["layers_0.3_events_per_px_median"] < 0.36
+    assert found["layers_0.3_closed_form_affine_sharpness"] > 1
     assert (tmp_path / "report.html").exists()
 
 
-def test_too_few_windows_are_refused(tmp_path, capsys):
-    assert main(flow_quality.study, flow_quality.Config, ["--windows", "1", "--out", str(tmp_path)]) == 2
-    assert "at least 2 are needed" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [(["--windows", "1"], "at least 2 are needed"), (["--sets", "roads"], "--sets roads is unknown")],
+)
+def test_unfit_options_are_refused(tmp_path, capsys, options, said):
+    assert main(study, Config, [*options, "--out", str(tmp_path)]) == 2
+    assert said in capsys.readouterr().err

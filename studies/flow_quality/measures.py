@@ -1,0 +1,165 @@
+"""What is measured of an estimator on a set of windows: errors, how honest and how telling its claims are, and
+how sharp it makes the events."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.stats import rankdata
+
+from codesign.flow.contrast import nearest_images, volume_tracks
+from codesign.flow.metrics import endpoint_error
+
+SHARES = np.linspace(0, 0.95, 20)  # of the pixels left out of a sparsification curve
+HONEST_MEDIAN = np.log(2) ** 0.5  # of error over claimed deviation, when errors are Gaussian as claimed
+DRAWS = 2000  # of the bootstrap
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Figures of N windows.
+
+    error_px, zero_px: [N] mean endpoint error over valid pixels of the estimate and of zero flow.
+    claim: [N] mean squared error over the trace of the claimed covariance; claim_median: [N] median of its
+      root; None where nothing is claimed. spearman: [N] rank correlation of 1 - confidence with the error
+      over the pixels of a window, NaN where the confidence is the same everywhere.
+    left, best: [N, len(SHARES)] mean error of the pixels left when a share of them is taken out, least
+      confident first, and largest error first. fwl, truth_fwl: [N] variance of the image of warped events
+      over the unwarped one's, by the estimate and by the true flow, NaN for windows without events.
+    """
+
+    error_px: np.ndarray
+    zero_px: np.ndarray
+    claim: np.ndarray | None
+    claim_median: np.ndarray | None
+    spearman: np.ndarray
+    left: np.ndarray
+    best: np.ndarray
+    fwl: np.ndarray
+    truth_fwl: np.ndarray
+
+    @property
+    def ratio(self) -> float:
+        """Error over that of zero flow."""
+        return float(self.error_px.mean() / self.zero_px.mean())
+
+    def ratio_interval(self, seed: int = 0) -> tuple[float, float]:
+        """95 % interval of the ratio, by bootstrap over windows."""
+        pick = np.random.default_rng(seed).integers(0, len(self.error_px), (DRAWS, len(self.error_px)))
+        ratios = self.error_px[pick].mean(1) / self.zero_px[pick].mean(1)
+        low, high = np.quantile(ratios, (0.025, 0.975))
+        return float(low), float(high)
+
+    @property
+    def worse_percent(self) -> float:
+        """Share of windows with a larger error than zero flow's."""
+        return float(100 * (self.error_px > self.zero_px).mean())
+
+    @property
+    def error_over_claimed(self) -> float | None:
+        """Root mean square of error over claimed deviation; 1 for an honest claim."""
+        return None if self.claim is None else float(self.claim.mean() ** 0.5)
+
+    @property
+    def error_over_claimed_median(self) -> float | None:
+        """Median over windows of the median over pixels, over what it is for Gaussian errors alike in all
+        directions; a few bad windows do not count."""
+        return None if self.claim_median is None else float(np.median(self.claim_median) / HONEST_MEDIAN)
+
+    @property
+    def rank_correlation(self) -> float | None:
+        """Mean of ``spearman`` over the windows that have one; None without any."""
+        known = self.spearman[np.isfinite(self.spearman)]
+        return float(known.mean()) if len(known) else None
+
+    @property
+    def curves(self) -> tuple[np.ndarray, np.ndarray]:
+        """Sparsification curves over SHARES, by confidence and by true error, relative to the error of all
+        pixels."""
+        whole = self.left[:, 0].mean()
+        return self.left.mean(0) / whole, self.best.mean(0) / whole
+
+    @property
+    def ause(self) -> float:
+        """Area between the two curves (Ilg et al., ECCV 2018); 0 for a confidence that ranks all errors
+        rightly."""
+        ours, best = self.curves
+        return float(np.trapezoid(ours - best, SHARES))
+
+    @property
+    def sharpness(self) -> float | None:
+        """Mean FWL over the windows with events; None without any."""
+        known = self.fwl[np.isfinite(self.fwl)]
+        return float(known.mean()) if len(known) else None
+
+
+def measure(field, windows) -> Measured:
+    """Measured of a FlowField on FlowWindows; windows without a valid pixel are left out."""
+    truth = windows.truth
+    valid = truth.valid
+    error = endpoint_error(field.flow_px, truth.flow_px).double()
+    zero = truth.flow_px.double().norm(dim=1)
+    confidence = field.confidence if field.confidence is not None else torch.ones_like(error)
+    claim = None
+    if field.covariance_px2 is not None:
+        claim = error.square() / (field.covariance_px2[:, 0] + field.covariance_px2[:, 2]).double()
+    rows = []
+    for k in torch.arange(len(valid))[valid.flatten(1).any(1)].tolist():
+        here = valid[k]
+        e = error[k][here].numpy()
+        doubt = -confidence[k][here].double().numpy()
+        c = np.full(1, np.nan) if claim is None else claim[k][here].numpy()
+        rows.append(
+            (
+                e.mean(),
+                float(zero[k][here].mean()),
+                c.mean(),
+                np.median(np.sqrt(c)),
+                spearman(doubt, e),
+                sparsified(e, doubt),
+                sparsified(e, e),
+                warp_loss(windows.volume, field.flow_px, k),
+                warp_loss(windows.volume, truth.flow_px, k),
+            )
+        )
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    if claim is None:
+        columns[2] = columns[3] = None
+    return Measured(*columns)
+
+
+def join(parts) -> Measured:
+    """One Measured of those of several batches."""
+    names = Measured.__dataclass_fields__
+    columns = ([getattr(part, name) for part in parts] for name in names)
+    return Measured(*(None if column[0] is None else np.concatenate(column) for column in columns))
+
+
+def spearman(doubt, error) -> float:
+    """Rank correlation (ties take their mean rank) of two lists; NaN where one is constant."""
+    if len(error) < 2 or np.ptp(doubt) == 0 or np.ptp(error) == 0:
+        return float("nan")
+    return float(np.corrcoef(rankdata(doubt), rankdata(error))[0, 1])
+
+
+def sparsified(error, doubt) -> np.ndarray:
+    """Mean error [len(SHARES)] of the pixels that are left when the most doubtful share is taken out; pixels
+    of equal doubt count with their mean error."""
+    order = np.argsort(doubt, kind="stable")
+    _, group, sizes = np.unique(doubt[order], return_inverse=True, return_counts=True)
+    mean = np.bincount(group, error[order]) / sizes
+    sums = np.cumsum(mean[group])
+    kept = np.maximum(np.rint((1 - SHARES) * len(error)).astype(int), 1)
+    return sums[kept - 1] / kept
+
+
+def warp_loss(volume, flow_px, k) -> float:
+    """FWL of sample k by the contents of its bins, each at its centroid (codesign.flow.metrics.fwl has it for
+    streams); NaN where the unwarped image is even."""
+    one = type(volume)(volume.counts[k : k + 1], volume.centroid_s, volume.collected_s)
+    tracks = volume_tracks(one, flow_px[k : k + 1])
+    still, moved = (
+        float(nearest_images(tracks, time)[0].double().sum(1).var(correction=0))
+        for time in (tracks.time, 1.0)
+    )
+    return moved / still if still > 0 else float("nan")
