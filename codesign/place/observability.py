@@ -43,13 +43,16 @@ def planar_flow(camera: ChiefRayCamera, depth_m: Tensor, T_body_cam: Tensor) -> 
     return flow[..., list(PLANAR)], seen
 
 
-def body_flow(camera: ChiefRayCamera, depth_m: Tensor, T_body_cam: Tensor) -> tuple[Tensor, Tensor]:
+def body_flow(
+    camera: ChiefRayCamera, depth_m: Tensor, T_body_cam: Tensor, pixels: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Flow that each unit of a body's twist makes in every pixel.
 
     Args:
       camera: has ``chief_rays`` and ``film`` (see render.Camera). depth_m: [..., P] true depth along the
         camera's z axis per pixel, film order.
       T_body_cam: [..., 4, 4]. Pixels without a surface carry a depth that is not finite or not positive.
+      pixels: [P, 2] px to look at, or [..., P, 2]; all of the film when None.
     Returns: flow [..., P, 2, 6] px/s per m/s forward, left, up of the body's origin and per rad/s about these
       axes; 0 where there is no surface. seen [..., P] bool.
     Gradient: depth, mount, and the lens behind the chief rays.
@@ -63,17 +66,19 @@ def body_flow(camera: ChiefRayCamera, depth_m: Tensor, T_body_cam: Tensor) -> tu
     >>> [round(v) for v in flow[0, 1].tolist()]  # down in the image: 160 px over 2 m for a metre up per second
     [-3, 0, 80, 7, -163, 0]
     """
-    pixels = camera.film.pixels()
-    if depth_m.shape[-1:] != pixels.shape[:1] or T_body_cam.shape[-2:] != (4, 4):
+    pixels = camera.film.pixels() if pixels is None else pixels
+    if depth_m.shape[-1:] != pixels.shape[-2:-1] or T_body_cam.shape[-2:] != (4, 4):
         raise ShapeError(
-            f"the flow of a body needs depths [..., {pixels.shape[0]}] (one per pixel) and a mount [..., 4, 4], "
+            f"the flow of a body needs depths [..., {pixels.shape[-2]}] (one per pixel) and a mount [..., 4, 4], "
             f"got {tuple(depth_m.shape)} and {tuple(T_body_cam.shape)}."
         )
     check_finite(T_body_cam, "T_body_cam")
     depth = depth_m.double()
     seen = depth.detach().isfinite() & (depth.detach() > 0)
     depth = torch.where(seen, depth, 1.0)[..., None]
-    base, slope, base_step, slope_step = chief_lines(camera, pixels)
+    base, slope, base_step, slope_step = (
+        part.unflatten(0, pixels.shape[:-1]) for part in chief_lines(camera, pixels.reshape(-1, 2))
+    )
     point = torch.cat([base + slope * depth, depth], -1)  # [..., P, 3]
     moving = _point_velocity(point, T_body_cam.double())  # [..., P, 3, 3]
     flow = flow_of_points(moving, slope, base_step + slope_step * depth[..., None])
@@ -175,7 +180,7 @@ def chief_lines(camera: ChiefRayCamera, pixels: Tensor) -> tuple[Tensor, Tensor,
 def flow_of_points(velocity: Tensor, slope: Tensor, step: Tensor) -> Tensor:
     """Image motion [..., P, 2, K] px per unit of K motions of the points under pixels.
 
-    Args: velocity: [..., P, 3, K] m of the points, in camera axes. slope: [P, 2] of the chief rays. step:
+    Args: velocity: [..., P, 3, K] m of the points, in camera axes. slope: [..., P, 2] of the chief rays. step:
       [..., P, 2, 2] m by which a pixel's ray moves sideways at the point, last axis: pixel x, y.
     """
     sideways = velocity[..., :2, :] - slope[..., None] * velocity[..., 2:, :]
@@ -186,9 +191,8 @@ def _point_velocity(point, T_body_cam):
     """Velocity in camera axes of static points [..., P, 3] per unit of the body's twist: [..., P, 3 (axis), 6]."""
     to_camera = T_body_cam[..., :3, :3].mT  # columns: the body's axes as the camera has them
     position = T_body_cam[..., :3, 3]
-    lever = torch.linalg.cross(
-        torch.eye(3).to(position), position[..., None, :]
-    ).mT  # of the camera, body axes
+    units = torch.eye(3).to(position).expand_as(to_camera)
+    lever = torch.linalg.cross(units, position[..., None, :]).mT  # of the camera, in body axes
     shift = torch.cat([to_camera, to_camera @ lever], -1)
     axes = to_camera.mT[..., None, :, :].expand(*point.shape[:-1], 3, 3)
     turning = torch.linalg.cross(axes, point[..., None, :]).mT

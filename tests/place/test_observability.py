@@ -88,6 +88,15 @@ def test_all_six_velocities_of_a_free_body(camera, placed, generator):
     torch.testing.assert_close(found[0], twist, rtol=0, atol=1e-7)
 
 
+def test_mounts_and_pixels_together_as_one_by_one(camera, generator):
+    mounts = torch.stack([mount_of(*placed) for placed in MOUNTS])
+    pixels = 16 * torch.rand(len(MOUNTS), 5, 2, generator=generator, dtype=D)
+    depth = 1 + torch.rand(len(MOUNTS), 5, generator=generator, dtype=D)
+    together, _ = place.body_flow(camera, depth, mounts, pixels)
+    alone = [place.body_flow(camera, *each)[0] for each in zip(depth, mounts, pixels, strict=True)]
+    torch.testing.assert_close(together, torch.stack(alone), rtol=1e-12, atol=1e-12)
+
+
 def test_weights_do_not_move_an_exact_answer(camera, generator):
     T_body_cam = mount_of(*MOUNTS[1])
     flow, depth = exact_flow(camera, T_body_cam, VELOCITIES[0])
