@@ -1,0 +1,143 @@
+"""The velocity of a body from event flow: weighted least squares on points of the flow, with the covariance that
+the flow's own estimator gives.
+
+What an estimator with a prior returns is drawn towards zero where it saw little: with precision S^-1 after it saw
+the events and S0^-1 before, the flow is (1 - S S0^-1) times what the events alone say. Taken as a measurement of
+precision S^-1 - S0^-1, about confidence x S^-1, each point counts by what the events said of it, and one that saw
+nothing counts nothing. Points of one window err alike: an affine field has three numbers per component, so a window
+counts as three points however many are read.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from codesign import place
+from codesign.errors import DomainError, check_whole
+from codesign.flow.checks import check_number
+from codesign.task.depth import ground_depth, scene_depth
+from codesign.types import ChiefRayCamera, FlowField
+
+INDEPENDENT = 3.0  # points that a window counts as
+UNSEEN_PX = 1e3  # standard deviation of flow where a field comes without covariance and nothing was seen
+PLAIN_PX = 0.3  # of flow where it comes without covariance
+DEPTHS = {"ground": ground_depth, "scene": scene_depth}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """velocity: [N, K] m/s and rad/s. covariance: [N, K, K] of it, as least squares expects. kept: [N, P] in 0..1,
+    by how much each point was believed."""
+
+    velocity: Tensor
+    covariance: Tensor
+    kept: Tensor
+
+
+class EgoVelocity:
+    """Stage ``estimate`` of a System: the velocity of the body over the interval.
+
+    Args:
+      axes: which of the six velocities the body has: ``place.PLANAR`` or ``place.FREE``.
+      prior: [K] standard deviations expected of them around zero, m/s and rad/s.
+      depth: "ground" (the plane z = 0 of the world under a body that knows its height and attitude), "scene" (a
+        perfect map), or a function (camera, pixels [N, P, 2], T_world_cam [N, 4, 4], scene) -> [N, P] m.
+      every_px: spacing of the points read. floor_px: standard deviation of flow errors that no covariance knows of.
+      outlier: errors of that many standard deviations count a quarter (Geman and McClure, 1987); None: all count.
+      steps: of reweighting, for outliers.
+    Gradient: flow, covariance, mount, poses, lens.
+
+    >>> from codesign import place, task
+    >>> drone = task.EgoVelocity(place.FREE, prior=(2.0, 2.0, 1.0, 1.0, 1.0, 1.0), depth="scene")
+    """
+
+    def __init__(
+        self,
+        axes: Sequence[int] = place.PLANAR,
+        prior: Sequence[float] = (1.0, 1.0, 1.0),
+        depth: str | Callable[..., Tensor] = "ground",
+        *,
+        every_px: int = 8,
+        floor_px: float = 0.05,
+        outlier: float | None = 3.0,
+        steps: int = 4,
+    ) -> None:
+        if isinstance(depth, str) and depth not in DEPTHS:
+            raise DomainError(f"depth is {depth!r}; choose one of {', '.join(DEPTHS)}, or give a function.")
+        if len(prior) != len(axes) or not all(value > 0 for value in prior):
+            raise DomainError(
+                f"prior is {tuple(prior)}; give one standard deviation > 0 for each of the {len(axes)} velocities."
+            )
+        self.axes = tuple(axes)
+        self.prior = tuple(float(value) for value in prior)
+        self.depth = DEPTHS[depth] if isinstance(depth, str) else depth
+        self.every_px = check_whole(every_px, "every_px")
+        self.floor_px = check_number(floor_px, "floor_px", above=0.0)
+        self.outlier = None if outlier is None else check_number(outlier, "outlier", above=0.0)
+        self.steps = check_whole(steps, "steps")
+
+    def __call__(
+        self, field: FlowField, camera: ChiefRayCamera, scene: Any, T_body_cam: Tensor, T_world_cam: Tensor
+    ) -> Motion:
+        """Motion of N bodies from fields [N x windows, 2, H, W] behind poses T_world_cam [..., T, 4, 4]."""
+        poses = T_world_cam.reshape(-1, *T_world_cam.shape[-3:])
+        count = len(poses)
+        pixels, flow, precision, seen = self._measured(field, camera, count)
+        middle = pixels + flow.detach() / 2  # where the points are at mid-interval
+        mounts = T_body_cam.double().expand(*T_world_cam.shape[:-3], 4, 4).reshape(-1, 4, 4)
+        depth = self.depth(camera, middle, poses[:, poses.shape[1] // 2], scene)
+        rows, on_surface = self._rows(camera, depth, mounts, middle, field.interval_s)
+        share = INDEPENDENT * _windows(camera) / flow.shape[1] * on_surface.to(flow)
+        prior = torch.diag(flow.new_tensor(self.prior) ** -2)
+        kept = torch.ones_like(share)
+        velocity, normal = _solved(rows, flow, share[..., None, None] * precision, seen, prior)
+        for _ in range(0 if self.outlier is None else self.steps):
+            miss = flow - seen * (rows @ velocity[:, None, :, None])[..., 0]
+            squared = (miss[..., None, :] @ precision @ miss[..., :, None])[..., 0, 0]
+            kept = (1 + squared / self.outlier**2) ** -2
+            velocity, normal = _solved(rows, flow, (kept * share)[..., None, None] * precision, seen, prior)
+        return Motion(velocity, torch.linalg.inv(normal), kept)
+
+    def _measured(self, field, camera, count):
+        """Points [N, P, 2] px, their flow [N, P, 2] px, its precision [N, P, 2, 2] and confidence [N, P, 1]."""
+        height, width = camera.film.shape[-2:]
+        first = min(self.every_px, height, width) // 2
+        at = (..., slice(first, None, self.every_px), slice(first, None, self.every_px))
+        pixels = camera.film.pixels().reshape(-1, height, width, 2).movedim(-1, 1)[at]
+
+        def per_body(values):  # [N x windows, C, h, w] -> [N, P, C]
+            return values.double().movedim(1, -1).reshape(count, -1, values.shape[1])
+
+        flow = per_body(field.flow_px[at])
+        if field.covariance_px2 is None:
+            deviation = torch.where(field.valid, PLAIN_PX, UNSEEN_PX)[:, None][at]
+            xx = yy = per_body(deviation)[..., 0] ** 2
+            xy = torch.zeros_like(xx)
+        else:
+            xx, xy, yy = per_body(field.covariance_px2[at]).unbind(-1)
+        confidence = field.valid.to(flow) if field.confidence is None else field.confidence
+        xx = xx + self.floor_px**2
+        yy = yy + self.floor_px**2
+        inverse = torch.stack([torch.stack([yy, -xy], -1), torch.stack([-xy, xx], -1)], -2)
+        precision = inverse / (xx * yy - xy * xy)[..., None, None]
+        points = per_body(pixels[None].expand(count, *pixels.shape).flatten(0, 1))
+        return points, flow, precision, per_body(confidence[:, None][at])
+
+    def _rows(self, camera, depth, mounts, pixels, interval_s):
+        rows, seen = place.body_flow(camera, depth, mounts, pixels)
+        return rows[..., list(self.axes)] * interval_s, seen
+
+
+def _windows(camera):
+    return camera.film.shape[0] if len(camera.film.shape) == 3 else 1
+
+
+def _solved(rows, flow, precision, seen, prior):
+    """Velocity [N, K] and normal matrix [N, K, K] of J^T (c P) J v = J^T P f, c the confidence."""
+    weighed = rows.mT @ precision  # [N, P, K, 2]
+    normal = (seen[..., None] * (weighed @ rows)).sum(1) + prior
+    right = (weighed @ flow[..., None]).sum(1)
+    return torch.linalg.solve(normal, right)[..., 0], normal
