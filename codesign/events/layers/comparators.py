@@ -24,7 +24,6 @@ from codesign.events.layers.memory import memory, soft_counts
 from codesign.events.layers.soft import soft
 from codesign.events.sensor.model import SensorModel
 from codesign.events.spiking.comparators import count_spikes
-from codesign.events.spiking.srm import GRADIENTS
 
 
 class Comparator(Protocol):
@@ -138,9 +137,9 @@ class Spikes:
     whole = True
 
     def __post_init__(self):
-        if self.gradient not in GRADIENTS:
+        if self.gradient not in ("surrogate", "play"):
             raise DomainError(
-                f"gradient is {self.gradient!r}; choose one of {', '.join(map(repr, GRADIENTS))}."
+                f"gradient is {self.gradient!r}; choose one of 'surrogate', 'play': the layer memorises a level."
             )
         if isinstance(self.steps, bool) or not isinstance(self.steps, int) or self.steps < 1:
             raise DomainError(

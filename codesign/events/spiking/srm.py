@@ -12,12 +12,13 @@ from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.events.spiking.srm_forward import Plan
 from codesign.events.spiking.srm_gradient import Setup, reset_sum, run
 from codesign.events.spiking.srm_kernels import RESETS, RESPONSES, STATES
+from codesign.events.spiking.srm_mean import check_mean, meant
 from codesign.events.spiking.srm_play import check_play, played
 from codesign.events.spiking.srm_state import SrmState, entering_state
 from codesign.events.spiking.srm_truncated import run_truncated
 from codesign.events.spiking.surrogate import Laplace, Surrogate
 
-GRADIENTS = ("surrogate", "play")
+GRADIENTS = ("surrogate", "play", "mean")
 THROUGH_RESET = ("off", "full", "bounded")
 NONFINITE = ("raise", "zero")
 
@@ -64,7 +65,9 @@ def srm(
         ``response="step"``, ``reset_scale=1`` and log-intensity steps as drive (ON +, OFF -) this is the
         memorised-reference event model.
       gradient: "surrogate", or for that event model "play": the gradient of the mean count over where inside
-        its threshold a pixel may have begun, as ``events.memory``, with one event per step.
+        its threshold a pixel may have begun, as ``events.memory``, with one event per step. For resets that fade
+        "mean": the exact gradient of a smooth mean response, of many neurons with noise at the threshold that
+        spiked last at a random time. It points better than a surrogate; docs/srm.md says how well.
       surrogate: Laplace, FastSigmoid or Triangular; None: Laplace of unit mass and width mean(theta), that is
         alpha = 2 theta, beta = 1 / theta.
       through_reset: gradient of a spike by way of the resets it causes: "off" (as SLAYER), "full", or
@@ -84,7 +87,8 @@ def srm(
     Gradient: drive, theta, tau_s, tau_r, state; spikes by the surrogate. theta and tau_r act through the
       reset amplitude with spikes held, also when
       through_reset is "off". With ``gradient="play"`` spikes carry a gradient to drive, theta and state.play, and
-      the potential none. Second derivatives raise.
+      the potential none. With ``gradient="mean"`` spikes carry one to drive, theta, tau_s, tau_r, state.response and
+      state.mean, and the potential none. Second derivatives raise.
     Raises: ShapeError for T = 0, no pixel, shapes that do not fit; DomainError for thresholds, time constants
       or dt that are not positive, unknown
       names, NaN or infinite drive; NonFiniteError when a finite drive overflows. Warns (RuntimeWarning) when
@@ -131,6 +135,25 @@ def srm(
             )
         spikes, play = played(spikes, *given)
         return spikes, potential, replace(after, play=play)
+    if gradient == "mean":
+        others = {
+            "surrogate": (surrogate, None),
+            "through_reset": (through_reset, "off"),
+            "smooth": (smooth, False),
+            "segment": (segment, None),
+            "truncation": (truncation, None),
+        }
+        check_mean(kernel, coupled, others, state)
+        return _with_mean(
+            drive if nonfinite == "raise" else drive.where(drive.isfinite(), 0),
+            theta,
+            None if tau_s is None else tau_s / dt,
+            tau_r / dt,
+            kernel,
+            state,
+            response,
+            reset_scale,
+        )
     if surrogate is None:
         surrogate = Laplace.unit(float(theta.detach().mean()))
     elif not isinstance(surrogate, Surrogate):
@@ -192,6 +215,21 @@ def srm(
         potential.view(drive.shape),
         SrmState(*(rows.reshape(rows.shape[0], *pixels) for rows in after)),
     )
+
+
+def _with_mean(drive, theta, tau_s, tau_r, kernel, state, response, reset_scale):
+    """The hard layer with the gradient of its mean response; time constants in steps."""
+    layer = {"tau_s": tau_s, "response": response}
+    with torch.no_grad():
+        spikes, potential, after = srm(
+            drive, theta=theta, tau_r=tau_r, kernel=kernel, reset_scale=reset_scale, state=state, **layer
+        )
+    before = None if state is None else SrmState(state.response, torch.zeros_like(after.reset[:1]))
+    _, driven, responded = srm(drive, theta=1.0, kernel="step", reset_scale=0.0, state=before, **layer)
+    spikes, mean = meant(
+        spikes, driven, theta, 1 / tau_r, kernel, reset_scale, None if state is None else state.mean
+    )
+    return spikes, potential, replace(after, response=responded.response, mean=mean)
 
 
 def per_pixel(value: Tensor | float | None, name: str, drive: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from codesign.errors import DomainError
 from codesign.events.entry import check_theta
 from codesign.events.layers.memory import memory
 from codesign.events.layers.pixel_loop import Loop
+from codesign.events.spiking.instead import instead
 from codesign.events.spiking.srm_state import PlayState, SrmState
 
 NEVER = 0xFFFFFFFF
@@ -43,7 +44,7 @@ def with_play(
     else:
         slow, centre = _Limited.apply(level, state.centre, theta_on, theta_off)
     counts, after = memory(slow, theta_on, theta_off, state=before, log_input=True)
-    return _Instead.apply(spikes.detach(), counts), PlayState(after, centre, level[-1])
+    return instead(spikes, counts), PlayState(after, centre, level[-1])
 
 
 def check_play(
@@ -80,18 +81,6 @@ def played(spikes: Tensor, drive: Tensor, theta: Tensor, state: SrmState | None)
     if state is None or state.play is None:
         return with_play(spikes, torch.cat((before[None], level)), theta_on, theta_off, None)
     return with_play(spikes, level, theta_on, theta_off, state.play)
-
-
-class _Instead(Function):
-    """The first tensor with the gradient of the second."""
-
-    @staticmethod
-    def forward(ctx, shown, meant):
-        return shown.view_as(shown)
-
-    @staticmethod
-    def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return None, grad
 
 
 class _Limited(Function):

@@ -31,16 +31,20 @@ class SrmState:
       1 drives with ``srm_truncated``).
     reset: [states, ...] of the reset kernel, likewise (1 or 2 states; the last taps - 1 spikes).
     play: PlayState with ``gradient="play"``, else None.
+    mean: [1 + states, ages, ...] with ``gradient="mean"``, in the type of the drive: shares of neurons by the age of
+      their last spike, and the mean states of their resets; else None.
     """
 
     response: Tensor
     reset: Tensor
     play: PlayState | None = None
+    mean: Tensor | None = None
 
     def detach(self) -> "SrmState":
         """The same state without its graph."""
         play = None if self.play is None else self.play.detach()
-        return SrmState(self.response.detach(), self.reset.detach(), play)
+        mean = None if self.mean is None else self.mean.detach()
+        return SrmState(self.response.detach(), self.reset.detach(), play, mean)
 
 
 def entering_state(state, counts, pixels, device, dtype=torch.float64):
