@@ -3,6 +3,7 @@ the log level, ON and OFF apart, with a reset that fades, by their mean response
 
 import itertools
 import warnings
+from typing import Any
 
 import torch
 
@@ -71,7 +72,7 @@ def truth(kernel, frames, t_s, **changed):
     drive = drives(frames)
     places = offsets(tuple(drive.shape[2:]), BEGINNINGS)
     generator = torch.Generator().manual_seed(0)
-    total = 0.0
+    total: Any = 0.0
     for place in places:
         if kernel == "step":
             spikes = coupled(drive, distance(place, THETA, THETA))
@@ -147,7 +148,7 @@ def by_parameter(case, kernel, rate_hz, t_s, name, wanted):
     down, up = (truth(kernel, frames, t_s, **{name: value * (1 + s * PARAMETER_STEP)}) for s in (-1, 1))
     difference = compare.blocks(up - down).double() / 2
     for gradient in wanted:
-        slope = 0
+        slope: Any = 0.0
         for k in range(PARAMETER_SECTIONS):
             place = (2 * k + 1) / PARAMETER_SECTIONS - 1
             number = torch.full(

@@ -209,7 +209,8 @@ class _Ages:
             given = [dr.detach(value) + 0 for value in given]
             dr.enable_grad(given)
             found = self.step(*given)
-            dr.backward_from(sum(value * dr.detach(seed) for value, seed in zip(found, seeds, strict=True)))
+            products = [value * dr.detach(seed) for value, seed in zip(found, seeds, strict=True)]
+            dr.backward_from(sum(products[1:], products[0]))
             return [dr.grad(value) for value in given]
 
     def bounds(self, span):
