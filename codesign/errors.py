@@ -45,7 +45,8 @@ def as_number(value: Any, name: str) -> float:
             raise TypeError
         return float(value)
     except (TypeError, ValueError, RuntimeError):
-        raise DomainError(f"{name} = {value!r} is no number; give one.") from None
+        shown = " ".join(repr(value).split())[:80]
+        raise DomainError(f"{name} = {shown} is no number; give one.") from None
 
 
 def check_whole(value: Any, name: str) -> int:

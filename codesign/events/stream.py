@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import Times, check_times
+from codesign.events.entry import Times, check_times, check_whole
 from codesign.types import EventStream
 
 
@@ -53,8 +53,13 @@ def check_stream(stream: EventStream, part: slice = slice(None)) -> EventStream:
             f"the events are a {type(stream).__name__}; an EventStream is needed, as events.read, "
             "events.simulate and codesign.events.stream.ordered give it."
         )
+    for side, name in ((stream.height_px, "height_px"), (stream.width_px, "width_px")):
+        check_whole(side, f"{name} of the stream", 0)
     columns = (stream.t_us, stream.x, stream.y, stream.p)
-    if not all(isinstance(values, Tensor) and values.dtype == torch.int64 for values in columns):
+    if not all(
+        isinstance(values, Tensor) and values.dtype == torch.int64 and not values.is_meta
+        for values in columns
+    ):
         given = [
             str(values.dtype) if isinstance(values, Tensor) else type(values).__name__ for values in columns
         ]

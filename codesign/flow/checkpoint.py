@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from codesign.atomic import replacing
 from codesign.errors import CodesignError, DomainError, FileFormatError
+from codesign.flow.checks import check_kind, check_path
 
 if TYPE_CHECKING:
     from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
@@ -89,7 +90,10 @@ def save(network: nn.Module, path: str | Path, metadata: Mapping[str, Any] | Non
     >>> read("again.safetensors").metadata
     {'note': 'as delivered'}
     """
-    weights = network.state_dict()
+    path = check_path(path, "the path of a network file")
+    if metadata is not None and not isinstance(metadata, Mapping):
+        raise DomainError(f"the metadata are a {type(metadata).__name__}; a dictionary is needed.")
+    weights = check_kind(network, nn.Module, "the network").state_dict()
     bad = [name for name, tensor in weights.items() if not bool(tensor.isfinite().all())]
     if bad:
         raise DomainError(
@@ -126,7 +130,7 @@ def load(name_or_path: str | Path) -> "Network":
     >>> network(evenly_timed(torch.zeros(1, 2, network.config["bins"], 64, 96))).flow_px.shape
     torch.Size([1, 2, 64, 96])
     """
-    path = Path(name_or_path)
+    path = check_path(name_or_path, "the name or path of a network")
     if str(name_or_path) in DELIVERED:
         path = DELIVERED[str(name_or_path)]
     elif path.suffix != ".safetensors":
@@ -210,7 +214,7 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
     Raises: FileFormatError when the file is missing, cut short, changed, or of another version.
     """
-    path = Path(path)
+    path = check_path(path, "the path of a network file")
     if not path.is_file():
         raise FileFormatError(
             f"'{path}' does not exist or is no file; give the path of a .safetensors file that a training "

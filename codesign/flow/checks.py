@@ -2,16 +2,28 @@
 sentence."""
 
 import math
-from typing import Any
+import os
+from pathlib import Path
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, as_number, check_finite
+from codesign.errors import DomainError, FileFormatError, ShapeError, as_number, check_finite
+from codesign.events.entry import check_whole
 from codesign.types import EventVolume, FlowField
 
+Kind = TypeVar("Kind")
+MOST_SIDE_PX = 2**15
+MOST_STEPS = 1000  # of an iteration
 COUNTS = (torch.float32, torch.float64)
+MOST_EVENTS = 1e9  # of a pixel and bin: squares of it are far from overflow
 NEGATIVE = -1e-3  # counts a hair below 0 are let through: steps of differences go there
+
+
+def shown(value: Any) -> str:
+    """A value in one line of a message."""
+    return " ".join(repr(value).split())[:80]
 
 
 def check_real(value: Any, name: str, dtypes: tuple[torch.dtype, ...] | None = None) -> Tensor:
@@ -22,6 +34,10 @@ def check_real(value: Any, name: str, dtypes: tuple[torch.dtype, ...] | None = N
     if not value.is_floating_point() or (dtypes is not None and value.dtype not in dtypes):
         wanted = "floating-point numbers" if dtypes is None else "float32 or float64"
         raise DomainError(f"{name} is {value.dtype}; {wanted} are needed: convert with .float().")
+    return _dense(value, name)
+
+
+def _dense(value, name):
     if value.layout != torch.strided or value.is_meta:
         given = "a meta tensor without values" if value.is_meta else f"stored as {value.layout}"
         raise DomainError(f"{name} is {given}; a dense tensor is needed (sparse ones: to_dense()).")
@@ -34,8 +50,8 @@ def check_mask(value: Any, name: str, shape: tuple[int, ...]) -> Tensor:
         given = value.dtype if isinstance(value, Tensor) else type(value).__name__
         raise DomainError(f"{name} is {given}; a bool tensor is needed, True where pixels count.")
     if tuple(value.shape) != tuple(shape):
-        raise ShapeError(f"{name} is {list(value.shape)}; {list(shape)} is needed, one entry per pixel.")
-    return value
+        raise ShapeError(f"{name} must be {tuple(shape)}, one entry per pixel, got {tuple(value.shape)}.")
+    return _dense(value, name)
 
 
 def check_volume(volume: EventVolume, bins: int | None = None, least_bins: int = 1) -> Tensor:
@@ -51,7 +67,8 @@ def check_volume(volume: EventVolume, bins: int | None = None, least_bins: int =
             "events.from_counts make it."
         )
     counts = check_real(volume.counts, "the counts of the event volume", COUNTS)
-    wanted = f"bins >= {least_bins}" if bins is None else str(bins)
+    wanted = f"bins >= {least_bins}" if least_bins > 1 else "bins"
+    wanted = wanted if bins is None else str(bins)
     fits = counts.ndim == 5 and counts.shape[1] == 2 and 0 not in counts.shape
     if not fits or counts.shape[2] < least_bins or bins not in (None, counts.shape[2]):
         advice = "" if bins is None else f"; make the volume with {bins} bins or build the network for others"
@@ -62,6 +79,10 @@ def check_volume(volume: EventVolume, bins: int | None = None, least_bins: int =
     low, high = (float(bound) for bound in counts.detach().aminmax())
     if not (math.isfinite(low) and math.isfinite(high)):
         check_finite(counts, "event volume")
+    if high > MOST_EVENTS:
+        raise DomainError(
+            f"the counts of the event volume reach {high:g}; at most {MOST_EVENTS:g} are possible."
+        )
     if low < NEGATIVE:
         raise DomainError(
             f"the counts of the event volume reach down to {low:g}; numbers of events are 0 or more, OFF "
@@ -77,6 +98,10 @@ def check_volume(volume: EventVolume, bins: int | None = None, least_bins: int =
             raise DomainError(
                 f"{name} of the event volume is {times.tolist()}; finite times > {least} are needed."
             )
+    if bool((volume.centroid_s.diff() <= 0).any()):
+        raise DomainError(
+            f"centroid_s of the event volume is {volume.centroid_s.tolist()}; rising times are needed."
+        )
     return counts
 
 
@@ -85,7 +110,7 @@ def check_flow(flow_px: Any, shape: tuple[int, ...] | None = None, name: str = "
     finite; DomainError, ShapeError otherwise."""
     check_real(flow_px, name)
     if shape is not None and tuple(flow_px.shape) != tuple(shape):
-        raise ShapeError(f"{name} is {list(flow_px.shape)}; {list(shape)} is needed.")
+        raise ShapeError(f"{name} must be {list(shape)}, got {list(flow_px.shape)}.")
     if flow_px.ndim != 4 or flow_px.shape[1] != 2 or 0 in flow_px.shape:
         raise ShapeError(f"{name} is {list(flow_px.shape)}; [B, 2, H, W] with at least one pixel is needed.")
     return check_finite(flow_px, name)
@@ -103,6 +128,38 @@ def check_field(field: FlowField, name: str) -> FlowField:
         )
     check_mask(field.valid, f"valid of {name}", (flow.shape[0], *flow.shape[2:]))
     return field
+
+
+def check_kind(value: Any, kind: type[Kind], name: str) -> Kind:
+    """``value`` unchanged when it is a ``kind``; DomainError otherwise."""
+    if not isinstance(value, kind):
+        raise DomainError(f"{name} is a {type(value).__name__}; a {kind.__name__} is needed.")
+    return value
+
+
+def check_path(path: Any, name: str = "the path") -> Path:
+    """``path`` as a Path; FileFormatError for anything but text or a Path."""
+    if not isinstance(path, (str, os.PathLike)) or "\0" in str(path):
+        raise FileFormatError(f"{name} is {shown(path)}; a path is needed.")
+    return Path(path)
+
+
+def check_size(size: Any, name: str) -> tuple[int, int]:
+    """``size`` as (height, width), two whole numbers from 1; ShapeError, DomainError otherwise."""
+    if not isinstance(size, (tuple, list)) or len(size) != 2:
+        raise ShapeError(f"{name} is {shown(size)}; (height, width) in pixels is needed.")
+    height, width = (check_whole(side, name) for side in size)
+    if not (1 <= height <= MOST_SIDE_PX and 1 <= width <= MOST_SIDE_PX):
+        raise ShapeError(f"{name} is {height} x {width}; 1 to {MOST_SIDE_PX} pixels a side are possible.")
+    return height, width
+
+
+def check_count(value: Any, name: str, least: int = 0, most: int = MOST_STEPS) -> int:
+    """A whole number from ``least`` to ``most`` as an int; DomainError otherwise."""
+    number = check_whole(value, name, least)
+    if number > most:
+        raise DomainError(f"{name} is {value!r}; a whole number from {least} to {most} is needed.")
+    return number
 
 
 def check_number(value: Any, name: str, least: float = -math.inf, above: float | None = None) -> float:

@@ -8,14 +8,28 @@ flow(x0), by fixed-point steps from x0 = x, bilinear between pixels. Each step l
 higher in the slope of the flow.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.errors import DomainError, ShapeError
+from codesign.events.entry import check_whole
+from codesign.events.stream import check_stream
+from codesign.flow.checks import (
+    MOST_SIDE_PX,
+    check_count,
+    check_flow,
+    check_kind,
+    check_number,
+    check_real,
+    check_volume,
+)
 from codesign.types import EventStream, EventVolume
+
+LATEST_US = 2**60
 
 
 @dataclass(frozen=True)
@@ -37,7 +51,8 @@ class EventTracks:
 
     def positions(self, at: float | Tensor) -> tuple[Tensor, Tensor]:
         """Places (x, y), [B, N] each, at the time ``at``."""
-        moved = (at - self.time) * self.flow_px
+        _check_tracks(self)
+        moved = (_time(at, self) - self.time) * self.flow_px
         return self.x_px + moved[:, 0], self.y_px + moved[:, 1]
 
 
@@ -53,9 +68,7 @@ def volume_tracks(volume: EventVolume, flow_px: Tensor, carry_steps: int = 0) ->
     Gradient: counts and flow_px.
     Raises: ShapeError; DomainError for a flow that is not finite.
     """
-    counts = volume.counts
-    if counts.ndim != 5 or counts.shape[1] != 2:
-        raise ShapeError(f"an event volume is [B, 2, bins, H, W], got {tuple(counts.shape)}.")
+    counts = check_volume(volume)
     batch, _, bins, height, width = counts.shape
     flow = _entered(flow_px, (batch, 2, height, width))
     time = volume_times(volume, flow)
@@ -87,10 +100,13 @@ def stream_tracks(
     Raises: ShapeError; DomainError for an empty interval, an interval without events, or a flow that is not
       finite.
     """
-    if int(t0_us) != t0_us or int(t1_us) != t1_us or t1_us <= t0_us:
-        raise DomainError(
-            f"the interval is {t0_us!r} to {t1_us!r} us; whole microseconds with t1 > t0 are needed."
-        )
+    check_stream(stream)
+    t0_us, t1_us = (
+        check_whole(end, f"{name} (whole microseconds)") for end, name in ((t0_us, "t0_us"), (t1_us, "t1_us"))
+    )
+    if not -LATEST_US < t0_us < t1_us < LATEST_US:
+        raise DomainError(f"the interval is {t0_us} to {t1_us} us; t1 > t0, both within 2^60 us, are needed.")
+    check_real(flow_px, "the flow of these events")
     flow = _entered(
         flow_px if flow_px.ndim == 4 else flow_px[None], (1, 2, stream.height_px, stream.width_px)
     )
@@ -122,18 +138,20 @@ def count_image(tracks: EventTracks, at: float | Tensor) -> Tensor:
     A share that falls on no pixel is lost: the image and ``leaving`` add up to all events. Gradient: counts
     and flow; piecewise smooth, with a kink where an event crosses the centre line of a pixel.
     """
-    return _shared(tracks, tracks.count, at)
+    return _shared(check_kind(tracks, EventTracks, "the tracks"), tracks.count, at)
 
 
 def time_image(tracks: EventTracks, at: float | Tensor) -> Tensor:
     """Mean time [B, 2, H, W] of the events that share in a pixel, 0 where there are none. Gradient: as in
     count_image, but without bound where a count goes to 0."""
+    _check_tracks(tracks)
     return _ratio(_shared(tracks, tracks.count * tracks.time, at), _shared(tracks, tracks.count, at))
 
 
 def nearest_images(tracks: EventTracks, at: float | Tensor) -> tuple[Tensor, Tensor]:
     """Counts and mean times, [B, 2, H, W] each, with every event on the pixel nearest to it (a tie goes right
     and down). Gradient: none in the flow."""
+    check_kind(tracks, EventTracks, "the tracks")
     column, row = (torch.floor(value.detach() + 0.5).long() for value in tracks.positions(at))
     counts, sums = (
         _gathered(tracks, column, row, [(0, 0, value)])
@@ -144,6 +162,7 @@ def nearest_images(tracks: EventTracks, at: float | Tensor) -> tuple[Tensor, Ten
 
 def leaving(tracks: EventTracks, at: float | Tensor) -> Tensor:
     """[B] number of events that are outside the image at the time ``at`` (shares of events in part)."""
+    _check_tracks(tracks)
     return tracks.count.sum((1, 2)) - count_image(tracks, at).sum((1, 2, 3))
 
 
@@ -155,10 +174,14 @@ def smooth_image(tracks: EventTracks, at: float | Tensor, weight: Tensor | None 
     shares have a variance between 0 and 1/4), and its gradient has no jumps. weight: [B, N] factor per event,
     or None. Gradient: counts, flow and weight; continuous.
     """
-    x, y = tracks.positions(at)
+    x, y = check_kind(tracks, EventTracks, "the tracks").positions(at)
     column, row = (value.detach().add(0.5).floor() for value in (x, y))
     share_x = _spline(x - column)
     share_y = _spline(y - row)
+    if weight is not None and check_real(weight, "the weight").shape != tracks.count[:, 0].shape:
+        raise ShapeError(
+            f"the weight is {list(weight.shape)}; one per event, {list(tracks.count[:, 0].shape)}, is needed."
+        )
     count = tracks.count if weight is None else tracks.count * weight[:, None]
     parts = ((i - 1, k - 1, count * (share_x[i] * share_y[k])[:, None]) for i in range(3) for k in range(3))
     return _gathered(tracks, column.long(), row.long(), parts)
@@ -166,6 +189,10 @@ def smooth_image(tracks: EventTracks, at: float | Tensor, weight: Tensor | None 
 
 def still_image(counts: Tensor) -> Tensor:
     """What smooth_image gives at zero flow, for counts [B, 2, bins, H, W], much faster."""
+    if check_real(counts, "the counts").ndim != 5 or counts.shape[1] != 2 or 0 in counts.shape:
+        raise ShapeError(
+            f"the counts are {list(counts.shape)}; [B, 2, bins, H, W], no axis empty, is needed."
+        )
     image = counts.sum(2)
     for axis in (2, 3):
         nothing = torch.zeros_like(image.narrow(axis, 0, 1))
@@ -185,13 +212,19 @@ def warp_jacobian(
     Returns: dx'/dx, dx'/dy, dy'/dx, dy'/dy, [B, bins, H, W] each. Gradient: flow. Raises: ShapeError for
       images less than 2 pixels high or wide.
     """
-    shape = (bins, tracks.height_px, tracks.width_px)
+    _check_tracks(tracks)
+    shape = (check_whole(bins, "bins", 1), tracks.height_px, tracks.width_px)
+    if math.prod(shape) != tracks.flow_px.shape[2]:
+        raise ShapeError(
+            f"the tracks are {tracks.flow_px.shape[2]}, not the {' x '.join(map(str, shape))} of a volume with {bins} "
+            "bins; make them with volume_tracks."
+        )
     if min(shape[1:]) < 2:
         raise ShapeError(
             f"an image of {shape[1]} x {shape[2]} pixels has no slope of the flow; at least 2 x 2 are needed."
         )
     by_y, by_x = torch.gradient(tracks.flow_px.unflatten(2, shape), dim=(3, 4))
-    span = at - tracks.time.reshape(1, *shape)
+    span = _time(at, tracks) - tracks.time.reshape(1, *shape)
     return 1 + span * by_x[:, 0], span * by_y[:, 0], span * by_x[:, 1], 1 + span * by_y[:, 1]
 
 
@@ -201,7 +234,15 @@ def area_change(jacobian: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
     Source: Shiba, Aoki, Gallego, Event collapse in contrast maximization frameworks, Sensors 2022, sec.
       3.4.2.
     """
-    xx, xy, yx, yy = jacobian
+    if not isinstance(jacobian, (tuple, list)) or len(jacobian) != 4:
+        raise ShapeError(
+            "a Jacobian is four tensors dx'/dx, dx'/dy, dy'/dx, dy'/dy, as warp_jacobian gives them."
+        )
+    xx, xy, yx, yy = (check_real(part, "a part of the Jacobian") for part in jacobian)
+    if not xx.shape == xy.shape == yx.shape == yy.shape:
+        raise ShapeError(
+            f"the Jacobian has parts {[list(part.shape) for part in jacobian]}; four alike are needed."
+        )
     return xx * yy - xy * yx
 
 
@@ -213,6 +254,10 @@ def sharpness(image: Tensor) -> Tensor:
     Gradient: image.
     Source: Gallego et al., Focus is all you need, CVPR 2019.
     """
+    if check_real(image, "the image").ndim != 4 or image.shape[1] != 2 or min(image.shape[2:]) < 2:
+        raise ShapeError(
+            f"the image is {list(image.shape)}; [B, 2, H, W] of at least 2 x 2 pixels is needed."
+        )
     return image.diff(dim=2).square().mean((2, 3)).sum(1) + image.diff(dim=3).square().mean((2, 3)).sum(1)
 
 
@@ -222,17 +267,50 @@ def _spline(offset):
     return (0.5 - offset).square() / 2, 0.75 - offset.square(), (0.5 + offset).square() / 2
 
 
+def _time(at, tracks):
+    """A time that tracks are moved to: a number, or a tensor that fits them."""
+    if not isinstance(at, Tensor):
+        return check_number(at, "the time the events are moved to")
+    if check_real(at, "the time the events are moved to").numel() not in (1, tracks.time.numel()):
+        raise ShapeError(f"the time is {list(at.shape)}; one for all events, or one for each, is needed.")
+    return at
+
+
+def _check_tracks(tracks):
+    """Raise unless the parts of tracks fit each other."""
+    check_kind(tracks, EventTracks, "the tracks")
+    for side in (tracks.height_px, tracks.width_px):
+        check_count(
+            check_kind(side, int, "height_px, width_px of the tracks"),
+            "a side of the tracks",
+            1,
+            MOST_SIDE_PX,
+        )
+    for name in ("x_px", "y_px", "time", "count", "flow_px"):
+        check_real(getattr(tracks, name), f"{name} of the tracks")
+    flow = tracks.flow_px
+    if (
+        flow.ndim != 3
+        or flow.shape[1] != 2
+        or tracks.count.shape != flow.shape
+        or any(part.shape != flow.shape[2:] for part in (tracks.x_px, tracks.y_px, tracks.time))
+    ):
+        raise ShapeError(
+            f"the tracks have flow {list(flow.shape)}, count {list(tracks.count.shape)}, x, y and time "
+            f"{[list(part.shape) for part in (tracks.x_px, tracks.y_px, tracks.time)]}; [B, 2, N] twice and [N] "
+            "are needed."
+        )
+
+
 def _entered(flow_px, shape):
-    if tuple(flow_px.shape) != shape:
-        raise ShapeError(f"the flow of these events must be {list(shape)}, got {list(flow_px.shape)}.")
-    check_finite(flow_px, "flow")
-    return flow_px.to(
+    return check_flow(flow_px, shape, "the flow of these events").to(
         torch.promote_types(flow_px.dtype, torch.float32)
     )  # places in half precision would be half a pixel off
 
 
 def _carried(flow, own, x, y, time, steps):
     """Flow [B, 2, N] of the tracks that pass (x, y) at a time."""
+    steps = check_count(steps, "carry_steps")
     height, width = flow.shape[2:]
     size = torch.tensor([max(width - 1, 1), max(height - 1, 1)], dtype=flow.dtype, device=flow.device)
     found = own

@@ -10,26 +10,37 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from codesign.errors import DomainError
-from codesign.flow.checks import check_flow, check_volume
+from codesign.flow.checks import check_flow, check_volume, shown
 from codesign.types import EventVolume, FlowField
 
 Given = ParamSpec("Given")
 Found = TypeVar("Found")
+WIDEST = 4096  # channels of a first layer
+MOST_BINS = 1024
 FEW = 10.0  # events of a sample at which half of the flow is believed
 
 
 def check_bins(bins: int, even: bool = False) -> None:
     """Raise DomainError unless a network can be built for this many bins."""
-    if isinstance(bins, bool) or not isinstance(bins, int) or bins < 2 or (even and bins % 2):
-        raise DomainError(f"bins is {bins!r}; {'an even' if even else 'a'} whole number >= 2 is needed.")
+    if (
+        isinstance(bins, bool)
+        or not isinstance(bins, int)
+        or not 2 <= bins <= MOST_BINS
+        or (even and bins % 2)
+    ):
+        raise DomainError(
+            f"bins is {shown(bins)}; {'an even' if even else 'a'} whole number >= 2, at most {MOST_BINS}, is needed."
+        )
 
 
 def check_sizes(width: float, hidden: int | None) -> None:
     """Raise DomainError unless layers can have these widths."""
-    if not width > 0:
-        raise DomainError(f"width is {width!r}; a number > 0 is needed.")
-    if hidden is not None and (not isinstance(hidden, int) or hidden < 4 or hidden % 4):
-        raise DomainError(f"hidden is {hidden!r}; a multiple of 4, or None for 8 times the width, is needed.")
+    if isinstance(width, bool) or not isinstance(width, (int, float)) or not 0 < width <= WIDEST:
+        raise DomainError(f"width is {shown(width)}; a number > 0 of channels, at most {WIDEST}, is needed.")
+    if hidden is not None and (not isinstance(hidden, int) or not 4 <= hidden <= 8 * WIDEST or hidden % 4):
+        raise DomainError(
+            f"hidden is {shown(hidden)}; a multiple of 4, or None for 8 times the width, is needed."
+        )
 
 
 def takes_volume(

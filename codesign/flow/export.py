@@ -6,14 +6,15 @@ import io
 import logging
 import warnings
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from codesign.atomic import replacing
-from codesign.errors import DomainError
+from codesign.errors import DomainError, ShapeError
+from codesign.flow.checks import MOST_SIDE_PX, check_count, check_kind, check_number, check_path, check_real
 from codesign.optional import require
 from codesign.types import EventVolume
 
@@ -21,6 +22,9 @@ from codesign.types import EventVolume
 def evenly_timed(counts: Tensor, interval_s: float = 1.0) -> EventVolume:
     """EventVolume of counts [B, 2, bins, H, W] whose bins are those of codesign.events.from_stream: equally
     spaced nodes, the two at the ends collecting half."""
+    interval_s = check_number(interval_s, "interval_s", above=0.0)
+    if check_real(counts, "the counts").ndim != 5 or counts.shape[1] != 2 or counts.shape[2] < 2:
+        raise ShapeError(f"the counts are {list(counts.shape)}; [B, 2, bins >= 2, H, W] is needed.")
     bins = counts.shape[2]
     step = interval_s / (bins - 1)
     centroid_s = torch.arange(bins, dtype=torch.float64) * step
@@ -50,7 +54,7 @@ def export(network: nn.Module, path: str | Path, height_px: int, width_px: int, 
     >>> flow_px.shape
     torch.Size([1, 2, 32, 32])
     """
-    path = Path(path)
+    path = check_path(path, "the path of a program")
     if path.suffix not in (".pt2", ".onnx"):
         raise DomainError(
             f"'{path.name}' is no program file; give a name that ends in .pt2 (torch.export) or .onnx."
@@ -80,7 +84,15 @@ def trace(network: nn.Module, height_px: int, width_px: int, batch: int = 1) -> 
         field = network(evenly_timed(counts))
         return field.flow_px, field.valid.to(field.flow_px) if field.confidence is None else field.confidence
 
-    config: dict[str, Any] = cast(Any, network).config
+    height_px, width_px, batch = (
+        check_count(value, name, 1, MOST_SIDE_PX)
+        for value, name in ((height_px, "height_px"), (width_px, "width_px"), (batch, "batch"))
+    )
+    config: dict[str, Any] = getattr(check_kind(network, nn.Module, "the network"), "config", {})
+    if "bins" not in config:
+        raise DomainError(
+            f"a {type(network).__name__} has no config['bins'], so it is no flow network of this package."
+        )
     was_training = network.training
     network.eval()
     counts = torch.zeros(batch, 2, config["bins"], height_px, width_px)

@@ -17,6 +17,7 @@ import torch
 
 from codesign.atomic import replacing
 from codesign.errors import DomainError, FileFormatError, ShapeError
+from codesign.flow.checks import check_mask, check_path, check_real
 
 SCALE = 128.0
 OFFSET = 2**15
@@ -41,16 +42,17 @@ def write_flow(path: str | Path, flow_px: torch.Tensor, valid: torch.Tensor | No
     >>> flow_px.shape, float(flow_px.max()), bool(valid.all())
     (torch.Size([2, 4, 6]), 1.5, True)
     """
-    path = Path(path)
+    path = check_path(path, "the path of a flow file")
     encode = _choose({".png": _to_png, ".flo": _to_flo}, path, "written")
-    flow = torch.as_tensor(flow_px).detach().cpu().double().numpy()
+    if isinstance(flow_px, np.ndarray) and flow_px.dtype.kind in "fiu":
+        flow_px = torch.from_numpy(np.array(flow_px, np.float64))
+    flow = check_real(flow_px, "the flow to write").detach().cpu().double().numpy()
     if flow.ndim != 3 or flow.shape[0] != 2 or 0 in flow.shape:
         raise ShapeError(f"a flow to write must be [2, H, W], got {list(flow.shape)}.")
-    seen = np.ones(flow.shape[1:], bool) if valid is None else torch.as_tensor(valid).detach().cpu().numpy()
-    if seen.shape != flow.shape[1:] or seen.dtype != np.bool_:
-        raise ShapeError(
-            f"the valid mask must be bool {list(flow.shape[1:])}, got {seen.dtype} {list(seen.shape)}."
-        )
+    if isinstance(valid, np.ndarray) and valid.dtype == np.bool_:
+        valid = torch.from_numpy(valid.copy())
+    everything = torch.ones(flow.shape[1:], dtype=torch.bool)
+    seen = check_mask(everything if valid is None else valid, "the valid mask", flow.shape[1:]).cpu().numpy()
     if not np.isfinite(flow[:, seen]).all():
         raise DomainError("a flow marked as valid is NaN or infinite; mark it as not valid.")
     content = encode(flow, seen)
@@ -69,7 +71,7 @@ def read_flow(path: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
     >>> int(valid.sum())
     4
     """
-    path = Path(path)
+    path = check_path(path, "the path of a flow file")
     decode = _choose({".png": _from_png, ".flo": _from_flo}, path, "read")
     try:
         if path.stat().st_size > MOST_BYTES:

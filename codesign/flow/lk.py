@@ -14,7 +14,7 @@ import torch
 
 from codesign.errors import DomainError, ShapeError
 from codesign.flow import lk_field, lk_level
-from codesign.flow.checks import check_number, check_volume
+from codesign.flow.checks import check_count, check_number, check_volume, shown
 from codesign.types import EventVolume, FlowField
 
 
@@ -56,9 +56,17 @@ def estimate_lk(
     [2.0, 1.0]
     """
     counts = check_volume(volume, least_bins=2)
-    if model not in lk_field.TERMS:
+    if not isinstance(model, str) or model not in lk_field.TERMS:
         raise DomainError(f"flow model '{model}' is unknown; choose one of {', '.join(lk_field.TERMS)}.")
     check_number(prior_px, "prior_px", above=0.0)
+    check_number(noise_floor, "noise_floor", 0.0)
+    steps = check_count(steps, "steps", 1)
+    if not isinstance(levels_px, Sequence) or not levels_px or isinstance(levels_px, str):
+        raise DomainError(
+            f"levels_px is {shown(levels_px)}; a list of blurs in pixels, coarse to fine, is needed."
+        )
+    for blur_px in levels_px:
+        check_number(blur_px, "a blur of levels_px", above=0.0)
     batch, _, _, height, width = counts.shape
     if min(height, width) < 2:
         raise ShapeError(

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from codesign.errors import DomainError, ShapeError
+from codesign.flow.checks import check_field, check_kind, check_number, check_real, shown
 from codesign.flow.contrast import (
     area_change,
     sharpness,
@@ -38,6 +39,9 @@ _MOST = 2.5
 def charbonnier(squared: Tensor, epsilon: float, exponent: float = 0.5) -> Tensor:
     """(s + epsilon^2)^exponent - epsilon^(2 exponent) of squared lengths s: 0 at 0 to rounding, smooth,
     s^exponent far away. Source: Charbonnier et al., ICIP 1994; Sun et al., IJCV 2014."""
+    check_real(squared, "the squared lengths")
+    epsilon = check_number(epsilon, "epsilon", above=0.0)
+    exponent = check_number(exponent, "exponent", above=0.0)
     return (squared + epsilon**2) ** exponent - epsilon ** (2 * exponent)
 
 
@@ -70,7 +74,7 @@ def supervised_loss(
     >>> round(float(supervised_loss([still, still], right)), 2), float(supervised_loss([right], right))
     (4.23, 0.0)
     """
-    unit = _per_pixel(unit_per_px, truth.flow_px)
+    unit = _per_pixel(unit_per_px, check_field(truth, "the truth").flow_px)
     return _over_predictions(
         predictions,
         truth,
@@ -102,6 +106,9 @@ def likelihood_loss(
     Source: Nix and Weigend, ICNN 1994, in two dimensions.
     """
 
+    check_number(floor_px, "floor_px", above=0.0)
+    check_number(prior_px, "prior_px", above=0.0)
+
     def nll(field, error):
         xx, xy, yy = _covariance(field, prior_px)
         spare = floor_px**2
@@ -118,6 +125,7 @@ def likelihood_loss(
 def relative_unit(truth: FlowField, floor_px: float = 1.0) -> Tensor:
     """[B] 1 / sqrt(mean squared length of the valid true flow + floor_px^2): turns an error in px into a
     share of the sample's motion. Gradient: none."""
+    check_number(floor_px, "floor_px", 0.0)
     squared = _known(truth).detach().square().sum(1).flatten(1).sum(1) / truth.valid.flatten(1).sum(
         1
     ).clamp_min(1)
@@ -127,6 +135,7 @@ def relative_unit(truth: FlowField, floor_px: float = 1.0) -> Tensor:
 def require_valid(truth: FlowField) -> FlowField:
     """Raise DomainError when a sample of the truth has no valid pixel; return the truth unchanged
     otherwise."""
+    check_field(truth, "the truth")
     empty = (~truth.valid.flatten(1).any(1)).nonzero().flatten().tolist()
     if empty:
         raise DomainError(
@@ -163,6 +172,7 @@ def contrast_loss(
       et al., Sensors 2022, sec. 3.4.2, here as a weight.
     """
     tracks = volume_tracks(volume, flow_px, carry_steps)
+    _check_references(references)
     still = sharpness(still_image(volume.counts)) + _FAINT
     total = torch.zeros_like(still)
     for at, share in references:
@@ -183,6 +193,7 @@ def plain_contrast_loss(
     To compare with, and for flows that cannot contract. Arguments, gradient and source as in contrast_loss.
     """
     tracks = volume_tracks(volume, flow_px, carry_steps)
+    _check_references(references)
     moved = torch.stack([share * sharpness(smooth_image(tracks, at)) for at, share in references]).sum(0)
     return ((sharpness(still_image(volume.counts)) + _FAINT) / (moved + _FAINT)).mean()
 
@@ -202,6 +213,8 @@ def collapse_penalty(
       threshold, to be smooth).
     """
     tracks = volume_tracks(volume, flow_px)
+    check_number(least, "least")
+    _check_references(references)
     events = volume.counts.sum(1)
     total = sum(
         share
@@ -229,6 +242,8 @@ def photometric_loss(
       Spike-FlowNet, ECCV 2020.
     """
     flow_px = _full(flow_px)
+    if frames is not None:
+        check_real(frames, "the frames")
     if frames is None or frames.shape != flow_px.shape:
         raise ShapeError(
             f"frames must be {list(flow_px.shape)}, start and end, for this flow; got "
@@ -266,9 +281,14 @@ def smoothness_loss(
     Source: Zhu et al., EV-FlowNet, RSS 2018; edge weights: Heise et al., ICCV 2013.
     """
     flow_px = _full(flow_px)
-    if frame is not None and frame.shape != flow_px[:, 0].shape:
+    check_number(edge, "edge", above=0.0)
+    if frame is not None and check_real(frame, "the frame").shape != flow_px[:, 0].shape:
         raise ShapeError(
             f"the frame must be {list(flow_px[:, 0].shape)} for this flow, got {list(frame.shape)}."
+        )
+    if min(flow_px.shape[2:]) < 2:
+        raise ShapeError(
+            f"a flow of {list(flow_px.shape[2:])} pixels has no neighbours both ways; give at least 2 x 2."
         )
     total = flow_px.new_zeros(())
     for axis in (2, 3):
@@ -279,13 +299,27 @@ def smoothness_loss(
     return total
 
 
+def _check_references(references):
+    """Raise unless references are (time, weight) pairs."""
+    pairs = isinstance(references, Sequence) and not isinstance(references, str) and len(references) > 0
+    if not pairs or not all(isinstance(pair, Sequence) and len(pair) == 2 for pair in references):
+        raise ShapeError(f"references are {shown(references)}; a list of (time, weight) pairs is needed.")
+    for at, share in references:
+        check_number(at, "the time of a reference")
+        check_number(share, "the weight of a reference", 0.0)
+    if abs(sum(share for _, share in references) - 1) > 1e-6:
+        raise DomainError(f"the weights of the references {shown(references)} do not sum to 1; scale them.")
+
+
 def _over_predictions(predictions, truth, gamma, per_pixel):
-    if not predictions:
+    check_number(gamma, "gamma", above=0.0)
+    if not isinstance(predictions, Sequence) or not predictions:
         raise ShapeError("no prediction was given; a list of at least one FlowField is needed.")
     target = _known(truth)
     weights = 0.0
     total = target.new_zeros(())
     for field in predictions:
+        check_real(check_kind(field, FlowField, "a prediction").flow_px, "the flow of a prediction")
         if field.flow_px.shape != target.shape:
             raise ShapeError(
                 f"predictions must be {list(target.shape)} like the truth, at full resolution; got "
@@ -298,15 +332,7 @@ def _over_predictions(predictions, truth, gamma, per_pixel):
 
 def _known(truth):
     """True flow, 0 where it is unknown: what is not valid may be NaN and must not reach the gradient."""
-    if (
-        truth.flow_px.ndim != 4
-        or truth.flow_px.shape[1] != 2
-        or truth.valid.shape != truth.flow_px[:, 0].shape
-    ):
-        raise ShapeError(
-            f"the truth must be [B, 2, H, W] with valid [B, H, W]; got {list(truth.flow_px.shape)} and "
-            f"{list(truth.valid.shape)}."
-        )
+    check_field(truth, "the truth")
     return torch.where(truth.valid[:, None], truth.flow_px, 0.0)
 
 
@@ -315,7 +341,9 @@ def _valid_mean(values, valid):
 
 
 def _per_pixel(unit, flow):
-    unit = torch.as_tensor(unit, dtype=flow.dtype, device=flow.device)
+    if not isinstance(unit, torch.Tensor):
+        unit = torch.tensor(check_number(unit, "unit_per_px", 0.0))
+    unit = check_real(unit, "unit_per_px").to(flow)
     if unit.ndim == 1:
         unit = unit[:, None, None]
     try:
@@ -333,6 +361,14 @@ def _covariance(field, prior_px):
         raise DomainError(
             "a prediction has neither covariance_px2 nor confidence, so it has no likelihood; use "
             "supervised_loss, or an estimator that gives one."
+        )
+    batch, _, height, width = field.flow_px.shape
+    name, wanted = ("covariance_px2", (batch, 3, height, width))
+    if field.covariance_px2 is None:
+        name, wanted = ("confidence", (batch, height, width))
+    if check_real(getattr(field, name), f"{name} of a prediction").shape != wanted:
+        raise ShapeError(
+            f"{name} of a prediction must be {list(wanted)}, got {list(getattr(field, name).shape)}."
         )
     if field.covariance_px2 is None:
         if not bool(((field.confidence >= 0) & (field.confidence <= 1)).all()):
@@ -368,6 +404,7 @@ def _rise(value):
 
 def _full(flow_px):
     """The flow in at least single precision: places and squares in half precision would be far off."""
-    if flow_px.ndim != 4 or flow_px.shape[1] != 2:
+    check_real(flow_px, "the flow")
+    if flow_px.ndim != 4 or flow_px.shape[1] != 2 or 0 in flow_px.shape:
         raise ShapeError(f"the flow must be [B, 2, H, W], got {list(flow_px.shape)}.")
     return flow_px.to(torch.promote_types(flow_px.dtype, torch.float32))

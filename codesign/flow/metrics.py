@@ -9,30 +9,40 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
+from codesign.flow.checks import (
+    check_field,
+    check_mask,
+    check_number,
+    check_real,
+    check_size,
+    check_volume,
+    shown,
+)
 from codesign.flow.contrast import nearest_images, stream_tracks
 from codesign.types import EventStream, EventVolume, FlowField
 
 
 def endpoint_error(flow: Tensor, truth: Tensor) -> Tensor:
     """Length of the difference of two flows [..., 2, H, W] -> [..., H, W] px."""
-    _check(flow, truth)
+    flow, truth = _check(flow, truth)
     return torch.linalg.vector_norm(flow - truth, dim=-3)  # its gradient at zero error is 0, not NaN
 
 
 def _check(flow, truth):
-    if flow.shape != truth.shape or flow.ndim < 3 or flow.shape[-3] != 2:
+    for value, name in ((flow, "the flow"), (truth, "the truth")):
+        check_real(value, name)
+    if flow.shape != truth.shape or flow.ndim < 3 or flow.shape[-3] != 2 or not flow.numel():
         raise ShapeError(
             f"flows must both be [..., 2, H, W]; got {tuple(flow.shape)} and {tuple(truth.shape)}."
         )
+    wider = torch.promote_types(flow.dtype, truth.dtype)
+    return flow.to(wider), truth.to(wider)
 
 
 def _masked(values, mask):
     """The values under the mask, flat; a non-finite one would count as no outlier, so it is refused."""
     if mask is not None:
-        if mask.shape != values.shape:
-            raise ShapeError(
-                f"the mask must be {tuple(values.shape)}, one entry per pixel, got {tuple(mask.shape)}."
-            )
+        check_mask(mask, "the mask", values.shape)
         if not bool(mask.any()):
             raise DomainError(
                 "the mask selects no pixel, so the error is undefined; check the valid and event masks."
@@ -60,7 +70,7 @@ def aee(flow: Tensor, truth: Tensor, mask: Tensor | None = None) -> Tensor:
 def zero_flow_error(truth: Tensor, mask: Tensor | None = None) -> Tensor:
     """Average endpoint error of the estimate "nothing moves", px: the mean true length, which every error
     should be compared with."""
-    return aee(torch.zeros_like(truth), truth, mask)
+    return aee(torch.zeros_like(check_real(truth, "the truth")), truth, mask)
 
 
 def outlier_percent(
@@ -74,6 +84,8 @@ def outlier_percent(
     25.0
     """
     error = endpoint_error(flow, truth)
+    check_number(pixels, "pixels", 0.0)
+    check_number(share, "share", 0.0)
     length = truth.square().sum(-3).sqrt()
     error = _masked(error, mask)
     length = _masked(length, mask)
@@ -89,6 +101,7 @@ def npe(flow: Tensor, truth: Tensor, pixels: float, mask: Tensor | None = None) 
     50.0
     """
     error = _masked(endpoint_error(flow, truth), mask)
+    check_number(pixels, "pixels", 0.0)
     return 100 * (error > pixels).to(error.dtype).mean()
 
 
@@ -100,7 +113,7 @@ def angular_error_deg(flow: Tensor, truth: Tensor, mask: Tensor | None = None) -
     >>> round(float(angular_error_deg(flow, torch.zeros(2, 8, 8))), 3)
     45.0
     """
-    _check(flow, truth)
+    flow, truth = _check(flow, truth)
     one = torch.ones_like(flow[..., :1, :, :])
     return _masked(
         torch.rad2deg(_angle(torch.cat([flow, one], -3), torch.cat([truth, one], -3))), mask
@@ -119,7 +132,7 @@ def ray_error_mrad(flow: Tensor, truth: Tensor, direction: Tensor, mask: Tensor 
       pixels: exact for a pinhole.
     Gradient: flow, truth, direction. Raises: ShapeError; DomainError for rays that do not go forward.
     """
-    _check(flow, truth)
+    flow, truth = _check(flow, truth)
     plane = _slopes(direction, flow)
     return 1000 * _masked(_angle(_ray_at(plane, flow), _ray_at(plane, truth)), mask).mean()
 
@@ -141,6 +154,14 @@ def pinhole_directions(
 ) -> Tensor:
     """Directions [H, W, 3], z = 1, of a pinhole camera; centre_px: (x, y) of the axis, the image's middle
     when None."""
+    height_px, width_px = check_size((height_px, width_px), "the picture")
+    check_number(focal_px, "focal_px", above=0.0)
+    if not isinstance(dtype, torch.dtype) or not dtype.is_floating_point:
+        raise DomainError(f"dtype is {shown(dtype)}; torch.float32 or torch.float64 is needed.")
+    if centre_px is not None and (not isinstance(centre_px, (tuple, list)) or len(centre_px) != 2):
+        raise ShapeError(f"centre_px is {shown(centre_px)}; (x, y) in pixels is needed.")
+    for coordinate in centre_px or ():
+        check_number(coordinate, "a coordinate of centre_px")
     centre_x, centre_y = ((width_px - 1) / 2, (height_px - 1) / 2) if centre_px is None else centre_px
     y, x = torch.meshgrid(
         torch.arange(height_px, dtype=dtype) - centre_y,
@@ -152,13 +173,13 @@ def pinhole_directions(
 
 def event_mask(volume: EventVolume) -> Tensor:
     """Pixels [B, H, W] with at least a part of an event of either polarity in the window."""
-    return (volume.counts.detach() > 0).flatten(1, 2).any(1)
+    return (check_volume(volume).detach() > 0).flatten(1, 2).any(1)
 
 
 def masks(volume: EventVolume, truth: FlowField) -> dict[str, Tensor]:
     """The three masks that errors are reported under: {"valid", "events", "both"}, each [B, H, W] bool."""
     events = event_mask(volume)
-    valid = truth.valid
+    valid = check_field(truth, "the truth").valid
     if events.shape != valid.shape:
         raise ShapeError(
             f"volume and truth differ in size: {tuple(events.shape)} and {tuple(valid.shape)} pixels."
@@ -180,7 +201,7 @@ def fwl(
     Gradient: none. Raises: DomainError for an interval without events, or with equally many events on every
       pixel. Source: Stoffregen et al., ECCV 2020, sec. 4.1.
     """
-    tracks = stream_tracks(stream, flow_px.detach(), t0_us, t1_us, carry_steps)
+    tracks = stream_tracks(stream, check_real(flow_px, "the flow").detach(), t0_us, t1_us, carry_steps)
     still, moved = (
         nearest_images(tracks, time)[0].double().sum(1).var(correction=0) for time in (tracks.time, at)
     )
@@ -202,7 +223,7 @@ def rsat(stream: EventStream, flow_px: Tensor, t0_us: int, t1_us: int, carry_ste
     Gradient: none. Raises: DomainError for an interval without events, or when all leave the image, or lie at
       t0. Source: Hagenaars et al., NeurIPS 2021.
     """
-    tracks = stream_tracks(stream, flow_px.detach(), t0_us, t1_us, carry_steps)
+    tracks = stream_tracks(stream, check_real(flow_px, "the flow").detach(), t0_us, t1_us, carry_steps)
     squares = []
     for time in (tracks.time, 1.0):
         counts, mean_time = (image.double() for image in nearest_images(tracks, time))
@@ -226,6 +247,7 @@ def _angle(a, b):
 
 def _slopes(direction, like):
     """x/z and y/z, [2, H, W]."""
+    check_real(direction, "the directions")
     if (
         direction.ndim != 3
         or direction.shape[2] != 3

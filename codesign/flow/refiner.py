@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, pad, silu, unfold
 
 from codesign.errors import DomainError
+from codesign.flow.checks import check_count
 from codesign.flow.entry import check_bins, pad_to, presence, takes_volume
 from codesign.flow.layers import GROUPS, Layer
 from codesign.flow.lk import estimate_lk
@@ -48,7 +49,9 @@ class Refiner(nn.Module):
     def __init__(self, bins: int = 8, width: int = 28, steps: int = 2) -> None:
         super().__init__()
         check_bins(bins)
-        if steps < 1 or width < GROUPS or width % GROUPS:
+        check_count(steps, "steps", 1)
+        width = check_count(width, "width", 1)
+        if width < GROUPS or width % GROUPS:
             raise DomainError(
                 f"width = {width}, steps = {steps}; a width that is a multiple of {GROUPS} and at least 1 "
                 "step are needed."

@@ -255,5 +255,5 @@ def test_what_cannot_be_warped_is_refused():
             contrast.stream_tracks(stream, torch.zeros(2, 8, 16), t0_us, t1_us)  # pyright: ignore[reportArgumentType]
     flow = torch.zeros(1, 2, 8, 16, dtype=D)
     flow[0, 0, 2, 2] = math.nan
-    with pytest.raises(DomainError, match="flow: 1 of 256"):
+    with pytest.raises(DomainError, match="flow of these events: 1 of 256"):
         contrast.volume_tracks(volume, flow)

@@ -131,8 +131,10 @@ def test_what_is_no_flow_is_refused(tmp_path):
         write_flow(tmp_path / "a.png", torch.full((2, 3, 3), torch.nan))
     with pytest.raises(ShapeError, match=r"\[2, H, W\]"):
         write_flow(tmp_path / "a.png", torch.zeros(3, 3, 2))
-    with pytest.raises(ShapeError, match="valid mask"):
+    with pytest.raises(DomainError, match="valid mask"):
         write_flow(tmp_path / "a.png", torch.zeros(2, 3, 3), torch.ones(3, 3))
+    with pytest.raises(ShapeError, match="valid mask"):
+        write_flow(tmp_path / "a.png", torch.zeros(2, 3, 3), torch.ones(3, 4, dtype=torch.bool))
     with pytest.raises(FileFormatError, match=r"end in \.flo or \.png"):
         write_flow(tmp_path / "a.tif", torch.zeros(2, 3, 3))
     with pytest.raises(DomainError, match="reads as unknown"):

@@ -202,7 +202,7 @@ def test_every_kind_of_event_file_is_a_recording(tmp_path):
 @pytest.mark.parametrize(
     ("options", "error", "reason"),
     [
-        (PacketOptions(window_s=-1.0), DomainError, "above 0"),
+        (PacketOptions(window_s=-1.0), DomainError, "number > 0"),
         (PacketOptions(window_s=0.1, events=3), DomainError, "one of both"),
         (PacketOptions(truth_unit="m"), DomainError, "'px/s'"),
         (PacketOptions(window_s=9.0), DomainError, "no window of 9 s"),

@@ -266,8 +266,10 @@ def test_what_is_hidden_invalid_or_between_surfaces_is_not_followed():
         True,
         False,
     ]
-    with pytest.raises(ShapeError, match=r"\[K, 2, H, W\]"):
+    with pytest.raises(ShapeError, match=r"valid must be \(2, 8, 9\)"):
         chained(edge, ok)
+    with pytest.raises(ShapeError, match=r"\[K, 2, H, W\]"):
+        chained(edge[:, 0], ok)
 
 
 def test_the_camera_fit_projects_as_the_camera():

@@ -128,7 +128,7 @@ def test_a_recording_without_truth_has_its_sharpness_only(tmp_path):
         (["--recording", "absent"], "nothing lies at absent"),
         (["--estimator", "nothing"], "nothing"),
         (["--width-px", "60"], "give both"),
-        (["--window-ms", "-1"], "above 0"),
+        (["--window-ms", "-1"], "number > 0"),
         (["--truth", "absent.flo"], "no ground truth lies"),
     ],
 )

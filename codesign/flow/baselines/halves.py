@@ -3,6 +3,7 @@
 from torch import Tensor
 
 from codesign.errors import ShapeError
+from codesign.flow.checks import check_real
 
 
 def to_halves(counts: Tensor) -> Tensor:
@@ -17,6 +18,7 @@ def to_halves(counts: Tensor) -> Tensor:
     Raises: ShapeError for an odd number of bins.
     Source: Lee et al., Spike-FlowNet, ECCV 2020, sec. 3.1.
     """
+    check_real(counts, "the counts")
     if counts.ndim != 5 or counts.shape[1] != 2 or counts.shape[2] % 2 or counts.shape[2] == 0:
         raise ShapeError(
             "two halves need counts [B, 2, bins, H, W] with an even number of bins, got "
@@ -32,6 +34,7 @@ def from_halves(halves: Tensor) -> Tensor:
 
     Raises: ShapeError.
     """
+    check_real(halves, "the halves")
     if halves.ndim != 5 or halves.shape[1] != 4:
         raise ShapeError(
             "halves are [B, 4, H, W, steps] (ON, OFF of the former half, ON, OFF of the latter), got "

@@ -6,6 +6,7 @@ from torch import Tensor
 from codesign.backend import NoSecondDerivative
 from codesign.errors import DomainError, ShapeError
 from codesign.events.spiking.surrogate import Surrogate
+from codesign.flow.checks import check_number, check_real
 
 _FIRST_ONLY = "a surrogate stands for the first derivative of a spike only; a second one through integrate-and-fire neurons was asked for. Use differences of gradients instead."
 
@@ -64,8 +65,12 @@ def integrate_and_fire(current: Tensor, threshold: float, surrogate: Surrogate) 
     Source: Lee et al., Spike-FlowNet, ECCV 2020, eqs. 1 to 3, which lets rho be 1 / threshold above it and 0
       below.
     """
+    check_real(current, "the current")
     if current.ndim < 1 or len(current) < 1:
         raise ShapeError(f"the current needs a time axis with at least one step, got {tuple(current.shape)}.")
-    if not threshold > 0:
-        raise DomainError(f"the threshold is {threshold}; a number > 0 is needed.")
+    check_number(threshold, "the threshold", above=0.0)
+    if not isinstance(surrogate, Surrogate):
+        raise DomainError(
+            f"the surrogate is a {type(surrogate).__name__}; give one such as events.FastSigmoid."
+        )
     return _Fire.apply(current, threshold, surrogate)

@@ -5,6 +5,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from codesign.errors import ShapeError
+from codesign.flow.checks import check_real, check_size
 
 
 def rescale_flow(flow_px: Tensor, size: tuple[int, int] | torch.Size) -> Tensor:
@@ -18,13 +19,14 @@ def rescale_flow(flow_px: Tensor, size: tuple[int, int] | torch.Size) -> Tensor:
     Gradient: flow_px.
     Raises: ShapeError.
     """
-    height, width = size
+    height, width = check_size(tuple(size) if isinstance(size, torch.Size) else size, "the new size")
+    check_real(flow_px, "the flow")
     if flow_px.ndim != 4 or flow_px.shape[1] != 2 or min(height, width, *flow_px.shape[2:]) < 1:
         raise ShapeError(
             f"a flow is [B, 2, H, W] and its new size at least 1 x 1; got {tuple(flow_px.shape)} and "
             f"{height} x {width}."
         )
-    if tuple(size) == tuple(flow_px.shape[2:]):
+    if (height, width) == tuple(flow_px.shape[2:]):
         return flow_px
     factor = torch.tensor(
         [width / flow_px.shape[3], height / flow_px.shape[2]], dtype=flow_px.dtype, device=flow_px.device

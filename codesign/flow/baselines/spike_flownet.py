@@ -6,12 +6,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv_transpose2d, leaky_relu
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import ShapeError
 from codesign.events.spiking.surrogate import FastSigmoid
 from codesign.flow.baselines.halves import to_halves
 from codesign.flow.baselines.neuron import integrate_and_fire
 from codesign.flow.baselines.rescale import rescale_flow
 from codesign.flow.baselines.weights import channels, fill_budget, start
+from codesign.flow.checks import check_number, check_real
 from codesign.flow.entry import check_bins, check_sizes, normalise, pad_to, takes_volume, to_field
 from codesign.types import EventVolume, FlowField
 
@@ -55,8 +56,8 @@ class SpikeFlowNet(nn.Module):
         super().__init__()
         check_bins(bins, even=True)
         check_sizes(width, hidden)
-        if not threshold > 0:
-            raise DomainError(f"threshold is {threshold}; a number > 0 is needed.")
+        threshold = check_number(threshold, "threshold", above=0.0)
+        surrogate_width = check_number(surrogate_width, "surrogate_width", above=0.0)
         self.config: dict[str, Any] = {
             "bins": bins,
             "width": width,
@@ -115,12 +116,20 @@ class SpikeFlowNet(nn.Module):
         Args: halves: [B, 4, H, W, steps], ON and OFF of the former half of the window, then of the latter; H
           and W multiples of 16.
         """
-        if halves.ndim != 5 or halves.shape[1] != 4 or halves.shape[2] % STRIDE or halves.shape[3] % STRIDE:
+        check_real(halves, "the encoder's input")
+        if (
+            halves.ndim != 5
+            or halves.shape[1] != 4
+            or 0 in halves.shape
+            or halves.shape[2] % STRIDE
+            or halves.shape[3] % STRIDE
+        ):
             raise ShapeError(
                 f"the encoder takes [B, 4, H, W, steps] with H and W multiples of {STRIDE}, got "
                 f"{tuple(halves.shape)}."
             )
         steps = halves.shape[4]
+        halves = halves.to(self.encoder[0].weight.dtype)  # pyright: ignore[reportArgumentType]
         x = halves.permute(4, 0, 1, 2, 3).flatten(0, 1).contiguous(memory_format=torch.channels_last)
         sums = []
         for layer in (

@@ -5,7 +5,9 @@ from collections.abc import Callable, Iterable
 import torch
 from torch import nn
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, check_seed, check_whole
+
+MOST_WEIGHTS = 10**9
 
 
 def channels(width: float, factor: float = 1.0) -> int:
@@ -24,7 +26,7 @@ def start(module: nn.Module, seed: int, variance: float, heads: Iterable[nn.Modu
 
     The generator's seed is the only source. Modules on the meta device, built to be counted, are left alone.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(check_seed(seed, "seed"))
     for part in module.modules():
         if (
             isinstance(part, (torch.nn.Conv2d, torch.nn.ConvTranspose2d))
@@ -52,6 +54,8 @@ def fill_budget(build: Callable[..., nn.Module], weights: int) -> tuple[float, i
         with torch.device("meta"):
             return count_weights(build(width=width, hidden=hidden))
 
+    if check_whole(weights, "weights") > MOST_WEIGHTS:
+        raise DomainError(f"a budget of {weights} weights is too large; at most {MOST_WEIGHTS} are possible.")
     if counted(1.0) > weights:
         raise DomainError(
             f"a budget of {weights} weights is too small; the narrowest network has {counted(1.0)}."

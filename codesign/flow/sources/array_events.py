@@ -8,6 +8,7 @@ import numpy as np
 
 from codesign import events
 from codesign.errors import FileFormatError
+from codesign.flow.checks import check_path
 from codesign.flow.sources.columns import LIMIT_PX, EventColumns, from_stream, settled_size
 from codesign.flow.sources.text_events import UNITS_US
 
@@ -29,7 +30,7 @@ def read_array_events(
     Returns: EventColumns. The package's own .npz (t_us, x, y, p, height_px, width_px) is read by events.read.
     Raises: FileFormatError for other contents, with the first wrong event.
     """
-    path = Path(path)
+    path = check_path(path)
     try:
         with path.open("rb") as file:
             loaded: Any = np.load(file, allow_pickle=False)

@@ -1,6 +1,7 @@
 """How the camera of a recording turned: from its gyroscope (imu.txt) or from recorded poses
 (groundtruth.txt)."""
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from codesign.errors import FileFormatError
+from codesign.errors import DomainError, FileFormatError
+from codesign.flow.checks import check_path, shown
 
 LARGEST_GAP_S = 0.1  # between samples that are interpolated
 UNIT_TOLERANCE = 1e-2  # of a quaternion's length
@@ -63,9 +65,14 @@ def read_gyroscope(path: str | Path, axes: np.ndarray | None = None) -> Attitude
     Args: axes: [3, 3], camera axes from the gyroscope's (identity when None). The gyroscope's offset is not
       removed.
     """
+    turned = np.eye(3) if axes is None else np.asarray(axes)
+    if turned.shape != (3, 3) or turned.dtype.kind not in "fiu" or not np.isfinite(turned).all():
+        raise DomainError(
+            f"the gyroscope's axes are {shown(axes)}; a matrix [3, 3] of finite numbers is needed."
+        )
     table = _table(path, 7, "t ax ay az gx gy gz")
     t_s = table[:, 0]
-    rate = table[:, 4:] @ (np.eye(3) if axes is None else np.asarray(axes)).T
+    rate = table[:, 4:] @ turned.T
     steps = Rotation.from_rotvec((rate[1:] + rate[:-1]) / 2 * np.diff(t_s)[:, None])
     turns = [Rotation.identity()]
     for step in steps:
@@ -89,7 +96,7 @@ def read_poses(path: str | Path) -> Attitude:
 def _table(path, columns, names):
     """[N >= 2, columns] finite numbers with rising times in the first column; repeated times are left out
     after the first."""
-    path = Path(path)
+    path = check_path(path)
     try:
         if path.stat().st_size > MOST_BYTES:
             raise FileFormatError(
@@ -97,7 +104,9 @@ def _table(path, columns, names):
             )
         with path.open("rb") as file:
             delimiter = "," if b"," in file.read(400) else None
-        table = np.loadtxt(path, ndmin=2, comments="#", delimiter=delimiter)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of a file without a number, which is refused below
+            table = np.loadtxt(path, ndmin=2, comments="#", delimiter=delimiter)
     except FileFormatError:
         raise
     except (OSError, ValueError) as error:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from codesign.errors import DomainError, FileFormatError
+from codesign.flow.checks import check_kind, check_path
 
 STEPS = 50
 RESIDUAL_PX = 1e-6
@@ -75,7 +76,7 @@ def read_calibration(path: str | Path) -> Calibration:
 
     Raises: FileFormatError for anything else.
     """
-    path = Path(path)
+    path = check_path(path)
     try:
         words = path.read_text(encoding="utf-8").replace(",", " ").split()
         values = [float(word) for word in words if not word.endswith(":")]
@@ -100,7 +101,7 @@ def signed_axes(text: str) -> np.ndarray:
     signs = []
     names = []
     sign = 1.0
-    for letter in text.replace(" ", ""):
+    for letter in check_kind(text, str, "the gyroscope's axes").replace(" ", ""):
         if letter in "+-":
             sign = 1.0 if letter == "+" else -1.0
         else:

@@ -5,6 +5,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from codesign.errors import ShapeError
+from codesign.flow.checks import check_mask, check_real
 
 EDGE_PX = 0.75  # flows of the four pixels around a place that differ by more belong to different surfaces
 
@@ -22,15 +23,12 @@ def chained(flows_px: Tensor, valid: Tensor, hidden: Tensor | None = None) -> tu
       surfaces whose flows differ by more than 0.75 px.
     Gradient: flows_px.
     """
-    if (
-        flows_px.ndim != 4
-        or flows_px.shape[1] != 2
-        or valid.shape != (flows_px.shape[0], *flows_px.shape[2:])
-    ):
-        raise ShapeError(
-            f"flows and valid have shapes {list(flows_px.shape)} and {list(valid.shape)}; [K, 2, H, W] and "
-            "[K, H, W] are needed."
-        )
+    check_real(flows_px, "the flows")
+    if flows_px.ndim != 4 or flows_px.shape[1] != 2 or 0 in flows_px.shape:
+        raise ShapeError(f"the flows are {list(flows_px.shape)}; [K, 2, H, W], no axis empty, is needed.")
+    for mask, name in ((valid, "valid"), (hidden, "hidden")):
+        if mask is not None or name == "valid":
+            check_mask(mask, name, (len(flows_px), *flows_px.shape[2:]))
     height, width = flows_px.shape[2:]
     y, x = torch.meshgrid(
         *(torch.arange(n, dtype=flows_px.dtype, device=flows_px.device) for n in (height, width)),

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
+from codesign.flow.checks import check_count, check_number
 from codesign.types import EventVolume, FlowField, FlowWindows
 
 ALIKE = 0.05  # windows of one source may differ in length by this share
@@ -91,6 +92,8 @@ def collate(samples: Sequence[Sample]) -> FlowWindows:
 
 def bin_times(bins: int, seconds: float) -> tuple[Tensor, Tensor]:
     """(centroid_s, collected_s) [bins] of an even event rate, as events.from_stream has them."""
+    check_count(bins, "bins", 1)
+    seconds = check_number(seconds, "the length of the window", above=0.0)
     if bins == 1:
         return torch.tensor([seconds / 2], dtype=torch.float64), torch.tensor([seconds], dtype=torch.float64)
     node = torch.arange(bins, dtype=torch.float64) / (bins - 1)

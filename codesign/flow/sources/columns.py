@@ -8,6 +8,7 @@ import torch
 
 from codesign.errors import FileFormatError
 from codesign.events.stream import ordered
+from codesign.flow.checks import check_size
 from codesign.types import EventStream
 
 # width, height: the sensors that recordings without a size come from, smallest first
@@ -76,7 +77,9 @@ def settled_size(
     A recording that says nothing is taken to be of the smallest sensor of SENSORS_PX that holds its events.
     Raises: FileFormatError for sizes that disagree, and for an event outside, with its number.
     """
-    if given is not None and told is not None and tuple(given) != tuple(told):
+    given = None if given is None else check_size(given, "the sensor's size asked for")
+    told = None if told is None else check_size(told, f"the sensor's size by {told_by}")
+    if given is not None and told is not None and given != told:
         raise FileFormatError(
             f"{path} comes from a sensor of {told[1]} x {told[0]} pixels by {told_by}, but {given[1]} x "
             f"{given[0]} was asked for."

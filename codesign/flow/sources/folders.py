@@ -10,6 +10,7 @@ from pathlib import Path
 
 from codesign.errors import FileFormatError
 from codesign.events.files import READERS
+from codesign.flow.checks import check_path
 
 EVENT_SUFFIXES = {".txt", ".npy", *READERS}
 FLOW_SUFFIXES = {".flo", ".png", ".npy", ".npz", ".mat", ".txt", ".csv"}
@@ -35,7 +36,7 @@ def opened(path: str | Path) -> Iterator[Path]:
 
     Raises: FileFormatError when there is nothing, or the archive is damaged or out of all proportion.
     """
-    path = Path(path)
+    path = check_path(path, "the path of the recording")
     if not path.exists():
         raise FileFormatError(
             f"nothing lies at {path}; give a folder with events.txt, an event file, or a zip archive of "

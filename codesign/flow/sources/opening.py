@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from codesign.errors import FileFormatError
+from codesign.flow.checks import check_path
 from codesign.flow.sources.dsec import DsecWindows
 from codesign.flow.sources.mvsec import DATA, MvsecWindows
 from codesign.flow.sources.rendered import DatasetWindows
@@ -23,7 +24,7 @@ def open_windows(
     Returns: DatasetWindows, DsecWindows or MvsecWindows: ``len(source)`` and ``source.batch(indices)``.
     Raises: FileFormatError when the folder is none of these, or something in it is missing or damaged.
     """
-    folder = Path(folder)
+    folder = check_path(folder, "the folder")
     if not folder.is_dir():
         raise FileFormatError(f"no folder lies at {folder}; give the folder of a data set.")
     if (folder / "manifest.json").is_file() or (folder / "frames.h5").is_file():

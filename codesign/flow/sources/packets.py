@@ -10,6 +10,8 @@ from PIL import Image, UnidentifiedImageError
 
 from codesign import events
 from codesign.errors import DomainError, FileFormatError
+from codesign.events.entry import check_whole
+from codesign.flow.checks import check_kind, check_number, check_path, check_size
 from codesign.flow.sources import columns, folders, truth
 from codesign.flow.sources.array_events import read_array_events
 from codesign.flow.sources.attitude import read_gyroscope, read_poses
@@ -79,7 +81,7 @@ def read_packets(
     Raises: FileFormatError, DomainError.
     """
     options = PacketOptions() if options is None else options
-    _check(options)
+    _check(options, truth_path)
     with folders.opened(path) as place:
         files = folders.event_files(place)
         if len(files) > 1:
@@ -118,11 +120,23 @@ def read_events(path: Path, options: PacketOptions, truth_path: Path | None = No
     )
 
 
-def _check(options):
-    for name in ("window_s", "count", "events", "truth_interval_s"):
-        value = getattr(options, name)
-        if value is not None and not value > 0:
-            raise DomainError(f"{name} is {value}; a number above 0 is needed.")
+def _check(options, truth_path):
+    check_kind(options, PacketOptions, "the options")
+    for name in ("window_s", "truth_interval_s"):
+        if getattr(options, name) is not None:
+            check_number(getattr(options, name), name, above=0.0)
+    for name in ("count", "events"):
+        if getattr(options, name) is not None:
+            check_whole(getattr(options, name), name, 1)
+    if options.start_s is not None:
+        check_number(options.start_s, "start_s", 0.0)
+    if options.size_px is not None:
+        check_size(options.size_px, "size_px")
+    for name in ("columns", "time_unit", "gyro_axes"):
+        check_kind(getattr(options, name), str, name)
+    for unit in (options.calibration, truth_path):
+        if unit is not None:
+            check_path(unit)
     if options.truth_unit not in ("px", "px/s"):
         raise DomainError(
             f"the truth's unit is {options.truth_unit!r}; 'px' (per interval) or 'px/s' is possible."

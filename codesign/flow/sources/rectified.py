@@ -3,8 +3,10 @@
 import torch
 from torch import Tensor
 
-from codesign.errors import ShapeError
+from codesign.errors import DomainError, ShapeError
+from codesign.events.entry import check_whole
 from codesign.events.volumes.volume import check_bins
+from codesign.flow.checks import check_mask, check_real, check_size
 
 
 def splatted(
@@ -25,6 +27,14 @@ def splatted(
     Events, and shares of them, that fall outside the picture are left out; everything else is conserved.
     """
     check_bins(bins)
+    height_px, width_px = check_size((height_px, width_px), "the picture")
+    if check_whole(t1_us, "t1_us") <= check_whole(t0_us, "t0_us"):
+        raise DomainError(f"the window is {t0_us} to {t1_us} us; a start before its end is needed.")
+    for values, name in ((x_px, "x_px"), (y_px, "y_px")):
+        check_real(values, name)
+    if not isinstance(t_us, Tensor) or t_us.dtype != torch.int64 or t_us.ndim != 1:
+        raise DomainError("t_us must be a list [N] of int64 microseconds.")
+    check_mask(on, "on", t_us.shape)
     if not t_us.shape == x_px.shape == y_px.shape == on.shape:
         raise ShapeError(
             f"times, places and polarities have shapes {[list(v.shape) for v in (t_us, x_px, y_px, on)]}; "

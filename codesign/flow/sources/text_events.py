@@ -14,6 +14,7 @@ import numpy as np
 
 from codesign.errors import FileFormatError
 from codesign.events.formats.arrival import DISORDER_US
+from codesign.flow.checks import check_kind, check_path
 from codesign.flow.sources.columns import LIMIT_PX, EventColumns, settled_size
 
 CHUNK_BYTES = 2**23
@@ -57,7 +58,7 @@ def read_text_events(
     Raises: FileFormatError naming the line that is not four numbers, goes back in time, lies outside the
       sensor or has another polarity.
     """
-    path = Path(path)
+    path = check_path(path)
     parts = []
     number = 1
     carried_us = -(2**62)
@@ -190,7 +191,7 @@ def _settled_order(path, table, columns):
         return (
             rising[0] if rising else ORDERS[0]
         )  # without either, the line that goes back in time is named by the check that follows
-    if sorted(columns) != ["p", "t", "x", "y"]:
+    if sorted(check_kind(columns, str, "the order of the columns")) != ["p", "t", "x", "y"]:
         raise FileFormatError(
             f"columns {columns!r} given for {path}; the four letters t, x, y, p in the file's order are "
             "needed, for example 'txyp'."
@@ -201,7 +202,7 @@ def _settled_order(path, table, columns):
 def _settled_unit(path, times, unit):
     if unit == "auto":
         return "s" if bool((times % 1 != 0).any()) else "us"
-    if unit not in UNITS_US:
+    if not isinstance(unit, str) or unit not in UNITS_US:
         raise FileFormatError(
             f"time unit {unit!r} given for {path}; choose one of {', '.join(UNITS_US)} or auto."
         )

@@ -2,6 +2,7 @@
 with their times."""
 
 import re
+import warnings
 import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
 from codesign.errors import FileFormatError
+from codesign.flow.checks import check_path, check_size
 from codesign.flow.files import read_flow
 from codesign.flow.sources import folders
 
@@ -76,7 +78,8 @@ def read_truth(path: str | Path, size_px: tuple[int, int]) -> list[TrueFlow]:
       exactly (0, 0).
     Raises: FileFormatError for anything else.
     """
-    path = Path(path)
+    path = check_path(path, "the path of the true flow")
+    size_px = check_size(size_px, "the size of the recording")
     if path.is_dir():
         files = folders.flow_files(path)
         flows = [flow for file in files for flow in _of_file(file, size_px)]
@@ -273,7 +276,11 @@ def _of_table(path, size_px):
             header = bool(words) and not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf", words[0])
             if not header:
                 file.seek(0)
-            table = np.loadtxt(file, ndmin=2, delimiter="," if "," in first else None)
+            with warnings.catch_warnings():
+                warnings.simplefilter(
+                    "ignore", UserWarning
+                )  # of a file without a number, which is refused below
+                table = np.loadtxt(file, ndmin=2, delimiter="," if "," in first else None)
     except (OSError, ValueError) as error:
         raise FileFormatError(f"{path} is no table of numbers ({error}).") from error
     height, width = size_px
