@@ -22,6 +22,7 @@ def written_out(level, centre, thetas, interval_s, dead_s):
     position = position.to(level)
     rows = [level.new_zeros(PHASES, level.shape[1])]
     begun = rows[0]
+    heading = rows[0][0]
     kept = [[level.new_zeros(level.shape[1])] * 2 for _ in interval_s]
     for part, interval in enumerate(intervals.tolist()):
         now = torch.lerp(level[interval], level[interval + 1], float(shares[part]))
@@ -30,7 +31,11 @@ def written_out(level, centre, thetas, interval_s, dead_s):
         centre = torch.where(rise > 0, now - half, torch.where(fall > 0, now + half, centre))
         total = rise / thetas[0] + fall / thetas[1]
         free = looked(rows, times_s, (times_s[part] + times_s[part + 1]) / 2 - dead_s)
-        start = position + offset
+        ahead = torch.where(rise > 0, 1.0, torch.where(fall > 0, -1.0, heading))
+        begun = torch.where(ahead * heading < 0, rows[-1], begun)
+        heading = ahead
+        # downward, windows are entered from above
+        start = torch.where(ahead < 0, WIDTH - position - offset, position + offset)
         end = start + total
         border = start.detach().floor() + 1
         begins = end >= border
@@ -42,7 +47,7 @@ def written_out(level, centre, thetas, interval_s, dead_s):
         passed = (early + late).mean(0)
         on, off = kept[interval]
         kept[interval] = [on + torch.where(rise > 0, passed, 0), off + torch.where(fall > 0, passed, 0)]
-        position = position + total
+        position = position + ahead * total
     return torch.stack([torch.stack(pair) for pair in kept]), centre, position
 
 

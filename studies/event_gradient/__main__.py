@@ -17,7 +17,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from codesign.errors import DomainError
-from studies.event_gradient import flow_of_events, layers, pointwise, sensors, spiking, thresholds, timing
+from studies.event_gradient import (
+    dead_time,
+    flow_of_events,
+    layers,
+    pointwise,
+    sensors,
+    spiking,
+    thresholds,
+    timing,
+)
 from studies.event_gradient.case import DIRECTIONS, Case
 from studies.event_gradient.compare import Row
 from studies.event_gradient.topic import Topic, label
@@ -30,6 +39,7 @@ TOPICS: dict[str, Topic] = {
     "curves": thresholds.CURVES,
     "pointwise": pointwise.TOPIC,
     "sensors": sensors.TOPIC,
+    "dead_time": dead_time.TOPIC,
     "flow": flow_of_events.TOPIC,
     "timing": timing.TOPIC,
     "spiking": spiking.TOPIC,

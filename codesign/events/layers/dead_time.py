@@ -1,8 +1,9 @@
 """What dead time lets pass of mean counts: the expectation over where events stand in a pixel's threshold, as a
 smooth function of the levels, the thresholds and the dead time.
 
-A pixel's events come one by one as its mean count I grows by one, at I = i + u, with a phase u that is as good
-as random. Event i is kept unless one kept before lies less than T back, and no two kept ones do:
+A pixel has an event whenever its mean signed count I (ON less OFF) passes i + u, up or down, with a phase u that is
+as good as random: on a way back those come first that came last. Event i is kept unless one kept before lies less
+than T back, and no two kept ones do:
 
     kept_i = 1 - sum over j < i with t_i - t_j < T of kept_j,
 
@@ -35,11 +36,13 @@ FEWEST = 8  # dead times shorter than an interval over this are taken as local
 
 @dataclass(frozen=True)
 class DeadTimeState:
-    """What ``mean_counts`` carries over chunks. position: [...] mean count so far, modulo 1. begun: [PHASES, ...]
-    what a group had kept when its last event began. kept: [N, PHASES, ...] what it had kept at ago_s: [N] seconds
+    """What ``mean_counts`` carries over chunks. position: [...] mean signed count so far, modulo 1. heading:
+    [...] 1 where the last counts were ON, -1 where they were OFF. begun: [PHASES, ...] what a group had kept when its
+    last event began. kept: [N, PHASES, ...] what it had kept at ago_s: [N] seconds
     before the end, the last one 0. All keep their graph."""
 
     position: Tensor
+    heading: Tensor
     begun: Tensor
     kept: Tensor
     ago_s: Tensor
@@ -70,28 +73,31 @@ def mean_counts(
         pixels = torch.arange(level[0].numel(), dtype=torch.float64)
         nothing = level.new_zeros(PHASES, *level.shape[1:])
         position = ((0.37 + GOLDEN * pixels) % 1).to(level).reshape(level.shape[1:])
-        state = DeadTimeState(position, nothing, nothing[None], interval_s.new_zeros(1))
+        state = DeadTimeState(position, nothing[0], nothing, nothing[None], interval_s.new_zeros(1))
     cut, rows_s = _cut(interval_s, float(dead_s.detach()), state.ago_s)
     missing = cut.reach - len(state.kept)
     rows = state.kept[-cut.reach :]
     if missing > 0:
         rows = torch.cat((rows.new_zeros(missing, *rows.shape[1:]), rows))
-    passed, centre, position, begun, rows = _Kept.apply(
-        level, *thetas, dead_s, centre, state.position, state.begun, rows, cut
+    passed, centre, position, heading, begun, rows = _Kept.apply(
+        level, *thetas, dead_s, centre, state.position, state.heading, state.begun, rows, cut
     )
     ago_s = rows_s[-1] - rows_s
     kept = rows[-_wanted(ago_s, float(dead_s.detach())) :]
     base = kept[-1].detach()
     after = DeadTimeState(
-        position - position.detach().floor(), begun - base, kept - base, ago_s[-len(kept) :]
+        position - position.detach().floor(), heading, begun - base, kept - base, ago_s[-len(kept) :]
     )
     return passed, centre, after
 
 
 class _Kept(Function):
     @staticmethod
-    def forward(ctx, level, theta_on, theta_off, dead_s, centre, position, begun, rows, cut):
-        passed, after, stored = kernel.forward(cut, level, theta_on, theta_off, centre, position, begun, rows)
+    def forward(ctx, level, theta_on, theta_off, dead_s, centre, position, heading, begun, rows, cut):
+        passed, after, stored = kernel.forward(
+            cut, level, theta_on, theta_off, centre, position, heading, begun, rows
+        )
+        ctx.mark_non_differentiable(after[2])
         ctx.cut = cut
         ctx.stored = stored
         ctx.save_for_backward(level, theta_on, theta_off)
@@ -101,7 +107,7 @@ class _Kept(Function):
     @once_differentiable
     def backward(ctx, *grads):
         level, theta_on, theta_off = ctx.saved_tensors
-        of_level, of_on, of_off, of_dead, *of_state = kernel.adjoint(
+        of_level, of_on, of_off, of_dead, of_centre, of_position, *of_kept = kernel.adjoint(
             ctx.cut, level, theta_on, theta_off, ctx.stored, grads[0], grads[1:]
         )
         return (
@@ -109,7 +115,10 @@ class _Kept(Function):
             of_on.sum_to_size(theta_on.shape),
             of_off.sum_to_size(theta_off.shape),
             of_dead.sum(dtype=torch.float64),
-            *of_state,
+            of_centre,
+            of_position,
+            None,
+            *of_kept,
             None,
         )
 

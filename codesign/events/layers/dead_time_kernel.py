@@ -13,10 +13,10 @@ import torch
 from codesign.events.layers.dead_time_part import PHASES, Run
 
 
-def forward(parts, level, theta_on, theta_off, centre, position, begun, rows):
+def forward(parts, level, theta_on, theta_off, centre, position, heading, begun, rows):
     """Kept counts [T, 2, ...] of levels [T + 1, ...]; the state after them; the stored states.
 
-    Args: centre, position: [...]. begun: [PHASES, ...]. rows: [reach, PHASES, ...], the last one now.
+    Args: centre, position, heading: [...]. begun: [PHASES, ...]. rows: [reach, PHASES, ...], the last one now.
     """
     run = Run(parts, level, theta_on, theta_off)
     target = run.nothing(2 * (len(level) - 1))
@@ -30,7 +30,7 @@ def forward(parts, level, theta_on, theta_off, centre, position, begun, rows):
             mine[run.size + row] = run.gather(begun_rows, row * PHASES + group)
         return (local,)
 
-    def walk_block(block, centre, position, begun, local):
+    def walk_block(block, centre, position, heading, begun, local):
         first, size = run.ends(block)
         place = block * run.stored
 
@@ -42,23 +42,23 @@ def forward(parts, level, theta_on, theta_off, centre, position, begun, rows):
             return (local,)
 
         (local,) = run.repeat(run.reach, shift, local)
-        for index, value in enumerate((*begun, centre, position)):
+        for index, value in enumerate((*begun, centre, position, heading)):
             run.scatter(stored, value, place + run.reach * PHASES + index)
 
-        def walk(index, centre, position, begun, local):
+        def walk(index, centre, position, heading, begun, local):
             part = first + index
             interval, rise, fall, kept, *after = run.walk(
-                local, part, index + run.reach - 1, centre, position, begun
+                local, part, index + run.reach - 1, centre, position, heading, begun
             )
             run.add(target, kept, 2 * interval, rise > 0)
             run.add(target, kept, 2 * interval + 1, fall > 0)
             return *after, local
 
-        return run.repeat(size, walk, centre, position, begun, local)
+        return run.repeat(size, walk, centre, position, heading, begun, local)
 
     (local,) = run.repeat(run.reach, begin, local)
-    start = (run.load(centre), run.load(position), [run.load(one) for one in begun])
-    centre, position, begun, local = run.repeat(run.blocks, walk_block, *start, local)
+    start = (*map(run.load, (centre, position, heading)), [run.load(one) for one in begun])
+    centre, position, heading, begun, local = run.repeat(run.blocks, walk_block, *start, local)
     last = run.count - (run.blocks - 1) * run.size
 
     def write(row, local):
@@ -67,13 +67,14 @@ def forward(parts, level, theta_on, theta_off, centre, position, begun, rows):
         return (local,)
 
     run.repeat(run.reach, write, local)
-    run.dr.eval(target, stored, behind, centre, position, begun)
+    run.dr.eval(target, stored, behind, centre, position, heading, begun)
     run.dr.sync_thread()
     shape = level.shape[1:]
     kept = run.tensor(target, (len(level) - 1, 2, *shape))
     after = (
         run.tensor(centre, shape),
         run.tensor(position, shape),
+        run.tensor(heading, shape),
         torch.stack([run.tensor(one, shape) for one in begun]),
         run.tensor(behind, (run.reach, PHASES, *shape)),
     )
@@ -89,7 +90,7 @@ def adjoint(parts, level, theta_on, theta_off, stored, grad_kept, grad_after):
     dr = run.dr
     seed = run.load(grad_kept)
     target = run.nothing(len(level))
-    ahead = run.load(grad_after[3])
+    ahead = run.load(grad_after[4])
     before = run.fresh(run.reach * PHASES * run.width)
 
     def begin(row, pull):
@@ -116,16 +117,17 @@ def adjoint(parts, level, theta_on, theta_off, stored, grad_kept, grad_after):
         begun = [run.gather(stored, place + run.reach * PHASES + group) for group in range(PHASES)]
         centre = run.gather(stored, place + run.reach * PHASES + PHASES)
         position = run.gather(stored, place + run.reach * PHASES + PHASES + 1)
+        heading = run.gather(stored, place + run.reach * PHASES + PHASES + 2)
 
-        def walk(index, centre, position, begun, local, path):
-            for mine, value in zip(path, (*begun, centre, position), strict=True):
+        def walk(index, centre, position, heading, begun, local, path):
+            for mine, value in zip(path, (*begun, centre, position, heading), strict=True):
                 mine[index] = value
-            *_, centre, position, begun = run.walk(
-                local, first + index, index + run.reach - 1, centre, position, begun
+            *_, centre, position, heading, begun = run.walk(
+                local, first + index, index + run.reach - 1, centre, position, heading, begun
             )
-            return centre, position, begun, local, path
+            return centre, position, heading, begun, local, path
 
-        *_, local, path = run.repeat(size, walk, centre, position, begun, local, path)
+        *_, local, path = run.repeat(size, walk, centre, position, heading, begun, local, path)
 
         def shift(done, pull):  # what later blocks pull at lies behind this one
             row = run.reach + size - 1 - done
@@ -139,10 +141,10 @@ def adjoint(parts, level, theta_on, theta_off, stored, grad_kept, grad_after):
 
         def back(done, pulls, pull, local, path):
             index = size - 1 - done
-            *begun, centre, position = (mine[index] for mine in path)
+            *begun, centre, position, heading = (mine[index] for mine in path)
             now = index + run.reach - 1
-            pulls = run.pull(seed, target, pulls, pull, local, first + index, now, centre, position, begun)
-            return pulls, pull, local, path
+            before = (centre, position, heading, begun)
+            return run.pull(seed, target, pulls, pull, local, first + index, now, *before), pull, local, path
 
         return run.repeat(size, back, pulls, pull, local, path)
 
@@ -151,12 +153,12 @@ def adjoint(parts, level, theta_on, theta_off, stored, grad_kept, grad_after):
     pulls = {
         "centre": run.load(grad_after[0]),
         "position": run.load(grad_after[1]),
-        "begun": [run.load(one) for one in grad_after[2]],
+        "begun": [run.load(one) for one in grad_after[3]],
         "theta_on": run.zero,
         "theta_off": run.zero,
         "dead": run.zero,
     }
-    path = run.local(run.size, PHASES + 2)
+    path = run.local(run.size, PHASES + 3)
     pulls, pull, *_ = run.repeat(run.blocks, back_block, pulls, pull, run.local(run.reach + run.size), path)
     run.repeat(run.reach, end, pull)
     dr.eval(target, before, pulls)

@@ -48,7 +48,7 @@ class Run(Loop):
             self._of(self.arr.Float, values) for values in (parts.share, parts.blend, parts.slope)
         )
         self.half = (self.theta_on + self.theta_off) * 0.25
-        self.stored = self.reach * PHASES + PHASES + 2  # numbers of a state
+        self.stored = self.reach * PHASES + PHASES + 3  # numbers of a state
         self.zero = self.dr.zeros(self.arr.Float, self.width)
 
     def _of(self, kind, values):
@@ -125,20 +125,32 @@ class Run(Loop):
             found.append((self.dr.fma(blend, more, low), more))
         return found
 
-    def walk(self, rows, part, now, centre, position, begun):
+    def heads(self, rise, fall, heading, rows, now, begun):
+        """Where the play heads now, and what groups had kept when their last event began: at a turn one begins,
+        of those phases that the level has just passed."""
+        dr = self.dr
+        ahead = dr.select(rise > 0, 1, dr.select(fall > 0, -1, heading))
+        turned = ahead * heading < 0
+        kept = [mine[now] for mine in rows]
+        begun = [dr.select(turned, now, before) for now, before in zip(kept, begun, strict=True)]
+        return ahead, turned, kept, begun
+
+    def walk(self, rows, part, now, centre, position, heading, begun):
         """One part forward; rows gain one. Returns interval, rise, fall, kept counts, and the state after it."""
         interval, rise, fall = self.play(part, centre)
         total = rise / self.theta_on + fall / self.theta_off
-        kept = self.zero
+        ahead, _, kept, begun = self.heads(rise, fall, heading, rows, now, begun)
+        passed = self.zero
         after = []
         for group, (free, _) in enumerate(self.look(rows, part, now)):
-            step = _Step(self.dr, group, position, total, rows[group][now], begun[group], free)
+            step = _Step(self.dr, group, position, ahead, total, kept[group], begun[group], free)
             rows[group][now + 1] = step.before + step.added
-            kept = kept + step.added
+            passed = passed + step.added
             after.append(step.begun)
-        return interval, rise, fall, kept / PHASES, centre + (rise - fall), position + total, after
+        centre = centre + (rise - fall)
+        return interval, rise, fall, passed / PHASES, centre, position + ahead * total, ahead, after
 
-    def pull(self, seed, target, pulls, pull, rows, part, now, centre, position, begun):
+    def pull(self, seed, target, pulls, pull, rows, part, now, centre, position, heading, begun):
         """One part backward: what ``walk`` did, differentiated. pulls: gradients of the state after it, by name; pull:
         of the rows. Returns those of the state before it."""
         dr = self.dr
@@ -151,19 +163,20 @@ class Run(Loop):
         of_kept = dr.select(moves, of_kept, 0)
         blend = self.of_part(self.blend, part)
         before = now - self.of_part(self.back, part)
-        of_total = pulls["position"]
+        ahead, turned, kept, begun = self.heads(rise, fall, heading, rows, now, begun)
+        of_total = pulls["position"] * ahead
         of_position = pulls["position"]
         of_dead = self.zero
         of_begun = []
         for group, (free, more) in enumerate(self.look(rows, part, now)):
-            step = _Step(dr, group, position, total, rows[group][now], begun[group], free)
+            step = _Step(dr, group, position, ahead, total, kept[group], begun[group], free)
             of_row = pull[group][now + 1]
             of_end, of_start, looked, of_middle, older = step.pull(of_kept + of_row, pulls["begun"][group])
             of_total = of_total + of_end
-            of_position = of_position + of_end - of_start
+            of_position = of_position + ahead * (of_end - of_start)
             of_dead = of_dead + looked * more
-            of_begun.append(older)
-            _increase(pull[group], now, of_row + of_middle)
+            of_begun.append(dr.select(turned, 0, older))
+            _increase(pull[group], now, of_row + of_middle + dr.select(turned, older, 0))
             _increase(pull[group], before, (1 - blend) * looked)
             _increase(pull[group], before + 1, blend * looked)
         # the play: the edge that the level has reached stands at the level
@@ -189,10 +202,11 @@ class _Step:
     """One part of one group: masses of the event begun before it (early) and of the one that begins in it (late), the
     share of each that is kept, what is kept more, and what had been kept when the last event began."""
 
-    def __init__(self, dr, group, position, total, before, begun, free):
+    def __init__(self, dr, group, position, ahead, total, before, begun, free):
         self.dr = dr
-        start = position + group / PHASES
-        end = position + total + group / PHASES
+        place = position + group / PHASES
+        start = dr.select(ahead < 0, WIDTH - place, place)  # downward, the same events come in reverse order
+        end = start + total
         filled, self.fills_before = _filled(dr, start)
         filled_after, self.fills_after = _filled(dr, end)
         border = dr.floor(start) + 1
