@@ -20,13 +20,14 @@ from codesign.flow import metrics
 from codesign.flow.checkpoint import DELIVERED
 from codesign.flow.checkpoint import load as load_network
 from codesign.flow.sources import PacketOptions, read_packets
+from studies.flow_recording import doubts, made
 from studies.flow_recording import figures as drawn
-from studies.flow_recording import made
 from studies.frame.run import Run, StudyConfig, main
 
 SHOWN = 4  # packets with pictures
 UNITS = {
     "aee_px": "AEE, px",
+    "rotation_difference_px": "difference from the flow of rotation alone, px",
     "aee_dense_px": "AEE everywhere, px",
     "zero_aee_px": "AEE of zero flow, px",
     "outlier_percent": "outliers, %",
@@ -67,6 +68,12 @@ class Config(StudyConfig):
     """Unit of the times of event text; auto: seconds where they have a fraction, else microseconds."""
     truth_unit: Literal["px", "px/s"] = "px"
     """Unit of flow files."""
+    truth_pixels: Literal["raw", "undistorted"] = "raw"
+    """Whose pixels flow files belong to: the sensor's, or those of a pinhole, from which they are then carried to
+    the sensor's by calib.txt."""
+    skip: tuple[str, ...] = ()
+    """Faults to leave out and count instead of refusing (events) or keeping (windows): events_back_in_time,
+    events_off_sensor, windows_without_events, windows_across_gaps."""
     truth_interval_ms: float | None = None
     """What a flow file without times covers; the whole packet when left out."""
     gyro_axes: str = "xyz"
@@ -142,6 +149,8 @@ def options(config, synthetic):
         seconds(config.truth_interval_ms),
         config.gyro_axes,
         config.calibration,
+        config.truth_pixels,
+        config.skip,
     )
 
 
@@ -161,19 +170,30 @@ def measured(packet, estimate, bins):
                 f"{list(field.flow_px.shape)}; give the sensor's size."
             )
         both = valid & (volume.counts.sum((1, 2)) > 0)
-        if bool(both.any()):
-            found["aee_px"] = float(metrics.aee(field.flow_px, truth, both))
-            found["zero_aee_px"] = float(metrics.aee(torch.zeros_like(truth), truth, both))
-            found["outlier_percent"] = float(metrics.outlier_percent(field.flow_px, truth, both))
-            found["angular_error_deg"] = float(metrics.angular_error_deg(field.flow_px, truth, both))
-        if bool(valid.any()):
-            found["aee_dense_px"] = float(metrics.aee(field.flow_px, truth, valid))
+        if packet.translates:  # what rotation alone says is no truth then
+            if bool(both.any()):
+                found["rotation_difference_px"] = float(metrics.aee(field.flow_px, truth, both))
+        else:
+            found |= errors(field.flow_px, truth, valid, both)
         if len(packet.stream):
             found["truth_fwl"] = float(metrics.fwl(packet.stream, truth, packet.t0_us, packet.t1_us))
     if len(packet.stream):
         found["fwl"] = float(metrics.fwl(packet.stream, field.flow_px, packet.t0_us, packet.t1_us))
         found["rsat"] = float(metrics.rsat(packet.stream, field.flow_px, packet.t0_us, packet.t1_us))
     return field, found
+
+
+def errors(flow_px, truth, valid, both):
+    """{figure: value} of the errors where the truth is valid, and where events are too (``both``)."""
+    found = {}
+    if bool(both.any()):
+        found["aee_px"] = float(metrics.aee(flow_px, truth, both))
+        found["zero_aee_px"] = float(metrics.aee(torch.zeros_like(truth), truth, both))
+        found["outlier_percent"] = float(metrics.outlier_percent(flow_px, truth, both))
+        found["angular_error_deg"] = float(metrics.angular_error_deg(flow_px, truth, both))
+    if bool(valid.any()):
+        found["aee_dense_px"] = float(metrics.aee(flow_px, truth, valid))
+    return found
 
 
 def caption(packet):
@@ -201,14 +221,7 @@ def show(run, packets, rows, names, synthetic):
         worse = [found["aee_px"] > found["zero_aee_px"] for found in mine if found["aee_px"] is not None]
         if worse:
             run.record(**{f"{key}_worse_than_zero_share": sum(worse) / len(worse)})
-    empty = sum(not len(packet.stream) for packet in packets)
-    blind = sum(packet.truth is None for packet in packets)
-    run.record(
-        packets=len(packets),
-        packets_without_events=empty,
-        packets_without_truth=blind,
-        events=sum(len(packet.stream) for packet in packets),
-    )
+    run.record(packets=len(packets), **doubts.counts(packets, rows, names[-1]))
     main_one = (
         names[-1].replace("-", "_").replace(".", "_")
     )  # the trained network where there is one; its figures also under plain names
@@ -251,21 +264,8 @@ def show(run, packets, rows, names, synthetic):
         for name in names
     ]
     run.table("Means over packets", ("estimator", *UNITS.values()), means)
-    if empty or blind:
-        run.text(
-            f"{empty} packet(s) hold no event, {blind} have no true flow; they do not count in the figures "
-            "that need one."
-        )
-    doubtful = [
-        packet.name
-        for packet, name, found in rows
-        if name == names[0] and found["truth_fwl"] is not None and found["truth_fwl"] < 1
-    ]
-    if doubtful:
-        run.text(
-            f"**The true flow makes the events less sharp than none** in {len(doubtful)} packet(s) "
-            f"({', '.join(doubtful[:5])}): check its unit, times and axes, or whether it holds there."
-        )
+    for sentence in doubts.sentences(packets, rows, names[-1]):
+        run.text(sentence)
     source = "a synthetic recording" if synthetic else f"`{run.config.recording}`"
     run.finish("Event flow on a recording", f"{len(packets)} packets of {source}.")
 

@@ -122,6 +122,34 @@ def test_a_recording_without_truth_has_its_sharpness_only(tmp_path):
     assert metrics["lk_fwl"] > 0
 
 
+def test_a_slider_has_no_error_against_its_rotation(tmp_path):
+    folder = tmp_path / "slider"
+    folder.mkdir()
+    lines = [f"{1 + k * 1e-4:.6f} {(k * 7) % 60} {(k * 3) % 45} {k % 2}" for k in range(600)]
+    (folder / "events.txt").write_text("\n".join([*lines, "1.070000 99 3 1"]) + "\n")
+    (folder / "calib.txt").write_text("60 60 30 22 0 0 0 0 0\n")
+    t_s = 0.9 + np.arange(60) / 100
+    still = np.zeros((60, 2))
+    np.savetxt(
+        folder / "groundtruth.txt",
+        np.column_stack([t_s, t_s, still, np.zeros((60, 3)), np.ones(60)]),
+        fmt="%.9f",
+    )
+    options = ["--recording", str(folder), "--width-px", "60", "--height-px", "45", "--window-ms", "20"]
+    assert run(tmp_path / "refused", *options)[0] == 2  # an event off the sensor
+    code, metrics = run(tmp_path / "run", *options, "--skip", "events_off_sensor")
+    assert code == 0
+    assert metrics is not None
+    assert metrics["packets_translating"] == metrics["packets"] == 2
+    assert metrics["left_out_events_off_sensor"] == 1
+    assert not [name for name in metrics if name.endswith("aee_px")]
+    assert metrics["lk_rotation_difference_px"] >= 0
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "The camera translates" in page
+    assert "1 events off sensor" in page
+    assert "AEE where events are, lk" not in page  # no card
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [

@@ -1,6 +1,7 @@
 """Events as NumPy arrays by their usual names: .npz of t, x, y, p, or .npy of rows t x y p."""
 
 import zipfile
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,15 @@ import numpy as np
 from codesign import events
 from codesign.errors import FileFormatError
 from codesign.flow.checks import check_path
-from codesign.flow.sources.columns import LIMIT_PX, EventColumns, from_stream, settled_size
+from codesign.flow.sources.columns import (
+    BACKWARDS,
+    LIMIT_PX,
+    OFF_SENSOR,
+    EventColumns,
+    from_stream,
+    on_sensor,
+    settled_size,
+)
 from codesign.flow.sources.text_events import UNITS_US
 
 NAMES = {
@@ -21,12 +30,12 @@ NAMES = {
 
 
 def read_array_events(
-    path: str | Path, size: tuple[int, int] | None = None, time_unit: str = "auto"
+    path: str | Path, size: tuple[int, int] | None = None, time_unit: str = "auto", skip: Collection[str] = ()
 ) -> EventColumns:
     """Read events from .npz or .npy.
 
     Args: size: (height, width) of the sensor, or None. time_unit: as for text; "auto": seconds where a time
-      has a fraction, else microseconds.
+      has a fraction, else microseconds. skip: faults whose events are left out and counted, as for text.
     Returns: EventColumns. The package's own .npz (t_us, x, y, p, height_px, width_px) is read by events.read.
     Raises: FileFormatError for other contents, with the first wrong event.
     """
@@ -76,10 +85,10 @@ def read_array_events(
             "t x y p (.npy), are needed."
         )
     told = tuple(frames[1:]) if len(frames) == 3 else None
-    return _columns(path, table, size, told, time_unit)
+    return _columns(path, table, size, told, time_unit, skip)
 
 
-def _columns(path, table, size, told, time_unit):
+def _columns(path, table, size, told, time_unit, skip):
     t, x, y, p = (table[key].astype(np.float64) for key in "txyp")
     unit = time_unit if time_unit != "auto" else "s" if bool((t % 1 != 0).any()) else "us"
     t_us = (
@@ -87,18 +96,25 @@ def _columns(path, table, size, told, time_unit):
         if unit == "us" and table["t"].dtype.kind in "iu"
         else np.rint(t * UNITS_US[unit])
     )
-    for bad, reason in (
-        (~np.isfinite(t), "its time is not finite"),
-        (np.diff(t_us, prepend=t_us[:1]) < 0, "it lies before the one ahead of it"),
+    left_out = dict.fromkeys(skip, 0)
+    kept = np.ones(len(t_us), bool)
+    for fault, bad, reason in (
+        ("", ~np.isfinite(t), "its time is not finite"),
+        (BACKWARDS, t_us < np.maximum.accumulate(t_us), "it lies before one ahead of it"),
         (
+            OFF_SENSOR,
             ~((x % 1 == 0) & (y % 1 == 0) & (x >= 0) & (y >= 0) & (x < LIMIT_PX) & (y < LIMIT_PX)),
             "its pixel is no pair of whole numbers from 0 on",
         ),
-        (~((p == 0) | (p == 1) | (p == -1)), "its polarity is not 1 or 0 (or +1 and -1)"),
+        ("", ~((p == 0) | (p == 1) | (p == -1)), "its polarity is not 1 or 0 (or +1 and -1)"),
     ):
-        if bool(bad.any()):
+        bad = bad & kept
+        if fault in left_out:
+            left_out[fault] += int(bad.sum())
+            kept &= ~bad
+        elif bool(bad.any()):
             raise FileFormatError(f"{path}: event {int(np.argmax(bad))}: {reason}.")
-    narrow = x.astype(np.int16), y.astype(np.int16)
-    return EventColumns(
-        np.asarray(t_us, np.int64), *narrow, p > 0, *settled_size(path, *narrow, size, told, "its frames")
-    )
+    t_us, x, y, p = (values[kept] for values in (t_us, x, y, p))
+    narrow = np.asarray(t_us, np.int64), x.astype(np.int16), y.astype(np.int16), p > 0
+    settled = settled_size(path, *narrow[1:3], size, told, "its frames")
+    return on_sensor(path, narrow, settled, skip, left_out)

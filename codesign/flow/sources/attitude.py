@@ -33,21 +33,28 @@ class Attitude:
         Raises: FileFormatError when the window is not covered by samples, or lies across a gap of more than
           0.1 s.
         """
-        if not (self.t_s[0] <= t0_s and t1_s <= self.t_s[-1]):
-            raise FileFormatError(
-                f"{self.name} covers {self.t_s[0]:.6f} to {self.t_s[-1]:.6f} s, not the window {t0_s:.6f} "
-                f"to {t1_s:.6f} s; choose windows inside."
-            )
-        first = np.searchsorted(self.t_s, t0_s, "right") - 1
-        last = np.searchsorted(self.t_s, t1_s, "left")
-        gap_s = float(np.diff(self.t_s[first : last + 1]).max())
-        if gap_s > LARGEST_GAP_S:
-            raise FileFormatError(
-                f"{self.name} has no sample for {gap_s:.3f} s in the window {t0_s:.6f} to {t1_s:.6f} s; at "
-                f"most {LARGEST_GAP_S} s are interpolated."
-            )
+        reason = self.missing(t0_s, t1_s)
+        if reason:
+            raise FileFormatError(f"{reason}; choose windows inside.")
+        first, last = self._around(t0_s, t1_s)
         turns = Slerp(self.t_s[first : last + 1], self.turns[first : last + 1])(np.array([t0_s, t1_s]))
         return (turns[1].inv() * turns[0]).as_matrix()
+
+    def missing(self, t0_s: float, t1_s: float) -> str:
+        """Why a window cannot be told of, in words: it is not covered by samples, or lies across a gap of more
+        than 0.1 s; empty where it can."""
+        window = f"the window {t0_s:.6f} to {t1_s:.6f} s"
+        if not (self.t_s[0] <= t0_s and t1_s <= self.t_s[-1]):
+            return f"{self.name} covers {self.t_s[0]:.6f} to {self.t_s[-1]:.6f} s, not {window}"
+        first, last = self._around(t0_s, t1_s)
+        gap_s = float(np.diff(self.t_s[first : last + 1]).max())
+        if gap_s > LARGEST_GAP_S:
+            return f"{self.name} has no sample for {gap_s:.3f} s in {window}; at most {LARGEST_GAP_S} s are interpolated"
+        return ""
+
+    def _around(self, t0_s, t1_s):
+        """Numbers of the samples around a window."""
+        return np.searchsorted(self.t_s, t0_s, "right") - 1, np.searchsorted(self.t_s, t1_s, "left")
 
     def moved_m(self, t0_s: float, t1_s: float) -> float | None:
         """Distance between the camera's places at both times, metres; None where nobody recorded it. Linear

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from codesign.errors import DomainError, FileFormatError
 from codesign.flow.checks import check_kind, check_path
@@ -69,6 +70,27 @@ class Calibration:
         flow = (self.project(rays @ np.asarray(R_later_earlier).T) - np.stack([x, y], -1)).transpose(2, 0, 1)
         valid = np.asarray(np.isfinite(flow).all(0))
         return np.where(valid, flow, 0.0), valid
+
+    def raw_flow(self, flow_px: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Flow of undistorted pixels carried to the sensor's own.
+
+        Args: flow_px: [2, H, W] on the pixels of a pinhole with these focal lengths and this centre. valid: [H, W].
+        Returns: flow_px [2, H, W] on the pixels as the lens makes them, 0 where not valid; valid [H, W], where the
+          four undistorted pixels around are.
+        """
+        height, width = valid.shape
+        slopes = self.directions(height, width)[..., :2]
+        place = slopes * self.focal_px + self.centre_px
+        at = np.where(np.isfinite(place), place, -1.0)[..., ::-1].transpose(2, 0, 1)  # -1: beside the picture
+        known = map_coordinates(valid.astype(float), at, order=1, cval=0.0) > 1 - 1e-9
+        read = np.stack([map_coordinates(part, at, order=1) for part in np.where(valid, flow_px, 0.0)], -1)
+        landed = (
+            self.distorted((place + read - self.centre_px) / self.focal_px) * self.focal_px + self.centre_px
+        )
+        y, x = np.mgrid[:height, :width]
+        raw = (landed - np.stack([x, y], -1)).transpose(2, 0, 1)
+        known = known & np.isfinite(raw).all(0)
+        return np.where(known, raw, 0.0), known
 
 
 def read_calibration(path: str | Path) -> Calibration:

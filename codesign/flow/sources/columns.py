@@ -1,6 +1,7 @@
 """Events of a long recording in few bytes each, from which windows are cut as event streams."""
 
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ SENSORS_PX = {
     "Prophesee HD": (1280, 720),
 }
 LIMIT_PX = 2**15
+BACKWARDS = "events_back_in_time"
+OFF_SENSOR = "events_off_sensor"
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class EventColumns:
     """Events in order of time, 13 bytes each.
 
     t_us: [N] int64 microseconds. x, y: [N] int16. on: [N] bool. height_px, width_px: sensor size. size_from:
-      a phrase that says where that came from.
+      a phrase that says where that came from. left_out: how many events of which fault were left out.
     """
 
     t_us: np.ndarray
@@ -36,6 +39,7 @@ class EventColumns:
     height_px: int
     width_px: int
     size_from: str
+    left_out: dict[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.t_us)
@@ -75,7 +79,7 @@ def settled_size(
     Args: path: for messages. x, y: [N] columns and rows of the events. given: (height_px, width_px) of the
       caller, or None. told: the same from the data, or None; told_by: what told them.
     A recording that says nothing is taken to be of the smallest sensor of SENSORS_PX that holds its events.
-    Raises: FileFormatError for sizes that disagree, and for an event outside, with its number.
+    Raises: FileFormatError for sizes that disagree.
     """
     given = None if given is None else check_size(given, "the sensor's size asked for")
     told = None if told is None else check_size(told, f"the sensor's size by {told_by}")
@@ -97,11 +101,35 @@ def settled_size(
         phrase = (
             f"{name}, the smallest known sensor that holds the events" if fits else "the events themselves"
         )
-    for label, values, limit in (("x", x, width), ("y", y, height)):
-        if len(values) and (int(values.min()) < 0 or int(values.max()) >= limit):
-            at = int(np.argmax((values < 0) | (values >= limit)))
-            raise FileFormatError(
-                f"{path}: event {at} lies at {label} = {int(values[at])}; the sensor has {limit} pixels "
-                f"there by {phrase} (0 to {limit - 1})."
-            )
     return int(height), int(width), phrase
+
+
+def on_sensor(
+    path: str | Path,
+    table: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    size: tuple[int, int, str],
+    skip: Collection[str] = (),
+    left_out: dict[str, int] | None = None,
+) -> EventColumns:
+    """EventColumns of t_us, x, y, on, all on a sensor of ``size`` (see settled_size).
+
+    Args: skip: faults whose events are left out and counted: OFF_SENSOR. left_out: counts so far.
+    Raises: FileFormatError for an event outside, with its number, and where nothing is left.
+    """
+    height, width, phrase = size
+    counted = dict(left_out or {})
+    _, x, y, _ = table
+    outside = (x < 0) | (x >= width) | (y < 0) | (y >= height)
+    if bool(outside.any()) and OFF_SENSOR not in skip:
+        at = int(np.argmax(outside))
+        label, value, limit = ("x", x[at], width) if not 0 <= x[at] < width else ("y", y[at], height)
+        raise FileFormatError(
+            f"{path}: event {at} lies at {label} = {int(value)}; the sensor has {limit} pixels there by {phrase} "
+            f"(0 to {limit - 1}); give its true size, or leave such events out (skip)."
+        )
+    if OFF_SENSOR in skip:
+        counted[OFF_SENSOR] = counted.get(OFF_SENSOR, 0) + int(outside.sum())
+        table = tuple(values[~outside] for values in table)  # pyright: ignore[reportAssignmentType]
+    if not len(table[0]):
+        raise FileFormatError(f"{path} holds no event that is on the sensor and in order of time.")
+    return EventColumns(*table, height, width, phrase, counted)

@@ -12,6 +12,9 @@ from codesign.errors import FileFormatError
 from codesign.events.files import READERS
 from codesign.flow.checks import check_path
 
+# of several event files of one name the first of these kinds is read: text as the Event-Camera Dataset has it, what
+# cameras write, then arrays that somebody made of either
+KINDS = (".txt", ".csv", ".h5", ".aedat4", ".raw", ".dat")
 EVENT_SUFFIXES = {".txt", ".npy", *READERS}
 FLOW_SUFFIXES = {".flo", ".png", ".npy", ".npz", ".mat", ".txt", ".csv"}
 SIDE_FILES = {
@@ -98,13 +101,26 @@ def event_files(path: Path) -> list[Path]:
                 (entry for entry in folder.iterdir() if entry.is_file() and _holds_events(entry)), key=natural
             )
             named = [entry for entry in found if entry.stem.lower() == "events"]
-            files += named[:1] if named else found
+            files += sorted(named, key=_rank)[:1] if named else found
         if files:
             return files
     raise FileFormatError(
         f"{path} holds no events: no events.txt, no event file by another name "
         f"({', '.join(sorted(EVENT_SUFFIXES))}), and no subfolder with one."
     )
+
+
+def passed_over(file: Path) -> list[Path]:
+    """Other event files of the same name beside one, which event_files passes over."""
+    if file.stem.lower() != "events":
+        return []
+    same = (entry for entry in file.parent.iterdir() if entry.stem.lower() == "events" and entry != file)
+    return sorted((entry for entry in same if entry.is_file() and _holds_events(entry)), key=natural)
+
+
+def _rank(entry):
+    suffix = entry.suffix.lower()
+    return KINDS.index(suffix) if suffix in KINDS else len(KINDS)
 
 
 def flow_files(folder: Path) -> list[Path]:

@@ -8,6 +8,7 @@ by blanks or commas. A first line of two whole numbers is the sensor's width and
 import io
 import re
 import warnings
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,14 @@ import numpy as np
 from codesign.errors import FileFormatError
 from codesign.events.formats.arrival import DISORDER_US
 from codesign.flow.checks import check_kind, check_path
-from codesign.flow.sources.columns import LIMIT_PX, EventColumns, settled_size
+from codesign.flow.sources.columns import (
+    BACKWARDS,
+    LIMIT_PX,
+    OFF_SENSOR,
+    EventColumns,
+    on_sensor,
+    settled_size,
+)
 
 CHUNK_BYTES = 2**23
 MOST_EVENTS = 500_000_000
@@ -45,6 +53,7 @@ def read_text_events(
     told_by: str = "the file",
     columns: str = "auto",
     time_unit: str = "auto",
+    skip: Collection[str] = (),
 ) -> EventColumns:
     """Read events from a text file, eight megabytes at a time.
 
@@ -54,12 +63,15 @@ def read_text_events(
         "xytp" where only the third column rises.
       time_unit: "s", "ms", "us", "ns"; "auto": seconds where a time of the first chunk has a fraction, else
         microseconds.
+      skip: faults whose events are left out and counted instead of refused: columns.BACKWARDS,
+        columns.OFF_SENSOR.
     Returns: EventColumns in order of time. Events up to 1 ms late are put in order.
     Raises: FileFormatError naming the line that is not four numbers, goes back in time, lies outside the
       sensor or has another polarity.
     """
     path = check_path(path)
     parts = []
+    left_out = dict.fromkeys(skip, 0)
     number = 1
     carried_us = -(2**62)
     try:
@@ -72,7 +84,9 @@ def read_text_events(
                 if not parts:
                     columns = _settled_order(path, table, columns)
                     time_unit = _settled_unit(path, table[:, columns.index("t")], time_unit)
-                parts.append(_checked(path, table, at_lines, columns, UNITS_US[time_unit], carried_us))
+                parts.append(
+                    _checked(path, table, at_lines, columns, UNITS_US[time_unit], carried_us, left_out)
+                )
                 carried_us = max(carried_us, int(parts[-1][0].max())) if len(parts[-1][0]) else carried_us
                 number += lines.count(b"\n")
                 if sum(len(part[0]) for part in parts) > MOST_EVENTS:
@@ -89,7 +103,8 @@ def read_text_events(
         x = x[order]
         y = y[order]
         on = on[order]
-    return EventColumns(t_us, x, y, on, *settled_size(path, x, y, size, told, told_by))
+    settled = settled_size(path, x, y, size, told, told_by)
+    return on_sensor(path, (t_us, x, y, on), settled, skip, left_out)
 
 
 def _head(path, file, columns):
@@ -209,27 +224,35 @@ def _settled_unit(path, times, unit):
     return unit
 
 
-def _checked(path, table, at_lines, columns, us, carried_us):
-    """(t_us, x, y, on) of the rows of a table, narrow."""
+def _checked(path, table, at_lines, columns, us, carried_us, left_out):
+    """(t_us, x, y, on) of the rows of a table, narrow; faults named in ``left_out`` are counted there."""
     t, x, y, p = (table[:, columns.index(name)] for name in "txyp")
     t_us = np.rint(t * us)
     latest_us = np.maximum(np.maximum.accumulate(t_us), carried_us) if len(t_us) else t_us
-    for bad, reason in (
-        ((np.abs(t_us) >= 2**61), "its time exceeds 61 bits of microseconds"),
+    kept = np.ones(len(t_us), bool)
+    for fault, bad, reason in (
+        ("", np.abs(t_us) >= 2**61, "its time exceeds 61 bits of microseconds"),
         (
+            BACKWARDS,
             t_us < latest_us - DISORDER_US,
             f"its time lies more than {DISORDER_US} us before that of an earlier line",
         ),
         (
+            OFF_SENSOR,
             (x % 1 != 0) | (y % 1 != 0) | (x < 0) | (y < 0) | (x >= LIMIT_PX) | (y >= LIMIT_PX),
             f"pixel coordinates are whole numbers from 0 to {LIMIT_PX - 1}",
         ),
-        (~((p == 1) | (p == 0) | (p == -1)), "polarity is 1 or 0 (or +1 and -1)"),
+        ("", ~((p == 1) | (p == 0) | (p == -1)), "polarity is 1 or 0 (or +1 and -1)"),
     ):
-        if bool(bad.any()):
+        bad = bad & kept
+        if fault in left_out:
+            left_out[fault] += int(bad.sum())
+            kept &= ~bad
+        elif bool(bad.any()):
             at = int(np.argmax(bad))
             raise FileFormatError(
                 f"{path}, line {at_lines[at]}: {' '.join(f'{value:.15g}' for value in table[at])!r}: "
                 f"{reason}."
             )
+    t_us, x, y, p = (values[kept] for values in (t_us, x, y, p))
     return t_us.astype(np.int64), x.astype(np.int16), y.astype(np.int16), p > 0
