@@ -37,7 +37,8 @@ def moving(
       samples.
     Raises: ShapeError where shapes do not fit; GradientError for a second derivative.
     Cost: one pass forward, two backward; nothing of n bins is stored forward. Backward four values per sample and
-      bin, or ``lk_warp_kernel.MOST_VALUES`` where that is less, in each thread.
+      bin, or ``lk_warp_kernel.MOST_VALUES`` where that is less, in each thread. One kernel for each number of bins,
+      whatever the sizes; it is traced once for each size.
     Source: Lucas and Kanade, 1981; Jaderberg et al., Spatial Transformer Networks, NeurIPS 2015, for the reading.
     """
     batch, bins = rate.shape[:2]

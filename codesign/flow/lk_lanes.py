@@ -1,12 +1,16 @@
-"""What the kernels of the closed form share: the samples of an image, and opaque numbers for lanes of them."""
+"""What the kernels of the closed form share: the samples of an image, numbers for lanes of them, and recordings."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import cache, wraps
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from codesign import backend
+
+RECORDINGS = 64  # of a kernel: one for each size and setting in use
 
 
 @dataclass(frozen=True)
@@ -23,19 +27,76 @@ class Grid:
         return self.height // self.stride, self.width // self.stride
 
 
-class Lanes:
-    """One lane of drjit per sample and image, and numbers that need no new kernel when they change."""
+class Form(NamedTuple):
+    """What a kernel must know of its arrays: device, precision, and sizes of a batch of images."""
 
-    def __init__(self, like: Tensor, grid: Grid) -> None:
-        """Args: like: [B, ...], tells batch, device and precision."""
+    device: str
+    dtype: torch.dtype
+    images: int
+    height: int
+    width: int
+    stride: int
+
+    @classmethod
+    def of(cls, tensor: Tensor, grid: Grid) -> "Form":
+        """Of a tensor [B, ...] on the samples of ``grid``."""
+        return cls(tensor.device.type, tensor.dtype, len(tensor), grid.height, grid.width, grid.stride)
+
+    def load(self, *tensors: Tensor) -> list[Any]:
+        """As flat drjit arrays, without a copy where they are dense."""
+        flat = backend.arrays(self.device, self.dtype).Float
+        return [flat(tensor.detach().contiguous().reshape(-1)) for tensor in tensors]
+
+    def scalars(self, numbers: list[float]) -> list[Any]:
+        """Opaque: other numbers need no new kernel."""
+        import drjit as dr
+
+        flat = backend.arrays(self.device, self.dtype).Float
+        return [dr.opaque(flat, number) for number in numbers]
+
+
+def recorded(kernel: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of drjit arrays and hashable settings that is traced once for each of the settings, and replayed
+    after that: small images cost mostly tracing. Widths of arrays must follow from the settings."""
+
+    @cache
+    def frozen():
+        import drjit as dr
+
+        return dr.freeze(kernel, limit=RECORDINGS, warn_after=1 << 30)
+
+    @wraps(kernel)
+    def run(*args):
+        import drjit as dr
+
+        with dr.suspend_grad():
+            return frozen()(*args)
+
+    return run
+
+
+def tensors(shape: tuple[int, ...], *values: Any) -> list[Tensor]:
+    """Evaluated drjit arrays as tensors of one shape that own their memory."""
+    import drjit as dr
+
+    dr.sync_thread()
+    return [value.torch().reshape(shape) for value in values]
+
+
+class Lanes:
+    """Lanes of drjit for the samples of images, and numbers that need no new kernel when they change."""
+
+    def __init__(self, form: Form) -> None:
         import drjit as dr
 
         self.dr: Any = dr
-        self.arr = backend.arrays(like.device.type, like.dtype)
-        self.double = backend.arrays(like.device.type, torch.float64).Float
-        self.images = len(like)
-        self.rows, self.columns = grid.shape
+        self.arr = backend.arrays(form.device, form.dtype)
+        self.double = backend.arrays(form.device, torch.float64).Float
+        self.form = form
+        self.images = form.images
+        self.rows, self.columns = Grid(*form[3:]).shape
         self.samples = self.rows * self.columns
+        self.width = self.images * self.samples
         self.area = self.count(self.samples)
         self.across = self.count(self.columns)
 
@@ -47,9 +108,6 @@ class Lanes:
 
     def lanes(self, count: int) -> Any:
         return self.dr.arange(self.arr.UInt32, count)
-
-    def load(self, tensor: Tensor) -> Any:
-        return self.arr.Float(tensor.detach().contiguous().reshape(-1))
 
     def take(self, flat: Any, index: Any) -> Any:
         return self.dr.gather(self.arr.Float, flat, index)
@@ -79,9 +137,3 @@ class Lanes:
             mode="symbolic",
         )
         return carried
-
-    def tensors(self, shape: tuple[int, ...], *values: Any) -> list[Tensor]:
-        """Compute the values, as tensors of one shape that own their memory."""
-        self.dr.eval(values)
-        self.dr.sync_thread()
-        return [value.torch().reshape(shape) for value in values]

@@ -47,8 +47,8 @@ def stride(sigma_px: float, shortest_px: int = 2**30) -> int:
 
 
 def signed_rate(volume: EventVolume) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
-    """(weight [n], time [n]) of the bins, events per interval [B, n, H, W] as if each bin ran over all of it,
-    and events of both signs per pixel [B, H, W]; hot pixels weighed down.
+    """(weight [n], time [n]) of the bins, ON less OFF events [B, n, H, W] of each, and events of both signs per
+    pixel [B, H, W]; hot pixels weighed down.
 
     Weights are the shares of the interval; time is 0 at mid-interval, in intervals.
     """
@@ -56,10 +56,10 @@ def signed_rate(volume: EventVolume) -> tuple[tuple[Tensor, Tensor], Tensor, Ten
     span = volume.collected_s.sum()
     weight = (volume.collected_s / span).to(counts)
     time = (volume.centroid_s / span).to(counts) - 0.5
+    on, off = counts.unbind(1)
     events = counts.sum((1, 2))
     kept = cool(events)
-    rate = kept[:, None] * (counts[:, 0] - counts[:, 1]) / weight[:, None, None]
-    return (weight, time), rate, kept * events
+    return (weight, time), kept[:, None] * (on - off), kept * events
 
 
 def cool(events: Tensor) -> Tensor:
@@ -69,12 +69,18 @@ def cool(events: Tensor) -> Tensor:
     events. Moving texture puts events on several pixels; a hot pixel has them alone.
     Args: events [B, H, W]. Returns: [B, H, W].
     """
-    side = 5
-    padded = pad(torch.stack([events, torch.ones_like(events)]), (side // 2,) * 4)
-    total, number = side**2 * avg_pool2d(padded, side, 1)
+    total = _boxes(events)
+    number = _boxes(torch.ones_like(events[:1, :, :1])) * _boxes(torch.ones_like(events[:1, :1]))
     around = (total - events).clamp_min(0) / (number - 1)
     excess = (events - LONELY * around - HOT_EVENTS).clamp_min(0) / (around + HOT_EVENTS)
     return 1 / (1 + excess.square())
+
+
+def _boxes(images):
+    """Sums over the 5 x 5 pixels around each of [B, H, W], or as many of them as there are."""
+    side = 5
+    across = avg_pool2d(images, (1, side), 1, (0, side // 2), divisor_override=1)
+    return avg_pool2d(across, (side, 1), 1, (side // 2, 0), divisor_override=1)
 
 
 class Level:
@@ -101,7 +107,8 @@ class Level:
         weight, self.time = times
         centred = self.time - weight @ self.time
         spread = weight @ centred.square()
-        self.contrast = torch.stack([weight, weight * centred / spread])  # mean over bins, slope over time
+        # of the rate, the events over the share of the interval: mean over bins, slope over time
+        self.contrast = torch.stack([torch.ones_like(weight), centred / spread])
         self.slope_noise = 1 / (float(spread) * OVERLAP * sigma_px**2)
         self.texture_noise = _slope_of_noise(kernel, self.stride)
 

@@ -2,24 +2,120 @@
 
 from torch import Tensor
 
-from codesign.flow.lk_lanes import Grid, Lanes
+from codesign.flow.lk_lanes import Form, Grid, Lanes, recorded, tensors
 
 PRODUCTS = 8
+
+
+def forward(mean: Tensor, slope: Tensor, seen: Tensor, density: Tensor, grid: Grid, cell: int) -> Tensor:
+    """[B, 8, ceil(h / cell), w]: sums along the columns of each cell."""
+    form = Form.of(mean, grid)
+    rows, columns = grid.shape
+    found = _forward(form, cell, *form.load(mean, slope, seen, density))
+    return tensors((len(mean), PRODUCTS, -(-rows // cell), columns), found)[0]
+
+
+def adjoint(
+    mean: Tensor, slope: Tensor, seen: Tensor, density: Tensor, grid: Grid, cell: int, grad: Tensor
+) -> list[Tensor]:
+    """Gradients of mean, slope, seen, density from that of the cells' sums [B, 8, ceil(h / cell), ceil(w /
+    cell)]."""
+    form = Form.of(mean, grid)
+    return tensors(mean.shape, *_adjoint(form, cell, *form.load(mean, slope, seen, density, grad)))
+
+
+@recorded
+def _forward(form, cell, mean, slope, seen, density):
+    image = _Slopes(form, cell, mean)
+    dr = image.dr
+    arr = image.arr
+    rows = image.cell_rows
+    width = image.images * rows * image.columns
+    number, place = image.split(image.lanes(width), rows * image.columns)
+    row, x = image.split(place, image.columns)
+    start = number * image.area
+    first = row * image.count(cell)
+    end = dr.minimum(first + image.count(cell), image.count(image.rows))
+
+    def body(y, *sums):
+        at = start + y * image.across + x
+        by_x, by_y = image.slopes(start, y, x)
+        s = image.take(slope, at)
+        weight = image.take(seen, at)
+        sx = weight * by_x
+        sy = weight * by_y
+        ss = weight * s
+        terms = (
+            (sx, by_x),
+            (sx, by_y),
+            (sy, by_y),
+            (sx, s),
+            (sy, s),
+            (ss, s),
+            (weight, 1),
+            (weight, image.take(density, at)),
+        )
+        return [dr.fma(a, b, total) for (a, b), total in zip(terms, sums, strict=True)]
+
+    sums = image.loop(first, end, body, *([dr.zeros(arr.Float, width)] * PRODUCTS))
+    target = image.empty(PRODUCTS * width)
+    plane = image.count(rows * image.columns)
+    for k, total in enumerate(sums):
+        image.put(target, total, (number * PRODUCTS + k) * plane + place)
+    dr.eval(target)
+    return target
+
+
+@recorded
+def _adjoint(form, cell, mean, slope, seen, density, grad):
+    image = _Slopes(form, cell, mean)
+    dr = image.dr
+    across = -(-image.columns // cell)
+    at = image.lanes(image.width)
+    number, place = image.split(at, image.samples)
+    y, x = image.split(place, image.columns)
+    start = number * image.area
+    plane = image.count(image.cell_rows * across)
+    of_cell = (
+        number * PRODUCTS * plane + image.split(y, cell)[0] * image.count(across) + image.split(x, cell)[0]
+    )
+    by_xx, by_xy, by_yy, by_xs, by_ys, by_ss, by_one, by_density = (
+        image.take(grad, of_cell + k * plane) for k in range(PRODUCTS)
+    )
+    by_x, by_y = image.slopes(start, y, x)
+    s = image.take(slope, at)
+    seen = image.take(seen, at)
+    density = image.take(density, at)
+    on_x = by_xx * by_x + by_xy * by_y + by_xs * s  # twice, less what is quadratic once
+    on_y = by_yy * by_y + by_ys * s
+    on_s = by_ss * s
+    grad_seen = on_x * by_x + on_y * by_y + on_s * s + by_one + by_density * density
+    grad_x = seen * (on_x + by_xx * by_x)
+    grad_y = seen * (on_y + by_yy * by_y + by_xy * by_x)
+    grad_slope = seen * (by_xs * by_x + by_ys * by_y + 2 * on_s)
+    grad_x *= image.factor(x, image.edge)
+    grad_y *= image.factor(y, image.bottom)
+    dr.eval(grad_x, grad_y, grad_slope, grad_seen)
+    grad_density = by_density * seen
+    grad_mean = _back(image, grad_x, start + y * image.across, x, image.edge, 1) + _back(
+        image, grad_y, start + x, y, image.bottom, image.across
+    )
+    dr.eval(grad_mean, grad_density)
+    return grad_mean, grad_slope, grad_seen, grad_density
 
 
 class _Slopes(Lanes):
     """The slopes of the mean at a sample, and the other values there."""
 
-    def __init__(self, mean, slope, seen, density, grid, cell):
-        super().__init__(mean, grid)
-        self.mean, self.slope, self.seen, self.density = (self.load(x) for x in (mean, slope, seen, density))
-        self.cell = cell
+    def __init__(self, form, cell, mean):
+        super().__init__(form)
+        self.mean = mean
         self.cell_rows = -(-self.rows // cell)
         self.bottom = self.count(self.rows - 1)
         self.edge = self.count(self.columns - 1)
         # of a slope between two neighbours of the sample, and of one at the border
-        self.per_two = self.number(1 / (2 * grid.stride))
-        self.per_one = self.number(1 / grid.stride)
+        self.per_two = self.number(1 / (2 * form.stride))
+        self.per_one = self.number(1 / form.stride)
 
     def slopes(self, start, y, x):
         """Central differences of the mean, one-sided at the border; ``start``: index of the image's first
@@ -38,94 +134,6 @@ class _Slopes(Lanes):
 
     def factor(self, at, last):
         return self.dr.select((at > 0) & (at < last), self.per_two, self.per_one)
-
-
-def forward(mean: Tensor, slope: Tensor, seen: Tensor, density: Tensor, grid: Grid, cell: int) -> Tensor:
-    """[B, 8, ceil(h / cell), w]: sums along the columns of each cell."""
-    image = _Slopes(mean, slope, seen, density, grid, cell)
-    dr = image.dr
-    arr = image.arr
-    rows = image.cell_rows
-    width = image.images * rows * image.columns
-    with dr.suspend_grad():
-        number, place = image.split(image.lanes(width), rows * image.columns)
-        row, x = image.split(place, image.columns)
-        start = number * image.area
-        first = row * image.count(cell)
-        end = dr.minimum(first + image.count(cell), image.count(image.rows))
-
-        def body(y, *sums):
-            at = start + y * image.across + x
-            by_x, by_y = image.slopes(start, y, x)
-            s = image.take(image.slope, at)
-            seen = image.take(image.seen, at)
-            sx = seen * by_x
-            sy = seen * by_y
-            ss = seen * s
-            terms = (
-                (sx, by_x),
-                (sx, by_y),
-                (sy, by_y),
-                (sx, s),
-                (sy, s),
-                (ss, s),
-                (seen, 1),
-                (seen, image.take(image.density, at)),
-            )
-            return [dr.fma(a, b, total) for (a, b), total in zip(terms, sums, strict=True)]
-
-        sums = image.loop(first, end, body, *([dr.zeros(arr.Float, width)] * PRODUCTS))
-        target = image.empty(PRODUCTS * width)
-        plane = image.count(rows * image.columns)
-        for k, total in enumerate(sums):
-            image.put(target, total, (number * PRODUCTS + k) * plane + place)
-        return image.tensors((image.images, PRODUCTS, rows, image.columns), target)[0]
-
-
-def adjoint(
-    mean: Tensor, slope: Tensor, seen: Tensor, density: Tensor, grid: Grid, cell: int, grad: Tensor
-) -> list[Tensor]:
-    """Gradients of mean, slope, seen, density from that of the cells' sums [B, 8, ceil(h / cell), ceil(w /
-    cell)]."""
-    image = _Slopes(mean, slope, seen, density, grid, cell)
-    dr = image.dr
-    width = image.images * image.samples
-    across = grad.shape[3]
-    with dr.suspend_grad():
-        grad = image.load(grad)
-        at = image.lanes(width)
-        number, place = image.split(at, image.samples)
-        y, x = image.split(place, image.columns)
-        start = number * image.area
-        plane = image.count(image.cell_rows * across)
-        of_cell = (
-            number * PRODUCTS * plane
-            + image.split(y, cell)[0] * image.count(across)
-            + image.split(x, cell)[0]
-        )
-        by_xx, by_xy, by_yy, by_xs, by_ys, by_ss, by_one, by_density = (
-            image.take(grad, of_cell + k * plane) for k in range(PRODUCTS)
-        )
-        by_x, by_y = image.slopes(start, y, x)
-        s = image.take(image.slope, at)
-        seen = image.take(image.seen, at)
-        density = image.take(image.density, at)
-        on_x = by_xx * by_x + by_xy * by_y + by_xs * s  # twice, less what is quadratic once
-        on_y = by_yy * by_y + by_ys * s
-        on_s = by_ss * s
-        grad_seen = on_x * by_x + on_y * by_y + on_s * s + by_one + by_density * density
-        grad_x = seen * (on_x + by_xx * by_x)
-        grad_y = seen * (on_y + by_yy * by_y + by_xy * by_x)
-        grad_slope = seen * (by_xs * by_x + by_ys * by_y + 2 * on_s)
-        grad_x *= image.factor(x, image.edge)
-        grad_y *= image.factor(y, image.bottom)
-        dr.eval(grad_x, grad_y, grad_slope, grad_seen)
-        grad_density = by_density * seen
-        grad_mean = _back(image, grad_x, start + y * image.across, x, image.edge, 1) + _back(
-            image, grad_y, start + x, y, image.bottom, image.across
-        )
-        shape = (image.images, *grid.shape)
-        return image.tensors(shape, grad_mean, grad_slope, grad_seen, grad_density)
 
 
 def _back(image, grad, start, at, last, step):
