@@ -85,11 +85,13 @@ class FlowWindows:
     volume: EventVolume of B samples. truth: FlowField of the same interval, on the pixels of its start.
     frames: [B, 2, H, W] linear intensity at the start and at the end, 0..255 scale; None where there are
       none.
+    start: FlowField with covariance that a network may begin with; None where it makes its own.
     """
 
     volume: EventVolume
     truth: FlowField
     frames: Tensor | None = None
+    start: FlowField | None = None
 
 
 class PixelGrid(Protocol):

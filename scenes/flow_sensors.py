@@ -32,7 +32,7 @@ class Sensors:
       pace: largest change of speed within a window.
     """
 
-    density: tuple[float, float] = (0.03, 8.0)
+    density: tuple[float, float] = (0.08, 12.0)
     light: tuple[float, float] = (10.0, 150.0)
     duration_s: tuple[float, float] = (0.003, 0.06)
     theta: tuple[float, float] = (0.1, 0.4)

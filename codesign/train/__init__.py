@@ -1,10 +1,10 @@
 """Training: batches by step, the learner, the loop around it, several processes, validation."""
 
-from codesign.train.batches import Batches, Part, Source
+from codesign.train.batches import Batches, Part, Source, Started
 from codesign.train.fit import fit
 from codesign.train.learner import Learner, adamw
 from codesign.train.loop import Budget, Clock, Cosine, Progress
-from codesign.train.objectives import Contrast, Photometric, Supervised
+from codesign.train.objectives import Contrast, Likelihood, Photometric, Supervised
 from codesign.train.parallel import Ranks, join
 from codesign.train.validation import Score, error_ratio, score
 
@@ -15,12 +15,14 @@ __all__ = [
     "Contrast",
     "Cosine",
     "Learner",
+    "Likelihood",
     "Part",
     "Photometric",
     "Progress",
     "Ranks",
     "Score",
     "Source",
+    "Started",
     "Supervised",
     "adamw",
     "error_ratio",

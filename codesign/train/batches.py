@@ -7,6 +7,7 @@ with an end have ``__len__`` too.
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
@@ -102,31 +103,42 @@ def shuffled(indices: Sequence[int], length: int) -> list[int]:
 def turned(windows: FlowWindows, way: int) -> FlowWindows:
     """The same windows seen in a mirror or turned: way 0 to 15, bits: mirror x, mirror y, exchange x and y,
     exchange polarities. Exact."""
-    counts = windows.volume.counts
+    counts = _image(windows.volume.counts, way)
     frames = windows.frames
-    flow = windows.truth.flow_px
-    valid = windows.truth.valid
-    for bit, axis in ((1, -1), (2, -2)):
-        if way & bit:
-            sign = torch.tensor(
-                [-1.0, 1.0] if axis == -1 else [1.0, -1.0], dtype=flow.dtype, device=flow.device
-            )
-            counts = counts.flip(axis)
-            flow = flow.flip(axis) * sign[:, None, None]
-            valid = valid.flip(axis)
-            frames = None if frames is None else frames.flip(axis)
-    if way & 4:
-        counts = counts.transpose(-1, -2)
-        flow = flow.flip(1).transpose(-1, -2)
-        valid = valid.transpose(-1, -2)
-        frames = None if frames is None else frames.transpose(-1, -2)
-    if way & 8:
-        counts = counts.flip(1)
-    volume = EventVolume(counts.contiguous(), windows.volume.centroid_s, windows.volume.collected_s)
     return FlowWindows(
-        volume,
-        FlowField(flow.contiguous(), valid.contiguous(), windows.truth.interval_s),
-        None if frames is None else frames.contiguous(),
+        replace(windows.volume, counts=(counts.flip(1) if way & 8 else counts).contiguous()),
+        _field(windows.truth, way),
+        None if frames is None else _image(frames, way).contiguous(),
+        None if windows.start is None else _field(windows.start, way),
+    )
+
+
+def _image(image, way):
+    """Rows and columns [..., H, W] turned."""
+    for bit, axis in ((1, -1), (2, -2)):
+        image = image.flip(axis) if way & bit else image
+    return image.transpose(-1, -2) if way & 4 else image
+
+
+def _field(field, way):
+    """A FlowField turned: components of the flow and of the covariance change places and signs with the
+    pixels."""
+    x = -1.0 if way & 1 else 1.0
+    y = -1.0 if way & 2 else 1.0
+
+    def turn(components, signs):
+        if components is None:
+            return None
+        turned = _image(components, way) * torch.tensor(signs).to(components)[:, None, None]
+        return (turned.flip(1) if way & 4 else turned).contiguous()
+
+    confidence = field.confidence
+    return replace(
+        field,
+        flow_px=turn(field.flow_px, [x, y]),
+        valid=_image(field.valid, way).contiguous(),
+        confidence=None if confidence is None else _image(confidence, way).contiguous(),
+        covariance_px2=turn(field.covariance_px2, [1.0, x * y, 1.0]),
     )
 
 
@@ -144,6 +156,39 @@ class Part:
     def batch(self, indices: Sequence[int]) -> Any:
         """The samples of these numbers, counted from the first."""
         return self.source.batch([self.first + index for index in indices])
+
+
+class Started:
+    """Windows of a source together with what a network begins from, estimated once however often they are shown.
+
+    Args: start: EventVolume -> FlowField with covariance, equivariant to turns and mirrors. foreign: share of the
+      samples that begin elsewhere, as from the window before: with half to one and a fifth of the start's flow, and a
+      covariance of 1 px^2 along both axes.
+    """
+
+    def __init__(self, source: Source, start: Callable[[EventVolume], FlowField], foreign: float = 0.0):
+        self.source = source
+        self.start = start
+        self.foreign = foreign
+
+    def batch(self, indices: Sequence[int]) -> FlowWindows:
+        """The samples of these numbers."""
+        windows = self.source.batch(indices)
+        with torch.no_grad():
+            start = self.start(windows.volume)
+        claimed = start.covariance_px2
+        assert claimed is not None
+        unknown = torch.tensor([1.0, 0.0, 1.0]).to(claimed)[:, None, None].expand_as(claimed[0])
+        flows = []
+        covariances = []
+        for index, flow, covariance in zip(indices, start.flow_px, claimed, strict=True):
+            draw = torch.rand(2, generator=torch.Generator().manual_seed(int(index)))
+            elsewhere = bool(draw[0] < self.foreign)
+            flows.append(flow * (0.5 + 0.7 * float(draw[1])) if elsewhere else flow)
+            covariances.append(unknown if elsewhere else covariance)
+        return replace(
+            windows, start=replace(start, flow_px=torch.stack(flows), covariance_px2=torch.stack(covariances))
+        )
 
 
 def probe(source: Source) -> Any:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from codesign.errors import DomainError
 from codesign.flow.losses import (
     contrast_loss,
+    laplace_loss,
     likelihood_loss,
     photometric_loss,
     relative_unit,
@@ -21,7 +22,10 @@ GAMMA = 0.8  # an earlier prediction counts so much less than the next (Teed and
 
 
 def flow_predictions(network: nn.Module, windows: FlowWindows) -> list[FlowField]:
-    """All predictions of a flow network, the last one counting most; of a plain one, its one flow."""
+    """All predictions of a flow network, the last one counting most; of a plain one, its one flow. A network that
+    refines begins with the start of the windows where they have one."""
+    if windows.start is not None and hasattr(network, "refined"):
+        return network.refined(windows.volume, windows.start, through=False)
     several = getattr(network, "predictions", None)
     return [network(windows.volume)] if several is None else several(windows.volume)
 
@@ -51,11 +55,31 @@ class Supervised:
 
     def check(self, windows: FlowWindows) -> None:
         """Raise DomainError for windows without any true flow."""
-        if not bool(windows.truth.valid.any()):
-            raise DomainError(
-                "the supervised loss needs true flow, and the windows looked at have none; choose the "
-                "contrast loss, or check the data set."
-            )
+        _need_truth(windows)
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Likelihood of the error under the covariance that the network claims, with long tails: what nothing can be
+    known of pulls little, and a tenth of a pixel counts where a hundredth is claimed.
+
+    distance: weight of the distance to the true flow beside it, as shares of the window's own root mean square
+      flow; a network that claims no covariance is taught by it alone.
+    """
+
+    distance: float = 0.3
+
+    def __call__(self, predictions: Sequence[FlowField], windows: FlowWindows) -> Tensor:
+        """The loss, a scalar. Gradient: to flow and claim."""
+        unit = relative_unit(windows.truth)
+        loss = supervised_loss(predictions, windows.truth, GAMMA, unit_per_px=unit)
+        if any(field.covariance_px2 is None for field in predictions):
+            return loss
+        return self.distance * loss + laplace_loss(predictions, windows.truth, GAMMA)
+
+    def check(self, windows: FlowWindows) -> None:
+        """Raise DomainError for windows without any true flow."""
+        _need_truth(windows)
 
 
 @dataclass(frozen=True)
@@ -105,6 +129,14 @@ class Photometric:
                 "the photometric loss needs frames, and these windows have none; choose the supervised or "
                 "the contrast loss."
             )
+
+
+def _need_truth(windows):
+    if not bool(windows.truth.valid.any()):
+        raise DomainError(
+            "the supervised loss needs true flow, and the windows looked at have none; choose the "
+            "contrast loss, or check the data set."
+        )
 
 
 def _weighted(predictions: Sequence[FlowField], of_flow: Callable[[Tensor], Tensor]):

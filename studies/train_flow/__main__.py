@@ -40,14 +40,14 @@ class Config(StudyConfig):
     """Arguments of the network's constructor, name=number."""
     weights: int = 0
     """Number of weights wanted of a network that comes in sizes; 0 leaves its own."""
-    mix: str = "delivered"
+    mix: str = "real"
     """Windows to train on (studies.train_flow.sources)."""
     data: Path | None = None
     """Folder of a data set (ours, DSEC, MVSEC) to train on instead; its last tenth is what is judged on."""
     window_frames: int = 1
     """Frame intervals per window of a data set."""
-    loss: str = "supervised"
-    """supervised, contrast or photometric."""
+    loss: str = "likelihood"
+    """likelihood, supervised, contrast or photometric."""
     unit: Literal["px", "motion"] = "motion"
     """Errors count in pixels, or as shares of the window's own root mean square flow (supervised)."""
     claim_weight: float = 0.1
@@ -59,7 +59,7 @@ class Config(StudyConfig):
     cpu_minutes: float | None = None
     """Processor time to spend, minutes; 20 without --steps. With --steps: the run stops there even if steps
     are left."""
-    batch: int = 8
+    batch: int = 16
     """Windows per step, over all processes."""
     height_px: int = 64
     """Height of the windows; of the piece cut out of a data set's."""
@@ -67,15 +67,15 @@ class Config(StudyConfig):
     """Width likewise."""
     bins: int = 8
     """Time bins of the windows."""
-    reuse: int = 4
-    """Times that windows are shown, turned and mirrored in between; making them costs as much as a step."""
+    reuse: int = 16
+    """Times that windows are shown, turned and mirrored in between; making them costs more than a step."""
     learning_rate: float = 2e-3
     """Largest step of AdamW."""
     weight_decay: float = 1e-4
     """Decay of AdamW."""
     warm_up: float = 0.05
     """Share of the budget over which the step grows; then it falls as a half cosine to a hundredth."""
-    clip: float = 5.0
+    clip: float = 1.0
     """Longest gradient; longer ones are shortened to it, and counted."""
     average: float = 0.998
     """Decay per step of a running average of the weights, which is then what is judged and kept; 0 for

@@ -11,15 +11,29 @@ import torch
 from codesign.errors import DomainError, FileFormatError
 from codesign.flow import checkpoint
 from codesign.flow.sources import open_windows
-from codesign.train import Batches, Contrast, Learner, Part, Photometric, Progress, Supervised, adamw
+from codesign.train import (
+    Batches,
+    Contrast,
+    Learner,
+    Likelihood,
+    Part,
+    Photometric,
+    Progress,
+    Started,
+    Supervised,
+    adamw,
+)
 from codesign.train import checkpoint as training
 from codesign.train.batches import probe
 from studies.train_flow.sources import VALIDATION, Shape, training_parts
 
 # the last window in so many of a data set is judged on: whole stretches, since neighbours look alike
 HELD_OUT = 10
+FOREIGN = 0.2  # share of the windows on which a network that refines begins from another flow than its own
+POOL = 64  # batches shown in turn before windows come again
 LOSSES = {
     "supervised": lambda config: Supervised(config.unit, config.claim_weight),
+    "likelihood": lambda config: Likelihood(),
     "contrast": lambda config: Contrast(config.smoothness),
     "photometric": lambda config: Photometric(config.smoothness),
 }
@@ -125,7 +139,9 @@ def prepare(config, folder, resumed, ranks, clock):
         "torch": torch.__version__,
     }
     progress = training.load(folder / "checkpoint", learner, facts) if resumed else None
-    batches = Batches(parts, config.batch, config.reuse, mine=ranks.mine)
+    if hasattr(network, "start") and config.data is None:
+        parts = [(share, Started(source, network.start, FOREIGN)) for share, source in parts]
+    batches = Batches(parts, config.batch, config.reuse, POOL, ranks.mine)
     return Job(learner, batches, validation, progress or Progress(), facts)
 
 

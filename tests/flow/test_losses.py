@@ -138,6 +138,27 @@ def test_likelihood_is_that_of_a_gaussian(generator):
     assert float(found) == pytest.approx(float(expected))
 
 
+def test_long_tailed_likelihood_is_that_of_a_density_with_the_covariance_claimed(generator):
+    """exp(-sqrt(3) |e|) integrated over the plane in polar coordinates has the mass 2 pi / 3 and the second moment 1
+    along each axis; with it the loss is the log density of errors whitened by the claim."""
+    radius = torch.linspace(0, 40, 400_001, dtype=D)
+    density = torch.exp(-math.sqrt(3) * radius) * 2 * math.pi * radius
+    mass = float(torch.trapezoid(density, radius))
+    assert mass == pytest.approx(2 * math.pi / 3, rel=1e-8)
+    assert float(torch.trapezoid(density * radius**2, radius)) / mass == pytest.approx(2, rel=1e-8)
+    factor = torch.randn(1, 4, 2, 2, generator=generator, dtype=D) + 3 * torch.eye(2, dtype=D)
+    matrix = factor @ factor.mT
+    flow, truth = 5 * torch.randn(2, 1, 4, 2, generator=generator, dtype=D)
+    white = torch.linalg.solve(
+        torch.linalg.cholesky(matrix + 0.0025 * torch.eye(2, dtype=D)), (flow - truth)[..., None]
+    )
+    expected = math.sqrt(3) * white.square().sum((-1, -2)).add(1e-4).sqrt()
+    expected = (expected + torch.linalg.slogdet(matrix + 0.0025 * torch.eye(2, dtype=D))[1] / 2).mean()
+    claim = torch.stack([matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]], 1)[:, :, None]
+    found = losses.laplace_loss([field(flow.tolist(), covariance_px2=claim)], field(truth.tolist()))
+    assert float(found) == pytest.approx(float(expected))
+
+
 def test_likelihood_of_a_confidence_is_least_where_it_is_honest():
     # an error of e px per axis: (2 e^2 / s + 2 ln s) / 2 is least at s = e^2 = 64 (1 - c) + 0.01
     truth = field([[(0.0, 0.0)]])

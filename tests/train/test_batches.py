@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from codesign.train.batches import Batches, pick, probe, shuffled, to_device, turned, without_truth
+from codesign.train.batches import Batches, Started, pick, probe, shuffled, to_device, turned, without_truth
 from codesign.types import EventVolume, FlowField, FlowWindows
 
 
@@ -54,6 +54,22 @@ def test_turned_windows_show_the_turned_motion(way):
     assert seen.truth.flow_px[0, :, y[0], x[0]].tolist() == [float(x[1] - x[0]), float(y[1] - y[0])]
     assert seen.frames is not None
     assert torch.equal(seen.frames[0], seen.volume.counts[0].sum(0))
+
+
+@pytest.mark.parametrize("way", range(16))
+def test_a_start_is_turned_with_the_truth(way):
+    """A start that errs by e = (1, 2) px and claims the covariance e e^T still does, e turned."""
+    flow = torch.randn(2, 2, 5, 7, generator=torch.Generator().manual_seed(1))
+    valid = torch.ones(2, 5, 7, dtype=torch.bool)
+    error = torch.tensor([1.0, 2.0])[:, None, None]
+    claim = torch.tensor([1.0, 2.0, 4.0])[:, None, None].expand(2, 3, 5, 7)
+    volume = EventVolume(torch.ones(2, 2, 2, 5, 7), torch.tensor([0.0, 1.0]), torch.tensor([0.5, 0.5]))
+    start = FlowField(flow + error, valid, 1.0, torch.rand(2, 5, 7), claim)
+    seen = turned(FlowWindows(volume, FlowField(flow, valid, 1.0), start=start), way)
+    assert seen.start is not None
+    assert seen.start.covariance_px2 is not None
+    x, y = (seen.start.flow_px - seen.truth.flow_px).unbind(1)
+    torch.testing.assert_close(seen.start.covariance_px2, torch.stack([x * x, x * y, y * y], 1))
 
 
 def test_the_sixteen_ways_differ():
@@ -121,3 +137,41 @@ def test_windows_without_any_true_flow_are_counted():
     windows.truth.valid[2, 1:] = False
     assert without_truth(windows) == 1
     assert without_truth((torch.zeros(3), torch.zeros(3))) == 0
+
+
+def test_a_start_is_estimated_once_for_all_showings():
+    asked = []
+
+    def estimate(volume):
+        asked.append(len(volume.counts))
+        flow = volume.counts.sum(1)
+        return FlowField(flow, flow[:, 0] > 0, 1.0, None, flow.repeat(1, 2, 1, 1)[:, :3])
+
+    shown = Batches([(1.0, Started(Made(), estimate))], 2, reuse=4, pool=3)
+    for step in range(12):
+        windows = shown(step)
+        assert windows.start is not None
+        length = windows.start.flow_px.square().sum(1)
+        torch.testing.assert_close(length, windows.volume.counts.sum(1).square().sum(1))
+    assert asked == [2, 2, 2]
+
+
+def test_some_begin_elsewhere():
+    """A fifth of the samples, the same ones in any batch: 0.5 to 1.2 of the start, claimed to a pixel."""
+
+    def estimate(volume):
+        flow = volume.counts.sum(1)
+        return FlowField(flow, flow[:, 0] > 0, 1.0, None, torch.zeros(len(flow), 3, 6, 6))
+
+    windows = Started(Made(), estimate, foreign=0.2).batch(range(200))
+    assert windows.start is not None
+    assert windows.start.covariance_px2 is not None
+    elsewhere = windows.start.covariance_px2[:, 0, 0, 0] == 1
+    assert 25 <= int(elsewhere.sum()) <= 55  # 40, five deviations of 5.7 off at the most
+    factor = (windows.start.flow_px / windows.volume.counts.sum(1)).mean((1, 2, 3))
+    assert torch.allclose(factor[~elsewhere], torch.ones(()))
+    assert 0.5 <= float(factor[elsewhere].min()) < 0.6
+    assert 1.1 < float(factor[elsewhere].max()) <= 1.2
+    alone = Started(Made(), estimate, foreign=0.2).batch([int(elsewhere.nonzero()[0])])
+    assert alone.start is not None
+    assert torch.equal(alone.start.flow_px[0], windows.start.flow_px[elsewhere][0])

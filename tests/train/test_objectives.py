@@ -1,10 +1,13 @@
 """Objectives of flow networks, put together by hand."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from codesign.flow.losses import likelihood_loss
-from codesign.train import Contrast, Photometric, Supervised
+from codesign.flow.losses import laplace_loss, likelihood_loss, relative_unit, supervised_loss
+from codesign.train import Contrast, Likelihood, Photometric, Supervised
+from codesign.train.objectives import flow_predictions
 from codesign.types import FlowField
 from tests.flow_training_case import SIDE, Made
 
@@ -42,3 +45,28 @@ def test_the_likelihood_teaches_the_claim_and_leaves_the_flow_alone():
     assert torch.equal(flow, same)
     assert unseen is None
     assert float(claim.abs().min()) > 0
+
+
+def test_the_likelihood_pulls_at_flow_and_claim_beside_the_distance():
+    windows = Made().batch(range(4))
+    claim = torch.tensor([1.0, 0.0, 2.0])[:, None, None].repeat(4, 1, SIDE, SIDE).requires_grad_()
+    prediction = field(0, claim)
+    loss = Likelihood(0.3)([prediction], windows)
+    distance = supervised_loss([prediction], windows.truth, unit_per_px=relative_unit(windows.truth))
+    expected = 0.3 * distance + laplace_loss([prediction], windows.truth)
+    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-6)
+    flow, claimed = torch.autograd.grad(loss, (prediction.flow_px, claim))
+    assert float(flow.abs().min()) > 0
+    assert float(claimed.abs().min()) > 0
+    plain = Likelihood(0.3)([field(0)], windows)
+    assert float(plain.detach()) == pytest.approx(float(distance.detach()), rel=1e-6)
+
+
+def test_windows_with_a_start_are_refined_from_it():
+    class Refines(torch.nn.Module):
+        def refined(self, volume, start, through):
+            return [volume, start, through]
+
+    windows = Made().batch(range(2))
+    begun = replace(windows, start=field(3))
+    assert flow_predictions(Refines(), begun) == [begun.volume, begun.start, False]
