@@ -1,0 +1,339 @@
+"""Flow along a stream of events: windows by time or by number of events, each with its flow and confidence, as the
+chunks of a camera come in."""
+
+import inspect
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from codesign.errors import DomainError, ShapeError
+from codesign.events.entry import check_whole
+from codesign.events.stream import check_stream
+from codesign.events.volumes.volume import check_bins, from_stream
+from codesign.flow.checks import check_field, check_number, check_size, shown
+from codesign.flow.sources.columns import BACKWARDS, OFF_SENSOR
+from codesign.flow.sources.packet import EMPTY
+from codesign.flow.warp import pixel_grid
+from codesign.types import EventStream, EventVolume, FlowField
+
+Chunk = EventStream | tuple[Any, Any, Any, Any]
+SKIPPABLE = (EMPTY, BACKWARDS, OFF_SENSOR)
+MOST_EMPTY = 10_000  # windows without events that one chunk may bring
+
+
+@dataclass(frozen=True)
+class TrackedWindow:
+    """One window of a stream and its flow.
+
+    t0_us, t1_us: from its start, included, to its end, which belongs to the next window. events: how many it has.
+    field: FlowField [1, ...], px from t0 to t1. warm: the estimator was given the flow of the window before.
+    processor_s: processor time that volume and estimate took, of all threads.
+    """
+
+    t0_us: int
+    t1_us: int
+    events: int
+    field: FlowField
+    warm: bool
+    processor_s: float
+
+
+class Tracker:
+    """Flow of one window after the other.
+
+    Args:
+      estimate: estimator, EventVolume -> FlowField: flow.estimate_lk, a network, or a function of your own.
+      window_s: length of the windows in seconds, whole microseconds; or
+      events: number of events of a window, which then lasts until the first event of the next.
+      bins: of the volumes; the network's own, else 8, when None.
+      size_px: (height, width) of the sensor, for events as arrays; an EventStream says it itself.
+      warm_start: hand the flow of the window before, scaled to the new duration and carried along itself, to
+        estimators that take ``start_px``; for others it changes nothing.
+      skip: faults that are left out and counted in ``left_out`` instead of refused (events) or handed out with
+        flow 0, confidence 0 and valid False (windows): names of SKIPPABLE.
+    windows, events: how many came out so far. processor_s: processor time spent, event_s: time of the stream that
+      was covered, seconds. left_out: {fault: number}.
+    Every event is in one window, whatever the chunks; memory is that of one chunk and one window.
+    Raises: DomainError, ShapeError.
+
+    >>> from codesign import events, flow
+    >>> y, x = torch.meshgrid(torch.arange(32.0), torch.arange(48.0), indexing="ij")
+    >>> times = [0.001 * k for k in range(21)]  # a texture that moves right by 200 px/s
+    >>> frames = torch.stack([130 + 60 * torch.sin((x - 200 * t) / 3) + 60 * torch.sin((y + x) / 5) for t in times])
+    >>> stream = events.simulate(frames, times, events.SensorModel())
+    >>> tracker = flow.Tracker(flow.estimate_lk, window_s=0.01)
+    >>> found = [round(float(window.field.flow_px[0, 0].mean())) for window in tracker.track([stream])]
+    >>> found, tracker.windows, tracker.events == len(stream), tracker.real_time_factor > 0
+    ([2, 2], 2, True, True)
+    """
+
+    def __init__(
+        self,
+        estimate: Callable[..., FlowField],
+        window_s: float | None = None,
+        events: int | None = None,
+        bins: int | None = None,
+        size_px: tuple[int, int] | None = None,
+        warm_start: bool = True,
+        skip: tuple[str, ...] = (),
+    ) -> None:
+        if not callable(estimate):
+            raise DomainError(f"the estimator is {shown(estimate)}; a function of an EventVolume is needed.")
+        if (window_s is None) == (events is None):
+            raise DomainError(
+                f"window_s is {shown(window_s)} and events {shown(events)}; windows are cut by time or by number of "
+                "events: give one of both."
+            )
+        if not isinstance(skip, tuple) or not set(skip) <= set(SKIPPABLE):
+            raise DomainError(f"skip is {shown(skip)}; a tuple of {', '.join(SKIPPABLE)} is possible.")
+        self.estimate = estimate
+        self.window_us = None if window_s is None else round(1e6 * check_number(window_s, "window_s", 1e-6))
+        self.number = None if events is None else check_whole(events, "events", 1)
+        config = getattr(estimate, "config", None)
+        self.bins: int = (config.get("bins", 8) if isinstance(config, dict) else 8) if bins is None else bins
+        check_bins(self.bins)
+        self.size_px = None if size_px is None else check_size(size_px, "size_px")
+        self.warm_start = bool(warm_start) and _takes_start(estimate)
+        self.skip = skip
+        self.left_out = dict.fromkeys(skip, 0)
+        self.windows = 0
+        self.events = 0
+        self.processor_s = 0.0
+        self.event_s = 0.0
+        self._forget()
+
+    @property
+    def real_time_factor(self) -> float:
+        """Processor time over the time of the stream: below 1 where one core keeps up with the camera."""
+        if not self.event_s:
+            raise DomainError("no window is done, so there is no real-time factor; give events first.")
+        return self.processor_s / self.event_s
+
+    def track(self, chunks: Iterable[Chunk]) -> Iterator[TrackedWindow]:
+        """The windows of all chunks, as soon as each is complete, the last one included."""
+        for chunk in chunks:
+            yield from self.add(chunk)
+        yield from self.finish()
+
+    def add(self, chunk: Chunk) -> list[TrackedWindow]:
+        """Take the next events in and return the windows that they complete.
+
+        Args: chunk: EventStream, or arrays (t_us, x, y, p) of whole numbers, p +1 and -1 or 1 and 0, with rising
+          times; of any length, 0 included.
+        Raises: DomainError for what is no such stream, for events before those of the chunks before or off the
+          sensor; ShapeError for another sensor.
+        """
+        stream = self._checked(chunk)
+        if not len(stream):
+            return []
+        self._parts.append(stream)
+        self._last_us = int(stream.t_us[-1])
+        self._waiting += len(stream)
+        if self._start_us is None:
+            self._start_us = int(stream.t_us[0])
+        if self.window_us is not None and self._last_us < self._start_us + self.window_us:
+            return []
+        if self.number is not None and self._waiting <= self.number:
+            return []
+        return self._cut(_joined(self._parts), last=False)
+
+    def finish(self) -> list[TrackedWindow]:
+        """Return the last window, which ends at the last event (a microsecond later where that is its start), and
+        forget stream and clock: what is added next is another stream."""
+        found = self._cut(_joined(self._parts), last=True) if self._parts else []
+        self._forget()
+        return found
+
+    def _forget(self):
+        self._parts: list[EventStream] = []
+        self._waiting = 0
+        self._last_us: int | None = None
+        self._start_us: int | None = None
+        self._before: TrackedWindow | None = None
+
+    def _checked(self, chunk):
+        """The chunk as an EventStream of this sensor, no event before the last one of the chunks before."""
+        if isinstance(chunk, EventStream):
+            stream = check_stream(chunk, slice(0))
+            self.size_px = self.size_px or (stream.height_px, stream.width_px)
+            if (stream.height_px, stream.width_px) != self.size_px:
+                raise ShapeError(
+                    f"the stream is of a sensor of {stream.width_px} x {stream.height_px} px, the tracker of "
+                    f"{self.size_px[1]} x {self.size_px[0]}; take one tracker for each."
+                )
+            columns = stream.t_us, stream.x, stream.y, stream.p
+        else:
+            columns = _columns(chunk)
+        if self.size_px is None:
+            raise DomainError(
+                "events as arrays do not say how large the sensor is; give size_px to the tracker."
+            )
+        columns = self._in_order(self._on_sensor(columns))
+        return check_stream(EventStream(*columns, *self.size_px))
+
+    def _on_sensor(self, columns):
+        height, width = self.size_px
+        _, x, y, _ = columns
+        outside = (x < 0) | (x >= width) | (y < 0) | (y >= height)
+        return self._without(OFF_SENSOR, outside, columns) if bool(outside.any()) else columns
+
+    def _in_order(self, columns):
+        t_us = columns[0]
+        if not len(t_us):
+            return columns
+        before = int(t_us[0]) if self._last_us is None else self._last_us
+        latest = torch.cummax(torch.cat([t_us.new_tensor([before]), t_us]), 0).values[1:]
+        return self._without(BACKWARDS, t_us < latest, columns) if bool((t_us < latest).any()) else columns
+
+    def _without(self, fault, bad, columns):
+        if fault not in self.skip:
+            at = int(bad.nonzero()[0])
+            t_us, x, y, _ = (int(values[at]) for values in columns)
+            reason = (
+                f"lies before {self._last_us if at == 0 else int(columns[0][:at].max())} us"
+                if fault == BACKWARDS
+                else f"lies outside the sensor of {self.size_px[1]} x {self.size_px[0]} px"
+            )
+            raise DomainError(
+                f"event {at} of the chunk, at {t_us} us and ({x}, {y}), {reason}; order the stream, or leave such events "
+                f"out with skip=({fault!r},)."
+            )
+        self.left_out[fault] += int(bad.sum())
+        return tuple(values[~bad] for values in columns)
+
+    def _cut(self, stream, last):
+        """The complete windows of the waiting events, with the rest of them where they are the ``last``; what is
+        not complete waits on."""
+        found = []
+        at = 0
+        start_us = self._start_us
+        empty = 0
+        while True:
+            if self.window_us is not None:
+                end_us = start_us + self.window_us
+                to = int(torch.searchsorted(stream.t_us, end_us))
+            else:
+                to = at + self.number
+                end_us = max(int(stream.t_us[to]), start_us + 1) if to < len(stream) else None
+            if to >= len(stream):  # nothing has come that lies behind this window
+                break
+            if to == at:
+                empty += 1
+                self._check_empty(empty)
+            if to == at and EMPTY in self.skip:
+                self.left_out[EMPTY] += 1
+                self._before = None
+            else:
+                found.append(self._window(_part(stream, at, to), start_us, end_us))
+            at = to
+            start_us = end_us if self.window_us is not None else int(stream.t_us[to])
+        if last and at < len(stream):
+            end_us = max(int(stream.t_us[-1]), start_us + 1)
+            found.append(self._window(_part(stream, at, len(stream)), start_us, end_us))
+        rest = _part(stream, at, len(stream))
+        self._parts = [EventStream(*(v.clone() for v in (rest.t_us, rest.x, rest.y, rest.p)), *self.size_px)]
+        self._waiting = len(rest)
+        self._start_us = start_us
+        return found
+
+    def _check_empty(self, empty):
+        if empty > MOST_EMPTY and EMPTY not in self.skip:
+            raise DomainError(
+                f"more than {MOST_EMPTY} windows of {self.window_us} us in this chunk hold no event; did the clock "
+                f"jump? Leave such windows out with skip=({EMPTY!r},), or take longer ones."
+            )
+
+    @torch.no_grad()
+    def _window(self, stream, t0_us, t1_us):
+        began = time.process_time()
+        before = self._before
+        warm = self.warm_start and before is not None and before.events > 0 and len(stream) > 0
+        if len(stream):
+            volume = from_stream(stream, t0_us, t1_us, self.bins)
+            start = {"start_px": _carried_on(before, t1_us - t0_us)} if warm else {}
+            field = self._answer(self.estimate(volume, **start), volume)
+        else:
+            field = _nothing(*self.size_px, t1_us - t0_us, stream.t_us.device)
+        spent_s = time.process_time() - began
+        window = TrackedWindow(t0_us, t1_us, len(stream), field, warm, spent_s)
+        self._before = window
+        self.windows += 1
+        self.events += len(stream)
+        self.processor_s += spent_s
+        self.event_s += (t1_us - t0_us) * 1e-6
+        return window
+
+    def _answer(self, field, volume: EventVolume):
+        wanted = (1, 2, *volume.counts.shape[3:])
+        if tuple(check_field(field, "what the estimator returned").flow_px.shape) != wanted:
+            raise ShapeError(
+                f"the estimator returned a flow {list(field.flow_px.shape)} for a volume "
+                f"{list(volume.counts.shape)}; {list(wanted)} is needed."
+            )
+        return field
+
+
+def _takes_start(estimate):
+    """Whether an estimator has a parameter ``start_px``."""
+    function = estimate.forward if isinstance(estimate, torch.nn.Module) else estimate
+    try:
+        return "start_px" in inspect.signature(function).parameters
+    except (TypeError, ValueError):  # built-in functions do not say
+        return False
+
+
+def _columns(chunk):
+    """t_us, x, y, p as int64 tensors of arrays, p +1 and -1."""
+    if not isinstance(chunk, (tuple, list)) or len(chunk) != 4:
+        raise DomainError(
+            f"the chunk is {shown(chunk)}; an EventStream or arrays (t_us, x, y, p) are needed."
+        )
+    columns = []
+    for name, given in zip(("t_us", "x", "y", "p"), chunk, strict=True):
+        values = given.detach().cpu().numpy() if isinstance(given, Tensor) else np.asarray(given)
+        whole = values.dtype.kind in "iub" or (values.dtype.kind == "f" and bool((values % 1 == 0).all()))
+        if values.ndim != 1 or not (whole or not values.size):
+            raise DomainError(f"{name} is {shown(values)}; a list [N] of whole numbers is needed.")
+        columns.append(torch.from_numpy(values.astype(np.int64)))
+    if len({len(values) for values in columns}) > 1:
+        raise ShapeError(
+            f"t_us, x, y, p have {[len(values) for values in columns]} entries; equal lists are needed."
+        )
+    t_us, x, y, p = columns
+    return t_us, x, y, torch.where(p == 0, -1, p)
+
+
+def _joined(parts):
+    first = parts[0]
+    columns = (torch.cat([getattr(part, name) for part in parts]) for name in ("t_us", "x", "y", "p"))
+    return first if len(parts) == 1 else EventStream(*columns, first.height_px, first.width_px)
+
+
+def _part(stream, first, last):
+    columns = (getattr(stream, name)[first:last] for name in ("t_us", "x", "y", "p"))
+    return EventStream(*columns, stream.height_px, stream.width_px)
+
+
+def _carried_on(before, duration_us):
+    """Flow [1, 2, H, W] of the window before, at the same speed over the new duration, on the pixels it has led
+    to: read where each pixel came from."""
+    flow = before.field.flow_px
+    height, width = flow.shape[2:]
+    half = flow.new_tensor([width / 2, height / 2])[:, None, None]
+    at = (pixel_grid(height, width, flow) - flow[0] + 0.5) / half - 1
+    read = grid_sample(flow, at.permute(1, 2, 0)[None], padding_mode="border", align_corners=False)
+    return read * (duration_us / (before.t1_us - before.t0_us))
+
+
+def _nothing(height, width, duration_us, device):
+    """FlowField of a window without events."""
+    flow = torch.zeros(1, 2, height, width, device=device)
+    return FlowField(
+        flow, torch.zeros_like(flow[:, 0], dtype=torch.bool), duration_us * 1e-6, torch.zeros_like(flow[:, 0])
+    )
