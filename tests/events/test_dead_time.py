@@ -219,7 +219,7 @@ def hard_mean(level, t_s, sensor, beginnings):
     return total / beginnings
 
 
-# cosine and scale measured: a threshold 0.96/0.88, dead time 1.00/0.87 and 1.00/0.89. A group mixes the phases of a third of a
+# cosine and scale measured: a threshold 0.96/0.88, dead time 1.00/0.88 and 1.00/0.89. A group mixes the phases of a third of a
 # count, which takes up to an eighth of the slope to the dead time; a threshold moved alone leaves the other
 # behind, and the play's width is then a long-run mean only. The bounds are below what was asked (0.97, 0.9).
 @pytest.mark.parametrize(
