@@ -10,7 +10,7 @@ import torch
 
 from codesign import events
 from codesign.errors import DomainError, ShapeError
-from codesign.events.spiking.srm_ages import WIDTH, mean_spikes, rested
+from codesign.events.spiking.srm_ages import PACE, WIDTH, mean_spikes, rested
 from studies.event_gradient import compare, spiking
 from studies.event_gradient.case import FOCUS, SHIFT_X, Case, times
 
@@ -23,19 +23,20 @@ FADING = {"theta": THETA, "kernel": "exp", "response": "alpha", "tau_s": 2.4, "t
 def drawn(kind, ages=4, steps=7, lanes=3):
     """Response, theta, decay, amplitude and start of some pixels, some of which spike and some of which rest."""
     generator = torch.Generator().manual_seed(0)
-    response, a, m, theta = (
+    response, a, m, theta, pace = (
         low + (high - low) * torch.rand(shape, generator=generator, dtype=D)
         for low, high, shape in (
             (-0.1, 0.6, (steps, lanes)),
             (0.3, 0.6, lanes),
             (-0.5, -0.3, lanes),
             (0.15, 0.3, lanes),
+            (0.2, 1.5, lanes),
         )
     )
-    return response, theta, a, m, rested(ages, KINDS[kind], -a.log())
+    return response, theta, a, m, pace, rested(ages, KINDS[kind], -a.log())
 
 
-def slow_mean(kind, response, theta, a, m, start):
+def slow_mean(kind, response, theta, a, m, pace, start):
     """Mean spikes of one pixel, age by age."""
     groups = [(shares[0], list(shares[1:])) for shares in start.T]
     found = []
@@ -53,7 +54,7 @@ def slow_mean(kind, response, theta, a, m, start):
             else:
                 u = v + m * states[0]
                 states = [a * states[0]]
-            firing = 1 / (1 + np.exp(-(u - theta) / (WIDTH * theta)))
+            firing = 1 - (1 + np.exp((u - theta) / (WIDTH * theta))) ** -pace
             spiking.append((share * firing, states))
             resting.append((share * (1 - firing), states))
         found.append(sum(share for share, _ in spiking))
@@ -71,12 +72,12 @@ def together(groups):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_mean_is_that_of_the_ages_written_out(kind):
-    response, theta, a, m, start = drawn(kind)
-    mean, _ = mean_spikes(kind, response, theta, a, m, start)
+    response, theta, a, m, pace, start = given = drawn(kind)
+    mean, _ = mean_spikes(kind, response, theta, a, m, pace, start)
     for lane in range(response.shape[1]):
-        numbers = (x[..., lane].numpy() for x in (response, theta, a, m, start))
+        one = (x[..., lane].numpy() for x in given)
         # the kernel keeps shares of 1e-9 per age, so that an empty one has states
-        np.testing.assert_allclose(mean[:, lane], slow_mean(kind, *numbers), rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(mean[:, lane], slow_mean(kind, *one), rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -93,20 +94,21 @@ def test_the_mean_passes_gradcheck(kind):
 def test_the_mean_is_that_of_noisy_neurons_where_only_the_last_spike_counts():
     steps = 8
     response = 0.1 + 0.3 * torch.rand(steps, 1, generator=torch.Generator().manual_seed(3), dtype=D)
-    a, m = 1e-4, -2 * THETA  # the reset of the spike before the last has faded to 1e-4
+    a, m, pace = 1e-4, -2 * THETA, 0.7  # the reset of the spike before the last has faded to 1e-4
     start = torch.zeros(2, 3, 1, dtype=D)
     start[0, -1] = 1  # all have rested long
     number = torch.ones(1, dtype=D)
-    mean, _ = mean_spikes("early", response, THETA * number, a * number, m * number, start)
+    mean, _ = mean_spikes("early", response, THETA * number, a * number, m * number, pace * number, start)
     truth = np.zeros(steps)
     for history in itertools.product((0, 1), repeat=steps):
         chance, reset = 1.0, 0.0
         for v, spike in zip(response[:, 0].tolist(), history, strict=True):
-            fires = 1 / (1 + math.exp(-(v + m * reset - THETA) / (WIDTH * THETA)))
+            rate = pace * math.log(1 + math.exp((v + m * reset - THETA) / (WIDTH * THETA)))
+            fires = 1 - math.exp(-rate)
             chance *= fires if spike else 1 - fires
             reset = a * reset + spike
         truth += chance * np.array(history)
-    # a shift of the potential of 1e-4 * 2 theta, in each of the steps before, at a slope of up to 1/(4 WIDTH theta)
+    # a shift of the potential of 1e-4 * 2 theta, in each of the steps before, at a slope of less than 1/(4 WIDTH theta)
     np.testing.assert_allclose(mean[:, 0], truth, rtol=0, atol=steps * 1e-4 * 2 / (4 * WIDTH))
 
 
@@ -154,9 +156,9 @@ def test_a_layer_passes_the_gradient_of_the_mean_on_to_drive_and_parameters():
             [(kernel[:t].flip(0) @ drive[:t]) if t else 0 * drive[0] for t in range(len(drive))]
         )
         h = (1 / tau_r).expand(5)
-        start = rested(8, 2, h)
+        start = rested(6, 2, h)
         theta = theta.expand(5)
-        spikes, _ = mean_spikes("pair", response, theta, (-h).exp(), -2 * theta * math.e * h, start)
+        spikes, _ = mean_spikes("pair", response, theta, (-h).exp(), -2 * theta * math.e * h, PACE * h, start)
         return (spikes * weights).sum()
 
     leaves = [x.clone().requires_grad_() for x in (given, *numbers)]
@@ -231,7 +233,8 @@ def test_an_infinite_drive_that_counts_as_zero_gets_no_gradient():
 @pytest.mark.parametrize(
     ("kernel", "direction", "cosine", "surrogate"),
     [("exp", FOCUS, 0.95, 0.95), ("slayer", FOCUS, 0.93, 0.89), ("exp", SHIFT_X, 0.86, 0.79)],
-)  # measured: 0.970 and 0.939, 0.956 and 0.869, 0.900 and 0.760; interval of the first (90 %) 0.958 to 0.979
+)  # measured: 0.970 beside 0.939 of Triangular/bounded, 0.958 beside 0.869, 0.900 beside 0.760; the first's interval
+# of 90 % is 0.958 to 0.979
 def test_it_points_to_where_hard_spikes_go(kernel, direction, cosine, surrogate):
     case = Case(5, size_px=32)
     t_s = times(240)
@@ -246,7 +249,7 @@ def test_it_points_to_where_hard_spikes_go(kernel, direction, cosine, surrogate)
     mean = row("mean")
     assert mean["cosine"] > cosine
     assert 0.75 < mean["scale"] < 1.05
-    assert row("Triangular")["cosine"] < surrogate  # the best of the surrogates
+    assert row("Triangular")["cosine"] < surrogate
 
 
 @pytest.mark.parametrize(
@@ -259,7 +262,7 @@ def test_it_points_to_where_hard_spikes_go(kernel, direction, cosine, surrogate)
         ({"truncation": 0.01}, "truncation is 0.01, which"),
         ({"through_reset": "full"}, "through_reset is 'full', which"),
         ({"surrogate": events.Laplace.unit(1.0)}, "surrogate is Laplace"),
-        ({"tau_r": 20.0}, "tau_r is up to 20 steps, and gradient 'mean' goes up to 15"),
+        ({"tau_r": 40.0}, "tau_r is up to 40 steps, and gradient 'mean' goes up to 30"),
     ],
 )
 def test_what_has_no_mean_of_this_kind_is_refused(change, words):
@@ -273,6 +276,6 @@ def test_states_of_other_layers_are_refused():
         events.srm(drive(), **FADING, gradient="mean", state=plain)
     _, _, other = events.srm(drive(), **FADING, gradient="mean")
     with pytest.raises(
-        ShapeError, match=r"state\.mean is torch\.float64 \[2, 8, 5\], this layer keeps torch\.float32"
+        ShapeError, match=r"state\.mean is torch\.float64 \[2, 6, 5\], this layer keeps torch\.float32"
     ):
         events.srm(drive().float(), **FADING, gradient="mean", state=other)

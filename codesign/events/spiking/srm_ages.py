@@ -2,13 +2,15 @@
 last spike.
 
 All neurons of a pixel see one response v; a share P_k of them spiked last k steps ago, and carries the mean states
-of its resets. In every step the share F = 1 / (1 + exp(-(u - theta) / (WIDTH theta))) of each age spikes, u = v +
-reset, and goes to age 0; the others grow older, into a last age that holds all that are older still. The mean spikes,
-sum_k P_k F_k, are a smooth function of the response, and their gradient is exact: the loop backward in time lets
-drjit differentiate one step after the other, from states kept at some steps and computed again between.
+of its resets. Where u = v + reset comes near theta a neuron spikes at the rate PACE / tau_r ln(1 + exp(x)), x = (u -
+theta) / (WIDTH theta): of each age the share F = 1 - exp(-dt rate) spikes in a step and goes to age 0; the others grow
+older, into a last age that holds all that are older still. The mean spikes, sum_k P_k F_k, are a smooth function of
+the response, and their gradient is exact: the loop backward in time lets drjit differentiate one step after the other,
+from states kept at some steps and computed again between.
 
 The equations are those of a population of neurons with escape noise: Gerstner and Kistler, Spiking Neuron Models,
-2002, section 6.2, with the resets of earlier spikes as a mean per age.
+2002, section 6.2, with the resets of earlier spikes as a mean per age. For dt = tau_r / PACE the share is a logistic
+function of x.
 """
 
 import math
@@ -21,7 +23,8 @@ from torch.autograd.function import once_differentiable
 from codesign.backend import arrays
 from codesign.events.spiking.srm_kernels import advance
 
-WIDTH = 0.087  # of the logistic share over the threshold
+WIDTH = 0.087  # of the noise, in thresholds; a narrower one is nearer to hard spikes, and its gradient more erratic
+PACE = 1.2  # spikes per tau_r and x, far above the threshold
 MEAN_AGE = 3.0  # of the last spike before the first step, in time constants of the reset
 TINY = 1e-9  # share below which an age has no states of its own
 
@@ -39,38 +42,39 @@ def rested(ages: int, states: int, h: Tensor) -> Tensor:
 
 
 def mean_spikes(
-    kind: str, response: Tensor, theta: Tensor, a: Tensor, m: Tensor, start: Tensor
+    kind: str, response: Tensor, theta: Tensor, a: Tensor, m: Tensor, pace: Tensor, start: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Mean spikes of the noisy neurons.
 
-    Args: kind: of recursion of the reset (srm_kernels). response: [T, N] float32 or float64. theta, a, m: [N]
-      threshold, decay and amplitude of the reset, of the same type. start: [1 + states, ages, N] shares and states.
+    Args: kind: of recursion of the reset (srm_kernels). response: [T, N] float32 or float64. theta, a, m, pace: [N]
+      threshold, decay and amplitude of the reset, PACE dt / tau_r; of the same type. start: [1 + states,
+      ages, N] shares and states.
     Returns: [T, N] in 0 to 1; the shares and states after the last step. Gradient: of all but kind.
     """
-    return _Mean.apply(kind, response, theta, a, m, start)
+    return _Mean.apply(kind, response, theta, a, m, pace, start)
 
 
 class _Mean(Function):
     @staticmethod
-    def forward(ctx, kind, response, theta, a, m, start):
-        loop = _Ages(kind, response, theta, a, m, start.shape)
+    def forward(ctx, kind, response, theta, a, m, pace, start):
+        loop = _Ages(kind, response, theta, a, m, pace, start.shape)
         mean, after, ctx.starts = loop.forward(start)
         ctx.kind = kind
-        ctx.save_for_backward(response, theta, a, m, start)
+        ctx.save_for_backward(response, theta, a, m, pace, start)
         return mean, after
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad_mean, grad_after):  # pyright: ignore[reportIncompatibleMethodOverride]
-        response, theta, a, m, start = ctx.saved_tensors
-        loop = _Ages(ctx.kind, response, theta, a, m, start.shape)
+        response, theta, a, m, pace, start = ctx.saved_tensors
+        loop = _Ages(ctx.kind, response, theta, a, m, pace, start.shape)
         return None, *loop.adjoint(ctx.starts, grad_mean, grad_after)
 
 
 class _Ages:
     """The loops over time of every pixel."""
 
-    def __init__(self, kind, response, theta, a, m, shape):
+    def __init__(self, kind, response, theta, a, m, pace, shape):
         import drjit as dr
 
         self.dr = dr
@@ -82,7 +86,7 @@ class _Ages:
         self.lane = dr.arange(self.arr.UInt32, self.width)
         self.pixels = dr.opaque(self.arr.UInt32, self.width)
         self.response = self.load(response)
-        self.numbers = [self.load(value) for value in (theta, a, m)]
+        self.numbers = [self.load(value) for value in (theta, a, m, pace)]
         size = max(4, math.isqrt(self.steps))
         self.spans = [(first, min(first + size, self.steps)) for first in range(0, self.steps, size)]
 
@@ -96,19 +100,19 @@ class _Ages:
     def join(self, values):
         return torch.stack([value.torch() for value in values]).reshape(1 + self.states, self.ages, -1)
 
-    def step(self, response, theta, a, m, *flat):
+    def step(self, response, theta, a, m, pace, *flat):
         """Mean spikes of one step; shares and states after it."""
         dr = self.dr
         ages = self.ages
+        sharpness = 1 / (WIDTH * theta)
         rows = [flat[ages * j : ages * (j + 1)] for j in range(1 + self.states)]
         fired, kept, carried = [], [], []
         for share, *states in zip(*rows, strict=True):
             reset, states = advance(self.kind, states, a, m)
-            x = (response + reset - theta) / (WIDTH * theta)
-            tail = dr.exp(-dr.abs(x))  # either share as a product: a difference would lose a small one
-            more, less = share / (1 + tail), share * tail / (1 + tail)
-            fired.append(dr.select(x > 0, more, less))
-            kept.append(dr.select(x > 0, less, more))
+            x = (response + reset - theta) * sharpness
+            hazard = pace * (dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x))))
+            kept.append(share * dr.exp(-hazard))
+            fired.append(share - kept[-1])
             carried.append(states)
         spikes = sum(fired)
         new = self.mixed(fired, carried)
@@ -161,7 +165,7 @@ class _Ages:
         return flat
 
     def adjoint(self, starts, grad_mean, grad_after):
-        """Gradients of response, theta, a, m and the start."""
+        """Gradients of response, theta, a, m, pace and the start."""
         dr = self.dr
         Float = self.arr.Float
         target = dr.empty(Float, self.steps * self.width)

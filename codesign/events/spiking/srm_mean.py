@@ -6,11 +6,11 @@ from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
 from codesign.events.spiking.instead import instead
-from codesign.events.spiking.srm_ages import mean_spikes, rested
+from codesign.events.spiking.srm_ages import PACE, mean_spikes, rested
 from codesign.events.spiking.srm_kernels import RESETS, STATES, reset_coefficients
 from codesign.events.spiking.srm_state import SrmState
 
-AGES_PER_TAU = 4  # an age for every step up to so many time constants of the reset, and MORE_AGES
+AGES_PER_TAU = 2  # an age for every step up to so many time constants of the reset, and MORE_AGES
 MORE_AGES = 3
 MOST_AGES = 64
 
@@ -75,7 +75,7 @@ def meant(
         )
     reset = reset_coefficients(kernel, h_reset, -reset_scale * theta)
     flat = response.reshape(len(response), -1)
-    mean, after = mean_spikes(RESETS[kernel], flat, theta, reset.a, reset.m, start)
+    mean, after = mean_spikes(RESETS[kernel], flat, theta, reset.a, reset.m, PACE * h_reset, start)
     return instead(spikes, mean.reshape(response.shape)), after.reshape(wanted)
 
 
