@@ -3,6 +3,7 @@ textures, motions, densities and 3-D worlds that guided no choice, with hard eve
 
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar
 
 import torch
@@ -11,7 +12,7 @@ from codesign import flow
 from codesign.errors import DomainError
 from codesign.train.validation import batches
 from scenes.flow_worlds import ALL
-from studies.flow_quality import figures
+from studies.flow_quality import figures, packets_page
 from studies.flow_quality.estimators import estimators
 from studies.flow_quality.measures import join, measure
 from studies.flow_quality.sets import judged
@@ -50,7 +51,7 @@ FIGURES = {
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
-    QUICK: ClassVar = {"windows": 8, "world_windows": 5, "real_windows": 2}
+    QUICK: ClassVar = {"windows": 8, "world_windows": 5, "real_windows": 2, "packets": 1}
     network: str = "refiner"
     """Network to judge: "refiner" (the delivered one) or the path of a network file."""
     windows: int = 256
@@ -60,7 +61,16 @@ class Config(StudyConfig):
     real_windows: int = 128
     """Windows of every set of scenes.flow_sets: packets of few events, bent images, vibration, rotation."""
     sets: tuple[str, ...] = ()
-    """Sets to judge on; all when left out."""
+    """Sets to judge on; all when left out, with the recordings."""
+    recording: tuple[Path, ...] = ()
+    """Recordings (docs/flow_recordings.md) to judge on beside the two that are made."""
+    focal_px: float | None = None
+    """Focal length of a camera that only turned, px: those recordings are then compared with the sharpest
+    rotation, else with the sharpest affine flow."""
+    packet_events: tuple[int, ...] = (5_000, 10_000, 30_000)
+    """Events of a packet of a recording."""
+    packets: int = 6
+    """Packets of each number of events, spread over a recording."""
 
 
 def study(run: Run[Config]) -> None:
@@ -70,6 +80,13 @@ def study(run: Run[Config]) -> None:
             f"--windows {config.windows}, --world-windows {config.world_windows}, --real-windows "
             f"{config.real_windows}: at least 2 are needed."
         )
+    if config.packets < 1 or not config.packet_events or min(config.packet_events) < 100:
+        raise DomainError(
+            f"--packets {config.packets}, --packet-events {config.packet_events}: at least 1 packet of at "
+            "least 100 events is needed."
+        )
+    if config.focal_px is not None and not config.focal_px > 0:
+        raise DomainError(f"--focal-px is {config.focal_px}; a focal length > 0 px is needed.")
     network = flow.load(config.network).eval()
     sets = judged(config, network.config["bins"])
     unknown = [name for name in config.sets if name not in sets]
@@ -92,6 +109,8 @@ def study(run: Run[Config]) -> None:
     _show(run, found, about, who)
     if "worlds" in found:
         _worlds(run, found["worlds"])
+    if config.recording or not config.sets:
+        packets_page.show(run, who, network.config["bins"])
     run.finish(
         "Quality of event flow",
         "Hard events with threshold mismatch and background noise; textures are photographs, unseen speckle "

@@ -1,0 +1,170 @@
+"""Recordings of the study of flow's quality: made streams against the geometry they were made with, and the
+contrast maximisation against events placed by hand."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+from codesign import events
+from codesign.errors import DomainError
+from codesign.events.stream import ordered
+from codesign.flow import metrics
+from codesign.flow.sources.packets import Packet
+from codesign.types import FlowField
+from scenes import flow_streams
+from studies.flow_quality import recordings, sharpest
+from studies.flow_quality.packets_page import _record
+from studies.frame.run import StudyConfig, open_run
+
+SIZE = (48, 64)
+
+
+@dataclass(frozen=True)
+class Config(StudyConfig):
+    packet_events: tuple[int, ...] = (400,)
+    packets: int = 2
+
+
+def packet(x, y, t_us, height=SIZE[0], width=SIZE[1]):
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    columns = (torch.from_numpy(values[inside].astype(np.int64)) for values in (t_us, x, y))
+    p = torch.ones(int(inside.sum()), dtype=torch.int64)
+    return Packet("by hand", ordered(*columns, p, height, width), 0, 10_000, None)
+
+
+def dots(move, count=60, seed=0):
+    """Events of dots that move by move(x, y, time from 0 to 1), each at every millisecond."""
+    draw = np.random.default_rng(seed)
+    x, y = draw.uniform(-40, 40, count), draw.uniform(-30, 30, count)
+    t = np.linspace(0, 1, 21)
+    at = [move(x, y, each) for each in t]
+    px = np.concatenate([np.rint(a + (SIZE[1] - 1) / 2) for a, _ in at])
+    py = np.concatenate([np.rint(b + (SIZE[0] - 1) / 2) for _, b in at])
+    return packet(px, py, np.repeat(t * 10_000, count))
+
+
+def test_the_sharpest_rotation_of_turning_dots():
+    """A turn of f tan: exact pinhole geometry; the events' rounding to pixels is 0.3 px, over many dots."""
+    focal = 60.0
+    turn = np.array([0.03, -0.06, 0.05])
+
+    def move(x, y, time):
+        rotation = flow_streams.Rotation.from_rotvec(time * turn).as_matrix()
+        seen = rotation @ np.stack([x / focal, y / focal, np.ones_like(x)])
+        return focal * seen[0] / seen[2], focal * seen[1] / seen[2]
+
+    found = sharpest.rotation(dots(move), focal)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]].astype(float)
+    x -= (SIZE[1] - 1) / 2
+    y -= (SIZE[0] - 1) / 2
+    u, v = move(x.ravel(), y.ravel(), 1.0)
+    truth = np.stack([u - x.ravel(), v - y.ravel()]).reshape(2, *SIZE)
+    error = np.hypot(*(found.flow_px - truth))
+    assert np.hypot(*truth).mean() > 3
+    assert error.mean() < 0.25
+    assert found.contrast > 1
+
+
+def test_the_sharpest_affine_flow_belongs_to_the_start():
+    """x(t) = c + t s with a zoom of 0.12: at the end of the window a pixel of the start has moved by just that
+    share."""
+
+    def move(x, y, time):
+        return x + time * (2.0 + 0.12 * x), y + time * (-1.5 + 0.12 * y)
+
+    found = sharpest.affine(dots(move, 90))
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]].astype(float)
+    truth = np.stack(move(x - (SIZE[1] - 1) / 2, y - (SIZE[0] - 1) / 2, 1.0)) - np.stack(
+        [x - (SIZE[1] - 1) / 2, y - (SIZE[0] - 1) / 2]
+    )
+    assert np.hypot(*(found.flow_px - truth)).mean() < 0.35
+
+
+def test_zero_flow_is_not_the_sharpest_by_its_place_on_pixels():
+    """Dots that move by 1.5 px: their events stay on two or three pixels, and unmoved each lies on one."""
+
+    def move(x, y, time):
+        return x + 1.5 * time, y
+
+    found = sharpest.rotation(dots(move), 1e4).flow_px
+    assert found[0].mean() == pytest.approx(1.5, abs=0.25)
+    assert abs(found[1].mean()) < 0.25
+
+
+def test_an_empty_packet_is_refused():
+    nothing = np.zeros(0)
+    with pytest.raises(DomainError, match="holds no event"):
+        sharpest.affine(packet(nothing, nothing, nothing))
+
+
+@pytest.fixture(scope="module")
+def slid():
+    return flow_streams.sliding(0.03, SIZE, seed=1)
+
+
+def test_the_flow_of_a_slider_is_inverse_to_depth(slid):
+    flow = slid.truth(5_000, 25_000).flow_px
+    assert float(flow[:, 1].abs().max()) < 1e-4
+    speeds = sorted({round(float(value), 3) for value in flow[:, 0].unique()})
+    allowed = [-flow_streams.FOCAL_PX * flow_streams.SLIDE_M_S * 0.02 / z for z in flow_streams.DEPTHS_M]
+    assert len(speeds) >= 2
+    for speed in speeds:
+        assert min(abs(speed - each) for each in allowed) < 2e-3
+
+
+def test_the_flow_of_a_turn_is_that_of_its_rays():
+    """Rays of start and end pixels differ by one rotation: R from three pixels maps all others."""
+    made = flow_streams.turning(0.02, SIZE, seed=1)
+    flow = made.truth(2_000, 18_000).flow_px[0].double()
+    assert float(flow.norm(dim=0).mean()) > 0.3
+    y, x = torch.meshgrid(
+        torch.arange(SIZE[0], dtype=torch.float64) - (SIZE[0] - 1) / 2,
+        torch.arange(SIZE[1], dtype=torch.float64) - (SIZE[1] - 1) / 2,
+        indexing="ij",
+    )
+    focal = torch.full_like(x, made.focal_px)
+    before = torch.stack([x, y, focal]).flatten(1)
+    after = torch.stack([x + flow[0], y + flow[1], focal]).flatten(1)
+    before = before / before.norm(dim=0)
+    after = after / after.norm(dim=0)
+    u, _, vh = torch.linalg.svd(after @ before.T)
+    torch.testing.assert_close(u @ vh @ before, after, rtol=0, atol=3e-7)
+
+
+def test_events_of_a_made_recording_follow_its_flow(slid):
+    """Warped by the true flow the events are sharper than as they came, and than by the reversed flow."""
+    stream = slid.stream
+    t0_us, t1_us = 0, 30_000
+    true_px = slid.truth(t0_us, t1_us).flow_px
+    right, wrong = (metrics.fwl(stream, sign * true_px, t0_us, t1_us) for sign in (1.0, -1.0))
+    assert right > 1.02
+    assert right > 1.05 * wrong
+
+
+def test_packets_of_a_recording(slid, tmp_path):
+    """Packets hold the events asked for, and what is recorded are means and extremes over them."""
+    first, second = recordings._cut(slid, 400, 2)
+    assert len(first.stream) == len(second.stream) == 400
+    assert first.t1_us <= second.t0_us
+    case = recordings._case(first, "slid", 400, slid, turns=False)
+    assert case.kind == "slid_0k"
+
+    def nothing_moves(volume):
+        shape = (1, 2, *volume.counts.shape[3:])
+        return FlowField(torch.zeros(shape), torch.ones(1, *shape[2:], dtype=torch.bool), 1.0)
+
+    still = recordings.judged(case, nothing_moves, 4)
+    assert still["fwl"] == 1.0
+    volume = events.from_stream(first.stream, first.t0_us, first.t1_us, 4)
+    mask = metrics.event_mask(volume)[0]
+    assert still["aee_px"] == pytest.approx(float(first.truth.flow_px[0].norm(dim=0)[mask].mean()), rel=1e-5)
+    rows = [{"corrections": {**still, "fwl": value}, "closed_form_quadratic": still} for value in (1.0, 2.0)]
+    run = open_run("flow_quality", Config(out=tmp_path))
+    _record(run, "slid_0k", rows)
+    assert run.metrics["slid_0k_corrections_fwl"] == 1.5
+    assert run.metrics["slid_0k_corrections_fwl_least"] == 1.0
+    assert run.metrics["slid_0k_corrections_distance_over_closed_form_largest"] == 1.0
+    assert math.isclose(run.metrics["slid_0k_corrections_aee_px_largest"], still["aee_px"])
