@@ -1,5 +1,5 @@
-"""The refiner against a plain and a spiking network of as many weights: the same windows, the same processor
-time, several seeds.
+"""The refiner against a plain, a spiking, a cascaded and a deblurring network of as many weights: the same
+windows, the same processor time, several seeds.
 
 Every training is a run of studies.train_flow in a folder below; those that are done are kept when the study
 goes on with --resume. Then all networks are judged on the same windows.
@@ -18,16 +18,26 @@ from codesign import flow
 from codesign.errors import CodesignError, DomainError
 from codesign.flow.refiner import Refiner
 from codesign.train.validation import batches, score
+from scenes.flow_sets import SETS
 from scenes.flow_worlds import ALL, WorldWindows
 from studies.frame.run import Run, StudyConfig, main
 from studies.train_flow.sources import UNSEEN, VALIDATION, Shape
 
-NAMES = {"refiner": "refiner", "flownet-events": "FlowNetEvents", "spike-flownet": "spiking encoder"}
-RIVALS = ("flownet-events", "spike-flownet")
+NAMES = {
+    "refiner": "refiner",
+    "flownet-events": "FlowNetEvents",
+    "spike-flownet": "spiking encoder",
+    "ecn": "ECN",
+    "idnet": "IDNet",
+}
+RIVALS = tuple(name for name in NAMES if name != "refiner")
+ASKED = 0.6  # of a rival's error, at most
 RATES = {
     "refiner": 1e-3,
     "flownet-events": 2e-3,
     "spike-flownet": 3e-3,
+    "ecn": 3e-3,
+    "idnet": 1e-3,
 }  # found in short trials of 300 to 750 steps (1e-3 and 3e-3 for the spiking network)
 SEED = 55  # of what is judged here
 POLL_S = 1.0
@@ -35,7 +45,7 @@ POLL_S = 1.0
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
-    QUICK: ClassVar = {"windows": 8, "world_windows": 5}
+    QUICK: ClassVar = {"windows": 8, "world_windows": 5, "real_windows": 2}
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of weights and windows; every network sees the same windows with the same seed."""
     cpu_minutes: float = 5.0
@@ -48,6 +58,8 @@ class Config(StudyConfig):
     """Windows of every set of flat textures to judge on."""
     world_windows: int = 40
     """Windows of 3-D worlds, 128 x 128."""
+    real_windows: int = 64
+    """Windows of every set of scenes.flow_sets."""
     jobs: int = 2
     """Trainings at a time, one thread each."""
 
@@ -58,7 +70,7 @@ def study(run: Run[Config]) -> None:
         not config.seeds
         or config.cpu_minutes <= 0
         or config.jobs < 1
-        or min(config.windows, config.world_windows) < 1
+        or min(config.windows, config.world_windows, config.real_windows) < 1
     ):
         raise DomainError(
             "give at least one seed, one window of each kind and one job, and more than 0 minutes."
@@ -75,7 +87,7 @@ def study(run: Run[Config]) -> None:
             rival: max(a / b for a, b in zip(ratios["refiner"], ratios[rival], strict=True))
             for rival in RIVALS
         }
-        met += sum(value <= 0.5 for value in share.values())
+        met += sum(value <= ASKED for value in share.values())
         for network in NAMES:
             run.record(
                 **{
@@ -109,9 +121,13 @@ def study(run: Run[Config]) -> None:
     run.record(
         **{f"{_key(network)}_weights": weights[network] for network in NAMES},
         shares_met=met,
-        shares_asked=2 * len(rows),
+        shares_asked=len(RIVALS) * len(rows),
     )
-    run.card("Half of a rival's error or less", f"{met} of {2 * len(rows)}", "sets and rivals, worst seed")
+    run.card(
+        f"At most {ASKED:g} of a rival's error",
+        f"{met} of {len(RIVALS) * len(rows)}",
+        "sets and rivals, worst seed",
+    )
     columns = [
         "windows",
         "closed form",
@@ -122,7 +138,7 @@ def study(run: Run[Config]) -> None:
         "Endpoint error over that of zero flow",
         columns,
         rows,
-        f"Least to largest of {len(config.seeds)} seeds. Asked: at most half of either rival.",
+        f"Least to largest of {len(config.seeds)} seeds. Asked: at most {ASKED:g} of every rival.",
     )
     run.table(
         "Networks", ["network", "weights", "learning rate"], [[NAMES[n], weights[n], RATES[n]] for n in NAMES]
@@ -201,6 +217,7 @@ def _judge(run, networks):
     bins = 8
     sets = {name: (make(shape, SEED), config.windows) for name, make in VALIDATION.items()}
     sets["worlds"] = (WorldWindows(ALL, seed=UNSEEN + SEED, bins=bins), config.world_windows)
+    sets |= {name: (make(UNSEEN + SEED, bins), config.real_windows) for name, make in SETS.items()}
     estimators = {"closed form": flow.estimate_lk, **networks}
     found = {}
     with run.progress(len(sets), "judging") as progress:

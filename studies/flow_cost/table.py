@@ -12,7 +12,7 @@ import codesign  # noqa: F401  (first: it sets OpenMP's wait policy before torch
 import torch  # isort: skip
 
 from codesign.flow import estimate_lk
-from codesign.flow.baselines import FlowNetEvents, SpikeFlowNet
+from codesign.flow.baselines import ECN, FlowNetEvents, IDNet, SpikeFlowNet
 from codesign.flow.baselines.weights import count_weights
 from codesign.flow.refiner import Refiner
 from codesign.types import EventVolume, FlowField
@@ -71,6 +71,10 @@ def entries(seed):
         REFINER: refiner,
         "FlowNetEvents, equal weights": FlowNetEvents.with_weights(budget, seed=seed),
         "Spike-FlowNet form, equal weights": SpikeFlowNet.with_weights(budget, seed=seed),
+        "ECN, equal weights": ECN.with_weights(budget, seed=seed),
+        "ECN": ECN(seed=seed),
+        "IDNet, equal weights": IDNet.with_weights(budget, seed=seed),
+        "IDNet, small": IDNet(seed=seed),
         PUBLISHED: SpikeFlowNet(seed=seed),
         TEN_BINS: SpikeFlowNet(bins=10, seed=seed),
         STEPS: StepByStep(seed=seed),

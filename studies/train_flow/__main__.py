@@ -35,7 +35,7 @@ class Config(StudyConfig):
         "save_every": 6,
     }
     network: str = "refiner"
-    """Which network: refiner, flownet-events or spike-flownet."""
+    """Which network: refiner, flownet-events, spike-flownet, ecn or idnet."""
     options: tuple[str, ...] = ()
     """Arguments of the network's constructor, name=number."""
     weights: int = 0

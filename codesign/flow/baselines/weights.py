@@ -42,11 +42,11 @@ def start(module: nn.Module, seed: int, variance: float, heads: Iterable[nn.Modu
                     part.bias.zero_()
 
 
-def fill_budget(build: Callable[..., nn.Module], weights: int) -> tuple[float, int]:
+def fill_budget(build: Callable[..., nn.Module], weights: int, inside: float = 8.0) -> tuple[float, int]:
     """Arguments (width, hidden) of the network with the fewest weights that is not below the budget.
 
     Args: build: function of width and hidden (channels inside the residual blocks, None for the usual number)
-      that makes the network. weights: the budget.
+      that makes the network. weights: the budget. inside: the usual ``hidden`` over the width.
     Raises: DomainError when even the narrowest network is above the budget.
     """
 
@@ -70,7 +70,7 @@ def fill_budget(build: Callable[..., nn.Module], weights: int) -> tuple[float, i
         middle = (low + high) // 2
         low, high = (middle, high) if counted(middle / 4) <= weights else (low, middle)
     width = low / 4
-    hidden = channels(low / 4, 8)
+    hidden = channels(low / 4, inside)
     while counted(width, hidden) < weights:
         hidden += 4
     return width, hidden
