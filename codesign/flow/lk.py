@@ -1,21 +1,25 @@
 """Closed-form event flow: coarse-to-fine Bayesian least squares on event volumes.
 
 The signed event rate of a moving texture moves with it, so the volume obeys V_t + u V_x + v V_y = 0 (Lucas
-and Kanade, 1981, with event rate in place of intensity). The volume is warped back along the current flow;
-per pixel, the regression of the bins over time gives V_t and their mean gives V_x, V_y; all pixels together
-pull at the parameters of an affine or quadratic field (lk_level). A Gaussian prior on the field (lk_field)
-holds against the pull, which is weighed by the noise that scattered events put into it, so that few events
-mean small steps, and the spread of what is left is returned with the flow.
+and Kanade, 1981, with event rate in place of intensity); time is the way that the scene has gone (lk_path). The
+volume is warped back along the current flow; per pixel, the regression of the bins over the way gives V_t and their
+mean gives V_x, V_y; all pixels together pull at the parameters of a polynomial field (lk_level), those of cells at
+what it leaves (lk_cells). Gaussian priors on the field (lk_field, lk_tree) hold against the pull, which is weighed
+by the noise that scattered events put into it, so that few events mean small steps, and the spread of what is left
+is returned with the flow.
 """
 
 from collections.abc import Sequence
 
-import torch
-
 from codesign.errors import DomainError, ShapeError
 from codesign.flow import lk_field, lk_level
 from codesign.flow.checks import check_count, check_number, check_volume, shown
+from codesign.flow.lk_descent import Descent
 from codesign.types import EventVolume, FlowField
+
+# field -> the polynomial in it
+MODELS = {"constant": "constant", "affine": "affine", "quadratic": "quadratic", "local": "quadratic"}
+TURNED = 0.1  # share of the variance of the whole way that remains where it leads back to its start
 
 
 def estimate_lk(
@@ -31,22 +35,22 @@ def estimate_lk(
     Args:
       volume: EventVolume, counts [B, 2, bins >= 2, H >= 2, W >= 2]. Hot pixels are weighed down
         (lk_level.cool).
-      model: "constant", "affine" or "quadratic" field over the image.
+      model: "constant", "affine" or "quadratic" field over the image, or "local": a quadratic one and values on
+        cells of 8 px, as smooth as the data ask, for layers and depth.
       prior_px: standard deviation expected of each component of the flow at the image centre, px per
         interval; weak evidence leaves the flow near zero.
       levels_px: Gaussian blur of the volume, coarse to fine. steps: Gauss-Newton steps at each.
       noise_floor: least noise assumed, relative to that of a Poisson volume with these counts; matters for
         counts without quantisation or noise.
     Returns: FlowField on the pixels of the start of the interval: flow_px [B, 2, H, W] px per interval;
-      covariance_px2 [B, 3, H, W] of its error by
-      the posterior of the parameters; confidence [B, H, W] = 1 - trace(covariance) / trace(prior covariance), in
-      0..1;
-      valid is False for samples without
+      covariance_px2 [B, 3, H, W] of its error by the posterior; confidence [B, H, W] in 0..1, 1 - trace(covariance) /
+      trace(prior covariance), both of the flow along the whole way (``lk_path``); valid is False for samples without
       events, whose flow and confidence are 0 and whose covariance is the prior's.
     Gradient: counts, of flow, covariance and confidence.
     Raises: ShapeError, DomainError.
     Cost: linear in pixels and bins; a level of blur s works on a grid of spacing 2^floor(log2 s) px.
 
+    >>> import torch
     >>> from codesign.flow.export import evenly_timed
     >>> y, x = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
     >>> times = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -56,8 +60,8 @@ def estimate_lk(
     [2.0, 1.0]
     """
     counts = check_volume(volume, least_bins=2)
-    if not isinstance(model, str) or model not in lk_field.TERMS:
-        raise DomainError(f"flow model '{model}' is unknown; choose one of {', '.join(lk_field.TERMS)}.")
+    if not isinstance(model, str) or model not in MODELS:
+        raise DomainError(f"flow model '{model}' is unknown; choose one of {', '.join(MODELS)}.")
     check_number(prior_px, "prior_px", above=0.0)
     check_number(noise_floor, "noise_floor", 0.0)
     steps = check_count(steps, "steps", 1)
@@ -72,28 +76,24 @@ def estimate_lk(
         raise ShapeError(
             f"an event volume of {height} x {width} pixels has no slopes both ways; give at least 2 x 2."
         )
-    shape = lk_field.Polynomials(model, height, width, prior_px, counts.device)
-    one = torch.eye(2 * shape.terms, dtype=torch.float64, device=counts.device)
-    found = one.new_zeros(batch, 2 * shape.terms)  # in units of the prior: parameters = unit found
-    parameters = counts.new_zeros(batch, 2 * shape.terms)
-    precision = one.expand(batch, -1, -1)
-    times, rate, density = lk_level.signed_rate(volume)
-    for blur_px in levels_px:
-        level = lk_level.Level(rate, density, times, shape, blur_px, noise_floor)
-        for _ in range(steps):
-            evidence, pull = level.evidence(parameters)
-            precision = one + evidence
-            change = torch.linalg.solve(precision, pull - found)
-            moved = shape.mean_square(change @ shape.unit.T)
-            found = (
-                found + change * (1 + moved / (2 * blur_px) ** 2).rsqrt()[:, None]
-            )  # no step beyond the reach of the linearisation
-            parameters = (found @ shape.unit.T).to(counts)
-    flow, places = shape.at_start(parameters)
-    spread = shape.unit @ torch.linalg.inv(precision) @ shape.unit.T
-    covariance = shape.covariance(spread.to(counts), places)
-    widest = shape.covariance((shape.unit @ shape.unit.T).to(counts)[None], places)
-    confidence = 1 - (covariance[:, 0] + covariance[:, 2]) / (widest[:, 0] + widest[:, 2])
-    confidence = confidence.clamp(0, 1)  # rounding alone leaves them
+    shape = lk_field.Polynomials(MODELS[model], height, width, prior_px, counts.device)
+    way, bins, density = lk_level.along_path(volume)
+    found = Descent(shape, prior_px, model == "local", counts)
+    for number, blur_px in enumerate(levels_px):
+        level = lk_level.Level(way, bins, density, shape, blur_px, noise_floor)
+        bend = number > 0 or len(levels_px) == 1
+        found.descend(level, steps, bend)
+        if number == 1:  # a coarse blur may take one stripe for the next: another start
+            other = Descent(shape, prior_px, model == "local", counts)
+            other.descend(level, steps, bend)
+            found.join(other, level)
+    flow, covariance, confidence = found.at_start(way.start)
+    net = way.net.to(flow)[:, None, None, None]
     valid = (counts.detach().sum((1, 2, 3, 4)) > 0)[:, None, None].expand(batch, height, width)
-    return FlowField(flow, valid, float(volume.collected_s.sum()), confidence, covariance)
+    return FlowField(
+        net * flow,
+        valid,
+        float(volume.collected_s.sum()),
+        confidence,
+        (net.square() + TURNED * (1 - net.square())) * covariance,
+    )

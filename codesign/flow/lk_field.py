@@ -5,6 +5,8 @@ A field is u = sum p_k b_k(x, y), v = sum q_k b_k(x, y) with b = 1, x, y, x^2, x
 reach from -1 to 1 along the longer side. Parameters are [B, 2K]: p_1..p_K, q_1..q_K.
 """
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -77,22 +79,33 @@ class Polynomials:
         )
         return torch.einsum("bck,kl,bcl->b", p, second[: self.terms, : self.terms], p)
 
-    def at_start(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """From the field at mid-interval to the flow on the pixels of the start, by fixed point: w(x) = v(x +
-        w(x) / 2).
+    def at_start(
+        self,
+        parameters: Tensor,
+        start: Tensor,
+        local: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """From the field v at the mean place of the events to the flow on the pixels of the start, by fixed point:
+        w(x) = v(x - start w(x)).
 
-        Returns: flow [B, 2, H, W] px, and the basis [B, K, H, W] where each pixel is at mid-interval.
+        Args: parameters: [B, 2K]. start: [B] place of the start on the way, -1/2 for even motion. local: part of
+          the flow and its covariance at pixel coordinates, (x, y) -> ([B, 2, H, W], [B, 3, H, W]), or None.
+        Returns: flow [B, 2, H, W] px per way; where each pixel is at the mean place, the basis [B, K, H, W]; the local
+          part's covariance [B, 3, H, W].
         """
         p = parameters.reshape(len(parameters), 2, self.terms)
-        u, v = self.scaled(torch.arange(self.width).to(p)[None, :], torch.arange(self.height).to(p)[:, None])
-        u = u.expand(len(p), self.height, self.width)
-        v = v.expand(len(p), self.height, self.width)
-        places = self.basis(u, v, 1)
-        flow = (p @ places.flatten(2)).unflatten(2, u.shape[1:])
-        for _ in range(FIXED_POINT_STEPS if self.terms > 1 else 0):
-            places = self.basis(u + flow[:, 0] / (2 * self.half), v + flow[:, 1] / (2 * self.half), 1)
-            flow = (p @ places.flatten(2)).unflatten(2, u.shape[1:])
-        return flow, places
+        y, x = torch.meshgrid(torch.arange(self.height).to(p), torch.arange(self.width).to(p), indexing="ij")
+        back = -start.to(p)[:, None, None]
+        shift = p.new_zeros(len(p), 2, self.height, self.width)
+        for _ in range(FIXED_POINT_STEPS + 1):
+            at = x + back * shift[:, 0], y + back * shift[:, 1]
+            places = self.basis(*self.scaled(*at), 1)
+            shift = (p @ places.flatten(2)).unflatten(2, (self.height, self.width))
+            spread = torch.zeros_like(shift[:, :1]).expand(-1, 3, -1, -1)
+            if local is not None:
+                part, spread = local(*at)
+                shift = shift + part
+        return shift, places, spread
 
     def covariance(self, covariance: Tensor, places: Tensor) -> Tensor:
         """Covariance [B, 3, H, W] (xx, xy, yy) of the flow from that of the parameters [B, 2K, 2K]."""

@@ -22,6 +22,7 @@ from codesign.flow.lk_field import Polynomials
 from codesign.flow.lk_kernel import blurred, cell_sums, moving
 from codesign.flow.lk_lanes import Grid
 from codesign.flow.lk_moments import Moments
+from codesign.flow.lk_path import Path, path
 from codesign.types import EventVolume
 
 # the factor 3 and the power 4 = 2^2 above
@@ -41,14 +42,14 @@ TINY = 2.0**-100  # keeps empty samples solvable, far below a millionth of an ev
 
 
 def stride(sigma_px: float, shortest_px: int = 2**30) -> int:
-    """Spacing of a level's grid, px: the largest power of two up to sigma, at least 1, of which two fit into
-    the shorter side."""
-    return 2 ** math.floor(math.log2(max(min(sigma_px, shortest_px / 2), 1.0)))
+    """Spacing of a level's grid, px: the largest power of two up to sigma, at least 1, at most 8, of which
+    two fit into the shorter side."""
+    return 2 ** math.floor(math.log2(max(min(sigma_px, shortest_px / 2, 8.0), 1.0)))
 
 
-def signed_rate(volume: EventVolume) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
-    """(weight [n], time [n]) of the bins, ON less OFF events [B, n, H, W] of each, and events of both signs per
-    pixel [B, H, W]; hot pixels weighed down.
+def along_path(volume: EventVolume) -> tuple[Path, Tensor, Tensor]:
+    """The way of the samples, weight and time of the bins [2, n], events of both signs per pixel [B, H, W];
+    hot pixels weighed down.
 
     Weights are the shares of the interval; time is 0 at mid-interval, in intervals.
     """
@@ -57,9 +58,10 @@ def signed_rate(volume: EventVolume) -> tuple[tuple[Tensor, Tensor], Tensor, Ten
     weight = (volume.collected_s / span).to(counts)
     time = (volume.centroid_s / span).to(counts) - 0.5
     on, off = counts.unbind(1)
-    events = counts.sum((1, 2))
-    kept = cool(events)
-    return (weight, time), kept[:, None] * (on - off), kept * events
+    kept = cool(counts.sum((1, 2)))
+    events = kept[:, None] * (on + off)
+    found = path(kept[:, None] * (on - off), events.sum((2, 3)), weight, time)
+    return found, torch.stack([weight, time]), events.sum(1)
 
 
 def cool(events: Tensor) -> Tensor:
@@ -89,9 +91,9 @@ class Level:
 
     def __init__(
         self,
-        rate: Tensor,
+        way: Path,
+        bins: Tensor,
         density: Tensor,
-        times: tuple[Tensor, Tensor],
         shape: Polynomials,
         sigma_px: float,
         noise_floor: float,
@@ -101,26 +103,43 @@ class Level:
         self.noise_floor = noise_floor
         self.stride = stride(sigma_px, min(shape.height, shape.width))
         self.grid = Grid(shape.height, shape.width, self.stride)
-        self.rate, kernel = _blurred(rate, sigma_px, self.grid)
+        self.counts, kernel = _blurred(way.counts, sigma_px, self.grid)
         self.density = avg_pool2d(density, self.stride) if self.stride > 1 else density
-        self.moments = Moments(shape, self.grid, rate)
-        weight, self.time = times
-        centred = self.time - weight @ self.time
-        spread = weight @ centred.square()
-        # of the rate, the events over the share of the interval: mean over bins, slope over time
-        self.contrast = torch.stack([torch.ones_like(weight), centred / spread])
-        self.slope_noise = 1 / (float(spread) * OVERLAP * sigma_px**2)
+        self.moments = Moments(shape, self.grid, density)
+        weight, time = bins
+        self.place = time - weight @ time
+        spread = weight @ self.place.square()
+        # of the events: their sum over the bins is the rate, their mean place its slope over the way
+        self.contrast = torch.stack([torch.ones_like(weight), self.place / spread])
+        self.gain = (spread / way.spread).to(density)
+        self.slope_noise = 1 / (way.spread * OVERLAP * sigma_px**2)
         self.texture_noise = _slope_of_noise(kernel, self.stride)
 
-    def evidence(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Precision [B, 2K, 2K] that the data add at these parameters, and their pull [B, 2K] on them:
-        precision times the distance to the best fit."""
-        k = self.shape.terms
-        flow = self.moments.flow(parameters)
+    def products(self, flow: Tensor) -> Tensor:
+        """[B, 8, h, w] as of ``cell_sums``, per sample, at a flow [B, 2, h, w] px per way."""
+        mean, slope, seen = self._moving(flow)
+        return cell_sums(mean, slope, seen, self.density, self.grid)
+
+    def contrast_along(self, flow: Tensor) -> Tensor:
+        """Mean square [B] of the rate over the level's samples, in units of what scattered events give it, times how
+        many independent samples there are."""
+        mean, _, seen = self._moving(flow)
+        square = (seen * mean.square()).sum((1, 2)) / (seen.sum((1, 2)) + TINY)
+        noise = (self.density.mean((1, 2)) + TINY) / (OVERLAP * self.sigma**2)
+        samples = mean[0].numel() * self.stride**2 / (CALIBRATION * OVERLAP * self.sigma**2)
+        return (samples * square / noise).double()
+
+    def _moving(self, flow):
         mean, slope, seen = moving(
-            self.rate, flow, self.time, self.contrast, self.grid, fade_px=1 + self.sigma
+            self.counts, flow, self.place, self.contrast, self.grid, fade_px=1 + self.sigma
         )
-        sums = self.moments.sums(cell_sums(mean, slope, seen, self.density, self.grid))
+        return mean, self.gain[:, None, None] * slope, seen
+
+    def evidence(self, products: Tensor) -> tuple[Tensor, Tensor]:
+        """Precision [B, 2K, 2K] that the data add where their products were taken, and their pull [B, 2K] on the
+        parameters: precision times the distance to the best fit."""
+        k = self.shape.terms
+        sums = self.moments.sums(products)
         xx, xy, yy, event_products = self.moments.by_products(sums[:, [0, 1, 2, 7]]).unbind(1)
         normal = torch.cat([torch.cat([xx, xy], 2), torch.cat([xy, yy], 2)], 1)
         scattered = (

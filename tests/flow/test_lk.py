@@ -209,7 +209,7 @@ def test_hard_events_of_fine_textures_beat_zero_flow_and_sparse_ones_do_not_lose
     assert ratios[0.05] <= 1.1  # hardly an event that is not noise: near zero flow, not far from it
 
 
-@pytest.mark.parametrize("model", ["constant", "affine", "quadratic"])
+@pytest.mark.parametrize("model", ["constant", "affine", "quadratic", "local"])
 def test_gradcheck(model, generator):
     volume, _ = moving(4, shift=(0.7, -0.4), steps=20, bins=3)
     counts = volume.counts[..., 10:24, 8:22].clone().requires_grad_()
@@ -294,7 +294,7 @@ def test_confidence_follows_from_the_covariance_and_is_zero_without_events():
     assert float(field.confidence[0].min()) > 0.99
 
 
-@pytest.mark.parametrize("model", ["affine", "quadratic"])
+@pytest.mark.parametrize("model", ["affine", "quadratic", "local"])
 def test_gradients_of_the_uncertainty_are_those_of_differences(model, generator):
     volume, _ = moving(4, shift=(0.7, -0.4), steps=20, bins=3)
     counts = (volume.counts[..., 10:24, 8:22] * 0.3).clone().requires_grad_()

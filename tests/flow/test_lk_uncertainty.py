@@ -20,7 +20,7 @@ D = torch.float64
 def test_step_to_the_start_solves_its_equation(model, generator):
     shape = lk_field.Polynomials(model, 20, 30)
     parameters = torch.randn(2, 2 * shape.terms, generator=generator, dtype=D) * 1.5
-    flow, _ = shape.at_start(parameters)
+    flow, _, _ = shape.at_start(parameters, torch.full((2,), -0.5, dtype=D))
     # w(x) = v(x + w(x) / 2); the fixed point gains a factor of |grad v| / 2, some 0.3 for these wild fields,
     # in each of 4 steps
     y, x = torch.meshgrid(torch.arange(20, dtype=D), torch.arange(30, dtype=D), indexing="ij")
@@ -35,7 +35,7 @@ def test_prior_and_its_spread_are_those_of_drawn_fields(generator):
     shape = lk_field.Polynomials("quadratic", 8, 12)
     spread = torch.linalg.inv(shape.prior_precision(2.0))
     drawn = torch.randn(20000, 12, generator=generator, dtype=D) @ torch.linalg.cholesky(spread).T
-    _, places = shape.at_start(torch.zeros(1, 12, dtype=D))
+    _, places, _ = shape.at_start(torch.zeros(1, 12, dtype=D), torch.full((1,), -0.5, dtype=D))
     flow = torch.einsum("nck,khw->nchw", drawn.reshape(-1, 2, 6), places[0])
     expected = shape.covariance(spread[None], places)[0]
     deviation = (flow - flow.mean(0)).square().mean(0)

@@ -1,0 +1,76 @@
+"""Gauss-Newton steps towards the field that the events and the prior agree on."""
+
+import torch
+from torch import Tensor
+
+from codesign.flow.lk_cells import Cells
+from codesign.flow.lk_field import Polynomials
+from codesign.flow.lk_level import Level
+
+FIRST = 1.0  # by what the first of two answers leads in the logarithm of their odds
+
+
+class Descent:
+    """A field, and how surely it is known: a polynomial, and values on cells where ``local``."""
+
+    def __init__(self, shape: Polynomials, prior_px: float, local: bool, like: Tensor) -> None:
+        """Args: like: [B, ...], tells batch, device and precision."""
+        batch = len(like)
+        self.shape = shape
+        self.like = like
+        # in units of the prior: parameters = unit @ found
+        self.found = torch.zeros(batch, 2 * shape.terms, dtype=torch.float64, device=like.device)
+        self.one = torch.eye(2 * shape.terms, dtype=torch.float64, device=like.device)
+        self.precision = self.one.expand(batch, -1, -1)
+        self.cells = Cells(batch, shape.height, shape.width, prior_px, like.device) if local else None
+
+    def parameters(self) -> Tensor:
+        """[B, 2K] of the polynomial, px per way."""
+        return (self.found @ self.shape.unit.T).to(self.like)
+
+    def flow(self, level: Level) -> Tensor:
+        """[B, 2, h, w] px per way on the level's samples."""
+        flow = level.moments.flow(self.parameters())
+        return flow if self.cells is None else flow + self.cells.on(level).to(flow)
+
+    def descend(self, level: Level, steps: int, bend: bool) -> None:
+        """Moves to the best field, by steps no longer than the linearisation reaches.
+
+        Args: bend: whether cells move too; they do from the second step on, or the only one, since what the
+          polynomial has not yet reached looks like a local part.
+        """
+        for step in range(steps):
+            products = level.products(self.flow(level))
+            evidence, pull = level.evidence(products)
+            self.precision = self.one + evidence
+            change = torch.linalg.solve(self.precision, pull - self.found)
+            moved = self.shape.mean_square(change @ self.shape.unit.T)
+            change = change * (1 + moved / (2 * level.sigma) ** 2).rsqrt()[:, None]
+            self.found = self.found + change
+            if self.cells is not None and bend and step >= min(1, steps - 1):
+                by_polynomial = level.moments.flow((change @ self.shape.unit.T).to(self.like))
+                self.cells.step(level, products, by_polynomial)
+
+    def join(self, other: "Descent", level: Level) -> None:
+        """The mean of this field and another, by how much contrast the events along each have."""
+        more = level.contrast_along(self.flow(level)) - level.contrast_along(other.flow(level))
+        share = torch.sigmoid(more / 2 + FIRST)[:, None]
+        self.found = other.found + share * (self.found - other.found)
+        if self.cells is not None and other.cells is not None:
+            share = share[..., None, None]
+            self.cells.value = other.cells.value + share * (self.cells.value - other.cells.value)
+
+    def at_start(self, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Flow [B, 2, H, W], its covariance [B, 3, H, W] and confidence [B, H, W] on the pixels of the start, which
+        lies at ``start`` [B] on the way."""
+        unit = self.shape.unit
+        local = None if self.cells is None else self.cells.at
+        flow, places, covariance = self.shape.at_start(self.parameters(), start, local)
+        spread = unit @ torch.linalg.inv(self.precision) @ unit.T
+        covariance = covariance + self.shape.covariance(spread.to(flow), places)
+        widest = self.shape.covariance((unit @ unit.T).to(flow)[None], places)
+        widest = widest[:, 0] + widest[:, 2]
+        if self.cells is not None:
+            widest = widest + 2 * self.cells.widest.to(flow)[:, None, None]
+        confidence = 1 - (covariance[:, 0] + covariance[:, 2]) / widest
+        return flow, covariance, confidence.clamp(0, 1)  # rounding alone leaves them
