@@ -28,10 +28,11 @@ def show(run, who, bins):
     todo = cases(run.config, run.say)
     with run.progress(len(todo), "packets") as progress:
         for case in todo:
-            rows = {name: judged(case, estimate, bins) for name, estimate in who.items()}
-            rows |= of_reference(case, bins)
+            reference = case.seek()
+            rows = {name: judged(case, reference, estimate, bins) for name, estimate in who.items()}
+            rows |= of_reference(case, reference, bins)
             found.setdefault(case.kind, []).append(rows)
-            counts.setdefault(case.kind, []).append((case.packet, case.made_for))
+            counts.setdefault(case.kind, []).append((case.packet, case.assumed))
             progress.advance()
     for kind, packets in found.items():
         _record(run, kind, packets)

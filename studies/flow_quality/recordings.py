@@ -1,7 +1,9 @@
 """Recordings, cut into packets of a fixed number of events: two that are made here, with exact flow, and those
 the user names."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,33 +25,45 @@ EDGE = 0.05  # of the events of a recording left out at either end
 
 @dataclass(frozen=True)
 class Case:
-    """A packet to judge on. kind: recording and number of events. reference: flow by contrast maximisation;
-    made_for: what it assumes."""
+    """A packet to judge on. kind: recording and number of events. seek: finds its flow by contrast
+    maximisation; assumed: the flows among which."""
 
     kind: str
     packet: Packet
-    reference: sharpest.Sharpest
-    made_for: str
+    seek: Callable[[], sharpest.Sharpest]
+    assumed: str
 
 
 def cases(config, say):
     """Cases of all recordings, the made ones first; a recording with too few events for a packet says so."""
     found = []
-    for made, focal_px in ((turning, True), (sliding, False)):
-        recording = made(seed=config.seed)
+    for make, turns in ((turning, True), (sliding, False)):
+        recording = make(seed=config.seed)
         for count in config.packet_events:
             packets = _cut(recording, count, config.packets)
-            found += [_case(p, recording.name, count, recording, focal_px) for p in packets]
+            assumed = "rotation" if turns else "affine"
+            found += [
+                Case(_kind(recording.name, count), p, partial(_in_context, recording, p, turns), assumed)
+                for p in packets
+            ]
     for path in config.recording:
         for count in config.packet_events:
-            name = Path(path).stem.replace("-", "_").replace(".", "_")
             try:
                 packets = read_packets(path, None, PacketOptions(events=count, count=config.packets))
             except DomainError as error:
                 say(f"{path}, packets of {count} events: left out: {error}")
                 continue
-            found += [_read_case(p, name, count, config.focal_px) for p in packets]
+            seek = (
+                partial(sharpest.rotation, focal_px=config.focal_px) if config.focal_px else sharpest.affine
+            )
+            assumed = "rotation" if config.focal_px else "affine"
+            kind = _kind(Path(path).stem, count)
+            found += [Case(kind, p, partial(seek, p), assumed) for p in packets]
     return found
+
+
+def _kind(name, count):
+    return f"{name.replace('-', '_').replace('.', '_')}_{count / 1000:g}k"
 
 
 def _cut(recording, count, packets):
@@ -77,33 +91,26 @@ def _part(stream, part):
     return check_stream(EventStream(*columns, stream.height_px, stream.width_px))
 
 
-def _case(packet, name, count, recording, turns):
-    """A made packet; the contrast maximisation sees at least CONTEXT events around its middle, and its flow is
-    scaled to the packet."""
+def _in_context(recording, packet, turns):
+    """Flow of a packet of a made recording by contrast maximisation over at least CONTEXT events around its
+    middle, scaled to its length: a few thousand events are too few to be sure of."""
     stream = recording.stream
     first = int(torch.searchsorted(stream.t_us, torch.tensor(packet.t0_us)))
-    extra = max(0, CONTEXT - count) // 2
+    extra = max(0, CONTEXT - len(packet.stream)) // 2
     start = max(0, first - extra)
-    stop = min(len(stream), first + count + extra)
-    wide = Packet(
-        packet.name,
-        _part(stream, slice(start, stop)),
-        int(stream.t_us[start]),
-        int(stream.t_us[stop - 1]),
-        None,
+    stop = min(len(stream), first + len(packet.stream) + extra)
+    wide = replace(
+        packet,
+        stream=_part(stream, slice(start, stop)),
+        t0_us=int(stream.t_us[start]),
+        t1_us=int(stream.t_us[stop - 1]),
     )
-    best = sharpest.rotation(wide, recording.focal_px) if turns else sharpest.affine(wide)
+    found = sharpest.rotation(wide, recording.focal_px) if turns else sharpest.affine(wide)
     share = (packet.t1_us - packet.t0_us) / (wide.t1_us - wide.t0_us)
-    best = sharpest.Sharpest(share * best.flow_px, best.contrast)
-    return Case(f"{name}_{count // 1000}k", packet, best, "rotation" if turns else "affine")
+    return sharpest.Sharpest(share * found.flow_px, found.contrast)
 
 
-def _read_case(packet, name, count, focal_px):
-    best = sharpest.rotation(packet, focal_px) if focal_px else sharpest.affine(packet)
-    return Case(f"{name}_{count // 1000}k", packet, best, "rotation" if focal_px else "affine")
-
-
-def judged(case, estimate, bins):
+def judged(case, reference, estimate, bins):
     """Figures of an estimator on a packet: distance_px to the contrast maximisation and aee_px to the truth,
     over pixels with events; fwl. None where there is no truth."""
     packet = case.packet
@@ -113,7 +120,7 @@ def judged(case, estimate, bins):
         "distance_px": float(
             metrics.aee(
                 flow_px,
-                torch.from_numpy(case.reference.flow_px).to(flow_px)[None],
+                torch.from_numpy(reference.flow_px).to(flow_px)[None],
                 metrics.event_mask(volume),
             )
         ),
@@ -122,11 +129,11 @@ def judged(case, estimate, bins):
     }
 
 
-def of_reference(case, bins):
+def of_reference(case, reference, bins):
     """The same figures of the contrast maximisation itself, and of the true flow where there is one."""
     packet = case.packet
     volume = events.from_stream(packet.stream, packet.t0_us, packet.t1_us, bins)
-    flow_px = torch.from_numpy(case.reference.flow_px).float()[None]
+    flow_px = torch.from_numpy(reference.flow_px).float()[None]
     rows = {
         "contrast_maximisation": {
             "distance_px": None,
