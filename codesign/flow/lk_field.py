@@ -6,11 +6,13 @@ reach from -1 to 1 along the longer side. Parameters are [B, 2K]: p_1..p_K, q_1.
 """
 
 from collections.abc import Callable
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 TERMS = {"constant": 1, "affine": 3, "quadratic": 6}
+POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of x and y in the basis
 # expected flow at the border from these terms, over that of the constant: cameras mostly shift, turn and
 # approach
 AFFINE = 0.35
@@ -26,6 +28,8 @@ class Polynomials:
         self, model: str, height: int, width: int, prior_px: float = 1.0, device: torch.device | None = None
     ) -> None:
         self.terms = TERMS[model]
+        self.powers = torch.tensor(POWERS[: self.terms], device=device)
+        self.degree = int(self.powers.sum(1).max())
         self.height = height
         self.width = width
         self.half = max(height, width) / 2
@@ -64,10 +68,30 @@ class Polynomials:
             precision += torch.outer(direction, direction) / (relative * prior_px) ** 2
         return precision
 
-    def mean_square(self, parameters: Tensor) -> Tensor:
-        """Mean squared length [B] of the flow over the square [-1, 1]^2."""
-        p = parameters.reshape(len(parameters), 2, self.terms)
-        second = p.new_tensor(
+    @cached_property
+    def equations(self) -> Tensor:
+        """Sums over an image to normal equations, which are linear in them: [8 s^2, 8 K^2 + 2 K + 2], float64.
+
+        Rows: the sums of ``lk_kernel.cell_sums`` times y^i x^j, i, j < s = 2 degree + 1. Columns: in units of the
+        prior the matrix of the slopes and that of events as slopes along x and y, [2K, 2K] each, and the pull [2K];
+        then energy of the temporal slopes, and events.
+        """
+        side = 2 * self.degree + 1
+        one = torch.eye(8 * side**2, dtype=torch.float64, device=self.unit.device)
+        sums = one.unflatten(1, (8, side, side))
+        x, y = self.powers.T
+        xx, xy, yy, events = sums[:, [0, 1, 2, 7]][..., y[:, None] + y, x[:, None] + x].unbind(1)
+        none = torch.zeros_like(events)
+        slopes = torch.cat([torch.cat([xx, xy], 2), torch.cat([xy, yy], 2)], 1)
+        scattered = torch.cat([torch.cat([events, none], 2), torch.cat([none, events], 2)], 1)
+        pull = -sums[:, 3:5][..., y, x].flatten(1)
+        matrices = [(self.unit.T @ matrix @ self.unit).flatten(1) for matrix in (slopes, scattered)]
+        return torch.cat([*matrices, pull @ self.unit, sums[:, 5, 0, :1], sums[:, 7, 0, :1]], 1)
+
+    @cached_property
+    def second_moments(self) -> Tensor:
+        """[2K, 2K] of the basis over the square [-1, 1]^2, for both components."""
+        one = torch.tensor(
             [
                 [1, 0, 0, 1 / 3, 0, 1 / 3],
                 [0, 1 / 3, 0, 0, 0, 0],
@@ -75,9 +99,15 @@ class Polynomials:
                 [1 / 3, 0, 0, 1 / 5, 0, 1 / 9],
                 [0, 0, 0, 0, 1 / 9, 0],
                 [1 / 3, 0, 0, 1 / 9, 0, 1 / 5],
-            ]
-        )
-        return torch.einsum("bck,kl,bcl->b", p, second[: self.terms, : self.terms], p)
+            ],
+            dtype=torch.float64,
+            device=self.unit.device,
+        )[: self.terms, : self.terms]
+        return torch.block_diag(one, one)
+
+    def mean_square(self, parameters: Tensor) -> Tensor:
+        """Mean squared length [B] of the flow over the square [-1, 1]^2."""
+        return ((parameters @ self.second_moments.to(parameters)) * parameters).sum(1)
 
     def at_start(
         self,

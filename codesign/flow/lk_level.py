@@ -138,22 +138,17 @@ class Level:
     def evidence(self, products: Tensor) -> tuple[Tensor, Tensor]:
         """Precision [B, 2K, 2K] that the data add where their products were taken, and their pull [B, 2K] on the
         parameters: precision times the distance to the best fit."""
-        k = self.shape.terms
-        sums = self.moments.sums(products)
-        xx, xy, yy, event_products = self.moments.by_products(sums[:, [0, 1, 2, 7]]).unbind(1)
-        normal = torch.cat([torch.cat([xx, xy], 2), torch.cat([xy, yy], 2)], 1)
-        scattered = (
-            torch.block_diag(torch.ones(k, k), torch.ones(k, k)).to(event_products)
-            * event_products.repeat(1, 2, 2)
-            * self.texture_noise
-        )
-        right = -self.moments.by_basis(sums[:, 3:5]).flatten(1)
-        unit = self.shape.unit
+        side = 2 * self.shape.terms
+        slopes, scattered, right, energy, events = (
+            self.moments.sums(products).double() @ self.shape.equations
+        ).split([side**2, side**2, side, 1, 1], 1)
         kept, weighed, explained = _trusted(
-            unit.T @ normal.double() @ unit, unit.T @ scattered.double() @ unit, right.double() @ unit
+            slopes.unflatten(1, (side, side)),
+            self.texture_noise * scattered.unflatten(1, (side, side)),
+            right,
         )
         scale = (CALIBRATION * OVERLAP * self.sigma**2 / self.stride**2) * self._noise(
-            explained, event_products[:, 0, 0].double(), sums[:, 5, 0, 0].double()
+            explained, events[:, 0], energy[:, 0]
         )
         return kept / scale[:, None, None], weighed / scale[:, None]
 
