@@ -44,7 +44,7 @@ def write_flow(path: str | Path, flow_px: torch.Tensor, valid: torch.Tensor | No
     """
     path = check_path(path, "the path of a flow file")
     encode = _choose({".png": _to_png, ".flo": _to_flo}, path, "written")
-    if isinstance(flow_px, np.ndarray) and flow_px.dtype.kind in "fiu":
+    if isinstance(flow_px, np.ndarray) and np.asarray(flow_px).dtype.kind in "fiu":
         flow_px = torch.from_numpy(np.array(flow_px, np.float64))
     flow = check_real(flow_px, "the flow to write").detach().cpu().double().numpy()
     if flow.ndim != 3 or flow.shape[0] != 2 or 0 in flow.shape:

@@ -324,10 +324,11 @@ def _check_references(references):
     pairs = isinstance(references, Sequence) and not isinstance(references, str) and len(references) > 0
     if not pairs or not all(isinstance(pair, Sequence) and len(pair) == 2 for pair in references):
         raise ShapeError(f"references are {shown(references)}; a list of (time, weight) pairs is needed.")
+    total = 0.0
     for at, share in references:
         check_number(at, "the time of a reference")
-        check_number(share, "the weight of a reference", 0.0)
-    if abs(sum(share for _, share in references) - 1) > 1e-6:
+        total += check_number(share, "the weight of a reference", 0.0)
+    if abs(total - 1) > 1e-6:
         raise DomainError(f"the weights of the references {shown(references)} do not sum to 1; scale them.")
 
 

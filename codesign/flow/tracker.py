@@ -3,7 +3,7 @@ chunks of a camera come in."""
 
 import inspect
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -141,12 +141,13 @@ class Tracker:
             return []
         if self.number is not None and self._waiting <= self.number:
             return []
-        return self._cut(_joined(self._parts), last=False)
+        return self._cut(_joined(self._parts), self._start_us, last=False)
 
     def finish(self) -> list[TrackedWindow]:
         """Return the last window, which ends at the last event (a microsecond later where that is its start), and
         forget stream and clock: what is added next is another stream."""
-        found = self._cut(_joined(self._parts), last=True) if self._parts else []
+        rest = _joined(self._parts) if self._parts else None
+        found = [] if rest is None or self._start_us is None else self._cut(rest, self._start_us, last=True)
         self._forget()
         return found
 
@@ -167,7 +168,7 @@ class Tracker:
                     f"the stream is of a sensor of {stream.width_px} x {stream.height_px} px, the tracker of "
                     f"{self.size_px[1]} x {self.size_px[0]}; take one tracker for each."
                 )
-            columns = stream.t_us, stream.x, stream.y, stream.p
+            columns = _columns_of(stream)
         else:
             columns = _columns(chunk)
         if self.size_px is None:
@@ -175,10 +176,10 @@ class Tracker:
                 "events as arrays do not say how large the sensor is; give size_px to the tracker."
             )
         columns = self._in_order(self._on_sensor(columns))
-        return check_stream(EventStream(*columns, *self.size_px))
+        return check_stream(_stream(columns, self.size_px))
 
     def _on_sensor(self, columns):
-        height, width = self.size_px
+        height, width = self.size_px or (0, 0)
         _, x, y, _ = columns
         outside = (x < 0) | (x >= width) | (y < 0) | (y >= height)
         return self._without(OFF_SENSOR, outside, columns) if bool(outside.any()) else columns
@@ -195,10 +196,11 @@ class Tracker:
         if fault not in self.skip:
             at = int(bad.nonzero()[0])
             t_us, x, y, _ = (int(values[at]) for values in columns)
+            height, width = self.size_px or (0, 0)
             reason = (
                 f"lies before {self._last_us if at == 0 else int(columns[0][:at].max())} us"
                 if fault == BACKWARDS
-                else f"lies outside the sensor of {self.size_px[1]} x {self.size_px[0]} px"
+                else f"lies outside the sensor of {width} x {height} px"
             )
             raise DomainError(
                 f"event {at} of the chunk, at {t_us} us and ({x}, {y}), {reason}; order the stream, or leave such events "
@@ -207,59 +209,69 @@ class Tracker:
         self.left_out[fault] += int(bad.sum())
         return tuple(values[~bad] for values in columns)
 
-    def _cut(self, stream, last):
-        """The complete windows of the waiting events, with the rest of them where they are the ``last``; what is
-        not complete waits on."""
+    def _cut(self, stream: EventStream, start_us: int, last: bool) -> list[TrackedWindow]:
+        """The complete windows of the waiting events, and with ``last`` the rest of them; what is not complete
+        waits on."""
         found = []
         at = 0
-        start_us = self._start_us
-        empty = 0
-        while True:
+        while at < len(stream):
             if self.window_us is not None:
-                end_us = start_us + self.window_us
-                to = int(torch.searchsorted(stream.t_us, end_us))
-            else:
-                to = at + self.number
-                end_us = max(int(stream.t_us[to]), start_us + 1) if to < len(stream) else None
-            if to >= len(stream):  # nothing has come that lies behind this window
+                found += self._idle(start_us, int(stream.t_us[at]), stream.t_us.device)
+                start_us += (int(stream.t_us[at]) - start_us) // self.window_us * self.window_us
+            to = self._end(stream, at, start_us)
+            if to == len(stream) and not last:  # nothing has come that lies behind this window
                 break
-            if to == at:
-                empty += 1
-                self._check_empty(empty)
-            if to == at and EMPTY in self.skip:
-                self.left_out[EMPTY] += 1
-                self._before = None
-            else:
-                found.append(self._window(_part(stream, at, to), start_us, end_us))
+            end_us = int(stream.t_us[-1]) if to == len(stream) else int(stream.t_us[to])
+            if self.window_us is not None and to < len(stream):
+                end_us = start_us + self.window_us
+            found.append(self._window(_part(stream, at, to), start_us, max(end_us, start_us + 1)))
+            start_us = end_us
             at = to
-            start_us = end_us if self.window_us is not None else int(stream.t_us[to])
-        if last and at < len(stream):
-            end_us = max(int(stream.t_us[-1]), start_us + 1)
-            found.append(self._window(_part(stream, at, len(stream)), start_us, end_us))
         rest = _part(stream, at, len(stream))
-        self._parts = [EventStream(*(v.clone() for v in (rest.t_us, rest.x, rest.y, rest.p)), *self.size_px)]
+        self._parts = [_stream([values.clone() for values in _columns_of(rest)], self.size_px)]
         self._waiting = len(rest)
         self._start_us = start_us
         return found
 
-    def _check_empty(self, empty):
-        if empty > MOST_EMPTY and EMPTY not in self.skip:
+    def _end(self, stream, at, start_us):
+        """Number of the first event behind the window that begins with event ``at``; all of them where there is
+        none."""
+        if self.number is not None:
+            return min(at + self.number, len(stream))
+        return int(torch.searchsorted(stream.t_us, start_us + (self.window_us or 0)))
+
+    def _idle(self, start_us, next_us, device) -> list[TrackedWindow]:
+        """The windows without events before the next event, as they are to be handed out."""
+        length_us = self.window_us or 1
+        count = (next_us - start_us) // length_us
+        if count and EMPTY in self.skip:
+            self.left_out[EMPTY] += count
+            self._before = None
+            return []
+        if count > MOST_EMPTY:
             raise DomainError(
-                f"more than {MOST_EMPTY} windows of {self.window_us} us in this chunk hold no event; did the clock "
+                f"{count} windows of {length_us} us in a row hold no event, the next is at {next_us} us; did the clock "
                 f"jump? Leave such windows out with skip=({EMPTY!r},), or take longer ones."
             )
+        nothing = _stream([torch.zeros(0, dtype=torch.int64, device=device)] * 4, self.size_px)
+        return [
+            self._window(nothing, t0_us, t0_us + length_us)
+            for t0_us in range(start_us, start_us + count * length_us, length_us)
+        ]
 
     @torch.no_grad()
     def _window(self, stream, t0_us, t1_us):
         began = time.process_time()
-        before = self._before
-        warm = self.warm_start and before is not None and before.events > 0 and len(stream) > 0
+        before = (
+            self._before if self.warm_start and self._before is not None and self._before.events else None
+        )
+        warm = before is not None and len(stream) > 0
         if len(stream):
             volume = from_stream(stream, t0_us, t1_us, self.bins)
-            start = {"start_px": _carried_on(before, t1_us - t0_us)} if warm else {}
+            start = {} if before is None else {"start_px": _carried_on(before, t1_us - t0_us)}
             field = self._answer(self.estimate(volume, **start), volume)
         else:
-            field = _nothing(*self.size_px, t1_us - t0_us, stream.t_us.device)
+            field = _nothing(self.size_px, t1_us - t0_us, stream.t_us.device)
         spent_s = time.process_time() - began
         window = TrackedWindow(t0_us, t1_us, len(stream), field, warm, spent_s)
         self._before = window
@@ -309,15 +321,27 @@ def _columns(chunk):
     return t_us, x, y, torch.where(p == 0, -1, p)
 
 
+def _columns_of(stream: EventStream) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    return stream.t_us, stream.x, stream.y, stream.p
+
+
+def _stream(columns: Sequence[Tensor], size_px: Any) -> EventStream:
+    t_us, x, y, p = columns
+    height, width = size_px
+    return EventStream(t_us, x, y, p, height, width)
+
+
 def _joined(parts):
     first = parts[0]
-    columns = (torch.cat([getattr(part, name) for part in parts]) for name in ("t_us", "x", "y", "p"))
-    return first if len(parts) == 1 else EventStream(*columns, first.height_px, first.width_px)
+    if len(parts) == 1:
+        return first
+    columns = [torch.cat(columns) for columns in zip(*map(_columns_of, parts), strict=True)]
+    return _stream(columns, (first.height_px, first.width_px))
 
 
 def _part(stream, first, last):
-    columns = (getattr(stream, name)[first:last] for name in ("t_us", "x", "y", "p"))
-    return EventStream(*columns, stream.height_px, stream.width_px)
+    columns = [values[first:last] for values in _columns_of(stream)]
+    return _stream(columns, (stream.height_px, stream.width_px))
 
 
 def _carried_on(before, duration_us):
@@ -331,9 +355,7 @@ def _carried_on(before, duration_us):
     return read * (duration_us / (before.t1_us - before.t0_us))
 
 
-def _nothing(height, width, duration_us, device):
-    """FlowField of a window without events."""
-    flow = torch.zeros(1, 2, height, width, device=device)
-    return FlowField(
-        flow, torch.zeros_like(flow[:, 0], dtype=torch.bool), duration_us * 1e-6, torch.zeros_like(flow[:, 0])
-    )
+def _nothing(size_px: Any, duration_us: int, device: torch.device) -> FlowField:
+    """FlowField of a window without events, all of one number in memory."""
+    zero = torch.zeros((), device=device).expand(1, 2, *size_px)
+    return FlowField(zero, zero[:, 0].bool(), duration_us * 1e-6, zero[:, 0])

@@ -19,8 +19,8 @@ from codesign.errors import DomainError, ShapeError
 from codesign.flow import metrics
 from codesign.flow.checkpoint import DELIVERED
 from codesign.flow.checkpoint import load as load_network
-from codesign.flow.sources import PacketOptions, read_packets
-from studies.flow_recording import doubts, made
+from codesign.flow.sources import PacketOptions, read_packets, read_recording
+from studies.flow_recording import doubts, made, video
 from studies.flow_recording import figures as drawn
 from studies.frame.run import Run, StudyConfig, main
 
@@ -80,6 +80,12 @@ class Config(StudyConfig):
     """The camera's axes in terms of the gyroscope's, for example x-y-z."""
     calibration: Path | None = None
     """Camera file, instead of the calib.txt beside the events."""
+    video: bool = False
+    """Also write a video of the events with arrows of the flow, window after window (a tracker; see docs/flow.md)."""
+    video_windows: int = 150
+    """Most windows of the video."""
+    video_fps: float = 15.0
+    """Windows per second of the video."""
     bins: int = 8
     """Time bins of the event volumes for lk; networks have their own."""
 
@@ -108,7 +114,24 @@ def study(run: Run[Config]) -> None:
                 progress.advance()
             if number < SHOWN:
                 run.figure(drawn.packet(packet, fields), f"packet_{number:02d}", caption(packet))
-    show(run, packets, rows, tuple(estimators), synthetic)
+    made_video = config.video and filmed(run, recording, estimators, options(config, synthetic))
+    show(run, packets, rows, tuple(estimators), synthetic, made_video)
+
+
+def filmed(run, recording, estimators, read):
+    """The Film of a recording, by the last of the estimators; its figures are recorded."""
+    name, (estimate, bins) = list(estimators.items())[-1]
+    held = read_recording(recording, read)
+    tracker = flow.Tracker(
+        estimate,
+        None if read.events else read.window_s or 0.02,
+        read.events,
+        bins or run.config.bins,
+        skip=("windows_without_events",),
+    )
+    film = video.write(run, held, tracker, name, read.start_s or 0.0)
+    run.record(**film.metrics)
+    return film
 
 
 def load(name):
@@ -201,7 +224,7 @@ def caption(packet):
     return f"{packet.name}: {len(packet.stream)} events in {length:.2f} ms. {'; '.join(packet.notes)}. Hue is the direction of the flow, saturation its length; black where nothing is known."
 
 
-def show(run, packets, rows, names, synthetic):
+def show(run, packets, rows, names, synthetic, made_video):
     """Figures, tables and page."""
     for name in names:
         mine = [found for _, estimator, found in rows if estimator == name]
@@ -266,6 +289,9 @@ def show(run, packets, rows, names, synthetic):
     run.table("Means over packets", ("estimator", *UNITS.values()), means)
     for sentence in doubts.sentences(packets, rows, names[-1]):
         run.text(sentence)
+    if made_video:
+        run.section("Video", made_video.sentence)
+        run.video(made_video.path.name, made_video.caption)
     source = "a synthetic recording" if synthetic else f"`{run.config.recording}`"
     run.finish("Event flow on a recording", f"{len(packets)} packets of {source}.")
 

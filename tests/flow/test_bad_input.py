@@ -99,6 +99,7 @@ def test_the_gradient_to_wide_events_goes_through_narrow_weights(name):
         NETWORKS[name](events).flow_px.square().sum().backward()
     assert counts.grad is not None
     assert counts.grad.dtype == torch.float64
+    assert narrow.counts.grad is not None
     scale = float(counts.grad.abs().max())
     assert float((counts.grad - narrow.counts.grad).abs().max()) < 1e-3 * scale
 

@@ -3,15 +3,16 @@ known cases, its errors."""
 
 import json
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
 
-from codesign import events, render
-from codesign.flow.sources import PacketOptions, read_packets
+from codesign import events, flow, render
+from codesign.flow.sources import PacketOptions, read_packets, read_recording
 from codesign.types import FlowField
 from studies.flow_recording import __main__ as study
-from studies.flow_recording import made
+from studies.flow_recording import made, video
 from studies.frame.run import main
 
 SIZE = (45, 60)
@@ -77,9 +78,9 @@ def test_figures_of_a_run(recording, tmp_path):
     zero = []
     for packet in packets:
         volume = events.from_stream(packet.stream, packet.t0_us, packet.t1_us, 8)
-        flow, _ = study.measured(packet, study.load("lk")["lk"][0], 8)
+        field, _ = study.measured(packet, study.load("lk")["lk"][0], 8)
         seen = (volume.counts.sum((1, 2)) > 0)[0]
-        errors.append(float((flow.flow_px - true(packet).flow_px)[0].square().sum(0).sqrt()[seen].mean()))
+        errors.append(float((field.flow_px - true(packet).flow_px)[0].square().sum(0).sqrt()[seen].mean()))
         zero.append(float(true(packet).flow_px[0].square().sum(0).sqrt()[seen].mean()))
     assert metrics["lk_aee_px"] == pytest.approx(np.mean(errors), rel=1e-5)
     assert metrics["lk_zero_aee_px"] == pytest.approx(np.mean(zero), rel=1e-5)
@@ -120,6 +121,38 @@ def test_a_recording_without_truth_has_its_sharpness_only(tmp_path):
     assert metrics["packets_without_truth"] == metrics["packets"] == 1  # shorter than 0.1 s: one packet
     assert "lk_aee_px" not in metrics
     assert metrics["lk_fwl"] > 0
+
+
+def test_a_video_of_all_windows(recording, tmp_path):
+    size = ["--width-px", "60", "--height-px", "45"]
+    cut = ["--window-ms", "5", "--packets", "1", "--video", "--video-windows", "99"]
+    code, metrics = run(tmp_path / "run", "--recording", str(recording[0]), *size, *cut)
+    assert code == 0
+    assert metrics is not None
+    held = read_recording(recording[0], PacketOptions(size_px=SIZE))
+    assert metrics["video_events"] == len(held)
+    assert metrics["video_event_s"] == pytest.approx((held.t_us[-1] - held.t_us[0]) * 1e-6, abs=2e-6)
+    assert metrics["video_real_time_factor"] == pytest.approx(
+        metrics["video_processor_s"] / metrics["video_event_s"]
+    )
+    frames = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "run" / "flow.mp4"))[0]
+    assert frames == metrics["video_windows"] == -(-(held.t_us[-1] - held.t_us[0]) // 5000)
+    assert "real-time factor" in (tmp_path / "run" / "report.html").read_text()
+
+
+def test_arrows_are_the_flow_per_second_where_events_are(recording):
+    held = read_recording(recording[0], PacketOptions(size_px=SIZE))
+    t0_us = int(held.t_us[0])
+    y, x = torch.meshgrid(torch.arange(45.0), torch.arange(60.0), indexing="ij")
+    linear = torch.stack([x / 10, 3 + 0 * y])[None]
+    field = FlowField(linear, torch.ones(1, *SIZE, dtype=torch.bool), 0.01, torch.full((1, *SIZE), 0.5))
+    found = video.arrows(held, flow.TrackedWindow(t0_us, t0_us + 10_000, 9, field, False, 0.0), 1)
+    part = held.window(t0_us, t0_us + 10_000)
+    places = {(float(a), float(b)) for a, b in zip(part.x.tolist(), part.y.tolist(), strict=True)}
+    assert {(float(a), float(b)) for a, b in zip(found.x_px, found.y_px, strict=True)} == places
+    np.testing.assert_allclose(found.u, found.x_px / 10 / 0.01, rtol=1e-5)
+    np.testing.assert_allclose(found.v, 300, rtol=1e-5)
+    np.testing.assert_allclose(found.sure, 0.5, rtol=1e-5)
 
 
 def test_a_slider_has_no_error_against_its_rotation(tmp_path):

@@ -129,7 +129,7 @@ class SpikeFlowNet(nn.Module):
                 f"{tuple(halves.shape)}."
             )
         steps = halves.shape[4]
-        halves = halves.to(self.encoder[0].weight.dtype)  # pyright: ignore[reportArgumentType]
+        halves = halves.to(next(self.parameters()).dtype)
         x = halves.permute(4, 0, 1, 2, 3).flatten(0, 1).contiguous(memory_format=torch.channels_last)
         sums = []
         for layer in (

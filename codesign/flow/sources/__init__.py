@@ -5,7 +5,7 @@ from codesign.flow.sources.dsec import DsecWindows
 from codesign.flow.sources.mvsec import MvsecWindows
 from codesign.flow.sources.opening import open_windows
 from codesign.flow.sources.packet import SKIPPABLE, Packet, PacketOptions
-from codesign.flow.sources.packets import read_packets
+from codesign.flow.sources.packets import read_packets, read_recording
 from codesign.flow.sources.rendered import DatasetWindows
 from codesign.flow.sources.text_events import read_text_events
 
@@ -18,5 +18,6 @@ __all__ = [
     "PacketOptions",
     "open_windows",
     "read_packets",
+    "read_recording",
     "read_text_events",
 ]

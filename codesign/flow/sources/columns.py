@@ -1,6 +1,6 @@
 """Events of a long recording in few bytes each, from which windows are cut as event streams."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,6 +20,7 @@ SENSORS_PX = {
     "Prophesee HD": (1280, 720),
 }
 LIMIT_PX = 2**15
+CHUNK = 100_000  # events
 BACKWARDS = "events_back_in_time"
 OFF_SENSOR = "events_off_sensor"
 
@@ -52,6 +53,17 @@ class EventColumns:
             for values in (self.t_us, self.x, self.y, self.on)
         )
         return ordered(t, x, y, 2 * on - 1, self.height_px, self.width_px)
+
+    def chunks(self, size: int = CHUNK, start_us: int | None = None) -> Iterator[EventStream]:
+        """EventStreams of ``size`` events each, in order, from ``start_us`` on; events of one microsecond may
+        part."""
+        first = 0 if start_us is None else int(np.searchsorted(self.t_us, start_us))
+        for k in range(first, len(self), size):
+            t, x, y, on = (
+                torch.from_numpy(values[k : k + size].astype(np.int64))
+                for values in (self.t_us, self.x, self.y, self.on)
+            )
+            yield EventStream(t, x, y, 2 * on - 1, self.height_px, self.width_px)
 
 
 def from_stream(stream: EventStream, size_from: str = "the file") -> EventColumns:

@@ -59,6 +59,23 @@ def read_packets(
         return _with_truth_somewhere(_cut(files[0], truth_path, options))
 
 
+def read_recording(path: str | Path, options: PacketOptions | None = None) -> EventColumns:
+    """All events of a recording that is one event file, or a folder or zip archive with one.
+
+    Returns: EventColumns, whose ``chunks()`` a flow.Tracker takes.
+    Raises: FileFormatError, DomainError; also for a folder of several packets.
+    """
+    options = PacketOptions() if options is None else options
+    check_options(options, None)
+    with folders.opened(path) as place:
+        files = folders.event_files(place)
+        if len(files) > 1:
+            raise DomainError(
+                f"{path} holds {len(files)} packets, which are no one stream; give one of its files."
+            )
+        return read_events(files[0], options)
+
+
 def read_events(path: Path, options: PacketOptions, truth_path: Path | None = None) -> EventColumns:
     """EventColumns of one event file of any kind."""
     path = Path(path)
