@@ -183,11 +183,11 @@ def test_a_speed_that_changes_is_followed():
     ):
         found = list(tracker.track(pieces(stream, range(0, len(stream), 997))))
         assert tracker.events == len(stream)
-        for window in found[:-1]:
+        for window in found[1:-1]:  # the first begins with the levels of all pixels those of one frame
             t0_s, t1_s = window.t0_us * 1e-6, window.t1_us * 1e-6
             right = 200 * (t1_s - t0_s) + 3000 * (t1_s**2 - t0_s**2)
             mean = window.field.flow_px[0].mean((1, 2)).tolist()
-            # what the closed form leaves of such a motion on hard events, some percent (docs/flow_closed_form.md)
+            # what the closed form leaves on hard events of dense texture (0.02 to 0.06 of zero flow)
             assert mean[0] == pytest.approx(right, rel=0.05)
             assert abs(mean[1]) < 0.05 * right
     network = flow.Refiner(bins=4, width=4, steps=1)
