@@ -157,8 +157,9 @@ def test_a_layer_passes_the_gradient_of_the_mean_on_to_drive_and_parameters():
         )
         h = (1 / tau_r).expand(5)
         start = rested(6, 2, h)
+        pace = torch.full((5,), PACE / 1.2, dtype=D)  # held, also where tau_r moves
         theta = theta.expand(5)
-        spikes, _ = mean_spikes("pair", response, theta, (-h).exp(), -2 * theta * math.e * h, PACE * h, start)
+        spikes, _ = mean_spikes("pair", response, theta, (-h).exp(), -2 * theta * math.e * h, pace, start)
         return (spikes * weights).sum()
 
     leaves = [x.clone().requires_grad_() for x in (given, *numbers)]

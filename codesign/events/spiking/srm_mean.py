@@ -75,7 +75,9 @@ def meant(
         )
     reset = reset_coefficients(kernel, h_reset, -reset_scale * theta)
     flat = response.reshape(len(response), -1)
-    mean, after = mean_spikes(RESETS[kernel], flat, theta, reset.a, reset.m, PACE * h_reset, start)
+    # the noise is the model's: held where tau_r moves, as it moves no hard spike
+    pace = PACE * h_reset.detach()
+    mean, after = mean_spikes(RESETS[kernel], flat, theta, reset.a, reset.m, pace, start)
     return instead(spikes, mean.reshape(response.shape)), after.reshape(wanted)
 
 
