@@ -15,6 +15,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from codesign.atomic import replacing
 from codesign.errors import DomainError, ShapeError
 from codesign.flow.checks import MOST_SIDE_PX, check_count, check_kind, check_number, check_path, check_real
+from codesign.flow.lk_plain import plain_operations
 from codesign.optional import require
 from codesign.types import EventVolume
 
@@ -97,7 +98,7 @@ def trace(network: nn.Module, height_px: int, width_px: int, batch: int = 1) -> 
     network.eval()
     counts = torch.zeros(batch, 2, config["bins"], height_px, width_px)
     try:
-        with torch.no_grad():
+        with torch.no_grad(), plain_operations():
             # traced with values, since torch.export alone cannot follow a check for finite input or a number
             # computed from the bins' times
             graph = make_fx(program, tracing_mode="real", _error_on_data_dependent_ops=False)(counts)

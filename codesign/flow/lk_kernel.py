@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 
 from codesign.backend import NoSecondDerivative
 from codesign.errors import DomainError, ShapeError
-from codesign.flow import lk_blur_kernel, lk_sums_kernel, lk_warp_kernel
+from codesign.flow import lk_blur_kernel, lk_plain, lk_sums_kernel, lk_warp_kernel
 from codesign.flow.lk_lanes import Grid
 
 _FIRST_ONLY = (
@@ -51,6 +51,8 @@ def moving(
         raise ShapeError(
             f"{bins} bins have times {list(time.shape)} and shares {list(contrast.shape)}; give [n] and [2, n]."
         )
+    if lk_plain.wanted():
+        return lk_plain.moving(rate, flow_px, time, contrast, grid, fade_px)
     return _Moving.apply(rate, flow_px, torch.cat([time[None], contrast]).to(rate), grid, fade_px)
 
 
@@ -76,6 +78,8 @@ def cell_sums(
         )
     if cell < 1:
         raise DomainError(f"cell is {cell}; give a side of at least 1 sample.")
+    if lk_plain.wanted():
+        return lk_plain.cell_sums(mean, slope, seen, density, grid, cell)
     return _Sums.apply(mean, slope, seen, density, grid, cell)
 
 
@@ -95,6 +99,8 @@ def blurred(images: Tensor, grid: Grid, taps: Sequence[float]) -> Tensor:
             f"images are {list(images.shape)}, the grid has {grid.height} x {grid.width} pixels and {grid.shape[0]} "
             f"x {grid.shape[1]} samples; give [B, n, {grid.height}, {grid.width}] and at least one sample."
         )
+    if lk_plain.wanted():
+        return lk_plain.blurred(images, grid, taps)
     return _Blurred.apply(images, grid, tuple(taps))
 
 
