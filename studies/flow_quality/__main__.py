@@ -62,6 +62,8 @@ class Config(StudyConfig):
     """Windows of every set of scenes.flow_sets: packets of few events, bent images, vibration, rotation."""
     sets: tuple[str, ...] = ()
     """Sets to judge on; all when left out, with the recordings."""
+    middlebury: Path | None = None
+    """Folder with Middlebury's .flo files, to move photographs by as they are and three times as far."""
     recording: tuple[Path, ...] = ()
     """Recordings (docs/flow_recordings.md) to judge on beside the two that are made."""
     focal_px: float | None = None
@@ -107,6 +109,11 @@ def study(run: Run[Config]) -> None:
                 "that the network claims. Colour: direction, strength: length.",
             )
     _show(run, found, about, who)
+    if config.middlebury is None:
+        run.text(
+            "Middlebury's flows were left out: give the folder of its .flo files with `--middlebury`. The sets "
+            "`many_depths` stand for them."
+        )
     if "worlds" in found:
         _worlds(run, found["worlds"])
     if config.recording or not config.sets:

@@ -1,5 +1,6 @@
 """The windows flow is judged on: seeds that guided no choice."""
 
+from scenes.flow_files import FileWindows
 from scenes.flow_sets import SETS
 from scenes.flow_worlds import ALL, WorldWindows
 from studies.train_flow.sources import UNSEEN, VALIDATION, Shape
@@ -17,4 +18,8 @@ def judged(config, bins):
     found["worlds"] = (WorldWindows(ALL, seed=UNSEEN + seed, bins=bins), config.world_windows)
     for name, make in SETS.items():
         found[name] = (make(UNSEEN + seed, bins), config.real_windows)
+    if config.middlebury is not None:
+        for factor in (1, 3):
+            source = FileWindows(config.middlebury, factor, seed=UNSEEN + seed, bins=bins)
+            found[f"middlebury_x{factor}"] = (source, config.real_windows)
     return found

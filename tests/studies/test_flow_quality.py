@@ -9,12 +9,13 @@ import pytest
 import torch
 
 from codesign.events.stream import ordered
-from codesign.flow import metrics
+from codesign.flow import metrics, write_flow
 from codesign.flow.checkpoint import DELIVERED
 from codesign.flow.export import evenly_timed
 from codesign.types import FlowField, FlowWindows
 from studies.flow_quality.__main__ import Config, study
 from studies.flow_quality.measures import SHARES, join, measure, sparsified, spearman, warp_loss
+from studies.flow_quality.sets import judged
 from studies.frame.run import main
 
 
@@ -135,3 +136,12 @@ def test_quick_form(tmp_path):
 def test_unfit_options_are_refused(tmp_path, capsys, options, said):
     assert main(study, Config, [*options, "--out", str(tmp_path)]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_flows_of_middlebury_are_judged_where_they_are(tmp_path):
+    write_flow(tmp_path / "flow10.flo", torch.ones(2, 130, 140))
+    without, given = (judged(Config(middlebury=folder), 4) for folder in (None, tmp_path))
+    assert sorted(set(given) - set(without)) == ["middlebury_x1", "middlebury_x3"]
+    source, number = given["middlebury_x3"]
+    assert number == Config.real_windows
+    assert torch.equal(source.batch([0]).truth.flow_px, torch.full((1, 2, 128, 128), 3.0))
