@@ -54,6 +54,8 @@ class Config(StudyConfig):
     QUICK: ClassVar = {"windows": 8, "world_windows": 5, "real_windows": 2, "packets": 1}
     network: str = "refiner"
     """Network to judge: "refiner" (the delivered one) or the path of a network file."""
+    models: tuple[str, ...] = ("constant", "affine", "quadratic")
+    """Models of the closed form to judge, "affine" among them."""
     windows: int = 256
     """Windows of every set of flat textures, 64 x 64."""
     world_windows: int = 75
@@ -89,13 +91,17 @@ def study(run: Run[Config]) -> None:
         )
     if config.focal_px is not None and not config.focal_px > 0:
         raise DomainError(f"--focal-px is {config.focal_px}; a focal length > 0 px is needed.")
+    if START.removeprefix("closed_form_") not in config.models:
+        raise DomainError(
+            f"--models {' '.join(config.models)}: affine is needed, which others are compared with."
+        )
     network = flow.load(config.network).eval()
     sets = judged(config, network.config["bins"])
     unknown = [name for name in config.sets if name not in sets]
     if unknown:
         raise DomainError(f"--sets {unknown[0]} is unknown; choose from {', '.join(sets)}.")
     sets = {name: sets[name] for name in config.sets or sets}
-    who = estimators(network)
+    who = estimators(network, config.models)
     found = {}
     about = {}
     with run.progress(sum(number for _, number in sets.values()), "windows") as progress:

@@ -1,4 +1,4 @@
-"""The estimators that are judged: the closed form in all its models, the network, and the network's
+"""The estimators that are judged: models of the closed form, the network, and the network's
 corrections alone."""
 
 from functools import partial
@@ -6,13 +6,12 @@ from functools import partial
 import torch
 
 from codesign import flow
-from codesign.flow import lk_field
 
 
-def estimators(network):
-    """Name -> function from an EventVolume to a FlowField. "corrections": what the network says before it is
-    weighed against its start."""
-    found = {f"closed_form_{model}": partial(flow.estimate_lk, model=model) for model in lk_field.TERMS}
+def estimators(network, models):
+    """Name -> function from an EventVolume to a FlowField. models: of the closed form. "corrections": what the
+    network says before it is weighed against its start."""
+    found = {f"closed_form_{model}": partial(flow.estimate_lk, model=model) for model in models}
     found["refiner"] = network
     if hasattr(network, "predictions"):
         found["corrections"] = partial(_corrections, network)

@@ -131,7 +131,11 @@ def test_quick_form(tmp_path):
 
 @pytest.mark.parametrize(
     ("options", "said"),
-    [(["--windows", "1"], "at least 2 are needed"), (["--sets", "roads"], "--sets roads is unknown")],
+    [
+        (["--windows", "1"], "at least 2 are needed"),
+        (["--sets", "roads"], "--sets roads is unknown"),
+        (["--models", "constant"], "affine is needed"),
+    ],
 )
 def test_unfit_options_are_refused(tmp_path, capsys, options, said):
     assert main(study, Config, [*options, "--out", str(tmp_path)]) == 2
