@@ -58,10 +58,12 @@ def along_path(volume: EventVolume) -> tuple[Path, Tensor, Tensor]:
     weight = (volume.collected_s / span).to(counts)
     time = (volume.centroid_s / span).to(counts) - 0.5
     on, off = counts.unbind(1)
-    kept = cool(counts.sum((1, 2)))
-    events = kept[:, None] * (on + off)
-    found = path(kept[:, None] * (on - off), events.sum((2, 3)), weight, time)
-    return found, torch.stack([weight, time]), events.sum(1)
+    both = on + off
+    density = both.sum(1)
+    kept = cool(density)
+    events = (both.flatten(2) @ kept.flatten(1)[:, :, None])[..., 0]  # of each bin
+    found = path(kept[:, None] * (on - off), events, weight, time)
+    return found, torch.stack([weight, time]), kept * density
 
 
 def cool(events: Tensor) -> Tensor:

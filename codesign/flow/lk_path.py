@@ -56,9 +56,8 @@ def path(signed: Tensor, events: Tensor, weight: Tensor, time: Tensor) -> Path:
     place = edge - direction * share / 2 + direction * speed * off_middle
     mean = (share * place).sum(1, keepdim=True)
     place = place - mean
-    moved = _shared(place, time - weight @ time).to(signed)
-    turned = direction.to(signed)[:, :, None] * signed.flatten(2)
-    counts = (moved.mT @ turned).unflatten(2, signed.shape[2:])
+    moved = direction[:, :, None] * _shared(place, time - weight @ time)
+    counts = (moved.mT.to(signed) @ signed.flatten(2)).unflatten(2, signed.shape[2:])
     return Path(counts, edge[:, -1], -mean[:, 0], (share * place.square()).sum(1))
 
 
