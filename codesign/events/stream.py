@@ -1,12 +1,13 @@
 """Event streams: put in order, joined, and counted per frame interval."""
 
 from collections.abc import Iterable
+from numbers import Integral
 
 import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import Times, check_times, check_whole
+from codesign.events.entry import Times, check_times
 from codesign.types import EventStream
 
 
@@ -54,16 +55,25 @@ def check_stream(stream: EventStream, part: slice = slice(None)) -> EventStream:
             "events.simulate and codesign.events.stream.ordered give it."
         )
     for side, name in ((stream.height_px, "height_px"), (stream.width_px, "width_px")):
-        check_whole(side, f"{name} of the stream", 0)
+        if isinstance(side, bool) or not isinstance(side, Integral) or side < 0:
+            raise DomainError(
+                f"{name} of the stream is {' '.join(repr(side).split())}; a whole number is needed."
+            )
     columns = (stream.t_us, stream.x, stream.y, stream.p)
     if not all(
-        isinstance(values, Tensor) and values.dtype == torch.int64 and not values.is_meta
+        isinstance(values, Tensor)
+        and values.dtype == torch.int64
+        and values.layout == torch.strided
+        and not values.is_meta
         for values in columns
     ):
         given = [
-            str(values.dtype) if isinstance(values, Tensor) else type(values).__name__ for values in columns
+            f"{values.dtype}, {values.layout}, on {values.device}"
+            if isinstance(values, Tensor)
+            else type(values).__name__
+            for values in columns
         ]
-        raise DomainError(f"t_us, x, y, p of the stream are {given}; tensors of int64 are needed.")
+        raise DomainError(f"t_us, x, y, p of the stream are {given}; dense tensors of int64 are needed.")
     if not all(values.shape == (len(stream),) for values in columns):
         raise ShapeError(
             f"t_us, x, y, p of the stream have shapes {[list(v.shape) for v in columns]}; four lists of equal "

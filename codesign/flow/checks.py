@@ -34,10 +34,11 @@ def check_real(value: Any, name: str, dtypes: tuple[torch.dtype, ...] | None = N
     if not value.is_floating_point() or (dtypes is not None and value.dtype not in dtypes):
         wanted = "floating-point numbers" if dtypes is None else "float32 or float64"
         raise DomainError(f"{name} is {value.dtype}; {wanted} are needed: convert with .float().")
-    return _dense(value, name)
+    return check_dense(value, name)
 
 
-def _dense(value, name):
+def check_dense(value: Tensor, name: str) -> Tensor:
+    """``value`` unchanged when it is a dense tensor with values; DomainError otherwise."""
     if value.layout != torch.strided or value.is_meta:
         given = "a meta tensor without values" if value.is_meta else f"stored as {value.layout}"
         raise DomainError(f"{name} is {given}; a dense tensor is needed (sparse ones: to_dense()).")
@@ -51,7 +52,7 @@ def check_mask(value: Any, name: str, shape: tuple[int, ...]) -> Tensor:
         raise DomainError(f"{name} is {given}; a bool tensor is needed, True where pixels count.")
     if tuple(value.shape) != tuple(shape):
         raise ShapeError(f"{name} must be {tuple(shape)}, one entry per pixel, got {tuple(value.shape)}.")
-    return _dense(value, name)
+    return check_dense(value, name)
 
 
 def check_volume(volume: EventVolume, bins: int | None = None, least_bins: int = 1) -> Tensor:

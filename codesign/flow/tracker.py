@@ -16,7 +16,7 @@ from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import check_whole
 from codesign.events.stream import check_stream
 from codesign.events.volumes.volume import check_bins, from_stream
-from codesign.flow.checks import check_field, check_number, check_size, shown
+from codesign.flow.checks import check_dense, check_field, check_number, check_size, shown
 from codesign.flow.sources.columns import BACKWARDS, OFF_SENSOR
 from codesign.flow.sources.packet import EMPTY
 from codesign.flow.warp import pixel_grid
@@ -308,8 +308,12 @@ def _columns(chunk):
         )
     columns = []
     for name, given in zip(("t_us", "x", "y", "p"), chunk, strict=True):
-        values = given.detach().cpu().numpy() if isinstance(given, Tensor) else np.asarray(given)
-        whole = values.dtype.kind in "iub" or (values.dtype.kind == "f" and bool((values % 1 == 0).all()))
+        if isinstance(given, Tensor):
+            given = check_dense(given, name).detach().cpu().numpy()
+        values = np.asarray(given)
+        whole = values.dtype.kind in "iub"
+        if values.dtype.kind == "f":
+            whole = bool((np.abs(values) < 2**53).all()) and bool((values % 1 == 0).all())
         if values.ndim != 1 or not (whole or not values.size):
             raise DomainError(f"{name} is {shown(values)}; a list [N] of whole numbers is needed.")
         columns.append(torch.from_numpy(values.astype(np.int64)))

@@ -22,6 +22,8 @@ NETWORKS = {
     "refiner": flow.Refiner(BINS, width=8, steps=1),
     "flownet": flow.FlowNetEvents(BINS, width=4.0),
     "spiking": flow.SpikeFlowNet(BINS, width=4.0),
+    "ecn": flow.ECN(BINS, width=4.0),
+    "idnet": flow.IDNet(BINS, width=4.0),
 }
 ESTIMATORS = {"lk": flow.estimate_lk, **NETWORKS}
 
@@ -69,6 +71,47 @@ COUNTS = volume().counts
 def test_volumes_that_are_none(estimate, given, words):
     with pytest.raises(CodesignError, match=words):
         estimate(given)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 2), (3, 40), (13, 12), (33, 17)], ids=str)
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_size_has_an_answer_of_its_own_size_or_a_sentence(name, size):
+    given = volume(*size)
+    if min(size) < 2 and name in ("lk", "refiner"):  # a single row or column has no slope
+        with pytest.raises(CodesignError, match="at least 2 x 2"):
+            ESTIMATORS[name](given)
+        return
+    found = ESTIMATORS[name](given)
+    assert found.flow_px.shape == (2, 2, *size)
+    assert bool(found.flow_px.isfinite().all())
+
+
+def few_events(draw):
+    """A volume of 0 to 40 events at places drawn at random, some of them many times over."""
+    counts = torch.zeros(3, 2, BINS, 20, 24)
+    for sample in range(3):
+        for _ in range(int(torch.randint(0, 14, (), generator=draw)) * sample):
+            cell = [int(torch.randint(side, (), generator=draw)) for side in counts.shape[1:]]
+            counts[(sample, *cell)] += float(torch.randint(1, 4, (), generator=draw))
+    return evenly_timed(counts)
+
+
+@pytest.mark.parametrize("name", [*NETWORKS, "constant", "affine", "quadratic", "local"])
+def test_confidence_lies_between_none_and_all(name):
+    draw = torch.Generator().manual_seed(1)
+    for given in [few_events(draw) for _ in range(12)] + [
+        with_counts(1000 * COUNTS),
+        with_counts(0 * COUNTS),
+    ]:
+        found = NETWORKS[name](given) if name in NETWORKS else flow.estimate_lk(given, name)
+        assert found.confidence is not None
+        least, most = found.confidence.detach().aminmax()
+        assert float(least) >= 0
+        assert float(most) <= 1
+        empty = given.counts.sum((1, 2, 3, 4)) == 0
+        unseen = torch.where(empty[:, None, None], found.confidence.detach(), 0.0)
+        assert float(unseen.max()) < 1e-6  # of single precision
+        assert not found.valid[empty].any()
 
 
 @pytest.mark.parametrize("name", NETWORKS)
