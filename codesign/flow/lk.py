@@ -81,11 +81,12 @@ def estimate_lk(
     found = Descent(shape, prior_px, model == "local", counts)
     for number, blur_px in enumerate(levels_px):
         level = lk_level.Level(way, bins, density, shape, blur_px, noise_floor)
-        bend = number > 0 or len(levels_px) == 1
-        found.descend(level, steps, bend)
+        last = number == len(levels_px) - 1
+        bend = number > 0 or last
+        found.descend(level, steps, bend, last)
         if number == 1:  # a coarse blur may take one stripe for the next: another start
             other = Descent(shape, prior_px, model == "local", counts)
-            other.descend(level, steps, bend)
+            other.descend(level, steps, bend, last)
             found.join(other, level)
     flow, covariance, confidence = found.at_start(way.start)
     net = way.net.to(flow)[:, None, None, None]

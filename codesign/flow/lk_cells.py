@@ -17,18 +17,20 @@ from codesign.flow import lk_tree
 from codesign.flow.lk_level import CALIBRATION, DOUBT, OVERLAP, RIDGE, TINY, Level
 
 CELL = 8  # px
-SIZES = (0.01, 0.033, 0.1, 0.33)  # standard deviations of the cells' own steps, over the prior's
+SIZES = (0.005, 0.025, 0.1, 0.33)  # standard deviations of the cells' own steps, over the prior's
+RARER = 2.0  # logarithm of how much rarer each size is than the one before
 GROWTH = 6.0  # of the variance, from a scale to the next coarser one
 # events whose slopes are as the whole image's are, and whose noise, added to those of the cells around
 FEW_EVENTS = 30.0
 FEW_OF_NOISE = 10.0
-CLAIM = 0.5  # of the calibration of the whole image: sums over cells share fewer events
+CLAIM = 0.7  # of the calibration of the whole image: sums over cells share fewer events
 
 
 class Cells:
     """The local part over an image of height x width pixels, and what is known of it.
 
-    value, covariance, widest: [B, 2 or 3, rows, columns] px per way, float64.
+    value, covariance: [B, 2 or 3, rows, columns] px per way, float64. widest: variance of each component before anything
+    is seen.
     """
 
     def __init__(self, batch: int, height: int, width: int, prior_px: float, device: torch.device) -> None:
@@ -37,7 +39,9 @@ class Cells:
         self.scales = 1 + max(1, int(math.log2(max(height, width, 2 * CELL) / (2 * CELL))))
         self.value = torch.zeros(batch, 2, rows, columns, dtype=torch.float64, device=device)
         self.covariance = self.value.new_zeros(batch, 3, rows, columns)
-        self.widest = self.value.new_zeros(batch)
+        self.prior = (-RARER * torch.arange(len(SIZES), device=device).double()).softmax(0)
+        variances = (self.value.new_tensor(SIZES) * prior_px) ** 2
+        self.widest = float(self.prior @ variances) * sum(GROWTH**scale for scale in range(self.scales))
 
     def on(self, level: Level) -> Tensor:
         """Flow [B, 2, h, w] on the samples of a level."""
@@ -66,13 +70,12 @@ class Cells:
         many = len(SIZES), 1, 1, 1
         found = lk_tree.posterior(precision.repeat(many), pull.repeat(many), steps)
         means, covariances, evidence = (x.unflatten(0, (len(SIZES), -1)) for x in found)
-        weights = evidence.softmax(0)
+        weights = (evidence + self.prior.log()[:, None]).softmax(0)
         whole = weights[:, :, None, None, None]
         mean = (whole * means).sum(0)
         x, y = (means - mean).unbind(2)
         apart = torch.stack([x * x, x * y, y * y], 2)
         self.covariance = (whole * (covariances + apart)).sum(0)
-        self.widest = weights.T @ variances * sum(GROWTH**scale for scale in range(self.scales))
         change = mean - self.value
         far = change.square().sum(1, keepdim=True) / (2 * level.sigma) ** 2
         self.value = self.value + change * (1 + far).rsqrt()

@@ -11,7 +11,11 @@ FIRST = 1.0  # by what the first of two answers leads in the logarithm of their 
 
 
 class Descent:
-    """A field, and how surely it is known: a polynomial, and values on cells where ``local``."""
+    """A field, and how surely it is known: a polynomial, and values on cells.
+
+    Where not ``local``, the cells are no part of the flow. They are found once, at the end: what one polynomial does
+    not explain is error of the field.
+    """
 
     def __init__(self, shape: Polynomials, prior_px: float, local: bool, like: Tensor) -> None:
         """Args: like: [B, ...], tells batch, device and precision."""
@@ -22,7 +26,8 @@ class Descent:
         self.found = torch.zeros(batch, 2 * shape.terms, dtype=torch.float64, device=like.device)
         self.one = torch.eye(2 * shape.terms, dtype=torch.float64, device=like.device)
         self.precision = self.one.expand(batch, -1, -1)
-        self.cells = Cells(batch, shape.height, shape.width, prior_px, like.device) if local else None
+        self.local = local
+        self.cells = Cells(batch, shape.height, shape.width, prior_px, like.device)
 
     def parameters(self) -> Tensor:
         """[B, 2K] of the polynomial, px per way."""
@@ -31,13 +36,13 @@ class Descent:
     def flow(self, level: Level) -> Tensor:
         """[B, 2, h, w] px per way on the level's samples."""
         flow = level.moments.flow(self.parameters())
-        return flow if self.cells is None else flow + self.cells.on(level).to(flow)
+        return flow + self.cells.on(level).to(flow) if self.local else flow
 
-    def descend(self, level: Level, steps: int, bend: bool) -> None:
+    def descend(self, level: Level, steps: int, bend: bool, last: bool) -> None:
         """Moves to the best field, by steps no longer than the linearisation reaches.
 
-        Args: bend: whether cells move too; they do from the second step on, or the only one, since what the
-          polynomial has not yet reached looks like a local part.
+        Args: bend: whether cells of a local field move too; they do from the second step on, or the only one, since
+          what the polynomial has not yet reached looks like a local part. last: whether nothing follows.
         """
         for step in range(steps):
             products = level.products(self.flow(level))
@@ -47,7 +52,8 @@ class Descent:
             moved = self.shape.mean_square(change @ self.shape.unit.T)
             change = change * (1 + moved / (2 * level.sigma) ** 2).rsqrt()[:, None]
             self.found = self.found + change
-            if self.cells is not None and bend and step >= min(1, steps - 1):
+            moves = bend and step >= min(1, steps - 1) if self.local else last and step == steps - 1
+            if moves:
                 by_polynomial = level.moments.flow((change @ self.shape.unit.T).to(self.like))
                 self.cells.step(level, products, by_polynomial)
 
@@ -56,7 +62,7 @@ class Descent:
         more = level.contrast_along(self.flow(level)) - level.contrast_along(other.flow(level))
         share = torch.sigmoid(more / 2 + FIRST)[:, None]
         self.found = other.found + share * (self.found - other.found)
-        if self.cells is not None and other.cells is not None:
+        if self.local:
             share = share[..., None, None]
             self.cells.value = other.cells.value + share * (self.cells.value - other.cells.value)
 
@@ -64,13 +70,13 @@ class Descent:
         """Flow [B, 2, H, W], its covariance [B, 3, H, W] and confidence [B, H, W] on the pixels of the start, which
         lies at ``start`` [B] on the way."""
         unit = self.shape.unit
-        local = None if self.cells is None else self.cells.at
-        flow, places, covariance = self.shape.at_start(self.parameters(), start, local)
+        flow, places, misfit, doubt = self.shape.at_start(self.parameters(), start, self.cells.at, self.local)
         spread = unit @ torch.linalg.inv(self.precision) @ unit.T
-        covariance = covariance + self.shape.covariance(spread.to(flow), places)
+        covariance = doubt + self.shape.covariance(spread.to(flow), places)
+        if not self.local:
+            x, y = misfit.unbind(1)
+            covariance = covariance + torch.stack([x * x, x * y, y * y], 1)
         widest = self.shape.covariance((unit @ unit.T).to(flow)[None], places)
-        widest = widest[:, 0] + widest[:, 2]
-        if self.cells is not None:
-            widest = widest + 2 * self.cells.widest.to(flow)[:, None, None]
+        widest = widest[:, 0] + widest[:, 2] + 2 * self.cells.widest
         confidence = 1 - (covariance[:, 0] + covariance[:, 2]) / widest
-        return flow, covariance, confidence.clamp(0, 1)  # rounding alone leaves them
+        return flow, covariance, confidence.clamp(0, 1)

@@ -113,29 +113,34 @@ class Polynomials:
         self,
         parameters: Tensor,
         start: Tensor,
-        local: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        local: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
+        joined: bool,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """From the field v at the mean place of the events to the flow on the pixels of the start, by fixed point:
         w(x) = v(x - start w(x)).
 
-        Args: parameters: [B, 2K]. start: [B] place of the start on the way, -1/2 for even motion. local: part of
-          the flow and its covariance at pixel coordinates, (x, y) -> ([B, 2, H, W], [B, 3, H, W]), or None.
-        Returns: flow [B, 2, H, W] px per way; where each pixel is at the mean place, the basis [B, K, H, W]; the local
-          part's covariance [B, 3, H, W].
+        Args: parameters: [B, 2K]. start: [B] place of the start on the way, -1/2 for even motion. local: local part
+          and its covariance at pixel coordinates, (x, y) -> ([B, 2, H, W], [B, 3, H, W]). joined: whether it is part
+          of v.
+        Returns: flow [B, 2, H, W] px per way; where each pixel is at the mean place: the basis [B, K, H, W], the local
+          part and its covariance.
         """
         p = parameters.reshape(len(parameters), 2, self.terms)
         y, x = torch.meshgrid(torch.arange(self.height).to(p), torch.arange(self.width).to(p), indexing="ij")
         back = -start.to(p)[:, None, None]
-        shift = p.new_zeros(len(p), 2, self.height, self.width)
-        for _ in range(FIXED_POINT_STEPS + 1):
-            at = x + back * shift[:, 0], y + back * shift[:, 1]
-            places = self.basis(*self.scaled(*at), 1)
-            shift = (p @ places.flatten(2)).unflatten(2, (self.height, self.width))
-            spread = torch.zeros_like(shift[:, :1]).expand(-1, 3, -1, -1)
-            if local is not None:
-                part, spread = local(*at)
-                shift = shift + part
-        return shift, places, spread
+        flow = p.new_zeros(len(p), 2, self.height, self.width)
+        for _ in range(FIXED_POINT_STEPS):
+            flow, *_ = self._along(p, x + back * flow[:, 0], y + back * flow[:, 1], local if joined else None)
+        at = x + back * flow[:, 0], y + back * flow[:, 1]
+        flow, places = self._along(p, *at, None)
+        part, covariance = local(*at)
+        return flow + part if joined else flow, places, part, covariance
+
+    def _along(self, p, x_px, y_px, local):
+        """Flow and basis at pixel coordinates."""
+        places = self.basis(*self.scaled(x_px, y_px), 1)
+        flow = (p @ places.flatten(2)).unflatten(2, places.shape[2:])
+        return flow if local is None else flow + local(x_px, y_px)[0], places
 
     def covariance(self, covariance: Tensor, places: Tensor) -> Tensor:
         """Covariance [B, 3, H, W] (xx, xy, yy) of the flow from that of the parameters [B, 2K, 2K]."""

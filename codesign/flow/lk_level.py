@@ -32,7 +32,7 @@ FEW_EVENTS = 10.0  # worth of Poisson noise the measured noise starts from: some
 OVERLAP = 4 * math.pi  # blurred white noise is alike over 4 pi sigma^2 pixels
 # for what makes errors larger than that: bins share events, thresholds quantise, fields warp imperfectly
 # (docs/flow_closed_form.md)
-CALIBRATION = 3.0
+CALIBRATION = 1.7
 # of the mean diagonal: above the rounding of sums in float32
 RIDGE = 1e-5
 # the factor 4 and m of ``cool``: they take 0.05 % off the events of moving textures at most

@@ -54,7 +54,7 @@ class Config(StudyConfig):
     QUICK: ClassVar = {"windows": 8, "world_windows": 5, "real_windows": 2, "packets": 1}
     network: str = "refiner"
     """Network to judge: "refiner" (the delivered one) or the path of a network file."""
-    models: tuple[str, ...] = ("constant", "affine", "quadratic")
+    models: tuple[str, ...] = ("constant", "affine", "quadratic", "local")
     """Models of the closed form to judge, "affine" among them."""
     windows: int = 256
     """Windows of every set of flat textures, 64 x 64."""

@@ -287,9 +287,9 @@ def test_confidence_follows_from_the_covariance_and_is_zero_without_events():
         )
     )
     variance = field.covariance_px2[:, 0] + field.covariance_px2[:, 2]
-    torch.testing.assert_close(
-        field.confidence, 1 - variance / 8, rtol=1e-12, atol=1e-12
-    )  # the prior's: 2^2 + 2^2
+    # the empty sample has the prior's: 2^2 + 2^2, and a little for what no polynomial explains
+    assert 8 < float(variance[1].min()) <= float(variance[1].max()) < 8.5
+    torch.testing.assert_close(field.confidence, 1 - variance / variance[1:], rtol=1e-12, atol=1e-12)
     assert not field.confidence[1].any()
     assert float(field.confidence[0].min()) > 0.99
 

@@ -16,11 +16,16 @@ from tests.certain_case import certain
 D = torch.float64
 
 
+def nowhere(x_px, y_px):
+    """No local part, known exactly."""
+    return torch.zeros_like(torch.stack([x_px] * 2, 1)), torch.zeros_like(torch.stack([y_px] * 3, 1))
+
+
 @pytest.mark.parametrize("model", ["affine", "quadratic"])
 def test_step_to_the_start_solves_its_equation(model, generator):
     shape = lk_field.Polynomials(model, 20, 30)
     parameters = torch.randn(2, 2 * shape.terms, generator=generator, dtype=D) * 1.5
-    flow, _, _ = shape.at_start(parameters, torch.full((2,), -0.5, dtype=D))
+    flow, *_ = shape.at_start(parameters, torch.full((2,), -0.5, dtype=D), nowhere, False)
     # w(x) = v(x + w(x) / 2); the fixed point gains a factor of |grad v| / 2, some 0.3 for these wild fields,
     # in each of 4 steps
     y, x = torch.meshgrid(torch.arange(20, dtype=D), torch.arange(30, dtype=D), indexing="ij")
@@ -35,7 +40,9 @@ def test_prior_and_its_spread_are_those_of_drawn_fields(generator):
     shape = lk_field.Polynomials("quadratic", 8, 12)
     spread = torch.linalg.inv(shape.prior_precision(2.0))
     drawn = torch.randn(20000, 12, generator=generator, dtype=D) @ torch.linalg.cholesky(spread).T
-    _, places, _ = shape.at_start(torch.zeros(1, 12, dtype=D), torch.full((1,), -0.5, dtype=D))
+    _, places, *_ = shape.at_start(
+        torch.zeros(1, 12, dtype=D), torch.full((1,), -0.5, dtype=D), nowhere, False
+    )
     flow = torch.einsum("nck,khw->nchw", drawn.reshape(-1, 2, 6), places[0])
     expected = shape.covariance(spread[None], places)[0]
     deviation = (flow - flow.mean(0)).square().mean(0)
