@@ -244,7 +244,7 @@ def _figure(found, seeds):
             label = NAMES[network] if place == 0 else None
             axes.plot(
                 [scores[network, seed].ratio for seed in seeds],
-                [place + 0.2 * (shift - 1)] * len(seeds),
+                [place + 0.15 * (shift - (len(NAMES) - 1) / 2)] * len(seeds),
                 "o",
                 color=f"C{shift}",
                 label=label,
