@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import codesign  # noqa: F401  (first: it sets OpenMP's wait policy before torch is imported)
 
@@ -19,12 +20,16 @@ from codesign.types import EventVolume, FlowField
 from studies.flow_cost.steps import StepByStep
 from studies.lens_bench.tracers import forget_peak, peak
 
+CLOSED = "closed form"
+CELLS = "closed form with cells"
 REFINER = "refiner"
 PUBLISHED = "Spike-FlowNet form"
 TEN_BINS = f"{PUBLISHED}, 10 bins"
 STEPS = f"{PUBLISHED}, step by step"
 SIZE_PX = 256
 KINDS = ("forward", "forward_backward")
+SMALL_PX = 64  # windows as loops that design a lens take them, so many at a time
+WINDOWS = 32
 
 
 @dataclass(frozen=True)
@@ -79,17 +84,17 @@ def entries(seed):
         TEN_BINS: SpikeFlowNet(bins=10, seed=seed),
         STEPS: StepByStep(seed=seed),
     }
-    found = {"closed form": Entry(estimate_lk, 8)}
+    found = {CLOSED: Entry(estimate_lk, 8), CELLS: Entry(partial(estimate_lk, model="local"), 8)}
     return found | {
         name: Entry(network.eval(), network.config["bins"], tuple(network.parameters()))
         for name, network in networks.items()
     }
 
 
-def scattered(size_px, bins, seed):
+def scattered(size_px, bins, seed, windows=1):
     """One event in 20 bins and pixels at random: what a call costs hardly depends on where they are."""
     counts = torch.poisson(
-        torch.full((1, 2, bins, size_px, size_px), 0.05), generator=torch.Generator().manual_seed(seed)
+        torch.full((windows, 2, bins, size_px, size_px), 0.05), generator=torch.Generator().manual_seed(seed)
     )
     spacing = 0.05 / bins
     return EventVolume(
