@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         report,
         state,
         system,
+        task,
         train,
         types,
     )
@@ -48,6 +49,7 @@ __all__ = [
     "report",
     "state",
     "system",
+    "task",
     "train",
     "types",
 ]

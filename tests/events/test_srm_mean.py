@@ -204,6 +204,7 @@ def test_chunks_give_the_spikes_and_the_gradient_of_the_whole(cut):
     torch.testing.assert_close(found[0][1:], found[1][1:], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.bits
 def test_pixels_of_a_batch_have_gradients_of_their_own():
     given = drive(5, pixels=(2, 3, 4)).float()
     theta = torch.linspace(0.1, 0.3, 12).reshape(3, 4)

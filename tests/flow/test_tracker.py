@@ -55,6 +55,7 @@ def pieces(stream, cuts):
         yield part(stream, slice(first, last))
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("by", [{"window_s": 0.004}, {"events": 70}, {"events": 1}], ids=str)
 def test_chunks_change_nothing_and_every_event_is_in_one_window(by):
     stream = stream_of(random_times())

@@ -103,6 +103,7 @@ def test_memorised_levels_start_as_after_a_long_time(asked, expected):
     assert not bool(counts[:, 1].any())
 
 
+@pytest.mark.bits
 def test_a_sample_is_the_same_in_any_batch():
     source = SensorWindows(Draws(layers=(0, 2)), Sensors(bend=0.4), seed=8, height_px=32, width_px=40)
     together = source.batch([3, 4])
