@@ -131,8 +131,8 @@ def _recorded(name, layers, duration_s, size_px, seed):
     whole = events.concatenate(parts)
     start_us = round(SETTLING_S * 1e6)
     kept = whole.t_us >= start_us
-    columns = (values[kept] for values in (whole.t_us - start_us, whole.x, whole.y, whole.p))
-    return Recording(name, EventStream(*columns, *size_px), FOCAL_PX, layers)
+    t_us, x, y, p = (values[kept] for values in (whole.t_us - start_us, whole.x, whole.y, whole.p))
+    return Recording(name, EventStream(t_us, x, y, p, *size_px), FOCAL_PX, layers)
 
 
 def _pixels(height, width):

@@ -104,10 +104,9 @@ def warps(draw, t, width_px, height_px, flow_px, layers):
         torch.linspace(-width_px / 2, width_px / 2, 17),
         indexing="ij",
     )
-    probe = torch.stack([x, y], -1)
-    probe = probe.double()
+    probe = torch.stack([x, y], -1).double()
     share = torch.from_numpy(np.asarray(t, dtype=np.float64))
-    unit = [Warp(*parts, share) for parts in found]
+    unit = [Warp(wave, phase, part, affine, share) for wave, phase, part, affine in found]
     length = torch.stack([field.displacement(probe).square().sum(-1) for field in unit]).mean().sqrt()
     size = wanted / float(length)
     steepest = size * float(torch.stack([field.stretch(probe) for field in unit]).max())

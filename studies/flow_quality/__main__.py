@@ -193,10 +193,8 @@ def _show(run, found, about, who):
             cells = []
             for measured in mine.values():
                 value = getattr(measured, key)
-                cell = None if value is None else f"{value:.{digits}f}"
-                if key == "ratio":
-                    cell += " ({:.3f} to {:.3f})".format(*measured.ratio_interval())
-                cells.append(cell)
+                interval = " ({:.3f} to {:.3f})".format(*measured.ratio_interval()) if key == "ratio" else ""
+                cells.append(None if value is None else f"{value:.{digits}f}{interval}")
             if key == "sharpness":
                 truth = next(iter(mine.values())).truth_fwl
                 truth = truth[truth == truth]

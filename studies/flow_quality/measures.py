@@ -21,7 +21,7 @@ class Measured:
 
     error_px, zero_px: [N] mean endpoint error over valid pixels of the estimate and of zero flow.
     claim: [N] mean squared error over the trace of the claimed covariance; claim_median: [N] median of its
-      root; None where nothing is claimed. spearman: [N] rank correlation of 1 - confidence with the error
+      root; NaN where nothing is claimed. spearman: [N] rank correlation of 1 - confidence with the error
       over the pixels of a window, NaN where the confidence is the same everywhere.
     left, best: [N, len(SHARES)] mean error of the pixels left when a share of them is taken out, least
       confident first, and largest error first. fwl, truth_fwl: [N] variance of the image of warped events
@@ -30,8 +30,8 @@ class Measured:
 
     error_px: np.ndarray
     zero_px: np.ndarray
-    claim: np.ndarray | None
-    claim_median: np.ndarray | None
+    claim: np.ndarray
+    claim_median: np.ndarray
     spearman: np.ndarray
     left: np.ndarray
     best: np.ndarray
@@ -58,13 +58,15 @@ class Measured:
     @property
     def error_over_claimed(self) -> float | None:
         """Root mean square of error over claimed deviation; 1 for an honest claim."""
-        return None if self.claim is None else float(self.claim.mean() ** 0.5)
+        return None if np.isnan(self.claim).any() else float(self.claim.mean() ** 0.5)
 
     @property
     def error_over_claimed_median(self) -> float | None:
         """Median over windows of the median over pixels, over what it is for Gaussian errors alike in all
         directions; a few bad windows do not count."""
-        return None if self.claim_median is None else float(np.median(self.claim_median) / HONEST_MEDIAN)
+        return (
+            None if np.isnan(self.claim_median).any() else float(np.median(self.claim_median) / HONEST_MEDIAN)
+        )
 
     @property
     def rank_correlation(self) -> float | None:
@@ -122,17 +124,13 @@ def measure(field, windows) -> Measured:
                 warp_loss(windows.volume, truth.flow_px, k),
             )
         )
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    if claim is None:
-        columns[2] = columns[3] = None
-    return Measured(*columns)
+    return Measured(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
 def join(parts) -> Measured:
     """One Measured of those of several batches."""
     names = Measured.__dataclass_fields__
-    columns = ([getattr(part, name) for part in parts] for name in names)
-    return Measured(*(None if column[0] is None else np.concatenate(column) for column in columns))
+    return Measured(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def spearman(doubt, error) -> float:

@@ -87,8 +87,8 @@ def _window(recording, first, count):
 
 
 def _part(stream, part):
-    columns = (getattr(stream, name)[part] for name in ("t_us", "x", "y", "p"))
-    return check_stream(EventStream(*columns, stream.height_px, stream.width_px))
+    t_us, x, y, p = (getattr(stream, name)[part] for name in ("t_us", "x", "y", "p"))
+    return check_stream(EventStream(t_us, x, y, p, stream.height_px, stream.width_px))
 
 
 def _in_context(recording, packet, turns):

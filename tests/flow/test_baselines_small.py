@@ -137,9 +137,10 @@ def test_the_recurrent_unit_written_out():
     h) + W x), h <- (1 - z) h + z h'."""
     net = small(IDNet)
     read = torch.randn(1, BINS, 16, 1, 1, dtype=D, generator=torch.Generator().manual_seed(5))
+    held = net.state_dict()
     gates, candidate = (
-        (layer.weight[:, :, 1, 1].detach().numpy(), layer.bias.detach().numpy())
-        for layer in (net.gates, net.candidate)
+        (held[f"{name}.weight"][:, :, 1, 1].numpy(), held[f"{name}.bias"].numpy())
+        for name in ("gates", "candidate")
     )
     h = np.zeros(16)
     for x in read[0, :, :, 0, 0].numpy():
@@ -156,7 +157,7 @@ def test_the_second_iteration_reads_what_the_first_one_deblurred():
     with torch.no_grad():
         for parameter in net.head.parameters():
             parameter.zero_()
-        net.head[2].bias.copy_(torch.tensor([1.0, 0.0]))
+        net.get_parameter("head.2.bias").copy_(torch.tensor([1.0, 0.0]))
     seen = []
     net.encoder.register_forward_hook(lambda _, given, __: seen.append(given[0]))
     counts = torch.zeros(1, 2, BINS, 24, 40, dtype=D)

@@ -63,6 +63,7 @@ def test_the_end_frame_shows_the_start_along_the_flow(tmp_path):
     flow = torch.stack([2 + torch.sin(y / 9), torch.cos(x / 11)])
     write_flow(tmp_path / "a.flo", flow)
     windows = FileWindows(tmp_path, seed=1, side_px=40, bins=4, intervals=8).batch([0])
+    assert windows.frames is not None
     first, last = windows.frames.clamp_min(1).log().unbind(1)
     brought = along_flow(last[:, None], windows.truth.flow_px, torch.ones(1))[:, 0]
     inner = (slice(None), slice(6, -6), slice(6, -6))

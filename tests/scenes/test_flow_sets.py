@@ -74,6 +74,7 @@ def test_bent_layers_keep_their_radiance(layers, mean_share):
     for what gets hidden where there are layers."""
     draws = replace(Draws("mixed", "warps", layers, (3.0, 6.0)), contrast=(1.0, 1.0))
     windows = RenderedWindows(draws, seed=3, height_px=72, width_px=96).batch(range(4))
+    assert windows.frames is not None
     first, last = windows.frames.log().unbind(1)
     brought = along_flow(last[:, None], windows.truth.flow_px, torch.ones(1))[:, 0]
     inside = along_flow(torch.ones_like(last[:, None]), windows.truth.flow_px, torch.ones(1))[:, 0] > 0.999
@@ -142,6 +143,7 @@ def test_unequal_thresholds_count_as_they_should():
     draws = replace(planes("fine", theta=0.1, noise=(1e-12, 1e-12)), mismatch=0.0, on_over_off=(4.0, 4.0))
     windows = RenderedWindows(draws, seed=2).batch(range(3))
     on, off = windows.volume.counts.sum(2).unbind(1)
+    assert windows.frames is not None
     change = windows.frames[:, 1].log() - windows.frames[:, 0].log()
     assert (0.2 * on - 0.05 * off - change).abs().max() <= 0.25 + 1e-4
     assert float(off.sum() / on.sum()) > 2.5

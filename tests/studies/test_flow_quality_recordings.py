@@ -31,9 +31,9 @@ class Config(StudyConfig):
 
 def packet(x, y, t_us, height=SIZE[0], width=SIZE[1]):
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    columns = (torch.from_numpy(values[inside].astype(np.int64)) for values in (t_us, x, y))
+    t_us, x, y = (torch.from_numpy(values[inside].astype(np.int64)) for values in (t_us, x, y))
     p = torch.ones(int(inside.sum()), dtype=torch.int64)
-    return Packet("by hand", ordered(*columns, p, height, width), 0, 10_000, None)
+    return Packet("by hand", ordered(t_us, x, y, p, height, width), 0, 10_000, None)
 
 
 def dots(move, count=60, seed=0):
@@ -161,6 +161,7 @@ def test_packets_of_a_recording(slid, tmp_path):
     assert still["fwl"] == 1.0
     volume = events.from_stream(first.stream, first.t0_us, first.t1_us, 4)
     mask = metrics.event_mask(volume)[0]
+    assert first.truth is not None
     assert still["aee_px"] == pytest.approx(float(first.truth.flow_px[0].norm(dim=0)[mask].mean()), rel=1e-5)
     rows = [{"corrections": {**still, "fwl": value}, "closed_form_quadratic": still} for value in (1.0, 2.0)]
     run = open_run("flow_quality", Config(out=tmp_path))
