@@ -55,7 +55,7 @@ def check_stream(stream: EventStream, part: slice = slice(None)) -> EventStream:
             "events.simulate and codesign.events.stream.ordered give it."
         )
     for side, name in ((stream.height_px, "height_px"), (stream.width_px, "width_px")):
-        if isinstance(side, bool) or not isinstance(side, Integral) or side < 0:
+        if isinstance(side, bool) or not isinstance(side, Integral) or not 0 <= side < 2**31:
             raise DomainError(
                 f"{name} of the stream is {' '.join(repr(side).split())}; a whole number is needed."
             )

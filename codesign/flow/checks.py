@@ -3,6 +3,7 @@ sentence."""
 
 import math
 import os
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,6 +19,7 @@ MOST_SIDE_PX = 2**15
 MOST_STEPS = 1000  # of an iteration
 COUNTS = (torch.float32, torch.float64)
 MOST_EVENTS = 1e9  # of a pixel and bin: squares of it are far from overflow
+LEAST_SPREAD = 0.01  # of the centroids, over the interval
 NEGATIVE = -1e-3  # counts a hair below 0 are let through: steps of differences go there
 
 
@@ -99,9 +101,18 @@ def check_volume(volume: EventVolume, bins: int | None = None, least_bins: int =
             raise DomainError(
                 f"{name} of the event volume is {times.tolist()}; finite times > {least} are needed."
             )
-    if bool((volume.centroid_s.diff() <= 0).any()):
+    times = volume.centroid_s.detach().tolist()
+    span = float(volume.collected_s.detach().sum())
+    rising = all(first < second for first, second in pairwise(times))
+    if not (
+        rising
+        and times[0] >= 0
+        and times[-1] <= span
+        and times[-1] - times[0] >= (len(times) > 1) * LEAST_SPREAD * span
+    ):
         raise DomainError(
-            f"centroid_s of the event volume is {volume.centroid_s.tolist()}; rising times are needed."
+            f"centroid_s of the event volume is {times} in an interval of {span:g} s (the sum of collected_s); rising "
+            "times spread over it are needed."
         )
     return counts
 

@@ -20,6 +20,7 @@ from codesign.types import EventVolume, FlowField
 # field -> the polynomial in it
 MODELS = {"constant": "constant", "affine": "affine", "quadratic": "quadratic", "local": "quadratic"}
 TURNED = 0.1  # share of the variance of the whole way that remains where it leads back to its start
+MOST_BLUR_PX = 1000
 
 
 def estimate_lk(
@@ -70,7 +71,8 @@ def estimate_lk(
             f"levels_px is {shown(levels_px)}; a list of blurs in pixels, coarse to fine, is needed."
         )
     for blur_px in levels_px:
-        check_number(blur_px, "a blur of levels_px", above=0.0)
+        if check_number(blur_px, "a blur of levels_px", above=0.0) > MOST_BLUR_PX:
+            raise DomainError(f"a blur of levels_px is {blur_px:g} px; at most {MOST_BLUR_PX} are possible.")
     batch, _, _, height, width = counts.shape
     if min(height, width) < 2:
         raise ShapeError(

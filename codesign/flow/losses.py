@@ -107,8 +107,8 @@ def likelihood_loss(
     Source: Nix and Weigend, ICNN 1994, in two dimensions.
     """
 
-    check_number(floor_px, "floor_px", above=0.0)
-    check_number(prior_px, "prior_px", above=0.0)
+    floor_px = check_number(floor_px, "floor_px", above=0.0)
+    prior_px = check_number(prior_px, "prior_px", above=0.0)
 
     def nll(field, error):
         squared, log_determinant = _distance(field, error, floor_px, prior_px)
@@ -145,7 +145,7 @@ def laplace_loss(
 def relative_unit(truth: FlowField, floor_px: float = 1.0) -> Tensor:
     """[B] 1 / sqrt(mean squared length of the valid true flow + floor_px^2): turns an error in px into a
     share of the sample's motion. Gradient: none."""
-    check_number(floor_px, "floor_px", 0.0)
+    floor_px = check_number(floor_px, "floor_px", 0.0)
     squared = _known(truth).detach().square().sum(1).flatten(1).sum(1) / truth.valid.flatten(1).sum(
         1
     ).clamp_min(1)
@@ -301,7 +301,7 @@ def smoothness_loss(
     Source: Zhu et al., EV-FlowNet, RSS 2018; edge weights: Heise et al., ICCV 2013.
     """
     flow_px = _full(flow_px)
-    check_number(edge, "edge", above=0.0)
+    edge = check_number(edge, "edge", above=0.0)
     if frame is not None and check_real(frame, "the frame").shape != flow_px[:, 0].shape:
         raise ShapeError(
             f"the frame must be {list(flow_px[:, 0].shape)} for this flow, got {list(frame.shape)}."

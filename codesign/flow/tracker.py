@@ -313,6 +313,7 @@ def _columns(chunk):
         values = np.asarray(given)
         whole = values.dtype.kind in "iub"
         if values.dtype.kind == "f":
+            values = values.astype(np.float64)
             whole = bool((np.abs(values) < 2**53).all()) and bool((values % 1 == 0).all())
         if values.ndim != 1 or not (whole or not values.size):
             raise DomainError(f"{name} is {shown(values)}; a list [N] of whole numbers is needed.")

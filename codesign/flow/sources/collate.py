@@ -92,7 +92,7 @@ def collate(samples: Sequence[Sample]) -> FlowWindows:
 
 def bin_times(bins: int, seconds: float) -> tuple[Tensor, Tensor]:
     """(centroid_s, collected_s) [bins] of an even event rate, as events.from_stream has them."""
-    check_count(bins, "bins", 1)
+    bins = check_count(bins, "bins", 1)
     seconds = check_number(seconds, "the length of the window", above=0.0)
     if bins == 1:
         return torch.tensor([seconds / 2], dtype=torch.float64), torch.tensor([seconds], dtype=torch.float64)

@@ -5,8 +5,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import check_whole
-from codesign.events.volumes.volume import check_bins
-from codesign.flow.checks import check_mask, check_real, check_size
+from codesign.flow.checks import check_count, check_mask, check_real, check_size
 
 
 def splatted(
@@ -26,7 +25,7 @@ def splatted(
     Args: t_us: [N] int64 within t0_us to t1_us. x_px, y_px: [N] float. on: [N] bool.
     Events, and shares of them, that fall outside the picture are left out; everything else is conserved.
     """
-    check_bins(bins)
+    bins = check_count(bins, "bins", 1)
     height_px, width_px = check_size((height_px, width_px), "the picture")
     if check_whole(t1_us, "t1_us") <= check_whole(t0_us, "t0_us"):
         raise DomainError(f"the window is {t0_us} to {t1_us} us; a start before its end is needed.")

@@ -70,6 +70,7 @@ def read_text_events(
       sensor or has another polarity.
     """
     path = check_path(path)
+    columns = check_kind(columns, str, "the order of the columns")
     parts = []
     left_out = dict.fromkeys(skip, 0)
     number = 1
@@ -206,7 +207,7 @@ def _settled_order(path, table, columns):
         return (
             rising[0] if rising else ORDERS[0]
         )  # without either, the line that goes back in time is named by the check that follows
-    if sorted(check_kind(columns, str, "the order of the columns")) != ["p", "t", "x", "y"]:
+    if sorted(columns) != ["p", "t", "x", "y"]:
         raise FileFormatError(
             f"columns {columns!r} given for {path}; the four letters t, x, y, p in the file's order are "
             "needed, for example 'txyp'."
