@@ -15,6 +15,7 @@ from codesign.errors import DomainError, ShapeError
 from codesign.flow import lk_field, lk_level
 from codesign.flow.checks import check_count, check_number, check_volume, shown
 from codesign.flow.lk_descent import Descent
+from codesign.flow.lk_path import between
 from codesign.types import EventVolume, FlowField
 
 # field -> the polynomial in it
@@ -79,7 +80,7 @@ def estimate_lk(
             f"an event volume of {height} x {width} pixels has no slopes both ways; give at least 2 x 2."
         )
     shape = lk_field.Polynomials(MODELS[model], height, width, prior_px, counts.device)
-    way, bins, density = lk_level.along_path(volume)
+    way, by_time, bins, density = lk_level.along_path(volume)
     found = Descent(shape, prior_px, model == "local", counts)
     for number, blur_px in enumerate(levels_px):
         level = lk_level.Level(way, bins, density, shape, blur_px, noise_floor)
@@ -89,7 +90,12 @@ def estimate_lk(
         if number == 1:  # a coarse blur may take one stripe for the next: another start
             other = Descent(shape, prior_px, model == "local", counts)
             other.descend(level, steps, bend, last)
-            found.join(other, level)
+            found.join(level, other, level)
+            timed = found.copy()  # events may be a false clock
+            time_level = lk_level.Level(by_time, bins, density, shape, blur_px, noise_floor)
+            timed.descend(time_level, steps, bend, last)
+            way = between(by_time, way, timed.join(time_level, found, level))
+            found = timed
     flow, covariance, confidence = found.at_start(way.start)
     net = way.net.to(flow)[:, None, None, None]
     valid = (counts.detach().sum((1, 2, 3, 4)) > 0)[:, None, None].expand(batch, height, width)

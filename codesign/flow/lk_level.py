@@ -22,7 +22,7 @@ from codesign.flow.lk_field import Polynomials
 from codesign.flow.lk_kernel import blurred, cell_sums, moving
 from codesign.flow.lk_lanes import Grid
 from codesign.flow.lk_moments import Moments
-from codesign.flow.lk_path import Path, path
+from codesign.flow.lk_path import Path, even, path
 from codesign.types import EventVolume
 
 # the factor 3 and the power 4 = 2^2 above
@@ -47,9 +47,9 @@ def stride(sigma_px: float, shortest_px: int = 2**30) -> int:
     return 2 ** math.floor(math.log2(max(min(sigma_px, shortest_px / 2, 8.0), 1.0)))
 
 
-def along_path(volume: EventVolume) -> tuple[Path, Tensor, Tensor]:
-    """The way of the samples, weight and time of the bins [2, n], events of both signs per pixel [B, H, W];
-    hot pixels weighed down.
+def along_path(volume: EventVolume) -> tuple[Path, Path, Tensor, Tensor]:
+    """The way of the samples by their events and by time, weight and time of the bins [2, n], events of both signs
+    per pixel [B, H, W]; hot pixels weighed down.
 
     Weights are the shares of the interval; time is 0 at mid-interval, in intervals.
     """
@@ -62,8 +62,9 @@ def along_path(volume: EventVolume) -> tuple[Path, Tensor, Tensor]:
     density = both.sum(1)
     kept = cool(density)
     events = (both.flatten(2) @ kept.flatten(1)[:, :, None])[..., 0]  # of each bin
-    found = path(kept[:, None] * (on - off), events, weight, time)
-    return found, torch.stack([weight, time]), kept * density
+    signed = kept[:, None] * (on - off)
+    ways = path(signed, events, weight, time), even(signed, weight, time)
+    return *ways, torch.stack([weight, time]), kept * density
 
 
 def cool(events: Tensor) -> Tensor:

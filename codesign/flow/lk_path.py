@@ -4,9 +4,13 @@ Moving texture gives events by the way it goes, not by the time it takes, so a b
 share of the path. Where the motion turns back, what was ON becomes OFF in the same place: the signed counts of
 nearby bins are alike while the direction holds, and opposite across a turn. Turns are looked for only where
 events become rare, since speed passes through zero there.
+
+Events are a false clock where a bin has few of them for another reason: a sensor that begins with the window has
+all its pixels in the middle of their thresholds, light that changes makes events of its own. So time is the other
+candidate, and the closed form takes the one along which the events have more contrast.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -49,7 +53,26 @@ def path(signed: Tensor, events: Tensor, weight: Tensor, time: Tensor) -> Path:
     speed = speed / weight
     uneven = (weight * (speed - 1).square()).sum(1, keepdim=True)
     speed = 1 + (speed - 1) * uneven / (uneven + UNEVEN)
-    direction = _directions(signed, speed, weight)
+    return _along(signed, speed, _directions(signed, speed, weight), weight, time)
+
+
+def even(signed: Tensor, weight: Tensor, time: Tensor) -> Path:
+    """The way of motion of even speed: time itself. Args: as of ``path``."""
+    ones = torch.ones_like(weight, dtype=torch.float64).expand(len(signed), -1)
+    return _along(signed, ones, ones, weight.double(), time.double())
+
+
+def between(first: Path, second: Path, share: Tensor) -> Path:
+    """share [B] of the first of two ways, the rest of the second: bin by bin."""
+    mixed = (torch.lerp(b, a, share.to(a).reshape(-1, *[1] * (a.ndim - 1))) for a, b in _pairs(first, second))
+    return Path(*mixed)
+
+
+def _pairs(first, second):
+    return [(getattr(first, field.name), getattr(second, field.name)) for field in fields(Path)]
+
+
+def _along(signed, speed, direction, weight, time):
     share = speed * weight
     edge = (direction * share).cumsum(1)
     off_middle = time - (weight.cumsum(0) - weight / 2 - 0.5)

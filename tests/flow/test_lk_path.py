@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from codesign import events
 from codesign.flow import estimate_lk, lk_path
 from codesign.types import EventVolume
 from tests.flow.test_lk import D, length, mean_error, moving, pattern
@@ -50,6 +51,22 @@ def test_displacement_of_uneven_motion(seed, way, relative):
 def test_motion_there_and_back_is_no_displacement(seed):
     volume, _ = along(seed, lambda t: torch.sin(math.pi * t), (4.0, -2.0))
     assert float(estimate_lk(volume, "constant").flow_px.abs().max()) <= 0.05 * 4.0
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_sensor_that_begins_with_the_window_is_no_slow_start(seed):
+    """All pixels begin in the middle of their thresholds, so that the first bin has half of its events. By events alone the flow is 13 to 18 % short; by time 6 to 9 %, since the first events of a
+    pixel come late."""
+    y, x = torch.meshgrid(torch.arange(SIZE, dtype=D), torch.arange(SIZE, dtype=D), indexing="ij")
+    shade = pattern(seed)
+    t_s = torch.linspace(0, 1, 25, dtype=D)
+    level = torch.stack([shade(x - 4 * t, y - 2 * t) for t in t_s])
+    counts, _ = events.memory(level, 0.4, 0.4, log_input=True)
+    volume = events.from_counts(counts[:, :, None], t_s, 5)
+    share = volume.counts.sum((0, 1, 3, 4)) / volume.counts.sum()
+    assert float(share[0]) < 0.6 * float(share[4])
+    truth = torch.tensor([4.0, 2.0], dtype=D)[:, None, None].expand(2, SIZE, SIZE)
+    assert mean_error(estimate_lk(volume, "constant"), truth) <= 0.09 * length(truth)
 
 
 def test_even_motion_keeps_its_bins():
