@@ -15,11 +15,11 @@ from codesign.errors import DomainError, ShapeError
 from codesign.flow import lk_field, lk_level
 from codesign.flow.checks import check_count, check_number, check_volume, shown
 from codesign.flow.lk_descent import Descent
-from codesign.flow.lk_path import between
 from codesign.types import EventVolume, FlowField
 
 # field -> the polynomial in it
 MODELS = {"constant": "constant", "affine": "affine", "quadratic": "quadratic", "local": "quadratic"}
+CLOCKS = ("time", "events")
 TURNED = 0.1  # share of the variance of the whole way that remains where it leads back to its start
 MOST_BLUR_PX = 1000
 
@@ -31,6 +31,7 @@ def estimate_lk(
     levels_px: Sequence[float] = (4.0, 2.0, 1.0),
     steps: int = 3,
     noise_floor: float = 0.02,
+    clock: str = "time",
 ) -> FlowField:
     """Flow over the volume's interval, with its uncertainty.
 
@@ -44,6 +45,8 @@ def estimate_lk(
       levels_px: Gaussian blur of the volume, coarse to fine. steps: Gauss-Newton steps at each.
       noise_floor: least noise assumed, relative to that of a Poisson volume with these counts; matters for
         counts without quantisation or noise.
+      clock: "time": motion is even over the interval. "events": it goes as the events come, and may turn back
+        (``lk_path``); for sensors that saw the scene before the window began, in steady light.
     Returns: FlowField on the pixels of the start of the interval: flow_px [B, 2, H, W] px per interval;
       covariance_px2 [B, 3, H, W] of its error by the posterior; confidence [B, H, W] in 0..1, 1 - trace(covariance) /
       trace(prior covariance), both of the flow along the whole way (``lk_path``); valid is False for samples without
@@ -64,6 +67,8 @@ def estimate_lk(
     counts = check_volume(volume, least_bins=2)
     if not isinstance(model, str) or model not in MODELS:
         raise DomainError(f"flow model '{model}' is unknown; choose one of {', '.join(MODELS)}.")
+    if clock not in CLOCKS:
+        raise DomainError(f"clock '{clock}' is unknown; choose one of {', '.join(CLOCKS)}.")
     check_number(prior_px, "prior_px", above=0.0)
     check_number(noise_floor, "noise_floor", 0.0)
     steps = check_count(steps, "steps", 1)
@@ -80,7 +85,7 @@ def estimate_lk(
             f"an event volume of {height} x {width} pixels has no slopes both ways; give at least 2 x 2."
         )
     shape = lk_field.Polynomials(MODELS[model], height, width, prior_px, counts.device)
-    way, by_time, bins, density = lk_level.along_path(volume)
+    way, bins, density = lk_level.along_path(volume, clock)
     found = Descent(shape, prior_px, model == "local", counts)
     for number, blur_px in enumerate(levels_px):
         level = lk_level.Level(way, bins, density, shape, blur_px, noise_floor)
@@ -90,12 +95,7 @@ def estimate_lk(
         if number == 1:  # a coarse blur may take one stripe for the next: another start
             other = Descent(shape, prior_px, model == "local", counts)
             other.descend(level, steps, bend, last)
-            found.join(level, other, level)
-            timed = found.copy()  # events may be a false clock
-            time_level = lk_level.Level(by_time, bins, density, shape, blur_px, noise_floor)
-            timed.descend(time_level, steps, bend, last)
-            way = between(by_time, way, timed.join(time_level, found, level))
-            found = timed
+            found.join(other, level)
     flow, covariance, confidence = found.at_start(way.start)
     net = way.net.to(flow)[:, None, None, None]
     valid = (counts.detach().sum((1, 2, 3, 4)) > 0)[:, None, None].expand(batch, height, width)

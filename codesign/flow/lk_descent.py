@@ -1,7 +1,5 @@
 """Gauss-Newton steps towards the field that the events and the prior agree on."""
 
-import copy
-
 import torch
 from torch import Tensor
 
@@ -59,23 +57,14 @@ class Descent:
                 by_polynomial = level.moments.flow((change @ self.shape.unit.T).to(self.like))
                 self.cells.step(level, products, by_polynomial)
 
-    def copy(self) -> "Descent":
-        """The same field, to go on from elsewhere."""
-        twin = copy.copy(self)
-        twin.cells = copy.copy(self.cells)
-        return twin
-
-    def join(self, level: Level, other: "Descent", its_level: Level) -> Tensor:
-        """The mean of this field and another, by how much contrast the events along each have; returns this one's
-        share [B]."""
-        more = level.contrast_along(self.flow(level)) - its_level.contrast_along(other.flow(its_level))
-        odds = torch.sigmoid(more / 2 + FIRST)
-        share = odds[:, None]
+    def join(self, other: "Descent", level: Level) -> None:
+        """The mean of this field and another, by how much contrast the events along each have."""
+        more = level.contrast_along(self.flow(level)) - level.contrast_along(other.flow(level))
+        share = torch.sigmoid(more / 2 + FIRST)[:, None]
         self.found = other.found + share * (self.found - other.found)
         if self.local:
             share = share[..., None, None]
             self.cells.value = other.cells.value + share * (self.cells.value - other.cells.value)
-        return odds
 
     def at_start(self, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Flow [B, 2, H, W], its covariance [B, 3, H, W] and confidence [B, H, W] on the pixels of the start, which

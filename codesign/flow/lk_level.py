@@ -47,11 +47,11 @@ def stride(sigma_px: float, shortest_px: int = 2**30) -> int:
     return 2 ** math.floor(math.log2(max(min(sigma_px, shortest_px / 2, 8.0), 1.0)))
 
 
-def along_path(volume: EventVolume) -> tuple[Path, Path, Tensor, Tensor]:
-    """The way of the samples by their events and by time, weight and time of the bins [2, n], events of both signs
-    per pixel [B, H, W]; hot pixels weighed down.
+def along_path(volume: EventVolume, clock: str) -> tuple[Path, Tensor, Tensor]:
+    """The way of the samples, weight and time of the bins [2, n], events of both signs per pixel [B, H, W];
+    hot pixels weighed down.
 
-    Weights are the shares of the interval; time is 0 at mid-interval, in intervals.
+    clock: "time" or "events". Weights are the shares of the interval; time is 0 at mid-interval, in intervals.
     """
     counts = volume.counts
     span = volume.collected_s.sum()
@@ -63,8 +63,8 @@ def along_path(volume: EventVolume) -> tuple[Path, Path, Tensor, Tensor]:
     kept = cool(density)
     events = (both.flatten(2) @ kept.flatten(1)[:, :, None])[..., 0]  # of each bin
     signed = kept[:, None] * (on - off)
-    ways = path(signed, events, weight, time), even(signed, weight, time)
-    return *ways, torch.stack([weight, time]), kept * density
+    found = path(signed, events, weight, time) if clock == "events" else even(signed, weight, time)
+    return found, torch.stack([weight, time]), kept * density
 
 
 def cool(events: Tensor) -> Tensor:

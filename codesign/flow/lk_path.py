@@ -6,11 +6,10 @@ nearby bins are alike while the direction holds, and opposite across a turn. Tur
 events become rare, since speed passes through zero there.
 
 Events are a false clock where a bin has few of them for another reason: a sensor that begins with the window has
-all its pixels in the middle of their thresholds, light that changes makes events of its own. So time is the other
-candidate, and the closed form takes the one along which the events have more contrast.
+all its pixels in the middle of their thresholds, light that changes makes events of its own. Then time is the clock.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -60,16 +59,6 @@ def even(signed: Tensor, weight: Tensor, time: Tensor) -> Path:
     """The way of motion of even speed: time itself. Args: as of ``path``."""
     ones = torch.ones_like(weight, dtype=torch.float64).expand(len(signed), -1)
     return _along(signed, ones, ones, weight.double(), time.double())
-
-
-def between(first: Path, second: Path, share: Tensor) -> Path:
-    """share [B] of the first of two ways, the rest of the second: bin by bin."""
-    mixed = (torch.lerp(b, a, share.to(a).reshape(-1, *[1] * (a.ndim - 1))) for a, b in _pairs(first, second))
-    return Path(*mixed)
-
-
-def _pairs(first, second):
-    return [(getattr(first, field.name), getattr(second, field.name)) for field in fields(Path)]
 
 
 def _along(signed, speed, direction, weight, time):

@@ -44,13 +44,13 @@ def along(seed, way, reach_px):
 def test_displacement_of_uneven_motion(seed, way, relative):
     # bins hold a tenth of the way or two: that much of a bin's length is the place of an event not known
     volume, truth = along(seed, way, (4.0, -2.0))
-    assert mean_error(estimate_lk(volume, "constant"), truth) <= relative * length(truth)
+    assert mean_error(estimate_lk(volume, "constant", clock="events"), truth) <= relative * length(truth)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_motion_there_and_back_is_no_displacement(seed):
     volume, _ = along(seed, lambda t: torch.sin(math.pi * t), (4.0, -2.0))
-    assert float(estimate_lk(volume, "constant").flow_px.abs().max()) <= 0.05 * 4.0
+    assert float(estimate_lk(volume, "constant", clock="events").flow_px.abs().max()) <= 0.05 * 4.0
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -94,7 +94,7 @@ def test_gradients_through_a_turn_are_those_of_differences(generator):
     counts = volume.counts[..., 10:30, 10:30].clone().requires_grad_()
 
     def loss(counts):
-        return estimate_lk(EventVolume(counts, TIME, SHARE)).flow_px.square().sum()
+        return estimate_lk(EventVolume(counts, TIME, SHARE), clock="events").flow_px.square().sum()
 
     (found,) = torch.autograd.grad(loss(counts), counts)
     tangent = torch.randn(counts.shape, generator=generator, dtype=D)
