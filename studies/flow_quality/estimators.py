@@ -11,7 +11,9 @@ from codesign import flow
 def estimators(network, models):
     """Name -> function from an EventVolume to a FlowField. models: of the closed form. "corrections": what the
     network says before it is weighed against its start."""
-    found = {f"closed_form_{model}": partial(flow.estimate_lk, model=model) for model in models}
+    found = {
+        f"closed_form_{model}": partial(flow.estimate_lk, model=model, clock="events") for model in models
+    }
     found["refiner"] = network
     if hasattr(network, "predictions"):
         found["corrections"] = partial(_corrections, network)

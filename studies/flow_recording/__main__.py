@@ -9,6 +9,7 @@ packets of events with flow files, and every event file the package reads (docs/
 import statistics
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -136,7 +137,7 @@ def filmed(run, recording, estimators, read):
 
 def load(name):
     """{name: (estimator, bins it needs, None: any)}."""
-    closed_form = {"lk": (flow.estimate_lk, None)}
+    closed_form = {"lk": (partial(flow.estimate_lk, clock="events"), None)}
     if name == "lk":
         return closed_form
     if name == "auto":
