@@ -169,9 +169,11 @@ def test_other_sizes_need_no_new_kernel(generator):
             history = dr.kernel_history()
         return {entry["hash"] for entry in history if entry["type"] == dr.KernelType.JIT}
 
-    first = kernels((1, 3, 8, 9, 2, 2))
+    # several threads scatter into copies of a large target, and one into a small one itself
+    first = kernels((1, 3, 8, 9, 2, 2)) | kernels((3, 3, 70, 31, 2, 2))
     assert len(first) >= 9
     assert kernels((4, 3, 80, 21, 4, 5)) <= first
+    assert kernels((1, 3, 9, 8, 2, 2)) <= first
 
 
 def test_a_second_derivative_is_refused(generator):
