@@ -171,7 +171,7 @@ class _Adjoint(_Warp):
         """Gradient of the flow through ``count`` bins, on top of grad_flow. Adds to the slots of these bins,
         ``added``, unless None."""
         dr = self.dr
-        # processors need no locks where each thread has a copy
+        # processors need no locks where each thread has a copy; with several, this kernel is one for each size
         mode = dr.ReduceMode.Expand if self.form.device == "cpu" else dr.ReduceMode.Auto
         image = self.image * self.count(count)
         grad_u, grad_v = grad_flow
