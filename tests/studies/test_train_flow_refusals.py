@@ -51,7 +51,7 @@ def edit(folder, **changes):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--network", "refinr"], "network 'refinr' is unknown; choose one of flownet-events"),
+        (["--network", "refinr"], "network 'refinr' is unknown; choose one of ecn, flownet-events"),
         (["--options", "depth=3"], "has no option 'depth'; it has bins, gain"),
         (["--options", "gain"], "give name=number"),
         (["--weights", "500"], "which 'linear' does not"),
