@@ -11,9 +11,12 @@ is returned with the flow.
 
 from collections.abc import Sequence
 
-from codesign.errors import DomainError, ShapeError
+import torch
+from torch import Tensor
+
+from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.flow import lk_field, lk_level
-from codesign.flow.checks import check_count, check_number, check_volume, shown
+from codesign.flow.checks import check_count, check_flow, check_number, check_real, check_volume, shown
 from codesign.flow.lk_descent import Descent
 from codesign.types import EventVolume, FlowField
 
@@ -32,6 +35,7 @@ def estimate_lk(
     steps: int = 3,
     noise_floor: float = 0.02,
     clock: str = "time",
+    start_px: Tensor | None = None,
 ) -> FlowField:
     """Flow over the volume's interval, with its uncertainty.
 
@@ -47,13 +51,18 @@ def estimate_lk(
         counts without quantisation or noise.
       clock: "time": motion is even over the interval. "events": it goes as the events come, and may turn back
         (``lk_path``); for sensors that saw the scene before the window began, in steady light.
+      start_px: flow [B, 2] or [B, 2, H, W] on the pixels of the start, px per interval, expected of these windows (in a
+        video, that of the window before): its least-squares fit by the polynomial is one more field to descend from,
+        with the prior about it at the first of several levels. The descents from zero stay, and are averaged with it
+        by the contrast of the events along each.
     Returns: FlowField on the pixels of the start of the interval: flow_px [B, 2, H, W] px per interval;
       covariance_px2 [B, 3, H, W] of its error by the posterior; confidence [B, H, W] in 0..1, 1 - trace(covariance) /
       trace(prior covariance), both of the flow along the whole way (``lk_path``); valid is False for samples without
       events, whose flow and confidence are 0 and whose covariance is the prior's.
-    Gradient: counts, of flow, covariance and confidence.
+    Gradient: counts, of flow, covariance and confidence; none to start_px.
     Raises: ShapeError, DomainError.
-    Cost: linear in pixels and bins; a level of blur s works on a grid of spacing 2^floor(log2 s) px.
+    Cost: linear in pixels and bins; a level of blur s works on a grid of spacing 2^floor(log2 s) px. start_px adds a
+      descent on the first two levels.
 
     >>> import torch
     >>> from codesign.flow.export import evenly_timed
@@ -86,23 +95,43 @@ def estimate_lk(
         )
     shape = lk_field.Polynomials(MODELS[model], height, width, prior_px, counts.device)
     way, bins, density = lk_level.along_path(volume, clock)
-    found = Descent(shape, prior_px, model == "local", counts)
+    net = way.net.to(counts)[:, None, None, None]
+    share = net.square() + TURNED * (1 - net.square())
+    valid = (counts.detach().sum((1, 2, 3, 4)) > 0)[:, None, None].expand(batch, height, width)
+    descents = [Descent(shape, prior_px, model == "local", counts)]
+    if start_px is not None:
+        warm = Descent(shape, prior_px, model == "local", counts)
+        begun = torch.where(valid[:, None], _start(start_px, counts) * net / share, 0)
+        warm.begin(begun.detach(), way.start.detach())
+        descents.insert(0, warm)
     for number, blur_px in enumerate(levels_px):
         level = lk_level.Level(way, bins, density, shape, blur_px, noise_floor)
         last = number == len(levels_px) - 1
         bend = number > 0 or last
-        found.descend(level, steps, bend, last)
         if number == 1:  # a coarse blur may take one stripe for the next: another start
-            other = Descent(shape, prior_px, model == "local", counts)
-            other.descend(level, steps, bend, last)
-            found.join(other, level)
-    flow, covariance, confidence = found.at_start(way.start)
-    net = way.net.to(flow)[:, None, None, None]
-    valid = (counts.detach().sum((1, 2, 3, 4)) > 0)[:, None, None].expand(batch, height, width)
+            descents.append(Descent(shape, prior_px, model == "local", counts))
+        for descent in descents:
+            descent.descend(level, steps, bend, last, expected=number == 0 and not last)
+        while len(descents) > 1 and (number == 1 or last):
+            other = descents.pop()
+            descents[-1].join(other, level)
+    flow, covariance, confidence = descents[0].at_start(way.start)
     return FlowField(
         net * flow,
         valid,
         float(volume.collected_s.sum()),
         confidence,
-        (net.square() + TURNED * (1 - net.square())) * covariance,
+        share * covariance,
     )
+
+
+def _start(start_px, counts):
+    """[B, 2, H, W] as ``counts``."""
+    batch, _, _, height, width = counts.shape
+    if check_real(start_px, "start_px").ndim != 2:
+        return check_flow(start_px, (batch, 2, height, width), "start_px").to(counts)
+    if tuple(start_px.shape) != (batch, 2):
+        raise ShapeError(
+            f"start_px is {list(start_px.shape)}; [{batch}, 2] or [{batch}, 2, {height}, {width}] is needed."
+        )
+    return check_finite(start_px, "start_px").to(counts)[:, :, None, None].expand(-1, -1, height, width)

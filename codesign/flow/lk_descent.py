@@ -24,10 +24,16 @@ class Descent:
         self.like = like
         # in units of the prior: parameters = unit @ found
         self.found = torch.zeros(batch, 2 * shape.terms, dtype=torch.float64, device=like.device)
+        self.expected: Tensor | None = None
         self.one = torch.eye(2 * shape.terms, dtype=torch.float64, device=like.device)
         self.precision = self.one.expand(batch, -1, -1)
         self.local = local
         self.cells = Cells(batch, shape.height, shape.width, prior_px, like.device)
+
+    def begin(self, flow_px: Tensor, start: Tensor) -> None:
+        """Moves to the least-squares fit of a flow [B, 2, H, W], px per way, on the pixels of the start, which lies at
+        ``start`` [B] on the way."""
+        self.found = self.expected = self.shape.fitted(flow_px, start)
 
     def parameters(self) -> Tensor:
         """[B, 2K] of the polynomial, px per way."""
@@ -38,17 +44,19 @@ class Descent:
         flow = level.moments.flow(self.parameters())
         return flow + self.cells.on(level).to(flow) if self.local else flow
 
-    def descend(self, level: Level, steps: int, bend: bool, last: bool) -> None:
+    def descend(self, level: Level, steps: int, bend: bool, last: bool, expected: bool = False) -> None:
         """Moves to the best field, by steps no longer than the linearisation reaches.
 
         Args: bend: whether cells of a local field move too; they do from the second step on, or the only one, since
-          what the polynomial has not yet reached looks like a local part. last: whether nothing follows.
+          what the polynomial has not yet reached looks like a local part. last: whether nothing follows. expected:
+          whether the prior is about the field of ``begin``, which a blur that sees nothing then leaves as it is.
         """
+        centre = self.expected if expected and self.expected is not None else torch.zeros_like(self.found)
         for step in range(steps):
             products = level.products(self.flow(level))
             evidence, pull = level.evidence(products)
             self.precision = self.one + evidence
-            change = torch.linalg.solve(self.precision, pull - self.found)
+            change = torch.linalg.solve(self.precision, pull + centre - self.found)
             moved = self.shape.mean_square(change @ self.shape.unit.T)
             change = change * (1 + moved / (2 * level.sigma) ** 2).rsqrt()[:, None]
             self.found = self.found + change
@@ -58,8 +66,11 @@ class Descent:
                 self.cells.step(level, products, by_polynomial)
 
     def join(self, other: "Descent", level: Level) -> None:
-        """The mean of this field and another, by how much contrast the events along each have."""
+        """The mean of this field and another, by how much contrast the events along each have; where this one began
+        somewhere, also by the prior, which it has had few steps to meet."""
         more = level.contrast_along(self.flow(level)) - level.contrast_along(other.flow(level))
+        if self.expected is not None:
+            more = more + other.found.square().sum(1) - self.found.square().sum(1)
         share = torch.sigmoid(more / 2 + FIRST)[:, None]
         self.found = other.found + share * (self.found - other.found)
         if self.local:

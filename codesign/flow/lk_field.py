@@ -10,6 +10,7 @@ from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 TERMS = {"constant": 1, "affine": 3, "quadratic": 6}
 POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of x and y in the basis
@@ -18,6 +19,8 @@ POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of x and y in the b
 AFFINE = 0.35
 SHEAR = 0.25
 QUADRATIC = 0.15
+POOL = 8  # px a side over which a flow is averaged before it is fitted
+RIDGE = 1e-6  # of the mean diagonal: tiny images have fewer pixels than parameters
 FIXED_POINT_STEPS = 4  # each gains a factor of half the flow's gradient, some 0.03 per px and px
 
 
@@ -141,6 +144,21 @@ class Polynomials:
         places = self.basis(*self.scaled(x_px, y_px), 1)
         flow = (p @ places.flatten(2)).unflatten(2, places.shape[2:])
         return flow if local is None else flow + local(x_px, y_px)[0], places
+
+    def fitted(self, flow_px: Tensor, start: Tensor) -> Tensor:
+        """Numbers [B, 2K], float64, for which unit @ numbers are the parameters whose flow on the pixels of the start is
+        nearest to this one, px per way; args as of ``at_start``."""
+        side = max(1, min(POOL, self.height // 2, self.width // 2))
+        flow = avg_pool2d(flow_px.double(), side)
+        y, x = (torch.arange(count).to(flow) * side + (side - 1) / 2 for count in flow.shape[2:])
+        back = -start.to(flow)[:, None, None]
+        places = self.basis(*self.scaled(x + back * flow[:, 0], y[:, None] + back * flow[:, 1]), 1)
+        by_unit = places.flatten(2).mT[:, None] @ self.unit.unflatten(0, (2, -1))  # [B, 2, n, 2K]
+        design = by_unit.flatten(1, 2)
+        normal = design.mT @ design
+        ridge = RIDGE * normal.diagonal(dim1=1, dim2=2).mean(1)[:, None, None]
+        right = design.mT @ flow.flatten(1)[:, :, None]
+        return torch.linalg.solve(normal + ridge * torch.eye(2 * self.terms).to(normal), right)[..., 0]
 
     def covariance(self, covariance: Tensor, places: Tensor) -> Tensor:
         """Covariance [B, 3, H, W] (xx, xy, yy) of the flow from that of the parameters [B, 2K, 2K]."""

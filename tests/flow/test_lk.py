@@ -26,7 +26,15 @@ def pattern(seed, finest_px=6.0, coarsest_px=24.0, count=40):
     return lambda x, y: torch.cos(x[..., None] * kx + y[..., None] * ky + phase).sum(-1) * (2 / count) ** 0.5
 
 
-def moving(seed, matrix=((0.0, 0.0), (0.0, 0.0)), shift=(0.0, 0.0), per_pixel=8.0, steps=80, bins=5):
+def moving(
+    seed,
+    matrix=((0.0, 0.0), (0.0, 0.0)),
+    shift=(0.0, 0.0),
+    per_pixel=8.0,
+    steps=80,
+    bins=5,
+    waves_px=(6.0, 24.0),
+):
     """Volume of a signed event rate whose points move evenly, by matrix (x - centre) + shift from where they
     are at mid-interval, and the flow [2, H, W].
 
@@ -37,7 +45,7 @@ def moving(seed, matrix=((0.0, 0.0), (0.0, 0.0)), shift=(0.0, 0.0), per_pixel=8.
     shift = torch.tensor(shift, dtype=D)
     y, x = torch.meshgrid(torch.arange(SIZE, dtype=D), torch.arange(SIZE, dtype=D), indexing="ij")
     at = torch.stack([x, y], -1) - (SIZE - 1) / 2
-    rate = pattern(seed)
+    rate = pattern(seed, *waves_px)
     counts = []
     for k in range(steps):
         tau = (k + 0.5) / steps - 0.5

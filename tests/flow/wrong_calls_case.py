@@ -94,6 +94,7 @@ def calls(folder: Path) -> dict[str, Call]:
                     "levels_px": (2.0, 1.0),
                     "steps": 1,
                     "noise_floor": 0.02,
+                    "start_px": flow_px,
                 },
             ),
             ("FlowNetEvents()", network, {"volume": volume}),

@@ -1,0 +1,131 @@
+"""Warm starts of the closed form: fields of a known flow, motions that are found from near by only, and starts that are
+wrong."""
+
+import pytest
+import torch
+
+from codesign import events, flow
+from codesign.errors import DomainError, ShapeError
+from codesign.flow import estimate_lk, lk_field
+from codesign.types import EventVolume
+from tests.flow.test_lk import D, length, mean_error, moving, pattern
+
+FINE_PX = (4.0, 8.0)  # a blur of 4 px leaves a thousandth of these textures
+
+
+@pytest.mark.parametrize("size", [(16, 24), (31, 18), (2, 3)])
+def test_a_polynomial_is_read_off_its_own_flow(size, generator):
+    """Within the fixed point (a factor of 0.1 in each of 5 steps) and the ridge (1e-6 of the mean diagonal, where the
+    least term counts some hundredth of the mean)."""
+    shape = lk_field.Polynomials("affine", *size)
+    height, width = size
+    matrix = 0.05 * torch.randn(2, 2, 2, generator=generator, dtype=D)
+    shift = torch.randn(2, 2, generator=generator, dtype=D)
+    parameters = torch.cat([shift[:, :, None], matrix * shape.half], 2).flatten(1)
+    start = torch.tensor([-0.5, -0.3], dtype=D)
+    y, x = torch.meshgrid(torch.arange(height, dtype=D), torch.arange(width, dtype=D), indexing="ij")
+    at = torch.stack([x - (width - 1) / 2, y - (height - 1) / 2])
+    # w = M (a - s w) + t
+    unit = torch.eye(2, dtype=D)
+    right = torch.einsum("bij,jyx->biyx", matrix, at) + shift[:, :, None, None]
+    flow_px = torch.einsum("bij,bjyx->biyx", torch.linalg.inv(unit + start[:, None, None] * matrix), right)
+    found = shape.fitted(flow_px, start) @ shape.unit.T
+    torch.testing.assert_close(found, parameters, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("model", ["affine", "local"])
+def test_a_start_near_by_finds_what_the_coarse_blur_wipes_out(model):
+    volume, truth = moving(1, shift=(18.0, 5.0), bins=8, waves_px=FINE_PX)
+    near = 0.85 * torch.tensor([[18.0, 5.0]])
+    cold = estimate_lk(volume, model)
+    assert mean_error(cold, truth) >= 0.5 * length(truth)
+    assert mean_error(estimate_lk(volume, model, start_px=near), truth) <= 0.01 * length(truth)
+    whole = near[:, :, None, None].expand(-1, -1, *truth.shape[1:])
+    torch.testing.assert_close(
+        estimate_lk(volume, model, start_px=whole).flow_px,
+        estimate_lk(volume, model, start_px=near).flow_px,
+        rtol=0,
+        atol=1e-9,
+    )
+
+
+def test_a_start_near_by_does_with_fewer_levels_and_steps():
+    volume, truth = moving(0, shift=(10.0, -4.0))
+    options = {"levels_px": (2.0, 1.0), "steps": 2}
+    assert mean_error(estimate_lk(volume, **options), truth) >= 0.02 * length(truth)
+    near = estimate_lk(volume, **options, start_px=torch.tensor([[8.0, -3.0]]))
+    assert mean_error(near, truth) <= 0.005 * length(truth)
+
+
+@pytest.mark.parametrize("waves_px", [FINE_PX, (6.0, 24.0)])
+@pytest.mark.parametrize("levels_px", [(4.0, 2.0, 1.0), (2.0, 1.0)])
+def test_a_wrong_start_leaves_what_is_found_without(waves_px, levels_px):
+    # the share of the wrong one is below 1e-3 where contrasts differ by 7 in the logarithm of the odds
+    volume, truth = moving(1, shift=(3.0, -2.0), waves_px=waves_px)
+    cold = mean_error(estimate_lk(volume, levels_px=levels_px), truth)
+    for wrong in ((-6.0, 4.0), (9.0, 9.0), (0.0, -12.0)):
+        found = estimate_lk(volume, levels_px=levels_px, start_px=torch.tensor([wrong]))
+        assert mean_error(found, truth) <= cold + 0.01 * length(truth)
+
+
+@pytest.mark.parametrize("count", [0, 1, 20, 200])
+def test_events_that_say_nothing_keep_no_start(count):
+    # few steps of at most 4 px do not lead back from 40 px: the prior drops it (without it 27 px stay)
+    shell, truth = moving(0, steps=10)
+    for seed in range(4):
+        generator = torch.Generator().manual_seed(seed)
+        counts = torch.zeros(2 * 5 * truth[0].numel(), dtype=D)
+        counts[torch.randint(len(counts), (count,), generator=generator)] += 1
+        volume = EventVolume(counts.reshape(1, 2, 5, *truth.shape[1:]), shell.centroid_s, shell.collected_s)
+        cold = estimate_lk(volume).flow_px
+        warm = estimate_lk(volume, start_px=torch.tensor([[40.0, -20.0]])).flow_px
+        torch.testing.assert_close(warm, cold, rtol=0, atol=1e-6)
+
+
+def test_starts_of_a_batch_are_each_their_own_and_have_no_gradient():
+    (a, _), (b, _) = moving(0, shift=(2.0, 1.0)), moving(1, shift=(-1.0, 0.5))
+    both = EventVolume(torch.cat([a.counts, b.counts]), a.centroid_s, a.collected_s)
+    starts = torch.tensor([[4.0, 0.0], [-2.0, -1.0]], requires_grad=True)
+    found = estimate_lk(both, start_px=starts).flow_px
+    assert not found.requires_grad
+    for k, volume in enumerate((a, b)):
+        alone = estimate_lk(volume, start_px=starts[k : k + 1]).flow_px[0]
+        torch.testing.assert_close(found[k], alone, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("start", "error", "sentence"),
+    [
+        (torch.zeros(2), ShapeError, r"must be \[1, 2, 48, 48\], got \[2\]"),
+        (torch.zeros(2, 2), ShapeError, r"start_px is \[2, 2\]; \[1, 2\] or \[1, 2, 48, 48\] is needed"),
+        (torch.zeros(1, 2, 40, 48), ShapeError, r"must be \[1, 2, 48, 48\], got \[1, 2, 40, 48\]"),
+        (torch.full((1, 2), torch.nan), DomainError, "start_px"),
+        ((1.0, 2.0), DomainError, "start_px is a tuple; a torch tensor is needed"),
+    ],
+)
+def test_starts_that_do_not_fit_are_refused(start, error, sentence):
+    volume, _ = moving(0, steps=5)
+    with pytest.raises(error, match=sentence):
+        estimate_lk(volume, start_px=start)
+
+
+def test_a_stream_that_speeds_up_is_followed_from_window_to_window():
+    shade = pattern(0, *FINE_PX)
+    y, x = torch.meshgrid(torch.arange(48, dtype=D), torch.arange(48, dtype=D), indexing="ij")
+    times = torch.arange(121, dtype=D) / 2000  # 60 ms
+    places = 200 * times + 10_000 * times.square()  # 200 to 1400 px/s
+    frames = torch.stack([120 * torch.exp(0.5 * shade(x - place, y)) for place in places])
+    stream = events.simulate(frames, times, events.SensorModel(theta_on=0.1, theta_off=0.1))
+    lost = {}
+    for warm in (True, False):
+        found = list(flow.Tracker(estimate_lk, window_s=0.01, warm_start=warm).track([stream]))
+        assert [window.warm for window in found] == [False] + [warm] * (len(found) - 1)
+        lost[warm] = 0
+        for window in found:
+            t0_s, t1_s = window.t0_us * 1e-6, window.t1_us * 1e-6
+            right = 200 * (t1_s - t0_s) + 10_000 * (t1_s**2 - t0_s**2)
+            mean = window.field.flow_px[0].mean((1, 2)).tolist()
+            # what the closed form leaves on hard events of dense texture (0.02 to 0.06 of zero flow)
+            lost[warm] += abs(mean[0] - right) > 0.05 * right or abs(mean[1]) > 0.05 * right
+    assert lost[True] == 0
+    assert lost[False] >= 3
