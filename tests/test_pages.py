@@ -11,6 +11,7 @@ PAGES = (
     "docs/chain.md",
     "docs/diffraction.md",
     "docs/your_own.md",
+    "docs/mounts.md",
     "docs/placement.md",
     "docs/worlds.md",
 )

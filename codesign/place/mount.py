@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from codesign.errors import DomainError, ShapeError, check_finite
@@ -108,6 +109,21 @@ class Mount(nn.Module):
             *top.shape[:-2], 1, 4
         )
         return torch.cat([top, last], -2)
+
+    def numbers_at(self, T_body_cam: Tensor) -> Tensor:
+        """Numbers [..., 6] that give poses [..., 4, 4], the inverse of ``forward``; no gradient.
+
+        Raises: DomainError for a position that is not strictly inside the box; ShapeError.
+        """
+        if T_body_cam.shape[-2:] != (4, 4):
+            raise ShapeError(f"mount: poses are [..., 4, 4], got {tuple(T_body_cam.shape)}.")
+        pose = check_finite(T_body_cam.detach().double(), "mount: T_body_cam")
+        turn = self.start_attitude.mT @ pose[..., :3, :3]
+        vector = torch.from_numpy(Rotation.from_matrix(turn.reshape(-1, 3, 3).numpy()).as_rotvec())
+        return (
+            torch.cat([self._unbounded(pose[..., :3, 3]), vector.reshape(*pose.shape[:-2], 3)], -1)
+            / self.unit
+        )
 
     def variables(
         self, camera: ChiefRayCamera, depth_m: float | Tensor, step_px: float = 1.0
