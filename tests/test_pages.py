@@ -14,6 +14,7 @@ PAGES = (
     "docs/mounts.md",
     "docs/placement.md",
     "docs/worlds.md",
+    "docs/robots_and_worlds.md",
 )
 
 

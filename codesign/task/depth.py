@@ -1,12 +1,15 @@
-"""How far the surfaces under pixels are: over flat ground, or as a map of the world tells it."""
+"""How far the surfaces under pixels are: over flat ground, or as a map of the world tells it. What moves through the
+world by itself, such as the robot's own body, has no depth: its image says nothing of the way the body goes."""
 
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from codesign.render.truth import cameras_of, hits_of
-from codesign.types import ChiefRayCamera, Rays
+from codesign.render.hits import Hits, first_hits
+from codesign.render.moving import MovingScene, in_one_row
+from codesign.render.truth import cameras_of
+from codesign.types import ChiefRayCamera
 
 LEVEL = 1e-6  # metres that a ray must fall per metre of depth to meet the ground
 
@@ -14,8 +17,10 @@ LEVEL = 1e-6  # metres that a ray must fall per metre of depth to meet the groun
 def ground_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, scene: Any = None) -> Tensor:
     """Depth of the plane z = 0 of the world.
 
-    Args: camera: with ``chief_rays``. pixels: [N, P, 2] px. T_world_cam: [N, 4, 4]. scene: not looked at.
-    Returns: [N, P] m along the camera's z axis, float64; infinite where a ray goes up or along the ground.
+    Args: camera: with ``chief_rays``. pixels: [N, P, 2] px. T_world_cam: [N, 4, 4]. scene: as for ``scene_depth``;
+      only the objects of a MovingScene are looked at, which hide the ground.
+    Returns: [N, P] m along the camera's z axis, float64; infinite where a ray goes up or along the ground, or meets
+      an object that moves.
     Gradient: pose, and the lens behind the chief rays.
     """
     rays = camera.chief_rays(pixels.reshape(-1, 2))
@@ -25,23 +30,47 @@ def ground_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, sc
     falling = -(slope.reshape(*pixels.shape[:2], 1, 3) @ up)[..., 0, 0]
     height = T_world_cam[:, 2, 3].double()[:, None] + (base.reshape(*pixels.shape[:2], 1, 3) @ up)[..., 0, 0]
     meets = falling.detach() > LEVEL
+    if any(isinstance(world, MovingScene) for world in _scenes(scene)):
+        hits, _ = _hits(camera, pixels, T_world_cam, scene)
+        meets = meets & (hits.part <= 0)
     return torch.where(meets, height / torch.where(meets, falling, 1.0), torch.inf)
 
 
 def scene_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, scene: Any) -> Tensor:
     """Depth of what a scene has under the pixels, as a perfect map would know it.
 
-    Args and Returns: as for ``ground_depth``; scene: one, or a tuple of as many for equal shares of the N poses.
+    Args and Returns: as for ``ground_depth``; scene: one, or a tuple of as many for equal shares of the N poses. Of
+      a MovingScene the objects stand where they are in the middle of its frames, and have no depth.
     Gradient: pose and lens, the surface taken as its tangent plane.
     """
-    scenes = scene if isinstance(scene, tuple | list) else (scene,)
+    hits, ahead = _hits(camera, pixels, T_world_cam, scene)
+    return torch.where(hits.part == 0, ahead(hits.distance_m), torch.inf)
+
+
+def _hits(camera, pixels, T_world_cam, scene):
+    """First surfaces [N, P], and the function from distances along the rays to depths."""
     rays = camera.chief_rays(pixels.reshape(-1, 2))
+    shape = pixels.shape[:2]
+    origin = rays.origin_m.double().reshape(*shape, 3)
+    direction = rays.direction.double().reshape(*shape, 3)
+    lit = (rays.weight.detach() > 0).reshape(shape)
+    scenes = _scenes(scene)
+    share = len(T_world_cam) // len(scenes)
     found = []
-    for number, pose in enumerate(T_world_cam):
-        mine = slice(number * pixels.shape[1], (number + 1) * pixels.shape[1])
-        here = Rays(rays.origin_m[mine], rays.direction[mine], rays.weight[mine])
-        world = scenes[number * len(scenes) // len(T_world_cam)]
-        hits = hits_of(here, world, cameras_of(world, pose[None]))
-        depth = here.origin_m[:, 2].double() + here.direction[:, 2].double() * hits.distance_m[0]
-        found.append(torch.where(hits.part[0] >= 0, depth, torch.inf))
-    return torch.stack(found)
+    for number, world in enumerate(scenes):
+        mine = slice(number * share, (number + 1) * share)
+        poses = T_world_cam[mine].double()
+        if isinstance(world, MovingScene) and world.names:
+            middle = world.T_world_object[0].shape[-3] // 2
+            world, poses = in_one_row(world.during([middle]), poses[:, None])
+        found.append(first_hits(origin[mine], direction[mine], lit[mine], world, cameras_of(world, poses)))
+    hits = Hits(*(torch.cat([getattr(each, name) for each in found]) for name in Hits.__dataclass_fields__))
+
+    def ahead(distance_m):
+        return origin[..., 2] + direction[..., 2] * distance_m
+
+    return hits, ahead
+
+
+def _scenes(scene):
+    return scene if isinstance(scene, tuple | list) else (scene,)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from codesign import lens, render
+from codesign.report import robot_figures
 from scenes import robots
 from studies import robot_view
 from studies.frame.run import main
@@ -29,7 +30,7 @@ def test_the_page_shows_the_robot_and_counts_its_body_in_view(tmp_path):
 
 def test_the_drawn_view_is_that_of_the_camera():
     camera = render.Camera(lens.Pinhole(4.0), 40, 20, 0.1, 1)
-    lines = robot_view.view_lines(camera, robots.T_LINK_OPTICAL, 2.0)
+    lines = robot_figures.view_lines(camera, robots.T_LINK_OPTICAL, 2.0)
     # 2 m ahead the film of 4 x 2 mm behind 4 mm is 2 x 1 m wide, in the axes of a link: x ahead, y left, z up
     np.testing.assert_allclose(
         lines[:4, 1], [[2, 1, 0.5], [2, -1, 0.5], [2, -1, -0.5], [2, 1, -0.5]], atol=1e-12
@@ -40,7 +41,7 @@ def test_the_drawn_view_is_that_of_the_camera():
 def test_cut_triangles_cover_what_they_were_cut_from():
     generator = torch.Generator().manual_seed(0)
     triangles = torch.rand(5, 3, 3, generator=generator, dtype=torch.float64).numpy()
-    parts, shade = robot_view._cut(triangles, np.arange(5.0), 0.2)
+    parts, shade = robot_figures.cut(triangles, np.arange(5.0), 0.2)
     edges = np.linalg.norm(parts - np.roll(parts, -1, 1), axis=2)
     assert edges.max() <= 0.2
 

@@ -1,0 +1,252 @@
+"""A robot and the world it moves through: what the design of its camera is judged by.
+
+A pair says where a camera may sit on a robot's body, which lens and mount it starts from, which velocities of the
+body count, and makes worlds and drives by number. Numbers below ``UNSEEN_FROM`` are for training, those from there on
+for judging; they share neither photographs nor random patterns, places or motions.
+
+All pairs move in one hard regime: speeds from 0.05 to 3 m/s, evenly in their logarithm, unknown roll, pitch and yaw
+rates, half of the contrast of photographs, a slow sensor with high thresholds. There is no velocity at which flow is
+always within the estimator's reach, so that focal length, focus, height and attitude all matter.
+
+Body axes: x forward, y left, z up. The body is drawn in front of its camera (``render.MovingScene``).
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codesign import events, flow, lens, place, render, task
+from codesign.errors import DomainError
+from codesign.pose import se3_exp
+from codesign.system import Batch, System
+from scenes import textures
+from scenes.bodies import Body
+from scenes.build import Paint, World, emissive
+
+# nine windows of a DAVIS346: the whole field of view for a tenth of its pixels
+SENSOR_PX = (346, 260)
+PITCH_MM = 0.0185
+WINDOW_PX = 32
+LEFTS_PX, TOPS_PX = ((0, (size - WINDOW_PX) // 2, size - WINDOW_PX) for size in SENSOR_PX)
+FILM = render.Film(
+    *SENSOR_PX, WINDOW_PX, WINDOW_PX, PITCH_MM, tuple((left, top) for top in TOPS_PX for left in LEFTS_PX)
+)
+RAYS_PER_PX = 8
+DURATION_S = 0.02
+FRAMES = 9
+BINS = 5
+SENSOR = events.SensorModel(
+    theta_on=0.25, theta_off=0.25, theta_sigma=0.03, cutoff_hz=200.0, shot_rate_hz=5.0
+)
+PRIOR_PX = 4.0  # of the flow over the interval
+SPEED_M_S = (0.05, 3.0)
+RATE_RAD_S = 0.7  # standard deviation of roll, pitch and yaw rates
+CONTRAST = 0.6  # exponent of radiance
+LIGHT = (70.0, 180.0)  # mean radiance of surfaces
+UNSEEN_FROM = 1_000_000
+PHOTOS = {False: ("gravel", "grass", "coffee"), True: ("brick", "astronaut", "chelsea")}  # by whether unseen
+
+
+@dataclass(frozen=True)
+class Design:
+    """A lens and where it looks from: focal length, f-number, 1 / distance in focus; position, yaw to the left,
+    pitch downwards and roll in body axes."""
+
+    efl_mm: float
+    fno: float
+    focus_per_m: float
+    x_m: float
+    y_m: float
+    z_m: float
+    yaw_rad: float
+    pitch_rad: float
+    roll_rad: float
+
+    def mount(self) -> Tensor:
+        """T_body_cam [4, 4]."""
+        at = (self.x_m, self.y_m, self.z_m)
+        attitude = {name: getattr(self, name) for name in ("yaw_rad", "pitch_rad", "roll_rad")}
+        return place.Mount(at, (0.0, 0.0, 0.0), **attitude)().detach()
+
+    def camera(self) -> render.Camera:
+        """Nine windows behind a thin lens."""
+        image_mm = 1 / (1 / self.efl_mm - 1e-3 * self.focus_per_m)
+        optics = lens.ThinLens(self.efl_mm, self.efl_mm / self.fno, image_mm)
+        return render.Camera(optics, WINDOW_PX, WINDOW_PX, PITCH_MM, RAYS_PER_PX, 0, FILM)
+
+
+@dataclass(frozen=True)
+class Drives(Batch):
+    """A batch that knows the truth. twist: [N, 6] of the body over the interval, m/s and rad/s in its own axes."""
+
+    twist: Any = None
+
+
+@dataclass(frozen=True)
+class RobotPair:
+    """A robot, its worlds and its drives.
+
+    name: of the pair. bodies: link -> mesh in body axes. low, high: bounds of the design. design: where to start,
+      inside them.
+    axes: which of the six velocities count (``place.PLANAR`` or ``place.FREE``); all six are estimated.
+    prior: standard deviations expected of the six, m/s and rad/s.
+    depth: how depth is known, "ground" or "scene" (``task.EgoVelocity``).
+    look_ahead: distance in metres, and the share of the image that must see beyond it; None where nothing must.
+    world: number -> what stands still. drive: (number, how many) -> T_world_body [M, T, 4, 4], twist [M, 6].
+    """
+
+    name: str
+    bodies: Mapping[str, Body]
+    low: Design
+    high: Design
+    design: Design
+    axes: tuple[int, ...]
+    prior: tuple[float, ...]
+    depth: str
+    look_ahead: tuple[float, float] | None
+    world: Callable[[int], render.MitsubaScene]
+    drive: Callable[[int, int], tuple[Tensor, Tensor]]
+
+    def check(self, design: Design) -> Design:
+        """The design. Raises: DomainError where a number of it lies outside the bounds."""
+        for field in fields(Design):
+            low, value, high = (getattr(each, field.name) for each in (self.low, design, self.high))
+            if not low <= value <= high:
+                raise DomainError(
+                    f"pair '{self.name}': {field.name} = {value:g} lies outside its bounds, {low:g} to {high:g}."
+                )
+        return design
+
+    def body(self) -> render.MitsubaScene:
+        """The robot in its own axes, grey in the light of a plain sky that turns with it."""
+        grey = Paint(np.full((1, 1), 90.0))
+        return emissive(World({name: (mesh, grey) for name, mesh in self.bodies.items()}))
+
+    def batch(self, numbers: Sequence[int], motions: int, seed: int = 0) -> Drives:
+        """Worlds of these numbers with as many drives each, the body in them; the same for every design.
+
+        seed: of film samples and sensor noise.
+        """
+        body = self.body()
+        drives = [self.drive(number, motions) for number in numbers]
+        scenes = tuple(
+            render.MovingScene(self.world(number), {"body": (body, poses)})
+            for number, (poses, _) in zip(numbers, drives, strict=True)
+        )
+        poses, twists = (torch.stack(part) for part in zip(*drives, strict=True))
+        return Drives(poses, times(), scenes, seed, twist=twists.flatten(0, 1))
+
+    def system(self, design: Design, layer: str = "memory") -> System:
+        """Camera, mount, sensor, flow and estimate of a design; objective "error" is the mean bounded one.
+
+        layer: "memory" (hard counts, straight-through gradient), "counts" (smooth, without noise) or "sensor" (single
+          events, no gradient: the judge).
+        """
+        mount = self.check(design).mount()
+
+        def error(estimate, batch):
+            return self.errors(estimate, batch).bounded().mean()
+
+        return System(
+            camera=design.camera(),
+            mount=lambda: mount,
+            events=LAYERS[layer],
+            flow=closed_form,
+            estimate=task.EgoVelocity(place.FREE, self.prior, self.depth),
+            objectives={"error": error},
+            bins=BINS,
+        )
+
+    def errors(self, estimate: task.Motion, batch: Drives) -> task.VelocityErrors:
+        """Errors of the velocities that count."""
+        return task.velocity_errors(estimate.velocity[:, list(self.axes)], batch.twist, self.axes)
+
+    def judged(self, design: Design, batch: Drives, layer: str = "memory") -> task.VelocityErrors:
+        """Errors of a design over a batch, without gradient."""
+        with torch.no_grad():
+            return self.errors(self.system(design, layer).begin(batch)["estimate"], batch)
+
+
+LAYERS = {
+    "memory": events.layer("memory", SENSOR, learn=()),
+    "counts": events.layer("counts", replace(SENSOR, theta_sigma=0.0, shot_rate_hz=0.0), learn=()),
+    "sensor": events.HardSensor(SENSOR, BINS),
+}
+
+
+def closed_form(volume):
+    """Affine flow of each window, with its covariance."""
+    return flow.estimate_lk(volume, model="affine", prior_px=PRIOR_PX)
+
+
+def training(count: int) -> range:
+    """Numbers of the first training variants."""
+    return range(_counted(count))
+
+
+def unseen(count: int) -> range:
+    """Numbers of the first unseen variants."""
+    return range(UNSEEN_FROM, UNSEEN_FROM + _counted(count))
+
+
+def _counted(count):
+    if not 1 <= count <= UNSEEN_FROM:
+        raise DomainError(f"{count} variants are asked for; give 1 to {UNSEEN_FROM}.")
+    return count
+
+
+def times() -> Tensor:
+    """[T] seconds of the frames of a window."""
+    return torch.linspace(0, DURATION_S, FRAMES, dtype=torch.float64)
+
+
+def moved(T_world_body: Tensor, twist: Tensor) -> Tensor:
+    """Poses [M, T, 4, 4] of bodies that are at [M, 4, 4] in the middle of the window and go with twists [M, 6]."""
+    return T_world_body[:, None] @ se3_exp((times() - DURATION_S / 2)[:, None] * twist[:, None])
+
+
+def speeds_and_deviates(number: int, motions: int, columns: int) -> tuple[Tensor, Tensor]:
+    """Speeds [M] m/s, even in the logarithm over SPEED_M_S, and standard normal numbers [M, columns]; each of them
+    spread evenly over its distribution, in an order of its own (a Latin hypercube)."""
+    random = np.random.default_rng([number, 1])
+    order = random.permuted(np.tile(np.arange(motions), (columns + 1, 1)), axis=1)
+    share = torch.from_numpy((order + random.random(order.shape)) / motions).T
+    slowest, fastest = (math.log(speed) for speed in SPEED_M_S)
+    deviates = math.sqrt(2) * torch.erfinv((2 * share[:, 1:] - 1).clamp(-0.9999, 0.9999))
+    return (slowest + (fastest - slowest) * share[:, 0]).exp(), deviates
+
+
+def picture(random: np.random.Generator, unseen: bool, level: float) -> np.ndarray:
+    """A photograph or a random pattern of many scales as radiance [H, W] of a mean level, at CONTRAST."""
+    if random.random() < 0.5:
+        found = textures.photo(str(random.choice(PHOTOS[unseen])))
+    else:
+        found = textures.speckle(int(random.integers(2**31)), finest_px=3.0, coarsest_px=128.0)
+    found = found**CONTRAST
+    return (found * (level / found.mean())).astype(np.float32)
+
+
+def light_level(random: np.random.Generator) -> float:
+    """Mean radiance of the surfaces of a world, even in the logarithm over LIGHT."""
+    return float(np.exp(random.uniform(*np.log(LIGHT))))
+
+
+def paint(random: np.random.Generator, unseen: bool, level: float, width_m: float, height_m: float) -> Paint:
+    """A surface of this size with texels of 1.5 to 3 mm."""
+    found = picture(random, unseen, level)
+    texel_m = random.uniform(0.0015, 0.003)
+    return Paint(found, (width_m / (texel_m * found.shape[1]), height_m / (texel_m * found.shape[0])))
+
+
+def standing(at: Tensor) -> Tensor:
+    """Upright poses [M, 4, 4] from places and headings [M, 3] on the ground, m and rad."""
+    turn = torch.zeros(len(at), 6, dtype=torch.float64)
+    turn[:, 5] = at[:, 2]
+    pose = se3_exp(turn)
+    pose[:, :2, 3] = at[:, :2]
+    return pose

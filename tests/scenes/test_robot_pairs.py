@@ -1,0 +1,198 @@
+"""Robots and their worlds: bodies by volume, drives by closed forms, flow by two roads, variants by number."""
+
+import math
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+
+from codesign import lens, place, pose, render, task
+from codesign.errors import DomainError
+from codesign.task.depth import scene_depth
+from scenes import robot_pair, robot_parts
+from scenes.robot_pairs import PAIRS
+
+D = torch.float64
+NAMES = tuple(PAIRS)
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def pair(request):
+    return PAIRS[request.param]()
+
+
+@pytest.fixture(scope="module")
+def drives(pair):
+    """One world with three drives."""
+    return pair.batch((3,), 3)
+
+
+def volume_m3(body):
+    """By the divergence theorem: positive when faces turn outwards."""
+    corners = body.vertices_m[body.faces]
+    return float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6
+
+
+def test_boxes_and_cylinders_have_their_volumes_and_stand_where_they_are_asked_to():
+    around = robot_parts.AROUND
+    area = around / 2 * math.sin(2 * math.pi / around)  # of the regular polygon in a circle of radius 1
+    assert volume_m3(robot_parts.box((2.0, 1.0, 0.5), (3.0, 2.0, 1.0), 30.0)) == pytest.approx(1.0, rel=1e-12)
+    for axis, name in enumerate("xyz"):
+        body = robot_parts.cylinder(0.1, 0.04, (1.0, 2.0, 3.0), name)
+        assert volume_m3(body) == pytest.approx(area * 0.01 * 0.04, rel=1e-9)
+        half = np.ptp(body.vertices_m, axis=0)[axis] / 2
+        assert half == pytest.approx(0.02, rel=1e-12)
+        np.testing.assert_allclose(body.vertices_m.mean(0), [1, 2, 3], atol=1e-12)
+
+
+def test_bodies_are_closed_and_stand_above_the_ground(pair, drives):
+    for body in pair.bodies.values():
+        edges = np.concatenate([body.faces[:, [k, (k + 1) % 3]] for k in range(3)])
+        counted = np.unique(edges, axis=0, return_counts=True)
+        assert (counted[1] == 1).all()  # every directed edge once,
+        assert {tuple(edge) for edge in edges} == {tuple(edge[::-1]) for edge in edges}  # and once back
+        assert volume_m3(body) > 0
+        points = torch.from_numpy(body.vertices_m)
+        lowest = pose.apply(drives.T_world_body.flatten(0, 1), points)[..., 2].min()
+        assert float(lowest) > 0
+
+
+def test_poses_follow_the_true_velocity(drives):
+    twist = torch.stack([drives.twist] * (robot_pair.FRAMES - 1), 1)
+    found, _ = render.camera_velocity(drives.T_world_body[0], drives.t_s)
+    torch.testing.assert_close(found, twist, rtol=0, atol=1e-9)  # rounding of poses of 1e-15 m over 2.5 ms
+
+
+def test_rendered_correspondences_move_as_the_body_flow_says(pair, drives):
+    """The flow of the scene under pixels, from one pose to another close by, against the flow of the twist."""
+    world = pair.world(3)
+    camera = render.Camera(lens.Pinhole(pair.design.efl_mm), 12, 9, 0.5, 1)
+    mount = pair.design.mount()
+    dt = 1e-6
+    middle = drives.T_world_body[0, :, robot_pair.FRAMES // 2]
+    twist = drives.twist
+    poses = middle[:, None] @ pose.se3_exp(dt * torch.tensor([-0.5, 0.5], dtype=D)[:, None] * twist[:, None])
+    moved, valid = render.true_flow(camera, world, poses @ mount)
+    pixels = camera.film.pixels().expand(3, -1, 2)
+    depth = scene_depth(camera, pixels, (middle @ mount), world)
+    rows, seen = place.body_flow(camera, depth, mount, pixels)
+    expected = (rows @ twist[:, None, :, None])[..., 0] * dt
+    both = (seen & valid[:, 0].flatten(1))[..., None]
+    assert float(both.double().mean()) > 0.4
+    found = moved[:, 0].flatten(2).mT
+    # hits are read in float32: 1e-6 of the depth; edges of things, where the two poses see other surfaces, are left
+    close = ((found - expected).abs() <= 1e-3 * expected.norm(dim=-1, keepdim=True) + 1e-9) | ~both
+    assert float(close.double().mean()) > 0.97
+
+
+def test_the_ground_is_where_the_estimator_takes_it(pair, drives):
+    """Where a robot on flat ground is said to know depth by the ground, most of what it sees lies there."""
+    if pair.depth != "ground":
+        pytest.skip("depth comes from the scene")
+    camera = pair.design.camera()
+    pixels = camera.film.pixels()[::37].expand(3, -1, 2)
+    poses = drives.T_world_body[0, :, robot_pair.FRAMES // 2] @ pair.design.mount()
+    ground = task.ground_depth(camera, pixels, poses, drives.scene)
+    seen = scene_depth(camera, pixels, poses, drives.scene)
+    near = ground < 1.5
+    alike = (ground - seen).abs() < 1e-4
+    assert float(alike[near].double().mean()) > 0.7
+
+
+def test_a_known_body_has_no_depth(pair, drives):
+    """Straight down on the robot: where its mesh is hit, and only there, depth is infinite."""
+    camera = render.Camera(lens.Pinhole(5.0), 16, 16, 0.3, 1)
+    above = pose.look_at((0.02, 0.01, 1.2), (0.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
+    T_world_body = drives.T_world_body[:, :, robot_pair.FRAMES // 2]
+    poses = (T_world_body @ above).flatten(0, 1)
+    pixels = camera.film.pixels().expand(3, -1, 2)
+    depth = scene_depth(camera, pixels, poses, drives.scene)
+    rays = camera.chief_rays(camera.film.pixels())
+    _, _, hit = render.truth.world_points(rays, pair.body(), above)
+    assert 0.05 < float(hit.double().mean()) < 0.9
+    assert bool(depth[:, hit].isinf().all())
+    assert bool(depth[:, ~hit].isfinite().all())
+
+
+def test_variants_differ_and_come_again(pair):
+    kept = pair.drive(5, 4)
+    for again, other in zip(pair.drive(5, 4), pair.drive(6, 4), strict=True):
+        assert any(torch.equal(again, each) for each in kept)
+        assert not any(each.shape == other.shape and torch.equal(other, each) for each in kept)
+    camera = render.Camera(pair.design.camera().lens, 12, 9, 0.4, 4)
+    poses = kept[0][0, :1] @ pair.design.mount()
+    first, second, third = (render.frames(camera, pair.world(n), poses) for n in (5, 5, 6))
+    assert torch.equal(first, second)
+    assert float((first / third).log().abs().mean()) > 0.1
+
+
+def test_unseen_variants_share_nothing_with_training():
+    assert not set(robot_pair.training(500)) & set(robot_pair.unseen(500))
+    assert not set(robot_pair.PHOTOS[True]) & set(robot_pair.PHOTOS[False])
+    with pytest.raises(DomainError, match="give 1 to"):
+        robot_pair.training(robot_pair.UNSEEN_FROM + 1)
+    drawn = [robot_pair.picture(np.random.default_rng([n, 2]), n > 9, 100.0) for n in range(20)]
+    sums = {round(float(each.std()), 4) for each in drawn}
+    assert len(sums) >= 12  # photographs come again, patterns do not
+
+
+def test_pictures_have_their_mean_and_six_tenths_of_the_contrast():
+    from scenes import textures
+
+    found = robot_pair.picture(np.random.default_rng([1, 2]), False, 120.0)
+    assert float(found.mean()) == pytest.approx(120.0, rel=1e-4)
+    log = np.log(found)
+    whole = [np.log(textures.photo(name)).std() for name in robot_pair.PHOTOS[False]]
+    whole.append(0.5)  # of random patterns
+    assert min(abs(log.std() / 0.6 - each) for each in whole) < 1e-3
+
+
+def test_speeds_and_rates_are_those_of_the_hard_regime():
+    speed, deviates = robot_pair.speeds_and_deviates(4, 400, 3)
+    # one in every four-hundredth of the distribution
+    share = (speed / 0.05).log() / math.log(60)
+    even = (torch.arange(400, dtype=D) + 0.5) / 400
+    torch.testing.assert_close(share.sort().values, even, rtol=0, atol=0.5 / 400)
+    normal = 0.5 * (1 + torch.erf(deviates / math.sqrt(2)))
+    torch.testing.assert_close(normal.sort(0).values, even[:, None].expand(-1, 3), rtol=0, atol=0.5 / 400)
+
+
+def test_the_design_starts_inside_its_bounds_and_others_are_refused(pair):
+    assert pair.check(pair.design) is pair.design
+    for field in fields(robot_pair.Design):
+        low, start, high = (getattr(d, field.name) for d in (pair.low, pair.design, pair.high))
+        assert low < start < high or low == start == high
+    with pytest.raises(DomainError, match=r"efl_mm = 99 lies outside its bounds"):
+        pair.check(replace(pair.design, efl_mm=99.0))
+
+
+def test_a_design_is_its_lens_and_its_mount():
+    design = robot_pair.Design(6.0, 1.2, 2.0, 0.3, 0.1, 0.4, 0.2, 0.5, -0.1)
+    optics = design.camera().lens
+    assert float(optics.image_distance_mm) == pytest.approx(1 / (1 / 6.0 - 1 / 500.0), rel=1e-12)
+    assert optics.entrance_pupil_diameter_mm == pytest.approx(5.0)
+    mount = design.mount()
+    assert mount[:3, 3].tolist() == [0.3, 0.1, 0.4]
+    angles = place.yaw_pitch_roll_rad(mount)
+    torch.testing.assert_close(angles, torch.tensor([0.2, 0.5, -0.1], dtype=D), rtol=0, atol=1e-12)
+
+
+def test_an_estimate_of_exact_flow_is_the_true_velocity(pair, drives):
+    """Rendered truth through the design's own windows, where the scene's depth is known, gives back the twist."""
+    mount = pair.design.mount()
+    exact = task.EgoVelocity(place.FREE, (1e3,) * 6, "scene", outlier=1.0, steps=20)
+    slow = replace(drives, T_world_body=slowed(drives, 0.05))
+    system = pair.system(pair.design).replaced(flow=lambda volume, truth: truth, estimate=exact)
+    with torch.no_grad():
+        found = system.begin(slow)["estimate"].velocity
+    assert mount.shape == (4, 4)
+    # things' edges and the body's own are left to the outlier rule
+    torch.testing.assert_close(found, 0.05 * drives.twist, rtol=0.05, atol=2e-3)
+
+
+def slowed(drives, share):
+    """Poses of the same drives at a share of their velocity, about the middle of the window."""
+    middle = drives.T_world_body[:, :, robot_pair.FRAMES // 2]
+    twist = share * drives.twist.unflatten(0, middle.shape[:2])
+    return robot_pair.moved(middle.flatten(0, 1), twist.flatten(0, 1)).unflatten(0, middle.shape[:2])
