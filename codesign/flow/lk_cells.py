@@ -65,11 +65,9 @@ class Cells:
         """
         precision, pull = self._evidence(level, self._summed(products, CELL // level.stride, change))
         pull = pull + _apply(precision, self.value)
+        growth = GROWTH ** torch.arange(self.scales).to(pull)
         variances = (pull.new_tensor(SIZES) * self.prior_px) ** 2
-        steps = [(variances * GROWTH**scale).repeat_interleave(len(pull)) for scale in range(self.scales)]
-        many = len(SIZES), 1, 1, 1
-        found = lk_tree.posterior(precision.repeat(many), pull.repeat(many), steps)
-        means, covariances, evidence = (x.unflatten(0, (len(SIZES), -1)) for x in found)
+        means, covariances, evidence = lk_tree.posterior(precision, pull, growth[:, None] * variances)
         weights = (evidence + self.prior.log()[:, None]).softmax(0)
         whole = weights[:, :, None, None, None]
         mean = (whole * means).sum(0)

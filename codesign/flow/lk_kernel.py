@@ -9,15 +9,9 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.nn.functional import pad
 
-from codesign.backend import NoSecondDerivative
 from codesign.errors import DomainError, ShapeError
 from codesign.flow import lk_blur_kernel, lk_plain, lk_sums_kernel, lk_warp_kernel
-from codesign.flow.lk_lanes import Grid
-
-_FIRST_ONLY = (
-    "the kernels of the closed form give first derivatives only; a second derivative through event flow was asked "
-    "for. Use differences of gradients instead."
-)
+from codesign.flow.lk_lanes import Grid, first_only
 
 
 def moving(
@@ -114,7 +108,7 @@ class _Moving(Function):
     @staticmethod
     def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
         found = lk_warp_kernel.adjoint(*ctx.saved_tensors, *ctx.rest, grads, ctx.needs_input_grad[0])
-        return *_first_only(found, *ctx.saved_tensors[:2], *grads), None, None, None
+        return *first_only(found, *ctx.saved_tensors[:2], *grads), None, None, None
 
 
 class _Sums(Function):
@@ -130,7 +124,7 @@ class _Sums(Function):
     @staticmethod
     def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
         found = lk_sums_kernel.adjoint(*ctx.saved_tensors, *ctx.rest, grad)
-        return *_first_only(found, *ctx.saved_tensors, grad), None, None
+        return *first_only(found, *ctx.saved_tensors, grad), None, None
 
 
 class _Blurred(Function):
@@ -143,13 +137,4 @@ class _Blurred(Function):
     @staticmethod
     def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
         found = lk_blur_kernel.adjoint(grad.flatten(0, 1), *ctx.rest).unflatten(0, grad.shape[:2])
-        return *_first_only([found], *ctx.saved_tensors, grad), None, None
-
-
-def _first_only(found, *sources):
-    """Gradients as they are, sealed where a graph of them is asked for."""
-    if not torch.is_grad_enabled():
-        return found
-    live = [grad for grad in found if grad is not None]
-    sealed = iter(NoSecondDerivative.apply(_FIRST_ONLY, len(live), *live, *sources))
-    return [None if grad is None else next(sealed) for grad in found]
+        return *first_only([found], *ctx.saved_tensors, grad), None, None

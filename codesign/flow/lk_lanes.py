@@ -1,6 +1,6 @@
 """What the kernels of the closed form share: the samples of an image, numbers for lanes of them, and recordings."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, wraps
 from typing import Any, NamedTuple
@@ -10,6 +10,10 @@ from torch import Tensor
 
 from codesign import backend
 
+_FIRST_ONLY = (
+    "the kernels of the closed form give first derivatives only; a second derivative through event flow was asked "
+    "for. Use differences of gradients instead."
+)
 RECORDINGS = 64  # of a kernel: one for each size and setting in use
 
 
@@ -83,6 +87,15 @@ def tensors(shape: tuple[int, ...], *values: Any) -> list[Tensor]:
     return [value.torch().reshape(shape) for value in values]
 
 
+def first_only(found: Sequence[Tensor | None], *sources: Tensor) -> Sequence[Tensor | None]:
+    """Gradients as they are, sealed where a graph of them is asked for."""
+    if not torch.is_grad_enabled():
+        return found
+    live = [grad for grad in found if grad is not None]
+    sealed = iter(backend.NoSecondDerivative.apply(_FIRST_ONLY, len(live), *live, *sources))
+    return [None if grad is None else next(sealed) for grad in found]
+
+
 class Lanes:
     """Lanes of drjit for the samples of images, and numbers that need no new kernel when they change."""
 
@@ -137,3 +150,14 @@ class Lanes:
             mode="symbolic",
         )
         return carried
+
+    def back(self, function: Callable[..., Any], given: list[Any], seeds: list[Any]) -> list[Any]:
+        """Gradients of what a function of lanes is given, from those of what it gives."""
+        dr = self.dr
+        with dr.resume_grad():
+            given = [dr.detach(value) + 0 for value in given]
+            dr.enable_grad(given)
+            found = function(*given)
+            products = [value * dr.detach(seed) for value, seed in zip(found, seeds, strict=True)]
+            dr.backward_from(sum(products[1:], products[0]))
+            return [dr.grad(value) for value in given]

@@ -8,33 +8,58 @@ other, are averaged.
 
 import torch
 from torch import Tensor
+from torch.autograd import Function
 from torch.nn.functional import avg_pool2d, interpolate, pad
+
+from codesign.flow import lk_plain, lk_tree_kernel
+from codesign.flow.lk_lanes import first_only
 
 # cells down and right: at each of the finer scales every alignment once
 SHIFTS = ((0, 0), (5, 2), (2, 7), (7, 5))
-REACH = 7
 
 
-def posterior(precision: Tensor, pull: Tensor, steps: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, covariance and evidence of fields on cells.
+def posterior(precision: Tensor, pull: Tensor, steps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, covariance and evidence of fields on cells, for steps of several sizes.
 
-    Args: precision: [B, 3, h, w] (xx, xy, yy) of what the data say of each cell by themselves, >= 0. pull: [B, 2, h, w]
-      precision times the value they say. steps: [B] variance of the step to each scale, cells first.
-    Returns: mean [B, 2, h, w], covariance [B, 3, h, w], and the logarithm [B] of the evidence for these variances,
-      relative to a field that is zero; covariance includes what the trees differ by.
+    Args: precision: [B, 3, h, w] (xx, xy, yy) of what the data say of each cell by themselves, >= 0, float64. pull:
+      [B, 2, h, w] precision times the value they say. steps: [scales, S] variances of the steps to each scale, cells
+      first.
+    Returns: mean [S, B, 2, h, w], covariance [S, B, 3, h, w], and the logarithm [S, B] of the evidence for these
+      variances, relative to a field that is zero; covariance includes what the trees differ by.
+    Gradient: precision, pull; exact, the first one.
     """
-    scales = len(steps)
-    side = 2 ** (scales - 1)
-    rows, columns = (-(-(size + REACH) // side) * side for size in precision.shape[2:])
-    height, width = precision.shape[2:]
-    both = torch.cat([precision, pull], 1)
-    trees = torch.stack(
-        [pad(both, (x, columns - width - x, y, rows - height - y)) for y, x in SHIFTS], 1
-    ).flatten(0, 1)
-    variances = [step.repeat_interleave(len(SHIFTS))[:, None, None] for step in steps]
-    evidence = precision.new_zeros(len(trees))
+    data = torch.cat([precision, pull], 1)
+    values, evidence = _plain(data, steps) if lk_plain.wanted() else _Posterior.apply(data, steps)
+    return values[:, :, :2], values[:, :, 2:], evidence
+
+
+class _Posterior(Function):
+    @staticmethod
+    def forward(ctx, data, steps):
+        trees = lk_tree_kernel.Trees(steps.shape[1], len(steps), SHIFTS)
+        values, evidence, kept = lk_tree_kernel.forward(data, steps, trees)
+        ctx.trees = trees
+        ctx.save_for_backward(data, steps, *kept)
+        return values, evidence
+
+    @staticmethod
+    def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
+        data, steps, *kept = ctx.saved_tensors
+        found = lk_tree_kernel.adjoint(data, steps, ctx.trees, kept, *grads)
+        return *first_only([found], data, *grads), None
+
+
+def _plain(data, steps):
+    """As operations of torch: [S, B, 5, h, w] and [S, B]."""
+    scales, sizes = steps.shape
+    batch, _, height, width = data.shape
+    rows, columns = lk_tree_kernel.Trees(sizes, scales, SHIFTS).shape(0, height, width)
+    shifted = [pad(data, (x, columns - width - x, y, rows - height - y)) for y, x in SHIFTS]
+    trees = torch.stack(shifted, 1).flatten(0, 1).repeat(sizes, 1, 1, 1)
+    evidence = data.new_zeros(len(trees))
     passed = []
-    for variance in variances:
+    for step in steps:
+        variance = step.repeat_interleave(batch * len(SHIFTS))[:, None, None]
         xx, xy, yy, px, py = trees.unbind(1)
         a = 1 + variance * xx
         b = variance * xy
@@ -66,14 +91,15 @@ def posterior(precision: Tensor, pull: Tensor, steps: list[Tensor]) -> tuple[Ten
             ],
             1,
         )
-    value = value.unflatten(0, (-1, len(SHIFTS)))
-    each = torch.stack([value[:, k, :, y : y + height, x : x + width] for k, (y, x) in enumerate(SHIFTS)], 1)
-    mean = each.mean(1)
-    apart = each[:, :, :2] - mean[:, None, :2]
-    differ = torch.stack(
-        [apart[:, :, 0].square(), apart[:, :, 0] * apart[:, :, 1], apart[:, :, 1].square()], 2
+    value = value.unflatten(0, (sizes, batch, len(SHIFTS)))
+    each = torch.stack(
+        [value[:, :, k, :, y : y + height, x : x + width] for k, (y, x) in enumerate(SHIFTS)], 2
     )
-    return mean[:, :2], mean[:, 2:] + differ.mean(1), evidence.unflatten(0, (-1, len(SHIFTS))).mean(1)
+    mean = each.mean(2)
+    x, y = (each[:, :, :, :2] - mean[:, :, None, :2]).unbind(3)
+    differ = torch.stack([x * x, x * y, y * y], 3).mean(2)
+    evidence = evidence.unflatten(0, (sizes, batch, len(SHIFTS))).mean(2)
+    return torch.cat([mean[:, :, :2], mean[:, :, 2:] + differ], 2), evidence
 
 
 def _times(matrix, x, y):

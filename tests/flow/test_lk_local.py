@@ -1,10 +1,14 @@
 """The closed form's local part: its tree against a dense solve, its fields where one polynomial does not do."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 import torch
 
+from codesign.errors import GradientError
 from codesign.flow import estimate_lk, lk_tree
+from codesign.flow.lk_plain import plain_operations
 from codesign.types import EventVolume
 from scenes.flow_windows import RenderedWindows, planes
 from tests.certain_case import certain
@@ -13,6 +17,7 @@ from tests.flow.test_lk import D, mean_error, moving
 ROWS = 3
 COLUMNS = 5
 VARIANCES = (0.3, 0.8, 2.0)
+SIZES = (1.0, 0.2)
 
 
 def prior_covariance(shift):
@@ -25,16 +30,22 @@ def prior_covariance(shift):
     return found
 
 
-def test_the_tree_finds_the_posterior_of_a_dense_solve(generator):
+def steps():
+    return torch.tensor(VARIANCES, dtype=D)[:, None] * torch.tensor(SIZES, dtype=D)
+
+
+@pytest.mark.parametrize("form", [nullcontext, plain_operations])
+def test_the_tree_finds_the_posterior_of_a_dense_solve(form, generator):
     half = torch.randn(2, ROWS, COLUMNS, 2, 2, generator=generator, dtype=D)
     precision = half @ half.mT
     precision[0, 1] = 0  # a row of which nothing is known
     pull = (precision @ torch.randn(2, ROWS, COLUMNS, 2, 1, generator=generator, dtype=D))[..., 0]
     xx, xy, yy = precision[..., 0, 0], precision[..., 0, 1], precision[..., 1, 1]
-    steps = [torch.full((2,), variance, dtype=D) for variance in VARIANCES]
-    mean, covariance, evidence = lk_tree.posterior(torch.stack([xx, xy, yy], 1), pull.movedim(-1, 1), steps)
+    with form():
+        found = lk_tree.posterior(torch.stack([xx, xy, yy], 1), pull.movedim(-1, 1), steps())
     cells = ROWS * COLUMNS
-    for k in range(2):
+    for number, k in np.ndindex(2, 2):
+        mean, covariance, evidence = (values[number] for values in found)
         data = np.zeros((2, cells, 2, cells))
         p = precision[k].reshape(cells, 2, 2).numpy()
         for cell in range(cells):
@@ -43,7 +54,7 @@ def test_the_tree_finds_the_posterior_of_a_dense_solve(generator):
         h = pull[k].reshape(cells, 2).numpy().T.ravel()
         means, covariances, evidences = [], [], []
         for shift in lk_tree.SHIFTS:
-            prior = np.kron(np.eye(2), prior_covariance(shift))
+            prior = SIZES[number] * np.kron(np.eye(2), prior_covariance(shift))
             posterior = np.linalg.inv(np.linalg.inv(prior) + data)
             means.append(posterior @ h)
             covariances.append(posterior)
@@ -60,6 +71,20 @@ def test_the_tree_finds_the_posterior_of_a_dense_solve(generator):
             covariance[k, 2].flatten(), whole[cells + index, cells + index], atol=1e-10
         )
         assert float(evidence[k]) == pytest.approx(np.mean(evidences), abs=1e-9)
+
+
+def test_the_trees_gradient_is_that_of_differences(generator):
+    half = torch.randn(2, 9, 6, 2, 2, generator=generator, dtype=D)
+    matrix = half @ half.mT
+    precision = torch.stack([matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]], 1).requires_grad_()
+    pull = torch.randn(2, 2, 9, 6, generator=generator, dtype=D).requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda precision, pull: lk_tree.posterior(precision, pull, steps()), (precision, pull)
+    )
+    mean, *_ = lk_tree.posterior(precision, pull, steps())
+    (grad,) = torch.autograd.grad(mean.square().sum(), pull, create_graph=True)
+    with pytest.raises(GradientError, match="first derivatives only"):
+        grad.sum().backward()
 
 
 def test_two_motions_side_by_side():

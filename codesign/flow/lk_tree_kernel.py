@@ -1,0 +1,258 @@
+"""The trees of lk_tree in drjit; forward and adjoint.
+
+A pass is one kernel for each scale, a lane for each cell. At the cells themselves the trees of one size of steps have
+the same data, so what goes up from there is found once for all of them. The adjoint of a cell is left to drjit; how
+cells hang together is written down here.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+from torch import Tensor
+
+from codesign.flow.lk_lanes import Form, Grid, Lanes, recorded, tensors
+
+DATA = 5  # of a cell: precision xx, xy, yy and pull x, y; or mean x, y and covariance xx, xy, yy
+UP = DATA + 1  # and the logarithm of the evidence
+
+
+class Trees(NamedTuple):
+    """How many sizes of steps are tried, how many scales there are, and the cells (down, right) that each tree is
+    shifted by."""
+
+    sizes: int
+    scales: int
+    shifts: tuple[tuple[int, int], ...]
+
+    def shape(self, scale: int, height: int, width: int) -> tuple[int, int]:
+        """Rows and columns of a scale above the cells."""
+        side = 2 ** (self.scales - 1)
+        reach = max(max(shift) for shift in self.shifts)
+        rows, columns = (-(-(size + reach) // side) * side for size in (height, width))
+        return rows >> scale, columns >> scale
+
+
+def forward(data: Tensor, variances: Tensor, trees: Trees) -> tuple[Tensor, Tensor, list[Tensor]]:
+    """Mean and covariance [S, B, 5, h, w], evidence [S, B], and what the adjoint needs.
+
+    Args: data: [B, 5, h, w] float64. variances: [scales, S] of the steps.
+    """
+    batch, _, height, width = data.shape
+    found = _forward(_form(data), trees, *_form(data).load(data, variances))
+    each = trees.sizes, batch, len(trees.shifts)
+    shapes = [trees.shape(scale, height, width) for scale in range(1, trees.scales)]
+    (values,) = tensors((trees.sizes, *data.shape), found[0])
+    (evidence,) = tensors((*each, *shapes[-1]), found[1])
+    kept = [
+        tensors((*each, DATA, *shape), array)[0]
+        for shape, array in zip([*shapes, *shapes], found[2:], strict=True)
+    ]
+    return values, evidence.sum((3, 4)).mean(2), kept
+
+
+def adjoint(
+    data: Tensor,
+    variances: Tensor,
+    trees: Trees,
+    kept: Sequence[Tensor],
+    by_values: Tensor,
+    by_evidence: Tensor,
+) -> Tensor:
+    """Gradient of data, from those of values and evidence."""
+    form = _form(data)
+    arrays = form.load(data, variances, by_values, by_evidence, *kept)
+    return tensors((trees.sizes, *data.shape), _adjoint(form, trees, *arrays))[0].sum(0)
+
+
+def _form(data):
+    return Form.of(data, Grid(*data.shape[2:]))
+
+
+@recorded
+def _forward(form, trees, data, variances):
+    scales = [_Cells(form, trees, variances, scale) for scale in range(trees.scales)]
+    dr = scales[0].dr
+    summed = []
+    up = scales[0].stored(scales[0].above(*scales[0].data(data)))
+    dr.eval(up)
+    for below, cells in pairwise(scales):
+        *given, evidence = cells.of_children(below, up, UP)
+        *up, more = cells.above(*given)
+        evidence = evidence + more
+        summed.append(cells.stored(given))
+        up = cells.stored([*up, evidence])
+        dr.eval(summed[-1], up, evidence)
+    values = []
+    for cells in reversed(scales[1:]):
+        parent = cells.of_parent(scales[cells.scale + 1], values[0]) if values else [0] * DATA
+        found = cells.below(*cells.loaded(summed[cells.scale - 1]), *parent)
+        values.insert(0, cells.stored(found))
+        dr.eval(values[0])
+    cells = scales[0]
+    parents = cells.of_parents(scales[1], values[0])
+    found = cells.stored(cells.mean_below(*cells.data(data), *parents))
+    dr.eval(found)
+    return found, evidence, *summed, *values
+
+
+@recorded
+def _adjoint(form, trees, data, variances, by_values, by_evidence, *kept):
+    scales = [_Cells(form, trees, variances, scale) for scale in range(trees.scales)]
+    summed = [data, *kept[: trees.scales - 1]]
+    values = [None, *kept[trees.scales - 1 :]]
+    cells = scales[0]
+    dr = cells.dr
+    none = [dr.zeros(cells.arr.Float)] * DATA
+    given = [*cells.data(data), *cells.of_parents(scales[1], values[1])]
+    found = cells.back(cells.mean_below, given, cells.loaded(by_values))
+    grads = [cells.stored(found[:DATA])]
+    down = cells.stored(found[DATA:])
+    dr.eval(grads[0], down)
+    for below, cells in pairwise(scales):
+        top = cells is scales[-1]
+        parent = none if top else cells.of_parent(scales[cells.scale + 1], values[cells.scale + 1])
+        given = [*cells.loaded(summed[cells.scale]), *parent]
+        found = cells.back(cells.below, given, cells.of_children(below, down, DATA, apart=True))
+        grads.append(cells.stored(found[:DATA]))
+        down = cells.stored(found[DATA:])
+        dr.eval(grads[-1], down)
+    for cells in reversed(scales):
+        seeds = none
+        if cells is not scales[-1]:
+            every = cells.of_parent if cells.scale else cells.of_parents
+            seeds = every(scales[cells.scale + 1], grads[cells.scale + 1])
+            seeds = [sum(seeds[part::DATA]) for part in range(DATA)]
+        given = cells.loaded(summed[cells.scale]) if cells.scale else cells.data(data)
+        found = cells.back(cells.above, given, [*seeds, cells.of_evidence(by_evidence)])
+        so_far = cells.loaded(grads[cells.scale])
+        grads[cells.scale] = cells.stored([a + b for a, b in zip(found, so_far, strict=True)])
+        dr.eval(grads[cells.scale])
+    return grads[0]
+
+
+class _Cells(Lanes):
+    """The cells of one scale: of all trees, or at scale 0, where their data are the same, of all sizes and images."""
+
+    def __init__(self, form, trees, variances, scale):
+        super().__init__(form)
+        self.scale = scale
+        self.trees = len(trees.shifts)
+        self.shifts = trees.shifts
+        self.sets = trees.sizes * form.images * (self.trees if scale else 1)
+        shape = trees.shape(scale, form.height, form.width) if scale else (form.height, form.width)
+        self.cells = shape[0] * shape[1]
+        self.total = self.sets * self.cells
+        self.plane = self.count(self.cells)
+        self.high, self.wide = (self.count(size) for size in shape)
+        self.set, self.place = self.split(self.lanes(self.total), self.cells)
+        self.y, self.x = self.split(self.place, shape[1])
+        self.whole, self.tree = self.split(self.set, self.trees) if scale else (self.set, None)
+        size, self.image = self.split(self.whole, form.images)
+        self.variance = self.take(variances, self.count(scale * trees.sizes) + size)
+
+    def stored(self, parts):
+        """[sets, parts, cells]."""
+        target = self.empty(len(parts) * self.total)
+        for number, part in enumerate(parts):
+            self.put(target, part, (self.set * len(parts) + number) * self.plane + self.place)
+        return target
+
+    def loaded(self, array):
+        """Of [sets, 5, cells]."""
+        return [self.take(array, (self.set * DATA + part) * self.plane + self.place) for part in range(DATA)]
+
+    def data(self, array):
+        """Of [B, 5, cells]."""
+        return [
+            self.take(array, (self.image * DATA + part) * self.plane + self.place) for part in range(DATA)
+        ]
+
+    def of_evidence(self, array):
+        """Of [sizes, B], a mean over trees."""
+        return self.take(array, self.whole) * (1 / self.trees if self.scale else 1)
+
+    def of_children(self, below, array, parts, apart=False):
+        """Sums over the four children of [sets, parts, cells]; ``apart``: at scale 0 [sets, trees, parts, cells]."""
+        dr = self.dr
+        found = [dr.zeros(self.arr.Float)] * parts
+        chosen = self.set if below.scale or apart else self.whole
+        for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            y = 2 * self.y + down
+            x = 2 * self.x + right
+            if not below.scale:
+                y -= self.shift(0)
+                x -= self.shift(1)
+            inside = (y < below.high) & (x < below.wide)  # below 0 whole numbers begin again from the largest
+            place = y * below.wide + x
+            for part in range(parts):
+                at = (chosen * parts + part) * below.plane + place
+                found[part] = found[part] + dr.gather(self.arr.Float, array, at, active=inside)
+        return found
+
+    def of_parents(self, above, array):
+        """At scale 0: ``of_parent`` of one tree after the other."""
+        return [part for tree in range(self.trees) for part in self.of_parent(above, array, tree)]
+
+    def of_parent(self, above, array, tree=0):
+        """Of [sets, 5, cells] of the scale above; ``tree``: of this one, at scale 0."""
+        chosen = self.set
+        y = self.y
+        x = self.x
+        if not self.scale:
+            chosen = chosen * self.trees + tree
+            y = y + self.shifts[tree][0]
+            x = x + self.shifts[tree][1]
+        place = (y >> 1) * above.wide + (x >> 1)
+        return [self.take(array, (chosen * DATA + part) * above.plane + place) for part in range(DATA)]
+
+    def shift(self, axis):
+        """Of each lane's tree."""
+        found = self.arr.UInt32(0)
+        for number, shift in enumerate(self.shifts):
+            found = self.dr.select(self.tree == number, shift[axis], found)
+        return found
+
+    def gain(self, xx, xy, yy):
+        """(1 + variance P)^-1 and its determinant."""
+        a = 1 + self.variance * xx
+        b = self.variance * xy
+        d = 1 + self.variance * yy
+        determinant = self.dr.rcp(a * d - b * b)
+        return (d * determinant, -b * determinant, a * determinant), determinant
+
+    def above(self, xx, xy, yy, px, py):
+        """What cells say of their parents, and the logarithm of their evidence."""
+        (a, b, d), determinant = self.gain(xx, xy, yy)
+        x, y = _times((a, b, d), px, py)
+        evidence = (self.variance * (px * x + py * y) + self.dr.log(determinant)) / 2
+        return a * xx + b * xy, a * xy + b * yy, b * xy + d * yy, x, y, evidence
+
+    def below(self, xx, xy, yy, px, py, x, y, uu, uv, vv):
+        """Mean and covariance of cells, from what is summed up there and the mean and covariance of their parents."""
+        (a, b, d), _ = self.gain(xx, xy, yy)
+        mean = _times((a, b, d), x + self.variance * px, y + self.variance * py)
+        first = _times((a, b, d), uu, uv)
+        second = _times((a, b, d), uv, vv)
+        return (
+            *mean,
+            a * first[0] + b * second[0] + self.variance * a,
+            b * first[0] + d * second[0] + self.variance * b,
+            b * first[1] + d * second[1] + self.variance * d,
+        )
+
+    def mean_below(self, *given):
+        """Mean and covariance over trees with the same data, and what they differ by."""
+        data = given[:DATA]
+        each = [self.below(*data, *given[k : k + DATA]) for k in range(DATA, len(given), DATA)]
+        x, y, xx, xy, yy = (sum(part) / self.trees for part in zip(*each, strict=True))
+        for here_x, here_y, *_ in each:
+            xx = xx + (here_x - x) ** 2 / self.trees
+            xy = xy + (here_x - x) * (here_y - y) / self.trees
+            yy = yy + (here_y - y) ** 2 / self.trees
+        return x, y, xx, xy, yy
+
+
+def _times(matrix, x, y):
+    """A symmetric matrix (xx, xy, yy) times (x, y)."""
+    return matrix[0] * x + matrix[1] * y, matrix[1] * x + matrix[2] * y
