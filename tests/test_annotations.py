@@ -19,6 +19,7 @@ WHOLE = (
     "lens",
     "optimise",
     "place",
+    "plain_yaml",
     "pose",
     "report",
     "state",

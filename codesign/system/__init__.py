@@ -2,7 +2,17 @@
 
 from codesign.system.batch import Batch
 from codesign.system.check import check
+from codesign.system.hand_over import HandOver, load_hand_over, save_hand_over
 from codesign.system.result import JUNCTIONS, Result
 from codesign.system.system import System
 
-__all__ = ["JUNCTIONS", "Batch", "Result", "System", "check"]
+__all__ = [
+    "JUNCTIONS",
+    "Batch",
+    "HandOver",
+    "Result",
+    "System",
+    "check",
+    "load_hand_over",
+    "save_hand_over",
+]

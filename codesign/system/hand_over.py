@@ -1,0 +1,209 @@
+"""The mount that was found, for those who build it: a transform between named frames in YAML, lens, sensor and camera
+beside it. It loads back to the same bits."""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from codesign import lens as lenses
+from codesign import plain_yaml, render
+from codesign.atomic import write_atomic
+from codesign.errors import CodesignError, DomainError, FileFormatError
+from codesign.events import SensorModel
+from codesign.place import Mount, yaw_pitch_roll_rad
+
+FORMAT = "codesign mount 1"
+AGREES = 1e-9  # metres, and entries of the rotation, between the transform and the mount's own numbers
+COMMENT = """Pose of a camera on a robot, p_parent = R p_child + t: metres, unit quaternion (x, y, z, w).
+Axes of the parent as in REP 103: x forward, y left, z up. The child is an optical frame (suffix _optical_frame): z along
+the view, x right, y down in the image; its origin is the centre of the lens's entrance pupil. urdf_origin has the same
+pose for a link with x along the view and z up, as <origin xyz= rpy=> of a fixed joint.
+The section mount rebuilds the learnable mount to the last bit; leave it out to hold the pose of the transform."""
+
+
+@dataclass(frozen=True)
+class HandOver:
+    """What is handed over.
+
+    mount, camera: as found; the camera has its lens. sensor: of the events, or None. parent_frame, child_frame: names of
+    the robot's link (REP 105: base_link, base_footprint) and of the camera's optical frame. notes: what was measured,
+    name -> number or text.
+    """
+
+    mount: Mount
+    camera: render.Camera
+    sensor: SensorModel | None = None
+    parent_frame: str = "base_link"
+    child_frame: str = "camera_optical_frame"
+    notes: Mapping[str, float | int | str] = field(default_factory=dict)
+
+
+def save_hand_over(path: str | Path, handed: HandOver) -> None:
+    """Write a mount to a .yaml file, and a traced lens to a .lens.json beside it.
+
+    Raises: DomainError for a frame without a name, a lens that no file keeps or a camera whose film has other parts;
+      FileFormatError where the place is not writable.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        raise FileFormatError(f"hand-over {path}: extension '{path.suffix}' is not written; use .yaml.")
+    for name in (handed.parent_frame, handed.child_frame):
+        if not name or not isinstance(name, str):
+            raise DomainError(f"hand-over: a frame is named {name!r}; give a name such as 'base_link'.")
+    pose = handed.mount().detach()
+    camera = handed.camera
+    page: dict[str, Any] = {"format": FORMAT, "transform": _transform(pose, handed)}
+    yaw, pitch, roll = yaw_pitch_roll_rad(pose).tolist()
+    page["urdf_origin"] = {"xyz_m": pose[:3, 3].tolist(), "rpy_rad": [roll, pitch, yaw]}
+    page["lens"] = _lens_page(camera.lens, path)
+    page["camera"] = {
+        **{name: value for name, value in asdict(camera.film).items() if value is not None},
+        **{name: getattr(camera, name) for name in ("samples_per_pixel", "seed", "falloff", "aim")},
+    }
+    if camera.spectrum is not None:
+        page["camera"]["wavelengths_um"] = [float(value) for value in camera.spectrum.wavelengths_um]
+        page["camera"]["weights"] = [float(value) for value in camera.spectrum.weights]
+    if handed.sensor is not None:
+        page["sensor"] = asdict(handed.sensor)
+    if handed.notes:
+        page["notes"] = dict(handed.notes)
+    page["mount"] = {name: value.detach().tolist() for name, value in handed.mount.state_dict().items()}
+    write_atomic(path, plain_yaml.dump(page, COMMENT).encode())
+
+
+def load_hand_over(path: str | Path) -> HandOver:
+    """Read what ``save_hand_over`` wrote: the same mount, lens, camera and sensor, to the last bit.
+
+    A file without the section mount holds the pose of its transform. The file is data: nothing in it is run, and it
+    names no file outside its own folder.
+    Raises: FileFormatError, in a sentence that names what is missing, unknown or at odds.
+    """
+    path = Path(path)
+    try:
+        page = plain_yaml.load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise FileFormatError(f"hand-over {path}: it cannot be read ({error}); give a .yaml file.") from error
+    except FileFormatError as error:
+        raise FileFormatError(f"hand-over {path}: {error}") from error
+    if page.get("format") != FORMAT:
+        raise FileFormatError(
+            f"hand-over {path}: it has no line 'format: \"{FORMAT}\"'; write it with save_hand_over."
+        )
+    try:
+        transform = page["transform"]
+        return HandOver(
+            _mount(page, _pose(transform)),
+            _camera(page["camera"], _lens(page["lens"], path)),
+            SensorModel(**page["sensor"]) if "sensor" in page else None,
+            transform["parent_frame"],
+            transform["child_frame"],
+            page.get("notes", {}),
+        )
+    except CodesignError as error:
+        raise FileFormatError(f"hand-over {path}: {error}") from error
+    except KeyError as error:
+        raise FileFormatError(f"hand-over {path}: the entry {error} is missing; write it anew.") from error
+    except (TypeError, ValueError, RuntimeError) as error:  # entries of other kinds than the classes take
+        said = " ".join(str(error).split())[:120]
+        raise FileFormatError(f"hand-over {path}: an entry is not as it should be ({said}).") from error
+
+
+def _transform(pose, handed):
+    quaternion = Rotation.from_matrix(pose[:3, :3].numpy()).as_quat(canonical=True)  # x, y, z, w >= 0
+    return {
+        "parent_frame": handed.parent_frame,
+        "child_frame": handed.child_frame,
+        "translation_m": dict(zip("xyz", pose[:3, 3].tolist(), strict=True)),
+        "rotation_quaternion": dict(zip("xyzw", quaternion.tolist(), strict=True)),
+    }
+
+
+def _pose(page):
+    pose = torch.eye(4, dtype=torch.float64)
+    quaternion = torch.tensor([page["rotation_quaternion"][axis] for axis in "xyzw"], dtype=torch.float64)
+    if not abs(float(quaternion.norm()) - 1) < 1e-6:
+        raise DomainError(f"the quaternion has length {float(quaternion.norm()):.6g}; give one of length 1.")
+    pose[:3, :3] = torch.from_numpy(Rotation.from_quat(quaternion.numpy()).as_matrix())
+    pose[:3, 3] = torch.tensor([page["translation_m"][axis] for axis in "xyz"], dtype=torch.float64)
+    return pose
+
+
+def _mount(page, pose: Tensor) -> Mount:
+    if "mount" not in page:
+        held = Mount(pose[:3, 3], (0.0, 0.0, 0.0))
+        held.start_attitude.copy_(pose[:3, :3])
+        return held
+    state = {name: torch.tensor(value, dtype=torch.float64) for name, value in page["mount"].items()}
+    mount = Mount((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    mount.load_state_dict(state)
+    off = float((mount().detach() - pose).abs().max())
+    if not off < AGREES:
+        raise DomainError(
+            f"the transform and the numbers of the section mount are {off:.3g} apart; take out that section to hold the "
+            "transform, or write the file anew."
+        )
+    return mount
+
+
+def _lens_page(lens, path):
+    lens = lens.replace() if hasattr(lens, "replace") else lens  # its values now, of variables too
+    dtype = str(getattr(lens, "dtype", torch.float64)).removeprefix("torch.")
+    if isinstance(lens, lenses.ThinLens):
+        efl_mm, image_mm = (float(value.detach()) for value in (lens.efl_mm, lens.image_distance_mm))
+        page = {"kind": "thin", "dtype": dtype, "efl_mm": efl_mm}
+        page["entrance_pupil_diameter_mm"] = lens.entrance_pupil_diameter_mm
+        return page if image_mm == efl_mm else {**page, "image_distance_mm": image_mm}
+    if isinstance(lens, lenses.GeoLens):
+        file = path.with_suffix(".lens.json")
+        lenses.save(lens, file)
+        return {"kind": "traced", "dtype": dtype, "file": file.name, "sha256": _digest(file)}
+    raise DomainError(
+        f"hand-over: a {type(lens).__name__} is kept by no file; give a GeoLens, ThinLens or Pinhole."
+    )
+
+
+def _lens(page, path):
+    dtype = {"float32": torch.float32, "float64": torch.float64}[page["dtype"]]
+    if page["kind"] == "thin":
+        efl = torch.tensor(page["efl_mm"], dtype=dtype)
+        diameter = page["entrance_pupil_diameter_mm"]
+        image = page.get("image_distance_mm")
+        if diameter == 0 and image is None:
+            return lenses.Pinhole(efl)
+        return lenses.ThinLens(efl, diameter, None if image is None else torch.tensor(image, dtype=dtype))
+    if page["kind"] != "traced":
+        raise DomainError(f"a lens of the kind {page['kind']!r} is not known; there are 'thin' and 'traced'.")
+    file = path.parent / page["file"]
+    if Path(page["file"]).name != page["file"]:
+        raise DomainError(
+            f"the lens {page['file']!r} is not beside it; give the name of a file in the same folder."
+        )
+    if not file.is_file() or _digest(file) != page["sha256"]:
+        said = "is missing" if not file.is_file() else "is not the one that was handed over"
+        raise DomainError(f"the lens '{file.name}' {said}; put the file back, or write both anew.")
+    return lenses.load(file, dtype)
+
+
+def _digest(file):
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def _camera(page, lens):
+    names = render.Film.__dataclass_fields__
+    film = {name: value for name, value in page.items() if name in names}
+    if film.get("windows_px") is not None:
+        film["windows_px"] = tuple(tuple(window) for window in film["windows_px"])
+    rest = {name: value for name, value in page.items() if name not in names}
+    spectrum = None
+    if "wavelengths_um" in rest:
+        spectrum = lenses.Spectrum(tuple(rest.pop("wavelengths_um")), tuple(rest.pop("weights")))
+    made = render.Film(**film)
+    return render.Camera(
+        lens, made.width_px, made.height_px, made.pixel_pitch_mm, film=made, spectrum=spectrum, **rest
+    )
