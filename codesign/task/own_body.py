@@ -1,0 +1,72 @@
+"""How much of the picture the robot's own body covers, as a requirement of a mount."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codesign import backend
+from codesign.errors import DomainError, as_number
+from codesign.place import Body
+from codesign.render import Camera, MitsubaScene, frames
+from codesign.render.charts import emissive_mesh
+from codesign.render.truth import cameras_of, hits_of
+
+
+@dataclass(frozen=True)
+class OwnBody:
+    """The body covers at most ``largest_share`` of the picture, one of the requirements of a mount (see codesign.place).
+
+    The slack's gradient is that of a rendered picture in which the body glows and nothing else does, with the motion of
+    its silhouettes: it is 0 where nothing of the body is in view. The exact answer counts chief rays.
+
+    >>> from codesign import lens, place, render, task
+    >>> sheet = place.Body([([(2, -9, 0), (2, 9, 0), (2, 9, 9), (2, -9, 9)], [(0, 1, 2), (0, 2, 3)])])
+    >>> camera = render.Camera(lens.Pinhole(8.0), 16, 16, 0.1, 4)
+    >>> level = place.Mount((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))().detach()  # the sheet fills the upper half
+    >>> round(float(task.OwnBody(sheet, 0.7).slack(level, camera)), 3)
+    0.2
+
+    Args: body: in the axes of the mount. largest_share: 0 to 1. step: share below it from which on nothing pushes. per_px: points of
+      silhouettes per pixel length, for the gradient (before a rover, in 16 x 12 pixels, it is good to 2 %).
+    Raises: DomainError for shares out of range.
+    """
+
+    body: Body
+    largest_share: float
+    step: float = 0.02
+    per_px: float = 10.0
+    name: str = "own body in view"
+    unit: str = "of the picture"
+
+    def __post_init__(self):
+        if not 0 <= as_number(self.largest_share, "largest_share") <= 1:
+            raise DomainError(
+                f"own body: largest_share is {self.largest_share}; a share from 0 to 1 is needed."
+            )
+        if not 0 < as_number(self.step, "step") < float("inf"):
+            raise DomainError(f"own body: step is {self.step}; a share > 0 is needed.")
+
+    @cached_property
+    def scene(self) -> MitsubaScene:
+        """The body with radiance 1 on both sides of every face, before nothing."""
+        corners = self.body.triangles.reshape(-1, 3).numpy()
+        faces = np.arange(len(corners)).reshape(-1, 3)
+        mesh = emissive_mesh(backend.mitsuba("cpu"), corners, faces, np.ones(len(faces)))
+        return MitsubaScene({"body": mesh}).two_sided()
+
+    def slack(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
+        """[..., 1] share of the picture that may still be covered. Gradient: mount and lens."""
+        found = frames(camera, self.scene, T_body_cam.reshape(-1, 4, 4), "boundary", self.per_px).double()
+        covered = found.flatten(1).mean(1).reshape(*T_body_cam.shape[:-2], 1)
+        return self.largest_share - covered
+
+    @torch.no_grad()
+    def exact(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
+        """[..., 1]: the same, of the pixels whose chief ray meets the body."""
+        rays = camera.chief_rays(camera.film.pixels())
+        hits = hits_of(rays, self.scene, cameras_of(self.scene, T_body_cam.reshape(-1, 4, 4)))
+        covered = (hits.part >= 0).double().mean(-1).reshape(*T_body_cam.shape[:-2], 1)
+        return self.largest_share - covered
