@@ -6,6 +6,7 @@ from torch import Tensor
 from codesign.flow.lk_cells import Cells
 from codesign.flow.lk_field import Polynomials
 from codesign.flow.lk_level import Level
+from codesign.flow.lk_start import at_start
 
 FIRST = 1.0  # by what the first of two answers leads in the logarithm of their odds
 
@@ -81,13 +82,5 @@ class Descent:
         """Flow [B, 2, H, W], its covariance [B, 3, H, W] and confidence [B, H, W] on the pixels of the start, which
         lies at ``start`` [B] on the way."""
         unit = self.shape.unit
-        flow, places, misfit, doubt = self.shape.at_start(self.parameters(), start, self.cells.at, self.local)
         spread = unit @ torch.linalg.inv(self.precision) @ unit.T
-        covariance = doubt + self.shape.covariance(spread.to(flow), places)
-        if not self.local:
-            x, y = misfit.unbind(1)
-            covariance = covariance + torch.stack([x * x, x * y, y * y], 1)
-        widest = self.shape.covariance((unit @ unit.T).to(flow)[None], places)
-        widest = widest[:, 0] + widest[:, 2] + 2 * self.cells.widest
-        confidence = 1 - (covariance[:, 0] + covariance[:, 2]) / widest
-        return flow, covariance, confidence.clamp(0, 1)
+        return at_start(self.shape, self.parameters(), spread, self.cells, self.local, start)

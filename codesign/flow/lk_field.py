@@ -160,6 +160,21 @@ class Polynomials:
         right = design.mT @ flow.flatten(1)[:, :, None]
         return torch.linalg.solve(normal + ridge * torch.eye(2 * self.terms).to(normal), right)[..., 0]
 
+    @cached_property
+    def of_squares(self) -> tuple[tuple[int, int], ...]:
+        """Powers of x and y in products of two terms of the basis."""
+        most = 2 * self.degree
+        return tuple((x, degree - x) for degree in range(most + 1) for x in range(degree, -1, -1))
+
+    def squares(self, covariance: Tensor) -> Tensor:
+        """``covariance`` as coefficients [3, B, M] of polynomials in the powers of ``of_squares``."""
+        k = self.terms
+        sums = (self.powers[:, None] + self.powers).flatten(0, 1)
+        powers = torch.tensor(self.of_squares, device=sums.device)
+        place = (sums[:, None] == powers).all(2).to(covariance)  # [K^2, M]
+        blocks = torch.stack([covariance[:, :k, :k], covariance[:, :k, k:], covariance[:, k:, k:]])
+        return blocks.flatten(2) @ place
+
     def covariance(self, covariance: Tensor, places: Tensor) -> Tensor:
         """Covariance [B, 3, H, W] (xx, xy, yy) of the flow from that of the parameters [B, 2K, 2K]."""
         k = self.terms

@@ -151,8 +151,11 @@ class Lanes:
         )
         return carried
 
-    def back(self, function: Callable[..., Any], given: list[Any], seeds: list[Any]) -> list[Any]:
-        """Gradients of what a function of lanes is given, from those of what it gives."""
+    def back(
+        self, function: Callable[..., Any], given: list[Any], seeds: list[Any], leaves: Sequence[Any] = ()
+    ) -> list[Any]:
+        """Gradients of what a function of lanes is given, from those of what it gives; then those of ``leaves``, which
+        it may add its own to."""
         dr = self.dr
         with dr.resume_grad():
             given = [dr.detach(value) + 0 for value in given]
@@ -160,4 +163,4 @@ class Lanes:
             found = function(*given)
             products = [value * dr.detach(seed) for value, seed in zip(found, seeds, strict=True)]
             dr.backward_from(sum(products[1:], products[0]))
-            return [dr.grad(value) for value in given]
+            return [dr.grad(value) for value in (*given, *leaves)]

@@ -58,12 +58,14 @@ def along_path(volume: EventVolume, clock: str) -> tuple[Path, Tensor, Tensor]:
     weight = (volume.collected_s / span).to(counts)
     time = (volume.centroid_s / span).to(counts) - 0.5
     on, off = counts.unbind(1)
-    both = on + off
-    density = both.sum(1)
+    density = counts.sum((1, 2))
     kept = cool(density)
-    events = (both.flatten(2) @ kept.flatten(1)[:, :, None])[..., 0]  # of each bin
     signed = kept[:, None] * (on - off)
-    found = path(signed, events, weight, time) if clock == "events" else even(signed, weight, time)
+    if clock == "time":
+        found = even(signed, weight, time)
+    else:
+        events = (counts.sum(1).flatten(2) @ kept.flatten(1)[:, :, None])[..., 0]  # of each bin
+        found = path(signed, events, weight, time)
     return found, torch.stack([weight, time]), kept * density
 
 

@@ -57,8 +57,11 @@ def path(signed: Tensor, events: Tensor, weight: Tensor, time: Tensor) -> Path:
 
 def even(signed: Tensor, weight: Tensor, time: Tensor) -> Path:
     """The way of motion of even speed: time itself. Args: as of ``path``."""
-    ones = torch.ones_like(weight, dtype=torch.float64).expand(len(signed), -1)
-    return _along(signed, ones, ones, weight.double(), time.double())
+    weight = weight.double()
+    mean = weight @ time.double()
+    spread = weight @ (time.double() - mean).square()
+    ones = torch.ones(len(signed), dtype=torch.float64, device=signed.device)
+    return Path(signed, ones, -(0.5 + mean) * ones, spread * ones)
 
 
 def _along(signed, speed, direction, weight, time):

@@ -6,8 +6,11 @@ from torch import nn
 
 from codesign.flow import estimate_lk, lk_kernel
 from codesign.flow.export import evenly_timed, trace
+from codesign.flow.lk_cells import Cells
+from codesign.flow.lk_field import Polynomials
 from codesign.flow.lk_lanes import Grid
 from codesign.flow.lk_plain import plain_operations
+from codesign.flow.lk_start import at_start
 
 D = torch.float64
 
@@ -34,6 +37,55 @@ def test_plain_operations_are_the_kernels(generator, height, width, stride, cell
         plain = run()
     for ours, kernel in zip(plain, run(), strict=True):
         torch.testing.assert_close(ours, kernel, rtol=1e-11, atol=1e-11)
+
+
+def places(model, joined, height, width, generator):
+    """Inputs of ``at_start``, and it as a function of them; flows lead beyond the border, cells differ by pixels."""
+    shape = Polynomials(model, height, width, 3.0)
+    cells = Cells(2, height, width, 3.0, torch.device("cpu"))
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator, dtype=D)
+
+    half = 0.3 * draw(2, 2 * shape.terms, 2 * shape.terms)
+    given = [
+        1.5 * draw(2, 2 * shape.terms),
+        half @ half.mT,
+        draw(*cells.value.shape),
+        draw(*cells.covariance.shape),
+        torch.tensor([-0.5, -0.4], dtype=D),
+    ]
+
+    def run(parameters, spread, value, covariance, start):
+        cells.value = value
+        cells.covariance = covariance
+        return at_start(shape, parameters, spread, cells, joined, start)
+
+    return run, [values.requires_grad_() for values in given]
+
+
+@pytest.mark.parametrize("joined", [False, True])
+@pytest.mark.parametrize(
+    ("model", "height", "width"), [("constant", 7, 12), ("affine", 20, 9), ("quadratic", 70, 17)]
+)
+def test_the_step_to_the_start_is_that_of_plain_operations(model, height, width, joined, generator):
+    run, given = places(model, joined, height, width, generator)
+    found = run(*given)
+    weights = [torch.randn(values.shape, generator=generator, dtype=D) for values in found]
+    with plain_operations():
+        plain = run(*given)
+    grads = []
+    for outcome in (found, plain):
+        total = sum((values * weight).sum() for values, weight in zip(outcome, weights, strict=True))
+        grads.append(torch.autograd.grad(total, given))
+    for ours, theirs in zip([*found, *grads[0]], [*plain, *grads[1]], strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("joined", [False, True])
+def test_the_gradient_of_the_step_to_the_start_is_that_of_differences(joined, generator):
+    run, given = places("affine", joined, 3, 10, generator)
+    assert torch.autograd.gradcheck(run, given)
 
 
 class Closed(nn.Module):
