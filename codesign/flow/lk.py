@@ -40,8 +40,7 @@ def estimate_lk(
     """Flow over the volume's interval, with its uncertainty.
 
     Args:
-      volume: EventVolume, counts [B, 2, bins >= 2, H >= 2, W >= 2]. Hot pixels are weighed down
-        (lk_level.cool).
+      volume: EventVolume, counts [B, 2, bins >= 2, H >= 2, W >= 2]. Hot pixels are weighed down (lk_cool).
       model: "constant", "affine" or "quadratic" field over the image, or "local": a quadratic one and values on
         cells of 8 px, as smooth as the data ask, for layers and depth.
       prior_px: standard deviation expected of each component of the flow at the image centre, px per

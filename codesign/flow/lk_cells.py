@@ -86,9 +86,12 @@ class Cells:
             for cells, samples in zip(self.value.shape[2:], products.shape[2:], strict=True)
         )
         beyond = (0, columns, 0, rows)
-        sums = step**2 * avg_pool2d(pad(products, beyond), step).double()
+        if rows or columns:
+            products = pad(products, beyond)
+            change = pad(change, beyond, mode="replicate")
+        sums = step**2 * avg_pool2d(products, step).double()
         xx, xy, yy, xs, ys, ss, seen, events = sums.unbind(1)
-        u, v = avg_pool2d(pad(change, beyond, mode="replicate"), step).double().unbind(1)
+        u, v = avg_pool2d(change, step).double().unbind(1)
         by_x = xx * u + xy * v
         by_y = xy * u + yy * v
         ss = ss + 2 * (xs * u + ys * v) + by_x * u + by_y * v

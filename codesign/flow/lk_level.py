@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
+from codesign.flow.lk_cool import cooled
 from codesign.flow.lk_field import Polynomials
 from codesign.flow.lk_kernel import blurred, cell_sums, moving
 from codesign.flow.lk_lanes import Grid
@@ -35,9 +36,6 @@ OVERLAP = 4 * math.pi  # blurred white noise is alike over 4 pi sigma^2 pixels
 CALIBRATION = 1.7
 # of the mean diagonal: above the rounding of sums in float32
 RIDGE = 1e-5
-# the factor 4 and m of ``cool``: they take 0.05 % off the events of moving textures at most
-LONELY = 4.0
-HOT_EVENTS = 5.0
 TINY = 2.0**-100  # keeps empty samples solvable, far below a millionth of an event
 
 
@@ -57,37 +55,13 @@ def along_path(volume: EventVolume, clock: str) -> tuple[Path, Tensor, Tensor]:
     span = volume.collected_s.sum()
     weight = (volume.collected_s / span).to(counts)
     time = (volume.centroid_s / span).to(counts) - 0.5
-    on, off = counts.unbind(1)
-    density = counts.sum((1, 2))
-    kept = cool(density)
-    signed = kept[:, None] * (on - off)
+    signed, density, kept = cooled(counts)
     if clock == "time":
         found = even(signed, weight, time)
     else:
         events = (counts.sum(1).flatten(2) @ kept.flatten(1)[:, :, None])[..., 0]  # of each bin
         found = path(signed, events, weight, time)
-    return found, torch.stack([weight, time]), kept * density
-
-
-def cool(events: Tensor) -> Tensor:
-    """Weight of each pixel, 1 / (1 + x^2), where its events exceed what its surroundings explain.
-
-    x = max(0, n - 4 q - m) / (q + m): n events of the pixel, q the mean of the 24 pixels around it, m = 5
-    events. Moving texture puts events on several pixels; a hot pixel has them alone.
-    Args: events [B, H, W]. Returns: [B, H, W].
-    """
-    total = _boxes(events)
-    number = _boxes(torch.ones_like(events[:1, :, :1])) * _boxes(torch.ones_like(events[:1, :1]))
-    around = (total - events).clamp_min(0) / (number - 1)
-    excess = (events - LONELY * around - HOT_EVENTS).clamp_min(0) / (around + HOT_EVENTS)
-    return 1 / (1 + excess.square())
-
-
-def _boxes(images):
-    """Sums over the 5 x 5 pixels around each of [B, H, W], or as many of them as there are."""
-    side = 5
-    across = avg_pool2d(images, (1, side), 1, (0, side // 2), divisor_override=1)
-    return avg_pool2d(across, (side, 1), 1, (side // 2, 0), divisor_override=1)
+    return found, torch.stack([weight, time]), density
 
 
 class Level:
@@ -178,11 +152,11 @@ def _trusted(normal, scattered, right):
       trust: L t(S) (1 - S) L^T (symmetric, no eigenvalue below 0), L t(S) L^-1 r, and what a step
       x = (N + Z)^-1 r takes off the energy, 2 r x - x N x.
     """
-    unit = torch.eye(normal.shape[-1]).to(normal)
+    unit = torch.eye(normal.shape[-1], dtype=normal.dtype, device=normal.device)
     ridge = (RIDGE * (normal + scattered).diagonal(dim1=1, dim2=2).mean(1) + TINY)[:, None, None] * unit
     root = torch.linalg.cholesky(normal + scattered + ridge)
-    half = torch.linalg.solve_triangular(root, scattered + ridge, upper=False)
-    noise = torch.linalg.solve_triangular(root, half.mT, upper=False)
+    inverse = torch.linalg.solve_triangular(root, unit, upper=False)
+    noise = inverse @ (scattered + ridge) @ inverse.mT
     doubt = DOUBT * noise
     texture = unit - noise
     trust = texture
@@ -190,7 +164,7 @@ def _trusted(normal, scattered, right):
         trust = trust @ trust
         doubt = doubt @ doubt
     trust = torch.linalg.solve(trust + doubt, trust)
-    seen = torch.linalg.solve_triangular(root, right[:, :, None], upper=False)
+    seen = inverse @ right[:, :, None]
     explained = (seen * (seen + noise @ seen)).sum((1, 2))
     kept = root @ (trust @ texture) @ root.mT
     return (kept + kept.mT) / 2, (root @ (trust @ seen))[..., 0], explained

@@ -1,10 +1,12 @@
 """The closed form on volumes that say little or nothing, on sensors with faulty pixels, on images of any size."""
 
+import numpy as np
 import pytest
 import torch
 
 from codesign.flow import estimate_lk
 from codesign.flow.export import evenly_timed
+from codesign.flow.lk_cool import cooled
 from codesign.types import EventVolume
 from scenes.flow_windows import RenderedWindows, planes
 from tests.certain_case import certain
@@ -94,3 +96,23 @@ def test_images_of_two_pixels_and_more(height, width):
     # even light that flickers moves nothing, however small the image
     even = torch.ones(1, 2, 4, height, width) * torch.tensor([1.0, 0.2, 2.0, 0.5])[:, None, None]
     assert float(estimate_lk(evenly_timed(even)).flow_px.abs().max()) <= 1e-4
+
+
+def test_pixels_count_by_what_their_surroundings_explain(generator):
+    counts = torch.poisson(torch.full((2, 2, 3, 6, 7), 0.8, dtype=D), generator=generator)
+    counts[0, 0, :, 0, 6] = 30.0
+    counts[1, 1, :, 3, 3] = 9.0
+    counts += 0.1 * torch.rand(counts.shape, generator=generator, dtype=D)  # off the kinks
+    signed, events, kept = cooled(counts)
+    n = counts.sum((1, 2))
+    hot = 0
+    for image, y, x in np.ndindex(2, 6, 7):
+        near = n[image, max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
+        q = float(near.sum() - n[image, y, x]) / (near.numel() - 1)
+        excess = max(0.0, float(n[image, y, x]) - 4 * q - 5) / (q + 5)
+        hot += excess > 0
+        assert float(kept[image, y, x]) == pytest.approx(1 / (1 + excess**2), rel=1e-12)
+    assert hot == 2
+    torch.testing.assert_close(events, kept * n, rtol=1e-14, atol=0)
+    torch.testing.assert_close(signed, kept[:, None] * (counts[:, 0] - counts[:, 1]), rtol=1e-14, atol=0)
+    assert torch.autograd.gradcheck(cooled, counts.requires_grad_())
