@@ -2,6 +2,7 @@
 the body's motion."""
 
 from codesign.place.body import Body, Housing
+from codesign.place.criterion import Sight, expected_error, flow_precision, sight
 from codesign.place.mount import Mount, yaw_pitch_roll_rad
 from codesign.place.observability import FREE, PLANAR, body_flow, information, planar_flow, velocity_from_flow
 from codesign.place.requirements import CableSide, Clearance, LookAhead, Requirement, Verdict, judge, penalty
@@ -17,13 +18,17 @@ __all__ = [
     "LookAhead",
     "Mount",
     "Requirement",
+    "Sight",
     "Verdict",
     "body_flow",
     "check_mount",
+    "expected_error",
+    "flow_precision",
     "information",
     "judge",
     "penalty",
     "planar_flow",
+    "sight",
     "starts",
     "velocity_from_flow",
     "yaw_pitch_roll_rad",

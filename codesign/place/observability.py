@@ -99,7 +99,8 @@ def velocity_from_flow(
     Args:
       flow_px_s: [B, 2, H, W] image flow, px per second. camera, depth_m [P] or [B, P], T_body_cam [4, 4] or
         [B, 4, 4]: as for ``body_flow``.
-      weight: [P] or [B, P] >= 0, inverse variance of the flow per pixel, s^2/px^2; equal weights when None.
+      weight: [P] or [B, P] >= 0, inverse variance of the flow per pixel, s^2/px^2, or [..., P, 2, 2], the inverse of
+        its covariance (``flow_precision``); equal weights when None.
       prior: [K] standard deviations expected of the K velocities around zero; what the image does not show
         then stays near zero. None: no prior.
       axes: which K of the six velocities the body has (``body_flow``); ``PLANAR``, or ``FREE``.
@@ -128,7 +129,7 @@ def velocity_from_flow(
             "camera."
         )
     normal = _normal_matrix(rows, weight, prior)
-    right = torch.einsum("...pck,...p,...pc->...k", rows, weight, measured)
+    right = torch.einsum("...pkc,...pc->...k", _weighed(rows, weight), measured)
     return torch.linalg.solve(normal.expand(*right.shape, right.shape[-1]), right)
 
 
@@ -140,7 +141,7 @@ def information(
     prior: Sequence[float] | Tensor | None = None,
     axes: Sequence[int] = PLANAR,
 ) -> Tensor:
-    """Information matrix of the body's velocity in a flow field: sum over pixels of weight J^T J.
+    """Information matrix of the body's velocity in a flow field: sum over pixels of J^T weight J.
 
     Args: as for velocity_from_flow, with or without a batch axis. With weight = 1 / variance of the flow
       (s^2/px^2) its inverse is the covariance of the velocity.
@@ -209,6 +210,15 @@ def _weighted_rows(camera, depth_m, T_body_cam, weight, axes):
     if weight is None:
         return rows, seen.to(rows)
     check_finite(weight, "flow weight")
+    if _is_matrix(rows, weight):
+        xx, xy, yx, yy = weight.detach().flatten(-2).unbind(-1)
+        good = (xx >= 0) & (yy >= 0) & (xy == yx) & (xx * yy - xy * yx >= -1e-9 * xx * yy)
+        if not bool(good.all()):
+            raise DomainError(
+                "a flow weight [2, 2] is not symmetric and positive; give inverses of covariances, as of "
+                "place.flow_precision."
+            )
+        return rows, torch.where(seen[..., None, None], weight.double(), 0.0)
     if bool((weight.detach() < 0).any()):
         raise DomainError(
             f"a flow weight is negative (smallest {float(weight.detach().min()):.3g}); weights are inverse "
@@ -217,8 +227,18 @@ def _weighted_rows(camera, depth_m, T_body_cam, weight, axes):
     return rows, torch.where(seen, weight.double(), 0.0)
 
 
+def _is_matrix(rows, weight):
+    """Whether weights are [..., P, 2, 2] for rows [..., P, 2, K]."""
+    return weight.ndim >= 3 and weight.shape[-3:] == (rows.shape[-3], 2, 2)
+
+
+def _weighed(rows, weight):
+    """Weight times rows, [..., P, K, 2]."""
+    return rows.mT @ weight if _is_matrix(rows, weight) else rows.mT * weight[..., None, None]
+
+
 def _normal_matrix(rows, weight, prior):
-    normal = torch.einsum("...pck,...p,...pcl->...kl", rows, weight, rows)
+    normal = torch.einsum("...pkc,...pcl->...kl", _weighed(rows, weight), rows)
     if prior is not None:
         deviation = torch.as_tensor(prior, dtype=rows.dtype, device=rows.device)
         if deviation.shape != rows.shape[-1:] or not bool(((deviation > 0) & deviation.isfinite()).all()):
@@ -228,7 +248,8 @@ def _normal_matrix(rows, weight, prior):
             )
         return normal + torch.diag(deviation**-2)
     fixed = normal.detach()
-    if not bool((weight.detach() > 0).any(-1).all()):
+    strength = weight.diagonal(dim1=-2, dim2=-1).sum(-1) if _is_matrix(rows, weight) else weight
+    if not bool((strength.detach() > 0).any(-1).all()):
         raise DomainError(
             "no pixel sees the ground with positive weight, so the flow says nothing about the velocity; "
             "turn the camera towards the ground, or give a prior."

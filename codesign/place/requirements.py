@@ -8,7 +8,7 @@ decides. ``penalty`` makes one smooth number of the slacks, to add to an objecti
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -32,11 +32,11 @@ class Requirement(Protocol):
     @property
     def step(self) -> float: ...
 
-    def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
+    def slack(self, T_body_cam: Tensor, camera: Any) -> Tensor:
         """[..., K] of mounts [..., 4, 4], with gradient."""
         ...
 
-    def exact(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
+    def exact(self, T_body_cam: Tensor, camera: Any) -> Tensor:
         """[..., K]: the requirement is kept where none is negative."""
         ...
 

@@ -5,13 +5,20 @@ from codesign.task.depth import ground_depth, scene_depth
 from codesign.task.ego_velocity import EgoVelocity, Motion
 from codesign.task.own_body import OwnBody
 from codesign.task.score import VelocityErrors, velocity_errors
+from codesign.task.sight import ATTITUDES, VELOCITIES, Surroundings, sight_map, sight_table, sight_units
 
 __all__ = [
+    "ATTITUDES",
+    "VELOCITIES",
     "EgoVelocity",
     "Motion",
     "OwnBody",
+    "Surroundings",
     "VelocityErrors",
     "ground_depth",
     "scene_depth",
+    "sight_map",
+    "sight_table",
+    "sight_units",
     "velocity_errors",
 ]

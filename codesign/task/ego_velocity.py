@@ -119,10 +119,7 @@ class EgoVelocity:
         else:
             xx, xy, yy = per_body(field.covariance_px2[at]).unbind(-1)
         confidence = field.valid.to(flow) if field.confidence is None else field.confidence
-        xx = xx + self.floor_px**2
-        yy = yy + self.floor_px**2
-        inverse = torch.stack([torch.stack([yy, -xy], -1), torch.stack([-xy, xx], -1)], -2)
-        precision = inverse / (xx * yy - xy * xy)[..., None, None]
+        precision = place.flow_precision(torch.stack([xx, xy, yy], -1), floor=self.floor_px)
         points = per_body(pixels[None].expand(count, *pixels.shape).flatten(0, 1))
         return points, flow, precision, per_body(confidence[:, None][at])
 

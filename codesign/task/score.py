@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
+from codesign.place.criterion import LINEAR, NAMES
 
 PERCENTILES = (5, 10, 25, 50, 75, 90, 95)
-NAMES = ("forward", "left", "up", "roll", "pitch", "yaw")
-LINEAR = 3  # of the six, m/s; the others rad/s
 
 
 @dataclass(frozen=True)

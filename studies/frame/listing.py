@@ -58,6 +58,7 @@ GROUPS = {
         "combinations",
         "joint_design",
         "placement",
+        "mount_sight",
         "gradient_flow",
         "certify_precision",
         "speed_error",

@@ -1,0 +1,51 @@
+"""A number over all directions in which a camera on a robot may look."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+from torch import Tensor
+
+COLOURS = ("#d62728", "#1f77b4", "#ff7f0e", "#e377c2", "#17becf", "#8c564b")
+
+
+def mount_sphere(
+    yaw_rad: Tensor,
+    pitch_rad: Tensor,
+    values: Tensor,
+    label: str,
+    marked: Mapping[str, tuple[float, float]] | None = None,
+) -> Figure:
+    """Figure of a sphere of directions in equal areas (Mollweide), as seen from the body: ahead is the middle, left is
+    left, down is below.
+
+    Args: yaw_rad: [columns], pitch_rad: [rows] middles of cells of equal angles, as of ``task.sight_map``. values: [rows,
+      columns] > 0, on a logarithmic scale; label: of them. marked: name -> yaw and pitch of directions to mark.
+    """
+    rows, columns = values.shape
+    figure = plt.figure(figsize=(8.6, 4.8), layout="constrained")
+    axes: Any = figure.add_subplot(projection="mollweide")
+    across = np.linspace(-math.pi, math.pi, columns + 1)
+    upwards = np.linspace(-math.pi / 2, math.pi / 2, rows + 1)
+    # yaw grows to the left and pitch downwards
+    shown = values.detach().numpy()[::-1, ::-1]
+    mesh = axes.pcolormesh(
+        across, upwards, shown, norm=LogNorm(shown.min(), shown.max()), cmap="viridis_r", shading="flat"
+    )
+    axes.grid(color="white", lw=0.5, alpha=0.4)
+    axes.set_xticks(
+        [math.radians(a) for a in (-90, 0, 90)], ["left", "ahead", "right"]
+    )  # as the body looks: yaw to the left
+    axes.set_yticks([math.radians(a) for a in (-60, -30, 0, 30, 60)])
+    bar = figure.colorbar(mesh, shrink=0.8, label=label)
+    bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    for k, (name, (yaw, pitch)) in enumerate((marked or {}).items()):
+        axes.plot([-yaw], [-pitch], "o", mfc="white", mec=COLOURS[k % len(COLOURS)], mew=2, ms=8, label=name)
+    if marked:
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=min(len(marked), 5), frameon=False)
+    return figure
