@@ -3,15 +3,13 @@
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from codesign import backend
 from codesign.errors import DomainError, as_number
 from codesign.place import Body
 from codesign.render import Camera, MitsubaScene, frames
-from codesign.render.charts import emissive_mesh
+from codesign.render.glowing import glowing
 from codesign.render.truth import cameras_of, hits_of
 
 
@@ -52,10 +50,7 @@ class OwnBody:
     @cached_property
     def scene(self) -> MitsubaScene:
         """The body with radiance 1 on both sides of every face, before nothing."""
-        corners = self.body.triangles.reshape(-1, 3).numpy()
-        faces = np.arange(len(corners)).reshape(-1, 3)
-        mesh = emissive_mesh(backend.mitsuba("cpu"), corners, faces, np.ones(len(faces)))
-        return MitsubaScene({"body": mesh}).two_sided()
+        return glowing(self.body.triangles)
 
     def slack(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
         """[..., 1] share of the picture that may still be covered. Gradient: mount and lens."""
