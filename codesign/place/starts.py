@@ -15,8 +15,9 @@ from codesign.pose import se3_exp
 from codesign.types import ChiefRayCamera
 
 INNER = 0.9  # of the box, in which searches begin: at its walls the map of the mount is flat
-DRAWS = 256  # looked at together
-MOST_DRAWS = 16  # times DRAWS
+DRAWS = 64  # looked at together
+MOST_DRAWS = 64  # times DRAWS
+PLACES = 256  # of a box, in which room is looked for
 NEAREST = 8  # places of the box from which the way to the body is followed
 WAYS = 50  # steps of it, to and fro between box and body
 
@@ -38,7 +39,8 @@ def starts(
       of the start attitude, up to pi (all directions). roll_rad: largest turn about the view either way. seed: of
       the scrambling.
     Returns: [count, 6] for ``Mount.forward`` or ``mount.numbers.copy_``; the same for the same seed. Gradient: none.
-    Raises: DomainError when hardly any draw keeps the requirements, naming what fails most.
+    Raises: DomainError when hardly any draw keeps the requirements, naming the one at which most fail; they are asked in
+      their order, so the cheap ones stand first.
     Source: Sobol, USSR Comput. Math. 7, 1967, scrambled (torch.quasirandom).
 
     >>> mount = Mount((0.2, 0.0, 0.4), (0.1, 0.0, 0.2), pitch_rad=1.0)
@@ -55,19 +57,21 @@ def starts(
     failed = torch.zeros(len(requirements))
     for _ in range(MOST_DRAWS):
         poses = _drawn(mount, engine.draw(DRAWS, dtype=torch.float64), reach_rad, roll_rad)
-        kept = torch.ones(DRAWS, dtype=torch.bool)
         for k, each in enumerate(requirements):
-            good = (_exact(each, poses, camera) >= 0).all(-1)
-            failed[k] += int((~good).sum())
-            kept &= good
-        found.append(mount.numbers_at(poses[kept]))
+            kept = (_exact(each, poses, camera) >= 0).all(-1)
+            failed[k] += int((~kept).sum())
+            poses = poses[kept]
+            if not len(poses):
+                break
+        else:
+            found.append(mount.numbers_at(poses))
         if sum(map(len, found)) >= count:
             return torch.cat(found)[:count]
     worst = int(failed.argmax())
     raise DomainError(
         f"starts: of {DRAWS * MOST_DRAWS} mounts {sum(map(len, found))} keep the requirements, {count} are asked for; "
-        f"'{requirements[worst].name}' refuses {float(failed[worst]) / (DRAWS * MOST_DRAWS):.0%}: move or widen the "
-        "box, turn the start attitude, or ask for less."
+        f"most, {float(failed[worst]) / (DRAWS * MOST_DRAWS):.0%}, fail first at '{requirements[worst].name}': move or widen "
+        "the box, turn the start attitude, or ask for less."
     )
 
 
@@ -118,7 +122,7 @@ def _check_box(mount, clearance, reach_m):
     low = mount.nominal_m - mount.half_range_m
     high = mount.nominal_m + mount.half_range_m
     corners = torch.cartesian_prod(*torch.tensor([[0.0, 1.0]] * 3, dtype=torch.float64))
-    draw = torch.cat([corners, SobolEngine(3).draw(DRAWS, dtype=torch.float64)])
+    draw = torch.cat([corners, SobolEngine(3).draw(PLACES, dtype=torch.float64)])
     places = low + (high - low) * draw
     distance = clearance.body.distance_m(places)
     room = float(distance.max()) - clearance.housing.radius_m - clearance.margin_m
