@@ -4,7 +4,7 @@ from codesign.train.batches import Batches, Part, Source, Started
 from codesign.train.fit import fit
 from codesign.train.learner import Learner, adamw
 from codesign.train.loop import Budget, Clock, Cosine, Progress
-from codesign.train.objectives import Contrast, Likelihood, Photometric, Supervised
+from codesign.train.objectives import Contrast, Photometric, Supervised
 from codesign.train.parallel import Ranks, join
 from codesign.train.validation import Score, error_ratio, score
 
@@ -15,7 +15,6 @@ __all__ = [
     "Contrast",
     "Cosine",
     "Learner",
-    "Likelihood",
     "Part",
     "Photometric",
     "Progress",

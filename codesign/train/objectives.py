@@ -10,7 +10,6 @@ from codesign.errors import DomainError
 from codesign.flow.losses import (
     contrast_loss,
     laplace_loss,
-    likelihood_loss,
     photometric_loss,
     relative_unit,
     smoothness_loss,
@@ -32,15 +31,15 @@ def flow_predictions(network: nn.Module, windows: FlowWindows) -> list[FlowField
 
 @dataclass(frozen=True)
 class Supervised:
-    """Distance to the true flow; and, where the network claims a covariance, its likelihood, which teaches
-    the claim and leaves the flow alone.
+    """Distance to the true flow; and, where the network claims a covariance, the likelihood of the error under it, with
+    long tails, which teaches the claim and leaves the flow alone.
 
     unit: errors count in pixels, or as shares of the window's own root mean square flow. claim_weight: of the
       likelihood.
     """
 
     unit: Literal["px", "motion"] = "motion"
-    claim_weight: float = 0.1
+    claim_weight: float = 0.3
 
     def __call__(self, predictions: Sequence[FlowField], windows: FlowWindows) -> Tensor:
         """The loss, a scalar. Gradient: to flow and claim."""
@@ -50,36 +49,16 @@ class Supervised:
             field.covariance_px2 is not None or field.confidence is not None for field in predictions
         ):
             claims = [replace(field, flow_px=field.flow_px.detach()) for field in predictions]
-            loss = loss + self.claim_weight * likelihood_loss(claims, windows.truth, GAMMA)
+            loss = loss + self.claim_weight * laplace_loss(claims, windows.truth, GAMMA)
         return loss
 
     def check(self, windows: FlowWindows) -> None:
         """Raise DomainError for windows without any true flow."""
-        _need_truth(windows)
-
-
-@dataclass(frozen=True)
-class Likelihood:
-    """Likelihood of the error under the covariance that the network claims, with long tails: what nothing can be
-    known of pulls little, and a tenth of a pixel counts where a hundredth is claimed.
-
-    distance: weight of the distance to the true flow beside it, as shares of the window's own root mean square
-      flow; a network that claims no covariance is taught by it alone.
-    """
-
-    distance: float = 0.3
-
-    def __call__(self, predictions: Sequence[FlowField], windows: FlowWindows) -> Tensor:
-        """The loss, a scalar. Gradient: to flow and claim."""
-        unit = relative_unit(windows.truth)
-        loss = supervised_loss(predictions, windows.truth, GAMMA, unit_per_px=unit)
-        if any(field.covariance_px2 is None for field in predictions):
-            return loss
-        return self.distance * loss + laplace_loss(predictions, windows.truth, GAMMA)
-
-    def check(self, windows: FlowWindows) -> None:
-        """Raise DomainError for windows without any true flow."""
-        _need_truth(windows)
+        if not bool(windows.truth.valid.any()):
+            raise DomainError(
+                "the supervised loss needs true flow, and the windows looked at have none; choose the "
+                "contrast loss, or check the data set."
+            )
 
 
 @dataclass(frozen=True)
@@ -129,14 +108,6 @@ class Photometric:
                 "the photometric loss needs frames, and these windows have none; choose the supervised or "
                 "the contrast loss."
             )
-
-
-def _need_truth(windows):
-    if not bool(windows.truth.valid.any()):
-        raise DomainError(
-            "the supervised loss needs true flow, and the windows looked at have none; choose the "
-            "contrast loss, or check the data set."
-        )
 
 
 def _weighted(predictions: Sequence[FlowField], of_flow: Callable[[Tensor], Tensor]):

@@ -46,11 +46,11 @@ class Config(StudyConfig):
     """Folder of a data set (ours, DSEC, MVSEC) to train on instead; its last tenth is what is judged on."""
     window_frames: int = 1
     """Frame intervals per window of a data set."""
-    loss: str = "likelihood"
-    """likelihood, supervised, contrast or photometric."""
+    loss: str = "supervised"
+    """supervised, contrast or photometric."""
     unit: Literal["px", "motion"] = "motion"
     """Errors count in pixels, or as shares of the window's own root mean square flow (supervised)."""
-    claim_weight: float = 0.1
+    claim_weight: float = 0.3
     """Weight of the likelihood that teaches a network its confidence (supervised)."""
     smoothness: float = 0.1
     """Weight of the roughness of the flow (contrast, photometric)."""

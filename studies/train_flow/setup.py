@@ -15,7 +15,6 @@ from codesign.train import (
     Batches,
     Contrast,
     Learner,
-    Likelihood,
     Part,
     Photometric,
     Progress,
@@ -33,7 +32,6 @@ FOREIGN = 0.2  # share of the windows on which a network that refines begins fro
 POOL = 64  # batches shown in turn before windows come again
 LOSSES = {
     "supervised": lambda config: Supervised(config.unit, config.claim_weight),
-    "likelihood": lambda config: Likelihood(),
     "contrast": lambda config: Contrast(config.smoothness),
     "photometric": lambda config: Photometric(config.smoothness),
 }

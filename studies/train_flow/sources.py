@@ -56,13 +56,17 @@ BENDING = Sensors(bend=0.4)
 
 
 def real(shape, seed):
-    """Windows as real sensors give them: planes, layers that bend, short and long flows."""
+    """Windows as real sensors give them: planes, layers that bend, short and long flows; and a third as ideal ones
+    do."""
     return [
-        (0.2, shape.seen_by(STIFF, SHORT, seed)),
-        (0.15, shape.seen_by(STIFF, PLANES, seed + 1)),
-        (0.35, shape.seen_by(BENDING, DEPTHS, seed + 2)),
-        (0.1, shape.seen_by(BENDING, SHORT_DEPTHS, seed + 3)),
-        (0.2, shape.seen_by(BENDING, FAST_DEPTHS, seed + 4, 96)),
+        (0.12, shape.seen_by(STIFF, SHORT, seed)),
+        (0.08, shape.seen_by(STIFF, PLANES, seed + 1)),
+        (0.22, shape.seen_by(BENDING, DEPTHS, seed + 2)),
+        (0.08, shape.seen_by(BENDING, SHORT_DEPTHS, seed + 3)),
+        (0.15, shape.seen_by(BENDING, FAST_DEPTHS, seed + 4, 96)),
+        (0.2, shape(DENSE, seed + 5)),
+        (0.1, shape(FLAT, seed + 6)),
+        (0.05, shape(WIDE, seed + 7, 96, 96)),
     ]
 
 

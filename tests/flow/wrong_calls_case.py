@@ -62,7 +62,7 @@ def calls(folder: Path) -> dict[str, Call]:
     directions = metrics.pinhole_directions(HEIGHT, WIDTH, 20.0)
     network = flow.FlowNetEvents(BINS, width=4.0)
     spiking = flow.SpikeFlowNet(BINS, width=4.0)
-    refiner = flow.Refiner(BINS, width=4, steps=1)
+    refiner = flow.Refiner(BINS, width=16, steps=1)
     flow.save(network, folder / "n.safetensors")
     for name in ("f.flo", "f.png"):
         flow.write_flow(folder / name, flow_px[0])
@@ -146,7 +146,7 @@ def calls(folder: Path) -> dict[str, Call]:
                 flow.SpikeFlowNet.with_weights,
                 {"weights": 30_000, "bins": 2, "seed": 0},
             ),
-            ("Refiner", flow.Refiner, {"bins": 2, "width": 4, "steps": 1}),
+            ("Refiner", flow.Refiner, {"bins": 2, "width": 16, "steps": 1}),
             ("to_halves", baselines.to_halves, {"counts": volume.counts}),
             ("from_halves", baselines.from_halves, {"halves": rand(1, 4, 4, 4, 2)}),
             ("rescale_flow", baselines.rescale_flow, {"flow_px": flow_px, "size": (20, 20)}),

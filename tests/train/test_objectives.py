@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from codesign.flow.losses import laplace_loss, likelihood_loss, relative_unit, supervised_loss
-from codesign.train import Contrast, Likelihood, Photometric, Supervised
+from codesign.flow.losses import laplace_loss
+from codesign.train import Contrast, Photometric, Supervised
 from codesign.train.objectives import flow_predictions
 from codesign.types import FlowField
 from tests.flow_training_case import SIDE, Made
@@ -40,26 +40,11 @@ def test_the_likelihood_teaches_the_claim_and_leaves_the_flow_alone():
     plain, flow, unseen = gradients(0.0)
     both, same, claim = gradients(0.3)
     prediction = field(0, torch.tensor([1.0, 0.0, 2.0])[:, None, None].repeat(4, 1, SIDE, SIDE))
-    likelihood = float(likelihood_loss([prediction], windows.truth, 0.8).detach())
+    likelihood = float(laplace_loss([prediction], windows.truth, 0.8).detach())
     assert both == pytest.approx(plain + 0.3 * likelihood, rel=1e-6)
     assert torch.equal(flow, same)
     assert unseen is None
     assert float(claim.abs().min()) > 0
-
-
-def test_the_likelihood_pulls_at_flow_and_claim_beside_the_distance():
-    windows = Made().batch(range(4))
-    claim = torch.tensor([1.0, 0.0, 2.0])[:, None, None].repeat(4, 1, SIDE, SIDE).requires_grad_()
-    prediction = field(0, claim)
-    loss = Likelihood(0.3)([prediction], windows)
-    distance = supervised_loss([prediction], windows.truth, unit_per_px=relative_unit(windows.truth))
-    expected = 0.3 * distance + laplace_loss([prediction], windows.truth)
-    assert float(loss.detach()) == pytest.approx(float(expected.detach()), rel=1e-6)
-    flow, claimed = torch.autograd.grad(loss, (prediction.flow_px, claim))
-    assert float(flow.abs().min()) > 0
-    assert float(claimed.abs().min()) > 0
-    plain = Likelihood(0.3)([field(0)], windows)
-    assert float(plain.detach()) == pytest.approx(float(distance.detach()), rel=1e-6)
 
 
 def test_windows_with_a_start_are_refined_from_it():
