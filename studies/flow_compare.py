@@ -33,7 +33,7 @@ NAMES = {
 RIVALS = tuple(name for name in NAMES if name != "refiner")
 ASKED = 0.6  # of a rival's error, at most
 RATES = {
-    "refiner": 1e-3,
+    "refiner": 2e-3,
     "flownet-events": 2e-3,
     "spike-flownet": 3e-3,
     "ecn": 2e-3,
@@ -53,7 +53,7 @@ class Config(StudyConfig):
     """Processor time of every training, making the windows included, minutes."""
     weights: int = 0
     """Weights of the rivals; 0 for as many as the refiner has."""
-    mix: str = "delivered"
+    mix: str = "real"
     """Windows to train on (studies.train_flow.sources)."""
     windows: int = 128
     """Windows of every set of flat textures to judge on."""
