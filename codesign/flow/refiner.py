@@ -13,7 +13,7 @@ from codesign.flow.checks import check_count
 from codesign.flow.entry import check_bins, pad_to, presence, takes_volume
 from codesign.flow.layers import Layer
 from codesign.flow.lk import estimate_lk
-from codesign.flow.refiner_evidence import CELL, FEW, FLOWS_OF, SOLVED, TOLD, TRIED, Evidence, larger
+from codesign.flow.refiner_evidence import AROUND, CELL, FEW, SOLVED, TOLD, TRIED, Evidence, larger
 from codesign.types import EventVolume, FlowField
 
 NEVER = 1e-3  # weight that a cell has at least in a mean of cells, before training
@@ -64,7 +64,7 @@ class Refiner(nn.Module):
         self.join_middle = Layer(2 * width + wide, wide)
         self.narrow = nn.Conv2d(wide, 2 * width // 3, 1)
         self.join_fine = Layer(width + 2 * width // 3, width)
-        self.change = nn.Conv2d(width, 2 + SOLVED + len(FLOWS_OF), 1)
+        self.change = nn.Conv2d(width, 2 + SOLVED + len(AROUND), 1)
         self.claim = nn.Conv2d(width, 2, 1)
         self.edges = nn.Conv2d(width, 9 * CELL**2, 1)
         for last in (self.change, self.claim, self.edges):
@@ -123,7 +123,7 @@ class Refiner(nn.Module):
             read = silu(self.reading(bins))
             parts = [read, known, tried, told, flow / FAR_PX, (flow - first) / NEAR_PX]
             core = self._core(torch.cat(parts, 1))
-            own, shares = self.change(core).split([2, SOLVED + len(FLOWS_OF)], 1)
+            own, shares = self.change(core).split([2, SOLVED + len(AROUND)], 1)
             moves = torch.cat([solved, offered], 1)
             flow = flow + unit * own + (shares[:, :, None] * moves).sum(1)
             found.append((_on_pixels(flow - first, self.edges(core)), self.claim(core)))

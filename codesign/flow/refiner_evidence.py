@@ -5,6 +5,9 @@ The noise is that of the closed form (lk_level): rho scattered events per pixel 
 temporal slopes of variance rho / (4 pi sigma^2 sum w t^2) and slopes of the mean of variance about rho / (8 pi
 sigma^4), alike over 4 pi sigma^2 px. With N the sums of products of slopes in a window, the precision is N over that
 variance and overlap; it counts by the share (g / (g + 4 z))^2 of the trace g of N, z what scattered events add to it.
+
+At the border between two motions no window says where it runs, but the events near by are sharp along one of the two:
+flows of cells around are tried as they are (PatchMatch: Barnes et al., SIGGRAPH 2009).
 """
 
 import math
@@ -24,13 +27,13 @@ POOL = 2  # px a side over which the bins that are read are averaged
 CELL = 4  # px a side of the cells on which flow is corrected
 BLURS = (1, 2, 4)  # standard deviations in px, and spacing of the samples
 WINDOWS = ((3, 9), (3, 9), (9,))  # cells a side, for each blur
-MISFIT = 4.0  # claimed variances that what is missing may have
+MISFIT = 4.0  # variance expected of what is missing where the claim is believed, over the claimed one
 SOLVED = 2 * sum(len(sizes) for sizes in WINDOWS)
-FLOWS_OF = ((3, 0), (-3, 0), (0, 3), (0, -3), (5, 5), (5, -5), (-5, 5), (-5, -5))  # cells down and right
-COMPARED = (3, 7)  # cells a side of the windows in which flows of others are tried
-COMPARED_BLUR = 2
+AROUND = ((3, 0), (-3, 0), (0, 3), (0, -3), (5, 5), (5, -5), (-5, 5), (-5, -5))  # cells down and right
+TRIED_IN = (3, 7)  # cells a side of the windows in which their flows are tried
+TRIED_AT = 1  # of BLURS
 TOLD = 5 * SOLVED  # channels told by ``Evidence.at``
-TRIED = len(FLOWS_OF) * len(COMPARED)  # channels told by ``Evidence.others``
+TRIED = len(AROUND) * len(TRIED_IN)  # channels told by ``Evidence.others``
 MOST_PX = 2.0  # deviation expected of what is missing
 CALIBRATION = 3.0  # real errors over those of scattered events, as in the closed form
 NOISE = 4.0  # the factor on z above
@@ -65,12 +68,14 @@ class Evidence:
             self.levels.append((blur, grid, blurred(way.counts, grid, _taps(blur)), pooled))
 
     def at(self, flow: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-        """What is still missing along a flow [B, 2, h, w] px on cells.
+        """What is still missing along a flow [B, 2, h, w] px on cells, of which ``variance`` [B, 1, h, w] px^2 is
+        claimed.
 
-        Returns: told [B, TOLD, h, w]: per blur and window the flow (2), logarithms of twice the likelihood gained and
-          of the precision, orientation of the texture (2), logarithms of what moves and of the texture over their
-          noise. solved [B, SOLVED, 2, h, w]: the flows, px.
-        Gradient: flow, volume.
+        Returns: told [B, TOLD, h, w]: per blur and window the two flows below (4), logarithms of twice the likelihood
+          gained and of the precision, orientation of the texture (2), logarithms of what moves and of the texture over
+          their noise. solved [B, SOLVED, 2, h, w]: per blur and window two flows in px, where next to nothing is
+          expected (MOST_PX), and where the claim is believed (MISFIT).
+        Gradient: flow, variance, volume.
         """
         told = []
         solved = []
@@ -88,25 +93,26 @@ class Evidence:
     def others(self, flow: Tensor) -> tuple[Tensor, Tensor]:
         """What the flows of cells around would explain here.
 
-        Args: flow: [B, 2, h, w] px on cells. Returns: told [B, TRIED, h, w]: for each neighbour of FLOWS_OF and window
-          of COMPARED the contrast that the events have more along its flow, over that along the cell's own and along
-          its. offered: [B, neighbours, 2, h, w] px, its flow less the cell's own.
+        Args: flow: [B, 2, h, w] px on cells.
+        Returns: told [B, TRIED, h, w]: for each cell of AROUND and window of TRIED_IN, by how much the events have more
+          contrast along its flow than along the cell's own, over the sum of both and of noise. offered
+          [B, len(AROUND), 2, h, w]: its flow less the cell's own, px.
         Gradient: flow, volume.
         """
-        blur, grid, counts, density = self.levels[BLURS.index(COMPARED_BLUR)]
+        blur, grid, counts, _ = self.levels[TRIED_AT]
         rows, columns = flow.shape[2:]
 
         def contrast(flow):
             there = larger(flow, CELL // blur)
             mean, _, seen = moving(counts, there, self.time, self.contrast, grid, fade_px=1.0 + blur)
             square = avg_pool2d((seen * mean.square())[:, None], CELL // blur)
-            return [avg_pool2d(square, size, 1, size // 2) for size in COMPARED]
+            return [avg_pool2d(square, size, 1, size // 2) for size in TRIED_IN]
 
         told = []
         offered = []
         least = self.mean_density / (OVERLAP * blur**2)
         own = contrast(flow)
-        for down, right in FLOWS_OF:
+        for down, right in AROUND:
             edge = max(abs(down), abs(right))
             other = pad(flow, (edge,) * 4, mode="replicate")
             other = other[:, :, edge + down : edge + down + rows, edge + right : edge + right + columns]
@@ -127,7 +133,8 @@ class Evidence:
         return torch.cat([self.pooled, found.unflatten(0, (-1, bins))[:, :, 0]], 1)
 
     def _solved(self, sums, blur, variance):
-        """Flow [B, 2, h, w] px that the sums of a window ask for, and what is told of it [B, 6, h, w]."""
+        """Flows [B, 2, h, w] px that the sums of a window ask for with the one prior and the other, and what is told of
+        the first [B, 6, h, w]."""
         xx, xy, yy, xs, ys, ss, seen, events = sums.unbind(1)
         alike = OVERLAP  # samples, blur px apart, over which noise is alike
         density = (events + FEW * (seen + 1)) / (seen + 1)
@@ -136,11 +143,11 @@ class Evidence:
         texture = xx + yy
         noise = NOISE * texture_noise * (seen + 1)
         weight = (texture / (texture + noise)).square() / (CALIBRATION * alike * moving_noise)
-        u, v, a, b, c = _least(weight, xx, xy, yy, xs, ys, MOST_PX**-2)
-        sure = torch.stack(_least(weight, xx, xy, yy, xs, ys, 1 / (MISFIT * variance[:, 0]))[:2], 1)
+        matrix = xx, xy, yy
+        u, v, a, b, c = _least(weight, matrix, xs, ys, MOST_PX**-2)
+        sure = torch.stack(_least(weight, matrix, xs, ys, 1 / (MISFIT * variance[:, 0]))[:2], 1)
         determinant = a * b - c * c
         gain = -weight * (u * xs + v * ys)
-        limit = (1 + (u * u + v * v) / (3.0 * blur) ** 2).rsqrt()
         trust = [
             (gain + SMALL).log() / 4,
             determinant.log() / 8,
@@ -149,8 +156,13 @@ class Evidence:
             ((ss + SMALL * moving_noise) / ((seen + 1) * moving_noise)).log() / 4,
             ((texture + SMALL * texture_noise) / ((seen + 1) * texture_noise)).log() / 4,
         ]
-        there = (1 + sure.square().sum(1, keepdim=True) / (3.0 * blur) ** 2).rsqrt()
-        return torch.stack([u * limit, v * limit], 1), there * sure, torch.stack(trust, 1)
+        free = torch.stack([u, v], 1)
+        return _within(free, 3.0 * blur), _within(sure, 3.0 * blur), torch.stack(trust, 1)
+
+
+def _within(flow, reach):
+    """Flow [B, 2, h, w] bent towards lengths below ``reach``."""
+    return flow * (1 + (flow / reach).square().sum(1, keepdim=True)).rsqrt()
 
 
 def _compressed(value):
@@ -172,8 +184,9 @@ def _taps(blur: int) -> Sequence[float]:
     return [tap / total for tap in taps]
 
 
-def _least(weight, xx, xy, yy, xs, ys, prior):
+def _least(weight, matrix, xs, ys, prior):
     """Flow (u, v) of the normal equations, and their matrix (xx, yy, xy), with a prior precision."""
+    xx, xy, yy = matrix
     a = weight * xx + prior
     b = weight * yy + prior
     c = weight * xy
