@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from codesign.errors import DomainError
-from codesign.flow.checks import check_flow, check_volume, shown
+from codesign.flow.checks import check_volume, shown
 from codesign.types import EventVolume, FlowField
 
 Given = ParamSpec("Given")
@@ -48,9 +48,8 @@ def takes_volume(
 ) -> Callable[Concatenate[Any, EventVolume, Given], Found]:
     """Make a network's method of an EventVolume refuse what is none, and compute in the type of the weights.
 
-    The counts (and a flow ``start_px``) are converted to the weights' type, float32 as delivered; the flow,
-    confidence and covariance that come back have the type of the counts, so a chain in float64 stays in
-    float64, to the precision of the weights.
+    The counts are converted to the weights' type, float32 as delivered; the flow, confidence and covariance that
+    come back have the type of the counts, so a chain in float64 stays in float64, to the precision of the weights.
     Raises: as check_volume, for another number of bins than ``config["bins"]`` too; DomainError for events and
       weights on different devices.
     """
@@ -65,16 +64,8 @@ def takes_volume(
                 "with .to()."
             )
 
-        def start(flow_px):
-            wanted = (counts.shape[0], 2, *counts.shape[3:])
-            return (
-                None if flow_px is None else check_flow(flow_px, wanted, "the flow to start from").to(weight)
-            )
-
         own = replace(volume, counts=counts.to(weight.dtype))
-        starts = [start(flow_px) for flow_px in more]
-        named_starts = {name: start(flow_px) for name, flow_px in named.items()}
-        found = cast(Any, method)(network, own, *starts, **named_starts)
+        found = cast(Any, method)(network, own, *more, **named)
         return cast(Found, _in_type(found, counts.dtype))
 
     return checked

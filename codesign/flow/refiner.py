@@ -74,11 +74,10 @@ class Refiner(nn.Module):
     def forward(self, volume: EventVolume, start_px: Tensor | None = None) -> FlowField:
         """Flow of an EventVolume [B, 2, bins, H, W] of any H, W.
 
-        Args: start_px: [B, 2, H, W] flow to begin with, such as that of the window before, instead of the
-          closed form's.
-        Returns: FlowField with confidence and covariance. An empty sample has the start's flow (0 without
-          one), confidence 0 and no gradient.
-        Gradient: counts, start_px and weights.
+        Args: start_px: [B, 2] or [B, 2, H, W] flow that is expected, px per interval, such as that of the window
+          before: the closed form begins from it too (``estimate_lk``).
+        Returns: FlowField with confidence and covariance. An empty sample has flow 0, confidence 0 and no gradient.
+        Gradient: counts and weights.
         Raises: ShapeError for other shapes or numbers of bins; DomainError for counts that are no events.
         """
         return self.predictions(volume, start_px)[-1]
@@ -86,20 +85,16 @@ class Refiner(nn.Module):
     @takes_volume
     def predictions(self, volume: EventVolume, start_px: Tensor | None = None) -> list[FlowField]:
         """FlowFields after each correction. Arguments, gradient and errors as ``forward``."""
-        if start_px is None:
-            return self.refined(volume, self.start(volume))
-        unknown = torch.ones_like(start_px[:, :1])
-        covariance = torch.cat([unknown, torch.zeros_like(unknown), unknown], 1)
-        valid = torch.ones_like(start_px[:, 0], dtype=torch.bool)
-        return self.refined(volume, FlowField(start_px, valid, 1.0, None, covariance))
+        return self.refined(volume, self.start(volume, start_px))
 
-    def start(self, volume: EventVolume) -> FlowField:
+    def start(self, volume: EventVolume, start_px: Tensor | None = None) -> FlowField:
         """The closed form that is corrected."""
         with torch.autocast(volume.counts.device.type, enabled=False):  # its solves need full precision
-            return estimate_lk(volume, model="local")
+            return estimate_lk(volume, model="local", start_px=start_px)
 
     def refined(self, volume: EventVolume, start: FlowField, through: bool = True) -> list[FlowField]:
-        """FlowFields after each correction of an estimate with covariance, such as ``start(volume)``.
+        """FlowFields after each correction of an estimate with covariance, such as ``start(volume)``, whose covariance
+        says how far it may be off. Gradient: counts, start and weights.
 
         through: False leaves out the gradient through the places at which bins are read, as in the training of
           RAFT (Teed and Deng, ECCV 2020): it takes a third off a step.

@@ -191,7 +191,7 @@ def test_a_speed_that_changes_is_followed():
             # what the closed form leaves on hard events of dense texture (0.02 to 0.06 of zero flow)
             assert mean[0] == pytest.approx(right, rel=0.05)
             assert abs(mean[1]) < 0.05 * right
-    network = flow.Refiner(bins=4, width=4, steps=1)
+    network = flow.Refiner(bins=4, width=16, steps=1)
     (first, *_) = flow.Tracker(network, window_s=0.01).track([stream])
     assert first.field.flow_px.shape == (1, 2, 48, 64)
 
