@@ -40,6 +40,11 @@ FIGURES = {
         "everywhere.",
         2,
     ),
+    "rank_correlation_if_true": (
+        "Rank correlation that the claims would have if they were true",
+        "Errors drawn from the claimed covariances, per pixel: what a right claim reaches on these windows.",
+        2,
+    ),
     "ause": (
         "Area between the sparsification curves",
         "By confidence less by true error, over the error of all pixels; 0 is best.",

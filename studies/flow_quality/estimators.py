@@ -1,5 +1,4 @@
-"""The estimators that are judged: models of the closed form, the network, and the network's
-corrections alone."""
+"""The estimators that are judged: models of the closed form, and the network."""
 
 from functools import partial
 
@@ -9,16 +8,9 @@ from codesign import flow
 
 
 def estimators(network, models):
-    """Name -> function from an EventVolume to a FlowField. models: of the closed form. "corrections": what the
-    network says before it is weighed against its start."""
+    """Name -> function from an EventVolume to a FlowField. models: of the closed form."""
     found = {
         f"closed_form_{model}": partial(flow.estimate_lk, model=model, clock="events") for model in models
     }
     found["refiner"] = network
-    if hasattr(network, "predictions"):
-        found["corrections"] = partial(_corrections, network)
     return {name: torch.no_grad()(estimate) for name, estimate in found.items()}
-
-
-def _corrections(network, volume):
-    return network.predictions(volume)[-1]

@@ -22,7 +22,8 @@ class Measured:
     error_px, zero_px: [N] mean endpoint error over valid pixels of the estimate and of zero flow.
     claim: [N] mean squared error over the trace of the claimed covariance; claim_median: [N] median of its
       root; NaN where nothing is claimed. spearman: [N] rank correlation of 1 - confidence with the error
-      over the pixels of a window, NaN where the confidence is the same everywhere.
+      over the pixels of a window, NaN where the confidence is the same everywhere; spearman_if_true: [N] with errors
+      drawn from the claimed covariance in place of the true ones.
     left, best: [N, len(SHARES)] mean error of the pixels left when a share of them is taken out, least
       confident first, and largest error first. fwl, truth_fwl: [N] variance of the image of warped events
       over the unwarped one's, by the estimate and by the true flow, NaN for windows without events.
@@ -33,6 +34,7 @@ class Measured:
     claim: np.ndarray
     claim_median: np.ndarray
     spearman: np.ndarray
+    spearman_if_true: np.ndarray
     left: np.ndarray
     best: np.ndarray
     fwl: np.ndarray
@@ -75,6 +77,12 @@ class Measured:
         return float(known.mean()) if len(known) else None
 
     @property
+    def rank_correlation_if_true(self) -> float | None:
+        """The same of ``spearman_if_true``: what claims reach that are right."""
+        known = self.spearman_if_true[np.isfinite(self.spearman_if_true)]
+        return float(known.mean()) if len(known) else None
+
+    @property
     def curves(self) -> tuple[np.ndarray, np.ndarray]:
         """Sparsification curves over SHARES, by confidence and by true error, relative to the error of all
         pixels."""
@@ -103,6 +111,7 @@ def measure(field, windows) -> Measured:
     zero = truth.flow_px.double().norm(dim=1)
     confidence = field.confidence if field.confidence is not None else torch.ones_like(error)
     claim = None
+    drawn = np.random.default_rng(0)
     if field.covariance_px2 is not None:
         claim = error.square() / (field.covariance_px2[:, 0] + field.covariance_px2[:, 2]).double()
     rows = []
@@ -111,6 +120,7 @@ def measure(field, windows) -> Measured:
         e = error[k][here].numpy()
         doubt = -confidence[k][here].double().numpy()
         c = np.full(1, np.nan) if claim is None else claim[k][here].numpy()
+        as_claimed = np.ones(1) if claim is None else _drawn(field.covariance_px2[k][:, here], drawn)
         rows.append(
             (
                 e.mean(),
@@ -118,6 +128,7 @@ def measure(field, windows) -> Measured:
                 c.mean(),
                 np.median(np.sqrt(c)),
                 spearman(doubt, e),
+                spearman(doubt[: len(as_claimed)], as_claimed),
                 sparsified(e, doubt),
                 sparsified(e, e),
                 warp_loss(windows.volume, field.flow_px, k),
@@ -125,6 +136,14 @@ def measure(field, windows) -> Measured:
             )
         )
     return Measured(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def _drawn(covariance, random):
+    """Lengths [N] of errors drawn from covariances [3, N] (xx, xy, yy)."""
+    xx, xy, yy = covariance.double().numpy()
+    across = xy / np.sqrt(xx)
+    one, other = random.standard_normal((2, len(xx)))
+    return np.hypot(np.sqrt(xx) * one, across * one + np.sqrt(np.maximum(yy - across**2, 0)) * other)
 
 
 def join(parts) -> Measured:

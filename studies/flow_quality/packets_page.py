@@ -18,7 +18,8 @@ TITLES = {
     ),
     "fwl": ("Flow warp loss (FWL)", "Above 1 is sharper; mean over packets (least)."),
 }
-REFERENCE = "closed_form_quadratic"  # whose distance others are compared with
+JUDGED = "refiner"
+REFERENCE = "closed_form_quadratic"  # whose distance the network's is compared with
 
 
 def show(run, who, bins):
@@ -86,7 +87,6 @@ def _record(run, kind, packets):
                         ),
                     }
                 )
-    for name in ("refiner", "corrections"):
-        if name in packets[0] and REFERENCE in packets[0]:
-            shares = [rows[name]["distance_px"] / rows[REFERENCE]["distance_px"] for rows in packets]
-            run.record(**{f"{kind}_{name}_distance_over_closed_form_largest": max(shares)})
+    if JUDGED in packets[0] and REFERENCE in packets[0]:
+        shares = [rows[JUDGED]["distance_px"] / rows[REFERENCE]["distance_px"] for rows in packets]
+        run.record(**{f"{kind}_{JUDGED}_distance_over_closed_form_largest": max(shares)})

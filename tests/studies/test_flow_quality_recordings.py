@@ -163,10 +163,10 @@ def test_packets_of_a_recording(slid, tmp_path):
     mask = metrics.event_mask(volume)[0]
     assert first.truth is not None
     assert still["aee_px"] == pytest.approx(float(first.truth.flow_px[0].norm(dim=0)[mask].mean()), rel=1e-5)
-    rows = [{"corrections": {**still, "fwl": value}, "closed_form_quadratic": still} for value in (1.0, 2.0)]
+    rows = [{"refiner": {**still, "fwl": value}, "closed_form_quadratic": still} for value in (1.0, 2.0)]
     run = open_run("flow_quality", Config(out=tmp_path))
     _record(run, "slid", rows)
-    assert run.metrics["slid_corrections_fwl"] == 1.5
-    assert run.metrics["slid_corrections_fwl_least"] == 1.0
-    assert run.metrics["slid_corrections_distance_over_closed_form_largest"] == 1.0
-    assert math.isclose(run.metrics["slid_corrections_aee_px_largest"], still["aee_px"])
+    assert run.metrics["slid_refiner_fwl"] == 1.5
+    assert run.metrics["slid_refiner_fwl_least"] == 1.0
+    assert run.metrics["slid_refiner_distance_over_closed_form_largest"] == 1.0
+    assert math.isclose(run.metrics["slid_refiner_aee_px_largest"], still["aee_px"])
