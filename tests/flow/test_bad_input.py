@@ -19,7 +19,7 @@ def generator():
 
 
 NETWORKS = {
-    "refiner": flow.Refiner(BINS, width=8, steps=1),
+    "refiner": flow.Refiner(BINS, width=16, steps=1),
     "flownet": flow.FlowNetEvents(BINS, width=4.0),
     "spiking": flow.SpikeFlowNet(BINS, width=4.0),
     "ecn": flow.ECN(BINS, width=4.0),
