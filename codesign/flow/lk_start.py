@@ -30,27 +30,47 @@ def at_start(
     widest = shape.squares(prior)
     widest = widest[0] + widest[2]
     widest[:, 0] += 2 * cells.widest
-    numbers = [-start.to(parameters)[:, None], parameters, xx, xy, yy, widest.expand_as(xx)]
-    both = torch.cat([cells.value, cells.covariance], 1).to(parameters)
+    of_flow = torch.cat([-start.to(parameters)[:, None], parameters], 1)
+    of_rest = torch.cat([xx, xy, yy, widest.expand_as(xx)], 1)
     powers = tuple(tuple(pair) for pair in shape.powers.tolist())
+    rows, columns = cells.value.shape[2:]
     setting = lk_start_kernel.Setting(
-        powers, shape.of_squares, *both.shape[2:], CELL, FIXED_POINT_STEPS, joined
+        powers, shape.of_squares, rows, columns, CELL, FIXED_POINT_STEPS, joined
     )
-    found = _AtStart.apply(torch.cat(numbers, 1), both, Grid(shape.height, shape.width), setting)
-    return found[:, :2], found[:, 2:5], found[:, 5]
+    grid = Grid(shape.height, shape.width)
+    of_cells = cells.value.to(parameters), cells.covariance.to(parameters)
+    flow, rest = _AtStart.apply(of_flow, of_rest, *of_cells, grid, setting)
+    return flow, rest[:, :3], rest[:, 3]
 
 
 class _AtStart(Function):
     @staticmethod
-    def forward(ctx, coefficients, cells, grid, setting):
+    def forward(ctx, of_flow, of_rest, value, covariance, grid, setting):
+        ctx.set_materialize_grads(False)
+        coefficients = torch.cat([of_flow, of_rest], 1)
+        cells = torch.cat([value, covariance], 1)
         ctx.save_for_backward(coefficients, cells)
         ctx.rest = grid, setting
-        return lk_start_kernel.forward(coefficients, cells, grid, setting)
+        found = lk_start_kernel.forward(coefficients, cells, grid, setting)
+        return found[:, :2].clone(), found[:, 2:].clone()
 
     @staticmethod
-    def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
-        found = lk_start_kernel.adjoint(*ctx.saved_tensors, *ctx.rest, grad)
-        return *first_only(found, *ctx.saved_tensors, grad), None, None
+    def backward(ctx, by_flow, by_rest):  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Most who follow a gradient follow that of the flow alone: what it does not depend on has none."""
+        if by_flow is None and by_rest is None:
+            return (None,) * 6
+        coefficients, cells = ctx.saved_tensors
+        grid, setting = ctx.rest
+        if by_flow is None:
+            by_flow = torch.zeros_like(by_rest[:, :2])
+        grad, of_cells = lk_start_kernel.adjoint(coefficients, cells, grid, setting, by_flow, by_rest)
+        found = [grad[:, : setting.of_flow], None, None, None]
+        if by_rest is not None:
+            found[1:] = grad[:, setting.of_flow :], of_cells[:, :2], of_cells[:, 2:]
+        elif setting.joined:
+            found[2] = of_cells[:, :2]
+        live = [by for by in (by_flow, by_rest) if by is not None]
+        return *first_only(found, coefficients, cells, *live), None, None
 
 
 def _plain(shape, parameters, spread, prior, cells, joined, start):

@@ -32,9 +32,14 @@ class Setting:
     joined: bool
 
     @property
+    def of_flow(self) -> int:
+        """Coefficients that the flow depends on: how far an image is from its start, and the polynomials' own."""
+        return 1 + 2 * len(self.powers)
+
+    @property
     def numbers(self) -> int:
-        """Coefficients of an image: how far it is from its start, those of the flow, xx, xy, yy and the widest trace."""
-        return 1 + 2 * len(self.powers) + 4 * len(self.of_variance)
+        """All coefficients of an image: then those of xx, xy, yy and the widest trace."""
+        return self.of_flow + 4 * len(self.of_variance)
 
 
 def forward(coefficients: Tensor, cells: Tensor, grid: Grid, setting: Setting) -> Tensor:
@@ -45,13 +50,16 @@ def forward(coefficients: Tensor, cells: Tensor, grid: Grid, setting: Setting) -
 
 
 def adjoint(
-    coefficients: Tensor, cells: Tensor, grid: Grid, setting: Setting, grad: Tensor
+    coefficients: Tensor, cells: Tensor, grid: Grid, setting: Setting, by_flow: Tensor, by_rest: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Gradients of coefficients and cells."""
+    """Gradients of coefficients and cells. by_rest: of covariance and confidence [B, 4, H, W]; None, where only the flow
+    has one: then those of the coefficients end with the flow's."""
     form = Form.of(coefficients, grid)
-    sums, slots = _adjoint(form, setting, *form.load(coefficients, cells, grad))
+    grads = form.load(by_flow) if by_rest is None else form.load(by_flow, by_rest)
+    sums, slots = _adjoint(form, setting, *form.load(coefficients, cells), *grads)
+    numbers = setting.of_flow if by_rest is None else setting.numbers
     blocks = -(-grid.height // ROWS)
-    (sums,) = tensors((setting.numbers, len(cells), blocks * grid.width), sums)
+    (sums,) = tensors((numbers, len(cells), blocks * grid.width), sums)
     rows, columns = max(setting.rows - 1, 1), max(setting.columns - 1, 1)
     (slots,) = tensors((len(cells), OF_CELL, rows, columns, 4), slots)
     of_cells = torch.zeros_like(cells)
@@ -71,7 +79,7 @@ def _forward(form, setting, coefficients, cells):
 
     def body(y):
         for part, value in enumerate(pixels.outcome(given, pixels.arr.Float(y), None)):
-            pixels.put(target, value, pixels.at(part, y))
+            pixels.put(target, value, pixels.at(part, y, OUT))
         return ()
 
     pixels.loop(pixels.top, pixels.end, body)
@@ -80,31 +88,36 @@ def _forward(form, setting, coefficients, cells):
 
 
 @recorded
-def _adjoint(form, setting, coefficients, cells, grad):
+def _adjoint(form, setting, coefficients, cells, by_flow, by_rest=None):
     pixels = _Pixels(form, setting, cells)
     dr = pixels.dr
-    given = pixels.coefficients(coefficients)
+    numbers = setting.of_flow if by_rest is None else setting.numbers
+    given = pixels.coefficients(coefficients)[:numbers]
     slots = dr.zeros(pixels.arr.Float, 4 * OF_CELL * pixels.images * pixels.slots)
     # processors need no locks where each thread has a copy
     mode = dr.ReduceMode.Expand if form.device == "cpu" else dr.ReduceMode.Auto
 
     def body(y, *sums):
         read = _Read([], [])
-        seeds = [pixels.take(grad, pixels.at(part, y)) for part in range(OUT)]
+        seeds = [pixels.take(by_flow, pixels.at(part, y, 2)) for part in range(2)]
+        if by_rest is not None:
+            seeds += [pixels.take(by_rest, pixels.at(part, y, OUT - 2)) for part in range(OUT - 2)]
 
         def outcome(*given):
-            return pixels.outcome(given, pixels.arr.Float(y), read)
+            row = pixels.arr.Float(y)
+            return pixels.flow(given, row, read)[0] if by_rest is None else pixels.outcome(given, row, read)
 
         found = pixels.back(outcome, given, seeds, read.values)
-        of_cells = found[setting.numbers :]
+        of_cells = found[numbers:]
         for number, slot in enumerate(read.slots):
             four = pixels.arr.Array4(*of_cells[4 * number : 4 * number + 4])
             dr.scatter_add(slots, four, slot, mode=mode)
         return [total + more for total, more in zip(sums, found, strict=False)]
 
-    zero = dr.zeros(pixels.arr.Float, pixels.lane_count)
-    sums = pixels.loop(pixels.top, pixels.end, body, *[zero] * setting.numbers)
-    target = pixels.empty(setting.numbers * pixels.lane_count)
+    sums = pixels.loop(
+        pixels.top, pixels.end, body, *[dr.zeros(pixels.arr.Float, pixels.lane_count)] * numbers
+    )
+    target = pixels.empty(numbers * pixels.lane_count)
     for number, total in enumerate(sums):
         pixels.put(target, total, pixels.count(number * pixels.lane_count) + pixels.lane)
     dr.eval(target, slots)
@@ -131,7 +144,7 @@ class _Pixels(Lanes):
         block, x = self.split(self.lane, self.columns)
         self.image, block = self.split(block, blocks)
         self.x = self.arr.Float(x)
-        self.corner = self.image * self.count(OUT * self.samples) + x
+        self.column = x
         self.top = block * self.count(ROWS)
         self.end = self.dr.minimum(self.top + self.count(ROWS), self.count(self.rows))
         self.slots = max(setting.rows - 1, 1) * max(setting.columns - 1, 1)
@@ -153,42 +166,45 @@ class _Pixels(Lanes):
         start = self.image * self.setting.numbers
         return [self.take(array, start + number) for number in range(self.setting.numbers)]
 
-    def at(self, part, y):
-        return self.corner + self.count(part * self.samples) + y * self.across
+    def at(self, part, y, parts):
+        """Of [B, parts, H, W]."""
+        return (self.image * parts + part) * self.area + y * self.across + self.column
 
-    def outcome(self, given, y, read):
-        """The six values of a pixel; ``read`` takes what cells gave."""
+    def flow(self, given, y, read):
+        """Flow on a pixel of the start, and where that is at the mean place. ``read`` takes what cells gave."""
         back, *given = given
         terms = len(self.setting.powers)
         field = given[:terms], given[terms : 2 * terms]
-        flow_x = flow_y = 0
         joined = self.setting.joined
+        flow = 0, 0
         for _ in range(self.setting.rounds):
-            place = self.x + back * flow_x, y + back * flow_y
-            flow_x, flow_y = self.polynomials(field, self.setting.powers, place)
+            place = self.x + back * flow[0], y + back * flow[1]
+            flow = self.polynomials(field, self.setting.powers, place)
             if joined:
-                part = self.of_cells(place, 2, read)
-                flow_x = flow_x + part[0]
-                flow_y = flow_y + part[1]
-        place = self.x + back * flow_x, y + back * flow_y
-        flow_x, flow_y = self.polynomials(field, self.setting.powers, place)
-        part_x, part_y, *local = self.of_cells(place, OF_CELL, read)
+                flow = [a + b for a, b in zip(flow, self.of_cells(place, (0, 1), read), strict=True)]
+        place = self.x + back * flow[0], y + back * flow[1]
+        flow = self.polynomials(field, self.setting.powers, place)
+        if joined:
+            flow = [a + b for a, b in zip(flow, self.of_cells(place, (0, 1), read), strict=True)]
+        return flow, place
+
+    def outcome(self, given, y, read):
+        """The six values of a pixel; ``read`` takes what cells gave."""
+        flow, place = self.flow(given, y, read)
         size = len(self.setting.of_variance)
-        rest = given[2 * terms :]
+        rest = given[self.setting.of_flow :]
         rest = [rest[k * size : (k + 1) * size] for k in range(4)]
         xx, xy, yy, widest = self.polynomials(rest, self.setting.of_variance, place)
-        xx = xx + local[0]
-        xy = xy + local[1]
-        yy = yy + local[2]
-        if joined:
-            flow_x = flow_x + part_x
-            flow_y = flow_y + part_y
-        else:
+        of_xx, of_xy, of_yy = self.of_cells(place, (2, 3, 4), read)
+        xx = xx + of_xx
+        xy = xy + of_xy
+        yy = yy + of_yy
+        if not self.setting.joined:
+            part_x, part_y = self.of_cells(place, (0, 1), read)
             xx = xx + part_x * part_x
             xy = xy + part_x * part_y
             yy = yy + part_y * part_y
-        confidence = self.dr.clip(1 - (xx + yy) / widest, 0, 1)
-        return flow_x, flow_y, xx, xy, yy, confidence
+        return *flow, xx, xy, yy, self.dr.clip(1 - (xx + yy) / widest, 0, 1)
 
     def polynomials(self, rows, powers, place):
         """Values of several polynomials with the same powers."""
@@ -202,14 +218,14 @@ class _Pixels(Lanes):
         return found
 
     def of_cells(self, place, parts, read):
-        """Bilinear values of the first parts of the cells, beyond the outermost as there."""
+        """Bilinear values of the cells' ``parts``, beyond the outermost as there."""
         dr = self.dr
         (x, a), (y, b) = (
             self.along(at, last, lower)
             for at, last, lower in zip(place, self.last, self.last_lower, strict=True)
         )
         found = []
-        for part in range(parts):
+        for part in parts:
             plane = self.image * OF_CELL + part
             start = plane * self.plane + y * self.wide + x
             four = [self.take(self.cells, start + corner) for corner in self.corners]

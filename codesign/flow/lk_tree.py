@@ -36,6 +36,7 @@ def posterior(precision: Tensor, pull: Tensor, steps: Tensor) -> tuple[Tensor, T
 class _Posterior(Function):
     @staticmethod
     def forward(ctx, data, steps):
+        ctx.set_materialize_grads(False)
         trees = lk_tree_kernel.Trees(steps.shape[1], len(steps), SHIFTS)
         values, evidence, kept = lk_tree_kernel.forward(data, steps, trees)
         ctx.trees = trees
@@ -43,8 +44,15 @@ class _Posterior(Function):
         return values, evidence
 
     @staticmethod
-    def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx, by_values, by_evidence):  # pyright: ignore[reportIncompatibleMethodOverride]
+        if by_values is None and by_evidence is None:
+            return None, None
         data, steps, *kept = ctx.saved_tensors
+        sizes = len(steps[0]), len(data)
+        grads = [
+            data.new_zeros(shape) if by is None else by
+            for by, shape in ((by_values, (*sizes, *data.shape[1:])), (by_evidence, sizes))
+        ]
         found = lk_tree_kernel.adjoint(data, steps, ctx.trees, kept, *grads)
         return *first_only([found], data, *grads), None
 
