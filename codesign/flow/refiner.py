@@ -17,6 +17,8 @@ from codesign.flow.refiner_evidence import AROUND, CELL, FEW, SOLVED, TOLD, TRIE
 from codesign.types import EventVolume, FlowField
 
 NEVER = 1e-3  # weight that a cell has at least in a mean of cells, before training
+LEAST_NET = 0.5  # flows along the way are not taken longer than the displacement over this
+TURNS = 4  # power of the displacement over the way by which corrections fade
 COARSEST = 4  # cells a side of the coarsest grid
 PRIOR_PX = 3.0  # deviation of each component where nothing is known, as in the closed form
 FAR_PX = 8.0  # flows and changes of flow come into the network in these units
@@ -71,28 +73,33 @@ class Refiner(nn.Module):
             for parameter in last.parameters():
                 nn.init.zeros_(parameter)
 
-    def forward(self, volume: EventVolume, start_px: Tensor | None = None) -> FlowField:
+    def forward(self, volume: EventVolume, start_px: Tensor | None = None, clock: str = "time") -> FlowField:
         """Flow of an EventVolume [B, 2, bins, H, W] of any H, W.
 
         Args: start_px: [B, 2] or [B, 2, H, W] flow that is expected, px per interval, such as that of the window
-          before: the closed form begins from it too (``estimate_lk``).
+          before: the closed form begins from it too (``estimate_lk``). clock: "time" or "events", as of
+          ``estimate_lk``; corrections fade where motion turns back.
         Returns: FlowField with confidence and covariance. An empty sample has flow 0, confidence 0 and no gradient.
         Gradient: counts and weights.
         Raises: ShapeError for other shapes or numbers of bins; DomainError for counts that are no events.
         """
-        return self.predictions(volume, start_px)[-1]
+        return self.predictions(volume, start_px, clock)[-1]
 
     @takes_volume
-    def predictions(self, volume: EventVolume, start_px: Tensor | None = None) -> list[FlowField]:
+    def predictions(
+        self, volume: EventVolume, start_px: Tensor | None = None, clock: str = "time"
+    ) -> list[FlowField]:
         """FlowFields after each correction. Arguments, gradient and errors as ``forward``."""
-        return self.refined(volume, self.start(volume, start_px))
+        return self.refined(volume, self.start(volume, start_px, clock), clock=clock)
 
-    def start(self, volume: EventVolume, start_px: Tensor | None = None) -> FlowField:
+    def start(self, volume: EventVolume, start_px: Tensor | None = None, clock: str = "time") -> FlowField:
         """The closed form that is corrected."""
         with torch.autocast(volume.counts.device.type, enabled=False):  # its solves need full precision
-            return estimate_lk(volume, model="local", start_px=start_px)
+            return estimate_lk(volume, model="local", start_px=start_px, clock=clock)
 
-    def refined(self, volume: EventVolume, start: FlowField, through: bool = True) -> list[FlowField]:
+    def refined(
+        self, volume: EventVolume, start: FlowField, through: bool = True, clock: str = "time"
+    ) -> list[FlowField]:
         """FlowFields after each correction of an estimate with covariance, such as ``start(volume)``, whose covariance
         says how far it may be off. Gradient: counts, start and weights.
 
@@ -100,10 +107,11 @@ class Refiner(nn.Module):
           RAFT (Teed and Deng, ECCV 2020): it takes a third off a step.
         """
         with torch.autocast(volume.counts.device.type, enabled=False):
-            evidence = Evidence(replace(volume, counts=pad_to(volume.counts, CELL)))
+            evidence = Evidence(replace(volume, counts=pad_to(volume.counts, CELL)), clock)
+        net = evidence.net.clamp_min(LEAST_NET)
         claimed = start.covariance_px2
-        deviation = _on_cells((claimed[:, :1] + claimed[:, 2:]) / 2)
-        first = flow = _on_cells(start.flow_px)
+        deviation = _on_cells((claimed[:, :1] + claimed[:, 2:]) / 2) / net.square()
+        first = flow = _on_cells(start.flow_px) / net
         near = avg_pool2d(evidence.density, 3, 1, 1, count_include_pad=False) + FEW
         far = evidence.mean_density.expand_as(near)
         told = torch.cat([near.log(), far.log(), (deviation + SPARE_PX2).log()], 1) / 4
@@ -121,8 +129,8 @@ class Refiner(nn.Module):
             own, shares = self.change(core).split([2, SOLVED + len(AROUND)], 1)
             moves = torch.cat([solved, offered], 1)
             flow = flow + unit * own + (shares[:, :, None] * moves).sum(1)
-            found.append((_on_pixels(flow - first, self.edges(core)), self.claim(core)))
-        shown = presence(volume.counts)
+            found.append((_on_pixels(net * (flow - first), self.edges(core)), self.claim(core)))
+        shown = presence(volume.counts) * evidence.net.clamp_min(0) ** TURNS
         return [_field(volume, start, shown, *parts) for parts in found]
 
     def _core(self, known):

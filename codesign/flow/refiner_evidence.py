@@ -44,13 +44,15 @@ OVERLAP = 4 * math.pi
 
 
 class Evidence:
-    """A volume blurred at several scales, and what it says along a flow.
+    """A volume blurred at several scales, and what it says along a flow, px per way (lk_path).
 
     Sides of the volume are multiples of CELL. density: [B, 1, h, w] events per px on cells; mean_density: [B, 1, 1, 1].
+    net: [B, 1, 1, 1] displacement over the way, 1 for motion that never turns.
     """
 
-    def __init__(self, volume: EventVolume) -> None:
-        way, (weight, time), density = along_path(volume, "time")
+    def __init__(self, volume: EventVolume, clock: str = "time") -> None:
+        way, (weight, time), density = along_path(volume, clock)
+        self.net = way.net.to(density)[:, None, None, None]
         height, width = density.shape[-2:]
         place = time - weight @ time
         spread = weight @ place.square()
