@@ -34,7 +34,7 @@ BODIES = {
 }
 LOW = Design(2.5, 1.2, 0.0, 0.33, -0.15, 0.1, -0.6, 0.0, -0.4)
 HIGH = Design(12.0, 1.2, 8.0, 0.5, 0.15, 0.7, 0.6, math.radians(80), 0.4)
-START = Design(6.5, 1.2, 0.7, 0.4, 0.0, 0.25, 0.0, math.radians(22), 0.0)
+START = Design(6.5, 1.2, 0.55, 0.4, 0.0, 0.22, 0.0, math.radians(19), 0.0)
 
 
 def outdoors() -> RobotPair:
@@ -43,7 +43,7 @@ def outdoors() -> RobotPair:
 
     >>> pair = outdoors()
     >>> pair.check(pair.design).mount()[:3, 3].tolist()
-    [0.4, 0.0, 0.25]
+    [0.4, 0.0, 0.22]
     """
     prior = (1.5, 0.2, 0.05, 0.8, 0.8, 0.8)
     return RobotPair(

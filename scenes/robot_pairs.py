@@ -2,7 +2,13 @@
 
 from collections.abc import Callable
 
+from scenes.robot_corridor import corridor
+from scenes.robot_flight import flight
 from scenes.robot_outdoors import outdoors
 from scenes.robot_pair import RobotPair
 
-PAIRS: dict[str, Callable[[], RobotPair]] = {"outdoors": outdoors}
+PAIRS: dict[str, Callable[[], RobotPair]] = {
+    "outdoors": outdoors,
+    "corridor": corridor,
+    "flight": flight,
+}

@@ -59,6 +59,7 @@ GROUPS = {
         "joint_design",
         "placement",
         "mount_sight",
+        "robot_gates",
         "gradient_flow",
         "certify_precision",
         "speed_error",

@@ -1,5 +1,6 @@
 """Robots and their worlds: bodies by volume, drives by closed forms, flow by two roads, variants by number."""
 
+import itertools
 import math
 from dataclasses import fields, replace
 
@@ -165,6 +166,32 @@ def test_the_design_starts_inside_its_bounds_and_others_are_refused(pair):
         assert low < start < high or low == start == high
     with pytest.raises(DomainError, match=r"efl_mm = 99 lies outside its bounds"):
         pair.check(replace(pair.design, efl_mm=99.0))
+
+
+def test_cameras_inside_the_bounds_stand_clear_of_the_body(pair):
+    """A housing of 4 cm about every corner of the box touches nothing; where it starts it looks as far as it must."""
+    body = place.Body((mesh.vertices_m, mesh.faces) for mesh in pair.bodies.values())
+    corners = [
+        torch.tensor(
+            [getattr(low_or_high, f"{axis}_m") for low_or_high, axis in zip(ends, "xyz", strict=True)]
+        )
+        for ends in itertools.product((pair.low, pair.high), repeat=3)
+    ]
+    assert float(body.distance_m(torch.stack(corners).double()).min()) > 0.02
+    if pair.look_ahead is not None:
+        distance_m, share = pair.look_ahead
+        ahead = place.LookAhead(distance_m=distance_m, share=share)
+        assert all(
+            verdict.kept for verdict in place.judge([ahead], pair.design.mount(), pair.design.camera())
+        )
+
+
+def test_the_corridor_robot_sees_its_forks():
+    pair = PAIRS["corridor"]()
+    camera = pair.design.camera()
+    rays = camera.chief_rays(camera.film.pixels())
+    _, _, hit = render.truth.world_points(rays, pair.body(), pair.design.mount())
+    assert 0.02 < float(hit.double().mean()) < 0.4
 
 
 def test_a_design_is_its_lens_and_its_mount():
