@@ -13,6 +13,7 @@ import sys
 from dataclasses import dataclass
 from typing import ClassVar
 
+import drjit as dr
 import matplotlib.pyplot as plt
 import torch
 
@@ -55,8 +56,8 @@ class Config(StudyConfig):
     """Timed calls per turn."""
     rounds: int = 5
     """Turns of every estimator at 256 x 256 pixels; growth gets two."""
-    threads: int = 2
-    """Threads of torch."""
+    threads: int = 1
+    """Threads of torch and of drjit; more than one wait for each other in processor time."""
 
 
 def study(run: Run[Config]) -> None:
@@ -67,6 +68,7 @@ def study(run: Run[Config]) -> None:
             "1 and 1."
         )
     torch.set_num_threads(config.threads)
+    dr.set_thread_count(config.threads)
     rounds = config.rounds
     sizes = SIZES_PX[:2] if config.quick else SIZES_PX
     table = entries(config.seed)
