@@ -24,7 +24,8 @@ from codesign.types import EventVolume, FlowField
 MODELS = {"constant": "constant", "affine": "affine", "quadratic": "quadratic", "local": "quadratic"}
 CLOCKS = ("time", "events")
 TURNED = 0.1  # share of the variance of the whole way that remains where it leads back to its start
-MOST_BLUR_PX = 1000
+LEAST_BLUR_PX, MOST_BLUR_PX = 0.2, 1000  # below, a Gaussian is one sample
+LONGEST_PX = 1e4  # of a prior or a start
 
 
 def estimate_lk(
@@ -75,9 +76,10 @@ def estimate_lk(
     counts = check_volume(volume, least_bins=2)
     if not isinstance(model, str) or model not in MODELS:
         raise DomainError(f"flow model '{model}' is unknown; choose one of {', '.join(MODELS)}.")
-    if clock not in CLOCKS:
+    if not isinstance(clock, str) or clock not in CLOCKS:
         raise DomainError(f"clock '{clock}' is unknown; choose one of {', '.join(CLOCKS)}.")
-    check_number(prior_px, "prior_px", above=0.0)
+    if check_number(prior_px, "prior_px", above=0.0) > LONGEST_PX:
+        raise DomainError(f"prior_px is {prior_px:g}; at most {LONGEST_PX:g} px are possible.")
     check_number(noise_floor, "noise_floor", 0.0)
     steps = check_count(steps, "steps", 1)
     if not isinstance(levels_px, Sequence) or not levels_px or isinstance(levels_px, str):
@@ -85,8 +87,10 @@ def estimate_lk(
             f"levels_px is {shown(levels_px)}; a list of blurs in pixels, coarse to fine, is needed."
         )
     for blur_px in levels_px:
-        if check_number(blur_px, "a blur of levels_px", above=0.0) > MOST_BLUR_PX:
-            raise DomainError(f"a blur of levels_px is {blur_px:g} px; at most {MOST_BLUR_PX} are possible.")
+        if not LEAST_BLUR_PX <= check_number(blur_px, "a blur of levels_px", above=0.0) <= MOST_BLUR_PX:
+            raise DomainError(
+                f"a blur of levels_px is {blur_px:g} px; {LEAST_BLUR_PX} to {MOST_BLUR_PX} are possible."
+            )
     batch, _, _, height, width = counts.shape
     if min(height, width) < 2:
         raise ShapeError(
@@ -128,9 +132,13 @@ def _start(start_px, counts):
     """[B, 2, H, W] as ``counts``."""
     batch, _, _, height, width = counts.shape
     if check_real(start_px, "start_px").ndim != 2:
-        return check_flow(start_px, (batch, 2, height, width), "start_px").to(counts)
-    if tuple(start_px.shape) != (batch, 2):
+        start_px = check_flow(start_px, (batch, 2, height, width), "start_px")
+    elif tuple(start_px.shape) != (batch, 2):
         raise ShapeError(
             f"start_px is {list(start_px.shape)}; [{batch}, 2] or [{batch}, 2, {height}, {width}] is needed."
         )
-    return check_finite(start_px, "start_px").to(counts)[:, :, None, None].expand(-1, -1, height, width)
+    else:
+        start_px = check_finite(start_px, "start_px")[:, :, None, None].expand(-1, -1, height, width)
+    if (longest := float(start_px.detach().abs().max())) > LONGEST_PX:
+        raise DomainError(f"start_px reaches {longest:g} px; at most {LONGEST_PX:g} px are possible.")
+    return start_px.to(counts)

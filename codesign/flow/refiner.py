@@ -130,8 +130,9 @@ class Refiner(nn.Module):
             moves = torch.cat([solved, offered], 1)
             flow = flow + unit * own + (shares[:, :, None] * moves).sum(1)
             found.append((_on_pixels(net * (flow - first), self.edges(core)), self.claim(core)))
-        shown = presence(volume.counts) * evidence.net.clamp_min(0) ** TURNS
-        return [_field(volume, start, shown, *parts) for parts in found]
+        present = presence(volume.counts)
+        shown = present * evidence.net.clamp_min(0) ** TURNS
+        return [_field(volume, start, present, shown, *parts) for parts in found]
 
     def _core(self, known):
         """Features [B, width, h, w] of the cells, from what is known of them; beyond the image nothing is."""
@@ -169,9 +170,10 @@ def _linear():
     return (along[:, None, :, None] * along[None, :, None, :]).flatten(0, 1)
 
 
-def _field(volume, start, shown, change, claim):
+def _field(volume, start, present, shown, change, claim):
     """FlowField from the change of the flow [B, 2, >= H, >= W] px and the claim [B, 2, h, w] on cells: logarithms of
-    the factor on the start's covariance and of the variance that is added."""
+    the factor on the start's covariance and of the variance that is added; ``shown`` [B, 1, 1, 1] is how much of both
+    counts."""
     height, width = start.flow_px.shape[-2:]
     change, claim = (part[..., :height, :width] for part in (change, larger(claim, CELL)))
     factor, added = (WIDEST * torch.tanh(claim / WIDEST)).exp().split(1, 1)
@@ -179,7 +181,7 @@ def _field(volume, start, shown, change, claim):
     added = shown * SPARE_PX2 * added
     covariance = covariance + torch.cat([added, torch.zeros_like(added), added], 1)
     spread = (covariance[:, 0] + covariance[:, 2]) / 2
-    confidence = shown[:, 0] / (1 + spread / PRIOR_PX**2)
-    valid = (shown.detach() > 0)[:, 0].expand(-1, height, width)
+    confidence = present[:, 0] / (1 + spread / PRIOR_PX**2)
+    valid = (present.detach() > 0)[:, 0].expand(-1, height, width)
     interval_s = float(volume.collected_s.sum())
     return FlowField(start.flow_px + shown * change, valid, interval_s, confidence, covariance)

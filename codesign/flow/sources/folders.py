@@ -81,7 +81,7 @@ def natural(path: str | Path) -> list[int | str]:
 
 def event_files(path: Path) -> list[Path]:
     """[event file] of a recording: the file itself; events.* of a folder; otherwise one per packet, from the
-    folder or its subfolders, in natural order.
+    folder or its subfolders, in natural order; of several of one name the first of KINDS.
 
     Raises: FileFormatError when there is none.
     """
@@ -101,7 +101,9 @@ def event_files(path: Path) -> list[Path]:
                 (entry for entry in folder.iterdir() if entry.is_file() and _holds_events(entry)), key=natural
             )
             named = [entry for entry in found if entry.stem.lower() == "events"]
-            files += sorted(named, key=_rank)[:1] if named else found
+            wanted = named or found
+            worse = _worse(wanted)
+            files += [entry for entry in wanted if entry not in worse]
         if files:
             return files
     raise FileFormatError(
@@ -112,15 +114,25 @@ def event_files(path: Path) -> list[Path]:
 
 def passed_over(file: Path) -> list[Path]:
     """Other event files of the same name beside one, which event_files passes over."""
-    if file.stem.lower() != "events":
-        return []
-    same = (entry for entry in file.parent.iterdir() if entry.stem.lower() == "events" and entry != file)
+    same = (entry for entry in file.parent.iterdir() if entry != file and _stem(entry) == _stem(file))
     return sorted((entry for entry in same if entry.is_file() and _holds_events(entry)), key=natural)
+
+
+def _stem(entry):
+    return entry.stem.lower()
+
+
+def _worse(files):
+    """Those of which another of the same name is read."""
+    best = {}
+    for entry in sorted(files, key=_rank, reverse=True):
+        best[_stem(entry)] = entry
+    return set(files) - set(best.values())
 
 
 def _rank(entry):
     suffix = entry.suffix.lower()
-    return KINDS.index(suffix) if suffix in KINDS else len(KINDS)
+    return KINDS.index(suffix) if suffix in KINDS else len(KINDS), entry.name
 
 
 def flow_files(folder: Path) -> list[Path]:
