@@ -252,6 +252,20 @@ def test_gradcheck(model, generator):
         ),
         (torch.full((1, 2, 5, 32, 32), math.nan), {}, DomainError, "event volume"),
         (torch.zeros(1, 2, 5, 32, 32), {"model": "cubic"}, DomainError, "flow model 'cubic' is unknown"),
+        (torch.zeros(1, 2, 5, 32, 32), {"clock": ["time"]}, DomainError, "clock .* is unknown"),
+        (
+            torch.zeros(1, 2, 5, 32, 32),
+            {"levels_px": (0.05,)},
+            DomainError,
+            "0.05 px; 0.2 to 1000 are possible",
+        ),
+        (torch.zeros(1, 2, 5, 32, 32), {"prior_px": 1e20}, DomainError, "at most 10000 px"),
+        (
+            torch.zeros(1, 2, 5, 32, 32),
+            {"start_px": torch.full((1, 2), 1e300, dtype=torch.float64)},
+            DomainError,
+            "reaches 1e\\+300 px",
+        ),
     ],
 )
 def test_volumes_and_models_that_cannot_be_are_refused(counts, options, error, sentence):

@@ -270,7 +270,12 @@ def test_events_may_be_the_clock():
     rate = 20 * torch.cos(time) * (torch.sin(u / 2 + y / 7) + torch.sin(y / 2 - u / 5))
     turned = volume(torch.stack([rate.clamp(min=0), (-rate).clamp(min=0)])[None])
     start = estimate_lk(turned, model="local", clock="events").flow_px
-    assert (network()(turned, clock="events").flow_px - start).abs().max() < 1e-3
+    found = network()(turned, clock="events")
+    assert (found.flow_px - start).abs().max() < 1e-3
+    assert found.confidence is not None
+    assert found.covariance_px2 is not None
+    spread = (found.covariance_px2[:, 0] + found.covariance_px2[:, 2]) / 2
+    torch.testing.assert_close(found.confidence, 9 / (9 + spread), rtol=1e-3, atol=0)
     assert (network()(turned).flow_px - start).abs().max() > 0.1
 
 

@@ -46,6 +46,16 @@ def test_text_is_read_before_arrays_of_the_same_name_and_that_is_said(tmp_path):
     assert any("events from events.txt; events.npy beside it not read" in note for note in packet.notes)
 
 
+def test_a_recording_in_two_forms_is_one(tmp_path):
+    columns = recording(tmp_path / "a")
+    (tmp_path / "a" / "events.txt").rename(tmp_path / "a" / "walk-01.txt")
+    np.save(tmp_path / "a" / "walk-01.npy", np.zeros((3, 4)))
+    packets = read_packets(tmp_path / "a", options=WINDOWS)
+    assert {packet.name.split()[0] for packet in packets} == {"walk-01.txt"}
+    assert len(packets[0].stream) == int((columns[0] <= columns[0][0] + 20_000).sum())
+    assert any("walk-01.npy beside it not read" in note for note in packets[0].notes)
+
+
 def test_motion_recorded_later_than_the_events_tells_of_the_windows_it_covers(tmp_path):
     columns = recording(tmp_path / "a")
     start_s = columns[0][0] * 1e-6

@@ -45,6 +45,7 @@ def varied(optic):
     return render.Camera(optic, 16, 16, 0.1, 4)
 
 
+@pytest.mark.bits
 @pytest.mark.parametrize("kind", CAMERAS)
 def test_it_loads_back_bit_for_bit(tmp_path, generator, kind):
     camera = CAMERAS[kind]()
