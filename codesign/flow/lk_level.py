@@ -170,6 +170,16 @@ def _trusted(normal, scattered, right):
     return (kept + kept.mT) / 2, (root @ (trust @ seen))[..., 0], explained
 
 
+def gaussian(sigma_px: float, step: int) -> Tensor:
+    """Taps [2 radius + 1], float64, on samples ``step`` px apart, that after averaging over squares of ``step`` px make
+    a Gaussian of standard deviation sigma."""
+    # in samples: the averages have variance (step^2 - 1) / 12 px^2
+    spread = math.sqrt(sigma_px**2 - (step**2 - 1) / 12) / step
+    radius = int((3.0 if step == 1 else 2.5) * spread + 0.5)
+    taps = torch.exp(-torch.arange(-radius, radius + 1, dtype=torch.float64).square() / (2 * spread**2))
+    return taps / taps.sum()
+
+
 def _blurred(images, sigma_px, grid):
     """[B, n, H, W] averaged over squares, then through a Gaussian, together of standard deviation sigma;
     mirrored at the border.
@@ -177,11 +187,8 @@ def _blurred(images, sigma_px, grid):
     Returns: images on the samples of ``grid``, and the whole kernel along one axis, taps of 1 px.
     """
     step = grid.stride
-    # in samples: the averages have variance (step^2 - 1) / 12 px^2
-    spread = math.sqrt(sigma_px**2 - (step**2 - 1) / 12) / step
-    radius = int((3.0 if step == 1 else 2.5) * spread + 0.5)
-    taps = torch.exp(-torch.arange(-radius, radius + 1, dtype=torch.float64).square() / (2 * spread**2))
-    taps = taps / taps.sum()
+    taps = gaussian(sigma_px, step)
+    radius = len(taps) // 2
     kernel = torch.zeros(2 * radius * step + step, dtype=torch.float64)
     for shift in range(step):
         kernel[shift : shift + 2 * radius * step + 1 : step] += taps / step

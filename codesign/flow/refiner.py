@@ -36,11 +36,12 @@ class Refiner(nn.Module):
     Args: bins: time bins of the volumes. width: channels on cells of 4 px, a multiple of 16. steps:
       corrections, by the same weights.
     A correction reads the volume along the flow so far and solves V_t + u V_x + v V_y = 0 by least squares for what
-    still moves, on cells of 4 px, at three blurs and in windows of 12, 28 and 36 px (refiner_evidence). A U-Net on
-    cells of 4, 8 and 16 px reads these solutions and how sure they are, the bins as they are and along the flow so far, all in units
-    of the noise of scattered events, the density of events, the flow so far and the deviation that the closed form
-    claims. It says cell by cell how much of each solution to add, adds something of
-    its own, of their size, and says how wide the claim is to be. Fresh weights give the closed form as it is.
+    still moves, on cells of 4 px, at three blurs and in windows of 12, 28 and 36 px, and tries the flows of cells around
+    (refiner_evidence). A U-Net on cells of 4, 8 and 16 px reads these solutions and how sure they are, the bins as they
+    are and along the flow so far, all in units of the noise of scattered events, the density of events, the flow so far
+    and the deviation that the closed form claims. It says cell by cell how much of each solution and neighbour to add,
+    adds something of its own in units of the claimed deviation, and says how pixels mix cells and how wide the claim is
+    to be. Fresh weights give the closed form as it is.
     Bins are read at q + t flow(q), so the flow belongs to the pixels of the window's start.
 
     >>> from codesign.flow.export import evenly_timed

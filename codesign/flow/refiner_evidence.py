@@ -11,7 +11,6 @@ flows of cells around are tried as they are (PatchMatch: Barnes et al., SIGGRAPH
 """
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -19,7 +18,7 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate, pad
 
 from codesign.flow.lk_kernel import blurred, cell_sums, moving
 from codesign.flow.lk_lanes import Grid
-from codesign.flow.lk_level import along_path
+from codesign.flow.lk_level import along_path, gaussian
 from codesign.flow.warp import pixel_grid
 from codesign.types import EventVolume
 
@@ -67,7 +66,9 @@ class Evidence:
         for blur in BLURS:
             grid = Grid(height, width, blur)
             pooled = avg_pool2d(density, blur) if blur > 1 else density
-            self.levels.append((blur, grid, blurred(way.counts, grid, _taps(blur)), pooled))
+            taps = gaussian(blur, blur)
+            counts = blurred(way.counts, grid, taps[len(taps) // 2 :].tolist())
+            self.levels.append((blur, grid, counts, pooled))
 
     def at(self, flow: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
         """What is still missing along a flow [B, 2, h, w] px on cells, of which ``variance`` [B, 1, h, w] px^2 is
@@ -174,16 +175,6 @@ def _compressed(value):
 def larger(image: Tensor, factor: int) -> Tensor:
     """An image on cells enlarged bilinearly."""
     return interpolate(image, scale_factor=factor, mode="bilinear", align_corners=False)
-
-
-def _taps(blur: int) -> Sequence[float]:
-    """Half a Gaussian that makes, after averaging over squares, one of standard deviation ``blur`` samples of ``blur``
-    px."""
-    spread = math.sqrt(blur**2 - (blur**2 - 1) / 12) / blur
-    radius = int((3.0 if blur == 1 else 2.5) * spread + 0.5)
-    taps = [math.exp(-(k**2) / (2 * spread**2)) for k in range(radius + 1)]
-    total = taps[0] + 2 * sum(taps[1:])
-    return [tap / total for tap in taps]
 
 
 def _least(weight, matrix, xs, ys, prior):

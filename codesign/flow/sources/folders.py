@@ -101,9 +101,7 @@ def event_files(path: Path) -> list[Path]:
                 (entry for entry in folder.iterdir() if entry.is_file() and _holds_events(entry)), key=natural
             )
             named = [entry for entry in found if entry.stem.lower() == "events"]
-            wanted = named or found
-            worse = _worse(wanted)
-            files += [entry for entry in wanted if entry not in worse]
+            files += _one_of_each_name(named or found)
         if files:
             return files
     raise FileFormatError(
@@ -122,12 +120,9 @@ def _stem(entry):
     return entry.stem.lower()
 
 
-def _worse(files):
-    """Those of which another of the same name is read."""
-    best = {}
-    for entry in sorted(files, key=_rank, reverse=True):
-        best[_stem(entry)] = entry
-    return set(files) - set(best.values())
+def _one_of_each_name(files):
+    best = {_stem(entry): entry for entry in sorted(files, key=_rank, reverse=True)}
+    return [entry for entry in files if best[_stem(entry)] == entry]
 
 
 def _rank(entry):
