@@ -122,6 +122,13 @@ class RobotPair:
                 )
         return design
 
+    @property
+    def ranges(self) -> place.MountRanges:
+        """Bounds of the mount."""
+        names = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "roll_rad")
+        low, high = ([getattr(each, name) for name in names] for each in (self.low, self.high))
+        return place.MountRanges(low, high)
+
     def body(self) -> render.MitsubaScene:
         """The robot in its own axes, grey in the light of a plain sky that turns with it."""
         grey = Paint(np.full((1, 1), 90.0))

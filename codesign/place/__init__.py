@@ -5,6 +5,7 @@ from codesign.place.body import Body, Housing
 from codesign.place.criterion import Sight, expected_error, flow_precision, sight
 from codesign.place.mount import Mount, yaw_pitch_roll_rad
 from codesign.place.observability import FREE, PLANAR, body_flow, information, planar_flow, velocity_from_flow
+from codesign.place.ranges import MountRanges
 from codesign.place.requirements import CableSide, Clearance, LookAhead, Requirement, Verdict, judge, penalty
 from codesign.place.starts import check_mount, starts
 
@@ -17,6 +18,7 @@ __all__ = [
     "Housing",
     "LookAhead",
     "Mount",
+    "MountRanges",
     "Requirement",
     "Sight",
     "Verdict",

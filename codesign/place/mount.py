@@ -184,20 +184,24 @@ class Mount(nn.Module):
         return T_world_body @ self(numbers)
 
 
-def attitude(yaw_rad: float, pitch_rad: float, roll_rad: float) -> Tensor:
-    """Rotation [3, 3] from camera to body axes: Rz(yaw) Ry(pitch) Rx(roll) after the axes of a level camera.
-    Raises: DomainError when not finite."""
+def attitude(yaw_rad: float | Tensor, pitch_rad: float | Tensor, roll_rad: float | Tensor) -> Tensor:
+    """Rotations [..., 3, 3] float64 from camera to body axes: Rz(yaw) Ry(pitch) Rx(roll) after the axes of a level
+    camera.
+
+    Args: numbers or tensors [...] that broadcast. Gradient: exact, to the angles. Raises: DomainError when not finite.
+    """
     turn = torch.eye(3, dtype=torch.float64)
     for axis, angle, name in (
         (2, yaw_rad, "yaw_rad"),
         (1, pitch_rad, "pitch_rad"),
         (0, roll_rad, "roll_rad"),
     ):
-        vector = torch.zeros(6, dtype=torch.float64)
-        vector[3 + axis] = check_finite(
+        angle = check_finite(
             torch.as_tensor(angle, dtype=torch.float64), f"mount: {name}", "give a finite angle"
         )
-        turn = turn @ se3_exp(vector)[:3, :3]
+        zero = torch.zeros_like(angle)
+        vector = torch.stack([angle if k == 3 + axis else zero for k in range(6)], -1)
+        turn = turn @ se3_exp(vector)[..., :3, :3]
     return turn @ AXES_BODY_CAM
 
 
