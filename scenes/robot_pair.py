@@ -39,6 +39,8 @@ FILM = render.Film(
 RAYS_PER_PX = 8
 DURATION_S = 0.02
 FRAMES = 9
+LEAD_S = DURATION_S / (FRAMES - 2)  # the first interval lets the sensor settle: its events are not read
+MIDDLE_S = LEAD_S + DURATION_S / 2
 BINS = 5
 SENSOR = events.SensorModel(
     theta_on=0.25, theta_off=0.25, theta_sigma=0.03, cutoff_hz=200.0, shot_rate_hz=5.0
@@ -180,9 +182,11 @@ class RobotPair:
 
 
 LAYERS = {
-    "memory": events.layer("memory", SENSOR, learn=()),
-    "counts": events.layer("counts", replace(SENSOR, theta_sigma=0.0, shot_rate_hz=0.0), learn=()),
-    "sensor": events.HardSensor(SENSOR, BINS),
+    "memory": events.Settled(events.layer("memory", SENSOR, learn=()), LEAD_S),
+    "counts": events.Settled(
+        events.layer("counts", replace(SENSOR, theta_sigma=0.0, shot_rate_hz=0.0), learn=()), LEAD_S
+    ),
+    "sensor": events.HardSensor(SENSOR, BINS, LEAD_S),
 }
 
 
@@ -208,13 +212,13 @@ def _counted(count):
 
 
 def times() -> Tensor:
-    """[T] seconds of the frames of a window."""
-    return torch.linspace(0, DURATION_S, FRAMES, dtype=torch.float64)
+    """[T] seconds of the frames: one before the window, in which the sensor settles, and those of the window."""
+    return torch.linspace(0, LEAD_S + DURATION_S, FRAMES, dtype=torch.float64)
 
 
 def moved(T_world_body: Tensor, twist: Tensor) -> Tensor:
     """Poses [M, T, 4, 4] of bodies that are at [M, 4, 4] in the middle of the window and go with twists [M, 6]."""
-    return T_world_body[:, None] @ se3_exp((times() - DURATION_S / 2)[:, None] * twist[:, None])
+    return T_world_body[:, None] @ se3_exp((times() - MIDDLE_S)[:, None] * twist[:, None])
 
 
 def speeds_and_deviates(number: int, motions: int, columns: int) -> tuple[Tensor, Tensor]:

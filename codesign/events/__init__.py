@@ -16,6 +16,7 @@ from codesign.events.layers.layer import ComparatorLayer, EventLayer, PhysicalLa
 from codesign.events.layers.memory import memory, soft_counts
 from codesign.events.layers.physical import PhysicalState, sensor_counts
 from codesign.events.layers.positive import PositiveValues
+from codesign.events.layers.settled import Settled
 from codesign.events.layers.soft import soft
 from codesign.events.level_path import finer
 from codesign.events.low_pass import low_pass, one_pole
@@ -55,6 +56,7 @@ __all__ = [
     "RecordedFrames",
     "SensorModel",
     "SensorState",
+    "Settled",
     "SpikeEsim",
     "SpikeEsimState",
     "SrmState",

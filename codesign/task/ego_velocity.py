@@ -80,15 +80,25 @@ class EgoVelocity:
         self.steps = check_whole(steps, "steps")
 
     def __call__(
-        self, field: FlowField, camera: ChiefRayCamera, scene: Any, T_body_cam: Tensor, T_world_cam: Tensor
+        self,
+        field: FlowField,
+        camera: ChiefRayCamera,
+        scene: Any,
+        T_body_cam: Tensor,
+        T_world_cam: Tensor,
+        t_s: Tensor | None = None,
     ) -> Motion:
-        """Motion of N bodies from fields [N x windows, 2, H, W] behind poses T_world_cam [..., T, 4, 4]."""
+        """Motion of N bodies from fields [N x windows, 2, H, W] behind poses T_world_cam [..., T, 4, 4].
+
+        t_s: [T] of the poses; the flow's interval ends with them and may begin later. None: it is all of them.
+        """
         poses = T_world_cam.reshape(-1, *T_world_cam.shape[-3:])
         count = len(poses)
         pixels, flow, precision, seen = self._measured(field, camera, count)
-        middle = pixels + flow.detach() / 2  # where the points are at mid-interval
+        frame, share = _middle(poses.shape[1], t_s, field.interval_s)
+        middle = pixels + share * flow.detach()  # where the points are at that frame
         mounts = T_body_cam.double().expand(*T_world_cam.shape[:-3], 4, 4).reshape(-1, 4, 4)
-        depth = self.depth(camera, middle, poses[:, poses.shape[1] // 2], scene)
+        depth = self.depth(camera, middle, poses[:, frame], scene)
         rows, on_surface = self._rows(camera, depth, mounts, middle, field.interval_s)
         share = INDEPENDENT * _windows(camera) / flow.shape[1] * on_surface.to(flow)
         prior = torch.diag(flow.new_tensor(self.prior) ** -2)
@@ -126,6 +136,15 @@ class EgoVelocity:
     def _rows(self, camera, depth, mounts, pixels, interval_s):
         rows, seen = place.body_flow(camera, depth, mounts, pixels)
         return rows[..., list(self.axes)] * interval_s, seen
+
+
+def _middle(frames: int, t_s: Tensor | None, interval_s: float) -> tuple[int, float]:
+    """Number of the frame nearest to the middle of the flow's interval, and how much of the interval is over then."""
+    if t_s is None:
+        return frames // 2, 0.5
+    since_s = t_s - (t_s[-1] - interval_s)
+    frame = int((since_s - interval_s / 2).abs().argmin())
+    return frame, float(since_s[frame]) / interval_s
 
 
 def _windows(camera):
