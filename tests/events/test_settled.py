@@ -53,11 +53,12 @@ def test_the_steady_rate_of_a_ramp_is_read_after_the_lead(part):
 
 @pytest.mark.parametrize("part", PARTS.values(), ids=PARTS)
 def test_a_slow_sensor_has_settled_after_its_lead(part):
-    """Behind a low pass the first events come later still; after the lead hardly anything is missed."""
-    settled = part(SLOW, LEAD_S)(ramps(times()), times(), 5).counts.sum() / 200
-    sudden = part(SLOW, 0.0)(ramps(times(0.0)), times(0.0), 5).counts.sum() / 200
-    assert sudden.item() < STEADY - 0.6
-    assert settled.item() == pytest.approx(STEADY, rel=0.06)
+    """Behind a low pass the first events come later still; after the lead what is left is that its time constant, which
+    goes as one over the light, is shorter at the end of the ramp than at its beginning."""
+    settled = part(SLOW, LEAD_S)(ramps(times()), times(), 5).counts.sum().item() / 200
+    sudden = part(SLOW, 0.0)(ramps(times(0.0)), times(0.0), 5).counts.sum().item() / 200
+    assert sudden <= STEADY - 0.5
+    assert STEADY < settled < STEADY + 0.2
 
 
 def test_gradient_is_that_of_the_count():
