@@ -100,6 +100,9 @@ class RobotPair:
     depth: how depth is known, "ground" or "scene" (``task.EgoVelocity``).
     look_ahead: distance in metres, and the share of the image that must see beyond it; None where nothing must.
     world: number -> what stands still. drive: (number, how many) -> T_world_body [M, T, 4, 4], twist [M, 6].
+    housing_radius_m, margin_m: of the camera, and by how much it must stay clear of the body. own_body_share: of the
+      image, that the body may cover. cable: direction in body axes and half angle in radians of a cone into which the
+      camera's back must not point; None where it may point anywhere. ground_z_m: height of the ground in body axes.
     """
 
     name: str
@@ -113,6 +116,11 @@ class RobotPair:
     look_ahead: tuple[float, float] | None
     world: Callable[[int], render.MitsubaScene]
     drive: Callable[[int, int], tuple[Tensor, Tensor]]
+    housing_radius_m: float = 0.02
+    margin_m: float = 0.005
+    own_body_share: float = 0.3
+    cable: tuple[tuple[float, float, float], float] | None = None
+    ground_z_m: float = 0.0
 
     def check(self, design: Design) -> Design:
         """The design. Raises: DomainError where a number of it lies outside the bounds."""
@@ -131,10 +139,21 @@ class RobotPair:
         low, high = ([getattr(each, name) for name in names] for each in (self.low, self.high))
         return place.MountRanges(low, high)
 
+    def requirements(self) -> list[place.Requirement]:
+        """What a mount of this robot has to keep, the cheap ones first."""
+        body = place.Body((mesh.vertices_m, mesh.faces) for mesh in self.bodies.values())
+        found: list[place.Requirement] = []
+        if self.cable is not None:
+            found.append(place.CableSide(*self.cable))
+        if self.look_ahead is not None:
+            found.append(place.LookAhead(*self.look_ahead, ground_z_m=self.ground_z_m))
+        found.append(place.Clearance(body, place.Housing(self.housing_radius_m), self.margin_m))
+        return [*found, task.OwnBody(body, self.own_body_share)]
+
     def body(self) -> render.MitsubaScene:
         """The robot in its own axes, grey in the light of a plain sky that turns with it."""
         grey = Paint(np.full((1, 1), 90.0))
-        return emissive(World({name: (mesh, grey) for name, mesh in self.bodies.items()}))
+        return emissive(World({name: (mesh, grey) for name, mesh in self.bodies.items()}, two_sided=True))
 
     def batch(self, numbers: Sequence[int], motions: int, seed: int = 0) -> Drives:
         """Worlds of these numbers with as many drives each, the body in them; the same for every design.

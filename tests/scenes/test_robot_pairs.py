@@ -169,7 +169,7 @@ def test_the_design_starts_inside_its_bounds_and_others_are_refused(pair):
 
 
 def test_cameras_inside_the_bounds_stand_clear_of_the_body(pair):
-    """A housing of 4 cm about every corner of the box touches nothing; where it starts it looks as far as it must."""
+    """A housing of 4 cm about every corner of the box touches nothing."""
     body = place.Body((mesh.vertices_m, mesh.faces) for mesh in pair.bodies.values())
     corners = [
         torch.tensor(
@@ -178,12 +178,28 @@ def test_cameras_inside_the_bounds_stand_clear_of_the_body(pair):
         for ends in itertools.product((pair.low, pair.high), repeat=3)
     ]
     assert float(body.distance_m(torch.stack(corners).double()).min()) > 0.02
-    if pair.look_ahead is not None:
-        distance_m, share = pair.look_ahead
-        ahead = place.LookAhead(distance_m=distance_m, share=share)
-        assert all(
-            verdict.kept for verdict in place.judge([ahead], pair.design.mount(), pair.design.camera())
-        )
+
+
+def test_the_default_design_keeps_what_a_mount_has_to_keep(pair):
+    wanted = pair.requirements()
+    assert ("look-ahead" in [each.name for each in wanted]) == (pair.look_ahead is not None)
+    assert all(verdict.kept for verdict in place.judge(wanted, pair.design.mount(), pair.design.camera()))
+    # the clearance is that of the nearest mesh, less the housing and its margin
+    at = pair.design.mount()[:3, 3]
+    nearest = min(
+        float(place.Body([(mesh.vertices_m, mesh.faces)]).distance_m(at)) for mesh in pair.bodies.values()
+    )
+    found = next(each for each in wanted if each.name == "clearance").exact(pair.design.mount(), None)
+    assert float(found.min()) == pytest.approx(nearest - 0.02 - 0.005, abs=1e-12)
+
+
+def test_a_pair_asks_for_its_cable_side(pair):
+    asked = replace(pair, cable=((1.0, 0.0, 0.0), 0.5))
+    kept, *_ = place.judge(asked.requirements(), pair.design.mount(), pair.design.camera())
+    assert kept.name == "cable side"
+    assert kept.kept
+    against = replace(pair, cable=((-1.0, 0.0, 0.0), 1.2))
+    assert not place.judge(against.requirements(), pair.design.mount(), pair.design.camera())[0].kept
 
 
 def test_the_corridor_robot_sees_its_forks():
