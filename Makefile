@@ -55,7 +55,7 @@ flow-quality: ## error of the delivered refiner and of the closed form on unseen
 flow-compare: .venv/with-training-logs.stamp ## the refiner against networks of its size, same windows and budget
 flow-cost: ## time and memory of flow estimators
 flow-recording: .venv/with-event-files.stamp ## flow of a recording: make flow-recording ARGS="--recording FOLDER"
-placement: ## where to mount the camera on a robot
+placement: .venv/with-search.stamp ## where to mount the camera on a robot
 speed-error: ## time and error of every fidelity level
 stability: ## hard cases: outcome expected and seen
 gradcheck: ## autograd against differences, junction by junction
