@@ -21,7 +21,7 @@ from codesign.errors import DomainError, FileFormatError
 INDENT = 2
 MOST_LINES = 10_000
 KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_/.-]*")  # text that needs no quotes
+WORD = re.compile(r"(\.{0,2}/)*[A-Za-z_][A-Za-z0-9_/.-]*")  # text that needs no quotes
 OTHERS = re.compile(
     "y|n|yes|no|on|off|true|false|null|nan|inf|infinity", re.IGNORECASE
 )  # values to some readers
@@ -118,6 +118,8 @@ def _value(text, number, line):
         word = text.split(" #")[0].strip()
         if WORD.fullmatch(word) and not OTHERS.fullmatch(word):
             return word
+        if word.startswith("[") and word.endswith("]") and "[" not in word[1:]:
+            return [_value(each.strip(), number, line) for each in word[1:-1].split(",")]
         raise _bad(number, line, 'give a number, "text", true, false, null or a [list] of these') from None
     rest = text[end:].strip()
     if (rest and not rest.startswith("#")) or isinstance(value, dict):

@@ -1,7 +1,8 @@
 """Trajectories as TUM text files: one pose per line, ``timestamp tx ty tz qx qy qz qw``; and a trajectory
 through recorded poses.
 
-Lines that begin with # and empty lines are skipped; numbers are separated by spaces or tabs. Source: the file
+Lines that begin with # and empty lines are skipped; numbers are separated by spaces or tabs, or by commas (CSV), and
+the first line may be a header such as ``t_s,x,y,z,qx,qy,qz,qw``. Source: the file
 formats of the TUM RGB-D benchmark (Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS
 2012).
 """
@@ -24,6 +25,7 @@ MOST_POSES = 1_000_000
 LONGEST_LINE = 400
 UNIT_TOLERANCE = 1e-3  # of a quaternion's length: files with four digits stay within 1e-4
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,4})?")
+NAMES = re.compile(r"(timestamp|time|t)(_s)? t?x(_m)? t?y(_m)? t?z(_m)? qx qy qz qw")
 HEADER = "# timestamp tx ty tz qx qy qz qw"
 
 
@@ -57,7 +59,9 @@ def read_tum(path):
         line = line.strip(" \t\r")
         if not line or line.startswith("#"):
             continue
-        words = line.split() if len(line) <= LONGEST_LINE else []
+        words = _words(line) if len(line) <= LONGEST_LINE else []
+        if not rows and NAMES.fullmatch(" ".join(words)):
+            continue
         if len(words) != 8 or not all(NUMBER.fullmatch(word) for word in words):
             raise FileFormatError(
                 f"{path}, line {number}: {line[:60]!r} is not 'timestamp tx ty tz qx qy qz qw', eight "
@@ -87,6 +91,10 @@ def read_tum(path):
     poses[:, :3, :3] = torch.from_numpy(Rotation.from_quat(table[:, 4:]).as_matrix())
     poses[:, :3, 3] = torch.from_numpy(table[:, 1:4])
     return torch.from_numpy(table[:, 0].copy()), poses
+
+
+def _words(line):
+    return [word.strip() for word in line.split(",")] if "," in line else line.split()
 
 
 def _text(path):

@@ -38,6 +38,8 @@ def test_pages_come_back():
 def test_words_need_no_quotes():
     page = plain_yaml.load("a: base_link  # here\nb: [1, 2]  # there\n\n# c: 3\nd:  # below\n  e: 1.5e-3\n")
     assert page == {"a": "base_link", "b": [1, 2], "d": {"e": 1.5e-3}}
+    page = plain_yaml.load('a: [base_link, 2, "x y"]  # here\nb: ../robots/rover.urdf\nc: /tmp/rover.urdf\n')
+    assert page == {"a": ["base_link", 2, "x y"], "b": "../robots/rover.urdf", "c": "/tmp/rover.urdf"}
 
 
 @pytest.mark.parametrize(
@@ -58,6 +60,12 @@ def test_words_need_no_quotes():
         "a: " + 100_000 * "[",
         "a: 1 2",
         "a: [1, 2",
+        "a: [b, [c]]",
+        "a: [b, yes]",
+        "a: [b,]",
+        "a: [b] c",
+        "a: " + 100_000 * "[" + "b" + 100_000 * "]",
+        "a: ..",
         "- 1",
         "a 1",
         "a:1",

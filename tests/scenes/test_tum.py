@@ -52,6 +52,17 @@ def test_comments_tabs_and_line_ends_do_not_matter(tmp_path):
     torch.testing.assert_close(poses[:, :3, :3], torch.eye(3, dtype=D).expand(2, 3, 3), rtol=0, atol=0)
 
 
+@pytest.mark.parametrize(
+    "header", ["", "t_s,x,y,z,qx,qy,qz,qw\n", "timestamp, tx, ty, tz, qx, qy, qz, qw\r\n"]
+)
+def test_tables_with_commas_are_read_alike(header, tmp_path):
+    rows = "0.5,1,2,3,0,0,0,1\n1.5, -1, 2.5e-1, 3, 0, 0, 1, 0\n"
+    (tmp_path / "a.csv").write_text(header + rows)
+    (tmp_path / "a.txt").write_text(rows.replace(",", " "))
+    for found, expected in zip(read_tum(tmp_path / "a.csv"), read_tum(tmp_path / "a.txt"), strict=True):
+        assert torch.equal(found, expected)
+
+
 def test_four_digit_quaternions_become_rotations(tmp_path):
     (tmp_path / "a.txt").write_text("0 0 0 0 0.1826 0.3651 0.5477 0.7303\n")
     check_poses(read_tum(tmp_path / "a.txt")[1])
@@ -77,6 +88,11 @@ def test_four_digit_quaternions_become_rotations(tmp_path):
         (f"{LINE}\n0.4 1 2 3 0 0 0 1\n", "line 2: the timestamp"),
         (f"{LINE}\n1.0 {'1' * 500} 2 3 0 0 0 1\n", "line 2"),
         ("0,5,1,2,3,0,0,0,1\n", "line 1"),
+        ("0,5 1,0 2,0 3,0 0,0 0,0 0,0 1,0\n", "line 1: .* is not"),  # decimal commas
+        ("0.5,1,2,3,0,0,0,\n", "line 1: .* is not"),
+        (f"t_s,x,y,z,qw,qx,qy,qz\n{LINE}\n", "line 1: .* is not"),  # another order of the quaternion
+        (f"{LINE}\nt x y z qx qy qz qw\n", "line 2: .* is not"),
+        ("t x y z qx qy qz qw\n", "holds no pose"),
     ],
 )
 def test_hostile_files_are_refused_with_the_line(text, sentence, tmp_path):
