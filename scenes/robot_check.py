@@ -1,0 +1,68 @@
+"""Looks at a pair before its first frame: what would spoil a study of it gets a sentence."""
+
+from collections.abc import Sequence
+
+import torch
+
+from codesign import place, render
+from codesign.errors import DomainError
+from scenes import robot_pair
+from scenes.robot_pair import RobotPair
+
+DRIVES = 6  # looked at in each world
+BLOCK_PX = 8
+LEAST_TEXTURE = 0.15  # of the blocks: the horizon over blank ground makes 0.08, the pairs have 0.4 and more
+STILL = 1e-6  # m/s and rad/s
+
+
+@torch.no_grad()
+def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Sequence[int] = (0,)) -> None:
+    """Look at bounds, mount, drives and worlds of a pair.
+
+    Args: camera: to judge by; None is that of the pair's design. numbers: of the worlds and drives looked at; each
+      world is made and one frame of six drives rendered.
+    Raises: DomainError, in a sentence that says what to change, for a design outside its bounds, one that does not
+      keep the pair's requirements, a box inside or far from the robot, a lens whose image circle is smaller than the
+      sensor (``place.check_mount``), drives that never move, and worlds of which less than LEAST_TEXTURE of what
+      the camera sees (blocks of 8 x 8 pixels) varies by more than the sensor's threshold.
+    """
+    pair.check(pair.design)
+    camera = pair.design.camera() if camera is None else camera
+    place.check_mount(_mount(pair), pair.requirements(), camera)
+    for number in numbers:
+        poses, twist = pair.drive(number, DRIVES)
+        if not float(twist.abs().max()) > STILL:
+            raise DomainError(
+                f"pair '{pair.name}': drives {number} never move, so there are no events; give a motion that does."
+            )
+        middle = poses[:, robot_pair.FRAMES // 2] @ pair.design.mount()
+        share = _textured(render.frames(camera, pair.world(number), middle))
+        if share < LEAST_TEXTURE:
+            raise DomainError(
+                f"pair '{pair.name}': world {number} has no texture where the camera looks: {share:.0%} of blocks of "
+                f"{BLOCK_PX} x {BLOCK_PX} pixels vary by more than the sensor's threshold, {LEAST_TEXTURE:.0%} are the "
+                "least; paint its surfaces with pictures, or turn the start to where there are some."
+            )
+
+
+def _mount(pair):
+    """The design's mount in the middle of the box of its bounds."""
+    low, high = pair.ranges.low[:3], pair.ranges.high[:3]
+    design = pair.design
+    return place.Mount(
+        (low + high) / 2,
+        (high - low) / 2,
+        yaw_rad=design.yaw_rad,
+        pitch_rad=design.pitch_rad,
+        roll_rad=design.roll_rad,
+        position_m=design.mount()[:3, 3],
+    )
+
+
+def _textured(frames):
+    """Share of blocks in which log intensity spans more than a threshold."""
+    rows, columns = (min(BLOCK_PX, size) for size in frames.shape[-2:])
+    blocks = frames.unfold(-2, rows, rows).unfold(-2, columns, columns).flatten(-2)
+    sensor = robot_pair.SENSOR
+    least = torch.tensor(min(float(sensor.theta_on), float(sensor.theta_off))).exp()
+    return float((blocks.amax(-1) > least * blocks.amin(-1)).double().mean())

@@ -1,0 +1,201 @@
+"""A pair out of a user's own files: a robot from URDF or a mesh, a world, a trajectory (scenes.robot_file)."""
+
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codesign import place, render
+from codesign.errors import DomainError, FileFormatError
+from codesign.pose import se3_exp
+from scenes import mesh_files, robot_pair, robots, worlds
+from scenes.bodies import Body
+from scenes.robot_file import OwnRobot, read_own
+from scenes.robot_pair import Design, RobotPair
+from scenes.robot_pairs import PAIRS
+from scenes.tum import Recorded, read_tum
+
+ROOM_M = 0.75  # from a robot's origin to its outermost point, in the worlds of the pairs
+LIFT_M = 0.008  # of what rolls: roll and pitch take it away over half a window
+DULL = 80.0  # radiance of what lies behind a mesh
+TRAINING = 2 / 3  # of a trajectory; the rest is for judging
+STILL = 1e-3  # metres and radians within which a trajectory stands still
+LEAST_PRIOR = 0.05  # m/s and rad/s
+
+Drive = Callable[[int, int], tuple[Tensor, Tensor]]
+
+
+def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
+    """The pair that a page of settings describes; to be looked at by ``robot_check.check_pair`` before the first frame.
+
+    A robot that drives through the world of a pair stands with its lowest point 8 mm over the ground, wherever its
+    origin is. Windows of a trajectory begin at random places, for training in its first two thirds, for judging in
+    the rest. A world from a file is the same for all numbers.
+
+    Args: settings: or the path of their page (``robot_file.read_own``).
+    Raises: FileFormatError for files that are missing or damaged; DomainError, naming the entry, for what is
+      unknown, missing, out of range, or does not go together: a robot without room in the world, a trajectory that
+      stands still or is shorter than three windows.
+    """
+    own = settings if isinstance(settings, OwnRobot) else read_own(settings)
+    bodies = _bodies(own)
+    world, depth = _world(own)
+    if own.motion is None or own.motion in PAIRS:
+        named = PAIRS[own.motion or own.world]()
+        drive, axes, prior = _standing(named, bodies), named.axes, named.prior
+    else:
+        drive, prior = recorded_drives(_file("motion", own.motion))
+        axes = place.FREE
+    if own.velocities is not None:
+        axes = place.PLANAR if own.velocities == "planar" else place.FREE
+    low, high, start = _designs(own)
+    asked = own.require
+    ahead, cable = asked.look_ahead, asked.cable
+    middle = drive(0, 12)[0][:, robot_pair.FRAMES // 2]
+    return RobotPair(
+        Path(own.robot).stem,
+        bodies,
+        low,
+        high,
+        start,
+        axes,
+        prior,
+        own.depth or depth,
+        None if ahead is None else (ahead.distance_m, ahead.share),
+        world,
+        drive,
+        housing_radius_m=asked.clearance.radius_m,
+        margin_m=asked.clearance.margin_m,
+        own_body_share=asked.own_body_share,
+        cable=None if cable is None else (cable.forbidden, math.radians(cable.half_angle_deg)),
+        ground_z_m=-float(middle[:, 2, 3].mean()),
+    )
+
+
+def recorded_drives(path: Path) -> tuple[Drive, tuple[float, ...]]:
+    """Windows of a trajectory (``RobotPair.drive``), with the constant twist that leads from the first pose whose
+    events are read to the last; and the root mean squares of its six velocities, at least 0.05 m/s and rad/s, as a prior.
+
+    Raises: FileFormatError, as ``scenes.tum.read_tum``; DomainError for one that is too short or stands still.
+    """
+    t_s, poses = read_tum(path)
+    window_s = float(robot_pair.times()[-1])
+    if not float(t_s[-1] - t_s[0]) >= 3 * window_s:
+        raise DomainError(
+            f"motion: '{path}' lasts {float(t_s[-1] - t_s[0]):g} s; {3 * window_s:.3g} s are the least: windows of "
+            f"{window_s:.3g} s are taken from its first two thirds for training and from the rest for judging."
+        )
+    trajectory = Recorded(t_s - t_s[0], poses)
+    end = float(trajectory.t_s[-1])
+    parts = {False: (0.0, TRAINING * end), True: (TRAINING * end, end)}
+    for first, last in parts.values():
+        inside = trajectory.t_s[(trajectory.t_s > first) & (trajectory.t_s < last)]
+        passed = trajectory(torch.cat([torch.tensor([first, last], dtype=torch.float64), inside]))
+        if float((passed - passed[0]).abs().max()) < STILL:
+            raise DomainError(
+                f"motion: '{path}' stands still from {first:g} to {last:g} s after its begin, so nothing there makes "
+                "an event; cut it to where the robot moves."
+            )
+    length = trajectory.t_s.diff()[:, None]
+    squares = (length * trajectory.twist_per_s**2).sum(0) / length.sum()
+    prior = tuple(squares.sqrt().clamp_min(LEAST_PRIOR).tolist())
+
+    def drive(number: int, motions: int) -> tuple[Tensor, Tensor]:
+        first, last = parts[number >= robot_pair.UNSEEN_FROM]
+        begin = np.random.default_rng([number, 4]).uniform(first, last - window_s, motions)
+        t_s = torch.from_numpy(begin)[:, None] + robot_pair.times()
+        poses = trajectory(t_s.clamp_max(last).flatten()).unflatten(0, t_s.shape)
+        twist, _ = render.camera_velocity(poses[:, [1, -1]], [0.0, robot_pair.DURATION_S])
+        return poses, twist[:, 0]
+
+    return drive, prior
+
+
+def _file(entry, name, kinds=()):
+    """Path of a file that an entry names, of one of some kinds."""
+    path = Path(name)
+    if kinds and path.suffix.lower() not in kinds:
+        raise DomainError(f"{entry}: '{path}' is of no kind that is read here; give {', '.join(kinds)}.")
+    if not path.is_file():
+        raise FileFormatError(f"{entry}: there is no file '{path}'; paths count from the folder of the page.")
+    return path
+
+
+def _bodies(own):
+    """Meshes in body axes, less those that move with the camera."""
+    path = _file("robot", own.robot, (".urdf", *mesh_files.KINDS))
+    if path.suffix.lower() == ".urdf":
+        parts = list(robots.from_urdf(path).parts)
+    else:
+        parts = mesh_files.read(path, materials=False)
+    names = sorted({part.name for part in parts})
+    unknown = [name for name in own.without if name not in names]
+    if unknown:
+        raise DomainError(
+            f"without: no part belongs to '{unknown[0]}'; there are {', '.join(names) or 'none'}."
+        )
+    left = [part for part in parts if part.name not in own.without]
+    if not left:
+        raise DomainError(f"robot: of '{path}' nothing with a shape is left; name fewer links in 'without'.")
+    return {
+        f"{k}-{re.sub(r'[^A-Za-z0-9_-]', '_', part.name)}": Body(part.vertices_m, part.faces)
+        for k, part in enumerate(left)
+    }
+
+
+def _world(own):
+    """What makes worlds by number, and how depth is known there unless asked otherwise."""
+    if own.world in PAIRS:
+        named = PAIRS[own.world]()
+        return named.world, named.depth
+    path = _file("world", own.world, (*mesh_files.KINDS, ".xml"))
+    if path.suffix.lower() == ".xml":
+        scene = worlds.from_mitsuba(path)
+    else:
+        scene = worlds.from_mesh(path, background=DULL)
+
+    def same(number: int) -> render.MitsubaScene:
+        return scene
+
+    return same, "scene"
+
+
+def _standing(named, bodies):
+    """Drives of a pair for other bodies; those that drive stand on the ground."""
+    vertices = np.concatenate([mesh.vertices_m for mesh in bodies.values()])
+    reach = float(np.linalg.norm(vertices[:, :2], axis=1).max())
+    if reach > ROOM_M:
+        raise DomainError(
+            f"robot: it reaches {reach:.3g} m from its origin, the drives of '{named.name}' have room for {ROOM_M:g} m; "
+            "give a mesh in metres, or a world and a trajectory of your own."
+        )
+    if named.axes == place.FREE:
+        return named.drive
+    up = torch.eye(4, dtype=torch.float64)
+    up[2, 3] = LIFT_M - float(vertices[:, 2].min())
+
+    def drive(number: int, motions: int) -> tuple[Tensor, Tensor]:
+        poses, twist = named.drive(number, motions)
+        middle = poses[:, 0] @ se3_exp(robot_pair.MIDDLE_S * twist)
+        return robot_pair.moved(middle @ up, twist), twist
+
+    return drive
+
+
+def _designs(own):
+    """Lowest, highest and first design."""
+    bounds = own.camera.bounds()
+    first = {name: getattr(own.start, name) for name in bounds}
+    first = {name: sum(bounds[name]) / 2 if value is None else value for name, value in first.items()}
+    lens = (own.lens.focal_length_mm, own.lens.fno, 1 / own.lens.focus_m)
+    low, high = ({name: ends[k] for name, ends in bounds.items()} for k in (0, 1))
+    return [Design(*lens, **_in_radians(each)) for each in (low, high, first)]
+
+
+def _in_radians(numbers):
+    turns = {name.replace("_deg", "_rad"): math.radians(v) for name, v in numbers.items() if "_deg" in name}
+    return turns | {name: value for name, value in numbers.items() if name.endswith("_m")}

@@ -1,0 +1,288 @@
+"""A user's own robot, world and trajectory: twists by closed forms, faults by their sentences."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from codesign import lens, place, pose, render, task
+from codesign.errors import CodesignError, DomainError, FileFormatError
+from scenes import robot_pair, robot_parts, robots
+from scenes.robot_check import check_pair
+from scenes.robot_file import CameraBox, OwnRobot, Start, read_own
+from scenes.robot_own import own_pair
+from scenes.robot_pairs import PAIRS
+
+D = torch.float64
+TWIST = torch.tensor([0.4, 0.1, 0.0, 0.0, 0.0, 0.3], dtype=D)
+UNSEEN = robot_pair.UNSEEN_FROM
+PAGE = """
+robot: box.obj
+camera:
+  low_m: [0.24, -0.1, 0.25]
+  high_m: [0.34, 0.1, 0.4]
+start:
+  pitch_deg: 30
+"""
+
+
+def obj(body, uv=""):
+    """Text of a Wavefront file."""
+    vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in body.vertices_m)
+    return vertices + uv + "".join(f"f {a} {b} {c}\n" for a, b, c in body.faces + 1)
+
+
+def csv(t_s, poses):
+    """Text of a table of poses."""
+    turns = Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat()
+    rows = np.concatenate([t_s[:, None], poses[:, :3, 3].numpy(), turns], 1).tolist()
+    return "t_s,x,y,z,qx,qy,qz,qw\n" + "\n".join(",".join(map(repr, row)) for row in rows) + "\n"
+
+
+def screw(t_s):
+    """Poses of a body that goes with TWIST, 0.3 m above the origin of a room at first."""
+    first = torch.eye(4, dtype=D)
+    first[2, 3] = 0.3
+    return first @ pose.se3_exp(torch.as_tensor(t_s)[:, None] * TWIST)
+
+
+@pytest.fixture
+def page(tmp_path):
+    """Writes a page beside a robot, a blank room and trajectories, and gives its path."""
+    t_s = np.linspace(1.7e9, 1.7e9 + 1.5, 31)
+    (tmp_path / "box.obj").write_text(obj(robot_parts.box((0.4, 0.3, 0.2), (0.0, 0.0, 0.05))))
+    (tmp_path / "blank.obj").write_text(obj(robot_parts.box((6.0, 6.0, 3.0), (0.0, 0.0, 1.4))))
+    (tmp_path / "notes.txt").write_text("a robot")
+    (tmp_path / "screw.csv").write_text(csv(t_s, screw(t_s - t_s[0])))
+    (tmp_path / "short.csv").write_text(csv(t_s[:2], screw([0.0, 0.05])))
+    (tmp_path / "still.csv").write_text(csv(t_s, screw(np.zeros(31))))
+    (tmp_path / "parks.csv").write_text(csv(t_s, screw(np.minimum(t_s - t_s[0], 0.9))))
+    (tmp_path / "back.csv").write_text(csv(t_s[::-1], screw(t_s - t_s[0])))
+
+    def write(text, name="page.yaml"):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def textured_room(folder):
+    """A room of 6 x 6 x 3 m as a mesh, each side with the same picture."""
+    import PIL.Image
+    import skimage.data
+
+    PIL.Image.fromarray(skimage.data.brick()).save(folder / "brick.png")
+    (folder / "room.mtl").write_text("newmtl wall\nmap_Kd brick.png\n")
+    corners = [(x, y, z) for x in (-3, 3) for y in (-3, 3) for z in (-0.1, 2.9)]
+    sides = ((1, 3, 4, 2), (5, 6, 8, 7), (1, 2, 6, 5), (3, 7, 8, 4), (1, 5, 7, 3), (2, 4, 8, 6))
+    (folder / "room.obj").write_text(
+        "mtllib room.mtl\nvt 0 0\nvt 6 0\nvt 6 6\nvt 0 6\nusemtl wall\n"
+        + "".join(f"v {x} {y} {z}\n" for x, y, z in corners)
+        + "".join(f"f {a}/1 {b}/2 {c}/3 {d}/4\n" for a, b, c, d in sides)
+    )
+
+
+def test_the_built_in_pairs_pass():
+    for make in PAIRS.values():
+        check_pair(make())
+
+
+def test_a_page_becomes_a_pair(page):
+    found = own_pair(
+        page(
+            PAGE.replace("box.obj", f'"{robots.ROVER}"')
+            + """  yaw_deg: 5
+without: [camera_link]
+lens:
+  focal_length_mm: 5
+  focus_m: 2.5
+velocities: free
+require:
+  clearance:
+    radius_m: 0.03
+    margin_m: 0.01
+  look_ahead:
+    distance_m: 2.0
+    share: 0.2
+  cable:
+    forbidden: [0, 0, -1]
+    half_angle_deg: 30
+  own_body_share: 0.1
+"""
+        )
+    )
+    start = robot_pair.Design(5.0, 1.2, 0.4, 0.29, 0.0, 0.325, math.radians(5), math.radians(30), 0.0)
+    assert found.design.mount().allclose(start.mount(), rtol=0, atol=1e-12)
+    assert replace(found.design, x_m=0.29, z_m=0.325) == start
+    assert found.low.z_m == 0.25
+    assert found.high.pitch_rad == math.radians(80)
+    assert found.axes == place.FREE
+    assert found.depth == "ground"
+    cable, ahead, clearance, own_body = found.requirements()
+    assert cable == place.CableSide((0.0, 0.0, -1.0), math.radians(30))
+    assert ahead == place.LookAhead(2.0, 0.2, ground_z_m=found.ground_z_m)
+    assert isinstance(clearance, place.Clearance)
+    assert (clearance.housing, clearance.margin_m) == (place.Housing(0.03), 0.01)
+    assert isinstance(own_body, task.OwnBody)
+    assert own_body.largest_share == 0.1
+    # seven of the rover's eight shapes, from the ends of its wheels at 1 mm up to the top of its mast
+    corners = np.concatenate([mesh.vertices_m for mesh in found.bodies.values()])
+    assert len(found.bodies) == 7
+    assert corners[:, 2].min() == pytest.approx(0.001, abs=1e-9)
+    assert corners[:, 2].max() == pytest.approx(0.17 + 0.062 + 0.3, abs=1e-9)
+
+
+def test_a_robot_stands_on_the_ground_wherever_its_origin_is(page):
+    """The box reaches 5 cm below its origin; its velocity is that of the origin."""
+    found = own_pair(page(PAGE))
+    poses, twist = found.drive(2, 4)
+    assert torch.equal(twist, PAIRS["outdoors"]().drive(2, 4)[1])
+    seen, _ = render.camera_velocity(poses, robot_pair.times())
+    torch.testing.assert_close(seen, twist[:, None].expand_as(seen), rtol=0, atol=1e-9)  # 1e-15 m over 2.9 ms
+    middle = poses[:, 0] @ pose.se3_exp(robot_pair.MIDDLE_S * twist)
+    torch.testing.assert_close(middle[:, 2, 3], torch.full((4,), 0.058, dtype=D), rtol=0, atol=1e-12)
+    corners = torch.from_numpy(next(iter(found.bodies.values())).vertices_m)
+    assert float(pose.apply(poses.flatten(0, 1), corners)[..., 2].min()) > 0
+    assert found.ground_z_m == pytest.approx(-0.058, abs=1e-4)  # it heaves by 0.03 m/s for 1.4 ms
+
+
+def test_windows_of_a_screw_have_its_twist(page):
+    """Poses 50 ms apart; between them the constant twist, so exact in and across them."""
+    found = own_pair(page(PAGE + "motion: screw.csv\n"))
+    for number in (0, 7, UNSEEN):
+        poses, twist = found.drive(number, 5)
+        torch.testing.assert_close(
+            twist, TWIST.expand(5, 6), rtol=0, atol=1e-5
+        )  # clocks of 1.7e9 s have 2e-7 s
+        seen, _ = render.camera_velocity(poses, robot_pair.times())
+        torch.testing.assert_close(seen, twist[:, None].expand_as(seen), rtol=0, atol=1e-5)
+        angle = torch.atan2(poses[:, 0, 1, 0], poses[:, 0, 0, 0])
+        begin = angle / TWIST[5]
+        torch.testing.assert_close(poses[:, 0], screw(begin), rtol=0, atol=1e-5)
+        last = begin + robot_pair.times()[-1]
+        assert bool((last <= 1.0 + 1e-5).all() if number < UNSEEN else (begin >= 1.0 - 1e-5).all())
+    assert found.prior == pytest.approx((0.4, 0.1, 0.05, 0.05, 0.05, 0.3), abs=1e-5)
+    assert found.ground_z_m == pytest.approx(-0.3, abs=1e-9)
+
+
+def test_windows_of_uneven_motion_have_their_mean_velocity(page, tmp_path):
+    """x = t^2 / 2 sampled every millisecond: from t to u the mean velocity is (t + u) / 2; chords of 1 ms lie within
+    1.25e-7 m of the parabola, so velocities over 20 ms within 1.25e-5."""
+    t_s = np.linspace(0, 1.5, 1501)
+    poses = torch.eye(4, dtype=D).repeat(len(t_s), 1, 1)
+    poses[:, 0, 3] = torch.from_numpy(t_s**2 / 2)
+    (tmp_path / "gains.csv").write_text(csv(t_s, poses))
+    poses, twist = own_pair(page(PAGE + "motion: gains.csv\n")).drive(3, 6)
+    at = (2 * poses[:, 1:, 0, 3]).sqrt()
+    torch.testing.assert_close(twist[:, 0], (at[:, 0] + at[:, -1]) / 2, rtol=0, atol=1.3e-5)
+    torch.testing.assert_close(at[:, -1] - at[:, 0], torch.full((6,), 0.02, dtype=D), rtol=0, atol=1e-4)
+
+
+def test_rendered_flow_of_a_world_of_ones_own_gives_the_twist_back(page, tmp_path):
+    textured_room(tmp_path)
+    found = own_pair(page(PAGE + "world: room.obj\nmotion: screw.csv\n"))
+    check_pair(found)
+    assert found.depth == "scene"
+    drives = found.batch((0, UNSEEN), 2)
+    system = found.system(found.design).replaced(
+        flow=lambda volume, truth: truth, estimate=task.EgoVelocity(place.FREE, (1e3,) * 6, "scene")
+    )
+    with torch.no_grad():
+        velocity = system.begin(drives)["estimate"].velocity
+    # the clock of 1.7e9 s moves poses by 2e-7 s of 20 ms, hits are read to 1e-6 of the depth
+    torch.testing.assert_close(velocity, drives.twist, rtol=0, atol=1e-4)
+
+
+def test_settings_need_no_file():
+    box = CameraBox((0.05, 0.0, 0.4), (0.25, 0.0, 0.6), pitch_deg=(20.0, 20.0))
+    found = own_pair(OwnRobot(str(robots.ROVER), box, ("camera_link",), Start(z_m=0.5), world="flight"))
+    assert found.axes == place.FREE
+    assert found.ranges.held.tolist() == [False, True, False, False, True, False]
+    assert found.design.pitch_rad == math.radians(20)
+    poses, _ = found.drive(0, 8)
+    assert float(poses[..., 2, 3].min()) > 0.3  # it flies as it is
+
+
+FAULTS = {
+    "unknown": ("robto: box.obj", "no entry 'robto'; did you mean 'robot'"),
+    "unknown below": (PAGE + "  pitch: 3", r"no entry 'start.pitch'; did you mean 'start.pitch_deg'\? There are x_m"),
+    "no robot": (PAGE.replace("robot:", "world:"), "'robot' is missing"),
+    "no box": ("robot: box.obj", "'camera' is missing"),
+    "no corner": ("robot: box.obj\ncamera:\n  low_m: [0, 0, 0]", "'camera.high_m' is missing"),
+    "no mapping": ("robot: box.obj\ncamera: 3", "camera is 3; write low_m, high_m, .* below it"),
+    "no text": (PAGE + "world: 3", "world is 3; give text"),
+    "no number": (PAGE + "  yaw_deg: left", "start.yaw_deg = 'left' is no number"),
+    "truth": (PAGE + "  yaw_deg: true", "start.yaw_deg is True; give a finite number"),
+    "two numbers": (PAGE.replace("[0.24, -0.1, 0.25]", "[0.24, 0.25]"), r"camera.low_m is \[0.24, 0.25\]; give a list of 3"),
+    "yaml": (PAGE + "without: {a: 1}", "line 8"),
+    "no file": (PAGE.replace("box.obj", "bux.obj"), "robot: there is no file '.*bux.obj'"),
+    "kind": (PAGE.replace("box.obj", "notes.txt"), "robot: '.*notes.txt' is of no kind .* give .urdf, .obj"),
+    "no world": (PAGE + "world: none.obj\nmotion: screw.csv", "world: there is no file"),
+    "world's kind": (PAGE + "world: outdoor\nmotion: screw.csv", "world: '.*outdoor' is of no kind"),
+    "no motion": (PAGE + "motion: none.csv", "motion: there is no file"),
+    "motion missing": (PAGE + "world: blank.obj", "motion is missing: the world '.*blank.obj' is a file"),
+    "two worlds": (PAGE + "motion: flight", "motion 'flight' goes through its own world, not through 'outdoors'"),
+    "link": (PAGE + "without: [camera]", "without: no part belongs to 'camera'; there are"),
+    "nothing left": (PAGE + 'without: ["box.obj"]', "nothing with a shape is left"),
+    "low over high": (PAGE.replace("0.34, 0.1", "0.34, -0.2"), r"y_m goes from -0.1 to -0.2; give the lower"),
+    "angles": (PAGE.replace("start:", "  yaw_deg: [3, 2]\nstart:"), "yaw_deg goes from 3 to 2"),
+    "straight down": (PAGE.replace("start:", "  pitch_deg: [0, 90]\nstart:"), "strictly between -90 and 90"),
+    "start": (PAGE.replace("pitch_deg: 30", "pitch_deg: 85"), "start: pitch_deg is 85, outside .* 0 to 80"),
+    "start's place": (PAGE + "  x_m: 0.5", "start: x_m is 0.5, outside .* 0.24 to 0.34"),
+    "lens": (PAGE + "lens:\n  fno: 0", "lens: fno is 0"),
+    "focus": (PAGE + "lens:\n  focus_m: 0.006", "focus_m is 0.006; it must lie beyond the focal length, 6.5 mm"),
+    "velocities": (PAGE + "velocities: flat", "velocities is 'flat'; give planar or free"),
+    "depth": (PAGE + "depth: none", "depth is 'none'; give ground or scene"),
+    "share": (PAGE + "require:\n  own_body_share: 2", "largest_share is 2"),
+    "stands still": (PAGE + "motion: still.csv", "still.csv' stands still from 0 to 1 s"),
+    "parks": (PAGE + "motion: parks.csv", "parks.csv' stands still from 1 to 1.5 s"),
+    "short": (PAGE + "motion: short.csv", "lasts 0.05 s; 0.0686 s are the least"),
+    "back in time": (PAGE + "motion: back.csv", "line 3: the timestamp is not after"),
+    "inside": (PAGE.replace("0.24, ", "0.0, ").replace("0.34, ", "0.1, ").replace("0.25]", "0.0]").replace("0.4]", "0.1]"),
+               "has no room for the camera"),
+    "far": (PAGE.replace("0.24", "2.4").replace("0.34", "3.4"), "m away from the robot"),
+    "look ahead": (PAGE + "require:\n  look_ahead:\n    distance_m: 3\n    share: 0.9", "look-ahead: missed by"),
+    "blank": (PAGE + "world: blank.obj\nmotion: screw.csv", "has no texture where the camera looks"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_gets_one_sentence_before_the_first_frame(fault, page):
+    text, sentence = FAULTS[fault]
+    with pytest.raises(CodesignError, match=sentence) as caught:
+        check_pair(own_pair(page(text)))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_robot_in_millimetres_has_no_room_in_the_worlds_of_pairs(page, tmp_path):
+    (tmp_path / "box.obj").write_text(obj(robot_parts.box((400.0, 300.0, 200.0), (0.0, 0.0, 50.0))))
+    with pytest.raises(DomainError, match=r"reaches 250 m from its origin, .* give a mesh in metres"):
+        own_pair(page(PAGE))
+
+
+def test_a_page_that_is_no_text_is_refused(tmp_path):
+    with pytest.raises(FileFormatError, match=r"none.yaml' cannot be read"):
+        read_own(tmp_path / "none.yaml")
+    (tmp_path / "a.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(FileFormatError, match=r"a.yaml' cannot be read"):
+        read_own(tmp_path / "a.yaml")
+
+
+def test_a_pair_made_by_hand_is_looked_at_too():
+    pair = PAIRS["flight"]()
+    with pytest.raises(DomainError, match="efl_mm = 99 lies outside its bounds"):
+        check_pair(replace(pair, design=replace(pair.design, efl_mm=99.0)))
+
+    def rests(number, motions):
+        poses, twist = pair.drive(number, motions)
+        return robot_pair.moved(poses[:, 0], 0 * twist), 0 * twist
+
+    with pytest.raises(DomainError, match="drives 0 never move"):
+        check_pair(replace(pair, drive=rests))
+    triplet = render.Camera(lens.load("cooke-triplet"), 60, 60, 2.0, 1)
+    with pytest.raises(DomainError, match="image circle"):
+        check_pair(pair, triplet)
