@@ -39,7 +39,7 @@ FILM = render.Film(
 RAYS_PER_PX = 8
 DURATION_S = 0.02
 FRAMES = 9
-LEAD_S = DURATION_S / (FRAMES - 2)  # the first interval lets the sensor settle: its events are not read
+LEAD_S = 2 * DURATION_S / (FRAMES - 2)  # before the window, for the sensor to settle: its events are not read
 MIDDLE_S = LEAD_S + DURATION_S / 2
 BINS = 5
 SENSOR = events.SensorModel(
@@ -232,7 +232,8 @@ def _counted(count):
 
 def times() -> Tensor:
     """[T] seconds of the frames: one before the window, in which the sensor settles, and those of the window."""
-    return torch.linspace(0, LEAD_S + DURATION_S, FRAMES, dtype=torch.float64)
+    window = LEAD_S + torch.linspace(0, DURATION_S, FRAMES - 1, dtype=torch.float64)
+    return torch.cat([torch.zeros(1, dtype=torch.float64), window])
 
 
 def moved(T_world_body: Tensor, twist: Tensor) -> Tensor:
