@@ -2,7 +2,7 @@
 judged."""
 
 from codesign.task.depth import ground_depth, scene_depth
-from codesign.task.ego_velocity import EgoVelocity, Motion
+from codesign.task.ego_velocity import EgoVelocity, Motion, Readings
 from codesign.task.own_body import OwnBody
 from codesign.task.score import VelocityErrors, velocity_errors
 from codesign.task.sight import ATTITUDES, VELOCITIES, Surroundings, sight_map, sight_table, sight_units
@@ -13,6 +13,7 @@ __all__ = [
     "EgoVelocity",
     "Motion",
     "OwnBody",
+    "Readings",
     "Surroundings",
     "VelocityErrors",
     "ground_depth",

@@ -37,6 +37,35 @@ class Motion:
     kept: Tensor
 
 
+@dataclass(frozen=True)
+class Readings:
+    """Flow at P points of each of N bodies, and what each of K velocities would show there.
+
+    pixels: [N, P, 2] of the points at mid-interval, window after window. flow_px: [N, P, 2] over the interval.
+    precision: [N, P, 2, 2] px^-2. confidence: [N, P] in 0..1, the share of it that the events said; the flow is drawn
+    towards zero by as much. depth_m: [N, P], infinite without a surface. rows: [N, P, 2, K] px of flow per m/s and
+    rad/s. share: [N, P] of an independent point that each counts as, 0 without a surface. windows: in P.
+    """
+
+    pixels: Tensor
+    flow_px: Tensor
+    precision: Tensor
+    confidence: Tensor
+    depth_m: Tensor
+    rows: Tensor
+    share: Tensor
+    windows: int
+
+    def missed_px(self, velocity: Tensor) -> Tensor:
+        """Flow [N, P, 2] that velocities [N, K] leave unexplained."""
+        return self.flow_px - self.confidence[..., None] * (self.rows @ velocity[:, None, :, None])[..., 0]
+
+    def squared(self, velocity: Tensor) -> Tensor:
+        """The same [N, P] as a sum of two squares in units of its standard deviation."""
+        miss = self.missed_px(velocity)
+        return (miss[..., None, :] @ self.precision @ miss[..., :, None])[..., 0, 0]
+
+
 class EgoVelocity:
     """Stage ``estimate`` of a System: the velocity of the body over the interval.
 
@@ -92,23 +121,41 @@ class EgoVelocity:
 
         t_s: [T] of the poses; the flow's interval ends with them and may begin later. None: it is all of them.
         """
+        return self.solve(self.read(field, camera, scene, T_body_cam, T_world_cam, t_s))
+
+    def read(
+        self,
+        field: FlowField,
+        camera: ChiefRayCamera,
+        scene: Any,
+        T_body_cam: Tensor,
+        T_world_cam: Tensor,
+        t_s: Tensor | None = None,
+        depth: Callable[..., Tensor] | None = None,
+    ) -> Readings:
+        """What the fields say, and what each velocity would show. Arguments and gradient as of the call.
+
+        depth: other than the estimator believes in, such as ``task.scene_depth`` for what is true.
+        """
         poses = T_world_cam.reshape(-1, *T_world_cam.shape[-3:])
-        count = len(poses)
-        pixels, flow, precision, seen = self._measured(field, camera, count)
-        frame, share = _middle(poses.shape[1], t_s, field.interval_s)
-        middle = pixels + share * flow.detach()  # where the points are at that frame
+        pixels, flow, precision, confidence = self._measured(field, camera, len(poses))
+        frame, over = _middle(poses.shape[1], t_s, field.interval_s)
+        middle = pixels + over * flow.detach()  # where the points are at that frame
         mounts = T_body_cam.double().expand(*T_world_cam.shape[:-3], 4, 4).reshape(-1, 4, 4)
-        depth = self.depth(camera, middle, poses[:, frame], scene)
-        rows, on_surface = self._rows(camera, depth, mounts, middle, field.interval_s)
-        share = INDEPENDENT * _windows(camera) / flow.shape[1] * on_surface.to(flow)
-        prior = torch.diag(flow.new_tensor(self.prior) ** -2)
-        kept = torch.ones_like(share)
-        velocity, normal = _solved(rows, flow, share[..., None, None] * precision, seen, prior)
+        depth_m = (depth or self.depth)(camera, middle, poses[:, frame], scene)
+        rows, on_surface = self._rows(camera, depth_m, mounts, middle, field.interval_s)
+        windows = _windows(camera)
+        share = INDEPENDENT * windows / flow.shape[1] * on_surface.to(flow)
+        return Readings(middle, flow, precision, confidence[..., 0], depth_m, rows, share, windows)
+
+    def solve(self, read: Readings) -> Motion:
+        """Least squares, reweighted for outliers. Gradient: all readings."""
+        prior = torch.diag(read.flow_px.new_tensor(self.prior) ** -2)
+        kept = torch.ones_like(read.share)
+        velocity, normal = _solved(read, kept, prior)
         for _ in range(0 if self.outlier is None else self.steps):
-            miss = flow - seen * (rows @ velocity[:, None, :, None])[..., 0]
-            squared = (miss[..., None, :] @ precision @ miss[..., :, None])[..., 0, 0]
-            kept = (1 + squared / self.outlier**2) ** -2
-            velocity, normal = _solved(rows, flow, (kept * share)[..., None, None] * precision, seen, prior)
+            kept = (1 + read.squared(velocity) / self.outlier**2) ** -2
+            velocity, normal = _solved(read, kept, prior)
         return Motion(velocity, torch.linalg.inv(normal), kept)
 
     def _measured(self, field, camera, count):
@@ -151,9 +198,9 @@ def _windows(camera):
     return camera.film.shape[0] if len(camera.film.shape) == 3 else 1
 
 
-def _solved(rows, flow, precision, seen, prior):
+def _solved(read, kept, prior):
     """Velocity [N, K] and normal matrix [N, K, K] of J^T (c P) J v = J^T P f, c the confidence."""
-    weighed = rows.mT @ precision  # [N, P, K, 2]
-    normal = (seen[..., None] * (weighed @ rows)).sum(1) + prior
-    right = (weighed @ flow[..., None]).sum(1)
+    weighed = read.rows.mT @ ((kept * read.share)[..., None, None] * read.precision)  # [N, P, K, 2]
+    normal = (read.confidence[..., None, None] * (weighed @ read.rows)).sum(1) + prior
+    right = (weighed @ read.flow_px[..., None]).sum(1)
     return torch.linalg.solve(normal, right)[..., 0], normal
