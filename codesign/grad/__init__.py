@@ -1,7 +1,9 @@
-"""Certificates of gradients: autograd against differences with common random numbers."""
+"""Certificates of gradients: autograd against differences with common random numbers; and other ways to a gradient where
+they fail."""
 
 from codesign.grad.certify import certify, worst
 from codesign.grad.differences import Difference, central, plateau
+from codesign.grad.fallback import Choice, choose, gradient
 from codesign.grad.row import Row
 
-__all__ = ["Difference", "Row", "central", "certify", "plateau", "worst"]
+__all__ = ["Choice", "Difference", "Row", "central", "certify", "choose", "gradient", "plateau", "worst"]
