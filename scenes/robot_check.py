@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import torch
 
-from codesign import place, render
+from codesign import events, place, render
 from codesign.errors import DomainError
 from scenes import robot_pair
 from scenes.robot_pair import RobotPair
@@ -41,7 +41,7 @@ def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Se
             raise DomainError(
                 f"pair '{pair.name}': world {number} has no texture where the camera looks: {share:.0%} of blocks of "
                 f"{BLOCK_PX} x {BLOCK_PX} pixels vary by more than the sensor's threshold, {LEAST_TEXTURE:.0%} are the "
-                "least; paint its surfaces with pictures, or turn the start to where there are some."
+                "least; paint its surfaces with pictures of radiance 0 to 255, or turn the start to where there are some."
             )
 
 
@@ -60,9 +60,9 @@ def _mount(pair):
 
 
 def _textured(frames):
-    """Share of blocks in which log intensity spans more than a threshold."""
-    rows, columns = (min(BLOCK_PX, size) for size in frames.shape[-2:])
-    blocks = frames.unfold(-2, rows, rows).unfold(-2, columns, columns).flatten(-2)
-    sensor = robot_pair.SENSOR
-    least = torch.tensor(min(float(sensor.theta_on), float(sensor.theta_off))).exp()
-    return float((blocks.amax(-1) > least * blocks.amin(-1)).double().mean())
+    """Share of blocks over which the sensor's log level spans more than a threshold."""
+    level = events.lin_log(frames)
+    rows, columns = (min(BLOCK_PX, size) for size in level.shape[-2:])
+    blocks = level.unfold(-2, rows, rows).unfold(-2, columns, columns).flatten(-2)
+    least = min(float(robot_pair.SENSOR.theta_on), float(robot_pair.SENSOR.theta_off))
+    return float((blocks.amax(-1) - blocks.amin(-1) > least).double().mean())

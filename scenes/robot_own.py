@@ -21,7 +21,8 @@ from scenes.tum import Recorded, read_tum
 
 ROOM_M = 0.75  # from a robot's origin to its outermost point, in the worlds of the pairs
 LIFT_M = 0.008  # of what rolls: roll and pitch take it away over half a window
-DULL = 80.0  # radiance of what lies behind a mesh
+WHITE = 255.0  # radiance that the 1 of a Mitsuba scene becomes
+DULL = 80.0  # of what lies behind a mesh
 TRAINING = 2 / 3  # of a trajectory; the rest is for judging
 STILL = 1e-3  # metres and radians within which a trajectory stands still
 LEAST_PRIOR = 0.05  # m/s and rad/s
@@ -154,7 +155,7 @@ def _world(own):
         return named.world, named.depth
     path = _file("world", own.world, (*mesh_files.KINDS, ".xml"))
     if path.suffix.lower() == ".xml":
-        scene = worlds.from_mitsuba(path)
+        scene = worlds.from_mitsuba(path, gain=WHITE)
     else:
         scene = worlds.from_mesh(path, background=DULL)
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from codesign import lens, place, pose, render, task
+from codesign import backend, lens, place, pose, render, task
 from codesign.errors import CodesignError, DomainError, FileFormatError
-from scenes import robot_pair, robot_parts, robots
+from scenes import build, robot_pair, robot_parts, robots, textures, worlds
 from scenes.robot_check import check_pair
 from scenes.robot_file import CameraBox, OwnRobot, Start, read_own
 from scenes.robot_own import own_pair
@@ -84,6 +84,19 @@ def textured_room(folder):
         + "".join(f"v {x} {y} {z}\n" for x, y, z in corners)
         + "".join(f"f {a}/1 {b}/2 {c}/3 {d}/4\n" for a, b, c, d in sides)
     )
+
+
+def textured_floor(folder):
+    """A floor of 6 x 6 m at z = -0.1 as a Mitsuba scene that glows, y up, white at 1."""
+    import PIL.Image
+    import skimage.data
+
+    tiled = np.tile(skimage.data.gravel(), (2, 2))
+    PIL.Image.fromarray(tiled).save(folder / "gravel.png")
+    (folder / "floor.xml").write_text("""<scene version="3.0.0"><shape type="rectangle">
+      <transform name="to_world"><rotate x="1" angle="-90"/><scale value="3"/><translate y="-0.1"/></transform>
+      <emitter type="area"><texture type="bitmap" name="radiance"><string name="filename" value="gravel.png"/></texture>
+      </emitter></shape></scene>""")
 
 
 def test_the_built_in_pairs_pass():
@@ -182,9 +195,11 @@ def test_windows_of_uneven_motion_have_their_mean_velocity(page, tmp_path):
     torch.testing.assert_close(at[:, -1] - at[:, 0], torch.full((6,), 0.02, dtype=D), rtol=0, atol=1e-4)
 
 
-def test_rendered_flow_of_a_world_of_ones_own_gives_the_twist_back(page, tmp_path):
-    textured_room(tmp_path)
-    found = own_pair(page(PAGE + "world: room.obj\nmotion: screw.csv\n"))
+@pytest.mark.parametrize(("write", "world"), [(textured_room, "room.obj"), (textured_floor, "floor.xml")])
+def test_rendered_flow_of_a_world_of_ones_own_gives_the_twist_back(write, world, page, tmp_path):
+    write(tmp_path)
+    low = PAGE.replace("pitch_deg: 30", "pitch_deg: 70")
+    found = own_pair(page(low + f"world: {world}\nmotion: screw.csv\n"))
     check_pair(found)
     assert found.depth == "scene"
     drives = found.batch((0, UNSEEN), 2)
@@ -286,3 +301,31 @@ def test_a_pair_made_by_hand_is_looked_at_too():
     triplet = render.Camera(lens.load("cooke-triplet"), 60, 60, 2.0, 1)
     with pytest.raises(DomainError, match="image circle"):
         check_pair(pair, triplet)
+
+
+@pytest.mark.parametrize(("scale", "textured"), [(1.0, True), (1 / 255, False)])
+def test_a_world_too_dark_for_the_sensor_has_no_texture(scale, textured):
+    """Below 20 of 255 the sensor's level is linear in radiance: between 0 and 1 it spans a seventh, log(20) / 20."""
+    picture = scale * textures.speckle(3, finest_px=3.0, coarsest_px=128.0)
+
+    def ground(number):
+        return worlds.ground(picture)
+
+    pair = replace(PAIRS["flight"](), world=ground)
+    if textured:
+        check_pair(pair)
+    else:
+        with pytest.raises(DomainError, match="world 0 has no texture where the camera looks: 0% of blocks"):
+            check_pair(pair)
+
+
+def test_a_horizon_alone_is_no_texture():
+    def ground_and_sky(number):
+        mi = backend.mitsuba("cpu")
+        ground = build.rectangle(mi, (0, 0, 0), (0, 0, 1), 200, 200, (0, 1, 0))
+        paint = build.Paint(np.full((2, 2), 60.0))
+        above = build.sky(mi, np.full((4, 8), 150.0))
+        return build.emissive(build.World({"ground": (ground, paint)}, {"sky": above}))
+
+    with pytest.raises(DomainError, match=r"world 0 has no texture where the camera looks: \d% of blocks"):
+        check_pair(replace(PAIRS["outdoors"](), world=ground_and_sky))
