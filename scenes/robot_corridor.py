@@ -52,15 +52,9 @@ def corridor() -> RobotPair:
 def world(number: int) -> MitsubaScene:
     """Walls, floor, ceiling and ends, pillars along both walls and crates between them, along +y."""
     mi = backend.mitsuba("cpu")
-    unseen = number >= robot_pair.UNSEEN_FROM
-    random = np.random.default_rng([number, 2])
-    level = robot_pair.light_level(random)
+    random, _, covered = robot_pair.variant(number)
     half = half_width_m(number)
     along, up = LENGTH_M / 2, HEIGHT_M / 2
-
-    def covered(width_m, height_m):
-        return robot_pair.paint(random, unseen, level, width_m, height_m)
-
     shapes: dict = {}
     for name, x in (("west", -half), ("east", half)):
         side = rectangle(mi, (x, along, up), (0, along, up), LENGTH_M, HEIGHT_M)

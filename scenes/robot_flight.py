@@ -54,14 +54,8 @@ def flight() -> RobotPair:
 def world(number: int) -> MitsubaScene:
     """A room whose six sides have pictures, with crates and balls along its walls."""
     mi = backend.mitsuba("cpu")
-    unseen = number >= robot_pair.UNSEEN_FROM
-    random = np.random.default_rng([number, 2])
-    level = robot_pair.light_level(random)
+    random, _, covered = robot_pair.variant(number)
     side, up = SIDE_M / 2, HEIGHT_M / 2
-
-    def covered(width_m, height_m):
-        return robot_pair.paint(random, unseen, level, width_m, height_m)
-
     shapes: dict = {}
     for name, x, y in (("north", 0, side), ("south", 0, -side), ("east", side, 0), ("west", -side, 0)):
         standing = rectangle(mi, (x, y, up), (0, 0, up), SIDE_M, HEIGHT_M)

@@ -54,15 +54,13 @@ def outdoors() -> RobotPair:
 def world(number: int) -> MitsubaScene:
     """Ground, things on it, and a sky as bright as they are."""
     mi = backend.mitsuba("cpu")
-    unseen = number >= robot_pair.UNSEEN_FROM
-    random = np.random.default_rng([number, 2])
-    level = robot_pair.light_level(random)
-    ground = robot_pair.paint(random, unseen, level, 2 * HALF_M, 2 * HALF_M)
+    random, level, paint = robot_pair.variant(number)
+    ground = paint(2 * HALF_M, 2 * HALF_M)
     shapes: dict = {
         "ground": (rectangle(mi, (0, 0, 0), (0, 0, 1), 2 * HALF_M, 2 * HALF_M, (0, 1, 0)), ground)
     }
     for k, (x, y, size) in enumerate(places(number)):
-        covered = robot_pair.paint(random, unseen, level, 2 * size, 2 * size)
+        covered = paint(2 * size, 2 * size)
         if k % 3 == 0:
             half = (size, size * random.uniform(0.5, 1), size * random.uniform(0.6, 1.6))
             shapes[f"crate-{k}"] = (block(mi, x, y, 0.0, half, random.uniform(0, 90)), covered)

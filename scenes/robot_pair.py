@@ -262,16 +262,18 @@ def picture(random: np.random.Generator, unseen: bool, level: float) -> np.ndarr
     return (found * (level / found.mean())).astype(np.float32)
 
 
-def light_level(random: np.random.Generator) -> float:
-    """Mean radiance of the surfaces of a world, even in the logarithm over LIGHT."""
-    return float(np.exp(random.uniform(*np.log(LIGHT))))
+def variant(number: int) -> tuple[np.random.Generator, float, Callable[[float, float], Paint]]:
+    """What every world of a number begins with: its random numbers, the mean radiance of its surfaces, even in the
+    logarithm over LIGHT, and what paints a surface of a width and height in metres, in texels of 1.5 to 3 mm."""
+    random = np.random.default_rng([number, 2])
+    level = float(np.exp(random.uniform(*np.log(LIGHT))))
 
+    def paint(width_m: float, height_m: float) -> Paint:
+        found = picture(random, number >= UNSEEN_FROM, level)
+        texel_m = random.uniform(0.0015, 0.003)
+        return Paint(found, (width_m / (texel_m * found.shape[1]), height_m / (texel_m * found.shape[0])))
 
-def paint(random: np.random.Generator, unseen: bool, level: float, width_m: float, height_m: float) -> Paint:
-    """A surface of this size with texels of 1.5 to 3 mm."""
-    found = picture(random, unseen, level)
-    texel_m = random.uniform(0.0015, 0.003)
-    return Paint(found, (width_m / (texel_m * found.shape[1]), height_m / (texel_m * found.shape[0])))
+    return random, level, paint
 
 
 def standing(at: Tensor) -> Tensor:
