@@ -61,7 +61,7 @@ class Clearance:
             raise DomainError(
                 f"clearance: margin_m is {self.margin_m}; finite metres of at least 0 are needed."
             )
-        _positive(self.step, "clearance: step")
+        check_positive(self.step, "clearance: step")
 
     def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
         """[..., solids] m of clearance beyond the margin. Gradient: mount."""
@@ -89,7 +89,7 @@ class CableSide:
                 f"cable side: half_angle_rad is {self.half_angle_rad}; give one between 0 and pi."
             )
         _direction(self.forbidden, "cable side: forbidden")
-        _positive(self.step, "cable side: step")
+        check_positive(self.step, "cable side: step")
 
     def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
         """[..., 1]: (cos a - cos b) / sin a with a the half angle and b the angle between back and axis; near the rim
@@ -128,8 +128,8 @@ class LookAhead:
     unit: str = "rad"
 
     def __post_init__(self):
-        _positive(self.distance_m, "look-ahead: distance_m")
-        _positive(self.step, "look-ahead: step")
+        check_positive(self.distance_m, "look-ahead: distance_m")
+        check_positive(self.step, "look-ahead: step")
         for label in ("share", "smooth"):
             if not 0 < as_number(getattr(self, label), label) <= 1:
                 raise DomainError(
@@ -236,6 +236,7 @@ def _direction(vector, name):
     return given / given.norm()
 
 
-def _positive(value, name):
+def check_positive(value: float, name: str) -> None:
+    """Raise DomainError unless it is a finite number > 0."""
     if not 0 < as_number(value, name) < math.inf:
         raise DomainError(f"{name} is {value}; a finite number > 0 is needed.")

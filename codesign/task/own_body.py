@@ -8,6 +8,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError, as_number
 from codesign.place import Body
+from codesign.place.requirements import check_positive
 from codesign.render import Camera, MitsubaScene, frames
 from codesign.render.glowing import glowing
 from codesign.render.truth import cameras_of, hits_of
@@ -44,8 +45,7 @@ class OwnBody:
             raise DomainError(
                 f"own body: largest_share is {self.largest_share}; a share from 0 to 1 is needed."
             )
-        if not 0 < as_number(self.step, "step") < float("inf"):
-            raise DomainError(f"own body: step is {self.step}; a share > 0 is needed.")
+        check_positive(self.step, "own body: step")
 
     @cached_property
     def scene(self) -> MitsubaScene:
