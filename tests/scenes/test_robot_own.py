@@ -208,8 +208,8 @@ def test_rendered_flow_of_a_world_of_ones_own_gives_the_twist_back(write, world,
     )
     with torch.no_grad():
         velocity = system.begin(drives)["estimate"].velocity
-    # the clock of 1.7e9 s moves poses by 2e-7 s of 20 ms, hits are read to 1e-6 of the depth
-    torch.testing.assert_close(velocity, drives.twist, rtol=0, atol=1e-4)
+    # depth is read up to 1.5 ms from the middle of the flow: 0.6 mm of 0.6 m and more, a thousandth of 0.4 m/s
+    torch.testing.assert_close(velocity, drives.twist, rtol=0, atol=4e-4)
 
 
 def test_settings_need_no_file():
@@ -255,7 +255,7 @@ FAULTS = {
     "share": (PAGE + "require:\n  own_body_share: 2", "largest_share is 2"),
     "stands still": (PAGE + "motion: still.csv", "still.csv' stands still from 0 to 1 s"),
     "parks": (PAGE + "motion: parks.csv", "parks.csv' stands still from 1 to 1.5 s"),
-    "short": (PAGE + "motion: short.csv", "lasts 0.05 s; 0.0686 s are the least"),
+    "short": (PAGE + "motion: short.csv", f"lasts 0.05 s; {3 * float(robot_pair.times()[-1]):.3g} s are the least"),
     "back in time": (PAGE + "motion: back.csv", "line 3: the timestamp is not after"),
     "inside": (PAGE.replace("0.24, ", "0.0, ").replace("0.34, ", "0.1, ").replace("0.25]", "0.0]").replace("0.4]", "0.1]"),
                "has no room for the camera"),
