@@ -34,10 +34,10 @@ class Placement:
             if not 0 < getattr(self, name) < float("inf"):
                 raise DomainError(f"placement: {name} = {getattr(self, name)} must be positive and finite.")
 
-    def in_scene(self, arr: Any, direction: Any) -> Any:
+    def in_scene(self, direction: Any) -> Any:
         """World directions (drjit arrays) in the scene's axes."""
         rows = self.R_world_scene.mT.tolist()
-        return arr.Array3(*[r[0] * direction.x + r[1] * direction.y + r[2] * direction.z for r in rows])
+        return type(direction)(*[r[0] * direction.x + r[1] * direction.y + r[2] * direction.z for r in rows])
 
 
 class PlacedScene:
@@ -66,16 +66,16 @@ class PlacedScene:
 
     def radiance(self, arr: Any, origin: Any, direction: Any) -> Any:
         """Radiance along world rays (drjit arrays)."""
-        return self.placement.gain * self.scene.radiance(arr, *self._in_scene(arr, origin, direction))
+        return self.placement.gain * self.scene.radiance(arr, *self._in_scene(origin, direction))
 
     def radiance_and_distance(self, arr: Any, origin: Any, direction: Any) -> Any:
         """Radiance as above, and the distance in metres to what is hit."""
-        light, distance = self.scene.radiance_and_distance(arr, *self._in_scene(arr, origin, direction))
+        light, distance = self.scene.radiance_and_distance(arr, *self._in_scene(origin, direction))
         return self.placement.gain * light, self.placement.unit_m * distance
 
-    def _in_scene(self, arr, origin, direction):
+    def _in_scene(self, origin, direction):
         place = self.placement
-        return place.in_scene(arr, origin) / place.unit_m, place.in_scene(arr, direction)
+        return place.in_scene(origin) / place.unit_m, place.in_scene(direction)
 
     def hit(self, origin_m: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """First surface met by world rays [N, 3]: point [N, 3], normal [N, 3], valid [N], as MitsubaScene has

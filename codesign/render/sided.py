@@ -23,34 +23,23 @@ class SidedScene(MitsubaScene):
         placement: Placement,
         device: str = "cpu",
     ):
-        import drjit as dr
-
         super().__init__(description, device, merge=False)
-        mi = self.mi
         self.placement = placement
-        self.backs = dict(backs)  # alive as long as the table that points to them
-        shapes = {
-            shape.id(): int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
-            for shape in self.scene.shapes()
-        }
-        table = [0] * (1 + max(shapes.values(), default=0))
-        for name, back in self.backs.items():
-            table[shapes[name]] = int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(back))[0])
-        self.table = mi.UInt32(table)
+        self.backs = dict(backs)
 
-    def emitted(self, arr: Any, si: Any, ray: Any) -> Any:
-        """Radiance of what is met towards the ray: of the side that it comes from."""
+    def leaving(self, shape: Any, si: Any, ray: Any) -> Any:
+        """Radiance of a shape towards the ray: of the side that it comes from."""
         import drjit as dr
 
-        mi = self.mi
-        met = si.is_valid()
         facing = -dr.dot(si.n, ray.d)
-        number = dr.gather(mi.UInt32, self.table, dr.reinterpret_array(mi.UInt32, si.shape), met)
-        behind = met & (facing < 0) & (number != 0)
-        emitter = dr.select(behind, dr.reinterpret_array(mi.EmitterPtr, number), si.emitter(self.scene))
-        si.wi = dr.select(
-            met,
-            mi.Vector3f(0, 0, dr.select(behind, -facing, facing)),
-            mi.Vector3f(self.placement.in_scene(arr, -ray.d)),
-        )
-        return self.placement.gain * emitter.eval(si)[0]
+        back = self.backs.get(shape.id())
+        si.wi = self.mi.Vector3f(0, 0, facing)
+        light = shape.emitter().eval(si)[0]
+        if back is not None:
+            si.wi = -si.wi
+            light = dr.select(facing < 0, back.eval(si)[0], light)
+        return self.placement.gain * light
+
+    def sky(self, direction: Any) -> Any:
+        """Radiance of the sky that turns with the scene."""
+        return self.placement.gain * super().sky(self.placement.in_scene(direction))

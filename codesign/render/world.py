@@ -12,6 +12,7 @@ from codesign import backend
 from codesign.errors import CodesignError, DomainError
 from codesign.render.outline import outlines
 from codesign.render.outline.curves import Segments
+from codesign.render.slopes import box_around, shape_numbers, with_slopes
 from codesign.render.soundness import check_description, check_scene
 
 
@@ -51,6 +52,8 @@ class MitsubaScene:
             if emissive and merge and not all(shape.is_emitter() for shape in self.scene.shapes()):
                 self.scene = self._built(description, False)  # joined meshes have lost their names
         check_scene(self.mi, self.scene, emissive)
+        self._numbers = shape_numbers(self.mi, self.scene)
+        self._box = box_around(self.mi, self.scene)
 
     def _built(self, description, merge):
         try:
@@ -82,31 +85,71 @@ class MitsubaScene:
 
         mi = self.mi
         ray = mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction))
-        found = self.scene.ray_intersect_preliminary(ray, coherent=True)
-        si = found.compute_surface_interaction(ray, mi.RayFlags.UV | mi.RayFlags.Minimal)
-        light = self.emitted(arr, si, ray)
+        still = dr.detach(ray)
+        found = self.scene.ray_intersect_preliminary(still, coherent=True, active=self._ahead(still))
+        met = found.is_valid()
+        shapes = self.scene.shapes()
+        shown = [self._shown(shape) for shape in shapes] + [self._beyond]
+        number = dr.gather(mi.UInt32, self._numbers, dr.reinterpret_array(mi.UInt32, found.shape), met)
+        number = dr.select(met, number, len(shapes))
         if not dr.grad_enabled(ray.o, ray.d):
-            return light, found.t
-        met = si.is_valid()
-        normal = dr.detach(si.n)
+            return dr.switch(number, shown, still.o, still.d, found)[0], found.t
+        sloped = [with_slopes(each) for each in shown]
+        light, normal, to_origin, to_direction = dr.switch(number, sloped, still.o, still.d, found)
         falling = dr.dot(ray.d, normal)
-        along = dr.dot(dr.detach(si.p) - ray.o, normal) / dr.select(met & (falling != 0), falling, 1)
-        return light, dr.replace_grad(found.t, dr.select(met, along, 0))
+        along = dr.dot(still(found.t) - ray.o, normal) / dr.select(met & (falling != 0), falling, 1)
+        return (
+            dr.replace_grad(light, dr.dot(to_origin, ray.o) + dr.dot(to_direction, ray.d)),
+            dr.replace_grad(found.t, dr.select(met, along, 0)),
+        )
 
-    def emitted(self, arr: Any, si: Any, ray: Any) -> Any:
-        """Radiance towards a ray (drjit arrays) of the surface that it meets, of the sky where it meets none."""
+    def _ahead(self, ray):
+        """Whether rays may meet anything: those that pass by a small object need no cast."""
+        if self._box is None:
+            return True
+        crossed, _, leaves = self._box.ray_intersect(ray)
+        return crossed & (leaves > 0)
+
+    def _shown(self, shape):
+        """What a shape shows to rays that meet it, and its normal there."""
+        mi = self.mi
+
+        def shown(origin, direction, found):
+            ray = mi.Ray3f(origin, direction)
+            si = shape.compute_surface_interaction(ray, found, mi.RayFlags.UV | mi.RayFlags.Minimal)
+            return self.leaving(shape, si, ray), si.n
+
+        return shown
+
+    def _beyond(self, origin, direction, found):
+        """What is seen where nothing is met."""
+        mi = self.mi
+        return self.sky(direction), mi.Normal3f(0, 0, 0)
+
+    def leaving(self, shape: Any, si: Any, ray: Any) -> Any:
+        """Radiance of a shape where it is met (drjit arrays) towards the ray."""
         import drjit as dr
 
-        mi = self.mi
+        emitter = shape.emitter()
+        if emitter is None:
+            return self.mi.Float(0)
         # emission is one-sided by the face: vertex normals are stored to 1 % only and would blacken faces
         # seen nearly edge-on
         facing = -dr.dot(si.n, ray.d)
-        si.wi = mi.Vector3f(0, 0, dr.abs(facing) if self.both_sides else facing)
-        if (
-            self.scene.environment() is not None
-        ):  # a sky is looked up by the direction, which these flags leave out where nothing is met
-            si.wi = dr.select(si.is_valid(), si.wi, -ray.d)
-        return si.emitter(self.scene).eval(si)[0]
+        si.wi = self.mi.Vector3f(0, 0, dr.abs(facing) if self.both_sides else facing)
+        return emitter.eval(si)[0]
+
+    def sky(self, direction: Any) -> Any:
+        """Radiance that comes against directions (drjit arrays) where nothing is met; 0 without a sky."""
+        import drjit as dr
+
+        mi = self.mi
+        environment = self.scene.environment()
+        if environment is None:
+            return mi.Float(0)
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi = -direction
+        return environment.eval(si)[0]
 
     def outline(self) -> Any:
         """Curves where radiance may jump, see codesign.render.outline; worked out once."""
