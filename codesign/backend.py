@@ -282,15 +282,7 @@ class _Kernel(torch.autograd.Function):
     def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
         with torch.no_grad():
             result = _adjoint(ctx, grads)
-        if torch.is_grad_enabled():
-            live = [g for g in result if g is not None]
-            sealed = iter(
-                NoSecondDerivative.apply(
-                    _FIRST_ONLY, len(live), *live, *ctx.saved_tensors, *[g for g in grads if g is not None]
-                )
-            )
-            result = [None if g is None else next(sealed) for g in result]
-        return (None, None, *result)
+        return (None, None, *first_only(result, (*ctx.saved_tensors, *grads)))
 
 
 def _adjoint(ctx, grads):
@@ -318,6 +310,16 @@ def _adjoint(ctx, grads):
 
 
 _FIRST_ONLY = "drjit kernels give first derivatives only; a second derivative through the lens or the renderer was asked for. Use differences of gradients instead."
+
+
+def first_only(found: Sequence[Tensor | None], sources: Iterable[Tensor | None]) -> Sequence[Tensor | None]:
+    """Gradients that a kernel found, as they are; differentiating them to their sources raises GradientError."""
+    if not torch.is_grad_enabled():
+        return found
+    live = [g for g in found if g is not None]
+    given = [source for source in sources if source is not None]
+    sealed = iter(NoSecondDerivative.apply(_FIRST_ONLY, len(live), *live, *given))  # pyright: ignore[reportArgumentType]
+    return [None if g is None else next(sealed) for g in found]
 
 
 class NoSecondDerivative(torch.autograd.Function):

@@ -1,6 +1,5 @@
 """All frames of all trajectories in one wavefront: camera-space rays x poses -> pixel means."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,7 +9,9 @@ from codesign.backend import arrays, memory_bytes, run_kernel
 from codesign.errors import DomainError, ShapeError, check_whole
 from codesign.pose import Poses, as_poses
 from codesign.render.kinds import Scene
+from codesign.render.lanes import lanes, nearest
 from codesign.render.moving import MovingScene, cameras_in_parts, in_one_row, parts, says_distance
+from codesign.render.pixel_means import Wavefront, pixel_means
 from codesign.types import Rays
 
 # an edge is hidden when all beside it is nearer by this share; a face next to it comes nearer by less
@@ -53,12 +54,9 @@ def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Poses, samples_pe
             f"at once, this machine has {memory_bytes() / 2**30:.3g} GiB; render fewer frames at a time "
             "(frame_chunks)."
         )
-    columns = [*rays.origin_m.unbind(1), *rays.direction.unbind(1), rays.weight]
-    inputs = [c.to(dtype) for c in columns] + [
-        pose[:, :3].to(dtype) for pose in cameras_in_parts(scene, T_world_cam)
-    ]
-    kernel = _Wavefront(parts(scene), count, poses, samples_per_pixel)
-    (image,) = run_kernel(kernel, inputs, [(poses, count // samples_per_pixel)])
+    lines = [rays.origin_m.mT.to(dtype), rays.direction.mT.to(dtype), rays.weight.to(dtype)]
+    cameras = torch.stack([pose[:, :3].to(dtype) for pose in cameras_in_parts(scene, T_world_cam)])
+    image = pixel_means(Wavefront(parts(scene), samples_per_pixel, dtype), *lines, cameras)
     return image.reshape(*batch, -1)
 
 
@@ -76,14 +74,12 @@ def light_and_nearness(rays: Rays, scene: Scene | MovingScene, T_world_cam: Tens
                 f"a {type(part).__name__} does not say how far away its light comes from, which a picture by "
                 "depth needs; give a MitsubaScene or a TexturedPlane, or render traced frames."
             )
-    poses = T_world_cam.shape[0]
-    count = rays.weight.numel()
     columns = [*rays.origin_m.unbind(1), *rays.direction.unbind(1)]
     inputs = [c.to(scene.dtype) for c in columns] + [
         pose[:, :3].to(scene.dtype) for pose in cameras_in_parts(scene, T_world_cam)
     ]
-    kernel = _Depths(parts(scene), count, poses, 1)
-    light, nearness = run_kernel(kernel, inputs, [(poses, count)] * 2)
+    shape = T_world_cam.shape[0], rays.weight.numel()
+    light, nearness = run_kernel(_Depths(parts(scene)), inputs, [shape] * 2)
     return light, nearness
 
 
@@ -104,79 +100,23 @@ def look(scene: Any, cameras: Tensor, origin: Tensor, direction: Tensor) -> tupl
         )
         for pose in cameras
     ]
-    light, distance = nearest(arr, parts(scene), placed)
+    light, distance, _ = nearest(arr, parts(scene), placed)
     dr.eval(light, distance)
     light, distance = (torch.as_tensor(arr.Float(v).numpy()).double() for v in (light, distance))
     return light, distance
 
 
-class _Wavefront:
-    """The kernel: rays into every part's own frame, and the light of the part that is met first."""
-
-    def __init__(self, scenes, count, poses, samples):
-        self.scenes = scenes
-        self.count = count
-        self.poses = poses
-        self.samples = samples
-
-    def __call__(self, arr, ox, oy, oz, dx, dy, dz, weight, *poses):
-        import drjit as dr
-
-        ray, o, d, placed = self._lanes(arr, (ox, oy, oz), (dx, dy, dz), poses)
-        seen = (
-            self.scenes[0].radiance(arr, *placed[0])
-            if len(placed) == 1
-            else nearest(arr, self.scenes, placed)[0]
-        )
-        light = seen * dr.gather(arr.Float, weight, ray)
-        if dr.grad_enabled(
-            light
-        ):  # the adjoint of the sum needs no values of light: without this it would be rendered twice
-            light = dr.replace_grad(dr.zeros(arr.Float, dr.width(light)), light)
-        return (dr.block_sum(light, self.samples) / self.samples,)
-
-    def _lanes(self, arr, origin, direction, poses):
-        """Number of the ray of every lane, its origin and direction before the camera, and those in each part."""
-        import drjit as dr
-
-        lane = dr.arange(arr.UInt32, self.count * self.poses)
-        frame = lane // self.count
-        ray = lane - frame * self.count
-        o, d = (arr.Array3(*[dr.gather(arr.Float, v, ray) for v in part]) for part in (origin, direction))
-        return ray, o, d, [_placed(arr, o, d, pose, frame) for pose in poses]
-
-
-class _Depths(_Wavefront):
+class _Depths:
     """The kernel of light and 1 / depth, ray by ray."""
 
-    def __call__(self, arr, ox, oy, oz, dx, dy, dz, *poses):
+    def __init__(self, scenes):
+        self.scenes = scenes
+
+    def __call__(self, arr, *columns):
         import drjit as dr
 
-        _, o, d, placed = self._lanes(arr, (ox, oy, oz), (dx, dy, dz), poses)
-        light, distance = nearest(arr, self.scenes, placed)
+        _, o, d, placed = lanes(arr, columns[:6], columns[6:])
+        light, distance, _ = nearest(arr, self.scenes, placed)
         met = dr.isfinite(distance)
         depth = o.z + d.z * dr.select(met, distance, 1)
         return light, dr.select(met & (depth > 0), 1 / dr.select(depth > 0, depth, 1), 0)
-
-
-def _placed(arr, o, d, pose, frame):
-    """Origins and directions in the frame of a part, by the pose of the camera in it at each lane's frame."""
-    import drjit as dr
-
-    m = [dr.gather(arr.Float, pose, frame * 12 + k) for k in range(12)]
-    origin = arr.Array3(
-        *[m[4 * r] * o.x + m[4 * r + 1] * o.y + m[4 * r + 2] * o.z + m[4 * r + 3] for r in range(3)]
-    )
-    return origin, arr.Array3(*[m[4 * r] * d.x + m[4 * r + 1] * d.y + m[4 * r + 2] * d.z for r in range(3)])
-
-
-def nearest(arr: Any, scenes: Sequence[Any], placed: Sequence[Any]) -> tuple[Any, Any]:
-    """Radiance of the part met first and its distance; where nothing is met, what the first part says."""
-    import drjit as dr
-
-    light, least = scenes[0].radiance_and_distance(arr, *placed[0])
-    for scene, rays in zip(scenes[1:], placed[1:], strict=True):
-        other, distance = scene.radiance_and_distance(arr, *rays)
-        light = dr.select(distance < least, other, light)
-        least = dr.minimum(distance, least)
-    return light, least

@@ -12,7 +12,8 @@ from codesign import backend
 from codesign.errors import CodesignError, DomainError
 from codesign.render.outline import outlines
 from codesign.render.outline.curves import Segments
-from codesign.render.slopes import box_around, shape_numbers, with_slopes
+from codesign.render.shape_table import box_around, shape_numbers
+from codesign.render.slopes import with_slopes
 from codesign.render.soundness import check_description, check_scene
 
 

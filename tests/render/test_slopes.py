@@ -1,0 +1,111 @@
+"""Gradients of frames from the slopes of every ray's light: kept, or worked out again; and which rays visit what."""
+
+import pytest
+import torch
+
+from codesign import lens, pose, render
+from codesign.errors import GradientError
+from codesign.render import slopes
+from codesign.render.light import PathScene
+from codesign.render.wavefront import look, shade
+from codesign.types import Rays
+
+FRAMES = 3
+
+
+def plane():
+    return render.TexturedPlane([[0.4, 0.1], [-0.2, 0.5]], [0.3, 0.2], [0.1, 0.7], 90.0)
+
+
+@pytest.fixture
+def rays(generator):
+    """Eight rays of two pixels about the camera's axis, in float64, with all of their numbers asking."""
+    aside = 0.2 * torch.randn(8, 2, dtype=torch.float64, generator=generator)
+    direction = torch.nn.functional.normalize(torch.cat([aside, torch.ones(8, 1).double()], 1), dim=1)
+    origin = 0.01 * torch.randn(8, 3, dtype=torch.float64, generator=generator)
+    weight = 0.5 + torch.rand(8, dtype=torch.float64, generator=generator)
+    return [value.requires_grad_() for value in (origin, direction, weight)]
+
+
+@pytest.fixture
+def motion(generator):
+    """Twists of a camera and of an object."""
+    return [
+        (0.05 * torch.randn(FRAMES, 6, dtype=torch.float64, generator=generator)).requires_grad_()
+        for _ in range(2)
+    ]
+
+
+def pictures(origin, direction, weight, camera, thing):
+    """Two pixels of a camera three metres before a plane; another plane moves before it in the second frame, and
+    behind it in the others."""
+    behind = torch.eye(4, dtype=torch.float64).repeat(FRAMES, 1, 1)
+    behind[:, 2, 3] = torch.tensor([0.8, -0.8, 0.8])
+    scene = render.MovingScene(plane(), {"thing": (plane(), behind @ pose.se3_exp(thing))})
+    down = pose.look_at((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), down=(0, 1, 0))
+    return shade(Rays(origin, direction, weight), scene, down @ pose.se3_exp(camera), 4)
+
+
+def test_gradient_to_rays_weights_and_poses_of_camera_and_object_is_that_of_differences(rays, motion):
+    assert torch.autograd.gradcheck(pictures, (*rays, *motion))
+
+
+def test_every_part_is_met(rays, motion):
+    grads = torch.autograd.grad(pictures(*rays, *motion).sum(), motion)
+    assert bool((grads[0] != 0).any(1).all())
+    assert (grads[1] != 0).any(1).tolist() == [False, True, False]
+
+
+def test_what_memory_does_not_hold_is_worked_out_again_frame_by_frame(rays, motion, monkeypatch):
+    inputs = (*rays, *motion)
+    seed = torch.linspace(-1, 1, 2 * FRAMES, dtype=torch.float64).reshape(FRAMES, 2)
+    kept = torch.autograd.grad(pictures(*inputs), inputs, seed)
+    monkeypatch.setattr(slopes, "KEPT", 0.0)
+    again = torch.autograd.grad(pictures(*inputs), inputs, seed)
+    for a, b in zip(kept, again, strict=True):  # the frames' sums are added in another order
+        torch.testing.assert_close(a, b, rtol=1e-13, atol=1e-13 * float(a.abs().max()))
+
+
+def test_room_is_given_back_with_the_graph(rays, motion):
+    before = slopes.ROOM.taken
+    image = pictures(*rays, *motion)
+    assert slopes.ROOM.taken - before == 7 * 8 * 8 * FRAMES  # numbers, bytes, rays, frames
+    del image
+    assert slopes.ROOM.taken == before
+    with torch.no_grad():
+        pictures(*rays, *motion)
+    assert slopes.ROOM.taken == before
+
+
+def test_second_derivatives_are_refused(rays, motion):
+    (grad,) = torch.autograd.grad(pictures(*rays, *motion).sum(), motion[:1], create_graph=True)
+    with pytest.raises(GradientError, match="first derivatives only"):
+        grad.sum().backward()
+
+
+def test_a_scene_without_gradient_is_rendered_and_says_so_when_one_is_asked_for():
+    scene = PathScene({"light": {"type": "constant"}, "ball": {"type": "sphere"}}, samples=1)
+    camera = render.Camera(lens.Pinhole(8.0), 4, 4, pixel_pitch_mm=0.5, samples_per_pixel=1)
+    poses = pose.look_at((0, -4, 1), (0, 0, 0))[None].clone().requires_grad_()
+    image = render.frames(camera, scene, poses)
+    assert float(image.detach().mean()) > 0
+    with pytest.raises(GradientError, match="PathScene has no gradient"):
+        image.sum().backward()
+
+
+@pytest.mark.parametrize("shape", ["sphere", "rectangle", "cube"])
+def test_box_around_a_scene_takes_no_ray_from_it(shape, generator):
+    """Rays from before, inside and behind, at the shape and past it, some along its box's faces."""
+    glow = {"type": "area", "radiance": {"type": "uniform", "value": 7.0}}
+    scene = render.MitsubaScene({"thing": {"type": shape, "emitter": glow}}).two_sided()
+    origin = 3 * torch.randn(4000, 3, dtype=torch.float64, generator=generator)
+    target = 1.2 * (2 * torch.rand(4000, 3, dtype=torch.float64, generator=generator) - 1)
+    target[::4] = target[::4].round()
+    direction = torch.nn.functional.normalize(target - origin, dim=1)
+    still = torch.eye(4, dtype=torch.float64).expand(1, 4000, 4, 4)
+    light, distance = look(scene, still, origin, direction)
+    scene._box = None
+    again, same = look(scene, still, origin, direction)
+    assert torch.equal(light, again)
+    assert torch.equal(distance, same)
+    assert 0.05 < float((light == 7.0).double().mean()) < 0.95
