@@ -89,10 +89,8 @@ class MitsubaScene:
         still = dr.detach(ray)
         found = self.scene.ray_intersect_preliminary(still, coherent=True, active=self._ahead(still))
         met = found.is_valid()
-        shapes = self.scene.shapes()
-        shown = [self._shown(shape) for shape in shapes] + [self._beyond]
-        number = dr.gather(mi.UInt32, self._numbers, dr.reinterpret_array(mi.UInt32, found.shape), met)
-        number = dr.select(met, number, len(shapes))
+        number = self._number(found)
+        shown = [self._shown(shape) for shape in self.scene.shapes()] + [self._beyond]
         if not dr.grad_enabled(ray.o, ray.d):
             return dr.switch(number, shown, still.o, still.d, found)[0], found.t
         sloped = [with_slopes(each) for each in shown]
@@ -103,6 +101,14 @@ class MitsubaScene:
             dr.replace_grad(light, dr.dot(to_origin, ray.o) + dr.dot(to_direction, ray.d)),
             dr.replace_grad(found.t, dr.select(met, along, 0)),
         )
+
+    def _number(self, found):
+        """Number of the shape that is met, as many as there are where none is."""
+        import drjit as dr
+
+        held = dr.reinterpret_array(self.mi.UInt32, found.shape)
+        number = dr.gather(self.mi.UInt32, self._numbers, held, found.is_valid())
+        return dr.select(found.is_valid(), number, len(self.scene.shapes()))
 
     def _ahead(self, ray):
         """Whether rays may meet anything: those that pass by a small object need no cast."""
@@ -162,6 +168,8 @@ class MitsubaScene:
     def hit(self, origin_m: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """First surface met by world rays [N, 3]: point [N, 3], normal [N, 3], valid [N]; no gradient,
         float64 out of float32 geometry."""
+        import drjit as dr
+
         mi = self.mi
         if origin_m.shape[0] == 0:  # a cast of no rays would end the process
             return origin_m.detach(), origin_m.detach(), torch.zeros(0, dtype=torch.bool)
@@ -170,12 +178,31 @@ class MitsubaScene:
             mi.Point3f(*[mi.Float(v.contiguous()) for v in o]),
             mi.Vector3f(*[mi.Float(v.contiguous()) for v in d]),
         )
-        si = self.scene.ray_intersect(ray)
-        valid = torch.as_tensor(si.is_valid().numpy()).reshape(-1)
-        t = torch.as_tensor(si.t.numpy()).double()
-        normal = torch.as_tensor(si.n.numpy()).double()
+        found = self.scene.ray_intersect_preliminary(ray, coherent=True, active=self._ahead(ray))
+        n = self._normal(ray, found)
+        dr.eval(found.t, n)
+        valid = torch.as_tensor(found.is_valid().numpy()).reshape(-1)
+        t = torch.as_tensor(found.t.numpy()).double()
+        normal = torch.as_tensor(n.numpy()).double()
         t = torch.where(valid, t, torch.ones_like(t))
         return origin_m.detach() + direction.detach() * t[:, None], normal.T, valid
+
+    def _normal(self, ray, found):
+        """Normals (drjit arrays) of the surfaces that are met."""
+        import drjit as dr
+
+        mi = self.mi
+        shapes = self.scene.shapes()
+        if any(
+            shape.class_name() == "Instance" for shape in shapes
+        ):  # met are shapes of its group, not in the list
+            return found.compute_surface_interaction(ray, mi.RayFlags.Minimal).n
+
+        def of(shape):
+            return lambda ray, found: shape.compute_surface_interaction(ray, found, mi.RayFlags.Minimal).n
+
+        across = [*map(of, shapes), lambda ray, found: mi.Normal3f(0, 0, 0)]
+        return dr.switch(self._number(found), across, ray, found)
 
 
 def _never_black(curve):
