@@ -59,6 +59,7 @@ GROUPS = {
         "joint_design",
         "placement",
         "mount_sight",
+        "velocity_head",
         "robot_gates",
         "gradient_flow",
         "certify_precision",
