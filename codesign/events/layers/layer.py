@@ -12,6 +12,7 @@ from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import check_layout, check_times
 from codesign.events.intensity import FrontEnd, log_levels
 from codesign.events.layers.comparators import Comparator, check_comparator
+from codesign.events.layers.last_draw import LastDraw
 from codesign.events.layers.physical import DESIGN, PhysicalState, sensor_counts
 from codesign.events.layers.positive import PositiveValues
 from codesign.events.level_path import finer, parts
@@ -239,6 +240,7 @@ class ComparatorLayer(EventLayer):
         super().__init__(sensor, **options)
         check_comparator(comparator, self.sensor, self.learnt)
         self.comparator = comparator
+        self._last_draw = LastDraw()
         self.refines = getattr(comparator, "refines", False)
         self.whole = getattr(comparator, "whole", False)
 
@@ -271,17 +273,27 @@ class ComparatorLayer(EventLayer):
     def _noise(self, frames, interval_s, state):
         """Deviates of the thresholds [2, ..., H, W] and noise events [T-1, 2, ..., H, W], None each where the
         sensor has none; one sample after the other."""
+        draws_thetas = self.sensor.theta_sigma > 0 and state.deviates is None
+        if not draws_thetas and not self.sensor.has_shots:
+            return state.deviates, None
+        asked = (frames.shape, frames.dtype, frames.device, interval_s.tolist(), draws_thetas)
+        deviates, shots = self._last_draw(
+            asked, state.generators, lambda: self._draw(frames, interval_s, state.generators, draws_thetas)
+        )
+        return state.deviates if deviates is None else deviates, shots
+
+    def _draw(self, frames, interval_s, generators, draws_thetas):
         pixels = frames.shape[-2:]
         deviates = []
         shots = []
-        for generator in state.generators:
-            if self.sensor.theta_sigma > 0 and state.deviates is None:
+        for generator in generators:
+            if draws_thetas:
                 deviates.append(draw_deviates(pixels, generator, dtype=frames.dtype))
             if self.sensor.has_shots:
                 shots.append(draw_shot_counts(self.sensor, pixels, interval_s, generator, dtype=frames.dtype))
         batch = frames.shape[1:]
         return (
-            torch.stack(deviates, 1).reshape(2, *batch).to(frames) if deviates else state.deviates,
+            torch.stack(deviates, 1).reshape(2, *batch).to(frames) if deviates else None,
             torch.stack(shots, 2).reshape(-1, 2, *batch).to(frames) if shots else None,
         )
 

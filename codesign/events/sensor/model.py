@@ -316,14 +316,12 @@ def draw_shot_counts(
             "interval_s holds a length that is not a finite number > 0; give t_s.diff() of increasing frame "
             "times."
         )
-    counts = torch.zeros((len(interval_s), 2, *pixels), dtype=dtype, device=device)
-    if sensor.shot_rate_hz > 0:
-        rate_hz = torch.full(
-            (2, *pixels), sensor.shot_rate_hz / 2, dtype=torch.float64, device=generator.device
-        )
-        for index, length_s in enumerate(interval_s.tolist()):
-            counts[index] = torch.poisson(rate_hz * length_s, generator=generator).to(counts)
-    return counts
+    shape = (len(interval_s), 2, *pixels)
+    if sensor.shot_rate_hz == 0:
+        return torch.zeros(shape, dtype=dtype, device=device)
+    mean = (sensor.shot_rate_hz / 2) * interval_s.to(generator.device)
+    mean = mean.reshape(-1, *[1] * (len(pixels) + 1)).expand(shape).contiguous()
+    return torch.poisson(mean, generator=generator).to(dtype=dtype, device=device)
 
 
 def _shape(pixels):
