@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from codesign.backend import run_kernel
 from codesign.errors import DomainError, ShapeError, as_number
 from codesign.events.entry import check_layout
 from codesign.events.intensity import light_share
@@ -27,6 +28,13 @@ def coefficients(
     small = pace < SERIES
     series = 1 - pace * (0.5 - pace * (1 / 6 - pace * (1 / 24 - pace / 120)))
     return fade, select(small, series, (1 - fade) / select(small, 1.0, pace))
+
+
+def _coefficients(arr, pace):
+    """``coefficients`` in one launch: in torch each of its operations passes through memory."""
+    import drjit as dr
+
+    return coefficients(pace, dr.exp, dr.select)
 
 
 def passed(filtered: Any, before: Any, now: Any, fade: Any, mean: Any) -> Any:
@@ -55,7 +63,7 @@ def one_pole(level: Tensor, pace: Tensor, start: Tensor | None = None) -> Tensor
             f"[{len(level) - 1}, ...] of at most {level.ndim} axes."
         )
     filtered = [level[0] if start is None else start]
-    steps = zip(level[:-1], level[1:], *coefficients(pace, torch.exp, torch.where), strict=True)
+    steps = zip(level[:-1], level[1:], *run_kernel(_coefficients, (pace,), [pace.shape] * 2), strict=True)
     for step in steps:
         filtered.append(passed(filtered[-1], *step))
     return torch.stack(filtered)
