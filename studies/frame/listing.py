@@ -61,6 +61,7 @@ GROUPS = {
         "mount_sight",
         "velocity_head",
         "robot_gates",
+        "placement_step",
         "gradient_flow",
         "certify_precision",
         "speed_error",
