@@ -38,6 +38,15 @@ def _lin_log(frames):
     return torch.where(frames <= JOINT, frames * DARK_SLOPE, frames.clamp(min=JOINT).log())
 
 
+def _linear(arr, level):
+    """Inverse of lin-log, in one launch: in torch each of its operations passes through memory."""
+    import drjit as dr
+
+    joint = math.log(JOINT)
+    dark = dr.maximum(level, 0) / DARK_SLOPE
+    return (dr.select(level <= joint, dark, dr.exp(dr.maximum(level, joint))),)
+
+
 def light_share(intensity: Any) -> Any:
     """How far the photoreceptor's speed and noise are from dark to full light: (I + 20)/275, 1 at I = 255.
     Tensors and drjit arrays. Source: v2e."""
@@ -81,8 +90,7 @@ class FrontEnd:
             return level
         if self.log_eps is not None:
             return (level.exp() - self.log_eps).clamp(min=0)
-        dark = level <= math.log(JOINT)
-        return torch.where(dark, level.clamp(min=0) / DARK_SLOPE, level.clamp(min=math.log(JOINT)).exp())
+        return backend.run_kernel(_linear, (level,), [level.shape])[0]
 
     def slope(self, frames):
         """Derivative of the level to the frame."""
