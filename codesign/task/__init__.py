@@ -3,19 +3,25 @@ judged."""
 
 from codesign.task.depth import ground_depth, scene_depth
 from codesign.task.ego_velocity import EgoVelocity, Motion, Readings
+from codesign.task.expected import Expected, FlowErrors, expected_errors
 from codesign.task.own_body import OwnBody
 from codesign.task.score import VelocityErrors, velocity_errors
 from codesign.task.sight import ATTITUDES, VELOCITIES, Surroundings, sight_map, sight_table, sight_units
+from codesign.task.trend import PrecisionTrend
 
 __all__ = [
     "ATTITUDES",
     "VELOCITIES",
     "EgoVelocity",
+    "Expected",
+    "FlowErrors",
     "Motion",
     "OwnBody",
+    "PrecisionTrend",
     "Readings",
     "Surroundings",
     "VelocityErrors",
+    "expected_errors",
     "ground_depth",
     "scene_depth",
     "sight_map",

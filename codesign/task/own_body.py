@@ -54,9 +54,12 @@ class OwnBody:
 
     def slack(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
         """[..., 1] share of the picture that may still be covered. Gradient: mount and lens."""
+        return self.largest_share - self.covered(T_body_cam, camera).mean(-1, keepdim=True)
+
+    def covered(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
+        """[..., windows] share of every window of the film that the body covers. Gradient: mount and lens."""
         found = frames(camera, self.scene, T_body_cam.reshape(-1, 4, 4), "boundary", self.per_px).double()
-        covered = found.flatten(1).mean(1).reshape(*T_body_cam.shape[:-2], 1)
-        return self.largest_share - covered
+        return found.flatten(-2).mean(-1).reshape(*T_body_cam.shape[:-2], -1)
 
     @torch.no_grad()
     def exact(self, T_body_cam: Tensor, camera: Camera) -> Tensor:

@@ -1,0 +1,76 @@
+"""How well flow is known where it is longer or nearer, in the mean over textures: the part of the gradient of its
+precision that is not the draw's.
+
+The precision that an estimator gives a window jumps with the texture under it: moved by a pixel, the picture has other
+edges. Its derivative to a pose is that jump times hundreds of pixels per radian, and has no mean. What goes on when the
+jumps are averaged is that flow is told better where there is more of it, until it is too fast, and where the surface
+and its texture are near. That trend is fitted over all points seen so far, and is followed instead.
+"""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from codesign.flow.checks import check_number
+from codesign.task.ego_velocity import Readings
+
+LEAST_PX = 0.5  # flow below which a length says no more
+LEAST_PER_M = 0.3  # nearness below which a distance says no more
+RIDGE = 1e-5
+SURE = 1e-4  # of a confidence from 0 and 1
+
+
+class PrecisionTrend:
+    """Regression of the logarithm of precision, and of the log odds of confidence, on flow length and nearness (third
+    order in the first, second in the other).
+
+    >>> trend = PrecisionTrend()
+
+    forget: share of what was seen before that each ``add`` leaves out, 0 for none.
+    """
+
+    def __init__(self, forget: float = 0.0) -> None:
+        self.forget = check_number(forget, "forget", least=0.0)
+        self._normal: Tensor | None = None
+        self._right: Tensor | None = None
+
+    @torch.no_grad()
+    def add(self, read: Readings, flow_px: Tensor) -> "PrecisionTrend":
+        """Take in readings whose true flow is [N, P, 2] px; points without a surface are left out."""
+        seen = read.share > 0
+        terms = _terms(read, flow_px)[seen]
+        wanted = torch.stack([0.5 * torch.logdet(read.precision), _log_odds(read.confidence)], -1)[seen]
+        normal, right = terms.mT @ terms, terms.mT @ wanted
+        kept = 1 - self.forget
+        self._normal = normal if self._normal is None else kept * self._normal + normal
+        self._right = right if self._right is None else kept * self._right + right
+        return self
+
+    def followed(self, read: Readings, flow_px: Tensor) -> Readings:
+        """The same readings, whose precision and confidence have the gradient of the trend to flow and depth."""
+        said = _terms(read, flow_px) @ self._coefficients()
+        change = said - said.detach()
+        precision = read.precision.detach() * change[..., 0].exp()[..., None, None]
+        confidence = torch.sigmoid(_log_odds(read.confidence.detach()) + change[..., 1])
+        return replace(read, precision=precision, confidence=confidence)
+
+    def _coefficients(self):
+        weight = self._normal[0, 0]  # the number of points: the first term is 1
+        ridge = RIDGE * weight * torch.eye(len(self._normal), dtype=self._normal.dtype)
+        return torch.linalg.solve(self._normal + ridge, self._right)
+
+
+def _terms(read, flow_px):
+    """[N, P, 8] of true flow and depth."""
+    length = ((flow_px.square().sum(-1) + 1e-12).sqrt() + LEAST_PX).log()
+    near = torch.where(read.depth_m.isfinite(), 1 / read.depth_m, 0.0)
+    nearness = (near.clamp_min(0) + LEAST_PER_M).log()
+    one = torch.ones_like(length)
+    terms = [one, length, length**2, length**3, nearness, nearness**2]
+    return torch.stack([*terms, length * nearness, length**2 * nearness], -1)
+
+
+def _log_odds(confidence):
+    inside = confidence.clamp(SURE, 1 - SURE)
+    return (inside / (1 - inside)).log()

@@ -1,0 +1,78 @@
+"""What must come out when there is nothing to be found, and what a wrong objective finds."""
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from codesign import events
+from codesign.types import EventVolume
+from scenes.robot_pair import BINS, LEAD_S, SENSOR
+from studies.placement.problem import Problem, Samples
+
+MISMATCHED = replace(SENSOR, theta_on=1.3 * SENSOR.theta_on, theta_off=0.8 * SENSOR.theta_off)
+NEAR_M = 0.12  # in front of the robot, looking back at it
+
+
+@torch.no_grad()
+def controls(problem: Problem, mount: Tensor, samples: Samples) -> dict[str, float]:
+    """Mean bounded errors with single events: of a mount [4, 4] as it is, and with something taken away from it."""
+    batch = problem.batch(samples)
+    system = problem.system(mount, "sensor")
+    run = system.begin(batch)
+    errors = problem.pair.errors
+
+    def judged(recorded, chain=system):
+        return float(errors(chain.begin(batch, recorded)["estimate"], batch).bounded().mean())
+
+    frames = run["frames"]
+    still = torch.full_like(frames, float(frames.mean()))
+    told = run["estimate"]
+    zero = replace(told, velocity=torch.zeros_like(told.velocity))
+    other = events.HardSensor(MISMATCHED, BINS, LEAD_S)
+    backward = problem.system(looking_back(problem), "sensor")
+    return {
+        "as_found": float(errors(told, batch).bounded().mean()),
+        "no_texture": judged({"frames": still}),
+        "shuffled_events": judged({"events": shuffled(run["volume"])}),
+        "only_the_robot": judged({}, backward),
+        "thresholds_mismatched": judged({"frames": frames}, system.replaced(events=other)),
+        "always_zero": float(errors(zero, batch).bounded().mean()),
+    }
+
+
+def shuffled(volume: EventVolume) -> EventVolume:
+    """Every window's events at other pixels of it: as many, in the same bins, with no picture that moves."""
+    height, width = volume.counts.shape[-2:]
+    order = torch.randperm(height * width, generator=torch.Generator().manual_seed(0))
+    return replace(volume, counts=volume.counts.flatten(-2)[..., order].unflatten(-1, (height, width)))
+
+
+def looking_back(problem: Problem) -> Tensor:
+    """T_body_cam [4, 4] of a camera just before the robot that looks back at its middle."""
+    points = torch.cat([torch.as_tensor(mesh.vertices_m) for mesh in problem.pair.bodies.values()]).double()
+    low, high = points.min(0).values, points.max(0).values
+    middle = (low + high) / 2
+    at = torch.stack([high[0] + NEAR_M, middle[1], middle[2]])
+    back = torch.tensor([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = back
+    pose[:3, 3] = at
+    return pose
+
+
+@torch.no_grad()
+def cheat(problem: Problem, shares: Tensor, samples: Samples) -> list[tuple[float, float]]:
+    """Of mounts [N, 6]: root mean square error of the flow in pixels, and mean bounded error of the velocity."""
+    found = []
+    for share in shares:
+        batch = problem.batch(samples)
+        run = problem.system(problem.ranges.pose(share)).begin(batch)
+        estimator = run.system.estimate
+        what = [run[name] for name in ("field", "camera", "scene", "T_body_cam", "T_world_cam", "t_s")]
+        read = estimator.read(*what)
+        seen = (read.share > 0)[..., None]
+        missed = read.flow_px - (read.rows @ batch.twist[:, None, :, None])[..., 0]
+        pixels = float((missed.square() * seen).sum().div(seen.sum()).sqrt())
+        found.append((pixels, float(problem.pair.errors(run["estimate"], batch).bounded().mean())))
+    return found

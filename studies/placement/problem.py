@@ -1,0 +1,158 @@
+"""What a search for a mount looks at: a pair of robot and world, a pool of its training worlds and drives, and the
+requirements of the mount. A mount is six shares of the pair's ranges."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from codesign import place, render, task
+from codesign.system import System
+from scenes import robot_pair
+from scenes.robot_pair import Drives, RobotPair, times
+
+DRIVES = 48  # of every world that draws are made from
+CLEAR = 0.02  # least share of a window that is taken to be clear of the robot
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Drives in ``numbers`` of worlds, the same ``which`` of each, and the seed of film samples and sensor noise."""
+
+    numbers: tuple[int, ...]
+    which: tuple[int, ...]
+    seed: int
+
+
+@dataclass
+class Problem:
+    """pair: robot and worlds. numbers: of the worlds that draws are made from. per_world: drives in each of ``spread``
+    worlds of a draw. errors: of flow beyond the estimator's covariance, for what is expected. camera: in place of the
+    pair's own."""
+
+    pair: RobotPair
+    numbers: Sequence[int]
+    spread: int = 4
+    per_world: int = 6
+    errors: task.FlowErrors = field(default_factory=task.FlowErrors)
+    camera: render.Camera | None = None
+
+    def __post_init__(self):
+        self._worlds: dict[int, tuple] = {}
+        self.ranges = self.pair.ranges
+        self.trend = task.PrecisionTrend()
+        self.rendered = 0  # samples so far
+        if self.camera is None:
+            self.camera = self.pair.design.camera()
+
+    @property
+    def samples(self) -> int:
+        """Drives in a draw."""
+        return self.spread * self.per_world
+
+    @property
+    def start(self) -> Tensor:
+        """Shares [6] of the pair's own design."""
+        return self.ranges.share_at(self.pair.design.mount())
+
+    @cached_property
+    def requirements(self) -> list[place.Requirement]:
+        return self.pair.requirements()
+
+    def draw(self, number: int) -> Samples:
+        """Samples of that number: other worlds and drives for each, until all have been seen."""
+        turns, part = divmod(number, max(1, len(self.numbers) // self.spread))
+        order = torch.randperm(len(self.numbers), generator=torch.Generator().manual_seed(turns))
+        drives = torch.randperm(DRIVES, generator=torch.Generator().manual_seed(number))[: self.per_world]
+        chosen = order[part * self.spread : (part + 1) * self.spread].tolist()
+        return Samples(tuple(self.numbers[k] for k in chosen), tuple(drives.tolist()), number)
+
+    def batch(self, samples: Samples) -> Drives:
+        """Worlds and drives of samples, the robot in them; worlds are built once."""
+        scenes = []
+        poses = []
+        twists = []
+        for number in samples.numbers:
+            if number not in self._worlds:
+                self._worlds[number] = (self.pair.world(number), *self.pair.drive(number, DRIVES))
+            world, driven, twist = self._worlds[number]
+            which = list(samples.which)
+            scenes.append(render.MovingScene(world, {"body": (self._body, driven[which])}))
+            poses.append(driven[which])
+            twists.append(twist[which])
+        self.rendered += self.samples
+        return Drives(torch.stack(poses), times(), tuple(scenes), samples.seed, twist=torch.cat(twists))
+
+    @cached_property
+    def _own_body(self):
+        body = place.Body((mesh.vertices_m, mesh.faces) for mesh in self.pair.bodies.values())
+        return task.OwnBody(body, 1.0)
+
+    @cached_property
+    def _body(self):
+        return self.pair.body()
+
+    @cached_property
+    def _system(self):
+        return self.pair.system(self.pair.design)
+
+    def system(self, T_body_cam: Tensor, layer: str = "memory") -> System:
+        """The chain behind a mount [4, 4]."""
+        return self._system.replaced(
+            camera=self.camera, mount=lambda: T_body_cam, events=robot_pair.LAYERS[layer]
+        )
+
+    @torch.no_grad()
+    def judged(self, T_body_cam: Tensor, samples: Samples, layer: str = "memory") -> task.VelocityErrors:
+        """Errors of a mount [4, 4], hard counts or single events ("sensor")."""
+        batch = self.batch(samples)
+        return self.pair.errors(self.system(T_body_cam, layer).begin(batch)["estimate"], batch)
+
+    def error(self, share: Tensor, samples: Samples) -> float:
+        """What searches without gradients minimise: the mean bounded error, and the penalty of what is required."""
+        with torch.no_grad():
+            mount = self.ranges.pose(share)
+            found = self.judged(mount, samples).bounded().mean() + self.penalty(mount)
+        return float(found)
+
+    def penalty(self, T_body_cam: Tensor) -> Tensor:
+        """0 where every requirement is kept with a step to spare. Gradient: mount."""
+        return place.penalty(self.requirements, T_body_cam, self.camera)
+
+    def expected(self, T_body_cam: Tensor, samples: Samples, learn: bool = False) -> Tensor:
+        """Bounded error [N] to be expected of a mount, the default objective.
+
+        learn: take these samples into the trend of the flow's precision.
+        Gradient: mount, through the geometry of flow, the trend of its precision over length and nearness, and the
+        share of every window that the robot itself covers; not through single frames, whose texture makes it noise.
+        """
+        batch = self.batch(samples)
+        system = self.system(T_body_cam)
+        with torch.no_grad():
+            field = system.begin(batch)["field"]
+        run = system.begin(batch, {"flow": field})
+        estimator = system.estimate
+        what = [run[name] for name in ("field", "camera", "scene", "T_body_cam", "T_world_cam", "t_s")]
+        read = estimator.read(*what)
+        true = read if self.pair.depth == "scene" else estimator.read(*what, depth=task.scene_depth)
+        flow_px = (true.rows @ batch.twist[:, None, :, None])[..., 0]
+        seen = replace(read, depth_m=true.depth_m)
+        if learn:
+            self.trend.add(seen, flow_px)
+        if T_body_cam.requires_grad:
+            read = replace(self.trend.followed(seen, flow_px), depth_m=read.depth_m)
+            clear = (1 - self._own_body.covered(T_body_cam, self.camera)).clamp_min(CLEAR)
+            clear = (clear / clear.detach()).repeat_interleave(read.share.shape[1] // read.windows)
+            read = replace(read, share=read.share * clear)
+        expected = task.expected_errors(estimator, read, batch.twist, true.rows, self.errors)
+        squared = expected.squared[:, list(self.pair.axes)]
+        unit = task.velocity_errors(torch.zeros_like(squared), batch.twist, self.pair.axes).unit()
+        squared = (squared / unit**2).mean(1)
+        return squared / (1 + squared)
+
+    def seen(self, T_body_cam: Tensor, samples: Samples) -> Tensor:
+        """Bounded error [N] of single draws, the gradient straight through the events."""
+        batch = self.batch(samples)
+        return self.pair.errors(self.system(T_body_cam).begin(batch)["estimate"], batch).bounded()
