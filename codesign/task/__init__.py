@@ -3,7 +3,9 @@ judged."""
 
 from codesign.task.depth import ground_depth, scene_depth
 from codesign.task.ego_velocity import EgoVelocity, Motion, Readings
+from codesign.task.evidence import Evidence
 from codesign.task.expected import Expected, FlowErrors, expected_errors
+from codesign.task.head import VelocityHead
 from codesign.task.own_body import OwnBody
 from codesign.task.score import VelocityErrors, velocity_errors
 from codesign.task.sight import ATTITUDES, VELOCITIES, Surroundings, sight_map, sight_table, sight_units
@@ -13,6 +15,7 @@ __all__ = [
     "ATTITUDES",
     "VELOCITIES",
     "EgoVelocity",
+    "Evidence",
     "Expected",
     "FlowErrors",
     "Motion",
@@ -21,6 +24,7 @@ __all__ = [
     "Readings",
     "Surroundings",
     "VelocityErrors",
+    "VelocityHead",
     "expected_errors",
     "ground_depth",
     "scene_depth",

@@ -34,6 +34,7 @@ WIDEST = 6.0  # logarithm of the largest factor on a window's weight
 WIDER = 4.0  # of those on deviations
 SIX = len(FREE)
 KIND = "velocity head"
+DELIVERED = Path(__file__).with_name("head.safetensors")
 
 
 class VelocityHead(nn.Module):
@@ -49,9 +50,8 @@ class VelocityHead(nn.Module):
       design: False hides lens and mount from the network.
 
     >>> from codesign import place, task
-    >>> from codesign.task.head import VelocityHead
     >>> plain = task.EgoVelocity(place.FREE, prior=(2.0, 2.0, 1.0, 1.0, 1.0, 1.0), depth="scene")
-    >>> sum(weight.numel() for weight in VelocityHead(plain).parameters()) <= 50_000
+    >>> sum(weight.numel() for weight in task.VelocityHead(plain).parameters()) <= 50_000
     True
     """
 
@@ -190,6 +190,15 @@ class VelocityHead(nn.Module):
         head = cls(plain, **content["config"])
         checkpoint.fill(head, weights, path)
         return head.eval()
+
+    @classmethod
+    def pretrained(cls, plain: EgoVelocity) -> "VelocityHead":
+        """The delivered head, which studies.velocity_head trained on the three pairs of scenes.robot_pairs.
+
+        It knows their regime: nine windows of 32 x 32, the closed form of flow with a prior of 4 px, axes ``place.FREE``.
+        Elsewhere it is a start for training.
+        """
+        return cls.load(plain, DELIVERED)
 
 
 def _layers(inputs, width, outputs):

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from codesign import task
 from codesign.errors import DomainError
-from codesign.task.head import VelocityHead
 from scenes import robot_pair
 from scenes.robot_pairs import PAIRS
 from studies.frame.run import Run, StudyConfig, main
@@ -156,7 +155,7 @@ def _trained(run, arm, lessons, judge, shown):
     run.say(f"training the head '{arm}' on {sum(len(part.twist) for part in lessons)} samples")
     torch.manual_seed(config.seed)
     plain = task.EgoVelocity(tuple(range(6)), (1.0,) * 6)
-    head = VelocityHead(plain, config.width, design=shown)
+    head = task.VelocityHead(plain, config.width, design=shown)
     return trained(head, lessons, judge, config.steps, config.batch, config.seed)
 
 
@@ -165,7 +164,7 @@ def _compared(run, data, index, heads) -> dict[str, Tensor]:
     config = run.config
     lessons, judge = data.split([data.own[index]])
     torch.manual_seed(config.seed)
-    fresh = VelocityHead(heads["shared"].plain, config.width)
+    fresh = task.VelocityHead(heads["shared"].plain, config.width)
     rates = {"alone": (fresh, RATE), "trained on": (copy.deepcopy(heads["shared"]), TUNED * RATE)}
     own = {
         arm: trained(head, [lessons], [judge], config.own_steps, config.batch, config.seed, rate)

@@ -11,8 +11,6 @@ from torch.quasirandom import SobolEngine
 
 from codesign import task
 from codesign.flow import checkpoint
-from codesign.task.evidence import Evidence
-from codesign.task.head import VelocityHead
 from scenes.robot_pair import Design, RobotPair
 
 AT_ONCE = 6  # motions in each world, rendered together: 8 million rays for every 12 samples
@@ -25,7 +23,7 @@ class Samples:
     """Evidence of N bodies, their true twists [N, 6], and what plain least squares makes of them: velocities [N, 6] and
     covariances [N, 6, 6]. Samples of one world are neighbours. axes: the velocities that count."""
 
-    seen: Evidence
+    seen: task.Evidence
     twist: Tensor
     velocity: Tensor
     covariance: Tensor
@@ -41,7 +39,7 @@ class Samples:
         several = (
             torch.cat([getattr(each, n) for each in parts]) for n in ("twist", "velocity", "covariance")
         )
-        return Samples(Evidence.joined([each.seen for each in parts]), *several, parts[0].axes)
+        return Samples(task.Evidence.joined([each.seen for each in parts]), *several, parts[0].axes)
 
 
 def designs(pair: RobotPair, count: int, seed: int) -> list[Design]:
@@ -69,7 +67,7 @@ class Drawn:
         self.folder = folder
         self.seed = seed
         self.plain = task.EgoVelocity(tuple(range(6)), pair.prior, pair.depth)
-        self.head = VelocityHead(self.plain)
+        self.head = task.VelocityHead(self.plain)
         self.world = functools.cache(pair.world)
         self.drives = functools.cache(functools.partial(_drives, pair))
         self.pair = pair
@@ -79,12 +77,12 @@ class Drawn:
         path = self.folder / f"{self.pair.name}_{kind}_{index:03d}.safetensors"
         if not path.exists():
             made = self._made(design, index, motions)
-            tensors = {f"seen/{f.name}": getattr(made.seen, f.name).float() for f in fields(Evidence)}
+            tensors = {f"seen/{f.name}": getattr(made.seen, f.name).float() for f in fields(task.Evidence)}
             tensors |= {name: getattr(made, name).float() for name in ("twist", "velocity", "covariance")}
             self.folder.mkdir(parents=True, exist_ok=True)
             checkpoint.write_tensors(path, tensors, {"kind": "evidence"})
         tensors = {name: tensor.double() for name, tensor in checkpoint.read_tensors(path)[0].items()}
-        seen = Evidence(*(tensors[f"seen/{f.name}"] for f in fields(Evidence)))
+        seen = task.Evidence(*(tensors[f"seen/{f.name}"] for f in fields(task.Evidence)))
         return Samples(seen, tensors["twist"], tensors["velocity"], tensors["covariance"], self.pair.axes)
 
     @torch.no_grad()

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from codesign import task, train
-from codesign.task.head import VelocityHead
 from studies.velocity_head.samples import Samples
 
 CLAIM = 0.05  # weight of the likelihood beside the bounded error
@@ -50,20 +49,20 @@ def lesson(predictions: list[tuple[Tensor, ...]], batch: list[Samples]) -> Tenso
     return torch.stack(losses).mean()
 
 
-def judged(head: VelocityHead, batch: list[Samples]) -> list[tuple[Tensor, ...]]:
+def judged(head: task.VelocityHead, batch: list[Samples]) -> list[tuple[Tensor, ...]]:
     """What a head says of samples of each pair."""
     return [head.judged(samples.seen) for samples in batch]
 
 
 def trained(
-    head: VelocityHead,
+    head: task.VelocityHead,
     lessons: list[Samples],
     judge: list[Samples],
     steps: int,
     batch: int,
     seed: int,
     rate: float = RATE,
-) -> VelocityHead:
+) -> task.VelocityHead:
     """The head, trained on samples of each pair in equal shares; of the weights on its way those that judge best.
 
     Args: lessons, judge: samples to train on and to choose by, for each pair.

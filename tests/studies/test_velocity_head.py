@@ -7,8 +7,6 @@ import pytest
 import torch
 
 from codesign import task
-from codesign.task.evidence import Evidence
-from codesign.task.head import VelocityHead
 from scenes import robot_pair
 from scenes.robot_pairs import PAIRS
 from studies.frame.run import main
@@ -39,7 +37,7 @@ def made(count, seed, pair):
     flow = flow * (1 - (1 - SHORT) * marked[..., None])
     told = torch.zeros(count, WINDOWS, 11, dtype=D)
     told[..., 9] = marked
-    seen = Evidence(
+    seen = task.Evidence(
         rows.mT @ rows / NOISE_PX**2,
         (rows.mT @ flow[..., None])[..., 0] / NOISE_PX**2,
         flow.square().sum(-1) / NOISE_PX**2,
@@ -50,7 +48,7 @@ def made(count, seed, pair):
         torch.zeros(count, 9, dtype=D),
         torch.ones(count, 6, dtype=D),
     )
-    head = VelocityHead(task.EgoVelocity(tuple(range(6)), (1.0,) * 6))
+    head = task.VelocityHead(task.EgoVelocity(tuple(range(6)), (1.0,) * 6))
     velocity, covariance, _ = (part.detach() for part in head.judged(seen))
     return Samples(seen, twist, velocity, covariance, pair.axes)
 
@@ -135,7 +133,7 @@ def test_the_shared_head_is_as_good_as_own_ones_where_designs_do_not_matter(tmp_
     # a window that reads half of its flow is far out of a covariance that does not know it
     assert metrics["plain_within_90_share"] < 0.3
     assert metrics["shared_within_90_share"] == pytest.approx(0.9, abs=0.1)
-    head = VelocityHead.load(task.EgoVelocity(), out / "head.safetensors")
+    head = task.VelocityHead.load(task.EgoVelocity(), out / "head.safetensors")
     assert head.config["width"] == 16
 
 
