@@ -12,7 +12,7 @@ import io
 import math
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -39,7 +39,8 @@ from studies.placement.searches import SEARCHES, Trail, available, refined_grid
 GRADIENT = "gradient"
 GRID = "grid"
 STEP = 0.12  # of the cube, of the differences that judge the gradient
-AGREES = {"relative_l2": 0.5, "cosine": 0.9}  # steps have a set length: what counts is where they lead
+AGREES = {"relative_l2": 1.0, "cosine": 0.8}  # steps have a set length: what counts is where they lead
+UNKNOWN = 1 / 3  # standard error of differences from which on they judge nothing
 TRIES = 4096
 RESAMPLED = 4000
 INTERVAL = 0.9
@@ -241,14 +242,24 @@ def scales() -> dict[str, float]:
     return dict.fromkeys(GROUPS, STEP)
 
 
+def pose_of(problem: Problem, parts: dict[str, Tensor]) -> Tensor:
+    """T_body_cam [4, 4]."""
+    return problem.ranges.pose(torch.cat([parts[name] for name in GROUPS]))
+
+
+def expected(problem: Problem, parts: dict[str, Tensor], draw: int, learn: bool = False) -> Tensor:
+    """The mean error to be expected."""
+    return problem.expected(pose_of(problem, parts), problem.draw(draw), learn).mean()
+
+
 def objective(problem: Problem, parts: dict[str, Tensor], draw: int, learn: bool = False) -> Tensor:
-    """The mean error to be expected, and the penalty of what is required."""
-    mount = problem.ranges.pose(torch.cat([parts[name] for name in GROUPS]))
-    return problem.expected(mount, problem.draw(draw), learn).mean() + problem.penalty(mount)
+    """The same and the penalty of what is required, whose gradient is exact."""
+    return expected(problem, parts, draw, learn) + problem.penalty(pose_of(problem, parts))
 
 
 def certified(run: Run[Config], race: Race, start: Tensor) -> dict[str, grad.Choice]:
-    """The way to the gradient of position and attitude: autograd where it agrees with averaged differences."""
+    """The way to the gradient of position and attitude: autograd where it agrees with averaged differences of what is
+    expected, or these are too noisy to tell."""
     draws = run.config.certified
     if not draws:
         return {name: grad.Choice("autograd", math.nan, math.nan, math.nan, 0) for name in GROUPS}
@@ -256,10 +267,10 @@ def certified(run: Run[Config], race: Race, start: Tensor) -> dict[str, grad.Cho
         problem = race.problem
         problem.trend = task.PrecisionTrend()
         for draw in range(draws):
-            objective(problem, split(start), draw, learn=True)
+            expected(problem, split(start), draw, learn=True)
         run.say(f"comparing the gradient with differences in {draws} draws of {problem.samples} samples")
         found = grad.choose(
-            lambda parts, draw: objective(problem, parts, draw),
+            lambda parts, draw: expected(problem, parts, draw),
             split(start),
             range(draws),
             scales=scales(),
@@ -274,7 +285,8 @@ def certified(run: Run[Config], race: Race, start: Tensor) -> dict[str, grad.Cho
     ways = {}
     for name, row in zip(GROUPS, race.tensors["ways"].tolist(), strict=True):
         way = ("autograd", "differences", "evolution")[int(row[0])]
-        ways[name] = grad.Choice(way, row[1], row[2], row[3], int(row[4]))
+        said = grad.Choice(way, row[1], row[2], row[3], int(row[4]))
+        ways[name] = said if said.noise < UNKNOWN else replace(said, way="autograd", calls=0)
         run.say(f"{name}: {ways[name]}")
     return ways
 

@@ -11,7 +11,7 @@ from scenes.robot_pair import BINS, LEAD_S, SENSOR
 from studies.placement.problem import Problem, Samples
 
 MISMATCHED = replace(SENSOR, theta_on=1.3 * SENSOR.theta_on, theta_off=0.8 * SENSOR.theta_off)
-NEAR_M = 0.12  # in front of the robot, looking back at it
+NEAR_M = 0.01  # before a face of the robot
 
 
 @torch.no_grad()
@@ -49,15 +49,16 @@ def shuffled(volume: EventVolume) -> EventVolume:
 
 
 def looking_back(problem: Problem) -> Tensor:
-    """T_body_cam [4, 4] of a camera just before the robot that looks back at its middle."""
-    points = torch.cat([torch.as_tensor(mesh.vertices_m) for mesh in problem.pair.bodies.values()]).double()
-    low, high = points.min(0).values, points.max(0).values
-    middle = (low + high) / 2
-    at = torch.stack([high[0] + NEAR_M, middle[1], middle[2]])
-    back = torch.tensor([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+    """T_body_cam [4, 4] of a camera before the middle of the robot's largest face, so near that it sees nothing else."""
+    meshes = problem.pair.bodies.values()
+    faces = torch.cat([torch.as_tensor(mesh.vertices_m[mesh.faces]) for mesh in meshes]).double()
+    across = torch.linalg.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
+    largest = int(across.norm(dim=1).argmax())
+    view = -across[largest] / across[largest].norm()
+    right = (faces[largest, 1] - faces[largest, 0]) / (faces[largest, 1] - faces[largest, 0]).norm()
     pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = back
-    pose[:3, 3] = at
+    pose[:3, :3] = torch.stack([right, torch.linalg.cross(view, right), view], 1)
+    pose[:3, 3] = faces[largest].mean(0) - NEAR_M * view
     return pose
 
 
