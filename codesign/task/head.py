@@ -16,6 +16,7 @@ from torch.nn.functional import silu
 
 from codesign.errors import FileFormatError, check_whole
 from codesign.flow import checkpoint
+from codesign.flow.checks import check_kind
 from codesign.place import FREE
 from codesign.task.ego_velocity import EgoVelocity, Motion
 from codesign.task.evidence import LENS, MOUNT, TOLD, Evidence, evidence
@@ -57,7 +58,7 @@ class VelocityHead(nn.Module):
 
     def __init__(self, plain: EgoVelocity, width: int = 32, rounds: int = 2, design: bool = True) -> None:
         super().__init__()
-        self.plain = plain
+        self.plain = check_kind(plain, EgoVelocity, "plain")
         width = check_whole(width, "width")
         self.config: dict[str, Any] = {
             "width": width,
@@ -114,7 +115,8 @@ class VelocityHead(nn.Module):
         """Evidence, and the plain solution."""
         read = self.plain.read(field, camera, scene, T_body_cam, T_world_cam, t_s)
         plain = self.plain.solve(read)
-        return evidence(read, plain, camera, T_body_cam, self.plain.prior, volume), plain
+        mounts = T_body_cam.expand(*T_world_cam.shape[:-3], 4, 4).reshape(-1, 4, 4)
+        return evidence(read, plain, camera, mounts, self.plain.prior, volume), plain
 
     def judged(self, seen: Evidence) -> tuple[Tensor, Tensor, Tensor]:
         """Velocity [N, K], its covariance [N, K, K] and the weights [N, W] of the windows. Gradient: evidence and

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from codesign import lens, place, pose, render, task
-from codesign.errors import FileFormatError
+from codesign.errors import DomainError, FileFormatError
 from codesign.task.evidence import evidence
 from codesign.types import FlowField
 from scenes import robot_pair
@@ -273,6 +273,30 @@ def _flow_network():
     from codesign.flow.checkpoint import DELIVERED
 
     return DELIVERED["refiner"]
+
+
+def test_every_body_may_have_a_mount_of_its_own(mount):
+    """Two mounts with two drives each are as four bodies."""
+    other = mount @ pose.se3_exp(torch.tensor([0.1, 0.0, 0.0, 0.0, 0.2, 0.0], dtype=D))
+    mounts = torch.stack([mount, other])[:, None]
+    poses = torch.stack([moved(2, mount), moved(2, other)])
+    head = stirred(task.VelocityHead(plain_of()))
+    field = noisy(4)
+    found = head(field, camera_of(), None, mounts, poses).velocity
+    each = mounts.expand(2, 2, 4, 4).reshape(4, 4, 4)
+    torch.testing.assert_close(found, head(field, camera_of(), None, each, poses.flatten(0, 1)).velocity)
+    alone = FlowField(
+        *(part[6:] for part in (field.flow_px, field.valid)),
+        INTERVAL_S,
+        field.confidence[6:],
+        field.covariance_px2[6:],
+    )
+    torch.testing.assert_close(found[2:], head(alone, camera_of(), None, other, poses[1]).velocity)
+
+
+def test_it_needs_a_plain_estimator():
+    with pytest.raises(DomainError, match="plain is a tuple; a EgoVelocity is needed"):
+        task.VelocityHead(place.FREE)
 
 
 def test_hidden_design_is_not_heard(mount):
