@@ -1,0 +1,158 @@
+"""The placement study: its descent on a noisy valley, draws of samples, gradients against differences, controls that see
+nothing, its bad input, and the whole of it, resumed."""
+
+import csv
+import json
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from codesign.errors import DomainError
+from codesign.system import load_hand_over
+from scenes import robot_pair
+from scenes.robot_pairs import PAIRS
+from studies.frame.run import main
+from studies.placement import __main__ as placement
+from studies.placement.controls import controls, looking_back, shuffled
+from studies.placement.descent import descend
+from studies.placement.problem import Problem
+
+F = torch.float64
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return Problem(PAIRS["outdoors"](), robot_pair.training(2), spread=2, per_world=2)
+
+
+def test_descent_finds_the_end_of_a_noisy_valley():
+    """A valley ten times as steep across as along, gradients as noisy as they are long."""
+    goal = torch.tensor([0.8, 0.3, 0.55, 0.1, 0.62, 0.4], dtype=F)
+    steep = torch.tensor([10.0, 1.0, 3.0, 1.0, 5.0, 2.0], dtype=F)
+    noise = torch.Generator().manual_seed(0)
+
+    def slope(share, step):
+        exact = steep * (share - goal)
+        return float((exact * (share - goal)).sum()), exact + exact.norm() / 6**0.5 * torch.randn(
+            6, generator=noise, dtype=F
+        )
+
+    start = torch.full((6,), 0.05, dtype=F)
+    found = descend(slope, start, 40)
+    assert torch.equal(found.share[0], start)
+    assert len(found.error) == 41
+    assert float((found.share[-1] - goal).norm()) < 0.15 < 0.2 * float((start - goal).norm())
+
+
+def test_descent_goes_along_a_wall():
+    """The goal lies beyond a wall: the other numbers still arrive, and no step leaves the cube."""
+    goal = torch.tensor([1.7, 0.5], dtype=F)
+    found = descend(lambda x, k: (0.0, x - goal), torch.tensor([0.2, 0.1], dtype=F), 60)
+    assert found.share.min() >= 0
+    assert found.share.max() <= 1
+    assert found.share[-1].tolist() == pytest.approx([1.0, 0.5], abs=0.03)
+
+
+def test_draws_see_all_worlds_and_are_the_same_for_every_mount(problem):
+    many = replace(problem, numbers=range(6), spread=2)
+    drawn = [many.draw(k) for k in range(3)]
+    assert sorted(n for each in drawn for n in each.numbers) == list(range(6))
+    assert many.draw(1) == many.draw(1) != many.draw(4)
+    batch = problem.batch(problem.draw(0))
+    assert torch.equal(batch.twist, problem.batch(problem.draw(0)).twist)
+    assert batch.twist.shape == (4, 6)
+
+
+def test_gradient_to_height_is_that_of_wide_differences():
+    """Outdoors the error falls with height (flow is slower, more ground is seen); differences over a quarter of the box,
+    through frames, events and flow, say by how much."""
+    pair = PAIRS["outdoors"]()
+    problem = Problem(pair, robot_pair.training(4), spread=2, per_world=6)
+    found = torch.zeros(2, 2, dtype=F)
+    step = torch.tensor([0.0, 0.0, 0.12, 0.0, 0.0, 0.0], dtype=F)
+    for draw in range(2):
+        samples = problem.draw(draw)
+        share = problem.start.clone().requires_grad_()
+        value = problem.expected(problem.ranges.pose(share), samples, learn=True)
+        assert value.min().item() >= 0
+        assert value.max().item() <= 1
+        (slope,) = torch.autograd.grad(value.mean(), share)
+        with torch.no_grad():
+            low, high = (
+                problem.expected(problem.ranges.pose(problem.start + sign * step), samples).mean()
+                for sign in (-1, 1)
+            )
+        found[draw] = torch.stack([slope[2], (high - low) / 0.24])
+    ours, wide = found.mean(0).tolist()
+    assert wide < -0.2
+    assert ours == pytest.approx(wide, rel=0.5)
+
+
+def test_controls_see_nothing(problem):
+    found = controls(problem, problem.ranges.pose(problem.start), problem.draw(0))
+    for name in ("no_texture", "shuffled_events", "only_the_robot"):
+        assert found[name] == pytest.approx(found["always_zero"], abs=0.05)
+    assert found["as_found"] < 0.8 * found["always_zero"]
+    back = looking_back(problem)
+    assert torch.linalg.det(back[:3, :3]) == pytest.approx(1.0)
+
+
+def test_shuffled_events_are_as_many_in_every_bin(problem):
+    volume = problem.system(problem.ranges.pose(problem.start)).begin(problem.batch(problem.draw(0)))[
+        "volume"
+    ]
+    mixed = shuffled(volume)
+    assert torch.allclose(mixed.counts.sum((-2, -1)), volume.counts.sum((-2, -1)))
+    assert not torch.equal(mixed.counts, volume.counts)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["--pair", "submarine"], "--pair submarine: choose from outdoors"),
+        (["--seeds", "0"], "--seeds is 0"),
+        (["--certified", "1"], "at least 2 draws"),
+        (["--searches", "oracle"], "search 'oracle' is unknown"),
+        (["--robot", "nowhere.yaml"], "nowhere.yaml"),
+    ],
+)
+def test_wrong_input_is_one_sentence_before_the_first_frame(given, said, tmp_path, capsys):
+    assert main(placement.study, placement.Config, [*given, "--out", str(tmp_path / "run")]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_ratios_are_of_paired_starts():
+    found = placement.paired(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 2.5, 2.0]))
+    assert (found.median, found.ahead, found.count) == (pytest.approx(0.8), 2, 3)
+    assert found.low == pytest.approx(0.5)
+    assert found.high == pytest.approx(1.5)
+
+
+def test_a_bound_that_nothing_keeps_is_said():
+    pair = PAIRS["outdoors"]()
+    blind = Problem(replace(pair, look_ahead=(3.0, 0.9)), robot_pair.training(1), 1, 1)
+    with pytest.raises(DomainError, match="keep what is required"):
+        placement.feasible(blind, 1, 0)
+
+
+def test_the_whole_study_and_its_resumption(tmp_path):
+    out = tmp_path / "run"
+    sizes = "--seeds 1 --steps 2 --worlds 1 --per-world 1 --judged-worlds 1 --judged-drives 2 --certified 0 --grid 5"
+    arguments = [*sizes.split(), "--searches", "random", "--out", str(out)]
+    assert main(placement.study, placement.Config, arguments) == 0
+    found = json.loads((out / "metrics.json").read_text())
+    assert found["hand_over_score_again"] == pytest.approx(found["hand_over_score"], rel=1e-9)
+    before = (out / "race.csv").read_text()
+    rows = list(csv.DictReader(before.splitlines()))
+    assert {row["search"] for row in rows} == {"default", "start", "gradient", "random", "grid"}
+    assert {int(row["samples"]) for row in rows if row["search"] in ("gradient", "random")} == {2}
+    handed = load_hand_over(out / "mount.yaml")
+    row = next(row for row in rows if row["search"] == "gradient")
+    assert handed.mount()[2, 3].item() == pytest.approx(float(row["z_m"]), abs=1e-4)
+    assert math.isfinite(found["control_no_texture_error"])
+    (out / "report.html").unlink()
+    assert main(placement.study, placement.Config, ["--resume", str(out)]) == 0
+    assert (out / "race.csv").read_text() == before
+    assert "belongs at" in (out / "report.html").read_text()
