@@ -58,6 +58,7 @@ GROUPS = {
         "combinations",
         "joint_design",
         "placement",
+        "placement_objectives",
         "mount_sight",
         "velocity_head",
         "robot_gates",

@@ -121,18 +121,21 @@ class Problem:
         """0 where every requirement is kept with a step to spare. Gradient: mount."""
         return place.penalty(self.requirements, T_body_cam, self.camera)
 
-    def expected(self, T_body_cam: Tensor, samples: Samples, learn: bool = False) -> Tensor:
+    def expected(
+        self, T_body_cam: Tensor, samples: Samples, learn: bool = False, frames: bool = False
+    ) -> Tensor:
         """Bounded error [N] to be expected of a mount, the default objective.
 
-        learn: take these samples into the trend of the flow's precision.
+        learn: take these samples into the trend of the flow's precision. frames: the gradient goes through frames, events
+          and the estimator's covariance instead of the trend.
         Gradient: mount, through the geometry of flow, the trend of its precision over length and nearness, and the
         share of every window that the robot itself covers; not through single frames, whose texture makes it noise.
         """
         batch = self.batch(samples)
         system = self.system(T_body_cam)
-        with torch.no_grad():
-            field = system.begin(batch)["field"]
-        run = system.begin(batch, {"flow": field})
+        with torch.set_grad_enabled(frames):
+            flow = system.begin(batch)["field"]
+        run = system.begin(batch, {"flow": flow})
         estimator = system.estimate
         what = [run[name] for name in ("field", "camera", "scene", "T_body_cam", "T_world_cam", "t_s")]
         read = estimator.read(*what)
@@ -141,7 +144,7 @@ class Problem:
         seen = replace(read, depth_m=true.depth_m)
         if learn:
             self.trend.add(seen, flow_px)
-        if T_body_cam.requires_grad:
+        if T_body_cam.requires_grad and not frames:
             read = replace(self.trend.followed(seen, flow_px), depth_m=read.depth_m)
             clear = (1 - self._own_body.covered(T_body_cam, self.camera)).clamp_min(CLEAR)
             clear = (clear / clear.detach()).repeat_interleave(read.share.shape[1] // read.windows)
@@ -151,8 +154,3 @@ class Problem:
         unit = task.velocity_errors(torch.zeros_like(squared), batch.twist, self.pair.axes).unit()
         squared = (squared / unit**2).mean(1)
         return squared / (1 + squared)
-
-    def seen(self, T_body_cam: Tensor, samples: Samples) -> Tensor:
-        """Bounded error [N] of single draws, the gradient straight through the events."""
-        batch = self.batch(samples)
-        return self.pair.errors(self.system(T_body_cam).begin(batch)["estimate"], batch).bounded()

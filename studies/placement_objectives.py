@@ -1,0 +1,304 @@
+"""What should a placement descend? Objectives beside the errors of the hard sensor: how they rank designs, where their
+gradients point, and what a sure direction costs.
+
+Ranking: mounts spread over the pair's bounds behind two lenses; what is expected of each on training worlds (the default
+objective, and the information of the estimator's own covariance alone) against its errors with single events in worlds
+never seen. Gradients: at random mounts, of the error straight through the events, of what is expected through frames and
+events, and of the default (geometry, trend of the precision, cover by the robot), against differences over a quarter of
+the bounds of what is expected and of hard errors, in the same draws.
+"""
+
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from scipy.stats import spearmanr
+from torch import Tensor
+from torch.quasirandom import SobolEngine
+
+from codesign import place, task
+from codesign.errors import DomainError
+from codesign.place.criterion import LINEAR
+from scenes import robot_pair
+from scenes.robot_pair import RATE_RAD_S
+from scenes.robot_pairs import PAIRS
+from studies.frame.run import Run, StudyConfig, main
+from studies.placement.problem import Problem, Samples
+
+LENSES = {"pair's own": None, "wide, near": (3.5, 2.0)}  # focal length mm, focus 1/m
+STEP = 0.12
+UNIT_M_S, UNIT_RAD_S = 0.1, 0.15  # errors that count 1 of the criterion
+
+
+@dataclass(frozen=True)
+class Config(StudyConfig):
+    QUICK: ClassVar = {"pair": ("corridor",), "designs": 6, "judged": 2, "points": 1, "draws": 2}
+    pair: tuple[str, ...] = tuple(PAIRS)
+    """Pairs to look at."""
+    designs: int = 40
+    """Mounts behind each of two lenses."""
+    judged: int = 8
+    """Unseen worlds of 12 drives each that designs are judged in."""
+    points: int = 3
+    """Mounts at which gradients are looked at, the first the pair's own."""
+    draws: int = 8
+    """Draws of 24 samples for each gradient."""
+
+
+def study(run: Run[Config]) -> None:
+    size = run.config
+    unknown = [name for name in size.pair if name not in PAIRS]
+    if unknown or not size.pair:
+        raise DomainError(f"--pair {' '.join(unknown)}: choose from {', '.join(PAIRS)}.")
+    if min(size.designs, size.draws) < 2 or min(size.judged, size.points) < 1:
+        raise DomainError("--designs and --draws need at least 2, --judged and --points at least 1.")
+    stored = run.load_state()
+    kept: dict[str, Tensor] = dict(stored.tensors) if stored else {}
+    said = []
+    for name in size.pair:
+        run.section(f"Pair '{name}'")
+        said.append(f"{name} {ranking(run, kept, name):.2f}")
+        gradients(run, kept, name)
+    run.record(seconds=run.seconds)
+    run.finish(
+        "What a placement should descend",
+        f"Spearman's rank correlation of the expected error with errors of the hard sensor on unseen worlds: {', '.join(said)}.",
+    )
+
+
+def once(run: Run[Config], kept: dict[str, Tensor], key: str, make: Callable[[], Tensor]) -> Tensor:
+    """What an earlier session made, or what is made and kept now."""
+    if key not in kept:
+        kept[key] = make().double()
+        run.save_state(kept, {})
+    return kept[key]
+
+
+def problems(name: str, lens: str, judged: int) -> tuple[Problem, Problem]:
+    """To expect in, and to judge in."""
+    pair = PAIRS[name]()
+    if (chosen := LENSES[lens]) is not None:
+        pair = replace(pair, design=replace(pair.design, efl_mm=chosen[0], focus_per_m=chosen[1]))
+    return (
+        Problem(pair, robot_pair.training(8), 8, 6),
+        Problem(pair, robot_pair.unseen(judged), judged, 12),
+    )
+
+
+def ranking(run: Run[Config], kept: dict[str, Tensor], name: str) -> float:
+    """Rank correlations with hard errors; returns that of the default objective."""
+    size = run.config
+    shares = 0.05 + 0.9 * SobolEngine(6, scramble=True, seed=size.seed).draw(
+        size.designs, dtype=torch.float64
+    )
+    rows = []
+    with run.progress(len(LENSES) * size.designs, f"{name}: ranking") as bar:
+        for lens in LENSES:
+            training, unseen = problems(name, lens, size.judged)
+            for number, share in enumerate(shares):
+                found = once(
+                    run,
+                    kept,
+                    f"{name}/ranking/{lens}/{number}",
+                    lambda share=share, training=training, unseen=unseen: judgements(training, unseen, share),
+                )
+                rows.append(found)
+                bar.advance(error=float(found[0]))
+    table = torch.stack(rows)
+    hard, halves, ours, alone = table[:, 0], table[:, 1:3], table[:, 3], table[:, 4]
+    agree = spearmanr(halves[:, 0], halves[:, 1])[0]
+    found = {
+        "expected": spearmanr(hard, ours)[0],
+        "observability": spearmanr(hard, alone)[0],
+        "halves": agree,
+        "ceiling": math.sqrt(max(0.0, 2 * agree / (1 + agree))),
+    }
+    run.record(**{f"{name}_spearman_{key}": value for key, value in found.items()})
+    run.table(
+        "Rank correlation with errors of the hard sensor",
+        ("objective", "Spearman"),
+        [
+            ["expected error (default)", found["expected"]],
+            ["information of the estimator's own covariance alone", found["observability"]],
+            ["one half of the samples that judge with the other", found["halves"]],
+            ["what a perfect objective would have, by that", found["ceiling"]],
+        ],
+        f"{len(table)} designs, {size.designs} mounts behind two lenses; errors from {float(hard.min()):.2f} to {float(hard.max()):.2f}.",
+    )
+    return float(found["expected"])
+
+
+def judgements(training: Problem, unseen: Problem, share: Tensor) -> Tensor:
+    """[5]: hard error, of either half of its samples, expected error, and that of the information alone."""
+    mount = training.ranges.pose(share)
+    hard = unseen.judged(mount, unseen.draw(0), "sensor").bounded()
+    samples = training.draw(0)
+    with torch.no_grad():
+        ours = training.expected(mount, samples).mean()
+        batch = training.batch(samples)
+        told = training.system(mount).begin(batch)["estimate"]
+        axes = list(training.pair.axes)
+        unit = [UNIT_M_S if axis < LINEAR else UNIT_RAD_S for axis in axes]
+        prior = [max(training.pair.prior[axis], RATE_RAD_S if axis >= LINEAR else 0.1) for axis in axes]
+        covariance = told.covariance[:, axes][:, :, axes]
+        information = torch.linalg.inv(covariance) - torch.diag(torch.tensor(prior).double() ** -2)
+        alone = place.expected_error(information, unit, prior).square()
+    return torch.stack([hard.mean(), hard[::2].mean(), hard[1::2].mean(), ours, (alone / (1 + alone)).mean()])
+
+
+def gradients(run: Run[Config], kept: dict[str, Tensor], name: str) -> None:
+    """Cosines, lengths, noise and cost of the ways to a gradient."""
+    size = run.config
+    pair = PAIRS[name]()
+    problem = Problem(pair, robot_pair.training(8))
+    random = torch.Generator().manual_seed(size.seed + 5)
+    points = [problem.start]
+    points += [
+        0.15 + 0.7 * torch.rand(6, generator=random, dtype=torch.float64) for _ in range(size.points - 1)
+    ]
+    rows = []
+    means: dict[str, list[Tensor]] = {}
+    costs: dict[str, list[float]] = {}
+    ratios: dict[str, list[float]] = {}
+    with run.progress(size.points * size.draws, f"{name}: gradients") as bar:
+        for number, point in enumerate(points):
+            trend_of(problem, point, size.draws)
+            found = torch.stack(
+                [
+                    once(
+                        run,
+                        kept,
+                        f"{name}/gradient/{number}/{draw}",
+                        lambda point=point, draw=draw: all_ways(problem, point, problem.draw(draw)),
+                    )
+                    for draw in stepped(bar, size.draws)
+                ]
+            )  # [draws, ways, 7]: gradient and processor seconds
+            for index, way in enumerate(WAYS):
+                slopes = found[:, index, :6]
+                mean = slopes.mean(0)
+                noise = (slopes - mean).square().sum(1).mean().sqrt()
+                means.setdefault(way, []).append(mean)
+                costs.setdefault(way, []).append(float(found[1:, index, 6].mean()))
+                ratios.setdefault(way, []).append(float(mean.norm() / noise))
+    wide = torch.cat(means["differences, expected"])
+    hard = torch.cat(means["differences, hard"])
+    for way in WAYS:
+        ours = torch.cat(means[way])
+        cost = sum(costs[way]) / len(costs[way])
+        sure = sum(ratios[way]) / len(ratios[way])
+        values = {
+            "cosine_expected": cosine(ours, wide),
+            "cosine_hard": cosine(ours, hard),
+            "length_over_expected": float(ours.norm() / wide.norm()),
+            "signal_over_noise": sure,
+            "cpu_s": cost,
+            "signal_over_noise_per_root_cpu_s": sure / math.sqrt(cost),
+        }
+        label = way.replace(",", "").replace(" ", "_").replace("-", "_")
+        run.record(**{f"{name}_{label}_{key}": value for key, value in values.items()})
+        rows.append([way, *values.values()])
+    run.table(
+        "Ways to the gradient",
+        (
+            "way",
+            "cosine, expected",
+            "cosine, hard",
+            "length",
+            "signal/noise",
+            "CPU-s",
+            "signal/noise per root CPU-s",
+        ),
+        rows,
+        f"At {len(points)} mounts together, mean of {size.draws} draws of {problem.samples} samples. Cosines with differences "
+        "over a quarter of the bounds of what is expected and of hard errors; length over that of the former; signal over "
+        "noise of one draw.",
+    )
+
+
+def stepped(bar, count):
+    """Numbers of draws, the bar moved after each."""
+    for draw in range(count):
+        yield draw
+        bar.advance()
+
+
+def trend_of(problem: Problem, point: Tensor, draws: int) -> None:
+    """Fit the trend of precision at a point, on other draws than those that are looked at."""
+    problem.trend = task.PrecisionTrend()
+    with torch.no_grad():
+        for draw in range(min(4, draws)):
+            problem.expected(problem.ranges.pose(point), problem.draw(1000 + draw), learn=True)
+
+
+def all_ways(problem: Problem, point: Tensor, samples: Samples) -> Tensor:
+    """[ways, 7]: gradients to the shares, and processor seconds of each."""
+    rows = []
+    for way in WAYS.values():
+        began = time.process_time()
+        slope = way(problem, point, samples)
+        rows.append(torch.cat([slope, slope.new_tensor([time.process_time() - began])]))
+    return torch.stack(rows)
+
+
+def _straight(problem, point, samples):
+    share = point.clone().requires_grad_()
+    batch = problem.batch(samples)
+    told = problem.system(problem.ranges.pose(share)).begin(batch)["estimate"]
+    return torch.autograd.grad(problem.pair.errors(told, batch).bounded().mean(), share)[0]
+
+
+def _through_frames(problem, point, samples):
+    share = point.clone().requires_grad_()
+    value = problem.expected(problem.ranges.pose(share), samples, frames=True)
+    return torch.autograd.grad(value.mean(), share)[0]
+
+
+def _default(problem, point, samples):
+    share = point.clone().requires_grad_()
+    return torch.autograd.grad(problem.expected(problem.ranges.pose(share), samples).mean(), share)[0]
+
+
+def _differences(value):
+    def slope(problem, point, samples):
+        found = []
+        with torch.no_grad():
+            for direction in STEP * torch.eye(6, dtype=torch.float64):
+                low, high = (
+                    value(problem, problem.ranges.pose(point + sign * direction), samples).mean()
+                    for sign in (-1, 1)
+                )
+                found.append((high - low) / (2 * STEP))
+        return torch.stack(found)
+
+    return slope
+
+
+def _expected(problem, mount, samples):
+    return problem.expected(mount, samples)
+
+
+def _hard(problem, mount, samples):
+    return problem.judged(mount, samples).bounded()
+
+
+WAYS: dict[str, Callable[[Problem, Tensor, Samples], Tensor]] = {
+    "straight through, bounded error": _straight,
+    "expected, through frames": _through_frames,
+    "expected, default": _default,
+    "differences, expected": _differences(_expected),
+    "differences, hard": _differences(_hard),
+}
+
+
+def cosine(a: Tensor, b: Tensor) -> float:
+    """Of two vectors."""
+    return float(torch.cosine_similarity(a, b, dim=0))
+
+
+if __name__ == "__main__":
+    sys.exit(main(study, Config))
