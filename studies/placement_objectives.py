@@ -27,7 +27,7 @@ from scenes import robot_pair
 from scenes.robot_pair import RATE_RAD_S
 from scenes.robot_pairs import PAIRS
 from studies.frame.run import Run, StudyConfig, main
-from studies.placement.problem import Problem, Samples
+from studies.placement.problem import Problem, Samples, traced_camera
 
 LENSES = {"pair's own": None, "wide, near": (3.5, 2.0)}  # focal length mm, focus 1/m
 STEP = 0.12
@@ -47,6 +47,8 @@ class Config(StudyConfig):
     """Mounts at which gradients are looked at, the first the pair's own."""
     draws: int = 8
     """Draws of 24 samples for each gradient."""
+    lens: str = "cooke-triplet"
+    """Traced lens through which gradients are looked at, scaled to the pair's focal length; "none": the pair's thin one."""
 
 
 def study(run: Run[Config]) -> None:
@@ -154,7 +156,8 @@ def gradients(run: Run[Config], kept: dict[str, Tensor], name: str) -> None:
     """Cosines, lengths, noise and cost of the ways to a gradient."""
     size = run.config
     pair = PAIRS[name]()
-    problem = Problem(pair, robot_pair.training(8))
+    camera = pair.design.camera() if size.lens == "none" else traced_camera(pair, size.lens)
+    problem = Problem(pair, robot_pair.training(8), camera=camera)
     random = torch.Generator().manual_seed(size.seed + 5)
     points = [problem.start]
     points += [

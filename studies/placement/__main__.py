@@ -33,7 +33,7 @@ from studies.frame.run import Run, StudyConfig, main
 from studies.placement import figures
 from studies.placement.controls import cheat, controls
 from studies.placement.descent import descend
-from studies.placement.problem import Problem
+from studies.placement.problem import Problem, traced_camera
 from studies.placement.searches import SEARCHES, Trail, available, refined_grid
 
 GRADIENT = "gradient"
@@ -62,6 +62,10 @@ class Config(StudyConfig):
     """Robot and world: outdoors, corridor or flight."""
     robot: Path | None = None
     """A robot of your own instead, described in a .yaml file (docs/robots_and_worlds.md)."""
+    lens: str | None = None
+    """A traced lens in place of the pair's thin one: a name in the catalogue or a lens file."""
+    focal_mm: float | None = None
+    """Focal length that the traced lens is scaled to; the pair's own when left out."""
     seeds: int = 3
     """Starting mounts, paired over all searches."""
     steps: int = 32
@@ -94,9 +98,12 @@ def study(run: Run[Config]) -> None:
     if run.device.type != "cpu":
         run.say("This study computes on the CPU; the device asked for stays unused.")
     pair = own_pair(size.robot) if size.robot else PAIRS[size.pair]()
-    check_pair(pair)
-    problem = Problem(pair, robot_pair.training(size.worlds), min(SPREAD, size.worlds), size.per_world)
-    unseen = Problem(pair, robot_pair.unseen(size.judged_worlds), size.judged_worlds, size.judged_drives)
+    camera = traced_camera(pair, size.lens, size.focal_mm) if size.lens else pair.design.camera()
+    check_pair(pair, camera)
+    spread = min(SPREAD, size.worlds)
+    problem = Problem(pair, robot_pair.training(size.worlds), spread, size.per_world, camera=camera)
+    judged_in = robot_pair.unseen(size.judged_worlds)
+    unseen = Problem(pair, judged_in, size.judged_worlds, size.judged_drives, camera=camera)
     race = Race(run, problem)
     starts = feasible(problem, size.seeds, size.seed)
     ways = certified(run, race, starts[0])

@@ -1,6 +1,7 @@
 """What a search for a mount looks at: a pair of robot and world, a pool of its training worlds and drives, and the
 requirements of the mount. A mount is six shares of the pair's ranges."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -8,7 +9,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from codesign import place, render, task
+from codesign import lens, place, render, task
+from codesign.errors import DomainError
 from codesign.system import System
 from scenes import robot_pair
 from scenes.robot_pair import Drives, RobotPair, times
@@ -154,3 +156,19 @@ class Problem:
         unit = task.velocity_errors(torch.zeros_like(squared), batch.twist, self.pair.axes).unit()
         squared = (squared / unit**2).mean(1)
         return squared / (1 + squared)
+
+
+def traced_camera(pair: RobotPair, name: str, focal_mm: float | None = None) -> render.Camera:
+    """The pair's windows behind a traced lens.
+
+    Args: name: in the catalogue, or a lens file. focal_mm: to which the lens is scaled; None: that of the pair's design.
+    The lens is focused where the pair's is. Raises: as ``lens.load``; DomainError for a focal length that is not positive.
+    """
+    design = pair.design
+    wanted = design.efl_mm if focal_mm is None else focal_mm
+    if not 0 < wanted < math.inf:
+        raise DomainError(f"--focal-mm is {wanted:g}; millimetres > 0 are needed.")
+    geo = lens.load(name).requires_grad_(False)
+    geo = geo.scaled(wanted / float(geo.first_order().efl_mm.detach()))
+    focused = geo.focus_at(1 / design.focus_per_m if design.focus_per_m else math.inf).freeze()
+    return design.camera().with_lens(focused)

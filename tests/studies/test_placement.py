@@ -17,7 +17,7 @@ from studies.frame.run import main
 from studies.placement import __main__ as placement
 from studies.placement.controls import controls, looking_back, shuffled
 from studies.placement.descent import descend
-from studies.placement.problem import Problem
+from studies.placement.problem import Problem, traced_camera
 
 F = torch.float64
 
@@ -116,6 +116,9 @@ def test_shuffled_events_are_as_many_in_every_bin(problem):
         (["--certified", "1"], "at least 2 draws"),
         (["--searches", "oracle"], "search 'oracle' is unknown"),
         (["--robot", "nowhere.yaml"], "nowhere.yaml"),
+        (["--lens", "nowhere.zmx"], "nowhere.zmx"),
+        (["--lens", "cooke-triplet", "--focal-mm", "-1"], "--focal-mm is -1"),
+        (["--lens", "double-gauss"], "larger image circle"),
     ],
 )
 def test_wrong_input_is_one_sentence_before_the_first_frame(given, said, tmp_path, capsys):
@@ -135,6 +138,16 @@ def test_a_bound_that_nothing_keeps_is_said():
     blind = Problem(replace(pair, look_ahead=(3.0, 0.9)), robot_pair.training(1), 1, 1)
     with pytest.raises(DomainError, match="keep what is required"):
         placement.feasible(blind, 1, 0)
+
+
+def test_a_traced_lens_has_the_focal_length_and_focus_asked_for():
+    pair = PAIRS["outdoors"]()
+    optics = traced_camera(pair, "cooke-triplet").lens
+    assert float(optics.first_order().efl_mm) == pytest.approx(pair.design.efl_mm)
+    nearer = traced_camera(replace(pair, design=replace(pair.design, focus_per_m=4.0)), "cooke-triplet").lens
+    shift_mm = float(nearer.thickness_mm[-1] - optics.thickness_mm[-1])
+    newton_mm = pair.design.efl_mm**2 * 1e-3 * (4.0 - pair.design.focus_per_m)
+    assert shift_mm == pytest.approx(newton_mm, rel=0.05)
 
 
 def test_the_whole_study_and_its_resumption(tmp_path):
