@@ -12,6 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from codesign.errors import DomainError
 from codesign.flow.checks import check_number
 from codesign.task.ego_velocity import Readings
 
@@ -27,11 +28,13 @@ class PrecisionTrend:
 
     >>> trend = PrecisionTrend()
 
-    forget: share of what was seen before that each ``add`` leaves out, 0 for none.
+    forget: share of what was seen before that each ``add`` leaves out, 0 for none. Raises: DomainError for no share.
     """
 
     def __init__(self, forget: float = 0.0) -> None:
         self.forget = check_number(forget, "forget", least=0.0)
+        if self.forget > 1:
+            raise DomainError(f"forget is {forget:g}; a share from 0 to 1 is needed.")
         self._normal: Tensor | None = None
         self._right: Tensor | None = None
 
@@ -48,7 +51,10 @@ class PrecisionTrend:
         return self
 
     def followed(self, read: Readings, flow_px: Tensor) -> Readings:
-        """The same readings, whose precision and confidence have the gradient of the trend to flow and depth."""
+        """The same readings, whose precision and confidence have the gradient of the trend to flow and depth.
+
+        Raises: DomainError where nothing has been added.
+        """
         said = _terms(read, flow_px) @ self._coefficients()
         change = said - said.detach()
         precision = read.precision.detach() * change[..., 0].exp()[..., None, None]
@@ -56,7 +62,9 @@ class PrecisionTrend:
         return replace(read, precision=precision, confidence=confidence)
 
     def _coefficients(self):
-        weight = self._normal[0, 0]  # the number of points: the first term is 1
+        if self._normal is None:
+            raise DomainError("the trend of precision has seen no readings; add some before it is followed.")
+        weight = self._normal[0, 0].clamp_min(1)  # the number of points: the first term is 1
         ridge = RIDGE * weight * torch.eye(len(self._normal), dtype=self._normal.dtype)
         return torch.linalg.solve(self._normal + ridge, self._right)
 
