@@ -33,7 +33,8 @@ from studies.frame.run import Run, StudyConfig, main
 from studies.placement import figures
 from studies.placement.controls import cheat, controls
 from studies.placement.descent import descend
-from studies.placement.problem import Problem, traced_camera
+from studies.placement.problem import DRIVES, Problem, traced_camera
+from studies.placement.resumption import asked, check_same
 from studies.placement.searches import SEARCHES, Trail, available, refined_grid
 
 GRADIENT = "gradient"
@@ -126,12 +127,21 @@ def checked(size: Config) -> None:
     for name in ("seeds", "steps", "worlds", "per_world", "judged_worlds", "judged_drives"):
         if getattr(size, name) < 1:
             raise DomainError(f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed.")
+    for name in ("per_world", "judged_drives"):
+        if getattr(size, name) > DRIVES:
+            raise DomainError(
+                f"--{name.replace('_', '-')} is {getattr(size, name)}; a world has {DRIVES} drives."
+            )
+    if size.seed < 0:
+        raise DomainError(f"--seed is {size.seed}; the searches need 0 or more.")
     if size.grid < 0 or size.certified < 0 or size.certified == 1:
         raise DomainError("--grid needs 0 or more mounts, --certified 0 or at least 2 draws.")
 
 
 def feasible(problem: Problem, count: int, seed: int) -> list[Tensor]:
     """Mounts [6] spread at random over what is allowed."""
+    if bool(problem.ranges.held.all()):
+        raise DomainError("equal bounds hold all six numbers of the mount; widen what is to be searched.")
     random = torch.Generator().manual_seed(seed)
     found: list[Tensor] = []
     for _ in range(TRIES):
@@ -159,8 +169,15 @@ class Race:
     def __init__(self, run: Run[Config], problem: Problem):
         self.run = run
         self.problem = problem
+        self.asked = asked(run.config, problem.pair)
         stored = run.load_state()
         self.tensors: dict[str, Tensor] = dict(stored.tensors) if stored else {}
+        if stored:
+            check_same(stored.numbers, self.asked)
+
+    def save(self) -> None:
+        """Keep what has been found."""
+        self.run.save_state(self.tensors, self.asked)
 
     def trail(self, number: int, name: str) -> Trail:
         """What a search looked at."""
@@ -210,7 +227,16 @@ class Race:
             return
         count = max(2, self.samples(number, GRADIENT) // self.problem.samples)
         seed = size.seed + number
-        self._made(number, name, count, lambda advance: SEARCHES[name](error, start, count, seed, advance))
+        free = ~self.problem.ranges.held
+
+        def whole(part):
+            return start.expand(*part.shape[:-1], 6).masked_scatter(free.expand(*part.shape[:-1], 6), part)
+
+        def make(advance):
+            trail = SEARCHES[name](lambda part: error(whole(part)), start[free], count, seed, advance)
+            return Trail(whole(trail.share), trail.error)
+
+        self._made(number, name, count, make)
 
     def _made(self, number: int, name: str, total: int, make: Callable[..., Trail]) -> None:
         key = f"{name}/{number}"
@@ -224,7 +250,7 @@ class Race:
             f"{key}/error": trail.error,
             f"{key}/samples": torch.tensor(self.problem.rendered - before),
         }
-        self.run.save_state(self.tensors, {})
+        self.save()
 
     def answer(self, number: int, name: str) -> Tensor:
         """The mount [6] that a search ends with: the descent's mean of its end; of the others the best of those that keep
@@ -289,7 +315,7 @@ def certified(run: Run[Config], race: Race, start: Tensor) -> dict[str, grad.Cho
             for c in (found[name] for name in GROUPS)
         ]
         race.tensors["ways"] = torch.tensor(rows, dtype=torch.float64)
-        run.save_state(race.tensors, {})
+        race.save()
     ways = {}
     for name, row in zip(GROUPS, race.tensors["ways"].tolist(), strict=True):
         way = ("autograd", "differences", "evolution")[int(row[0])]
@@ -318,10 +344,23 @@ def judge(
             key = f"judged/{name}/{number}"
             if key not in race.tensors:
                 race.tensors[key] = unseen.judged(unseen.ranges.pose(share), samples, "sensor").bounded()
-                run.save_state(race.tensors, {})
+                race.save()
             found[number, name] = race.tensors[key]
             bar.advance(error=float(found[number, name].mean()))
     return found
+
+
+def chosen(race: Race, count: int) -> int:
+    """Number of the descent whose answer does best on other training samples, one draw in every world: what is judged on
+    unseen ones has not been chosen by them."""
+    if "chosen" not in race.tensors:
+        problem = race.problem
+        draws = [problem.draw(-1 - k) for k in range(max(1, len(problem.numbers) // problem.spread))]
+        answers = [race.answer(number, GRADIENT) for number in range(count)]
+        errors = [sum(problem.error(share, draw) for draw in draws) for share in answers]
+        race.tensors["chosen"] = torch.tensor(errors).argmin()
+        race.save()
+    return int(race.tensors["chosen"])
 
 
 @dataclass(frozen=True)
@@ -343,7 +382,7 @@ def paired(ours: Tensor, theirs: Tensor) -> Paired:
     ratio = ours / theirs
     drawn = torch.randint(len(ratio), (RESAMPLED, len(ratio)), generator=torch.Generator().manual_seed(0))
     ends = torch.tensor([(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], dtype=ratio.dtype)
-    low, high = torch.quantile(ratio[drawn].median(1).values, ends).tolist()
+    low, high = torch.quantile(ratio[drawn].quantile(0.5, 1), ends).tolist()
     return Paired(float(ratio.quantile(0.5)), low, high, int((ratio < 1).sum()), len(ratio))
 
 
@@ -363,7 +402,7 @@ def report(
         name: torch.stack([judged[k, name].mean() for k in range(len(starts))]) for name in ["start", *names]
     }
     default = float(judged[0, "default"].mean())
-    best = int(errors[GRADIENT].argmin())
+    best = chosen(race, len(starts))
     share = race.answer(best, GRADIENT)
     mount = problem.ranges.pose(share)
     rivals = {name: paired(errors[GRADIENT], errors[name]) for name in size.searches}
@@ -372,9 +411,10 @@ def report(
         default_error=default,
         samples_per_search=race.samples(0, GRADIENT),
         samples_judged=unseen.samples,
+        chosen_start=best,
         seeds=len(starts),
         seconds=run.seconds,
-        **{f"{label(name)}_median_error": values.median() for name, values in errors.items()},
+        **{f"{label(name)}_median_error": values.quantile(0.5) for name, values in errors.items()},
     )
     for name, found in rivals.items():
         run.record(
@@ -441,7 +481,7 @@ def write_table(run: Run[Config], race: Race, judged: dict[tuple[int, str], Tens
         else:
             share, samples = race.answer(number, name), race.samples(number, name)
         row = [f"{value:.5f}" for value in race.problem.ranges.numbers(share).tolist()]
-        deviation = float(errors.std() / math.sqrt(len(errors)))
+        deviation = standard_error(errors, run.config.judged_worlds)
         writer.writerow(
             [
                 race.problem.pair.name,
@@ -456,6 +496,13 @@ def write_table(run: Run[Config], race: Race, judged: dict[tuple[int, str], Tens
     write_atomic(run.path("race.csv"), text.getvalue().encode())
 
 
+def standard_error(errors: Tensor, worlds: int) -> float:
+    """Of the mean of errors [N], world after world: of the worlds' means, since drives in one world err alike; of one
+    world's drives where there is one."""
+    means = errors.unflatten(0, (worlds, -1)).mean(1) if worlds > 1 else errors
+    return float(means.std() / math.sqrt(len(means))) if len(means) > 1 else 0.0
+
+
 def ranked(
     run: Run[Config],
     race: Race,
@@ -468,13 +515,13 @@ def ranked(
         "Searches at equal renders",
         f"Every search began at the same {len(errors['start'])} mounts and rendered {race.samples(0, GRADIENT)} samples; "
         "errors are means of q / (1 + q), q the squared error of the velocities that count in units of 0.05 m/s plus a "
-        "tenth of the speed, and 0.15 rad/s, with single events in worlds that no search saw. In brackets: "
+        "tenth of the speed, and 0.15 rad/s, with single events in worlds and drives that no search saw (a world from a file is the same for all). In brackets: "
         f"{INTERVAL:.0%} of resampled starts.",
     )
     rows: list[list[Any]] = []
     for name, values in errors.items():
         over = str(rivals[name]) if name in rivals else None
-        rows.append([name, values.median(), values.min(), values.max(), over])
+        rows.append([name, values.quantile(0.5), values.min(), values.max(), over])
     if (0, GRID) in judged:
         grid = float(judged[0, GRID].mean())
         within = int((errors[GRADIENT] <= 1.02 * grid).sum())
@@ -516,13 +563,16 @@ def seen(run: Run[Config], problem: Problem, unseen: Problem, mount: Tensor, sha
     run.text("Requirements: " + "; ".join(map(str, verdicts)) + ".")
     planar = problem.pair.axes
     depth = task.ground_depth
-    height = problem.ranges.numbers(share)[:3].tolist()
-    around = task.Surroundings(tuple(height), axes=planar, depth=depth)
-    if height[2] > 0.05:
+    x, y, z = problem.ranges.numbers(share)[:3].tolist()
+    T_world_body = torch.eye(4, dtype=torch.float64)
+    T_world_body[2, 3] = problem.pair.drive(0, 12)[0][:, robot_pair.FRAMES // 2, 2, 3].mean()
+    around = task.Surroundings((x, y, z), T_world_body, axes=planar, depth=depth)
+    height = z + float(T_world_body[2, 3])
+    if height > 0.05:
         information, _ = around.information(problem.camera, mount)
         sight = place.sight(information, task.sight_units(around), planar)
         run.text(
-            f"Over flat ground the motion that shows least from there is {sight.weakest_named()} (in units of 0.1 m/s and 0.1 "
+            f"{height:.2f} m over flat ground the motion that shows least from there is {sight.weakest_named()} (in units of 0.1 m/s and 0.1 "
             f"rad/s, deviation {sight.weakest_deviation:.2f}); blind to: {', '.join(sight.blind()) or 'nothing'}."
         )
         yaw, pitch, errors = task.sight_map(problem.camera, around, rows=9, columns=18)

@@ -1,10 +1,12 @@
 """The placement study: its descent on a noisy valley, draws of samples, gradients against differences, controls that see
 nothing, its bad input, and the whole of it, resumed."""
 
+import contextlib
 import csv
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -18,6 +20,7 @@ from studies.placement import __main__ as placement
 from studies.placement.controls import controls, looking_back, shuffled
 from studies.placement.descent import descend
 from studies.placement.problem import Problem, traced_camera
+from studies.placement.resumption import asked, check_same
 
 F = torch.float64
 
@@ -114,6 +117,8 @@ def test_shuffled_events_are_as_many_in_every_bin(problem):
         (["--pair", "submarine"], "--pair submarine: choose from outdoors"),
         (["--seeds", "0"], "--seeds is 0"),
         (["--certified", "1"], "at least 2 draws"),
+        (["--seed", "-1"], "--seed is -1"),
+        (["--judged-drives", "49"], "a world has 48 drives"),
         (["--searches", "oracle"], "search 'oracle' is unknown"),
         (["--robot", "nowhere.yaml"], "nowhere.yaml"),
         (["--lens", "nowhere.zmx"], "nowhere.zmx"),
@@ -131,6 +136,76 @@ def test_ratios_are_of_paired_starts():
     assert (found.median, found.ahead, found.count) == (pytest.approx(0.8), 2, 3)
     assert found.low == pytest.approx(0.5)
     assert found.high == pytest.approx(1.5)
+
+
+def test_the_median_of_an_even_number_of_starts_is_the_mean_of_two():
+    """Of ratios spread evenly, resamples lie as far above the middle as below it."""
+    assert placement.paired(torch.tensor([1.0, 3.0]), torch.ones(2)).median == pytest.approx(2.0)
+    found = placement.paired(torch.arange(1.0, 13.0, dtype=F), torch.ones(12, dtype=F))
+    assert found.median == pytest.approx(6.5)
+    assert found.high - 6.5 == pytest.approx(6.5 - found.low)
+
+
+def test_drives_of_a_world_err_alike():
+    """Means of four worlds 0, 1, 2, 3: deviation sqrt(5 / 3), over the root of four."""
+    errors = torch.arange(4.0, dtype=F).repeat_interleave(6)
+    assert placement.standard_error(errors, 4) == pytest.approx((5 / 3) ** 0.5 / 2)
+    assert placement.standard_error(errors[:1], 1) == 0.0
+
+
+def test_a_run_that_goes_on_is_the_one_that_was_begun():
+    config = placement.Config(seeds=2)
+    pair = PAIRS["outdoors"]()
+    begun = json.loads(json.dumps(asked(config, pair)))
+    check_same(begun, asked(replace(config, out=Path("elsewhere")), PAIRS["outdoors"]()))
+    for changed in (replace(config, seeds=3), replace(config, searches=("TPE",))):
+        with pytest.raises(DomainError, match="changed since this run was begun"):
+            check_same(begun, asked(changed, pair))
+    wider = replace(pair, high=replace(pair.high, z_m=pair.high.z_m + 0.1))
+    with pytest.raises(DomainError, match="the robot's high changed"):
+        check_same(begun, asked(config, wider))
+    with pytest.raises(DomainError, match="the robot's shape changed"):
+        check_same(begun, asked(config, replace(pair, bodies=dict(list(pair.bodies.items())[1:]))))
+
+
+def test_held_numbers_are_not_searched(problem):
+    """Every point that coordinate search looks at is another mount, and held numbers stay."""
+    pair = problem.pair
+    held = {name: getattr(pair.design, name) for name in ("x_m", "y_m", "yaw_rad", "roll_rad")}
+    narrow = Problem(
+        replace(pair, low=replace(pair.low, **held), high=replace(pair.high, **held)), range(1), 1, 1
+    )
+    narrow.error = lambda share, samples: float((narrow.ranges.numbers(share) - 0.3).square().sum())
+    race = placement.Race(FakeRun(placement.Config()), narrow)
+    race.tensors["gradient/0/samples"] = torch.tensor(8)
+    race.search(0, "coordinate", narrow.start)
+    found = race.trail(0, "coordinate").share
+    assert found.shape == (8, 6)
+    assert len({tuple(row) for row in found[:, ~narrow.ranges.held].tolist()}) == 8
+    assert torch.equal(found[:, narrow.ranges.held], narrow.start[narrow.ranges.held].expand(8, 4))
+    everything = Problem(replace(pair, low=pair.design, high=pair.design), range(1), 1, 1)
+    with pytest.raises(DomainError, match="hold all six"):
+        placement.feasible(everything, 1, 0)
+
+
+class FakeRun:
+    """A run that keeps nothing."""
+
+    def __init__(self, config):
+        self.config = config
+
+    def load_state(self):
+        return None
+
+    def save_state(self, tensors, numbers):
+        pass
+
+    @contextlib.contextmanager
+    def progress(self, total, description):
+        yield self
+
+    def advance(self, error):
+        pass
 
 
 def test_a_bound_that_nothing_keeps_is_said():

@@ -1,0 +1,43 @@
+"""Whether a run that goes on is still the one that was begun."""
+
+import hashlib
+import json
+from typing import Any
+
+import numpy as np
+
+from codesign.errors import DomainError
+from scenes.robot_pair import RobotPair
+from studies.frame.config import StudyConfig, to_json
+
+ELSEWHERE = ("study", "out", "device", "resume")  # on which no result depends
+SETTINGS = ("low", "high", "design", "axes", "prior", "depth", "look_ahead", "housing_radius_m", "margin_m")
+MORE = ("own_body_share", "cable", "ground_z_m")
+
+
+def asked(config: StudyConfig, pair: RobotPair) -> dict[str, Any]:
+    """Name -> what results depend on: options, the pair's settings, and digests of its meshes and first drive."""
+    options = json.loads(to_json("", config))
+    named = {f"--{name.replace('_', '-')}": value for name, value in options.items() if name not in ELSEWHERE}
+    settings = {f"the robot's {name}": repr(getattr(pair, name)) for name in (*SETTINGS, *MORE)}
+    meshes = [part for body in pair.bodies.values() for part in (body.vertices_m, body.faces)]
+    poses, _ = pair.drive(0, 1)
+    return named | settings | {"the robot's shape": _digest(meshes), "the robot's drives": _digest([poses])}
+
+
+def check_same(stored: dict[str, Any], now: dict[str, Any]) -> None:
+    """Raise DomainError where a run that goes on is asked for something else than it was begun with."""
+    for name, value in now.items():
+        if name in stored and stored[name] != value:
+            raise DomainError(
+                f"{name} changed since this run was begun ({stored[name]}, now {value}); what it has found holds no "
+                "more: change it back, or start a new run."
+            )
+
+
+def _digest(arrays):
+    """Of numbers to a millionth."""
+    found = hashlib.sha256()
+    for each in arrays:
+        found.update((np.round(np.asarray(each, dtype=np.float64), 6) + 0.0).tobytes())
+    return found.hexdigest()[:12]
