@@ -435,8 +435,10 @@ def report(
                     f"gradient_{name}_calls": way.calls,
                 }
             )
+    better = float(errors[GRADIENT][best]) < default
+    said = "belongs at" if better else "is no better off than at its default mount at"
     answer = (
-        f"The camera of '{problem.pair.name}' belongs at {place_in_words(problem, share)}: mean error "
+        f"The camera of '{problem.pair.name}' {said} {place_in_words(problem, share)}: mean error "
         f"{float(errors[GRADIENT][best]):.3f} on {unseen.samples} unseen samples with single events, "
         f"{default:.3f} at its default mount."
     )
@@ -521,7 +523,7 @@ def ranked(
     rows: list[list[Any]] = []
     for name, values in errors.items():
         over = str(rivals[name]) if name in rivals else None
-        rows.append([name, values.quantile(0.5), values.min(), values.max(), over])
+        rows.append([name, float(values.quantile(0.5)), float(values.min()), float(values.max()), over])
     if (0, GRID) in judged:
         grid = float(judged[0, GRID].mean())
         within = int((errors[GRADIENT] <= 1.02 * grid).sum())
@@ -534,7 +536,7 @@ def ranked(
             f"{within} of {len(errors[GRADIENT])} descents end within 2 % of the best of the refined grid, with {share:.3f} "
             "of its renders."
         )
-    rows.append(["default mount", judged[0, "default"].mean(), None, None, None])
+    rows.append(["default mount", float(judged[0, "default"].mean()), None, None, None])
     run.table("Errors on unseen samples", ("search", "median", "best", "worst", "gradient over it"), rows)
     trails = {
         name: [race.trail(number, name) for number in range(len(errors["start"]))]
@@ -607,8 +609,9 @@ def seen(run: Run[Config], problem: Problem, unseen: Problem, mount: Tensor, sha
         cheat_best_error=pairs[:, 1].min(),
         cheat_pixel_error_of_answer_px=pairs[-1, 0],
     )
+    cheats = least != int(pairs[:, 1].argmin())
     run.text(
-        f"An objective in pixels would cheat: of {len(pairs)} mounts the one with the least error of flow "
+        f"An objective in pixels {'would cheat' if cheats else 'chose well this time'}: of {len(pairs)} mounts the one with the least error of flow "
         f"({float(pairs[least, 0]):.2f} px) has a velocity error of {float(pairs[least, 1]):.3f}, the best has "
         f"{float(pairs[:, 1].min()):.3f}. Flow is smallest, and its errors with it, where everything is far away and says "
         "little of the way the robot goes."

@@ -12,6 +12,7 @@ from studies.placement.problem import Problem, Samples
 
 MISMATCHED = replace(SENSOR, theta_on=1.3 * SENSOR.theta_on, theta_off=0.8 * SENSOR.theta_off)
 NEAR_M = 0.01  # before a face of the robot
+DOWN = 0.5  # cosine with straight down from which on a face is one of the underside
 
 
 @torch.no_grad()
@@ -49,11 +50,12 @@ def shuffled(volume: EventVolume) -> EventVolume:
 
 
 def looking_back(problem: Problem) -> Tensor:
-    """T_body_cam [4, 4] of a camera before the middle of the robot's largest face, so near that it sees nothing else."""
+    """T_body_cam [4, 4] of a camera before the middle of the robot's largest face that is not its underside, so near that it sees nothing else."""
     meshes = problem.pair.bodies.values()
     faces = torch.cat([torch.as_tensor(mesh.vertices_m[mesh.faces]) for mesh in meshes]).double()
     across = torch.linalg.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
-    largest = int(across.norm(dim=1).argmax())
+    downward = across[:, 2] < -DOWN * across.norm(dim=1)  # beneath them there may be no room over the ground
+    largest = int(across.norm(dim=1).masked_fill(downward, 0).argmax())
     view = -across[largest] / across[largest].norm()
     right = (faces[largest, 1] - faces[largest, 0]) / (faces[largest, 1] - faces[largest, 0]).norm()
     pose = torch.eye(4, dtype=torch.float64)

@@ -100,6 +100,9 @@ def test_controls_see_nothing(problem):
     assert found["as_found"] < 0.8 * found["always_zero"]
     back = looking_back(problem)
     assert torch.linalg.det(back[:3, :3]) == pytest.approx(1.0)
+    assert all(
+        looking_back(Problem(each(), range(1)))[2, 2] < 0.5 for each in PAIRS.values()
+    )  # view not upwards
 
 
 def test_shuffled_events_are_as_many_in_every_bin(problem):
@@ -243,4 +246,6 @@ def test_the_whole_study_and_its_resumption(tmp_path):
     (out / "report.html").unlink()
     assert main(placement.study, placement.Config, ["--resume", str(out)]) == 0
     assert (out / "race.csv").read_text() == before
-    assert "belongs at" in (out / "report.html").read_text()
+    page = (out / "report.html").read_text()
+    assert ("belongs at" in page) == (found["hand_over_score"] < found["default_error"])
+    assert "tensor(" not in page
