@@ -56,7 +56,6 @@ class Config(StudyConfig):
         "worlds": 4,
         "judged_worlds": 2,
         "judged_drives": 6,
-        "certified": 0,
         "searches": ("random", "TPE"),
     }
     pair: str = "outdoors"
@@ -85,7 +84,7 @@ class Config(StudyConfig):
     """Unseen worlds."""
     judged_drives: int = 12
     """Drives in each."""
-    certified: int = 2
+    certified: int = 0
     """Draws in which the gradient is compared with differences before it is used, 0 for none."""
 
 

@@ -64,11 +64,11 @@ class Config(StudyConfig):
     """Values of every variable, the default in the middle; an odd number."""
     reach: float = 0.9
     """How far towards the bounds they go."""
-    pool: int = 12
-    """Training worlds with 6 drives each that draws of 96 samples are made from."""
+    pool: int = 32
+    """Training worlds with 3 drives each that draws of 96 samples are made from."""
 
 
-POOL_MOTIONS = 6
+POOL_MOTIONS = 3
 
 
 def study(run: Run[Config]) -> None:
