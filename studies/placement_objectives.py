@@ -157,7 +157,7 @@ def gradients(run: Run[Config], kept: dict[str, Tensor], name: str) -> None:
     size = run.config
     pair = PAIRS[name]()
     camera = pair.design.camera() if size.lens == "none" else traced_camera(pair, size.lens)
-    problem = Problem(pair, robot_pair.training(8), camera=camera)
+    problem = Problem(pair, robot_pair.training(12), camera=camera)
     random = torch.Generator().manual_seed(size.seed + 5)
     points = [problem.start]
     points += [

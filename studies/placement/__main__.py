@@ -72,8 +72,8 @@ class Config(StudyConfig):
     """Steps of the gradient; other searches look at as many mounts as render as many samples."""
     worlds: int = 12
     """Training worlds."""
-    per_world: int = 6
-    """Drives in each of the four worlds of a step."""
+    per_world: int = 2
+    """Drives in each of the worlds of a step, twelve of them at most."""
     searches: tuple[str, ...] = tuple(SEARCHES)
     """Searches beside the gradient."""
     rivals_expect: bool = False
@@ -88,7 +88,7 @@ class Config(StudyConfig):
     """Draws in which the gradient is compared with differences before it is used, 0 for none."""
 
 
-SPREAD = 4
+SPREAD = 12
 
 
 def study(run: Run[Config]) -> None:

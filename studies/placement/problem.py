@@ -36,8 +36,8 @@ class Problem:
 
     pair: RobotPair
     numbers: Sequence[int]
-    spread: int = 4
-    per_world: int = 6
+    spread: int = 12
+    per_world: int = 2
     errors: task.FlowErrors = field(default_factory=task.FlowErrors)
     camera: render.Camera | None = None
 
