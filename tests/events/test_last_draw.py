@@ -37,6 +37,7 @@ def test_a_layer_counts_what_a_fresh_one_counts_call_after_call(generator):
             assert torch.equal(mine, fresh)
 
 
+@pytest.mark.bits
 def test_shapes_and_chunks_keep_their_own_draws(generator):
     layer = events.layer("memory", SENSOR)
     shown = frames(generator)
