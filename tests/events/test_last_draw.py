@@ -1,5 +1,6 @@
 """A layer draws again what it drew from the same generators, and only then."""
 
+import pytest
 import torch
 
 from codesign import events
