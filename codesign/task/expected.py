@@ -77,6 +77,8 @@ def expected_errors(
     Args: estimator: whose prior, axes and outliers count. read: what it reads. twist: [N, 6] true, m/s and rad/s.
       true_rows: [N, P, 2, K] px of flow per velocity at the true depth, where the estimator believes in another one;
       None: ``read.rows``. errors: of the flow.
+    Outliers count less by the mean of the squared misfit to be expected of a component, where the estimator goes by that
+    of the draw.
     Gradient: readings, twist, rows.
     """
     velocity = twist[:, list(estimator.axes)].to(read.flow_px)[:, None, :, None]
@@ -85,7 +87,7 @@ def expected_errors(
     covariance = errors.covariance(read, flow_px)
     wrong = read.confidence[..., None] * (flow_px - (read.rows @ velocity)[..., 0])
     second = covariance + wrong[..., :, None] * wrong[..., None, :]
-    misfit = (read.precision * second).sum((-2, -1))  # E e^T W e
+    misfit = (read.precision * second).sum((-2, -1))  # E e^T W e: 2 where the claim is right
     kept = 1.0 if estimator.outlier is None else (1 + misfit / 2 / estimator.outlier**2) ** -2
     believed = kept * read.share
     weighed = read.rows.mT @ read.precision  # [N, P, K, 2]

@@ -133,6 +133,8 @@ def checked(size: Config) -> None:
             )
     if size.seed < 0:
         raise DomainError(f"--seed is {size.seed}; the searches need 0 or more.")
+    if size.focal_mm is not None and size.lens is None:
+        raise DomainError("--focal-mm scales a traced lens; give --lens too, or leave it out.")
     if size.grid < 0 or size.certified < 0 or size.certified == 1:
         raise DomainError("--grid needs 0 or more mounts, --certified 0 or at least 2 draws.")
 

@@ -125,6 +125,7 @@ def test_shuffled_events_are_as_many_in_every_bin(problem):
         (["--searches", "oracle"], "search 'oracle' is unknown"),
         (["--robot", "nowhere.yaml"], "nowhere.yaml"),
         (["--lens", "nowhere.zmx"], "nowhere.zmx"),
+        (["--focal-mm", "8"], "give --lens too"),
         (["--lens", "cooke-triplet", "--focal-mm", "-1"], "--focal-mm is -1"),
         (["--lens", "double-gauss"], "larger image circle"),
     ],
