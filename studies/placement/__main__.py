@@ -375,6 +375,8 @@ class Paired:
     count: int
 
     def __str__(self):
+        if self.count == 1:
+            return f"{self.median:.2f}, one start"
         return f"{self.median:.2f} ({self.low:.2f} to {self.high:.2f}), ahead {self.ahead} of {self.count}"
 
 
