@@ -8,7 +8,7 @@ from torch import Tensor
 from codesign import events, task
 from codesign.types import EventVolume
 from scenes.robot_pair import BINS, LEAD_S, SENSOR
-from studies.placement.problem import Problem, Samples
+from studies.placement.problem import Problem, Samples, readings
 
 MISMATCHED = replace(SENSOR, theta_on=1.3 * SENSOR.theta_on, theta_off=0.8 * SENSOR.theta_off)
 NEAR_M = 0.01  # before a face of the robot
@@ -71,9 +71,7 @@ def cheat(problem: Problem, shares: Tensor, samples: Samples) -> list[tuple[floa
     for share in shares:
         batch = problem.batch(samples)
         run = problem.system(problem.ranges.pose(share)).begin(batch)
-        estimator = run.system.estimate
-        what = [run[name] for name in ("field", "camera", "scene", "T_body_cam", "T_world_cam", "t_s")]
-        read = estimator.read(*what, depth=task.scene_depth)
+        read = readings(run, task.scene_depth)
         seen = (read.share > 0)[..., None]
         missed = read.flow_px - (read.rows @ batch.twist[:, None, :, None])[..., 0]
         pixels = float((missed.square() * seen).sum().div(seen.sum()).sqrt())

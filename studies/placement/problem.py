@@ -2,9 +2,10 @@
 requirements of the mount. A mount is six shares of the pair's ranges."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -139,9 +140,8 @@ class Problem:
             flow = system.begin(batch)["field"]
         run = system.begin(batch, {"flow": flow})
         estimator = system.estimate
-        what = [run[name] for name in ("field", "camera", "scene", "T_body_cam", "T_world_cam", "t_s")]
-        read = estimator.read(*what)
-        true = read if self.pair.depth == "scene" else estimator.read(*what, depth=task.scene_depth)
+        read = readings(run)
+        true = read if self.pair.depth == "scene" else readings(run, task.scene_depth)
         flow_px = (true.rows @ batch.twist[:, None, :, None])[..., 0]
         seen = replace(read, depth_m=true.depth_m)
         if learn:
@@ -156,6 +156,12 @@ class Problem:
         unit = task.velocity_errors(torch.zeros_like(squared), batch.twist, self.pair.axes).unit()
         squared = (squared / unit**2).mean(1)
         return squared / (1 + squared)
+
+
+def readings(run: Mapping[str, Any], depth: Callable[..., Tensor] | None = None) -> task.Readings:
+    """What the estimator of a pass reads, by the depth it believes in or another."""
+    what = (run[name] for name in ("field", "camera", "scene", "T_body_cam", "T_world_cam", "t_s"))
+    return run.system.estimate.read(*what, depth=depth)  # pyright: ignore[reportAttributeAccessIssue] - a Pass
 
 
 def traced_camera(pair: RobotPair, name: str, focal_mm: float | None = None) -> render.Camera:

@@ -17,9 +17,11 @@ from scenes import robot_pair
 from scenes.robot_pairs import PAIRS
 from studies.frame.run import main
 from studies.placement import __main__ as placement
+from studies.placement import results
 from studies.placement.controls import controls, looking_back, shuffled
 from studies.placement.descent import descend
 from studies.placement.problem import Problem, traced_camera
+from studies.placement.race import Race, feasible
 from studies.placement.resumption import asked, check_same
 
 F = torch.float64
@@ -136,7 +138,7 @@ def test_wrong_input_is_one_sentence_before_the_first_frame(given, said, tmp_pat
 
 
 def test_ratios_are_of_paired_starts():
-    found = placement.paired(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 2.5, 2.0]))
+    found = results.paired(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 2.5, 2.0]))
     assert (found.median, found.ahead, found.count) == (pytest.approx(0.8), 2, 3)
     assert found.low == pytest.approx(0.5)
     assert found.high == pytest.approx(1.5)
@@ -144,8 +146,8 @@ def test_ratios_are_of_paired_starts():
 
 def test_the_median_of_an_even_number_of_starts_is_the_mean_of_two():
     """Of ratios spread evenly, resamples lie as far above the middle as below it."""
-    assert placement.paired(torch.tensor([1.0, 3.0]), torch.ones(2)).median == pytest.approx(2.0)
-    found = placement.paired(torch.arange(1.0, 13.0, dtype=F), torch.ones(12, dtype=F))
+    assert results.paired(torch.tensor([1.0, 3.0]), torch.ones(2)).median == pytest.approx(2.0)
+    found = results.paired(torch.arange(1.0, 13.0, dtype=F), torch.ones(12, dtype=F))
     assert found.median == pytest.approx(6.5)
     assert found.high - 6.5 == pytest.approx(6.5 - found.low)
 
@@ -153,8 +155,8 @@ def test_the_median_of_an_even_number_of_starts_is_the_mean_of_two():
 def test_drives_of_a_world_err_alike():
     """Means of four worlds 0, 1, 2, 3: deviation sqrt(5 / 3), over the root of four."""
     errors = torch.arange(4.0, dtype=F).repeat_interleave(6)
-    assert placement.standard_error(errors, 4) == pytest.approx((5 / 3) ** 0.5 / 2)
-    assert placement.standard_error(errors[:1], 1) == 0.0
+    assert results.standard_error(errors, 4) == pytest.approx((5 / 3) ** 0.5 / 2)
+    assert results.standard_error(errors[:1], 1) == 0.0
 
 
 def test_a_run_that_goes_on_is_the_one_that_was_begun():
@@ -180,7 +182,7 @@ def test_held_numbers_are_not_searched(problem):
         replace(pair, low=replace(pair.low, **held), high=replace(pair.high, **held)), range(1), 1, 1
     )
     narrow.error = lambda share, samples: float((narrow.ranges.numbers(share) - 0.3).square().sum())
-    race = placement.Race(FakeRun(placement.Config()), narrow)
+    race = Race(FakeRun(placement.Config()), narrow)
     race.tensors["gradient/0/samples"] = torch.tensor(8)
     race.search(0, "coordinate", narrow.start)
     found = race.trail(0, "coordinate").share
@@ -189,7 +191,7 @@ def test_held_numbers_are_not_searched(problem):
     assert torch.equal(found[:, narrow.ranges.held], narrow.start[narrow.ranges.held].expand(8, 4))
     everything = Problem(replace(pair, low=pair.design, high=pair.design), range(1), 1, 1)
     with pytest.raises(DomainError, match="hold all six"):
-        placement.feasible(everything, 1, 0)
+        feasible(everything, 1, 0)
 
 
 class FakeRun:
@@ -216,7 +218,7 @@ def test_a_bound_that_nothing_keeps_is_said():
     pair = PAIRS["outdoors"]()
     blind = Problem(replace(pair, look_ahead=(3.0, 0.9)), robot_pair.training(1), 1, 1)
     with pytest.raises(DomainError, match="keep what is required"):
-        placement.feasible(blind, 1, 0)
+        feasible(blind, 1, 0)
 
 
 def test_a_traced_lens_has_the_focal_length_and_focus_asked_for():

@@ -1,0 +1,249 @@
+"""The searches for a mount from the same starts at equal renders, what each ends with, and its error in worlds that none
+saw; all of it kept in the run's state."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from codesign import grad, task
+from codesign.errors import DomainError
+from studies.frame.run import Run
+from studies.placement.descent import descend
+from studies.placement.problem import Problem
+from studies.placement.resumption import asked, check_same
+from studies.placement.searches import SEARCHES, Trail, refined_grid
+
+GRADIENT = "gradient"
+GRID = "grid"
+STEP = 0.12  # of the cube, of the differences that judge the gradient
+AGREES = {"relative_l2": 1.0, "cosine": 0.8}  # steps have a set length: what counts is where they lead
+UNKNOWN = 1 / 3  # standard error of differences from which on they judge nothing
+WAYS = ("autograd", "differences", "evolution")
+TRIES = 2048
+GROUPS = {"position": slice(0, 3), "attitude": slice(3, 6)}
+
+
+def feasible(problem: Problem, count: int, seed: int) -> list[Tensor]:
+    """Mounts [6] spread at random over what is allowed."""
+    if bool(problem.ranges.held.all()):
+        raise DomainError("equal bounds hold all six numbers of the mount; widen what is to be searched.")
+    random = torch.Generator().manual_seed(seed)
+    found: list[Tensor] = []
+    for _ in range(TRIES):
+        share = 0.05 + 0.9 * torch.rand(6, generator=random, dtype=torch.float64)
+        if kept(problem, share):
+            found.append(share)
+            if len(found) == count:
+                return found
+    raise DomainError(
+        f"of {TRIES} mounts within the bounds {len(found)} keep what is required, {count} are needed; widen the bounds, or "
+        "ask for less."
+    )
+
+
+def kept(problem: Problem, share: Tensor) -> bool:
+    """Whether a mount keeps every requirement, by the hard answer; the cheap ones are asked first."""
+    mount = problem.ranges.pose(share)
+    with torch.no_grad():
+        return all(float(each.exact(mount, problem.camera).min()) >= 0 for each in problem.requirements)
+
+
+class Race:
+    """Finished searches, kept in the run's state: a resumed run makes only those that are missing."""
+
+    def __init__(self, run: Run[Any], problem: Problem):
+        self.run = run
+        self.problem = problem
+        self.asked = asked(run.config, problem.pair)
+        stored = run.load_state()
+        self.tensors: dict[str, Tensor] = dict(stored.tensors) if stored else {}
+        if stored:
+            check_same(stored.numbers, self.asked)
+
+    def save(self) -> None:
+        """Keep what has been found."""
+        self.run.save_state(self.tensors, self.asked)
+
+    def trail(self, number: int, name: str) -> Trail:
+        """What a search looked at."""
+        return Trail(*(self.tensors[f"{name}/{number}/{part}"] for part in ("share", "error")))
+
+    def samples(self, number: int, name: str) -> int:
+        """Drives that a search rendered."""
+        return int(self.tensors[f"{name}/{number}/samples"])
+
+    def descent(self, number: int, start: Tensor, ways: dict[str, grad.Choice]) -> None:
+        """Gradient steps, every group of numbers by the way chosen for it."""
+        problem, first = self.problem, 1000 * (self.run.config.seed + number)
+        problem.trend = task.PrecisionTrend()
+
+        def slope(share, step):
+            values = []
+
+            def loss(parts, draw):
+                value = objective(problem, parts, draw, learn=True)
+                values.append(float(value.detach()))
+                return value
+
+            found = grad.gradient(loss, split(share), ways, first + step, scales=scales())
+            return values[0], torch.cat([found[name] for name in GROUPS])
+
+        steps = self.run.config.steps
+        self._made(number, GRADIENT, steps, lambda advance: descend(slope, start, steps, advance))
+
+    def search(self, number: int, name: str, start: Tensor) -> None:
+        """A search without gradients at as many samples as the descent rendered, all on the same ones."""
+        size = self.run.config
+        draw = 1000 * (size.seed + number)
+        samples = self.problem.draw(draw)
+
+        def error(share):
+            if size.rivals_expect:
+                with torch.no_grad():
+                    return float(objective(self.problem, split(share), draw))
+            return self.problem.error(share, samples)
+
+        if name == GRID:
+            total = size.grid + 2 * max(1, size.grid // 5)
+            self._made(
+                number, name, total, lambda advance: refined_grid(error, 6, size.grid, 2, size.seed, advance)
+            )
+            return
+        count = max(2, self.samples(number, GRADIENT) // self.problem.samples)
+        seed = size.seed + number
+        free = ~self.problem.ranges.held
+
+        def whole(part):
+            return start.expand(*part.shape[:-1], 6).masked_scatter(free.expand(*part.shape[:-1], 6), part)
+
+        def make(advance):
+            trail = SEARCHES[name](lambda part: error(whole(part)), start[free], count, seed, advance)
+            return Trail(whole(trail.share), trail.error)
+
+        self._made(number, name, count, make)
+
+    def _made(self, number: int, name: str, total: int, make: Callable[..., Trail]) -> None:
+        key = f"{name}/{number}"
+        if f"{key}/error" in self.tensors:
+            return
+        before = self.problem.rendered
+        with self.run.progress(total, f"{name}, start {number + 1}") as bar:
+            trail = make(lambda error: bar.advance(error=error))
+        self.tensors |= {
+            f"{key}/share": trail.share,
+            f"{key}/error": trail.error,
+            f"{key}/samples": torch.tensor(self.problem.rendered - before),
+        }
+        self.save()
+
+    def answer(self, number: int, name: str) -> Tensor:
+        """The mount [6] that a search ends with: the descent's mean of its end; of the others the best of those that keep
+        what is required."""
+        trail = self.trail(number, name)
+        if name == GRADIENT:
+            order = range(len(trail.error) - 1, -1, -1)
+        else:
+            order = trail.error.argsort().tolist()
+        for index in order:
+            if kept(self.problem, trail.share[index]):
+                return trail.share[index]
+        return trail.share[0]
+
+
+def split(share: Tensor) -> dict[str, Tensor]:
+    """Position and attitude."""
+    return {name: share[part] for name, part in GROUPS.items()}
+
+
+def scales() -> dict[str, float]:
+    """Steps of differences."""
+    return dict.fromkeys(GROUPS, STEP)
+
+
+def pose_of(problem: Problem, parts: dict[str, Tensor]) -> Tensor:
+    """T_body_cam [4, 4]."""
+    return problem.ranges.pose(torch.cat([parts[name] for name in GROUPS]))
+
+
+def expected(problem: Problem, parts: dict[str, Tensor], draw: int, learn: bool = False) -> Tensor:
+    """The mean error to be expected."""
+    return problem.expected(pose_of(problem, parts), problem.draw(draw), learn).mean()
+
+
+def objective(problem: Problem, parts: dict[str, Tensor], draw: int, learn: bool = False) -> Tensor:
+    """The same and the penalty of what is required, whose gradient is exact."""
+    return expected(problem, parts, draw, learn) + problem.penalty(pose_of(problem, parts))
+
+
+def certified(run: Run[Any], race: Race, start: Tensor) -> dict[str, grad.Choice]:
+    """The way to the gradient of position and attitude: autograd where it agrees with averaged differences of what is
+    expected, or these are too noisy to tell."""
+    draws = run.config.certified
+    if not draws:
+        return {name: grad.Choice("autograd", math.nan, math.nan, math.nan, 0) for name in GROUPS}
+    if "ways" not in race.tensors:
+        problem = race.problem
+        problem.trend = task.PrecisionTrend()
+        for draw in range(draws):
+            expected(problem, split(start), draw, learn=True)
+        run.say(f"comparing the gradient with differences in {draws} draws of {problem.samples} samples")
+        found = grad.choose(
+            lambda parts, draw: expected(problem, parts, draw),
+            split(start),
+            range(draws),
+            scales=scales(),
+            **AGREES,
+        )
+        rows = [
+            [WAYS.index(c.way), c.relative_l2, c.cosine, c.noise, c.calls]
+            for c in (found[name] for name in GROUPS)
+        ]
+        race.tensors["ways"] = torch.tensor(rows, dtype=torch.float64)
+        race.save()
+    ways = {}
+    for name, row in zip(GROUPS, race.tensors["ways"].tolist(), strict=True):
+        way = WAYS[int(row[0])]
+        said = grad.Choice(way, row[1], row[2], row[3], int(row[4]))
+        ways[name] = said if said.noise < UNKNOWN else replace(said, way="autograd", calls=0)
+        run.say(f"{name}: {ways[name]}")
+    return ways
+
+
+def judge(run: Run[Any], race: Race, unseen: Problem, starts: list[Tensor]) -> dict[tuple[int, str], Tensor]:
+    """Bounded errors [N] of starts and answers, on the same unseen samples with single events. Key: (start, search); the
+    pair's own design is (0, "default"), the starts (number, "start")."""
+    samples = unseen.draw(0)
+    wanted = {(0, "default"): unseen.start}
+    for number, start in enumerate(starts):
+        wanted[number, "start"] = start
+        for name in (GRADIENT, *run.config.searches):
+            wanted[number, name] = race.answer(number, name)
+    if run.config.grid:
+        wanted[0, GRID] = race.answer(0, GRID)
+    found = {}
+    with run.progress(len(wanted), "judging with single events") as bar:
+        for (number, name), share in wanted.items():
+            key = f"judged/{name}/{number}"
+            if key not in race.tensors:
+                race.tensors[key] = unseen.judged(unseen.ranges.pose(share), samples, "sensor").bounded()
+                race.save()
+            found[number, name] = race.tensors[key]
+            bar.advance(error=float(found[number, name].mean()))
+    return found
+
+
+def chosen(race: Race, count: int) -> int:
+    """Number of the descent whose answer does best on other training samples, one draw in every world: what is judged on
+    unseen ones has not been chosen by them."""
+    if "chosen" not in race.tensors:
+        problem = race.problem
+        draws = [problem.draw(-1 - k) for k in range(max(1, len(problem.numbers) // problem.spread))]
+        answers = [race.answer(number, GRADIENT) for number in range(count)]
+        errors = [sum(problem.error(share, draw) for draw in draws) for share in answers]
+        race.tensors["chosen"] = torch.tensor(errors).argmin()
+        race.save()
+    return int(race.tensors["chosen"])
