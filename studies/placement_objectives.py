@@ -5,7 +5,8 @@ Ranking: mounts spread over the pair's bounds behind two lenses; what is expecte
 objective, and the information of the estimator's own covariance alone) against its errors with single events in worlds
 never seen. Gradients: at random mounts, of the error straight through the events, of what is expected through frames and
 events, and of the default (geometry, trend of the precision, cover by the robot), against differences over a quarter of
-the bounds of what is expected and of hard errors, in the same draws.
+the bounds of what is expected and of hard errors, in the same draws. A difference over so wide a step is the mean of the
+slope along it: the certificate compares it with the default gradient's mean along the same way (three Gauss points).
 """
 
 import math
@@ -31,6 +32,8 @@ from studies.placement.problem import Problem, Samples, traced_camera
 
 LENSES = {"pair's own": None, "wide, near": (3.5, 2.0)}  # focal length mm, focus 1/m
 STEP = 0.12
+NODE, MIDDLE, ENDS = math.sqrt(3 / 5), 8 / 18, 5 / 18  # of Gauss and Legendre's rule with three points
+ALONG, DIFFERENCES, HARD = "expected, default, along the steps", "differences, expected", "differences, hard"
 UNIT_M_S, UNIT_RAD_S = 0.1, 0.15  # errors that count 1 of the criterion
 
 
@@ -164,12 +167,11 @@ def gradients(run: Run[Config], kept: dict[str, Tensor], name: str) -> None:
         0.15 + 0.7 * torch.rand(6, generator=random, dtype=torch.float64) for _ in range(size.points - 1)
     ]
     rows = []
-    means: dict[str, list[Tensor]] = {}
+    slopes: dict[str, list[Tensor]] = {}
     costs: dict[str, list[float]] = {}
-    ratios: dict[str, list[float]] = {}
     with run.progress(size.points * size.draws, f"{name}: gradients") as bar:
         for number, point in enumerate(points):
-            trend_of(problem, point, size.draws)
+            trend_of(problem, point)
             found = torch.stack(
                 [
                     once(
@@ -181,23 +183,21 @@ def gradients(run: Run[Config], kept: dict[str, Tensor], name: str) -> None:
                     for draw in stepped(bar, size.draws)
                 ]
             )  # [draws, ways, 7]: gradient and processor seconds
-            for index, way in enumerate(WAYS):
-                slopes = found[:, index, :6]
-                mean = slopes.mean(0)
-                noise = (slopes - mean).square().sum(1).mean().sqrt()
-                means.setdefault(way, []).append(mean)
+            for index, way in enumerate(NAMES):
+                slopes.setdefault(way, []).append(found[:, index, :6])
                 costs.setdefault(way, []).append(float(found[1:, index, 6].mean()))
-                ratios.setdefault(way, []).append(float(mean.norm() / noise))
-    wide = torch.cat(means["differences, expected"])
-    hard = torch.cat(means["differences, hard"])
-    for way in WAYS:
-        ours = torch.cat(means[way])
+    drawn = {way: torch.cat(parts, 1) for way, parts in slopes.items()}  # [draws, 6 points]
+    wide, hard = drawn[DIFFERENCES].mean(0), drawn[HARD].mean(0)
+    for way, each in drawn.items():
+        ours, missed = each.mean(0), each - drawn[DIFFERENCES]
         cost = sum(costs[way]) / len(costs[way])
-        sure = sum(ratios[way]) / len(ratios[way])
+        sure = float(ours.norm() / spread(each))
         values = {
             "cosine_expected": cosine(ours, wide),
             "cosine_hard": cosine(ours, hard),
             "length_over_expected": float(ours.norm() / wide.norm()),
+            "relative_l2": float(missed.mean(0).norm() / wide.norm()),
+            "relative_l2_noise": spread(missed) / math.sqrt(size.draws) / float(wide.norm()),
             "signal_over_noise": sure,
             "cpu_s": cost,
             "signal_over_noise_per_root_cpu_s": sure / math.sqrt(cost),
@@ -212,6 +212,8 @@ def gradients(run: Run[Config], kept: dict[str, Tensor], name: str) -> None:
             "cosine, expected",
             "cosine, hard",
             "length",
+            "relative L2",
+            "of it noise",
             "signal/noise",
             "CPU-s",
             "signal/noise per root CPU-s",
@@ -230,12 +232,13 @@ def stepped(bar, count):
         bar.advance()
 
 
-def trend_of(problem: Problem, point: Tensor, draws: int) -> None:
-    """Fit the trend of precision at a point, on other draws than those that are looked at."""
+@torch.no_grad()
+def trend_of(problem: Problem, point: Tensor) -> None:
+    """Fit the trend of precision at a point and a step to all sides, on other draws than those that are looked at."""
     problem.trend = task.PrecisionTrend()
-    with torch.no_grad():
-        for draw in range(min(4, draws)):
-            problem.expected(problem.ranges.pose(point), problem.draw(1000 + draw), learn=True)
+    steps = STEP * torch.cat([torch.zeros(1, 6), torch.eye(6), -torch.eye(6)]).double()
+    for draw, step in enumerate(steps):
+        problem.expected(problem.ranges.pose(point + step), problem.draw(1000 + draw), learn=True)
 
 
 def all_ways(problem: Problem, point: Tensor, samples: Samples) -> Tensor:
@@ -243,8 +246,9 @@ def all_ways(problem: Problem, point: Tensor, samples: Samples) -> Tensor:
     rows = []
     for way in WAYS.values():
         began = time.process_time()
-        slope = way(problem, point, samples)
-        rows.append(torch.cat([slope, slope.new_tensor([time.process_time() - began])]))
+        slopes = way(problem, point, samples)
+        seconds = (time.process_time() - began) / len(slopes)
+        rows += [torch.cat([slope, slope.new_tensor([seconds])]) for slope in slopes]
     return torch.stack(rows)
 
 
@@ -252,50 +256,55 @@ def _straight(problem, point, samples):
     share = point.clone().requires_grad_()
     batch = problem.batch(samples)
     told = problem.system(problem.ranges.pose(share)).begin(batch)["estimate"]
-    return torch.autograd.grad(problem.pair.errors(told, batch).bounded().mean(), share)[0]
+    return torch.autograd.grad(problem.pair.errors(told, batch).bounded().mean(), share)
 
 
 def _through_frames(problem, point, samples):
     share = point.clone().requires_grad_()
     value = problem.expected(problem.ranges.pose(share), samples, frames=True)
-    return torch.autograd.grad(value.mean(), share)[0]
+    return torch.autograd.grad(value.mean(), share)
 
 
 def _default(problem, point, samples):
     share = point.clone().requires_grad_()
-    return torch.autograd.grad(problem.expected(problem.ranges.pose(share), samples).mean(), share)[0]
+    return torch.autograd.grad(problem.expected(problem.ranges.pose(share), samples).mean(), share)
 
 
-def _differences(value):
-    def slope(problem, point, samples):
-        found = []
-        with torch.no_grad():
-            for direction in STEP * torch.eye(6, dtype=torch.float64):
-                low, high = (
-                    value(problem, problem.ranges.pose(point + sign * direction), samples).mean()
-                    for sign in (-1, 1)
-                )
-                found.append((high - low) / (2 * STEP))
-        return torch.stack(found)
-
-    return slope
+def _along(problem, point, samples):
+    """The mean of the default gradient along the way of every difference."""
+    middle = _default(problem, point, samples)[0]
+    found = MIDDLE * middle
+    for index, direction in enumerate(STEP * torch.eye(6, dtype=torch.float64)):
+        for sign in (-1, 1):
+            found[index] += ENDS * _default(problem, point + sign * NODE * direction, samples)[0][index]
+    return (found,)
 
 
-def _expected(problem, mount, samples):
-    return problem.expected(mount, samples)
+def _differences(problem, point, samples):
+    """Of what is expected, and of hard errors."""
+    found = []
+    for direction in STEP * torch.eye(6, dtype=torch.float64):
+        low, high = (
+            problem.expected_and_hard(problem.ranges.pose(point + sign * direction), samples).mean(1)
+            for sign in (-1, 1)
+        )
+        found.append((high - low) / (2 * STEP))
+    return tuple(torch.stack(found, 1))
 
 
-def _hard(problem, mount, samples):
-    return problem.judged(mount, samples).bounded()
-
-
-WAYS: dict[str, Callable[[Problem, Tensor, Samples], Tensor]] = {
+WAYS: dict[str, Callable[[Problem, Tensor, Samples], tuple[Tensor, ...]]] = {
     "straight through, bounded error": _straight,
     "expected, through frames": _through_frames,
     "expected, default": _default,
-    "differences, expected": _differences(_expected),
-    "differences, hard": _differences(_hard),
+    ALONG: _along,
+    DIFFERENCES: _differences,
 }
+NAMES = (*WAYS, HARD)  # differences are two
+
+
+def spread(drawn: Tensor) -> float:
+    """Root mean square distance of vectors [draws, N] from their mean."""
+    return math.sqrt(float(drawn.var(0).sum()))
 
 
 def cosine(a: Tensor, b: Tensor) -> float:

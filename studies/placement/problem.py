@@ -139,14 +139,26 @@ class Problem:
         with torch.set_grad_enabled(frames):
             flow = system.begin(batch)["field"]
         run = system.begin(batch, {"flow": flow})
-        estimator = system.estimate
+        return self._expected(run, batch, T_body_cam, learn, T_body_cam.requires_grad and not frames)
+
+    @torch.no_grad()
+    def expected_and_hard(self, T_body_cam: Tensor, samples: Samples) -> Tensor:
+        """[2, N]: bounded errors to be expected, and those with hard counts, of the same pictures."""
+        batch = self.batch(samples)
+        run = self.system(T_body_cam).begin(batch)
+        hard = self.pair.errors(run["estimate"], batch).bounded()
+        return torch.stack([self._expected(run, batch, T_body_cam), hard])
+
+    def _expected(self, run, batch, T_body_cam, learn=False, followed=False):
+        """Bounded error [N] to be expected of what a pass has read; followed: with the gradient of trend and cover."""
+        estimator = run.system.estimate
         read = readings(run)
         true = read if self.pair.depth == "scene" else readings(run, task.scene_depth)
         flow_px = (true.rows @ batch.twist[:, None, :, None])[..., 0]
         seen = replace(read, depth_m=true.depth_m)
         if learn:
             self.trend.add(seen, flow_px)
-        if T_body_cam.requires_grad and not frames:
+        if followed:
             read = replace(self.trend.followed(seen, flow_px), depth_m=read.depth_m)
             clear = (1 - self._own_body.covered(T_body_cam, self.camera)).clamp_min(CLEAR)
             clear = (clear / clear.detach()).repeat_interleave(read.share.shape[1] // read.windows)
