@@ -10,6 +10,7 @@ from codesign.task.own_body import OwnBody
 from codesign.task.score import VelocityErrors, velocity_errors
 from codesign.task.sight import ATTITUDES, VELOCITIES, Surroundings, sight_map, sight_table, sight_units
 from codesign.task.trend import PrecisionTrend
+from codesign.task.unknown_depth import UnknownDepth
 
 __all__ = [
     "ATTITUDES",
@@ -23,6 +24,7 @@ __all__ = [
     "PrecisionTrend",
     "Readings",
     "Surroundings",
+    "UnknownDepth",
     "VelocityErrors",
     "VelocityHead",
     "expected_errors",

@@ -30,9 +30,7 @@ def ground_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, sc
     falling = -(slope.reshape(*pixels.shape[:2], 1, 3) @ up)[..., 0, 0]
     height = T_world_cam[:, 2, 3].double()[:, None] + (base.reshape(*pixels.shape[:2], 1, 3) @ up)[..., 0, 0]
     meets = falling.detach() > LEVEL
-    if any(isinstance(world, MovingScene) for world in _scenes(scene)):
-        hits, _ = _hits(camera, pixels, T_world_cam, scene)
-        meets = meets & (hits.part <= 0)
+    meets = meets & ~hidden_by_objects(camera, pixels, T_world_cam, scene)
     return torch.where(meets, height / torch.where(meets, falling, 1.0), torch.inf)
 
 
@@ -45,6 +43,13 @@ def scene_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, sce
     """
     hits, ahead = _hits(camera, pixels, T_world_cam, scene)
     return torch.where(hits.part == 0, ahead(hits.distance_m), torch.inf)
+
+
+def hidden_by_objects(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, scene: Any) -> Tensor:
+    """[N, P] bool: where an object of a MovingScene is seen. Arguments as for ``ground_depth``. No gradient."""
+    if not any(isinstance(world, MovingScene) for world in _scenes(scene)):
+        return torch.zeros(pixels.shape[:-1], dtype=torch.bool, device=pixels.device)
+    return _hits(camera, pixels, T_world_cam, scene)[0].part > 0
 
 
 def _hits(camera, pixels, T_world_cam, scene):

@@ -9,7 +9,7 @@ counts as three points however many are read.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -18,23 +18,27 @@ from torch import Tensor
 from codesign import place
 from codesign.errors import DomainError, check_whole
 from codesign.flow.checks import check_number
+from codesign.task import unknown_depth
 from codesign.task.depth import ground_depth, scene_depth
+from codesign.task.unknown_depth import UnknownDepth
 from codesign.types import ChiefRayCamera, FlowField
 
 INDEPENDENT = 3.0  # points that a window counts as
 UNSEEN_PX = 1e3  # standard deviation of flow where a field comes without covariance and nothing was seen
 PLAIN_PX = 0.3  # of flow where it comes without covariance
+INNER = 4  # steps after each reweighting where depth is not known
 DEPTHS = {"ground": ground_depth, "scene": scene_depth}
 
 
 @dataclass(frozen=True)
 class Motion:
     """velocity: [N, K] m/s and rad/s. covariance: [N, K, K] of it, as least squares expects. kept: [N, P] in 0..1,
-    by how much each point was believed."""
+    by how much each point was believed. depth_m: [N, P] of the points, as estimated where it was not known."""
 
     velocity: Tensor
     covariance: Tensor
     kept: Tensor
+    depth_m: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,8 @@ class Readings:
     pixels: [N, P, 2] of the points at mid-interval, window after window. flow_px: [N, P, 2] over the interval.
     precision: [N, P, 2, 2] px^-2. confidence: [N, P] in 0..1, the share of it that the events said; the flow is drawn
     towards zero by as much. depth_m: [N, P], infinite without a surface. rows: [N, P, 2, K] px of flow per m/s and
-    rad/s. share: [N, P] of an independent point that each counts as, 0 without a surface. windows: in P.
+    rad/s. share: [N, P] of an independent point that each counts as, 0 without a surface. windows: in P. parallax:
+    [N, P, 2, K] that each 1 / m of nearness adds to the rows, where depth is not known; then depth_m is that of ``rows``.
     """
 
     pixels: Tensor
@@ -55,6 +60,7 @@ class Readings:
     rows: Tensor
     share: Tensor
     windows: int
+    parallax: Tensor | None = None
 
     def missed_px(self, velocity: Tensor) -> Tensor:
         """Flow [N, P, 2] that velocities [N, K] leave unexplained."""
@@ -73,7 +79,8 @@ class EgoVelocity:
       axes: which of the six velocities the body has: ``place.PLANAR`` or ``place.FREE``.
       prior: [K] standard deviations expected of them around zero, m/s and rad/s.
       depth: "ground" (the plane z = 0 of the world under a body that knows its height and attitude), "scene" (a
-        perfect map), or a function (camera, pixels [N, P, 2], T_world_cam [N, 4, 4], scene) -> [N, P] m.
+        perfect map), a function (camera, pixels [N, P, 2], T_world_cam [N, 4, 4], scene) -> [N, P] m, or
+        ``task.UnknownDepth``: estimated with the velocity.
       every_px: spacing of the points read. floor_px: standard deviation of flow errors that no covariance knows of.
       outlier: errors of that many standard deviations count a quarter (Geman and McClure, 1987); None: all count.
       steps: of reweighting, for outliers.
@@ -142,21 +149,63 @@ class EgoVelocity:
         frame, over = _middle(poses.shape[1], t_s, field.interval_s)
         middle = pixels + over * flow.detach()  # where the points are at that frame
         mounts = T_body_cam.double().expand(*T_world_cam.shape[:-3], 4, 4).reshape(-1, 4, 4)
-        depth_m = (depth or self.depth)(camera, middle, poses[:, frame], scene)
+        known = depth or self.depth
+        depth_m = known(camera, middle, poses[:, frame], scene)
         rows, on_surface = self._rows(camera, depth_m, mounts, middle, field.interval_s)
+        parallax = None
+        if isinstance(known, UnknownDepth):
+            nearest = torch.where(on_surface, known.nearest_m, torch.inf)
+            near, _ = self._rows(camera, nearest, mounts, middle, field.interval_s)
+            parallax = (near - rows) / (1 / known.nearest_m - sum(known.bounds_per_m) / 2)
         windows = _windows(camera)
         share = INDEPENDENT * windows / flow.shape[1] * on_surface.to(flow)
-        return Readings(middle, flow, precision, confidence[..., 0], depth_m, rows, share, windows)
+        return Readings(middle, flow, precision, confidence[..., 0], depth_m, rows, share, windows, parallax)
 
     def solve(self, read: Readings) -> Motion:
         """Least squares, reweighted for outliers. Gradient: all readings."""
         prior = torch.diag(read.flow_px.new_tensor(self.prior) ** -2)
         kept = torch.ones_like(read.share)
+        if isinstance(self.depth, UnknownDepth):
+            return self._solved_with_depth(read)
         velocity, normal = _solved(read, kept, prior)
         for _ in range(0 if self.outlier is None else self.steps):
             kept = (1 + read.squared(velocity) / self.outlier**2) ** -2
             velocity, normal = _solved(read, kept, prior)
-        return Motion(velocity, torch.linalg.inv(normal), kept)
+        return Motion(velocity, torch.linalg.inv(normal), kept, read.depth_m)
+
+    def points(self, read: Readings, kept: Tensor) -> unknown_depth.Points:
+        """Readings [N, P] of unknown depth, each believed by as much as ``kept`` [N, P]. Gradient: both.
+
+        Raises: DomainError for readings that know their depth.
+        """
+        if read.parallax is None or not isinstance(self.depth, UnknownDepth):
+            raise DomainError(
+                "these readings know their depth; read them with the estimator that solves them."
+            )
+        bounds = self.depth.bounds_per_m
+        far = read.rows - read.parallax * (sum(bounds) / 2)
+        told = (read.precision @ read.flow_px[..., None])[..., 0]
+        precision = read.confidence[..., None, None] * read.precision
+        prior = torch.diag(read.flow_px.new_tensor(self.prior) ** -2)
+        return unknown_depth.Points(precision, told, far, read.parallax, kept * read.share, prior, bounds)
+
+    def _solved_with_depth(self, read):
+        """The same, whatever the depths. Gradient: all readings, by the last steps."""
+        kept = torch.ones_like(read.share)
+        points = self.points(read, kept)
+        velocity = unknown_depth.follow(points, torch.zeros_like(read.rows[:, 0, 0]))
+        velocity = unknown_depth.settled(points, velocity)
+        for _ in range(0 if self.outlier is None else self.steps):
+            nearness = unknown_depth.look(points, velocity).nearness
+            known = replace(read, rows=points.far + nearness[..., None, None] * points.near)
+            kept = (1 + known.squared(velocity) / self.outlier**2) ** -2
+            points = self.points(read, kept)
+            with torch.no_grad():
+                moved = unknown_depth.descend(points, velocity, INNER)
+            velocity = unknown_depth.settled(points, velocity + (moved - velocity).detach())
+        nearness = unknown_depth.look(points, velocity).nearness
+        depth_m = torch.where(read.share > 0, 1 / nearness, torch.inf)
+        return Motion(velocity, unknown_depth.covariance(points, velocity), kept, depth_m)
 
     def _measured(self, field, camera, count):
         """Points [N, P, 2] px, their flow [N, P, 2] px, its precision [N, P, 2, 2] and confidence [N, P, 1]."""

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from codesign.errors import DomainError
 from codesign.flow.checks import check_number
 from codesign.task.ego_velocity import EgoVelocity, Readings
 
@@ -79,8 +80,12 @@ def expected_errors(
       None: ``read.rows``. errors: of the flow.
     Outliers count less by the mean of the squared misfit to be expected of a component, where the estimator goes by that
     of the draw.
-    Gradient: readings, twist, rows.
+    Gradient: readings, twist, rows. Raises: DomainError for readings whose depth is estimated with the velocity.
     """
+    if read.parallax is not None:
+        raise DomainError(
+            "errors are expected of velocities whose depth is known; give the estimator a depth."
+        )
     velocity = twist[:, list(estimator.axes)].to(read.flow_px)[:, None, :, None]
     rows = read.rows if true_rows is None else true_rows
     flow_px = (rows @ velocity)[..., 0]

@@ -14,12 +14,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import silu
 
-from codesign.errors import FileFormatError, check_whole
+from codesign.errors import DomainError, FileFormatError, check_whole
 from codesign.flow import checkpoint
 from codesign.flow.checks import check_kind
 from codesign.place import FREE
 from codesign.task.ego_velocity import EgoVelocity, Motion
 from codesign.task.evidence import LENS, MOUNT, TOLD, Evidence, evidence
+from codesign.task.unknown_depth import UnknownDepth
 from codesign.types import ChiefRayCamera, EventVolume, FlowField
 
 SOLVED = (
@@ -59,6 +60,8 @@ class VelocityHead(nn.Module):
     def __init__(self, plain: EgoVelocity, width: int = 32, rounds: int = 2, design: bool = True) -> None:
         super().__init__()
         self.plain = check_kind(plain, EgoVelocity, "plain")
+        if isinstance(plain.depth, UnknownDepth):
+            raise DomainError("a head weighs windows whose depth is known; give ``plain`` a depth.")
         width = check_whole(width, "width")
         self.config: dict[str, Any] = {
             "width": width,

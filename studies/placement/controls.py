@@ -5,7 +5,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from codesign import events, task
+from codesign import events, place, task
 from codesign.types import EventVolume
 from scenes.robot_pair import BINS, LEAD_S, SENSOR
 from studies.placement.problem import Problem, Samples, readings
@@ -31,11 +31,13 @@ def controls(problem: Problem, mount: Tensor, samples: Samples) -> dict[str, flo
     told = run["estimate"]
     zero = replace(told, velocity=torch.zeros_like(told.velocity))
     other = events.HardSensor(MISMATCHED, BINS, LEAD_S)
+    mapless = task.EgoVelocity(place.FREE, problem.pair.prior, task.UnknownDepth())
     backward = problem.system(looking_back(problem), "sensor")
     return {
         "as_found": float(errors(told, batch).bounded().mean()),
         "no_texture": judged({"frames": still}),
         "shuffled_events": judged({"events": shuffled(run["volume"])}),
+        "depth_unknown": judged({"flow": run["field"]}, system.replaced(estimate=mapless)),
         "only_the_robot": judged({}, backward),
         "thresholds_mismatched": judged({"frames": frames}, system.replaced(events=other)),
         "always_zero": float(errors(zero, batch).bounded().mean()),
