@@ -48,7 +48,9 @@ def flight() -> RobotPair:
     (0, 1, 2, 3, 4, 5)
     """
     prior = (0.8, 0.8, 0.4, 0.8, 0.8, 0.8)
-    return RobotPair("flight", BODIES, LOW, HIGH, START, place.FREE, prior, "scene", None, world, drive)
+    return RobotPair(
+        "flight", BODIES, LOW, HIGH, START, place.FREE, prior, "scene", None, world, drive, frame="base_link"
+    )
 
 
 def world(number: int) -> MitsubaScene:

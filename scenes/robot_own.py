@@ -43,7 +43,7 @@ def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
       stands still or is shorter than three windows.
     """
     own = settings if isinstance(settings, OwnRobot) else read_own(settings)
-    bodies = _bodies(own)
+    bodies, frame = _bodies(own)
     world, depth = _world(own)
     if own.motion is None or own.motion in PAIRS:
         named = PAIRS[own.motion or own.world]()
@@ -74,6 +74,8 @@ def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
         own_body_share=asked.own_body_share,
         cable=None if cable is None else (cable.forbidden, math.radians(cable.half_angle_deg)),
         ground_z_m=-float(middle[:, 2, 3].mean()),
+        frame=frame,
+        files=tuple(Path(name) for name in (own.robot, own.world, own.motion) if name and name not in PAIRS),
     )
 
 
@@ -127,12 +129,13 @@ def _file(entry, name, kinds=()):
 
 
 def _bodies(own):
-    """Meshes in body axes, less those that move with the camera."""
+    """Meshes in body axes, less those that move with the camera, and the name of the axes."""
     path = _file("robot", own.robot, (".urdf", *mesh_files.KINDS))
     if path.suffix.lower() == ".urdf":
-        parts = list(robots.from_urdf(path).parts)
+        robot = robots.from_urdf(path)
+        parts, frame = list(robot.parts), robot.base
     else:
-        parts = mesh_files.read(path, materials=False)
+        parts, frame = mesh_files.read(path, materials=False), "base_link"
     names = sorted({part.name for part in parts})
     unknown = [name for name in own.without if name not in names]
     if unknown:
@@ -142,10 +145,11 @@ def _bodies(own):
     left = [part for part in parts if part.name not in own.without]
     if not left:
         raise DomainError(f"robot: of '{path}' nothing with a shape is left; name fewer links in 'without'.")
-    return {
+    bodies = {
         f"{k}-{re.sub(r'[^A-Za-z0-9_-]', '_', part.name)}": Body(part.vertices_m, part.faces)
         for k, part in enumerate(left)
     }
+    return bodies, frame
 
 
 def _world(own):

@@ -14,6 +14,7 @@ Body axes: x forward, y left, z up. The body is drawn in front of its camera (``
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -103,6 +104,7 @@ class RobotPair:
     housing_radius_m, margin_m: of the camera, and by how much it must stay clear of the body. own_body_share: of the
       image, that the body may cover. cable: direction in body axes and half angle in radians of a cone into which the
       camera's back must not point; None where it may point anywhere. ground_z_m: height of the ground in body axes.
+    frame: name of the body's axes (REP 105). files: of which the pair was made, where a user gave them.
     """
 
     name: str
@@ -121,6 +123,8 @@ class RobotPair:
     own_body_share: float = 0.3
     cable: tuple[tuple[float, float, float], float] | None = None
     ground_z_m: float = 0.0
+    frame: str = "base_footprint"
+    files: tuple[Path, ...] = ()
 
     def check(self, design: Design) -> Design:
         """The design. Raises: DomainError where a number of it lies outside the bounds."""

@@ -43,11 +43,12 @@ MOVES = ("revolute", "continuous", "prismatic")
 @dataclass(frozen=True)
 class Robot:
     """Links at joint angles. path: of the URDF. frames: name of each link -> T_robot_link [4, 4]. parts: what is
-    seen, in the robot's axes, named by link."""
+    seen, in the robot's axes, named by link. base: the link whose axes are the robot's."""
 
     path: Path
     frames: Mapping[str, np.ndarray]
     parts: Sequence[mesh_files.Part]
+    base: str
 
     def frame(self, name: str) -> Tensor:
         """T_robot_frame [4, 4] float64 of a link. Raises: DomainError for one that is not there."""
@@ -114,7 +115,7 @@ def from_urdf(
             colour = _colour(getattr(shape, "material", None), materials)
             parts += [_moved(part, placed, link.name, colour) for part in _parts(shape.geometry, finder)]
     finder.check()
-    robot = Robot(path, frames, tuple(parts))
+    robot = Robot(path, frames, tuple(parts), root)
     if parts:
         corners = np.concatenate([part.vertices_m for part in parts])
         units.hint(corners.min(0), corners.max(0), f"robot '{path}'")

@@ -113,7 +113,7 @@ def report(
         run.card(
             f"gradient over {name}", f"{found.median:.2f}", f"ahead {found.ahead} of {found.count} starts"
         )
-    ranked(run, race, errors, rivals, judged)
+    ranked(run, race, errors, rivals, judged, ways)
     seen(run, problem, unseen, mount, share)
     handed(run, problem, unseen, mount, judged[best, GRADIENT])
     run.finish("Where to mount the camera", answer)
@@ -175,6 +175,7 @@ def ranked(
     errors: dict[str, Tensor],
     rivals: dict[str, Paired],
     judged: dict[tuple[int, str], Tensor],
+    ways: dict[str, grad.Choice],
 ) -> None:
     """The searches beside one another."""
     run.section(
@@ -201,6 +202,12 @@ def ranked(
             "of its renders."
         )
     rows.append(["default mount", float(judged[0, "default"].mean()), None, None, None])
+    if run.config.certified:
+        run.text(
+            "The gradient beside differences over a quarter of the bounds: "
+            + "; ".join(f"{name} by {way}" for name, way in ways.items())
+            + "."
+        )
     run.table("Errors on unseen samples", ("search", "median", "best", "worst", "gradient over it"), rows)
     trails = {
         name: [race.trail(number, name) for number in range(len(errors["start"]))]
@@ -290,16 +297,15 @@ def handed(run: Run[Any], problem: Problem, unseen: Problem, pose: Tensor, error
     middle = (low + high) / 2
     inside = torch.where(half > 0, (pose[:3, 3] - middle).clamp(-0.999 * half, 0.999 * half), 0.0)
     mount = place.Mount(middle, half, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll, position_m=middle + inside)
-    parent = "base_footprint" if len(problem.pair.axes) == 3 else "base_link"
     path = run.path("mount.yaml")
     notes = {
         "pair": problem.pair.name,
         "error_unseen": float(errors.mean()),
-        "error_found": float(errors.mean()),
     }
-    save_hand_over(
-        path, HandOver(mount, problem.camera, robot_pair.SENSOR, parent, "camera_optical_frame", notes)
+    handed_over = HandOver(
+        mount, problem.camera, robot_pair.SENSOR, problem.pair.frame, "camera_optical_frame", notes
     )
+    save_hand_over(path, handed_over)
     back = load_hand_over(path)
     again = unseen.judged(back.mount().detach(), unseen.draw(0), "sensor").bounded()
     run.record(hand_over_score_again=again.mean(), hand_over_score=errors.mean())

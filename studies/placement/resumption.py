@@ -16,13 +16,20 @@ MORE = ("own_body_share", "cable", "ground_z_m")
 
 
 def asked(config: StudyConfig, pair: RobotPair) -> dict[str, Any]:
-    """Name -> what results depend on: options, the pair's settings, and digests of its meshes and first drive."""
+    """Name -> what results depend on: options, the pair's settings, and digests of its meshes,
+    first drive and files."""
     options = json.loads(to_json("", config))
     named = {f"--{name.replace('_', '-')}": value for name, value in options.items() if name not in ELSEWHERE}
     settings = {f"the robot's {name}": repr(getattr(pair, name)) for name in (*SETTINGS, *MORE)}
     meshes = [part for body in pair.bodies.values() for part in (body.vertices_m, body.faces)]
     poses, _ = pair.drive(0, 1)
-    return named | settings | {"the robot's shape": _digest(meshes), "the robot's drives": _digest([poses])}
+    files = {f"'{path}'": hashlib.sha256(path.read_bytes()).hexdigest()[:12] for path in pair.files}
+    return (
+        named
+        | settings
+        | files
+        | {"the robot's shape": _digest(meshes), "the robot's drives": _digest([poses])}
+    )
 
 
 def check_same(stored: dict[str, Any], now: dict[str, Any]) -> None:

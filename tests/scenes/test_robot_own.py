@@ -135,6 +135,8 @@ require:
     assert found.high.pitch_rad == math.radians(80)
     assert found.axes == place.FREE
     assert found.depth == "ground"
+    assert found.frame == robots.from_urdf(robots.ROVER).base == "base_link"
+    assert [path.name for path in found.files] == ["rover.urdf"]
     cable, ahead, clearance, own_body = found.requirements()
     assert cable == place.CableSide((0.0, 0.0, -1.0), math.radians(30))
     assert ahead == place.LookAhead(2.0, 0.2, ground_z_m=found.ground_z_m)

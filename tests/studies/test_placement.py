@@ -159,7 +159,7 @@ def test_drives_of_a_world_err_alike():
     assert results.standard_error(errors[:1], 1) == 0.0
 
 
-def test_a_run_that_goes_on_is_the_one_that_was_begun():
+def test_a_run_that_goes_on_is_the_one_that_was_begun(tmp_path):
     config = placement.Config(seeds=2)
     pair = PAIRS["outdoors"]()
     begun = json.loads(json.dumps(asked(config, pair)))
@@ -170,6 +170,13 @@ def test_a_run_that_goes_on_is_the_one_that_was_begun():
     wider = replace(pair, high=replace(pair.high, z_m=pair.high.z_m + 0.1))
     with pytest.raises(DomainError, match="the robot's high changed"):
         check_same(begun, asked(config, wider))
+    world = tmp_path / "room.obj"
+    world.write_text("v 0 0 0")
+    own = replace(pair, files=(world,))
+    begun |= asked(config, own)
+    world.write_text("v 0 0 1")
+    with pytest.raises(DomainError, match=r"room\.obj' changed"):
+        check_same(begun, asked(config, own))
     with pytest.raises(DomainError, match="the robot's shape changed"):
         check_same(begun, asked(config, replace(pair, bodies=dict(list(pair.bodies.items())[1:]))))
 
