@@ -26,7 +26,7 @@ from codesign.errors import DomainError
 from codesign.place.criterion import LINEAR
 from scenes import robot_pair
 from scenes.robot_pair import RATE_RAD_S
-from scenes.robot_pairs import PAIRS
+from scenes.robot_pairs import PAIRS, check_pairs
 from studies.frame.run import Run, StudyConfig, main
 from studies.placement.problem import Problem, Samples, traced_camera
 
@@ -56,9 +56,7 @@ class Config(StudyConfig):
 
 def study(run: Run[Config]) -> None:
     size = run.config
-    unknown = [name for name in size.pair if name not in PAIRS]
-    if unknown or not size.pair:
-        raise DomainError(f"--pair {' '.join(unknown)}: choose from {', '.join(PAIRS)}.")
+    check_pairs(size.pair)
     if min(size.designs, size.draws) < 2 or min(size.judged, size.points) < 1:
         raise DomainError("--designs and --draws need at least 2, --judged and --points at least 1.")
     stored = run.load_state()

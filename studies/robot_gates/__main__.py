@@ -18,7 +18,7 @@ import torch
 from codesign.errors import DomainError
 from scenes import robot_pair
 from scenes.robot_pair import Design, Drives, RobotPair
-from scenes.robot_pairs import PAIRS
+from scenes.robot_pairs import PAIRS, check_pairs
 from studies.frame.run import Run, StudyConfig, main
 from studies.robot_gates import figures
 from studies.robot_gates.measures import (
@@ -73,9 +73,7 @@ POOL_MOTIONS = 3
 
 def study(run: Run[Config]) -> None:
     config = run.config
-    unknown = [name for name in config.pair if name not in PAIRS]
-    if unknown or not config.pair:
-        raise DomainError(f"--pair {' '.join(unknown)}: choose from {', '.join(PAIRS)}.")
+    check_pairs(config.pair)
     if (
         config.levels < 3
         or config.levels % 2 == 0

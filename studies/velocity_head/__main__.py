@@ -17,7 +17,7 @@ from torch import Tensor
 from codesign import task
 from codesign.errors import DomainError
 from scenes import robot_pair
-from scenes.robot_pairs import PAIRS
+from scenes.robot_pairs import PAIRS, check_pairs
 from studies.frame.run import Run, StudyConfig, main
 from studies.velocity_head import page
 from studies.velocity_head.compare import ARMS, Errors
@@ -91,9 +91,7 @@ def study(run: Run[Config]) -> None:
 
 
 def _check(config):
-    unknown = [name for name in config.pair if name not in PAIRS]
-    if unknown or not config.pair:
-        raise DomainError(f"--pair {' '.join(unknown)}: choose from {', '.join(PAIRS)}.")
+    check_pairs(config.pair)
     least = {"designs": 1, "held_out": 1, "worlds": 2, "unseen": 1, "motions": 1, "own_motions": 1}
     least |= {"judged_motions": 1, "steps": 1, "own_steps": 1, "batch": len(config.pair)}
     for name, value in least.items():
