@@ -3,9 +3,8 @@ precision that is not the draw's.
 
 The precision that an estimator gives a window jumps with the texture under it: moved by a pixel, the picture has other
 edges. Its derivative to a pose is that jump times hundreds of pixels per radian, and has no mean. What goes on when the
-jumps are averaged is that flow is told better where there is more of it, until it is too fast, where the surface and its
-texture are near, and where it is not seen at a glancing angle. That trend is fitted over all points seen so far, and is
-followed instead.
+jumps are averaged is that flow is told better where there is more of it, until it is too fast, and where the surface
+and its texture are near. That trend is fitted over all points seen so far, and is followed instead.
 """
 
 from dataclasses import replace
@@ -20,16 +19,12 @@ from codesign.task.ego_velocity import Readings
 LEAST_PX = 0.5  # flow below which a length says no more
 LEAST_PER_M = 0.3  # nearness below which a distance says no more
 RIDGE = 1e-5
-LEAST_NEAR = 0.05  # 1 / m to which relative changes are taken at least
-SLOPE_PX = (
-    300.0  # about a focal length: by it the change of nearness per pixel becomes the tangent of obliqueness
-)
 SURE = 1e-4  # of a confidence from 0 and 1
 
 
 class PrecisionTrend:
-    """Regression of the logarithm of precision, and of the log odds of confidence, on flow length (third order), nearness and
-    obliqueness (second), the latter by how nearness changes over a window.
+    """Regression of the logarithm of precision, and of the log odds of confidence, on flow length and nearness (third
+    order in the first, second in the other).
 
     >>> trend = PrecisionTrend()
 
@@ -75,32 +70,13 @@ class PrecisionTrend:
 
 
 def _terms(read, flow_px):
-    """[N, P, 12] of true flow and depth."""
+    """[N, P, 8] of true flow and depth."""
     length = ((flow_px.square().sum(-1) + 1e-12).sqrt() + LEAST_PX).log()
-    near = torch.where(read.depth_m.isfinite(), 1 / read.depth_m, 0.0).clamp_min(0)
-    nearness = (near + LEAST_PER_M).log()
-    oblique = _obliqueness(read, near)
+    near = torch.where(read.depth_m.isfinite(), 1 / read.depth_m, 0.0)
+    nearness = (near.clamp_min(0) + LEAST_PER_M).log()
     one = torch.ones_like(length)
-    terms = [one, length, length**2, length**3, nearness, nearness**2, oblique, oblique**2]
-    mixed = [length * nearness, length**2 * nearness, length * oblique, nearness * oblique]
-    return torch.stack([*terms, *mixed], -1)
-
-
-def _obliqueness(read, near):
-    """[N, P], of the plane through the nearness of a window's points: the logarithm of 1 and the tangent to its normal."""
-
-    def by_window(values):
-        return values.reshape(len(near), read.windows, -1, *values.shape[2:])
-
-    seen = by_window((read.share > 0).to(near))
-    weight = (seen / seen.sum(2, keepdim=True).clamp_min(1))[..., None]
-    at, value = by_window(read.pixels), by_window(near)[..., None]
-    offset = at - (weight * at).sum(2, keepdim=True)
-    mean = (weight * value).sum(2, keepdim=True)
-    spread = offset.mT @ (weight * offset) + 1e-6 * torch.eye(2, dtype=at.dtype)
-    slope = torch.linalg.solve(spread, offset.mT @ (weight * (value - mean)))[..., 0]
-    steep = (slope.square().sum(-1, keepdim=True) + 1e-18).sqrt() / (mean[..., 0] + LEAST_NEAR)
-    return torch.log1p(SLOPE_PX * steep).expand_as(seen).flatten(1)
+    terms = [one, length, length**2, length**3, nearness, nearness**2]
+    return torch.stack([*terms, length * nearness, length**2 * nearness], -1)
 
 
 def _log_odds(confidence):
