@@ -20,26 +20,42 @@ from studies.placement.problem import Problem, Samples
 from studies.placement.searches import Trail
 
 DRAWN_M = 0.6  # length of the drawn view
-COLOURS = ("#d62728", "#7f7f7f", "#1f77b4", "#2ca02c", "#9467bd")
+COLOURS = ("#d62728", "#7f7f7f", "#1f77b4", "#2ca02c", "#9467bd", "#8c564b")
 
 
 def ways(problem: Problem, trails: dict[str, list[Trail]]) -> Figure:
-    """Best error so far over mounts looked at, and height and pitch of the descents."""
+    """Best error so far over mounts looked at; and of all these mounts height, pitch and error, below the ways of the
+    descents."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     for (name, found), colour in zip(trails.items(), COLOURS, strict=False):
         for number, trail in enumerate(found):
-            error = trail.error if name == "gradient" else torch.cummin(trail.error, 0).values
+            if name == "gradient":  # above 1 is the penalty of what is not allowed
+                error = trail.error.masked_fill(trail.error > 1, math.nan)
+            else:
+                error = torch.cummin(trail.error, 0).values
             left.plot(error.numpy(), color=colour, linewidth=0.9, label=name if number == 0 else None)
     left.set(xlabel="mounts looked at", ylabel="own objective", ylim=(0, 1))
     left.legend()
+    looked = [trail for name, found in trails.items() if name != "gradient" for trail in found]
+    if looked:
+        pitch, height = _pitch_and_height(problem, torch.cat([trail.share for trail in looked]))
+        error = torch.cat([trail.error for trail in looked])
+        allowed = (error < 1).numpy()  # errors are bounded by 1: beyond lies what is not allowed
+        map_ = right.scatter(pitch[allowed], height[allowed], c=error[allowed], s=9, cmap="viridis_r")
+        figure.colorbar(map_, ax=right, label="error")
     for trail in trails["gradient"]:
-        numbers = problem.ranges.numbers(trail.share).numpy()
-        height, pitch = numbers[:, NAMES.index("z_m")], np.degrees(numbers[:, NAMES.index("pitch_rad")])
+        pitch, height = _pitch_and_height(problem, trail.share)
         right.plot(pitch, height, color=COLOURS[0], linewidth=0.9)
         right.plot(pitch[0], height[0], "o", mfc="none", color=COLOURS[0])
         right.plot(pitch[-1], height[-1], "*", color=COLOURS[0])
     right.set(xlabel="pitch, degrees down", ylabel="height, m")
     return figure
+
+
+def _pitch_and_height(problem: Problem, share: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Degrees down and metres of mounts [N, 6]."""
+    numbers = problem.ranges.numbers(share).numpy()
+    return np.degrees(numbers[:, NAMES.index("pitch_rad")]), numbers[:, NAMES.index("z_m")]
 
 
 def before_and_after(problem: Problem, mount: Tensor) -> Figure:

@@ -214,11 +214,13 @@ def ranked(
         for name in errors
         if name != "start"
     }
+    if (0, GRID) in judged:
+        trails[GRID] = [race.trail(0, GRID)]
     run.figure(
         figures.ways(race.problem, trails),
         "ways",
         "Left: what the searches saw of their own objective, best so far (the gradient's is the error to be expected, which "
-        "is larger). Right: the mounts that the descents went through.",
+        "is larger). Right: the map, every mount that a search without gradient looked at with its error, and the ways of the descents.",
     )
 
 
