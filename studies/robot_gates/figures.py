@@ -3,18 +3,13 @@
 from typing import Any
 
 import matplotlib.pyplot as plt
-import numpy as np
 import torch
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
-from codesign import render
-from codesign.report import robot_figures
-from scenes import bodies
-from scenes.robot_pair import FILM, FRAMES, PITCH_MM, SENSOR_PX, WINDOW_PX, Drives, RobotPair
+from scenes.robot_pair import Drives, RobotPair
+from studies.frame.robot_pictures import draw_frame, draw_pair
 from studies.robot_gates.measures import APART, DRAWN, PLANES, Ranking, level
 
-DRAWN_M = 0.6  # length of the drawn view
 LABELS = {
     "efl_mm": "focal length, mm",
     "focus_per_m": "focus, 1/m",
@@ -28,24 +23,11 @@ def robot_and_frames(pair: RobotPair, shown: dict[str, Drives]) -> Figure:
     their captions, windows outlined."""
     figure = plt.figure(figsize=(5 + 4 * len(shown), 4.2), layout="constrained")
     axis: Any = figure.add_subplot(1, 1 + len(shown), 1, projection="3d")
-    triangles = [mesh.vertices_m[mesh.faces] for mesh in pair.bodies.values()]
-    shade = [np.clip(0.8 * bodies.skylight(mesh), 0, 1) for mesh in pair.bodies.values()]
-    small = pair.design.camera()
-    mount = pair.design.mount()
-    lines = robot_figures.view_lines(small, mount, DRAWN_M)
-    robot_figures.draw_robot(axis, np.concatenate(triangles), np.concatenate(shade), lines)
-    camera = render.Camera(small.lens, *SENSOR_PX, PITCH_MM, 8)
+    camera, mount = pair.design.camera(), pair.design.mount()
+    draw_pair(axis, pair, camera, mount)
     for place, (caption, batch) in enumerate(shown.items(), 2):
-        scene = batch.scene[0].during([FRAMES // 2])
-        poses = (batch.T_world_body[0, :, FRAMES // 2] @ mount)[:, None]
-        with torch.no_grad():
-            image = render.frames(camera, scene, poses)[0, 0].numpy()
         right = figure.add_subplot(1, 1 + len(shown), place)
-        right.imshow(np.clip(image / 255, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
-        for corner in FILM.windows_px or ():
-            right.add_patch(
-                Rectangle(corner, WINDOW_PX, WINDOW_PX, fill=False, color="tab:red", linewidth=0.6)
-            )
+        draw_frame(right, batch, camera, mount)
         right.set(xticks=[], yticks=[], title=caption)
     return figure
 
