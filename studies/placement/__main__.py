@@ -57,7 +57,7 @@ class Config(StudyConfig):
     rivals_expect: bool = False
     """Searches beside the gradient minimise what it descends, instead of errors with hard counts."""
     grid: int = 0
-    """Mounts of a quasi-random grid that is refined twice, 0 for none."""
+    """Mounts of a quasi-random grid that is refined twice, its best looked at once more; 0 for none."""
     judged_worlds: int = 12
     """Unseen worlds."""
     judged_drives: int = 12
@@ -88,6 +88,7 @@ def study(run: Run[Config]) -> None:
             race.search(number, name, start)
     if size.grid:
         race.search(0, GRID, problem.start)
+        race.finals()
     judged = judge(run, race, unseen, starts)
     report(run, race, unseen, starts, judged, ways)
 
