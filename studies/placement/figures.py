@@ -20,7 +20,7 @@ COLOURS = ("#d62728", "#7f7f7f", "#1f77b4", "#2ca02c", "#9467bd", "#8c564b")
 
 
 def ways(problem: Problem, trails: dict[str, list[Trail]]) -> Figure:
-    """Best error so far over mounts looked at; and of all these mounts height, pitch and error, below the ways of the
+    """Best error so far over drives rendered; and of all these mounts height, pitch and error, below the ways of the
     descents."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     for (name, found), colour in zip(trails.items(), COLOURS, strict=False):
@@ -29,8 +29,11 @@ def ways(problem: Problem, trails: dict[str, list[Trail]]) -> Figure:
                 error = trail.error.masked_fill(trail.error > 1, math.nan)
             else:
                 error = torch.cummin(trail.error, 0).values
-            left.plot(error.numpy(), color=colour, linewidth=0.9, label=name if number == 0 else None)
-    left.set(xlabel="mounts looked at", ylabel="own objective", ylim=(0, 1))
+            rendered = problem.samples * np.arange(1, len(error) + 1)
+            left.plot(
+                rendered, error.numpy(), color=colour, linewidth=0.9, label=name if number == 0 else None
+            )
+    left.set(xscale="log", xlabel="drives rendered", ylabel="own objective", ylim=(0, 1))
     left.legend()
     looked = [trail for name, found in trails.items() if name != "gradient" for trail in found]
     if looked:

@@ -23,6 +23,7 @@ from studies.placement.race import GRADIENT, GRID, Race, chosen, feasible
 
 RESAMPLED = 4000
 INTERVAL = 0.9
+INSIDE = 1 - 1e-9  # of a box that a mount approaches by a hyperbolic tangent
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,16 @@ def paired(ours: Tensor, theirs: Tensor) -> Paired:
     ends = torch.tensor([(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], dtype=ratio.dtype)
     low, high = torch.quantile(ratio[drawn].quantile(0.5, 1), ends).tolist()
     return Paired(float(ratio.quantile(0.5)), low, high, int((ratio < 1).sum()), len(ratio))
+
+
+def over_worlds(ours: Tensor, theirs: Tensor, worlds: int) -> tuple[float, float, float]:
+    """Ratio of mean errors [N], world after world, ours over theirs; and its interval over resampled worlds."""
+    means = torch.stack([ours, theirs]).unflatten(1, (worlds, -1)).mean(2)
+    drawn = torch.randint(worlds, (RESAMPLED, worlds), generator=torch.Generator().manual_seed(0))
+    ratio = means[:, drawn].mean(2)
+    ends = torch.tensor([(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], dtype=ratio.dtype)
+    low, high = torch.quantile(ratio[0] / ratio[1], ends).tolist()
+    return float(means[0].mean() / means[1].mean()), low, high
 
 
 def report(
@@ -80,13 +91,13 @@ def report(
         seconds=run.seconds,
         **{f"{label(name)}_median_error": values.quantile(0.5) for name, values in errors.items()},
     )
-    for name, found in rivals.items():
+    for name, beside in rivals.items():
         run.record(
             **{
-                f"over_{label(name)}_median": found.median,
-                f"over_{label(name)}_low90": found.low,
-                f"over_{label(name)}_high90": found.high,
-                f"over_{label(name)}_ahead": found.ahead,
+                f"over_{label(name)}_median": beside.median,
+                f"over_{label(name)}_low90": beside.low,
+                f"over_{label(name)}_high90": beside.high,
+                f"over_{label(name)}_ahead": beside.ahead,
             }
         )
     for name, way in ways.items():
@@ -101,17 +112,22 @@ def report(
             )
     better = float(errors[GRADIENT][best]) < default
     said = "belongs at" if better else "is no better off than at its default mount at"
+    found = over_worlds(judged[best, GRADIENT], judged[0, "default"], size.judged_worlds)
+    ratio = f"{found[0]:.2f}"
+    if size.judged_worlds > 1:
+        ratio += f" ({found[1]:.2f} to {found[2]:.2f}, {INTERVAL:.0%} of resampled worlds)"
     answer = (
-        f"The camera of '{problem.pair.name}' {said} {place_in_words(problem, share)}: mean error "
-        f"{float(errors[GRADIENT][best]):.3f} on {unseen.samples} unseen samples with single events, "
-        f"{default:.3f} at its default mount."
+        f"The camera of '{problem.pair.name}' {said} {place_in_words(problem, share)}: its error there is {ratio} times that "
+        f"at its default mount, {float(errors[GRADIENT][best]):.3f} against {default:.3f} on {unseen.samples} unseen samples "
+        "with single events."
     )
+    run.record(over_default=found[0], over_default_low90=found[1], over_default_high90=found[2])
     run.card(
         "error of the mount found", f"{float(errors[GRADIENT][best]):.3f}", f"default mount: {default:.3f}"
     )
-    for name, found in rivals.items():
+    for name, beside in rivals.items():
         run.card(
-            f"gradient over {name}", f"{found.median:.2f}", f"ahead {found.ahead} of {found.count} starts"
+            f"gradient over {name}", f"{beside.median:.2f}", f"ahead {beside.ahead} of {beside.count} starts"
         )
     ranked(run, race, errors, rivals, judged, ways)
     seen(run, problem, unseen, mount, share)
@@ -297,7 +313,7 @@ def handed(run: Run[Any], problem: Problem, unseen: Problem, pose: Tensor, error
     yaw, pitch, roll = place.yaw_pitch_roll_rad(pose).tolist()
     half = (high - low) / 2
     middle = (low + high) / 2
-    inside = torch.where(half > 0, (pose[:3, 3] - middle).clamp(-0.999 * half, 0.999 * half), 0.0)
+    inside = torch.where(half > 0, (pose[:3, 3] - middle).clamp(-INSIDE * half, INSIDE * half), 0.0)
     mount = place.Mount(middle, half, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll, position_m=middle + inside)
     path = run.path("mount.yaml")
     notes = {

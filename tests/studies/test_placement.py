@@ -159,6 +159,12 @@ def test_drives_of_a_world_err_alike():
     assert results.standard_error(errors[:1], 1) == 0.0
 
 
+def test_a_ratio_over_worlds_is_of_means():
+    """Two worlds, ratios 1 / 2 and 3 / 4 of means: together 4 / 6, resampled from 0.5 to 0.75."""
+    ours, theirs = torch.tensor([0.5, 1.5, 2.0, 4.0], dtype=F), torch.tensor([1.0, 3.0, 4.0, 4.0], dtype=F)
+    assert results.over_worlds(ours, theirs, 2) == pytest.approx((4 / 6, 0.5, 0.75))
+
+
 def test_a_run_that_goes_on_is_the_one_that_was_begun(tmp_path):
     config = placement.Config(seeds=2)
     pair = PAIRS["outdoors"]()
