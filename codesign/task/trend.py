@@ -3,8 +3,9 @@ precision that is not the draw's.
 
 The precision that an estimator gives a window jumps with the texture under it: moved by a pixel, the picture has other
 edges. Its derivative to a pose is that jump times hundreds of pixels per radian, and has no mean. What goes on when the
-jumps are averaged is that flow is told better where there is more of it, until it is too fast, and where the surface
-and its texture are near. That trend is fitted over all points seen so far, and is followed instead.
+jumps are averaged is that flow is told better where there is more of it, until it is too fast, where the surface and its
+texture are near, and where the robot's own body, whose image stands still, does not reach into the window. That trend is
+fitted over all points seen so far, and is followed instead.
 """
 
 from dataclasses import replace
@@ -23,8 +24,8 @@ SURE = 1e-4  # of a confidence from 0 and 1
 
 
 class PrecisionTrend:
-    """Regression of the logarithm of precision, and of the log odds of confidence, on flow length and nearness (third
-    order in the first, second in the other).
+    """Regression of the logarithm of precision, and of the log odds of confidence, on flow length (third order), nearness, and
+    the share of the window that the body covers (second).
 
     >>> trend = PrecisionTrend()
 
@@ -39,10 +40,13 @@ class PrecisionTrend:
         self._right: Tensor | None = None
 
     @torch.no_grad()
-    def add(self, read: Readings, flow_px: Tensor) -> "PrecisionTrend":
-        """Take in readings whose true flow is [N, P, 2] px; points without a surface are left out."""
+    def add(self, read: Readings, flow_px: Tensor, covered: Tensor | None = None) -> "PrecisionTrend":
+        """Take in readings whose true flow is [N, P, 2] px; points without a surface are left out.
+
+        covered: share of each window that the robot's own body covers, [windows] (``OwnBody.covered``) or [N, windows].
+        """
         seen = read.share > 0
-        terms = _terms(read, flow_px)[seen]
+        terms = _terms(read, flow_px, covered)[seen]
         wanted = torch.stack([0.5 * torch.logdet(read.precision), _log_odds(read.confidence)], -1)[seen]
         normal, right = terms.mT @ terms, terms.mT @ wanted
         kept = 1 - self.forget
@@ -50,12 +54,12 @@ class PrecisionTrend:
         self._right = right if self._right is None else kept * self._right + right
         return self
 
-    def followed(self, read: Readings, flow_px: Tensor) -> Readings:
-        """The same readings, whose precision and confidence have the gradient of the trend to flow and depth.
+    def followed(self, read: Readings, flow_px: Tensor, covered: Tensor | None = None) -> Readings:
+        """The same readings, whose precision and confidence have the gradient of the trend to flow, depth and cover.
 
         Raises: DomainError where nothing has been added.
         """
-        said = _terms(read, flow_px) @ self._coefficients()
+        said = _terms(read, flow_px, covered) @ self._coefficients()
         change = said - said.detach()
         precision = read.precision.detach() * change[..., 0].exp()[..., None, None]
         confidence = torch.sigmoid(_log_odds(read.confidence.detach()) + change[..., 1])
@@ -69,14 +73,18 @@ class PrecisionTrend:
         return torch.linalg.solve(self._normal + ridge, self._right)
 
 
-def _terms(read, flow_px):
-    """[N, P, 8] of true flow and depth."""
+def _terms(read, flow_px, covered):
+    """[N, P, 10] of true flow, depth and cover."""
     length = ((flow_px.square().sum(-1) + 1e-12).sqrt() + LEAST_PX).log()
     near = torch.where(read.depth_m.isfinite(), 1 / read.depth_m, 0.0)
     nearness = (near.clamp_min(0) + LEAST_PER_M).log()
     one = torch.ones_like(length)
     terms = [one, length, length**2, length**3, nearness, nearness**2]
-    return torch.stack([*terms, length * nearness, length**2 * nearness], -1)
+    hidden = torch.zeros_like(length)
+    if covered is not None:
+        hidden = covered.to(length).expand(len(length), read.windows)
+        hidden = hidden.repeat_interleave(length.shape[1] // read.windows, 1)
+    return torch.stack([*terms, length * nearness, length**2 * nearness, hidden, hidden**2], -1)
 
 
 def _log_odds(confidence):

@@ -157,7 +157,9 @@ def settled(points: Points, velocity: Tensor) -> Tensor:
 def covariance(points: Points, velocity: Tensor) -> Tensor:
     """[N, K, K]: the inverse of the curvature, taken for positive where it is not. Gradient: both."""
     curvature = look(points, velocity).curvature
-    values, vectors = torch.linalg.eigh(curvature.detach())  # its own gradient is none where two values are alike
+    values, vectors = torch.linalg.eigh(
+        curvature.detach()
+    )  # its own gradient is none where two values are alike
     lifted = values.abs().clamp_min(LEAST) - values
     return torch.linalg.inv(curvature + vectors @ (lifted[..., None] * vectors.mT))
 

@@ -156,11 +156,12 @@ class Problem:
         true = read if self.pair.depth == "scene" else readings(run, task.scene_depth)
         flow_px = (true.rows @ batch.twist[:, None, :, None])[..., 0]
         seen = replace(read, depth_m=true.depth_m)
+        covered = self._own_body.covered(T_body_cam, self.camera) if learn or followed else None
         if learn:
-            self.trend.add(seen, flow_px)
+            self.trend.add(seen, flow_px, covered)
         if followed:
-            read = replace(self.trend.followed(seen, flow_px), depth_m=read.depth_m)
-            clear = (1 - self._own_body.covered(T_body_cam, self.camera)).clamp_min(CLEAR)
+            read = replace(self.trend.followed(seen, flow_px, covered), depth_m=read.depth_m)
+            clear = (1 - covered).clamp_min(CLEAR)
             clear = (clear / clear.detach()).repeat_interleave(read.share.shape[1] // read.windows)
             read = replace(read, share=read.share * clear)
         expected = task.expected_errors(estimator, read, batch.twist, true.rows, self.errors)

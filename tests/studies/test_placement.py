@@ -23,6 +23,7 @@ from studies.placement.descent import descend
 from studies.placement.problem import Problem, traced_camera
 from studies.placement.race import Race, feasible
 from studies.placement.resumption import asked, check_same
+from studies.placement.searches import SEARCHES
 
 F = torch.float64
 
@@ -150,6 +151,21 @@ def test_the_median_of_an_even_number_of_starts_is_the_mean_of_two():
     found = results.paired(torch.arange(1.0, 13.0, dtype=F), torch.ones(12, dtype=F))
     assert found.median == pytest.approx(6.5)
     assert found.high - 6.5 == pytest.approx(6.5 - found.low)
+
+
+def test_the_page_says_what_the_committed_race_says():
+    """Every ratio and median of the table in docs/placement.md, from the raw table beside it."""
+    docs = Path(placement.__file__).parents[2] / "docs"
+    page = (docs / "placement.md").read_text()
+    errors: dict = {}
+    for row in csv.DictReader((docs / "placement_race.csv").read_text().splitlines()):
+        errors.setdefault((row["pair"], row["search"]), []).append(float(row["error"]))
+    for pair, search in errors:
+        if search in SEARCHES:
+            ours, theirs = (torch.tensor(errors[pair, name], dtype=F) for name in ("gradient", search))
+            assert len(ours) == len(theirs) == 12
+            assert f"{float(theirs.quantile(0.5)):.3f}; {results.paired(ours, theirs)}" in page
+    assert {pair for pair, _ in errors} == set(PAIRS)
 
 
 def test_drives_of_a_world_err_alike():

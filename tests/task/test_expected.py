@@ -130,6 +130,22 @@ def test_the_trend_is_found_through_the_texture():
     assert float(odds) == pytest.approx(float((0.5 * length / (length + 0.5)).mean()), rel=0.08)
 
 
+def test_what_the_body_covers_is_found_through_the_texture():
+    """Windows of ten points whose precision falls by e to the power of four times what is covered of them."""
+    read, flow = lawful(noise=0.3)
+    random = torch.Generator().manual_seed(4)
+    covered = torch.rand(20, 20, generator=random, dtype=F) * (
+        torch.rand(20, 20, generator=random, dtype=F) > 0.5
+    )
+    fall = (-4 * covered).exp().repeat_interleave(10, 1)[..., None, None]
+    windows = replace(read, windows=20, precision=read.precision * fall)
+    trend = PrecisionTrend().add(windows, flow, covered)
+    more = covered.clone().requires_grad_()
+    sizes = 0.5 * torch.logdet(trend.followed(windows, flow, more).precision)
+    (slope,) = torch.autograd.grad(sizes.mean(), more)
+    assert float(slope.sum()) == pytest.approx(-4.0, rel=0.05)
+
+
 def test_points_without_a_surface_and_what_is_forgotten():
     read, flow = lawful()
     half = torch.ones_like(read.share)
