@@ -156,7 +156,7 @@ class EgoVelocity:
         if isinstance(known, UnknownDepth):
             nearest = torch.where(on_surface, known.nearest_m, torch.inf)
             near, _ = self._rows(camera, nearest, mounts, middle, field.interval_s)
-            parallax = (near - rows) / (1 / known.nearest_m - sum(known.bounds_per_m) / 2)
+            parallax = (near - rows) / (1 / known.nearest_m - known.mean_per_m)
         windows = _windows(camera)
         share = INDEPENDENT * windows / flow.shape[1] * on_surface.to(flow)
         return Readings(middle, flow, precision, confidence[..., 0], depth_m, rows, share, windows, parallax)
@@ -169,9 +169,13 @@ class EgoVelocity:
             return self._solved_with_depth(read)
         velocity, normal = _solved(read, kept, prior)
         for _ in range(0 if self.outlier is None else self.steps):
-            kept = (1 + read.squared(velocity) / self.outlier**2) ** -2
+            kept = self._believed(read, velocity)
             velocity, normal = _solved(read, kept, prior)
         return Motion(velocity, torch.linalg.inv(normal), kept, read.depth_m)
+
+    def _believed(self, read, velocity):
+        """Weight [N, P] of each point beside what velocities leave unexplained (Geman and McClure)."""
+        return (1 + read.squared(velocity) / self.outlier**2) ** -2
 
     def points(self, read: Readings, kept: Tensor) -> unknown_depth.Points:
         """Readings [N, P] of unknown depth, each believed by as much as ``kept`` [N, P]. Gradient: both.
@@ -182,12 +186,12 @@ class EgoVelocity:
             raise DomainError(
                 "these readings know their depth; read them with the estimator that solves them."
             )
-        bounds = self.depth.bounds_per_m
-        far = read.rows - read.parallax * (sum(bounds) / 2)
+        far = read.rows - read.parallax * self.depth.mean_per_m
         told = (read.precision @ read.flow_px[..., None])[..., 0]
         precision = read.confidence[..., None, None] * read.precision
         prior = torch.diag(read.flow_px.new_tensor(self.prior) ** -2)
-        return unknown_depth.Points(precision, told, far, read.parallax, kept * read.share, prior, bounds)
+        weight, bounds = kept * read.share, self.depth.bounds_per_m
+        return unknown_depth.Points(precision, told, far, read.parallax, weight, prior, bounds)
 
     def _solved_with_depth(self, read):
         """The same, whatever the depths. Gradient: all readings, by the last steps."""
@@ -198,7 +202,7 @@ class EgoVelocity:
         for _ in range(0 if self.outlier is None else self.steps):
             nearness = unknown_depth.look(points, velocity).nearness
             known = replace(read, rows=points.far + nearness[..., None, None] * points.near)
-            kept = (1 + known.squared(velocity) / self.outlier**2) ** -2
+            kept = self._believed(known, velocity)
             points = self.points(read, kept)
             with torch.no_grad():
                 moved = unknown_depth.descend(points, velocity, INNER)

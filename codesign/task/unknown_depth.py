@@ -51,11 +51,16 @@ class UnknownDepth:
         """Of 1 / depth."""
         return 1 / self.farthest_m, 1 / self.nearest_m
 
+    @property
+    def mean_per_m(self) -> float:
+        """Of 1 / depth."""
+        return sum(self.bounds_per_m) / 2
+
     def __call__(
         self, camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, scene: Any = None
     ) -> Tensor:
         """The depth of mean nearness [N, P] m, infinite where an object of a MovingScene is seen."""
-        depth = pixels.new_full(pixels.shape[:-1], 2 / sum(self.bounds_per_m), dtype=torch.float64)
+        depth = pixels.new_full(pixels.shape[:-1], 1 / self.mean_per_m, dtype=torch.float64)
         return depth.masked_fill(hidden_by_objects(camera, pixels, T_world_cam, scene), torch.inf)
 
 
@@ -157,9 +162,8 @@ def settled(points: Points, velocity: Tensor) -> Tensor:
 def covariance(points: Points, velocity: Tensor) -> Tensor:
     """[N, K, K]: the inverse of the curvature, taken for positive where it is not. Gradient: both."""
     curvature = look(points, velocity).curvature
-    values, vectors = torch.linalg.eigh(
-        curvature.detach()
-    )  # its own gradient is none where two values are alike
+    # detached: eigenvectors have no gradient where two values are alike
+    values, vectors = torch.linalg.eigh(curvature.detach())
     lifted = values.abs().clamp_min(LEAST) - values
     return torch.linalg.inv(curvature + vectors @ (lifted[..., None] * vectors.mT))
 
@@ -180,9 +184,9 @@ def _moments(tilt, bend, low, high):
         start, end = (peak - reach).clamp_min(low), (peak + reach).clamp_max(high)
         half = (end - start).clamp_min(LEAST) / 2
     rho = ((start + end) / 2)[..., None] + half[..., None] * NODES.to(tilt)
-    power = tilt[..., None] * rho - bend[..., None] * rho**2 / 2
-    share = (power + WEIGHTS.to(tilt).log()).softmax(-1)
-    mass = torch.logsumexp(power + WEIGHTS.to(tilt).log(), -1) + half.log() - math.log(high - low)
+    power = tilt[..., None] * rho - bend[..., None] * rho**2 / 2 + WEIGHTS.to(tilt).log()
+    share = power.softmax(-1)
+    mass = torch.logsumexp(power, -1) + half.log() - math.log(high - low)
     mean = (share * rho).sum(-1)
     off = rho - mean[..., None]
     return mass, mean, *((share * off**order).sum(-1) for order in (2, 3, 4))
