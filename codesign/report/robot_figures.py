@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
 from codesign import pose
@@ -35,6 +36,8 @@ def draw_robot(axis: Any, triangles: np.ndarray, shade: np.ndarray, lines: np.nd
         zlabel="z, m",
     )
     axis.set_box_aspect(np.maximum(high - low, 1e-3))
+    for side, extent in zip((axis.xaxis, axis.yaxis, axis.zaxis), high - low, strict=True):
+        side.set_major_locator(MaxNLocator(1 + round(4 * extent / (high - low).max())))
     axis.view_init(elev=22, azim=-125)
 
 

@@ -18,9 +18,10 @@ from scenes.robot_check import check_pair
 from scenes.robot_own import own_pair
 from scenes.robot_pairs import PAIRS
 from studies.frame.run import Run, StudyConfig, main
+from studies.placement.outcome import Outcome
+from studies.placement.page import report
 from studies.placement.problem import DRIVES, Problem, traced_camera
-from studies.placement.race import GRID, Race, certified, feasible, judge
-from studies.placement.results import report
+from studies.placement.race import GRID, Race, certified, feasible, judge, judge_along
 from studies.placement.searches import SEARCHES, available
 
 SPREAD = 12  # worlds of a step at most
@@ -46,7 +47,7 @@ class Config(StudyConfig):
     """Focal length that the traced lens is scaled to; the pair's own when left out."""
     seeds: int = 3
     """Starting mounts, paired over all searches."""
-    steps: int = 32
+    steps: int = 24
     """Steps of the gradient; other searches look at as many mounts as render as many samples."""
     worlds: int = 12
     """Training worlds."""
@@ -60,8 +61,10 @@ class Config(StudyConfig):
     """Mounts of a quasi-random grid that is refined twice, its best looked at once more; 0 for none."""
     judged_worlds: int = 12
     """Unseen worlds."""
-    judged_drives: int = 12
+    judged_drives: int = 8
     """Drives in each."""
+    along: int = 1
+    """Parts of the renders after each of which what a search has is judged; 1: only the end."""
     certified: int = 0
     """Draws in which the gradient is compared with differences before it is used, 0 for none."""
 
@@ -90,7 +93,8 @@ def study(run: Run[Config]) -> None:
         race.search(0, GRID, problem.start)
         race.finals()
     judged = judge(run, race, unseen, starts)
-    report(run, race, unseen, starts, judged, ways)
+    along = judge_along(run, race, unseen, judged, len(starts))
+    report(run, Outcome(race, unseen, judged, along, ways))
 
 
 def checked(size: Config) -> None:
@@ -99,7 +103,7 @@ def checked(size: Config) -> None:
         raise DomainError(
             f"--pair {size.pair}: choose from {', '.join(PAIRS)}, or give --robot and a .yaml file."
         )
-    for name in ("seeds", "steps", "worlds", "per_world", "judged_worlds", "judged_drives"):
+    for name in ("seeds", "steps", "worlds", "per_world", "judged_worlds", "judged_drives", "along"):
         if getattr(size, name) < 1:
             raise DomainError(f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed.")
     for name in ("per_world", "judged_drives"):

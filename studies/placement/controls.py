@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from codesign import events, place, task
+from codesign.task.depth import hidden_by_objects
 from codesign.types import EventVolume
 from scenes.robot_pair import BINS, LEAD_S, SENSOR
 from studies.placement.problem import Problem, Samples, readings
@@ -67,15 +68,20 @@ def looking_back(problem: Problem) -> Tensor:
 
 
 @torch.no_grad()
-def cheat(problem: Problem, shares: Tensor, samples: Samples) -> list[tuple[float, float]]:
-    """Of mounts [N, 6]: root mean square error of the flow in pixels (against the true depth), and mean bounded error of the velocity."""
-    found = []
-    for share in shares:
-        batch = problem.batch(samples)
-        run = problem.system(problem.ranges.pose(share)).begin(batch)
-        read = readings(run, task.scene_depth)
-        seen = (read.share > 0)[..., None]
-        missed = read.flow_px - (read.rows @ batch.twist[:, None, :, None])[..., 0]
-        pixels = float((missed.square() * seen).sum().div(seen.sum()).sqrt())
-        found.append((pixels, float(problem.pair.errors(run["estimate"], batch).bounded().mean())))
-    return found
+def pixel_errors(problem: Problem, mount: Tensor, samples: Samples) -> float:
+    """Root mean square error of the flow of hard counts in pixels, over surfaces of the world and the robot's own body, whose image stands
+    still; the sky is left out."""
+    batch = problem.batch(samples)
+    run = problem.system(mount).begin(batch)
+    read = readings(run, task.scene_depth)
+    true = (read.rows @ batch.twist[:, None, :, None])[..., 0]
+    body = readings(run, _body_depth).share > 0
+    seen = body | (read.share > 0)
+    missed = (read.flow_px - true * ~body[..., None]).square().sum(-1)
+    return float(missed[seen].mean().sqrt())
+
+
+def _body_depth(*where):
+    """A depth where the robot's own body is seen, whichever; infinite elsewhere."""
+    body = hidden_by_objects(*where)
+    return torch.where(body, torch.ones(body.shape, dtype=torch.float64), torch.inf)

@@ -45,5 +45,10 @@ def descend(
         here = (here - length * pace / pace.norm().clamp_min(1e-12)).clamp(0, 1)
     shares.append(here)
     errors.append(errors[-1])
-    end = torch.stack(shares)[-max(1, round(KEPT * steps)) :].mean(0)
-    return Trail(torch.stack([*shares[:-1], end]), torch.tensor(errors, dtype=torch.float64))
+    way = torch.stack(shares)
+    return Trail(settled(way, steps), torch.tensor(errors, dtype=torch.float64))
+
+
+def settled(way: Tensor, steps: int) -> Tensor:
+    """Points [N, V] of so many steps, the last of which is the mean of the way's end."""
+    return torch.cat([way[:-1], way[-max(1, round(KEPT * steps)) :].mean(0, keepdim=True)])

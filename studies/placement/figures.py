@@ -19,22 +19,32 @@ from studies.placement.searches import Trail
 COLOURS = ("#d62728", "#7f7f7f", "#1f77b4", "#2ca02c", "#9467bd", "#8c564b")
 
 
-def ways(problem: Problem, trails: dict[str, list[Trail]]) -> Figure:
-    """Best error so far over drives rendered; and of all these mounts height, pitch and error, below the ways of the
-    descents."""
+def ways(
+    problem: Problem,
+    trails: dict[str, list[Trail]],
+    along: dict[str, Tensor],
+    samples: int,
+    grid: float | None,
+) -> Figure:
+    """Errors on unseen samples, and the best that a search saw of its own, over drives rendered; and of all mounts looked
+    at height, pitch and error, below the ways of the descents.
+
+    along: search -> errors [starts, parts + 1] after equal parts of ``samples``. grid: error of its best mount.
+    """
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
-    for (name, found), colour in zip(trails.items(), COLOURS, strict=False):
-        for number, trail in enumerate(found):
-            if name == "gradient":  # above 1 is the penalty of what is not allowed
-                error = trail.error.masked_fill(trail.error > 1, math.nan)
-            else:
-                error = torch.cummin(trail.error, 0).values
-            rendered = problem.samples * np.arange(1, len(error) + 1)
-            left.plot(
-                rendered, error.numpy(), color=colour, linewidth=0.9, label=name if number == 0 else None
-            )
-    left.set(xscale="log", xlabel="drives rendered", ylabel="own objective", ylim=(0, 1))
-    left.legend()
+    for (name, errors), colour in zip(along.items(), COLOURS, strict=False):
+        rendered = np.linspace(0, samples, errors.shape[1])
+        left.plot(rendered, errors.T.numpy(), color=colour, linewidth=0.4, alpha=0.5)
+        median = errors.quantile(0.5, 0).numpy()
+        left.plot(rendered, median, "o-", color=colour, linewidth=1.8, markersize=4, label=name)
+        if name != "gradient":
+            best = torch.stack([torch.cummin(trail.error, 0).values for trail in trails[name]])
+            drives = problem.samples * np.arange(1, best.shape[1] + 1)
+            left.plot(drives, best.quantile(0.5, 0).numpy(), "--", color=colour, linewidth=1)
+    if grid is not None:
+        left.axhline(grid, color="black", linewidth=1, linestyle=":", label="best of the grid")
+    left.set(xlabel="drives rendered", ylabel="mean bounded error", ylim=(0, None))
+    left.legend(fontsize="small")
     looked = [trail for name, found in trails.items() if name != "gradient" for trail in found]
     if looked:
         pitch, height = _pitch_and_height(problem, torch.cat([trail.share for trail in looked]))
@@ -44,7 +54,7 @@ def ways(problem: Problem, trails: dict[str, list[Trail]]) -> Figure:
         figure.colorbar(map_, ax=right, label="error")
     for trail in trails["gradient"]:
         pitch, height = _pitch_and_height(problem, trail.share)
-        right.plot(pitch, height, color=COLOURS[0], linewidth=0.9)
+        right.plot(pitch, height, color=COLOURS[0], linewidth=0.9, alpha=0.7)
         right.plot(pitch[0], height[0], "o", mfc="none", color=COLOURS[0])
         right.plot(pitch[-1], height[-1], "*", color=COLOURS[0])
     right.set(xlabel="pitch, degrees down", ylabel="height, m")

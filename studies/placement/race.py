@@ -12,7 +12,7 @@ from torch import Tensor
 from codesign import grad, task
 from codesign.errors import DomainError
 from studies.frame.run import Run
-from studies.placement.descent import descend
+from studies.placement.descent import descend, settled
 from studies.placement.problem import Problem
 from studies.placement.resumption import asked, check_same
 from studies.placement.searches import SEARCHES, Trail, refined_grid
@@ -161,12 +161,14 @@ class Race:
         }
         self.save()
 
-    def answer(self, number: int, name: str) -> Tensor:
-        """The mount [6] that a search ends with: the descent's mean of its end; the best of the grid's finalists; of the others
-        the best of those that keep what is required."""
+    def answer(self, number: int, name: str, part: float = 1.0) -> Tensor:
+        """The mount [6] that a search ends with, or would end with after a part of its renders: the descent's mean of its end;
+        the best of the grid's finalists; of the others the best of those that keep what is required."""
         if name == GRID:
             return self.tensors[f"{GRID}/0/final"]
         trail = self.trail(number, name)
+        if part < 1:
+            trail = shortened(trail, part, name == GRADIENT)
         if name == GRADIENT:
             order = range(len(trail.error) - 1, -1, -1)
         else:
@@ -175,6 +177,14 @@ class Race:
             if kept(self.problem, trail.share[index]):
                 return trail.share[index]
         return trail.share[0]
+
+
+def shortened(trail: Trail, part: float, descended: bool) -> Trail:
+    """What a search had after a part of its points. descended: the last is the mean of a way's end, and no point of its own."""
+    count = max(1, round(part * (len(trail.error) - descended)))
+    if not descended:
+        return Trail(trail.share[:count], trail.error[:count])
+    return Trail(settled(trail.share[: count + 1], count), trail.error[: count + 1])
 
 
 def split(share: Tensor) -> dict[str, Tensor]:
@@ -239,7 +249,6 @@ def certified(run: Run[Any], race: Race, start: Tensor) -> dict[str, grad.Choice
 def judge(run: Run[Any], race: Race, unseen: Problem, starts: list[Tensor]) -> dict[tuple[int, str], Tensor]:
     """Bounded errors [N] of starts and answers, on the same unseen samples with single events. Key: (start, search); the
     pair's own design is (0, "default"), the starts (number, "start")."""
-    samples = unseen.draw(0)
     wanted = {(0, "default"): unseen.start}
     for number, start in enumerate(starts):
         wanted[number, "start"] = start
@@ -247,15 +256,47 @@ def judge(run: Run[Any], race: Race, unseen: Problem, starts: list[Tensor]) -> d
             wanted[number, name] = race.answer(number, name)
     if run.config.grid:
         wanted[0, GRID] = race.answer(0, GRID)
+    named = {f"judged/{name}/{number}": share for (number, name), share in wanted.items()}
+    found = _judged(run, race, unseen, named, "judging with single events")
+    return dict(zip(wanted, found, strict=True))
+
+
+def judge_along(
+    run: Run[Any], race: Race, unseen: Problem, judged: dict[tuple[int, str], Tensor], count: int
+) -> dict[str, Tensor]:
+    """Mean errors [starts, parts + 1] of each search from its start to its end, on the samples of ``judge``."""
+    parts = run.config.along
+    names = [GRADIENT, *run.config.searches]
+    wanted = {
+        f"judged/{name}/{number}/{part}/{parts}": race.answer(number, name, part / parts)
+        for name in names
+        for number in range(count)
+        for part in range(1, parts)
+    }
+    between = dict(zip(wanted, _judged(run, race, unseen, wanted, "judging on the way"), strict=True))
     found = {}
-    with run.progress(len(wanted), "judging with single events") as bar:
-        for (number, name), share in wanted.items():
-            key = f"judged/{name}/{number}"
+    for name in names:
+        ways = []
+        for number in range(count):
+            errors = [between[f"judged/{name}/{number}/{part}/{parts}"] for part in range(1, parts)]
+            ways.append(torch.stack([judged[number, "start"], *errors, judged[number, name]]).mean(1))
+        found[name] = torch.stack(ways)
+    return found
+
+
+def _judged(run, race, unseen, wanted, said):
+    """Errors [N] of every mount, kept by their keys."""
+    samples = unseen.draw(0)
+    found: list[Tensor] = []
+    if not wanted:
+        return found
+    with run.progress(len(wanted), said) as bar:
+        for key, share in wanted.items():
             if key not in race.tensors:
                 race.tensors[key] = unseen.judged(unseen.ranges.pose(share), samples, "sensor").bounded()
                 race.save()
-            found[number, name] = race.tensors[key]
-            bar.advance(error=float(found[number, name].mean()))
+            found.append(race.tensors[key])
+            bar.advance(error=float(found[-1].mean()))
     return found
 
 

@@ -17,13 +17,13 @@ from scenes import robot_pair
 from scenes.robot_pairs import PAIRS
 from studies.frame.run import main
 from studies.placement import __main__ as placement
-from studies.placement import results
-from studies.placement.controls import controls, looking_back, shuffled
+from studies.placement import outcome
+from studies.placement.controls import controls, looking_back, pixel_errors, shuffled
 from studies.placement.descent import descend
 from studies.placement.problem import Problem, traced_camera
-from studies.placement.race import Race, feasible
+from studies.placement.race import Race, feasible, shortened
 from studies.placement.resumption import asked, check_same
-from studies.placement.searches import SEARCHES
+from studies.placement.searches import SEARCHES, Trail
 
 F = torch.float64
 
@@ -108,6 +108,23 @@ def test_controls_see_nothing(problem):
     )  # view not upwards
 
 
+def test_pixels_are_told_best_where_nothing_moves(problem):
+    """Noise is all there is before the robot's own panel; elsewhere it is the lost flow of fast drives that counts."""
+    samples = problem.draw(0)
+    assert pixel_errors(problem, looking_back(problem), samples) < 0.1
+    assert pixel_errors(problem, problem.ranges.pose(problem.start), samples) > 1.0
+
+
+def test_a_search_cut_short_has_what_it_had_then():
+    """Of searches the first points; of a descent the mean of the last quarter of the steps so far."""
+    way = Trail(torch.arange(13.0, dtype=F)[:, None], torch.zeros(13, dtype=F))
+    assert shortened(way, 0.5, descended=False).share[:, 0].tolist() == list(range(6))
+    cut = shortened(way, 2 / 3, descended=True).share[:, 0].tolist()
+    assert cut == [*range(8), 7.5]
+    whole = descend(lambda x, k: (0.0, x - 1), torch.zeros(1, dtype=F), 12)
+    assert shortened(whole, 0.5, descended=True).share[:-1].tolist() == whole.share[:6].tolist()
+
+
 def test_shuffled_events_are_as_many_in_every_bin(problem):
     volume = problem.system(problem.ranges.pose(problem.start)).begin(problem.batch(problem.draw(0)))[
         "volume"
@@ -122,6 +139,7 @@ def test_shuffled_events_are_as_many_in_every_bin(problem):
     [
         (["--pair", "submarine"], "--pair submarine: choose from outdoors"),
         (["--seeds", "0"], "--seeds is 0"),
+        (["--along", "0"], "--along is 0"),
         (["--certified", "1"], "at least 2 draws"),
         (["--seed", "-1"], "--seed is -1"),
         (["--judged-drives", "49"], "a world has 48 drives"),
@@ -139,7 +157,7 @@ def test_wrong_input_is_one_sentence_before_the_first_frame(given, said, tmp_pat
 
 
 def test_ratios_are_of_paired_starts():
-    found = results.paired(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 2.5, 2.0]))
+    found = outcome.paired(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 2.5, 2.0]))
     assert (found.median, found.ahead, found.count) == (pytest.approx(0.8), 2, 3)
     assert found.low == pytest.approx(0.5)
     assert found.high == pytest.approx(1.5)
@@ -147,8 +165,8 @@ def test_ratios_are_of_paired_starts():
 
 def test_the_median_of_an_even_number_of_starts_is_the_mean_of_two():
     """Of ratios spread evenly, resamples lie as far above the middle as below it."""
-    assert results.paired(torch.tensor([1.0, 3.0]), torch.ones(2)).median == pytest.approx(2.0)
-    found = results.paired(torch.arange(1.0, 13.0, dtype=F), torch.ones(12, dtype=F))
+    assert outcome.paired(torch.tensor([1.0, 3.0]), torch.ones(2)).median == pytest.approx(2.0)
+    found = outcome.paired(torch.arange(1.0, 13.0, dtype=F), torch.ones(12, dtype=F))
     assert found.median == pytest.approx(6.5)
     assert found.high - 6.5 == pytest.approx(6.5 - found.low)
 
@@ -164,21 +182,21 @@ def test_the_page_says_what_the_committed_race_says():
         if search in SEARCHES:
             ours, theirs = (torch.tensor(errors[pair, name], dtype=F) for name in ("gradient", search))
             assert len(ours) == len(theirs) == 12
-            assert f"{float(theirs.quantile(0.5)):.3f}; {results.paired(ours, theirs)}" in page
+            assert f"{float(theirs.quantile(0.5)):.3f}; {outcome.paired(ours, theirs)}" in page
     assert {pair for pair, _ in errors} == set(PAIRS)
 
 
 def test_drives_of_a_world_err_alike():
     """Means of four worlds 0, 1, 2, 3: deviation sqrt(5 / 3), over the root of four."""
     errors = torch.arange(4.0, dtype=F).repeat_interleave(6)
-    assert results.standard_error(errors, 4) == pytest.approx((5 / 3) ** 0.5 / 2)
-    assert results.standard_error(errors[:1], 1) == 0.0
+    assert outcome.standard_error(errors, 4) == pytest.approx((5 / 3) ** 0.5 / 2)
+    assert outcome.standard_error(errors[:1], 1) == 0.0
 
 
 def test_a_ratio_over_worlds_is_of_means():
     """Two worlds, ratios 1 / 2 and 3 / 4 of means: together 4 / 6, resampled from 0.5 to 0.75."""
     ours, theirs = torch.tensor([0.5, 1.5, 2.0, 4.0], dtype=F), torch.tensor([1.0, 3.0, 4.0, 4.0], dtype=F)
-    assert results.over_worlds(ours, theirs, 2) == pytest.approx((4 / 6, 0.5, 0.75))
+    assert outcome.over_worlds(ours, theirs, 2) == pytest.approx((4 / 6, 0.5, 0.75))
 
 
 def test_a_run_that_goes_on_is_the_one_that_was_begun(tmp_path):
@@ -262,7 +280,9 @@ def test_a_traced_lens_has_the_focal_length_and_focus_asked_for():
 
 def test_the_whole_study_and_its_resumption(tmp_path):
     out = tmp_path / "run"
-    sizes = "--seeds 1 --steps 2 --worlds 1 --per-world 1 --judged-worlds 1 --judged-drives 2 --certified 0 --grid 5"
+    sizes = (
+        "--seeds 1 --steps 2 --worlds 1 --per-world 1 --judged-worlds 1 --judged-drives 2 --along 2 --grid 5"
+    )
     arguments = [*sizes.split(), "--searches", "random", "--out", str(out)]
     assert main(placement.study, placement.Config, arguments) == 0
     found = json.loads((out / "metrics.json").read_text())

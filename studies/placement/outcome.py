@@ -1,0 +1,194 @@
+"""What a race for a mount came to on unseen samples: errors, ratios with intervals, metrics and the raw table."""
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from codesign import grad
+from codesign.place.ranges import NAMES
+from studies.placement.problem import Problem
+from studies.placement.race import GRADIENT, GRID, Race, chosen
+
+RESAMPLED = 4000
+INTERVAL = 0.9
+
+
+@dataclass(frozen=True)
+class Paired:
+    """Ratio of errors, ours over theirs, over paired starts: median and interval of resampled starts; how many below 1."""
+
+    median: float
+    low: float
+    high: float
+    ahead: int
+    count: int
+
+    def __str__(self):
+        if self.count == 1:
+            return f"{self.median:.2f}, one start"
+        return f"{self.median:.2f} ({self.low:.2f} to {self.high:.2f}), ahead {self.ahead} of {self.count}"
+
+
+def paired(ours: Tensor, theirs: Tensor) -> Paired:
+    """Of errors [seeds] each."""
+    ratio = ours / theirs
+    drawn = torch.randint(len(ratio), (RESAMPLED, len(ratio)), generator=torch.Generator().manual_seed(0))
+    ends = torch.tensor([(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], dtype=ratio.dtype)
+    low, high = torch.quantile(ratio[drawn].quantile(0.5, 1), ends).tolist()
+    return Paired(float(ratio.quantile(0.5)), low, high, int((ratio < 1).sum()), len(ratio))
+
+
+def over_worlds(ours: Tensor, theirs: Tensor, worlds: int) -> tuple[float, float, float]:
+    """Ratio of mean errors [N], world after world, ours over theirs; and its interval over resampled worlds."""
+    means = torch.stack([ours, theirs]).unflatten(1, (worlds, -1)).mean(2)
+    drawn = torch.randint(worlds, (RESAMPLED, worlds), generator=torch.Generator().manual_seed(0))
+    ratio = means[:, drawn].mean(2)
+    ends = torch.tensor([(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], dtype=ratio.dtype)
+    low, high = torch.quantile(ratio[0] / ratio[1], ends).tolist()
+    return float(means[0].mean() / means[1].mean()), low, high
+
+
+def standard_error(errors: Tensor, worlds: int) -> float:
+    """Of the mean of errors [N], world after world: of the worlds' means, since drives in one world err alike; of one
+    world's drives where there is one."""
+    means = errors.unflatten(0, (worlds, -1)).mean(1) if worlds > 1 else errors
+    return float(means.std() / math.sqrt(len(means))) if len(means) > 1 else 0.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A race, and its answers on unseen samples.
+
+    unseen: worlds and drives that judged. judged: errors [N] by start and search (``race.judge``). along: search -> errors
+    [starts, parts + 1] (``race.judge_along``). ways: to the gradient, by group of numbers.
+    """
+
+    race: Race
+    unseen: Problem
+    judged: dict[tuple[int, str], Tensor]
+    along: dict[str, Tensor]
+    ways: dict[str, grad.Choice]
+
+    @property
+    def starts(self) -> int:
+        """How many."""
+        return len(self.along[GRADIENT])
+
+    @cached_property
+    def errors(self) -> dict[str, Tensor]:
+        """Of the starts and of what each search ends with, [starts]."""
+        return {"start": self.along[GRADIENT][:, 0]} | {
+            name: each[:, -1] for name, each in self.along.items()
+        }
+
+    @cached_property
+    def rivals(self) -> dict[str, Paired]:
+        """The gradient over each of the other searches."""
+        ours = self.errors[GRADIENT]
+        return {name: paired(ours, self.errors[name]) for name in self.along if name != GRADIENT}
+
+    @cached_property
+    def best(self) -> int:
+        """Number of the descent that training samples choose."""
+        return chosen(self.race, self.starts)
+
+    @property
+    def share(self) -> Tensor:
+        """The mount [6] that is the answer."""
+        return self.race.answer(self.best, GRADIENT)
+
+    @property
+    def pose(self) -> Tensor:
+        """The same as T_body_cam [4, 4]."""
+        return self.race.problem.ranges.pose(self.share)
+
+    @property
+    def error(self) -> float:
+        """Of the answer."""
+        return float(self.judged[self.best, GRADIENT].mean())
+
+    @property
+    def default_error(self) -> float:
+        """Of the pair's own mount."""
+        return float(self.judged[0, "default"].mean())
+
+    @property
+    def grid_error(self) -> float | None:
+        """Of the grid's best, where there is a grid."""
+        return float(self.judged[0, GRID].mean()) if (0, GRID) in self.judged else None
+
+    @property
+    def over_default(self) -> tuple[float, float, float]:
+        """Ratio of the answer's error to that of the pair's own mount, and its interval over worlds."""
+        return over_worlds(
+            self.judged[self.best, GRADIENT], self.judged[0, "default"], len(self.unseen.numbers)
+        )
+
+    def metrics(self) -> dict[str, float | int]:
+        """By name."""
+        ratio, low, high = self.over_default
+        found: dict[str, float | int] = {
+            "default_error": self.default_error,
+            "samples_per_search": self.race.samples(0, GRADIENT),
+            "samples_judged": self.unseen.samples,
+            "chosen_start": self.best,
+            "seeds": self.starts,
+            "over_default": ratio,
+            "over_default_low90": low,
+            "over_default_high90": high,
+        }
+        for name, values in self.errors.items():
+            found[f"{label(name)}_median_error"] = float(values.quantile(0.5))
+        for name, beside in self.rivals.items():
+            over = f"over_{label(name)}"
+            found |= {f"{over}_median": beside.median, f"{over}_ahead": beside.ahead}
+            found |= {f"{over}_low90": beside.low, f"{over}_high90": beside.high}
+        if self.grid_error is not None:
+            found["grid_error"] = self.grid_error
+            found["starts_within_2_percent_of_grid"] = self.near_grid
+            found["renders_of_gradient_over_grid"] = self.race.samples(0, GRADIENT) / self.race.samples(
+                0, GRID
+            )
+        for name, way in self.ways.items():
+            if not math.isnan(way.noise):
+                found |= {
+                    f"gradient_{name}_relative_l2": way.relative_l2,
+                    f"gradient_{name}_cosine": way.cosine,
+                }
+                found |= {
+                    f"gradient_{name}_differences_noise": way.noise,
+                    f"gradient_{name}_calls": way.calls,
+                }
+        return found
+
+    @property
+    def near_grid(self) -> int:
+        """Descents that end within 2 % of the grid's best, or below."""
+        return int((self.errors[GRADIENT] <= 1.02 * (self.grid_error or 0.0)).sum())
+
+    def table(self) -> str:
+        """race.csv: every answer with its mount, what it rendered and its error."""
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(["pair", "seed", "search", *NAMES, "samples", "error", "standard_error"])
+        race, problem = self.race, self.race.problem
+        for (number, name), errors in sorted(self.judged.items()):
+            share, samples = problem.start, 0
+            if name == "start":
+                share = race.trail(number, GRADIENT).share[0]
+            elif name != "default":
+                share, samples = race.answer(number, name), race.samples(number, name)
+            place = [f"{value:.5f}" for value in problem.ranges.numbers(share).tolist()]
+            told = [f"{float(errors.mean()):.5f}", f"{standard_error(errors, len(self.unseen.numbers)):.5f}"]
+            writer.writerow([problem.pair.name, race.run.config.seed + number, name, *place, samples, *told])
+        return text.getvalue()
+
+
+def label(name: str) -> str:
+    """A name among metrics."""
+    return name.lower().replace("-", "_").replace(" ", "_")

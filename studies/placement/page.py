@@ -1,0 +1,191 @@
+"""The page of a placement: the answer in one sentence, searches beside one another, the robot before and after, what its
+place is blind to, controls, and the mount handed over."""
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from codesign import place, task
+from codesign.atomic import write_atomic
+from codesign.report.mount_sphere import mount_sphere
+from codesign.system import HandOver, load_hand_over, save_hand_over
+from scenes import robot_pair
+from studies.frame.run import Run
+from studies.placement import figures
+from studies.placement.controls import controls, looking_back, pixel_errors
+from studies.placement.outcome import INTERVAL, Outcome
+from studies.placement.problem import Problem
+from studies.placement.race import GRADIENT, GRID
+
+INSIDE = 1 - 1e-9  # of a box that a mount approaches by a hyperbolic tangent
+
+
+def report(run: Run[Any], outcome: Outcome) -> None:
+    """Metrics, raw table, hand-over and page."""
+    write_atomic(run.path("race.csv"), outcome.table().encode())
+    run.record(**outcome.metrics())
+    run.card(
+        "error of the mount found", f"{outcome.error:.3f}", f"default mount: {outcome.default_error:.3f}"
+    )
+    for name, beside in outcome.rivals.items():
+        run.card(
+            f"gradient over {name}", f"{beside.median:.2f}", f"ahead {beside.ahead} of {beside.count} starts"
+        )
+    searches(run, outcome)
+    seen(run, outcome)
+    left(run, outcome)
+    handed(run, outcome)
+    run.record(seconds=run.seconds)
+    run.finish("Where to mount the camera", answer(outcome))
+
+
+def answer(outcome: Outcome) -> str:
+    """In one sentence."""
+    problem, worlds = outcome.race.problem, len(outcome.unseen.numbers)
+    better = outcome.error < outcome.default_error
+    said = "belongs at" if better else "is no better off than at its default mount at"
+    ratio, low, high = outcome.over_default
+    interval = f" ({low:.2f} to {high:.2f}, {INTERVAL:.0%} of resampled worlds)" if worlds > 1 else ""
+    return (
+        f"The camera of '{problem.pair.name}' {said} {place_in_words(problem, outcome.share)}: its error there is {ratio:.2f}"
+        f"{interval} times that at its default mount, {outcome.error:.3f} against {outcome.default_error:.3f} on "
+        f"{outcome.unseen.samples} unseen samples with single events."
+    )
+
+
+def place_in_words(problem: Problem, share: Tensor) -> str:
+    """Position and attitude of a mount."""
+    x, y, z, yaw, pitch, roll = problem.ranges.numbers(share).tolist()
+    turned = ", ".join(
+        f"{name} {math.degrees(angle):+.0f}°"
+        for name, angle in (("yaw", yaw), ("pitch", pitch), ("roll", roll))
+    )
+    return f"({x:.2f}, {y:.2f}, {z:.2f}) m, {turned}"
+
+
+def searches(run: Run[Any], outcome: Outcome) -> None:
+    """The searches beside one another."""
+    race = outcome.race
+    samples = race.samples(0, GRADIENT)
+    run.section(
+        "Searches at equal renders",
+        f"Every search began at the same {outcome.starts} mounts and rendered {samples} samples; "
+        "errors are means of q / (1 + q), q the squared error of the velocities that count in units of 0.05 m/s plus a "
+        "tenth of the speed, and 0.15 rad/s, with single events in worlds and drives that no search saw (a world from a "
+        f"file is the same for all). In brackets: {INTERVAL:.0%} of resampled starts.",
+    )
+    rows: list[list[Any]] = []
+    for name, values in outcome.errors.items():
+        over = str(outcome.rivals[name]) if name in outcome.rivals else None
+        rows.append([name, float(values.quantile(0.5)), float(values.min()), float(values.max()), over])
+    trails = {name: [race.trail(number, name) for number in range(outcome.starts)] for name in outcome.along}
+    if (grid := outcome.grid_error) is not None:
+        trails[GRID] = [race.trail(0, GRID)]
+        looked = race.samples(0, GRID)
+        rows.append([f"grid, {looked} samples", grid, grid, grid, None])
+        run.text(
+            f"{outcome.near_grid} of {outcome.starts} descents end within 2 % of the best of the refined grid, with "
+            f"{samples / looked:.3f} of its renders."
+        )
+    rows.append(["default mount", outcome.default_error, None, None, None])
+    if run.config.certified:
+        ways = "; ".join(f"{name} by {way}" for name, way in outcome.ways.items())
+        run.text(f"The gradient beside differences over a quarter of the bounds: {ways}.")
+    run.table("Errors on unseen samples", ("search", "median", "best", "worst", "gradient over it"), rows)
+    own = "what is expected" if run.config.rivals_expect else "errors of their own drives"
+    run.figure(
+        figures.ways(race.problem, trails, outcome.along, samples, grid),
+        "ways",
+        "Left: errors on unseen samples, median over starts (thin: each start); dashed the least that searches without "
+        f"gradient have seen of what they minimise, {own}. Right: the map, every mount that these looked at with its error, "
+        "and the ways of the descents.",
+    )
+
+
+def seen(run: Run[Any], outcome: Outcome) -> None:
+    """The robot with its camera before and after, what it sees, and what it is blind to."""
+    problem, unseen, mount = outcome.race.problem, outcome.unseen, outcome.pose
+    run.section("Before and after")
+    run.figure(
+        figures.before_and_after(unseen, mount),
+        "before_and_after",
+        "The robot with its default mount (above) and the one found (below): frame of an unseen drive with the windows read, "
+        "events of the hard sensor in them, flow.",
+    )
+    verdicts = place.judge(problem.requirements, mount, problem.camera)
+    run.text("Requirements: " + "; ".join(map(str, verdicts)) + ".")
+    planar = problem.pair.axes
+    depth = task.ground_depth
+    x, y, z = problem.ranges.numbers(outcome.share)[:3].tolist()
+    T_world_body = torch.eye(4, dtype=torch.float64)
+    T_world_body[2, 3] = problem.pair.drive(0, 12)[0][:, robot_pair.FRAMES // 2, 2, 3].mean()
+    around = task.Surroundings((x, y, z), T_world_body, axes=planar, depth=depth)
+    height = z + float(T_world_body[2, 3])
+    if height > 0.05:
+        information, _ = around.information(problem.camera, mount)
+        sight = place.sight(information, task.sight_units(around), planar)
+        run.text(
+            f"{height:.2f} m over flat ground the motion that shows least from there is {sight.weakest_named()} (in units of "
+            f"0.1 m/s and 0.1 rad/s, deviation {sight.weakest_deviation:.2f}); blind to: "
+            f"{', '.join(sight.blind()) or 'nothing'}."
+        )
+        yaw, pitch, errors = task.sight_map(problem.camera, around, rows=9, columns=18)
+        now = place.yaw_pitch_roll_rad(mount).tolist()
+        run.figure(
+            mount_sphere(yaw, pitch, errors, "expected error, units", {"found": (now[0], now[1])}),
+            "sight",
+            "What the place allows: the error that flow over flat ground lets expect, over all directions the camera may look "
+            "in (27 points of 5 px/s).",
+        )
+
+
+def left(run: Run[Any], outcome: Outcome) -> None:
+    """What is left where there is nothing to be found, and what an objective in pixels would find."""
+    unseen, mount = outcome.unseen, outcome.pose
+    samples = unseen.draw(0)
+    found = controls(unseen, mount, samples)
+    run.section(
+        "Controls",
+        "Single events in unseen worlds. Errors of an answer that is always zero, of a camera that sees nothing move, and of "
+        "one that looks at its own robot should be alike.",
+    )
+    run.table(
+        "What is left",
+        ("control", "mean bounded error"),
+        [[k.replace("_", " "), v] for k, v in found.items()],
+    )
+    run.record(**{f"control_{name}_error": value for name, value in found.items()})
+    moving, still = pixel_errors(unseen, mount, samples), pixel_errors(unseen, looking_back(unseen), samples)
+    run.record(pixel_error_px=moving, pixel_error_only_the_robot_px=still)
+    run.text(
+        "An objective in pixels would cheat: the mount that sees only the robot has the least error of flow, "
+        f"{still:.2f} px against {moving:.2f} px of the mount found, since nothing moves there. Of the way the robot goes it "
+        f"says nothing ({found['only_the_robot']:.2f} against {found['as_found']:.2f})."
+    )
+
+
+def handed(run: Run[Any], outcome: Outcome) -> None:
+    """Write the mount, read it back, and see that it has the same score."""
+    problem, unseen, pose = outcome.race.problem, outcome.unseen, outcome.pose
+    low, high = problem.ranges.low[:3], problem.ranges.high[:3]
+    yaw, pitch, roll = place.yaw_pitch_roll_rad(pose).tolist()
+    half = (high - low) / 2
+    middle = (low + high) / 2
+    inside = torch.where(half > 0, (pose[:3, 3] - middle).clamp(-INSIDE * half, INSIDE * half), 0.0)
+    mount = place.Mount(middle, half, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll, position_m=middle + inside)
+    path = run.path("mount.yaml")
+    notes = {"pair": problem.pair.name, "error_unseen": outcome.error}
+    handed_over = HandOver(
+        mount, problem.camera, robot_pair.SENSOR, problem.pair.frame, "camera_optical_frame", notes
+    )
+    save_hand_over(path, handed_over)
+    back = load_hand_over(path)
+    again = unseen.judged(back.mount().detach(), unseen.draw(0), "sensor").bounded()
+    run.record(hand_over_score_again=again.mean(), hand_over_score=outcome.error)
+    run.section(
+        "Hand-over",
+        f"`mount.yaml` has the transform, lens, camera and sensor; read back it scores {float(again.mean()):.4f} where the "
+        f"search's mount had {outcome.error:.4f}.",
+    )
