@@ -58,7 +58,8 @@ class OwnBody:
 
     def covered(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
         """[..., windows] share of every window of the film that the body covers. Gradient: mount and lens."""
-        found = frames(camera, self.scene, T_body_cam.reshape(-1, 4, 4), "boundary", self.per_px).double()
+        way = "boundary" if torch.is_grad_enabled() else "interior"  # of which the pictures are the same
+        found = frames(camera, self.scene, T_body_cam.reshape(-1, 4, 4), way, self.per_px).double()
         return found.flatten(-2).mean(-1).reshape(*T_body_cam.shape[:-2], -1)
 
     @torch.no_grad()

@@ -47,7 +47,7 @@ class PrecisionTrend:
         """
         seen = read.share > 0
         terms = _terms(read, flow_px, covered)[seen]
-        wanted = torch.stack([0.5 * torch.logdet(read.precision), _log_odds(read.confidence)], -1)[seen]
+        wanted = torch.stack([_log_precision(read), _log_odds(read.confidence)], -1)[seen]
         normal, right = terms.mT @ terms, terms.mT @ wanted
         kept = 1 - self.forget
         self._normal = normal if self._normal is None else kept * self._normal + normal
@@ -59,11 +59,33 @@ class PrecisionTrend:
 
         Raises: DomainError where nothing has been added.
         """
-        said = _terms(read, flow_px, covered) @ self._coefficients()
-        change = said - said.detach()
+        told = self.told(read, flow_px, covered)
+        change = told - told.detach()
         precision = read.precision.detach() * change[..., 0].exp()[..., None, None]
         confidence = torch.sigmoid(_log_odds(read.confidence.detach()) + change[..., 1])
         return replace(read, precision=precision, confidence=confidence)
+
+    def told(self, read: Readings, flow_px: Tensor, covered: Tensor | None = None) -> Tensor:
+        """[N, P, 2]: logarithm of precision and log odds of confidence by the trend alone. Arguments and errors as ``followed``."""
+        return _terms(read, flow_px, covered) @ self._coefficients()
+
+    def carried(self, here: Readings, told_here: Tensor, there: Readings, told_there: Tensor) -> Readings:
+        """Readings of the same points and textures as if they had been made from another place, no picture of which there is.
+
+        Args: here: what was read. told_here, told_there: what the trend tells of either place (``told``). there: depth, rows
+          and share from the other place; its estimates are not looked at.
+        Precision and confidence are those of here, changed as the trend tells. A point that shows a surface only from
+        there takes what the nearest window with surfaces had beside the trend: a mean would be too good, since a window in
+        three without texture says less than all of them with a little. Gradient: readings of here, what is told.
+        """
+        seen = here.share > 0
+        own = torch.stack([_log_precision(here), _log_odds(here.confidence)], -1)
+        beside = own - told_here
+        told = torch.where(seen[..., None], beside, _of_nearest_window(here, beside, seen)) + told_there
+        grown = (told - own)[..., 0].exp()[..., None, None] * here.precision
+        alone = told[..., 0].exp()[..., None, None] * torch.eye(2, dtype=told.dtype)
+        precision = torch.where(seen[..., None, None], grown, alone)
+        return replace(there, precision=precision, confidence=torch.sigmoid(told[..., 1]))
 
     def _coefficients(self):
         if self._normal is None:
@@ -85,6 +107,22 @@ def _terms(read, flow_px, covered):
         hidden = covered.to(length).expand(len(length), read.windows)
         hidden = hidden.repeat_interleave(length.shape[1] // read.windows, 1)
     return torch.stack([*terms, length * nearness, length**2 * nearness, hidden, hidden**2], -1)
+
+
+def _of_nearest_window(read, values, seen):
+    """[N, P, C]: the mean of values over what is seen in the nearest window that shows anything."""
+    windows = read.windows
+    count = seen.unflatten(1, (windows, -1)).sum(2)  # [N, W]
+    total = (values * seen[..., None]).unflatten(1, (windows, -1)).sum(2)
+    middle = read.pixels.detach().unflatten(1, (windows, -1)).mean(2)
+    away = torch.cdist(middle, middle).masked_fill((count == 0)[:, None], torch.inf)
+    lender = away.argmin(2)[..., None].expand(-1, -1, values.shape[-1])
+    lent = (total / count.clamp_min(1)[..., None]).gather(1, lender)
+    return lent.repeat_interleave(values.shape[1] // windows, 1)
+
+
+def _log_precision(read):
+    return 0.5 * torch.logdet(read.precision)
 
 
 def _log_odds(confidence):

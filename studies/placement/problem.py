@@ -3,8 +3,8 @@ requirements of the mount. A mount is six shares of the pair's ranges."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -27,6 +27,21 @@ class Samples:
     numbers: tuple[int, ...]
     which: tuple[int, ...]
     seed: int
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What is seen of N drives from one mount.
+
+    read: by the depth that the estimator believes in. surfaces: the same with true depths. true_rows: [N, P, 2, 6].
+    flow_px: [N, P, 2], true. covered: [N, windows] by the robot, where it was asked for.
+    """
+
+    read: task.Readings
+    surfaces: task.Readings
+    true_rows: Tensor
+    flow_px: Tensor
+    covered: Tensor | None
 
 
 @dataclass
@@ -73,7 +88,12 @@ class Problem:
         return Samples(tuple(self.numbers[k] for k in chosen), tuple(drives.tolist()), number)
 
     def batch(self, samples: Samples) -> Drives:
-        """Worlds and drives of samples, the robot in them; worlds are built once."""
+        """Worlds and drives of samples, the robot in them, which count as rendered."""
+        self.rendered += self.samples
+        return self._scenes(samples)
+
+    def _scenes(self, samples):
+        """The same; worlds are built once."""
         scenes = []
         poses = []
         twists = []
@@ -85,7 +105,6 @@ class Problem:
             scenes.append(render.MovingScene(world, {"body": (self._body, driven[which])}))
             poses.append(driven[which])
             twists.append(twist[which])
-        self.rendered += self.samples
         return Drives(torch.stack(poses), times(), tuple(scenes), samples.seed, twist=torch.cat(twists))
 
     @cached_property
@@ -135,11 +154,13 @@ class Problem:
         share of every window that the robot itself covers; not through single frames, whose texture makes it noise.
         """
         batch = self.batch(samples)
-        system = self.system(T_body_cam)
         with torch.set_grad_enabled(frames):
-            flow = system.begin(batch)["field"]
-        run = system.begin(batch, {"flow": flow})
-        return self._expected(run, batch, T_body_cam, learn, T_body_cam.requires_grad and not frames)
+            field = self.system(T_body_cam).begin(batch)["field"]
+        followed = T_body_cam.requires_grad and not frames
+        seen = self._seen(field, batch, T_body_cam, learn or followed)
+        if learn:
+            self.trend.add(seen.surfaces, seen.flow_px, seen.covered)
+        return self._bounded(self._followed(seen) if followed else seen.read, seen, batch.twist)
 
     @torch.no_grad()
     def expected_and_hard(self, T_body_cam: Tensor, samples: Samples) -> Tensor:
@@ -147,28 +168,81 @@ class Problem:
         batch = self.batch(samples)
         run = self.system(T_body_cam).begin(batch)
         hard = self.pair.errors(run["estimate"], batch).bounded()
-        return torch.stack([self._expected(run, batch, T_body_cam), hard])
+        seen = self._seen(run["field"], batch, T_body_cam)
+        return torch.stack([self._bounded(seen.read, seen, batch.twist), hard])
 
-    def _expected(self, run, batch, T_body_cam, learn=False, followed=False):
-        """Bounded error [N] to be expected of what a pass has read; followed: with the gradient of trend and cover."""
-        estimator = run.system.estimate
-        read = readings(run)
-        true = read if self.pair.depth == "scene" else readings(run, task.scene_depth)
-        flow_px = (true.rows @ batch.twist[:, None, :, None])[..., 0]
-        seen = replace(read, depth_m=true.depth_m)
-        covered = self._own_body.covered(T_body_cam, self.camera) if learn or followed else None
+    @torch.no_grad()
+    def expected_around(
+        self, share: Tensor, samples: Samples, step: float, learn: bool = False
+    ) -> tuple[Tensor, Tensor]:
+        """Mean bounded error to be expected of a mount [6], and its differences [6] over a step to both sides.
+
+        Pictures are taken of the mount itself alone. From the others there is the geometry, with its edges: surfaces, their true flow,
+        what the robot covers; how well flow is told there is carried over by the trend (``task.PrecisionTrend.carried``).
+        At a wall of the cube the step ends there. learn: as for ``expected``.
+        """
+        batch = self.batch(samples)
+        pose = self.ranges.pose(share)
+        field = self.system(pose).begin(batch)["field"]
+        here = self._seen(field, batch, pose, True)
         if learn:
-            self.trend.add(seen, flow_px, covered)
-        if followed:
-            read = replace(self.trend.followed(seen, flow_px, covered), depth_m=read.depth_m)
-            clear = (1 - covered).clamp_min(CLEAR)
-            clear = (clear / clear.detach()).repeat_interleave(read.share.shape[1] // read.windows)
-            read = replace(read, share=read.share * clear)
-        expected = task.expected_errors(estimator, read, batch.twist, true.rows, self.errors)
+            self.trend.add(here.surfaces, here.flow_px, here.covered)
+        value = self._bounded(here.read, here, batch.twist).mean()
+        low, high = ((share + sign * step * torch.eye(6).to(share)).clamp(0, 1) for sign in (-1, 1))
+        errors = self._carried(field, here, samples, self.ranges.pose(torch.cat([low, high])))
+        width = (high - low).diagonal()
+        rise = errors[6:] - errors[:6]
+        return value, torch.where(self.ranges.held, 0.0, rise / width)
+
+    def _carried(self, field, here, samples, poses):
+        """Mean bounded errors [M] to be expected of mounts [M, 4, 4], what was told from one of them carried over."""
+        worlds, each = len(samples.numbers), len(samples.which)
+        batch = self._scenes(replace(samples, which=samples.which * len(poses)))
+        which = torch.arange(worlds * each).reshape(worlds, 1, each).expand(-1, len(poses), -1).flatten()
+        there = self._seen(_of(field, which, worlds * each), batch, poses.repeat_interleave(each, 0), True)
+        told = self.trend.told(here.surfaces, here.flow_px, here.covered)
+        told_there = self.trend.told(there.surfaces, there.flow_px, there.covered)
+        read = self.trend.carried(_of(here.read, which, worlds * each), told[which], there.read, told_there)
+        return self._bounded(read, there, batch.twist).reshape(worlds, len(poses), each).mean((0, 2))
+
+    def _seen(self, field, batch, T_body_cam, cover=False):
+        """What flow in the windows of a batch is of, from a mount [4, 4], or from one for each drive of a world."""
+        T_world_cam = batch.T_world_body @ T_body_cam[..., None, :, :]
+        estimator = self._system.estimate
+        look = partial(estimator.read, field, self.camera, batch.scene, T_body_cam, T_world_cam, batch.t_s)
+        read = look()
+        true = read if self.pair.depth == "scene" else look(depth=task.scene_depth)
+        flow_px = (true.rows @ batch.twist[:, None, :, None])[..., 0]
+        covered = None
+        if cover:
+            covered = self._own_body.covered(T_body_cam, self.camera)
+            covered = covered.expand(*T_world_cam.shape[:2], -1).flatten(0, 1)
+        return Seen(read, replace(read, depth_m=true.depth_m), true.rows, flow_px, covered)
+
+    def _followed(self, seen):
+        """Readings with the gradient of trend and cover."""
+        read = self.trend.followed(seen.surfaces, seen.flow_px, seen.covered)
+        clear = (1 - seen.covered).clamp_min(CLEAR)
+        clear = (clear / clear.detach()).repeat_interleave(read.share.shape[1] // read.windows, 1)
+        return replace(read, depth_m=seen.read.depth_m, share=read.share * clear)
+
+    def _bounded(self, read, seen, twist):
+        """Bounded error [N] to be expected of readings."""
+        expected = task.expected_errors(self._system.estimate, read, twist, seen.true_rows, self.errors)
         squared = expected.squared[:, list(self.pair.axes)]
-        unit = task.velocity_errors(torch.zeros_like(squared), batch.twist, self.pair.axes).unit()
+        unit = task.velocity_errors(torch.zeros_like(squared), twist, self.pair.axes).unit()
         squared = (squared / unit**2).mean(1)
         return squared / (1 + squared)
+
+
+def _of(parts, which, count):
+    """A dataclass of tensors over ``count`` bodies, or their windows, of the bodies ``which`` alone."""
+    found = {}
+    for each in fields(parts):
+        value = getattr(parts, each.name)
+        if torch.is_tensor(value):
+            found[each.name] = value.unflatten(0, (count, -1))[which].flatten(0, 1)
+    return replace(parts, **found)
 
 
 def readings(run: Mapping[str, Any], depth: Callable[..., Tensor] | None = None) -> task.Readings:

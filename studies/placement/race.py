@@ -19,7 +19,7 @@ from studies.placement.searches import SEARCHES, Trail, refined_grid
 
 GRADIENT = "gradient"
 GRID = "grid"
-STEP = 0.12  # of the cube, of the differences that judge the gradient
+STEP = 0.12  # of the cube: of the gradient's differences of geometry, and of those that judge it
 AGREES = {"relative_l2": 1.0, "cosine": 0.8}  # steps have a set length: what counts is where they lead
 UNKNOWN = 1 / 3  # standard error of differences from which on they judge nothing
 WAYS = ("autograd", "differences", "evolution")
@@ -203,8 +203,12 @@ def pose_of(problem: Problem, parts: dict[str, Tensor]) -> Tensor:
 
 
 def expected(problem: Problem, parts: dict[str, Tensor], draw: int, learn: bool = False) -> Tensor:
-    """The mean error to be expected."""
-    return problem.expected(pose_of(problem, parts), problem.draw(draw), learn).mean()
+    """The mean error to be expected; its gradient is that of ``Problem.expected_around``."""
+    share, samples = torch.cat([parts[name] for name in GROUPS]), problem.draw(draw)
+    if not share.requires_grad:
+        return problem.expected(problem.ranges.pose(share), samples, learn).mean()
+    value, slope = problem.expected_around(share.detach(), samples, STEP, learn)
+    return value + slope @ (share - share.detach())
 
 
 def objective(problem: Problem, parts: dict[str, Tensor], draw: int, learn: bool = False) -> Tensor:
