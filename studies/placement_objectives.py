@@ -3,10 +3,11 @@ gradients point, and what a sure direction costs.
 
 Ranking: mounts spread over the pair's bounds behind two lenses; what is expected of each on training worlds (the default
 objective, and the information of the estimator's own covariance alone) against its errors with single events in worlds
-never seen. Gradients: at random mounts, of the error straight through the events, of what is expected through frames and
-events, and of the default (geometry, trend of the precision, cover by the robot), against differences over a quarter of
-the bounds of what is expected and of hard errors, in the same draws. A difference over so wide a step is the mean of the
-slope along it: the certificate compares it with the default gradient's mean along the same way (three Gauss points).
+never seen. Gradients: at random mounts, of the error straight through the events; of what is expected through frames and
+events; its slope through geometry, trend of the precision and cover by the robot, at the mount and in the mean along the
+steps (three Gauss points); and the default, differences over geometry alone with the precision carried over by the trend.
+All against differences over a quarter of the bounds of what is expected and of hard errors, every picture rendered, in the
+same draws.
 """
 
 import math
@@ -14,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import torch
@@ -33,7 +35,7 @@ from studies.placement.problem import Problem, Samples, traced_camera
 LENSES = {"pair's own": None, "wide, near": (3.5, 2.0)}  # focal length mm, focus 1/m
 STEP = 0.12
 NODE, MIDDLE, ENDS = math.sqrt(3 / 5), 8 / 18, 5 / 18  # of Gauss and Legendre's rule with three points
-ALONG, DIFFERENCES, HARD = "expected, default, along the steps", "differences, expected", "differences, hard"
+DIFFERENCES, HARD = "differences, expected", "differences, hard"
 UNIT_M_S, UNIT_RAD_S = 0.1, 0.15  # errors that count 1 of the criterion
 
 
@@ -170,17 +172,11 @@ def gradients(run: Run[Config], kept: dict[str, Tensor], name: str) -> None:
     with run.progress(size.points * size.draws, f"{name}: gradients") as bar:
         for number, point in enumerate(points):
             trend_of(problem, point)
-            found = torch.stack(
-                [
-                    once(
-                        run,
-                        kept,
-                        f"{name}/gradient/{number}/{draw}",
-                        lambda point=point, draw=draw: all_ways(problem, point, problem.draw(draw)),
-                    )
-                    for draw in stepped(bar, size.draws)
-                ]
-            )  # [draws, ways, 7]: gradient and processor seconds
+            draws = [
+                drawn_ways(run, kept, f"{name}/gradient/{number}/{draw}", problem, point, problem.draw(draw))
+                for draw in stepped(bar, size.draws)
+            ]
+            found = torch.stack(draws)  # [draws, ways, 7]: gradient and processor seconds
             for index, way in enumerate(NAMES):
                 slopes.setdefault(way, []).append(found[:, index, :6])
                 costs.setdefault(way, []).append(float(found[1:, index, 6].mean()))
@@ -239,15 +235,18 @@ def trend_of(problem: Problem, point: Tensor) -> None:
         problem.expected(problem.ranges.pose(point + step), problem.draw(1000 + draw), learn=True)
 
 
-def all_ways(problem: Problem, point: Tensor, samples: Samples) -> Tensor:
+def drawn_ways(
+    run: Run[Config], kept: dict[str, Tensor], key: str, problem: Problem, point: Tensor, samples: Samples
+) -> Tensor:
     """[ways, 7]: gradients to the shares, and processor seconds of each."""
-    rows = []
-    for way in WAYS.values():
+
+    def rows(way):
         began = time.process_time()
-        slopes = way(problem, point, samples)
+        slopes = torch.stack(way(problem, point, samples))
         seconds = (time.process_time() - began) / len(slopes)
-        rows += [torch.cat([slope, slope.new_tensor([seconds])]) for slope in slopes]
-    return torch.stack(rows)
+        return torch.cat([slopes, slopes.new_full((len(slopes), 1), seconds)], 1)
+
+    return torch.cat([once(run, kept, f"{key}/{name}", partial(rows, way)) for name, way in WAYS.items()])
 
 
 def _straight(problem, point, samples):
@@ -263,19 +262,23 @@ def _through_frames(problem, point, samples):
     return torch.autograd.grad(value.mean(), share)
 
 
-def _default(problem, point, samples):
+def _slope(problem, point, samples):
     share = point.clone().requires_grad_()
     return torch.autograd.grad(problem.expected(problem.ranges.pose(share), samples).mean(), share)
 
 
 def _along(problem, point, samples):
-    """The mean of the default gradient along the way of every difference."""
-    middle = _default(problem, point, samples)[0]
+    """The mean of the slope along the way of every difference."""
+    middle = _slope(problem, point, samples)[0]
     found = MIDDLE * middle
     for index, direction in enumerate(STEP * torch.eye(6, dtype=torch.float64)):
         for sign in (-1, 1):
-            found[index] += ENDS * _default(problem, point + sign * NODE * direction, samples)[0][index]
+            found[index] += ENDS * _slope(problem, point + sign * NODE * direction, samples)[0][index]
     return (found,)
+
+
+def _default(problem, point, samples):
+    return (problem.expected_around(point, samples, STEP)[1],)
 
 
 def _differences(problem, point, samples):
@@ -293,8 +296,9 @@ def _differences(problem, point, samples):
 WAYS: dict[str, Callable[[Problem, Tensor, Samples], tuple[Tensor, ...]]] = {
     "straight through, bounded error": _straight,
     "expected, through frames": _through_frames,
+    "expected, slope": _slope,
+    "expected, mean slope along the steps": _along,
     "expected, default": _default,
-    ALONG: _along,
     DIFFERENCES: _differences,
 }
 NAMES = (*WAYS, HARD)  # differences are two

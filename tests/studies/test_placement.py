@@ -96,6 +96,50 @@ def test_gradient_to_height_is_that_of_wide_differences():
     assert ours == pytest.approx(wide, rel=0.5)
 
 
+def test_differences_of_geometry_are_those_of_rendered_mounts():
+    """In the corridor, with the forks in view: height, and pitch, whose slope at the mount itself points the other way."""
+    pair = PAIRS["corridor"]()
+    problem = Problem(pair, robot_pair.training(6), spread=6, per_world=4)
+    moved = 0.12 * torch.eye(6, dtype=F)
+    wanted = torch.zeros(6, dtype=F)
+    with torch.no_grad():
+        samples = problem.draw(0)
+        problem.expected(problem.ranges.pose(problem.start), samples, learn=True)
+        for k in (2, 4):
+            low, high = (
+                problem.expected(problem.ranges.pose(problem.start + sign * moved[k]), samples, learn=True)
+                for sign in (-1, 1)
+            )
+            wanted[k] = (high.mean() - low.mean()) / 0.24
+    before = problem.rendered
+    value, slope = problem.expected_around(problem.start, samples, 0.12)
+    assert problem.rendered == before + problem.samples
+    assert float(value) == pytest.approx(
+        float(problem.expected(problem.ranges.pose(problem.start), samples).mean()), rel=1e-9
+    )
+    assert wanted[2] < -0.2 < 0.1 < wanted[4]
+    assert float((slope - wanted)[[2, 4]].norm()) < 0.4 * float(wanted.norm())
+
+
+def test_small_differences_of_geometry_are_its_slope(problem):
+    """Where the robot is out of view and steps are too small for edges (rays are of single precision: 1e-5 would be too
+    small for them); at a wall of the cube to one side alone."""
+    samples = problem.draw(0)
+    share = problem.start.clone().requires_grad_()
+    value = problem.expected(problem.ranges.pose(share), samples, learn=True).mean()
+    (slope,) = torch.autograd.grad(value, share)
+    found, differences = problem.expected_around(problem.start, samples, 3e-4)
+    assert float(found) == pytest.approx(float(value.detach()), rel=1e-9)
+    assert torch.allclose(differences, slope, rtol=5e-3, atol=1e-3)
+    wall = problem.start.clone()
+    wall[2] = 1.0
+    (slope,) = torch.autograd.grad(
+        problem.expected(problem.ranges.pose(wall.requires_grad_()), samples).mean(), wall
+    )
+    _, differences = problem.expected_around(wall.detach(), samples, 3e-4)
+    assert differences[2] == pytest.approx(float(slope[2]), rel=5e-3, abs=1e-3)
+
+
 def test_controls_see_nothing(problem):
     found = controls(problem, problem.ranges.pose(problem.start), problem.draw(0))
     for name in ("no_texture", "shuffled_events", "only_the_robot"):

@@ -130,6 +130,28 @@ def test_the_trend_is_found_through_the_texture():
     assert float(odds) == pytest.approx(float((0.5 * length / (length + 0.5)).mean()), rel=0.08)
 
 
+def test_precision_is_carried_to_another_place():
+    """From where all is twice as near and twice as fast the same textures are told as the law says; a window that showed
+    nothing from here takes the texture of its neighbour, not that of all."""
+    whole, flow = lawful()
+    trend = PrecisionTrend().add(whole, flow)
+    rich = (torch.arange(20) % 2 == 0).to(F)[:, None]  # bodies whose world has more texture than the law's
+    told = whole.precision * (1 + 4 * rich)[..., None, None]
+    pixels = torch.cat([torch.zeros(20, 100, 2), torch.full((20, 100, 2), 50.0)], 1).to(F)
+    here = replace(whole, precision=told, pixels=pixels, windows=2, share=whole.share.clone())
+    here.share[:, 100:] = 0
+    there = replace(whole, depth_m=whole.depth_m / 2, windows=2)
+    truth = told * (((2 * flow[..., 0] + 0.5) / (flow[..., 0] + 0.5)) ** 0.8)[..., None, None]
+    truth = truth * ((2 / whole.depth_m + 0.3) / (1 / whole.depth_m + 0.3))[..., None, None]
+    found = trend.carried(here, trend.told(here, flow), there, trend.told(there, 2 * flow))
+    assert torch.equal(found.depth_m, there.depth_m)
+    wrong = 0.5 * (torch.logdet(found.precision) - torch.logdet(truth))
+    assert float(wrong[:, :100].abs().max()) < 0.25  # the trend's third order against the law
+    assert float(wrong[:, :100].mean().abs()) < 0.02
+    assert wrong[:, 100:].mean(1).tolist() == pytest.approx([0.0] * 20, abs=0.25)  # of 100 points' textures
+    assert torch.allclose(found.confidence.detach().clamp(0, 1), found.confidence)
+
+
 def test_what_the_body_covers_is_found_through_the_texture():
     """Windows of ten points whose precision falls by e to the power of four times what is covered of them."""
     read, flow = lawful(noise=0.3)
