@@ -28,7 +28,7 @@ def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Se
     """
     pair.check(pair.design)
     camera = pair.design.camera() if camera is None else camera
-    place.check_mount(_mount(pair), pair.requirements(), camera)
+    place.check_mount(robot_pair.mount_at(pair.ranges, pair.design.mount()), pair.requirements(), camera)
     for number in numbers:
         poses, twist = pair.drive(number, DRIVES)
         if not float(twist.abs().max()) > STILL:
@@ -43,20 +43,6 @@ def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Se
                 f"{BLOCK_PX} x {BLOCK_PX} pixels vary by more than the sensor's threshold, {LEAST_TEXTURE:.0%} are the "
                 "least; paint its surfaces with pictures of radiance 0 to 255, or turn the start to where there are some."
             )
-
-
-def _mount(pair):
-    """The design's mount in the middle of the box of its bounds."""
-    low, high = pair.ranges.low[:3], pair.ranges.high[:3]
-    design = pair.design
-    return place.Mount(
-        (low + high) / 2,
-        (high - low) / 2,
-        yaw_rad=design.yaw_rad,
-        pitch_rad=design.pitch_rad,
-        roll_rad=design.roll_rad,
-        position_m=design.mount()[:3, 3],
-    )
 
 
 def _textured(frames):

@@ -52,6 +52,7 @@ RATE_RAD_S = 0.7  # standard deviation of roll, pitch and yaw rates
 CONTRAST = 0.6  # exponent of radiance
 LIGHT = (70.0, 180.0)  # mean radiance of surfaces
 UNSEEN_FROM = 1_000_000
+INSIDE = 1 - 1e-9  # of a box that a mount approaches by a hyperbolic tangent
 PHOTOS = {False: ("gravel", "grass", "coffee"), True: ("brick", "astronaut", "chelsea")}  # by whether unseen
 
 
@@ -211,6 +212,15 @@ LAYERS = {
     ),
     "sensor": events.HardSensor(SENSOR, BINS, LEAD_S),
 }
+
+
+def mount_at(ranges: place.MountRanges, T_body_cam: Tensor) -> place.Mount:
+    """The learnable mount in the middle of a box that stands at a pose [4, 4]; a wall is approached to a billionth."""
+    low, high = ranges.low[:3], ranges.high[:3]
+    half, middle = (high - low) / 2, (low + high) / 2
+    inside = torch.where(half > 0, (T_body_cam[:3, 3] - middle).clamp(-INSIDE * half, INSIDE * half), 0.0)
+    yaw, pitch, roll = place.yaw_pitch_roll_rad(T_body_cam).tolist()
+    return place.Mount(middle, half, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll, position_m=middle + inside)
 
 
 def closed_form(volume):

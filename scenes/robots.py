@@ -113,7 +113,9 @@ def from_urdf(
         for shape in shapes:
             placed = frames[link.name] @ (np.eye(4) if shape.origin is None else shape.origin)
             colour = _colour(getattr(shape, "material", None), materials)
-            parts += [_moved(part, placed, link.name, colour) for part in _parts(shape.geometry, finder)]
+            parts += [
+                _moved(part, placed, link.name, colour) for part in _parts(shape.geometry, finder, link.name)
+            ]
     finder.check()
     robot = Robot(path, frames, tuple(parts), root)
     if parts:
@@ -185,16 +187,20 @@ def _colour(material, known):
     )
 
 
-def _parts(geometry, finder):
+def _parts(geometry, finder, link):
     """Parts of a shape in its own axes."""
     if geometry.mesh is not None:
-        return finder.parts(geometry.mesh)
+        return finder.parts(geometry.mesh, link)
     if geometry.box is not None:
-        mesh = trimesh.creation.box(extents=geometry.box.size)
+        mesh = trimesh.creation.box(extents=finder.sizes(geometry.box.size, 3, "box", link))
     elif geometry.cylinder is not None:
-        mesh = trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length, sections=ROUND)
+        radius, length = finder.sizes(
+            (geometry.cylinder.radius, geometry.cylinder.length), 2, "cylinder", link
+        )
+        mesh = trimesh.creation.cylinder(radius, length, sections=ROUND)
     else:
-        mesh = trimesh.creation.icosphere(FINE, geometry.sphere.radius)
+        (radius,) = finder.sizes((geometry.sphere.radius,), 1, "sphere", link)
+        mesh = trimesh.creation.icosphere(FINE, radius)
     grey = np.full(len(mesh.faces), mesh_files.UNCOLOURED)
     return [mesh_files.Part("", np.array(mesh.vertices), np.array(mesh.faces), grey, coloured=False)]
 
@@ -217,7 +223,17 @@ class _Finder:
         self.read: dict[str, Any] = {}
         self.lost: dict[str, str] = {}
 
-    def parts(self, mesh):
+    def sizes(self, values, count, shape, link):
+        """Sizes of a shape, metres. Raises: DomainError for others than ``count`` positive ones."""
+        values = [float(value) for value in np.atleast_1d(values)]
+        if len(values) != count or not all(0 < value < math.inf for value in values):
+            raise DomainError(
+                f"robot '{self.urdf}': the {shape} of link '{link}' has the size {values}; {count} positive "
+                f"{'number' if count == 1 else 'numbers'} of metres are needed."
+            )
+        return values
+
+    def parts(self, mesh, link):
         """Parts of a mesh at its scale; none where it is lost."""
         name = mesh.filename or ""
         if name not in self.read:
@@ -229,6 +245,11 @@ class _Finder:
                 self.lost[name] = str(error).rstrip(".")
                 self.read[name] = []
         scale = np.ones(3) * (1.0 if mesh.scale is None else mesh.scale)
+        if not np.isfinite(scale).all() or not scale.all():
+            raise DomainError(
+                f"robot '{self.urdf}': a mesh of link '{link}' has the scale {scale.tolist()}, which leaves nothing of it; "
+                "give three numbers other than 0."
+            )
         stretched = np.eye(4)
         stretched[:3, :3] = np.diag(scale)
         return [_moved(part, stretched, part.name, None) for part in self.read[name]]

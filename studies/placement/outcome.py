@@ -93,14 +93,19 @@ class Outcome:
         return {name: paired(ours, self.errors[name]) for name in self.along if name != GRADIENT}
 
     @cached_property
-    def best(self) -> int:
-        """Number of the descent that training samples choose."""
+    def best(self) -> int | None:
+        """Number of the descent that training samples choose; None: they choose the pair's own mount."""
         return chosen(self.race, self.starts)
+
+    @property
+    def answered(self) -> Tensor:
+        """Errors [N] of the answer."""
+        return self.judged[(0, "default") if self.best is None else (self.best, GRADIENT)]
 
     @property
     def share(self) -> Tensor:
         """The mount [6] that is the answer."""
-        return self.race.answer(self.best, GRADIENT)
+        return self.race.problem.start if self.best is None else self.race.answer(self.best, GRADIENT)
 
     @property
     def pose(self) -> Tensor:
@@ -110,7 +115,7 @@ class Outcome:
     @property
     def error(self) -> float:
         """Of the answer."""
-        return float(self.judged[self.best, GRADIENT].mean())
+        return float(self.answered.mean())
 
     @property
     def default_error(self) -> float:
@@ -125,9 +130,7 @@ class Outcome:
     @property
     def over_default(self) -> tuple[float, float, float]:
         """Ratio of the answer's error to that of the pair's own mount, and its interval over worlds."""
-        return over_worlds(
-            self.judged[self.best, GRADIENT], self.judged[0, "default"], len(self.unseen.numbers)
-        )
+        return over_worlds(self.answered, self.judged[0, "default"], len(self.unseen.numbers))
 
     def metrics(self) -> dict[str, float | int]:
         """By name."""
@@ -136,18 +139,19 @@ class Outcome:
             "default_error": self.default_error,
             "samples_per_search": self.race.samples(0, GRADIENT),
             "samples_judged": self.unseen.samples,
-            "chosen_start": self.best,
+            "chosen_start": -1 if self.best is None else self.best,
             "seeds": self.starts,
             "over_default": ratio,
-            "over_default_low90": low,
-            "over_default_high90": high,
         }
+        if len(self.unseen.numbers) > 1:
+            found |= {"over_default_low90": low, "over_default_high90": high}
         for name, values in self.errors.items():
             found[f"{label(name)}_median_error"] = float(values.quantile(0.5))
         for name, beside in self.rivals.items():
             over = f"over_{label(name)}"
             found |= {f"{over}_median": beside.median, f"{over}_ahead": beside.ahead}
-            found |= {f"{over}_low90": beside.low, f"{over}_high90": beside.high}
+            if beside.count > 1:
+                found |= {f"{over}_low90": beside.low, f"{over}_high90": beside.high}
         if self.grid_error is not None:
             found["grid_error"] = self.grid_error
             found["starts_within_2_percent_of_grid"] = self.near_grid

@@ -19,8 +19,6 @@ from studies.placement.outcome import INTERVAL, Outcome
 from studies.placement.problem import Problem
 from studies.placement.race import GRADIENT, GRID
 
-INSIDE = 1 - 1e-9  # of a box that a mount approaches by a hyperbolic tangent
-
 
 def report(run: Run[Any], outcome: Outcome) -> None:
     """Metrics, raw table, hand-over and page."""
@@ -43,15 +41,21 @@ def report(run: Run[Any], outcome: Outcome) -> None:
 
 def answer(outcome: Outcome) -> str:
     """In one sentence."""
-    problem, worlds = outcome.race.problem, len(outcome.unseen.numbers)
-    better = outcome.error < outcome.default_error
-    said = "belongs at" if better else "is no better off than at its default mount at"
+    name, worlds = outcome.race.problem.pair.name, len(outcome.unseen.numbers)
+    where = place_in_words(outcome.race.problem, outcome.share)
+    beside = f"{outcome.error:.3f} against {outcome.default_error:.3f} on {outcome.unseen.samples} unseen samples with single events."
+    if outcome.best is None:
+        return (
+            f"The camera of '{name}' stays at its default mount, {where}: on training drives none of {outcome.starts} "
+            f"descents ends at a better place (error {outcome.default_error:.3f} on unseen samples with single events)."
+        )
+    if outcome.error >= outcome.default_error:
+        return f"The place found for the camera of '{name}', {where}, is no better than its default mount: {beside}"
     ratio, low, high = outcome.over_default
     interval = f" ({low:.2f} to {high:.2f}, {INTERVAL:.0%} of resampled worlds)" if worlds > 1 else ""
     return (
-        f"The camera of '{problem.pair.name}' {said} {place_in_words(problem, outcome.share)}: its error there is {ratio:.2f}"
-        f"{interval} times that at its default mount, {outcome.error:.3f} against {outcome.default_error:.3f} on "
-        f"{outcome.unseen.samples} unseen samples with single events."
+        f"The camera of '{name}' belongs at {where}: its error there is {ratio:.2f}{interval} times that at its default mount, "
+        f"{beside}"
     )
 
 
@@ -169,14 +173,13 @@ def left(run: Run[Any], outcome: Outcome) -> None:
 def handed(run: Run[Any], outcome: Outcome) -> None:
     """Write the mount, read it back, and see that it has the same score."""
     problem, unseen, pose = outcome.race.problem, outcome.unseen, outcome.pose
-    low, high = problem.ranges.low[:3], problem.ranges.high[:3]
-    yaw, pitch, roll = place.yaw_pitch_roll_rad(pose).tolist()
-    half = (high - low) / 2
-    middle = (low + high) / 2
-    inside = torch.where(half > 0, (pose[:3, 3] - middle).clamp(-INSIDE * half, INSIDE * half), 0.0)
-    mount = place.Mount(middle, half, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll, position_m=middle + inside)
+    mount = robot_pair.mount_at(problem.ranges, pose)
     path = run.path("mount.yaml")
-    notes = {"pair": problem.pair.name, "error_unseen": outcome.error}
+    notes = {
+        "pair": problem.pair.name,
+        "error_unseen": outcome.error,
+        "error_unseen_default": outcome.default_error,
+    }
     handed_over = HandOver(
         mount, problem.camera, robot_pair.SENSOR, problem.pair.frame, "camera_optical_frame", notes
     )

@@ -136,7 +136,11 @@ class Race:
         problem, before = self.problem, self.problem.rendered
         trail = self.trail(0, GRID)
         allowed = [index for index in trail.error.argsort().tolist() if kept(problem, trail.share[index])]
-        shares = trail.share[(allowed or [0])[:FINALISTS]]
+        if not allowed:
+            raise DomainError(
+                f"of {len(trail.error)} mounts of the grid none keeps what is required; give --grid more of them, or ask for less."
+            )
+        shares = trail.share[allowed[:FINALISTS]]
         draws = [problem.draw(-1 - k) for k in range(FINAL_DRAWS)]
         errors = []
         with self.run.progress(len(shares), "the grid's best once more") as bar:
@@ -304,14 +308,15 @@ def _judged(run, race, unseen, wanted, said):
     return found
 
 
-def chosen(race: Race, count: int) -> int:
-    """Number of the descent whose answer does best on other training samples, one draw in every world: what is judged on
-    unseen ones has not been chosen by them."""
+def chosen(race: Race, count: int) -> int | None:
+    """Number of the descent whose answer does best on training samples that no step saw, None where the pair's own mount does
+    better than all of them: what is judged on unseen samples has not been chosen by them."""
     if "chosen" not in race.tensors:
         problem = race.problem
         draws = [problem.draw(-1 - k) for k in range(max(1, len(problem.numbers) // problem.spread))]
-        answers = [race.answer(number, GRADIENT) for number in range(count)]
-        errors = [sum(problem.error(share, draw) for draw in draws) for share in answers]
-        race.tensors["chosen"] = torch.tensor(errors).argmin()
+        mounts = [problem.start, *(race.answer(number, GRADIENT) for number in range(count))]
+        errors = [sum(problem.error(share, draw) for draw in draws) for share in mounts]
+        race.tensors["chosen"] = torch.tensor(errors).argmin() - 1
         race.save()
-    return int(race.tensors["chosen"])
+    number = int(race.tensors["chosen"])
+    return None if number < 0 else number

@@ -151,6 +151,11 @@ require:
     assert corners[:, 2].max() == pytest.approx(0.17 + 0.062 + 0.3, abs=1e-9)
 
 
+def test_a_start_may_stand_on_a_wall_of_its_box(page):
+    path = page(PAGE.replace("  pitch_deg: 30", "  pitch_deg: 30\n  x_m: 0.34"))
+    check_pair(own_pair(path))
+
+
 def test_a_robot_stands_on_the_ground_wherever_its_origin_is(page):
     """The box reaches 5 cm below its origin; its velocity is that of the origin."""
     found = own_pair(page(PAGE))

@@ -233,6 +233,17 @@ def test_robots_that_cannot_be_are_refused(tmp_path):
         robots.from_urdf(arm(tmp_path, two))
     with pytest.raises(FileFormatError, match="no path of this machine"):
         robots.from_urdf(arm(tmp_path, '<mesh filename="http://127.0.0.1:9/a.stl"/>'))
+    for geometry, sentence in (
+        ('<box size="0.6 0.4"/>', r"the box of link '.*' has the size \[0.6, 0.4\]; 3 positive numbers"),
+        ('<box size="0.6 -0.4 1"/>', "3 positive numbers"),
+        ('<cylinder radius="-0.1" length="1"/>', "the cylinder of link .* 2 positive numbers"),
+        ('<sphere radius="-0.1"/>', "the sphere of link .* 1 positive number of metres"),
+    ):
+        with pytest.raises(DomainError, match=sentence):
+            robots.from_urdf(arm(tmp_path, geometry))
+    mesh_of(tmp_path)
+    with pytest.raises(DomainError, match=r"has the scale .* leaves nothing of it"):
+        robots.from_urdf(arm(tmp_path, '<mesh filename="t.stl" scale="1 0 1"/>'))
     files = {
         "nowhere.urdf": (None, "is not a file"),
         "a.xacro": ("<robot/>", "expand it first"),

@@ -336,7 +336,9 @@ def test_the_whole_study_and_its_resumption(tmp_path):
     assert {row["search"] for row in rows} == {"default", "start", "gradient", "random", "grid"}
     assert {int(row["samples"]) for row in rows if row["search"] in ("gradient", "random")} == {2}
     handed = load_hand_over(out / "mount.yaml")
-    row = next(row for row in rows if row["search"] == "gradient")
+    row = next(
+        row for row in rows if row["search"] == ("default" if found["chosen_start"] < 0 else "gradient")
+    )
     assert handed.mount()[2, 3].item() == pytest.approx(float(row["z_m"]), abs=1e-4)
     assert math.isfinite(found["control_no_texture_error"])
     (out / "report.html").unlink()
@@ -344,4 +346,5 @@ def test_the_whole_study_and_its_resumption(tmp_path):
     assert (out / "race.csv").read_text() == before
     page = (out / "report.html").read_text()
     assert ("belongs at" in page) == (found["hand_over_score"] < found["default_error"])
+    assert ("stays at" in page) == (found["chosen_start"] < 0)
     assert "tensor(" not in page
