@@ -228,8 +228,8 @@ class _Finder:
         values = [float(value) for value in np.atleast_1d(values)]
         if len(values) != count or not all(0 < value < math.inf for value in values):
             raise DomainError(
-                f"robot '{self.urdf}': the {shape} of link '{link}' has the size {values}; {count} positive "
-                f"{'number' if count == 1 else 'numbers'} of metres are needed."
+                f"robot '{self.urdf}': the {shape} of link '{link}' has the size {values}; positive metres are needed, "
+                f"{count} of them."
             )
         return values
 

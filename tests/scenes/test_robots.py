@@ -234,10 +234,12 @@ def test_robots_that_cannot_be_are_refused(tmp_path):
     with pytest.raises(FileFormatError, match="no path of this machine"):
         robots.from_urdf(arm(tmp_path, '<mesh filename="http://127.0.0.1:9/a.stl"/>'))
     for geometry, sentence in (
-        ('<box size="0.6 0.4"/>', r"the box of link '.*' has the size \[0.6, 0.4\]; 3 positive numbers"),
-        ('<box size="0.6 -0.4 1"/>', "3 positive numbers"),
-        ('<cylinder radius="-0.1" length="1"/>', "the cylinder of link .* 2 positive numbers"),
-        ('<sphere radius="-0.1"/>', "the sphere of link .* 1 positive number of metres"),
+        (
+            '<box size="0.6 -0.4 1"/>',
+            r"the box of link '.*' has the size \[0.6, -0.4, 1.0\]; positive metres are needed, 3",
+        ),
+        ('<cylinder radius="-0.1" length="1"/>', r"the cylinder of link .* needed, 2 of them"),
+        ('<sphere radius="-0.1"/>', r"the sphere of link .* needed, 1 of them"),
     ):
         with pytest.raises(DomainError, match=sentence):
             robots.from_urdf(arm(tmp_path, geometry))
