@@ -20,7 +20,7 @@ def versions():
             found[package] = version(package)
         except PackageNotFoundError:
             found[package] = "not installed"
-    found["commit"] = _commit(Path(__file__).resolve().parents[1])
+    found["commit"] = _commit(Path(__file__).resolve().parents[2])
     return found
 
 

@@ -19,6 +19,7 @@ import torch
 
 from codesign.errors import CodesignError, DomainError, FileFormatError, NonFiniteError, ShapeError
 from studies.frame.config import StudyConfig
+from studies.frame.machine import versions
 from studies.frame.run import Run, main, open_run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -507,3 +508,13 @@ def test_page_refuses_what_it_cannot_show(run):
         run.table("T", ["a", "b"], [[1, 2], [3]])
     with pytest.raises(CodesignError, match="leads out of the run's folder"):
         run.path("../elsewhere.png")
+
+
+def test_the_commit_is_that_of_the_checkout():
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        pytest.skip("not a checkout of git")
+    said = subprocess.run(
+        ["git", "-C", root, "rev-parse", "HEAD"], capture_output=True, text=True, check=True
+    )
+    assert versions()["commit"].removesuffix("+changes") == said.stdout.strip()
