@@ -216,18 +216,35 @@ def test_the_median_of_an_even_number_of_starts_is_the_mean_of_two():
 
 
 def test_the_page_says_what_the_committed_race_says():
-    """Every ratio and median of the table in docs/placement.md, from the raw table beside it."""
+    """Every cell of the table in docs/placement.md that its raw table has, in its row and column."""
     docs = Path(placement.__file__).parents[2] / "docs"
-    page = (docs / "placement.md").read_text()
+    lines = (docs / "placement.md").read_text().split("## What it found")[1].splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| ")]
+    pairs = [cell.strip("`") for cell in rows[0][1:]]
+    assert sorted(pairs) == sorted(PAIRS)
     errors: dict = {}
     for row in csv.DictReader((docs / "placement_race.csv").read_text().splitlines()):
         errors.setdefault((row["pair"], row["search"]), []).append(float(row["error"]))
-    for pair, search in errors:
-        if search in SEARCHES:
-            ours, theirs = (torch.tensor(errors[pair, name], dtype=F) for name in ("gradient", search))
-            assert len(ours) == len(theirs) == 12
-            assert f"{float(theirs.quantile(0.5)):.3f}; {outcome.paired(ours, theirs)}" in page
-    assert {pair for pair, _ in errors} == set(PAIRS)
+
+    def cell(begin, pair):
+        [found] = [row for row in rows if row[0].startswith(begin)]
+        return found[1 + pairs.index(pair)]
+
+    for pair in pairs:
+        each = {name: torch.tensor(errors[pair, name], dtype=F) for name in ("start", "gradient", *SEARCHES)}
+        assert {len(values) for values in each.values()} == {12}
+        ours, grid = each["gradient"], errors[pair, "grid"][0]
+        assert cell("default mount", pair) == f"{errors[pair, 'default'][0]:.2f}"
+        assert cell("starts", pair) == f"{float(each['start'].quantile(0.5)):.2f}"
+        assert cell("gradient,", pair) == (
+            f"{float(ours.quantile(0.5)):.3f} ({float(ours.min()):.2f} to {float(ours.max()):.2f})"
+        )
+        for search in SEARCHES:
+            beside = outcome.paired(ours, each[search])
+            assert cell(f"{search},", pair) == f"{float(each[search].quantile(0.5)):.3f}; {beside}"
+        assert cell("grid of", pair) == f"{grid:.3f}"
+        within = int((ours <= 1.02 * grid).sum())
+        assert cell("descents within", pair).startswith(f"{within} of 12, ")
 
 
 def test_drives_of_a_world_err_alike():
