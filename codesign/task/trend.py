@@ -5,7 +5,8 @@ The precision that an estimator gives a window jumps with the texture under it: 
 edges. Its derivative to a pose is that jump times hundreds of pixels per radian, and has no mean. What goes on when the
 jumps are averaged is that flow is told better where there is more of it, until it is too fast, where the surface and its
 texture are near, and where the robot's own body, whose image stands still, does not reach into the window. That trend is
-fitted over all points seen so far, and is followed instead.
+fitted over all points seen so far, and is followed instead; or, over steps that no slope describes, what was told from
+one place is carried to another by it.
 """
 
 from dataclasses import replace
@@ -83,7 +84,7 @@ class PrecisionTrend:
         beside = own - told_here
         told = torch.where(seen[..., None], beside, _of_nearest_window(here, beside, seen)) + told_there
         grown = (told - own)[..., 0].exp()[..., None, None] * here.precision
-        alone = told[..., 0].exp()[..., None, None] * torch.eye(2, dtype=told.dtype)
+        alone = told[..., 0].exp()[..., None, None] * torch.eye(2, dtype=told.dtype, device=told.device)
         precision = torch.where(seen[..., None, None], grown, alone)
         return replace(there, precision=precision, confidence=torch.sigmoid(told[..., 1]))
 

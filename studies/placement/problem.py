@@ -146,11 +146,11 @@ class Problem:
     def expected(
         self, T_body_cam: Tensor, samples: Samples, learn: bool = False, frames: bool = False
     ) -> Tensor:
-        """Bounded error [N] to be expected of a mount, the default objective.
+        """Bounded error [N] to be expected of a mount: what is descended, by ``expected_around``.
 
         learn: take these samples into the trend of the flow's precision. frames: the gradient goes through frames, events
           and the estimator's covariance instead of the trend.
-        Gradient: mount, through the geometry of flow, the trend of its precision over length and nearness, and the
+        Gradient: mount, the slope at this very place, through the geometry of flow, the trend of its precision, and the
         share of every window that the robot itself covers; not through single frames, whose texture makes it noise.
         """
         batch = self.batch(samples)

@@ -221,8 +221,8 @@ def objective(problem: Problem, parts: dict[str, Tensor], draw: int, learn: bool
 
 
 def certified(run: Run[Any], race: Race, start: Tensor) -> dict[str, grad.Choice]:
-    """The way to the gradient of position and attitude: autograd where it agrees with averaged differences of what is
-    expected, or these are too noisy to tell."""
+    """The way to the gradient of position and attitude: that of ``expected`` ("autograd") where it agrees with averaged differences
+    of rendered mounts, or these are too noisy to tell."""
     draws = run.config.certified
     if not draws:
         return {name: grad.Choice("autograd", math.nan, math.nan, math.nan, 0) for name in GROUPS}
