@@ -31,9 +31,9 @@ from scenes.robot_pair import RATE_RAD_S
 from scenes.robot_pairs import PAIRS, check_pairs
 from studies.frame.run import Run, StudyConfig, main
 from studies.placement.problem import Problem, Samples, traced_camera
+from studies.placement.race import STEP
 
 LENSES = {"pair's own": None, "wide, near": (3.5, 2.0)}  # focal length mm, focus 1/m
-STEP = 0.12
 NODE, MIDDLE, ENDS = math.sqrt(3 / 5), 8 / 18, 5 / 18  # of Gauss and Legendre's rule with three points
 DIFFERENCES, HARD = "differences, expected", "differences, hard"
 UNIT_M_S, UNIT_RAD_S = 0.1, 0.15  # errors that count 1 of the criterion

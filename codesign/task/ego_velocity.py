@@ -66,8 +66,12 @@ class Readings:
         """Flow [N, P, 2] that velocities [N, K] leave unexplained."""
         return self.flow_px - self.confidence[..., None] * (self.rows @ velocity[:, None, :, None])[..., 0]
 
+    def of_windows(self, values: Tensor) -> Tensor:
+        """[N, P, ...]: values [N, windows, ...] of windows at each of their points. Gradient: values."""
+        return values.repeat_interleave(self.share.shape[1] // self.windows, 1)
+
     def squared(self, velocity: Tensor) -> Tensor:
-        """The same [N, P] as a sum of two squares in units of its standard deviation."""
+        """What velocities leave unexplained, [N, P], as a sum of two squares in units of its standard deviation."""
         miss = self.missed_px(velocity)
         return (miss[..., None, :] @ self.precision @ miss[..., :, None])[..., 0, 0]
 

@@ -105,8 +105,7 @@ def _terms(read, flow_px, covered):
     terms = [one, length, length**2, length**3, nearness, nearness**2]
     hidden = torch.zeros_like(length)
     if covered is not None:
-        hidden = covered.to(length).expand(len(length), read.windows)
-        hidden = hidden.repeat_interleave(length.shape[1] // read.windows, 1)
+        hidden = read.of_windows(covered.to(length).expand(len(length), read.windows))
     return torch.stack([*terms, length * nearness, length**2 * nearness, hidden, hidden**2], -1)
 
 
@@ -119,7 +118,7 @@ def _of_nearest_window(read, values, seen):
     away = torch.cdist(middle, middle).masked_fill((count == 0)[:, None], torch.inf)
     lender = away.argmin(2)[..., None].expand(-1, -1, values.shape[-1])
     lent = (total / count.clamp_min(1)[..., None]).gather(1, lender)
-    return lent.repeat_interleave(values.shape[1] // windows, 1)
+    return read.of_windows(lent)
 
 
 def _log_precision(read):

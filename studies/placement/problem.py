@@ -223,8 +223,8 @@ class Problem:
         """Readings with the gradient of trend and cover."""
         read = self.trend.followed(seen.surfaces, seen.flow_px, seen.covered)
         clear = (1 - seen.covered).clamp_min(CLEAR)
-        clear = (clear / clear.detach()).repeat_interleave(read.share.shape[1] // read.windows, 1)
-        return replace(read, depth_m=seen.read.depth_m, share=read.share * clear)
+        share = read.share * read.of_windows(clear / clear.detach())
+        return replace(read, depth_m=seen.read.depth_m, share=share)
 
     def _bounded(self, read, seen, twist):
         """Bounded error [N] to be expected of readings."""

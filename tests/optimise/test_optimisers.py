@@ -197,10 +197,12 @@ class TestDampedLeastSquares:
 
     def test_modes_of_a_lens_that_no_ray_sees_do_not_stall_it(self, monkeypatch):
         """The double Gauss has a plane stop in air: its curvature, and how the gap around it is shared, blur
-        nothing. Without the floor this loss falls by 0.1 % in 30 steps, and the run ends as a stall."""
+        nothing, and their columns of J are rounding. Without the floor most runs stall, which ones is
+        rounding too: hence eight starts, 1e-13 apart."""
         geo = lens.load("double-gauss")
         fields = (0.0, 0.12, 0.22)
         design = make_design(geo, fields, 0.005)
+        starts = 1e-13 * torch.randn(8, 21, dtype=D, generator=torch.Generator().manual_seed(0))
 
         def residuals(x):
             candidate = design.lens(x)
@@ -209,17 +211,15 @@ class TestDampedLeastSquares:
             blur = points - (points * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
             return torch.cat([(blur * weight).reshape(-1) / 0.05, 3 * design.penalty(candidate).reshape(1)])
 
-        def solve():
-            solver = DampedLeastSquares(residuals, torch.zeros(21, dtype=D), by_differences(1e-6))
+        def left(start):
+            """Loss after 40 steps over that at the start."""
+            solver = DampedLeastSquares(residuals, start, by_differences(1e-6))
             solver.run(40)
-            return solver
+            return solver.loss / solver.history[0].loss
 
-        solver = solve()
-        assert solver.loss < 0.02 * solver.history[0].loss
+        assert all(left(start) < 0.02 for start in starts[:3])
         monkeypatch.setattr(least_squares, "FLOOR", 0.0)
-        stalled = solve()
-        assert stalled.loss > 0.99 * solver.history[0].loss
-        assert stalled.stopped == "stall"
+        assert any(left(start) > 0.9 for start in starts)
 
     @pytest.mark.bits
     @pytest.mark.parametrize("route", ["json", "torch"])

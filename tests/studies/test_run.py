@@ -511,10 +511,9 @@ def test_page_refuses_what_it_cannot_show(run):
 
 
 def test_the_commit_is_that_of_the_checkout():
-    root = Path(__file__).resolve().parents[2]
-    if not (root / ".git").exists():
+    if not (ROOT / ".git").exists():
         pytest.skip("not a checkout of git")
     said = subprocess.run(
-        ["git", "-C", root, "rev-parse", "HEAD"], capture_output=True, text=True, check=True
+        ["git", "-C", ROOT, "rev-parse", "HEAD"], capture_output=True, text=True, check=True
     )
     assert versions()["commit"].removesuffix("+changes") == said.stdout.strip()

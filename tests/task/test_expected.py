@@ -144,12 +144,14 @@ def test_precision_is_carried_to_another_place():
     truth = told * (((2 * flow[..., 0] + 0.5) / (flow[..., 0] + 0.5)) ** 0.8)[..., None, None]
     truth = truth * ((2 / whole.depth_m + 0.3) / (1 / whole.depth_m + 0.3))[..., None, None]
     found = trend.carried(here, trend.told(here, flow), there, trend.told(there, 2 * flow))
-    assert torch.equal(found.depth_m, there.depth_m)
+    assert found.depth_m is there.depth_m
     wrong = 0.5 * (torch.logdet(found.precision) - torch.logdet(truth))
     assert float(wrong[:, :100].abs().max()) < 0.25  # the trend's third order against the law
     assert float(wrong[:, :100].mean().abs()) < 0.02
     assert wrong[:, 100:].mean(1).tolist() == pytest.approx([0.0] * 20, abs=0.25)  # of 100 points' textures
-    assert torch.allclose(found.confidence.detach().clamp(0, 1), found.confidence)
+    odds = [(each / (1 - each)).log()[:, :100] for each in (found.confidence, whole.confidence)]
+    law = 0.5 * ((2 * flow[..., 0] + 0.5) / (flow[..., 0] + 0.5)).log()[:, :100]
+    assert float((odds[0] - odds[1] - law).mean().abs()) < 0.05
 
 
 def test_what_the_body_covers_is_found_through_the_texture():
