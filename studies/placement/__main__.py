@@ -21,7 +21,7 @@ from studies.frame.run import Run, StudyConfig, main
 from studies.placement.outcome import Outcome
 from studies.placement.page import report
 from studies.placement.problem import DRIVES, Problem, traced_camera
-from studies.placement.race import GRID, Race, certified, feasible, judge, judge_along
+from studies.placement.race import Race, certified, feasible, judge, judge_along
 from studies.placement.searches import SEARCHES, available
 
 SPREAD = 12  # worlds of a step at most
@@ -58,7 +58,7 @@ class Config(StudyConfig):
     rivals_expect: bool = False
     """Searches beside the gradient minimise what it descends, instead of errors with hard counts."""
     grid: int = 0
-    """Mounts of a quasi-random grid that is refined twice, its best looked at once more; 0 for none."""
+    """Mounts of a quasi-random grid that is refined twice, the best of each cube looked at again; 0 for none."""
     judged_worlds: int = 12
     """Unseen worlds."""
     judged_drives: int = 8
@@ -90,8 +90,7 @@ def study(run: Run[Config]) -> None:
         for name in size.searches:
             race.search(number, name, start)
     if size.grid:
-        race.search(0, GRID, problem.start)
-        race.finals()
+        race.grid()
     judged = judge(run, race, unseen, starts)
     along = judge_along(run, race, unseen, judged, len(starts))
     report(run, Outcome(race, unseen, judged, along, ways))

@@ -13,9 +13,10 @@ from codesign import grad, task
 from codesign.errors import DomainError
 from studies.frame.run import Run
 from studies.placement.descent import descend, settled
+from studies.placement.grid import looks, refined_grid
 from studies.placement.problem import Problem
 from studies.placement.resumption import asked, check_same
-from studies.placement.searches import SEARCHES, Trail, refined_grid
+from studies.placement.searches import SEARCHES, Trail
 
 GRADIENT = "gradient"
 GRID = "grid"
@@ -24,8 +25,8 @@ AGREES = {"relative_l2": 1.0, "cosine": 0.8}  # steps have a set length: what co
 UNKNOWN = 1 / 3  # standard error of differences from which on they judge nothing
 WAYS = ("autograd", "differences", "evolution")
 TRIES = 2048
-FINALISTS = 20  # of the grid
-FINAL_DRAWS = 12
+FINAL_DRAWS = 12  # of the grid's second look
+KEPT_EVERY = 50  # looks
 GROUPS = {"position": slice(0, 3), "attitude": slice(3, 6)}
 
 
@@ -109,12 +110,6 @@ class Race:
                     return float(objective(self.problem, split(share), draw))
             return self.problem.error(share, samples)
 
-        if name == GRID:
-            total = size.grid + 2 * max(1, size.grid // 5)
-            self._made(
-                number, name, total, lambda advance: refined_grid(error, 6, size.grid, 2, size.seed, advance)
-            )
-            return
         count = max(2, self.samples(number, GRADIENT) // self.problem.samples)
         seed = size.seed + number
         free = ~self.problem.ranges.held
@@ -128,27 +123,45 @@ class Race:
 
         self._made(number, name, count, make)
 
-    def finals(self) -> None:
-        """Look again at the best mounts of the grid, with draws that did not choose them: of hundreds the first is the best
-        by luck."""
+    def grid(self) -> None:
+        """The refined grid, looked at again with draws that did not choose its points. What is known of it is kept while it
+        goes on."""
         if f"{GRID}/0/final" in self.tensors:
             return
-        problem, before = self.problem, self.problem.rendered
-        trail = self.trail(0, GRID)
-        allowed = [index for index in trail.error.argsort().tolist() if kept(problem, trail.share[index])]
-        if not allowed:
-            raise DomainError(
-                f"of {len(trail.error)} mounts of the grid none keeps what is required; give --grid more of them, or ask for less."
+        problem, size = self.problem, self.run.config
+        first = [problem.draw(1000 * size.seed)]
+        other = [problem.draw(-1 - k) for k in range(FINAL_DRAWS)]
+        known = self.tensors.get(f"{GRID}/0/known", torch.zeros(0, dtype=torch.float64)).tolist()
+        replayed = iter(known[:])
+
+        def look(share, again):
+            error = next(replayed, None)
+            if error is None:
+                draws = other if again else first
+                error = sum(problem.error(share, draw) for draw in draws) / len(draws)
+                known.append(error)
+                if len(known) % KEPT_EVERY == 0:
+                    self.tensors[f"{GRID}/0/known"] = torch.tensor(known, dtype=torch.float64)
+                    self.save()
+            return error
+
+        with self.run.progress(looks(size.grid), GRID) as bar:
+            points, finals = refined_grid(
+                look,
+                6,
+                size.grid,
+                seed=size.seed,
+                allowed=lambda share: kept(problem, share),
+                advance=lambda error: bar.advance(error=error),
             )
-        shares = trail.share[allowed[:FINALISTS]]
-        draws = [problem.draw(-1 - k) for k in range(FINAL_DRAWS)]
-        errors = []
-        with self.run.progress(len(shares), "the grid's best once more") as bar:
-            for share in shares:
-                errors.append(sum(problem.error(share, draw) for draw in draws) / len(draws))
-                bar.advance(error=errors[-1])
-        self.tensors[f"{GRID}/0/final"] = shares[torch.tensor(errors).argmin()]
-        self.tensors[f"{GRID}/0/samples"] += problem.rendered - before
+        self.tensors.pop(f"{GRID}/0/known", None)
+        drives = problem.samples * (len(points.error) + FINAL_DRAWS * len(finals.error))
+        self.tensors |= {
+            f"{GRID}/0/share": points.share,
+            f"{GRID}/0/error": points.error,
+            f"{GRID}/0/final": finals.share[finals.best],
+            f"{GRID}/0/samples": torch.tensor(drives),
+        }
         self.save()
 
     def _made(self, number: int, name: str, total: int, make: Callable[..., Trail]) -> None:

@@ -13,7 +13,6 @@ from typing import TypeAlias
 import numpy as np
 import torch
 from torch import Tensor
-from torch.quasirandom import SobolEngine
 
 from codesign.errors import DomainError, NonFiniteError, ShapeError, check_seed, check_whole
 from codesign.optional import optional, require
@@ -26,7 +25,6 @@ cma = optional("cma", "search", "the search CMA-ES")
 optuna = optional("optuna", "search", "the search TPE")
 
 SIGMA = 0.25  # of CMA-ES: a quarter of the cube, as its authors advise
-SHRINK = 3.0  # of the refined grid
 SEED_BITS = 32
 
 
@@ -85,10 +83,10 @@ class Search:
 
 def uniform(start: Tensor, seed: int) -> Proposals:
     """Points spread evenly at random."""
-    random = torch.Generator().manual_seed(seed)
+    random = np.random.default_rng(seed)  # another stream than the starts'
     yield start
     while True:
-        yield torch.rand(start.shape, generator=random, dtype=torch.float64)
+        yield torch.from_numpy(random.random(len(start)))
 
 
 def evolved(start: Tensor, seed: int) -> Proposals:
@@ -157,42 +155,6 @@ def available(names: Iterable[str]) -> dict[str, Search]:
         if found[name].library:
             require(found[name].library, "search", f"the search {name}")
     return found
-
-
-def refined_grid(
-    judge: Judge,
-    dimensions: int,
-    count: int,
-    refinements: int = 2,
-    seed: int = 0,
-    advance: Callable[[float], object] = lambda error: None,
-) -> Trail:
-    """``count`` quasi-random points in the cube, then ``refinements`` times ``count`` / 5 in a cube about the best so far,
-    each a third as wide as the one before.
-
-    The smaller cubes stay whole inside the large one. Returns: Trail, best of all parts. Raises: as a Search.
-    """
-    check_whole(count, "refined grid: count")
-    part = max(1, count // 5)
-    return _followed(
-        _refined(check_whole(dimensions, "refined grid: dimensions"), count, part, refinements, seed),
-        judge,
-        count + refinements * part,
-        advance,
-    )
-
-
-def _refined(dimensions, count, part, refinements, seed):
-    engine = SobolEngine(dimensions, scramble=True, seed=seed)
-    best, least = torch.full((dimensions,), 0.5, dtype=torch.float64), math.inf
-    for level in range(refinements + 1):
-        half = 0.5 / SHRINK**level
-        middle = best.clamp(half, 1 - half)
-        for draw in engine.draw(part if level else count, dtype=torch.float64):
-            share = middle + half * (2 * draw - 1)
-            error = yield share
-            if error < least:
-                best, least = share, error
 
 
 def _followed(proposals, judge, count, advance):

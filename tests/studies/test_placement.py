@@ -21,7 +21,7 @@ from studies.placement import outcome
 from studies.placement.controls import controls, looking_back, pixel_errors, shuffled
 from studies.placement.descent import descend
 from studies.placement.problem import Problem, traced_camera
-from studies.placement.race import Race, feasible, shortened
+from studies.placement.race import KEPT_EVERY, Race, feasible, kept, shortened
 from studies.placement.resumption import asked, check_same
 from studies.placement.searches import SEARCHES, Trail
 
@@ -300,6 +300,36 @@ def test_held_numbers_are_not_searched(problem):
     everything = Problem(replace(pair, low=pair.design, high=pair.design), range(1), 1, 1)
     with pytest.raises(DomainError, match="hold all six"):
         feasible(everything, 1, 0)
+
+
+def test_a_grid_that_was_interrupted_repeats_no_more_than_was_not_kept(problem):
+    """It ends at the same mount, and looks once at what it knew."""
+    few = replace(problem)
+    calls = []
+
+    def error(share, samples):
+        calls.append(samples)
+        if len(calls) == 70:
+            raise KeyboardInterrupt
+        return float((share - 0.4).square().sum())
+
+    few.error = error
+    run = FakeRun(placement.Config(grid=60))
+    cut = Race(run, few)
+    with pytest.raises(KeyboardInterrupt):
+        cut.grid()
+    resumed = Race(run, few)
+    resumed.tensors = cut.tensors
+    resumed.grid()
+    whole = Race(run, few)
+    before = len(calls)
+    whole.grid()
+    answer = resumed.answer(0, "grid")
+    assert answer.tolist() == whole.answer(0, "grid").tolist()
+    assert kept(few, answer)
+    assert resumed.samples(0, "grid") == whole.samples(0, "grid") == (len(calls) - before) * few.samples
+    assert before == 70 + len(calls) - before - KEPT_EVERY
+    assert "grid/0/known" not in resumed.tensors
 
 
 class FakeRun:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from codesign.errors import DomainError, MissingPackageError, NonFiniteError, ShapeError
-from studies.placement.searches import SEARCHES, Trail, available, refined_grid
+from studies.placement.searches import SEARCHES, Trail, available
 
 D = torch.float64
 MINIMUM = torch.tensor([0.3, 0.62, 0.71, 0.9], dtype=D)
@@ -99,28 +99,6 @@ def test_a_flat_judge_does_not_end_a_search(search):
     assert heard == [1.0] * 300
     assert len(trail.share.unique(dim=0)) > 100, "it looks on elsewhere"
     assert optuna.logging.get_verbosity() == verbosity
-
-
-def test_the_refined_grid_closes_in():
-    """Each part is a Sobol set in its own cube: as wide as said, whole inside, about the best of the parts before."""
-    trail = refined_grid(coupled, 4, 128, seed=3)
-    assert len(trail.error) == 128 + 2 * 25
-    stages = ((0, 0.5), (128, 1 / 6), (153, 1 / 18))
-    for (first, half), last in zip(stages, (128, 153, 178), strict=True):
-        middle = torch.full((4,), 0.5, dtype=D)
-        if first:
-            middle = trail.share[int(trail.error[:first].argmin())].clamp(half, 1 - half)
-        offset = (trail.share[first:last] - middle) / half
-        assert float(offset.abs().max()) <= 1 + 1e-12
-        assert float(offset.abs().max()) > 0.9
-        # means of n even numbers from -1 to 1 have a standard deviation of 1 / sqrt(3 n); four of them
-        assert float(offset.mean(0).abs().max()) < 4 / math.sqrt(3 * (last - first))
-    best = [float(trail.error[:last].min()) for last in (128, 153, 178)]
-    assert best[2] < best[0] / 2
-    assert torch.equal(trail.share, refined_grid(coupled, 4, 128, seed=3).share)
-    at_wall = refined_grid(lambda share: float(share.sum()), 2, 50, refinements=3, seed=0)
-    assert float(at_wall.share.min()) >= 0
-    assert float(at_wall.error.min()) < 0.05
 
 
 def test_best_is_the_first_of_the_least():
