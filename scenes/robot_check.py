@@ -13,6 +13,7 @@ DRIVES = 6  # looked at in each world
 BLOCK_PX = 8
 LEAST_TEXTURE = 0.15  # of the blocks: the horizon over blank ground makes 0.08, the pairs have 0.4 and more
 STILL = 1e-6  # m/s and rad/s
+LEAST_FOLLOWED = 0.05  # of the pixels: the pairs have 0.7 and more
 
 
 @torch.no_grad()
@@ -23,12 +24,19 @@ def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Se
       world is made and one frame of six drives rendered.
     Raises: DomainError, in a sentence that says what to change, for a design outside its bounds, one that does not
       keep the pair's requirements, a box inside or far from the robot, a lens whose image circle is smaller than the
-      sensor (``place.check_mount``), drives that never move, and worlds of which less than LEAST_TEXTURE of what
-      the camera sees (blocks of 8 x 8 pixels) varies by more than the sensor's threshold.
+      sensor (``place.check_mount``), a box that reaches under the ground whose depth is believed in, drives that
+      never move or so fast that less than LEAST_FOLLOWED of the picture stays within a window's width, and worlds of
+      which less than LEAST_TEXTURE of what the camera sees (blocks of 8 x 8 pixels) varies by more than the
+      sensor's threshold.
     """
     pair.check(pair.design)
     camera = pair.design.camera() if camera is None else camera
     place.check_mount(robot_pair.mount_at(pair.ranges, pair.design.mount()), pair.requirements(), camera)
+    if pair.depth == "ground" and pair.low.z_m <= pair.ground_z_m:
+        raise DomainError(
+            f"pair '{pair.name}': the camera may sit as low as {pair.low.z_m:g} m in body axes, and the ground, from which depth "
+            f"is known, lies at {pair.ground_z_m:.3g} m; raise the box."
+        )
     for number in numbers:
         poses, twist = pair.drive(number, DRIVES)
         if not float(twist.abs().max()) > STILL:
@@ -41,7 +49,17 @@ def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Se
             raise DomainError(
                 f"pair '{pair.name}': world {number} has no texture where the camera looks: {share:.0%} of blocks of "
                 f"{BLOCK_PX} x {BLOCK_PX} pixels vary by more than the sensor's threshold, {LEAST_TEXTURE:.0%} are the "
-                "least; paint its surfaces with pictures of radiance 0 to 255, or turn the start to where there are some."
+                "least; paint its surfaces with pictures of radiance 0 to 255, turn the start to where there are some, or see "
+                "whether so long, wide or wrongly focused a lens blurs them."
+            )
+        ends = poses[:, [1, -1]] @ pair.design.mount()
+        flow_px, valid = render.true_flow(camera, pair.world(number), ends)
+        followed = float((valid & (flow_px.norm(dim=2) <= robot_pair.WINDOW_PX)).double().mean())
+        if followed < LEAST_FOLLOWED:
+            raise DomainError(
+                f"pair '{pair.name}': in drives {number} {followed:.0%} of the picture moves by less than the width of a window "
+                f"({robot_pair.WINDOW_PX} pixels in {1e3 * robot_pair.DURATION_S:g} ms), {LEAST_FOLLOWED:.0%} are the least; drive "
+                "more slowly, or take a shorter lens."
             )
 
 

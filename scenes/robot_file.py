@@ -14,7 +14,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import TypeAlias, get_args, get_type_hints
+from typing import TypeAlias, get_args, get_origin, get_type_hints
 
 from codesign import plain_yaml
 from codesign.errors import CodesignError, DomainError, FileFormatError, as_number
@@ -25,6 +25,7 @@ Three: TypeAlias = tuple[float, float, float]
 VELOCITIES = ("planar", "free")
 DEPTHS = ("ground", "scene")
 MOST_BYTES = 1_000_000
+LEAST_FNO = 0.5  # 1 / (2 sin u) of a lens without spherical aberration and coma, at u = 90 degrees
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,13 @@ class OwnLens:
     focus_m: float = 1.8
 
     def __post_init__(self):
-        for name in ("focal_length_mm", "fno"):
-            if not getattr(self, name) > 0:
-                raise DomainError(f"lens: {name} is {getattr(self, name):g}; a number > 0 is needed.")
+        if not self.focal_length_mm > 0:
+            raise DomainError(f"lens: focal_length_mm is {self.focal_length_mm:g}; a number > 0 is needed.")
+        if not self.fno >= LEAST_FNO:
+            raise DomainError(
+                f"lens: fno is {self.fno:g}; no lens in air has less than {LEAST_FNO:g} (its light would come from more than "
+                "half of all directions)."
+            )
         if not 1e3 * self.focus_m > self.focal_length_mm:
             raise DomainError(
                 f"lens: focus_m is {self.focus_m:g}; it must lie beyond the focal length, {self.focal_length_mm:g} mm."
@@ -129,7 +134,8 @@ class OwnRobot:
     """A user's robot, and how its camera is judged.
 
     robot: URDF or mesh file. camera: bounds of the mount. without: links left out, those that move with the camera.
-    start: of the mount. lens: held.
+    start: of the mount. lens: held. packages: package -> folder, for package:// paths of a URDF. unit_m: metres per unit of
+    the robot's mesh file, world_unit_m of the world's; None is as the file says it, or metres.
     world: "outdoors", "corridor" or "flight", or a file: a mesh (metres, z up; glTF y up) or a Mitsuba scene (.xml).
     motion: the drives of a pair by the same names, or a file of poses T_world_body (scenes.tum); None is the world's.
     velocities: which count, "planar" or "free"; None is as the pair has it that the motion names, "free" for a file.
@@ -144,6 +150,9 @@ class OwnRobot:
     without: tuple[str, ...] = ()
     start: Start = field(default_factory=Start)
     lens: OwnLens = field(default_factory=OwnLens)
+    packages: dict[str, str] = field(default_factory=dict)
+    unit_m: float | None = None
+    world_unit_m: float | None = None
     world: str = "outdoors"
     motion: str | None = None
     velocities: str | None = None
@@ -161,10 +170,20 @@ class OwnRobot:
         for name, known in (("velocities", VELOCITIES), ("depth", DEPTHS)):
             if getattr(self, name) not in (None, *known):
                 raise DomainError(f"{name} is '{getattr(self, name)}'; give {' or '.join(known)}.")
-        if self.motion is None and self.world not in PAIRS:
+        for name, of in (("unit_m", self.robot), ("world_unit_m", self.world)):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise DomainError(
+                    f"{name} is {value:g}; metres > 0 are needed, such as 0.001 for millimetres."
+                )
+            if value is not None and (of in PAIRS or Path(of).suffix.lower() == ".urdf"):
+                raise DomainError(f"{name} is of mesh files, and '{of}' is in metres; leave it out.")
+        opened = self.lens.focal_length_mm / self.lens.fno
+        if opened > 2e3 * self.require.clearance.radius_m:
             raise DomainError(
-                f"motion is missing: the world '{self.world}' is a file and has no drives; give a file of poses, or "
-                f"one of {', '.join(PAIRS)}."
+                f"lens: {self.lens.focal_length_mm:g} mm at f/{self.lens.fno:g} is {opened:.3g} mm wide, wider than the "
+                f"camera's housing, {2e3 * self.require.clearance.radius_m:g} mm; stop it down, take a shorter lens, or give "
+                "require.clearance.radius_m."
             )
         if self.motion in PAIRS and self.world in PAIRS and self.motion != self.world:
             raise DomainError(
@@ -190,9 +209,9 @@ def read_own(path: str | Path) -> OwnRobot:
         raise type(error)(f"robot page '{path}': {error}") from error
     here = path.parent
     files = {name: getattr(own, name) for name in ("robot", "world", "motion")}
-    return replace(
-        own, **{name: str(here / file) for name, file in files.items() if file and file not in PAIRS}
-    )
+    packages = {name: str(here / folder) for name, folder in own.packages.items()}
+    given = {name: str(here / file) for name, file in files.items() if file and file not in PAIRS}
+    return replace(own, packages=packages, **given)
 
 
 def _filled(kind, page, entry):
@@ -216,6 +235,10 @@ def _filled(kind, page, entry):
 def _value(kind, given, entry):
     """What stands at an entry, checked to be of a kind: text, a number, so many of them, or a mapping."""
     parts = get_args(kind)
+    if get_origin(kind) is dict:
+        if not isinstance(given, Mapping):
+            raise DomainError(f"{entry} is {given!r}; write name: value below it, indented by two spaces.")
+        return {name: _value(parts[1], each, f"{entry}.{name}") for name, each in given.items()}
     if type(None) in parts:
         return None if given is None else _value(parts[0], given, entry)
     if is_dataclass(kind):

@@ -132,10 +132,10 @@ def _bodies(own):
     """Meshes in body axes, less those that move with the camera, and the name of the axes."""
     path = _file("robot", own.robot, (".urdf", *mesh_files.KINDS))
     if path.suffix.lower() == ".urdf":
-        robot = robots.from_urdf(path)
+        robot = robots.from_urdf(path, packages=own.packages)
         parts, frame = list(robot.parts), robot.base
     else:
-        parts, frame = mesh_files.read(path, materials=False), "base_link"
+        parts, frame = mesh_files.read(path, own.unit_m, materials=False), "base_link"
     names = sorted({part.name for part in parts})
     unknown = [name for name in own.without if name not in names]
     if unknown:
@@ -158,10 +158,15 @@ def _world(own):
         named = PAIRS[own.world]()
         return named.world, named.depth
     path = _file("world", own.world, (*mesh_files.KINDS, ".xml"))
+    if own.motion is None:
+        raise DomainError(
+            f"motion is missing: the world '{own.world}' is a file and has no drives; give a file of poses, or one of "
+            f"{', '.join(PAIRS)}."
+        )
     if path.suffix.lower() == ".xml":
-        scene = worlds.from_mitsuba(path, gain=WHITE)
+        scene = worlds.from_mitsuba(path, gain=WHITE, unit_m=own.world_unit_m or 1.0)
     else:
-        scene = worlds.from_mesh(path, background=DULL)
+        scene = worlds.from_mesh(path, background=DULL, unit_m=own.world_unit_m)
 
     def same(number: int) -> render.MitsubaScene:
         return scene
@@ -176,7 +181,7 @@ def _standing(named, bodies):
     if reach > ROOM_M:
         raise DomainError(
             f"robot: it reaches {reach:.3g} m from its origin, the drives of '{named.name}' have room for {ROOM_M:g} m; "
-            "give a mesh in metres, or a world and a trajectory of your own."
+            "give a mesh in metres, or its unit_m, or a world and a trajectory of your own."
         )
     if named.axes == place.FREE:
         return named.drive

@@ -82,8 +82,19 @@ class Run(Generic[Config]):
         if resumed and (stored := self._stored()) is not None:
             self._earlier_s = stored.numbers[TIMES]["seconds"]
             self._paces = {name: Pace(**pace) for name, pace in stored.numbers[TIMES]["loops"].items()}
+            self._continue_from(stored.numbers[TIMES].get("commit"))
         if resumed and (folder / "metrics.json").exists():
             self.metrics = _read_metrics(folder / "metrics.json")
+
+    def _continue_from(self, commit):
+        """Say, here and among the versions, that other code than this made a part of the results."""
+        versions = self._machine["versions"]
+        now = versions["commit"]
+        if commit is None or commit.endswith(now):
+            versions["commit"] = commit or now
+            return
+        self.say(f"This run was made so far by commit {commit}, and goes on with {now}.")
+        versions["commit"] = f"{commit}, {now}"
 
     def say(self, text: str):
         """Print a line, above the progress bar when there is one."""
@@ -116,6 +127,7 @@ class Run(Generic[Config]):
         times = {
             "seconds": self.seconds,
             "loops": {name: pace.to_json() for name, pace in self._paces.items()},
+            "commit": self._machine["versions"]["commit"],
         }
         state.write_state(self.folder / "state.npz", tensors, {"numbers": numbers, TIMES: times})
 

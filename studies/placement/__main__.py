@@ -110,6 +110,8 @@ def checked(size: Config) -> None:
             raise DomainError(
                 f"--{name.replace('_', '-')} is {getattr(size, name)}; a world has {DRIVES} drives."
             )
+    if len(set(size.searches)) < len(size.searches):
+        raise DomainError(f"--searches {' '.join(size.searches)} names one twice; name each once.")
     if size.seed < 0:
         raise DomainError(f"--seed is {size.seed}; the searches need 0 or more.")
     if size.focal_mm is not None and size.lens is None:

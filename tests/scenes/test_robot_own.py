@@ -60,6 +60,8 @@ def page(tmp_path):
     (tmp_path / "short.csv").write_text(csv(t_s[:2], screw([0.0, 0.05])))
     (tmp_path / "still.csv").write_text(csv(t_s, screw(np.zeros(31))))
     (tmp_path / "parks.csv").write_text(csv(t_s, screw(np.minimum(t_s - t_s[0], 0.9))))
+    (tmp_path / "fast.csv").write_text(csv(t_s, screw(300 * (t_s - t_s[0]))))
+    textured_room(tmp_path)
     (tmp_path / "back.csv").write_text(csv(t_s[::-1], screw(t_s - t_s[0])))
 
     def write(text, name="page.yaml"):
@@ -243,7 +245,7 @@ FAULTS = {
     "yaml": (PAGE + "without: {a: 1}", "line 8"),
     "no file": (PAGE.replace("box.obj", "bux.obj"), "robot: there is no file '.*bux.obj'"),
     "kind": (PAGE.replace("box.obj", "notes.txt"), "robot: '.*notes.txt' is of no kind .* give .urdf, .obj"),
-    "no world": (PAGE + "world: none.obj\nmotion: screw.csv", "world: there is no file"),
+    "no world": (PAGE + "world: none.obj", "world: there is no file"),
     "world's kind": (PAGE + "world: outdoor\nmotion: screw.csv", "world: '.*outdoor' is of no kind"),
     "no motion": (PAGE + "motion: none.csv", "motion: there is no file"),
     "motion missing": (PAGE + "world: blank.obj", "motion is missing: the world '.*blank.obj' is a file"),
@@ -255,7 +257,15 @@ FAULTS = {
     "straight down": (PAGE.replace("start:", "  pitch_deg: [0, 90]\nstart:"), "strictly between -90 and 90"),
     "start": (PAGE.replace("pitch_deg: 30", "pitch_deg: 85"), "start: pitch_deg is 85, outside .* 0 to 80"),
     "start's place": (PAGE + "  x_m: 0.5", "start: x_m is 0.5, outside .* 0.24 to 0.34"),
-    "lens": (PAGE + "lens:\n  fno: 0", "lens: fno is 0"),
+    "lens": (PAGE + "lens:\n  fno: 0", "lens: fno is 0; no lens in air has less than 0.5"),
+    "no lens": (PAGE + "lens:\n  focal_length_mm: 0", "focal_length_mm is 0; a number > 0"),
+    "telescope": (PAGE + "lens:\n  focal_length_mm: 500", "500 mm at f/1.2 is 417 mm wide, wider than .* housing, 40 mm"),
+    "unit": (PAGE + "unit_m: 0", "unit_m is 0; metres > 0"),
+    "unit of a pair": (PAGE + "world_unit_m: 0.01", "world_unit_m is of mesh files, and 'outdoors' is in metres"),
+    "packages": (PAGE + "packages: 3", "packages is 3; write name: value below it"),
+    "package": (PAGE + "packages:\n  arm: 3", "packages.arm is 3; give text"),
+    "fast": (PAGE + "motion: fast.csv\nworld: room.obj", "drives 0 .*% of the picture moves by less than the width"),
+    "under ground": (PAGE.replace("0.25]", "-0.1]"), "as low as -0.1 m in body axes, and the ground, .* lies at -0.058 m"),
     "focus": (PAGE + "lens:\n  focus_m: 0.006", "focus_m is 0.006; it must lie beyond the focal length, 6.5 mm"),
     "velocities": (PAGE + "velocities: flat", "velocities is 'flat'; give planar or free"),
     "depth": (PAGE + "depth: none", "depth is 'none'; give ground or scene"),
@@ -284,6 +294,30 @@ def test_a_robot_in_millimetres_has_no_room_in_the_worlds_of_pairs(page, tmp_pat
     (tmp_path / "box.obj").write_text(obj(robot_parts.box((400.0, 300.0, 200.0), (0.0, 0.0, 50.0))))
     with pytest.raises(DomainError, match=r"reaches 250 m from its origin, .* give a mesh in metres"):
         own_pair(page(PAGE))
+
+
+def test_a_mesh_counts_in_the_unit_that_the_page_says(page, tmp_path):
+    (tmp_path / "box.obj").write_text(obj(robot_parts.box((400.0, 300.0, 200.0), (0.0, 0.0, 50.0))))
+    said = own_pair(page(PAGE + "unit_m: 0.001\nworld: room.obj\nworld_unit_m: 0.5\nmotion: screw.csv\n"))
+    [body] = said.bodies.values()
+    assert body.vertices_m.max(0).tolist() == pytest.approx([0.2, 0.15, 0.15])
+    assert said.world(0).scene.bbox().max.x == pytest.approx(1.5)
+
+
+def test_a_package_of_a_urdf_lies_where_the_page_says(page, tmp_path):
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "box.obj").rename(tmp_path / "parts" / "box.obj")
+    (tmp_path / "robot.urdf").write_text(
+        '<robot name="r"><link name="base"><visual><geometry><mesh filename="package://mine/box.obj"/></geometry></visual>'
+        "</link></robot>"
+    )
+    urdf = PAGE.replace("box.obj", "robot.urdf")
+    with pytest.raises(FileFormatError, match="packages"):
+        own_pair(page(urdf))
+    [body] = own_pair(page(urdf + "packages:\n  mine: parts\n")).bodies.values()
+    assert body.vertices_m.max(0).tolist() == pytest.approx([0.2, 0.15, 0.15])
+    with pytest.raises(DomainError, match=r"unit_m is of mesh files, and '.*robot.urdf' is in metres"):
+        own_pair(page(urdf + "unit_m: 0.001\n"))
 
 
 def test_a_page_that_is_no_text_is_refused(tmp_path):

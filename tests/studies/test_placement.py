@@ -188,6 +188,7 @@ def test_shuffled_events_are_as_many_in_every_bin(problem):
         (["--seed", "-1"], "--seed is -1"),
         (["--judged-drives", "49"], "a world has 48 drives"),
         (["--searches", "oracle"], "search 'oracle' is unknown"),
+        (["--searches", "random", "random"], "names one twice"),
         (["--robot", "nowhere.yaml"], "nowhere.yaml"),
         (["--lens", "nowhere.zmx"], "nowhere.zmx"),
         (["--focal-mm", "8"], "give --lens too"),

@@ -396,6 +396,20 @@ def test_what_is_typed_comes_before_what_quick_sets(tmp_path, typed, ran):
     assert config["sizes"] == [1, 2]
 
 
+def test_a_run_that_other_code_goes_on_with_says_so(tmp_path, monkeypatch, capsys):
+    commits = iter(["a1", "a1", "b2", "b2"])
+    monkeypatch.setattr("studies.frame.machine._commit", lambda root: next(commits))
+    run = open_run("test_run", Config(out=tmp_path / "out"))
+    said = []
+    for _ in range(3):
+        run.save_state({}, {})
+        run = open_run("test_run", Config(resume=tmp_path / "out"))
+        run.record(one=1.0)
+        said.append(json.loads((tmp_path / "out" / "metrics.json").read_text())["versions"]["commit"])
+    assert said == ["a1", "a1, b2", "a1, b2"]
+    assert capsys.readouterr().out.count("made so far by commit a1, and goes on with b2") == 1
+
+
 def test_resume_refuses_only_what_differs_from_the_stored_run(tmp_path, capsys):
     out = tmp_path / "out"
     assert main(record_one, Config, ["--out", str(out), "--quick", "--limit", "0.5"]) == 0
