@@ -7,7 +7,9 @@ error is M^-1 (J^T W (f - c J v) - L v), so with flow errors of mean b and covar
     mean  M^-1 (J^T W b - L v),   covariance  M^-1 (J^T W V W J) M^-1.
 
 V is what the flow's estimator claims, and what it does not know of: a share of the flow's length (windows are not affine,
-pictures change), and a flow of which nothing is left once it is beyond the estimator's reach. b is the flow that the
+pictures change), and a flow of which nothing is left once it is beyond the estimator's reach; both are taken of J v
+rather than of the c J v that the estimator would read, and as independent from point to point, though flow that is lost
+is drawn to zero in whole windows. b is the flow that the
 estimator of the velocity expects wrongly, because it believes in another depth than there is. What only single draws
 know, in which way an error points, is not in it: of that the gradient would change its sign with every pixel by which
 the picture shifts.
@@ -28,7 +30,7 @@ class FlowErrors:
     """Errors of flow beyond the covariance that its estimator claims.
 
     claimed: factor on the claimed deviation. share: deviation per component, of the flow's length. reach_px: flow of
-    this length is lost half of the time; width_px: by which the odds of being lost grow to e times.
+    this length is lost half of the time; width_px: by which the odds of that grow to e times.
     """
 
     claimed: float = 1.0
@@ -92,7 +94,7 @@ def expected_errors(
     covariance = errors.covariance(read, flow_px)
     wrong = read.confidence[..., None] * (flow_px - (read.rows @ velocity)[..., 0])
     second = covariance + wrong[..., :, None] * wrong[..., None, :]
-    misfit = (read.precision * second).sum((-2, -1))  # E e^T W e: 2 where the claim is right
+    misfit = (read.precision * second).sum((-2, -1))  # E e^T W e: 2 c where the claim is right
     kept = 1.0 if estimator.outlier is None else (1 + misfit / 2 / estimator.outlier**2) ** -2
     believed = kept * read.share
     weighed = read.rows.mT @ read.precision  # [N, P, K, 2]
