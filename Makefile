@@ -87,5 +87,5 @@ doctor: setup ## what is installed, what is missing, what to do
 	@$(RUN) -m codesign doctor
 
 clean: ## remove the environment and caches; results in runs/ stay
-	rm -rf .venv build *.egg-info .pytest_cache .ruff_cache
+	rm -rf .venv build *.egg-info .pytest_cache .pytest_log .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
