@@ -57,6 +57,8 @@ class Config(StudyConfig):
     """Searches beside the gradient."""
     rivals_expect: bool = False
     """Searches beside the gradient minimise what it descends, instead of errors with hard counts."""
+    rivals_fresh: bool = False
+    """Searches beside the gradient see other drives at every mount, as its steps do, instead of always the same."""
     grid: int = 0
     """Mounts of a quasi-random grid that is refined twice, the best of each cube looked at again; 0 for none."""
     judged_worlds: int = 12

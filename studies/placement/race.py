@@ -1,6 +1,7 @@
 """The searches for a mount from the same starts at equal renders, what each ends with, and its error in worlds that none
 saw; all of it kept in the run's state."""
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -99,16 +100,18 @@ class Race:
         self._made(number, GRADIENT, steps, lambda advance: descend(slope, start, steps, advance))
 
     def search(self, number: int, name: str, start: Tensor) -> None:
-        """A search without gradients at as many samples as the descent rendered, all on the same ones."""
+        """A search without gradients at as many samples as the descent rendered, all on the same ones unless it is asked
+        for others."""
         size = self.run.config
-        draw = 1000 * (size.seed + number)
-        samples = self.problem.draw(draw)
+        first = 1000 * (size.seed + number)
+        steps = itertools.count()
 
         def error(share):
+            draw = first + (next(steps) if size.rivals_fresh else 0)
             if size.rivals_expect:
                 with torch.no_grad():
                     return float(objective(self.problem, split(share), draw))
-            return self.problem.error(share, samples)
+            return self.problem.error(share, self.problem.draw(draw))
 
         count = max(2, self.samples(number, GRADIENT) // self.problem.samples)
         seed = size.seed + number

@@ -333,6 +333,22 @@ def test_a_grid_that_was_interrupted_repeats_no_more_than_was_not_kept(problem):
     assert "grid/0/known" not in resumed.tensors
 
 
+@pytest.mark.parametrize("fresh", [False, True])
+def test_rivals_see_the_same_drives_unless_they_are_asked_for_others(problem, fresh):
+    watched = replace(problem)
+    seen = []
+
+    def error(share, samples):
+        seen.append(samples.seed)
+        return float((share - 0.4).square().sum())
+
+    watched.error = error
+    race = Race(FakeRun(placement.Config(rivals_fresh=fresh)), watched)
+    race.tensors["gradient/2/samples"] = torch.tensor(5 * watched.samples)
+    race.search(2, "random", watched.start)
+    assert seen == [2000 + fresh * k for k in range(5)]
+
+
 class FakeRun:
     """A run that keeps nothing."""
 
