@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, wraps
+from functools import lru_cache, wraps
 from typing import Any, NamedTuple
 
 import torch
@@ -60,21 +60,30 @@ class Form(NamedTuple):
 
 
 def recorded(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of drjit arrays and hashable settings that is traced once for each of the settings, and replayed
-    after that: small images cost mostly tracing. Widths of arrays must follow from the settings."""
+    """A function of hashable settings and then drjit arrays or lists of them, which is traced once for each of the
+    settings and replayed after that: small images cost mostly tracing. Widths of arrays must follow from the settings.
 
-    @cache
-    def frozen():
+    While drjit looks at what a recording is given, or at what its closure holds, it holds its own lock. Where that runs
+    anything in Python, as for a dataclass, another thread may get Python's lock and wait for drjit's for ever (one that
+    gives tensors back to torch does). So settings, which have methods in Python, are not given but bound as defaults.
+    """
+
+    @lru_cache(RECORDINGS)
+    def frozen(settings):
         import drjit as dr
 
-        return dr.freeze(kernel, limit=RECORDINGS, warn_after=1 << 30)
+        def of_arrays(*arrays, settings=settings, kernel=kernel):
+            return kernel(*settings, *arrays)
+
+        return dr.freeze(of_arrays, warn_after=1 << 30)
 
     @wraps(kernel)
     def run(*args):
         import drjit as dr
 
+        given = tuple(each for each in args if isinstance(each, list) or dr.is_array_v(each))
         with dr.suspend_grad():
-            return frozen()(*args)
+            return frozen(args[: len(args) - len(given)])(*given)
 
     return run
 

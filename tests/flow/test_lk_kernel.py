@@ -1,15 +1,19 @@
 """The kernels of the closed form against the same written down in torch (lk_reference) and scipy, against
 differences, and against a plane that moves."""
 
+import sys
+
 import drjit as dr
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import correlate1d
 
+from codesign import flow
 from codesign.errors import DomainError, GradientError, ShapeError
 from codesign.flow import lk_kernel, lk_warp_kernel
 from codesign.flow.lk_lanes import Grid
+from codesign.types import EventVolume
 from tests.flow import lk_reference
 
 D = torch.float64
@@ -173,6 +177,30 @@ def test_other_sizes_need_no_new_kernel_but_for_copies_to_scatter_into(generator
     assert len(first) >= 9
     # several threads scatter into a copy each, whose size is part of the one kernel that does
     assert len(kernels((4, 3, 80, 21, 4, 5)) - first) <= (dr.thread_count() > 1)
+
+
+def test_replaying_runs_no_python_while_drjit_holds_its_lock(generator):
+    """Another thread that got Python's lock meanwhile would wait for drjit's, and this one for Python's, for ever."""
+    (counts,) = leaves(torch.rand(2, 2, 5, 32, 32, dtype=D, generator=generator))
+    times_s = torch.linspace(0, 0.02, 5, dtype=D)
+
+    def passes():
+        found = flow.estimate_lk(EventVolume(counts, times_s, torch.full((5,), 0.004, dtype=D)))
+        torch.autograd.grad(found.flow_px.sum() + found.covariance_px2.sum(), counts)
+
+    passes()
+    replays, called = [], []
+
+    def watch(frame, event, arg):
+        outer = frame.f_back.f_code if frame.f_back else None
+        if event == "call" and outer and outer.co_filename == dr.__file__ and outer.co_name == "__call__":
+            (replays if frame.f_code.co_name == "capture_closure" else called).append(frame.f_code.co_name)
+
+    sys.setprofile(watch)
+    passes()
+    sys.setprofile(None)
+    assert len(replays) > 10
+    assert called == []
 
 
 def test_a_second_derivative_is_refused(generator):
