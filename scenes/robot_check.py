@@ -32,10 +32,11 @@ def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Se
     pair.check(pair.design)
     camera = pair.design.camera() if camera is None else camera
     place.check_mount(robot_pair.mount_at(pair.ranges, pair.design.mount()), pair.requirements(), camera)
-    if pair.depth == "ground" and pair.low.z_m <= pair.ground_z_m:
+    if pair.depth == "ground" and pair.low.z_m - pair.housing_radius_m <= pair.ground_z_m:
         raise DomainError(
-            f"pair '{pair.name}': the camera may sit as low as {pair.low.z_m:g} m in body axes, and the ground, from which depth "
-            f"is known, lies at {pair.ground_z_m:.3g} m; raise the box."
+            f"pair '{pair.name}': the camera may sit as low as {pair.low.z_m:g} m in body axes, its housing has a radius of "
+            f"{pair.housing_radius_m:g} m, and the ground, from which depth is known, lies at {pair.ground_z_m + 0.0:.3g} m; raise "
+            "the box."
         )
     for number in numbers:
         poses, twist = pair.drive(number, DRIVES)
@@ -49,8 +50,8 @@ def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Se
             raise DomainError(
                 f"pair '{pair.name}': world {number} has no texture where the camera looks: {share:.0%} of blocks of "
                 f"{BLOCK_PX} x {BLOCK_PX} pixels vary by more than the sensor's threshold, {LEAST_TEXTURE:.0%} are the "
-                "least; paint its surfaces with pictures of radiance 0 to 255, turn the start to where there are some, or see "
-                "whether so long, wide or wrongly focused a lens blurs them."
+                "least; paint its surfaces with pictures of radiance 0 to 255, turn the start to where there are some, see "
+                "whether so long, wide or wrongly focused a lens blurs them, or whether world and motion are in other units or places."
             )
         ends = poses[:, [1, -1]] @ pair.design.mount()
         flow_px, valid = render.true_flow(camera, pair.world(number), ends)

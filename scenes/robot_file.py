@@ -1,6 +1,6 @@
 """A page of plain YAML that describes a user's robot: its body, where its camera may sit, what it moves through and how.
 
-    robot: rover.urdf          # or .obj, .stl, .ply, .dae, .gltf, .glb: metres, x forward, y left, z up
+    robot: rover.urdf          # or .obj, .stl, .ply, .dae, .gltf, .glb: metres, or unit_m; x forward, y left, z up
     without: [camera_link]     # links that move with the camera
     camera:
       low_m: [0.1, -0.1, 0.4]
@@ -176,14 +176,21 @@ class OwnRobot:
                 raise DomainError(
                     f"{name} is {value:g}; metres > 0 are needed, such as 0.001 for millimetres."
                 )
-            if value is not None and (of in PAIRS or Path(of).suffix.lower() == ".urdf"):
+            if value is not None and of in PAIRS:
                 raise DomainError(f"{name} is of mesh files, and '{of}' is in metres; leave it out.")
+            if value is not None and Path(of).suffix.lower() == ".urdf":
+                raise DomainError(
+                    f"{name} is of mesh files, and '{of}' is in metres; give its meshes a scale there, such as "
+                    'scale="0.001 0.001 0.001" for millimetres.'
+                )
+        if self.packages and Path(self.robot).suffix.lower() != ".urdf":
+            raise DomainError(f"packages are of URDFs, and '{self.robot}' is none; leave them out.")
         opened = self.lens.focal_length_mm / self.lens.fno
         if opened > 2e3 * self.require.clearance.radius_m:
             raise DomainError(
                 f"lens: {self.lens.focal_length_mm:g} mm at f/{self.lens.fno:g} is {opened:.3g} mm wide, wider than the "
-                f"camera's housing, {2e3 * self.require.clearance.radius_m:g} mm; stop it down, take a shorter lens, or give "
-                "require.clearance.radius_m."
+                f"camera's housing, {2e3 * self.require.clearance.radius_m:g} mm; stop it down, take a shorter lens, or give a "
+                "larger require.clearance.radius_m."
             )
         if self.motion in PAIRS and self.world in PAIRS and self.motion != self.world:
             raise DomainError(

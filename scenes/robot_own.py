@@ -76,6 +76,7 @@ def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
         ground_z_m=-float(middle[:, 2, 3].mean()),
         frame=frame,
         files=tuple(Path(name) for name in (own.robot, own.world, own.motion) if name and name not in PAIRS),
+        page=repr(own),
     )
 
 
@@ -131,6 +132,13 @@ def _file(entry, name, kinds=()):
 def _bodies(own):
     """Meshes in body axes, less those that move with the camera, and the name of the axes."""
     path = _file("robot", own.robot, (".urdf", *mesh_files.KINDS))
+    missing = [
+        f"'{name}' in '{folder}'" for name, folder in own.packages.items() if not Path(folder).is_dir()
+    ]
+    if missing:
+        raise FileFormatError(
+            f"packages: there is no folder for {', '.join(missing)}; paths count from the folder of the page."
+        )
     if path.suffix.lower() == ".urdf":
         robot = robots.from_urdf(path, packages=own.packages)
         parts, frame = list(robot.parts), robot.base

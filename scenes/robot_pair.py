@@ -105,7 +105,8 @@ class RobotPair:
     housing_radius_m, margin_m: of the camera, and by how much it must stay clear of the body. own_body_share: of the
       image, that the body may cover. cable: direction in body axes and half angle in radians of a cone into which the
       camera's back must not point; None where it may point anywhere. ground_z_m: height of the ground in body axes.
-    frame: name of the body's axes (REP 105). files: of which the pair was made, where a user gave them.
+    frame: name of the body's axes (REP 105). files: of which the pair was made, where a user gave them; page: what they
+      wrote of it.
     """
 
     name: str
@@ -126,6 +127,7 @@ class RobotPair:
     ground_z_m: float = 0.0
     frame: str = "base_footprint"
     files: tuple[Path, ...] = ()
+    page: str = ""
 
     def check(self, design: Design) -> Design:
         """The design. Raises: DomainError where a number of it lies outside the bounds."""

@@ -82,7 +82,7 @@ class Run(Generic[Config]):
         if resumed and (stored := self._stored()) is not None:
             self._earlier_s = stored.numbers[TIMES]["seconds"]
             self._paces = {name: Pace(**pace) for name, pace in stored.numbers[TIMES]["loops"].items()}
-            self._continue_from(stored.numbers[TIMES].get("commit"))
+            self._continue_from(stored.numbers[TIMES].get("commit", "unknown"))
         if resumed and (folder / "metrics.json").exists():
             self.metrics = _read_metrics(folder / "metrics.json")
 
@@ -90,8 +90,8 @@ class Run(Generic[Config]):
         """Say, here and among the versions, that other code than this made a part of the results."""
         versions = self._machine["versions"]
         now = versions["commit"]
-        if commit is None or commit.endswith(now):
-            versions["commit"] = commit or now
+        if commit.split(", ")[-1] == now:
+            versions["commit"] = commit
             return
         self.say(f"This run was made so far by commit {commit}, and goes on with {now}.")
         versions["commit"] = f"{commit}, {now}"

@@ -21,7 +21,7 @@ from studies.frame.run import Run, StudyConfig, main
 from studies.placement.outcome import Outcome
 from studies.placement.page import report
 from studies.placement.problem import DRIVES, Problem, traced_camera
-from studies.placement.race import Race, certified, feasible, judge, judge_along
+from studies.placement.race import Race, certified, check_grid, feasible, judge, judge_along
 from studies.placement.searches import SEARCHES, available
 
 SPREAD = 12  # worlds of a step at most
@@ -86,6 +86,7 @@ def study(run: Run[Config]) -> None:
     unseen = Problem(pair, judged_in, size.judged_worlds, size.judged_drives, camera=camera)
     race = Race(run, problem)
     starts = feasible(problem, size.seeds, size.seed)
+    check_grid(problem, size.grid, size.seed)
     ways = certified(run, race, starts[0])
     for number, start in enumerate(starts):
         race.descent(number, start, ways)

@@ -14,7 +14,7 @@ from codesign import grad, task
 from codesign.errors import DomainError
 from studies.frame.run import Run
 from studies.placement.descent import descend, settled
-from studies.placement.grid import looks, refined_grid
+from studies.placement.grid import first_points, looks, refined_grid
 from studies.placement.problem import Problem
 from studies.placement.resumption import asked, check_same
 from studies.placement.searches import SEARCHES, Trail
@@ -47,6 +47,14 @@ def feasible(problem: Problem, count: int, seed: int) -> list[Tensor]:
         f"of {TRIES} mounts within the bounds {len(found)} keep what is required, {count} are needed; widen the bounds, or "
         "ask for less."
     )
+
+
+def check_grid(problem: Problem, count: int, seed: int) -> None:
+    """Raise DomainError where a grid has no point that is allowed to begin with."""
+    if count and not any(kept(problem, share) for share in first_points(6, count, seed)):
+        raise DomainError(
+            f"of {count} mounts of the grid none keeps what is required; give --grid more of them, or ask for less."
+        )
 
 
 def kept(problem: Problem, share: Tensor) -> bool:
@@ -127,8 +135,8 @@ class Race:
         self._made(number, name, count, make)
 
     def grid(self) -> None:
-        """The refined grid, looked at again with draws that did not choose its points. What is known of it is kept while it
-        goes on."""
+        """The refined grid: all its points with the draw of the first search, the best of each cube again with others. What is
+        known of it is kept when it is interrupted, and every so often."""
         if f"{GRID}/0/final" in self.tensors:
             return
         problem, size = self.problem, self.run.config
@@ -137,6 +145,11 @@ class Race:
         known = self.tensors.get(f"{GRID}/0/known", torch.zeros(0, dtype=torch.float64)).tolist()
         replayed = iter(known[:])
 
+        def keep():
+            if f"{GRID}/0/final" not in self.tensors:
+                self.tensors[f"{GRID}/0/known"] = torch.tensor(known, dtype=torch.float64)
+                self.save()
+
         def look(share, again):
             error = next(replayed, None)
             if error is None:
@@ -144,18 +157,14 @@ class Race:
                 error = sum(problem.error(share, draw) for draw in draws) / len(draws)
                 known.append(error)
                 if len(known) % KEPT_EVERY == 0:
-                    self.tensors[f"{GRID}/0/known"] = torch.tensor(known, dtype=torch.float64)
-                    self.save()
+                    keep()
+                bar.advance(error=error)
             return error
 
-        with self.run.progress(looks(size.grid), GRID) as bar:
+        self.run.on_interrupt(keep)
+        with self.run.progress(looks(size.grid), GRID, done=len(known)) as bar:
             points, finals = refined_grid(
-                look,
-                6,
-                size.grid,
-                seed=size.seed,
-                allowed=lambda share: kept(problem, share),
-                advance=lambda error: bar.advance(error=error),
+                look, 6, size.grid, seed=size.seed, allowed=lambda share: kept(problem, share)
             )
         self.tensors.pop(f"{GRID}/0/known", None)
         drives = problem.samples * (len(points.error) + FINAL_DRAWS * len(finals.error))

@@ -12,7 +12,7 @@ from studies.frame.config import StudyConfig, to_json
 
 ELSEWHERE = ("study", "out", "device", "resume")  # on which no result depends
 SETTINGS = ("low", "high", "design", "axes", "prior", "depth", "look_ahead", "housing_radius_m", "margin_m")
-MORE = ("own_body_share", "cable", "ground_z_m")
+MORE = ("own_body_share", "cable", "ground_z_m", "page")
 
 
 def asked(config: StudyConfig, pair: RobotPair) -> dict[str, Any]:

@@ -265,7 +265,7 @@ FAULTS = {
     "packages": (PAGE + "packages: 3", "packages is 3; write name: value below it"),
     "package": (PAGE + "packages:\n  arm: 3", "packages.arm is 3; give text"),
     "fast": (PAGE + "motion: fast.csv\nworld: room.obj", "drives 0 .*% of the picture moves by less than the width"),
-    "under ground": (PAGE.replace("0.25]", "-0.1]"), "as low as -0.1 m in body axes, and the ground, .* lies at -0.058 m"),
+    "under ground": (PAGE.replace("0.25]", "-0.1]"), "as low as -0.1 m in body axes, its housing .* 0.02 m, and the ground, .* lies at -0.058 m"),
     "focus": (PAGE + "lens:\n  focus_m: 0.006", "focus_m is 0.006; it must lie beyond the focal length, 6.5 mm"),
     "velocities": (PAGE + "velocities: flat", "velocities is 'flat'; give planar or free"),
     "depth": (PAGE + "depth: none", "depth is 'none'; give ground or scene"),
@@ -316,7 +316,14 @@ def test_a_package_of_a_urdf_lies_where_the_page_says(page, tmp_path):
         own_pair(page(urdf))
     [body] = own_pair(page(urdf + "packages:\n  mine: parts\n")).bodies.values()
     assert body.vertices_m.max(0).tolist() == pytest.approx([0.2, 0.15, 0.15])
-    with pytest.raises(DomainError, match=r"unit_m is of mesh files, and '.*robot.urdf' is in metres"):
+    with pytest.raises(FileFormatError, match=r"packages: there is no folder for 'mine' in '.*prts'"):
+        own_pair(page(urdf + "packages:\n  mine: prts\n"))
+    with pytest.raises(DomainError, match=r"packages are of URDFs, and 'box.obj' is none"):
+        own_pair(page(PAGE + "packages:\n  mine: parts\n"))
+    with pytest.raises(
+        DomainError,
+        match=r"unit_m is of mesh files, and '.*robot.urdf' is in metres; give its meshes a scale",
+    ):
         own_pair(page(urdf + "unit_m: 0.001\n"))
 
 

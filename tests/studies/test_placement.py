@@ -21,7 +21,7 @@ from studies.placement import outcome
 from studies.placement.controls import controls, looking_back, pixel_errors, shuffled
 from studies.placement.descent import descend
 from studies.placement.problem import Problem, traced_camera
-from studies.placement.race import KEPT_EVERY, Race, feasible, kept, shortened
+from studies.placement.race import FINAL_DRAWS, Race, check_grid, feasible, kept, shortened
 from studies.placement.resumption import asked, check_same
 from studies.placement.searches import SEARCHES, Trail
 
@@ -277,6 +277,8 @@ def test_a_run_that_goes_on_is_the_one_that_was_begun(tmp_path):
     own = replace(pair, files=(world,))
     begun |= asked(config, own)
     world.write_text("v 0 0 1")
+    with pytest.raises(DomainError, match="the robot's page changed"):
+        check_same(begun, asked(config, replace(own, page="world_unit_m=0.01")))
     with pytest.raises(DomainError, match=r"room\.obj' changed"):
         check_same(begun, asked(config, own))
     with pytest.raises(DomainError, match="the robot's shape changed"):
@@ -303,34 +305,45 @@ def test_held_numbers_are_not_searched(problem):
         feasible(everything, 1, 0)
 
 
-def test_a_grid_that_was_interrupted_repeats_no_more_than_was_not_kept(problem):
-    """It ends at the same mount, and looks once at what it knew."""
+@pytest.mark.parametrize("asked", [False, True])
+def test_a_grid_that_was_interrupted_repeats_no_more_than_was_not_kept(problem, asked):
+    """In the middle of second looks, of twelve draws each. Killed it goes back to the fiftieth look, asked to stop nowhere."""
     few = replace(problem)
     calls = []
 
     def error(share, samples):
         calls.append(samples)
-        if len(calls) == 70:
+        if len(calls) == 60 + 5 * FINAL_DRAWS + 3:
             raise KeyboardInterrupt
-        return float((share - 0.4).square().sum())
+        return float((share - 0.4).square().sum()) + 1e-3 * (samples.seed % 7)
 
     few.error = error
     run = FakeRun(placement.Config(grid=60))
     cut = Race(run, few)
     with pytest.raises(KeyboardInterrupt):
         cut.grid()
+    if asked:
+        run.save()
     resumed = Race(run, few)
     resumed.tensors = cut.tensors
     resumed.grid()
-    whole = Race(run, few)
     before = len(calls)
+    whole = Race(run, few)
     whole.grid()
     answer = resumed.answer(0, "grid")
     assert answer.tolist() == whole.answer(0, "grid").tolist()
     assert kept(few, answer)
     assert resumed.samples(0, "grid") == whole.samples(0, "grid") == (len(calls) - before) * few.samples
-    assert before == 70 + len(calls) - before - KEPT_EVERY
+    repeated = 3 if asked else 13 + 5 * FINAL_DRAWS
+    assert before == len(calls) - before + repeated
     assert "grid/0/known" not in resumed.tensors
+
+
+def test_a_grid_without_an_allowed_mount_is_refused_before_the_first_descent():
+    blind = Problem(replace(PAIRS["outdoors"](), look_ahead=(3.0, 0.9)), robot_pair.training(1), 1, 1)
+    with pytest.raises(DomainError, match="of 5 mounts of the grid none keeps what is required"):
+        check_grid(blind, 5, 0)
+    check_grid(blind, 0, 0)
 
 
 @pytest.mark.parametrize("fresh", [False, True])
@@ -361,8 +374,11 @@ class FakeRun:
     def save_state(self, tensors, numbers):
         pass
 
+    def on_interrupt(self, save):
+        self.save = save
+
     @contextlib.contextmanager
-    def progress(self, total, description):
+    def progress(self, total, description, done=0):
         yield self
 
     def advance(self, error):

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, NonFiniteError
 from studies.placement.grid import FINALISTS, looks, refined_grid
 
 D = torch.float64
@@ -72,3 +72,8 @@ def test_only_what_is_allowed_is_an_answer():
     assert float(finals.share[:, 0].min()) > 0.4
     with pytest.raises(DomainError, match="of 178 mounts of the grid none keeps what is required"):
         refined_grid(lambda share, again: coupled(share), 4, 128, allowed=lambda share: False)
+
+
+def test_an_error_that_is_no_number_is_refused():
+    with pytest.raises(NonFiniteError, match=r"refined grid: the error of .* is nan"):
+        refined_grid(lambda share, again: math.nan if share[0] > 0.5 else 1.0, 3, 20)
