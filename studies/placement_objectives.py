@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, TypeAlias
 
 import torch
 from scipy.stats import spearmanr
@@ -33,9 +33,10 @@ from studies.frame.run import Run, StudyConfig, main
 from studies.placement.problem import Problem, Samples, traced_camera
 from studies.placement.race import STEP
 
+Way: TypeAlias = Callable[[Problem, Tensor, Samples], tuple[Tensor, ...]]
 LENSES = {"pair's own": None, "wide, near": (3.5, 2.0)}  # focal length mm, focus 1/m
 NODE, MIDDLE, ENDS = math.sqrt(3 / 5), 8 / 18, 5 / 18  # of Gauss and Legendre's rule with three points
-DIFFERENCES, HARD = "differences, expected", "differences, hard"
+DEFAULT, DIFFERENCES, HARD = "expected, default", "differences, expected", "differences, hard"
 UNIT_M_S, UNIT_RAD_S = 0.1, 0.15  # errors that count 1 of the criterion
 
 
@@ -45,13 +46,15 @@ class Config(StudyConfig):
     pair: tuple[str, ...] = tuple(PAIRS)
     """Pairs to look at."""
     designs: int = 40
-    """Mounts behind each of two lenses."""
+    """Mounts behind each of two lenses; 0 for no ranking."""
     judged: int = 8
     """Unseen worlds of 12 drives each that designs are judged in."""
     points: int = 3
     """Mounts at which gradients are looked at, the first the pair's own."""
     draws: int = 8
     """Draws of 24 samples for each gradient."""
+    ways: tuple[str, ...] = ()
+    """Ways to the gradient that stand beside the default and the differences, such as "expected, slope"; all when left out."""
     lens: str = "cooke-triplet"
     """Traced lens through which gradients are looked at, scaled to the pair's focal length; "none": the pair's thin one."""
 
@@ -59,19 +62,25 @@ class Config(StudyConfig):
 def study(run: Run[Config]) -> None:
     size = run.config
     check_pairs(size.pair)
-    if min(size.designs, size.draws) < 2 or min(size.judged, size.points) < 1:
-        raise DomainError("--designs and --draws need at least 2, --judged and --points at least 1.")
+    if size.draws < 2 or not (size.designs == 0 or size.designs >= 2) or min(size.judged, size.points) < 1:
+        raise DomainError(
+            "--draws needs at least 2, --designs 0 or at least 2, --judged and --points at least 1."
+        )
+    for way in size.ways:
+        if way not in WAYS:
+            raise DomainError(f"--ways {way!r}: choose from {'; '.join(WAYS)}.")
     stored = run.load_state()
     kept: dict[str, Tensor] = dict(stored.tensors) if stored else {}
     said = []
     for name in size.pair:
         run.section(f"Pair '{name}'")
-        said.append(f"{name} {ranking(run, kept, name):.2f}")
-        gradients(run, kept, name)
+        ranked = f"rank correlation {ranking(run, kept, name):.2f}, " if size.designs else ""
+        said.append(f"{name} {ranked}cosine {gradients(run, kept, name):.2f}")
     run.record(seconds=run.seconds)
     run.finish(
         "What a placement should descend",
-        f"Spearman's rank correlation of the expected error with errors of the hard sensor on unseen worlds: {', '.join(said)}.",
+        "The expected error: Spearman's rank correlation with errors of the hard sensor on unseen worlds, and the cosine of "
+        f"its gradient with differences: {'; '.join(said)}.",
     )
 
 
@@ -155,9 +164,11 @@ def judgements(training: Problem, unseen: Problem, share: Tensor) -> Tensor:
     return torch.stack([hard.mean(), hard[::2].mean(), hard[1::2].mean(), ours, (alone / (1 + alone)).mean()])
 
 
-def gradients(run: Run[Config], kept: dict[str, Tensor], name: str) -> None:
-    """Cosines, lengths, noise and cost of the ways to a gradient."""
+def gradients(run: Run[Config], kept: dict[str, Tensor], name: str) -> float:
+    """Cosines, lengths, noise and cost of the ways to a gradient; returns the cosine of the one in question."""
     size = run.config
+    asked = {*(size.ways or WAYS), DEFAULT, DIFFERENCES}
+    ways = {way: slope for way, slope in WAYS.items() if way in asked}
     pair = PAIRS[name]()
     camera = pair.design.camera() if size.lens == "none" else traced_camera(pair, size.lens)
     problem = Problem(pair, robot_pair.training(12), camera=camera)
@@ -173,11 +184,13 @@ def gradients(run: Run[Config], kept: dict[str, Tensor], name: str) -> None:
         for number, point in enumerate(points):
             trend_of(problem, point)
             draws = [
-                drawn_ways(run, kept, f"{name}/gradient/{number}/{draw}", problem, point, problem.draw(draw))
+                drawn_ways(
+                    run, kept, f"{name}/gradient/{number}/{draw}", ways, problem, point, problem.draw(draw)
+                )
                 for draw in stepped(bar, size.draws)
             ]
             found = torch.stack(draws)  # [draws, ways, 7]: gradient and processor seconds
-            for index, way in enumerate(NAMES):
+            for index, way in enumerate((*ways, HARD)):  # differences are two
                 slopes.setdefault(way, []).append(found[:, index, :6])
                 costs.setdefault(way, []).append(float(found[1:, index, 6].mean()))
     drawn = {way: torch.cat(parts, 1) for way, parts in slopes.items()}  # [draws, 6 points]
@@ -217,6 +230,7 @@ def gradients(run: Run[Config], kept: dict[str, Tensor], name: str) -> None:
         "over a quarter of the bounds of what is expected and of hard errors; length over that of the former; signal over "
         "noise of one draw.",
     )
+    return cosine(drawn[DEFAULT].mean(0), wide)
 
 
 def stepped(bar, count):
@@ -236,7 +250,13 @@ def trend_of(problem: Problem, point: Tensor) -> None:
 
 
 def drawn_ways(
-    run: Run[Config], kept: dict[str, Tensor], key: str, problem: Problem, point: Tensor, samples: Samples
+    run: Run[Config],
+    kept: dict[str, Tensor],
+    key: str,
+    ways: dict[str, Way],
+    problem: Problem,
+    point: Tensor,
+    samples: Samples,
 ) -> Tensor:
     """[ways, 7]: gradients to the shares, and processor seconds of each."""
 
@@ -246,7 +266,7 @@ def drawn_ways(
         seconds = (time.process_time() - began) / len(slopes)
         return torch.cat([slopes, slopes.new_full((len(slopes), 1), seconds)], 1)
 
-    return torch.cat([once(run, kept, f"{key}/{name}", partial(rows, way)) for name, way in WAYS.items()])
+    return torch.cat([once(run, kept, f"{key}/{name}", partial(rows, way)) for name, way in ways.items()])
 
 
 def _straight(problem, point, samples):
@@ -293,15 +313,14 @@ def _differences(problem, point, samples):
     return tuple(torch.stack(found, 1))
 
 
-WAYS: dict[str, Callable[[Problem, Tensor, Samples], tuple[Tensor, ...]]] = {
+WAYS: dict[str, Way] = {
     "straight through, bounded error": _straight,
     "expected, through frames": _through_frames,
     "expected, slope": _slope,
     "expected, mean slope along the steps": _along,
-    "expected, default": _default,
+    DEFAULT: _default,
     DIFFERENCES: _differences,
 }
-NAMES = (*WAYS, HARD)  # differences are two
 
 
 def spread(drawn: Tensor) -> float:
