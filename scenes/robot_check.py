@@ -13,7 +13,7 @@ DRIVES = 6  # looked at in each world
 BLOCK_PX = 8
 LEAST_TEXTURE = 0.15  # of the blocks: the horizon over blank ground makes 0.08, the pairs have 0.4 and more
 STILL = 1e-6  # m/s and rad/s
-LEAST_FOLLOWED = 0.05  # of the pixels: the pairs have 0.7 and more
+LEAST_FOLLOWED = 0.05  # of the pixels that show a surface: the pairs have 0.7 and more
 
 
 @torch.no_grad()
@@ -24,13 +24,14 @@ def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Se
       world is made and one frame of six drives rendered.
     Raises: DomainError, in a sentence that says what to change, for a design outside its bounds, one that does not
       keep the pair's requirements, a box inside or far from the robot, a lens whose image circle is smaller than the
-      sensor (``place.check_mount``), a box that reaches under the ground whose depth is believed in, drives that
-      never move or so fast that less than LEAST_FOLLOWED of the picture stays within a window's width, and worlds of
+      sensor (``place.check_mount``) or that is wider than the camera's housing, a box that reaches under the ground whose depth is believed in, drives that
+      never move or so fast that less than LEAST_FOLLOWED of the surfaces seen stays within a window's width, and worlds of
       which less than LEAST_TEXTURE of what the camera sees (blocks of 8 x 8 pixels) varies by more than the
       sensor's threshold.
     """
     pair.check(pair.design)
     camera = pair.design.camera() if camera is None else camera
+    _check_width(pair, camera)
     place.check_mount(robot_pair.mount_at(pair.ranges, pair.design.mount()), pair.requirements(), camera)
     if pair.depth == "ground" and pair.low.z_m - pair.housing_radius_m <= pair.ground_z_m:
         raise DomainError(
@@ -55,13 +56,27 @@ def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Se
             )
         ends = poses[:, [1, -1]] @ pair.design.mount()
         flow_px, valid = render.true_flow(camera, pair.world(number), ends)
-        followed = float((valid & (flow_px.norm(dim=2) <= robot_pair.WINDOW_PX)).double().mean())
-        if followed < LEAST_FOLLOWED:
+        followed = float((flow_px.norm(dim=2)[valid] <= robot_pair.WINDOW_PX).double().mean())
+        if not followed >= LEAST_FOLLOWED:  # no surface, no number
             raise DomainError(
-                f"pair '{pair.name}': in drives {number} {followed:.0%} of the picture moves by less than the width of a window "
+                f"pair '{pair.name}': in drives {number} {followed:.0%} of the surfaces seen move by less than the width of a window "
                 f"({robot_pair.WINDOW_PX} pixels in {1e3 * robot_pair.DURATION_S:g} ms), {LEAST_FOLLOWED:.0%} are the least; drive "
                 "more slowly, or take a shorter lens."
             )
+
+
+def _check_width(pair, camera):
+    """Raise for a lens that does not fit into the camera's housing."""
+    lens, housing_mm = camera.lens, 2e3 * pair.housing_radius_m
+    widths = (
+        2 * lens.semi_aperture_mm if hasattr(lens, "semi_aperture_mm") else lens.entrance_pupil_diameter_mm
+    )
+    width_mm = float(torch.as_tensor(widths).max())
+    if width_mm > housing_mm:
+        raise DomainError(
+            f"pair '{pair.name}': its lens is {width_mm:.3g} mm wide, wider than the camera's housing, {housing_mm:g} mm; stop it "
+            "down, take a shorter one, or give a larger housing (require.clearance.radius_m)."
+        )
 
 
 def _textured(frames):

@@ -18,6 +18,7 @@ from typing import TypeAlias, get_args, get_origin, get_type_hints
 
 from codesign import plain_yaml
 from codesign.errors import CodesignError, DomainError, FileFormatError, as_number
+from scenes import robot_pair
 from scenes.robot_pairs import PAIRS
 
 Two: TypeAlias = tuple[float, float]
@@ -26,6 +27,8 @@ VELOCITIES = ("planar", "free")
 DEPTHS = ("ground", "scene")
 MOST_BYTES = 1_000_000
 LEAST_FNO = 0.5  # 1 / (2 sin u) of a lens without spherical aberration and coma, at u = 90 degrees
+WIDEST_DEG = 160  # that a flat picture spans from corner to corner
+HALF_DIAGONAL_MM = robot_pair.PITCH_MM * math.hypot(*robot_pair.SENSOR_PX) / 2
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,12 @@ class OwnLens:
     def __post_init__(self):
         if not self.focal_length_mm > 0:
             raise DomainError(f"lens: focal_length_mm is {self.focal_length_mm:g}; a number > 0 is needed.")
+        spans_deg = 2 * math.degrees(math.atan(HALF_DIAGONAL_MM / self.focal_length_mm))
+        if spans_deg > WIDEST_DEG:
+            raise DomainError(
+                f"lens: at focal_length_mm {self.focal_length_mm:g} a flat picture spans {spans_deg:.0f} degrees, "
+                f"{WIDEST_DEG} are the most; take a longer one."
+            )
         if not self.fno >= LEAST_FNO:
             raise DomainError(
                 f"lens: fno is {self.fno:g}; no lens in air has less than {LEAST_FNO:g} (its light would come from more than "
@@ -185,13 +194,6 @@ class OwnRobot:
                 )
         if self.packages and Path(self.robot).suffix.lower() != ".urdf":
             raise DomainError(f"packages are of URDFs, and '{self.robot}' is none; leave them out.")
-        opened = self.lens.focal_length_mm / self.lens.fno
-        if opened > 2e3 * self.require.clearance.radius_m:
-            raise DomainError(
-                f"lens: {self.lens.focal_length_mm:g} mm at f/{self.lens.fno:g} is {opened:.3g} mm wide, wider than the "
-                f"camera's housing, {2e3 * self.require.clearance.radius_m:g} mm; stop it down, take a shorter lens, or give a "
-                "larger require.clearance.radius_m."
-            )
         if self.motion in PAIRS and self.world in PAIRS and self.motion != self.world:
             raise DomainError(
                 f"motion '{self.motion}' goes through its own world, not through '{self.world}'; leave one of them out."

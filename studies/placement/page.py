@@ -24,9 +24,7 @@ def report(run: Run[Any], outcome: Outcome) -> None:
     """Metrics, raw table, hand-over and page."""
     write_atomic(run.path("race.csv"), outcome.table().encode())
     run.record(**outcome.metrics())
-    run.card(
-        "error of the mount found", f"{outcome.error:.3f}", f"default mount: {outcome.default_error:.3f}"
-    )
+    run.card("error of the answer", f"{outcome.error:.3f}", f"default mount: {outcome.default_error:.3f}")
     for name, beside in outcome.rivals.items():
         run.card(
             f"gradient over {name}", f"{beside.median:.2f}", f"ahead {beside.ahead} of {beside.count} starts"
@@ -45,16 +43,15 @@ def answer(outcome: Outcome) -> str:
     where = place_in_words(outcome.race.problem, outcome.share)
     beside = f"{outcome.error:.3f} against {outcome.default_error:.3f} on {outcome.unseen.samples} unseen samples with single events."
     if outcome.best is None:
-        return (
-            f"The camera of '{name}' stays at its default mount, {where}: on training drives none of {outcome.starts} "
-            f"descents ends at a better place (error {outcome.default_error:.3f} on unseen samples with single events)."
-        )
+        none = f"none of {outcome.starts} descents" if outcome.starts > 1 else "the one descent"
+        return f"The camera of '{name}' stays at its default mount, {where}: on training drives {none} ends at a better place (error {outcome.default_error:.3f} on unseen samples with single events)."
     if outcome.error >= outcome.default_error:
         return f"The place found for the camera of '{name}', {where}, is no better than its default mount: {beside}"
     ratio, low, high = outcome.over_default
     interval = f" ({low:.2f} to {high:.2f}, {INTERVAL:.0%} of resampled worlds)" if worlds > 1 else ""
+    sits = "belongs at" if high < 1 else "may be better off at"
     return (
-        f"The camera of '{name}' belongs at {where}: its error there is {ratio:.2f}{interval} times that at its default mount, "
+        f"The camera of '{name}' {sits} {where}: its error there is {ratio:.2f}{interval} times that at its default mount, "
         f"{beside}"
     )
 
@@ -115,7 +112,7 @@ def seen(run: Run[Any], outcome: Outcome) -> None:
     run.figure(
         figures.before_and_after(unseen, mount),
         "before_and_after",
-        "The robot with its default mount (above) and the one found (below): frame of an unseen drive with the windows read, "
+        "The robot with its default mount (above) and that of the answer (below): frame of an unseen drive with the windows read, "
         "events of the hard sensor in them, flow.",
     )
     verdicts = place.judge(problem.requirements, mount, problem.camera)
@@ -138,7 +135,7 @@ def seen(run: Run[Any], outcome: Outcome) -> None:
         yaw, pitch, errors = task.sight_map(problem.camera, around, rows=9, columns=18)
         now = place.yaw_pitch_roll_rad(mount).tolist()
         run.figure(
-            mount_sphere(yaw, pitch, errors, "expected error, units", {"found": (now[0], now[1])}),
+            mount_sphere(yaw, pitch, errors, "expected error, units", {"answer": (now[0], now[1])}),
             "sight",
             "What the place allows: the error that flow over flat ground lets expect, over all directions the camera may look "
             "in (27 points of 5 px/s).",
@@ -165,7 +162,7 @@ def left(run: Run[Any], outcome: Outcome) -> None:
     run.record(pixel_error_px=moving, pixel_error_only_the_robot_px=still)
     run.text(
         "An objective in pixels would cheat: the mount that sees only the robot has the least error of flow, "
-        f"{still:.2f} px against {moving:.2f} px of the mount found, since nothing moves there. Of the way the robot goes it "
+        f"{still:.2f} px against {moving:.2f} px of the answer, since nothing moves there. Of the way the robot goes it "
         f"says nothing ({found['only_the_robot']:.2f} against {found['as_found']:.2f})."
     )
 
@@ -190,5 +187,5 @@ def handed(run: Run[Any], outcome: Outcome) -> None:
     run.section(
         "Hand-over",
         f"`mount.yaml` has the transform, lens, camera and sensor; read back it scores {float(again.mean()):.4f} where the "
-        f"search's mount had {outcome.error:.4f}.",
+        f"answer had {outcome.error:.4f}.",
     )

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import PIL.Image
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
@@ -13,7 +14,7 @@ from codesign.errors import CodesignError, DomainError, FileFormatError
 from scenes import build, robot_pair, robot_parts, robots, textures, worlds
 from scenes.robot_check import check_pair
 from scenes.robot_file import CameraBox, OwnRobot, Start, read_own
-from scenes.robot_own import own_pair
+from scenes.robot_own import own_pair, with_named
 from scenes.robot_pairs import PAIRS
 
 D = torch.float64
@@ -259,12 +260,13 @@ FAULTS = {
     "start's place": (PAGE + "  x_m: 0.5", "start: x_m is 0.5, outside .* 0.24 to 0.34"),
     "lens": (PAGE + "lens:\n  fno: 0", "lens: fno is 0; no lens in air has less than 0.5"),
     "no lens": (PAGE + "lens:\n  focal_length_mm: 0", "focal_length_mm is 0; a number > 0"),
-    "telescope": (PAGE + "lens:\n  focal_length_mm: 500", "500 mm at f/1.2 is 417 mm wide, wider than .* housing, 40 mm"),
+    "telescope": (PAGE + "lens:\n  focal_length_mm: 500", "its lens is 417 mm wide, wider than .* housing, 40 mm"),
+    "pinhole": (PAGE + "lens:\n  focal_length_mm: 0.1", "focal_length_mm 0.1 a flat picture spans 177 degrees, 160 are"),
     "unit": (PAGE + "unit_m: 0", "unit_m is 0; metres > 0"),
     "unit of a pair": (PAGE + "world_unit_m: 0.01", "world_unit_m is of mesh files, and 'outdoors' is in metres"),
     "packages": (PAGE + "packages: 3", "packages is 3; write name: value below it"),
     "package": (PAGE + "packages:\n  arm: 3", "packages.arm is 3; give text"),
-    "fast": (PAGE + "motion: fast.csv\nworld: room.obj", "drives 0 .*% of the picture moves by less than the width"),
+    "fast": (PAGE + "motion: fast.csv\nworld: room.obj", "drives 0 .*% of the surfaces seen move by less than the width"),
     "under ground": (PAGE.replace("0.25]", "-0.1]"), "as low as -0.1 m in body axes, its housing .* 0.02 m, and the ground, .* lies at -0.058 m"),
     "focus": (PAGE + "lens:\n  focus_m: 0.006", "focus_m is 0.006; it must lie beyond the focal length, 6.5 mm"),
     "velocities": (PAGE + "velocities: flat", "velocities is 'flat'; give planar or free"),
@@ -325,6 +327,36 @@ def test_a_package_of_a_urdf_lies_where_the_page_says(page, tmp_path):
         match=r"unit_m is of mesh files, and '.*robot.urdf' is in metres; give its meshes a scale",
     ):
         own_pair(page(urdf + "unit_m: 0.001\n"))
+
+
+def test_files_that_a_world_names_belong_to_it(page, tmp_path):
+    """So that a run is another one where a picture of its world was changed."""
+    (tmp_path / "pictures").mkdir()
+    PIL.Image.new("L", (4, 4), 90).save(tmp_path / "pictures" / "wall.png")
+    (tmp_path / "pictures" / "a floor.png").write_bytes(b"another")
+    (tmp_path / "unused.png").write_bytes(b"not named")
+    (tmp_path / "room.mtl").write_text("newmtl wall\nmap_Kd pictures/wall.png\n")
+    (tmp_path / "world.obj").write_text("mtllib room.mtl\nusemtl wall\nv 0.1 2.0 3.5\nf 1/1 2/2 3/3\n")
+    (tmp_path / "world.gltf").write_text(
+        '{"images": [{"uri": "pictures/a%20floor.png"}, {"uri": "world.gltf"}]}'
+    )
+    (tmp_path / "world.dae").write_text(
+        "<init_from>pictures/wall.png</init_from><init_from>none.png</init_from>"
+    )
+    named = {
+        kind: sorted(str(each.relative_to(tmp_path)) for each in with_named(tmp_path / f"world.{kind}"))
+        for kind in ("obj", "gltf", "dae")
+    }
+    assert named == {
+        "obj": ["pictures/wall.png", "room.mtl", "world.obj"],
+        "gltf": ["pictures/a floor.png", "world.gltf"],
+        "dae": ["pictures/wall.png", "world.dae"],
+    }
+    with (tmp_path / "room.obj").open("a") as room:
+        room.write("\nmtllib room.mtl\n")
+    found = own_pair(page(PAGE + "world: room.obj\nmotion: screw.csv\n"))
+    names = [path.name for path in found.files]
+    assert names == ["box.obj", "room.obj", "room.mtl", "wall.png", "screw.csv"]
 
 
 def test_a_page_that_is_no_text_is_refused(tmp_path):
