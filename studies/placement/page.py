@@ -32,7 +32,7 @@ def report(run: Run[Any], outcome: Outcome) -> None:
     searches(run, outcome)
     seen(run, outcome)
     left(run, outcome)
-    handed(run, outcome)
+    velocities(run, outcome, handed(run, outcome))
     run.record(seconds=run.seconds)
     run.finish("Where to mount the camera", answer(outcome))
 
@@ -167,8 +167,8 @@ def left(run: Run[Any], outcome: Outcome) -> None:
     )
 
 
-def handed(run: Run[Any], outcome: Outcome) -> None:
-    """Write the mount, read it back, and see that it has the same score."""
+def handed(run: Run[Any], outcome: Outcome) -> task.VelocityErrors:
+    """Write the mount, read it back, and see that it has the same score; returns its errors."""
     problem, unseen, pose = outcome.race.problem, outcome.unseen, outcome.pose
     mount = robot_pair.mount_at(problem.ranges, pose)
     path = run.path("mount.yaml")
@@ -182,10 +182,40 @@ def handed(run: Run[Any], outcome: Outcome) -> None:
     )
     save_hand_over(path, handed_over)
     back = load_hand_over(path)
-    again = unseen.judged(back.mount().detach(), unseen.draw(0), "sensor").bounded()
-    run.record(hand_over_score_again=again.mean(), hand_over_score=outcome.error)
+    found = unseen.judged(back.mount().detach(), unseen.draw(0), "sensor")
+    again = found.bounded().mean()
+    run.record(hand_over_score_again=again, hand_over_score=outcome.error)
     run.section(
         "Hand-over",
-        f"`mount.yaml` has the transform, lens, camera and sensor; read back it scores {float(again.mean()):.4f} where the "
+        f"`mount.yaml` has the transform, lens, camera and sensor; read back it scores {float(again):.4f} where the "
         f"answer had {outcome.error:.4f}.",
     )
+    return found
+
+
+def velocities(run: Run[Any], outcome: Outcome, found: task.VelocityErrors) -> None:
+    """Errors of each velocity, in its own unit."""
+    unseen = outcome.unseen
+    default = unseen.judged(unseen.ranges.pose(unseen.start), unseen.draw(0), "sensor")
+    rows: list[list[Any]] = []
+    for (name, before), after in zip(default.table().items(), found.table().values(), strict=True):
+        unit = "m_s" if "p50_m_s" in before else "rad_s"
+        kinds = [f"p50_{unit}", f"p90_{unit}", "median_over_speed"]
+        rows.append(
+            [
+                f"{name}, {unit.replace('_', '/')}",
+                *(each.get(kind) for kind in kinds for each in (before, after)),
+            ]
+        )
+        for kind in kinds[:2]:
+            run.record(**{f"{name.replace(' ', '_')}_error_{kind}": after[kind]})
+    heads = [
+        f"{kind}, {who}"
+        for kind in ("median", "nine tenths below", "median over speed")
+        for who in ("default", "answer")
+    ]
+    run.section(
+        "Errors of the velocities",
+        "Sizes of errors on unseen samples with single events, all speeds together.",
+    )
+    run.table("Errors in their own units", ("velocity", *heads), rows)

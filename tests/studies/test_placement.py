@@ -421,6 +421,7 @@ def test_the_whole_study_and_its_resumption(tmp_path):
     )
     assert handed.mount()[2, 3].item() == pytest.approx(float(row["z_m"]), abs=1e-4)
     assert math.isfinite(found["control_no_texture_error"])
+    assert 0 < found["forward_error_p50_m_s"] < found["forward_error_p90_m_s"]
     (out / "report.html").unlink()
     assert main(placement.study, placement.Config, ["--resume", str(out)]) == 0
     assert (out / "race.csv").read_text() == before
