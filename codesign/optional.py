@@ -30,6 +30,11 @@ def require(module: str, extra: str, purpose: str) -> ModuleType:
         raise MissingPackageError(
             f"{purpose} needs {package}; install it with: pip install 'codesign[{extra}]'"
         ) from error
+    except ImportError as error:
+        raise MissingPackageError(
+            f"{purpose} needs {module}, which is installed but cannot be imported ({error}); install it anew with: "
+            f"pip install --force-reinstall 'codesign[{extra}]'"
+        ) from error
 
 
 def optional(module: str, extra: str, purpose: str, *before: str) -> Any:

@@ -1,5 +1,6 @@
 """Looks at a pair before its first frame: what would spoil a study of it gets a sentence."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -13,6 +14,7 @@ DRIVES = 6  # looked at in each world
 BLOCK_PX = 8
 LEAST_TEXTURE = 0.15  # of the blocks: the horizon over blank ground makes 0.08, the pairs have 0.4 and more
 STILL = 1e-6  # m/s and rad/s
+LEAST_MOVED_PX = 0.1  # median flow over the window: the pairs have 3 and more
 LEAST_FOLLOWED = 0.05  # of the pixels that show a surface: the pairs have 0.7 and more
 
 
@@ -25,14 +27,15 @@ def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Se
     Raises: DomainError, in a sentence that says what to change, for a design outside its bounds, one that does not
       keep the pair's requirements, a box inside or far from the robot, a lens whose image circle is smaller than the
       sensor (``place.check_mount``) or that is wider than the camera's housing, a box that reaches under the ground whose depth is believed in, drives that
-      never move or so fast that less than LEAST_FOLLOWED of the surfaces seen stays within a window's width, and worlds of
+      never move, by less than LEAST_MOVED_PX, or so fast that less than LEAST_FOLLOWED of the surfaces seen stays within a window's width, and worlds of
       which less than LEAST_TEXTURE of what the camera sees (blocks of 8 x 8 pixels) varies by more than the
       sensor's threshold.
     """
     pair.check(pair.design)
     camera = pair.design.camera() if camera is None else camera
+    requirements = pair.requirements()
     _check_width(pair, camera)
-    place.check_mount(robot_pair.mount_at(pair.ranges, pair.design.mount()), pair.requirements(), camera)
+    place.check_mount(robot_pair.mount_at(pair.ranges, pair.design.mount()), requirements, camera)
     if pair.depth == "ground" and pair.low.z_m - pair.housing_radius_m <= pair.ground_z_m:
         raise DomainError(
             f"pair '{pair.name}': the camera may sit as low as {pair.low.z_m:g} m in body axes, its housing has a radius of "
@@ -56,6 +59,13 @@ def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Se
             )
         ends = poses[:, [1, -1]] @ pair.design.mount()
         flow_px, valid = render.true_flow(camera, pair.world(number), ends)
+        moved_px = float(flow_px.norm(dim=2)[valid].median()) if valid.any() else math.inf
+        if moved_px < LEAST_MOVED_PX:
+            raise DomainError(
+                f"pair '{pair.name}': in drives {number} the picture moves by {moved_px:.2g} pixels in "
+                f"{1e3 * robot_pair.DURATION_S:g} ms, {LEAST_MOVED_PX:g} are the least; drive faster, or see whether the motion "
+                "is in metres and seconds."
+            )
         followed = float((flow_px.norm(dim=2)[valid] <= robot_pair.WINDOW_PX).double().mean())
         if not followed >= LEAST_FOLLOWED:  # no surface, no number
             raise DomainError(

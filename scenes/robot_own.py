@@ -27,9 +27,12 @@ WHITE = 255.0  # radiance that the 1 of a Mitsuba scene becomes
 DULL = 80.0  # of what lies behind a mesh
 TRAINING = 2 / 3  # of a trajectory; the rest is for judging
 STILL = 1e-3  # metres and radians within which a trajectory stands still
+MOST_TILT_RAD = math.radians(60)  # of a robot that drives
 LEAST_PRIOR = 0.05  # m/s and rad/s
 # a file's name in quotes, or between tags or blanks
-NAMED = re.compile(rb'"([^"\r\n]{1,200}\.[A-Za-z]{2,5})"|(?<=[\s>])([^\s"<>]{1,200}\.[A-Za-z]{2,5})(?=[\s<])')
+NAMED = re.compile(
+    rb"""["']([^"'\r\n]{1,200}\.[A-Za-z][A-Za-z0-9]{1,4})["']|(?<=[\s>])([^\s"'<>]{1,200}\.[A-Za-z][A-Za-z0-9]{1,4})(?=[\s<]|\Z)"""
+)
 
 Drive = Callable[[int, int], tuple[Tensor, Tensor]]
 
@@ -57,10 +60,15 @@ def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
         axes = place.FREE
     if own.velocities is not None:
         axes = place.PLANAR if own.velocities == "planar" else place.FREE
+    middle = drive(0, 12)[0][:, robot_pair.FRAMES // 2]
+    if axes == place.PLANAR and float(middle[:, 2, 2].min()) < math.cos(MOST_TILT_RAD):
+        raise DomainError(
+            f"motion: '{own.motion}' tips the robot by more than {math.degrees(MOST_TILT_RAD):.0f} degrees, and its velocities "
+            "are planar; see whether its quaternions are qx qy qz qw, or set velocities: free."
+        )
     low, high, start = _designs(own)
     asked = own.require
     ahead, cable = asked.look_ahead, asked.cable
-    middle = drive(0, 12)[0][:, robot_pair.FRAMES // 2]
     return RobotPair(
         Path(own.robot).stem,
         bodies,
@@ -79,6 +87,7 @@ def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
         cable=None if cable is None else (cable.forbidden, math.radians(cable.half_angle_deg)),
         ground_z_m=-float(middle[:, 2, 3].mean()),
         frame=frame,
+        one_world=own.world not in PAIRS,
         files=tuple(
             each
             for name in (own.robot, own.world, own.motion)
@@ -216,6 +225,12 @@ def _standing(named, bodies):
             "give a mesh in metres, or its unit_m, or a world and a trajectory of your own."
         )
     if named.axes == place.FREE:
+        lowest = float(vertices[:, 2].min()) + float(named.drive(0, 12)[0][..., 2, 3].min())
+        if lowest < 0:
+            raise DomainError(
+                f"robot: it reaches {-float(vertices[:, 2].min()):.3g} m below its origin, and the drives of '{named.name}' would "
+                f"bring that {-lowest:.2g} m under the floor; put its origin lower, or give a world and a trajectory of your own."
+            )
         return named.drive
     up = torch.eye(4, dtype=torch.float64)
     up[2, 3] = LIFT_M - float(vertices[:, 2].min())

@@ -105,7 +105,7 @@ class RobotPair:
     housing_radius_m, margin_m: of the camera, and by how much it must stay clear of the body. own_body_share: of the
       image, that the body may cover. cable: direction in body axes and half angle in radians of a cone into which the
       camera's back must not point; None where it may point anywhere. ground_z_m: height of the ground in body axes.
-    frame: name of the body's axes (REP 105). files: of which the pair was made, where a user gave them; page: what they
+    frame: name of the body's axes (REP 105). one_world: whether all numbers are the same world, with other drives. files: of which the pair was made, where a user gave them; page: what they
       wrote of it.
     """
 
@@ -126,6 +126,7 @@ class RobotPair:
     cable: tuple[tuple[float, float, float], float] | None = None
     ground_z_m: float = 0.0
     frame: str = "base_footprint"
+    one_world: bool = False
     files: tuple[Path, ...] = ()
     page: str = ""
 

@@ -100,6 +100,15 @@ def test_the_stand_in_is_the_module_once_it_is_there():
         require("no_such_package", "video", "this")
 
 
+def test_a_package_that_cannot_be_imported_is_named(tmp_path, monkeypatch):
+    (tmp_path / "half_installed.py").write_text("raise ImportError('libgone.so: no such file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(
+        MissingPackageError, match=r"half_installed, which is installed .* \(libgone.so: no such file\)"
+    ):
+        require("half_installed", "video", "this")
+
+
 def test_sources_name_extras_that_exist_and_no_other_package_is_imported_at_the_top():
     core = {re.split(r"[^A-Za-z0-9_-]", line)[0] for line in PROJECT["dependencies"]}
     named = set()

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
+
 from codesign.errors import DomainError
 from scenes import robot_pair
 from scenes.robot_check import check_pair
@@ -25,6 +27,7 @@ from studies.placement.race import Race, certified, check_grid, feasible, judge,
 from studies.placement.searches import SEARCHES, available
 
 SPREAD = 12  # worlds of a step at most
+HIGHEST_SEED = 1_000_000  # every start has a thousand of its own, and generators take 32 bits
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class Config(StudyConfig):
     focal_mm: float | None = None
     """Focal length that the traced lens is scaled to; the pair's own when left out."""
     seeds: int = 3
-    """Starting mounts, paired over all searches."""
+    """Starting mounts, paired over all searches; the first is your own robot's own."""
     steps: int = 24
     """Steps of the gradient; other searches look at as many mounts as render as many samples."""
     worlds: int = 12
@@ -78,14 +81,16 @@ def study(run: Run[Config]) -> None:
     if run.device.type != "cpu":
         run.say("This study computes on the CPU; the device asked for stays unused.")
     pair = own_pair(size.robot) if size.robot else PAIRS[size.pair]()
+    if size.robot:
+        run.say(size_in_words(pair))
     camera = traced_camera(pair, size.lens, size.focal_mm) if size.lens else pair.design.camera()
-    check_pair(pair, camera)
+    check_pair(pair, camera, (0, robot_pair.UNSEEN_FROM) if size.robot else (0,))
     spread = min(SPREAD, size.worlds)
     problem = Problem(pair, robot_pair.training(size.worlds), spread, size.per_world, camera=camera)
     judged_in = robot_pair.unseen(size.judged_worlds)
     unseen = Problem(pair, judged_in, size.judged_worlds, size.judged_drives, camera=camera)
     race = Race(run, problem)
-    starts = feasible(problem, size.seeds, size.seed)
+    starts = feasible(problem, size.seeds, size.seed, [problem.start] if size.robot else [])
     check_grid(problem, size.grid, size.seed)
     ways = certified(run, race, starts[0])
     for number, start in enumerate(starts):
@@ -97,6 +102,13 @@ def study(run: Run[Config]) -> None:
     judged = judge(run, race, unseen, starts)
     along = judge_along(run, race, unseen, judged, len(starts))
     report(run, Outcome(race, unseen, judged, along, ways))
+
+
+def size_in_words(pair: robot_pair.RobotPair) -> str:
+    """How large a robot is, by which a wrong unit or axis is seen."""
+    vertices = np.concatenate([mesh.vertices_m for mesh in pair.bodies.values()])
+    length, width, height = vertices.max(0) - vertices.min(0)
+    return f"'{pair.name}' is {length:.2f} m long (x), {width:.2f} wide (y) and {height:.2f} high (z)."
 
 
 def checked(size: Config) -> None:
@@ -115,8 +127,8 @@ def checked(size: Config) -> None:
             )
     if len(set(size.searches)) < len(size.searches):
         raise DomainError(f"--searches {' '.join(size.searches)} names one twice; name each once.")
-    if size.seed < 0:
-        raise DomainError(f"--seed is {size.seed}; the searches need 0 or more.")
+    if not 0 <= size.seed <= HIGHEST_SEED:
+        raise DomainError(f"--seed is {size.seed}; the searches need 0 to {HIGHEST_SEED}.")
     if size.focal_mm is not None and size.lens is None:
         raise DomainError("--focal-mm scales a traced lens; give --lens too, or leave it out.")
     if size.grid < 0 or size.certified < 0 or size.certified == 1:

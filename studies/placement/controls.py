@@ -70,7 +70,7 @@ def looking_back(problem: Problem) -> Tensor:
 @torch.no_grad()
 def pixel_errors(problem: Problem, mount: Tensor, samples: Samples) -> float:
     """Root mean square error of the flow of hard counts in pixels, over surfaces of the world and the robot's own body, whose image stands
-    still; the sky is left out."""
+    still; the sky is left out. NaN where nothing else is seen."""
     batch = problem.batch(samples)
     run = problem.system(mount).begin(batch)
     read = readings(run, task.scene_depth)

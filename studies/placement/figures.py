@@ -48,10 +48,9 @@ def ways(
     looked = [trail for name, found in trails.items() if name != "gradient" for trail in found]
     if looked:
         pitch, height = _pitch_and_height(problem, torch.cat([trail.share for trail in looked]))
-        error = torch.cat([trail.error for trail in looked])
-        allowed = (error < 1).numpy()  # errors are bounded by 1: beyond lies what is not allowed
-        map_ = right.scatter(pitch[allowed], height[allowed], c=error[allowed], s=9, cmap="viridis_r")
-        figure.colorbar(map_, ax=right, label="error")
+        error = torch.cat([trail.error for trail in looked]).numpy()
+        map_ = right.scatter(pitch, height, c=error, s=9, cmap="viridis_r", vmax=1)  # beyond: penalties
+        figure.colorbar(map_, ax=right, label="error and penalty", extend="max")
     for trail in trails["gradient"]:
         pitch, height = _pitch_and_height(problem, trail.share)
         right.plot(pitch, height, color=COLOURS[0], linewidth=0.9, alpha=0.7)

@@ -123,6 +123,11 @@ class Outcome:
         return float(self.judged[0, "default"].mean())
 
     @property
+    def resampled(self) -> str:
+        """What an interval over worlds resamples."""
+        return "groups of drives" if self.unseen.pair.one_world else "worlds"
+
+    @property
     def grid_error(self) -> float | None:
         """Of the grid's best, where there is a grid."""
         return float(self.judged[0, GRID].mean()) if (0, GRID) in self.judged else None

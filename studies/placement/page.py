@@ -31,8 +31,8 @@ def report(run: Run[Any], outcome: Outcome) -> None:
         )
     searches(run, outcome)
     seen(run, outcome)
-    left(run, outcome)
     velocities(run, outcome, handed(run, outcome))
+    left(run, outcome)
     run.record(seconds=run.seconds)
     run.finish("Where to mount the camera", answer(outcome))
 
@@ -43,12 +43,18 @@ def answer(outcome: Outcome) -> str:
     where = place_in_words(outcome.race.problem, outcome.share)
     beside = f"{outcome.error:.3f} against {outcome.default_error:.3f} on {outcome.unseen.samples} unseen samples with single events."
     if outcome.best is None:
-        none = f"none of {outcome.starts} descents" if outcome.starts > 1 else "the one descent"
-        return f"The camera of '{name}' stays at its default mount, {where}: on training drives {none} ends at a better place (error {outcome.default_error:.3f} on unseen samples with single events)."
+        none = (
+            f"none of {outcome.starts} descents ends"
+            if outcome.starts > 1
+            else "the one descent does not end"
+        )
+        return f"The camera of '{name}' stays at its default mount, {where}: on training drives {none} at a better place (error {outcome.default_error:.3f} on unseen samples with single events)."
     if outcome.error >= outcome.default_error:
         return f"The place found for the camera of '{name}', {where}, is no better than its default mount: {beside}"
     ratio, low, high = outcome.over_default
-    interval = f" ({low:.2f} to {high:.2f}, {INTERVAL:.0%} of resampled worlds)" if worlds > 1 else ""
+    interval = (
+        f" ({low:.2f} to {high:.2f}, {INTERVAL:.0%} of resampled {outcome.resampled})" if worlds > 1 else ""
+    )
     sits = "belongs at" if high < 1 else "may be better off at"
     return (
         f"The camera of '{name}' {sits} {where}: its error there is {ratio:.2f}{interval} times that at its default mount, "
@@ -70,12 +76,12 @@ def searches(run: Run[Any], outcome: Outcome) -> None:
     """The searches beside one another."""
     race = outcome.race
     samples = race.samples(0, GRADIENT)
+    told = "drives through the one world" if outcome.unseen.pair.one_world else "worlds and drives"
     run.section(
         "Searches at equal renders",
         f"Every search began at the same {outcome.starts} mounts and rendered {samples} samples; "
         "errors are means of q / (1 + q), q the squared error of the velocities that count in units of 0.05 m/s plus a "
-        "tenth of the speed, and 0.15 rad/s, with single events in worlds and drives that no search saw (a world from a "
-        f"file is the same for all). In brackets: {INTERVAL:.0%} of resampled starts.",
+        f"tenth of the speed, and 0.15 rad/s, with single events in {told} that no search saw. In brackets: {INTERVAL:.0%} of resampled starts.",
     )
     rows: list[list[Any]] = []
     for name, values in outcome.errors.items():
@@ -93,7 +99,9 @@ def searches(run: Run[Any], outcome: Outcome) -> None:
     rows.append(["default mount", outcome.default_error, None, None, None])
     if run.config.certified:
         ways = "; ".join(f"{name} by {way}" for name, way in outcome.ways.items())
-        run.text(f"The gradient beside differences over a quarter of the bounds: {ways}.")
+        run.text(
+            f"The gradient beside differences over a quarter of the bounds, whose own renders are not counted: {ways}."
+        )
     run.table("Errors on unseen samples", ("search", "median", "best", "worst", "gradient over it"), rows)
     own = "what is expected" if run.config.rivals_expect else "errors of their own drives"
     run.figure(
@@ -149,7 +157,7 @@ def left(run: Run[Any], outcome: Outcome) -> None:
     found = controls(unseen, mount, samples)
     run.section(
         "Controls",
-        "Single events in unseen worlds. Errors of an answer that is always zero, of a camera that sees nothing move, and of "
+        "Single events on unseen samples. Errors of an answer that is always zero, of a camera that sees nothing move, and of "
         "one that looks at its own robot should be alike.",
     )
     run.table(
@@ -159,6 +167,9 @@ def left(run: Run[Any], outcome: Outcome) -> None:
     )
     run.record(**{f"control_{name}_error": value for name, value in found.items()})
     moving, still = pixel_errors(unseen, mount, samples), pixel_errors(unseen, looking_back(unseen), samples)
+    if math.isnan(moving + still):
+        run.text("Where nothing of the world is seen there is no error of flow in pixels.")
+        return
     run.record(pixel_error_px=moving, pixel_error_only_the_robot_px=still)
     run.text(
         "An objective in pixels would cheat: the mount that sees only the robot has the least error of flow, "

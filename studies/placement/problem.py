@@ -132,12 +132,15 @@ class Problem:
         batch = self.batch(samples)
         return self.pair.errors(self.system(T_body_cam, layer).begin(batch)["estimate"], batch)
 
+    def bounded(self, share: Tensor, samples: Samples) -> float:
+        """The mean bounded error of a mount [6] with hard counts."""
+        return float(self.judged(self.ranges.pose(share), samples).bounded().mean())
+
     def error(self, share: Tensor, samples: Samples) -> float:
-        """What searches without gradients minimise: the mean bounded error, and the penalty of what is required."""
+        """What searches without gradients minimise: the same and the penalty of what is required."""
         with torch.no_grad():
-            mount = self.ranges.pose(share)
-            found = self.judged(mount, samples).bounded().mean() + self.penalty(mount)
-        return float(found)
+            penalty = float(self.penalty(self.ranges.pose(share)))
+        return self.bounded(share, samples) + penalty
 
     def penalty(self, T_body_cam: Tensor) -> Tensor:
         """0 where every requirement is kept with a step to spare. Gradient: mount."""

@@ -3,7 +3,7 @@ saw; all of it kept in the run's state."""
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,26 +27,29 @@ UNKNOWN = 1 / 3  # standard error of differences from which on they judge nothin
 WAYS = ("autograd", "differences", "evolution")
 TRIES = 2048
 FINAL_DRAWS = 12  # of the grid's second look
+CHOOSING = 96  # training samples that choose among answers: what tells 10 % (studies.robot_gates)
 KEPT_EVERY = 50  # looks
 GROUPS = {"position": slice(0, 3), "attitude": slice(3, 6)}
 
 
-def feasible(problem: Problem, count: int, seed: int) -> list[Tensor]:
-    """Mounts [6] spread at random over what is allowed."""
+def feasible(problem: Problem, count: int, seed: int, first: Sequence[Tensor] = ()) -> list[Tensor]:
+    """Mounts [6] to start from: those given, and others spread at random over what is allowed."""
     if bool(problem.ranges.held.all()):
         raise DomainError("equal bounds hold all six numbers of the mount; widen what is to be searched.")
     random = torch.Generator().manual_seed(seed)
-    found: list[Tensor] = []
+    found = list(first)[:count]
     for _ in range(TRIES):
+        if len(found) == count:
+            break
         share = 0.05 + 0.9 * torch.rand(6, generator=random, dtype=torch.float64)
         if kept(problem, share):
             found.append(share)
-            if len(found) == count:
-                return found
-    raise DomainError(
-        f"of {TRIES} mounts within the bounds {len(found)} keep what is required, {count} are needed; widen the bounds, or "
-        "ask for less."
-    )
+    if len(found) < count:
+        raise DomainError(
+            f"of {TRIES} mounts within the bounds {len(found) - len(first)} keep what is required, {count - len(first)} are "
+            "needed; widen the bounds, or ask for less."
+        )
+    return found
 
 
 def check_grid(problem: Problem, count: int, seed: int) -> None:
@@ -334,13 +337,13 @@ def _judged(run, race, unseen, wanted, said):
 
 
 def chosen(race: Race, count: int) -> int | None:
-    """Number of the descent whose answer does best on training samples that no step saw, None where the pair's own mount does
-    better than all of them: what is judged on unseen samples has not been chosen by them."""
+    """Number of the descent whose answer errs least on training samples, None where the pair's own mount errs less than all of
+    them: what is judged on unseen samples has not been chosen by them."""
     if "chosen" not in race.tensors:
         problem = race.problem
-        draws = [problem.draw(-1 - k) for k in range(max(1, len(problem.numbers) // problem.spread))]
+        draws = [problem.draw(-1 - k) for k in range(max(1, round(CHOOSING / problem.samples)))]
         mounts = [problem.start, *(race.answer(number, GRADIENT) for number in range(count))]
-        errors = [sum(problem.error(share, draw) for draw in draws) for share in mounts]
+        errors = [sum(problem.bounded(share, draw) for draw in draws) for share in mounts]
         race.tensors["chosen"] = torch.tensor(errors).argmin() - 1
         race.save()
     number = int(race.tensors["chosen"])

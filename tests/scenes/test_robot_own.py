@@ -50,6 +50,13 @@ def screw(t_s):
     return first @ pose.se3_exp(torch.as_tensor(t_s)[:, None] * TWIST)
 
 
+def tipped(pitch_rad):
+    """A pose [4, 4] that looks down."""
+    turn = torch.zeros(6, dtype=D)
+    turn[4] = pitch_rad
+    return pose.se3_exp(turn)
+
+
 @pytest.fixture
 def page(tmp_path):
     """Writes a page beside a robot, a blank room and trajectories, and gives its path."""
@@ -61,6 +68,12 @@ def page(tmp_path):
     (tmp_path / "short.csv").write_text(csv(t_s[:2], screw([0.0, 0.05])))
     (tmp_path / "still.csv").write_text(csv(t_s, screw(np.zeros(31))))
     (tmp_path / "parks.csv").write_text(csv(t_s, screw(np.minimum(t_s - t_s[0], 0.9))))
+    (tmp_path / "slow.csv").write_text(csv(t_s, screw(8e-3 * (t_s - t_s[0]))))
+    (tmp_path / "late.csv").write_text(
+        csv(t_s, screw(np.where(t_s - t_s[0] < 1, t_s - t_s[0], 1 + 8e-3 * (t_s - t_s[0]))))
+    )
+    (tmp_path / "tips.csv").write_text(csv(t_s, screw(t_s - t_s[0]) @ tipped(1.2)))
+    (tmp_path / "pole.obj").write_text(obj(robot_parts.box((0.1, 0.1, 0.6), (0.0, 0.0, -0.25))))
     (tmp_path / "fast.csv").write_text(csv(t_s, screw(300 * (t_s - t_s[0]))))
     textured_room(tmp_path)
     (tmp_path / "back.csv").write_text(csv(t_s[::-1], screw(t_s - t_s[0])))
@@ -267,6 +280,11 @@ FAULTS = {
     "packages": (PAGE + "packages: 3", "packages is 3; write name: value below it"),
     "package": (PAGE + "packages:\n  arm: 3", "packages.arm is 3; give text"),
     "fast": (PAGE + "motion: fast.csv\nworld: room.obj", "drives 0 .*% of the surfaces seen move by less than the width"),
+    "slow": (PAGE + "motion: slow.csv\nworld: room.obj", "drives 0 the picture moves by .* pixels in 20 ms, 0.1 are the least; .* seconds"),
+    "parks late": (PAGE + "motion: late.csv\nworld: room.obj", "drives 1000000 the picture moves by .* pixels"),
+    "tips": (PAGE + "motion: tips.csv\nworld: room.obj\nvelocities: planar", "tips the robot by more than 60 degrees, .* qx qy qz qw"),
+    "hangs": (PAGE.replace("box.obj", "pole.obj") + "world: flight", "reaches 0.55 m below its origin, .* 0.23 m under the floor"),
+    "ball": (PAGE + "require:\n  clearance:\n    radius_m: -0.02", "radius_m is -0.02; metres > 0"),
     "under ground": (PAGE.replace("0.25]", "-0.1]"), "as low as -0.1 m in body axes, its housing .* 0.02 m, and the ground, .* lies at -0.058 m"),
     "focus": (PAGE + "lens:\n  focus_m: 0.006", "focus_m is 0.006; it must lie beyond the focal length, 6.5 mm"),
     "velocities": (PAGE + "velocities: flat", "velocities is 'flat'; give planar or free"),
@@ -288,7 +306,7 @@ FAULTS = {
 def test_a_fault_gets_one_sentence_before_the_first_frame(fault, page):
     text, sentence = FAULTS[fault]
     with pytest.raises(CodesignError, match=sentence) as caught:
-        check_pair(own_pair(page(text)))
+        check_pair(own_pair(page(text)), numbers=(0, UNSEEN))
     assert "\n" not in str(caught.value)
 
 
@@ -335,22 +353,25 @@ def test_files_that_a_world_names_belong_to_it(page, tmp_path):
     PIL.Image.new("L", (4, 4), 90).save(tmp_path / "pictures" / "wall.png")
     (tmp_path / "pictures" / "a floor.png").write_bytes(b"another")
     (tmp_path / "unused.png").write_bytes(b"not named")
-    (tmp_path / "room.mtl").write_text("newmtl wall\nmap_Kd pictures/wall.png\n")
+    (tmp_path / "room.mtl").write_text("newmtl wall\nmap_Kd pictures/wall.png")
     (tmp_path / "world.obj").write_text("mtllib room.mtl\nusemtl wall\nv 0.1 2.0 3.5\nf 1/1 2/2 3/3\n")
     (tmp_path / "world.gltf").write_text(
         '{"images": [{"uri": "pictures/a%20floor.png"}, {"uri": "world.gltf"}]}'
     )
+    (tmp_path / "sky.jp2").write_bytes(b"of the sky")
+    (tmp_path / "world.xml").write_text("<bitmap><string name='filename' value='sky.jp2'/></bitmap>")
     (tmp_path / "world.dae").write_text(
         "<init_from>pictures/wall.png</init_from><init_from>none.png</init_from>"
     )
     named = {
         kind: sorted(str(each.relative_to(tmp_path)) for each in with_named(tmp_path / f"world.{kind}"))
-        for kind in ("obj", "gltf", "dae")
+        for kind in ("obj", "gltf", "dae", "xml")
     }
     assert named == {
         "obj": ["pictures/wall.png", "room.mtl", "world.obj"],
         "gltf": ["pictures/a floor.png", "world.gltf"],
         "dae": ["pictures/wall.png", "world.dae"],
+        "xml": ["sky.jp2", "world.xml"],
     }
     with (tmp_path / "room.obj").open("a") as room:
         room.write("\nmtllib room.mtl\n")

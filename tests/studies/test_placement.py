@@ -7,6 +7,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -20,8 +21,9 @@ from studies.placement import __main__ as placement
 from studies.placement import outcome
 from studies.placement.controls import controls, looking_back, pixel_errors, shuffled
 from studies.placement.descent import descend
+from studies.placement.page import answer
 from studies.placement.problem import Problem, traced_camera
-from studies.placement.race import FINAL_DRAWS, Race, check_grid, feasible, kept, shortened
+from studies.placement.race import FINAL_DRAWS, Race, check_grid, chosen, feasible, kept, shortened
 from studies.placement.resumption import asked, check_same
 from studies.placement.searches import SEARCHES, Trail
 
@@ -270,7 +272,7 @@ def test_a_run_that_goes_on_is_the_one_that_was_begun(tmp_path):
         with pytest.raises(DomainError, match="changed since this run was begun"):
             check_same(begun, asked(changed, pair))
     wider = replace(pair, high=replace(pair.high, z_m=pair.high.z_m + 0.1))
-    with pytest.raises(DomainError, match="the robot's high changed"):
+    with pytest.raises(DomainError, match="the robot's high, z_m changed"):
         check_same(begun, asked(config, wider))
     world = tmp_path / "room.obj"
     world.write_text("v 0 0 0")
@@ -281,8 +283,11 @@ def test_a_run_that_goes_on_is_the_one_that_was_begun(tmp_path):
         check_same(begun, asked(config, replace(own, page="world_unit_m=0.01")))
     with pytest.raises(DomainError, match=r"room\.obj' changed"):
         check_same(begun, asked(config, own))
+    with pytest.raises(DomainError, match=r"room\.obj' belongs to this run's robot or world no more"):
+        check_same(begun, asked(config, pair))
+    world.write_text("v 0 0 0")
     with pytest.raises(DomainError, match="the robot's shape changed"):
-        check_same(begun, asked(config, replace(pair, bodies=dict(list(pair.bodies.items())[1:]))))
+        check_same(begun, asked(config, replace(own, bodies=dict(list(pair.bodies.items())[1:]))))
 
 
 def test_held_numbers_are_not_searched(problem):
@@ -337,6 +342,43 @@ def test_a_grid_that_was_interrupted_repeats_no_more_than_was_not_kept(problem, 
     repeated = 3 if asked else 13 + 5 * FINAL_DRAWS
     assert before == len(calls) - before + repeated
     assert "grid/0/known" not in resumed.tensors
+
+
+def test_the_answer_says_that_the_default_stays():
+    """Of one descent and of three."""
+    problem = Problem(PAIRS["flight"](), robot_pair.training(1), 1, 1)
+    told = {"race": SimpleNamespace(problem=problem), "unseen": problem, "share": problem.start, "best": None}
+    errors = {"error": 0.5, "default_error": 0.5}
+    one, three = (answer(SimpleNamespace(**told, **errors, starts=count)) for count in (1, 3))
+    assert "on training drives the one descent does not end at a better place (error 0.500" in one
+    assert "on training drives none of 3 descents ends at a better place (error 0.500" in three
+
+
+def test_the_first_start_may_be_given(problem):
+    """An own robot's own mount; the others are the first that are drawn at random."""
+    given, *others = feasible(problem, 3, 5, [problem.start])
+    assert torch.equal(given, problem.start)
+    assert torch.equal(torch.stack(others), torch.stack(feasible(problem, 2, 5)))
+
+
+def test_answers_are_chosen_by_their_errors_alone(problem):
+    """On 96 training samples: the second descent errs least, though it has a penalty."""
+    watched = replace(problem)
+    errors = {0.3: 0.4, 0.5: 0.2}
+    drawn = []
+
+    def bounded(share, samples):
+        drawn.append(samples)
+        return errors.get(float(share[0]), 0.3)
+
+    watched.bounded, watched.penalty = bounded, lambda mount: torch.tensor(0.5)
+    race = Race(FakeRun(placement.Config()), watched)
+    race.answer = lambda number, name: torch.full((6,), (0.3, 0.5)[number], dtype=F)
+    assert chosen(race, 2) == 1
+    assert len({samples.seed for samples in drawn}) * watched.samples == 96
+    errors[0.5] = 0.35
+    race.tensors.clear()
+    assert chosen(race, 2) is None
 
 
 def test_a_grid_without_an_allowed_mount_is_refused_before_the_first_descent():
