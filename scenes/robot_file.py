@@ -143,7 +143,7 @@ class OwnRobot:
     """A user's robot, and how its camera is judged.
 
     robot: URDF or mesh file. camera: bounds of the mount. without: links left out, those that move with the camera.
-    start: of the mount. lens: held. packages: package -> folder, for package:// paths of a URDF. unit_m: metres per unit of
+    start: of the mount, where the first search begins. lens: held. packages: package -> folder, for package:// paths of a URDF. unit_m: metres per unit of
     the robot's mesh file, world_unit_m of the world's; None is as the file says it, or metres.
     world: "outdoors", "corridor" or "flight", or a file: a mesh (metres, z up; glTF y up) or a Mitsuba scene (.xml).
     motion: the drives of a pair by the same names, or a file of poses T_world_body (scenes.tum); None is the world's.

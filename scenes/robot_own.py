@@ -1,5 +1,6 @@
 """A pair out of a user's own files: a robot from URDF or a mesh, a world, a trajectory (scenes.robot_file)."""
 
+import contextlib
 import math
 import os
 import re
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from codesign import place, render
-from codesign.errors import DomainError, FileFormatError
+from codesign.errors import CodesignError, DomainError, FileFormatError
 from codesign.pose import se3_exp
 from scenes import mesh_files, robot_pair, robots, worlds
 from scenes.bodies import Body
@@ -152,6 +153,15 @@ def recorded_drives(path: Path) -> tuple[Drive, tuple[float, ...]]:
     return drive, prior
 
 
+@contextlib.contextmanager
+def _entry(name):
+    """What goes wrong inside names an entry of the page."""
+    try:
+        yield
+    except CodesignError as error:
+        raise type(error)(f"{name}: {error}") from error
+
+
 def _file(entry, name, kinds=()):
     """Path of a file that an entry names, of one of some kinds."""
     path = Path(name)
@@ -173,10 +183,12 @@ def _bodies(own):
             f"packages: there is no folder for {', '.join(missing)}; paths count from the folder of the page."
         )
     if path.suffix.lower() == ".urdf":
-        robot = robots.from_urdf(path, packages=own.packages)
+        with _entry("robot"):
+            robot = robots.from_urdf(path, packages=own.packages)
         parts, frame = list(robot.parts), robot.base
     else:
-        parts, frame = mesh_files.read(path, own.unit_m, materials=False), "base_link"
+        with _entry("robot"):
+            parts, frame = mesh_files.read(path, own.unit_m, materials=False), "base_link"
     names = sorted({part.name for part in parts})
     unknown = [name for name in own.without if name not in names]
     if unknown:
@@ -204,10 +216,11 @@ def _world(own):
             f"motion is missing: the world '{own.world}' is a file and has no drives; give a file of poses, or one of "
             f"{', '.join(PAIRS)}."
         )
-    if path.suffix.lower() == ".xml":
-        scene = worlds.from_mitsuba(path, gain=WHITE, unit_m=own.world_unit_m or 1.0)
-    else:
-        scene = worlds.from_mesh(path, background=DULL, unit_m=own.world_unit_m)
+    with _entry("world"):
+        if path.suffix.lower() == ".xml":
+            scene = worlds.from_mitsuba(path, gain=WHITE, unit_m=own.world_unit_m or 1.0)
+        else:
+            scene = worlds.from_mesh(path, background=DULL, unit_m=own.world_unit_m)
 
     def same(number: int) -> render.MitsubaScene:
         return scene

@@ -1,8 +1,8 @@
 """What a mount has to keep: distance to the robot, a free way for its cable, a view ahead.
 
 Each requirement has a ``slack`` in metres or radians with a gradient to the mount (and to the lens where it looks
-through it), and an ``exact`` one that is at least 0 where it is kept; they are the same but where a count of pixels
-decides. ``penalty`` makes one smooth number of the slacks, to add to an objective; ``judge`` says yes or no.
+through it), and an ``exact`` one that is at least 0 where it is kept; they have the same sign but where a
+count of pixels decides. ``penalty`` makes one smooth number of the slacks, to add to an objective; ``judge`` says yes or no.
 """
 
 import math
@@ -94,11 +94,15 @@ class CableSide:
     def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
         """[..., 1]: (cos a - cos b) / sin a with a the half angle and b the angle between back and axis; near the rim
         of the cone that is b - a in radians, and it is smooth everywhere. Gradient: mount."""
-        axis = _direction(self.forbidden, "cable side: forbidden").to(T_body_cam)
-        cosine = -(T_body_cam[..., :3, 2] * axis).sum(-1, keepdim=True)
-        return (math.cos(self.half_angle_rad) - cosine) / math.sin(self.half_angle_rad)
+        return (math.cos(self.half_angle_rad) - self._cosine(T_body_cam)) / math.sin(self.half_angle_rad)
 
-    exact = slack
+    def exact(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
+        """[..., 1]: b - a, radians."""
+        return self._cosine(T_body_cam).clamp(-1, 1).acos() - self.half_angle_rad
+
+    def _cosine(self, T_body_cam):
+        axis = _direction(self.forbidden, "cable side: forbidden").to(T_body_cam)
+        return -(T_body_cam[..., :3, 2] * axis).sum(-1, keepdim=True)
 
 
 @dataclass(frozen=True)

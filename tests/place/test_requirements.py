@@ -51,6 +51,9 @@ def test_the_cable_side_is_an_angle(camera, angle_deg):
     slack = float(requirement.slack(mount_at(math.radians(angle_deg)), camera))
     assert (slack >= 0) == (angle_deg >= 30)
     over = math.radians(angle_deg - 30)
+    assert float(requirement.exact(mount_at(math.radians(angle_deg)), camera)) == pytest.approx(
+        over, abs=1e-12
+    )
     if abs(over) < 0.01:
         assert slack == pytest.approx(over, abs=over**2)  # cos to second order over sin 30 degrees
 

@@ -248,6 +248,8 @@ def test_the_page_says_what_the_committed_race_says():
         assert cell("grid of", pair) == f"{grid:.3f}"
         within = int((ours <= 1.02 * grid).sum())
         assert cell("descents within", pair).startswith(f"{within} of 12, ")
+        near = [int((each[name] <= 1.02 * grid).sum()) for name in ("start", *SEARCHES)]
+        assert cell("others within", pair) == ", ".join(map(str, near))
 
 
 def test_drives_of_a_world_err_alike():
