@@ -26,8 +26,7 @@ AGREES = {"relative_l2": 1.0, "cosine": 0.8}  # steps have a set length: what co
 UNKNOWN = 1 / 3  # standard error of differences from which on they judge nothing
 WAYS = ("autograd", "differences", "evolution")
 TRIES = 2048
-FINAL_DRAWS = 12  # of the grid's second look
-CHOOSING = 96  # training samples that choose among answers: what tells 10 % (studies.robot_gates)
+FINAL_DRAWS = 12  # that choose among answers, and of the grid's second look
 KEPT_EVERY = 50  # looks
 GROUPS = {"position": slice(0, 3), "attitude": slice(3, 6)}
 
@@ -341,7 +340,7 @@ def chosen(race: Race, count: int) -> int | None:
     them: what is judged on unseen samples has not been chosen by them."""
     if "chosen" not in race.tensors:
         problem = race.problem
-        draws = [problem.draw(-1 - k) for k in range(max(1, round(CHOOSING / problem.samples)))]
+        draws = [problem.draw(-1 - k) for k in range(FINAL_DRAWS)]
         mounts = [problem.start, *(race.answer(number, GRADIENT) for number in range(count))]
         errors = [sum(problem.bounded(share, draw) for draw in draws) for share in mounts]
         race.tensors["chosen"] = torch.tensor(errors).argmin() - 1

@@ -364,7 +364,7 @@ def test_the_first_start_may_be_given(problem):
 
 
 def test_answers_are_chosen_by_their_errors_alone(problem):
-    """On 96 training samples: the second descent errs least, though it has a penalty."""
+    """On twelve draws: the second descent errs least, though it has a penalty."""
     watched = replace(problem)
     errors = {0.3: 0.4, 0.5: 0.2}
     drawn = []
@@ -377,7 +377,7 @@ def test_answers_are_chosen_by_their_errors_alone(problem):
     race = Race(FakeRun(placement.Config()), watched)
     race.answer = lambda number, name: torch.full((6,), (0.3, 0.5)[number], dtype=F)
     assert chosen(race, 2) == 1
-    assert len({samples.seed for samples in drawn}) * watched.samples == 96
+    assert len({samples.seed for samples in drawn}) == FINAL_DRAWS
     errors[0.5] = 0.35
     race.tensors.clear()
     assert chosen(race, 2) is None
