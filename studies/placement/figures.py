@@ -38,9 +38,11 @@ def ways(
         median = errors.quantile(0.5, 0).numpy()
         left.plot(rendered, median, "o-", color=colour, linewidth=1.8, markersize=4, label=name)
         if name != "gradient":
-            best = torch.stack([torch.cummin(trail.error, 0).values for trail in trails[name]])
-            drives = problem.samples * np.arange(1, best.shape[1] + 1)
-            left.plot(drives, best.quantile(0.5, 0).numpy(), "--", color=colour, linewidth=1)
+            best = [torch.cummin(trail.error, 0).values for trail in trails[name]]
+            shortest = min(map(len, best))  # one that finds little that is allowed looks at less
+            least = torch.stack([each[:shortest] for each in best]).quantile(0.5, 0).numpy()
+            drives = problem.samples * np.arange(1, shortest + 1)
+            left.plot(drives, least, "--", color=colour, linewidth=1)
     if grid is not None:
         left.axhline(grid, color="black", linewidth=1, linestyle=":", label="best of the grid")
     left.set(xlabel="drives rendered", ylabel="mean bounded error", ylim=(0, None))
@@ -49,8 +51,8 @@ def ways(
     if looked:
         pitch, height = _pitch_and_height(problem, torch.cat([trail.share for trail in looked]))
         error = torch.cat([trail.error for trail in looked]).numpy()
-        map_ = right.scatter(pitch, height, c=error, s=9, cmap="viridis_r", vmax=1)  # beyond: penalties
-        figure.colorbar(map_, ax=right, label="error and penalty", extend="max")
+        map_ = right.scatter(pitch, height, c=error, s=9, cmap="viridis_r")
+        figure.colorbar(map_, ax=right, label="error and penalty")
     for trail in trails["gradient"]:
         pitch, height = _pitch_and_height(problem, trail.share)
         right.plot(pitch, height, color=COLOURS[0], linewidth=0.9, alpha=0.7)

@@ -138,9 +138,12 @@ class Problem:
 
     def error(self, share: Tensor, samples: Samples) -> float:
         """What searches without gradients minimise: the same and the penalty of what is required."""
-        with torch.no_grad():
-            penalty = float(self.penalty(self.ranges.pose(share)))
-        return self.bounded(share, samples) + penalty
+        return self.bounded(share, samples) + self.penalty_of(share)
+
+    @torch.no_grad()
+    def penalty_of(self, share: Tensor) -> float:
+        """Of a mount [6]."""
+        return float(self.penalty(self.ranges.pose(share)))
 
     def penalty(self, T_body_cam: Tensor) -> Tensor:
         """0 where every requirement is kept with a step to spare. Gradient: mount."""

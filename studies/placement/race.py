@@ -28,6 +28,7 @@ WAYS = ("autograd", "differences", "evolution")
 TRIES = 2048
 FINAL_DRAWS = 12  # that choose among answers, and of the grid's second look
 KEPT_EVERY = 50  # looks
+WORST = 1.0  # of bounded errors
 GROUPS = {"position": slice(0, 3), "attitude": slice(3, 6)}
 
 
@@ -111,7 +112,7 @@ class Race:
 
     def search(self, number: int, name: str, start: Tensor) -> None:
         """A search without gradients at as many samples as the descent rendered, all on the same ones unless it is asked
-        for others."""
+        for others. Of mounts that do not keep what is required nothing is rendered: they are told to be worse than any other."""
         size = self.run.config
         first = 1000 * (size.seed + number)
         steps = itertools.count()
@@ -130,8 +131,13 @@ class Race:
         def whole(part):
             return start.expand(*part.shape[:-1], 6).masked_scatter(free.expand(*part.shape[:-1], 6), part)
 
+        def refused(part):
+            share = whole(part)
+            return None if kept(self.problem, share) else WORST + self.problem.penalty_of(share)
+
         def make(advance):
-            trail = SEARCHES[name](lambda part: error(whole(part)), start[free], count, seed, advance)
+            judge = SEARCHES[name]
+            trail = judge(lambda part: error(whole(part)), start[free], count, seed, advance, refused)
             return Trail(whole(trail.share), trail.error)
 
         self._made(number, name, count, make)

@@ -1,8 +1,8 @@
 """Searches without gradients, over the cube of shares from 0 to 1 in which ``place.MountRanges`` puts mounts.
 
 Each looks at ``count`` points, one call of the judge each, the start first; how the judge deals with noise is its own
-affair. A search is a generator that gives a point and is sent its error, so that budget, bounds and records are the
-same for all. The same seed and judge give the same points.
+affair. What can be refused without a look costs none. A search is a generator that gives a point and is sent its error,
+so that budget, bounds and records are the same for all. The same seed and judge give the same points.
 """
 
 import math
@@ -24,6 +24,7 @@ Proposals: TypeAlias = Generator[Tensor, float, None]
 cma = optional("cma", "search", "the search CMA-ES")
 optuna = optional("optuna", "search", "the search TPE")
 
+MOST_REFUSED = 100  # points for each that is looked at
 SIGMA = 0.25  # of CMA-ES: a quarter of the cube, as its authors advise
 SEED_BITS = 32
 
@@ -59,12 +60,14 @@ class Search:
         count: int,
         seed: int,
         advance: Callable[[float], object] = lambda error: None,
+        refused: Callable[[Tensor], float | None] = lambda share: None,
     ) -> Trail:
         """Look at ``count`` points.
 
         Args: judge: share [V] -> error, the lower the better. start: [V] shares in 0..1. seed: from 0. advance: called
-          with each error.
-        Returns: Trail of count points; the first is the start.
+          with each error. refused: share [V] -> what the search is told of a point that needs no look, None for others;
+          after MOST_REFUSED times ``count`` of them the search ends.
+        Returns: Trail of the points looked at; the first is the start.
         Raises: DomainError for a start outside the cube; NonFiniteError where the judge's error is not finite;
           ShapeError; MissingPackageError.
         """
@@ -78,7 +81,7 @@ class Search:
             raise DomainError(
                 f"search: the start {start.tolist()} is not in the cube from 0 to 1; move it inside."
             )
-        return _followed(self.propose(start, seed), judge, count, advance)
+        return _followed(self.propose(start, seed), judge, count, advance, refused)
 
 
 def uniform(start: Tensor, seed: int) -> Proposals:
@@ -157,22 +160,24 @@ def available(names: Iterable[str]) -> dict[str, Search]:
     return found
 
 
-def _followed(proposals, judge, count, advance):
-    """Trail of the first ``count`` proposals."""
+def _followed(proposals, judge, count, advance, refused):
+    """Trail of the first ``count`` proposals that are not refused."""
     shares = []
     errors = []
-    share = next(proposals)
-    while True:
-        share = share.clamp(0, 1)  # rounding
-        error = float(judge(share.clone()))
-        if not math.isfinite(error):
+    share = next(proposals).clamp(0, 1)
+    for _ in range((1 + MOST_REFUSED) * count):
+        told = refused(share.clone()) if errors else None  # the start is looked at
+        if told is None:
+            told = float(judge(share.clone()))
+            shares.append(share)
+            errors.append(told)
+            advance(told)
+        if not math.isfinite(told):
             raise NonFiniteError(
-                f"search: the judge says {error} of the shares {share.tolist()}; give it finite errors."
+                f"search: the judge says {told} of the shares {share.tolist()}; give it finite errors."
             )
-        shares.append(share)
-        errors.append(error)
-        advance(error)
         if len(errors) == count:
-            proposals.close()
-            return Trail(torch.stack(shares), torch.tensor(errors, dtype=torch.float64))
-        share = proposals.send(error)
+            break
+        share = proposals.send(told).clamp(0, 1)  # rounding
+    proposals.close()
+    return Trail(torch.stack(shares), torch.tensor(errors, dtype=torch.float64))

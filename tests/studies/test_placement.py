@@ -406,6 +406,23 @@ def test_rivals_see_the_same_drives_unless_they_are_asked_for_others(problem, fr
     assert seen == [2000 + fresh * k for k in range(5)]
 
 
+def test_searches_render_nothing_of_mounts_that_are_not_allowed(problem):
+    """Outdoors most of the cube looks down too far to see ahead."""
+    watched = replace(problem)
+    looked = []
+
+    def error(share, samples):
+        looked.append(share)
+        return float((share - 0.4).square().sum())
+
+    watched.error = error
+    race = Race(FakeRun(placement.Config()), watched)
+    race.tensors["gradient/0/samples"] = torch.tensor(12 * watched.samples)
+    race.search(0, "random", watched.start)
+    assert len(looked) == len(race.trail(0, "random").error) == 12
+    assert all(kept(watched, share) for share in looked)
+
+
 class FakeRun:
     """A run that keeps nothing."""
 

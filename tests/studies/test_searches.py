@@ -44,6 +44,26 @@ def test_a_quadratic_is_solved():
             assert trail.error[trail.best] == coupled(trail.share[trail.best])
 
 
+def test_what_is_refused_costs_no_look(search):
+    """A quarter of the square is refused, the minimum beside it; then all but the start."""
+    goal = torch.tensor([0.55, 0.4], dtype=D)
+    looked = []
+
+    def judge(share):
+        looked.append(share)
+        return float((share - goal).square().sum())
+
+    def refused(share):
+        return 2.0 if float(share.max()) < 0.5 else None
+
+    trail = search(judge, torch.tensor([0.7, 0.7], dtype=D), 40, 0, refused=refused)
+    assert len(trail.error) == len(looked) == 40
+    assert float(trail.share.amax(1).min()) >= 0.5
+    assert float(trail.error.min()) < 0.02
+    alone = search(judge, torch.tensor([0.7, 0.7], dtype=D), 3, 0, refused=lambda share: 2.0)
+    assert alone.share.tolist() == [[0.7, 0.7]]
+
+
 def test_coordinate_search_needs_one_round_where_numbers_are_independent():
     """Steps of doubled length until it is worse (four at most from 0.15 to 0.9, one back) and a parabola, which meets the
     minimum of a quadratic: no axis takes more than seven calls."""
