@@ -76,10 +76,11 @@ def searches(run: Run[Any], outcome: Outcome) -> None:
     """The searches beside one another."""
     race = outcome.race
     samples = race.samples(0, GRADIENT)
+    begun = f"{outcome.starts} mounts" if outcome.starts > 1 else "mount"
     told = "drives through the one world" if outcome.unseen.pair.one_world else "worlds and drives"
     run.section(
         "Searches at equal renders",
-        f"Every search began at the same {outcome.starts} mounts and rendered {samples} samples; "
+        f"Every search began at the same {begun} and rendered {samples} samples; "
         "errors are means of q / (1 + q), q the squared error of the velocities that count in units of 0.05 m/s plus a "
         f"tenth of the speed, and 0.15 rad/s, with single events in {told} that no search saw. In brackets: {INTERVAL:.0%} of resampled starts.",
     )
