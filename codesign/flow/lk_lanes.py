@@ -1,6 +1,8 @@
 """What the kernels of the closed form share: the samples of an image, numbers for lanes of them, and recordings."""
 
-from collections.abc import Callable, Sequence
+import contextlib
+import gc
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, wraps
 from typing import Any, NamedTuple
@@ -82,10 +84,23 @@ def recorded(kernel: Callable[..., Any]) -> Callable[..., Any]:
         import drjit as dr
 
         given = tuple(each for each in args if isinstance(each, list) or dr.is_array_v(each))
-        with dr.suspend_grad():
+        with dr.suspend_grad(), uncollected():
             return frozen(args[: len(args) - len(given)])(*given)
 
     return run
+
+
+@contextlib.contextmanager
+def uncollected() -> Iterator[None]:
+    """No garbage is collected inside: a scene of Mitsuba that is freed waits for drjit's kernels, which no recording
+    allows, and the process ends ("Aborted")."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 def tensors(shape: tuple[int, ...], *values: Any) -> list[Tensor]:

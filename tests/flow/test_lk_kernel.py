@@ -1,6 +1,7 @@
 """The kernels of the closed form against the same written down in torch (lk_reference) and scipy, against
 differences, and against a plane that moves."""
 
+import gc
 import sys
 
 import drjit as dr
@@ -12,7 +13,7 @@ from scipy.ndimage import correlate1d
 from codesign import flow
 from codesign.errors import DomainError, GradientError, ShapeError
 from codesign.flow import lk_kernel, lk_warp_kernel
-from codesign.flow.lk_lanes import Grid
+from codesign.flow.lk_lanes import Grid, recorded
 from codesign.types import EventVolume
 from tests.flow import lk_reference
 
@@ -177,6 +178,36 @@ def test_other_sizes_need_no_new_kernel_but_for_copies_to_scatter_into(generator
     assert len(first) >= 9
     # several threads scatter into a copy each, whose size is part of the one kernel that does
     assert len(kernels((4, 3, 80, 21, 4, 5)) - first) <= (dr.thread_count() > 1)
+
+
+def test_no_garbage_is_collected_in_a_recording():
+    """A scene that is freed in one ends the process: the kernel makes more garbage than the collector waits for."""
+    before = gc.get_threshold()
+    collections = []
+
+    def watch(phase, info):
+        collections.append(recording[0])
+
+    def kernel(added, numbers):
+        recording[0] = True
+        kept = [[] for _ in range(1000)]
+        recording[0] = False
+        return numbers + added + 0 * len(kept)
+
+    recording = [False]
+    gc.callbacks.append(watch)
+    gc.set_threshold(50)
+    try:
+        found = recorded(kernel)(2.0, dr.llvm.ad.Float64([1, 2]))
+        kept = [[] for _ in range(1000)]
+    finally:
+        gc.set_threshold(*before)
+        gc.callbacks.remove(watch)
+    assert found.numpy().tolist() == [3, 4]
+    assert len(kept) == 1000
+    assert gc.isenabled()
+    assert collections
+    assert not any(collections)
 
 
 def test_replaying_runs_no_python_while_drjit_holds_its_lock(generator):
