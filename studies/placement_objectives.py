@@ -62,7 +62,7 @@ class Config(StudyConfig):
 def study(run: Run[Config]) -> None:
     size = run.config
     check_pairs(size.pair)
-    if size.draws < 2 or not (size.designs == 0 or size.designs >= 2) or min(size.judged, size.points) < 1:
+    if size.draws < 2 or size.designs < 0 or size.designs == 1 or min(size.judged, size.points) < 1:
         raise DomainError(
             "--draws needs at least 2, --designs 0 or at least 2, --judged and --points at least 1."
         )

@@ -136,8 +136,8 @@ class Race:
             return None if kept(self.problem, share) else WORST + self.problem.penalty_of(share)
 
         def make(advance):
-            judge = SEARCHES[name]
-            trail = judge(lambda part: error(whole(part)), start[free], count, seed, advance, refused)
+            look = SEARCHES[name]
+            trail = look(lambda part: error(whole(part)), start[free], count, seed, advance, refused)
             return Trail(whole(trail.share), trail.error)
 
         self._made(number, name, count, make)
