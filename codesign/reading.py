@@ -29,7 +29,7 @@ def reading(what: str | Path, remedy: str = "it is damaged, or of another kind")
         yield
     except CodesignError:
         raise
-    except Exception as error:  # noqa: BLE001 - what libraries raise for damaged bytes has no common root
+    except Exception as error:  # what libraries raise for damaged bytes has no common root
         said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         said = " ".join(said.split())[:160] or type(error).__name__
         raise FileFormatError(f"{what} cannot be read ({said}); {remedy}.") from error

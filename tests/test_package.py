@@ -18,6 +18,7 @@ PRIVATE = {
     "interrupt",
     "optional",
     "plain_yaml",
+    "reading",
 }  # for the toolkit itself
 
 
