@@ -5,6 +5,7 @@ Every training is a run of studies.train_flow in a folder below; those that are 
 goes on with --resume. Then all networks are judged on the same windows.
 """
 
+import re
 import statistics
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from codesign.train.validation import batches, score
 from scenes.flow_sets import SETS
 from scenes.flow_worlds import ALL, WorldWindows
 from studies.frame.run import Run, StudyConfig, main
+from studies.train_flow.setup import named_class
 from studies.train_flow.sources import UNSEEN, VALIDATION, Shape
 
 NAMES = {
@@ -30,7 +32,6 @@ NAMES = {
     "ecn": "ECN",
     "idnet": "IDNet",
 }
-RIVALS = tuple(name for name in NAMES if name != "refiner")
 ASKED = 0.6  # of a rival's error, at most
 RATES = {
     "refiner": 2e-3,
@@ -61,6 +62,10 @@ class Config(StudyConfig):
     """Windows of 3-D worlds, 128 x 128."""
     real_windows: int = 64
     """Windows of every set of scenes.flow_sets."""
+    own: tuple[str, ...] = ()
+    """Networks of your own to race too: module:Class, run from the folder of the module."""
+    own_learning_rate: float = 2e-3
+    """Their largest step."""
     jobs: int = 2
     """Trainings at a time, one thread each."""
 
@@ -76,20 +81,26 @@ def study(run: Run[Config]) -> None:
         raise DomainError(
             "give at least one seed, one window of each kind and one job, and more than 0 minutes."
         )
-    wanted = [(network, seed) for seed in config.seeds for network in NAMES]
-    _train(run, wanted)
-    networks = {job: flow.load(_folder(run, *job) / "network.safetensors").eval() for job in wanted}
+    names = NAMES | {name: name.partition(":")[2] for name in config.own}
+    rivals = [name for name in names if name != "refiner"]
+    rates = dict.fromkeys(config.own, config.own_learning_rate) | RATES
+    kinds = {name: named_class(name) for name in config.own}
+    wanted = [(network, seed) for seed in config.seeds for network in names]
+    _train(run, wanted, rates)
+    networks = {
+        job: flow.load(_folder(run, *job) / "network.safetensors", kinds.get(job[0])) for job in wanted
+    }
     found = _judge(run, networks)
     rows = []
     met = 0
     for name, scores in found.items():
-        ratios = {network: [scores[network, seed].ratio for seed in config.seeds] for network in NAMES}
+        ratios = {network: [scores[network, seed].ratio for seed in config.seeds] for network in names}
         share = {
             rival: max(a / b for a, b in zip(ratios["refiner"], ratios[rival], strict=True))
-            for rival in RIVALS
+            for rival in rivals
         }
         met += sum(value <= ASKED for value in share.values())
-        for network in NAMES:
+        for network in names:
             run.record(
                 **{
                     f"{name}_{_key(network)}_ratio_seed{seed}": value
@@ -104,7 +115,7 @@ def study(run: Run[Config]) -> None:
                 }
             )
         run.record(
-            **{f"{name}_refiner_over_{_key(rival)}_largest": share[rival] for rival in RIVALS},
+            **{f"{name}_refiner_over_{_key(rival)}_largest": share[rival] for rival in rivals},
             **{f"{name}_closed_form_ratio": scores["closed form"].ratio},
         )
         run.record(**{f"{name}_zero_flow_px": scores["closed form"].zero_flow_px})
@@ -112,28 +123,28 @@ def study(run: Run[Config]) -> None:
             [
                 name.replace("_", " "),
                 round(scores["closed form"].ratio, 3),
-                *[_spread(ratios[network]) for network in NAMES],
-                *[round(share[rival], 2) for rival in RIVALS],
+                *[_spread(ratios[network]) for network in names],
+                *[round(share[rival], 2) for rival in rivals],
             ]
         )
     weights = {
-        network: sum(p.numel() for p in networks[network, config.seeds[0]].parameters()) for network in NAMES
+        network: sum(p.numel() for p in networks[network, config.seeds[0]].parameters()) for network in names
     }
     run.record(
-        **{f"{_key(network)}_weights": weights[network] for network in NAMES},
+        **{f"{_key(network)}_weights": weights[network] for network in names},
         shares_met=met,
-        shares_asked=len(RIVALS) * len(rows),
+        shares_asked=len(rivals) * len(rows),
     )
     run.card(
         f"At most {ASKED:g} of a rival's error",
-        f"{met} of {len(RIVALS) * len(rows)}",
+        f"{met} of {len(rivals) * len(rows)}",
         "sets and rivals, worst seed",
     )
     columns = [
         "windows",
         "closed form",
-        *NAMES.values(),
-        *[f"refiner / {NAMES[rival]}, worst seed" for rival in RIVALS],
+        *names.values(),
+        *[f"refiner / {names[rival]}, worst seed" for rival in rivals],
     ]
     run.table(
         "Endpoint error over that of zero flow",
@@ -142,10 +153,10 @@ def study(run: Run[Config]) -> None:
         f"Least to largest of {len(config.seeds)} seeds. Asked: at most {ASKED:g} of every rival.",
     )
     run.table(
-        "Networks", ["network", "weights", "learning rate"], [[NAMES[n], weights[n], RATES[n]] for n in NAMES]
+        "Networks", ["network", "weights", "learning rate"], [[names[n], weights[n], rates[n]] for n in names]
     )
     run.figure(
-        _figure(found, config.seeds),
+        _figure(found, config.seeds, names),
         "compare",
         "Error over that of zero flow; a dot is a seed, the line is the closed form.",
     )
@@ -157,10 +168,10 @@ def study(run: Run[Config]) -> None:
 
 
 def _folder(run, network, seed):
-    return run.folder / f"{network}_seed{seed}"
+    return run.folder / f"{network.replace(':', '-')}_seed{seed}"
 
 
-def _train(run, wanted):
+def _train(run, wanted, rates):
     """Run every training that is not done, some at a time."""
     waiting = [job for job in wanted if not (_folder(run, *job) / "report.html").exists()]
     active: dict[tuple[str, int], subprocess.Popen] = {}
@@ -170,7 +181,10 @@ def _train(run, wanted):
                 while waiting and len(active) < run.config.jobs:
                     job = waiting.pop(0)
                     active[job] = subprocess.Popen(
-                        _command(run, *job), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+                        _command(run, *job, rates[job[0]]),
+                        stdout=subprocess.DEVNULL,
+                        stderr=subprocess.PIPE,
+                        text=True,
                     )
                 time.sleep(POLL_S)
                 for job in [job for job, process in active.items() if process.poll() is not None]:
@@ -187,7 +201,7 @@ def _train(run, wanted):
                 process.terminate()
 
 
-def _command(run, network, seed):
+def _command(run, network, seed, rate):
     config = run.config
     folder = _folder(run, network, seed)
     if (folder / "checkpoint").exists():
@@ -197,7 +211,7 @@ def _command(run, network, seed):
         "seed": seed,
         "cpu-minutes": config.cpu_minutes,
         "mix": config.mix,
-        "learning-rate": RATES[network],
+        "learning-rate": rate,
         "out": folder,
     }
     options |= {
@@ -205,7 +219,7 @@ def _command(run, network, seed):
         "validate-every": 10**9,
         "validate-on": "layers",
     }  # all are judged together afterwards
-    if network != "refiner":
+    if network in NAMES and network != "refiner":
         options["weights"] = config.weights or sum(p.numel() for p in Refiner().parameters())
     given = [word for name, value in options.items() for word in (f"--{name}", str(value))]
     return [sys.executable, "-m", "studies.train_flow", *given, *(["--quick"] if config.quick else [])]
@@ -230,21 +244,21 @@ def _judge(run, networks):
 
 
 def _key(network):
-    return network.replace("-", "_")
+    return re.sub(r"\W+", "_", network)
 
 
 def _spread(values):
     return f"{min(values):.3f} to {max(values):.3f}"
 
 
-def _figure(found, seeds):
+def _figure(found, seeds, names):
     figure, axes = plt.subplots(figsize=(8, 0.9 + 0.5 * len(found)), constrained_layout=True)
     for place, scores in enumerate(found.values()):
-        for shift, network in enumerate(NAMES):
-            label = NAMES[network] if place == 0 else None
+        for shift, network in enumerate(names):
+            label = names[network] if place == 0 else None
             axes.plot(
                 [scores[network, seed].ratio for seed in seeds],
-                [place + 0.15 * (shift - (len(NAMES) - 1) / 2)] * len(seeds),
+                [place + 0.15 * (shift - (len(names) - 1) / 2)] * len(seeds),
                 "o",
                 color=f"C{shift}",
                 label=label,

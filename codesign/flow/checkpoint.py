@@ -8,7 +8,7 @@ FileFormatError, before any number is computed.
 import hashlib
 import importlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -53,8 +53,11 @@ class NetworkFile:
 def network_class(name: str) -> type[Any]:
     """Class of the network called ``name``.
 
-    Raises: DomainError for a name that is not in NETWORKS.
+    Raises: DomainError for a name that is not in NETWORKS, also for one of a class of the user's own: no file makes
+      anything be imported.
     """
+    if ":" in name:
+        raise DomainError(f"'{name}' is a class of your own; hand it over: flow.load(path, kind=...).")
     if name not in NETWORKS:
         raise DomainError(f"network '{name}' is unknown; choose one of {', '.join(sorted(NETWORKS))}.")
     module, kind = NETWORKS[name].split(":")
@@ -62,9 +65,9 @@ def network_class(name: str) -> type[Any]:
 
 
 def network_name(network: nn.Module) -> str:
-    """The name under which a network's class stands in NETWORKS.
+    """The name under which a network's class stands in NETWORKS, or module:Class of one of the user's own.
 
-    Raises: DomainError when it stands under none.
+    Raises: DomainError for a class that does not keep its constructor's arguments in ``config``.
     """
     kind = type(network)
     for name, place in NETWORKS.items():
@@ -73,18 +76,20 @@ def network_name(network: nn.Module) -> str:
             kind.__module__ == module or kind.__module__.startswith(f"{module}.")
         ):
             return name
-    raise DomainError(
-        f"networks of class {kind.__qualname__} have no name; add it to codesign.flow.checkpoint.NETWORKS."
-    )
+    if not isinstance(getattr(network, "config", None), Mapping):
+        raise DomainError(
+            f"the network ({kind.__qualname__}) has no 'config'; keep its constructor's arguments there, as a dictionary."
+        )
+    return f"{kind.__module__}:{kind.__qualname__}"
 
 
 def save(network: nn.Module, path: str | Path, metadata: Mapping[str, Any] | None = None) -> None:
     """Write a network to ``path`` (.safetensors), whole or not at all.
 
     Args:
-      network: nn.Module of a class in NETWORKS, with its constructor's arguments in ``config``.
+      network: nn.Module with its constructor's arguments in ``config``.
       metadata: plain JSON values to keep with it (seed, steps, figures, command), or None.
-    Raises: DomainError for a network without name, weights that are not finite, and metadata that JSON cannot
+    Raises: DomainError for a network without ``config``, weights that are not finite, and metadata that JSON cannot
       hold; FileFormatError when the file cannot be written.
 
     >>> network = load("refiner")
@@ -117,11 +122,12 @@ def save(network: nn.Module, path: str | Path, metadata: Mapping[str, Any] | Non
     write_tensors(path, weights, content)
 
 
-def load(name_or_path: str | Path) -> "Network":
+def load(name_or_path: str | Path, kind: Callable[..., Any] | None = None) -> "Network":
     """A trained network, in evaluation mode, on the CPU.
 
     Args: name_or_path: "refiner", the one delivered with the package, or the path of a file that ``save``
       wrote.
+      kind: the class of a network of one's own, called with the stored ``config``.
     Returns: the network, a callable from EventVolume to FlowField. Its weights still take gradients;
       ``requires_grad_(False)`` saves their cost.
     Raises: FileFormatError when the file is missing, damaged, of another version, or does not fit its
@@ -140,7 +146,7 @@ def load(name_or_path: str | Path) -> "Network":
             f"'{name_or_path}' is neither a delivered network ({', '.join(DELIVERED)}) nor a .safetensors "
             "file; give one of these."
         )
-    return build(read(path), path).eval()
+    return build(read(path), path, kind).eval()
 
 
 def read(path: str | Path) -> NetworkFile:
@@ -160,13 +166,16 @@ def read(path: str | Path) -> NetworkFile:
     return NetworkFile(content["network"], content["config"], weights, content.get("metadata", {}))
 
 
-def build(stored: NetworkFile, path: str | Path) -> "Network":
-    """The network of a NetworkFile; ``path`` is named in errors.
+def build(stored: NetworkFile, path: str | Path, kind: Callable[..., Any] | None = None) -> "Network":
+    """The network of a NetworkFile; ``path`` is named in errors, ``kind`` as in ``load``.
 
     Raises: FileFormatError when class, configuration and weights do not fit each other.
     """
+    own = getattr(kind, "__qualname__", None)
+    if kind is not None and own != stored.network.partition(":")[2]:
+        raise FileFormatError(f"'{path}' holds a network '{stored.network}', not a {own}; give its class.")
     try:
-        network = network_class(stored.network)(**stored.config)
+        network = (kind or network_class(stored.network))(**stored.config)
     except (CodesignError, TypeError) as error:
         raise FileFormatError(
             f"'{path}' cannot be built as '{stored.network}' ({error}); it was written by another version "

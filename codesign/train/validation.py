@@ -1,12 +1,13 @@
 """How well an estimator does on windows that no network was trained on, beside zero flow."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import nn
 
+from codesign.flow.losses import contrast_loss
 from codesign.flow.metrics import endpoint_error
 from codesign.train.batches import Source, to_device
 from codesign.types import EventVolume, FlowField, FlowWindows
@@ -21,17 +22,21 @@ class Score:
     aee_px, zero_flow_px: mean endpoint error over all valid pixels, of the estimate and of zero flow.
       worse_percent: share of the windows on which the estimate's own mean error is above zero flow's.
       windows: how many were judged.
+    blur: of a set without any true flow, the blur of its events warped by the estimate, as a share of that of zero
+      flow (contrast_loss), which then stands for the errors; worse_percent counts windows where it is above 1. None
+      where there is truth.
     """
 
     aee_px: float
     zero_flow_px: float
     worse_percent: float
     windows: int
+    blur: float | None = None
 
     @property
     def ratio(self) -> float:
-        """Error as a share of that of zero flow."""
-        return self.aee_px / self.zero_flow_px
+        """Error as a share of that of zero flow; blur where there is no truth."""
+        return self.aee_px / self.zero_flow_px if self.blur is None else self.blur
 
 
 def batches(source: Source, count: int) -> Iterator[FlowWindows]:
@@ -48,11 +53,15 @@ def score(
     found: Iterable[FlowWindows],
     device: torch.device | None = None,
 ) -> Score:
-    """Score of ``estimator`` on windows, computed on ``device``. Windows without a valid pixel count for
-    nothing."""
+    """Score of ``estimator`` on windows, computed on ``device``.
+
+    Windows without a valid pixel count for nothing beside others that have some; by themselves they are judged by how
+    sharp the estimate makes their events.
+    """
     device = device or torch.device("cpu")
     sums = torch.zeros(3, dtype=torch.float64)  # error, error of zero flow, pixels
     worse = judged = 0
+    blurs = []
     for windows in found:
         windows = to_device(windows, device)
         flow = estimator(windows.volume).flow_px
@@ -66,7 +75,15 @@ def score(
         sums += torch.stack([error.sum(), zero.sum(), pixels.sum()]).cpu()
         worse += int((error > zero).sum())
         judged += int((pixels > 0).sum())
+        if not judged:
+            blurs += [
+                float(contrast_loss(replace(windows.volume, counts=counts[None]), one[None]))
+                for counts, one in zip(windows.volume.counts, flow.to(windows.volume.counts), strict=True)
+            ]
     error, zero, pixels = sums.tolist()
+    if not judged and blurs:
+        share = sum(blur > 1 for blur in blurs) / len(blurs)
+        return Score(0.0, 0.0, 100 * share, len(blurs), sum(blurs) / len(blurs))
     return Score(error / max(pixels, 1.0), zero / max(pixels, 1.0), 100 * worse / max(judged, 1), judged)
 
 

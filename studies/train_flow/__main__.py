@@ -35,7 +35,7 @@ class Config(StudyConfig):
         "save_every": 6,
     }
     network: str = "refiner"
-    """Which network: refiner, flownet-events, spike-flownet, ecn or idnet."""
+    """Which network: refiner, flownet-events, spike-flownet, ecn or idnet, or module:Class of your own."""
     options: tuple[str, ...] = ()
     """Arguments of the network's constructor, name=number."""
     weights: int = 0
@@ -43,9 +43,12 @@ class Config(StudyConfig):
     mix: str = "real"
     """Windows to train on (studies.train_flow.sources)."""
     data: Path | None = None
-    """Folder of a data set (ours, DSEC, MVSEC) to train on instead; its last tenth is what is judged on."""
+    """Data set (ours, DSEC, MVSEC) or recording to train on instead; its last tenth is what is judged on. Without true
+    flow: --loss contrast."""
     window_frames: int = 1
     """Frame intervals per window of a data set."""
+    window_ms: float = 20.0
+    """Length of the windows of a recording."""
     loss: str = "supervised"
     """supervised, contrast or photometric."""
     unit: Literal["px", "motion"] = "motion"

@@ -18,14 +18,14 @@ def show(run, config, job, scores):
     cpu = (progress.data_s + progress.training_s) / 60
     for name, (ours, closed) in scores.items():
         run.card(
-            f"error over zero flow's, {name.replace('_', ' ')}",
+            f"{'error' if ours.blur is None else 'blur'} over zero flow's, {name.replace('_', ' ')}",
             f"{ours.ratio:.3f}",
             f"closed form {closed.ratio:.3f}; worse than zero flow on {ours.worse_percent:.1f} %",
         )
     run.section(
         "On windows never trained on",
         "Error: mean endpoint error over valid pixels. Worse: windows whose own mean error is above that of "
-        "zero flow.",
+        "zero flow. Windows without any true flow are judged by the blur of their warped events over that of zero flow.",
     )
     rows = [
         (

@@ -1,5 +1,6 @@
 """Everything a training run needs, made and checked before its first step."""
 
+import importlib
 import inspect
 import json
 from dataclasses import dataclass
@@ -178,11 +179,10 @@ def build_network(config):
 
     Raises: DomainError for an unknown name or option.
     """
-    kind = checkpoint.network_class(config.network)
+    kind = named_class(config.network)
     accepted = inspect.signature(kind).parameters
-    options = {"bins": config.bins, **dict(parse(option) for option in config.options)}
-    if "seed" in accepted:
-        options.setdefault("seed", config.seed)
+    options = {name: getattr(config, name) for name in ("bins", "seed") if name in accepted}
+    options |= dict(parse(option) for option in config.options)
     unknown = [name for name in options if name not in accepted]
     if unknown:
         raise DomainError(
@@ -201,6 +201,22 @@ def build_network(config):
             return kind.with_weights(config.weights, **options)
         except TypeError as error:
             raise DomainError(f"network '{config.network}' does not take these options ({error}).") from error
+
+
+def named_class(name):
+    """The class of a network by its name, or by module:Class.
+
+    Raises: DomainError where there is none.
+    """
+    module, colon, own = name.partition(":")
+    if not colon:
+        return checkpoint.network_class(name)
+    try:
+        return getattr(importlib.import_module(module), own)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise DomainError(
+            f"network '{name}' is not there ({error}); give module:Class, run from the folder of the module."
+        ) from error
 
 
 def parse(option):
@@ -241,7 +257,12 @@ def sources(config, shape):
             name: VALIDATION[name](shape, 0) for name in chosen
         }
     whole = open_windows(
-        config.data, config.bins, config.window_frames, (config.height_px, config.width_px), config.seed
+        config.data,
+        config.bins,
+        config.window_frames,
+        (config.height_px, config.width_px),
+        config.seed,
+        config.window_ms * 1e-3,
     )
     held = max(1, len(whole) // HELD_OUT)
     if len(whole) <= held:

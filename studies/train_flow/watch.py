@@ -123,12 +123,8 @@ class Watch:
         }
         for name, (ours, closed) in scores.items():
             for who, found in (("", ours), ("closed_form_", closed)):
-                figures |= {
-                    f"{name}_{who}aee_px": found.aee_px,
-                    f"{name}_{who}ratio": found.ratio,
-                    f"{name}_{who}worse_percent": found.worse_percent,
-                }
-            figures |= {f"{name}_zero_flow_px": ours.zero_flow_px, f"{name}_windows": ours.windows}
+                figures |= {f"{name}_{who}{key}": value for key, value in _figures(found).items()}
+            figures |= {f"{name}_windows": ours.windows}
         run.record(**figures)
         options = json.loads((run.folder / "config.json").read_text(encoding="utf-8"))
         kept = {name: options[name] for name in options if name not in ("out", "resume")}
@@ -146,3 +142,15 @@ class Watch:
         found = score(network, windows, next(network.parameters()).device)
         network.train()
         return found
+
+
+def _figures(found):
+    """{name: value} of a Score; errors only where there is truth."""
+    if found.blur is not None:
+        return {"blur_ratio": found.blur, "worse_percent": found.worse_percent}
+    return {
+        "aee_px": found.aee_px,
+        "ratio": found.ratio,
+        "worse_percent": found.worse_percent,
+        "zero_flow_px": found.zero_flow_px,
+    }

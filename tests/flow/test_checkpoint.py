@@ -27,7 +27,7 @@ class Tiny(nn.Module):
 
 
 class Other(Tiny):
-    """A network without a name."""
+    """A network of the user's own."""
 
 
 @pytest.fixture(autouse=True)
@@ -57,6 +57,19 @@ def test_every_bit_comes_back(tmp_path):
             tensor.reshape(-1).view(torch.uint8).tolist() == own[name].reshape(-1).view(torch.uint8).tolist()
         )
     assert checkpoint.read(tmp_path / "a.safetensors").metadata == {"seed": 3, "loss": 0.1 + 0.2, "note": "π"}
+
+
+def test_a_network_of_ones_own_is_kept_and_needs_its_class(tmp_path):
+    """A file says what it is, and imports nothing: the class is handed over."""
+    network = Other(bins=3)
+    checkpoint.save(network, tmp_path / "own.safetensors")
+    back = checkpoint.load(tmp_path / "own.safetensors", Other)
+    assert back.config == network.config
+    assert torch.equal(back.get_parameter("layer.weight"), network.layer.weight)
+    with pytest.raises(FileFormatError, match=r"Other' is a class of your own; hand it over"):
+        checkpoint.load(tmp_path / "own.safetensors")
+    with pytest.raises(FileFormatError, match=r"Other', not a Tiny"):
+        checkpoint.load(tmp_path / "own.safetensors", Tiny)
 
 
 def test_equal_networks_are_equal_files(tmp_path, path):
@@ -149,8 +162,8 @@ def test_weights_must_be_those_of_the_network(path):
 
 def test_what_cannot_be_loaded_again_is_not_saved(tmp_path, path):
     before = path.read_bytes()
-    with pytest.raises(DomainError, match="have no name"):
-        checkpoint.save(Other(), path)
+    with pytest.raises(DomainError, match="has no 'config'"):
+        checkpoint.save(nn.Conv2d(2, 2, 1), path)
     bad = Tiny()
     nn.init.constant_(bad.layer.weight, torch.inf)
     with pytest.raises(DomainError, match=r"layer\.weight"):

@@ -13,7 +13,7 @@ import torch
 from codesign import events
 from codesign.errors import DomainError, FileFormatError, ShapeError
 from codesign.events.stream import ordered
-from codesign.flow.sources import DatasetWindows, open_windows
+from codesign.flow.sources import DatasetWindows, RecordingWindows, open_windows
 from codesign.flow.sources.chain import chained
 from codesign.flow.sources.collate import bin_times
 from codesign.flow.sources.rows import Rows
@@ -22,6 +22,7 @@ from scenes import worlds
 from studies.frame.run import main
 from studies.make_dataset import __main__ as study
 from studies.make_dataset.store import h5
+from tests.recording_case import eth_text, made
 
 D = torch.float64
 OPTIONS = [
@@ -276,3 +277,19 @@ def test_times_of_the_bins_are_those_of_from_stream():
             bin_times(bins, 1e-3), (volume.centroid_s, volume.collected_s), strict=True
         ):
             torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
+
+
+def test_a_recording_is_a_source_of_windows(tmp_path):
+    """Events of a text file, all of them, in windows of the length asked for; no flow is known."""
+    columns = made(2000, duration_s=0.101)
+    (tmp_path / "events.txt").write_text(eth_text(columns))
+    source = open_windows(tmp_path, bins=4, window_s=0.025)
+    assert isinstance(source, RecordingWindows)
+    windows = source.batch(range(len(source)))
+    assert windows.volume.counts.shape == (4, 2, 4, 180, 240)
+    first_us = columns[0][0]
+    inside = (columns[0] - first_us <= 100_000).sum()
+    # an event on the border of two windows is in both
+    borders = sum(int((columns[0] - first_us == k * 25_000).sum()) for k in (1, 2, 3))
+    assert float(windows.volume.counts.sum()) == pytest.approx(inside + borders)
+    assert not bool(windows.truth.valid.any())

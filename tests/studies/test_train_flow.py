@@ -265,7 +265,7 @@ def test_the_last_tenth_of_a_data_set_is_judged_on_alone(tmp_path, monkeypatch):
         )
         == 0
     )
-    assert opened == [(tmp_path, 2, 2, (16, 16), 0)]
+    assert opened == [(tmp_path, 2, 2, (16, 16), 0, 0.02)]
     probe = asked[0]
     steps = asked[1:15]
     judged = asked[15]

@@ -59,3 +59,22 @@ def test_the_judge_of_a_fit_is_the_ratio_on_windows_made_once():
         network.layer.weight.copy_(TRUE_WEIGHTS[:, :, None, None])
     assert judge(network) < 1e-6
     assert [list(each) for each in made] == [list(range(16)), [16, 17, 18]]
+
+
+def test_windows_without_truth_are_judged_by_the_blur_of_their_events():
+    """A dot crosses 4 px in a window: along its flow all five events fall on one pixel (a fifth of the energy spread out,
+    less the stretch of smoothing), unmoved they lie side by side, which is 1, and against it they part further."""
+    counts = torch.zeros(1, 2, 5, 9, 15)
+    counts[0, 0, torch.arange(5), 4, 5 + torch.arange(5)] = 1.0
+    volume = EventVolume(counts, torch.linspace(0, 1, 5), torch.tensor([0.125, 0.25, 0.25, 0.25, 0.125]))
+    unknown = FlowField(torch.zeros(1, 2, 9, 15), torch.zeros(1, 9, 15, dtype=torch.bool), 1.0)
+
+    def judged(length_px):
+        flow = torch.zeros(1, 2, 9, 15)
+        flow[:, 0] = length_px
+        return score(lambda _: FlowField(flow, unknown.valid, 1.0), [FlowWindows(volume, unknown)])
+
+    along, still, against = judged(4.0), judged(0.0), judged(-4.0)
+    assert still.ratio == pytest.approx(1.0)
+    assert along.ratio < 0.6 < 1.0 < against.ratio
+    assert (along.worse_percent, against.worse_percent, along.windows) == (0.0, 100.0, 1)

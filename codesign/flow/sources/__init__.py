@@ -6,6 +6,7 @@ from codesign.flow.sources.mvsec import MvsecWindows
 from codesign.flow.sources.opening import open_windows
 from codesign.flow.sources.packet import SKIPPABLE, Packet, PacketOptions
 from codesign.flow.sources.packets import read_packets, read_recording
+from codesign.flow.sources.recorded import RecordingWindows
 from codesign.flow.sources.rendered import DatasetWindows
 from codesign.flow.sources.text_events import read_text_events
 
@@ -16,6 +17,7 @@ __all__ = [
     "MvsecWindows",
     "Packet",
     "PacketOptions",
+    "RecordingWindows",
     "open_windows",
     "read_packets",
     "read_recording",
