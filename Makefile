@@ -11,7 +11,7 @@ STUDIES := lens-opt lens-report lens-scratch lens-tolerance lens-bench silhouett
 	event-gradient event-bench srm-bench davis train-flow flow-quality flow-compare flow-cost flow-recording \
 	placement speed-error stability gradcheck
 
-.PHONY: help setup test test-bits lint core-check doctor clean $(STUDIES)
+.PHONY: help setup test test-bits lint core-check try-all doctor clean $(STUDIES)
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1|/p' Makefile | awk -F'|' '{printf "%-24s %s\n", $$1, $$2}'
@@ -82,6 +82,9 @@ lint: setup ## format, ruff and pyright
 
 core-check: ## an environment of its own with the core alone: everything is imported, lens_opt runs
 	@setup/core_check.sh "$(PYTHON)"
+
+try-all: setup ## every command of README, docs and Makefile in its quick form, one table (an hour or two)
+	@$(RUN) setup/try_all.py $(ARGS)
 
 doctor: setup ## what is installed, what is missing, what to do
 	@$(RUN) -m codesign doctor

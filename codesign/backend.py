@@ -280,16 +280,16 @@ class _Kernel(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
+        inputs = ctx.saved_tensors  # read once: a checkpoint gives them no second time
         with torch.no_grad():
-            result = _adjoint(ctx, grads)
-        return (None, None, *first_only(result, (*ctx.saved_tensors, *grads)))
+            result = _adjoint(ctx, inputs, grads)
+        return (None, None, *first_only(result, (*inputs, *grads)))
 
 
-def _adjoint(ctx, grads):
+def _adjoint(ctx, inputs, grads):
     """Gradients of the kernel's inputs, by re-running it with drjit's reverse mode."""
     import drjit as dr
 
-    inputs = ctx.saved_tensors
     arr = ctx.arrays
     wanted = ctx.needs_input_grad[2:]
     flat = [_to_drjit(arr, x) for x in inputs]

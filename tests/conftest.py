@@ -1,6 +1,8 @@
 """What every test may ask for: reference data, a seeded generator, a screenless matplotlib."""
 
+import importlib.util
 import os
+import re
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -19,9 +21,46 @@ if "CODESIGN_TEST_THREADS" in os.environ:
     import drjit
 
     drjit.set_thread_count(torch.get_num_threads())
+# modules that extras of pyproject.toml bring
+EXTRAS = {
+    "h5py",
+    "hdf5plugin",
+    "lz4",
+    "zstandard",
+    "imageio",
+    "imageio_ffmpeg",
+    "tifffile",
+    "trimesh",
+    "collada",
+}
+EXTRAS |= {"yourdfpy", "lxml", "tensorboard", "cma", "optuna", "onnx", "onnxscript"}
+ABSENT = {name for name in EXTRAS if importlib.util.find_spec(name) is None}
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = next((folder for folder in (ROOT / "shared", ROOT.parent / "shared") if folder.is_dir()), None)
 SUBSET = ROOT / "tests" / "data"  # of the reference values; see its README.md
+
+
+def _without_extras(report, path):
+    """The report of a file or test that fails for want of a package of an extra, as skipped."""
+    said = report.longreprtext + "".join(text for _, text in report.sections)
+    names = "|".join(sorted(ABSENT))
+    missing = re.search(
+        rf"No module named '({names})\b|needs \S+; install it with: pip install 'codesign\[", said
+    )
+    if ABSENT and report.failed and missing:
+        report.outcome = "skipped"
+        report.longrepr = (str(path), 0, f"Skipped: {missing[0]}")
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    return _without_extras((yield), collector.path)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item):
+    return _without_extras((yield), item.path)
 
 
 @pytest.fixture(scope="session")

@@ -107,8 +107,9 @@ class _Moving(Function):
 
     @staticmethod
     def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
-        found = lk_warp_kernel.adjoint(*ctx.saved_tensors, *ctx.rest, grads, ctx.needs_input_grad[0])
-        return *first_only(found, *ctx.saved_tensors[:2], *grads), None, None, None
+        saved = ctx.saved_tensors
+        found = lk_warp_kernel.adjoint(*saved, *ctx.rest, grads, ctx.needs_input_grad[0])
+        return *first_only(found, *saved[:2], *grads), None, None, None
 
 
 class _Sums(Function):
@@ -123,8 +124,9 @@ class _Sums(Function):
 
     @staticmethod
     def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
-        found = lk_sums_kernel.adjoint(*ctx.saved_tensors, *ctx.rest, grad)
-        return *first_only(found, *ctx.saved_tensors, grad), None, None
+        saved = ctx.saved_tensors
+        found = lk_sums_kernel.adjoint(*saved, *ctx.rest, grad)
+        return *first_only(found, *saved, grad), None, None
 
 
 class _Blurred(Function):

@@ -211,6 +211,30 @@ class GeoLens(Replaceable):
             )
         super()._known(name)
 
+    def _identity(self):
+        found = {
+            "entrance pupil diameter in mm": self.entrance_pupil_diameter_mm,
+            "soft edge in mm": self.soft_edge_mm,
+            "half field in degrees": self.half_field_deg or 0.0,
+            "stop": self.stop_index + 1.0,
+            "plate's surface": self.plate_at[0] if self.plate is not None else 0.0,
+            "plate's distance in mm": float(self.plate_at[1]) if self.plate is not None else 0.0,
+        }
+        for i, s in enumerate(self.surfaces, 1):
+            medium = s.medium or AIR
+            low, high = medium.range_um
+            found |= {
+                f"index behind surface {i} at {line} ({medium.name} here)": medium.index(
+                    min(max(w, low), high)
+                )
+                for line, w in WAVELENGTH_UM.items()
+            }
+            found[f"mirror at surface {i}"] = float(s.mirror)
+            found[f"obstruction of surface {i} in mm"] = s.inner_semi_aperture_mm
+            found[f"diffraction order of surface {i}"] = float(s.phase.order if s.phase else 0)
+            found[f"blaze of surface {i} in um"] = (s.phase and s.phase.blaze_um) or 0.0
+        return found
+
     def _kinds(self):
         return kinds(self)
 

@@ -118,6 +118,9 @@ class ThinLens(Replaceable):
             )
         return self.replace(efl_mm=efl, image_distance_mm=1 / (1 / efl - 1 / distance_mm))
 
+    def _identity(self):
+        return {"entrance pupil diameter in mm": self.entrance_pupil_diameter_mm}
+
     def _kinds(self):
         at = torch.zeros(1, dtype=torch.int64, device=self.efl_mm.device)
         reach = 0.1 * self.efl_mm.detach().reshape(1)

@@ -33,6 +33,8 @@ class Replaceable(nn.Module):
 
     tensor_names: the tensors that ``replace`` takes. parameter_names: those of them that are Parameters of a
       lens as it was built.
+    A saved state also says what its tensors belong to (pupil, glasses, kinds of surfaces): ``load_state_dict`` refuses
+      that of another lens before it copies anything.
     Conversions (``to``, ``float``, ``double``) and ``load_state_dict`` make new tensors wherever a tensor may be
       shared, so make optimisers after converting, as torch asks. ``copy.deepcopy`` gives a lens that owns its
       numbers, whatever it is a copy of.
@@ -119,14 +121,50 @@ class Replaceable(nn.Module):
                     self._parameters[name] = new
         return super()._apply(fn, recurse)
 
-    def _load_from_state_dict(self, state_dict, prefix, *rest):
+    def get_extra_state(self) -> Tensor:
+        """What the tensors of a saved state belong to, beside their shapes: the numbers of ``_identity``."""
+        return torch.tensor([*self._identity().values()], dtype=torch.float64)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Checked in ``_load_from_state_dict``, before any tensor is copied."""
+
+    def _identity(self) -> dict[str, float]:
+        """What is no tensor of this object, but what its tensors belong to: {what: number}."""
+        raise NotImplementedError
+
+    def _check_state(self, state):
+        """Raise DomainError where a saved state is that of another object."""
+        own = self._identity()
+        remedy = "build the same one and load again; files of lens.save hold a lens whole"
+        given = state.tolist() if torch.is_tensor(state) and state.ndim == 1 else []
+        if len(given) != len(own):
+            raise DomainError(
+                f"the state is of another {type(self).__name__} ({len(given)} numbers describe it, {len(own)} this one); "
+                f"{remedy}."
+            )
+        eps = 4 * torch.finfo(state.dtype if state.is_floating_point() else torch.float64).eps
+        for (name, here), there in zip(own.items(), given, strict=True):
+            if not abs(there - here) <= eps * abs(here):
+                raise DomainError(
+                    f"the state is of another {type(self).__name__}: its {name} is {there:.9g}, here {here:.9g}; {remedy}."
+                )
+
+    def _load_from_state_dict(self, state_dict, prefix, local_metadata, strict, missing, *rest):
+        key = f"{prefix}_extra_state"
+        if key in state_dict:
+            self._check_state(state_dict[key])
         # values are copied in place, so the buffers, and a plate of another lens, must be this lens's own
         self._buffers.update({name: _own(value) for name, value in self._buffers.items()})
         if self.borrows:
             parts = {name: child for name, child in self._modules.items() if isinstance(child, Replaceable)}
             self._modules.update(copy.deepcopy(parts))
             self.borrows = False
-        super()._load_from_state_dict(state_dict, prefix, *rest)
+        super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, missing, *rest)
+        if key in missing:  # torch names it in its error, unless it is asked not to be strict
+            missing[missing.index(key)] = (
+                f"{key} (pupil, glasses and kinds of surfaces; states of earlier versions lack them: strict=False loads "
+                "one that you know to be of this very lens)"
+            )
 
     def _known(self, name):
         if name not in self.tensor_names:

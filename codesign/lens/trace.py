@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from codesign.backend import run_kernel
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.errors import DomainError, ShapeError, check_finite, check_whole
 from codesign.lens.kernel import Kernel, Status, Works
 
 
@@ -336,7 +336,14 @@ def sum_over_chunks(function: Callable[..., Tensor], *rays: Tensor, rows: int = 
     Args: function of tensors [n, ...] -> tensor, such as a merit of traced rays; rays: tensors [N, ...] split
       together into ``rows`` at a time.
     Returns: the sum over chunks. Gradient: as if all were traced at once.
+    Raises: ShapeError unless every tensor holds the same number of rays, at least one.
     """
+    rows = check_whole(rows, "rows")
+    counts = {len(r) if isinstance(r, Tensor) and r.ndim else 0 for r in rays}
+    if len(counts) != 1 or 0 in counts:
+        raise ShapeError(
+            f"rays hold {sorted(counts)} rows; give tensors of the same number of rays, at least one."
+        )
     first, *rest = zip(*(r.split(rows) for r in rays), strict=True)
     total: Tensor = checkpoint(function, *first, use_reentrant=False)  # pyright: ignore[reportAssignmentType]
     for part in rest:

@@ -52,7 +52,7 @@ class Config(StudyConfig):
     QUICK: ClassVar = {"systems": 12}
     references: Path | None = None
     """Folder that holds cooke_triplet.json, double_gauss.json and la1509.json; ../shared/refs/lens beside the
-    repository when left out."""
+    repository, or tests/data/refs/lens in it, when left out."""
     systems: int = 50
     """Random lenses with objects at finite distances."""
 
@@ -97,9 +97,12 @@ def study(run: Run[Config]) -> None:
 
 
 def default_folder():
-    """The reference folder beside the repository (or in it), where there is one."""
+    """The reference folder beside the repository (or in it), where there is one, else the one of the tests."""
     root = Path(__file__).resolve().parents[2]
-    found = [place / "shared" / "refs" / "lens" for place in (root.parent, root)]
+    found = [
+        place / "refs" / "lens"
+        for place in (root.parent / "shared", root / "shared", root / "tests" / "data")
+    ]
     return next((folder for folder in found if folder.is_dir()), found[0])
 
 

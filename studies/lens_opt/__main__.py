@@ -299,8 +299,8 @@ def judge_all(course, lenses):
             for name, optics in lenses.items():
                 row = job.task.judge(optics, case, job.system.flow, 2 * run.config.samples)
                 found.setdefault(name, []).append(row)
+            course.save()
             bar.advance()
-    course.save()
     return found
 
 

@@ -87,7 +87,7 @@ def shrink_spots(
     The even weights are optimised from ``starts`` starts, the detuned lens and others around it; the other weights go
     on from the best of them.
     Args: judge: mean flow error on development cases. steps: most steps of a run.
-    Raises: DomainError when no start gives a smaller spot than it had.
+    Returns: the start itself, with a complaint, when no start gives a smaller spot than it had.
     """
     generator = torch.Generator().manual_seed(seed)
     weights = field_weights(task)
@@ -105,10 +105,12 @@ def shrink_spots(
     best = min(tried, key=lambda solver: solver.loss, default=None)
     before = float(residuals(task, size, weights[FIRST])(first).square().sum()) / 2
     if best is None or not best.loss < before:
-        raise DomainError(
-            f"the spot designer finds no smaller spot from {starts} starts in {steps} steps, so there is no rival to "
-            "compare with; give more --spot-starts or --spot-steps, or another --seed."
+        complaint = (
+            f"the spot designer finds no smaller spot from {starts} starts in {steps} steps, so its lens is the start; "
+            "with more --spot-starts or --spot-steps it may do better than shown."
         )
+        optics = task.design.reference.freeze()
+        return [Variant("none smaller: the start", optics, judge(optics), complaint)]
     solved = {FIRST: best}
     for name in weights.keys() - {FIRST}:
         solved[name] = _solved(task, size, weights[name], best.variables, steps)

@@ -2,14 +2,19 @@
 say, one lens in two formats, and reasons for refusals."""
 
 import contextlib
+import importlib.util
 import json
 import math
+import sys
+import warnings
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from codesign import lens
 from codesign.errors import CodesignError, DomainError, FileFormatError
+from codesign.lens.analysis.rays import field_rays
 from studies import lens_files
 from studies.frame.run import main
 from studies.lens_files import ALLOWED, CLAIMS, examine
@@ -256,7 +261,26 @@ def test_real_lenses_survive_a_round_trip(name, extension, shared, tmp_path):
         )
 
 
-def test_a_study_of_a_folder_counts_what_loads(tmp_path, capsys):
+class WarningPeer:
+    """A stand-in for a ray tracer whose figures are the lens's own, and which warns while it compiles."""
+
+    def __init__(self, path):
+        warnings.warn("an internal check of the compiler", stacklevel=1)
+        self.geo = lens.load(path)
+        self.paraxial = SimpleNamespace(f2=lambda: float(self.geo.first_order().efl_mm.detach()))
+
+    def trace_generic(self, x_share, y_share, x, y, wavelength_um):
+        field = y_share * math.radians(self.geo.half_field_deg or 0.0)
+        pupil = torch.stack([torch.as_tensor(x), torch.as_tensor(y)], 1)
+        out = self.geo.trace(*field_rays(self.geo, field, pupil, wavelength_um), wavelength_um)
+        return SimpleNamespace(**dict(zip("xy", out.position_mm[:, :2].detach().numpy().T, strict=True)))
+
+
+@pytest.mark.parametrize("peer", [None, WarningPeer])
+def test_a_study_of_a_folder_counts_what_loads_with_and_without_a_peer(peer, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: peer)
+    monkeypatch.setitem(sys.modules, "optiland", SimpleNamespace())
+    monkeypatch.setitem(sys.modules, "optiland.fileio", SimpleNamespace(load_zemax_file=peer))
     folder = tmp_path / "lenses"
     out = tmp_path / "run"
     folder.mkdir()
@@ -266,6 +290,8 @@ def test_a_study_of_a_folder_counts_what_loads(tmp_path, capsys):
     assert main(lens_files.study, lens_files.Config, ["--out", str(out), "--folder", str(folder)]) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     assert [metrics[name] for name in ("files", "loaded", "refused", "claims")] == [2, 1, 1, 0]
+    assert metrics["round_trips"] == (3 if peer else 0)  # the catalogue's own
+    assert metrics.get("round_trips_missed", 0) == 0
     table = (out / "table.md").read_text()
     assert "| bad.seq | refused |" in table
     assert "glass 'NOGLASS' is not in the catalogue" in table

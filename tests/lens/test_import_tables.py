@@ -197,6 +197,31 @@ def test_an_optiland_file(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("kind", "height", "half_field"),
+    [
+        ("AngleField", 5.0, lambda f: 5.0),
+        ("ObjectHeightField", 5.0, lambda f: math.degrees(math.atan(5.0 / 200.0))),
+        ("ParaxialImageHeightField", 4.0, lambda f: math.degrees(math.atan(4.0 / f))),
+        ("RealImageHeightField", 4.0, lambda f: math.degrees(math.atan(4.0 / f))),
+    ],
+)
+def test_fields_as_version_0_6_writes_them(kind, height, half_field, tmp_path):
+    fields = {"fields": [{"x": 0.0, "y": 0, "vx": 0.0, "weight": 1.0}, {"x": 0.0, "y": height}]}
+    near = {"geometry": {"type": "Plane", "cs": axes(-200.0), "radius": math.inf}}
+    page = optiland(
+        (0, near), fields=fields | {"telecentric": False, "field_definition": {"field_type": kind}}
+    )
+    geo = lens.load(write(tmp_path, "lens.json", page))
+    assert geo.half_field_deg == pytest.approx(half_field(geo.first_order().efl_mm.item()), rel=1e-12)
+
+
+def test_a_medium_without_dispersion_holds_at_any_wavelength(tmp_path):
+    page = optiland((1, {"material_post": {"type": "IdealMaterial", "index": 4.002}}))
+    geo = lens.load(write(tmp_path, "lens.json", page))
+    assert geo.index(10.6).tolist() == [1, 4.002, 1]
+
+
+@pytest.mark.parametrize(
     ("pupil", "true"),
     [
         ({"type": "imageFNO", "value": 5}, lambda f: f / 5),

@@ -270,6 +270,27 @@ def test_the_light_may_step_back_at_a_plane_that_does_nothing(tmp_path):
     assert [s.thickness_mm for s in load(tmp_path, text(surfaces=kept)).to_surfaces()] == [5, 4, 60]
 
 
+BREAK = ["  TYPE COORDBRK", "  CURV 0.0", "  PARM 1 0", "  PARM 3 0", "  PARM 6 1"]
+
+
+def test_a_coordinate_break_that_moves_nothing_stays_in_its_medium(tmp_path):
+    front = changed(FRONT, "DISZ", ["  DISZ 3"])
+    inside = ["SURF 2", *BREAK, "  DISZ 1"]
+    outside = ["SURF 4", *BREAK, "  DISZ 0"]
+    back = changed(BACK, "SURF", ["SURF 3"])
+    geo = load(
+        tmp_path, text(surfaces=(OBJECT, front, inside, back, outside, changed(IMAGE, "SURF", ["SURF 5"])))
+    )
+    assert efl(geo) == pytest.approx(thick(0.02, -0.01, 4.0), rel=1e-13)
+    assert [s.medium and s.medium.name for s in geo.to_surfaces()] == ["N-BK7", "N-BK7", None, None]
+    # behind a mirror on the back of the glass the light goes back through the glass
+    mirror = [*changed(back, "DISZ", ["  DISZ -1"]), "  GLAS MIRROR 0 0 1.5 40"]
+    last = ["SURF 5", "  CURV 0", "  DISZ -30"]
+    behind = ["SURF 4", *BREAK, "  DISZ -3"]
+    mangin = (OBJECT, front, inside, mirror, behind, last, ["SURF 6", "  CURV 0"])
+    assert load(tmp_path, text(surfaces=mangin)).index().tolist() == [1, N, N, N, N, 1]
+
+
 def test_obstructions_and_rings_become_an_inner_aperture(tmp_path):
     for line in ("  OBSC 0 2.5 0", "  CLAP 2.5 8 0"):
         geo = load(tmp_path, text(surfaces=(OBJECT, [*FRONT, line], BACK, IMAGE)))
@@ -438,6 +459,16 @@ BAD = {
     "coordinate break": (
         front("TYPE", "TYPE COORDBRK", "PARM 3 45"),
         "surface 1: type COORDBRK is not read.*tilts or shifts",
+    ),
+    "no aperture": (head("ENPD"), "does not say how wide its beam is; give the entrance pupil diameter"),
+    "no curvature": (front("CURV"), "surface 1: the line CURV is missing"),
+    "no distance": (front("DISZ"), "surface 1: the line DISZ is missing"),
+    "an f-number in glass": (
+        text(
+            changed(HEAD, "ENPD", ["FNUM 5 0"]),
+            (OBJECT, FRONT, [*BACK, "  GLAS N-BK7 0 0"], IMAGE),
+        ),
+        "f-number is counted in the image space, which is glass",
     ),
     "toroid": (front("TYPE", "TYPE TOROIDAL"), "type TOROIDAL"),
     "paraxial": (front("TYPE", "TYPE PARAXIAL"), "ideal thin lens"),

@@ -205,7 +205,8 @@ def test_loading_and_converting_a_replacement_leave_the_plate_alone(plate):
     plated = with_plate(landscape(), plate, z_mm=1.0)
     (first,) = plate.parameters()
     twin = plated.replace()
-    twin.load_state_dict({name: value * 0 for name, value in twin.state_dict().items()})
+    state = twin.state_dict()
+    twin.load_state_dict(state | {name: v * 0 for name, v in state.items() if "extra_state" not in name})
     assert float(next(twin.plate.parameters()).detach().abs().max()) == 0
     for other in (plated.replace(), plated):
         assert next(other.float().plate.parameters()).dtype == torch.float32

@@ -132,3 +132,12 @@ def test_what_cannot_be_sampled_is_refused():
         diffraction_psf(geo, 0.0, padding=1)
     with pytest.raises(DomainError, match="wider than the"):
         psf_on_pixels(paraboloid(), 0.0, 0.01, 512, grid=64)
+
+
+@pytest.mark.parametrize("psf", [analysis.psf_on_pixels, analysis.geometric_psf])
+@pytest.mark.parametrize("wrong", [-1, 0, math.nan, math.inf, None, "fine", []])
+@pytest.mark.parametrize("name", ["pixel_mm", "pixels"])
+def test_a_grid_of_no_pixels_is_refused(psf, wrong, name):
+    geo = lens.load("cooke-triplet")
+    with pytest.raises(DomainError, match=f"^{name} = "):
+        psf(geo, 0.0, **({"pixel_mm": 0.004, "pixels": 8} | {name: wrong}))

@@ -1,6 +1,7 @@
 """Lenses as torch Modules: what they own, what they share, what conversions, copies and saved states keep."""
 
 import copy
+import dataclasses
 import math
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 
 from codesign import lens
 from codesign.errors import DomainError
-from codesign.lens import GeoLens, Glass, Pinhole, Surface, ThinLens
+from codesign.lens import GeoLens, Glass, Phase, Pinhole, Surface, ThinLens, plates
 
 D = torch.float64
 GLASS = Glass.from_indices(1.51, 1.5, 1.49, "g")
@@ -20,7 +21,8 @@ def rays(dtype=D):
 
 
 def tensors(module):
-    return {name: value.clone() for name, value in module.state_dict().items()}
+    """What ``state_dict`` gives, without what says whose it is."""
+    return {n: value.clone() for n, value in module.state_dict().items() if "extra_state" not in n}
 
 
 def same(found, wanted):
@@ -76,7 +78,7 @@ def test_a_twin_and_its_original_are_converted_apart(change):
     exact = geo.trace(*rays()).position_mm
     assert exact.dtype == D
     out = twin.trace(*rays(torch.float32))
-    assert {v.dtype for n, v in twin.state_dict().items()} == {torch.float32}
+    assert {v.dtype for v in tensors(twin).values()} == {torch.float32}
     gradient = torch.autograd.grad(out.position_mm[:, :2].square().sum(), geo.curvature_per_mm)[0]
     assert gradient.dtype == D
     wanted = torch.autograd.grad(
@@ -97,7 +99,7 @@ def test_the_state_of_a_twin_holds_every_tensor_and_is_its_own():
     assert tensors(twin).keys() == tensors(geo).keys()
     assert list(twin.parameters()) == []
     first = tensors(geo)
-    twin.load_state_dict({name: value + 0.01 for name, value in first.items()})
+    twin.load_state_dict(twin.state_dict() | {name: value + 0.01 for name, value in first.items()})
     same(tensors(geo), first)
     same(tensors(twin), {name: value + 0.01 for name, value in first.items()})
     twin = geo.replace(thickness_mm=geo.thickness_mm * 2)
@@ -144,6 +146,60 @@ def test_a_state_goes_through_a_file_without_pickle(tmp_path):
         torch.save(module.state_dict(), tmp_path / "state.pt")
         fresh.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
         same(tensors(fresh), tensors(module))
+
+
+TRIPLET = lens.load("cooke-triplet")
+DOUBLET = [Surface(50.0, 5.0, GLASS, 10.0, is_stop=True), Surface(-80.0, 20.0, None, 10.0)]
+
+
+def surfaces_with(**changes):
+    return GeoLens([dataclasses.replace(DOUBLET[0], **changes), DOUBLET[1]], 8.0)
+
+
+# name of what differs in the sentence, the lens that is saved, the one it is loaded into
+HYBRIDS = {
+    "entrance pupil diameter": (TRIPLET.scaled(0.1), TRIPLET.scaled(0.2)),
+    "index behind surface 1 at F .N-SK16 here.": (TRIPLET.replace_glass(0, "SF2"), TRIPLET),
+    "index behind surface 2 at F .air here.": (TRIPLET.replace_glass(1, "SF2"), TRIPLET),
+    "mirror at surface 1": (surfaces_with(mirror=True, medium=None), surfaces_with(medium=None)),
+    "obstruction of surface 1": (surfaces_with(inner_semi_aperture_mm=2.0), surfaces_with()),
+    "diffraction order of surface 1": (
+        surfaces_with(phase=Phase((0.1,), 2)),
+        surfaces_with(phase=Phase((0.1,), 1)),
+    ),
+    "stop": (
+        GeoLens(DOUBLET, 8.0),
+        GeoLens([*(dataclasses.replace(s, is_stop=not s.is_stop) for s in DOUBLET)], 8.0),
+    ),
+    "soft edge": (GeoLens(DOUBLET, 8.0), GeoLens(DOUBLET, 8.0, soft_edge_mm=0.1)),
+    "half field": (GeoLens(DOUBLET, 8.0, half_field_deg=5.0), GeoLens(DOUBLET, 8.0)),
+    "numbers describe it": (TRIPLET, lens.load("double-gauss")),
+    "ThinLens: its entrance pupil": (ThinLens(50.0, 10.0), ThinLens(50.0, 5.0)),
+    "term 1": tuple(plates.ZernikePlate({term: 1.0}, 4.0) for term in (5, 6)),
+    "finest detail": tuple(plates.GridPlate(torch.ones(6, 6), pitch) for pitch in (1.0, 2.0)),
+}
+
+
+@pytest.mark.parametrize("what", HYBRIDS)
+def test_no_hybrid_comes_from_a_saved_state(what):
+    saved, other = HYBRIDS[what]
+    before = tensors(other)
+    for strict in (True, False):
+        with pytest.raises(DomainError, match=what):
+            other.load_state_dict(saved.state_dict(), strict=strict)
+    same(tensors(other), before)
+    copy.deepcopy(saved).load_state_dict({name: value.float() for name, value in saved.state_dict().items()})
+
+
+def test_a_state_of_before_is_taken_where_its_owner_vouches_for_it():
+    other = lens.load("cooke-triplet")
+    old = {name: value * 1.01 for name, value in tensors(TRIPLET).items()}
+    with pytest.raises(
+        RuntimeError, match=r"lens._extra_state .pupil, glasses and .* lack them: strict=False"
+    ):
+        torch.nn.ModuleDict({"lens": other}).load_state_dict({f"lens.{n}": v for n, v in old.items()})
+    other.load_state_dict(old, strict=False)
+    same(tensors(other), old)
 
 
 def test_conversion_keeps_values_flags_and_gradients():

@@ -20,7 +20,7 @@ from studies.lens_opt import rivals
 from studies.lens_opt.paired import of_differences, paired, pooled, verdict
 from studies.lens_opt.spots import spot_rays
 from studies.lens_opt.stages import estimator, weights_of
-from studies.lens_opt.task import DISTANCE_M, LIGHT, PITCH_MM, make_task
+from studies.lens_opt.task import DISTANCE_M, LIGHT, PITCH_MM, LensTask, make_task
 
 SMALL = ["--quick", *(f"--{name}=1" for name in ("after-steps", "cases", "scored", "spot-steps"))]
 SMALL += ["--steps=2", "--judged=2", "--samples=4"]
@@ -85,10 +85,41 @@ def test_rivals_keep_focal_length_aperture_and_floors_of_the_design(task):
     assert all("has not converged in 4 steps" in variant.complaint for variant in spots)
 
 
-def test_a_spot_designer_that_finds_nothing_is_refused(task, monkeypatch):
+def test_a_spot_designer_that_finds_nothing_ends_at_the_start_and_says_so(task, monkeypatch):
     monkeypatch.setattr(rivals, "_solved", lambda *_: SimpleNamespace(loss=math.inf))
-    with pytest.raises(DomainError, match="finds no smaller spot from 2 starts in 5 steps"):
-        rivals.shrink_spots(task, None, 5, 2, 0)
+    (found,) = rivals.shrink_spots(task, lambda optics: 7.0, 5, 2, 0)
+    assert "finds no smaller spot from 2 starts in 5 steps, so its lens is the start" in found.complaint
+    assert torch.equal(found.optics.curvature_per_mm, task.design.reference.curvature_per_mm)
+    assert found.error_mrad == 7.0
+
+
+class Killed(BaseException):
+    pass
+
+
+def test_what_was_judged_before_a_kill_is_not_judged_again(tmp_path, monkeypatch):
+    judge = LensTask.judge
+    last = lens_opt.JUDGED + 2
+    asked = set()
+
+    def watched(task, optics, case, *rest):
+        asked.add(case.seed)
+        if case.seed == last and not resumed:
+            raise Killed
+        return judge(task, optics, case, *rest)
+
+    monkeypatch.setattr(LensTask, "judge", watched)
+    resumed = False
+    with pytest.raises(Killed):
+        main(
+            lens_opt.study, lens_opt.Config, [*SMALL, "--judged=3", "--steps=1", "--out", str(tmp_path / "a")]
+        )
+    assert last - 1 in asked
+    asked.clear()
+    resumed = True
+    assert main(lens_opt.study, lens_opt.Config, ["--resume", str(tmp_path / "a")]) == 0
+    assert last in asked
+    assert last - 1 not in asked
 
 
 def test_paired_differences_of_a_made_up_table():

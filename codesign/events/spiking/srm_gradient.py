@@ -88,24 +88,25 @@ class _Srm(Function):
 
     @staticmethod
     def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
+        saved = ctx.saved_tensors
         with torch.no_grad():
-            result = _backward(ctx, grads)
+            result = _backward(ctx, saved, grads)
         if torch.is_grad_enabled():
             live = [g for g in result if g is not None]
             sealed = iter(
                 NoSecondDerivative.apply(
-                    FIRST_ONLY, len(live), *live, *[x for x in (*ctx.saved_tensors, *grads) if x is not None]
+                    FIRST_ONLY, len(live), *live, *[x for x in (*saved, *grads) if x is not None]
                 )
             )
             result = [None if g is None else next(sealed) for g in result]
         return None, *result
 
 
-def _backward(ctx, grads):
+def _backward(ctx, saved, grads):
     """Gradients of drive, theta, h_response, h_reset, response and reset."""
     import drjit as dr
 
-    drive, theta, h_response, h_reset, response, reset, spikes, potential = ctx.saved_tensors
+    drive, theta, h_response, h_reset, response, reset, spikes, potential = saved
     need = ctx.needs_input_grad[1:]
     work = _Work(ctx.setup, drive, theta, h_response, h_reset)
     carried = ctx.setup.plan.through_reset != "off" or need[3] or need[5]

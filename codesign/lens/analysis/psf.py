@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, as_number, check_whole
 from codesign.lens.analysis.pupil import pupil_function
 from codesign.lens.analysis.rays import Light, chief_ray, spectral_lines
 from codesign.lens.analysis.spots import polychromatic_spot
@@ -90,6 +90,7 @@ def psf_on_pixels(
     Gradient: to every lens tensor. Raises: DomainError, see ``pupil_function``, and when the grid is wider
       than the sampled pupil's period.
     """
+    pixel_mm, pixels = _pixels(pixel_mm, pixels)
     wavelengths, shares = spectral_lines(light)
     reference = chief_ray(lens, field_rad, wavelengths[0], defocus_mm, at_m).position_mm[0]
     at = (torch.arange(pixels, dtype=lens.dtype, device=reference.device) - pixels // 2) * pixel_mm
@@ -136,6 +137,7 @@ def geometric_psf(
       falls on it.
     Gradient: energy to every lens tensor, piecewise linear in the ray positions.
     """
+    pixel_mm, pixels = _pixels(pixel_mm, pixels)
     positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
     reference = chief_ray(lens, field_rad, spectral_lines(light)[0][0], defocus_mm, at_m).position_mm[0]
     place = (positions.reshape(-1, 2) - reference) / pixel_mm + pixels // 2  # x, y in pixels
@@ -155,3 +157,11 @@ def geometric_psf(
             on = (x >= 0) & (x < pixels) & (y >= 0) & (y < pixels)
             energy = energy.index_add(0, (y * pixels + x)[on], part[on])
     return Psf(energy.reshape(pixels, pixels), torch.full((2,), pixel_mm, dtype=lens.dtype), reference)
+
+
+def _pixels(pixel_mm, pixels):
+    """Size and number of the pixels of a grid. Raises: DomainError for what is none."""
+    size = as_number(pixel_mm, "pixel_mm")
+    if not 0 < size < math.inf:
+        raise DomainError(f"pixel_mm = {size} must be positive and finite.")
+    return size, check_whole(pixels, "pixels")

@@ -133,7 +133,12 @@ def _surface(row, semi_aperture=None, inner=None):
 
 def _pupil(lens, rows, optics):
     """Entrance pupil diameter, mm."""
-    kind, value = lens.pupil if lens.pupil is not None else ("stop", 0.0)
+    if lens.pupil is None:
+        raise FileFormatError(
+            "it does not say how wide its beam is; give the entrance pupil diameter (ENPD in .zmx, EPD in .seq), or "
+            "FLOA in .zmx where the stop's semi-diameter says it."
+        )
+    kind, value = lens.pupil
     if kind == "stop":
         heights, _ = optics.trace(1.0, 0.0)
         stop = rows[optics.stop].semi_aperture
@@ -154,6 +159,10 @@ def _pupil(lens, rows, optics):
         raise FileFormatError(f"its {kind} is {value:g}; it must be positive.")
     if kind == "diameter":
         return value * lens.unit_mm
+    if optics.index[-1] != 1:
+        raise FileFormatError(
+            f"its {kind} is counted in the image space, which is glass here; give the entrance pupil diameter."
+        )
     slope = (
         value if kind == "numerical aperture" else 1 / (2 * value)
     )  # of the marginal ray in the image space

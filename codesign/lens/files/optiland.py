@@ -8,7 +8,7 @@ from codesign.lens.files import page as p
 from codesign.lens.files.page import Page
 from codesign.lens.files.system import FileLens, FileSurface
 from codesign.lens.files.text import at, shown, title
-from codesign.lens.glass import Glass
+from codesign.lens.glass import AIR, Glass
 
 SHAPES = ("Plane", "StandardGeometry", "EvenAsphere")
 PUPILS = {
@@ -22,6 +22,11 @@ FIELDS = {
     "object_height": "object height",
     "paraxial_image_height": "image height",
     "real_image_height": "image height",
+    # as version 0.6 writes them
+    "AngleField": "angle",
+    "ObjectHeightField": "object height",
+    "ParaxialImageHeightField": "image height",
+    "RealImageHeightField": "image height",
 }
 SURFACE = {
     "type",
@@ -111,11 +116,11 @@ def _take_pupil(lens, aperture, surfaces):
 def _take_field(lens, fields):
     if not isinstance(fields, dict) or not isinstance(fields.get("fields"), list) or not fields["fields"]:
         return
-    kind = fields.get(
-        "field_type", fields["fields"][0].get("field_type") if isinstance(fields["fields"][0], dict) else None
-    )
+    first = fields["fields"][0] if isinstance(fields["fields"][0], dict) else {}
+    given = [page.get(key) for page in (fields, first) for key in ("field_definition", "field_type")]
+    kind = next((kind for kind in given if kind is not None), None)
     kind = kind.get("field_type") if isinstance(kind, dict) else kind
-    if kind not in FIELDS:
+    if not isinstance(kind, str) or kind not in FIELDS:
         raise FileFormatError(f"the fields are given as {shown(kind)}; known are {', '.join(FIELDS)}.")
     if p.boolean(fields, "object_space_telecentric") or p.boolean(fields, "telecentric"):
         raise FileFormatError(
@@ -223,7 +228,8 @@ def _medium(row, key):
     kind = p.present(material, "type")
     if kind == "IdealMaterial":
         index = p.number(material, "index")
-        return None if index == 1 else Glass.from_indices(index, index, index, f"{index:.6g}")
+        # without dispersion at any wavelength
+        return None if index == 1 else Glass(f"{index:.6g}", "cauchy", (index,), AIR.range_um)
     if kind == "AbbeMaterial":
         return Glass.from_abbe(p.number(material, "index"), p.number(material, "abbe"))
     if kind == "Material" and isinstance(material.get("name"), str):

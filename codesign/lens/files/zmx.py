@@ -165,9 +165,14 @@ class Header:
         entries[0].check_object()
         entries[-1].check_image()
         surfaces: list[FileSurface] = []
+        medium = None
         for entry in entries[1:-1]:
             with at(f"surface {entry.label}"):
-                surfaces.append(entry.surface())
+                surface = entry.surface()
+            if entry.kind == "COORDBRK":  # no surface of its own: the light stays in its medium
+                surface.medium = medium
+            medium = medium if surface.mirror else surface.medium
+            surfaces.append(surface)
         return FileLens(
             self.name,
             surfaces,

@@ -204,6 +204,9 @@ class Entry:
 
     def surface(self) -> FileSurface:
         """FileSurface of this entry."""
+        missing = [keyword for keyword in ("CURV", "DISZ") if keyword not in self.seen]
+        if missing:
+            raise FileFormatError(f"the line {missing[0]} is missing; add it (CURV 0 is a plane).")
         moved = any(v for i, v in self.parameters.items() if i != 6)  # 6: the order of shifts and tilts
         if self.kind not in TYPES and (self.kind != "COORDBRK" or moved):
             raise FileFormatError(

@@ -31,6 +31,13 @@ class Plate(Replaceable):
         self.wavelength_um = float(wavelength_um)
         self.diffractive = bool(diffractive)
 
+    def _identity(self):
+        return {
+            "wavelength in um": self.wavelength_um,
+            "being diffractive": float(self.diffractive),
+            "finest detail in mm": self.finest_mm,
+        }
+
     def look(self, points_mm: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Phase [N] rad, its slope [N, 2] rad/mm, and whether the plate reaches there, [N] bool, at points [N, 2]
         mm from the axis. Gradient: to the points and to what the plate is made of."""
@@ -73,6 +80,10 @@ class ZernikePlate(Plate):
             check_finite(values, "plate coefficients", "give finite radians")
         )
         self.finest_mm = self.radius_mm / max(1, *(noll(term)[0] for term in self.terms))
+
+    def _identity(self):
+        terms = {f"term {i}": float(term) for i, term in enumerate(self.terms, 1)}
+        return super()._identity() | {"radius in mm": self.radius_mm} | terms
 
     def look(self, points_mm: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         values, slopes = zernike(self.terms, points_mm / self.radius_mm)

@@ -1,0 +1,131 @@
+"""Run every command that README, docs and Makefile name, in its quick form, and print what became of each.
+
+    make try-all                      from a fresh clone; ARGS="--only lens --limit 120" runs a part
+
+A new command on a page is tried by itself. A study runs with --quick in a folder of its own, through its target of
+make where it has one. A command that names a file of the reader's own must end in a sentence (exit 2).
+"""
+
+import argparse
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+MAKEFILE = (ROOT / "Makefile").read_text(encoding="utf-8")
+TARGETS = re.findall(r"^([a-z][a-z-]*):", MAKEFILE, re.M)
+LISTED = re.search(r"^STUDIES := ((?:.*\\\n)*.*)", MAKEFILE, re.M)
+STUDIES = LISTED[1].replace("\\\n", " ").split() if LISTED else []
+NAMES = dict(
+    re.findall(r"^([a-z-]+): STUDY := (\w+)", MAKEFILE, re.M)
+)  # of modules that differ from the target's
+MODULES = {NAMES.get(target, target.replace("-", "_")): target for target in STUDIES}
+COMMAND = re.compile(r"(?:\.venv/bin/)?python -m studies\.[a-z].*|make [a-z].*|codesign [a-z].*")
+INSTEAD = {"NAME_OR_FILE": "cooke-triplet", "--lens NAME": "--lens cooke-triplet", "--random N": "--random 2"}
+# what else stands for something of the reader's own
+OWN = re.compile(r"\b[A-Z]{3,}\b|\w\.(mp4|npz|npy|txt|yaml|urdf)\b|frames/|runs/|--recording |--video$")
+ELSEWHERE = ("help", "setup", "test", "test-bits", "lint", "core-check", "clean", "try-all")
+
+
+def commands() -> dict[str, str]:
+    """{command: the page that names it first}: code spans, lines of code blocks, targets of studies no page names."""
+    found = {}
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "Makefile"):
+        text = page.read_text(encoding="utf-8").replace("```", "")
+        spans = (
+            re.findall(r"`((?:python|make|codesign|\.venv)[^`\n]*)`", text)
+            if page.suffix
+            else re.findall(r"## .*?: (make .*)", text)
+        )
+        lines = re.findall(r"^(?:    |#   )?([\w.].*)$", text, re.M)
+        for said in (*spans, *lines):
+            if COMMAND.fullmatch(said) and "`" not in said and (plain := normal(said)):
+                found.setdefault(plain, page.relative_to(ROOT).as_posix())
+    unnamed = [t for t in STUDIES if not any(c.split()[1] == t for c in found)]
+    return found | {f"make {target}": "Makefile" for target in unnamed}
+
+
+def normal(said: str) -> str:
+    """One spelling of a command: without remarks, what may be left out, --quick and --out; "" where it is none."""
+    said = re.sub(r"\s+#.*|\s{2,}.*|\[[^]]*\]|…|\.venv/bin/|--quick|--out [^\s\"]+", "", said).strip()
+    for word, value in INSTEAD.items():
+        said = said.replace(word, value)
+    try:
+        name, *words = shlex.split(said)
+    except ValueError:  # a quote was cut
+        return ""
+    if name == "make":
+        target, given = (
+            words[0],
+            " ".join(w.removeprefix("ARGS=") for w in words[1:] if w.startswith("ARGS=")),
+        )
+    elif name == "python":
+        target, given = MODULES.get(words[1].removeprefix("studies."), ""), " ".join(words[2:])
+    else:
+        return "" if words[0] == "run" else said
+    if name == "python" and not target:
+        return said
+    given = " ".join(given.split())
+    return (
+        (f'make {target} ARGS="{given}"' if given else f"make {target}")
+        if target in TARGETS + STUDIES
+        else ""
+    )
+
+
+def outcome(command: str, limit_s: float) -> tuple[bool, str, str]:
+    """Whether it went as it should, its exit and the first line of its error."""
+    name, *words = shlex.split(command)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
+    with tempfile.TemporaryDirectory(prefix="try-all-") as folder:
+        more = ["--quick", "--out", f"{folder}/out"] if name == "python" or words[0] in STUDIES else []
+        if name == "make":
+            given = " ".join(["".join(words[1:]).removeprefix("ARGS="), *more])
+            words = ["make", "-C", str(ROOT), words[0], f"ARGS={given}"]
+        else:
+            words = [sys.executable, *([] if name == "python" else ["-m", name]), *words, *more]
+        try:
+            done = subprocess.run(
+                words, cwd=folder, env=environment, capture_output=True, text=True, timeout=limit_s
+            )
+        except subprocess.TimeoutExpired:
+            return False, "time", ""
+    code = re.findall(r"^make: \*\*\* .* Error (\d+)", done.stderr, re.M) or [str(done.returncode)]
+    traced = "Traceback (most" in done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.strip() and not line.startswith("make")] or [
+        ""
+    ]
+    # the sentence of a command that needs data of the reader's own names the option to give them with
+    theirs = OWN.search(command) or " --" in lines[0]
+    right = code[0] == "0" or (code[0] == "2" and not traced and bool(theirs))
+    return right, code[0], "" if code[0] == "0" else lines[-1 if traced else 0][:160]
+
+
+def main() -> int:
+    asked = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    asked.add_argument("--only", default="", help="try the commands that hold this text")
+    asked.add_argument("--limit", type=float, default=900.0, help="seconds that a command may take")
+    options = asked.parse_args()
+    failed = 0
+    print("| command | page | exit | seconds | first line of the error |\n|---|---|---|---|---|")
+    for command, page in commands().items():
+        if options.only not in command or command.split()[1] in ELSEWHERE:
+            continue
+        began = time.monotonic()
+        right, code, said = outcome(command, options.limit)
+        failed += not right
+        mark = "" if right else " **fails**"
+        print(
+            f"| `{command}` | {page} | {code}{mark} | {time.monotonic() - began:.0f} | {said} |", flush=True
+        )
+    print(f"{failed} failed; {', '.join(ELSEWHERE)} are left to CI and to you")
+    return min(failed, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
