@@ -235,7 +235,10 @@ def test_states_of_other_frames_or_layers(name):
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ({"leak_rate_hz": 1.0}, "a leak"),
+        ({"leak_rate_hz": 1.0, "rate_cov_decades": 0.1}, "a spread of leaks"),
+        ({"leak_rate_hz": 1.0, "leak_jitter": 0.1}, "a leak that jitters"),
+        ({"hot_pixel_share": 0.1, "hot_pixel_rate_hz": 1.0}, "hot pixels"),
+        ({"theta_sigma": 0.03}, "a mismatch of thresholds"),
         ({"refractory_s": 0.1}, "a dead time"),
         ({"cutoff_hz": 30.0}, "a bandwidth"),
         ({"shot_rate_hz": 3.0}, "noise events"),
