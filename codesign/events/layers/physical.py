@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
+from codesign.errors import DomainError
 from codesign.events.entry import Times, check_frames, check_times
 from codesign.events.intensity import FrontEnd
 from codesign.events.layers import dead_time
@@ -76,6 +77,9 @@ def sensor_counts(
     Raises: DomainError for other names in ``design`` (they have no gradient) or values outside the sensor's
       domain, or a dead time that its gradient cannot follow over thousands of intervals; and as ``simulate``.
     """
+    if state is not None and not isinstance(state, PhysicalState):
+        raise DomainError(f"the state is a {type(state).__name__}; pass what sensor_counts returned.")
+    front_end = FrontEnd(log_input)
     hard_sensor = with_design(sensor, design, DESIGN)
     value: dict[str, Any] = {name: design.get(name, getattr(sensor, name)) for name in DESIGN}
     check_frames(frames, 2 if state is None else 1, non_negative=not log_input)
@@ -86,7 +90,7 @@ def sensor_counts(
         frames = torch.cat((state.frame[None], frames))
         times_s = torch.cat((torch.tensor([state.time_s], dtype=torch.float64), times_s))
     interval_s = times_s.diff()
-    level = FrontEnd(log_input).level(frames)
+    level = front_end.level(frames)
     if hard_sensor.cutoff_hz > 0:
         level = low_pass(
             level,

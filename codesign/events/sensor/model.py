@@ -11,8 +11,10 @@ import torch
 from torch import Generator, Tensor
 
 from codesign.errors import DomainError, ShapeError, as_number
+from codesign.events.entry import MOST_VALUES, check_dtype, shown
 
 THETA_MINIMUM = 0.01  # no drawn threshold falls below, as in v2e
+MOST_NUMBER = 1e30
 TIMINGS = ("interpolated", "v2e")
 
 
@@ -80,8 +82,8 @@ class SensorModel:
             if (
                 isinstance(value, bool)
                 or not isinstance(value, (int, float))
-                or not math.isfinite(value)
-                or value < 0
+                or not 0 <= value < math.inf
+                or value > MOST_NUMBER
                 or (positive and value == 0)
             ):
                 hint = (
@@ -90,7 +92,7 @@ class SensorModel:
                     else ""
                 )
                 raise DomainError(
-                    f"SensorModel.{field.name} is {value!r} ({type(value).__name__}); a finite Python number "
+                    f"SensorModel.{field.name} is {shown(value)} ({type(value).__name__}); a finite Python number "
                     f"{'> 0' if positive else '>= 0'} is needed{hint}."
                 )
         if self.hot_pixel_share > 1:
@@ -234,6 +236,8 @@ def draw_thresholds(
       to 0.01; first all ON, then all OFF.
     Source: v2e (Hu et al., CVPR-W 2021), threshold mismatch.
     """
+    check_generator(generator)
+    check_dtype(dtype, device)
     pixels = _shape(pixels)
     draws = check_sensor(sensor).theta_sigma > 0
     deviates = draw_deviates(pixels, generator, dtype=dtype) if draws else (None, None)
@@ -320,12 +324,16 @@ def draw_shot_counts(
     Returns: [T-1, 2, *pixels] whole numbers >= 0, ON first.
     """
     check_generator(generator)
+    check_sensor(sensor)
+    check_dtype(dtype, device)
     pixels = _shape(pixels)
     try:
         interval_s = torch.as_tensor(interval_s, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
-        raise DomainError(f"interval_s is {interval_s!r}; a list of lengths in seconds is needed.") from None
-    if interval_s.ndim != 1:
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise DomainError(
+            f"interval_s is {shown(interval_s)}; a list of lengths in seconds is needed."
+        ) from None
+    if interval_s.is_meta or interval_s.ndim != 1:
         raise ShapeError(
             f"interval_s has shape {list(interval_s.shape)}; one length per interval is needed, [T-1]."
         )
@@ -345,6 +353,9 @@ def draw_shot_counts(
 def _shape(pixels):
     """A shape as a tuple of whole numbers."""
     try:
-        return tuple(operator.index(side) for side in pixels)
-    except TypeError:
-        raise DomainError(f"pixels is {pixels!r}; the shape of one frame is needed, (H, W).") from None
+        found = tuple(operator.index(side) for side in pixels)
+    except (TypeError, RuntimeError):
+        found = (-1,)
+    if min(found, default=1) < 0 or max(*found, math.prod(found), 1) > MOST_VALUES:
+        raise DomainError(f"pixels is {shown(pixels)}; the shape of one frame is needed, (H, W).")
+    return found
