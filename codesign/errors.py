@@ -44,7 +44,7 @@ def as_number(value: Any, name: str) -> float:
         if isinstance(value, str):
             raise TypeError
         return float(value)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         shown = " ".join(repr(value).split())[:80]
         raise DomainError(f"{name} = {shown} is no number; give one.") from None
 

@@ -1,15 +1,20 @@
 """What may enter an event layer: frames, thresholds, times. Everything else is refused with a sentence."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, as_number, check_finite
+from codesign.errors import DomainError, FileFormatError, ShapeError, as_number, check_finite
 
 Times = Tensor | Sequence[float] | np.ndarray  # seconds
+REAL = (torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.int16)
+LEAST = 1e-30  # of thresholds and time constants; its inverse is the largest
+MOST_WHOLE = 2**62
+MOST_VALUES = 2**32  # that are made in one call: 16 GB in single precision
 
 
 def check_frames(
@@ -49,7 +54,7 @@ def check_layout(frames: Tensor, minimum: int = 2, *, name: str = "frames") -> N
     if frames.layout != torch.strided or frames.is_meta:
         given = "meta tensors without values" if frames.is_meta else f"stored as {frames.layout}"
         raise DomainError(f"{name} are {given}; a dense tensor is needed (sparse ones: frames.to_dense()).")
-    if frames.ndim == 0 or frames.shape[0] < minimum:
+    if minimum and (frames.ndim == 0 or frames.shape[0] < minimum):
         count = frames.shape[0] if frames.ndim else "no time axis, so 0"
         raise ShapeError(
             f"{name} hold {count} frame(s) (shape {list(frames.shape)}); at least {minimum} are needed, "
@@ -59,38 +64,41 @@ def check_layout(frames: Tensor, minimum: int = 2, *, name: str = "frames") -> N
         raise ShapeError(f"{name} have shape {list(frames.shape)}, which holds no pixel; give at least one.")
 
 
-def check_theta(theta: Tensor | float, name: str, frames: Tensor) -> Tensor:
-    """Return a contrast threshold as a tensor of the frames' dtype and device that broadcasts over one frame.
+def check_per_pixel(
+    value: Tensor | float, name: str, frames: Tensor, dtype: torch.dtype | None = None
+) -> Tensor:
+    """Return a contrast threshold or time constant as a tensor on the frames' device that broadcasts over one frame.
 
     Args:
-      theta: number, 0-dim tensor, or tensor that broadcasts to the pixel shape ``frames.shape[1:]``; natural
-        log units, > 0.
-    Raises: DomainError when a threshold is not a positive finite number; ShapeError when it does not
-      broadcast.
+      value: number, 0-dim tensor, or tensor that broadcasts to the pixel shape ``frames.shape[1:]``; > 0, thresholds
+        in natural log units. dtype: None: of the frames.
+    Raises: DomainError when a value is no number from 1e-30 to 1e30, beyond which single precision ends; ShapeError
+      when it does not broadcast.
     """
-    is_complex = isinstance(theta, Tensor) and theta.is_complex()
-    if isinstance(theta, bool) or is_complex or not isinstance(theta, (Tensor, float, int)):
-        raise DomainError(
-            f"{name} is a {'complex tensor' if is_complex else type(theta).__name__}; give a number or a "
-            "tensor of natural log units."
-        )
-    theta = torch.as_tensor(theta, dtype=frames.dtype, device=frames.device)
+    is_real = isinstance(value, (Tensor, float, int)) and not isinstance(value, bool)
+    if isinstance(value, Tensor):
+        is_real = value.dtype in REAL and value.layout == torch.strided and not value.is_meta
+    if not is_real:
+        given = f"a tensor of {value.dtype} on {value.device}" if isinstance(value, Tensor) else shown(value)
+        raise DomainError(f"{name} is {given}; give a real number, or a dense tensor of them, > 0.")
+    if not isinstance(value, Tensor):
+        value = as_number(value, name)
+    value = torch.as_tensor(value, dtype=torch.float64 if dtype is None else dtype, device=frames.device)
     pixels = frames.shape[1:]
-    fits = theta.ndim <= len(pixels) and all(
-        a in (1, b) for a, b in zip(reversed(theta.shape), reversed(pixels), strict=False)
+    fits = value.ndim <= len(pixels) and all(
+        a in (1, b) for a, b in zip(reversed(value.shape), reversed(pixels), strict=False)
     )
-    if not fits or theta.numel() == 0:
+    if not fits or value.numel() == 0:
         raise ShapeError(
-            f"{name} has shape {list(theta.shape)}; it must be a scalar or fit the pixel shape "
+            f"{name} has shape {list(value.shape)}; it must be a scalar or fit the pixel shape "
             f"{list(pixels)}."
         )
-    low, high = (float(bound) for bound in theta.detach().aminmax())
-    if not (low > 0 and math.isfinite(high)):
+    low, high = (float(bound) for bound in value.detach().aminmax())
+    if not (low >= LEAST and high <= 1 / LEAST):
         raise DomainError(
-            f"{name} spans {low:g} to {high:g}; every contrast threshold must be a finite number > 0 (0.2 "
-            "is typical)."
+            f"{name} spans {low:g} to {high:g}; every value must be a number > 0, from {LEAST:g} to {1 / LEAST:g}."
         )
-    return theta
+    return value.to(frames.dtype if dtype is None else dtype)
 
 
 def check_times(t_s: Times, count: int | None = None) -> Tensor:
@@ -101,10 +109,10 @@ def check_times(t_s: Times, count: int | None = None) -> Tensor:
     """
     try:
         times_s = torch.as_tensor(t_s)
-        if times_s.is_complex():
+        if times_s.is_complex() or times_s.is_meta:
             raise TypeError
         times_s = torch.as_tensor(t_s, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         raise DomainError(
             f"t_s is {str(t_s)[:60]!r} ({type(t_s).__name__}); times are a list or tensor of real numbers, "
             "seconds."
@@ -116,6 +124,8 @@ def check_times(t_s: Times, count: int | None = None) -> Tensor:
         raise ShapeError(
             f"t_s has shape {list(times_s.shape)}; one time per frame is needed, [{count or 'T'}]."
         )
+    if not len(times_s):
+        raise ShapeError("t_s holds no time; at least one is needed.")
     check_finite(times_s, "t_s")
     steps = times_s.diff()
     if bool((steps <= 0).any()):
@@ -127,33 +137,83 @@ def check_times(t_s: Times, count: int | None = None) -> Tensor:
     return times_s
 
 
-def check_positive(value: float, name: str, unit: str = "") -> float:
-    """A finite number above 0 as a float; DomainError for anything else."""
+def check_positive(value: float, name: str, unit: str = "", least: float = LEAST) -> float:
+    """A number of at least ``least`` and at most 1e30 as a float; DomainError for anything else."""
     number = as_number(value, name)
-    if not 0 < number < math.inf:
-        raise DomainError(f"{name} is {value!r}; a finite number above 0{unit} is needed.")
+    if not least <= number <= 1 / LEAST:
+        raise DomainError(
+            f"{name} is {shown(value)}; a finite number above 0{unit}, at least {least:g}, is needed."
+        )
     return number
 
 
-def check_whole(value: int, name: str, least: int | None = None) -> int:
-    """A whole number as an int, at least ``least``; DomainError for anything else."""
+def check_whole(value: int, name: str, least: int | None = None, most: int = MOST_WHOLE) -> int:
+    """A whole number as an int, at least ``least`` and at most ``most``; DomainError for anything else."""
     number = math.nan if isinstance(value, bool) else as_number(value, name)
-    if not math.isfinite(number) or int(value) != value or (least is not None and value < least):
-        raise DomainError(
-            f"{name} is {value!r}; a whole number{'' if least is None else f' >= {least}'} is needed."
-        )
+    if (
+        not math.isfinite(number)
+        or int(value) != value
+        or not (-most if least is None else least) <= value <= most
+    ):
+        bounds = "" if least is None else f" >= {least}"
+        if number > most or (least is None and number < -most):
+            bounds += f" up to {most}"
+        raise DomainError(f"{name} is {shown(value)}; a whole number{bounds} is needed.")
     return int(value)
+
+
+def check_flag(value: bool, name: str, meaning: str = "") -> bool:
+    """True or False; DomainError for anything else."""
+    if not isinstance(value, bool):
+        raise DomainError(f"{name} is {shown(value)}; True{meaning} or False is needed.")
+    return value
+
+
+def check_choice(value: str, name: str, allowed: Iterable[str]) -> str:
+    """One of several names; DomainError for anything else."""
+    if not isinstance(value, str) or value not in allowed:
+        raise DomainError(f"{name} is {shown(value)}; choose one of {', '.join(map(repr, allowed))}.")
+    return value
+
+
+def check_dtype(dtype: torch.dtype, device: torch.device | str = "cpu") -> None:
+    """Raise DomainError for what is no real type of tensors, or no device."""
+    if not any(dtype is one for one in REAL):
+        raise DomainError(f"dtype is {shown(dtype)}; a real type is needed, such as torch.float32.")
+    try:
+        torch.empty(0, device=device)
+    except (TypeError, ValueError, RuntimeError, AssertionError):
+        raise DomainError(
+            f"device is {shown(device)}; a device that is there is needed, such as 'cpu'."
+        ) from None
+
+
+def check_room(values: float, what: str) -> None:
+    """Raise DomainError where a result would hold more values than are made in one call."""
+    if not values <= MOST_VALUES:
+        raise DomainError(
+            f"{what} would hold {values:.3g} values, more than the {MOST_VALUES} of one call; ask for less."
+        )
+
+
+def shown(value: object) -> str:
+    """A wrong value in one short line."""
+    return " ".join(repr(value).split())[:80]
+
+
+def check_path(path: str | Path) -> Path:
+    """A path of a file; FileFormatError for what is none."""
+    if not isinstance(path, (str, Path)) or not str(path) or "\0" in str(path):
+        raise FileFormatError(
+            f"the path is {shown(path)} ({type(path).__name__}); a str or pathlib.Path is needed."
+        )
+    return Path(path)
 
 
 def check_counts(counts: Tensor, *, non_negative: bool = False) -> None:
     """Raise unless ``counts`` are a float32 or float64 tensor [T-1, 2, ..., H, W] of finite numbers, 0 or more
     where asked; ShapeError for the axes, DomainError for the rest."""
-    if not isinstance(counts, Tensor) or counts.dtype not in (torch.float32, torch.float64):
-        given = counts.dtype if isinstance(counts, Tensor) else type(counts).__name__
-        raise DomainError(
-            f"counts are {given}; a torch tensor of float32 or float64 is needed, since bins take shares of "
-            "an event: convert with .float()."
-        )
+    check_layout(counts, 0, name="counts")
     if counts.ndim < 4 or counts.shape[1] != 2 or 0 in counts.shape:
         raise ShapeError(
             f"counts have shape {list(counts.shape)}; [T-1, 2, H, W] or [T-1, 2, K, H, W] is needed, ON first "
@@ -167,9 +227,13 @@ def check_counts(counts: Tensor, *, non_negative: bool = False) -> None:
 
 
 def check_level(state: Tensor, level: Tensor) -> Tensor:
-    """Return a memorised level unchanged when it has the shape and type of one frame of ``level``, finite;
-    ShapeError, DomainError otherwise."""
-    if not isinstance(state, Tensor) or state.shape != level.shape[1:] or state.dtype != level.dtype:
+    """Return a level carried from an earlier chunk unchanged when it has the shape and type of one frame of ``level``,
+    finite; ShapeError, DomainError otherwise."""
+    if not isinstance(state, Tensor) or (state.shape, state.dtype, state.device) != (
+        level.shape[1:],
+        level.dtype,
+        level.device,
+    ):
         given = f"{state.dtype} {list(state.shape)}" if isinstance(state, Tensor) else type(state).__name__
         raise ShapeError(
             f"state is {given}, one frame is {level.dtype} {list(level.shape[1:])}; pass the state of the same "

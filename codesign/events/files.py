@@ -4,7 +4,7 @@ from pathlib import Path
 
 from codesign.atomic import replacing
 from codesign.errors import FileFormatError
-from codesign.events.entry import check_whole
+from codesign.events.entry import check_path, check_whole
 from codesign.events.formats.aedat2 import read_aedat2, write_aedat2
 from codesign.events.formats.aedat4 import read_aedat4, write_aedat4
 from codesign.events.formats.dat import read_dat, write_dat
@@ -13,6 +13,7 @@ from codesign.events.formats.npz import read_npz, write_npz
 from codesign.events.formats.raw import read_raw, write_raw
 from codesign.events.formats.text import read_csv, write_csv
 from codesign.events.stream import check_stream
+from codesign.reading import check_regular
 from codesign.types import EventStream
 
 READERS = {
@@ -58,17 +59,12 @@ def read(path: str | Path, *, height_px: int | None = None, width_px: int | None
     >>> events.read("brighter.npz").t_us.tolist()
     [2885, 5771, 8656]
     """
-    path = _path(path)
+    path = check_path(path)
     for name, size in (("height_px", height_px), ("width_px", width_px)):
         if size is not None:
             check_whole(size, name, 1)
     reader = _choose(READERS, path, "read")
-    if not path.is_file():
-        raise FileFormatError(f"no event file at {path}; check the path.")
-    try:
-        return reader(path, height_px, width_px)
-    except OSError as error:
-        raise FileFormatError(f"cannot read {path}: {error.strerror or error}.") from error
+    return reader(check_regular(path), height_px, width_px)
 
 
 def write(path: str | Path, stream: EventStream, *, evt: int | None = None, t0_us: int | None = None) -> None:
@@ -94,7 +90,7 @@ def write(path: str | Path, stream: EventStream, *, evt: int | None = None, t0_u
     >>> stream = events.simulate(frames, [0.0, 0.01], events.SensorModel())
     >>> events.write("brighter.raw", stream, evt=2)
     """
-    path = _path(path)
+    path = check_path(path)
     writer = _choose(WRITERS, path, "written")
     check_stream(stream)
     options = {name: value for name, value in (("evt", evt), ("t0_us", t0_us)) if value is not None}
@@ -108,14 +104,6 @@ def write(path: str | Path, stream: EventStream, *, evt: int | None = None, t0_u
             writer(temporary, stream, **options)
         except FileFormatError as error:  # writers know what does not fit, not where the file will lie
             raise FileFormatError(f"cannot write {path}: {error}") from error
-
-
-def _path(path):
-    if not isinstance(path, (str, Path)):
-        raise FileFormatError(
-            f"the path is {path!r} ({type(path).__name__}); a str or pathlib.Path is needed."
-        )
-    return Path(path)
 
 
 def _choose(table, path, verb):

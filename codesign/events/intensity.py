@@ -9,7 +9,7 @@ from torch import Tensor
 
 from codesign import backend
 from codesign.errors import DomainError, as_number
-from codesign.events.entry import check_frames
+from codesign.events.entry import check_flag, check_frames
 
 JOINT = 20.0  # intensity on the 0-255 scale where the linear part meets the logarithm
 DARK_SLOPE = math.log(JOINT) / JOINT
@@ -65,10 +65,7 @@ class FrontEnd:
     log_eps: float | None = None
 
     def __post_init__(self):
-        if not isinstance(self.log_input, bool):
-            raise DomainError(
-                f"log_input is {self.log_input!r}; True (frames are log levels) or False is needed."
-            )
+        check_flag(self.log_input, "log_input", " (frames are log levels)")
         if self.log_eps is not None and (
             self.log_input or not 0 < as_number(self.log_eps, "log_eps") < math.inf
         ):

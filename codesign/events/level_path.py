@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, as_number
-from codesign.events.entry import Times, check_layout, check_times
+from codesign.events.entry import Times, check_layout, check_room, check_times
 from codesign.events.intensity import FrontEnd, log_levels
 
 ROUNDING = 1e-3  # of a part: what rounding of times (float32, or seconds since 1970) adds makes no part more
@@ -39,7 +39,7 @@ def finer(frames: Tensor, t_s: Times, longest_s: float, *, log_input: bool = Fal
     """
     check_layout(frames)
     given_s = check_times(t_s, len(frames))
-    interval, share, times_s = parts(given_s, longest_s)
+    interval, share, times_s = parts(given_s, longest_s, max(frames[0].numel(), len(frames)))
     if len(times_s) == len(frames):
         return frames, given_s
     level = log_levels(frames, log_input, minimum=2)
@@ -51,19 +51,22 @@ def finer(frames: Tensor, t_s: Times, longest_s: float, *, log_input: bool = Fal
     return torch.cat((frames, made)).index_select(0, place), times_s
 
 
-def parts(times_s: Tensor, longest_s: float) -> tuple[Tensor, Tensor, Tensor]:
+def parts(times_s: Tensor, longest_s: float, values: int = 1) -> tuple[Tensor, Tensor, Tensor]:
     """Intervals cut into equal parts no longer than asked for.
 
-    Args: times_s: [T] float64, strictly increasing, as from ``check_times``. longest_s: > 0.
+    Args: times_s: [T] float64, strictly increasing, as from ``check_times``. longest_s: > 0. values: that will
+      be made of each part.
     Returns: of each of the K parts the interval it lies in [K] and the share of it [K] at which it ends; times
       [K + 1] float64 of all ends, the given ones among them exactly.
-    Raises: DomainError for a length that is not positive.
+    Raises: DomainError for a length that is not positive, or so short that the parts would fill the memory.
     """
     longest = as_number(longest_s, "longest_s")
     if not longest > 0:
         raise DomainError(f"the longest interval is {longest_s!r} s; a length > 0 s is needed.")
     duration_s = times_s.diff()
-    count = (duration_s / longest - ROUNDING).ceil().clamp(min=1).long()
+    count = (duration_s / longest - ROUNDING).ceil().clamp(min=1)
+    check_room(float(count.sum()) * values, f"intervals of at most {longest:g} s")
+    count = count.long()
     interval = torch.repeat_interleave(count)
     first = (count.cumsum(0) - count)[interval]
     share = (torch.arange(1, len(interval) + 1) - first) / count[interval].double()

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from codesign.backend import run_kernel
-from codesign.errors import DomainError, ShapeError, as_number
-from codesign.events.entry import check_layout
+from codesign.errors import DomainError, ShapeError, as_number, check_finite
+from codesign.events.entry import check_layout, check_level
 from codesign.events.intensity import light_share
 
 SERIES = 0.05  # below it (1 - e^-a)/a comes from a series: its first term left out is below 5e-10
@@ -57,6 +57,10 @@ def one_pole(level: Tensor, pace: Tensor, start: Tensor | None = None) -> Tensor
     Raises: ShapeError when there are not as many paces as intervals; DomainError for levels of another type.
     """
     check_layout(level, name="levels")
+    check_layout(pace, 1, name="paces")
+    check_finite(level, "levels")
+    if start is not None:
+        check_level(start, level)
     if not 1 <= pace.ndim <= level.ndim or len(pace) != len(level) - 1:
         raise ShapeError(
             f"pace has shape {list(pace.shape)} for {len(level)} levels; one per interval is needed, "
@@ -92,10 +96,16 @@ def low_pass(
     number = cutoff_hz.detach() if isinstance(cutoff_hz, Tensor) else cutoff_hz
     if not 0 < as_number(number, "cutoff_hz") < math.inf:
         raise DomainError(f"cutoff_hz is {number!r}; a finite number above 0 is needed.")
-    if intensity.shape != level.shape or interval_s.shape != (len(level) - 1,):
+    check_layout(intensity, name="intensity")
+    check_finite(intensity, "intensity")
+    if (
+        not isinstance(interval_s, Tensor)
+        or intensity.shape != level.shape
+        or interval_s.shape != (len(level) - 1,)
+    ):
         raise ShapeError(
             f"levels {list(level.shape)}, intensity {list(intensity.shape)} and interval_s "
-            f"{list(interval_s.shape)} do not fit; [T, ...] twice and [T-1] are needed."
+            f"{list(getattr(interval_s, 'shape', ()))} do not fit; [T, ...] twice and [T-1] are needed."
         )
     light = light_share(0.5 * (intensity[1:] + intensity[:-1]))
     interval_s = interval_s.to(level).reshape(-1, *[1] * (level.ndim - 1))

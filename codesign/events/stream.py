@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import Times, check_times
+from codesign.events.entry import Times, check_dtype, check_room, check_times
 from codesign.types import EventStream
 
 
@@ -127,6 +127,7 @@ def to_counts(stream: EventStream, t_s: Times, *, dtype: torch.dtype = torch.flo
     Gradient: none.
     """
     check_stream(stream)
+    check_dtype(dtype)
     times_us = (check_times(t_s) * 1e6).round().long()
     if len(times_us) < 2 or bool((times_us.diff() <= 0).any()):
         raise DomainError(
@@ -139,4 +140,5 @@ def to_counts(stream: EventStream, t_s: Times, *, dtype: torch.dtype = torch.flo
         (interval * 2 + (stream.p[inside] < 0)) * stream.height_px + stream.y[inside]
     ) * stream.width_px + stream.x[inside]
     shape = (len(times_us) - 1, 2, stream.height_px, stream.width_px)
+    check_room(torch.Size(shape).numel(), "the counts")
     return torch.bincount(cell, minlength=torch.Size(shape).numel()).reshape(shape).to(dtype)

@@ -154,7 +154,7 @@ WRONG = {
     "state": (lambda: events.simulate(FRAMES, T_S, SensorModel(), state={}), "the state is a dict"),
     "log_input": (lambda: events.simulate(FRAMES, T_S, SensorModel(), log_input="no"), "log_input is 'no'"),
     "log_eps": (lambda: events.simulate(FRAMES, T_S, SensorModel(), log_eps="a"), "log_eps"),
-    "threshold as bool": (lambda: events.memory(FRAMES, True, 0.2), "theta_on is a bool"),
+    "threshold as bool": (lambda: events.memory(FRAMES, True, 0.2), "theta_on is True"),
     "complex threshold": (lambda: events.soft(FRAMES, torch.tensor(0.2 + 0j)), "complex"),
     "numpy's single": (lambda: SensorModel(theta_on=np.float32(0.2)), r"\(float32\); a finite Python number"),
     "a tensor in a sensor": (lambda: SensorModel(theta_on=torch.tensor(0.2)), "events.sensor_counts"),
@@ -210,7 +210,57 @@ WRONG = {
         for name in ("theta_sigma", "cutoff_hz", "refractory_s")
     },
     "comparator": (lambda: events.ComparatorLayer(None), "the comparator is None"),
+    "parts without end": (
+        lambda: layer("memory").finely(FRAMES, T_S, 1e-12),
+        r"1e-12 s would hold .* of one call",
+    ),
+    "bins without end": (lambda: events.from_counts(COUNTS, T_S, 2**40), "bins is"),
+    "width of a surrogate": (lambda: events.Laplace.unit(0), "width is 0"),
+    "width as text": (lambda: events.Triangular.unit("x"), "width = 'x' is no number"),
+    "tau below double precision": (
+        lambda: events.srm(DRIVE, theta=1.0, tau_r=1.0, tau_s=1e-155, response="alpha"),
+        "tau_s spans|tau_s is",
+    ),
+    "tau far below a step": (lambda: events.srm(DRIVE, theta=1.0, tau_r=1e-12), "tau_r is 1e-12 .* steps"),
+    "kernel that no set can hold": (lambda: events.srm(DRIVE, theta=1.0, kernel=["step"]), "kernel is"),
+    "coupled as text": (lambda: events.srm(DRIVE, theta=1.0, tau_r=1.0, coupled="no"), "coupled is 'no'"),
+    "threshold without values": (
+        lambda: events.memory(FRAMES, torch.ones((), device="meta"), 0.2),
+        "on meta",
+    ),
+    "threshold beyond floats": (lambda: events.memory(FRAMES, 10**400, 0.2), "theta_on = 1000"),
+    "sensor beyond floats": (lambda: SensorModel(theta_on=10**400), "theta_on is 1000"),
+    "state of memory with NaN": (
+        lambda: events.memory(FRAMES, 0.2, 0.2, state=torch.full((2, 4, 6), math.nan)),
+        "state: ",
+    ),
+    "state of sensor_counts": (lambda: events.sensor_counts(FRAMES, T_S, SensorModel(), state=3), "is a int"),
+    "state of the thesis network": (lambda: events.TwoBranchSpikes(1)(FRAMES, 3), "is a int"),
+    "threshold of the thesis network": (lambda: events.TwoBranchSpikes(1, theta=math.nan), "theta is nan"),
+    "width of Spike-ESIM": (lambda: events.SpikeEsim(width=2**40), "width is"),
+    "path of Spike-ESIM": (lambda: events.SpikeEsim.load(None), "the path is None"),
+    "annealed": (lambda: events.annealed(1, 10, math.nan), "first is nan"),
+    "levels of NaN": (lambda: events.one_pole(FRAMES * math.nan, torch.ones(4, 1, 1)), "levels: "),
+    "start of a filter": (
+        lambda: events.one_pole(FRAMES, torch.ones(4, 1, 1), torch.zeros(6)),
+        r"\[6\], one frame is",
+    ),
+    "dtype": (lambda: events.to_counts(STREAM, T_S, dtype="float"), "dtype is 'float'"),
+    "device": (
+        lambda: events.draw_thresholds(SensorModel(), (2, 2), torch.Generator(), device="x"),
+        "device is 'x'",
+    ),
+    "layer to settle": (lambda: events.Settled(None, 0.1), "the layer is a NoneType"),
+    "fading within nothing": (lambda: events.decay(COUNTS, T_S, 1e-200), "tau_s is 1e-200"),
+    "trace of the future": (
+        lambda: events.decay_from_stream(STREAM, [10], 0.1, start=(COUNTS[0], 2**40)),
+        "the trace is of",
+    ),
+    "frames without times": (lambda: list(events.upsample_stream(FRAMES, [0.0])), "there is no time 1"),
+    "spikes of a list": (lambda: events.stream_from_spikes([1], 0, 5), "spikes are list"),
+    "encoding": (lambda: events.write("e.raw", STREAM, evt=[2]), r"evt=\[2\]"),
 }
+DRIVE = torch.rand(5, 2, 4)
 STREAM_INTS = (STREAM.x[:1], STREAM.y[:1], STREAM.p[:1])
 
 
@@ -227,15 +277,19 @@ def test_states_of_other_frames_or_layers(name):
     for frames in (FRAMES[:, :2], FRAMES.double(), FRAMES[None].expand(2, -1, -1, -1)):
         with pytest.raises(ShapeError):
             made.advance(frames, T_S + 1, state)
-    other = layer("memory" if name == "physical" else "physical")
-    with pytest.raises(DomainError, match="pass what this layer returned"):
-        other.advance(FRAMES, T_S + 1, state)
+    for other in events.LAYERS:
+        if other != name:
+            with pytest.raises(DomainError, match="pass what this layer returned"):
+                layer(other).advance(FRAMES, T_S + 1, state)
 
 
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ({"leak_rate_hz": 1.0}, "a leak"),
+        ({"leak_rate_hz": 1.0, "rate_cov_decades": 0.1}, "a spread of leaks"),
+        ({"leak_rate_hz": 1.0, "leak_jitter": 0.1}, "a leak that jitters"),
+        ({"hot_pixel_share": 0.1, "hot_pixel_rate_hz": 1.0}, "hot pixels"),
+        ({"theta_sigma": 0.03}, "a mismatch of thresholds"),
         ({"refractory_s": 0.1}, "a dead time"),
         ({"cutoff_hz": 30.0}, "a bandwidth"),
         ({"shot_rate_hz": 3.0}, "noise events"),

@@ -222,6 +222,7 @@ def hard_mean(level, t_s, sensor, beginnings):
 # cosine and scale measured: a threshold 0.96/0.88, dead time 1.00/0.88 and 1.00/0.89. A group mixes the phases of a third of a
 # count, which takes up to an eighth of the slope to the dead time; a threshold moved alone leaves the other
 # behind, and the play's width is then a long-run mean only. The bounds are below what was asked (0.97, 0.9).
+@pytest.mark.filterwarnings("ignore:rate x dead time is above 2")
 @pytest.mark.parametrize(
     ("name", "dead_s", "cosine", "low"),
     [
@@ -273,3 +274,16 @@ def test_without_gradients_the_counts_are_the_hard_sensor_s_and_no_mean_is_compu
     plain, _ = sensor_counts(level, t_s, sensor, log_input=True)
     torch.testing.assert_close(bare, wanted, rtol=0, atol=1e-6)  # n + (s - s) rounds
     torch.testing.assert_close(plain, wanted, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("dead_s", "learnt", "warned"), [(4e-3, True, False), (8e-3, True, True), (8e-3, False, False)]
+)
+def test_gradients_to_thresholds_behind_a_long_dead_time_are_warned_of(dead_s, learnt, warned, recwarn):
+    t_s = torch.arange(41, dtype=D) / 1000
+    level = (60 * t_s)[:, None].requires_grad_()  # 0.15 in 2.5 ms: 1.6 and 3.2 events in a dead time
+    theta = torch.tensor(0.15, dtype=D, requires_grad=learnt)
+    sensor_counts(
+        level, t_s, SensorModel(theta_off=0.15, refractory_s=dead_s), log_input=True, theta_on=theta
+    )
+    assert [str(one.message)[:28] for one in recwarn] == ["rate x dead time is above 2 "] * warned

@@ -141,7 +141,7 @@ def test_unknown_extensions_and_missing_places_are_refused(tmp_path):
             read(tmp_path / name)
         with pytest.raises(FileFormatError, match=r"\.csv, \.dat, \.h5, \.npz, \.raw"):
             write(tmp_path / name, stream)
-    with pytest.raises(FileFormatError, match="no event file"):
+    with pytest.raises(FileFormatError, match="no file lies"):
         read(tmp_path / "none.csv")
     with pytest.raises(FileFormatError, match="folder"):
         write(tmp_path / "none" / "e.csv", stream)

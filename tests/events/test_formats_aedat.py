@@ -154,7 +154,7 @@ def test_a_cut_file_and_missing_frames_are_refused(tmp_path):
     write(path, stream_of((5, 1, 2, 1), (9, 3, 4, -1)))
     with pytest.raises(FileFormatError, match="0 streams of kind FRME"):
         read_frames(path)
-    with pytest.raises(FileFormatError, match="no event file"):
+    with pytest.raises(FileFormatError, match="no file lies"):
         read_frames(tmp_path / "none.aedat4")
     path.write_bytes(path.read_bytes()[:-20])
     with pytest.raises(FileFormatError, match="damaged"):

@@ -230,7 +230,7 @@ BAD = [
     (GOOD, -0.2, DomainError, "> 0"),
     (GOOD, math.nan, DomainError, "> 0"),
     (GOOD, math.inf, DomainError, "> 0"),
-    (GOOD, "0.2", DomainError, "str"),
+    (GOOD, "0.2", DomainError, "'0.2'"),
     (GOOD, torch.full((5, 4), 0.2), ShapeError, r"\[4, 5\]"),
     (GOOD, torch.full((3, 4, 5), 0.2), ShapeError, r"\[4, 5\]"),
 ]

@@ -344,7 +344,7 @@ def test_an_overflow_is_an_error():
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
-        ({"drive": torch.zeros(0, 3)}, ShapeError, "no time step"),
+        ({"drive": torch.zeros(0, 3)}, ShapeError, "hold 0 frame"),
         ({"drive": torch.zeros(3, 0)}, ShapeError, "no pixel"),
         ({"drive": torch.zeros(3, 2, dtype=torch.float16)}, DomainError, "float32 or float64"),
         ({"drive": [1.0]}, DomainError, "tensor"),

@@ -149,7 +149,7 @@ def test_several_steps_per_frame_go_on_in_chunks():
     first, state = made.advance(level[:4, None], t_s[:4])
     second, _ = made.advance(level[4:, None], t_s[4:], state)
     assert torch.equal(torch.cat((first, second)), made(level[:, None], t_s))
-    with pytest.raises(DomainError, match="steps is 0; give a whole number >= 1"):
+    with pytest.raises(DomainError, match="steps is 0; a whole number >= 1"):
         events.layer("srm", steps=0)
 
 

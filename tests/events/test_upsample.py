@@ -176,7 +176,7 @@ def test_what_cannot_be_is_refused_with_a_sentence():
         ((frames, [0.0, 0.1, 0.2]), {}, ShapeError, "t_s"),
         ((frames, [0.1, 0.1]), {}, DomainError, "increase"),
         ((frames, times), {"max_displacement_px": 0.0}, DomainError, "max_displacement_px is 0.0"),
-        ((frames, times), {"max_displacement_px": None}, DomainError, "max_displacement_px is None"),
+        ((frames, times), {"max_displacement_px": None}, DomainError, "max_displacement_px = None"),
         ((frames, times), {"max_log_change": math.nan}, DomainError, "max_log_change is nan"),
         ((frames, times), {"max_steps": 0}, DomainError, "max_steps is 0"),
         ((frames, times), {"max_steps": 2}, DomainError, "max_steps = 2: record faster"),

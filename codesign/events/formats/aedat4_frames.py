@@ -12,8 +12,10 @@ import torch
 from torch import Tensor
 
 from codesign.errors import FileFormatError
+from codesign.events.entry import check_path
 from codesign.events.formats import flatbuffer
 from codesign.events.formats.aedat4_container import read_container
+from codesign.reading import check_regular
 
 # places in the schema
 TIMESTAMP = 0
@@ -49,9 +51,7 @@ def read_frames(path: str | Path) -> RecordedFrames:
     Raises: FileFormatError when the file is missing, damaged, cut short, without a single stream of frames,
       or has frames in colour or of several sizes.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileFormatError(f"no event file at {path}; check the path.")
+    path = check_regular(check_path(path))
     packets, size, _ = read_container(path, "FRME")
     if not packets:
         raise FileFormatError(f"{path} holds no frame.")

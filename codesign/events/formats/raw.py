@@ -58,7 +58,7 @@ def write_raw(path, stream, *, evt=3, t0_us=0):
     Raises: FileFormatError for a sensor beyond 2048 x 2048, another ``evt``, or times (less t0_us) below 0 or
       beyond 2^44 us (EVT 2.0: 2^34 us).
     """
-    if evt not in ENCODINGS:
+    if not isinstance(evt, int) or evt not in ENCODINGS:
         raise FileFormatError(f"evt={evt!r} was given; 2 (EVT 2.0) and 3 (EVT 3.0) are written.")
     encoding = ENCODINGS[evt]
     t_us, x, y, p = columns(

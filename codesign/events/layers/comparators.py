@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
+from codesign.events.entry import check_whole
 from codesign.events.intensity import log_levels
 from codesign.events.layers.dense import dense
 from codesign.events.layers.expected import expected
@@ -24,6 +25,8 @@ from codesign.events.layers.memory import memory, soft_counts
 from codesign.events.layers.soft import soft
 from codesign.events.sensor.model import SensorModel
 from codesign.events.spiking.comparators import count_spikes
+
+MOST_STEPS = 4096  # of spiking neurons per frame interval
 
 
 class Comparator(Protocol):
@@ -141,10 +144,7 @@ class Spikes:
             raise DomainError(
                 f"gradient is {self.gradient!r}; choose one of 'surrogate', 'play': the layer memorises a level."
             )
-        if isinstance(self.steps, bool) or not isinstance(self.steps, int) or self.steps < 1:
-            raise DomainError(
-                f"steps is {self.steps!r}; give a whole number >= 1 of steps per frame interval."
-            )
+        self.steps = check_whole(self.steps, "steps", 1, MOST_STEPS)
 
     def __call__(
         self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Any, log_input: bool

@@ -31,6 +31,7 @@ GOLDEN = (5**0.5 - 1) / 2  # its multiples spread evenly: neighbouring pixels st
 STEPS = 5  # of the recursion in a dead time, at least
 MOST_ROWS = 2000  # of the recursion in a dead time: they lie in the memory of a thread
 MOST_LOAD = 5.0  # rate x dead time up to which gradients were measured to point right
+THRESHOLD_LOAD = 2.0  # the same for gradients to thresholds
 FEWEST = 8  # dead times shorter than an interval over this are taken as local
 
 
@@ -177,7 +178,8 @@ def load(
 def warn_beyond(
     level: Tensor, thetas: Sequence[Tensor], interval_s: Tensor, refractory_s: Tensor | float
 ) -> None:
-    """Warn where rate x dead time is beyond ``MOST_LOAD``, the mean over events."""
+    """Warn where rate x dead time is beyond ``MOST_LOAD``, the mean over events, or beyond ``THRESHOLD_LOAD`` where
+    thresholds have gradients."""
     most = load(level, thetas, interval_s, refractory_s)
     if most > MOST_LOAD:
         warnings.warn(
@@ -185,6 +187,13 @@ def warn_beyond(
             f"kept; gradients are measured up to {MOST_LOAD:g} (docs/events.md). Beyond, which event is kept "
             "depends on each one before, and the gradient of a shift is lost first (cosine 0.45 against "
             "differences at 8.8): shorten the dead time or raise the thresholds.",
+            stacklevel=4,
+        )
+    elif most > THRESHOLD_LOAD and any(theta.requires_grad for theta in thetas):
+        # no figure in it, so that a design loop says it once
+        warnings.warn(
+            f"rate x dead time is above {THRESHOLD_LOAD:g} for the average event: gradients to thresholds, one apart from "
+            "the other, may point wrong there (docs/events.md); shorten the dead time, or set thresholds by differences.",
             stacklevel=4,
         )
 

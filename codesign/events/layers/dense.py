@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
-from codesign.events.entry import check_level, check_positive, check_theta
+from codesign.events.entry import check_level, check_per_pixel, check_positive
 from codesign.events.intensity import log_levels
 
 
@@ -33,8 +33,8 @@ def dense(
     Source: comparator surrogate: Zenke and Ganguli 2018 (fast sigmoid).
     """
     level = log_levels(frames, log_input, minimum=2 if state is None else 1)
-    theta_on = check_theta(theta_on, "theta_on", level)
-    theta_off = check_theta(theta_off, "theta_off", level)
+    theta_on = check_per_pixel(theta_on, "theta_on", level)
+    theta_off = check_per_pixel(theta_off, "theta_off", level)
     check_positive(sharpness, "sharpness")
     reference = level[0] if state is None else check_level(state, level)
     counts = []

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, as_number
-from codesign.events.entry import check_level, check_theta
+from codesign.events.entry import check_level, check_per_pixel, check_positive, check_whole
 from codesign.events.intensity import log_levels
 
 # beyond a spread of so many events the sum over events equals its integral less a half, to exp(-2 pi^2 1.2^2)
@@ -41,8 +41,8 @@ def expected(
     Raises: ShapeError, DomainError as ``memory``, and for a spread outside its range.
     """
     level = log_levels(frames, log_input, minimum=2 if state is None else 1)
-    theta_on = check_theta(theta_on, "theta_on", level)
-    theta_off = check_theta(theta_off, "theta_off", level)
+    theta_on = check_per_pixel(theta_on, "theta_on", level)
+    theta_off = check_per_pixel(theta_off, "theta_off", level)
     number = spread.detach() if isinstance(spread, Tensor) else spread
     if not LEAST_SPREAD <= as_number(number, "spread") <= MOST_SPREAD:
         raise DomainError(
@@ -62,7 +62,9 @@ def expected(
 
 def annealed(step: int, steps: int, first: float = 0.5, last: float = 0.02) -> float:
     """Spread at a step of an optimisation, falling geometrically from ``first`` at step 0 to ``last`` at the
-    end."""
+    end. Raises: DomainError for what is no finite number, or a spread that is not positive."""
+    first, last = check_positive(first, "first"), check_positive(last, "last")
+    step, steps = check_whole(step, "step"), check_whole(steps, "steps")
     return first * (last / first) ** (min(max(step, 0), steps) / max(steps, 1))
 
 

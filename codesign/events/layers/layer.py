@@ -111,7 +111,7 @@ class EventLayer(nn.Module):
           T frames give T intervals. None: the first chunk.
         Returns: counts [..., T-1, 2, H, W] ([..., T, 2, H, W] with a state); state to carry on, with its graph.
         """
-        _check_axes(frames)
+        check_axes(frames)
         if state is not None and generator is not None:
             raise DomainError(
                 "a generator and a state are given; the state carries the generator of its first chunk on: "
@@ -141,12 +141,14 @@ class EventLayer(nn.Module):
         Gradient: as ``forward``, also for when events come.
         Raises: as ``forward``; DomainError for a length that is not positive.
         """
-        _check_axes(frames)
+        check_axes(frames)
         if self.refines:
             fine, times_s = finer(frames.movedim(-3, 0), t_s, longest_s, log_input=self.log_input)
             return self(fine.movedim(0, -3), times_s, generator), times_s
         counts = self(frames, t_s, generator)
-        interval, share, times_s = parts(check_times(t_s, counts.shape[-4] + 1), longest_s)
+        interval, share, times_s = parts(
+            check_times(t_s, counts.shape[-4] + 1), longest_s, counts.select(-4, 0).numel()
+        )
         if len(interval) == counts.shape[-4]:
             return counts, times_s
         alike = torch.bincount(interval)[interval]
@@ -168,7 +170,7 @@ class EventLayer(nn.Module):
         Gradient: as ``forward``, also for when events come.
         """
         check_bins(bins)
-        _check_axes(frames)
+        check_axes(frames)
         given_s = check_times(t_s, frames.shape[-3])
         longest_s = float(given_s[-1] - given_s[0]) / (bins - 1) / PARTS_PER_BIN if bins > 1 else math.inf
         counts, times_s = self.finely(frames, t_s, longest_s, generator)
@@ -189,7 +191,7 @@ class EventLayer(nn.Module):
           ``surface_from_counts``.
         Raises: as ``forward``; DomainError for tau.
         """
-        check_tau(tau_s)
+        tau_s = check_tau(tau_s)
         counts, times_s = self.finely(frames, t_s, tau_s / PARTS_PER_TAU, generator)
         counts = counts.movedim((-4, -3), (0, 1))
         given_s = check_times(t_s, frames.shape[-3])[1:]
@@ -209,7 +211,7 @@ class EventLayer(nn.Module):
 class LayerState:
     """What a ``ComparatorLayer`` carries over chunks.
 
-    comparator: state of the comparator. level, frame: [..., H, W] level behind the low-pass and last frame,
+    comparator: state of the comparator, and what it is a state of. level, frame: [..., H, W] level behind the low-pass and last frame,
       None without a low-pass. deviates: [2, ..., H, W] standard normal numbers of the thresholds, None without
       mismatch. time_s: time of the last frame. generators: of the noise still to come, one per sample.
     shape, dtype: of a frame [..., H, W].
@@ -223,6 +225,7 @@ class LayerState:
     generators: Sequence[Generator]
     shape: torch.Size
     dtype: torch.dtype
+    kind: type
 
 
 class ComparatorLayer(EventLayer):
@@ -247,6 +250,13 @@ class ComparatorLayer(EventLayer):
     def _count(self, frames, t_s, state, generators):
         if state is not None and not isinstance(state, LayerState):
             raise DomainError(f"the state is a {type(state).__name__}; pass what this layer returned.")
+        if state is not None and state.kind is not type(self.comparator):
+            raise DomainError(
+                f"the state comes from a layer with the comparator {state.kind.__name__}, this one has "
+                f"{type(self.comparator).__name__}; pass what this layer returned."
+            )
+        if state is not None and state.level is None and self.sensor.cutoff_hz > 0:
+            raise DomainError("the layer has a bandwidth, the one that began the state had not; begin anew.")
         if state is not None and (state.shape, state.dtype) != (frames.shape[1:], frames.dtype):
             raise ShapeError(
                 f"{frames.dtype} frames of {list(frames.shape[1:])} follow {state.dtype} frames of "
@@ -254,7 +264,8 @@ class ComparatorLayer(EventLayer):
             )
         times_s = _times(frames, t_s, None if state is None else state.time_s)
         if state is None:
-            state = LayerState(None, None, None, None, 0.0, generators, frames.shape[1:], frames.dtype)
+            kept = (generators, frames.shape[1:], frames.dtype, type(self.comparator))
+            state = LayerState(None, None, None, None, 0.0, *kept)
         deviates, shots = self._noise(frames, times_s.diff(), state)
         seen, level = self._seen(frames, times_s.diff(), state)
         on, off = (None, None) if deviates is None else deviates
@@ -354,7 +365,8 @@ class PhysicalLayer(EventLayer):
         return torch.stack(counts, 2).reshape(-1, 2, *frames.shape[1:]), states
 
 
-def _check_axes(frames):
+def check_axes(frames: Tensor) -> None:
+    """Raise ShapeError for frames that are no tensor of at least three axes."""
     if not isinstance(frames, Tensor) or frames.ndim < 3:
         given = list(frames.shape) if isinstance(frames, Tensor) else type(frames).__name__
         raise ShapeError(f"frames are {given}; a tensor [T, H, W] or [..., T, H, W] is needed.")

@@ -7,8 +7,8 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import check_frames, check_layout, check_theta
+from codesign.errors import DomainError
+from codesign.events.entry import check_frames, check_layout, check_level, check_per_pixel
 from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
 from codesign.events.layers import memory_kernel as play
 from codesign.events.layers import turns_kernel as turns
@@ -78,16 +78,14 @@ def memory(
     """
     front_end = FrontEnd(log_input)
     check_layout(frames, minimum=2 if state is None else 1)
-    theta_on = check_theta(theta_on, "theta_on", frames)
-    theta_off = check_theta(theta_off, "theta_off", frames)
+    theta_on = check_per_pixel(theta_on, "theta_on", frames)
+    theta_off = check_per_pixel(theta_off, "theta_off", frames)
     if state is not None and not isinstance(state, Tensor):
         raise DomainError(f"state is {type(state).__name__}; pass the tensor that an earlier call returned.")
     if state is not None and state.shape == frames.shape[1:]:
         state = torch.stack((state, state))
-    if state is not None and (state.shape != (2, *frames.shape[1:]) or state.dtype != frames.dtype):
-        given = f"{state.dtype} {list(state.shape)}"
-        wanted = f"{frames.dtype} {list(frames.shape[1:])}"
-        raise ShapeError(f"state is {given}, one frame is {wanted}; pass the state of the same sensor.")
+    if state is not None:
+        check_level(state, frames[:1].expand(2, *frames.shape[1:])[None])
     steers = torch.is_grad_enabled() and any(x.requires_grad for x in (frames, theta_on, theta_off))
     gradient = _gradient(gradient, theta_on, theta_off, steers)
     return _MemorisedCounts.apply(frames, theta_on, theta_off, state, front_end, gradient)
@@ -116,8 +114,8 @@ def soft_counts(
     [[3.466, 0.0], [0.0, 2.554]]
     """
     level = log_levels(frames, log_input, minimum=2)
-    theta_on = check_theta(theta_on, "theta_on", level)
-    theta_off = check_theta(theta_off, "theta_off", level)
+    theta_on = check_per_pixel(theta_on, "theta_on", level)
+    theta_off = check_per_pixel(theta_off, "theta_off", level)
     step = level.diff(dim=0)
     return torch.stack(((step.abs() + step) / (2 * theta_on), (step.abs() - step) / (2 * theta_off)), dim=1)
 

@@ -5,7 +5,8 @@ from collections.abc import Iterator, Mapping
 import torch
 from torch import Tensor, nn
 
-from codesign.events.entry import check_positive
+from codesign.errors import DomainError
+from codesign.events.entry import check_positive, shown
 
 STEP = 0.1  # a unit step of a variable changes its value by a tenth: exp(0.1) - 1 = 10.5 %
 
@@ -18,6 +19,10 @@ class PositiveValues(nn.Module):
 
     def __init__(self, start: Mapping[str, float]):
         super().__init__()
+        if not isinstance(start, Mapping):
+            raise DomainError(
+                f"start is {shown(start)}; values by name are needed, such as {{'tau_s': 0.01}}."
+            )
         start = {name: check_positive(value, name) for name, value in start.items()}
         zeros = [(name, nn.Parameter(torch.zeros((), dtype=torch.float64))) for name in start]
         self.raw = nn.ParameterDict(zeros)
@@ -26,6 +31,8 @@ class PositiveValues(nn.Module):
 
     def __getitem__(self, name: str) -> Tensor:
         """The value as it is now, a 0-dim float64 tensor. Gradient: its variable."""
+        if not isinstance(name, str) or name not in self.raw:
+            raise DomainError(f"no value is called {shown(name)}; there are {', '.join(self.raw)}.")
         return getattr(self, f"start_{name}") * (STEP * self.raw[name]).exp()
 
     def __contains__(self, name: str) -> bool:

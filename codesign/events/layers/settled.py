@@ -7,10 +7,11 @@ from torch import Generator, Tensor, nn
 
 from codesign.errors import DomainError, as_number
 from codesign.events.entry import check_times
-from codesign.events.layers.layer import PARTS_PER_BIN, EventLayer
+from codesign.events.layers.layer import PARTS_PER_BIN, EventLayer, check_axes
 from codesign.events.volumes.volume import check_bins, from_counts
 from codesign.types import EventVolume
 
+MOST_S = 1e9
 NEAR = 1e-6  # of the lead, by which a frame may miss its end
 
 
@@ -31,6 +32,8 @@ class Settled(nn.Module):
 
     def __init__(self, layer: EventLayer, lead_s: float) -> None:
         super().__init__()
+        if not isinstance(layer, EventLayer):
+            raise DomainError(f"the layer is a {type(layer).__name__}; one of events.layer is needed.")
         self.layer = layer
         self.lead_s = check_lead(lead_s)
 
@@ -40,9 +43,12 @@ class Settled(nn.Module):
         """Events after the lead in time bins, [B, 2, bins, H, W]. Args and gradient: as ``EventLayer.volume``.
         Raises: DomainError when no frame stands at the end of the lead."""
         check_bins(bins)
+        check_axes(frames)
         given_s = check_times(t_s, frames.shape[-3])
         start_s = float(given_s[0]) + self.lead_s
-        if float((given_s[:-1] - start_s).abs().min()) > NEAR * max(self.lead_s, float(given_s.diff().min())):
+        if len(given_s) < 2 or float((given_s[:-1] - start_s).abs().min()) > NEAR * max(
+            self.lead_s, float(given_s.diff().min())
+        ):
             raise DomainError(
                 f"settled: no frame stands {self.lead_s:g} s after the first; give frames at "
                 f"{(given_s - given_s[0]).tolist()} s a lead that ends with one, before the last."
@@ -55,6 +61,6 @@ class Settled(nn.Module):
 
 def check_lead(lead_s: float) -> float:
     """Seconds. Raises: DomainError for others than finite ones of at least 0."""
-    if not 0 <= as_number(lead_s, "lead_s") < math.inf:
-        raise DomainError(f"lead_s is {lead_s}; finite seconds of at least 0 are needed.")
+    if not 0 <= as_number(lead_s, "lead_s") < MOST_S:
+        raise DomainError(f"lead_s is {lead_s}; seconds of at least 0 and less than {MOST_S:g} are needed.")
     return float(lead_s)

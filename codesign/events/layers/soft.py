@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from codesign.events.entry import check_positive, check_theta
+from codesign.events.entry import check_per_pixel, check_positive
 from codesign.events.intensity import log_levels
 
 GHOST_LOGIT = -5.0  # a pixel without change fires sigmoid(-5) = 0.67 % of an event per polarity and frame
@@ -33,7 +33,7 @@ def soft(
     [[1.0, 0.0], [0.0, 1.0]]
     """
     level = log_levels(frames, log_input, minimum=2)
-    theta = check_theta(theta, "theta", level)
+    theta = check_per_pixel(theta, "theta", level)
     k = -GHOST_LOGIT / theta if sharpness is None else check_positive(sharpness, "sharpness")
     step = level.diff(dim=0)
     return torch.stack((torch.sigmoid(k * (step - theta)), torch.sigmoid(k * (-step - theta))), dim=1)

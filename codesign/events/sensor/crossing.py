@@ -158,9 +158,10 @@ class _Step:
         if sensor.cutoff_hz > 0:
             fade, mean = coefficients(light * self.omega * dt_s, dr.exp, dr.select)
             now["level"] = passed(now["level"], now["input_level"], level, fade, mean)
-            now["input_level"] = level
         else:
             now["level"] = level
+        if "input_level" in now:
+            now["input_level"] = level
         gauss = (
             normal_pair(dr, self.arr, self.key ^ dr.gather(self.arr.UInt32, self.interval_key, index))
             if self.jitters or sensor.photoreceptor_noise

@@ -5,13 +5,16 @@ import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Generator, Tensor
 
 from codesign.errors import DomainError, ShapeError, as_number
+from codesign.events.entry import MOST_VALUES, check_dtype, shown
 
 THETA_MINIMUM = 0.01  # no drawn threshold falls below, as in v2e
+MOST_NUMBER = 1e30
 TIMINGS = ("interpolated", "v2e")
 
 
@@ -79,8 +82,8 @@ class SensorModel:
             if (
                 isinstance(value, bool)
                 or not isinstance(value, (int, float))
-                or not math.isfinite(value)
-                or value < 0
+                or not 0 <= value < math.inf
+                or value > MOST_NUMBER
                 or (positive and value == 0)
             ):
                 hint = (
@@ -89,7 +92,7 @@ class SensorModel:
                     else ""
                 )
                 raise DomainError(
-                    f"SensorModel.{field.name} is {value!r} ({type(value).__name__}); a finite Python number "
+                    f"SensorModel.{field.name} is {shown(value)} ({type(value).__name__}); a finite Python number "
                     f"{'> 0' if positive else '>= 0'} is needed{hint}."
                 )
         if self.hot_pixel_share > 1:
@@ -106,7 +109,17 @@ class SensorModel:
     @property
     def leaks(self) -> bool:
         """Whether the memorised level drifts by itself."""
-        return self.leak_rate_hz > 0 or self.hot_pixel_share * self.hot_pixel_rate_hz > 0
+        return self.leak_rate_hz > 0 or self.has_hot_pixels
+
+    @property
+    def leaks_unevenly(self) -> bool:
+        """Whether the leak rate is drawn for every pixel."""
+        return self.leak_rate_hz > 0 and self.rate_cov_decades > 0
+
+    @property
+    def has_hot_pixels(self) -> bool:
+        """Whether some pixels fire by themselves."""
+        return self.hot_pixel_share * self.hot_pixel_rate_hz > 0
 
     @property
     def has_shots(self) -> bool:
@@ -223,13 +236,22 @@ def draw_thresholds(
       to 0.01; first all ON, then all OFF.
     Source: v2e (Hu et al., CVPR-W 2021), threshold mismatch.
     """
-    nominal = (check_sensor(sensor).theta_on, sensor.theta_off)
+    check_generator(generator)
+    check_dtype(dtype, device)
     pixels = _shape(pixels)
+    draws = check_sensor(sensor).theta_sigma > 0
+    deviates = draw_deviates(pixels, generator, dtype=dtype) if draws else (None, None)
+    return thresholds(sensor, pixels, deviates, dtype=dtype, device=device)
+
+
+def thresholds(sensor, pixels, deviates, *, dtype, device):
+    """Thresholds ON and OFF of every pixel, [*pixels] each, of the standard normal numbers drawn for them; these are
+    not looked at without a mismatch."""
+    nominal = sensor.theta_on, sensor.theta_off
     if sensor.theta_sigma == 0:
         return tuple(torch.tensor(theta, dtype=dtype, device=device).expand(pixels) for theta in nominal)
-    deviates = draw_deviates(pixels, generator, dtype=dtype)
     return tuple(
-        mismatched(theta, sensor.theta_sigma, deviate).to(device)
+        mismatched(theta, sensor.theta_sigma, deviate).to(device, dtype)
         for theta, deviate in zip(nominal, deviates, strict=True)
     )
 
@@ -251,32 +273,32 @@ def mismatched(theta: Tensor | float, sigma: Tensor | float, deviate: Tensor) ->
     return (theta + sigma * deviate).clamp(min=THETA_MINIMUM)
 
 
-def draw_leak_rates(
-    sensor: SensorModel,
-    pixels: Sequence[int],
-    generator: Generator,
-    *,
-    dtype: torch.dtype = torch.float32,
-    device: torch.device | str = "cpu",
-) -> Tensor:
-    """Leak of every pixel in ON thresholds per second, [*pixels]: log-normal spread around leak_rate_hz, plus
-    the rate of hot pixels.
+def draw_leaks(
+    sensor: SensorModel, pixels: Sequence[int], generator: Generator, *, dtype: torch.dtype = torch.float32
+) -> tuple[Tensor | None, Tensor | None]:
+    """What makes the leaks of pixels differ, drawn only where the sensor has it: standard normal numbers of the spread,
+    then even ones in 0 to 1, by which pixels are hot. [*pixels] each, or None."""
+    pixels = tuple(pixels)
+    place: dict[str, Any] = {"generator": generator, "device": generator.device}
+    return (
+        torch.randn(pixels, dtype=dtype, **place) if sensor.leaks_unevenly else None,
+        torch.rand(pixels, **place) if sensor.has_hot_pixels else None,
+    )
 
-    Draws only what the sensor has: the spread, then which pixels are hot.
+
+def leak_rates(sensor, pixels, spread, heat, *, dtype, device):
+    """Leak of every pixel in ON thresholds per second, [*pixels]: log-normal around leak_rate_hz, plus
+    the rate of hot pixels, of the numbers from ``draw_leaks``.
+
     Source: v2e, noise_rate_cov_decades (a median of leak_rate_hz; the mean is higher by exp((ln 10 c)^2 /
       2)).
     """
-    rate_hz = torch.full(tuple(pixels), sensor.leak_rate_hz, dtype=dtype)
-    if sensor.leak_rate_hz > 0 and sensor.rate_cov_decades > 0:
-        spread = torch.randn(tuple(pixels), generator=generator, dtype=dtype, device=generator.device).cpu()
-        rate_hz = rate_hz * torch.pow(10.0, sensor.rate_cov_decades * spread)
-    if sensor.hot_pixel_share * sensor.hot_pixel_rate_hz > 0:
-        hot = (
-            torch.rand(tuple(pixels), generator=generator, device=generator.device).cpu()
-            < sensor.hot_pixel_share
-        )
-        rate_hz = rate_hz + sensor.hot_pixel_rate_hz * hot.to(dtype)
-    return rate_hz.to(device)
+    rate_hz = torch.full(pixels, sensor.leak_rate_hz, dtype=dtype)
+    if sensor.leaks_unevenly:
+        rate_hz = rate_hz * torch.pow(10.0, sensor.rate_cov_decades * spread.cpu())
+    if sensor.has_hot_pixels:
+        rate_hz = rate_hz + sensor.hot_pixel_rate_hz * (heat.cpu() < sensor.hot_pixel_share).to(dtype)
+    return rate_hz.to(device, dtype)
 
 
 def draw_shot_counts(
@@ -302,12 +324,16 @@ def draw_shot_counts(
     Returns: [T-1, 2, *pixels] whole numbers >= 0, ON first.
     """
     check_generator(generator)
+    check_sensor(sensor)
+    check_dtype(dtype, device)
     pixels = _shape(pixels)
     try:
         interval_s = torch.as_tensor(interval_s, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
-        raise DomainError(f"interval_s is {interval_s!r}; a list of lengths in seconds is needed.") from None
-    if interval_s.ndim != 1:
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        raise DomainError(
+            f"interval_s is {shown(interval_s)}; a list of lengths in seconds is needed."
+        ) from None
+    if interval_s.is_meta or interval_s.ndim != 1:
         raise ShapeError(
             f"interval_s has shape {list(interval_s.shape)}; one length per interval is needed, [T-1]."
         )
@@ -327,6 +353,9 @@ def draw_shot_counts(
 def _shape(pixels):
     """A shape as a tuple of whole numbers."""
     try:
-        return tuple(operator.index(side) for side in pixels)
-    except TypeError:
-        raise DomainError(f"pixels is {pixels!r}; the shape of one frame is needed, (H, W).") from None
+        found = tuple(operator.index(side) for side in pixels)
+    except (TypeError, RuntimeError):
+        found = (-1,)
+    if min(found, default=1) < 0 or max(*found, math.prod(found), 1) > MOST_VALUES:
+        raise DomainError(f"pixels is {shown(pixels)}; the shape of one frame is needed, (H, W).")
+    return found

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import ShapeError
-from codesign.events.entry import Times, check_theta, check_times
+from codesign.events.entry import Times, check_per_pixel, check_times
 from codesign.events.intensity import log_levels
 from codesign.events.stream import ordered
 from codesign.types import EventStream
@@ -32,7 +32,7 @@ def naive(frames: Tensor, t_s: Times, theta: Tensor | float, *, log_input: bool 
     level = log_levels(frames, log_input, minimum=2)
     if level.ndim != 3:
         raise ShapeError(f"frames have shape {list(frames.shape)}; [T, H, W] is needed.")
-    theta = check_theta(theta, "theta", level)
+    theta = check_per_pixel(theta, "theta", level)
     times_us = (check_times(t_s, len(level)) * 1e6).round().long().to(level.device)
     step = level.diff(dim=0)
     polarity = (step >= theta).long() - (step <= -theta).long()

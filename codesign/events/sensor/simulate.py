@@ -13,8 +13,8 @@ from codesign.events.intensity import FrontEnd, kernel_levels
 from codesign.events.sensor import crossing, v2e
 from codesign.events.sensor.model import SensorModel, check_generator, check_sensor
 from codesign.events.sensor.sinks import DenseCounts, EventKeys, KeyLayout
-from codesign.events.sensor.state import SensorState, begin, check_state
-from codesign.events.stream import ordered
+from codesign.events.sensor.state import SensorState, begin, change, check_state
+from codesign.events.stream import concatenate, ordered
 from codesign.types import EventStream
 
 EVENTS_PER_PIXEL = 0.1  # room made at first
@@ -47,7 +47,9 @@ def simulate(
       generator: torch.Generator for all that is random. None: the one in ``state``, which starts at seed 0.
       state: SensorState carried over chunks, changed in place; empty for the first. Later chunks start with
         the frame after the last one seen, and may
-        hold a single frame. Any chunking gives the events of the whole.
+        hold a single frame. Any chunking gives the events of the whole. A later chunk may have another sensor
+        (biases that change in a recording): its pixels keep the numbers drawn for them, and those that stand beyond
+        their new thresholds fire at once. What the first sensor had not, and needs draws or a memory, is refused.
       log_input: frames are natural-log levels (of the 0-255 scale where the sensor's speed or noise depends
         on intensity).
       log_eps: level is ln(I + log_eps) instead of lin-log, for linear frames of high dynamic range (ESIM:
@@ -77,12 +79,13 @@ def simulate(
     check_layout(frames, minimum=1)
     if frames.ndim != 3:
         raise ShapeError(f"frames have shape {list(frames.shape)}; [T, H, W] is needed.")
-    frames, times_s, generator = _open(frames, t_s, sensor, generator, moved, front_end)
+    frames, times_s, generator, at_once = _open(frames, t_s, sensor, generator, moved, front_end)
+    start_us = round(moved.time_s * 1e6)
     height_px, width_px = frames.shape[1:]
     if sensor.timing == "v2e":
         stream = _v2e_events(frames, times_s, sensor, generator, moved, front_end)
     else:
-        layout = KeyLayout(round(moved.time_s * 1e6), height_px, width_px)
+        layout = KeyLayout(start_us, height_px, width_px)
         _check_range(layout, times_s[-1])
         keys = []
         size = backend.frames_per_kernel(height_px * width_px)
@@ -97,6 +100,10 @@ def simulate(
             density = 1.25 * len(keys[-1]) / frames[chunk].numel()
         t_us, x, y, p = layout.columns(keys[0] if len(keys) == 1 else np.concatenate(keys))
         stream = EventStream(t_us, x, y, p, height_px, width_px)
+    if at_once is not None:
+        stream = concatenate(
+            [_fired(at_once, start_us + 1), stream]
+        )  # behind the interval before, as all others
     state.__dict__.update(moved.__dict__)
     return stream
 
@@ -126,7 +133,7 @@ def dense_counts(
     check_state(state, sensor)
     moved = replace(state)
     front_end = FrontEnd(log_input, log_eps)
-    frames, times_s, generator = _open(frames, t_s, sensor, generator, moved, front_end)
+    frames, times_s, generator, at_once = _open(frames, t_s, sensor, generator, moved, front_end)
     import drjit as dr
 
     sink = DenseCounts(dr, backend.arrays(frames.device.type, frames.dtype), len(frames), frames[0].numel())
@@ -134,12 +141,15 @@ def dense_counts(
         frames, times_s, _random_keys(len(frames), sensor, moved, generator), sensor, moved, front_end, sink
     )
     state.__dict__.update(moved.__dict__)
-    return sink.tensor((len(frames), 2, *frames.shape[1:]))
+    counts = sink.tensor((len(frames), 2, *frames.shape[1:]))
+    if at_once is not None:
+        counts[0] += at_once
+    return counts
 
 
 def _open(frames, t_s, sensor, generator, state, front_end):
     """Check what can be checked without reading every frame, and begin an empty state with the first. Returns
-    the frames and times still to be seen."""
+    the frames and times still to be seen, the generator, and what a changed sensor fires at once (``change``)."""
     fresh = state.level is None
     check_layout(frames, minimum=2 if fresh else 1)
     times_s = check_times(t_s, len(frames)).tolist()
@@ -162,7 +172,7 @@ def _open(frames, t_s, sensor, generator, state, front_end):
             times_s[0],
             generator,
         )
-        return frames[1:], times_s[1:], generator
+        return frames[1:], times_s[1:], generator, None
     shape = state.level.shape
     dtype = state.level.dtype
     if shape != frames.shape[1:] or (dtype != frames.dtype and sensor.timing != "v2e"):
@@ -175,7 +185,15 @@ def _open(frames, t_s, sensor, generator, state, front_end):
             f"the chunk starts at {times_s[0]!r} s, the last frame seen was at {state.time_s!r} s; times "
             "must go on increasing."
         )
-    return frames, times_s, generator
+    return frames, times_s, generator, change(state, sensor)
+
+
+def _fired(counts, t_us):
+    """Stream of whole counts [2, H, W] at one time."""
+    polarity, y, x = counts.nonzero(as_tuple=True)
+    many = counts[polarity, y, x].long()
+    x, y, p = (column.repeat_interleave(many).cpu() for column in (x, y, 1 - 2 * polarity))
+    return ordered(torch.full_like(x, t_us), x, y, p, *counts.shape[1:])
 
 
 def _v2e_events(frames, times_s, sensor, generator, state, front_end):

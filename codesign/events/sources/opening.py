@@ -4,6 +4,7 @@ alike."""
 from pathlib import Path
 
 from codesign.errors import FileFormatError
+from codesign.events.entry import check_path
 from codesign.events.sources.frames import PICTURES, FrameSource
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".gif")
@@ -25,11 +26,7 @@ def open_frames(path: str | Path) -> FrameSource:
     # readers are imported when they are asked for, with the decoders that they need
     from codesign.events.sources import folder, mraw, stack, video
 
-    if not isinstance(path, (str, Path)):
-        raise FileFormatError(
-            f"the path is {path!r} ({type(path).__name__}); a str or pathlib.Path is needed."
-        )
-    path = Path(path)
+    path = check_path(path)
     if path.is_dir():
         return folder.open_folder(path)
     if not path.is_file():

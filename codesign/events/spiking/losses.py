@@ -4,8 +4,8 @@ counts."""
 import torch.nn.functional as F
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import check_whole
+from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.events.entry import check_layout, check_whole
 from codesign.events.spiking.srm_scale import alpha_response
 
 
@@ -55,10 +55,8 @@ def _pooled(counts, side_px, steps):
 
 def _difference(found, target):
     for counts in (found, target):
-        if not isinstance(counts, Tensor):
-            raise DomainError(
-                f"counts are {type(counts).__name__}; tensors [T, 2, ...] are needed, ON first."
-            )
+        check_layout(counts, 1, name="counts")
+        check_finite(counts, "counts")
     if found.shape != target.shape:
         raise ShapeError(
             f"counts of shape {list(found.shape)} and {list(target.shape)} have no distance; give the same "

@@ -9,9 +9,18 @@ from typing import Any
 import torch
 from torch import Generator, Tensor, nn
 
-from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import Times, check_frames, check_times
+from codesign.errors import DomainError, ShapeError, check_seed
+from codesign.events.entry import (
+    Times,
+    check_choice,
+    check_frames,
+    check_path,
+    check_times,
+    check_whole,
+    shown,
+)
 from codesign.events.intensity import lin_log
+from codesign.events.sensor.model import check_generator
 from codesign.events.spiking.comparators import COMPARATORS
 from codesign.events.spiking.front import Bandwidth, Prefilter, ToneCurve
 from codesign.events.spiking.noise import NoiseRate
@@ -65,8 +74,12 @@ class SpikeEsim(nn.Module):
         seed: int = 0,
     ):
         super().__init__()
-        if comparator not in COMPARATORS:
-            raise DomainError(f"comparator is {comparator!r}; allowed: {', '.join(map(repr, COMPARATORS))}.")
+        check_choice(comparator, "comparator", COMPARATORS)
+        width, depth = (
+            check_whole(value, name, 1, most)
+            for value, name, most in ((width, "width", 4096), (depth, "depth", 256))
+        )
+        seed = check_seed(seed, "seed")
         for name, value, least in (
             ("theta_on", theta_on, 1e-6),
             ("theta_off", theta_off, 1e-6),
@@ -139,10 +152,13 @@ class SpikeEsim(nn.Module):
           them).
         """
         frames, times_s = _checked(frames, t_s, state)
-        scale = torch.as_tensor(theta_scale, dtype=torch.float64)
-        if scale.shape not in ((), (2,)) or not bool((scale.isfinite() & (scale > 0)).all()):
+        try:
+            scale = torch.as_tensor(theta_scale, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError, OverflowError):
+            scale = torch.zeros(())
+        if scale.is_meta or scale.shape not in ((), (2,)) or not bool((scale.isfinite() & (scale > 0)).all()):
             raise DomainError(
-                f"theta_scale is {theta_scale!r}; a finite factor > 0, or one each for ON and OFF, is needed."
+                f"theta_scale is {shown(theta_scale)}; a finite factor > 0, or one each for ON and OFF, is needed."
             )
         seen, after = self._levels(frames, times_s, state)
         compare = COMPARATORS[self.settings["comparator"]]
@@ -176,19 +192,20 @@ class SpikeEsim(nn.Module):
     ) -> tuple[Tensor, SpikeEsimState]:
         """Hard events with noise: ``forward`` plus a Poisson draw of ``expected_noise``. Returns counts and
         state."""
+        check_generator(generator)
         noise = torch.poisson(self.expected_noise(frames, t_s, state), generator=generator)
         counts, after = self(frames, t_s, state, theta_scale=theta_scale)
         return counts + noise, after
 
     def save(self, path: str | Path) -> None:
         """Write settings and parameters as an .npz file."""
-        write_generator(path, self.settings, self.state_dict())
+        write_generator(check_path(path), self.settings, self.state_dict())
 
     @classmethod
     def load(cls, path: str | Path) -> "SpikeEsim":
         """A generator that ``save`` wrote. Raises: FileFormatError when the file is missing, damaged or of
         another kind."""
-        return read_generator(path, cls)
+        return read_generator(check_path(path), cls)
 
     def _levels(self, frames, times_s, state):
         """What the comparators see, [T, ...], and (level, filtered, slow) after the last frame."""

@@ -1,14 +1,21 @@
 """The spike response model as an event layer: exact kernels by recursion, learnable thresholds and time
 constants, explicit state."""
 
-import math
 import warnings
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.errors import DomainError, ShapeError, as_number, check_finite
+from codesign.events.entry import (
+    check_choice,
+    check_flag,
+    check_layout,
+    check_per_pixel,
+    check_positive,
+    shown,
+)
 from codesign.events.spiking.srm_forward import Plan
 from codesign.events.spiking.srm_gradient import Setup, reset_sum, run
 from codesign.events.spiking.srm_kernels import RESETS, RESPONSES, STATES
@@ -21,6 +28,7 @@ from codesign.events.spiking.surrogate import Laplace, Surrogate
 GRADIENTS = ("surrogate", "play", "mean")
 THROUGH_RESET = ("off", "full", "bounded")
 NONFINITE = ("raise", "zero")
+MOST_STEPS = 1e9
 
 
 def srm(
@@ -105,20 +113,23 @@ def srm(
     """
     drive = _checked_drive(drive, nonfinite, truncation)
     pixels = drive.shape[1:]
+    check_flag(coupled, "coupled")
+    check_flag(smooth, "smooth")
     if coupled and (not pixels or pixels[0] != 2):
         raise ShapeError(
             f"coupled polarities need a drive of shape [T, 2, ...], ON first, got {list(drive.shape)}; "
             "stack the two drives on axis 1."
         )
-    _choice("kernel", kernel, RESETS)
-    _choice("response", response, RESPONSES)
-    _choice("through_reset", through_reset, THROUGH_RESET)
-    _choice("gradient", gradient, GRADIENTS)
-    dt = _number("dt", dt, least=0, strict=True)
-    reset_scale = _number("reset_scale", reset_scale, least=0)
-    theta = per_pixel(theta, "theta", drive)
-    tau_s = per_pixel(tau_s, "tau_s", drive) if response == "alpha" else None
-    tau_r = per_pixel(tau_r, "tau_r", drive) if kernel != "step" else torch.ones_like(theta)
+    check_choice(kernel, "kernel", RESETS)
+    check_choice(response, "response", RESPONSES)
+    check_choice(through_reset, "through_reset", THROUGH_RESET)
+    check_choice(gradient, "gradient", GRADIENTS)
+    dt = check_positive(dt, "dt")
+    if reset_scale := as_number(reset_scale, "reset_scale"):
+        reset_scale = check_positive(reset_scale, "reset_scale")
+    theta = check_per_pixel(theta, "theta", drive, torch.float64)
+    tau_s = _time_constant(tau_s, "tau_s", drive, dt) if response == "alpha" else None
+    tau_r = _time_constant(tau_r, "tau_r", drive, dt) if kernel != "step" else torch.ones_like(theta)
     if gradient == "play":
         check_play(drive, kernel, response, reset_scale, coupled, state)
         given = (drive, theta, state)
@@ -165,7 +176,7 @@ def srm(
         RESETS[kernel],
         2 if coupled else 1,
         type(surrogate),
-        bool(smooth),
+        smooth,
         through_reset,
         nonfinite == "zero",
     )
@@ -186,7 +197,7 @@ def srm(
             None if tau_s is None else dt / tau_s,
             h_reset,
             state,
-            _number("truncation", truncation, least=0, strict=True),
+            check_positive(truncation, "truncation", least=1e-300),
         )
     if drive.numel() >= 2**32:
         raise ShapeError(
@@ -232,44 +243,9 @@ def _with_mean(drive, theta, tau_s, tau_r, kernel, state, response, reset_scale)
     return spikes, potential, replace(after, response=responded.response, mean=mean)
 
 
-def per_pixel(value: Tensor | float | None, name: str, drive: Tensor) -> Tensor:
-    """A positive parameter as float64 tensor that broadcasts over one frame of the drive.
-
-    Raises: DomainError when it is not a positive finite number; ShapeError when it does not broadcast.
-    """
-    if isinstance(value, bool) or not isinstance(value, (Tensor, float, int)):
-        raise DomainError(f"{name} is {value!r}; give a number or a tensor, > 0.")
-    value = torch.as_tensor(value, dtype=torch.float64, device=drive.device)
-    pixels = drive.shape[1:]
-    fits = value.ndim <= len(pixels) and all(
-        a in (1, b) for a, b in zip(reversed(value.shape), reversed(pixels), strict=False)
-    )
-    if not fits or value.numel() == 0:
-        raise ShapeError(
-            f"{name} has shape {list(value.shape)}; it must be a scalar or fit the pixel shape "
-            f"{list(pixels)}."
-        )
-    low, high = (float(bound) for bound in value.detach().aminmax())
-    if not (low > 0 and math.isfinite(high)):
-        raise DomainError(f"{name} spans {low:g} to {high:g}; every value must be a finite number > 0.")
-    return value
-
-
 def _checked_drive(drive, nonfinite, truncation):
-    if not isinstance(drive, Tensor) or drive.dtype not in (torch.float32, torch.float64):
-        given = drive.dtype if isinstance(drive, Tensor) else type(drive).__name__
-        raise DomainError(
-            f"drive is {given}; a torch tensor of float32 or float64 is needed: convert with "
-            "torch.as_tensor(drive).float()."
-        )
-    if drive.ndim == 0 or drive.shape[0] == 0:
-        raise ShapeError(
-            f"drive has shape {list(drive.shape)}, which holds no time step; give at least one, time on the "
-            "first axis."
-        )
-    if drive.numel() == 0:
-        raise ShapeError(f"drive has shape {list(drive.shape)}, which holds no pixel; give at least one.")
-    _choice("nonfinite", nonfinite, NONFINITE)
+    check_layout(drive, 1, name="drive")
+    check_choice(nonfinite, "nonfinite", NONFINITE)
     if truncation is None:
         return drive  # the loop over time looks at every value anyway
     return (
@@ -279,26 +255,22 @@ def _checked_drive(drive, nonfinite, truncation):
     )
 
 
-def _choice(name, value, allowed):
-    if value not in allowed:
-        raise DomainError(f"{name} is {value!r}; choose one of {', '.join(map(repr, allowed))}.")
-
-
-def _number(name, value, least, strict=False):
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, (int, float))
-        or not (least < value if strict else least <= value)
-        or value == math.inf
-    ):
-        raise DomainError(f"{name} is {value!r}; give a finite number {'>' if strict else '>='} {least}.")
-    return float(value)
+def _time_constant(value, name, drive, dt):
+    """A time constant of every pixel, float64. Beyond a billionth and a billion of a step it is none: kernels and their
+    derivatives leave double precision."""
+    value = check_per_pixel(value, name, drive, torch.float64)
+    low, high = (float(bound) / dt for bound in value.detach().aminmax())
+    if not 1 / MOST_STEPS <= low <= high <= MOST_STEPS:
+        raise DomainError(
+            f"{name} is {low:.3g} to {high:.3g} steps of dt; {1 / MOST_STEPS:g} to {MOST_STEPS:g} are possible."
+        )
+    return value
 
 
 def _segment(segment):
     if segment is not None and (isinstance(segment, bool) or not isinstance(segment, int) or segment < 1):
         raise DomainError(
-            f"segment is {segment!r}; give a whole number of steps >= 1 (about the square root of 8 T needs "
+            f"segment is {shown(segment)}; give a whole number of steps >= 1 (about the square root of 8 T needs "
             "least memory), or None."
         )
     return segment

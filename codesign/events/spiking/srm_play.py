@@ -14,7 +14,7 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
 from codesign.errors import DomainError
-from codesign.events.entry import check_theta
+from codesign.events.entry import check_per_pixel
 from codesign.events.layers.memory import memory
 from codesign.events.layers.pixel_loop import Loop
 from codesign.events.spiking.instead import instead
@@ -35,8 +35,8 @@ def with_play(
     Args: spikes: [T-1, 2, ...] of a level [T, ...], or [T, 2, ...] with a state of the chunk before.
     Returns: the same spikes; state to carry on, with its graph. Gradient: level, thetas, state.
     """
-    theta_on = check_theta(theta_on, "theta_on", level)
-    theta_off = check_theta(theta_off, "theta_off", level)
+    theta_on = check_per_pixel(theta_on, "theta_on", level)
+    theta_off = check_per_pixel(theta_off, "theta_off", level)
     before = None if state is None else state.memory
     if state is None:
         slow, centre = _Limited.apply(level[1:], level[0], theta_on, theta_off)
@@ -64,7 +64,7 @@ def check_play(
             "gradient 'play' needs the OFF drive to be minus the ON drive, steps of one level; use "
             "gradient='surrogate' for two drives of their own."
         )
-    if state is not None and state.play is None:
+    if state is not None and getattr(state, "play", None) is None:
         raise DomainError(
             "the state comes from a layer without gradient='play'; begin with that gradient, or go on with "
             "gradient='surrogate'."

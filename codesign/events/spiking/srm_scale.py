@@ -4,7 +4,8 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.events.spiking.srm import per_pixel, srm
+from codesign.events.entry import check_per_pixel
+from codesign.events.spiking.srm import srm
 from codesign.events.spiking.srm_state import SrmState
 
 
@@ -51,7 +52,7 @@ def drive_scale(
         _, potential, _ = srm(
             drive, theta=1.0, tau_s=tau_s, dt=dt, kernel="step", response=response, reset_scale=0.0
         )
-        relative = (potential / per_pixel(theta, "theta", drive)).flatten()
+        relative = (potential / check_per_pixel(theta, "theta", drive, torch.float64)).flatten()
         reached = max(1, round(share * relative.numel()))
         level = float(relative.kthvalue(relative.numel() + 1 - reached).values)
     if level <= 0:

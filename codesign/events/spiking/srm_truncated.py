@@ -94,7 +94,7 @@ def reset_taps(kernel, h, amplitude, cut, pixels):
 def cut_taps(shape, h, amplitude, cut, pixels):
     """Values of a kernel at lags 0 to the longest one kept over all pixels, zero where a pixel's own kernel
     has ended."""
-    h, amplitude = (x.reshape(*[1] * (len(pixels) - x.ndim), *x.shape) for x in (h, amplitude))
+    h, amplitude = (x.reshape((*[1] * (len(pixels) - x.ndim), *x.shape)) for x in (h, amplitude))
     lags = 64
     while True:
         k = torch.arange(lags, dtype=torch.float64, device=h.device).reshape(-1, *[1] * len(pixels))

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
+from codesign.events.entry import check_positive, shown
 
 LOG2_E = math.log2(math.e)
 
@@ -47,7 +48,7 @@ class Surrogate:
         for name, value in (("alpha", self.alpha), ("beta", self.beta)):
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
                 raise DomainError(
-                    f"{type(self).__name__}: {name} is {value!r}; give a finite number > 0, for example "
+                    f"{type(self).__name__}: {name} is {shown(value)}; give a finite number > 0, for example "
                     f"{type(self).__name__}.unit(width=theta)."
                 )
 
@@ -55,6 +56,7 @@ class Surrogate:
     def unit(cls, width: float) -> Self:
         """The surrogate of the given width in potential units whose integral is 1, like that of the step's
         true derivative."""
+        width = check_positive(width, f"{cls.__name__}.unit: width")
         return cls(cls.mass * width, 1 / width)
 
     @staticmethod

@@ -6,13 +6,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import check_frames
+from codesign.errors import DomainError, ShapeError, check_seed
+from codesign.events.entry import check_frames, check_positive, check_whole
 from codesign.events.spiking.srm import srm
 from codesign.events.spiking.srm_scale import drive_scale
 from codesign.events.spiking.srm_state import SrmState
 from codesign.events.spiking.stepwise import stepwise
 from codesign.events.spiking.surrogate import Surrogate
+
+MOST_CHANNELS = 1024
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,12 @@ class TwoBranchSpikes(nn.Module):
         seed: int = 0,
     ):
         super().__init__()
-        if isinstance(channels, bool) or not isinstance(channels, int) or channels < 1:
-            raise DomainError(f"channels is {channels!r}; give 3 for RGB or 1 for monochrome frames.")
+        dt = check_positive(dt, "dt")
+        for name, value in (("theta", theta), ("tau_r", tau_r), ("smoothing_tau", smoothing_tau)):
+            if not isinstance(value, Tensor) and (value is not None or name != "smoothing_tau"):
+                check_positive(value, name)
+        channels = check_whole(channels, "channels", 1, MOST_CHANNELS)
+        seed = check_seed(seed, "seed")
         draw = torch.rand(2, channels, 3, 3, generator=torch.Generator().manual_seed(seed)) / (9 * channels)
         self.weight_on = nn.Parameter(draw[0])
         self.weight_off = nn.Parameter(draw[1])
@@ -84,6 +90,8 @@ class TwoBranchSpikes(nn.Module):
         Gradient: weights and frames, by the surrogate.
         Raises: ShapeError for other shapes or too few frames; DomainError for NaN or infinity.
         """
+        if state is not None and not isinstance(state, BranchState):
+            raise DomainError(f"the state is a {type(state).__name__}; pass the one that was returned.")
         drive, last = self._drive(frames, state)
         neurons = None if state is None else state.neurons
         spikes, potential, neurons = srm(

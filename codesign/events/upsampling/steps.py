@@ -20,14 +20,14 @@ def largest(values):
 def steps_for(amount, bound, max_steps, what, start_s, end_s):
     """Least number of equal steps that keep ``amount`` within ``bound`` each. Raises: DomainError when that
     takes more than ``max_steps``."""
-    count = max(1, math.ceil(amount / bound * (1 - 1e-6)))
+    count = max(1.0, amount / bound * (1 - 1e-6))
     if count > max_steps:
         raise DomainError(
             f"between the frames at {start_s:.9g} s and {end_s:.9g} s {what} changes by {amount:.3g}; steps "
-            f"of {bound:g} take {count}, more than max_steps = {max_steps}: "
+            f"of {bound:g} take {count:.3g}, more than max_steps = {max_steps}: "
             "record faster, or allow larger or more steps."
         )
-    return count
+    return math.ceil(count)
 
 
 def largest_change(levels):

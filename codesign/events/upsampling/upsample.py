@@ -3,13 +3,22 @@ optical flow."""
 
 import math
 from collections.abc import Iterable, Iterator
+from itertools import zip_longest
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import Times, check_frames, check_times
+from codesign.errors import DomainError, ShapeError, as_number
+from codesign.events.entry import (
+    Times,
+    check_frames,
+    check_layout,
+    check_positive,
+    check_times,
+    check_whole,
+    shown,
+)
 from codesign.events.intensity import lin_log
 from codesign.events.upsampling.between import between, visibility
 from codesign.events.upsampling.flow import flow_both_ways, flow_levels
@@ -80,22 +89,25 @@ def upsample_stream(
       later frame those that lead to it, and itself. Joined they are what ``upsample`` gives, bit for bit.
     Raises: as ``upsample``; bounds at once, frames and times when they come.
     """
-    for name, bound in (("max_displacement_px", max_displacement_px), ("max_log_change", max_log_change)):
-        if not (bound is None and name == "max_log_change") and not (
-            isinstance(bound, (int, float)) and 0 < bound < math.inf
-        ):
-            raise DomainError(f"{name} is {bound!r}; a finite number above 0 is needed.")
-    if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
-        raise DomainError(f"max_steps is {max_steps!r}; a whole number of at least 1 is needed.")
+    max_displacement_px = check_positive(max_displacement_px, "max_displacement_px")
+    if max_log_change is not None:
+        max_log_change = check_positive(max_log_change, "max_log_change")
+    max_steps = check_whole(max_steps, "max_steps", 1)
+    for name, given in (("frames", frames), ("t_s", t_s)):
+        if not isinstance(given, Iterable):
+            raise DomainError(f"{name} are {shown(given)}; something that yields them one by one is needed.")
     return _pieces(frames, t_s, max_displacement_px, max_log_change, max_steps)
 
 
 def _pieces(frames, t_s, max_displacement_px, max_log_change, max_steps):
     before = None
     before_s = -math.inf
-    for index, (frame, time_s) in enumerate(zip(frames, t_s, strict=True)):
+    for index, (frame, time_s) in enumerate(zip_longest(frames, t_s)):
+        if frame is None or time_s is None:
+            raise ShapeError(f"there is no {'frame' if frame is None else 'time'} {index}; give one of each.")
+        check_layout(frame, 0, name=f"frame {index}")
         check_frames(frame[None], 1, name=f"frame {index}")
-        time_s = float(time_s)
+        time_s = as_number(time_s, f"the time of frame {index}")
         if frame.ndim != 2 or (
             before is not None and (frame.shape != before.shape or frame.dtype != before.dtype)
         ):

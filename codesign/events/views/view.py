@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import ShapeError
-from codesign.events.entry import Times, check_layout, check_positive, check_times
+from codesign.events.entry import Times, check_counts, check_layout, check_positive, check_times
 
 
 def picture(counts: Tensor, full_scale: float | None = None) -> Tensor:
@@ -39,16 +39,16 @@ def rates(counts: Tensor, t_s: Times) -> tuple[Tensor, Tensor]:
     Args: counts: [T-1, 2, H, W]. t_s: [T] seconds, strictly increasing.
     Returns: middle of each interval [T-1], seconds, and rate [T-1, 2], events per second, ON first.
     """
-    check_layout(counts, 1, name="counts")
+    check_counts(counts)
     times_s = check_times(t_s, len(counts) + 1)
     totals = counts.detach().flatten(2).sum(-1).cpu().double()
     return (times_s[1:] + times_s[:-1]) / 2, totals / times_s.diff()[:, None]
 
 
 def _scaled(counts, full_scale):
-    if not isinstance(counts, Tensor) or counts.ndim < 3 or counts.shape[-3] != 2 or not counts.numel():
-        given = list(counts.shape) if isinstance(counts, Tensor) else type(counts).__name__
-        raise ShapeError(f"counts are {given}; a tensor [..., 2, H, W] is needed (ON first).")
+    check_layout(counts, 0, name="counts")
+    if counts.ndim < 3 or counts.shape[-3] != 2:
+        raise ShapeError(f"counts are {list(counts.shape)}; a tensor [..., 2, H, W] is needed (ON first).")
     counts = counts.detach()
     if full_scale is None:
         full_scale = max(1.0, float(counts.max()))

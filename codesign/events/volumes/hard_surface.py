@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.events.entry import Times, check_times
+from codesign.errors import DomainError
+from codesign.events.entry import Times, check_counts, check_times
 from codesign.events.volumes.traces import check_tau
 
 
@@ -36,12 +36,8 @@ def surface_from_hard_counts(
     Raises: ShapeError, DomainError as ``from_counts``; DomainError for counts that are not whole, and for tau.
     Source: the surface: Lagorce et al., HOTS, PAMI 2017; the gradient is ours.
     """
-    check_tau(tau_s)
-    if counts.ndim < 4 or counts.shape[0] < 1 or counts.shape[1] != 2:
-        raise ShapeError(
-            f"counts have shape {list(counts.shape)}; [T-1, 2, ..., H, W] is needed (ON first on axis 1)."
-        )
-    check_finite(counts, "counts")
+    tau_s = check_tau(tau_s)
+    check_counts(counts)
     times_s = check_times(t_s, len(counts) + 1)
     wrong = counts.detach()[(counts.detach() < 0) | (counts.detach() % 1 != 0)]
     if len(wrong):
@@ -49,7 +45,7 @@ def surface_from_hard_counts(
             f"counts hold {float(wrong[0]):g}; whole numbers of events are needed (surface_from_counts takes "
             "shares of events)."
         )
-    return _LastEvents.apply(counts, times_s, check_times(at_s, len(at_s)), tau_s)
+    return _LastEvents.apply(counts, times_s, check_times(at_s), tau_s)
 
 
 class _LastEvents(Function):

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import check_counts, check_whole
+from codesign.events.entry import check_counts, check_dtype, check_layout, check_room, check_whole
 from codesign.events.stream import check_stream, ordered
 from codesign.types import EventStream
 
@@ -32,6 +32,8 @@ def spikes_from_stream(
     step_us = check_whole(step_us, "step_us", 1)
     steps = check_whole(steps, "steps", 1)
     check_stream(stream)
+    check_dtype(dtype)
+    check_room(2 * stream.width_px * stream.height_px * steps, "the spikes")
     step = torch.div(stream.t_us - t0_us, step_us, rounding_mode="floor")
     inside = (step >= 0) & (step < steps)
     shape = (2, stream.width_px, stream.height_px, steps)
@@ -50,12 +52,14 @@ def stream_from_spikes(spikes: Tensor, t0_us: int, step_us: int) -> EventStream:
     """
     t0_us = check_whole(t0_us, "t0_us")
     step_us = check_whole(step_us, "step_us", 1)
+    check_layout(spikes, 1, name="spikes")
     if spikes.ndim != 4 or spikes.shape[0] != 2 or 0 in spikes.shape:
         raise ShapeError(f"spikes have shape {list(spikes.shape)}; [2, W, H, T] is needed (ON first).")
     if not bool(((spikes == 0) | (spikes == 1)).all()):
         raise DomainError(
             "spikes hold values other than 0 and 1; round soft spikes before making single events of them."
         )
+    check_whole(t0_us + spikes.shape[3] * step_us, "the end of the stream")
     off, x, y, step = spikes.nonzero(as_tuple=True)
     return ordered(t0_us + step * step_us, x, y, 1 - 2 * off, spikes.shape[2], spikes.shape[1])
 

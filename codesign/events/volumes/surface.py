@@ -31,7 +31,7 @@ def surface_from_stream(
     Raises: DomainError for reference times that are not whole or do not increase, and for tau.
     Source: Lagorce et al., HOTS, PAMI 2017, eq. 2 and 3.
     """
-    check_tau(tau_s)
+    tau_s = check_tau(tau_s)
     check_stream(stream)
     height = stream.height_px
     width = stream.width_px
@@ -72,7 +72,7 @@ def surface_from_times(
       sensor, another polarity, and for tau.
     Numerics: give times relative to the start of a recording; float64 epoch times are exact to 0.2 us.
     """
-    check_tau(tau_s)
+    tau_s = check_tau(tau_s)
     if not (t_s.ndim == 1 and t_s.shape == x.shape == y.shape == p.shape) or not t_s.is_floating_point():
         given = [(str(v.dtype), list(v.shape)) for v in (t_s, x, y, p)]
         raise ShapeError(
@@ -93,7 +93,7 @@ def surface_from_times(
     cell = (((p < 0).long() * height_px + y) * width_px + x)[order]
     rank = torch.arange(len(order), device=cell.device)
     surfaces = []
-    for time_s in check_times(at_s, len(at_s)).tolist():
+    for time_s in check_times(at_s).tolist():
         seen = int(
             torch.searchsorted(
                 times_s.detach(), torch.tensor(time_s, dtype=t_s.dtype, device=t_s.device), right=True
@@ -124,7 +124,7 @@ def surface_from_counts(counts: Tensor, t_s: Times, tau_s: float) -> Tensor:
     Gradient: counts up to and including 1; none above, where one more event moves no last time.
     Raises: ShapeError, DomainError as ``from_counts``; DomainError for negative counts and for tau.
     """
-    check_tau(tau_s)
+    tau_s = check_tau(tau_s)
     check_counts(counts, non_negative=True)
     fade = torch.exp(check_times(t_s, len(counts) + 1).diff() / -tau_s).tolist()
     share = counts.clamp(max=1)

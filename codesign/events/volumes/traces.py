@@ -6,10 +6,20 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import Times, check_layout, check_positive, check_times
+from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.events.entry import (
+    Times,
+    check_dtype,
+    check_layout,
+    check_positive,
+    check_times,
+    check_whole,
+    shown,
+)
 from codesign.events.stream import check_stream
 from codesign.types import EventStream
+
+NANOSECOND = 1e-9
 
 
 def decay(counts: Tensor, t_s: Times, tau_s: float) -> Tensor:
@@ -22,8 +32,9 @@ def decay(counts: Tensor, t_s: Times, tau_s: float) -> Tensor:
     Returns: [T-1, 2, ...]; after each interval of length d: s = s exp(-d/tau) + counts.
     Gradient: counts (the sum is linear in them).
     """
-    check_tau(tau_s)
+    tau_s = check_tau(tau_s)
     check_layout(counts, 1, name="counts")
+    check_finite(counts, "counts")
     fade = torch.exp(check_times(t_s, len(counts) + 1).diff() / -tau_s).tolist()
     trace = torch.zeros_like(counts[0])
     traces = []
@@ -56,14 +67,18 @@ def decay_from_stream(
     Raises: DomainError for reference times that are not whole or do not increase, and for tau; ShapeError for
       a trace of another size.
     """
-    check_tau(tau_s)
+    tau_s = check_tau(tau_s)
     check_stream(stream)
+    check_dtype(dtype)
     height = stream.height_px
     width = stream.width_px
     trace = torch.zeros(2 * height * width, dtype=torch.float64, device=stream.t_us.device)
     before_us = None
     if start is not None:
-        earlier, before_us = start
+        if not isinstance(start, tuple) or len(start) != 2 or not isinstance(start[0], Tensor):
+            raise DomainError(f"start is {shown(start)}; a trace and its time in microseconds are needed.")
+        earlier, before_us = start[0], check_whole(start[1], "the time of the trace")
+        check_layout(earlier, name="the trace to go on with")
         if earlier.shape != (2, height, width):
             raise ShapeError(
                 f"the trace to go on with has shape {list(earlier.shape)}; the sensor's is "
@@ -73,6 +88,10 @@ def decay_from_stream(
     traces = []
     for time_us, (cell, t_us) in segments(stream, at_us):
         if before_us is not None:
+            if time_us < before_us:
+                raise DomainError(
+                    f"the trace is of {before_us} us, after the first time asked for, {time_us} us."
+                )
             trace *= math.exp((time_us - before_us) / (-1e6 * tau_s))
         trace.index_add_(0, cell, torch.exp((time_us - t_us).to(torch.float64) / (-1e6 * tau_s)))
         before_us = time_us
@@ -89,7 +108,8 @@ def segments(stream, at_us):
     """
     try:
         times_us = torch.as_tensor(at_us)
-    except (TypeError, ValueError, RuntimeError):
+        check_whole(int(times_us.abs().max()) if len(times_us) else 0, "at_us")
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         times_us = torch.empty(0)
     if (
         times_us.ndim != 1
@@ -99,8 +119,7 @@ def segments(stream, at_us):
         or bool((times_us.diff() <= 0).any())
     ):
         raise DomainError(
-            f"at_us is {at_us if len(str(at_us)) < 80 else str(at_us)[:80] + ' …'}; a list of whole "
-            "microseconds that increase strictly is needed."
+            f"at_us is {shown(at_us)}; a list of whole microseconds that increase strictly is needed."
         )
     ends = torch.searchsorted(stream.t_us, times_us.to(stream.t_us), right=True).tolist()
     cell = ((stream.p < 0).long() * stream.height_px + stream.y) * stream.width_px + stream.x
@@ -109,5 +128,5 @@ def segments(stream, at_us):
 
 
 def check_tau(tau_s):
-    """Raise DomainError unless a fading time is a finite number of seconds > 0."""
-    check_positive(tau_s, "tau_s", " s")
+    """A fading time as a float; DomainError unless it is a finite number of seconds of at least a nanosecond."""
+    return check_positive(tau_s, "tau_s", " s", NANOSECOND)

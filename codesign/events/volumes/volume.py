@@ -9,9 +9,19 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.events.entry import Times, check_counts, check_times, check_whole
+from codesign.events.entry import (
+    Times,
+    check_counts,
+    check_dtype,
+    check_room,
+    check_times,
+    check_whole,
+    shown,
+)
 from codesign.events.stream import check_stream
 from codesign.types import EventStream, EventVolume
+
+MOST_BINS = 2**20
 
 
 def bin_shares(position: Tensor, bins: int) -> Tensor:
@@ -31,8 +41,9 @@ def bin_shares(position: Tensor, bins: int) -> Tensor:
 
 def check_bins(bins: object) -> None:
     """Raise DomainError unless ``bins`` is a whole number >= 1."""
-    if isinstance(bins, bool) or not isinstance(bins, int) or bins < 1:
-        raise DomainError(f"bins is {bins!r}; a whole number >= 1 is needed.")
+    if not isinstance(bins, int):
+        raise DomainError(f"bins is {shown(bins)}; a whole number >= 1 is needed.")
+    check_whole(bins, "bins", 1, MOST_BINS)
 
 
 def from_counts(counts: Tensor, t_s: Times, bins: int) -> EventVolume:
@@ -60,6 +71,7 @@ def from_counts(counts: Tensor, t_s: Times, bins: int) -> EventVolume:
     (torch.Size([1, 2, 3, 4, 6]), [2.0, 4.0, 2.0])
     """
     check_counts(counts)
+    check_bins(bins)
     times_s = check_times(t_s, counts.shape[0] + 1)
     middle_s = (times_s[1:] + times_s[:-1]) / 2 - times_s[0]
     shares = bin_shares(middle_s / (times_s[-1] - times_s[0]), bins)
@@ -106,6 +118,8 @@ def from_stream(
             f"the interval is {t0_us!r} to {t1_us!r} us; whole microseconds with t1 > t0 are needed."
         )
     check_bins(bins)
+    check_dtype(dtype)
+    check_room(2 * bins * stream.height_px * stream.width_px, "the volume")
     duration_us = int(t1_us) - int(t0_us)
     first, last = torch.searchsorted(
         stream.t_us, torch.tensor([int(t0_us), int(t1_us) + 1], device=stream.t_us.device)
