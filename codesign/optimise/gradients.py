@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from codesign.errors import GradientError
+from codesign.errors import DomainError, GradientError, ShapeError
 
 
 @dataclass(frozen=True)
@@ -23,18 +23,36 @@ def sample_gradients(losses: Iterable[Tensor], parameters: Sequence[Tensor]) -> 
     Args: losses: scalars, S of them; a generator makes each when it is needed. parameters: leaves that ask for
       gradients, of any shapes.
     Returns: SampleGradients, float64.
-    Raises: GradientError when a loss does not depend on any of the parameters.
+    Raises: GradientError when a loss does not depend on any of the parameters, or shares its graph with another;
+      DomainError, ShapeError for samples that are no scalar tensors, or none.
     """
+    if isinstance(losses, Tensor) or not isinstance(losses, Iterable):
+        raise DomainError(
+            f"samples are one {type(losses).__name__}; give a list or generator of scalar losses."
+        )
     values = []
     rows = []
     for loss in losses:
+        if not isinstance(loss, Tensor) or loss.numel() != 1:
+            given = tuple(loss.shape) if isinstance(loss, Tensor) else type(loss).__name__
+            raise ShapeError(f"a sample's loss is {given}; give one number as a tensor, such as a mean.")
         if not loss.requires_grad:
             raise GradientError("a sample's loss has no gradient; the graph is cut before the objective.")
-        grads = torch.autograd.grad(loss, list(parameters), allow_unused=True)
+        try:
+            grads = torch.autograd.grad(loss, list(parameters), allow_unused=True)
+        except RuntimeError as error:
+            if "second time" not in str(error):
+                raise
+            raise GradientError(
+                "the samples share a graph, which the first of them used up; make each by a pass of its own (a "
+                "generator), or add them up to one loss."
+            ) from error
         if all(g is None for g in grads):
             raise GradientError("a sample's loss does not depend on any parameter that is optimised.")
         values.append(float(loss.detach()))
         rows.append(torch.cat([_flat(g, p) for g, p in zip(grads, parameters, strict=True)]))
+    if not rows:
+        raise DomainError("there are no samples in this step; give at least one loss.")
     return SampleGradients(torch.tensor(values, dtype=torch.float64), torch.stack(rows))
 
 

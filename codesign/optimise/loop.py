@@ -70,6 +70,10 @@ class Loop:
                 f"loop: clip {clip} must be above 0 (or None), judge_every {judge_every} at least 1, shrink "
                 f"{shrink} above 0 and at most 1, patience {patience} at least 0 (or None)."
             )
+        if not callable(samples):
+            raise DomainError(
+                f"loop: samples is a {type(samples).__name__}; give a function of the step's number."
+            )
         self.optimiser = optimiser
         self.samples = samples
         self.clip = clip
@@ -135,6 +139,12 @@ class Loop:
         found = self.samples(self.step_number)
         if not isinstance(found, SampleGradients):
             found = sample_gradients(found, self.parameters)
+        count = sum(p.numel() for p in self.parameters)
+        if found.gradients.shape != (found.values.numel(), count) or not len(found.gradients):
+            raise ShapeError(
+                f"the samples have gradients of shape {tuple(found.gradients.shape)}; [S, {count}] is needed, S of them "
+                f"for {found.values.numel()} values, at least one."
+            )
         if not bool(found.values.isfinite().all() and found.gradients.isfinite().all()):
             raise NonFiniteError("a sample's loss or its gradient is infinite or NaN.")
         assign(self.parameters, self._clipped(found.gradients))
@@ -193,18 +203,24 @@ class Loop:
             "shrunk": self._shrunk,
             "worse": self._worse,
             "record": vars(self.record),
+            "optimiser": type(self.optimiser).__name__,
         }
         for i, parameter in enumerate(self.parameters):
             for name, value in self.optimiser.state.get(parameter, {}).items():
                 if torch.is_tensor(value):
                     tensors[f"optimiser_{i}_{name}"] = value
+                elif value is not None:
+                    raise DomainError(
+                        f"{type(self.optimiser).__name__} keeps '{name}', which is no tensor and cannot be stored; "
+                        "choose another optimiser, or do not save."
+                    )
         return tensors, numbers
 
     @torch.no_grad()
     def resume(self, tensors: dict[str, Tensor], numbers: dict[str, Any]) -> "Loop":
         """Go on from ``state()``; the same steps follow as without the break.
 
-        Raises: ShapeError when the state is of other parameters.
+        Raises: ShapeError when the state is of other parameters; DomainError when it is of another optimiser.
         """
         shapes = [
             tuple(tensors[f"now_{i}"].shape) for i in range(len(self.parameters)) if f"now_{i}" in tensors
@@ -213,6 +229,11 @@ class Loop:
             raise ShapeError(
                 f"the state has parameters of shapes {shapes}, this loop {[tuple(p.shape) for p in self.parameters]}; "
                 "give the state of the same problem."
+            )
+        kind = type(self.optimiser).__name__
+        if numbers.get("optimiser", kind) != kind:
+            raise DomainError(
+                f"the state is of the optimiser {numbers['optimiser']}, this loop has {kind}; go on with the same one."
             )
         self._go([tensors[f"now_{i}"] for i in range(len(self.parameters))])
         self.best = [tensors[f"best_{i}"].to(p).clone() for i, p in enumerate(self.parameters)]
@@ -225,9 +246,9 @@ class Loop:
             if name.startswith("optimiser_"):
                 _, index, entry = name.split("_", 2)
                 parameter = self.parameters[int(index)]
-                self.optimiser.state[parameter][entry] = (
-                    value.clone() if entry == "step" else value.to(parameter)
-                )
+                # numbers such as NAdam's product of momenta have a dtype of their own, and stay on the CPU
+                own = value.clone() if value.ndim == 0 else value.to(parameter)
+                self.optimiser.state[parameter][entry] = own
         return self
 
 

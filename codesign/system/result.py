@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from codesign.errors import DomainError, NonFiniteError, ShapeError
+from codesign.system.contents import tensors_in
 from codesign.types import EventVolume, FlowField, Rays
 
 JUNCTIONS = ("lens", "pose", "rays", "frames", "events", "flow", "estimate")
@@ -30,7 +31,8 @@ class Result:
 
     objectives: name -> tensor, as the objective returned it. field: what the flow stage returned. estimate: what
       the stage behind it returned; None without one. camera: with the lens as it was. T_world_cam: [..., T,
-      4, 4]. junctions: name -> tensors, whose .grad is kept; None unless the pass was probed.
+      4, 4]. junctions: name -> tensors, whose .grad is kept; None unless the pass was probed. check_passes: time of
+      ``check`` over that of its pass alone; None elsewhere.
     """
 
     objectives: dict[str, Tensor]
@@ -39,6 +41,7 @@ class Result:
     camera: Any
     T_world_cam: Tensor | None
     junctions: dict[str, tuple[Tensor, ...]] | None
+    check_passes: float | None = None
 
     @property
     def loss(self) -> Tensor:
@@ -117,7 +120,7 @@ def tensors_of(junction: str, value: Any) -> tuple[Tensor, ...]:
         return (value.counts,)
     if isinstance(value, FlowField):
         return (value.flow_px,)
-    return (value,) if torch.is_tensor(value) else ()
+    return tuple(tensor for tensor in tensors_in(value) if tensor.is_floating_point())
 
 
 def probe(junction: str, value: Any) -> tuple[Tensor, ...]:

@@ -1,5 +1,6 @@
 """One pass of a system: each stage runs when what it makes is first asked for."""
 
+from collections import ChainMap
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -9,9 +10,12 @@ from torch import Tensor
 from codesign import events as event_stage
 from codesign import render as render_stage
 from codesign.errors import DomainError, ShapeError
+from codesign.events.entry import check_times
 from codesign.system.batch import check_batch, scenes_of
+from codesign.system.contents import tensors_in
+from codesign.system.layout import check_layout, look_at, look_at_times
 from codesign.system.result import JUNCTIONS, RECORDABLE, Result, probe
-from codesign.system.stage import Stage, event_call
+from codesign.system.stage import Stage, event_call, label, modules_of
 from codesign.types import EventVolume, FlowField, Rays
 
 
@@ -30,12 +34,26 @@ class Pass(Mapping[str, Any]):
             raise DomainError(
                 f"the batch is a {type(batch).__name__} without '{missing[0]}'; give a system.Batch."
             )
-        t_s = torch.as_tensor(batch.t_s, dtype=torch.float64)
-        self.made: dict[str, Any] = {"batch": batch, "t_s": t_s}
+        self.asked: dict[str, tuple[str, ...]] = {}
+        self.samples: int | None = None
+        self.making: list[str] = []
+        self.made: dict[str, Any] = {"batch": batch, "t_s": check_times(batch.t_s)}
+        if probed:
+            look_at_times(self["t_s"])
 
     def __getitem__(self, name: str) -> Any:
-        if name not in self.made:
+        if name in self.made:
+            return self.made[name]
+        if name in self.making:
+            circle = " needs ".join(f"'{each}'" for each in (*self.making[self.making.index(name) :], name))
+            raise DomainError(
+                f"the stages go in a circle: {circle}; a stage may ask for what comes before it."
+            )
+        self.making.append(name)
+        try:
             self.made[name] = getattr(self, f"_{name}")()
+        finally:
+            self.making.remove(name)
         return self.made[name]
 
     def __iter__(self):
@@ -58,11 +76,40 @@ class Pass(Mapping[str, Any]):
             raise DomainError(f"objective '{name}' returned a {type(value).__name__}; return a tensor.")
         return value
 
-    def _call(self, name, part, *inputs):
-        return Stage(name, part, len(inputs))(self, *inputs)
+    def _call(self, name, part, *inputs, **instead):
+        stage = Stage(name, part)
+        has = ChainMap(instead, self)  # pyright: ignore[reportArgumentType] - read alone
+        self.asked[name] = stage.asked if stage.input is None else (stage.input, *stage.asked)
+        if self.junctions is None:
+            return stage(has, *inputs)
+        batch = self["batch"]
+        given = {each: has[each] for each in stage.asked} | self.made | {"inputs": inputs, "scene": None}
+        given |= {"batch": (batch.T_world_body, batch.t_s, getattr(batch, "truth", None))}
+        before = [(each, t, t.detach().clone()) for each, value in given.items() for t in tensors_in(value)]
+        found = stage(has, *inputs)
+        changed = [each for each, tensor, copy in before if not torch.equal(tensor, copy)]
+        if changed:
+            raise DomainError(
+                f"stage '{name}' ({label(part)}) changes '{changed[0]}' in place, which others read too; work on a "
+                "copy: .clone() (and no inplace=True in its first layer)."
+            )
+        return found
 
-    def _at(self, junction: str, make: Callable[[], Any]) -> Any:
+    def _by(self, junction: str, stage: str) -> str:
+        """Subject and verb of a sentence about what stands at a junction."""
+        part = getattr(self.system, stage)
+        own = "" if part is None or junction == "rays" else f" ({label(part)})"
+        return (
+            f"junction '{junction}' holds" if junction in self.recorded else f"stage '{stage}'{own} returned"
+        )
+
+    def _looked_at(self, junction: str) -> bool:
+        """Whether values are read: where they are probed, and of recordings."""
+        return self.junctions is not None or junction in self.recorded
+
+    def _at(self, junction: str, make: Callable[[], Any], check: Callable[[Any], None]) -> Any:
         value = self.recorded[junction] if junction in self.recorded else make()
+        check(value)
         if self.junctions is not None:
             self.junctions[junction] = probe(junction, value)
         return value
@@ -98,86 +145,113 @@ class Pass(Mapping[str, Any]):
         if self.system.mount is None:
             return torch.eye(4, dtype=torch.float64)
         pose = self._call("mount", self.system.mount)
-        if not torch.is_tensor(pose) or pose.shape[-2:] != (4, 4):
-            given = tuple(pose.shape) if torch.is_tensor(pose) else type(pose).__name__
-            raise ShapeError(f"stage 'mount' returned {given}; T_body_cam [..., 4, 4] is needed.")
+        check_layout("stage 'mount' returned poses", pose, Tensor, ("...", 4, 4))
         return pose
 
     def _T_world_body(self):
         trajectory = self.system.trajectory
         check_batch(self["batch"], self["scene"], trajectory is not None)
         poses = self["batch"].T_world_body
-        return self._call("trajectory", trajectory) if poses is None else poses
+        if poses is None:
+            poses = self._call("trajectory", trajectory)
+            check_layout(
+                "stage 'trajectory' returned", poses, Tensor, ("...", "T", 4, 4), T=self["t_s"].numel()
+            )
+        return poses
 
     def _T_world_cam(self):
         poses = self["T_world_body"]
         if self.system.mount is not None:
-            poses = poses @ self["T_body_cam"][..., None, :, :].to(poses)
+            mounted = self["T_body_cam"][..., None, :, :].to(poses)
+            try:
+                torch.broadcast_shapes(poses.shape, mounted.shape)
+            except RuntimeError:
+                raise ShapeError(
+                    f"stage 'mount' returned poses of shape {tuple(self['T_body_cam'].shape)}, which do not go with "
+                    f"those of the body, {tuple(poses.shape)}; give one for all, [4, 4], or one per trajectory."
+                ) from None
+            poses = poses @ mounted
         if self.junctions is not None:
             self.junctions["pose"] = probe("pose", poses)
         return poses
 
     def _rays(self) -> Rays:
-        return self._at("rays", lambda: self["camera"].rays())
+        by = self._by("rays", "camera")
+        return self._at("rays", lambda: self["camera"].rays(), lambda rays: check_layout(by, rays, Rays))
 
     def _frames(self):
-        return self._at("frames", self._rendered)
+        return self._at("frames", self._rendered, self._check_frames)
+
+    def _check_frames(self, frames):
+        film = tuple(self["camera"].film.shape)
+        axes = ("...", "T", "windows", "H", "W") if len(film) == 3 else ("...", "T", "H", "W")
+        by = self._by("frames", "render")
+        check_layout(
+            by, frames, Tensor, axes, T=self["t_s"].numel(), **dict(zip(axes[2:], film, strict=True))
+        )
+        self._check_count(
+            "frames", frames.shape[: -1 - len(film)].numel() * (film[0] if len(film) == 3 else 1)
+        )
+        if self._looked_at("frames"):
+            look_at(by, frames)
 
     def _rendered(self):
         scene = self["scene"]
         poses = self["T_world_cam"]
         if self.system.render is None:
             way = self.system.gradient
+            self.asked["render"] = ("camera", "rays", "T_world_cam")
             rays = self["rays"] if way in render_stage.sequence.PROVEN or "rays" in self.recorded else None
             return render_stage.frames(self["camera"], scene, poses, way, rays=rays)
-        stage = Stage("render", self.system.render, 0)
-        asked = {name: self[name] for name in stage.asked if name not in ("scene", "T_world_cam")}
-        parts = [stage({**asked, "scene": one, "T_world_cam": its}) for one, its in scenes_of(scene, poses)]
+        pairs = scenes_of(scene, poses)
+        parts = [self._call("render", self.system.render, scene=one, T_world_cam=its) for one, its in pairs]
+        for part in parts[1:]:
+            check_layout(
+                "stage 'render' returned frames", part, Tensor, tuple(getattr(parts[0], "shape", ()))
+            )
         return torch.stack(parts) if isinstance(scene, (tuple, list)) else parts[0]
 
     def _volume(self) -> EventVolume:
-        volume = self._at("events", self._events)
-        if not isinstance(volume, EventVolume):
-            raise DomainError(
-                f"junction 'events' holds a {type(volume).__name__}; an EventVolume is needed (events.from_counts, "
-                "events.from_stream)."
-            )
-        self._check_count("events", volume.counts)
-        built = getattr(self.system.flow, "config", None)
-        wanted = (
-            built.get("bins", volume.counts.shape[2]) if isinstance(built, dict) else volume.counts.shape[2]
-        )
-        if volume.counts.shape[2] != wanted:
+        return self._at("events", self._events, self._check_volume)
+
+    def _check_volume(self, volume):
+        by = self._by("events", "events")
+        height, width = self["camera"].film.shape[-2:]
+        check_layout(by, volume, EventVolume, H=height, W=width)
+        self._check_count("events", volume.counts.shape[0])
+        if self._looked_at("events"):
+            look_at(by, volume)
+        wanted = built_bins(self.system.flow)
+        if wanted is not None and volume.counts.shape[2] != wanted:
             raise ShapeError(
-                f"stage 'flow' ({type(self.system.flow).__name__}) was built for {wanted} time bins, stage 'events' "
+                f"stage 'flow' ({label(self.system.flow)}) was built for {wanted} time bins, stage 'events' "
                 f"made {volume.counts.shape[2]}; give the one as many as the other."
             )
-        return volume
 
     def _events(self):
         found = self._call("events", event_call(self.system.events), self._samples(self["frames"]))
         if not torch.is_tensor(found):
             return found
         count = self["t_s"].numel() - 1
-        if found.ndim != 5 or found.shape[1:3] != (count, 2):
-            raise ShapeError(
-                f"stage 'events' returned counts of shape {tuple(found.shape)}; [N, {count}, 2, H, W] is needed "
-                "behind these frames, or an EventVolume."
-            )
+        height, width = self["camera"].film.shape[-2:]
+        check_layout(
+            "stage 'events' returned counts", found, Tensor, ("N", count, 2, "H", "W"), H=height, W=width
+        )
         return event_stage.from_counts(found.permute(1, 2, 0, 3, 4), self["t_s"], self.system.bins)
 
-    def _check_count(self, what, tensor):
+    def _check_count(self, what: str, given: int) -> None:
         """Raise ShapeError when a junction holds other than one sample per trajectory and window."""
-        if "T_world_cam" not in self.made and self["batch"].T_world_body is None:
-            return  # recorded without poses: nothing to compare with
-        film = self["camera"].film.shape
-        windows = film[0] if len(film) == 3 else 1
-        wanted = self["T_world_cam"].shape[:-3].numel() * windows
-        if tensor.shape[0] != wanted:
+        if "T_world_cam" in self.made or self["batch"].T_world_body is not None:
+            film = self["camera"].film.shape
+            windows = film[0] if len(film) == 3 else 1
+            self.samples = self["T_world_cam"].shape[:-3].numel() * windows
+        wanted = given if self.samples is None else self.samples
+        if given != wanted:
             raise ShapeError(
-                f"'{what}' holds {tensor.shape[0]} sample(s) and the batch has {wanted} (trajectories times windows "
+                f"'{what}' holds {given} sample(s) and the batch has {wanted} (trajectories times windows "
                 "of the film); give one for each."
             )
+        self.samples = given
 
     def _samples(self, image: Tensor, channels: int = 0) -> Tensor:
         """[..., T, channels, *film.shape] as [N, T, channels, H, W]: trajectories times windows first."""
@@ -187,26 +261,43 @@ class Pass(Mapping[str, Any]):
         return flat if len(film) == 2 else flat.movedim(-3, 1).flatten(0, 1)
 
     def _field(self):
-        field = self._at("flow", lambda: self._call("flow", self.system.flow, self["volume"]))
+        return self._at(
+            "flow", lambda: self._call("flow", self.system.flow, self["volume"]), self._check_field
+        )
+
+    def _check_field(self, field):
         if isinstance(field, FlowField):
-            self._check_count("flow", field.flow_px)
-        return field
+            height, width = self["camera"].film.shape[-2:]
+            check_layout(self._by("flow", "flow"), field, FlowField, H=height, W=width)
+            self._check_count("flow", field.flow_px.shape[0])
 
     def _estimate(self):
         if self.system.estimate is None and "estimate" not in self.recorded:
             raise DomainError("the system has no stage 'estimate'; give estimate=.")
-        return self._at("estimate", lambda: self._call("estimate", self.system.estimate, self["field"]))
+        made = lambda: self._call("estimate", self.system.estimate, self["field"])  # noqa: E731
+        return self._at("estimate", made, lambda value: None)
 
     def _truth(self) -> FlowField:
         """True flow over the whole interval through the camera's lens, [N, 2, H, W], in float64."""
         recorded = getattr(self["batch"], "truth", None)
         if recorded is not None:
-            self._check_count("truth", recorded.flow_px)
+            height, width = self["camera"].film.shape[-2:]
+            check_layout("the batch's truth has", recorded, FlowField, H=height, W=width)
+            self._check_count("truth", recorded.flow_px.shape[0])
             return recorded
         last = self["t_s"].numel() - 1
         flow, valid = render_stage.true_flow(self["camera"], self["scene"], self["T_world_cam"], stride=last)
         interval_s = float(self["t_s"][-1] - self["t_s"][0])
         return FlowField(self._samples(flow, 1)[:, 0], self._samples(valid)[:, 0], interval_s)
+
+
+def built_bins(flow: Any) -> int | None:
+    """Time bins that an estimator says it was built for (``config``); None where it says nothing."""
+    for part in (flow, *modules_of(getattr(flow, "call", flow))):
+        built = getattr(part, "config", None)
+        if isinstance(built, dict) and built.get("bins") is not None:
+            return built["bins"]
+    return None
 
 
 def _order(item: tuple[str, Any]) -> int:

@@ -10,12 +10,12 @@ from codesign import render as render_stage
 from codesign.errors import DomainError
 from codesign.system.batch import Batch
 from codesign.system.result import Result
-from codesign.system.run import Pass
-from codesign.system.stage import Stage, event_call
+from codesign.system.run import Pass, built_bins
+from codesign.system.stage import Stage, event_call, label, modules_of, registrable
 
 BINS = 5  # time bins where neither the estimator nor the user says
-# the parts, and how many inputs each takes by position
-PARTS = {"camera": 0, "mount": 0, "trajectory": 0, "render": 0, "events": 1, "flow": 1, "estimate": 1}
+PARTS = ("camera", "mount", "trajectory", "render", "events", "flow", "estimate")
+_ALSO = ("lens", "objectives", "named_objectives", "gradient", "scene", "bins", "training")
 
 
 class System(nn.Module):
@@ -74,12 +74,6 @@ class System(nn.Module):
         bins: int | None = None,
     ):
         super().__init__()
-        if not isinstance(objectives, Mapping) or not objectives:
-            raise DomainError("a system needs at least one objective; give objectives={'name': function}.")
-        if gradient not in render_stage.sequence.WAYS:
-            raise DomainError(
-                f"gradient = {gradient!r} is not known; choose one of {', '.join(render_stage.sequence.WAYS)}."
-            )
         self.gradient: render_stage.sequence.Way = gradient
         self.scene = scene
         self.camera = camera
@@ -90,28 +84,47 @@ class System(nn.Module):
         self.flow = flow
         self.estimate = estimate
         self.bins = _bins(flow, bins)
-        self.named_objectives = dict(objectives)
-        modules = [part for part in objectives.values() if isinstance(part, nn.Module)]
-        self.objectives = nn.ModuleList(modules)  # their parameters are the system's too
-        for name, part in objectives.items():
-            if "estimate" in Stage(f"objective {name}", part, 0).asked and estimate is None:
-                raise DomainError(
-                    f"objective '{name}' asks for 'estimate', but the system has no such stage; give estimate=."
-                )
+        self.objectives: Any = objectives
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Parts can be exchanged; a camera brings its lens."""
-        if name == "camera" and hasattr(value, "rays"):
+        """Parts can be exchanged; a camera brings its lens, objectives their Modules."""
+        if type(self) is System and name not in (*PARTS, *_ALSO) and not name.startswith("_"):
+            raise _unknown(name, (*PARTS, *_ALSO))
+        if name == "objectives":
+            self.named_objectives = self._checked(value)
+            held = [module for part in self.named_objectives.values() for module in modules_of(part)]
+            value = nn.ModuleList(dict.fromkeys(held))  # their parameters are the system's too
+        elif name == "gradient" and value not in render_stage.sequence.WAYS:
+            raise DomainError(
+                f"gradient = {value!r} is not known; choose one of {', '.join(render_stage.sequence.WAYS)}."
+            )
+        elif name == "camera" and hasattr(value, "rays"):
+            self.__dict__.pop("lens", None)
             super().__setattr__("lens", value.lens)
         elif name in PARTS and value is not None:
             if hasattr(value, "camera_rays"):
                 raise DomainError(
                     f"stage '{name}' is a lens; put it into a camera: render.Camera(lens, ...)."
                 )
-            Stage(
-                name, event_call(value) if name == "events" else value, PARTS[name]
-            )  # refuses what it cannot call
+            called = event_call(value) if name == "events" else value
+            Stage(name, called)  # refuses what it cannot call
+            owner = getattr(value, "__self__", None)
+            of_layer = name == "events" and isinstance(owner, nn.Module) and value == event_call(owner)
+            value = owner if of_layer else registrable(value)
+        if name in (*PARTS, "lens"):  # a Module in the place of a function, or the other way round
+            self.__dict__.pop(name, None)
+            self._modules.pop(name, None)
         super().__setattr__(name, value)  # pyright: ignore[reportArgumentType] - None and functions are parts too
+
+    def _checked(self, objectives: Any) -> dict[str, Callable[..., Tensor]]:
+        if not isinstance(objectives, Mapping) or not objectives:
+            raise DomainError("a system needs at least one objective; give objectives={'name': function}.")
+        for name, part in objectives.items():
+            if "estimate" in Stage(f"objective {name}", part).asked and self.estimate is None:
+                raise DomainError(
+                    f"objective '{name}' asks for 'estimate', but the system has no such stage; give estimate=."
+                )
+        return dict(objectives)
 
     def forward(
         self,
@@ -132,17 +145,21 @@ class System(nn.Module):
         Raises: DomainError for names that are not there; ShapeError where batch or stages do not fit;
           NonFiniteError naming the junction, when probed.
         """
+        run = self.begin(batch, recorded, probe)
+        return run.result({name: run.objective(name) for name in self.chosen(objectives)})
+
+    def chosen(self, objectives: tuple[str, ...] | None) -> tuple[str, ...]:
+        """Names of the objectives in use, all for None. Raises: DomainError for names that are not there."""
         chosen = tuple(self.named_objectives) if objectives is None else objectives
         unknown = [name for name in chosen if name not in self.named_objectives]
         if unknown or not chosen:
             asked = f"objective '{unknown[0]}'" if unknown else "objective at all"
             raise DomainError(f"there is no {asked}; there are {', '.join(self.named_objectives)}.")
-        run = Pass(self, batch, dict(recorded or {}), probe)
-        return run.result({name: run.objective(name) for name in chosen})
+        return chosen
 
-    def begin(self, batch: Batch, recorded: Mapping[str, Any] | None = None) -> "Pass":
+    def begin(self, batch: Batch, recorded: Mapping[str, Any] | None = None, probe: bool = False) -> "Pass":
         """A pass to read from by name (``["frames"]``, ``["volume"]``, ...); each stage runs when it is asked for."""
-        return Pass(self, batch, dict(recorded or {}), False)
+        return Pass(self, batch, dict(recorded or {}), probe)
 
     def replaced(self, **parts: Any) -> "System":
         """The same system with other parts, for example the hard sensor for ``events``; what stays is shared."""
@@ -150,21 +167,24 @@ class System(nn.Module):
         now["objectives"] = self.named_objectives
         unknown = [name for name in parts if name not in now]
         if unknown:
-            near = difflib.get_close_matches(unknown[0], now, n=1)
-            meant = f", did you mean '{near[0]}'?" if near else ";"
-            raise DomainError(f"a system has no part '{unknown[0]}'{meant} it has {', '.join(now)}.")
+            raise _unknown(unknown[0], tuple(now))
         if "flow" in parts and "bins" not in parts:
             now["bins"] = None  # those of the new estimator
         return System(**{**now, **parts})
 
 
+def _unknown(name: str, known: tuple[str, ...]) -> DomainError:
+    near = difflib.get_close_matches(name, known, n=1)
+    meant = f", did you mean '{near[0]}'?" if near else ";"
+    return DomainError(f"a system has no part '{name}'{meant} it has {', '.join(known)}.")
+
+
 def _bins(flow: Any, bins: int | None) -> int:
     """Time bins of the volume. Raises: DomainError when the estimator was built for others."""
-    built = getattr(flow, "config", None)
-    wanted = built.get("bins") if isinstance(built, dict) else None
+    wanted = built_bins(flow)
     if bins is not None and wanted is not None and bins != wanted:
         raise DomainError(
-            f"stage 'flow' ({type(flow).__name__}) was built for {wanted} time bins and the system makes {bins}; "
+            f"stage 'flow' ({label(flow)}) was built for {wanted} time bins and the system makes {bins}; "
             f"give bins={wanted} or leave bins out."
         )
     found = next((n for n in (bins, wanted) if n is not None), BINS)

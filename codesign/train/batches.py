@@ -5,13 +5,13 @@ A source has ``batch(indices) -> FlowWindows``; its sample i depends on i and th
 with an end have ``__len__`` too.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
 
+from codesign.system.contents import mapped
 from codesign.types import EventVolume, FlowField, FlowWindows
 
 GOLDEN = 0.6180339887498949
@@ -202,18 +202,7 @@ def probe(source: Source) -> Any:
 
 def to_device(value: Any, device: torch.device) -> Any:
     """A batch on a device: tensors inside dataclasses, tuples, lists and dictionaries are moved."""
-    if isinstance(value, torch.Tensor):
-        return value.to(device)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = (field.name for field in dataclasses.fields(value))
-        return dataclasses.replace(
-            value, **{name: to_device(getattr(value, name), device) for name in fields}
-        )
-    if isinstance(value, list | tuple) and type(value) in (list, tuple):
-        return type(value)(to_device(each, device) for each in value)
-    if isinstance(value, dict):
-        return {name: to_device(each, device) for name, each in value.items()}
-    return value
+    return mapped(value, lambda tensor: tensor.to(device))
 
 
 def without_truth(batch: Any) -> int:

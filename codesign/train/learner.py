@@ -185,6 +185,7 @@ class Learner:
             found["best/score"] = torch.tensor(self.best.score, dtype=torch.float64)
             found["best/step"] = torch.tensor(self.best.step)
         found["steps"] = torch.tensor(self.steps)
+        found["kind"] = torch.tensor(list(type(self.optimiser).__name__.encode()), dtype=torch.uint8)
         return found
 
     def load_state_dict(self, tensors: dict[str, Tensor], path: Any = "the state") -> None:
@@ -192,6 +193,12 @@ class Learner:
 
         Raises: FileFormatError when it is not of this network and optimiser.
         """
+        kind = type(self.optimiser).__name__
+        stored = bytes(tensors["kind"].tolist()).decode(errors="replace") if "kind" in tensors else kind
+        if stored != kind:
+            raise FileFormatError(
+                f"'{path}' is of the optimiser {stored}, this run has {kind}; go on with the same one."
+            )
         parts: dict[str, dict[str, Tensor]] = {"weights": {}, "average": {}, "optimiser": {}, "best": {}}
         for name, tensor in tensors.items():
             kind, _, rest = name.partition("/")
@@ -257,6 +264,10 @@ class Learner:
                 )
         state = {index: held[name] for index, name in enumerate(self._names) if name in held}
         self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": state})
+        moved = [parameter for group in self.optimiser.param_groups for parameter in group["params"]]
+        for index, moments in state.items():  # numbers keep their dtype, which torch takes from the weights
+            numbers = {name: value.clone() for name, value in moments.items() if value.ndim == 0}
+            self.optimiser.state[moved[index]].update(numbers)
 
 
 def _names(network, optimiser):

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import nn
 
-from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
-from codesign.optimise import Descent, Loop, clipped_mean, sample_gradients
+from codesign.errors import CodesignError, DomainError, GradientError, NonFiniteError, ShapeError
+from codesign.optimise import Descent, Loop, SampleGradients, clipped_mean, sample_gradients
 
 GOAL = torch.tensor([2.0, -1.0], dtype=torch.float64)
 
@@ -103,7 +103,15 @@ def test_a_worse_score_goes_back_to_the_best_with_smaller_steps():
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize("optimiser", [lambda p: Descent(p, 0.3), lambda p: torch.optim.Adam(p, lr=0.2)])
+@pytest.mark.parametrize(
+    "optimiser",
+    [
+        lambda p: Descent(p, 0.3),
+        lambda p: torch.optim.Adam(p, lr=0.2),
+        lambda p: torch.optim.NAdam(p, lr=0.2),  # keeps float32 numbers beside float64 moments
+        lambda p: torch.optim.ASGD(p, lr=0.2),
+    ],
+)
 def test_resumed_equals_uninterrupted(optimiser):
     # element-wise operations on two numbers, so the same bits by construction
     whole = noisy_loop(optimiser=optimiser)[1]
@@ -175,3 +183,31 @@ def test_what_cannot_be_optimised_is_refused_before_the_first_step():
         Loop(torch.optim.LBFGS([y]), lambda step: [])
     with pytest.raises(DomainError, match="patience -1 at least 0"):
         Loop(torch.optim.SGD([y], lr=1.0), lambda step: [], patience=-1)
+
+
+x = nn.Parameter(torch.zeros(2, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("samples", "said"),
+    [
+        (lambda step: [], "no samples in this step"),
+        (lambda step: x.sum(), "samples are one Tensor"),
+        (lambda step: 1.0, "samples are one float"),
+        (lambda step: [1.0], "a sample's loss is float"),
+        (lambda step: [2 * x], r"a sample's loss is \(2,\)"),
+        (lambda step: (lambda y: [y.sum(), y.sum()])(x.exp()), "share a graph"),
+        (lambda step: SampleGradients(torch.zeros(3), torch.zeros(3, 5)), r"shape \(3, 5\); \[S, 2\]"),
+        ([1.0], "samples is a list; give a function"),
+    ],
+)
+def test_bad_samples_get_a_sentence(samples, said):
+    with pytest.raises(CodesignError, match=said):
+        Loop(torch.optim.SGD([x], lr=1.0), samples).run(1)
+
+
+def test_a_state_of_another_optimiser_is_refused():
+    first = noisy_loop(optimiser=lambda p: torch.optim.Adam(p, lr=0.2))[1]
+    first.run(2)
+    with pytest.raises(DomainError, match="of the optimiser Adam, this loop has NAdam"):
+        noisy_loop(optimiser=lambda p: torch.optim.NAdam(p, lr=0.2))[1].resume(*first.state())

@@ -48,15 +48,23 @@ class ToyCamera:
 
 
 def volume_of(frames):
-    return EventVolume(frames.reshape(1, 1, 1, 1, 1), torch.zeros(1), ONE)
+    """The first frame as ON events in one bin; no OFF."""
+    on = frames.reshape(-1, 2, 1, 1)[:, :1, None]
+    return EventVolume(torch.cat([on, torch.zeros_like(on)], 1), torch.zeros(1), ONE)
 
 
 def field_of(flow):
-    return FlowField(flow, torch.ones(1, 1, 1, dtype=torch.bool), 1.0)
+    """Flow along x."""
+    return FlowField(torch.cat([flow, torch.zeros_like(flow)], 1), torch.ones(1, 1, 1, dtype=torch.bool), 1.0)
+
+
+def both(value):
+    """Two equal frames of one pixel, [2, 1, 1]."""
+    return value.reshape(1, 1, 1).expand(2, 1, 1)
 
 
 def render_sum(rays):
-    return rays.direction.sum(1).reshape(1, 1, 1)
+    return both(rays.direction.sum())
 
 
 def doubled(frames):
@@ -64,7 +72,7 @@ def doubled(frames):
 
 
 def tripled(volume):
-    return field_of(3 * volume.counts[:, 0])
+    return field_of(3 * volume.counts[:, :1, 0])
 
 
 def square(field):
@@ -90,7 +98,7 @@ def test_gradient_at_every_junction_is_that_of_the_algebra():
 
 
 def test_table_counts_zero_gradients():
-    result = toy(render=lambda rays: rays.direction[:, 0].reshape(1, 1, 1))(BATCH, probe=True)
+    result = toy(render=lambda rays: both(rays.direction[:, 0]))(BATCH, probe=True)
     result.backward()
     row = next(r for r in result.table() if r["junction"] == "rays")
     assert row["gradient_norm"] == pytest.approx(36.0)
@@ -131,8 +139,8 @@ def test_several_objectives_share_one_pass_and_add_up_by_weight():
 @pytest.mark.parametrize(
     ("name", "value", "loss"),
     [
-        ("frames", torch.ones(1, 1, 1), 36.0),
-        ("events", EventVolume(torch.ones(1, 1, 1, 1, 1), torch.zeros(1), ONE), 9.0),
+        ("frames", torch.ones(1, 2, 1, 1), 36.0),
+        ("events", volume_of(torch.ones(2)), 9.0),
         ("flow", field_of(torch.full((1, 1, 1, 1), 2.0)), 4.0),
     ],
 )
@@ -159,7 +167,7 @@ def test_a_bad_gradient_is_named_by_its_junction():
     # sqrt(|x|) at 0 has a finite value and an infinite slope: the frames are the first junction from the loss
     # back to see it
     system = toy(
-        render=lambda rays: rays.direction[:, 1].reshape(1, 1, 1),
+        render=lambda rays: both(rays.direction[:, 1]),
         events=lambda frames: volume_of(frames.abs().sqrt()),
         objectives={"sum": lambda field: field.flow_px.sum()},
     )
@@ -179,14 +187,6 @@ def test_a_stage_gets_what_its_signature_names():
     assert seen["camera"].seed == 5
     assert seen["theta"] == 0.2
     torch.testing.assert_close(seen["draw"], torch.rand(3, generator=torch.Generator().manual_seed(5)))
-
-
-def test_a_stage_that_asks_for_what_is_not_there_is_refused_at_once():
-    with pytest.raises(
-        DomainError,
-        match="stage 'events' asks for 'theta', which a system does not have; it has batch, camera",
-    ):
-        toy(events=lambda frames, theta: frames)
 
 
 def test_parameters_of_every_part_are_the_systems():
@@ -227,13 +227,6 @@ def test_estimator_and_bins_must_fit():
         DomainError, match=r"stage 'flow' \(Network\) was built for 5 time bins and the system makes 9"
     ):
         toy(flow=Network(), bins=9)
-
-
-def test_counts_of_the_event_stage_must_belong_to_the_frames():
-    with pytest.raises(
-        ShapeError, match=r"stage 'events' returned counts of shape \(1, 3, 2, 1, 1\); \[N, 1, 2, H, W\]"
-    ):
-        toy(events=lambda frames: torch.zeros(1, 3, 2, 1, 1))(BATCH)
 
 
 @pytest.mark.parametrize(
@@ -281,7 +274,7 @@ def test_windows_of_a_film_become_samples():
         seen.append(frames[..., 0, 0])
         return frames[:, 1:, None].expand(-1, -1, 2, -1, -1)
 
-    toy(camera=camera, render=render, events=events, bins=1)(Batch(poses, T_S, "wall"))
+    toy(camera=camera, render=render, events=events, bins=1).begin(Batch(poses, T_S, "wall"))["volume"]
     assert seen[0].tolist() == [[0, 10], [1, 11], [2, 12], [100, 110], [101, 111], [102, 112]]
 
 
@@ -304,12 +297,6 @@ def test_check_finds_a_frozen_variable_one_that_no_objective_sees_and_a_cut_grap
         GradientError, match=r"variable 'lens.efl_mm' is frozen but was handed to the optimiser"
     ):
         check(system, BATCH, [lens.efl_mm])
-
-
-def test_check_wants_scalars():
-    system = toy(objectives={"each": lambda field: field.flow_px.reshape(1, 1).expand(2, 1)})
-    with pytest.raises(ShapeError, match=r"objective 'each' has shape \(2, 1\); reduce it to one number"):
-        check(system, BATCH)
 
 
 def test_a_copy_is_independent_and_whole():
@@ -339,25 +326,11 @@ def test_parts_can_be_exchanged_in_place_and_are_looked_at():
         system.replaced(event=doubled)
 
 
-def test_samples_that_are_not_those_of_the_batch_are_refused():
-    poses = torch.eye(4, dtype=torch.float64).expand(3, 2, 4, 4)
-    with pytest.raises(ShapeError, match=r"'events' holds 1 sample\(s\) and the batch has 3"):
-        toy()(Batch(poses, T_S, "wall"), recorded={"frames": torch.ones(1, 1, 1, 1)})
-    one = field_of(torch.ones(1, 2, 1, 1))
-    three = toy(
-        render=lambda: torch.ones(3, 2, 1, 1),
-        events=lambda frames: frames[:, 1:, None].expand(-1, -1, 2, -1, -1),
-    )
-    seen = {"error": lambda field, truth: (field.flow_px - truth.flow_px).sum()}
-    with pytest.raises(ShapeError, match=r"'truth' holds 1 sample\(s\)"):
-        three.replaced(objectives=seen, bins=1)(Batch(poses, T_S, "wall", truth=one))
-
-
 def test_objectives_are_scalar_tensors():
     with pytest.raises(DomainError, match="objective 'square' returned a float"):
         toy(objectives={"square": lambda field: 1.0})(BATCH)
-    vector = toy(objectives={"each": lambda field: field.flow_px.expand(1, 1, 1, 2)})(BATCH)
-    with pytest.raises(ShapeError, match=r"objective 'each' has shape \(1, 1, 1, 2\)"):
+    vector = toy(objectives={"each": lambda field: field.flow_px})(BATCH)
+    with pytest.raises(ShapeError, match=r"objective 'each' has shape \(1, 2, 1, 1\)"):
         vector.backward()
     with pytest.raises(DomainError, match="asks for 'estimate', but the system has no such stage"):
         toy(objectives={"task": lambda estimate: estimate})
@@ -371,7 +344,7 @@ def test_check_finds_nan_a_flow_that_passes_no_gradient_and_a_lens_computed_once
     with pytest.raises(GradientError, match="cannot see what lies before junction 'flow'"):
         check(system.replaced(objectives=through_truth), BATCH, [system.lens.efl_mm])
     with pytest.raises(GradientError, match="exactly 0 for every variable"):
-        check(toy(flow=lambda volume: field_of(0 * volume.counts[:, 0])), BATCH)
+        check(toy(flow=lambda volume: field_of(0 * volume.counts[:, :1, 0])), BATCH)
     once = toy()
     once.lens.register_buffer("made", 2 * once.lens.efl_mm)
     with pytest.raises(GradientError, match="computed once from other tensors"):

@@ -219,3 +219,20 @@ def test_biases_do_not_decay():
         (0.5, [2]),
         (0.0, [1]),
     ]
+
+
+def test_resumed_in_float64_it_goes_on_bit_for_bit_and_with_the_same_optimiser_alone():
+    def made(kind):
+        network = line().double()
+        return learner(network, optimiser=kind(network.parameters(), 0.1))
+
+    whole, second = made(torch.optim.NAdam), made(torch.optim.NAdam)
+    for step in range(6):
+        if step == 3:
+            second.load_state_dict({name: tensor.clone() for name, tensor in whole.state_dict().items()})
+        whole.step(X.double())
+        if step >= 3:
+            second.step(X.double())
+    assert torch.equal(whole.network.weight, second.network.weight)
+    with pytest.raises(FileFormatError, match="of the optimiser NAdam, this run has Adam"):
+        made(torch.optim.Adam).load_state_dict(whole.state_dict())

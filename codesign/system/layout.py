@@ -1,0 +1,91 @@
+"""What stands at every junction: kinds, shapes, dtypes and devices in every pass, values where a pass is looked at."""
+
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from codesign.errors import DomainError, ShapeError
+from codesign.types import EventVolume, FlowField, Rays
+
+LAYOUT: dict[type, dict[str, tuple[str | int, ...]]] = {
+    Rays: {"direction": ("rays", 3), "origin_m": ("rays", 3), "weight": ("rays",)},
+    EventVolume: {"counts": ("N", 2, "bins", "H", "W"), "centroid_s": ("bins",), "collected_s": ("bins",)},
+    FlowField: {
+        "flow_px": ("N", 2, "H", "W"),
+        "valid": ("N", "H", "W"),
+        "confidence": ("N", "H", "W"),
+        "covariance_px2": ("N", 3, "H", "W"),
+    },
+}
+PICTURE = 256  # values from which on the scale of frames can be judged
+LONGEST_S = 2.0  # a window of flow that lasts longer is in milliseconds
+
+
+def check_layout(by: str, value: Any, kind: type, shape: tuple[str | int, ...] = (), **sizes: int) -> None:
+    """Raise unless a value is of a kind and its tensors have their layouts, with the sizes that letters stand for.
+
+    Args: by: subject and verb of the sentence, such as "stage 'flow' returned", with the noun for a plain tensor.
+      shape: of a plain tensor, "..." first where any axes may come before.
+    Raises: DomainError for kinds, dtypes and devices; ShapeError for shapes.
+    """
+    if not isinstance(value, kind):
+        as_ = " as" if shape else ""
+        raise DomainError(f"{by}{as_} a {type(value).__name__}; a {kind.__name__} is needed.")
+    first = None
+    for name, axes in LAYOUT.get(kind, {"": shape}).items():
+        tensor = getattr(value, name) if name else value
+        if tensor is None and name in ("confidence", "covariance_px2"):
+            continue
+        if not isinstance(tensor, Tensor):
+            raise DomainError(f"{by} {name} as a {type(tensor).__name__}; a tensor is needed.")
+        behind = axes[1:] if axes[0] == "..." else axes
+        given = tensor.shape[max(tensor.ndim - len(behind), 0) :] if behind is not axes else tensor.shape
+        named = f"{by} {name}" if name else by
+        wanted = [
+            sizes.setdefault(w, g) if isinstance(w, str) else w for w, g in zip(behind, given, strict=False)
+        ]
+        if len(given) != len(behind) or wanted != list(given):
+            known = ", ".join(f"{axis} = {sizes[axis]}" for axis in axes if axis in sizes)
+            raise ShapeError(
+                f"{named} of shape {tuple(tensor.shape)}; [{', '.join(map(str, axes))}] is needed"
+                f"{f' with {known}' if known else ''}."
+            )
+        if (tensor.dtype != torch.bool) if name == "valid" else not tensor.is_floating_point():
+            kinds = "bool" if name == "valid" else "floating point"
+            raise DomainError(f"{named} of {tensor.dtype}; {kinds} is needed.")
+        first = tensor if first is None else first
+        if tensor.device != first.device:
+            raise DomainError(f"{by} tensors on {first.device} and on {tensor.device}; use one device.")
+
+
+def look_at(by: str, value: Any) -> None:
+    """Warn of frames on 0 to 1, and raise DomainError for numbers of events below 0, further than rounding takes
+    them."""
+    tensor = value.counts if isinstance(value, EventVolume) else value
+    low, high = (float(bound) for bound in tensor.detach().aminmax())
+    if tensor is not value and low < -1e-4 * max(high, 1e-3):
+        raise DomainError(
+            f"{by} counts down to {low:.3g}; numbers of events are 0 or more, ON first: a signed change belongs into "
+            "two channels, change.relu() and (-change).relu()."
+        )
+    if tensor is value and low >= 0 and 0 < high <= 1 and tensor.numel() >= PICTURE:
+        warn(
+            f"{by} between {low:.3g} and {high:.3g}; the scale is 0 to 255, on which these are black: multiply "
+            "by 255 if they are on 0 to 1."
+        )
+
+
+def look_at_times(t_s: Tensor) -> None:
+    """Warn of times that seem to be milliseconds."""
+    if float(t_s[-1] - t_s[0]) > LONGEST_S:
+        warn(
+            f"the batch's times span {float(t_s[-1] - t_s[0]):.4g} s, one window of flow; t_s are seconds: divide by 1e3 "
+            "if they are milliseconds."
+        )
+
+
+def warn(sentence: str) -> None:
+    """A warning to the caller of the caller."""
+    warnings.warn(sentence, UserWarning, stacklevel=3)
