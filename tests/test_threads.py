@@ -8,12 +8,14 @@ ROOT = Path(__file__).resolve().parents[1]
 FORKED = """
 import os, torch
 from codesign import lens, render
+from codesign.exclusive import exclusive
 camera = render.Camera(lens.load("cooke-triplet").scaled(0.22), 4, 4, 0.2, 4)
 camera.rays()
 child = os.fork()
 if child == 0:
     try:
-        camera.with_seed(1).rays()
+        with exclusive:
+            pass
     except Exception as error:
         os._exit(7 if "spawn" in str(error) else 1)
     os._exit(2)
