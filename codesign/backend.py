@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import BackendError, DomainError, GradientError
+from codesign.exclusive import exclusive
 
 MINIMUM_LLVM = (
     19  # 15 and 16 abort the process while compiling Mitsuba 3.9 kernels; 14 is refused; 19 and 22 work
@@ -145,6 +146,7 @@ def require_renderer(device: str = "cpu") -> None:
             return  # an unwritable cache costs a trial render per process, nothing else
 
 
+@exclusive
 def mitsuba(device: str = "cpu") -> Any:
     """The Mitsuba module with the variant of ``device`` set, after the renderer check."""
     require_renderer(device)
@@ -241,8 +243,10 @@ def run_kernel(
     return _Kernel.apply(kernel, tuple(map(tuple, out_shapes)), *inputs)
 
 
-def _to_drjit(arr, tensor):
-    return arr.Float(tensor.detach().contiguous().reshape(-1))
+def load(array: Any, tensor: Tensor) -> Any:
+    """A flat drjit array of that type, of the numbers of a tensor, without a copy where they are dense. It must not
+    outlive the ``exclusive`` function that loads it."""
+    return array(exclusive.keep(tensor.detach().contiguous().reshape(-1)))
 
 
 def _to_torch(value, shape, inputs):
@@ -255,6 +259,7 @@ def _to_torch(value, shape, inputs):
 
 class _Kernel(torch.autograd.Function):
     @staticmethod
+    @exclusive
     def forward(ctx, kernel, out_shapes, *inputs):
         import drjit as dr
 
@@ -263,7 +268,7 @@ class _Kernel(torch.autograd.Function):
         ctx.save_for_backward(*inputs)
         ctx.set_materialize_grads(False)
         with dr.suspend_grad():
-            outputs = [dr.detach(o) for o in kernel(ctx.arrays, *[_to_drjit(ctx.arrays, x) for x in inputs])]
+            outputs = [dr.detach(o) for o in kernel(ctx.arrays, *[load(ctx.arrays.Float, x) for x in inputs])]
             owned = [
                 o.state != dr.VarState.Evaluated for o in outputs
             ]  # memory that was there before may belong to something the kernel captured
@@ -286,20 +291,21 @@ class _Kernel(torch.autograd.Function):
         return (None, None, *first_only(result, (*inputs, *grads)))
 
 
+@exclusive
 def _adjoint(ctx, inputs, grads):
     """Gradients of the kernel's inputs, by re-running it with drjit's reverse mode."""
     import drjit as dr
 
     arr = ctx.arrays
     wanted = ctx.needs_input_grad[2:]
-    flat = [_to_drjit(arr, x) for x in inputs]
+    flat = [load(arr.Float, x) for x in inputs]
     for value, want in zip(flat, wanted, strict=True):
         if want:
             dr.enable_grad(value)
     outputs = ctx.kernel(arr, *flat)
     for value, grad in zip(outputs, grads, strict=True):
         if grad is not None and dr.grad_enabled(value):
-            seed = _to_drjit(arr, grad)
+            seed = load(arr.Float, grad)
             dr.accum_grad(value, seed if dr.width(value) == dr.width(seed) else dr.sum(seed))
             dr.enqueue(dr.ADMode.Backward, value)
     dr.traverse(dr.ADMode.Backward)

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     {"errors"},
-    {"types", "optional", "reading"},
+    {"types", "optional", "reading", "exclusive"},
     {"pose", "backend", "atomic", "plain_yaml", "interrupt", "grad"},
     {"state"},
     {"lens", "render", "events", "place"},  # none imports another: what one needs is passed in

@@ -10,6 +10,7 @@ from torch import Tensor
 from codesign import backend
 from codesign.errors import DomainError, as_number
 from codesign.events.entry import check_flag, check_frames
+from codesign.exclusive import exclusive
 
 JOINT = 20.0  # intensity on the 0-255 scale where the linear part meets the logarithm
 DARK_SLOPE = math.log(JOINT) / JOINT
@@ -114,13 +115,14 @@ class FrontEnd:
         return dr.isfinite(frames) if self.log_input else (frames >= 0) & (frames < math.inf)
 
 
+@exclusive
 def kernel_levels(frames, front_end):
     """Log levels of frames by the arithmetic of the kernels, which rounds alike on every processor (torch's
     logarithm does not); also whether one may not enter (then the levels mean nothing). No gradient."""
     import drjit as dr
 
     arr = backend.arrays(frames.device.type, frames.dtype)
-    values = arr.Float(frames.detach().contiguous().reshape(-1))
+    values = backend.load(arr.Float, frames)
     with dr.suspend_grad():
         found = front_end.traced(dr, values)[0]
         bad = dr.any(~front_end.accepts(dr, values))

@@ -9,11 +9,13 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
+from codesign.exclusive import exclusive
 from codesign.flow.lk_lanes import Form, Grid, Lanes, recorded, tensors
 
 ROWS = 64  # that a lane goes down: columns of a whole image are far apart in memory
 
 
+@exclusive
 def forward(images: Tensor, grid: Grid, taps: Sequence[float]) -> Tensor:
     """[N, h, w] of images [N, H, W]; ``taps``: the middle one, then those to one side."""
     form = Form.of(images, grid)
@@ -23,6 +25,7 @@ def forward(images: Tensor, grid: Grid, taps: Sequence[float]) -> Tensor:
     return tensors((len(images), *grid.shape), _blurred(form, False, source, form.scalars(list(taps))))[0]
 
 
+@exclusive
 def adjoint(grad: Tensor, grid: Grid, taps: Sequence[float]) -> Tensor:
     """[N, H, W], of a gradient [N, h, w]."""
     form = Form.of(grad, grid)

@@ -1,8 +1,6 @@
 """What the kernels of the closed form share: the samples of an image, numbers for lanes of them, and recordings."""
 
-import contextlib
-import gc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, wraps
 from typing import Any, NamedTuple
@@ -51,7 +49,7 @@ class Form(NamedTuple):
     def load(self, *tensors: Tensor) -> list[Any]:
         """As flat drjit arrays, without a copy where they are dense."""
         flat = backend.arrays(self.device, self.dtype).Float
-        return [flat(tensor.detach().contiguous().reshape(-1)) for tensor in tensors]
+        return [backend.load(flat, tensor) for tensor in tensors]
 
     def scalars(self, numbers: list[float]) -> list[Any]:
         """Opaque: other numbers need no new kernel."""
@@ -84,23 +82,10 @@ def recorded(kernel: Callable[..., Any]) -> Callable[..., Any]:
         import drjit as dr
 
         given = tuple(each for each in args if isinstance(each, list) or dr.is_array_v(each))
-        with dr.suspend_grad(), uncollected():
+        with dr.suspend_grad():
             return frozen(args[: len(args) - len(given)])(*given)
 
     return run
-
-
-@contextlib.contextmanager
-def uncollected() -> Iterator[None]:
-    """No garbage is collected inside: a scene of Mitsuba that is freed waits for drjit's kernels, which no recording
-    allows, and the process ends ("Aborted")."""
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collects:
-            gc.enable()
 
 
 def tensors(shape: tuple[int, ...], *values: Any) -> list[Tensor]:

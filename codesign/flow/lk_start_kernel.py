@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from codesign.exclusive import exclusive
 from codesign.flow.lk_lanes import Form, Grid, Lanes, recorded, tensors
 
 OUT = 6  # flow x, y, covariance xx, xy, yy, confidence
@@ -42,6 +43,7 @@ class Setting:
         return self.of_flow + 4 * len(self.of_variance)
 
 
+@exclusive
 def forward(coefficients: Tensor, cells: Tensor, grid: Grid, setting: Setting) -> Tensor:
     """[B, 6, H, W] of [B, numbers] and cells [B, 5, rows, columns]."""
     form = Form.of(coefficients, grid)
@@ -49,6 +51,7 @@ def forward(coefficients: Tensor, cells: Tensor, grid: Grid, setting: Setting) -
     return tensors((len(cells), OUT, *grid.shape), found)[0]
 
 
+@exclusive
 def adjoint(
     coefficients: Tensor, cells: Tensor, grid: Grid, setting: Setting, by_flow: Tensor, by_rest: Tensor | None
 ) -> tuple[Tensor, Tensor]:

@@ -2,11 +2,13 @@
 
 from torch import Tensor
 
+from codesign.exclusive import exclusive
 from codesign.flow.lk_lanes import Form, Grid, Lanes, recorded, tensors
 
 PRODUCTS = 8
 
 
+@exclusive
 def forward(mean: Tensor, slope: Tensor, seen: Tensor, density: Tensor, grid: Grid, cell: int) -> Tensor:
     """[B, 8, ceil(h / cell), w]: sums along the columns of each cell."""
     form = Form.of(mean, grid)
@@ -15,6 +17,7 @@ def forward(mean: Tensor, slope: Tensor, seen: Tensor, density: Tensor, grid: Gr
     return tensors((len(mean), PRODUCTS, -(-rows // cell), columns), found)[0]
 
 
+@exclusive
 def adjoint(
     mean: Tensor, slope: Tensor, seen: Tensor, density: Tensor, grid: Grid, cell: int, grad: Tensor
 ) -> list[Tensor]:

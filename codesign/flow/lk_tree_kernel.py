@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from codesign.exclusive import exclusive
 from codesign.flow.lk_lanes import Form, Grid, Lanes, recorded, tensors
 
 DATA = 5  # of a cell: precision xx, xy, yy and pull x, y; or mean x, y and covariance xx, xy, yy
@@ -33,6 +34,7 @@ class Trees(NamedTuple):
         return rows >> scale, columns >> scale
 
 
+@exclusive
 def forward(data: Tensor, variances: Tensor, trees: Trees) -> tuple[Tensor, Tensor, list[Tensor]]:
     """Mean and covariance [S, B, 5, h, w], evidence [S, B], and what the adjoint needs.
 
@@ -51,6 +53,7 @@ def forward(data: Tensor, variances: Tensor, trees: Trees) -> tuple[Tensor, Tens
     return values, evidence.sum((3, 4)).mean(2), kept
 
 
+@exclusive
 def adjoint(
     data: Tensor,
     variances: Tensor,

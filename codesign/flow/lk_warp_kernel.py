@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
+from codesign.exclusive import exclusive
 from codesign.flow.lk_lanes import Form, Grid, Lanes, recorded, tensors
 
 BINS = 16  # in one kernel
@@ -16,6 +17,7 @@ BINS = 16  # in one kernel
 MOST_VALUES = 1 << 23
 
 
+@exclusive
 def forward(rate: Tensor, flow_px: Tensor, weights: Tensor, grid: Grid, fade_px: float) -> list[Tensor]:
     """Mean, slope and seen, [B, h, w] each; weights: [3, n]: time, share in the mean, share in the slope."""
     form = Form.of(rate, grid)
@@ -23,6 +25,7 @@ def forward(rate: Tensor, flow_px: Tensor, weights: Tensor, grid: Grid, fade_px:
     return tensors((len(rate), *grid.shape), *found)
 
 
+@exclusive
 def adjoint(
     rate: Tensor,
     flow_px: Tensor,

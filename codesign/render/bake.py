@@ -17,6 +17,7 @@ import torch
 from scipy.ndimage import distance_transform_edt, zoom
 
 from codesign.errors import DomainError
+from codesign.exclusive import exclusive
 from codesign.render.atlas import Nodes
 from codesign.render.charts import Chart, placed
 from codesign.render.placed import Placement
@@ -38,6 +39,7 @@ GRAZING = 0.05  # cosine of the flattest direction that shiny surfaces are looke
 MAX_FINE = 1 << 24  # texels of a finished texture
 
 
+@exclusive
 def bake(
     description: Mapping[str, Any] | Any,
     device: str = "cpu",

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from codesign.errors import DomainError, ShapeError
+from codesign.exclusive import exclusive
 from codesign.render.atlas import Atlas, Nodes, atlas_of, cells_of, nodes_of
 from codesign.render.soundness import checked_mesh
 
@@ -108,6 +109,7 @@ def emitter(mi, texture):
     }
 
 
+@exclusive
 def emissive_mesh(mi, vertices, faces, light, uv=None, bsdf=None, attribute="face_radiance"):
     """A Mitsuba mesh of flat faces: ``light`` is an emitter dictionary, an array of radiance, [F] per face or, for an
     ``attribute`` that begins with vertex_, [V] per vertex, or None; ``bsdf`` a dictionary or None. Raises: DomainError

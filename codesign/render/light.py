@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, GradientError, as_number, check_seed, check_whole
+from codesign.exclusive import exclusive
 from codesign.render.bake import bake
 from codesign.render.camera import Camera
 from codesign.render.kinds import Scene
@@ -43,6 +44,7 @@ class PathScene(MitsubaScene):
       numbers one by one is not the gradient of their mean; asking for it raises GradientError.
     """
 
+    @exclusive
     def __init__(
         self,
         description: Mapping[str, Any] | Any,

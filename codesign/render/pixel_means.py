@@ -8,8 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.backend import arrays, first_only
+from codesign.backend import arrays, first_only, load
 from codesign.errors import GradientError
+from codesign.exclusive import exclusive
 from codesign.render.lanes import lanes, nearest
 from codesign.render.slopes import ROOM, Slopes, pose_gradients, ray_gradients
 
@@ -81,6 +82,7 @@ def pixel_means(
 
 class _PixelMeans(torch.autograd.Function):
     @staticmethod
+    @exclusive
     def forward(ctx, wavefront, wanted, *tensors):
         import drjit as dr
 
@@ -115,9 +117,10 @@ def _to_drjit(wavefront, origin, direction, weight, poses):
 
 
 def _flat(arr, tensor):
-    return arr.Float(tensor.detach().contiguous().reshape(-1))
+    return load(arr.Float, tensor)
 
 
+@exclusive
 def _gradients(ctx, grad, origin, direction, weight, poses):
     """Gradients of the four tensors; None for those that ask for none."""
     import drjit as dr

@@ -5,8 +5,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.backend import arrays, memory_bytes, run_kernel
+from codesign.backend import arrays, load, memory_bytes, run_kernel
 from codesign.errors import DomainError, ShapeError, check_whole
+from codesign.exclusive import exclusive
 from codesign.pose import Poses, as_poses
 from codesign.render.kinds import Scene
 from codesign.render.lanes import lanes, nearest
@@ -83,6 +84,7 @@ def light_and_nearness(rays: Rays, scene: Scene | MovingScene, T_world_cam: Tens
     return light, nearness
 
 
+@exclusive
 def look(scene: Any, cameras: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
     """Radiance [n] and distance [n] along rays [n, 3] in camera axes, seen from poses [parts, n, 4, 4] of the camera;
     float64 without gradient."""
@@ -91,7 +93,7 @@ def look(scene: Any, cameras: Tensor, origin: Tensor, direction: Tensor) -> tupl
     arr = arrays(origin.device.type, scene.dtype)
 
     def columns(vectors):
-        return arr.Array3(*[arr.Float(c.to(scene.dtype).contiguous()) for c in vectors.unbind(1)])
+        return arr.Array3(*[load(arr.Float, c.to(scene.dtype)) for c in vectors.unbind(1)])
 
     placed = [
         (

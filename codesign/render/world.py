@@ -10,6 +10,7 @@ from torch import Tensor
 
 from codesign import backend
 from codesign.errors import CodesignError, DomainError
+from codesign.exclusive import exclusive
 from codesign.render.outline import outlines
 from codesign.render.outline.curves import Segments
 from codesign.render.shape_table import box_around, shape_numbers
@@ -35,6 +36,7 @@ class MitsubaScene:
     def __deepcopy__(self, memo):
         return self  # a scene is never changed, so copies of what holds it share it
 
+    @exclusive
     def __init__(
         self,
         description: Mapping[str, Any] | Any,
@@ -158,6 +160,7 @@ class MitsubaScene:
         si.wi = -direction
         return environment.eval(si)[0]
 
+    @exclusive
     def outline(self) -> Any:
         """Curves where radiance may jump, see codesign.render.outline; worked out once."""
         if self._outline is None:
@@ -165,6 +168,7 @@ class MitsubaScene:
             self._outline = [_never_black(curve) for curve in curves] if self.both_sides else curves
         return self._outline
 
+    @exclusive
     def hit(self, origin_m: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """First surface met by world rays [N, 3]: point [N, 3], normal [N, 3], valid [N]; no gradient,
         float64 out of float32 geometry."""
@@ -175,8 +179,8 @@ class MitsubaScene:
             return origin_m.detach(), origin_m.detach(), torch.zeros(0, dtype=torch.bool)
         o, d = (part.detach().float().cpu().unbind(1) for part in (origin_m, direction))
         ray = mi.Ray3f(
-            mi.Point3f(*[mi.Float(v.contiguous()) for v in o]),
-            mi.Vector3f(*[mi.Float(v.contiguous()) for v in d]),
+            mi.Point3f(*[backend.load(mi.Float, v) for v in o]),
+            mi.Vector3f(*[backend.load(mi.Float, v) for v in d]),
         )
         found = self.scene.ray_intersect_preliminary(ray, coherent=True, active=self._ahead(ray))
         n = self._normal(ray, found)

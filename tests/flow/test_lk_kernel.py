@@ -12,6 +12,7 @@ from scipy.ndimage import correlate1d
 
 from codesign import flow
 from codesign.errors import DomainError, GradientError, ShapeError
+from codesign.exclusive import exclusive
 from codesign.flow import lk_kernel, lk_warp_kernel
 from codesign.flow.lk_lanes import Grid, recorded
 from codesign.types import EventVolume
@@ -198,7 +199,8 @@ def test_no_garbage_is_collected_in_a_recording():
     gc.callbacks.append(watch)
     gc.set_threshold(50)
     try:
-        found = recorded(kernel)(2.0, dr.llvm.ad.Float64([1, 2]))
+        with exclusive:
+            found = recorded(kernel)(2.0, dr.llvm.ad.Float64([1, 2]))
         kept = [[] for _ in range(1000)]
     finally:
         gc.set_threshold(*before)

@@ -11,8 +11,10 @@ backward, walks each forward once more, and then back.
 import torch
 
 from codesign.events.layers.dead_time_part import PHASES, Run
+from codesign.exclusive import exclusive
 
 
+@exclusive
 def forward(parts, level, theta_on, theta_off, centre, position, heading, begun, rows):
     """Kept counts [T, 2, ...] of levels [T + 1, ...]; the state after them; the stored states.
 
@@ -81,6 +83,7 @@ def forward(parts, level, theta_on, theta_off, centre, position, heading, begun,
     return kept, after, stored
 
 
+@exclusive
 def adjoint(parts, level, theta_on, theta_off, stored, grad_kept, grad_after):
     """Adjoint of ``forward``: gradients of level, theta_on, theta_off [...], dead time [...] and of the state.
 

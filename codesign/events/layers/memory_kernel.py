@@ -12,8 +12,10 @@ engaged before: the loop forward in time writes both.
 """
 
 from codesign.events.layers.pixel_loop import Loop
+from codesign.exclusive import exclusive
 
 
+@exclusive
 def count(frames, start, theta_on, theta_off, front_end):
     """Counts [T, 2, ...] of frames [T, ...] from a start [2, ...] (memorised level, centre of the play); the
     state after them; whether a value may not enter."""
@@ -31,6 +33,7 @@ def count(frames, start, theta_on, theta_off, front_end):
     return loop.result(target, after, bad)
 
 
+@exclusive
 def adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end, *, first, wants_thetas):
     """Adjoint of ``count``: gradients of the frames [first + T, ...] (rows before ``first`` are left to the
     caller), start, theta_on, theta_off [...] (zero unless wanted).

@@ -24,7 +24,7 @@ class Loop:
         self.values = self.load(frames)
 
     def load(self, tensor):
-        return self.arr.Float(tensor.detach().contiguous().reshape(-1))
+        return backend.load(self.arr.Float, tensor)
 
     def tensor(self, value, shape):
         return value.torch().reshape(shape).clone()

@@ -18,6 +18,7 @@ needs more, the pair with the least weight x distance is spread evenly over the 
 """
 
 from codesign.events.layers.pixel_loop import Loop
+from codesign.exclusive import exclusive
 
 PAIRS = 4
 WIDTH = 6  # values of a pair
@@ -27,6 +28,7 @@ START = 0xFFFFFFFE  # in place of a frame
 NONE = 0xFFFFFFFF
 
 
+@exclusive
 def adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end, *, first):
     """Gradients of the frames [first + T, ...] (rows before ``first`` are left to the caller) and of the place of
     the box that the pixels begin in, [...].

@@ -52,7 +52,7 @@ def run(frames, front_end, dt_s, interval_key, sensor, state, sink):
     names = [name for name in CARRIED if getattr(state, name) is not None]
     carried = [_load(arr, getattr(state, name)) for name in names]
     step = _Step(dr, arr, front_end, dt_s, interval_key, sensor, state, sink, lane)
-    values = arr.Float(frames.detach().reshape(-1))
+    values = _load(arr, frames)
     end = dr.opaque(arr.UInt32, len(frames))
     dr.eval(values, carried, step.held)
 
@@ -81,8 +81,9 @@ def run(frames, front_end, dt_s, interval_key, sensor, state, sink):
 
 
 def _load(arr, tensor):
-    tensor = tensor.detach().contiguous().reshape(-1)
-    return arr.UInt32(arr.Int32(tensor)) if tensor.dtype == torch.int32 else arr.Float(tensor)
+    if tensor.dtype == torch.int32:
+        return arr.UInt32(backend.load(arr.Int32, tensor))
+    return backend.load(arr.Float, tensor)
 
 
 def _unload(arr, value, like):
@@ -124,7 +125,7 @@ class _Step:
         self.theta_on, self.theta_off = (
             drawn if sensor.theta_sigma > 0 else (opaque(sensor.theta_on), opaque(sensor.theta_off))
         )
-        self.dt_s = arr.Float(dt_s.to(state.reference))
+        self.dt_s = _load(arr, dt_s.to(state.reference))
         self.interval_key = _load(arr, interval_key)
         self.leak_hz = None if state.leak_hz is None else _load(arr, state.leak_hz)
         self.key = None if state.key is None else _load(arr, state.key)

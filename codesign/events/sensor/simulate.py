@@ -15,6 +15,7 @@ from codesign.events.sensor.model import SensorModel, check_generator, check_sen
 from codesign.events.sensor.sinks import DenseCounts, EventKeys, KeyLayout
 from codesign.events.sensor.state import SensorState, begin, change, check_state
 from codesign.events.stream import concatenate, ordered
+from codesign.exclusive import exclusive
 from codesign.types import EventStream
 
 EVENTS_PER_PIXEL = 0.1  # room made at first
@@ -108,6 +109,7 @@ def simulate(
     return stream
 
 
+@exclusive
 @torch.no_grad()
 def dense_counts(
     frames: Tensor,
@@ -210,6 +212,7 @@ def _v2e_events(frames, times_s, sensor, generator, state, front_end):
     return ordered(t_us, x, y, p, *frames.shape[1:])
 
 
+@exclusive
 def _interpolated_keys(frames, times_s, sensor, generator, state, front_end, layout, density):
     """Sorted keys of the events of one chunk; a chunk busier than the room made for it is run again with the
     room it needs."""

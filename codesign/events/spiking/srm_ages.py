@@ -20,8 +20,9 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from codesign.backend import arrays
+from codesign.backend import arrays, load
 from codesign.events.spiking.srm_kernels import advance
+from codesign.exclusive import exclusive
 
 WIDTH = 0.087  # of the noise, in thresholds; a narrower one is nearer to hard spikes, and its gradient more erratic
 PACE = 1.2  # spikes per tau_r and x, far above the threshold
@@ -56,6 +57,7 @@ def mean_spikes(
 
 class _Mean(Function):
     @staticmethod
+    @exclusive
     def forward(ctx, kind, response, theta, a, m, pace, start):
         loop = _Ages(kind, response, theta, a, m, pace, start.shape)
         mean, after, ctx.starts = loop.forward(start)
@@ -65,10 +67,11 @@ class _Mean(Function):
 
     @staticmethod
     @once_differentiable
+    @exclusive
     def backward(ctx, grad_mean, grad_after):  # pyright: ignore[reportIncompatibleMethodOverride]
         response, theta, a, m, pace, start = ctx.saved_tensors
         loop = _Ages(ctx.kind, response, theta, a, m, pace, start.shape)
-        return None, *loop.adjoint(ctx.starts, grad_mean, grad_after)
+        return None, *loop.adjoint([loop.split(start), *ctx.starts], grad_mean, grad_after)
 
 
 class _Ages:
@@ -91,7 +94,7 @@ class _Ages:
         self.spans = [(first, min(first + size, self.steps)) for first in range(0, self.steps, size)]
 
     def load(self, tensor):
-        return self.arr.Float(tensor.detach().contiguous().reshape(-1))
+        return load(self.arr.Float, tensor)
 
     def split(self, tensor):
         """Lanes of shares and states [1 + states, ages, N], one after the other."""
@@ -132,7 +135,7 @@ class _Ages:
         ]
 
     def forward(self, start):
-        """Mean spikes; shares and states after the last step; those before every span, as lanes."""
+        """Mean spikes; shares and states after the last step; those before every span but the first, as lanes."""
         dr = self.dr
         mean = dr.empty(self.arr.Float, self.steps * self.width)
         flat = self.split(start)
@@ -142,7 +145,7 @@ class _Ages:
                 starts.append(flat)
                 flat = self.run(span, flat, mean=mean)
         dr.sync_thread()
-        return mean.torch().reshape(self.steps, self.width), self.join(flat), starts
+        return mean.torch().reshape(self.steps, self.width), self.join(flat), starts[1:]
 
     def run(self, span, flat, mean=None, kept=None):
         """The steps of a span; the mean spikes and the states before every step, where wanted."""

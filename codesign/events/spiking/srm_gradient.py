@@ -6,12 +6,13 @@ from dataclasses import astuple, dataclass
 import torch
 from torch.autograd import Function
 
-from codesign.backend import NoSecondDerivative, arrays
+from codesign.backend import NoSecondDerivative, arrays, load
 from codesign.errors import NonFiniteError, check_finite
 from codesign.events.spiking.srm_adjoint import Wanted, pack, scan_back, unpack
 from codesign.events.spiking.srm_forward import Grid, Plan, scan
 from codesign.events.spiking.srm_kernels import absolute_sum, reset_coefficients, response_coefficients
 from codesign.events.spiking.surrogate import Surrogate
+from codesign.exclusive import exclusive
 
 FIRST_ONLY = "events.srm gives first derivatives only, and a second one was asked for; use differences of gradients instead."
 
@@ -54,6 +55,7 @@ def reset_sum(setup, theta, h_reset, steps):
 
 class _Srm(Function):
     @staticmethod
+    @exclusive
     def forward(ctx, setup, drive, theta, h_response, h_reset, response, reset):
         import drjit as dr
 
@@ -62,10 +64,12 @@ class _Srm(Function):
         spikes = dr.empty(work.single.Float, drive.numel())
         potential = dr.empty(work.single.Float, drive.numel() + STAGGER)
         segmented = setup.segment is not None and any(ctx.needs_input_grad)
+        # states before every segment but the first, which are given
         checkpoints = []
         bad = dr.zeros(work.single.Bool, work.grid.lanes)
         for first, end in work.spans(setup.segment if segmented else None):
-            checkpoints.append(states)
+            if segmented and first > 0:
+                checkpoints.append(states)
             states, found = work.forward(states, first, end, 0, spikes, potential, STAGGER)
             bad |= found
             dr.eval(spikes, potential, states, bad)
@@ -82,7 +86,7 @@ class _Srm(Function):
             drive, theta, h_response, h_reset, response, reset, spikes, None if segmented else potential
         )
         ctx.setup = setup
-        ctx.checkpoints = checkpoints if segmented else []
+        ctx.checkpoints = checkpoints if segmented else None
         ctx.set_materialize_grads(False)
         return spikes, potential, *work.join(states)
 
@@ -102,6 +106,7 @@ class _Srm(Function):
         return None, *result
 
 
+@exclusive
 def _backward(ctx, saved, grads):
     """Gradients of drive, theta, h_response, h_reset, response and reset."""
     import drjit as dr
@@ -120,7 +125,7 @@ def _backward(ctx, saved, grads):
             part[name] = [
                 dr.zeros(work.double.Float, work.grid.lanes)
                 if given is None
-                else work.double.Float(given[j, k].contiguous())
+                else load(work.double.Float, given[j, k])
                 for j in range(len(values))
             ]
     carried = pack(parts)
@@ -132,12 +137,13 @@ def _backward(ctx, saved, grads):
         "potential": work.flat(potential),
     }
     flat["grad_drive"] = dr.empty(work.single.Float, drive.numel()) if need[0] else None
-    for j, (first, end) in reversed(
-        list(enumerate(work.spans(ctx.setup.segment if ctx.checkpoints else None)))
-    ):
-        if ctx.checkpoints:
+    segmented = ctx.checkpoints is not None
+    before = [work.split(response, reset), *(ctx.checkpoints or [])]
+    spans = work.spans(ctx.setup.segment if segmented else None)
+    for states, (first, end) in reversed(list(zip(before, spans, strict=True))):
+        if segmented:
             flat["potential"] = dr.empty(work.single.Float, (end - first) * drive[0].numel())
-            work.forward(ctx.checkpoints[j], first, end, first, None, flat["potential"], 0)
+            work.forward(states, first, end, first, None, flat["potential"], 0)
             dr.eval(flat["potential"])
         span = work.count(first), work.count(end)
         carried = scan_back(
@@ -149,7 +155,7 @@ def _backward(ctx, saved, grads):
             flat,
             carried,
             span,
-            work.count(first if ctx.checkpoints else 0),
+            work.count(first if segmented else 0),
         )
         dr.eval(carried, *([flat["grad_drive"]] if need[0] else []))
     dr.sync_thread()
@@ -213,7 +219,7 @@ class _Work:
         self.columns = {"theta": theta, "reset": reset, "response": response}
 
     def flat(self, tensor):
-        return None if tensor is None else self.single.Float(tensor.detach().contiguous().view(-1))
+        return None if tensor is None else load(self.single.Float, tensor)
 
     def opaque_surrogate(self, types):
         """The surrogate's numbers in one precision."""
@@ -235,7 +241,7 @@ class _Work:
         """Per channel, a dictionary of drjit arrays [lanes] from tensors [channels, lanes]."""
         return [
             {
-                name: None if column is None else self.double.Float(column[k].contiguous())
+                name: None if column is None else load(self.double.Float, column[k])
                 for name, column in columns.items()
             }
             for k in range(self.channels)
@@ -286,7 +292,7 @@ class _Work:
     def split(self, response, reset):
         """States as drjit arrays [lanes], channel by channel, response before reset."""
         return [
-            self.double.Float(rows[j, k].contiguous())
+            load(self.double.Float, rows[j, k])
             for k in range(self.channels)
             for rows in (response, reset)
             for j in range(rows.shape[0])

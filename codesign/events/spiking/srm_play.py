@@ -19,6 +19,7 @@ from codesign.events.layers.memory import memory
 from codesign.events.layers.pixel_loop import Loop
 from codesign.events.spiking.instead import instead
 from codesign.events.spiking.srm_state import PlayState, SrmState
+from codesign.exclusive import exclusive
 
 NEVER = 0xFFFFFFFF
 
@@ -87,12 +88,14 @@ class _Limited(Function):
     """The level, held back to one threshold beyond the play, and the centre of the play after it."""
 
     @staticmethod
+    @exclusive
     def forward(ctx, level, centre, theta_on, theta_off):
         ctx.save_for_backward(level, centre, theta_on, theta_off)
         return _Play(level, theta_on, theta_off).forward(centre)
 
     @staticmethod
     @once_differentiable
+    @exclusive
     def backward(ctx, *grads):
         level, centre, theta_on, theta_off = ctx.saved_tensors
         grad_level, grad_centre, *grad_thetas = _Play(level, theta_on, theta_off).adjoint(centre, *grads)

@@ -1,0 +1,40 @@
+"""Threads that compute gradients at once give what one after the other gives; what was forked says what to do."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+FORKED = """
+import os, torch
+from codesign import lens, render
+from codesign.exclusive import exclusive
+camera = render.Camera(lens.load("cooke-triplet").scaled(0.22), 4, 4, 0.2, 4)
+camera.rays()
+child = os.fork()
+if child == 0:
+    try:
+        with exclusive:
+            pass
+    except Exception as error:
+        os._exit(7 if "spawn" in str(error) else 1)
+    os._exit(2)
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+def test_many_threads_with_gradients_equal_serial_ones():
+    script = "from tests.hostile.threads import *; print(max(run(8, 1, ('traced', 'estimated', 'counted')).values()))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    # sums of doubles, in an order that drjit's own threads choose
+    assert float(done.stdout) < 1e-9
+
+
+def test_a_process_forked_after_the_first_kernel_is_told_to_spawn():
+    done = subprocess.run(
+        [sys.executable, "-c", FORKED], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.stdout.strip() == "7", done.stderr[-2000:]
