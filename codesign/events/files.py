@@ -13,6 +13,7 @@ from codesign.events.formats.npz import read_npz, write_npz
 from codesign.events.formats.raw import read_raw, write_raw
 from codesign.events.formats.text import read_csv, write_csv
 from codesign.events.stream import check_stream
+from codesign.reading import check_regular, reading
 from codesign.types import EventStream
 
 READERS = {
@@ -35,6 +36,7 @@ WRITERS = {
     ".npz": write_npz,
     ".raw": write_raw,
 }
+MOST_SIDE_PX = 2**15
 OPTIONS = {"evt": (".raw",), "t0_us": (".dat", ".raw")}  # of the writers, and who knows them
 
 
@@ -63,12 +65,15 @@ def read(path: str | Path, *, height_px: int | None = None, width_px: int | None
         if size is not None:
             check_whole(size, name, 1)
     reader = _choose(READERS, path, "read")
-    if not path.is_file():
-        raise FileFormatError(f"no event file at {path}; check the path.")
-    try:
-        return reader(path, height_px, width_px)
-    except OSError as error:
-        raise FileFormatError(f"cannot read {path}: {error.strerror or error}.") from error
+    check_regular(path)
+    with reading(path):
+        stream = reader(path, height_px, width_px)
+    if not max(stream.height_px, stream.width_px) <= MOST_SIDE_PX:
+        raise FileFormatError(
+            f"{path} gives a sensor of {stream.width_px} x {stream.height_px} pixels; at most {MOST_SIDE_PX} a side are "
+            "read."
+        )
+    return stream
 
 
 def write(path: str | Path, stream: EventStream, *, evt: int | None = None, t0_us: int | None = None) -> None:

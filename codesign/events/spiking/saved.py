@@ -2,13 +2,14 @@
 
 import io
 import json
-import zipfile
-from pathlib import Path
 
 import numpy as np
 import torch
 
+from codesign.arrays import read_npz
+from codesign.atomic import write_atomic
 from codesign.errors import CodesignError, FileFormatError
+from codesign.reading import reading
 
 SETTINGS = "settings"
 
@@ -21,7 +22,7 @@ def write_generator(path, settings, parameters):
         **{SETTINGS: np.array(json.dumps(settings))},
         **{name: value.detach().cpu().numpy() for name, value in parameters.items()},
     )
-    Path(path).write_bytes(buffer.getvalue())
+    write_atomic(path, buffer.getvalue())
 
 
 def read_generator(path, kind):
@@ -30,30 +31,17 @@ def read_generator(path, kind):
     Raises: FileFormatError when the file is missing, damaged, or holds other parameters than the settings ask
       for.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileFormatError(
-            f"the generator '{path}' is not there; give the .npz file that SpikeEsim.save wrote."
-        )
+    remedy = "give the .npz file that SpikeEsim.save wrote"
+    stored = read_npz(path, remedy)
+    with reading(f"'{path}'", remedy):
+        settings = json.loads(str(stored.pop(SETTINGS)))
+        parameters = {name: torch.from_numpy(values) for name, values in stored.items()}
     try:
-        with np.load(path, allow_pickle=False) as data:
-            settings = json.loads(str(data[SETTINGS]))
-            parameters = {name: torch.from_numpy(data[name]) for name in data.files if name != SETTINGS}
-        generator = kind(**settings)
-        generator.load_state_dict(parameters)
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        RuntimeError,
-        zipfile.BadZipFile,
-        CodesignError,
-    ) as error:
-        reason = " ".join(str(error).split())
-        raise FileFormatError(
-            f"'{path}' holds no generator ({reason[:120]}); give the .npz file that SpikeEsim.save wrote."
-        ) from error
+        with reading(f"'{path}'", remedy):
+            generator = kind(**settings)
+            generator.load_state_dict(parameters)
+    except CodesignError as error:
+        raise FileFormatError(f"'{path}' holds no generator ({error}); {remedy}.") from error
     for name, value in parameters.items():
         if not bool(value.isfinite().all()):
             raise FileFormatError(
