@@ -5,6 +5,7 @@ import runpy
 import sys
 
 import codesign
+from codesign.interrupt import written_out
 
 EXAMPLES = """
 for example:
@@ -16,6 +17,11 @@ for example:
 
 def main(arguments: list[str] | None = None) -> int:
     """Parse the command line and run it. Returns the exit code; a study ends by itself (SystemExit)."""
+    with written_out():
+        return _main(arguments)
+
+
+def _main(arguments):
     parser = argparse.ArgumentParser(
         prog="codesign",
         description="Differentiable co-design of a lens, its mount, an event camera and event flow.",

@@ -2,12 +2,15 @@
 
 import contextlib
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from codesign.errors import FileFormatError
+
+UNFINISHED = re.compile(r"\..*-[a-z0-9_]{8}(\.[^.]*)?")  # a name of ``replacing``
 
 
 @contextmanager
@@ -44,6 +47,14 @@ def replacing(path: str | Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
     with contextlib.suppress(OSError):  # some file systems cannot sync a folder; the file itself is whole
         _sync(path.parent, os.O_RDONLY)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove what ``replacing`` left in a folder, and below, when its process was killed; for a folder that no other
+    process writes to."""
+    for path in folder.rglob(".*"):
+        if UNFINISHED.fullmatch(path.name) and path.is_file():
+            path.unlink(missing_ok=True)
 
 
 def write_atomic(path: str | Path, content: bytes) -> None:

@@ -20,6 +20,7 @@ from codesign.errors import DomainError, FileFormatError
 
 INDENT = 2
 MOST_LINES = 10_000
+DEEPEST = 20  # levels
 KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 WORD = re.compile(r"(\.{0,2}/)*[A-Za-z_][A-Za-z0-9_/.-]*")  # text that needs no quotes
 OTHERS = re.compile(
@@ -94,7 +95,7 @@ def load(text: str) -> dict[str, Any]:
         level, odd = divmod(len(line) - len(body), INDENT)
         key, colon, value = body.partition(":")
         deepest = len(open_pages) - 1
-        if odd or level > deepest or (awaited and level != deepest):
+        if odd or level > min(deepest, DEEPEST) or (awaited and level != deepest):
             raise _bad(number, line, "indent by two spaces a level, below a key that ends with a colon")
         if not KEY.fullmatch(key) or not colon or (value and not value.startswith(" ")):
             raise _bad(number, line, "write 'key: value', the key in letters, digits and _")

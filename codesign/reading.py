@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from codesign.errors import CodesignError, FileFormatError
+from codesign.errors import CodesignError, DomainError, FileFormatError, ShapeError
 
 MOST_BYTES = 2**33  # of an array that a header announces; larger ones are read in pieces
 
@@ -33,6 +33,17 @@ def reading(what: str | Path, remedy: str = "it is damaged, or of another kind")
         said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         said = " ".join(said.split())[:160] or type(error).__name__
         raise FileFormatError(f"{what} cannot be read ({said}); {remedy}.") from error
+
+
+@contextmanager
+def building(what: str | Path, remedy: str = "it is damaged, or of another version") -> Iterator[None]:
+    """As ``reading``, around classes that are made of a file's values: their refusals name the file too."""
+    try:
+        with reading(what, remedy):
+            yield
+    except (DomainError, ShapeError, FileFormatError) as error:
+        said = " ".join(str(error).split())
+        raise FileFormatError(said if said.startswith(str(what)) else f"{what}: {said}") from error
 
 
 def open_regular(path: str | Path, most_bytes: int | None = None) -> BinaryIO:
@@ -72,9 +83,16 @@ def read_bytes(path: str | Path, most_bytes: int) -> bytes:
 
 def read_json(path: str | Path, most_bytes: int = 50_000_000) -> Any:
     """What a file of JSON in UTF-8 holds. Raises: FileFormatError where it is none, or nested without end."""
-    content = read_bytes(path, most_bytes)
+    text = read_text(path, most_bytes)
     with reading(path, "it is no whole JSON file"):
-        return json.loads(content.decode("utf-8"))
+        return json.loads(text)
+
+
+def read_text(path: str | Path, most_bytes: int = 50_000_000) -> str:
+    """The text of a regular file in UTF-8. Raises: FileFormatError, as ``open_regular``, and where it is no text."""
+    content = read_bytes(path, most_bytes)
+    with reading(path, "it is no text in UTF-8"):
+        return content.decode("utf-8").replace("\r\n", "\n")
 
 
 def check_room(

@@ -2,7 +2,6 @@
 
 import io
 import json
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from codesign.arrays import read_npz
 from codesign.atomic import write_atomic
-from codesign.errors import FileFormatError, ShapeError
+from codesign.errors import ShapeError
+from codesign.reading import reading
 
 
 @dataclass(frozen=True)
@@ -51,15 +52,12 @@ def read_state(path: Path) -> State | None:
     """
     if not path.exists():
         return None
-    try:
-        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as stored:
-            header = json.loads(stored["header"].tobytes())
-            tensors = {
-                name: torch.from_numpy(stored[f"tensor_{index}"])
-                for index, name in enumerate(header["names"])
-            }
-        return State(tensors, header["numbers"])
-    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise FileFormatError(
-            f"'{path}' is not a state file of a run ({error}); remove it to start from the beginning."
-        ) from error
+    remedy = "it is not a state file of a run; remove it to start from the beginning"
+    stored = read_npz(path, remedy)
+    with reading(path, remedy):
+        header = json.loads(stored["header"].tobytes())
+        names, numbers = list(header["names"]), dict(header["numbers"])
+        return State(
+            {str(name): torch.from_numpy(stored[f"tensor_{index}"]) for index, name in enumerate(names)},
+            numbers,
+        )

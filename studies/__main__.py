@@ -1,6 +1,8 @@
 """`python -m studies`: the studies there are, each with its question."""
 
+from codesign.interrupt import written_out
 from studies.frame import listing
 
 if __name__ == "__main__":
-    print(listing.show())
+    with written_out():
+        print(listing.show())

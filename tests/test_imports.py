@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     {"errors"},
     {"types", "optional", "reading", "exclusive"},
-    {"pose", "backend", "atomic", "plain_yaml", "interrupt", "grad"},
+    {"pose", "arrays", "backend", "atomic", "plain_yaml", "interrupt", "grad"},
     {"state"},
     {"lens", "render", "events", "place"},  # none imports another: what one needs is passed in
     {"flow"},

@@ -13,7 +13,7 @@ from codesign.events.formats.npz import read_npz, write_npz
 from codesign.events.formats.raw import read_raw, write_raw
 from codesign.events.formats.text import read_csv, write_csv
 from codesign.events.stream import check_stream
-from codesign.reading import check_regular
+from codesign.reading import check_regular, reading
 from codesign.types import EventStream
 
 READERS = {
@@ -36,6 +36,7 @@ WRITERS = {
     ".npz": write_npz,
     ".raw": write_raw,
 }
+MOST_SIDE_PX = 2**15
 OPTIONS = {"evt": (".raw",), "t0_us": (".dat", ".raw")}  # of the writers, and who knows them
 
 
@@ -64,7 +65,15 @@ def read(path: str | Path, *, height_px: int | None = None, width_px: int | None
         if size is not None:
             check_whole(size, name, 1)
     reader = _choose(READERS, path, "read")
-    return reader(check_regular(path), height_px, width_px)
+    check_regular(path)
+    with reading(path):
+        stream = reader(path, height_px, width_px)
+    if not max(stream.height_px, stream.width_px) <= MOST_SIDE_PX:
+        raise FileFormatError(
+            f"{path} gives a sensor of {stream.width_px} x {stream.height_px} pixels; at most {MOST_SIDE_PX} a side are "
+            "read."
+        )
+    return stream
 
 
 def write(path: str | Path, stream: EventStream, *, evt: int | None = None, t0_us: int | None = None) -> None:

@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 import safetensors.torch
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from torch import Tensor, nn
 
 from codesign.atomic import replacing
-from codesign.errors import CodesignError, DomainError, FileFormatError
+from codesign.errors import DomainError, FileFormatError
 from codesign.flow.checks import check_kind, check_path
+from codesign.reading import building, check_regular, reading
 
 if TYPE_CHECKING:
     from codesign.flow.baselines import ECN, FlowNetEvents, IDNet, SpikeFlowNet
@@ -174,13 +175,8 @@ def build(stored: NetworkFile, path: str | Path, kind: Callable[..., Any] | None
     own = getattr(kind, "__qualname__", None)
     if kind is not None and own != stored.network.partition(":")[2]:
         raise FileFormatError(f"'{path}' holds a network '{stored.network}', not a {own}; give its class.")
-    try:
+    with building(f"'{path}'", f"it was written by another version of the network '{stored.network}'"):
         network = (kind or network_class(stored.network))(**stored.config)
-    except (CodesignError, TypeError) as error:
-        raise FileFormatError(
-            f"'{path}' cannot be built as '{stored.network}' ({error}); it was written by another version "
-            "of this network."
-        ) from error
     fill(network, stored.weights, path)
     return network
 
@@ -226,24 +222,17 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises: FileFormatError when the file is missing, cut short, changed, or of another version.
     """
     path = check_path(path, "the path of a network file")
-    if not path.is_file():
-        raise FileFormatError(
-            f"'{path}' does not exist or is no file; give the path of a .safetensors file that a training "
-            "run wrote."
-        )
-    try:
-        with safe_open(str(path), framework="pt") as stored:
-            header = json.loads((stored.metadata() or {})["codesign"])
-            tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118  no mapping
+    check_regular(path)
+    with (
+        reading(f"'{path}'", "it is damaged or not written by codesign; train or copy it again"),
+        safe_open(str(path), framework="pt") as stored,
+    ):
+        header = json.loads((stored.metadata() or {})["codesign"])
+        tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118  no mapping
         digest = header["sha256"]
         text = header["content"]
         content = json.loads(text)
         version = content["version"]
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
-        raise FileFormatError(
-            f"'{path}' is damaged or not written by codesign ({type(error).__name__}: {error}); train or "
-            "copy it again."
-        ) from error
     if version != VERSION:
         raise FileFormatError(
             f"'{path}' has format version {version}, this codesign reads version {VERSION}; train it again, "

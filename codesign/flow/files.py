@@ -18,6 +18,7 @@ import torch
 from codesign.atomic import replacing
 from codesign.errors import DomainError, FileFormatError, ShapeError
 from codesign.flow.checks import check_mask, check_path, check_real
+from codesign.reading import read_bytes, reading
 
 SCALE = 128.0
 OFFSET = 2**15
@@ -73,12 +74,7 @@ def read_flow(path: str | Path) -> tuple[torch.Tensor, torch.Tensor]:
     """
     path = check_path(path, "the path of a flow file")
     decode = _choose({".png": _from_png, ".flo": _from_flo}, path, "read")
-    try:
-        if path.stat().st_size > MOST_BYTES:
-            raise FileFormatError(f"{path} has {path.stat().st_size} bytes; at most {MOST_BYTES} are read.")
-        content = path.read_bytes()
-    except OSError as error:
-        raise FileFormatError(f"cannot read the flow file {path}: {error.strerror}.") from error
+    content = read_bytes(path, MOST_BYTES)
     flow, valid = decode(path, content)
     return torch.from_numpy(np.where(valid, flow, 0).astype(np.float32)), torch.from_numpy(valid)
 
@@ -169,11 +165,8 @@ def _from_png(path, content):
     if not 1 <= width * height <= MOST_PIXELS:
         raise FileFormatError(f"{path} announces {width} x {height} pixels; up to {MOST_PIXELS} are read.")
     size = height * (1 + 6 * width)
-    try:
-        unpacker = zlib.decompressobj()
-        raw = unpacker.decompress(b"".join(packed), size + 1)
-    except zlib.error as error:
-        raise FileFormatError(f"{path} is damaged: its pixels do not unpack ({error}).") from error
+    with reading(path, "it is damaged: its pixels do not unpack"):
+        raw = zlib.decompressobj().decompress(b"".join(packed), size + 1)
     if len(raw) != size:
         raise FileFormatError(
             f"{path} is damaged: {width} x {height} pixels need {size} bytes, it holds "

@@ -14,11 +14,13 @@ from torch import Tensor
 from codesign import lens as lenses
 from codesign import plain_yaml, render
 from codesign.atomic import write_atomic
-from codesign.errors import CodesignError, DomainError, FileFormatError
+from codesign.errors import DomainError, FileFormatError
 from codesign.events import SensorModel
 from codesign.place import Mount, yaw_pitch_roll_rad
+from codesign.reading import building, read_bytes, read_text
 
 FORMAT = "codesign mount 1"
+MOST_BYTES = 50_000_000  # of a lens file
 AGREES = 1e-9  # metres, and entries of the rotation, between the transform and the mount's own numbers
 COMMENT = """Pose of a camera on a robot, p_parent = R p_child + t: metres, unit quaternion (x, y, z, w).
 Axes of the parent as in REP 103: x forward, y left, z up. The child is an optical frame (suffix _optical_frame): z along
@@ -54,8 +56,7 @@ def save_hand_over(path: str | Path, handed: HandOver) -> None:
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise FileFormatError(f"hand-over {path}: extension '{path.suffix}' is not written; use .yaml.")
     for name in (handed.parent_frame, handed.child_frame):
-        if not name or not isinstance(name, str):
-            raise DomainError(f"hand-over: a frame is named {name!r}; give a name such as 'base_link'.")
+        _check_frame(name)
     pose = handed.mount().detach()
     camera = handed.camera
     page: dict[str, Any] = {"format": FORMAT, "transform": _transform(pose, handed)}
@@ -85,33 +86,29 @@ def load_hand_over(path: str | Path) -> HandOver:
     Raises: FileFormatError, in a sentence that names what is missing, unknown or at odds.
     """
     path = Path(path)
-    try:
-        page = plain_yaml.load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"hand-over {path}: it cannot be read ({error}); give a .yaml file.") from error
-    except FileFormatError as error:
-        raise FileFormatError(f"hand-over {path}: {error}") from error
-    if page.get("format") != FORMAT:
-        raise FileFormatError(
-            f"hand-over {path}: it has no line 'format: \"{FORMAT}\"'; write it with save_hand_over."
-        )
-    try:
+    with building(f"hand-over {path}", "give a .yaml file that save_hand_over wrote"):
+        page = plain_yaml.load(read_text(path))
+        if page.get("format") != FORMAT:
+            raise FileFormatError(f"it has no line 'format: \"{FORMAT}\"'; write it with save_hand_over.")
+        missing = [name for name in ("transform", "camera", "lens") if not isinstance(page.get(name), dict)]
+        if missing:
+            raise FileFormatError(f"the entry '{missing[0]}' is missing; write it anew.")
         transform = page["transform"]
+        frames = [transform.get(name) for name in ("parent_frame", "child_frame")]
+        for name in frames:
+            _check_frame(name)
         return HandOver(
             _mount(page, _pose(transform)),
             _camera(page["camera"], _lens(page["lens"], path)),
             SensorModel(**page["sensor"]) if "sensor" in page else None,
-            transform["parent_frame"],
-            transform["child_frame"],
+            *frames,
             page.get("notes", {}),
         )
-    except CodesignError as error:
-        raise FileFormatError(f"hand-over {path}: {error}") from error
-    except KeyError as error:
-        raise FileFormatError(f"hand-over {path}: the entry {error} is missing; write it anew.") from error
-    except (TypeError, ValueError, RuntimeError) as error:  # entries of other kinds than the classes take
-        said = " ".join(str(error).split())[:120]
-        raise FileFormatError(f"hand-over {path}: an entry is not as it should be ({said}).") from error
+
+
+def _check_frame(name):
+    if not name or not isinstance(name, str):
+        raise DomainError(f"hand-over: a frame is named {name!r}; give a name such as 'base_link'.")
 
 
 def _transform(pose, handed):
@@ -191,7 +188,7 @@ def _lens(page, path):
 
 
 def _digest(file):
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+    return hashlib.sha256(read_bytes(file, MOST_BYTES)).hexdigest()
 
 
 def _camera(page, lens):
@@ -200,6 +197,9 @@ def _camera(page, lens):
     if film.get("windows_px") is not None:
         film["windows_px"] = tuple(tuple(window) for window in film["windows_px"])
     rest = {name: value for name, value in page.items() if name not in names}
+    for name in ("falloff", "aim"):
+        if not isinstance(rest.get(name, False), bool):
+            raise DomainError(f"{name} is {rest[name]!r}; true or false is needed.")
     spectrum = None
     if "wavelengths_um" in rest:
         spectrum = lenses.Spectrum(tuple(rest.pop("wavelengths_um")), tuple(rest.pop("weights")))

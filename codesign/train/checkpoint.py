@@ -11,6 +11,7 @@ import torch
 from codesign.atomic import write_atomic
 from codesign.errors import FileFormatError
 from codesign.flow import checkpoint
+from codesign.reading import read_json, reading
 from codesign.train.learner import Learner
 from codesign.train.loop import Progress
 
@@ -55,12 +56,10 @@ def load(folder: Path, learner: Learner, facts: dict[str, Any]) -> Progress | No
     path = folder / "checkpoint.json"
     if not path.exists():
         return None
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
+    stored = read_json(path)
+    with reading(f"'{path}'", "start a new run"):
         version = stored["version"]
         file = str(stored["tensors"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise _damaged(path, error) from error
     if version != VERSION:
         raise FileFormatError(
             f"'{path}' has format version {version}, this codesign reads version {VERSION}; go on with the "
@@ -70,11 +69,19 @@ def load(folder: Path, learner: Learner, facts: dict[str, Any]) -> Progress | No
     if Path(file).name != file:
         raise FileFormatError(f"'{path}' names a file outside its folder ('{file}'); start a new run.")
     tensors, content = checkpoint.read_tensors(folder / file)
-    try:
-        progress = Progress(**stored["progress"])
+    with reading(f"'{path}'", "start a new run"):
+        numbers = {name: stored["progress"][name] for name in NUMBERS}
+        wrong = [
+            name
+            for name, value in numbers.items()
+            if name != "validation" and (isinstance(value, bool) or not isinstance(value, int | float))
+        ]
+        if wrong or not isinstance(numbers["validation"], list):
+            raise FileFormatError(
+                f"'{path}' is damaged ({', '.join(wrong or ['validation'])}); start a new run."
+            )
+        progress = Progress(**numbers)
         curves = {name: tensors.pop(f"curve/{name}").tolist() for name in CURVES}
-    except (KeyError, TypeError) as error:
-        raise _damaged(path, error) from error
     if content.get("step") != progress.step:
         raise FileFormatError(f"'{path}' and '{file}' are of different steps; start a new run.")
     learner.load_state_dict(tensors, folder / file)
@@ -96,7 +103,3 @@ def _check_facts(path, stored, facts):
         raise FileFormatError(
             f"'{path}' was written with {name} {earlier}, this run has {value}; start a new run."
         )
-
-
-def _damaged(path, error):
-    return FileFormatError(f"'{path}' is damaged ({type(error).__name__}: {error}); start a new run.")

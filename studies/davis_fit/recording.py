@@ -8,9 +8,11 @@ import torch
 from torch import Tensor
 
 from codesign import events
+from codesign.arrays import open_npz
 from codesign.errors import FileFormatError, ShapeError
 from codesign.events.formats.aedat4_frames import read_frames
 from codesign.events.stream import ordered
+from codesign.reading import reading
 from codesign.types import EventStream
 
 PLACE = Path("shared") / "data" / "davis346_newton_cradle" / "demo-01.npz"
@@ -75,22 +77,16 @@ def load(path):
 
 
 def _read_npz(path):
-    try:
-        with np.load(path) as data:
-            missing = [name for name in ENTRIES if name not in data]
-            if missing:
-                raise FileFormatError(
-                    f"'{path}' has no entry {missing[0]!r}; a recording holds {', '.join(ENTRIES)}."
-                )
-            t_us, x, y, p, frames, exposure_us = (
-                torch.from_numpy(np.ascontiguousarray(data[name])) for name in ENTRIES
+    with open_npz(path) as data:
+        missing = [name for name in ENTRIES if name not in data]
+        if missing:
+            raise FileFormatError(
+                f"'{path}' has no entry {missing[0]!r}; a recording holds {', '.join(ENTRIES)}."
             )
-    except (OSError, ValueError, TypeError) as error:
-        if isinstance(error, FileFormatError):
-            raise
-        raise FileFormatError(
-            f"'{path}' is not a recording in NumPy's format ({error}); give an .aedat4 or .npz file."
-        ) from error
+        with reading(path, "give an .aedat4 or .npz file"):
+            t_us, x, y, p, frames, exposure_us = (
+                torch.from_numpy(np.ascontiguousarray(data.read(name))) for name in ENTRIES
+            )
     if frames.ndim != 3 or exposure_us.shape != (len(frames), 2):
         raise FileFormatError(
             f"'{path}' has frames {list(frames.shape)} and exposure {list(exposure_us.shape)}; [T, H, W] "

@@ -12,6 +12,9 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
 
 from codesign.errors import DomainError, FileFormatError
+from codesign.reading import building, read_json
+
+UNIONS = (typing.Union, types.UnionType)
 
 
 @dataclass(frozen=True)
@@ -52,14 +55,13 @@ def read_config(path: Path, study: str, kind: type[Config]) -> Config:
 
     Raises: FileFormatError when it is missing, malformed, or of another study or version of it.
     """
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        owner = stored.pop("study")
-    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+    with building(f"'{path.parent}' is not a run that can be resumed"):
+        stored = read_json(path)
+    owner = stored.pop("study", None) if isinstance(stored, dict) else None
+    if not isinstance(owner, str):
         raise FileFormatError(
-            f"'{path.parent}' is not a run that can be resumed (its config.json is missing or malformed); "
-            "give the folder of an interrupted run."
-        ) from error
+            f"'{path}' is no configuration of a run; give the folder of an interrupted run."
+        )
     if owner != study:
         raise FileFormatError(
             f"'{path.parent}' is a run of the study '{owner}', not of '{study}'; resume it with: "
@@ -72,7 +74,7 @@ def read_config(path: Path, study: str, kind: type[Config]) -> Config:
             f"{', '.join(sorted(known ^ set(stored)))}); start a new run."
         )
     hints = typing.get_type_hints(kind)
-    return kind(**{name: _typed(value, hints[name]) for name, value in stored.items()})
+    return kind(**{name: _typed(path, name, value, hints[name]) for name, value in stored.items()})
 
 
 def resume_command(study: str, folder: Path) -> str:
@@ -131,11 +133,23 @@ def _plain(name, value) -> Any:
     )
 
 
-def _typed(value, hint) -> Any:
-    kinds = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
-    if isinstance(value, str) and Path in kinds:
-        return Path(value)
-    if isinstance(value, list):
-        entry = next((typing.get_args(kind)[0] for kind in kinds if typing.get_args(kind)), object)
-        return tuple(_typed(each, entry) for each in value)
-    return value
+def _typed(path, name, value, hint) -> Any:
+    """A value of config.json as the field wants it."""
+    for kind in typing.get_args(hint) if typing.get_origin(hint) in UNIONS else (hint,):
+        origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+        if origin is Literal and value in arguments and type(value) in map(type, arguments):
+            return value
+        if kind is Path and isinstance(value, str):
+            return Path(value)
+        if kind is float and type(value) is int:
+            return float(value) if abs(value) < 2**53 else value
+        if origin is tuple and isinstance(value, list):
+            wanted = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else arguments
+            if len(wanted) == len(value):
+                return tuple(_typed(path, name, *each) for each in zip(value, wanted, strict=True))
+        if type(value) is kind or (kind is type(None) and value is None):
+            return value
+    raise FileFormatError(
+        f"'{path}': {name} is {json.dumps(value)[:80]}, which is no {getattr(hint, '__name__', hint)}; it was changed or "
+        "is damaged: start a new run."
+    )

@@ -1,13 +1,23 @@
 """The folder of a run: made fresh, or found again; never a folder that holds anything else."""
 
-import json
+import contextlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
 from codesign.atomic import write_atomic
-from codesign.errors import CodesignError
+from codesign.errors import CodesignError, FileFormatError
+from codesign.reading import read_json
 from studies.frame.config import resume_command
 
+try:
+    import fcntl
+except ImportError:  # Windows has no such locks: two processes in one folder are not told apart there
+    fcntl = None
+
+LOCK = ".lock"
 REMEDY = "choose a folder you may write to with --out"
 
 
@@ -18,7 +28,9 @@ def fresh(study: str, out: Path | None):
     """
     folder = out or _timed(Path("runs") / study)
     try:
-        holds = sorted(entry.name for entry in folder.iterdir()) if folder.exists() else []
+        holds = (
+            sorted(entry.name for entry in folder.iterdir() if entry.name != LOCK) if folder.exists() else []
+        )
     except OSError as error:
         raise CodesignError(
             f"the output folder '{folder}' cannot be read ({error.strerror}); {REMEDY}."
@@ -48,10 +60,44 @@ def fresh(study: str, out: Path | None):
 def owner(folder: Path):
     """Name of the study whose run ``folder`` holds, or None."""
     try:
-        stored = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        stored = read_json(folder / "config.json")
+    except FileFormatError:
         return None
     return stored.get("study") if isinstance(stored, dict) else None
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Hold a run's folder for this process: the lock ends with the process, however that ends.
+
+    Raises: CodesignError when another process holds it.
+    """
+    path = folder / LOCK
+    if fcntl is None:
+        yield
+        return
+    while True:
+        try:
+            handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        except OSError as error:
+            raise CodesignError(f"'{folder}' cannot be written ({error.strerror}); {REMEDY}.") from error
+        try:
+            # a record lock: workers that outlive a killed run do not inherit it
+            fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(handle)
+            raise CodesignError(
+                f"another process works on the run in '{folder}'; wait for it, or stop it first."
+            ) from error
+        with contextlib.suppress(FileNotFoundError):  # removed by the one who held it: take the new one
+            if os.fstat(handle).st_ino == path.stat().st_ino:
+                break
+        os.close(handle)
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        os.close(handle)
 
 
 def _timed(parent: Path):

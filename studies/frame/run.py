@@ -14,7 +14,9 @@ A study is a function of a Run and a frozen dataclass:
         sys.exit(main(study, Config))
 """
 
+import contextlib
 import dataclasses
+import hashlib
 import inspect
 import io
 import json
@@ -33,9 +35,10 @@ import tyro
 from rich.console import Console
 
 from codesign import backend, state
-from codesign.atomic import write_atomic
+from codesign.atomic import remove_unfinished, write_atomic
 from codesign.errors import CodesignError, DomainError, FileFormatError, NonFiniteError
-from codesign.interrupt import Interruption
+from codesign.interrupt import Interruption, written_out
+from codesign.reading import read_json
 from codesign.report import page, prose
 from studies.frame import folder as folders
 from studies.frame import machine
@@ -45,6 +48,7 @@ from studies.frame.progress import Pace, StepProgress
 __all__ = ["Run", "StudyConfig", "main", "open_run"]
 
 RESERVED = ("versions", "hardware")
+VERSION = 2  # of the frame's part of state.npz
 TIMES = "times"  # of the frame itself, among the numbers of state.npz
 
 
@@ -74,6 +78,7 @@ class Run(Generic[Config]):
         self._console = Console(highlight=False)
         self._interruption = interruption or Interruption()
         self._machine = {"versions": machine.versions(), "hardware": machine.hardware()}
+        self._identity = {"version": VERSION, "study": study, "configuration": _digest(study, config)}
         self._cards: list[page.Card] = []
         self._sections = [page.Section("")]
         self._paces: dict[str, Pace] = {}
@@ -129,7 +134,9 @@ class Run(Generic[Config]):
             "loops": {name: pace.to_json() for name, pace in self._paces.items()},
             "commit": self._machine["versions"]["commit"],
         }
-        state.write_state(self.folder / "state.npz", tensors, {"numbers": numbers, TIMES: times})
+        state.write_state(
+            self.folder / "state.npz", tensors, {"numbers": numbers, TIMES: times, **self._identity}
+        )
 
     def load_state(self):
         """State(tensors, numbers) stored by an earlier session, on the CPU; None for a fresh run.
@@ -212,27 +219,42 @@ class Run(Generic[Config]):
     def _stored(self):
         path = self.folder / "state.npz"
         stored = state.read_state(path)
-        if stored is not None and stored.numbers.keys() != {"numbers", TIMES}:
-            raise FileFormatError(f"'{path}' was written by another version of this study; start a new run.")
+        if stored is None:
+            return None
+        made_by = {name: stored.numbers.get(name) for name in self._identity}
+        if made_by != self._identity or stored.numbers.keys() != {"numbers", TIMES, *made_by}:
+            other = next((name for name in made_by if made_by[name] != self._identity[name]), "version")
+            raise FileFormatError(
+                f"'{path}' was written by another {other} ({made_by[other]}, not {self._identity[other]}); start a new run."
+            )
         return stored
 
     def _show(self, kind, block):
         self._sections[-1].blocks.append((kind, block))
 
 
-def open_run(study: str, config: Config, interruption: Interruption | None = None) -> Run[Config]:
+def open_run(
+    study: str,
+    config: Config,
+    interruption: Interruption | None = None,
+    held: contextlib.ExitStack | None = None,
+) -> Run[Config]:
     """Make the folder of a new run and write its config.json, or find the run that ``config.resume`` names,
-    which goes on with its stored configuration.
+    which goes on with its stored configuration; what a killed session left half written is removed there. No other
+    process may work in the folder until ``held`` ends.
 
     Raises: CodesignError with one sentence when the folder, the stored configuration or the device is unfit.
     """
     if config.resume is not None:
         stored = read_config(config.resume / "config.json", study, type(config))
+        _hold(config.resume, held)
+        remove_unfinished(config.resume)
         return Run(study, stored, config.resume, _device(stored.device), True, interruption)
     device = _device(config.device)
     config = dataclasses.replace(config, device=device.type)  # the same device when the run is resumed
     text = to_json(study, config)
     folder = folders.fresh(study, config.out)
+    _hold(folder, held)
     write_atomic(folder / "config.json", text.encode())
     return Run(study, config, folder, device, False, interruption)
 
@@ -240,8 +262,8 @@ def open_run(study: str, config: Config, interruption: Interruption | None = Non
 def main(study: Callable[[Run[Config]], None], kind: type[Config], arguments: list[str] | None = None) -> int:
     """Run a study from its command line.
 
-    Returns: exit code: 0 done, 2 bad input (one clear line on stderr), 130 interrupted (with the line to go
-      on).
+    Returns: exit code: 0 done, 2 bad input (one clear line on stderr), 130 interrupted, 143 ended by SIGTERM
+      (both with the line to go on).
     Raises: SystemExit from the command line itself (0 for --help, 2 for a wrong option).
     """
     name = _name(kind)
@@ -262,18 +284,32 @@ def main(study: Callable[[Run[Config]], None], kind: type[Config], arguments: li
         # 2x)
     )
     run = None
+    interruption = Interruption()
     try:
-        with Interruption() as interruption:
-            run = open_run(name, resolved(name, kind, parse), interruption)
-            study(run)
+        with written_out(), interruption:
+            config = resolved(name, kind, parse)
+            with contextlib.ExitStack() as held:
+                run = open_run(name, config, interruption, held)
+                study(run)
     except CodesignError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         again = f"; go on with: {resume_command(name, run.folder)}" if run else ""
         print(f"interrupted{again}", file=sys.stderr)
-        return 130
+        return interruption.exit_code
     return 0
+
+
+def _hold(folder, held):
+    if held is not None:
+        held.enter_context(folders.held(folder))
+
+
+def _digest(study, config):
+    """Of what a state belongs to, but for the place of its folder."""
+    stored = json.loads(to_json(study, dataclasses.replace(config, out=None, resume=None)))
+    return hashlib.sha256(json.dumps(stored, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _name(kind):
@@ -309,8 +345,12 @@ def _metric(name, value):
 
 
 def _read_metrics(path):
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-        return {name: value for name, value in stored.items() if name not in RESERVED}
-    except (OSError, ValueError, AttributeError) as error:
-        raise FileFormatError(f"'{path}' is damaged ({error}); remove it to go on with this run.") from error
+    stored = read_json(path)
+    numbers = (
+        {name: value for name, value in stored.items() if name not in RESERVED}
+        if isinstance(stored, dict)
+        else {}
+    )
+    if not isinstance(stored, dict) or not all(type(value) in (int, float) for value in numbers.values()):
+        raise FileFormatError(f"'{path}' is damaged; remove it to go on with this run.")
+    return numbers

@@ -11,7 +11,6 @@ Random lenses with objects at 0.2 to 5 m follow: every figure of the analysis, o
 against a long-double lens that shares no code with ours (longdouble.py).
 """
 
-import json
 import math
 import sys
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ import torch
 from codesign import lens
 from codesign.errors import DomainError, FileFormatError
 from codesign.lens.seidel import seidel_sums
+from codesign.reading import read_json, reading
 from studies.frame.run import Run, StudyConfig, main
 from studies.lens_accuracy.near import NEAR_ASKED, near_objects, show_near_objects
 
@@ -108,18 +108,9 @@ def default_folder():
 
 def read_page(path):
     """A reference file as a dictionary. Raises: FileFormatError when it is missing or not such a file."""
-    try:
-        page = json.loads(Path(path).read_text(encoding="utf-8"))
+    page = read_json(path)
+    with reading(path, "name a folder of lens references with --references"):
         missing = {"wavelengths_um", "rays", "spots", "first_order", "ray_parameter_gradients_d"} - set(page)
-    except OSError as error:
-        raise FileFormatError(
-            f"the lens references are not there ('{path}': {error.strerror}); name their folder with "
-            "--references."
-        ) from error
-    except (ValueError, TypeError) as error:
-        raise FileFormatError(
-            f"'{path}' is not a file of lens references ({error}); name their folder with --references."
-        ) from error
     if missing:
         raise FileFormatError(
             f"'{path}' lacks {', '.join(sorted(missing))}; name a folder of lens references with "

@@ -10,11 +10,11 @@ held-out cases: textures and motions that neither saw, walls 0.3 to 5 m away.
 import json
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 from codesign.atomic import write_atomic
-from codesign.errors import DomainError, FileFormatError
+from codesign.errors import DomainError
+from codesign.reading import read_json, reading
 from studies.frame.run import Run, StudyConfig, main
 from studies.lens_trade import page
 from studies.lens_trade.sweep import Effort, chain_job, lens_file, point_job, run_jobs
@@ -122,11 +122,9 @@ def _earlier(run, config):
         return stored.numbers["rows"]
     if not config.raw:
         return {}
-    try:
-        rows = json.loads(Path(config.raw).read_text())
+    rows = read_json(config.raw)
+    with reading(f"--raw {config.raw}", "it is no raw table of this study"):
         return {_key(row["trade"], row["at"]): row for row in rows.values()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise FileFormatError(f"--raw {config.raw} is no raw table of this study ({error}).") from error
 
 
 def _key(name, at):

@@ -18,9 +18,9 @@ import numpy as np
 import torch
 
 from codesign.atomic import replacing, write_atomic
-from codesign.errors import FileFormatError
 from codesign.events import SensorState
 from codesign.events.formats.hdf5_chunks import h5py
+from codesign.reading import check_regular, reading
 from codesign.types import EventStream
 
 PARTS = "parts"
@@ -67,28 +67,21 @@ def write_part(path: Path, arrays: dict[str, torch.Tensor], events: EventStream,
 
 def read_state(path: Path):
     """The sensor's state that a part ends with. Raises: FileFormatError when the part is damaged."""
-    try:
-        with h5(path) as file:
-            stored = {name: values[()] for name, values in file["state"].items()}
-            start_s, time_s = (float(stored.pop(name)) for name in ("start_s", "time_s"))
-            generator = torch.Generator()
-            generator.set_state(torch.from_numpy(stored.pop("generator")))
-            return SensorState(
-                **{name: torch.from_numpy(values) for name, values in stored.items()},
-                start_s=start_s,
-                time_s=time_s,
-                generator=generator,
-            )
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise FileFormatError(
-            f"'{path}' is damaged ({error}); remove it and go on again with --resume."
-        ) from error
+    with reading(f"'{path}'", "remove it and go on again with --resume"), h5(check_regular(path)) as file:
+        stored = {name: values[()] for name, values in file["state"].items()}
+        start_s, time_s = (float(stored.pop(name)) for name in ("start_s", "time_s"))
+        generator = torch.Generator()
+        generator.set_state(torch.from_numpy(stored.pop("generator")))
+        return SensorState(
+            **{name: torch.from_numpy(values) for name, values in stored.items()},
+            start_s=start_s,
+            time_s=time_s,
+            generator=generator,
+        )
 
 
 def parts_done(folder: Path):
-    """Number of parts there are without a gap, after removing what an interrupted write left behind."""
-    for left in folder.rglob(".*"):
-        left.unlink()
+    """Number of parts there are without a gap."""
     count = 0
     while part_path(folder, count).exists():
         count += 1

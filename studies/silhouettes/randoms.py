@@ -2,7 +2,6 @@
 
 import json
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -10,7 +9,7 @@ import torch
 
 from codesign import lens, render
 from codesign.atomic import write_atomic
-from codesign.errors import FileFormatError
+from codesign.reading import read_json, reading
 from scenes import random_worlds
 from studies.silhouettes.judge import (
     HIGHEST,
@@ -80,11 +79,9 @@ def _earlier(run, raw):
     stored = run.load_state()
     rows = dict(stored.numbers["rows"]) if stored is not None else {}
     for name in raw:
-        try:
-            given = json.loads(Path(name).read_text(encoding="utf-8"))
+        given = read_json(name)
+        with reading(f"--raw {name}", "it is no raw table of this study"):
             rows |= {str(int(seed)): list(group) for seed, group in given.items() if group[0]["lens"]}
-        except (OSError, ValueError, KeyError, IndexError, TypeError, AttributeError) as error:
-            raise FileFormatError(f"--raw {name} is no raw table of this study ({error}).") from error
     return rows
 
 

@@ -7,6 +7,7 @@ import torch
 from codesign.errors import DomainError, FileFormatError
 from codesign.events.entry import check_times
 from codesign.events.sources.frames import times_from_fps
+from codesign.reading import read_text
 
 UNITS_PER_SECOND = {"s": 1, "ms": 1_000, "us": 1_000_000, "ns": 1_000_000_000}
 
@@ -68,12 +69,7 @@ def read_times(path, unit, count):
     Numbers are read as decimals, so whole microseconds and nanoseconds of epoch times become the nearest
     float.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileFormatError(
-            f"the times in {path} cannot be read ({error}); give a text file with one number per line."
-        ) from error
+    lines = read_text(path).splitlines()
     times = []
     for number, line in enumerate(lines, start=1):
         text = line.strip()

@@ -123,7 +123,7 @@ def test_npz_of_something_else_is_refused(tmp_path):
         ({"x": np.zeros(2, int)}, "equal length"),
         ({"x": np.full(3, 2)}, "x spans"),
         ({"p": np.zeros(3, int)}, "polarity"),
-        ({"t_us": np.array([None] * 3)}, "array t_us"),
+        ({"t_us": np.array([None] * 3)}, "t_us holds object"),
         ({"height_px": np.array([2])}, "height_px"),
     ]:
         np.savez(path, **{name: values for name, values in (good | change).items() if values is not None})
@@ -141,7 +141,7 @@ def test_unknown_extensions_and_missing_places_are_refused(tmp_path):
             read(tmp_path / name)
         with pytest.raises(FileFormatError, match=r"\.csv, \.dat, \.h5, \.npz, \.raw"):
             write(tmp_path / name, stream)
-    with pytest.raises(FileFormatError, match="no file lies"):
+    with pytest.raises(FileFormatError, match="no file lies at"):
         read(tmp_path / "none.csv")
     with pytest.raises(FileFormatError, match="folder"):
         write(tmp_path / "none" / "e.csv", stream)

@@ -251,7 +251,7 @@ def test_what_is_no_source_is_refused_with_a_reason(clip, tmp_path):
         (clear, "transparent"),
         (mixed, "several kinds"),
         (tmp_path / "one" / "a.png", "single picture"),
-        (tmp_path / "half.npy", "NumPy"),
+        (tmp_path / "half.npy", "whole .npy"),
         (tmp_path / "flat.npy", "at least two"),
         (tmp_path / "complex.npy", "complex128"),
         (tmp_path / "two.npz", "called frames"),

@@ -85,7 +85,7 @@ def test_a_name_stands_for_the_delivered_file(monkeypatch, tmp_path, path):
         checkpoint.load(path).get_parameter("layer.weight"),
     )
     monkeypatch.setitem(checkpoint.DELIVERED, "refiner", tmp_path / "gone.safetensors")
-    with pytest.raises(FileFormatError, match="does not exist"):
+    with pytest.raises(FileFormatError, match="no file lies at"):
         checkpoint.load("refiner")
     with pytest.raises(FileFormatError, match="neither a delivered network"):
         checkpoint.load("refinerr")
@@ -138,7 +138,7 @@ def rewritten(path, **changes):
         ({"version": 2}, "format version 2, this codesign reads version 1"),
         ({"kind": "training"}, "holds no network"),
         ({"network": "gone"}, "network 'gone' is unknown"),
-        ({"config": {"width": 4, "depth": 2}}, "another version of this network"),
+        ({"config": {"width": 4, "depth": 2}}, "another version of the network"),
         ({"config": {"width": 40}}, "width is at most 9"),
         ({"config": {"width": 5}}, r"'layer.bias' is \[4\], the network's is \[5\]"),
         ({"config": []}, "holds no network"),

@@ -194,7 +194,7 @@ def damaged(dataset, tmp_path, what):
         ("missing", "lacks events.h5"),
         ("cut", "by the manifest; it was cut"),
         ("cut, no manifest", "cut or damaged"),
-        ("manifest", "manifest.json is missing"),
+        ("manifest", "has no manifest.json"),
         ("format", "format 'codesign-dataset/9'"),
         ("shape", r"flow has shape \[12, 2, 40, 39\], \[12, 2, 40, 40\] is needed"),
         ("times", "do not rise"),

@@ -222,8 +222,8 @@ def test_mvsec_windows(frames, chunks, tmp_path):
     ("what", "reason"),
     [
         ("flow", "has no indoor_flying1_gt_flow_dist.npz"),
-        ("npz", "no whole .npz file"),
-        ("names", "no whole .npz file"),
+        ("npz", "use a whole .npz file"),
+        ("names", "use a whole .npz file"),
         ("times", "rising times"),
         ("hdf5", "cut or damaged"),
         ("columns", r"\[9000, 3\]"),

@@ -174,8 +174,8 @@ def test_several_flows_and_their_times(tmp_path):
         ("a.txt", "1 2\n3 4\n", "one for all pixels or 204"),
         ("a.txt", "a, b\nc d", "no table"),
         ("a.bmp", "", "ends in '.bmp'"),
-        ("a.npy", "text", "not a readable file of arrays"),
-        ("a.mat", "text", "not a readable file of arrays"),
+        ("a.npy", "text", "use a whole .npy file"),
+        ("a.mat", "text", "no MATLAB file"),
         ("a.flo", "text", "not a .flo"),
     ],
 )

@@ -18,6 +18,7 @@ import pytest
 import torch
 
 from codesign.errors import CodesignError, DomainError, FileFormatError, NonFiniteError, ShapeError
+from codesign.state import write_state
 from studies.frame.config import StudyConfig
 from studies.frame.machine import versions
 from studies.frame.run import Run, main, open_run
@@ -127,7 +128,8 @@ def test_state_is_data_and_damage_is_named(run):
             run.load_state()
 
 
-def test_interrupted_and_resumed_gives_the_same_numbers(tmp_path):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interrupted_and_resumed_gives_the_same_numbers(tmp_path, number, code):
     (tmp_path / "walk.py").write_text(WALK)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     command = [sys.executable, "-W", "error", "walk.py"]
@@ -154,9 +156,27 @@ def test_interrupted_and_resumed_gives_the_same_numbers(tmp_path):
     assert broken.stdout is not None
     while broken.stdout.readline() != "step 5\n":
         assert broken.poll() is None, broken.communicate()
-    broken.send_signal(signal.SIGINT)
+    broken.send_signal(signal.SIGSTOP)  # it is there, and gets no further
+    second = subprocess.run(
+        [*command, "--resume", "with space"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert second.returncode == 2
+    assert second.stderr.startswith("error: another process works on the run in 'with space'")
+    broken.send_signal(signal.SIGCONT)
+    broken.send_signal(number)
     _, complaint = broken.communicate(timeout=60)
-    assert broken.returncode == 130, complaint
+    assert broken.returncode == code, complaint
+    left = [
+        tmp_path / "with space" / name for name in (".decay-a_b3c4d5.mp4", ".state-abcdefgh.npz", ".mine")
+    ]
+    for path in left:  # as a killed run leaves them, and one that is none of ours
+        path.write_bytes(b"half")
     assert (
         complaint.splitlines()[-1] == "interrupted; go on with: python -m studies.walk --resume 'with space'"
     )
@@ -181,6 +201,92 @@ def test_interrupted_and_resumed_gives_the_same_numbers(tmp_path):
         k: v for k, v in second.items() if k not in ("versions", "hardware")
     }
     assert (tmp_path / "with space" / "report.html").exists()
+    assert [path.exists() for path in left] == [False, False, True]
+    assert not (tmp_path / "with space" / ".lock").exists()
+
+
+def test_a_reader_that_goes_away_gets_no_traceback(tmp_path):
+    (tmp_path / "walk.py").write_text(WALK)
+    for command in ("walk.py --help", "-m codesign --help", "-m codesign list", "-m studies"):
+        done = subprocess.run(
+            f"{shlex.quote(sys.executable)} {command} | head -c 1",
+            shell=True,
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "4000"},
+            capture_output=True,
+            check=False,
+        )
+        assert done.stderr == b"", command
+
+
+FORKED = """
+import os, signal
+from codesign.interrupt import Interruption
+with Interruption() as interruption:
+    interruption.in_loop = True
+    ready, told = os.pipe()
+    if not (worker := os.fork()):
+        os.write(told, b"!")
+        signal.pause()
+    os.read(ready, 1)
+    os.kill(worker, signal.SIGTERM)
+    print(os.waitstatus_to_exitcode(os.waitpid(worker, 0)[1]), interruption.requested)
+"""
+
+
+def test_a_forked_worker_ends_when_its_pool_does():
+    """Handlers go to forked workers too: one that waited for its next step would never end."""
+    done = subprocess.run(
+        [sys.executable, "-c", FORKED], capture_output=True, text=True, check=True, timeout=60, cwd=ROOT
+    )
+    assert done.stdout == "-15 False\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("limit", "much"),
+        ("limit", True),
+        ("limit", None),
+        ("sizes", [1, "2"]),
+        ("sizes", 3),
+        ("sizes", [1, [2]]),
+        ("seed", 0.5),
+        ("quick", 1),
+        ("device", "tpu"),
+        ("device", ["cpu"]),
+        ("out", 7),
+    ],
+)
+def test_a_configuration_of_other_types_is_one_sentence(tmp_path, capsys, name, value):
+    out = open_run("test_run", Config(out=tmp_path / "out")).folder
+    stored = json.loads((out / "config.json").read_text())
+    (out / "config.json").write_text(json.dumps({**stored, name: value}))
+    assert main(record_one, Config, ["--resume", str(out)]) == 2
+    complaint = capsys.readouterr().err
+    assert f": {name} is " in complaint
+    assert ", which is no " in complaint
+    assert complaint.count("\n") == 1
+
+
+def test_the_state_of_another_run_is_refused(tmp_path):
+    def folder(name, study="test_run", **options):
+        made = open_run(study, Config(out=tmp_path / name, **options))
+        made.save_state({}, {"step": 1})
+        return made.folder
+
+    def resumed(at):
+        return open_run("test_run", Config(resume=at)).load_state()
+
+    mine = folder("mine")
+    assert resumed(mine).numbers == {"step": 1}
+    for other, reason in ((folder("a", "other"), "study"), (folder("b", limit=2.0), "configuration")):
+        (mine / "state.npz").write_bytes((other / "state.npz").read_bytes())
+        with pytest.raises(FileFormatError, match=f"another {reason}"):
+            resumed(mine)
+    write_state(mine / "state.npz", {}, {"numbers": {}, "times": {"seconds": 0.0, "loops": {}}})
+    with pytest.raises(FileFormatError, match="another version .*start a new run"):
+        resumed(mine)
 
 
 def test_second_interrupt_ends_at_once(run):

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from codesign.errors import FileFormatError
 from codesign.events.formats import flatbuffer
 from codesign.optional import optional
+from codesign.reading import open_regular, reading
 
 lz4_frame = optional("lz4.frame", "event-files", "reading and writing .aedat4")
 zstandard = optional("zstandard", "event-files", "reading .aedat4 packed by Zstandard")
@@ -46,7 +47,8 @@ def read_container(path, kind):
     Raises: FileFormatError for another kind of file, damage, a file cut short, or not exactly one stream of
       the kind.
     """
-    data = path.read_bytes()
+    with open_regular(path) as file:
+        data = file.read()
     if not data.startswith(MAGIC):
         raise FileFormatError(f"{path} does not start with {MAGIC!r}; it is not an AEDAT 4.0 file.")
     start = len(MAGIC) + 4 + flatbuffer.number(path, data, len(MAGIC), "<I")
@@ -85,35 +87,23 @@ def unpacked(path, data, compression):
     limit = LIMIT_RATIO * len(data) + LIMIT_EXTRA_BYTES
     if compression == NONE:
         return data
-    try:
+    with reading(f"{path}: a block of {len(data)} bytes", "the file is damaged"):
         if compression in (LZ4, LZ4_HIGH):
             unpacker = lz4_frame.LZ4FrameDecompressor()
             body = unpacker.decompress(data, max_length=limit)
         else:
-            body, unpacker = _from_zstandard(path, data, limit)
-    except (RuntimeError, EOFError) as error:
-        raise FileFormatError(
-            f"{path}: a block of {len(data)} bytes does not decompress: {error}; the file is damaged."
-        ) from error
+            unpacker = zstandard.ZstdDecompressor(max_window_size=2**27).decompressobj()
+            if zstandard.frame_content_size(data) > limit:
+                raise FileFormatError(
+                    f"{path}: a block of {len(data)} bytes claims to hold more than {limit} bytes; the file is damaged."
+                )
+            body = unpacker.decompress(data)
     if not unpacker.eof or unpacker.unused_data:
         raise FileFormatError(
             f"{path}: a block of {len(data)} bytes ends early, goes on too long, or holds more than {limit} "
             "bytes; the file is damaged."
         )
     return body
-
-
-def _from_zstandard(path, data, limit):
-    try:
-        unpacker = zstandard.ZstdDecompressor(max_window_size=2**27).decompressobj()
-        if zstandard.frame_content_size(data) > limit:
-            raise FileFormatError(
-                f"{path}: a block of {len(data)} bytes claims to hold more than {limit} bytes; the file is "
-                "damaged."
-            )
-        return unpacker.decompress(data), unpacker
-    except zstandard.ZstdError as error:
-        raise RuntimeError(str(error)) from error
 
 
 def _places(path, data, at, stop):
@@ -155,7 +145,7 @@ def _table(path, body, count):
 
 def _stream(path, text, kind):
     """(number, (height_px, width_px) or None) of the only stream of a kind in the XML of the header."""
-    try:
+    with reading(f"{path}: the header's XML", "the file is damaged"):
         plain = text.decode("utf-8")  # decoded here, so that another encoding cannot hide a declaration
         if "<!" in plain.replace("<!--", ""):
             raise FileFormatError(
@@ -167,10 +157,6 @@ def _stream(path, text, kind):
             for node in found.findall("./node[@name='outInfo']/node")
             if _attribute(node, "typeIdentifier") == kind
         ]
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise FileFormatError(
-            f"{path}: the header's XML cannot be read: {error}; the file is damaged."
-        ) from error
     if len(streams) != 1:
         raise FileFormatError(
             f"{path} holds {len(streams)} streams of kind {kind}; one is needed, export a single one."

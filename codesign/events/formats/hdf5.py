@@ -6,6 +6,7 @@ from codesign.errors import FileFormatError
 from codesign.events.formats.dsec import from_dsec, to_dsec
 from codesign.events.formats.hdf5_chunks import h5py, values
 from codesign.events.formats.v2e_hdf5 import from_v2e
+from codesign.reading import reading
 
 # all that h5py raises on damaged files
 LIBRARY_ERRORS = (
@@ -30,13 +31,8 @@ def read_hdf5(path, height_px=None, width_px=None):
     Raises: FileFormatError for another layout, damage, data kept in other files, and what dsec and v2e_hdf5
       refuse.
     """
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            from_layout, arrays, attributes = _contents(path, file)
-    except FileFormatError:
-        raise
-    except LIBRARY_ERRORS as error:
-        raise FileFormatError(f"{path} is not a readable HDF5 file of events: {error}.") from error
+    with reading(path, "it is no whole HDF5 file of events"), h5py.File(path, "r", locking=False) as file:
+        from_layout, arrays, attributes = _contents(path, file)
     return from_layout(path, arrays, attributes, height_px, width_px)
 
 

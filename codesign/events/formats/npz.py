@@ -1,17 +1,14 @@
 """Event streams as NPZ: arrays t_us, x, y, p and the sensor size height_px, width_px."""
 
-import math
 import zipfile
-import zlib
 
 import numpy as np
 import torch
 
+from codesign.arrays import open_npz
 from codesign.errors import CodesignError, FileFormatError
 from codesign.events.stream import ordered
 
-HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-DEFLATE_RATIO = 1040  # at most 1032 to 1
 NAMES = ("t_us", "x", "y", "p", "height_px", "width_px")
 
 
@@ -33,29 +30,8 @@ def read_npz(path, height_px=None, width_px=None):
     Raises: FileFormatError when the file is truncated, corrupt, not NPZ, lacks an array, or holds values that
       are no events.
     """
-    try:
-        # opened here, because np.load leaves the file open when it is corrupt
-        with open(path, "rb") as opened:
-            _check_sizes(path, opened)
-            with np.load(opened, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in NAMES}
-    except FileFormatError:
-        raise
-    except (
-        ValueError,
-        KeyError,
-        EOFError,
-        OSError,
-        NotImplementedError,
-        RuntimeError,
-        zipfile.BadZipFile,
-        zlib.error,
-        AttributeError,
-        TypeError,
-    ) as error:
-        raise FileFormatError(
-            f"{path} is not an NPZ file of events with arrays {', '.join(NAMES)}: {error}."
-        ) from error
+    with open_npz(path, f"an NPZ file of events has the arrays {', '.join(NAMES)}") as file:
+        arrays = {name: file.read(name) for name in NAMES}
     for name, values in arrays.items():
         if values.dtype.kind not in "iu" or values.ndim != (0 if name.endswith("px") else 1):
             raise FileFormatError(
@@ -80,22 +56,3 @@ def read_npz(path, height_px=None, width_px=None):
         return ordered(t_us, x, y, p, *size)
     except CodesignError as error:
         raise FileFormatError(f"{path}: {error}") from error
-
-
-def _check_sizes(path, opened):
-    """Refuse arrays that claim more values than are there, before memory is taken for them."""
-    with zipfile.ZipFile(opened) as archive:
-        for name in NAMES:
-            entry = archive.getinfo(f"{name}.npy")
-            with archive.open(entry) as member:
-                shape, _, dtype = HEADERS[np.lib.format.read_magic(member)](member)
-                claimed_bytes = member.tell() + math.prod(shape) * dtype.itemsize
-            if (
-                claimed_bytes != entry.file_size
-                or entry.file_size > DEFLATE_RATIO * min(entry.compress_size, path.stat().st_size) + 4096
-            ):
-                raise FileFormatError(
-                    f"{path}: array {name} claims {list(shape)} values, not what the file holds; it is "
-                    "damaged."
-                )
-    opened.seek(0)

@@ -65,7 +65,8 @@ def open_folder(folder):
 def natural(path):
     """Sort key of a file name that puts frame 2 before frame 10."""
     return [
-        (int(part), "") if part.isdigit() else (-1, part.lower()) for part in re.split(r"([0-9]+)", path.stem)
+        (int(part), "") if part.isdecimal() else (-1, part.lower())
+        for part in re.split(r"([0-9]+)", path.stem)
     ], path.name
 
 

@@ -10,7 +10,10 @@ import numpy as np
 
 from codesign.errors import FileFormatError
 from codesign.events.sources.frames import FrameSource, same_size, times_from_fps
+from codesign.reading import read_bytes
 
+MOST_BYTES = 10_000_000  # of a description
+NUMBER = re.compile(r"[0-9]{1,9}")
 XML = {
     "rate": "recordRate",
     "frames": "totalFrame",
@@ -44,7 +47,7 @@ def open_mraw(path):
         _number(facts, name, path) for name in ("frames", "height", "width", "bits")
     )
     rate = facts.get("rate", "").split("/")[0]
-    if not rate.isdigit() or int(rate) == 0:
+    if not NUMBER.fullmatch(rate) or int(rate) == 0:
         raise FileFormatError(
             f"the description of {path.name} gives the record rate {facts.get('rate')!r}; a whole number of "
             "frames per second is needed."
@@ -55,12 +58,12 @@ def open_mraw(path):
             "read."
         )
     size = width * height * bits // 8
-    if path.stat().st_size != count * size or count < 2:
+    if path.stat().st_size != count * size or count < 2 or not width * height:
         raise FileFormatError(
             f"{path} has {path.stat().st_size} bytes; {count} frames (two or more) of {width} x {height} "
             f"pixels and {bits} bits, monochrome, are {count * size}."
         )
-    lower = facts.get("side", "").lower() == "lower" and facts.get("depth", "").isdigit()
+    lower = facts.get("side", "").lower() == "lower" and NUMBER.fullmatch(facts.get("depth", ""))
     white = 2.0 ** (min(bits, int(facts["depth"])) if lower else bits) - 1
 
     def read(start):
@@ -102,7 +105,7 @@ def _facts(path):
         beside = path.with_suffix(suffix)
         if beside.is_file():
             # patterns and no parser: the XML stands behind other bytes, and nothing in it is ever expanded
-            text = beside.read_text(encoding="latin-1")
+            text = read_bytes(beside, MOST_BYTES).decode("latin-1")
             found = {name: re.search(pattern.format(re.escape(key)), text) for name, key in names.items()}
             return {name: match[1] for name, match in found.items() if match}
     raise FileFormatError(
@@ -112,7 +115,7 @@ def _facts(path):
 
 
 def _number(facts, name, path):
-    if not facts.get(name, "").isdigit():
+    if not NUMBER.fullmatch(facts.get(name, "")):
         raise FileFormatError(
             f"the description of {path.name} gives {name} as {facts.get(name)!r}; a whole number is needed."
         )

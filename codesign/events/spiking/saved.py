@@ -6,12 +6,12 @@ import json
 import numpy as np
 import torch
 
+from codesign.arrays import read_npz
 from codesign.atomic import write_atomic
-from codesign.errors import FileFormatError
-from codesign.reading import open_regular, reading
+from codesign.errors import CodesignError, FileFormatError
+from codesign.reading import reading
 
 SETTINGS = "settings"
-MOST_BYTES = 10**9
 
 
 def write_generator(path, settings, parameters):
@@ -32,12 +32,16 @@ def read_generator(path, kind):
       for.
     """
     remedy = "give the .npz file that SpikeEsim.save wrote"
-    with open_regular(path, MOST_BYTES) as file, reading(f"the generator {path}", remedy):
-        with np.load(file, allow_pickle=False) as data:
-            settings = json.loads(str(data[SETTINGS]))
-            parameters = {name: torch.from_numpy(data[name]) for name in data.files if name != SETTINGS}
-        generator = kind(**settings)
-        generator.load_state_dict(parameters)
+    stored = read_npz(path, remedy)
+    with reading(f"'{path}'", remedy):
+        settings = json.loads(str(stored.pop(SETTINGS)))
+        parameters = {name: torch.from_numpy(values) for name, values in stored.items()}
+    try:
+        with reading(f"'{path}'", remedy):
+            generator = kind(**settings)
+            generator.load_state_dict(parameters)
+    except CodesignError as error:
+        raise FileFormatError(f"'{path}' holds no generator ({error}); {remedy}.") from error
     for name, value in parameters.items():
         if not bool(value.isfinite().all()):
             raise FileFormatError(

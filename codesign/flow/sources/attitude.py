@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from codesign.errors import DomainError, FileFormatError
 from codesign.flow.checks import check_path, shown
+from codesign.reading import open_regular, reading
 
 LARGEST_GAP_S = 0.1  # between samples that are interpolated
 UNIT_TOLERANCE = 1e-2  # of a quaternion's length
@@ -104,20 +105,12 @@ def _table(path, columns, names):
     """[N >= 2, columns] finite numbers with rising times in the first column; repeated times are left out
     after the first."""
     path = check_path(path)
-    try:
-        if path.stat().st_size > MOST_BYTES:
-            raise FileFormatError(
-                f"{path} has more than {MOST_BYTES} bytes; cut it to the part that is needed."
-            )
-        with path.open("rb") as file:
-            delimiter = "," if b"," in file.read(400) else None
+    with open_regular(path, MOST_BYTES) as file, reading(path, f"lines of '{names}' are needed"):
+        delimiter = "," if b"," in file.read(400) else None
+        file.seek(0)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a file without a number, which is refused below
-            table = np.loadtxt(path, ndmin=2, comments="#", delimiter=delimiter)
-    except FileFormatError:
-        raise
-    except (OSError, ValueError) as error:
-        raise FileFormatError(f"{path} cannot be read as lines of '{names}' ({error}).") from error
+            table = np.loadtxt(file, ndmin=2, comments="#", delimiter=delimiter, encoding="utf-8")
     if table.shape[1] != columns or len(table) < 2 or not np.isfinite(table).all():
         raise FileFormatError(
             f"{path} has {len(table)} rows of {table.shape[1]} numbers; at least two rows of {columns} "

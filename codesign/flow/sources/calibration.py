@@ -10,7 +10,9 @@ from scipy.ndimage import map_coordinates
 
 from codesign.errors import DomainError, FileFormatError
 from codesign.flow.checks import check_kind, check_path
+from codesign.reading import read_text, reading
 
+MOST_BYTES = 100_000
 STEPS = 50
 RESIDUAL_PX = 1e-6
 
@@ -99,13 +101,9 @@ def read_calibration(path: str | Path) -> Calibration:
     Raises: FileFormatError for anything else.
     """
     path = check_path(path)
-    try:
-        words = path.read_text(encoding="utf-8").replace(",", " ").split()
+    with reading(path, "'fx fy cx cy k1 k2 p1 p2 k3' in pixels is needed"):
+        words = read_text(path, MOST_BYTES).replace(",", " ").split()
         values = [float(word) for word in words if not word.endswith(":")]
-    except (OSError, ValueError) as error:
-        raise FileFormatError(
-            f"{path} is no calibration: 'fx fy cx cy k1 k2 p1 p2 k3' in pixels is needed ({error})."
-        ) from error
     if len(values) not in (4, 8, 9) or not all(map(math.isfinite, values)) or not min(values[:2]) > 0:
         raise FileFormatError(
             f"{path} holds {len(values)} numbers; fx fy cx cy k1 k2 p1 p2 k3 are needed (distortion or k3 "

@@ -21,7 +21,8 @@ from codesign.flow.files import read_flow
 from codesign.flow.sources.collate import Crop, Sample, check_indices, check_lengths, collate
 from codesign.flow.sources.folders import natural
 from codesign.flow.sources.rectified import splatted
-from codesign.flow.sources.rows import Rows, reading
+from codesign.flow.sources.rows import Rows
+from codesign.reading import read_text, reading
 from codesign.types import FlowWindows
 
 SIZE_PX = (480, 640)
@@ -185,7 +186,7 @@ def _flows(folder):
     files = sorted((folder / "forward").glob("*.png"), key=natural)
     lines = [
         line
-        for line in (folder / "forward_timestamps.txt").read_text(encoding="utf-8").splitlines()
+        for line in read_text(folder / "forward_timestamps.txt").splitlines()
         if line.strip() and not line.startswith("#")
     ]
     numbers = [re.fullmatch(r"\s*(\d{1,18})\s*,\s*(\d{1,18})\s*", line) for line in lines]

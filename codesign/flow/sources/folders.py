@@ -11,6 +11,7 @@ from pathlib import Path
 from codesign.errors import FileFormatError
 from codesign.events.files import READERS
 from codesign.flow.checks import check_path
+from codesign.reading import open_regular, reading
 
 # of several event files of one name the first of these kinds is read: text as the Event-Camera Dataset has it, what
 # cameras write, then arrays that somebody made of either
@@ -49,8 +50,8 @@ def opened(path: str | Path) -> Iterator[Path]:
         yield path
         return
     with tempfile.TemporaryDirectory() as folder:
-        try:
-            with zipfile.ZipFile(path) as archive:
+        with open_regular(path) as file, reading(path, "it is no whole zip archive"):
+            with zipfile.ZipFile(file) as archive:
                 members = [entry for entry in archive.infolist() if not entry.is_dir()]
                 size = sum(entry.file_size for entry in members)
                 if size > MOST_BYTES or any(
@@ -61,10 +62,6 @@ def opened(path: str | Path) -> Iterator[Path]:
                         "allows; unpack it by hand."
                     )
                 archive.extractall(folder, members)  # keeps inside the folder whatever the names say
-        except (zipfile.BadZipFile, OSError, RuntimeError, NotImplementedError, ValueError) as error:
-            if isinstance(error, FileFormatError):
-                raise
-            raise FileFormatError(f"{path} is not a readable zip archive ({error}).") from error
         inside = Path(folder)
         while (
             len(entries := [entry for entry in inside.iterdir() if entry.name != "__MACOSX"]) == 1
@@ -76,7 +73,7 @@ def opened(path: str | Path) -> Iterator[Path]:
 
 def natural(path: str | Path) -> list[int | str]:
     """Sort key: names with numbers in order of the numbers."""
-    return [int(word) if word.isdigit() else word for word in re.split(r"(\d+)", str(path).lower())]
+    return [int(word) if word.isdecimal() else word for word in re.split(r"(\d+)", str(path).lower())]
 
 
 def event_files(path: Path) -> list[Path]:

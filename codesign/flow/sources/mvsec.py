@@ -9,6 +9,7 @@ Sources: Zhu et al., "The Multivehicle Stereo Event Camera Dataset", RA-L 2018; 
   2018 (dt = 1, 4).
 """
 
+import math
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -16,10 +17,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from codesign.arrays import open_npz
 from codesign.errors import DomainError, FileFormatError
 from codesign.events.stream import ordered
 from codesign.events.volumes.volume import from_stream
-from codesign.flow.sources import npz_member
 from codesign.flow.sources.chain import chained
 from codesign.flow.sources.collate import ALIKE, Crop, Sample, check_indices, collate
 from codesign.flow.sources.rows import Rows
@@ -27,6 +28,8 @@ from codesign.types import EventStream, FlowWindows
 
 DATA = "_data.hdf5"
 FLOW = "_gt_flow_dist.npz"
+COMPONENTS = ("x_flow_dist", "y_flow_dist")
+MOST_BYTES = 2**35  # of one of them: outdoors the file has 9.5 GB
 BLOCK = 4096  # events between the times that are kept to find a window
 
 
@@ -104,30 +107,35 @@ class Sequence:
 
     def __init__(self, data: Path, truth: Path) -> None:
         self.truth = truth
-        shapes = npz_member.shapes(truth, ("x_flow_dist", "y_flow_dist", "timestamps"))
-        self.flow_s = np.asarray(npz_member.array(truth, "timestamps"), np.float64)
-        count, *size = shapes["x_flow_dist"]
+        with open_npz(truth) as file:
+            heads = [file.header(name) for name in (*COMPONENTS, "timestamps")]
+            if any(head.dtype.kind not in "fiu" for head in heads):
+                raise FileFormatError(f"{truth} holds {heads[0].dtype}; flows and times are numbers.")
+            self.flow_s = file.read("timestamps").astype(np.float64)
+        shape = heads[0].shape
         if (
-            shapes["y_flow_dist"] != shapes["x_flow_dist"]
-            or len(size) != 2
-            or self.flow_s.shape != (count,)
-            or count < 2
-            or bool((np.diff(self.flow_s) <= 0).any())
+            heads[1].shape != shape
+            or len(shape) != 3
+            or self.flow_s.shape != shape[:1]
+            or len(self.flow_s) < 2
+            or not _rise(self.flow_s)
         ):
             raise FileFormatError(
-                f"{truth} has flows {shapes['x_flow_dist']}, {shapes['y_flow_dist']} and times "
+                f"{truth} has flows {list(shape)}, {list(heads[1].shape)} and times "
                 f"{list(self.flow_s.shape)}; [N, H, W] twice and N rising times are needed."
             )
-        self.size_px = tuple(size)
+        self.size_px = shape[1:]
         self.fields = None
         self.events = Rows(data, "davis/left/events", [4])
         frames = Rows(data, "davis/left/image_raw_ts", [])
         self.frame_s = frames.read(0, len(frames)).astype(np.float64)
-        if len(self.events) < 2 or bool((np.diff(self.frame_s) <= 0).any()):
+        if len(self.events) < 2 or not _rise(self.frame_s):
             raise FileFormatError(
                 f"{data} has {len(self.events)} events, or frame times that do not rise; it is damaged."
             )
         self.ends_s = float(self.events[0][2]), float(self.events[len(self.events) - 1][2])
+        if not all(map(math.isfinite, self.ends_s)):
+            raise FileFormatError(f"{data}: its events run from {self.ends_s[0]} to {self.ends_s[1]} s.")
 
     def windows(self, frames: int, span_s: tuple[float, float] | None) -> list[tuple[float, float]]:
         """[(from, to)] seconds."""
@@ -146,7 +154,8 @@ class Sequence:
     def flow(self, t0_s: float, t1_s: float) -> tuple[Tensor, Tensor]:
         """(flow_px [2, H, W], valid [H, W]) on the pixels of t0_s, to t1_s."""
         if self.fields is None:
-            self.fields = [npz_member.array(self.truth, name) for name in ("x_flow_dist", "y_flow_dist")]
+            with open_npz(self.truth) as file:
+                self.fields = [file.mapped(name, MOST_BYTES) for name in COMPONENTS]
         first = int(np.searchsorted(self.flow_s, t0_s, "right")) - 1
         parts = []
         masks = []
@@ -197,6 +206,10 @@ class Sequence:
             middle = (low + high) // 2
             low, high = (middle, high) if self.events[middle][2] < t_s else (low, middle)
         return low + int(np.searchsorted(self.events.read(low, high)[:, 2], t_s))
+
+
+def _rise(times):
+    return bool(np.isfinite(times).all()) and bool((np.diff(times) > 0).all())
 
 
 def _places(folder):

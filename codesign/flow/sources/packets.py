@@ -6,7 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from codesign import events
 from codesign.errors import DomainError, FileFormatError
@@ -17,6 +17,7 @@ from codesign.flow.sources.packet import OUTSIDE, Packet, PacketOptions, check_o
 from codesign.flow.sources.packet_truth import NO_TRUTH, Truth, is_motion, packet, read_source
 from codesign.flow.sources.text_events import read_text_events
 from codesign.flow.sources.windows import covers, spread, windows, without
+from codesign.reading import open_regular, reading
 
 LONGEST_S = 1.0  # of a packet that is a file of its own
 
@@ -255,10 +256,6 @@ def _size_of_images(folder):
     )
     if first is None:
         return None
-    try:
-        with Image.open(first) as image:
+    with open_regular(first) as file, reading(first, "remove this frame or give the sensor size"):
+        with Image.open(file) as image:
             return image.height, image.width
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise FileFormatError(
-            f"{first} is not a readable frame ({error}); remove it or give the sensor size."
-        ) from error

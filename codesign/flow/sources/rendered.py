@@ -1,7 +1,6 @@
 """Windows of the data sets that studies.make_dataset writes (docs/datasets.md): events, true flow over one
 frame interval or several, and the frames."""
 
-import json
 import shlex
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,6 +15,7 @@ from codesign.flow.sources.camera_fit import CameraFit
 from codesign.flow.sources.chain import chained
 from codesign.flow.sources.collate import Crop, Sample, check_indices, collate
 from codesign.flow.sources.rows import Rows
+from codesign.reading import read_json, reading
 from codesign.types import EventStream, FlowWindows
 
 FORMAT = "codesign-dataset/1"
@@ -91,6 +91,12 @@ class DatasetWindows:
         t0_us, t1_us = (int(sequence.times_us[k]) for k in (first, last))
         volume = from_stream(sequence.stream(t0_us, t1_us), t0_us, t1_us, self.bins)
         frames = torch.from_numpy(np.stack([sequence.rows["frames"][k] for k in (first, last)]))
+        for values, name in ((frames, "frames"), (flow[:, valid], "flow marked as valid")):
+            if not bool(values.isfinite().all()):
+                raise FileFormatError(
+                    f"{sequence.folder / 'frames.h5'} holds {name} that is NaN or infinite, at frame {first} or {last}; "
+                    "make the sequence anew."
+                )
         return Sample(volume.counts[0], flow, valid, (t1_us - t0_us) * 1e-6, frames)
 
 
@@ -213,16 +219,21 @@ def _places(folder, names):
     if (folder / "frames.h5").is_file():
         return [(folder, None)]
     path = folder / "manifest.json"
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        kind = manifest["format"]
-        sequences = list(manifest["sequences"])
-        files = {name: entry["bytes"] for name, entry in manifest["files"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    if not path.is_file():
         raise FileFormatError(
-            f"{folder} is no data set: its manifest.json is missing or malformed, so it was not finished; "
+            f"{folder} is no data set: it has no manifest.json, so it was not finished; "
             f"finish it with: python -m studies.make_dataset --resume {shlex.quote(str(folder))}"
-        ) from error
+        )
+    manifest = read_json(path)
+    with reading(path, "it is no manifest of a data set; make the data set anew"):
+        kind = manifest["format"]
+        sequences = [str(name) for name in manifest["sequences"]]
+        files = {name: int(entry["bytes"]) for name, entry in manifest["files"].items()}
+    outside = [name for name in sequences if Path(name).name != name]
+    if outside:
+        raise FileFormatError(
+            f"{path} names {outside[0]!r}, which is no folder of its own; make the data set anew."
+        )
     if kind != FORMAT:
         raise FileFormatError(f"{path} says format {kind!r}; {FORMAT!r} is read.")
     unknown = sorted(set(names or ()) - set(sequences))

@@ -1,21 +1,21 @@
 """Ground-truth flow of a recording by path: flow files of several kinds, tables of text, and folders of them
 with their times."""
 
+import io
 import re
 import warnings
-import zipfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from scipy.io import loadmat
-from scipy.io.matlab import MatReadError
 
+from codesign.arrays import read_npy, read_npz
 from codesign.errors import FileFormatError
 from codesign.flow.checks import check_path, check_size
 from codesign.flow.files import read_flow
 from codesign.flow.sources import folders
+from codesign.flow.sources.matlab import read_mat
+from codesign.reading import open_regular, read_text, reading
 
 ARRAYS = ("flow", "flow_px", "gt_flow", "flow_gt", "gt", "truth", "arr_0")
 PAIRS = (
@@ -48,6 +48,8 @@ TABLES = {
     6: ("t", "x", "y", "p", "u", "v"),
 }
 MOST_VALUES = 2_000_000_000
+MOST_BYTES = 2_000_000_000  # of a table
+MOST_COLUMNS = 1_000_000  # characters of its first line
 
 
 @dataclass(frozen=True)
@@ -126,27 +128,12 @@ def _of_file(path, size_px):
 
 def _arrays(path) -> dict[str, np.ndarray]:
     """The arrays of a file by name; the only one of an .npy file as "arr_0"."""
-    try:
-        with path.open("rb") as file:
-            loaded: Any = (
-                loadmat(file) if path.suffix.lower() == ".mat" else np.load(file, allow_pickle=False)
-            )
-            if isinstance(loaded, np.ndarray):
-                return {"arr_0": loaded}
-            return {name: np.asarray(loaded[name]) for name in loaded if name[0] != "_"}
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        EOFError,
-        MemoryError,
-        zipfile.BadZipFile,
-        NotImplementedError,
-        MatReadError,
-        TypeError,
-        IndexError,
-    ) as error:
-        raise FileFormatError(f"{path} is not a readable file of arrays ({error}).") from error
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        return {"arr_0": read_npy(path)}
+    if suffix == ".mat":
+        return read_mat(path)
+    return read_npz(path)
 
 
 def _of_arrays(path):
@@ -235,17 +222,13 @@ def _spans_beside(folder, inside, count):
     )
     if file is None:
         return None
-    try:
+    with reading(file, "it is no list of times: lines of 'from, to' are needed"):
         rows = [
             [float(word) for word in re.split(r"[,\s]+", line.strip())]
-            for line in file.read_text(encoding="utf-8").splitlines()
+            for line in read_text(file).splitlines()
             if line.strip() and not line.startswith("#")
         ]
         ends = np.array(rows, np.float64)
-    except (OSError, ValueError) as error:
-        raise FileFormatError(
-            f"{file} is no list of times: lines of 'from, to' are needed ({error})."
-        ) from error
     if ends.ndim == 2 and ends.shape[1] == 1 and len(ends) == count + 1:
         ends = np.concatenate([ends[:-1], ends[1:]], 1)
     if ends.ndim != 2 or ends.shape[1] != 2:
@@ -269,20 +252,16 @@ def _checked_spans(path, ends, count):
 
 def _of_table(path, size_px):
     """A flow as lines of numbers."""
-    try:
-        with path.open(encoding="utf-8") as file:
-            first = file.readline()
-            words = first.lstrip("# ").replace(",", " ").lower().split()
-            header = bool(words) and not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf", words[0])
-            if not header:
-                file.seek(0)
-            with warnings.catch_warnings():
-                warnings.simplefilter(
-                    "ignore", UserWarning
-                )  # of a file without a number, which is refused below
-                table = np.loadtxt(file, ndmin=2, delimiter="," if "," in first else None)
-    except (OSError, ValueError) as error:
-        raise FileFormatError(f"{path} is no table of numbers ({error}).") from error
+    with open_regular(path, MOST_BYTES) as opened, reading(path, "it is no table of numbers"):
+        file = io.TextIOWrapper(opened, encoding="utf-8")
+        first = file.readline(MOST_COLUMNS)
+        words = first.lstrip("# ").replace(",", " ").lower().split()
+        header = bool(words) and not re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf", words[0])
+        if not header:
+            file.seek(0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of a file without a number, which is refused below
+            table = np.loadtxt(file, ndmin=2, delimiter="," if "," in first else None)
     height, width = size_px
     if not header and table.shape == (2 * height, width):
         return _filled(
