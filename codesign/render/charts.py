@@ -10,6 +10,7 @@ import numpy as np
 from codesign.errors import DomainError, ShapeError
 from codesign.exclusive import exclusive
 from codesign.render.atlas import Atlas, Nodes, atlas_of, cells_of, nodes_of
+from codesign.render.fronts import front_faces, is_mirrored
 from codesign.render.soundness import checked_mesh
 
 FINE_MESH = 0.5  # of a texel: meshes whose pieces are smaller on the average have their light at vertices
@@ -45,15 +46,14 @@ def chart_of(mi: Any, shape: Any, texel: float, detail: float | None) -> Chart |
         (mi.ShapeType.Cylinder, _cylinder),
     ):
         if kind == int(known):
-            return chart(_matrix(parameters), -1.0 if shape.has_flipped_normals() else 1.0)
+            return chart(*_unmirrored(mi, shape, _matrix(parameters)))
     if not shape.is_mesh() or "faces" not in parameters:
         raise DomainError(
             f"bake: shape '{shape.id()}', a {shape.class_name()}, has no texture chart here; use meshes, rectangles, "
             "cubes, spheres, disks and cylinders (copies instead of instances), or PathScene."
         )
-    vertices, faces, uv = mesh_arrays(parameters)
-    if shape.has_flipped_normals():
-        faces = faces[:, ::-1]
+    vertices, _, uv = mesh_arrays(parameters)
+    faces = front_faces(shape, parameters)
     area = _areas(vertices[faces])
     faces = faces[area > 0]
     if not len(faces):
@@ -164,6 +164,16 @@ def mesh_arrays(parameters):
 
 def _matrix(parameters):
     return np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+
+
+def _unmirrored(mi, shape, matrix):
+    """A to_world [4, 4] of the same surface that does not mirror, and whether its normals are then flipped (-1)."""
+    flip = -1.0 if shape.has_flipped_normals() else 1.0
+    if is_mirrored(matrix):
+        matrix = matrix @ np.diag([1.0, -1, 1, 1])
+        # Mitsuba counts the mirror as a flip of a cylinder's normals, but leaves them outside
+        flip *= -1 if shape.shape_type() == int(mi.ShapeType.Cylinder) else 1
+    return matrix, flip
 
 
 def _to_world(matrix, local):

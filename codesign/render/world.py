@@ -11,6 +11,7 @@ from torch import Tensor
 from codesign import backend
 from codesign.errors import CodesignError, DomainError
 from codesign.exclusive import exclusive
+from codesign.render.fronts import are_geometric
 from codesign.render.outline import outlines
 from codesign.render.outline.curves import Segments
 from codesign.render.shape_table import box_around, shape_numbers
@@ -121,11 +122,17 @@ class MitsubaScene:
 
     def _shown(self, shape):
         """What a shape shows to rays that meet it, and its normal there."""
+        import drjit as dr
+
         mi = self.mi
+        geometric = are_geometric(mi, shape)
+        asked = mi.RayFlags.UV | (mi.RayFlags.Minimal if geometric else mi.RayFlags.ShadingFrame)
 
         def shown(origin, direction, found):
             ray = mi.Ray3f(origin, direction)
-            si = shape.compute_surface_interaction(ray, found, mi.RayFlags.UV | mi.RayFlags.Minimal)
+            si = shape.compute_surface_interaction(ray, found, asked)
+            if not geometric:
+                si.n = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
             return self.leaving(shape, si, ray), si.n
 
         return shown

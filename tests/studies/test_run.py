@@ -285,7 +285,7 @@ def test_the_state_of_another_run_is_refused(tmp_path):
         with pytest.raises(FileFormatError, match=f"another {reason}"):
             resumed(mine)
     write_state(mine / "state.npz", {}, {"numbers": {}, "times": {"seconds": 0.0, "loops": {}}})
-    with pytest.raises(FileFormatError, match="another version .*start a new run"):
+    with pytest.raises(FileFormatError, match=r"another version .*start a new run"):
         resumed(mine)
 
 

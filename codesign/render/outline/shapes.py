@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from codesign.errors import DomainError
+from codesign.render.fronts import front_faces, is_mirrored
 
 EVEN = 1e-4  # axes of a sphere or cylinder may differ in length and angle by this share
 
@@ -114,7 +115,9 @@ def read(mi: Any, shape: Any) -> Shape:
     parameters = mi.traverse(shape)
     if kind == int(mi.ShapeType.Rectangle):
         corners = _place(parameters, [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-        return Mesh(name, corners, _wound(shape, np.array([[0, 1, 2], [0, 2, 3]])), None, light)
+        faces = np.array([[0, 1, 2], [0, 2, 3]])
+        turned = shape.has_flipped_normals() != is_mirrored(_matrix(parameters))
+        return Mesh(name, corners, faces[:, ::-1] if turned else faces, None, light)
     if kind == int(mi.ShapeType.Sphere):
         centre, *ends = _place(parameters, [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
         _check_even(name, "sphere", *(end - centre for end in ends))
@@ -129,8 +132,7 @@ def read(mi: Any, shape: Any) -> Shape:
         return Tube(name, start, end, u - start, v - start, light)
     if shape.is_mesh() and "vertex_positions" in parameters:
         vertices = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
-        faces = np.array(parameters["faces"], dtype=np.int64).reshape(-1, 3)
-        faces = _wound(shape, faces)
+        faces = front_faces(shape, parameters)
         return Mesh(name, vertices, faces, _values(shape, parameters, faces, len(vertices)), light)
     raise DomainError(
         f"the outline of shape '{name}' is not known; use meshes, rectangles, cubes, spheres, disks and "
@@ -146,11 +148,6 @@ def _light(shape):
     return float(uniform[1]) if uniform else None
 
 
-def _wound(shape, faces):
-    """Faces [F, 3] wound so that their normals point to the side that shines."""
-    return faces[:, ::-1] if shape.has_flipped_normals() else faces
-
-
 def _values(shape, parameters, faces, count):
     emitter = str(shape.emitter()) if shape.is_emitter() else ""
     attribute = re.search(r'MeshAttribute\[\s*name = "((face|vertex)_[^"]*)"', emitter)
@@ -164,8 +161,12 @@ def _values(shape, parameters, faces, count):
     return None
 
 
+def _matrix(parameters):
+    return np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+
+
 def _place(parameters, points):
-    matrix = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    matrix = _matrix(parameters)
     return np.array(points, dtype=np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
