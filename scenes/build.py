@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from codesign import backend
-from codesign.errors import DomainError
+from codesign.errors import DomainError, as_number
 from codesign.render import MitsubaScene, light
 from codesign.render.charts import emissive_mesh
 from scenes import bodies, textures
@@ -168,8 +168,16 @@ def _bitmap(mi, paint, scale):
 # ---- geometry
 
 
+def check_sizes(what, **sizes):
+    """Raise DomainError unless every size is positive and finite."""
+    for name, value in sizes.items():
+        if not 0 < as_number(value, f"{what}: {name}") < math.inf:
+            raise DomainError(f"{what}: {name} = {value} must be positive and finite.")
+
+
 def rectangle(mi, centre, normal_to, width_m, height_m, up=(0, 0, 1)):
     """A rectangle at ``centre`` facing ``normal_to``; its picture stands upright along ``up``."""
+    check_sizes("rectangle", width_m=width_m, height_m=height_m)
     frame = mi.ScalarTransform4f().look_at(
         origin=list(centre), target=list(normal_to), up=list(up)
     ) @ mi.ScalarTransform4f().scale([width_m / 2, height_m / 2, 1])
@@ -178,6 +186,7 @@ def rectangle(mi, centre, normal_to, width_m, height_m, up=(0, 0, 1)):
 
 def block(mi, x, y, bottom_m, half_m, turn_deg=0.0):
     """A cuboid of half sizes ``half_m`` (three numbers) that stands GAP_M over ``bottom_m``."""
+    check_sizes("block", **dict(zip(("half_x_m", "half_y_m", "half_z_m"), half_m, strict=True)))
     T = mi.ScalarTransform4f
     return {
         "type": "cube",
@@ -190,6 +199,7 @@ def block(mi, x, y, bottom_m, half_m, turn_deg=0.0):
 
 def ball(mi, x, y, bottom_m, radius_m):
     """A sphere that rests GAP_M over ``bottom_m``."""
+    check_sizes("ball", radius_m=radius_m)
     return {
         "type": "sphere",
         "to_world": mi.ScalarTransform4f().translate([x, y, bottom_m + GAP_M + radius_m]).scale(radius_m),
@@ -201,6 +211,7 @@ def pole(mi, start, end, radius_m):
     start = np.array(start, dtype=float)
     end = np.array(end, dtype=float)
     length = float(np.linalg.norm(end - start))
+    check_sizes("pole", radius_m=radius_m, length=length)
     helper = [0, 0, 1] if abs(end[2] - start[2]) < 0.9 * length else [1, 0, 0]
     T = mi.ScalarTransform4f
     tube = T().look_at(origin=start.tolist(), target=end.tolist(), up=helper) @ T().scale(

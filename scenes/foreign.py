@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from codesign import backend, lens
-from codesign.errors import CodesignError, DomainError, FileFormatError
+from codesign.errors import CodesignError, DomainError, FileFormatError, check_whole
 from codesign.render import Camera, Film
 from codesign.render.light import PathScene, bake
 from codesign.render.placed import PlacedScene, Placement
@@ -83,6 +83,8 @@ def from_mitsuba(
     """
     if light not in LEVELS:
         raise DomainError(f"light = {light!r} is not known; choose one of {', '.join(LEVELS)}.")
+    if samples is not None:
+        samples = check_whole(samples, "samples")
     mi = backend.mitsuba(device)
     place = Placement(_axes(up, unit_m), unit_m, gain)
     scene = loaded(mi, source, parameters, merge=light == "path")

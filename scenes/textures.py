@@ -1,6 +1,8 @@
 """Photographs and procedural patterns as linear radiance textures on the 0..255 scale."""
 
+import io
 import math
+import warnings
 from contextlib import closing
 from pathlib import Path
 
@@ -9,9 +11,10 @@ import PIL.Image
 import torch
 from scipy.ndimage import gaussian_filter
 
-from codesign import backend
 from codesign.errors import DomainError, FileFormatError
 from codesign.events.sources.video import open_video
+from codesign.reading import read_bytes, reading
+from scenes import rgbe
 
 PHOTOS = (
     "brick",
@@ -27,6 +30,8 @@ PHOTOS = (
 LIFT = 2.0  # the darkest radiance of a photograph: no real wall is perfectly black
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue: ITU-R BT.709
 HDR = (".hdr", ".exr")
+FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "GIF", "PPM", "TGA", "WEBP")
+MOST_BYTES = 1 << 30
 HDR_MEAN = 80.0
 
 
@@ -60,13 +65,16 @@ def _stored(path):
             f"texture '{path}' is neither a file nor one of {', '.join(PHOTOS)}; give the path of a "
             "PNG, JPEG, HDR or EXR."
         )
-    try:
-        with PIL.Image.open(path) as image:
+    return decoded(read_bytes(path, MOST_BYTES), f"texture {path}")
+
+
+def decoded(data: bytes, what: str) -> np.ndarray:
+    """Values of a picture in the bytes of its file as they are stored: [H, W] or [H, W, 3]; FileFormatError, which
+    begins with ``what``, for damaged, enormous and other ones."""
+    with reading(what, "it is no whole picture; convert it to PNG"), warnings.catch_warnings():
+        warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
+        with PIL.Image.open(io.BytesIO(data), formats=FORMATS) as image:
             return stored_values(image)
-    except (OSError, ValueError, SyntaxError, PIL.Image.DecompressionBombError) as error:
-        raise FileFormatError(
-            f"texture {path} is not a readable image ({str(error)[:120]}); convert it to PNG."
-        ) from error
 
 
 def stored_values(image: PIL.Image.Image) -> np.ndarray:
@@ -83,9 +91,14 @@ def linear(stored: np.ndarray) -> np.ndarray:
     scale = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1.0
     values = np.asarray(stored, dtype=np.float64) / scale
     light = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
-    if light.ndim == 3:
-        light = light[..., :3] @ LUMINANCE if light.shape[2] >= 3 else light[..., 0]
-    return light
+    return luminance(light)
+
+
+def luminance(values: np.ndarray) -> np.ndarray:
+    """Luminance [H, W] of values in linear light, [H, W] or [H, W, C] of which the first three are red, green, blue."""
+    if values.ndim == 3:
+        values = values[..., :3] @ LUMINANCE if values.shape[2] >= 3 else values[..., 0]
+    return values
 
 
 def reduced(values: np.ndarray, size_px: int) -> np.ndarray:
@@ -166,27 +179,57 @@ def faded_to(texture, level, margin=0.12):
 
 
 def check_texture(values, name):
-    """Raise DomainError unless all radiances are finite and at least 0; returns float32."""
+    """Radiances [H, W] as float32. Raises: DomainError unless all are finite and at least 0, and for whole numbers of 8
+    or 16 bits, which may be light or be coded by the sRGB gamma (``picture`` is told which)."""
     values = np.asarray(values)
-    if values.ndim != 2 or not np.isfinite(values).all() or (values < 0).any():
-        bad = (
-            "NaN or infinite"
-            if not np.isfinite(values).all()
-            else "negative"
-            if values.ndim == 2
-            else f"shape {values.shape} instead of [H, W] with"
-        )
+    if values.dtype.kind == "u":
         raise DomainError(
-            f"texture {name}: {bad} values; give finite radiances of at least 0 as a 2-D array."
+            f"texture {name}: an array of {values.dtype} may hold pixels coded as in a PNG, or radiance; say which: "
+            "textures.picture(array, encoding='srgb') or encoding='linear'."
         )
-    return values.astype(np.float32)
+    if values.dtype.kind not in "bif":
+        raise DomainError(f"texture {name}: it holds no numbers; give radiances of at least 0, [H, W].")
+    with np.errstate(over="ignore"):
+        values = values.astype(np.float32)
+    wrong = None
+    if values.ndim != 2 or not values.size:
+        wrong = f"shape {values.shape} instead of [H, W] with"
+    elif not np.isfinite(values).all():
+        wrong = "NaN or infinite"
+    elif (values < 0).any():
+        wrong = "negative"
+    if wrong:
+        raise DomainError(
+            f"texture {name}: {wrong} values; give finite radiances of at least 0 as a 2-D array."
+        )
+    return values
 
 
-def picture(source, blur_texels=2.0):
+def picture(source, blur_texels=2.0, encoding=None):
     """What a world's surface is given: an array [H, W], a path, one of PHOTOS, or "speckle-3" (seed 3); files
-    and photographs softened by ``blur_texels``."""
-    if not isinstance(source, str | Path):
-        return check_texture(source, "given as an array")
+    and photographs softened by ``blur_texels``.
+
+    Args: encoding: of an array: None or "linear" takes it as radiance 0..255, "srgb" as pixels [H, W] or [H, W, 3], whole
+      numbers or 0..1, coded as those of a PNG. Whole numbers of 8 or 16 bits are refused without it.
+    """
+    if encoding not in (None, "linear", "srgb"):
+        raise DomainError(f"encoding = {encoding!r} is not known; give 'linear' or 'srgb'.")
+    if isinstance(source, str | Path):
+        if encoding is not None:
+            raise DomainError(f"encoding is of arrays, and '{source}' says its own; leave it out.")
+    elif encoding == "srgb":
+        pixels = np.asarray(source)
+        if pixels.dtype.kind not in "uf" or pixels.ndim not in (2, 3) or not pixels.size:
+            raise DomainError(
+                f"an array coded by sRGB has pixels [H, W] or [H, W, 3], uint8, uint16 or 0..1, not {pixels.dtype} "
+                f"{pixels.shape}."
+            )
+        return _radiance(linear(pixels), "given as an array")
+    else:
+        values = np.asarray(source)
+        return check_texture(
+            values.astype(float) if encoding and values.dtype.kind == "u" else values, "given as an array"
+        )
     if str(source).startswith("speckle-") and str(source)[8:].isdigit():
         return np.minimum(
             softened(speckle(int(str(source)[8:]), finest_px=16.0, contrast=0.4), blur_texels), 255
@@ -261,17 +304,10 @@ def _unscaled(path, what):
     """Luminance [H, W] float64 of a picture in linear light, in the units of its file."""
     if not Path(path).is_file():
         raise FileFormatError(f"{what} '{path}' is not a file; give the path of an .hdr or .exr picture.")
-    mi = backend.mitsuba("cpu")
-    try:
-        values = np.array(
-            mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.Y, mi.Struct.Type.Float32, srgb_gamma=False),
-            dtype=np.float64,
-        )
-    except Exception as error:  # Mitsuba raises plain RuntimeErrors of many lines
-        raise FileFormatError(
-            f"{what} '{path}' cannot be read ({str(error).splitlines()[-1][:120]}); convert it to .exr or .hdr."
-        ) from error
-    return check_texture(values.reshape(values.shape[0], -1), str(path)).astype(np.float64)
+    if Path(path).suffix.lower() not in HDR:
+        return linear(_stored(path))
+    values = rgbe.read(path)
+    return check_texture(luminance(values), str(path)).astype(np.float64)
 
 
 def _scaled(values, weight, mean, name):

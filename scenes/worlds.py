@@ -16,7 +16,7 @@ import numpy as np
 from codesign import backend
 from codesign.render import MitsubaScene, TexturedPlane
 from scenes import bodies, textures
-from scenes.build import GAP_M, Paint, World, ball, block, emissive, pole, rectangle, sky, sun
+from scenes.build import GAP_M, Paint, World, ball, block, check_sizes, emissive, pole, rectangle, sky, sun
 from scenes.foreign import from_mitsuba, view_of
 from scenes.from_mesh import from_mesh
 from scenes.tabletop import tabletop
@@ -61,6 +61,7 @@ def ground(texture, texel_m=0.004, half_width_m=12.0, device="cpu"):
 
 
 def _plane(name, texture, texel_m, half_width_m, towards, up, wrap, device):
+    check_sizes(name, texel_m=texel_m, half_width_m=half_width_m)
     named = isinstance(texture, str | Path)
     texture = textures.picture(texture) if named else textures.check_texture(texture, "of the scene")
     repeat = (

@@ -76,7 +76,7 @@ def bake(
     Raises: DomainError for mirrors, glass and masks unless ``matte``; media; shapes without known charts; of a
       dictionary, shapes of which nothing can be seen from their front.
     """
-    if not (texel_m > 0 and samples >= 1 and max_texels >= 4 and fine >= 1):
+    if not (0 < texel_m < np.inf and samples >= 1 and max_texels >= 4 and fine >= 1):
         raise DomainError(
             f"bake: texel_m = {texel_m}, samples = {samples}, max_texels = {max_texels}, fine = {fine}: "
             "sizes must be positive, samples and fine at least 1, max_texels at least 4."

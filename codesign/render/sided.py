@@ -33,11 +33,9 @@ class SidedScene(MitsubaScene):
 
         facing = -dr.dot(si.n, ray.d)
         back = self.backs.get(shape.id())
-        si.wi = self.mi.Vector3f(0, 0, facing)
-        light = shape.emitter().eval(si)[0]
+        light = self.emitted(shape, shape.emitter(), si, facing)
         if back is not None:
-            si.wi = -si.wi
-            light = dr.select(facing < 0, back.eval(si)[0], light)
+            light = dr.select(facing < 0, self.emitted(shape, back, si, -facing), light)
         return self.placement.gain * light
 
     def sky(self, direction: Any) -> Any:

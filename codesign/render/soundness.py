@@ -8,10 +8,17 @@ from typing import Any
 import numpy as np
 
 from codesign.errors import DomainError, ShapeError
+from codesign.render.vertex_light import vertex_attribute
 
 FILES_UNCHECKED = ("ply", "serialized")  # Mitsuba itself follows their faces to vertices that are not there
 RADIANCE = ("value", "data", "scale")  # last part of the names of what an emitter shines with
 OWN = ("positions", "normals", "texcoords")  # of a mesh, beside the attributes its user has given it
+MOST_TEXELS = (
+    2.0**22
+)  # from the origin of texture coordinates: beyond, float32 knows a texel to a quarter at best
+THINNEST = (
+    1e-5  # squared sine of the angle at a face's corner, below which Mitsuba's weights of corners are noise
+)
 NAMED = 3  # shapes that a sentence names
 
 
@@ -101,10 +108,13 @@ def _file_of(entry):
 
 def _check_shape(mi, name, shape):
     parameters = mi.traverse(shape)
+    _check_lookup(name, parameters)
     if shape.is_mesh() and "vertex_positions" in parameters:
-        checked_mesh(
+        vertices, faces = checked_mesh(
             name, *(np.array(parameters[key]).reshape(-1, 3) for key in ("vertex_positions", "faces"))
         )
+        if vertex_attribute(shape.bsdf()):
+            _check_thick(name, vertices[faces])
         attributes = (
             key for key, _ in parameters if key.startswith(("vertex_", "face_")) and not key.endswith(OWN)
         )
@@ -113,6 +123,33 @@ def _check_shape(mi, name, shape):
     box = shape.bbox()
     if not np.isfinite(np.array([box.min, box.max], dtype=float)).all():
         raise DomainError(f"shape '{name}': its place or size is NaN or infinite; repair its to_world.")
+
+
+def _check_lookup(name, parameters):
+    """Texture coordinates times texels stay below what float32 can tell apart."""
+    uv = np.array(parameters["vertex_texcoords"]) if "vertex_texcoords" in parameters else np.ones(1)
+    for key in [key for key, _ in parameters if key.endswith(".data")]:
+        size = max(np.shape(parameters[key]))
+        to_uv = key.removesuffix("data") + "to_uv"
+        scale = np.abs(np.array(parameters[to_uv].matrix, dtype=float)).max() if to_uv in parameters else 1.0
+        reach = float(np.abs(uv).max(initial=0)) * scale * size
+        if not reach <= MOST_TEXELS:
+            raise DomainError(
+                f"shape '{name}': its texture coordinates reach {reach:.3g} texels away from 0, where float32 no longer "
+                f"tells texels apart (at most {MOST_TEXELS:.0f}); repeat the picture less often, or make its texels larger."
+            )
+
+
+def _check_thick(name, corners):
+    u, v = corners[:, 1].astype(float) - corners[:, 0], corners[:, 2].astype(float) - corners[:, 0]
+    uu, vv, uv = (u * u).sum(1), (v * v).sum(1), (u * v).sum(1)
+    area = uu * vv - uv * uv
+    thin = int(((area > 0) & (area < THINNEST * uu * vv)).sum())
+    if thin:
+        raise DomainError(
+            f"mesh '{name}': {thin} of its faces are more than {THINNEST**-0.5:.0f} times as long as wide, on which Mitsuba "
+            "cannot tell albedo at vertices; remove them, or show the mesh at the level 'emissive'."
+        )
 
 
 def _check_radiance(name, values):

@@ -306,10 +306,10 @@ def _flow_truth(camera, scene, T_world_cam, stride, occlusion):
     T_world_cam = as_poses(T_world_cam)
     scene, poses = in_one_row(scene, T_world_cam, rays)
     length = T_world_cam.shape[-3]
-    if not 1 <= stride < length:
+    if not (1 <= as_number(stride, "stride") < length and stride % 1 == 0):
         raise ShapeError(
-            f"true flow over {stride} pose(s) ahead needs a stride of at least 1 and more poses than that, "
-            f"got {length}; give more poses."
+            f"true flow over {stride} pose(s) ahead needs a whole stride of at least 1 and more poses than "
+            f"that, got {length}; give more poses."
         )
     cameras = cameras_of(scene, poses)
     starts = torch.arange(poses.shape[0]).reshape(-1, length)[:, : length - stride].reshape(-1)

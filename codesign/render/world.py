@@ -17,6 +17,7 @@ from codesign.render.outline.curves import Segments
 from codesign.render.shape_table import box_around, shape_numbers
 from codesign.render.slopes import with_slopes
 from codesign.render.soundness import check_description, check_scene
+from codesign.render.vertex_light import interpolated, vertex_attribute
 
 
 class MitsubaScene:
@@ -152,8 +153,18 @@ class MitsubaScene:
         # emission is one-sided by the face: vertex normals are stored to 1 % only and would blacken faces
         # seen nearly edge-on
         facing = -dr.dot(si.n, ray.d)
-        si.wi = self.mi.Vector3f(0, 0, dr.abs(facing) if self.both_sides else facing)
-        return emitter.eval(si)[0]
+        return self.emitted(shape, emitter, si, dr.abs(facing) if self.both_sides else facing)
+
+    def emitted(self, shape: Any, emitter: Any, si: Any, facing: Any) -> Any:
+        """Radiance that an emitter shows on a shape where it is met (drjit arrays); 0 where ``facing`` is negative."""
+        import drjit as dr
+
+        si.wi = self.mi.Vector3f(0, 0, facing)
+        name = vertex_attribute(emitter)
+        if name is None:
+            return emitter.eval(si)[0]
+        scale = float(self.mi.traverse(emitter)["radiance.scale"])
+        return dr.select(facing > 0, scale * interpolated(self.mi, shape, name, si), 0)
 
     def sky(self, direction: Any) -> Any:
         """Radiance that comes against directions (drjit arrays) where nothing is met; 0 without a sky."""

@@ -132,7 +132,7 @@ def test_scenes_and_textures_that_cannot_be_are_refused(tmp_path):
     with pytest.raises(FileFormatError, match="neither a file nor one of brick"):
         textures.photo("nowhere.png")
     (tmp_path / "broken.png").write_bytes(b"not a picture")
-    with pytest.raises(FileFormatError, match=r"broken\.png is not a readable image"):
+    with pytest.raises(FileFormatError, match=r"broken\.png cannot be read"):
         textures.photo(tmp_path / "broken.png")
 
 

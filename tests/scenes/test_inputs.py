@@ -1,0 +1,88 @@
+"""What users bring into worlds: pictures in linear light against Mitsuba's reader, and one sentence for what has no
+meaning."""
+
+import numpy as np
+import pytest
+import torch
+
+from codesign import backend, lens, render
+from codesign.errors import DomainError, FileFormatError
+from codesign.pose import look_at
+from codesign.render.charts import emissive_mesh
+from scenes import build, rgbe, textures, worlds
+from tests.hostile import seeds_scenes
+
+HEAD = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 4\n"
+FLAT = HEAD + bytes([9, 8, 7, 130] * 3 + [5, 6, 7, 120])
+OLD = HEAD + bytes([9, 8, 7, 130, 1, 1, 1, 2, 5, 6, 7, 120])  # the same in run lengths of the older kind
+EVEN = np.ones((4, 4))
+
+
+@pytest.mark.parametrize("name", ["new.hdr", "flat.hdr", "old.hdr", "sky.exr"])
+def test_pictures_in_linear_light_hold_what_mitsuba_reads(tmp_path, name):
+    made = {"new.hdr": seeds_scenes.hdr(), "flat.hdr": FLAT, "old.hdr": OLD, "sky.exr": seeds_scenes.exr()}
+    path, known = tmp_path / name, tmp_path / f"known-{name}"
+    path.write_bytes(made[name])
+    known.write_bytes(
+        FLAT if name == "old.hdr" else made[name]
+    )  # Mitsuba does not know the older run lengths
+    theirs = np.array(backend.mitsuba().Bitmap(str(known)))[..., :3]
+    np.testing.assert_array_equal(rgbe.read(path).astype(np.float32), theirs.astype(np.float32))
+
+
+@pytest.mark.parametrize(("at", "value"), [(-1, None), (-30, 255), (60, 3)])
+def test_a_damaged_hdr_ends_in_a_sentence(tmp_path, at, value):
+    data = bytearray(seeds_scenes.hdr())
+    data[at:] = b"" if value is None else bytes([value, *data[at:][1:]])
+    (tmp_path / "sky.hdr").write_bytes(data)
+    with pytest.raises(FileFormatError, match="cannot be read"):
+        textures.environment(tmp_path / "sky.hdr")
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda: worlds.wall(np.full((4, 4), 99, np.uint8)), "encoding='srgb'"),
+        (lambda: textures.picture(EVEN.astype(np.uint16)), "encoding='linear'"),
+        (lambda: textures.picture(np.array([["a"]])), "holds no numbers"),
+        (lambda: textures.picture(np.empty((0, 0))), r"shape \(0, 0\)"),
+        (lambda: textures.picture(1e39 * EVEN), "NaN or infinite"),
+        (lambda: worlds.wall(EVEN, texel_m=float("nan")), "texel_m = nan"),
+        (lambda: worlds.wall(EVEN, texel_m=0), "texel_m = 0"),
+        (lambda: worlds.wall(EVEN, texel_m=1e-9), "no longer tells texels apart"),
+        (lambda: worlds.wall(EVEN, half_width_m=-1), "half_width_m = -1"),
+        (lambda: worlds.room(size_m=(4, -4, 2.6)), "width_m|height_m"),
+        (lambda: build.ball(backend.mitsuba(), 0, 0, 0, -0.1), "radius_m = -0.1"),
+        (lambda: worlds.from_mitsuba({"a": {"type": "sphere"}}, samples=0), "samples = 0"),
+    ],
+)
+def test_what_has_no_meaning_ends_in_a_sentence(call, says):
+    with pytest.raises(DomainError, match=says):
+        call()
+
+
+def test_an_array_of_bytes_says_how_it_is_coded(tmp_path):
+    import imageio.v3 as imageio
+
+    pixels = np.full((8, 8), 188, dtype=np.uint8)
+    imageio.imwrite(tmp_path / "grey.png", pixels)
+    np.testing.assert_allclose(
+        textures.picture(pixels, encoding="srgb"), textures.picture(tmp_path / "grey.png"), rtol=1e-6
+    )
+    assert float(textures.picture(pixels, encoding="linear").max()) == 188
+
+
+def test_colours_of_a_needle_a_kilometre_long_are_those_between_its_corners():
+    mi = backend.mitsuba()
+    vertices = np.array([[0, 0, -0.1], [0, 0, 0.1], [0, 1000.0, 0]])
+    source = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_radiance"}}
+    needle = emissive_mesh(mi, vertices, np.array([[0, 1, 2]]), source)
+    needle.add_attribute("vertex_radiance", 1, np.float32(50 + vertices[:, 1] / 10))
+    scene = render.MitsubaScene({"needle": needle}).two_sided()
+    camera = render.Camera(lens.Pinhole(100.0), 5, 5, 0.1, 1)
+    for y in (5.0, 200.0, 700.0):  # radiance is 50 + y / 10 there
+        pose = look_at((3.0, y, 0.0), (0.0, y, 0.0))[None].requires_grad_()
+        frame = render.frames(camera, scene, pose)
+        assert float(frame[0, 2, 2].detach()) == pytest.approx(50 + y / 10, abs=0.01)
+        (slope,) = torch.autograd.grad(frame[0, 2, 2], pose)
+        assert float(slope[0, 1, 3]) == pytest.approx(0.1, rel=1e-3)
