@@ -97,8 +97,8 @@ def yu_trace(
 def first_order(
     power: Tensor, thickness_mm: Tensor, index: Tensor, stop: int, entrance_pupil_diameter_mm: float | Tensor
 ) -> FirstOrder:
-    """First-order figures. Gradient: to every tensor. Raises: DomainError for an afocal lens or a stop that
-    no ray images.
+    """First-order figures. Gradient: to every tensor. Raises: DomainError for an afocal lens, numbers
+    that are not finite, or a stop that no ray images.
 
     Source: Smith, Modern Optical Engineering, ch. 2 and 9.
     """
@@ -106,6 +106,10 @@ def first_order(
     zero = torch.zeros_like(power[0])
     heights, angles = yu_trace(power, thickness_mm, index, one, zero)
     total = -angles[-1]
+    if not math.isfinite(float(total.detach())):
+        raise DomainError(
+            "the lens has no finite power: a curvature, thickness or index is NaN or infinite; correct it."
+        )
     if abs(float(total.detach())) < 1e-12:
         raise DomainError(
             "the lens is afocal (its power is zero), so it has no focal length; change a curvature."

@@ -18,6 +18,7 @@ from codesign.place.observability import chief_lines, flow_of_points
 from codesign.pose import se3_exp
 from codesign.types import ChiefRayCamera
 
+UPRIGHT = 1e-12  # sine of the angle to the vertical below which the view has no direction over ground
 MOST_PIXELS = 255  # of a film, spread over it, at which the motion of the image is measured
 AXES_BODY_CAM = torch.tensor(
     [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64
@@ -209,13 +210,22 @@ def yaw_pitch_roll_rad(T_body_cam: Tensor) -> Tensor:
     """Angles [..., 3] of a mount, the inverse of ``attitude``: yaw and roll in (-pi, pi], pitch in [-pi/2,
     pi/2].
 
-    Yaw and pitch are where the camera's axis points; looking straight up or down only their sum with roll
-    means something.
+    Yaw and pitch are where the camera's axis points. Looking straight up or down only yaw and roll together mean
+    something: yaw is then both, and roll 0.
+    Gradient: the matrix; straight up or down, where pitch has its largest or smallest value, 0 for pitch and roll.
     """
     turn = T_body_cam[..., :3, :3] @ AXES_BODY_CAM.to(T_body_cam).mT
-    yaw = torch.atan2(turn[..., 1, 0], turn[..., 0, 0])
-    pitch = torch.atan2(-turn[..., 2, 0], torch.hypot(turn[..., 0, 0], turn[..., 1, 0]))
-    return torch.stack([yaw, pitch, torch.atan2(turn[..., 2, 1], turn[..., 2, 2])], -1)
+    upright = turn[..., :2, 0].detach().square().sum(-1) < UPRIGHT**2
+    safe = torch.where(
+        upright, 1.0, turn[..., 0, 0]
+    )  # where there is no direction, a safe one to differentiate
+    aside = torch.where(upright, 0.0, turn[..., 1, 0])
+    level = torch.where(upright, 0.0, torch.hypot(safe, aside))
+    yaw = torch.where(upright, torch.atan2(-turn[..., 0, 1], turn[..., 1, 1]), torch.atan2(aside, safe))
+    pitch = torch.atan2(-turn[..., 2, 0], level)
+    below = torch.where(upright, 1.0, turn[..., 2, 2])
+    roll = torch.where(upright, 0.0, torch.atan2(torch.where(upright, 0.0, turn[..., 2, 1]), below))
+    return torch.stack([yaw, pitch, roll], -1)
 
 
 def _three(values, name):

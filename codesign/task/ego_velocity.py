@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from codesign import place
-from codesign.errors import DomainError, check_whole
+from codesign.errors import DomainError, check_finite, check_whole
 from codesign.flow.checks import check_number
 from codesign.task import unknown_depth
 from codesign.task.depth import ground_depth, scene_depth
@@ -130,6 +130,8 @@ class EgoVelocity:
     ) -> Motion:
         """Motion of N bodies from fields [N x windows, 2, H, W] behind poses T_world_cam [..., T, 4, 4].
 
+        Raises: DomainError for NaN where the field says that it is valid.
+
         t_s: [T] of the poses; the flow's interval ends with them and may begin later. None: it is all of them.
         """
         return self.solve(self.read(field, camera, scene, T_body_cam, T_world_cam, t_s))
@@ -225,17 +227,23 @@ class EgoVelocity:
         def per_body(values):  # [N x windows, C, h, w] -> [N, P, C]
             return values.double().movedim(1, -1).reshape(count, -1, values.shape[1])
 
-        flow = per_body(field.flow_px[at])
+        valid = field.valid[:, None][at]
+        seen = field.valid if field.confidence is None else field.confidence
+        confidence = per_body(seen[:, None][at])
+        # what is not known means nothing, NaN too: it is masked before anything is computed with it
+        known = confidence > 0
+        flow = torch.where(known, per_body(field.flow_px[at]), 0.0)
         if field.covariance_px2 is None:
-            deviation = torch.where(field.valid, PLAIN_PX, UNSEEN_PX)[:, None][at]
-            xx = yy = per_body(deviation)[..., 0] ** 2
+            xx = yy = per_body(torch.where(valid, PLAIN_PX, UNSEEN_PX))[..., 0] ** 2
             xy = torch.zeros_like(xx)
         else:
-            xx, xy, yy = per_body(field.covariance_px2[at]).unbind(-1)
-        confidence = field.valid.to(flow) if field.confidence is None else field.confidence
+            unknown = flow.new_tensor([UNSEEN_PX**2, 0.0, UNSEEN_PX**2])
+            xx, xy, yy = torch.where(known, per_body(field.covariance_px2[at]), unknown).unbind(-1)
+        for name, values in (("flow", flow), ("covariance", xx + xy + yy)):
+            check_finite(values, f"the {name} of valid pixels", "mark what is not known as not valid")
         precision = place.flow_precision(torch.stack([xx, xy, yy], -1), floor=self.floor_px)
         points = per_body(pixels[None].expand(count, *pixels.shape).flatten(0, 1))
-        return points, flow, precision, per_body(confidence[:, None][at])
+        return points, flow, precision, confidence
 
     def _rows(self, camera, depth, mounts, pixels, interval_s):
         rows, seen = place.body_flow(camera, depth, mounts, pixels)

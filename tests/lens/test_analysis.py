@@ -135,6 +135,10 @@ def test_afocal_lenses_and_double_stops_are_refused():
     window = GeoLens([Surface(math.inf, 5.0, GLASS, 5.0), Surface(math.inf, 5.0, None, 5.0)], 3.0)
     with pytest.raises(DomainError, match="afocal"):
         window.first_order()
+    with torch.no_grad():
+        window.curvature_per_mm[0] = math.nan
+    with pytest.raises(DomainError, match="no finite power"):
+        window.first_order()
     with pytest.raises(DomainError, match=r"surfaces \[1, 2\] are all marked as the stop"):
         GeoLens(
             [Surface(50.0, 5.0, GLASS, 5.0, is_stop=True), Surface(-50.0, 5.0, None, 5.0, is_stop=True)], 3.0

@@ -2,6 +2,7 @@
 the covariance against many noisy draws, outliers."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -125,6 +126,24 @@ def test_unseen_flow_says_nothing(camera, drive):
     found = ours(field_of(0 * flow, deviation_px=8.0, confidence=0.0), camera, None, mount, poses)
     assert float(found.velocity.abs().max()) == 0
     torch.testing.assert_close(found.covariance, 1e6 * torch.eye(6, dtype=D).expand(5, 6, 6))
+
+
+def test_what_is_not_valid_means_nothing_and_nan_that_is_valid_is_refused(camera, drive):
+    """NaN under a pixel that is not valid gives the same velocity as any number there; where the field claims to know,
+    it is refused."""
+    mount, poses, _, flow = drive
+    field = field_of(flow)
+    field.valid[:, 3:9] = False
+    field = replace(field, confidence=field.valid.double())
+    ours = task.EgoVelocity(place.FREE, (1e3,) * 6)
+
+    def solved(value, where):
+        given = replace(field, flow_px=torch.where(where[:, None], value, field.flow_px))
+        return ours(given, camera, None, mount, poses).velocity
+
+    torch.testing.assert_close(solved(torch.nan, ~field.valid), solved(1e3, ~field.valid), rtol=0, atol=0)
+    with pytest.raises(DomainError, match=r"flow of valid pixels: .* NaN"):
+        solved(torch.nan, field.valid)
 
 
 def test_gradient_to_the_mount(camera, drive):
