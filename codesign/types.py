@@ -69,6 +69,8 @@ class FlowField:
     confidence: [B, H, W] in 0..1, 0 where nothing was seen, 1 for a flow known exactly; None where nobody
       estimated it.
     covariance_px2: [B, 3, H, W] of the error, px^2: xx, xy, yy; None where nobody estimated it.
+    net_share: [B] displacement over the length of the way, 1 for motion that does not turn back, about 0 for one that
+      ends where it began; None where nobody looked.
     """
 
     flow_px: Tensor
@@ -76,6 +78,7 @@ class FlowField:
     interval_s: float
     confidence: Tensor | None = None
     covariance_px2: Tensor | None = None
+    net_share: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -122,6 +122,46 @@ def vibration(draw, t, width_px, height_px, flow_px):
     return out
 
 
+def zoom(draw, t, width_px, height_px, rate):
+    """An approach or a retreat at a steady course, by exp(rate t) about a point near the middle.
+
+    rate: (least, most) per window. Returns: [1, T, 3, 3].
+    """
+    return _about(draw, t, width_px, draw.choice([-1.0, 1.0]) * draw.uniform(*rate))
+
+
+def roll(draw, t, width_px, height_px, turn_rad):
+    """A turn about an axis of view near the middle. turn_rad: (least, most) per window. Returns: [1, T, 3, 3]."""
+    return _about(draw, t, width_px, 1j * draw.choice([-1.0, 1.0]) * draw.uniform(*turn_rad))
+
+
+def _about(draw, t, width_px, rate):
+    """Similarities exp(rate t) about a point within a tenth of the width of the middle."""
+    centre = complex(*draw.uniform(-0.1, 0.1, 2)) * width_px
+    m = np.exp(np.asarray(t) * rate)
+    rows = [m.real, -m.imag, ((1 - m) * centre).real, m.imag, m.real, ((1 - m) * centre).imag]
+    out = np.zeros((1, len(t), 3, 3))
+    out[0, :, :2] = np.stack(rows, -1).reshape(-1, 2, 3)
+    out[0, :, 2, 2] = 1
+    return out
+
+
+def out_and_back(draw, t, width_px, height_px, flow_px):
+    """A shift out and half to all of the way back, at an even pace, in the window.
+
+    flow_px: (least, most) of the way out. Returns: [1, T, 3, 3].
+    """
+    length = draw.uniform(*flow_px)
+    angle = draw.uniform(0, 2 * np.pi)
+    turn = 1 / (1 + draw.uniform(0.5, 1.0))  # when it turns
+    t = np.asarray(t)
+    way = length * (turn - np.abs(t - turn)) / turn
+    out = np.tile(np.eye(3), (1, len(t), 1, 1))
+    out[0, :, 0, 2] = way * np.cos(angle)
+    out[0, :, 1, 2] = way * np.sin(angle)
+    return out
+
+
 def _corners(width_px, height_px):
     """x and y [5] of the corners and the centre."""
     return (

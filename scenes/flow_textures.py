@@ -11,7 +11,8 @@ from scenes import textures
 SIZE = 512
 PROCEDURAL_COUNT = 48
 EVERYDAY_PILES = 5
-POOLS = ("procedural", "fine", "mixed", "everyday")
+STRIPE_COUNT = 8
+POOLS = ("procedural", "fine", "mixed", "everyday", "stripes")
 
 
 @lru_cache(maxsize=4)
@@ -22,7 +23,8 @@ def pool(name):
     are trained on. "fine": gravel, grass, brick and three speckles with seeds of their own: detail
     everywhere. "mixed": camera, chelsea, coffee, astronaut, rocket: photographs with large smooth areas.
     "everyday": those and as many piles of few, mostly smooth shapes with seeds of their own: what a camera
-    sees in rooms. No photograph is in "procedural".
+    sees in rooms. "stripes": lines of several widths that all run the same way, so that motion along them is
+    not seen. No photograph is in "procedural".
     """
     if name == "fine":
         return tuple(textures.photo(source) for source in ("gravel", "grass", "brick")) + tuple(
@@ -36,6 +38,8 @@ def pool(name):
         return pool("mixed") + tuple(
             pile(np.random.default_rng((90_100, k)), shapes=150) for k in range(EVERYDAY_PILES)
         )
+    if name == "stripes":
+        return tuple(_stripes(np.random.default_rng((90_200, k))) for k in range(STRIPE_COUNT))
     if name == "procedural":
         return tuple(_procedural(seed) for seed in range(PROCEDURAL_COUNT))
     raise DomainError(f"texture pool {name!r} is unknown; there are {', '.join(POOLS)}.")
@@ -50,6 +54,18 @@ def _procedural(seed):
             seed, finest_px=finest, coarsest_px=finest * draw.uniform(3, 16), contrast=draw.uniform(0.2, 0.7)
         )
     return pile(draw)
+
+
+def _stripes(draw):
+    """Half of them of one period, half of random widths."""
+    x = np.arange(SIZE, dtype=np.float32)
+    if draw.random() < 0.5:
+        line = np.sin(2 * np.pi * x / draw.uniform(8, 24))
+    else:
+        line = gaussian_filter(draw.standard_normal(SIZE), draw.uniform(1.5, 5), mode="wrap")
+        line = line / line.std()
+    values = np.exp(4 + draw.uniform(0.3, 0.8) * line).astype(np.float32)
+    return textures.check_texture(np.broadcast_to(values, (SIZE, SIZE)).clip(textures.LIFT, 255.0), "stripes")
 
 
 def pile(draw, size_px=SIZE, shapes=1500):

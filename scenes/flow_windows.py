@@ -23,6 +23,9 @@ ONE_PLANE = {
     "similarity": flow_motion.similarity,
     "rotation": flow_motion.rotation,
     "vibration": flow_motion.vibration,
+    "zoom": flow_motion.zoom,
+    "roll": flow_motion.roll,
+    "out_and_back": flow_motion.out_and_back,
 }
 MOTIONS = (*ONE_PLANE, "camera", "warps")
 
@@ -32,8 +35,8 @@ class Draws:
     """Ranges (least, most) from which a sample is drawn.
 
     textures: pool of scenes.flow_textures. motion: "similarity" (one plane; rotation, zoom, translation),
-      "rotation" (a camera that turns), "vibration" (one that shakes), "camera" (tilted planes, perspective) or
-      "warps" (layers that bend).
+      "rotation" (a camera that turns), "vibration" (one that shakes), "zoom", "roll", "out_and_back", "camera"
+      (tilted planes, perspective) or "warps" (layers that bend).
     layers: planes before the background. flow_px: see scenes.flow_motion. theta: contrast threshold, drawn
       evenly in its logarithm. mismatch: relative spread of thresholds over pixels. noise: background events
       per pixel, polarity and eighth of the window, evenly in the logarithm. contrast: factor on log radiance.

@@ -4,6 +4,7 @@ network files, flow files, sources of windows, and flow along a stream of events
 from codesign.flow import contrast, losses, metrics, sources
 from codesign.flow.baselines import ECN, FlowNetEvents, IDNet, SpikeFlowNet
 from codesign.flow.checkpoint import load, save
+from codesign.flow.choice import estimate
 from codesign.flow.export import export
 from codesign.flow.files import read_flow, write_flow
 from codesign.flow.lk import estimate_lk
@@ -19,6 +20,7 @@ __all__ = [
     "TrackedWindow",
     "Tracker",
     "contrast",
+    "estimate",
     "estimate_lk",
     "export",
     "load",

@@ -18,6 +18,7 @@ from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.flow import lk_field, lk_level
 from codesign.flow.checks import check_count, check_flow, check_number, check_real, check_volume, shown
 from codesign.flow.lk_descent import Descent
+from codesign.flow.lk_path import Path
 from codesign.types import EventVolume, FlowField
 
 # field -> the polynomial in it
@@ -91,20 +92,39 @@ def estimate_lk(
             raise DomainError(
                 f"a blur of levels_px is {blur_px:g} px; {LEAST_BLUR_PX} to {MOST_BLUR_PX} are possible."
             )
-    batch, _, _, height, width = counts.shape
+    height, width = counts.shape[-2:]
     if min(height, width) < 2:
         raise ShapeError(
             f"an event volume of {height} x {width} pixels has no slopes both ways; give at least 2 x 2."
         )
-    shape = lk_field.Polynomials(MODELS[model], height, width, prior_px, counts.device)
-    way, bins, density = lk_level.along_path(volume, clock)
-    net = way.net.to(counts)[:, None, None, None]
-    share = net.square() + TURNED * (1 - net.square())
-    valid = (counts.detach().sum((1, 2, 3, 4)) > 0)[:, None, None].expand(batch, height, width)
+    found = lk_level.along_path(volume, clock)
+    return field(
+        volume, found[0], *descended(volume, found, model, prior_px, levels_px, steps, noise_floor, start_px)
+    )
+
+
+def descended(
+    volume: EventVolume,
+    found: tuple[Path, Tensor, Tensor],
+    model: str = "local",
+    prior_px: float = 3.0,
+    levels_px: Sequence[float] = (4.0, 2.0, 1.0),
+    steps: int = 3,
+    noise_floor: float = 0.02,
+    start_px: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Flow [B, 2, H, W] px per way on the pixels of the start, its covariance [B, 3, H, W] and confidence [B, H, W].
+
+    Args: found: as of ``lk_level.along_path``. Others, gradient: as of ``estimate_lk``.
+    """
+    way, bins, density = found
+    counts = volume.counts
+    shape = lk_field.Polynomials(MODELS[model], *counts.shape[-2:], prior_px, counts.device)
     descents = [Descent(shape, prior_px, model == "local", counts)]
     if start_px is not None:
         warm = Descent(shape, prior_px, model == "local", counts)
-        begun = torch.where(valid[:, None], _start(start_px, counts) * net / share, 0)
+        net, share = _net(way, counts)
+        begun = torch.where(_seen(counts)[:, None], check_start(start_px, counts) * net / share, 0)
         warm.begin(begun.detach(), way.start.detach())
         descents.insert(0, warm)
     for number, blur_px in enumerate(levels_px):
@@ -118,18 +138,31 @@ def estimate_lk(
         while len(descents) > 1 and (number == 1 or last):
             other = descents.pop()
             descents[-1].join(other, level)
-    flow, covariance, confidence = descents[0].at_start(way.start)
-    return FlowField(
-        net * flow,
-        valid,
-        float(volume.collected_s.sum()),
-        confidence,
-        share * covariance,
-    )
+    return descents[0].at_start(way.start)
 
 
-def _start(start_px, counts):
-    """[B, 2, H, W] as ``counts``."""
+def field(volume: EventVolume, way: Path, flow: Tensor, covariance: Tensor, confidence: Tensor) -> FlowField:
+    """FlowField over the interval of what was found along the way."""
+    net, share = _net(way, volume.counts)
+    interval_s = float(volume.collected_s.sum())
+    covariance = share * covariance
+    return FlowField(net * flow, _seen(volume.counts), interval_s, confidence, covariance, way.net.detach())
+
+
+def _net(way, counts):
+    """[B, 1, 1, 1] displacement over the way, and the factor on variances."""
+    net = way.net.to(counts)[:, None, None, None]
+    return net, net.square() + TURNED * (1 - net.square())
+
+
+def _seen(counts):
+    """[B, H, W] whether a sample has events."""
+    batch, *_, height, width = counts.shape
+    return (counts.detach().sum((1, 2, 3, 4)) > 0)[:, None, None].expand(batch, height, width)
+
+
+def check_start(start_px: Tensor, counts: Tensor) -> Tensor:
+    """``start_px`` of ``estimate_lk`` as [B, 2, H, W], of the type of ``counts``."""
     batch, _, _, height, width = counts.shape
     if check_real(start_px, "start_px").ndim != 2:
         start_px = check_flow(start_px, (batch, 2, height, width), "start_px")

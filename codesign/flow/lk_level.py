@@ -49,7 +49,7 @@ def along_path(volume: EventVolume, clock: str) -> tuple[Path, Tensor, Tensor]:
     """The way of the samples, weight and time of the bins [2, n], events of both signs per pixel [B, H, W];
     hot pixels weighed down.
 
-    clock: "time" or "events". Weights are the shares of the interval; time is 0 at mid-interval, in intervals.
+    clock: "time", "events", or "turn": events, with one turn of any speed. Weights are the shares of the interval; time is 0 at mid-interval, in intervals.
     """
     counts = volume.counts
     span = volume.collected_s.sum()
@@ -60,7 +60,7 @@ def along_path(volume: EventVolume, clock: str) -> tuple[Path, Tensor, Tensor]:
         found = even(signed, weight, time)
     else:
         events = (counts.sum(1).flatten(2) @ kept.flatten(1)[:, :, None])[..., 0]  # of each bin
-        found = path(signed, events, weight, time)
+        found = path(signed, events, weight, time, clock == "turn")
     return found, torch.stack([weight, time]), density
 
 

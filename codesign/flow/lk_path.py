@@ -20,6 +20,7 @@ UNEVEN = 0.02  # mean square of speed over its mean, less 1, from which on it co
 NEAR = 3  # bins that far apart are compared
 SHORT = 1e-3  # share of the energy of all bins below which a bin says little
 TINY = 2.0**-100
+MIRRORED = 0.35  # correlation of the bins before and after a turn, sign turned, from which on it is one
 SHARP = 6.0  # of the choice between ways, per unit of correlation
 POOL = 4  # pixels a side over which counts are compared
 
@@ -31,15 +32,19 @@ class Path:
     counts: [B, n, H, W] ON less OFF, in bins evenly spaced on the path as the volume's are in time, events on the
       way back with their sign turned. net: [B] displacement over the way, 1 for motion that never turns. start:
       [B] place of the beginning; 0 is the mean place of the events. spread: [B] mean square place of the events.
+    place: [B, n] of the volume's bins on the way. direction: [B, n] of the motion in them, 1 forwards, -1 on the way
+      back.
     """
 
     counts: Tensor
     net: Tensor
     start: Tensor
     spread: Tensor
+    place: Tensor
+    direction: Tensor
 
 
-def path(signed: Tensor, events: Tensor, weight: Tensor, time: Tensor) -> Path:
+def path(signed: Tensor, events: Tensor, weight: Tensor, time: Tensor, mirrored: bool = False) -> Path:
     """The way of each sample.
 
     Args: signed: [B, n, H, W] ON less OFF per bin. events: [B, n] of both signs. weight, time: [n] share of the
@@ -52,7 +57,8 @@ def path(signed: Tensor, events: Tensor, weight: Tensor, time: Tensor) -> Path:
     speed = speed / weight
     uneven = (weight * (speed - 1).square()).sum(1, keepdim=True)
     speed = 1 + (speed - 1) * uneven / (uneven + UNEVEN)
-    return _along(signed, speed, _directions(signed, speed, weight), weight, time)
+    direction = _mirror(signed, weight) if mirrored else _directions(signed, speed, weight)
+    return _along(signed, speed, direction, weight, time)
 
 
 def even(signed: Tensor, weight: Tensor, time: Tensor) -> Path:
@@ -61,7 +67,8 @@ def even(signed: Tensor, weight: Tensor, time: Tensor) -> Path:
     mean = weight @ time.double()
     spread = weight @ (time.double() - mean).square()
     ones = torch.ones(len(signed), dtype=torch.float64, device=signed.device)
-    return Path(signed, ones, -(0.5 + mean) * ones, spread * ones)
+    place = (time.double() - mean).expand(len(signed), -1)
+    return Path(signed, ones, -(0.5 + mean) * ones, spread * ones, place, torch.ones_like(place))
 
 
 def _along(signed, speed, direction, weight, time):
@@ -73,7 +80,7 @@ def _along(signed, speed, direction, weight, time):
     place = place - mean
     moved = direction[:, :, None] * _shared(place, time - weight @ time)
     counts = (moved.mT.to(signed) @ signed.flatten(2)).unflatten(2, signed.shape[2:])
-    return Path(counts, edge[:, -1], -mean[:, 0], (share * place.square()).sum(1))
+    return Path(counts, edge[:, -1], -mean[:, 0], (share * place.square()).sum(1), place, direction)
 
 
 def _shared(place, nodes):
@@ -83,6 +90,29 @@ def _shared(place, nodes):
     share = (place - nodes[upper - 1]) / (nodes[upper] - nodes[upper - 1])
     found = place.new_zeros(*place.shape, len(nodes))
     return found.scatter(2, torch.stack([upper - 1, upper], 2), torch.stack([1 - share, share], 2))
+
+
+def _mirror(signed, weight):
+    """[B, n] in -1..1: one turn, or none. Bins as far before it as after it have seen the same places, with the
+    opposite sign, whatever the texture, the speed and the direction."""
+    bins = len(weight)
+    side = min(POOL, *signed.shape[2:])
+    images = avg_pool2d(signed.detach(), side).flatten(2).double()
+    products = images @ images.mT
+    sizes = (products.diagonal(dim1=1, dim2=2) + TINY).sqrt()
+    sizes = sizes[:, :, None] * sizes[:, None]
+    at = torch.arange(bins, device=signed.device)
+    twice = torch.arange(
+        3, 2 * bins - 4, device=signed.device
+    )  # place of the turn: two pairs of bins at least
+    if not len(twice):
+        return torch.ones_like(products[:, 0])
+    pairs = (at[:, None] + at == twice[:, None, None]) & (at[:, None] != at)
+    alike = [(pairs * matrix[:, None]).sum((2, 3)) for matrix in (-products, sizes)]
+    most, which = (alike[0] / alike[1]).max(1)
+    back = (twice[which, None] / 2 - at).clamp(-1, 1).to(weight)
+    back = torch.where((back @ weight < 0)[:, None], -back, back)
+    return torch.where((most > MIRRORED)[:, None], back, 1.0)
 
 
 def _directions(signed, speed, weight):

@@ -24,6 +24,12 @@ START = "closed_form_affine"
 FIGURES = {
     "ratio": ("Endpoint error over that of zero flow", "Mean over valid pixels and windows.", 3),
     "worse_percent": ("Windows worse than zero flow, %", "", 1),
+    "much_worse_percent": ("Windows worse than zero flow by more than 5 %, %", "", 1),
+    "within_percent": (
+        "Pixels whose error lies in the claimed ellipse of 90 %, %",
+        "90 for an honest claim.",
+        1,
+    ),
     "error_over_claimed": (
         "Error over claimed deviation, root mean square",
         "1 for an honest claim; a few windows of small claims and large errors rule it.",

@@ -13,6 +13,7 @@ def estimators(network, models):
     found = {
         f"closed_form_{model}": partial(flow.estimate_lk, model=model, clock="events") for model in models
     }
+    found["estimate"] = flow.estimate
     refines = isinstance(network, flow.Refiner)
     found["refiner"] = partial(network, clock="events") if refines else network
     return {name: torch.no_grad()(estimate) for name, estimate in found.items()}

@@ -13,6 +13,8 @@ from codesign.flow.metrics import endpoint_error
 SHARES = np.linspace(0, 0.95, 20)  # of the pixels left out of a sparsification curve
 HONEST_MEDIAN = np.log(2) ** 0.5  # of error over claimed deviation, when errors are Gaussian as claimed
 DRAWS = 2000  # of the bootstrap
+ELLIPSE = -2 * np.log(0.1)  # normalised square of two Gaussian errors that 90 % stay below
+MUCH = 1.05  # error over that of zero flow from which on a window is worse than by chance
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,7 @@ class Measured:
     left, best: [N, len(SHARES)] mean error of the pixels left when a share of them is taken out, least
       confident first, and largest error first. fwl, truth_fwl: [N] variance of the image of warped events
       over the unwarped one's, by the estimate and by the true flow, NaN for windows without events.
+    within: [N] share of the pixels whose error lies in the claimed ellipse of 90 %; NaN where nothing is claimed.
     """
 
     error_px: np.ndarray
@@ -39,6 +42,7 @@ class Measured:
     best: np.ndarray
     fwl: np.ndarray
     truth_fwl: np.ndarray
+    within: np.ndarray
 
     @property
     def ratio(self) -> float:
@@ -56,6 +60,16 @@ class Measured:
     def worse_percent(self) -> float:
         """Share of windows with a larger error than zero flow's."""
         return float(100 * (self.error_px > self.zero_px).mean())
+
+    @property
+    def much_worse_percent(self) -> float:
+        """Share of windows with an error above 1.05 times zero flow's."""
+        return float(100 * (self.error_px > MUCH * self.zero_px).mean())
+
+    @property
+    def within_percent(self) -> float | None:
+        """Share of the pixels in their claimed ellipses of 90 %."""
+        return None if np.isnan(self.within).any() else float(100 * self.within.mean())
 
     @property
     def error_over_claimed(self) -> float | None:
@@ -133,9 +147,19 @@ def measure(field, windows) -> Measured:
                 sparsified(e, e),
                 warp_loss(windows.volume, field.flow_px, k),
                 warp_loss(windows.volume, truth.flow_px, k),
+                np.nan if claim is None else within(field, truth, k),
             )
         )
     return Measured(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def within(field, truth, k) -> float:
+    """Share of the valid pixels of sample k whose error lies in the claimed ellipse of 90 %."""
+    here = truth.valid[k]
+    x, y = (field.flow_px - truth.flow_px)[k][:, here].double().numpy()
+    xx, xy, yy = field.covariance_px2[k][:, here].double().numpy()
+    square = yy * x**2 - 2 * xy * x * y + xx * y**2
+    return float((square <= ELLIPSE * (xx * yy - xy**2)).mean())
 
 
 def _drawn(covariance, random):

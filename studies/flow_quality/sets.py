@@ -1,6 +1,7 @@
 """The windows flow is judged on: seeds that guided no choice."""
 
 from scenes.flow_files import FileWindows
+from scenes.flow_harsh import HARSH
 from scenes.flow_sets import SETS
 from scenes.flow_worlds import ALL, WorldWindows
 from studies.train_flow.sources import UNSEEN, VALIDATION, Shape
@@ -16,7 +17,7 @@ def judged(config, bins):
         name: (make(shape, seed), config.windows) for name, make in VALIDATION.items() if name != "worlds"
     }
     found["worlds"] = (WorldWindows(ALL, seed=UNSEEN + seed, bins=bins), config.world_windows)
-    for name, make in SETS.items():
+    for name, make in (SETS | HARSH).items():
         found[name] = (make(UNSEEN + seed, bins), config.real_windows)
     if config.middlebury is not None:
         for factor in (1, 3):

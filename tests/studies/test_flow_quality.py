@@ -43,7 +43,9 @@ def test_errors_claims_and_ranks_of_two_windows():
     both = join([rising, even])
     assert rising.ratio == pytest.approx(1.25 / 2)
     assert both.ratio == pytest.approx((1.25 + 6) / 4)
-    assert both.worse_percent == 50.0
+    assert both.worse_percent == both.much_worse_percent == 50.0
+    # 0.5^2 / (0.5^2 / 8) = 8 and its like are outside 4.6, 36 / 18 = 2 is inside
+    assert both.within_percent == 50.0
     low, high = both.ratio_interval()
     # draws of two windows from two: both the first, both the second, with a probability of 1/4 each
     assert low == pytest.approx(1.25 / 2)

@@ -1,0 +1,223 @@
+"""Flow whose prior, levels, model and clock are chosen by how well the bins agree along it, zero flow among the
+candidates.
+
+A flow that is right carries every bin to the same signed picture. The agreement r of a flow is the correlation of
+pairs of blurred bins read along it, at least two bins apart, since neighbours share events. Events scattered at random
+have r = 0 along any flow, with a variance that their density tells; no flow gains by squeezing events together, since r
+is relative to what is read. Twice the likelihood gained over zero flow is about n log((1 - r0^2) / (1 - r^2)), n the
+inverse of that variance.
+"""
+
+import math
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, grid_sample
+
+from codesign.flow.checks import check_volume
+from codesign.flow.lk import check_start, descended, field
+from codesign.flow.lk_cool import cooled
+from codesign.flow.lk_kernel import blurred
+from codesign.flow.lk_lanes import Grid
+from codesign.flow.lk_level import along_path, gaussian
+from codesign.flow.lk_path import Path
+from codesign.flow.warp import pixel_grid
+from codesign.types import EventVolume, FlowField
+
+BLUR_PX = 1.0
+LEAST_SHARE = 0.3  # of the pixels that must stay in the image, for a flow to be compared
+TINY = 1e-12
+SOME = 0.02  # variance of a pixel's share, squared events, where nothing was seen
+WIDE: dict[str, Any] = {"prior_px": 20.0, "levels_px": (8.0, 4.0, 2.0, 1.0)}
+COARSE: dict[str, Any] = {"model": "affine", "prior_px": 8.0, "levels_px": (8.0, 4.0, 2.0)}
+NARROW: dict[str, Any] = {"model": "affine"}
+OPTIONS: dict[bool, dict[str, Any]] = {
+    False: {},
+    True: WIDE,
+}  # of a local field, by whether it is to reach far
+CLOCKS = {False: "time", True: "turn"}
+TURNED = 0.95  # factor on 1 - r from which on events are the clock
+FAR = 0.9  # and the wide prior is taken
+FEW = 25.0  # nats over zero flow at which half of the flow is believed
+# bodies before still ground, logistic: extent of what agrees, logarithm of the share of the cells that hold it and of
+# how much worse one affine field explains it, 1; fitted to windows of scenes.flow_harsh and flow_sets, other seeds
+BODIES = (-13.1, -0.26, 1.8, -0.54)
+SURE = 0.2  # probability from which on they are taken for such
+MOVES = 5.0  # deviations of scattered events from which on a pixel belongs to one
+CELL = 8
+LEAST = 1e-3
+
+
+class Agreed(NamedTuple):
+    """alike: [B] the agreement r. sure: [B] inverse of its variance for scattered events. z: [B, H, W] of the pixels'
+    share in it, over its deviation for scattered events; empty where not asked for."""
+
+    alike: Tensor
+    sure: Tensor
+    z: Tensor
+
+
+class Agreement:
+    """The bins of a volume, blurred, and how well they agree along flows. No gradient."""
+
+    @torch.no_grad()
+    def __init__(self, volume: EventVolume) -> None:
+        counts = volume.counts.detach()
+        signed, _, kept = cooled(counts)
+        grid = Grid(*counts.shape[-2:])
+        taps = gaussian(BLUR_PX, 1)
+        taps = taps[len(taps) // 2 :].tolist()
+        self.signed = blurred(signed, grid, taps)
+        self.events = blurred(counts.sum(1) * kept[:, None], grid, taps)
+        self.apart = min(2, signed.shape[1] - 1)
+
+    @torch.no_grad()
+    def along(self, flow: Tensor, way: Path, sure: bool = False) -> Agreed:
+        """Agreement along a flow [B, 2, H, W] px per way, on the pixels of the start."""
+        place = (way.place - way.start[:, None]).to(flow)
+        at = pixel_grid(*flow.shape[2:], flow) + place[:, :, None, None, None] * flow[:, None]
+        size = torch.tensor([flow.shape[3], flow.shape[2]]).to(flow)[:, None, None]
+        unit = (2 * at + 1) / size - 1
+        inside = (unit.abs() <= 1).all(2).all(1)
+        inside = inside & (inside.to(flow).mean((1, 2), keepdim=True) > LEAST_SHARE)
+        unit = unit.permute(0, 1, 3, 4, 2).flatten(0, 1)
+        found = inside[:, None] * _read(self.signed, unit) * way.direction.to(flow)[:, :, None, None]
+        size = found.square().sum((2, 3)).sqrt()
+        product, most = self._pairs(found), self._pairs(size)
+        alike = product.sum((1, 2)) / (most + TINY)
+        if not sure:
+            return Agreed(alike, alike.new_empty(0), alike.new_empty(0))
+        events = self._pairs(inside[:, None] * _read(self.events, unit)).clamp_min(0)
+        variance = events / (8 * math.pi * BLUR_PX**2)
+        return Agreed(
+            alike, most.square() / (variance.sum((1, 2)) + TINY), product / (variance + SOME).sqrt()
+        )
+
+    def _pairs(self, bins):
+        """Sum of the products of bins [B, n, ...] that are ``apart`` or more."""
+        apart = [bins[:, lag:] * bins[:, :-lag] for lag in range(self.apart, bins.shape[1])]
+        return torch.cat(apart, 1).sum(1)
+
+
+def _read(bins, unit):
+    """Bins [B, n, H, W] at places [B n, H, W, 2] in grid_sample's units."""
+    flat = bins.flatten(0, 1)[:, None]
+    return grid_sample(flat, unit, padding_mode="border", align_corners=False).reshape(bins.shape)
+
+
+def estimate(volume: EventVolume, start_px: Tensor | None = None) -> FlowField:
+    """Flow over the volume's interval, with its uncertainty, where nothing is known of scene, motion and sensor.
+
+    Chosen for each sample by the agreement of the bins: time or events as the clock, or a motion that turns back once
+    (``net_share`` tells); a local field with the prior of ``estimate_lk`` or a wide one for motions of many pixels; and
+    zero flow, towards which all shrinks where it explains the events as well. Where few places give nearly all events
+    and do not move as one, they are taken for bodies before still ground, and there is no flow in between.
+
+    Args: volume, start_px: as of ``estimate_lk``; with fewer than 4 bins little can be told apart.
+    Returns: as of ``estimate_lk``. The covariance takes in how far the candidates are apart, and what was shrunk.
+    Gradient: counts, as of ``estimate_lk``, through what was chosen; none through the choice.
+    Raises: ShapeError, DomainError.
+    Cost: forward 5 to 9 times a local field (docs/flow_closed_form.md); a gradient passes through one of them.
+
+    >>> import torch
+    >>> from codesign.flow.export import evenly_timed
+    >>> y, x = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
+    >>> rate = torch.stack([torch.sin((x - 2 * t) / 4) + torch.sin((y - t) / 5) for t in torch.linspace(0, 1, 6)])
+    >>> counts = torch.stack([rate.clamp(min=0), (-rate).clamp(min=0)])[None]
+    >>> estimate(evenly_timed(counts)).flow_px[0, :, 24, 32].round(decimals=0).tolist()
+    [2.0, 1.0]
+    """
+    counts = check_volume(volume, least_bins=2)
+    start = None if start_px is None else check_start(start_px, counts)
+    with torch.no_grad():
+        chosen = _chosen(replace(volume, counts=counts.detach()), start)
+    parts = []
+    places = []
+    for turned, far in ((False, False), (False, True), (True, False), (True, True)):
+        these = ((chosen.turned == turned) & (chosen.far == far)).nonzero()[:, 0]
+        if len(these):
+            part = replace(volume, counts=counts[these])
+            path = along_path(part, CLOCKS[turned])
+            from_px = None if start is None else start[these]
+            parts.append(field(part, path[0], *descended(part, path, **OPTIONS[far], start_px=from_px)))
+            places.append(these)
+    order = torch.cat(places).argsort()
+    flow, valid, confidence, covariance, net = (
+        torch.cat([getattr(part, name) for part in parts])[order]
+        for name in ("flow_px", "valid", "confidence", "covariance_px2", "net_share")
+    )
+    believed = chosen.believed
+    covariance = covariance + chosen.apart
+    return FlowField(
+        believed[:, None] * flow, valid, parts[0].interval_s, believed * confidence, covariance, net
+    )
+
+
+class _Chosen(NamedTuple):
+    """turned, far: [B] bool. believed: [B, H, W] share of the flow. apart: [B, 3, H, W] what is added to the claim."""
+
+    turned: Tensor
+    far: Tensor
+    believed: Tensor
+    apart: Tensor
+
+
+def _chosen(volume, start):
+    agreement = Agreement(volume)
+    found = [along_path(volume, clock) for clock in CLOCKS.values()]
+    missing = [1 - agreement.along(descended(volume, path, **COARSE)[0], path[0]).alike for path in found]
+    turned = missing[1] < TURNED * missing[0]
+    names = ("counts", "net", "start", "spread", "place", "direction")
+    way = Path(*(_where(turned, *(getattr(path[0], name) for path in reversed(found))) for name in names))
+    path = way, *found[0][1:]
+    flows = [descended(volume, path, **options, start_px=start)[0] for options in ({}, WIDE, NARROW)]
+    local, wide, narrow = (agreement.along(flow, way, sure=True) for flow in flows)
+    still = agreement.along(torch.zeros_like(flows[0]), way).alike
+    far = 1 - wide.alike < FAR * (1 - local.alike)
+    flow = _where(far, flows[1], flows[0])
+    best = Agreed(*(_where(far, *pair) for pair in zip(wide, local, strict=True)))
+    nats = best.sure * (_unexplained(still) - _unexplained(best.alike)).clamp_min(0) / 2
+    shrunk = (nats / (nats + FEW) * (best.alike > 0))[:, None, None]
+    coarse = torch.minimum(*missing)
+    bodies = _bodies(local, torch.minimum(1 - narrow.alike, coarse))[:, None, None]
+    ground = (bodies > SURE) & (best.z < MOVES)
+    believed = torch.where(ground, 0.0, shrunk.expand_as(best.z))
+    doubt = believed * (1 - believed) + torch.where(ground, 1 - bodies, 0.0)
+    apart = doubt[:, None] * _squared(flow) + sum(_squared(other - flow) for other in flows)
+    return _Chosen(turned, far, believed, way.net.to(flow)[:, None, None, None].square() * apart)
+
+
+def _unexplained(alike):
+    """Logarithm of the share of the variance that an agreement leaves."""
+    return (1 - alike.square()).clamp_min(LEAST / 10).log()
+
+
+def _bodies(local, missing):
+    """Probability [B] that what agrees along the local field, of which one affine field leaves ``missing`` [B], are
+    bodies before still ground."""
+    cells = avg_pool2d(local.z.clamp_min(0)[:, None], CELL, ceil_mode=True)[:, 0]
+    rows, columns = (torch.arange(size).to(cells) for size in cells.shape[1:])
+    whole = cells.sum((1, 2)) + TINY
+    x, y = cells.sum(1), cells.sum(2)
+    spread = sum(
+        (part @ place.square()) / whole - ((part @ place) / whole).square()
+        for part, place in ((x, columns), (y, rows))
+    )
+    extent = spread.clamp_min(0).sqrt() / max(cells.shape[1:])
+    share = whole.square() / (cells.square().sum((1, 2)) + TINY) / cells[0].numel()
+    worse = missing.clamp_min(LEAST).log() - (1 - local.alike).clamp_min(LEAST).log()
+    parts = extent, share.clamp_min(LEAST).log(), worse, torch.ones_like(worse)
+    return torch.sigmoid(sum(weight * part for weight, part in zip(BODIES, parts, strict=True)))
+
+
+def _where(choice, one, other):
+    """Of each sample the one or the other."""
+    return torch.where(choice.reshape(-1, *[1] * (one.ndim - 1)), one, other)
+
+
+def _squared(flow):
+    """[B, 3, H, W] products (xx, xy, yy) of the components of a flow."""
+    x, y = flow.unbind(1)
+    return torch.stack([x * x, x * y, y * y], 1)
