@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import ConvexHull
 from torch import Tensor
 
 from codesign import backend, pose
 from codesign.render import MitsubaScene, MovingScene
 from codesign.render.charts import emissive_mesh
 from scenes import silhouettes
-from scenes.random_shapes import frame, icosphere
 
 RADIUS_M = 0.01  # of the cylinders that are seen from afar
 
@@ -31,6 +31,47 @@ class World:
     lens_scale: float = 1.0
     narrow: float = 1.0
     kinds: tuple[str, ...] = ("pinhole", "traced")
+
+
+def frame(axis, centre=(0, 0, 0), turn=0.0):
+    """A rigid motion [4, 4] that takes z to ``axis`` and the origin to ``centre``, after a turn about z."""
+    axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    u = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    u /= np.linalg.norm(u)
+    v = np.cross(axis, u)
+    across = np.cos(turn) * u + np.sin(turn) * v
+    found = np.eye(4)
+    found[:3, :3] = np.stack([across, np.cross(axis, across), axis], 1)
+    found[:3, 3] = centre
+    return found
+
+
+def icosphere(level):
+    """20 x 4^level faces on the unit sphere."""
+    g = (1 + 5**0.5) / 2
+    corners = np.array([[0, s, t * g] for s in (-1, 1) for t in (-1, 1)])
+    vertices = np.concatenate([np.roll(corners, k, 1) for k in range(3)])
+    vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    faces = _outward(vertices)
+    for _ in range(level):
+        edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
+        ends, which = np.unique(edges, axis=0, return_inverse=True)
+        middle = vertices[ends].mean(1)
+        ab, bc, ca = len(vertices) + which.reshape(3, -1)
+        vertices = np.concatenate([vertices, middle / np.linalg.norm(middle, axis=1, keepdims=True)])
+        a, b, c = faces.T
+        faces = np.concatenate(
+            [np.stack(t, 1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
+        )
+    return vertices, faces
+
+
+def _outward(vertices):
+    """Faces [F, 3] of the convex hull of points [V, 3] that all lie on it."""
+    hull = ConvexHull(vertices)
+    a, b, c = (vertices[hull.simplices[:, k]] for k in range(3))
+    inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0
+    return np.where(inward[:, None], hull.simplices[:, ::-1], hull.simplices)
 
 
 def _light(value):

@@ -1,8 +1,8 @@
-"""Random worlds by number, for gradients at silhouettes: boxes, poles, balls, discs, meshes, floors and walls,
-0.3 to 20 m away and from a fifth of a pixel to half the film in size; some that pass through each other.
+"""Random worlds by number, for gradients at silhouettes: things that stick in each other, lie in each other, are small and
+far, mirrored, or move, before sequences of views.
 
-Nothing stands along rows of pixels: an edge there is a kink for differences. Textures are smooth at the scale of
-a pixel, so that the silhouettes are what is tested.
+Everything is drawn in the axes of the first camera, where the film says how large things are, and nothing is asked of the
+renderer. Only things that move keep clear of the others: those that stick in each other are refused, as the docs say.
 """
 
 from dataclasses import dataclass, field
@@ -10,282 +10,291 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from codesign import backend, pose
-from codesign.render import MitsubaScene
-from scenes import random_shapes as shapes
-from scenes.random_shapes import Hull, Shape, gap_m, painted
+from codesign import backend
+from codesign.render import MitsubaScene, MovingScene
+from codesign.render.charts import emissive_mesh
 
 WIDTH_PX = 28  # of the square film that sizes are meant for
-HALF_SLOPE = 4 / 11  # from the middle of the film to its border
-SLOPE_PER_PX = 2 * HALF_SLOPE / WIDTH_PX
-NEAR_M, FAR_M = 0.3, 20.0
-CLEAR_M = 0.15  # around the camera
-TRIES = 25
-# kinds of things and how often they come; the first of a world is one of the solid ones, in view
-THINGS = {"box": 4, "pole": 3, "capped pole": 3, "ball": 3, "disc": 2, "card": 2, "mesh": 7}
-SOLID = ("box", "pole", "ball", "mesh")
-MESHES = ("ball", "hull", "torus", "sheet", "bowl")
+WIDEST = 4 / 11  # slope at the border of the film, at most
+FRAMES = 3
+ROUNDEST = 1000  # radii from which round shapes are seen at most: half of where float32 rays lose their edges
 BACKGROUNDS = ("wall", "room", "sky", "nothing")
+EDGED = ("cube", "card", "hull", "ring", "sheet", "fine", "bowl")
+KINDS = ("ball", "tube", "can", "disc", *EDGED)
+NEIGHBOURS = ("apart", "stuck", "nested")
 
 
 @dataclass(frozen=True)
 class Draw:
-    """One random world before a camera. shapes: in room axes; T_world_room, T_world_cam [4, 4]; sky: radiance
-    all around, or None. lens_scale: size of the lens over one of 11 mm; focus_m: distance in focus.
-
-    crosses: whether two shapes pass through each other, or may. facts: what was drawn, in plain values."""
+    """A random world before a camera on its way. T_world_cam: [FRAMES, 4, 4]; half_slope: of the film's border. lens_scale:
+    size of the lens over one of 11 mm; focus_m: distance in focus. facts: what was drawn, in plain values."""
 
     seed: int
-    shapes: list[Shape]
-    T_world_room: np.ndarray
+    scene: MitsubaScene | MovingScene
     T_world_cam: Tensor
-    sky: float | None
+    half_slope: float
     lens_scale: float
     focus_m: float
-    crosses: bool
     facts: dict[str, Any] = field(default_factory=dict)
-
-    def scene(self, device: str = "cpu") -> MitsubaScene:
-        """The world as a scene of its own."""
-        mi = backend.mitsuba(device)
-        found = {shape.name: shape.description(mi, self.T_world_room) for shape in self.shapes}
-        if self.sky is not None:
-            found["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": self.sky}}
-        return MitsubaScene(found, device)
 
 
 def draw(seed: int) -> Draw:
     """The world of this number: the same one every time."""
-    rng = np.random.default_rng([seed, 15])
-    plan = {
-        "background": str(rng.choice(BACKGROUNDS, p=(0.35, 0.35, 0.2, 0.1))),
-        "crosses": bool(rng.random() < 0.15),
-        "border": bool(rng.random() < 0.25),
-        "behind": bool(rng.random() < 0.15),
-        "far_m": float(np.exp(rng.uniform(np.log(10), np.log(100)))) if rng.random() < 0.15 else 0.0,
-    }
-    T_room_cam, background, deepest_m = _stage(rng, plan["background"])
-    sky = float(rng.uniform(10, 200)) if plan["background"] == "sky" or rng.random() < 0.15 else None
-    world = _Builder(rng, T_room_cam, background, deepest_m, plan["border"])
-    for k in range(int(rng.integers(1, 7))):
-        weights = np.array(list(THINGS.values())) / sum(THINGS.values())
-        kind = str(rng.choice(SOLID) if k == 0 else rng.choice(list(THINGS), p=weights))
-        world.add_thing(f"thing{k}", kind, smallest_px=2.0 if k == 0 else 0.2)
-    if plan["background"] == "room":
-        for k in range(int(rng.integers(0, 3))):
-            world.add_standing(f"standing{k}")
-    if plan["behind"]:
-        world.add_from_behind()
-    if plan["crosses"]:
-        world.add_crossing()
-    T_world_room = shapes.frame(rng.standard_normal(3), turn=rng.uniform(0, 2 * np.pi))
-    away = rng.standard_normal(3)
-    T_world_room[:3, 3] = away / np.linalg.norm(away) * (plan["far_m"] or rng.uniform(0, 3))
-    in_focus = rng.random() < 0.5 and world.depths
-    focus_m = rng.choice(world.depths) if in_focus else float(np.exp(rng.uniform(np.log(0.25), np.log(30))))
-    facts = {
-        **plan,
-        "crosses": world.crosses,
-        "sky": sky is not None,
-        "touches": world.touches,
-        "things": [[shape.name, shape.kind, round(shape.px, 2)] for shape in world.found],
-    }
-    return Draw(
-        seed,
-        world.found,
-        T_world_room,
-        torch.as_tensor(T_world_room @ T_room_cam),
-        sky,
-        float(np.exp(rng.uniform(0, np.log(10)))),
-        float(max(focus_m, 0.25)),
-        world.crosses,
-        facts,
+    rng = np.random.default_rng([seed, 2026])
+    half = _between(rng, 0.02, WIDEST)
+    depth = _between(rng, 0.5, 100)
+    background = str(rng.choice(BACKGROUNDS, p=(0.4, 0.25, 0.25, 0.1)))
+    T_world_first = _rigid(Rotation.random(random_state=rng), rng.standard_normal(3) * _between(rng, 0.1, 30))
+    world = _World(rng, T_world_first, half, depth)
+    world.add_background(background)
+    for _ in range(int(rng.integers(1, 4))):
+        world.add_cluster()
+    moving = {}
+    for k in range(int(rng.choice([0, 1, 2], p=(0.65, 0.25, 0.1)))):
+        world.add_moving(f"moving{k}", moving)
+    scene: Any = MitsubaScene(world.shapes, merge=False)
+    if moving:
+        scene = MovingScene(scene, moving)
+    # a walk of some pixels a frame
+    turns = 2 * half / WIDTH_PX * _between(rng, 0.3, 6) * np.cumsum(rng.standard_normal((FRAMES, 3)), 0)
+    ways = (
+        2 * half / WIDTH_PX * depth * _between(rng, 0.3, 3) * np.cumsum(rng.standard_normal((FRAMES, 3)), 0)
     )
+    path = [
+        T_world_first @ _rigid(Rotation.from_rotvec(t - turns[0]), w - ways[0])
+        for t, w in zip(turns, ways, strict=True)
+    ]
+    # the pupil, 2.2 mm times the scale, blurs what lies twice as far away as the focus by two pixels at most
+    scale = min(_between(rng, 1, 10), 8 * half / WIDTH_PX * depth / 2.2e-3)
+    focus_m = max(depth * _between(rng, 0.5, 3), 0.03 * scale)
+    facts = {
+        "background": background,
+        "depth_m": depth,
+        "half_slope": half,
+        "moving": len(moving),
+        "things": world.told,
+    }
+    return Draw(seed, scene, torch.as_tensor(np.stack(path)), half, max(scale, 0.05), focus_m, facts)
 
 
-def _stage(rng, background):
-    """T_room_cam [4, 4], the shapes of the background, and how deep things may stand."""
-    if background == "wall":
-        distance = float(np.exp(rng.uniform(np.log(1.0), np.log(FAR_M))))
-        lean = np.array([*rng.uniform(-0.4, 0.4, 2), -1.0])
-        placed = shapes.frame(lean, (0, 0, distance), rng.uniform(0.1, 1.4))
-        return np.eye(4), [shapes.card("wall", placed, [2 * distance] * 2, painted(rng, 60), 99)], distance
-    if background != "room":
-        return np.eye(4), [], FAR_M
-    size = float(np.exp(rng.uniform(np.log(1.5), np.log(15))))
-    eye = (0.0, 0.0, size * rng.uniform(0.2, 0.5))
-    target = (rng.uniform(-0.3, 0.3) * size, size, rng.uniform(0, 0.4) * size)
-    roll = torch.tensor([0, 0, 0, 0, 0, float(rng.choice([-1, 1]) * rng.uniform(0.1, 0.6))]).double()
-    T_room_cam = (pose.look_at(eye, target) @ pose.se3_exp(roll)).numpy()
-    return T_room_cam, _room(rng, size), size
+def _between(rng, low, high):
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def _room(rng, size):
-    """A floor whose far edge meets the lower edges of two walls, and whose right edge meets a part of a third."""
-    width = size * rng.uniform(0.4, 1.0)
-    seam = width * rng.uniform(-0.5, 0.5)
-    floor = np.eye(4)
-    floor[:3, 3] = [0, size / 2 - 0.5, 0]
-    found = [shapes.card("floor", floor, [width, size / 2 + 0.5], painted(rng, 30), 99)]
-    for name, left, right in (("left", -width, seam), ("right", seam, width)):
-        height = size * rng.uniform(0.2, 0.8)
-        placed = np.eye(4)
-        placed[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
-        placed[:3, 3] = [(left + right) / 2, size, height / 2]
-        half = [(right - left) / 2, height / 2]
-        found.append(shapes.card(f"wall {name}", placed, half, painted(rng, 20), 99))
-    if rng.random() < 0.6:
-        length = size * rng.uniform(0.3, 0.9)
-        height = size * rng.uniform(0.1, 0.6)
-        placed = np.eye(4)
-        placed[:3, :3] = [[0, 0, -1], [-1, 0, 0], [0, 1, 0]]
-        placed[:3, 3] = [width, size - length / 2, height / 2]
-        found.append(shapes.card("wall aside", placed, [length / 2, height / 2], painted(rng, 20), 99))
+def _rigid(rotation, place):
+    found = np.eye(4)
+    found[:3, :3] = rotation.as_matrix()
+    found[:3, 3] = place
     return found
 
 
-class _Builder:
-    """Adds things to a world so that none passes through another, unless it is asked to."""
+class _World:
+    """Things so far: shapes by name, and balls around them (middle, radius) in the axes of the first camera."""
 
-    def __init__(self, rng, T_room_cam, background, deepest_m, border):
-        self.rng = rng
-        self.T_room_cam = T_room_cam
-        self.found = list(background)
-        self.deepest_m = deepest_m
-        self.border = border
-        self.crosses = self.touches = False
-        self.depths = []
-        eye = T_room_cam[None, :3, 3]
-        self.camera = Hull(eye, np.array([CLEAR_M]), np.zeros((1, 3)))
+    def __init__(self, rng, T_world_first, half, depth):
+        self.rng, self.T_world_first, self.half, self.depth = rng, T_world_first, half, depth
+        self.mi = backend.mitsuba("cpu")
+        self.shapes: dict[str, Any] = {}
+        self.balls: list[tuple[np.ndarray, float]] = []
+        self.told: list[Any] = []
+        self.furthest = np.inf
 
-    def fits(self, candidates, exempt=()):
-        return all(
-            gap_m(shape.hull, other) > 1e-4
-            for shape in candidates
-            for other in (self.camera, *(s.hull for s in self.found if s.name not in exempt))
-        )
-
-    def place(self, border):
-        """A point in camera axes, beside the film's border or in view, and its distance."""
+    def add_background(self, kind):
         rng = self.rng
-        depth = float(np.exp(rng.uniform(np.log(NEAR_M), np.log(self.deepest_m))))
-        slope = rng.uniform(-0.9, 0.9, 2) * HALF_SLOPE
-        if border and rng.random() < 0.6:
-            slope[rng.integers(2)] = rng.choice([-1, 1]) * rng.uniform(0.9, 1.3) * HALF_SLOPE
-        return np.array([*slope, 1.0]) * depth, depth
+        if kind in ("sky", "wall"):
+            level = float(rng.uniform(10, 200))
+            self.shapes["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": level}}
+        if kind == "wall":
+            self.furthest = self.depth * _between(rng, 1.3, 5)
+            lean = Rotation.from_rotvec([np.pi, 0, 0]) * Rotation.from_rotvec(rng.uniform(-0.3, 0.3, 3))
+            placed = _rigid(lean, [0, 0, self.furthest]) @ np.diag([3 * self.furthest] * 2 + [1, 1])
+            self.add("wall", "card", placed, 20)
+        if kind == "room":
+            self.furthest = self.depth * _between(rng, 2, 4)
+            size = np.array([1.1, 1.2, 1.3]) * self.furthest
+            inside = _rigid(Rotation.from_rotvec(rng.uniform(-0.5, 0.5, 3)), [0, 0, 0]) @ np.diag([*size, 1])
+            self.add("room", "cube", inside, 20, flip_normals=True)
 
-    def add_thing(self, name, kind, smallest_px=0.2):
-        """A thing somewhere in the view where it fits; after some tries none."""
-        for _ in range(TRIES):
-            at, depth = self.place(self.border and smallest_px < 1)
-            made = self.make(name, kind, at, depth, smallest_px)
-            if self.fits(made):
-                self.found += made
-                self.depths.append(depth)
-                return
-
-    def make(self, name, kind, at, depth, smallest_px=0.2):
-        """The shapes of a thing at a point [3] in camera axes."""
+    def add_cluster(self):
+        """One to four things, each apart from, stuck in or within the first."""
         rng = self.rng
-        px = float(np.exp(rng.uniform(np.log(smallest_px), np.log(WIDTH_PX / 2))))
-        size = px * SLOPE_PER_PX * depth / 2
-        placed = self.T_room_cam @ shapes.frame(rng.standard_normal(3), at, rng.uniform(0, 2 * np.pi))
-        paint = painted(rng, px)
-        if kind == "box":
-            return [shapes.box(name, placed, size * rng.uniform(0.3, 1, 3), paint, px)]
-        if kind in ("pole", "capped pole"):
-            return self.make_pole(name, placed, depth, kind == "capped pole")
-        if kind == "ball":
-            return [shapes.ball(name, placed, size, paint, px)]
-        if kind == "disc":
-            return [shapes.disc(name, placed, size, paint, px)]
-        if kind == "card":
-            return [shapes.card(name, placed, size * rng.uniform(0.3, 1, 2), paint, px)]
-        which = str(rng.choice(MESHES))
-        vertices, faces = {
-            "ball": lambda: shapes.icosphere(int(rng.integers(1, 4))),
-            "hull": lambda: shapes.random_hull(rng),
-            "torus": lambda: shapes.torus(24, 12, rng.uniform(0.2, 0.6)),
-            "sheet": lambda: shapes.sheet(rng, 6),
-            "bowl": lambda: shapes.bowl(2),
-        }[which]()
-        colouring = str(rng.choice(["faces", "uv", "plain"]))
-        return [shapes.mesh(f"{name} {which} {colouring}", placed, size, vertices, faces, colouring, rng, px)]
-
-    def make_pole(self, name, placed, depth, capped):
-        """A cylinder whose middle is at the frame's origin, a fifth of a pixel to eight pixels thick."""
-        rng = self.rng
-        px = float(np.exp(rng.uniform(np.log(0.2), np.log(8))))
-        radius = px * SLOPE_PER_PX * depth / 2
-        length = max(float(np.exp(rng.uniform(np.log(3), np.log(40)))) * SLOPE_PER_PX * depth, radius)
-        start = placed.copy()
-        start[:3, 3] -= length / 2 * placed[:3, 2]
-        shown = painted(rng, px, textured=False)
-        found = [shapes.tube(name, start, length, radius, shown, px)]
-        if capped:
-            for end, sign in (("low", -1), ("high", 1)):
-                middle = placed[:3, 3] + sign * length / 2 * placed[:3, 2]
-                lid = shapes.frame(sign * placed[:3, 2], middle)
-                found.append(shapes.disc(f"{name} {end}", lid, radius, float(rng.uniform(5, 240)), px))
-        return found
-
-    def add_standing(self, name):
-        """A box on the floor, with a gap or none, or a ball that just touches it."""
-        rng = self.rng
-        for _ in range(TRIES):
-            slope = rng.uniform(-0.8, 0.8, 2) * HALF_SLOPE
-            towards = self.T_room_cam[:3, :3] @ [*slope, 1.0]
-            eye = self.T_room_cam[:3, 3]
-            if towards[2] > -1e-3:
+        first = None
+        for _ in range(int(rng.integers(1, 5))):
+            px = _between(rng, 0.7, 14)
+            how = "apart" if first is None else str(rng.choice(NEIGHBOURS))
+            centre, size = self.somewhere(px)
+            if first is not None and how != "apart":
+                away = rng.standard_normal(3)
+                away *= first[1] * (rng.uniform(0.5, 1.1) if how == "stuck" else 0.3) / np.linalg.norm(away)
+                centre = first[0] + away
+                size = first[1] * rng.uniform(0.1, 0.6) if how == "nested" else size
+            if np.linalg.norm(centre) < 1.5 * size or centre[2] < 0.1 * self.depth:
                 continue
-            depth = -eye[2] / towards[2]
-            at = eye + depth * towards
-            px = float(np.exp(rng.uniform(np.log(0.5), np.log(WIDTH_PX / 2))))
-            half = px * SLOPE_PER_PX * depth / 2 * rng.uniform(0.3, 1, 3)
-            gap = float(rng.choice([0.0, 1e-3, 0.02]))
-            if rng.random() < 0.3:
-                at[2] = half[0] + gap
-                made = shapes.ball(name, shapes.frame([0, 0, 1], at), half[0], painted(rng, px), px)
-            else:
-                at[2] = half[2] + gap
-                placed = shapes.frame([0, 0, 1], at, rng.uniform(0, np.pi))
-                made = shapes.box(name, placed, half, painted(rng, px), px)
-            if self.fits([made], exempt=("floor",)):
-                self.found.append(made)
-                self.depths.append(float(depth))
-                self.touches |= gap == 0
-                return
+            self.add_thing(f"thing{len(self.told)}", centre, size, how)
+            first = first or (centre, size)
 
-    def add_from_behind(self):
-        """A pole that begins behind the camera and ends in the view."""
+    def somewhere(self, px):
+        """A place in or beside the view, and the radius there of a thing so many pixels wide."""
         rng = self.rng
-        for _ in range(TRIES):
-            depth = float(np.exp(rng.uniform(np.log(NEAR_M), np.log(3.0))))
-            end = np.array([*rng.uniform(-0.8, 0.8, 2) * HALF_SLOPE, 1.0]) * depth
-            start = np.array([*rng.choice([-1, 1], 2) * rng.uniform(0.3, 0.8, 2), -rng.uniform(0.05, 1)])
-            length = float(np.linalg.norm(end - start))
-            placed = self.T_room_cam @ shapes.frame(end - start, start)
-            radius = rng.uniform(0.3, 4) * SLOPE_PER_PX * depth / 2
-            px = 2 * radius / SLOPE_PER_PX / depth
-            made = shapes.tube("beside", placed, length, radius, painted(rng, px, textured=False), px)
-            if self.fits([made]):
-                self.found.append(made)
-                return
+        away = self.depth * _between(rng, 0.6, 1.6)
+        slope = rng.uniform(-1.1, 1.1, 2) * self.half
+        return np.array([*slope, 1.0]) * away, px * self.half / WIDTH_PX * away
 
-    def add_crossing(self):
-        """A thing whose middle lies on the surface of another, so that the two pass through each other."""
+    def add_thing(self, name, centre, size, how):
         rng = self.rng
-        if not self.found:
+        small = np.linalg.norm(centre) > ROUNDEST / 4 * size
+        kind = str(rng.choice(EDGED if small else KINDS))
+        mirrored = bool(rng.random() < 0.2)
+        px = 2 * size / np.linalg.norm(centre) * WIDTH_PX / (2 * self.half)
+        placed = _rigid(Rotation.random(random_state=rng), centre) @ np.diag(
+            [-size if mirrored else size, size, size, 1]
+        )
+        self.balls.append((centre, size))
+        self.told.append([kind, how, round(float(px), 2), *(["mirrored"] if mirrored else [])])
+        self.add(name, kind, placed, px)
+
+    def add_moving(self, name, moving):
+        """A thing in a scene of its own, on a way through the world on which it touches nothing."""
+        rng = self.rng
+        for _ in range(20):
+            centre, size = self.somewhere(_between(rng, 1, 10))
+            way = np.cumsum(rng.standard_normal((FRAMES, 3)), 0) * size * 0.5
+            reach = size + np.linalg.norm(way - way[0], axis=1).max()
+            clear = all(
+                np.linalg.norm(centre - c) > reach + r for c, r in [*self.balls, (np.zeros(3), 0.1 * size)]
+            )
+            if clear and centre[2] + reach < 0.6 * self.furthest:
+                break
+        else:
             return
-        other = self.found[int(rng.integers(len(self.found)))]
-        towards = rng.standard_normal(3)
-        at = other.hull.furthest(towards)
-        eye = self.T_room_cam
-        at_cam = eye[:3, :3].T @ (at - eye[:3, 3])
-        kind = str(rng.choice(["box", "pole", "ball", "mesh"]))
-        made = self.make("crossing", kind, at_cam, float(np.linalg.norm(at_cam)))
-        if all(gap_m(shape.hull, self.camera) > 0 for shape in made):
-            self.crosses = not self.fits(made)
-            self.found += made
+        others, self.shapes = self.shapes, {}
+        T_world_first, self.T_world_first = self.T_world_first, np.eye(4)
+        self.add_thing(name, np.array([0.0, 0.0, np.linalg.norm(centre)]), size, "moving")
+        self.balls[-1] = (centre, reach)
+        own, self.shapes, self.T_world_first = self.shapes, others, T_world_first
+        # the thing stands ahead of its own origin: poses carry it to its place
+        ahead = _rigid(Rotation.identity(), [0, 0, -np.linalg.norm(centre)])
+        turn = [Rotation.from_rotvec(0.2 * k * rng.standard_normal(3)) for k in range(FRAMES)]
+        poses = [
+            T_world_first @ _rigid(t, centre + w - way[0]) @ ahead for t, w in zip(turn, way, strict=True)
+        ]
+        moving[name] = (MitsubaScene(own, merge=False), torch.as_tensor(np.stack(poses)))
+
+    def add(self, name, kind, placed, px, **options):
+        """A shape of about unit radius, ``placed`` [4, 4] in the axes of the first camera."""
+        rng, mi = self.rng, self.mi
+        size = float(np.linalg.norm(placed[:3, 0]))
+        slim = max(
+            0.03, float(np.linalg.norm(placed[:3, 3])) / ROUNDEST / size
+        )  # of a pole: radius over length
+        placed = self.T_world_first @ placed
+        unit = np.eye(4)
+        plugin = {"ball": "sphere", "cube": "cube", "disc": "disk", "card": "rectangle"}.get(kind, "cylinder")
+        if kind == "cube" and name != "room":
+            sides = rng.uniform(0.2, 1, 3)
+            unit[:3, :3] = np.diag(sides / np.linalg.norm(sides))
+        if kind == "card" and name != "wall":
+            angle = rng.uniform(0.2, 1.3)
+            unit[:3, :3] = np.diag([np.cos(angle), np.sin(angle), 1])
+        if kind in ("tube", "can"):
+            angle = np.arctan(rng.uniform(slim, 1))
+            unit = np.diag([np.sin(angle), np.sin(angle), 2 * np.cos(angle), 1.0])
+            unit[2, 3] = -np.cos(angle)
+            if kind == "can":
+                for end, sign in (("low", -1), ("high", 1)):
+                    lid = _rigid(
+                        Rotation.from_rotvec([np.pi if sign < 0 else 0, 0, 0]), [0, 0, sign * np.cos(angle)]
+                    )
+                    lid = placed @ lid @ np.diag([np.sin(angle), np.sin(angle), 1, 1])
+                    self.shapes[f"{name} {end}"] = self._plain("disk", lid, px)
+        if kind in ("hull", "ring", "sheet", "fine", "bowl"):
+            vertices, faces = MESHES[kind](rng)
+            vertices = vertices @ placed[:3, :3].T + placed[:3, 3]
+            if np.linalg.det(placed[:3, :3]) < 0:
+                faces = faces[:, ::-1]
+            by_face = rng.random() < 0.5
+            light = (
+                rng.uniform(20, 240) * rng.uniform(0.4, 1, len(faces)) if by_face else self._light(px, False)
+            )
+            self.shapes[name] = emissive_mesh(mi, vertices, faces, light)
+            return
+        self.shapes[name] = {**self._plain(plugin, placed @ unit, px), **options}
+
+    def _plain(self, plugin, to_world, px):
+        return {
+            "type": plugin,
+            "to_world": self.mi.ScalarTransform4f(to_world),
+            "emitter": self._light(px, True),
+        }
+
+    def _light(self, px, textured):
+        """One radiance, or a picture without detail below some pixels."""
+        rng = self.rng
+        radiance: Any = {"type": "rgb", "value": 0.0 if rng.random() < 0.1 else float(rng.uniform(5, 240))}
+        if textured and px > 6 and rng.random() < 0.4:
+            coarse = torch.as_tensor(rng.uniform(20, 220, (1, 1, 4, 4)))
+            fine = torch.nn.functional.interpolate(coarse, size=(64, 64), mode="bicubic", align_corners=True)[
+                0, 0
+            ]
+            picture = self.mi.Bitmap(fine.clamp(5, 250).float().numpy()[..., None])
+            radiance = {"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": "mirror"}
+        return {"type": "area", "radiance": radiance}
+
+
+def _hull(rng):
+    corners = rng.standard_normal((int(rng.integers(6, 14)), 3))
+    corners /= np.linalg.norm(corners, axis=1, keepdims=True)
+    return _convex(corners * rng.uniform(0.5, 1, 3))
+
+
+def _fine(rng):
+    """A ball of some hundred faces, its corners along a spiral."""
+    k = np.arange(int(rng.integers(40, 400))) + 0.5
+    z = 1 - 2 * k / len(k)
+    turn = np.pi * (1 + 5**0.5) * k
+    return _convex(np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], 1))
+
+
+def _bowl(rng):
+    vertices, faces = _fine(rng)
+    return vertices, faces[vertices[faces].mean(1)[:, 2] > rng.uniform(-0.5, 0.3)]
+
+
+def _convex(corners):
+    found = ConvexHull(corners)
+    a, b, c = corners[found.simplices].transpose(1, 0, 2)
+    inward = (np.cross(b - a, c - a) * found.equations[:, :3]).sum(1) < 0
+    return corners, np.where(inward[:, None], found.simplices[:, ::-1], found.simplices)
+
+
+def _grid(rows, columns, around_rows, around_columns):
+    """Faces of a grid of vertices, closed where it says so."""
+    i, j = np.meshgrid(
+        np.arange(rows - (not around_rows)), np.arange(columns - (not around_columns)), indexing="ij"
+    )
+    a, b, c, d = (
+        ((i + p) % rows * columns + (j + q) % columns).reshape(-1)
+        for p, q in ((0, 0), (1, 0), (1, 1), (0, 1))
+    )
+    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
+def _ring(rng):
+    u, v = np.meshgrid(2 * np.pi * np.arange(18) / 18, 2 * np.pi * np.arange(9) / 9, indexing="ij")
+    thick = rng.uniform(0.15, 0.45)
+    reach = 1 - thick + thick * np.cos(v)
+    vertices = np.stack([reach * np.cos(u), reach * np.sin(u), thick * np.sin(v)], -1).reshape(-1, 3)
+    return vertices, _grid(18, 9, True, True)
+
+
+def _sheet(rng):
+    x, y = np.meshgrid(np.linspace(-0.65, 0.65, 7), np.linspace(-0.65, 0.65, 7), indexing="ij")
+    z = 0.2 * np.sin(rng.uniform(-4, 4) * x + rng.uniform(-4, 4) * y + 1)
+    return np.stack([x, y, z], -1).reshape(-1, 3), _grid(7, 7, False, False)
+
+
+MESHES = {"hull": _hull, "ring": _ring, "sheet": _sheet, "fine": _fine, "bowl": _bowl}

@@ -21,7 +21,7 @@ PIECE_PX = 8.0
 PIECE_RAD = 0.1
 MARGIN_PX = 1.0  # beyond the film, on top of the blur
 WIDER = 1.02  # of the film's field, for what chief rays of the border do not say: colour, pupil aberration
-IN_FRONT_M = 1e-3
+IN_FRONT_M = 1e-6
 STEP = 1e-4  # of a piece, for the direction of its curve
 PUPILS = 4096
 FLOAT32_RAD = 5e-7  # by how much a float32 ray may miss, per length of its coordinates over the distance
@@ -32,16 +32,16 @@ class CurvePoints:
     """Sampled points of curves, in the axes of the part of the scene that the curve belongs to.
 
     world_m, ahead_m [n, 3]: the point, and the same curve a little further on. share [n]: how many such steps each
-    point stands for. aside_rad [n]: how far to the sides radiance is safely read. covered [n]: whether surfaces lie at
-    the point's own distance on both sides. pupil [n, 2]; colour, window,
-    frame, part [n]: numbers of the wavelength, the window of the film, the frame and the part of the scene.
+    point stands for. aside_rad [n]: how far to the sides radiance is safely read. face_slope [n]: tangent of the
+    view's angle to the steeper of the faces on both sides, infinite where what is seen may lie far behind. pupil [n, 2];
+    colour, window, frame, part [n]: numbers of the wavelength, the window of the film, the frame and the part of the scene.
     """
 
     world_m: Tensor
     ahead_m: Tensor
     share: Tensor
     aside_rad: Tensor
-    covered: Tensor
+    face_slope: Tensor
     pupil: Tensor
     colour: Tensor
     window: Tensor
@@ -130,13 +130,18 @@ def _on_pieces(view, curve, pieces, cameras, per_px, generator):
     viewpoint = eye + (pose[:, :3, :2] @ (pupil * view.aperture_m)[..., None])[..., 0]
     y = curve.points(index, s, viewpoint)
     on = curve.points(index, s + STEP * (high - low), viewpoint)
-    distance = (y - viewpoint).norm(dim=1)
-    coordinates = torch.maximum(y.abs().amax(1), eye.abs().amax(1))
-    aside = torch.maximum(curve.aside_rad(index, viewpoint), FLOAT32_RAD * coordinates / distance)
-    covered = curve.covered(index, viewpoint)
-    share = share * curve.counts(index, viewpoint)
+    aside = read_aside_rad(curve, index, y, viewpoint)
+    slope = curve.face_slope(index, y, viewpoint)
+    share = share * curve.counts(index, y, viewpoint)
     colour = (number + turn[1]) % view.colours
-    return y, on, share, aside, covered, pupil, colour, pieces.window[piece], frame
+    return y, on, share, aside, slope, pupil, colour, pieces.window[piece], frame
+
+
+def read_aside_rad(curve: Any, index: Tensor, y: Tensor, viewpoint: Tensor) -> Tensor:
+    """Angle [n] from the curves' points y [n, 3] at which radiances beside them are read, seen from viewpoints [n, 3]."""
+    coordinates = torch.maximum(y.abs().amax(1), viewpoint.abs().amax(1))
+    rounded = FLOAT32_RAD * coordinates / (y - viewpoint).norm(dim=1)
+    return torch.maximum(curve.aside_rad(index, viewpoint), rounded)
 
 
 def piece_rad(slope_per_px: float) -> float:

@@ -1,48 +1,54 @@
 """Does a scene list every curve where radiance jumps, and each once? Asked of the picture, not of the geometry.
 
 Lines are laid across the film, each through one point of the pupil; where radiance differs between neighbouring rays
-the larger difference is halved again and again, until what is left is a jump or a slope. Every jump must lie on
-exactly one listed curve. What is neither makes the gradient of the boundary term wrong, and is refused.
+the larger difference is halved again and again, until what is left is a jump or a slope. The listed curves that cross
+the line there are read as the boundary term reads them, and their jumps together must be the one that was found. What
+differs makes the gradient of that term wrong, and is refused.
 """
 
-import math
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.pose import apply, inverse
+from codesign.pose import apply
 from codesign.render.camera import Camera
-from codesign.render.curve_points import IN_FRONT_M, piece_rad
+from codesign.render.curve_points import CurvePoints, piece_rad, read_aside_rad
 from codesign.render.film import coarse_pixels
+from codesign.render.jumps import SAFETY, jumps
 from codesign.render.moving import parts, says_distance
+from codesign.render.rays import coloured_rays
 from codesign.render.sampling import film_pupil_pattern
-from codesign.render.wavefront import HIDDEN, look
+from codesign.render.wavefront import look
 
 LINES = 16  # each way across the film
+LEAST_LINES = 4  # each way across every frame of a sequence
+FRAMES = 32  # looked at in one launch
 RAYS_PER_PX = 3
 HALVINGS = 14
 CONTRAST = 0.02  # of a frame's range: what is less is no jump worth the name
-NEAR_PX = 0.5  # between a jump and the chord of a piece that may hold it
-ON_PX = 0.05  # between a jump and the curve it lies on
-SAME_RAD = 3e-5  # between curves that are one, at float32's precision
-MEETING = 20  # times that from their ends, curves that run together are one listed twice
-STEPS = 24  # of the search along a piece
+FOUND_PX = 1e-3  # between a jump and the curve it lies on, beside what the curve is known to
+DEPTH = 0.01  # share of the distance by which a curve may lie before or behind what is seen beside it
+NEAR = 0.1  # of the length of a piece, between its chord and a ray that may meet it
+NEAR_PX = 0.1  # the same, where pieces are short
+BEYOND = 0.3  # of a piece, by which it is searched beyond its ends
+STEP = 1e-4  # of a piece, for the direction of its curve
+TURNS = 4  # of the search along a piece
+GRAZING = 0.3  # sine of the angle between a line and a curve, at least
 WRONG = 0.05  # share of all jumps up to which a view is taken as listed
-# another view needs no look of its own as long as the camera has moved by less than this share of the distance to what
-# it sees, and turned by less than this share of half its field
-MOVED = 0.2
-WIDER = 1.2
-TURNED = 0.5
 
 
 @dataclass(frozen=True)
 class Listing:
-    """Of the jumps in a view, weighted by their size: the share on no listed curve, the share on several, and the
-    largest of these jumps in world axes (or the axes of the static part); crossings: how many jumps were found."""
+    """Of the jumps in a view, weighted by their size: the share that is on no listed curve, the share that curves have
+    beyond what is seen, and the place where most is amiss in world axes (or the axes of the static part); crossings: how
+    many jumps were found."""
 
     unlisted: float
     doubled: float
@@ -50,84 +56,78 @@ class Listing:
     crossings: int
 
 
-def listing(
+@dataclass(frozen=True)
+class _Crossings:
+    """Jumps along lines: frame [n]; film position, direction of the line on the film and point of the pupil [n, 2];
+    change [n] of radiance along the line; origin and direction [n, 3] of the ray in camera axes, and distance [n] m of the
+    nearer side."""
+
+    frame: Tensor
+    film_px: Tensor
+    along: Tensor
+    pupil: Tensor
+    window: Tensor
+    change: Tensor
+    origin: Tensor
+    direction: Tensor
+    distance: Tensor
+
+    def __getitem__(self, rows: Any) -> "_Crossings":
+        return _Crossings(*(getattr(self, each.name)[rows] for each in fields(self)))
+
+
+def listings(
     camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor, lines: int = LINES
-) -> Listing:
-    """Whether the jumps of one view lie on the listed curves. cameras: [parts, 4, 4], the camera in the axes of every
-    part; curves: of every part; lines: each way across the film, at most."""
+) -> list[Listing]:
+    """Whether the jumps of views lie on the listed curves, one by one. cameras: [parts, F, 4, 4], the camera in the axes
+    of every part; curves: of every part; lines: each way across the film, at most, in each of the views."""
+    camera = copy.copy(camera)
+    camera.spectrum, camera.falloff = None, False
     with torch.no_grad():
-        x, q, size, distance, furthest = _crossings(camera, scene, cameras, lines)
-        if not len(x):
-            return Listing(0.0, 0.0, None, 0)
-        rays = camera.rays_through(x, q)
-        origin, direction = rays.origin_m.double(), rays.direction.double()
-        count, along = _on_curves(camera, curves, cameras, origin, direction, distance, furthest)
-    total = float(size.sum())
-    none, many = count == 0, along > 1
-    place = None
-    if bool((none | many).any()):
-        worst = int((size * (none | many)).argmax())
-        at = origin[worst] + direction[worst] * distance[worst].clamp_max(1e6)
-        x, y, z = apply(cameras[0], at[None])[0].tolist()
-        place = (x, y, z)
-    return Listing(float(size[none].sum()) / total, float(size[many].sum()) / total, place, len(size))
+        found = _crossings(camera, scene, cameras, lines)
+        if len(found.frame):
+            found, listed = _listed(camera, scene, curves, cameras, found)
+        else:
+            listed = found.change
+    amiss = (found.change - listed).abs()
+    missing = torch.minimum(amiss, found.change.abs()) * (listed.abs() < found.change.abs())
+    told = []
+    for frame in range(cameras.shape[1]):
+        rows = torch.nonzero(found.frame == frame)[:, 0]
+        total = float(found.change[rows].abs().sum()) or 1.0
+        place = None
+        if rows.numel() and float(amiss[rows].max()) > 0:
+            worst = rows[amiss[rows].argmax()]
+            at = found.origin[worst] + found.direction[worst] * found.distance[worst].clamp_max(1e6)
+            x, y, z = apply(cameras[0, frame], at[None])[0].tolist()
+            place = (x, y, z)
+        lacks, both = float(missing[rows].sum()), float(amiss[rows].sum())
+        told.append(Listing(lacks / total, (both - lacks) / total, place, len(rows)))
+    return told
 
 
 def check_listed(camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor) -> None:
     """Raise DomainError when a frame of a sequence shows jumps of radiance that the scene does not list, or lists
-    twice. Views near one that was found right are not looked at again. cameras: [parts, F, 4, 4]."""
-    known = _known_views(parts(scene), camera.film)
-    field = _half_field_rad(camera)
-    pupil_m = getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3
-    for frame in range(cameras.shape[1]):
-        view = cameras[:, frame]
-        if any(old.covers(view, field, pupil_m) for old in known):
-            continue
-        found = listing(camera, scene, curves, view)
-        if max(found.unlisted, found.doubled) > WRONG:  # a few crossings say little: look closer
-            found = listing(camera, scene, curves, view, 8 * LINES)
-        for share, what in (
-            (found.unlisted, "lie on no edge or outline that the scene lists"),
-            (found.doubled, "lie on several of its edges at once"),
-        ):
-            if share > WRONG:
-                at = ", ".join(f"{v:.3g}" for v in found.place_m or ())
-                raise DomainError(
-                    f"gradient 'boundary': {share:.0%} of the jumps of radiance in frame {frame} {what}, the largest near "
-                    f"({at}) m: parts of a moving scene that touch, textures with hard texels, or shapes that are not "
-                    "known; move them apart, smooth the texture, or use 'difference'."
-                )
-        known.append(_View(view.clone(), reach_m(camera, scene, view), field, pupil_m))
-
-
-def _known_views(own, film):
-    """The views of these parts on such a film that were found right: a list, kept by the first part where it can
-    keep anything, with the other parts, so that none of them makes way for another of its name."""
-    kept = getattr(own[0], "__dict__", {}).setdefault("_listed", {})
-    return kept.setdefault((tuple(map(id, own)), film), (own, []))[1]
-
-
-@dataclass(frozen=True)
-class _View:
-    """A view that was found right: the camera [parts, 4, 4], the distance of what it showed, half its field and the
-    diameter of its pupil."""
-
-    cameras: Tensor
-    reach_m: float
-    field_rad: float
-    pupil_m: float
-
-    def covers(self, cameras, field_rad, pupil_m):
-        """Whether the camera is near where it was, seen from every part, through a lens that shows little more."""
-        moved = (cameras[:, :3, 3] - self.cameras[:, :3, 3]).norm(dim=1)
-        straight = (cameras[:, :3, 2] * self.cameras[:, :3, 2]).sum(1)
-        near = (moved < MOVED * self.reach_m).all() and (straight > math.cos(TURNED * self.field_rad)).all()
-        return bool(near) and field_rad <= WIDER * self.field_rad and pupil_m <= WIDER * self.pupil_m
-
-
-def _half_field_rad(camera):
-    film = camera.film
-    return math.atan(max(film.sensor_width_px, film.sensor_height_px) / 2 * abs(camera.slope_per_px()))
+    twice. Every frame is looked at, by fewer lines where there are many. cameras: [parts, F, 4, 4]."""
+    count = cameras.shape[1]
+    lines = max(LEAST_LINES, LINES // count)
+    for start in range(0, count, FRAMES):
+        views = cameras[:, start : start + FRAMES]
+        for frame, found in enumerate(listings(camera, scene, curves, views, lines), start):
+            if max(found.unlisted, found.doubled) > WRONG:  # a few crossings say little: look closer
+                (found,) = listings(camera, scene, curves, cameras[:, frame : frame + 1], 8 * LINES)
+            if max(found.unlisted, found.doubled) <= WRONG:
+                continue
+            share, what = max(
+                (found.unlisted, "lie on no edge or outline that the scene lists"),
+                (found.doubled, "lie on several of its edges at once"),
+            )
+            at = ", ".join(f"{v:.3g}" for v in found.place_m or ())
+            raise DomainError(
+                f"gradient 'boundary': {share:.0%} of the jumps of radiance in frame {frame} {what}, the largest near "
+                f"({at}) m: parts of a moving scene that touch, textures with hard texels, or shapes that are not "
+                "known; move them apart, smooth the texture, or use 'difference'."
+            )
 
 
 def reach_m(camera: Camera, scene: Any, cameras: Tensor | Sequence[Tensor]) -> float:
@@ -145,147 +145,201 @@ def reach_m(camera: Camera, scene: Any, cameras: Tensor | Sequence[Tensor]) -> f
     return float(met.median()) if len(met) else 1.0
 
 
-def _crossings(camera, scene, cameras, most):
-    """Jumps along lines: film position [n, 2] px, pupil point [n, 2], size of the jump [n], and distances [n] m of the
-    nearer and the further of its sides."""
-    film = camera.film
+def _lines(film, most):
+    """Points of lines across every window: film position [lines, points, 2] px for either way, with direction [2], pupil
+    [lines, 2] and window [lines]."""
     generator = torch.Generator().manual_seed(most)
     _, pupils = film_pupil_pattern(64, most)
-    low, high, pupil = [], [], []
-    for left, top in film.windows_px or ((0, 0),):
-        for axis, (along, across) in enumerate(
-            ((film.width_px, film.height_px), (film.height_px, film.width_px))
-        ):
+    for window, (left, top) in enumerate(film.windows_px or ((0, 0),)):
+        for axis in (0, 1):
+            along, across = (film.width_px, film.height_px)[:: 1 - 2 * axis]
             lines = min(most, 4 * across)
             shift = torch.rand(lines, generator=generator, dtype=torch.float64)
             level = (torch.arange(lines) + shift) / lines * across - 0.5
-            cells = along * RAYS_PER_PX
-            edges = torch.arange(cells + 1, dtype=torch.float64) / RAYS_PER_PX - 0.5
-            at = torch.stack([edges.expand(lines, -1), level[:, None].expand(-1, cells + 1)], -1)
+            edges = torch.arange(along * RAYS_PER_PX + 1, dtype=torch.float64) / RAYS_PER_PX - 0.5
+            at = torch.stack([edges.expand(lines, -1), level[:, None].expand(-1, len(edges))], -1)
             at = (at if axis == 0 else at.flip(-1)) + torch.tensor([left, top], dtype=torch.float64)
-            low.append(at[:, :-1].reshape(-1, 2))
-            high.append(at[:, 1:].reshape(-1, 2))
             turn = torch.randint(64, (lines,), generator=generator)
-            pupil.append(pupils[turn].repeat_interleave(cells, 0))
-    low, high, pupil = torch.cat(low), torch.cat(high), torch.cat(pupil)
+            yield at, torch.eye(2, dtype=torch.float64)[axis], pupils[turn], torch.full((lines,), window)
 
-    def light(at, q):
-        rays = camera.rays_through(at, q)
-        passes = rays.weight > 0
-        seen = look(
-            scene, cameras[:, None].expand(-1, len(at), 4, 4), rays.origin_m.double(), rays.direction.double()
+
+def _crossings(camera, scene, cameras, most):
+    count = cameras.shape[1]
+    colour = torch.zeros(1, dtype=torch.long)
+    aperture = getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) > 0
+
+    def light(frame, at, q):
+        origin, direction, weight = coloured_rays(camera, at, q, colour.expand(len(at)))
+        if frame is None:  # the same rays in every frame
+            frame = torch.arange(count).repeat_interleave(len(at))
+            origin, direction, weight = (
+                origin.repeat(count, 1),
+                direction.repeat(count, 1),
+                weight.repeat(count),
+            )
+        seen, distance = look(scene, cameras[:, frame], origin, direction)
+        return weight * seen, distance, weight > 0
+
+    columns = []
+    lit = []
+    for at, along, pupil, window in _lines(camera.film, most):
+        pupil = pupil * aperture
+        lines, points = at.shape[:2]
+        seen, distance, passes = (
+            v.reshape(count, lines, points)
+            for v in light(None, at.reshape(-1, 2), pupil.repeat_interleave(points, 0))
         )
-        return *seen, passes
-
-    (first, near, begins), (second, far, ends) = light(low, pupil), light(high, pupil)
-    lit = torch.cat([first, second])
-    least = CONTRAST * float(lit.amax() - lit.amin())
-    rows = torch.nonzero(((first - second).abs() > least) & begins & ends)[:, 0]
-    low, high, pupil, first, second, near, far = (
-        v[rows] for v in (low, high, pupil, first, second, near, far)
+        lit.append(seen.reshape(count, -1))
+        frame, line, cell = torch.nonzero(
+            passes[..., 1:] & passes[..., :-1] & (seen.diff(dim=2) != 0)
+        ).unbind(1)
+        ends = [(v[frame, line, cell], v[frame, line, cell + 1]) for v in (seen, distance)]
+        columns.append(
+            (frame, at[line, cell], at[line, cell + 1], along.expand(len(line), 2), pupil[line], window[line])
+            + (*ends[0], *ends[1])
+        )
+    frame, low, high, along, pupil, window, first, second, near, far = (
+        torch.cat(column) for column in zip(*columns, strict=True)
     )
-    for _ in range(HALVINGS):
-        if not len(low):
-            break
+    lit = torch.cat(lit, 1)
+    least = CONTRAST * (lit.amax(1) - lit.amin(1))[frame]
+
+    def taken(rows, *values):
+        return [v[rows] for v in values]
+
+    rows = torch.nonzero((first - second).abs() > least)[:, 0]
+    frame, low, high, along, pupil, window, first, second, near, far, least = taken(
+        rows, frame, low, high, along, pupil, window, first, second, near, far, least
+    )
+    for _ in range(HALVINGS if len(low) else 0):
         middle = (low + high) / 2
-        between, depth, _ = light(middle, pupil)
+        between, depth, _ = light(frame, middle, pupil)
         left = (between - first).abs() > (second - between).abs()
         low, high = torch.where(left[:, None], low, middle), torch.where(left[:, None], middle, high)
         first, second = torch.where(left, first, between), torch.where(left, between, second)
         near, far = torch.where(left, near, depth), torch.where(left, depth, far)
-    size = (second - first).abs()
-    jump = torch.nonzero(size > least)[:, 0]
-    return (
-        ((low + high) / 2)[jump],
-        pupil[jump],
-        size[jump],
-        torch.minimum(near, far)[jump],
-        torch.maximum(near, far)[jump],
+    rows = torch.nonzero((second - first).abs() > least)[:, 0]
+    frame, at, along, pupil, window, change, near = taken(
+        rows, frame, (low + high) / 2, along, pupil, window, second - first, torch.minimum(near, far)
     )
+    if not len(at):
+        return _Crossings(frame, at, along, pupil, window, change, near, near, near)
+    origin, direction, _ = coloured_rays(camera, at, pupil, colour.expand(len(at)))
+    return _Crossings(frame, at, along, pupil, window, change, origin, direction, near)
 
 
-def _on_curves(camera, curves, cameras, origin, direction, distance, furthest):
-    """On how many listed curves the edge lies that each ray [n, 3] of the camera meets at a distance [n], behind which
-    the light comes from ``furthest`` [n], and on how many of them away from their ends, where curves may meet without
-    being one."""
-    slope_per_px = camera.slope_per_px()
+def _listed(camera, scene, curves, cameras, found):
+    """The crossings that can be judged, and the change of radiance [n] along their lines that the listed curves have there,
+    as the boundary term reads them. A line along a curve tells little of it: there is one across."""
+    angle = piece_rad(camera.slope_per_px())
+    near_rad = NEAR_PX * abs(camera.slope_per_px())
     aperture_m = getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2
-    found = []
-    names = 0
-    for pose, of_part in zip(cameras, curves, strict=True):
-        back = inverse(pose)
-        eye = pose[:3, 3]
-        o = apply(pose, origin)
-        d = direction @ pose[:3, :3].T
-        for curve in of_part:
-            index, bounds = curve.pieces(eye, piece_rad(slope_per_px), aperture_m)
-            if not index.numel():
-                continue
-            ends = torch.stack([apply(back, curve.points(index, bounds[:, i], eye)) for i in (0, 1)])
-            front = torch.nonzero((ends[..., 2] > IN_FRONT_M).all(0))[:, 0]
-            ray, piece = _close(ends[:, front], origin, direction, NEAR_PX * slope_per_px)
-            piece = front[piece]
-            away, reach, apart = _angle(curve, index[piece], bounds[piece], o[ray], d[ray])
-            within = curve.aside_rad(index[piece], eye).clamp_min(ON_PX * slope_per_px)
-            rows = (away < within) & (reach < distance[ray] * (1 + HIDDEN))
-            rows &= curve.counts(index[piece], o[ray])
-            beside = curve.covered(
-                index[piece], o[ray]
-            )  # by surfaces on both sides: not where one is far behind
-            rows &= ~beside | (furthest[ray] < reach * (1 + HIDDEN))
-            found.append((ray[rows], away[rows], apart[rows], names + index[piece][rows]))
-            names += int(index.max()) + 1
-    if not found:
-        return torch.zeros(2, len(origin), dtype=torch.long)
-    ray, away, apart, name = (torch.cat(column) for column in zip(*found, strict=True))
-    least = torch.full((len(origin),), torch.inf, dtype=torch.float64).scatter_reduce(0, ray, away, "amin")
-    same = away < least[ray] + SAME_RAD
+    columns = []
+    for part, of_part in enumerate(curves):
+        pose = cameras[part][found.frame]
+        o = apply(pose, found.origin[:, None])[:, 0]
+        d = (pose[:, :3, :3] @ found.direction[..., None])[..., 0]
+        for frame in torch.unique(found.frame).tolist():
+            rows = torch.nonzero((found.frame == frame) & found.distance.isfinite())[:, 0]
+            eye = cameras[part, frame, :3, 3]
+            for curve in of_part:
+                index, bounds = curve.pieces(eye, angle, aperture_m)
+                ray, piece = _near(
+                    curve, index, bounds, eye, o[rows], d[rows], found.distance[rows], near_rad
+                )
+                if not ray.numel():
+                    continue
+                ray = rows[ray]
+                index, bounds = index[piece], bounds[piece]
+                within, y, ahead = _place(curve, index, bounds, o[ray], d[ray])
+                count = curve.counts(index, y, o[ray]) & within
+                ray, index, y, ahead = (v[count] for v in (ray, index, y, ahead))
+                share = torch.ones(len(ray), dtype=torch.float64)
+                aside = read_aside_rad(curve, index, y, o[ray])
+                slope = curve.face_slope(index, y, o[ray])
+                numbers = (torch.full_like(ray, number) for number in (frame, part))
+                columns.append((ray, y, ahead, share, aside, slope, *numbers))
+    total = torch.zeros_like(found.change)
+    read = None
+    if columns:
+        ray, y, ahead, share, aside, slope, frame, part = (torch.cat(v) for v in zip(*columns, strict=True))
+        points = CurvePoints(
+            y,
+            ahead,
+            share,
+            aside,
+            slope,
+            found.pupil[ray],
+            torch.zeros_like(ray),
+            found.window[ray],
+            frame,
+            part,
+        )
+        read = jumps(camera, scene, cameras, points)
+    if read is None:
+        return found, total
+    read = read[torch.nonzero(read.seen)[:, 0]]
+    ray = ray[read.row]
+    turned = (read.normal * found.along[ray]).sum(1)
+    away = ((read.film_px - found.film_px[ray]) * read.normal).sum(1).abs()
+    met = torch.nonzero(away < SAFETY * read.aside_px + FOUND_PX)[:, 0]
+    ray, turned, read = ray[met], turned[met], read[met]
+    total = total.index_add(0, ray, (read.behind - read.before) * turned.sign())
+    # rounding leaves slivers at edges: the change is that between rays as far aside as the curves are read
+    reach = torch.zeros_like(total).scatter_reduce(0, ray, read.aside_px, "amax")
+    slant = torch.ones_like(total).scatter_reduce(0, ray, turned.abs(), "amin")
+    rows = torch.nonzero((reach > 0) & (slant > GRAZING))[:, 0]
+    before, behind = (
+        _light(camera, scene, cameras, found, rows, sign * (reach / slant)[rows]) for sign in (-1, 1)
+    )
+    change = found.change.index_put((rows,), behind - before)
+    kept = torch.nonzero((reach == 0) | (slant > GRAZING))[:, 0]
+    return replace(found, change=change)[kept], total[kept]
 
-    def count(rows):
-        pairs = torch.unique(torch.stack([ray[rows], name[rows]]), dim=1)  # pieces of one curve are one
-        return torch.bincount(pairs[0], minlength=len(origin))
 
-    return torch.stack([count(same), count(same & (apart > MEETING * SAME_RAD))])
-
-
-def _close(ends, origin, direction, near):
-    """Pairs (ray, piece) whose angle is at most ``near`` and a tenth of the piece's length: ends [2, pieces, 3]."""
-    a, b = ends
-    rays, pieces = [], []
-    for block in torch.arange(len(origin)).split(256):
-        o, d = origin[block, None], direction[block, None]
-        depth = ((a - o) * d).sum(2).clamp_min(1e-6)
-        # in the plane across the ray, scaled to angles at the depth of the piece's start
-        p = ((a - o) - ((a - o) * d).sum(2, keepdim=True) * d) / depth[..., None]
-        then = ((b - o) * d).sum(2).clamp_min(1e-6)
-        r = ((b - o) - ((b - o) * d).sum(2, keepdim=True) * d) / then[..., None]
-        v = r - p
-        t = (-(p * v).sum(2) / v.square().sum(2).clamp_min(1e-30)).clamp(0, 1)
-        away = (p + t[..., None] * v).norm(dim=2)
-        ray, piece = torch.nonzero(away < near + 0.1 * v.norm(dim=2), as_tuple=True)
-        rays.append(block[ray])
-        pieces.append(piece)
-    return torch.cat(rays), torch.cat(pieces)
+def _light(camera, scene, cameras, found, rows, along_px):
+    """Light [n] of crossings ``rows`` [n], so far [n] px along their lines."""
+    at = found.film_px[rows] + along_px[:, None] * found.along[rows]
+    origin, direction, weight = coloured_rays(camera, at, found.pupil[rows], torch.zeros_like(rows))
+    return weight * look(scene, cameras[:, found.frame[rows]], origin, direction)[0]
 
 
-def _angle(curve, index, bounds, origin, direction):
-    """Least angle [n] between rays and pieces of curves, the distance [n] m there, and the angle [n] from there to the
-    nearer end of the piece; by golden sections along the piece."""
+def _near(curve, index, bounds, eye, origin, direction, distance, near_rad):
+    """Pairs (ray, piece) of which the chord of the piece passes near where the ray [n, 3] meets something at a distance
+    [n]."""
+    if not index.numel():
+        return index, index
+    a, b = (curve.points(index, s, eye) for s in bounds.unbind(1))
+    middle = (a + b) / 2
+    half = (b - a).norm(dim=1) / 2
+    share = float((half / (middle - eye).norm(dim=1).clamp_min(1e-9)).max()) + DEPTH
+    at = origin + distance[:, None] * direction
+    near = cKDTree(middle.numpy()).query_ball_point(at.numpy(), (distance * share * (1 + share)).numpy())
+    ray = torch.arange(len(at)).repeat_interleave(torch.tensor([len(pieces) for pieces in near]))
+    piece = torch.tensor(np.concatenate(near).astype(np.int64))
+    # in the plane across the ray
+    p, q = (_across(v[piece] - origin[ray], direction[ray]) for v in (a, b))
+    v = q - p
+    t = (-(p * v).sum(1) / v.square().sum(1).clamp_min(1e-30)).clamp(0, 1)
+    away = (p + t[:, None] * v).norm(dim=1)
+    rows = torch.nonzero(away < NEAR * v.norm(dim=1) + near_rad * distance[ray])[:, 0]
+    return ray[rows], piece[rows]
+
+
+def _place(curve, index, bounds, origin, direction):
+    """Whether the point of a curve that is nearest to a ray lies on its piece [n], that point and one a little further on
+    [n, 3]; by Newton's method along the piece and a little beyond it."""
     low, high = bounds.unbind(1)
+    step = STEP * (high - low)
+    s = (low + high) / 2
+    for _ in range(TURNS):
+        y, ahead = (curve.points(index, at, origin) for at in (s, s + step))
+        p, v = _across(y - origin, direction), _across(ahead - y, direction)
+        s = s - step * ((p * v).sum(1) / v.square().sum(1).clamp_min(1e-30))
+        s = torch.minimum(torch.maximum(s, low - BEYOND * (high - low)), high + BEYOND * (high - low))
+    y, ahead = (curve.points(index, at, origin) for at in (s, s + step))
+    return (s >= low) & (s < high), y, ahead
 
-    def away(s):
-        y = curve.points(index, s, origin) - origin
-        reach = (y * direction).sum(1).clamp_min(1e-9)
-        return torch.linalg.cross(y, direction).norm(dim=1) / reach, reach
 
-    share = 0.6180339887498949
-    a, b = high - share * (high - low), low + share * (high - low)
-    (at_a, _), (at_b, _) = away(a), away(b)
-    for _ in range(STEPS):
-        lower = at_a < at_b
-        low, high = torch.where(lower, low, a), torch.where(lower, b, high)
-        a, b = high - share * (high - low), low + share * (high - low)
-        (at_a, _), (at_b, reach) = away(a), away(b)
-    here = curve.points(index, (a + b) / 2, origin)
-    ends = torch.stack([(curve.points(index, s, origin) - here).norm(dim=1) for s in bounds.unbind(1)])
-    return torch.minimum(at_a, at_b), reach, ends.amin(0) / reach
+def _across(v, direction):
+    return v - (v * direction).sum(1, keepdim=True) * direction

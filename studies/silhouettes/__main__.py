@@ -20,7 +20,7 @@ from scenes import silhouettes as silhouette_scenes
 from studies.frame.run import Run, StudyConfig, main
 from studies.silhouettes.judge import LENSES, USUAL, Effort
 from studies.silhouettes.listed import listed
-from studies.silhouettes.randoms import sweep
+from studies.silhouettes.randoms import QUICK, SWEEP, sweep
 from studies.silhouettes.task import SAMPLES, Task, compare, cost
 
 ASKED = {"pose": 0.03, "lens": 0.03, "single": 0.10, "interior": 0.005, "cost": 2.0}
@@ -51,7 +51,7 @@ def study(run: Run[Config]) -> None:
         raise DomainError(f"random = {config.random} and first = {config.first} must be at least 0.")
     effort = Effort(seeds=(4,)) if config.quick else USUAL
     if config.random:
-        sweep(run, config.random, config.first, config.raw, effort)
+        sweep(run, config.random, config.first, config.raw, QUICK if config.quick else SWEEP)
         return
     if config.only_listed:
         missed = listed(run, effort)

@@ -17,6 +17,8 @@ from torch import Tensor
 
 from codesign import lens, pose, render
 from codesign.errors import DomainError
+from codesign.render.hits import first_hits
+from codesign.render.moving import cameras_in_parts
 from codesign.render.sequence import Way
 
 LENSES = ("pinhole", "thin", "traced")
@@ -45,7 +47,8 @@ USUAL = Effort()
 
 @dataclass(frozen=True)
 class Case:
-    """A scene before a camera at T_world_cam [4, 4]; nearest_m: how near the nearest thing in view is."""
+    """A scene before a camera at T_world_cam [4, 4] or on its way [T, 4, 4]; nearest_m: how near the nearest thing in
+    view is."""
 
     scene: Any
     optics: Any
@@ -61,10 +64,15 @@ class Case:
 
     @property
     def weight(self) -> Tensor:
-        """What the pixels count in the loss: [H, W], smooth and random."""
+        """What the pixels of every frame count in the loss: [T, H, W], smooth and random."""
         generator = torch.Generator().manual_seed(self.seed)
-        coarse = torch.randn(1, 1, COARSE, COARSE, generator=generator)
-        return torch.nn.functional.interpolate(coarse, size=(self.width_px,) * 2, mode="bicubic")[0, 0]
+        coarse = torch.randn(len(self.path), 1, COARSE, COARSE, generator=generator)
+        return torch.nn.functional.interpolate(coarse, size=(self.width_px,) * 2, mode="bicubic")[:, 0]
+
+    @property
+    def path(self) -> Tensor:
+        """Poses of the frames [T, 4, 4]."""
+        return self.T_world_cam.double().reshape(-1, 4, 4)
 
     @property
     def steps(self) -> Tensor:
@@ -178,10 +186,10 @@ def verdict(error: float, noise: float, noise_of_gradient: float) -> Verdict:
 def differences(case: Case, effort: Effort, seed: int) -> Tensor:
     """Central differences [6] of the loss, in units of the steps; one launch for all of them."""
     steps = torch.diag(case.steps)
-    poses = (case.T_world_cam.double() @ pose.se3_exp(torch.cat([steps, -steps])))[:, None]
+    poses = case.path @ pose.se3_exp(torch.cat([steps, -steps]))[:, None]
     with torch.no_grad():
-        frames = render.frames(case.camera(effort.samples, seed), case.scene, poses)[:, 0]
-    ahead, behind = (frames.double() * case.weight).mean((1, 2)).reshape(2, 6)
+        frames = render.frames(case.camera(effort.samples, seed), case.scene, poses)
+    ahead, behind = (frames.double() * case.weight).mean((1, 2, 3)).reshape(2, 6)
     return (ahead - behind) / 2
 
 
@@ -196,21 +204,20 @@ def gradient(case: Case, effort: Effort, seed: int, way: Way) -> Tensor:
     frames = render.frames(
         case.camera(effort.samples // 4, seed),
         case.scene,
-        (case.T_world_cam.double() @ pose.se3_exp(offsets) @ pose.se3_exp(twist))[:, None],
+        case.path @ (pose.se3_exp(offsets) @ pose.se3_exp(twist))[:, None],
         gradient=way,
         per_px=effort.per_px,
     )
-    (found,) = torch.autograd.grad((frames[:, 0].double() * case.weight).sum() / case.width_px**2, twist)
+    (found,) = torch.autograd.grad((frames.double() * case.weight).sum() / case.weight.numel(), twist)
     own = found.reshape(6, effort.poses, 6).mean(1).diagonal()
     return own * case.steps
 
 
-def nearest_m(scene: Any, optics: Any, T_world_cam: Tensor, pitch_mm: float, width_px: int) -> float:
-    """Distance of the nearest thing that the chief rays of the film meet, 1 where they meet none."""
+def nearest_m(scene: Any, optics: Any, path: Tensor, pitch_mm: float, width_px: int) -> float:
+    """Distance of the nearest thing that the chief rays of the film meet on the way [T, 4, 4], 1 where they meet none."""
     camera = render.Camera(optics, 4 * width_px, 4 * width_px, pitch_mm / 4, 1)
     rays = camera.rays()
-    turned = rays.direction.double() @ T_world_cam[:3, :3].T
-    start = pose.apply(T_world_cam, rays.origin_m.double())
-    point, _, met = scene.hit(start, torch.nn.functional.normalize(turned, dim=1))
-    away = (point - start).norm(dim=1)[met]
+    poses = torch.stack(cameras_in_parts(scene, path))
+    found = first_hits(rays.origin_m, rays.direction, rays.weight > 0, scene, poses).distance_m
+    away = found[found.isfinite()]
     return float(away.min()) if away.numel() else 1.0

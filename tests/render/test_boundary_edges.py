@@ -10,9 +10,9 @@ import torch
 from codesign import backend, lens, pose, render
 from codesign.lens import GeoLens, Glass, Pinhole, Surface
 from codesign.render import MitsubaScene
-from codesign.render.boundary import _on_film
 from codesign.render.camera import project
 from codesign.render.curve_points import CurvePoints
+from codesign.render.jumps import _on_film
 from codesign.render.outline import Circles, outlines
 
 F64 = torch.float64

@@ -195,6 +195,7 @@ def test_no_piece_of_a_rim_turns_back(eye):
     quarter turn, however nearly edge-on, and together they are the whole rim."""
     rim = Circles(
         *(torch.tensor([v], dtype=F64) for v in ((0.1, 0.0, 0.0), (0.2, 0.1, 0.0), (-0.15, 0.3, 0.0))),
+        torch.zeros(1, 3, dtype=F64),
         torch.zeros(1),
     )
     eye = torch.tensor(eye, dtype=F64)

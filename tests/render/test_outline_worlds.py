@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from codesign import backend, pose
+from codesign import backend, lens, pose, render
+from codesign.errors import DomainError
 from codesign.render import MitsubaScene
 from codesign.render.charts import emissive_mesh
 from scenes.silhouettes import smooth
+from studies.silhouettes import judge
 from studies.silhouettes.task import PITCH_MM, SIZE_PX, STEPS, Task
 
 F64 = torch.float64
@@ -189,3 +191,49 @@ def check(scene, without, kind="pinhole"):
     assert float((plain - truth.mean(0)).norm() / truth.mean(0).norm()) > without
     assert float((whole - truth.mean(0)).norm() / truth.mean(0).norm()) < 0.03 + 2 * noise
     assert noise < 0.04
+
+
+@pytest.mark.parametrize("ratio", [5, 50, 100])
+def test_a_dark_ball_through_a_mesh_however_far(ratio):
+    """A mesh of 320 faces with a black ball of half its radius before its centre, the film narrower the further it is. The
+    ball's outline lies just within the mesh and the curve along which the two meet just behind the ball, both nearer to
+    what is seen than rays pass beside them."""
+    radius, distance = 0.3, 0.3 * ratio
+    vertices, faces = ball_of_triangles(2)
+    ball = {"type": "sphere", "center": [0.06, distance - 0.24, 0.03], "radius": 0.15, "emitter": light(0)}
+    mesh = emissive_mesh(backend.mitsuba(), radius * vertices + [0, distance, 0], faces, light(200))
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": 60.0}}
+    turned = pose.se3_exp(torch.tensor([0, 0, 0, 0, 0, 0.3], dtype=F64))
+    ahead = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)) @ turned
+    scene = MitsubaScene({"mesh": mesh, "ball": ball, "sky": sky})
+    case = judge.Case(scene, lens.Pinhole(11.0), ahead, 22 * radius / distance / 12, 28, distance - radius, 1)
+    found = judge.judge(case, effort=judge.Effort(seeds=(6,)))
+    assert found.error < 0.05 + 2 * found.noise
+    assert found.noise < 0.05
+
+
+@pytest.mark.parametrize(
+    "twist", [(-6.0, 0, 0, 0, 0, 0), (0, 0, 0, 0, -0.23, 0)], ids=["6 m aside", "13 degrees of turning"]
+)
+def test_a_view_is_looked_at_though_another_was_right(twist):
+    """A wall at 100 m that alone is seen at first, and a ball that moves through a cube 10 m ahead, aside."""
+    T = backend.mitsuba().ScalarTransform4f
+    wall_of = {
+        "type": "rectangle",
+        "to_world": T().translate([0, 0, 100.0]).rotate([1, 0, 0], 180).scale(80.0),
+    }
+    cube = {
+        "type": "cube",
+        "to_world": T().translate([-7.2, 0, 10.0]).rotate([1, 1, 0], 40).scale(0.8),
+        "emitter": light(200),
+    }
+    ball = MitsubaScene({"ball": {"type": "sphere", "radius": 0.55, "emitter": light(20)}})
+    static = MitsubaScene({"wall": {**wall_of, "emitter": texture(2, 6)}, "cube": cube})
+    place = torch.eye(4, dtype=F64)[None].clone()
+    place[0, :3, 3] = torch.tensor([-6.6, 0.1, 9.3])
+    world = render.MovingScene(static, {"ball": (ball, place)})
+    camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.35, 4)
+    render.frames(camera, world, torch.eye(4, dtype=F64)[None], gradient="boundary")
+    other = pose.se3_exp(torch.tensor([twist], dtype=F64))
+    with pytest.raises(DomainError, match="of the jumps of radiance in frame 0"):
+        render.frames(camera, world, other, gradient="boundary")

@@ -30,12 +30,13 @@ def outlines(mi: Any, scene: Any) -> list[Any]:
     edges.append(_seams(shapes))
     balls = [(s.centre, s.radius) for s in shapes if isinstance(s, Ball)]
     tubes = [(s.start, s.end, s.radius) for s in shapes if isinstance(s, Tube)]
-    rims = [
-        (centre, s.u, s.v, wide)
-        for s, both in zip(shapes, width_m, strict=True)
-        if isinstance(s, Disk | Tube)
-        for centre, wide in zip((s.centre,) if isinstance(s, Disk) else (s.start, s.end), both, strict=False)
-    ]
+    rims = []
+    for s, both in zip(shapes, width_m, strict=True):
+        if isinstance(s, Disk):
+            rims.append((s.centre, s.u, s.v, np.zeros(3), both[0]))
+        if isinstance(s, Tube):
+            rims.append((s.start, s.u, s.v, s.end - s.start, both[0]))
+            rims.append((s.end, s.u, s.v, s.start - s.end, both[1]))
     meridians = [
         (s.centre, *s.seam) for s in shapes if isinstance(s, Ball) and s.light is None and s.seam is not None
     ]

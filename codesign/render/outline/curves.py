@@ -3,8 +3,8 @@ and cylinders.
 
 A curve is cut into pieces [s0, s1] of its parameter; a piece becomes a point of the world once a parameter
 and a viewpoint are given. ``aside_rad`` says how far to either side of the true curve the radiances before and
-behind it are read, ``counts`` whether the curve is one from a place of the pupil, and ``covered`` whether surfaces
-lie at its own distance on both its sides.
+behind it are read, ``counts`` whether the curve is one from a place of the pupil, and ``face_slope`` how steeply the
+faces on both its sides are seen.
 
 Rays are cast in float32. Mitsuba finds a sphere or cylinder of radius r at distance d by the sign of
 b^2 - 4 a c, of size (r / d)^2 of its terms; an error of one part in 2^23 of these moves the edge by
@@ -32,8 +32,22 @@ ROUND = 96  # pieces of a full circle
 PARTS = 16  # parts of a cylinder's length that tell their own distance
 
 
+class Curve:
+    """A curve that counts from everywhere, with nothing known of the surfaces beside it."""
+
+    def counts(self, index: Tensor, y: Tensor, viewpoint: Tensor) -> Tensor:
+        """Whether [n] the curves ``index`` [n] are any at their points y [n, 3] from the viewpoint [n, 3] itself: next
+        to an outline lie edges that are one from elsewhere in the pupil, and would be counted with it."""
+        return torch.ones_like(index, dtype=torch.bool)
+
+    def face_slope(self, index: Tensor, y: Tensor, viewpoint: Tensor) -> Tensor:
+        """Tangent [n] of the angle between view and normal of the steeper of the faces on both sides of points y [n, 3],
+        where both are seen: a reading from farther away than they lie has missed them. Infinite elsewhere."""
+        return torch.full(index.shape, torch.inf, dtype=torch.float64)
+
+
 @dataclass(frozen=True)
-class Segments:
+class Segments(Curve):
     """Straight edges. start, end: [E, 3]. normals: [E, 2, 3] of the two faces, on the side that shines, 0 where
     none is known; always: [E] bool, True where it counts from every side but that from which both faces are black
     (rims, seams, sharp creases). width_m: [E], how far apart edges lie that count as this one."""
@@ -53,9 +67,8 @@ class Segments:
         kept = torch.nonzero((self.always | outline) & ~black)[:, 0]
         return cut(kept, pieces_of(self.start[kept] - viewpoint, self.end[kept] - viewpoint, angle))
 
-    def counts(self, index, viewpoint):
-        """Whether [n] the curves ``index`` [n] are outlines from the viewpoint [3] or [n, 3] itself: next to an outline
-        lie edges that are one from elsewhere in the pupil, and would be counted with it."""
+    def counts(self, index, y, viewpoint):
+        """As for Curve."""
         facing = self._facing(index, viewpoint)
         outline = (facing.amin(1) <= 0) & (facing.amax(1) >= 0)
         return (self.always[index] | outline) & ~(facing < 0).all(1)
@@ -80,20 +93,21 @@ class Segments:
         rays = STRAIGHT_RAD + SAFETY * LONG * EPS * furthest / distance.clamp_min(1e-6)
         return rays + rounding_rad(viewpoint, size, distance) + _wide(self.width_m[index], distance)
 
-    def covered(self, index, viewpoint):
-        """Whether [n] surfaces lie at the curve's own distance on both its sides, seen from the viewpoint [3]
-        or [n, 3]: creases of which both faces are seen. A reading from much farther away has then missed them."""
-        return (self._facing(index, viewpoint) > 0).all(1)
+    def face_slope(self, index, y, viewpoint):
+        """As for Curve, of creases."""
+        facing = self._facing(index, viewpoint).amin(1) / (viewpoint - y).norm(dim=1)
+        return torch.where(facing > 0, (1 - facing.square()).clamp_min(0).sqrt() / facing, torch.inf)
 
 
 @dataclass(frozen=True)
-class Circles:
-    """Rims of disks and cylinders: centre + cos u + sin v, with u and v of the rim's radius; [C, 3] each.
-    width_m: [C], how far apart rims lie that count as this one."""
+class Circles(Curve):
+    """Rims of disks and cylinders: centre + cos u + sin v, with u and v of the rim's radius; axis: from there to the
+    cylinder's other end, 0 for disks; [C, 3] each. width_m: [C], how far apart rims lie that count as this one."""
 
     centre: Tensor
     u: Tensor
     v: Tensor
+    axis: Tensor
     width_m: Tensor
 
     def pieces(self, viewpoint, angle, within_m=0.0):
@@ -134,17 +148,14 @@ class Circles:
             + _wide(self.width_m[index], distance)
         )
 
-    def counts(self, index, viewpoint):
-        """As for Segments: always."""
-        return torch.ones_like(index, dtype=torch.bool)
-
-    def covered(self, index, viewpoint):
-        """As for Segments: nowhere."""
-        return torch.zeros_like(index, dtype=torch.bool)
+    def counts(self, index, y, viewpoint):
+        """As for Curve: not behind the near wall of the cylinder itself."""
+        axis = self.axis[index]
+        return ~(axis.any(1) & behind_itself(y - self.centre[index], viewpoint - y, axis))
 
 
 @dataclass(frozen=True)
-class Spheres:
+class Spheres(Curve):
     """Outlines of spheres: the circle where rays from the viewpoint are tangent. centre: [C, 3]; radius:
     [C]. Parameters run over 0..1, 2..3 or 4..5: where on the circle they begin is told from the first, second or third
     axis, the one farthest from the view, so that they name the same place from all points of a pupil."""
@@ -167,8 +178,9 @@ class Spheres:
         distance = towards.norm(dim=1, keepdim=True)
         axis = towards / distance
         share = radius[:, None] / distance
-        u, v = _across(axis, (s / 2).floor().long())
-        turn = 2 * torch.pi * (s % 2)[:, None]
+        beside = ((s + 0.5) / 2).floor()
+        u, v = _across(axis, beside.long())
+        turn = 2 * torch.pi * (s - 2 * beside)[:, None]
         return centre + radius[:, None] * (
             share * axis + (1 - share.square()).clamp_min(0).sqrt() * (turn.cos() * u + turn.sin() * v)
         )
@@ -179,17 +191,9 @@ class Spheres:
         distance = (centre - viewpoint).norm(dim=1)
         return _beside_round("sphere", centre, self.radius[index], distance, distance, viewpoint)
 
-    def counts(self, index, viewpoint):
-        """As for Segments: always."""
-        return torch.ones_like(index, dtype=torch.bool)
-
-    def covered(self, index, viewpoint):
-        """As for Segments: nowhere."""
-        return torch.zeros_like(index, dtype=torch.bool)
-
 
 @dataclass(frozen=True)
-class Cylinders:
+class Cylinders(Curve):
     """Outlines of cylinders without caps: lines where rays from the viewpoint are tangent, ``side`` +1 or -1
     of the axis. start, end: [C, 3] of a part of the axis; radius, side: [C]."""
 
@@ -241,14 +245,6 @@ class Cylinders:
         distance = (middle - viewpoint).norm(dim=1)
         return _beside_round("cylinder", middle, self.radius[index], towards.norm(dim=1), distance, viewpoint)
 
-    def counts(self, index, viewpoint):
-        """As for Segments: always."""
-        return torch.ones_like(index, dtype=torch.bool)
-
-    def covered(self, index, viewpoint):
-        """As for Segments: nowhere."""
-        return torch.zeros_like(index, dtype=torch.bool)
-
     def _across(self, viewpoint, index=slice(None)):
         """From the axis to the viewpoint, across the axis [n, 3], and the axis' direction [n, 3]."""
         axis = torch.nn.functional.normalize((self.end - self.start)[index], dim=1)
@@ -273,6 +269,17 @@ def _beside_round(kind, place, radius, across, distance, viewpoint):
             "'difference'."
         )
     return torch.minimum(ASIDE_RAD + SAFETY * error + coordinates, deepest)
+
+
+def behind_itself(away: Tensor, towards: Tensor, axis: Tensor) -> Tensor:
+    """Whether points [..., 3] of a round shape, ``away`` from its centre and with ``towards`` left to the viewpoint, lie
+    behind the shape's own near side; ``axis`` of a cylinder from its centre to its other end, 0 for a sphere."""
+    square = axis.square().sum(-1).clamp_min(1e-300)
+    across, sight = (v - ((v * axis).sum(-1) / square)[..., None] * axis for v in (away, towards))
+    outward = (across * sight).sum(-1)
+    share = -2 * outward / sight.square().sum(-1).clamp_min(1e-300)
+    level = ((away + share[..., None] * towards) * axis).sum(-1) / square
+    return (outward < 0) & (share < 1) & (level >= 0) & (level <= 1)
 
 
 def rounding_rad(viewpoint, size, distance):

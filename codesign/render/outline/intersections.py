@@ -7,7 +7,17 @@ import torch
 from torch import Tensor
 
 from codesign.render.outline.crossings import AROUND, Crossings
-from codesign.render.outline.curves import ASIDE_RAD, DEEPEST, EPS, SAFETY, cut, pieces_of, rounding_rad
+from codesign.render.outline.curves import (
+    ASIDE_RAD,
+    DEEPEST,
+    EPS,
+    SAFETY,
+    Curve,
+    behind_itself,
+    cut,
+    pieces_of,
+    rounding_rad,
+)
 from codesign.render.outline.shapes import Ball, Disk, Mesh, Shape, Tube
 
 TURNS = 6  # of Newton's method, from chords of a hundredth of a circle
@@ -15,10 +25,10 @@ FOUND = 1e-9  # share of the radius by which a point may miss the surfaces
 
 
 @dataclass(frozen=True)
-class Intersections:
+class Intersections(Curve):
     """Pieces start, end [n, 3] of curves on two surfaces each, f(x) = (x - c) A (x - c) + b (x - c) + k = 0 with
-    gradients of length one: c, b [n, 2, 3], A [n, 2, 3, 3], k [n, 2]; curve: [n], which pieces are one curve;
-    radius: [n], the lesser one of the two surfaces. Parameter 2 k .. 2 k + 1 of a curve for its piece k."""
+    gradients of length one: c, b, axis [n, 2, 3], A [n, 2, 3, 3], k [n, 2], axis that of a tube from c to its other
+    end, 0 for others; curve: [n], which pieces are one curve; radius: [n], the lesser one of the two surfaces."""
 
     start: Tensor
     end: Tensor
@@ -26,21 +36,23 @@ class Intersections:
     A: Tensor
     b: Tensor
     k: Tensor
+    axis: Tensor
     curve: Tensor
     radius: Tensor
 
     def pieces(self, viewpoint, angle, within_m=0.0):
         """As for Segments; all of every curve."""
-        index, s = cut(
-            torch.arange(len(self.start)), pieces_of(self.start - viewpoint, self.end - viewpoint, angle)
-        )
-        return self.curve[index], s + 2 * index[:, None]
+        every = torch.arange(len(self.start))
+        return cut(every, pieces_of(self.start - viewpoint, self.end - viewpoint, angle))
 
     def points(self, index, s, viewpoint):
         """As for Segments: by Newton's method from the chord, in the plane across it."""
-        piece = ((s + 0.5) / 2).floor().long().clamp(0, len(self.start) - 1)
-        share = (s - 2 * piece)[:, None]
-        return self.onto(piece, self.start[piece] + share * (self.end - self.start)[piece])[0]
+        return self.onto(index, self.start[index] + s[:, None] * (self.end - self.start)[index])[0]
+
+    def counts(self, index, y, viewpoint):
+        """As for Curve: not on the far side of a round shape, whose near side is before it."""
+        away, towards = y[:, None] - self.c[index], (viewpoint - y)[:, None]
+        return ~((self.k[index] < 0) & behind_itself(away, towards, self.axis[index])).any(1)
 
     def onto(self, piece, x):
         """Points x [n, 3] near pieces [n] carried onto both surfaces, and how far [n] they still are from these."""
@@ -48,9 +60,11 @@ class Intersections:
         for _ in range(TURNS):
             away = x[:, None] - c
             f = (away * ((A @ away[..., None])[..., 0] + b)).sum(2) + k
-            gradient = 2 * (A @ away[..., None])[..., 0] + b
-            square = gradient @ gradient.mT + 1e-12 * torch.eye(2, dtype=x.dtype)
-            x = x - (gradient * torch.linalg.solve(square, f[..., None])).sum(1)
+            first, second = (2 * (A @ away[..., None])[..., 0] + b).unbind(1)
+            p, q, r = ((u * v).sum(1) for u, v in ((first, first), (first, second), (second, second)))
+            p, r = p + 1e-12, r + 1e-12
+            s, t = ((r * f[:, 0] - q * f[:, 1]), (p * f[:, 1] - q * f[:, 0]))
+            x = x - (s[:, None] * first + t[:, None] * second) / (p * r - q * q)[:, None]
         away = x[:, None] - c
         return x, ((away * ((A @ away[..., None])[..., 0] + b)).sum(2) + k).abs().amax(1)
 
@@ -64,19 +78,13 @@ class Intersections:
         )
         radius = torch.full((count,), torch.inf, dtype=torch.float64).scatter_reduce(
             0, self.curve, self.radius, "amin"
-        )[index]
+        )
+        index = self.curve[index]
+        radius = radius[index]
         distance = (middle[index] - viewpoint).norm(dim=1) + reach[index]
         ratio = distance / radius
         aside = torch.minimum(ASIDE_RAD + SAFETY * EPS * ratio, DEEPEST / ratio)
         return aside + rounding_rad(viewpoint, middle[index].norm(dim=1), distance)
-
-    def counts(self, index, viewpoint):
-        """As for Segments: always."""
-        return torch.ones_like(index, dtype=torch.bool)
-
-    def covered(self, index, viewpoint):
-        """As for Segments: nowhere."""
-        return torch.zeros_like(index, dtype=torch.bool)
 
 
 def on_surfaces(
@@ -88,13 +96,12 @@ def on_surfaces(
     if not len(found.start):
         return None, width
     sides = [_surfaces(found, shapes, side) for side in (0, 1)]
-    c, A, b, k = (torch.tensor(np.stack([side[i] for side in sides], 1)) for i in range(4))
-    least = torch.tensor(np.minimum(sides[0][4], sides[1][4]))
+    c, A, b, k, axis = (torch.tensor(np.stack([side[i] for side in sides], 1)) for i in range(5))
+    least = torch.tensor(np.minimum(sides[0][5], sides[1][5]))
     _, curve = np.unique(found.shapes, axis=0, return_inverse=True)
-    pieces = Intersections(
-        torch.tensor(found.start), torch.tensor(found.end), c, A, b, k, torch.tensor(curve.reshape(-1)), least
-    )
-    every = torch.arange(len(curve.reshape(-1)))
+    curve = torch.tensor(curve.reshape(-1))
+    pieces = Intersections(torch.tensor(found.start), torch.tensor(found.end), c, A, b, k, axis, curve, least)
+    every = torch.arange(len(curve))
     (start, miss_start), (end, miss_end) = (pieces.onto(every, x) for x in (pieces.start, pieces.end))
     length = (pieces.end - pieces.start).norm(dim=1)
     moved = torch.maximum((start - pieces.start).norm(dim=1), (end - pieces.end).norm(dim=1))
@@ -114,12 +121,14 @@ def on_surfaces(
 
 
 def _surfaces(found, shapes, side):
-    """c, b [n, 3], A [n, 3, 3], k [n], and radius [n] of one side of all crossings, infinite where it is flat."""
+    """c, b [n, 3], A [n, 3, 3], k [n], axis [n, 3] and radius [n] of one side of all crossings, infinite where
+    it is flat."""
     count = len(found.start)
     c = found.start.copy()
     A = np.zeros((count, 3, 3))
     b = found.normals[:, side].copy()
     k = np.zeros(count)
+    axes = np.zeros((count, 3))
     radius = np.full(count, np.inf)
     for number in np.unique(found.shapes[:, side]):
         rows = found.shapes[:, side] == number
@@ -129,6 +138,7 @@ def _surfaces(found, shapes, side):
             across = np.eye(3)
         elif isinstance(shape, Tube):
             c[rows] = shape.start
+            axes[rows] = shape.end - shape.start
             axis = (shape.end - shape.start) / np.linalg.norm(shape.end - shape.start)
             across = np.eye(3) - np.outer(axis, axis)
         else:
@@ -137,7 +147,7 @@ def _surfaces(found, shapes, side):
         b[rows] = 0
         k[rows] = -shape.radius / 2
         radius[rows] = shape.radius
-    return c, A, b, k, radius
+    return c, A, b, k, axes, radius
 
 
 def _from_rims(shape, start, end):

@@ -113,20 +113,21 @@ def _from_line(points, edges):
 
 
 def rims_once(
-    centre: np.ndarray, u: np.ndarray, v: np.ndarray, width_m: np.ndarray, apart_m: float
+    centre: np.ndarray, u: np.ndarray, v: np.ndarray, axis: np.ndarray, width_m: np.ndarray, apart_m: float
 ) -> tuple[np.ndarray, ...]:
-    """Rims centre + cos u + sin v, [C, 3] each, that are not one curve with an earlier one; and ``width_m`` [C],
-    grown by how far apart those lie that are."""
-    shape = np.einsum("ni,nj->nij", u, u) + np.einsum(
-        "ni,nj->nij", v, v
-    )  # the same however u and v are turned
+    """Rims centre + cos u + sin v with the ``axis`` of their cylinders, [C, 3] each, that are not one curve with an earlier
+    one, whose axis is then that of either; and ``width_m`` [C], grown by how far apart those lie that are."""
+    # the same however u and v are turned
+    shape = np.einsum("ni,nj->nij", u, u) + np.einsum("ni,nj->nij", v, v)
     radius = np.sqrt(np.trace(shape, axis1=1, axis2=2) / 2)
     kept = np.ones(len(centre), dtype=bool)
+    axis = axis.copy()
     width = width_m.copy()
     pairs = cKDTree(centre).query_pairs(apart_m, output_type="ndarray")
     for i, j in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:
         apart = np.linalg.norm(centre[i] - centre[j]) + np.linalg.norm(shape[i] - shape[j]) / radius[i]
         if kept[i] and kept[j] and apart < apart_m:
             kept[j] = False
+            axis[i] = axis[i] if axis[i].any() else axis[j]
             width[i] = max(width[i], width[j] + apart)
-    return centre[kept], u[kept], v[kept], width[kept]
+    return centre[kept], u[kept], v[kept], axis[kept], width[kept]

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.render.outline.curves import ROUND, cut
+from codesign.render.outline.curves import ROUND, Curve, cut
 
 GRAZING = (
     0.05  # cosine of the view below which a piece is left out: it runs along the outline, which is listed
@@ -14,7 +14,7 @@ GRAZING = (
 
 
 @dataclass(frozen=True)
-class Meridians:
+class Meridians(Curve):
     """Half circles centre + sin u + cos v for angles 0 to pi. centre, u, v: [C, 3], u and v of the sphere's radius."""
 
     centre: Tensor
@@ -26,10 +26,7 @@ class Meridians:
         index, s = cut(torch.arange(len(self.centre)), torch.full((len(self.centre),), ROUND // 2))
         seen = torch.ones(len(index), dtype=torch.bool)
         for end in s.unbind(1):
-            y = self.points(index, end, viewpoint)
-            towards = torch.nn.functional.normalize(viewpoint - y, dim=1)
-            outward = torch.nn.functional.normalize(y - self.centre[index], dim=1)
-            seen &= (outward * towards).sum(1) > GRAZING
+            seen &= self._cosine(index, self.points(index, end, viewpoint), viewpoint) > GRAZING
         return index[seen], s[seen]
 
     def points(self, index: Tensor, s: Tensor, viewpoint: Any) -> Tensor:
@@ -42,10 +39,15 @@ class Meridians:
         distance = (self.centre[index] - viewpoint).norm(dim=1)
         return 1e-5 + 1e-6 * distance / self.u[index].norm(dim=1)
 
-    def counts(self, index: Tensor, viewpoint: Any) -> Tensor:
-        """As for Segments: always."""
-        return torch.ones_like(index, dtype=torch.bool)
+    def counts(self, index: Tensor, y: Tensor, viewpoint: Tensor) -> Tensor:
+        """As for Curve: on the side that faces the viewpoint."""
+        return self._cosine(index, y, viewpoint) > 0
 
-    def covered(self, index: Tensor, viewpoint: Any) -> Tensor:
-        """As for Segments: everywhere."""
-        return torch.ones_like(index, dtype=torch.bool)
+    def face_slope(self, index: Tensor, y: Tensor, viewpoint: Tensor) -> Tensor:
+        """As for Curve: of the sphere, on both sides."""
+        cosine = self._cosine(index, y, viewpoint)
+        return torch.where(cosine > 0, (1 - cosine.square()).clamp_min(0).sqrt() / cosine, torch.inf)
+
+    def _cosine(self, index, y, viewpoint):
+        towards = torch.nn.functional.normalize(viewpoint - y, dim=1)
+        return (torch.nn.functional.normalize(y - self.centre[index], dim=1) * towards).sum(1)

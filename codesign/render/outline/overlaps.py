@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.render.outline.curves import cut, pieces_of
+from codesign.render.outline.curves import Curve, cut, pieces_of
 
 
 @dataclass(frozen=True)
-class Overlaps:
+class Overlaps(Curve):
     """A line start, end [n, 3] across every overlap; normal: [n, 3] of both faces; names: of their shapes [n]. No
     radiance can be read there: where it is asked how, the scene is refused."""
 
@@ -39,14 +39,6 @@ class Overlaps:
             f"faces of shapes '{first}' and '{second}' lie in one plane near ({at}) m, one over the other, and rounding "
             "decides which is seen; move one of them by a millimetre."
         )
-
-    def counts(self, index, viewpoint):
-        """As for Segments: always."""
-        return torch.ones_like(index, dtype=torch.bool)
-
-    def covered(self, index, viewpoint):
-        """As for Segments: nowhere."""
-        return torch.zeros_like(index, dtype=torch.bool)
 
 
 def overlaps(

@@ -1,0 +1,199 @@
+"""Radiances on both sides of points on curves, where the camera's own rays see these, and whether they are seen.
+
+A point is hidden when the rays that pass it on either side meet something before it. They pass aside, where a slanting
+surface lies nearer than at the curve itself: where that is in doubt a second pair of rays, twice as far aside, tells
+how the surface goes on, and it is taken back to the curve along a straight line. What is left is rounding of float32.
+"""
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from codesign.pose import apply, inverse
+from codesign.render.camera import Camera
+from codesign.render.curve_points import IN_FRONT_M, CurvePoints
+from codesign.render.rays import coloured_rays
+from codesign.render.wavefront import look
+
+# px, of the film position for the derivative of a ray; the change up to which its root is taken as found, since the
+# next would be of its square
+STEP_PX = 1e-3
+FOUND_PX = 1e-4
+TURNS = 6
+DOUBTFUL = 0.05  # share of the distance by which a slanting surface may come nearer beside its edge
+ROUNDING = 2.0**-21  # of float32 distances, four units in the last place
+SAFETY = 2.0
+
+
+@dataclass(frozen=True)
+class Jumps:
+    """Points of curves on the film. row: [n], number of the given point. world [n, 3], frame and part [n], in the axes
+    of the part; film position [n, 2] px, pupil [n, 2], colour [n], pixel [n] of the sequence; normal [n, 2] of the curve
+    on the film; before, behind [n]: radiances along it; seen [n] bool; weight [n] of the jump; per_miss: the motion along
+    the normal per miss of the ray in space, [n, 2] px/m; aside_px [n]: how far to the sides radiances are read."""
+
+    row: Tensor
+    world_m: Tensor
+    frame: Tensor
+    part: Tensor
+    film_px: Tensor
+    pupil: Tensor
+    colour: Tensor
+    pixel: Tensor
+    normal: Tensor
+    before: Tensor
+    behind: Tensor
+    seen: Tensor
+    weight: Tensor
+    per_miss: Tensor
+    aside_px: Tensor
+
+    def __getitem__(self, rows: Any) -> "Jumps":
+        return Jumps(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    @property
+    def contrast(self) -> Tensor:
+        """[n], of the two radiances."""
+        return (self.before - self.behind).abs() / torch.maximum(self.before, self.behind).clamp_min(1e-30)
+
+
+def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> Jumps | None:
+    """The points that fall on the film, with their jumps of radiance, of weight 0 where they are hidden; None for none.
+    cameras: [parts, F, 4, 4]."""
+    back = inverse(cameras)[points.part, points.frame]
+    y, on = apply(back, torch.stack([points.world_m, points.ahead_m], 1)).unbind(1)
+    row = torch.nonzero((y[:, 2] > IN_FRONT_M) & (on[:, 2] > IN_FRONT_M))[:, 0]
+    if not row.numel():
+        return None
+    points, y, on = points[row], y[row], on[row]
+    x, per_px, slope, passes = _on_film(camera, y, points)
+    pixel = _pixels(camera.film, x, points.window)
+    moved = (on - y)[:, :2] - slope * (on - y)[:, 2:]
+    fine = passes & (pixel >= 0)
+    per_m = torch.linalg.inv(torch.where(fine[:, None, None], per_px, torch.eye(2, dtype=y.dtype)))
+    tangent = (per_m @ moved[..., None])[..., 0]
+    length = tangent.norm(dim=1)
+    rows = torch.nonzero(fine & (length > 0))[:, 0]
+    if not rows.numel():
+        return None
+    points = points[rows]
+    row, y, x, per_px, slope, per_m, tangent, length, pixel = (
+        v[rows] for v in (row, y, x, per_px, slope, per_m, tangent, length, pixel)
+    )
+    normal = torch.stack([-tangent[:, 1], tangent[:, 0]], 1) / length[:, None]
+    aside_px = points.aside_rad / _rad_per_px(y, per_px, slope, normal)
+    before, behind, seen = _sides(camera, scene, cameras, points, y, x, aside_px[:, None] * normal)
+    return Jumps(
+        row,
+        points.world_m,
+        points.frame,
+        points.part,
+        x,
+        points.pupil,
+        points.colour,
+        pixel + points.frame * math.prod(camera.film.shape),
+        normal,
+        before,
+        behind,
+        seen,
+        (before - behind) * length * points.share * seen,
+        (normal[:, None] @ per_m)[:, 0],
+        aside_px,
+    )
+
+
+def _sides(camera, scene, cameras, points, y, x, aside):
+    """Radiances [n] before and behind points y [n, 3] of curves at film positions x [n, 2], ``aside`` [n, 2] px to
+    either side, and whether the points are seen [n]."""
+
+    def read(rows, times):
+        q, colour = (v[rows].repeat(2, *[1] * (v.ndim - 1)) for v in (points.pupil, points.colour))
+        at = torch.cat([x[rows] - times * aside[rows], x[rows] + times * aside[rows]])
+        origin, direction, weight = coloured_rays(camera, at, q, colour)
+        light, distance = look(scene, cameras[:, points.frame[rows].repeat(2)], origin, direction)
+        reach = (y[rows] - origin[: len(rows)]).norm(dim=1)
+        return (weight.detach() * light).reshape(2, -1), distance.reshape(2, -1), reach
+
+    (before, behind), distance, reach = read(torch.arange(len(y)), 1)
+    rounding = ROUNDING * (reach + points.world_m.norm(dim=1))
+    nearest = distance.clone()
+    rows = torch.nonzero((distance.amax(0) < reach) & (distance.amax(0) > reach * (1 - DOUBTFUL)))[:, 0]
+    if rows.numel():
+        change = read(rows, 2)[1] - distance[:, rows]
+        change = torch.where(change.abs() < DOUBTFUL * reach[rows], change, 0.0)
+        nearest[:, rows] -= change
+        steepness = change.abs().amax(0) / (points.aside_rad * reach)[rows]
+        rounding[rows] *= 1 + steepness
+    seen = nearest.amax(0) > reach - rounding
+    # between two faces that are seen a ray may slip through, and tells of what lies behind them
+    within = reach * (1 + SAFETY * points.aside_rad * points.face_slope) + rounding
+    return before, behind, seen & (distance.amax(0) <= within)
+
+
+def _rad_per_px(y, per_px, slope, normal):
+    """Angle [n] that a ray to y [n, 3] turns by per pixel along ``normal`` [n, 2] on the film."""
+    ray = torch.cat([slope, torch.ones_like(slope[:, :1])], 1)
+    moved = (per_px @ normal[..., None])[..., 0]
+    moved = torch.cat([moved, torch.zeros_like(moved[:, :1])], 1)
+    return torch.linalg.cross(moved, ray).norm(dim=1) / (y[:, 2] * ray.square().sum(1))
+
+
+def _on_film(camera, y, points):
+    """Where points y [n, 3] in camera axes are seen through points of the pupil: film position [n, 2] px, change of
+    the place at that depth per pixel of it [n, 2, 2] m/px, slope of the ray there [n, 2], and whether light passes
+    [n]. Newton's method on the rays of the camera, from where the lens says light of the point goes."""
+    steps = STEP_PX * torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], dtype=y.dtype)
+    x = _first_guess(camera, y, points)
+    per_px = torch.eye(2, dtype=y.dtype).repeat(len(y), 1, 1)
+    slope = torch.zeros_like(x)
+    found = torch.zeros(len(y), dtype=torch.bool)
+    rows = torch.arange(len(y))
+    for _ in range(TURNS):
+        at = (x[rows] + steps[:, None]).reshape(-1, 2)
+        q, colour = points.pupil[rows].repeat(3, 1), points.colour[rows].repeat(3)
+        origin, direction, light = coloured_rays(camera, at, q, colour)
+        origin, direction = (v.reshape(3, -1, 3) for v in (origin, direction))
+        passes = ((light.reshape(3, -1) > 0) & (direction[..., 2] > 1e-6)).all(0)
+        slopes = direction[..., :2] / torch.where(passes[:, None], direction[..., 2:], 1.0)
+        here = origin[..., :2] + slopes * (y[rows, 2:] - origin[..., 2:])
+        change_per_px = torch.stack([here[1] - here[0], here[2] - here[0]], -1) / STEP_PX
+        passes &= torch.linalg.det(change_per_px).abs() > 1e-12 * change_per_px.square().sum((1, 2))
+        rows, change_per_px = rows[passes], change_per_px[passes]
+        change = torch.linalg.solve(change_per_px, here[0, passes] - y[rows, :2])
+        x[rows] -= change
+        per_px[rows] = change_per_px
+        slope[rows] = slopes[0, passes]
+        near = change.abs().amax(1) < FOUND_PX
+        found[rows] = near
+        rows = rows[~near]
+        if not rows.numel():
+            break
+    return x, per_px, slope, found
+
+
+def _first_guess(camera, y, points):
+    """Film position [n, 2] px of points y [n, 3]: as the lens sends light there, or else along the chief ray of the
+    axis's scale."""
+    film = camera.film
+    if not hasattr(camera.lens, "film_points"):
+        return film.middle_px + y[:, :2] / y[:, 2:] / camera.slope_per_px()
+    if camera.spectrum is None:
+        x, _, _ = camera.lens.film_points(1e3 * y, points.pupil)
+        return x / film.pixel_pitch_mm + film.middle_px
+    x = torch.zeros_like(y[:, :2])
+    for number, wavelength in enumerate(camera.spectrum.wavelengths_um):
+        rows = points.colour == number
+        x[rows] = camera.lens.film_points(1e3 * y[rows], points.pupil[rows], wavelength)[0].to(x)
+    return x / film.pixel_pitch_mm + film.middle_px
+
+
+def _pixels(film, x, window):
+    """Flat number of the pixel of the given windows [n] that holds each position [n, 2], -1 outside."""
+    corner = torch.tensor(film.windows_px or ((0, 0),), dtype=x.dtype)[window]
+    column, row = (x - corner + 0.5).floor().unbind(1)
+    inside = (column >= 0) & (column < film.width_px) & (row >= 0) & (row < film.height_px)
+    number = window * (film.width_px * film.height_px) + row * film.width_px + column
+    return torch.where(inside, number, -1.0).long()
