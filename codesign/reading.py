@@ -78,7 +78,7 @@ def check_regular(path: str | Path, most_bytes: int | None = None) -> Path:
 def read_bytes(path: str | Path, most_bytes: int) -> bytes:
     """The content of a regular file of at most so many bytes. Raises: FileFormatError, as ``open_regular``."""
     with open_regular(path, most_bytes) as file, reading(path, "check the disk"):
-        return file.read(most_bytes + 1)
+        return file.read()
 
 
 def read_json(path: str | Path, most_bytes: int = 50_000_000) -> Any:

@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PRIVATE = {
     "__init__",
     "__main__",
+    "arrays",
     "atomic",
     "doctor",
     "interrupt",

@@ -235,7 +235,7 @@ def test_a_rate_that_changes_linearly_is_integrated_exactly_about_a_fixed_axis(t
         ("groundtruth.txt", "0 0 0 0 0 0 0 2\n1 0 0 0 0 0 0 1\n", "length 2"),
         ("calib.txt", "1 2 3\n", "3 numbers"),
         ("calib.txt", "-1 2 3 4\n", "above 0"),
-        ("calib.txt", "x\n", "is no calibration"),
+        ("calib.txt", "x\n", "in pixels is needed"),
     ],
 )
 def test_damaged_side_files(name, content, reason, tmp_path):

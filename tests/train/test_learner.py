@@ -221,6 +221,7 @@ def test_biases_do_not_decay():
     ]
 
 
+@pytest.mark.bits
 def test_resumed_in_float64_it_goes_on_bit_for_bit_and_with_the_same_optimiser_alone():
     def made(kind):
         network = line().double()

@@ -1,5 +1,6 @@
 """Frames of a folder of pictures, in natural order of their names."""
 
+import contextlib
 import re
 
 import numpy as np
@@ -7,19 +8,14 @@ import numpy as np
 from codesign.errors import FileFormatError
 from codesign.events.sources.frames import PICTURES, FrameSource, same_size
 from codesign.optional import optional
+from codesign.reading import check_room, open_regular, reading
 
 iio = optional("imageio.v3", "video", "reading pictures")
 
-BROKEN = (
-    OSError,
-    ValueError,
-    SyntaxError,
-    TypeError,
-    KeyError,
-    IndexError,
-    EOFError,
-    RuntimeError,
-)  # what Pillow and tifffile raise on damaged files
+tifffile = optional("tifffile", "video", "reading TIFF")
+
+PACKINGS = (1, 5, 8, 32773, 32946)  # none, LZW, zlib, PackBits
+MOST_RATIO = 1040  # at most 1032 to 1
 
 
 def open_folder(folder):
@@ -77,21 +73,18 @@ def read_picture(path):
     Raises: FileFormatError when it cannot be read, holds several pages, is partly transparent, or is of
       another depth.
     """
-    try:
-        if path.suffix.lower() == ".png" and _is_deep_colour(path):
-            raise FileFormatError(
-                f"{path} is a PNG in colour with 16 bits, which the reader would cut to 8; convert it to "
-                "TIFF, or to gray."
-            )
-        picture = np.asarray(
-            iio.imread(path, plugin="tifffile" if path.suffix.lower().startswith(".tif") else "pillow")
-        )
-    except FileFormatError:
-        raise
-    except BROKEN as error:
-        raise FileFormatError(
-            f"{path} cannot be read as a picture ({error}); is it one, and whole?"
-        ) from error
+    with open_regular(path) as file, reading(path, "is it a picture, and whole?"):
+        if path.suffix.lower().startswith(".tif"):
+            picture = _tiff(path, file)
+        else:
+            head = file.read(26)
+            if head[:4] == b"\x89PNG" and head[24:25] == b"\x10" and head[25:] in (b"\x02", b"\x06"):
+                raise FileFormatError(
+                    f"{path} is a PNG in colour with 16 bits, which the reader would cut to 8; convert it to "
+                    "TIFF, or to gray."
+                )
+            file.seek(0)
+            picture = np.asarray(iio.imread(file, plugin="pillow", extension=path.suffix.lower()))
     if picture.dtype == bool:
         picture = picture.astype(np.uint8) * 255
     if picture.ndim == 3 and picture.shape[-1] in (2, 4):
@@ -121,7 +114,16 @@ def _alike(path, first):
     return picture
 
 
-def _is_deep_colour(path):
-    with open(path, "rb") as file:
-        head = file.read(26)
-    return len(head) == 26 and head[24] == 16 and head[25] in (2, 6)
+def _tiff(path, file):
+    """The one page of a TIFF, of the size that the file can hold."""
+    with tifffile.TiffFile(file) as pages:
+        page = pages.pages.first
+        check_room(path, page.shape, page.dtype.itemsize, MOST_RATIO * path.stat().st_size)
+        if len(page.shape) not in (2, 3) or page.compression not in PACKINGS or page.is_tiled:
+            raise FileFormatError(
+                f"{path} is packed as {page.compression.name}, in tiles or in depth; save it plain, or packed by zlib."
+            )
+        with contextlib.suppress(IndexError):
+            pages.pages.get(1)
+            raise FileFormatError(f"{path} holds several pages; one is needed.")
+        return page.asarray()
