@@ -95,6 +95,13 @@ def mesh(kind: str) -> Callable[[], bytes]:
     return made
 
 
+def read_scene(path: Path) -> object:
+    """A Mitsuba scene, with the picture and the mesh that it names beside it."""
+    (path.parent / "brick.png").write_bytes(picture("PNG")())
+    (path.parent / "mesh.ply").write_bytes(mesh("ply")())
+    return worlds.from_mitsuba(path, "path", samples=1)
+
+
 SEEDS: dict[str, Seed] = {
     "sky.hdr": (hdr, textures.environment),
     "sky.exr": (exr, textures.environment),
@@ -103,7 +110,7 @@ SEEDS: dict[str, Seed] = {
     "picture.jpg": (picture("JPEG"), textures.photo),
     **{f"mesh.{kind}": (mesh(kind), mesh_files.read) for kind in ("obj", "ply", "stl", "glb", "gltf", "dae")},
     "robot.urdf": (URDF.encode, robots.from_urdf),
-    "scene.xml": (XML.encode, lambda path: worlds.from_mitsuba(path, "path", samples=1)),
+    "scene.xml": (XML.encode, read_scene),
     "robot.yaml": (PAGE.encode, read_own),
     "poses.txt": (POSES.replace(",", " ").encode, tum.read_tum),
     "poses.csv": (POSES.encode, tum.read_tum),
