@@ -23,7 +23,7 @@ from codesign.errors import CodesignError, DomainError, FileFormatError, check_w
 from codesign.render import Camera, Film
 from codesign.render.light import PathScene, bake
 from codesign.render.placed import PlacedScene, Placement
-from scenes import units
+from scenes import trial_load, units
 
 Up = Literal["y", "z"]
 UP: dict[str, list[list[float]]] = {  # from the axes of a file with this up axis to ours, z up
@@ -270,7 +270,13 @@ def _from_file(mi, path, parameters, merge):
         )
     try:
         with _quiet(mi):
+            config = mi.parser.ParserConfig(mi.variant())
+            trial_load.check(
+                mi, mi.parser.parse_file(config, str(path), **parameters), path, parameters.items()
+            )
             found = mi.load_file(str(path), optimize=merge, **parameters)
+    except CodesignError as error:
+        raise FileFormatError(f"scene '{path}' cannot be loaded: {error}") from error
     except Exception as error:  # Mitsuba raises plain RuntimeErrors of many lines
         raise FileFormatError(f"Mitsuba cannot load scene '{path}': {_sentence(error)}") from error
     if not isinstance(found, mi.Scene):
@@ -284,7 +290,9 @@ def _from_dictionary(mi, source, merge):
     _check_variants(mi, source, "")
     try:
         with _quiet(mi):
-            return mi.load_dict({"type": "scene", **source}, optimize=merge)
+            scene = {"type": "scene", **source}
+            trial_load.check(mi, mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene))
+            return mi.load_dict(scene, optimize=merge)
     except CodesignError:
         raise
     except Exception as error:

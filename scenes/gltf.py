@@ -7,6 +7,7 @@ Source: Khronos Group, glTF 2.0 Specification, 2021.
 import base64
 import io
 import json
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,16 @@ import numpy as np
 import PIL.Image
 
 from codesign.errors import FileFormatError
+from codesign.reading import reading
 from scenes import textures
 from scenes.mesh_folder import Folder
+from scenes.trees import unreached
 
 MAGIC = b"glTF"
 WRAPS = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
 REPEAT = 10497  # where no sampler says
 FLOAT = 5126
+SHORTEST = 1e-3  # of a quaternion, whose length is 1
 OWN_BUFFER = "codesign:the binary chunk"
 LIGHT_ONLY = (
     "KHR_materials_",
@@ -52,25 +56,16 @@ def opened(path: Path, folder: Folder, materials: bool) -> tuple[bytes, dict[str
     """A .gltf, or the same in a .glb, as text that trimesh reads with ``folder``, and its materials by the names
     that the text gives them: their numbers. Raises: FileFormatError for what is damaged or not read."""
     try:
-        tree = _tree(path.read_bytes(), folder)
-        if str(tree["asset"]["version"]).split(".")[0] != "2":
-            raise ValueError(f"version {tree['asset']['version']}")
-        _check_read(path, tree)
-        surfaces = _surfaces(tree, folder) if materials else {}
+        with reading(f"mesh '{path}'", "it is no whole glTF 2.0; export it anew"):
+            tree = _tree(path.read_bytes(), folder)
+            if str(tree["asset"]["version"]).split(".")[0] != "2":
+                raise ValueError(f"version {tree['asset']['version']}")
+            _check_read(path, tree)
+            _check_nodes(tree.get("nodes", []))
+            surfaces = _surfaces(tree, folder) if materials else {}
     except FileFormatError:
         folder.check()
         raise
-    except (
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        OSError,
-        PIL.Image.DecompressionBombError,
-    ) as error:
-        raise FileFormatError(
-            f"mesh '{path}' cannot be read as glTF 2.0 ({str(error)[:100]}); export it anew."
-        ) from error
     tree.pop("images", None)
     for number, material in enumerate(tree.get("materials", [])):
         material["name"] = str(number)
@@ -116,6 +111,20 @@ def _check_read(path, tree):
                     raise FileFormatError(
                         f"mesh '{path}' has its {attribute} in whole numbers; export it without quantisation."
                     )
+
+
+def _check_nodes(nodes):
+    """What trimesh would go round in, or read as something else."""
+    pairs = [(parent, child) for parent, node in enumerate(nodes) for child in node.get("children", [])]
+    often = [child for child, count in Counter(child for _, child in pairs).items() if count > 1]
+    looped = unreached(range(len(nodes)), pairs)
+    if often or looped:
+        raise ValueError(
+            f"its nodes are no tree: node {[*often, *looped][0]} has two parents, or is below itself"
+        )
+    for number, node in enumerate(nodes):
+        if not np.linalg.norm(node.get("rotation", [1.0])) > SHORTEST:
+            raise ValueError(f"node {number} has the rotation {node['rotation']}, which is no quaternion")
 
 
 def _surfaces(tree, folder):

@@ -29,7 +29,7 @@ def read(path: str | Path) -> np.ndarray:
       left.
     """
     if Path(path).suffix.lower() == ".hdr":
-        return _radiance(path)
+        return radiance(path)
     check_regular(path, MOST_BYTES)
     with reading(path, "it is no whole OpenEXR picture; convert it to .hdr or PNG"):
         done = subprocess.run(
@@ -41,7 +41,8 @@ def read(path: str | Path) -> np.ndarray:
         return np.load(io.BytesIO(done.stdout)).astype(np.float64)
 
 
-def _radiance(path):
+def radiance(path: str | Path) -> np.ndarray:
+    """As ``read``, of an RGBE picture whatever its name ends in."""
     data = read_bytes(path, MOST_BYTES)
     head = re.match(rb"#\?[^\n]*\n(?:[^\n]+\n)*\n-Y (\d{1,6}) \+X (\d{1,6})\n", data[:65536])
     with reading(path):

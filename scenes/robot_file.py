@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import TypeAlias, get_args, get_origin, get_type_hints
 
 from codesign import plain_yaml
-from codesign.errors import CodesignError, DomainError, FileFormatError, as_number
+from codesign.errors import CodesignError, DomainError, as_number
+from codesign.reading import read_text, reading
 from scenes import robot_pair
 from scenes.robot_pairs import PAIRS
 
@@ -207,13 +208,11 @@ def read_own(path: str | Path) -> OwnRobot:
       entry that is unknown (with the nearest name), missing, of another kind, or out of range.
     """
     path = Path(path)
+    text = read_text(path, MOST_BYTES)
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise FileFormatError(f"it is larger than {MOST_BYTES} bytes; give a page of settings.")
-        page = plain_yaml.load(path.read_text(encoding="utf-8"))
+        with reading("it", "give a page of plain YAML"):
+            page = plain_yaml.load(text)
         own = _filled(OwnRobot, page, "")
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"robot page '{path}' cannot be read ({error}); give a text file.") from error
     except CodesignError as error:
         raise type(error)(f"robot page '{path}': {error}") from error
     here = path.parent

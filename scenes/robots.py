@@ -10,6 +10,7 @@ Forward kinematics carries no gradient; a mount is moved by a further transform 
 
 import io
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,12 +20,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.errors import CodesignError, DomainError, FileFormatError
+from codesign.errors import DomainError, FileFormatError
 from codesign.optional import optional
+from codesign.reading import building, read_bytes
 from codesign.render import MitsubaScene
 from scenes import mesh_files, textures, units
 from scenes.build import World, emissive
 from scenes.from_mesh import shapes_of
+from scenes.trees import unreached
 
 yourdfpy = optional("yourdfpy", "worlds", "reading URDF")
 trimesh = optional("trimesh", "worlds", "reading URDF")
@@ -38,6 +41,8 @@ ROVER = Path(__file__).with_name("rover.urdf")  # four wheels, a mast, a camera 
 ROUND = 48  # faces around a cylinder
 FINE = 3  # subdivisions of a ball's icosahedron: 1,280 faces
 MOVES = ("revolute", "continuous", "prismatic")
+KINDS = (*MOVES, "fixed", "floating", "planar")
+MOST_BYTES = 100_000_000
 
 
 @dataclass(frozen=True)
@@ -129,25 +134,62 @@ def _model(path):
         raise FileFormatError(f"robot '{path}' is not a file; give the path of a .urdf file.")
     if path.suffix.lower() == ".xacro":
         raise FileFormatError(f"robot '{path}' is a xacro; expand it first: xacro {path.name} > robot.urdf")
-    data = path.read_bytes()
-    try:
+    data = read_bytes(path, MOST_BYTES)
+    with building(f"robot '{path}'", "it is no whole URDF; correct or export it anew"):
         tree = etree.fromstring(data)  # whole or not at all: yourdfpy would go on with what it can read
         if tree.tag != "robot":
             raise ValueError(f"its first element is <{tree.tag}> instead of <robot>")
-        model = yourdfpy.URDF.load(io.BytesIO(data), load_meshes=False)
-    except CodesignError:
-        raise
-    except Exception as error:  # lxml and yourdfpy raise whatever a damaged file brings up
-        said = " ".join(str(error).split())[:120]
-        raise FileFormatError(
-            f"robot '{path}' cannot be read as URDF ({said}); correct or export it anew."
-        ) from error
-    names = {link.name for link in model.robot.links}
-    lost = sorted({str(end) for joint in model.robot.joints for end in (joint.parent, joint.child)} - names)
-    if lost or model.base_link is None:
-        what = f"joints name links that are not there: {', '.join(lost)}" if lost else "it has no root link"
-        raise FileFormatError(f"robot '{path}' is no tree of links: {what}; correct it.")
+        with np.errstate(all="ignore"):  # what is not finite, or has no axis, is refused below
+            model = yourdfpy.URDF.load(io.BytesIO(data), load_meshes=False)
+        wrong = _no_tree(model) or _wrong_joint(model.robot.joints) or _wrong_shape(model.robot.links)
+    if wrong:
+        raise FileFormatError(f"robot '{path}' cannot be built: {wrong}; correct it.")
     return model
+
+
+def _no_tree(model):
+    """What keeps links and joints from being a tree, or an empty text."""
+    links = [link.name for link in model.robot.links]
+    joints = model.robot.joints
+    for kind, names in (("links", links), ("joints", [joint.name for joint in joints])):
+        twice = sorted(name for name, count in Counter(names).items() if count > 1)
+        if twice:
+            return f"several {kind} are called {', '.join(twice)}"
+    pairs = [(joint.parent, joint.child) for joint in joints]
+    lost = sorted({str(end) for pair in pairs for end in pair} - set(links))
+    if lost:
+        return f"joints name links that are not there: {', '.join(lost)}"
+    looped = unreached(links, pairs)
+    if looped:
+        return f"joints lead in a loop through {', '.join(looped)}"
+    roots = sorted(set(links) - {child for _, child in pairs})
+    return "" if len(roots) == 1 else f"it has {len(roots)} root links instead of 1: {', '.join(roots)}"
+
+
+def _wrong_joint(joints):
+    """What is wrong with a joint of the file, or an empty text."""
+    leaders = {joint.name for joint in joints if joint.type in MOVES and joint.mimic is None}
+    for joint in joints:
+        numbers = [joint.origin, joint.axis]
+        if joint.type not in KINDS:
+            return f"joint '{joint.name}' is of the type '{joint.type}', which is none of {', '.join(KINDS)}"
+        if joint.mimic is not None:
+            numbers += [joint.mimic.multiplier, joint.mimic.offset]
+            if joint.mimic.joint not in leaders:
+                return f"joint '{joint.name}' mimics '{joint.mimic.joint}', which is no joint that moves by itself"
+        if not all(np.isfinite(np.asarray(each, dtype=float)).all() for each in numbers if each is not None):
+            return f"joint '{joint.name}' has an origin, axis or mimic that is not finite"
+        if joint.type in MOVES and not np.any(joint.axis):
+            return f"joint '{joint.name}' has the axis 0 0 0, along which nothing turns or slides"
+    return ""
+
+
+def _wrong_shape(links):
+    for link in links:
+        origins = [shape.origin for shape in (*link.visuals, *link.collisions) if shape.origin is not None]
+        if not all(np.isfinite(origin).all() for origin in origins):
+            return f"a shape of link '{link.name}' has an origin that is not finite"
+    return ""
 
 
 def _checked_angles(path, model, angles):

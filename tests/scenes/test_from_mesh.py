@@ -332,9 +332,9 @@ def test_files_that_are_no_whole_meshes_are_refused(tmp_path):
         "short.stl": (bytes(80) + (9).to_bytes(4, "little") + bytes(50), "no faces"),
         "other.dae": ("<xml/>", "cannot be read as DAE"),
         "half.dae": ("<COLLADA>", "cannot be read as DAE"),
-        "other.gltf": ("{}", "cannot be read as glTF"),
+        "other.gltf": ("{}", "no whole glTF"),
         "one.gltf": ('{"asset": {"version": "1.0"}}', "version 1.0"),
-        "other.glb": (b"glTF" + bytes(30), "cannot be read as glTF"),
+        "other.glb": (b"glTF" + bytes(30), "no whole glTF"),
         "short.ply": (
             "ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\nend_header\n1\n",
             "read as PLY|no faces",
@@ -392,10 +392,17 @@ def test_gltf_that_would_be_read_in_part_is_refused(tmp_path):
     refused("KHR_texture_transform", extensionsUsed=["KHR_texture_transform"])
     refused("lies on a network", buffers=[{"byteLength": 92, "uri": "https://127.0.0.1:9/a.bin"}])
     refused("neither PNG nor JPEG", textures=[{"extensions": {"EXT_texture_webp": {"source": 0}}}])
-    refused("cannot be read as glTF", images=[{"uri": "data:image/png;base64,AAAA"}])
+    refused("no whole glTF", images=[{"uri": "data:image/png;base64,AAAA"}])
     refused("'a.bin' is missing", buffers=[{"byteLength": 92, "uri": "a.bin"}])
     second = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "texCoord": 1}}}
     refused("TEXCOORD_1", materials=[second])
+    for nodes in ([{"mesh": 0, "children": [0]}], [{"children": [1]}, {"mesh": 0, "children": [0]}]):
+        refused("node 0 has two parents, or is below itself", nodes=nodes)
+    refused("node 1 has two parents", nodes=[{"children": [1, 1]}, {"mesh": 0}])
+    refused(r"rotation \[0, 0, 0, 0\], which is no quaternion", nodes=[{"mesh": 0, "rotation": [0, 0, 0, 0]}])
+    (tmp_path / "deep.gltf").write_text("[" * 100_000)
+    with pytest.raises(FileFormatError, match="no whole glTF"):
+        mesh_files.read(tmp_path / "deep.gltf")
     refused("one way along u", samplers=[{"wrapS": 33071}], textures=[{"source": 0, "sampler": 0}])
 
 

@@ -1,6 +1,8 @@
 """Worlds from Mitsuba scenes: the same picture as Mitsuba's own sensor, units and axes, and what is refused."""
 
 import math
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ from codesign.errors import DomainError, FileFormatError, GradientError
 from codesign.pose import look_at
 from codesign.render import Camera, light
 from codesign.render.charts import emissive_mesh
-from scenes import worlds
+from scenes import trial_load, worlds
 
 XML = """<scene version="3.0.0">
     <default name="bright" value="2"/>
@@ -184,6 +186,53 @@ def test_a_missing_picture_is_named(path):
     path.write_text(XML.replace('<rgb name="base_color" value="0.8, 0.3, 0.2"/>', picture))
     with pytest.raises(FileFormatError, match=r"scene\.xml.*no\.png"):
         worlds.from_mitsuba(path)
+
+
+ROW = b"\x02\x02\x00\x09"  # of nine pixels, run by run; 136 is a run of eight
+HDR = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 9\n" + ROW
+ENDS = """import sys
+from codesign.errors import FileFormatError
+from scenes import worlds
+filename = {"filename": sys.argv[2]} if sys.argv[2] else {}
+paint = {"type": "diffuse", "reflectance": {"type": "bitmap", **filename}}
+for source in sys.argv[1], {"a": {"type": "rectangle", "paint": paint}, "sky": {"type": "constant"}}:
+    try:
+        worlds.from_mitsuba(source, "path")
+    except FileFormatError as error:
+        print(error)"""
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "sentence"),
+    [
+        ("", b"", "names no file"),
+        ("run.hdr", HDR + b"\x88\x01" * 8, "a run is longer than its row"),
+        ("other.png", HDR + b"\x88\x01" * 8, "a run is longer than its row"),
+    ],
+)
+def test_a_picture_that_would_end_the_process_is_a_sentence(path, name, content, sentence):
+    picture = path.with_name(name) if name else ""
+    if picture:
+        picture.write_bytes(content)
+    named = f'<string name="filename" value="{name}"/>' if name else ""
+    texture = f'<texture type="bitmap" name="base_color">{named}</texture>'
+    path.write_text(XML.replace('<rgb name="base_color" value="0.8, 0.3, 0.2"/>', texture))
+    done = subprocess.run(
+        [sys.executable, "-c", ENDS, path, picture], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert [sentence in line for line in done.stdout.splitlines()] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("trial", "sentence"),
+    [("import os; os.abort()", "Mitsuba itself ends"), ("import time; time.sleep(60)", "within 1 s")],
+)
+def test_whatever_ends_mitsuba_ends_a_trial(path, monkeypatch, trial, sentence):
+    monkeypatch.setattr(trial_load, "TRIAL", trial)
+    monkeypatch.setattr(trial_load, "LONGEST_S", 1.0)
+    with pytest.raises(FileFormatError, match=rf"scene\.xml.*{sentence}"):
+        worlds.view_of(path)
 
 
 def test_what_is_no_scene_is_refused(path, tmp_path):

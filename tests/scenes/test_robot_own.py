@@ -381,10 +381,10 @@ def test_files_that_a_world_names_belong_to_it(page, tmp_path):
 
 
 def test_a_page_that_is_no_text_is_refused(tmp_path):
-    with pytest.raises(FileFormatError, match=r"none.yaml' cannot be read"):
+    with pytest.raises(FileFormatError, match=r"no file lies at .*none.yaml"):
         read_own(tmp_path / "none.yaml")
     (tmp_path / "a.yaml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(FileFormatError, match=r"a.yaml' cannot be read"):
+    with pytest.raises(FileFormatError, match=r"a.yaml cannot be read"):
         read_own(tmp_path / "a.yaml")
 
 

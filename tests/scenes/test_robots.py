@@ -249,7 +249,7 @@ def test_robots_that_cannot_be_are_refused(tmp_path):
     files = {
         "nowhere.urdf": (None, "is not a file"),
         "a.xacro": ("<robot/>", "expand it first"),
-        "half.urdf": (ARM[:300], "cannot be read as URDF"),
+        "half.urdf": (ARM[:300], "no whole URDF"),
         "other.urdf": ("<sdf/>", "instead of <robot>"),
         "lost.urdf": (
             '<robot name="a"><link name="b"/><joint name="j" type="fixed"><parent link="b"/><child link="c"/></joint></robot>',
@@ -265,6 +265,46 @@ def test_robots_that_cannot_be_are_refused(tmp_path):
     (tmp_path / "bare.urdf").write_text('<robot name="a"><link name="b"/></robot>')
     with pytest.raises(DomainError, match="nothing to see"):
         robots.from_urdf(tmp_path / "bare.urdf").scene()
+
+
+LIMIT = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'
+SECOND = '<link name="c"/><joint name="{}" type="continuous"><parent link="{}"/><child link="c"/>{}</joint>'
+
+
+@pytest.mark.parametrize(
+    ("kind", "inside", "more", "sentence"),
+    [
+        ("revolute", LIMIT + '<axis xyz="0 0 0"/>', "", "joint 'j' has the axis 0 0 0"),
+        ("prismatic", LIMIT + '<axis xyz="0 0 0"/>', "", "joint 'j' has the axis 0 0 0"),
+        ("continuous", '<axis xyz="0 nan 1"/>', "", "joint 'j' .* not finite"),
+        ("fixed", '<origin xyz="nan 0 0"/>', "", "joint 'j' .* not finite"),
+        ("fixed", '<origin rpy="0 inf 0"/>', "", "joint 'j' .* not finite"),
+        ("fixed", "", SECOND.format("j", "a", ""), "several joints are called j"),
+        ("fixed", "", '<link name="b"/>', "several links are called b"),
+        ("bendy", "", "", "of the type 'bendy', which is none of revolute"),
+        ("fixed", "", SECOND.format("k", "c", ""), "in a loop through c;"),
+        ("fixed", "", '<link name="c"/>', "2 root links instead of 1: a, c"),
+        ("continuous", '<mimic joint="zz"/>', "", "'j' mimics 'zz', which is no joint that moves by itself"),
+        ("continuous", '<mimic joint="k"/>', SECOND.format("k", "a", '<mimic joint="j"/>'), "'j' mimics 'k'"),
+        ("fixed", '<mimic joint="k" offset="nan"/>', SECOND.format("k", "a", ""), "joint 'j' .* not finite"),
+    ],
+)
+def test_joints_that_make_no_robot_are_one_sentence(tmp_path, kind, inside, more, sentence):
+    path = tmp_path / "r.urdf"
+    path.write_text(
+        f'<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="{kind}"><parent link="a"/>'
+        f'<child link="b"/>{inside}</joint>{more}</robot>'
+    )
+    with pytest.raises(FileFormatError, match=sentence) as told:
+        robots.from_urdf(path)
+    assert "\n" not in str(told.value)
+
+
+def test_a_shape_without_a_place_is_refused(tmp_path):
+    box = '<visual><origin xyz="0 nan 0"/><geometry><box size="1 1 1"/></geometry></visual>'
+    (tmp_path / "r.urdf").write_text(f'<robot name="r"><link name="a">{box}</link></robot>')
+    with pytest.raises(FileFormatError, match="a shape of link 'a' has an origin that is not finite"):
+        robots.from_urdf(tmp_path / "r.urdf")
 
 
 def test_a_robot_in_millimetres_gets_a_hint(tmp_path):
