@@ -281,19 +281,26 @@ def _listed(camera, scene, curves, cameras, found):
     read = read[torch.nonzero(read.seen)[:, 0]]
     ray = ray[read.row]
     turned = (read.normal * found.along[ray]).sum(1)
-    away = ((read.film_px - found.film_px[ray]) * read.normal).sum(1).abs()
-    met = torch.nonzero(away < SAFETY * read.aside_px + FOUND_PX)[:, 0]
-    ray, turned, read = ray[met], turned[met], read[met]
-    total = total.index_add(0, ray, (read.behind - read.before) * turned.sign())
-    # rounding leaves slivers at edges: the change is that between rays as far aside as the curves are read
-    reach = torch.zeros_like(total).scatter_reduce(0, ray, read.aside_px, "amax")
-    slant = torch.ones_like(total).scatter_reduce(0, ray, turned.abs(), "amin")
-    rows = torch.nonzero((reach > 0) & (slant > GRAZING))[:, 0]
+    away = ((read.film_px - found.film_px[ray]) * read.normal).sum(1)
+    met = torch.nonzero((away.abs() < SAFETY * read.aside_px + FOUND_PX) & (turned.abs() > 0))[:, 0]
+    ray, turned, away, read = ray[met], turned[met], away[met], read[met]
+    # rounding leaves slivers at edges: the change that counts is that around the nearest curve, as far aside as it is read
+    least = torch.full_like(total, torch.inf).scatter_reduce(0, ray, away.abs(), "amin")
+    first = torch.nonzero(away.abs() == least[ray])[:, 0]
+    nearest = torch.full_like(found.frame, -1).scatter_reduce(0, ray[first], first, "amax")
+    place, half, slant = (
+        torch.where(nearest >= 0, v[nearest], 1.0) if len(v) else torch.ones_like(total)
+        for v in (away / turned, read.aside_px / turned.abs(), turned.abs())
+    )
+    within = (away / turned - place[ray]).abs() < half[ray]
+    change = (read.behind - read.before) * turned.sign() * within
+    total = total.index_add(0, ray, change)
+    rows = torch.nonzero((nearest >= 0) & (slant > GRAZING))[:, 0]
     before, behind = (
-        _light(camera, scene, cameras, found, rows, sign * (reach / slant)[rows]) for sign in (-1, 1)
+        _light(camera, scene, cameras, found, rows, (place + sign * half)[rows]) for sign in (-1, 1)
     )
     change = found.change.index_put((rows,), behind - before)
-    kept = torch.nonzero((reach == 0) | (slant > GRAZING))[:, 0]
+    kept = torch.nonzero((nearest < 0) | (slant > GRAZING))[:, 0]
     return replace(found, change=change)[kept], total[kept]
 
 
