@@ -11,7 +11,7 @@ STUDIES := lens-opt lens-report lens-scratch lens-tolerance lens-bench silhouett
 	event-gradient event-bench srm-bench davis train-flow flow-quality flow-compare flow-cost flow-recording \
 	placement speed-error stability gradcheck
 
-.PHONY: help setup test test-bits lint core-check try-all doctor clean $(STUDIES)
+.PHONY: help setup test fuzz test-bits lint core-check try-all doctor clean $(STUDIES)
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1|/p' Makefile | awk -F'|' '{printf "%-24s %s\n", $$1, $$2}'
@@ -63,6 +63,9 @@ gradcheck: STUDY := gradient_flow
 
 test: setup ## all tests, on all cores
 	@$(RUN) -m pytest -n auto --maxprocesses 8 $(ARGS)
+
+fuzz: setup ## mutants of every file format for hours: make fuzz ARGS="--minutes 120 --format .npz"
+	@$(RUN) -m tests.hostile fuzz $(ARGS)
 
 test-bits: setup ## tests that promise equal bits, as other processors and numbers of threads round
 	@failed=0; for how in \

@@ -2,6 +2,7 @@
 holds before room is taken for it, objects are never built, and what is wrong is one sentence."""
 
 import math
+import re
 import struct
 import zipfile
 from collections.abc import Iterator
@@ -11,7 +12,6 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
-from numpy.lib import format as npy
 
 from codesign.errors import FileFormatError
 from codesign.reading import MOST_BYTES, check_room, open_regular, reading
@@ -20,6 +20,8 @@ DEFLATE_RATIO = 1040  # at most 1032 to 1
 PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 LOCAL_HEADER_BYTES = 30  # PKWARE, .ZIP File Format Specification, 4.3.7
 BLOCK_BYTES = 2**24
+MOST_HEADER_BYTES = 10_000
+HEADER = re.compile(r"\{( *'\w+': *('[^']{1,20}'|True|False|\([0-9, ]{0,400}\)),?){3} *\}\s*")
 KINDS = "biufcSU"  # data without pointers
 
 
@@ -134,17 +136,22 @@ def read_npy(path: str | Path, mapped: bool = False) -> np.ndarray:
 
 
 def _header(file: IO[bytes], what: str) -> Header:
-    version = npy.read_magic(file)
-    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    shape, by_columns, dtype = read(file)
-    if (
-        dtype.kind not in KINDS
-        or dtype.subdtype is not None
-        or not dtype.itemsize
-        or any(size < 0 for size in shape)
-    ):
-        raise FileFormatError(f"{what} holds {dtype} {list(shape)}; plain numbers are needed.")
-    return Header(tuple(map(int, shape)), dtype, by_columns, file.tell())
+    version = file.read(8)[6:]
+    width = 2 if version == b"\x01\x00" else 4  # of the header's own length
+    length = int.from_bytes(file.read(width), "little")
+    text = file.read(min(length, MOST_HEADER_BYTES)).decode("latin-1")
+    told = HEADER.fullmatch(text)
+    parts = dict(re.findall(r"'(\w+)': *('[^']*'|\w+|\([^)]*\))", text)) if told else {}
+    if parts.keys() != {"descr", "fortran_order", "shape"}:
+        raise FileFormatError(
+            f"{what} has no header of an array of plain numbers ({text[:60]!r}); use a whole .npy file."
+        )
+    shape = [int(size) for size in re.findall(r"[0-9]+", parts["shape"])]
+    dtype = np.dtype(parts["descr"].strip("'"))
+    by_columns = parts["fortran_order"] == "True"
+    if dtype.kind not in KINDS or not dtype.itemsize:
+        raise FileFormatError(f"{what} holds {dtype} {shape}; plain numbers are needed.")
+    return Header(tuple(shape), dtype, by_columns, file.tell())
 
 
 def _filled(read, header):

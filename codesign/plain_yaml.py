@@ -21,7 +21,7 @@ from codesign.errors import DomainError, FileFormatError
 INDENT = 2
 MOST_LINES = 10_000
 DEEPEST = 20  # levels
-KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,99}")
 WORD = re.compile(r"(\.{0,2}/)*[A-Za-z_][A-Za-z0-9_/.-]*")  # text that needs no quotes
 OTHERS = re.compile(
     "y|n|yes|no|on|off|true|false|null|nan|inf|infinity", re.IGNORECASE

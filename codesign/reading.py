@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 
 from codesign.errors import CodesignError, DomainError, FileFormatError, ShapeError
 
+MOST_SAID = 600  # characters of a sentence
 MOST_BYTES = 2**33  # of an array that a header announces; larger ones are read in pieces
 
 
@@ -43,6 +44,7 @@ def building(what: str | Path, remedy: str = "it is damaged, or of another versi
             yield
     except (DomainError, ShapeError, FileFormatError) as error:
         said = " ".join(str(error).split())
+        said = said if len(said) < MOST_SAID else f"{said[:MOST_SAID]} …"
         raise FileFormatError(said if said.startswith(str(what)) else f"{what}: {said}") from error
 
 
@@ -85,7 +87,7 @@ def read_json(path: str | Path, most_bytes: int = 50_000_000) -> Any:
     """What a file of JSON in UTF-8 holds. Raises: FileFormatError where it is none, or nested without end."""
     text = read_text(path, most_bytes)
     with reading(path, "it is no whole JSON file"):
-        return json.loads(text)
+        return json.loads(text, parse_constant=_number, parse_float=_number)
 
 
 def read_text(path: str | Path, most_bytes: int = 50_000_000) -> str:
@@ -104,6 +106,12 @@ def check_room(
             f"{what} announces {' x '.join(map(str, shape))} values of {item_bytes} bytes, more than the {most_bytes} "
             "bytes that are read at once; it is damaged."
         )
+
+
+def _number(text):
+    if not math.isfinite(value := float(text)):
+        raise ValueError(f"{text[:20]} is no finite number")
+    return value
 
 
 def _without_waiting(path: str, flags: int) -> int:

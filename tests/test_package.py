@@ -11,9 +11,9 @@ import codesign
 
 ROOT = Path(__file__).resolve().parents[1]
 PRIVATE = {
+    "arrays",
     "__init__",
     "__main__",
-    "arrays",
     "atomic",
     "doctor",
     "interrupt",

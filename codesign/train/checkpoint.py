@@ -66,8 +66,8 @@ def load(folder: Path, learner: Learner, facts: dict[str, Any]) -> Progress | No
             "codesign that wrote it, or start a new run."
         )
     _check_facts(path, stored, json.loads(json.dumps(facts)))
-    if Path(file).name != file:
-        raise FileFormatError(f"'{path}' names a file outside its folder ('{file}'); start a new run.")
+    if Path(file).name != file or len(file) > 100:
+        raise FileFormatError(f"'{path}' names a file outside its folder ('{file[:100]}'); start a new run.")
     tensors, content = checkpoint.read_tensors(folder / file)
     with reading(f"'{path}'", "start a new run"):
         numbers = {name: stored["progress"][name] for name in NUMBERS}

@@ -64,14 +64,14 @@ def read_config(path: Path, study: str, kind: type[Config]) -> Config:
         )
     if owner != study:
         raise FileFormatError(
-            f"'{path.parent}' is a run of the study '{owner}', not of '{study}'; resume it with: "
-            f"{resume_command(owner, path.parent)}"
+            f"'{path.parent}' is a run of the study '{owner[:60]}', not of '{study}'; resume it with: "
+            f"{resume_command(owner[:60], path.parent)}"
         )
     known = {field.name for field in dataclasses.fields(kind)}
     if known != set(stored):
         raise FileFormatError(
             f"'{path}' was written by another version of this study (fields that differ: "
-            f"{', '.join(sorted(known ^ set(stored)))}); start a new run."
+            f"{', '.join(sorted(known ^ set(stored)))[:200]}); start a new run."
         )
     hints = typing.get_type_hints(kind)
     return kind(**{name: _typed(path, name, value, hints[name]) for name, value in stored.items()})

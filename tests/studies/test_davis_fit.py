@@ -318,7 +318,7 @@ def test_a_recording_is_read_and_a_bad_one_refused(tmp_path):
         with pytest.raises(error, match=words):
             load(path)
     path.write_bytes(b"no archive")
-    with pytest.raises(FileFormatError, match="not a recording"):
+    with pytest.raises(FileFormatError, match=r"use a whole \.npz file"):
         load(path)
 
 

@@ -425,7 +425,7 @@ def test_what_cannot_be_is_one_sentence_and_exit_code_2(tmp_path, capsys):
             (["--input", folder, "--timestamps", tmp_path / "few.txt"], "2 times, the input 4"),
             (["--input", folder, "--timestamps", tmp_path / "word.txt"], "line 3: 'noon'"),
             (["--input", folder, "--timestamps", tmp_path / "close.txt"], "0.1 us apart"),
-            (["--input", folder, "--timestamps", tmp_path / "none.txt"], "cannot be read"),
+            (["--input", folder, "--timestamps", tmp_path / "none.txt"], "no file lies at"),
             (["--input", folder, "--timestamps", tmp_path / "few.txt", "--fps", 5], "both given"),
             (["--input", tmp_path / "nan.npy", "--fps", 30], "frame 2 holds nan at row 3, column 4"),
             (["--input", folder, "--fps", 30, "--stop-s", -1], "0 frame"),

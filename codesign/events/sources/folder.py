@@ -1,20 +1,23 @@
 """Frames of a folder of pictures, in natural order of their names."""
 
 import contextlib
+import io
 import re
 
 import numpy as np
+import PIL.Image
 
 from codesign.errors import FileFormatError
 from codesign.events.sources.frames import PICTURES, FrameSource, same_size
 from codesign.optional import optional
-from codesign.reading import check_room, open_regular, reading
+from codesign.reading import check_room, read_bytes, reading
 
 iio = optional("imageio.v3", "video", "reading pictures")
 
 tifffile = optional("tifffile", "video", "reading TIFF")
 
 PACKINGS = (1, 5, 8, 32773, 32946)  # none, LZW, zlib, PackBits
+MOST_BYTES = 2**30
 MOST_RATIO = 1040  # at most 1032 to 1
 
 
@@ -73,7 +76,9 @@ def read_picture(path):
     Raises: FileFormatError when it cannot be read, holds several pages, is partly transparent, or is of
       another depth.
     """
-    with open_regular(path) as file, reading(path, "is it a picture, and whole?"):
+    content = read_bytes(path, MOST_BYTES)
+    with reading(path, "is it a picture, and whole?"):
+        file = io.BytesIO(content)  # in memory, where a part that claims more than the file has takes no room
         if path.suffix.lower().startswith(".tif"):
             picture = _tiff(path, file)
         else:
@@ -83,6 +88,9 @@ def read_picture(path):
                     f"{path} is a PNG in colour with 16 bits, which the reader would cut to 8; convert it to "
                     "TIFF, or to gray."
                 )
+            file.seek(0)
+            with PIL.Image.open(file) as opened:
+                check_room(path, (opened.height, opened.width, 4), 1, 4 * MOST_RATIO * path.stat().st_size)
             file.seek(0)
             picture = np.asarray(iio.imread(file, plugin="pillow", extension=path.suffix.lower()))
     if picture.dtype == bool:

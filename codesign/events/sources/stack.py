@@ -74,6 +74,10 @@ def _look(path):
             if heads[key].dtype.kind not in "fiu":
                 raise FileFormatError(f"{path}: the times {key} are {heads[key].dtype}; numbers are needed.")
             t_s = archive.read(key).astype(np.float64) / TIMES[key]
+            if not np.isfinite(t_s).all():
+                raise FileFormatError(
+                    f"{path}: the times {key} are NaN or infinite; give one for every frame."
+                )
             clock = f"array {key} of the file"
         return chosen, heads[chosen].shape, heads[chosen].dtype, t_s, clock
 

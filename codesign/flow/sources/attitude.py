@@ -15,6 +15,7 @@ from codesign.reading import open_regular, reading
 
 LARGEST_GAP_S = 0.1  # between samples that are interpolated
 UNIT_TOLERANCE = 1e-2  # of a quaternion's length
+LARGEST = 1e15  # of a time, rate or place: products of two stay finite
 MOST_BYTES = 2_000_000_000
 
 
@@ -111,7 +112,7 @@ def _table(path, columns, names):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a file without a number, which is refused below
             table = np.loadtxt(file, ndmin=2, comments="#", delimiter=delimiter, encoding="utf-8")
-    if table.shape[1] != columns or len(table) < 2 or not np.isfinite(table).all():
+    if table.shape[1] != columns or len(table) < 2 or not (np.abs(table) < LARGEST).all():
         raise FileFormatError(
             f"{path} has {len(table)} rows of {table.shape[1]} numbers; at least two rows of {columns} "
             f"finite ones are needed: '{names}'."

@@ -268,7 +268,12 @@ def _of_table(path, size_px):
             path, table.reshape(2, height, width), np.isfinite(table.reshape(2, height, width)).all(0)
         )
     names = tuple(COLUMNS.get(word, "?") for word in words) if header else TABLES.get(table.shape[1], ())
-    if len(names) != table.shape[1] or "u" not in names or "v" not in names or len(set(names)) != len(names):
+    if (
+        len(names) != table.shape[1]
+        or not {"u", "v"} <= set(names)
+        or ("x" in names) != ("y" in names)
+        or len(set(names)) != len(names)
+    ):
         raise FileFormatError(
             f"{path} has {table.shape[0]} lines of {table.shape[1]} numbers; 'u v' for all pixels row by "
             f"row, 'x y u v', 'x y u v valid', 't x y p u v' or 2 x {height} lines of {width} are read."

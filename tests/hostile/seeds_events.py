@@ -1,0 +1,145 @@
+"""Small whole files of every format of events and frames, and who reads each."""
+
+import io
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import torch
+
+from codesign import events
+from codesign.events.stream import ordered
+
+Seed = tuple[Callable[[], bytes], Callable[[Path], object]]
+SIZE = (260, 346)
+CIH = "#Camera\r\nRecord Rate(fps) : 1000\r\nTotal Frame : 3\r\nImage Width : 8\r\nImage Height : 6\r\nColor Bit : 8\r\n"
+
+
+def stream(count=120):
+    dice = torch.Generator().manual_seed(1)
+    t_us = torch.randint(0, 20_000, (count,), generator=dice)
+    x, y, p = (torch.randint(0, high, (count,), generator=dice) for high in (SIZE[1], SIZE[0], 2))
+    return ordered(t_us, x, y, 2 * p - 1, *SIZE)
+
+
+def written(suffix: str, **options) -> Callable[[], bytes]:
+    """A file that ``events.write`` makes."""
+
+    def made():
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"events{suffix}"
+            events.write(path, stream(), **options)
+            return path.read_bytes()
+
+    return made
+
+
+def dsec(packing=None) -> Callable[[], bytes]:
+    """HDF5 without checksums, as published files are."""
+
+    def made():
+        import h5py
+        import hdf5plugin
+
+        options = {"blosc": dict(hdf5plugin.Blosc(cname="zstd", clevel=1)), "gzip": {"compression": "gzip"}}
+        buffer = io.BytesIO()
+        given = stream()
+        with h5py.File(buffer, "w") as file:
+            for name, values in (("t", given.t_us), ("x", given.x), ("y", given.y), ("p", given.p > 0)):
+                data = values.numpy().astype(np.uint32)
+                file.create_dataset(f"events/{name}", data=data, chunks=(64,), **options.get(packing, {}))
+            file["t_offset"] = 0
+        return buffer.getvalue()
+
+    return made
+
+
+def v2e():
+    import h5py
+
+    buffer = io.BytesIO()
+    given = stream()
+    with h5py.File(buffer, "w") as file:
+        rows = torch.stack((given.t_us, given.x, given.y, (given.p > 0).long()), 1)
+        file.create_dataset("events", data=rows.numpy().astype(np.uint32), compression="gzip", chunks=(50, 4))
+    return buffer.getvalue()
+
+
+def arrays(packed: bool, **values) -> Callable[[], bytes]:
+    """An .npz of arrays, or an .npy of the one called ``only``."""
+
+    def made():
+        buffer = io.BytesIO()
+        if "only" in values:
+            np.save(buffer, values["only"])
+        else:
+            (np.savez_compressed if packed else np.savez)(buffer, **values)
+        return buffer.getvalue()
+
+    return made
+
+
+def picture(kind: str, dtype=np.uint8, colour=True, **options) -> Callable[[], bytes]:
+    """A picture that Pillow or tifffile writes."""
+
+    def made():
+        pixels = np.arange(9 * 12 * 3).reshape(9, 12, 3)[..., : 3 if colour else 1].squeeze()
+        buffer = io.BytesIO()
+        if kind == "TIFF":
+            import tifffile
+
+            tifffile.imwrite(
+                buffer, (pixels * 150).astype(dtype), photometric="rgb" if colour else "minisblack", **options
+            )
+        else:
+            PIL.Image.fromarray(pixels.astype(dtype)).save(buffer, kind, **options)
+        return buffer.getvalue()
+
+    return made
+
+
+def frames(path: Path):
+    """All frames and times of a source, read to its end."""
+    if path.suffix == ".mraw":
+        path.with_suffix(".cih").write_text(CIH)
+    elif path.suffix == ".cih":
+        path.with_suffix(".mraw").write_bytes(bytes(range(144)))
+        path = path.with_suffix(".mraw")
+    source = events.open_frames(path)
+    shapes = {frame.shape for frame in source.read(0)}
+    return [source.t_s, source.white, source.count, len(shapes)]
+
+
+def folder_frames(path: Path):
+    """A picture as the second of a folder of two alike."""
+    from codesign.events.sources.folder import read_picture
+
+    return read_picture(path)
+
+
+STACK = np.arange(4 * 6 * 8).reshape(4, 6, 8)
+SEEDS: dict[str, Seed] = {
+    "dsec.h5": (written(".h5"), events.read),
+    "gzip.h5": (dsec("gzip"), events.read),
+    "blosc.h5": (dsec("blosc"), events.read),
+    "plain.h5": (dsec(), events.read),
+    "v2e.h5": (v2e, events.read),
+    "events.aedat4": (written(".aedat4"), events.read),
+    "evt3.raw": (written(".raw", evt=3), events.read),
+    "evt2.raw": (written(".raw", evt=2), events.read),
+    "events.dat": (written(".dat"), events.read),
+    "events.csv": (written(".csv"), events.read),
+    "events.npz": (written(".npz"), events.read),
+    "stack.npy": (arrays(False, only=STACK.astype(np.uint8)), frames),
+    "stack.npz": (arrays(True, frames=STACK.astype(np.float32), t_s=np.arange(4.0)), frames),
+    "camera.mraw": (lambda: bytes(range(144)), frames),
+    "camera.cih": (CIH.encode, frames),
+    "frame.png": (picture("PNG"), folder_frames),
+    "frame.jpg": (picture("JPEG"), folder_frames),
+    "frame.bmp": (picture("BMP"), folder_frames),
+    "frame.tif": (picture("TIFF", np.uint16), folder_frames),
+    "packed.tif": (picture("TIFF", np.uint16, compression="zlib", rowsperstrip=2), folder_frames),
+    "gray.tif": (picture("TIFF", np.uint8, colour=False), folder_frames),
+}

@@ -1,0 +1,121 @@
+"""Small whole files of runs, trainings, generators, hand-overs and lenses, and who reads each."""
+
+import json
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from codesign import events, lens, place, plain_yaml, render
+from codesign.events.spiking.spike_esim import SpikeEsim
+from codesign.reading import read_json, read_text
+from codesign.system import HandOver, load_hand_over, save_hand_over
+from codesign.train import checkpoint
+from codesign.train.loop import Progress
+from studies.frame.config import StudyConfig
+from studies.frame.run import Run, open_run
+from tests.hostile.seeds_events import Seed
+
+SEQ = "RDM\nTITLE 'x'\nEPD 10\nDIM M\nWL 587.6\nYAN 0 5\nSO 0 1e13\nS 50 4 NBK7_SCHOTT\nSTO\nCIR 8\nASP\nK -1\nA 1e-7\n"
+SEQ += "S -100 60; CIR 7\nPIM\nSI 0 0\n"
+TABLE = "x\ntype distance roc diameter material\nO 0 0 0 AIR\nS 0 50 12 N-BK7 0.1 1e-7\nS 4 -100 12 AIR\nI 60 0 9 AIR\n"
+
+
+@dataclass(frozen=True)
+class Config(StudyConfig):
+    limit: float = 1.0
+    sizes: tuple[int, ...] = (1, 2)
+
+
+def made(name: str, write: Callable[[Path], object]) -> Callable[[], bytes]:
+    """The file of a name that ``write`` leaves in a folder."""
+
+    def content():
+        with tempfile.TemporaryDirectory() as folder:
+            write(Path(folder))
+            return next(Path(folder).rglob(name)).read_bytes()
+
+    return content
+
+
+def run(folder: Path) -> Run[Config]:
+    """A run with a state and a number."""
+    begun = open_run("hostile", Config(out=folder / "run", device="cpu"))
+    begun.save_state(
+        {"x": torch.arange(3.0), "g": torch.Generator().get_state()}, {"step": 3, "rows": {"a": [1.0]}}
+    )
+    begun.record(loss=0.5)
+    return begun
+
+
+def resumed(path: Path):
+    """The run beside a file that was changed: its configuration, state and numbers."""
+    if path.name != "config.json" and not (path.parent / "config.json").exists():
+        (path.parent / "config.json").write_bytes(made("config.json", run)())
+    again = open_run("hostile", Config(resume=path.parent, device="cpu"))
+    state = again.load_state()
+    return [again.config.limit, again.config.sizes, again.metrics, state.tensors if state else None]
+
+
+class Learner:
+    """Stands in for a training's."""
+
+    def state_dict(self):
+        return {"w": torch.ones(2)}
+
+    def load_state_dict(self, tensors, path):
+        pass
+
+
+def training(folder: Path):
+    """A checkpoint of three steps."""
+    checkpoint.save(folder, Learner(), Progress(3, 1.0, 2.0, 0.5, 0, 0, [1.0], [1.0], [0.1]), {"seed": 0})  # type: ignore[arg-type]
+
+
+def trained(path: Path):
+    """The numbers of a checkpoint whose tensors are whole."""
+    if not list(path.parent.glob("*.safetensors")):
+        content = path.read_bytes()
+        training(path.parent)
+        path.write_bytes(content)
+    return checkpoint.load(path.parent, Learner(), {"seed": 0})  # type: ignore[arg-type]
+
+
+def hand_over(folder: Path):
+    """A mount with a thin lens and a sensor."""
+    mount = place.Mount((0.2, 0.0, 0.4), (0.1, 0.0, 0.2), yaw_rad=0.3)
+    camera = render.Camera(lens.ThinLens(8.0, 2.0).focus_at(1.3), 32, 24, 0.1, 4, falloff=True)
+    save_hand_over(folder / "mount.yaml", HandOver(mount, camera, events.SensorModel(), notes={"by": "me"}))
+
+
+def handed(path: Path):
+    """What has a meaning of a hand-over."""
+    found = load_hand_over(path)
+    names = [found.parent_frame, found.child_frame]
+    assert all(isinstance(name, str) for name in names)
+    assert isinstance(found.camera.falloff, bool)
+    return [found.mount(), found.camera.film.pixel_pitch_mm, found.sensor]
+
+
+SEEDS: dict[str, Seed] = {
+    "config.json": (made("config.json", run), resumed),
+    "state.npz": (made("state.npz", run), resumed),
+    "metrics.json": (made("metrics.json", run), resumed),
+    "checkpoint.json": (made("checkpoint.json", training), trained),
+    "generator.npz": (made("g.npz", lambda folder: SpikeEsim().save(folder / "g.npz")), SpikeEsim.load),
+    "mount.yaml": (made("mount.yaml", hand_over), handed),
+    "page.yaml": (
+        lambda: plain_yaml.dump({"a": {"b": [0.1, 2, "x"], "c": None}, "d": True}).encode(),
+        lambda path: plain_yaml.load(read_text(path)),
+    ),
+    "page.json": (lambda: json.dumps({"a": [1, {"b": None}]}).encode(), read_json),
+    "lens.json": (
+        made("l.json", lambda folder: lens.save(lens.load("la1509"), folder / "l.json")),
+        lens.load,
+    ),
+    "lens.zmx": (made("l.zmx", lambda folder: lens.save(lens.load("la1509"), folder / "l.zmx")), lens.load),
+    "lens.seq": (SEQ.encode, lens.load),
+    "lens.txt": (TABLE.encode, lens.load),
+}
