@@ -51,12 +51,17 @@ def run(folder: Path) -> Run[Config]:
 
 
 def resumed(path: Path):
-    """The run beside a file that was changed: its configuration, state and numbers."""
+    """The run beside a file that was changed: its configuration, numbers, and what its state names."""
     if path.name != "config.json" and not (path.parent / "config.json").exists():
         (path.parent / "config.json").write_bytes(made("config.json", run)())
     again = open_run("hostile", Config(resume=path.parent, device="cpu"))
     state = again.load_state()
-    return [again.config.limit, again.config.sizes, again.metrics, state.tensors if state else None]
+    return [
+        again.config.limit,
+        again.config.sizes,
+        again.metrics,
+        sorted(state.tensors) if state else None,
+    ]  # a state may hold an infinite best
 
 
 class Learner:
