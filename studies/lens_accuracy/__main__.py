@@ -108,6 +108,8 @@ def default_folder():
 
 def read_page(path):
     """A reference file as a dictionary. Raises: FileFormatError when it is missing or not such a file."""
+    if not Path(path).is_file():
+        raise FileFormatError(f"no lens references lie at {path}; name their folder with --references.")
     page = read_json(path)
     with reading(path, "name a folder of lens references with --references"):
         missing = {"wavelengths_um", "rays", "spots", "first_order", "ray_parameter_gradients_d"} - set(page)

@@ -25,9 +25,9 @@ def undrawn(monkeypatch):
 @pytest.mark.parametrize(
     ("damage", "sentence"),
     [
-        (lambda folder: (folder / "checkpoint.json").write_text("{"), "is damaged"),
+        (lambda folder: (folder / "checkpoint.json").write_text("{"), "is no whole JSON file"),
         (lambda folder: next(folder.glob("*.safetensors")).write_bytes(b"short"), "is damaged"),
-        (lambda folder: next(folder.glob("*.safetensors")).unlink(), "does not exist"),
+        (lambda folder: next(folder.glob("*.safetensors")).unlink(), "no file lies at"),
         (lambda folder: edit(folder, version=9), "format version 9"),
         (lambda folder: edit(folder, network="refiner"), "written with network refiner, this run has linear"),
         (lambda folder: edit(folder, seed=5), "written with seed 5, this run has 0"),
@@ -65,7 +65,7 @@ def edit(folder, **changes):
         (["--batch", "0"], "--batch is 0; at least 1"),
         (["--warm-up", "1"], "warm-up 1.0"),
         (["--mixed-precision"], "--mixed-precision needs CUDA"),
-        (["--start", "nowhere.safetensors"], "'nowhere.safetensors' does not exist"),
+        (["--start", "nowhere.safetensors"], "no file lies at nowhere.safetensors"),
     ],
 )
 @pytest.mark.usefixtures("undrawn")
