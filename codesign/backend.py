@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from codesign.doors import explain
 from codesign.errors import BackendError, DomainError, GradientError
 from codesign.exclusive import exclusive
 
@@ -340,3 +341,6 @@ class NoSecondDerivative(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         raise GradientError(ctx.sentence)
+
+
+explain(globals())

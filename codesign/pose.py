@@ -9,6 +9,7 @@ import torch
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
+from codesign.doors import explain
 from codesign.errors import DomainError, ShapeError, check_finite
 
 # [..., T, 4, 4], or [4, 4] where one pose is asked for; numbers other than tensors are taken in float64
@@ -164,3 +165,6 @@ def check_poses(transform: Poses) -> Tensor:
             "matrices that act on column vectors."
         )
     return transform
+
+
+explain(globals())

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from codesign.arrays import read_npz
 from codesign.atomic import write_atomic
+from codesign.doors import explain
 from codesign.errors import ShapeError
 from codesign.reading import reading
 
@@ -61,3 +62,6 @@ def read_state(path: Path) -> State | None:
             {str(name): torch.from_numpy(stored[f"tensor_{index}"]) for index, name in enumerate(names)},
             numbers,
         )
+
+
+explain(globals())

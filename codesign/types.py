@@ -6,6 +6,8 @@ from typing import Protocol
 
 from torch import Tensor
 
+from codesign.doors import explain
+
 
 @dataclass(frozen=True)
 class Rays:
@@ -114,3 +116,6 @@ class ChiefRayCamera(Protocol):
     def chief_rays(self, pixels: Tensor, /) -> Rays:
         """Rays through the pupil's centre for pixel coordinates [N, 2]: Rays, float64."""
         ...
+
+
+explain(globals())

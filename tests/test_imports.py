@@ -10,6 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     {"errors"},
+    {"doors"},
     {"types", "optional", "reading", "exclusive"},
     {"pose", "arrays", "backend", "atomic", "plain_yaml", "interrupt", "grad"},
     {"state"},

@@ -16,6 +16,7 @@ PRIVATE = {
     "__main__",
     "atomic",
     "doctor",
+    "doors",
     "interrupt",
     "optional",
     "plain_yaml",

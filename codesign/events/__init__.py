@@ -5,6 +5,7 @@ Hard: ``simulate`` (sensor), ``naive`` (frame difference). Differentiable: ``mem
 ``sensor_counts``, ``srm``; ``layer(name)`` makes a module of any of them, with learnable sensor values.
 """
 
+from codesign.doors import explain
 from codesign.events.files import read, write
 from codesign.events.formats.aedat4_frames import RecordedFrames, read_frames
 from codesign.events.intensity import lin_log
@@ -109,3 +110,5 @@ __all__ = [
     "write",
     "write_video",
 ]
+
+explain(globals())

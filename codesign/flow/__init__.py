@@ -1,6 +1,7 @@
 """Event flow: the closed form, the refiner and the networks it is compared with, losses, error measures,
 network files, flow files, sources of windows, and flow along a stream of events."""
 
+from codesign.doors import explain
 from codesign.flow import contrast, losses, metrics, sources
 from codesign.flow.baselines import ECN, FlowNetEvents, IDNet, SpikeFlowNet
 from codesign.flow.checkpoint import load, save
@@ -31,3 +32,5 @@ __all__ = [
     "sources",
     "write_flow",
 ]
+
+explain(globals())

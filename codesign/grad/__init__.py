@@ -1,9 +1,12 @@
 """Certificates of gradients: autograd against differences with common random numbers; and other ways to a gradient where
 they fail."""
 
+from codesign.doors import explain
 from codesign.grad.certify import certify, worst
 from codesign.grad.differences import Difference, central, plateau
 from codesign.grad.fallback import Choice, choose, gradient
 from codesign.grad.row import Row
 
 __all__ = ["Choice", "Difference", "Row", "central", "certify", "choose", "gradient", "plateau", "worst"]
+
+explain(globals())

@@ -1,5 +1,6 @@
 """Differentiable lenses: ray-traced (GeoLens), thin, and pinhole."""
 
+from codesign.doors import explain
 from codesign.lens import analysis, catalogue, design
 from codesign.lens.aiming import aimed_rays
 from codesign.lens.analysis import pupil_grid, rms_spot_mm, spots
@@ -39,3 +40,5 @@ __all__ = [
     "spots",
     "sum_over_chunks",
 ]
+
+explain(globals())

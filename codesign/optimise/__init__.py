@@ -1,5 +1,6 @@
 """Optimisers and the loop around them."""
 
+from codesign.doors import explain
 from codesign.optimise.adam import ScaledAdam
 from codesign.optimise.descent import Descent
 from codesign.optimise.gradients import SampleGradients, clipped_mean, sample_gradients
@@ -18,3 +19,5 @@ __all__ = [
     "clipped_mean",
     "sample_gradients",
 ]
+
+explain(globals())

@@ -1,6 +1,7 @@
 """Placement: a camera mount on a robot body, what it has to keep, and what the camera can tell from there about
 the body's motion."""
 
+from codesign.doors import explain
 from codesign.place.body import Body, Housing
 from codesign.place.criterion import Sight, expected_error, flow_precision, sight
 from codesign.place.mount import Mount, yaw_pitch_roll_rad
@@ -35,3 +36,5 @@ __all__ = [
     "velocity_from_flow",
     "yaw_pitch_roll_rad",
 ]
+
+explain(globals())

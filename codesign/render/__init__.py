@@ -1,5 +1,6 @@
 """Cameras, scenes and frames: one wavefront for all frames, ground truth through the current lens."""
 
+from codesign.doors import explain
 from codesign.render import sequence, truth
 from codesign.render.camera import Camera, angular_miss_rad, project
 from codesign.render.check import check_view
@@ -63,3 +64,5 @@ __all__ = [
     "truth_of_frames",
     "view",
 ]
+
+explain(globals())

@@ -1,5 +1,6 @@
 """One system of camera, mount, event layer and estimator, with a probe at every junction."""
 
+from codesign.doors import explain
 from codesign.system.batch import Batch
 from codesign.system.check import check
 from codesign.system.hand_over import HandOver, load_hand_over, save_hand_over
@@ -16,3 +17,5 @@ __all__ = [
     "load_hand_over",
     "save_hand_over",
 ]
+
+explain(globals())

@@ -1,6 +1,7 @@
 """What a body reads off event flow, as a stage of a system: its velocity, and the errors by which a design is
 judged."""
 
+from codesign.doors import explain
 from codesign.task.depth import ground_depth, scene_depth
 from codesign.task.ego_velocity import EgoVelocity, Motion, Readings
 from codesign.task.evidence import Evidence
@@ -35,3 +36,5 @@ __all__ = [
     "sight_units",
     "velocity_errors",
 ]
+
+explain(globals())

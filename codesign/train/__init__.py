@@ -1,5 +1,6 @@
 """Training: batches by step, the learner, the loop around it, several processes, validation."""
 
+from codesign.doors import explain
 from codesign.train.batches import Batches, Part, Source, Started
 from codesign.train.fit import fit
 from codesign.train.learner import Learner, adamw
@@ -29,3 +30,5 @@ __all__ = [
     "join",
     "score",
 ]
+
+explain(globals())

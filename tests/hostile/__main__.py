@@ -1,32 +1,57 @@
-"""``python -m tests.hostile fuzz`` reads mutants of every format."""
+"""Attacks from outside, and the figures of docs/safety.md.
+
+``python -m tests.hostile PART`` attacks one part and writes what was found into ``runs/hostile/metrics.json``, beside
+the figures of the other parts; exit code 1 where something was found.
+"""
 
 import argparse
+import importlib
 import json
 import sys
 from pathlib import Path
 
 from codesign.atomic import write_atomic
-from tests.hostile import fuzz
+
+# part: (what it does, how many it makes where --count is left out)
+PARTS = {
+    "fuzz": ("mutants of every file format", 10**9),
+    "calls": ("wrong calls into every public function, through the tests' own right ones", 20),
+    "kills": ("long studies killed at random, resumed and compared", 50),
+    "threads": ("rounds of thirty threads with gradients, beside serial work", 20),
+    "worlds": ("random worlds, three lenses each, gradients beside differences", 300),
+    "stages": ("stages of a System that are cut, wrapped or misshapen", 300),
+}
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m tests.hostile", description=__doc__)
-    commands = parser.add_subparsers(dest="command", required=True)
-    mutants = commands.add_parser("fuzz", help="mutants of every format")
-    mutants.add_argument("--minutes", type=float, default=10.0)
-    mutants.add_argument("--mutants", type=int, default=10**9, help="of every seed, at most")
-    mutants.add_argument("--format", default="", help="end of the names of seeds, such as .npz")
-    mutants.add_argument("--seed", type=int, default=0)
-    mutants.add_argument("--processes", type=int, default=2)
-    mutants.add_argument("--metrics", type=Path, help="file for the figures, flat name -> number")
-    chosen = parser.parse_args()
-    found = fuzz.fuzz(chosen.minutes, chosen.format, chosen.seed, chosen.processes, chosen.mutants)
-    figures = {f"mutants_{name}": read for name, (read, _) in found.items()}
-    figures |= {"mutants": sum(figures.values()), "findings": sum(len(each) for _, each in found.values())}
-    print(json.dumps(figures, indent=1))
-    if chosen.metrics:
-        write_atomic(chosen.metrics, json.dumps(figures, indent=1).encode())
-    return int(figures["findings"] > 0)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.hostile",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parts = parser.add_subparsers(dest="part", required=True)
+    for name, (words, count) in PARTS.items():
+        part = parts.add_parser(name, help=words)
+        part.add_argument("--count", type=int, default=count, help=f"how many (default {count})")
+        part.add_argument("--seed", type=int, default=0)
+        part.add_argument("--out", type=Path, default=Path("runs/hostile"), help="folder of metrics.json")
+        if name == "fuzz":
+            part.add_argument("--minutes", type=float, default=10.0)
+            part.add_argument("--format", default="", help="end of the names of seeds, such as .npz")
+            part.add_argument("--processes", type=int, default=2)
+        if name == "calls":
+            part.add_argument("paths", nargs="*", default=["tests"], help="tests whose calls are exchanged")
+    chosen = vars(parser.parse_args())
+    part, out = chosen.pop("part"), chosen.pop("out")
+    figures, findings = importlib.import_module(f"tests.hostile.{part}").measure(**chosen)
+    metrics = out / "metrics.json"
+    known = json.loads(metrics.read_text()) if metrics.exists() else {}
+    figures = {f"{part}_{name.removeprefix(part + '_')}": value for name, value in figures.items()}
+    figures[f"{part}_findings"] = len(findings)
+    out.mkdir(parents=True, exist_ok=True)
+    write_atomic(metrics, json.dumps(dict(sorted({**known, **figures}.items())), indent=1).encode())
+    print(*findings, json.dumps(figures, indent=1), f"written to {metrics}", sep="\n")
+    return int(bool(findings))
 
 
 if __name__ == "__main__":
