@@ -28,7 +28,7 @@ FAILS = (ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, Ty
 # what torch and NumPy say of tensors that do not fit
 UNFIT = re.compile(
     r"shape|size|dimension|dtype|device|broadcast|meta|layout|sparse|complex|scalar|one element|out of range|index"
-    r"|must match|assignment failed|division|cannot be converted|overflow|invalid combination|Long|Half|Double|Float|must be|expected|negative|NaN|infinit|not implemented for",
+    r"|must match|assignment failed|0-d tensor|null byte|linalg|division|cannot be converted|overflow|invalid combination|Long|Half|Double|Float|must be|expected|negative|NaN|infinit|not implemented for",
     re.IGNORECASE,
 )
 KINDS: dict[
@@ -121,7 +121,9 @@ def _sentence(function, name, args, kwargs, error):
         if isinstance(value, numbers.Real) and not math.isfinite(value):
             return DomainError(f"{name}: {argument} = {value}, but a finite number is needed.")
     for argument, value in given.items():
-        if isinstance(error, (AttributeError, TypeError)) and f"'{type(value).__name__}' object" in said:
+        parts = value if isinstance(value, (list, tuple)) else ()
+        blamed = {f"'{type(each).__name__}' object" for each in (value, *parts)}
+        if isinstance(error, (AttributeError, TypeError)) and any(words in said for words in blamed):
             return DomainError(f"{name}: {argument} = {shown(value)} does not fit ({said}).")
         if isinstance(error, KeyError) and error.args[0] is value:
             return DomainError(f"{name}: {argument} = {shown(value)} is not known.")

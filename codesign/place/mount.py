@@ -19,6 +19,7 @@ from codesign.pose import se3_exp
 from codesign.types import ChiefRayCamera
 
 UPRIGHT = 1e-12  # sine of the angle to the vertical below which the view has no direction over ground
+NEAREST_M = 1e-6  # of what moves in the image
 MOST_PIXELS = 255  # of a film, spread over it, at which the motion of the image is measured
 AXES_BODY_CAM = torch.tensor(
     [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64
@@ -163,11 +164,11 @@ class Mount(nn.Module):
             )
         at = torch.linspace(0, pixels.shape[0] - 1, min(MOST_PIXELS, pixels.shape[0])).round().long()
         depth = depth.expand(pixels.shape[0])[at]
-        seen = depth.isfinite() & (depth > 0) & (camera.chief_rays(pixels[at]).weight > 0)
+        seen = depth.isfinite() & (depth > NEAREST_M) & (camera.chief_rays(pixels[at]).weight > 0)
         if not bool(seen.any()):
             raise DomainError(
                 "mount: no pixel sees a surface in front of the camera, so no step moves the image; give depths "
-                "> 0 in metres."
+                f"> {NEAREST_M:g} m."
             )
         pixels = pixels[at][seen]
         depth = depth[seen][:, None]
