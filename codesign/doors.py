@@ -28,7 +28,7 @@ FAILS = (ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, Ty
 # what torch and NumPy say of tensors that do not fit
 UNFIT = re.compile(
     r"shape|size|dimension|dtype|device|broadcast|meta|layout|sparse|complex|scalar|one element|out of range|index"
-    r"|must match|assignment failed|0-d tensor|null byte|linalg|division|cannot be converted|overflow|invalid combination|Long|Half|Double|Float|must be|expected|negative|NaN|infinit|not implemented for",
+    r"|must match|assignment failed|0-d tensor|determinant|null byte|linalg|division|cannot be converted|overflow|invalid combination|Long|Half|Double|Float|must be|expected|negative|NaN|infinit|not implemented for",
     re.IGNORECASE,
 )
 KINDS: dict[

@@ -54,8 +54,6 @@ GROUPS = {
     "whole chain": (
         "lens_opt",
         "lens_opt_seeds",
-        "flow_needs",
-        "combinations",
         "joint_design",
         "placement",
         "placement_objectives",

@@ -18,7 +18,6 @@ from codesign.errors import DomainError, NonFiniteError
 from codesign.flow import checkpoint
 from codesign.lens.design import edge_thickness_mm
 from codesign.system import check
-from studies.frame.config import configured
 from studies.frame.run import Run, StudyConfig, main
 from studies.lens_opt import page as lens_opt_page
 from studies.lens_opt import rivals
@@ -26,7 +25,6 @@ from studies.lens_opt.comparison import label
 from studies.lens_opt.descend import JUDGED, Job, development_error, prepare
 from studies.lens_opt.paired import paired
 from studies.lens_opt.task import HELD_OUT, LIGHT, draw_case, make_worlds
-from studies.lens_trade import __main__ as lens_trade
 
 
 @dataclass(frozen=True)
@@ -41,8 +39,6 @@ class Config(StudyConfig):
         "spot_steps": 8,
         "spot_starts": 1,
     }
-    trade: bool = False
-    """Instead: five trades against the best spot designer, a long sweep; as python -m studies.lens_trade."""
     lens: str = "cooke-triplet"
     """Lens to start from: cooke-triplet, double-gauss, la1509, or a lens .json file."""
     objective: Literal["flow", "edge"] = "flow"
@@ -121,8 +117,6 @@ class Course:
 
 def study(run: Run[Config]):
     config = run.config
-    if config.trade:
-        return lens_trade.trade(run, configured(lens_trade.Config, config.quick, seed=config.seed))
     _check(config)
     job = prepare(config)
     course = Course(run)
