@@ -86,20 +86,6 @@ def test_plateau_of_a_cubic():
     assert found.noise == pytest.approx((1e-4 - 1e-6) / 2, rel=1e-6)
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-@pytest.mark.parametrize(
-    "name", ["three logarithms", "logarithms 12x12", "logsumexp 12x12", "squares 64x64", "contrast 64x64"]
-)
-def test_right_gradients_pass_and_wrong_ones_fail_at_any_size(name, dtype):
-    assert {judged(name, dtype, seed, None).verdict for seed in range(40)} == {"pass"}
-    assert {judged(name, dtype, 100 + seed, KINDS[seed % 4]).verdict for seed in range(40)} == {"fail"}
-
-
-def test_a_thousand_numbers_in_single_precision():
-    assert judged("thousand logarithms", "float32", 0, None).verdict == "pass"
-    assert [judged("thousand logarithms", "float32", 1, kind).verdict for kind in KINDS] == ["fail"] * 4
-
-
 def test_the_weights_of_a_network_with_kinks():
     assert {judged("weights of a network", "float32", seed, None).verdict for seed in range(3)} == {"pass"}
     assert [judged("weights of a network", "float32", 1, kind).verdict for kind in KINDS] == ["fail"] * 4
@@ -120,24 +106,6 @@ def test_a_small_signal_on_a_large_constant_is_noise_and_never_judged_wrongly():
     assert all(
         row.length_bias == pytest.approx(0.3, abs=0.06) for row in decided if row.length_bias is not None
     )
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_the_noise_floor_is_the_size_of_the_error(seed):
-    # single precision against the derivative in closed form, d/dx log(x+1)^2 = 2 log(x+1) / (x+1): the
-    # squared error of 4 independent normal numbers exceeds 4 x 3^2 of their variance once in 3 million times
-    generator = torch.Generator().manual_seed(seed)
-    x = torch.rand(64, 64, generator=generator)
-    (row,) = certify(lambda p: (p["x"] + 1).log().square().sum(), {"x": x}, directions=4, generator=generator)
-    generator = torch.Generator().manual_seed(seed)
-    torch.rand(64, 64, generator=generator)
-    torch.randn(64, 64, generator=generator, dtype=D)  # the line on which rounding is measured
-    lines = torch.randn(4, 64, 64, generator=generator, dtype=D)
-    lines /= lines.flatten(1).norm(dim=1)[:, None, None]
-    truth = (lines.float().double() * 2 * (x.double() + 1).log() / (x.double() + 1)).sum((1, 2))
-    found = torch.tensor(row.difference, dtype=D)
-    assert float((found - truth).norm() / found.norm()) <= 3 * row.noise_floor
-    assert row.noise_floor < 0.01
 
 
 @pytest.mark.parametrize("directions", [None, 4])
@@ -197,17 +165,6 @@ def test_steps_out_of_the_domain_are_left_out_and_named():
     assert row.verdict == "pass"
     with pytest.raises(NonFiniteError, match="at any step"):
         certify(lambda p: p["x"].sqrt().sum(), {"x": torch.full((2,), 5e-3, dtype=D)}, ladder=(0.1, 0.05))
-
-
-def test_groups_of_two_precisions_in_one_function():
-    params = {"lens": torch.rand(3, dtype=D) + 1, "image": torch.rand(12, 12)}
-    rows = certify(
-        lambda p: (p["image"] * p["lens"].prod().float()).square().sum(),
-        params,
-        scales={"lens": torch.full((3,), 0.1, dtype=D), "image": torch.tensor(0.5, dtype=D)},
-        directions=4,
-    )
-    assert [row.verdict for row in rows] == ["pass", "pass"]
 
 
 def test_directions_are_the_same_at_every_call():
