@@ -127,6 +127,14 @@ def test_random_combinations_of_them():
     assert figures["stages_named"] == figures["stages_right_passed"] == 12, findings
 
 
+def test_a_silent_network_runs_no_more_often_for_more_weights():
+    net, calls = s.zeroed(s.Convolution()), []
+    net.register_forward_hook(lambda *_: calls.append(1))
+    s.checked(flow=net)
+    # the pass, one beside, its input moved and not, its weights moved and not
+    assert len(calls) <= 6
+
+
 def brighter(mount, rays, T_world_cam):
     return mount()[0, 0].float() * s.picture()(rays, T_world_cam)
 

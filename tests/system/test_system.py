@@ -151,13 +151,6 @@ def test_recorded_junctions_replace_what_is_before_them(name, value, loss):
     assert toy(render=never)(BATCH, recorded={name: value}).loss.item() == pytest.approx(loss)
 
 
-def test_unknown_recorded_junction_is_refused():
-    with pytest.raises(
-        DomainError, match=r"\['lenses'\] cannot be replaced; rays, frames, events, flow, estimate can"
-    ):
-        toy()(BATCH, recorded={"lenses": None})
-
-
 def test_a_bad_value_is_named_by_its_junction():
     with pytest.raises(NonFiniteError, match="junction 'frames'"):
         toy(render=lambda rays: render_sum(rays) / 0)(BATCH, probe=True)
@@ -278,7 +271,7 @@ def test_windows_of_a_film_become_samples():
     assert seen[0].tolist() == [[0, 10], [1, 11], [2, 12], [100, 110], [101, 111], [102, 112]]
 
 
-def test_check_finds_a_frozen_variable_one_that_no_objective_sees_and_a_cut_graph():
+def test_check_finds_a_frozen_variable_and_one_that_no_objective_sees():
     system = toy()
     lens = system.lens
     assert check(system, BATCH, torch.optim.SGD([lens.efl_mm], lr=0.1)).loss.item() == pytest.approx(9.0)
@@ -287,11 +280,6 @@ def test_check_finds_a_frozen_variable_one_that_no_objective_sees_and_a_cut_grap
         GradientError, match=r"no objective \(square\) depends on variable 1 \(no parameter of the system"
     ):
         check(system, BATCH, [lens.efl_mm, stray])
-    with pytest.raises(
-        GradientError,
-        match="cannot see what lies before junction 'events'",
-    ):
-        check(system.replaced(events=lambda frames: doubled(frames.detach())), BATCH, [lens.efl_mm])
     lens.efl_mm.requires_grad_(False)
     with pytest.raises(
         GradientError, match=r"variable 'lens.efl_mm' is frozen but was handed to the optimiser"
@@ -318,10 +306,6 @@ def test_parts_can_be_exchanged_in_place_and_are_looked_at():
     assert system(BATCH).loss.item() == pytest.approx(9.0)
     system.camera = ToyCamera(Glass(2.0))
     assert system(BATCH).loss.item() == pytest.approx(36.0)
-    with pytest.raises(DomainError, match="stage 'flow' asks for 'gain'"):
-        system.flow = lambda volume, gain: volume
-    with pytest.raises(DomainError, match="is the class Linear; give an instance"):
-        system.flow = nn.Linear
     with pytest.raises(DomainError, match="no part 'event', did you mean 'events'"):
         system.replaced(event=doubled)
 
@@ -336,13 +320,9 @@ def test_objectives_are_scalar_tensors():
         toy(objectives={"task": lambda estimate: estimate})
 
 
-def test_check_finds_nan_a_flow_that_passes_no_gradient_and_a_lens_computed_once():
+def test_check_finds_nan_zero_gradients_and_a_lens_computed_once():
     with pytest.raises(NonFiniteError, match="objective 'nan' is nan"):
         check(toy(objectives={"nan": lambda field: field.flow_px.sum() * math.nan}), BATCH)
-    system = toy(flow=torch.no_grad()(tripled))
-    through_truth = {"error": lambda field, camera: field.flow_px.sum() + camera.lens.efl_mm}
-    with pytest.raises(GradientError, match="cannot see what lies before junction 'flow'"):
-        check(system.replaced(objectives=through_truth), BATCH, [system.lens.efl_mm])
     with pytest.raises(GradientError, match="exactly 0 for every variable"):
         check(toy(flow=lambda volume: field_of(0 * volume.counts[:, :1, 0])), BATCH)
     once = toy()
