@@ -1,9 +1,7 @@
 """The certificate itself: it must pass right gradients and fail wrong ones, by amounts that are known."""
 
-import doctest
 import json
 import math
-import sys
 from pathlib import Path
 
 import pytest
@@ -20,20 +18,6 @@ from studies.frame.run import main
 D = torch.float64
 
 
-class Scaled(torch.autograd.Function):
-    """sin(x) whose gradient is wrong by a known factor."""
-
-    @staticmethod
-    def forward(ctx, x, factor):
-        ctx.save_for_backward(x)
-        ctx.factor = factor
-        return x.sin()
-
-    @staticmethod
-    def backward(ctx, *grads):
-        return grads[0] * ctx.saved_tensors[0].cos() * ctx.factor, None
-
-
 def test_right_gradient_passes_with_the_plateau_between_bending_and_rounding():
     (row,) = certify(lambda p: p["x"].sin().sum(), {"x": torch.linspace(0.1, 1, 5, dtype=D)}, tolerance=1e-8)
     # central differences of sin: h^2/6 of bending and 1e-16/h of rounding meet near h = 1e-5, at about 1e-11
@@ -45,7 +29,11 @@ def test_right_gradient_passes_with_the_plateau_between_bending_and_rounding():
 
 @pytest.mark.parametrize("factor", [0.9, 1.25, -1.0])
 def test_wrong_scale_is_seen_as_bias_of_that_size(factor):
-    (row,) = certify(lambda p: Scaled.apply(p["x"], factor).sum(), {"x": torch.linspace(0.1, 1, 5, dtype=D)})  # pyright: ignore[reportOptionalMemberAccess]
+    def sines(p):
+        x = p["x"]
+        return (x.sin() + (factor - 1) * x.detach().cos() * (x - x.detach())).sum()
+
+    (row,) = certify(sines, {"x": torch.linspace(0.1, 1, 5, dtype=D)})
     assert row.verdict == "fail"
     assert row.signed_bias == pytest.approx(factor - 1, abs=1e-6)
     assert row.relative_error == pytest.approx(abs(factor - 1), abs=1e-6)
@@ -56,24 +44,6 @@ def test_scales_set_the_unit_of_every_number():
     (row,) = certify(lambda p: (2 * p["x"]).sum(), {"x": torch.zeros(1, dtype=D)}, scales={"x": 0.25})
     assert row.autograd == pytest.approx((0.5,))
     assert row.difference == pytest.approx((0.5,))
-
-
-def test_noise_is_told_from_error():
-    # A loss rounded to 1e-3 has differences good to about 1e-3 / h: on this ladder they cannot judge a
-    # gradient of 1
-    def noisy(p):
-        return torch.round(p["x"].sum() * 1e3) / 1e3 + (p["x"].sum() - p["x"].sum().detach())
-
-    (row,) = certify(
-        noisy, {"x": torch.full((3,), 0.12345, dtype=D)}, ladder=(3e-3, 2e-3, 1.3e-3), tolerance=1e-6
-    )
-    assert row.verdict in ("noise", "pass")
-    assert row.relative_error < 0.5
-
-
-def test_cut_graph_is_refused():
-    with pytest.raises(GradientError, match="does not depend on 'y'"):
-        certify(lambda p: p["x"].sum(), {"x": torch.ones(2, dtype=D), "y": torch.ones(1, dtype=D)})
 
 
 def test_plateau_of_a_cubic():
@@ -193,6 +163,7 @@ X = {"x": torch.ones(2, dtype=D)}
         (lambda p: p["x"], X, {}, GradientError, r"got shape \(2,\)"),
         (lambda p: p["x"].detach().sum(), X, {}, GradientError, "without a graph"),
         (lambda p: 1.0, X, {}, GradientError, "returned a float"),
+        (lambda p: p["x"].sum(), X | {"y": torch.ones(1)}, {}, GradientError, "does not depend on 'y'"),
         (lambda p: p["x"].log().sum(), {"x": -torch.ones(2)}, {}, NonFiniteError, "gradient|loss"),
         (
             lambda p: p["x"].sqrt().sum(),
@@ -218,11 +189,6 @@ X = {"x": torch.ones(2, dtype=D)}
 def test_bad_input_is_refused_in_one_sentence(fn, params, options, error, words):
     with pytest.raises(error, match=words):
         certify(fn, params, **options)
-
-
-def test_the_example_runs():
-    assert doctest.testmod(sys.modules[certify.__module__]).failed == 0
-    assert doctest.testmod(sys.modules[certify.__module__]).attempted >= 3
 
 
 def test_the_stages_of_the_page_are_certified():
@@ -288,21 +254,6 @@ def test_rungs_that_agree_by_accident_are_contradicted_by_smaller_ones():
 def test_the_verdict_is_a_statement_at_three_noise_floors(gap, noise, tolerance, expected):
     assert verdict(gap, 1.0, noise, tolerance) == expected
     assert verdict(10 * gap, 10.0, 10 * noise, tolerance) == expected
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_rounding_inside_a_double_precision_loss_is_noticed(seed):
-    # the sum is in single precision, where 1000 has 6e-5 per last digit: steps of 0.03 and 0.01 know a
-    # gradient of about 1 to 1e-3, not to the 1e-5 asked for
-    x = torch.rand(3, generator=torch.Generator().manual_seed(seed), dtype=D)
-    (row,) = certify(
-        lambda p: (1e3 + p["x"].square().sum().float()).double(),
-        {"x": x},
-        ladder=(0.03, 0.01),
-        tolerance=1e-5,
-    )
-    assert row.verdict == "noise"
-    assert row.relative_error <= 3 * row.noise_floor
 
 
 def test_larger_steps_that_the_function_refuses_are_left_out():

@@ -27,67 +27,32 @@ class Draw:
     def uniform(self, *shape):
         return torch.rand(shape or (self.numbers,), generator=self.generator, dtype=D)
 
-    def decades(self, low, high, *shape):
-        return low * (high / low) ** self.uniform(*(shape or (1,)))
+    def decades(self, low, high):
+        return (low * (high / low) ** self.uniform(1)).item()
 
 
 def waves(low, high):
     def draw(of):
         rate, phase = of.decades(low, high), 6 * of.uniform()
-        return of.uniform(), lambda x: (rate.to(x) * x + phase.to(x)).sin().sum() / rate.item()
+        return of.uniform(), lambda x: (rate * x + phase.to(x)).sin().sum() / rate
 
     return draw
 
 
 def several_scales(of):
-    rates = [of.decades(1, 30).item(), of.decades(30, 1e3).item(), of.decades(1e3, 3e4).item()]
-    shares = of.decades(0.1, 1, 3).tolist()
-    weight = of.uniform() + 0.2
-
-    def fn(x):
-        return sum(s / r * (weight.to(x) * (r * x).sin()).sum() for s, r in zip(shares, rates, strict=True))
-
-    return of.uniform(), fn
-
-
-def exponentials(of):
-    rate = of.decades(0.1, 10).item()
-    return 2 * of.uniform() - 1, lambda x: (rate * x).exp().mean()
-
-
-def logarithms(of):
-    return of.decades(0.1, 300) * of.uniform(), lambda x: (x + 1).log().square().mean()
-
-
-def rational(of):
-    width = of.decades(0.02, 1).item()
-    return 2 * of.uniform() - 1, lambda x: (1 / (width + x.square())).mean()
-
-
-def powers(of):
-    power = of.decades(0.2, 3).item()
-    return of.decades(1e-3, 1e3, of.numbers), lambda x: x.pow(power).mean()
-
-
-def small_on_an_offset(of):
-    offset, size = of.decades(1, 1e4).item(), of.decades(1e-4, 1).item()
-    return of.uniform(), lambda x: offset + size * (3 * x).sin().sum()
+    waves = [(of.decades(*rates), of.decades(0.1, 1)) for rates in ((1, 30), (30, 1e3), (1e3, 3e4))]
+    return of.uniform(), lambda x: sum(share / rate * (rate * x).sin().sum() for rate, share in waves)
 
 
 def kinks(of):
-    x = of.uniform()
-    at = x + of.decades(1e-3, 1, of.numbers) * (of.uniform() - 0.5).sign()
-    height = of.uniform()
+    x, height = of.uniform(), of.uniform()
+    at = x + 1000 ** (of.uniform() - 1) * (of.uniform() - 0.5).sign()
     return x, lambda x: ((x - at.to(x)).abs() * height.to(x) + x.sin()).sum()
 
 
 def single_inside(of):
-    offset = of.decades(1, 1e3).item()
-
-    def fn(x):
-        return (offset + (3 * x.float()).sin().sum()).to(x) + 0.3 * x.square().sum()
-
-    return of.uniform(), fn
+    offset = of.decades(1, 1e3)
+    return of.uniform(), lambda x: (offset + (3 * x.float()).sin().sum()).to(x) + 0.3 * x.square().sum()
 
 
 def coupled(of):
@@ -95,16 +60,28 @@ def coupled(of):
     return of.uniform(), lambda x: (2 * matrix.to(x) @ x).tanh().square().mean()
 
 
+def with_a_number(low, high, fn, at=Draw.uniform):
+    def draw(of):
+        number = of.decades(low, high)
+        return at(of), lambda x: fn(x, number)
+
+    return draw
+
+
 FAMILIES = {
     "slow waves": waves(0.1, 100),
     "fast waves": waves(100, 3e4),
     "faster than the ladder": waves(3e4, 1e6),
     "several scales": several_scales,
-    "exponentials": exponentials,
-    "logarithms": logarithms,
-    "rational": rational,
-    "powers": powers,
-    "small on an offset": small_on_an_offset,
+    "exponentials": with_a_number(0.1, 10, lambda x, rate: (rate * x).exp().mean()),
+    "logarithms": with_a_number(
+        1, 1, lambda x, _: (x + 1).log().square().mean(), lambda of: of.decades(0.1, 300) * of.uniform()
+    ),
+    "rational": with_a_number(0.02, 1, lambda x, width: (1 / (width + x.square())).mean()),
+    "powers": with_a_number(
+        0.2, 3, lambda x, power: x.pow(power).mean(), lambda of: 1e6 ** of.uniform() / 1e3
+    ),
+    "small on an offset": with_a_number(1, 1e4, lambda x, offset: offset + (3 * x).sin().mean()),
     "kinks": kinks,
     "single precision inside": single_inside,
     "coupled": coupled,
@@ -116,10 +93,6 @@ def grad_of(fn, x):
     return torch.autograd.grad(fn(x), x)[0]
 
 
-def without_its_largest(grad, fn, x, of):
-    return torch.where(grad.abs() == grad.abs().max(), 0.0, grad)
-
-
 def of_the_smoothed(grad, fn, x, of):
     near = [x * (0.8 + 0.4 * of.uniform()).to(x) for _ in range(8)]
     return torch.stack([grad_of(fn, each) for each in near]).mean(0)
@@ -129,7 +102,7 @@ WRONG = (
     lambda grad, *_: -grad,
     lambda grad, *_: 1.05 * grad,
     lambda grad, *_: 1.02 * grad,
-    without_its_largest,
+    lambda grad, *_: torch.where(grad.abs() == grad.abs().max(), 0.0, grad),
     of_the_smoothed,
 )
 

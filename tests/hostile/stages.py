@@ -72,13 +72,13 @@ class Camera:
 class Stage(nn.Module):
     """What it gets, changed, through a function and a gain of its own, changed."""
 
-    def __init__(self, core, before=same, after=same, own=True, gain=same):
+    def __init__(self, core, before=same, own=True, gain=same):
         super().__init__()
         self.gain = nn.Parameter(torch.ones(())) if own else 1.0
-        self.core, self.before, self.after, self.change = core, before, after, gain
+        self.core, self.before, self.change = core, before, gain
 
     def forward(self, given, t_s):
-        return self.after(self.core(self.before(given), self.change(self.gain)))
+        return self.core(self.before(given), self.change(self.gain))
 
     def method(self, given):
         return self(given, T_S)
@@ -225,21 +225,15 @@ HIDDEN_AT = {
     part: lambda hide, part=part, make=make: ("does not see", {part: hide(make().method)})
     for part, make in (("events", layer), ("flow", network), ("estimate", speed))
 }
-PRODUCTS = (
-    (CUTS, CUT_AT),
-    (CUTS | HARD, THROUGH),
-    (SHAPES, SHAPED_AT),
-    (IN_PLACE, TOUCHED_AT),
-    (HIDINGS, HIDDEN_AT),
-)
+PRODUCTS = ((CUTS, CUT_AT), (CUTS | HARD, THROUGH), (SHAPES, SHAPED_AT), (IN_PLACE, TOUCHED_AT))
+RIGHT = ("an axis more at frames", "an axis more at mount", "turned at valid")  # axes before, a square film
 BAD = {
     f"{how} at {place}": spoil(change)
-    for ways, places in PRODUCTS
+    for ways, places in (*PRODUCTS, (HIDINGS, HIDDEN_AT))
     for how, change in ways.items()
     for place, spoil in places.items()
+    if f"{how} at {place}" not in RIGHT
 }
-for name in ("an axis more at frames", "an axis more at mount", "turned at valid"):
-    del BAD[name]  # these are right: any axes may come first, and the film is square
 
 
 class Convolution(nn.Sequential):
@@ -297,9 +291,7 @@ GOOD = {
     "said to cut": of(flow=network(before=torch.Tensor.detach), may_cut=("flow",)),
     "no mount": of(mount=None),
     "a mount per drive": of(mount=held(lambda T: T.expand(2, 4, 4))),
-    "rays without variables": of(
-        camera=Camera(glass().requires_grad_(False)), render=picture(rays=torch.Tensor.detach)
-    ),
+    "a lens without variables": of(camera=Camera(glass().requires_grad_(False))),
     "dim frames": of(render=picture(after=lambda f: f / 100)),
     "hard counts with gradients": of(events=events.layer("memory", HARD_SENSOR.sensor), render=picture()),
 }

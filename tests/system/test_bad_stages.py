@@ -12,12 +12,13 @@ from codesign.errors import CodesignError
 from codesign.system import Batch
 from codesign.types import FlowField
 from tests.hostile import stages as s
+from tests.hostile.stages import BATCH, SIDE, T_S, counted, field_of, flow_of, glass, held, moved, of
 
 
 def truth(px, valid=True):
     seen = {"error": lambda field, truth: (field.flow_px - truth.flow_px.detach()).square().mean()}
-    known = torch.ones(len(px), s.SIDE, s.SIDE, dtype=torch.bool) if valid else px[:, 0]
-    return s.of(objectives=seen, batch=replace(s.BATCH, truth=FlowField(px, known, 0.02)))
+    known = torch.ones(len(px), SIDE, SIDE, dtype=torch.bool) if valid else px[:, 0]
+    return of(objectives=seen, batch=replace(BATCH, truth=FlowField(px, known, 0.02)))
 
 
 def placed(frames, t_s, /):
@@ -29,83 +30,65 @@ def helper(volume):
 
 
 NET, GAIN = s.Convolution(), nn.Parameter(torch.ones(()))
-PX = torch.ones(2, 2, s.SIDE, s.SIDE)
-HALF = (..., slice(None, None, 2), slice(None, None, 2))
+PX = torch.ones(2, 2, SIDE, SIDE)
 BAD = {
-    "hard sensor": ("events", s.of(events=s.HARD_SENSOR)),
+    "hard sensor": ("events", of(events=s.HARD_SENSOR)),
     "pose cut": (
         "flow.*T_world_cam",
-        s.of(flow=lambda v, T_world_cam: s.flow_of(v, T_world_cam.detach().mean())),
+        of(flow=lambda v, T_world_cam: flow_of(v, T_world_cam.detach().mean())),
     ),
     "objective cuts": (
         "'a'.*'estimate'",
-        s.of(objectives={"a": lambda estimate, field: s.error(estimate.detach()) + field.flow_px.mean()}),
+        of(objectives={"a": lambda estimate, field: s.error(estimate.detach()) + field.flow_px.mean()}),
     ),
-    "flow s.of one drive": ("'flow' holds 1", s.of(flow=lambda v: s.field_of(s.moved(v)[:1]))),
+    "flow of one drive": ("'flow' holds 1", of(flow=lambda v: field_of(moved(v)[:1]))),
     "flow [N, 2, 1, 1]": (
         "flow",
-        s.of(flow=lambda v: s.entry("flow_px", lambda t: t[..., :1, :1])(s.flow_of(v))),
+        of(flow=lambda v: s.entry("flow_px", lambda t: t[..., :1, :1])(flow_of(v))),
     ),
-    "flow s.of half size": ("flow", s.of(flow=lambda v: s.field_of(s.moved(v)[HALF]))),
-    "confidence [N, 1, H, W]": (
-        "flow",
-        s.of(flow=lambda v: replace(s.flow_of(v), confidence=s.moved(v)[:, :1])),
-    ),
-    "covariance s.of two": ("flow", s.of(flow=lambda v: replace(s.flow_of(v), covariance_px2=s.moved(v)))),
+    "confidence [N, 1, H, W]": ("flow", of(flow=lambda v: replace(flow_of(v), confidence=moved(v)[:, :1]))),
+    "covariance of two": ("flow", of(flow=lambda v: replace(flow_of(v), covariance_px2=moved(v)))),
     "truth [N, 2, 1, 1]": ("truth", truth(PX[..., :1, :1])),
     "truth [N, 1, H, W]": ("truth", truth(PX[:, :1])),
     "truth [1, 2, H, W]": ("'truth' holds 1", truth(PX[:1])),
-    "truth valid s.of floats": ("truth", truth(PX, valid=False)),
-    "frames s.of colours": (
-        "render",
-        s.of(render=s.picture(after=lambda f: f[..., None, :, :].expand(2, 5, 3, 16, 16))),
-    ),
-    "frames s.of one drive": ("'frames' holds 1", s.of(render=s.picture(after=lambda f: f[:1]))),
-    "frames on 0 to 1": ("scale is 0 to 255", s.of(render=s.picture(after=lambda f: f / 255))),
-    "counts below 0": ("0 or more", s.of(events=lambda f: s.counted(f) - 1)),
-    "volume s.of other bins": (
-        "events",
-        s.of(events=lambda f: replace(s.volume_of(f), centroid_s=torch.ones(3))),
-    ),
-    "volume below 0": ("0 or more", s.of(events=lambda f: s.entry("counts", torch.neg)(s.volume_of(f)))),
-    "rays as a tensor": ("camera", s.of(camera=s.Camera(s.glass(), lambda r: r.direction))),
-    "mounts s.of three drives": ("mount", s.of(mount=s.held(lambda T: T.expand(3, 4, 4)))),
-    "trajectory s.of T - 1": (
+    "truth valid of floats": ("truth", truth(PX, valid=False)),
+    "frames of one drive": ("'frames' holds 1", of(render=s.picture(after=lambda f: f[:1]))),
+    "frames on 0 to 1": ("scale is 0 to 255", of(render=s.picture(after=lambda f: f / 255))),
+    "counts below 0": ("0 or more", of(events=lambda f: counted(f) - 1)),
+    "volume below 0": ("0 or more", of(events=lambda f: s.entry("counts", torch.neg)(s.volume_of(f)))),
+    "rays as a tensor": ("camera", of(camera=s.Camera(glass(), lambda r: r.direction))),
+    "mounts of three drives": ("mount", of(mount=held(lambda T: T.expand(3, 4, 4)))),
+    "trajectory of T - 1": (
         "trajectory",
-        s.of(trajectory=lambda: s.DRIVES[1:5], batch=Batch(None, s.T_S, "waves")),
+        of(trajectory=lambda: s.DRIVES[1:5], batch=Batch(None, T_S, "waves")),
     ),
-    "times in ms": ("milliseconds", s.of(batch=replace(s.BATCH, t_s=1e3 * s.T_S))),
-    "times that stand still": ("increase strictly", s.of(batch=replace(s.BATCH, t_s=0 * s.T_S))),
-    "float64 network": ("float64 on cpu.*float32 on cpu.*'events'", s.of(flow=s.Convolution().double())),
-    "weights without values": (
-        "'flow.0.weight' is on the device meta",
-        s.of(flow=s.Convolution().to("meta")),
-    ),
-    "hidden in a global": ("does not see", s.of(flow=lambda volume: helper(volume))),
-    "hidden parameter": ("does not see", s.of(events=lambda frames: s.counted(frames, GAIN))),
-    "hidden mount": ("does not see", s.of(mount=s.closed(s.held()))),
-    "hidden camera": ("does not see", s.of(camera=s.closed(functools.partial(s.Camera, s.glass())))),
+    "times in ms": ("milliseconds", of(batch=replace(BATCH, t_s=1e3 * T_S))),
+    "times that stand still": ("increase strictly", of(batch=replace(BATCH, t_s=0 * T_S))),
+    "float64 network": ("float64 on cpu.*float32 on cpu.*'events'", of(flow=s.Convolution().double())),
+    "weights without values": ("'flow.0.weight' is on the device meta", of(flow=s.Convolution().to("meta"))),
+    "hidden in a global": ("does not see", of(flow=lambda volume: helper(volume))),
+    "hidden parameter": ("does not see", of(events=lambda frames: counted(frames, GAIN))),
+    "hidden mount": ("does not see", of(mount=s.closed(held()))),
+    "hidden camera": ("does not see", of(camera=s.closed(functools.partial(s.Camera, glass())))),
     "hidden in an objective": (
         "does not see",
-        s.of(objectives={"a": lambda volume: NET(volume).flow_px.mean()}),
+        of(objectives={"a": lambda volume: NET(volume).flow_px.mean()}),
     ),
-    "in place by a ReLU": ("in place", s.of(events=s.layer(before=nn.ReLU6(inplace=True)))),
-    "in place on the batch": ("in place", s.of(mount=None, render=s.picture(poses=lambda T: T.mul_(1.01)))),
-    "in place on times": ("in place", s.of(flow=lambda volume, t_s: (t_s.add_(1), s.flow_of(volume))[1])),
-    "takes no input": ("flow.*takes no input", s.of(flow=lambda: None)),
-    "takes keywords alone": ("estimate.*takes no input", s.of(estimate=lambda *, t_s: None)),
-    "takes another first": ("names its first argument 't", s.of(flow=lambda truth, volume: None)),
-    "more by position": ("'t_s' by position alone", s.of(events=placed)),
-    "asks for what is not": ("asks for 'theta'", s.of(events=lambda frames, theta: frames)),
-    "asks for what comes after": ("in a circle: '", s.of(events=lambda frames, field: frames)),
-    "a class": ("is the class", s.of(flow=s.Convolution)),
-    "a string": ("is a str", s.of(flow="refiner")),
-    "no objective": ("at least one objective", s.of(objectives={})),
-    "a gradient s.of no kind": ("gradient = 'exact'", s.of(gradient="exact")),
-    "said to cut, s.of no stage": ("may_cut is", s.of(may_cut=("event",))),
-    "one variable s.of 0": (
+    "in place on the batch": ("in place", of(mount=None, render=s.picture(poses=lambda T: T.mul_(1.01)))),
+    "in place on times": ("in place", of(flow=lambda volume, t_s: (t_s.add_(1), flow_of(volume))[1])),
+    "takes no input": ("flow.*takes no input", of(flow=lambda: None)),
+    "takes another first": ("names its first argument 't", of(flow=lambda truth, volume: None)),
+    "more by position": ("'t_s' by position alone", of(events=placed)),
+    "asks for what is not": ("asks for 'theta'", of(events=lambda frames, theta: frames)),
+    "asks for what comes after": ("in a circle: '", of(events=lambda frames, field: frames)),
+    "a class": ("is the class", of(flow=s.Convolution)),
+    "a string": ("is a str", of(flow="refiner")),
+    "no objective": ("at least one objective", of(objectives={})),
+    "a gradient of no kind": ("gradient = 'exact'", of(gradient="exact")),
+    "said to cut, of no stage": ("may_cut is", of(may_cut=("event",))),
+    "one variable of 0": (
         "'estimate.gain' is exactly 0",
-        s.of(estimate=s.Stage(lambda f, gain: s.mean_flow(f) + 0 * gain)),
+        of(estimate=s.Stage(lambda f, gain: s.mean_flow(f) + 0 * gain)),
     ),
 }
 
@@ -150,10 +133,10 @@ WRAPPED = [
     ("flow", 4, functools.partial(NET.forward)),
     ("flow", 4, functools.partial(functools.partial(lambda net, v, gain: net(v), NET), gain=2.0)),
     ("events", 2, events.layer("counts").volume),
-    ("mount", 1, s.held().forward),
-    ("camera", 2, functools.partial(s.Camera, s.glass())),
-    ("render", 1, functools.partial(brighter, s.held())),
-    ("estimate", 1, functools.partial(scaled, scale=s.held())),
+    ("mount", 1, held().forward),
+    ("camera", 2, functools.partial(s.Camera, glass())),
+    ("render", 1, functools.partial(brighter, held())),
+    ("estimate", 1, functools.partial(scaled, scale=held())),
     ("objectives", 4, {"a": functools.partial(lambda net, volume: net(volume).flow_px.mean(), NET)}),
 ]
 
