@@ -55,7 +55,6 @@ BAD = {
     "frames of one drive": ("'frames' holds 1", of(render=s.picture(after=lambda f: f[:1]))),
     "frames on 0 to 1": ("scale is 0 to 255", of(render=s.picture(after=lambda f: f / 255))),
     "counts below 0": ("0 or more", of(events=lambda f: counted(f) - 1)),
-    "volume below 0": ("0 or more", of(events=lambda f: s.entry("counts", torch.neg)(s.volume_of(f)))),
     "rays as a tensor": ("camera", of(camera=s.Camera(glass(), lambda r: r.direction))),
     "mounts of three drives": ("mount", of(mount=held(lambda T: T.expand(3, 4, 4)))),
     "trajectory of T - 1": (

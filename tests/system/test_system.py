@@ -11,6 +11,7 @@ from torch import nn
 from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
 from codesign.system import Batch, System, check
 from codesign.types import EventVolume, FlowField, Rays
+from tests.hostile.stages import Stage, held
 
 ONE = torch.ones(1)
 T_S = torch.tensor([0.0, 1.0], dtype=torch.float64)
@@ -183,43 +184,22 @@ def test_a_stage_gets_what_its_signature_names():
 
 
 def test_parameters_of_every_part_are_the_systems():
-    class Layer(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.gain = nn.Parameter(torch.tensor(2.0))
-
-        def forward(self, frames):
-            return volume_of(self.gain * frames)
-
-    class Mount(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.numbers = nn.Parameter(torch.zeros(6))
-
-        def forward(self):
-            return torch.eye(4, dtype=torch.float64)
-
-    system = toy(events=Layer(), mount=Mount())
-    assert {name for name, _ in system.named_parameters()} == {"lens.efl_mm", "events.gain", "mount.numbers"}
+    layer = Stage(lambda frames, gain: volume_of(gain * frames))
+    system = toy(events=layer, mount=held())
+    assert {name for name, _ in system.named_parameters()} == {"lens.efl_mm", "events.gain", "mount.twist"}
     twin = system.replaced(events=doubled)
-    assert {name for name, _ in twin.named_parameters()} == {"lens.efl_mm", "mount.numbers"}
+    assert {name for name, _ in twin.named_parameters()} == {"lens.efl_mm", "mount.twist"}
     assert twin.lens is system.lens
 
 
 def test_estimator_and_bins_must_fit():
-    class Network(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.config = {"bins": 5}
-
-        def forward(self, volume):
-            return tripled(volume)
-
-    assert toy(flow=Network()).bins == 5
+    network = Stage(lambda volume, gain: tripled(volume))
+    network.config = {"bins": 5}
+    assert toy(flow=network).bins == 5
     with pytest.raises(
-        DomainError, match=r"stage 'flow' \(Network\) was built for 5 time bins and the system makes 9"
+        DomainError, match=r"stage 'flow' \(Stage\) was built for 5 time bins and the system makes 9"
     ):
-        toy(flow=Network(), bins=9)
+        toy(flow=network, bins=9)
 
 
 @pytest.mark.parametrize(
