@@ -11,10 +11,12 @@ import torch
 from codesign.errors import DomainError
 from codesign.grad.differences import Ladder, rounding_noise
 from codesign.grad.groups import Loss, check_groups, components, gradients, random_lines, repeated
-from codesign.grad.row import SIGMAS, Row, make_row, verdict
+from codesign.grad.row import SIGMAS, Row, make_row
 
 DEFAULT_LADDER = tuple(10.0**-k for k in (2, 2.5, 3, 3.5, 4, 4.5, 5))
-LARGER_STEPS = (10**-1.5, 10**-1.0)  # added to the default ladder where rounding hides the gradient
+# added to the default ladder where it does not decide: rounding hides the gradient, or the function is too quick
+MORE_STEPS = (10**-1.5, 1e-1, 1e-6, 1e-7, 1e-8)
+FEW, MANY = 4, 12  # spacings at which noise stays alike before it is believed
 NOISE_STEP = 1e-2  # of the largest step: near enough to be straight, far enough to round anew
 
 
@@ -41,7 +43,7 @@ def certify(
       params: name -> floating tensor (the point where the gradient is checked).
       scales: name -> step unit (number or tensor like the parameter); 1 where left out. A ladder rung h moves
         a parameter by h * scale.
-      ladder: relative steps; where left out 1e-2 to 1e-5, and up to 1e-1 where rounding needs it (float32).
+      ladder: relative steps; where left out 1e-2 to 1e-5, and 1e-1 to 1e-8 where these do not decide.
       tolerance: relative error that is allowed.
       directions: None checks every component; a number checks that many random unit directions per group
         (many parameters; take four or more), drawn with ``generator`` (on the CPU; seed 0 where left out),
@@ -71,8 +73,9 @@ def certify(
 
         unit = torch.as_tensor(scales.get(name, 1.0)).to(value) * torch.ones_like(value)
         probe = next(random_lines(value, 1, generator)) * unit
-        noise = max(jitter, rounding_noise(alone, value, probe, NOISE_STEP * max(steps)))
-        group = _Group(name, alone, value, unit, grads[name], noise, eps, steps, ladder is None, tolerance)
+        group = _Group(
+            name, alone, value, unit, grads[name], probe, jitter, eps, steps, ladder is None, tolerance
+        )
         if directions is None or directions >= value.numel():
             lines = components(value)
         else:
@@ -88,14 +91,16 @@ def worst(rows: Sequence[Row]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class _Group:
-    """One group of parameters at its point, and what measuring it needs (extend: larger steps too)."""
+    """One group of parameters at its point, and what measuring it needs (probe: line on which noise is measured; extend: more
+    steps too)."""
 
     name: str
     alone: Callable[[torch.Tensor], torch.Tensor]
     value: torch.Tensor
     unit: torch.Tensor
     grad: torch.Tensor
-    noise: float
+    probe: torch.Tensor
+    jitter: float
     eps: float
     steps: tuple[float, ...]
     extend: bool
@@ -104,37 +109,40 @@ class _Group:
     def row(self, lines):
         """Row of the derivatives along lines of the scaled parameters; where they are lost in noise, the
         length of the gradient is measured along itself, where the signal is largest."""
-        row = make_row(self.name, *self.measured(lines), self.tolerance)
+        row = self.measured(lines)
         slope = self.grad.double() * self.unit.double()
         if row.verdict != "noise" or not bool(slope.any()):
             return row
-        (length,), (found,) = self.measured([slope / slope.norm()])
-        if found.value == 0:
+        along = self.measured([slope / slope.norm()])
+        if along.difference == (0.0,):
             return row
-        failed = verdict(abs(length - found.value), abs(found.value), found.noise, self.tolerance) == "fail"
-        return dataclasses.replace(
-            row, length_bias=length / found.value - 1, verdict="fail" if failed else "noise"
-        )
+        failed = "fail" if along.verdict == "fail" else "noise"
+        return dataclasses.replace(row, length_bias=along.signed_bias, verdict=failed)
 
     def measured(self, lines):
-        """Derivatives along lines: by autograd, and Differences."""
+        """Row of the derivatives along lines, by autograd and by differences; with more steps, and noise looked for at
+        smaller ones, where the first do not decide."""
+        lines = list(lines)
+        row = self.tried(lines, FEW, ())
+        decided = row.verdict == "pass" and SIGMAS * row.noise_floor <= self.tolerance
+        return row if decided or not self.extend else self.tried(lines, MANY, MORE_STEPS)
+
+    def tried(self, lines, spacings, more):
+        step = NOISE_STEP * max(self.steps)
+        noise = max(self.jitter, rounding_noise(self.alone, self.value, self.probe, step, spacings))
         slopes = []
         ladders = []
         for line in lines:
             step = line.to(self.unit) * self.unit
             slopes.append(float((self.grad.double() * step.double()).sum()))
-            ladders.append(Ladder(self.alone, self.value, step, self.noise, self.eps))
+            ladders.append(Ladder(self.alone, self.value, step, noise, self.eps, self.grad))
             ladders[-1].take(self.steps)
-        found = [ladder.difference() for ladder in ladders]
-        size = math.hypot(*(f.value for f in found))
-        if not self.extend or SIGMAS * math.hypot(*(f.noise for f in found)) <= self.tolerance * size:
-            return slopes, found
-        for ladder, step in product(ladders, LARGER_STEPS):
+        for ladder, step in product(ladders, more):
             try:
                 ladder.take((step,))
             except (ArithmeticError, RuntimeError, ValueError):  # nobody asked for steps as large as these
                 ladder.left_out.append(step)
-        return slopes, [ladder.difference() for ladder in ladders]
+        return make_row(self.name, slopes, [ladder.difference() for ladder in ladders], self.tolerance)
 
 
 def _check(steps, tolerance, directions):

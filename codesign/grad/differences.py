@@ -17,7 +17,11 @@ from codesign.errors import NonFiniteError
 
 Scalar = Callable[[torch.Tensor], torch.Tensor]
 EPS = torch.finfo(torch.float64).eps
-NEIGHBOURS = 3.0  # standard deviations by which neighbouring rungs may differ before it counts against them
+POINTS = 16  # roundings of a parameter between points where noise is measured
+SHRINK = 10**0.5  # of their spacing; differences of fourth to sixth order of what is smooth then fall
+SMOOTH = (20.0, 1e4)  # by 1e2 to 1e3, more or less: noise does not
+FIRM = 1 / 30  # of their noise: three rungs that agree so well are no noise, whatever made it
+NEIGHBOURS = 5.0  # standard deviations by which neighbouring rungs may differ before it counts against them
 
 
 @dataclass(frozen=True)
@@ -60,14 +64,32 @@ def plateau(fn: Scalar, point: torch.Tensor, direction: torch.Tensor, steps: Seq
     return Difference(value, (ladder[best][0] * ladder[best + 1][0]) ** 0.5, gaps[best] / 2, ladder)
 
 
-def rounding_noise(fn: Scalar, point: torch.Tensor, direction: torch.Tensor, step: float) -> float:
+def rounding_noise(
+    fn: Scalar, point: torch.Tensor, direction: torch.Tensor, step: float, spacings: int = 4
+) -> float:
     """Standard deviation of f's rounding errors: nine points on a line, ``step`` apart, and the differences
     of fourth to sixth order between them, from which anything smooth has gone. 0 where f is not finite there.
 
+    What falls by powers of the spacing is f itself, too quick for it, and the points are taken closer; errors stay alike,
+    or are gone at once where all points lie on one stair. The largest of ``spacings`` that stay alike counts. No
+    closer at first than some roundings of the parameter, where points would repeat each other.
     Source: Moré and Wild, Estimating computational noise, SIAM J. Sci. Comput. 33(3), 2011.
     """
+    unit = direction.double()
+    step = max(step, POINTS * torch.finfo(point.dtype).eps * float(point.double().norm() / unit.norm()))
+    found = [_nine(fn, point, step * unit)]
+    alike = 1
+    while alike < spacings:
+        step /= SHRINK
+        found.append(_nine(fn, point, step * unit))
+        falls = found[-1] > 0 and SMOOTH[0] < found[-2] / found[-1] < SMOOTH[1]
+        alike = 1 if falls else alike + 1
+    return max(found[-spacings:])
+
+
+def _nine(fn, point, unit):
+    """Noise in nine points that lie ``unit`` apart."""
     start = point.double()
-    unit = step * direction.double()
     values = [_value(fn, (start + k * unit).to(point.dtype)) for k in range(-4, 5)]
     if not all(map(math.isfinite, values)):
         return 0.0
@@ -84,18 +106,26 @@ class Ladder:
     """Central differences along one direction, rung by rung, each with what rounding may do to it."""
 
     def __init__(
-        self, fn: Scalar, point: torch.Tensor, direction: torch.Tensor, noise: float = 0.0, eps: float = EPS
+        self,
+        fn: Scalar,
+        point: torch.Tensor,
+        direction: torch.Tensor,
+        noise: float = 0.0,
+        eps: float = EPS,
+        grad: torch.Tensor | None = None,
     ):
         """Args:
         fn: function of one tensor -> scalar tensor. point, direction: tensors of one shape.
         noise: standard deviation of f's own errors, measured.
         eps: of f's number format, whose rounding counts on top.
+        grad: gradient that is asked about; how far rounding of the parameter, aside of the line, may move f.
         """
         self.fn = fn
         self.point = point
         self.direction = direction
         self.noise = noise
         self.eps = eps
+        self.grad = None if grad is None else grad.double()
         self.rungs: list[tuple[float, float, float]] = []  # step, difference, standard deviation by rounding
         self.left_out: list[float] = []
 
@@ -109,12 +139,14 @@ class Ladder:
             ahead = (start + step * unit).to(self.point.dtype)
             behind = (start - step * unit).to(self.point.dtype)
             # twice the step that is left after rounding of the parameter itself
-            width = float(((ahead.double() - behind.double()) * unit).sum()) / length
+            moved = ahead.double() - behind.double()
+            width = float((moved * unit).sum()) / length
             high = _value(self.fn, ahead)
             low = _value(self.fn, behind)
             if width > 0 and math.isfinite(high) and math.isfinite(low):
                 error = math.hypot(self.noise, _rounding(max(abs(high), abs(low)), self.eps))
-                self.rungs.append((step, (high - low) / width, 2**0.5 * error / width))
+                aside = 0.0 if self.grad is None else float((self.grad * (moved - width * unit)).norm())
+                self.rungs.append((step, (high - low) / width, math.hypot(2**0.5 * error, aside) / width))
             else:
                 self.left_out.append(step)
 
@@ -144,13 +176,18 @@ class Ladder:
         bends = [abs(value - rung[1]) for value, rung in zip(values, rungs, strict=True)]
         if len(rungs) > 1:
             bends[0] = abs(values[1] - values[0])
+        firm = [
+            k > 1
+            and rungs[k][1] != 0
+            and all(abs(rungs[j][1] - rungs[j - 1][1]) < FIRM * rungs[j][2] for j in (k - 1, k))
+            for k in range(len(rungs))
+        ]
         spreads = []
         for k in range(len(rungs)):
-            others = range(k + 1, min(k + 3, len(rungs))) or range(max(k - 1, 0), k)
             contradicted = 0.0
-            for other in others:
-                beyond = abs(values[k] - values[other]) - NEIGHBOURS * math.hypot(sigmas[k], sigmas[other])
-                contradicted = max(contradicted, beyond)
+            for other in range(k + 1, len(rungs)) or range(max(k - 1, 0), k):
+                unsure = math.hypot(sigmas[k], 0.0 if firm[other] else sigmas[other])
+                contradicted = max(contradicted, abs(values[k] - values[other]) - NEIGHBOURS * unsure)
             spreads.append(math.hypot(sigmas[k], bends[k], contradicted))
         best = min(range(len(rungs)), key=spreads.__getitem__)
         return Difference(

@@ -55,6 +55,8 @@ def check_layout(by: str, value: Any, kind: type, shape: tuple[str | int, ...] =
         if (tensor.dtype != torch.bool) if name == "valid" else not tensor.is_floating_point():
             kinds = "bool" if name == "valid" else "floating point"
             raise DomainError(f"{named} of {tensor.dtype}; {kinds} is needed.")
+        if tensor.is_meta:
+            raise DomainError(f"{named} on the device meta, without values; make it on cpu or cuda.")
         first = tensor if first is None else first
         if tensor.device != first.device:
             raise DomainError(f"{by} tensors on {first.device} and on {tensor.device}; use one device.")

@@ -15,7 +15,7 @@ from codesign.system.batch import check_batch, scenes_of
 from codesign.system.contents import tensors_in
 from codesign.system.layout import check_layout, look_at, look_at_times
 from codesign.system.result import JUNCTIONS, RECORDABLE, Result, probe
-from codesign.system.stage import Stage, event_call, label, modules_of
+from codesign.system.stage import event_call, label, modules_of
 from codesign.types import EventVolume, FlowField, Rays
 
 
@@ -77,7 +77,7 @@ class Pass(Mapping[str, Any]):
         return value
 
     def _call(self, name, part, *inputs, **instead):
-        stage = Stage(name, part)
+        stage = self.system.stage(name, part)
         has = ChainMap(instead, self)  # pyright: ignore[reportArgumentType] - read alone
         self.asked[name] = stage.asked if stage.input is None else (stage.input, *stage.asked)
         if self.junctions is None:

@@ -74,6 +74,7 @@ class System(nn.Module):
         bins: int | None = None,
     ):
         super().__init__()
+        self._stages: dict[str, Stage] = {}
         self.gradient: render_stage.sequence.Way = gradient
         self.scene = scene
         self.camera = camera
@@ -160,6 +161,13 @@ class System(nn.Module):
     def begin(self, batch: Batch, recorded: Mapping[str, Any] | None = None, probe: bool = False) -> "Pass":
         """A pass to read from by name (``["frames"]``, ``["volume"]``, ...); each stage runs when it is asked for."""
         return Pass(self, batch, dict(recorded or {}), probe)
+
+    def stage(self, name: str, part: Callable[..., Any]) -> Stage:
+        """A part as a stage of that name; its signature is read once."""
+        known = self._stages.get(name)
+        if known is None or known.call != part:
+            known = self._stages[name] = Stage(name, part)
+        return known
 
     def replaced(self, **parts: Any) -> "System":
         """The same system with other parts, for example the hard sensor for ``events``; what stays is shared."""

@@ -79,6 +79,11 @@ def check_stages(run: Pass, wanted: Sequence[Tensor], may_cut: Sequence[str]) ->
                     f"{before}: it is exactly 0, though what it makes follows its input (rounding, a hard comparison, "
                     f"saturation, or thresholds that this batch does not reach); exchange that stage, or {meant}."
                 )
+            silent = [way for way in silent if way.name not in outer]
+        # a zero-initialised layer silences all weights before it: first moved together, each alone if that shows
+        together = tuple(way.tensor for way in silent if not way.at)
+        if together and not _follows(run, output, together, (), STEP):
+            silent = [way for way in silent if way.at]
         cut = [
             way.name for way in silent if part is not None and _follows(run, output, (way.tensor,), way.at)
         ]
