@@ -96,7 +96,8 @@ class Refiner(nn.Module):
     ) -> list[FlowField]:
         """FlowFields after each correction. Arguments, gradient and errors as ``forward``."""
         start = self.start(volume, start_px, clock)
-        share = _bends(start.flow_px)
+        with torch.autocast(volume.counts.device.type, enabled=False):
+            share = _bends(start.flow_px)
         return [_mixed(volume, start, field, share) for field in self.refined(volume, start, clock=clock)]
 
     def start(self, volume: EventVolume, start_px: Tensor | None = None, clock: str = "time") -> FlowField:
