@@ -10,7 +10,7 @@ inverse of that variance.
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -119,7 +119,7 @@ def estimate(volume: EventVolume, start_px: Tensor | None = None) -> FlowField:
     Returns: as of ``estimate_lk``. The covariance takes in how far the candidates are apart, and what was shrunk.
     Gradient: counts, as of ``estimate_lk``, through what was chosen; none through the choice.
     Raises: ShapeError, DomainError.
-    Cost: forward 5 to 9 times a local field (docs/flow_closed_form.md); a gradient passes through one of them.
+    Cost: forward 4 times a local field (docs/flow_closed_form.md); where a gradient is asked for, one field more.
 
     >>> import torch
     >>> from codesign.flow.export import evenly_timed
@@ -133,31 +133,43 @@ def estimate(volume: EventVolume, start_px: Tensor | None = None) -> FlowField:
     start = None if start_px is None else check_start(start_px, counts)
     with torch.no_grad():
         chosen = _chosen(replace(volume, counts=counts.detach()), start)
+    found = chosen.found
+    if torch.is_grad_enabled() and counts.requires_grad:  # once more, what was chosen alone
+        found = _followed(volume, chosen, start)
+    believed = chosen.believed
+    return replace(
+        found,
+        flow_px=believed[:, None] * found.flow_px,
+        confidence=believed * cast(Tensor, found.confidence),
+        covariance_px2=cast(Tensor, found.covariance_px2) + chosen.apart,
+    )
+
+
+def _followed(volume, chosen, start):
+    """The fields that were chosen, with their gradients."""
     parts = []
     places = []
     for turned, far in ((False, False), (False, True), (True, False), (True, True)):
         these = ((chosen.turned == turned) & (chosen.far == far)).nonzero()[:, 0]
         if len(these):
-            part = replace(volume, counts=counts[these])
+            part = replace(volume, counts=volume.counts[these])
             path = along_path(part, CLOCKS[turned])
             from_px = None if start is None else start[these]
             parts.append(field(part, path[0], *descended(part, path, **OPTIONS[far], start_px=from_px)))
             places.append(these)
     order = torch.cat(places).argsort()
-    flow, valid, confidence, covariance, net = (
-        torch.cat([getattr(part, name) for part in parts])[order]
-        for name in ("flow_px", "valid", "confidence", "covariance_px2", "net_share")
-    )
-    believed = chosen.believed
-    covariance = covariance + chosen.apart
+    names = ("flow_px", "valid", "confidence", "covariance_px2", "net_share")
     return FlowField(
-        believed[:, None] * flow, valid, parts[0].interval_s, believed * confidence, covariance, net
+        interval_s=parts[0].interval_s,
+        **{name: torch.cat([getattr(part, name) for part in parts])[order] for name in names},
     )
 
 
 class _Chosen(NamedTuple):
-    """turned, far: [B] bool. believed: [B, H, W] share of the flow. apart: [B, 3, H, W] what is added to the claim."""
+    """found: the fields chosen, without gradient. turned, far: [B] bool. believed: [B, H, W] share of the flow. apart:
+    [B, 3, H, W] what is added to the claim."""
 
+    found: FlowField
     turned: Tensor
     far: Tensor
     believed: Tensor
@@ -172,11 +184,13 @@ def _chosen(volume, start):
     names = ("counts", "net", "start", "spread", "place", "direction")
     way = Path(*(_where(turned, *(getattr(path[0], name) for path in reversed(found))) for name in names))
     path = way, *found[0][1:]
-    flows = [descended(volume, path, **options, start_px=start)[0] for options in ({}, WIDE, NARROW)]
+    fields = [descended(volume, path, **options, start_px=start) for options in ({}, WIDE, NARROW)]
+    flows = [flow for flow, *_ in fields]
     local, wide, narrow = (agreement.along(flow, way, sure=True) for flow in flows)
     still = agreement.along(torch.zeros_like(flows[0]), way).alike
     far = 1 - wide.alike < FAR * (1 - local.alike)
-    flow = _where(far, flows[1], flows[0])
+    chosen = [_where(far, *pair) for pair in zip(fields[1], fields[0], strict=True)]
+    flow = chosen[0]
     best = Agreed(*(_where(far, *pair) for pair in zip(wide, local, strict=True)))
     nats = best.sure * (_unexplained(still) - _unexplained(best.alike)).clamp_min(0) / 2
     shrunk = (nats / (nats + FEW) * (best.alike > 0))[:, None, None]
@@ -186,7 +200,8 @@ def _chosen(volume, start):
     believed = torch.where(ground, 0.0, shrunk.expand_as(best.z))
     doubt = believed * (1 - believed) + torch.where(ground, 1 - bodies, 0.0)
     apart = doubt[:, None] * _squared(flow) + sum(_squared(other - flow) for other in flows)
-    return _Chosen(turned, far, believed, way.net.to(flow)[:, None, None, None].square() * apart)
+    found = field(volume, way, *chosen)
+    return _Chosen(found, turned, far, believed, way.net.to(flow)[:, None, None, None].square() * apart)
 
 
 def _unexplained(alike):

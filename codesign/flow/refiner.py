@@ -28,6 +28,8 @@ OWN = 7  # what is told beside bins and evidence
 WIDEST = 10.0  # logarithm of the largest factor on a claim
 SMALLEST_PX2 = 1e-4
 SPARE_PX2 = 0.01  # unit of the variance that is added to the start's claim
+BENT = 0.01  # what one quadratic field leaves of the start, over its length, at which the correction counts by half,
+BENT_PX = 0.03  # and in px
 
 
 class Refiner(nn.Module):
@@ -43,6 +45,8 @@ class Refiner(nn.Module):
     adds something of its own in units of the claimed deviation, and says how pixels mix cells and how wide the claim is
     to be. Fresh weights give the closed form as it is.
     Bins are read at q + t flow(q), so the flow belongs to the pixels of the window's start.
+    The correction counts as far as the closed form bends away from one quadratic field: it does so where the events have
+    evidence for it, and without any (noise, thin packets, cameras that turn) the closed form stands as it is.
 
     >>> from codesign.flow.export import evenly_timed
     >>> network = Refiner(bins=4, width=16, steps=1)
@@ -91,7 +95,10 @@ class Refiner(nn.Module):
         self, volume: EventVolume, start_px: Tensor | None = None, clock: str = "time"
     ) -> list[FlowField]:
         """FlowFields after each correction. Arguments, gradient and errors as ``forward``."""
-        return self.refined(volume, self.start(volume, start_px, clock), clock=clock)
+        start = self.start(volume, start_px, clock)
+        with torch.autocast(volume.counts.device.type, enabled=False):
+            share = _bends(start.flow_px)
+        return [_mixed(volume, start, field, share) for field in self.refined(volume, start, clock=clock)]
 
     def start(self, volume: EventVolume, start_px: Tensor | None = None, clock: str = "time") -> FlowField:
         """The closed form that is corrected."""
@@ -101,8 +108,8 @@ class Refiner(nn.Module):
     def refined(
         self, volume: EventVolume, start: FlowField, through: bool = True, clock: str = "time"
     ) -> list[FlowField]:
-        """FlowFields after each correction of an estimate with covariance, such as ``start(volume)``, whose covariance
-        says how far it may be off. Gradient: counts, start and weights.
+        """FlowFields after each whole correction, as it is trained, of an estimate with covariance, such as
+        ``start(volume)``, whose covariance says how far it may be off. Gradient: counts, start and weights.
 
         through: False leaves out the gradient through the places at which bins are read, as in the training of
           RAFT (Teed and Deng, ECCV 2020): it takes a third off a step.
@@ -181,8 +188,33 @@ def _field(volume, start, present, shown, change, claim):
     covariance = start.covariance_px2 * (1 + shown * (factor - 1))
     added = shown * SPARE_PX2 * added
     covariance = covariance + torch.cat([added, torch.zeros_like(added), added], 1)
+    return _claiming(volume, start.flow_px + shown * change, covariance, present)
+
+
+def _claiming(volume, flow, covariance, present):
+    """FlowField whose confidence follows from its covariance."""
     spread = (covariance[:, 0] + covariance[:, 2]) / 2
     confidence = present[:, 0] / (1 + spread / PRIOR_PX**2)
-    valid = (present.detach() > 0)[:, 0].expand(-1, height, width)
-    interval_s = float(volume.collected_s.sum())
-    return FlowField(start.flow_px + shown * change, valid, interval_s, confidence, covariance)
+    valid = (present.detach() > 0)[:, 0].expand_as(spread)
+    return FlowField(flow, valid, float(volume.collected_s.sum()), confidence, covariance)
+
+
+def _bends(flow):
+    """[B, 1, 1, 1] in 0..1 by the root mean square of what a quadratic field leaves of a flow [B, 2, H, W]."""
+    y, x = (torch.linspace(-1, 1, size).to(flow) for size in flow.shape[2:])
+    y, x = torch.meshgrid(y, x, indexing="ij")
+    basis = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1).flatten(0, 1)
+    basis = torch.linalg.qr(basis).Q
+    whole = flow.flatten(2)
+    left = whole - whole @ basis @ basis.T
+    left, whole = (part.square().sum(1).mean(1) for part in (left, whole))
+    return (left / (left + BENT**2 * whole + BENT_PX**2))[:, None, None, None]
+
+
+def _mixed(volume, start, corrected, share):
+    """Mean and covariance of the belief that the correction is right by ``share``, and else the start."""
+    change = corrected.flow_px - start.flow_px
+    x, y = change.unbind(1)
+    apart = share * (1 - share) * torch.stack([x * x, x * y, y * y], 1)
+    covariance = torch.lerp(start.covariance_px2, corrected.covariance_px2, share.expand_as(apart))
+    return _claiming(volume, start.flow_px + share * change, covariance + apart, presence(volume.counts))

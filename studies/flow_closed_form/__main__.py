@@ -17,7 +17,6 @@ import numpy as np
 from codesign import flow
 from codesign.errors import DomainError
 from scenes.flow_windows import RenderedWindows, planes
-from studies.flow_closed_form.gain import gains
 from studies.flow_closed_form.plain import plain_lk
 from studies.flow_closed_form.score import join, score
 from studies.frame.run import Run, StudyConfig, main
@@ -167,7 +166,6 @@ def show(run, cells, scores, samples):
         "flow_closed_form_ratio",
         "Error against background noise; bands: 95 % intervals; dotted: what is asked; grey: zero flow.",
     )
-    gains(run, max(4, samples // 10))
     calibration(run, join([scores[*cell, "closed form"] for cell in cells]))
     run.finish(
         "Closed-form flow on hard events",

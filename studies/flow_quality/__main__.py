@@ -213,12 +213,6 @@ def _show(run, found, about, who):
             rows.append([name.replace("_", " "), *cells])
         extra = ["true flow"] if key == "sharpness" else []
         run.table(title, ["set", *(name.replace("_", " ") for name in who), *extra], rows, note)
-    run.figure(
-        figures.sparsification(found),
-        "sparsification",
-        "Error of the pixels left when the least confident are taken out, over that of all; dashed: when those "
-        "of the largest error are.",
-    )
 
 
 def _worlds(run, found):

@@ -1,10 +1,8 @@
 """Pictures of studies.flow_quality."""
 
 import matplotlib.pyplot as plt
-import numpy as np
 
 from codesign.report.flow_colours import flow_colours
-from studies.flow_quality.measures import SHARES
 
 DEVIATION_PX = 2.0  # shown white
 
@@ -38,40 +36,4 @@ def windows(shown, who):
         axis.set_title(title, fontsize=8)
     for axis in axes.flat:
         axis.set_axis_off()
-    return figure
-
-
-def sparsification(found):
-    """Figure: a panel per set, a curve per estimator, dashed where the true error chooses the pixels."""
-    across = 5
-    down = -(-len(found) // across)
-    figure, axes = plt.subplots(
-        down,
-        across,
-        figsize=(2.6 * across, 2.1 * down + 0.4),
-        constrained_layout=True,
-        squeeze=False,
-        sharex=True,
-        sharey=True,
-    )
-    for axis, (name, mine) in zip(axes.flat, found.items(), strict=False):
-        for number, (who, measured) in enumerate(mine.items()):
-            ours, best = measured.curves
-            axis.plot(SHARES, ours, color=f"C{number}", label=who.replace("_", " "), linewidth=1.2)
-            axis.plot(SHARES, best, "--", color=f"C{number}", linewidth=0.7)
-        axis.set_title(name.replace("_", " "), fontsize=8)
-        axis.set(xlim=(0, 1), ylim=(0, 1.3))
-    for axis in axes.flat[len(found) :]:
-        axis.set_axis_off()
-    for axis in axes[-1]:
-        axis.set_xlabel("share left out")
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    kept = np.unique(labels, return_index=True)[1]
-    figure.legend(
-        [handles[k] for k in sorted(kept)],
-        [labels[k] for k in sorted(kept)],
-        loc="outside lower center",
-        ncols=len(kept),
-        frameon=False,
-    )
     return figure
