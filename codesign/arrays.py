@@ -88,7 +88,7 @@ class Npz:
     def _member(self, name):
         if name not in self._entries:
             raise FileFormatError(
-                f"{self.path} has no array {name}, but {', '.join(self.names)[:200] or 'none'}; {self._remedy}."
+                f"{self.path} has no array {name}, but {', '.join(map(ascii, self.names))[:200] or 'none'}; {self._remedy}."
             )
         entry = self._entries[name]
         with reading(f"{self.path}: {name}", self._remedy), self._archive.open(entry) as member:

@@ -80,8 +80,8 @@ def _head(path, file):
             told = (int(words[1]), int(words[0]))
             if not all(1 <= side <= LIMIT_PX for side in told):
                 raise FileFormatError(
-                    f"{path}, line {used}: a sensor of {told[1]} x {told[0]} pixels is announced; 1 to "
-                    f"{LIMIT_PX} a side are possible."
+                    f"{path}, line {used}: a sensor of {' x '.join(words)[:60]} pixels is announced; 1 to {LIMIT_PX} a "
+                    "side are possible."
                 )
         else:
             file.seek(here)
