@@ -88,7 +88,7 @@ class Npz:
     def _member(self, name):
         if name not in self._entries:
             raise FileFormatError(
-                f"{self.path} has no array {name}, but {', '.join(map(ascii, self.names))[:200] or 'none'}; {self._remedy}."
+                f"{self.path} has no array {name}, but {', '.join(self.names)[:200] or 'none'}; {self._remedy}."
             )
         entry = self._entries[name]
         with reading(f"{self.path}: {name}", self._remedy), self._archive.open(entry) as member:
@@ -110,6 +110,8 @@ def open_npz(path: str | Path, remedy: str = "use a whole .npz file") -> Iterato
             archive = zipfile.ZipFile(file)
             if any(entry.compress_type not in PACKINGS for entry in archive.infolist()):
                 raise FileFormatError(f"{path} is packed in a way that NumPy does not use; save it anew.")
+            if not all(entry.filename.isprintable() for entry in archive.infolist()):
+                raise FileFormatError(f"{path} names arrays in no letters; it is damaged.")
         with archive:
             yield Npz(Path(path), archive, remedy)
 

@@ -9,6 +9,7 @@ import torch
 
 from codesign.errors import FileFormatError
 from codesign.events import read, write
+from codesign.events.formats import hdf5
 from codesign.events.stream import ordered
 
 FIELDS = ("t_us", "x", "y", "p")
@@ -151,3 +152,19 @@ def test_streams_longer_than_32_bits_of_microseconds_are_refused(tmp_path):
     with pytest.raises(FileFormatError, match="32 bits"):
         write(tmp_path / "e.h5", stream_of([0, 2**32], [1, 1], [1, 1], [1, 1]))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_window_is_the_events_between_two_times(tmp_path, monkeypatch, indexed):
+    monkeypatch.setattr(hdf5, "FINE", 16)  # so that bisection has to find its way
+    t, x, y, p = example()
+    late = t.copy()
+    late[1::7] -= 400  # a little disorder, which an index of milliseconds cannot hold
+    times = t if indexed else np.maximum(late, 0)
+    change = {} if indexed else {"events/t": times.astype(np.uint32), "ms_to_idx": None}
+    events = hdf5.Hdf5Events(dsec(tmp_path / "e.h5", change))
+    for t0_us, t1_us in ((0, 0), (11_999, 12_000), (7_300, 21_450), (39_000, 60_000), (-50, 40_000)):
+        inside = (times >= t0_us) & (times <= t1_us)
+        truth = stream_of(times[inside] + EPOCH_US, x[inside], y[inside], p[inside])
+        found = events.window(t0_us + EPOCH_US, t1_us + EPOCH_US, (480, 640))
+        assert all(torch.equal(getattr(found, name), getattr(truth, name)) for name in FIELDS)
