@@ -1,7 +1,6 @@
 """Event files: exact round trips, and a clear refusal of everything else."""
 
 import io
-import random
 
 import h5py
 import numpy as np
@@ -71,6 +70,7 @@ SAME = {
     "with_size.txt": b"# a comment\n10 6\n0.000007 3 0 0\n1.4 0 5 1\n2 9 2 1\n",
     "xytp.txt": b"3 0 7 -1\n0 5 1400000 1\n9 2 2000000 1\n",
     "xytp_seconds.csv": b"3,0,0.000007,0\n0,5,1.4,1\n9,2,2.0,1\n",
+    "commented.csv": b"# made by hand\n#\n# p timestamp y x\n0 0.000007 0 3\n1 1.4 5 0\n1 2 2 9\n",
     "rows.npy": in_rows(T_US * 1e-6, *EVENTS[1:]),
     "xytp.npy": in_rows(*EVENTS[1:3], T_US, ON),
     "own.npz": in_arrays(t_us=T_US, x=EVENTS[1], y=EVENTS[2], p=EVENTS[3], height_px=6, width_px=10),
@@ -214,28 +214,6 @@ def test_recordings_of_cameras_are_the_same_through_both_doors(shared):
             assert np.array_equal(found, true)
         assert np.array_equal(stream.t_us.numpy(), t_us)
         assert int((stream.x * stream.p).sum()) == int((x * (2 * (p > 0) - 1)).sum())
-
-
-def test_mutated_npz_never_gives_a_wrong_stream(tmp_path):
-    path = tmp_path / "e.npz"
-    stream = random_events(200)
-    write(path, stream)
-    whole = path.read_bytes()
-    dice = random.Random(0)
-    for trial in range(300):
-        data = bytearray(whole)
-        if trial % 3 == 0:
-            data = data[: dice.randrange(len(data))]
-        else:
-            for _ in range(dice.randint(1, 4)):
-                data[dice.randrange(len(data))] = dice.randrange(256)
-        path.write_bytes(data)
-        try:
-            back = read(path)
-        except FileFormatError:
-            continue
-        # what still reads passed the checksums: only bytes without meaning had changed
-        assert all(torch.equal(getattr(stream, name), getattr(back, name)) for name in FIELDS)
 
 
 def test_npz_of_something_else_is_refused(tmp_path):

@@ -45,20 +45,6 @@ def test_events_are_read_as_written_whatever_the_chunks(form, tmp_path, monkeypa
     check_events(read_text_events(path), columns)
 
 
-@pytest.mark.parametrize(
-    "head", ["t,x,y,p\n", "# t x y p\n", "# made by hand\n#\n", "timestamp,x,y,polarity\n", "240 180\n"]
-)
-def test_heads_of_text_files(head, tmp_path):
-    columns = made()
-    path = tmp_path / "events.csv"
-    path.write_text(head + eth_text(columns))
-    found = read_text_events(path)
-    check_events(found, columns)
-    assert ("first line" in found.size_from) == (head == "240 180\n")
-    path.write_text("p y x t\n" + eth_text(columns, "{p} {y} {x} {t:.6f}\n"))
-    check_events(read_text_events(path), columns)
-
-
 def test_the_sensor_is_the_one_told_or_the_smallest_that_holds_the_events(tmp_path):
     path = tmp_path / "events.txt"
     for reach, size in (

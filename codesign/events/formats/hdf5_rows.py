@@ -9,7 +9,7 @@ import numpy as np
 from codesign.errors import FileFormatError
 from codesign.events.formats import hdf5_chunks as chunks
 from codesign.events.formats.hdf5_chunks import h5py
-from codesign.reading import reading
+from codesign.reading import check_regular, reading
 
 REMEDY = "it is missing, cut or damaged, or no HDF5 file of this kind"
 
@@ -55,7 +55,7 @@ class Rows:
     def __init__(
         self, path: str | Path, name: str, columns: Sequence[int] | None = None, count: int | None = None
     ) -> None:
-        self.path = Path(path)
+        self.path = check_regular(path)
         self.name = name
         self.block_shape = None
         self.places = {}

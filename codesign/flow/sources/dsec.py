@@ -99,11 +99,6 @@ class Sequence:
     def __init__(self, events: Path, flow: Path, size_px: tuple[int, int]) -> None:
         self.path = events / "events.h5"
         self.size_px = size_px
-        for path in (self.path, events / "rectify_map.h5"):
-            if not path.is_file():
-                raise FileFormatError(
-                    f"{path} is missing; DSEC's events come as two files, events.h5 and rectify_map.h5."
-                )
         self.map: np.ndarray = (
             Rows(events / "rectify_map.h5", "rectify_map", [size_px[1], 2], size_px[0])
             .read(0, size_px[0])
