@@ -110,6 +110,8 @@ def open_npz(path: str | Path, remedy: str = "use a whole .npz file") -> Iterato
             archive = zipfile.ZipFile(file)
             if any(entry.compress_type not in PACKINGS for entry in archive.infolist()):
                 raise FileFormatError(f"{path} is packed in a way that NumPy does not use; save it anew.")
+            if not all(entry.filename.isprintable() for entry in archive.infolist()):
+                raise FileFormatError(f"{path} names arrays in no letters; it is damaged.")
         with archive:
             yield Npz(Path(path), archive, remedy)
 

@@ -1,29 +1,39 @@
-"""Event streams to and from files; the extension says the format."""
+"""Event streams to and from files: a file -> packets of t, x, y, p, by the reader of its ending and content -> checked
+and put in order (Arrival) -> EventColumns -> an EventStream (``read``), or windows (codesign.flow.sources)."""
 
 from pathlib import Path
 
 from codesign.atomic import replacing
 from codesign.errors import FileFormatError
+from codesign.events.columns import LIMIT_PX, EventColumns
 from codesign.events.entry import check_path, check_whole
 from codesign.events.formats.aedat2 import read_aedat2, write_aedat2
 from codesign.events.formats.aedat4 import read_aedat4, write_aedat4
+from codesign.events.formats.arrays import read_arrays, write_npz
+from codesign.events.formats.arrival import Asked
 from codesign.events.formats.dat import read_dat, write_dat
 from codesign.events.formats.hdf5 import read_hdf5, write_hdf5
-from codesign.events.formats.npz import read_npz, write_npz
 from codesign.events.formats.raw import read_raw, write_raw
-from codesign.events.formats.text import read_csv, write_csv
+from codesign.events.formats.tables import check_asked
+from codesign.events.formats.text import read_text, write_csv
 from codesign.events.stream import check_stream
 from codesign.reading import check_regular, reading
 from codesign.types import EventStream
 
-READERS = {
+# whose rows may be in any order, or whose times in another unit
+TABLES = {
+    ".csv": read_text,
+    ".h5": read_hdf5,
+    ".hdf5": read_hdf5,
+    ".npy": read_arrays,
+    ".npz": read_arrays,
+    ".txt": read_text,
+}
+READERS = TABLES | {
     ".aedat": read_aedat2,
     ".aedat2": read_aedat2,
     ".aedat4": read_aedat4,
-    ".csv": read_csv,
     ".dat": read_dat,
-    ".h5": read_hdf5,
-    ".npz": read_npz,
     ".raw": read_raw,
 }
 WRITERS = {
@@ -33,22 +43,33 @@ WRITERS = {
     ".csv": write_csv,
     ".dat": write_dat,
     ".h5": write_hdf5,
+    ".hdf5": write_hdf5,
     ".npz": write_npz,
     ".raw": write_raw,
 }
-MOST_SIDE_PX = 2**15
 OPTIONS = {"evt": (".raw",), "t0_us": (".dat", ".raw")}  # of the writers, and who knows them
 
 
-def read(path: str | Path, *, height_px: int | None = None, width_px: int | None = None) -> EventStream:
+def read(
+    path: str | Path,
+    *,
+    height_px: int | None = None,
+    width_px: int | None = None,
+    columns: str = "auto",
+    time_unit: str = "auto",
+) -> EventStream:
     """Read an event stream.
 
     Args:
-      path: file ending in .h5 (DSEC's or v2e's layout), .aedat4, .raw (EVT 2.0, EVT 3.0), .dat, .csv (header
-        t,x,y,p; microseconds) or .npz.
+      path: file ending in .h5 or .hdf5 (DSEC's, v2e's or MVSEC's layout), .aedat4, .raw (EVT 2.0, EVT 3.0), .dat, .csv
+        or .txt (lines t x y p, with or without a header), .npz or .npy.
       height_px, width_px: sensor size. Taken where the file has none (else the smallest that holds the
         events); checked against the file otherwise.
-    Returns: EventStream sorted by (t, y, x, p), times as the file gives them.
+      columns: order of the columns of rows, such as "xytp"; "auto": what the file says, or its numbers tell beyond
+        doubt (t x y p or x y t p).
+      time_unit: "s", "ms", "us" or "ns"; "auto": what the file says, else seconds where a time has a fraction, else
+        microseconds.
+    Returns: EventStream sorted by (t, y, x, p), times as the file gives them, in microseconds.
     Raises: FileFormatError when the file is missing, malformed (with the line or event where there is one) or
       of another kind.
 
@@ -60,20 +81,30 @@ def read(path: str | Path, *, height_px: int | None = None, width_px: int | None
     >>> events.read("brighter.npz").t_us.tolist()
     [2885, 5771, 8656]
     """
-    path = check_path(path)
     for name, size in (("height_px", height_px), ("width_px", width_px)):
         if size is not None:
-            check_whole(size, name, 1)
+            check_whole(size, name, 1, LIMIT_PX)
+    asked = Asked(height_px, width_px, columns=columns, time_unit=time_unit)
+    return read_columns(check_path(path), asked).stream()
+
+
+def read_columns(path: Path, asked: Asked) -> EventColumns:
+    """The events of a file with all that the caller says of it; see ``read``, which takes the same files."""
     reader = _choose(READERS, path, "read")
-    check_regular(path)
-    with reading(path):
-        stream = reader(path, height_px, width_px)
-    if not max(stream.height_px, stream.width_px) <= MOST_SIDE_PX:
+    check_asked(path, asked)
+    if path.suffix.lower() not in TABLES and (asked.columns, asked.time_unit) != ("auto", "auto"):
         raise FileFormatError(
-            f"{path} gives a sensor of {stream.width_px} x {stream.height_px} pixels; at most {MOST_SIDE_PX} a side are "
+            f"{path} has one order of columns and one clock by its format; leave columns and time_unit away (they are "
+            f"for {', '.join(TABLES)})."
+        )
+    with reading(check_regular(path)):
+        columns = reader(path, asked)
+    if not max(columns.height_px, columns.width_px) <= LIMIT_PX:
+        raise FileFormatError(
+            f"{path} gives a sensor of {columns.width_px} x {columns.height_px} pixels; at most {LIMIT_PX} a side are "
             "read."
         )
-    return stream
+    return columns
 
 
 def write(path: str | Path, stream: EventStream, *, evt: int | None = None, t0_us: int | None = None) -> None:

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -11,8 +10,6 @@ from codesign import events
 from codesign.arrays import open_npz
 from codesign.errors import FileFormatError, ShapeError
 from codesign.events.formats.aedat4_frames import read_frames
-from codesign.events.stream import ordered
-from codesign.reading import reading
 from codesign.types import EventStream
 
 PLACE = Path("shared") / "data" / "davis346_newton_cradle" / "demo-01.npz"
@@ -77,22 +74,14 @@ def load(path):
 
 
 def _read_npz(path):
-    with open_npz(path) as data:
-        missing = [name for name in ENTRIES if name not in data]
-        if missing:
-            raise FileFormatError(
-                f"'{path}' has no entry {missing[0]!r}; a recording holds {', '.join(ENTRIES)}."
-            )
-        with reading(path, "give an .aedat4 or .npz file"):
-            t_us, x, y, p, frames, exposure_us = (
-                torch.from_numpy(np.ascontiguousarray(data.read(name))) for name in ENTRIES
-            )
+    with open_npz(path, f"a recording holds {', '.join(ENTRIES)}") as data:
+        frames, exposure_us = (torch.from_numpy(data.read(name)) for name in ("frames", "exposure"))
     if frames.ndim != 3 or exposure_us.shape != (len(frames), 2):
         raise FileFormatError(
             f"'{path}' has frames {list(frames.shape)} and exposure {list(exposure_us.shape)}; [T, H, W] "
             "and [T, 2] are needed."
         )
-    return frames, exposure_us, ordered(t_us, x, y, 2 * p.long() - 1, *frames.shape[1:])
+    return frames, exposure_us, events.read(path)
 
 
 def _read_aedat4(path):

@@ -9,6 +9,7 @@ import torch
 
 from codesign.errors import FileFormatError
 from codesign.events import read, write
+from codesign.events.formats import hdf5
 from codesign.events.stream import ordered
 
 FIELDS = ("t_us", "x", "y", "p")
@@ -113,13 +114,13 @@ def test_v2e_files_are_read(tmp_path, with_frames):
         ({"events/p": None}, "events/p is absent"),
         ({"t_offset": None}, "t_offset is absent"),
         ({"t_offset": np.int64(2**62)}, "61 bits"),
-        ({"t_offset": np.zeros(2, int)}, "2 values"),
-        ({"events/x": np.zeros(5, np.uint16)}, "equal length"),
+        ({"t_offset": np.zeros(2, int)}, "one whole number"),
+        ({"events/x": np.zeros(5, np.uint16)}, r"\[5\], \[3000\] is needed"),
         ({"events/x": np.zeros(3000)}, "whole numbers"),
-        ({"events/p": np.full(3000, 2, np.uint8)}, "polarity spans 2 to 2"),
+        ({"events/p": np.full(3000, 2, np.uint8)}, "event 0: its polarity is 2"),
         ({"events/t": example()[0][::-1].astype(np.uint32), "ms_to_idx": None}, "before an earlier"),
         ({"ms_to_idx": np.arange(41)}, "first event of each millisecond"),
-        ({"ms_to_idx": np.array([0, 2**40])}, "no list of places"),
+        ({"ms_to_idx": np.array([0, 2**40])}, "no index of its 3000 events"),
     ],
 )
 def test_malformed_files_are_refused(tmp_path, change, words):
@@ -143,7 +144,7 @@ def test_files_that_point_elsewhere_are_refused(tmp_path):
     with pytest.raises(FileFormatError, match="filters"):
         read(dsec(tmp_path / "e.h5", compression="lzf"))
     (tmp_path / "e.h5").write_bytes(b"not HDF5")
-    with pytest.raises(FileFormatError, match="no whole HDF5"):
+    with pytest.raises(FileFormatError, match="no HDF5 file"):
         read(tmp_path / "e.h5")
 
 
@@ -151,3 +152,19 @@ def test_streams_longer_than_32_bits_of_microseconds_are_refused(tmp_path):
     with pytest.raises(FileFormatError, match="32 bits"):
         write(tmp_path / "e.h5", stream_of([0, 2**32], [1, 1], [1, 1], [1, 1]))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_window_is_the_events_between_two_times(tmp_path, monkeypatch, indexed):
+    monkeypatch.setattr(hdf5, "FINE", 16)  # so that bisection has to find its way
+    t, x, y, p = example()
+    late = t.copy()
+    late[1::7] -= 400  # a little disorder, which an index of milliseconds cannot hold
+    times = t if indexed else np.maximum(late, 0)
+    change = {} if indexed else {"events/t": times.astype(np.uint32), "ms_to_idx": None}
+    events = hdf5.Hdf5Events(dsec(tmp_path / "e.h5", change))
+    for t0_us, t1_us in ((0, 0), (11_999, 12_000), (7_300, 21_450), (39_000, 60_000), (-50, 40_000)):
+        inside = (times >= t0_us) & (times <= t1_us)
+        truth = stream_of(times[inside] + EPOCH_US, x[inside], y[inside], p[inside])
+        found = events.window(t0_us + EPOCH_US, t1_us + EPOCH_US, (480, 640))
+        assert all(torch.equal(getattr(found, name), getattr(truth, name)) for name in FIELDS)

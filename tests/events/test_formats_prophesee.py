@@ -224,7 +224,7 @@ def test_small_disorder_is_sorted_and_more_is_refused(tmp_path):
     path.write_bytes(dat((5000, 1, 1, 1), (4000, 2, 1, 1), (5000, 0, 1, 1)))
     assert rows(read(path)) == [(4000, 2, 1, 1), (5000, 0, 1, 1), (5000, 1, 1, 1)]
     path.write_bytes(dat((5000, 1, 1, 1), (3999, 2, 1, 1)))
-    with pytest.raises(FileFormatError, match="event 1 lies 1001 us before"):
+    with pytest.raises(FileFormatError, match="event 1: it lies 1001 us before"):
         read(path)
 
 
@@ -264,7 +264,7 @@ def test_small_disorder_is_sorted_and_more_is_refused(tmp_path):
         ("e.raw", b"% t0 1e6\n" + EVT3, r"start time \(t0\) as '1e6'"),
         ("e.raw", b"% t0 5\n% T0 6\n" + EVT3, "5 and as 6"),
         ("e.dat", DAT + b"1234567", "amid an event"),
-        ("e.dat", dat((1, 2, 3, 2)), "polarity 2"),
+        ("e.dat", dat((1, 2, 3, 2)), "polarity is 2"),
         ("e.dat", dat((1, 640, 3, 1)), "x = 640"),
         ("e.dat", DAT.replace(b"Width 640", b"Width -6"), "Width as '-6'"),
     ],
@@ -285,7 +285,7 @@ def test_sizes_come_from_the_header_the_caller_or_the_events(tmp_path):
     with pytest.raises(FileFormatError, match=r"x = 9.*9 pixels"):
         read(path, width_px=9)
     path.write_bytes(evt2(0x80000000, evt2_event(1, 9, 5, 1)))
-    with pytest.raises(FileFormatError, match="width_px 640, but 641"):
+    with pytest.raises(FileFormatError, match="width_px 640 by the file, but 641"):
         read(path, width_px=641)
 
 

@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from codesign.errors import DomainError
+from codesign.events.spiking.srm import srm
 from codesign.events.spiking.surrogate import FastSigmoid, Laplace, Triangular
 
 KINDS = [Laplace, FastSigmoid, Triangular]
@@ -46,3 +47,29 @@ def test_laplace_is_the_published_formula():
 def test_parameters_are_checked(kind, alpha, beta, word):
     with pytest.raises(DomainError, match=word):
         kind(alpha, beta)
+
+
+@pytest.mark.parametrize(
+    "x", [None, "1", 0.5, [0.1], torch.ones(2, dtype=torch.int64), torch.ones(2).to_sparse()]
+)
+def test_surrogates_of_what_is_no_potential_are_refused(x):
+    for function in (Laplace(1.0, 1.0).torch_density, Laplace(1.0, 1.0).torch_integral):
+        with pytest.raises(DomainError, match="tensor of real numbers"):
+            function(x)
+
+
+@pytest.mark.parametrize("kernel", ["slayer", "thesis", "exp", "step"])
+def test_one_neuron_without_an_axis_is_truncated_as_with_one(kernel):
+    drive = torch.rand(30, dtype=torch.float64, generator=torch.Generator().manual_seed(3)) * 2
+    options = {
+        "theta": 1.0,
+        "tau_r": 2.0,
+        "kernel": kernel,
+        "response": "alpha",
+        "tau_s": 3.0,
+        "truncation": 1e-2,
+    }
+    bare, alone = srm(drive, **options), srm(drive[:, None], **options)
+    assert torch.equal(bare[0], alone[0][:, 0])
+    assert bare[0].sum() > 0
+    assert torch.equal(bare[1], alone[1][:, 0])

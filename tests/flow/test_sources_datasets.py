@@ -12,11 +12,11 @@ import torch
 
 from codesign import events
 from codesign.errors import DomainError, FileFormatError, ShapeError
+from codesign.events.formats.hdf5_rows import Rows
 from codesign.events.stream import ordered
 from codesign.flow.sources import DatasetWindows, RecordingWindows, open_windows
 from codesign.flow.sources.chain import chained
 from codesign.flow.sources.collate import bin_times
-from codesign.flow.sources.rows import Rows
 from codesign.render import flow_and_occlusion
 from scenes import worlds
 from studies.frame.run import main
@@ -260,9 +260,9 @@ def test_rows_refuse_what_the_library_would_end_the_process_on(tmp_path):
         rows.read(0, 40)
     for name, reason in (
         ("b", "went through the filters"),
-        ("c", "kept in other files"),
+        ("c", "absent or a link"),
         ("d", "no list of numbers"),
-        ("e", "no list of numbers"),
+        ("e", "absent or a link"),
     ):
         with pytest.raises(FileFormatError, match=reason):
             Rows(path, name)

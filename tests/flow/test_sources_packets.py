@@ -8,8 +8,6 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from codesign.errors import DomainError, FileFormatError
-from codesign.events import write
-from codesign.events.stream import ordered
 from codesign.flow.files import write_flow
 from codesign.flow.sources import PacketOptions, read_packets
 from codesign.flow.sources.calibration import read_calibration
@@ -174,29 +172,6 @@ def test_flows_outside_the_recording_are_counted(tmp_path):
     np.savez(tmp_path / "flow.npz", flow=field().numpy(), t0=5.0, t1=5.1)
     with pytest.raises(FileFormatError, match="are both on one clock"):
         read_packets(tmp_path / "a", tmp_path / "flow.npz")
-
-
-def test_every_kind_of_event_file_is_a_recording(tmp_path):
-    t_us, x, y, on = made(200, start_s=1.0)
-    t, column, row, p = (torch.from_numpy(values) for values in (t_us, x, y, 2 * on - 1))
-    stream = ordered(t, column, row, p, *DAVIS)
-    write(tmp_path / "a.h5", stream)
-    write(tmp_path / "a.aedat4", stream)
-    write(tmp_path / "a.npz", stream)
-    np.savez(
-        tmp_path / "b.npz",
-        t=t_us,
-        x=x.astype(np.int16),
-        y=y.astype(np.int16),
-        p=on.astype(np.uint8),
-        frames=np.zeros((2, *DAVIS), np.uint8),
-    )
-    np.save(tmp_path / "c.npy", np.column_stack([t_us * 1e-6, x, y, on]))
-    for name in ("a.h5", "a.aedat4", "a.npz", "b.npz", "c.npy"):
-        (packet,) = read_packets(tmp_path / name)
-        for key in ("t_us", "x", "y", "p"):
-            assert torch.equal(getattr(packet.stream, key), getattr(stream, key)), name
-        assert (packet.stream.height_px, packet.stream.width_px) == DAVIS
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ from kornia.geometry.calibration import distort_points
 from scipy.spatial.transform import Rotation
 
 from codesign.errors import DomainError, FileFormatError
-from codesign.flow.sources import read_text_events, text_events
+from codesign.events.formats import text as text_events
+from codesign.flow.sources import read_text_events
 from codesign.flow.sources.attitude import read_gyroscope, read_poses
 from codesign.flow.sources.calibration import Calibration, read_calibration, signed_axes
 from tests.recording_case import DAVIS, ETH_CALIBRATION, eth_text, made
@@ -44,20 +45,6 @@ def test_events_are_read_as_written_whatever_the_chunks(form, tmp_path, monkeypa
     check_events(read_text_events(path), columns)
 
 
-@pytest.mark.parametrize(
-    "head", ["t,x,y,p\n", "# t x y p\n", "# made by hand\n#\n", "timestamp,x,y,polarity\n", "240 180\n"]
-)
-def test_heads_of_text_files(head, tmp_path):
-    columns = made()
-    path = tmp_path / "events.csv"
-    path.write_text(head + eth_text(columns))
-    found = read_text_events(path)
-    check_events(found, columns)
-    assert ("first line" in found.size_from) == (head == "240 180\n")
-    path.write_text("p y x t\n" + eth_text(columns, "{p} {y} {x} {t:.6f}\n"))
-    check_events(read_text_events(path), columns)
-
-
 def test_the_sensor_is_the_one_told_or_the_smallest_that_holds_the_events(tmp_path):
     path = tmp_path / "events.txt"
     for reach, size in (
@@ -72,55 +59,10 @@ def test_the_sensor_is_the_one_told_or_the_smallest_that_holds_the_events(tmp_pa
         found = read_text_events(path)
         assert (found.height_px, found.width_px) == size
     assert read_text_events(path, size=(700, 1300)).size_from == "the options"
-    with pytest.raises(FileFormatError, match=r"event 0 lies at x = 1280; the sensor has 1280 pixels"):
+    with pytest.raises(FileFormatError, match=r"line 1: .*x = 1280; the sensor has 1280 pixels"):
         read_text_events(path, size=(720, 1280))
-    with pytest.raises(FileFormatError, match=r"1281 x 5 pixels by the frames, but 1300 x 700 was asked for"):
+    with pytest.raises(FileFormatError, match=r"height_px 5 by the frames, but 700 was asked for"):
         read_text_events(path, size=(700, 1300), told=(5, 1281), told_by="the frames")
-
-
-@pytest.mark.parametrize(
-    ("line", "reason"),
-    [
-        ("0.3 1 2\n", "not an event of four"),
-        ("0.3 1 2 1 9\n", "not an event of four"),
-        ("0.3 1 two 1\n", "not an event of four"),
-        ("nan 1 2 1\n", "not an event of four"),
-        ("0.1 1 2 1\n", "before that of an earlier line"),
-        ("0.3 1.5 2 1\n", "whole numbers"),
-        ("0.3 -1 2 1\n", "whole numbers"),
-        ("0.3 1 2 7\n", "polarity is 1 or 0"),
-        ("1e40 1 2 1\n", "61 bits"),
-    ],
-)
-def test_a_wrong_line_is_named(line, reason, tmp_path, monkeypatch):
-    path = tmp_path / "events.txt"
-    good = "\n" + "".join(f"0.2{k:03d} 1 2 1\n" for k in range(299))  # empty lines count as lines
-    path.write_text(good + line + "0.5 1 2 1\n" * 40)
-    for chunk in (2**23, 640):
-        monkeypatch.setattr(text_events, "CHUNK_BYTES", chunk)
-        with pytest.raises(FileFormatError, match=rf"line 301: .*{reason}"):
-            read_text_events(path)
-
-
-def test_files_that_hold_no_events(tmp_path):
-    path = tmp_path / "events.txt"
-    for content, reason in (
-        (b"", "holds no event"),
-        (b"# nothing\n", "holds no event"),
-        (b"a b c\n", "line 1"),
-        (bytes(range(256)) * 90, "line"),
-    ):
-        path.write_bytes(content)
-        with pytest.raises(FileFormatError, match=reason):
-            read_text_events(path)
-    with pytest.raises(FileFormatError, match="cannot read"):
-        read_text_events(tmp_path / "absent.txt")
-
-
-def test_events_a_little_late_are_put_in_order(tmp_path):
-    path = tmp_path / "events.txt"
-    path.write_text("0.100000 1 1 1\n0.100500 2 2 1\n0.100200 3 3 0\n0.101000 4 4 0\n")
-    np.testing.assert_array_equal(read_text_events(path).x, [1, 3, 2, 4])
 
 
 # the camera and how it turns

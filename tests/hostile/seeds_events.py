@@ -56,15 +56,38 @@ def dsec(packing=None) -> Callable[[], bytes]:
     return made
 
 
-def v2e():
-    import h5py
-
-    buffer = io.BytesIO()
+def rows(order: str, seconds: bool) -> np.ndarray:
+    """[N, 4] events, the columns in this order; times in seconds, or all whole numbers."""
     given = stream()
-    with h5py.File(buffer, "w") as file:
-        rows = torch.stack((given.t_us, given.x, given.y, (given.p > 0).long()), 1)
-        file.create_dataset("events", data=rows.numpy().astype(np.uint32), compression="gzip", chunks=(50, 4))
-    return buffer.getvalue()
+    columns = {
+        "t": given.t_us * 1e-6 if seconds else given.t_us,
+        "x": given.x,
+        "y": given.y,
+        "p": given.p > 0,
+    }
+    return np.stack([columns[letter].numpy() for letter in order], 1)
+
+
+def hdf5(name: str, order: str, seconds: bool) -> Callable[[], bytes]:
+    """A file of v2e's or MVSEC's layout."""
+
+    def made():
+        import h5py
+
+        buffer = io.BytesIO()
+        with h5py.File(buffer, "w") as file:
+            data = rows(order, seconds) if seconds else rows(order, seconds).astype(np.uint32)
+            file.create_dataset(name, data=data, compression="gzip", chunks=(50, 4))
+            file["davis/left/image_raw" if seconds else "frame"] = np.zeros((1, *SIZE), np.uint8)
+        return buffer.getvalue()
+
+    return made
+
+
+def text(order: str, form: str, head: str = "") -> Callable[[], bytes]:
+    """Lines of four numbers, as other programs write them."""
+    lines = (form.format(**dict(zip(order, row, strict=True))) for row in rows(order, True).tolist())
+    return (head + "".join(lines)).encode
 
 
 def arrays(packed: bool, **values) -> Callable[[], bytes]:
@@ -125,7 +148,16 @@ SEEDS: dict[str, Seed] = {
     "gzip.h5": (dsec("gzip"), events.read),
     "blosc.h5": (dsec("blosc"), events.read),
     "plain.h5": (dsec(), events.read),
-    "v2e.h5": (v2e, events.read),
+    "v2e.h5": (hdf5("events", "txyp", False), events.read),
+    "mvsec.hdf5": (hdf5("davis/left/events", "xytp", True), events.read),
+    "ecd.txt": (text("txyp", "{t:.9f} {x:.0f} {y:.0f} {p:.0f}\n"), events.read),
+    "headed.txt": (text("xytp", "{x:.0f},{y:.0f},{t:.6f},{p:.0f}\n", "346 260\nx,y,t_s,p\n"), events.read),
+    "xytp.csv": (text("xytp", "{x:.0f},{y:.0f},{t:.6f},{p:.0f}\n"), events.read),
+    "rows.npy": (arrays(False, only=rows("txyp", True)), events.read),
+    "names.npz": (
+        lambda: arrays(True, **dict(zip("xytp", rows("xytp", True).T, strict=True)))(),
+        events.read,
+    ),
     "events.aedat4": (written(".aedat4"), events.read),
     "evt3.raw": (written(".raw", evt=3), events.read),
     "evt2.raw": (written(".raw", evt=2), events.read),

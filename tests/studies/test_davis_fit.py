@@ -310,7 +310,7 @@ def test_a_recording_is_read_and_a_bad_one_refused(tmp_path):
     inside = (stream.t_us > 14_000) & (stream.t_us <= 254_000)
     assert float(recording.counts(offset_s=0.004).sum()) == int(inside.sum())
     for changed, error, words in (
-        ({"x": None}, FileFormatError, "no entry 'x'"),
+        ({"x": None}, FileFormatError, "no array x"),
         ({"exposure": np.zeros((3, 2))}, FileFormatError, "exposure"),
         ({"frames": np.zeros((4, 40, 48)), "exposure": np.zeros((4, 2))}, ShapeError, "at least 5"),
     ):
@@ -318,7 +318,7 @@ def test_a_recording_is_read_and_a_bad_one_refused(tmp_path):
         with pytest.raises(error, match=words):
             load(path)
     path.write_bytes(b"no archive")
-    with pytest.raises(FileFormatError, match=r"use a whole \.npz file"):
+    with pytest.raises(FileFormatError, match="a recording holds"):
         load(path)
 
 

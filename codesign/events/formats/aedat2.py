@@ -54,7 +54,7 @@ def write_aedat2(path, stream):
     path.write_bytes(HEADER.format(chip).encode("ascii") + records.astype(">i4").tobytes())
 
 
-def read_aedat2(path, height_px=None, width_px=None):
+def read_aedat2(path, _):
     """Refuse: addresses depend on the camera, and the header does not reliably name it."""
     raise FileFormatError(
         f"{path}: AEDAT 2.0 is written, not read; convert the recording to .aedat4 or .raw."

@@ -54,8 +54,8 @@ INFO = """<dv version="2.0">
 """
 
 
-def read_aedat4(path, height_px=None, width_px=None):
-    """Read the events of ``path``; the sensor size is the header's. Frames, inertial data and triggers are
+def read_aedat4(path, asked):
+    """EventColumns of ``path``; the sensor size is the header's. Frames, inertial data and triggers are
     other streams (frames: see aedat4_frames).
 
     Raises: FileFormatError for damage, for a file cut short, without a single stream of events, or whose
@@ -70,22 +70,7 @@ def read_aedat4(path, height_px=None, width_px=None):
                 "us, which it does not hold; the file is damaged."
             )
     events = np.concatenate(parts) if parts else np.empty(0, EVENT)
-    if events.size and int(events["on"].max()) > 1:
-        at = int(np.argmax(events["on"] > 1))
-        raise FileFormatError(
-            f"{path}: event {at} has polarity {int(events['on'][at])}; 0 or 1 is allowed, the file is "
-            "damaged."
-        )
-    return arranged(
-        path,
-        events["t"],
-        events["x"],
-        events["y"],
-        events["on"],
-        size=size,
-        height_px=height_px,
-        width_px=width_px,
-    )
+    return arranged(path, asked, *(events[name] for name in ("t", "x", "y", "on")), size=size)
 
 
 def write_aedat4(path, stream):

@@ -1,100 +1,168 @@
-"""Events in the order a camera's file holds them, made a sorted stream; and the checks every binary format
-needs."""
+"""Events in the order a file holds them, packet by packet, checked and put in order; and what a format can hold."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 
 from codesign.errors import FileFormatError
-from codesign.events.stream import ordered
-from codesign.types import EventStream
+from codesign.events.columns import LIMIT_PX, EventColumns
 
 # read-out and packet merging swap neighbours within about a frame of the read-out; more than this is another
 # fault
 DISORDER_US = 1000
+LAST_US = 2**61
+MOST_EVENTS = 2_000_000_000
+BACKWARDS = "events_back_in_time"
+OFF_SENSOR = "events_off_sensor"
 
 
-def arranged(path, t_us, x, y, p, *, size=None, height_px=None, width_px=None):
-    """EventStream of events in file order.
+@dataclass(frozen=True)
+class Asked:
+    """What the caller says of a file.
 
-    Args:
-      path: the file, for messages.
-      t_us, x, y: [N] integer arrays. p: [N] array, positive for ON, otherwise OFF.
-      size: (height_px, width_px) from the file, or None where the format has no place for it.
-      height_px, width_px: what the caller says; must agree with ``size``. Without either the smallest sensor
-        that holds the events is taken.
-    Returns: EventStream sorted by (t, y, x, p).
-    Raises: FileFormatError for sizes that disagree, no size and no event, an event outside the sensor, or a
-      time more than DISORDER_US before an earlier one.
+    height_px, width_px: sensor size, or None. told: (height, width) by ``told_by``, which lies beside the file, or
+      None. sensors: name -> (width, height), of which the smallest that holds the events is taken where nothing
+      tells; without any, the smallest size that does.
+    columns: order of the columns of rows, four letters, or "auto". time_unit: s, ms, us, ns or "auto".
+    skip: faults whose events are left out and counted; None: where the caller cannot ask for that.
     """
-    height_px, width_px = settled_size(path, x, y, size, height_px, width_px)
-    for name, values, limit in (("x", x, width_px), ("y", y, height_px)):
-        if values.size and (int(values.min()) < 0 or int(values.max()) >= limit):
-            at = int(np.argmax((values < 0) | (values >= limit)))
-            raise FileFormatError(
-                f"{path}: event {at} lies at {name} = {int(values[at])}; the sensor has {limit} pixels "
-                f"there (0 to {limit - 1})."
-            )
-    t_us = np.ascontiguousarray(t_us, np.int64)
-    latest_us = np.maximum.accumulate(t_us)
-    late = t_us < latest_us - DISORDER_US
-    if bool(late.any()):
-        at = int(np.argmax(late))
-        lag_us = int(latest_us[at]) - int(t_us[at])
-        raise FileFormatError(
-            f"{path}: event {at} lies {lag_us} us before an earlier one; at most {DISORDER_US} us of "
-            "disorder is put in order."
+
+    height_px: int | None = None
+    width_px: int | None = None
+    told: tuple[int, int] | None = None
+    told_by: str = "the file"
+    sensors: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    columns: str = "auto"
+    time_unit: str = "auto"
+    skip: tuple[str, ...] | None = None
+
+
+class Arrival:
+    """The events of one file, on their way to EventColumns.
+
+    Args: path: for messages. size, size_from: (height_px, width_px) by the file, or None, and what in it says so.
+      place: what the events are numbered by.
+    Raises: FileFormatError for sizes that disagree.
+    """
+
+    def __init__(self, path, asked, size=None, size_from="the file", place="event"):
+        self.path = path
+        self.asked = asked
+        self.place = place
+        size, self.size_from = (size, size_from) if size else (asked.told, asked.told_by)
+        self.size = [asked.height_px, asked.width_px]
+        for k, name in enumerate(("height_px", "width_px")):
+            if size and self.size[k] not in (None, size[k]):
+                raise FileFormatError(
+                    f"{path} comes from a sensor with {name} {size[k]} by {self.size_from}, but {self.size[k]} was "
+                    "asked for."
+                )
+            self.size[k] = size[k] if size else self.size[k]
+        self.size_from = self.size_from if size else "the options"
+        self.left_out = dict.fromkeys(asked.skip or (), 0)
+        self.count = 0
+        self.latest_us = -LAST_US
+        self.off = None
+        self.parts = [(np.empty(0, np.int64), *[np.empty(0, np.int16)] * 2, np.empty(0, bool))]
+
+    def add(self, t_us, x, y, p, places=None):
+        """Take the events that follow.
+
+        Args: t_us, x, y, p: [N] numbers; p above 0 for ON, else 0, or -1. places: [N] line numbers, or None.
+        Raises: FileFormatError naming the first that is no event, lies outside the sensor or more than DISORDER_US
+          before an earlier one.
+        """
+        height, width = (LIMIT_PX if side is None else side for side in self.size)
+        latest_us = np.maximum(np.maximum.accumulate(t_us), self.latest_us) if len(t_us) else t_us
+        if self.off is None:
+            self.off = next(iter(p[(p == 0) | (p == -1)][:1].tolist()), None)
+        outside_x, outside_y = (
+            ~((values >= 0) & (values < limit)) | (values % 1 != 0)
+            for values, limit in ((x, width), (y, height))
         )
-    return _sorted(t_us, x, y, p, height_px, width_px)
-
-
-def settled_size(path, x, y, size, height_px, width_px):
-    """(height_px, width_px) from the file, the caller, or the events, in this order."""
-    for given, found, name in (
-        (height_px, size and size[0], "height_px"),
-        (width_px, size and size[1], "width_px"),
-    ):
-        if size and given is not None and given != found:
-            raise FileFormatError(
-                f"{path} comes from a sensor with {name} {found}, but {given} was asked for."
-            )
-    if size:
-        return size
-    if not x.size and (height_px is None or width_px is None):
-        raise FileFormatError(
-            f"{path} holds no event, so the sensor size cannot be told; pass height_px and width_px."
+        faults = (
+            ("", ~((t_us > -LAST_US) & (t_us < LAST_US)), self._bad_time),
+            (BACKWARDS, latest_us - t_us > DISORDER_US, self._late),
+            (OFF_SENSOR, outside_x, self._outside),
+            (OFF_SENSOR, outside_y, self._outside),
+            ("", ~((p == 1) | (p == (0 if self.off is None else self.off))), self._bad_polarity),
         )
-    return (
-        int(y.max()) + 1 if height_px is None else height_px,
-        int(x.max()) + 1 if width_px is None else width_px,
-    )
+        kept = np.ones(len(t_us), bool)
+        for fault, bad, say in faults:
+            bad &= kept
+            if fault in self.left_out:
+                self.left_out[fault] += int(bad.sum())
+                kept &= ~bad
+            elif bool(bad.any()):
+                at = int(np.argmax(bad))
+                number = self.count + at if places is None else places[at]
+                event = {"t": t_us[at], "x": x[at], "y": y[at], "p": p[at], "latest": latest_us[at]}
+                advice = (
+                    f", or leave such events out (skip: {fault})"
+                    if fault and self.asked.skip is not None
+                    else ""
+                )
+                raise FileFormatError(f"{self.path}, {self.place} {number}: {say(event)}{advice}.")
+        self.count += len(t_us)
+        self.latest_us = latest_us[-1] if len(t_us) else self.latest_us
+        if self.count > MOST_EVENTS:
+            raise FileFormatError(f"{self.path} holds more than {MOST_EVENTS} events; split it.")
+        t_us, x, y, p = (values[kept] for values in (t_us, x, y, p))
+        self.parts.append((t_us.astype(np.int64), x.astype(np.int16), y.astype(np.int16), p > 0))
+
+    def columns(self):
+        """EventColumns of all that was taken. Raises: FileFormatError where neither anything nor anybody tells the
+        sensor size."""
+        t_us, x, y, on = (np.concatenate(column) for column in zip(*self.parts, strict=True))
+        self.parts.clear()
+        if bool((t_us[1:] < t_us[:-1]).any()):
+            order = np.argsort(t_us, kind="stable")
+            t_us, x, y, on = (values[order] for values in (t_us, x, y, on))
+        height, width, size_from = self._settled(x, y)
+        return EventColumns(t_us, x, y, on, height, width, size_from, self.left_out)
+
+    def _settled(self, x, y):
+        height, width = self.size
+        if height is not None and width is not None:
+            return height, width, self.size_from
+        if not len(x):
+            raise FileFormatError(
+                f"{self.path} holds no event, so the sensor size cannot be told; pass height_px and width_px."
+            )
+        needed = max(int(x.max()) + 1, width or 1), max(int(y.max()) + 1, height or 1)
+        for name, sensor in self.asked.sensors.items():
+            if sensor[0] >= needed[0] and sensor[1] >= needed[1]:
+                return sensor[1], sensor[0], f"{name}, the smallest known sensor that holds the events"
+        return height or needed[1], width or needed[0], "the events themselves"
+
+    def _bad_time(self, event):
+        return f"its time is {event['t']} us; 61 bits of microseconds are read"
+
+    def _late(self, event):
+        lag_us = int(event["latest"]) - int(event["t"])
+        return (
+            f"it lies {lag_us} us before an earlier one; at most {DISORDER_US} us of disorder is put in order"
+        )
+
+    def _outside(self, event):
+        for name, limit in zip("yx", self.size, strict=True):
+            value, most = event[name], LIMIT_PX if limit is None else limit
+            if not (0 <= value < most and value % 1 == 0):
+                by = f" by {self.size_from}" if limit is not None else ", as far as sensors are known,"
+                said = f"{name} = {value:.15g}; the sensor has {most} pixels there{by} (0 to {most - 1}, whole numbers)"
+        return f"it lies at {said}; give its true size"
+
+    def _bad_polarity(self, event):
+        off = "0 or -1" if self.off is None else f"{self.off:g}, as in the events before"
+        return f"its polarity is {event['p']:g}; 1 for ON, {off}, for OFF is allowed"
 
 
-def _sorted(t_us, x, y, p, height_px, width_px):
-    """Sort by one packed key where time and pixel fit 63 bits together: several times faster than sorting
-    indices."""
-    cells = 2 * height_px * width_px
-    span_us = int(t_us.max()) - int(t_us.min()) + 1 if t_us.size else 0
-    if span_us * cells >= 2**63:
-        signed = np.where(np.asarray(p) > 0, 1, -1)
-        return ordered(_tensor(t_us), _tensor(x), _tensor(y), _tensor(signed), height_px, width_px)
-    first_us = int(t_us.min()) if t_us.size else 0
-    key = (t_us - first_us) * cells + (np.asarray(y, np.int64) * width_px + x) * 2 + (np.asarray(p) > 0)
-    if key.size and bool((key[1:] < key[:-1]).any()):
-        key.sort(kind="stable")  # nearly sorted already: runs are merged
-    since_us, cell = np.divmod(key, cells)
-    row, column = np.divmod(cell >> 1, width_px)
-    return EventStream(
-        _tensor(since_us + first_us),
-        _tensor(column),
-        _tensor(row),
-        _tensor((cell & 1) * 2 - 1),
-        int(height_px),
-        int(width_px),
-    )
-
-
-def _tensor(values):
-    return torch.from_numpy(np.asarray(values, np.int64))
+def arranged(path, asked, t_us, x, y, p, size=None):
+    """EventColumns of the events of a file, all at once; see Arrival."""
+    arrival = Arrival(path, asked, size)
+    arrival.add(t_us, x, y, p)
+    return arrival.columns()
 
 
 def columns(stream, *, height_limit_px, width_limit_px, first_us, last_us, name, t0_us=None):

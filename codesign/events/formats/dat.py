@@ -19,9 +19,8 @@ LOOP_US = 2**32
 SIDE_PX = 2**14
 
 
-def read_dat(path, height_px=None, width_px=None):
-    """Read events from ``path``; the sensor size is the header's, else the caller's, else the smallest that
-    holds the events. A header with nothing behind it, as faery writes for no events, is an empty stream.
+def read_dat(path, asked):
+    """EventColumns of ``path``. A header with nothing behind it, as faery writes for no events, is an empty stream.
 
     Raises: FileFormatError for another version or event type, a damaged header, a file cut amid an event, an
       unknown polarity, or time going back.
@@ -44,23 +43,9 @@ def read_dat(path, height_px=None, width_px=None):
         )
     events = np.frombuffer(body, EVENT, offset=2)
     address = events["address"].astype(np.int64)
-    on = address >> 28
-    if on.size and int(on.max()) > 1:
-        at = int(np.argmax(on > 1))
-        raise FileFormatError(
-            f"{path}: event {at} has polarity {int(on[at])}; 0 or 1 is allowed, the file is damaged."
-        )
     t_us = unwrapped(events["t"].astype(np.int64), LOOP_US) + start_us(path, fields)
-    return arranged(
-        path,
-        t_us,
-        address & 0x3FFF,
-        address >> 14 & 0x3FFF,
-        on,
-        size=_size(path, fields),
-        height_px=height_px,
-        width_px=width_px,
-    )
+    x, y = address & 0x3FFF, address >> 14 & 0x3FFF
+    return arranged(path, asked, t_us, x, y, address >> 28, size=_size(path, fields))
 
 
 def write_dat(path, stream, *, t0_us=0):

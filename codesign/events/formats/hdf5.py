@@ -1,39 +1,125 @@
-"""Event streams in HDF5: DSEC's layout (read and written) and v2e's (read)."""
+"""Event streams in HDF5: DSEC's layout (a group ``events`` of t, x, y, p; read and written), v2e's (a dataset
+``events`` of rows t, x, y, p in microseconds) and MVSEC's (``davis/left/events``, rows x, y, t, p in seconds).
 
-import zlib
+Sources: DSEC: see dsec. v2e, class EventEmulator, output ``dvs_h5`` (Hu et al., CVPRW 2021). Zhu et al., "The
+  Multivehicle Stereo Event Camera Dataset", RA-L 2018.
+"""
+
+import numpy as np
 
 from codesign.errors import FileFormatError
-from codesign.events.formats.dsec import from_dsec, to_dsec
-from codesign.events.formats.hdf5_chunks import h5py, values
-from codesign.events.formats.v2e_hdf5 import from_v2e
-from codesign.reading import reading
+from codesign.events.formats.arrival import DISORDER_US, Arrival, Asked
+from codesign.events.formats.dsec import check_index, pixels, to_dsec
+from codesign.events.formats.hdf5_chunks import h5py
+from codesign.events.formats.hdf5_rows import REMEDY, Rows, own, scalar
+from codesign.events.formats.tables import microseconds, settled_order, settled_unit, signed
+from codesign.reading import check_regular, reading
 
-# all that h5py raises on damaged files
-LIBRARY_ERRORS = (
-    OSError,
-    RuntimeError,
-    KeyError,
-    ValueError,
-    TypeError,
-    AttributeError,
-    NotImplementedError,
-    MemoryError,
-    OverflowError,
-    zlib.error,
-)
+MVSEC = "davis/left"
 EVENTS_PER_CHUNK = 2**17
+BLOCK = 2**20  # events that are read at once
+FINE = 4096  # events that are read to find one
 
 
-def read_hdf5(path, height_px=None, width_px=None):
-    """Read events from ``path``, in DSEC's layout (a group ``events`` of t, x, y, p) or v2e's (a dataset
-    ``events`` of rows).
+class Hdf5Events:
+    """The events of a file in any of the layouts, by number or by time.
 
-    Raises: FileFormatError for another layout, damage, data kept in other files, and what dsec and v2e_hdf5
-      refuse.
+    Args: path: file. asked: see Asked.
+    size_px: (height, width) where the file tells, else None. rows: of t, x, y, p, or of all four together ("rows").
+    Raises: FileFormatError for another layout, damage, and data kept in other files.
     """
-    with reading(path, "it is no whole HDF5 file of events"), h5py.File(path, "r", locking=False) as file:
-        from_layout, arrays, attributes = _contents(path, file)
-    return from_layout(path, arrays, attributes, height_px, width_px)
+
+    def __init__(self, path, asked=None):
+        self.path = check_regular(path)
+        self.asked = Asked() if asked is None else asked
+        self.index = None
+        self.offset_us = 0
+        with reading(path, REMEDY), h5py.File(path, "r", locking=False) as file:
+            names = set(file.keys())
+            name = f"{MVSEC}/events" if "davis" in names else "events"
+            events = own(path, file, name)
+            grouped = isinstance(events, h5py.Group)
+            pictures = f"{MVSEC}/image_raw" if "davis" in names else "frame"
+            beside = own(path, file, pictures) if not grouped and pictures in file else None
+            self.size_px = tuple(beside.shape[1:]) if getattr(beside, "ndim", 0) == 3 else None
+            if grouped and {"height_px", "width_px"} & set(events.attrs):
+                self.size_px = tuple(pixels(path, events.attrs, name) for name in ("height_px", "width_px"))
+            self.size_from = "the file" if grouped else "its frames"
+        if not grouped:
+            self.rows = {"rows": Rows(path, name, [4])}
+            first = self.rows["rows"].read(0, min(BLOCK, len(self)))
+            self.order = settled_order(
+                path, first, self.asked.columns, "xytp" if "davis" in names else "txyp"
+            )
+            unit = "s" if "davis" in names and self.asked.time_unit == "auto" else self.asked.time_unit
+            self.unit = settled_unit(first[:, self.order.index("t")], unit)
+            return
+        self.rows = {"t": Rows(path, "events/t", [])}
+        self.rows |= {key: Rows(path, f"events/{key}", [], len(self)) for key in "xyp"}
+        if any(rows.dtype.kind not in "iu" for rows in self.rows.values()):
+            raise FileFormatError(
+                f"{path}: t, x, y, p under events are no whole numbers, as in DSEC's layout."
+            )
+        self.offset_us = scalar(path, "t_offset")
+        if "ms_to_idx" in names:
+            index = Rows(path, "ms_to_idx", [])
+            self.index = index.read(0, len(index)).astype(np.int64)
+            if bool((np.diff(self.index, prepend=0, append=len(self)) < 0).any()):
+                raise FileFormatError(
+                    f"{path}: ms_to_idx is no index of its {len(self)} events; the file is damaged."
+                )
+
+    def __len__(self):
+        return len(next(iter(self.rows.values())))
+
+    def packet(self, first, last):
+        """t_us, x, y, p of the events first to last - 1."""
+        if "rows" in self.rows:
+            table = self.rows["rows"].read(first, last)
+            t, x, y, p = (table[:, self.order.index(letter)] for letter in "txyp")
+            return microseconds(t, self.unit), x, y, p
+        t, x, y, p = (self.rows[letter].read(first, last) for letter in "txyp")
+        return signed(t) + self.offset_us, x, y, p
+
+    def columns(self):
+        """EventColumns of all."""
+        arrival = Arrival(self.path, self.asked, self.size_px, self.size_from)
+        for first in range(0, len(self), BLOCK):
+            packet = self.packet(first, min(first + BLOCK, len(self)))
+            arrival.add(*packet)
+            if self.index is not None:
+                check_index(self.path, packet[0] - self.offset_us, first, self.index)
+        return arrival.columns()
+
+    def window(self, t0_us, t1_us, size_px):
+        """EventStream of the events from t0_us to t1_us, both included, of a sensor of ``size_px``; a few blocks are
+        read, not the file."""
+        if self.index is not None:
+            edges = (t0_us - self.offset_us) // 1000, (t1_us - self.offset_us) // 1000 + 1
+            low, high = (
+                int(np.append(self.index, len(self))[min(max(k, 0), len(self.index))]) for k in edges
+            )
+        else:
+            low, high = self._place(t0_us - DISORDER_US), self._place(t1_us + DISORDER_US + 1)
+        packet = self.packet(low, high)
+        inside = np.flatnonzero((packet[0] >= t0_us) & (packet[0] <= t1_us))
+        arrival = Arrival(self.path, Asked(*size_px))
+        arrival.add(*(values[inside] for values in packet), places=low + inside)
+        return arrival.columns().stream()
+
+    def _place(self, t_us):
+        """Number of an event not before a time, behind one before it, by bisection."""
+        low = 0
+        high = len(self)
+        while high - low > FINE:
+            middle = (low + high) // 2
+            low, high = (middle, high) if self.packet(middle, middle + 1)[0][0] < t_us else (low, middle)
+        return low + int(np.searchsorted(self.packet(low, high)[0], t_us))
+
+
+def read_hdf5(path, asked):
+    """EventColumns of ``path``. Raises: FileFormatError, as Hdf5Events, and what arrival refuses."""
+    return Hdf5Events(path, asked).columns()
 
 
 def write_hdf5(path, stream):
@@ -54,42 +140,3 @@ def write_hdf5(path, stream):
                 }
             file.create_dataset(name, data=array, **packing)
         file["events"].attrs.update(attributes)
-
-
-def _contents(path, file):
-    """(function that makes the stream, arrays by name, attributes) of an open file."""
-    events = _own(path, file, "events")
-    if isinstance(events, h5py.Group):
-        names = [
-            "events/t",
-            "events/x",
-            "events/y",
-            "events/p",
-            "t_offset",
-            *(name for name in ("ms_to_idx",) if name in file),
-        ]
-        attributes = {name: events.attrs[name] for name in ("height_px", "width_px") if name in events.attrs}
-        return (
-            from_dsec,
-            {name.removeprefix("events/"): values(path, _own(path, file, name), name) for name in names},
-            attributes,
-        )
-    frames = _own(path, file, "frame") if "frame" in file else None
-    size = ()
-    if frames is not None and isinstance(frames, h5py.Dataset) and frames.ndim == 3:
-        size = frames.shape[1:]
-    return (
-        from_v2e,
-        {"events": values(path, events, "events")},
-        dict(zip(("height_px", "width_px"), size, strict=False)),
-    )
-
-
-def _own(path, file, name):
-    """The object of a name, which must lie in this file."""
-    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-        raise FileFormatError(
-            f"{path}: {name} is absent or a link to another file; files must hold their own data (t, x, y, "
-            "p under events, and t_offset)."
-        )
-    return file[name]

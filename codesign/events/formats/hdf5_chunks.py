@@ -28,54 +28,6 @@ LIMIT_RATIO = 4096
 LIMIT_EXTRA_BYTES = 2**20
 
 
-def values(path, dataset, name):
-    """The numpy array of a dataset of whole numbers, all of whose data lie in this file.
-
-    Args: path, name: file and dataset, for messages. dataset: h5py.Dataset.
-    Raises: FileFormatError for another type, data in other files, missing or damaged blocks, or other
-      filters.
-    """
-    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "iu" or dataset.shape is None:
-        raise FileFormatError(
-            f"{path}: {name} is no list of whole numbers; t, x, y, p under events (DSEC) or rows of four in "
-            "events (v2e) are needed."
-        )
-    if dataset.is_virtual or dataset.external:
-        raise FileFormatError(f"{path}: {name} is kept in other files; files must hold their own data.")
-    file_bytes = path.stat().st_size
-    if dataset.chunks is None:
-        if dataset.size * dataset.dtype.itemsize > file_bytes:
-            raise FileFormatError(
-                f"{path}: {name} claims {dataset.size} values, more than the file has; it was cut or is "
-                "damaged."
-            )
-        return np.asarray(dataset[()])
-    places = places_of(path, dataset, name, file_bytes)
-    plist = dataset.id.get_create_plist()
-    filters = [plist.get_filter(k) for k in range(plist.get_nfilters())]
-    kinds = [kind for kind, *_ in filters]
-    if kinds == [BLOSC]:
-        check_blosc(path, dataset, name, places, filters[0][2])
-        return np.asarray(dataset[()])
-    if not set(kinds) <= {GZIP, SHUFFLE, FLETCHER32} or len(set(kinds)) < len(kinds):
-        raise FileFormatError(
-            f"{path}: {name} went through the filters {kinds}; gzip, shuffle, fletcher32, or Blosc alone "
-            "are read; write it anew with gzip."
-        )
-    found = np.empty(dataset.shape, dataset.dtype)
-    for at, mask, _ in places:
-        data = dataset.id.read_direct_chunk(at)[1]
-        for k in reversed(range(len(kinds))):
-            if not mask >> k & 1:
-                data = undone(path, name, kinds[k], filters[k][2], data, chunk_bytes(dataset))
-        if len(data) != chunk_bytes(dataset):
-            raise damaged(path, name, at)
-        block = np.frombuffer(data, dataset.dtype).reshape(dataset.chunks)
-        place = tuple(slice(first, first + length) for first, length in zip(at, dataset.chunks, strict=True))
-        found[place] = block[tuple(slice(0, length) for length in found[place].shape)]
-    return found
-
-
 def chunk_bytes(dataset):
     return math.prod(dataset.chunks) * dataset.dtype.itemsize
 

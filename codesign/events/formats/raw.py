@@ -21,9 +21,8 @@ SIDE_PX = 2048  # 11 bits
 GEOMETRY = re.compile(r"(\d{1,5})x(\d{1,5})")
 
 
-def read_raw(path, height_px=None, width_px=None):
-    """Read events from ``path``; the sensor size is the header's, else the caller's, else the smallest that
-    holds the events.
+def read_raw(path, asked):
+    """EventColumns of ``path``.
 
     Events before the first word that gives a time or row are left out with a warning: recordings may start
     amid the camera's words.
@@ -46,9 +45,7 @@ def read_raw(path, height_px=None, width_px=None):
             stacklevel=2,
         )
     t_us += start_us(path, fields)
-    return arranged(
-        path, t_us, x, y, p, size=_size(path, fields, options), height_px=height_px, width_px=width_px
-    )
+    return arranged(path, asked, t_us, x, y, p, size=_size(path, fields, options))
 
 
 def write_raw(path, stream, *, evt=3, t0_us=0):

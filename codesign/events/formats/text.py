@@ -1,91 +1,139 @@
-"""Event streams as CSV: a header line ``t,x,y,p``, then one event per line, t in whole microseconds, p +1 or
--1."""
+"""Events as text, one per line: ``t x y p`` as in the Event-Camera Dataset, or what a header line says.
 
+Times with a fraction are seconds, whole ones microseconds; p is 1 and 0, or +1 and -1. Numbers are separated
+by blanks or commas. A first line of two whole numbers is the sensor's width and height; lines that begin with
+# are skipped at the top. Written: a header line ``t,x,y,p``, t in whole microseconds, p +1 or -1.
+Source: Mueggler et al., IJRR 2017 (layout of events.txt).
+"""
+
+import contextlib
+import io
 import re
+import warnings
 
 import numpy as np
-import torch
 
 from codesign.errors import FileFormatError
-from codesign.events.stream import ordered
+from codesign.events.columns import LIMIT_PX
+from codesign.events.formats.arrival import LAST_US, Arrival, columns
+from codesign.events.formats.tables import NAMES, microseconds, settled_order, settled_unit
 
-HEADER = "t,x,y,p"
-LINE = re.compile(r"\s*[+-]?\d{1,19}\s*(,\s*[+-]?\d{1,19}\s*){3}")
+CHUNK_BYTES = 2**23
+LETTERS = {name: letter for letter, names in NAMES.items() for name in names}
+NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 def write_csv(path, stream):
     """Write events to ``path``. The format has no place for the sensor size: pass it when reading."""
-    rows = torch.stack((stream.t_us, stream.x, stream.y, stream.p), dim=1).cpu().numpy()
-    np.savetxt(path, rows, fmt="%d", delimiter=",", header=HEADER, comments="")
+    limits = {"height_limit_px": LIMIT_PX, "width_limit_px": LIMIT_PX}
+    rows = columns(stream, first_us=1 - LAST_US, last_us=LAST_US - 1, name="CSV", **limits)
+    np.savetxt(path, np.stack(rows, 1), fmt="%d", delimiter=",", header="t,x,y,p", comments="")
 
 
-def read_csv(path, height_px=None, width_px=None):
-    """Read events from ``path``; the sensor size is the smallest that holds them unless given.
+def read_text(path, asked):
+    """EventColumns of a text file, eight megabytes at a time.
 
-    Raises: FileFormatError naming the first line that is not four whole numbers, goes back in time, or has a
-      negative pixel or unknown polarity (+1 and -1, or 1 and 0, are read as ON and OFF); also without events
-      and without a size.
+    Raises: FileFormatError naming the line that is not four numbers, and what tables and arrival refuse.
     """
-    try:
-        with open(path, encoding="ascii", newline=None) as file:
-            lines = file.read().split("\n")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(
-            f"{path} is not a text file (byte {error.start} is {error.object[error.start]:#x}); CSV events "
-            "are plain ASCII."
-        ) from error
-    if lines[0].strip() != HEADER:
-        raise FileFormatError(f"{path}, line 1: {lines[0][:60]!r} found, the header {HEADER!r} is needed.")
-    if lines[-1] == "":
-        lines.pop()
-    rows = _parse(path, lines[1:])
-    for bad, reason in (
-        (
-            np.flatnonzero(np.diff(rows[:, 0], prepend=rows[:1, 0]) < 0),
-            "its time lies before that of the line above",
-        ),
-        (np.flatnonzero((rows[:, 1:3] < 0).any(axis=1)), "pixel coordinates are 0 or more"),
-        (np.flatnonzero(~np.isin(rows[:, 3], (-1, 0, 1))), "polarity is +1 or -1 (or 1 and 0)"),
-        (
-            np.flatnonzero(rows[:, 3] == 0) if (rows[:, 3] == -1).any() else np.empty(0, int),
-            "polarity 0 in a file that also holds -1",
-        ),
-        (
-            np.flatnonzero(rows[:, 1] >= (np.inf if width_px is None else width_px)),
-            f"x is below the width, {width_px}",
-        ),
-        (
-            np.flatnonzero(rows[:, 2] >= (np.inf if height_px is None else height_px)),
-            f"y is below the height, {height_px}",
-        ),
-    ):
-        if bad.size:
-            raise FileFormatError(f"{path}, line {bad[0] + 2}: {lines[bad[0] + 1]!r}: {reason}.")
-    if not len(rows) and (height_px is None or width_px is None):
-        raise FileFormatError(
-            f"{path} holds no event, so the sensor size cannot be told; pass height_px and width_px."
-        )
-    t_us, x, y, p = torch.from_numpy(rows).unbind(1)
-    height_px = int(y.max()) + 1 if height_px is None else height_px
-    width_px = int(x.max()) + 1 if width_px is None else width_px
-    return ordered(t_us, x, y, torch.where(p > 0, 1, -1), height_px, width_px)
+    with open(path, "rb") as file:
+        number, names, size = _head(path, file)
+        arrival = Arrival(path, asked, size, "its first line", "line")
+        order, unit = "".join(LETTERS[name] for name in names), asked.time_unit
+        order = asked.columns if asked.columns != "auto" or not names else order
+        while lines := _whole_lines(path, file, number):
+            table, at_lines = _table(path, lines, number)
+            if not arrival.count and len(table):
+                order = settled_order(path, table, order)
+                name = next((name for name in names if LETTERS[name] == "t"), "")
+                unit = settled_unit(table[:, order.index("t")], unit, name)
+            if len(table):
+                t, x, y, p = (table[:, order.index(letter)] for letter in "txyp")
+                arrival.add(microseconds(t, unit), x, y, p, at_lines)
+            number += lines.count(b"\n")
+    return arrival.columns()
 
 
-def _parse(path, lines):
-    """[N, 4] int64 of lines of four whole numbers."""
-    for number, line in enumerate(lines, start=2):
-        if LINE.fullmatch(line) is None:
-            raise FileFormatError(
-                f"{path}, line {number}: {line[:60]!r} is not four whole numbers ({HEADER})."
-            )
-    if not lines:
-        return np.empty((0, 4), np.int64)
-    try:
-        return np.loadtxt(lines, dtype=np.int64, delimiter=",", ndmin=2, comments=None)
-    except ValueError as error:  # all are numbers, so one is too large
-        number, line = next(
-            (n, line)
-            for n, line in enumerate(lines, start=2)
-            if any(not -(2**63) <= int(value) < 2**63 for value in line.split(","))
-        )
-        raise FileFormatError(f"{path}, line {number}: {line[:60]!r} exceeds 64-bit integers.") from error
+def _head(path, file):
+    """(number of the first line behind comments, a header, or a size at the top of the file; names of the header, or
+    ""; (height, width) or None)."""
+    used = 0
+    names: list[str] = []
+    told = None
+    while True:
+        here = file.tell()
+        line = file.readline(4096)
+        words = line.decode("latin-1").lower().replace(",", " ").split()
+        if line.startswith(b"#"):
+            words = " ".join(words).removeprefix("#").split()
+        if line.startswith(b"#") and (not words or words[0] not in LETTERS):
+            used += 1
+        elif words and not names and not NUMBER.fullmatch(words[-1].encode("latin-1")):
+            names = words
+            if sorted(LETTERS.get(name, "?") for name in names) != ["p", "t", "x", "y"]:
+                raise FileFormatError(
+                    f"{path}, line {used + 1}: {line[:60].decode('ascii', 'replace').rstrip()!r} is neither "
+                    "an event of four numbers nor a header that names t, x, y, p."
+                )
+            used += 1
+        elif len(words) == 2 and told is None and all(word.isdigit() for word in words):
+            used += 1
+            told = (int(words[1]), int(words[0]))
+            if not all(1 <= side <= LIMIT_PX for side in told):
+                raise FileFormatError(
+                    f"{path}, line {used}: a sensor of {' x '.join(words)[:60]} pixels is announced; 1 to {LIMIT_PX} a "
+                    "side are possible."
+                )
+        else:
+            file.seek(here)
+            return used + 1, names, told
+
+
+def _whole_lines(path, file, number):
+    """The next bytes up to the end of a line; empty at the end of the file."""
+    block = file.read(CHUNK_BYTES)
+    if block and not block.endswith(b"\n"):
+        block += file.readline(4096)
+        if not block.endswith(b"\n"):
+            if file.read(1):
+                raise FileFormatError(
+                    f"{path}: a line after line {number} is longer than 4096 bytes; this is no text file of "
+                    "events."
+                )
+            block += b"\n"
+    return block.replace(b",", b" ") if b"," in block else block
+
+
+def _table(path, lines, number):
+    """[N, 4] int64 or float64 of whole lines, and the number of the line of each row. Every line must hold four
+    numbers or nothing."""
+    raw = np.frombuffer(lines, np.uint8)
+    blank = raw <= 32
+    starts = ~blank & np.concatenate([[True], blank[:-1]])
+    ends = np.flatnonzero(raw == 10)
+    words = np.diff(np.cumsum(starts, dtype=np.int64)[ends], prepend=0)
+    wrong = np.flatnonzero((words != 4) & (words != 0))
+    if wrong.size:
+        raise _bad(path, lines, number, int(wrong[0]))
+    rows = np.flatnonzero(words)
+    found = np.empty(0)
+    for kind in (np.int64, np.float64):  # whole numbers stay exact
+        # what numpy says where it meets no number, older versions by a warning
+        with contextlib.suppress(ValueError, DeprecationWarning), warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)
+            found = np.fromstring(lines.decode("latin-1"), kind, sep=" ")
+            break
+    if len(found) != 4 * len(rows) or not np.isfinite(found).all():
+        for at, line in enumerate(io.BytesIO(lines)):
+            if line.strip() and not all(
+                NUMBER.fullmatch(word) and np.isfinite(float(word)) for word in line.split()
+            ):
+                raise _bad(path, lines, number, at)
+    return found.reshape(-1, 4), number + rows
+
+
+def _bad(path, lines, number, at):
+    number += at
+    line = lines.split(b"\n", at + 1)[at][:60].decode("ascii", "replace").rstrip()
+    return FileFormatError(
+        f"{path}, line {number}: {line!r} is not an event of four finite numbers (t x y p)."
+    )

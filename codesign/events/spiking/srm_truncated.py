@@ -101,7 +101,7 @@ def cut_taps(shape, h, amplitude, cut, pixels):
         taps = amplitude * shape(h, k)
         kept = ~((taps.detach().abs() < cut) & (k * h.detach() > 1))
         if not bool(kept[-1].any()):
-            return torch.where(kept, taps, 0)[: int(kept.flatten(1).any(1).sum())]
+            return torch.where(kept, taps, 0)[: int(kept.reshape(lags, -1).any(1).sum())]
         lags *= 2
 
 

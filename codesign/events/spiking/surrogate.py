@@ -70,12 +70,22 @@ class Surrogate:
         raise NotImplementedError
 
     def torch_density(self, x: Tensor) -> Tensor:
-        """rho(x) of a torch tensor."""
-        return self.density(TORCH, x, *astuple(self))
+        """rho(x) of a torch tensor of real numbers. Raises: DomainError for anything else."""
+        return self.density(TORCH, _real(x), *astuple(self))
 
     def torch_integral(self, x: Tensor) -> Tensor:
-        """Integral of rho up to a torch tensor x, differentiable."""
-        return self.integral(TORCH, x, *astuple(self))
+        """Integral of rho up to a torch tensor x of real numbers, differentiable. Raises: DomainError for anything
+        else."""
+        return self.integral(TORCH, _real(x), *astuple(self))
+
+
+def _real(x):
+    if not isinstance(x, Tensor) or not x.is_floating_point() or x.layout != torch.strided:
+        given = f"{x.dtype}, {x.layout}" if isinstance(x, Tensor) else shown(x)
+        raise DomainError(
+            f"x is {given}; a dense tensor of real numbers, potential less threshold, is needed."
+        )
+    return x
 
 
 class Laplace(Surrogate):

@@ -16,16 +16,17 @@ import torch
 from torch import Tensor
 
 from codesign.errors import FileFormatError
-from codesign.events.formats.hdf5_chunks import h5py
+from codesign.events.formats.hdf5 import Hdf5Events
+from codesign.events.formats.hdf5_rows import Rows
 from codesign.flow.files import read_flow
 from codesign.flow.sources.collate import Crop, Sample, check_indices, check_lengths, collate
 from codesign.flow.sources.folders import natural
 from codesign.flow.sources.rectified import splatted
-from codesign.flow.sources.rows import Rows
-from codesign.reading import read_text, reading
+from codesign.reading import read_text
 from codesign.types import FlowWindows
 
 SIZE_PX = (480, 640)
+SLACK_US = 2000  # of the clock of the flow beyond the events
 PNG_START = b"\x89PNG\r\n\x1a\n"
 
 
@@ -98,60 +99,34 @@ class Sequence:
     def __init__(self, events: Path, flow: Path, size_px: tuple[int, int]) -> None:
         self.path = events / "events.h5"
         self.size_px = size_px
-        for path in (self.path, events / "rectify_map.h5"):
-            if not path.is_file():
-                raise FileFormatError(
-                    f"{path} is missing; DSEC's events come as two files, events.h5 and rectify_map.h5."
-                )
         self.map: np.ndarray = (
             Rows(events / "rectify_map.h5", "rectify_map", [size_px[1], 2], size_px[0])
             .read(0, size_px[0])
             .astype(np.float64)
         )
-        self.rows = {"t": Rows(self.path, "events/t", [])}
-        self.rows |= {name: Rows(self.path, f"events/{name}", [], len(self.rows["t"])) for name in "xyp"}
-        index = Rows(self.path, "ms_to_idx", [])
-        self.ms_to_idx = index.read(0, len(index)).astype(np.int64)
-        self.offset_us = _scalar(self.path, "t_offset")
-        if (
-            not len(index)
-            or bool((np.diff(self.ms_to_idx) < 0).any())
-            or not 0 <= self.ms_to_idx[0] <= self.ms_to_idx[-1] <= len(self.rows["t"])
-        ):
-            raise FileFormatError(
-                f"{self.path}: ms_to_idx is no index of its {len(self.rows['t'])} events; the file is "
-                "damaged."
-            )
+        self.events = Hdf5Events(self.path)
         self.files, self.spans_us = _flows(flow)
-        end_us = self.offset_us + 1000 * len(self.ms_to_idx)
-        outside = [span for span in self.spans_us if not self.offset_us <= span[0] < span[1] <= end_us]
+        first_us, last_us = (int(self.events.packet(k, k + 1)[0][0]) for k in (0, len(self.events) - 1))
+        outside = [
+            span
+            for span in self.spans_us
+            if not first_us - SLACK_US <= span[0] < span[1] <= last_us + SLACK_US
+        ]
         if outside:
             raise FileFormatError(
                 f"{flow} has a flow from {outside[0][0]} to {outside[0][1]} us; the events of {self.path} "
-                f"run from {self.offset_us} to about {end_us} us."
+                f"run from {first_us} to {last_us} us."
             )
 
     def rectified(self, t0_us: int, t1_us: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(t_us, x_px, y_px, on) of the events of a window, on the rectified picture."""
-        first = (t0_us - self.offset_us) // 1000
-        last = (t1_us - self.offset_us) // 1000 + 1
-        low = int(self.ms_to_idx[first])
-        high = int(self.ms_to_idx[last]) if last < len(self.ms_to_idx) else len(self.rows["t"])
-        columns = {name: self.rows[name].read(low, high).astype(np.int64) for name in "txyp"}
-        inside = (columns["t"] + self.offset_us >= t0_us) & (columns["t"] + self.offset_us <= t1_us)
-        t, x, y, p = (columns[name][inside] for name in "txyp")
-        height, width = self.size_px
-        if bool(((x < 0) | (x >= width) | (y < 0) | (y >= height) | (p < 0) | (p > 1)).any()):
-            raise FileFormatError(
-                f"{self.path} holds events outside {width} x {height} px or of another polarity than 0 and "
-                "1; it is damaged."
-            )
-        place = torch.from_numpy(self.map[y, x])
+        stream = self.events.window(t0_us, t1_us, self.size_px)
+        place = torch.from_numpy(self.map[stream.y.numpy(), stream.x.numpy()])
         if not bool(torch.isfinite(place).all()):
             raise FileFormatError(
                 f"{self.path.parent / 'rectify_map.h5'} is not finite where there are events."
             )
-        return torch.from_numpy(t + self.offset_us), place[:, 0], place[:, 1], torch.from_numpy(p == 1)
+        return stream.t_us, place[:, 0], place[:, 1], stream.p > 0
 
 
 def _places(folder):
@@ -200,12 +175,3 @@ def _flows(folder):
             if opened.read(8) != PNG_START:
                 raise FileFormatError(f"{file} is not a PNG file.")
     return files, [(int(found[1]), int(found[2])) for found in numbers if found]
-
-
-def _scalar(path, name):
-    """One whole number of a file."""
-    with reading(path), h5py.File(path, "r", locking=False) as file:
-        held = file.get(name)
-        if not isinstance(held, h5py.Dataset) or held.size != 1 or held.dtype.kind not in "iu":
-            raise FileFormatError(f"{path} has no whole number {name}, the start of its clock.")
-        return int(np.asarray(held[()]).reshape(-1)[0])

@@ -15,8 +15,8 @@ from codesign.reading import open_regular, reading
 
 # of several event files of one name the first of these kinds is read: text as the Event-Camera Dataset has it, what
 # cameras write, then arrays that somebody made of either
-KINDS = (".txt", ".csv", ".h5", ".aedat4", ".raw", ".dat")
-EVENT_SUFFIXES = {".txt", ".npy", *READERS}
+KINDS = (".txt", ".csv", ".h5", ".hdf5", ".aedat4", ".raw", ".dat")
+EVENT_SUFFIXES = set(READERS)
 FLOW_SUFFIXES = {".flo", ".png", ".npy", ".npz", ".mat", ".txt", ".csv"}
 SIDE_FILES = {
     "imu.txt",

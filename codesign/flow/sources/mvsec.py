@@ -19,18 +19,17 @@ from torch import Tensor
 
 from codesign.arrays import open_npz
 from codesign.errors import DomainError, FileFormatError
-from codesign.events.stream import ordered
+from codesign.events.formats.hdf5 import Hdf5Events
+from codesign.events.formats.hdf5_rows import Rows
 from codesign.events.volumes.volume import from_stream
 from codesign.flow.sources.chain import chained
 from codesign.flow.sources.collate import ALIKE, Crop, Sample, check_indices, collate
-from codesign.flow.sources.rows import Rows
-from codesign.types import EventStream, FlowWindows
+from codesign.types import FlowWindows
 
 DATA = "_data.hdf5"
 FLOW = "_gt_flow_dist.npz"
 COMPONENTS = ("x_flow_dist", "y_flow_dist")
 MOST_BYTES = 2**35  # of one of them: outdoors the file has 9.5 GB
-BLOCK = 4096  # events between the times that are kept to find a window
 
 
 class MvsecWindows:
@@ -97,7 +96,7 @@ class MvsecWindows:
         flow, valid = sequence.flow(t0_s, t1_s)
         t0_us = round(t0_s * 1e6)
         t1_us = round(t1_s * 1e6)
-        volume = from_stream(sequence.stream(t0_us, t1_us), t0_us, t1_us, self.bins)
+        volume = from_stream(sequence.events.window(t0_us, t1_us, sequence.size_px), t0_us, t1_us, self.bins)
         return Sample(volume.counts[0], flow.float(), valid, t1_s - t0_s)
 
 
@@ -126,14 +125,15 @@ class Sequence:
             )
         self.size_px = shape[1:]
         self.fields = None
-        self.events = Rows(data, "davis/left/events", [4])
+        self.events = Hdf5Events(data)
         frames = Rows(data, "davis/left/image_raw_ts", [])
         self.frame_s = frames.read(0, len(frames)).astype(np.float64)
         if len(self.events) < 2 or not _rise(self.frame_s):
             raise FileFormatError(
                 f"{data} has {len(self.events)} events, or frame times that do not rise; it is damaged."
             )
-        self.ends_s = float(self.events[0][2]), float(self.events[len(self.events) - 1][2])
+        ends_us = [float(self.events.packet(k, k + 1)[0][0]) for k in (0, len(self.events) - 1)]
+        self.ends_s = ends_us[0] * 1e-6, ends_us[1] * 1e-6
         if not all(map(math.isfinite, self.ends_s)):
             raise FileFormatError(f"{data}: its events run from {self.ends_s[0]} to {self.ends_s[1]} s.")
 
@@ -168,44 +168,6 @@ class Sequence:
             masks.append(seen)
             first += 1
         return chained(torch.stack(parts), torch.stack(masks))
-
-    def stream(self, t0_us: int, t1_us: int) -> EventStream:
-        """EventStream of the events from t0_us to t1_us, both included."""
-        low = self._place(t0_us * 1e-6 - 1e-6)
-        high = self._place(t1_us * 1e-6 + 1e-6)
-        rows = self.events.read(low, high).astype(np.float64)
-        x = rows[:, 0]
-        y = rows[:, 1]
-        t = rows[:, 2]
-        p = rows[:, 3]
-        t_us = np.rint(t * 1e6)
-        inside = (t_us >= t0_us) & (t_us <= t1_us)
-        wrong = ~(
-            (x % 1 == 0)
-            & (y % 1 == 0)
-            & (x >= 0)
-            & (y >= 0)
-            & (x < self.size_px[1])
-            & (y < self.size_px[0])
-            & (np.abs(p) == 1)
-        )
-        if bool((wrong & inside).any()):
-            at = int(np.argmax(wrong & inside))
-            raise FileFormatError(
-                f"{self.events.path}: event {low + at} is ({x[at]:g}, {y[at]:g}, {p[at]:g}); pixels within "
-                f"{self.size_px[1]} x {self.size_px[0]} and polarity +1 or -1 are needed."
-            )
-        t_us, x, y, p = (torch.from_numpy(values[inside].astype(np.int64)) for values in (t_us, x, y, p))
-        return ordered(t_us, x, y, p, *self.size_px)
-
-    def _place(self, t_s):
-        """Number of the first event not before a time, by bisection: a few blocks are read, not the file."""
-        low = 0
-        high = len(self.events)
-        while high - low > BLOCK:
-            middle = (low + high) // 2
-            low, high = (middle, high) if self.events[middle][2] < t_s else (low, middle)
-        return low + int(np.searchsorted(self.events.read(low, high)[:, 2], t_s))
 
 
 def _rise(times):

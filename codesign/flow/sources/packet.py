@@ -5,15 +5,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from codesign.errors import DomainError
-from codesign.events.entry import check_whole
+from codesign.events.entry import check_whole, shown
+from codesign.events.formats.arrival import BACKWARDS, OFF_SENSOR
 from codesign.flow.checks import check_kind, check_number, check_path, check_size
-from codesign.flow.sources.columns import BACKWARDS, OFF_SENSOR
 from codesign.types import EventStream, FlowField
 
 EMPTY = "windows_without_events"
 GAP = "windows_across_gaps"
 OUTSIDE = "true_flows_outside"  # the recording, or before the start asked for
 SKIPPABLE = (BACKWARDS, OFF_SENSOR, EMPTY, GAP)  # what PacketOptions.skip may name
+MOST_S = 1e9  # of a recording
 # the flow of a translation, for a scene 1 m away, that makes the flow of rotation alone no truth: px, and a share of it
 TRANSLATION_PX = 0.1
 TRANSLATION_SHARE = 0.25
@@ -62,7 +63,7 @@ class PacketOptions:
 
     window_s, start_s, count: length of the windows, start of the first (seconds after the first event), and
       how many; events: cut by this number instead.
-    size_px: (height, width) of the sensor. columns, time_unit: of text, see read_text_events. truth_unit:
+    size_px: (height, width) of the sensor. columns, time_unit: of text, see events.read. truth_unit:
       "px" per interval or "px/s".
     truth_interval_s: what a flow without times of its own covers. gyro_axes: camera axes from the
       gyroscope's. calibration: file, instead of calib.txt beside.
@@ -97,6 +98,11 @@ def check_options(options: PacketOptions, truth_path: object) -> None:
             check_whole(getattr(options, name), name, 1)
     if options.start_s is not None:
         check_number(options.start_s, "start_s", 0.0)
+    for name in ("window_s", "truth_interval_s", "start_s"):
+        if (getattr(options, name) or 0) > MOST_S:
+            raise DomainError(
+                f"{name} is {shown(getattr(options, name))}; at most {MOST_S:g} s are possible."
+            )
     if options.size_px is not None:
         check_size(options.size_px, "size_px")
     for name in ("columns", "time_unit", "gyro_axes"):
@@ -106,11 +112,13 @@ def check_options(options: PacketOptions, truth_path: object) -> None:
             check_path(path)
     if options.truth_unit not in ("px", "px/s"):
         raise DomainError(
-            f"the truth's unit is {options.truth_unit!r}; 'px' (per interval) or 'px/s' is possible."
+            f"the truth's unit is {shown(options.truth_unit)}; 'px' (per interval) or 'px/s' is possible."
         )
     if options.truth_pixels not in ("raw", "undistorted"):
-        raise DomainError(f"truth_pixels is {options.truth_pixels!r}; 'raw' or 'undistorted' is possible.")
+        raise DomainError(
+            f"truth_pixels is {shown(options.truth_pixels)}; 'raw' or 'undistorted' is possible."
+        )
     if not isinstance(options.skip, tuple) or not set(options.skip) <= set(SKIPPABLE):
-        raise DomainError(f"skip is {options.skip!r}; a tuple of {', '.join(SKIPPABLE)} is possible.")
+        raise DomainError(f"skip is {shown(options.skip)}; a tuple of {', '.join(SKIPPABLE)} is possible.")
     if options.window_s is not None and options.events is not None:
         raise DomainError("windows are cut by time or by number of events; give one of both.")

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from codesign.errors import FileFormatError
+from codesign.events.columns import EventColumns
 from codesign.flow.sources import folders
 from codesign.flow.sources.attitude import Attitude, read_gyroscope, read_poses
 from codesign.flow.sources.calibration import Calibration, read_calibration, signed_axes
-from codesign.flow.sources.columns import EventColumns
 from codesign.flow.sources.packet import Packet, PacketOptions
 from codesign.flow.sources.truth import TrueFlow, read_truth
 from codesign.flow.sources.windows import across, gaps

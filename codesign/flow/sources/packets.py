@@ -1,6 +1,6 @@
 """Packets of a recording: windows of events, each with its true flow where there is one."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -8,18 +8,25 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from codesign import events
 from codesign.errors import DomainError, FileFormatError
-from codesign.flow.sources import columns, folders, truth
-from codesign.flow.sources.array_events import read_array_events
-from codesign.flow.sources.columns import EventColumns
+from codesign.events.columns import EventColumns
+from codesign.events.files import read_columns
+from codesign.events.formats.arrival import Asked
+from codesign.flow.checks import check_kind, check_path, check_size
+from codesign.flow.sources import folders, truth
 from codesign.flow.sources.packet import OUTSIDE, Packet, PacketOptions, check_options
 from codesign.flow.sources.packet_truth import NO_TRUTH, Truth, is_motion, packet, read_source
-from codesign.flow.sources.text_events import read_text_events
 from codesign.flow.sources.windows import covers, spread, windows, without
 from codesign.reading import open_regular, reading
 
 LONGEST_S = 1.0  # of a packet that is a file of its own
+# width, height: the sensors that recordings without a size come from, smallest first
+SENSORS_PX = {
+    "DAVIS240C": (240, 180),
+    "DAVIS346": (346, 260),
+    "VGA (DVXplorer, Prophesee Gen3)": (640, 480),
+    "Prophesee HD": (1280, 720),
+}
 
 
 def read_packets(
@@ -78,21 +85,44 @@ def read_recording(path: str | Path, options: PacketOptions | None = None) -> Ev
 
 
 def read_events(path: Path, options: PacketOptions, truth_path: Path | None = None) -> EventColumns:
-    """EventColumns of one event file of any kind."""
-    path = Path(path)
-    size = options.size_px
-    kind = path.suffix.lower()
-    if kind in (".txt", ".csv"):
-        told = truth.size_of(truth_path) if truth_path is not None else None
-        told, by = (
-            (told, f"the flow in {truth_path}") if told else (_size_of_images(path.parent), "its frames")
-        )
-        return read_text_events(path, size, told, by, options.columns, options.time_unit, options.skip)
-    if kind in (".npy", ".npz"):
-        return read_array_events(path, size, options.time_unit, options.skip)
-    return columns.from_stream(
-        events.read(path, **({} if size is None else {"height_px": size[0], "width_px": size[1]}))
+    """EventColumns of one event file of any kind that events.read takes."""
+    told = truth.size_of(truth_path) if truth_path is not None else None
+    told_by = f"the flow in {truth_path}"
+    if told is None and Path(path).suffix.lower() in (".txt", ".csv"):
+        told, told_by = _size_of_images(Path(path).parent), "its frames"
+    return read_text_events(
+        path, options.size_px, told, told_by, options.columns, options.time_unit, options.skip
     )
+
+
+def read_text_events(
+    path: str | Path,
+    size: tuple[int, int] | None = None,
+    told: tuple[int, int] | None = None,
+    told_by: str = "the file",
+    columns: str = "auto",
+    time_unit: str = "auto",
+    skip: Collection[str] = (),
+) -> EventColumns:
+    """Read events from a file of text, or any other that events.read takes.
+
+    Args:
+      path: file. size: (height, width) of the sensor. told, told_by: the same from what lies beside, and what that is.
+        Without either, the smallest sensor of SENSORS_PX that holds the events, where the file does not say.
+      columns, time_unit: as of events.read.
+      skip: faults whose events are left out and counted instead of refused: events_back_in_time, events_off_sensor.
+    Returns: EventColumns in order of time. Events up to 1 ms late are put in order.
+    Raises: FileFormatError, as events.read, and where no event is left.
+    """
+    height, width = (None, None) if size is None else check_size(size, "the sensor's size asked for")
+    told = None if told is None else check_size(told, f"the sensor's size by {told_by}")
+    skip = tuple(check_kind(fault, str, "a fault to skip") for fault in skip)
+    found = read_columns(
+        check_path(path), Asked(height, width, told, told_by, SENSORS_PX, columns, time_unit, skip)
+    )
+    if not len(found):
+        raise FileFormatError(f"{path} holds no event that is on the sensor and in order of time.")
+    return found
 
 
 def _alone(file):

@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, FileFormatError
+from codesign.events.formats.hdf5 import Hdf5Events
+from codesign.events.formats.hdf5_rows import Rows
 from codesign.events.volumes.volume import from_stream
 from codesign.flow.sources.camera_fit import CameraFit
 from codesign.flow.sources.chain import chained
 from codesign.flow.sources.collate import Crop, Sample, check_indices, collate
-from codesign.flow.sources.rows import Rows
 from codesign.reading import read_json, reading
-from codesign.types import EventStream, FlowWindows
+from codesign.types import FlowWindows
 
 FORMAT = "codesign-dataset/1"
 DONE = "sequence.json"
@@ -89,7 +90,7 @@ class DatasetWindows:
         last = first + self.window_frames
         flow, valid = sequence.flow(first, last)
         t0_us, t1_us = (int(sequence.times_us[k]) for k in (first, last))
-        volume = from_stream(sequence.stream(t0_us, t1_us), t0_us, t1_us, self.bins)
+        volume = from_stream(sequence.events.window(t0_us, t1_us, sequence.size_px), t0_us, t1_us, self.bins)
         frames = torch.from_numpy(np.stack([sequence.rows["frames"][k] for k in (first, last)]))
         for values, name in ((frames, "frames"), (flow[:, valid], "flow marked as valid")):
             if not bool(values.isfinite().all()):
@@ -140,41 +141,13 @@ class Sequence:
             raise FileFormatError(
                 f"{path}: its frame times do not rise, or its poses are not finite; the file is damaged."
             )
-        events = folder / "events.h5"
-        self.events = {"t": Rows(events, "events/t", [])}
-        self.events |= {name: Rows(events, f"events/{name}", [], len(self.events["t"])) for name in "xyp"}
-        self.ms_to_idx = Rows(events, "ms_to_idx", []).read(0, self.times_us[-1] // 1000 + 2).astype(np.int64)
-        if bool((np.diff(self.ms_to_idx) < 0).any()) or not 0 <= self.ms_to_idx[0] <= self.ms_to_idx[
-            -1
-        ] <= len(self.events["t"]):
-            raise FileFormatError(
-                f"{events}: ms_to_idx is no index of its {len(self.events['t'])} events; the file is damaged."
-            )
+        self.events = Hdf5Events(folder / "events.h5")
         camera = {
             name: Rows(folder / "camera.h5", name, [size[1], 3], size[0]).read(0, size[0])
             for name in ("direction", "origin_m")
         }
         self.rays = camera
         self.fit = None
-
-    def stream(self, t0_us: int, t1_us: int) -> EventStream:
-        """EventStream of the events from t0_us to t1_us, both included."""
-        low = self.ms_to_idx[t0_us // 1000]
-        high = self.ms_to_idx[min(t1_us // 1000 + 1, len(self.ms_to_idx) - 1)]
-        columns = {
-            name: rows.read(int(low), int(high)).astype(np.int64) for name, rows in self.events.items()
-        }
-        inside = (columns["t"] >= t0_us) & (columns["t"] <= t1_us)
-        t, x, y, p = (torch.from_numpy(columns[name][inside]) for name in "txyp")
-        height, width = self.size_px
-        if len(t) and (
-            bool((t.diff() < 0).any()) or int(x.max()) >= width or int(y.max()) >= height or int(p.max()) > 1
-        ):
-            raise FileFormatError(
-                f"{self.folder / 'events.h5'} holds events that are not in order, outside {width} x "
-                f"{height} px or of another polarity; it is damaged."
-            )
-        return EventStream(t, x, y, 2 * p - 1, height, width)
 
     def flow(self, first: int, last: int) -> tuple[Tensor, Tensor]:
         """(flow_px [2, H, W] float32, valid [H, W]) on the pixels of frame ``first``, to frame ``last``."""

@@ -5,7 +5,7 @@ from typing import TypeVar
 import numpy as np
 
 from codesign.errors import DomainError
-from codesign.flow.sources.columns import EventColumns
+from codesign.events.columns import EventColumns
 from codesign.flow.sources.packet import EMPTY, GAP, PacketOptions
 
 Choice = TypeVar("Choice")

@@ -1,7 +1,6 @@
-"""Rows of large HDF5 datasets, block by block, with the guard against damaged files that the event readers
-have (see codesign.events.formats.hdf5_chunks)."""
+"""Rows of large HDF5 datasets, block by block, with the guard of hdf5_chunks against damaged files."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -9,22 +8,38 @@ import numpy as np
 
 from codesign.errors import FileFormatError
 from codesign.events.formats import hdf5_chunks as chunks
-from codesign.events.formats.hdf5 import LIBRARY_ERRORS
 from codesign.events.formats.hdf5_chunks import h5py
+from codesign.reading import check_regular, reading
+
+REMEDY = "it is missing, cut or damaged, or no HDF5 file of this kind"
 
 
-@contextmanager
-def reading(path: str | Path) -> Iterator[None]:
-    """Context in which all that h5py raises on a missing or damaged file becomes one FileFormatError that
-    names it."""
-    try:
-        yield
-    except FileFormatError:
-        raise
-    except LIBRARY_ERRORS as error:
-        raise FileFormatError(
-            f"{path} is missing, cut or damaged, or no HDF5 file ({str(error)[:160]})."
-        ) from error
+def own(path, file, name):
+    """The object of a name, which must lie in this file, all along its path. Raises: FileFormatError."""
+    found = file
+    for part in name.split("/"):
+        if not isinstance(found, h5py.Group) or not isinstance(found.get(part, getlink=True), h5py.HardLink):
+            raise FileFormatError(
+                f"{path}: {name} is absent or a link to another file; files must hold their own data."
+            )
+        found = found[part]
+    return found
+
+
+def scalar(path, name):
+    """One whole number of a file, within 61 bits. Raises: FileFormatError."""
+    with reading(path, REMEDY), h5py.File(path, "r", locking=False) as file:
+        held = own(path, file, name)
+        number = (
+            int(held[()].reshape(-1)[0])
+            if getattr(held, "size", 0) == 1 and held.dtype.kind in "iu"
+            else None
+        )
+        if number is None or not abs(number) <= 2**61:
+            raise FileFormatError(
+                f"{path}: {name} is {number or held}; one whole number of 61 bits is needed."
+            )
+        return number
 
 
 class Rows:
@@ -40,7 +55,7 @@ class Rows:
     def __init__(
         self, path: str | Path, name: str, columns: Sequence[int] | None = None, count: int | None = None
     ) -> None:
-        self.path = Path(path)
+        self.path = check_regular(path)
         self.name = name
         self.block_shape = None
         self.places = {}
@@ -55,6 +70,7 @@ class Rows:
                 ]
                 raise FileFormatError(f"{path}: {name} has shape {list(dataset.shape)}, {wanted} is needed.")
             self.shape = dataset.shape
+            self.dtype = dataset.dtype
             self._find_blocks(dataset)
 
     def __len__(self) -> int:
@@ -62,20 +78,16 @@ class Rows:
 
     @contextmanager
     def _dataset(self):
-        with reading(self.path), h5py.File(self.path, "r", locking=False) as file:
-            dataset = file.get(self.name)
+        with reading(self.path, REMEDY), h5py.File(self.path, "r", locking=False) as file:
+            dataset = own(self.path, file, self.name)
             if (
                 not isinstance(dataset, h5py.Dataset)
                 or dataset.shape is None
                 or dataset.ndim < 1
                 or dataset.dtype.kind not in "iufb"
             ):
-                raise FileFormatError(f"{self.path} has no list of numbers named {self.name}.")
-            if (
-                not isinstance(file.get(self.name, getlink=True), h5py.HardLink)
-                or dataset.is_virtual
-                or dataset.external
-            ):
+                raise FileFormatError(f"{self.path}: {self.name} is no list of numbers.")
+            if dataset.is_virtual or dataset.external:
                 raise FileFormatError(
                     f"{self.path}: {self.name} is kept in other files; files must hold their own data."
                 )
