@@ -10,8 +10,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     {"errors"},
-    {"types", "optional", "reading", "exclusive"},
-    {"pose", "arrays", "backend", "atomic", "plain_yaml", "interrupt", "grad"},
+    {"types", "optional", "reading", "exclusive", "atomic"},
+    {"pose", "arrays", "backend", "plain_yaml", "interrupt", "grad"},
     {"state"},
     {"lens", "render", "events", "place"},  # none imports another: what one needs is passed in
     {"flow"},
