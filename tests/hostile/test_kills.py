@@ -7,7 +7,9 @@ import pytest
 pytest.importorskip("resource", reason="kills are those of Unix")
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="a full disk is set on a running process, which Linux alone can")
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="a full disk is set on a running process, which Linux alone can"
+)
 def test_a_killed_run_ends_with_the_same_numbers():
     from tests.hostile import kills
 
