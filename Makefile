@@ -11,7 +11,7 @@ STUDIES := lens-opt lens-report lens-scratch lens-tolerance lens-bench silhouett
 	event-gradient event-bench srm-bench davis train-flow flow-quality flow-compare flow-cost flow-recording \
 	placement speed-error stability gradcheck
 
-.PHONY: help setup test fuzz test-bits lint core-check try-all doctor clean $(STUDIES)
+.PHONY: help setup test fuzz kill-test test-bits lint core-check try-all doctor clean $(STUDIES)
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):.*## /  make \1|/p' Makefile | awk -F'|' '{printf "%-24s %s\n", $$1, $$2}'
@@ -66,6 +66,9 @@ test: setup ## all tests, on all cores
 
 fuzz: setup ## mutants of every file format for hours: make fuzz ARGS="--minutes 120 --format .npz"
 	@$(RUN) -m tests.hostile fuzz $(ARGS)
+
+kill-test: setup ## long studies killed at random moments, resumed and compared: make kill-test ARGS="--count 50"
+	@$(RUN) -m tests.hostile kills $(ARGS)
 
 test-bits: setup ## tests that promise equal bits, as other processors and numbers of threads round
 	@failed=0; for how in \

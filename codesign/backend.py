@@ -16,8 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from codesign.atomic import write_atomic
 from codesign.doors import explain
-from codesign.errors import BackendError, DomainError, GradientError
+from codesign.errors import BackendError, DomainError, FileFormatError, GradientError
 from codesign.exclusive import exclusive
 
 MINIMUM_LLVM = (
@@ -142,8 +143,8 @@ def require_renderer(device: str = "cpu") -> None:
             raise BackendError(f"{message}; {install_hint()}, then run 'python -m codesign doctor'.")
         try:
             memory.parent.mkdir(parents=True, exist_ok=True)
-            memory.write_text(json.dumps({key: "ok"}))
-        except OSError:
+            write_atomic(memory, json.dumps({key: "ok"}).encode())
+        except (OSError, FileFormatError):
             return  # an unwritable cache costs a trial render per process, nothing else
 
 

@@ -7,6 +7,7 @@ library into ``reading``: no list of the errors of libraries stands anywhere els
 import json
 import math
 import os
+import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,15 +17,20 @@ from typing import Any, BinaryIO
 from codesign.errors import CodesignError, DomainError, FileFormatError, ShapeError
 
 MOST_SAID = 600  # characters of a sentence
+SOURCE = re.compile(r"\[\w+\.cpp:\d+\]")  # places in a library's own source, in its words
 MOST_BYTES = 2**33  # of an array that a header announces; larger ones are read in pieces
 
 
 @contextmanager
-def reading(what: str | Path, remedy: str = "it is damaged, or of another kind") -> Iterator[None]:
+def reading(
+    what: str | Path,
+    remedy: str = "it is damaged, or of another kind",
+    kind: type[CodesignError] = FileFormatError,
+) -> Iterator[None]:
     """Turn whatever a library raises for bytes it did not expect into one sentence.
 
-    Args: what: file, or part of one, that the sentence begins with. remedy: what it ends with.
-    Raises: FileFormatError; errors of ours pass unchanged, and so does Ctrl-C.
+    Args: what: file, or part of one, that the sentence begins with. remedy: what it ends with. kind: of the error.
+    Raises: FileFormatError, or ``kind``; errors of ours pass unchanged, and so does Ctrl-C.
     """
     try:
         yield
@@ -32,8 +38,8 @@ def reading(what: str | Path, remedy: str = "it is damaged, or of another kind")
         raise
     except Exception as error:  # what libraries raise for damaged bytes has no common root
         said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        said = " ".join(said.split())[:160] or type(error).__name__
-        raise FileFormatError(f"{what} cannot be read ({said}); {remedy}.") from error
+        said = " ".join(SOURCE.sub("", said).split())[:200] or type(error).__name__
+        raise kind(f"{what} cannot be read ({said}); {remedy}.") from error
 
 
 @contextmanager

@@ -7,7 +7,6 @@ a little off from the luminance of a colour rendering.
 """
 
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,7 +18,9 @@ import torch
 from torch import Tensor
 
 from codesign import backend, lens
-from codesign.errors import CodesignError, DomainError, FileFormatError, check_whole
+from codesign.errors import DomainError, FileFormatError, check_whole
+from codesign.exclusive import exclusive
+from codesign.reading import building, reading
 from codesign.render import Camera, Film
 from codesign.render.light import PathScene, bake
 from codesign.render.placed import PlacedScene, Placement
@@ -39,9 +40,9 @@ INTEGRATORS = (
     "VolumetricPathIntegrator",
     "VolumetricMisPathIntegrator",
 )
-LONGEST = 300  # letters of Mitsuba's own words in a sentence
 
 
+@exclusive
 def from_mitsuba(
     source: str | Path | Mapping[str, Any] | Any,
     light: Level = "auto",
@@ -166,6 +167,7 @@ class FileView:
         return Camera(lens.Pinhole(focal_mm), columns, rows, pitch_mm, samples_per_pixel, seed, film)
 
 
+@exclusive
 def view_of(
     source: str | Path | Mapping[str, Any] | Any,
     number: int = 0,
@@ -231,6 +233,7 @@ def _axes(up, unit_m):
     return torch.tensor(UP[up], dtype=torch.float64)
 
 
+@exclusive
 def loaded(mi: Any, source: Any, parameters: Mapping[str, Any], merge: bool = True) -> Any:
     """The mi.Scene of a path, a dictionary or itself.
 
@@ -268,17 +271,10 @@ def _from_file(mi, path, parameters, merge):
         raise FileFormatError(
             f"scene '{path}' ends in '{path.suffix}'; Mitsuba scenes are .xml files, so export it as one."
         )
-    try:
-        with _quiet(mi):
-            config = mi.parser.ParserConfig(mi.variant())
-            trial_load.check(
-                mi, mi.parser.parse_file(config, str(path), **parameters), path, parameters.items()
-            )
-            found = mi.load_file(str(path), optimize=merge, **parameters)
-    except CodesignError as error:
-        raise FileFormatError(f"scene '{path}' cannot be loaded: {error}") from error
-    except Exception as error:  # Mitsuba raises plain RuntimeErrors of many lines
-        raise FileFormatError(f"Mitsuba cannot load scene '{path}': {_sentence(error)}") from error
+    with _quiet(mi), building(f"scene '{path}'", "Mitsuba cannot load it; correct it, or export it anew"):
+        config = mi.parser.ParserConfig(mi.variant())
+        trial_load.check(mi, mi.parser.parse_file(config, str(path), **parameters), path, parameters.items())
+        found = mi.load_file(str(path), optimize=merge, **parameters)
     if not isinstance(found, mi.Scene):
         raise FileFormatError(
             f"'{path}' holds a {type(found).__name__}, not a scene; give a file of a <scene>."
@@ -288,15 +284,10 @@ def _from_file(mi, path, parameters, merge):
 
 def _from_dictionary(mi, source, merge):
     _check_variants(mi, source, "")
-    try:
-        with _quiet(mi):
-            scene = {"type": "scene", **source}
-            trial_load.check(mi, mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene))
-            return mi.load_dict(scene, optimize=merge)
-    except CodesignError:
-        raise
-    except Exception as error:
-        raise DomainError(f"Mitsuba cannot build the scene: {_sentence(error)}") from error
+    with _quiet(mi), reading("the scene's dictionary", "Mitsuba cannot build the scene from it", DomainError):
+        scene = {"type": "scene", **source}
+        trial_load.check(mi, mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), scene))
+        return mi.load_dict(scene, optimize=merge)
 
 
 def _check_variants(mi, entry, place):
@@ -309,12 +300,6 @@ def _check_variants(mi, entry, place):
                 f"'{place}{key}' of the scene was made in Mitsuba's variant {value.variant_name()}, but worlds are "
                 f"made in {mi.variant()}; call mi.set_variant('{mi.variant()}') before you make it."
             )
-
-
-def _sentence(error):
-    """Mitsuba's words on one line, without the place in its own source."""
-    words = re.sub(r"\[\w+\.cpp:\d+\]\s*", "", " ".join(str(error).split()))
-    return f"{words[:LONGEST].rstrip('.!')}."
 
 
 @contextmanager

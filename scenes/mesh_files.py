@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from codesign.errors import CodesignError, DomainError, FileFormatError
+from codesign.errors import DomainError, FileFormatError
 from codesign.optional import optional
+from codesign.reading import open_regular, reading
 from scenes import gltf, textures
 from scenes.mesh_folder import Folder
 
@@ -136,13 +137,11 @@ def _checked_kind(path, unit_m, up):
 
 def _dae_says(path):
     """Metres per unit and the axis that is up, of a COLLADA file."""
-    try:
-        with path.open("rb") as file:
-            asset = collada.Collada(file, ignore=[collada.DaeError]).assetInfo
-    except CodesignError:
-        raise
-    except Exception as error:  # whatever an XML of another kind brings up
-        raise _damaged(path, error) from error
+    with (
+        open_regular(path, MOST_BYTES) as file,
+        reading(f"mesh '{path}'", "export it anew as DAE"),
+    ):
+        asset = collada.Collada(file, ignore=[collada.DaeError]).assetInfo
     return asset.unitmeter or 1.0, (asset.upaxis or "Y_UP")[0].lower()
 
 
@@ -181,23 +180,18 @@ def _loaded(path, data, folder, kind, materials):
     elif kind == ".dae":
         options["ignore_broken"] = False
     try:
-        with warnings.catch_warnings():  # numpy reads numbers as far as it can, and only warns
+        with (
+            reading(f"mesh '{path}'", f"export it anew as {path.suffix[1:].upper()}"),
+            warnings.catch_warnings(),
+        ):
+            # numpy reads numbers as far as it can, and only warns
             warnings.filterwarnings("error", message=".*could not be read to its end")
             return trimesh.load_scene(
                 trimesh.util.wrap_as_stream(data), file_type=kind[1:], resolver=folder, **options
             )
-    except CodesignError:
+    except FileFormatError:
+        folder.check()  # what a file names says more than what trimesh made of its absence
         raise
-    except Exception as error:  # trimesh raises whatever a damaged file brings up
-        folder.check()
-        raise _damaged(path, error) from error
-
-
-def _damaged(path, error):
-    said = " ".join(str(error).split())[:120] or type(error).__name__
-    return FileFormatError(
-        f"mesh '{path}' cannot be read as {path.suffix[1:].upper()} ({said}); export it anew."
-    )
 
 
 def _parts(path, scene, told, axes, surfaces, materials) -> Iterator[Part]:

@@ -15,6 +15,7 @@ from codesign.reading import open_regular
 from scenes import rgbe
 
 LONGEST_S = 600.0
+SURVIVED: set[tuple[Any, ...]] = set()  # what was tried, with size and time of every file
 SOURCES = ("filename", "bitmap", "data")  # of which a bitmap has one
 # errors end well: they come again, in words, where the scene is loaded for use
 TRIAL = """import sys, json, mitsuba
@@ -53,16 +54,20 @@ def check(mi: Any, state: Any, file: Path | None = None, parameters: Iterable[tu
         if path is None:
             continue
         named.append((kind, str(path)))
-        with open_regular(path) as opened:
+    texts = {name: str(value) for name, value in dict(parameters).items()}
+    asked = json.dumps([mi.variant(), file and str(file), texts, [] if file else named])
+    files = [Path(name) for _, name in named] + [Path(str(each)) for each in state.files]
+    facts = [(str(each), each.stat().st_size, each.stat().st_mtime_ns) for each in files if each.is_file()]
+    tried = (TRIAL, asked, *facts)
+    if (file is None and not named) or tried in SURVIVED:
+        return
+    for kind, name in named:
+        with open_regular(name) as opened:
             begin = opened.read(2)
         # Mitsuba goes by the first bytes, not by the ending
         if begin == b"#?" and kind in ("bitmap", "envmap"):
             # a reader that writes past its end may go on for a while, so a trial would not always tell
-            rgbe.radiance(path)
-    if file is None and not named:
-        return
-    texts = {name: str(value) for name, value in dict(parameters).items()}
-    asked = json.dumps([mi.variant(), file and str(file), texts, [] if file else named])
+            rgbe.radiance(name)
     try:
         done = subprocess.run(
             [sys.executable, "-c", TRIAL, asked], capture_output=True, timeout=LONGEST_S, check=False
@@ -76,3 +81,4 @@ def check(mi: Any, state: Any, file: Path | None = None, parameters: Iterable[tu
             "Mitsuba itself ends while it reads the scene, so something it names is damaged "
             f"({', '.join(name for _, name in named)[:200] or 'no file is named'}); export it anew."
         )
+    SURVIVED.add(tried)

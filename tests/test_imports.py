@@ -11,8 +11,8 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = (
     {"errors"},
     {"doors"},
-    {"types", "optional", "reading", "exclusive"},
-    {"pose", "arrays", "backend", "atomic", "plain_yaml", "interrupt", "grad"},
+    {"types", "optional", "reading", "exclusive", "atomic"},
+    {"pose", "arrays", "backend", "plain_yaml", "interrupt", "grad"},
     {"state"},
     {"lens", "render", "events", "place"},  # none imports another: what one needs is passed in
     {"flow"},

@@ -52,7 +52,12 @@ class Room:
     """Counts the bytes of what is kept, so that many renders together leave memory to others."""
 
     def __init__(self) -> None:
-        self.taken = 0
+        self._sizes: weakref.WeakKeyDictionary[Slopes, int] = weakref.WeakKeyDictionary()
+
+    @property
+    def taken(self) -> int:
+        """Bytes of all slopes that live; threads add and free them at once."""
+        return sum(size for _, size in self._sizes.items())
 
     def left(self) -> int:
         """Bytes that may be kept beside the others."""
@@ -60,11 +65,7 @@ class Room:
 
     def take(self, slopes: Slopes, size: int) -> None:
         """Count them for as long as the slopes live."""
-        self.taken += size
-        weakref.finalize(slopes, self._give, size)
-
-    def _give(self, size):
-        self.taken -= size
+        self._sizes[slopes] = size
 
 
 ROOM = Room()

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from codesign import backend
-from codesign.errors import CodesignError, DomainError
+from codesign.errors import DomainError
 from codesign.exclusive import exclusive
+from codesign.reading import reading
 from codesign.render.fronts import are_geometric
 from codesign.render.outline import outlines
 from codesign.render.outline.curves import Segments
@@ -61,14 +62,8 @@ class MitsubaScene:
         self._box = box_around(self.mi, self.scene)
 
     def _built(self, description, merge):
-        try:
+        with reading("the scene's description", "Mitsuba cannot build the scene from it", DomainError):
             return self.mi.load_dict({"type": "scene", **description}, optimize=merge)
-        except CodesignError:
-            raise
-        except Exception as error:  # Mitsuba raises plain RuntimeErrors of many lines
-            raise DomainError(
-                f"Mitsuba cannot build the scene: {str(error).splitlines()[0][:200]}"
-            ) from error
 
     def two_sided(self) -> "MitsubaScene":
         """The same scene with surfaces that show from behind what they show from in front, as sheets and meshes

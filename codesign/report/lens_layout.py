@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from codesign.atomic import replacing
 from codesign.errors import FileFormatError
 from codesign.lens.analysis.rays import field_rays
 from codesign.lens.distance import PARALLEL
@@ -49,12 +50,8 @@ def lens_layout(
     draw_layout(axis, lens, fields_rad, rays, at_m)
     axis.set_title(lens.name, loc="left")
     if path is not None:
-        try:
-            figure.savefig(path, dpi=160, facecolor="white")
-        except OSError as error:
-            raise FileFormatError(
-                f"drawing {path} cannot be written ({error.strerror}); choose a folder you may write to."
-            ) from error
+        with replacing(path) as temporary:
+            figure.savefig(temporary, dpi=160, facecolor="white")
     return figure
 
 

@@ -8,6 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from codesign import events, lens, pose, render
+from codesign.atomic import replacing, write_atomic
 from codesign.events import SensorModel, SensorState
 from scenes import worlds
 
@@ -68,22 +69,20 @@ def make(folder, duration_s=0.2, size_px=(180, 240), seed=0):
     stream = events.concatenate(parts)
     folder.mkdir(parents=True, exist_ok=True)
     rows = torch.stack([stream.x, stream.y, (stream.p > 0).long()], 1).numpy()
-    with open(folder / "events.txt", "w", encoding="ascii") as file:
+    with replacing(folder / "events.txt") as temporary, open(temporary, "w", encoding="ascii") as file:
         file.writelines(
             f"{t * 1e-6 + START_S:.6f} {x} {y} {p}\n"
             for t, (x, y, p) in zip(stream.t_us.tolist(), rows.tolist(), strict=True)
         )
     imu_s = np.arange(round(duration_s * IMU_HZ) + 1) / IMU_HZ
     gravity = np.tile([0.0, 9.81, 0.0], (len(imu_s), 1))
-    np.savetxt(folder / "imu.txt", np.column_stack([imu_s + START_S, gravity, turn_rate(imu_s)]), fmt="%.9f")
+    with replacing(folder / "imu.txt") as temporary:
+        np.savetxt(temporary, np.column_stack([imu_s + START_S, gravity, turn_rate(imu_s)]), fmt="%.9f")
     pose_s = np.arange(round(duration_s * POSES_HZ) + 1) / POSES_HZ
     T = poses(pose_s).numpy()
-    np.savetxt(
-        folder / "groundtruth.txt",
-        np.column_stack([pose_s + START_S, T[:, :3, 3], Rotation.from_matrix(T[:, :3, :3]).as_quat()]),
-        fmt="%.9f",
-    )
-    (folder / "calib.txt").write_text(
-        f"{FOCAL_PX} {FOCAL_PX} {(width - 1) / 2} {(height - 1) / 2} 0 0 0 0 0\n", encoding="ascii"
-    )
+    turned = Rotation.from_matrix(T[:, :3, :3]).as_quat()
+    with replacing(folder / "groundtruth.txt") as temporary:
+        np.savetxt(temporary, np.column_stack([pose_s + START_S, T[:, :3, 3], turned]), fmt="%.9f")
+    middle = f"{(width - 1) / 2} {(height - 1) / 2}"
+    write_atomic(folder / "calib.txt", f"{FOCAL_PX} {FOCAL_PX} {middle} 0 0 0 0 0\n".encode())
     return camera, scene, poses

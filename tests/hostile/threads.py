@@ -2,24 +2,29 @@
 
 import faulthandler
 import gc
+import json
 import random
+import subprocess
 import sys
 import threading
+import time
+import timeit
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 
 import torch
 from torch import Tensor
 
 from codesign import System, events, flow, lens, pose, render
 from codesign.errors import CodesignError
+from codesign.exclusive import Exclusive, exclusive
 from codesign.system import Batch
 from codesign.types import EventVolume
-from scenes import silhouettes, textures, trajectories, worlds
+from scenes import textures, trajectories, worlds
 
 D = torch.float64
 START = pose.look_at((0, -2, 0), (0, 0, 0))
-T_S = torch.linspace(0, 0.05, 5, dtype=D)
+T_S = torch.linspace(0, 0.05, 3, dtype=D)
 SEEDS = 4
 # of a float32 sum whose order depends on the threads of drjit's own pool
 TOLERANCE = 1e-4
@@ -40,8 +45,11 @@ def _lens():
 
 
 @cache
-def _cubes():
-    return silhouettes.build("cubes")
+def _ball():
+    glow = {"type": "area", "radiance": {"type": "rgb", "value": 100.0}}
+    return render.MitsubaScene(
+        {"ball": {"type": "sphere", "center": [0, 1, 0.8], "radius": 0.4, "emitter": glow}}
+    )
 
 
 def _wall():
@@ -49,7 +57,7 @@ def _wall():
 
 
 def _camera(seed):
-    return render.Camera(_lens(), 16, 16, 0.074, 4).with_seed(seed)
+    return render.Camera(_lens(), 8, 8, 0.148, 4).with_seed(seed)
 
 
 def _path(seed, start=START):
@@ -72,7 +80,7 @@ def outlined(seed: int) -> list[Tensor]:
     """Of a scene that all threads share."""
     twist = torch.zeros(6, dtype=D, requires_grad=True)
     poses = _path(seed, pose.look_at((0, -1.2, 1), (0, 1, 0.8))) @ pose.se3_exp(twist)
-    return _gradients(render.frames(_camera(seed), _cubes(), poses, gradient="boundary"), twist)
+    return _gradients(render.frames(_camera(seed), _ball(), poses, gradient="boundary"), twist)
 
 
 def counted(seed: int) -> list[Tensor]:
@@ -95,9 +103,9 @@ def simulated(seed: int) -> list[Tensor]:
 
 
 def estimated(seed: int) -> list[Tensor]:
-    counts = _drawn(seed, 2, 2, 5, 16 + 8 * (seed % 2), 24).abs().requires_grad_()
-    volume = EventVolume(counts, T_S, torch.full((5,), 0.0125, dtype=D))
-    found = flow.estimate_lk(volume, levels_px=(2.0, 1.0), model=("affine", "local")[seed % 2])
+    counts = _drawn(seed, 1, 2, 3, 16 + 8 * (seed % 2), 16).abs().requires_grad_()
+    volume = EventVolume(counts, T_S, torch.full((3,), 0.025, dtype=D))
+    found = flow.estimate_lk(volume, levels_px=(1.0,), model=("affine", "local")[seed % 2])
     return _gradients(found.flow_px, counts)
 
 
@@ -108,7 +116,7 @@ def optimised(seed: int) -> list[Tensor]:
     system = System(
         camera=_camera(seed).with_lens(_lens().replace(curvature_per_mm=bent)),
         events=events.layer("memory"),
-        flow=flow.estimate_lk,
+        flow=partial(flow.estimate_lk, levels_px=(1.0,)),
         objectives={"flow": lambda field: field.flow_px.square().mean()},
         scene=_wall(),
     )
@@ -134,11 +142,15 @@ def run(threads: int, rounds: int, kinds: tuple[str, ...] = tuple(KINDS)) -> dic
     """Every thread does every kind of work ``rounds`` times, in an order of its own, while garbage is collected at
     random in another.
 
-    Returns: by kind, the largest relative difference from the work done serially. Hangs or ends the process where
-      threads are not safe: call it in a process with a time limit.
+    Returns: by kind, the largest relative difference from the work done serially, and rounds of a thread per second,
+      serially and threaded. Hangs or ends the process where threads are not safe: call it in a process with a time limit.
     Raises: what the first thread raised.
     """
+    torch.set_num_threads(
+        1
+    )  # else every thread gets a pool of torch's, and they wait for one another's cores
     serial = {(kind, seed): KINDS[kind](seed) for kind in kinds for seed in range(SEEDS)}
+    serial_s = min(timeit.repeat(lambda: [KINDS[kind](0) for kind in kinds], number=1, repeat=3))
     worst = dict.fromkeys(kinds, 0.0)
     raised = []
     over = threading.Event()
@@ -160,17 +172,56 @@ def run(threads: int, rounds: int, kinds: tuple[str, ...] = tuple(KINDS)) -> dic
 
     workers = [threading.Thread(target=work, args=(number,)) for number in range(threads)]
     collector = threading.Thread(target=collect)
+    began = time.monotonic()
     for thread in (collector, *workers):
         thread.start()
     for thread in workers:
         thread.join()
+    rate = threads * rounds / (time.monotonic() - began)
     over.set()
     collector.join()
     if raised:
         raise raised[0]
-    return worst
+    return {**worst, "rounds_per_second_serial": 1 / serial_s, "rounds_per_second_threaded": rate}
+
+
+def lock() -> dict[str, float]:
+    """What the lock costs one thread: nanoseconds, and the time of a small kernel with it over that without it."""
+
+    def least_s(work, number):
+        return min(timeit.repeat(work, number=number, repeat=7)) / number
+
+    def entered():
+        with exclusive:
+            pass
+
+    held = least_s(lambda: counted(0), 20)
+    enter, leave = Exclusive.__enter__, Exclusive.__exit__
+    Exclusive.__enter__, Exclusive.__exit__ = (lambda self: self), (lambda self, *error: None)
+    bare = least_s(lambda: counted(0), 20)
+    Exclusive.__enter__, Exclusive.__exit__ = enter, leave
+    return {"lock_ns": 1e9 * least_s(entered, 10_000), "small_kernel_with_over_without_lock": held / bare}
+
+
+def measure(count: int, seed: int, say=print, threads: int = 30) -> tuple[dict[str, float], list[str]]:
+    """``count`` rounds of all kinds in every thread, in a process that is ended where they do not."""
+    limit_s = 120 + 3.0 * threads * count
+    command = [sys.executable, "-m", "tests.hostile.threads", str(threads), str(count), str(limit_s)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    say(f"{threads} threads, {count} rounds: exit code {done.returncode}")
+    if done.returncode:
+        return {}, [f"{threads} threads, {count} rounds: ends with {done.returncode}: {done.stderr[-300:]}"]
+    found = {f"threads_{name}": value for name, value in json.loads(done.stdout).items()}
+    wrong = [
+        f"{name} differs by {found[f'threads_{name}']}"
+        for name in KINDS
+        if found[f"threads_{name}"] > TOLERANCE
+    ]
+    return {**found, "threads": threads, "threads_rounds": count, **lock()}, wrong
 
 
 if __name__ == "__main__":
     faulthandler.dump_traceback_later(float(sys.argv[3]), exit=True)
-    print(run(int(sys.argv[1]), int(sys.argv[2]), *([tuple(sys.argv[4:])] if sys.argv[4:] else [])))
+    print(
+        json.dumps(run(int(sys.argv[1]), int(sys.argv[2]), *([tuple(sys.argv[4:])] if sys.argv[4:] else [])))
+    )

@@ -1,7 +1,6 @@
 """Hostile lens files: every one ends in one sentence, after a bounded amount of reading, whatever its
 extension."""
 
-import os
 import random
 
 import pytest
@@ -58,7 +57,7 @@ def test_no_more_than_the_limit_is_ever_read(tmp_path, monkeypatch):
     path = tmp_path / "lens.zmx"
     with open(path, "wb") as file:
         file.truncate(50_000_000_000)  # a sparse file, longer than memory
-    with pytest.raises(FileFormatError, match=f"more than {LARGEST_BYTES} bytes"):
+    with pytest.raises(FileFormatError, match=f"more than the {LARGEST_BYTES} of its kind"):
         lens.load(path)
     path.write_bytes(b" " * LARGEST_BYTES)
     assert len(read_text(path)) == LARGEST_BYTES
@@ -67,61 +66,7 @@ def test_no_more_than_the_limit_is_ever_read(tmp_path, monkeypatch):
         read_text(path)
 
 
-@pytest.mark.parametrize("extension", EXTENSIONS)
-def test_what_is_no_regular_file_is_neither_waited_for_nor_followed(extension, tmp_path):
-    pipe, folder, loop, link = (
-        tmp_path / f"{name}{extension}" for name in ("pipe", "folder", "loop", "link")
-    )
-    os.mkfifo(pipe)
-    folder.mkdir()
-    loop.symlink_to(loop)
-    link.symlink_to("/dev/zero")
-    for path in (pipe, folder, link):
-        with pytest.raises(FileFormatError, match="not a regular file"):
-            lens.load(path)
-    with pytest.raises(FileFormatError, match="neither a file nor a known name"):
-        lens.load(loop)
-
-
 def test_a_link_to_a_lens_file_is_read(tmp_path):
     lens.save(lens.load("la1509"), tmp_path / "a.json")
     (tmp_path / "b.json").symlink_to("a.json")
     assert lens.load(tmp_path / "b.json").to_surfaces() == lens.load("la1509").to_surfaces()
-
-
-def test_a_file_that_may_not_be_read_is_refused(tmp_path, monkeypatch):
-    path = tmp_path / "lens.seq"
-    path.write_text("S 1 1")
-
-    def refuse(*_args, **_more):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(os, "open", refuse)
-    with pytest.raises(FileFormatError, match=r"cannot be read \(Permission denied\)"):
-        lens.load(path)
-
-
-@pytest.mark.parametrize("extension", EXTENSIONS)
-def test_a_damaged_real_file_is_refused_or_is_a_lens(extension, tmp_path, generator):
-    """One byte of a good file changed at a time: an error is always one of ours."""
-    path = tmp_path / f"lens{extension}"
-    good = {
-        ".seq": "RDM\nTITLE 'x'\nEPD 10\nDIM M\nWL 587.6\nYAN 0 5\nSO 0 1e13\nS 50 4 NBK7_SCHOTT\nSTO\nCIR 8\nASP\nK -1\nA 1e-7\nS -100 60; CIR 7\nPIM\nSI 0 0\n",
-        ".txt": "x\ntype distance roc diameter material\nO 0 0 0 AIR\nS 0 50 12 N-BK7 0.1 1e-7\nS 4 -100 12 AIR\nI 60 0 9 AIR\n",
-    }.get(extension)
-    if good is None:
-        lens.save(lens.load("la1509"), path)
-        good = path.read_text()
-    random_ = random.Random(1)
-    lens_count = 0
-    for _ in range(150):
-        at = random_.randrange(len(good))
-        new = random_.choice("0123456789-+.eEnN \n;&!'\"{}[],:Sx\x00\xe9")
-        path.write_text(good[:at] + new + good[at + 1 :], encoding="utf-8")
-        try:
-            geo = lens.load(path)
-        except CodesignError as error:
-            assert str(error).startswith(f"lens file {path}: ")  # noqa: PT017
-        else:
-            lens_count += len(geo.surfaces) > 0
-    assert 0 < lens_count < 150

@@ -79,7 +79,7 @@ def test_a_layout_is_saved_by_its_ending(tmp_path):
         assert (tmp_path / name).read_bytes().startswith(start)
     with pytest.raises(FileFormatError, match=r"extension '\.bmp' is not written"):
         lens_figures.lens_layout(geo, path=tmp_path / "a.bmp")
-    with pytest.raises(FileFormatError, match="choose a folder you may write to"):
+    with pytest.raises(FileFormatError, match="give a file in an existing, writable folder"):
         lens_figures.lens_layout(geo, path=tmp_path / "none" / "a.png")
 
 

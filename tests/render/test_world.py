@@ -127,7 +127,7 @@ def test_scenes_and_textures_that_cannot_be_are_refused(tmp_path):
         worlds.ground(-quadrants())
     with pytest.raises(DomainError, match=r"shape \(64,\)"):
         worlds.room(photos=[np.ones(64)])
-    with pytest.raises(DomainError, match="Mitsuba cannot build the scene"):
+    with pytest.raises(DomainError, match="Mitsuba cannot build the scene from it"):
         MitsubaScene({"shape": {"type": "no-such-shape"}})
     with pytest.raises(FileFormatError, match="neither a file nor one of brick"):
         textures.photo("nowhere.png")

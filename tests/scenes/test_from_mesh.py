@@ -325,19 +325,19 @@ def test_files_that_are_no_whole_meshes_are_refused(tmp_path):
         "line.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no faces"),
         "text.stl": (
             "solid t\nfacet\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 x 0\nendsolid t\n",
-            "cannot be read as STL",
+            "cannot be read .* as STL",
         ),
         "cut.stl": ("solid t\nfacet\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n", "no faces"),
         "large.ply": ("ply\nformat ascii 1.0\nelement face 10000000\n", "10,000,000 faces, more than"),
         "short.stl": (bytes(80) + (9).to_bytes(4, "little") + bytes(50), "no faces"),
-        "other.dae": ("<xml/>", "cannot be read as DAE"),
-        "half.dae": ("<COLLADA>", "cannot be read as DAE"),
+        "other.dae": ("<xml/>", "cannot be read .* as DAE"),
+        "half.dae": ("<COLLADA>", "cannot be read .* as DAE"),
         "other.gltf": ("{}", "no whole glTF"),
         "one.gltf": ('{"asset": {"version": "1.0"}}', "version 1.0"),
         "other.glb": (b"glTF" + bytes(30), "no whole glTF"),
         "short.ply": (
             "ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\nend_header\n1\n",
-            "read as PLY|no faces",
+            "anew as PLY|no faces",
         ),
     }
     for name, (content, sentence) in cases.items():

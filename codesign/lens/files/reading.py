@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from codesign.errors import CodesignError, FileFormatError
+from codesign.errors import FileFormatError
 from codesign.lens import catalogue
 from codesign.lens.files import page
 from codesign.lens.files.assemble import assemble
@@ -17,6 +17,7 @@ from codesign.lens.files.seq import read_seq
 from codesign.lens.files.text import at, read_text, title
 from codesign.lens.files.zmx import read_zmx
 from codesign.lens.geolens import GeoLens
+from codesign.reading import reading
 
 TEXTS = {".zmx": read_zmx, ".seq": read_seq, ".txt": read_diffoptics}
 
@@ -57,19 +58,12 @@ def load(source: str | Path, dtype: torch.dtype = torch.float64) -> GeoLens:
             )
         text = read_text(path)
         name = title(path.stem, "lens")
-        try:
+        with reading("a value", "it is of the wrong kind or size; see docs/lens_files.md"):
             return (
                 _from_json(text, name, dtype)
                 if suffix == ".json"
                 else assemble(TEXTS[suffix](text, name), dtype)
             )
-        except CodesignError:
-            raise
-        except (ArithmeticError, AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-            raise FileFormatError(
-                f"a value is of the wrong kind or size ({' '.join(str(error).split())[:80]}); see "
-                "docs/lens_files.md."
-            ) from error
 
 
 def _from_json(text, name, dtype):

@@ -2,14 +2,13 @@
 
 import codecs
 import math
-import os
 import re
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from codesign.errors import CodesignError, FileFormatError
+from codesign.reading import read_bytes
 
 LARGEST_BYTES = 2_000_000
 MOST_SURFACES = 500
@@ -19,21 +18,12 @@ CONTROL = re.compile(r"[\x00-\x08\x0b\x0e-\x1f\x7f]")
 
 
 def read_text(path: str | Path) -> str:
-    """The text of a file in UTF-8, UTF-16 (either byte order) or Latin-1; at most LARGEST_BYTES + 1 bytes are
-    read.
+    """The text of a file in UTF-8, UTF-16 (either byte order) or Latin-1, of at most LARGEST_BYTES.
 
     Raises: FileFormatError for what is not a regular file (a pipe is not waited for), is too long, or is not
       text.
     """
-    try:
-        with open(path, "rb", opener=_open_regular) as file:
-            content = file.read(LARGEST_BYTES + 1)
-    except OSError as error:
-        raise FileFormatError(f"it cannot be read ({error.strerror}); give a file you may read.") from error
-    if len(content) > LARGEST_BYTES:
-        raise FileFormatError(
-            f"it has more than {LARGEST_BYTES} bytes, which no lens needs; is it a lens file?"
-        )
+    content = read_bytes(path, LARGEST_BYTES)
     try:
         text = content.decode(_encoding(content))
     except UnicodeDecodeError as error:
@@ -50,14 +40,6 @@ def read_text(path: str | Path) -> str:
             "as UTF-8."
         )
     return text
-
-
-def _open_regular(path, flags):
-    handle = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
-    if not stat.S_ISREG(os.fstat(handle).st_mode):
-        os.close(handle)
-        raise FileFormatError("it is not a regular file; give a lens file.")
-    return handle
 
 
 def _encoding(content):
