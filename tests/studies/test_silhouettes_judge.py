@@ -79,7 +79,7 @@ def test_a_square_is_judged_by_its_closed_form():
         image = 100 * overlap(0.021)[:, None] * overlap(0.013 - dx)
         return float((image * case.weight).mean())
 
-    step = float(case.steps[0])
+    step = float(case.steps()[0, 0])
     assert step * px / 2 == pytest.approx(judge.STEP_PX)
     truth = {
         0: (loss(step, 0) - loss(-step, 0)) / 2,
