@@ -239,9 +239,17 @@ def _crossings(camera, scene, cameras, most):
         first, second = torch.where(left, first, between), torch.where(left, between, second)
         near, far = torch.where(left, near, depth), torch.where(left, depth, far)
     rows = torch.nonzero((second - first).abs() > least)[:, 0]
-    frame, at, along, pupil, window, change, near = taken(
-        rows, frame, (low + high) / 2, along, pupil, window, second - first, torch.minimum(near, far)
+    frame, at, along, pupil, window, near, least = taken(
+        rows, frame, (low + high) / 2, along, pupil, window, torch.minimum(near, far), least
     )
+    if len(at):  # between faces that meet rays slip through a line without width
+        before, behind = (light(frame, at + side * FOUND_PX * along, pupil)[0] for side in (-1, 1))
+        rows = torch.nonzero((behind - before).abs() > least)[:, 0]
+        frame, at, along, pupil, window, near, change = taken(
+            rows, frame, at, along, pupil, window, near, behind - before
+        )
+    else:
+        change = near
     if not len(at):
         return _Crossings(frame, at, along, pupil, window, change, near, near, near)
     origin, direction, _ = coloured_rays(camera, at, pupil, colour.expand(len(at)))

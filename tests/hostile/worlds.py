@@ -11,12 +11,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 from scenes import random_worlds
-from studies.silhouettes.judge import HIGHEST, LENSES, RIGHT, Effort, judge
-from studies.silhouettes.randoms import case_of
+from studies.silhouettes.judge import HIGHEST, LENSES, RIGHT, Case, Effort, judge, nearest_m, optics_of
 
 EFFORT = Effort(samples=512, per_px=24.0, seeds=(3, 10), directions=2, enough=0.06)
 EACH = 10_000  # worlds of one seed
 REFUSED = 0.03  # of all cases, at most
+
+
+def case_of(draw: random_worlds.Draw, kind: str) -> Case:
+    """The draw before one of LENSES, focused as it says."""
+    scale = 1.0 if kind == "pinhole" else draw.lens_scale
+    optics = optics_of(kind, scale, draw.focus_m)
+    width_px = random_worlds.WIDTH_PX
+    pitch_mm = 2 * 11.0 * scale * draw.half_slope / width_px
+    near = nearest_m(draw.scene, optics, draw.T_world_cam, pitch_mm, width_px)
+    return Case(draw.scene, optics, draw.T_world_cam, pitch_mm, width_px, near, draw.seed)
 
 
 def measure(
@@ -37,7 +46,7 @@ def measure(
         with path.open("a") as file:
             file.write(json.dumps(row) + "\n")
         if _fate(row) not in ("right", "noisy", "empty"):
-            say(f"{_told(row)}")
+            say(_told(row))
     return summary([rows[key] for key in wanted])
 
 

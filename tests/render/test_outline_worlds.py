@@ -163,6 +163,18 @@ def test_a_ball_of_5120_faces_with_one_radiance_each():
     check(MitsubaScene({"wall": wall(), "ball": ball}), 0.3)
 
 
+def test_lines_without_width_between_faces_are_no_jumps():
+    """Rays along the middle row of the film meet edges of a mesh exactly, and may slip through."""
+    vertices, faces = ball_of_triangles(4)
+    ball = emissive_mesh(backend.mitsuba(), 0.5 * vertices + [0, 2, 0], faces, light(200))
+    scene = MitsubaScene(
+        {"ball": ball, "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 60.0}}}
+    )
+    camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.3575, 4)
+    ahead = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))[None]
+    assert not bool(render.frames(camera, scene, ahead, gradient="boundary").isnan().any())
+
+
 def test_the_outline_of_a_fine_mesh_through_a_wide_pupil():
     """An aperture of 5 mm sees the outline of a ball of 20,480 faces move over edges next to it."""
     vertices, faces = ball_of_triangles(5)
