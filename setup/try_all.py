@@ -26,7 +26,7 @@ NAMES = dict(
 )  # of modules that differ from the target's
 MODULES = {NAMES.get(target, target.replace("-", "_")): target for target in STUDIES}
 COMMAND = re.compile(r"(?:\.venv/bin/)?python -m studies\.[a-z].*|make [a-z].*|codesign [a-z].*")
-INSTEAD = {"NAME_OR_FILE": "cooke-triplet", "--lens NAME": "--lens cooke-triplet", "--random N": "--random 2"}
+INSTEAD = {"NAME_OR_FILE": "cooke-triplet", "--lens NAME": "--lens cooke-triplet"}
 # what else stands for something of the reader's own
 OWN = re.compile(r"\b[A-Z]{3,}\b|\w\.(mp4|npz|npy|txt|yaml|urdf)\b|frames/|runs/|--recording |--video$")
 ELSEWHERE = ("help", "setup", "test", "test-bits", "lint", "core-check", "clean", "try-all")

@@ -18,7 +18,7 @@ from torch import Tensor
 from codesign.errors import DomainError
 from codesign.pose import apply, inverse
 from codesign.render.camera import Camera
-from codesign.render.curve_points import curve_points
+from codesign.render.curve_points import Views, curve_points
 from codesign.render.jumps import jumps
 from codesign.render.moving import cameras_in_parts, in_one_row, parts
 from codesign.render.rays import coloured_rays
@@ -71,8 +71,9 @@ def radiance_jumps(camera: Camera, scene: Any, T_world_cam: Tensor) -> bool:
 def _seen(camera, scene, cameras, frames_each, per_px):
     """Jumps at points on the curves of all parts, of views that are certified; None for none."""
     curves = [_curves(part) for part in parts(scene)]
-    check_listed(camera, scene, curves, cameras)
-    points = curve_points(camera, curves, cameras, frames_each, per_px)
+    view = Views(camera)
+    check_listed(camera, view, scene, curves, cameras)
+    points = curve_points(view, curves, cameras, frames_each, per_px)
     found = None if points is None else jumps(camera, scene, cameras, points)
     return None if found is None else found[torch.nonzero(found.weight)[:, 0]]
 

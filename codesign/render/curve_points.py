@@ -55,18 +55,17 @@ class CurvePoints:
 
 
 def curve_points(
-    camera: Camera, curves: Sequence[Sequence[Any]], cameras: Tensor, frames_each: int, per_px: float
+    view: "Views", curves: Sequence[Sequence[Any]], cameras: Tensor, frames_each: int, per_px: float
 ) -> CurvePoints | None:
     """Points on all curves that may fall on the film, about ``per_px`` per pixel length; None for none.
 
-    Args: curves: of every part of the scene, in its own axes. cameras [parts, F, 4, 4]: the camera in the axes of
-      every part. frames_each: frames of a trajectory; every trajectory draws the same numbers.
+    Args: view: of the camera. curves: of every part of the scene, in its own axes. cameras [parts, F, 4, 4]: the camera
+      in the axes of every part. frames_each: frames of a trajectory; every trajectory draws the same numbers.
     """
-    view = _Views(camera)
     count = cameras.shape[1]
     found = []
     for start in range(0, count, frames_each):
-        generator = torch.Generator().manual_seed(camera.seed)
+        generator = torch.Generator().manual_seed(view.seed)
         frames = range(start, min(start + frames_each, count))
         for part, of_part in enumerate(curves):
             for curve in of_part:
@@ -151,11 +150,12 @@ def piece_rad(slope_per_px: float) -> float:
     return min(PIECE_PX * slope_per_px, PIECE_RAD)
 
 
-class _Views:
+class Views:
     """What of space falls on the windows of a film, in rough pixels: slopes from the pupil's centre over the slope
     of a pixel at the axis, in which straight lines are straight whatever the distortion."""
 
-    def __init__(self, camera):
+    def __init__(self, camera: Camera):
+        self.seed = camera.seed
         self.px_per_slope = 1 / camera.slope_per_px()
         self.colours = 1 if camera.spectrum is None else len(camera.spectrum.wavelengths_um)
         self.aperture_m = getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2
@@ -177,6 +177,29 @@ class _Views:
             boxes.append(self._box(camera, middle + border * size))
         self.low, self.high = (torch.stack(side) for side in zip(*boxes, strict=True))
         self.spread, self.shift = self._blur(camera)
+
+    @property
+    def steepest(self) -> float:
+        """Rough pixels per angle, at most."""
+        reach = torch.maximum(self.low.abs(), self.high.abs()).amax(0) / self.px_per_slope
+        return abs(self.px_per_slope) * (1 + float(reach.square().sum()))
+
+    def differs_px(self, other: "Views", nearest_m: float) -> float:
+        """By how much at most other rays fall on the film through another lens, of what is so far away or further."""
+        if self.shift.shape != other.shift.shape or not nearest_m > 0:
+            return math.inf
+        field, spread, shift = (
+            float((a - b).norm(dim=-1).max())
+            for a, b in (
+                (
+                    torch.stack([v / view.px_per_slope for v in (view.low, view.high)])
+                    for view in (self, other)
+                ),
+                (self.spread, other.spread),
+                (self.shift, other.shift),
+            )
+        )
+        return (field + spread + shift / nearest_m) * abs(other.px_per_slope)
 
     def _box(self, camera, pixels):
         """Lowest and highest rough pixel of film positions; the axis scale where no chief ray reaches the film."""

@@ -113,7 +113,7 @@ def _sides(camera, scene, cameras, points, y, x, aside):
         q, colour = (v[rows].repeat(2, *[1] * (v.ndim - 1)) for v in (points.pupil, points.colour))
         at = torch.cat([x[rows] - times * aside[rows], x[rows] + times * aside[rows]])
         origin, direction, weight = coloured_rays(camera, at, q, colour)
-        light, distance = look(scene, cameras[:, points.frame[rows].repeat(2)], origin, direction)
+        light, distance = look(scene, cameras, points.frame[rows].repeat(2), origin, direction)
         reach = (y[rows] - origin[: len(rows)]).norm(dim=1)
         return (weight.detach() * light).reshape(2, -1), distance.reshape(2, -1), reach
 

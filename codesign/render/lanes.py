@@ -18,10 +18,10 @@ def lanes(arr: Any, line: Sequence[Any], poses: Sequence[Any]) -> tuple[Any, Any
     frame = lane // count
     ray = lane - frame * count
     o, d = (arr.Array3(*[dr.gather(arr.Float, v, ray) for v in part]) for part in (line[:3], line[3:]))
-    return ray, o, d, [_placed(arr, o, d, pose, frame) for pose in poses]
+    return ray, o, d, [placed(arr, o, d, pose, frame) for pose in poses]
 
 
-def _placed(arr, o, d, pose, frame):
+def placed(arr: Any, o: Any, d: Any, pose: Any, frame: Any) -> tuple[Any, Any]:
     """Origins and directions in the frame of a part, by the pose of the camera in it at each lane's frame."""
     import drjit as dr
 

@@ -83,6 +83,11 @@ class TexturedPlane:
         """No curves: its radiance jumps nowhere."""
         return []
 
+    def nearest_m(self, eye_m: Tensor) -> float:
+        """Distance of the plane from a point [3] in world axes."""
+        height = (eye_m.double() - self.T_world_plane[:3, 3]) @ self.T_world_plane[:3, 2]
+        return abs(float(height))
+
     def radiance(self, arr: Any, origin: Any, direction: Any) -> Any:
         """Radiance along world rays (drjit arrays). Gradient: exact, to the rays."""
         return self.radiance_and_distance(arr, origin, direction)[0]

@@ -47,12 +47,9 @@ def rim_term(camera: Camera, scene: Any, T_world_cam: Tensor, samples: int) -> T
         scene, T_world_cam = in_one_row(scene, T_world_cam)
         cameras = torch.stack([pose.double() for pose in cameras_in_parts(scene, T_world_cam)])
         count = cameras.shape[1]
-        light, _ = look(
-            scene,
-            cameras.repeat_interleave(len(pixel), 1),
-            origin.detach().repeat(count, 1),
-            direction.detach().repeat(count, 1),
-        )
+        frame = torch.arange(count).repeat_interleave(len(pixel))
+        origin, direction = (v.detach().repeat(count, 1) for v in (origin, direction))
+        light, _ = look(scene, cameras, frame, origin, direction)
         light = light.reshape(count, -1) * (size / samples)
     taken = light * (weight - weight.detach())
     image = torch.zeros(count, math.prod(camera.film.shape), dtype=taken.dtype).index_add(1, pixel, taken)

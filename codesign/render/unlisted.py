@@ -19,16 +19,17 @@ from torch import Tensor
 from codesign.errors import DomainError
 from codesign.pose import apply
 from codesign.render.camera import Camera
-from codesign.render.curve_points import CurvePoints, piece_rad, read_aside_rad
+from codesign.render.curve_points import CurvePoints, Views, piece_rad, read_aside_rad
 from codesign.render.film import coarse_pixels
 from codesign.render.jumps import SAFETY, jumps
+from codesign.render.looked import MOST, Looked, looked_at, nearest_m
 from codesign.render.moving import parts, says_distance
 from codesign.render.rays import coloured_rays
 from codesign.render.sampling import film_pupil_pattern
 from codesign.render.wavefront import look
 
 LINES = 16  # each way across the film
-LEAST_LINES = 4  # each way across every frame of a sequence
+LEAST_LINES = 4  # each way across every frame that is looked at in a sequence
 FRAMES = 32  # looked at in one launch
 RAYS_PER_PX = 3
 HALVINGS = 14
@@ -106,28 +107,48 @@ def listings(
     return told
 
 
-def check_listed(camera: Camera, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor) -> None:
+def check_listed(
+    camera: Camera, view: Views, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor
+) -> None:
     """Raise DomainError when a frame of a sequence shows jumps of radiance that the scene does not list, or lists
-    twice. Every frame is looked at, by fewer lines where there are many. cameras: [parts, F, 4, 4]."""
-    count = cameras.shape[1]
-    lines = max(LEAST_LINES, LINES // count)
-    for start in range(0, count, FRAMES):
+    twice. Looked at are frames that may show what was not looked at yet, by fewer lines where there are many. view: of
+    the camera; cameras: [parts, F, 4, 4]."""
+    known = looked_at(parts(scene), camera.film)
+    for start in range(0, cameras.shape[1], FRAMES):
         views = cameras[:, start : start + FRAMES]
-        for frame, found in enumerate(listings(camera, scene, curves, views, lines), start):
-            if max(found.unlisted, found.doubled) > WRONG:  # a few crossings say little: look closer
-                (found,) = listings(camera, scene, curves, cameras[:, frame : frame + 1], 8 * LINES)
-            if max(found.unlisted, found.doubled) <= WRONG:
-                continue
-            share, what = max(
-                (found.unlisted, "lie on no edge or outline that the scene lists"),
-                (found.doubled, "lie on several of its edges at once"),
-            )
-            at = ", ".join(f"{v:.3g}" for v in found.place_m or ())
-            raise DomainError(
-                f"gradient 'boundary': {share:.0%} of the jumps of radiance in frame {frame} {what}, the largest near "
-                f"({at}) m: parts of a moving scene that touch, textures with hard texels, or shapes that are not "
-                "known; move them apart, smooth the texture, or use 'difference'."
-            )
+        left = torch.ones(views.shape[1], dtype=torch.bool)
+        for each in known:
+            left &= ~each.answers_for(views, view)
+        fresh = {}
+        while left.any():
+            row = int(left.nonzero()[0])
+            fresh[row] = Looked(views[:, row], nearest_m(parts(scene), views[:, row]), view)
+            left &= ~fresh[row].answers_for(views, view)
+            left[row] = False
+        if fresh:
+            _check_frames(camera, scene, curves, views, list(fresh), start)
+            known.extend(fresh.values())
+    del known[:-MOST]
+
+
+def _check_frames(camera, scene, curves, cameras, rows, start):
+    """Look at frames ``rows`` of cameras [parts, F, 4, 4], of which the first is frame ``start``."""
+    lines = max(LEAST_LINES, LINES // len(rows))
+    for row, found in zip(rows, listings(camera, scene, curves, cameras[:, rows], lines), strict=True):
+        if max(found.unlisted, found.doubled) > WRONG:  # a few crossings say little: look closer
+            (found,) = listings(camera, scene, curves, cameras[:, row : row + 1], 8 * LINES)
+        if max(found.unlisted, found.doubled) <= WRONG:
+            continue
+        share, what = max(
+            (found.unlisted, "lie on no edge or outline that the scene lists"),
+            (found.doubled, "lie on several of its edges at once"),
+        )
+        at = ", ".join(f"{v:.3g}" for v in found.place_m or ())
+        raise DomainError(
+            f"gradient 'boundary': {share:.0%} of the jumps of radiance in frame {start + row} {what}, the largest near "
+            f"({at}) m: parts of a moving scene that touch, textures with hard texels, or shapes that are not "
+            "known; move them apart, smooth the texture, or use 'difference'."
+        )
 
 
 def reach_m(camera: Camera, scene: Any, cameras: Tensor | Sequence[Tensor]) -> float:
@@ -138,9 +159,8 @@ def reach_m(camera: Camera, scene: Any, cameras: Tensor | Sequence[Tensor]) -> f
     pixels = coarse_pixels(camera.film, 8)
     rays = camera.rays_through(pixels, torch.zeros_like(pixels))
     poses = torch.stack([pose.double().reshape(1, 4, 4) for pose in cameras])
-    _, distance = look(
-        scene, poses.expand(-1, len(pixels), 4, 4), rays.origin_m.double(), rays.direction.double()
-    )
+    first = torch.zeros(len(pixels), dtype=torch.long)
+    _, distance = look(scene, poses, first, rays.origin_m.double(), rays.direction.double())
     met = distance[distance.isfinite()]
     return float(met.median()) if len(met) else 1.0
 
@@ -177,7 +197,7 @@ def _crossings(camera, scene, cameras, most):
                 direction.repeat(count, 1),
                 weight.repeat(count),
             )
-        seen, distance = look(scene, cameras[:, frame], origin, direction)
+        seen, distance = look(scene, cameras, frame, origin, direction)
         return weight * seen, distance, weight > 0
 
     columns = []
@@ -219,9 +239,17 @@ def _crossings(camera, scene, cameras, most):
         first, second = torch.where(left, first, between), torch.where(left, between, second)
         near, far = torch.where(left, near, depth), torch.where(left, depth, far)
     rows = torch.nonzero((second - first).abs() > least)[:, 0]
-    frame, at, along, pupil, window, change, near = taken(
-        rows, frame, (low + high) / 2, along, pupil, window, second - first, torch.minimum(near, far)
+    frame, at, along, pupil, window, near, least = taken(
+        rows, frame, (low + high) / 2, along, pupil, window, torch.minimum(near, far), least
     )
+    if len(at):  # between faces that meet rays slip through a line without width
+        before, behind = (light(frame, at + side * FOUND_PX * along, pupil)[0] for side in (-1, 1))
+        rows = torch.nonzero((behind - before).abs() > least)[:, 0]
+        frame, at, along, pupil, window, near, change = taken(
+            rows, frame, at, along, pupil, window, near, behind - before
+        )
+    else:
+        change = near
     if not len(at):
         return _Crossings(frame, at, along, pupil, window, change, near, near, near)
     origin, direction, _ = coloured_rays(camera, at, pupil, colour.expand(len(at)))
@@ -308,7 +336,7 @@ def _light(camera, scene, cameras, found, rows, along_px):
     """Light [n] of crossings ``rows`` [n], so far [n] px along their lines."""
     at = found.film_px[rows] + along_px[:, None] * found.along[rows]
     origin, direction, weight = coloured_rays(camera, at, found.pupil[rows], torch.zeros_like(rows))
-    return weight * look(scene, cameras[:, found.frame[rows]], origin, direction)[0]
+    return weight * look(scene, cameras, found.frame[rows], origin, direction)[0]
 
 
 def _near(curve, index, bounds, eye, origin, direction, distance, near_rad):

@@ -10,7 +10,7 @@ from codesign.errors import DomainError, ShapeError, check_whole
 from codesign.exclusive import exclusive
 from codesign.pose import Poses, as_poses
 from codesign.render.kinds import Scene
-from codesign.render.lanes import lanes, nearest
+from codesign.render.lanes import lanes, nearest, placed
 from codesign.render.moving import MovingScene, cameras_in_parts, in_one_row, parts, says_distance
 from codesign.render.pixel_means import Wavefront, pixel_means
 from codesign.types import Rays
@@ -85,24 +85,18 @@ def light_and_nearness(rays: Rays, scene: Scene | MovingScene, T_world_cam: Tens
 
 
 @exclusive
-def look(scene: Any, cameras: Tensor, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Radiance [n] and distance [n] along rays [n, 3] in camera axes, seen from poses [parts, n, 4, 4] of the camera;
-    float64 without gradient."""
+def look(
+    scene: Any, cameras: Tensor, frame: Tensor, origin: Tensor, direction: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Radiance [n] and distance [n] along rays [n, 3] in camera axes, each seen in its frame [n] of cameras
+    [parts, F, 4, 4]; float64 without gradient."""
     import drjit as dr
 
-    arr = arrays(origin.device.type, scene.dtype)
-
-    def columns(vectors):
-        return arr.Array3(*[load(arr.Float, c.to(scene.dtype)) for c in vectors.unbind(1)])
-
-    placed = [
-        (
-            columns((pose[:, :3, :3] @ origin[..., None])[..., 0] + pose[:, :3, 3]),
-            columns((pose[:, :3, :3] @ direction[..., None])[..., 0]),
-        )
-        for pose in cameras
-    ]
-    light, distance, _ = nearest(arr, parts(scene), placed)
+    arr, fine = (arrays(origin.device.type, dtype) for dtype in (scene.dtype, torch.float64))
+    at = fine.UInt32(load(fine.Int32, frame.int()))
+    o, d = (fine.Array3(*[load(fine.Float, c) for c in v.unbind(1)]) for v in (origin, direction))
+    rays = [placed(fine, o, d, load(fine.Float, pose[:, :3]), at) for pose in cameras]
+    light, distance, _ = nearest(arr, parts(scene), [[arr.Array3(v) for v in pair] for pair in rays])
     dr.eval(light, distance)
     light, distance = (torch.as_tensor(arr.Float(v).numpy()).double() for v in (light, distance))
     return light, distance
@@ -117,8 +111,8 @@ class _Depths:
     def __call__(self, arr, *columns):
         import drjit as dr
 
-        _, o, d, placed = lanes(arr, columns[:6], columns[6:])
-        light, distance, _ = nearest(arr, self.scenes, placed)
+        _, o, d, rays = lanes(arr, columns[:6], columns[6:])
+        light, distance, _ = nearest(arr, self.scenes, rays)
         met = dr.isfinite(distance)
         depth = o.z + d.z * dr.select(met, distance, 1)
         return light, dr.select(met & (depth > 0), 1 / dr.select(depth > 0, depth, 1), 0)

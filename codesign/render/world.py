@@ -15,6 +15,8 @@ from codesign.reading import reading
 from codesign.render.fronts import are_geometric
 from codesign.render.outline import outlines
 from codesign.render.outline.curves import Segments
+from codesign.render.outline.nearness import Bodies
+from codesign.render.outline.shapes import read
 from codesign.render.shape_table import box_around, shape_numbers
 from codesign.render.slopes import with_slopes
 from codesign.render.soundness import check_description, check_scene
@@ -49,7 +51,7 @@ class MitsubaScene:
         emissive: bool = True,
     ):
         self.mi = backend.mitsuba(device)
-        self._outline = None
+        self._outline = self._bodies = None
         if isinstance(description, self.mi.Scene):
             self.scene: Any = description
         else:
@@ -177,9 +179,19 @@ class MitsubaScene:
     def outline(self) -> Any:
         """Curves where radiance may jump, see codesign.render.outline; worked out once."""
         if self._outline is None:
-            curves = outlines(self.mi, self.scene)
+            curves = outlines(self._read())
             self._outline = [_never_black(curve) for curve in curves] if self.both_sides else curves
         return self._outline
+
+    def nearest_m(self, eye_m: Tensor) -> float:
+        """Distance from a point [3] in world axes below which there is no surface; infinite without shapes."""
+        if self._bodies is None:
+            self._bodies = Bodies.of(self._read())
+        return self._bodies.nearest_m(eye_m.detach().numpy())
+
+    @exclusive
+    def _read(self):
+        return [read(self.mi, shape) for shape in self.scene.shapes()]
 
     @exclusive
     def hit(self, origin_m: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:

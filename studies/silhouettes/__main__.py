@@ -5,8 +5,6 @@ The loss is a fixed smooth weighting of one frame. Its differences, with many sa
 numbers at several seeds, are the truth and tell their own noise; beside them stand the interior gradient
 (plain automatic differentiation), and the one with the boundary term, with many samples and with the usual
 16.
-
-With --random N, random worlds before a pinhole, a thin lens and a traced lens are judged instead.
 """
 
 import sys
@@ -20,7 +18,6 @@ from scenes import silhouettes as silhouette_scenes
 from studies.frame.run import Run, StudyConfig, main
 from studies.silhouettes.judge import LENSES, USUAL, Effort
 from studies.silhouettes.listed import listed
-from studies.silhouettes.randoms import QUICK, SWEEP, sweep
 from studies.silhouettes.task import SAMPLES, Task, compare, cost
 
 ASKED = {"pose": 0.03, "lens": 0.03, "single": 0.10, "interior": 0.005, "cost": 2.0}
@@ -35,24 +32,13 @@ class Config(StudyConfig):
     """Seeds of the differences; as many of the single estimates."""
     only_listed: bool = False
     """Judge the listed worlds, which once were wrong, and nothing else."""
-    random: int = 0
-    """Judge so many random worlds instead of the others."""
-    first: int = 0
-    """Number of the first random world."""
-    raw: tuple[str, ...] = ()
-    """Raw tables (random.json of other runs) whose random worlds are taken over instead of being judged again."""
 
 
 def study(run: Run[Config]) -> None:
     config = run.config
     if config.many < 64 or config.seeds < 2:
         raise DomainError(f"many = {config.many} and seeds = {config.seeds} must be at least 64 and 2.")
-    if config.random < 0 or config.first < 0:
-        raise DomainError(f"random = {config.random} and first = {config.first} must be at least 0.")
     effort = Effort(seeds=(4,)) if config.quick else USUAL
-    if config.random:
-        sweep(run, config.random, config.first, config.raw, QUICK if config.quick else SWEEP)
-        return
     if config.only_listed:
         missed = listed(run, effort)
         told = (

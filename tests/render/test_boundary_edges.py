@@ -14,6 +14,7 @@ from codesign.render.camera import project
 from codesign.render.curve_points import CurvePoints
 from codesign.render.jumps import _on_film
 from codesign.render.outline import Circles, outlines
+from codesign.render.outline.shapes import read
 
 F64 = torch.float64
 RADIANCE = 100.0
@@ -107,12 +108,8 @@ def test_points_are_found_on_the_film_through_their_own_point_of_the_pupil(gener
 def test_both_rims_of_a_cylinder_are_circles_about_its_axis():
     mi = backend.mitsuba()
     start, end, radius = np.array([0.1, -0.2, 0.3]), np.array([0.5, 0.4, 1.3]), 0.15
-    found = outlines(
-        mi,
-        mi.load_dict(
-            {"type": "scene", "tube": {"type": "cylinder", "p0": start, "p1": end, "radius": radius}}
-        ),
-    )
+    tube = mi.load_dict({"type": "cylinder", "p0": start, "p1": end, "radius": radius})
+    found = outlines([read(mi, tube)])
     rims = next(curve for curve in found if isinstance(curve, Circles))
     axis = torch.tensor((end - start) / np.linalg.norm(end - start))
     s = torch.linspace(0, 0.95, 20, dtype=F64)

@@ -16,7 +16,7 @@ from codesign.render.outline.crossings import find_crossings
 from codesign.render.outline.intersections import Intersections
 from codesign.render.outline.overlaps import Overlaps, overlaps
 from codesign.render.outline.pairs import touching
-from codesign.render.outline.shapes import Mesh
+from codesign.render.outline.shapes import Mesh, read
 from scenes.silhouettes import smooth
 from studies.silhouettes.task import STEPS, Task
 
@@ -34,7 +34,8 @@ def place():
 
 def curves(**shapes):
     mi = backend.mitsuba()
-    return outlines(mi, mi.load_dict({"type": "scene", **shapes}, optimize=False))
+    scene = mi.load_dict({"type": "scene", **shapes}, optimize=False)
+    return outlines([read(mi, shape) for shape in scene.shapes()])
 
 
 def intersection(**shapes):

@@ -9,7 +9,7 @@ import torch
 
 from codesign import backend, lens, pose, render
 from codesign.errors import DomainError
-from codesign.render import MitsubaScene
+from codesign.render import MitsubaScene, unlisted
 from codesign.render.charts import emissive_mesh
 from scenes.silhouettes import smooth
 from studies.silhouettes import judge
@@ -163,6 +163,18 @@ def test_a_ball_of_5120_faces_with_one_radiance_each():
     check(MitsubaScene({"wall": wall(), "ball": ball}), 0.3)
 
 
+def test_lines_without_width_between_faces_are_no_jumps():
+    """Rays along the middle row of the film meet edges of a mesh exactly, and may slip through."""
+    vertices, faces = ball_of_triangles(4)
+    ball = emissive_mesh(backend.mitsuba(), 0.5 * vertices + [0, 2, 0], faces, light(200))
+    scene = MitsubaScene(
+        {"ball": ball, "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 60.0}}}
+    )
+    camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.3575, 4)
+    ahead = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))[None]
+    assert not bool(render.frames(camera, scene, ahead, gradient="boundary").isnan().any())
+
+
 def test_the_outline_of_a_fine_mesh_through_a_wide_pupil():
     """An aperture of 5 mm sees the outline of a ball of 20,480 faces move over edges next to it."""
     vertices, faces = ball_of_triangles(5)
@@ -213,10 +225,13 @@ def test_a_dark_ball_through_a_mesh_however_far(ratio):
 
 
 @pytest.mark.parametrize(
-    "twist", [(-6.0, 0, 0, 0, 0, 0), (0, 0, 0, 0, -0.23, 0)], ids=["6 m aside", "13 degrees of turning"]
+    ("twist", "nearer"),
+    [((-6.0, 0, 0, 0, 0, 0), 1), ((0, 0, 0, 0, -0.23, 0), 1), ((-0.3, 0, 0, 0, 0, 0), 20)],
+    ids=["6 m aside", "13 degrees of turning", "0.3 m aside of what is near"],
 )
-def test_a_view_is_looked_at_though_another_was_right(twist):
-    """A wall at 100 m that alone is seen at first, and a ball that moves through a cube 10 m ahead, aside."""
+def test_a_view_is_looked_at_though_another_was_right(twist, nearer, monkeypatch):
+    """A wall at 100 m that alone is seen at first, and a ball that moves through a cube 10 m ahead, aside, or as much
+    smaller and nearer. A camera that moves by a thousandth of that is not looked through again."""
     T = backend.mitsuba().ScalarTransform4f
     wall_of = {
         "type": "rectangle",
@@ -224,16 +239,41 @@ def test_a_view_is_looked_at_though_another_was_right(twist):
     }
     cube = {
         "type": "cube",
-        "to_world": T().translate([-7.2, 0, 10.0]).rotate([1, 1, 0], 40).scale(0.8),
+        "to_world": T().scale(1 / nearer).translate([-7.2, 0, 10.0]).rotate([1, 1, 0], 40).scale(0.8),
         "emitter": light(200),
     }
-    ball = MitsubaScene({"ball": {"type": "sphere", "radius": 0.55, "emitter": light(20)}})
+    ball = MitsubaScene({"ball": {"type": "sphere", "radius": 0.55 / nearer, "emitter": light(20)}})
     static = MitsubaScene({"wall": {**wall_of, "emitter": texture(2, 6)}, "cube": cube})
     place = torch.eye(4, dtype=F64)[None].clone()
-    place[0, :3, 3] = torch.tensor([-6.6, 0.1, 9.3])
+    place[0, :3, 3] = torch.tensor([-6.6, 0.1, 9.3]) / nearer
     world = render.MovingScene(static, {"ball": (ball, place)})
     camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.35, 4)
-    render.frames(camera, world, torch.eye(4, dtype=F64)[None], gradient="boundary")
+    looks = []
+    listings = unlisted.listings
+    monkeypatch.setattr(unlisted, "listings", lambda *given: looks.append(given) or listings(*given))
+    for share in (0.0, 1e-3):
+        small = pose.se3_exp(share * torch.tensor([twist], dtype=F64))
+        render.frames(camera, world, small, gradient="boundary")
+    assert len(looks) == 1
     other = pose.se3_exp(torch.tensor([twist], dtype=F64))
     with pytest.raises(DomainError, match="of the jumps of radiance in frame 0"):
         render.frames(camera, world, other, gradient="boundary")
+
+
+@pytest.mark.parametrize("kind", ["ball", "tube", "disk", "mesh"])
+def test_no_surface_is_nearer_than_it_is_said(kind, generator):
+    """Against points spread over the shape, from outside and within."""
+    T = backend.mitsuba().ScalarTransform4f
+    placed = T().translate([0.3, -0.2, 0.5]).rotate([0.6, 0.8, 0], 50)
+    plugin = {"ball": "sphere", "tube": "cylinder", "disk": "disk", "mesh": "cube"}[kind]
+    scene = MitsubaScene({"thing": {"type": plugin, "to_world": placed.scale(0.4), "emitter": light(1)}})
+    at = torch.randn(40_000, 2, 3, generator=generator, dtype=F64)
+    eyes = torch.cat([2 * at[:20, 0], 0.1 * at[20:40, 0] + torch.tensor([0.3, -0.2, 0.5], dtype=F64)])
+    target = torch.tensor([0.3, -0.2, 0.5], dtype=F64) + 0.4 * at[:, 1]
+    direction = torch.nn.functional.normalize(target - at[:, 0], dim=1)
+    point, _, valid = scene.hit(at[:, 0], direction)
+    for eye in eyes:
+        nearest = float((point[valid] - eye).norm(dim=1).min())
+        assert scene.nearest_m(eye) <= nearest * (1 + 1e-5)
+        if kind in ("ball", "mesh"):
+            assert scene.nearest_m(eye) > nearest - 0.06

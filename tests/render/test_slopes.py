@@ -102,10 +102,10 @@ def test_box_around_a_scene_takes_no_ray_from_it(shape, generator):
     target = 1.2 * (2 * torch.rand(4000, 3, dtype=torch.float64, generator=generator) - 1)
     target[::4] = target[::4].round()
     direction = torch.nn.functional.normalize(target - origin, dim=1)
-    still = torch.eye(4, dtype=torch.float64).expand(1, 4000, 4, 4)
-    light, distance = look(scene, still, origin, direction)
+    still = torch.eye(4, dtype=torch.float64)[None, None], torch.zeros(4000, dtype=torch.long)
+    light, distance = look(scene, *still, origin, direction)
     scene._box = None
-    again, same = look(scene, still, origin, direction)
+    again, same = look(scene, *still, origin, direction)
     assert torch.equal(light, again)
     assert torch.equal(distance, same)
     assert 0.05 < float((light == 7.0).double().mean()) < 0.95

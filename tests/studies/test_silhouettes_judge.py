@@ -12,9 +12,8 @@ import torch
 from codesign import backend, lens, pose
 from codesign.render import MitsubaScene
 from scenes import outline_cases, random_worlds
-from studies.frame.run import main
-from studies.silhouettes import judge, listed, randoms
-from studies.silhouettes.__main__ import Config, study
+from studies.silhouettes import judge, listed
+from tests.hostile import worlds
 
 QUICK = judge.Effort(seeds=(4,))
 
@@ -79,7 +78,7 @@ def test_a_square_is_judged_by_its_closed_form():
         image = 100 * overlap(0.021)[:, None] * overlap(0.013 - dx)
         return float((image * case.weight).mean())
 
-    step = float(case.steps[0])
+    step = float(case.steps()[0, 0])
     assert step * px / 2 == pytest.approx(judge.STEP_PX)
     truth = {
         0: (loss(step, 0) - loss(-step, 0)) / 2,
@@ -111,48 +110,26 @@ def test_a_verdict_weighs_errors_by_their_noise():
     assert found.noise == pytest.approx(spread, rel=1e-6)
 
 
-def test_a_few_random_worlds_are_judged_through_all_lenses():
-    rows = randoms.judged_draw(4, ("pinhole",), randoms.QUICK) + randoms.judged_draw(3, effort=randoms.QUICK)
-    assert [row["verdict"] for row in rows] == ["right"] * 4
-    found = randoms.counted(rows)
-    assert found["random_worlds"] == 2
-    assert found["random_pinhole_right_count"] == 2
-    assert found["random_thin_right_count"] == 1
-    assert found["random_traced_worst_error"] == max(row["error"] for row in rows if row["lens"] == "traced")
-    assert all(row["interior"] > 0.5 for row in rows)
-
-
-def test_rows_of_earlier_runs_are_taken_over_and_verdicts_counted(tmp_path, monkeypatch, capsys):
-    """Judging is replaced by made-up rows: what is judged anew, what is recorded, and what a broken table says."""
-    asked = []
-
-    def made_up(seed, effort):
-        asked.append(seed)
-        row = judge.Judged("wrong", 0.4, 0.01, 0.005, 1.0).row()
-        shy = judge.Judged("refused", sentence="too thin").row()
-        facts = random_worlds.draw(seed).facts
-        return [
-            {"seed": seed, "lens": kind, **(shy if kind == "thin" else row), "facts": facts}
-            for kind in judge.LENSES
-        ]
-
-    monkeypatch.setattr(randoms, "judged_draw", made_up)
-    first, second = tmp_path / "first", tmp_path / "second"
-    assert main(study, Config, ["--random", "2", "--first", "3", "--out", str(first)]) == 0
-    table = str(first / "random.json")
-    assert main(study, Config, ["--random", "3", "--first", "2", "--raw", table, "--out", str(second)]) == 0
-    assert asked == [3, 4, 2]
-    metrics = json.loads((second / "metrics.json").read_text())
-    assert metrics["random_worlds"] == 3
-    assert metrics["random_pinhole_wrong_count"] == metrics["random_thin_refused_count"] == 3
-    assert metrics["random_pinhole_worst_error"] == 0.4
-    assert metrics["random_thin_refused_share"] == 1.0
-    assert "too thin" in (second / "report.html").read_text()
-    capsys.readouterr()
-    (tmp_path / "broken.json").write_text("[1]")
-    broken = ["--random", "1", "--raw", str(tmp_path / "broken.json"), "--out", str(tmp_path / "third")]
-    assert main(study, Config, broken) == 2
-    assert "is no raw table of this study" in capsys.readouterr().err
+def test_random_worlds_are_judged_once_and_counted(tmp_path):
+    """Two worlds of which one is known from an earlier call, as wrong and refused as it can be."""
+    path = tmp_path / "worlds.jsonl"
+    known = {
+        "pinhole": judge.Judged("near", 0.08, 0.01),
+        "thin": judge.Judged("refused", sentence="too thin"),
+    }
+    known["traced"] = judge.Judged("doubtful", 0.3, 0.2)
+    lines = [json.dumps({"world": 0, "lens": kind, **found.row()}) for kind, found in known.items()]
+    path.write_text("\n".join(lines) + "\n")
+    told = []
+    figures, findings = worlds.measure(2, 0, told.append, path)
+    assert (figures["worlds_judged"], figures["worlds_right"], figures["worlds_wrong"]) == (4, 3, 1)
+    assert figures["worlds_noisy"] == figures["worlds_refused"] == 1
+    assert findings[0] == "world 0 through the lens 'pinhole' is 8.0% wrong at a noise of 1.0%."
+    assert findings[1:] == ["1 of 6 random worlds are refused, 3% may be."]
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    assert all(row["verdict"] == "right" and row["interior"] > 0.5 for row in rows if row["world"] == 1)
+    assert worlds.measure(2, 0, told.append, path) == (figures, findings)
+    assert told == []
 
 
 def test_a_listed_world_is_told_from_a_wrong_gradient():

@@ -12,13 +12,12 @@ from codesign.render.outline.edges import mesh_edges, segments
 from codesign.render.outline.intersections import on_surfaces
 from codesign.render.outline.joints import edges_once, rims_once, tolerance
 from codesign.render.outline.meridians import Meridians
-from codesign.render.outline.shapes import Ball, Disk, Mesh, Tube, read
+from codesign.render.outline.shapes import Ball, Disk, Mesh, Shape, Tube
 
 
-def outlines(mi: Any, scene: Any) -> list[Any]:
-    """All curves of a Mitsuba scene: a list of Segments, Circles, Spheres, Cylinders, Meridians, Intersections, and of
-    Overlaps that refuse to be seen. Raises: DomainError for shapes whose outline is not known."""
-    shapes = [read(mi, shape) for shape in scene.shapes()]
+def outlines(shapes: list[Shape]) -> list[Any]:
+    """All curves of the shapes of a scene: a list of Segments, Circles, Spheres, Cylinders, Meridians, Intersections, and of
+    Overlaps that refuse to be seen."""
     if not shapes:
         return []
     apart_m = tolerance(np.concatenate([shape.corners() for shape in shapes]))

@@ -94,7 +94,7 @@ def _neighbours(place, pairs):
 def _near_others(shapes):
     """Triangles of all shapes: of meshes all, since they may cross themselves; of others those within the box of
     another shape."""
-    boxes = [(s.corners().min(0), s.corners().max(0)) for s in shapes]
+    lows, highs = (np.stack([of(s.corners(), 0) for s in shapes]) for of in (np.min, np.max))
     parts = []
     for number, shape in enumerate(shapes):
         vertices, faces = tessellated(shape)
@@ -103,9 +103,10 @@ def _near_others(shapes):
         if not kept.all():
             low = corners.min(1)
             high = corners.max(1)
-            for other, (other_low, other_high) in enumerate(boxes):
-                if other != number:
-                    kept |= ((low <= other_high) & (high >= other_low)).all(1)
+            beside = ((lows[number] <= highs) & (highs[number] >= lows)).all(1)
+            beside[number] = False
+            for other in np.nonzero(beside)[0]:
+                kept |= ((low <= highs[other]) & (high >= lows[other])).all(1)
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         kept &= np.linalg.norm(across, axis=1) > 0
         place = welded(vertices, 0.0)[faces] if kept.any() else faces

@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from codesign.render.outline.edges import ROUNDING, Edges, joined, welded
+from codesign.render.outline.pairs import touching
 
 SAME_PLACE_M = 1e-4  # curves nearer than this are one; they are read from farther aside by as much
-FEW = 32  # edges of a shape up to which each is held against those of others
 SHORT = 4  # edges shorter than this many such distances are left as they are
 
 
@@ -27,7 +27,11 @@ def edges_once(parts: list[Edges], apart_m: float) -> Edges:
     """
     parts = [part for part in parts if len(part)]
     edges = joined(parts)
-    chosen = edges.always & (edges.length_m > SHORT * apart_m) & (edges.free | _beside_others(parts, apart_m))
+    chosen = (
+        edges.always
+        & (edges.length_m > SHORT * apart_m)
+        & (edges.free | _beside_others(parts, edges, apart_m))
+    )
     rows = np.nonzero(chosen)[0]
     if len(rows) < 2:
         return edges
@@ -50,23 +54,13 @@ def edges_once(parts: list[Edges], apart_m: float) -> Edges:
     return joined([edges[~chosen], merged])
 
 
-def _beside_others(parts, apart_m):
-    """Edges [E] whose boxes touch those of another shape's edges: of each of them where these are few, of all
-    together where they are many."""
-    low = [np.minimum(p.start, p.end) - apart_m for p in parts]
-    high = [np.maximum(p.start, p.end) + apart_m for p in parts]
-    boxes = [(a.min(0), b.max(0)) for a, b in zip(low, high, strict=True)]
-    found = []
-    for i, (own_low, own_high) in enumerate(boxes):
-        touched = np.zeros(len(parts[i]), dtype=bool)
-        for j, (other_low, other_high) in enumerate(boxes):
-            if i == j or (own_low > other_high).any() or (own_high < other_low).any():
-                continue
-            each = zip(low[j], high[j], strict=True) if len(low[j]) <= FEW else [(other_low, other_high)]
-            for a, b in each:
-                touched |= ((low[i] <= b) & (high[i] >= a)).all(1)
-        found.append(touched)
-    return np.concatenate(found)
+def _beside_others(parts, edges, apart_m):
+    """Edges [E] whose boxes touch those of another shape's edges."""
+    shape = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    pairs = touching(np.stack([edges.start, edges.end], 1), 2 * apart_m)
+    found = np.zeros(len(edges), dtype=bool)
+    found[pairs[shape[pairs[:, 0]] != shape[pairs[:, 1]]]] = True
+    return found
 
 
 def _cut_at_ends(edges, apart_m):

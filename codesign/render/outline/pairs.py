@@ -1,4 +1,4 @@
-"""Which of many triangles may touch: pairs whose boxes overlap, from a tree of boxes walked all levels at once."""
+"""Which of many triangles or edges may touch: pairs whose boxes overlap, from a tree of boxes walked all levels at once."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ BITS = 10  # of each coordinate in the order along a space-filling curve
 
 
 def touching(corners: np.ndarray, margin_m: float) -> np.ndarray:
-    """Pairs [n, 2], first below second, of triangles [N, 3, 3] whose boxes come nearer than ``margin_m``."""
+    """Pairs [n, 2], first below second, of triangles or edges, by their corners [N, k, 3], whose boxes come nearer than ``margin_m``."""
     count = len(corners)
     if count < 2:
         return np.zeros((0, 2), dtype=np.int64)
