@@ -103,7 +103,7 @@ def door(function: Callable[P, T], name: str) -> Callable[P, T]:
 
 
 def _sentence(function, name, args, kwargs, error):
-    if isinstance(error, CodesignError) or not _is_ours(error.__traceback__):
+    if isinstance(error, CodesignError) or not is_ours(error.__traceback__):
         return None
     try:
         given = inspect.signature(function).bind(*args, **kwargs).arguments
@@ -125,7 +125,8 @@ def _sentence(function, name, args, kwargs, error):
         blamed = {f"'{type(each).__name__}' object" for each in (value, *parts)}
         if isinstance(error, (AttributeError, TypeError)) and any(words in said for words in blamed):
             return DomainError(f"{name}: {argument} = {shown(value)} does not fit ({said}).")
-        if isinstance(error, KeyError) and error.args[0] is value:
+        unknown = isinstance(error, AttributeError) and said.endswith(f"has no attribute {value!r}")
+        if unknown or (isinstance(error, KeyError) and error.args[0] is value):
             return DomainError(f"{name}: {argument} = {shown(value)} is not known.")
     if isinstance(error, (AttributeError, OSError, KeyError)) or not UNFIT.search(said):
         return None
@@ -134,7 +135,7 @@ def _sentence(function, name, args, kwargs, error):
     return kind(f"{name} cannot work with {what}: {said[:200]} (its help says which shapes and values fit).")
 
 
-def _is_ours(trace):
+def is_ours(trace: types.TracebackType | None) -> bool:
     """Whether the last function that is no library's is one of ours, and no callback of the caller's."""
     last = ""
     while trace is not None:
