@@ -7,6 +7,7 @@ make where it has one. A command that names a file of the reader's own must end 
 """
 
 import argparse
+import json
 import os
 import re
 import shlex
@@ -29,6 +30,7 @@ COMMAND = re.compile(r"(?:\.venv/bin/)?python -m studies\.[a-z].*|make [a-z].*|c
 INSTEAD = {"NAME_OR_FILE": "cooke-triplet", "--lens NAME": "--lens cooke-triplet"}
 # what else stands for something of the reader's own
 OWN = re.compile(r"\b[A-Z]{3,}\b|\w\.(mp4|npz|npy|txt|yaml|urdf)\b|frames/|runs/|--recording |--video$")
+NEEDS = re.compile(r"\b(?:give|needs?|pass|with|required:)\b.*?(--[a-z][a-z-]*)")
 ELSEWHERE = ("help", "setup", "test", "test-bits", "lint", "core-check", "clean", "try-all")
 
 
@@ -83,6 +85,7 @@ def outcome(command: str, limit_s: float) -> tuple[bool, str, str]:
     name, *words = shlex.split(command)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
     with tempfile.TemporaryDirectory(prefix="try-all-") as folder:
+        os.symlink(ROOT / "docs", f"{folder}/docs")  # pages name raw tables as from the project's folder
         more = ["--quick", "--out", f"{folder}/out"] if name == "python" or words[0] in STUDIES else []
         if name == "make":
             given = " ".join(["".join(words[1:]).removeprefix("ARGS="), *more])
@@ -100,8 +103,9 @@ def outcome(command: str, limit_s: float) -> tuple[bool, str, str]:
     lines = [line for line in done.stderr.splitlines() if line.strip() and not line.startswith("make")] or [
         ""
     ]
-    # the sentence of a command that needs data of the reader's own names the option to give them with
-    theirs = OWN.search(command) or " --" in lines[0]
+    # exit 2 is right only where the command names data of the reader's own, or asks for an option that it lacks
+    asked = NEEDS.search(lines[0])
+    theirs = OWN.search(command) or (asked and asked[1] not in command)
     right = code[0] == "0" or (code[0] == "2" and not traced and bool(theirs))
     return right, code[0], "" if code[0] == "0" else lines[-1 if traced else 0][:160]
 
@@ -109,16 +113,19 @@ def outcome(command: str, limit_s: float) -> tuple[bool, str, str]:
 def main() -> int:
     asked = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     asked.add_argument("--only", default="", help="try the commands that hold this text")
+    asked.add_argument("--metrics", type=Path, help="file for the figures commands and failed")
     asked.add_argument("--limit", type=float, default=900.0, help="seconds that a command may take")
     options = asked.parse_args()
-    failed = 0
+    tried = failed = 0
     print("| command | page | exit | seconds | first line of the error |\n|---|---|---|---|---|")
     for command, page in commands().items():
         if options.only not in command or command.split()[1] in ELSEWHERE:
             continue
         began = time.monotonic()
         right, code, said = outcome(command, options.limit)
-        failed += not right
+        tried, failed = tried + 1, failed + (not right)
+        if options.metrics:
+            options.metrics.write_text(json.dumps({"commands": tried, "failed": failed}), encoding="utf-8")
         mark = "" if right else " **fails**"
         print(
             f"| `{command}` | {page} | {code}{mark} | {time.monotonic() - began:.0f} | {said} |", flush=True
