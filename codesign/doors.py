@@ -1,7 +1,7 @@
 """What a public function says when it fails for what it was given: which argument, what it was, what is needed.
 
-Values are checked where the formula needs it. That text, None or a list stands where a tensor belongs is checked
-nowhere: when a call fails in Python, torch or NumPy, its arguments are held against the annotations, and the caller
+Values are checked where the formula needs it; that a number is not NaN, at every door. That text, None or a list stands
+where a tensor belongs is checked nowhere: when a call fails in Python, torch or NumPy, its arguments are held against the annotations, and the caller
 reads a sentence. A call that succeeds costs less than a microsecond more.
 """
 
@@ -27,8 +27,9 @@ LIBRARIES = (sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), syscon
 FAILS = (ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
 # what torch and NumPy say of tensors that do not fit
 UNFIT = re.compile(
-    r"shape|size|dimension|dtype|device|broadcast|meta|layout|sparse|complex|scalar|one element|out of range|index"
-    r"|must match|assignment failed|0-d tensor|determinant|null byte|linalg|division|cannot be converted|overflow|invalid combination|Long|Half|Double|Float|must be|expected|negative|NaN|infinit|not implemented for",
+    "shape|size|dimension|dtype|device|broadcast|meta|layout|sparse|complex|scalar|one element|out of range|index|linalg"
+    "|too large|must match|must be|not supported|operand|0-d|determinant|null byte|assignment failed|cannot be converted"
+    "|overflow|division|negative|NaN|infinit|expected|invalid combination|Long|Half|Double|Float|not implemented for",
     re.IGNORECASE,
 )
 KINDS: dict[
@@ -53,7 +54,7 @@ def explain(room: dict[str, Any]) -> None:
             for base in public.__mro__:
                 if base.__module__.startswith("codesign.") and "__explained__" not in vars(base):
                     _class(base)
-        elif isinstance(public, types.FunctionType):
+        elif isinstance(public, types.FunctionType) and not hasattr(public, "__explained__"):
             room[name] = door(public, f"{home.removeprefix('codesign.')}.{name}")
             room[name].__module__ = home  # where a pickle finds it
 
@@ -67,11 +68,12 @@ def _class(kind):
         if not name.startswith("_") or name in ("__init__", "__call__"):
             inner = made.__func__ if isinstance(made, (staticmethod, classmethod)) else made
             if isinstance(inner, types.FunctionType):
-                told = door(inner, kind.__name__ if name == "__init__" else f"{kind.__name__}.{name}")
+                full = kind.__name__ if name == "__init__" else f"{kind.__name__}.{name}"
+                told = door(inner, full, nan_fits=name == "__init__")  # results that are held may be NaN
                 setattr(kind, name, told if inner is made else type(made)(told))
 
 
-def door(function: Callable[P, T], name: str) -> Callable[P, T]:
+def door(function: Callable[P, T], name: str, nan_fits: bool = False) -> Callable[P, T]:
     """``function``, whose failures for what it was given are sentences.
 
     Raises: ShapeError or DomainError from the error of torch, NumPy or Python; other errors as they are: those of
@@ -96,21 +98,24 @@ def door(function: Callable[P, T], name: str) -> Callable[P, T]:
             result = function(*args, **kwargs)
         except FAILS as error:
             explained(error, args, kwargs)
-        else:
-            return later(result, args, kwargs) if isinstance(result, types.GeneratorType) else result
+            raise
+        for value in () if nan_fits else (*args, *kwargs.values()):
+            if value.__class__ is float and value != value:
+                raise DomainError(
+                    f"{name}: an argument is NaN, which is no number; give one ({_listed(_given(function, args, kwargs) or {})})."
+                )
+        return later(result, args, kwargs) if isinstance(result, types.GeneratorType) else result
 
+    told.__explained__ = True  # pyright: ignore
     return told
 
 
 def _sentence(function, name, args, kwargs, error):
     if isinstance(error, CodesignError) or not is_ours(error.__traceback__):
         return None
-    try:
-        given = inspect.signature(function).bind(*args, **kwargs).arguments
-    except TypeError:
-        return None  # Python's own sentence: too many, too few, unknown names
-    given.pop("self", None)
-    given.pop("cls", None)
+    given = _given(function, args, kwargs)
+    if given is None:
+        return None
     hints = _hints(function)
     said = " ".join(str(error).split())
     for argument, value in given.items():
@@ -118,7 +123,7 @@ def _sentence(function, name, args, kwargs, error):
         if needed:
             return DomainError(f"{name}: {argument} = {shown(value)}, but {needed} is needed.")
     for argument, value in given.items():
-        if isinstance(value, numbers.Real) and not math.isfinite(value):
+        if isinstance(value, float) and not math.isfinite(value):
             return DomainError(f"{name}: {argument} = {value}, but a finite number is needed.")
     for argument, value in given.items():
         parts = value if isinstance(value, (list, tuple)) else ()
@@ -130,9 +135,22 @@ def _sentence(function, name, args, kwargs, error):
             return DomainError(f"{name}: {argument} = {shown(value)} is not known.")
     if isinstance(error, (AttributeError, OSError, KeyError)) or not UNFIT.search(said):
         return None
-    what = ", ".join(f"{argument} = {shown(value)}" for argument, value in given.items())
+    what = _listed(given)
     kind = ShapeError if re.search("shape|size|dimension|index|broadcast", said) else DomainError
     return kind(f"{name} cannot work with {what}: {said[:200]} (its help says which shapes and values fit).")
+
+
+def _given(function, args, kwargs):
+    """{argument: value}; None where Python's own sentence says what is wrong: too many, too few, unknown names."""
+    try:
+        given = inspect.signature(function).bind(*args, **kwargs).arguments
+    except TypeError:
+        return None
+    return {argument: value for argument, value in given.items() if argument not in ("self", "cls")}
+
+
+def _listed(given):
+    return ", ".join(f"{argument} = {shown(value)}" for argument, value in given.items())
 
 
 def is_ours(trace: types.TracebackType | None) -> bool:
@@ -180,7 +198,7 @@ def mismatch(value: Any, hint: Any) -> str:
     kind = origin or hint
     if getattr(kind, "_is_protocol", False):
         lacks = [each for each in _asked(kind) if not hasattr(value, each)]
-        return f"a {kind.__name__} (which has {', '.join(lacks)})" if lacks else ""
+        return f"a {kind.__name__} (which has {', '.join(lacks[:4])})" if lacks else ""
     if not isinstance(kind, type):
         return ""
     text = isinstance(value, (str, bytes)) and kind is not str

@@ -19,8 +19,8 @@ from tests.hostile import calls
     ("call", "sentence"),
     [
         (lambda: lens.load(3.4), "lens.load: source = 3.4, but a str or a path is needed"),
-        (lambda: lens.half_field_deg("none"), "lens.half_field_deg: name = 'none' is not known"),
-        (lambda: lens.rms_spot_mm(None, [0.0]), "lens.rms_spot_mm: lens = None"),
+        (lambda: lens.half_field_deg("none"), "no published lens is called 'none'"),
+        (lambda: lens.rms_spot_mm(None, [0.0]), "rms_spot_mm: lens = None, but a TracedLens"),
         (
             lambda: pose.look_at("up", (0, 0, 1)),
             "pose.look_at: origin_m = 'up', but a Sequence or a torch.Tensor",
@@ -28,6 +28,11 @@ from tests.hostile import calls
         (
             lambda: pose.se3_exp(torch.ones(6, dtype=torch.complex64)),
             r"pose.se3_exp cannot work with twist = Tensor \[",
+        ),
+        (lambda: lens.ThinLens(float("inf"), 5.0), "focal length inf mm"),
+        (
+            lambda: lens.load("la1509").scaled(float("nan")),
+            r"GeoLens.scaled: an argument is NaN, which is no number; give one \(factor = nan",
         ),
         (lambda: render.project(7, torch.ones(1, 3)), "render.project: camera = 7, but a Camera is needed"),
         (

@@ -1,5 +1,6 @@
 """Published lenses by name."""
 
+from codesign.errors import DomainError
 from codesign.lens.glass import Glass
 from codesign.lens.surface import Surface
 
@@ -68,5 +69,7 @@ def named_surfaces(name: str) -> tuple[list[Surface], float]:
 
 
 def half_field_deg(name: str) -> float:
-    """Published half field of view, degrees."""
+    """Published half field of view, degrees. Raises: DomainError for a lens that is not in the catalogue."""
+    if name not in LENSES:
+        raise DomainError(f"no published lens is called {name!r}; choose one of {', '.join(LENSES)}.")
     return LENSES[name][1]

@@ -56,7 +56,7 @@ def real_numbers(values: Any, name: str) -> Tensor:
             if isinstance(values, Tensor)
             else torch.as_tensor(values, dtype=torch.float64)
         )
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError, RuntimeError, OverflowError):
         found = None
     if found is None or found.is_complex():
         raise DomainError(f"{name}: {values!r} is no real number and no list of them; give numbers.")

@@ -89,8 +89,9 @@ class GeoLens(Replaceable):
     ) -> None:
         super().__init__()
         surfaces = tuple(surfaces)
-        if not surfaces:
-            raise DomainError(f"{name}: a lens needs at least one surface; none were given.")
+        if not surfaces or not all(isinstance(surface, Surface) for surface in surfaces):
+            kinds = ", ".join(sorted({type(surface).__name__ for surface in surfaces})) or "none"
+            raise DomainError(f"{name}: a lens needs at least one surface, each a Surface; given: {kinds}.")
         for i, surface in enumerate(surfaces):
             surface.check(f"{name}, surface {i + 1}")
         if not 0 < entrance_pupil_diameter_mm < math.inf:

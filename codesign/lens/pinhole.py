@@ -48,10 +48,10 @@ class ThinLens(Replaceable):
         image = None if image_distance_mm is None else torch.as_tensor(image_distance_mm, dtype=efl.dtype)
         self._hold("image_distance_mm", image)
         self.entrance_pupil_diameter_mm = float(entrance_pupil_diameter_mm)
-        if not (float(self.efl_mm.detach()) > 0 and float(self.image_distance_mm.detach()) > 0):
+        focal_mm, image_mm = float(self.efl_mm.detach()), float(self.image_distance_mm.detach())
+        if not (0 < focal_mm < float("inf") and 0 < image_mm < float("inf")):
             raise DomainError(
-                f"thin lens: focal length {float(self.efl_mm.detach())} mm and image distance "
-                f"{float(self.image_distance_mm.detach())} mm must be positive."
+                f"thin lens: focal length {focal_mm} mm and image distance {image_mm} mm must be positive and finite."
             )
         if not 0 <= self.entrance_pupil_diameter_mm < float("inf"):
             raise DomainError(

@@ -66,8 +66,10 @@ class Replaceable(nn.Module):
         for name, value in tensors.items():
             self._known(name)
             shape = getattr(self, name).shape
-            if value.shape != shape:
-                raise ShapeError(f"{name} has shape {tuple(shape)}, got {tuple(value.shape)}.")
+            if not isinstance(value, Tensor) or not value.is_floating_point() or value.shape != shape:
+                given = tuple(value.shape) if isinstance(value, Tensor) else repr(value)[:60]
+                kind = getattr(value, "dtype", type(value).__name__)
+                raise ShapeError(f"{name} has shape {tuple(shape)}, got {given} ({kind}); give real numbers.")
         return self._with(self._now() | tensors)
 
     def freeze(self, *names: str) -> Self:

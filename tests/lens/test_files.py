@@ -191,7 +191,7 @@ BAD = {
     ),
     "soft edge negative": (page(soft_edge_mm=-0.1), "soft edge -0.1 mm"),
     "deeply nested": ("[" * 100_000 + "]" * 100_000, "not readable JSON"),
-    "huge": (" " * 2_000_001, "more than 2000000 bytes"),
+    "huge": (" " * 2_000_001, "2000001 bytes, more than the 2000000"),
 }
 
 

@@ -1,6 +1,7 @@
 """Where flow is learned from and judged on: recordings with true flow by path, and folders of data sets as
 sources of windows."""
 
+from codesign.doors import explain
 from codesign.flow.sources.dsec import DsecWindows
 from codesign.flow.sources.mvsec import MvsecWindows
 from codesign.flow.sources.opening import open_windows
@@ -22,3 +23,5 @@ __all__ = [
     "read_recording",
     "read_text_events",
 ]
+
+explain(globals())

@@ -1,6 +1,7 @@
 """What a lens does to the light of an object at any distance: spots, fans, wavefront, point spread, MTF, distortion,
 field curvature, colour, depth of field."""
 
+from codesign.doors import explain
 from codesign.lens.analysis.chromatic import chromatic_focus_shift_mm, lateral_colour_mm
 from codesign.lens.analysis.depth_of_field import (
     DepthOfField,
@@ -86,3 +87,5 @@ __all__ = [
     "traced_depth_of_field",
     "wavefront",
 ]
+
+explain(globals())

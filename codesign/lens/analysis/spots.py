@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, ShapeError
 from codesign.lens.analysis.rays import (
     Light,
     Values,
@@ -107,6 +107,10 @@ def polychromatic_spot(
 def spot_radius_mm(positions_mm: Tensor, weight: Tensor) -> Tensor:
     """RMS distance from the weighted mean point. Args: positions [..., 2] mm, weight [...]. Returns: scalar
     mm; its gradient is 0 at a point image."""
+    if weight.shape != positions_mm.shape[:-1]:
+        raise ShapeError(
+            f"weight has shape {list(weight.shape)}, positions {list(positions_mm.shape)}; one each."
+        )
     points = positions_mm.reshape(-1, 2)
     w = (weight / weight.sum()).reshape(-1, 1)
     # norm of positions times root weights: regular at a point image; the root of a weight 0 has no

@@ -1,6 +1,7 @@
 """Designing a lens: solves, constraints, tolerances, and designs in principal modes of ray
 motion."""
 
+from codesign.doors import explain
 from codesign.lens.design.constraints import Limits
 from codesign.lens.design.element_errors import moved_element
 from codesign.lens.design.glass_map import neighbour_glasses
@@ -37,3 +38,5 @@ __all__ = [
     "without_element",
     "without_surface",
 ]
+
+explain(globals())

@@ -92,4 +92,5 @@ def at(place: str) -> Iterator[None]:
     try:
         yield
     except CodesignError as error:
-        raise type(error)(f"{place}: {error}") from error
+        said = str(error).removeprefix(f"{place.split()[-1]} ")  # that names the file itself
+        raise type(error)(f"{place}: {said}") from error
