@@ -7,8 +7,10 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 from tests.hostile.reader import SECONDS, numbered, seed_of
 
@@ -91,21 +93,34 @@ def _passed_on(pipe, said):
     said.put(None)
 
 
-def fuzz(minutes: float, only: str, seed: int, processes: int, count: int = 10**9, keep: bool = True):
-    """Read mutants of all seeds for some time, or so many of each. Returns: {name: (mutants, findings)}."""
-    chosen = seeds(only)
+def measure(
+    count: int,
+    seed: int,
+    say: Callable[[str], Any] = print,
+    *,
+    minutes: float = 10.0,
+    format: str = "",
+    processes: int = 2,
+) -> tuple[dict[str, float], list[str]]:
+    """Read ``count`` mutants of every seed whose name ends in ``format``, or as many as the time allows.
+
+    Returns: {name of the seed: mutants read} with their sum, and a sentence for each finding, whose file is kept.
+    """
+    chosen = seeds(format)
     share_s = minutes * 60 * processes / max(len(chosen), 1)
 
     def one(place):
         module, name = place
         read, found = read_mutants(module, name, seed, count, share_s)
-        print(f"{name:28} {read:9d} mutants, {len(found)} findings", flush=True)
-        for finding in found if keep else ():
+        say(f"{name:28} {read:9d} mutants, {len(found)} findings")
+        for finding in found:
             kept(module, name, seed, finding)
-        return name, (read, found)
+        return name, read, [f"{name} {each['index']}: {each['kind']}: {each['found']}" for each in found]
 
     with ThreadPoolExecutor(processes) as pool:
-        return dict(pool.map(one, chosen))
+        rows = list(pool.map(one, chosen))
+    figures = {name: read for name, read, _ in rows}
+    return {**figures, "all": sum(figures.values())}, [each for _, _, found in rows for each in found]
 
 
 def kept(module, name, seed, finding):

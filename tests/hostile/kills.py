@@ -31,7 +31,6 @@ STUDIES = {
     "event_classes": "--quick --training 20 --test 20 --calibration 10",
     "lens_scratch": "--quick --seeds 2",
     "placement": "--seeds 1 --steps 2 --worlds 1 --per-world 1 --judged-worlds 1 --judged-drives 2 --searches random",
-    "combinations": "--steps 1 --cases 1 --judged 1 --directions 2 --layers memory counts --estimators closed-form",
     "phase_plate": "--quick",
     "lens_opt": "--quick --after-steps 1 --cases 1 --scored 1 --spot-steps 1 --steps 2 --judged 2 --samples 4",
 }
