@@ -3,6 +3,7 @@
 A full disk is RLIMIT_FSIZE set on the running process, as root or not: from then on every write beyond it fails.
 """
 
+import contextlib
 import itertools
 import json
 import os
@@ -90,6 +91,14 @@ def _whole(study, folder, seed):
     return _numbers(folder), first_s, time.monotonic() - began
 
 
+def _holds(process):
+    """Whether a run has begun: it heeds signals, and holds its folder."""
+    with contextlib.suppress(OSError):
+        opened = (os.readlink(link) for link in Path(f"/proc/{process.pid}/fd").iterdir())
+        return any(name.endswith("/.lock") for name in opened)
+    return False
+
+
 def _kill(process, kind, order):
     if kind == "full_disk":
         most = order.choice((0, 300, 5000))
@@ -123,7 +132,9 @@ def measure(count: int, seed: int, say=print, studies=tuple(STUDIES)) -> tuple[d
             for _ in range(order.randint(1, KILLS)):
                 kind = order.choice(list(KINDS))
                 process = _started(arguments)
-                after_s = order.uniform(first_s, all_s)
+                after_s = order.uniform(0.0, all_s - first_s)
+                while process.poll() is None and not _holds(process):
+                    time.sleep(0.02)
                 try:
                     process.wait(after_s)
                 except subprocess.TimeoutExpired:
