@@ -60,7 +60,7 @@ class GeoLens(Replaceable):
     plate: a phase plate, see ``plates.with_plate``; plate_at: the surface it follows, and mm behind its vertex.
     """
 
-    tensor_names = (*LEARNABLES, "semi_aperture_mm")
+    tensor_names: tuple[str, ...] = (*LEARNABLES, "semi_aperture_mm")
     parameter_names = LEARNABLES[:6]
     solved_tensors: ClassVar = {
         "efl_mm": "curvature_per_mm",

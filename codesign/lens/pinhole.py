@@ -30,7 +30,7 @@ class ThinLens(Replaceable):
     Raises: DomainError for lengths that are not positive, or a diameter below 0.
     """
 
-    tensor_names = ("efl_mm", "image_distance_mm")
+    tensor_names: tuple[str, ...] = ("efl_mm", "image_distance_mm")
     parameter_names = tensor_names
     solved_tensors: ClassVar = {}
     efl_mm: Tensor
