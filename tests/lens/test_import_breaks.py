@@ -93,9 +93,8 @@ def test_rays_go_where_a_trace_by_hand_leads_them(case, tmp_path):
     vertex, _ = by_hand(rows[first:], np.zeros(3), np.zeros(3), bends=False)
     draw = np.random.default_rng(7).uniform
     starts = [np.array([*draw(-1.5, 1.5, 2), -10.0]) for _ in range(6)]
-    towards = [
-        along / np.linalg.norm(along) for along in (np.array([*draw(-0.06, 0.06, 2), 1.0]) for _ in range(6))
-    ]
+    aims = [np.array([*draw(-0.06, 0.06, 2), 1.0]) for _ in range(6)]
+    towards = [aim / np.linalg.norm(aim) for aim in aims]
     led = np.array([by_hand(rows, *ray, bends=False) for ray in zip(starts, towards, strict=True)])
     rays = geo.trace(torch.tensor(led[:, 0] - [0.0, 0.0, vertex[2]]), torch.tensor(led[:, 1]))
     true = np.array([by_hand(rows, *ray) for ray in zip(starts, towards, strict=True)])
@@ -122,10 +121,8 @@ def test_four_tilted_mirrors_bring_the_beam_to_the_stated_spot(shared):
     # the breaks' tilts, each once before and once behind its mirror
     angle = -2 * math.radians(16.44 - 12 + 15.939999999989485 - 5.9999999994997468)
     around = torch.linspace(0, 2 * math.pi, 7201, dtype=torch.float64)[:, None]
-    up, along = torch.tensor(
-        [[0, math.cos(angle), math.sin(angle)], [0, -math.sin(angle), math.cos(angle)]], dtype=torch.float64
-    )
-    across = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    tilt = [[1, 0, 0], [0, math.cos(angle), -math.sin(angle)], [0, math.sin(angle), math.cos(angle)]]
+    across, up, along = torch.tensor(tilt, dtype=torch.float64).T
     vertex = torch.tensor([*geo.to_surfaces()[0].decentre_mm, 0.0], dtype=torch.float64)
     origins = vertex + 10 * (around.sin() * up + around.cos() * across)
     rays = geo.trace(origins, along.expand(7201, 3).contiguous())
