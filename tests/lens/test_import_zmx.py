@@ -282,13 +282,13 @@ def test_a_coordinate_break_that_moves_nothing_stays_in_its_medium(tmp_path):
         tmp_path, text(surfaces=(OBJECT, front, inside, back, outside, changed(IMAGE, "SURF", ["SURF 5"])))
     )
     assert efl(geo) == pytest.approx(thick(0.02, -0.01, 4.0), rel=1e-13)
-    assert [s.medium and s.medium.name for s in geo.to_surfaces()] == ["N-BK7", "N-BK7", None, None]
+    assert [s.medium and s.medium.name for s in geo.to_surfaces()] == ["N-BK7", None]
     # behind a mirror on the back of the glass the light goes back through the glass
     mirror = [*changed(back, "DISZ", ["  DISZ -1"]), "  GLAS MIRROR 0 0 1.5 40"]
     last = ["SURF 5", "  CURV 0", "  DISZ -30"]
     behind = ["SURF 4", *BREAK, "  DISZ -3"]
     mangin = (OBJECT, front, inside, mirror, behind, last, ["SURF 6", "  CURV 0"])
-    assert load(tmp_path, text(surfaces=mangin)).index().tolist() == [1, N, N, N, N, 1]
+    assert load(tmp_path, text(surfaces=mangin)).index().tolist() == [1, N, N, 1]
 
 
 def test_obstructions_and_rings_become_an_inner_aperture(tmp_path):
@@ -451,15 +451,31 @@ def front(old, *new):
     return text(surfaces=(OBJECT, changed(FRONT, old, [f"  {n}" for n in new]), BACK, IMAGE))
 
 
+def broken(*lines):
+    """The singlet with a coordinate break before its image."""
+    held = [] if any("DISZ" in line for line in lines) else ["  DISZ 0"]
+    turn = ["SURF 3", "  TYPE COORDBRK", "  CURV 0", *held, *(f"  {line}" for line in lines)]
+    return text(surfaces=(OBJECT, FRONT, BACK, turn, changed(IMAGE, "SURF", ["SURF 4"])))
+
+
 def head(old, *new):
     return text(changed(HEAD, old, list(new)))
 
 
 BAD = {
-    "coordinate break": (
+    "a break that is a surface": (
         front("TYPE", "TYPE COORDBRK", "PARM 3 45"),
-        "surface 1: type COORDBRK is not read.*tilts or shifts",
+        "surface 1: it is a coordinate break with a stop, a glass or extra data",
     ),
+    "a break of an order nobody knows": (broken("PARM 1 1", "PARM 6 2"), "surface 3: its PARM 6 is 2, which"),
+    "a break with more than it can have": (
+        broken("PARM 1 1", "PARM 7 3"),
+        "surface 3: its PARM 7 is 3, which",
+    ),
+    "a fold": (broken("PARM 3 90"), "surface 1: its axis stands at 90 degrees to that of the image plane"),
+    "a return": (broken("PARM 4 180"), "surface 1: its axis stands at 180 degrees"),
+    "a shift behind the image": (broken("DISZ -70", "PARM 1 1"), "surface 2: the light would travel 10 mm"),
+    "a break at infinity": (broken("DISZ INFINITY", "PARM 1 1"), "surface 3: its thickness is infinite"),
     "no aperture": (head("ENPD"), "does not say how wide its beam is; give the entrance pupil diameter"),
     "no curvature": (front("CURV"), "surface 1: the line CURV is missing"),
     "no distance": (front("DISZ"), "surface 1: the line DISZ is missing"),
@@ -544,7 +560,7 @@ BAD = {
     "not a number": (front("CURV", "CURV 0.0x2"), "CURV is '0.0x2', a finite number is needed"),
     "NaN": (front("CURV", "CURV NaN"), "a finite number"),
     "infinite": (front("CURV", "CURV 1e999"), "a finite number"),
-    "infinite thickness": (front("DISZ", "DISZ INFINITY"), "finite"),
+    "infinite thickness": (front("DISZ", "DISZ INFINITY"), "surface 1: its thickness is infinite"),
     "underscores": (front("CURV", "CURV 1_0"), "a finite number"),
     "5000 digits": (front("CURV", "CURV " + "9" * 5000), "a finite number"),
     "a focal length that is none": (

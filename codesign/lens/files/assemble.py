@@ -9,7 +9,7 @@ import torch
 from codesign.errors import FileFormatError
 from codesign.lens.files.system import FileLens
 from codesign.lens.files.text import MOST_SURFACES
-from codesign.lens.files.unfold import unfold
+from codesign.lens.files.unfold import placed, unfold
 from codesign.lens.geolens import GeoLens
 from codesign.lens.surface import Surface, sag_mm
 
@@ -47,8 +47,11 @@ def assemble(lens: FileLens, dtype: torch.dtype = torch.float64) -> GeoLens:
     diameter = _pupil(lens, rows, optics)
     half_field = _half_field(lens, optics)
     _open(rows, optics, diameter, half_field)
-    surfaces = [_surface(row).check(f"surface {row.label}") for row in rows]
     _check_glass(rows)
+    rows = placed(rows)
+    surfaces = [_surface(row).check(f"surface {row.label}") for row in rows]
+    if half_field and lens.image_tilt_deg:  # what all directions around the image's normal share
+        half_field = half_field - lens.image_tilt_deg if half_field > lens.image_tilt_deg else None
     return GeoLens(surfaces, diameter, dtype, min(0.2, diameter / 50), lens.name, half_field)
 
 

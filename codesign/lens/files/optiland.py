@@ -28,22 +28,11 @@ FIELDS = {
     "ParaxialImageHeightField": "image height",
     "RealImageHeightField": "image height",
 }
-SURFACE = {
-    "type",
-    "geometry",
-    "material_pre",
-    "material_post",
-    "is_stop",
-    "aperture",
-    "is_reflective",
-    "interaction_model",
-    "comment",
-    "surface_type",
-    "thickness",
-    "semi_aperture",
-    "radius",
-    "conic",
-}
+SURFACE_WORDS = """
+type geometry material_pre material_post is_stop aperture is_reflective interaction_model comment
+surface_type thickness semi_aperture radius conic
+"""
+SURFACE = set(SURFACE_WORDS.split())
 
 
 def is_optiland(page: Any) -> bool:

@@ -1,6 +1,8 @@
 """Load a lens by name or from a file."""
 
+import math
 import os
+import warnings
 from pathlib import Path
 
 import torch
@@ -21,6 +23,9 @@ from codesign.reading import reading
 
 TEXTS = {".zmx": read_zmx, ".seq": read_seq, ".txt": read_diffoptics}
 
+# share of its semi-aperture by which a stop may stand beside the axis without a word
+SEEN = 1e-3
+
 
 def load(source: str | Path, dtype: torch.dtype = torch.float64) -> GeoLens:
     """Lens from a catalogue name (cooke-triplet, double-gauss, la1509) or a file; docs/lens_files.md says
@@ -29,6 +34,7 @@ def load(source: str | Path, dtype: torch.dtype = torch.float64) -> GeoLens:
     Args: source: name, or path with the extension .json (native, DeepLens or optiland), .zmx, .seq, or .txt
       (DiffOptics). dtype: precision of the lens.
     Returns: GeoLens. Files are parsed, never executed; at most 2 MB and 500 surfaces are read.
+    Warns: when coordinate breaks of a .zmx file put the stop beside the axis.
     Raises: FileFormatError or DomainError, one sentence naming file, place, fault and remedy; nothing is half
       loaded or dropped.
 
@@ -59,11 +65,20 @@ def load(source: str | Path, dtype: torch.dtype = torch.float64) -> GeoLens:
         text = read_text(path)
         name = title(path.stem, "lens")
         with reading("a value", "it is of the wrong kind or size; see docs/lens_files.md"):
-            return (
+            geo = (
                 _from_json(text, name, dtype)
                 if suffix == ".json"
                 else assemble(TEXTS[suffix](text, name), dtype)
             )
+    beside_mm = math.hypot(*geo.decentre_mm[geo.stop_index].tolist())
+    if suffix == ".zmx" and beside_mm > SEEN * float(geo.semi_aperture_mm[geo.stop_index]):
+        warnings.warn(
+            f"lens file {path}: the centre of the stop lies {beside_mm:.4g} mm beside the axis, the normal of the image "
+            "plane through its centre; first-order figures and pupils are those of that axis, so trace rays of your "
+            "own or aim them (camera_rays(aim=True)).",
+            stacklevel=3,
+        )
+    return geo
 
 
 def _from_json(text, name, dtype):

@@ -40,76 +40,18 @@ REFUSED = {
     "CUX": "its two curvatures differ",
     "RDX": "its two curvatures differ",
 }
-OWN = {
-    "SPH",
-    "CON",
-    "ASP",
-    "K",
-    *ASPHERE,
-    "CUF",
-    "CIR",
-    *MOVES,
-    "DAR",
-    "THI",
-    "RDY",
-    "CUY",
-    "GLA",
-    "DIF",
-    "HOR",
-    "HWL",
-    "HCT",
-    "HCO",
-    "RMD",
-}
+OWN_WORDS = """
+SPH CON ASP K CUF CIR DAR THI RDY CUY GLA DIF HOR HWL HCT HCO RMD
+"""
+OWN = {*OWN_WORDS.split(), *ASPHERE, *MOVES}
 SURFACE = OWN | set(REFUSED)
 # labels, weights, variables, couplings, vignetting of the bundle, colours, solves and pickups: the values
 # they lead to stand in the file, or no ray changes
-IDLE = {
-    "INI",
-    "WTW",
-    "WTF",
-    "WTX",
-    "WTY",
-    "VUX",
-    "VLX",
-    "VUY",
-    "VLY",
-    "SLB",
-    "CCY",
-    "CCX",
-    "THC",
-    "CUC",
-    "GLC",
-    "KC",
-    "AC",
-    "BC",
-    "CC",
-    "DC",
-    "EC",
-    "FC",
-    "GC",
-    "HC",
-    "JC",
-    "HCC",
-    "XDC",
-    "YDC",
-    "ZDC",
-    "ADC",
-    "BDC",
-    "CDC",
-    "CUM",
-    "THM",
-    "GLM",
-    "DER",
-    "CLS",
-    "PIK",
-    "POL",
-    "CA",
-    "GO",
-    "COM",
-    "CWL",
-    "PTC",
-}
+IDLE_WORDS = """
+INI WTW WTF WTX WTY VUX VLX VUY VLY SLB CCY CCX THC CUC GLC KC AC BC CC DC EC FC GC HC JC HCC XDC YDC ZDC
+ADC BDC CDC CUM THM GLM DER CLS PIK POL CA GO COM CWL PTC
+"""
+IDLE = set(IDLE_WORDS.split())
 
 
 @dataclass

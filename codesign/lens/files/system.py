@@ -16,6 +16,8 @@ class FileSurface:
     label: its number in the file. semi_aperture: None where the file says nothing. fixed: whether that
       aperture stops rays.
     tilt_deg: right-handed about +x, then about +y. inner: radius of a central obstruction.
+    depth: of the vertex along the axis of the image plane, from there, where coordinate breaks tilt or shift; the
+      thickness stays the one along the light.
     """
 
     label: int | str
@@ -32,6 +34,7 @@ class FileSurface:
     decentre: tuple[float, float] = (0.0, 0.0)
     tilt_deg: tuple[float, float] = (0.0, 0.0)
     inner: float = 0.0
+    depth: float | None = None
 
 
 @dataclass
@@ -43,7 +46,7 @@ class FileLens:
     field: ("angle" degrees | "object height" | "image height", value) or None. object_distance: from the
       object to the first surface.
     focus: whether the last thickness is to be solved for the paraxial focus. defocus: added to the last
-      thickness.
+      thickness. image_tilt_deg: between the axes of object and image plane.
     """
 
     name: str = "lens"
@@ -55,3 +58,4 @@ class FileLens:
     object_distance: float = math.inf
     focus: bool = False
     defocus: float = 0.0
+    image_tilt_deg: float = 0.0

@@ -40,6 +40,20 @@ def unfold(lens: FileLens) -> list[FileSurface]:
     return _without_steps_back(found)
 
 
+def placed(surfaces: list[FileSurface]) -> list[FileSurface]:
+    """The surfaces of ``unfold`` with thicknesses along the axis of the image plane, where coordinate breaks moved
+    some; as they were elsewhere. Raises: FileFormatError as there."""
+    depths = [surface.depth for surface in surfaces] + [0.0]
+    found = []
+    sign = 1.0
+    for surface, depth, behind in zip(surfaces, depths, depths[1:], strict=False):
+        if depth is None or behind is None:
+            return surfaces
+        sign = -sign if surface.mirror else sign
+        found.append(dataclasses.replace(surface, thickness=sign * (behind - depth) + 0.0))
+    return _without_steps_back(found)
+
+
 def in_mm(surface: FileSurface, unit_mm: float, sign: float) -> FileSurface:
     """The surface in millimetres, its shape and tilt mirrored in z where ``sign`` is -1; its thickness is
     left alone."""
@@ -59,6 +73,7 @@ def in_mm(surface: FileSurface, unit_mm: float, sign: float) -> FileSurface:
         semi_aperture=aperture,
         inner=surface.inner * unit_mm,
         decentre=(x * unit_mm, y * unit_mm),
+        depth=None if surface.depth is None else surface.depth * unit_mm,
         tilt_deg=(sign * about_x + 0.0, sign * about_y + 0.0),
     )
 

@@ -1,10 +1,14 @@
 """Reader of OpticStudio .zmx files (sequential mode)."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from codesign.errors import FileFormatError
+from codesign.lens.files.frames import along, place
 from codesign.lens.files.system import FileLens, FileSurface
 from codesign.lens.files.text import MOST_SURFACES, at, lines, number, shown, title, whole
 from codesign.lens.files.zmx_surface import KEYWORDS, Entry
@@ -160,19 +164,29 @@ class Header:
             raise FileFormatError(
                 f"surfaces {stops} are marked as the stop; mark one between object and image with STOP."
             )
-        pairs = zip(self.heights.get("XFLN", [0.0]), self.heights.get("YFLN", [0.0]), strict=False)
+        pairs = itertools.zip_longest(
+            self.heights.get("XFLN", []), self.heights.get("YFLN", []), fillvalue=0.0
+        )
         height = max((math.hypot(x, y) for x, y in list(pairs)[: self.count]), default=0.0)
         entries[0].check_object()
         entries[-1].check_image()
         surfaces: list[FileSurface] = []
-        medium = None
+        frames = []
+        frame = np.eye(4)
+        object_distance = entries[0].thickness
         for entry in entries[1:-1]:
             with at(f"surface {entry.label}"):
-                surface = entry.surface()
-            if entry.kind == "COORDBRK":  # no surface of its own: the light stays in its medium
-                surface.medium = medium
-            medium = medium if surface.mirror else surface.medium
-            surfaces.append(surface)
+                if entry.kind == "COORDBRK":
+                    frame = frame @ entry.coordinate_break()
+                    if surfaces:
+                        surfaces[-1].thickness += entry.thickness
+                    else:
+                        object_distance += entry.thickness
+                else:
+                    surfaces.append(entry.surface())
+                    frames.append(frame)
+                frame = frame @ along(entry.thickness)
+        moved = any(entry.kind == "COORDBRK" and entry.moves() for entry in entries)
         return FileLens(
             self.name,
             surfaces,
@@ -180,5 +194,6 @@ class Header:
             self.pupil,
             (FIELDS[self.kind], height),
             self.waves.get(self.primary, 0.5875618),
-            entries[0].thickness,
+            object_distance,
+            image_tilt_deg=place(surfaces, frames, frame) if moved else 0.0,
         )

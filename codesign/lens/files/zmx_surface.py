@@ -3,7 +3,10 @@
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from codesign.errors import FileFormatError
+from codesign.lens.files.frames import coordinate_break
 from codesign.lens.files.system import FileSurface
 from codesign.lens.files.text import at, number, shown, whole
 from codesign.lens.glass import Glass
@@ -11,7 +14,6 @@ from codesign.lens.surface import Phase
 
 TYPES = ("STANDARD", "EVENASPH", "BINARY_2")
 REASONS = {
-    "COORDBRK": "it tilts or shifts everything behind it",
     "PARAXIAL": "an ideal thin lens has no shape to trace",
     "TOROIDAL": "its two curvatures differ, and only surfaces of revolution are traced",
     "BICONICX": "its two curvatures differ, and only surfaces of revolution are traced",
@@ -21,34 +23,11 @@ REASONS = {
 }
 # solves, pickups, tolerances, drawing, coatings, mechanical sizes and labels: the values they lead to stand
 # in the file, or no ray changes
-IDLE = {
-    "SLAB",
-    "HIDE",
-    "MIRR",
-    "POPS",
-    "FIMP",
-    "COAT",
-    "COMM",
-    "PZUP",
-    "PPAR",
-    "VPAR",
-    "VDSZ",
-    "VCON",
-    "PKUP",
-    "MAZH",
-    "MARG",
-    "EDGE",
-    "MEMA",
-    "OEMA",
-    "TCMM",
-    "TCED",
-    "CHZN",
-    "SCOL",
-    "SOPA",
-    "DRAW",
-    "NOTE",
-    "RCMF",
-}
+IDLE_WORDS = """
+SLAB HIDE MIRR POPS FIMP COAT COMM PZUP PPAR VPAR VDSZ VCON PKUP MAZH MARG EDGE MEMA OEMA TCMM TCED CHZN
+SCOL SOPA DRAW NOTE RCMF
+"""
+IDLE = set(IDLE_WORDS.split())
 APERTURES = {
     "SQAP": "rectangular",
     "ELAP": "elliptical",
@@ -59,26 +38,8 @@ APERTURES = {
     "ELOB": "elliptical",
     "SPID": "spider",
 }
-KEYWORDS = (
-    IDLE
-    | set(APERTURES)
-    | {
-        "TYPE",
-        "CURV",
-        "DISZ",
-        "GLAS",
-        "CONI",
-        "STOP",
-        "DIAM",
-        "FLAP",
-        "CLAP",
-        "OBSC",
-        "OBDC",
-        "SCBD",
-        "PARM",
-        "XDAT",
-    }
-)
+OWN_WORDS = "TYPE CURV DISZ GLAS CONI STOP DIAM FLAP CLAP OBSC OBDC SCBD PARM XDAT"
+KEYWORDS = IDLE | set(APERTURES) | set(OWN_WORDS.split())
 
 
 @dataclass
@@ -181,7 +142,7 @@ class Entry:
     def _take_scbd(self, words):
         if any(number(w, "SCBD") for w in words[3:]):
             raise FileFormatError(
-                "it tilts or shifts everything behind it (SCBD); only centred systems are read."
+                "it tilts or shifts what is behind it (SCBD); write that as surfaces COORDBRK of their own."
             )
 
     def _take_parm(self, words):
@@ -202,19 +163,36 @@ class Entry:
                 f"surface {self.label} is a curved or special image surface; only a flat image plane is read."
             )
 
-    def surface(self) -> FileSurface:
-        """FileSurface of this entry."""
+    def _check_lines(self):
         missing = [keyword for keyword in ("CURV", "DISZ") if keyword not in self.seen]
         if missing:
             raise FileFormatError(f"the line {missing[0]} is missing; add it (CURV 0 is a plane).")
-        moved = any(v for i, v in self.parameters.items() if i != 6)  # 6: the order of shifts and tilts
-        if self.kind not in TYPES and (self.kind != "COORDBRK" or moved):
+
+    def moves(self) -> bool:
+        """Whether a coordinate break tilts or shifts; PARM 6 is the order in which."""
+        return any(v for i, v in self.parameters.items() if i != 6)
+
+    def coordinate_break(self) -> np.ndarray:
+        """The frame [4, 4] behind this coordinate break, before its thickness; the light stays in its medium."""
+        self._check_lines()
+        if self.is_stop or self.glass or any(self.extra.values()):
+            raise FileFormatError(
+                "it is a coordinate break with a stop, a glass or extra data; give those to a surface of its own."
+            )
+        return coordinate_break(self.parameters)
+
+    def surface(self) -> FileSurface:
+        """FileSurface of this entry."""
+        self._check_lines()
+        if self.kind not in TYPES:
             raise FileFormatError(
                 f"type {shown(self.kind)} is not read "
                 f"({REASONS.get(self.kind, 'only STANDARD, EVENASPH and BINARY_2 are')}); replace it, or "
                 "use a design without it."
             )
-        if (self.kind != "BINARY_2" and any(self.extra.values())) or (self.kind == "STANDARD" and moved):
+        if (self.kind != "BINARY_2" and any(self.extra.values())) or (
+            self.kind == "STANDARD" and self.moves()
+        ):
             raise FileFormatError(
                 f"parameters or extra data (PARM, XDAT) on a surface of type {self.kind} are not "
                 "understood; delete them if they change no ray."
