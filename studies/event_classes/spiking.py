@@ -71,7 +71,7 @@ class Thesis:
         return self.mean_counts(frames, t_s)
 
     def sources(self):
-        return [Source("thesis", "thesis network", self.generate)]
+        return [Source("thesis", "thesis network, SLAYER's reset", self.generate)]
 
 
 MODELS = {"thesis": Thesis, "spike_esim": Ours}

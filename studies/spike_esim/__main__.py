@@ -21,7 +21,7 @@ from studies.frame.run import Run, StudyConfig, main
 from studies.spike_esim import data, jobs, page, score, sweeps
 from studies.spike_esim import recording as recorded
 
-JUDGED = ("thesis", "smoothed", "esim", "ours")
+JUDGED = (*jobs.VARIANTS, "esim", "ours")
 SHOWN = (*JUDGED, "ours_signal", "ours_expected", "sensor again")
 RECORDING_TRAINING = {"size_px": 48, "batch": 4, "count_weight": 0.3, "fast": 6e-2}
 RENDERED_TRAINING = {"size_px": 32, "batch": 2, "count_weight": 0.1}

@@ -1,24 +1,52 @@
 """What is trained, on rendered sequences and on the recording's first half; finished jobs are kept, so that a
 stopped run goes on with the next."""
 
+from functools import partial
+
 import torch
+from torch import nn
 
 from codesign.events.spiking.spike_esim import SpikeEsim
+from codesign.events.spiking.srm import srm
 from codesign.events.spiking.two_branches import TwoBranchSpikes
 from studies.spike_esim import train as training
 from studies.spike_esim.data import Sequence
 
-SHARES = (
-    0.01,
-    0.04,
-    # of potentials of the busiest sequence at the threshold when training starts: two starts, the better by
-    # training loss is kept
-)
+# of potentials of the busiest sequence at the threshold when training starts: the better by training loss is kept
+SHARES = (0.01, 0.04)
 SMOOTHING_MS = 10.0
 START = {"theta_on": 0.2, "theta_off": 0.2, "refractory_s": 5e-4, "width": 4}
 COMPARED_STEPS = 0.4  # share of the steps after which the two comparators are compared
 # frames are divided by it for the thesis network: weights of the order of 1, as its step of Adam supposes
 LIGHT = 32.0
+
+
+class SecondModule(nn.Module):
+    """The thesis network, own reset, and a spike module behind it: its spikes, times one weight per polarity,
+    through an alpha response to a threshold of their own."""
+
+    def __init__(self, channels, *, dt, seed):
+        super().__init__()
+        self.first = TwoBranchSpikes(channels, kernel="thesis", dt=dt, seed=seed)
+        self.wake = self.first.wake
+        self.dt = dt
+        self.weight = nn.Parameter(torch.full((2, 1, 1), 1.05))  # a lone spike gives one
+
+    def forward(self, frames):
+        self.first.dt = self.dt
+        return self.second(self.first(frames)[0])
+
+    def second(self, spikes, **options):
+        times = {"tau_r": 1.0, "tau_s": SMOOTHING_MS, "dt": self.dt}
+        return srm(self.weight * spikes, theta=1.0, kernel="thesis", response="alpha", **times, **options)
+
+
+VARIANTS = {
+    "thesis": TwoBranchSpikes,
+    "own_reset": partial(TwoBranchSpikes, kernel="thesis"),
+    "smoothed": partial(TwoBranchSpikes, smoothing_tau=SMOOTHING_MS),
+    "second_module": SecondModule,
+}
 
 
 class Trained:
@@ -83,8 +111,8 @@ def train_all(jobs, kind, sequences, steps, seed, options, advance):
     of ours."""
     theta = jobs.number(f"{kind}_theta", lambda: training.best_theta(sequences))
     networks = {
-        name: _thesis(jobs, f"{kind}_{name}", smoothing, sequences, steps // 2, seed, advance)
-        for name, smoothing in (("thesis", None), ("smoothed", SMOOTHING_MS))
+        name: _thesis(jobs, f"{kind}_{name}", made, sequences, steps // 2, seed, advance)
+        for name, made in VARIANTS.items()
     }
     ours, losses = jobs.module(
         f"{kind}_ours",
@@ -110,7 +138,7 @@ def train_spiking_comparator(jobs, sequences, steps, seed, options, advance):
 
 def job_steps(steps):
     """Optimisation steps of ``train_all``."""
-    return steps + 2 * len(SHARES) * (steps // 2)
+    return steps + len(VARIANTS) * len(SHARES) * (steps // 2)
 
 
 def _ours(model, sequences, steps, until, seed, options, advance):
@@ -119,11 +147,11 @@ def _ours(model, sequences, steps, until, seed, options, advance):
     )
 
 
-def _thesis(jobs, key, smoothing, sequences, steps, seed, advance):
+def _thesis(jobs, key, made, sequences, steps, seed, advance):
     found = []
     busiest = max(sequences, key=lambda sequence: float(sequence.counts.sum()))
     for share in SHARES:
-        network = TwoBranchSpikes(1, smoothing_tau=smoothing, dt=1e3 * sequences[0].dt_s, seed=seed)
+        network = made(1, dt=1e3 * sequences[0].dt_s, seed=seed)
         network.wake(busiest.frames / LIGHT, share)
         network, _ = jobs.module(
             f"{key}_{share}",

@@ -10,8 +10,9 @@ from codesign import events
 from studies.spike_esim import score
 from studies.spike_esim.sweeps import Sweeps
 
-TITLES = {"sensor": "physical sensor", "thesis": "thesis network", "smoothed": "thesis, smoothed", "esim": "ESIM, best threshold", "ours": "ours", "ours_signal": "ours without noise",
-          "ours_expected": "ours, expected noise", "sensor again": "sensor, another draw"}  # fmt: skip
+TITLES = {"sensor": "physical sensor", "thesis": "thesis network, SLAYER's reset", "own_reset": "thesis network, own reset", "smoothed": "thesis, smoothed, one threshold",
+          "second_module": "thesis, smoothed, second module", "esim": "ESIM, best threshold", "ours": "ours", "ours_signal": "ours without noise", "ours_expected": "ours, expected noise",
+          "sensor again": "sensor, another draw"}  # fmt: skip
 COLOURS = {
     "sensor": "black",
     "thesis": "#cc79a7",
@@ -87,25 +88,14 @@ def _figures_of_merit(run, results):
                 )
                 rows.append((TITLES[name], loss, rate, f["rate_correlation_on"], f["rate_correlation_off"], f["cell_correlation"], f["patch_correlation"], f["flicker_ratio"], 1e3 * f["delay_s"],
                              f["median_rate_ratio"], f["median_rate_correlation"]))  # fmt: skip
-        columns = [
-            "generator",
-            "loss",
-            "rate / target",
-            "r ON",
-            "r OFF",
-            "r cells",
-            "r patches",
-            "flicker",
-            "delay, ms",
-            "median: rate",
-            "median: r",
-        ]
-        run.table(kind.replace("_", " "), columns, rows)
-    rows = [(source, kind.replace("_", " "), *(f"{results.crossed[source, kind, name][0].value:.3f} · {results.crossed[source, kind, name][1].value:.2f}" for name in PICTURED))
+        columns = "generator|loss|rate / target|r ON|r OFF|r cells|r patches|flicker|delay, ms|median: rate|median: r"
+        run.table(kind.replace("_", " "), columns.split("|"), rows)
+    names = dict.fromkeys(name for _, _, name in results.crossed)
+    rows = [(source, kind.replace("_", " "), *(f"{results.crossed[source, kind, name][0].value:.3f} · {results.crossed[source, kind, name][1].value:.2f}" for name in names))
             for source in results.trained for kind in results.sets]  # fmt: skip
     run.table(
         "Trained on one, tested on the other: loss · rate over the target's",
-        ["trained on", "tested on", *(TITLES[name] for name in PICTURED)],
+        ["trained on", "tested on", *(TITLES[name] for name in names)],
         rows,
     )
 

@@ -78,9 +78,8 @@ def flicker(pairs):
         total = 0.0
         for pair, counts in zip(pairs, which, strict=True):
             rate = counts.sum((-2, -1)).double()
-            taper = torch.hann_window(len(rate), dtype=torch.float64)[
-                :, None
-            ]  # without it the drift of the rate leaks upwards
+            # without a taper the drift of the rate leaks upwards
+            taper = torch.hann_window(len(rate), dtype=torch.float64)[:, None]
             spectrum = torch.fft.rfft((rate - rate.mean(0)) * taper, dim=0).abs().square()
             frequency_hz = torch.fft.rfftfreq(len(rate), pair.sequence.dt_s)
             total += float(spectrum[frequency_hz > min(HIGH_HZ, 0.25 / pair.sequence.dt_s)].sum())

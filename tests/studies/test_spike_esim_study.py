@@ -12,7 +12,7 @@ from codesign.events import SensorModel
 from codesign.events.spiking.spike_esim import SpikeEsim
 from studies.frame.run import main
 from studies.spike_esim import __main__ as study
-from studies.spike_esim import score
+from studies.spike_esim import jobs, score
 from studies.spike_esim import train as training
 from studies.spike_esim.data import Sequence, part, tiles
 from studies.spike_esim.recording import moved, travelled
@@ -135,6 +135,47 @@ def test_best_theta_is_that_of_the_target():
     truth = training.THETAS[4]
     made = Sequence("made", frames, t_s, training.esim_counts(frames, t_s, truth))
     assert training.best_theta([made]) == truth
+
+
+def spikes_by_loop(drive, reset, response):
+    """Spikes of threshold 1, step by step from all steps so far; kernels [T], by lag."""
+    spikes = torch.zeros_like(drive)
+    for t in range(len(drive)):
+        back = [kernel[: t + 1].flip(0) for kernel in (response, reset)]
+        spikes[t] = (
+            torch.tensordot(back[0], drive[: t + 1], 1) + torch.tensordot(back[1], spikes[: t + 1], 1) >= 1
+        )
+    return spikes
+
+
+def test_thesis_variants_spike_when_a_loop_over_their_own_kernels_does():
+    frames = torch.rand(60, 6, 6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    lag = torch.arange(59, dtype=torch.float64)
+    fast, slow = (lag * DT_S / tau_s for tau_s in (1e-3, 1e-2))
+    none, alpha = (lag == 0).double(), slow * (1 - slow).exp()
+    slayer, own = -2 * fast * (1 - fast).exp(), -2 * (1 - fast).exp() * (lag > 0)
+    kernels = {"thesis": (slayer, none), "own_reset": (own, none), "smoothed": (slayer, alpha)}
+    for name, made in jobs.VARIANTS.items():
+        network = made(1, dt=1e3 * DT_S, seed=0).double()
+        network.wake(frames, 0.2)
+        first = getattr(network, "first", network)
+        weights = torch.stack((first.weight_on, -first.weight_off)).detach()
+        drive = torch.nn.functional.conv2d(frames.diff(dim=0)[:, None], weights, padding=1)
+        truth = spikes_by_loop(drive, *kernels.get(name, kernels["own_reset"]))
+        if name == "second_module":
+            truth = spikes_by_loop(network.weight.detach() * truth, own, alpha)
+        assert truth.any()
+        assert torch.equal(network(frames)[0], truth), name
+
+
+def test_gradient_of_the_second_module_is_that_of_differences():
+    module = jobs.SecondModule(1, dt=1e3 * DT_S, seed=0).double()
+    given = torch.rand(12, 2, 2, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+
+    def smooth_twin(weight, given):  # the spike is the integral of its surrogate
+        return module.second(given, smooth=True, through_reset="full")[0]
+
+    assert torch.autograd.gradcheck(smooth_twin, (module.weight, given.requires_grad_()))
 
 
 def test_calibration_finds_the_thresholds_of_a_sensor():

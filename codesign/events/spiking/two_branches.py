@@ -37,7 +37,8 @@ class TwoBranchSpikes(nn.Module):
       the unit of dt. dt: length of a step.
     smoothing_tau: None for the network itself; else time constant of an alpha response of the drive before
       the threshold (temporal smoothing): weak changes add up over a few tau, and events come later, by 2 tau
-      for a short change. kernel, surrogate, through_reset: as for ``events.srm``.
+      for a short change. kernel, surrogate, through_reset: as for ``events.srm``; the thesis's own reset is
+      "thesis".
     seed: of the weights, uniform in 0 to 1 over their number, so that ON starts as brighter and OFF as
       darker.
     """
