@@ -130,7 +130,8 @@ def _sentence(function, name, args, kwargs, error):
         blamed = {f"'{type(each).__name__}' object" for each in (value, *parts)}
         if isinstance(error, (AttributeError, TypeError)) and any(words in said for words in blamed):
             return DomainError(f"{name}: {argument} = {shown(value)} does not fit ({said}).")
-        unknown = isinstance(error, AttributeError) and said.endswith(f"has no attribute {value!r}")
+        name_of = f"has no attribute '{value}'" if isinstance(value, str) else None
+        unknown = name_of is not None and isinstance(error, AttributeError) and name_of in str(error)
         if unknown or (isinstance(error, KeyError) and error.args[0] is value):
             return DomainError(f"{name}: {argument} = {shown(value)} is not known.")
     if isinstance(error, (AttributeError, OSError, KeyError)) or not UNFIT.search(said):
