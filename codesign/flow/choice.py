@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample
+from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d
 
 from codesign.flow.checks import check_volume
 from codesign.flow.lk import check_start, descended, field
@@ -33,20 +33,20 @@ SOME = 0.02  # variance of a pixel's share, squared events, where nothing was se
 WIDE: dict[str, Any] = {"prior_px": 20.0, "levels_px": (8.0, 4.0, 2.0, 1.0)}
 COARSE: dict[str, Any] = {"model": "affine", "prior_px": 8.0, "levels_px": (8.0, 4.0, 2.0)}
 NARROW: dict[str, Any] = {"model": "affine"}
-OPTIONS: dict[bool, dict[str, Any]] = {
-    False: {},
-    True: WIDE,
-}  # of a local field, by whether it is to reach far
+OPTIONS: dict[bool, dict[str, Any]] = {False: {}, True: WIDE}  # local fields, by whether to reach far
 CLOCKS = {False: "time", True: "turn"}
 TURNED = 0.95  # factor on 1 - r from which on events are the clock
 FAR = 0.9  # and the wide prior is taken
 FEW = 25.0  # nats over zero flow at which half of the flow is believed
-# bodies before still ground, logistic: extent of what agrees, logarithm of the share of the cells that hold it and of
-# how much worse one affine field explains it, 1; fitted to windows of scenes.flow_harsh and flow_sets, other seeds
-BODIES = (-13.1, -0.26, 1.8, -0.54)
-SURE = 0.2  # probability from which on they are taken for such
+# bodies before still ground, logistic: extent of what agrees, logarithms of the share of the cells that hold it and of
+# how much worse shifts of places explain it than one affine field, 1; fitted to scenes.flow_harsh, flow_sets, other seeds
+BODIES = (-5.85, -2.79, -9.29, -6.8)
+MOST = 0.5  # of the third
+SURE = 0.6  # probability from which on they are taken for such
 MOVES = 5.0  # deviations of scattered events from which on a pixel belongs to one
-CELL = 8
+NOISE = 2.0  # and below which it says nothing of where they are
+CELL = 8  # px; places that shift by themselves, and half of the widest gap within a body
+EDGE = 1  # px that the blur carries evidence beyond a body
 LEAST = 1e-3
 
 
@@ -66,11 +66,8 @@ class Agreement:
     def __init__(self, volume: EventVolume) -> None:
         counts = volume.counts.detach()
         signed, _, kept = cooled(counts)
-        grid = Grid(*counts.shape[-2:])
-        taps = gaussian(BLUR_PX, 1)
-        taps = taps[len(taps) // 2 :].tolist()
-        self.signed = blurred(signed, grid, taps)
-        self.events = blurred(counts.sum(1) * kept[:, None], grid, taps)
+        self.signed = _blurred(signed, BLUR_PX)
+        self.events = _blurred(counts.sum(1) * kept[:, None], BLUR_PX)
         self.apart = min(2, signed.shape[1] - 1)
 
     @torch.no_grad()
@@ -113,7 +110,7 @@ def estimate(volume: EventVolume, start_px: Tensor | None = None) -> FlowField:
     Chosen for each sample by the agreement of the bins: time or events as the clock, or a motion that turns back once
     (``net_share`` tells); a local field with the prior of ``estimate_lk`` or a wide one for motions of many pixels; and
     zero flow, towards which all shrinks where it explains the events as well. Where few places give nearly all events
-    and do not move as one, they are taken for bodies before still ground, and there is no flow in between.
+    and do not move as one, they are taken for bodies before still ground, and there is no flow beyond their outlines.
 
     Args: volume, start_px: as of ``estimate_lk``; with fewer than 4 bins little can be told apart.
     Returns: as of ``estimate_lk``. The covariance takes in how far the candidates are apart, and what was shrunk.
@@ -159,10 +156,8 @@ def _followed(volume, chosen, start):
             places.append(these)
     order = torch.cat(places).argsort()
     names = ("flow_px", "valid", "confidence", "covariance_px2", "net_share")
-    return FlowField(
-        interval_s=parts[0].interval_s,
-        **{name: torch.cat([getattr(part, name) for part in parts])[order] for name in names},
-    )
+    joined = {name: torch.cat([getattr(part, name) for part in parts])[order] for name in names}
+    return replace(parts[0], **joined)
 
 
 class _Chosen(NamedTuple):
@@ -181,8 +176,8 @@ def _chosen(volume, start):
     found = [along_path(volume, clock) for clock in CLOCKS.values()]
     missing = [1 - agreement.along(descended(volume, path, **COARSE)[0], path[0]).alike for path in found]
     turned = missing[1] < TURNED * missing[0]
-    names = ("counts", "net", "start", "spread", "place", "direction")
-    way = Path(*(_where(turned, *(getattr(path[0], name) for path in reversed(found))) for name in names))
+    straight, turning = (vars(path[0]) for path in found)
+    way = Path(**{name: _where(turned, turning[name], straight[name]) for name in straight})
     path = way, *found[0][1:]
     fields = [descended(volume, path, **options, start_px=start) for options in ({}, WIDE, NARROW)]
     flows = [flow for flow, *_ in fields]
@@ -190,18 +185,19 @@ def _chosen(volume, start):
     still = agreement.along(torch.zeros_like(flows[0]), way).alike
     far = 1 - wide.alike < FAR * (1 - local.alike)
     chosen = [_where(far, *pair) for pair in zip(fields[1], fields[0], strict=True)]
-    flow = chosen[0]
     best = Agreed(*(_where(far, *pair) for pair in zip(wide, local, strict=True)))
     nats = best.sure * (_unexplained(still) - _unexplained(best.alike)).clamp_min(0) / 2
     shrunk = (nats / (nats + FEW) * (best.alike > 0))[:, None, None]
-    coarse = torch.minimum(*missing)
-    bodies = _bodies(local, torch.minimum(1 - narrow.alike, coarse))[:, None, None]
-    ground = (bodies > SURE) & (best.z < MOVES)
+    seen = local.z.clamp_min(0)[:, None]
+    shifts = _blurred(seen * flows[0], CELL) / (_blurred(seen, CELL) + TINY)
+    one = torch.minimum(1 - narrow.alike, torch.minimum(*missing))
+    bodies = _bodies(local, 1 - agreement.along(shifts, way).alike, one)[:, None, None]
+    ground = (bodies > SURE) & ~_enclosed(best.z > MOVES)
     believed = torch.where(ground, 0.0, shrunk.expand_as(best.z))
     doubt = believed * (1 - believed) + torch.where(ground, 1 - bodies, 0.0)
-    apart = doubt[:, None] * _squared(flow) + sum(_squared(other - flow) for other in flows)
+    apart = doubt[:, None] * _squared(chosen[0]) + sum(_squared(other - chosen[0]) for other in flows)
     found = field(volume, way, *chosen)
-    return _Chosen(found, turned, far, believed, way.net.to(flow)[:, None, None, None].square() * apart)
+    return _Chosen(found, turned, far, believed, way.net.to(apart)[:, None, None, None].square() * apart)
 
 
 def _unexplained(alike):
@@ -209,22 +205,31 @@ def _unexplained(alike):
     return (1 - alike.square()).clamp_min(LEAST / 10).log()
 
 
-def _bodies(local, missing):
-    """Probability [B] that what agrees along the local field, of which one affine field leaves ``missing`` [B], are
-    bodies before still ground."""
+def _bodies(local, shifts, one):
+    """Probability [B] that what agrees along the local field are bodies before still ground. shifts, one: [B] what shifts
+    of places and one affine field leave of it."""
     cells = avg_pool2d(local.z.clamp_min(0)[:, None], CELL, ceil_mode=True)[:, 0]
-    rows, columns = (torch.arange(size).to(cells) for size in cells.shape[1:])
-    whole = cells.sum((1, 2)) + TINY
-    x, y = cells.sum(1), cells.sum(2)
-    spread = sum(
-        (part @ place.square()) / whole - ((part @ place) / whole).square()
-        for part, place in ((x, columns), (y, rows))
-    )
-    extent = spread.clamp_min(0).sqrt() / max(cells.shape[1:])
-    share = whole.square() / (cells.square().sum((1, 2)) + TINY) / cells[0].numel()
-    worse = missing.clamp_min(LEAST).log() - (1 - local.alike).clamp_min(LEAST).log()
-    parts = extent, share.clamp_min(LEAST).log(), worse, torch.ones_like(worse)
+    share = cells.sum((1, 2)).square() / (cells.square().sum((1, 2)) + TINY) / cells[0].numel()
+    cells = avg_pool2d((local.z - NOISE).clamp_min(0).sqrt()[:, None], CELL, ceil_mode=True)[:, 0]
+    weight = cells[:, None] / (cells.sum((1, 2)) + TINY)[:, None, None, None]
+    place = pixel_grid(*cells.shape[1:], cells)
+    off_middle = place - (weight * place).sum((2, 3), keepdim=True)
+    extent = (weight * off_middle.square()).sum((1, 2, 3)).sqrt() / max(cells.shape[1:])
+    worse = shifts.clamp_min(LEAST).log() - one.clamp_min(LEAST).log()
+    parts = extent, share.clamp_min(LEAST).log(), worse.clamp(-MOST, MOST), torch.ones_like(worse)
     return torch.sigmoid(sum(weight * part for weight, part in zip(BODIES, parts, strict=True)))
+
+
+def _enclosed(moves):
+    """[B, H, W] bool: pixels among those that move, also within an outline, less the edge that the blur adds."""
+    closed = max_pool2d(moves.float(), 2 * CELL + 1, 1, CELL)
+    return max_pool2d(1 - closed, 2 * (CELL + EDGE) + 1, 1, CELL + EDGE) < 0.5
+
+
+def _blurred(images, sigma_px):
+    """[B, n, H, W] through a Gaussian."""
+    taps = gaussian(sigma_px, 1)
+    return blurred(images, Grid(*images.shape[-2:]), taps[len(taps) // 2 :].tolist())
 
 
 def _where(choice, one, other):

@@ -1,6 +1,7 @@
 """flow.estimate on windows with exact flow, where the closed form as it is set fails, and on noise."""
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -12,17 +13,14 @@ from scenes.flow_harsh import HARSH
 SEED = 4242  # of no study
 
 
-@pytest.fixture(scope="module")
-def judged():
-    def judge(family):
-        windows = HARSH[family](SEED, 8).batch(range(8))
-        return windows, flow.estimate(windows.volume)
-
-    return judge
+@cache
+def judged(family):
+    windows = HARSH[family](SEED, 8).batch(range(8))
+    return windows, flow.estimate(windows.volume)
 
 
 @pytest.mark.parametrize("family", ["zoom_fine", "roll_fine"])
-def test_as_good_as_the_better_option(judged, family):
+def test_as_good_as_the_better_option(family):
     """A window of weak texture is lost by the closed form as it is set (1.0 of zero flow), not by the wide prior."""
     windows, found = judged(family)
     wide = {"prior_px": 20.0, "levels_px": (8.0, 4.0, 2.0, 1.0)}
@@ -36,16 +34,15 @@ def test_as_good_as_the_better_option(judged, family):
 
 @pytest.mark.parametrize(
     ("family", "most"),
-    # of zero flow; the closed form as it is set has 7 to 9 of it on out_and_back
-    [("out_and_back", 0.7), ("vibration_hard", 0.5), ("noise", 1.001)],
+    # of zero flow; the closed form as it is set has 7 to 9 on out_and_back, 15 on small_discs, whose ground is still
+    [("out_and_back", 0.7), ("vibration_hard", 0.5), ("noise", 1.001), ("small_discs", 0.7)],
 )
-def test_error_over_zero_flow(judged, family, most):
+def test_error_over_zero_flow(family, most):
     windows, found = judged(family)
-    truth = windows.truth.flow_px
-    assert aee(found.flow_px, truth) <= most * zero_flow_error(truth)
+    assert aee(found.flow_px, windows.truth.flow_px) <= most * zero_flow_error(windows.truth.flow_px)
 
 
-def test_motion_that_turns_back_is_told_as_such(judged):
+def test_motion_that_turns_back_is_told_as_such():
     """Out by L and back by 0.5 to 1 L: the way is 1.5 to 2 L, the displacement 0 to 0.5 L."""
     _, turning = judged("out_and_back")
     _, straight = judged("zoom_fine")
@@ -53,14 +50,14 @@ def test_motion_that_turns_back_is_told_as_such(judged):
     assert (straight.net_share > 0.99).all()
 
 
-def test_noise_alone_has_no_flow_and_no_confidence(judged):
+def test_noise_alone_has_no_flow_and_no_confidence():
     _, found = judged("noise")
     assert found.flow_px.abs().max() < 0.02
     assert found.confidence.max() < 0.02
     assert found.covariance_px2[:, [0, 2]].min() > 1.0
 
 
-def test_samples_do_not_see_each_other(judged):
+def test_samples_do_not_see_each_other():
     windows, found = judged("vibration_hard")
     volume = windows.volume
     for k in (0, 3):
@@ -68,7 +65,7 @@ def test_samples_do_not_see_each_other(judged):
         torch.testing.assert_close(alone.flow_px[0], found.flow_px[k], rtol=1e-3, atol=1e-3)
 
 
-def test_gradient_is_that_of_the_closed_form_that_was_chosen(judged):
+def test_gradient_is_that_of_the_closed_form_that_was_chosen():
     """On a plane in plain motion the choice is the closed form as it is set, nearly all of it believed: differences of
     the estimate along a random direction, in float64, agree with its gradient, as long as the choice stays."""
     volume = HARSH["roll_fine"](SEED, 8).batch([0]).volume
@@ -78,9 +75,7 @@ def test_gradient_is_that_of_the_closed_form_that_was_chosen(judged):
     def value(counts):
         return (weight * flow.estimate(replace(volume, counts=counts)).flow_px).mean()
 
-    way = torch.rand(counts.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * (
-        counts > 0
-    )
+    way = torch.rand(counts.shape, generator=torch.Generator().manual_seed(2)) * (counts > 0)
     followed = value(counts)
     (grad,) = torch.autograd.grad(followed, counts)
     with torch.no_grad():
