@@ -26,6 +26,8 @@ WIDER = 1.02  # of the film's field, for what chief rays of the border do not sa
 IN_FRONT_M = 1e-3
 STEP = 1e-4  # of a piece, for the direction of its curve
 PUPILS = 4096
+NEARBY = 0.07  # share of the distance from which what is not hidden is read again
+NEAR_RAD = 2e-6  # by how much, at least: an edge of a face five times as wide as it is away moved by 1.2e-6
 FLOAT32_RAD = 5e-7  # by how much a float32 ray may miss, per length of its coordinates over the distance
 
 
@@ -34,7 +36,8 @@ class CurvePoints:
     """Sampled points of curves, in the axes of the part of the scene that the curve belongs to.
 
     world_m, ahead_m [n, 3]: the point, and the same curve a little further on. share [n]: how many such steps each
-    point stands for. aside_rad [n]: how far to the sides radiance is safely read. face_slope [n]: tangent of the
+    point stands for. aside_rad, near_rad [n]: how far to the sides radiance is safely read from afar and from NEARBY of
+    the way, both as seen from the viewpoint. face_slope [n]: tangent of the
     view's angle to the steeper of the faces on both sides, infinite where what is seen may lie far behind. pupil [n, 2];
     colour, window, frame, part [n]: numbers of the wavelength, the window of the film, the frame and the part of the scene.
     """
@@ -43,6 +46,7 @@ class CurvePoints:
     ahead_m: Tensor
     share: Tensor
     aside_rad: Tensor
+    near_rad: Tensor
     face_slope: Tensor
     pupil: Tensor
     colour: Tensor
@@ -131,18 +135,24 @@ def _on_pieces(view, curve, pieces, cameras, per_px, generator):
     viewpoint = eye + (pose[:, :3, :2] @ (pupil * view.aperture_m)[..., None])[..., 0]
     y = curve.points(index, s, viewpoint)
     on = curve.points(index, s + STEP * (high - low), viewpoint)
-    aside = read_aside_rad(curve, index, y, viewpoint)
+    aside, near = read_aside_rad(curve, index, y, viewpoint)
     slope = curve.face_slope(index, y, viewpoint)
     share = share * curve.counts(index, y, viewpoint)
     colour = (number + turn[1]) % view.colours
-    return y, on, share, aside, slope, pupil, colour, pieces.window[piece], frame
+    return y, on, share, aside, near, slope, pupil, colour, pieces.window[piece], frame
 
 
-def read_aside_rad(curve: Any, index: Tensor, y: Tensor, viewpoint: Tensor) -> Tensor:
-    """Angle [n] from the curves' points y [n, 3] at which radiances beside them are read, seen from viewpoints [n, 3]."""
-    coordinates = torch.maximum(y.abs().amax(1), viewpoint.abs().amax(1))
-    rounded = FLOAT32_RAD * coordinates / (y - viewpoint).norm(dim=1)
-    return torch.maximum(curve.aside_rad(index, viewpoint), rounded)
+def read_aside_rad(curve: Any, index: Tensor, y: Tensor, viewpoint: Tensor) -> tuple[Tensor, Tensor]:
+    """Angles [n] from the curves' points y [n, 3] at which radiances beside them are read, seen from viewpoints [n, 3]:
+    by rays from there, and by rays from NEARBY."""
+    aside, near = (
+        torch.maximum(
+            curve.aside_rad(index, eye),
+            FLOAT32_RAD * torch.maximum(y.abs().amax(1), eye.abs().amax(1)) / (y - eye).norm(dim=1),
+        )
+        for eye in (viewpoint, y + NEARBY * (viewpoint - y))
+    )
+    return aside, torch.minimum((NEARBY * near).clamp_min(NEAR_RAD), aside)
 
 
 def piece_rad(slope_per_px: float) -> float:

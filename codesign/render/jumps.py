@@ -14,7 +14,7 @@ from torch import Tensor
 
 from codesign.pose import apply, inverse
 from codesign.render.camera import Camera
-from codesign.render.curve_points import IN_FRONT_M, CurvePoints
+from codesign.render.curve_points import IN_FRONT_M, NEARBY, CurvePoints
 from codesign.render.rays import coloured_rays
 from codesign.render.wavefront import look
 
@@ -109,28 +109,38 @@ def _sides(camera, scene, cameras, points, y, x, aside):
     """Radiances [n] before and behind points y [n, 3] of curves at film positions x [n, 2], ``aside`` [n, 2] px to
     either side, and whether the points are seen [n]."""
 
-    def read(rows, times):
-        q, colour = (v[rows].repeat(2, *[1] * (v.ndim - 1)) for v in (points.pupil, points.colour))
-        at = torch.cat([x[rows] - times * aside[rows], x[rows] + times * aside[rows]])
-        origin, direction, weight = coloured_rays(camera, at, q, colour)
-        light, distance = look(scene, cameras, points.frame[rows].repeat(2), origin, direction)
-        reach = (y[rows] - origin[: len(rows)]).norm(dim=1)
-        return (weight.detach() * light).reshape(2, -1), distance.reshape(2, -1), reach
+    q, colour = (v.repeat(2, *[1] * (v.ndim - 1)) for v in (points.pupil, points.colour))
+    origin, direction, weight = coloured_rays(camera, torch.cat([x - aside, x + aside]), q, colour)
+    origin, direction, weight = (v.unflatten(0, (2, -1)) for v in (origin, direction, weight.detach()))
+    reach = (y - origin[0]).norm(dim=1)
 
-    (before, behind), distance, reach = read(torch.arange(len(y)), 1)
-    rounding = ROUNDING * (reach + points.world_m.norm(dim=1))
+    def read(rows, share, start=0.0):
+        """At a share [n] of the way aside, from where the share ``start`` of the distance is left behind."""
+        o, d = (v[:, rows].mean(0) + share[:, None] * (v - v.mean(0))[:, rows] for v in (origin, direction))
+        skipped = start * reach[rows]
+        o = o + skipped[:, None] * d
+        frame = points.frame[rows].repeat(2)
+        light, distance = look(scene, cameras, frame, o.flatten(0, 1), d.flatten(0, 1))
+        return weight[:, rows] * light.reshape(2, -1), distance.reshape(2, -1) + skipped
+
+    light, distance = read(torch.arange(len(y)), torch.ones_like(reach))
+    # what nothing hides from afar is read again from nearby, where float32 tells finer things apart
+    rows = torch.nonzero(distance.amax(0) > reach * (1 - DOUBTFUL))[:, 0]
+    finer = points.near_rad / points.aside_rad
+    light[:, rows], distance[:, rows] = read(rows, finer[rows], 1 - NEARBY)
+    rounding = ROUNDING * (NEARBY * reach + points.world_m.norm(dim=1))
     nearest = distance.clone()
-    rows = torch.nonzero((distance.amax(0) < reach) & (distance.amax(0) > reach * (1 - DOUBTFUL)))[:, 0]
+    rows = rows[((distance.amax(0) < reach) & (distance.amax(0) > reach * (1 - DOUBTFUL)))[rows]]
     if rows.numel():
-        change = read(rows, 2)[1] - distance[:, rows]
+        change = read(rows, 2 * finer[rows], 1 - NEARBY)[1] - distance[:, rows]
         change = torch.where(change.abs() < DOUBTFUL * reach[rows], change, 0.0)
         nearest[:, rows] -= change
-        steepness = change.abs().amax(0) / (points.aside_rad * reach)[rows]
+        steepness = change.abs().amax(0) / (points.near_rad * reach)[rows]
         rounding[rows] *= 1 + steepness
     seen = nearest.amax(0) > reach - rounding
     # between two faces that are seen a ray may slip through, and tells of what lies behind them
-    within = reach * (1 + SAFETY * points.aside_rad * points.face_slope) + rounding
-    return before, behind, seen & (distance.amax(0) <= within)
+    within = reach * (1 + SAFETY * points.near_rad * points.face_slope) + rounding
+    return *light, seen & (distance.amax(0) <= within)
 
 
 def _rad_per_px(y, per_px, slope, normal):

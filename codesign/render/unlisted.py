@@ -283,19 +283,22 @@ def _listed(camera, scene, curves, cameras, found):
                 count = curve.counts(index, y, o[ray]) & within
                 ray, index, y, ahead = (v[count] for v in (ray, index, y, ahead))
                 share = torch.ones(len(ray), dtype=torch.float64)
-                aside = read_aside_rad(curve, index, y, o[ray])
+                aside, near = read_aside_rad(curve, index, y, o[ray])
                 slope = curve.face_slope(index, y, o[ray])
                 numbers = (torch.full_like(ray, number) for number in (frame, part))
-                columns.append((ray, y, ahead, share, aside, slope, *numbers))
+                columns.append((ray, y, ahead, share, aside, near, slope, *numbers))
     total = torch.zeros_like(found.change)
     read = None
     if columns:
-        ray, y, ahead, share, aside, slope, frame, part = (torch.cat(v) for v in zip(*columns, strict=True))
+        ray, y, ahead, share, aside, near, slope, frame, part = (
+            torch.cat(v) for v in zip(*columns, strict=True)
+        )
         points = CurvePoints(
             y,
             ahead,
             share,
             aside,
+            near,
             slope,
             found.pupil[ray],
             torch.zeros_like(ray),

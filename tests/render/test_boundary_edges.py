@@ -11,6 +11,7 @@ from codesign import backend, lens, pose, render
 from codesign.lens import GeoLens, Glass, Pinhole, Surface
 from codesign.render import MitsubaScene
 from codesign.render.camera import project
+from codesign.render.charts import emissive_mesh
 from codesign.render.curve_points import CurvePoints
 from codesign.render.jumps import _on_film
 from codesign.render.outline import Circles, outlines
@@ -93,7 +94,7 @@ def test_points_are_found_on_the_film_through_their_own_point_of_the_pupil(gener
     pupil = 1.2 * (torch.rand(count, 2, generator=generator, dtype=F64) - 0.5)
     none = torch.zeros(count, dtype=torch.long)
     asks = torch.zeros(count, dtype=F64)
-    points = CurvePoints(y, y, asks, asks, asks > 0, pupil, none, none, none, none)
+    points = CurvePoints(y, y, asks, asks, asks, asks > 0, pupil, none, none, none, none)
     with torch.no_grad():
         at, per_px, _, passes = _on_film(camera, y, points)
         assert bool(passes.all())
@@ -117,3 +118,31 @@ def test_both_rims_of_a_cylinder_are_circles_about_its_axis():
         out = rims.points(torch.full((20,), number), s, None) - torch.tensor(centre)
         torch.testing.assert_close(out.norm(dim=1), torch.full((20,), radius, dtype=F64), rtol=1e-5, atol=0)
         torch.testing.assert_close(out @ axis, torch.zeros(20, dtype=F64), rtol=0, atol=1e-6)
+
+
+def test_a_face_narrower_than_a_reading_is_no_second_edge():
+    """Of a card with a lip that recedes steeply at its right side, 2 mm before a wall that shines half as bright."""
+    corners = [[x, y, z] for x, z in ((-9, 4), (0.08, 4), (0.08001, 4.001)) for y in (-9.0, 9.0)]
+    faces = [[0, 1, 3], [0, 3, 2], [2, 3, 5], [2, 5, 4]]
+    wall = [[-9, -9, 4.003], [-9, 9, 4.003], [9, -9, 4.003], [9, 9, 4.003]]
+    light = np.repeat([RADIANCE, RADIANCE / 2], [4, 2])
+    both = np.concatenate([faces, 6 + np.array([[0, 1, 3], [0, 3, 2]])])
+    scene = MitsubaScene({"mesh": emissive_mesh(backend.mitsuba(), np.array(corners + wall), both, light)})
+    camera = render.Camera(Pinhole(11.0), 60, 60, 0.05, 4)
+    truth = -RADIANCE / 2 * 60 / (camera.slope_per_px() * 4.001)
+    assert sideways(camera, scene) == pytest.approx(truth, rel=3e-3)
+
+
+def test_light_of_a_small_far_tube_grows_as_the_camera_comes_nearer():
+    """An open tube 580 radii away, seen nearly from its end, black inside: of its light 2 r times its length across the view
+    is seen, which falls with the square of the distance."""
+    radius, across = 0.8 / 580, math.hypot(5e-4, 7e-4)
+    tube = {"type": "cylinder", "p0": [0, 0, 0.8], "p1": [5e-4, 7e-4, 0.805], "radius": radius}
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": RADIANCE}}
+    scene = MitsubaScene({"tube": {**tube, "emitter": emitter}})
+    camera = render.Camera(Pinhole(11.0), 16, 16, 0.0168, 4)
+    twist = torch.zeros(6, dtype=F64, requires_grad=True)
+    image = render.frames(camera, scene, pose.se3_exp(twist[None]), gradient="boundary", per_px=24.0)
+    (found,) = torch.autograd.grad(image.double().sum(), twist)
+    light = RADIANCE * 2 * radius * across / (0.8025 * camera.slope_per_px()) ** 2
+    assert float(found[2]) == pytest.approx(2 / 0.8025 * light, rel=0.05)
