@@ -28,8 +28,8 @@ from codesign.render.rays import coloured_rays
 from codesign.render.sampling import film_pupil_pattern
 from codesign.render.wavefront import look
 
-LINES = 16  # each way across the film
-LEAST_LINES = 4  # each way across every frame that is looked at in a sequence
+LINES = 48  # each way across the film
+LEAST_LINES = 16  # each way across every frame that is looked at in a sequence
 FRAMES = 32  # looked at in one launch
 RAYS_PER_PX = 3
 HALVINGS = 14
@@ -42,7 +42,9 @@ BEYOND = 0.3  # of a piece, by which it is searched beyond its ends
 STEP = 1e-4  # of a piece, for the direction of its curve
 TURNS = 4  # of the search along a piece
 GRAZING = 0.3  # sine of the angle between a line and a curve, at least
-WRONG = 0.05  # share of all jumps up to which a view is taken as listed
+UNLISTED = 0.05  # share of all jumps up to which a view is taken as listed
+DOUBLED = 0.015  # the same, of jumps that lie on two edges: where gradients are right it is below 0.003
+DOUBTFUL = 0.005  # from which on a first look, of a few lines, is followed by a closer one
 
 
 @dataclass(frozen=True)
@@ -135,9 +137,9 @@ def _check_frames(camera, scene, curves, cameras, rows, start):
     """Look at frames ``rows`` of cameras [parts, F, 4, 4], of which the first is frame ``start``."""
     lines = max(LEAST_LINES, LINES // len(rows))
     for row, found in zip(rows, listings(camera, scene, curves, cameras[:, rows], lines), strict=True):
-        if max(found.unlisted, found.doubled) > WRONG:  # a few crossings say little: look closer
+        if max(found.unlisted, found.doubled) > DOUBTFUL:  # a few crossings say little
             (found,) = listings(camera, scene, curves, cameras[:, row : row + 1], 8 * LINES)
-        if max(found.unlisted, found.doubled) <= WRONG:
+        if found.unlisted <= UNLISTED and found.doubled <= DOUBLED:
             continue
         share, what = max(
             (found.unlisted, "lie on no edge or outline that the scene lists"),
