@@ -13,7 +13,7 @@ pytest.importorskip("resource", reason="kills are those of Unix")
 def test_a_killed_run_ends_with_the_same_numbers():
     from tests.hostile import kills
 
-    figures, findings = kills.measure(1, 0, studies=("make_dataset",))
+    figures, findings = kills.measure(1, 0, studies=("lens_tolerance",))
     assert not findings
     assert figures["kill_hits"] >= 1
     assert figures["killed_runs_equal"] == figures["killed_runs"] >= 1
