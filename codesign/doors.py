@@ -1,8 +1,8 @@
 """What a public function says when it fails for what it was given: which argument, what it was, what is needed.
 
 Values are checked where the formula needs it; that a number is not NaN, at every door. That text, None or a list stands
-where a tensor belongs is checked nowhere: when a call fails in Python, torch or NumPy, its arguments are held against the annotations, and the caller
-reads a sentence. A call that succeeds costs less than a microsecond more.
+where a tensor belongs is checked nowhere: when a call fails in Python, torch or NumPy, its arguments are held against
+the annotations, and the caller reads a sentence. A call that succeeds costs less than a microsecond more.
 """
 
 import functools
@@ -16,7 +16,7 @@ import typing
 from collections.abc import Callable, Iterable, Mapping
 from os import PathLike
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NoReturn, ParamSpec, TypeVar
 
 from codesign.errors import CodesignError, DomainError, ShapeError
 
@@ -32,9 +32,8 @@ UNFIT = re.compile(
     "|overflow|division|negative|NaN|infinit|expected|invalid combination|Long|Half|Double|Float|not implemented for",
     re.IGNORECASE,
 )
-KINDS: dict[
-    str, type
-] = {}  # that have doors, for annotations of which they are imported only when types are checked
+# classes that have doors, for annotations whose names are imported only when types are checked
+KINDS: dict[str, type] = {}
 PLAIN: dict[Any, tuple[tuple[type, ...], str]] = {
     float: ((numbers.Real,), "a number"),
     int: ((numbers.Integral,), "a whole number"),
@@ -47,8 +46,7 @@ PLAIN: dict[Any, tuple[tuple[type, ...], str]] = {
 def explain(room: dict[str, Any]) -> None:
     """Put doors into the public functions and classes of a room: ``explain(globals())`` is its last line."""
     home = room["__name__"]
-    own = (name for name, made in room.items() if name[0] != "_" and getattr(made, "__module__", "") == home)
-    for name in list(room.get("__all__", own)):
+    for name in public_names(room):
         public = room[name]
         if inspect.isclass(public):
             for base in public.__mro__:
@@ -57,6 +55,13 @@ def explain(room: dict[str, Any]) -> None:
         elif isinstance(public, types.FunctionType) and not hasattr(public, "__explained__"):
             room[name] = door(public, f"{home.removeprefix('codesign.')}.{name}")
             room[name].__module__ = home  # where a pickle finds it
+
+
+def public_names(room: Mapping[str, Any]) -> list[str]:
+    """What ``__all__`` of a module's names says, or what it defines itself without an underscore."""
+    home = room["__name__"]
+    own = (name for name, made in room.items() if name[0] != "_" and getattr(made, "__module__", "") == home)
+    return list(room.get("__all__", own))
 
 
 def _class(kind):
@@ -80,7 +85,7 @@ def door(function: Callable[P, T], name: str, nan_fits: bool = False) -> Callabl
       functions of the caller's own, and those that no argument explains.
     """
 
-    def explained(error, args, kwargs):
+    def explained(error, args, kwargs) -> NoReturn:
         sentence = _sentence(function, name, args, kwargs, error)
         if sentence is None:
             raise error
@@ -98,12 +103,10 @@ def door(function: Callable[P, T], name: str, nan_fits: bool = False) -> Callabl
             result = function(*args, **kwargs)
         except FAILS as error:
             explained(error, args, kwargs)
-            raise
         for value in () if nan_fits else (*args, *kwargs.values()):
             if value.__class__ is float and value != value:
-                raise DomainError(
-                    f"{name}: an argument is NaN, which is no number; give one ({_listed(_given(function, args, kwargs) or {})})."
-                )
+                given = _listed(_given(function, args, kwargs) or {})
+                raise DomainError(f"{name}: an argument is NaN, which is no number; give one ({given}).")
         return later(result, args, kwargs) if isinstance(result, types.GeneratorType) else result
 
     told.__explained__ = True  # pyright: ignore

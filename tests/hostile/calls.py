@@ -65,7 +65,7 @@ class Calls:
         self.journal = journal.open("a", buffering=1)
         for room in ROOMS:
             module = importlib.import_module(f"codesign.{room}")
-            for name in getattr(module, "__all__", own(module)):
+            for name in doors.public_names(vars(module)):
                 self._watch(module, name, getattr(module, name))
 
     def _watch(self, module, name, public):
@@ -134,15 +134,6 @@ class Calls:
                     self.journal.write(f'{{"call": "{name} | {argument} | {label}"')
                     what = attempt(call, again.args, again.kwargs)
                     self.journal.write(f', "found": {json.dumps(what)}}}\n')
-
-
-def own(module: Any) -> list[str]:
-    """Public names that a module without ``__all__`` defines."""
-    return [
-        name
-        for name, made in vars(module).items()
-        if name[0] != "_" and getattr(made, "__module__", "") == module.__name__
-    ]
 
 
 def wrong_values(value: Any) -> list[tuple[str, Any]]:
