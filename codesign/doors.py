@@ -9,6 +9,7 @@ import functools
 import inspect
 import math
 import numbers
+import os
 import re
 import sysconfig
 import types
@@ -22,7 +23,7 @@ from codesign.errors import CodesignError, DomainError, ShapeError
 
 P = ParamSpec("P")
 T = TypeVar("T")
-HOME = str(Path(__file__).parent)
+HOME = str(Path(__file__).parent) + os.sep
 LIBRARIES = (sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"), sysconfig.get_path("platlib"), "<")
 FAILS = (ArithmeticError, AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
 # what torch and NumPy say of tensors that do not fit
@@ -162,7 +163,7 @@ def is_ours(trace: types.TracebackType | None) -> bool:
     last = ""
     while trace is not None:
         file = trace.tb_frame.f_code.co_filename
-        if not file.startswith(LIBRARIES):
+        if file.startswith(HOME) or not file.startswith(LIBRARIES):  # it may be installed among them
             last = file
         trace = trace.tb_next
     return last.startswith(HOME)

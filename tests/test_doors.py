@@ -46,6 +46,12 @@ def test_arguments_that_do_not_fit_are_named(call, sentence):
         call()
 
 
+def test_arguments_are_named_also_where_the_package_is_installed_among_libraries(monkeypatch):
+    monkeypatch.setattr(doors, "LIBRARIES", (*doors.LIBRARIES, doors.HOME))
+    with pytest.raises(DomainError, match=r"lens.load: source = 3\.4"):
+        lens.load(3.4)
+
+
 def test_shapes_that_do_not_fit_are_a_shape_error():
     told = doors.door(lambda a, b: a @ b, "product")
     with pytest.raises(
@@ -56,7 +62,7 @@ def test_shapes_that_do_not_fit_are_a_shape_error():
 
 def _ours(told):
     """As if the function stood in the package."""
-    code = told.__wrapped__.__code__.replace(co_filename=f"{doors.HOME}/made_up.py")
+    code = told.__wrapped__.__code__.replace(co_filename=f"{doors.HOME}made_up.py")
     told.__wrapped__.__code__ = code
     return told
 
