@@ -38,6 +38,11 @@ class NonFiniteError(CodesignError, ArithmeticError):
     """A value or gradient became infinite or NaN; the message names the junction where it appeared."""
 
 
+def shown(value: Any) -> str:
+    """A wrong value in one short line of a message."""
+    return " ".join(repr(value).split())[:80]
+
+
 def as_number(value: Any, name: str) -> float:
     """A real number as a float, NaN and infinity too; DomainError for text, lists, complex numbers, None."""
     try:
@@ -45,8 +50,7 @@ def as_number(value: Any, name: str) -> float:
             raise TypeError
         return float(value)
     except (TypeError, ValueError, RuntimeError, OverflowError):
-        shown = " ".join(repr(value).split())[:80]
-        raise DomainError(f"{name} = {shown} is no number; give one.") from None
+        raise DomainError(f"{name} = {shown(value)} is no number; give one.") from None
 
 
 def check_whole(value: Any, name: str) -> int:

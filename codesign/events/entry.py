@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, FileFormatError, ShapeError, as_number, check_finite
+from codesign.errors import DomainError, FileFormatError, ShapeError, as_number, check_finite, shown
 
 Times = Tensor | Sequence[float] | np.ndarray  # seconds
 REAL = (torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.int16)
@@ -194,11 +194,6 @@ def check_room(values: float, what: str) -> None:
         raise DomainError(
             f"{what} would hold {values:.3g} values, more than the {MOST_VALUES} of one call; ask for less."
         )
-
-
-def shown(value: object) -> str:
-    """A wrong value in one short line."""
-    return " ".join(repr(value).split())[:80]
 
 
 def check_path(path: str | Path) -> Path:

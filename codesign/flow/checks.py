@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, FileFormatError, ShapeError, as_number, check_finite
+from codesign.errors import DomainError, FileFormatError, ShapeError, as_number, check_finite, shown
 from codesign.events.entry import check_whole
 from codesign.types import EventVolume, FlowField
 
@@ -21,11 +21,6 @@ COUNTS = (torch.float32, torch.float64)
 MOST_EVENTS = 1e9  # of a pixel and bin: squares of it are far from overflow
 LEAST_SPREAD = 0.01  # of the centroids, over the interval
 NEGATIVE = -1e-3  # counts a hair below 0 are let through: steps of differences go there
-
-
-def shown(value: Any) -> str:
-    """A value in one line of a message."""
-    return " ".join(repr(value).split())[:80]
 
 
 def check_real(value: Any, name: str, dtypes: tuple[torch.dtype, ...] | None = None) -> Tensor:

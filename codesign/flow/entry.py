@@ -9,8 +9,8 @@ from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 from torch import Tensor
 from torch.nn.functional import pad
 
-from codesign.errors import DomainError
-from codesign.flow.checks import check_volume, shown
+from codesign.errors import DomainError, shown
+from codesign.flow.checks import check_volume
 from codesign.types import EventVolume, FlowField
 
 Given = ParamSpec("Given")

@@ -14,9 +14,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, check_finite
+from codesign.errors import DomainError, ShapeError, check_finite, shown
 from codesign.flow import lk_field, lk_level
-from codesign.flow.checks import check_count, check_flow, check_number, check_real, check_volume, shown
+from codesign.flow.checks import check_count, check_flow, check_number, check_real, check_volume
 from codesign.flow.lk_descent import Descent
 from codesign.flow.lk_path import Path
 from codesign.types import EventVolume, FlowField

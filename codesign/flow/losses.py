@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from codesign.errors import DomainError, ShapeError
-from codesign.flow.checks import check_field, check_kind, check_number, check_real, shown
+from codesign.errors import DomainError, ShapeError, shown
+from codesign.flow.checks import check_field, check_kind, check_number, check_real
 from codesign.flow.contrast import (
     area_change,
     sharpness,

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError, ShapeError, shown
 from codesign.events.entry import check_whole
 from codesign.events.formats.arrival import BACKWARDS, OFF_SENSOR
 from codesign.events.stream import check_stream
 from codesign.events.volumes.volume import check_bins, from_stream
-from codesign.flow.checks import check_dense, check_field, check_number, check_size, shown
+from codesign.flow.checks import check_dense, check_field, check_number, check_size
 from codesign.flow.sources.packet import EMPTY
 from codesign.flow.warp import pixel_grid
 from codesign.types import EventStream, EventVolume, FlowField

@@ -111,9 +111,8 @@ def measure(count: int, seed: int, say=print, studies=tuple(STUDIES)) -> tuple[d
     """Kill until ``count`` kills hit. A kill that comes after the end, or before anything was kept, is no hit."""
     order = random.Random(seed)
     hits: Counter[str] = Counter()
-    runs: Counter[str] = Counter()
-    equal: Counter[str] = Counter()
-    kills = 0
+    hit_studies = set()
+    kills = compared = equal = 0
     findings = []
     whole = {}
     with tempfile.TemporaryDirectory() as place:
@@ -148,7 +147,7 @@ def measure(count: int, seed: int, say=print, studies=tuple(STUDIES)) -> tuple[d
                     findings.append(f"{study}, {', '.join(story)}: ends with {code}: {said}")
                 if _kept(folder):
                     hits[kind] += 1
-                    runs[study] += not runs[study]
+                    hit_studies.add(study)
                 if (folder / "config.json").exists():
                     arguments = [f"studies.{study}", "--resume", str(folder)]
             if not story:
@@ -158,8 +157,8 @@ def measure(count: int, seed: int, say=print, studies=tuple(STUDIES)) -> tuple[d
             found = _numbers(folder) if code == 0 else {}
             different = [name for name in expected | found if expected.get(name) != found.get(name)]
             left = [path.name for path in folder.rglob(".*")]
-            equal[study] += not different and not left
-            equal["compared"] += 1
+            compared += 1
+            equal += not different and not left
             if code != 0:
                 findings.append(f"{study}, {', '.join(story)}: resuming ends with {code}: {said}")
             elif different or left:
@@ -169,6 +168,5 @@ def measure(count: int, seed: int, say=print, studies=tuple(STUDIES)) -> tuple[d
                 )
             say(f"{study}, {', '.join(story)}: {'equal' if not different and not left else findings[-1]}")
     figures = {f"kill_hits_{kind}": hits[kind] for kind in KINDS}
-    compared = equal.pop("compared", 0)
-    figures |= {"kills": kills, "kill_hits": sum(hits.values()), "kill_studies": len(runs)}
-    return figures | {"killed_runs": compared, "killed_runs_equal": sum(equal.values())}, findings
+    figures |= {"kills": kills, "kill_hits": sum(hits.values()), "kill_studies": len(hit_studies)}
+    return figures | {"killed_runs": compared, "killed_runs_equal": equal}, findings

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from codesign.errors import FileFormatError
+from codesign.errors import FileFormatError, shown
 from codesign.events.columns import LIMIT_PX
-from codesign.events.entry import shown
 
 ORDERS = ("txyp", "xytp")
 UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Mapping
 import torch
 from torch import Tensor, nn
 
-from codesign.errors import DomainError
-from codesign.events.entry import check_positive, shown
+from codesign.errors import DomainError, shown
+from codesign.events.entry import check_positive
 
 STEP = 0.1  # a unit step of a variable changes its value by a tenth: exp(0.1) - 1 = 10.5 %
 

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from codesign.errors import DomainError, ShapeError, as_number
-from codesign.events.entry import MOST_VALUES, check_dtype, shown
+from codesign.errors import DomainError, ShapeError, as_number, shown
+from codesign.events.entry import MOST_VALUES, check_dtype
 
 THETA_MINIMUM = 0.01  # no drawn threshold falls below, as in v2e
 MOST_NUMBER = 1e30

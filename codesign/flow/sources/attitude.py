@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from codesign.errors import DomainError, FileFormatError
-from codesign.flow.checks import check_path, shown
+from codesign.errors import DomainError, FileFormatError, shown
+from codesign.flow.checks import check_path
 from codesign.reading import open_regular, reading
 
 LARGEST_GAP_S = 0.1  # between samples that are interpolated

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from codesign.errors import DomainError
-from codesign.events.entry import check_whole, shown
+from codesign.errors import DomainError, shown
+from codesign.events.entry import check_whole
 from codesign.events.formats.arrival import BACKWARDS, OFF_SENSOR
 from codesign.flow.checks import check_kind, check_number, check_path, check_size
 from codesign.types import EventStream, FlowField
