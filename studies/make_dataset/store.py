@@ -20,6 +20,7 @@ import torch
 from codesign.atomic import replacing, write_atomic
 from codesign.events import SensorState
 from codesign.events.formats.hdf5_chunks import h5py
+from codesign.events.formats.hdf5_new import new_hdf5
 from codesign.reading import check_regular, reading
 from codesign.types import EventStream
 
@@ -134,7 +135,7 @@ def manifest(root: Path, sequences):
 @contextmanager
 def _whole(path):
     """An HDF5 file that takes its name when it is complete."""
-    with replacing(path) as temporary, h5(temporary, "w") as file:
+    with replacing(path) as temporary, new_hdf5(temporary) as file:
         yield file
 
 

@@ -11,6 +11,7 @@ from codesign.errors import FileFormatError
 from codesign.events.formats.arrival import DISORDER_US, Arrival, Asked
 from codesign.events.formats.dsec import check_index, pixels, to_dsec
 from codesign.events.formats.hdf5_chunks import h5py
+from codesign.events.formats.hdf5_new import new_hdf5
 from codesign.events.formats.hdf5_rows import REMEDY, Rows, own, scalar
 from codesign.events.formats.tables import microseconds, settled_order, settled_unit, signed
 from codesign.reading import check_regular, reading
@@ -125,9 +126,8 @@ def read_hdf5(path, asked):
 def write_hdf5(path, stream):
     """Write events to ``path`` in DSEC's layout, with checksums; see dsec for what it holds."""
     arrays, attributes = to_dsec(stream)
-    with h5py.File(
-        path, "w", libver=("v110", "v110")
-    ) as file:  # from 1.10 on, HDF5 keeps checksums of its own structure too
+    # from 1.10 on, HDF5 keeps checksums of its own structure too
+    with new_hdf5(path, libver=("v110", "v110")) as file:
         for name, array in arrays.items():
             packing = {}
             if array.size > 1:
