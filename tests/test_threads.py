@@ -1,8 +1,11 @@
 """Threads that compute gradients at once give what one after the other gives; what was forked says what to do."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 FORKED = """
@@ -23,6 +26,26 @@ print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
 
 
+WORKERS = """
+import sys, torch
+from torch.utils.data import DataLoader
+from tests.hostile.threads import estimated
+
+class Made(torch.utils.data.Dataset):
+    def __len__(self): return 2
+    def __getitem__(self, k): return torch.cat([each.double().reshape(-1) for each in estimated(k)])
+
+def loaded():
+    workers = DataLoader(Made(), batch_size=None, num_workers=2, multiprocessing_context=sys.argv[1])
+    return torch.cat(list(workers))
+
+if __name__ == "__main__":
+    early = loaded() if sys.argv[1] == "fork" else None  # before the first kernel of this process
+    serial = torch.cat([Made()[k] for k in range(2)])
+    print(float(((early if early is not None else loaded()) - serial).abs().max()))
+"""
+
+
 def test_many_threads_with_gradients_equal_serial_ones():
     kinds = "('traced', 'estimated', 'counted')"
     script = f"from tests.hostile.threads import *; k = {kinds}; found = run(8, 1, k); print(max(found[n] for n in k))"
@@ -39,3 +62,20 @@ def test_a_process_forked_after_the_first_kernel_is_told_to_spawn():
         [sys.executable, "-c", FORKED], cwd=ROOT, capture_output=True, text=True, timeout=60, check=False
     )
     assert done.stdout.strip() == "7", done.stderr[-2000:]
+
+
+@pytest.mark.parametrize("context", ["spawn", "fork"])
+def test_workers_of_a_loader_with_gradients_equal_serial_work(context, tmp_path):
+    script = tmp_path / "workers.py"
+    script.write_text(WORKERS)
+    done = subprocess.run(
+        [sys.executable, script, context],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert float(done.stdout) < 1e-9

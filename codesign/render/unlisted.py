@@ -43,7 +43,8 @@ STEP = 1e-4  # of a piece, for the direction of its curve
 TURNS = 4  # of the search along a piece
 GRAZING = 0.3  # sine of the angle between a line and a curve, at least
 UNLISTED = 0.05  # share of all jumps up to which a view is taken as listed
-DOUBLED = 0.025  # the same, on two edges: a ball with a steep picture, rightly seen, has 0.017, a wrong world 0.03
+# the same, of jumps that lie on two edges: a ball with a steep picture, rightly seen, has 0.017, a wrong world 0.03
+DOUBLED = 0.025
 DOUBTFUL = 0.005  # from which on a first look, of a few lines, is followed by a closer one
 
 
