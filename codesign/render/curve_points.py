@@ -38,7 +38,8 @@ class CurvePoints:
     world_m, ahead_m [n, 3]: the point, and the same curve a little further on. share [n]: how many such steps each
     point stands for. aside_rad, near_rad [n]: how far to the sides radiance is safely read from afar and from NEARBY of
     the way, both as seen from the viewpoint. face_slope [n]: tangent of the
-    view's angle to the steeper of the faces on both sides, infinite where what is seen may lie far behind. pupil [n, 2];
+    view's angle to the steeper of the faces on both sides, infinite where what is seen may lie far behind. apex_m
+    [n, 2, 3]: third corners of the triangles on both sides, NaN where there are none. pupil [n, 2];
     colour, window, frame, part [n]: numbers of the wavelength, the window of the film, the frame and the part of the scene.
     """
 
@@ -48,6 +49,7 @@ class CurvePoints:
     aside_rad: Tensor
     near_rad: Tensor
     face_slope: Tensor
+    apex_m: Tensor
     pupil: Tensor
     colour: Tensor
     window: Tensor
@@ -114,7 +116,7 @@ def _in_view(view, curve, cameras, frames):
 
 
 def _on_pieces(view, curve, pieces, cameras, per_px, generator):
-    """Columns world_m .. frame, window of points on pieces of one curve."""
+    """Columns world_m .. window, frame of points on pieces of one curve."""
     piece, inside, fraction = places(pieces.length_px, per_px, generator)
     index = pieces.index[piece]
     low, high = pieces.bounds[piece].unbind(1)
@@ -139,7 +141,8 @@ def _on_pieces(view, curve, pieces, cameras, per_px, generator):
     slope = curve.face_slope(index, y, viewpoint)
     share = share * curve.counts(index, y, viewpoint)
     colour = (number + turn[1]) % view.colours
-    return y, on, share, aside, near, slope, pupil, colour, pieces.window[piece], frame
+    sides = aside, near, slope, curve.apex_m(index)
+    return y, on, share, *sides, pupil, colour, pieces.window[piece], frame
 
 
 def read_aside_rad(curve: Any, index: Tensor, y: Tensor, viewpoint: Tensor) -> tuple[Tensor, Tensor]:

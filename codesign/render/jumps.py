@@ -16,6 +16,7 @@ from codesign.pose import apply, inverse
 from codesign.render.camera import Camera
 from codesign.render.curve_points import IN_FRONT_M, NEARBY, CurvePoints
 from codesign.render.rays import coloured_rays
+from codesign.render.slivers import of_slivers
 from codesign.render.wavefront import look
 
 # px, of the film position for the derivative of a ray; the change up to which its root is taken as found, since the
@@ -80,12 +81,12 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
     if not rows.numel():
         return None
     points = points[rows]
-    row, y, x, per_px, slope, per_m, tangent, length, pixel = (
-        v[rows] for v in (row, y, x, per_px, slope, per_m, tangent, length, pixel)
+    row, y, on, x, per_px, slope, per_m, tangent, length, pixel = (
+        v[rows] for v in (row, y, on, x, per_px, slope, per_m, tangent, length, pixel)
     )
     normal = torch.stack([-tangent[:, 1], tangent[:, 0]], 1) / length[:, None]
     aside_px = points.aside_rad / _rad_per_px(y, per_px, slope, normal)
-    before, behind, seen = _sides(camera, scene, cameras, points, y, x, aside_px[:, None] * normal)
+    before, behind, seen = _sides(camera, scene, cameras, points, y, on, x, aside_px[:, None] * normal)
     return Jumps(
         row,
         points.world_m,
@@ -105,10 +106,9 @@ def jumps(camera: Camera, scene: Any, cameras: Tensor, points: CurvePoints) -> J
     )
 
 
-def _sides(camera, scene, cameras, points, y, x, aside):
-    """Radiances [n] before and behind points y [n, 3] of curves at film positions x [n, 2], ``aside`` [n, 2] px to
-    either side, and whether the points are seen [n]."""
-
+def _sides(camera, scene, cameras, points, y, on, x, aside):
+    """Radiances [n] before and behind points y [n, 3] of curves, which go on to ``on`` [n, 3], at film positions x [n, 2],
+    ``aside`` [n, 2] px to either side, and whether the points are seen [n]."""
     q, colour = (v.repeat(2, *[1] * (v.ndim - 1)) for v in (points.pupil, points.colour))
     origin, direction, weight = coloured_rays(camera, torch.cat([x - aside, x + aside]), q, colour)
     origin, direction, weight = (v.unflatten(0, (2, -1)) for v in (origin, direction, weight.detach()))
@@ -138,6 +138,9 @@ def _sides(camera, scene, cameras, points, y, x, aside):
         steepness = change.abs().amax(0) / (points.near_rad * reach)[rows]
         rounding[rows] *= 1 + steepness
     seen = nearest.amax(0) > reach - rounding
+    side, row, own = of_slivers(scene, cameras, points, y, on, origin.mean(0), direction)
+    light[side, row] = weight[side, row] * own
+    distance[side, row] = torch.minimum(distance[side, row], reach[row])
     # between two faces that are seen a ray may slip through, and tells of what lies behind them
     within = reach * (1 + SAFETY * points.near_rad * points.face_slope) + rounding
     return *light, seen & (distance.amax(0) <= within)

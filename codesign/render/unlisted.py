@@ -42,9 +42,7 @@ BEYOND = 0.3  # of a piece, by which it is searched beyond its ends
 STEP = 1e-4  # of a piece, for the direction of its curve
 TURNS = 4  # of the search along a piece
 GRAZING = 0.3  # sine of the angle between a line and a curve, at least
-UNLISTED = 0.05  # share of all jumps up to which a view is taken as listed
-# the same, of jumps that lie on two edges: a ball with a steep picture, rightly seen, has 0.017, a wrong world 0.03
-DOUBLED = 0.025
+WRONG = 0.05  # share of all jumps up to which a view is taken as listed
 DOUBTFUL = 0.005  # from which on a first look, of a few lines, is followed by a closer one
 
 
@@ -140,7 +138,7 @@ def _check_frames(camera, scene, curves, cameras, rows, start):
     for row, found in zip(rows, listings(camera, scene, curves, cameras[:, rows], lines), strict=True):
         if max(found.unlisted, found.doubled) > DOUBTFUL:  # a few crossings say little
             (found,) = listings(camera, scene, curves, cameras[:, row : row + 1], 8 * LINES)
-        if found.unlisted <= UNLISTED and found.doubled <= DOUBLED:
+        if max(found.unlisted, found.doubled) <= WRONG:
             continue
         share, what = max(
             (found.unlisted, "lie on no edge or outline that the scene lists"),
@@ -288,12 +286,13 @@ def _listed(camera, scene, curves, cameras, found):
                 share = torch.ones(len(ray), dtype=torch.float64)
                 aside, near = read_aside_rad(curve, index, y, o[ray])
                 slope = curve.face_slope(index, y, o[ray])
+                apex = curve.apex_m(index)
                 numbers = (torch.full_like(ray, number) for number in (frame, part))
-                columns.append((ray, y, ahead, share, aside, near, slope, *numbers))
+                columns.append((ray, y, ahead, share, aside, near, slope, apex, *numbers))
     total = torch.zeros_like(found.change)
     read = None
     if columns:
-        ray, y, ahead, share, aside, near, slope, frame, part = (
+        ray, y, ahead, share, aside, near, slope, apex, frame, part = (
             torch.cat(v) for v in zip(*columns, strict=True)
         )
         points = CurvePoints(
@@ -303,6 +302,7 @@ def _listed(camera, scene, curves, cameras, found):
             aside,
             near,
             slope,
+            apex,
             found.pupil[ray],
             torch.zeros_like(ray),
             found.window[ray],

@@ -84,6 +84,23 @@ def test_an_edge_counts_with_the_light_that_passes_the_apertures():
     assert sideways(camera, scene) == pytest.approx(truth, rel=1e-2)
 
 
+@pytest.mark.parametrize(
+    ("sliver_rad", "until_m"), [(1e-7, 2.01), (1e-6, 2.01), (1e-5, 2.01), (1e-5, 2.5), (1e-4, 2.5)]
+)
+def test_edges_of_a_face_seen_nearly_edge_on_tell_of_one_jump_together(sliver_rad, until_m):
+    """A card on whose right edge a brighter face goes on into the depth, so that all but nothing is seen of it: where its
+    two edges lie side by side on the film they move by their own depths."""
+    corners = np.array([[-5.0, -0.3, 2], [0.2, -0.3, 2], [0.2, 0.3, 2], [-5, 0.3, 2]])
+    deeper = corners[1:3] * until_m / 2 + np.array([until_m * sliver_rad, 0, 0])
+    vertices = np.concatenate([corners, deeper])
+    faces = np.array([[0, 2, 1], [0, 3, 2], [1, 2, 5], [1, 5, 4]])
+    light = np.array([RADIANCE, RADIANCE, 240.0, 240.0])
+    scene = MitsubaScene({"card": emissive_mesh(backend.mitsuba(), vertices, faces, light)}, merge=False)
+    camera = render.Camera(Pinhole(11.0), 40, 40, 0.25, 1)
+    truth = -((RADIANCE - 240.0) * 44 / 2 + 240.0 * 44 / until_m) * 0.6 * 44 / 2
+    assert sideways(camera, scene) == pytest.approx(truth, rel=1e-3)
+
+
 def test_points_are_found_on_the_film_through_their_own_point_of_the_pupil(generator):
     """Against the projection of points through the same pupil points, and its differences."""
     camera = render.Camera(lens.load("cooke-triplet"), 240, 180, 0.1, 1)
@@ -94,7 +111,8 @@ def test_points_are_found_on_the_film_through_their_own_point_of_the_pupil(gener
     pupil = 1.2 * (torch.rand(count, 2, generator=generator, dtype=F64) - 0.5)
     none = torch.zeros(count, dtype=torch.long)
     asks = torch.zeros(count, dtype=F64)
-    points = CurvePoints(y, y, asks, asks, asks, asks > 0, pupil, none, none, none, none)
+    apex = torch.full((count, 2, 3), torch.nan, dtype=F64)
+    points = CurvePoints(y, y, asks, asks, asks, asks > 0, apex, pupil, none, none, none, none)
     with torch.no_grad():
         at, per_px, _, passes = _on_film(camera, y, points)
         assert bool(passes.all())

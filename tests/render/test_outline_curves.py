@@ -172,7 +172,8 @@ def test_float32_rays_find_straight_edges_within_the_reading_angle(offset_m, dis
         mesh = emissive_mesh(mi, corners, np.array([[0, 1, 2]]), np.ones(1))
         scene = mi.load_dict({"type": "scene", "triangle": mesh})
         start, end = torch.tensor(corners[:1]), torch.tensor(corners[1:2])
-        curve = Segments(start, end, torch.zeros(1, 2, 3, dtype=F64), always, torch.zeros(1, dtype=F64))
+        none = torch.zeros(1, 2, 3, dtype=F64)
+        curve = Segments(start, end, none, always, torch.zeros(1, dtype=F64), none)
         place = corners[0] + rng.uniform(0.1, 0.9, (64, 1)) * (corners[1] - corners[0])
         eyes = place + distance_m * _units(rng, 64)
         along = (place - eyes) / distance_m

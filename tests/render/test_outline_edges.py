@@ -34,9 +34,7 @@ def tube(sides=64):
 
 def silhouettes(edges, eye):
     """Edges of a list that are outlines from the eye and not from every side."""
-    curve = Segments(
-        *(torch.tensor(v) for v in (edges.start, edges.end, edges.normals, edges.always, edges.width_m))
-    )
+    curve = Segments.of(edges)
     index, _ = curve.pieces(torch.tensor(eye, dtype=F64), 10.0)
     return int((~curve.always[index]).sum())
 
@@ -60,8 +58,7 @@ def test_faces_wound_against_their_neighbour_part_light_from_black():
 
 def test_edges_whose_faces_both_turn_away_are_black_on_both_sides():
     edges = mesh_edges(CORNERS, CUBE)
-    columns = (edges.start, edges.end, edges.normals, edges.always, edges.width_m)
-    curve = Segments(*(torch.tensor(v) for v in columns))
+    curve = Segments.of(edges)
     index, _ = curve.pieces(torch.tensor([3.0, 4.0, 5.0], dtype=F64), 10.0)
     assert len(index) == 9  # the three that meet in the far corner are not seen
     middle = (curve.start[index] + curve.end[index]) / 2
@@ -73,10 +70,7 @@ def test_edges_whose_faces_both_turn_away_are_black_on_both_sides():
     edges = mesh_edges(
         CORNERS, CUBE[:2]
     )  # a square at x = 0, its normal along -x: black from here, and in the way
-    columns = (edges.start, edges.end, edges.normals, edges.always, edges.width_m)
-    index, _ = Segments(*(torch.tensor(v) for v in columns)).pieces(
-        torch.tensor([3.0, 4, 5], dtype=F64), 10.0
-    )
+    index, _ = Segments.of(edges).pieces(torch.tensor([3.0, 4, 5], dtype=F64), 10.0)
     assert len(index) == 4
 
 
@@ -179,9 +173,7 @@ def test_edges_that_count_as_one_are_read_from_beyond_both():
     edges = edges_once([lines([(0, 0, 0), (1, 0, 0)]), lines([(0, 6e-5, 0), (1, 6e-5, 0)])], 1e-4)
     assert len(edges) == 1
     assert float(edges.width_m[0]) == pytest.approx(6e-5, rel=1e-6)
-    curve = Segments(
-        *(torch.tensor(v) for v in (edges.start, edges.end, edges.normals, edges.always, edges.width_m))
-    )
+    curve = Segments.of(edges)
     eye = torch.tensor([0.5, 0.0, 2.0], dtype=F64)
     assert float(curve.aside_rad(torch.zeros(1).long(), eye)) > 1e-5 + 6e-5 / 2
 

@@ -42,7 +42,7 @@ def outlines(shapes: list[Shape]) -> list[Any]:
     found = []
     if any(map(len, edges)):
         once = edges_once(edges, apart_m)
-        found.append(Segments(*_tensors(once.start, once.end, once.normals, once.always, once.width_m)))
+        found.append(Segments.of(once))
     if rims:
         found.append(Circles(*_tensors(*rims_once(*_columns(rims), apart_m))))
     if balls:

@@ -15,7 +15,7 @@ end over that of the ray's point. Readings lie at twice that, never deeper in th
 where the edge itself may lie there (beyond some 2,000 radii) the curve is refused.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -45,18 +45,29 @@ class Curve:
         where both are seen: a reading from farther away than they lie has missed them. Infinite elsewhere."""
         return torch.full(index.shape, torch.inf, dtype=torch.float64)
 
+    def apex_m(self, index: Tensor) -> Tensor:
+        """Third corners [n, 2, 3] of the triangles on both sides of the curves ``index`` [n], NaN where there are none."""
+        return torch.full((*index.shape, 2, 3), torch.nan, dtype=torch.float64)
+
 
 @dataclass(frozen=True)
 class Segments(Curve):
     """Straight edges. start, end: [E, 3]. normals: [E, 2, 3] of the two faces, on the side that shines, 0 where
     none is known; always: [E] bool, True where it counts from every side but that from which both faces are black
-    (rims, seams, sharp creases). width_m: [E], how far apart edges lie that count as this one."""
+    (rims, seams, sharp creases). width_m: [E], how far apart edges lie that count as this one. apexes: [E, 2, 3], third
+    corners of the two faces, NaN for none."""
 
     start: Tensor
     end: Tensor
     normals: Tensor
     always: Tensor
     width_m: Tensor
+    apexes: Tensor
+
+    @classmethod
+    def of(cls, edges):
+        """Segments of Edges, arrays that are named as its own."""
+        return cls(*(torch.tensor(getattr(edges, field.name)) for field in fields(cls)))
 
     def pieces(self, viewpoint, angle, within_m=0.0):
         """Indices and parameters [n], [n, 2] of pieces that subtend at most ``angle`` from the viewpoint [3]
@@ -97,6 +108,10 @@ class Segments(Curve):
         """As for Curve, of creases."""
         facing = self._facing(index, viewpoint).amin(1) / (viewpoint - y).norm(dim=1)
         return torch.where(facing > 0, (1 - facing.square()).clamp_min(0).sqrt() / facing, torch.inf)
+
+    def apex_m(self, index):
+        """As for Curve."""
+        return self.apexes[index]
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ SHARP = 0.98
 class Edges:
     """start, end: [E, 3]. normals: [E, 2, 3] of the two faces, the side that shines. always: [E], True where an
     edge counts from every side. free: [E], True where not just two faces of one mesh meet. width_m: [E], how far
-    apart edges lie that count as this one."""
+    apart edges lie that count as this one. apexes: [E, 2, 3], third corners of the two faces, NaN for
+    none and where more than two meet."""
 
     start: np.ndarray
     end: np.ndarray
@@ -28,6 +29,7 @@ class Edges:
     always: np.ndarray
     free: np.ndarray
     width_m: np.ndarray
+    apexes: np.ndarray
 
     def __getitem__(self, rows):
         return Edges(*(getattr(self, f.name)[rows] for f in fields(self)))
@@ -50,7 +52,9 @@ def segments(start: np.ndarray, end: np.ndarray) -> Edges:
     """Edges from start to end [E, 3] that count from every side and belong to no mesh."""
     count = len(start)
     yes = np.ones(count, dtype=bool)
-    return Edges(start, end, np.zeros((count, 2, 3)), yes, yes, np.zeros(count))
+    return Edges(
+        start, end, np.zeros((count, 2, 3)), yes, yes, np.zeros(count), np.full((count, 2, 3), np.nan)
+    )
 
 
 def mesh_edges(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray | None = None) -> Edges:
@@ -96,7 +100,11 @@ def mesh_edges(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray | Non
     kept = np.nonzero(always | (cosine < FLAT))[0]
     start = vertices[faces[whole].reshape(-1)[one[kept]]]
     end = vertices[np.roll(faces[whole], -1, axis=1).reshape(-1)[one[kept]]]
-    return Edges(start, end, n[kept], always[kept], free[kept], np.zeros(len(kept)))
+    third = vertices[np.roll(faces[whole], -2, axis=1).reshape(-1)]
+    apexes = np.stack([third[one], third[other]], 1)
+    apexes[count != 2, 1] = np.nan
+    apexes[count > 2] = np.nan
+    return Edges(start, end, n[kept], always[kept], free[kept], np.zeros(len(kept)), apexes[kept])
 
 
 def _differ(values, one, other, forward):

@@ -50,7 +50,8 @@ def edges_once(parts: list[Edges], apart_m: float) -> Edges:
     width = np.where(count > 1, np.maximum(width, cut.width_m[first]), cut.width_m[first])
     merged = cut[first]
     normals = np.where((count > 1)[:, None, None], 0.0, merged.normals)
-    merged = replace(merged, normals=normals, width_m=width)
+    apexes = np.where((count > 1)[:, None, None], np.nan, merged.apexes)
+    merged = replace(merged, normals=normals, width_m=width, apexes=apexes)
     return joined([edges[~chosen], merged])
 
 
