@@ -79,8 +79,8 @@ def search_all(run, jobs, goal_um):
         run.save_state(
             {},
             {
-                "done": [dataclasses.asdict(o) for o in done],
-                "now": search.state() if (search := searches["now"]) else None,
+                "done": [dataclasses.asdict(o) for o in [*done, *ended(searches["now"])]],
+                "now": search.state() if (search := searches["now"]) and not search.outcome else None,
             },
         )
 
@@ -98,8 +98,8 @@ def search_all(run, jobs, goal_um):
                 entry = search.step()
                 search.seconds += time.monotonic() - began
                 progress.advance(loss=entry.loss)
-        outcome = search.outcome
-        done.append(dataclasses.replace(outcome, seconds=search.seconds))
+        (outcome,) = ended(search)
+        done.append(outcome)
         searches["now"] = None
         save()
         verdict = judge_outcome(outcome)
@@ -110,6 +110,11 @@ def search_all(run, jobs, goal_um):
             f"{outcome.attempts}"
         )
     return done
+
+
+def ended(search):
+    """The outcome of a search, in a list; an empty one before its last step."""
+    return [dataclasses.replace(search.outcome, seconds=search.seconds)] if search and search.outcome else []
 
 
 def judge_outcome(outcome):

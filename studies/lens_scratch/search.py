@@ -103,6 +103,9 @@ class Search:
         self.optimiser.resume(state["optimiser"])
         for name in ("steps", "evaluations", "seconds", "losses", "borders"):
             setattr(self, name, state[name])
+        taken = self.optimiser.history
+        if self.method != "adam" and taken and not taken[-1].accepted:
+            self.evaluations -= len(self.began)  # slopes behind a rejected step are found a second time
         return self
 
     def _begin_attempt(self):
