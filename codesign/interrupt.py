@@ -44,11 +44,12 @@ class Interruption:
     """Turns SIGINT and SIGTERM into a request that a loop answers at its next safe point.
 
     Outside a loop, and at the second signal, KeyboardInterrupt is raised at once and nothing is saved: what
-    was saved before still stands. ``exit_code`` is that of the signal (130, 143).
+    was saved before still stands. ``exit_code`` is that of the signal (130, 143); ``raised``: whether that error was,
+    which a library that is being loaded may turn into another.
     """
 
     def __init__(self):
-        self.requested = False
+        self.requested = self.raised = False
         self.in_loop = False
         self.exit_code = 128 + signal.SIGINT
         self.save: Callable[[], object] | None = None
@@ -75,6 +76,7 @@ class Interruption:
             return
         self.exit_code = 128 + signum
         if self.requested or not self.in_loop:
+            self.raised = True
             raise KeyboardInterrupt
         self.requested = True
         os.write(2, NOTICE)  # print is not safe in a signal handler

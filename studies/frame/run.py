@@ -16,6 +16,7 @@ A study is a function of a Run and a frozen dataclass:
 
 import contextlib
 import dataclasses
+import errno
 import hashlib
 import inspect
 import io
@@ -47,6 +48,8 @@ from studies.frame.progress import Pace, StepProgress
 
 __all__ = ["Run", "StudyConfig", "main", "open_run"]
 
+FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+NO_ROOM = "No usable temporary directory"  # of Python's, on a full disk
 RESERVED = ("versions", "hardware")
 VERSION = 2  # of the frame's part of state.npz
 TIMES = "times"  # of the frame itself, among the numbers of state.npz
@@ -294,10 +297,14 @@ def main(study: Callable[[Run[Config]], None], kind: type[Config], arguments: li
     except CodesignError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except (Exception, KeyboardInterrupt) as error:
+        full = isinstance(error, OSError) and (error.errno in FULL or NO_ROOM in str(error))
+        if not (full or interruption.raised or isinstance(error, KeyboardInterrupt)):
+            raise
         again = f"; go on with: {resume_command(name, run.folder)}" if run else ""
-        print(f"interrupted{again}", file=sys.stderr)
-        return interruption.exit_code
+        # what a signal breaks off while a library loads is an error of that library's
+        print(f"error: the disk is full{again}" if full else f"interrupted{again}", file=sys.stderr)
+        return 2 if full else interruption.exit_code
     return 0
 
 

@@ -1,6 +1,8 @@
 """The frame of a study: exact state, interruption and resumption, refusals, metrics, a page that loads
 nothing."""
 
+import contextlib
+import errno
 import json
 import os
 import re
@@ -287,6 +289,30 @@ def test_the_state_of_another_run_is_refused(tmp_path):
     write_state(mine / "state.npz", {}, {"numbers": {}, "times": {"seconds": 0.0, "loops": {}}})
     with pytest.raises(FileFormatError, match=r"another version .*start a new run"):
         resumed(mine)
+
+
+@pytest.mark.parametrize(
+    ("error", "number", "code", "sentence"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), None, 2, "error: the disk is full"),
+        (ImportError("while a library was loaded"), signal.SIGTERM, 143, "interrupted"),
+        (ImportError("while a library was loaded"), None, None, ""),
+    ],
+)
+def test_what_libraries_make_of_a_full_disk_or_a_signal(tmp_path, capsys, error, number, code, sentence):
+    def study(run):
+        if number:
+            with contextlib.suppress(KeyboardInterrupt):
+                signal.raise_signal(number)
+        raise error
+
+    study.__module__ = __name__
+    if code is None:
+        with pytest.raises(ImportError):
+            main(study, Config, ["--out", str(tmp_path / "out")])
+        return
+    assert main(study, Config, ["--out", str(tmp_path / "out")]) == code
+    assert capsys.readouterr().err.startswith(f"{sentence}; go on with: python -m studies.test_run --resume")
 
 
 def test_second_interrupt_ends_at_once(run):
