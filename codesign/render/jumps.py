@@ -139,6 +139,8 @@ def _sides(camera, scene, cameras, points, y, on, x, aside):
         rounding[rows] *= 1 + steepness
     seen = nearest.amax(0) > reach - rounding
     side, row, own = of_slivers(scene, cameras, points, y, on, origin.mean(0), direction)
+    differ = light[0, row] != light[1, row]  # what is narrower than a reading as a whole is left alone
+    side, row, own = side[differ], row[differ], own[differ]
     light[side, row] = weight[side, row] * own
     distance[side, row] = torch.minimum(distance[side, row], reach[row])
     # between two faces that are seen a ray may slip through, and tells of what lies behind them
