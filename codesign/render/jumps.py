@@ -27,6 +27,7 @@ TURNS = 6
 DOUBTFUL = 0.05  # share of the distance by which a slanting surface may come nearer beside its edge
 ROUNDING = 2.0**-21  # of float32 distances, four units in the last place
 SAFETY = 2.0
+SAME = 0.05  # share of the contrast of a sliver by which what is seen beyond it may differ from what is before it
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,8 @@ def _sides(camera, scene, cameras, points, y, on, x, aside):
         rounding[rows] *= 1 + steepness
     seen = nearest.amax(0) > reach - rounding
     side, row, own = of_slivers(scene, cameras, points, y, on, origin.mean(0), direction)
-    differ = light[0, row] != light[1, row]  # what is narrower than a reading as a whole is left alone
+    # what is narrower than a reading as a whole is left alone: nearly the same is seen on both its sides
+    differ = (light[0, row] - light[1, row]).abs() > SAME * (own - light[side, row]).abs()
     side, row, own = side[differ], row[differ], own[differ]
     light[side, row] = weight[side, row] * own
     distance[side, row] = torch.minimum(distance[side, row], reach[row])

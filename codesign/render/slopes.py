@@ -33,7 +33,10 @@ def with_slopes(shown: Callable[..., Any]) -> Callable[..., Any]:
             light, normal = shown(origin, direction, *others)
             if dr.grad_enabled(light):
                 dr.backward(light)
-            return dr.detach(light), dr.detach(normal), dr.grad(origin), dr.grad(direction)
+            slopes = dr.grad(origin), dr.grad(direction)
+            # a ray that touches a round shape, or meets a pole of its picture, has no slope: one in some millions
+            told = dr.all(dr.isfinite(slopes[0])) & dr.all(dr.isfinite(slopes[1])) | ~dr.isfinite(light)
+            return dr.detach(light), dr.detach(normal), *(dr.select(told, slope, 0) for slope in slopes)
 
     return sloped
 

@@ -299,7 +299,8 @@ def main(study: Callable[[Run[Config]], None], kind: type[Config], arguments: li
         return 2
     except (Exception, KeyboardInterrupt) as error:
         full = isinstance(error, OSError) and (error.errno in FULL or NO_ROOM in str(error))
-        if not (full or interruption.raised or isinstance(error, KeyboardInterrupt)):
+        broken_off = isinstance(error, ImportError | NameError) and interruption.raised
+        if not (full or broken_off or isinstance(error, KeyboardInterrupt)):
             raise
         again = f"; go on with: {resume_command(name, run.folder)}" if run else ""
         # what a signal breaks off while a library loads is an error of that library's

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import ConvexHull
 
 from codesign import backend, lens, pose, render
 from codesign.lens import GeoLens, Glass, Pinhole, Surface
@@ -99,6 +100,34 @@ def test_edges_of_a_face_seen_nearly_edge_on_tell_of_one_jump_together(sliver_ra
     camera = render.Camera(Pinhole(11.0), 40, 40, 0.25, 1)
     truth = -((RADIANCE - 240.0) * 44 / 2 + 240.0 * 44 / until_m) * 0.6 * 44 / 2
     assert sideways(camera, scene) == pytest.approx(truth, rel=1e-3)
+
+
+@pytest.mark.parametrize("thick_m", [1e-7, 1e-6])
+def test_a_plate_narrower_than_a_reading_changes_nothing_before_a_picture(thick_m):
+    """Its two sides tell of faces of their own, whose jumps would not cancel."""
+    mi = backend.mitsuba()
+    picture = mi.Bitmap(np.linspace(40, 60, 64 * 64 * 3).reshape(64, 64, 3).astype("f"))
+    radiance = {"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": "clamp"}
+    place = mi.ScalarTransform4f().translate([0, 0, 4]).rotate([0, 1, 0], 180).scale(5)
+    wall = {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": radiance}}
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.3, 0.3) for z in (2, 2.6)])
+    vertices = corners * [thick_m, 1, 1]
+    faces = ConvexHull(corners).simplices
+    inward = (
+        np.einsum(
+            "ni,ni->n",
+            np.cross(*np.diff(corners[faces], axis=1).transpose(1, 0, 2)),
+            corners[faces].mean(1) - corners.mean(0),
+        )
+        < 0
+    )
+    faces = np.where(inward[:, None], faces[:, ::-1], faces)
+    plate = emissive_mesh(mi, vertices, faces, np.linspace(20, 200, len(faces)))
+    camera = render.Camera(Pinhole(11.0), 40, 40, 0.25, 4)
+    bare = sideways(camera, MitsubaScene({"wall": wall}))
+    assert sideways(camera, MitsubaScene({"wall": wall, "plate": plate}, merge=False)) == pytest.approx(
+        bare, rel=1e-3
+    )
 
 
 def test_points_are_found_on_the_film_through_their_own_point_of_the_pupil(generator):

@@ -109,3 +109,20 @@ def test_box_around_a_scene_takes_no_ray_from_it(shape, generator):
     assert torch.equal(light, again)
     assert torch.equal(distance, same)
     assert 0.05 < float((light == 7.0).double().mean()) < 0.95
+
+
+def test_a_ray_without_a_slope_counts_none_and_leaves_the_others_theirs():
+    """As one that touches a ball: infinite slopes of roots against each other."""
+    import drjit as dr
+    from drjit.llvm.ad import Array3f, Float
+
+    def shown(origin, direction):
+        return 2 * direction.y + dr.sqrt(origin.x) - dr.sqrt(origin.x), Array3f(0, 0, 1)
+
+    with dr.suspend_grad():
+        light, _, to_origin, to_direction = slopes.with_slopes(shown)(
+            Array3f(Float([0, 1]), 0, 0), Array3f(0, Float([3, 4]), 1)
+        )
+    assert light.numpy().tolist() == [6, 8]
+    assert to_origin.numpy().tolist() == [[0, 0], [0, 0], [0, 0]]
+    assert to_direction.numpy().tolist() == [[0, 0], [0, 2], [0, 0]]

@@ -21,11 +21,15 @@ def new_hdf5(path: str | Path, **options: Any) -> Iterator[Any]:
         OSError: when the block ends, if something could not be written. HDF5 itself ends the process where it fails
             while it closes a file, so it is not told.
     """
-    with _Disk(path, "w+") as disk:
-        with h5py.File(disk, "w", **options) as file:
-            yield file
-        if disk.failure:
-            raise disk.failure
+    with h5py.File(path, "w"):  # HDF5 refuses a file that somebody reads
+        pass
+    with _Disk(path, "r+") as disk:
+        try:
+            with h5py.File(disk, "w", **options) as file:
+                yield file
+        finally:
+            if disk.failure:
+                raise disk.failure
 
 
 class _Disk(io.FileIO):
