@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TypeAlias, get_args, get_origin, get_type_hints
 
 from codesign import plain_yaml
-from codesign.errors import CodesignError, DomainError, as_number
+from codesign.errors import CodesignError, DomainError, as_number, shown
 from codesign.reading import read_text, reading
 from scenes import robot_pair
 from scenes.robot_pairs import PAIRS
@@ -179,7 +179,7 @@ class OwnRobot:
                 )
         for name, known in (("velocities", VELOCITIES), ("depth", DEPTHS)):
             if getattr(self, name) not in (None, *known):
-                raise DomainError(f"{name} is '{getattr(self, name)}'; give {' or '.join(known)}.")
+                raise DomainError(f"{name} is {shown(getattr(self, name))}; give {' or '.join(known)}.")
         for name, of in (("unit_m", self.robot), ("world_unit_m", self.world)):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
@@ -227,7 +227,9 @@ def _filled(kind, page, entry):
     kinds = get_type_hints(kind)
     where = f"{entry}." if entry else ""
     if not isinstance(page, Mapping):
-        raise DomainError(f"{entry} is {page!r}; write {', '.join(kinds)} below it, indented by two spaces.")
+        raise DomainError(
+            f"{entry} is {shown(page)}; write {', '.join(kinds)} below it, indented by two spaces."
+        )
     for name in page:
         if name not in kinds:
             near = difflib.get_close_matches(name, kinds, n=1)
@@ -245,7 +247,9 @@ def _value(kind, given, entry):
     parts = get_args(kind)
     if get_origin(kind) is dict:
         if not isinstance(given, Mapping):
-            raise DomainError(f"{entry} is {given!r}; write name: value below it, indented by two spaces.")
+            raise DomainError(
+                f"{entry} is {shown(given)}; write name: value below it, indented by two spaces."
+            )
         return {name: _value(parts[1], each, f"{entry}.{name}") for name, each in given.items()}
     if type(None) in parts:
         return None if given is None else _value(parts[0], given, entry)
@@ -253,14 +257,14 @@ def _value(kind, given, entry):
         return _filled(kind, given, entry)
     if kind is str:
         if not isinstance(given, str) or not given:
-            raise DomainError(f"{entry} is {given!r}; give text.")
+            raise DomainError(f"{entry} is {shown(given)}; give text.")
         return given
     if kind is float:
         if isinstance(given, bool) or not math.isfinite(as_number(given, entry)):
-            raise DomainError(f"{entry} is {given!r}; give a finite number.")
+            raise DomainError(f"{entry} is {shown(given)}; give a finite number.")
         return float(given)
     if not isinstance(given, list) or (parts[-1] is not ... and len(given) != len(parts)):
         raise DomainError(
-            f"{entry} is {given!r}; give a list of {'texts' if ... in parts else len(parts)}, in [ ]."
+            f"{entry} is {shown(given)}; give a list of {'texts' if ... in parts else len(parts)}, in [ ]."
         )
     return tuple(_value(parts[0], each, entry) for each in given)

@@ -143,7 +143,7 @@ def _model(path):
             model = yourdfpy.URDF.load(io.BytesIO(data), load_meshes=False)
         wrong = _no_tree(model) or _wrong_joint(model.robot.joints) or _wrong_shape(model.robot.links)
     if wrong:
-        raise FileFormatError(f"robot '{path}' cannot be built: {wrong}; correct it.")
+        raise FileFormatError(f"robot '{path}' cannot be built: {wrong[:300]}; correct it.")
     return model
 
 

@@ -29,6 +29,7 @@ PHOTOS = (
 )
 LIFT = 2.0  # the darkest radiance of a photograph: no real wall is perfectly black
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue: ITU-R BT.709
+MOST_PIXELS = 32_000_000
 HDR = (".hdr", ".exr")
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "GIF", "PPM", "TGA", "WEBP")
 MOST_BYTES = 1 << 30
@@ -74,6 +75,11 @@ def decoded(data: bytes, what: str) -> np.ndarray:
     with reading(what, "it is no whole picture; convert it to PNG"), warnings.catch_warnings():
         warnings.simplefilter("error", PIL.Image.DecompressionBombWarning)
         with PIL.Image.open(io.BytesIO(data), formats=FORMATS) as image:
+            if image.width * image.height > MOST_PIXELS:
+                raise FileFormatError(
+                    f"{what} has {image.width} x {image.height} pixels; at most {MOST_PIXELS / 1e6:.0f} million are read, "
+                    "make it smaller."
+                )
             return stored_values(image)
 
 
@@ -88,10 +94,19 @@ def stored_values(image: PIL.Image.Image) -> np.ndarray:
 def linear(stored: np.ndarray) -> np.ndarray:
     """Linear luminance 0..1, [H, W] float64, of values coded by the sRGB gamma: [H, W] or [H, W, 3], whole numbers
     or 0..1."""
-    scale = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1.0
-    values = np.asarray(stored, dtype=np.float64) / scale
-    light = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
-    return luminance(light)
+    if stored.dtype.kind != "u" or stored.dtype.itemsize > 2:
+        scale = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1.0
+        return luminance(_light(np.asarray(stored, dtype=np.float64) / scale))
+    level = _light(np.arange(np.iinfo(stored.dtype).max + 1) / np.iinfo(stored.dtype).max)
+    if stored.ndim < 3 or stored.shape[2] < 3:
+        return luminance(level[stored])
+    # colour by colour: a picture of 45 megapixels takes a gigabyte at once
+    return sum(share * level[stored[..., colour]] for colour, share in enumerate(LUMINANCE))
+
+
+def _light(values):
+    """Linear light of values 0..1 coded by the sRGB gamma. Source: IEC 61966-2-1."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
 def luminance(values: np.ndarray) -> np.ndarray:
