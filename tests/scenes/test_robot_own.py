@@ -256,7 +256,7 @@ FAULTS = {
     "no number": (PAGE + "  yaw_deg: left", "start.yaw_deg = 'left' is no number"),
     "truth": (PAGE + "  yaw_deg: true", "start.yaw_deg is True; give a finite number"),
     "two numbers": (PAGE.replace("[0.24, -0.1, 0.25]", "[0.24, 0.25]"), r"camera.low_m is \[0.24, 0.25\]; give a list of 3"),
-    "yaml": (PAGE + "without: {a: 1}", "line 8"),
+    "yaml": (PAGE + "require: [1, 2", r"yaml, line \d+"),
     "no file": (PAGE.replace("box.obj", "bux.obj"), "robot: there is no file '.*bux.obj'"),
     "kind": (PAGE.replace("box.obj", "notes.txt"), "robot: '.*notes.txt' is of no kind .* give .urdf, .obj"),
     "no world": (PAGE + "world: none.obj", "world: there is no file"),

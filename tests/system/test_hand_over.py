@@ -131,7 +131,7 @@ def test_a_transform_alone_is_a_held_mount(tmp_path, generator):
     ("old", "new", "sentence"),
     [
         ("  translation_m:\n    x: 0.", "  translation_m:\n    x: 7.", "apart; take out that section"),
-        ('format: "codesign mount 1"', "format: other", "no line 'format"),
+        ("format: codesign mount 1", "format: other", "no line 'format"),
         ("    w: 0.", "    w: 1.", "quaternion has length"),
         ("camera:", "lens_of_old:", "entry 'camera' is missing"),
         ("  theta_on:", "  theta_of:", "save_hand_over wrote"),
