@@ -17,7 +17,6 @@ GROUPS = {
         "lens_scratch",
         "lens_tolerance",
         "phase_plate",
-        "lens_accuracy",
         "lens_files",
         "lens_bench",
         "benchmark",
