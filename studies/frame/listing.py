@@ -61,7 +61,6 @@ GROUPS = {
         "robot_gates",
         "placement_step",
         "gradient_flow",
-        "certify_precision",
         "speed_error",
         "stability",
         "chain_picture",
