@@ -22,7 +22,6 @@ GROUPS = {
         "benchmark",
     ),
     "render": (
-        "render_truth",
         "render_quality",
         "psf_level",
         "silhouettes",
