@@ -30,7 +30,6 @@ MITSUBA = {
     "codesign.render": "makes pictures with it",
     "scenes": "describe worlds to it",
     "studies.render_quality": "compares with its sensors",
-    "studies.foreign_scenes": "compares with its sensors",
 }
 
 

@@ -27,7 +27,6 @@ GROUPS = {
         "silhouettes",
         "silhouettes_chain",
         "light_levels",
-        "foreign_scenes",
         "robot_view",
         "make_dataset",
     ),
