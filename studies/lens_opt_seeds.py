@@ -1,7 +1,4 @@
-"""lens_opt over several detunings: does the flow design beat its rivals every time? Its losses are shown too.
-
-With --scan, instead, which step size suits each gradient objective, by development cases.
-"""
+"""lens_opt over several detunings: does the flow design beat its rivals every time? Its losses are shown too."""
 
 import dataclasses
 import sys
@@ -16,7 +13,6 @@ from studies.frame.run import Run, StudyConfig, main, open_run
 from studies.lens_opt import __main__ as lens_opt
 from studies.lens_opt.comparison import DESIGNS, RIVALS, label
 from studies.lens_opt.paired import log_ratios, of_differences, pooled, verdict
-from studies.lens_opt.scan import scan
 
 COMPARED = ("refocused", "spots", "edge")
 
@@ -28,17 +24,12 @@ class Config(StudyConfig):
     """Seeds of the detuning and of the training cases."""
     lens: str = "cooke-triplet"
     """Lens to start from."""
-    scan: bool = False
-    """Compare step sizes of both objectives on development cases, and nothing else."""
 
 
 def study(run: Run[Config]):
     config = run.config
     if not config.seeds or len(set(config.seeds)) < len(config.seeds):
         raise DomainError(f"seeds {config.seeds}: give at least one seed, and none twice.")
-    if config.scan:
-        _scan(run)
-        return
     parts = {}
     for seed in config.seeds:
         run.say(f"seed {seed}")
@@ -123,26 +114,6 @@ def _errors(part):
     """Flow errors of every lens of a finished run on its held-out cases, by name."""
     found = part.load_state().numbers["found"]
     return {name: [row["flow_error_mrad"] for row in rows] for name, rows in found.items()}
-
-
-def _scan(run):
-    config = run.config
-    configs = [
-        configured(lens_opt.Config, config.quick, seed=seed, lens=config.lens) for seed in config.seeds
-    ]
-    rows = scan(run, configs)
-    for objective, size, *_, mean in rows:
-        run.record(**{f"{objective}_step_{size:g}_error_mrad".replace(".", "_"): mean})
-    run.table(
-        "Step sizes on development cases (mrad)",
-        ["objective", "step size", *(f"seed {s}" for s in config.seeds), "mean"],
-        rows,
-    )
-    run.finish(
-        "Step sizes of the gradient objectives",
-        "Geometric mean hard flow error on development cases after a default run's steps; the defaults of lens_opt are "
-        "the least of each objective.",
-    )
 
 
 if __name__ == "__main__":

@@ -29,9 +29,7 @@ DOOR = "codesign"  # the package itself, which names its rooms and imports them 
 MITSUBA = {
     "codesign.render": "makes pictures with it",
     "scenes": "describe worlds to it",
-    "studies.render_truth": "compares with its sensors",
     "studies.render_quality": "compares with its sensors",
-    "studies.foreign_scenes": "compares with its sensors",
 }
 
 

@@ -141,7 +141,7 @@ def settings(run, course):
         f"camera's own light by damped least squares, from {config.spot_starts} starts. Both choose among the settings "
         f"below by the geometric mean flow error on {config.developed} development cases, of other textures than those "
         "optimised on and those judged on. The other gradient objective runs from the same start, for as many steps, "
-        "with a clip and a step size of its own, which `lens_opt_seeds --scan` compares on development cases.",
+        "with a clip and a step size of its own, the best of a few on development cases.",
     )
     for name, rows in course.choices.items():
         least = min(rows, key=lambda row: row["error_mrad"])

@@ -26,6 +26,7 @@ STAGES = {
     "adam": (Stage(1.0, 1.0, LINES, 1000),),
 }
 ATTEMPTS = {"curriculum": 3, "direct": 3, "adam": 1}  # draws of a start until one succeeds
+NUMBERS = ("steps", "evaluations", "seconds", "losses")  # of a search, which outlive its stages
 LOSS_CHANGE = 1e-6  # a stage ends when a step gains less than this share
 ADAM_STEP = 1.0  # residual units (0.01 mm RMS) per step
 ADAM_LIMIT = torch.tensor(
@@ -35,8 +36,8 @@ ADAM_LIMIT = torch.tensor(
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a search found. losses: half the sum of squared residuals before each step of the last attempt;
-    borders: steps at which its stages began."""
+    """What a search found. losses: half the sum of squared residuals before each step of the last
+    attempt."""
 
     method: str
     seed: int
@@ -47,7 +48,6 @@ class Outcome:
     evaluations: int
     seconds: float
     losses: list[float]
-    borders: list[int]
 
 
 class Search:
@@ -85,13 +85,7 @@ class Search:
     def state(self):
         """Numbers and lists for a state file."""
         return {
-            "attempt": self.attempt,
-            "stage": self.stage,
-            "steps": self.steps,
-            "evaluations": self.evaluations,
-            "seconds": self.seconds,
-            "losses": self.losses,
-            "borders": self.borders,
+            **{name: getattr(self, name) for name in ("attempt", "stage", *NUMBERS)},
             "began": self.began.tolist(),
             "optimiser": self.optimiser.state(),
         }
@@ -101,7 +95,7 @@ class Search:
         self.attempt = state["attempt"]
         self._begin_stage(state["stage"], torch.tensor(state["began"], dtype=torch.float64))
         self.optimiser.resume(state["optimiser"])
-        for name in ("steps", "evaluations", "seconds", "losses", "borders"):
+        for name in NUMBERS:
             setattr(self, name, state[name])
         taken = self.optimiser.history
         if self.method != "adam" and taken and not taken[-1].accepted:
@@ -110,13 +104,11 @@ class Search:
 
     def _begin_attempt(self):
         self.losses = []
-        self.borders = []
         self._begin_stage(0, draw_start(torch.Generator().manual_seed(1000 * self.seed + self.attempt)))
 
     def _begin_stage(self, stage, variables):
         self.stage = stage
         self.began = variables
-        self.borders.append(len(self.losses))
         plain = residuals_of(self.stages[stage])
 
         def residuals(at):
@@ -148,15 +140,6 @@ class Search:
         if not succeeded and self.attempt < ATTEMPTS[self.method]:
             self._begin_attempt()
             return
-        self.outcome = Outcome(
-            self.method,
-            self.seed,
-            self._variables().tolist(),
-            succeeded,
-            self.attempt,
-            self.steps,
-            self.evaluations,
-            self.seconds,
-            self.losses,
-            self.borders,
-        )
+        numbers = {name: getattr(self, name) for name in NUMBERS}
+        variables = self._variables().tolist()
+        self.outcome = Outcome(self.method, self.seed, variables, succeeded, self.attempt, **numbers)

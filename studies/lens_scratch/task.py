@@ -22,10 +22,8 @@ STOP = 3  # the rear of the middle element, as in the published lens
 LINES = ("F", "d", "C")
 JUDGED_FIELDS = (0.0, 0.7 * HALF_FIELD, HALF_FIELD)
 SPOT_UNIT_MM = 0.01  # an RMS spot of this size makes a residual of 1
-VARIABLES = 11  # five curvatures (the sixth holds the focal length), five thicknesses, defocus
-STEPS = torch.tensor(
-    [1e-7] * 5 + [1e-5] * 6, dtype=torch.float64
-)  # differences: rays move by some 1e-5 mm, with 1e-15 mm rounding
+# of differences: rays move by some 1e-5 mm, with 1e-15 mm rounding
+STEPS = torch.tensor([1e-7] * 5 + [1e-5] * 6, dtype=torch.float64)
 LIMITS = Limits(
     glass_centre_mm=1.0,
     glass_centre_most_mm=8.0,
@@ -37,6 +35,8 @@ LIMITS = Limits(
 )
 JUDGED_LIMITS = dataclasses.replace(LIMITS, incidence_deg=60.0, rays=True, fields_rad=JUDGED_FIELDS)
 SPARE_MM = 0.05  # a penalty gives way a little, so the optimiser holds limits that are tighter by this much
+LEAST = ("glass_centre_mm", "glass_edge_mm", "air_gap_mm", "back_focus_mm")
+MOST = ("glass_centre_most_mm", "track_mm")
 CONSTRAINT_WEIGHT = 3.0
 HALF_PUPIL = pupil_grid(8)[pupil_grid(8)[:, 0] > 0]  # the other half is its mirror image
 
@@ -108,20 +108,9 @@ def residuals_of(stage, fields=4):
     """
     angles = [stage.field * HALF_FIELD * k / (fields - 1) for k in range(fields)]
     pupil = HALF_PUPIL * stage.aperture
-    tight = dataclasses.replace(
-        LIMITS,
-        **{
-            name: getattr(LIMITS, name) + SPARE_MM * sign
-            for name, sign in (
-                ("glass_centre_mm", 1),
-                ("glass_centre_most_mm", -1),
-                ("glass_edge_mm", 1),
-                ("air_gap_mm", 1),
-                ("track_mm", -1),
-                ("back_focus_mm", 1),
-            )
-        },
-    )
+    least = {name: getattr(LIMITS, name) + SPARE_MM for name in LEAST}
+    most = {name: getattr(LIMITS, name) - SPARE_MM for name in MOST}
+    tight = dataclasses.replace(LIMITS, **least, **most)
 
     def residuals(variables):
         try:

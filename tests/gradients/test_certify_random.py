@@ -142,3 +142,26 @@ def test_no_right_gradient_fails_and_no_wrong_one_passes(name):
     # and it decides, where double precision has the digits
     assert verdicts[D, "pass"] >= 0.7 * len(SEEDS)
     assert verdicts["wrong", "fail"] >= 0.9 * (verdicts["wrong", "fail"] + verdicts["wrong", "noise"])
+
+
+IMAGES = {
+    "logarithms": lambda x: (x + 1).log().square().sum(),
+    "logsumexp": lambda x: (5 * x).flatten().logsumexp(0),
+    "steps of log brightness": lambda x: (x + 0.1).log().diff(dim=-1).square().sum(),
+}
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_of_images_in_four_directions_every_right_gradient_passes_and_every_wrong_one_fails(name):
+    """4,096 pixels in both precisions; wrong is 30 % too long, too short or turned."""
+    fn = IMAGES[name]
+    for seed in range(4):
+        for dtype in (torch.float32, D):
+            of = Draw(seed)
+            x = of.uniform(64, 64).to(dtype)
+            grad = grad_of(fn, x)
+            noise = (of.uniform(64, 64) - 0.5).to(dtype)
+            turned = noise - (noise * grad).sum() / grad.square().sum() * grad
+            wrong = (0.3 * grad, -0.3 * grad, 0.3 * turned * grad.norm() / turned.norm())[seed % 3]
+            assert judged(fn, x, 0 * grad).verdict == "pass", (seed, dtype)
+            assert judged(fn, x, wrong).verdict == "fail", (seed, dtype)

@@ -12,8 +12,8 @@ from codesign.errors import DomainError
 from codesign.pose import look_at
 from codesign.render import Camera, Film, TexturedPlane, angular_miss_rad, project
 from scenes import worlds
-from studies.render_truth import OPTICS as FITTED
-from studies.render_truth import PITCH_MM, SENSOR_PX, fitted
+from tests.render.fitted_lenses import OPTICS as FITTED
+from tests.render.fitted_lenses import PITCH_MM, SENSOR_PX, fitted
 
 D = torch.float64
 NAMES = ["cooke-triplet", "double-gauss", "la1509"]

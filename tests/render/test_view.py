@@ -21,7 +21,7 @@ from codesign.render import (
     view,
 )
 from scenes import textures, worlds
-from studies.render_truth import OPTICS, PITCH_MM, SENSOR_PX
+from tests.render.fitted_lenses import OPTICS, PITCH_MM, SENSOR_PX
 
 D = torch.float64
 

@@ -8,7 +8,6 @@ import pytest
 
 from studies import lens_opt_seeds
 from studies.frame.run import main
-from studies.lens_opt import scan
 
 LENSES = ("nominal", "detuned", "refocused", "spots", "edge", "optimised", "after_spots")
 RATIO = {
@@ -46,25 +45,3 @@ def test_a_seed_given_twice_is_refused(tmp_path, capsys):
     arguments = ["--seeds", "1", "1", "--out", str(tmp_path / "twice")]
     assert main(lens_opt_seeds.study, lens_opt_seeds.Config, arguments) == 2
     assert "give at least one seed, and none twice" in capsys.readouterr().err
-
-
-def test_a_scan_gives_every_objective_its_step_sizes_and_averages_over_seeds(tmp_path, monkeypatch):
-    def prepared(config):
-        size = {"flow": config.step_size, "edge": config.edge_step_size}[config.objective]
-        return SimpleNamespace(
-            loop=SimpleNamespace(run=lambda steps: None),
-            best=lambda: size + config.seed,
-            task=None,
-            system=SimpleNamespace(flow=None),
-        )
-
-    monkeypatch.setattr(scan, "prepare", prepared)
-    monkeypatch.setattr(scan, "development_error", lambda *_: lambda optics: optics)
-    folder = tmp_path / "scan"
-    arguments = ["--scan", "--seeds", "1", "2", "--out", str(folder)]
-    assert main(lens_opt_seeds.study, lens_opt_seeds.Config, arguments) == 0
-    metrics = json.loads((folder / "metrics.json").read_text())
-    for objective, (_, sizes) in scan.GRID.items():
-        for size in sizes:
-            found = metrics[f"{objective}_step_{size:g}_error_mrad".replace(".", "_")]
-            assert found == pytest.approx(size + 1.5)

@@ -4,9 +4,7 @@ import pytest
 import torch
 
 from codesign.errors import DomainError
-from studies.frame.run import main
 from studies.frame.timing import measure
-from studies.lens_accuracy import __main__ as lens_accuracy
 from studies.speed_error import __main__ as speed_error
 from studies.speed_error.__main__ import Measured, cheapest
 from studies.stability import __main__ as stability
@@ -72,32 +70,6 @@ def test_a_case_that_stops_is_a_miss_with_its_sentence():
     outcome = stability.judge(refuses)
     assert not outcome.passed
     assert "upside down" in outcome.seen
-
-
-def test_the_singlet_is_as_true_as_asked(shared):
-    page = lens_accuracy.read_page(shared("refs/lens/la1509.json"))
-    found = lens_accuracy.compare("la1509", page)
-    assert set(found) == set(lens_accuracy.FIGURES)
-    for figure, (label, limit, _) in lens_accuracy.FIGURES.items():
-        assert found[figure] <= limit, label
-
-
-def test_the_comparison_sees_an_error_of_a_nanometre(shared):
-    page = lens_accuracy.read_page(shared("refs/lens/la1509.json"))
-    page["rays"][7]["mp30"]["y"] = str(float(page["rays"][7]["mp30"]["y"]) + 1e-6)
-    assert lens_accuracy.compare("la1509", page, torch.float64)["max_position_error_mm"] == pytest.approx(
-        1e-6, rel=1e-6
-    )
-
-
-def test_missing_references_are_one_sentence_and_exit_code_2(tmp_path, capsys):
-    code = main(
-        lens_accuracy.study,
-        lens_accuracy.Config,
-        ["--out", str(tmp_path / "run"), "--references", str(tmp_path / "nowhere")],
-    )
-    assert code == 2
-    assert "name their folder with --references" in capsys.readouterr().err
 
 
 def test_times_count_the_repeats_only():
