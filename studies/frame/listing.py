@@ -53,7 +53,6 @@ GROUPS = {
         "lens_opt_seeds",
         "joint_design",
         "placement",
-        "placement_objectives",
         "mount_sight",
         "velocity_head",
         "robot_gates",
