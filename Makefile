@@ -8,7 +8,7 @@ STUDY :=
 RUN := .venv/bin/python
 INSTALL := $(RUN) -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable
 STUDIES := lens-opt lens-report lens-scratch lens-tolerance lens-bench silhouettes dataset video-to-events \
-	event-gradient event-bench srm-bench davis train-flow flow-quality flow-compare flow-cost flow-recording \
+	event-gradient event-bench srm-bench sensor-fit train-flow flow-quality flow-compare flow-cost flow-recording \
 	placement speed-error stability gradcheck
 
 .PHONY: help setup test fuzz kill-test test-bits lint core-check try-all doctor clean $(STUDIES)
@@ -48,8 +48,7 @@ video-to-events: .venv/with-event-files.stamp .venv/with-video.stamp ## events o
 event-gradient: ## gradients of the event layers against differences of hard counts
 event-bench: ## speed and memory of the event stage
 srm-bench: .venv/with-bench.stamp ## the spiking layer against a convolution and two spiking libraries (installs them)
-davis: .venv/with-event-files.stamp ## a sensor fitted to a real recording, judged on its other half
-davis: STUDY := davis_fit
+sensor-fit: .venv/with-event-files.stamp ## fit a sensor to a recording of yours: make sensor-fit ARGS="--recording FILE.aedat4"
 train-flow: .venv/with-event-files.stamp .venv/with-training-logs.stamp ## train a flow network: make train-flow ARGS="--network refiner --cpu-minutes 20"
 flow-quality: ## error of the delivered refiner and of the closed form on unseen textures and worlds
 flow-compare: .venv/with-training-logs.stamp ## the refiner against networks of its size, same windows and budget

@@ -36,7 +36,7 @@ GROUPS = {
         "event_gradient",
         "event_bench",
         "event_classes",
-        "davis_fit",
+        "sensor_fit",
         "spike_esim",
         "srm_bench",
     ),

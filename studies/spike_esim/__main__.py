@@ -1,38 +1,31 @@
 """Learnt event generators against a physical sensor: the spiking network of the thesis, its smoothed variant,
 ESIM with its best threshold, and ours.
 
-Trained on rendered sequences with hard events of a noisy, slow, unequal sensor, and on the first half of a
-real DAVIS recording; judged on motions and worlds never seen and on the second half. Judged are total rates,
+Trained on rendered sequences with hard events of a noisy, slow, unequal sensor; judged on motions and worlds
+never seen. Judged are total rates,
 rates over time per polarity, van Rossum distance, flicker, patches, medians, delays, and what happens to all
 of it when thresholds, noise, chunks or the kind of data change.
 """
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import count
-from pathlib import Path
 from typing import ClassVar
 
 import torch
 
 from codesign.errors import DomainError
-from studies.davis_fit.recording import default_path, load
 from studies.frame.run import Run, StudyConfig, main
 from studies.spike_esim import data, jobs, page, score, sweeps
-from studies.spike_esim import recording as recorded
 
 JUDGED = (*jobs.VARIANTS, "esim", "ours")
 SHOWN = (*JUDGED, "ours_signal", "ours_expected", "sensor again")
-RECORDING_TRAINING = {"size_px": 48, "batch": 4, "count_weight": 0.3, "fast": 6e-2}
 RENDERED_TRAINING = {"size_px": 32, "batch": 2, "count_weight": 0.1}
 
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
     QUICK: ClassVar = {"frames": 60, "steps": 8, "resamples": 100}
-    recording: Path | None = None
-    """File with frames and events, .npz or .aedat4; ../shared/data/davis346_newton_cradle/demo-01.npz beside
-    the repository when left out."""
     frames: int = 200
     """Frames of every rendered sequence, at 500 per second."""
     steps: int = 160
@@ -84,11 +77,7 @@ def sequences(run, config):
     rendering = [data.TRAINING, data.UNSEEN_MOTION, data.UNSEEN_WORLD]
     if config.quick:
         rendering = [part[:2] for part in rendering]
-    path = config.recording or default_path()
-    real = load(path) if config.recording or path.is_file() else None
-    if real is not None and config.quick:
-        real = replace(real, frames=real.frames[:5], mid_s=real.mid_s[:5])
-    total = sum(map(len, rendering)) + (0 if real is None else len(real.frames) - 1)
+    total = sum(map(len, rendering))
     with run.progress(total, "sequences") as progress:
         made = []
         for part in rendering:
@@ -98,18 +87,6 @@ def sequences(run, config):
                 progress.advance()
         sets = {"unseen_motion": made[1], "unseen_world": made[2]}
         learning = {"rendered": made[0]}
-        if real is None:
-            run.say(
-                f"no recording at '{path}': rendered sequences alone are studied; name one by --recording."
-            )
-        else:
-            steps = 4 if config.quick else recorded.STEPS_PER_INTERVAL
-            whole = recorded.upsampled(real, steps, progress.advance)
-            half = len(whole.counts) // 2 // steps * steps
-            sets["unseen_half"], learning["recording"] = (
-                [data.part(whole, half, len(whole.counts))],
-                data.tiles(data.part(whole, 0, half)),
-            )
     return sets, learning
 
 
@@ -122,7 +99,7 @@ def train(run, config, learning):
     losses = {}
     with run.progress(total, "training", shelf.steps_done()) as progress:
         for kind, found in learning.items():
-            crops = RENDERED_TRAINING if kind == "rendered" else RECORDING_TRAINING
+            crops = RENDERED_TRAINING
             seed = config.seed + next(number)
             trained[kind], losses[kind] = jobs.train_all(
                 shelf, kind, found, config.steps, seed, crops, progress.advance

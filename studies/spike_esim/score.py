@@ -8,7 +8,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from codesign import events
-from studies.davis_fit.score import draws, interval
 from studies.spike_esim.data import Sequence
 from studies.spike_esim.train import TAU_S
 
@@ -21,11 +20,38 @@ LAGS_S = 0.03
 
 
 @dataclass(frozen=True)
+class Interval:
+    """A figure and the ends of its 95 % bootstrap interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self):
+        return f"{self.value:.3f} ({self.low:.3f} to {self.high:.3f})"
+
+
+@dataclass(frozen=True)
 class Pair:
     """Generated counts beside those of the target, [T-1, 2, H, W] both."""
 
     found: Tensor
     sequence: Sequence
+
+
+def draws(blocks, resamples, generator):
+    """How often each block is taken: [1 + resamples, blocks] whole numbers, each row summing to ``blocks``;
+    first row all 1 (the recording itself)."""
+    chosen = torch.randint(blocks, (resamples, blocks), generator=generator)
+    weights = torch.zeros(resamples, blocks, dtype=torch.float64)
+    weights.scatter_add_(1, chosen, torch.ones_like(weights))
+    return torch.cat((torch.ones(1, blocks, dtype=torch.float64), weights))
+
+
+def interval(draws):
+    """Interval of bootstrap draws [1 + resamples], of which the first is the value itself."""
+    low, high = torch.quantile(draws[1:], torch.tensor([0.025, 0.975], dtype=draws.dtype)).tolist()
+    return Interval(float(draws[0]), low, high)
 
 
 def block_losses(found, target, dt_s):

@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
@@ -15,7 +14,6 @@ from studies.spike_esim import __main__ as study
 from studies.spike_esim import jobs, score
 from studies.spike_esim import train as training
 from studies.spike_esim.data import Sequence, part, tiles
-from studies.spike_esim.recording import moved, travelled
 
 DT_S = 2e-3
 
@@ -105,26 +103,6 @@ def test_parts_and_tiles_keep_their_events():
     assert sum(tile.counts.sum() for tile in tiles(whole)) == whole.counts.sum()
 
 
-def test_way_between_frames_has_the_speeds_asked_at_its_ends():
-    time = np.linspace(0, 1, 1001)
-    way = travelled(time, 0.5, 2.0)
-    assert way[0] == 0
-    assert way[-1] == pytest.approx(1, abs=1e-15)
-    speed = np.gradient(way, time)
-    assert speed[0] == pytest.approx(0.5, abs=4e-3)  # one-sided difference over 1e-3, curvature 2
-    assert speed[-1] == pytest.approx(2.0, abs=5e-3)
-    assert np.allclose(travelled(time, 1.0, 1.0), time, atol=1e-15)  # even motion
-
-
-def test_a_ramp_is_moved_to_where_it_belongs():
-    x = torch.arange(20.0).expand(8, 20)
-    forth = np.zeros((2, 8, 20), np.float32)
-    back = np.zeros((2, 8, 20), np.float32)
-    forth[1], back[1] = 2.0, -2.0  # two columns to the right
-    middle = moved(10 * x, 10 * (x - 2), forth, back, np.full((8, 20), 0.25))
-    assert torch.allclose(middle[:, 3:-3], 10 * (x - 0.5)[:, 3:-3])
-
-
 def test_best_theta_is_that_of_the_target():
     frames = (
         (3.5 + (0.1 * torch.randn(80, 12, 12, generator=torch.Generator().manual_seed(8))).cumsum(0))
@@ -191,18 +169,9 @@ def test_calibration_finds_the_thresholds_of_a_sensor():
     assert scale == pytest.approx([1.5, 1.2], rel=0.02)
 
 
-def test_too_small_a_study_and_an_absent_recording_are_refused(tmp_path, capsys):
+def test_too_small_a_study_is_refused(tmp_path, capsys):
     assert main(study.study, study.Config, ["--steps", "1", "--out", str(tmp_path / "a")]) == 2
     assert "at least" in capsys.readouterr().err
-    assert (
-        main(
-            study.study,
-            study.Config,
-            ["--quick", "--recording", str(tmp_path / "absent.npz"), "--out", str(tmp_path / "b")],
-        )
-        == 2
-    )
-    assert "not there" in capsys.readouterr().err
 
 
 def test_training_forgets_batches_without_events():

@@ -30,15 +30,14 @@ class Recording:
     exposure_s: float
     stream: EventStream
 
-    def counts(self, offset_s=0.0):
-        """Recorded events between consecutive mid-exposures, all moved by ``offset_s``: [T-1, 2, H, W], ON
-        first."""
-        return events.to_counts(self.stream, self.mid_s + offset_s)
+    def counts(self):
+        """Recorded events between consecutive mid-exposures: [T-1, 2, H, W], ON first."""
+        return events.to_counts(self.stream, self.mid_s)
 
 
 def default_path():
     """The recording beside the repository (or in it), where there is one."""
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     found = [place / PLACE for place in (root.parent, root)]
     return next((path for path in found if path.is_file()), found[0])
 
