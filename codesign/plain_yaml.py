@@ -33,7 +33,10 @@ class _Loader(yaml.SafeLoader):
                 raise yaml.MarkedYAMLError(
                     problem=f"'{key.value}' stands there twice", problem_mark=key.start_mark
                 )
-        return super().construct_mapping(node, deep)
+        found = super().construct_mapping(node, deep)
+        if not all(isinstance(key, str) for key in found):
+            raise yaml.MarkedYAMLError(problem="a key is no word", problem_mark=node.start_mark)
+        return found
 
 
 class _Dumper(yaml.SafeDumper):
@@ -95,6 +98,6 @@ def load(text: str) -> dict[str, Any]:
         raise FileFormatError(
             f"yaml: {' '.join(str(error).split())[:120]}; give 'key: value' lines."
         ) from error
-    if not isinstance(page, dict) or not all(isinstance(key, str) for key in page):
+    if not isinstance(page, dict):
         raise FileFormatError("yaml: this is no mapping; give 'key: value' lines.")
     return page
