@@ -123,8 +123,13 @@ def from_urdf(
             ]
     finder.check()
     robot = Robot(path, frames, tuple(parts), root)
+    corners = np.concatenate([np.zeros((1, 3)), *(part.vertices_m for part in parts)])
+    if not all(np.isfinite(each).all() for each in (corners, *frames.values())):
+        raise FileFormatError(
+            f"robot '{path}' has places that are not finite; look for an origin, an axis or a size that is too large."
+        )
     if parts:
-        corners = np.concatenate([part.vertices_m for part in parts])
+        corners = corners[1:]
         units.hint(corners.min(0), corners.max(0), f"robot '{path}'")
     return robot
 
@@ -179,8 +184,8 @@ def _wrong_joint(joints):
                 return f"joint '{joint.name}' mimics '{joint.mimic.joint}', which is no joint that moves by itself"
         if not all(np.isfinite(np.asarray(each, dtype=float)).all() for each in numbers if each is not None):
             return f"joint '{joint.name}' has an origin, axis or mimic that is not finite"
-        if joint.type in MOVES and not np.any(joint.axis):
-            return f"joint '{joint.name}' has the axis 0 0 0, along which nothing turns or slides"
+        if joint.type in MOVES and not 1e-9 < np.linalg.norm(joint.axis) < 1e9:
+            return f"joint '{joint.name}' has the axis {' '.join(f'{v:g}' for v in joint.axis)}, which has no direction"
     return ""
 
 
