@@ -14,7 +14,6 @@ import yaml
 from codesign.errors import DomainError, FileFormatError
 
 MOST = 10_000  # lines, and brackets
-REFUSED = (yaml.TagToken, yaml.AnchorToken, yaml.AliasToken)
 SCALARS = {
     "bool": r"true|false",
     "null": r"null",
@@ -26,10 +25,18 @@ SCALARS = {
 class _Loader(yaml.SafeLoader):
     yaml_implicit_resolvers: dict = {}  # noqa: RUF012 - PyYAML's own name
 
+    def compose_node(self, parent, index):
+        event = self.peek_event()
+        if isinstance(event, yaml.AliasEvent) or event.anchor or event.tag:
+            raise yaml.MarkedYAMLError(
+                problem="tags, anchors and aliases are not read", problem_mark=event.start_mark
+            )
+        return super().compose_node(parent, index)
+
     def construct_mapping(self, node, deep=False):
-        keys = [key.value for key, _ in node.value]
-        for (key, _), before in zip(node.value, range(len(keys)), strict=True):
-            if key.value in keys[:before]:
+        names = [key.value for key, _ in node.value]
+        for place, (key, _) in enumerate(node.value):
+            if key.value in names[:place]:
                 raise yaml.MarkedYAMLError(
                     problem=f"'{key.value}' stands there twice", problem_mark=key.start_mark
                 )
@@ -84,11 +91,6 @@ def load(text: str) -> dict[str, Any]:
     if max(map(text.count, "\n[{")) > MOST:
         raise FileFormatError(f"yaml: more than {MOST} lines, lists or mappings; fewer are read.")
     try:
-        for token in yaml.scan(text):
-            if isinstance(token, REFUSED):
-                raise yaml.MarkedYAMLError(
-                    problem="tags, anchors and aliases are not read", problem_mark=token.start_mark
-                )
         page = yaml.load(text, _Loader)
         json.dumps(page, allow_nan=False)
     except yaml.MarkedYAMLError as error:

@@ -123,13 +123,13 @@ def from_urdf(
             ]
     finder.check()
     robot = Robot(path, frames, tuple(parts), root)
-    corners = np.concatenate([np.zeros((1, 3)), *(part.vertices_m for part in parts)])
-    if not all(np.isfinite(each).all() for each in (corners, *frames.values())):
+    corners = [part.vertices_m for part in parts]
+    if not all(np.isfinite(each).all() for each in (*corners, *frames.values())):
         raise FileFormatError(
             f"robot '{path}' has places that are not finite; look for an origin, an axis or a size that is too large."
         )
     if parts:
-        corners = corners[1:]
+        corners = np.concatenate(corners)
         units.hint(corners.min(0), corners.max(0), f"robot '{path}'")
     return robot
 

@@ -94,10 +94,10 @@ def stored_values(image: PIL.Image.Image) -> np.ndarray:
 def linear(stored: np.ndarray) -> np.ndarray:
     """Linear luminance 0..1, [H, W] float64, of values coded by the sRGB gamma: [H, W] or [H, W, 3], whole numbers
     or 0..1."""
+    white = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1.0
     if stored.dtype.kind != "u" or stored.dtype.itemsize > 2:
-        scale = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1.0
-        return luminance(_light(np.asarray(stored, dtype=np.float64) / scale))
-    level = _light(np.arange(np.iinfo(stored.dtype).max + 1) / np.iinfo(stored.dtype).max)
+        return luminance(_light(np.asarray(stored, dtype=np.float64) / white))
+    level = _light(np.arange(white + 1) / white)
     if stored.ndim < 3 or stored.shape[2] < 3:
         return luminance(level[stored])
     # colour by colour: a picture of 45 megapixels takes a gigabyte at once

@@ -8,6 +8,7 @@ the given arguments, with gradients for all floating tensors among them, and wit
 not belong. What was given and what came of it is pickled, which only who recorded it should read. Leaves with issue N.
 """
 
+import contextlib
 import dataclasses
 import importlib
 import inspect
@@ -252,7 +253,8 @@ if __name__ == "__main__":
     if what == "record":
         record(folder, rest or ["tests"])
     elif what == "replay":
-        with tempfile.TemporaryDirectory():
+        folder = Path(folder).resolve()
+        with tempfile.TemporaryDirectory() as place, contextlib.chdir(place):
             sys.exit(min(replay(folder), 1))
     else:
         options = ["-q", "-p", "no:xdist", "-p", "no:cacheprovider", "-p", "no:unraisableexception"]

@@ -137,17 +137,15 @@ def _on_pieces(view, curve, pieces, cameras, per_px, generator):
     viewpoint = eye + (pose[:, :3, :2] @ (pupil * view.aperture_m)[..., None])[..., 0]
     y = curve.points(index, s, viewpoint)
     on = curve.points(index, s + STEP * (high - low), viewpoint)
-    aside, near = read_aside_rad(curve, index, y, viewpoint)
-    slope = curve.face_slope(index, y, viewpoint)
     share = share * curve.counts(index, y, viewpoint)
     colour = (number + turn[1]) % view.colours
-    sides = aside, near, slope, curve.apex_m(index)
-    return y, on, share, *sides, pupil, colour, pieces.window[piece], frame
+    beside = known_beside(curve, index, y, viewpoint)
+    return y, on, share, *beside, pupil, colour, pieces.window[piece], frame
 
 
-def read_aside_rad(curve: Any, index: Tensor, y: Tensor, viewpoint: Tensor) -> tuple[Tensor, Tensor]:
-    """Angles [n] from the curves' points y [n, 3] at which radiances beside them are read, seen from viewpoints [n, 3]:
-    by rays from there, and by rays from NEARBY."""
+def known_beside(curve: Any, index: Tensor, y: Tensor, viewpoint: Tensor) -> tuple[Tensor, ...]:
+    """Columns aside_rad .. apex_m of CurvePoints at points y [n, 3] of the curves ``index`` [n], seen from viewpoints
+    [n, 3]."""
     aside, near = (
         torch.maximum(
             curve.aside_rad(index, eye),
@@ -155,7 +153,8 @@ def read_aside_rad(curve: Any, index: Tensor, y: Tensor, viewpoint: Tensor) -> t
         )
         for eye in (viewpoint, y + NEARBY * (viewpoint - y))
     )
-    return aside, torch.minimum((NEARBY * near).clamp_min(NEAR_RAD), aside)
+    near = torch.minimum((NEARBY * near).clamp_min(NEAR_RAD), aside)
+    return aside, near, curve.face_slope(index, y, viewpoint), curve.apex_m(index)
 
 
 def piece_rad(slope_per_px: float) -> float:

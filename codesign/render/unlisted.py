@@ -19,7 +19,7 @@ from torch import Tensor
 from codesign.errors import DomainError
 from codesign.pose import apply
 from codesign.render.camera import Camera
-from codesign.render.curve_points import CurvePoints, Views, piece_rad, read_aside_rad
+from codesign.render.curve_points import CurvePoints, Views, known_beside, piece_rad
 from codesign.render.film import coarse_pixels
 from codesign.render.jumps import SAFETY, jumps
 from codesign.render.looked import MOST, Looked, looked_at, nearest_m
@@ -284,25 +284,18 @@ def _listed(camera, scene, curves, cameras, found):
                 count = curve.counts(index, y, o[ray]) & within
                 ray, index, y, ahead = (v[count] for v in (ray, index, y, ahead))
                 share = torch.ones(len(ray), dtype=torch.float64)
-                aside, near = read_aside_rad(curve, index, y, o[ray])
-                slope = curve.face_slope(index, y, o[ray])
-                apex = curve.apex_m(index)
+                beside = known_beside(curve, index, y, o[ray])
                 numbers = (torch.full_like(ray, number) for number in (frame, part))
-                columns.append((ray, y, ahead, share, aside, near, slope, apex, *numbers))
+                columns.append((ray, y, ahead, share, *beside, *numbers))
     total = torch.zeros_like(found.change)
     read = None
     if columns:
-        ray, y, ahead, share, aside, near, slope, apex, frame, part = (
-            torch.cat(v) for v in zip(*columns, strict=True)
-        )
+        ray, y, ahead, share, *beside, frame, part = (torch.cat(v) for v in zip(*columns, strict=True))
         points = CurvePoints(
             y,
             ahead,
             share,
-            aside,
-            near,
-            slope,
-            apex,
+            *beside,
             found.pupil[ray],
             torch.zeros_like(ray),
             found.window[ray],

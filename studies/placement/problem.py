@@ -149,33 +149,21 @@ class Problem:
         """0 where every requirement is kept with a step to spare. Gradient: mount."""
         return place.penalty(self.requirements, T_body_cam, self.camera)
 
-    def expected(
-        self, T_body_cam: Tensor, samples: Samples, learn: bool = False, frames: bool = False
-    ) -> Tensor:
+    def expected(self, T_body_cam: Tensor, samples: Samples, learn: bool = False) -> Tensor:
         """Bounded error [N] to be expected of a mount: what is descended, by ``expected_around``.
 
-        learn: take these samples into the trend of the flow's precision. frames: the gradient goes through frames, events
-          and the estimator's covariance instead of the trend.
+        learn: take these samples into the trend of the flow's precision.
         Gradient: mount, the slope at this very place, through the geometry of flow, the trend of its precision, and the
         share of every window that the robot itself covers; not through single frames, whose texture makes it noise.
         """
         batch = self.batch(samples)
-        with torch.set_grad_enabled(frames):
+        with torch.no_grad():
             field = self.system(T_body_cam).begin(batch)["field"]
-        followed = T_body_cam.requires_grad and not frames
+        followed = T_body_cam.requires_grad
         seen = self._seen(field, batch, T_body_cam, learn or followed)
         if learn:
             self.trend.add(seen.surfaces, seen.flow_px, seen.covered)
         return self._bounded(self._followed(seen) if followed else seen.read, seen, batch.twist)
-
-    @torch.no_grad()
-    def expected_and_hard(self, T_body_cam: Tensor, samples: Samples) -> Tensor:
-        """[2, N]: bounded errors to be expected, and those with hard counts, of the same pictures."""
-        batch = self.batch(samples)
-        run = self.system(T_body_cam).begin(batch)
-        hard = self.pair.errors(run["estimate"], batch).bounded()
-        seen = self._seen(run["field"], batch, T_body_cam)
-        return torch.stack([self._bounded(seen.read, seen, batch.twist), hard])
 
     @torch.no_grad()
     def expected_around(

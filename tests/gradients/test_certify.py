@@ -10,6 +10,7 @@ from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeErr
 from codesign.grad import certify, plateau
 from codesign.grad.differences import Ladder, rounding_noise
 from codesign.grad.row import verdict
+from tests.gradients.wrong_case import certified, grad_of
 
 D = torch.float64
 
@@ -52,22 +53,6 @@ def test_plateau_of_a_cubic():
     assert found.noise == pytest.approx((1e-4 - 1e-6) / 2, rel=1e-6)
 
 
-def grad_of(fn, x):
-    leaf = x.clone().requires_grad_(True)
-    return torch.autograd.grad(fn(leaf), leaf)[0]
-
-
-def certified(fn, x, error, generator, directions=4):
-    """The row of a function whose gradient has an error that its values do not show."""
-    (row,) = certify(
-        lambda p: fn(p["x"]) + (error * (p["x"] - p["x"].detach())).sum(),
-        {"x": x},
-        directions=directions,
-        generator=generator,
-    )
-    return row
-
-
 def on_a_thousand(seed, longer):
     """A mean of squares on top of 1,000 in single precision, whose gradient is longer by a share."""
     generator = torch.Generator().manual_seed(seed)
@@ -77,7 +62,7 @@ def on_a_thousand(seed, longer):
     def fn(x):
         return 1e3 + (weight * x.square()).mean()
 
-    return certified(fn, x, longer * grad_of(fn, x), generator)
+    return certified(fn, x, longer * grad_of(fn, x), directions=4, generator=generator)
 
 
 def test_the_weights_of_a_network_with_kinks():
@@ -100,8 +85,8 @@ def test_the_weights_of_a_network_with_kinks():
         few = order[grad[order].square().cumsum(0).sqrt() < 0.15 * grad.norm()]
         flipped[few] = -2 * grad[few]
         errors = (-0.3 * grad, 0.3 * grad, 0.3 * turned * grad.norm() / turned.norm(), flipped)
-        verdicts["right"].append(certified(fn, weights, 0 * grad, generator, directions=None).verdict)
-        verdicts["wrong"].append(certified(fn, weights, errors[seed], generator, directions=None).verdict)
+        verdicts["right"].append(certified(fn, weights, 0 * grad, generator=generator).verdict)
+        verdicts["wrong"].append(certified(fn, weights, errors[seed], generator=generator).verdict)
     assert verdicts == {"right": ["pass"] * 4, "wrong": ["fail"] * 4}
 
 

@@ -9,7 +9,7 @@ from collections import Counter
 import pytest
 import torch
 
-from codesign.grad import certify
+from tests.gradients.wrong_case import certified, grad_of
 
 D = torch.float64
 NUMBERS = (1, 2, 5, 30, 200)
@@ -88,11 +88,6 @@ FAMILIES = {
 }
 
 
-def grad_of(fn, x):
-    x = x.detach().clone().requires_grad_(True)
-    return torch.autograd.grad(fn(x), x)[0]
-
-
 def of_the_smoothed(grad, fn, x, of):
     near = [x * (0.8 + 0.4 * of.uniform()).to(x) for _ in range(8)]
     return torch.stack([grad_of(fn, each) for each in near]).mean(0)
@@ -110,12 +105,7 @@ WRONG = (
 def judged(fn, x, error):
     """Row for the right gradient plus an error that the function's values do not show."""
     lines = None if x.numel() <= 5 else 4
-    return certify(
-        lambda p: fn(p["x"]) + (error * (p["x"] - p["x"].detach())).sum(),
-        {"x": x},
-        directions=lines,
-        tolerance=TOLERANCE,
-    )[0]
+    return certified(fn, x, error, directions=lines, tolerance=TOLERANCE)
 
 
 @pytest.mark.parametrize("name", FAMILIES)

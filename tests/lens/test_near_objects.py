@@ -160,7 +160,7 @@ def waves(system, at_m):
         waves[seen] = paths / WAVELENGTH_MM
         steepest = max(np.nanmax(np.abs(np.diff(waves, axis=k))) for k in (0, 1))
     geo = geolens(system)
-    field = np.where(seen, np.exp(-2j * np.arctan2(L(0), L(-1)) * np.nan_to_num(waves)), 0)
+    field = np.where(seen, np.exp(-2j * np.arctan2(L(0), L(-1)) * np.where(seen, waves, 0)), 0)
     energy = (np.abs(field) ** 2).sum()
     radius = (points * (slope - slope.mean(0))).sum(0) / (points**2).sum(
         0
