@@ -1,7 +1,7 @@
 """Values, gradients and refusals of every public function, recorded once and asked again while the house is made smaller.
 
     python -m tests.pins record FOLDER [tests ...]   at the commit that is to be kept
-    python -m tests.pins replay FOLDER               at any later one
+    python -m tests.pins replay FOLDER [prefix]      at any later one, all or of names that start so
 
 While tests run, the first calls of every public function and method are kept, as tests.hostile does, and made anew: with
 the given arguments, with gradients for all floating tensors among them, and with one argument exchanged for what does
@@ -189,10 +189,10 @@ def found(name):
     return value
 
 
-def replay(folder, say=print):
-    """Ask every recorded call again. Returns the number of those that differ."""
+def replay(folder, prefix="", say=print):
+    """Ask every recorded call again whose name starts so. Returns the number of those that differ."""
     counts = Counter()
-    for path in sorted(Path(folder).glob("*.pkl")):
+    for path in sorted(Path(folder).glob(f"{prefix}*.pkl")):
         told = pickle.loads(path.read_bytes())
         try:
             call = found(told["name"])
@@ -255,7 +255,7 @@ if __name__ == "__main__":
     elif what == "replay":
         folder = Path(folder).resolve()
         with tempfile.TemporaryDirectory() as place, contextlib.chdir(place):
-            sys.exit(min(replay(folder), 1))
+            sys.exit(min(replay(folder, *rest), 1))
     else:
         options = ["-q", "-p", "no:xdist", "-p", "no:cacheprovider", "-p", "no:unraisableexception"]
         sys.exit(pytest.main([rest[0], *options], plugins=[Recorder(folder, rest[1:])]))
