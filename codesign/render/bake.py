@@ -19,10 +19,8 @@ from scipy.ndimage import distance_transform_edt, zoom
 from codesign.errors import DomainError
 from codesign.exclusive import exclusive
 from codesign.render.atlas import Nodes
-from codesign.render.charts import Chart, placed
-from codesign.render.placed import Placement
-from codesign.render.sided import SidedScene
-from codesign.render.surfaces import Surface, surfaces_of
+from codesign.render.charts import Chart, Surface, placed, surfaces_of
+from codesign.render.placed import Placement, SidedScene
 from codesign.render.world import MitsubaScene
 
 # of (1 m + distance from the origin): height over the surface from which a texel is looked at; about half of

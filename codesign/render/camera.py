@@ -2,16 +2,15 @@
 
 import copy
 import math
+from collections.abc import Callable
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite, check_seed, check_whole
-from codesign.render.film import Film, check_memory, coarse_pixels
-from codesign.render.kinds import Lens
-from codesign.render.sampling import film_pupil_pattern
+from codesign.render.film import Film, check_memory, coarse_pixels, film_pupil_pattern
 from codesign.types import Rays
 
 _NEWTON_STEPS = 8
@@ -21,6 +20,15 @@ _SHRINK_STEPS = 3
 _SHRINK = 0.85
 CHECKED_ACROSS = 32
 CHECKED_RAYS = 16
+
+
+class Lens(Protocol):
+    """camera_rays(film_mm [N, 2], pupil [N, 2], aim=...) -> Rays [N], as GeoLens has it; ``dtype`` where it is
+    not float64, ``film_points`` for a first guess where gradients of silhouettes are asked for,
+    ``entrance_pupil_diameter_mm`` where there is an aperture."""
+
+    @property
+    def camera_rays(self) -> Callable[..., Rays]: ...
 
 
 class Camera:
@@ -303,3 +311,32 @@ def angular_miss_rad(camera: Camera, pixels: Tensor, points_cam_m: Tensor) -> Te
 
 
 __all__ = ["Camera", "Film", "Rays", "angular_miss_rad", "project"]
+
+
+def coloured_rays(
+    camera: Camera, film_px: Tensor, pupil: Tensor, colour: Tensor, whole: bool = True
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Origins and directions [n, 3] in camera axes of rays through film positions and pupil points, and the share of
+    a sample's light [n] that they carry, each in its own colour; without ``whole`` the share that passes the apertures."""
+    if camera.spectrum is None:
+        return _of_rays(camera, camera.rays_through(film_px, pupil), 1.0, whole)
+    count = len(camera.spectrum.wavelengths_um)
+    found = []
+    order = []
+    for number, (wavelength, weight) in enumerate(
+        zip(camera.spectrum.wavelengths_um, camera.spectrum.weights, strict=True)
+    ):
+        rows = torch.nonzero(colour == number)[:, 0]
+        order.append(rows)
+        rays = camera.rays_through(film_px[rows], pupil[rows], wavelength)
+        found.append(_of_rays(camera, rays, weight * count, whole))
+    back = torch.cat(order).argsort()
+    origin, direction, light = (torch.cat(column)[back] for column in zip(*found, strict=True))
+    return origin, direction, light
+
+
+def _of_rays(camera, rays, share, whole):
+    light = rays.weight * share if whole else rays.weight
+    if whole and camera.falloff:
+        light = light * rays.irradiance.detach()
+    return rays.origin_m.double(), rays.direction.double(), light.double()

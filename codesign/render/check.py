@@ -9,8 +9,7 @@ from codesign.pose import Poses
 from codesign.render.camera import Camera
 from codesign.render.film import coarse_pixels
 from codesign.render.hits import dot, of_part, turned
-from codesign.render.kinds import Scene
-from codesign.render.moving import MovingScene, in_one_row
+from codesign.render.moving import MovingScene, Scene, in_one_row
 from codesign.render.truth import cameras_of, hits_of
 from codesign.render.wavefront import shade
 

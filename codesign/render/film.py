@@ -1,4 +1,5 @@
-"""Pixels of a sensor: their grid, and windows on it."""
+"""Pixels of a sensor, windows on it, and the one low-discrepancy pattern over film and pupil that all pixels, all frames
+and both sides of a difference share."""
 
 import math
 from dataclasses import dataclass
@@ -109,3 +110,27 @@ def coarse_pixels(film: Film, every_px: int) -> Tensor:
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     corners = torch.tensor(film.windows_px or ((0, 0),), dtype=torch.float64)
     return (corners[:, None] + torch.stack([x.reshape(-1), y.reshape(-1)], 1)).reshape(-1, 2)
+
+
+def film_pupil_pattern(samples, seed):
+    """Scrambled Sobol points over pixel x pupil.
+
+    Args: samples per pixel, seed. Returns: offset [samples, 2] in pixels, within [-1/2, 1/2); pupil [samples,
+      2] on the unit disc; float64. The same pattern in every pixel makes the sampled point spread the same
+      everywhere: a static scene gives equal frames and a moving one no sampling flicker. A single sample is
+      the pixel centre through the pupil centre.
+    """
+    if samples == 1:
+        return torch.zeros(1, 2, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
+    points = torch.quasirandom.SobolEngine(4, scramble=True, seed=seed).draw(samples, dtype=torch.float64)
+    return points[:, :2] - 0.5, concentric_disc(points[:, 2:])
+
+
+def concentric_disc(unit):
+    """Unit square to unit disc, area-preserving (Shirley and Chiu, 1997)."""
+    a, b = (2 * unit - 1).unbind(1)
+    wide = a.abs() > b.abs()
+    radius = torch.where(wide, a, b)
+    safe = torch.where(radius == 0, torch.ones_like(radius), radius)
+    angle = torch.where(wide, math.pi / 4 * b / safe, math.pi / 2 - math.pi / 4 * a / safe)
+    return torch.stack([radius * angle.cos(), radius * angle.sin()], 1)

@@ -19,8 +19,7 @@ from codesign.errors import DomainError, GradientError, as_number, check_seed, c
 from codesign.exclusive import exclusive
 from codesign.render.bake import bake
 from codesign.render.camera import Camera
-from codesign.render.kinds import Scene
-from codesign.render.moving import MovingScene
+from codesign.render.moving import MovingScene, Scene
 from codesign.render.sequence import frames
 from codesign.render.world import MitsubaScene
 

@@ -1,16 +1,41 @@
 """A world with objects that move: every object is a scene in its own frame, with a pose per frame of the
 sequence."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
 from codesign.pose import Poses, as_poses, check_poses, inverse
-from codesign.render.kinds import Scene, check_kind
 from codesign.types import Rays
+
+
+class Scene(Protocol):
+    """Radiance along world rays, in drjit arrays of one dtype; ``hit`` as MitsubaScene has it for truth."""
+
+    @property
+    def dtype(self) -> torch.dtype: ...
+
+    @property
+    def radiance(self) -> Callable[..., Any]: ...
+
+
+def check_kind(scene: Any) -> None:
+    """Raise DomainError for what is no scene: neither ``radiance`` nor ``hit`` can be asked of it."""
+    if (hasattr(scene, "radiance") or hasattr(scene, "hit")) and not isinstance(scene, type):
+        return
+    kind = type(scene).__name__
+    if isinstance(scene, type):
+        cure = f"make one, as by {scene.__name__}(...)"
+    elif isinstance(scene, Mapping):
+        cure = "render.MitsubaScene(description) builds one"
+    elif type(scene).__module__.startswith("mitsuba"):
+        cure = "worlds.from_mitsuba(scene) makes one of it"
+    else:
+        cure = "give a MitsubaScene, TexturedPlane or MovingScene, or a list of them"
+    raise DomainError(f"the scene is a {kind}, which has no radiance that could be rendered; {cure}.")
 
 
 class MovingScene:

@@ -17,8 +17,7 @@ from torch.nn.functional import avg_pool2d, pad
 from codesign.errors import DomainError, ShapeError
 from codesign.pose import Poses, as_poses
 from codesign.render.camera import Camera
-from codesign.render.kinds import Scene
-from codesign.render.moving import MovingScene, in_one_row, scenes_and_poses
+from codesign.render.moving import MovingScene, Scene, in_one_row, scenes_and_poses
 from codesign.render.psf_map import SIDE, PsfMap, psf_map
 from codesign.render.wavefront import light_and_nearness
 

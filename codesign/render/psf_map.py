@@ -17,8 +17,7 @@ from torch.nn.functional import interpolate
 
 from codesign.errors import DomainError, ShapeError
 from codesign.render.camera import Camera
-from codesign.render.film import coarse_pixels
-from codesign.render.sampling import concentric_disc
+from codesign.render.film import coarse_pixels, concentric_disc
 from codesign.types import Rays
 
 ROUNDING = 1e-6  # of distances given in float32

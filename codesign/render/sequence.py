@@ -16,12 +16,18 @@ from torch import Tensor
 
 from codesign.errors import DomainError, as_number
 from codesign.pose import Poses, as_poses, inverse, se3_exp
-from codesign.render.boundary import boundary_term, radiance_jumps
+from codesign.render.aperture_edges import aperture_edge_term
 from codesign.render.camera import Camera
-from codesign.render.kinds import Scene
-from codesign.render.moving import MovingScene, at_frames, cameras_in_parts, in_one_row, scenes_and_poses
-from codesign.render.rim import rim_term
-from codesign.render.unlisted import reach_m
+from codesign.render.moving import (
+    MovingScene,
+    Scene,
+    at_frames,
+    cameras_in_parts,
+    in_one_row,
+    scenes_and_poses,
+)
+from codesign.render.silhouettes.boundary import boundary_term, radiance_jumps
+from codesign.render.silhouettes.occlusion_check import reach_m
 from codesign.render.wavefront import shade
 from codesign.types import Rays
 
@@ -38,7 +44,7 @@ LENS_STEP = {
     "efl_mm": 1e-2,
     "image_distance_mm": 2e-3,
 }
-RIM_SAMPLES = 4  # points per pixel on the edges of apertures, for "boundary"
+APERTURE_SAMPLES = 4  # points per pixel on the edges of apertures, for "boundary"
 PASSES = 0.05  # relative L2 distance from differences up to which a way is kept
 
 
@@ -119,14 +125,16 @@ def frames(
     rays = camera.given(rays)
     taken = None
     if rays.weight.requires_grad:
-        taken = rim_term(camera, scene, T_world_cam, max(RIM_SAMPLES, camera.samples_per_pixel // 8))
+        taken = aperture_edge_term(
+            camera, scene, T_world_cam, max(APERTURE_SAMPLES, camera.samples_per_pixel // 8)
+        )
     if taken is not None:
-        rays = _with_still_rims(camera, rays)
+        rays = _with_still_apertures(camera, rays)
     found = image(camera, scene, T_world_cam, rays) + boundary_term(camera, scene, T_world_cam, per_px)
     return found if taken is None else found + taken
 
 
-def _with_still_rims(camera, rays):
+def _with_still_apertures(camera, rays):
     """The same rays; no gradient goes to the light that apertures take away."""
     weight = rays.weight.detach()
     if camera.falloff:

@@ -9,6 +9,7 @@ MovingScene with n poses per object.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -18,10 +19,12 @@ from codesign.errors import DomainError, as_number, check_finite, check_whole
 from codesign.pose import Poses, check_poses
 from codesign.render.camera import Camera
 from codesign.render.film import coarse_pixels
-from codesign.render.kinds import Scene, Trajectory
-from codesign.render.moving import MovingScene, at_frames, in_one_row
+from codesign.render.moving import MovingScene, Scene, at_frames, in_one_row
 from codesign.render.truth import track
 from codesign.render.wavefront import shade
+
+# times [n] in seconds to T_world_cam [..., n, 4, 4]
+Trajectory: TypeAlias = Callable[[Tensor], Tensor]
 
 FIRST_STEP = 1 / 64  # of the interval, until the motion is known
 # from step to step at most; the share of the largest displacement that steps aim at

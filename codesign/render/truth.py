@@ -16,8 +16,14 @@ from codesign.errors import ShapeError, as_number
 from codesign.pose import Poses, as_poses, check_poses, inverse
 from codesign.render.camera import Camera, project
 from codesign.render.hits import Hits, carried, dot, first_hits, of_part, turned
-from codesign.render.kinds import Scene
-from codesign.render.moving import MovingScene, cameras_in_parts, in_one_row, poses_of_parts, scenes_and_poses
+from codesign.render.moving import (
+    MovingScene,
+    Scene,
+    cameras_in_parts,
+    in_one_row,
+    poses_of_parts,
+    scenes_and_poses,
+)
 from codesign.render.projection import ProjectionTable
 from codesign.types import Rays
 

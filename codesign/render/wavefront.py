@@ -9,10 +9,8 @@ from codesign.backend import arrays, load, memory_bytes, run_kernel
 from codesign.errors import DomainError, ShapeError, check_whole
 from codesign.exclusive import exclusive
 from codesign.pose import Poses, as_poses
-from codesign.render.kinds import Scene
-from codesign.render.lanes import lanes, nearest, placed
-from codesign.render.moving import MovingScene, cameras_in_parts, in_one_row, parts, says_distance
-from codesign.render.pixel_means import Wavefront, pixel_means
+from codesign.render.moving import MovingScene, Scene, cameras_in_parts, in_one_row, parts, says_distance
+from codesign.render.pixel_means import Wavefront, lanes, nearest, pixel_means, placed
 from codesign.types import Rays
 
 # an edge is hidden when all beside it is nearer by this share; a face next to it comes nearer by less

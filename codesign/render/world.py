@@ -12,15 +12,18 @@ from codesign import backend
 from codesign.errors import DomainError
 from codesign.exclusive import exclusive
 from codesign.reading import reading
-from codesign.render.fronts import are_geometric
-from codesign.render.outline import outlines
-from codesign.render.outline.curves import Segments
-from codesign.render.outline.nearness import Bodies
-from codesign.render.outline.shapes import read
-from codesign.render.shape_table import box_around, shape_numbers
+from codesign.render.mitsuba_shapes import (
+    are_geometric,
+    box_around,
+    interpolated,
+    shape_numbers,
+    vertex_attribute,
+)
+from codesign.render.scene_checks import check_description, check_scene
+from codesign.render.silhouettes import outlines
+from codesign.render.silhouettes.curves import Segments
+from codesign.render.silhouettes.shapes import Bodies, read
 from codesign.render.slopes import with_slopes
-from codesign.render.soundness import check_description, check_scene
-from codesign.render.vertex_light import interpolated, vertex_attribute
 
 
 class MitsubaScene:
@@ -177,7 +180,7 @@ class MitsubaScene:
 
     @exclusive
     def outline(self) -> Any:
-        """Curves where radiance may jump, see codesign.render.outline; worked out once."""
+        """Curves where radiance may jump, see codesign.render.silhouettes; worked out once."""
         if self._outline is None:
             curves = outlines(self._read())
             self._outline = [_never_black(curve) for curve in curves] if self.both_sides else curves

@@ -10,7 +10,7 @@ from codesign.errors import DomainError, as_number
 from codesign.place import Body
 from codesign.place.requirements import check_positive
 from codesign.render import Camera, MitsubaScene, frames
-from codesign.render.glowing import glowing
+from codesign.render.charts import glowing
 from codesign.render.truth import cameras_of, hits_of
 
 

@@ -9,7 +9,7 @@ import torch
 from codesign import backend, pose, render
 from codesign.errors import DomainError
 from codesign.render import MitsubaScene
-from codesign.render.curve_points import places as _places
+from codesign.render.silhouettes.curve_points import places as _places
 from scenes import silhouettes as silhouette_scenes
 from studies.silhouettes import STEPS, Task
 

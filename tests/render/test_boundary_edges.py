@@ -13,10 +13,10 @@ from codesign.lens import GeoLens, Glass, Pinhole, Surface
 from codesign.render import MitsubaScene
 from codesign.render.camera import project
 from codesign.render.charts import emissive_mesh
-from codesign.render.curve_points import CurvePoints
-from codesign.render.jumps import _on_film
-from codesign.render.outline import Circles, outlines
-from codesign.render.outline.shapes import read
+from codesign.render.silhouettes import Circles, outlines
+from codesign.render.silhouettes.curve_points import CurvePoints
+from codesign.render.silhouettes.jumps import _on_film
+from codesign.render.silhouettes.shapes import read
 
 F64 = torch.float64
 RADIANCE = 100.0

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from codesign import backend, lens, render
 from codesign.pose import look_at
-from codesign.render import Camera, light, outline
+from codesign.render import Camera, light
+from codesign.render.silhouettes.shapes import read
 from scenes import worlds
 
 CAMERA = Camera(lens.Pinhole(4.0), 24, 24, 0.1, 4)
@@ -52,7 +53,7 @@ def test_what_glows_shows_the_side_that_mitsuba_shows(tmp_path, kind, seed):
     )
     # Mitsuba stores the normals of vertices to 1 %, by which a face seen nearly edge-on is lit or not
     assert float((ours - theirs).abs().mean()) < 0.02 * 100
-    found = outline.shapes.read(mi, mi.load_dict({"type": "scene", **glowing}).shapes()[0])
+    found = read(mi, mi.load_dict({"type": "scene", **glowing}).shapes()[0])
     if kind not in EQUAL:  # faces of the outline point to where the light goes
         corners = found.vertices[found.faces]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

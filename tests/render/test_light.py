@@ -13,7 +13,7 @@ from codesign.errors import DomainError, GradientError
 from codesign.pose import look_at
 from codesign.render import Camera, MitsubaScene, light
 from codesign.render.charts import chart_of, emissive_mesh
-from codesign.render.outline import Segments
+from codesign.render.silhouettes import Segments
 from codesign.types import Rays
 from scenes import textures, worlds
 from scenes.build import sky

@@ -11,12 +11,11 @@ from codesign.errors import DomainError
 from codesign.lens import Pinhole
 from codesign.render import MitsubaScene
 from codesign.render.charts import emissive_mesh
-from codesign.render.outline import Segments, outlines
-from codesign.render.outline.crossings import find_crossings
-from codesign.render.outline.intersections import Intersections
-from codesign.render.outline.overlaps import Overlaps, overlaps
-from codesign.render.outline.pairs import touching
-from codesign.render.outline.shapes import Mesh, read
+from codesign.render.silhouettes import Segments, outlines
+from codesign.render.silhouettes.crossings import Overlaps, find_crossings, overlaps
+from codesign.render.silhouettes.edges import touching
+from codesign.render.silhouettes.intersections import Intersections
+from codesign.render.silhouettes.shapes import Mesh, read
 from scenes.silhouettes import smooth
 from studies.silhouettes.task import STEPS, Task
 

@@ -8,7 +8,7 @@ import torch
 from codesign import backend
 from codesign.errors import DomainError
 from codesign.render.charts import emissive_mesh
-from codesign.render.outline.curves import DEEPEST, EPS, PARTS, Circles, Cylinders, Segments, Spheres
+from codesign.render.silhouettes.curves import DEEPEST, EPS, PARTS, Circles, Cylinders, Segments, Spheres
 
 F64 = torch.float64
 EYE = torch.tensor([0.3, -2.0, 0.4], dtype=F64)

@@ -9,9 +9,8 @@ import torch
 from codesign import backend
 from codesign.render import MitsubaScene
 from codesign.render.charts import emissive_mesh
-from codesign.render.outline import Circles, Segments, mesh_edges
-from codesign.render.outline.edges import segments
-from codesign.render.outline.joints import edges_once, rims_once
+from codesign.render.silhouettes import Circles, Segments, mesh_edges
+from codesign.render.silhouettes.edges import edges_once, rims_once, segments
 from scenes.build import pole
 
 F64 = torch.float64

@@ -9,8 +9,9 @@ import torch
 
 from codesign import backend, lens, pose, render
 from codesign.errors import DomainError
-from codesign.render import MitsubaScene, unlisted
+from codesign.render import MitsubaScene
 from codesign.render.charts import emissive_mesh
+from codesign.render.silhouettes import occlusion_check
 from scenes.silhouettes import smooth
 from studies.silhouettes import judge
 from studies.silhouettes.task import PITCH_MM, SIZE_PX, STEPS, Task
@@ -249,8 +250,8 @@ def test_a_view_is_looked_at_though_another_was_right(twist, nearer, monkeypatch
     world = render.MovingScene(static, {"ball": (ball, place)})
     camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.35, 4)
     looks = []
-    listings = unlisted.listings
-    monkeypatch.setattr(unlisted, "listings", lambda *given: looks.append(given) or listings(*given))
+    listings = occlusion_check.listings
+    monkeypatch.setattr(occlusion_check, "listings", lambda *given: looks.append(given) or listings(*given))
     for share in (0.0, 1e-3):
         small = pose.se3_exp(share * torch.tensor([twist], dtype=F64))
         render.frames(camera, world, small, gradient="boundary")

@@ -10,7 +10,7 @@ from codesign import lens, render
 from codesign.errors import DomainError
 from codesign.pose import look_at, se3_exp
 from codesign.render import Camera, TexturedPlane, true_flow
-from codesign.render.sampling import film_pupil_pattern
+from codesign.render.film import film_pupil_pattern
 from scenes import textures, worlds
 
 D = torch.float64

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from codesign.errors import DomainError, ShapeError
-from codesign.render.vertex_light import vertex_attribute
+from codesign.render.mitsuba_shapes import vertex_attribute
 
 FILES_UNCHECKED = ("ply", "serialized")  # Mitsuba itself follows their faces to vertices that are not there
 RADIANCE = ("value", "data", "scale")  # last part of the names of what an emitter shines with

@@ -18,14 +18,12 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.pose import apply
-from codesign.render.camera import Camera
-from codesign.render.curve_points import CurvePoints, Views, known_beside, piece_rad
-from codesign.render.film import coarse_pixels
-from codesign.render.jumps import SAFETY, jumps
-from codesign.render.looked import MOST, Looked, looked_at, nearest_m
+from codesign.render.camera import Camera, coloured_rays
+from codesign.render.film import coarse_pixels, film_pupil_pattern
 from codesign.render.moving import parts, says_distance
-from codesign.render.rays import coloured_rays
-from codesign.render.sampling import film_pupil_pattern
+from codesign.render.silhouettes.certified_views import MOST, Looked, looked_at, nearest_m
+from codesign.render.silhouettes.curve_points import CurvePoints, Views, known_beside, piece_rad
+from codesign.render.silhouettes.jumps import SAFETY, jumps
 from codesign.render.wavefront import look
 
 LINES = 48  # each way across the film

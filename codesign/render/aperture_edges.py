@@ -13,9 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign.render.camera import Camera
+from codesign.render.camera import Camera, coloured_rays
 from codesign.render.moving import cameras_in_parts, in_one_row
-from codesign.render.rays import coloured_rays
 from codesign.render.wavefront import look
 
 FIELDS = 6  # cells across the sensor, in each of which the edge is looked for
@@ -26,7 +25,7 @@ DARK = 1e-9
 WHOLE = 1 - 1e-9  # share of light from which nothing is taken away
 
 
-def rim_term(camera: Camera, scene: Any, T_world_cam: Tensor, samples: int) -> Tensor | None:
+def aperture_edge_term(camera: Camera, scene: Any, T_world_cam: Tensor, samples: int) -> Tensor | None:
     """Zero-valued image [..., T, *film.shape] whose gradient is that of the light which apertures take away; None where
     the edge cannot be found so (an obstruction in the pupil's middle).
 

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign.render.outline.crossings import AROUND, Crossings
-from codesign.render.outline.curves import (
+from codesign.render.silhouettes.crossings import AROUND, Crossings
+from codesign.render.silhouettes.curves import (
     ASIDE_RAD,
     DEEPEST,
     EPS,
@@ -18,7 +18,7 @@ from codesign.render.outline.curves import (
     pieces_of,
     rounding_rad,
 )
-from codesign.render.outline.shapes import Ball, Disk, Mesh, Shape, Tube
+from codesign.render.silhouettes.shapes import Ball, Disk, Mesh, Shape, Tube
 
 TURNS = 6  # of Newton's method, from chords of a hundredth of a circle
 FOUND = 1e-9  # share of the radius by which a point may miss the surfaces

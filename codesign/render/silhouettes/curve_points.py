@@ -14,7 +14,7 @@ from torch import Tensor
 
 from codesign.pose import apply, inverse
 from codesign.render.camera import Camera
-from codesign.render.sampling import film_pupil_pattern
+from codesign.render.film import film_pupil_pattern
 
 # length of a piece on the film, and its angle, at most: one that reaches behind the camera is left out
 PIECE_PX = 8.0

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from codesign.pose import inverse
-from codesign.render.curve_points import Views
+from codesign.render.silhouettes.curve_points import Views
 
 WITHIN_PX = 2.0
 APART_PX = 0.1  # parts of a moving scene against one another: what touched nothing does not touch then

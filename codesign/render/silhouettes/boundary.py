@@ -17,12 +17,11 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.pose import apply, inverse
-from codesign.render.camera import Camera
-from codesign.render.curve_points import Views, curve_points
-from codesign.render.jumps import jumps
+from codesign.render.camera import Camera, coloured_rays
 from codesign.render.moving import cameras_in_parts, in_one_row, parts
-from codesign.render.rays import coloured_rays
-from codesign.render.unlisted import check_listed
+from codesign.render.silhouettes.curve_points import Views, curve_points
+from codesign.render.silhouettes.jumps import jumps
+from codesign.render.silhouettes.occlusion_check import check_listed
 
 # for the question whether there are jumps at all: points per pixel of curve, and share of the light
 GLANCE_PER_PX = 0.3

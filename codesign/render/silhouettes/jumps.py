@@ -3,6 +3,8 @@
 A point is hidden when the rays that pass it on either side meet something before it. They pass aside, where a slanting
 surface lies nearer than at the curve itself: where that is in doubt a second pair of rays, twice as far aside, tells
 how the surface goes on, and it is taken back to the curve along a straight line. What is left is rounding of float32.
+Faces narrower than radiance is read beside their edges (slivers) are read along their normal: rays from the camera would
+pass over them, and both their edges would tell of one jump.
 """
 
 import math
@@ -11,12 +13,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from codesign.pose import apply, inverse
-from codesign.render.camera import Camera
-from codesign.render.curve_points import IN_FRONT_M, NEARBY, CurvePoints
-from codesign.render.rays import coloured_rays
-from codesign.render.slivers import of_slivers
+from codesign.render.camera import Camera, coloured_rays
+from codesign.render.silhouettes.curve_points import IN_FRONT_M, NEARBY, CurvePoints
 from codesign.render.wavefront import look
 
 # px, of the film position for the derivative of a ray; the change up to which its root is taken as found, since the
@@ -28,6 +29,10 @@ DOUBTFUL = 0.05  # share of the distance by which a slanting surface may come ne
 ROUNDING = 2.0**-21  # of float32 distances, four units in the last place
 SAFETY = 2.0
 SAME = 0.05  # share of the contrast of a sliver by which what is seen beyond it may differ from what is before it
+NARROW = 4.0  # times as wide as radiance is read to the side: wider faces are met
+WITHIN = 0.1  # share of the way from an edge to the corner beyond it at which a face is read
+FLOAT32 = 2.0**-20  # of coordinates, by which a reading keeps clear of edge and face
+THIN = 1e-9
 
 
 @dataclass(frozen=True)
@@ -139,7 +144,7 @@ def _sides(camera, scene, cameras, points, y, on, x, aside):
         steepness = change.abs().amax(0) / (points.near_rad * reach)[rows]
         rounding[rows] *= 1 + steepness
     seen = nearest.amax(0) > reach - rounding
-    side, row, own = of_slivers(scene, cameras, points, y, on, origin.mean(0), direction)
+    side, row, own = sliver_radiance(scene, cameras, points, y, on, origin.mean(0), direction)
     # what is narrower than a reading as a whole is left alone: nearly the same is seen on both its sides
     differ = (light[0, row] - light[1, row]).abs() > SAME * (own - light[side, row]).abs()
     side, row, own = side[differ], row[differ], own[differ]
@@ -214,3 +219,49 @@ def _pixels(film, x, window):
     inside = (column >= 0) & (column < film.width_px) & (row >= 0) & (row < film.height_px)
     number = window * (film.width_px * film.height_px) + row * film.width_px + column
     return torch.where(inside, number, -1.0).long()
+
+
+def sliver_radiance(
+    scene: object, cameras: Tensor, points: CurvePoints, y: Tensor, on: Tensor, origin: Tensor, sides: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(side [k], row [k], radiance [k]) where the face that is seen beside a straight edge is a sliver: read along its
+    normal, since radiance is the same in all directions.
+
+    Args: cameras: [parts, F, 4, 4]. y, on: [n, 3], the points and the same curves a little further on, in camera axes.
+      origin: [n, 3] of the rays to the points; sides: [2, n, 3], directions of the rays before and behind them.
+    """
+    known = torch.nonzero(points.apex_m.isfinite().all(2).any(1))[:, 0]
+    points, y, on, origin, sides = points[known], y[known], on[known], origin[known], sides[:, known]
+    back = inverse(cameras)[points.part, points.frame]
+    apex = apply(back, points.apex_m)
+    ahead = normalize(y - origin, dim=1)
+    edge = on - y
+    across = normalize(torch.linalg.cross(edge, ahead), dim=1)
+    across = across * ((sides[1] - sides[0]) * across).sum(1, keepdim=True).sign()
+    away = apex - origin[:, None]
+    width = (away * across[:, None]).sum(2) / (away * ahead[:, None]).sum(2)
+    normal = torch.linalg.cross(edge[:, None].expand_as(apex), apex - y[:, None])
+    facing = (normal * ahead[:, None]).sum(2)
+    nearer = -(normal * across[:, None]).sum(2) / torch.where(facing.abs() > 0, facing, THIN)  # per angle
+    none = torch.zeros(0, dtype=torch.long)
+    found = [(none, none, none.double())]
+    for side, sign in ((0, -1.0), (1, 1.0)):
+        there = width * sign > 0
+        seen = torch.where(there, nearer * sign, torch.inf).argmin(1)
+        rows = torch.nonzero(there.any(1))[:, 0]
+        face = seen[rows]
+        reach = (y - origin)[rows].norm(dim=1)
+        low = width[rows, face].abs() < NARROW * points.aside_rad[rows]
+        rows, face, reach = rows[low], face[low], reach[low]
+        if not rows.numel():
+            continue
+        way = apex[rows, face] - y[rows]
+        least = FLOAT32 * (points.world_m[rows].norm(dim=1) + reach)
+        up = normalize(normal[rows, face], dim=1) * -facing[rows, face].sign()[:, None]
+        share = (least / way.norm(dim=1).clamp_min(THIN)).clamp(WITHIN, 0.5)
+        height = torch.maximum(least, 1e-3 * way.norm(dim=1))
+        start = y[rows] + share[:, None] * way + height[:, None] * up
+        light, distance = look(scene, cameras, points.frame[rows], start, -up)
+        met = torch.nonzero((distance - height).abs() < least)[:, 0]
+        found.append((torch.full_like(met, side), known[rows[met]], light[met]))
+    return tuple(torch.cat(column) for column in zip(*found, strict=True))

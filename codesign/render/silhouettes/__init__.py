@@ -6,13 +6,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from codesign.render.outline.crossings import find_crossings
-from codesign.render.outline.curves import Circles, Cylinders, Segments, Spheres
-from codesign.render.outline.edges import mesh_edges, segments
-from codesign.render.outline.intersections import on_surfaces
-from codesign.render.outline.joints import edges_once, rims_once, tolerance
-from codesign.render.outline.meridians import Meridians
-from codesign.render.outline.shapes import Ball, Disk, Mesh, Shape, Tube
+from codesign.render.silhouettes.crossings import find_crossings
+from codesign.render.silhouettes.curves import Circles, Cylinders, Meridians, Segments, Spheres
+from codesign.render.silhouettes.edges import edges_once, mesh_edges, rims_once, segments, tolerance
+from codesign.render.silhouettes.intersections import on_surfaces
+from codesign.render.silhouettes.shapes import Ball, Disk, Mesh, Shape, Tube
 
 
 def outlines(shapes: list[Shape]) -> list[Any]:
