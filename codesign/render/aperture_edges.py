@@ -8,13 +8,12 @@ b - a is the edge at that angle and field point.
 """
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from codesign.render.camera import Camera, coloured_rays
-from codesign.render.moving import cameras_in_parts, in_one_row
+from codesign.render.moving import Views
 from codesign.render.wavefront import look
 
 FIELDS = 6  # cells across the sensor, in each of which the edge is looked for
@@ -25,34 +24,35 @@ DARK = 1e-9
 WHOLE = 1 - 1e-9  # share of light from which nothing is taken away
 
 
-def aperture_edge_term(camera: Camera, scene: Any, T_world_cam: Tensor, samples: int) -> Tensor | None:
+def aperture_edge_term(camera: Camera, views: Views, samples: int) -> Tensor | None:
     """Zero-valued image [..., T, *film.shape] whose gradient is that of the light which apertures take away; None where
     the edge cannot be found so (an obstruction in the pupil's middle).
 
-    Args: camera, scene, T_world_cam as for ``frames``; samples: points of the edge per pixel, for those pixels whose
-      pupil has one.
+    Args:
+      camera: as for ``frames``.
+      views: of a scene.
+      samples: points of the edge per pixel, for those pixels whose pupil has one.
     Gradient: to what the camera's lens says of ``Rays.weight``.
     """
-    shape = (*T_world_cam.shape[:-2], *camera.film.shape)
+    shape = (*views.batch, *camera.film.shape)
+    dtype = views.scene.dtype
     with torch.no_grad():
         found = _edge_points(camera, samples)
     if found is None:
         return None
     film_px, pupil, colour, pixel, size = found
     if not len(pixel):
-        return torch.zeros(shape, dtype=scene.dtype)
+        return torch.zeros(shape, dtype=dtype)
     origin, direction, weight = coloured_rays(camera, film_px, pupil, colour)
     with torch.no_grad():
-        scene, T_world_cam = in_one_row(scene, T_world_cam)
-        cameras = torch.stack([pose.double() for pose in cameras_in_parts(scene, T_world_cam)])
-        count = cameras.shape[1]
+        count = views.cameras.shape[1]
         frame = torch.arange(count).repeat_interleave(len(pixel))
         origin, direction = (v.detach().repeat(count, 1) for v in (origin, direction))
-        light, _ = look(scene, cameras, frame, origin, direction)
+        light, _ = look(views.scene, views.cameras, frame, origin, direction)
         light = light.reshape(count, -1) * (size / samples)
     taken = light * (weight - weight.detach())
     image = torch.zeros(count, math.prod(camera.film.shape), dtype=taken.dtype).index_add(1, pixel, taken)
-    return image.reshape(shape).to(scene.dtype)
+    return image.reshape(shape).to(dtype)
 
 
 def _edge_points(camera, samples):

@@ -9,9 +9,9 @@ from codesign.pose import Poses
 from codesign.render.camera import Camera
 from codesign.render.film import coarse_pixels
 from codesign.render.hits import dot, of_part, turned
-from codesign.render.moving import MovingScene, Scene, in_one_row
-from codesign.render.truth import cameras_of, hits_of
-from codesign.render.wavefront import shade
+from codesign.render.moving import MovingScene, Scene, views_of
+from codesign.render.truth import hits_of
+from codesign.render.wavefront import shaded
 
 CLOSEST_M = 1e-5  # for lenses without an aperture
 BACKS = 0.5  # of the rays of a frame
@@ -31,12 +31,12 @@ def check_view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Poses, e
       that are lit from behind, as planes without sides are, pass); or a radiance is NaN, infinite or
       negative.
     """
-    scene, T_world_cam = in_one_row(scene, T_world_cam)
+    views = views_of(scene, T_world_cam)
     with torch.no_grad():
         pixels = coarse_pixels(camera.film, check_whole(every_px, "every_px"))
         rays = camera.chief_rays(pixels)
         rays = replace(rays, weight=(rays.weight > 0).to(rays.weight))
-        light = shade(rays, scene, T_world_cam, 1)
+        light = shaded(rays, views, 1).flatten(0, -2)
         if not bool((light.isfinite() & (light >= 0)).all()):
             wrong = ~(light.isfinite() & (light >= 0))
             frame, ray = wrong.nonzero()[0].tolist()
@@ -45,10 +45,9 @@ def check_view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Poses, e
                 f"({_place(pixels[ray])}); make every radiance of the scene finite and at least 0."
             )
         nearest_m = max(CLOSEST_M, getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2)
-        cameras = cameras_of(scene, T_world_cam)
-        hits = hits_of(rays, scene, cameras)
-        along = dot(turned(of_part(hits, cameras), rays.direction.double()), hits.normal)
-        for frame in range(T_world_cam.shape[0]):
+        hits = hits_of(rays, views.scene, views.cameras)
+        along = dot(turned(of_part(hits, views.cameras), rays.direction.double()), hits.normal)
+        for frame in range(len(light)):
             _check_frame(
                 frame, hits.part[frame] >= 0, hits.distance_m[frame], along[frame], light[frame], nearest_m
             )

@@ -2,6 +2,7 @@
 sequence."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -145,39 +146,56 @@ def scenes_and_poses(scene: Any, T_world_cam: Poses) -> list[tuple[Any, Tensor]]
     return list(zip(scene, T_world_cam, strict=True))
 
 
-def in_one_row(scene: Any, T_world_cam: Poses, rays: Rays | None = None) -> tuple[Any, Tensor]:
-    """The frames of a batch of trajectories [..., T, 4, 4] as one sequence: the scene for it, and poses
-    [N, 4, 4]; on one device with the rays. Raises: DomainError for what is no scene."""
+@dataclass(frozen=True)
+class Views:
+    """A scene as all frames of all trajectories see it, N frames one after the other.
+
+    scene: with the poses of its objects in these frames. T_world_part: [parts, N, 4, 4], the identity for the static
+    part. cameras: [parts, N, 4, 4], poses of the camera in the axes of every part. batch: (..., T). float64.
+    """
+
+    scene: Any
+    T_world_part: Tensor
+    cameras: Tensor
+    batch: tuple[int, ...]
+
+    @property
+    def T_world_cam(self) -> Tensor:
+        """Poses of the camera in the world, [N, 4, 4]."""
+        return self.cameras[0]
+
+    def detach(self) -> "Views":
+        """The same views without a gradient to the camera."""
+        return replace(self, cameras=self.cameras.detach())
+
+
+def views_of(scene: Any, T_world_cam: Poses) -> Views:
+    """Views of a scene from trajectories [..., T, 4, 4]: the one place where poses are checked and brought into the
+    axes of every part.
+
+    Raises: DomainError for what is no scene or no poses; ShapeError unless every object has a pose for every frame.
+    """
     for part in parts(scene):
         check_kind(part)
-    T_world_cam = as_poses(T_world_cam)
-    if rays is not None and rays.weight.device != T_world_cam.device:
-        raise DomainError(
-            f"poses are on {T_world_cam.device}, the rays of the camera on {rays.weight.device}; move one to "
-            "the other with .to(device)."
-        )
-    check_poses(T_world_cam)
-    if isinstance(scene, MovingScene):
-        scene = scene.in_one_row(T_world_cam.shape[:-2])
-    return scene, T_world_cam.reshape(-1, 4, 4)
-
-
-def poses_of_parts(scene: Any, count: int) -> Tensor:
-    """T_world_part [parts, T, 4, 4], float64: the identity for the static scene. Raises: ShapeError unless
-    every object has ``count`` poses."""
-    still = torch.eye(4, dtype=torch.float64).expand(count, 4, 4)
+    T_world_cam = check_poses(T_world_cam)
+    batch = tuple(T_world_cam.shape[:-2])
+    cameras = T_world_cam.reshape(-1, 4, 4).double()
+    still = torch.eye(4, dtype=torch.float64).expand(len(cameras), 4, 4)
     if not isinstance(scene, MovingScene):
-        return still[None]
-    scene.check_length(count)
-    return torch.stack([still, *(poses.double() for poses in scene.T_world_object)])
+        return Views(scene, still[None], cameras[None], batch)
+    scene = scene.in_one_row(batch)
+    objects = [poses.double() for poses in scene.T_world_object]
+    seen = [_product(inverse(poses.to(cameras.device)), cameras) for poses in objects]
+    return Views(scene, torch.stack([still, *objects]), torch.stack([cameras, *seen]), batch)
 
 
-def cameras_in_parts(scene: Any, T_world_cam: Tensor) -> list[Tensor]:
-    """Poses of the camera [T, 4, 4] in the axes of every part: as given for the static one, float64 for
-    objects."""
-    objects = poses_of_parts(scene, T_world_cam.shape[0])[1:]
-    cameras = T_world_cam.double()
-    return [T_world_cam, *(_product(inverse(poses.to(cameras.device)), cameras) for poses in objects)]
+def check_device(rays: Rays, cameras: Tensor) -> None:
+    """Raise DomainError unless the rays of a camera are on one device with its poses."""
+    if rays.weight.device != cameras.device:
+        raise DomainError(
+            f"poses are on {cameras.device}, the rays of the camera on {rays.weight.device}; move one to the other "
+            "with .to(device)."
+        )
 
 
 def _product(a, b):

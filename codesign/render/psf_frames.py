@@ -15,9 +15,9 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from codesign.errors import DomainError, ShapeError
-from codesign.pose import Poses, as_poses
+from codesign.pose import Poses
 from codesign.render.camera import Camera
-from codesign.render.moving import MovingScene, Scene, in_one_row, scenes_and_poses
+from codesign.render.moving import MovingScene, Scene, scenes_and_poses, views_of
 from codesign.render.psf_map import SIDE, PsfMap, psf_map
 from codesign.render.wavefront import light_and_nearness
 
@@ -60,15 +60,14 @@ def psf_frames(
             f"psf frames: the map is of the film {psf.camera.film}, the camera has {camera.film}; make the map of "
             "this camera, psf_map(camera)."
         )
-    T_world_cam = as_poses(T_world_cam)
     if pairs := scenes_and_poses(scene, T_world_cam):
         return torch.stack([psf_frames(camera, one, poses, psf) for one, poses in pairs])
-    row, poses = in_one_row(scene, T_world_cam, psf.sharp)
-    light, per_m = light_and_nearness(psf.sharp, row, poses)
+    views = views_of(scene, T_world_cam)
+    light, per_m = light_and_nearness(psf.sharp, views)
     lit = (psf.sharp.weight.detach() > 0).to(light)
     numbers, step = _layers(psf, per_m.detach(), lit)
     found = [_frame(psf, *frame, lit, numbers, step) for frame in zip(light, per_m, strict=True)]
-    return torch.stack(found).reshape(*T_world_cam.shape[:-2], *camera.film.shape)
+    return torch.stack(found).reshape(*views.batch, *camera.film.shape)
 
 
 def _layers(psf, per_m, lit):

@@ -8,27 +8,20 @@ three that is right for the frames at hand.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, as_number
-from codesign.pose import Poses, as_poses, inverse, se3_exp
+from codesign.pose import Poses, inverse, se3_exp
 from codesign.render.aperture_edges import aperture_edge_term
 from codesign.render.camera import Camera
-from codesign.render.moving import (
-    MovingScene,
-    Scene,
-    at_frames,
-    cameras_in_parts,
-    in_one_row,
-    scenes_and_poses,
-)
+from codesign.render.moving import MovingScene, Scene, Views, scenes_and_poses, views_of
 from codesign.render.silhouettes.boundary import boundary_term, radiance_jumps
 from codesign.render.silhouettes.occlusion_check import reach_m
-from codesign.render.wavefront import shade
+from codesign.render.wavefront import shaded
 from codesign.types import Rays
 
 Way = Literal["interior", "boundary", "difference", "auto"]
@@ -45,21 +38,6 @@ LENS_STEP = {
     "image_distance_mm": 2e-3,
 }
 APERTURE_SAMPLES = 4  # points per pixel on the edges of apertures, for "boundary"
-PASSES = 0.05  # relative L2 distance from differences up to which a way is kept
-
-
-@dataclass(frozen=True)
-class Choice:
-    """What ``choose`` found for one group of parameters: the way to use, and the relative error of each way
-    against differences."""
-
-    way: Way
-    errors: dict[str, float]
-    noise: float
-
-    def __str__(self):
-        measured = ", ".join(f"{way} {error:.1%}" for way, error in self.errors.items())
-        return f"{self.way}: relative error against differences: {measured}; the differences themselves {self.noise:.1%}"
 
 
 def frames(
@@ -110,27 +88,23 @@ def frames(
         raise DomainError(
             f"the camera is a {type(camera).__name__}; give a render.Camera, which has a lens and a film."
         )
-    T_world_cam = as_poses(T_world_cam)
     if pairs := scenes_and_poses(scene, T_world_cam):
         rays = camera.given(rays) if gradient in PROVEN else None
         return torch.stack([frames(camera, s, poses, gradient, per_px, rays=rays) for s, poses in pairs])
-    if gradient in ("auto", "difference"):
-        row = in_one_row(scene, T_world_cam)
-        if gradient == "auto":
-            gradient = settled(camera, *row)
-        if gradient == "difference":
-            return by_differences(camera, *row).reshape(*T_world_cam.shape[:-2], *camera.film.shape)
+    views = views_of(scene, T_world_cam)
+    if gradient == "auto":
+        gradient = cheapest(camera, views)
+    if gradient == "difference":
+        return by_differences(camera, views)
     if gradient == "interior":
-        return image(camera, scene, T_world_cam, rays)
+        return image(camera, views, rays)
     rays = camera.given(rays)
     taken = None
     if rays.weight.requires_grad:
-        taken = aperture_edge_term(
-            camera, scene, T_world_cam, max(APERTURE_SAMPLES, camera.samples_per_pixel // 8)
-        )
+        taken = aperture_edge_term(camera, views, max(APERTURE_SAMPLES, camera.samples_per_pixel // 8))
     if taken is not None:
         rays = _with_still_apertures(camera, rays)
-    found = image(camera, scene, T_world_cam, rays) + boundary_term(camera, scene, T_world_cam, per_px)
+    found = image(camera, views, rays) + boundary_term(camera, views, per_px)
     return found if taken is None else found + taken
 
 
@@ -142,37 +116,42 @@ def _with_still_apertures(camera, rays):
     return replace(rays, weight=weight)
 
 
-def image(camera: Camera, scene: Any, T_world_cam: Tensor, rays: Rays | None = None) -> Tensor:
+def image(camera: Camera, views: Views, rays: Rays | None = None) -> Tensor:
     """Frames [..., T, *film.shape] with their interior gradient."""
-    return shade(camera.given(rays), scene, T_world_cam, camera.samples_per_pixel).reshape(
-        *T_world_cam.shape[:-2], *camera.film.shape
-    )
+    found = shaded(camera.given(rays), views, camera.samples_per_pixel)
+    return found.reshape(*views.batch, *camera.film.shape)
 
 
-def by_differences(camera: Camera, scene: Any, T_world_cam: Tensor) -> Tensor:
+def by_differences(camera: Camera, views: Views) -> Tensor:
     """Frames whose gradient to poses and lens tensors is that of central differences with common random
     numbers."""
-    if any(pose.requires_grad for pose in getattr(scene, "T_world_object", ())):
+    if _objects_ask(views.scene):
         raise DomainError(
             "gradient 'difference' goes to camera and lens only, but the pose of an object asks for one; "
             "use 'boundary'."
         )
     with torch.no_grad():
-        found = first = image(camera, scene, T_world_cam)
-    if T_world_cam.requires_grad:
-        twist = _twist(T_world_cam)
-        steps = pose_steps(camera, scene, T_world_cam)
+        found = first = image(camera, views)
+    if views.cameras.requires_grad:
+        twist = _twist(views.T_world_cam).reshape(*views.batch, 6)
+        steps = pose_steps(camera, views)
         for k in range(6):
-            slope = pose_difference(camera, scene, T_world_cam, k, steps[k])
-            found = found + slope * twist[:, k].to(first).reshape(-1, *[1] * (first.ndim - 1))
+            slope = pose_difference(camera, views, k, steps[k])
+            weight = twist[..., k].to(first)
+            found = found + slope * weight.reshape(*views.batch, *[1] * len(camera.film.shape))
     known = lens_tensors(camera.lens)
     _check_known(camera.lens, known)
     for name, tensor in known.items():
         for i in range(tensor.numel()):
-            slope = lens_difference(camera, scene, T_world_cam, name, i)
+            slope = lens_difference(camera, views, name, i)
             value = tensor.reshape(-1)[i]
             found = found + slope * (value - value.detach()).to(first)
     return found
+
+
+def _objects_ask(scene):
+    """Whether the pose of an object asks for a gradient."""
+    return any(pose.requires_grad for pose in getattr(scene, "T_world_object", ()))
 
 
 def _twist(T_world_cam):
@@ -183,25 +162,26 @@ def _twist(T_world_cam):
     return torch.stack([*small[:, :3, 3].unbind(1), turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], 1)
 
 
-def pose_steps(camera: Camera, scene: Any, T_world_cam: Tensor) -> list[float]:
+def pose_steps(camera: Camera, views: Views) -> list[float]:
     """Steps of differences to the six components of a twist, metres and radians: at most STEP_PX of motion on the film,
     for translations at the median distance of what the first frame shows."""
     with torch.no_grad():
         turn = STEP_PX * abs(camera.slope_per_px())
-        move = turn * reach_m(camera, scene, cameras_in_parts(at_frames(scene, [0]), T_world_cam[:1]))
+        move = turn * reach_m(camera, views.scene, views.cameras[:, :1])
     return 3 * [min(POSE_STEP, move)] + 3 * [min(POSE_STEP, turn)]
 
 
-def pose_difference(camera: Camera, scene: Any, T_world_cam: Tensor, k: int, size: float) -> Tensor:
+def pose_difference(camera: Camera, views: Views, k: int, size: float) -> Tensor:
     """Change of the frames per unit of the k-th component of the twist of every pose, by central
     differences over ``size`` either way."""
     step = torch.zeros(6, dtype=torch.float64)
     step[k] = size
     with torch.no_grad():
         ahead, behind = (
-            image(camera, scene, T_world_cam.double() @ se3_exp(sign * step[None])) for sign in (1, -1)
+            image(camera, views_of(views.scene, views.T_world_cam @ se3_exp(sign * step[None])))
+            for sign in (1, -1)
         )
-    return (ahead - behind) / (2 * size)
+    return ((ahead - behind) / (2 * size)).reshape(*views.batch, *camera.film.shape)
 
 
 def lens_tensors(lens: Any) -> dict[str, Tensor]:
@@ -235,7 +215,7 @@ def _check_known(lens, known):
             )
 
 
-def lens_difference(camera: Camera, scene: Any, T_world_cam: Tensor, name: str, i: int) -> Tensor:
+def lens_difference(camera: Camera, views: Views, name: str, i: int) -> Tensor:
     """Change of the frames per unit of one number of the lens, by central differences."""
     if name not in LENS_STEP:
         raise DomainError(
@@ -249,95 +229,26 @@ def lens_difference(camera: Camera, scene: Any, T_world_cam: Tensor, name: str, 
         ahead, behind = (
             image(
                 camera.with_lens(camera.lens.replace(**{name: value + sign * shift.reshape(value.shape)})),
-                scene,
-                T_world_cam,
+                views,
             )
             for sign in (1, -1)
         )
     return (ahead - behind) / (2 * step)
 
 
-def settled(camera: Camera, scene: Any, T_world_cam: Tensor) -> Way:
+def cheapest(camera: Camera, views: Views) -> Way:
     """The cheapest way that is right for these very frames: "interior" where no edge or outline in them parts two
     radiances, "boundary" where one does, "difference" where the scene does not list them."""
     middle = camera.film.middle_px[None]
     ray = camera.rays_through(middle, torch.zeros_like(middle))
-    asked = [T_world_cam, ray.origin_m, ray.direction, ray.weight, *lens_tensors(camera.lens).values()]
-    objects = any(pose.requires_grad for pose in getattr(scene, "T_world_object", ()))
+    asked = [views.cameras, ray.origin_m, ray.direction, ray.weight, *lens_tensors(camera.lens).values()]
+    objects = _objects_ask(views.scene)
     if not (objects or any(tensor.requires_grad for tensor in asked)):
         return "interior"
     try:
-        return "boundary" if radiance_jumps(camera, scene, T_world_cam) else "interior"
+        return "boundary" if radiance_jumps(camera, views) else "interior"
     except DomainError:
-        if objects:  # which differences do not reach
+        # differences do not reach objects
+        if objects:
             raise
         return "difference"
-
-
-def choose(camera: Camera, scene: Any, T_world_cam: Tensor, seed: int = 0) -> dict[str, Choice]:
-    """Choice per group of parameters ("pose" and each lens tensor that asks for gradients): the cheapest way
-    that agrees with differences.
-
-    A random smooth weighting of the pixels stands for the loss; differences are taken at two seeds of the
-    camera, whose disagreement is their noise. A way passes within PASSES plus that noise, of which no more
-    than PASSES counts. Two frames are looked at.
-    """
-    # a lens with variables makes its tensors anew whenever it is asked: differentiate one that holds them
-    held = {
-        name: value.detach().clone().requires_grad_() for name, value in lens_tensors(camera.lens).items()
-    }
-    if held and hasattr(camera.lens, "replace"):
-        camera = camera.with_lens(camera.lens.replace(**held))
-    which = [0, -1] if T_world_cam.shape[0] > 1 else [0]
-    scene = at_frames(scene, which)
-    poses = T_world_cam.detach()[which]
-    generator = torch.Generator().manual_seed(seed)
-    height, width = camera.film.shape[-2:]
-    coarse = torch.randn(1, 1, max(2, height // 6), max(2, width // 6), generator=generator)
-    weight = torch.nn.functional.interpolate(
-        coarse, size=(height, width), mode="bilinear", align_corners=True
-    )[0, 0]
-    other = camera.with_seed(camera.seed + 1)
-    found = {}
-    for group in [*(["pose"] if T_world_cam.requires_grad else []), *lens_tensors(camera.lens)]:
-        truth, again = (_by_group(c, scene, poses, group, weight) for c in (camera, other))
-        noise = float((truth - again).norm() / truth.norm().clamp_min(1e-30)) / 2
-        errors = {}
-        for way in PROVEN:
-            try:
-                errors[way] = float(
-                    (_by_way(camera, scene, poses, group, weight, way) - truth).norm()
-                    / truth.norm().clamp_min(1e-30)
-                )
-            except DomainError:
-                continue  # the scene has no known outline
-            if errors[way] <= PASSES + min(
-                noise, PASSES
-            ):  # differences that do not know better than that judge nothing
-                found[group] = Choice(way, errors, noise)
-                break
-        else:
-            found[group] = Choice("difference", errors, noise)
-    return found
-
-
-def _by_group(camera, scene, poses, group, weight):
-    if group == "pose":
-        steps = pose_steps(camera, scene, poses)
-        return torch.stack(
-            [(pose_difference(camera, scene, poses, k, steps[k]) * weight).sum((-2, -1)) for k in range(6)]
-        ).double()
-    return torch.stack(
-        [
-            (lens_difference(camera, scene, poses, group, i) * weight).sum()
-            for i in range(getattr(camera.lens, group).numel())
-        ]
-    ).double()
-
-
-def _by_way(camera, scene, poses, group, weight, way):
-    twist = torch.zeros(poses.shape[0], 6, dtype=torch.float64, requires_grad=True)
-    pictures = frames(camera, scene, poses.double() @ se3_exp(twist), way)
-    target = twist if group == "pose" else getattr(camera.lens, group)
-    (gradient,) = torch.autograd.grad((pictures * weight).sum(), target)
-    return gradient.T.double() if group == "pose" else gradient.reshape(-1).double()

@@ -19,7 +19,7 @@ from codesign.errors import DomainError, as_number, check_finite, check_whole
 from codesign.pose import Poses, check_poses
 from codesign.render.camera import Camera
 from codesign.render.film import coarse_pixels
-from codesign.render.moving import MovingScene, Scene, at_frames, in_one_row
+from codesign.render.moving import MovingScene, Scene, at_frames, views_of
 from codesign.render.truth import track
 from codesign.render.wavefront import shade
 
@@ -196,12 +196,12 @@ def _displacement_px(camera, scene, trajectory, ends, grids, largest_px):
     """The largest displacement within a step, px; infinite when a point passes the camera. The fine grid is
     asked only when the coarse one finds no more than allowed."""
     at = torch.tensor([ends[0], (ends[0] + ends[1]) / 2, ends[1]], dtype=torch.float64)
-    shown, poses = in_one_row(_at(scene, at), trajectory(at))
-    firsts = torch.arange(0, poses.shape[0], at.numel())[:, None]
+    views = views_of(_at(scene, at), trajectory(at))
+    firsts = torch.arange(0, views.cameras.shape[1], at.numel())[:, None]
     largest = 0.0
     for (pixels, rays), pairs in zip(grids, (((0, 1), (0, 2), (2, 0)), ((0, 2), (2, 0))), strict=True):
         now, later = ((firsts + torch.tensor(column)).reshape(-1) for column in zip(*pairs, strict=True))
-        found = track(camera, shown, poses, now, later, pixels, rays)
+        found = track(camera, views, now, later, pixels, rays)
         lost = (found.hits.part >= 0) & ~found.valid
         largest = max(
             largest,

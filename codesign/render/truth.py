@@ -13,17 +13,10 @@ import torch
 from torch import Tensor
 
 from codesign.errors import ShapeError, as_number
-from codesign.pose import Poses, as_poses, check_poses, inverse
+from codesign.pose import Poses, inverse
 from codesign.render.camera import Camera, project
 from codesign.render.hits import Hits, carried, dot, first_hits, of_part, turned
-from codesign.render.moving import (
-    MovingScene,
-    Scene,
-    cameras_in_parts,
-    in_one_row,
-    poses_of_parts,
-    scenes_and_poses,
-)
+from codesign.render.moving import MovingScene, Scene, Views, check_device, scenes_and_poses, views_of
 from codesign.render.projection import ProjectionTable
 from codesign.types import Rays
 
@@ -80,8 +73,9 @@ def world_points(
     Returns: points [N, 3] metres, depth [N] along the camera's z axis, valid [N].
     Gradient: to rays and poses, the surface taken as its tangent plane at the hit.
     """
-    hits = hits_of(rays, scene, cameras_of(scene, T_world_cam[None]))
-    return carried(hits, poses_of_parts(scene, 1))[0], _depth(rays, hits)[0], hits.part[0] >= 0
+    views = views_of(scene, T_world_cam[None])
+    hits = hits_of(rays, views.scene, views.cameras)
+    return carried(hits, views.T_world_part)[0], _depth(rays, hits)[0], hits.part[0] >= 0
 
 
 def view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Poses, frame: int) -> View:
@@ -89,17 +83,15 @@ def view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Poses, frame: 
 
     Gradient: points and depth to the lens, camera and object poses.
     """
-    T_world_cam = as_poses(T_world_cam)
-    batch = T_world_cam.shape[:-3]
-    count = T_world_cam.shape[-3] if T_world_cam.ndim > 2 else 0
     rays = camera.chief_rays(camera.film.pixels())
-    scene, poses = in_one_row(scene, T_world_cam, rays)
+    views = views_of(scene, T_world_cam)
+    *batch, count = views.batch
     if not -count <= as_number(frame, "view: frame") < count:
         raise ShapeError(f"view: frame {frame} of a sequence of {count}; give a number below that.")
-    rows = torch.arange(frame % count, poses.shape[0], count)
-    hits = hits_of(rays, scene, cameras_of(scene, poses)[:, rows])
+    rows = torch.arange(frame % count, views.cameras.shape[1], count)
+    hits = hits_of(rays, views.scene, views.cameras[:, rows])
     valid = hits.part >= 0
-    T_world_part = poses_of_parts(scene, poses.shape[0])[:, rows]
+    T_world_part = views.T_world_part[:, rows]
 
     def shaped(f):
         kept = torch.where(valid if f.ndim == 2 else valid[..., None], f, 0)
@@ -191,13 +183,12 @@ def truth_of_frames(
       flow where there is a frame behind (of ``count`` - 1 frames where T = count). rays: the camera's chief rays
       through all pixel centres, where they are traced already.
     """
-    T_world_cam = check_poses(T_world_cam)
     camera = table.camera
     shape = camera.film.shape
     rays = camera.chief_rays(camera.film.pixels()) if rays is None else rays
-    cameras = cameras_of(scene, T_world_cam)
+    cameras = views_of(scene, T_world_cam).cameras
     hits = hits_of(rays, scene, cameras[:, :count])
-    pairs = min(count, T_world_cam.shape[0] - 1)
+    pairs = min(count, cameras.shape[1] - 1)
     later = cameras[:, 1 : pairs + 1]
     if pairs:
         found = follow(table, hits[:pairs], later, camera.film.pixels())
@@ -235,13 +226,11 @@ class Track:
     chief: tuple[Tensor, Tensor] | None = None
 
 
-def track(
-    camera: Camera, scene: Any, T_world_cam: Tensor, now: Tensor, later: Tensor, pixels: Tensor, rays: Rays
-) -> Track:
+def track(camera: Camera, views: Views, now: Tensor, later: Tensor, pixels: Tensor, rays: Rays) -> Track:
     """Track of the pixel coordinates [P, 2] and their chief rays from frames ``now`` to frames ``later`` (numbers
     [F]) of a sequence."""
-    cameras = cameras_of(scene, T_world_cam)
-    return follow(camera, hits_of(rays, scene, cameras[:, now]), cameras[:, later], pixels)
+    hits = hits_of(rays, views.scene, views.cameras[:, now])
+    return follow(camera, hits, views.cameras[:, later], pixels)
 
 
 def follow(optics: Camera | ProjectionTable, hits: Hits, later: Tensor, pixels: Tensor) -> Track:
@@ -268,12 +257,10 @@ def later_points(rays: Rays, scene: Any, T_world_cam: Poses) -> tuple[Tensor, Te
       surface, and lies before the last camera (the point is (0, 0, 1) elsewhere).
     Gradient: to rays, camera and object poses, the surface taken as its tangent plane at the hit.
     """
-    T_world_cam = as_poses(T_world_cam)
-    scene, poses = in_one_row(scene, T_world_cam, rays)
-    length = T_world_cam.shape[-3]
-    cameras = cameras_of(scene, poses)
-    first = torch.arange(0, poses.shape[0], length)
-    return _before(hits_of(rays, scene, cameras[:, first]), cameras[:, first + length - 1])
+    views = views_of(scene, T_world_cam)
+    cameras, length = views.cameras, views.batch[-1]
+    first = torch.arange(0, cameras.shape[1], length)
+    return _before(hits_of(rays, views.scene, cameras[:, first]), cameras[:, first + length - 1])
 
 
 def _before(hits, later):
@@ -309,16 +296,15 @@ def _hidden(camera, scene, later, found):
 def _flow_truth(camera, scene, T_world_cam, stride, occlusion):
     pixels = camera.film.pixels()
     rays = camera.chief_rays(pixels)
-    T_world_cam = as_poses(T_world_cam)
-    scene, poses = in_one_row(scene, T_world_cam, rays)
-    length = T_world_cam.shape[-3]
+    views = views_of(scene, T_world_cam)
+    scene, cameras = views.scene, views.cameras
+    *batch, length = views.batch
     if not (1 <= as_number(stride, "stride") < length and stride % 1 == 0):
         raise ShapeError(
             f"true flow over {stride} pose(s) ahead needs a whole stride of at least 1 and more poses than "
             f"that, got {length}; give more poses."
         )
-    cameras = cameras_of(scene, poses)
-    starts = torch.arange(poses.shape[0]).reshape(-1, length)[:, : length - stride].reshape(-1)
+    starts = torch.arange(cameras.shape[1]).reshape(-1, length)[:, : length - stride].reshape(-1)
     flows = []
     for some in starts.split(max(1, TOGETHER // len(pixels))):
         later = cameras[:, some + stride]
@@ -326,20 +312,16 @@ def _flow_truth(camera, scene, T_world_cam, stride, occlusion):
         hidden = _hidden(camera, scene, later, found) if occlusion else torch.zeros_like(found.valid)
         flows.append(((found.to_px - pixels).mT, found.valid, hidden))
     flow, valid, hidden = (torch.cat(column) for column in zip(*flows, strict=True))
-    batch = (*T_world_cam.shape[:-3], length - stride)
+    batch = (*batch, length - stride)
     shape = camera.film.shape
     return FlowTruth(
         flow.reshape(*batch, 2, *shape), valid.reshape(*batch, *shape), hidden.reshape(*batch, *shape)
     )
 
 
-def cameras_of(scene: Any, T_world_cam: Tensor) -> Tensor:
-    """Poses of the camera in the axes of every part, [parts, T, 4, 4] float64."""
-    return torch.stack([poses.double() for poses in cameras_in_parts(scene, T_world_cam)])
-
-
 def hits_of(rays: Rays, scene: Any, cameras: Tensor) -> Hits:
     """Hits of the same rays in every frame of cameras [parts, F, 4, 4]."""
+    check_device(rays, cameras)
     return first_hits(rays.origin_m, rays.direction, rays.weight.detach() > 0, scene, cameras)
 
 

@@ -8,13 +8,10 @@ from torch import Tensor
 from codesign.backend import arrays, load, memory_bytes, run_kernel
 from codesign.errors import DomainError, ShapeError, check_whole
 from codesign.exclusive import exclusive
-from codesign.pose import Poses, as_poses
-from codesign.render.moving import MovingScene, Scene, cameras_in_parts, in_one_row, parts, says_distance
+from codesign.pose import Poses
+from codesign.render.moving import MovingScene, Scene, Views, check_device, parts, says_distance, views_of
 from codesign.render.pixel_means import Wavefront, lanes, nearest, pixel_means, placed
 from codesign.types import Rays
-
-# an edge is hidden when all beside it is nearer by this share; a face next to it comes nearer by less
-HIDDEN = 5e-3
 
 
 def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Poses, samples_per_pixel: int) -> Tensor:
@@ -25,11 +22,15 @@ def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Poses, samples_pe
     Gradient: to the rays (weights included), the poses and the poses of moving objects; the motion of
       silhouettes is not in it.
     """
-    T_world_cam = as_poses(T_world_cam)
-    batch = T_world_cam.shape[:-2]
-    scene, T_world_cam = in_one_row(scene, T_world_cam, rays)
+    return shaded(rays, views_of(scene, T_world_cam), samples_per_pixel)
+
+
+def shaded(rays: Rays, views: Views, samples_per_pixel: int) -> Tensor:
+    """As ``shade``, of views that are known already."""
+    check_device(rays, views.cameras)
+    scene = views.scene
     count = rays.weight.numel()
-    poses = T_world_cam.shape[0]
+    poses = views.cameras.shape[1]
     samples_per_pixel = check_whole(samples_per_pixel, "samples_per_pixel")
     if count % samples_per_pixel:
         raise ShapeError(
@@ -54,19 +55,21 @@ def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Poses, samples_pe
             "(frame_chunks)."
         )
     lines = [rays.origin_m.mT.to(dtype), rays.direction.mT.to(dtype), rays.weight.to(dtype)]
-    cameras = torch.stack([pose[:, :3].to(dtype) for pose in cameras_in_parts(scene, T_world_cam)])
+    cameras = views.cameras[:, :, :3].to(dtype)
     image = pixel_means(Wavefront(parts(scene), samples_per_pixel, dtype), *lines, cameras)
-    return image.reshape(*batch, -1)
+    return image.reshape(*views.batch, -1)
 
 
-def light_and_nearness(rays: Rays, scene: Scene | MovingScene, T_world_cam: Tensor) -> tuple[Tensor, Tensor]:
-    """Radiance [T, N] along rays [N] given in camera space, seen from poses [T, 4, 4], and 1 / depth [T, N] per
+def light_and_nearness(rays: Rays, views: Views) -> tuple[Tensor, Tensor]:
+    """Radiance [T, N] along rays [N] given in camera space, seen in views of T frames, and 1 / depth [T, N] per
     metre of what they meet, along the camera's axis; 0 where they meet nothing. The rays' weights do not count.
 
     Gradient: of both to the rays, the poses and the poses of moving objects, as ``shade``; depth through the
     tangent plane of what is met.
     Raises: DomainError for a scene that does not say how far away its light comes from.
     """
+    check_device(rays, views.cameras)
+    scene = views.scene
     for part in parts(scene):
         if not says_distance(type(part)):
             raise DomainError(
@@ -74,10 +77,8 @@ def light_and_nearness(rays: Rays, scene: Scene | MovingScene, T_world_cam: Tens
                 "depth needs; give a MitsubaScene or a TexturedPlane, or render traced frames."
             )
     columns = [*rays.origin_m.unbind(1), *rays.direction.unbind(1)]
-    inputs = [c.to(scene.dtype) for c in columns] + [
-        pose[:, :3].to(scene.dtype) for pose in cameras_in_parts(scene, T_world_cam)
-    ]
-    shape = T_world_cam.shape[0], rays.weight.numel()
+    inputs = [c.to(scene.dtype) for c in columns] + [pose[:, :3].to(scene.dtype) for pose in views.cameras]
+    shape = views.cameras.shape[1], rays.weight.numel()
     light, nearness = run_kernel(_Depths(parts(scene)), inputs, [shape] * 2)
     return light, nearness
 

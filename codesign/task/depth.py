@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from codesign.render.hits import Hits, first_hits
-from codesign.render.moving import MovingScene, in_one_row
-from codesign.render.truth import cameras_of
+from codesign.render.moving import MovingScene, views_of
 from codesign.types import ChiefRayCamera
 
 LEVEL = 1e-6  # metres that a ray must fall per metre of depth to meet the ground
@@ -67,8 +66,9 @@ def _hits(camera, pixels, T_world_cam, scene):
         poses = T_world_cam[mine].double()
         if isinstance(world, MovingScene) and world.names:
             middle = world.T_world_object[0].shape[-3] // 2
-            world, poses = in_one_row(world.during([middle]), poses[:, None])
-        found.append(first_hits(origin[mine], direction[mine], lit[mine], world, cameras_of(world, poses)))
+            world, poses = world.during([middle]), poses[:, None]
+        views = views_of(world, poses)
+        found.append(first_hits(origin[mine], direction[mine], lit[mine], views.scene, views.cameras))
     hits = Hits(*(torch.cat([getattr(each, name) for each in found]) for name in Hits.__dataclass_fields__))
 
     def ahead(distance_m):

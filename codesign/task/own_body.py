@@ -11,7 +11,8 @@ from codesign.place import Body
 from codesign.place.requirements import check_positive
 from codesign.render import Camera, MitsubaScene, frames
 from codesign.render.charts import glowing
-from codesign.render.truth import cameras_of, hits_of
+from codesign.render.moving import views_of
+from codesign.render.truth import hits_of
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,6 @@ class OwnBody:
     def exact(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
         """[..., 1]: the same, of the pixels whose chief ray meets the body."""
         rays = camera.chief_rays(camera.film.pixels())
-        hits = hits_of(rays, self.scene, cameras_of(self.scene, T_body_cam.reshape(-1, 4, 4)))
+        hits = hits_of(rays, self.scene, views_of(self.scene, T_body_cam.reshape(-1, 4, 4)).cameras)
         covered = (hits.part >= 0).double().mean(-1).reshape(*T_body_cam.shape[:-2], 1)
         return self.largest_share - covered

@@ -3,7 +3,7 @@
 import torch
 
 from codesign.render.hits import turned
-from codesign.render.moving import cameras_in_parts, parts
+from codesign.render.moving import parts, views_of
 
 
 class Segments:
@@ -27,7 +27,7 @@ class Segments:
         number of the part that is met first. scene: as it is in these frames. T_world_cam: [F, 4, 4]."""
         owner = object_id.flatten(1)
         found = torch.full(owner.shape, -1)
-        cameras = [poses.double()[:, None] for poses in cameras_in_parts(scene, T_world_cam)]
+        cameras = views_of(scene, T_world_cam).cameras[:, :, None]
         for number, ((part, shapes, first), pose) in enumerate(zip(self._parts, cameras, strict=True)):
             met = owner == number
             if not shapes or not bool(met.any()):

@@ -18,7 +18,7 @@ from torch import Tensor
 from codesign import lens, pose, render
 from codesign.errors import DomainError
 from codesign.render.hits import first_hits
-from codesign.render.moving import cameras_in_parts
+from codesign.render.moving import views_of
 from codesign.render.sequence import Way
 
 LENSES = ("pinhole", "thin", "traced")
@@ -226,7 +226,7 @@ def nearest_m(scene: Any, optics: Any, path: Tensor, pitch_mm: float, width_px: 
     """Distance of the nearest thing that the chief rays of the film meet on the way [T, 4, 4], 1 where they meet none."""
     camera = render.Camera(optics, 4 * width_px, 4 * width_px, pitch_mm / 4, 1)
     rays = camera.rays()
-    poses = torch.stack(cameras_in_parts(scene, path))
+    poses = views_of(scene, path).cameras
     found = first_hits(rays.origin_m, rays.direction, rays.weight > 0, scene, poses).distance_m
     away = found[found.isfinite()]
     return float(away.min()) if away.numel() else 1.0

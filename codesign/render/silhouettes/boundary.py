@@ -10,7 +10,6 @@ tracing through edge sampling, SIGGRAPH Asia 2018 (the term); Reynolds' transpor
 """
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,8 +17,8 @@ from torch import Tensor
 from codesign.errors import DomainError
 from codesign.pose import apply, inverse
 from codesign.render.camera import Camera, coloured_rays
-from codesign.render.moving import cameras_in_parts, in_one_row, parts
-from codesign.render.silhouettes.curve_points import Views, curve_points
+from codesign.render.moving import Views, parts
+from codesign.render.silhouettes.curve_points import FieldOfView, curve_points
 from codesign.render.silhouettes.jumps import jumps
 from codesign.render.silhouettes.occlusion_check import check_listed
 
@@ -28,22 +27,22 @@ GLANCE_PER_PX = 0.3
 CONTRAST = 1e-3
 
 
-def boundary_term(camera: Camera, scene: Any, T_world_cam: Tensor, per_px: float = 2.5) -> Tensor:
+def boundary_term(camera: Camera, views: Views, per_px: float = 2.5) -> Tensor:
     """Zero-valued image [..., T, *film.shape] whose gradient is that of moving silhouettes and edges.
 
-    Args: camera, scene, T_world_cam as for ``frames``; every part of the scene with ``outline()`` and
-      ``radiance_and_distance``. per_px: samples per pixel length of curve.
+    Args:
+      camera: as for ``frames``.
+      views: of a scene, every part of which has ``outline()`` and ``radiance_and_distance``.
+      per_px: samples per pixel length of curve.
     Gradient: lens, poses, and poses of moving objects, each of which is rigid.
     Raises: DomainError for a scene that does not know its curves.
     """
-    shape = (*T_world_cam.shape[:-2], *camera.film.shape)
-    frames_each = T_world_cam.shape[-3]
-    scene, T_world_cam = in_one_row(scene, T_world_cam)
-    cameras = torch.stack([pose.double() for pose in cameras_in_parts(scene, T_world_cam)])
-    found = _seen(camera, scene, cameras.detach(), frames_each, per_px)
+    shape = (*views.batch, *camera.film.shape)
+    dtype = views.scene.dtype
+    found = _seen(camera, views.detach(), per_px)
     if found is None or found.frame.numel() == 0:
-        return torch.zeros(shape, dtype=scene.dtype)
-    back = inverse(cameras)[found.part, found.frame]
+        return torch.zeros(shape, dtype=dtype)
+    back = inverse(views.cameras)[found.part, found.frame]
     y = apply(back, found.world_m[:, None])[:, 0]
     origin, direction, _ = coloured_rays(camera, found.film_px, found.pupil, found.colour)
     ahead = (y[:, 2:] - origin[:, 2:]) / direction[:, 2:]
@@ -53,26 +52,24 @@ def boundary_term(camera: Camera, scene: Any, T_world_cam: Tensor, per_px: float
     image = torch.zeros(math.prod(shape), dtype=torch.float64).index_add(
         0, found.pixel, found.weight * (along - along.detach())
     )
-    return image.reshape(shape).to(scene.dtype)
+    return image.reshape(shape).to(dtype)
 
 
-def radiance_jumps(camera: Camera, scene: Any, T_world_cam: Tensor) -> bool:
-    """Whether any frame [..., T, 4, 4] shows an edge or outline at which radiance jumps by more than CONTRAST of what
-    is seen there; looked at by few points. Raises: as ``boundary_term``."""
-    frames_each = T_world_cam.shape[-3]
-    scene, T_world_cam = in_one_row(scene, T_world_cam)
-    cameras = torch.stack([pose.detach().double() for pose in cameras_in_parts(scene, T_world_cam)])
-    found = _seen(camera, scene, cameras, frames_each, GLANCE_PER_PX)
+def radiance_jumps(camera: Camera, views: Views) -> bool:
+    """Whether any frame shows an edge or outline at which radiance jumps by more than CONTRAST of what is seen there;
+    looked at by few points. Raises: as ``boundary_term``."""
+    found = _seen(camera, views.detach(), GLANCE_PER_PX)
     return found is not None and bool((found.contrast > CONTRAST).any())
 
 
 @torch.no_grad()
-def _seen(camera, scene, cameras, frames_each, per_px):
+def _seen(camera, views, per_px):
     """Jumps at points on the curves of all parts, of views that are certified; None for none."""
+    scene, cameras = views.scene, views.cameras
     curves = [_curves(part) for part in parts(scene)]
-    view = Views(camera)
-    check_listed(camera, view, scene, curves, cameras)
-    points = curve_points(view, curves, cameras, frames_each, per_px)
+    field = FieldOfView(camera)
+    check_listed(camera, field, scene, curves, cameras)
+    points = curve_points(field, curves, cameras, views.batch[-1], per_px)
     found = None if points is None else jumps(camera, scene, cameras, points)
     return None if found is None else found[torch.nonzero(found.weight)[:, 0]]
 

@@ -1,4 +1,4 @@
-"""Views of a scene that were looked at, and which other views need no look of their own: those that show nothing which
+"""FieldOfView of a scene that were looked at, and which other views need no look of their own: those that show nothing which
 lies more than WITHIN_PX from what was seen, wherever it is, in view or beside it."""
 
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from codesign.pose import inverse
-from codesign.render.silhouettes.curve_points import Views
+from codesign.render.silhouettes.curve_points import FieldOfView
 
 WITHIN_PX = 2.0
 APART_PX = 0.1  # parts of a moving scene against one another: what touched nothing does not touch then
@@ -22,9 +22,9 @@ class Looked:
 
     cameras: Tensor
     nearest_m: Tensor
-    view: Views
+    view: FieldOfView
 
-    def answers_for(self, cameras: Tensor, view: Views) -> Tensor:
+    def answers_for(self, cameras: Tensor, view: FieldOfView) -> Tensor:
         """Of which views [F] of cameras [parts, F, 4, 4]."""
         moved = inverse(self.cameras)[:, None] @ cameras
         lens_px = self.view.differs_px(view, float(self.nearest_m.min()))

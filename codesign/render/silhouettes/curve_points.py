@@ -61,11 +61,11 @@ class CurvePoints:
 
 
 def curve_points(
-    view: "Views", curves: Sequence[Sequence[Any]], cameras: Tensor, frames_each: int, per_px: float
+    view: "FieldOfView", curves: Sequence[Sequence[Any]], cameras: Tensor, frames_each: int, per_px: float
 ) -> CurvePoints | None:
     """Points on all curves that may fall on the film, about ``per_px`` per pixel length; None for none.
 
-    Args: view: of the camera. curves: of every part of the scene, in its own axes. cameras [parts, F, 4, 4]: the camera
+    Args: field: of the camera. curves: of every part of the scene, in its own axes. cameras [parts, F, 4, 4]: the camera
       in the axes of every part. frames_each: frames of a trajectory; every trajectory draws the same numbers.
     """
     count = cameras.shape[1]
@@ -162,7 +162,7 @@ def piece_rad(slope_per_px: float) -> float:
     return min(PIECE_PX * slope_per_px, PIECE_RAD)
 
 
-class Views:
+class FieldOfView:
     """What of space falls on the windows of a film, in rough pixels: slopes from the pupil's centre over the slope
     of a pixel at the axis, in which straight lines are straight whatever the distortion."""
 
@@ -196,7 +196,7 @@ class Views:
         reach = torch.maximum(self.low.abs(), self.high.abs()).amax(0) / self.px_per_slope
         return abs(self.px_per_slope) * (1 + float(reach.square().sum()))
 
-    def differs_px(self, other: "Views", nearest_m: float) -> float:
+    def differs_px(self, other: "FieldOfView", nearest_m: float) -> float:
         """By how much at most other rays fall on the film through another lens, of what is so far away or further."""
         if self.shift.shape != other.shift.shape or not nearest_m > 0:
             return math.inf

@@ -22,7 +22,7 @@ from codesign.render.camera import Camera, coloured_rays
 from codesign.render.film import coarse_pixels, film_pupil_pattern
 from codesign.render.moving import parts, says_distance
 from codesign.render.silhouettes.certified_views import MOST, Looked, looked_at, nearest_m
-from codesign.render.silhouettes.curve_points import CurvePoints, Views, known_beside, piece_rad
+from codesign.render.silhouettes.curve_points import CurvePoints, FieldOfView, known_beside, piece_rad
 from codesign.render.silhouettes.jumps import SAFETY, jumps
 from codesign.render.wavefront import look
 
@@ -107,10 +107,10 @@ def listings(
 
 
 def check_listed(
-    camera: Camera, view: Views, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor
+    camera: Camera, view: FieldOfView, scene: Any, curves: Sequence[Sequence[Any]], cameras: Tensor
 ) -> None:
     """Raise DomainError when a frame of a sequence shows jumps of radiance that the scene does not list, or lists
-    twice. Looked at are frames that may show what was not looked at yet, by fewer lines where there are many. view: of
+    twice. Looked at are frames that may show what was not looked at yet, by fewer lines where there are many. field: of
     the camera; cameras: [parts, F, 4, 4]."""
     known = looked_at(parts(scene), camera.film)
     for start in range(0, cameras.shape[1], FRAMES):
@@ -150,16 +150,15 @@ def _check_frames(camera, scene, curves, cameras, rows, start):
         )
 
 
-def reach_m(camera: Camera, scene: Any, cameras: Tensor | Sequence[Tensor]) -> float:
+def reach_m(camera: Camera, scene: Any, cameras: Tensor) -> float:
     """Median distance of what a view shows, 1 where it shows nothing or a scene that does not say. cameras: the camera
-    [4, 4] or [1, 4, 4] in the axes of every part."""
+    [parts, 1, 4, 4] in the axes of every part."""
     if not all(says_distance(type(part)) for part in parts(scene)):
         return 1.0
     pixels = coarse_pixels(camera.film, 8)
     rays = camera.rays_through(pixels, torch.zeros_like(pixels))
-    poses = torch.stack([pose.double().reshape(1, 4, 4) for pose in cameras])
     first = torch.zeros(len(pixels), dtype=torch.long)
-    _, distance = look(scene, poses, first, rays.origin_m.double(), rays.direction.double())
+    _, distance = look(scene, cameras, first, rays.origin_m.double(), rays.direction.double())
     met = distance[distance.isfinite()]
     return float(met.median()) if len(met) else 1.0
 
