@@ -169,15 +169,18 @@ class Views:
         return replace(self, cameras=self.cameras.detach())
 
 
-def views_of(scene: Any, T_world_cam: Poses) -> Views:
+def views_of(scene: Any, T_world_cam: Poses, rays: Rays | None = None) -> Views:
     """Views of a scene from trajectories [..., T, 4, 4]: the one place where poses are checked and brought into the
-    axes of every part.
+    axes of every part. rays: of the camera, which must be on one device with them.
 
     Raises: DomainError for what is no scene or no poses; ShapeError unless every object has a pose for every frame.
     """
     for part in parts(scene):
         check_kind(part)
-    T_world_cam = check_poses(T_world_cam)
+    T_world_cam = as_poses(T_world_cam)
+    if rays is not None:
+        check_device(rays, T_world_cam)
+    check_poses(T_world_cam)
     batch = tuple(T_world_cam.shape[:-2])
     cameras = T_world_cam.reshape(-1, 4, 4).double()
     still = torch.eye(4, dtype=torch.float64).expand(len(cameras), 4, 4)
@@ -189,11 +192,11 @@ def views_of(scene: Any, T_world_cam: Poses) -> Views:
     return Views(scene, torch.stack([still, *objects]), torch.stack([cameras, *seen]), batch)
 
 
-def check_device(rays: Rays, cameras: Tensor) -> None:
+def check_device(rays: Rays, poses: Tensor) -> None:
     """Raise DomainError unless the rays of a camera are on one device with its poses."""
-    if rays.weight.device != cameras.device:
+    if rays.weight.device != poses.device:
         raise DomainError(
-            f"poses are on {cameras.device}, the rays of the camera on {rays.weight.device}; move one to the other "
+            f"poses are on {poses.device}, the rays of the camera on {rays.weight.device}; move one to the other "
             "with .to(device)."
         )
 

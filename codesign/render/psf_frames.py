@@ -62,7 +62,7 @@ def psf_frames(
         )
     if pairs := scenes_and_poses(scene, T_world_cam):
         return torch.stack([psf_frames(camera, one, poses, psf) for one, poses in pairs])
-    views = views_of(scene, T_world_cam)
+    views = views_of(scene, T_world_cam, psf.sharp)
     light, per_m = light_and_nearness(psf.sharp, views)
     lit = (psf.sharp.weight.detach() > 0).to(light)
     numbers, step = _layers(psf, per_m.detach(), lit)

@@ -1,9 +1,9 @@
 """Frames of a scene along trajectories, and the ways to their gradient.
 
-interior: what moves inside surfaces (plain automatic differentiation). boundary: with the motion of
-  silhouettes and edges. difference: central differences
-with common random numbers, twelve renders for the poses and two per lens number. auto: the cheapest of the
-three that is right for the frames at hand.
+interior: what moves inside surfaces (plain automatic differentiation).
+boundary: with the motion of silhouettes and edges.
+difference: central differences with common random numbers, twelve renders for the poses and two per lens number.
+auto: the cheapest of the three that is right for the frames at hand.
 """
 
 import math
@@ -58,17 +58,17 @@ def frames(
     >>> render.frames(camera, plane, poses).shape
     torch.Size([3, 5, 8, 8])
 
-    Args: camera: Camera, before any lens with ``camera_rays``. scene:
-      anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane, MovingScene), or a list of scenes,
-      one for each entry of the first axis of T_world_cam.
+    Args:
+      camera: Camera, before any lens with ``camera_rays``.
+      scene: anything with ``radiance`` and ``dtype`` (MitsubaScene, TexturedPlane, MovingScene), or a list of scenes,
+        one for each entry of the first axis of T_world_cam.
       T_world_cam: [..., T, 4, 4], several trajectories in one batch as if each were rendered by itself.
-      gradient: "interior", "boundary", "difference" or "auto", see the top of this file; the frames are the
-        same. per_px: samples per pixel length of
-      silhouettes and edges for "boundary". rays: ``camera.rays()`` where they are traced already (one trace
-      for many calls) or recorded, for "interior" and "boundary"; the boundary term traces its own points
-      through the camera's lens.
-    Returns: [..., T, H, W] (or [..., T, windows, H, W] behind a Film with windows) linear irradiance in the scene's units, box-filtered over each
-      pixel.
+      gradient: "interior", "boundary", "difference" or "auto", see the top of this file; the frames are the same.
+      per_px: samples per pixel length of silhouettes and edges for "boundary".
+      rays: ``camera.rays()`` where they are traced already (one trace for many calls) or recorded, for "interior" and
+        "boundary"; the boundary term traces its own points through the camera's lens.
+    Returns: [..., T, H, W] (or [..., T, windows, H, W] behind a Film with windows) linear irradiance in the scene's
+      units, box-filtered over each pixel.
     Gradient: lens and poses; "interior" leaves out the motion of silhouettes.
     Raises: DomainError for an unknown way, rays that it cannot use, or a scene whose silhouettes are not
       known; ShapeError for rays of another camera, or numbers of scenes and poses that differ.
@@ -91,20 +91,20 @@ def frames(
     if pairs := scenes_and_poses(scene, T_world_cam):
         rays = camera.given(rays) if gradient in PROVEN else None
         return torch.stack([frames(camera, s, poses, gradient, per_px, rays=rays) for s, poses in pairs])
-    views = views_of(scene, T_world_cam)
+    rays = camera.given(rays)
+    views = views_of(scene, T_world_cam, rays)
     if gradient == "auto":
         gradient = cheapest(camera, views)
     if gradient == "difference":
-        return by_differences(camera, views)
+        return by_differences(rays, camera, views)
     if gradient == "interior":
-        return image(camera, views, rays)
-    rays = camera.given(rays)
+        return image(rays, camera, views)
     taken = None
     if rays.weight.requires_grad:
         taken = aperture_edge_term(camera, views, max(APERTURE_SAMPLES, camera.samples_per_pixel // 8))
     if taken is not None:
         rays = _with_still_apertures(camera, rays)
-    found = image(camera, views, rays) + boundary_term(camera, views, per_px)
+    found = image(rays, camera, views) + boundary_term(camera, views, per_px)
     return found if taken is None else found + taken
 
 
@@ -116,13 +116,12 @@ def _with_still_apertures(camera, rays):
     return replace(rays, weight=weight)
 
 
-def image(camera: Camera, views: Views, rays: Rays | None = None) -> Tensor:
+def image(rays: Rays, camera: Camera, views: Views) -> Tensor:
     """Frames [..., T, *film.shape] with their interior gradient."""
-    found = shaded(camera.given(rays), views, camera.samples_per_pixel)
-    return found.reshape(*views.batch, *camera.film.shape)
+    return shaded(rays, views, camera.samples_per_pixel).reshape(*views.batch, *camera.film.shape)
 
 
-def by_differences(camera: Camera, views: Views) -> Tensor:
+def by_differences(rays: Rays, camera: Camera, views: Views) -> Tensor:
     """Frames whose gradient to poses and lens tensors is that of central differences with common random
     numbers."""
     if _objects_ask(views.scene):
@@ -131,12 +130,12 @@ def by_differences(camera: Camera, views: Views) -> Tensor:
             "use 'boundary'."
         )
     with torch.no_grad():
-        found = first = image(camera, views)
+        found = first = image(rays, camera, views)
     if views.cameras.requires_grad:
         twist = _twist(views.T_world_cam).reshape(*views.batch, 6)
         steps = pose_steps(camera, views)
         for k in range(6):
-            slope = pose_difference(camera, views, k, steps[k])
+            slope = pose_difference(rays, camera, views, k, steps[k])
             weight = twist[..., k].to(first)
             found = found + slope * weight.reshape(*views.batch, *[1] * len(camera.film.shape))
     known = lens_tensors(camera.lens)
@@ -171,14 +170,14 @@ def pose_steps(camera: Camera, views: Views) -> list[float]:
     return 3 * [min(POSE_STEP, move)] + 3 * [min(POSE_STEP, turn)]
 
 
-def pose_difference(camera: Camera, views: Views, k: int, size: float) -> Tensor:
+def pose_difference(rays: Rays, camera: Camera, views: Views, k: int, size: float) -> Tensor:
     """Change of the frames per unit of the k-th component of the twist of every pose, by central
     differences over ``size`` either way."""
     step = torch.zeros(6, dtype=torch.float64)
     step[k] = size
     with torch.no_grad():
         ahead, behind = (
-            image(camera, views_of(views.scene, views.T_world_cam @ se3_exp(sign * step[None])))
+            image(rays, camera, views_of(views.scene, views.T_world_cam @ se3_exp(sign * step[None])))
             for sign in (1, -1)
         )
     return ((ahead - behind) / (2 * size)).reshape(*views.batch, *camera.film.shape)
@@ -226,13 +225,8 @@ def lens_difference(camera: Camera, views: Views, name: str, i: int) -> Tensor:
     shift = torch.zeros_like(value).reshape(-1)
     shift[i] = step
     with torch.no_grad():
-        ahead, behind = (
-            image(
-                camera.with_lens(camera.lens.replace(**{name: value + sign * shift.reshape(value.shape)})),
-                views,
-            )
-            for sign in (1, -1)
-        )
+        moved = (camera.lens.replace(**{name: value + sign * shift.reshape(value.shape)}) for sign in (1, -1))
+        ahead, behind = (image(camera.with_lens(lens).rays(), camera, views) for lens in moved)
     return (ahead - behind) / (2 * step)
 
 

@@ -16,7 +16,7 @@ from codesign.errors import ShapeError, as_number
 from codesign.pose import Poses, inverse
 from codesign.render.camera import Camera, project
 from codesign.render.hits import Hits, carried, dot, first_hits, of_part, turned
-from codesign.render.moving import MovingScene, Scene, Views, check_device, scenes_and_poses, views_of
+from codesign.render.moving import MovingScene, Scene, Views, scenes_and_poses, views_of
 from codesign.render.projection import ProjectionTable
 from codesign.types import Rays
 
@@ -84,7 +84,7 @@ def view(camera: Camera, scene: Scene | MovingScene, T_world_cam: Poses, frame: 
     Gradient: points and depth to the lens, camera and object poses.
     """
     rays = camera.chief_rays(camera.film.pixels())
-    views = views_of(scene, T_world_cam)
+    views = views_of(scene, T_world_cam, rays)
     *batch, count = views.batch
     if not -count <= as_number(frame, "view: frame") < count:
         raise ShapeError(f"view: frame {frame} of a sequence of {count}; give a number below that.")
@@ -186,7 +186,7 @@ def truth_of_frames(
     camera = table.camera
     shape = camera.film.shape
     rays = camera.chief_rays(camera.film.pixels()) if rays is None else rays
-    cameras = views_of(scene, T_world_cam).cameras
+    cameras = views_of(scene, T_world_cam, rays).cameras
     hits = hits_of(rays, scene, cameras[:, :count])
     pairs = min(count, cameras.shape[1] - 1)
     later = cameras[:, 1 : pairs + 1]
@@ -257,7 +257,7 @@ def later_points(rays: Rays, scene: Any, T_world_cam: Poses) -> tuple[Tensor, Te
       surface, and lies before the last camera (the point is (0, 0, 1) elsewhere).
     Gradient: to rays, camera and object poses, the surface taken as its tangent plane at the hit.
     """
-    views = views_of(scene, T_world_cam)
+    views = views_of(scene, T_world_cam, rays)
     cameras, length = views.cameras, views.batch[-1]
     first = torch.arange(0, cameras.shape[1], length)
     return _before(hits_of(rays, views.scene, cameras[:, first]), cameras[:, first + length - 1])
@@ -296,7 +296,7 @@ def _hidden(camera, scene, later, found):
 def _flow_truth(camera, scene, T_world_cam, stride, occlusion):
     pixels = camera.film.pixels()
     rays = camera.chief_rays(pixels)
-    views = views_of(scene, T_world_cam)
+    views = views_of(scene, T_world_cam, rays)
     scene, cameras = views.scene, views.cameras
     *batch, length = views.batch
     if not (1 <= as_number(stride, "stride") < length and stride % 1 == 0):
@@ -321,7 +321,6 @@ def _flow_truth(camera, scene, T_world_cam, stride, occlusion):
 
 def hits_of(rays: Rays, scene: Any, cameras: Tensor) -> Hits:
     """Hits of the same rays in every frame of cameras [parts, F, 4, 4]."""
-    check_device(rays, cameras)
     return first_hits(rays.origin_m, rays.direction, rays.weight.detach() > 0, scene, cameras)
 
 

@@ -22,7 +22,7 @@ def shade(rays: Rays, scene: Scene | MovingScene, T_world_cam: Poses, samples_pe
     Gradient: to the rays (weights included), the poses and the poses of moving objects; the motion of
       silhouettes is not in it.
     """
-    return shaded(rays, views_of(scene, T_world_cam), samples_per_pixel)
+    return shaded(rays, views_of(scene, T_world_cam, rays), samples_per_pixel)
 
 
 def shaded(rays: Rays, views: Views, samples_per_pixel: int) -> Tensor:
@@ -68,7 +68,6 @@ def light_and_nearness(rays: Rays, views: Views) -> tuple[Tensor, Tensor]:
     tangent plane of what is met.
     Raises: DomainError for a scene that does not say how far away its light comes from.
     """
-    check_device(rays, views.cameras)
     scene = views.scene
     for part in parts(scene):
         if not says_distance(type(part)):

@@ -6,6 +6,7 @@ import torch
 
 from codesign import lens, pose, render
 from codesign.render.aperture_edges import aperture_edge_term
+from codesign.render.moving import views_of
 from scenes import silhouettes as silhouette_scenes
 
 F64 = torch.float64
@@ -49,7 +50,7 @@ def test_it_scatters_by_less_than_half():
 def test_a_lens_with_no_edge_in_its_pupil_has_none_and_an_obstructed_one_is_left_to_plain_samples():
     scene = silhouette_scenes.build("wall")
     narrow = render.Camera(lens.load("cooke-triplet").scaled(0.22), 8, 8, 0.1, 4)
-    term = aperture_edge_term(narrow, scene, START, 4)
+    term = aperture_edge_term(narrow, views_of(scene, START), 4)
     assert term is not None
     assert float(term.abs().max()) == 0.0
     assert not term.requires_grad
@@ -60,4 +61,4 @@ def test_a_lens_with_no_edge_in_its_pupil_has_none_and_an_obstructed_one_is_left
             share = 1 / (1 + torch.exp(40 * (0.3 - pupil.norm(dim=1))))
             return type(rays)(rays.origin_m, rays.direction, share.to(rays.weight), rays.irradiance)
 
-    assert aperture_edge_term(render.Camera(Ring(11.0, 2.2), 8, 8, 0.1, 4), scene, START, 4) is None
+    assert aperture_edge_term(render.Camera(Ring(11.0, 2.2), 8, 8, 0.1, 4), views_of(scene, START), 4) is None

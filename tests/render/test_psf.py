@@ -9,6 +9,7 @@ import torch
 from codesign import System, events, flow, lens, render
 from codesign.errors import DomainError, ShapeError
 from codesign.pose import look_at, se3_exp
+from codesign.render.moving import views_of
 from codesign.render.wavefront import light_and_nearness
 from codesign.system import Batch
 from scenes import textures, worlds
@@ -241,7 +242,7 @@ def test_depth_of_mitsuba_scenes_has_the_gradient_of_tangent_planes():
     pose = look_at((0.1, -1, 1.1), (0, 0.8, 0.5))
     rays = camera(THIN, 12, 8, 1, 0.5).rays()
     twist = torch.zeros(6, dtype=D, requires_grad=True)
-    _, per_m = light_and_nearness(rays, scene, (pose @ se3_exp(twist))[None])
+    _, per_m = light_and_nearness(rays, views_of(scene, (pose @ se3_exp(twist))[None]))
     points, depth, valid = render.truth.world_points(rays, scene, pose @ se3_exp(twist))
     assert bool(valid.all())
     torch.testing.assert_close(1 / per_m[0].double(), depth, rtol=1e-5, atol=0)
