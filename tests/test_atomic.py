@@ -89,7 +89,7 @@ HARMLESS = {"temporary", "buffer", "png", "content"}
 OTHERWISE = {
     "codesign/atomic.py": "it is the mechanism",
     "codesign/events/formats": "write what codesign/events/files.py replaces",
-    "studies/video_to_events/log.py": "a journal, whose length the state knows",
+    "studies/video_to_events/state.py": "a journal, whose length the state knows",
     "studies/lens_bench/tracers.py": "a switch of the kernel",
 }
 

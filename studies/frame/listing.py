@@ -32,7 +32,6 @@ GROUPS = {
     ),
     "events": (
         "video_to_events",
-        "upsampling",
         "event_gradient",
         "event_bench",
         "event_classes",

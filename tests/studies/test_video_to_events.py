@@ -21,14 +21,12 @@ from codesign.events.stream import ordered
 from codesign.types import EventStream
 from studies.frame.run import Run, main
 from studies.video_to_events import __main__ as study
-from studies.video_to_events.clock import read_times
-from studies.video_to_events.light import Light
-from studies.video_to_events.log import RECORD, EventLog
-from studies.video_to_events.sensor import chosen_sensor
-from studies.video_to_events.state import Progress
-from studies.video_to_events.steps import Steps
+from studies.video_to_events.input import Light, read_times
+from studies.video_to_events.options import chosen_sensor
+from studies.video_to_events.state import RECORD, EventLog, Progress
 
 FIELDS = ("t_us", "x", "y", "p")
+IDEAL = ("--preset", "ideal", "--events", "e.npz")
 
 
 @pytest.fixture
@@ -42,6 +40,10 @@ def call(folder, *arguments):
     return main(study.study, study.Config, ["--out", str(folder), *map(str, arguments)])
 
 
+def metrics_of(folder):
+    return json.loads((folder / "metrics.json").read_text())
+
+
 def write_folder(folder, stack):
     folder.mkdir()
     for index, frame in enumerate(stack):
@@ -49,9 +51,9 @@ def write_folder(folder, stack):
     return folder
 
 
-def waves(count=30, height=12, width=16, seed=0):
+def waves(count=30, height=12, width=16):
     """Gray frames [T, H, W] uint8 whose pixels swing smoothly and far."""
-    phase = 6 * np.random.default_rng(seed).random((height, width))
+    phase = 6 * np.random.default_rng(0).random((height, width))
     return (120 + 100 * np.sin(0.4 * np.arange(count)[:, None, None] + phase)).astype(np.uint8)
 
 
@@ -69,7 +71,7 @@ def crossings(values, fps, theta):
     return found
 
 
-def test_a_ramp_of_gray_values_fires_at_known_microseconds(tmp_path, plain):
+def test_a_ramp_of_gray_values_fires_at_known_microseconds(tmp_path, plain, capsys):
     # no step ends on a threshold: ln of whole numbers is no multiple of 0.2 away
     pixels = [
         [40, 52, 66, 90, 130, 250],
@@ -78,20 +80,8 @@ def test_a_ramp_of_gray_values_fires_at_known_microseconds(tmp_path, plain):
         [77] * 6,
         [30, 31, 33, 36, 39, 42],
     ]
-    stack = np.array(pixels, np.uint8).T[:, None, :]
-    code = call(
-        tmp_path / "run",
-        "--input",
-        write_folder(tmp_path / "in", stack),
-        "--fps",
-        200,
-        "--preset",
-        "ideal",
-        "--events",
-        "e.npz",
-        "e.csv",
-    )
-    assert code == 0
+    folder = write_folder(tmp_path / "in", np.array(pixels, np.uint8).T[:, None, :])
+    assert call(tmp_path / "run", "--input", folder, "--fps", 200, *IDEAL, "e.csv") == 0
     for name in ("e.npz", "e.csv"):
         stream = events.read(tmp_path / "run" / name)
         for x, values in enumerate(pixels):
@@ -102,53 +92,33 @@ def test_a_ramp_of_gray_values_fires_at_known_microseconds(tmp_path, plain):
             np.testing.assert_allclose(
                 stream.t_us[mine].numpy(), [t for t, _ in truth], atol=0.5 + 5000 * 5e-7 / 0.03
             )
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    metrics = metrics_of(tmp_path / "run")
     every = [sign for values in pixels for _, sign in crossings(values, 200, 0.2)]
-    assert (metrics["frames"], metrics["events_on"], metrics["events_off"]) == (
-        6,
-        every.count(1),
-        every.count(-1),
-    )
+    found = [metrics[name] for name in ("frames", "events_on", "events_off")]
+    assert found == [6, every.count(1), every.count(-1)]
     assert metrics["rate_on_hz"] == pytest.approx(every.count(1) / 0.025)
+    assert "too slow" in capsys.readouterr().out
     assert not (tmp_path / "run" / study.LOG).exists()
 
 
-@pytest.mark.filterwarnings(
-    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning"
-)  # imageio leaves FFmpeg's pipes open
+# imageio leaves FFmpeg's pipes open
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
 def test_a_video_gives_the_events_of_its_frames_as_imageio_decodes_them(tmp_path, plain):
-    writer = imageio_ffmpeg.write_frames(
-        str(tmp_path / "clip.mp4"), (32, 24), fps=25, codec="libx264", macro_block_size=2
-    )
+    path = tmp_path / "clip.mp4"
+    writer = imageio_ffmpeg.write_frames(str(path), (32, 24), fps=25, codec="libx264", macro_block_size=2)
     writer.send(None)
     for frame in waves(40, 24, 32):
         writer.send(np.ascontiguousarray(np.stack([frame, frame[::-1], frame[:, ::-1]], -1)))
     writer.close()
-    options = ["--preset", "clean", "--seed", 3, "--events", "e.npz"]
-    assert (
-        call(
-            tmp_path / "run",
-            "--input",
-            tmp_path / "clip.mp4",
-            "--slow-motion",
-            10,
-            "--start-s",
-            0.02,
-            "--stop-s",
-            0.1,
-            *options,
-        )
-        == 0
-    )
-    decoded = iio.imread(tmp_path / "clip.mp4", plugin="FFMPEG").astype(np.float64) @ np.array(
-        [0.2126, 0.7152, 0.0722]
-    )
+    clock = ("--slow-motion", 10, "--start-s", 0.02, "--stop-s", 0.1)
+    options = ("--preset", "clean", "--seed", 3, "--events", "e.npz")
+    assert call(tmp_path / "run", "--input", path, *clock, *options) == 0
+    decoded = iio.imread(path, plugin="FFMPEG").astype(np.float64) @ np.array([0.2126, 0.7152, 0.0722])
     t_s = np.arange(40) / 250
     used = (t_s >= 0.02) & (t_s <= 0.1 + 1e-9)
     sensor = events.SensorModel(theta_sigma=0.02)
-    truth = events.simulate(
-        torch.from_numpy(decoded[used]).float(), t_s[used], sensor, torch.Generator().manual_seed(3)
-    )
+    frames = torch.from_numpy(decoded[used]).float()
+    truth = events.simulate(frames, t_s[used], sensor, torch.Generator().manual_seed(3))
     found = events.read(tmp_path / "run" / "e.npz")
     assert len(truth) > 1000
     order = [
@@ -162,38 +132,22 @@ def test_a_video_gives_the_events_of_its_frames_as_imageio_decodes_them(tmp_path
     assert (truth.t_us[order[0]] - found.t_us[order[1]]).abs().max() <= 1
 
 
-def same_bytes(first, second, names=("e.npz", "e.csv")):
-    return all((first / name).read_bytes() == (second / name).read_bytes() for name in names)
-
-
 @pytest.mark.parametrize("how", ["Ctrl-C", "killed", "killed at the end"])
 def test_an_interrupted_run_goes_on_with_the_same_events(tmp_path, monkeypatch, plain, capsys, how):
     monkeypatch.setattr(study, "PIXELS_PER_CHUNK", 4 * 12 * 16)
     monkeypatch.setattr(study, "SECONDS_BETWEEN_SAVES", 0.0 if how == "killed" else 1e9)
-    common = [
-        "--input",
-        write_folder(tmp_path / "in", waves()),
-        "--fps",
-        300,
-        "--preset",
-        "noisy",
-        "--events",
-        "e.npz",
-        "e.csv",
-        "--seed",
-        7,
-    ]
+    folder = write_folder(tmp_path / "in", waves())
+    common = ["--input", folder, "--fps", 300, "--preset", "noisy", "--events", "e.npz", "--seed", 7]
     assert call(tmp_path / "whole", *common) == 0
     real = events.simulate
-    write_outputs = study.write_outputs
     calls = []
 
     def stops(*arguments, **options):
         found = real(*arguments, **options)
         calls.append(len(found))
-        if len(calls) == 4 and how != "killed at the end":
-            if how == "killed":
-                raise KeyboardInterrupt
+        if len(calls) == 4 and how == "killed":
+            raise KeyboardInterrupt
+        if len(calls) == 4 and how == "Ctrl-C":
             os.kill(os.getpid(), signal.SIGINT)
         return found
 
@@ -201,88 +155,53 @@ def test_an_interrupted_run_goes_on_with_the_same_events(tmp_path, monkeypatch, 
         raise KeyboardInterrupt
 
     monkeypatch.setattr(study.events, "simulate", stops)
-    if how == "killed at the end":
-        monkeypatch.setattr(study, "write_outputs", at_the_end)
-    assert call(tmp_path / "cut", *common) == 130
-    monkeypatch.setattr(study, "write_outputs", write_outputs)
+    with monkeypatch.context() as patched:
+        if how == "killed at the end":
+            patched.setattr(study, "write_outputs", at_the_end)
+        assert call(tmp_path / "cut", *common) == 130
     assert "--resume" in capsys.readouterr().err
-    with (tmp_path / "cut" / study.LOG).open(
-        "ab"
-    ) as file:  # what a killed run wrote after its state was stored does not count
+    # what a killed run wrote after its state was stored does not count
+    with (tmp_path / "cut" / study.LOG).open("ab") as file:
         file.write(b"rubbish")
     assert main(study.study, study.Config, ["--resume", str(tmp_path / "cut")]) == 0
     assert len(calls) == (9 if how == "killed" else 8)  # of eight chunks the killed run made one again
-    assert same_bytes(tmp_path / "whole", tmp_path / "cut")
+    assert (tmp_path / "whole" / "e.npz").read_bytes() == (tmp_path / "cut" / "e.npz").read_bytes()
     assert main(study.study, study.Config, ["--resume", str(tmp_path / "cut")]) == 0
     assert "complete" in capsys.readouterr().out
 
 
 def test_everything_is_drawn_and_shown(tmp_path):
     looks = ["--preview-fps", 10, "--preview-slowdown", 100, "--sensor-size", 20, 10, "--linear"]
-    assert (
-        call(tmp_path / "run", "--input", write_folder(tmp_path / "in", waves(12)), "--fps", 1000, *looks)
-        == 0
-    )
+    folder = write_folder(tmp_path / "in", waves(12))
+    assert call(tmp_path / "run", "--input", folder, "--fps", 1000, *looks) == 0
     stream = events.read(tmp_path / "run" / "events.h5")
     assert (stream.width_px, stream.height_px) == (20, 10)
     page = (tmp_path / "run" / "report.html").read_text()
-    assert page.count("data:image/png") == 4
+    assert page.count("data:image/png") == 3
     assert page.count("data:video/mp4") == 2
     assert "sRGB gamma is undone" in page
     assert "stretched to 20 x 10" in page
     # 11 ms at 100 times slower and 10 pictures a second
     assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "run" / "events.mp4"))[0] == 11
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    metrics = metrics_of(tmp_path / "run")
     assert metrics["events_on"] + metrics["events_off"] == len(stream)
     assert metrics["mpixel_per_s"] == pytest.approx(12 * 200 / metrics["seconds"] / 1e6)
 
 
-def test_epoch_times_of_a_file_stay_exact_to_the_microsecond(tmp_path, plain):
-    start_us = 1_700_000_000_123_457
-    steps = [0, 1000, 1700, 5000]
-    values = [40, 52, 66, 90]
-    (tmp_path / "times.txt").write_text(
-        "# microseconds\n" + "\n".join(str(start_us + step) for step in steps) + "\n"
-    )
-    assert read_times(tmp_path / "times.txt", "us", 4).mul(1e6).round().long().tolist() == [
-        start_us + step for step in steps
-    ]
-    stack = np.array(values, np.uint8)[:, None, None].repeat(2, 1).repeat(2, 2)
-    options = [
-        "--timestamps",
-        tmp_path / "times.txt",
-        "--timestamp-unit",
-        "us",
-        "--preset",
-        "ideal",
-        "--events",
-        "e.npz",
-    ]
-    assert call(tmp_path / "run", "--input", write_folder(tmp_path / "in", stack), *options) == 0
-    truth = []
-    for t, _ in crossings(values, 1, 0.2):  # seconds count frames here
-        k = int(t // 1e6)
-        truth.append(start_us + steps[k] + (t / 1e6 - k) * (steps[k + 1] - steps[k]))
-    found = events.read(tmp_path / "run" / "e.npz").t_us
-    # float64 seconds are exact to 0.24 us there, and events are rounded to 1
-    np.testing.assert_allclose(
-        (found.reshape(-1, 4)[:, 0] - start_us).numpy(), np.array(truth) - start_us, atol=1
-    )
+def test_epoch_times_of_a_file_stay_exact_to_the_microsecond(tmp_path):
+    times_us = [1_700_000_000_123_457 + step for step in (0, 1000, 1700, 5000)]
+    path = tmp_path / "times.txt"
+    path.write_text("# microseconds\n" + "\n".join(map(str, times_us)) + "\n")
+    assert read_times(path, "us", 4).mul(1e6).round().long().tolist() == times_us
 
 
 def test_light_follows_the_published_curves():
-    gray = np.arange(256, dtype=np.uint8)[None, None]
-    assert torch.equal(Light(255, False)([gray[0]], 0)[0, 0], torch.arange(256.0))
-    linear = Light(255, True)([gray[0]], 0)[0, 0] / 255
+    gray = np.arange(256, dtype=np.uint8)[None]
+    assert torch.equal(Light(255, False)([gray], 0)[0, 0], torch.arange(256.0))
+    linear = Light(255, True)([gray], 0)[0, 0] / 255
     # IEC 61966-2-1: digital values and their linear light to six decimals
-    for value, light in (
-        (0, 0.0),
-        (10, 0.003035),
-        (11, 0.003347),
-        (128, 0.215861),
-        (188, 0.502886),
-        (255, 1.0),
-    ):
+    published = {0: 0.0, 10: 0.003035, 11: 0.003347, 128: 0.215861, 188: 0.502886, 255: 1.0}
+    for value, light in published.items():
         assert float(linear[value]) == pytest.approx(light, abs=5e-7)
     primaries = np.eye(3, dtype=np.uint8)[None] * 255
     seen = Light(255, False)([primaries], 0)
@@ -291,17 +210,13 @@ def test_light_follows_the_published_curves():
     assert float(Light(255, False)([np.full((1, 1), 300.5)], 0)) == 300.5
 
 
-def test_a_new_size_keeps_what_is_even_and_what_is_linear():
+def test_a_new_size_keeps_what_is_linear():
     y, x = np.mgrid[:48, :64].astype(np.float64)
-    ramp = 50 + 2 * x + y
-    small = Light(255, False, (16, 12))([ramp], 0)[0]
+    small = Light(255, False, (16, 12))([50 + 2 * x + y], 0)[0]
     # the pixel centres of a quarter of the size lie at 4 k + 1.5; away from the edges, where the window is
     # cut
     truth = 50 + 2 * (4 * np.arange(16) + 1.5) + (4 * np.arange(12)[:, None] + 1.5)
     np.testing.assert_allclose(small.numpy()[1:-1, 1:-1], truth[1:-1, 1:-1], rtol=1e-6)
-    np.testing.assert_allclose(
-        Light(255, False, (100, 37))([np.full((48, 64), 99.0)], 0).numpy(), 99, rtol=1e-6
-    )
 
 
 def test_the_share_of_large_steps_is_counted():
@@ -309,74 +224,39 @@ def test_the_share_of_large_steps_is_counted():
     level[1:, :3] += 0.2 * 1.5  # 30 pixels by 1.5 thresholds
     level[1:, 3:5] += 0.2 * 10.5  # 20 pixels by 10.5
     level[2, 9] -= 0.4 * 4.5  # 10 pixels darker, OFF threshold 0.4
-    sensor = events.SensorModel(theta_on=0.2, theta_off=0.4)
+    none = torch.zeros(0, dtype=torch.int64)
     for chunks in ([slice(0, 3)], [slice(0, 2), slice(2, 3)]):
-        steps = Steps(sensor, Progress(0, {}, events.SensorState()))
+        steps = Progress(0, {}, events.SensorState())
         for chunk in chunks:
-            steps.add(level.exp()[chunk])
-        assert {n: int(steps.histogram[n]) for n in steps.histogram.nonzero().flatten().tolist()} == {
-            0: 140,
-            1: 30,
-            4: 10,
-            10: 20,
-        }
-        assert steps.large_share == pytest.approx(30 / 200)
-        assert steps.large_share_of_moving == pytest.approx(30 / 60)
-        assert steps.too_large
+            steps.add(level.exp()[chunk], EventStream(none, none, none, none, 10, 10), (0.2, 0.4))
+        assert dict(enumerate(steps.histogram[:11].tolist())) | {0: 140, 1: 30, 4: 10, 10: 20} == dict(
+            enumerate(steps.histogram[:11].tolist())
+        )
+        assert int(steps.histogram.sum()) == 200
+        assert steps.large_share == pytest.approx(30 / 60)
         assert steps.remedy == pytest.approx(11 / 3)  # nine in ten move by up to 11 thresholds, 3 are wanted
 
 
-def test_a_video_too_slow_for_its_motion_is_called_so(tmp_path, plain, capsys):
-    flicker = np.array([[30, 250], [250, 30]], np.uint8)[np.arange(6) % 2][:, None, :]
-    assert (
-        call(
-            tmp_path / "run",
-            "--input",
-            write_folder(tmp_path / "in", flicker),
-            "--fps",
-            30,
-            "--preset",
-            "ideal",
-            "--events",
-            "e.npz",
-        )
-        == 0
-    )
-    assert "too slow" in capsys.readouterr().out
-    # every pixel steps by ln(250/30)/0.2 = 10.6 thresholds
-    assert "Of the pixels that make events, 100.0% step" in (tmp_path / "run" / "report.html").read_text()
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())[
-        "frame_rate_factor_needed"
-    ] == pytest.approx(11 / 3)
+OFF = {"cutoff_hz": 0, "leak_rate_hz": 0, "shot_rate_hz": 0, "refractory_s": 0}
+V2E = {
+    "clean": {"theta_sigma": 0.02, **OFF},
+    "noisy": OFF | {"theta_sigma": 0.05, "cutoff_hz": 30, "leak_rate_hz": 0.1, "shot_rate_hz": 5},
+    "default": {
+        "theta_sigma": 0.03,
+        "cutoff_hz": 300,
+        "leak_rate_hz": 0.01,
+        "shot_rate_hz": 0.001,
+        "refractory_s": 5e-4,
+    },
+}
 
 
 def test_presets_are_those_of_v2e_and_every_parameter_is_an_option():
-    off = {"cutoff_hz": 0, "leak_rate_hz": 0, "shot_rate_hz": 0, "refractory_s": 0}
-    for name, values in {
-        "clean": {"theta_sigma": 0.02, **off},
-        "noisy": {
-            "theta_sigma": 0.05,
-            "cutoff_hz": 30,
-            "leak_rate_hz": 0.1,
-            "shot_rate_hz": 5,
-            "refractory_s": 0,
-        },
-        "default": {
-            "theta_sigma": 0.03,
-            "cutoff_hz": 300,
-            "leak_rate_hz": 0.01,
-            "shot_rate_hz": 0.001,
-            "refractory_s": 5e-4,
-        },
-    }.items():
+    for name, values in V2E.items():
         sensor = chosen_sensor(study.Config(preset=name))
         assert {field: getattr(sensor, field) for field in values} == values
         assert (sensor.theta_on, sensor.theta_off) == (0.2, 0.2)
-    given: dict[str, Any] = dataclasses.asdict(events.SensorModel()) | {
-        "theta_off": 0.35,
-        "refractory_s": 0.002,
-        "timing": "v2e",
-    }
+    given: dict[str, Any] = dataclasses.asdict(events.SensorModel()) | {"theta_off": 0.35, "timing": "v2e"}
     assert chosen_sensor(study.Config(preset="noisy", **given)) == events.SensorModel(**given)
     with pytest.raises(DomainError, match="ideal, clean, noisy, default"):
         chosen_sensor(study.Config(preset="best"))
@@ -392,7 +272,6 @@ def test_the_log_finds_events_by_time_and_forgets_what_does_not_count(tmp_path):
     times = [1_700_000_000_000_000 + k for k in (-1, 0, 57, 299, 400)]
     assert log.positions(times) == np.searchsorted(stream.t_us.numpy(), times, side="right").tolist()
     for read, part in (
-        (log.read(0, 500), slice(None)),
         (log.read(123, 321), slice(123, 321)),
         (log.pick(torch.tensor([3, 77, 499])), [3, 77, 499]),
     ):
@@ -403,38 +282,77 @@ def test_the_log_finds_events_by_time_and_forgets_what_does_not_count(tmp_path):
         EventLog(tmp_path / "log", 451, 7, 9)
 
 
-def test_what_cannot_be_is_one_sentence_and_exit_code_2(tmp_path, capsys):
-    folder = write_folder(tmp_path / "in", waves(4))
+def grating(count, height=24, width=56):
+    """[T, H, W] float32 whose log is a sinusoid of 14 px that moves to the right by 3 px a frame."""
+    x = np.arange(width) - 3 * np.arange(count)[:, None, None]
+    light = np.exp(4.5 + 0.55 * np.sin(2 * math.pi * x / 14))
+    return np.broadcast_to(light, (count, height, width)).astype(np.float32)
+
+
+def test_an_upsampled_grating_fires_when_its_closed_form_crosses_in_any_chunks(tmp_path, monkeypatch, plain):
+    np.save(tmp_path / "in.npy", grating(9))
+    options = ("--input", tmp_path / "in.npy", "--fps", 100, *IDEAL)
+    assert call(tmp_path / "up", *options, "--upsample", 0.5) == 0
+    assert call(tmp_path / "kept", *options) == 0
+    found, kept = (events.read(tmp_path / name / "e.npz") for name in ("up", "kept"))
+    monkeypatch.setattr(study, "PIXELS_PER_CHUNK", 2 * 24 * 56)
+    assert call(tmp_path / "chunks", *options, "--upsample", 0.5) == 0
+    assert (tmp_path / "chunks" / "e.npz").read_bytes() == (tmp_path / "up" / "e.npz").read_bytes()
+
+    # the truth: 2000 steps per second of the same grating; pixels whose light of the last frame was always
+    # inside the picture
+    t_s = torch.arange(0, 161, dtype=torch.float64) / 2000
+    x = torch.arange(56) - 300 * t_s[:, None, None]
+    level = 4.5 + 0.55 * torch.sin(2 * math.pi * x / 14)
+    truth = events.simulate(level.exp().expand(-1, 24, -1).contiguous(), t_s, events.SensorModel())
+    totals = [events.to_counts(each, [0.0, 0.08])[0][..., 28:-4].sum() for each in (truth, found, kept)]
+    # cut by 1 - cos(pi 0.5 / 14) = 0.6 % of 1.1 log units, an event of 0.2 more or less per half period of 5
+    # events at worst in one pixel of 30
+    assert abs(float(totals[1] / totals[0]) - 1) < 0.05
+    # straight lines over 3 of 14 px cut 1 - cos(3 pi / 14) = 22 % off half of the peaks
+    assert float(totals[2] / totals[0]) < 0.95
+    metrics = metrics_of(tmp_path / "up")
+    assert metrics["frames"] == 9
+    assert metrics["simulated_frames"] >= 1 + 8 * 6  # 3 px in steps of half a pixel
+
+
+FPS = ("--input", "in", "--fps", 30)
+TIMES = ("--input", "in", "--timestamps")
+WRONG = [
+    ((), "no input"),
+    (("--input", "none"), "no file or folder"),
+    (("--input", "in"), "--fps"),
+    (("--input", "in", "--fps", 0), "--fps is 0"),
+    ((*TIMES, "back.txt"), "increase strictly"),
+    ((*TIMES, "few.txt"), "2 times, the input 4"),
+    ((*TIMES, "word.txt"), "line 3: 'noon'"),
+    ((*TIMES, "close.txt"), "0.1 us apart"),
+    ((*TIMES, "few.txt", "--fps", 5), "both given"),
+    (("--input", "nan.npy", "--fps", 30), "frame 2 holds nan at row 3, column 4"),
+    ((*FPS, "--stop-s", -1), "0 frame"),
+    ((*FPS, "--events", "a.doc"), ".doc"),
+    ((*FPS, "--theta-on", -1), "theta_on"),
+    ((*FPS, "--preset", "x"), "ideal"),
+    ((*FPS, "--events", "../e.npz"), "plain name"),
+    ((*FPS, "--sensor-size", 0, 5), "--sensor-size"),
+    ((*FPS, "--upsample", 0), "--upsample is 0"),
+]
+
+
+def test_what_cannot_be_is_one_sentence_and_exit_code_2(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_folder(tmp_path / "in", waves(4))
     stack = waves(4).astype(np.float32)
     stack[2, 3, 4] = np.nan
-    np.save(tmp_path / "nan.npy", stack)
-    for name, lines in (
-        ("back", "0\n0.1\n0.05\n0.2"),
-        ("few", "0\n0.1"),
-        ("word", "0\n0.1\nnoon\n0.2"),
-        ("close", "0\n0.1\n0.1000001\n0.2"),
-    ):
-        (tmp_path / f"{name}.txt").write_text(lines)
-    for index, (arguments, words) in enumerate(
-        [
-            ([], "no input"),
-            (["--input", tmp_path / "none"], "no file or folder"),
-            (["--input", folder], "--fps"),
-            (["--input", folder, "--fps", 0], "--fps is 0"),
-            (["--input", folder, "--timestamps", tmp_path / "back.txt"], "increase strictly"),
-            (["--input", folder, "--timestamps", tmp_path / "few.txt"], "2 times, the input 4"),
-            (["--input", folder, "--timestamps", tmp_path / "word.txt"], "line 3: 'noon'"),
-            (["--input", folder, "--timestamps", tmp_path / "close.txt"], "0.1 us apart"),
-            (["--input", folder, "--timestamps", tmp_path / "none.txt"], "no file lies at"),
-            (["--input", folder, "--timestamps", tmp_path / "few.txt", "--fps", 5], "both given"),
-            (["--input", tmp_path / "nan.npy", "--fps", 30], "frame 2 holds nan at row 3, column 4"),
-            (["--input", folder, "--fps", 30, "--stop-s", -1], "0 frame"),
-            (["--input", folder, "--fps", 30, "--events", "a.doc"], ".doc"),
-            (["--input", folder, "--fps", 30, "--theta-on", -1], "theta_on"),
-            (["--input", folder, "--fps", 30, "--preset", "x"], "ideal"),
-            (["--input", folder, "--fps", 30, "--events", "../e.npz"], "plain name"),
-            (["--input", folder, "--fps", 30, "--sensor-size", 0, 5], "--sensor-size"),
-        ]
-    ):
+    np.save("nan.npy", stack)
+    lines = {
+        "back": "0\n0.1\n0.05\n0.2",
+        "few": "0\n0.1",
+        "word": "0\n0.1\nnoon\n0.2",
+        "close": "0\n0.1\n0.1000001\n0.2",
+    }
+    for name, text in lines.items():
+        (tmp_path / f"{name}.txt").write_text(text)
+    for index, (arguments, words) in enumerate(WRONG):
         assert call(tmp_path / f"run{index}", *arguments) == 2, words
         assert words in capsys.readouterr().err
