@@ -4,7 +4,7 @@ differentiation, in gradient."""
 import torch
 
 from codesign.events.layers.dead_time import GOLDEN, STEPS
-from codesign.events.layers.dead_time_part import PHASES, WIDTH
+from codesign.events.layers.dead_time_kernel import PHASES, WIDTH
 from codesign.events.level_path import parts
 
 

@@ -19,8 +19,7 @@ import torch
 
 from codesign.atomic import replacing, write_atomic
 from codesign.events import SensorState
-from codesign.events.formats.hdf5_chunks import h5py
-from codesign.events.formats.hdf5_new import new_hdf5
+from codesign.events.formats.hdf5_rows import h5py, new_hdf5
 from codesign.reading import check_regular, reading
 from codesign.types import EventStream
 

@@ -84,7 +84,9 @@ def with_sensor_options(kind):
     # the docstring of SensorModel says "name, name: sentence" of each, several to a paragraph
     text = " ".join((SensorModel.__doc__ or "").split("Source:")[0].split())
     parts = re.split(r"(?<=[ .])((?:[a-z_]+, )*[a-z_]+): ", text)
-    meaning = {name: said for names, said in zip(parts[1::2], parts[2::2], strict=True) for name in names.split(", ")}
+    meaning = {
+        name: said for names, said in zip(parts[1::2], parts[2::2], strict=True) for name in names.split(", ")
+    }
     added = []
     for field in dataclasses.fields(SensorModel):
         words = f"Sensor: {meaning[field.name].strip()} That of --preset when left out."

@@ -11,8 +11,7 @@ import torch
 from matplotlib.figure import Figure
 
 from codesign.events import decay_from_stream, picture, to_counts, write_video
-from codesign.events.views.rate_curves import PREFIXES, rate_figure
-from codesign.events.views.space_time import sample, space_time_figure
+from codesign.events.views.figures import PREFIXES, rate_figure, sample, space_time_figure
 from studies.frame.run import Run
 from studies.video_to_events.input import Light
 from studies.video_to_events.state import LARGE, WORRYING, EventLog

@@ -9,7 +9,7 @@ import torch
 
 from codesign.errors import DomainError
 from codesign.events import SensorModel, dense_counts, sensor_counts
-from codesign.events.layers.dead_time import load, mean_counts
+from codesign.events.layers.dead_time import mean_counts
 from codesign.events.sensor.state import SensorState, begin
 from tests.dead_time_case import written_out
 
@@ -97,28 +97,6 @@ def test_the_first_event_is_never_lost_and_nothing_follows_within_a_long_dead_ti
     torch.testing.assert_close(short[30:, 1, :2], -counts[30:, :2], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_gradients_are_those_of_the_smooth_mean(seed):
-    generator = torch.Generator().manual_seed(seed)
-    counts, lengths = bursts(generator, 24, 3)
-    counts = counts + 1e-2 * (counts == 0)
-    dead_s = 4e-3 + 8e-3 * torch.rand((), generator=generator, dtype=D)
-    _, centre, state = behind(counts[:9], lengths[:9], dead_s)
-    weights = torch.randn(15, 2, 3, generator=generator, dtype=D)
-
-    def loss(late, dead_s):  # in two chunks, so that the state's gradient is seen too
-        first, *before = behind(late[:7], lengths[9:16], dead_s, centre, state)
-        second, *_ = behind(late[7:], lengths[16:], dead_s, *before)
-        return (weights * torch.cat((first, second))).sum()
-
-    late = counts[9:].clone().requires_grad_()
-    # a step of 1e-7 of a count, or 1e-10 s, is far from the kinks where a group's event ends
-    assert torch.autograd.gradcheck(lambda x: loss(x, dead_s), (late,), eps=1e-7, atol=1e-5)
-    assert torch.autograd.gradcheck(
-        lambda x: loss(late.detach(), x), (dead_s.requires_grad_(),), eps=1e-9, atol=1e-2, rtol=1e-5
-    )
-
-
 # intervals longer than parts, several blocks, a look over many rows, one interval, a dead time beyond the window
 @pytest.mark.parametrize(
     ("frames", "interval_ms", "dead_ms"),
@@ -159,23 +137,6 @@ def test_the_kernel_is_the_recursion_written_out(frames, interval_ms, dead_ms, g
 def test_a_dead_time_over_too_many_intervals_is_refused():
     with pytest.raises(DomainError, match="reaches over 3000 intervals"):
         behind(torch.full((3100, 1), 0.1, dtype=D), torch.full((3100,), 1e-3, dtype=D), torch.tensor(3.0))
-
-
-def test_rate_times_dead_time_is_the_mean_over_events():
-    level = torch.tensor([[0.0, 0.0], [0.2, -0.6]], dtype=D)
-    # 1 and 3 events in 0.1 s: (1 x 10 + 3 x 30)/4 = 25 per second
-    assert load(level, (0.2, 0.2), torch.tensor([0.1], dtype=D), 0.02) == pytest.approx(0.5)
-
-
-def test_on_the_way_back_the_last_phases_come_first():
-    """Up by 0.5 within 5 ms, and down by 0.25, then by 0.5: what came up less than 10 ms before is lost again."""
-    counts = torch.tensor([0.5, -0.25, -0.5], dtype=D)[:, None].expand(3, 12)
-    lengths = torch.full((3,), 2e-3, dtype=D)
-    kept, *_ = behind(counts, lengths, torch.tensor(10e-3, dtype=D))
-    # the half that came up first; none of the quarter that went back first; of the rest a quarter had come up, a
-    # quarter had not. Groups a third of a count wide know by a sixth of their phases where the turn was
-    exact = torch.tensor([[0.5, 0], [0, 0], [0, 0.25]], dtype=D)
-    assert float((kept.mean(2) - exact).abs().max()) < 0.06
 
 
 def sines(generator, pixels, frames=61, slowest_hz=3, fastest_hz=9):

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from codesign import System, events
-from codesign.errors import DomainError, ShapeError
 from codesign.events.level_path import finer
 from codesign.system import Batch
 from codesign.types import FlowField
@@ -148,13 +147,6 @@ def test_a_step_rings_by_seven_percent_of_it_beside_and_nowhere_else():
     assert float(found.max()) == pytest.approx(3 + 4 / 27, abs=1e-4)
 
 
-def test_enough_frames_are_taken_as_they_are():
-    frames = torch.rand(33, 2, 3) * 200
-    found, times_s = finer(frames, times(32), SPAN_S / 16)
-    assert found is frames
-    assert torch.equal(times_s, times(32))
-
-
 @pytest.mark.parametrize(
     "t_s",
     [torch.linspace(0, 0.1, 17), 10 + torch.arange(17) / 100, 1.7e9 + torch.arange(17, dtype=D) / 1000],
@@ -231,23 +223,6 @@ def test_a_system_asks_a_layer_for_its_volume_and_sets_plain_counts_at_middles()
     assert not torch.equal(plain.counts, fine.counts)
 
 
-def test_what_does_not_fit_is_refused():
-    layer = events.layer("memory", SENSOR)
-    frames = torch.rand(3, 4, 5)
-    with pytest.raises(DomainError, match="a length > 0 s is needed"):
-        layer.finely(frames, [0.0, 1.0, 2.0], 0.0)
-    with pytest.raises(DomainError, match="longest_s"):
-        layer.finely(frames, [0.0, 1.0, 2.0], "short")
-    with pytest.raises(ShapeError, match=r"a tensor \[T, H, W\]"):
-        layer.volume(torch.rand(4, 5), [0.0, 1.0], 5)
-    with pytest.raises(ShapeError, match="one time per frame"):
-        layer.volume(frames, [0.0, 1.0], 5)
-    with pytest.raises(DomainError, match="tau_s is 0"):
-        layer.surface(frames, [0.0, 1.0, 2.0], 0)
-    with pytest.raises(DomainError, match="intensities are 0 or more"):
-        layer.volume(-frames, [0.0, 1.0, 2.0], 5)
-
-
 def test_a_surface_of_hard_counts_is_that_of_the_stream():
     generator = torch.Generator().manual_seed(2)
     counts = (torch.rand(30, 2, 3, 4, 5, generator=generator, dtype=D) * 1.3).floor()
@@ -308,8 +283,3 @@ def test_the_gradient_of_a_surface_is_that_of_the_two_windows_behind_its_events(
     counts.requires_grad_()
     surface = events.surface_from_hard_counts(counts, t_s, at_s, tau_s)
     torch.testing.assert_close(torch.autograd.grad(surface, counts, weight)[0], wanted)
-
-
-def test_shares_of_events_are_no_hard_counts():
-    with pytest.raises(DomainError, match=r"counts hold 0\.5; whole numbers of events are needed"):
-        events.surface_from_hard_counts(torch.full((2, 2, 1, 1), 0.5), times(2), [0.1], 0.02)

@@ -11,7 +11,7 @@ import zstandard
 
 from codesign.errors import FileFormatError
 from codesign.events import read, write
-from codesign.events.formats.aedat4_frames import read_frames
+from codesign.events.formats.aedat4 import read_frames
 from codesign.events.stream import ordered
 
 FIELDS = ("t_us", "x", "y", "p")

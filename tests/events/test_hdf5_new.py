@@ -6,12 +6,12 @@ import sys
 import h5py
 import numpy as np
 
-from codesign.events.formats.hdf5_new import new_hdf5
+from codesign.events.formats.hdf5_rows import new_hdf5
 
 PROGRAM = """
 import resource, signal, sys
 import numpy as np
-from codesign.events.formats.hdf5_new import new_hdf5
+from codesign.events.formats.hdf5_rows import new_hdf5
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 dice = np.random.default_rng(0)
 told = 0

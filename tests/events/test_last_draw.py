@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from codesign import events
-from codesign.events.layers.last_draw import LastDraw
 
 SENSOR = events.SensorModel(theta_on=0.2, theta_off=0.2, theta_sigma=0.03, shot_rate_hz=50.0)
 
@@ -50,21 +49,3 @@ def test_shapes_and_chunks_keep_their_own_draws(generator):
     rest, _ = layer.advance(shown[:1, 2:], t_s[2:], state)
     alone, _ = counted(events.layer("memory", SENSOR), shown[:1], 0)
     assert torch.equal(torch.cat([first, rest], 1), alone)
-
-
-def test_it_draws_once_for_the_same_generators_in_the_same_state():
-    drawn = []
-
-    def draw(source):
-        drawn.append(torch.rand(2, generator=source))
-        return (drawn[-1],)
-
-    last = LastDraw()
-    for asked, seed, count in (("a", 0, 1), ("a", 0, 1), ("b", 0, 2), ("b", 1, 3), ("b", 1, 3)):
-        source = torch.Generator().manual_seed(seed)
-        (found,) = last(asked, [source, source], lambda source=source: draw(source))
-        assert len(drawn) == count
-        assert torch.equal(found, torch.rand(2, generator=torch.Generator().manual_seed(seed)))
-    two = [torch.Generator().manual_seed(1) for _ in range(2)]
-    last("b", two, lambda: draw(two[0]))  # two generators alike are not one drawn from twice
-    assert len(drawn) == 4

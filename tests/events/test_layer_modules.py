@@ -7,9 +7,7 @@ import pytest
 import torch
 
 from codesign import events
-from codesign.errors import DomainError, ShapeError
 from codesign.events import LAYERS, SensorModel, layer
-from codesign.events.layers.comparators import Expected
 from codesign.events.sensor.model import draw_deviates
 
 D = torch.float64
@@ -176,13 +174,6 @@ def test_noise_is_that_of_the_drawing_functions():
     assert torch.equal(counts, events.memory(frames, *thetas)[0] + shots)
 
 
-@pytest.mark.bits
-def test_the_physical_layer_gives_the_events_of_the_sensor():
-    frames, t_s = drifting(6, 5)
-    hard = events.simulate(frames, t_s, NOISY, seeded(3))
-    assert torch.equal(layer("physical", NOISY)(frames, t_s, seeded(3)), events.to_counts(hard, t_s, dtype=D))
-
-
 def test_a_unit_step_of_a_variable_is_a_tenth_and_moves_every_pixel():
     frames, t_s = drifting(6, 5)
     sensor = SensorModel(0.15, 0.2, 0.03, 60.0)
@@ -238,19 +229,6 @@ def test_a_volume_is_that_of_the_counts(batch):
     assert float(volume.collected_s.sum()) == pytest.approx(29 * 2e-3)
 
 
-def test_options_reach_the_function():
-    frames, t_s = drifting(4, 5)
-    torch.testing.assert_close(
-        layer("sigmoid", SensorModel(), sharpness=3.0)(frames, t_s), events.soft(frames, 0.2, sharpness=3.0)
-    )
-    wide = layer("expected", SensorModel(), spread=0.4)
-    torch.testing.assert_close(wide(frames, t_s), events.expected(frames, 0.2, 0.2, 0.4)[0])
-    comparator = Expected(spread=0.4)
-    annealed = events.ComparatorLayer(comparator)
-    comparator.spread = 0.05
-    torch.testing.assert_close(annealed(frames, t_s), events.expected(frames, 0.2, 0.2, 0.05)[0])
-
-
 def test_a_comparator_of_ones_own_fits():
     class Steps:
         mismatched = True
@@ -264,33 +242,3 @@ def test_a_comparator_of_ones_own_fits():
     torch.testing.assert_close(
         own(frames.log(), t_s), layer("counts", PLAIN, log_input=True)(frames.log(), t_s)
     )
-
-
-def test_bad_input_is_refused():
-    frames, t_s = drifting(2, 4, 5, frames=4)
-    with pytest.raises(DomainError, match="no event layer 'memroy', did you mean 'memory'"):
-        layer("memroy")
-    with pytest.raises(DomainError, match=r"'x'; event layers are 'sigmoid'"):
-        layer("x")
-    with pytest.raises(DomainError, match="cannot learn 'refractory_s'"):
-        layer("memory", learn=("refractory_s",))
-    with pytest.raises(DomainError, match="switched off"):
-        layer("physical", learn=("cutoff_hz",))
-    memory = layer("memory", NOISY)
-    with pytest.raises(ShapeError, match=r"\[4, 5\]; a tensor"):
-        memory(frames[0, 0], t_s)
-    with pytest.raises(ShapeError, match="at least 2"):
-        memory(frames[:, :1], t_s[:1])
-    with pytest.raises(ShapeError, match="batch of 2"):
-        memory(frames, t_s, [seeded()])
-    _, state = memory.advance(frames, t_s)
-    with pytest.raises(DomainError, match="leave the generator out"):
-        memory.advance(frames, t_s + 1, state, seeded())
-    for name in LAYERS:
-        _, state = layer(name, NOISY).advance(frames, t_s)
-        with pytest.raises(DomainError, match="go on increasing"):
-            layer(name, NOISY).advance(frames, t_s, state)
-        with pytest.raises(DomainError, match="NaN"):
-            layer(name)(frames * math.nan, t_s)
-        with pytest.raises(DomainError, match="negative"):
-            layer(name)(-frames, t_s)

@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from codesign.errors import DomainError, ShapeError
 from codesign.events import (
     SensorModel,
     annealed,
@@ -176,24 +175,3 @@ def test_gradients_to_the_sensor_follow_differences_of_hard_counts(name, sensor,
     ) / (2 * step * before)
     assert float(slope @ difference / (slope.norm() * difference.norm())) > cosine
     assert scales[0] < float(slope @ difference / (difference @ difference)) < scales[1]
-
-
-def test_bad_input_is_refused():
-    frames, t_s = drifting(4)
-    with pytest.raises(DomainError, match="cannot carry a gradient"):
-        sensor_counts(frames, t_s, SensorModel(), leak_rate_hz=torch.tensor(1.0))
-    with pytest.raises(DomainError, match="theta_on"):
-        sensor_counts(frames, t_s, SensorModel(), theta_on=torch.tensor(-1.0))
-    with pytest.raises(DomainError, match="spread"):
-        expected(frames, 0.2, 0.2, 0.0)
-    for layer in (
-        lambda f: dense(f, 0.2, 0.2),
-        lambda f: expected(f, 0.2, 0.2, 0.1),
-        lambda f: sensor_counts(f, t_s[: len(f)], SensorModel()),
-    ):
-        with pytest.raises(ShapeError, match="at least 2"):
-            layer(frames[:1])
-        with pytest.raises(DomainError, match="NaN"):
-            layer(frames * math.nan)
-        with pytest.raises(DomainError, match="negative"):
-            layer(-frames)

@@ -6,7 +6,6 @@ import math
 import pytest
 import torch
 
-from codesign.errors import DomainError
 from codesign.events import memory
 
 BEGINNINGS = 1 << 16
@@ -169,11 +168,6 @@ def test_which_gradient_is_taken_depends_on_the_thresholds(theta_off, taken):
         memory(leaf, 0.2, theta_off, log_input=True, gradient=name)[0].square().sum().backward()
         slopes[name] = leaf.grad
     torch.testing.assert_close(slopes[None], slopes[taken], rtol=0, atol=0)
-
-
-def test_an_unknown_gradient_is_refused():
-    with pytest.raises(DomainError, match="'exact', 'play'"):
-        memory(torch.zeros(3, 2), 0.1, 0.2, log_input=True, gradient="mean")
 
 
 def test_thresholds_beyond_the_measured_ratio_are_named_where_a_gradient_may_be_asked_for():

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from codesign import backend
-from codesign.events.sensor.random_bits import exponential, hashed, normal_pair, uniform
+from codesign.events.sensor.crossing import exponential, hashed, normal_pair, uniform
 
 
 @pytest.fixture(scope="module")

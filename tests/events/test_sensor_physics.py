@@ -9,7 +9,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from codesign.errors import DomainError
-from codesign.events import PRESETS, SensorModel, SensorState, concatenate, dense_counts, simulate, to_counts
+from codesign.events import SensorModel, SensorState, concatenate, dense_counts, simulate, to_counts
 
 FIELDS = ("t_us", "x", "y", "p")
 EVERYTHING = SensorModel(
@@ -49,29 +49,6 @@ def test_the_low_pass_solves_its_differential_equation(cutoff_hz):
             right, (0, t[k] - t[k - 1]), [filtered], method="Radau", rtol=1e-10, atol=1e-12
         ).y[0, -1]
     assert float(state.level[3, 4]) == pytest.approx(filtered, abs=1e-8)
-
-
-@pytest.mark.parametrize(("fps", "error"), [(400, 0.02), (2000, 1e-3)])
-def test_a_sinusoid_through_the_low_pass_has_its_textbook_amplitude(fps, error):
-    # so small that the bandwidth is that of exp(4); gain 1/sqrt(1 + (f/fc)^2), times sinc^2 for the chords
-    # between frames. What the chords add at fps - 40 Hz folds back: (40/360)^2 = 1.2 % of it at 400 fps,
-    # (40/1960)^2 at 2000
-    bandwidth_hz = 50 * (math.exp(4) + 20) / 275
-    t_s = torch.arange(0, 0.2, 1 / fps, dtype=torch.float64)
-    level = (4 + 0.01 * torch.sin(2 * math.pi * 40 * t_s))[:, None, None]
-    seen = [float(level[0])]
-    state = SensorState()
-    for k in range(1, len(t_s)):
-        chunk = slice(0, 2) if k == 1 else slice(k, k + 1)
-        simulate(level[chunk], t_s[chunk], SensorModel(cutoff_hz=50.0), state=state, log_input=True)
-        seen.append(float(state.level))
-    late = t_s >= 0.1 - 1e-9  # four periods, more than six time constants after the start
-    wave = torch.tensor(seen, dtype=torch.float64)[late] - 4
-    phase = 2 * math.pi * 40 * t_s[late]
-    amplitude = 2 * math.hypot(float((wave * phase.sin()).mean()), float((wave * phase.cos()).mean()))
-    assert amplitude == pytest.approx(
-        0.01 * np.sinc(40 / fps) ** 2 / math.sqrt(1 + (40 / bandwidth_hz) ** 2), rel=error
-    )
 
 
 @pytest.mark.bits
@@ -270,51 +247,3 @@ def test_hot_pixels_fire_on_at_their_rate_and_others_are_silent():
     assert bool((events.p == 1).all())
     gaps = events.t_us[(events.y * 100 + events.x) == int(hot.nonzero()[0])].diff()
     assert (gaps - 20_000).abs().max() <= 2
-
-
-def test_dead_time_bounds_the_rate_of_a_pixel():
-    level = torch.linspace(0, 50, 51)[:, None, None].expand(51, 2, 2)
-    events = simulate(
-        level,
-        torch.arange(51, dtype=torch.float64) * 0.01,
-        SensorModel(0.1, 0.1, refractory_s=0.0035),
-        log_input=True,
-    )
-    # a crossing per millisecond: after an event those at 1, 2, 3 ms are lost, that at 4 ms counts
-    gaps = events.t_us[(events.x == 0) & (events.y == 0)].diff()
-    assert (gaps - 4000).abs().max() <= 1
-    assert len(gaps) == 124
-
-
-def test_static_scenes_are_silent_without_noise_in_every_preset_of_the_physics():
-    still = torch.rand(9, 8, generator=torch.Generator().manual_seed(0)).mul(255).expand(20, 9, 8)
-    t_s = torch.arange(20, dtype=torch.float64) * 0.05
-    for sensor in (
-        SensorModel(),
-        PRESETS["clean"],
-        SensorModel(cutoff_hz=3.0, refractory_s=1e-3, theta_sigma=0.05),
-    ):
-        for log_eps in (None, 1e-3):
-            assert len(simulate(still, t_s, sensor, log_eps=log_eps)) == 0
-
-
-def test_linear_frames_of_high_dynamic_range_take_the_logarithm():
-    frames = torch.tensor([1e-2, 1e4], dtype=torch.float64)[:, None, None]
-    events = simulate(frames, [0.0, 1.0], SensorModel(0.5, 0.5), log_eps=1e-4)
-    assert len(events) == math.floor(math.log((1e4 + 1e-4) / (1e-2 + 1e-4)) / 0.5)
-    with pytest.raises(DomainError, match="log_eps"):
-        simulate(frames, [0.0, 1.0], SensorModel(), log_eps=0.0)
-    with pytest.raises(DomainError, match="log_input"):
-        simulate(frames, [0.0, 1.0], SensorModel(), log_eps=1.0, log_input=True)
-
-
-def test_bad_frames_in_a_later_chunk_leave_the_state_as_it_was():
-    frames, t_s = clip()
-    state = SensorState()
-    simulate(frames[:5], t_s[:5], EVERYTHING, state=state)
-    before = {name: tensor.clone() for name, tensor in state.tensors().items()}
-    frames[20, 3, 3] = math.nan
-    with pytest.raises(DomainError, match="NaN"):
-        simulate(frames[5:], t_s[5:], EVERYTHING, state=state)
-    assert state.time_s == float(t_s[4])
-    assert all(torch.equal(tensor, before[name]) for name, tensor in state.tensors().items())

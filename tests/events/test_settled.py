@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from codesign import events
-from codesign.errors import DomainError
 
 RATE = 25.0  # of the log level, per second
 THETA = 0.2
@@ -67,13 +66,3 @@ def test_gradient_is_that_of_the_count():
     volume = PARTS["layer"](IDEAL, LEAD_S)(ramps(times(), slope), times(), 5)
     volume.counts[:, 0].sum(1).mean().backward()
     assert float(slope.grad) == pytest.approx(STEADY, rel=0.03)
-
-
-def test_a_lead_between_frames_is_refused():
-    times_s = torch.linspace(0, 0.03, 4, dtype=torch.float64)
-    with pytest.raises(DomainError, match=r"no frame stands 0\.007 s after the first"):
-        events.Settled(events.layer("memory"), 0.007).volume(ramps(times_s), times_s, 2)
-    with pytest.raises(DomainError, match="no frame stands"):
-        events.Settled(events.layer("memory"), 0.03).volume(ramps(times_s), times_s, 2)
-    with pytest.raises(DomainError, match="lead_s is -1"):
-        events.HardSensor(IDEAL, 5, -1.0)

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.errors import DomainError, ShapeError
 from codesign.events import (
     SensorModel,
-    SensorState,
     draw_shot_counts,
     draw_thresholds,
     lin_log,
@@ -149,34 +147,6 @@ def test_drawn_shot_counts_are_poisson_per_pixel_and_polarity():
             assert abs(found.var() - expected) < 5 * math.sqrt((expected + 2 * expected**2) / 50_000)
 
 
-def test_a_huge_step_and_one_pixel():
-    # from black (level 0) to 1e4 (ln 1e4 = 9.21034): 46 events of 0.2, evenly spaced by 0.2/9.21034 of the
-    # interval
-    events = simulate(
-        torch.tensor([0.0, 1e4, 1e4, 1e4], dtype=torch.float64)[:, None, None],
-        [0.0, 1.0, 2.0, 3.0],
-        SensorModel(),
-    )
-    truth = (torch.arange(1, 47) * 0.2 / math.log(1e4) * 1e6).round().long()
-    assert torch.equal(events.t_us, truth)
-
-
-@pytest.mark.parametrize("field", ["theta_on", "theta_off", "theta_sigma", "shot_rate_hz"])
-@pytest.mark.parametrize("value", [-1.0, math.nan, math.inf, "0.2", None])
-def test_sensor_parameters_are_checked(field, value):
-    with pytest.raises(DomainError, match=field):
-        SensorModel(**{field: value})
-
-
-def test_sensor_refuses_zero_thresholds_and_other_timings():
-    with pytest.raises(DomainError, match="theta_on"):
-        SensorModel(theta_on=0.0)
-    with pytest.raises(DomainError, match="theta_off"):
-        SensorModel(theta_off=0)
-    with pytest.raises(DomainError, match="timing"):
-        SensorModel(timing="exact")
-
-
 def test_single_precision_keeps_the_times_of_long_ramps():
     """Each event once rounded the memorised level alike: microseconds too early or late after some dozens."""
     generator = torch.Generator().manual_seed(0)
@@ -204,34 +174,3 @@ def test_a_leak_below_the_last_digit_of_a_level_still_leaks():
     assert (
         np.abs(events.t_us.numpy() - np.array([100_000, 200_000])).max() <= 20
     )  # a last digit of the level: 48 us
-
-
-def test_bad_frames_and_times_are_refused_and_the_state_stays():
-    good = torch.full((3, 4, 5), 50.0)
-    t_s = [0.0, 0.1, 0.2]
-    sensor = SensorModel()
-    for frames, times_s, error, words in [
-        (good[:1], t_s[:1], ShapeError, "at least 2"),
-        (good[:, 0], t_s, ShapeError, "H, W"),
-        (good * math.nan, t_s, DomainError, "NaN"),
-        (-good, t_s, DomainError, "negative"),
-        (good, t_s[:2], ShapeError, r"\[3\]"),
-        (good, [0.0, 0.1, 0.1], DomainError, "increase"),
-        (good, [0.0, math.nan, 0.1], DomainError, "t_s"),
-    ]:
-        with pytest.raises(error, match=words):
-            simulate(frames, times_s, sensor)
-    state = SensorState()
-    simulate(good, t_s, sensor, state=state)
-    for frames, times_s, error, words in [
-        (good[:, :2], [0.3, 0.4, 0.5], ShapeError, "keeps its size"),
-        (good.double(), [0.3, 0.4, 0.5], ShapeError, "keeps its size"),
-        (good, [0.2, 0.3, 0.4], DomainError, "go on increasing"),
-    ]:
-        with pytest.raises(error, match=words):
-            simulate(frames, times_s, sensor, state=state)
-    assert state.time_s == 0.2
-    with pytest.raises(DomainError, match="interval_s"):
-        draw_shot_counts(sensor, (2, 2), [0.1, 0.0], torch.Generator())
-    with pytest.raises(ShapeError, match="interval_s"):
-        draw_shot_counts(sensor, (2, 2), torch.tensor(0.1), torch.Generator())

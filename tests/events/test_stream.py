@@ -1,10 +1,8 @@
 """Order, joining and counting of event streams."""
 
-import pytest
 import torch
 
-from codesign.errors import DomainError, ShapeError
-from codesign.events import concatenate, to_counts
+from codesign.events import to_counts
 from codesign.events.stream import ordered
 
 
@@ -34,23 +32,3 @@ def test_counts_land_in_their_pixel():
     t_us, x, y, p = tensors([5, 6, 7, 7], [0, 2, 2, 2], [1, 0, 0, 0], [1, -1, 1, 1])
     counts = to_counts(ordered(t_us, x, y, p, 2, 3), [0, 1e-5])
     assert counts.tolist() == [[[[0, 0, 2], [1, 0, 0]], [[0, 0, 1], [0, 0, 0]]]]
-
-
-def test_what_is_no_event_is_refused():
-    t_us, x, y, p = tensors([1, 2], [0, 1], [0, 1], [1, -1])
-    for column, row, polarity, error, words in [
-        (x + 1, y, p, DomainError, "x spans 1 to 2"),
-        (x, y - 1, p, DomainError, "y spans -1 to 0"),
-        (x, y, p * 2, DomainError, "polarity 2"),
-        (x[:1], y, p, ShapeError, "equal length"),
-    ]:
-        with pytest.raises(error, match=words):
-            ordered(t_us, column, row, polarity, 2, 2)
-    stream = ordered(t_us, x, y, p, 2, 2)
-    with pytest.raises(ShapeError, match="one sensor"):
-        concatenate([stream, ordered(t_us, x, y, p, 2, 3)])
-    with pytest.raises(ShapeError, match="at least one"):
-        concatenate([])
-    for times_s in ([0.0], [0.0, 1e-7]):
-        with pytest.raises(DomainError, match="microsecond"):
-            to_counts(stream, times_s)

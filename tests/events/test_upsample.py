@@ -6,7 +6,6 @@ import math
 import pytest
 import torch
 
-from codesign.errors import DomainError, ShapeError
 from codesign.events import SensorModel, lin_log, simulate
 from codesign.events.upsampling.upsample import upsample, upsample_stream
 
@@ -149,44 +148,3 @@ def test_the_stream_gives_the_whole_bit_for_bit():
     assert torch.equal(torch.cat([made for made, _ in pieces]), whole)
     assert torch.equal(torch.cat([t_s for _, t_s in pieces]), whole_s)
     assert [float(t_s[-1]) for _, t_s in pieces] == times
-
-
-def test_gradients_to_the_frames_are_those_of_differences():
-    frames = moving([(0, 0), (2.3, 0.8)], 24, 30, torch.float64).requires_grad_()
-    weight = torch.rand(3, 24, 30, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    (upsample(frames, [0.0, 1.0], max_displacement_px=1.6)[0][:3] * weight).sum().backward()
-    # for light that is scaled as a whole flow and visibility stay (but for the offset of the dark), and the
-    # result is linear in the frames: the sum of gradient times frames is the weighted sum itself (Euler)
-    made = upsample(frames.detach(), [0.0, 1.0], max_displacement_px=1.6)[0][:3]
-    assert frames.grad is not None
-    assert float((frames.grad * frames.detach()).sum()) == pytest.approx(
-        float((made * weight).sum()), rel=1e-12
-    )
-
-
-def test_what_cannot_be_is_refused_with_a_sentence():
-    frames = moving([(0, 0), (6, 0)])
-    times = [0.0, 0.1]
-    for arguments, options, error, words in [
-        ((frames[:1], [0.0]), {}, ShapeError, "at least 2"),
-        ((frames[0], times), {}, ShapeError, r"\[T, H, W\]|times|t_s"),
-        ((frames * math.nan, times), {}, DomainError, "NaN"),
-        ((-frames, times), {}, DomainError, "negative"),
-        ((frames.to(torch.uint8), times), {}, DomainError, "float32"),
-        ((frames, [0.0, 0.1, 0.2]), {}, ShapeError, "t_s"),
-        ((frames, [0.1, 0.1]), {}, DomainError, "increase"),
-        ((frames, times), {"max_displacement_px": 0.0}, DomainError, "max_displacement_px is 0.0"),
-        ((frames, times), {"max_displacement_px": None}, DomainError, "max_displacement_px = None"),
-        ((frames, times), {"max_log_change": math.nan}, DomainError, "max_log_change is nan"),
-        ((frames, times), {"max_steps": 0}, DomainError, "max_steps is 0"),
-        ((frames, times), {"max_steps": 2}, DomainError, "max_steps = 2: record faster"),
-    ]:
-        with pytest.raises(error, match=words):
-            upsample(*arguments, **options)
-    for given, seconds, error, words in [
-        ([frames[0], frames[1, 1:]], times, ShapeError, "frame 1"),
-        ([frames[0], frames[1] * math.nan], times, DomainError, "frame 1"),
-        (frames, [0.1, 0.0], DomainError, "frame 1 is at 0.0 s"),
-    ]:
-        with pytest.raises(error, match=words):
-            list(upsample_stream(given, seconds))

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from codesign.errors import FileFormatError
-from codesign.events.sources.folder import natural
-from codesign.events.sources.opening import open_frames
+from codesign.events.sources.frames import open_frames
 
 # imageio leaves FFmpeg's pipes to the garbage collector
 IMAGEIO_LEAKS = pytest.mark.filterwarnings(
@@ -129,21 +128,6 @@ def test_lossless_folders_come_back_bit_for_bit_in_natural_order(tmp_path, suffi
     assert (source.count, source.white, source.t_s) == (12, float(np.iinfo(kind).max), None)
     np.testing.assert_array_equal(frames_of(tmp_path), frames)
     np.testing.assert_array_equal(frames_of(tmp_path, 9), frames[9:])
-
-
-def test_natural_order():
-    from pathlib import Path
-
-    names = ["a10b2.png", "a2b10.png", "a2b9.png", "a2.png", "B1.png", "10.png", "9.png"]
-    assert [path.name for path in sorted(map(Path, names), key=natural)] == [
-        "9.png",
-        "10.png",
-        "a2.png",
-        "a2b9.png",
-        "a2b10.png",
-        "a10b2.png",
-        "B1.png",
-    ]
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32, np.float64])

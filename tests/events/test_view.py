@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.errors import DomainError, FileFormatError, ShapeError
+from codesign.errors import DomainError, ShapeError
 from codesign.events import decay, decay_video, gray_picture, picture, rates, write_video
 from codesign.events.stream import ordered
-from codesign.events.views.rate_curves import rate_figure
-from codesign.events.views.space_time import sample, space_time_figure
+from codesign.events.views.figures import rate_figure, sample, space_time_figure
 
 COUNTS = torch.tensor([[[4.0, 0, 2, 0]], [[0, 4, 2, 0]]])  # [2, 1, 4]: four ON, four OFF, two of each, none
 
@@ -93,27 +92,6 @@ def test_decay_video_is_the_same_from_stream_and_counts(tmp_path):
     np.testing.assert_array_equal(first, second)
     faded = round(255 * (1 - math.exp(-1)))
     assert second[1, 0, 0].tolist() == [255, faded, faded]
-
-
-def test_bad_input_is_refused_with_a_reason(tmp_path):
-    still = torch.zeros(2, 4, 4, dtype=torch.uint8)
-    for path, pictures, fps, error, words in [
-        ("e.avi", still, 10, FileFormatError, r"\.mp4 or \.gif"),
-        ("none/e.gif", still, 10, FileFormatError, "folder"),
-        ("e.gif", still.float(), 10, ShapeError, "uint8"),
-        ("e.gif", still[0], 10, ShapeError, "uint8"),
-        ("e.gif", still, 0, DomainError, "fps"),
-    ]:
-        with pytest.raises(error, match=words):
-            write_video(tmp_path / path, pictures, fps)
-    with pytest.raises(ShapeError, match="ON first"):
-        picture(torch.zeros(3, 4, 4))
-    for full_scale in (0, -1, math.nan):
-        with pytest.raises(DomainError, match="full_scale"):
-            picture(COUNTS, full_scale)
-    with pytest.raises(DomainError, match="tau_s"):
-        decay(torch.zeros(1, 2, 3, 3), [0, 1], 0)
-    assert not list(tmp_path.iterdir())
 
 
 def test_pictures_may_come_one_by_one(tmp_path):

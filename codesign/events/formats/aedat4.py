@@ -1,16 +1,281 @@
-"""Events in AEDAT 4.0 files: packets of 16-byte events with 64-bit microseconds.
+"""AEDAT 4.0: packets of 16-byte events with 64-bit microseconds, and the frames that DAVIS cameras record beside them.
 
-Source: iniVation documentation, "AEDAT file formats", AEDAT 4.0 (the container is in aedat4_container).
+Layout: the line ``#!AER-DAT4.0``, an IOHeader (FlatBuffer: compression, position of the table, XML that names
+  the streams), packets of (stream, size) and a compressed FlatBuffer each, and a compressed FileDataTable
+  that lists the packets once more. FlatBuffers are read without generated code, every offset checked.
+Source: iniVation documentation, "AEDAT file formats", AEDAT 4.0; FlatBuffers schemas of dv-processing; FlatBuffers
+  documentation, "FlatBuffer Internals".
 """
 
+import re
 import struct
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from codesign.errors import FileFormatError
-from codesign.events.formats import flatbuffer
-from codesign.events.formats.aedat4_container import LZ4, MAGIC, lz4_frame, read_container
+from codesign.events.entry import check_path
 from codesign.events.formats.arrival import arranged, columns
+from codesign.optional import optional
+from codesign.reading import check_regular, open_regular, reading
+
+
+class Table:
+    """One table of a buffer; fields are asked for by their place in the schema (0, 1, …)."""
+
+    def __init__(self, path, data, at):
+        self.path = path
+        self.data = data
+        self.at = at
+        self.slots = at - number(path, data, at, "<i")
+        self.slots_bytes = number(path, data, self.slots, "<H")
+
+    def _field(self, place):
+        """Where a field lies, or 0 when it is absent."""
+        slot = 4 + 2 * place
+        offset = number(self.path, self.data, self.slots + slot, "<H") if slot + 2 <= self.slots_bytes else 0
+        return self.at + offset if offset else 0
+
+    def scalar(self, place, code, default=0):
+        """The number in a field, by its ``struct`` code."""
+        at = self._field(place)
+        return number(self.path, self.data, at, code) if at else default
+
+    def pair(self, place):
+        """Two int32 of a struct in a field."""
+        at = self._field(place)
+        return (
+            (number(self.path, self.data, at, "<i"), number(self.path, self.data, at + 4, "<i"))
+            if at
+            else (0, 0)
+        )
+
+    def array(self, place, dtype) -> np.ndarray:
+        """[N] numpy array of a vector of scalars or structs; empty when the field is absent. It shares the
+        buffer's memory."""
+        at = self._field(place)
+        if not at:
+            return np.empty(0, dtype)
+        at += number(self.path, self.data, at, "<I")
+        count = number(self.path, self.data, at, "<I")
+        dtype = np.dtype(dtype)
+        if at + 4 + count * dtype.itemsize > len(self.data):
+            raise damaged(
+                self.path, f"a list of {count} entries of {dtype.itemsize} bytes at byte {at}", len(self.data)
+            )
+        return np.frombuffer(self.data, dtype, count, at + 4)
+
+    def tables(self, place, count):
+        """The tables of a vector of tables, of which there must be ``count``."""
+        at = self._field(place)
+        starts = self.array(place, "<u4")
+        if len(starts) != count:
+            raise FileFormatError(
+                f"{self.path}: a list has {len(starts)} entries where {count} are needed; the file is "
+                "damaged."
+            )
+        first = at + number(self.path, self.data, at, "<I") + 4 if at else 0
+        return [Table(self.path, self.data, first + 4 * k + int(start)) for k, start in enumerate(starts)]
+
+
+def root(path, data, identifier):
+    """The root table of a buffer that begins with its size; ``identifier`` is the four letters of its
+    schema."""
+    size = number(path, data, 0, "<I")
+    if size + 4 != len(data) or data[8:12] != identifier:
+        raise FileFormatError(
+            f"{path}: a block of {len(data)} bytes says {size} and {data[8:12]!r}; {len(data) - 4} and "
+            f"{identifier!r} are needed; the file is damaged."
+        )
+    return Table(path, data, 4 + number(path, data, 4, "<I"))
+
+
+def number(path, data, at, code):
+    """The number at a byte, by its ``struct`` code."""
+    if at < 0 or at + struct.calcsize(code) > len(data):
+        raise damaged(path, f"a number at byte {at}", len(data))
+    return struct.unpack_from(code, data, at)[0]
+
+
+def damaged(path, what, size):
+    """The error for anything that lies outside its block."""
+    return FileFormatError(
+        f"{path}: a block of {size} bytes points to {what}, outside itself; the file is damaged."
+    )
+
+
+lz4_frame = optional("lz4.frame", "event-files", "reading and writing .aedat4")
+zstandard = optional("zstandard", "event-files", "reading .aedat4 packed by Zstandard")
+
+MAGIC = b"#!AER-DAT4.0\r\n"
+NONE, LZ4, LZ4_HIGH, ZSTD, ZSTD_HIGH = range(5)
+STREAM_NUMBER = re.compile(r"[0-9]{1,5}")
+SIDE = re.compile(r"[1-9][0-9]{0,4}")
+# LZ4 packs at most 255 to 1; what claims to unpack to more than this is refused, not unpacked
+LIMIT_RATIO = 1024
+LIMIT_EXTRA_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class Packet:
+    """One packet: stream number, where its bytes begin in the file, how many they are, and its unpacked
+    FlatBuffer."""
+
+    stream: int
+    at: int
+    size: int
+    body: bytes
+
+
+def read_container(path, kind):
+    """(packets of the one stream of a kind, its sensor size (height_px, width_px) or None, rows of the table
+    or None).
+
+    Args: path: file. kind: four letters, "EVTS" (events) or "FRME" (frames).
+    Raises: FileFormatError for another kind of file, damage, a file cut short, or not exactly one stream of
+      the kind.
+    """
+    with open_regular(path) as file:
+        data = file.read()
+    if not data.startswith(MAGIC):
+        raise FileFormatError(f"{path} does not start with {MAGIC!r}; it is not an AEDAT 4.0 file.")
+    start = len(MAGIC) + 4 + number(path, data, len(MAGIC), "<I")
+    header = root(path, data[len(MAGIC) : start], b"IOHE")
+    compression = header.scalar(0, "<i")
+    if compression not in range(5):
+        raise FileFormatError(
+            f"{path}: compression {compression} is unknown; 0 (none), 1 and 2 (LZ4), 3 and 4 (ZSTD) are read."
+        )
+    table_at = header.scalar(1, "<q", -1)
+    if table_at != -1 and not start <= table_at <= len(data):
+        raise FileFormatError(
+            f"{path}: the table of packets is said to lie at byte {table_at} of {len(data)}; the file was "
+            "cut or is damaged."
+        )
+    wanted, size = _stream(path, header.array(2, "u1").tobytes(), kind)
+    places = _places(path, data, start, len(data) if table_at == -1 else table_at)
+    packets = [
+        Packet(stream, at, count, unpacked(path, data[at : at + count], compression))
+        for stream, at, count in places
+        if stream == wanted
+    ]
+    rows = None
+    if table_at != -1:
+        rows = _listed(path, unpacked(path, data[table_at:], compression), len(places))
+        if [row[:3] for row in rows] != places:
+            raise FileFormatError(
+                f"{path}: the table at the end lists other packets than the file holds; the file is damaged."
+            )
+        rows = [row for row in rows if row[0] == wanted]
+    return packets, size, rows
+
+
+def unpacked(path, data, compression):
+    """Decompress one block, never into more than LIMIT_RATIO times its size."""
+    limit = LIMIT_RATIO * len(data) + LIMIT_EXTRA_BYTES
+    if compression == NONE:
+        return data
+    with reading(f"{path}: a block of {len(data)} bytes", "the file is damaged"):
+        if compression in (LZ4, LZ4_HIGH):
+            unpacker = lz4_frame.LZ4FrameDecompressor()
+            body = unpacker.decompress(data, max_length=limit)
+        else:
+            unpacker = zstandard.ZstdDecompressor(max_window_size=2**27).decompressobj()
+            if zstandard.frame_content_size(data) > limit:
+                raise FileFormatError(
+                    f"{path}: a block of {len(data)} bytes claims to hold more than {limit} bytes; the file is damaged."
+                )
+            body = unpacker.decompress(data)
+    if not unpacker.eof or unpacker.unused_data:
+        raise FileFormatError(
+            f"{path}: a block of {len(data)} bytes ends early, goes on too long, or holds more than {limit} "
+            "bytes; the file is damaged."
+        )
+    return body
+
+
+def _places(path, data, at, stop):
+    """[(stream, first byte, bytes)] of the packets between two places of the file."""
+    places = []
+    while at < stop:
+        if at + 8 > stop:
+            raise FileFormatError(
+                f"{path} ends amid a packet's header, at byte {at}; it was cut, copy it again."
+            )
+        stream, count = struct.unpack_from("<ii", data, at)
+        if count < 0 or at + 8 + count > stop:
+            raise FileFormatError(
+                f"{path}: the packet at byte {at} claims {count} bytes, {stop - at - 8} are left; the file "
+                "was cut or is damaged."
+            )
+        places.append((stream, at + 8, count))
+        at += 8 + count
+    return places
+
+
+def _listed(path, body, count):
+    """[(stream, first byte, bytes, elements, first time, last time)] of the table at the end."""
+    rows = []
+    for entry in root(path, body, b"FTAB").tables(0, count):
+        stream, count = entry.pair(1)
+        rows.append(
+            (
+                stream,
+                entry.scalar(0, "<q"),
+                count,
+                entry.scalar(2, "<q"),
+                entry.scalar(3, "<q"),
+                entry.scalar(4, "<q"),
+            )
+        )
+    return rows
+
+
+def _stream(path, text, kind):
+    """(number, (height_px, width_px) or None) of the only stream of a kind in the XML of the header."""
+    with reading(f"{path}: the header's XML", "the file is damaged"):
+        plain = text.decode("utf-8")  # decoded here, so that another encoding cannot hide a declaration
+        if "<!" in plain.replace("<!--", ""):
+            raise FileFormatError(
+                f"{path}: the header's XML declares a document type or entities; none is allowed."
+            )
+        found = ElementTree.fromstring(plain)
+        streams = [
+            node
+            for node in found.findall("./node[@name='outInfo']/node")
+            if _attribute(node, "typeIdentifier") == kind
+        ]
+    if len(streams) != 1:
+        raise FileFormatError(
+            f"{path} holds {len(streams)} streams of kind {kind}; one is needed, export a single one."
+        )
+    sizes = [
+        _attribute(node, name)
+        for node in streams[0].findall("./node[@name='info']")
+        for name in ("sizeY", "sizeX")
+    ]
+    number = streams[0].get("name", "")
+    sides = [size for size in sizes if size is not None]
+    if (
+        not STREAM_NUMBER.fullmatch(number)
+        or not all(SIDE.fullmatch(side) for side in sides)
+        or len(sides) not in (0, 2)
+    ):
+        raise FileFormatError(
+            f"{path}: stream number and sensor size are given as {number!r} and {sides}; whole numbers are "
+            "needed, the file is damaged."
+        )
+    return int(number), (tuple(int(side) for side in sides) or None)
+
+
+def _attribute(node, key):
+    found = node.find(f"./attr[@key='{key}']")
+    return None if found is None else (found.text or "")
+
 
 EVENT = np.dtype(
     {
@@ -62,7 +327,7 @@ def read_aedat4(path, asked):
       times go back (see arrival).
     """
     packets, size, rows = read_container(path, "EVTS")
-    parts = [flatbuffer.root(path, packet.body, b"EVTS").array(0, EVENT) for packet in packets]
+    parts = [root(path, packet.body, b"EVTS").array(0, EVENT) for packet in packets]
     for part, row in zip(parts, rows or (), strict=rows is not None):
         if len(part) != row[3] or (len(part) and (part["t"][0], part["t"][-1]) != row[4:]):
             raise FileFormatError(
@@ -143,3 +408,88 @@ def _table(entries):
         "<II4sHHHHHHHHHHiII", size - 4, 28, b"FTAB", 6, 8, 4, 14, 44, 4, 36, 12, 20, 28, 20, 4, len(entries)
     )
     return head + offsets + bytes(first - len(head) - len(offsets)) + entries.tobytes()
+
+
+# places in the schema
+TIMESTAMP = 0
+EXPOSURE_START = 3
+EXPOSURE_END = 4
+FORMAT = 5
+WIDTH = 6
+HEIGHT = 7
+LEFT = 8
+TOP = 9
+PIXELS = 10
+EXPOSURE = 11
+GRAY = 0
+
+
+@dataclass(frozen=True)
+class RecordedFrames:
+    """Grey frames of a camera, on the clock of its events.
+
+    frames: [T, H, W] uint8. exposure_start_us, exposure_end_us: [T] int64 microseconds.
+    """
+
+    frames: Tensor
+    exposure_start_us: Tensor
+    exposure_end_us: Tensor
+
+
+def read_frames(path: str | Path) -> RecordedFrames:
+    """Read the frames of an AEDAT 4.0 file.
+
+    Args: path: file ending in .aedat4.
+    Returns: RecordedFrames.
+    Raises: FileFormatError when the file is missing, damaged, cut short, without a single stream of frames,
+      or has frames in colour or of several sizes.
+    """
+    path = check_regular(check_path(path))
+    packets, size, _ = read_container(path, "FRME")
+    if not packets:
+        raise FileFormatError(f"{path} holds no frame.")
+    tables = [root(path, packet.body, b"FRME") for packet in packets]
+    frames = []
+    times_us = []
+    for table in tables:
+        height_px = table.scalar(HEIGHT, "<h")
+        width_px = table.scalar(WIDTH, "<h")
+        pixels = table.array(PIXELS, "u1")
+        if table.scalar(FORMAT, "<b") != GRAY:
+            raise FileFormatError(
+                f"{path}: frame {len(frames)} has pixel format {table.scalar(FORMAT, '<b')}; 0 (8-bit grey) "
+                "is read."
+            )
+        if height_px < 1 or width_px < 1 or pixels.size != height_px * width_px:
+            raise FileFormatError(
+                f"{path}: frame {len(frames)} has {pixels.size} values for {width_px} x {height_px} pixels; "
+                "the file is damaged."
+            )
+        if (height_px, width_px) != (size or (height_px, width_px)) or (
+            table.scalar(LEFT, "<h"),
+            table.scalar(TOP, "<h"),
+        ) != (0, 0):
+            raise FileFormatError(
+                f"{path}: frame {len(frames)} shows {width_px} x {height_px} pixels, a part of the sensor; "
+                "whole frames are read."
+            )
+        size = height_px, width_px
+        frames.append(pixels.reshape(size))
+        times_us.append(_exposure_us(table))
+    start_us, end_us = torch.tensor(times_us, dtype=torch.int64).unbind(1)
+    if bool((end_us < start_us).any()):
+        raise FileFormatError(
+            f"{path}: frame {int((end_us < start_us).nonzero()[0])} ends its exposure before it starts; the "
+            "file is damaged."
+        )
+    return RecordedFrames(torch.from_numpy(np.stack(frames)), start_us, end_us)
+
+
+def _exposure_us(table):
+    """Start and end of exposure; recorders since dv-processing 1.2 give the start as the time of the frame,
+    and a duration."""
+    start_us = table.scalar(EXPOSURE_START, "<q")
+    end_us = table.scalar(EXPOSURE_END, "<q")
+    if start_us or end_us:
+        return start_us, end_us
+    return table.scalar(TIMESTAMP, "<q"), table.scalar(TIMESTAMP, "<q") + table.scalar(EXPOSURE, "<q")

@@ -8,8 +8,7 @@ import torch
 
 from codesign.arrays import open_npz, read_npy
 from codesign.errors import FileFormatError
-from codesign.events.formats.arrival import Arrival
-from codesign.events.formats.tables import NAMES, microseconds, settled_order, settled_unit
+from codesign.events.formats.arrival import NAMES, Arrival, microseconds, settled_order, settled_unit
 
 OWN = ("t_us", "x", "y", "p", "height_px", "width_px")
 SIZE = ("height_px", "width_px")

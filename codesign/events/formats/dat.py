@@ -10,8 +10,13 @@ import numpy as np
 
 from codesign.errors import FileFormatError
 from codesign.events.formats.arrival import arranged, columns
-from codesign.events.formats.clock import unwrapped
-from codesign.events.formats.percent_header import checked_start_us, parsed, start_us, whole_number
+from codesign.events.formats.prophesee import (
+    checked_start_us,
+    parse_header,
+    start_us,
+    unwrapped,
+    whole_number,
+)
 
 EVENT = np.dtype([("t", "<u4"), ("address", "<u4")])
 TYPES = (0x00, 0x0C)  # generic events of pixels, and contrast detection
@@ -26,7 +31,7 @@ def read_dat(path, asked):
       unknown polarity, or time going back.
     """
     data = path.read_bytes()
-    fields, start = parsed(path, data)
+    fields, start = parse_header(path, data)
     if fields.get("Version") != "2":
         raise FileFormatError(
             f"{path}: the header gives version {fields.get('Version', 'none')!r}; DAT version 2 is read."

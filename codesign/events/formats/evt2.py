@@ -7,7 +7,7 @@ Source: Prophesee Metavision documentation, "EVT 2.0 Format".
 import numpy as np
 
 from codesign.errors import FileFormatError
-from codesign.events.formats.clock import held, unwrapped
+from codesign.events.formats.prophesee import held, unwrapped
 
 WORD = np.dtype("<u4")
 LOOP_US = 2**34

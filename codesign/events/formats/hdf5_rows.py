@@ -1,15 +1,131 @@
-"""Rows of large HDF5 datasets, block by block, with the guard of hdf5_chunks against damaged files."""
+"""HDF5 on damaged files and full disks: rows of large datasets, block by block, and new files.
 
-from collections.abc import Sequence
+The library trusts its filters: a block that unpacks to fewer bytes than its chunk, or a filter without its
+parameters, ends the process. So gzip blocks are unpacked and measured here, and Blosc blocks are handed on
+only when their headers say what the chunk needs; other filters are refused.
+Source: HDF5 File Format Specification 3.0, "Data Object Header Messages: Filter Pipeline"; c-blosc,
+  README_CHUNK_FORMAT.
+"""
+
+import contextlib
+import io
+import math
+import struct
+import zlib
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from codesign.errors import FileFormatError
-from codesign.events.formats import hdf5_chunks as chunks
-from codesign.events.formats.hdf5_chunks import h5py
+from codesign.optional import optional
 from codesign.reading import check_regular, reading
+
+# hdf5plugin registers the Blosc filter that DSEC's published files use
+h5py = optional("h5py", "event-files", "reading and writing HDF5 files", "hdf5plugin")
+
+GZIP = 1
+SHUFFLE = 2
+FLETCHER32 = 3
+BLOSC = 32001
+# what claims to unpack to more than this is refused, not unpacked
+LIMIT_RATIO = 4096
+LIMIT_EXTRA_BYTES = 2**20
+
+
+def chunk_bytes(dataset):
+    return math.prod(dataset.chunks) * dataset.dtype.itemsize
+
+
+def places_of(path, dataset, name, file_bytes):
+    """[(first indices, mask of filters left out, stored bytes)] of all blocks, which must cover the dataset
+    once."""
+    needed = math.prod(
+        -(-length // chunk) for length, chunk in zip(dataset.shape, dataset.chunks, strict=True)
+    )
+    if (
+        needed > file_bytes
+        or max(needed * chunk_bytes(dataset), dataset.size * dataset.dtype.itemsize)
+        > LIMIT_RATIO * file_bytes + LIMIT_EXTRA_BYTES
+    ):
+        raise FileFormatError(
+            f"{path}: {name} claims {list(dataset.shape)} values, out of proportion to a file of "
+            f"{file_bytes} bytes; it is damaged."
+        )
+    places = []
+    dataset.id.chunk_iter(lambda info: places.append((tuple(info.chunk_offset), info.filter_mask, info.size)))
+    sides = tuple(zip(dataset.chunks, dataset.shape, strict=True))
+    inside = all(
+        first % chunk == 0 and 0 <= first < length
+        for at, _, _ in places
+        for first, (chunk, length) in zip(at, sides, strict=True)
+    )
+    if (
+        not inside
+        or len({at for at, _, _ in places}) != needed
+        or len(places) != needed
+        or any(size > file_bytes for _, _, size in places)
+    ):
+        raise FileFormatError(
+            f"{path}: {name} needs {needed} blocks and lacks some; the file was cut or is damaged."
+        )
+    return places
+
+
+def undone(path, name, kind, options, data, limit_bytes):
+    """One filter undone."""
+    if kind == GZIP:
+        unpacker = zlib.decompressobj()
+        data = unpacker.decompress(data, limit_bytes + 4)
+        if not unpacker.eof or unpacker.unused_data:
+            raise damaged(path, name, "gzip")
+        return data
+    if kind == SHUFFLE:
+        width = options[0] if options else 0
+        if not 0 < width <= 8 or len(data) % width:
+            raise damaged(path, name, "shuffle")
+        return np.frombuffer(data, np.uint8).reshape(width, -1).T.tobytes()
+    if len(data) < 4:
+        raise damaged(path, name, "fletcher32")
+    words = np.frombuffer(data[:-4] + bytes(len(data) % 2), ">u2").astype(
+        np.int64
+    )  # an odd last byte is the high half of a word
+    low, high = struct.unpack("<HH", data[-4:])
+    if (int(words.sum()) - low) % 65535 or (
+        int((words * np.arange(len(words), 0, -1) % 65535).sum()) - high
+    ) % 65535:
+        raise FileFormatError(f"{path}: a block of {name} fails its checksum; the file is damaged.")
+    return data[:-4]
+
+
+def check_blosc(path, dataset, name, places, options):
+    """Every block must unpack to its chunk by its own header, and the filter must have been told so."""
+    width = dataset.dtype.itemsize
+    size = chunk_bytes(dataset)
+    if len(options) < 4 or tuple(options[2:4]) != (width, size):
+        raise damaged(path, name, "Blosc's parameters")
+    for at, mask, stored in places:
+        data = dataset.id.read_direct_chunk(at)[1]
+        if mask & 1:
+            fits = stored == size
+        else:
+            version, _, _, typesize, unpacked, block, packed = (
+                struct.unpack_from("<4B3I", data) if len(data) >= 16 else (0,) * 7
+            )
+            fits = (version, typesize, unpacked, packed) == (2, width, size, len(data)) and 0 < block <= max(
+                size, 1
+            )
+        if not fits:
+            raise damaged(path, name, at)
+
+
+def damaged(path, name, where):
+    return FileFormatError(
+        f"{path}: a block of {name} ({where}) does not unpack to what it should; the file is damaged."
+    )
+
 
 REMEDY = "it is missing, cut or damaged, or no HDF5 file of this kind"
 
@@ -103,13 +219,13 @@ class Rows:
                 )
             return
         self.block_shape = tuple(dataset.chunks)
-        for place in chunks.places_of(self.path, dataset, self.name, size):
+        for place in places_of(self.path, dataset, self.name, size):
             self.places.setdefault(place[0][0], []).append(place)
         plist = dataset.id.get_create_plist()
         self.filters = [plist.get_filter(k) for k in range(plist.get_nfilters())]
         kinds = [kind for kind, *_ in self.filters]
-        trusted = {chunks.GZIP, chunks.SHUFFLE, chunks.FLETCHER32}
-        if kinds != [chunks.BLOSC] and (not set(kinds) <= trusted or len(set(kinds)) < len(kinds)):
+        trusted = {GZIP, SHUFFLE, FLETCHER32}
+        if kinds != [BLOSC] and (not set(kinds) <= trusted or len(set(kinds)) < len(kinds)):
             raise FileFormatError(
                 f"{self.path}: {self.name} went through the filters {kinds}; gzip, shuffle, fletcher32, or "
                 "Blosc alone are read; write it anew with gzip."
@@ -151,16 +267,61 @@ class Rows:
     def _block(self, dataset, place):
         """One unpacked block, after checking that it is what it claims."""
         at, mask, _ = place
-        if self.filters and self.filters[0][0] == chunks.BLOSC:
-            chunks.check_blosc(self.path, dataset, self.name, [place], self.filters[0][2])
+        if self.filters and self.filters[0][0] == BLOSC:
+            check_blosc(self.path, dataset, self.name, [place], self.filters[0][2])
             return np.asarray(
                 dataset[tuple(slice(a, a + n) for a, n in zip(at, self.block_shape or (), strict=True))]
             )
         data = dataset.id.read_direct_chunk(at)[1]
-        size = chunks.chunk_bytes(dataset)
+        size = chunk_bytes(dataset)
         for k in reversed(range(len(self.filters))):
             if not mask >> k & 1:
-                data = chunks.undone(self.path, self.name, self.filters[k][0], self.filters[k][2], data, size)
+                data = undone(self.path, self.name, self.filters[k][0], self.filters[k][2], data, size)
         if len(data) != size:
-            raise chunks.damaged(self.path, self.name, at)
+            raise damaged(self.path, self.name, at)
         return np.frombuffer(data, dataset.dtype).reshape(self.block_shape)
+
+
+@contextlib.contextmanager
+def new_hdf5(path: str | Path, **options: Any) -> Iterator[Any]:
+    """Yield a new HDF5 file, open for writing.
+
+    Args:
+        path: of the file; what is there is lost.
+        options: of ``h5py.File``.
+
+    Raises:
+        OSError: when the block ends, if something could not be written. HDF5 itself ends the process where it fails
+            while it closes a file, so it is not told.
+    """
+    with h5py.File(path, "w"):  # HDF5 refuses a file that somebody reads
+        pass
+    with _Disk(path, "r+") as disk:
+        try:
+            with h5py.File(disk, "w", **options) as file:
+                yield file
+        finally:
+            if disk.failure:
+                raise disk.failure
+
+
+class _Disk(io.FileIO):
+    """A file whose first failure is kept; what is written after it goes nowhere."""
+
+    failure: OSError | None = None
+
+    def write(self, content) -> int:
+        left = memoryview(content).cast("B")
+        try:
+            while len(left) and self.failure is None:
+                left = left[super().write(left) :]
+        except OSError as error:
+            self.failure = error
+        return len(content)
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.failure = self.failure or error
+            return size or 0

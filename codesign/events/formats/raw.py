@@ -14,7 +14,7 @@ import numpy as np
 from codesign.errors import FileFormatError
 from codesign.events.formats import evt2, evt3
 from codesign.events.formats.arrival import arranged, columns
-from codesign.events.formats.percent_header import checked_start_us, parsed, start_us, whole_number
+from codesign.events.formats.prophesee import checked_start_us, parse_header, start_us, whole_number
 
 ENCODINGS = {2: evt2, 3: evt3}
 SIDE_PX = 2048  # 11 bits
@@ -30,7 +30,7 @@ def read_raw(path, asked):
       going back (see arrival).
     """
     data = path.read_bytes()
-    fields, start = parsed(path, data)
+    fields, start = parse_header(path, data)
     version, options = _format(path, fields)
     encoding = ENCODINGS[version]
     if (len(data) - start) % encoding.WORD.itemsize:

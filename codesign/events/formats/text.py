@@ -15,8 +15,15 @@ import numpy as np
 
 from codesign.errors import FileFormatError
 from codesign.events.columns import LIMIT_PX
-from codesign.events.formats.arrival import LAST_US, Arrival, columns
-from codesign.events.formats.tables import NAMES, microseconds, settled_order, settled_unit
+from codesign.events.formats.arrival import (
+    LAST_US,
+    NAMES,
+    Arrival,
+    columns,
+    microseconds,
+    settled_order,
+    settled_unit,
+)
 
 CHUNK_BYTES = 2**23
 LETTERS = {name: letter for letter, names in NAMES.items() for name in names}

@@ -6,7 +6,9 @@ from typing import Any
 
 from codesign.errors import DomainError
 from codesign.events.layers import comparators
-from codesign.events.layers.layer import ComparatorLayer, EventLayer, PhysicalLayer
+from codesign.events.layers.comparators import ComparatorLayer
+from codesign.events.layers.layer import EventLayer
+from codesign.events.layers.physical import PhysicalLayer
 from codesign.events.sensor.model import SensorModel
 
 COMPARATORS = {

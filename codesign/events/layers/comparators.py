@@ -9,22 +9,68 @@ the sensor's, the more often it looks. Without it the events of an interval are 
 """
 
 import warnings
-from collections.abc import Container
-from dataclasses import dataclass
+from collections.abc import Callable, Container, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
-from codesign.errors import DomainError
-from codesign.events.entry import check_whole
+from codesign.errors import DomainError, ShapeError
+from codesign.events.entry import check_times, check_whole
 from codesign.events.intensity import log_levels
-from codesign.events.layers.dense import dense
-from codesign.events.layers.expected import expected
+from codesign.events.layers.layer import EventLayer
 from codesign.events.layers.memory import memory, soft_counts
-from codesign.events.layers.soft import soft
-from codesign.events.sensor.model import SensorModel
+from codesign.events.layers.soft import dense, expected, soft
+from codesign.events.low_pass import low_pass
+from codesign.events.sensor.model import (
+    SensorModel,
+    draw_deviates,
+    draw_shot_counts,
+    mismatched,
+)
 from codesign.events.spiking.comparators import count_spikes
+
+MOST = 2**24  # numbers that are remembered
+
+
+class LastDraw:
+    """Remembers one draw: what was asked for, the generators' states before and behind it, and what came."""
+
+    def __init__(self) -> None:
+        self._asked: Any = None
+        self._before: list[Tensor] = []
+        self._behind: list[Tensor] = []
+        self._drawn: tuple[Tensor | None, ...] = ()
+
+    def __deepcopy__(self, memo):
+        return LastDraw()
+
+    def __call__(
+        self, asked: Any, generators: Sequence[Generator], draw: Callable[[], tuple[Tensor | None, ...]]
+    ) -> tuple[Tensor | None, ...]:
+        """What ``draw()`` returns, and the generators as it leaves them.
+
+        Args: asked: all that the draw depends on but its generators, to be compared by ==. generators: in the order in
+          which they are drawn from, also several times. draw: without arguments; what it returns is not changed
+          afterwards.
+        """
+        own = list(dict.fromkeys(generators))
+        place = {generator: number for number, generator in enumerate(own)}
+        asked = asked, [place[generator] for generator in generators]
+        before = [generator.get_state() for generator in own]
+        if asked == self._asked and all(map(torch.equal, before, self._before)):
+            for generator, state in zip(own, self._behind, strict=True):
+                generator.set_state(state)
+            return self._drawn
+        drawn = draw()
+        if sum(0 if numbers is None else numbers.numel() for numbers in drawn) <= MOST:
+            self._asked = asked
+            self._before = before
+            self._behind = [generator.get_state() for generator in own]
+            self._drawn = drawn
+        return drawn
+
 
 MOST_STEPS = 4096  # of spiking neurons per frame interval
 
@@ -197,3 +243,135 @@ def check_comparator(comparator: object, sensor: SensorModel, learnt: Container[
             "'physical' has them all; dataclasses.replace(sensor, ...) with zeros says that you mean it.",
             stacklevel=4,
         )
+
+
+@dataclass(frozen=True)
+class LayerState:
+    """What a ``ComparatorLayer`` carries over chunks.
+
+    comparator: state of the comparator, and what it is a state of. level, frame: [..., H, W] level behind the low-pass and last frame,
+      None without a low-pass. deviates: [2, ..., H, W] standard normal numbers of the thresholds, None without
+      mismatch. time_s: time of the last frame. generators: of the noise still to come, one per sample.
+    shape, dtype: of a frame [..., H, W].
+    """
+
+    comparator: Any
+    level: Tensor | None
+    frame: Tensor | None
+    deviates: Tensor | None
+    time_s: float
+    generators: Sequence[Generator]
+    shape: torch.Size
+    dtype: torch.dtype
+    kind: type
+
+
+class ComparatorLayer(EventLayer):
+    """Low-pass (where the sensor has a bandwidth), thresholds (with mismatch), a comparator, noise events.
+
+    Of the sensor it uses theta_on, theta_off, theta_sigma, cutoff_hz and shot_rate_hz (Poisson, as
+    ``draw_shot_counts``, without gradient); leak, dead time, hot pixels and photoreceptor noise are those of
+    ``PhysicalLayer``: a sensor that has them is taken without, and a warning names them.
+    comparator: one of ``events.layers.comparators``, or your own of the same call.
+    """
+
+    learnable = ("theta_on", "theta_off", "theta_sigma", "cutoff_hz")
+
+    def __init__(self, comparator: Comparator, sensor: SensorModel | None = None, **options: Any):
+        super().__init__(sensor, **options)
+        check_comparator(comparator, self.sensor, self.learnt)
+        self.comparator = comparator
+        self._last_draw = LastDraw()
+        self.refines = getattr(comparator, "refines", False)
+        self.whole = getattr(comparator, "whole", False)
+
+    def _count(self, frames, t_s, state, generators):
+        if state is not None and not isinstance(state, LayerState):
+            raise DomainError(f"the state is a {type(state).__name__}; pass what this layer returned.")
+        if state is not None and state.kind is not type(self.comparator):
+            raise DomainError(
+                f"the state comes from a layer with the comparator {state.kind.__name__}, this one has "
+                f"{type(self.comparator).__name__}; pass what this layer returned."
+            )
+        if state is not None and state.level is None and self.sensor.cutoff_hz > 0:
+            raise DomainError("the layer has a bandwidth, the one that began the state had not; begin anew.")
+        if state is not None and (state.shape, state.dtype) != (frames.shape[1:], frames.dtype):
+            raise ShapeError(
+                f"{frames.dtype} frames of {list(frames.shape[1:])} follow {state.dtype} frames of "
+                f"{list(state.shape)}; a sensor keeps its size and type, a batch its samples."
+            )
+        times_s = _times(frames, t_s, None if state is None else state.time_s)
+        if state is None:
+            kept = (generators, frames.shape[1:], frames.dtype, type(self.comparator))
+            state = LayerState(None, None, None, None, 0.0, *kept)
+        deviates, shots = self._noise(frames, times_s.diff(), state)
+        seen, level = self._seen(frames, times_s.diff(), state)
+        on, off = (None, None) if deviates is None else deviates
+        theta_on = self._threshold("theta_on", frames, on)
+        theta_off = self._threshold("theta_off", frames, off)
+        is_level = self.log_input or level is not None
+        counts, comparator = self.comparator(seen, theta_on, theta_off, state.comparator, is_level)
+        if shots is not None:
+            counts = counts + shots
+        frame = None if level is None else frames[-1]
+        time_s = float(times_s[-1])
+        return counts, replace(
+            state, comparator=comparator, level=level, frame=frame, deviates=deviates, time_s=time_s
+        )
+
+    def _noise(self, frames, interval_s, state):
+        """Deviates of the thresholds [2, ..., H, W] and noise events [T-1, 2, ..., H, W], None each where the
+        sensor has none; one sample after the other."""
+        draws_thetas = self.sensor.theta_sigma > 0 and state.deviates is None
+        if not draws_thetas and not self.sensor.has_shots:
+            return state.deviates, None
+        asked = (frames.shape, frames.dtype, frames.device, interval_s.tolist(), draws_thetas)
+        deviates, shots = self._last_draw(
+            asked, state.generators, lambda: self._draw(frames, interval_s, state.generators, draws_thetas)
+        )
+        return state.deviates if deviates is None else deviates, shots
+
+    def _draw(self, frames, interval_s, generators, draws_thetas):
+        pixels = frames.shape[-2:]
+        deviates = []
+        shots = []
+        for generator in generators:
+            if draws_thetas:
+                deviates.append(draw_deviates(pixels, generator, dtype=frames.dtype))
+            if self.sensor.has_shots:
+                shots.append(draw_shot_counts(self.sensor, pixels, interval_s, generator, dtype=frames.dtype))
+        batch = frames.shape[1:]
+        return (
+            torch.stack(deviates, 1).reshape(2, *batch).to(frames) if deviates else None,
+            torch.stack(shots, 2).reshape(-1, 2, *batch).to(frames) if shots else None,
+        )
+
+    def _seen(self, frames, interval_s, state):
+        """What the comparator gets: the frames, or log levels behind the low-pass with the last of them."""
+        if self.sensor.cutoff_hz == 0:
+            return frames, None
+        both = frames if state.frame is None else torch.cat((state.frame[None], frames))
+        level = log_levels(both, self.log_input, minimum=2)
+        intensity = both.exp() if self.log_input else both
+        level = low_pass(level, intensity, interval_s, self.value("cutoff_hz"), state.level)
+        return level[-len(frames) :], level[-1]
+
+    def _threshold(self, name, frames, deviate):
+        theta = torch.as_tensor(self.value(name), dtype=frames.dtype, device=frames.device)
+        if deviate is None or not self.comparator.mismatched:
+            return theta
+        sigma = torch.as_tensor(self.value("theta_sigma"), dtype=frames.dtype, device=frames.device)
+        return mismatched(theta, sigma, deviate)
+
+
+def _times(frames, t_s, before_s):
+    """Times of the frames, and before them that of the last frame of the chunk before."""
+    times_s = check_times(t_s, len(frames))
+    if before_s is None:
+        return times_s
+    if float(times_s[0]) <= before_s:
+        raise DomainError(
+            f"the chunk starts at {float(times_s[0])!r} s, the last frame seen was at {before_s!r} s; times "
+            "must go on increasing."
+        )
+    return torch.cat((torch.tensor([before_s], dtype=torch.float64), times_s))

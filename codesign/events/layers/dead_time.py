@@ -24,7 +24,7 @@ from torch.autograd.function import once_differentiable
 
 from codesign.errors import DomainError
 from codesign.events.layers import dead_time_kernel as kernel
-from codesign.events.layers.dead_time_part import PHASES, Parts
+from codesign.events.layers.dead_time_kernel import PHASES, Parts
 from codesign.events.level_path import parts
 
 GOLDEN = (5**0.5 - 1) / 2  # its multiples spread evenly: neighbouring pixels stand at different phases

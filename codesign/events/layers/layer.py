@@ -1,35 +1,62 @@
 """Event layers as modules: one call for all of them, and learnable sensor values as unconstrained variables."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Generator, Tensor, nn
 
-from codesign.errors import DomainError, ShapeError
-from codesign.events.entry import check_layout, check_times
-from codesign.events.intensity import FrontEnd, log_levels
-from codesign.events.layers.comparators import Comparator, check_comparator
-from codesign.events.layers.last_draw import LastDraw
-from codesign.events.layers.physical import DESIGN, PhysicalState, sensor_counts
-from codesign.events.layers.positive import PositiveValues
+from codesign.errors import DomainError, ShapeError, as_number, shown
+from codesign.events.entry import check_layout, check_positive, check_times
+from codesign.events.intensity import FrontEnd
 from codesign.events.level_path import finer, parts
-from codesign.events.low_pass import low_pass
 from codesign.events.sensor.model import (
+    DESIGN,
     SensorModel,
     check_generator,
     check_sensor,
-    draw_deviates,
-    draw_shot_counts,
-    mismatched,
 )
-from codesign.events.volumes.hard_surface import surface_from_hard_counts
-from codesign.events.volumes.surface import surface_from_counts
+from codesign.events.sensor.simulate import simulate
+from codesign.events.volumes.surface import surface_from_counts, surface_from_hard_counts
 from codesign.events.volumes.traces import check_tau
-from codesign.events.volumes.volume import check_bins, from_counts
+from codesign.events.volumes.volume import check_bins, from_counts, from_stream
 from codesign.types import EventVolume
+
+STEP = 0.1  # a unit step of a variable changes its value by a tenth: exp(0.1) - 1 = 10.5 %
+
+
+class PositiveValues(nn.Module):
+    """Positive values by name, each start exp(0.1 v) with a variable v in ``raw`` that is 0 at first.
+
+    start: value > 0 by name. Whatever the unit, a unit step of a variable is about 10 % of its value.
+    """
+
+    def __init__(self, start: Mapping[str, float]):
+        super().__init__()
+        if not isinstance(start, Mapping):
+            raise DomainError(
+                f"start is {shown(start)}; values by name are needed, such as {{'tau_s': 0.01}}."
+            )
+        start = {name: check_positive(value, name) for name, value in start.items()}
+        zeros = [(name, nn.Parameter(torch.zeros((), dtype=torch.float64))) for name in start]
+        self.raw = nn.ParameterDict(zeros)
+        for name, value in start.items():  # buffers, so that what is saved is complete
+            self.register_buffer(f"start_{name}", torch.tensor(value, dtype=torch.float64))
+
+    def __getitem__(self, name: str) -> Tensor:
+        """The value as it is now, a 0-dim float64 tensor. Gradient: its variable."""
+        if not isinstance(name, str) or name not in self.raw:
+            raise DomainError(f"no value is called {shown(name)}; there are {', '.join(self.raw)}.")
+        return getattr(self, f"start_{name}") * (STEP * self.raw[name]).exp()
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.raw
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.raw)
+
 
 THRESHOLDS = ("theta_on", "theta_off")
 PARTS_PER_BIN = 4  # intervals, from one node of a volume to the next, from which on finer ones change nothing
@@ -207,164 +234,6 @@ class EventLayer(nn.Module):
         raise NotImplementedError
 
 
-@dataclass(frozen=True)
-class LayerState:
-    """What a ``ComparatorLayer`` carries over chunks.
-
-    comparator: state of the comparator, and what it is a state of. level, frame: [..., H, W] level behind the low-pass and last frame,
-      None without a low-pass. deviates: [2, ..., H, W] standard normal numbers of the thresholds, None without
-      mismatch. time_s: time of the last frame. generators: of the noise still to come, one per sample.
-    shape, dtype: of a frame [..., H, W].
-    """
-
-    comparator: Any
-    level: Tensor | None
-    frame: Tensor | None
-    deviates: Tensor | None
-    time_s: float
-    generators: Sequence[Generator]
-    shape: torch.Size
-    dtype: torch.dtype
-    kind: type
-
-
-class ComparatorLayer(EventLayer):
-    """Low-pass (where the sensor has a bandwidth), thresholds (with mismatch), a comparator, noise events.
-
-    Of the sensor it uses theta_on, theta_off, theta_sigma, cutoff_hz and shot_rate_hz (Poisson, as
-    ``draw_shot_counts``, without gradient); leak, dead time, hot pixels and photoreceptor noise are those of
-    ``PhysicalLayer``: a sensor that has them is taken without, and a warning names them.
-    comparator: one of ``events.layers.comparators``, or your own of the same call.
-    """
-
-    learnable = ("theta_on", "theta_off", "theta_sigma", "cutoff_hz")
-
-    def __init__(self, comparator: Comparator, sensor: SensorModel | None = None, **options: Any):
-        super().__init__(sensor, **options)
-        check_comparator(comparator, self.sensor, self.learnt)
-        self.comparator = comparator
-        self._last_draw = LastDraw()
-        self.refines = getattr(comparator, "refines", False)
-        self.whole = getattr(comparator, "whole", False)
-
-    def _count(self, frames, t_s, state, generators):
-        if state is not None and not isinstance(state, LayerState):
-            raise DomainError(f"the state is a {type(state).__name__}; pass what this layer returned.")
-        if state is not None and state.kind is not type(self.comparator):
-            raise DomainError(
-                f"the state comes from a layer with the comparator {state.kind.__name__}, this one has "
-                f"{type(self.comparator).__name__}; pass what this layer returned."
-            )
-        if state is not None and state.level is None and self.sensor.cutoff_hz > 0:
-            raise DomainError("the layer has a bandwidth, the one that began the state had not; begin anew.")
-        if state is not None and (state.shape, state.dtype) != (frames.shape[1:], frames.dtype):
-            raise ShapeError(
-                f"{frames.dtype} frames of {list(frames.shape[1:])} follow {state.dtype} frames of "
-                f"{list(state.shape)}; a sensor keeps its size and type, a batch its samples."
-            )
-        times_s = _times(frames, t_s, None if state is None else state.time_s)
-        if state is None:
-            kept = (generators, frames.shape[1:], frames.dtype, type(self.comparator))
-            state = LayerState(None, None, None, None, 0.0, *kept)
-        deviates, shots = self._noise(frames, times_s.diff(), state)
-        seen, level = self._seen(frames, times_s.diff(), state)
-        on, off = (None, None) if deviates is None else deviates
-        theta_on = self._threshold("theta_on", frames, on)
-        theta_off = self._threshold("theta_off", frames, off)
-        is_level = self.log_input or level is not None
-        counts, comparator = self.comparator(seen, theta_on, theta_off, state.comparator, is_level)
-        if shots is not None:
-            counts = counts + shots
-        frame = None if level is None else frames[-1]
-        time_s = float(times_s[-1])
-        return counts, replace(
-            state, comparator=comparator, level=level, frame=frame, deviates=deviates, time_s=time_s
-        )
-
-    def _noise(self, frames, interval_s, state):
-        """Deviates of the thresholds [2, ..., H, W] and noise events [T-1, 2, ..., H, W], None each where the
-        sensor has none; one sample after the other."""
-        draws_thetas = self.sensor.theta_sigma > 0 and state.deviates is None
-        if not draws_thetas and not self.sensor.has_shots:
-            return state.deviates, None
-        asked = (frames.shape, frames.dtype, frames.device, interval_s.tolist(), draws_thetas)
-        deviates, shots = self._last_draw(
-            asked, state.generators, lambda: self._draw(frames, interval_s, state.generators, draws_thetas)
-        )
-        return state.deviates if deviates is None else deviates, shots
-
-    def _draw(self, frames, interval_s, generators, draws_thetas):
-        pixels = frames.shape[-2:]
-        deviates = []
-        shots = []
-        for generator in generators:
-            if draws_thetas:
-                deviates.append(draw_deviates(pixels, generator, dtype=frames.dtype))
-            if self.sensor.has_shots:
-                shots.append(draw_shot_counts(self.sensor, pixels, interval_s, generator, dtype=frames.dtype))
-        batch = frames.shape[1:]
-        return (
-            torch.stack(deviates, 1).reshape(2, *batch).to(frames) if deviates else None,
-            torch.stack(shots, 2).reshape(-1, 2, *batch).to(frames) if shots else None,
-        )
-
-    def _seen(self, frames, interval_s, state):
-        """What the comparator gets: the frames, or log levels behind the low-pass with the last of them."""
-        if self.sensor.cutoff_hz == 0:
-            return frames, None
-        both = frames if state.frame is None else torch.cat((state.frame[None], frames))
-        level = log_levels(both, self.log_input, minimum=2)
-        intensity = both.exp() if self.log_input else both
-        level = low_pass(level, intensity, interval_s, self.value("cutoff_hz"), state.level)
-        return level[-len(frames) :], level[-1]
-
-    def _threshold(self, name, frames, deviate):
-        theta = torch.as_tensor(self.value(name), dtype=frames.dtype, device=frames.device)
-        if deviate is None or not self.comparator.mismatched:
-            return theta
-        sigma = torch.as_tensor(self.value("theta_sigma"), dtype=frames.dtype, device=frames.device)
-        return mismatched(theta, sigma, deviate)
-
-
-class PhysicalLayer(EventLayer):
-    """``events.sensor_counts``: exactly the events of ``events.simulate``, noise and all, with gradients to
-    the sensor. A batch is one sample after the other."""
-
-    learnable = DESIGN
-    refines = True
-    whole = True
-
-    def _count(self, frames, t_s, state, generators):
-        samples = frames.reshape(len(frames), -1, *frames.shape[-2:]).unbind(1)
-        if state is not None and not (
-            isinstance(state, tuple) and all(isinstance(before, PhysicalState) for before in state)
-        ):
-            raise DomainError(f"the state is a {type(state).__name__}; pass what this layer returned.")
-        if state is not None and len(state) != len(samples):
-            raise ShapeError(
-                f"{len(samples)} samples follow {len(state)}; a batch keeps its samples over the chunks."
-            )
-        design = {name: self.value(name) for name in self.learnt}
-        counts, states = zip(
-            *(
-                sensor_counts(
-                    sample,
-                    t_s,
-                    self.sensor,
-                    generator=generator,
-                    state=before,
-                    log_input=self.log_input,
-                    **design,
-                )
-                for sample, generator, before in zip(
-                    samples, generators, state or [None] * len(samples), strict=True
-                )
-            ),
-            strict=True,
-        )
-        return torch.stack(counts, 2).reshape(-1, 2, *frames.shape[1:]), states
-
-
 def check_axes(frames: Tensor) -> None:
     """Raise ShapeError for frames that are no tensor of at least three axes."""
     if not isinstance(frames, Tensor) or frames.ndim < 3:
@@ -389,14 +258,91 @@ def _generators(generator, batch):
     return list(generator)
 
 
-def _times(frames, t_s, before_s):
-    """Times of the frames, and before them that of the last frame of the chunk before."""
-    times_s = check_times(t_s, len(frames))
-    if before_s is None:
-        return times_s
-    if float(times_s[0]) <= before_s:
-        raise DomainError(
-            f"the chunk starts at {float(times_s[0])!r} s, the last frame seen was at {before_s!r} s; times "
-            "must go on increasing."
+MOST_S = 1e9
+NEAR = 1e-6  # of the lead, by which a frame may miss its end
+
+
+class Settled(nn.Module):
+    """An event layer whose events in the first ``lead_s`` are not read; frames begin as much before the window.
+
+    A few time constants of the sensor's bandwidth are enough, and as much motion as makes an event or two.
+
+    Args: layer: of ``events.layer``. lead_s: length of a whole number of intervals between frames, seconds, >= 0.
+
+    >>> import torch
+    >>> from codesign import events
+    >>> settled = events.Settled(events.layer("memory"), lead_s=0.01)
+    >>> frames = torch.rand(1, 5, 8, 8, generator=torch.Generator().manual_seed(0))
+    >>> float(settled.volume(frames, torch.linspace(0, 0.04, 5), 3).collected_s.sum().round(decimals=3))
+    0.03
+    """
+
+    def __init__(self, layer: EventLayer, lead_s: float) -> None:
+        super().__init__()
+        if not isinstance(layer, EventLayer):
+            raise DomainError(f"the layer is a {type(layer).__name__}; one of events.layer is needed.")
+        self.layer = layer
+        self.lead_s = check_lead(lead_s)
+
+    def volume(
+        self, frames: Tensor, t_s: Tensor, bins: int, generator: Generator | None = None
+    ) -> EventVolume:
+        """Events after the lead in time bins, [B, 2, bins, H, W]. Args and gradient: as ``EventLayer.volume``.
+        Raises: DomainError when no frame stands at the end of the lead."""
+        check_bins(bins)
+        check_axes(frames)
+        given_s = check_times(t_s, frames.shape[-3])
+        start_s = float(given_s[0]) + self.lead_s
+        if len(given_s) < 2 or float((given_s[:-1] - start_s).abs().min()) > NEAR * max(
+            self.lead_s, float(given_s.diff().min())
+        ):
+            raise DomainError(
+                f"settled: no frame stands {self.lead_s:g} s after the first; give frames at "
+                f"{(given_s - given_s[0]).tolist()} s a lead that ends with one, before the last."
+            )
+        longest_s = float(given_s[-1] - start_s) / (bins - 1) / PARTS_PER_BIN if bins > 1 else math.inf
+        counts, times_s = self.layer.finely(frames, t_s, longest_s, generator)
+        first = int((times_s - start_s).abs().argmin())
+        return from_counts(counts.movedim((-4, -3), (0, 1))[first:], times_s[first:], bins)
+
+
+def check_lead(lead_s: float) -> float:
+    """Seconds. Raises: DomainError for others than finite ones of at least 0."""
+    if not 0 <= as_number(lead_s, "lead_s") < MOST_S:
+        raise DomainError(f"lead_s is {lead_s}; seconds of at least 0 and less than {MOST_S:g} are needed.")
+    return float(lead_s)
+
+
+class HardSensor(nn.Module):
+    """``events.simulate`` and ``events.from_stream`` called like an event layer.
+
+    Args: sensor: SensorModel. bins: time bins of the volume. lead_s: events before it are not read (``Settled``).
+    """
+
+    def __init__(self, sensor: SensorModel, bins: int, lead_s: float = 0.0):
+        super().__init__()
+        check_bins(bins)
+        self.sensor = check_sensor(sensor)
+        self.bins = bins
+        self.lead_s = check_lead(lead_s)
+
+    @torch.no_grad()
+    def forward(self, frames: Tensor, t_s: Tensor, generator: Generator | None = None) -> EventVolume:
+        """Events of frames [N, T, H, W] at t_s [T] in time bins, [N, 2, bins, H, W].
+
+        generator: one for all samples, which stand above one another as one tall sensor; None: seed 0.
+        Raises: ShapeError for other shapes; DomainError as ``simulate``.
+        """
+        check_layout(frames, 1)
+        if frames.ndim != 4:
+            raise ShapeError(f"the hard sensor takes frames [N, T, H, W], got {tuple(frames.shape)}.")
+        count, times, height, width = frames.shape
+        tall = frames.movedim(1, 0).reshape(times, count * height, width)
+        stream = simulate(
+            tall, t_s, self.sensor, Generator().manual_seed(0) if generator is None else generator
         )
-    return torch.cat((torch.tensor([before_s], dtype=torch.float64), times_s))
+        start_s, end_s = check_times(t_s, times)[[0, -1]].tolist()
+        start_us, end_us = (round(time_s * 1e6) for time_s in (start_s + self.lead_s, end_s))
+        volume = from_stream(stream, start_us, end_us, self.bins)
+        counts = volume.counts.reshape(2, self.bins, count, height, width).permute(2, 0, 1, 3, 4).contiguous()
+        return EventVolume(counts, volume.centroid_s, volume.collected_s)

@@ -10,8 +10,7 @@ from torch.autograd.function import once_differentiable
 from codesign.errors import DomainError
 from codesign.events.entry import check_frames, check_layout, check_level, check_per_pixel
 from codesign.events.intensity import FrontEnd, kernel_levels, log_levels
-from codesign.events.layers import memory_kernel as play
-from codesign.events.layers import turns_kernel as turns
+from codesign.events.layers import memory_kernel as kernel
 
 GRADIENTS = ("exact", "play")
 PLAY_RATIO = 1.25  # of the two thresholds: up to it the play met all that was asked of the exact gradient
@@ -151,7 +150,7 @@ class _MemorisedCounts(Function):
         ctx.front_end = front_end
         ctx.gradient = gradient
         ctx.first = int(state is None)
-        counts, end, bad = play.count(frames[ctx.first :], start, theta_on, theta_off, front_end)
+        counts, end, bad = kernel.count(frames[ctx.first :], start, theta_on, theta_off, front_end)
         if bad or ctx.first:
             check_frames(frames if bad else frames[:1], 1, non_negative=not front_end.log_input)
         ctx.save_for_backward(frames, theta_on, theta_off, start)
@@ -165,11 +164,11 @@ class _MemorisedCounts(Function):
         wants_thetas = any(ctx.needs_input_grad[1:3])
         grad_thetas = [None, None]
         if ctx.gradient == "play" or wants_thetas:
-            grad_frames, grad_start, *grad_thetas = play.adjoint(
+            grad_frames, grad_start, *grad_thetas = kernel.play_adjoint(
                 *call, first=ctx.first, wants_thetas=wants_thetas
             )
         if ctx.gradient == "exact":
-            grad_frames, grad_start = turns.adjoint(*call, first=ctx.first)
+            grad_frames, grad_start = kernel.turns_adjoint(*call, first=ctx.first)
         needed = zip(grad_thetas, (theta_on, theta_off), ctx.needs_input_grad[1:3], strict=True)
         grad_thetas = [grad.sum_to_size(theta.shape) if needs else None for grad, theta, needs in needed]
         if ctx.first:

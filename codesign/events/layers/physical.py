@@ -7,23 +7,21 @@ from typing import Any
 import torch
 from torch import Generator, Tensor
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import Times, check_frames, check_times
 from codesign.events.intensity import FrontEnd
 from codesign.events.layers import dead_time
+from codesign.events.layers.layer import EventLayer
 from codesign.events.layers.memory import memory
 from codesign.events.low_pass import low_pass
-from codesign.events.sensor.model import SensorModel, mismatched, with_design
+from codesign.events.sensor.model import (
+    DESIGN,
+    SensorModel,
+    mismatched,
+    with_design,
+)
 from codesign.events.sensor.simulate import dense_counts
 from codesign.events.sensor.state import SensorState
-
-DESIGN = (
-    "theta_on",
-    "theta_off",
-    "theta_sigma",
-    "cutoff_hz",
-    "refractory_s",
-)  # fields of SensorModel that may carry a gradient
 
 
 @dataclass(frozen=True)
@@ -81,7 +79,7 @@ def sensor_counts(
     if state is not None and not isinstance(state, PhysicalState):
         raise DomainError(f"the state is a {type(state).__name__}; pass what sensor_counts returned.")
     front_end = FrontEnd(log_input)
-    hard_sensor = with_design(sensor, design, DESIGN)
+    hard_sensor = with_design(sensor, design)
     value: dict[str, Any] = {name: design.get(name, getattr(sensor, name)) for name in DESIGN}
     check_frames(frames, 2 if state is None else 1, non_negative=not log_input)
     times_s = check_times(t_s, len(frames))
@@ -153,3 +151,42 @@ def _mean_counts(seen, thetas, interval_s, refractory_s, state):
     centre, before = (start, None) if state is None else (start[1], state.dead)
     passed, centre, dead = dead_time.mean_counts(seen, centre, thetas, interval_s, refractory_s, before)
     return passed, torch.stack((centre, centre)), dead
+
+
+class PhysicalLayer(EventLayer):
+    """``events.sensor_counts``: exactly the events of ``events.simulate``, noise and all, with gradients to
+    the sensor. A batch is one sample after the other."""
+
+    learnable = DESIGN
+    refines = True
+    whole = True
+
+    def _count(self, frames, t_s, state, generators):
+        samples = frames.reshape(len(frames), -1, *frames.shape[-2:]).unbind(1)
+        if state is not None and not (
+            isinstance(state, tuple) and all(isinstance(before, PhysicalState) for before in state)
+        ):
+            raise DomainError(f"the state is a {type(state).__name__}; pass what this layer returned.")
+        if state is not None and len(state) != len(samples):
+            raise ShapeError(
+                f"{len(samples)} samples follow {len(state)}; a batch keeps its samples over the chunks."
+            )
+        design = {name: self.value(name) for name in self.learnt}
+        counts, states = zip(
+            *(
+                sensor_counts(
+                    sample,
+                    t_s,
+                    self.sensor,
+                    generator=generator,
+                    state=before,
+                    log_input=self.log_input,
+                    **design,
+                )
+                for sample, generator, before in zip(
+                    samples, generators, state or [None] * len(samples), strict=True
+                )
+            ),
+            strict=True,
+        )
+        return torch.stack(counts, 2).reshape(-1, 2, *frames.shape[1:]), states

@@ -16,6 +16,8 @@ from codesign.events.entry import MOST_VALUES, check_dtype
 THETA_MINIMUM = 0.01  # no drawn threshold falls below, as in v2e
 MOST_NUMBER = 1e30
 TIMINGS = ("interpolated", "v2e")
+# fields of SensorModel that may carry a gradient
+DESIGN = ("theta_on", "theta_off", "theta_sigma", "cutoff_hz", "refractory_s")
 
 
 @dataclass(frozen=True)
@@ -183,20 +185,18 @@ def check_sensor(sensor: object) -> SensorModel:
     return sensor
 
 
-def with_design(
-    sensor: SensorModel, design: Mapping[str, Tensor | float], allowed: Sequence[str]
-) -> SensorModel:
+def with_design(sensor: SensorModel, design: Mapping[str, Tensor | float]) -> SensorModel:
     """The sensor with the numbers of design variables in place of its own.
 
-    Args: design: numbers or 0-dim tensors by name. allowed: names that may carry a gradient.
+    Args: design: numbers or 0-dim tensors by name, of DESIGN.
     Raises: DomainError for another name, a value that is no number or outside the sensor's domain, and one of 0
       that requires a gradient: what is switched off has none.
     """
     values = {}
     for name, value in design.items():
-        if name not in allowed:
+        if name not in DESIGN:
             raise DomainError(
-                f"{name!r} cannot carry a gradient; design variables of the sensor are {', '.join(allowed)}."
+                f"{name!r} cannot carry a gradient; design variables of the sensor are {', '.join(DESIGN)}."
             )
         if isinstance(value, Tensor) and (value.ndim or value.is_complex()):
             raise DomainError(

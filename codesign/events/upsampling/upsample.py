@@ -1,5 +1,6 @@
-"""Video to a higher frame rate, so that events see motion and not jumps: frames between frames along their
-optical flow."""
+"""Video to a higher frame rate, so that events see motion and not jumps: frames between frames, each scene point on its
+straight way from one to the other, hidden ones taken from the frame that shows them.
+"""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -8,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from codesign.errors import DomainError, ShapeError, as_number
 from codesign.events.entry import (
@@ -20,10 +22,172 @@ from codesign.events.entry import (
     shown,
 )
 from codesign.events.intensity import lin_log
-from codesign.events.upsampling.between import between, visibility
-from codesign.events.upsampling.flow import flow_both_ways, flow_levels
-from codesign.events.upsampling.hidden import repaired
-from codesign.events.upsampling.steps import largest, largest_change, shares, step_times, steps_for
+from codesign.events.upsampling.flow import blurred, flow_both_ways, flow_levels, inside, sampled, splatted
+
+DOUBTED = 0.5  # visibility below which the flow of a pixel is replaced
+SAMPLES = 4  # on each side: a neighbourhood is looked at in 9 x 9 places
+REACH = 1.5  # times the largest difference of motion: a hidden strip is at most as wide as that
+ALIKE = 0.15  # log units
+NEAR = 0.3  # share of the reach: standard deviation of the weight by distance
+WORKED_ON = 1 << 14  # pixels at a time
+
+
+@torch.no_grad()
+def repaired(levels, flows, seen):
+    """Flow with the values of doubted pixels replaced.
+
+    Args:
+      levels: [2, H, W] log levels of both frames. flows: [2, 2, H, W] both ways. seen: [2, H, W] visibility
+        of either frame in the other.
+    Returns: [2, 2, H, W]: in doubted pixels the median of the flow over seen pixels around, weighted by
+      visibility, likeness and nearness.
+    Source: weighted median of Sun, Roth and Black, Secrets of optical flow estimation and their principles,
+      CVPR 2010, section 5.
+    """
+    height, width = levels.shape[-2:]
+    spread_px = float((flows.amax((2, 3)) - flows.amin((2, 3))).max())
+    spacing = max(1.0, REACH * spread_px / SAMPLES)
+    steps = (torch.arange(-SAMPLES, SAMPLES + 1, device=levels.device) * spacing).round().long()
+    dy, dx = (step.flatten() for step in torch.meshgrid(steps, steps, indexing="ij"))
+    near = torch.exp(-(dx.square() + dy.square()) / (2 * (NEAR * SAMPLES * spacing) ** 2))
+    flows = flows.clone()
+    for flow, level, weight, mask in zip(flows, levels, seen, seen < DOUBTED, strict=True):
+        old = flow.clone()
+        for y, x in zip(*(place.split(WORKED_ON) for place in mask.nonzero().T), strict=True):
+            row = y[:, None] + dy
+            column = x[:, None] + dx
+            within = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+            at = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+            unlike = (level.flatten()[at] - level[y, x][:, None]).abs()
+            vote = within * near * torch.exp(-unlike / ALIKE) * (weight * (weight >= DOUBTED)).flatten()[at]
+            found = vote.sum(1) > 0
+            for component in range(2):
+                flow[component, y, x] = torch.where(
+                    found, _weighted_median(old[component].flatten()[at], vote), old[component, y, x]
+                )
+    return flows
+
+
+def _weighted_median(values, weights):
+    """Weighted median along the last axis, [N, K] each."""
+    ordered, index = values.sort(1)
+    below = weights.gather(1, index).cumsum(1)
+    middle = torch.searchsorted(below, below[:, -1:] / 2).clamp(max=values.shape[1] - 1)
+    return ordered.gather(1, middle)[:, 0]
+
+
+# forward and backward flow agree to about this much, plus this share of the motion
+TOLERANCE_PX = 0.5
+TOLERANCE_SHARE = 0.05
+HIDDEN = 0.05  # weight of what has no counterpart in the other frame: it shows where nothing else does
+LEAST = 1e-4  # weight below which a pixel counts as empty
+HOLE_PX = (
+    1.5  # standard deviation of the blur that fills pixels on which nothing lands; grows until none is left
+)
+
+
+def visibility(flows):
+    """How well a pixel of either frame is seen in the other, from the agreement of both flows.
+
+    Args: flows: [2, 2, H, W] from the first to the second frame, and back.
+    Returns: [2, H, W] in HIDDEN..1.
+    """
+    gap = (flows + sampled(flows.flip(0), flows, "bilinear")).square().sum(1)
+    allowed = (TOLERANCE_PX + TOLERANCE_SHARE * flows.norm(dim=1)).square()
+    return HIDDEN + (1 - HIDDEN) * torch.exp(-gap / (2 * allowed)) * inside(flows)[:, 0]
+
+
+def between(first, second, flows, seen, share):
+    """The frame at a share of the interval between two frames.
+
+    Args:
+      first, second: [H, W] linear intensity. flows: [2, 2, H, W] from ``flow_both_ways``. seen: [2, H, W]
+        from ``visibility``. share: 0..1.
+    Returns: [H, W]. What the bicubic kernel makes darker or brighter than all nine pixels around is set to
+      the darkest or brightest of them: next to a sharp edge its overshoot would be many thresholds of a dark
+      pixel.
+    Gradient: first and second (piecewise linear in them), for fixed flows.
+    Source: flow carried forward to the time asked for, Baker et al., A database and evaluation methodology
+      for optical flow, 2011, section 3.3.
+    """
+    motion, weight = _motion_at(flows, seen, share)
+    pictures = torch.stack((first, second))[:, None]
+    moved = torch.stack((-share * motion, (1 - share) * motion))
+    darkest, brightest = (
+        sampled(bound, moved, "nearest")
+        for bound in (-max_pool2d(-pictures, 3, 1, 1), max_pool2d(pictures, 3, 1, 1))
+    )
+    early, late = sampled(pictures, moved).maximum(darkest).minimum(brightest)[:, 0]
+    weight = share * weight[1] / ((1 - share) * weight[0] + share * weight[1])
+    return early + weight * (late - early)
+
+
+@torch.no_grad()
+def _motion_at(flows, seen, share):
+    """Motion per interval [2, H, W] of what is seen at a time in between, and how much either frame knows of
+    it, [2, H, W]."""
+    carried = []
+    for flow, weight, part in ((flows[0], seen[0], share), (-flows[1], seen[1], share - 1)):
+        carried.append(splatted(torch.cat((flow * weight, weight[None])).permute(1, 2, 0), part * flow))
+    total = carried[0] + carried[1]
+    motion = total[..., :2].permute(2, 0, 1)
+    mass = total[..., 2]
+    empty = mass < LEAST
+    width = HOLE_PX
+    if bool(empty.all()):  # everything left the picture: blend where it stands
+        return torch.zeros_like(motion), torch.ones_like(seen)
+    motion = motion / mass.clamp(min=LEAST)
+    while bool(empty.any()):
+        known = (~empty).to(motion.dtype)
+        spread = blurred(torch.cat((motion * known, known[None]))[:, None], width)[:, 0]
+        motion = torch.where(empty & (spread[2] > LEAST), spread[:2] / spread[2].clamp(min=LEAST), motion)
+        empty = empty & (spread[2] <= LEAST)
+        width = 2 * width
+    weight = torch.stack([each[..., 2] for each in carried]).clamp(max=1)
+    return motion, torch.where(weight.sum(0) < LEAST, torch.ones_like(weight), weight.clamp(min=LEAST**2))
+
+
+LARGEST_SHARE = (
+    0.999  # of the pixels keep a bound; the rest is what the flow got wrong, which would otherwise decide
+)
+
+
+def largest(values):
+    """The value that 99.9 % of the values do not exceed."""
+    flat = values.detach().flatten()
+    return float(flat.kthvalue(max(1, math.ceil(LARGEST_SHARE * flat.numel()))).values)
+
+
+def steps_for(amount, bound, max_steps, what, start_s, end_s):
+    """Least number of equal steps that keep ``amount`` within ``bound`` each. Raises: DomainError when that
+    takes more than ``max_steps``."""
+    count = max(1.0, amount / bound * (1 - 1e-6))
+    if count > max_steps:
+        raise DomainError(
+            f"between the frames at {start_s:.9g} s and {end_s:.9g} s {what} changes by {amount:.3g}; steps "
+            f"of {bound:g} take {count:.3g}, more than max_steps = {max_steps}: "
+            "record faster, or allow larger or more steps."
+        )
+    return math.ceil(count)
+
+
+def largest_change(levels):
+    """Largest change of level (99.9 % of the pixels) between consecutive frames [N, H, W] of log levels."""
+    return max(largest(change) for change in levels.detach().diff(dim=0).abs_())
+
+
+def shares(count):
+    """The shares of an interval at which ``count`` equal steps meet."""
+    return [step / count for step in range(1, count)]
+
+
+def step_times(start_s, end_s, count):
+    """[count] float64 ends of equal steps; the last is end_s exactly."""
+    part = torch.arange(1, count + 1, dtype=torch.float64) / count
+    times_s = start_s + (end_s - start_s) * part
+    times_s[-1] = end_s
+    return times_s
+
 
 MAX_STEPS = 256
 

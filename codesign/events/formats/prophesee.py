@@ -1,9 +1,38 @@
-"""The ASCII header of Prophesee files: lines ``% keyword value`` ahead of the binary part.
+"""What Prophesee's formats share: the ASCII header of lines ``% keyword value`` ahead of the binary part, hardware clocks of
+few bits that start again at zero, and values that hold until the next word changes them.
 
 Source: Prophesee Metavision documentation, "RAW File Format" and "DAT File Format".
 """
 
+import numpy as np
+
 from codesign.errors import FileFormatError
+
+
+def unwrapped(ticks, loop):
+    """Count the loops of a clock.
+
+    A fall by three quarters of the loop or more is a new loop; a smaller fall is time going back, which the
+    caller judges. (A single wrong bit changes a reading by at most half a loop, so it never passes for a new
+    one.)
+
+    Args: ticks: [N] int64 readings, 0 to loop - 1. loop: number of readings.
+    Returns: [N] int64 readings plus ``loop`` for each new loop so far.
+    """
+    falls = np.zeros(len(ticks), np.int64)
+    np.cumsum(ticks[1:] - ticks[:-1] <= -(loop // 4) * 3, out=falls[1:])
+    return ticks + falls * loop
+
+
+def held(starts, values, count):
+    """The last value given before each event; and how many events precede them all.
+
+    Args: starts: [M] rising numbers of the events that follow each value. values: [M]. count: number of
+      events.
+    """
+    first = int(starts[0]) if len(starts) else count
+    return np.repeat(values, np.diff(starts, append=count)), first
+
 
 LIMIT_BYTES = 65536
 # microseconds to add to every time: faery writes "t0" in .raw and "T0" in .dat, versions of codesign before
@@ -11,7 +40,7 @@ LIMIT_BYTES = 65536
 START_KEYS = ("t0", "T0", "codesign_t_offset_us")
 
 
-def parsed(path, data):
+def parse_header(path, data):
     """(fields, start): the values by keyword, and where the binary part of ``data`` starts.
 
     Raises: FileFormatError for a header without an end, not ASCII, or with a keyword said twice in two ways.
