@@ -88,32 +88,6 @@ def test_events_equal_the_published_algorithm_as_far_as_single_precision_tells(s
     assert int((to_counts(direct, t_s) - to_counts(events, t_s)).abs().sum()) <= 2e-5 * len(events)
 
 
-@pytest.mark.bits
-@pytest.mark.parametrize("seed", [None, 0, 1])
-def test_single_precision_moves_an_event_by_what_its_slope_allows(seed):
-    generator = torch.Generator().manual_seed(5)
-    exact = 4 + 0.3 * torch.randn(40, 8, 8, generator=generator, dtype=torch.float64).cumsum(0)
-    t_s = torch.arange(40, dtype=torch.float64) / 500
-    levels = jittered(exact.float(), seed)
-    events = simulate(levels, t_s, SensorModel(), log_input=True)
-    truth = [
-        (x, y, t, p)
-        for y in range(8)
-        for x in range(8)
-        for t, p in written_out(exact[:, y, x].numpy(), t_s.numpy(), 0.2, 0.2, 0)
-    ]
-    x, y, t, p = (np.array(column) for column in zip(*truth, strict=True))
-    order = np.lexsort((events.t_us, events.x, events.y))
-    # no level comes nearer than 3e-5 to a threshold at the end of an interval: rounding moves no event there
-    assert events.x.numpy()[order].tolist() == x.tolist()
-    assert events.y.numpy()[order].tolist() == y.tolist()
-    assert events.p.numpy()[order].tolist() == p.tolist()
-    off_us = np.abs(events.t_us.numpy()[order] - 1e6 * t)
-    slack = slack_us(exact.numpy(), t_s.numpy(), t, x, y, 0.2, ulps=2)
-    assert (off_us <= slack).all()
-    assert np.median(slack) < 0.75
-
-
 def written_out(levels, t_s, theta_on, theta_off, refractory_s):
     """ESIM for one pixel: events (t, p), those inside the dead time dropped, the reference moving on all the
     same."""
@@ -161,12 +135,3 @@ def test_dead_time_and_unequal_thresholds_equal_the_algorithm_written_out(refrac
     ]
     together = concatenate(parts)
     assert all(torch.equal(getattr(together, name), getattr(whole, name)) for name in FIELDS)
-
-
-def test_the_first_event_of_a_pixel_waits_for_no_dead_time():
-    events = simulate(
-        torch.tensor([3.0, 4.0])[:, None, None], [0.0, 1.0], SensorModel(refractory_s=100.0), log_input=True
-    )
-    assert events.t_us.tolist() == pytest.approx(
-        [200_000], abs=1
-    )  # the four crossings behind it fall into the dead time

@@ -126,17 +126,6 @@ def test_smooth_curves_between_frames_are_met_to_the_third_order(log_input):
     assert errors[0] / errors[1] > 7
 
 
-def test_a_parabola_is_met_exactly_at_uneven_times():
-    t_s = torch.tensor([0.0, 0.1, 0.25, 0.3, 0.5], dtype=D)
-
-    def curve(t):
-        return (1 + 3 * t + 2 * t**2).reshape(-1, 1)
-
-    found, times_s = finer(curve(t_s), t_s, 0.03, log_input=True)
-    assert float(times_s.diff().max()) <= 0.03 + 1e-12
-    torch.testing.assert_close(found, curve(times_s), rtol=1e-13, atol=0)
-
-
 def test_a_step_rings_by_seven_percent_of_it_beside_and_nowhere_else():
     level = torch.tensor([1.0, 1.0, 1.0, 3.0, 3.0, 3.0], dtype=D).reshape(-1, 1)
     found, times_s = finer(level, torch.arange(6.0), 1 / 96, log_input=True)
@@ -186,21 +175,6 @@ def test_every_layer_gives_volumes_and_surfaces_from_few_frames(name):
         halves = counts.unflatten(1, (8, 2))
         torch.testing.assert_close(halves[:, :, 0], halves[:, :, 1])
         torch.testing.assert_close(halves.sum(2), layer(level, times(8)))
-
-
-def test_a_surface_has_the_ages_of_the_streams_events():
-    """From two frames, where the level runs straight: ages are known to a sixteenth of tau."""
-    tau_s = 0.02
-    rise = torch.linspace(0.22, 3.07, 50, dtype=D)
-    level = torch.stack((torch.full_like(rise, 4), 4 + rise))[:, None]
-    found = events.layer("memory", SENSOR, log_input=True).surface(level, times(1), tau_s)[0, 0, 0].detach()
-    many = (rise / C).floor()
-    truth = torch.where(many > 0, torch.exp(-SPAN_S * (1 - many * C / rise) / tau_s), 0)
-    assert float((found - truth).abs().max()) < math.exp(1 / 16) - 1
-    coarse = events.surface_from_counts(events.memory(level, C, C, log_input=True)[0], times(1), tau_s)[
-        0, 0, 0
-    ]
-    assert float((coarse - truth).abs().max()) > 0.5
 
 
 def test_a_system_asks_a_layer_for_its_volume_and_sets_plain_counts_at_middles():

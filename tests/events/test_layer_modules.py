@@ -79,33 +79,6 @@ def test_gradients_of_smooth_layers_are_differences(name):
     assert torch.autograd.gradcheck(counts, (frames.requires_grad_(), *variables))
 
 
-def test_the_memory_layer_has_the_slope_of_the_mean_count():
-    # a climb of D: mean ON count (D - w/2)/C with the play w = (C + C_off)/2 round the first level
-    level = torch.tensor([4.0, 4.35, 4.9], dtype=D).requires_grad_()
-    made = layer("memory", PLAIN, log_input=True, gradient="play")
-    made(level[:, None, None], torch.arange(3.0))[:, 0].sum().backward()
-    torch.testing.assert_close(level.grad, torch.tensor([-1 / 0.15, 0, 1 / 0.15], dtype=D))
-    slope_on = -(0.9 - 0.175 / 2) / 0.15**2 - 1 / (4 * 0.15)
-    slope_off = -1 / (4 * 0.15)
-    tenth = 0.1  # of a threshold, per unit of its variable
-    assert float(made.learnt.raw["theta_on"].grad) == pytest.approx(tenth * 0.15 * slope_on)
-    assert float(made.learnt.raw["theta_off"].grad) == pytest.approx(tenth * 0.2 * slope_off)
-
-
-def test_the_spiking_layer_has_the_slope_of_its_surrogate():
-    # one step d of the level: u = d for ON, -d for OFF; fast sigmoid of the width of the mean threshold w
-    level = torch.tensor([4.0, 4.13], dtype=D).requires_grad_()
-    made = layer("srm", PLAIN, log_input=True, gradient="surrogate")
-    counts = made(level[:, None, None], torch.arange(2.0))
-    assert counts.flatten().tolist() == [0, 0]
-    (counts * torch.tensor([1.0, 2.0])[:, None, None]).sum().backward()
-    width = 0.175
-    on, off = (1 / (2 * width * (1 + abs(u - c) / width) ** 2) for u, c in ((0.13, 0.15), (-0.13, 0.2)))
-    torch.testing.assert_close(level.grad, torch.tensor([-1, 1], dtype=D) * (on - 2 * off))
-    assert float(made.learnt.raw["theta_on"].grad) == pytest.approx(-0.1 * 0.15 * on)
-    assert float(made.learnt.raw["theta_off"].grad) == pytest.approx(-0.1 * 0.2 * 2 * off)
-
-
 @pytest.mark.bits
 @pytest.mark.parametrize("sensor", [PLAIN, NOISY], ids=["plain", "noisy"])
 @pytest.mark.parametrize("name", LAYERS)
@@ -214,19 +187,6 @@ def test_learnt_thresholds_find_those_behind_the_counts(name):
         optimiser.step()
     assert made.fitted().theta_on == pytest.approx(0.17, rel=0.02)
     assert made.fitted().theta_off == pytest.approx(0.23, rel=0.02)
-
-
-@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-def test_a_volume_is_that_of_the_counts(batch):
-    frames, t_s = drifting(*batch, 4, 5)
-    volume = layer("counts", PLAIN).volume(frames, t_s, 4)
-    singles = [
-        events.from_counts(events.soft_counts(sample, 0.15, 0.2), t_s, 4).counts
-        for sample in frames.reshape(-1, 30, 4, 5)
-    ]
-    assert volume.counts.shape == (math.prod(batch), 2, 4, 4, 5)
-    torch.testing.assert_close(volume.counts, torch.cat(singles), rtol=1e-12, atol=1e-12)
-    assert float(volume.collected_s.sum()) == pytest.approx(29 * 2e-3)
 
 
 def test_a_comparator_of_ones_own_fits():

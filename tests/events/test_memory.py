@@ -78,15 +78,6 @@ def test_a_ramp_fires_at_every_threshold_it_crosses(dtype):
     torch.testing.assert_close(reference[0], torch.full((2, 3), 6 * 0.2, dtype=dtype))
 
 
-def test_a_sinusoid_counts_its_swing():
-    # amplitude 1.05 = 5.25 thresholds: up 5, then down from 5 to -5 and up again, 10 each; after 4.1 periods
-    # at 3.09 thresholds
-    time = torch.arange(0, 4 * 1000 + 101, dtype=torch.float64) / 1000
-    counts, _ = memory((1.05 * torch.sin(2 * math.pi * time))[:, None], 0.2, 0.2, log_input=True)
-    assert counts.sum((0, 2)).tolist() == [5 + 3 * 10 + 8, 4 * 10]
-    assert counts.max() == 1
-
-
 @pytest.mark.bits
 @pytest.mark.parametrize("cut", [1, 2, 13, 29])
 def test_chunks_equal_the_whole_bit_for_bit_gradients_included(cut):
@@ -106,18 +97,6 @@ def test_chunks_equal_the_whole_bit_for_bit_gradients_included(cut):
     (counts * weight).sum().backward()
     (joined * weight).sum().backward()
     torch.testing.assert_close(whole.grad, parts.grad, rtol=0, atol=0)
-
-
-def test_the_play_is_the_mean_of_the_hard_count_over_all_places_inside_the_threshold():
-    # a long swing first, so that every pixel stands at an even place below its turning point; then ways back
-    # of 0 to 3 thresholds
-    theta = 0.2
-    pixels = 4000
-    start = torch.arange(pixels, dtype=torch.float64) / pixels * theta
-    for back in (0.1, 0.15, 0.19, 0.21, 0.3, 0.55):
-        level = torch.stack((torch.zeros(pixels), 2 + start, 2 + start - back)).double()
-        counts, _ = memory(level, theta, theta, log_input=True)
-        assert float(counts[1, 1].mean()) == pytest.approx(max(0, back / theta - 1), abs=1e-3)
 
 
 def test_gradient_is_the_slope_of_the_mean_hard_count():

@@ -105,11 +105,6 @@ def test_pictures_may_come_one_by_one(tmp_path):
     assert not (tmp_path / "bad.mp4").exists()
 
 
-def test_a_long_strip_is_enlarged_no_further_than_a_screen(tmp_path):
-    write_video(tmp_path / "e.gif", torch.zeros(2, 10, 400, dtype=torch.uint8), fps=10)
-    assert iio.imread(tmp_path / "e.gif").shape[-3:] == (30, 1200, 3)
-
-
 def test_the_figure_of_rates_draws_the_rates_in_its_units():
     middle_s = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
     rate_hz = torch.tensor([[1000.0, 0], [5000, 2500], [0, 10]], dtype=torch.float64)

@@ -63,18 +63,6 @@ def test_centroid_is_the_mean_time_of_what_a_bin_collects_even_for_uneven_frames
     )
 
 
-def test_a_rate_linear_in_time_is_read_off_at_the_centroids_exactly():
-    times_s = torch.linspace(0, 1, 33, dtype=torch.float64)
-    middle_s = (times_s[1:] + times_s[:-1]) / 2
-    flat, slanted = (
-        rate[:, None, None, None].expand(32, 2, 1, 1)
-        for rate in (torch.ones_like(middle_s), 5 + 3 * middle_s)
-    )
-    volume = from_counts(slanted, times_s, 6)
-    rate = volume.counts[0, 0, :, 0, 0] / from_counts(flat, times_s, 6).counts[0, 0, :, 0, 0]
-    torch.testing.assert_close(rate, 5 + 3 * volume.centroid_s, rtol=1e-13, atol=0)
-
-
 def test_gradient_of_a_volume_is_its_share():
     counts = torch.rand(6, 2, 2, 3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: from_counts(x, torch.arange(7), 3).counts, (counts,))
