@@ -28,19 +28,7 @@ def ordered(t_us: Tensor, x: Tensor, y: Tensor, p: Tensor, height_px: int, width
             first = float(values[values != values.round()][0])
             raise DomainError(f"{name} holds {first!r}; whole numbers are needed: round them first.")
     t_us, x, y, p = (values.to(torch.int64) for values in (t_us, x, y, p))
-    if not (t_us.shape == x.shape == y.shape == p.shape == (t_us.numel(),)):
-        raise ShapeError(
-            f"t_us, x, y, p have shapes {[list(v.shape) for v in (t_us, x, y, p)]}; four lists of equal "
-            "length are needed."
-        )
-    for values, name, size in ((x, "x", width_px), (y, "y", height_px)):
-        if values.numel() and (int(values.min()) < 0 or int(values.max()) >= size):
-            raise DomainError(
-                f"{name} spans {int(values.min())} to {int(values.max())}; the sensor has {size} pixels "
-                f"there (0 to {size - 1})."
-            )
-    if bool((p.abs() != 1).any()):
-        raise DomainError(f"polarity {int(p[p.abs() != 1][0])} found; +1 (ON) or -1 (OFF) is allowed.")
+    _check_columns(t_us, x, y, p, height_px, width_px)
     rank = torch.argsort((y * width_px + x) * 2 + (p > 0), stable=True)
     rank = rank[torch.argsort(t_us[rank], stable=True)]
     return EventStream(t_us[rank], x[rank], y[rank], p[rank], int(height_px), int(width_px))
@@ -67,32 +55,30 @@ def check_stream(stream: EventStream, part: slice = slice(None)) -> EventStream:
         and not values.is_meta
         for values in columns
     ):
-        given = [
-            f"{values.dtype}, {values.layout}, on {values.device}"
-            if isinstance(values, Tensor)
-            else type(values).__name__
-            for values in columns
-        ]
+        given = [getattr(values, "dtype", type(values).__name__) for values in columns]
         raise DomainError(f"t_us, x, y, p of the stream are {given}; dense tensors of int64 are needed.")
-    if not all(values.shape == (len(stream),) for values in columns):
-        raise ShapeError(
-            f"t_us, x, y, p of the stream have shapes {[list(v.shape) for v in columns]}; four lists of equal "
-            "length are needed."
-        )
-    t_us, x, y, p = (values[part] for values in columns)
-    if not len(t_us):
-        return stream
+    _check_columns(*columns, stream.height_px, stream.width_px, part)
+    t_us = stream.t_us[part]
     if bool((t_us[1:] < t_us[:-1]).any()):
         raise DomainError("the times of the stream go back; order it with codesign.events.stream.ordered.")
-    for values, name, size in ((x, "x", stream.width_px), (y, "y", stream.height_px)):
-        low, high = (int(bound) for bound in values.aminmax())
+    return stream
+
+
+def _check_columns(t_us, x, y, p, height_px, width_px, part=slice(None)):
+    """Refuse lists of unequal length and, in ``part``, events outside the sensor or of another polarity."""
+    if not (t_us.shape == x.shape == y.shape == p.shape == (t_us.numel(),)):
+        raise ShapeError(
+            f"t_us, x, y, p have shapes {[list(v.shape) for v in (t_us, x, y, p)]}; four lists of equal length are needed."
+        )
+    for values, name, size in ((x[part], "x", width_px), (y[part], "y", height_px)):
+        low, high = (int(bound) for bound in values.aminmax()) if len(values) else (0, -1)
         if low < 0 or high >= size:
             raise DomainError(
                 f"{name} spans {low} to {high}; the sensor has {size} pixels there (0 to {size - 1})."
             )
+    p = p[part]
     if bool((p.abs() != 1).any()):
         raise DomainError(f"polarity {int(p[p.abs() != 1][0])} found; +1 (ON) or -1 (OFF) is allowed.")
-    return stream
 
 
 def concatenate(streams: Iterable[EventStream]) -> EventStream:

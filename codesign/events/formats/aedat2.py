@@ -38,14 +38,7 @@ def write_aedat2(path, stream):
         )
     height_px = stream.height_px
     width_px = stream.width_px
-    t_us, x, y, p = columns(
-        stream,
-        height_limit_px=height_px,
-        width_limit_px=width_px,
-        first_us=0,
-        last_us=2**31 - 1,
-        name="AEDAT 2.0",
-    )
+    t_us, x, y, p = columns(stream, "AEDAT 2.0", 2**15, 0, 2**31 - 1)
     records = np.stack(
         ((height_px - 1 - y) << 22 | (width_px - 1 - x) << 12 | (p > 0).astype(np.int64) << 11, t_us), axis=1
     )

@@ -23,6 +23,68 @@ from codesign.events.formats.arrival import arranged, columns
 from codesign.optional import optional
 from codesign.reading import check_regular, open_regular, reading
 
+lz4_frame = optional("lz4.frame", "event-files", "reading and writing .aedat4")
+zstandard = optional("zstandard", "event-files", "reading .aedat4 packed by Zstandard")
+MAGIC = b"#!AER-DAT4.0\r\n"
+NONE, LZ4, LZ4_HIGH, ZSTD, ZSTD_HIGH = range(5)
+STREAM_NUMBER = re.compile(r"[0-9]{1,5}")
+SIDE = re.compile(r"[1-9][0-9]{0,4}")
+# LZ4 packs at most 255 to 1; what claims to unpack to more than this is refused, not unpacked
+LIMIT_RATIO = 1024
+LIMIT_EXTRA_BYTES = 4096
+EVENT = np.dtype(
+    {
+        "names": ["t", "x", "y", "on"],
+        "formats": ["<i8", "<i2", "<i2", "u1"],
+        "offsets": [0, 8, 10, 12],
+        "itemsize": 16,
+    }
+)
+EVENTS_PER_PACKET = 8192
+SIDE_PX = 2**15
+TABLE_ENTRY = np.dtype(
+    [
+        ("slots", "<i4"),
+        ("at", "<i8"),
+        ("elements", "<i8"),
+        ("first_us", "<i8"),
+        ("last_us", "<i8"),
+        ("stream", "<i4"),
+        ("size", "<i4"),
+        ("pad", "<u4"),
+    ]
+)
+INFO = """<dv version="2.0">
+    <node name="outInfo" path="/mainloop/Recorder/outInfo/">
+        <node name="0" path="/mainloop/Recorder/outInfo/0/">
+            <attr key="compression" type="string">LZ4</attr>
+            <attr key="originalModuleName" type="string">codesign</attr>
+            <attr key="originalOutputName" type="string">events</attr>
+            <attr key="typeDescription" type="string">Array of events (polarity ON/OFF).</attr>
+            <attr key="typeIdentifier" type="string">EVTS</attr>
+            <node name="info" path="/mainloop/Recorder/outInfo/0/info/">
+                <attr key="sizeX" type="int">{width_px}</attr>
+                <attr key="sizeY" type="int">{height_px}</attr>
+                <attr key="source" type="string">codesign</attr>
+                <attr key="tsOffset" type="long">0</attr>
+            </node>
+        </node>
+    </node>
+</dv>
+"""
+# places in the schema
+TIMESTAMP = 0
+EXPOSURE_START = 3
+EXPOSURE_END = 4
+FORMAT = 5
+WIDTH = 6
+HEIGHT = 7
+LEFT = 8
+TOP = 9
+PIXELS = 10
+EXPOSURE = 11
+GRAY = 0
+
 
 class Table:
     """One table of a buffer; fields are asked for by their place in the schema (0, 1, …)."""
@@ -106,18 +168,6 @@ def damaged(path, what, size):
     return FileFormatError(
         f"{path}: a block of {size} bytes points to {what}, outside itself; the file is damaged."
     )
-
-
-lz4_frame = optional("lz4.frame", "event-files", "reading and writing .aedat4")
-zstandard = optional("zstandard", "event-files", "reading .aedat4 packed by Zstandard")
-
-MAGIC = b"#!AER-DAT4.0\r\n"
-NONE, LZ4, LZ4_HIGH, ZSTD, ZSTD_HIGH = range(5)
-STREAM_NUMBER = re.compile(r"[0-9]{1,5}")
-SIDE = re.compile(r"[1-9][0-9]{0,4}")
-# LZ4 packs at most 255 to 1; what claims to unpack to more than this is refused, not unpacked
-LIMIT_RATIO = 1024
-LIMIT_EXTRA_BYTES = 4096
 
 
 @dataclass(frozen=True)
@@ -277,48 +327,6 @@ def _attribute(node, key):
     return None if found is None else (found.text or "")
 
 
-EVENT = np.dtype(
-    {
-        "names": ["t", "x", "y", "on"],
-        "formats": ["<i8", "<i2", "<i2", "u1"],
-        "offsets": [0, 8, 10, 12],
-        "itemsize": 16,
-    }
-)
-EVENTS_PER_PACKET = 8192
-SIDE_PX = 2**15
-TABLE_ENTRY = np.dtype(
-    [
-        ("slots", "<i4"),
-        ("at", "<i8"),
-        ("elements", "<i8"),
-        ("first_us", "<i8"),
-        ("last_us", "<i8"),
-        ("stream", "<i4"),
-        ("size", "<i4"),
-        ("pad", "<u4"),
-    ]
-)
-INFO = """<dv version="2.0">
-    <node name="outInfo" path="/mainloop/Recorder/outInfo/">
-        <node name="0" path="/mainloop/Recorder/outInfo/0/">
-            <attr key="compression" type="string">LZ4</attr>
-            <attr key="originalModuleName" type="string">codesign</attr>
-            <attr key="originalOutputName" type="string">events</attr>
-            <attr key="typeDescription" type="string">Array of events (polarity ON/OFF).</attr>
-            <attr key="typeIdentifier" type="string">EVTS</attr>
-            <node name="info" path="/mainloop/Recorder/outInfo/0/info/">
-                <attr key="sizeX" type="int">{width_px}</attr>
-                <attr key="sizeY" type="int">{height_px}</attr>
-                <attr key="source" type="string">codesign</attr>
-                <attr key="tsOffset" type="long">0</attr>
-            </node>
-        </node>
-    </node>
-</dv>
-"""
-
-
 def read_aedat4(path, asked):
     """EventColumns of ``path``; the sensor size is the header's. Frames, inertial data and triggers are
     other streams (frames: see aedat4_frames).
@@ -343,14 +351,7 @@ def write_aedat4(path, stream):
 
     Raises: FileFormatError for a sensor beyond 32768 x 32768.
     """
-    t_us, x, y, p = columns(
-        stream,
-        height_limit_px=SIDE_PX,
-        width_limit_px=SIDE_PX,
-        first_us=-(2**63),
-        last_us=2**63 - 1,
-        name="AEDAT 4.0",
-    )
+    t_us, x, y, p = columns(stream, "AEDAT 4.0", SIDE_PX, -(2**63), 2**63 - 1)
     events = np.zeros(len(t_us), EVENT)
     events["t"], events["x"], events["y"], events["on"] = t_us, x, y, p > 0
     info = INFO.format(height_px=stream.height_px, width_px=stream.width_px).encode("ascii")
@@ -408,20 +409,6 @@ def _table(entries):
         "<II4sHHHHHHHHHHiII", size - 4, 28, b"FTAB", 6, 8, 4, 14, 44, 4, 36, 12, 20, 28, 20, 4, len(entries)
     )
     return head + offsets + bytes(first - len(head) - len(offsets)) + entries.tobytes()
-
-
-# places in the schema
-TIMESTAMP = 0
-EXPOSURE_START = 3
-EXPOSURE_END = 4
-FORMAT = 5
-WIDTH = 6
-HEIGHT = 7
-LEFT = 8
-TOP = 9
-PIXELS = 10
-EXPOSURE = 11
-GRAY = 0
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,13 @@ NAMES = {
     "y": ("y", "ys"),
     "p": ("p", "ps", "pol", "polarity"),
 }
+# read-out and packet merging swap neighbours within about a frame of the read-out; more than this is another
+# fault
+DISORDER_US = 1000
+LAST_US = 2**61
+MOST_EVENTS = 2_000_000_000
+BACKWARDS = "events_back_in_time"
+OFF_SENSOR = "events_off_sensor"
 
 
 def check_asked(path, asked):
@@ -74,15 +81,6 @@ def signed(t):
     if t.dtype.kind == "u":
         return np.minimum(t.astype(np.uint64), 2**62).astype(np.int64)
     return np.clip(t.astype(np.int64), -(2**62), 2**62)
-
-
-# read-out and packet merging swap neighbours within about a frame of the read-out; more than this is another
-# fault
-DISORDER_US = 1000
-LAST_US = 2**61
-MOST_EVENTS = 2_000_000_000
-BACKWARDS = "events_back_in_time"
-OFF_SENSOR = "events_off_sensor"
 
 
 @dataclass(frozen=True)
@@ -233,18 +231,20 @@ def arranged(path, asked, t_us, x, y, p, size=None):
     return arrival.columns()
 
 
-def columns(stream, *, height_limit_px, width_limit_px, first_us, last_us, name, t0_us=None):
+def columns(stream, name, side_px, first_us, last_us, t0_us=None):
     """t_us (less t0_us), x, y, p of a stream as int64 arrays, after checking that a format can hold it.
 
-    Args: height_limit_px, width_limit_px: largest sensor. first_us, last_us: first and last time the format
-      can hold. name: the format, for messages. t0_us: start time that the file tells, or None where the
-      format has no place for one.
+    Args:
+      name: the format, for messages.
+      side_px: largest height and width of a sensor.
+      first_us, last_us: first and last time the format can hold.
+      t0_us: start time that the file tells, or None where the format has no place for one.
     Raises: FileFormatError naming what does not fit and what to do.
     """
-    if stream.height_px > height_limit_px or stream.width_px > width_limit_px:
+    if max(stream.height_px, stream.width_px) > side_px:
         raise FileFormatError(
             f"the sensor has {stream.width_px} x {stream.height_px} pixels; {name} holds at most "
-            f"{width_limit_px} x {height_limit_px}; write .npz instead."
+            f"{side_px} x {side_px}; write .npz instead."
         )
     t_us, x, y, p = (values.cpu().numpy() for values in (stream.t_us, stream.x, stream.y, stream.p))
     # as Python integers, which do not wrap

@@ -60,15 +60,7 @@ def write_dat(path, stream, *, t0_us=0):
     Raises: FileFormatError for a sensor beyond 16384 x 16384, and times (less t0_us) below 0 or beyond 2^32
       us.
     """
-    t_us, x, y, p = columns(
-        stream,
-        height_limit_px=SIDE_PX,
-        width_limit_px=SIDE_PX,
-        first_us=0,
-        last_us=LOOP_US - 1,
-        name="DAT",
-        t0_us=checked_start_us(t0_us),
-    )
+    t_us, x, y, p = columns(stream, "DAT", SIDE_PX, 0, LOOP_US - 1, checked_start_us(t0_us))
     events = np.empty(len(t_us), EVENT)
     events["t"] = t_us
     events["address"] = (p > 0).astype(np.int64) << 28 | y << 14 | x

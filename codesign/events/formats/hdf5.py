@@ -22,6 +22,10 @@ from codesign.events.formats.hdf5_rows import REMEDY, Rows, h5py, new_hdf5, own,
 from codesign.reading import check_regular, reading
 
 LAST_T = 2**32 - 1
+MVSEC = "davis/left"
+EVENTS_PER_CHUNK = 2**17
+BLOCK = 2**20  # events that are read at once
+FINE = 4096  # events that are read to find one
 
 
 def to_dsec(stream):
@@ -30,14 +34,7 @@ def to_dsec(stream):
     Raises: FileFormatError for a stream longer than 2^32 us, because t has 32 bits, and for a sensor beyond
       65536 x 65536.
     """
-    t_us, x, y, p = columns(
-        stream,
-        height_limit_px=2**16,
-        width_limit_px=2**16,
-        first_us=-(2**61),
-        last_us=2**61,
-        name="DSEC's layout",
-    )
+    t_us, x, y, p = columns(stream, "DSEC's layout", 2**16, -(2**61), 2**61)
     offset_us = int(t_us[0]) if t_us.size else 0
     t = t_us - offset_us
     if t.size and int(t[-1]) > LAST_T:
@@ -81,12 +78,6 @@ def pixels(path, attributes, name):
             f"{path}: attribute {name} is {value}; a whole number from 1 to 65536 is needed."
         )
     return int(value.reshape(-1)[0])
-
-
-MVSEC = "davis/left"
-EVENTS_PER_CHUNK = 2**17
-BLOCK = 2**20  # events that are read at once
-FINE = 4096  # events that are read to find one
 
 
 class Hdf5Events:

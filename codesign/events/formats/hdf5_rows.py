@@ -33,6 +33,7 @@ BLOSC = 32001
 # what claims to unpack to more than this is refused, not unpacked
 LIMIT_RATIO = 4096
 LIMIT_EXTRA_BYTES = 2**20
+REMEDY = "it is missing, cut or damaged, or no HDF5 file of this kind"
 
 
 def chunk_bytes(dataset):
@@ -100,34 +101,25 @@ def undone(path, name, kind, options, data, limit_bytes):
     return data[:-4]
 
 
-def check_blosc(path, dataset, name, places, options):
-    """Every block must unpack to its chunk by its own header, and the filter must have been told so."""
+def check_blosc(path, dataset, name, place, options):
+    """A block must unpack to its chunk by its own header, and the filter must have been told so."""
     width = dataset.dtype.itemsize
     size = chunk_bytes(dataset)
     if len(options) < 4 or tuple(options[2:4]) != (width, size):
         raise damaged(path, name, "Blosc's parameters")
-    for at, mask, stored in places:
-        data = dataset.id.read_direct_chunk(at)[1]
-        if mask & 1:
-            fits = stored == size
-        else:
-            version, _, _, typesize, unpacked, block, packed = (
-                struct.unpack_from("<4B3I", data) if len(data) >= 16 else (0,) * 7
-            )
-            fits = (version, typesize, unpacked, packed) == (2, width, size, len(data)) and 0 < block <= max(
-                size, 1
-            )
-        if not fits:
-            raise damaged(path, name, at)
+    at, mask, stored = place
+    data = dataset.id.read_direct_chunk(at)[1]
+    header = struct.unpack_from("<4B3I", data) if len(data) >= 16 else (0,) * 7
+    version, _, _, typesize, unpacked, block, packed = header
+    fits = (version, typesize, unpacked, packed) == (2, width, size, len(data)) and 0 < block <= max(size, 1)
+    if not (stored == size if mask & 1 else fits):
+        raise damaged(path, name, at)
 
 
 def damaged(path, name, where):
     return FileFormatError(
         f"{path}: a block of {name} ({where}) does not unpack to what it should; the file is damaged."
     )
-
-
-REMEDY = "it is missing, cut or damaged, or no HDF5 file of this kind"
 
 
 def own(path, file, name):
@@ -268,7 +260,7 @@ class Rows:
         """One unpacked block, after checking that it is what it claims."""
         at, mask, _ = place
         if self.filters and self.filters[0][0] == BLOSC:
-            check_blosc(self.path, dataset, self.name, [place], self.filters[0][2])
+            check_blosc(self.path, dataset, self.name, place, self.filters[0][2])
             return np.asarray(
                 dataset[tuple(slice(a, a + n) for a, n in zip(at, self.block_shape or (), strict=True))]
             )

@@ -8,6 +8,11 @@ import numpy as np
 
 from codesign.errors import FileFormatError
 
+LIMIT_BYTES = 65536
+# microseconds to add to every time: faery writes "t0" in .raw and "T0" in .dat, versions of codesign before
+# it "codesign_t_offset_us"
+START_KEYS = ("t0", "T0", "codesign_t_offset_us")
+
 
 def unwrapped(ticks, loop):
     """Count the loops of a clock.
@@ -32,12 +37,6 @@ def held(starts, values, count):
     """
     first = int(starts[0]) if len(starts) else count
     return np.repeat(values, np.diff(starts, append=count)), first
-
-
-LIMIT_BYTES = 65536
-# microseconds to add to every time: faery writes "t0" in .raw and "T0" in .dat, versions of codesign before
-# it "codesign_t_offset_us"
-START_KEYS = ("t0", "T0", "codesign_t_offset_us")
 
 
 def parse_header(path, data):

@@ -59,13 +59,7 @@ def write_raw(path, stream, *, evt=3, t0_us=0):
         raise FileFormatError(f"evt={evt!r} was given; 2 (EVT 2.0) and 3 (EVT 3.0) are written.")
     encoding = ENCODINGS[evt]
     t_us, x, y, p = columns(
-        stream,
-        height_limit_px=SIDE_PX,
-        width_limit_px=SIDE_PX,
-        first_us=0,
-        last_us=encoding.LIMIT_US - 1,
-        name=f"EVT {evt}.0",
-        t0_us=checked_start_us(t0_us),
+        stream, f"EVT {evt}.0", SIDE_PX, 0, encoding.LIMIT_US - 1, checked_start_us(t0_us)
     )
     height_px = stream.height_px
     width_px = stream.width_px

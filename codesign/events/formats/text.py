@@ -32,8 +32,7 @@ NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 def write_csv(path, stream):
     """Write events to ``path``. The format has no place for the sensor size: pass it when reading."""
-    limits = {"height_limit_px": LIMIT_PX, "width_limit_px": LIMIT_PX}
-    rows = columns(stream, first_us=1 - LAST_US, last_us=LAST_US - 1, name="CSV", **limits)
+    rows = columns(stream, "CSV", LIMIT_PX, 1 - LAST_US, LAST_US - 1)
     np.savetxt(path, np.stack(rows, 1), fmt="%d", delimiter=",", header="t,x,y,p", comments="")
 
 

@@ -32,6 +32,7 @@ from codesign.events.sensor.model import (
 from codesign.events.spiking.comparators import count_spikes
 
 MOST = 2**24  # numbers that are remembered
+MOST_STEPS = 4096  # of spiking neurons per frame interval
 
 
 class LastDraw:
@@ -72,9 +73,6 @@ class LastDraw:
         return drawn
 
 
-MOST_STEPS = 4096  # of spiking neurons per frame interval
-
-
 class Comparator(Protocol):
     """What ``ComparatorLayer`` calls. frames: [T, ...] on the 0-255 scale, or log levels with log_input;
     theta_on, theta_off: 0-dim or [...]; state: what the call before returned, None at first."""
@@ -102,9 +100,7 @@ class Sigmoid:
     refines = False
     whole = False
 
-    def __call__(
-        self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
-    ) -> tuple[Tensor, Tensor]:
+    def __call__(self, frames, theta_on, theta_off, state, log_input):
         frames = _with_last(frames, state)
         on = soft(frames, theta_on, sharpness=self.sharpness, log_input=log_input)[:, 0]
         off = soft(frames, theta_off, sharpness=self.sharpness, log_input=log_input)[:, 1]
@@ -119,9 +115,7 @@ class SoftCounts:
     refines = True
     whole = False
 
-    def __call__(
-        self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
-    ) -> tuple[Tensor, Tensor]:
+    def __call__(self, frames, theta_on, theta_off, state, log_input):
         frames = _with_last(frames, state)
         return soft_counts(frames, theta_on, theta_off, log_input=log_input), frames[-1]
 
@@ -135,9 +129,7 @@ class Dense:
     refines = False
     whole = True
 
-    def __call__(
-        self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
-    ) -> tuple[Tensor, Tensor]:
+    def __call__(self, frames, theta_on, theta_off, state, log_input):
         return dense(frames, theta_on, theta_off, sharpness=self.sharpness, state=state, log_input=log_input)
 
 
@@ -150,9 +142,7 @@ class Memory:
     refines = True
     whole = True
 
-    def __call__(
-        self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
-    ) -> tuple[Tensor, Tensor]:
+    def __call__(self, frames, theta_on, theta_off, state, log_input):
         return memory(frames, theta_on, theta_off, state=state, log_input=log_input, gradient=self.gradient)
 
 
@@ -166,9 +156,7 @@ class Expected:
     refines = False
     whole = False
 
-    def __call__(
-        self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Tensor | None, log_input: bool
-    ) -> tuple[Tensor, Tensor]:
+    def __call__(self, frames, theta_on, theta_off, state, log_input):
         return expected(frames, theta_on, theta_off, self.spread, state=state, log_input=log_input)
 
 
@@ -192,9 +180,7 @@ class Spikes:
             )
         self.steps = check_whole(self.steps, "steps", 1, MOST_STEPS)
 
-    def __call__(
-        self, frames: Tensor, theta_on: Tensor, theta_off: Tensor, state: Any, log_input: bool
-    ) -> tuple[Tensor, Any]:
+    def __call__(self, frames, theta_on, theta_off, state, log_input):
         level = log_levels(frames, log_input, minimum=2 if state is None else 1)
         if self.steps > 1:
             level = _between(_with_last(level, None if state is None else state[0]), self.steps)

@@ -52,11 +52,10 @@ class Run(Loop):
         self.count = self.opaque(count)
         self.blocks = -(-count // self.size)
         self.interval = self._of(self.arr.UInt32, parts.interval)
-        self.back = self._of(self.arr.UInt32, parts.back)
+        self.back_rows = self._of(self.arr.UInt32, parts.back)
         self.share, self.blend, self.slope = (
             self._of(self.arr.Float, values) for values in (parts.share, parts.blend, parts.slope)
         )
-        self.half = (self.theta_on + self.theta_off) * 0.25
         self.stored = self.reach * PHASES + PHASES + 3  # numbers of a state
         self.zero = self.dr.zeros(self.arr.Float, self.width)
 
@@ -95,14 +94,13 @@ class Run(Loop):
         place = row * self.pixels + self.lane
         self.dr.scatter(target, value, place, mode=self.dr.ReduceMode.NoConflicts)
 
-    def add(self, target, value, row, active=True):
+    def add(self, target, value, row):
         place = row * self.pixels + self.lane
         self.dr.scatter_reduce(
             self.dr.ReduceOp.Add,
             target,
             value,
             place,
-            active=active,
             mode=self.dr.ReduceMode.NoConflicts,
         )
 
@@ -114,153 +112,115 @@ class Run(Loop):
         first = block * self.size
         return first, self.dr.minimum(self.count - first, self.size)
 
-    def play(self, part, centre):
-        """The interval of a part, and how far its level lies above and below the play."""
+    def given(self, rows, part, now, centre, position, begun):
+        """What ``step`` takes: of the pixel, then of every group when its last event began, now, and at the rows
+        around a dead time ago."""
         interval = self.of_part(self.interval, part)
         low = self.gather(self.values, interval)
         high = self.gather(self.values, interval + 1)
         level = self.dr.lerp(low, high, self.of_part(self.share, part))
-        return interval, *self.beyond(level, centre)
-
-    def look(self, rows, part, now):
-        """What every group had kept a dead time ago, and by how much more at the row behind than at the one
-        before."""
-        before = now - self.of_part(self.back, part)
+        before = now - self.of_part(self.back_rows, part)
+        groups = [
+            value
+            for mine, one in zip(rows, begun, strict=True)
+            for value in (one, mine[now], mine[before], mine[before + 1])
+        ]
         blend = self.of_part(self.blend, part)
-        found = []
-        for mine in rows:
-            low = mine[before]
-            more = mine[before + 1] - low
-            found.append((self.dr.fma(blend, more, low), more))
-        return found
+        return [level, self.theta_on, self.theta_off, blend, centre, position, *groups]
 
-    def heads(self, rise, fall, heading, rows, now, begun):
-        """Where the play heads now, and what groups had kept when their last event began: at a turn one begins,
-        of those phases that the level has just passed."""
+    def step(self, heading, level, theta_on, theta_off, blend, centre, position, *groups):
+        """One part, as drjit differentiates it. Returns where the play heads now; kept counts, centre, position, and of
+        every group what it had kept when its last event began, and what it has kept now."""
         dr = self.dr
+        half = (theta_on + theta_off) * 0.25
+        rise, fall = (dr.select(far > 0, far, 0) for far in (level - centre - half, centre - half - level))
+        total = rise / theta_on + fall / theta_off
         ahead = dr.select(rise > 0, 1, dr.select(fall > 0, -1, heading))
         turned = ahead * heading < 0
-        kept = [mine[now] for mine in rows]
-        begun = [dr.select(turned, now, before) for now, before in zip(kept, begun, strict=True)]
-        return ahead, turned, kept, begun
-
-    def walk(self, rows, part, now, centre, position, heading, begun):
-        """One part forward; rows gain one. Returns interval, rise, fall, kept counts, and the state after it."""
-        interval, rise, fall = self.play(part, centre)
-        total = rise / self.theta_on + fall / self.theta_off
-        ahead, _, kept, begun = self.heads(rise, fall, heading, rows, now, begun)
         passed = self.zero
         after = []
-        for group, (free, _) in enumerate(self.look(rows, part, now)):
-            step = _Step(self.dr, group, position, ahead, total, kept[group], begun[group], free)
-            rows[group][now + 1] = step.before + step.added
-            passed = passed + step.added
-            after.append(step.begun)
-        centre = centre + (rise - fall)
-        return interval, rise, fall, passed / PHASES, centre, position + ahead * total, ahead, after
+        for group in range(PHASES):
+            begun, kept, low, high = groups[4 * group : 4 * group + 4]
+            free = dr.fma(blend, high - low, low)
+            # at a turn an event begins, of those phases that the level has just passed
+            begun = dr.select(turned, kept, begun)
+            place = position + group / PHASES
+            # downward, the same events come in reverse order
+            start = dr.select(ahead < 0, WIDTH - place, place)
+            end = start + total
+            border = dr.floor(dr.detach(start)) + 1
+            begins = dr.floor(dr.detach(end)) >= border
+            # masses of the event begun before this part, and of the one that begins in it; further ones are lost to it
+            early = dr.select(begins, border, _filled(dr, end)) - _filled(dr, start)
+            late = dr.select(begins, _at_most_one(dr, _filled(dr, end) - border), 0)
+            early = early * _at_most_one(dr, 1 - (begun - free))
+            begun = dr.select(begins, kept + early, begun)
+            added = early + late * _at_most_one(dr, 1 - (begun - free))
+            passed = passed + added
+            after += begun, kept + added
+        return ahead, passed / PHASES, centre + (rise - fall), position + ahead * total, *after
+
+    def walk(self, rows, part, now, centre, position, heading, begun):
+        """One part forward; rows gain one. Returns kept counts and their place, and the state after it."""
+        given = self.given(rows, part, now, centre, position, begun)
+        ahead, passed, centre, position, *groups = self.step(heading, *given)
+        for mine, value in zip(rows, groups[1::2], strict=True):
+            mine[now + 1] = value
+        return passed, self.place(part, ahead), centre, position, ahead, groups[::2]
+
+    def place(self, part, ahead):
+        """Row of the counts of a part that heads there: ON, then OFF."""
+        return 2 * self.of_part(self.interval, part) + self.dr.select(ahead < 0, self.arr.UInt32(1), 0)
 
     def pull(self, seed, target, pulls, pull, rows, part, now, centre, position, heading, begun):
-        """One part backward: what ``walk`` did, differentiated. pulls: gradients of the state after it, by name; pull:
-        of the rows. Returns those of the state before it."""
-        dr = self.dr
-        interval, rise, fall = self.play(part, centre)
-        is_on = rise > 0
-        is_off = fall > 0
-        moves = is_on | is_off
-        total = rise / self.theta_on + fall / self.theta_off
-        of_kept = self.gather(seed, 2 * interval + dr.select(is_on, 0, 1)) / PHASES
-        of_kept = dr.select(moves, of_kept, 0)
-        blend = self.of_part(self.blend, part)
-        before = now - self.of_part(self.back, part)
-        ahead, turned, kept, begun = self.heads(rise, fall, heading, rows, now, begun)
-        of_total = pulls["position"] * ahead
-        of_position = pulls["position"]
-        of_dead = self.zero
-        of_begun = []
-        for group, (free, more) in enumerate(self.look(rows, part, now)):
-            step = _Step(dr, group, position, ahead, total, kept[group], begun[group], free)
-            of_row = pull[group][now + 1]
-            of_end, of_start, looked, of_middle, older = step.pull(of_kept + of_row, pulls["begun"][group])
-            of_total = of_total + of_end
-            of_position = of_position + ahead * (of_end - of_start)
-            of_dead = of_dead + looked * more
-            of_begun.append(dr.select(turned, 0, older))
-            _increase(pull[group], now, of_row + of_middle + dr.select(turned, older, 0))
-            _increase(pull[group], before, (1 - blend) * looked)
-            _increase(pull[group], before + 1, blend * looked)
-        # the play: the edge that the level has reached stands at the level
-        theta = dr.select(is_on, self.theta_on, self.theta_off)
-        per_level = dr.select(moves, of_total / theta, 0)
-        signed = dr.select(is_on, per_level, -per_level)
-        of_level = dr.select(moves, signed + pulls["centre"], 0)
-        of_half = dr.select(is_on, -of_level, of_level)  # of a quarter of each threshold
-        share = self.of_part(self.share, part)
-        self.add(target, (1 - share) * of_level, interval)
-        self.add(target, share * of_level, interval + 1)
+        """One part backward. pulls: gradients of the state after it, by name; pull: of the rows. Returns those of the
+        state before it."""
+        given = self.given(rows, part, now, centre, position, begun)
+        ahead = self.dr.detach(self.step(heading, *given)[0])
+        seeds = [self.gather(seed, self.place(part, ahead)), pulls["centre"], pulls["position"]]
+        for mine, one in zip(pull, pulls["begun"], strict=True):
+            seeds += one, mine[now + 1]
+        level, theta_on, theta_off, blend, centre, position, *groups = self.back(
+            lambda *values: self.step(heading, *values)[1:], given, seeds
+        )
+        before = now - self.of_part(self.back_rows, part)
+        for group, mine in enumerate(pull):
+            for row, value in zip(
+                (now, before, before + 1), groups[4 * group + 1 : 4 * group + 4], strict=True
+            ):
+                mine[row] = mine[row] + value
+        interval, share = self.of_part(self.interval, part), self.of_part(self.share, part)
+        self.add(target, (1 - share) * level, interval)
+        self.add(target, share * level, interval + 1)
         return {
-            "centre": dr.select(moves, -signed, pulls["centre"]),
-            "position": of_position,
-            "begun": of_begun,
-            "theta_on": pulls["theta_on"] + of_half / 4 - dr.select(is_on, per_level * total, 0),
-            "theta_off": pulls["theta_off"] + of_half / 4 - dr.select(is_off, per_level * total, 0),
-            "dead": pulls["dead"] - self.of_part(self.slope, part) * of_dead,
+            "centre": centre,
+            "position": position,
+            "begun": groups[::4],
+            "theta_on": pulls["theta_on"] + theta_on,
+            "theta_off": pulls["theta_off"] + theta_off,
+            "dead": pulls["dead"] - self.of_part(self.slope, part) * blend,
         }
 
-
-class _Step:
-    """One part of one group: masses of the event begun before it (early) and of the one that begins in it (late), the
-    share of each that is kept, what is kept more, and what had been kept when the last event began."""
-
-    def __init__(self, dr, group, position, ahead, total, before, begun, free):
-        self.dr = dr
-        place = position + group / PHASES
-        start = dr.select(ahead < 0, WIDTH - place, place)  # downward, the same events come in reverse order
-        end = start + total
-        filled, self.fills_before = _filled(dr, start)
-        filled_after, self.fills_after = _filled(dr, end)
-        border = dr.floor(start) + 1
-        self.begins = dr.floor(end) > dr.floor(start)
-        self.early = dr.select(self.begins, border, filled_after) - filled
-        grown = dr.select(self.begins, filled_after - border, 0)
-        self.single = grown <= 1
-        self.late = dr.minimum(grown, 1)  # further ones of this part are lost to it
-        self.kept_early = dr.minimum(1 - (begun - free), 1)
-        self.before = before
-        self.begun = dr.select(self.begins, before + self.kept_early * self.early, begun)
-        self.kept_late = dr.minimum(1 - (self.begun - free), 1)
-        self.added = self.kept_early * self.early + self.kept_late * self.late
-
-    def pull(self, of_added, of_begun):
-        """Of gradients to what is kept more and to ``begun``: those to end, start, look, kept before, begun before."""
+    def back(self, function, given, seeds):
+        """Gradients of what a function is given, from those of what it gives."""
         dr = self.dr
-        late = of_added * self.late
-        late_mass = of_added * self.kept_late
-        late_looks = dr.select(self.kept_late < 1, late, 0)
-        of_begun = of_begun - late_looks
-        middle = dr.select(self.begins, of_begun, 0)
-        of_begun = dr.select(self.begins, 0, of_begun)
-        early = (of_added + middle) * self.early
-        early_mass = (of_added + middle) * self.kept_early
-        early_looks = dr.select(self.kept_early < 1, early, 0)
-        end = dr.select(self.begins, dr.select(self.single, late_mass, 0), early_mass) * self.fills_after
-        return (
-            end,
-            early_mass * self.fills_before,
-            late_looks + early_looks,
-            middle,
-            of_begun - early_looks,
-        )
+        with dr.resume_grad():
+            given = [dr.detach(value) + 0 for value in given]
+            dr.enable_grad(given)
+            products = [value * dr.detach(one) for value, one in zip(function(*given), seeds, strict=True)]
+            dr.backward_from(sum(products[1:], products[0]))
+            return [dr.grad(value) for value in given]
 
 
 def _filled(dr, place):
-    """Mass of a group's events up to a place, and its slope."""
-    whole = dr.floor(place)
-    share = (place - whole) * (1 / WIDTH)
-    return whole + dr.minimum(share, 1), dr.select(share < 1, 1 / WIDTH, 0)
+    """Mass of a group's events up to a place."""
+    whole = dr.floor(dr.detach(place))
+    return whole + _at_most_one(dr, (place - whole) * (1 / WIDTH))
 
 
-def _increase(local, index, value):
-    local[index] = local[index] + value
+def _at_most_one(dr, share):
+    """No slope from 1 on: a phase that nothing blocks stays so."""
+    return dr.select(share < 1, share, 1)
 
 
 @exclusive
@@ -298,11 +258,10 @@ def forward(parts, level, theta_on, theta_off, centre, position, heading, begun,
 
         def walk(index, centre, position, heading, begun, local):
             part = first + index
-            interval, rise, fall, kept, *after = run.walk(
+            kept, place, *after = run.walk(
                 local, part, index + run.reach - 1, centre, position, heading, begun
             )
-            run.add(target, kept, 2 * interval, rise > 0)
-            run.add(target, kept, 2 * interval + 1, fall > 0)
+            run.add(target, kept, place)
             return *after, local
 
         return run.repeat(size, walk, centre, position, heading, begun, local)

@@ -25,6 +25,11 @@ from codesign.events.volumes.volume import check_bins, from_counts, from_stream
 from codesign.types import EventVolume
 
 STEP = 0.1  # a unit step of a variable changes its value by a tenth: exp(0.1) - 1 = 10.5 %
+THRESHOLDS = ("theta_on", "theta_off")
+PARTS_PER_BIN = 4  # intervals, from one node of a volume to the next, from which on finer ones change nothing
+MOST_LEAD_S = 1e9
+NEAR = 1e-6  # of the lead, by which a frame may miss its end
+PARTS_PER_TAU = 8  # the same for the time in which a surface fades
 
 
 class PositiveValues(nn.Module):
@@ -56,11 +61,6 @@ class PositiveValues(nn.Module):
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.raw)
-
-
-THRESHOLDS = ("theta_on", "theta_off")
-PARTS_PER_BIN = 4  # intervals, from one node of a volume to the next, from which on finer ones change nothing
-PARTS_PER_TAU = 8  # the same for the time in which a surface fades
 
 
 class EventLayer(nn.Module):
@@ -196,12 +196,25 @@ class EventLayer(nn.Module):
           as one.
         Gradient: as ``forward``, also for when events come.
         """
+        return self._volume(frames, t_s, bins, generator, 0.0)
+
+    def _volume(self, frames, t_s, bins, generator, lead_s):
+        """``volume`` of what comes after a lead."""
         check_bins(bins)
         check_axes(frames)
         given_s = check_times(t_s, frames.shape[-3])
-        longest_s = float(given_s[-1] - given_s[0]) / (bins - 1) / PARTS_PER_BIN if bins > 1 else math.inf
+        start_s = float(given_s[0]) + lead_s
+        longest_s = float(given_s[-1] - start_s) / (bins - 1) / PARTS_PER_BIN if bins > 1 else math.inf
+        if lead_s:
+            off_s = (given_s[:-1] - start_s).abs()
+            if len(given_s) < 2 or float(off_s.min()) > NEAR * max(lead_s, float(given_s.diff().min())):
+                raise DomainError(
+                    f"settled: no frame stands {lead_s:g} s after the first; give frames at "
+                    f"{(given_s - given_s[0]).tolist()} s a lead that ends with one, before the last."
+                )
         counts, times_s = self.finely(frames, t_s, longest_s, generator)
-        return from_counts(counts.movedim((-4, -3), (0, 1)), times_s, bins)
+        first = int((times_s - start_s).abs().argmin())
+        return from_counts(counts.movedim((-4, -3), (0, 1))[first:], times_s[first:], bins)
 
     def surface(
         self,
@@ -258,10 +271,6 @@ def _generators(generator, batch):
     return list(generator)
 
 
-MOST_S = 1e9
-NEAR = 1e-6  # of the lead, by which a frame may miss its end
-
-
 class Settled(nn.Module):
     """An event layer whose events in the first ``lead_s`` are not read; frames begin as much before the window.
 
@@ -289,27 +298,15 @@ class Settled(nn.Module):
     ) -> EventVolume:
         """Events after the lead in time bins, [B, 2, bins, H, W]. Args and gradient: as ``EventLayer.volume``.
         Raises: DomainError when no frame stands at the end of the lead."""
-        check_bins(bins)
-        check_axes(frames)
-        given_s = check_times(t_s, frames.shape[-3])
-        start_s = float(given_s[0]) + self.lead_s
-        if len(given_s) < 2 or float((given_s[:-1] - start_s).abs().min()) > NEAR * max(
-            self.lead_s, float(given_s.diff().min())
-        ):
-            raise DomainError(
-                f"settled: no frame stands {self.lead_s:g} s after the first; give frames at "
-                f"{(given_s - given_s[0]).tolist()} s a lead that ends with one, before the last."
-            )
-        longest_s = float(given_s[-1] - start_s) / (bins - 1) / PARTS_PER_BIN if bins > 1 else math.inf
-        counts, times_s = self.layer.finely(frames, t_s, longest_s, generator)
-        first = int((times_s - start_s).abs().argmin())
-        return from_counts(counts.movedim((-4, -3), (0, 1))[first:], times_s[first:], bins)
+        return self.layer._volume(frames, t_s, bins, generator, self.lead_s)
 
 
 def check_lead(lead_s: float) -> float:
     """Seconds. Raises: DomainError for others than finite ones of at least 0."""
-    if not 0 <= as_number(lead_s, "lead_s") < MOST_S:
-        raise DomainError(f"lead_s is {lead_s}; seconds of at least 0 and less than {MOST_S:g} are needed.")
+    if not 0 <= as_number(lead_s, "lead_s") < MOST_LEAD_S:
+        raise DomainError(
+            f"lead_s is {lead_s}; seconds of at least 0 and less than {MOST_LEAD_S:g} are needed."
+        )
     return float(lead_s)
 
 
@@ -338,9 +335,7 @@ class HardSensor(nn.Module):
             raise ShapeError(f"the hard sensor takes frames [N, T, H, W], got {tuple(frames.shape)}.")
         count, times, height, width = frames.shape
         tall = frames.movedim(1, 0).reshape(times, count * height, width)
-        stream = simulate(
-            tall, t_s, self.sensor, Generator().manual_seed(0) if generator is None else generator
-        )
+        stream = simulate(tall, t_s, self.sensor, generator)
         start_s, end_s = check_times(t_s, times)[[0, -1]].tolist()
         start_us, end_us = (round(time_s * 1e6) for time_s in (start_s + self.lead_s, end_s))
         volume = from_stream(stream, start_us, end_us, self.bins)

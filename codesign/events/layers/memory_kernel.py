@@ -33,6 +33,13 @@ needs more, the pair with the least weight x distance is spread evenly over the 
 from codesign.events.layers.pixel_loop import Loop
 from codesign.exclusive import exclusive
 
+PAIRS = 4
+WIDTH = 6  # values of a pair
+TIE = 1e-5  # thresholds: a pixel on the brink has not fired yet
+MET = 1e-4  # thresholds: nearer pairs have met
+START = 0xFFFFFFFE  # in place of a frame
+NONE = 0xFFFFFFFF
+
 
 @exclusive
 def count(frames, start, theta_on, theta_off, front_end):
@@ -137,14 +144,6 @@ def play_adjoint(
         loop.tensor(grad, start.shape[1:])
         for grad in (grad_start, grad_on + grad_width / 2, grad_off + grad_width / 2)
     )
-
-
-PAIRS = 4
-WIDTH = 6  # values of a pair
-TIE = 1e-5  # thresholds: a pixel on the brink has not fired yet
-MET = 1e-4  # thresholds: nearer pairs have met
-START = 0xFFFFFFFE  # in place of a frame
-NONE = 0xFFFFFFFF
 
 
 @exclusive

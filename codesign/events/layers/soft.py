@@ -13,6 +13,11 @@ from codesign.events.entry import check_level, check_per_pixel, check_positive, 
 from codesign.events.intensity import log_levels
 
 GHOST_LOGIT = -5.0  # a pixel without change fires sigmoid(-5) = 0.67 % of an event per polarity and frame
+# beyond a spread of so many events the sum over events equals its integral less a half, to exp(-2 pi^2 1.2^2)
+# = 5e-13
+SERIES_END = 1.2
+LEAST_SPREAD = 0.01
+MOST_SPREAD = 1.0
 
 
 def soft(
@@ -98,13 +103,6 @@ class _Step(Function):
     def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
         (value,) = ctx.saved_tensors
         return grad * ctx.sharpness / (1 + ctx.sharpness * value.abs()) ** 2, None
-
-
-# beyond a spread of so many events the sum over events equals its integral less a half, to exp(-2 pi^2 1.2^2)
-# = 5e-13
-SERIES_END = 1.2
-LEAST_SPREAD = 0.01
-MOST_SPREAD = 1.0
 
 
 def expected(

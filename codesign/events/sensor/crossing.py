@@ -23,6 +23,20 @@ from codesign import backend
 from codesign.events.intensity import light_share
 from codesign.events.low_pass import coefficients, passed
 
+# of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop counting
+MOST_EVENTS = 1e6
+CARRIED = (
+    "reference",
+    "reference_rest",
+    "level",
+    "input_level",
+    "input",
+    "noise",
+    "last_event_s",
+    "hazard",
+    "shots",
+)  # what changes from frame to frame
+
 
 def hashed(dr, bits):
     """32 well-mixed bits of 32 bits; one to one. Source: C. Wellons, "Prospecting for Hash Functions"
@@ -183,21 +197,6 @@ class DenseCounts:
     def tensor(self, shape):
         """The counts as a tensor; call once, it takes the memory over."""
         return self._counts.torch().reshape(shape)
-
-
-# of a pixel in one interval: beyond it a unit is wrong, and single precision would soon stop counting
-MOST_EVENTS = 1e6
-CARRIED = (
-    "reference",
-    "reference_rest",
-    "level",
-    "input_level",
-    "input",
-    "noise",
-    "last_event_s",
-    "hazard",
-    "shots",
-)  # what changes from frame to frame
 
 
 def run(frames, front_end, dt_s, interval_key, sensor, state, sink):

@@ -14,6 +14,7 @@ from codesign.errors import FileFormatError
 from codesign.events.entry import check_path
 
 PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".gif")
 
 
 @dataclass(frozen=True)
@@ -67,9 +68,6 @@ def times_from_fps(count, fps):
 
 def _size(shape):
     return f"{shape[1]} x {shape[0]} pixels{' in colour' if len(shape) == 3 else ''}"
-
-
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".wmv", ".gif")
 
 
 def open_frames(path: str | Path) -> FrameSource:

@@ -11,6 +11,31 @@ from kornia.filters import gaussian_blur2d
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, pad
 
+DATA_WEIGHT = 20.0  # lambda, for pictures of natural-log units
+COUPLING = 0.3  # theta: how far the solution of the data term may leave the smooth one
+DUAL_STEP = 0.25  # largest stable step of the dual variable, Chambolle 2004
+LEAST_GRADIENT = 1e-6  # squared; keeps the step finite on even surfaces
+MEDIAN_OF_NINE = (  # sorting network that leaves the median_of_nine in place 4 (Paeth, Graphics Gems I, 1990)
+    (1, 2), (4, 5), (7, 8), (0, 1), (3, 4), (6, 7), (1, 2), (4, 5), (7, 8), (0, 3), (5, 8), (4, 7), (3, 6), (1, 4), (2, 5), (4, 7), (4, 2), (6, 4), (4, 2),
+)  # fmt: skip
+RADIUS_PX = 9  # displacements looked at, at the scale of matching
+WINDOW_PX = 1  # neighbours on each side
+MOST = 0.5  # log units; larger differences count as this, so that an occluded corner does not decide
+STILLNESS = 5e-4  # log units per pixel: of equals the smaller displacement is taken
+# a match replaces the flow where its difference is below this share of the flow's, by at least this
+BETTER = 0.7
+MARGIN = 0.02
+AGREEMENT_PX = 1.5  # and where both directions agree
+# on the 0-255 scale: flow is found on ln(I + 12), so that dark edges count about as the sensor sees them
+DARK_OFFSET = 12.0
+SMALLEST_PX = 12  # shorter side of the coarsest scale
+# matches are sought at the first scale whose shorter side is at most this: there they reach a ninth of it or
+# more
+MATCHED_PX = 80
+PREFILTER_PX = 1.04  # standard deviation of the blur before every halving
+WARPS = 4
+ITERATIONS = 20
+
 
 def places(field):
     """[2, H, W] column and row of every pixel, of the type of ``field`` [..., H, W]."""
@@ -72,15 +97,6 @@ def splatted(values, displacement_px):
     for part, step in ((upper, 0), (lower, width + 2)):
         total.index_add_(0, index + step, part * (1 - right)).index_add_(0, index + step + 1, part * right)
     return total.reshape(height + 2, width + 2, channels)[1:-1, 1:-1]
-
-
-DATA_WEIGHT = 20.0  # lambda, for pictures of natural-log units
-COUPLING = 0.3  # theta: how far the solution of the data term may leave the smooth one
-DUAL_STEP = 0.25  # largest stable step of the dual variable, Chambolle 2004
-LEAST_GRADIENT = 1e-6  # squared; keeps the step finite on even surfaces
-MEDIAN_OF_NINE = (  # sorting network that leaves the median_of_nine in place 4 (Paeth, Graphics Gems I, 1990)
-    (1, 2), (4, 5), (7, 8), (0, 1), (3, 4), (6, 7), (1, 2), (4, 5), (7, 8), (0, 3), (5, 8), (4, 7), (3, 6), (1, 4), (2, 5), (4, 7), (4, 2), (6, 4), (4, 2),
-)  # fmt: skip
 
 
 def refined(first, second, flow, warps, iterations):
@@ -187,16 +203,6 @@ def _gradient(picture):
     )
 
 
-RADIUS_PX = 9  # displacements looked at, at the scale of matching
-WINDOW_PX = 1  # neighbours on each side
-MOST = 0.5  # log units; larger differences count as this, so that an occluded corner does not decide
-STILLNESS = 5e-4  # log units per pixel: of equals the smaller displacement is taken
-# a match replaces the flow where its difference is below this share of the flow's, by at least this
-BETTER = 0.7
-MARGIN = 0.02
-AGREEMENT_PX = 1.5  # and where both directions agree
-
-
 def with_matches(levels, flow):
     """The flow, with matches where they fit much better.
 
@@ -233,17 +239,6 @@ def _misfit(levels, flow):
 
 def _mean(field):
     return avg_pool2d(pad(field, (WINDOW_PX,) * 4, mode="replicate"), 2 * WINDOW_PX + 1, 1)
-
-
-# on the 0-255 scale: flow is found on ln(I + 12), so that dark edges count about as the sensor sees them
-DARK_OFFSET = 12.0
-SMALLEST_PX = 12  # shorter side of the coarsest scale
-# matches are sought at the first scale whose shorter side is at most this: there they reach a ninth of it or
-# more
-MATCHED_PX = 80
-PREFILTER_PX = 1.04  # standard deviation of the blur before every halving
-WARPS = 4
-ITERATIONS = 20
 
 
 @torch.no_grad()

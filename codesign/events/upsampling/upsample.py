@@ -19,7 +19,6 @@ from codesign.events.entry import (
     check_positive,
     check_times,
     check_whole,
-    shown,
 )
 from codesign.events.intensity import lin_log
 from codesign.events.upsampling.flow import blurred, flow_both_ways, flow_levels, inside, sampled, splatted
@@ -30,6 +29,17 @@ REACH = 1.5  # times the largest difference of motion: a hidden strip is at most
 ALIKE = 0.15  # log units
 NEAR = 0.3  # share of the reach: standard deviation of the weight by distance
 WORKED_ON = 1 << 14  # pixels at a time
+# forward and backward flow agree to about this much, plus this share of the motion
+TOLERANCE_PX = 0.5
+TOLERANCE_SHARE = 0.05
+HIDDEN = 0.05  # weight of what has no counterpart in the other frame: it shows where nothing else does
+LEAST = 1e-4  # weight below which a pixel counts as empty
+HOLE_PX = (
+    1.5  # standard deviation of the blur that fills pixels on which nothing lands; grows until none is left
+)
+# of the pixels keep a bound; the rest is what the flow got wrong, which would otherwise decide
+LARGEST_SHARE = 0.999
+MAX_STEPS = 256
 
 
 @torch.no_grad()
@@ -74,16 +84,6 @@ def _weighted_median(values, weights):
     below = weights.gather(1, index).cumsum(1)
     middle = torch.searchsorted(below, below[:, -1:] / 2).clamp(max=values.shape[1] - 1)
     return ordered.gather(1, middle)[:, 0]
-
-
-# forward and backward flow agree to about this much, plus this share of the motion
-TOLERANCE_PX = 0.5
-TOLERANCE_SHARE = 0.05
-HIDDEN = 0.05  # weight of what has no counterpart in the other frame: it shows where nothing else does
-LEAST = 1e-4  # weight below which a pixel counts as empty
-HOLE_PX = (
-    1.5  # standard deviation of the blur that fills pixels on which nothing lands; grows until none is left
-)
 
 
 def visibility(flows):
@@ -147,18 +147,13 @@ def _motion_at(flows, seen, share):
     return motion, torch.where(weight.sum(0) < LEAST, torch.ones_like(weight), weight.clamp(min=LEAST**2))
 
 
-LARGEST_SHARE = (
-    0.999  # of the pixels keep a bound; the rest is what the flow got wrong, which would otherwise decide
-)
-
-
 def largest(values):
     """The value that 99.9 % of the values do not exceed."""
     flat = values.detach().flatten()
     return float(flat.kthvalue(max(1, math.ceil(LARGEST_SHARE * flat.numel()))).values)
 
 
-def steps_for(amount, bound, max_steps, what, start_s, end_s):
+def steps_for(amount, bound, what, max_steps, start_s, end_s):
     """Least number of equal steps that keep ``amount`` within ``bound`` each. Raises: DomainError when that
     takes more than ``max_steps``."""
     count = max(1.0, amount / bound * (1 - 1e-6))
@@ -169,27 +164,6 @@ def steps_for(amount, bound, max_steps, what, start_s, end_s):
             "record faster, or allow larger or more steps."
         )
     return math.ceil(count)
-
-
-def largest_change(levels):
-    """Largest change of level (99.9 % of the pixels) between consecutive frames [N, H, W] of log levels."""
-    return max(largest(change) for change in levels.detach().diff(dim=0).abs_())
-
-
-def shares(count):
-    """The shares of an interval at which ``count`` equal steps meet."""
-    return [step / count for step in range(1, count)]
-
-
-def step_times(start_s, end_s, count):
-    """[count] float64 ends of equal steps; the last is end_s exactly."""
-    part = torch.arange(1, count + 1, dtype=torch.float64) / count
-    times_s = start_s + (end_s - start_s) * part
-    times_s[-1] = end_s
-    return times_s
-
-
-MAX_STEPS = 256
 
 
 def upsample(
@@ -257,9 +231,6 @@ def upsample_stream(
     if max_log_change is not None:
         max_log_change = check_positive(max_log_change, "max_log_change")
     max_steps = check_whole(max_steps, "max_steps", 1)
-    for name, given in (("frames", frames), ("t_s", t_s)):
-        if not isinstance(given, Iterable):
-            raise DomainError(f"{name} are {shown(given)}; something that yields them one by one is needed.")
     return _pieces(frames, t_s, max_displacement_px, max_log_change, max_steps)
 
 
@@ -288,7 +259,9 @@ def _pieces(frames, t_s, max_displacement_px, max_log_change, max_steps):
             yield frame[None], torch.tensor([time_s], dtype=torch.float64)
         else:
             made = _interval(before, frame, before_s, time_s, max_displacement_px, max_log_change, max_steps)
-            yield made, step_times(before_s, time_s, len(made))
+            times_s = before_s + (time_s - before_s) * _shares(len(made))
+            times_s[-1] = time_s
+            yield made, times_s
         before = frame
         before_s = time_s
 
@@ -298,22 +271,22 @@ def _interval(first, second, start_s, end_s, max_displacement_px, max_log_change
     flows = flow_both_ways(first.detach().float(), second.detach().float()).to(first)
     flows = repaired(flow_levels(first, second), flows, visibility(flows))
     seen = visibility(flows)
-    count = steps_for(
-        largest(flows.norm(dim=1)),
-        max_displacement_px,
-        max_steps,
-        "the place of things, in pixels,",
-        start_s,
-        end_s,
-    )
+    interval = max_steps, start_s, end_s
+    moved_px = largest(flows.norm(dim=1))
+    count = steps_for(moved_px, max_displacement_px, "the place of things, in pixels,", *interval)
     while True:
-        made = torch.stack([*(between(first, second, flows, seen, share) for share in shares(count)), second])
+        shares = _shares(count).tolist()[:-1]
+        made = torch.stack([*(between(first, second, flows, seen, share) for share in shares), second])
         if max_log_change is None:
             return made
-        # at least one step more each time, for the change of a step need not shrink with its length
-        change = largest_change(lin_log(torch.cat((first[None], made)).detach()))
+        levels = lin_log(torch.cat((first[None], made)).detach())
+        change = max(largest(one) for one in levels.diff(dim=0).abs_())
         if change <= max_log_change:
             return made
-        count = max(
-            count + 1, steps_for(change * count, max_log_change, max_steps, "the log level", start_s, end_s)
-        )
+        # at least one step more each time, for the change of a step need not shrink with its length
+        count = max(count + 1, steps_for(change * count, max_log_change, "the log level", *interval))
+
+
+def _shares(count):
+    """[count] float64 ends of equal steps of an interval, the last 1."""
+    return torch.arange(1, count + 1, dtype=torch.float64) / count

@@ -17,6 +17,13 @@ from codesign.events.volumes.traces import decay
 from codesign.optional import optional
 from codesign.types import EventStream
 
+iio = optional("imageio.v3", "video", "writing .gif")
+imageio_ffmpeg = optional("imageio_ffmpeg", "video", "writing .mp4")
+LEAST_SIDE_PX = (
+    256  # small frames are enlarged until their shorter side reaches this, so that single pixels can be seen,
+)
+LARGEST_SIDE_PX = 1280  # unless the longer one would exceed this
+
 
 def picture(counts: Tensor, full_scale: float | None = None) -> Tensor:
     """Event frames as colour pictures: white where nothing happened, red for ON, blue for OFF, purple for
@@ -66,15 +73,6 @@ def _scaled(counts, full_scale):
     else:
         full_scale = check_positive(full_scale, "full_scale")
     return counts[..., 0, :, :], counts[..., 1, :, :], full_scale
-
-
-iio = optional("imageio.v3", "video", "writing .gif")
-imageio_ffmpeg = optional("imageio_ffmpeg", "video", "writing .mp4")
-
-LEAST_SIDE_PX = (
-    256  # small frames are enlarged until their shorter side reaches this, so that single pixels can be seen,
-)
-LARGEST_SIDE_PX = 1280  # unless the longer one would exceed this
 
 
 def write_video(path: str | Path, pictures: Iterable[Any], fps: float) -> None:
