@@ -89,25 +89,6 @@ def test_what_is_written_follows_the_layout(tmp_path):
     assert (back.height_px, back.width_px) == (480, 640)
 
 
-@pytest.mark.parametrize("with_frames", [True, False])
-def test_v2e_files_are_read(tmp_path, with_frames):
-    t, x, y, p = example()
-    with h5py.File(tmp_path / "e.h5", "w") as file:  # as v2e makes it: grown from nothing, packed with gzip
-        rows = file.create_dataset(
-            "events", shape=(0, 4), maxshape=(None, 4), dtype="uint32", compression="gzip"
-        )
-        rows.resize(3000, axis=0)
-        rows[:] = np.stack((t, x, y, p), axis=1)
-        if with_frames:
-            file.create_dataset("frame", data=np.zeros((2, 500, 700), np.uint8), compression="gzip")
-    events = read(tmp_path / "e.h5")
-    truth = stream_of(*example())
-    assert all(torch.equal(getattr(events, name), getattr(truth, name)) for name in FIELDS)
-    assert (events.height_px, events.width_px) == (
-        (500, 700) if with_frames else (int(y.max()) + 1, int(x.max()) + 1)
-    )
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -64,20 +64,6 @@ def test_counts_and_all_gradients_equal_a_plain_autograd_loop(per_pixel, with_st
         torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12 * float(theirs.abs().max()))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_ramp_fires_at_every_threshold_it_crosses(dtype):
-    # log level k * 0.07 against theta 0.2: total after k steps is floor(k * 7 / 20), in integers; k * 7 is
-    # never a multiple of 20 for 0 < k < 20
-    level = torch.arange(20, dtype=dtype)[:, None, None] * 0.07 + torch.zeros(20, 2, 3, dtype=dtype)
-    rising, reference = memory(level, 0.2, 0.35, log_input=True)
-    falling, _ = memory(-level, 0.35, 0.2, log_input=True)
-    truth = torch.tensor([k * 7 // 20 - (k - 1) * 7 // 20 for k in range(1, 20)], dtype=dtype)
-    for counts, fired, silent in ((rising, 0, 1), (falling, 1, 0)):
-        assert torch.equal(counts[:, fired], truth[:, None, None].expand(-1, 2, 3))
-        assert not counts[:, silent].any()
-    torch.testing.assert_close(reference[0], torch.full((2, 3), 6 * 0.2, dtype=dtype))
-
-
 @pytest.mark.bits
 @pytest.mark.parametrize("cut", [1, 2, 13, 29])
 def test_chunks_equal_the_whole_bit_for_bit_gradients_included(cut):

@@ -59,20 +59,6 @@ def test_a_ramp_of_log_intensity_fires_at_known_microseconds(offset_s):
     assert events.t_us.dtype == torch.int64
 
 
-def test_a_sinusoid_fires_when_its_closed_form_crosses():
-    # linear interpolation of a sinusoid of amplitude A at step h is off by A (2 pi h)^2 / 8 = 6e-6 log units;
-    # away from the turning points the slope exceeds A * 2 pi * cos(asin(0.96)) = 2.2 log units/s, so times
-    # are good to 3 us, and to 0.5 us of rounding
-    t_s = torch.arange(0, 1999, dtype=torch.float64) / 2000
-    level = 4.5 + 1.25 * torch.sin(2 * math.pi * t_s)
-    events = simulate(intensity(level)[:, None, None], t_s, SensorModel())
-    up = [math.asin(0.16 * j) / (2 * math.pi) for j in range(1, 7)]
-    down = [0.5 - math.asin(0.16 * j) / (2 * math.pi) for j in range(5, -7, -1)]
-    again = [1 + math.asin(0.16 * j) / (2 * math.pi) for j in range(-5, 0)]
-    assert events.p.tolist() == [1] * 6 + [-1] * 12 + [1] * 5
-    assert (events.t_us - 1e6 * torch.tensor(up + down + again, dtype=torch.float64)).abs().max() < 4
-
-
 @pytest.mark.bits
 @pytest.mark.parametrize("sequence", ["edge", "grating", "flicker"])
 @pytest.mark.parametrize("configuration", ["ideal", "asym"])

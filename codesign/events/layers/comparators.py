@@ -31,7 +31,7 @@ from codesign.events.sensor.model import (
 )
 from codesign.events.spiking.comparators import count_spikes
 
-MOST = 2**24  # numbers that are remembered
+MOST_REMEMBERED = 2**24  # random numbers of a draw
 MOST_STEPS = 4096  # of spiking neurons per frame interval
 
 
@@ -65,7 +65,7 @@ class LastDraw:
                 generator.set_state(state)
             return self._drawn
         drawn = draw()
-        if sum(0 if numbers is None else numbers.numel() for numbers in drawn) <= MOST:
+        if sum(0 if numbers is None else numbers.numel() for numbers in drawn) <= MOST_REMEMBERED:
             self._asked = asked
             self._before = before
             self._behind = [generator.get_state() for generator in own]

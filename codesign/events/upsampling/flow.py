@@ -15,7 +15,7 @@ DATA_WEIGHT = 20.0  # lambda, for pictures of natural-log units
 COUPLING = 0.3  # theta: how far the solution of the data term may leave the smooth one
 DUAL_STEP = 0.25  # largest stable step of the dual variable, Chambolle 2004
 LEAST_GRADIENT = 1e-6  # squared; keeps the step finite on even surfaces
-MEDIAN_OF_NINE = (  # sorting network that leaves the median_of_nine in place 4 (Paeth, Graphics Gems I, 1990)
+MEDIAN_OF_NINE = (  # sorting network that leaves the median in place 4 (Paeth, Graphics Gems I, 1990)
     (1, 2), (4, 5), (7, 8), (0, 1), (3, 4), (6, 7), (1, 2), (4, 5), (7, 8), (0, 3), (5, 8), (4, 7), (3, 6), (1, 4), (2, 5), (4, 7), (4, 2), (6, 4), (4, 2),
 )  # fmt: skip
 RADIUS_PX = 9  # displacements looked at, at the scale of matching
