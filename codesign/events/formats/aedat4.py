@@ -329,7 +329,7 @@ def _attribute(node, key):
 
 def read_aedat4(path, asked):
     """EventColumns of ``path``; the sensor size is the header's. Frames, inertial data and triggers are
-    other streams (frames: see aedat4_frames).
+    other streams (frames: see ``read_frames``).
 
     Raises: FileFormatError for damage, for a file cut short, without a single stream of events, or whose
       times go back (see arrival).

@@ -1,4 +1,5 @@
-"""Events in the order a file holds them, packet by packet, checked and put in order; and what a format can hold."""
+"""Events in the order a file holds them, packet by packet, checked and put in order; what columns mean where a format
+does not say (their order, the unit of times); and what a format can hold."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,11 @@
 """Event streams in HDF5: DSEC's layout (a group ``events`` of t, x, y, p; read and written), v2e's (a dataset
 ``events`` of rows t, x, y, p in microseconds) and MVSEC's (``davis/left/events``, rows x, y, t, p in seconds).
 
-Sources: DSEC: see dsec. v2e, class EventEmulator, output ``dvs_h5`` (Hu et al., CVPRW 2021). Zhu et al., "The
+DSEC: t is uint32 microseconds since t_offset (int64), x and y uint16, p uint8 (1 ON, 0 OFF); ms_to_idx[k] is the
+first event with t >= 1000 k. What is written carries the sensor size as attributes height_px and width_px of
+the group; published files have none.
+Sources: Gehrig et al., "DSEC: A Stereo Event Camera Dataset for Driving Scenarios", RA-L 2021; its published
+  description of the data format. v2e, class EventEmulator, output ``dvs_h5`` (Hu et al., CVPRW 2021). Zhu et al., "The
   Multivehicle Stereo Event Camera Dataset", RA-L 2018.
 """
 
@@ -182,7 +186,7 @@ def read_hdf5(path, asked):
 
 
 def write_hdf5(path, stream):
-    """Write events to ``path`` in DSEC's layout, with checksums; see dsec for what it holds."""
+    """Write events to ``path`` in DSEC's layout, with checksums."""
     arrays, attributes = to_dsec(stream)
     # from 1.10 on, HDF5 keeps checksums of its own structure too
     with new_hdf5(path, libver=("v110", "v110")) as file:

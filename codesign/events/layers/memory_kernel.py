@@ -5,11 +5,10 @@ Forward, with L the log level, r the memorised level and C the threshold on the 
 r|/C), r += C n.
 
 Backward is the play of width w = (C_on + C_off)/2 and centre m that the mean of n follows over where in its
-threshold a pixel happens to stand (exactly for C_on = C_off, see docs/events.md; ``turns_kernel`` is exact for
+threshold a pixel happens to stand (exactly for C_on = C_off, see docs/events.md; ``turns_adjoint`` is exact for
 all). It moves only where L leaves it, by as much as L does: n_on = (L - m - w/2)/C_on, n_off = (m - w/2 - L)/C_off,
 and the edge then stands at L. So an engaged step pulls at its own level, and pushes at the level of the step
 engaged before: the loop forward in time writes both.
-
 
 The exact gradient of the mean count for unequal thresholds, as one drjit loop over time per pixel.
 
@@ -22,7 +21,7 @@ the density on the brink (ON: r = L_s - C_on before, r = L_s after; OFF: r = L_s
 for ON, and the negative for OFF: a **pair** of pixels, ``plus`` and ``minus``, C apart, simulated from s on by the
 rule of the hard sensor. In the inside of a monotone stretch they meet in the very next step; a pair born at a turn
 lives until they meet. For equal thresholds they meet when the way back has reached C, and what is left is the
-play of ``memory_kernel``; unequal ones may never meet.
+play of ``play_adjoint``; unequal ones may never meet.
 
 The pairs are also the edges of the density: of all pixels above ``plus`` and ``minus``, weight f lies between.
 Whatever passes the brink in a step changes the density there, f = -sum of weight (n_plus - n_minus) in signed
