@@ -31,7 +31,15 @@ import torch
 from tests.hostile import calls
 
 LARGEST = 300_000  # bytes of a call that is kept
-RENAMED: dict[str, str] = {}  # old full name -> new, of functions and classes
+RENAMED: dict[str, str] = {  # old full name -> new, of functions and classes
+    "codesign.events.layers.layer.ComparatorLayer": "codesign.events.layers.comparators.ComparatorLayer",
+    "codesign.events.layers.layer.LayerState": "codesign.events.layers.comparators.LayerState",
+    "codesign.events.layers.layer.PhysicalLayer": "codesign.events.layers.physical.PhysicalLayer",
+    "codesign.events.layers.last_draw.LastDraw": "codesign.events.layers.comparators.LastDraw",
+    "codesign.events.layers.positive.PositiveValues": "codesign.events.layers.layer.PositiveValues",
+    "codesign.events.layers.settled.Settled": "codesign.events.layers.layer.Settled",
+    "codesign.events.layers.hard.HardSensor": "codesign.events.layers.layer.HardSensor",
+}
 CLOSE = {torch.float64: 1e-12, torch.float32: 2e-6}
 WRONG_EACH = 4  # of an argument
 
