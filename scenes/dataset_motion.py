@@ -6,7 +6,7 @@ import math
 import torch
 
 from codesign.errors import DomainError
-from codesign.place import Mount
+from codesign.mount import Mount
 from codesign.render.hits import first_hits
 from scenes.trajectories import Driving, Flying, Orbital, Swinging, body_at, mounted
 

@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 import torch
 
-from codesign import events, place, render
+from codesign import events, render
 from codesign.errors import DomainError
+from codesign.mount import check_mount
 from scenes import robot_pair
 from scenes.robot_pair import RobotPair
 
@@ -25,7 +26,7 @@ def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Se
       world is made and one frame of six drives rendered.
     Raises: DomainError, in a sentence that says what to change, for a design outside its bounds, one that does not
       keep the pair's requirements, a box inside or far from the robot, a lens whose image circle is smaller than the
-      sensor (``place.check_mount``) or that is wider than the camera's housing, a box that reaches under the ground
+      sensor (``mount.check_mount``) or that is wider than the camera's housing, a box that reaches under the ground
       whose depth is believed in, drives that never move, or by less than LEAST_MOVED_PX, or so fast that less than
       LEAST_FOLLOWED of the surfaces seen stays within a window's width, and worlds of which less than LEAST_TEXTURE
       of what the camera sees (blocks of 8 x 8 pixels) varies by more than the sensor's threshold.
@@ -34,7 +35,7 @@ def check_pair(pair: RobotPair, camera: render.Camera | None = None, numbers: Se
     camera = pair.design.camera() if camera is None else camera
     requirements = pair.requirements()
     _check_width(pair, camera)
-    place.check_mount(robot_pair.mount_at(pair.ranges, pair.design.mount()), requirements, camera)
+    check_mount(robot_pair.mount_at(pair.ranges, pair.design.mount()), requirements, camera)
     if pair.depth == "ground" and pair.low.z_m - pair.housing_radius_m <= pair.ground_z_m:
         raise DomainError(
             f"pair '{pair.name}': the camera may sit as low as {pair.low.z_m:g} m in body axes, its housing has a radius of "

@@ -6,7 +6,8 @@ import math
 import numpy as np
 import torch
 
-from codesign import backend, place
+from codesign import backend
+from codesign.mount import PLANAR
 from codesign.render import MitsubaScene
 from scenes import robot_pair
 from scenes.build import GAP_M, World, block, emissive, rectangle
@@ -46,7 +47,7 @@ def corridor() -> RobotPair:
     ['fork left', 'fork right']
     """
     prior = (1.5, 0.08, 0.04, 0.8, 0.8, 0.8)
-    return RobotPair("corridor", BODIES, LOW, HIGH, START, place.PLANAR, prior, "scene", None, world, drive)
+    return RobotPair("corridor", BODIES, LOW, HIGH, START, PLANAR, prior, "scene", None, world, drive)
 
 
 def world(number: int) -> MitsubaScene:

@@ -6,7 +6,8 @@ import math
 import numpy as np
 import torch
 
-from codesign import backend, place
+from codesign import backend
+from codesign.mount import FREE
 from codesign.pose import se3_exp
 from codesign.render import MitsubaScene
 from scenes import robot_pair
@@ -49,7 +50,7 @@ def flight() -> RobotPair:
     """
     prior = (0.8, 0.8, 0.4, 0.8, 0.8, 0.8)
     return RobotPair(
-        "flight", BODIES, LOW, HIGH, START, place.FREE, prior, "scene", None, world, drive, frame="base_link"
+        "flight", BODIES, LOW, HIGH, START, FREE, prior, "scene", None, world, drive, frame="base_link"
     )
 
 

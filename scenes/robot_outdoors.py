@@ -6,8 +6,9 @@ import math
 import numpy as np
 import torch
 
-from codesign import backend, place
+from codesign import backend
 from codesign.errors import DomainError
+from codesign.mount import PLANAR
 from codesign.render import MitsubaScene
 from scenes import robot_pair, textures
 from scenes.build import GAP_M, Paint, World, ball, block, emissive, pole, rectangle, sky
@@ -46,9 +47,7 @@ def outdoors() -> RobotPair:
     [0.4, 0.0, 0.22]
     """
     prior = (1.5, 0.2, 0.05, 0.8, 0.8, 0.8)
-    return RobotPair(
-        "outdoors", BODIES, LOW, HIGH, START, place.PLANAR, prior, "ground", (3.0, 0.1), world, drive
-    )
+    return RobotPair("outdoors", BODIES, LOW, HIGH, START, PLANAR, prior, "ground", (3.0, 0.1), world, drive)
 
 
 def world(number: int) -> MitsubaScene:

@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign import place, render
+from codesign import render
 from codesign.errors import CodesignError, DomainError, FileFormatError
+from codesign.mount import FREE, PLANAR
 from codesign.pose import se3_exp
 from scenes import mesh_files, robot_pair, robots, worlds
 from scenes.bodies import Body
@@ -58,11 +59,11 @@ def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
         drive, axes, prior = _standing(named, bodies), named.axes, named.prior
     else:
         drive, prior = recorded_drives(_file("motion", own.motion))
-        axes = place.FREE
+        axes = FREE
     if own.velocities is not None:
-        axes = place.PLANAR if own.velocities == "planar" else place.FREE
+        axes = PLANAR if own.velocities == "planar" else FREE
     middle = drive(0, 12)[0][:, robot_pair.FRAMES // 2]
-    if axes == place.PLANAR and float(middle[:, 2, 2].min()) < math.cos(MOST_TILT_RAD):
+    if axes == PLANAR and float(middle[:, 2, 2].min()) < math.cos(MOST_TILT_RAD):
         raise DomainError(
             f"motion: '{own.motion}' tips the robot by more than {math.degrees(MOST_TILT_RAD):.0f} degrees, and its velocities "
             "are planar; see whether its quaternions are qx qy qz qw, or set velocities: free."
@@ -237,7 +238,7 @@ def _standing(named, bodies):
             f"robot: it reaches {reach:.3g} m from its origin, the drives of '{named.name}' have room for {ROOM_M:g} m; "
             "give a mesh in metres, or its unit_m, or a world and a trajectory of your own."
         )
-    if named.axes == place.FREE:
+    if named.axes == FREE:
         lowest = float(vertices[:, 2].min()) + float(named.drive(0, 12)[0][..., 2, 3].min())
         if lowest < 0:
             raise DomainError(

@@ -21,8 +21,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from codesign import events, flow, lens, place, render, task
+from codesign import events, flow, lens, render
 from codesign.errors import DomainError
+from codesign.mount import (
+    FREE,
+    CableSide,
+    Clearance,
+    EgoVelocity,
+    Housing,
+    LookAhead,
+    Motion,
+    Mount,
+    MountRanges,
+    OwnBody,
+    Requirement,
+    VelocityErrors,
+    velocity_errors,
+    yaw_pitch_roll_rad,
+)
+from codesign.mount import Body as SolidBody
 from codesign.pose import se3_exp
 from codesign.system import Batch, System
 from scenes import textures
@@ -75,7 +92,7 @@ class Design:
         """T_body_cam [4, 4]."""
         at = (self.x_m, self.y_m, self.z_m)
         attitude = {name: getattr(self, name) for name in ("yaw_rad", "pitch_rad", "roll_rad")}
-        return place.Mount(at, (0.0, 0.0, 0.0), **attitude)().detach()
+        return Mount(at, (0.0, 0.0, 0.0), **attitude)().detach()
 
     def camera(self) -> render.Camera:
         """Nine windows behind a thin lens."""
@@ -97,9 +114,9 @@ class RobotPair:
 
     name: of the pair. bodies: link -> mesh in body axes. low, high: bounds of the design. design: where to start,
       inside them.
-    axes: which of the six velocities count (``place.PLANAR`` or ``place.FREE``); all six are estimated.
+    axes: which of the six velocities count (``mount.PLANAR`` or ``mount.FREE``); all six are estimated.
     prior: standard deviations expected of the six, m/s and rad/s.
-    depth: how depth is known, "ground" or "scene" (``task.EgoVelocity``).
+    depth: how depth is known, "ground" or "scene" (``mount.EgoVelocity``).
     look_ahead: distance in metres, and the share of the image that must see beyond it; None where nothing must.
     world: number -> what stands still. drive: (number, how many) -> T_world_body [M, T, 4, 4], twist [M, 6].
     housing_radius_m, margin_m: of the camera, and by how much it must stay clear of the body. own_body_share: of the
@@ -141,22 +158,22 @@ class RobotPair:
         return design
 
     @property
-    def ranges(self) -> place.MountRanges:
+    def ranges(self) -> MountRanges:
         """Bounds of the mount."""
         names = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "roll_rad")
         low, high = ([getattr(each, name) for name in names] for each in (self.low, self.high))
-        return place.MountRanges(low, high)
+        return MountRanges(low, high)
 
-    def requirements(self) -> list[place.Requirement]:
+    def requirements(self) -> list[Requirement]:
         """What a mount of this robot has to keep, the cheap ones first."""
-        body = place.Body((mesh.vertices_m, mesh.faces) for mesh in self.bodies.values())
-        found: list[place.Requirement] = []
+        body = SolidBody((mesh.vertices_m, mesh.faces) for mesh in self.bodies.values())
+        found: list[Requirement] = []
         if self.cable is not None:
-            found.append(place.CableSide(*self.cable))
+            found.append(CableSide(*self.cable))
         if self.look_ahead is not None:
-            found.append(place.LookAhead(*self.look_ahead, ground_z_m=self.ground_z_m))
-        found.append(place.Clearance(body, place.Housing(self.housing_radius_m), self.margin_m))
-        return [*found, task.OwnBody(body, self.own_body_share)]
+            found.append(LookAhead(*self.look_ahead, ground_z_m=self.ground_z_m))
+        found.append(Clearance(body, Housing(self.housing_radius_m), self.margin_m))
+        return [*found, OwnBody(body, self.own_body_share)]
 
     def body(self) -> render.MitsubaScene:
         """The robot in its own axes, grey in the light of a plain sky that turns with it."""
@@ -193,16 +210,16 @@ class RobotPair:
             mount=lambda: mount,
             events=LAYERS[layer],
             flow=closed_form,
-            estimate=task.EgoVelocity(place.FREE, self.prior, self.depth),
+            estimate=EgoVelocity(FREE, self.prior, self.depth),
             objectives={"error": error},
             bins=BINS,
         )
 
-    def errors(self, estimate: task.Motion, batch: Drives) -> task.VelocityErrors:
+    def errors(self, estimate: Motion, batch: Drives) -> VelocityErrors:
         """Errors of the velocities that count."""
-        return task.velocity_errors(estimate.velocity[:, list(self.axes)], batch.twist, self.axes)
+        return velocity_errors(estimate.velocity[:, list(self.axes)], batch.twist, self.axes)
 
-    def judged(self, design: Design, batch: Drives, layer: str = "memory") -> task.VelocityErrors:
+    def judged(self, design: Design, batch: Drives, layer: str = "memory") -> VelocityErrors:
         """Errors of a design over a batch, without gradient."""
         with torch.no_grad():
             return self.errors(self.system(design, layer).begin(batch)["estimate"], batch)
@@ -217,13 +234,13 @@ LAYERS = {
 }
 
 
-def mount_at(ranges: place.MountRanges, T_body_cam: Tensor) -> place.Mount:
+def mount_at(ranges: MountRanges, T_body_cam: Tensor) -> Mount:
     """The learnable mount in the middle of a box that stands at a pose [4, 4]; a wall is approached to a billionth."""
     low, high = ranges.low[:3], ranges.high[:3]
     half, middle = (high - low) / 2, (low + high) / 2
     inside = torch.where(half > 0, (T_body_cam[:3, 3] - middle).clamp(-INSIDE * half, INSIDE * half), 0.0)
-    yaw, pitch, roll = place.yaw_pitch_roll_rad(T_body_cam).tolist()
-    return place.Mount(middle, half, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll, position_m=middle + inside)
+    yaw, pitch, roll = yaw_pitch_roll_rad(T_body_cam).tolist()
+    return Mount(middle, half, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll, position_m=middle + inside)
 
 
 def closed_form(volume):

@@ -18,7 +18,7 @@ from codesign import events, flow, lens, render
 from codesign.errors import DomainError
 from codesign.grad import certify
 from codesign.grad.modules import by_group
-from codesign.place import Mount
+from codesign.mount import Mount
 from codesign.report import chain_figures
 from codesign.system import Batch, System, check
 from codesign.types import FlowField

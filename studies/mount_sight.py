@@ -14,8 +14,9 @@ from typing import ClassVar
 
 import torch
 
-from codesign import lens, place, render, task
+from codesign import lens, render
 from codesign.errors import DomainError
+from codesign.mount import PLANAR, VELOCITIES, Surroundings, scene_depth, sight_map, sight_table
 from codesign.report.mount_sphere import mount_sphere
 from scenes import worlds
 from studies.frame.run import Run, StudyConfig, main
@@ -44,11 +45,11 @@ def study(run: Run[Config]) -> None:
     high[2, 3] = 1.2
     noise = config.deviation_px_s
     cases = {
-        "ground robot": task.Surroundings((0.2, 0.0, 0.4), axes=place.PLANAR, deviation_px_s=noise),
-        "free over ground, 0.4 m": task.Surroundings((0.0, 0.0, 0.4), deviation_px_s=noise),
-        "free over ground, 1.2 m": task.Surroundings((0.0, 0.0, 1.2), deviation_px_s=noise),
-        "free in a room": task.Surroundings(
-            (0.0, 0.0, 0.0), high, task.scene_depth, worlds.room(), deviation_px_s=noise
+        "ground robot": Surroundings((0.2, 0.0, 0.4), axes=PLANAR, deviation_px_s=noise),
+        "free over ground, 0.4 m": Surroundings((0.0, 0.0, 0.4), deviation_px_s=noise),
+        "free over ground, 1.2 m": Surroundings((0.0, 0.0, 1.2), deviation_px_s=noise),
+        "free in a room": Surroundings(
+            (0.0, 0.0, 0.0), high, scene_depth, worlds.room(), deviation_px_s=noise
         ),
     }
     with run.progress(len(cases), "surroundings") as progress:
@@ -62,8 +63,8 @@ def study(run: Run[Config]) -> None:
 
 
 def show(run, camera, name, around):
-    table = task.sight_table(camera, around)
-    velocities = [task.VELOCITIES[axis] for axis in around.axes]
+    table = sight_table(camera, around)
+    velocities = [VELOCITIES[axis] for axis in around.axes]
     label = name.replace(" ", "_").replace(",", "").replace(".", "_")
     for attitude, row in table.items():
         run.record(
@@ -95,7 +96,7 @@ def show(run, camera, name, around):
         ],
         "Blind to: worse than 0.1 m/s or 0.1 rad/s. Weakest motion: shares of the units in which it is hardest to see.",
     )
-    yaw, pitch, error = task.sight_map(camera, around, run.config.rows, run.config.columns)
+    yaw, pitch, error = sight_map(camera, around, run.config.rows, run.config.columns)
     best = int(
         (error <= error.min() * (1 + 1e-9)).flatten().nonzero()[0]
     )  # of directions that are alike the first

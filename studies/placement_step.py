@@ -12,8 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-from codesign import events, lens, place
+from codesign import events, lens
 from codesign.errors import DomainError
+from codesign.mount import Mount
 from codesign.system import Batch, System
 from scenes import robot_pair, textures, worlds
 from scenes.robot_pairs import PAIRS
@@ -88,7 +89,7 @@ def learnable(pair: Any, camera: Any) -> System:
     """System of a pair whose lens, mount and thresholds ask for gradients."""
     design = pair.design
     camera.lens.requires_grad_()
-    mount = place.Mount(
+    mount = Mount(
         (design.x_m, design.y_m, design.z_m),
         BOX_HALF_M,
         yaw_rad=design.yaw_rad,

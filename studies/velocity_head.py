@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from codesign import task, train
+from codesign import train
 from codesign.errors import DomainError
 from codesign.flow import checkpoint
+from codesign.mount import EgoVelocity, Evidence, VelocityHead, velocity_errors
 from scenes import robot_pair
 from scenes.robot_pair import Design, RobotPair
 from scenes.robot_pairs import PAIRS, check_pairs
@@ -53,7 +54,7 @@ class Config(StudyConfig):
 class Samples:
     """Evidence of N bodies, their true twists [N, 6], and the velocities that count."""
 
-    seen: task.Evidence
+    seen: Evidence
     twist: Tensor
     axes: tuple[int, ...]
 
@@ -66,7 +67,7 @@ def study(run: Run[Config]) -> None:
     check(config)
     lessons, held_out = zip(*(samples(run, PAIRS[name]()) for name in config.pair), strict=True)
     torch.manual_seed(config.seed)
-    head = task.VelocityHead(task.EgoVelocity(tuple(range(6)), (1.0,) * 6), config.width)
+    head = VelocityHead(EgoVelocity(tuple(range(6)), (1.0,) * 6), config.width)
     plain = [typical_error(head, each) for each in held_out]  # fresh weights are least squares as it is
     fit(head, lessons, held_out, config)
     content = {name: str(value) for name, value in asdict(config).items()}
@@ -113,10 +114,10 @@ def samples(run: Run[Config], pair: RobotPair) -> tuple[Samples, Samples]:
                 path.parent.mkdir(exist_ok=True)
                 checkpoint.write_tensors(path, rendered(pair, design, index, config), {"kind": "evidence"})
             tensors = {name: value.double() for name, value in checkpoint.read_tensors(path)[0].items()}
-            seen = task.Evidence(*(tensors[f.name] for f in fields(task.Evidence)))
+            seen = Evidence(*(tensors[f.name] for f in fields(Evidence)))
             parts.append(Samples(seen, tensors["twist"], pair.axes))
             bar.advance()
-    seen = task.Evidence.joined([part.seen for part in parts])
+    seen = Evidence.joined([part.seen for part in parts])
     first = config.worlds - max(1, config.worlds // 4)  # of those to choose by
     world = torch.arange(config.worlds).repeat_interleave(config.motions).repeat(config.designs)
     every = Samples(seen, torch.cat([part.twist for part in parts]), pair.axes)
@@ -134,8 +135,8 @@ def rendered(pair: RobotPair, design: Design, index: int, config: Config) -> dic
 
     numbers = robot_pair.training(config.worlds)
     batch = replace(pair, drive=drive).batch(numbers, config.motions, config.seed + first)
-    plain = task.EgoVelocity(tuple(range(6)), pair.prior, pair.depth)
-    system = pair.system(design, "sensor").replaced(estimate=task.VelocityHead(plain).evidence)
+    plain = EgoVelocity(tuple(range(6)), pair.prior, pair.depth)
+    system = pair.system(design, "sensor").replaced(estimate=VelocityHead(plain).evidence)
     seen = system.begin(batch)["estimate"]
     return {f.name: getattr(seen, f.name).float() for f in fields(seen)} | {"twist": batch.twist.float()}
 
@@ -143,11 +144,11 @@ def rendered(pair: RobotPair, design: Design, index: int, config: Config) -> dic
 def bounded(velocity: Tensor, samples: Samples) -> Tensor:
     """[N]: the error of the task, q / (1 + q)."""
     axes = list(samples.axes)
-    return task.velocity_errors(velocity[:, axes], samples.twist, axes).bounded()
+    return velocity_errors(velocity[:, axes], samples.twist, axes).bounded()
 
 
 @torch.no_grad()
-def typical_error(head: task.VelocityHead, samples: Samples) -> float:
+def typical_error(head: VelocityHead, samples: Samples) -> float:
     """The error, in units of the task, that all samples would have at their mean bounded one."""
     mean = float(bounded(head.judged(samples.seen)[0], samples).mean())
     return math.sqrt(mean / (1 - mean))
@@ -170,7 +171,7 @@ def lesson(predictions: list[tuple[Tensor, ...]], batch: list[Samples]) -> Tenso
     return torch.stack(losses).mean()
 
 
-def fit(head: task.VelocityHead, lessons, held_out, config: Config) -> None:
+def fit(head: VelocityHead, lessons, held_out, config: Config) -> None:
     """Train on samples of each pair in equal shares; of the weights on its way those that judge best."""
     generator = torch.Generator().manual_seed(config.seed)
 

@@ -31,7 +31,19 @@ import torch
 from tests.hostile import calls
 
 LARGEST = 300_000  # bytes of a call that is kept
-RENAMED: dict[str, str] = {  # old full name -> new, of functions and classes
+# old name -> new, of rooms, modules, functions and classes; the longest one that fits counts
+RENAMED: dict[str, str] = {
+    "place": "mount",
+    "task": "mount",
+    "codesign.place": "codesign.mount",
+    "codesign.place.mount": "codesign.mount.pose",
+    "codesign.place.criterion": "codesign.mount.sight",
+    "codesign.place.solids": "codesign.mount.body",
+    "codesign.task": "codesign.mount",
+    "codesign.task.evidence": "codesign.mount.head",
+    "codesign.task.expected": "codesign.mount.errors",
+    "codesign.task.own_body": "codesign.mount.requirements",
+    "codesign.task.score": "codesign.mount.errors",
     "codesign.events.layers.layer.ComparatorLayer": "codesign.events.layers.comparators.ComparatorLayer",
     "codesign.events.layers.layer.LayerState": "codesign.events.layers.comparators.LayerState",
     "codesign.events.layers.layer.PhysicalLayer": "codesign.events.layers.physical.PhysicalLayer",
@@ -184,13 +196,21 @@ def same(a, b):
 
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module, name):
-        module, name = RENAMED.get(f"{module}.{name}", f"{module}.{name}").rsplit(".", 1)
+        module, name = renamed(f"{module}.{name}").rsplit(".", 1)
         return super().find_class(module, name)
+
+
+def renamed(name):
+    """What has that name now."""
+    for old in sorted(RENAMED, key=len, reverse=True):
+        if f"{name}.".startswith(f"{old}."):
+            return RENAMED[old] + name[len(old) :]
+    return name
 
 
 def found(name):
     """The public function or method of that name, as it is called now."""
-    room, *rest = RENAMED.get(name, name).split(".")
+    room, *rest = renamed(name).split(".")
     value = importlib.import_module(f"codesign.{room}")
     for each in rest:
         value = getattr(value, each)

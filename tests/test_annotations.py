@@ -18,7 +18,7 @@ WHOLE = (
     "grad",
     "lens",
     "optimise",
-    "place",
+    "mount",
     "plain_yaml",
     "pose",
     "report",
@@ -36,7 +36,7 @@ EXPORTED = (  # packages where it holds of what their __all__ names
     "codesign.lens.analysis",
     "codesign.lens.design",
     "codesign.optimise",
-    "codesign.place",
+    "codesign.mount",
     "codesign.render",
 )
 CALLED = ("__init__", "__call__")  # the special methods a user calls

@@ -24,7 +24,7 @@ def mount_sphere(
     """Figure of a sphere of directions in equal areas (Mollweide), as seen from the body: ahead is the middle, left is
     left, down is below.
 
-    Args: yaw_rad: [columns], pitch_rad: [rows] middles of cells of equal angles, as of ``task.sight_map``. values: [rows,
+    Args: yaw_rad: [columns], pitch_rad: [rows] middles of cells of equal angles, as of ``mount.sight_map``. values: [rows,
       columns] > 0, on a logarithmic scale; label: of them. marked: name -> yaw and pitch of directions to mark.
     """
     rows, columns = values.shape

@@ -16,7 +16,7 @@ from codesign import plain_yaml, render
 from codesign.atomic import write_atomic
 from codesign.errors import DomainError, FileFormatError
 from codesign.events import SensorModel
-from codesign.place import Mount, yaw_pitch_roll_rad
+from codesign.mount import Mount, yaw_pitch_roll_rad
 from codesign.reading import building, read_bytes, read_text
 
 FORMAT = "codesign mount 1"

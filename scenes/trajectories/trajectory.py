@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.place.mount import AXES_BODY_CAM
+from codesign.mount.pose import AXES_BODY_CAM
 from codesign.pose import check_pose, look_at
 
 
@@ -104,7 +104,7 @@ def mounted(trajectory, T_body_cam):
     its own axes.
 
     Args: trajectory: anything with a call, ``velocity`` and ``span_s``. T_body_cam: [4, 4], for example of
-      codesign.place.Mount.
+      codesign.mount.Mount.
     Returns: a trajectory of the camera (x right, y down, z forward). Gradient: to T_body_cam.
     Raises: ShapeError, DomainError when T_body_cam is not one rigid transform.
     """

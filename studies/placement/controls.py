@@ -5,8 +5,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from codesign import events, place, task
-from codesign.task.depth import hidden_by_objects
+from codesign import events
+from codesign.mount import FREE, EgoVelocity, UnknownDepth, scene_depth
+from codesign.mount.depth import hidden_by_objects
 from codesign.types import EventVolume
 from scenes.robot_pair import BINS, LEAD_S, SENSOR
 from studies.placement.problem import Problem, Samples, readings
@@ -32,7 +33,7 @@ def controls(problem: Problem, mount: Tensor, samples: Samples) -> dict[str, flo
     told = run["estimate"]
     zero = replace(told, velocity=torch.zeros_like(told.velocity))
     other = events.HardSensor(MISMATCHED, BINS, LEAD_S)
-    mapless = task.EgoVelocity(place.FREE, problem.pair.prior, task.UnknownDepth())
+    mapless = EgoVelocity(FREE, problem.pair.prior, UnknownDepth())
     backward = problem.system(looking_back(problem), "sensor")
     return {
         "as_found": float(errors(told, batch).bounded().mean()),
@@ -73,7 +74,7 @@ def pixel_errors(problem: Problem, mount: Tensor, samples: Samples) -> float:
     still; the sky is left out. NaN where nothing else is seen."""
     batch = problem.batch(samples)
     run = problem.system(mount).begin(batch)
-    read = readings(run, task.scene_depth)
+    read = readings(run, scene_depth)
     true = (read.rows @ batch.twist[:, None, :, None])[..., 0]
     body = readings(run, _body_depth).share > 0
     seen = body | (read.share > 0)

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from codesign import events
-from codesign.place.ranges import NAMES
+from codesign.mount.ranges import NAMES
 from codesign.report.flow_colours import flow_colours
 from scenes.robot_pair import Drives
 from studies.frame.robot_pictures import draw_frame, draw_pair

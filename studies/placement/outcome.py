@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from codesign import grad
-from codesign.place.ranges import NAMES
+from codesign.mount.ranges import NAMES
 from studies.placement.problem import Problem
 from studies.placement.race import GRADIENT, GRID, Race, chosen
 

@@ -7,8 +7,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign import place, task
 from codesign.atomic import write_atomic
+from codesign.mount import (
+    Surroundings,
+    VelocityErrors,
+    ground_depth,
+    judge,
+    sight,
+    sight_map,
+    sight_units,
+    yaw_pitch_roll_rad,
+)
 from codesign.report.mount_sphere import mount_sphere
 from codesign.system import HandOver, load_hand_over, save_hand_over
 from scenes import robot_pair
@@ -124,25 +133,25 @@ def seen(run: Run[Any], outcome: Outcome) -> None:
         "The robot with its default mount (above) and that of the answer (below): frame of an unseen drive with the windows read, "
         "events of the hard sensor in them, flow.",
     )
-    verdicts = place.judge(problem.requirements, mount, problem.camera)
+    verdicts = judge(problem.requirements, mount, problem.camera)
     run.text("Requirements: " + "; ".join(map(str, verdicts)) + ".")
     planar = problem.pair.axes
-    depth = task.ground_depth
+    depth = ground_depth
     x, y, z = problem.ranges.numbers(outcome.share)[:3].tolist()
     T_world_body = torch.eye(4, dtype=torch.float64)
     T_world_body[2, 3] = problem.pair.drive(0, 12)[0][:, robot_pair.FRAMES // 2, 2, 3].mean()
-    around = task.Surroundings((x, y, z), T_world_body, axes=planar, depth=depth)
+    around = Surroundings((x, y, z), T_world_body, axes=planar, depth=depth)
     height = z + float(T_world_body[2, 3])
     if height > 0.05:
         information, _ = around.information(problem.camera, mount)
-        sight = place.sight(information, task.sight_units(around), planar)
+        told = sight(information, sight_units(around), planar)
         run.text(
-            f"{height:.2f} m over flat ground the motion that shows least from there is {sight.weakest_named()} (in units of "
-            f"0.1 m/s and 0.1 rad/s, deviation {sight.weakest_deviation:.2f}); blind to: "
-            f"{', '.join(sight.blind()) or 'nothing'}."
+            f"{height:.2f} m over flat ground the motion that shows least from there is {told.weakest_named()} (in units of "
+            f"0.1 m/s and 0.1 rad/s, deviation {told.weakest_deviation:.2f}); blind to: "
+            f"{', '.join(told.blind()) or 'nothing'}."
         )
-        yaw, pitch, errors = task.sight_map(problem.camera, around, rows=9, columns=18)
-        now = place.yaw_pitch_roll_rad(mount).tolist()
+        yaw, pitch, errors = sight_map(problem.camera, around, rows=9, columns=18)
+        now = yaw_pitch_roll_rad(mount).tolist()
         run.figure(
             mount_sphere(yaw, pitch, errors, "expected error, units", {"answer": (now[0], now[1])}),
             "sight",
@@ -179,7 +188,7 @@ def left(run: Run[Any], outcome: Outcome) -> None:
     )
 
 
-def handed(run: Run[Any], outcome: Outcome) -> task.VelocityErrors:
+def handed(run: Run[Any], outcome: Outcome) -> VelocityErrors:
     """Write the mount, read it back, and see that it has the same score; returns its errors."""
     problem, unseen, pose = outcome.race.problem, outcome.unseen, outcome.pose
     mount = robot_pair.mount_at(problem.ranges, pose)
@@ -205,7 +214,7 @@ def handed(run: Run[Any], outcome: Outcome) -> task.VelocityErrors:
     return found
 
 
-def velocities(run: Run[Any], outcome: Outcome, found: task.VelocityErrors) -> None:
+def velocities(run: Run[Any], outcome: Outcome, found: VelocityErrors) -> None:
     """Errors of each velocity, in its own unit."""
     unseen = outcome.unseen
     default = unseen.judged(unseen.ranges.pose(unseen.start), unseen.draw(0), "sensor")

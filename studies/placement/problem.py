@@ -10,8 +10,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign import lens, place, render, task
+from codesign import lens, mount, render
 from codesign.errors import DomainError
+from codesign.mount import (
+    Body,
+    FlowErrors,
+    OwnBody,
+    PrecisionTrend,
+    Readings,
+    Requirement,
+    VelocityErrors,
+    expected_errors,
+    scene_depth,
+    velocity_errors,
+)
 from codesign.system import System
 from scenes import robot_pair
 from scenes.robot_pair import Drives, RobotPair, times
@@ -37,8 +49,8 @@ class Seen:
     flow_px: [N, P, 2], true. covered: [N, windows] by the robot, where it was asked for.
     """
 
-    read: task.Readings
-    surfaces: task.Readings
+    read: Readings
+    surfaces: Readings
     true_rows: Tensor
     flow_px: Tensor
     covered: Tensor | None
@@ -54,13 +66,13 @@ class Problem:
     numbers: Sequence[int]
     spread: int = 12
     per_world: int = 2
-    errors: task.FlowErrors = field(default_factory=task.FlowErrors)
+    errors: FlowErrors = field(default_factory=FlowErrors)
     camera: render.Camera | None = None
 
     def __post_init__(self):
         self._worlds: dict[int, tuple] = {}
         self.ranges = self.pair.ranges
-        self.trend = task.PrecisionTrend()
+        self.trend = PrecisionTrend()
         self.rendered = 0  # samples so far
         if self.camera is None:
             self.camera = self.pair.design.camera()
@@ -76,7 +88,7 @@ class Problem:
         return self.ranges.share_at(self.pair.design.mount())
 
     @cached_property
-    def requirements(self) -> list[place.Requirement]:
+    def requirements(self) -> list[Requirement]:
         return self.pair.requirements()
 
     def draw(self, number: int) -> Samples:
@@ -109,8 +121,8 @@ class Problem:
 
     @cached_property
     def _own_body(self):
-        body = place.Body((mesh.vertices_m, mesh.faces) for mesh in self.pair.bodies.values())
-        return task.OwnBody(body, 1.0)
+        body = Body((mesh.vertices_m, mesh.faces) for mesh in self.pair.bodies.values())
+        return OwnBody(body, 1.0)
 
     @cached_property
     def _body(self):
@@ -127,7 +139,7 @@ class Problem:
         )
 
     @torch.no_grad()
-    def judged(self, T_body_cam: Tensor, samples: Samples, layer: str = "memory") -> task.VelocityErrors:
+    def judged(self, T_body_cam: Tensor, samples: Samples, layer: str = "memory") -> VelocityErrors:
         """Errors of a mount [4, 4], hard counts or single events ("sensor")."""
         batch = self.batch(samples)
         return self.pair.errors(self.system(T_body_cam, layer).begin(batch)["estimate"], batch)
@@ -147,7 +159,7 @@ class Problem:
 
     def penalty(self, T_body_cam: Tensor) -> Tensor:
         """0 where every requirement is kept with a step to spare. Gradient: mount."""
-        return place.penalty(self.requirements, T_body_cam, self.camera)
+        return mount.penalty(self.requirements, T_body_cam, self.camera)
 
     def expected(self, T_body_cam: Tensor, samples: Samples, learn: bool = False) -> Tensor:
         """Bounded error [N] to be expected of a mount: what is descended, by ``expected_around``.
@@ -172,7 +184,7 @@ class Problem:
         """Mean bounded error to be expected of a mount [6], and its differences [6] over a step to both sides.
 
         Pictures are taken of the mount itself alone. From the others there is the geometry, with its edges: surfaces, their true flow,
-        what the robot covers; how well flow is told there is carried over by the trend (``task.PrecisionTrend.carried``).
+        what the robot covers; how well flow is told there is carried over by the trend (``mount.PrecisionTrend.carried``).
         At a wall of the cube the step ends there. learn: as for ``expected``.
         """
         batch = self.batch(samples)
@@ -205,7 +217,7 @@ class Problem:
         estimator = self._system.estimate
         look = partial(estimator.read, field, self.camera, batch.scene, T_body_cam, T_world_cam, batch.t_s)
         read = look()
-        true = read if self.pair.depth == "scene" else look(depth=task.scene_depth)
+        true = read if self.pair.depth == "scene" else look(depth=scene_depth)
         flow_px = (true.rows @ batch.twist[:, None, :, None])[..., 0]
         covered = None
         if cover:
@@ -222,9 +234,9 @@ class Problem:
 
     def _bounded(self, read, seen, twist):
         """Bounded error [N] to be expected of readings."""
-        expected = task.expected_errors(self._system.estimate, read, twist, seen.true_rows, self.errors)
+        expected = expected_errors(self._system.estimate, read, twist, seen.true_rows, self.errors)
         squared = expected.squared[:, list(self.pair.axes)]
-        unit = task.velocity_errors(torch.zeros_like(squared), twist, self.pair.axes).unit()
+        unit = velocity_errors(torch.zeros_like(squared), twist, self.pair.axes).unit()
         squared = (squared / unit**2).mean(1)
         return squared / (1 + squared)
 
@@ -239,7 +251,7 @@ def _of(parts, which, count):
     return replace(parts, **found)
 
 
-def readings(run: Mapping[str, Any], depth: Callable[..., Tensor] | None = None) -> task.Readings:
+def readings(run: Mapping[str, Any], depth: Callable[..., Tensor] | None = None) -> Readings:
     """What the estimator of a pass reads, by the depth it believes in or another."""
     what = (run[name] for name in ("field", "camera", "scene", "T_body_cam", "T_world_cam", "t_s"))
     return run.system.estimate.read(*what, depth=depth)  # pyright: ignore[reportAttributeAccessIssue] - a Pass

@@ -10,8 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from codesign import grad, task
+from codesign import grad
 from codesign.errors import DomainError
+from codesign.mount import PrecisionTrend
 from studies.frame.run import Run
 from studies.placement.descent import descend, settled
 from studies.placement.grid import first_points, looks, refined_grid
@@ -94,7 +95,7 @@ class Race:
     def descent(self, number: int, start: Tensor, ways: dict[str, grad.Choice]) -> None:
         """Gradient steps, every group of numbers by the way chosen for it."""
         problem, first = self.problem, 1000 * (self.run.config.seed + number)
-        problem.trend = task.PrecisionTrend()
+        problem.trend = PrecisionTrend()
 
         def slope(share, step):
             values = []
@@ -261,7 +262,7 @@ def certified(run: Run[Any], race: Race, start: Tensor) -> dict[str, grad.Choice
         return {name: grad.Choice("autograd", math.nan, math.nan, math.nan, 0) for name in GROUPS}
     if "ways" not in race.tensors:
         problem = race.problem
-        problem.trend = task.PrecisionTrend()
+        problem.trend = PrecisionTrend()
         for draw in range(draws):
             expected(problem, split(start), draw, learn=True)
         run.say(f"comparing the gradient with differences in {draws} draws of {problem.samples} samples")

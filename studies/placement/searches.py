@@ -1,4 +1,4 @@
-"""Searches without gradients, over the cube of shares from 0 to 1 in which ``place.MountRanges`` puts mounts.
+"""Searches without gradients, over the cube of shares from 0 to 1 in which ``mount.MountRanges`` puts mounts.
 
 Each looks at ``count`` points, one call of the judge each, the start first; how the judge deals with noise is its own
 affair. What can be refused without a look costs none. A search is a generator that gives a point and is sent its error,

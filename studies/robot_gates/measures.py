@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from codesign import task
+from codesign.mount import scene_depth
 from scenes.robot_pair import FRAMES, PITCH_MM, Design, Drives, RobotPair
 
 VARIABLES = ("efl_mm", "focus_per_m", "z_m", "pitch_rad")
@@ -64,7 +64,7 @@ def blur_px(pair: RobotPair, batch: Drives) -> Tensor:
     pixels = camera.film.pixels().reshape(-1, height, width, 2)[:, ::4, ::4].reshape(-1, 2)
     poses = batch.T_world_body[..., FRAMES // 2, :, :].flatten(0, 1) @ pair.design.mount()
     with torch.no_grad():
-        depth_m = task.scene_depth(camera, pixels.expand(len(poses), -1, 2), poses, batch.scene)
+        depth_m = scene_depth(camera, pixels.expand(len(poses), -1, 2), poses, batch.scene)
         lens = camera.lens
         away = 1 - lens.image_distance_mm * (1 / lens.efl_mm - 1e-3 / depth_m)
         disc = lens.entrance_pupil_diameter_mm * away.abs() / PITCH_MM

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import torch
 
-from codesign import events, lens, place, plain_yaml, render
+from codesign import events, lens, plain_yaml, render
 from codesign.events.spiking.spike_esim import SpikeEsim
+from codesign.mount import Mount
 from codesign.reading import read_json, read_text
 from codesign.system import HandOver, load_hand_over, save_hand_over
 from codesign.train import checkpoint
@@ -90,7 +91,7 @@ def trained(path: Path):
 
 def hand_over(folder: Path):
     """A mount with a thin lens and a sensor."""
-    mount = place.Mount((0.2, 0.0, 0.4), (0.1, 0.0, 0.2), yaw_rad=0.3)
+    mount = Mount((0.2, 0.0, 0.4), (0.1, 0.0, 0.2), yaw_rad=0.3)
     camera = render.Camera(lens.ThinLens(8.0, 2.0).focus_at(1.3), 32, 24, 0.1, 4, falloff=True)
     save_hand_over(folder / "mount.yaml", HandOver(mount, camera, events.SensorModel(), notes={"by": "me"}))
 

@@ -9,8 +9,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from codesign import backend, lens, place, pose, render, task
+from codesign import backend, lens, pose, render
 from codesign.errors import CodesignError, DomainError, FileFormatError
+from codesign.mount import FREE, CableSide, Clearance, EgoVelocity, Housing, LookAhead, OwnBody
 from scenes import build, robot_pair, robot_parts, robots, textures, worlds
 from scenes.robot_check import check_pair
 from scenes.robot_file import CameraBox, OwnRobot, Start, read_own
@@ -149,16 +150,16 @@ require:
     assert replace(found.design, x_m=0.29, z_m=0.325) == start
     assert found.low.z_m == 0.25
     assert found.high.pitch_rad == math.radians(80)
-    assert found.axes == place.FREE
+    assert found.axes == FREE
     assert found.depth == "ground"
     assert found.frame == robots.from_urdf(robots.ROVER).base == "base_link"
     assert [path.name for path in found.files] == ["rover.urdf"]
     cable, ahead, clearance, own_body = found.requirements()
-    assert cable == place.CableSide((0.0, 0.0, -1.0), math.radians(30))
-    assert ahead == place.LookAhead(2.0, 0.2, ground_z_m=found.ground_z_m)
-    assert isinstance(clearance, place.Clearance)
-    assert (clearance.housing, clearance.margin_m) == (place.Housing(0.03), 0.01)
-    assert isinstance(own_body, task.OwnBody)
+    assert cable == CableSide((0.0, 0.0, -1.0), math.radians(30))
+    assert ahead == LookAhead(2.0, 0.2, ground_z_m=found.ground_z_m)
+    assert isinstance(clearance, Clearance)
+    assert (clearance.housing, clearance.margin_m) == (Housing(0.03), 0.01)
+    assert isinstance(own_body, OwnBody)
     assert own_body.largest_share == 0.1
     # seven of the rover's eight shapes, from the ends of its wheels at 1 mm up to the top of its mast
     corners = np.concatenate([mesh.vertices_m for mesh in found.bodies.values()])
@@ -227,7 +228,7 @@ def test_rendered_flow_of_a_world_of_ones_own_gives_the_twist_back(write, world,
     assert found.depth == "scene"
     drives = found.batch((0, UNSEEN), 2)
     system = found.system(found.design).replaced(
-        flow=lambda volume, truth: truth, estimate=task.EgoVelocity(place.FREE, (1e3,) * 6, "scene")
+        flow=lambda volume, truth: truth, estimate=EgoVelocity(FREE, (1e3,) * 6, "scene")
     )
     with torch.no_grad():
         velocity = system.begin(drives)["estimate"].velocity
@@ -238,7 +239,7 @@ def test_rendered_flow_of_a_world_of_ones_own_gives_the_twist_back(write, world,
 def test_settings_need_no_file():
     box = CameraBox((0.05, 0.0, 0.4), (0.25, 0.0, 0.6), pitch_deg=(20.0, 20.0))
     found = own_pair(OwnRobot(str(robots.ROVER), box, ("camera_link",), Start(z_m=0.5), world="flight"))
-    assert found.axes == place.FREE
+    assert found.axes == FREE
     assert found.ranges.held.tolist() == [False, True, False, False, True, False]
     assert found.design.pitch_rad == math.radians(20)
     poses, _ = found.drive(0, 8)

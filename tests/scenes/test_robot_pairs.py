@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from codesign import lens, place, pose, render, task
+from codesign import lens, pose, render
 from codesign.errors import DomainError
-from codesign.task.depth import scene_depth
+from codesign.mount import FREE, Body, EgoVelocity, body_flow, ground_depth, judge, yaw_pitch_roll_rad
+from codesign.mount.depth import scene_depth
 from scenes import robot_pair, robot_parts
 from scenes.robot_pairs import PAIRS
 
@@ -77,7 +78,7 @@ def test_rendered_correspondences_move_as_the_body_flow_says(pair, drives):
     moved, valid = render.true_flow(camera, world, poses @ mount)
     pixels = camera.film.pixels().expand(3, -1, 2)
     depth = scene_depth(camera, pixels, (middle @ mount), world)
-    rows, seen = place.body_flow(camera, depth, mount, pixels)
+    rows, seen = body_flow(camera, depth, mount, pixels)
     expected = (rows @ twist[:, None, :, None])[..., 0] * dt
     both = (seen & valid[:, 0].flatten(1))[..., None]
     assert float(both.double().mean()) > 0.4
@@ -94,7 +95,7 @@ def test_the_ground_is_where_the_estimator_takes_it(pair, drives):
     camera = pair.design.camera()
     pixels = camera.film.pixels()[::37].expand(3, -1, 2)
     poses = drives.T_world_body[0, :, robot_pair.FRAMES // 2] @ pair.design.mount()
-    ground = task.ground_depth(camera, pixels, poses, drives.scene)
+    ground = ground_depth(camera, pixels, poses, drives.scene)
     seen = scene_depth(camera, pixels, poses, drives.scene)
     near = ground < 1.5
     alike = (ground - seen).abs() < 1e-4
@@ -170,7 +171,7 @@ def test_the_design_starts_inside_its_bounds_and_others_are_refused(pair):
 
 def test_cameras_inside_the_bounds_stand_clear_of_the_body(pair):
     """A housing of 4 cm about every corner of the box touches nothing."""
-    body = place.Body((mesh.vertices_m, mesh.faces) for mesh in pair.bodies.values())
+    body = Body((mesh.vertices_m, mesh.faces) for mesh in pair.bodies.values())
     corners = [
         torch.tensor(
             [getattr(low_or_high, f"{axis}_m") for low_or_high, axis in zip(ends, "xyz", strict=True)]
@@ -183,11 +184,11 @@ def test_cameras_inside_the_bounds_stand_clear_of_the_body(pair):
 def test_the_default_design_keeps_what_a_mount_has_to_keep(pair):
     wanted = pair.requirements()
     assert ("look-ahead" in [each.name for each in wanted]) == (pair.look_ahead is not None)
-    assert all(verdict.kept for verdict in place.judge(wanted, pair.design.mount(), pair.design.camera()))
+    assert all(verdict.kept for verdict in judge(wanted, pair.design.mount(), pair.design.camera()))
     # the clearance is that of the nearest mesh, less the housing and its margin
     at = pair.design.mount()[:3, 3]
     nearest = min(
-        float(place.Body([(mesh.vertices_m, mesh.faces)]).distance_m(at)) for mesh in pair.bodies.values()
+        float(Body([(mesh.vertices_m, mesh.faces)]).distance_m(at)) for mesh in pair.bodies.values()
     )
     found = next(each for each in wanted if each.name == "clearance").exact(pair.design.mount(), None)
     assert float(found.min()) == pytest.approx(nearest - 0.02 - 0.005, abs=1e-12)
@@ -195,11 +196,11 @@ def test_the_default_design_keeps_what_a_mount_has_to_keep(pair):
 
 def test_a_pair_asks_for_its_cable_side(pair):
     asked = replace(pair, cable=((1.0, 0.0, 0.0), 0.5))
-    kept, *_ = place.judge(asked.requirements(), pair.design.mount(), pair.design.camera())
+    kept, *_ = judge(asked.requirements(), pair.design.mount(), pair.design.camera())
     assert kept.name == "cable side"
     assert kept.kept
     against = replace(pair, cable=((-1.0, 0.0, 0.0), 1.2))
-    assert not place.judge(against.requirements(), pair.design.mount(), pair.design.camera())[0].kept
+    assert not judge(against.requirements(), pair.design.mount(), pair.design.camera())[0].kept
 
 
 def test_the_corridor_robot_sees_its_forks():
@@ -217,14 +218,14 @@ def test_a_design_is_its_lens_and_its_mount():
     assert optics.entrance_pupil_diameter_mm == pytest.approx(5.0)
     mount = design.mount()
     assert mount[:3, 3].tolist() == [0.3, 0.1, 0.4]
-    angles = place.yaw_pitch_roll_rad(mount)
+    angles = yaw_pitch_roll_rad(mount)
     torch.testing.assert_close(angles, torch.tensor([0.2, 0.5, -0.1], dtype=D), rtol=0, atol=1e-12)
 
 
 def test_an_estimate_of_exact_flow_is_the_true_velocity(pair, drives):
     """Rendered truth through the design's own windows, where the scene's depth is known, gives back the twist."""
     mount = pair.design.mount()
-    exact = task.EgoVelocity(place.FREE, (1e3,) * 6, "scene", outlier=1.0, steps=20)
+    exact = EgoVelocity(FREE, (1e3,) * 6, "scene", outlier=1.0, steps=20)
     slow = replace(drives, T_world_body=slowed(drives, 0.05))
     system = pair.system(pair.design).replaced(flow=lambda volume, truth: truth, estimate=exact)
     with torch.no_grad():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from codesign.errors import DomainError, ShapeError
-from codesign.place import Mount
+from codesign.mount import Mount
 from codesign.pose import check_poses, inverse, look_at, se3_exp
 from scenes import trajectories
 from scenes.trajectories import Driving, Flying, Orbital, Swinging, Waves, body_at, minimum_snap, mounted

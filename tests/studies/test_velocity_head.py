@@ -6,7 +6,7 @@ from dataclasses import fields
 import pytest
 import torch
 
-from codesign import task
+from codesign.mount import EgoVelocity, Evidence, VelocityHead
 from scenes.robot_pairs import PAIRS
 from studies import velocity_head
 from studies.frame.run import main
@@ -33,7 +33,7 @@ def made(count, seed):
     flow = flow * (1 - (1 - SHORT) * marked[..., None])
     told = torch.zeros(count, WINDOWS, 11, dtype=D)
     told[..., 9] = marked
-    seen = task.Evidence(
+    seen = Evidence(
         rows.mT @ rows / NOISE_PX**2,
         (rows.mT @ flow[..., None])[..., 0] / NOISE_PX**2,
         flow.square().sum(-1) / NOISE_PX**2,
@@ -74,10 +74,10 @@ def test_a_little_training_lowers_the_error_on_worlds_kept_from_it_and_what_it_s
     assert main(velocity_head.study, velocity_head.Config, arguments) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["corridor_head_error"] < 0.6 * metrics["corridor_plain_error"]
-    head = task.VelocityHead.load(task.EgoVelocity(tuple(range(6)), (1.0,) * 6), out / "head.safetensors")
+    head = VelocityHead.load(EgoVelocity(tuple(range(6)), (1.0,) * 6), out / "head.safetensors")
     again = {name: tensor.double() for name, tensor in made(600, 1000).items()}
     samples = velocity_head.Samples(
-        task.Evidence(*(again[f.name] for f in fields(task.Evidence))),
+        Evidence(*(again[f.name] for f in fields(Evidence))),
         again["twist"],
         PAIRS["corridor"]().axes,
     )

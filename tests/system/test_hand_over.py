@@ -6,8 +6,9 @@ from typing import Any
 import pytest
 import torch
 
-from codesign import events, lens, place, render
+from codesign import events, lens, render
 from codesign.errors import DomainError, FileFormatError
+from codesign.mount import Mount
 from codesign.plain_yaml import load
 from codesign.system import HandOver, load_hand_over, save_hand_over
 
@@ -15,7 +16,7 @@ D = torch.float64
 
 
 def found_mount(generator):
-    mount = place.Mount((0.2, 0.0, 0.4), (0.1, 0.0, 0.2), yaw_rad=0.3, pitch_rad=1.0, roll_rad=-0.2)
+    mount = Mount((0.2, 0.0, 0.4), (0.1, 0.0, 0.2), yaw_rad=0.3, pitch_rad=1.0, roll_rad=-0.2)
     mount.numbers.detach().copy_(torch.randn(6, generator=generator, dtype=D))
     mount.variables(render.Camera(lens.Pinhole(3.4), 8, 8, 0.2, 1), 2.0)
     return mount

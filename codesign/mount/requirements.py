@@ -1,0 +1,309 @@
+"""What a mount has to keep: distance to the robot, a free way for its cable, a view ahead.
+
+Each requirement has a ``slack`` in metres or radians with a gradient to the mount (and to the lens where it looks
+through it), and an ``exact`` one that is at least 0 where it is kept; they have the same sign but where a
+count of pixels decides. ``penalty`` makes one smooth number of the slacks, to add to an objective; ``judge`` says yes or no.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from codesign.errors import DomainError, ShapeError, as_number, check_finite
+from codesign.mount.body import Body, Housing
+from codesign.render import Camera, MitsubaScene, frames
+from codesign.render.charts import glowing
+from codesign.render.moving import views_of
+from codesign.render.truth import hits_of
+from codesign.types import ChiefRayCamera
+
+CAMERA_PIXELS = 4096  # of a film, spread over it, that a look ahead looks at
+
+
+class Requirement(Protocol):
+    """name: what is required. unit: of the slack. step: slack from which on nothing pushes."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def unit(self) -> str: ...
+
+    @property
+    def step(self) -> float: ...
+
+    def slack(self, T_body_cam: Tensor, camera: Any) -> Tensor:
+        """[..., K] of mounts [..., 4, 4], with gradient."""
+        ...
+
+    def exact(self, T_body_cam: Tensor, camera: Any) -> Tensor:
+        """[..., K]: the requirement is kept where none is negative."""
+        ...
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """The housing stays ``margin_m`` away from the robot.
+
+    Args: body: in the axes of the mount. housing: of the camera. margin_m: >= 0. step: metres beyond the margin
+      within which ``penalty`` pushes.
+    """
+
+    body: Body
+    housing: Housing
+    margin_m: float = 0.0
+    step: float = 0.01
+    name: str = "clearance"
+    unit: str = "m"
+
+    def __post_init__(self):
+        if not 0 <= as_number(self.margin_m, "clearance: margin_m") < math.inf:
+            raise DomainError(
+                f"clearance: margin_m is {self.margin_m}; finite metres of at least 0 are needed."
+            )
+        check_positive(self.step, "clearance: step")
+
+    def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
+        """[..., solids] m of clearance beyond the margin. Gradient: mount."""
+        return self.body.clearances_m(T_body_cam, self.housing) - self.margin_m
+
+    exact = slack
+
+
+@dataclass(frozen=True)
+class CableSide:
+    """The back of the housing, where the cable leaves, does not point into a cone.
+
+    Args: forbidden: direction in body axes, of any length. half_angle_rad: of the cone, above 0 and below pi.
+    """
+
+    forbidden: tuple[float, float, float]
+    half_angle_rad: float
+    step: float = 0.1
+    name: str = "cable side"
+    unit: str = "rad"
+
+    def __post_init__(self):
+        if not 0 < as_number(self.half_angle_rad, "half_angle_rad") < math.pi:
+            raise DomainError(
+                f"cable side: half_angle_rad is {self.half_angle_rad}; give one between 0 and pi."
+            )
+        _direction(self.forbidden, "cable side: forbidden")
+        check_positive(self.step, "cable side: step")
+
+    def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
+        """[..., 1]: (cos a - cos b) / sin a with a the half angle and b the angle between back and axis; near the rim
+        of the cone that is b - a in radians, and it is smooth everywhere. Gradient: mount."""
+        return (math.cos(self.half_angle_rad) - self._cosine(T_body_cam)) / math.sin(self.half_angle_rad)
+
+    def exact(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
+        """[..., 1]: b - a, radians."""
+        return self._cosine(T_body_cam).clamp(-1, 1).acos() - self.half_angle_rad
+
+    def _cosine(self, T_body_cam):
+        axis = _direction(self.forbidden, "cable side: forbidden").to(T_body_cam)
+        return -(T_body_cam[..., :3, 2] * axis).sum(-1, keepdim=True)
+
+
+@dataclass(frozen=True)
+class LookAhead:
+    """A share of the picture sees farther than ``distance_m``.
+
+    A pixel sees beyond the distance when its chief ray goes ahead and meets the ground, if at all, beyond the line
+    across at that distance; with ``depth``, when what it sees lies there.
+
+    Args:
+      distance_m: from the body's origin, along ``ahead``, > 0. share: of the film's pixels, above 0, at most 1.
+      ahead: direction in body axes, level. ground_z_m: height of the ground in body axes (0 for a body whose origin
+        is on the ground, as base_footprint of REP 105).
+      depth: (camera, pixels [P, 2], T_body_cam [4, 4]) -> [P] m along the camera's z axis, not finite where nothing is
+        seen; None is flat ground. smooth: share of the pixels over which the slack at the wanted rank is averaged.
+    Raises: DomainError for numbers out of range.
+    """
+
+    distance_m: float
+    share: float
+    ahead: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    ground_z_m: float = 0.0
+    depth: Callable[[ChiefRayCamera, Tensor, Tensor], Tensor] | None = None
+    smooth: float = 0.02
+    step: float = 0.05
+    name: str = "look-ahead"
+    unit: str = "rad"
+
+    def __post_init__(self):
+        check_positive(self.distance_m, "look-ahead: distance_m")
+        check_positive(self.step, "look-ahead: step")
+        for label in ("share", "smooth"):
+            if not 0 < as_number(getattr(self, label), label) <= 1:
+                raise DomainError(
+                    f"look-ahead: {label} is {getattr(self, label)}; a share above 0, at most 1, is needed."
+                )
+        if not abs(float(_direction(self.ahead, "look-ahead: ahead")[2])) < 1e-9:
+            raise DomainError(f"look-ahead: ahead is {self.ahead}; give a level direction, z = 0.")
+
+    def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
+        """[..., 1]: the mean of ``angles`` at the ranks around the one that ``exact`` looks at, so that a row of pixels
+        decides and not its last one. Gradient: mount, and the lens behind the chief rays."""
+        angles = self.angles(T_body_cam, camera)
+        rank = torch.arange(angles.shape[-1]).to(angles)
+        weight = (1 - (rank - self._rank(angles)).abs() / max(1.0, self.smooth * len(rank))).clamp_min(0)
+        return (angles.sort(-1, descending=True).values * weight).sum(-1, keepdim=True) / weight.sum()
+
+    def exact(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
+        """[..., 1]: the angle that just ``share`` of the pixels reach."""
+        angles = self.angles(T_body_cam, camera)
+        rank = self._rank(angles)
+        return angles.sort(-1, descending=True).values[..., rank : rank + 1]
+
+    def _rank(self, angles):
+        return max(math.ceil(self.share * angles.shape[-1] - 1e-9) - 1, 0)
+
+    def angles(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
+        """By how much each pixel [..., P] looks beyond the distance: over ground the sine of the angle between its
+        ray and the plane through the line at that distance and the camera, or the vertical plane across, whichever
+        is smaller; before a scene (x - d) / hypot(x, d) of what it sees x metres ahead."""
+        if not hasattr(camera, "chief_rays"):
+            raise DomainError(
+                "look-ahead: it looks through the camera; give one with chief rays, as render.Camera."
+            )
+        pixels = camera.film.pixels()
+        count = min(CAMERA_PIXELS, len(pixels))
+        pixels = pixels[torch.linspace(0, len(pixels) - 1, count).round().long()]
+        rays = camera.chief_rays(pixels)
+        pose = T_body_cam.double()
+        direction = rays.direction.double() @ pose[..., :3, :3].mT
+        ahead = _direction(self.ahead, "ahead").to(pose)
+        forward = (direction * ahead).sum(-1)
+        origin = pose[..., None, :3, 3] + rays.origin_m.double() @ pose[..., :3, :3].mT
+        before = self.distance_m - (origin * ahead).sum(-1)
+        if self.depth is not None:
+            depth = torch.stack([self.depth(camera, pixels, one) for one in pose.reshape(-1, 4, 4)])
+            return self._of_scene(depth.reshape(direction.shape[:-1]), rays, direction, origin)
+        height = origin[..., 2] - self.ground_z_m
+        over = (height * forward + before * direction[..., 2]) / torch.hypot(height, before).clamp_min(1e-9)
+        return torch.minimum(over, forward)
+
+    def _of_scene(self, depth, rays, direction, origin):
+        ahead = _direction(self.ahead, "ahead").to(direction)
+        seen = depth.detach().isfinite()
+        length = (torch.where(seen, depth, 0.0) - rays.origin_m[:, 2].double()) / rays.direction[
+            :, 2
+        ].double()
+        away = ((origin + length[..., None] * direction) * ahead).sum(-1)
+        found = (away - self.distance_m) / torch.hypot(away, away.new_tensor(self.distance_m))
+        return torch.where(seen, found, torch.sign((direction * ahead).sum(-1)))
+
+
+def penalty(requirements: Sequence[Requirement], T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
+    """What to add to an objective so that a search keeps to its requirements: sum of max(0, 1 - slack / step)^2.
+
+    Args: T_body_cam: [..., 4, 4]. Returns: [...], 0 where every slack is at least its step, 1 where one of them is 0.
+    Gradient: mount, lens; continuous wherever the slack's is.
+    """
+    total = T_body_cam.new_zeros(T_body_cam.shape[:-2], dtype=torch.float64)
+    for each in requirements:
+        total = total + (1 - each.slack(T_body_cam, camera) / each.step).clamp_min(0).square().sum(-1)
+    return total
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """slack: the smallest, in ``unit``. kept: whether it is at least 0."""
+
+    name: str
+    slack: float
+    unit: str
+    kept: bool
+
+    def __str__(self):
+        said = "kept with" if self.kept else "missed by"
+        return f"{self.name}: {said} {abs(self.slack):.3g} {self.unit}"
+
+
+@torch.no_grad()
+def judge(requirements: Sequence[Requirement], T_body_cam: Tensor, camera: ChiefRayCamera) -> list[Verdict]:
+    """The hard answer for one mount [4, 4], one Verdict for each requirement."""
+    if T_body_cam.shape != (4, 4):
+        raise ShapeError(f"judge: one mount [4, 4] is judged at a time, got {tuple(T_body_cam.shape)}.")
+    found = []
+    for each in requirements:
+        slack = float(each.exact(T_body_cam, camera).min())
+        found.append(Verdict(each.name, slack, each.unit, slack >= 0))
+    return found
+
+
+def _direction(vector, name):
+    given = check_finite(torch.as_tensor(vector, dtype=torch.float64), name, "give finite numbers")
+    if given.shape != (3,) or not float(given.norm()) > 0:
+        raise DomainError(f"{name} is {vector}; three numbers that are not all 0 are needed.")
+    return given / given.norm()
+
+
+def check_positive(value: float, name: str) -> None:
+    """Raise DomainError unless it is a finite number > 0."""
+    if not 0 < as_number(value, name) < math.inf:
+        raise DomainError(f"{name} is {value}; a finite number > 0 is needed.")
+
+
+@dataclass(frozen=True)
+class OwnBody:
+    """The body covers at most ``largest_share`` of the picture, one of the requirements of a mount (see codesign.mount).
+
+    The slack's gradient is that of a rendered picture in which the body glows and nothing else does, with the motion of
+    its silhouettes: it is 0 where nothing of the body is in view. The exact answer counts chief rays.
+
+    >>> from codesign import lens, render
+    >>> from codesign.mount import Body, Mount, OwnBody
+    >>> sheet = Body([([(2, -9, 0), (2, 9, 0), (2, 9, 9), (2, -9, 9)], [(0, 1, 2), (0, 2, 3)])])
+    >>> camera = render.Camera(lens.Pinhole(8.0), 16, 16, 0.1, 4)
+    >>> level = Mount((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))().detach()  # the sheet fills the upper half
+    >>> round(float(OwnBody(sheet, 0.7).slack(level, camera)), 3)
+    0.2
+
+    Args: body: in the axes of the mount. largest_share: 0 to 1. step: share below it from which on nothing pushes. per_px: points of
+      silhouettes per pixel length, for the gradient (before a rover, in 16 x 12 pixels, it is good to 2 %).
+    Raises: DomainError for shares out of range.
+    """
+
+    body: Body
+    largest_share: float
+    step: float = 0.02
+    per_px: float = 10.0
+    name: str = "own body in view"
+    unit: str = "of the picture"
+
+    def __post_init__(self):
+        if not 0 <= as_number(self.largest_share, "largest_share") <= 1:
+            raise DomainError(
+                f"own body: largest_share is {self.largest_share}; a share from 0 to 1 is needed."
+            )
+        check_positive(self.step, "own body: step")
+
+    @cached_property
+    def scene(self) -> MitsubaScene:
+        """The body with radiance 1 on both sides of every face, before nothing."""
+        return glowing(self.body.triangles)
+
+    def slack(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
+        """[..., 1] share of the picture that may still be covered. Gradient: mount and lens."""
+        return self.largest_share - self.covered(T_body_cam, camera).mean(-1, keepdim=True)
+
+    def covered(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
+        """[..., windows] share of every window of the film that the body covers. Gradient: mount and lens."""
+        way = "boundary" if torch.is_grad_enabled() else "interior"  # of which the pictures are the same
+        found = frames(camera, self.scene, T_body_cam.reshape(-1, 4, 4), way, self.per_px).double()
+        return found.flatten(-2).mean(-1).reshape(*T_body_cam.shape[:-2], -1)
+
+    @torch.no_grad()
+    def exact(self, T_body_cam: Tensor, camera: Camera) -> Tensor:
+        """[..., 1]: the same, of the pixels whose chief ray meets the body."""
+        rays = camera.chief_rays(camera.film.pixels())
+        hits = hits_of(rays, self.scene, views_of(self.scene, T_body_cam.reshape(-1, 4, 4)).cameras)
+        covered = (hits.part >= 0).double().mean(-1).reshape(*T_body_cam.shape[:-2], 1)
+        return self.largest_share - covered

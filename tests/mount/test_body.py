@@ -1,0 +1,242 @@
+"""Distances to meshes against closed forms and brute force, inside and outside against shapes that are known."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from codesign.errors import DomainError, ShapeError
+from codesign.mount import Body, Housing
+from codesign.mount.pose import attitude
+from codesign.mount.triangles import closest_points, first_crossings, winding_numbers
+from scenes import robots
+
+D = torch.float64
+SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+FACES = [(a, b, c) for a, b, c, _ in SIDES] + [(a, c, d) for a, _, c, d in SIDES]
+BOX = ((-0.2, -0.1, 0.0), (0.3, 0.15, 0.4))
+
+
+def box_mesh(low, high):
+    corners = [(x, y, z) for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+    return np.array(corners), np.array(FACES)
+
+
+def box_distance(points, low, high):
+    """Closed form: outside the norm of what sticks out, inside the nearest face."""
+    middle = (torch.tensor(low, dtype=D) + torch.tensor(high, dtype=D)) / 2
+    half = (torch.tensor(high, dtype=D) - torch.tensor(low, dtype=D)) / 2
+    over = (points - middle).abs() - half
+    return over.clamp_min(0).norm(dim=-1) + over.amax(-1).clamp_max(0)
+
+
+def ball_mesh(radius, subdivisions):
+    """An octahedron, its faces cut in four and pushed out: [F, 3, 3]."""
+    unit = torch.eye(3, dtype=D)
+    signs = torch.cartesian_prod(*[torch.tensor([1.0, -1.0], dtype=D)] * 3)
+    faces = torch.stack([sign[:, None] * unit for sign in signs])
+    faces = torch.where((signs.prod(1) < 0)[:, None, None], faces.flip(1), faces)
+    for _ in range(subdivisions):
+        a, b, c = faces.unbind(1)
+        ab, bc, ca = a + b, b + c, c + a
+        cut = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        faces = torch.cat([torch.stack(each, 1) for each in cut])
+        faces = faces / faces.norm(dim=-1, keepdim=True)
+    triangles = radius * faces
+    vertices, index = np.unique(triangles.reshape(-1, 3).numpy().round(12), axis=0, return_inverse=True)
+    return vertices, index.reshape(-1, 3)
+
+
+def some_poses(generator, count, spread):
+    angles = (torch.rand(count, 3, generator=generator, dtype=D) - 0.5) * 6
+    poses = torch.eye(4, dtype=D).repeat(count, 1, 1)
+    poses[:, :3, :3] = torch.stack([attitude(*each) for each in angles.tolist()])
+    poses[:, :3, 3] = (torch.rand(count, 3, generator=generator, dtype=D) - 0.5) * spread
+    return poses
+
+
+def test_distance_to_a_box_is_the_closed_form(generator):
+    points = 1.5 * (torch.rand(2000, 3, generator=generator, dtype=D) - 0.4)
+    found = Body([box_mesh(*BOX)]).distance_m(points)
+    expected = box_distance(points, *BOX)
+    assert 20 < int((expected < 0).sum()) < 1980
+    # the sum and root of three squares below 4 in float64
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-14)
+
+
+def test_a_ball_of_triangles_lies_between_its_two_spheres(generator):
+    """Of the polyhedron, corners lie on the sphere of its radius and the rest inside by at most the sagitta."""
+    vertices, faces = ball_mesh(0.3, 4)
+    corner = torch.from_numpy(vertices)[torch.from_numpy(faces)]
+    middle = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    plane = ((middle / middle.norm(dim=1, keepdim=True)) * corner[:, 0]).sum(1).min()  # nearest of all faces
+    points = torch.randn(500, 3, generator=generator, dtype=D) * 0.3
+    found = Body([(vertices, faces)]).distance_m(points)
+    exact = points.norm(dim=1) - 0.3
+    sagitta = float(0.3 - plane)
+    assert sagitta < 2e-3
+    assert bool((found >= exact - 1e-12).all())
+    assert bool((found <= exact + sagitta + 1e-12).all())
+
+
+def test_nearest_points_beat_every_sampled_point(generator):
+    """No point of the triangles is nearer than the one found, and the one found is a point of them."""
+    triangles = torch.randn(7, 3, 3, generator=generator, dtype=D)
+    triangles[6, 2] = 0.5 * (triangles[6, 0] + triangles[6, 1])  # one without area
+    points = 2 * torch.randn(50, 3, generator=generator, dtype=D)
+    closest, face = closest_points(points, triangles)
+    grid = torch.linspace(0, 1, 101, dtype=D)
+    u, v = torch.meshgrid(grid, grid, indexing="ij")
+    u, v = u[u + v <= 1 + 1e-12], v[u + v <= 1 + 1e-12]
+    weight = torch.stack([1 - u - v, u, v], 1)  # [S, 3]
+    sampled = (weight @ triangles).reshape(-1, 3)
+    brute = torch.cdist(points, sampled).amin(1)
+    far = (points - closest).norm(dim=1)
+    spacing = 0.01 * float((triangles - triangles.roll(1, 1)).norm(dim=-1).max())
+    assert bool((far <= brute + 1e-12).all())
+    assert bool((brute - far <= spacing).all())
+    own = torch.cdist(closest[:, None], weight @ triangles[face]).amin((1, 2))
+    assert float(own.max()) <= spacing
+
+
+def test_winding_numbers_count_shells(generator):
+    body = Body([box_mesh((-1, -1, -1), (1, 1, 1)), box_mesh((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))])
+    points = torch.tensor([[0.1, 0.2, 0.3], [0.7, 0.1, 0.0], [3.0, 0.0, 1.0]], dtype=D)
+    torch.testing.assert_close(
+        winding_numbers(points, body.triangles), torch.tensor([2.0, 1.0, 0.0], dtype=D), rtol=0, atol=1e-12
+    )
+
+
+def test_overlapping_solids_have_no_walls_inside():
+    """Deep inside one of two boxes that overlap, a face of the other is near; the depth is that to the outside."""
+    both = Body([box_mesh((0, 0, 0), (2, 1, 1)), box_mesh((0.99, 0.3, 0.3), (3, 0.7, 0.7))])
+    found = both.distance_m(torch.tensor([[1.0, 0.5, 0.5], [2.5, 0.5, 0.5]], dtype=D))
+    torch.testing.assert_close(found, torch.tensor([-0.5, -0.2], dtype=D), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("turned", ["outward", "inward", "split at seams"])
+def test_winding_of_the_file_and_seams_do_not_matter(turned):
+    vertices, faces = box_mesh(*BOX)
+    if turned == "inward":
+        faces = faces[:, ::-1]
+    if turned == "split at seams":
+        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
+    body = Body([(vertices, faces)])
+    assert len(body.solids) == 1
+    points = torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.5]], dtype=D)
+    torch.testing.assert_close(
+        body.distance_m(points), torch.tensor([-0.1, 0.1], dtype=D), rtol=0, atol=1e-14
+    )
+
+
+def test_a_sheet_has_two_sides():
+    sheet = Body([([(-5, -5, 0), (5, -5, 0), (5, 5, 0), (-5, 5, 0)], [(0, 1, 2), (0, 2, 3)])])
+    points = torch.tensor([[0.3, 0.2, 2.0], [0.3, 0.2, -2.0]], dtype=D)
+    torch.testing.assert_close(sheet.distance_m(points), torch.tensor([2.0, 2.0], dtype=D))
+
+
+def test_one_file_with_two_things_makes_two_solids():
+    low, first = box_mesh((0, 0, 0), (1, 1, 1))
+    high, second = box_mesh((3, 0, 0), (4, 1, 1))
+    body = Body([(np.concatenate([low, high]), np.concatenate([first, second[:-1] + 8]))])
+    assert [len(solid) for solid in body.solids] == [12, 11]  # the other has a hole
+
+
+def test_gradient_of_the_distance(generator):
+    body = Body([box_mesh(*BOX), ball_mesh(0.2, 2)])
+    points = (0.8 * (torch.rand(40, 3, generator=generator, dtype=D) - 0.4)).requires_grad_()
+    assert torch.autograd.gradcheck(body.distances_m, (points,), eps=1e-7, atol=1e-6)
+    # on a face the slope is the normal: 1 outward
+    on_face = torch.tensor([[0.1, 0.05, 0.4]], dtype=D, requires_grad=True)
+    (slope,) = torch.autograd.grad(Body([box_mesh(*BOX)]).distance_m(on_face).sum(), on_face)
+    torch.testing.assert_close(slope[0], torch.tensor([0.0, 0.0, 1.0], dtype=D), rtol=0, atol=1e-12)
+
+
+def test_a_capsule_is_its_spheres(generator):
+    """The clearance of a capsule is the smallest of those of the balls along its axis: never more than that of any
+    sampled ball, and less by no more than half their spacing."""
+    body = Body([box_mesh(*BOX), ball_mesh(0.2, 2)])
+    poses = some_poses(generator, 60, 1.2)
+    housing = Housing(0.03, behind_m=0.12)
+    found = body.clearances_m(poses, housing)
+    share = torch.linspace(0, 0.12, 401, dtype=D)
+    axis = poses[:, None, :3, 3] - share[:, None] * poses[:, None, :3, 2]
+    sampled = (body.distances_m(axis) - 0.03).amin(1)
+    outside = sampled + 0.03 > 0
+    assert bool((found <= sampled + 1e-12)[outside].all())
+    assert bool((sampled - found <= 0.12 / 400 / 2 + 1e-12)[outside].all())
+    assert bool(((found < 0) == (sampled < 0)).all())
+    assert int((~outside).sum()) > 3
+    # inside, by the spacing of the points looked at
+    assert bool(((found - sampled).abs() <= 0.12 / 16 / 2 + 1e-12)[~outside].all())
+
+
+def test_a_capsule_that_pierces_a_sheet_has_no_room():
+    sheet = Body([([(-5, -5, 0), (5, -5, 0), (5, 5, 0), (-5, 5, 0)], [(0, 1, 2), (0, 2, 3)])])
+    pose = torch.eye(4, dtype=D)
+    pose[2, 3] = 0.0713  # looks up, its back goes down through the sheet
+    assert float(sheet.clearances_m(pose, Housing(0.02, behind_m=0.1))) == pytest.approx(-0.02, abs=1e-12)
+    assert float(sheet.clearances_m(pose, Housing(0.02, behind_m=0.05))) == pytest.approx(0.0013, abs=1e-12)
+
+
+def test_gradient_of_the_clearance_to_the_mount(generator):
+    body = Body([box_mesh(*BOX), ball_mesh(0.2, 2)])
+    poses = some_poses(generator, 10, 3.0)
+    for housing in (Housing(0.05), Housing(0.05, behind_m=0.2)):
+        tensor = poses.clone().requires_grad_()
+        assert torch.autograd.gradcheck(
+            lambda p, h=housing: body.clearances_m(p, h), (tensor,), eps=1e-7, atol=1e-6
+        )
+
+
+def test_rays_are_hidden_by_what_stands_before_them():
+    body = Body([box_mesh(*BOX)])
+    origin = torch.tensor([[1.0, 0.0, 0.2]] * 3, dtype=D)
+    direction = torch.tensor([[-2.0, 0.0, 0.0], [1.0, 0.0, 0.0], [-1.0, 0.5, 0.0]], dtype=D)
+    assert body.hidden(origin, direction).tolist() == [True, False, False]
+    found = first_crossings(origin, direction, body.triangles)
+    assert found.tolist() == [pytest.approx(0.35), math.inf, math.inf]  # 0.7 m in lengths of 2 m
+
+
+def test_the_rover_is_a_body_without_its_camera():
+    robot = robots.from_urdf(robots.ROVER)
+    camera = robot.frame("camera_link")[:3, 3]
+    whole = Body.of(robot.parts).distance_m(camera)
+    assert float(whole) == pytest.approx(
+        0.005, abs=1e-12
+    )  # the box of the camera ends 5 mm behind its origin
+    # the mast ends 50 mm below it and stands, 15 mm thick, 40 mm behind it
+    alone = Body.of(robot.parts, without=["camera_link"]).distance_m(camera)
+    rim = 0.04 - 0.015 * math.cos(math.pi / 48)  # of 48 faces: between its apothem and its radius
+    assert math.hypot(0.04 - 0.015, 0.05) - 1e-9 <= float(alone) <= math.hypot(rim, 0.05) + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "sentence"),
+    [
+        (lambda: Body([]), DomainError, "no triangles"),
+        (lambda: Body([([(0, 0, math.nan)] * 3, [(0, 1, 2)])]), DomainError, "vertices"),
+        (
+            lambda: Body([([(0, 0, 0)] * 3, [(0, 1, 3)])]),
+            DomainError,
+            "vertex 3; there are those from 0 to 2",
+        ),
+        (lambda: Body([([(0, 0)] * 3, [(0, 1, 2)])]), ShapeError, r"\[V, 3\]"),
+        (
+            lambda: Body([(box_mesh(*BOX)[0], np.concatenate([FACES[:-1], [FACES[-1][::-1]]]))]),
+            DomainError,
+            "turn different ways",
+        ),
+        (
+            lambda: Body.of(robots.from_urdf(robots.ROVER).parts, without=["arm"]),
+            DomainError,
+            "'arm'; there are",
+        ),
+        (lambda: Housing(0.0), DomainError, "radius_m is 0"),
+        (lambda: Housing(0.1, -1.0), DomainError, "behind_m is -1"),
+    ],
+)
+def test_bad_bodies_get_a_sentence(make, error, sentence):
+    with pytest.raises(error, match=sentence):
+        make()

@@ -1,0 +1,188 @@
+"""Velocity from flow fields: exact flow of random bodies through windows of a real lens, least squares written out,
+the covariance against many noisy draws, outliers."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from codesign import lens, pose, render
+from codesign.errors import DomainError, ShapeError
+from codesign.mount import FREE, PLANAR, EgoVelocity, Mount, body_flow, ground_depth, velocity_errors
+from codesign.types import FlowField
+from scenes import worlds
+
+D = torch.float64
+INTERVAL_S = 0.01
+WINDOWS = ((0, 0), (40, 20), (80, 60))
+TWIST_SCALE = torch.tensor([0.5, 0.3, 0.2, 0.3, 0.3, 0.5], dtype=D)
+
+
+@pytest.fixture(scope="module")
+def camera():
+    film = render.Film(112, 92, 32, 32, 0.3, WINDOWS)
+    return render.Camera(lens.load("cooke-triplet").requires_grad_(False), 32, 32, 0.3, 1, 0, film)
+
+
+@pytest.fixture(scope="module")
+def drive(camera):
+    """Mount, poses [N, 3, 4, 4] over flat ground, twists [N, 6], and the exact flow from first to last."""
+    generator = torch.Generator().manual_seed(3)
+    mount = Mount((0.2, 0.05, 0.5), (0.1, 0.1, 0.1), pitch_rad=1.0, yaw_rad=0.3)().detach()
+    twists = TWIST_SCALE * torch.randn(5, 6, generator=generator, dtype=D)
+    half = INTERVAL_S / 2 * torch.tensor([-1.0, 0.0, 1.0], dtype=D)
+    poses = pose.se3_exp(half[:, None] * twists[:, None]) @ mount
+    truth = [render.truth.true_flow(camera, worlds.smooth_plane(), each, stride=2) for each in poses]
+    assert all(bool(valid.all()) for _, valid in truth)
+    return mount, poses, twists, torch.cat([flow[0].detach().movedim(0, 1) for flow, _ in truth])
+
+
+def field_of(flow, deviation_px=0.1, confidence=1.0):
+    ones = torch.ones_like(flow[:, 0])
+    covariance = torch.stack([deviation_px**2 * ones, 0 * ones, deviation_px**2 * ones], 1)
+    return FlowField(flow, ones.bool(), INTERVAL_S, confidence * ones, covariance)
+
+
+@pytest.mark.parametrize("depth", ["ground", "scene"])
+def test_exact_flow_of_free_bodies_through_a_lens(camera, drive, depth):
+    mount, poses, twists, flow = drive
+    ours = EgoVelocity(FREE, (1e3,) * 6, depth)
+    found = ours(field_of(flow), camera, worlds.smooth_plane(), mount, poses)
+    # the mid-point rule leaves (w t)^2 / 24 of the flow, and points are read where half their flow leads, whose
+    # curvature is of that size: 1e-5 of the flow, in a system that tells turning from shifting ten times less well
+    torch.testing.assert_close(found.velocity, twists, rtol=0, atol=2e-4)
+
+
+def test_least_squares_written_out_with_covariance_and_confidence(camera, drive):
+    mount, poses, _, flow = drive
+    generator = torch.Generator().manual_seed(5)
+    noisy = flow + 0.1 * torch.randn(flow.shape, generator=generator, dtype=D)
+    xx, yy = 0.01 + torch.rand(2, *flow[:, 0].shape, generator=generator, dtype=D)
+    xy = 0.3 * (xx * yy).sqrt()
+    confidence = torch.rand(flow[:, 0].shape, generator=generator, dtype=D)
+    field = FlowField(noisy, confidence > 0, INTERVAL_S, confidence, torch.stack([xx, xy, yy], 1))
+    prior = (1.0, 0.5, 2.0)
+    ours = EgoVelocity(PLANAR, prior, every_px=8, floor_px=0.05, outlier=None)
+    found = ours(field, camera, None, mount, poses)
+    body = 2
+    normal = torch.diag(torch.tensor(prior, dtype=D) ** -2)
+    right = torch.zeros(3, dtype=D)
+    for window, (left, top) in enumerate(WINDOWS):
+        sample = body * len(WINDOWS) + window
+        for row in range(4, 32, 8):
+            for column in range(4, 32, 8):
+                seen = noisy[sample, :, row, column]
+                at = torch.tensor([left + column, top + row], dtype=D) + seen / 2
+                depth = ground_depth(camera, at[None, None], poses[body : body + 1, 1])
+                rows, _ = body_flow(camera, depth[0], mount, at[None])
+                j = rows[0][:, list(PLANAR)] * INTERVAL_S
+                c = xy[sample, row, column]
+                spread = torch.stack([xx[sample, row, column], c, c, yy[sample, row, column]]).reshape(2, 2)
+                precision = torch.linalg.inv(spread + 0.05**2 * torch.eye(2, dtype=D)) * 3 / 16
+                normal += confidence[sample, row, column] * j.T @ precision @ j
+                right += j.T @ precision @ seen
+    torch.testing.assert_close(found.velocity[body], torch.linalg.solve(normal, right), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(found.covariance[body], torch.linalg.inv(normal), rtol=1e-9, atol=1e-15)
+
+
+def test_the_covariance_is_that_of_many_draws(camera, drive):
+    """Flow of windows that err by an affine field each, with the covariance that such a field has."""
+    mount, poses, _, flow = drive
+    generator = torch.Generator().manual_seed(6)
+    y, x = torch.meshgrid(*[torch.linspace(-1, 1, 32, dtype=D)] * 2, indexing="ij")
+    basis = torch.stack([torch.ones_like(x), 0.7 * x, 0.7 * y])
+    sigma_px = 0.05
+    draws = 300
+    coefficients = sigma_px * torch.randn(draws, 3, 2, 3, generator=generator, dtype=D)
+    noisy = flow[:3] + torch.einsum("nwck,kyx->nwcyx", coefficients, basis)
+    variance = (sigma_px**2 * basis.square().sum(0)).expand(draws * 3, 32, 32)
+    covariance = torch.stack([variance, 0 * variance, variance], 1)
+    field = FlowField(noisy.flatten(0, 1), variance > 0, INTERVAL_S, torch.ones_like(variance), covariance)
+    ours = EgoVelocity(PLANAR, (10.0,) * 3, floor_px=1e-3, outlier=None)
+    found = ours(field, camera, None, mount, poses[:1].expand(draws, 3, 4, 4))
+    spread = torch.linalg.cholesky(found.covariance[0])
+    scaled = torch.linalg.solve_triangular(spread, (found.velocity - found.velocity.mean(0)).T, upper=False)
+    variances = torch.linalg.eigvalsh(scaled @ scaled.T / draws)
+    # that a window counts as three points is a rule for affine errors, not a fact of every direction
+    assert 0.3 < float(variances[0]) <= float(variances[-1]) < 3
+
+
+def test_windows_that_are_lost_do_not_lead_it_away(camera, drive):
+    mount, poses, twists, flow = drive
+    lost = flow.unflatten(0, (5, 3)).clone()
+    lost[:, 0] = 5.0 - lost[:, 0]
+    field = field_of(lost.flatten(0, 1))
+    errors = [
+        (EgoVelocity(PLANAR, (1.0,) * 3, **how)(field, camera, None, mount, poses).velocity)
+        - twists[:, list(PLANAR)]
+        for how in ({"steps": 12}, {"outlier": None})
+    ]
+    assert float(errors[0].abs().mean()) < 0.5 * float(errors[1].abs().mean())
+
+
+def test_unseen_flow_says_nothing(camera, drive):
+    mount, poses, _, flow = drive
+    ours = EgoVelocity(FREE, (1e3,) * 6)
+    found = ours(field_of(0 * flow, deviation_px=8.0, confidence=0.0), camera, None, mount, poses)
+    assert float(found.velocity.abs().max()) == 0
+    torch.testing.assert_close(found.covariance, 1e6 * torch.eye(6, dtype=D).expand(5, 6, 6))
+
+
+def test_what_is_not_valid_means_nothing_and_nan_that_is_valid_is_refused(camera, drive):
+    """NaN under a pixel that is not valid gives the same velocity as any number there; where the field claims to know,
+    it is refused."""
+    mount, poses, _, flow = drive
+    field = field_of(flow)
+    field.valid[:, 3:9] = False
+    field = replace(field, confidence=field.valid.double())
+    ours = EgoVelocity(FREE, (1e3,) * 6)
+
+    def solved(value, where):
+        given = replace(field, flow_px=torch.where(where[:, None], value, field.flow_px))
+        return ours(given, camera, None, mount, poses).velocity
+
+    torch.testing.assert_close(solved(torch.nan, ~field.valid), solved(1e3, ~field.valid), rtol=0, atol=0)
+    with pytest.raises(DomainError, match=r"flow of valid pixels: .* NaN"):
+        solved(torch.nan, field.valid)
+
+
+def test_gradient_to_the_mount(camera, drive):
+    mount, poses, _, flow = drive
+    body = poses[:1] @ torch.linalg.inv(mount)
+    ours = EgoVelocity(PLANAR, (1.0,) * 3, steps=2)
+
+    def velocity(shift):
+        turned = mount @ pose.se3_exp(shift)
+        return ours(field_of(flow[:3]), camera, None, turned, body @ turned).velocity[0]
+
+    found = torch.autograd.functional.jacobian(velocity, torch.zeros(6, dtype=D))
+    step = 1e-6
+    for axis, column in enumerate(found.T):
+        e = torch.zeros(6, dtype=D)
+        e[axis] = step
+        difference = (velocity(e) - velocity(-e)) / (2 * step)
+        # rounding 1e-12 over the step, truncation step^2
+        torch.testing.assert_close(column, difference, rtol=1e-5, atol=1e-6)
+
+
+def test_bad_input():
+    with pytest.raises(DomainError, match="depth is 'guess'"):
+        EgoVelocity(depth="guess")
+    with pytest.raises(DomainError, match="each of the 6 velocities"):
+        EgoVelocity(FREE)
+    with pytest.raises(DomainError, match="outlier"):
+        EgoVelocity(outlier=math.nan)
+    with pytest.raises(ShapeError, match="velocities are"):
+        velocity_errors(torch.zeros(2, 3), torch.zeros(2, 3), PLANAR)
+
+
+def test_scores_by_hand():
+    twist = torch.zeros(4, 6, dtype=D)
+    twist[:, 0] = torch.tensor([0.0, 1.0, 2.0, 4.0])
+    off = torch.tensor([[0.05, 0.0, 0.0], [0.0, -0.15, 0.0], [0.0, 0.0, 0.3], [9.0, 9.0, 9.0]], dtype=D)
+    errors = velocity_errors(twist[:, [0, 1, 5]] + off, twist, PLANAR)
+    torch.testing.assert_close(errors.squared()[:3], torch.tensor([1 / 3, 1 / 3, 4 / 3], dtype=D))
+    assert float(errors.bounded()[3]) == pytest.approx(1.0, abs=1e-3)
+    assert errors.table()["left"]["bias_m_s"] == pytest.approx((9 - 0.15) / 4)
+    assert errors.table()["yaw"]["p50_rad_s"] == pytest.approx(0.15)

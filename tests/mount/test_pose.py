@@ -1,0 +1,223 @@
+"""The mount's map against rotation matrices written by hand, its limits, and its gradient."""
+
+import math
+
+import pytest
+import torch
+
+from codesign import lens, pose, render
+from codesign.errors import DomainError, ShapeError
+from codesign.mount import Mount
+from codesign.mount.pose import yaw_pitch_roll_rad
+from codesign.pose import check_poses
+
+D = torch.float64
+NOMINAL = (0.2, -0.1, 0.4)
+HALF = (0.1, 0.05, 0.2)
+
+
+def axes(mount):
+    """Camera x (right), y (down), z (view) in body axes."""
+    return mount().detach()[:3, :3].unbind(1)
+
+
+@pytest.mark.parametrize(
+    ("angles", "right", "view"),
+    [
+        ({}, (0, -1, 0), (1, 0, 0)),  # level, forward: image right is the body's right
+        ({"yaw_rad": math.pi / 2}, (1, 0, 0), (0, 1, 0)),  # yaw turns the view to the left
+        ({"pitch_rad": math.pi / 2}, (0, -1, 0), (0, 0, -1)),  # pitch tilts it down
+        ({"roll_rad": math.pi / 2}, (0, 0, -1), (1, 0, 0)),
+        ({"yaw_rad": math.pi / 2, "pitch_rad": math.pi / 6}, (1, 0, 0), (0, math.cos(math.pi / 6), -0.5)),
+    ],
+)
+def test_known_attitudes(angles, right, view):
+    x, y, z = axes(Mount(NOMINAL, HALF, **angles))
+    torch.testing.assert_close(x, torch.tensor(right, dtype=D), rtol=0, atol=1e-15)
+    torch.testing.assert_close(z, torch.tensor(view, dtype=D), rtol=0, atol=1e-15)
+    torch.testing.assert_close(y, torch.linalg.cross(z, x), rtol=0, atol=1e-15)
+
+
+def test_angles_are_read_back(generator):
+    for yaw, pitch, roll in (
+        (torch.rand(20, 3, generator=generator, dtype=D) * 2 - 1) * torch.tensor([3.1, 1.5, 3.1], dtype=D)
+    ).tolist():
+        mount = Mount(NOMINAL, HALF, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll)
+        torch.testing.assert_close(
+            yaw_pitch_roll_rad(mount().detach()),
+            torch.tensor([yaw, pitch, roll], dtype=D),
+            rtol=0,
+            atol=1e-13,
+        )  # atan2 near the pole: rounding over cos 1.5
+
+
+@pytest.mark.parametrize("up", [1.0, -1.0])
+def test_angles_of_a_view_straight_up_or_down_have_a_gradient(up):
+    """There only yaw and roll together mean something: turned about the vertical by h, yaw grows by h, and the other
+    two angles stay what they are."""
+    upright = torch.eye(4, dtype=D)  # a camera's z axis is the body's: straight up
+    upright[1:3, 1:3] *= up
+    angle = torch.zeros((), dtype=D, requires_grad=True)
+
+    def turned(h):
+        zero = torch.zeros_like(h)
+        return yaw_pitch_roll_rad(pose.se3_exp(torch.stack([zero, zero, zero, zero, zero, h])) @ upright)
+
+    step = 1e-5
+    differences = (turned(torch.tensor(step, dtype=D)) - turned(torch.tensor(-step, dtype=D))) / (2 * step)
+    slopes = torch.stack([torch.autograd.grad(turned(angle)[k], angle)[0] for k in range(3)])
+    torch.testing.assert_close(differences, torch.tensor([1.0, 0.0, 0.0], dtype=D), rtol=0, atol=1e-10)
+    torch.testing.assert_close(slopes, differences, rtol=0, atol=1e-10)
+    yaw, pitch, roll = turned(angle).detach().tolist()
+    again = Mount(NOMINAL, HALF, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll)().detach()
+    torch.testing.assert_close(again[:3, :3], upright[:3, :3], rtol=0, atol=1e-15)
+
+
+def test_positions_stay_in_the_box_and_rotations_are_free(generator):
+    numbers = 4 * torch.randn(200, 6, generator=generator, dtype=D)
+    poses = Mount(NOMINAL, HALF)(numbers).detach()
+    check_poses(poses)
+    offset = (poses[:, :3, 3] - torch.tensor(NOMINAL, dtype=D)).abs() / torch.tensor(HALF, dtype=D)
+    assert float(offset.max()) <= 1 + 1e-15
+    assert float(offset.max()) > 0.99  # the whole box is in reach
+    assert float(poses[:, 2, 2].min()) < -0.9  # and every direction: down and
+    assert float(poses[:, 2, 2].max()) > 0.9  # up
+
+
+def test_start_position_is_kept_and_a_zero_range_holds_an_axis():
+    mount = Mount(NOMINAL, (0.1, 0.0, 0.2), position_m=(0.25, -0.1, 0.25))
+    torch.testing.assert_close(
+        mount().detach()[:3, 3], torch.tensor([0.25, -0.1, 0.25], dtype=D), rtol=0, atol=1e-15
+    )
+    moved = mount(torch.full((6,), 2.0, dtype=D))
+    assert float(moved[1, 3]) == -0.1
+
+
+@pytest.mark.parametrize(
+    "pitch", [0.3, math.pi / 2]
+)  # straight down, where yaw and roll are one, is no special case
+def test_gradient_of_the_pose(generator, pitch):
+    mount = Mount(NOMINAL, HALF, yaw_rad=0.4, pitch_rad=pitch)
+    numbers = (0.5 * torch.randn(2, 6, generator=generator, dtype=D)).requires_grad_()
+    assert torch.autograd.gradcheck(mount, (numbers,), atol=1e-8)
+    jacobian = torch.autograd.functional.jacobian(mount, torch.zeros(6, dtype=D))
+    assert torch.linalg.matrix_rank(jacobian.reshape(16, 6)) == 6
+
+
+def test_a_moving_body_carries_its_camera():
+    mount = Mount((0.2, 0.0, 0.4), HALF, pitch_rad=math.pi / 2)
+    turned = torch.tensor(
+        [[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=D
+    )  # body at (5, 6), heading +y
+    pose = mount.in_world(turned).detach()
+    torch.testing.assert_close(pose[:3, 3], torch.tensor([5.0, 6.2, 0.4], dtype=D), rtol=0, atol=1e-15)
+    torch.testing.assert_close(
+        pose[:3, 1], torch.tensor([0.0, -1, 0], dtype=D), rtol=0, atol=1e-15
+    )  # image down is backward
+
+
+def far_points(camera, mount, depth_m):
+    """Points in body axes under a lattice of pixels."""
+    pixels = camera.film.pixels()[::7]
+    rays = camera.chief_rays(pixels)
+    length = (depth_m - rays.origin_m[:, 2:]) / rays.direction[:, 2:]
+    return pose.apply(mount(), rays.origin_m + length * rays.direction).detach()
+
+
+@pytest.mark.parametrize("optics", ["pinhole", "cooke-triplet"])
+@pytest.mark.parametrize("depth_m", [0.8, 3.0])
+@pytest.mark.parametrize("position_m", [NOMINAL, (0.25, -0.09, 0.3)])
+@torch.no_grad()
+def test_a_unit_of_every_number_moves_the_image_by_the_natural_step(optics, depth_m, position_m):
+    optic = lens.Pinhole(11.0) if optics == "pinhole" else lens.load(optics).scaled(0.22)
+    camera = render.Camera(optic, 48, 36, 0.15, 1)
+    mount = Mount(NOMINAL, HALF, yaw_rad=0.4, pitch_rad=0.6, position_m=position_m)
+    mount.numbers[3:] = torch.tensor([0.2, -0.1, 0.3], dtype=D)
+    before = mount().clone()
+    assert mount.variables(camera, depth_m, step_px=0.1)[0] is mount.numbers
+    torch.testing.assert_close(mount(), before, rtol=0, atol=1e-15)
+    unit = mount.unit.clone()
+    mount.variables(camera, depth_m, step_px=0.1)  # asked again it says the same
+    torch.testing.assert_close(mount.unit, unit, rtol=1e-12, atol=0)
+    points = far_points(camera, mount, depth_m)
+    base = render.project(camera, pose.apply(pose.inverse(mount()), points))
+    for i in range(6):
+        mount.numbers[i] += 1
+        moved = render.project(camera, pose.apply(pose.inverse(mount()), points)) - base
+        mount.numbers[i] -= 1
+        assert float(moved.square().sum(1).nanmean().sqrt()) == pytest.approx(
+            0.1, rel=0.1
+        )  # a larger step meets the walls of the box
+
+
+def test_one_learning_rate_serves_lens_and_mount():
+    camera = render.Camera(lens.load("cooke-triplet").scaled(0.22), 32, 24, 0.2, 1)
+    mount = Mount(NOMINAL, HALF, pitch_rad=0.6)
+    wanted = render.project(camera, torch.tensor([[0.1, 0.2, 1.0], [-0.2, 0.1, 1.5]], dtype=D)).detach() + 0.8
+    variables = [*camera.lens.variables("curvature", "focus", step_mm=0.2), *mount.variables(camera, 1.2)]
+    points = pose.apply(mount(), torch.tensor([[0.1, 0.2, 1.0], [-0.2, 0.1, 1.5]], dtype=D)).detach()
+    optimiser = torch.optim.Adam(variables, lr=0.05)
+
+    def loss():
+        return (render.project(camera, pose.apply(pose.inverse(mount()), points)) - wanted).square().mean()
+
+    start = float(loss().detach())
+    for _ in range(50):
+        optimiser.zero_grad()
+        loss().backward()
+        optimiser.step()
+    assert float(loss().detach()) < 1e-2 * start
+    assert all(float(v.detach().abs().max()) > 0.01 for v in variables)
+
+
+def test_held_and_weak_numbers_keep_their_unit():
+    camera = render.Camera(lens.Pinhole(11.0), 8, 8, 0.5, 1)
+    mount = Mount(NOMINAL, (0.1, 0.0, 1e-6))
+    mount.variables(camera, 100.0)
+    assert mount.unit[1:3].tolist() == [1.0, 1.0]
+    other = Mount(NOMINAL, (0.1, 0.0, 1e-6))
+    other.load_state_dict(mount.state_dict())
+    assert torch.equal(other(), mount())
+    assert torch.equal(other.unit, mount.unit)
+
+
+def test_depths_of_a_picture_count_where_there_is_a_surface():
+    camera = render.Camera(lens.Pinhole(11.0), 8, 8, 0.5, 1)
+    depth = torch.full((64,), 2.0, dtype=D)
+    depth[:20] = math.nan
+    depth[20:24] = -1.0
+    found = Mount(NOMINAL, (0.4, 0.3, 0.2))
+    found.variables(camera, depth)
+    same = Mount(NOMINAL, (0.4, 0.3, 0.2))
+    same.variables(camera, 2.0)
+    # a shift across the view moves every pixel alike
+    torch.testing.assert_close(found.unit[1:3], same.unit[1:3], rtol=1e-9, atol=0)
+    # pixels per metre at 2 m: 11 mm / 0.5 mm / 2 m
+    assert same.unit[1:3].tolist() == pytest.approx([1 / (11 * 0.3), 1 / (11 * 0.2)], rel=1e-6)
+    with pytest.raises(DomainError, match="no pixel sees a surface"):
+        Mount(NOMINAL, HALF).variables(camera, torch.zeros(64, dtype=D))
+    with pytest.raises(ShapeError, match=r"one number or \[64\]"):
+        Mount(NOMINAL, HALF).variables(camera, depth[:5])
+    with pytest.raises(DomainError, match="step_px is 0"):
+        Mount(NOMINAL, HALF).variables(camera, 1.0, step_px=0)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "sentence"),
+    [
+        (lambda: Mount((0, 0, math.nan), HALF), DomainError, "nominal_m"),
+        (lambda: Mount(NOMINAL, (0.1, -0.1, 0.1)), DomainError, "at least 0"),
+        (lambda: Mount(NOMINAL, HALF, yaw_rad=math.inf), DomainError, "yaw_rad"),
+        (
+            lambda: Mount(NOMINAL, HALF, position_m=(0.31, -0.1, 0.4)),
+            DomainError,
+            "not strictly inside the allowed box",
+        ),
+        (lambda: Mount((0, 0), HALF), ShapeError, "three numbers"),
+        (lambda: Mount(NOMINAL, HALF)(torch.zeros(5, dtype=D)), ShapeError, r"\[..., 6\]"),
+        (lambda: Mount(NOMINAL, HALF)(torch.full((6,), math.nan, dtype=D)), DomainError, "last finite"),
+    ],
+)
+def test_bad_input_gets_a_sentence(make, error, sentence):
+    with pytest.raises(error, match=sentence):
+        make()

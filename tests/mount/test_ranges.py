@@ -1,0 +1,126 @@
+"""Shares of bounds to mounts and back: against rotations written by hand, differences, and bad bounds."""
+
+import math
+
+import pytest
+import torch
+
+from codesign.errors import DomainError, ShapeError
+from codesign.mount import Mount, MountRanges
+from codesign.pose import check_poses
+from scenes.robot_pairs import PAIRS
+
+D = torch.float64
+LOW = (0.1, -0.2, 0.3, -2.0, -1.4, -3.0)
+HIGH = (0.3, 0.1, 0.7, 3.0, 1.5, 3.0)
+
+
+def changed(bounds, k, value):
+    return tuple(value if i == k else each for i, each in enumerate(bounds))
+
+
+def test_directions_of_known_angles(generator):
+    """Columns of the rotation: the view by its azimuth and elevation, the image's right level before it rolls."""
+    share = torch.rand(3, 7, 6, generator=generator, dtype=D)
+    poses = MountRanges(LOW, HIGH).pose(share)
+    check_poses(poses)
+    numbers = torch.tensor(LOW, dtype=D) + share * (torch.tensor(HIGH, dtype=D) - torch.tensor(LOW, dtype=D))
+    torch.testing.assert_close(poses[..., :3, 3], numbers[..., :3], rtol=0, atol=1e-15)
+    yaw, pitch, roll = numbers[..., 3:].unbind(-1)
+    view = torch.stack([yaw.cos() * pitch.cos(), yaw.sin() * pitch.cos(), -pitch.sin()], -1)
+    level = torch.stack([yaw.sin(), -yaw.cos(), torch.zeros_like(yaw)], -1)
+    right = level * roll.cos()[..., None] + torch.linalg.cross(view, level) * roll.sin()[..., None]
+    down = torch.linalg.cross(view, right)
+    for column, expected in enumerate((right, down, view)):
+        torch.testing.assert_close(poses[..., :3, column], expected, rtol=0, atol=1e-14)
+
+
+def test_shares_are_read_back(generator):
+    ranges = MountRanges(LOW, HIGH)
+    share = torch.rand(50, 6, generator=generator, dtype=D)
+    # angles near the pole (1.5 of pi / 2) lose 1 / cos 1.5 = 14 times eps
+    torch.testing.assert_close(ranges.share_at(ranges.pose(share)), share, rtol=0, atol=1e-13)
+
+
+def test_angles_are_read_back_where_they_lie_beyond_half_a_turn(generator):
+    """A mount that looks backwards: yaw around pi, where its arc tangent changes sign."""
+    ranges = MountRanges(changed(LOW, 3, math.pi - 1), changed(HIGH, 3, math.pi + 1))
+    share = torch.rand(50, 6, generator=generator, dtype=D)
+    torch.testing.assert_close(ranges.share_at(ranges.pose(share)), share, rtol=0, atol=1e-13)
+
+
+def test_a_held_number_stays_and_has_the_middle_share(generator):
+    ranges = MountRanges(LOW, changed(changed(HIGH, 1, LOW[1]), 4, LOW[4]))
+    share = torch.rand(9, 6, generator=generator, dtype=D)
+    numbers = ranges.numbers(share)
+    assert numbers[:, [1, 4]].unique(dim=0).tolist() == [[LOW[1], LOW[4]]]
+    middle = changed(changed(tuple(share.T), 1, torch.full((9,), 0.5)), 4, torch.full((9,), 0.5))
+    expected = torch.stack([each.double() for each in middle], 1)
+    torch.testing.assert_close(ranges.share_at(ranges.pose(share)), expected, rtol=0, atol=1e-13)
+    torch.testing.assert_close(ranges.clamped(share), expected, rtol=0, atol=0)
+
+
+def test_bounds_are_met_exactly_and_shares_beyond_are_clamped():
+    ranges = MountRanges(LOW, HIGH)
+    ends = ranges.numbers(torch.tensor([[0.0], [1.0]], dtype=D).expand(2, 6))
+    assert ends.tolist() == [list(LOW), list(HIGH)]
+    beyond = ranges.clamped(torch.tensor([-0.1, 0.0, 0.3, 1.0, 1.1, 7.0], dtype=D))
+    assert beyond.tolist() == [0.0, 0.0, 0.3, 1.0, 1.0, 1.0]
+
+
+def test_gradient_against_differences(generator):
+    ranges = MountRanges(LOW, changed(HIGH, 1, LOW[1]))
+    share = torch.rand(2, 3, 6, generator=generator, dtype=D).requires_grad_()
+    assert torch.autograd.gradcheck(ranges.pose, (share,), atol=1e-8)
+    (slope,) = torch.autograd.grad(ranges.pose(share)[..., 1, 3].sum(), share)
+    assert slope[..., 1].tolist() == [[0.0] * 3] * 2, "what is held is not learned"
+
+
+@pytest.mark.parametrize(
+    ("k", "low", "high", "sentence"),
+    [
+        (2, 0.5, 0.4, r"z_m goes from 0\.5 to 0\.4; give the lower bound first"),
+        (4, 0.0, math.pi / 2, r"pitch_rad goes from 0 to 1\.57.*strictly between"),
+        (4, -2.0, 0.0, r"pitch_rad .*strictly between"),
+        (3, -3.2, 3.2, r"yaw_rad .* more than a turn"),
+        (5, 0.0, 7.0, r"roll_rad .* more than a turn"),
+        (0, math.nan, 1.0, "NaN or infinite"),
+        (1, 0.0, math.inf, "NaN or infinite"),
+    ],
+)
+def test_bad_bounds(k, low, high, sentence):
+    with pytest.raises(DomainError, match=sentence):
+        MountRanges(changed(LOW, k, low), changed(HIGH, k, high))
+
+
+def test_bad_shapes_and_mounts():
+    ranges = MountRanges(LOW, HIGH)
+    with pytest.raises(ShapeError, match=r"low needs six numbers \(x_m, .*got shape \(3,\)"):
+        MountRanges(LOW[:3], HIGH)
+    with pytest.raises(ShapeError, match=r"shares are \[\.\.\., 6\].*got \(5,\)"):
+        ranges.pose(torch.zeros(5))
+    with pytest.raises(DomainError, match="shares: 1 of 6 values"):
+        ranges.pose(torch.tensor([0.5, 0.5, math.nan, 0.5, 0.5, 0.5]))
+    inside = ranges.pose(torch.full((2, 6), 0.5, dtype=D))
+    inside[1, 2, 3] = 0.8
+    with pytest.raises(DomainError, match=r"z_m = 0\.8, outside 0\.3 to 0\.7"):
+        ranges.share_at(inside)
+    inside[1, 2, 3] = 0.5
+    inside[1, :3, :3] *= 2
+    with pytest.raises(DomainError, match="not rigid"):
+        ranges.share_at(inside)
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_pairs_start_within_their_ranges(name):
+    pair = PAIRS[name]()
+    mount = pair.design.mount()
+    share = pair.ranges.share_at(mount)
+    torch.testing.assert_close(pair.ranges.pose(share), mount, rtol=0, atol=1e-14)
+    assert bool(((share > 0) & (share < 1)).all()), "the default design is off every bound"
+
+
+def test_the_same_attitude_as_a_mount():
+    ranges = MountRanges((0.2, 0, 0, 0.3, -0.4, 0.5), (0.2, 0, 0, 0.3, -0.4, 0.5))
+    mount = Mount((0.2, 0.0, 0.0), (0.0, 0.0, 0.0), yaw_rad=0.3, pitch_rad=-0.4, roll_rad=0.5)
+    torch.testing.assert_close(ranges.pose(torch.rand(6)), mount().detach(), rtol=0, atol=0)

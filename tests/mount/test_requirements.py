@@ -1,0 +1,206 @@
+"""What a mount has to keep, against trigonometry and counting, and slopes against differences."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from codesign import lens, render
+from codesign.errors import DomainError, ShapeError
+from codesign.mount import Body, CableSide, Clearance, Housing, LookAhead, Mount, judge, penalty, scene_depth
+from scenes import worlds
+
+D = torch.float64
+HEIGHT = 0.4
+STILL = (0.0, 0.0, 0.0)
+NOTHING: Any = None
+
+
+def mount_at(pitch_rad, position=(0.0, 0.0, HEIGHT), **angles):
+    return Mount(position, STILL, pitch_rad=pitch_rad, **angles)().detach()
+
+
+def camera_of(focal_mm=3.4, width=24, height=16, pitch_mm=0.2):
+    return render.Camera(lens.Pinhole(focal_mm), width, height, pitch_mm, 1)
+
+
+@pytest.fixture(scope="module")
+def camera():
+    return camera_of()
+
+
+@pytest.fixture(scope="module")
+def cube():
+    corners = torch.cartesian_prod(*[torch.tensor([-0.1, 0.1], dtype=D)] * 3)
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return Body([(corners, [(a, b, c) for a, b, c, _ in sides] + [(a, c, d) for a, _, c, d in sides])])
+
+
+def test_clearance_is_that_of_the_housing_less_the_margin(cube, camera):
+    kept = Clearance(cube, Housing(0.03), margin_m=0.02)
+    assert float(kept.slack(mount_at(0.3), camera)) == pytest.approx(HEIGHT - 0.1 - 0.03 - 0.02, abs=1e-14)
+    assert float(kept.exact(mount_at(0.3, (0.12, 0.0, 0.0)), camera)) == pytest.approx(-0.03, abs=1e-14)
+
+
+@pytest.mark.parametrize("angle_deg", [5, 29.9, 30.1, 90, 179])
+def test_the_cable_side_is_an_angle(camera, angle_deg):
+    """A camera pitched down by p has its back p above the rear: from straight back it is p away."""
+    requirement = CableSide((-2.0, 0.0, 0.0), math.radians(30))
+    slack = float(requirement.slack(mount_at(math.radians(angle_deg)), camera))
+    assert (slack >= 0) == (angle_deg >= 30)
+    over = math.radians(angle_deg - 30)
+    assert float(requirement.exact(mount_at(math.radians(angle_deg)), camera)) == pytest.approx(
+        over, abs=1e-12
+    )
+    if abs(over) < 0.01:
+        assert slack == pytest.approx(over, abs=over**2)  # cos to second order over sin 30 degrees
+
+
+def beyond(camera, T_body_cam, distance_m):
+    """Whether each pixel sees beyond: rays followed to the ground one by one."""
+    rays = camera.chief_rays(camera.film.pixels())
+    found = []
+    for direction in (rays.direction.double() @ T_body_cam[:3, :3].mT).tolist():
+        x, _, z = T_body_cam[:3, 3].tolist()
+        if z + 1e9 * direction[2] > 0:
+            found.append(direction[0] >= 0)
+        else:
+            found.append(direction[0] >= 0 and x - z / direction[2] * direction[0] >= distance_m)
+    return torch.tensor(found)
+
+
+@pytest.mark.parametrize(
+    "angles", [{}, {"roll_rad": 0.3}, {"yaw_rad": 0.8}, {"yaw_rad": 2.0, "roll_rad": -1.0}]
+)
+@pytest.mark.parametrize("pitch_rad", [-0.4, 0.2, 0.6, 1.3])
+def test_what_looks_ahead_is_counted(camera, pitch_rad, angles):
+    pose = mount_at(pitch_rad, (0.2, -0.1, HEIGHT), **angles)
+    counted = beyond(camera, pose, 2.0)
+    ahead = LookAhead(2.0, share=0.25)
+    assert torch.equal(ahead.angles(pose, camera) >= 0, counted)
+    assert (float(ahead.exact(pose, camera)) >= 0) == (float(counted.double().mean()) >= 0.25)
+
+
+@pytest.mark.parametrize("share", [0.001, 0.1, 0.5, 0.77, 1.0])
+def test_the_exact_answer_changes_with_the_last_pixel(camera, share):
+    """Over pitches, a share of the picture is kept exactly as long as so many pixels are counted."""
+    ahead = LookAhead(1.5, share=share)
+    for pitch in torch.linspace(0.0, 1.2, 30).tolist():
+        pose = mount_at(pitch)
+        counted = int(beyond(camera, pose, 1.5).sum())
+        assert (float(ahead.exact(pose, camera)) >= 0) == (counted >= share * 384 - 1e-9)
+
+
+def test_the_middle_row_sees_at_the_horizon_of_the_distance(camera):
+    """Half of a level picture lies above the axis: its slack is the angle from the axis down to the line."""
+    pose = mount_at(0.1)
+    ahead = LookAhead(2.0, share=0.5)
+    rows_of_middle = math.atan(0.5 * 0.2 / 3.4)  # half a pixel above the axis
+    down_to_line = math.atan(HEIGHT / 2.0)
+    expected = math.sin(down_to_line - (0.1 - rows_of_middle)) * 1.0
+    # at the corner of that row the ray is longer by 1 / cos of its azimuth, 35 degrees
+    corner = 1 / math.hypot(1, math.tan(math.atan(11.5 * 0.2 / 3.4)))
+    assert corner * expected - 0.01 <= float(ahead.exact(pose, camera)) <= expected + 1e-12
+
+
+def test_before_a_scene_as_over_its_plane(camera):
+    """The ground as a scene: what is counted beyond the distance is the same."""
+    plane = worlds.smooth_plane()
+
+    def depth(camera, pixels, T_body_cam):
+        return scene_depth(camera, pixels[None], T_body_cam[None], plane)[0]
+
+    for pitch in (0.2, 0.5, 0.9):
+        pose = mount_at(pitch, roll_rad=0.2)
+        flat = LookAhead(1.5, share=0.3)
+        seen = LookAhead(1.5, share=0.3, depth=depth)
+        assert torch.equal(flat.angles(pose, camera) >= 0, seen.angles(pose, camera) >= 0)
+        found = seen.angles(pose, camera)
+        met = found < 1
+        # x metres ahead on the ground by the depth of the plane, (x - d) / hypot(x, d)
+        assert float(found[met].max()) < 1
+    up = LookAhead(1.5, share=0.3, depth=depth).angles(mount_at(-0.9), camera)
+    assert torch.equal(up, torch.ones_like(up))
+
+
+def requirements(cube, depth=None):
+    return (
+        Clearance(cube, Housing(0.03, behind_m=0.06), margin_m=0.2),
+        CableSide((-1.0, 0.0, 0.2), 1.0, step=0.5),
+        LookAhead(2.0, share=0.4, smooth=0.2),
+    )
+
+
+def test_gradient_of_every_slack_to_the_mount(cube, camera, generator):
+    mount = Mount((0.0, 0.0, HEIGHT), (0.2, 0.2, 0.1), pitch_rad=0.3, roll_rad=0.1)
+    numbers = (0.3 * torch.randn(6, generator=generator, dtype=D)).requires_grad_()
+    for each in requirements(cube):
+        # a difference of 1e-7 seldom swaps two ranks, and a swap of equal angles changes nothing to first order
+        assert torch.autograd.gradcheck(
+            lambda x, r=each: r.slack(mount(x), camera), (numbers,), eps=1e-7, atol=1e-6
+        ), each.name
+
+
+def test_gradient_of_the_look_ahead_to_the_focal_length():
+    ahead = LookAhead(2.0, share=0.2, smooth=0.2)
+    pose = mount_at(0.5, roll_rad=0.1)
+    focal = torch.tensor(3.4, dtype=D, requires_grad=True)
+
+    def slack(value):
+        return ahead.slack(pose, camera_of(value)).sum()
+
+    (slope,) = torch.autograd.grad(slack(focal), focal)
+    with torch.no_grad():
+        difference = float(slack(focal + 1e-5) - slack(focal - 1e-5)) / 2e-5
+    assert float(slope) == pytest.approx(difference, rel=1e-6)
+    assert float(slope) < -1e-3  # a longer lens sees less of the far ground
+
+
+def test_penalty_pushes_before_the_limit_and_is_smooth(cube, camera):
+    wanted = Clearance(cube, Housing(0.03), step=0.05)
+    height = torch.linspace(0.13, 0.25, 200, dtype=D, requires_grad=True)
+    poses = mount_at(0.0).repeat(200, 1, 1)
+    poses = (
+        poses
+        + torch.eye(4, dtype=D)[2][:, None] * torch.eye(4, dtype=D)[3] * (height - HEIGHT)[:, None, None]
+    )
+    found = penalty([wanted], poses, camera)
+    over = (1 - (height.detach() - 0.13) / 0.05).clamp_min(0)
+    torch.testing.assert_close(found.detach(), over**2, rtol=0, atol=1e-12)
+    (slope,) = torch.autograd.grad(found.sum(), height)
+    torch.testing.assert_close(slope, -2 * over / 0.05, rtol=0, atol=1e-9)
+    assert float(penalty([], poses, camera).abs().max()) == 0
+
+
+def test_a_search_by_penalty_ends_where_all_is_kept(cube, camera):
+    mount = Mount((0.0, 0.0, 0.2), (0.3, 0.3, 0.3), pitch_rad=1.4)
+    wanted = [Clearance(cube, Housing(0.1), margin_m=0.05), LookAhead(2.0, share=0.4)]
+    assert [verdict.kept for verdict in judge(wanted, mount(), camera)] == [False, False]
+    optimiser = torch.optim.Adam(mount.parameters(), lr=0.03)
+    for _ in range(100):
+        optimiser.zero_grad()
+        penalty(wanted, mount(), camera).backward()
+        optimiser.step()
+    verdicts = judge(wanted, mount().detach(), camera)
+    assert [verdict.kept for verdict in verdicts] == [True, True]
+    assert str(verdicts[0]).startswith("clearance: kept with 0.")
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "sentence"),
+    [
+        (lambda: CableSide((0, 0, 0), 0.3), DomainError, "not all 0"),
+        (lambda: CableSide((0, 0, 1), 4.0), DomainError, "between 0 and pi"),
+        (lambda: LookAhead(-1.0, 0.3), DomainError, "distance_m is -1"),
+        (lambda: LookAhead(1.0, 1.3), DomainError, "share is 1.3"),
+        (lambda: LookAhead(1.0, 0.3, ahead=(1, 0, 1)), DomainError, "level"),
+        (lambda: LookAhead(1.0, 0.3).slack(mount_at(0.1), NOTHING), DomainError, "looks through the camera"),
+        (lambda: Clearance(NOTHING, Housing(0.1), margin_m=-1), DomainError, "margin_m is -1"),
+        (lambda: Clearance(NOTHING, Housing(0.1), step=0), DomainError, "step is 0"),
+        (lambda: judge([], mount_at(0.1)[None], NOTHING), ShapeError, r"one mount \[4, 4\]"),
+    ],
+)
+def test_bad_input_gets_a_sentence(make, error, sentence):
+    with pytest.raises(error, match=sentence):
+        make()
