@@ -27,7 +27,6 @@ GROUPS = {
         "silhouettes",
         "silhouettes_chain",
         "light_levels",
-        "robot_view",
         "make_dataset",
     ),
     "events": (
@@ -52,9 +51,7 @@ GROUPS = {
         "lens_opt_seeds",
         "joint_design",
         "placement",
-        "mount_sight",
         "velocity_head",
-        "robot_gates",
         "placement_step",
         "gradient_flow",
         "speed_error",

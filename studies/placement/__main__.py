@@ -1,5 +1,5 @@
 """Where to mount the camera on a robot: gradient steps in the six numbers of its pose, beside random and coordinate search,
-CMA-ES and TPE at equal renders.
+CMA-ES and TPE at equal renders; with --look only the robot, what its camera sees, and what it is blind to.
 
 A robot drives through its worlds and reads its velocity off event flow (scenes/robot_pair.py, or a robot of your own:
 --robot). The gradient is that of the error to be expected: from the covariance that the flow's estimator claims, flow
@@ -12,18 +12,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-
 from codesign.errors import DomainError
 from scenes import robot_pair
 from scenes.robot_check import check_pair
 from scenes.robot_own import own_pair
 from scenes.robot_pairs import PAIRS
 from studies.frame.run import Run, StudyConfig, main
+from studies.placement.look import look, size_in_words
 from studies.placement.outcome import Outcome
 from studies.placement.page import report
 from studies.placement.problem import DRIVES, Problem, traced_camera
-from studies.placement.race import Race, certified, check_grid, feasible, judge, judge_along
+from studies.placement.race import Race, feasible
 from studies.placement.searches import SEARCHES, available
 
 SPREAD = 12  # worlds of a step at most
@@ -58,20 +57,12 @@ class Config(StudyConfig):
     """Drives in each of the worlds of a step, twelve of them at most."""
     searches: tuple[str, ...] = tuple(SEARCHES)
     """Searches beside the gradient."""
-    rivals_expect: bool = False
-    """Searches beside the gradient minimise what it descends, instead of errors with hard counts."""
-    rivals_fresh: bool = False
-    """Searches beside the gradient see other drives at every mount, as its steps do, instead of always the same."""
-    grid: int = 0
-    """Mounts of a quasi-random grid that is refined twice, the best of each cube looked at again; 0 for none."""
     judged_worlds: int = 12
     """Unseen worlds."""
     judged_drives: int = 8
     """Drives in each."""
-    along: int = 1
-    """Parts of the renders after each of which what a search has is judged; 1: only the end."""
-    certified: int = 0
-    """Draws in which the gradient is compared with differences before it is used, 0 for none."""
+    look: bool = False
+    """Search nothing: draw the robot with its camera's view, and say what its mount keeps, sees and is blind to."""
 
 
 def study(run: Run[Config]) -> None:
@@ -84,6 +75,9 @@ def study(run: Run[Config]) -> None:
     if size.robot:
         run.say(size_in_words(pair))
     camera = traced_camera(pair, size.lens, size.focal_mm) if size.lens else pair.design.camera()
+    if size.look:
+        look(run, pair, camera)
+        return
     check_pair(pair, camera, (0, robot_pair.UNSEEN_FROM) if size.robot else (0,))
     spread = min(SPREAD, size.worlds)
     problem = Problem(pair, robot_pair.training(size.worlds), spread, size.per_world, camera=camera)
@@ -91,24 +85,11 @@ def study(run: Run[Config]) -> None:
     unseen = Problem(pair, judged_in, size.judged_worlds, size.judged_drives, camera=camera)
     race = Race(run, problem)
     starts = feasible(problem, size.seeds, size.seed, [problem.start] if size.robot else [])
-    check_grid(problem, size.grid, size.seed)
-    ways = certified(run, race, starts[0])
     for number, start in enumerate(starts):
-        race.descent(number, start, ways)
+        race.descent(number, start)
         for name in size.searches:
             race.search(number, name, start)
-    if size.grid:
-        race.grid()
-    judged = judge(run, race, unseen, starts)
-    along = judge_along(run, race, unseen, judged, len(starts))
-    report(run, Outcome(race, unseen, judged, along, ways))
-
-
-def size_in_words(pair: robot_pair.RobotPair) -> str:
-    """How large a robot is, by which a wrong unit or axis is seen."""
-    vertices = np.concatenate([mesh.vertices_m for mesh in pair.bodies.values()])
-    length, width, height = vertices.max(0) - vertices.min(0)
-    return f"'{pair.name}' is {length:.2f} m long (x), {width:.2f} wide (y) and {height:.2f} high (z)."
+    report(run, Outcome(race, unseen, race.judge(unseen, starts)))
 
 
 def checked(size: Config) -> None:
@@ -117,7 +98,7 @@ def checked(size: Config) -> None:
         raise DomainError(
             f"--pair {size.pair}: choose from {', '.join(PAIRS)}, or give --robot and a .yaml file."
         )
-    for name in ("seeds", "steps", "worlds", "per_world", "judged_worlds", "judged_drives", "along"):
+    for name in ("seeds", "steps", "worlds", "per_world", "judged_worlds", "judged_drives"):
         if getattr(size, name) < 1:
             raise DomainError(f"--{name.replace('_', '-')} is {getattr(size, name)}; at least 1 is needed.")
     for name in ("per_world", "judged_drives"):
@@ -131,8 +112,6 @@ def checked(size: Config) -> None:
         raise DomainError(f"--seed is {size.seed}; the searches need 0 to {HIGHEST_SEED}.")
     if size.focal_mm is not None and size.lens is None:
         raise DomainError("--focal-mm scales a traced lens; give --lens too, or leave it out.")
-    if size.grid < 0 or size.certified < 0 or size.certified == 1:
-        raise DomainError("--grid needs 0 or more mounts, --certified 0 or at least 2 draws.")
 
 
 if __name__ == "__main__":

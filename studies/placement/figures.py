@@ -1,50 +1,46 @@
 """Pictures of a placement: the ways of the searches, and the robot before and after."""
 
 import math
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from torch import Tensor
 
 from codesign import events
 from codesign.mount.ranges import NAMES
+from codesign.render import Camera, frames
+from codesign.report import robot_figures
 from codesign.report.flow_colours import flow_colours
-from scenes.robot_pair import Drives
-from studies.frame.robot_pictures import draw_frame, draw_pair
+from scenes import bodies
+from scenes.robot_pair import FRAMES, SENSOR_PX, WINDOW_PX, Drives, RobotPair
 from studies.placement.problem import Problem, Samples
 from studies.placement.searches import Trail
 
+DRAWN_M = 0.6  # length of the drawn view
 COLOURS = ("#d62728", "#7f7f7f", "#1f77b4", "#2ca02c", "#9467bd", "#8c564b")
 
 
-def ways(
-    problem: Problem,
-    trails: dict[str, list[Trail]],
-    along: dict[str, Tensor],
-    samples: int,
-    grid: float | None,
-) -> Figure:
+def ways(problem: Problem, trails: dict[str, list[Trail]], errors: dict[str, Tensor], samples: int) -> Figure:
     """Errors on unseen samples, and the best that a search saw of its own, over drives rendered; and of all mounts looked
     at height, pitch and error, below the ways of the descents.
 
-    along: search -> errors [starts, parts + 1] after equal parts of ``samples``. grid: error of its best mount.
+    errors: of the starts and of each search, [starts]. samples: drives that each rendered.
     """
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
-    for (name, errors), colour in zip(along.items(), COLOURS, strict=False):
-        rendered = np.linspace(0, samples, errors.shape[1])
-        left.plot(rendered, errors.T.numpy(), color=colour, linewidth=0.4, alpha=0.5)
-        median = errors.quantile(0.5, 0).numpy()
-        left.plot(rendered, median, "o-", color=colour, linewidth=1.8, markersize=4, label=name)
+    for (name, found), colour in zip(trails.items(), COLOURS, strict=False):
+        along = torch.stack([errors["start"], errors[name]])
+        left.plot((0, samples), along.numpy(), color=colour, linewidth=0.4, alpha=0.5)
+        median = along.quantile(0.5, 1).numpy()
+        left.plot((0, samples), median, "o-", color=colour, linewidth=1.8, markersize=4, label=name)
         if name != "gradient":
-            best = [torch.cummin(trail.error, 0).values for trail in trails[name]]
+            best = [torch.cummin(trail.error, 0).values for trail in found]
             shortest = min(map(len, best))  # one that finds little that is allowed looks at less
             least = torch.stack([each[:shortest] for each in best]).quantile(0.5, 0).numpy()
-            drives = problem.samples * np.arange(1, shortest + 1)
-            left.plot(drives, least, "--", color=colour, linewidth=1)
-    if grid is not None:
-        left.axhline(grid, color="black", linewidth=1, linestyle=":", label="best of the grid")
+            left.plot(problem.samples * np.arange(1, shortest + 1), least, "--", color=colour, linewidth=1)
     left.set(xlabel="drives rendered", ylabel="mean bounded error", ylim=(0, None))
     left.legend(fontsize="small")
     looked = [trail for name, found in trails.items() if name != "gradient" for trail in found]
@@ -73,9 +69,9 @@ def before_and_after(problem: Problem, mount: Tensor) -> Figure:
     figure = plt.figure(figsize=(13, 6.4), layout="constrained")
     drives = fastest(problem)
     for row, pose in enumerate((problem.ranges.pose(problem.start), mount)):
-        draw_pair(figure.add_subplot(2, 4, 4 * row + 1, projection="3d"), problem.pair, problem.camera, pose)
+        _draw_pair(figure.add_subplot(2, 4, 4 * row + 1, projection="3d"), problem.pair, problem.camera, pose)
         axes = [figure.add_subplot(2, 4, 4 * row + column) for column in (2, 3, 4)]
-        draw_frame(axes[0], drives, problem.camera, pose)
+        _draw_frame(axes[0], drives, problem.camera, pose)
         with torch.no_grad():
             run = problem.system(pose, "sensor").begin(drives)
         counts, flow = run["volume"].counts.sum(2), run["field"].flow_px
@@ -98,3 +94,33 @@ def _tiled(windows: np.ndarray) -> np.ndarray:
     side = math.isqrt(len(windows))
     rows = [np.concatenate(list(windows[side * k : side * (k + 1)]), 1) for k in range(side)]
     return np.concatenate(rows, 0)
+
+
+def robot_and_frame(pair: RobotPair, drives: Drives, camera: Camera, pose: Tensor) -> Figure:
+    """The robot with its camera's view, and beside it the middle frame of the first drive."""
+    figure = plt.figure(figsize=(10, 4.4), layout="constrained")
+    _draw_pair(figure.add_subplot(1, 2, 1, projection="3d"), pair, camera, pose)
+    right = figure.add_subplot(1, 2, 2)
+    _draw_frame(right, drives, camera, pose)
+    right.set(xticks=[], yticks=[])
+    return figure
+
+
+def _draw_pair(axis: Any, pair: RobotPair, camera: Camera, T_body_cam: Tensor) -> None:
+    """Robot and view, into a 3-D axis."""
+    triangles = [mesh.vertices_m[mesh.faces] for mesh in pair.bodies.values()]
+    shade = [np.clip(0.8 * bodies.skylight(mesh), 0, 1) for mesh in pair.bodies.values()]
+    lines = robot_figures.view_lines(camera, T_body_cam, DRAWN_M)
+    robot_figures.draw_robot(axis, np.concatenate(triangles), np.concatenate(shade), lines)
+
+
+@torch.no_grad()
+def _draw_frame(axis: Any, drives: Drives, camera: Camera, T_body_cam: Tensor) -> None:
+    """The middle frame [H, W] of the first drive on the whole sensor, with the camera's windows."""
+    whole = Camera(camera.lens, *SENSOR_PX, camera.film.pixel_pitch_mm, 8)
+    scene = drives.scene[0].during([FRAMES // 2])
+    pose = (drives.T_world_body[0, :, FRAMES // 2] @ T_body_cam)[:, None]
+    frame = frames(whole, scene, pose)[0, 0].numpy()
+    axis.imshow(np.clip(frame / 255, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+    for corner in camera.film.windows_px or ():
+        axis.add_patch(Rectangle(corner, WINDOW_PX, WINDOW_PX, fill=False, color="tab:red", linewidth=0.6))

@@ -9,10 +9,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from codesign import grad
 from codesign.mount.ranges import NAMES
 from studies.placement.problem import Problem
-from studies.placement.race import GRADIENT, GRID, Race, chosen
+from studies.placement.race import GRADIENT, Race
 
 RESAMPLED = 4000
 INTERVAL = 0.9
@@ -37,20 +36,25 @@ class Paired:
 def paired(ours: Tensor, theirs: Tensor) -> Paired:
     """Of errors [seeds] each."""
     ratio = ours / theirs
-    drawn = torch.randint(len(ratio), (RESAMPLED, len(ratio)), generator=torch.Generator().manual_seed(0))
-    ends = torch.tensor([(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], dtype=ratio.dtype)
-    low, high = torch.quantile(ratio[drawn].quantile(0.5, 1), ends).tolist()
+    low, high = _interval(ratio[_resampled(len(ratio))].quantile(0.5, 1))
     return Paired(float(ratio.quantile(0.5)), low, high, int((ratio < 1).sum()), len(ratio))
 
 
 def over_worlds(ours: Tensor, theirs: Tensor, worlds: int) -> tuple[float, float, float]:
     """Ratio of mean errors [N], world after world, ours over theirs; and its interval over resampled worlds."""
     means = torch.stack([ours, theirs]).unflatten(1, (worlds, -1)).mean(2)
-    drawn = torch.randint(worlds, (RESAMPLED, worlds), generator=torch.Generator().manual_seed(0))
-    ratio = means[:, drawn].mean(2)
-    ends = torch.tensor([(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], dtype=ratio.dtype)
-    low, high = torch.quantile(ratio[0] / ratio[1], ends).tolist()
-    return float(means[0].mean() / means[1].mean()), low, high
+    resampled = means[:, _resampled(worlds)].mean(2)
+    return float(means[0].mean() / means[1].mean()), *_interval(resampled[0] / resampled[1])
+
+
+def _resampled(count):
+    """[RESAMPLED, count] of the numbers below count, with repetition; the same at every call."""
+    return torch.randint(count, (RESAMPLED, count), generator=torch.Generator().manual_seed(0))
+
+
+def _interval(values):
+    ends = torch.tensor([(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], dtype=values.dtype)
+    return torch.quantile(values, ends).tolist()
 
 
 def standard_error(errors: Tensor, worlds: int) -> float:
@@ -64,38 +68,41 @@ def standard_error(errors: Tensor, worlds: int) -> float:
 class Outcome:
     """A race, and its answers on unseen samples.
 
-    unseen: worlds and drives that judged. judged: errors [N] by start and search (``race.judge``). along: search -> errors
-    [starts, parts + 1] (``race.judge_along``). ways: to the gradient, by group of numbers.
+    unseen: worlds and drives that judged. judged: errors [N] by start and search (``Race.judge``).
     """
 
     race: Race
     unseen: Problem
     judged: dict[tuple[int, str], Tensor]
-    along: dict[str, Tensor]
-    ways: dict[str, grad.Choice]
 
     @property
     def starts(self) -> int:
         """How many."""
-        return len(self.along[GRADIENT])
+        return sum(name == "start" for _, name in self.judged)
 
     @cached_property
     def errors(self) -> dict[str, Tensor]:
-        """Of the starts and of what each search ends with, [starts]."""
-        return {"start": self.along[GRADIENT][:, 0]} | {
-            name: each[:, -1] for name, each in self.along.items()
+        """Mean errors of the starts and of what each search ends with, [starts]."""
+        names = dict.fromkeys(name for _, name in self.judged if name != "default")
+        return {
+            name: torch.stack([self.judged[number, name].mean() for number in range(self.starts)])
+            for name in names
         }
 
     @cached_property
     def rivals(self) -> dict[str, Paired]:
         """The gradient over each of the other searches."""
         ours = self.errors[GRADIENT]
-        return {name: paired(ours, self.errors[name]) for name in self.along if name != GRADIENT}
+        return {
+            name: paired(ours, theirs)
+            for name, theirs in self.errors.items()
+            if name not in ("start", GRADIENT)
+        }
 
     @cached_property
     def best(self) -> int | None:
         """Number of the descent that training samples choose; None: they choose the pair's own mount."""
-        return chosen(self.race, self.starts)
+        return self.race.chosen(self.starts)
 
     @property
     def answered(self) -> Tensor:
@@ -114,23 +121,13 @@ class Outcome:
 
     @property
     def error(self) -> float:
-        """Of the answer."""
+        """Mean error of the answer."""
         return float(self.answered.mean())
 
     @property
     def default_error(self) -> float:
-        """Of the pair's own mount."""
+        """Mean error of the pair's own mount."""
         return float(self.judged[0, "default"].mean())
-
-    @property
-    def resampled(self) -> str:
-        """What an interval over worlds resamples."""
-        return "groups of drives" if self.unseen.pair.one_world else "worlds"
-
-    @property
-    def grid_error(self) -> float | None:
-        """Of the grid's best, where there is a grid."""
-        return float(self.judged[0, GRID].mean()) if (0, GRID) in self.judged else None
 
     @property
     def over_default(self) -> tuple[float, float, float]:
@@ -151,34 +148,13 @@ class Outcome:
         if len(self.unseen.numbers) > 1:
             found |= {"over_default_low90": low, "over_default_high90": high}
         for name, values in self.errors.items():
-            found[f"{label(name)}_median_error"] = float(values.quantile(0.5))
+            found[f"{_label(name)}_median_error"] = float(values.quantile(0.5))
         for name, beside in self.rivals.items():
-            over = f"over_{label(name)}"
+            over = f"over_{_label(name)}"
             found |= {f"{over}_median": beside.median, f"{over}_ahead": beside.ahead}
             if beside.count > 1:
                 found |= {f"{over}_low90": beside.low, f"{over}_high90": beside.high}
-        if self.grid_error is not None:
-            found["grid_error"] = self.grid_error
-            found["starts_within_2_percent_of_grid"] = self.near_grid
-            found["renders_of_gradient_over_grid"] = self.race.samples(0, GRADIENT) / self.race.samples(
-                0, GRID
-            )
-        for name, way in self.ways.items():
-            if not math.isnan(way.noise):
-                found |= {
-                    f"gradient_{name}_relative_l2": way.relative_l2,
-                    f"gradient_{name}_cosine": way.cosine,
-                }
-                found |= {
-                    f"gradient_{name}_differences_noise": way.noise,
-                    f"gradient_{name}_calls": way.calls,
-                }
         return found
-
-    @property
-    def near_grid(self) -> int:
-        """Descents that end within 2 % of the grid's best, or below."""
-        return int((self.errors[GRADIENT] <= 1.02 * (self.grid_error or 0.0)).sum())
 
     def table(self) -> str:
         """race.csv: every answer with its mount, what it rendered and its error."""
@@ -192,12 +168,13 @@ class Outcome:
                 share = race.trail(number, GRADIENT).share[0]
             elif name != "default":
                 share, samples = race.answer(number, name), race.samples(number, name)
-            place = [f"{value:.5f}" for value in problem.ranges.numbers(share).tolist()]
+            numbers = [f"{value:.5f}" for value in problem.ranges.numbers(share).tolist()]
             told = [f"{float(errors.mean()):.5f}", f"{standard_error(errors, len(self.unseen.numbers)):.5f}"]
-            writer.writerow([problem.pair.name, race.run.config.seed + number, name, *place, samples, *told])
+            seed = race.run.config.seed + number
+            writer.writerow([problem.pair.name, seed, name, *numbers, samples, *told])
         return text.getvalue()
 
 
-def label(name: str) -> str:
+def _label(name):
     """A name among metrics."""
     return name.lower().replace("-", "_").replace(" ", "_")

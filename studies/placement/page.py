@@ -4,29 +4,19 @@ place is blind to, controls, and the mount handed over."""
 import math
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from codesign.atomic import write_atomic
-from codesign.mount import (
-    Surroundings,
-    VelocityErrors,
-    ground_depth,
-    judge,
-    sight,
-    sight_map,
-    sight_units,
-    yaw_pitch_roll_rad,
-)
-from codesign.report.mount_sphere import mount_sphere
+from codesign.mount import VelocityErrors, judge
 from codesign.system import HandOver, load_hand_over, save_hand_over
 from scenes import robot_pair
 from studies.frame.run import Run
 from studies.placement import figures
 from studies.placement.controls import controls, looking_back, pixel_errors
+from studies.placement.look import what_it_tells
 from studies.placement.outcome import INTERVAL, Outcome
 from studies.placement.problem import Problem
-from studies.placement.race import GRADIENT, GRID
+from studies.placement.race import GRADIENT
 
 
 def report(run: Run[Any], outcome: Outcome) -> None:
@@ -61,9 +51,8 @@ def answer(outcome: Outcome) -> str:
     if outcome.error >= outcome.default_error:
         return f"The place found for the camera of '{name}', {where}, is no better than its default mount: {beside}"
     ratio, low, high = outcome.over_default
-    interval = (
-        f" ({low:.2f} to {high:.2f}, {INTERVAL:.0%} of resampled {outcome.resampled})" if worlds > 1 else ""
-    )
+    resampled = "groups of drives" if outcome.unseen.pair.one_world else "worlds"
+    interval = f" ({low:.2f} to {high:.2f}, {INTERVAL:.0%} of resampled {resampled})" if worlds > 1 else ""
     sits = "belongs at" if high < 1 else "may be better off at"
     return (
         f"The camera of '{name}' {sits} {where}: its error there is {ratio:.2f}{interval} times that at its default mount, "
@@ -97,29 +86,18 @@ def searches(run: Run[Any], outcome: Outcome) -> None:
     for name, values in outcome.errors.items():
         over = str(outcome.rivals[name]) if name in outcome.rivals else None
         rows.append([name, float(values.quantile(0.5)), float(values.min()), float(values.max()), over])
-    trails = {name: [race.trail(number, name) for number in range(outcome.starts)] for name in outcome.along}
-    if (grid := outcome.grid_error) is not None:
-        trails[GRID] = [race.trail(0, GRID)]
-        looked = race.samples(0, GRID)
-        rows.append([f"grid, {looked} samples", grid, grid, grid, None])
-        run.text(
-            f"{outcome.near_grid} of {outcome.starts} descents end within 2 % of the best of the refined grid, with "
-            f"{samples / looked:.3f} of its renders."
-        )
     rows.append(["default mount", outcome.default_error, None, None, None])
-    if run.config.certified:
-        ways = "; ".join(f"{name} by {way}" for name, way in outcome.ways.items())
-        run.text(
-            f"The gradient beside differences over a quarter of the bounds, whose own renders are not counted: {ways}."
-        )
     run.table("Errors on unseen samples", ("search", "median", "best", "worst", "gradient over it"), rows)
-    own = "what is expected" if run.config.rivals_expect else "errors of their own drives"
+    trails = {
+        name: [race.trail(number, name) for number in range(outcome.starts)]
+        for name in (GRADIENT, *outcome.rivals)
+    }
     run.figure(
-        figures.ways(race.problem, trails, outcome.along, samples, grid),
+        figures.ways(race.problem, trails, outcome.errors, samples),
         "ways",
-        "Left: errors on unseen samples, median over starts (thin: each start); dashed the least that searches without "
-        f"gradient have seen of what they minimise, {own}. Right: the map, every mount that these looked at with its error, "
-        "and the ways of the descents.",
+        "Left: errors on unseen samples at the start and the end, median over starts (thin: each start); dashed the least "
+        "that searches without gradient have seen of the errors of their own drives. Right: the map, every mount that these "
+        "looked at with its error, and the ways of the descents.",
     )
 
 
@@ -135,29 +113,7 @@ def seen(run: Run[Any], outcome: Outcome) -> None:
     )
     verdicts = judge(problem.requirements, mount, problem.camera)
     run.text("Requirements: " + "; ".join(map(str, verdicts)) + ".")
-    planar = problem.pair.axes
-    depth = ground_depth
-    x, y, z = problem.ranges.numbers(outcome.share)[:3].tolist()
-    T_world_body = torch.eye(4, dtype=torch.float64)
-    T_world_body[2, 3] = problem.pair.drive(0, 12)[0][:, robot_pair.FRAMES // 2, 2, 3].mean()
-    around = Surroundings((x, y, z), T_world_body, axes=planar, depth=depth)
-    height = z + float(T_world_body[2, 3])
-    if height > 0.05:
-        information, _ = around.information(problem.camera, mount)
-        told = sight(information, sight_units(around), planar)
-        run.text(
-            f"{height:.2f} m over flat ground the motion that shows least from there is {told.weakest_named()} (in units of "
-            f"0.1 m/s and 0.1 rad/s, deviation {told.weakest_deviation:.2f}); blind to: "
-            f"{', '.join(told.blind()) or 'nothing'}."
-        )
-        yaw, pitch, errors = sight_map(problem.camera, around, rows=9, columns=18)
-        now = yaw_pitch_roll_rad(mount).tolist()
-        run.figure(
-            mount_sphere(yaw, pitch, errors, "expected error, units", {"answer": (now[0], now[1])}),
-            "sight",
-            "What the place allows: the error that flow over flat ground lets expect, over all directions the camera may look "
-            "in (27 points of 5 px/s).",
-        )
+    what_it_tells(run, problem.pair, problem.camera, mount, "answer")
 
 
 def left(run: Run[Any], outcome: Outcome) -> None:

@@ -1,36 +1,49 @@
 """The searches for a mount from the same starts at equal renders, what each ends with, and its error in worlds that none
 saw; all of it kept in the run's state."""
 
-import itertools
-import math
+import hashlib
+import json
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from codesign import grad
 from codesign.errors import DomainError
 from codesign.mount import PrecisionTrend
+from scenes.robot_pair import RobotPair
+from studies.frame.config import StudyConfig, to_json
 from studies.frame.run import Run
-from studies.placement.descent import descend, settled
-from studies.placement.grid import first_points, looks, refined_grid
 from studies.placement.problem import Problem
-from studies.placement.resumption import asked, check_same
-from studies.placement.searches import SEARCHES, Trail
+from studies.placement.searches import SEARCHES, Trail, descend
 
 GRADIENT = "gradient"
-GRID = "grid"
-STEP = 0.12  # of the cube: of the gradient's differences of geometry, and of those that judge it
-AGREES = {"relative_l2": 1.0, "cosine": 0.8}  # steps have a set length: what counts is where they lead
-UNKNOWN = 1 / 3  # standard error of differences from which on they judge nothing
-WAYS = ("autograd", "differences", "evolution")
+# of the cube: the gradient's differences of geometry
+STEP = 0.12
 TRIES = 2048
-FINAL_DRAWS = 12  # that choose among answers, and of the grid's second look
-KEPT_EVERY = 50  # looks
-WORST = 1.0  # of bounded errors
-GROUPS = {"position": slice(0, 3), "attitude": slice(3, 6)}
+# that choose among answers
+FINAL_DRAWS = 12
+# of bounded errors
+WORST = 1.0
+# of a pair, on which results depend
+SETTINGS = (
+    "low",
+    "high",
+    "design",
+    "axes",
+    "prior",
+    "depth",
+    "look_ahead",
+    "housing_radius_m",
+    "margin_m",
+    "own_body_share",
+    "cable",
+    "ground_z_m",
+    "page",
+)
+# options on which no result depends
+ELSEWHERE = ("study", "out", "device", "resume")
 
 
 def feasible(problem: Problem, count: int, seed: int, first: Sequence[Tensor] = ()) -> list[Tensor]:
@@ -53,19 +66,34 @@ def feasible(problem: Problem, count: int, seed: int, first: Sequence[Tensor] = 
     return found
 
 
-def check_grid(problem: Problem, count: int, seed: int) -> None:
-    """Raise DomainError where a grid has no point that is allowed to begin with."""
-    if count and not any(kept(problem, share) for share in first_points(6, count, seed)):
-        raise DomainError(
-            f"of {count} mounts of the grid none keeps what is required; give --grid more of them, or ask for less."
-        )
-
-
 def kept(problem: Problem, share: Tensor) -> bool:
     """Whether a mount keeps every requirement, by the hard answer; the cheap ones are asked first."""
-    mount = problem.ranges.pose(share)
+    pose = problem.ranges.pose(share)
     with torch.no_grad():
-        return all(float(each.exact(mount, problem.camera).min()) >= 0 for each in problem.requirements)
+        return all(float(each.exact(pose, problem.camera).min()) >= 0 for each in problem.requirements)
+
+
+def fingerprints(config: StudyConfig, pair: RobotPair) -> dict[str, Any]:
+    """What results depend on: options, the pair's settings, meshes and first drive (to a millionth), and the user's files."""
+    options = json.loads(to_json("", config))
+    found = {f"--{name.replace('_', '-')}": options[name] for name in options if name not in ELSEWHERE}
+    found |= {f"the robot's {name}": repr(getattr(pair, name)) for name in SETTINGS}
+    meshes = [part for body in pair.bodies.values() for part in (body.vertices_m, body.faces)]
+    for name, arrays in (("shape", meshes), ("drives", [pair.drive(0, 1)[0]])):
+        rounded = [(np.round(np.asarray(each, dtype=np.float64), 6) + 0.0).tobytes() for each in arrays]
+        found[f"the robot's {name}"] = hashlib.sha256(b"".join(rounded)).hexdigest()[:12]
+    return found | {f"'{path}'": hashlib.sha256(path.read_bytes()).hexdigest()[:12] for path in pair.files}
+
+
+def check_same(stored: dict[str, Any], now: dict[str, Any]) -> None:
+    """Raise DomainError where a run that goes on is not the one that was begun."""
+    for name in (*stored, *now):
+        if stored.get(name) != now.get(name):
+            was, is_now = stored.get(name, "not there"), now.get(name, "not there")
+            raise DomainError(
+                f"{name} changed since this run was begun ({was}, now {is_now}); what it has found holds no more: "
+                "change it back, or start a new run."
+            )
 
 
 class Race:
@@ -74,15 +102,15 @@ class Race:
     def __init__(self, run: Run[Any], problem: Problem):
         self.run = run
         self.problem = problem
-        self.asked = asked(run.config, problem.pair)
+        self.fingerprints = fingerprints(run.config, problem.pair)
         stored = run.load_state()
         self.tensors: dict[str, Tensor] = dict(stored.tensors) if stored else {}
         if stored:
-            check_same(stored.numbers, self.asked)
+            check_same(stored.numbers, self.fingerprints)
 
     def save(self) -> None:
         """Keep what has been found."""
-        self.run.save_state(self.tensors, self.asked)
+        self.run.save_state(self.tensors, self.fingerprints)
 
     def trail(self, number: int, name: str) -> Trail:
         """What a search looked at."""
@@ -92,98 +120,46 @@ class Race:
         """Drives that a search rendered."""
         return int(self.tensors[f"{name}/{number}/samples"])
 
-    def descent(self, number: int, start: Tensor, ways: dict[str, grad.Choice]) -> None:
-        """Gradient steps, every group of numbers by the way chosen for it."""
+    def descent(self, number: int, start: Tensor) -> None:
+        """Gradient steps: differences of geometry, and the exact gradient of the penalty."""
         problem, first = self.problem, 1000 * (self.run.config.seed + number)
         problem.trend = PrecisionTrend()
 
         def slope(share, step):
-            values = []
-
-            def loss(parts, draw):
-                value = objective(problem, parts, draw, learn=True)
-                values.append(float(value.detach()))
-                return value
-
-            found = grad.gradient(loss, split(share), ways, first + step, scales=scales())
-            return values[0], torch.cat([found[name] for name in GROUPS])
+            error, gradient = problem.expected_around(share, problem.draw(first + step), STEP, learn=True)
+            at = share.clone().requires_grad_()
+            penalty = problem.penalty(problem.ranges.pose(at))
+            (push,) = torch.autograd.grad(penalty, at)
+            return float(error + penalty.detach()), gradient + push
 
         steps = self.run.config.steps
         self._made(number, GRADIENT, steps, lambda advance: descend(slope, start, steps, advance))
 
     def search(self, number: int, name: str, start: Tensor) -> None:
-        """A search without gradients at as many samples as the descent rendered, all on the same ones unless it is asked
-        for others. Of mounts that do not keep what is required nothing is rendered: they are told to be worse than any other."""
-        size = self.run.config
-        first = 1000 * (size.seed + number)
-        steps = itertools.count()
+        """A search without gradients at as many samples as the descent rendered, all on the same ones.
 
-        def error(share):
-            draw = first + (next(steps) if size.rivals_fresh else 0)
-            if size.rivals_expect:
-                with torch.no_grad():
-                    return float(objective(self.problem, split(share), draw))
-            return self.problem.error(share, self.problem.draw(draw))
-
-        count = max(2, self.samples(number, GRADIENT) // self.problem.samples)
-        seed = size.seed + number
-        free = ~self.problem.ranges.held
+        Of mounts that do not keep what is required nothing is rendered: they are told to be worse than any other.
+        """
+        problem, seed = self.problem, self.run.config.seed + number
+        samples = problem.draw(1000 * seed)
+        count = max(2, self.samples(number, GRADIENT) // problem.samples)
+        free = ~problem.ranges.held
 
         def whole(part):
-            return start.expand(*part.shape[:-1], 6).masked_scatter(free.expand(*part.shape[:-1], 6), part)
+            batch = part.shape[:-1]
+            return start.expand(*batch, 6).masked_scatter(free.expand(*batch, 6), part)
 
         def refused(part):
             share = whole(part)
-            return None if kept(self.problem, share) else WORST + self.problem.penalty_of(share)
+            return None if kept(problem, share) else WORST + problem.penalty_of(share)
 
         def make(advance):
-            look = SEARCHES[name]
-            trail = look(lambda part: error(whole(part)), start[free], count, seed, advance, refused)
+            trail = SEARCHES[name](
+                lambda part: problem.error(whole(part), samples), start[free], count, seed, advance, refused
+            )
             return Trail(whole(trail.share), trail.error)
 
         self._made(number, name, count, make)
-
-    def grid(self) -> None:
-        """The refined grid: all its points with the draw of the first search, the best of each cube again with others. What is
-        known of it is kept when it is interrupted, and every so often."""
-        if f"{GRID}/0/final" in self.tensors:
-            return
-        problem, size = self.problem, self.run.config
-        first = [problem.draw(1000 * size.seed)]
-        other = [problem.draw(-1 - k) for k in range(FINAL_DRAWS)]
-        known = self.tensors.get(f"{GRID}/0/known", torch.zeros(0, dtype=torch.float64)).tolist()
-        replayed = iter(known[:])
-
-        def keep():
-            if f"{GRID}/0/final" not in self.tensors:
-                self.tensors[f"{GRID}/0/known"] = torch.tensor(known, dtype=torch.float64)
-                self.save()
-
-        def look(share, again):
-            error = next(replayed, None)
-            if error is None:
-                draws = other if again else first
-                error = sum(problem.error(share, draw) for draw in draws) / len(draws)
-                known.append(error)
-                if len(known) % KEPT_EVERY == 0:
-                    keep()
-                bar.advance(error=error)
-            return error
-
-        self.run.on_interrupt(keep)
-        with self.run.progress(looks(size.grid), GRID, done=len(known)) as bar:
-            points, finals = refined_grid(
-                look, 6, size.grid, seed=size.seed, allowed=lambda share: kept(problem, share)
-            )
-        self.tensors.pop(f"{GRID}/0/known", None)
-        drives = problem.samples * (len(points.error) + FINAL_DRAWS * len(finals.error))
-        self.tensors |= {
-            f"{GRID}/0/share": points.share,
-            f"{GRID}/0/error": points.error,
-            f"{GRID}/0/final": finals.share[finals.best],
-            f"{GRID}/0/samples": torch.tensor(drives),
-        }
-        self.save()
 
     def _made(self, number: int, name: str, total: int, make: Callable[..., Trail]) -> None:
         key = f"{name}/{number}"
@@ -199,158 +175,47 @@ class Race:
         }
         self.save()
 
-    def answer(self, number: int, name: str, part: float = 1.0) -> Tensor:
-        """The mount [6] that a search ends with, or would end with after a part of its renders: the descent's mean of its end;
-        the best of the grid's finalists; of the others the best of those that keep what is required."""
-        if name == GRID:
-            return self.tensors[f"{GRID}/0/final"]
+    def answer(self, number: int, name: str) -> Tensor:
+        """The mount [6] that a search ends with: the descent's mean of its end, or the last before it that keeps what is
+        required; of the others the best that does."""
         trail = self.trail(number, name)
-        if part < 1:
-            trail = shortened(trail, part, name == GRADIENT)
+        order = trail.error.argsort().tolist()
         if name == GRADIENT:
             order = range(len(trail.error) - 1, -1, -1)
-        else:
-            order = trail.error.argsort().tolist()
-        for index in order:
-            if kept(self.problem, trail.share[index]):
-                return trail.share[index]
-        return trail.share[0]
+        return next((trail.share[k] for k in order if kept(self.problem, trail.share[k])), trail.share[0])
 
+    def judge(self, unseen: Problem, starts: list[Tensor]) -> dict[tuple[int, str], Tensor]:
+        """Bounded errors [N] of starts and answers, on the same unseen samples with single events.
 
-def shortened(trail: Trail, part: float, descended: bool) -> Trail:
-    """What a search had after a part of its points. descended: the last is the mean of a way's end, and no point of its own."""
-    count = max(1, round(part * (len(trail.error) - descended)))
-    if not descended:
-        return Trail(trail.share[:count], trail.error[:count])
-    return Trail(settled(trail.share[: count + 1], count), trail.error[: count + 1])
-
-
-def split(share: Tensor) -> dict[str, Tensor]:
-    """Position and attitude."""
-    return {name: share[part] for name, part in GROUPS.items()}
-
-
-def scales() -> dict[str, float]:
-    """Steps of differences."""
-    return dict.fromkeys(GROUPS, STEP)
-
-
-def pose_of(problem: Problem, parts: dict[str, Tensor]) -> Tensor:
-    """T_body_cam [4, 4]."""
-    return problem.ranges.pose(torch.cat([parts[name] for name in GROUPS]))
-
-
-def expected(problem: Problem, parts: dict[str, Tensor], draw: int, learn: bool = False) -> Tensor:
-    """The mean error to be expected; its gradient is that of ``Problem.expected_around``."""
-    share, samples = torch.cat([parts[name] for name in GROUPS]), problem.draw(draw)
-    if not share.requires_grad:
-        return problem.expected(problem.ranges.pose(share), samples, learn).mean()
-    value, slope = problem.expected_around(share.detach(), samples, STEP, learn)
-    return value + slope @ (share - share.detach())
-
-
-def objective(problem: Problem, parts: dict[str, Tensor], draw: int, learn: bool = False) -> Tensor:
-    """The same and the penalty of what is required, whose gradient is exact."""
-    return expected(problem, parts, draw, learn) + problem.penalty(pose_of(problem, parts))
-
-
-def certified(run: Run[Any], race: Race, start: Tensor) -> dict[str, grad.Choice]:
-    """The way to the gradient of position and attitude: that of ``expected`` ("autograd") where it agrees with averaged differences
-    of rendered mounts, or these are too noisy to tell."""
-    draws = run.config.certified
-    if not draws:
-        return {name: grad.Choice("autograd", math.nan, math.nan, math.nan, 0) for name in GROUPS}
-    if "ways" not in race.tensors:
-        problem = race.problem
-        problem.trend = PrecisionTrend()
-        for draw in range(draws):
-            expected(problem, split(start), draw, learn=True)
-        run.say(f"comparing the gradient with differences in {draws} draws of {problem.samples} samples")
-        found = grad.choose(
-            lambda parts, draw: expected(problem, parts, draw),
-            split(start),
-            range(draws),
-            scales=scales(),
-            **AGREES,
-        )
-        rows = [
-            [WAYS.index(c.way), c.relative_l2, c.cosine, c.noise, c.calls]
-            for c in (found[name] for name in GROUPS)
-        ]
-        race.tensors["ways"] = torch.tensor(rows, dtype=torch.float64)
-        race.save()
-    ways = {}
-    for name, row in zip(GROUPS, race.tensors["ways"].tolist(), strict=True):
-        way = WAYS[int(row[0])]
-        said = grad.Choice(way, row[1], row[2], row[3], int(row[4]))
-        ways[name] = said if said.noise < UNKNOWN else replace(said, way="autograd", calls=0)
-        run.say(f"{name}: {ways[name]}")
-    return ways
-
-
-def judge(run: Run[Any], race: Race, unseen: Problem, starts: list[Tensor]) -> dict[tuple[int, str], Tensor]:
-    """Bounded errors [N] of starts and answers, on the same unseen samples with single events. Key: (start, search); the
-    pair's own design is (0, "default"), the starts (number, "start")."""
-    wanted = {(0, "default"): unseen.start}
-    for number, start in enumerate(starts):
-        wanted[number, "start"] = start
-        for name in (GRADIENT, *run.config.searches):
-            wanted[number, name] = race.answer(number, name)
-    if run.config.grid:
-        wanted[0, GRID] = race.answer(0, GRID)
-    named = {f"judged/{name}/{number}": share for (number, name), share in wanted.items()}
-    found = _judged(run, race, unseen, named, "judging with single events")
-    return dict(zip(wanted, found, strict=True))
-
-
-def judge_along(
-    run: Run[Any], race: Race, unseen: Problem, judged: dict[tuple[int, str], Tensor], count: int
-) -> dict[str, Tensor]:
-    """Mean errors [starts, parts + 1] of each search from its start to its end, on the samples of ``judge``."""
-    parts = run.config.along
-    names = [GRADIENT, *run.config.searches]
-    wanted = {
-        f"judged/{name}/{number}/{part}/{parts}": race.answer(number, name, part / parts)
-        for name in names
-        for number in range(count)
-        for part in range(1, parts)
-    }
-    between = dict(zip(wanted, _judged(run, race, unseen, wanted, "judging on the way"), strict=True))
-    found = {}
-    for name in names:
-        ways = []
-        for number in range(count):
-            errors = [between[f"judged/{name}/{number}/{part}/{parts}"] for part in range(1, parts)]
-            ways.append(torch.stack([judged[number, "start"], *errors, judged[number, name]]).mean(1))
-        found[name] = torch.stack(ways)
-    return found
-
-
-def _judged(run, race, unseen, wanted, said):
-    """Errors [N] of every mount, kept by their keys."""
-    samples = unseen.draw(0)
-    found: list[Tensor] = []
-    if not wanted:
+        Key: (start, search); the pair's own design is (0, "default"), the starts (number, "start").
+        """
+        wanted = {(0, "default"): unseen.start}
+        for number, start in enumerate(starts):
+            wanted[number, "start"] = start
+            for name in (GRADIENT, *self.run.config.searches):
+                wanted[number, name] = self.answer(number, name)
+        samples = unseen.draw(0)
+        found = {}
+        with self.run.progress(len(wanted), "judging with single events") as bar:
+            for (number, name), share in wanted.items():
+                key = f"judged/{name}/{number}"
+                if key not in self.tensors:
+                    pose = unseen.ranges.pose(share)
+                    self.tensors[key] = unseen.judged(pose, samples, "sensor").bounded()
+                    self.save()
+                found[number, name] = self.tensors[key]
+                bar.advance(error=float(self.tensors[key].mean()))
         return found
-    with run.progress(len(wanted), said) as bar:
-        for key, share in wanted.items():
-            if key not in race.tensors:
-                race.tensors[key] = unseen.judged(unseen.ranges.pose(share), samples, "sensor").bounded()
-                race.save()
-            found.append(race.tensors[key])
-            bar.advance(error=float(found[-1].mean()))
-    return found
 
-
-def chosen(race: Race, count: int) -> int | None:
-    """Number of the descent whose answer errs least on training samples, None where the pair's own mount errs less than all of
-    them: what is judged on unseen samples has not been chosen by them."""
-    if "chosen" not in race.tensors:
-        problem = race.problem
-        draws = [problem.draw(-1 - k) for k in range(FINAL_DRAWS)]
-        mounts = [problem.start, *(race.answer(number, GRADIENT) for number in range(count))]
-        errors = [sum(problem.bounded(share, draw) for draw in draws) for share in mounts]
-        race.tensors["chosen"] = torch.tensor(errors).argmin() - 1
-        race.save()
-    number = int(race.tensors["chosen"])
-    return None if number < 0 else number
+    def chosen(self, count: int) -> int | None:
+        """Number of the descent whose answer errs least on training samples, None where the pair's own mount errs less than
+        all of them: what is judged on unseen samples has not been chosen by them."""
+        if "chosen" not in self.tensors:
+            problem = self.problem
+            draws = [problem.draw(-1 - k) for k in range(FINAL_DRAWS)]
+            mounts = [problem.start, *(self.answer(number, GRADIENT) for number in range(count))]
+            errors = [sum(problem.bounded(share, draw) for draw in draws) for share in mounts]
+            self.tensors["chosen"] = torch.tensor(errors).argmin() - 1
+            self.save()
+        number = int(self.tensors["chosen"])
+        return None if number < 0 else number

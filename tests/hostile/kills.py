@@ -21,8 +21,7 @@ from pathlib import Path
 from codesign.atomic import UNFINISHED
 
 ROOT = Path(__file__).resolve().parents[2]
-# whose state is kept between steps, in small sizes; without those that begin with a recording, and robot_gates, which
-# differs from run to run by itself
+# whose state is kept between steps, in small sizes; without those that begin with a recording
 STUDIES = {
     "lens_tolerance": "--trials 300 --flow-lenses 0",
     "make_dataset": "--trajectories 2 --frames 14 --size 24 --samples 2 --chunk 4 --rate-hz 90",

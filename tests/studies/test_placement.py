@@ -19,15 +19,33 @@ from scenes.robot_pairs import PAIRS
 from studies.frame.run import main
 from studies.placement import __main__ as placement
 from studies.placement import outcome
-from studies.placement.controls import controls, looking_back, pixel_errors, shuffled
-from studies.placement.descent import descend
+from studies.placement.controls import controls, looking_back, pixel_errors
 from studies.placement.page import answer
 from studies.placement.problem import Problem, traced_camera
-from studies.placement.race import FINAL_DRAWS, Race, check_grid, chosen, feasible, kept, shortened
-from studies.placement.resumption import asked, check_same
-from studies.placement.searches import SEARCHES, Trail
+from studies.placement.race import FINAL_DRAWS, Race, check_same, feasible, fingerprints, kept
+from studies.placement.searches import SEARCHES, descend
 
 F = torch.float64
+
+
+class FakeRun:
+    """A run that keeps nothing."""
+
+    def __init__(self):
+        self.config = placement.Config()
+
+    def load_state(self):
+        return None
+
+    def save_state(self, tensors, numbers):
+        pass
+
+    @contextlib.contextmanager
+    def progress(self, total, description):
+        yield self
+
+    def advance(self, error):
+        pass
 
 
 @pytest.fixture(scope="module")
@@ -161,32 +179,11 @@ def test_pixels_are_told_best_where_nothing_moves(problem):
     assert pixel_errors(problem, problem.ranges.pose(problem.start), samples) > 1.0
 
 
-def test_a_search_cut_short_has_what_it_had_then():
-    """Of searches the first points; of a descent the mean of the last quarter of the steps so far."""
-    way = Trail(torch.arange(13.0, dtype=F)[:, None], torch.zeros(13, dtype=F))
-    assert shortened(way, 0.5, descended=False).share[:, 0].tolist() == list(range(6))
-    cut = shortened(way, 2 / 3, descended=True).share[:, 0].tolist()
-    assert cut == [*range(8), 7.5]
-    whole = descend(lambda x, k: (0.0, x - 1), torch.zeros(1, dtype=F), 12)
-    assert shortened(whole, 0.5, descended=True).share[:-1].tolist() == whole.share[:6].tolist()
-
-
-def test_shuffled_events_are_as_many_in_every_bin(problem):
-    volume = problem.system(problem.ranges.pose(problem.start)).begin(problem.batch(problem.draw(0)))[
-        "volume"
-    ]
-    mixed = shuffled(volume)
-    assert torch.allclose(mixed.counts.sum((-2, -1)), volume.counts.sum((-2, -1)))
-    assert not torch.equal(mixed.counts, volume.counts)
-
-
 @pytest.mark.parametrize(
     ("given", "said"),
     [
         (["--pair", "submarine"], "--pair submarine: choose from outdoors"),
         (["--seeds", "0"], "--seeds is 0"),
-        (["--along", "0"], "--along is 0"),
-        (["--certified", "1"], "at least 2 draws"),
         (["--seed", "-1"], "--seed is -1"),
         (["--judged-drives", "49"], "a world has 48 drives"),
         (["--searches", "oracle"], "search 'oracle' is unknown"),
@@ -203,19 +200,80 @@ def test_wrong_input_is_one_sentence_before_the_first_frame(given, said, tmp_pat
     assert said in capsys.readouterr().err
 
 
-def test_ratios_are_of_paired_starts():
+def test_ratios_are_of_paired_starts_and_worlds():
+    """Medians with an even number of starts are the mean of two; drives in a world err alike: means of four worlds 0, 1, 2,
+    3 deviate by sqrt(5 / 3), over the root of four; a ratio over worlds is one of means, 4 / 6 of 1 / 2 and 3 / 4."""
     found = outcome.paired(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 2.5, 2.0]))
     assert (found.median, found.ahead, found.count) == (pytest.approx(0.8), 2, 3)
-    assert found.low == pytest.approx(0.5)
-    assert found.high == pytest.approx(1.5)
-
-
-def test_the_median_of_an_even_number_of_starts_is_the_mean_of_two():
-    """Of ratios spread evenly, resamples lie as far above the middle as below it."""
-    assert outcome.paired(torch.tensor([1.0, 3.0]), torch.ones(2)).median == pytest.approx(2.0)
+    assert (found.low, found.high) == pytest.approx((0.5, 1.5))
     found = outcome.paired(torch.arange(1.0, 13.0, dtype=F), torch.ones(12, dtype=F))
     assert found.median == pytest.approx(6.5)
     assert found.high - 6.5 == pytest.approx(6.5 - found.low)
+    errors = torch.arange(4.0, dtype=F).repeat_interleave(6)
+    assert outcome.standard_error(errors, 4) == pytest.approx((5 / 3) ** 0.5 / 2)
+    assert outcome.standard_error(errors[:1], 1) == 0.0
+    ours, theirs = torch.tensor([0.5, 1.5, 2.0, 4.0], dtype=F), torch.tensor([1.0, 3.0, 4.0, 4.0], dtype=F)
+    assert outcome.over_worlds(ours, theirs, 2) == pytest.approx((4 / 6, 0.5, 0.75))
+
+
+def test_a_run_that_goes_on_is_the_one_that_was_begun(tmp_path):
+    config, world = placement.Config(seeds=2), tmp_path / "room.obj"
+    world.write_text("v 0 0 0")
+    pair = replace(PAIRS["outdoors"](), files=(world,))
+    begun = json.loads(json.dumps(fingerprints(config, pair)))
+    check_same(begun, fingerprints(replace(config, out=Path("elsewhere")), pair))
+    for changed, of, said in (
+        (replace(config, seeds=3), pair, "--seeds changed since this run was begun"),
+        (config, replace(pair, high=replace(pair.high, z_m=1.0)), "the robot's high changed"),
+        (config, replace(pair, page="world_unit_m=0.01"), "the robot's page changed"),
+        (config, replace(pair, bodies=dict(list(pair.bodies.items())[1:])), "the robot's shape changed"),
+        (config, replace(pair, files=()), r"room\.obj' changed since .*, now not there"),
+    ):
+        with pytest.raises(DomainError, match=said):
+            check_same(begun, fingerprints(changed, of))
+    world.write_text("v 0 0 1")
+    with pytest.raises(DomainError, match=r"room\.obj' changed"):
+        check_same(begun, fingerprints(config, pair))
+
+
+def test_searches_look_only_at_what_is_allowed_and_free(problem):
+    """Outdoors most of the cube looks down too far to see ahead; held numbers stay; rivals see always the same drives."""
+    pair = problem.pair
+    held = {name: getattr(pair.design, name) for name in ("x_m", "y_m", "yaw_rad", "roll_rad")}
+    narrow = replace(pair, low=replace(pair.low, **held), high=replace(pair.high, **held))
+    watched = Problem(narrow, range(1), 1, 1)
+    looked = []
+
+    def error(share, samples):
+        looked.append((share, samples.seed))
+        return float((watched.ranges.numbers(share) - 0.3).square().sum())
+
+    watched.error = error
+    race = Race(FakeRun(), watched)
+    race.tensors["gradient/2/samples"] = torch.tensor(8)
+    for name in ("random", "coordinate"):
+        looked.clear()
+        race.search(2, name, watched.start)
+        found = race.trail(2, name).share
+        assert [seed for _, seed in looked] == [2000] * 8
+        assert all(kept(watched, share) for share in found)
+        assert len({tuple(row) for row in found[:, ~watched.ranges.held].tolist()}) == 8
+        assert torch.equal(found[:, watched.ranges.held], watched.start[watched.ranges.held].expand(8, 4))
+
+
+def test_starts_are_those_given_and_others_at_random(problem):
+    """An own robot's own mount, and the first that are drawn."""
+    given, *others = feasible(problem, 3, 5, [problem.start])
+    assert torch.equal(given, problem.start)
+    assert torch.equal(torch.stack(others), torch.stack(feasible(problem, 2, 5)))
+    pair = problem.pair
+    for low, high, ahead, said in (
+        (pair.low, pair.high, (3.0, 0.9), "keep what is required"),
+        (pair.design, pair.design, pair.look_ahead, "hold all six"),
+    ):
+        hopeless = Problem(replace(pair, low=low, high=high, look_ahead=ahead), range(1), 1, 1)
+        with pytest.raises(DomainError, match=said):
+            feasible(hopeless, 1, 0)
 
 
 def test_the_page_says_what_the_committed_race_says():
@@ -252,100 +310,6 @@ def test_the_page_says_what_the_committed_race_says():
         assert cell("others within", pair) == ", ".join(map(str, near))
 
 
-def test_drives_of_a_world_err_alike():
-    """Means of four worlds 0, 1, 2, 3: deviation sqrt(5 / 3), over the root of four."""
-    errors = torch.arange(4.0, dtype=F).repeat_interleave(6)
-    assert outcome.standard_error(errors, 4) == pytest.approx((5 / 3) ** 0.5 / 2)
-    assert outcome.standard_error(errors[:1], 1) == 0.0
-
-
-def test_a_ratio_over_worlds_is_of_means():
-    """Two worlds, ratios 1 / 2 and 3 / 4 of means: together 4 / 6, resampled from 0.5 to 0.75."""
-    ours, theirs = torch.tensor([0.5, 1.5, 2.0, 4.0], dtype=F), torch.tensor([1.0, 3.0, 4.0, 4.0], dtype=F)
-    assert outcome.over_worlds(ours, theirs, 2) == pytest.approx((4 / 6, 0.5, 0.75))
-
-
-def test_a_run_that_goes_on_is_the_one_that_was_begun(tmp_path):
-    config = placement.Config(seeds=2)
-    pair = PAIRS["outdoors"]()
-    begun = json.loads(json.dumps(asked(config, pair)))
-    check_same(begun, asked(replace(config, out=Path("elsewhere")), PAIRS["outdoors"]()))
-    for changed in (replace(config, seeds=3), replace(config, searches=("TPE",))):
-        with pytest.raises(DomainError, match="changed since this run was begun"):
-            check_same(begun, asked(changed, pair))
-    wider = replace(pair, high=replace(pair.high, z_m=pair.high.z_m + 0.1))
-    with pytest.raises(DomainError, match="the robot's high, z_m changed"):
-        check_same(begun, asked(config, wider))
-    world = tmp_path / "room.obj"
-    world.write_text("v 0 0 0")
-    own = replace(pair, files=(world,))
-    begun |= asked(config, own)
-    world.write_text("v 0 0 1")
-    with pytest.raises(DomainError, match="the robot's page changed"):
-        check_same(begun, asked(config, replace(own, page="world_unit_m=0.01")))
-    with pytest.raises(DomainError, match=r"room\.obj' changed"):
-        check_same(begun, asked(config, own))
-    with pytest.raises(DomainError, match=r"room\.obj' belongs to this run's robot or world no more"):
-        check_same(begun, asked(config, pair))
-    world.write_text("v 0 0 0")
-    with pytest.raises(DomainError, match="the robot's shape changed"):
-        check_same(begun, asked(config, replace(own, bodies=dict(list(pair.bodies.items())[1:]))))
-
-
-def test_held_numbers_are_not_searched(problem):
-    """Every point that coordinate search looks at is another mount, and held numbers stay."""
-    pair = problem.pair
-    held = {name: getattr(pair.design, name) for name in ("x_m", "y_m", "yaw_rad", "roll_rad")}
-    narrow = Problem(
-        replace(pair, low=replace(pair.low, **held), high=replace(pair.high, **held)), range(1), 1, 1
-    )
-    narrow.error = lambda share, samples: float((narrow.ranges.numbers(share) - 0.3).square().sum())
-    race = Race(FakeRun(placement.Config()), narrow)
-    race.tensors["gradient/0/samples"] = torch.tensor(8)
-    race.search(0, "coordinate", narrow.start)
-    found = race.trail(0, "coordinate").share
-    assert found.shape == (8, 6)
-    assert len({tuple(row) for row in found[:, ~narrow.ranges.held].tolist()}) == 8
-    assert torch.equal(found[:, narrow.ranges.held], narrow.start[narrow.ranges.held].expand(8, 4))
-    everything = Problem(replace(pair, low=pair.design, high=pair.design), range(1), 1, 1)
-    with pytest.raises(DomainError, match="hold all six"):
-        feasible(everything, 1, 0)
-
-
-@pytest.mark.parametrize("asked", [False, True])
-def test_a_grid_that_was_interrupted_repeats_no_more_than_was_not_kept(problem, asked):
-    """In the middle of second looks, of twelve draws each. Killed it goes back to the fiftieth look, asked to stop nowhere."""
-    few = replace(problem)
-    calls = []
-
-    def error(share, samples):
-        calls.append(samples)
-        if len(calls) == 60 + 5 * FINAL_DRAWS + 3:
-            raise KeyboardInterrupt
-        return float((share - 0.4).square().sum()) + 1e-3 * (samples.seed % 7)
-
-    few.error = error
-    run = FakeRun(placement.Config(grid=60))
-    cut = Race(run, few)
-    with pytest.raises(KeyboardInterrupt):
-        cut.grid()
-    if asked:
-        run.save()
-    resumed = Race(run, few)
-    resumed.tensors = cut.tensors
-    resumed.grid()
-    before = len(calls)
-    whole = Race(run, few)
-    whole.grid()
-    answer = resumed.answer(0, "grid")
-    assert answer.tolist() == whole.answer(0, "grid").tolist()
-    assert kept(few, answer)
-    assert resumed.samples(0, "grid") == whole.samples(0, "grid") == (len(calls) - before) * few.samples
-    repeated = 3 if asked else 13 + 5 * FINAL_DRAWS
-    assert before == len(calls) - before + repeated
-    assert "grid/0/known" not in resumed.tensors
-
-
 def test_the_answer_says_that_the_default_stays():
     """Of one descent and of three."""
     problem = Problem(PAIRS["flight"](), robot_pair.training(1), 1, 1)
@@ -354,13 +318,6 @@ def test_the_answer_says_that_the_default_stays():
     one, three = (answer(SimpleNamespace(**told, **errors, starts=count)) for count in (1, 3))
     assert "on training drives the one descent does not end at a better place (error 0.500" in one
     assert "on training drives none of 3 descents ends at a better place (error 0.500" in three
-
-
-def test_the_first_start_may_be_given(problem):
-    """An own robot's own mount; the others are the first that are drawn at random."""
-    given, *others = feasible(problem, 3, 5, [problem.start])
-    assert torch.equal(given, problem.start)
-    assert torch.equal(torch.stack(others), torch.stack(feasible(problem, 2, 5)))
 
 
 def test_answers_are_chosen_by_their_errors_alone(problem):
@@ -374,83 +331,13 @@ def test_answers_are_chosen_by_their_errors_alone(problem):
         return errors.get(float(share[0]), 0.3)
 
     watched.bounded, watched.penalty = bounded, lambda mount: torch.tensor(0.5)
-    race = Race(FakeRun(placement.Config()), watched)
+    race = Race(FakeRun(), watched)
     race.answer = lambda number, name: torch.full((6,), (0.3, 0.5)[number], dtype=F)
-    assert chosen(race, 2) == 1
+    assert race.chosen(2) == 1
     assert len({samples.seed for samples in drawn}) == FINAL_DRAWS
     errors[0.5] = 0.35
     race.tensors.clear()
-    assert chosen(race, 2) is None
-
-
-def test_a_grid_without_an_allowed_mount_is_refused_before_the_first_descent():
-    blind = Problem(replace(PAIRS["outdoors"](), look_ahead=(3.0, 0.9)), robot_pair.training(1), 1, 1)
-    with pytest.raises(DomainError, match="of 5 mounts of the grid none keeps what is required"):
-        check_grid(blind, 5, 0)
-    check_grid(blind, 0, 0)
-
-
-@pytest.mark.parametrize("fresh", [False, True])
-def test_rivals_see_the_same_drives_unless_they_are_asked_for_others(problem, fresh):
-    watched = replace(problem)
-    seen = []
-
-    def error(share, samples):
-        seen.append(samples.seed)
-        return float((share - 0.4).square().sum())
-
-    watched.error = error
-    race = Race(FakeRun(placement.Config(rivals_fresh=fresh)), watched)
-    race.tensors["gradient/2/samples"] = torch.tensor(5 * watched.samples)
-    race.search(2, "random", watched.start)
-    assert seen == [2000 + fresh * k for k in range(5)]
-
-
-def test_searches_render_nothing_of_mounts_that_are_not_allowed(problem):
-    """Outdoors most of the cube looks down too far to see ahead."""
-    watched = replace(problem)
-    looked = []
-
-    def error(share, samples):
-        looked.append(share)
-        return float((share - 0.4).square().sum())
-
-    watched.error = error
-    race = Race(FakeRun(placement.Config()), watched)
-    race.tensors["gradient/0/samples"] = torch.tensor(12 * watched.samples)
-    race.search(0, "random", watched.start)
-    assert len(looked) == len(race.trail(0, "random").error) == 12
-    assert all(kept(watched, share) for share in looked)
-
-
-class FakeRun:
-    """A run that keeps nothing."""
-
-    def __init__(self, config):
-        self.config = config
-
-    def load_state(self):
-        return None
-
-    def save_state(self, tensors, numbers):
-        pass
-
-    def on_interrupt(self, save):
-        self.save = save
-
-    @contextlib.contextmanager
-    def progress(self, total, description, done=0):
-        yield self
-
-    def advance(self, error):
-        pass
-
-
-def test_a_bound_that_nothing_keeps_is_said():
-    pair = PAIRS["outdoors"]()
-    blind = Problem(replace(pair, look_ahead=(3.0, 0.9)), robot_pair.training(1), 1, 1)
-    with pytest.raises(DomainError, match="keep what is required"):
-        feasible(blind, 1, 0)
+    assert race.chosen(2) is None
 
 
 def test_a_traced_lens_has_the_focal_length_and_focus_asked_for():
@@ -465,16 +352,14 @@ def test_a_traced_lens_has_the_focal_length_and_focus_asked_for():
 
 def test_the_whole_study_and_its_resumption(tmp_path):
     out = tmp_path / "run"
-    sizes = (
-        "--seeds 1 --steps 2 --worlds 1 --per-world 1 --judged-worlds 1 --judged-drives 2 --along 2 --grid 5"
-    )
+    sizes = "--seeds 1 --steps 2 --worlds 1 --per-world 1 --judged-worlds 1 --judged-drives 2"
     arguments = [*sizes.split(), "--searches", "random", "--out", str(out)]
     assert main(placement.study, placement.Config, arguments) == 0
     found = json.loads((out / "metrics.json").read_text())
     assert found["hand_over_score_again"] == pytest.approx(found["hand_over_score"], rel=1e-9)
     before = (out / "race.csv").read_text()
     rows = list(csv.DictReader(before.splitlines()))
-    assert {row["search"] for row in rows} == {"default", "start", "gradient", "random", "grid"}
+    assert {row["search"] for row in rows} == {"default", "start", "gradient", "random"}
     assert {int(row["samples"]) for row in rows if row["search"] in ("gradient", "random")} == {2}
     handed = load_hand_over(out / "mount.yaml")
     row = next(

@@ -8,7 +8,7 @@ import optuna
 import pytest
 import torch
 
-from codesign.errors import DomainError, MissingPackageError, NonFiniteError, ShapeError
+from codesign.errors import DomainError, MissingPackageError, NonFiniteError
 from studies.placement.searches import SEARCHES, Trail, available
 
 D = torch.float64
@@ -142,13 +142,5 @@ def test_what_cannot_be_searched_is_refused(search):
         DomainError, match="search 'cmaes' is unknown; choose from random, coordinate, CMA-ES, TPE"
     ):
         available(["random", "cmaes"])
-    with pytest.raises(DomainError, match=r"start \[0.5, 1.1\] is not in the cube"):
-        search(coupled, torch.tensor([0.5, 1.1], dtype=D), 3, 0)
-    with pytest.raises(ShapeError, match=r"start is \[V\].*\(1, 4\)"):
-        search(coupled, START[None], 3, 0)
-    with pytest.raises(DomainError, match="count = 0 must be a whole number"):
-        search(coupled, START, 0, 0)
-    with pytest.raises(DomainError, match="seed = -1 must be at least 0"):
-        search(coupled, START, 3, -1)
     with pytest.raises(NonFiniteError, match="the judge says nan of the shares"):
         search(lambda share: math.nan, START, 3, 0)

@@ -1,0 +1,112 @@
+"""A robot with its camera before anything is searched: its size, what its camera sees, how much of that is the robot
+itself, whether the mount keeps what is required, and what motions it is blind to."""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from codesign import render
+from codesign.mount import (
+    ATTITUDES,
+    VELOCITIES,
+    Body,
+    OwnBody,
+    Surroundings,
+    judge,
+    sight,
+    sight_map,
+    sight_table,
+    sight_units,
+    yaw_pitch_roll_rad,
+)
+from codesign.report.mount_sphere import mount_sphere
+from scenes import robot_pair
+from scenes.robot_pair import RobotPair
+from studies.frame.run import Run
+from studies.placement import figures
+
+# under it a camera over flat ground tells nothing that a picture would not
+LEAST_HEIGHT_M = 0.05
+
+
+def look(run: Run[Any], pair: RobotPair, camera: render.Camera) -> None:
+    """The page of a robot and its default mount."""
+    pose = pair.design.mount()
+    drives = pair.batch((0,), 1, run.config.seed)
+    body = Body((mesh.vertices_m, mesh.faces) for mesh in pair.bodies.values())
+    own_share = 1 - float(OwnBody(body, 1.0).exact(pose, camera))
+    faces = sum(len(mesh.faces) for mesh in pair.bodies.values())
+    run.record(faces=faces, own_body_share=own_share)
+    run.card("Own body in view", f"{own_share:.1%}", "of the pixels' chief rays")
+    run.section("The robot and its view", size_in_words(pair))
+    run.figure(
+        figures.robot_and_frame(pair, drives, camera, pose),
+        "robot",
+        "Left: the robot in its own axes (m) and its camera's view; right: the frame (gamma 2.2, 255 is white), the windows "
+        "that are read outlined.",
+    )
+    run.text("Requirements: " + "; ".join(map(str, judge(pair.requirements(), pose, camera))) + ".")
+    around = surroundings(pair, pose)
+    if what_it_tells(run, pair, camera, pose, "default"):
+        names = [VELOCITIES[axis] for axis in around.axes]
+        table = sight_table(camera, around)
+        for attitude in ATTITUDES:
+            label = attitude.replace(" ", "_")
+            finite = {name: table[attitude][name] for name in names if math.isfinite(table[attitude][name])}
+            run.record(**{f"{label}_{name}": value for name, value in finite.items()})
+        run.table(
+            "Standard deviations from that place, by where the camera looks",
+            ["looks", "sees", *names, "blind to", "weakest motion"],
+            [
+                [
+                    attitude,
+                    f"{row['seen']:.0%}",
+                    *(row[name] for name in names),
+                    ", ".join(row["blind"]) or "nothing",
+                    row["weakest"],
+                ]
+                for attitude, row in table.items()
+            ],
+            "Blind to: worse than 0.1 m/s or 0.1 rad/s. Weakest motion: shares of the units in which it is hardest to see.",
+        )
+    run.finish("A robot and its camera", f"What the camera of '{pair.name}' sees from its default mount.")
+
+
+def size_in_words(pair: RobotPair) -> str:
+    """How large a robot is, by which a wrong unit or axis is seen."""
+    vertices = np.concatenate([mesh.vertices_m for mesh in pair.bodies.values()])
+    length, width, height = vertices.max(0) - vertices.min(0)
+    return f"'{pair.name}' is {length:.2f} m long (x), {width:.2f} wide (y) and {height:.2f} high (z)."
+
+
+def surroundings(pair: RobotPair, pose: Tensor) -> Surroundings:
+    """Flat ground, as far below a mount [4, 4] as it is in the middle of the pair's first drives."""
+    T_world_body = torch.eye(4, dtype=torch.float64)
+    T_world_body[2, 3] = pair.drive(0, 12)[0][:, robot_pair.FRAMES // 2, 2, 3].mean()
+    x, y, z = pose[:3, 3].tolist()
+    return Surroundings((x, y, z), T_world_body, axes=pair.axes)
+
+
+def what_it_tells(run: Run[Any], pair: RobotPair, camera: render.Camera, pose: Tensor, marked: str) -> bool:
+    """Show what a mount [4, 4] is blind to over flat ground, and all other directions there; False where it is too low."""
+    around = surroundings(pair, pose)
+    height = float(pose[2, 3] + around.T_world_body[2, 3])
+    if height <= LEAST_HEIGHT_M:
+        return False
+    told = sight(around.information(camera, pose)[0], sight_units(around), around.axes)
+    run.text(
+        f"{height:.2f} m over flat ground the motion that shows least from there is {told.weakest_named()} (in units of "
+        f"0.1 m/s and 0.1 rad/s, deviation {told.weakest_deviation:.2f}); blind to: {', '.join(told.blind()) or 'nothing'}."
+    )
+    yaw, pitch, errors = sight_map(camera, around, rows=9, columns=18)
+    now = yaw_pitch_roll_rad(pose).tolist()
+    run.figure(
+        mount_sphere(yaw, pitch, errors, "expected error, units", {marked: (now[0], now[1])}),
+        "sight",
+        "What the place allows: the error that flow over flat ground lets expect, over all directions the camera may look in "
+        "(27 points of 5 px/s).",
+    )
+    return True
