@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.errors import DomainError, ShapeError
 from codesign.mount import Body, Housing
 from codesign.mount.pose import attitude
 from codesign.mount.triangles import closest_points, first_crossings, winding_numbers
@@ -210,33 +209,3 @@ def test_the_rover_is_a_body_without_its_camera():
     alone = Body.of(robot.parts, without=["camera_link"]).distance_m(camera)
     rim = 0.04 - 0.015 * math.cos(math.pi / 48)  # of 48 faces: between its apothem and its radius
     assert math.hypot(0.04 - 0.015, 0.05) - 1e-9 <= float(alone) <= math.hypot(rim, 0.05) + 1e-9
-
-
-@pytest.mark.parametrize(
-    ("make", "error", "sentence"),
-    [
-        (lambda: Body([]), DomainError, "no triangles"),
-        (lambda: Body([([(0, 0, math.nan)] * 3, [(0, 1, 2)])]), DomainError, "vertices"),
-        (
-            lambda: Body([([(0, 0, 0)] * 3, [(0, 1, 3)])]),
-            DomainError,
-            "vertex 3; there are those from 0 to 2",
-        ),
-        (lambda: Body([([(0, 0)] * 3, [(0, 1, 2)])]), ShapeError, r"\[V, 3\]"),
-        (
-            lambda: Body([(box_mesh(*BOX)[0], np.concatenate([FACES[:-1], [FACES[-1][::-1]]]))]),
-            DomainError,
-            "turn different ways",
-        ),
-        (
-            lambda: Body.of(robots.from_urdf(robots.ROVER).parts, without=["arm"]),
-            DomainError,
-            "'arm'; there are",
-        ),
-        (lambda: Housing(0.0), DomainError, "radius_m is 0"),
-        (lambda: Housing(0.1, -1.0), DomainError, "behind_m is -1"),
-    ],
-)
-def test_bad_bodies_get_a_sentence(make, error, sentence):
-    with pytest.raises(error, match=sentence):
-        make()

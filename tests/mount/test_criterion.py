@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from codesign import lens, render
-from codesign.errors import DomainError, ShapeError
 from codesign.mount import (
     PLANAR,
     EgoVelocity,
@@ -163,35 +162,3 @@ def test_sight_of_two_that_look_alike():
     torch.testing.assert_close(found.alone, torch.full((2,), 101.0, dtype=D).rsqrt())
     assert found.weakest_named() in ("+0.71 forward -0.71 pitch", "-0.71 forward +0.71 pitch")
     assert found.weakest_deviation == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize(
-    ("make", "error", "sentence"),
-    [
-        (lambda: flow_precision(torch.zeros(4, 2)), ShapeError, "xx, xy, yy"),
-        (lambda: flow_precision(torch.tensor([1.0, 2.0, 1.0])), DomainError, "not positive"),
-        (
-            lambda: expected_error(torch.eye(3), (1.0, 1.0), (1.0, 1.0, 1.0)),
-            ShapeError,
-            "unit has 2 numbers",
-        ),
-        (lambda: expected_error(torch.eye(2), (1.0, 1.0), (1.0, 0.0)), DomainError, "prior is"),
-        (
-            lambda: sight(torch.eye(3).repeat(2, 1, 1), (1.0, 1.0, 1.0), PLANAR),
-            ShapeError,
-            "one information",
-        ),
-    ],
-)
-def test_bad_input_gets_a_sentence(make, error, sentence):
-    with pytest.raises(error, match=sentence):
-        make()
-
-
-def test_weights_that_are_no_covariances_get_a_sentence(camera, down):
-    depth = torch.full((24,), HEIGHT, dtype=D)
-    wrong = torch.tensor([[1.0, 2.0], [2.0, 1.0]], dtype=D).repeat(24, 1, 1)
-    with pytest.raises(DomainError, match="not symmetric and positive"):
-        observability.information(camera, depth, down, wrong)
-    with pytest.raises(DomainError, match="positive weight"):
-        observability.information(camera, depth, down, 0 * wrong)

@@ -8,10 +8,8 @@ import pytest
 import torch
 
 from codesign import lens, render
-from codesign.errors import DomainError, ShapeError
-from codesign.mount import ATTITUDES, VELOCITIES, Surroundings, scene_depth, sight_map, sight_table
+from codesign.mount import ATTITUDES, VELOCITIES, Surroundings, sight_map, sight_table
 from codesign.report.mount_sphere import mount_sphere
-from scenes import worlds
 
 D = torch.float64
 FOCAL_PX = 3.4 / 0.148
@@ -85,14 +83,6 @@ def test_far_walls_show_turns_alone(camera):
     assert row["blind"] == ["forward", "left", "up", "roll", "pitch", "yaw"]
 
 
-def test_ground_as_a_scene_is_ground(camera):
-    flat = Surroundings((0.1, 0.0, HEIGHT), farthest_m=4.0)
-    mapped = Surroundings((0.1, 0.0, HEIGHT), depth=scene_depth, scene=worlds.smooth_plane(), farthest_m=4.0)
-    for name in ("oblique", "downward"):
-        a, b = (sight_table(camera, each)[name]["sight"].deviation for each in (flat, mapped))
-        torch.testing.assert_close(a, b, rtol=1e-6, atol=0)
-
-
 def test_the_map_is_even_around_a_body_that_has_no_front(camera, over_ground):
     square = render.Camera(lens.Pinhole(3.4), 16, 16, 0.148)
     yaw, pitch, error = sight_map(square, over_ground, rows=6, columns=5)
@@ -115,12 +105,3 @@ def test_the_picture_shows_the_map(camera, over_ground):
     line = figure.axes[0].lines[-1]
     assert np.asarray(line.get_xydata()).tolist() == [[-0.3, -1.0]]
     plt.close(figure)
-
-
-def test_bad_input_gets_a_sentence(camera, over_ground):
-    with pytest.raises(DomainError, match="1 rows"):
-        sight_map(camera, over_ground, rows=1)
-    with pytest.raises(ShapeError, match="unit and prior need 6 numbers"):
-        sight_map(camera, over_ground, unit=(1.0,))
-    with pytest.raises(DomainError, match="deviation_px_s"):
-        Surroundings((0.0, 0.0, 1.0), deviation_px_s=0.0)

@@ -8,15 +8,12 @@ import torch
 from scipy.integrate import quad
 
 from codesign import lens, render
-from codesign.errors import DomainError
 from codesign.mount import (
     FREE,
     EgoVelocity,
     Mount,
     UnknownDepth,
-    VelocityHead,
     body_flow,
-    expected_errors,
     unknown_depth,
 )
 from codesign.types import FlowField
@@ -207,18 +204,3 @@ def test_gradient_is_that_of_differences(camera, outlier):
         spreads = [value(flow, spread + sign * step) for sign in (1, -1)]
     assert float((of_flow * along).sum()) == pytest.approx(float(flows[0] - flows[1]) / (2 * step), rel=0.02)
     assert float(of_spread) == pytest.approx(float(spreads[0] - spreads[1]) / (2 * step), rel=0.02, abs=1e-4)
-
-
-def test_refusals(camera):
-    for nearest_m, farthest_m in ((0.0, 1.0), (2.0, 1.0), (1.0, 1.0), (math.nan, 1.0)):
-        with pytest.raises(DomainError, match="nearest"):
-            UnknownDepth(nearest_m, farthest_m)
-    ours = estimator(0.3, 5.0)
-    with pytest.raises(DomainError, match="head"):
-        VelocityHead(ours)
-    mount, poses, twist, field = drives(camera, 2, 0.3, 5.0, 1)
-    with pytest.raises(DomainError, match="depth is known"):
-        expected_errors(ours, ours.read(field, camera, None, mount, poses), twist)
-    known = ours.read(field, camera, None, mount, poses, depth=ours.depth.__call__)
-    with pytest.raises(DomainError, match="know their depth"):
-        ours.solve(known)
