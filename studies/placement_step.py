@@ -16,8 +16,9 @@ from codesign import events, lens
 from codesign.errors import DomainError
 from codesign.mount import Mount
 from codesign.system import Batch, System
-from scenes import robot_pair, textures, worlds
-from scenes.robot_pairs import PAIRS
+from scenes import textures, worlds
+from scenes.robots import pair as robot_pair
+from scenes.robots.pairs import PAIRS
 from studies.frame.run import Run, StudyConfig, main
 
 ASKED_CPU_S = 0.6

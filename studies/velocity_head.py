@@ -18,9 +18,9 @@ from codesign import train
 from codesign.errors import DomainError
 from codesign.flow import checkpoint
 from codesign.mount import EgoVelocity, Evidence, VelocityHead, velocity_errors
-from scenes import robot_pair
-from scenes.robot_pair import Design, RobotPair
-from scenes.robot_pairs import PAIRS, check_pairs
+from scenes.robots import pair as robot_pair
+from scenes.robots.pair import Design, RobotPair
+from scenes.robots.pairs import PAIRS, check_pairs
 from studies.frame.run import Run, StudyConfig, main
 
 AT_ONCE = 6  # drives in each world, rendered together: 8 million rays for every 12 samples

@@ -337,7 +337,7 @@ class VelocityHead(nn.Module):
 
     @classmethod
     def pretrained(cls, plain: EgoVelocity) -> "VelocityHead":
-        """The delivered head, which studies.velocity_head trained on the three pairs of scenes.robot_pairs.
+        """The delivered head, which studies.velocity_head trained on the three pairs of scenes.robots.pairs.
 
         It knows their regime: nine windows of 32 x 32, the closed form of flow with a prior of 4 px, axes ``mount.FREE``.
         Elsewhere it is a start for training.

@@ -1,7 +1,7 @@
 """Where to mount the camera on a robot: gradient steps in the six numbers of its pose, beside random and coordinate search,
 CMA-ES and TPE at equal renders; with --look only the robot, what its camera sees, and what it is blind to.
 
-A robot drives through its worlds and reads its velocity off event flow (scenes/robot_pair.py, or a robot of your own:
+A robot drives through its worlds and reads its velocity off event flow (scenes/robots/pair.py, or a robot of your own:
 --robot). The gradient is that of the error to be expected: from the covariance that the flow's estimator claims, flow
 beyond its reach, wrong depths, and what the robot covers of the picture. All searches begin at the same mounts, render as
 many samples, and are judged by single events of the hard sensor in worlds and drives that none of them saw.
@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import ClassVar
 
 from codesign.errors import DomainError
-from scenes import robot_pair
-from scenes.robot_check import check_pair
-from scenes.robot_own import own_pair
-from scenes.robot_pairs import PAIRS
+from scenes.robots import pair as robot_pair
+from scenes.robots.check import check_pair
+from scenes.robots.own import own_pair
+from scenes.robots.pairs import PAIRS
 from studies.frame.run import Run, StudyConfig, main
 from studies.placement.look import look, size_in_words
 from studies.placement.outcome import Outcome

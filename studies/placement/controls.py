@@ -9,7 +9,7 @@ from codesign import events
 from codesign.mount import FREE, EgoVelocity, UnknownDepth, scene_depth
 from codesign.mount.depth import hidden_by_objects
 from codesign.types import EventVolume
-from scenes.robot_pair import BINS, LEAD_S, SENSOR
+from scenes.robots.pair import BINS, LEAD_S, SENSOR
 from studies.placement.problem import Problem, Samples, readings
 
 MISMATCHED = replace(SENSOR, theta_on=1.3 * SENSOR.theta_on, theta_off=0.8 * SENSOR.theta_off)

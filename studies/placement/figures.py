@@ -16,7 +16,7 @@ from codesign.render import Camera, frames
 from codesign.report import robot_figures
 from codesign.report.flow_colours import flow_colours
 from scenes import bodies
-from scenes.robot_pair import FRAMES, SENSOR_PX, WINDOW_PX, Drives, RobotPair
+from scenes.robots.pair import FRAMES, SENSOR_PX, WINDOW_PX, Drives, RobotPair
 from studies.placement.problem import Problem, Samples
 from studies.placement.searches import Trail
 

@@ -23,8 +23,8 @@ from codesign.mount import (
     yaw_pitch_roll_rad,
 )
 from codesign.report.mount_sphere import mount_sphere
-from scenes import robot_pair
-from scenes.robot_pair import RobotPair
+from scenes.robots import pair as robot_pair
+from scenes.robots.pair import RobotPair
 from studies.frame.run import Run
 from studies.placement import figures
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from codesign.atomic import write_atomic
 from codesign.mount import VelocityErrors, judge
 from codesign.system import HandOver, load_hand_over, save_hand_over
-from scenes import robot_pair
+from scenes.robots import pair as robot_pair
 from studies.frame.run import Run
 from studies.placement import figures
 from studies.placement.controls import controls, looking_back, pixel_errors

@@ -25,8 +25,8 @@ from codesign.mount import (
     velocity_errors,
 )
 from codesign.system import System
-from scenes import robot_pair
-from scenes.robot_pair import Drives, RobotPair, times
+from scenes.robots import pair as robot_pair
+from scenes.robots.pair import Drives, RobotPair, times
 
 DRIVES = 48  # of every world that draws are made from
 CLEAR = 0.02  # least share of a window that is taken to be clear of the robot

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.mount import PrecisionTrend
-from scenes.robot_pair import RobotPair
+from scenes.robots.pair import RobotPair
 from studies.frame.config import StudyConfig, to_json
 from studies.frame.run import Run
 from studies.placement.problem import Problem

@@ -9,7 +9,7 @@ import numpy as np
 import PIL.Image
 
 from scenes import mesh_files, robots, textures, tum, worlds
-from scenes.robot_file import read_own
+from scenes.robots.page import read_own
 
 Seed = tuple[Callable[[], bytes], Callable[[Path], object]]
 LIGHT = np.random.default_rng(0).uniform(0, 255, (6, 12, 3)).astype(np.uint8)

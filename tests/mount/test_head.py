@@ -13,8 +13,8 @@ from codesign.flow.checkpoint import DELIVERED
 from codesign.mount import FREE, PLANAR, EgoVelocity, Evidence, Mount, VelocityHead
 from codesign.mount.head import evidence
 from codesign.types import FlowField
-from scenes import robot_pair
-from scenes.robot_pairs import PAIRS
+from scenes.robots import pair as robot_pair
+from scenes.robots.pairs import PAIRS
 
 D = torch.float64
 INTERVAL_S = 0.01

@@ -7,7 +7,7 @@ import torch
 
 from codesign.mount import Mount, MountRanges
 from codesign.pose import check_poses
-from scenes.robot_pairs import PAIRS
+from scenes.robots.pairs import PAIRS
 
 D = torch.float64
 LOW = (0.1, -0.2, 0.3, -2.0, -1.4, -3.0)

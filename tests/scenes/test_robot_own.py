@@ -12,11 +12,12 @@ from scipy.spatial.transform import Rotation
 from codesign import backend, lens, pose, render
 from codesign.errors import CodesignError, DomainError, FileFormatError
 from codesign.mount import FREE, CableSide, Clearance, EgoVelocity, Housing, LookAhead, OwnBody
-from scenes import build, robot_pair, robot_parts, robots, textures, worlds
-from scenes.robot_check import check_pair
-from scenes.robot_file import CameraBox, OwnRobot, Start, read_own
-from scenes.robot_own import own_pair, with_named
-from scenes.robot_pairs import PAIRS
+from scenes import bodies, build, robots, textures, worlds
+from scenes.robots import pair as robot_pair
+from scenes.robots.check import check_pair
+from scenes.robots.own import own_pair, with_named
+from scenes.robots.page import CameraBox, OwnRobot, Start, read_own
+from scenes.robots.pairs import PAIRS
 
 D = torch.float64
 TWIST = torch.tensor([0.4, 0.1, 0.0, 0.0, 0.0, 0.3], dtype=D)
@@ -62,8 +63,8 @@ def tipped(pitch_rad):
 def page(tmp_path):
     """Writes a page beside a robot, a blank room and trajectories, and gives its path."""
     t_s = np.linspace(1.7e9, 1.7e9 + 1.5, 31)
-    (tmp_path / "box.obj").write_text(obj(robot_parts.box((0.4, 0.3, 0.2), (0.0, 0.0, 0.05))))
-    (tmp_path / "blank.obj").write_text(obj(robot_parts.box((6.0, 6.0, 3.0), (0.0, 0.0, 1.4))))
+    (tmp_path / "box.obj").write_text(obj(bodies.box((0.4, 0.3, 0.2), (0.0, 0.0, 0.05))))
+    (tmp_path / "blank.obj").write_text(obj(bodies.box((6.0, 6.0, 3.0), (0.0, 0.0, 1.4))))
     (tmp_path / "notes.txt").write_text("a robot")
     (tmp_path / "screw.csv").write_text(csv(t_s, screw(t_s - t_s[0])))
     (tmp_path / "short.csv").write_text(csv(t_s[:2], screw([0.0, 0.05])))
@@ -74,7 +75,7 @@ def page(tmp_path):
         csv(t_s, screw(np.where(t_s - t_s[0] < 1, t_s - t_s[0], 1 + 8e-3 * (t_s - t_s[0]))))
     )
     (tmp_path / "tips.csv").write_text(csv(t_s, screw(t_s - t_s[0]) @ tipped(1.2)))
-    (tmp_path / "pole.obj").write_text(obj(robot_parts.box((0.1, 0.1, 0.6), (0.0, 0.0, -0.25))))
+    (tmp_path / "pole.obj").write_text(obj(bodies.box((0.1, 0.1, 0.6), (0.0, 0.0, -0.25))))
     (tmp_path / "fast.csv").write_text(csv(t_s, screw(300 * (t_s - t_s[0]))))
     textured_room(tmp_path)
     (tmp_path / "back.csv").write_text(csv(t_s[::-1], screw(t_s - t_s[0])))
@@ -312,13 +313,13 @@ def test_a_fault_gets_one_sentence_before_the_first_frame(fault, page):
 
 
 def test_a_robot_in_millimetres_has_no_room_in_the_worlds_of_pairs(page, tmp_path):
-    (tmp_path / "box.obj").write_text(obj(robot_parts.box((400.0, 300.0, 200.0), (0.0, 0.0, 50.0))))
+    (tmp_path / "box.obj").write_text(obj(bodies.box((400.0, 300.0, 200.0), (0.0, 0.0, 50.0))))
     with pytest.raises(DomainError, match=r"reaches 250 m from its origin, .* give a mesh in metres"):
         own_pair(page(PAGE))
 
 
 def test_a_mesh_counts_in_the_unit_that_the_page_says(page, tmp_path):
-    (tmp_path / "box.obj").write_text(obj(robot_parts.box((400.0, 300.0, 200.0), (0.0, 0.0, 50.0))))
+    (tmp_path / "box.obj").write_text(obj(bodies.box((400.0, 300.0, 200.0), (0.0, 0.0, 50.0))))
     said = own_pair(page(PAGE + "unit_m: 0.001\nworld: room.obj\nworld_unit_m: 0.5\nmotion: screw.csv\n"))
     [body] = said.bodies.values()
     assert body.vertices_m.max(0).tolist() == pytest.approx([0.2, 0.15, 0.15])

@@ -12,8 +12,9 @@ from codesign import lens, pose, render
 from codesign.errors import DomainError
 from codesign.mount import FREE, Body, EgoVelocity, body_flow, ground_depth, judge, yaw_pitch_roll_rad
 from codesign.mount.depth import scene_depth
-from scenes import robot_pair, robot_parts
-from scenes.robot_pairs import PAIRS
+from scenes import bodies
+from scenes.robots import pair as robot_pair
+from scenes.robots.pairs import PAIRS
 
 D = torch.float64
 NAMES = tuple(PAIRS)
@@ -37,11 +38,11 @@ def volume_m3(body):
 
 
 def test_boxes_and_cylinders_have_their_volumes_and_stand_where_they_are_asked_to():
-    around = robot_parts.AROUND
+    around = bodies.AROUND
     area = around / 2 * math.sin(2 * math.pi / around)  # of the regular polygon in a circle of radius 1
-    assert volume_m3(robot_parts.box((2.0, 1.0, 0.5), (3.0, 2.0, 1.0), 30.0)) == pytest.approx(1.0, rel=1e-12)
+    assert volume_m3(bodies.box((2.0, 1.0, 0.5), (3.0, 2.0, 1.0), 30.0)) == pytest.approx(1.0, rel=1e-12)
     for axis, name in enumerate("xyz"):
-        body = robot_parts.cylinder(0.1, 0.04, (1.0, 2.0, 3.0), name)
+        body = bodies.cylinder(0.1, 0.04, (1.0, 2.0, 3.0), name)
         assert volume_m3(body) == pytest.approx(area * 0.01 * 0.04, rel=1e-9)
         half = np.ptp(body.vertices_m, axis=0)[axis] / 2
         assert half == pytest.approx(0.02, rel=1e-12)

@@ -14,8 +14,8 @@ import torch
 
 from codesign.errors import DomainError
 from codesign.system import load_hand_over
-from scenes import robot_pair
-from scenes.robot_pairs import PAIRS
+from scenes.robots import pair as robot_pair
+from scenes.robots.pairs import PAIRS
 from studies.frame.run import main
 from studies.placement import __main__ as placement
 from studies.placement import outcome

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from codesign.mount import EgoVelocity, Evidence, VelocityHead
-from scenes.robot_pairs import PAIRS
+from scenes.robots.pairs import PAIRS
 from studies import velocity_head
 from studies.frame.run import main
 from studies.velocity_head import designs

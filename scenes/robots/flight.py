@@ -10,10 +10,10 @@ from codesign import backend
 from codesign.mount import FREE
 from codesign.pose import se3_exp
 from codesign.render import MitsubaScene
-from scenes import robot_pair
+from scenes.bodies import box, cylinder
 from scenes.build import World, ball, block, emissive, rectangle
-from scenes.robot_pair import RATE_RAD_S, Design, RobotPair, speeds_and_deviates
-from scenes.robot_parts import box, cylinder
+from scenes.robots import pair as robot_pair
+from scenes.robots.pair import RATE_RAD_S, Design, RobotPair, speeds_and_deviates
 
 SIDE_M = 5.0
 HEIGHT_M = 3.2

@@ -1,4 +1,4 @@
-"""A pair out of a user's own files: a robot from URDF or a mesh, a world, a trajectory (scenes.robot_file)."""
+"""A pair out of a user's own files: a robot from URDF or a mesh, a world, a trajectory (scenes.robots.page)."""
 
 import contextlib
 import math
@@ -16,11 +16,12 @@ from codesign import render
 from codesign.errors import CodesignError, DomainError, FileFormatError
 from codesign.mount import FREE, PLANAR
 from codesign.pose import se3_exp
-from scenes import mesh_files, robot_pair, robots, worlds
+from scenes import mesh_files, robots, worlds
 from scenes.bodies import Body
-from scenes.robot_file import OwnRobot, read_own
-from scenes.robot_pair import Design, RobotPair
-from scenes.robot_pairs import PAIRS
+from scenes.robots import pair as robot_pair
+from scenes.robots.page import OwnRobot, read_own
+from scenes.robots.pair import Design, RobotPair
+from scenes.robots.pairs import PAIRS
 from scenes.tum import Recorded, read_tum
 
 ROOM_M = 0.75  # from a robot's origin to its outermost point, in the worlds of the pairs
@@ -40,13 +41,13 @@ Drive = Callable[[int, int], tuple[Tensor, Tensor]]
 
 
 def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
-    """The pair that a page of settings describes; to be looked at by ``robot_check.check_pair`` before the first frame.
+    """The pair that a page of settings describes; to be looked at by ``check.check_pair`` before the first frame.
 
     A robot that drives through the world of a pair stands with its lowest point 8 mm over the ground, wherever its
     origin is. Windows of a trajectory begin at random places, for training in its first two thirds, for judging in
     the rest. A world from a file is the same for all numbers.
 
-    Args: settings: or the path of their page (``robot_file.read_own``).
+    Args: settings: or the path of their page (``page.read_own``).
     Raises: FileFormatError for files that are missing or damaged; DomainError, naming the entry, for what is
       unknown, missing, out of range, or does not go together: a robot without room in the world, a trajectory that
       stands still or is shorter than three windows.

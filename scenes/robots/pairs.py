@@ -3,10 +3,10 @@
 from collections.abc import Callable, Sequence
 
 from codesign.errors import DomainError
-from scenes.robot_corridor import corridor
-from scenes.robot_flight import flight
-from scenes.robot_outdoors import outdoors
-from scenes.robot_pair import RobotPair
+from scenes.robots.corridor import corridor
+from scenes.robots.flight import flight
+from scenes.robots.outdoors import outdoors
+from scenes.robots.pair import RobotPair
 
 PAIRS: dict[str, Callable[[], RobotPair]] = {
     "outdoors": outdoors,

@@ -19,8 +19,8 @@ from typing import TypeAlias, get_args, get_origin, get_type_hints
 from codesign import plain_yaml
 from codesign.errors import CodesignError, DomainError, as_number, shown
 from codesign.reading import read_text, reading
-from scenes import robot_pair
-from scenes.robot_pairs import PAIRS
+from scenes.robots import pair as robot_pair
+from scenes.robots.pairs import PAIRS
 
 Two: TypeAlias = tuple[float, float]
 Three: TypeAlias = tuple[float, float, float]

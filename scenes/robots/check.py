@@ -7,8 +7,8 @@ import torch
 from codesign import events, render
 from codesign.errors import DomainError
 from codesign.mount import check_mount
-from scenes import robot_pair
-from scenes.robot_pair import RobotPair
+from scenes.robots import pair as robot_pair
+from scenes.robots.pair import RobotPair
 
 DRIVES = 6  # looked at in each world
 BLOCK_PX = 8

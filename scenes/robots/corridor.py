@@ -9,10 +9,10 @@ import torch
 from codesign import backend
 from codesign.mount import PLANAR
 from codesign.render import MitsubaScene
-from scenes import robot_pair
+from scenes.bodies import box, cylinder
 from scenes.build import GAP_M, World, block, emissive, rectangle
-from scenes.robot_pair import RATE_RAD_S, Design, RobotPair, speeds_and_deviates
-from scenes.robot_parts import box, cylinder
+from scenes.robots import pair as robot_pair
+from scenes.robots.pair import RATE_RAD_S, Design, RobotPair, speeds_and_deviates
 
 LENGTH_M = 14.0
 HEIGHT_M = 2.5

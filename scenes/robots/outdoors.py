@@ -10,10 +10,11 @@ from codesign import backend
 from codesign.errors import DomainError
 from codesign.mount import PLANAR
 from codesign.render import MitsubaScene
-from scenes import robot_pair, textures
+from scenes import textures
+from scenes.bodies import box, cylinder
 from scenes.build import GAP_M, Paint, World, ball, block, emissive, pole, rectangle, sky
-from scenes.robot_pair import RATE_RAD_S, Design, RobotPair, speeds_and_deviates
-from scenes.robot_parts import box, cylinder
+from scenes.robots import pair as robot_pair
+from scenes.robots.pair import RATE_RAD_S, Design, RobotPair, speeds_and_deviates
 
 HALF_M = 12.0  # of the ground
 THINGS = 28
