@@ -1,4 +1,4 @@
-"""What must come out when there is nothing to be found, and what a wrong objective finds."""
+"""What must come out when there is nothing to be found."""
 
 from dataclasses import replace
 
@@ -6,11 +6,10 @@ import torch
 from torch import Tensor
 
 from codesign import events
-from codesign.mount import FREE, EgoVelocity, UnknownDepth, scene_depth
-from codesign.mount.depth import hidden_by_objects
+from codesign.mount import FREE, EgoVelocity, UnknownDepth
 from codesign.types import EventVolume
 from scenes.robots.pair import BINS, LEAD_S, SENSOR
-from studies.placement.problem import Problem, Samples, readings
+from studies.placement.problem import Problem, Samples
 
 MISMATCHED = replace(SENSOR, theta_on=1.3 * SENSOR.theta_on, theta_off=0.8 * SENSOR.theta_off)
 NEAR_M = 0.01  # before a face of the robot
@@ -66,23 +65,3 @@ def looking_back(problem: Problem) -> Tensor:
     pose[:3, :3] = torch.stack([right, torch.linalg.cross(view, right), view], 1)
     pose[:3, 3] = faces[largest].mean(0) - NEAR_M * view
     return pose
-
-
-@torch.no_grad()
-def pixel_errors(problem: Problem, mount: Tensor, samples: Samples) -> float:
-    """Root mean square error of the flow of hard counts in pixels, over surfaces of the world and the robot's own body, whose image stands
-    still; the sky is left out. NaN where nothing else is seen."""
-    batch = problem.batch(samples)
-    run = problem.system(mount).begin(batch)
-    read = readings(run, scene_depth)
-    true = (read.rows @ batch.twist[:, None, :, None])[..., 0]
-    body = readings(run, _body_depth).share > 0
-    seen = body | (read.share > 0)
-    missed = (read.flow_px - true * ~body[..., None]).square().sum(-1)
-    return float(missed[seen].mean().sqrt())
-
-
-def _body_depth(*where):
-    """A depth where the robot's own body is seen, whichever; infinite elsewhere."""
-    body = hidden_by_objects(*where)
-    return torch.where(body, torch.ones(body.shape, dtype=torch.float64), torch.inf)

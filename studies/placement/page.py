@@ -12,7 +12,7 @@ from codesign.system import HandOver, load_hand_over, save_hand_over
 from scenes.robots import pair as robot_pair
 from studies.frame.run import Run
 from studies.placement import figures
-from studies.placement.controls import controls, looking_back, pixel_errors
+from studies.placement.controls import controls
 from studies.placement.look import what_it_tells
 from studies.placement.outcome import INTERVAL, Outcome
 from studies.placement.problem import Problem
@@ -117,7 +117,7 @@ def seen(run: Run[Any], outcome: Outcome) -> None:
 
 
 def left(run: Run[Any], outcome: Outcome) -> None:
-    """What is left where there is nothing to be found, and what an objective in pixels would find."""
+    """What is left where there is nothing to be found."""
     unseen, mount = outcome.unseen, outcome.pose
     samples = unseen.draw(0)
     found = controls(unseen, mount, samples)
@@ -132,16 +132,6 @@ def left(run: Run[Any], outcome: Outcome) -> None:
         [[k.replace("_", " "), v] for k, v in found.items()],
     )
     run.record(**{f"control_{name}_error": value for name, value in found.items()})
-    moving, still = pixel_errors(unseen, mount, samples), pixel_errors(unseen, looking_back(unseen), samples)
-    if math.isnan(moving + still):
-        run.text("Where nothing of the world is seen there is no error of flow in pixels.")
-        return
-    run.record(pixel_error_px=moving, pixel_error_only_the_robot_px=still)
-    run.text(
-        "An objective in pixels would cheat: the mount that sees only the robot has the least error of flow, "
-        f"{still:.2f} px against {moving:.2f} px of the answer, since nothing moves there. Of the way the robot goes it "
-        f"says nothing ({found['only_the_robot']:.2f} against {found['as_found']:.2f})."
-    )
 
 
 def handed(run: Run[Any], outcome: Outcome) -> VelocityErrors:

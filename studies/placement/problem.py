@@ -2,10 +2,9 @@
 requirements of the mount. A mount is six shares of the pair's ranges."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,7 +28,6 @@ from scenes.robots import pair as robot_pair
 from scenes.robots.pair import Drives, RobotPair, times
 
 DRIVES = 48  # of every world that draws are made from
-CLEAR = 0.02  # least share of a window that is taken to be clear of the robot
 
 
 @dataclass(frozen=True)
@@ -46,14 +44,14 @@ class Seen:
     """What is seen of N drives from one mount.
 
     read: by the depth that the estimator believes in. surfaces: the same with true depths. true_rows: [N, P, 2, 6].
-    flow_px: [N, P, 2], true. covered: [N, windows] by the robot, where it was asked for.
+    flow_px: [N, P, 2], true. covered: [N, windows] by the robot.
     """
 
     read: Readings
     surfaces: Readings
     true_rows: Tensor
     flow_px: Tensor
-    covered: Tensor | None
+    covered: Tensor
 
 
 @dataclass
@@ -161,22 +159,6 @@ class Problem:
         """0 where every requirement is kept with a step to spare. Gradient: mount."""
         return mount.penalty(self.requirements, T_body_cam, self.camera)
 
-    def expected(self, T_body_cam: Tensor, samples: Samples, learn: bool = False) -> Tensor:
-        """Bounded error [N] to be expected of a mount: what is descended, by ``expected_around``.
-
-        learn: take these samples into the trend of the flow's precision.
-        Gradient: mount, the slope at this very place, through the geometry of flow, the trend of its precision, and the
-        share of every window that the robot itself covers; not through single frames, whose texture makes it noise.
-        """
-        batch = self.batch(samples)
-        with torch.no_grad():
-            field = self.system(T_body_cam).begin(batch)["field"]
-        followed = T_body_cam.requires_grad
-        seen = self._seen(field, batch, T_body_cam, learn or followed)
-        if learn:
-            self.trend.add(seen.surfaces, seen.flow_px, seen.covered)
-        return self._bounded(self._followed(seen) if followed else seen.read, seen, batch.twist)
-
     @torch.no_grad()
     def expected_around(
         self, share: Tensor, samples: Samples, step: float, learn: bool = False
@@ -185,12 +167,13 @@ class Problem:
 
         Pictures are taken of the mount itself alone. From the others there is the geometry, with its edges: surfaces, their true flow,
         what the robot covers; how well flow is told there is carried over by the trend (``mount.PrecisionTrend.carried``).
-        At a wall of the cube the step ends there. learn: as for ``expected``.
+        At a wall of the cube the step ends there. learn: take these samples into the trend of the flow's precision.
+        What is expected is by errors of flow, not by single frames, whose texture would make its slope noise.
         """
         batch = self.batch(samples)
         pose = self.ranges.pose(share)
         field = self.system(pose).begin(batch)["field"]
-        here = self._seen(field, batch, pose, True)
+        here = self._seen(field, batch, pose)
         if learn:
             self.trend.add(here.surfaces, here.flow_px, here.covered)
         value = self._bounded(here.read, here, batch.twist).mean()
@@ -205,13 +188,13 @@ class Problem:
         worlds, each = len(samples.numbers), len(samples.which)
         batch = self._scenes(replace(samples, which=samples.which * len(poses)))
         which = torch.arange(worlds * each).reshape(worlds, 1, each).expand(-1, len(poses), -1).flatten()
-        there = self._seen(_of(field, which, worlds * each), batch, poses.repeat_interleave(each, 0), True)
+        there = self._seen(_of(field, which, worlds * each), batch, poses.repeat_interleave(each, 0))
         told = self.trend.told(here.surfaces, here.flow_px, here.covered)
         told_there = self.trend.told(there.surfaces, there.flow_px, there.covered)
         read = self.trend.carried(_of(here.read, which, worlds * each), told[which], there.read, told_there)
         return self._bounded(read, there, batch.twist).reshape(worlds, len(poses), each).mean((0, 2))
 
-    def _seen(self, field, batch, T_body_cam, cover=False):
+    def _seen(self, field, batch, T_body_cam):
         """What flow in the windows of a batch is of, from a mount [4, 4], or from one for each drive of a world."""
         T_world_cam = batch.T_world_body @ T_body_cam[..., None, :, :]
         estimator = self._system.estimate
@@ -219,18 +202,9 @@ class Problem:
         read = look()
         true = read if self.pair.depth == "scene" else look(depth=scene_depth)
         flow_px = (true.rows @ batch.twist[:, None, :, None])[..., 0]
-        covered = None
-        if cover:
-            covered = self._own_body.covered(T_body_cam, self.camera)
-            covered = covered.expand(*T_world_cam.shape[:2], -1).flatten(0, 1)
+        covered = self._own_body.covered(T_body_cam, self.camera)
+        covered = covered.expand(*T_world_cam.shape[:2], -1).flatten(0, 1)
         return Seen(read, replace(read, depth_m=true.depth_m), true.rows, flow_px, covered)
-
-    def _followed(self, seen):
-        """Readings with the gradient of trend and cover."""
-        read = self.trend.followed(seen.surfaces, seen.flow_px, seen.covered)
-        clear = (1 - seen.covered).clamp_min(CLEAR)
-        share = read.share * read.of_windows(clear / clear.detach())
-        return replace(read, depth_m=seen.read.depth_m, share=share)
 
     def _bounded(self, read, seen, twist):
         """Bounded error [N] to be expected of readings."""
@@ -249,12 +223,6 @@ def _of(parts, which, count):
         if torch.is_tensor(value):
             found[each.name] = value.unflatten(0, (count, -1))[which].flatten(0, 1)
     return replace(parts, **found)
-
-
-def readings(run: Mapping[str, Any], depth: Callable[..., Tensor] | None = None) -> Readings:
-    """What the estimator of a pass reads, by the depth it believes in or another."""
-    what = (run[name] for name in ("field", "camera", "scene", "T_body_cam", "T_world_cam", "t_s"))
-    return run.system.estimate.read(*what, depth=depth)  # pyright: ignore[reportAttributeAccessIssue] - a Pass
 
 
 def traced_camera(pair: RobotPair, name: str, focal_mm: float | None = None) -> render.Camera:

@@ -19,7 +19,7 @@ from scenes.robots.pairs import PAIRS
 from studies.frame.run import main
 from studies.placement import __main__ as placement
 from studies.placement import outcome
-from studies.placement.controls import controls, looking_back, pixel_errors
+from studies.placement.controls import controls, looking_back
 from studies.placement.page import answer
 from studies.placement.problem import Problem, traced_camera
 from studies.placement.race import FINAL_DRAWS, Race, check_same, feasible, fingerprints, kept
@@ -91,73 +91,29 @@ def test_draws_see_all_worlds_and_are_the_same_for_every_mount(problem):
     assert batch.twist.shape == (4, 6)
 
 
-def test_gradient_to_height_is_that_of_wide_differences():
-    """Outdoors the error falls with height (flow is slower, more ground is seen); differences over a quarter of the box,
-    through frames, events and flow, say by how much."""
-    pair = PAIRS["outdoors"]()
-    problem = Problem(pair, robot_pair.training(4), spread=2, per_world=6)
-    found = torch.zeros(2, 2, dtype=F)
-    step = torch.tensor([0.0, 0.0, 0.12, 0.0, 0.0, 0.0], dtype=F)
-    for draw in range(2):
-        samples = problem.draw(draw)
-        share = problem.start.clone().requires_grad_()
-        value = problem.expected(problem.ranges.pose(share), samples, learn=True)
-        assert value.min().item() >= 0
-        assert value.max().item() <= 1
-        (slope,) = torch.autograd.grad(value.mean(), share)
-        with torch.no_grad():
-            low, high = (
-                problem.expected(problem.ranges.pose(problem.start + sign * step), samples).mean()
-                for sign in (-1, 1)
-            )
-        found[draw] = torch.stack([slope[2], (high - low) / 0.24])
-    ours, wide = found.mean(0).tolist()
-    assert wide < -0.2
-    assert ours == pytest.approx(wide, rel=0.5)
-
-
 def test_differences_of_geometry_are_those_of_rendered_mounts():
     """In the corridor, with the forks in view: height, and pitch, whose slope at the mount itself points the other way."""
-    pair = PAIRS["corridor"]()
-    problem = Problem(pair, robot_pair.training(6), spread=6, per_world=4)
+    problem = Problem(PAIRS["corridor"](), robot_pair.training(6), spread=6, per_world=4)
+    samples = problem.draw(0)
+    rendered = torch.zeros(6, dtype=F)
     moved = 0.12 * torch.eye(6, dtype=F)
-    wanted = torch.zeros(6, dtype=F)
-    with torch.no_grad():
-        samples = problem.draw(0)
-        problem.expected(problem.ranges.pose(problem.start), samples, learn=True)
-        for k in (2, 4):
-            low, high = (
-                problem.expected(problem.ranges.pose(problem.start + sign * moved[k]), samples, learn=True)
-                for sign in (-1, 1)
-            )
-            wanted[k] = (high.mean() - low.mean()) / 0.24
+    problem.expected_around(problem.start, samples, 0.12, learn=True)
+    for k in (2, 4):
+        ends = [problem.start + sign * moved[k] for sign in (-1, 1)]
+        low, high = (problem.expected_around(end, samples, 0.12, learn=True)[0] for end in ends)
+        rendered[k] = (high - low) / 0.24
     before = problem.rendered
     value, slope = problem.expected_around(problem.start, samples, 0.12)
     assert problem.rendered == before + problem.samples
-    assert float(value) == pytest.approx(
-        float(problem.expected(problem.ranges.pose(problem.start), samples).mean()), rel=1e-9
-    )
-    assert wanted[2] < -0.2 < 0.1 < wanted[4]
-    assert float((slope - wanted)[[2, 4]].norm()) < 0.4 * float(wanted.norm())
-
-
-def test_small_differences_of_geometry_are_its_slope(problem):
-    """Where the robot is out of view and steps are too small for edges (rays are of single precision: 1e-5 would be too
-    small for them); at a wall of the cube to one side alone."""
-    samples = problem.draw(0)
-    share = problem.start.clone().requires_grad_()
-    value = problem.expected(problem.ranges.pose(share), samples, learn=True).mean()
-    (slope,) = torch.autograd.grad(value, share)
-    found, differences = problem.expected_around(problem.start, samples, 3e-4)
-    assert float(found) == pytest.approx(float(value.detach()), rel=1e-9)
-    assert torch.allclose(differences, slope, rtol=5e-3, atol=1e-3)
+    assert 0 < float(value) < 1
+    assert rendered[2] < -0.2 < 0.1 < rendered[4]
+    assert float((slope - rendered)[[2, 4]].norm()) < 0.4 * float(rendered.norm())
     wall = problem.start.clone()
     wall[2] = 1.0
-    (slope,) = torch.autograd.grad(
-        problem.expected(problem.ranges.pose(wall.requires_grad_()), samples).mean(), wall
-    )
-    _, differences = problem.expected_around(wall.detach(), samples, 3e-4)
-    assert differences[2] == pytest.approx(float(slope[2]), rel=5e-3, abs=1e-3)
+    below = problem.expected_around(wall - moved[2], samples, 0.12)[0]
+    value, slope = problem.expected_around(wall, samples, 0.12)
+    # at a wall by one side alone
+    assert float(slope[2]) == pytest.approx(float(value - below) / 0.12, rel=0.5)
 
 
 def test_controls_see_nothing(problem):
@@ -170,13 +126,6 @@ def test_controls_see_nothing(problem):
     assert all(
         looking_back(Problem(each(), range(1)))[2, 2] < 0.5 for each in PAIRS.values()
     )  # view not upwards
-
-
-def test_pixels_are_told_best_where_nothing_moves(problem):
-    """Noise is all there is before the robot's own panel; elsewhere it is the lost flow of fast drives that counts."""
-    samples = problem.draw(0)
-    assert pixel_errors(problem, looking_back(problem), samples) < 0.1
-    assert pixel_errors(problem, problem.ranges.pose(problem.start), samples) > 1.0
 
 
 @pytest.mark.parametrize(
