@@ -10,7 +10,7 @@ import torch
 from codesign import backend, lens, render
 from codesign.errors import DomainError, FileFormatError
 from codesign.pose import look_at, se3_exp
-from codesign.render import Camera, light
+from codesign.render import Camera
 from codesign.render.charts import chart_of
 from scenes import bodies, build, textures, worlds
 
@@ -262,8 +262,3 @@ def test_pictures_by_name_path_and_array(tmp_path):
         textures.picture(-np.eye(4))
     with pytest.raises(FileFormatError, match="neither a file"):
         worlds.room(photos=["nowhere.png"])
-
-
-def test_light_levels_of_a_world_are_the_functions_of_the_package():
-    assert list(build.LEVELS) == ["emissive", "baked", "path"]
-    assert isinstance(worlds.blank_room(light=build.path), light.PathScene)
