@@ -17,7 +17,6 @@ from codesign.mount.observability import (
     body_flow,
     flow_precision,
     information,
-    planar_flow,
     velocity_from_flow,
 )
 from codesign.mount.pose import Mount, yaw_pitch_roll_rad
@@ -83,7 +82,6 @@ __all__ = [
     "information",
     "judge",
     "penalty",
-    "planar_flow",
     "scene_depth",
     "sight",
     "sight_map",

@@ -16,32 +16,13 @@ from torch import Tensor
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.types import ChiefRayCamera
 
-_STEP_PX = (
-    1e-3  # central differences of chief rays: exact for a pinhole, 1e-6 of the third derivative otherwise
-)
-_SMALLEST_RATIO = (
-    1e-12  # of eigenvalues of the information matrix, below which a velocity is not observable in float64
-)
-
-
-PLANAR = (0, 1, 5)  # of the six: forward, lateral, yaw rate
+# central differences of chief rays: exact for a pinhole, 1e-6 of the third derivative otherwise
+_STEP_PX = 1e-3
+# of eigenvalues of the information matrix, below which a velocity is not observable in float64
+_SMALLEST_RATIO = 1e-12
+# of the six: forward, lateral, yaw rate
+PLANAR = (0, 1, 5)
 FREE = (0, 1, 2, 3, 4, 5)
-
-
-def planar_flow(camera: ChiefRayCamera, depth_m: Tensor, T_body_cam: Tensor) -> tuple[Tensor, Tensor]:
-    """Flow that each unit of planar body velocity makes in every pixel: ``body_flow`` of a body on the ground,
-    [..., P, 2, 3] px/s per (m/s, m/s, rad/s).
-
-    >>> from codesign import lens, render
-    >>> from codesign.mount import Mount
-    >>> camera = render.Camera(lens.ThinLens(8.0, 2.0), 16, 12, 0.05)
-    >>> down = Mount((0.0, 0.0, 2.0), (0.0, 0.0, 0.0), pitch_rad=1.5707963)().detach()
-    >>> flow, seen = planar_flow(camera, torch.full((192,), 2.0), down)
-    >>> [round(v) for v in flow[0, :, 0].tolist()]  # px/s per m/s forward: 160 px of focal length over 2 m
-    [0, 80]
-    """
-    flow, seen = body_flow(camera, depth_m, T_body_cam)
-    return flow[..., list(PLANAR)], seen
 
 
 def body_flow(
@@ -116,7 +97,7 @@ def velocity_from_flow(
     >>> camera = render.Camera(lens.ThinLens(8.0, 2.0), 16, 12, 0.05)
     >>> down = Mount((0.0, 0.0, 2.0), (0.0, 0.0, 0.0), pitch_rad=1.5707963)().detach()
     >>> depth_m = torch.full((192,), 2.0)
-    >>> rows, _ = planar_flow(camera, depth_m, down)
+    >>> rows = body_flow(camera, depth_m, down)[0][..., PLANAR]
     >>> flow_px_s = (rows @ torch.tensor([1.0, 0.5, 0.2], dtype=torch.float64)).T.reshape(1, 2, 12, 16)
     >>> velocity_from_flow(flow_px_s, camera, depth_m, down)[0].round(decimals=6).tolist()
     [1.0, 0.5, 0.2]
@@ -132,7 +113,7 @@ def velocity_from_flow(
             "camera."
         )
     normal = _normal_matrix(rows, weight, prior)
-    right = torch.einsum("...pkc,...pc->...k", _weighed(rows, weight), measured)
+    right = torch.einsum("...pkc,...pc->...k", rows.mT @ weight, measured)
     return torch.linalg.solve(normal.expand(*right.shape, right.shape[-1]), right)
 
 
@@ -234,44 +215,35 @@ def _point_velocity(point, T_body_cam):
 
 
 def _weighted_rows(camera, depth_m, T_body_cam, weight, axes):
+    """Rows [..., P, 2, K], and weights [..., P, 2, 2] that are 0 where nothing is seen."""
     if not axes or not set(axes) <= set(FREE):
         raise DomainError(
             f"axes = {tuple(axes)}; choose from 0 to 5: forward, left, up, and turns about these."
         )
     rows, seen = body_flow(camera, depth_m, T_body_cam)
     rows = rows[..., list(axes)]
+    both = torch.eye(2, dtype=rows.dtype, device=rows.device)
     if weight is None:
-        return rows, seen.to(rows)
-    check_finite(weight, "flow weight")
-    if _is_matrix(rows, weight):
-        xx, xy, yx, yy = weight.detach().flatten(-2).unbind(-1)
-        good = (xx >= 0) & (yy >= 0) & (xy == yx) & (xx * yy - xy * yx >= -1e-9 * xx * yy)
-        if not bool(good.all()):
+        return rows, seen.to(rows)[..., None, None] * both
+    weight = check_finite(weight, "flow weight").double()
+    if weight.ndim < 3 or weight.shape[-3:] != (rows.shape[-3], 2, 2):
+        if bool((weight.detach() < 0).any()):
             raise DomainError(
-                "a flow weight [2, 2] is not symmetric and positive; give inverses of covariances, as of "
-                "mount.flow_precision."
+                f"a flow weight is negative (smallest {float(weight.detach().min()):.3g}); weights are inverse "
+                "variances, at least 0."
             )
-        return rows, torch.where(seen[..., None, None], weight.double(), 0.0)
-    if bool((weight.detach() < 0).any()):
+        weight = weight[..., None, None] * both
+    xx, xy, yx, yy = weight.detach().flatten(-2).unbind(-1)
+    if not bool(((xx >= 0) & (yy >= 0) & (xy == yx) & (xx * yy - xy * yx >= -1e-9 * xx * yy)).all()):
         raise DomainError(
-            f"a flow weight is negative (smallest {float(weight.detach().min()):.3g}); weights are inverse "
-            "variances, at least 0."
+            "a flow weight [2, 2] is not symmetric and positive; give inverses of covariances, as of "
+            "mount.flow_precision."
         )
-    return rows, torch.where(seen, weight.double(), 0.0)
-
-
-def _is_matrix(rows, weight):
-    """Whether weights are [..., P, 2, 2] for rows [..., P, 2, K]."""
-    return weight.ndim >= 3 and weight.shape[-3:] == (rows.shape[-3], 2, 2)
-
-
-def _weighed(rows, weight):
-    """Weight times rows, [..., P, K, 2]."""
-    return rows.mT @ weight if _is_matrix(rows, weight) else rows.mT * weight[..., None, None]
+    return rows, torch.where(seen[..., None, None], weight, 0.0)
 
 
 def _normal_matrix(rows, weight, prior):
-    normal = torch.einsum("...pkc,...pcl->...kl", _weighed(rows, weight), rows)
+    normal = torch.einsum("...pkc,...pcl->...kl", rows.mT @ weight, rows)
     if prior is not None:
         deviation = torch.as_tensor(prior, dtype=rows.dtype, device=rows.device)
         if deviation.shape != rows.shape[-1:] or not bool(((deviation > 0) & deviation.isfinite()).all()):
@@ -280,14 +252,13 @@ def _normal_matrix(rows, weight, prior):
                 "one per velocity, are needed."
             )
         return normal + torch.diag(deviation**-2)
-    fixed = normal.detach()
-    strength = weight.diagonal(dim1=-2, dim2=-1).sum(-1) if _is_matrix(rows, weight) else weight
-    if not bool((strength.detach() > 0).any(-1).all()):
+    strength = weight.detach().diagonal(dim1=-2, dim2=-1).sum(-1)
+    if not bool((strength > 0).any(-1).all()):
         raise DomainError(
             "no pixel sees the ground with positive weight, so the flow says nothing about the velocity; "
             "turn the camera towards the ground, or give a prior."
         )
-    eigenvalues = torch.linalg.eigvalsh(fixed)
+    eigenvalues = torch.linalg.eigvalsh(normal.detach())
     if bool((eigenvalues[..., 0] <= _SMALLEST_RATIO * eigenvalues[..., -1]).any()):
         raise DomainError(
             "the velocity is not observable: some motion of the body leaves the flow of all weighted pixels "

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from codesign import lens, pose, render
-from codesign.mount import FREE, PLANAR, Mount, body_flow, information, planar_flow, velocity_from_flow
+from codesign.mount import FREE, PLANAR, Mount, body_flow, information, velocity_from_flow
 from codesign.render.truth import world_points
 from scenes import worlds
 
@@ -110,7 +110,8 @@ def test_straight_down_is_the_textbook_case(camera):
     rotation about the image's middle."""
     T_body_cam = mount_of(*MOUNTS[0])
     depth = torch.full((24 * 16,), HEIGHT, dtype=D)
-    rows, seen = planar_flow(camera, depth, T_body_cam)
+    rows, seen = body_flow(camera, depth, T_body_cam)
+    rows = rows[..., PLANAR]
     focal_px = 3.4 / 0.2
     from_middle = camera.film.pixels() - camera.film.middle_px
     assert bool(seen.all())
