@@ -1,4 +1,5 @@
-"""Triangle meshes: out of boxes and cylinders, or from files, of one colour or of their own. Metres, outward faces."""
+"""Triangle meshes: out of boxes and cylinders, or from files, of one colour or of their own. Metres, outward
+faces."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -35,7 +36,8 @@ ALONG = {
 class Body:
     """Triangles in the world: vertices_m [V, 3], faces [F, 3].
 
-    uv: [V, 2] where its paint is laid out by texture coordinates (v up). tint: what the paint's level is times
+    uv: [V, 2] where its paint is laid out by texture coordinates (v up). tint: what the paint's level is
+      times
     where it has none: one number, [F], or [V] where ``smooth``.
     """
 
@@ -58,8 +60,8 @@ class Body:
 
 
 def read(path: str | Path, scale: float = 1.0) -> Body:
-    """The shapes of a mesh file (scenes.mesh_files.KINDS) as one Body, its coordinates times ``scale`` (0.001 for
-    a file in millimetres); its colours are left.
+    """The shapes of a mesh file (scenes.mesh_files.KINDS) as one Body, its coordinates times ``scale`` (0.001
+    for a file in millimetres); its colours are left.
 
     Raises: FileFormatError when the file is missing, of another kind, empty or damaged; DomainError for a
       scale that is not positive.
@@ -73,8 +75,8 @@ def read(path: str | Path, scale: float = 1.0) -> Body:
 
 
 def skylight(body: Body) -> np.ndarray:
-    """Share of full light from a plain sky with a soft sun: what stands for shading where nothing is lit. [F] on
-    each face, or [V] by the mean normal at each vertex of a ``smooth`` body."""
+    """Share of full light from a plain sky with a soft sun: what stands for shading where nothing is lit. [F]
+    on each face, or [V] by the mean normal at each vertex of a ``smooth`` body."""
     corners = body.vertices_m[body.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     if body.smooth:

@@ -1,5 +1,6 @@
-"""How far the surfaces under pixels are: over flat ground, or as a map of the world tells it. What moves through the
-world by itself, such as the robot's own body, has no depth: its image says nothing of the way the body goes."""
+"""How far the surfaces under pixels are: over flat ground, or as a map of the world tells it. What moves
+through the world by itself, such as the robot's own body, has no depth: its image says nothing of the way the
+body goes."""
 
 from typing import Any
 
@@ -16,10 +17,10 @@ LEVEL = 1e-6  # metres that a ray must fall per metre of depth to meet the groun
 def ground_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, scene: Any = None) -> Tensor:
     """Depth of the plane z = 0 of the world.
 
-    Args: camera: with ``chief_rays``. pixels: [N, P, 2] px. T_world_cam: [N, 4, 4]. scene: as for ``scene_depth``;
-      only the objects of a MovingScene are looked at, which hide the ground.
-    Returns: [N, P] m along the camera's z axis, float64; infinite where a ray goes up or along the ground, or meets
-      an object that moves.
+    Args: camera: with ``chief_rays``. pixels: [N, P, 2] px. T_world_cam: [N, 4, 4]. scene: as for
+      ``scene_depth``; only the objects of a MovingScene are looked at, which hide the ground.
+    Returns: [N, P] m along the camera's z axis, float64; infinite where a ray goes up or along the ground, or
+      meets an object that moves.
     Gradient: pose, and the lens behind the chief rays.
     """
     rays = camera.chief_rays(pixels.reshape(-1, 2))
@@ -36,8 +37,8 @@ def ground_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, sc
 def scene_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, scene: Any) -> Tensor:
     """Depth of what a scene has under the pixels, as a perfect map would know it.
 
-    Args and Returns: as for ``ground_depth``; scene: one, or a tuple of as many for equal shares of the N poses. Of
-      a MovingScene the objects stand where they are in the middle of its frames, and have no depth.
+    Args and Returns: as for ``ground_depth``; scene: one, or a tuple of as many for equal shares of the N
+      poses. Of a MovingScene the objects stand where they are in the middle of its frames, and have no depth.
     Gradient: pose and lens, the surface taken as its tangent plane.
     """
     hits, ahead = _hits(camera, pixels, T_world_cam, scene)
@@ -45,7 +46,8 @@ def scene_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, sce
 
 
 def hidden_by_objects(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, scene: Any) -> Tensor:
-    """[N, P] bool: where an object of a MovingScene is seen. Arguments as for ``ground_depth``. No gradient."""
+    """[N, P] bool: where an object of a MovingScene is seen. Arguments as for ``ground_depth``. No
+    gradient."""
     if not any(isinstance(world, MovingScene) for world in _scenes(scene)):
         return torch.zeros(pixels.shape[:-1], dtype=torch.bool, device=pixels.device)
     return _hits(camera, pixels, T_world_cam, scene)[0].part > 0

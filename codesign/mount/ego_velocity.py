@@ -1,11 +1,11 @@
-"""The velocity of a body from event flow: weighted least squares on points of the flow, with the covariance that
-the flow's own estimator gives.
+"""The velocity of a body from event flow: weighted least squares on points of the flow, with the covariance
+that the flow's own estimator gives.
 
-What an estimator with a prior returns is drawn towards zero where it saw little: with precision S^-1 after it saw
-the events and S0^-1 before, the flow is (1 - S S0^-1) times what the events alone say. Taken as a measurement of
-precision S^-1 - S0^-1, about confidence x S^-1, each point counts by what the events said of it, and one that saw
-nothing counts nothing. Points of one window err alike: an affine field has three numbers per component, so a window
-counts as three points however many are read.
+What an estimator with a prior returns is drawn towards zero where it saw little: with precision S^-1 after it
+saw the events and S0^-1 before, the flow is (1 - S S0^-1) times what the events alone say. Taken as a
+measurement of precision S^-1 - S0^-1, about confidence x S^-1, each point counts by what the events said of
+it, and one that saw nothing counts nothing. Points of one window err alike: an affine field has three numbers
+per component, so a window counts as three points however many are read.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,8 +32,9 @@ DEPTHS = {"ground": ground_depth, "scene": scene_depth}
 
 @dataclass(frozen=True)
 class Motion:
-    """velocity: [N, K] m/s and rad/s. covariance: [N, K, K] of it, as least squares expects. kept: [N, P] in 0..1,
-    by how much each point was believed. depth_m: [N, P] of the points, as estimated where it was not known."""
+    """velocity: [N, K] m/s and rad/s. covariance: [N, K, K] of it, as least squares expects. kept: [N, P] in
+    0..1, by how much each point was believed. depth_m: [N, P] of the points, as estimated where it was not
+    known."""
 
     velocity: Tensor
     covariance: Tensor
@@ -45,11 +46,13 @@ class Motion:
 class Readings:
     """Flow at P points of each of N bodies, and what each of K velocities would show there.
 
-    pixels: [N, P, 2] of the points at mid-interval, window after window. flow_px: [N, P, 2] over the interval.
-    precision: [N, P, 2, 2] px^-2. confidence: [N, P] in 0..1, the share of it that the events said; the flow is drawn
-    towards zero by as much. depth_m: [N, P], infinite without a surface. rows: [N, P, 2, K] px of flow per m/s and
-    rad/s. share: [N, P] of an independent point that each counts as, 0 without a surface. windows: in P. parallax:
-    [N, P, 2, K] that each 1 / m of nearness adds to the rows, where depth is not known; then depth_m is that of ``rows``.
+    pixels: [N, P, 2] of the points at mid-interval, window after window. flow_px: [N, P, 2] over the
+      interval.
+    precision: [N, P, 2, 2] px^-2. confidence: [N, P] in 0..1, the share of it that the events said; the flow
+    is drawn towards zero by as much. depth_m: [N, P], infinite without a surface. rows: [N, P, 2, K] px of
+    flow per m/s and rad/s. share: [N, P] of an independent point that each counts as, 0 without a surface.
+    windows: in P. parallax: [N, P, 2, K] that each 1 / m of nearness adds to the rows, where depth is not
+      known; then depth_m is that of ``rows``.
     """
 
     pixels: Tensor
@@ -71,7 +74,8 @@ class Readings:
         return values.repeat_interleave(self.share.shape[1] // self.windows, 1)
 
     def squared(self, velocity: Tensor) -> Tensor:
-        """What velocities leave unexplained, [N, P], as a sum of two squares in units of its standard deviation."""
+        """What velocities leave unexplained, [N, P], as a sum of two squares in units of its standard
+        deviation."""
         miss = self.missed_px(velocity)
         return (miss[..., None, :] @ self.precision @ miss[..., :, None])[..., 0, 0]
 
@@ -82,11 +86,13 @@ class EgoVelocity:
     Args:
       axes: which of the six velocities the body has: ``mount.PLANAR`` or ``mount.FREE``.
       prior: [K] standard deviations expected of them around zero, m/s and rad/s.
-      depth: "ground" (the plane z = 0 of the world under a body that knows its height and attitude), "scene" (a
-        perfect map), a function (camera, pixels [N, P, 2], T_world_cam [N, 4, 4], scene) -> [N, P] m, or
+      depth: "ground" (the plane z = 0 of the world under a body that knows its height and attitude), "scene"
+        (a perfect map), a function (camera, pixels [N, P, 2], T_world_cam [N, 4, 4], scene) -> [N, P] m, or
         ``mount.UnknownDepth``: estimated with the velocity.
-      every_px: spacing of the points read. floor_px: standard deviation of flow errors that no covariance knows of.
-      outlier: errors of that many standard deviations count a quarter (Geman and McClure, 1987); None: all count.
+      every_px: spacing of the points read. floor_px: standard deviation of flow errors that no covariance
+        knows of.
+      outlier: errors of that many standard deviations count a quarter (Geman and McClure, 1987); None: all
+        count.
       steps: of reweighting, for outliers.
     Gradient: flow, covariance, mount, poses, lens.
 
@@ -132,7 +138,8 @@ class EgoVelocity:
 
         Raises: DomainError for NaN where the field says that it is valid.
 
-        t_s: [T] of the poses; the flow's interval ends with them and may begin later. None: it is all of them.
+        t_s: [T] of the poses; the flow's interval ends with them and may begin later. None: it is all of
+          them.
         """
         return self.solve(self.read(field, camera, scene, T_body_cam, T_world_cam, t_s))
 
@@ -218,7 +225,8 @@ class EgoVelocity:
         return Motion(velocity, unknown_depth.covariance(points, velocity), kept, depth_m)
 
     def _measured(self, field, camera, count):
-        """Points [N, P, 2] px, their flow [N, P, 2] px, its precision [N, P, 2, 2] and confidence [N, P, 1]."""
+        """Points [N, P, 2] px, their flow [N, P, 2] px, its precision [N, P, 2, 2] and confidence [N, P,
+        1]."""
         height, width = camera.film.shape[-2:]
         first = min(self.every_px, height, width) // 2
         at = (..., slice(first, None, self.every_px), slice(first, None, self.every_px))
@@ -251,7 +259,8 @@ class EgoVelocity:
 
 
 def _middle(frames: int, t_s: Tensor | None, interval_s: float) -> tuple[int, float]:
-    """Number of the frame nearest to the middle of the flow's interval, and how much of the interval is over then."""
+    """Number of the frame nearest to the middle of the flow's interval, and how much of the interval is over
+    then."""
     if t_s is None:
         return frames // 2, 0.5
     since_s = t_s - (t_s[-1] - interval_s)

@@ -1,9 +1,10 @@
 """A learnt head: least squares whose weights know the lens and the mount.
 
-Least squares counts every window by what its flow claims. A head learns what claims are worth: flow of a window that is
-blurred, or faster than the estimator reaches, or on something that is not where the map says, is read short or
-not at all, and which windows these are can be told from the design, the residuals and the other windows. It says, window by
-window, how much to count it and by how much its flow was read short, and solves again.
+Least squares counts every window by what its flow claims. A head learns what claims are worth: flow of a
+window that is blurred, or faster than the estimator reaches, or on something that is not where the map says,
+is read short or not at all, and which windows these are can be told from the design, the residuals and the
+other windows. It says, window by window, how much to count it and by how much its flow was read short, and
+solves again.
 """
 
 from collections.abc import Mapping
@@ -36,11 +37,13 @@ MOUNT = (1, -1, 1, 1, -1, 1, 1, -1, 1)
 class Evidence:
     """Windows W of N bodies, K velocities.
 
-    information: [N, W, K, K] of the velocities without prior, outliers weighted down. pull: [N, W, K], so that a window
-    alone says inverse(information) pull. energy: [N, W], the squared flow in units of its deviation. rows: [N, W, 2, K]
+    information: [N, W, K, K] of the velocities without prior, outliers weighted down. pull: [N, W, K], so
+    that a window alone says inverse(information) pull. energy: [N, W], the squared flow in units of its
+    deviation. rows: [N, W, 2, K]
     and flow_px: [N, W, 2], means over the window of what velocities make and of what was read, px.
-    told: [N, W, 11], the window's surface, depth, confidence, claim, flow and residuals. lens: [N, W, 6], its direction
-    in body axes, focal length and blur. mount: [N, 9], position in metres, camera z and y in body axes. prior: [N, K].
+    told: [N, W, 11], the window's surface, depth, confidence, claim, flow and residuals. lens: [N, W, 6], its
+    direction in body axes, focal length and blur. mount: [N, 9], position in metres, camera z and y in body
+    axes. prior: [N, K].
     """
 
     information: Tensor
@@ -73,7 +76,8 @@ def evidence(
 ) -> Evidence:
     """Evidence of what was read, and of the plain solution of it (``EgoVelocity.read`` and ``solve``).
 
-    Args: camera: one with ``rays_through`` says how it blurs, another counts as sharp. T_body_cam: [4, 4] or [N, 4, 4].
+    Args: camera: one with ``rays_through`` says how it blurs, another counts as sharp. T_body_cam: [4, 4] or
+      [N, 4, 4].
       prior: [K] standard deviations. volume: whose events are counted, None: they are not told.
     Gradient: readings, solution, lens, mount, counts.
     """
@@ -131,8 +135,8 @@ def _length(vectors):
 
 
 def _lens(camera, windows, nearness, mounts):
-    """[N, W, 6]: direction of the windows in body axes, logarithm of the focal length there, blur in pixels (root mean
-    square radius) of what is as near as 1 / nearness [N, W] m, and of what is infinitely far."""
+    """[N, W, 6]: direction of the windows in body axes, logarithm of the focal length there, blur in pixels
+    (root mean square radius) of what is as near as 1 / nearness [N, W] m, and of what is infinitely far."""
     pixels = camera.film.pixels().double().reshape(windows, -1, 2).mean(1)
     base, slope, base_step, slope_step = chief_lines(camera, pixels)
     ahead = torch.cat([slope, torch.ones_like(slope[:, :1])], 1)
@@ -179,15 +183,17 @@ DELIVERED = Path(__file__).with_name("head.safetensors")
 
 
 class VelocityHead(nn.Module):
-    """Stage ``estimate`` of a System, where EgoVelocity can stand, for any film, lens, mount and number of windows.
+    """Stage ``estimate`` of a System, where EgoVelocity can stand, for any film, lens, mount and number of
+    windows.
 
-    Windows are read by one network each, whose answers are pooled (mean and maximum; Zaheer et al., Deep Sets, 2017);
-    a second one hears the pool, the mount and the solution so far, a third says of each window a factor on its
-    information, up to e^6, and one on its flow, up to e; and of the body, factors on prior and covariance
-    and a correction of at most one standard deviation. It hears everything also as a mirror shows it, so that left and
-    right are treated alike. Fresh weights give the velocity of ``plain`` as it is.
+    Windows are read by one network each, whose answers are pooled (mean and maximum; Zaheer et al., Deep
+    Sets, 2017); a second one hears the pool, the mount and the solution so far, a third says of each window a
+    factor on its information, up to e^6, and one on its flow, up to e; and of the body, factors on prior and
+    covariance and a correction of at most one standard deviation. It hears everything also as a mirror shows
+    it, so that left and right are treated alike. Fresh weights give the velocity of ``plain`` as it is.
 
-    Args: plain: axes, prior, depth and how flow is read. width: of the layers. rounds: of weighing and solving.
+    Args: plain: axes, prior, depth and how flow is read. width: of the layers. rounds: of weighing and
+      solving.
       design: False hides lens and mount from the network.
 
     >>> from codesign.mount import FREE, EgoVelocity, VelocityHead
@@ -230,7 +236,8 @@ class VelocityHead(nn.Module):
         t_s: Tensor | None = None,
         volume: EventVolume | None = None,
     ) -> Motion:
-        """Motion of N bodies; arguments as of EgoVelocity, and the volume whose events are counted where there is one.
+        """Motion of N bodies; arguments as of EgoVelocity, and the volume whose events are counted where
+        there is one.
 
         ``kept``: by how much the plain solution believed each point, times its window's weight, at most 1.
         Gradient: flow, covariance, mount, poses, lens, counts, weights.
@@ -261,8 +268,8 @@ class VelocityHead(nn.Module):
         return evidence(read, plain, camera, mounts, self.plain.prior, volume), plain
 
     def judged(self, seen: Evidence) -> tuple[Tensor, Tensor, Tensor]:
-        """Velocity [N, K], its covariance [N, K, K] and the weights [N, W] of the windows. Gradient: evidence and
-        weights of the network."""
+        """Velocity [N, K], its covariance [N, K, K] and the weights [N, W] of the windows. Gradient: evidence
+        and weights of the network."""
         even = torch.ones_like(seen.energy)
         weight = even
         velocity, covariance = _solved(seen, even, even, seen.prior)
@@ -339,8 +346,8 @@ class VelocityHead(nn.Module):
     def pretrained(cls, plain: EgoVelocity) -> "VelocityHead":
         """The delivered head, which studies.velocity_head trained on the three pairs of scenes.robots.pairs.
 
-        It knows their regime: nine windows of 32 x 32, the closed form of flow with a prior of 4 px, axes ``mount.FREE``.
-        Elsewhere it is a start for training.
+        It knows their regime: nine windows of 32 x 32, the closed form of flow with a prior of 4 px, axes
+        ``mount.FREE``. Elsewhere it is a start for training.
         """
         return cls.load(plain, DELIVERED)
 

@@ -82,8 +82,8 @@ def velocity_from_flow(
     Args:
       flow_px_s: [B, 2, H, W] image flow, px per second. camera, depth_m [P] or [B, P], T_body_cam [4, 4] or
         [B, 4, 4]: as for ``body_flow``.
-      weight: [P] or [B, P] >= 0, inverse variance of the flow per pixel, s^2/px^2, or [..., P, 2, 2], the inverse of
-        its covariance (``flow_precision``); equal weights when None.
+      weight: [P] or [B, P] >= 0, inverse variance of the flow per pixel, s^2/px^2, or [..., P, 2, 2], the
+        inverse of its covariance (``flow_precision``); equal weights when None.
       prior: [K] standard deviations expected of the K velocities around zero; what the image does not show
         then stays near zero. None: no prior.
       axes: which K of the six velocities the body has (``body_flow``); ``PLANAR``, or ``FREE``.
@@ -146,11 +146,12 @@ def information(
 def flow_precision(covariance: Tensor, confidence: Tensor | None = None, floor: float = 0.0) -> Tensor:
     """Inverse covariance of flow as a measurement, out of what an estimator says of its flow.
 
-    Args: covariance: [..., 3] of the error (xx, xy, yy), px^2 as of FlowField.covariance_px2, or px^2/s^2. confidence:
-      [...] in 0..1, None: 1. A flow with a prior has precision S^-1 of which about confidence S^-1 came from events.
+    Args: covariance: [..., 3] of the error (xx, xy, yy), px^2 as of FlowField.covariance_px2, or px^2/s^2.
+      confidence: [...] in 0..1, None: 1. A flow with a prior has precision S^-1 of which about confidence
+        S^-1 came from events.
       floor: standard deviation of errors that no covariance knows of, px.
-    Returns: [..., 2, 2], confidence (S + floor^2)^-1, for ``information`` and ``velocity_from_flow`` (times the square of
-      the interval where the covariance is in px^2). Gradient: both.
+    Returns: [..., 2, 2], confidence (S + floor^2)^-1, for ``information`` and ``velocity_from_flow`` (times
+      the square of the interval where the covariance is in px^2). Gradient: both.
     Raises: ShapeError; DomainError for what is no covariance.
 
     >>> flow_precision(torch.tensor([2.0, 1.0, 1.0]), torch.tensor(0.5)).tolist()
@@ -195,15 +196,16 @@ def chief_lines(camera: ChiefRayCamera, pixels: Tensor) -> tuple[Tensor, Tensor,
 def flow_of_points(velocity: Tensor, slope: Tensor, step: Tensor) -> Tensor:
     """Image motion [..., P, 2, K] px per unit of K motions of the points under pixels.
 
-    Args: velocity: [..., P, 3, K] m of the points, in camera axes. slope: [..., P, 2] of the chief rays. step:
-      [..., P, 2, 2] m by which a pixel's ray moves sideways at the point, last axis: pixel x, y.
+    Args: velocity: [..., P, 3, K] m of the points, in camera axes. slope: [..., P, 2] of the chief rays.
+      step: [..., P, 2, 2] m by which a pixel's ray moves sideways at the point, last axis: pixel x, y.
     """
     sideways = velocity[..., :2, :] - slope[..., None] * velocity[..., 2:, :]
     return torch.linalg.solve(step, sideways)
 
 
 def _point_velocity(point, T_body_cam):
-    """Velocity in camera axes of static points [..., P, 3] per unit of the body's twist: [..., P, 3 (axis), 6]."""
+    """Velocity in camera axes of static points [..., P, 3] per unit of the body's twist: [..., P, 3 (axis),
+    6]."""
     to_camera = T_body_cam[..., :3, :3].mT  # columns: the body's axes as the camera has them
     position = T_body_cam[..., :3, 3]
     units = torch.eye(3).to(position).expand_as(to_camera)

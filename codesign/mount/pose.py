@@ -130,15 +130,15 @@ class Mount(nn.Module):
     def variables(
         self, camera: ChiefRayCamera, depth_m: float | Tensor, step_px: float = 1.0
     ) -> list[nn.Parameter]:
-        """Rescale ``numbers`` so that a unit of each moves the image of what the camera sees by ``step_px`` RMS;
-        the pose stays. Then one learning rate suits the mount, the lens's variables and a network.
+        """Rescale ``numbers`` so that a unit of each moves the image of what the camera sees by ``step_px``
+        RMS; the pose stays. Then one learning rate suits the mount, the lens's variables and a network.
 
         Args:
-          camera: has ``chief_rays`` and ``film`` (see render.Camera). depth_m: depth of the scene along the view,
-            one number or one per pixel [P]; pixels without a surface carry one that is not finite or not
-            positive. step_px: the natural step.
-        A number that hardly moves the image (a narrow box far from the scene) keeps 1 of its map's argument as
-        unit, as does one that is held.
+          camera: has ``chief_rays`` and ``film`` (see render.Camera). depth_m: depth of the scene along the
+            view, one number or one per pixel [P]; pixels without a surface carry one that is not finite or
+            not positive. step_px: the natural step.
+        A number that hardly moves the image (a narrow box far from the scene) keeps 1 of its map's argument
+        as unit, as does one that is held.
         Returns: [numbers], the mount's one Parameter, for torch.optim.
         Raises: DomainError when no pixel sees a surface, or the step is not positive and finite; ShapeError.
         """
@@ -187,10 +187,11 @@ class Mount(nn.Module):
 
 
 def attitude(yaw_rad: float | Tensor, pitch_rad: float | Tensor, roll_rad: float | Tensor) -> Tensor:
-    """Rotations [..., 3, 3] float64 from camera to body axes: Rz(yaw) Ry(pitch) Rx(roll) after the axes of a level
-    camera.
+    """Rotations [..., 3, 3] float64 from camera to body axes: Rz(yaw) Ry(pitch) Rx(roll) after the axes of a
+    level camera.
 
-    Args: numbers or tensors [...] that broadcast. Gradient: exact, to the angles. Raises: DomainError when not finite.
+    Args: numbers or tensors [...] that broadcast. Gradient: exact, to the angles. Raises: DomainError when
+      not finite.
     """
     turn = torch.eye(3, dtype=torch.float64)
     for axis, angle, name in (
@@ -211,9 +212,11 @@ def yaw_pitch_roll_rad(T_body_cam: Tensor) -> Tensor:
     """Angles [..., 3] of a mount, the inverse of ``attitude``: yaw and roll in (-pi, pi], pitch in [-pi/2,
     pi/2].
 
-    Yaw and pitch are where the camera's axis points. Looking straight up or down only yaw and roll together mean
+    Yaw and pitch are where the camera's axis points. Looking straight up or down only yaw and roll together
+    mean
     something: yaw is then both, and roll 0.
-    Gradient: the matrix; straight up or down, where pitch has its largest or smallest value, 0 for pitch and roll.
+    Gradient: the matrix; straight up or down, where pitch has its largest or smallest value, 0 for pitch and
+      roll.
     """
     turn = T_body_cam[..., :3, :3] @ AXES_BODY_CAM.to(T_body_cam).mT
     upright = turn[..., :2, 0].detach().square().sum(-1) < UPRIGHT**2

@@ -1,4 +1,5 @@
-"""Where a camera may sit and how it may be turned: bounds of six numbers, and mounts by their shares of them."""
+"""Where a camera may sit and how it may be turned: bounds of six numbers, and mounts by their shares of
+them."""
 
 import math
 from collections.abc import Sequence
@@ -28,9 +29,9 @@ class MountRanges:
     >>> ranges.share_at(middle).round(decimals=12).tolist()
     [0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
 
-    Args: low, high: six finite numbers each, in the order of NAMES, metres and radians. Equal bounds hold a number;
-      its share means nothing and is given as 0.5. Pitch is strictly between straight up and down, where yaw and
-      roll would be one; yaw and roll have a turn at most.
+    Args: low, high: six finite numbers each, in the order of NAMES, metres and radians. Equal bounds hold a
+      number; its share means nothing and is given as 0.5. Pitch is strictly between straight up and down,
+      where yaw and roll would be one; yaw and roll have a turn at most.
     low, high: [6] float64. held: [6] bool.
     Raises: DomainError for bounds that are not finite, in the wrong order, or too wide; ShapeError.
     """
@@ -55,11 +56,12 @@ class MountRanges:
                 raise DomainError(f"{said}, more than a turn; give 2 pi at most, as from -pi to pi.")
 
     def numbers(self, share: Tensor) -> Tensor:
-        """Position in metres and angles in radians [..., 6] of shares [..., 6]; exactly the bounds at 0 and 1.
+        """Position in metres and angles in radians [..., 6] of shares [..., 6]; exactly the bounds at 0 and
+        1.
 
         Shares beyond these go on beyond the bounds, as differences at a wall need; see ``clamped``.
-        Gradient: exact, to the shares, none to what is held. Raises: ShapeError; DomainError for shares that are not
-          finite.
+        Gradient: exact, to the shares, none to what is held. Raises: ShapeError; DomainError for shares that
+          are not finite.
         """
         share = _shares(share)
         return torch.where(self.held, self.low, torch.lerp(self.low, self.high, share))

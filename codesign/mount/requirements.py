@@ -1,8 +1,9 @@
 """What a mount has to keep: distance to the robot, a free way for its cable, a view ahead.
 
-Each requirement has a ``slack`` in metres or radians with a gradient to the mount (and to the lens where it looks
-through it), and an ``exact`` one that is at least 0 where it is kept; they have the same sign but where a
-count of pixels decides. ``penalty`` makes one smooth number of the slacks, to add to an objective; ``judge`` says yes or no.
+Each requirement has a ``slack`` in metres or radians with a gradient to the mount (and to the lens where it
+looks through it), and an ``exact`` one that is at least 0 where it is kept; they have the same sign but where
+a count of pixels decides. ``penalty`` makes one smooth number of the slacks, to add to an objective;
+``judge`` says yes or no.
 """
 
 import math
@@ -50,8 +51,8 @@ class Requirement(Protocol):
 class Clearance:
     """The housing stays ``margin_m`` away from the robot.
 
-    Args: body: in the axes of the mount. housing: of the camera. margin_m: >= 0. step: metres beyond the margin
-      within which ``penalty`` pushes.
+    Args: body: in the axes of the mount. housing: of the camera. margin_m: >= 0. step: metres beyond the
+      margin within which ``penalty`` pushes.
     """
 
     body: Body
@@ -97,8 +98,8 @@ class CableSide:
         check_positive(self.step, "cable side: step")
 
     def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
-        """[..., 1]: (cos a - cos b) / sin a with a the half angle and b the angle between back and axis; near the rim
-        of the cone that is b - a in radians, and it is smooth everywhere. Gradient: mount."""
+        """[..., 1]: (cos a - cos b) / sin a with a the half angle and b the angle between back and axis; near
+        the rim of the cone that is b - a in radians, and it is smooth everywhere. Gradient: mount."""
         return (math.cos(self.half_angle_rad) - self._cosine(T_body_cam)) / math.sin(self.half_angle_rad)
 
     def exact(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
@@ -114,15 +115,17 @@ class CableSide:
 class LookAhead:
     """A share of the picture sees farther than ``distance_m``.
 
-    A pixel sees beyond the distance when its chief ray goes ahead and meets the ground, if at all, beyond the line
-    across at that distance; with ``depth``, when what it sees lies there.
+    A pixel sees beyond the distance when its chief ray goes ahead and meets the ground, if at all, beyond the
+    line across at that distance; with ``depth``, when what it sees lies there.
 
     Args:
-      distance_m: from the body's origin, along ``ahead``, > 0. share: of the film's pixels, above 0, at most 1.
-      ahead: direction in body axes, level. ground_z_m: height of the ground in body axes (0 for a body whose origin
-        is on the ground, as base_footprint of REP 105).
-      depth: (camera, pixels [P, 2], T_body_cam [4, 4]) -> [P] m along the camera's z axis, not finite where nothing is
-        seen; None is flat ground. smooth: share of the pixels over which the slack at the wanted rank is averaged.
+      distance_m: from the body's origin, along ``ahead``, > 0. share: of the film's pixels, above 0, at most
+        1.
+      ahead: direction in body axes, level. ground_z_m: height of the ground in body axes (0 for a body whose
+        origin is on the ground, as base_footprint of REP 105).
+      depth: (camera, pixels [P, 2], T_body_cam [4, 4]) -> [P] m along the camera's z axis, not finite where
+        nothing is seen; None is flat ground. smooth: share of the pixels over which the slack at the wanted
+        rank is averaged.
     Raises: DomainError for numbers out of range.
     """
 
@@ -148,8 +151,8 @@ class LookAhead:
             raise DomainError(f"look-ahead: ahead is {self.ahead}; give a level direction, z = 0.")
 
     def slack(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
-        """[..., 1]: the mean of ``angles`` at the ranks around the one that ``exact`` looks at, so that a row of pixels
-        decides and not its last one. Gradient: mount, and the lens behind the chief rays."""
+        """[..., 1]: the mean of ``angles`` at the ranks around the one that ``exact`` looks at, so that a row
+        of pixels decides and not its last one. Gradient: mount, and the lens behind the chief rays."""
         angles = self.angles(T_body_cam, camera)
         rank = torch.arange(angles.shape[-1]).to(angles)
         weight = (1 - (rank - self._rank(angles)).abs() / max(1.0, self.smooth * len(rank))).clamp_min(0)
@@ -165,9 +168,9 @@ class LookAhead:
         return max(math.ceil(self.share * angles.shape[-1] - 1e-9) - 1, 0)
 
     def angles(self, T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
-        """By how much each pixel [..., P] looks beyond the distance: over ground the sine of the angle between its
-        ray and the plane through the line at that distance and the camera, or the vertical plane across, whichever
-        is smaller; before a scene (x - d) / hypot(x, d) of what it sees x metres ahead."""
+        """By how much each pixel [..., P] looks beyond the distance: over ground the sine of the angle
+        between its ray and the plane through the line at that distance and the camera, or the vertical plane
+        across, whichever is smaller; before a scene (x - d) / hypot(x, d) of what it sees x metres ahead."""
         if not hasattr(camera, "chief_rays"):
             raise DomainError(
                 "look-ahead: it looks through the camera; give one with chief rays, as render.Camera."
@@ -201,9 +204,11 @@ class LookAhead:
 
 
 def penalty(requirements: Sequence[Requirement], T_body_cam: Tensor, camera: ChiefRayCamera) -> Tensor:
-    """What to add to an objective so that a search keeps to its requirements: sum of max(0, 1 - slack / step)^2.
+    """What to add to an objective so that a search keeps to its requirements: sum of max(0, 1 - slack /
+    step)^2.
 
-    Args: T_body_cam: [..., 4, 4]. Returns: [...], 0 where every slack is at least its step, 1 where one of them is 0.
+    Args: T_body_cam: [..., 4, 4]. Returns: [...], 0 where every slack is at least its step, 1 where one of
+      them is 0.
     Gradient: mount, lens; continuous wherever the slack's is.
     """
     total = T_body_cam.new_zeros(T_body_cam.shape[:-2], dtype=torch.float64)
@@ -253,9 +258,11 @@ def check_positive(value: float, name: str) -> None:
 
 @dataclass(frozen=True)
 class OwnBody:
-    """The body covers at most ``largest_share`` of the picture, one of the requirements of a mount (see codesign.mount).
+    """The body covers at most ``largest_share`` of the picture, one of the requirements of a mount (see
+    codesign.mount).
 
-    The slack's gradient is that of a rendered picture in which the body glows and nothing else does, with the motion of
+    The slack's gradient is that of a rendered picture in which the body glows and nothing else does, with the
+    motion of
     its silhouettes: it is 0 where nothing of the body is in view. The exact answer counts chief rays.
 
     >>> from codesign import lens, render
@@ -266,8 +273,9 @@ class OwnBody:
     >>> round(float(OwnBody(sheet, 0.7).slack(level, camera)), 3)
     0.2
 
-    Args: body: in the axes of the mount. largest_share: 0 to 1. step: share below it from which on nothing pushes. per_px: points of
-      silhouettes per pixel length, for the gradient (before a rover, in 16 x 12 pixels, it is good to 2 %).
+    Args: body: in the axes of the mount. largest_share: 0 to 1. step: share below it from which on nothing
+      pushes. per_px: points of silhouettes per pixel length, for the gradient (before a rover, in 16 x 12
+      pixels, it is good to 2 %).
     Raises: DomainError for shares out of range.
     """
 

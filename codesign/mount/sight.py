@@ -23,11 +23,12 @@ NOTHING = 1e-12  # share of the largest eigenvalue below which a motion leaves a
 def expected_error(
     information: Tensor, unit: Sequence[float] | Tensor, prior: Sequence[float] | Tensor
 ) -> Tensor:
-    """Root mean square error of K velocities, in units of ``unit``, that the best unbiased use of the flow leaves.
+    """Root mean square error of K velocities, in units of ``unit``, that the best unbiased use of the flow
+    leaves.
 
-    Args: information: [..., K, K] as of ``mount.information`` without prior, or of an estimator: the inverse of
-      ``mount.Motion.covariance`` less the prior's. unit: [K] errors that count 1. prior: [K] standard deviations of the
-      velocities around zero, by which what no flow shows counts.
+    Args: information: [..., K, K] as of ``mount.information`` without prior, or of an estimator: the inverse
+      of ``mount.Motion.covariance`` less the prior's. unit: [K] errors that count 1. prior: [K] standard
+      deviations of the velocities around zero, by which what no flow shows counts.
     Returns: [...]. Gradient: information.
     Raises: ShapeError; DomainError for units or priors that are not positive.
     Source: Cramer-Rao bound with a prior (Van Trees, 1968).
@@ -45,9 +46,10 @@ def expected_error(
 class Sight:
     """What flow tells of K velocities.
 
-    axes: which of the six. deviation: [K] standard deviation of each where none is known, m/s and rad/s, infinite for
-    what leaves no trace in the flow; alone: [K] where all others are known. weakest: [K] motion that shows least, of
-    length 1 in units of ``unit``; weakest_deviation: its standard deviation in these units. unit: [K].
+    axes: which of the six. deviation: [K] standard deviation of each where none is known, m/s and rad/s,
+    infinite for what leaves no trace in the flow; alone: [K] where all others are known. weakest: [K] motion
+    that shows least, of length 1 in units of ``unit``; weakest_deviation: its standard deviation in these
+    units. unit: [K].
     """
 
     axes: tuple[int, ...]
@@ -66,8 +68,8 @@ class Sight:
         ]
 
     def weakest_named(self, least: float = 0.2) -> str:
-        """The weakest motion in words and shares of its units, such as "+0.71 left -0.70 roll"; parts below ``least``
-        are left out."""
+        """The weakest motion in words and shares of its units, such as "+0.71 left -0.70 roll"; parts below
+        ``least`` are left out."""
         parts = [
             f"{share:+.2f} {NAMES[axis]}"
             for axis, share in zip(self.axes, self.weakest.tolist(), strict=True)
@@ -80,8 +82,8 @@ class Sight:
 def sight(information: Tensor, unit: Sequence[float] | Tensor, axes: Sequence[int] = FREE) -> Sight:
     """What a mount sees and what it is blind to.
 
-    Args: information: [K, K] without prior. unit: [K] by which metres and radians per second are compared. axes: which
-      of the six velocities the K are. Returns: Sight; no gradient.
+    Args: information: [K, K] without prior. unit: [K] by which metres and radians per second are compared.
+      axes: which of the six velocities the K are. Returns: Sight; no gradient.
     Raises: ShapeError; DomainError.
 
     >>> sight(torch.diag(torch.tensor([100.0, 4.0, 0.0])), (0.1, 0.1, 0.1), (0, 1, 5)).blind()
@@ -139,10 +141,12 @@ Depth = Callable[[ChiefRayCamera, Tensor, Tensor, Any], Tensor]
 class Surroundings:
     """Where and by what flow a body's velocity is read.
 
-    position_m: of the camera on the body. T_world_body: [4, 4], None: at the world's origin. depth: as of EgoVelocity,
-    ``mount.ground_depth`` or ``mount.scene_depth``; scene: handed to it. axes: the velocities that the body has.
-    deviation_px_s: of the flow of one point; points: independent ones in the picture (a window read by an affine flow
-    counts as three). farthest_m: what lies farther counts as unseen: a pixel covers whole patterns there.
+    position_m: of the camera on the body. T_world_body: [4, 4], None: at the world's origin. depth: as of
+    EgoVelocity, ``mount.ground_depth`` or ``mount.scene_depth``; scene: handed to it. axes: the velocities
+    that the body has.
+    deviation_px_s: of the flow of one point; points: independent ones in the picture (a window read by an
+    affine flow counts as three). farthest_m: what lies farther counts as unseen: a pixel covers whole
+    patterns there.
     """
 
     position_m: tuple[float, float, float]
@@ -159,8 +163,8 @@ class Surroundings:
             check_number(getattr(self, name), name, above=0.0)
 
     def information(self, camera: ChiefRayCamera, T_body_cam: Tensor) -> tuple[Tensor, Tensor]:
-        """Information [..., K, K] without prior of mounts [..., 4, 4], and the share [...] of the picture that sees
-        something. Gradient: mount and lens."""
+        """Information [..., K, K] without prior of mounts [..., 4, 4], and the share [...] of the picture
+        that sees something. Gradient: mount and lens."""
         pixels = camera.film.pixels()
         count = min(MOST_PIXELS, len(pixels))
         pixels = pixels[torch.linspace(0, len(pixels) - 1, count).round().long()]
@@ -196,12 +200,14 @@ def sight_table(
     attitudes: Mapping[str, tuple[float, float]] = ATTITUDES,
     unit: Sequence[float] | None = None,
 ) -> dict[str, dict[str, Any]]:
-    """What forward, downward, sideways and oblique cameras see of the body's motion, and what they are blind to.
+    """What forward, downward, sideways and oblique cameras see of the body's motion, and what they are blind
+    to.
 
-    Args: attitudes: name -> yaw and pitch in degrees. unit: [K] errors that count 1; 0.1 m/s and 0.1 rad/s when None.
-    Returns: name -> "seen" (share of the picture), "sight" (mount.Sight), a column for each velocity (standard deviation
-      in m/s or rad/s, all unknown), "blind" (names of velocities worse than one unit), "weakest" (the motion that
-      shows least, in words) and "weakest_units" (its deviation). No gradient.
+    Args: attitudes: name -> yaw and pitch in degrees. unit: [K] errors that count 1; 0.1 m/s and 0.1 rad/s
+      when None.
+    Returns: name -> "seen" (share of the picture), "sight" (mount.Sight), a column for each velocity
+      (standard deviation in m/s or rad/s, all unknown), "blind" (names of velocities worse than one unit),
+      "weakest" (the motion that shows least, in words) and "weakest_units" (its deviation). No gradient.
 
     >>> from codesign import lens, render
     >>> from codesign.mount import Surroundings
@@ -238,10 +244,10 @@ def sight_map(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Expected error over all directions that a camera at one place may look in.
 
-    Args: rows: from straight up to straight down; columns: all around, both at least 2. unit, prior: [K] as of
-      ``mount.expected_error``; 0.1 and 1 when None.
-    Returns: yaw [columns], pitch [rows] rad at the middle of the cells, and the error [rows, columns] in units. For
-      ``report.mount_sphere``. No gradient.
+    Args: rows: from straight up to straight down; columns: all around, both at least 2. unit, prior: [K] as
+      of ``mount.expected_error``; 0.1 and 1 when None.
+    Returns: yaw [columns], pitch [rows] rad at the middle of the cells, and the error [rows, columns] in
+      units. For ``report.mount_sphere``. No gradient.
     """
     if check_whole(rows, "rows") < 2 or check_whole(columns, "columns") < 2:
         raise DomainError(f"sight_map: {rows} rows and {columns} columns; at least 2 of each are needed.")

@@ -1,4 +1,5 @@
-"""Where searches begin: mounts spread evenly over what is allowed; and what makes a search hopeless, said before it."""
+"""Where searches begin: mounts spread evenly over what is allowed; and what makes a search hopeless, said
+before it."""
 
 import math
 from collections.abc import Sequence
@@ -32,15 +33,16 @@ def starts(
     roll_rad: float = 0.0,
     seed: int = 0,
 ) -> Tensor:
-    """Numbers of mounts from which to search: quasi-random in the box and in the directions around the mount's start
-    attitude, as far as they keep the requirements.
+    """Numbers of mounts from which to search: quasi-random in the box and in the directions around the
+    mount's start attitude, as far as they keep the requirements.
 
-    Args: count: how many. camera: for requirements that look through it. reach_rad: largest angle of the view from that
-      of the start attitude, up to pi (all directions). roll_rad: largest turn about the view either way. seed: of
-      the scrambling.
-    Returns: [count, 6] for ``Mount.forward`` or ``mount.numbers.copy_``; the same for the same seed. Gradient: none.
-    Raises: DomainError when hardly any draw keeps the requirements, naming the one at which most fail; they are asked in
-      their order, so the cheap ones stand first.
+    Args: count: how many. camera: for requirements that look through it. reach_rad: largest angle of the view
+      from that of the start attitude, up to pi (all directions). roll_rad: largest turn about the view either
+      way. seed: of the scrambling.
+    Returns: [count, 6] for ``Mount.forward`` or ``mount.numbers.copy_``; the same for the same seed.
+      Gradient: none.
+    Raises: DomainError when hardly any draw keeps the requirements, naming the one at which most fail; they
+      are asked in their order, so the cheap ones stand first.
     Source: Sobol, USSR Comput. Math. 7, 1967, scrambled (torch.quasirandom).
 
     >>> mount = Mount((0.2, 0.0, 0.4), (0.1, 0.0, 0.2), pitch_rad=1.0)
@@ -101,8 +103,8 @@ def check_mount(
 
     Args: reach_m: how far from the body a bracket may hold a camera.
     Raises: DomainError, in a sentence that says what to change, for a box that is farther from the robot than
-      ``reach_m`` or has no room beside it, a start that does not keep a requirement, or a camera whose lens has a
-      smaller image circle than its film (where the camera has ``check``).
+      ``reach_m`` or has no room beside it, a start that does not keep a requirement, or a camera whose lens
+      has a smaller image circle than its film (where the camera has ``check``).
     """
     for each in requirements:
         if isinstance(each, Clearance):

@@ -1,12 +1,12 @@
-"""How well flow is known where it is longer or nearer, in the mean over textures: the part of the gradient of its
-precision that is not the draw's.
+"""How well flow is known where it is longer or nearer, in the mean over textures: the part of the gradient of
+its precision that is not the draw's.
 
-The precision that an estimator gives a window jumps with the texture under it: moved by a pixel, the picture has other
-edges. Its derivative to a pose is that jump times hundreds of pixels per radian, and has no mean. What goes on when the
-jumps are averaged is that flow is told better where there is more of it, until it is too fast, where the surface and its
-texture are near, and where the robot's own body, whose image stands still, does not reach into the window. That trend is
-fitted over all points seen so far, and is followed instead; or, over steps that no slope describes, what was told from
-one place is carried to another by it.
+The precision that an estimator gives a window jumps with the texture under it: moved by a pixel, the picture
+has other edges. Its derivative to a pose is that jump times hundreds of pixels per radian, and has no mean.
+What goes on when the jumps are averaged is that flow is told better where there is more of it, until it is
+too fast, where the surface and its texture are near, and where the robot's own body, whose image stands
+still, does not reach into the window. That trend is fitted over all points seen so far, and is followed
+instead; or, over steps that no slope describes, what was told from one place is carried to another by it.
 """
 
 from dataclasses import replace
@@ -25,12 +25,13 @@ SURE = 1e-4  # of a confidence from 0 and 1
 
 
 class PrecisionTrend:
-    """Regression of the logarithm of precision, and of the log odds of confidence, on flow length (third order), nearness, and
-    the share of the window that the body covers (second).
+    """Regression of the logarithm of precision, and of the log odds of confidence, on flow length (third
+    order), nearness, and the share of the window that the body covers (second).
 
     >>> trend = PrecisionTrend()
 
-    forget: share of what was seen before that each ``add`` leaves out, 0 for none. Raises: DomainError for no share.
+    forget: share of what was seen before that each ``add`` leaves out, 0 for none. Raises: DomainError for no
+      share.
     """
 
     def __init__(self, forget: float = 0.0) -> None:
@@ -44,7 +45,8 @@ class PrecisionTrend:
     def add(self, read: Readings, flow_px: Tensor, covered: Tensor | None = None) -> "PrecisionTrend":
         """Take in readings whose true flow is [N, P, 2] px; points without a surface are left out.
 
-        covered: share of each window that the robot's own body covers, [windows] (``OwnBody.covered``) or [N, windows].
+        covered: share of each window that the robot's own body covers, [windows] (``OwnBody.covered``) or [N,
+          windows].
         """
         seen = read.share > 0
         terms = _terms(read, flow_px, covered)[seen]
@@ -56,7 +58,8 @@ class PrecisionTrend:
         return self
 
     def followed(self, read: Readings, flow_px: Tensor, covered: Tensor | None = None) -> Readings:
-        """The same readings, whose precision and confidence have the gradient of the trend to flow, depth and cover.
+        """The same readings, whose precision and confidence have the gradient of the trend to flow, depth and
+        cover.
 
         Raises: DomainError where nothing has been added.
         """
@@ -67,17 +70,20 @@ class PrecisionTrend:
         return replace(read, precision=precision, confidence=confidence)
 
     def told(self, read: Readings, flow_px: Tensor, covered: Tensor | None = None) -> Tensor:
-        """[N, P, 2]: logarithm of precision and log odds of confidence by the trend alone. Arguments and errors as ``followed``."""
+        """[N, P, 2]: logarithm of precision and log odds of confidence by the trend alone. Arguments and
+        errors as ``followed``."""
         return _terms(read, flow_px, covered) @ self._coefficients()
 
     def carried(self, here: Readings, told_here: Tensor, there: Readings, told_there: Tensor) -> Readings:
-        """Readings of the same points and textures as if they had been made from another place, no picture of which there is.
+        """Readings of the same points and textures as if they had been made from another place, no picture of
+        which there is.
 
-        Args: here: what was read. told_here, told_there: what the trend tells of either place (``told``). there: depth, rows
-          and share from the other place; its estimates are not looked at.
-        Precision and confidence are those of here, changed as the trend tells. A point that shows a surface only from
-        there takes what the nearest window with surfaces had beside the trend: a mean would be too good, since a window in
-        three without texture says less than all of them with a little. Gradient: readings of here, what is told.
+        Args: here: what was read. told_here, told_there: what the trend tells of either place (``told``).
+          there: depth, rows and share from the other place; its estimates are not looked at.
+        Precision and confidence are those of here, changed as the trend tells. A point that shows a surface
+        only from there takes what the nearest window with surfaces had beside the trend: a mean would be too
+        good, since a window in three without texture says less than all of them with a little. Gradient:
+        readings of here, what is told.
         """
         seen = here.share > 0
         own = torch.stack([_log_precision(here), _log_odds(here.confidence)], -1)

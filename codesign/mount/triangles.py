@@ -1,4 +1,5 @@
-"""Points, segments and rays against triangles [F, 3, 3], exactly and without gradient; float64, many against many."""
+"""Points, segments and rays against triangles [F, 3, 3], exactly and without gradient; float64, many against
+many."""
 
 import math
 
@@ -46,8 +47,8 @@ def winding_numbers(points: Tensor, triangles: Tensor) -> Tensor:
 
     Args: points: [N, 3]. triangles: [F, 3, 3].
     Returns: [N]. Gradient: none.
-    Source: solid angle of a triangle of van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30, 1983; as a test of
-      what is inside Jacobson, Kavan and Sorkine-Hornung, SIGGRAPH 2013.
+    Source: solid angle of a triangle of van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30, 1983; as a
+      test of what is inside Jacobson, Kavan and Sorkine-Hornung, SIGGRAPH 2013.
     """
     found = []
     for chunk in points.detach().split(max(1, PAIRS // len(triangles))):

@@ -16,13 +16,14 @@ GRAIN = 256
 class Descent(torch.optim.Optimizer):
     """Steps along a running mean of the gradient, on a grid, with a weak pull towards 0.
 
-    For parameters in natural units, where 0 is the start and a unit is a sensible step. The pull keeps those that
-    the objective does not see from wandering. velocity <- momentum velocity + (1 - momentum)(gradient + pull
-    parameter); parameter <- parameter - lr velocity.
+    For parameters in natural units, where 0 is the start and a unit is a sensible step. The pull keeps those
+    that the objective does not see from wandering. velocity <- momentum velocity + (1 - momentum)(gradient +
+    pull parameter); parameter <- parameter - lr velocity.
 
-    Args: params: as for any torch optimiser. lr: length of a step per unit of velocity. momentum: 0 to below 1.
-      pull: >= 0. normalised: every gradient counts by its direction alone, and every step has length lr. grain:
-      1 over the spacing of the grid, on which steps below half its spacing do nothing; 0 for none.
+    Args: params: as for any torch optimiser. lr: length of a step per unit of velocity. momentum: 0 to below
+      1.
+      pull: >= 0. normalised: every gradient counts by its direction alone, and every step has length lr.
+      grain: 1 over the spacing of the grid, on which steps below half its spacing do nothing; 0 for none.
     Raises: DomainError for numbers outside these ranges.
 
     >>> import torch

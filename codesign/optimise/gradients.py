@@ -1,4 +1,5 @@
-"""Gradients of samples, one by one: clipped before they are averaged, because a few are tens of times too long."""
+"""Gradients of samples, one by one: clipped before they are averaged, because a few are tens of times too
+long."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -18,13 +19,14 @@ class SampleGradients:
 
 
 def sample_gradients(losses: Iterable[Tensor], parameters: Sequence[Tensor]) -> SampleGradients:
-    """Values and gradients of sample losses, each taken as soon as it is made, so that one graph lives at a time.
+    """Values and gradients of sample losses, each taken as soon as it is made, so that one graph lives at a
+    time.
 
-    Args: losses: scalars, S of them; a generator makes each when it is needed. parameters: leaves that ask for
-      gradients, of any shapes.
+    Args: losses: scalars, S of them; a generator makes each when it is needed. parameters: leaves that ask
+      for gradients, of any shapes.
     Returns: SampleGradients, float64.
-    Raises: GradientError when a loss does not depend on any of the parameters, or shares its graph with another;
-      DomainError, ShapeError for samples that are no scalar tensors, or none.
+    Raises: GradientError when a loss does not depend on any of the parameters, or shares its graph with
+      another; DomainError, ShapeError for samples that are no scalar tensors, or none.
     """
     if isinstance(losses, Tensor) or not isinstance(losses, Iterable):
         raise DomainError(

@@ -10,10 +10,10 @@ max(0, shortfall).
 
 A variable the residuals hardly see (a null mode) has a column about 0, hence a D about 0 and a step of any
 length: the linear model holds nowhere along it, and the damping that would hold it also holds all others. Its
-own column cannot tell it from a variable in small units, so D follows Marquardt as long as steps succeed. After
-``REJECTED`` failures in a row, when some D lies below ``FLOOR`` of the largest, D is raised to that floor for
-the rest of the run, and the damping goes back to what it was before them. Problems whose steps succeed keep
-their independence of units to the last bit; the others keep it within 1 / FLOOR.
+own column cannot tell it from a variable in small units, so D follows Marquardt as long as steps succeed.
+After ``REJECTED`` failures in a row, when some D lies below ``FLOOR`` of the largest, D is raised to that
+floor for the rest of the run, and the damping goes back to what it was before them. Problems whose steps
+succeed keep their independence of units to the last bit; the others keep it within 1 / FLOOR.
 Source: Marquardt, SIAM J. Appl. Math. 11 (1963); Nielsen, Damping parameter in Marquardt's method,
   IMM-REP-1999-05 (update of the damping);
 More, The Levenberg-Marquardt algorithm, LNM 630 (1978) (scaling).
@@ -46,8 +46,8 @@ class StopRules:
     steps: most steps of a run. gradient: largest cosine between a column of J and r (0 at a minimum).
     step: length of a step over that of the variables, both in units of D. loss: relative decrease by an
       accepted step.
-    damping: largest damping, reached when no step of any size helps. stall: share that the last ``trials`` steps
-      together gained of what the linear model promised for them, below which they lead nowhere.
+    damping: largest damping, reached when no step of any size helps. stall: share that the last ``trials``
+      steps together gained of what the linear model promised for them, below which they lead nowhere.
     """
 
     steps: int = 100

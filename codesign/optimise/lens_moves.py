@@ -1,4 +1,5 @@
-"""Lenses re-optimised around a move: an element taken out along a path, glasses exchanged for their neighbours.
+"""Lenses re-optimised around a move: an element taken out along a path, glasses exchanged for their
+neighbours.
 
     def residuals(candidate):
         spots, _ = lens.spots(candidate, fields)
@@ -42,8 +43,8 @@ STEP = 1e-3  # of the unit of a variable, which moves the rays by a thousandth o
 
 @dataclass(frozen=True)
 class Redesign:
-    """A lens of its own after a move, the merit (sum of squared residuals) of the lens given and of this one, why
-    the last run of least squares stopped, and what was done in words, a line each."""
+    """A lens of its own after a move, the merit (sum of squared residuals) of the lens given and of this one,
+    why the last run of least squares stopped, and what was done in words, a line each."""
 
     lens: GeoLens
     before: float
@@ -63,10 +64,11 @@ def reoptimise(
     """Damped least squares on the residuals of a lens, its focal length held by a curvature.
 
     Args:
-      residuals: lens -> [M]; limits enter as rows, see ``constraints.rows``. Values that are not finite, and a
-        DomainError, make a failed step.
+      residuals: lens -> [M]; limits enter as rows, see ``constraints.rows``. Values that are not finite, and
+        a DomainError, make a failed step.
       names, bounds: as in ``GeoLens.variables``; thicknesses stay above 0.
-      held: surfaces (from 0, from the last when negative) whose curvature is not to change. steps: most steps.
+      held: surfaces (from 0, from the last when negative) whose curvature is not to change. steps: most
+        steps.
     Returns: Redesign; the lens given stays as it is.
     Raises: DomainError when the residuals of the lens given are not finite, a held surface is not there, or
       nothing can vary.
@@ -111,8 +113,9 @@ def remove_element(
     steps: int = 40,
     bounds: Bounds | None = None,
 ) -> Redesign:
-    """The lens without an element, re-optimised: its curvatures are first led to a plate (see ``moves.flattened``)
-    in ``path`` equal parts, each followed by a quarter of the ``steps``, so that the others take over its work.
+    """The lens without an element, re-optimised: its curvatures are first led to a plate (see
+    ``moves.flattened``) in ``path`` equal parts, each followed by a quarter of the ``steps``, so that the
+    others take over its work.
 
     Args: element: its number in ``elements(lens)``. path: 0 removes at once. The rest as for ``reoptimise``.
     Returns: Redesign from the lens given to the one without the element.
@@ -145,8 +148,8 @@ def exchange_glasses(
     neighbours, where that is better after re-optimisation.
 
     Args: count, among: neighbours tried per glass and the names they are chosen from, see
-      ``neighbour_glasses``. steps: most steps per trial, and for the lens given first, so that a neighbour wins by
-      its glass and not by its steps. The rest as for ``reoptimise``.
+      ``neighbour_glasses``. steps: most steps per trial, and for the lens given first, so that a neighbour
+      wins by its glass and not by its steps. The rest as for ``reoptimise``.
     Returns: Redesign; its log has a line per trial.
     Raises: DomainError for a lens without glass, or as ``reoptimise`` for the lens given.
     """
@@ -173,14 +176,16 @@ def exchange_glasses(
 
 
 def _as_before(lens, like, held):
-    """The lens with the focal length and the defocus of another, by a curvature that is not among ``held``."""
+    """The lens with the focal length and the defocus of another, by a curvature that is not among
+    ``held``."""
     f = like.first_order()
     lens = hold_efl(lens, f.efl_mm.detach(), _holder(lens, held))
     return focus_paraxial(lens, defocus_mm=(like.thickness_mm[-1] - f.bfl_mm).detach())
 
 
 def _holder(lens, held):
-    """The surface that holds the focal length: ``holding_surface``, or the last that bends light and may change."""
+    """The surface that holds the focal length: ``holding_surface``, or the last that bends light and may
+    change."""
     at = holding_surface(lens)
     if at not in held:
         return at

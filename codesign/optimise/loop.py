@@ -26,17 +26,18 @@ class Record:
 class Loop:
     """Steps of any torch optimiser on clipped sample gradients; the best point by judgement is kept.
 
-    Straight-through gradients are noisy: single samples point anywhere, and some are tens of times too long. So
-    samples are clipped one by one, and what counts is a score on fixed cases, such as the hard sensor's.
+    Straight-through gradients are noisy: single samples point anywhere, and some are tens of times too long.
+    So samples are clipped one by one, and what counts is a score on fixed cases, such as the hard sensor's.
 
     Args:
       optimiser: torch.optim.Optimizer over what is optimised.
       samples: step number -> the samples' scalar losses, best as a generator; or their SampleGradients.
-      clip: longest gradient of a sample within a parameter group; None clips to the median length of the samples.
-      judge: () -> score, the lower the better, at the parameters as they are; without one the last point is the
-        best. judge_every: steps between judgements; the start and the end are judged too.
-      patience: worse judgements borne in a row before the loop goes back to the best point with its step sizes
-        times ``shrink``; None never goes back.
+      clip: longest gradient of a sample within a parameter group; None clips to the median length of the
+        samples.
+      judge: () -> score, the lower the better, at the parameters as they are; without one the last point is
+        the best. judge_every: steps between judgements; the start and the end are judged too.
+      patience: worse judgements borne in a row before the loop goes back to the best point with its step
+        sizes times ``shrink``; None never goes back.
       schedule: step number -> factor of the first step sizes (warm-up, decay).
     record: Record. best, best_score: clones of the parameters at the best judgement, and its score.
     Raises: DomainError for numbers that make no sense; GradientError for a frozen parameter.
@@ -108,10 +109,11 @@ class Loop:
     ) -> list[Tensor]:
         """Go on until ``steps`` are made in all, and leave the parameters at the best point.
 
-        Args: advance: called after every step with loss= and score=; may raise to stop. save: called after every
-          judgement.
+        Args: advance: called after every step with loss= and score=; may raise to stop. save: called after
+          every judgement.
         Returns: the best point, one tensor per parameter.
-        Raises: NonFiniteError when a loss or gradient is not finite; the parameters are then at the best point.
+        Raises: NonFiniteError when a loss or gradient is not finite; the parameters are then at the best
+          point.
         """
         try:
             while self.step_number < steps:

@@ -1,5 +1,5 @@
-"""Robots that carry a camera: from URDF files (``from_urdf``), and as pairs of a robot and the worlds it moves through
-(``pair``, by name in ``pairs``), your own too (``own``, from a page as ``page`` has it)."""
+"""Robots that carry a camera: from URDF files (``from_urdf``), and as pairs of a robot and the worlds it
+moves through (``pair``, by name in ``pairs``), your own too (``own``, from a page as ``page`` has it)."""
 
 from scenes.robots.urdf import ROVER, T_LINK_OPTICAL, Robot, from_urdf
 

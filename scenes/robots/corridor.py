@@ -1,5 +1,5 @@
-"""A fork truck in a corridor, its own forks in view: near walls with pillars on both sides, far ends. It reads its
-velocity in the plane with a map of the corridor; where it sees itself there is nothing to read."""
+"""A fork truck in a corridor, its own forks in view: near walls with pillars on both sides, far ends. It
+reads its velocity in the plane with a map of the corridor; where it sees itself there is nothing to read."""
 
 import math
 
@@ -41,7 +41,8 @@ START = Design(6.5, 1.2, 0.55, 0.2, 0.0, 0.24, 0.0, math.radians(23), 0.0)
 
 
 def corridor() -> RobotPair:
-    """The pair. The estimator has the true depth of walls, floor and things, and knows where it sees the robot itself.
+    """The pair. The estimator has the true depth of walls, floor and things, and knows where it sees the
+    robot itself.
 
     >>> sorted(corridor().bodies)[2:4]
     ['fork left', 'fork right']

@@ -1,5 +1,5 @@
-"""A quadrotor in a room, from low over the floor to under the ceiling: all six velocities count, in every direction
-of flight, with a map of the room."""
+"""A quadrotor in a room, from low over the floor to under the ceiling: all six velocities count, in every
+direction of flight, with a map of the room."""
 
 import math
 

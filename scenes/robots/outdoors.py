@@ -1,5 +1,5 @@
-"""A rover outdoors: rough ground with crates, balls and posts under a sky. It reads its velocity in the plane off
-ground it knows to be flat, from ahead of its bumper, and must also see what lies before it."""
+"""A rover outdoors: rough ground with crates, balls and posts under a sky. It reads its velocity in the plane
+off ground it knows to be flat, from ahead of its bumper, and must also see what lies before it."""
 
 import math
 
@@ -40,8 +40,8 @@ START = Design(6.5, 1.2, 0.55, 0.4, 0.0, 0.22, 0.0, math.radians(19), 0.0)
 
 
 def outdoors() -> RobotPair:
-    """The pair. The estimator knows the height and attitude of the rover over flat ground; what stands on it, and the
-    sky, it takes for what they are not.
+    """The pair. The estimator knows the height and attitude of the rover over flat ground; what stands on it,
+    and the sky, it takes for what they are not.
 
     >>> pair = outdoors()
     >>> pair.check(pair.design).mount()[:3, 3].tolist()

@@ -1,4 +1,5 @@
-"""A pair out of a user's own files: a robot from URDF or a mesh, a world, a trajectory (scenes.robots.page)."""
+"""A pair out of a user's own files: a robot from URDF or a mesh, a world, a trajectory
+(scenes.robots.page)."""
 
 import contextlib
 import math
@@ -41,16 +42,17 @@ Drive = Callable[[int, int], tuple[Tensor, Tensor]]
 
 
 def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
-    """The pair that a page of settings describes; to be looked at by ``check.check_pair`` before the first frame.
+    """The pair that a page of settings describes; to be looked at by ``check.check_pair`` before the first
+    frame.
 
-    A robot that drives through the world of a pair stands with its lowest point 8 mm over the ground, wherever its
-    origin is. Windows of a trajectory begin at random places, for training in its first two thirds, for judging in
-    the rest. A world from a file is the same for all numbers.
+    A robot that drives through the world of a pair stands with its lowest point 8 mm over the ground,
+    wherever its origin is. Windows of a trajectory begin at random places, for training in its first two
+    thirds, for judging in the rest. A world from a file is the same for all numbers.
 
     Args: settings: or the path of their page (``page.read_own``).
     Raises: FileFormatError for files that are missing or damaged; DomainError, naming the entry, for what is
-      unknown, missing, out of range, or does not go together: a robot without room in the world, a trajectory that
-      stands still or is shorter than three windows.
+      unknown, missing, out of range, or does not go together: a robot without room in the world, a trajectory
+      that stands still or is shorter than three windows.
     """
     own = settings if isinstance(settings, OwnRobot) else read_own(settings)
     bodies, frame = _bodies(own)
@@ -102,8 +104,8 @@ def own_pair(settings: OwnRobot | str | Path) -> RobotPair:
 
 
 def with_named(path: Path) -> list[Path]:
-    """A file and those that it names, and they in turn: materials, pictures, meshes. A name with a blank in it is found
-    in quotes alone."""
+    """A file and those that it names, and they in turn: materials, pictures, meshes. A name with a blank in
+    it is found in quotes alone."""
     found: list[Path] = []
     left = [path]
     while left:
@@ -117,10 +119,12 @@ def with_named(path: Path) -> list[Path]:
 
 
 def recorded_drives(path: Path) -> tuple[Drive, tuple[float, ...]]:
-    """Windows of a trajectory (``RobotPair.drive``), with the constant twist that leads from the first pose whose
-    events are read to the last; and the root mean squares of its six velocities, at least 0.05 m/s and rad/s, as a prior.
+    """Windows of a trajectory (``RobotPair.drive``), with the constant twist that leads from the first pose
+    whose events are read to the last; and the root mean squares of its six velocities, at least 0.05 m/s and
+    rad/s, as a prior.
 
-    Raises: FileFormatError, as ``scenes.tum.read_tum``; DomainError for one that is too short or stands still.
+    Raises: FileFormatError, as ``scenes.tum.read_tum``; DomainError for one that is too short or stands
+      still.
     """
     t_s, poses = read_tum(path)
     window_s = float(robot_pair.times()[-1])

@@ -1,12 +1,15 @@
-"""A page of plain YAML that describes a user's robot: its body, where its camera may sit, what it moves through and how.
+"""A page of plain YAML that describes a user's robot: its body, where its camera may sit, what it moves
+through and how.
 
-    robot: rover.urdf          # or .obj, .stl, .ply, .dae, .gltf, .glb: metres, or unit_m; x forward, y left, z up
+    robot: rover.urdf          # or .obj, .stl, .ply, .dae, .gltf, .glb: metres, or unit_m; x forward, y left,
+      z up
     without: [camera_link]     # links that move with the camera
     camera:
       low_m: [0.1, -0.1, 0.4]
       high_m: [0.3, 0.1, 0.6]
 
-What else may stand there is what the classes below have; units are in the names. Paths count from the page's folder.
+What else may stand there is what the classes below have; units are in the names. Paths count from the page's
+folder.
 """
 
 import difflib
@@ -143,14 +146,19 @@ class Require:
 class OwnRobot:
     """A user's robot, and how its camera is judged.
 
-    robot: URDF or mesh file. camera: bounds of the mount. without: links left out, those that move with the camera.
-    start: of the mount, where the first search begins. lens: held. packages: package -> folder, for package:// paths of a URDF. unit_m: metres per unit of
-    the robot's mesh file, world_unit_m of the world's; None is as the file says it, or metres.
-    world: "outdoors", "corridor" or "flight", or a file: a mesh (metres, z up; glTF y up) or a Mitsuba scene (.xml).
-    motion: the drives of a pair by the same names, or a file of poses T_world_body (scenes.tum); None is the world's.
-    velocities: which count, "planar" or "free"; None is as the pair has it that the motion names, "free" for a file.
-    depth: how it is known, "ground" (the plane z = 0 of the world) or "scene" (a map); None is as the world's pair
-      has it, "scene" for a file.
+    robot: URDF or mesh file. camera: bounds of the mount. without: links left out, those that move with the
+      camera.
+    start: of the mount, where the first search begins. lens: held. packages: package -> folder, for
+    package:// paths of a URDF. unit_m: metres per unit of the robot's mesh file, world_unit_m of the world's;
+    None is as the file says it, or metres.
+    world: "outdoors", "corridor" or "flight", or a file: a mesh (metres, z up; glTF y up) or a Mitsuba scene
+      (.xml).
+    motion: the drives of a pair by the same names, or a file of poses T_world_body (scenes.tum); None is the
+      world's.
+    velocities: which count, "planar" or "free"; None is as the pair has it that the motion names, "free" for
+      a file.
+    depth: how it is known, "ground" (the plane z = 0 of the world) or "scene" (a map); None is as the world's
+      pair has it, "scene" for a file.
     require: what the mount has to keep.
     Raises: DomainError for what does not go together.
     """
@@ -204,8 +212,8 @@ class OwnRobot:
 def read_own(path: str | Path) -> OwnRobot:
     """The settings on a page of plain YAML (codesign.plain_yaml).
 
-    Raises: FileFormatError where the file is missing or no such page; DomainError, naming file and entry, for an
-      entry that is unknown (with the nearest name), missing, of another kind, or out of range.
+    Raises: FileFormatError where the file is missing or no such page; DomainError, naming file and entry, for
+      an entry that is unknown (with the nearest name), missing, of another kind, or out of range.
     """
     path = Path(path)
     text = read_text(path, MOST_BYTES)

@@ -1,12 +1,13 @@
 """A robot and the world it moves through: what the design of its camera is judged by.
 
-A pair says where a camera may sit on a robot's body, which lens and mount it starts from, which velocities of the
-body count, and makes worlds and drives by number. Numbers below ``UNSEEN_FROM`` are for training, those from there on
-for judging; they share neither photographs nor random patterns, places or motions.
+A pair says where a camera may sit on a robot's body, which lens and mount it starts from, which velocities of
+the body count, and makes worlds and drives by number. Numbers below ``UNSEEN_FROM`` are for training, those
+from there on for judging; they share neither photographs nor random patterns, places or motions.
 
-All pairs move in one hard regime: speeds from 0.05 to 3 m/s, evenly in their logarithm, unknown roll, pitch and yaw
-rates, half of the contrast of photographs, a slow sensor with high thresholds. There is no velocity at which flow is
-always within the estimator's reach, so that focal length, focus, height and attitude all matter.
+All pairs move in one hard regime: speeds from 0.05 to 3 m/s, evenly in their logarithm, unknown roll, pitch
+and yaw rates, half of the contrast of photographs, a slow sensor with high thresholds. There is no velocity
+at which flow is always within the estimator's reach, so that focal length, focus, height and attitude all
+matter.
 
 Body axes: x forward, y left, z up. The body is drawn in front of its camera (``render.MovingScene``).
 """
@@ -75,8 +76,8 @@ PHOTOS = {False: ("gravel", "grass", "coffee"), True: ("brick", "astronaut", "ch
 
 @dataclass(frozen=True)
 class Design:
-    """A lens and where it looks from: focal length, f-number, 1 / distance in focus; position, yaw to the left,
-    pitch downwards and roll in body axes."""
+    """A lens and where it looks from: focal length, f-number, 1 / distance in focus; position, yaw to the
+    left, pitch downwards and roll in body axes."""
 
     efl_mm: float
     fno: float
@@ -103,7 +104,8 @@ class Design:
 
 @dataclass(frozen=True)
 class Drives(Batch):
-    """A batch that knows the truth. twist: [N, 6] of the body over the interval, m/s and rad/s in its own axes."""
+    """A batch that knows the truth. twist: [N, 6] of the body over the interval, m/s and rad/s in its own
+    axes."""
 
     twist: Any = None
 
@@ -112,18 +114,20 @@ class Drives(Batch):
 class RobotPair:
     """A robot, its worlds and its drives.
 
-    name: of the pair. bodies: link -> mesh in body axes. low, high: bounds of the design. design: where to start,
-      inside them.
+    name: of the pair. bodies: link -> mesh in body axes. low, high: bounds of the design. design: where to
+      start, inside them.
     axes: which of the six velocities count (``mount.PLANAR`` or ``mount.FREE``); all six are estimated.
     prior: standard deviations expected of the six, m/s and rad/s.
     depth: how depth is known, "ground" or "scene" (``mount.EgoVelocity``).
-    look_ahead: distance in metres, and the share of the image that must see beyond it; None where nothing must.
+    look_ahead: distance in metres, and the share of the image that must see beyond it; None where nothing
+      must.
     world: number -> what stands still. drive: (number, how many) -> T_world_body [M, T, 4, 4], twist [M, 6].
-    housing_radius_m, margin_m: of the camera, and by how much it must stay clear of the body. own_body_share: of the
-      image, that the body may cover. cable: direction in body axes and half angle in radians of a cone into which the
-      camera's back must not point; None where it may point anywhere. ground_z_m: height of the ground in body axes.
-    frame: name of the body's axes (REP 105). one_world: whether all numbers are the same world, with other drives. files: of which the pair was made, where a user gave them; page: what they
-      wrote of it.
+    housing_radius_m, margin_m: of the camera, and by how much it must stay clear of the body. own_body_share:
+      of the image, that the body may cover. cable: direction in body axes and half angle in radians of a cone
+      into which the camera's back must not point; None where it may point anywhere. ground_z_m: height of the
+      ground in body axes.
+    frame: name of the body's axes (REP 105). one_world: whether all numbers are the same world, with other
+      drives. files: of which the pair was made, where a user gave them; page: what they wrote of it.
     """
 
     name: str
@@ -197,7 +201,8 @@ class RobotPair:
     def system(self, design: Design, layer: str = "memory") -> System:
         """Camera, mount, sensor, flow and estimate of a design; objective "error" is the mean bounded one.
 
-        layer: "memory" (hard counts, straight-through gradient), "counts" (smooth, without noise) or "sensor" (single
+        layer: "memory" (hard counts, straight-through gradient), "counts" (smooth, without noise) or "sensor"
+          (single
           events, no gradient: the judge).
         """
         mount = self.check(design).mount()
@@ -235,7 +240,8 @@ LAYERS = {
 
 
 def mount_at(ranges: MountRanges, T_body_cam: Tensor) -> Mount:
-    """The learnable mount in the middle of a box that stands at a pose [4, 4]; a wall is approached to a billionth."""
+    """The learnable mount in the middle of a box that stands at a pose [4, 4]; a wall is approached to a
+    billionth."""
     low, high = ranges.low[:3], ranges.high[:3]
     half, middle = (high - low) / 2, (low + high) / 2
     inside = torch.where(half > 0, (T_body_cam[:3, 3] - middle).clamp(-INSIDE * half, INSIDE * half), 0.0)
@@ -265,19 +271,21 @@ def _counted(count):
 
 
 def times() -> Tensor:
-    """[T] seconds of the frames: one before the window, in which the sensor settles, and those of the window."""
+    """[T] seconds of the frames: one before the window, in which the sensor settles, and those of the
+    window."""
     window = LEAD_S + torch.linspace(0, DURATION_S, FRAMES - 1, dtype=torch.float64)
     return torch.cat([torch.zeros(1, dtype=torch.float64), window])
 
 
 def moved(T_world_body: Tensor, twist: Tensor) -> Tensor:
-    """Poses [M, T, 4, 4] of bodies that are at [M, 4, 4] in the middle of the window and go with twists [M, 6]."""
+    """Poses [M, T, 4, 4] of bodies that are at [M, 4, 4] in the middle of the window and go with twists [M,
+    6]."""
     return T_world_body[:, None] @ se3_exp((times() - MIDDLE_S)[:, None] * twist[:, None])
 
 
 def speeds_and_deviates(number: int, motions: int, columns: int) -> tuple[Tensor, Tensor]:
-    """Speeds [M] m/s, even in the logarithm over SPEED_M_S, and standard normal numbers [M, columns]; each of them
-    spread evenly over its distribution, in an order of its own (a Latin hypercube)."""
+    """Speeds [M] m/s, even in the logarithm over SPEED_M_S, and standard normal numbers [M, columns]; each of
+    them spread evenly over its distribution, in an order of its own (a Latin hypercube)."""
     random = np.random.default_rng([number, 1])
     order = random.permuted(np.tile(np.arange(motions), (columns + 1, 1)), axis=1)
     share = torch.from_numpy((order + random.random(order.shape)) / motions).T
@@ -297,8 +305,9 @@ def picture(random: np.random.Generator, unseen: bool, level: float) -> np.ndarr
 
 
 def variant(number: int) -> tuple[np.random.Generator, float, Callable[[float, float], Paint]]:
-    """What every world of a number begins with: its random numbers, the mean radiance of its surfaces, even in the
-    logarithm over LIGHT, and what paints a surface of a width and height in metres, in texels of 1.5 to 3 mm."""
+    """What every world of a number begins with: its random numbers, the mean radiance of its surfaces, even
+    in the logarithm over LIGHT, and what paints a surface of a width and height in metres, in texels of 1.5
+    to 3 mm."""
     random = np.random.default_rng([number, 2])
     level = float(np.exp(random.uniform(*np.log(LIGHT))))
 

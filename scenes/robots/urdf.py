@@ -1,5 +1,5 @@
-"""Robots from URDF files: their bodies at given joint angles as scenes, and named frames to mount a camera on.
-Metres, radians; the robot's own axes are those of one of its links.
+"""Robots from URDF files: their bodies at given joint angles as scenes, and named frames to mount a camera
+on. Metres, radians; the robot's own axes are those of one of its links.
 
     robot = robots.from_urdf("rover.urdf", {"mast": 0.3})
     world = render.MovingScene(static, {"robot": (robot.scene(), T_world_robot)})
@@ -33,7 +33,8 @@ yourdfpy = optional("yourdfpy", "worlds", "reading URDF")
 trimesh = optional("trimesh", "worlds", "reading URDF")
 etree = optional("lxml.etree", "worlds", "reading URDF")
 
-# from the axes of a camera (z forward, x right, y down) to those of a link (x forward, y left, z up): ROS REP 103
+# from the axes of a camera (z forward, x right, y down) to those of a link (x forward, y left, z up): ROS REP
+# 103
 T_LINK_OPTICAL = torch.tensor(
     [[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64
 )
@@ -47,8 +48,8 @@ MOST_BYTES = 100_000_000
 
 @dataclass(frozen=True)
 class Robot:
-    """Links at joint angles. path: of the URDF. frames: name of each link -> T_robot_link [4, 4]. parts: what is
-    seen, in the robot's axes, named by link. base: the link whose axes are the robot's."""
+    """Links at joint angles. path: of the URDF. frames: name of each link -> T_robot_link [4, 4]. parts: what
+    is seen, in the robot's axes, named by link. base: the link whose axes are the robot's."""
 
     path: Path
     frames: Mapping[str, np.ndarray]
@@ -62,8 +63,8 @@ class Robot:
         return torch.from_numpy(self.frames[name].copy())
 
     def scene(self, device: str = "cpu") -> MitsubaScene:
-        """The robot in its own axes, as an emissive scene before nothing: its colours in the light of a plain sky
-        that turns with it. Raises: DomainError for a robot without a body."""
+        """The robot in its own axes, as an emissive scene before nothing: its colours in the light of a plain
+        sky that turns with it. Raises: DomainError for a robot without a body."""
         return emissive(World(self.shapes(), two_sided=True), device)
 
     def shapes(self) -> dict[str, Any]:
@@ -88,16 +89,17 @@ def from_urdf(
 
     Args:
       path: a .urdf file (a .xacro has to be expanded before).
-      joint_angles: joint -> radians (metres of a prismatic one), within its limits; the others are at 0, or at
-        the limit next to it. Joints that mimic others follow them. Floating and planar joints are held at 0.
+      joint_angles: joint -> radians (metres of a prismatic one), within its limits; the others are at 0, or
+        at the limit next to it. Joints that mimic others follow them. Floating and planar joints are held at
+        0.
       base: the link whose axes are the robot's; None is the root of the tree.
-      packages: package -> folder, for package:// paths; one that is not named is searched from the URDF's folder
-        upwards.
+      packages: package -> folder, for package:// paths; one that is not named is searched from the URDF's
+        folder upwards.
       collision: whether collision shapes are shown even where there are visual ones; a link without visual
         shapes shows its collision shapes always.
-    Returns: Robot. Meshes keep their own colours, or take those of the URDF's material (as sRGB); the pictures of
-      URDF materials are left. A .dae counts in the unit that it says, with its axes as they are, as ROS's own
-      viewer has it.
+    Returns: Robot. Meshes keep their own colours, or take those of the URDF's material (as sRGB); the
+      pictures of URDF materials are left. A .dae counts in the unit that it says, with its axes as they are,
+      as ROS's own viewer has it.
     Raises: FileFormatError for a file that is missing or damaged, or for meshes that are (all of them in one
       sentence); DomainError for joints and frames that are not there and for angles outside their limits.
     """

@@ -1,10 +1,12 @@
-"""Where to mount the camera on a robot: gradient steps in the six numbers of its pose, beside random and coordinate search,
-CMA-ES and TPE at equal renders; with --look only the robot, what its camera sees, and what it is blind to.
+"""Where to mount the camera on a robot: gradient steps in the six numbers of its pose, beside random and
+coordinate search, CMA-ES and TPE at equal renders; with --look only the robot, what its camera sees, and what
+it is blind to.
 
-A robot drives through its worlds and reads its velocity off event flow (scenes/robots/pair.py, or a robot of your own:
---robot). The gradient is that of the error to be expected: from the covariance that the flow's estimator claims, flow
-beyond its reach, wrong depths, and what the robot covers of the picture. All searches begin at the same mounts, render as
-many samples, and are judged by single events of the hard sensor in worlds and drives that none of them saw.
+A robot drives through its worlds and reads its velocity off event flow (scenes/robots/pair.py, or a robot of
+your own: --robot). The gradient is that of the error to be expected: from the covariance that the flow's
+estimator claims, flow beyond its reach, wrong depths, and what the robot covers of the picture. All searches
+begin at the same mounts, render as many samples, and are judged by single events of the hard sensor in worlds
+and drives that none of them saw.
 """
 
 import sys

@@ -25,8 +25,8 @@ COLOURS = ("#d62728", "#7f7f7f", "#1f77b4", "#2ca02c", "#9467bd", "#8c564b")
 
 
 def ways(problem: Problem, trails: dict[str, list[Trail]], errors: dict[str, Tensor], samples: int) -> Figure:
-    """Errors on unseen samples, and the best that a search saw of its own, over drives rendered; and of all mounts looked
-    at height, pitch and error, below the ways of the descents.
+    """Errors on unseen samples, and the best that a search saw of its own, over drives rendered; and of all
+    mounts looked at height, pitch and error, below the ways of the descents.
 
     errors: of the starts and of each search, [starts]. samples: drives that each rendered.
     """

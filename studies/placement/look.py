@@ -1,5 +1,5 @@
-"""A robot with its camera before anything is searched: its size, what its camera sees, how much of that is the robot
-itself, whether the mount keeps what is required, and what motions it is blind to."""
+"""A robot with its camera before anything is searched: its size, what its camera sees, how much of that is
+the robot itself, whether the mount keeps what is required, and what motions it is blind to."""
 
 import math
 from typing import Any
@@ -91,7 +91,8 @@ def surroundings(pair: RobotPair, pose: Tensor) -> Surroundings:
 
 
 def what_it_tells(run: Run[Any], pair: RobotPair, camera: render.Camera, pose: Tensor, marked: str) -> bool:
-    """Show what a mount [4, 4] is blind to over flat ground, and all other directions there; False where it is too low."""
+    """Show what a mount [4, 4] is blind to over flat ground, and all other directions there; False where it
+    is too low."""
     around = surroundings(pair, pose)
     height = float(pose[2, 3] + around.T_world_body[2, 3])
     if height <= LEAST_HEIGHT_M:

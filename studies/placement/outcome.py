@@ -1,4 +1,5 @@
-"""What a race for a mount came to on unseen samples: errors, ratios with intervals, metrics and the raw table."""
+"""What a race for a mount came to on unseen samples: errors, ratios with intervals, metrics and the raw
+table."""
 
 import csv
 import io
@@ -19,7 +20,8 @@ INTERVAL = 0.9
 
 @dataclass(frozen=True)
 class Paired:
-    """Ratio of errors, ours over theirs, over paired starts: median and interval of resampled starts; how many below 1."""
+    """Ratio of errors, ours over theirs, over paired starts: median and interval of resampled starts; how
+    many below 1."""
 
     median: float
     low: float
@@ -41,7 +43,8 @@ def paired(ours: Tensor, theirs: Tensor) -> Paired:
 
 
 def over_worlds(ours: Tensor, theirs: Tensor, worlds: int) -> tuple[float, float, float]:
-    """Ratio of mean errors [N], world after world, ours over theirs; and its interval over resampled worlds."""
+    """Ratio of mean errors [N], world after world, ours over theirs; and its interval over resampled
+    worlds."""
     means = torch.stack([ours, theirs]).unflatten(1, (worlds, -1)).mean(2)
     resampled = means[:, _resampled(worlds)].mean(2)
     return float(means[0].mean() / means[1].mean()), *_interval(resampled[0] / resampled[1])
@@ -58,8 +61,8 @@ def _interval(values):
 
 
 def standard_error(errors: Tensor, worlds: int) -> float:
-    """Of the mean of errors [N], world after world: of the worlds' means, since drives in one world err alike; of one
-    world's drives where there is one."""
+    """Of the mean of errors [N], world after world: of the worlds' means, since drives in one world err
+    alike; of one world's drives where there is one."""
     means = errors.unflatten(0, (worlds, -1)).mean(1) if worlds > 1 else errors
     return float(means.std() / math.sqrt(len(means))) if len(means) > 1 else 0.0
 

@@ -1,5 +1,5 @@
-"""The page of a placement: the answer in one sentence, searches beside one another, the robot before and after, what its
-place is blind to, controls, and the mount handed over."""
+"""The page of a placement: the answer in one sentence, searches beside one another, the robot before and
+after, what its place is blind to, controls, and the mount handed over."""
 
 import math
 from typing import Any

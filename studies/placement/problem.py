@@ -1,5 +1,5 @@
-"""What a search for a mount looks at: a pair of robot and world, a pool of its training worlds and drives, and the
-requirements of the mount. A mount is six shares of the pair's ranges."""
+"""What a search for a mount looks at: a pair of robot and world, a pool of its training worlds and drives,
+and the requirements of the mount. A mount is six shares of the pair's ranges."""
 
 import math
 from collections.abc import Sequence
@@ -32,7 +32,8 @@ DRIVES = 48  # of every world that draws are made from
 
 @dataclass(frozen=True)
 class Samples:
-    """Drives in ``numbers`` of worlds, the same ``which`` of each, and the seed of film samples and sensor noise."""
+    """Drives in ``numbers`` of worlds, the same ``which`` of each, and the seed of film samples and sensor
+    noise."""
 
     numbers: tuple[int, ...]
     which: tuple[int, ...]
@@ -43,7 +44,8 @@ class Samples:
 class Seen:
     """What is seen of N drives from one mount.
 
-    read: by the depth that the estimator believes in. surfaces: the same with true depths. true_rows: [N, P, 2, 6].
+    read: by the depth that the estimator believes in. surfaces: the same with true depths. true_rows: [N, P,
+      2, 6].
     flow_px: [N, P, 2], true. covered: [N, windows] by the robot.
     """
 
@@ -56,9 +58,9 @@ class Seen:
 
 @dataclass
 class Problem:
-    """pair: robot and worlds. numbers: of the worlds that draws are made from. per_world: drives in each of ``spread``
-    worlds of a draw. errors: of flow beyond the estimator's covariance, for what is expected. camera: in place of the
-    pair's own."""
+    """pair: robot and worlds. numbers: of the worlds that draws are made from. per_world: drives in each of
+    ``spread`` worlds of a draw. errors: of flow beyond the estimator's covariance, for what is expected.
+    camera: in place of the pair's own."""
 
     pair: RobotPair
     numbers: Sequence[int]
@@ -163,12 +165,14 @@ class Problem:
     def expected_around(
         self, share: Tensor, samples: Samples, step: float, learn: bool = False
     ) -> tuple[Tensor, Tensor]:
-        """Mean bounded error to be expected of a mount [6], and its differences [6] over a step to both sides.
+        """Mean bounded error to be expected of a mount [6], and its differences [6] over a step to both
+        sides.
 
-        Pictures are taken of the mount itself alone. From the others there is the geometry, with its edges: surfaces, their true flow,
-        what the robot covers; how well flow is told there is carried over by the trend (``mount.PrecisionTrend.carried``).
-        At a wall of the cube the step ends there. learn: take these samples into the trend of the flow's precision.
-        What is expected is by errors of flow, not by single frames, whose texture would make its slope noise.
+        Pictures are taken of the mount itself alone. From the others there is the geometry, with its edges:
+        surfaces, their true flow, what the robot covers; how well flow is told there is carried over by the
+        trend (``mount.PrecisionTrend.carried``). At a wall of the cube the step ends there. learn: take these
+        samples into the trend of the flow's precision. What is expected is by errors of flow, not by single
+        frames, whose texture would make its slope noise.
         """
         batch = self.batch(samples)
         pose = self.ranges.pose(share)
@@ -184,7 +188,8 @@ class Problem:
         return value, torch.where(self.ranges.held, 0.0, rise / width)
 
     def _carried(self, field, here, samples, poses):
-        """Mean bounded errors [M] to be expected of mounts [M, 4, 4], what was told from one of them carried over."""
+        """Mean bounded errors [M] to be expected of mounts [M, 4, 4], what was told from one of them carried
+        over."""
         worlds, each = len(samples.numbers), len(samples.which)
         batch = self._scenes(replace(samples, which=samples.which * len(poses)))
         which = torch.arange(worlds * each).reshape(worlds, 1, each).expand(-1, len(poses), -1).flatten()
@@ -195,7 +200,8 @@ class Problem:
         return self._bounded(read, there, batch.twist).reshape(worlds, len(poses), each).mean((0, 2))
 
     def _seen(self, field, batch, T_body_cam):
-        """What flow in the windows of a batch is of, from a mount [4, 4], or from one for each drive of a world."""
+        """What flow in the windows of a batch is of, from a mount [4, 4], or from one for each drive of a
+        world."""
         T_world_cam = batch.T_world_body @ T_body_cam[..., None, :, :]
         estimator = self._system.estimate
         look = partial(estimator.read, field, self.camera, batch.scene, T_body_cam, T_world_cam, batch.t_s)
@@ -228,8 +234,9 @@ def _of(parts, which, count):
 def traced_camera(pair: RobotPair, name: str, focal_mm: float | None = None) -> render.Camera:
     """The pair's windows behind a traced lens.
 
-    Args: name: in the catalogue, or a lens file. focal_mm: to which the lens is scaled; None: that of the pair's design.
-    The lens is focused where the pair's is. Raises: as ``lens.load``; DomainError for a focal length that is not positive.
+    Args: name: in the catalogue, or a lens file. focal_mm: to which the lens is scaled; None: that of the
+    pair's design. The lens is focused where the pair's is. Raises: as ``lens.load``; DomainError for a focal
+    length that is not positive.
     """
     design = pair.design
     wanted = design.efl_mm if focal_mm is None else focal_mm

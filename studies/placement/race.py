@@ -1,5 +1,5 @@
-"""The searches for a mount from the same starts at equal renders, what each ends with, and its error in worlds that none
-saw; all of it kept in the run's state."""
+"""The searches for a mount from the same starts at equal renders, what each ends with, and its error in
+worlds that none saw; all of it kept in the run's state."""
 
 import hashlib
 import json
@@ -74,7 +74,8 @@ def kept(problem: Problem, share: Tensor) -> bool:
 
 
 def fingerprints(config: StudyConfig, pair: RobotPair) -> dict[str, Any]:
-    """What results depend on: options, the pair's settings, meshes and first drive (to a millionth), and the user's files."""
+    """What results depend on: options, the pair's settings, meshes and first drive (to a millionth), and the
+    user's files."""
     options = json.loads(to_json("", config))
     found = {f"--{name.replace('_', '-')}": options[name] for name in options if name not in ELSEWHERE}
     found |= {f"the robot's {name}": repr(getattr(pair, name)) for name in SETTINGS}
@@ -138,7 +139,8 @@ class Race:
     def search(self, number: int, name: str, start: Tensor) -> None:
         """A search without gradients at as many samples as the descent rendered, all on the same ones.
 
-        Of mounts that do not keep what is required nothing is rendered: they are told to be worse than any other.
+        Of mounts that do not keep what is required nothing is rendered: they are told to be worse than any
+        other.
         """
         problem, seed = self.problem, self.run.config.seed + number
         samples = problem.draw(1000 * seed)
@@ -176,8 +178,8 @@ class Race:
         self.save()
 
     def answer(self, number: int, name: str) -> Tensor:
-        """The mount [6] that a search ends with: the descent's mean of its end, or the last before it that keeps what is
-        required; of the others the best that does."""
+        """The mount [6] that a search ends with: the descent's mean of its end, or the last before it that
+        keeps what is required; of the others the best that does."""
         trail = self.trail(number, name)
         order = trail.error.argsort().tolist()
         if name == GRADIENT:
@@ -208,7 +210,8 @@ class Race:
         return found
 
     def chosen(self, count: int) -> int | None:
-        """Number of the descent whose answer errs least on training samples, None where the pair's own mount errs less than
+        """Number of the descent whose answer errs least on training samples, None where the pair's own mount
+        errs less than
         all of them: what is judged on unseen samples has not been chosen by them."""
         if "chosen" not in self.tensors:
             problem = self.problem

@@ -1,9 +1,10 @@
-"""Searches over the cube of shares from 0 to 1 in which ``mount.MountRanges`` puts mounts: descent along gradients that
-are noisy but right in the mean, and searches without gradients.
+"""Searches over the cube of shares from 0 to 1 in which ``mount.MountRanges`` puts mounts: descent along
+gradients that are noisy but right in the mean, and searches without gradients.
 
-A search without gradients is a generator that gives a point and is sent its error, so that budget, bounds and records are
-the same for all: ``count`` points, one call of the judge each, the start first. What can be refused without a look costs
-none. The same seed and judge give the same points.
+A search without gradients is a generator that gives a point and is sent its error, so that budget, bounds and
+records are
+the same for all: ``count`` points, one call of the judge each, the start first. What can be refused without a
+look costs none. The same seed and judge give the same points.
 """
 
 import math
@@ -59,9 +60,10 @@ def descend(
 ) -> Trail:
     """Normalised momentum descent in the cube, its steps ever shorter.
 
-    Args: slope: (share [V], number of the step) -> value and gradient [V], of other samples in every step. start: [V].
-    Returns: Trail of the points whose slopes were asked for, and last the mean of the end of the way, which is the answer
-      and has the error of the last step. Raises: NonFiniteError.
+    Args: slope: (share [V], number of the step) -> value and gradient [V], of other samples in every step.
+      start: [V].
+    Returns: Trail of the points whose slopes were asked for, and last the mean of the end of the way, which
+      is the answer and has the error of the last step. Raises: NonFiniteError.
     """
     here = start.detach().clone()
     pace = torch.zeros_like(here)
@@ -89,7 +91,8 @@ def descend(
 class Search:
     """A search by its proposals.
 
-    propose: (start [V], seed) -> generator of points [V] without end, the start first, sent the error of each.
+    propose: (start [V], seed) -> generator of points [V] without end, the start first, sent the error of
+      each.
     library: module that it needs, None for none.
     """
 
@@ -150,8 +153,8 @@ def uniform(start: Tensor, seed: int) -> Proposals:
 
 
 def evolved(start: Tensor, seed: int) -> Proposals:
-    """CMA-ES about the start (which it only looks at first, so that all searches do); when it has ended, again from a
-    random point with twice the population.
+    """CMA-ES about the start (which it only looks at first, so that all searches do); when it has ended,
+    again from a random point with twice the population.
 
     Source: pycma, Hansen, Akimoto and Baudis, 2019; restarts of Auger and Hansen, CEC 2005.
     """
@@ -195,12 +198,12 @@ def estimated(start: Tensor, seed: int) -> Proposals:
 
 
 def along_axes(start: Tensor, seed: int) -> Proposals:
-    """One number after the other, in an order drawn anew for each round, and once along what the round has moved; from a
-    random point again when steps have become too short to matter.
+    """One number after the other, in an order drawn anew for each round, and once along what the round has
+    moved; from a random point again when steps have become too short to matter.
 
-    Source: line searches of Davies, Swann and Campey, as in Box, Davies and Swann, Non-linear Optimization Techniques,
-      1969: steps are doubled while they help, then the vertex of a parabola is tried. The move after a round is that of
-      Hooke and Jeeves, J. ACM 8, 1961.
+    Source: line searches of Davies, Swann and Campey, as in Box, Davies and Swann, Non-linear Optimization
+      Techniques, 1969: steps are doubled while they help, then the vertex of a parabola is tried. The move
+      after a round is that of Hooke and Jeeves, J. ACM 8, 1961.
     """
     random = torch.Generator().manual_seed(seed)
     at = start
@@ -253,8 +256,8 @@ def _line(at, error, along, step):
 
 
 def _vertex(known, best):
-    """Where a parabola through the best of the known places and its two neighbours is lowest; the best itself where it
-    has one neighbour, or no parabola is lower by a step that matters."""
+    """Where a parabola through the best of the known places and its two neighbours is lowest; the best itself
+    where it has one neighbour, or no parabola is lower by a step that matters."""
     places = sorted(known)
     k = places.index(best)
     if not 0 < k < len(places) - 1:
@@ -279,7 +282,8 @@ SEARCHES: dict[str, Search] = {
 def available(names: Iterable[str]) -> dict[str, Search]:
     """The searches of these names.
 
-    Raises: DomainError for a name that is not there; MissingPackageError where the library of one is not installed.
+    Raises: DomainError for a name that is not there; MissingPackageError where the library of one is not
+      installed.
     """
     found = {}
     for name in names:

@@ -1,4 +1,5 @@
-"""Distances to meshes against closed forms and brute force, inside and outside against shapes that are known."""
+"""Distances to meshes against closed forms and brute force, inside and outside against shapes that are
+known."""
 
 import math
 
@@ -65,7 +66,8 @@ def test_distance_to_a_box_is_the_closed_form(generator):
 
 
 def test_a_ball_of_triangles_lies_between_its_two_spheres(generator):
-    """Of the polyhedron, corners lie on the sphere of its radius and the rest inside by at most the sagitta."""
+    """Of the polyhedron, corners lie on the sphere of its radius and the rest inside by at most the
+    sagitta."""
     vertices, faces = ball_mesh(0.3, 4)
     corner = torch.from_numpy(vertices)[torch.from_numpy(faces)]
     middle = torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -108,7 +110,8 @@ def test_winding_numbers_count_shells(generator):
 
 
 def test_overlapping_solids_have_no_walls_inside():
-    """Deep inside one of two boxes that overlap, a face of the other is near; the depth is that to the outside."""
+    """Deep inside one of two boxes that overlap, a face of the other is near; the depth is that to the
+    outside."""
     both = Body([box_mesh((0, 0, 0), (2, 1, 1)), box_mesh((0.99, 0.3, 0.3), (3, 0.7, 0.7))])
     found = both.distance_m(torch.tensor([[1.0, 0.5, 0.5], [2.5, 0.5, 0.5]], dtype=D))
     torch.testing.assert_close(found, torch.tensor([-0.5, -0.2], dtype=D), rtol=0, atol=1e-14)
@@ -153,8 +156,8 @@ def test_gradient_of_the_distance(generator):
 
 
 def test_a_capsule_is_its_spheres(generator):
-    """The clearance of a capsule is the smallest of those of the balls along its axis: never more than that of any
-    sampled ball, and less by no more than half their spacing."""
+    """The clearance of a capsule is the smallest of those of the balls along its axis: never more than that
+    of any sampled ball, and less by no more than half their spacing."""
     body = Body([box_mesh(*BOX), ball_mesh(0.2, 2)])
     poses = some_poses(generator, 60, 1.2)
     housing = Housing(0.03, behind_m=0.12)

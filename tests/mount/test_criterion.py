@@ -1,4 +1,5 @@
-"""Information with the covariance of an estimator, and what is made of it, against least squares written out by hand."""
+"""Information with the covariance of an estimator, and what is made of it, against least squares written out
+by hand."""
 
 import math
 
@@ -37,8 +38,8 @@ def down():
 
 
 def rows_by_hand():
-    """[48, 3]: flow of six by four pixels over ground straight below, to forward, left and yaw, as textbooks have it;
-    x components and y components of one pixel after another."""
+    """[48, 3]: flow of six by four pixels over ground straight below, to forward, left and yaw, as textbooks
+    have it; x components and y components of one pixel after another."""
     rows = []
     for row in range(4):
         for column in range(6):

@@ -1,5 +1,5 @@
-"""Velocity from flow fields: exact flow of random bodies through windows of a real lens, least squares written out,
-the covariance against many noisy draws, outliers."""
+"""Velocity from flow fields: exact flow of random bodies through windows of a real lens, least squares
+written out, the covariance against many noisy draws, outliers."""
 
 from dataclasses import replace
 
@@ -48,8 +48,9 @@ def test_exact_flow_of_free_bodies_through_a_lens(camera, drive, depth):
     mount, poses, twists, flow = drive
     ours = EgoVelocity(FREE, (1e3,) * 6, depth)
     found = ours(field_of(flow), camera, worlds.smooth_plane(), mount, poses)
-    # the mid-point rule leaves (w t)^2 / 24 of the flow, and points are read where half their flow leads, whose
-    # curvature is of that size: 1e-5 of the flow, in a system that tells turning from shifting ten times less well
+    # the mid-point rule leaves (w t)^2 / 24 of the flow, and points are read where half their flow leads,
+    # whose curvature is of that size: 1e-5 of the flow, in a system that tells turning from shifting ten
+    # times less well
     torch.testing.assert_close(found.velocity, twists, rtol=0, atol=2e-4)
 
 
@@ -129,8 +130,8 @@ def test_unseen_flow_says_nothing(camera, drive):
 
 
 def test_what_is_not_valid_means_nothing_and_nan_that_is_valid_is_refused(camera, drive):
-    """NaN under a pixel that is not valid gives the same velocity as any number there; where the field claims to know,
-    it is refused."""
+    """NaN under a pixel that is not valid gives the same velocity as any number there; where the field claims
+    to know, it is refused."""
     mount, poses, _, flow = drive
     field = field_of(flow)
     field.valid[:, 3:9] = False

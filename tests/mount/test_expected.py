@@ -1,4 +1,5 @@
-"""The error to be expected, against drawn flow errors; the trend of precision, against laws that it has to find."""
+"""The error to be expected, against drawn flow errors; the trend of precision, against laws that it has to
+find."""
 
 from dataclasses import replace
 
@@ -98,8 +99,8 @@ def test_gradient_is_that_of_differences():
 
 
 def test_lost_flow_has_half_its_length_squared():
-    """Far beyond the reach nothing of a flow is left: its error is the flow itself, half of the square in either
-    component."""
+    """Far beyond the reach nothing of a flow is left: its error is the flow itself, half of the square in
+    either component."""
     read = readings(points=3)
     flow = torch.tensor([[[3.0, 4.0], [0.1, 0.0], [100.0, 0.0]]], dtype=F)
     found = FlowErrors(claimed=0.0, share=0.0, reach_px=20.0, width_px=0.5).covariance(read, flow)
@@ -108,7 +109,8 @@ def test_lost_flow_has_half_its_length_squared():
 
 
 def lawful(seed=0, noise=0.5):
-    """Readings whose precision goes with flow to the power 0.8 and depth to the power -1, times what the texture says."""
+    """Readings whose precision goes with flow to the power 0.8 and depth to the power -1, times what the
+    texture says."""
     random = torch.Generator().manual_seed(seed)
     length = (6 * torch.rand(20, 200, generator=random, dtype=F) - 1.5).exp()
     depth = (2 * torch.rand(20, 200, generator=random, dtype=F) - 1.5).exp()
@@ -140,8 +142,8 @@ def test_the_trend_is_found_through_the_texture():
 
 
 def test_precision_is_carried_to_another_place():
-    """From where all is twice as near and twice as fast the same textures are told as the law says; a window that showed
-    nothing from here takes the texture of its neighbour, not that of all."""
+    """From where all is twice as near and twice as fast the same textures are told as the law says; a window
+    that showed nothing from here takes the texture of its neighbour, not that of all."""
     whole, flow = lawful()
     trend = PrecisionTrend().add(whole, flow)
     rich = (torch.arange(20) % 2 == 0).to(F)[:, None]  # bodies whose world has more texture than the law's

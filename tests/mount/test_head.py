@@ -1,5 +1,5 @@
-"""The learnt head: fresh it is least squares, its input against closed forms, gradients against differences, symmetry
-by a world in a mirror, and a task whose best answer is known."""
+"""The learnt head: fresh it is least squares, its input against closed forms, gradients against differences,
+symmetry by a world in a mirror, and a task whose best answer is known."""
 
 import math
 from dataclasses import replace
@@ -200,7 +200,8 @@ def _against_differences(function, at, step):
 
 
 def made(count, seed, short=0.6):
-    """Evidence of bodies one of whose windows, told by a number, reads ``short`` of its flow; and their velocities."""
+    """Evidence of bodies one of whose windows, told by a number, reads ``short`` of its flow; and their
+    velocities."""
     generator = torch.Generator().manual_seed(seed)
     windows = 4
     deviation_px = 0.1
@@ -309,5 +310,6 @@ def test_the_delivered_head_is_ahead_of_least_squares_in_an_unseen_world():
         plain = pair.errors(run["estimate"], batch).bounded().mean()
         learnt = system.replaced(estimate=head).begin(batch)["estimate"]
     assert sum(weight.numel() for weight in head.parameters()) <= 50_000
-    # the study found 0.80 of the typical error over four designs; 12 samples of one world scatter by a third of that
+    # the study found 0.80 of the typical error over four designs; 12 samples of one world scatter by a third
+    # of that
     assert float(pair.errors(learnt, batch).bounded().mean()) < float(plain)

@@ -52,8 +52,8 @@ def test_angles_are_read_back(generator):
 
 @pytest.mark.parametrize("up", [1.0, -1.0])
 def test_angles_of_a_view_straight_up_or_down_have_a_gradient(up):
-    """There only yaw and roll together mean something: turned about the vertical by h, yaw grows by h, and the other
-    two angles stay what they are."""
+    """There only yaw and roll together mean something: turned about the vertical by h, yaw grows by h, and
+    the other two angles stay what they are."""
     upright = torch.eye(4, dtype=D)  # a camera's z axis is the body's: straight up
     upright[1:3, 1:3] *= up
     angle = torch.zeros((), dtype=D, requires_grad=True)

@@ -19,7 +19,8 @@ def changed(bounds, k, value):
 
 
 def test_directions_of_known_angles(generator):
-    """Columns of the rotation: the view by its azimuth and elevation, the image's right level before it rolls."""
+    """Columns of the rotation: the view by its azimuth and elevation, the image's right level before it
+    rolls."""
     share = torch.rand(3, 7, 6, generator=generator, dtype=D)
     poses = MountRanges(LOW, HIGH).pose(share)
     check_poses(poses)

@@ -121,7 +121,8 @@ WRONG = [
     (lambda: OwnBody(ROVER, 2.0), "largest_share is 2"),
     (lambda: OwnBody(ROVER, 0.2, step=0.0), "step is 0"),
     (lambda: judge([], DOWN[None], NOTHING), r"one mount \[4, 4\]"),
-    # what makes a search hopeless: inside the chassis; beside a wheel, hypot(1.62, 0.07, 0.1); millimetres; on the mast
+    # what makes a search hopeless: inside the chassis; beside a wheel, hypot(1.62, 0.07, 0.1); millimetres;
+    # on the mast
     (
         lambda: check_mount(Mount((0.0, 0.0, 0.17), (0.05, 0.05, 0.02)), [NEAR], CAMERA),
         "no room for the camera",

@@ -123,7 +123,8 @@ def test_gradient_of_every_slack_to_the_mount(cube, camera, generator):
     mount = Mount((0.0, 0.0, HEIGHT), (0.2, 0.2, 0.1), pitch_rad=0.3, roll_rad=0.1)
     numbers = (0.3 * torch.randn(6, generator=generator, dtype=D)).requires_grad_()
     for each in requirements(cube):
-        # a difference of 1e-7 seldom swaps two ranks, and a swap of equal angles changes nothing to first order
+        # a difference of 1e-7 seldom swaps two ranks, and a swap of equal angles changes nothing to first
+        # order
         assert torch.autograd.gradcheck(
             lambda x, r=each: r.slack(mount(x), camera), (numbers,), eps=1e-7, atol=1e-6
         ), each.name

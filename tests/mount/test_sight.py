@@ -27,8 +27,9 @@ def over_ground():
 
 
 def test_a_downward_camera_sees_what_textbooks_say(camera, over_ground):
-    """Over its body's origin on the ground, alone: forward and left by f / h each, up by (x, y) / h, yaw by the radius,
-    and turns about the ground below it by no more than (x y, y^2) / f: shift and turn cancel in the middle."""
+    """Over its body's origin on the ground, alone: forward and left by f / h each, up by (x, y) / h, yaw by
+    the radius, and turns about the ground below it by no more than (x y, y^2) / f: shift and turn cancel in
+    the middle."""
     pixels = camera.film.pixels() - camera.film.middle_px
     x, y = pixels.unbind(1)
     sums = {
@@ -58,7 +59,8 @@ def test_the_table_says_what_each_is_blind_to(camera, over_ground):
             for name, value in zip(("forward", "left", "up", "roll", "pitch", "yaw"), columns, strict=True)
             if value > 0.1
         ]
-    # forward and sideways are one camera turned by a right angle: forward and left, roll and pitch change places
+    # forward and sideways are one camera turned by a right angle: forward and left, roll and pitch change
+    # places
     ahead, beside = (table[name]["sight"].deviation for name in ("forward", "sideways"))
     torch.testing.assert_close(ahead[[1, 0, 2, 4, 3, 5]], beside, rtol=1e-6, atol=0)
     assert set(table["downward"]["weakest"].split()[1::2]) <= {"forward", "left", "roll", "pitch"}

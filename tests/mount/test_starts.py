@@ -31,7 +31,8 @@ def test_numbers_give_their_poses_back(generator):
     mount = rover_mount()
     numbers = torch.randn(40, 6, generator=generator, dtype=D)
     mount.unit[:] = torch.rand(6, generator=generator, dtype=D) + 0.5
-    # the pose of numbers up to 3 lies within tanh 4.5 of the wall: its inverse loses cosh^2 4.5 = 2000 times eps
+    # the pose of numbers up to 3 lies within tanh 4.5 of the wall: its inverse loses cosh^2 4.5 = 2000 times
+    # eps
     torch.testing.assert_close(mount.numbers_at(mount(numbers)), numbers, rtol=0, atol=1e-11)
 
 

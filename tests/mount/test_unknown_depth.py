@@ -1,5 +1,5 @@
-"""Velocity without a map: the likelihood against integrals by adaptive quadrature, its maximum against descents from the
-truth, errors and claims over bodies, depths and mounts drawn at random."""
+"""Velocity without a map: the likelihood against integrals by adaptive quadrature, its maximum against
+descents from the truth, errors and claims over bodies, depths and mounts drawn at random."""
 
 import math
 

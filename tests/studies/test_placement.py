@@ -1,5 +1,5 @@
-"""The placement study: its descent on a noisy valley, draws of samples, gradients against differences, controls that see
-nothing, its bad input, and the whole of it, resumed."""
+"""The placement study: its descent on a noisy valley, draws of samples, gradients against differences,
+controls that see nothing, its bad input, and the whole of it, resumed."""
 
 import contextlib
 import csv
@@ -92,7 +92,8 @@ def test_draws_see_all_worlds_and_are_the_same_for_every_mount(problem):
 
 
 def test_differences_of_geometry_are_those_of_rendered_mounts():
-    """In the corridor, with the forks in view: height, and pitch, whose slope at the mount itself points the other way."""
+    """In the corridor, with the forks in view: height, and pitch, whose slope at the mount itself points the
+    other way."""
     problem = Problem(PAIRS["corridor"](), robot_pair.training(6), spread=6, per_world=4)
     samples = problem.draw(0)
     rendered = torch.zeros(6, dtype=F)
@@ -150,8 +151,9 @@ def test_wrong_input_is_one_sentence_before_the_first_frame(given, said, tmp_pat
 
 
 def test_ratios_are_of_paired_starts_and_worlds():
-    """Medians with an even number of starts are the mean of two; drives in a world err alike: means of four worlds 0, 1, 2,
-    3 deviate by sqrt(5 / 3), over the root of four; a ratio over worlds is one of means, 4 / 6 of 1 / 2 and 3 / 4."""
+    """Medians with an even number of starts are the mean of two; drives in a world err alike: means of four
+    worlds 0, 1, 2, 3 deviate by sqrt(5 / 3), over the root of four; a ratio over worlds is one of means, 4 /
+    6 of 1 / 2 and 3 / 4."""
     found = outcome.paired(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([2.0, 2.5, 2.0]))
     assert (found.median, found.ahead, found.count) == (pytest.approx(0.8), 2, 3)
     assert (found.low, found.high) == pytest.approx((0.5, 1.5))
@@ -186,7 +188,8 @@ def test_a_run_that_goes_on_is_the_one_that_was_begun(tmp_path):
 
 
 def test_searches_look_only_at_what_is_allowed_and_free(problem):
-    """Outdoors most of the cube looks down too far to see ahead; held numbers stay; rivals see always the same drives."""
+    """Outdoors most of the cube looks down too far to see ahead; held numbers stay; rivals see always the
+    same drives."""
     pair = problem.pair
     held = {name: getattr(pair.design, name) for name in ("x_m", "y_m", "yaw_rad", "roll_rad")}
     narrow = replace(pair, low=replace(pair.low, **held), high=replace(pair.high, **held))

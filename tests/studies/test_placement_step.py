@@ -1,4 +1,5 @@
-"""The cost of a step is that of a whole one: every stage is counted, and all that is to be designed gets a gradient."""
+"""The cost of a step is that of a whole one: every stage is counted, and all that is to be designed gets a
+gradient."""
 
 import torch
 
