@@ -18,7 +18,7 @@ from scenes.robots import pair as robot_pair
 from scenes.robots.pairs import PAIRS
 from studies.frame.run import main
 from studies.placement import __main__ as placement
-from studies.placement import outcome
+from studies.placement import outcome, race
 from studies.placement.controls import controls, looking_back
 from studies.placement.page import answer
 from studies.placement.problem import Problem, traced_camera
@@ -109,12 +109,17 @@ def test_differences_of_geometry_are_those_of_rendered_mounts():
     assert 0 < float(value) < 1
     assert rendered[2] < -0.2 < 0.1 < rendered[4]
     assert float((slope - rendered)[[2, 4]].norm()) < 0.4 * float(rendered.norm())
-    wall = problem.start.clone()
-    wall[2] = 1.0
-    below = problem.expected_around(wall - moved[2], samples, 0.12)[0]
-    value, slope = problem.expected_around(wall, samples, 0.12)
-    # at a wall by one side alone
-    assert float(slope[2]) == pytest.approx(float(value - below) / 0.12, rel=0.5)
+
+
+def test_differences_end_at_a_wall(problem):
+    """Of h^2 over a step of 0.12 to both sides, or to one: (0.62^2 - 0.38^2) / 0.24 and (1 - 0.88^2) / 0.12."""
+    watched = replace(problem)
+    watched._carried = lambda field, here, samples, poses: problem.ranges.share_at(poses)[:, 2] ** 2
+    for height, expected in ((0.5, 1.0), (1.0, 1.88)):
+        share = torch.full((6,), 0.5, dtype=F)
+        share[2] = height
+        _, slope = watched.expected_around(share, problem.draw(0), 0.12)
+        torch.testing.assert_close(slope, expected * torch.eye(6, dtype=F)[2], rtol=0, atol=1e-9)
 
 
 def test_controls_see_nothing(problem):
@@ -213,11 +218,12 @@ def test_searches_look_only_at_what_is_allowed_and_free(problem):
         assert torch.equal(found[:, watched.ranges.held], watched.start[watched.ranges.held].expand(8, 4))
 
 
-def test_starts_are_those_given_and_others_at_random(problem):
+def test_starts_are_those_given_and_others_at_random(problem, monkeypatch):
     """An own robot's own mount, and the first that are drawn."""
     given, *others = feasible(problem, 3, 5, [problem.start])
     assert torch.equal(given, problem.start)
     assert torch.equal(torch.stack(others), torch.stack(feasible(problem, 2, 5)))
+    monkeypatch.setattr(race, "TRIES", 50)
     pair = problem.pair
     for low, high, ahead, said in (
         (pair.low, pair.high, (3.0, 0.9), "keep what is required"),
