@@ -245,6 +245,9 @@ def replay(folder, prefix="", say=print):
             again = inspect.BoundArguments(given.signature, {**dict(given.arguments), argument: wrong})
             now = outcome(call, again.args, again.kwargs)
             counts["refusals"] += 1
+            if isinstance(before, dict) and "sentence" in before:
+                # it begins with the name of what was called
+                before = {**before, "sentence": renamed(before["sentence"])}
             if not same(before, now):
                 say(f"{path.stem}, {argument} {label}: {str(before)[:150]} -> {str(now)[:150]}")
                 counts["other refusals"] += 1
