@@ -50,8 +50,8 @@ class EventColumns:
             yield self[k : k + size].stream()
 
     def stream(self) -> EventStream:
-        """EventStream of all, sorted by (t, y, x, p): by one packed key where time and pixel fit 63 bits together,
-        several times faster than by indices."""
+        """EventStream of all, sorted by (t, y, x, p): by one packed key where time and pixel fit 63 bits
+        together, several times faster than by indices."""
         cells = 2 * self.height_px * self.width_px
         first_us, last_us = (int(self.t_us[0]), int(self.t_us[-1])) if len(self) else (0, 0)
         cell = (self.y.astype(np.int64) * self.width_px + self.x) * 2 + self.on

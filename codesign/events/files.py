@@ -1,5 +1,6 @@
-"""Event streams to and from files: a file -> packets of t, x, y, p, by the reader of its ending and content -> checked
-and put in order (Arrival) -> EventColumns -> an EventStream (``read``), or windows (codesign.flow.sources)."""
+"""Event streams to and from files: a file -> packets of t, x, y, p, by the reader of its ending and content
+-> checked and put in order (Arrival) -> EventColumns -> an EventStream (``read``), or windows
+(codesign.flow.sources)."""
 
 from pathlib import Path
 
@@ -60,14 +61,14 @@ def read(
     """Read an event stream.
 
     Args:
-      path: file ending in .h5 or .hdf5 (DSEC's, v2e's or MVSEC's layout), .aedat4, .raw (EVT 2.0, EVT 3.0), .dat, .csv
-        or .txt (lines t x y p, with or without a header), .npz or .npy.
+      path: file ending in .h5 or .hdf5 (DSEC's, v2e's or MVSEC's layout), .aedat4, .raw (EVT 2.0, EVT 3.0),
+        .dat, .csv or .txt (lines t x y p, with or without a header), .npz or .npy.
       height_px, width_px: sensor size. Taken where the file has none (else the smallest that holds the
         events); checked against the file otherwise.
-      columns: order of the columns of rows, such as "xytp"; "auto": what the file says, or its numbers tell beyond
-        doubt (t x y p or x y t p).
-      time_unit: "s", "ms", "us" or "ns"; "auto": what the file says, else seconds where a time has a fraction, else
-        microseconds.
+      columns: order of the columns of rows, such as "xytp"; "auto": what the file says, or its numbers tell
+        beyond doubt (t x y p or x y t p).
+      time_unit: "s", "ms", "us" or "ns"; "auto": what the file says, else seconds where a time has a
+        fraction, else microseconds.
     Returns: EventStream sorted by (t, y, x, p), times as the file gives them, in microseconds.
     Raises: FileFormatError when the file is missing, malformed (with the line or event where there is one) or
       of another kind.
@@ -93,14 +94,16 @@ def read_columns(path: Path, asked: Asked) -> EventColumns:
     check_asked(path, asked)
     if path.suffix.lower() not in TABLES and (asked.columns, asked.time_unit) != ("auto", "auto"):
         raise FileFormatError(
-            f"{path} has one order of columns and one clock by its format; leave columns and time_unit away (they are "
+            f"{path} has one order of columns and one clock by its format; leave columns and time_unit "
+            "away (they are "
             f"for {', '.join(TABLES)})."
         )
     with reading(check_regular(path)):
         columns = reader(path, asked)
     if not max(columns.height_px, columns.width_px) <= LIMIT_PX:
         raise FileFormatError(
-            f"{path} gives a sensor of {columns.width_px} x {columns.height_px} pixels; at most {LIMIT_PX} a side are "
+            f"{path} gives a sensor of {columns.width_px} x {columns.height_px} pixels; at most {LIMIT_PX} "
+            "a side are "
             "read."
         )
     return columns

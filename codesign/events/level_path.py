@@ -1,7 +1,9 @@
-"""The log level between frames: a cubic through the levels of the frames, sampled as finely as a use asks for.
+"""The log level between frames: a cubic through the levels of the frames, sampled as finely as a use asks
+for.
 
 Frames of a moving scene are samples of smooth curves. A straight line between them, h apart, is wrong by h^2
-|L''|/8: it cuts off every crest, and with it events. The cubic through central slopes is wrong by h^3 |L'''|/62.
+|L''|/8: it cuts off every crest, and with it events. The cubic through central slopes is wrong by h^3
+|L'''|/62.
 """
 
 import torch
@@ -18,9 +20,9 @@ def finer(frames: Tensor, t_s: Times, longest_s: float, *, log_input: bool = Fal
     """Frames between frames, so that no interval is longer than asked for.
 
     Args:
-      frames: [T, ...] linear intensity on the 0-255 scale, or log levels with ``log_input``. t_s: [T] seconds,
-        strictly increasing. longest_s: > 0; an interval longer than that by more than a thousandth is cut
-        into equal parts.
+      frames: [T, ...] linear intensity on the 0-255 scale, or log levels with ``log_input``. t_s: [T]
+        seconds, strictly increasing. longest_s: > 0; an interval longer than that by more than a thousandth
+        is cut into equal parts.
     Returns: frames [T', ...] of the same kind and times [T'] float64, the given ones among them exactly; the
       given frames themselves where no interval is too long.
       Between two frames the log level is the cubic with the slopes of parabolas through three frames each: a
@@ -54,10 +56,10 @@ def finer(frames: Tensor, t_s: Times, longest_s: float, *, log_input: bool = Fal
 def parts(times_s: Tensor, longest_s: float, values: int = 1) -> tuple[Tensor, Tensor, Tensor]:
     """Intervals cut into equal parts no longer than asked for.
 
-    Args: times_s: [T] float64, strictly increasing, as from ``check_times``. longest_s: > 0. values: that will
-      be made of each part.
-    Returns: of each of the K parts the interval it lies in [K] and the share of it [K] at which it ends; times
-      [K + 1] float64 of all ends, the given ones among them exactly.
+    Args: times_s: [T] float64, strictly increasing, as from ``check_times``. longest_s: > 0. values: that
+      will be made of each part.
+    Returns: of each of the K parts the interval it lies in [K] and the share of it [K] at which it ends;
+      times [K + 1] float64 of all ends, the given ones among them exactly.
     Raises: DomainError for a length that is not positive, or so short that the parts would fill the memory.
     """
     longest = as_number(longest_s, "longest_s")

@@ -19,8 +19,8 @@ SERIES = 0.05  # below it (1 - e^-a)/a comes from a series: its first term left 
 def coefficients(
     pace: Any, exp: Callable[[Any], Any], select: Callable[[Any, Any, Any], Any]
 ) -> tuple[Any, Any]:
-    """What an interval of a = ``pace`` time constants does: e^-a, and the mean of e^-s over 0 < s < a, that is
-    (1 - e^-a)/a, for small a without loss, value and derivative.
+    """What an interval of a = ``pace`` time constants does: e^-a, and the mean of e^-s over 0 < s < a, that
+    is (1 - e^-a)/a, for small a without loss, value and derivative.
 
     Tensors and drjit arrays alike: ``exp`` and ``select`` are those of their library.
     """
@@ -90,7 +90,8 @@ def low_pass(
       start: [...] filtered level at the first frame; None: the level itself.
     Returns: [T, ...] filtered levels, the start included.
     Gradient: level, intensity, cutoff_hz, start; exact.
-    Raises: ShapeError, DomainError as ``one_pole``; DomainError for a bandwidth that is not one number above 0.
+    Raises: ShapeError, DomainError as ``one_pole``; DomainError for a bandwidth that is not one number above
+      0.
     """
     check_layout(level, name="levels")
     number = cutoff_hz.detach() if isinstance(cutoff_hz, Tensor) else cutoff_hz

@@ -68,7 +68,8 @@ def _check_columns(t_us, x, y, p, height_px, width_px, part=slice(None)):
     """Refuse lists of unequal length and, in ``part``, events outside the sensor or of another polarity."""
     if not (t_us.shape == x.shape == y.shape == p.shape == (t_us.numel(),)):
         raise ShapeError(
-            f"t_us, x, y, p have shapes {[list(v.shape) for v in (t_us, x, y, p)]}; four lists of equal length are needed."
+            f"t_us, x, y, p have shapes {[list(v.shape) for v in (t_us, x, y, p)]}; four lists of equal "
+            "length are needed."
         )
     for values, name, size in ((x[part], "x", width_px), (y[part], "y", height_px)):
         low, high = (int(bound) for bound in values.aminmax()) if len(values) else (0, -1)

@@ -1,4 +1,5 @@
-"""Fit an event sensor to a recording of a real camera, and say how true its events are where it was not fitted.
+"""Fit an event sensor to a recording of a real camera, and say how true its events are where it was not
+fitted.
 
 Events are simulated from the recording's own frames, at mid-exposure times. Thresholds, dark offset, blur,
 low-pass and noise are fitted by gradient to the events of the first half and judged on those of the second,
@@ -122,7 +123,8 @@ def show(run, recording, sensor, simulated, figures):
     run.figure(
         maps(recorded, simulated, half),
         "maps",
-        "ON − OFF per pixel; red: more ON. The second half: its busiest, a middling and its quietest interval.",
+        "ON − OFF per pixel; red: more ON. The second half: its busiest, a middling and its quietest "
+        "interval.",
     )
     best = figures["fitted"]
     lead = (

@@ -148,8 +148,8 @@ class Light:
 
 
 def pieces(max_displacement_px, before, before_s, seen, t_s):
-    """What the sensor sees of a chunk: frames [n, H, W] and their times, piece by piece, with frames between in
-    the memory of one interval. The pieces of all chunks together do not depend on where the chunks begin.
+    """What the sensor sees of a chunk: frames [n, H, W] and their times, piece by piece, with frames between
+    in the memory of one interval. The pieces of all chunks together do not depend on where the chunks begin.
 
     Args:
       max_displacement_px: see ``events.upsample``; None: the frames as they are, in one piece.

@@ -1,5 +1,5 @@
-"""What a run of video_to_events shows: warnings, figures of the events on disk drawn piece by piece, two videos,
-metrics, and the page."""
+"""What a run of video_to_events shows: warnings, figures of the events on disk drawn piece by piece, two
+videos, metrics, and the page."""
 
 import dataclasses
 import math
@@ -62,7 +62,8 @@ class View:
         return self.config.decay_tau_s or max(TAU_PICTURES * self.exposure_s, frames_s)
 
     def slices(self, count):
-        """Equal parts of the time: first and last event of each, and its start and end in whole microseconds."""
+        """Equal parts of the time: first and last event of each, and its start and end in whole
+        microseconds."""
         start_us = round(float(self.t_s[0]) * 1e6)
         length_us = round(self.duration_s * 1e6)
         edges = sorted({start_us + length_us * k // count for k in range(count + 1)})
@@ -130,7 +131,10 @@ def show(view, state, sensor, clock, written):
     run.table(f"Sensor: {view.config.preset}", ("parameter", "value"), values)
     if written:
         run.table("Event files", ("file", "MB"), [(path.name, path.stat().st_size / 1e6) for path in written])
-    lead = f"{state.events:,} events from {frames} frames of `{view.source.path.name}`, {seconds(view.duration_s)}."
+    lead = (
+        f"{state.events:,} events from {frames} frames of `{view.source.path.name}`, "
+        f"{seconds(view.duration_s)}."
+    )
     warned = " **The video is too slow for its motion, see below.**" if slow else ""
     run.finish("Video to events", lead + warned)
 
@@ -138,11 +142,16 @@ def show(view, state, sensor, clock, written):
 def warnings(view, state, sensor, slow):
     """What the reader must know before the events are used, in sentences."""
     share = (
-        f"Of the pixels that make events, {state.large_share:.1%} step by {LARGE} thresholds or more from one frame "
-        "to the next. What happens inside such a step is not in the video: its events lie on a straight line of log "
+        f"Of the pixels that make events, {state.large_share:.1%} step by {LARGE} thresholds or more from "
+        "one frame "
+        "to the next. What happens inside such a step is not in the video: its events lie on a straight "
+        "line of log "
         "intensity between two frames."
     )
-    remedy = f"Record at about {math.ceil(state.remedy)} times the frame rate, or put frames between with --upsample 0.5."
+    remedy = (
+        f"Record at about {math.ceil(state.remedy)} times the frame rate, or put frames between with "
+        "--upsample 0.5."
+    )
     yield f"**Too slow for its motion.** {share} {remedy}" if slow else share
     if not state.events:
         yield (
@@ -157,15 +166,19 @@ def warnings(view, state, sensor, slow):
             "after an event, so much of what happens gives no event. `--preset clean` does neither."
         )
     if view.source.complaint:
-        yield f"**The decoder complained** about the file: {view.source.complaint}. Some frames may be damaged."
+        yield (
+            f"**The decoder complained** about the file: {view.source.complaint}. Some frames may be damaged."
+        )
     if state.largest < view.light.white / 4:
         yield (
-            f"**Dark input.** The largest digital value is {state.largest:g}, full light is {view.light.white:g}: the "
+            f"**Dark input.** The largest digital value is {state.largest:g}, full light is "
+            f"{view.light.white:g}: the "
             "sensor works in its dark, linear part. For 12 bits stored in 16 give --white-level 4095."
         )
     if state.largest > view.light.white:
         yield (
-            f"The largest digital value is {state.largest:g}, above full light ({view.light.white:g}); such values "
+            f"The largest digital value is {state.largest:g}, above full light ({view.light.white:g}); "
+            "such values "
             "are taken as they are, brighter than 255."
         )
     width, height = view.log.width_px, view.log.height_px
@@ -181,10 +194,12 @@ def light(view):
     gamma = (
         "the sRGB gamma is undone, so intensities are linear in light"
         if view.config.linear
-        else "digital values are taken as intensities, gamma and all, as v2e does (--linear undoes the sRGB gamma)"
+        else "digital values are taken as intensities, gamma and all, as v2e does (--linear undoes the sRGB "
+        "gamma)"
     )
     return (
-        f"Light: digital value {view.light.white:g} is 255 for the sensor; {gamma}. Colour is weighted 0.2126 red, "
+        f"Light: digital value {view.light.white:g} is 255 for the sensor; {gamma}. Colour is weighted "
+        "0.2126 red, "
         "0.7152 green, 0.0722 blue."
     )
 
@@ -195,17 +210,26 @@ def pictures(view):
     config = view.config
     run.section("Events")
     window_s = max(view.exposure_s, float(view.t_s.diff().median()))
-    caption = f"Frames, and the events of {seconds(window_s)} around them: red brighter, blue darker; full colour at {config.preview_full_scale:g} events."
+    caption = (
+        f"Frames, and the events of {seconds(window_s)} around them: red brighter, blue darker; full "
+        f"colour at {config.preview_full_scale:g} events."
+    )
     run.figure(first_pictures(view, window_s), "pictures", caption)
     middle_s, rate_hz = rates_over_time(view)
     caption = f"Events per second of the whole picture, in {len(middle_s)} equal parts of the time."
     run.figure(rate_figure(middle_s, rate_hz), "rates", caption)
     few = view.log.pick(sample(view.log.count, config.points, torch.Generator().manual_seed(config.seed)))
     figure = space_time_figure(few, points=config.points, total=view.log.count)
-    caption = f"Events in space and time: {len(few):,} of {view.log.count:,}, drawn at random. Orange brighter, blue darker."
+    caption = (
+        f"Events in space and time: {len(few):,} of {view.log.count:,}, drawn at random. Orange brighter, "
+        "blue darker."
+    )
     run.figure(figure, "space_time", caption)
     if config.preview:
-        covers = f"{view.slowdown:.4g} times slower than the scene, each picture covers {seconds(view.exposure_s)}. Red brighter, blue darker."
+        covers = (
+            f"{view.slowdown:.4g} times slower than the scene, each picture covers "
+            f"{seconds(view.exposure_s)}. Red brighter, blue darker."
+        )
         video(view, "events", event_pictures(view), f"Events; {covers}")
         fading = f"Fading traces, to 1/e in {seconds(view.tau_s)} of the scene"
         video(view, "decay", trace_pictures(view), f"{fading}; {covers}")

@@ -1,5 +1,5 @@
-"""What a run of video_to_events keeps, so that an interrupted one ends with the same events: the events so far, how
-far it has come, and how far pixels step from frame to frame."""
+"""What a run of video_to_events keeps, so that an interrupted one ends with the same events: the events so
+far, how far it has come, and how far pixels step from frame to frame."""
 
 import dataclasses
 from bisect import bisect_right
@@ -20,7 +20,8 @@ WORRYING = 0.1  # share of the moving pixels
 
 
 class EventLog:
-    """A file of events in order of time, appended to while they are made and read in pieces: memory stays flat.
+    """A file of events in order of time, appended to while they are made and read in pieces: memory stays
+    flat.
 
     path: the file.
     count: events in it that count; later ones, written before a run was killed, are cut off.
@@ -89,7 +90,8 @@ class Progress:
     simulated: frames that the sensor saw, those put between with them.
     largest: digital value seen.
     seconds: time spent.
-    histogram: [LARGEST + 1] int64; entry n counts pixels and intervals whose level moved by n to n + 1 thresholds.
+    histogram: [LARGEST + 1] int64; entry n counts pixels and intervals whose level moved by n to n + 1
+      thresholds.
     before: [H, W] the last frame seen.
     """
 

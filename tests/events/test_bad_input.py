@@ -1,5 +1,5 @@
-"""Wrong calls of the event package, as somebody makes who meets it for the first time: each gets one sentence that
-names what was given."""
+"""Wrong calls of the event package, as somebody makes who meets it for the first time: each gets one sentence
+that names what was given."""
 
 import math
 
@@ -173,6 +173,7 @@ def streamed(frames, t_s):
 
 
 GENERATOR = torch.Generator()
+UNSTABLE = {"cutoff_hz": 300.0, "shot_rate_hz": 5.0, "photoreceptor_noise": True, "timing": "v2e"}
 WRONG = [
     (lambda: events_at(0.5, 1, 1, 1), "t_us holds 0.5"),
     (lambda: events_at(1, 6, 1, 1), "x spans 6 to 6"),
@@ -251,6 +252,8 @@ WRONG = [
     (lambda: SensorModel(shot_rate_hz=NAN), "shot_rate_hz"),
     (lambda: SensorModel(cutoff_hz=None), "cutoff_hz"),
     (lambda: SensorModel(timing="exact"), "timing"),
+    (lambda: SensorModel(photoreceptor_noise=True), "needs cutoff_hz and shot_rate_hz"),
+    (lambda: events.simulate(FRAMES, T_S, SensorModel(**UNSTABLE)), "unstable"),
     (lambda: SensorModel(hot_pixel_share=2.0), "0 to 1"),
     (lambda: events.draw_thresholds(SensorModel(theta_sigma=0.1), 4, GENERATOR), "pixels is 4"),
     (lambda: events.draw_thresholds(SENSOR, (2, 2), GENERATOR, device="x"), "device is 'x'"),

@@ -1,4 +1,5 @@
-"""HDF5 and NPZ files made to break their libraries: refused before memory is taken. Mutants: tests/hostile."""
+"""HDF5 and NPZ files made to break their libraries: refused before memory is taken. Mutants:
+tests/hostile."""
 
 import zipfile
 import zlib

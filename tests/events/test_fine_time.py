@@ -32,9 +32,9 @@ GROUPS = torch.cat([torch.stack((x.sin(), x.cos())) for x in (PHASE * 2 * math.p
 
 
 def waves(intervals, amplitude=1.0, shift_s=0.0):
-    """[T, 1, N] levels: two waves per pixel with phases of its own, the faster with six samples per period where
-    there are eight intervals. Pixels begin anywhere in their thresholds, so a sum of many is a mean over
-    beginnings."""
+    """[T, 1, N] levels: two waves per pixel with phases of its own, the faster with six samples per period
+    where there are eight intervals. Pixels begin anywhere in their thresholds, so a sum of many is a mean
+    over beginnings."""
     turn = (times(intervals)[:, None] + shift_s) * 2 * math.pi
     level = 0.5 * torch.sin(13.3 * turn + PHASE * 2 * math.pi) + 0.7 * torch.sin(
         4.1 * turn + SECOND * 2 * math.pi
@@ -98,7 +98,8 @@ def test_events_of_one_long_interval_lie_where_the_level_crosses():
     crossing = torch.arange(1, 21, dtype=D) / 20.5 * (BINS - 1)  # in node spacings
     truth = (1 - (crossing - torch.arange(BINS, dtype=D)[:, None]).abs()).clamp(min=0).sum(1)
     assert float(volume.sum()) == 20
-    # four parts from node to node: an event lies at most an eighth of that from its place, early as often as late
+    # four parts from node to node: an event lies at most an eighth of that from its place, early as often as
+    # late
     nodes = torch.arange(BINS, dtype=D)
     assert abs(float(nodes @ (volume - truth))) < 20 / 8 / 4
     # a node shares the events of both spacings beside it, and so does one part's worth of them at most
@@ -207,7 +208,8 @@ def test_a_surface_of_hard_counts_is_that_of_the_stream():
 
 @pytest.mark.parametrize("move", MOVES)
 def test_a_surface_steers_as_the_mean_over_beginnings(move):
-    """Against the stream of single events, from forty intervals: what the gradient of the surface itself is worth."""
+    """Against the stream of single events, from forty intervals: what the gradient of the surface itself is
+    worth."""
     tau_s = 0.03
 
     def surface(level):

@@ -1,5 +1,5 @@
-"""Event layers as modules: the functions that they call, differences, closed forms, chunks and batches against
-the whole and the single sample."""
+"""Event layers as modules: the functions that they call, differences, closed forms, chunks and batches
+against the whole and the single sample."""
 
 import math
 

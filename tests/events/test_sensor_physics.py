@@ -153,8 +153,9 @@ def test_noise_events_scale_with_thresholds_and_reset_the_memorised_level():
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_noise_events_and_crossings_come_in_order_of_time(sign):
-    """Level 4 +- 1 per second: a threshold of 0.2 is crossed 0.2 s after the start, the last crossing or the last
-    noise event, which set the memorised level; so no pixel waits longer, and what comes earlier is noise."""
+    """Level 4 +- 1 per second: a threshold of 0.2 is crossed 0.2 s after the start, the last crossing or the
+    last noise event, which set the memorised level; so no pixel waits longer, and what comes earlier is
+    noise."""
     level = (4 + sign * torch.arange(2) + torch.zeros(60, 60, 2)).permute(2, 0, 1)
     rate_hz = 2.0
     events = simulate(
@@ -177,8 +178,8 @@ def test_noise_events_and_crossings_come_in_order_of_time(sign):
 
 
 def test_noise_events_start_no_dead_time():
-    """Level 4 + 1 per second and a dead time of 0.3 s: the first crossing comes 0.2 s after the start or after the
-    noise event that set the memorised level, and no crossing came before it."""
+    """Level 4 + 1 per second and a dead time of 0.3 s: the first crossing comes 0.2 s after the start or
+    after the noise event that set the memorised level, and no crossing came before it."""
     level = (4 + torch.arange(2) + torch.zeros(80, 80, 2)).permute(2, 0, 1)
     sensor = SensorModel(shot_rate_hz=3.0, refractory_s=0.3)
     events = simulate(level, [0.0, 1.0], sensor, torch.Generator().manual_seed(6), log_input=True)
@@ -195,8 +196,9 @@ def test_noise_events_start_no_dead_time():
 
 
 def test_photoreceptor_noise_grows_to_its_strength_and_fades_as_the_photoreceptor():
-    """A first-order process from 0: of the variance ``noise_level`` squared, 1 - q^2k is there after k frames, and
-    q = exp(-2 pi f dt) of the noise is left after one. 40,000 pixels: 0.35 % standard error of a deviation."""
+    """A first-order process from 0: of the variance ``noise_level`` squared, 1 - q^2k is there after k
+    frames, and q = exp(-2 pi f dt) of the noise is left after one. 40,000 pixels: 0.35 % standard error of a
+    deviation."""
     sensor = SensorModel(cutoff_hz=60.0, shot_rate_hz=5.0, photoreceptor_noise=True)
     step_s = 2e-3
     still = torch.full((6, 200, 200), 90.0, dtype=torch.float64)

@@ -18,8 +18,8 @@ STEADY = RATE * WINDOW_S / THETA
 
 
 def ramps(times_s, slope=1.0):
-    """Frames [1, T, 1, 200] whose log level rises by RATE, up to one event's time after the first of them: all phases of
-    the threshold are alike often."""
+    """Frames [1, T, 1, 200] whose log level rises by RATE, up to one event's time after the first of them:
+    all phases of the threshold are alike often."""
     delay_s = torch.linspace(0, THETA / RATE, 201, dtype=torch.float64)[:-1]
     since_s = (times_s[:, None] - times_s[0] - delay_s).clamp(min=0) if times_s[0] < 0 else times_s[:, None]
     return (4.0 + slope * RATE * since_s.expand(-1, 200)).exp()[None, :, None]
@@ -39,7 +39,8 @@ PARTS = {
 
 @pytest.mark.parametrize("part", PARTS.values(), ids=PARTS)
 def test_the_steady_rate_of_a_ramp_is_read_after_the_lead(part):
-    """Events of a window are its rise over the threshold; a sensor that begins with the window counts whole ones."""
+    """Events of a window are its rise over the threshold; a sensor that begins with the window counts whole
+    ones."""
     settled = part(IDEAL, LEAD_S)(ramps(times()), times(), 5)
     assert float(settled.collected_s.sum()) == pytest.approx(WINDOW_S)
     assert settled.counts[:, 0].sum(1).mean().item() == pytest.approx(STEADY, abs=0.03)
@@ -52,8 +53,8 @@ def test_the_steady_rate_of_a_ramp_is_read_after_the_lead(part):
 
 @pytest.mark.parametrize("part", PARTS.values(), ids=PARTS)
 def test_a_slow_sensor_has_settled_after_its_lead(part):
-    """Behind a low pass the first events come later still; after the lead what is left is that its time constant, which
-    goes as one over the light, is shorter at the end of the ramp than at its beginning."""
+    """Behind a low pass the first events come later still; after the lead what is left is that its time
+    constant, which goes as one over the light, is shorter at the end of the ramp than at its beginning."""
     settled = part(SLOW, LEAD_S)(ramps(times()), times(), 5).counts.sum().item() / 200
     sudden = part(SLOW, 0.0)(ramps(times(0.0)), times(0.0), 5).counts.sum().item() / 200
     assert sudden <= STEADY - 0.5

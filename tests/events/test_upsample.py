@@ -154,8 +154,8 @@ def test_the_stream_gives_the_whole_bit_for_bit():
 
 
 def test_a_rendered_room_gives_truer_events_upsampled_than_kept():
-    """7.5 px between the frames kept: docs/upsampling.md has 0.15 wrong counts per true event in 4 x 4 px and 5 ms, 0.69
-    of the kept frames alone, at twice the resolution."""
+    """7.5 px between the frames kept: docs/upsampling.md has 0.15 wrong counts per true event in 4 x 4 px and
+    5 ms, 0.69 of the kept frames alone, at twice the resolution."""
     camera = render.Camera(lens.Pinhole(5.0), 72, 54, 10 * math.tan(math.radians(22.5)) / 72, 16)
     start = pose.look_at(*worlds.VIEWS["room"])
     count, stride = 41, 20

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from codesign.errors import DomainError
 from codesign.events import SensorModel, SensorState, concatenate, simulate
 
 FIELDS = ("t_us", "x", "y", "p")
@@ -88,8 +87,8 @@ def test_noise_rates_are_those_of_v2e(shared, timing, case):
 
 
 def grating(frames, side=64):
-    """Sinusoid of 17.3 px and 12.7 Hz at 0.35 rad, one frame a millisecond: v2e's recorded sequence "grating" in
-    closed form (to 1e-12)."""
+    """Sinusoid of 17.3 px and 12.7 Hz at 0.35 rad, one frame a millisecond: v2e's recorded sequence "grating"
+    in closed form (to 1e-12)."""
     t, y, x = torch.meshgrid(
         *(torch.arange(count, dtype=torch.float64) for count in (frames, side, side)), indexing="ij"
     )
@@ -133,16 +132,9 @@ def test_slots_keep_microseconds_at_epoch_times_and_late():
             assert events.p.tolist() == [1, 1, -1, -1, 1, 1, 1, 1]
 
 
-def test_a_noise_filter_that_would_not_converge_is_refused():
-    sensor = SensorModel(cutoff_hz=300.0, shot_rate_hz=5.0, photoreceptor_noise=True, timing="v2e")
-    with pytest.raises(DomainError, match="unstable"):
-        simulate(torch.full((3, 2, 2), 50.0), [0.0, 0.01, 0.02], sensor)
-    with pytest.raises(DomainError, match="needs cutoff_hz and shot_rate_hz"):
-        SensorModel(photoreceptor_noise=True)
-
-
 def test_a_noise_event_of_either_polarity_resets_the_memorised_level():
-    # a rise of 0.15 below the threshold of 0.2: whatever fires is noise, and where nothing fires the memorised
+    # a rise of 0.15 below the threshold of 0.2: whatever fires is noise, and where nothing fires the
+    # memorised
     # level stays where it was
     frames = torch.tensor([80.0, 80.0 * math.exp(0.15)])[:, None, None].expand(2, 40, 50)
     state = SensorState()

@@ -13,7 +13,7 @@ from codesign.errors import DomainError, FileFormatError, ShapeError
 from studies.frame.run import main
 from studies.sensor_fit import __main__ as study
 from studies.sensor_fit.recording import load
-from studies.sensor_fit.sensor import Fit, FittedSensor, blur, match
+from studies.sensor_fit.sensor import Fit, FittedSensor, match
 
 D = torch.float64
 
@@ -30,16 +30,6 @@ def test_the_loss_and_the_figures_equal_values_by_hand():
     assert found["rate_factor"] == pytest.approx(math.exp(math.sqrt(mean_square)))
     with pytest.raises(DomainError, match="no event"):
         study.judge(recorded, torch.zeros_like(recorded))
-
-
-def test_blur_is_a_gaussian_of_one_pixel():
-    point = torch.zeros(1, 21, 21, dtype=D)
-    point[0, 10, 10] = 1
-    spread = blur(point)[0]
-    place = torch.arange(-10, 11, dtype=D)
-    assert float(spread.sum()) == pytest.approx(1, abs=1e-12)
-    # cut at 4 px: the variance misses 2 * 4^2 * exp(-8)/sqrt(2 pi) and what lies beyond, about 0.5 %
-    assert float((spread.sum(0) * place.square()).sum()) == pytest.approx(1, rel=6e-3)
 
 
 def drifting(t_s):

@@ -1,10 +1,11 @@
-"""AEDAT 4.0: packets of 16-byte events with 64-bit microseconds, and the frames that DAVIS cameras record beside them.
+"""AEDAT 4.0: packets of 16-byte events with 64-bit microseconds, and the frames that DAVIS cameras record
+beside them.
 
 Layout: the line ``#!AER-DAT4.0``, an IOHeader (FlatBuffer: compression, position of the table, XML that names
   the streams), packets of (stream, size) and a compressed FlatBuffer each, and a compressed FileDataTable
   that lists the packets once more. FlatBuffers are read without generated code, every offset checked.
-Source: iniVation documentation, "AEDAT file formats", AEDAT 4.0; FlatBuffers schemas of dv-processing; FlatBuffers
-  documentation, "FlatBuffer Internals".
+Source: iniVation documentation, "AEDAT file formats", AEDAT 4.0; FlatBuffers schemas of dv-processing;
+  FlatBuffers documentation, "FlatBuffer Internals".
 """
 
 import re
@@ -237,7 +238,8 @@ def unpacked(path, data, compression):
             unpacker = zstandard.ZstdDecompressor(max_window_size=2**27).decompressobj()
             if zstandard.frame_content_size(data) > limit:
                 raise FileFormatError(
-                    f"{path}: a block of {len(data)} bytes claims to hold more than {limit} bytes; the file is damaged."
+                    f"{path}: a block of {len(data)} bytes claims to hold more than {limit} bytes; the "
+                    "file is damaged."
                 )
             body = unpacker.decompress(data)
     if not unpacker.eof or unpacker.unused_data:

@@ -1,5 +1,5 @@
-"""Events as NumPy arrays: .npz of t_us, x, y, p and the sensor size height_px, width_px (written, and read by other usual
-names too), or .npy of rows t x y p or x y t p."""
+"""Events as NumPy arrays: .npz of t_us, x, y, p and the sensor size height_px, width_px (written, and read by
+other usual names too), or .npy of rows t x y p or x y t p."""
 
 import zipfile
 
@@ -27,10 +27,11 @@ def write_npz(path, stream):
 
 
 def read_arrays(path, asked):
-    """EventColumns of ``path``; the sensor size is the file's, or that of ``frames`` [T, H, W] beside the events.
+    """EventColumns of ``path``; the sensor size is the file's, or that of ``frames`` [T, H, W] beside the
+    events.
 
-    Raises: FileFormatError when the file is truncated, corrupt, of another kind, lacks an array, and what tables and
-      arrival refuse.
+    Raises: FileFormatError when the file is truncated, corrupt, of another kind, lacks an array, and what
+      tables and arrival refuse.
     """
     size, size_from, name = None, "the file", ""
     if path.suffix.lower() == ".npy":

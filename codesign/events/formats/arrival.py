@@ -1,5 +1,5 @@
-"""Events in the order a file holds them, packet by packet, checked and put in order; what columns mean where a format
-does not say (their order, the unit of times); and what a format can hold."""
+"""Events in the order a file holds them, packet by packet, checked and put in order; what columns mean where
+a format does not say (their order, the unit of times); and what a format can hold."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -30,20 +30,23 @@ def check_asked(path, asked):
     """Raise FileFormatError unless the order and the unit asked for mean something."""
     if not isinstance(asked.columns, str) or sorted(asked.columns) not in (list("ptxy"), sorted("auto")):
         raise FileFormatError(
-            f"columns {shown(asked.columns)} given for {path}; the four letters t, x, y, p in the file's order are "
+            f"columns {shown(asked.columns)} given for {path}; the four letters t, x, y, p in the file's "
+            "order are "
             "needed, for example 'txyp'."
         )
     if not isinstance(asked.time_unit, str) or asked.time_unit not in ("auto", *UNITS_US):
         raise FileFormatError(
-            f"time unit {shown(asked.time_unit)} given for {path}; choose one of {', '.join(UNITS_US)} or auto."
+            f"time unit {shown(asked.time_unit)} given for {path}; choose one of {', '.join(UNITS_US)} or "
+            "auto."
         )
 
 
 def settled_order(path, table, columns, default=None):
     """Which letter of t, x, y, p stands for which column of ``table`` [N, 4].
 
-    "auto": t is the first or the third column, the one of both whose values mostly are no pixels (fractions, beyond
-    LIMIT_PX), else the one that never falls. ``default`` where neither or both are; without one, FileFormatError.
+    "auto": t is the first or the third column, the one of both whose values mostly are no pixels (fractions,
+    beyond LIMIT_PX), else the one that never falls. ``default`` where neither or both are; without one,
+    FileFormatError.
     """
     if columns != "auto":
         return columns
@@ -62,8 +65,8 @@ def settled_order(path, table, columns, default=None):
 
 
 def settled_unit(t, unit, name=""):
-    """The unit of times ``t`` [N] of a column called ``name``; "auto": what the name says, else seconds where a time
-    has a fraction, else microseconds."""
+    """The unit of times ``t`` [N] of a column called ``name``; "auto": what the name says, else seconds where
+    a time has a fraction, else microseconds."""
     told = name.removeprefix("t_")
     if unit != "auto":
         return unit
@@ -88,9 +91,9 @@ def signed(t):
 class Asked:
     """What the caller says of a file.
 
-    height_px, width_px: sensor size, or None. told: (height, width) by ``told_by``, which lies beside the file, or
-      None. sensors: name -> (width, height), of which the smallest that holds the events is taken where nothing
-      tells; without any, the smallest size that does.
+    height_px, width_px: sensor size, or None. told: (height, width) by ``told_by``, which lies beside the
+      file, or None. sensors: name -> (width, height), of which the smallest that holds the events is taken
+      where nothing tells; without any, the smallest size that does.
     columns: order of the columns of rows, four letters, or "auto". time_unit: s, ms, us, ns or "auto".
     skip: faults whose events are left out and counted; None: where the caller cannot ask for that.
     """
@@ -108,7 +111,8 @@ class Asked:
 class Arrival:
     """The events of one file, on their way to EventColumns.
 
-    Args: path: for messages. size, size_from: (height_px, width_px) by the file, or None, and what in it says so.
+    Args: path: for messages. size, size_from: (height_px, width_px) by the file, or None, and what in it says
+      so.
       place: what the events are numbered by.
     Raises: FileFormatError for sizes that disagree.
     """
@@ -122,7 +126,8 @@ class Arrival:
         for k, name in enumerate(("height_px", "width_px")):
             if size and self.size[k] not in (None, size[k]):
                 raise FileFormatError(
-                    f"{path} comes from a sensor with {name} {size[k]} by {self.size_from}, but {self.size[k]} was "
+                    f"{path} comes from a sensor with {name} {size[k]} by {self.size_from}, but "
+                    f"{self.size[k]} was "
                     "asked for."
                 )
             self.size[k] = size[k] if size else self.size[k]
@@ -137,8 +142,8 @@ class Arrival:
         """Take the events that follow.
 
         Args: t_us, x, y, p: [N] numbers; p above 0 for ON, else 0, or -1. places: [N] line numbers, or None.
-        Raises: FileFormatError naming the first that is no event, lies outside the sensor or more than DISORDER_US
-          before an earlier one.
+        Raises: FileFormatError naming the first that is no event, lies outside the sensor or more than
+          DISORDER_US before an earlier one.
         """
         height, width = (LIMIT_PX if side is None else side for side in self.size)
         latest_us = np.maximum(np.maximum.accumulate(t_us), self.latest_us) if len(t_us) else t_us
@@ -179,8 +184,8 @@ class Arrival:
         self.parts.append((t_us.astype(np.int64), x.astype(np.int16), y.astype(np.int16), p > 0))
 
     def columns(self):
-        """EventColumns of all that was taken. Raises: FileFormatError where neither anything nor anybody tells the
-        sensor size."""
+        """EventColumns of all that was taken. Raises: FileFormatError where neither anything nor anybody
+        tells the sensor size."""
         t_us, x, y, on = (np.concatenate(column) for column in zip(*self.parts, strict=True))
         self.parts.clear()
         if bool((t_us[1:] < t_us[:-1]).any()):
@@ -217,7 +222,10 @@ class Arrival:
             value, most = event[name], LIMIT_PX if limit is None else limit
             if not (0 <= value < most and value % 1 == 0):
                 by = f" by {self.size_from}" if limit is not None else ", as far as sensors are known,"
-                said = f"{name} = {value:.15g}; the sensor has {most} pixels there{by} (0 to {most - 1}, whole numbers)"
+                said = (
+                    f"{name} = {value:.15g}; the sensor has {most} pixels there{by} (0 to {most - 1}, "
+                    "whole numbers)"
+                )
         return f"it lies at {said}; give its true size"
 
     def _bad_polarity(self, event):

@@ -1,8 +1,8 @@
 """Prophesee DAT files: an ASCII header, a byte each for event type and size, then 8-byte events of a 32-bit
 time and packed x, y, polarity.
 
-The time starts again at 2^32 us. Loops are counted when reading, but not by Prophesee's own readers, so none is
-written; the start time ``% T0`` that faery and we write where asked to is added to all times.
+The time starts again at 2^32 us. Loops are counted when reading, but not by Prophesee's own readers, so none
+is written; the start time ``% T0`` that faery and we write where asked to is added to all times.
 Source: Prophesee Metavision documentation, "DAT File Format"; faery (``T0``).
 """
 
@@ -25,7 +25,8 @@ SIDE_PX = 2**14
 
 
 def read_dat(path, asked):
-    """EventColumns of ``path``. A header with nothing behind it, as faery writes for no events, is an empty stream.
+    """EventColumns of ``path``. A header with nothing behind it, as faery writes for no events, is an empty
+    stream.
 
     Raises: FileFormatError for another version or event type, a damaged header, a file cut amid an event, an
       unknown polarity, or time going back.

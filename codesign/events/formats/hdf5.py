@@ -1,12 +1,13 @@
 """Event streams in HDF5: DSEC's layout (a group ``events`` of t, x, y, p; read and written), v2e's (a dataset
-``events`` of rows t, x, y, p in microseconds) and MVSEC's (``davis/left/events``, rows x, y, t, p in seconds).
+``events`` of rows t, x, y, p in microseconds) and MVSEC's (``davis/left/events``, rows x, y, t, p in
+seconds).
 
-DSEC: t is uint32 microseconds since t_offset (int64), x and y uint16, p uint8 (1 ON, 0 OFF); ms_to_idx[k] is the
-first event with t >= 1000 k. What is written carries the sensor size as attributes height_px and width_px of
-the group; published files have none.
+DSEC: t is uint32 microseconds since t_offset (int64), x and y uint16, p uint8 (1 ON, 0 OFF); ms_to_idx[k] is
+the first event with t >= 1000 k. What is written carries the sensor size as attributes height_px and width_px
+of the group; published files have none.
 Sources: Gehrig et al., "DSEC: A Stereo Event Camera Dataset for Driving Scenarios", RA-L 2021; its published
-  description of the data format. v2e, class EventEmulator, output ``dvs_h5`` (Hu et al., CVPRW 2021). Zhu et al., "The
-  Multivehicle Stereo Event Camera Dataset", RA-L 2018.
+  description of the data format. v2e, class EventEmulator, output ``dvs_h5`` (Hu et al., CVPRW 2021). Zhu et
+  al., "The Multivehicle Stereo Event Camera Dataset", RA-L 2018.
 """
 
 import numpy as np
@@ -61,8 +62,8 @@ def to_dsec(stream):
 
 
 def check_index(path, t, first, index):
-    """Raise FileFormatError unless ms_to_idx parts the times ``t`` of the events from number ``first`` on: none before
-    an entry at or after its millisecond, none behind it earlier."""
+    """Raise FileFormatError unless ms_to_idx parts the times ``t`` of the events from number ``first`` on:
+    none before an entry at or after its millisecond, none behind it earlier."""
     limit_us = 1000 * np.arange(len(index), dtype=np.int64)
     at = index[1:] - first
     inside, behind = (at >= 0) & (at < len(t)), (at > 0) & (at <= len(t))
@@ -88,7 +89,8 @@ class Hdf5Events:
     """The events of a file in any of the layouts, by number or by time.
 
     Args: path: file. asked: see Asked.
-    size_px: (height, width) where the file tells, else None. rows: of t, x, y, p, or of all four together ("rows").
+    size_px: (height, width) where the file tells, else None. rows: of t, x, y, p, or of all four together
+      ("rows").
     Raises: FileFormatError for another layout, damage, and data kept in other files.
     """
 
@@ -155,8 +157,8 @@ class Hdf5Events:
         return arrival.columns()
 
     def window(self, t0_us, t1_us, size_px):
-        """EventStream of the events from t0_us to t1_us, both included, of a sensor of ``size_px``; a few blocks are
-        read, not the file."""
+        """EventStream of the events from t0_us to t1_us, both included, of a sensor of ``size_px``; a few
+        blocks are read, not the file."""
         if self.index is not None:
             edges = (t0_us - self.offset_us) // 1000, (t1_us - self.offset_us) // 1000 + 1
             low, high = (

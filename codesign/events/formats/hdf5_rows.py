@@ -283,8 +283,8 @@ def new_hdf5(path: str | Path, **options: Any) -> Iterator[Any]:
         options: of ``h5py.File``.
 
     Raises:
-        OSError: when the block ends, if something could not be written. HDF5 itself ends the process where it fails
-            while it closes a file, so it is not told.
+        OSError: when the block ends, if something could not be written. HDF5 itself ends the process where it
+            fails while it closes a file, so it is not told.
     """
     with h5py.File(path, "w"):  # HDF5 refuses a file that somebody reads
         pass

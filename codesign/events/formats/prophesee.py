@@ -1,5 +1,5 @@
-"""What Prophesee's formats share: the ASCII header of lines ``% keyword value`` ahead of the binary part, hardware clocks of
-few bits that start again at zero, and values that hold until the next word changes them.
+"""What Prophesee's formats share: the ASCII header of lines ``% keyword value`` ahead of the binary part,
+hardware clocks of few bits that start again at zero, and values that hold until the next word changes them.
 
 Source: Prophesee Metavision documentation, "RAW File Format" and "DAT File Format".
 """

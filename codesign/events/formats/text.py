@@ -60,8 +60,8 @@ def read_text(path, asked):
 
 
 def _head(path, file):
-    """(number of the first line behind comments, a header, or a size at the top of the file; names of the header, or
-    ""; (height, width) or None)."""
+    """(number of the first line behind comments, a header, or a size at the top of the file; names of the
+    header, or ""; (height, width) or None)."""
     used = 0
     names: list[str] = []
     told = None
@@ -86,7 +86,8 @@ def _head(path, file):
             told = (int(words[1]), int(words[0]))
             if not all(1 <= side <= LIMIT_PX for side in told):
                 raise FileFormatError(
-                    f"{path}, line {used}: a sensor of {' x '.join(words)[:60]} pixels is announced; 1 to {LIMIT_PX} a "
+                    f"{path}, line {used}: a sensor of {' x '.join(words)[:60]} pixels is announced; 1 to "
+                    f"{LIMIT_PX} a "
                     "side are possible."
                 )
         else:
@@ -110,8 +111,8 @@ def _whole_lines(path, file, number):
 
 
 def _table(path, lines, number):
-    """[N, 4] int64 or float64 of whole lines, and the number of the line of each row. Every line must hold four
-    numbers or nothing."""
+    """[N, 4] int64 or float64 of whole lines, and the number of the line of each row. Every line must hold
+    four numbers or nothing."""
     raw = np.frombuffer(lines, np.uint8)
     blank = raw <= 32
     starts = ~blank & np.concatenate([[True], blank[:-1]])

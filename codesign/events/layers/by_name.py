@@ -33,8 +33,8 @@ def layer(name: str = "memory", sensor: SensorModel | None = None, **options: An
       sensor: SensorModel to start from. options: learn, log_input (see ``EventLayer``), and spread of
         "expected", sharpness of "sigmoid" and "dense", gradient ("play" or "surrogate") and steps (per frame
         interval) of "srm".
-    Raises: DomainError for an unknown name, with the nearest one, an unknown option, or a value that cannot be
-      learnt. A warning names what the sensor has and the layer does not know (leak, dead time, ...).
+    Raises: DomainError for an unknown name, with the nearest one, an unknown option, or a value that cannot
+      be learnt. A warning names what the sensor has and the layer does not know (leak, dead time, ...).
 
     Example:
     >>> import torch

@@ -52,9 +52,9 @@ class LastDraw:
     ) -> tuple[Tensor | None, ...]:
         """What ``draw()`` returns, and the generators as it leaves them.
 
-        Args: asked: all that the draw depends on but its generators, to be compared by ==. generators: in the order in
-          which they are drawn from, also several times. draw: without arguments; what it returns is not changed
-          afterwards.
+        Args: asked: all that the draw depends on but its generators, to be compared by ==. generators: in the
+          order in which they are drawn from, also several times. draw: without arguments; what it returns is
+          not changed afterwards.
         """
         own = list(dict.fromkeys(generators))
         place = {generator: number for number, generator in enumerate(own)}
@@ -93,7 +93,8 @@ class Comparator(Protocol):
 
 @dataclass
 class Sigmoid:
-    """``events.soft``: sigmoid of the step between two frames, no memory. sharpness: k, or None for 5/theta."""
+    """``events.soft``: sigmoid of the step between two frames, no memory. sharpness: k, or None for
+    5/theta."""
 
     sharpness: float | None = None
     mismatched = False
@@ -135,7 +136,8 @@ class Dense:
 
 @dataclass
 class Memory:
-    """``events.memory``: hard counts against the memorised level. gradient: "exact", "play" or None, as there."""
+    """``events.memory``: hard counts against the memorised level. gradient: "exact", "play" or None, as
+    there."""
 
     gradient: str | None = None
     mismatched = True
@@ -176,7 +178,8 @@ class Spikes:
     def __post_init__(self):
         if self.gradient not in ("surrogate", "play"):
             raise DomainError(
-                f"gradient is {self.gradient!r}; choose one of 'surrogate', 'play': the layer memorises a level."
+                f"gradient is {self.gradient!r}; choose one of 'surrogate', 'play': the layer memorises a "
+                "level."
             )
         self.steps = check_whole(self.steps, "steps", 1, MOST_STEPS)
 
@@ -204,8 +207,8 @@ def _with_last(frames, last):
 
 
 def check_comparator(comparator: object, sensor: SensorModel, learnt: Container[str]) -> None:
-    """Refuse what is no comparator, or takes no mismatch that is to be learnt; warn of what the sensor has and no
-    comparator knows."""
+    """Refuse what is no comparator, or takes no mismatch that is to be learnt; warn of what the sensor has
+    and no comparator knows."""
     if not callable(comparator) or not hasattr(comparator, "mismatched"):
         raise DomainError(
             f"the comparator is {comparator!r}; it is called (frames, theta_on, theta_off, state, log_input) "
@@ -235,9 +238,10 @@ def check_comparator(comparator: object, sensor: SensorModel, learnt: Container[
 class LayerState:
     """What a ``ComparatorLayer`` carries over chunks.
 
-    comparator: state of the comparator, and what it is a state of. level, frame: [..., H, W] level behind the low-pass and last frame,
-      None without a low-pass. deviates: [2, ..., H, W] standard normal numbers of the thresholds, None without
-      mismatch. time_s: time of the last frame. generators: of the noise still to come, one per sample.
+    comparator: state of the comparator, and what it is a state of. level, frame: [..., H, W] level behind the
+      low-pass and last frame, None without a low-pass. deviates: [2, ..., H, W] standard normal numbers of
+      the thresholds, None without mismatch. time_s: time of the last frame. generators: of the noise still to
+      come, one per sample.
     shape, dtype: of a frame [..., H, W].
     """
 

@@ -1,16 +1,18 @@
-"""What dead time lets pass of mean counts: the expectation over where events stand in a pixel's threshold, as a
-smooth function of the levels, the thresholds and the dead time.
+"""What dead time lets pass of mean counts: the expectation over where events stand in a pixel's threshold, as
+a smooth function of the levels, the thresholds and the dead time.
 
-A pixel has an event whenever its mean signed count I (ON less OFF) passes i + u, up or down, with a phase u that is
-as good as random: on a way back those come first that came last. Event i is kept unless one kept before lies less
+A pixel has an event whenever its mean signed count I (ON less OFF) passes i + u, up or down, with a phase u
+that is
+as good as random: on a way back those come first that came last. Event i is kept unless one kept before lies
+  less
 than T back, and no two kept ones do:
 
     kept_i = 1 - sum over j < i with t_i - t_j < T of kept_j,
 
 a linear recursion, exact for every single phase. Here it runs for PHASES groups of neighbouring phases, each
 WIDTH of a count wide and mixed within; S(t) is what a group has kept until t, and a phase that has its event
-during a step is kept by 1 - (S(its event before) - S(t - T)). The first event after a pause is never lost, and
-dead time reaches over frames, turns and polarities. What the mixing costs is in docs/events.md.
+during a step is kept by 1 - (S(its event before) - S(t - T)). The first event after a pause is never lost,
+and dead time reaches over frames, turns and polarities. What the mixing costs is in docs/events.md.
 """
 
 import warnings
@@ -38,8 +40,8 @@ FEWEST = 8  # dead times shorter than an interval over this are taken as local
 @dataclass(frozen=True)
 class DeadTimeState:
     """What ``mean_counts`` carries over chunks. position: [...] mean signed count so far, modulo 1. heading:
-    [...] 1 where the last counts were ON, -1 where they were OFF. begun: [PHASES, ...] what a group had kept when its
-    last event began. kept: [N, PHASES, ...] what it had kept at ago_s: [N] seconds
+    [...] 1 where the last counts were ON, -1 where they were OFF. begun: [PHASES, ...] what a group had kept
+    when its last event began. kept: [N, PHASES, ...] what it had kept at ago_s: [N] seconds
     before the end, the last one 0. All keep their graph."""
 
     position: Tensor
@@ -60,13 +62,14 @@ def mean_counts(
     """Mean counts behind a dead time, of levels linear between frames.
 
     Args:
-      level: [T + 1, ...] log levels. centre: [...] of the play at the first one. thetas: ON, OFF, 0-dim or [...].
+      level: [T + 1, ...] log levels. centre: [...] of the play at the first one. thetas: ON, OFF, 0-dim or
+        [...].
       interval_s: [T] float64 lengths. refractory_s: 0-dim, > 0. state: DeadTimeState of an earlier chunk.
     Returns: kept counts [T, 2, ...], ON first; the play's centre [...]; DeadTimeState.
     Gradient: level, centre, thetas, refractory_s, state; exact, of the recursion.
     Raises: DomainError for a dead time that reaches over more than MOST_ROWS intervals.
-    Cost: one pass forward and two backward; beside counts and gradients some 15 numbers per part (a fifth of the
-      dead time, or an interval) and pixel.
+    Cost: one pass forward and two backward; beside counts and gradients some 15 numbers per part (a fifth of
+      the dead time, or an interval) and pixel.
     """
     dead_s = torch.as_tensor(refractory_s, dtype=torch.float64)
     thetas = [torch.as_tensor(theta).to(level) for theta in thetas]
@@ -125,8 +128,8 @@ class _Kept(Function):
 
 
 def _cut(interval_s, refractory_s, ago_s):
-    """Parts of the intervals, at most a fifth of the dead time long, as the kernel wants them; the times [rows] that
-    it knows what was kept at, of the state's rows and of the ends of parts."""
+    """Parts of the intervals, at most a fifth of the dead time long, as the kernel wants them; the times
+    [rows] that it knows what was kept at, of the state's rows and of the ends of parts."""
     ends_s = torch.cat((interval_s.new_zeros(1), interval_s.cumsum(0)))
     interval, share, fine_s = parts(ends_s, refractory_s / STEPS)
     first = len(ago_s) - 1
@@ -143,7 +146,8 @@ def _cut(interval_s, refractory_s, ago_s):
     reach = max(int(back.max()) + 1, _wanted(rows_s[-1] - rows_s, refractory_s))
     if reach > MOST_ROWS:
         raise DomainError(
-            f"the dead time of {refractory_s:g} s reaches over {int(back.max())} intervals; its gradient over fewer "
+            f"the dead time of {refractory_s:g} s reaches over {int(back.max())} intervals; its gradient "
+            "over fewer "
             f"than {MOST_ROWS}: give fewer frames per second."
         )
     reach = -(-reach // 4) * 4  # few sizes, and so few kernels
@@ -157,7 +161,8 @@ def _wanted(ago_s, refractory_s):
 
 
 def reaches(interval_s: Tensor, refractory_s: float) -> bool:
-    """Whether a dead time is long enough beside the intervals for the recursion; otherwise ``local_share``."""
+    """Whether a dead time is long enough beside the intervals for the recursion; otherwise
+    ``local_share``."""
     return refractory_s * FEWEST >= float(interval_s.max())
 
 
@@ -178,12 +183,13 @@ def load(
 def warn_beyond(
     level: Tensor, thetas: Sequence[Tensor], interval_s: Tensor, refractory_s: Tensor | float
 ) -> None:
-    """Warn where rate x dead time is beyond ``MOST_LOAD``, the mean over events, or beyond ``THRESHOLD_LOAD`` where
-    thresholds have gradients."""
+    """Warn where rate x dead time is beyond ``MOST_LOAD``, the mean over events, or beyond ``THRESHOLD_LOAD``
+    where thresholds have gradients."""
     most = load(level, thetas, interval_s, refractory_s)
     if most > MOST_LOAD:
         warnings.warn(
-            f"rate x dead time is {most:.2g} for the average event, of which about one in {most + 0.5:.2g} is "
+            f"rate x dead time is {most:.2g} for the average event, of which about one in {most + 0.5:.2g} "
+            "is "
             f"kept; gradients are measured up to {MOST_LOAD:g} (docs/events.md). Beyond, which event is kept "
             "depends on each one before, and the gradient of a shift is lost first (cosine 0.45 against "
             "differences at 8.8): shorten the dead time or raise the thresholds.",
@@ -192,8 +198,10 @@ def warn_beyond(
     elif most > THRESHOLD_LOAD and any(theta.requires_grad for theta in thetas):
         # no figure in it, so that a design loop says it once
         warnings.warn(
-            f"rate x dead time is above {THRESHOLD_LOAD:g} for the average event: gradients to thresholds, one apart from "
-            "the other, may point wrong there (docs/events.md); shorten the dead time, or set thresholds by differences.",
+            f"rate x dead time is above {THRESHOLD_LOAD:g} for the average event: gradients to thresholds, "
+            "one apart from "
+            "the other, may point wrong there (docs/events.md); shorten the dead time, or set thresholds "
+            "by differences.",
             stacklevel=4,
         )
 

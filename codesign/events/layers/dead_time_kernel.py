@@ -1,11 +1,11 @@
-"""The recursion of ``dead_time`` behind the play of the mean count, as a drjit loop over time per pixel: forward and
-adjoint.
+"""The recursion of ``dead_time`` behind the play of the mean count, as a drjit loop over time per pixel:
+forward and adjoint.
 
-Intervals are cut into parts. A pixel carries the centre of its play, its mean count so far (position), and of every
-group of phases what it had kept when its last event began, and what it had kept at the ends of the parts within a
-dead time (rows). Rows lie in memory local to the pixel's thread: ``reach`` before a block of parts, then those of
-the block. The forward loop stores the state at the beginning of every block; the adjoint goes from block to block
-backward, walks each forward once more, and then back.
+Intervals are cut into parts. A pixel carries the centre of its play, its mean count so far (position), and of
+every group of phases what it had kept when its last event began, and what it had kept at the ends of the
+parts within a dead time (rows). Rows lie in memory local to the pixel's thread: ``reach`` before a block of
+parts, then those of the block. The forward loop stores the state at the beginning of every block; the adjoint
+goes from block to block backward, walks each forward once more, and then back.
 """
 
 from dataclasses import dataclass
@@ -23,9 +23,11 @@ BLOCK = 32  # parts, at least
 
 @dataclass(frozen=True)
 class Parts:
-    """Parts of intervals. interval: [N] that each lies in. share: [N] of the interval that has passed at its end.
-    back: [N] >= 1 rows from its start to the row before the look, a dead time before its middle; blend: [N] of the
-    way from that row to the next; slope: [N] of blend, per second of dead time, negative sign left out.
+    """Parts of intervals. interval: [N] that each lies in. share: [N] of the interval that has passed at its
+    end.
+    back: [N] >= 1 rows from its start to the row before the look, a dead time before its middle; blend: [N]
+    of the way from that row to the next; slope: [N] of blend, per second of dead time, negative sign left
+    out.
     reach: rows to keep."""
 
     interval: Tensor
@@ -113,8 +115,8 @@ class Run(Loop):
         return first, self.dr.minimum(self.count - first, self.size)
 
     def given(self, rows, part, now, centre, position, begun):
-        """What ``step`` takes: of the pixel, then of every group when its last event began, now, and at the rows
-        around a dead time ago."""
+        """What ``step`` takes: of the pixel, then of every group when its last event began, now, and at the
+        rows around a dead time ago."""
         interval = self.of_part(self.interval, part)
         low = self.gather(self.values, interval)
         high = self.gather(self.values, interval + 1)
@@ -129,8 +131,8 @@ class Run(Loop):
         return [level, self.theta_on, self.theta_off, blend, centre, position, *groups]
 
     def step(self, heading, level, theta_on, theta_off, blend, centre, position, *groups):
-        """One part, as drjit differentiates it. Returns where the play heads now; kept counts, centre, position, and of
-        every group what it had kept when its last event began, and what it has kept now."""
+        """One part, as drjit differentiates it. Returns where the play heads now; kept counts, centre,
+        position, and of every group what it had kept when its last event began, and what it has kept now."""
         dr = self.dr
         half = (theta_on + theta_off) * 0.25
         rise, fall = (dr.select(far > 0, far, 0) for far in (level - centre - half, centre - half - level))
@@ -150,7 +152,8 @@ class Run(Loop):
             end = start + total
             border = dr.floor(dr.detach(start)) + 1
             begins = dr.floor(dr.detach(end)) >= border
-            # masses of the event begun before this part, and of the one that begins in it; further ones are lost to it
+            # masses of the event begun before this part, and of the one that begins in it; further ones are
+            # lost to it
             early = dr.select(begins, border, _filled(dr, end)) - _filled(dr, start)
             late = dr.select(begins, _at_most_one(dr, _filled(dr, end) - border), 0)
             early = early * _at_most_one(dr, 1 - (begun - free))
@@ -173,8 +176,8 @@ class Run(Loop):
         return 2 * self.of_part(self.interval, part) + self.dr.select(ahead < 0, self.arr.UInt32(1), 0)
 
     def pull(self, seed, target, pulls, pull, rows, part, now, centre, position, heading, begun):
-        """One part backward. pulls: gradients of the state after it, by name; pull: of the rows. Returns those of the
-        state before it."""
+        """One part backward. pulls: gradients of the state after it, by name; pull: of the rows. Returns
+        those of the state before it."""
         given = self.given(rows, part, now, centre, position, begun)
         ahead = self.dr.detach(self.step(heading, *given)[0])
         seeds = [self.gather(seed, self.place(part, ahead)), pulls["centre"], pulls["position"]]
@@ -227,7 +230,8 @@ def _at_most_one(dr, share):
 def forward(parts, level, theta_on, theta_off, centre, position, heading, begun, rows):
     """Kept counts [T, 2, ...] of levels [T + 1, ...]; the state after them; the stored states.
 
-    Args: centre, position, heading: [...]. begun: [PHASES, ...]. rows: [reach, PHASES, ...], the last one now.
+    Args: centre, position, heading: [...]. begun: [PHASES, ...]. rows: [reach, PHASES, ...], the last one
+      now.
     """
     run = Run(parts, level, theta_on, theta_off)
     target = run.nothing(2 * (len(level) - 1))
@@ -293,9 +297,11 @@ def forward(parts, level, theta_on, theta_off, centre, position, heading, begun,
 
 @exclusive
 def adjoint(parts, level, theta_on, theta_off, stored, grad_kept, grad_after):
-    """Adjoint of ``forward``: gradients of level, theta_on, theta_off [...], dead time [...] and of the state.
+    """Adjoint of ``forward``: gradients of level, theta_on, theta_off [...], dead time [...] and of the
+    state.
 
-    Args: stored: of ``forward``. grad_kept: [T, 2, ...]. grad_after: of the state after, in the order of ``forward``.
+    Args: stored: of ``forward``. grad_kept: [T, 2, ...]. grad_after: of the state after, in the order of
+      ``forward``.
     """
     run = Run(parts, level, theta_on, theta_off)
     dr = run.dr

@@ -1,4 +1,5 @@
-"""Event layers as modules: one call for all of them, and learnable sensor values as unconstrained variables."""
+"""Event layers as modules: one call for all of them, and learnable sensor values as unconstrained
+variables."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -136,7 +137,8 @@ class EventLayer(nn.Module):
 
         Args: as for ``forward``. state: what the chunk before returned, which brings its own generators; then
           T frames give T intervals. None: the first chunk.
-        Returns: counts [..., T-1, 2, H, W] ([..., T, 2, H, W] with a state); state to carry on, with its graph.
+        Returns: counts [..., T-1, 2, H, W] ([..., T, 2, H, W] with a state); state to carry on, with its
+          graph.
         """
         check_axes(frames)
         if state is not None and generator is not None:
@@ -227,8 +229,8 @@ class EventLayer(nn.Module):
 
         Args: as for ``forward``. tau_s: time in which the surface fades to 1/e, seconds, > 0.
         Returns: [..., T-1, 2, H, W] in 0 to 1, ON first.
-        Gradient: of layers that count whole events as ``surface_from_hard_counts`` of these counts, of others as
-          ``surface_from_counts``.
+        Gradient: of layers that count whole events as ``surface_from_hard_counts`` of these counts, of others
+          as ``surface_from_counts``.
         Raises: as ``forward``; DomainError for tau.
         """
         tau_s = check_tau(tau_s)
@@ -272,11 +274,13 @@ def _generators(generator, batch):
 
 
 class Settled(nn.Module):
-    """An event layer whose events in the first ``lead_s`` are not read; frames begin as much before the window.
+    """An event layer whose events in the first ``lead_s`` are not read; frames begin as much before the
+    window.
 
     A few time constants of the sensor's bandwidth are enough, and as much motion as makes an event or two.
 
-    Args: layer: of ``events.layer``. lead_s: length of a whole number of intervals between frames, seconds, >= 0.
+    Args: layer: of ``events.layer``. lead_s: length of a whole number of intervals between frames, seconds,
+      >= 0.
 
     >>> import torch
     >>> from codesign import events
@@ -296,7 +300,8 @@ class Settled(nn.Module):
     def volume(
         self, frames: Tensor, t_s: Tensor, bins: int, generator: Generator | None = None
     ) -> EventVolume:
-        """Events after the lead in time bins, [B, 2, bins, H, W]. Args and gradient: as ``EventLayer.volume``.
+        """Events after the lead in time bins, [B, 2, bins, H, W]. Args and gradient: as
+        ``EventLayer.volume``.
         Raises: DomainError when no frame stands at the end of the lead."""
         return self.layer._volume(frames, t_s, bins, generator, self.lead_s)
 
@@ -313,7 +318,8 @@ def check_lead(lead_s: float) -> float:
 class HardSensor(nn.Module):
     """``events.simulate`` and ``events.from_stream`` called like an event layer.
 
-    Args: sensor: SensorModel. bins: time bins of the volume. lead_s: events before it are not read (``Settled``).
+    Args: sensor: SensorModel. bins: time bins of the volume. lead_s: events before it are not read
+      (``Settled``).
     """
 
     def __init__(self, sensor: SensorModel, bins: int, lead_s: float = 0.0):

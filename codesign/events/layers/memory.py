@@ -44,12 +44,13 @@ def memory(
       counts: [T-1, 2, ...] ([T, 2, ...] with a state), ON first, whole numbers >= 0.
       state: [2, ...] the memorised level, and the centre of its play (below), to carry on. It keeps its
         graph: detach it to cut the gradient between chunks.
-    Gradient: frames, thetas, state: of the mean count over all places of a pixel inside its thresholds (straight
-      through the rounding): D = L - r begins evenly from -theta_off/2 to theta_on/2. After a turn of the signal
-      the mean count stays 0 until the way back exceeds the threshold of that side. For equal thresholds this is
-      a play, exactly. For unequal ones:
+    Gradient: frames, thetas, state: of the mean count over all places of a pixel inside its thresholds
+      (straight through the rounding): D = L - r begins evenly from -theta_off/2 to theta_on/2. After a turn
+      of the signal the mean count stays 0 until the way back exceeds the threshold of that side. For equal
+      thresholds this is a play, exactly. For unequal ones:
         "exact": of the ideal sensor, by pairs of pixels followed from every turn. Slopes beat against the
-          thresholds: a wide step's mean slope is met only over many pixels or places. To the thresholds as "play".
+          thresholds: a wide step's mean slope is met only over many pixels or places. To the thresholds as
+            "play".
         "play": of width (theta_on + theta_off)/2, the mean over the scatter of real thresholds; smooth.
         None: "exact" where all pixels share one pair of thresholds that differ by more than a quarter, else
           "play". docs/events.md has both in figures.
@@ -120,8 +121,8 @@ def soft_counts(
 
 
 def _gradient(name, theta_on, theta_off, steers):
-    """The gradient that the thresholds [...] ask for where the caller leaves it open. steers: whether one may be
-    asked for at all."""
+    """The gradient that the thresholds [...] ask for where the caller leaves it open. steers: whether one may
+    be asked for at all."""
     if name not in (None, *GRADIENTS):
         raise DomainError(f"gradient is {name!r}; allowed: {', '.join(map(repr, GRADIENTS))}, or None.")
     if name is not None:

@@ -5,28 +5,30 @@ Forward, with L the log level, r the memorised level and C the threshold on the 
 r|/C), r += C n.
 
 Backward is the play of width w = (C_on + C_off)/2 and centre m that the mean of n follows over where in its
-threshold a pixel happens to stand (exactly for C_on = C_off, see docs/events.md; ``turns_adjoint`` is exact for
-all). It moves only where L leaves it, by as much as L does: n_on = (L - m - w/2)/C_on, n_off = (m - w/2 - L)/C_off,
-and the edge then stands at L. So an engaged step pulls at its own level, and pushes at the level of the step
-engaged before: the loop forward in time writes both.
+threshold a pixel happens to stand (exactly for C_on = C_off, see docs/events.md; ``turns_adjoint`` is exact
+for all). It moves only where L leaves it, by as much as L does: n_on = (L - m - w/2)/C_on, n_off = (m - w/2 -
+L)/C_off, and the edge then stands at L. So an engaged step pulls at its own level, and pushes at the level of
+the step engaged before: the loop forward in time writes both.
 
 The exact gradient of the mean count for unequal thresholds, as one drjit loop over time per pixel.
 
-The mean runs over all places that a pixel may begin at: its memorised level r evenly over a box. A small move of
-one level L_s makes the pixels that then stand on the brink fire at s, or not, and moves nothing else. So with f
-the density on the brink (ON: r = L_s - C_on before, r = L_s after; OFF: r = L_s + C_off before, L_s after)
+The mean runs over all places that a pixel may begin at: its memorised level r evenly over a box. A small move
+of one level L_s makes the pixels that then stand on the brink fire at s, or not, and moves nothing else. So
+with f the density on the brink (ON: r = L_s - C_on before, r = L_s after; OFF: r = L_s + C_off before, L_s
+after)
 
-    d mean(loss) / d L_s = f (J(fired) - J(not fired)),      J(r): what a pixel at r adds to the loss from s on,
+    d mean(loss) / d L_s = f (J(fired) - J(not fired)),  J(r): what a pixel at r adds to the loss from s on,
 
-for ON, and the negative for OFF: a **pair** of pixels, ``plus`` and ``minus``, C apart, simulated from s on by the
-rule of the hard sensor. In the inside of a monotone stretch they meet in the very next step; a pair born at a turn
-lives until they meet. For equal thresholds they meet when the way back has reached C, and what is left is the
-play of ``play_adjoint``; unequal ones may never meet.
+for ON, and the negative for OFF: a **pair** of pixels, ``plus`` and ``minus``, C apart, simulated from s on
+by the rule of the hard sensor. In the inside of a monotone stretch they meet in the very next step; a pair
+born at a turn lives until they meet. For equal thresholds they meet when the way back has reached C, and what
+is left is the play of ``play_adjoint``; unequal ones may never meet.
 
-The pairs are also the edges of the density: of all pixels above ``plus`` and ``minus``, weight f lies between.
-Whatever passes the brink in a step changes the density there, f = -sum of weight (n_plus - n_minus) in signed
-counts n, and the box begins as a pair of its own. A pixel keeps ``PAIRS`` pairs beside the youngest. Where a turn
-needs more, the pair with the least weight x distance is spread evenly over the threshold in use: mass is kept.
+The pairs are also the edges of the density: of all pixels above ``plus`` and ``minus``, weight f lies
+between. Whatever passes the brink in a step changes the density there, f = -sum of weight (n_plus - n_minus)
+in signed counts n, and the box begins as a pair of its own. A pixel keeps ``PAIRS`` pairs beside the
+youngest. Where a turn needs more, the pair with the least weight x distance is spread evenly over the
+threshold in use: mass is kept.
 """
 
 from codesign.events.layers.pixel_loop import Loop
@@ -147,10 +149,11 @@ def play_adjoint(
 
 @exclusive
 def turns_adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, grad_end, *, first):
-    """Gradients of the frames [first + T, ...] (rows before ``first`` are left to the caller) and of the place of
-    the box that the pixels begin in, [...].
+    """Gradients of the frames [first + T, ...] (rows before ``first`` are left to the caller) and of the
+    place of the box that the pixels begin in, [...].
 
-    Args: as for ``memory_kernel.turns_adjoint``; the box lies from centre - theta_on/2 to centre + theta_off/2.
+    Args: as for ``memory_kernel.turns_adjoint``; the box lies from centre - theta_on/2 to centre +
+      theta_off/2.
     """
     loop = Loop(frames, theta_on, theta_off)
     dr = loop.dr
@@ -191,8 +194,8 @@ def turns_adjoint(frames, start, theta_on, theta_off, front_end, grad_counts, gr
 
 
 class _Pairs:
-    """The pairs of one step, the youngest first. Each is six values: plus, minus, weight, gradient, slope of the
-    front end at the frame that it belongs to, and that frame."""
+    """The pairs of one step, the youngest first. Each is six values: plus, minus, weight, gradient, slope of
+    the front end at the frame that it belongs to, and that frame."""
 
     def __init__(self, loop, level, before, slots):
         dr = loop.dr

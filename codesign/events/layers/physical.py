@@ -27,7 +27,8 @@ from codesign.events.sensor.state import SensorState
 @dataclass(frozen=True)
 class PhysicalState:
     """What ``sensor_counts`` carries over chunks. sensor: SensorState of the hard sensor; reference, level:
-    [...] of the smooth account (their graph is kept); frame: [...] last frame; time_s: time of the last frame;
+    [...] of the smooth account (their graph is kept); frame: [...] last frame; time_s: time of the last
+    frame;
     dead: state of the dead time's account, None where no gradient was asked."""
 
     sensor: SensorState
@@ -66,13 +67,16 @@ def sensor_counts(
         theta_sigma, cutoff_hz, refractory_s (0-dim).
     Returns: counts [T-1, 2, ...] whole numbers, ON first; PhysicalState.
     Gradient: frames and design, as above; docs/events.md has each against differences of the hard counts.
-      With a dead time, over a step, cosine (scale) by rate x dead time of the average event, 240 frames per second:
+      With a dead time, over a step, cosine (scale) by rate x dead time of the average event, 240 frames per
+      second:
         0.7: contrast 1.00 (0.99), focus 0.98 (0.92), shift by a pixel 0.93 (0.92), thresholds 1.00 (1.02),
           dead time 1.00 (0.89)
-        2.9: contrast 1.00 (0.99), focus 0.98 (0.98), shift 0.90 (0.92), thresholds 0.96 (0.93), dead time 1.00 (0.98)
+        2.9: contrast 1.00 (0.99), focus 0.98 (0.98), shift 0.90 (0.92), thresholds 0.96 (0.93), dead time
+        1.00 (0.98)
         8.8: contrast 0.98 (0.89), focus 0.86 (0.99), shift 0.45 (0.84)
-    Warns: UserWarning where rate x dead time exceeds 5, or 2 with gradients to thresholds: one threshold alone had
-      cosine 0.11 to 0.96 at 2.6 to 2.9, by signal (the play of the mean width does not follow fast turns).
+    Warns: UserWarning where rate x dead time exceeds 5, or 2 with gradients to thresholds: one threshold
+      alone had cosine 0.11 to 0.96 at 2.6 to 2.9, by signal (the play of the mean width does not follow fast
+      turns).
     Raises: DomainError for other names in ``design`` (they have no gradient) or values outside the sensor's
       domain, or a dead time that its gradient cannot follow over thousands of intervals; and as ``simulate``.
     """
@@ -134,8 +138,8 @@ def _drawn(theta, sigma, deviate, level):
 
 
 def _mean_counts(seen, thetas, interval_s, refractory_s, state):
-    """Counts with the slopes of their mean over places inside the threshold and behind the dead time, [T-1, 2,
-    ...]; the states of ``memory`` and of the dead time after them."""
+    """Counts with the slopes of their mean over places inside the threshold and behind the dead time, [T-1,
+    2, ...]; the states of ``memory`` and of the dead time after them."""
     start = seen[0] if state is None else state.reference
     slopes = [seen, start, *thetas, refractory_s]
     if not (torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in slopes)):

@@ -7,10 +7,10 @@ interval lie on one side. Noise events are a Poisson process in continuous time:
 that must still pass until its next one, so nothing depends on the frame rate or on chunks, and nothing is
 drawn in vain.
 
-A sink is where events go, sortable 64-bit keys or dense counts per frame interval. It gives ``tally`` (what it carries
-through the events of one interval of a pixel), ``take`` (one event), ``close`` (the end of the interval) and
-``arrays`` (what to evaluate). Random numbers are hashes of a key per pixel and a counter, without a state, so that
-chunks and threads change nothing.
+A sink is where events go, sortable 64-bit keys or dense counts per frame interval. It gives ``tally`` (what
+it carries through the events of one interval of a pixel), ``take`` (one event), ``close`` (the end of the
+interval) and ``arrays`` (what to evaluate). Random numbers are hashes of a key per pixel and a counter,
+without a state, so that chunks and threads change nothing.
 """
 
 import math

@@ -94,7 +94,8 @@ class SensorModel:
                     else ""
                 )
                 raise DomainError(
-                    f"SensorModel.{field.name} is {shown(value)} ({type(value).__name__}); a finite Python number "
+                    f"SensorModel.{field.name} is {shown(value)} ({type(value).__name__}); a finite Python "
+                    "number "
                     f"{'> 0' if positive else '>= 0'} is needed{hint}."
                 )
         if self.hot_pixel_share > 1:
@@ -189,7 +190,8 @@ def with_design(sensor: SensorModel, design: Mapping[str, Tensor | float]) -> Se
     """The sensor with the numbers of design variables in place of its own.
 
     Args: design: numbers or 0-dim tensors by name, of DESIGN.
-    Raises: DomainError for another name, a value that is no number or outside the sensor's domain, and one of 0
+    Raises: DomainError for another name, a value that is no number or outside the sensor's domain, and one of
+      0
       that requires a gradient: what is switched off has none.
     """
     values = {}
@@ -205,7 +207,8 @@ def with_design(sensor: SensorModel, design: Mapping[str, Tensor | float]) -> Se
         values[name] = as_number(value.detach() if isinstance(value, Tensor) else value, name)
         if isinstance(value, Tensor) and value.requires_grad and values[name] == 0:
             raise DomainError(
-                f"{name} is 0, which switches it off, and requires a gradient, which is then none; start above "
+                f"{name} is 0, which switches it off, and requires a gradient, which is then none; start "
+                "above "
                 "0."
             )
     return replace(check_sensor(sensor), **values)
@@ -245,8 +248,8 @@ def draw_thresholds(
 
 
 def thresholds(sensor, pixels, deviates, *, dtype, device):
-    """Thresholds ON and OFF of every pixel, [*pixels] each, of the standard normal numbers drawn for them; these are
-    not looked at without a mismatch."""
+    """Thresholds ON and OFF of every pixel, [*pixels] each, of the standard normal numbers drawn for them;
+    these are not looked at without a mismatch."""
     nominal = sensor.theta_on, sensor.theta_off
     if sensor.theta_sigma == 0:
         return tuple(torch.tensor(theta, dtype=dtype, device=device).expand(pixels) for theta in nominal)
@@ -276,8 +279,8 @@ def mismatched(theta: Tensor | float, sigma: Tensor | float, deviate: Tensor) ->
 def draw_leaks(
     sensor: SensorModel, pixels: Sequence[int], generator: Generator, *, dtype: torch.dtype = torch.float32
 ) -> tuple[Tensor | None, Tensor | None]:
-    """What makes the leaks of pixels differ, drawn only where the sensor has it: standard normal numbers of the spread,
-    then even ones in 0 to 1, by which pixels are hot. [*pixels] each, or None."""
+    """What makes the leaks of pixels differ, drawn only where the sensor has it: standard normal numbers of
+    the spread, then even ones in 0 to 1, by which pixels are hot. [*pixels] each, or None."""
     pixels = tuple(pixels)
     place: dict[str, Any] = {"generator": generator, "device": generator.device}
     return (

@@ -49,8 +49,9 @@ def simulate(
       state: SensorState carried over chunks, changed in place; empty for the first. Later chunks start with
         the frame after the last one seen, and may
         hold a single frame. Any chunking gives the events of the whole. A later chunk may have another sensor
-        (biases that change in a recording): its pixels keep the numbers drawn for them, and those that stand beyond
-        their new thresholds fire at once. What the first sensor had not, and needs draws or a memory, is refused.
+        (biases that change in a recording): its pixels keep the numbers drawn for them, and those that stand
+        beyond their new thresholds fire at once. What the first sensor had not, and needs draws or a memory,
+        is refused.
       log_input: frames are natural-log levels (of the 0-255 scale where the sensor's speed or noise depends
         on intensity).
       log_eps: level is ln(I + log_eps) instead of lin-log, for linear frames of high dynamic range (ESIM:
@@ -151,7 +152,8 @@ def dense_counts(
 
 def _open(frames, t_s, sensor, generator, state, front_end):
     """Check what can be checked without reading every frame, and begin an empty state with the first. Returns
-    the frames and times still to be seen, the generator, and what a changed sensor fires at once (``change``)."""
+    the frames and times still to be seen, the generator, and what a changed sensor fires at once
+    (``change``)."""
     fresh = state.level is None
     check_layout(frames, minimum=2 if fresh else 1)
     times_s = check_times(t_s, len(frames)).tolist()

@@ -19,8 +19,10 @@ class SensorState:
     start_s, time_s: times of the first and the last frame. generator: used when none is passed; starts at
       seed 0. Only where the sensor needs them: reference_rest: [H, W] what rounding took from the memorised
       level (not for timing "v2e"); input_level, input: [H, W] last log level before the low-pass,
-      last intensity; noise: [H, W] photoreceptor noise; leak_hz: [H, W] as it is now; deviate_on, deviate_off,
-      leak_spread, leak_heat: [H, W] numbers drawn for thresholds and leaks; last_event_s: [H, W] time of the last event (since the first frame for timing "v2e", since the last frame otherwise, so <= 0); hazard:
+      last intensity; noise: [H, W] photoreceptor noise; leak_hz: [H, W] as it is now; deviate_on,
+      deviate_off,
+      leak_spread, leak_heat: [H, W] numbers drawn for thresholds and leaks; last_event_s: [H, W] time of the
+      last event (since the first frame for timing "v2e", since the last frame otherwise, so <= 0); hazard:
       [H, W] noise still to pass until the next noise event; key, shots: [H, W] int32 random key and noise
       events so far.
     """
@@ -130,12 +132,12 @@ def begin(state, sensor, frame, level, time_s, generator):
 
 
 def change(state, sensor):
-    """Give the pixels of a state the values of a sensor, which may be another than before: its thresholds and leaks by
-    the numbers drawn at first, and no noise where it has none.
+    """Give the pixels of a state the values of a sensor, which may be another than before: its thresholds and
+    leaks by the numbers drawn at first, and no noise where it has none.
 
-    Returns: [2, H, W] events, ON first, of pixels that stand beyond their thresholds now (at the time of the last frame;
-      the memorised level moves by them), None where nothing of that kind has changed, or with the timing of v2e,
-      which looks at the ends of intervals alone.
+    Returns: [2, H, W] events, ON first, of pixels that stand beyond their thresholds now (at the time of the
+      last frame; the memorised level moves by them), None where nothing of that kind has changed, or with the
+      timing of v2e, which looks at the ends of intervals alone.
     """
     before = state.theta_on, state.theta_off
     quiets = state.noise is not None and not sensor.photoreceptor_noise and bool(state.noise.any())

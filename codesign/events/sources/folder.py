@@ -129,7 +129,8 @@ def _tiff(path, file):
         check_room(path, page.shape, page.dtype.itemsize, MOST_RATIO * path.stat().st_size)
         if len(page.shape) not in (2, 3) or page.compression not in PACKINGS or page.is_tiled:
             raise FileFormatError(
-                f"{path} is packed as {page.compression.name}, in tiles or in depth; save it plain, or packed by zlib."
+                f"{path} is packed as {page.compression.name}, in tiles or in depth; save it plain, or "
+                "packed by zlib."
             )
         with contextlib.suppress(IndexError):
             pages.pages.get(1)

@@ -49,7 +49,8 @@ def open_mraw(path):
     rate = facts.get("rate", "").split("/")[0]
     if not NUMBER.fullmatch(rate) or int(rate) == 0:
         raise FileFormatError(
-            f"the description of {path.name} gives the record rate {str(facts.get('rate'))[:40]!r}; a whole number of "
+            f"the description of {path.name} gives the record rate {str(facts.get('rate'))[:40]!r}; a "
+            "whole number of "
             "frames per second is needed."
         )
     if bits not in (8, 12, 16) or width * height * bits % 8:
@@ -117,6 +118,7 @@ def _facts(path):
 def _number(facts, name, path):
     if not NUMBER.fullmatch(facts.get(name, "")):
         raise FileFormatError(
-            f"the description of {path.name} gives {name} as {str(facts.get(name))[:40]!r}; a whole number is needed."
+            f"the description of {path.name} gives {name} as {str(facts.get(name))[:40]!r}; a whole number "
+            "is needed."
         )
     return int(facts[name])

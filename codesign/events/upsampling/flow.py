@@ -1,6 +1,6 @@
-"""Optical flow between two frames, both ways, from coarse to fine: total variation of the flow against the absolute
-brightness difference at every scale, and block matches at a coarse one, which find what a coarse picture no longer
-shows.
+"""Optical flow between two frames, both ways, from coarse to fine: total variation of the flow against the
+absolute brightness difference at every scale, and block matches at a coarse one, which find what a coarse
+picture no longer shows.
 """
 
 import math
@@ -108,8 +108,8 @@ def refined(first, second, flow, warps, iterations):
         solver in between.
     Returns: [B, 2, H, W]. Where the flow leaves the picture it follows its neighbours.
     Source: Zach, Pock and Bischof, A duality based approach for realtime TV-L1 optical flow, DAGM 2007;
-      gradients averaged over both pictures and a median_of_nine filter between warps as in Wedel et al., An improved
-      algorithm for TV-L1 optical flow, 2009.
+      gradients averaged over both pictures and a median_of_nine filter between warps as in Wedel et al., An
+      improved algorithm for TV-L1 optical flow, 2009.
     """
     dual_x = torch.zeros_like(flow)
     dual_y = torch.zeros_like(flow)

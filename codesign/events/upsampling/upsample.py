@@ -1,5 +1,5 @@
-"""Video to a higher frame rate, so that events see motion and not jumps: frames between frames, each scene point on its
-straight way from one to the other, hidden ones taken from the frame that shows them.
+"""Video to a higher frame rate, so that events see motion and not jumps: frames between frames, each scene
+point on its straight way from one to the other, hidden ones taken from the frame that shows them.
 """
 
 import math

@@ -1,5 +1,5 @@
-"""Figures of events: their rate over time, one line per polarity, and a space-time plot, with time along one axis and
-the sensor across it.
+"""Figures of events: their rate over time, one line per polarity, and a space-time plot, with time along one
+axis and the sensor across it.
 """
 
 from typing import Any

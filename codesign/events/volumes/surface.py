@@ -1,11 +1,12 @@
 """Time surfaces: how long ago the last event was, per pixel and polarity, as exp(-(t_ref - t_last) / tau); 0
 where none was yet.
 
-The gradient of the surface of hard counts is that of its mean over where pixels stand inside their thresholds. In
-the mean over places inside a threshold C it is (1/C) times the integral of exp(-age/tau) over the last C of level
-that the pixel went through: later crossings hide what fired more than a threshold before. One hard pixel does not
-know where that window ends, but its own last event lies evenly in it and the one before evenly in the threshold
-behind, so the mean of the windows that begin at either is right to first order in their length.
+The gradient of the surface of hard counts is that of its mean over where pixels stand inside their
+thresholds. In the mean over places inside a threshold C it is (1/C) times the integral of exp(-age/tau) over
+the last C of level
+that the pixel went through: later crossings hide what fired more than a threshold before. One hard pixel does
+not know where that window ends, but its own last event lies evenly in it and the one before evenly in the
+threshold behind, so the mean of the windows that begin at either is right to first order in their length.
 """
 
 import math
@@ -152,14 +153,15 @@ def surface_from_hard_counts(
     """Time surface at given times of events that sit at the middles of their intervals.
 
     Args:
-      counts: [T-1, 2, ..., H, W] whole numbers >= 0, ON first, of short intervals (``EventLayer.finely``). t_s:
-        [T] seconds, strictly increasing. at_s: [K] reference times, seconds, strictly increasing; an interval
-        belongs to those at or after its end. tau_s: seconds, > 0.
+      counts: [T-1, 2, ..., H, W] whole numbers >= 0, ON first, of short intervals (``EventLayer.finely``).
+        t_s: [T] seconds, strictly increasing. at_s: [K] reference times, seconds, strictly increasing; an
+        interval belongs to those at or after its end. tau_s: seconds, > 0.
     Returns: [K, 2, ..., H, W] exp(-age/tau) of the last event, 0 where none was yet.
     Gradient: counts: made for counts that carry the slope of their mean (``memory``), then that of the mean
-      surface over beginnings, to first order in exp(-age/tau) per threshold, and where a level did not turn since.
-      None for the surface as a function of a count.
-    Raises: ShapeError, DomainError as ``from_counts``; DomainError for counts that are not whole, and for tau.
+      surface over beginnings, to first order in exp(-age/tau) per threshold, and where a level did not turn
+      since. None for the surface as a function of a count.
+    Raises: ShapeError, DomainError as ``from_counts``; DomainError for counts that are not whole, and for
+      tau.
     Source: the surface: Lagorce et al., HOTS, PAMI 2017; the gradient is ours.
     """
     tau_s = check_tau(tau_s)
@@ -203,12 +205,13 @@ class _LastEvents(Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, grad):  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Once back through time. A surface joins in at the last interval that it sees; its windows leave at the
-        event that they begin at, the last one or the one before it."""
+        """Once back through time. A surface joins in at the last interval that it sees; its windows leave at
+        the event that they begin at, the last one or the one before it."""
         counts, last, before = ctx.saved_tensors
         seen, middle_s, at_s, tau_s = ctx.course
         pull = torch.zeros(counts.shape, dtype=grad.dtype, device=grad.device)
-        # of the surfaces whose last event is not met yet, and of those with one event met: what an event now would
+        # of the surfaces whose last event is not met yet, and of those with one event met: what an event now
+        # would
         # show, less what the windows' beginnings show
         now = torch.zeros_like(pull[0])
         begun = now

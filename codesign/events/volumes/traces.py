@@ -128,5 +128,6 @@ def segments(stream, at_us):
 
 
 def check_tau(tau_s):
-    """A fading time as a float; DomainError unless it is a finite number of seconds of at least a nanosecond."""
+    """A fading time as a float; DomainError unless it is a finite number of seconds of at least a
+    nanosecond."""
     return check_positive(tau_s, "tau_s", " s", NANOSECOND)
