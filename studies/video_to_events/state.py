@@ -1,7 +1,6 @@
 """What a run of video_to_events keeps, so that an interrupted one ends with the same events: the events so
 far, how far it has come, and how far pixels step from frame to frame."""
 
-import dataclasses
 from bisect import bisect_right
 from dataclasses import dataclass, field
 
@@ -141,15 +140,11 @@ class Progress:
             tensors["before"] = self.before
         names = ("next_frame", "facts", "events", "on", "simulated", "largest", "seconds")
         numbers = {name: getattr(self, name) for name in names}
-        numbers["sensor"] = {}
-        for each in dataclasses.fields(self.sensor):
-            value = getattr(self.sensor, each.name)
-            if isinstance(value, Tensor):
-                tensors[f"sensor.{each.name}"] = value.contiguous()
-            elif isinstance(value, torch.Generator):
-                tensors["generator"] = value.get_state()
-            elif value is not None:
-                numbers["sensor"][each.name] = value
+        numbers["sensor"] = {"start_s": self.sensor.start_s, "time_s": self.sensor.time_s}
+        for name, value in self.sensor.tensors().items():
+            tensors[f"sensor.{name}"] = value.contiguous()
+        assert self.sensor.generator is not None
+        tensors["generator"] = self.sensor.generator.get_state()
         run.save_state(tensors, numbers)
 
     @classmethod

@@ -74,14 +74,13 @@ def simulate(
     >>> stream.t_us.tolist(), stream.p.tolist()  # 0.2, 0.4 and 0.6 of ln 2
     ([2885, 5771, 8656], [1, 1, 1])
     """
-    state = SensorState() if state is None else state
-    check_state(state, check_sensor(sensor))
-    moved = replace(state)
-    front_end = FrontEnd(log_input, log_eps)
+    check_sensor(sensor)
     check_layout(frames, minimum=1)
     if frames.ndim != 3:
         raise ShapeError(f"frames have shape {list(frames.shape)}; [T, H, W] is needed.")
-    frames, times_s, generator, at_once = _open(frames, t_s, sensor, generator, moved, front_end)
+    front_end = FrontEnd(log_input, log_eps)
+    state = SensorState() if state is None else state
+    moved, frames, times_s, generator, at_once = _open(frames, t_s, sensor, generator, state, front_end)
     start_us = round(moved.time_s * 1e6)
     height_px, width_px = frames.shape[1:]
     if sensor.timing == "v2e":
@@ -132,11 +131,9 @@ def dense_counts(
             f"dense counts come from timing 'interpolated', the sensor has {sensor.timing!r}; use simulate "
             "and to_counts."
         )
-    state = SensorState() if state is None else state
-    check_state(state, sensor)
-    moved = replace(state)
     front_end = FrontEnd(log_input, log_eps)
-    frames, times_s, generator, at_once = _open(frames, t_s, sensor, generator, moved, front_end)
+    state = SensorState() if state is None else state
+    moved, frames, times_s, generator, at_once = _open(frames, t_s, sensor, generator, state, front_end)
     import drjit as dr
 
     sink = DenseCounts(dr, backend.arrays(frames.device.type, frames.dtype), len(frames), frames[0].numel())
@@ -151,9 +148,11 @@ def dense_counts(
 
 
 def _open(frames, t_s, sensor, generator, state, front_end):
-    """Check what can be checked without reading every frame, and begin an empty state with the first. Returns
-    the frames and times still to be seen, the generator, and what a changed sensor fires at once
-    (``change``)."""
+    """Check what can be checked without reading every frame, and begin a copy of an empty state with the
+    first. Returns the copy, the frames and times still to be seen, the generator, and what a changed sensor
+    fires at once (``change``)."""
+    check_state(state, sensor)
+    state = replace(state)
     fresh = state.level is None
     check_layout(frames, minimum=2 if fresh else 1)
     times_s = check_times(t_s, len(frames)).tolist()
@@ -168,15 +167,9 @@ def _open(frames, t_s, sensor, generator, state, front_end):
             level = v2e.front_end(frames[:1]) if front_end == FrontEnd() else front_end.level(frames[:1])
         else:
             level, _ = kernel_levels(frames[:1], front_end)  # as those of all later frames
-        begin(
-            state,
-            sensor,
-            frames[0].exp() if front_end.log_input else frames[0],
-            level[0],
-            times_s[0],
-            generator,
-        )
-        return frames[1:], times_s[1:], generator, None
+        intensity = frames[0].exp() if front_end.log_input else frames[0]
+        begin(state, sensor, intensity, level[0], times_s[0], generator)
+        return state, frames[1:], times_s[1:], generator, None
     shape = state.level.shape
     dtype = state.level.dtype
     if shape != frames.shape[1:] or (dtype != frames.dtype and sensor.timing != "v2e"):
@@ -189,7 +182,7 @@ def _open(frames, t_s, sensor, generator, state, front_end):
             f"the chunk starts at {times_s[0]!r} s, the last frame seen was at {state.time_s!r} s; times "
             "must go on increasing."
         )
-    return frames, times_s, generator, change(state, sensor)
+    return state, frames, times_s, generator, change(state, sensor)
 
 
 def _fired(counts, t_us):
@@ -205,11 +198,8 @@ def _v2e_events(frames, times_s, sensor, generator, state, front_end):
     for frame, time_s in zip(frames, times_s, strict=True):
         check_frames(frame[None], 1, non_negative=not front_end.log_input)
         level = v2e.front_end(frame) if front_end == FrontEnd() else front_end.level(frame)
-        parts.append(
-            v2e.interval(
-                frame.exp() if front_end.log_input else frame, level, time_s, sensor, generator, state
-            )
-        )
+        intensity = frame.exp() if front_end.log_input else frame
+        parts.append(v2e.interval(intensity, level, time_s, sensor, generator, state))
     t_us, x, y, p = (torch.cat(column) for column in zip(*parts, strict=True))
     return ordered(t_us, x, y, p, *frames.shape[1:])
 
