@@ -108,15 +108,6 @@ class Table:
         at = self._field(place)
         return number(self.path, self.data, at, code) if at else default
 
-    def pair(self, place):
-        """Two int32 of a struct in a field."""
-        at = self._field(place)
-        return (
-            (number(self.path, self.data, at, "<i"), number(self.path, self.data, at + 4, "<i"))
-            if at
-            else (0, 0)
-        )
-
     def array(self, place, dtype) -> np.ndarray:
         """[N] numpy array of a vector of scalars or structs; empty when the field is absent. It shares the
         buffer's memory."""
@@ -128,21 +119,16 @@ class Table:
         dtype = np.dtype(dtype)
         if at + 4 + count * dtype.itemsize > len(self.data):
             raise damaged(
-                self.path, f"a list of {count} entries of {dtype.itemsize} bytes at byte {at}", len(self.data)
+                self.path, f"a block of {len(self.data)} bytes points to {count} entries outside itself"
             )
         return np.frombuffer(self.data, dtype, count, at + 4)
 
-    def tables(self, place, count):
-        """The tables of a vector of tables, of which there must be ``count``."""
+    def tables(self, place):
+        """The tables of a vector of tables."""
         at = self._field(place)
-        starts = self.array(place, "<u4")
-        if len(starts) != count:
-            raise FileFormatError(
-                f"{self.path}: a list has {len(starts)} entries where {count} are needed; the file is "
-                "damaged."
-            )
         first = at + number(self.path, self.data, at, "<I") + 4 if at else 0
-        return [Table(self.path, self.data, first + 4 * k + int(start)) for k, start in enumerate(starts)]
+        starts = self.array(place, "<u4").tolist()
+        return [Table(self.path, self.data, first + 4 * k + start) for k, start in enumerate(starts)]
 
 
 def root(path, data, identifier):
@@ -150,43 +136,30 @@ def root(path, data, identifier):
     schema."""
     size = number(path, data, 0, "<I")
     if size + 4 != len(data) or data[8:12] != identifier:
-        raise FileFormatError(
-            f"{path}: a block of {len(data)} bytes says {size} and {data[8:12]!r}; {len(data) - 4} and "
-            f"{identifier!r} are needed; the file is damaged."
-        )
+        what = f"a block of {len(data)} bytes says {size} and {data[8:12]!r}"
+        raise damaged(path, f"{what}; {len(data) - 4} and {identifier!r} are needed")
     return Table(path, data, 4 + number(path, data, 4, "<I"))
 
 
 def number(path, data, at, code):
     """The number at a byte, by its ``struct`` code."""
     if at < 0 or at + struct.calcsize(code) > len(data):
-        raise damaged(path, f"a number at byte {at}", len(data))
+        raise damaged(path, f"a block of {len(data)} bytes points to byte {at}, outside itself")
     return struct.unpack_from(code, data, at)[0]
 
 
-def damaged(path, what, size):
-    """The error for anything that lies outside its block."""
-    return FileFormatError(
-        f"{path}: a block of {size} bytes points to {what}, outside itself; the file is damaged."
-    )
-
-
-@dataclass(frozen=True)
-class Packet:
-    """One packet: stream number, where its bytes begin in the file, how many they are, and its unpacked
-    FlatBuffer."""
-
-    stream: int
-    at: int
-    size: int
-    body: bytes
+def damaged(path, what):
+    """The error for what cannot be."""
+    return FileFormatError(f"{path}: {what}; the file was cut or is damaged.")
 
 
 def read_container(path, kind):
-    """(packets of the one stream of a kind, its sensor size (height_px, width_px) or None, rows of the table
-    or None).
+    """(FlatBuffers of the packets of the one stream of a kind, its sensor size (height_px, width_px) or
+    None).
 
-    Args: path: file. kind: four letters, "EVTS" (events) or "FRME" (frames).
+    Args:
+      path: file.
+      kind: four letters, "EVTS" (events) or "FRME" (frames).
     Raises: FileFormatError for another kind of file, damage, a file cut short, or not exactly one stream of
       the kind.
     """
@@ -203,26 +176,17 @@ def read_container(path, kind):
         )
     table_at = header.scalar(1, "<q", -1)
     if table_at != -1 and not start <= table_at <= len(data):
-        raise FileFormatError(
-            f"{path}: the table of packets is said to lie at byte {table_at} of {len(data)}; the file was "
-            "cut or is damaged."
-        )
+        raise damaged(path, f"the table of packets is said to lie at byte {table_at} of {len(data)}")
     wanted, size = _stream(path, header.array(2, "u1").tobytes(), kind)
     places = _places(path, data, start, len(data) if table_at == -1 else table_at)
-    packets = [
-        Packet(stream, at, count, unpacked(path, data[at : at + count], compression))
-        for stream, at, count in places
-        if stream == wanted
-    ]
-    rows = None
     if table_at != -1:
-        rows = _listed(path, unpacked(path, data[table_at:], compression), len(places))
-        if [row[:3] for row in rows] != places:
-            raise FileFormatError(
-                f"{path}: the table at the end lists other packets than the file holds; the file is damaged."
-            )
-        rows = [row for row in rows if row[0] == wanted]
-    return packets, size, rows
+        table = root(path, unpacked(path, data[table_at:], compression), b"FTAB").tables(0)
+        listed = [(entry.scalar(0, "<q"), entry.scalar(1, "<q")) for entry in table]
+        # a packet is told by its stream and size, the eight bytes ahead of it
+        if listed != [(at, number(path, data, at - 8, "<q")) for _, at, _ in places]:
+            raise damaged(path, "the table at the end lists other packets than the file holds")
+    mine = [data[at : at + count] for stream, at, count in places if stream == wanted]
+    return [unpacked(path, body, compression) for body in mine], size
 
 
 def unpacked(path, data, compression):
@@ -230,23 +194,18 @@ def unpacked(path, data, compression):
     limit = LIMIT_RATIO * len(data) + LIMIT_EXTRA_BYTES
     if compression == NONE:
         return data
-    with reading(f"{path}: a block of {len(data)} bytes", "the file is damaged"):
+    block = f"a block of {len(data)} bytes"
+    with reading(f"{path}: {block}", "the file is damaged"):
         if compression in (LZ4, LZ4_HIGH):
             unpacker = lz4_frame.LZ4FrameDecompressor()
             body = unpacker.decompress(data, max_length=limit)
         else:
             unpacker = zstandard.ZstdDecompressor(max_window_size=2**27).decompressobj()
             if zstandard.frame_content_size(data) > limit:
-                raise FileFormatError(
-                    f"{path}: a block of {len(data)} bytes claims to hold more than {limit} bytes; the "
-                    "file is damaged."
-                )
+                raise damaged(path, f"{block} claims to hold more than {limit} bytes")
             body = unpacker.decompress(data)
     if not unpacker.eof or unpacker.unused_data:
-        raise FileFormatError(
-            f"{path}: a block of {len(data)} bytes ends early, goes on too long, or holds more than {limit} "
-            "bytes; the file is damaged."
-        )
+        raise damaged(path, f"{block} ends early, goes on too long, or holds more than {limit} bytes")
     return body
 
 
@@ -254,37 +213,12 @@ def _places(path, data, at, stop):
     """[(stream, first byte, bytes)] of the packets between two places of the file."""
     places = []
     while at < stop:
-        if at + 8 > stop:
-            raise FileFormatError(
-                f"{path} ends amid a packet's header, at byte {at}; it was cut, copy it again."
-            )
-        stream, count = struct.unpack_from("<ii", data, at)
+        stream, count = struct.unpack_from("<ii", data, at) if at + 8 <= stop else (0, -1)
         if count < 0 or at + 8 + count > stop:
-            raise FileFormatError(
-                f"{path}: the packet at byte {at} claims {count} bytes, {stop - at - 8} are left; the file "
-                "was cut or is damaged."
-            )
+            raise damaged(path, f"the packet at byte {at} claims {count} bytes, {stop - at - 8} are left")
         places.append((stream, at + 8, count))
         at += 8 + count
     return places
-
-
-def _listed(path, body, count):
-    """[(stream, first byte, bytes, elements, first time, last time)] of the table at the end."""
-    rows = []
-    for entry in root(path, body, b"FTAB").tables(0, count):
-        stream, count = entry.pair(1)
-        rows.append(
-            (
-                stream,
-                entry.scalar(0, "<q"),
-                count,
-                entry.scalar(2, "<q"),
-                entry.scalar(3, "<q"),
-                entry.scalar(4, "<q"),
-            )
-        )
-    return rows
 
 
 def _stream(path, text, kind):
@@ -312,15 +246,10 @@ def _stream(path, text, kind):
     ]
     number = streams[0].get("name", "")
     sides = [size for size in sizes if size is not None]
-    if (
-        not STREAM_NUMBER.fullmatch(number)
-        or not all(SIDE.fullmatch(side) for side in sides)
-        or len(sides) not in (0, 2)
-    ):
-        raise FileFormatError(
-            f"{path}: stream number and sensor size are given as {number!r} and {sides}; whole numbers are "
-            "needed, the file is damaged."
-        )
+    whole = STREAM_NUMBER.fullmatch(number) and all(SIDE.fullmatch(side) for side in sides)
+    if not whole or len(sides) not in (0, 2):
+        what = f"stream number and sensor size are given as {number!r} and {sides}"
+        raise damaged(path, f"{what}; whole numbers are needed")
     return int(number), (tuple(int(side) for side in sides) or None)
 
 
@@ -336,14 +265,8 @@ def read_aedat4(path, asked):
     Raises: FileFormatError for damage, for a file cut short, without a single stream of events, or whose
       times go back (see arrival).
     """
-    packets, size, rows = read_container(path, "EVTS")
-    parts = [root(path, packet.body, b"EVTS").array(0, EVENT) for packet in packets]
-    for part, row in zip(parts, rows or (), strict=rows is not None):
-        if len(part) != row[3] or (len(part) and (part["t"][0], part["t"][-1]) != row[4:]):
-            raise FileFormatError(
-                f"{path}: a packet of {len(part)} events is listed with {row[3]} from {row[4]} to {row[5]} "
-                "us, which it does not hold; the file is damaged."
-            )
+    packets, size = read_container(path, "EVTS")
+    parts = [root(path, body, b"EVTS").array(0, EVENT) for body in packets]
     events = np.concatenate(parts) if parts else np.empty(0, EVENT)
     return arranged(path, asked, *(events[name] for name in ("t", "x", "y", "on")), size=size)
 
@@ -434,43 +357,30 @@ def read_frames(path: str | Path) -> RecordedFrames:
       or has frames in colour or of several sizes.
     """
     path = check_regular(check_path(path))
-    packets, size, _ = read_container(path, "FRME")
+    packets, size = read_container(path, "FRME")
     if not packets:
         raise FileFormatError(f"{path} holds no frame.")
-    tables = [root(path, packet.body, b"FRME") for packet in packets]
     frames = []
     times_us = []
-    for table in tables:
-        height_px = table.scalar(HEIGHT, "<h")
-        width_px = table.scalar(WIDTH, "<h")
+    for nth, body in enumerate(packets):
+        table = root(path, body, b"FRME")
+        sides = table.scalar(HEIGHT, "<h"), table.scalar(WIDTH, "<h")
         pixels = table.array(PIXELS, "u1")
-        if table.scalar(FORMAT, "<b") != GRAY:
+        shown = f"{sides[1]} x {sides[0]} pixels"
+        if (kind := table.scalar(FORMAT, "<b")) != GRAY:
+            raise FileFormatError(f"{path}: frame {nth} has pixel format {kind}; 0 (8-bit grey) is read.")
+        if min(sides) < 1 or pixels.size != sides[0] * sides[1]:
+            raise damaged(path, f"frame {nth} has {pixels.size} values for {shown}")
+        if sides != (size or sides) or table.scalar(LEFT, "<h") or table.scalar(TOP, "<h"):
             raise FileFormatError(
-                f"{path}: frame {len(frames)} has pixel format {table.scalar(FORMAT, '<b')}; 0 (8-bit grey) "
-                "is read."
+                f"{path}: frame {nth} shows {shown}, a part of the sensor; whole frames are read."
             )
-        if height_px < 1 or width_px < 1 or pixels.size != height_px * width_px:
-            raise FileFormatError(
-                f"{path}: frame {len(frames)} has {pixels.size} values for {width_px} x {height_px} pixels; "
-                "the file is damaged."
-            )
-        if (height_px, width_px) != (size or (height_px, width_px)) or (
-            table.scalar(LEFT, "<h"),
-            table.scalar(TOP, "<h"),
-        ) != (0, 0):
-            raise FileFormatError(
-                f"{path}: frame {len(frames)} shows {width_px} x {height_px} pixels, a part of the sensor; "
-                "whole frames are read."
-            )
-        size = height_px, width_px
+        size = sides
         frames.append(pixels.reshape(size))
         times_us.append(_exposure_us(table))
+        if times_us[-1][1] < times_us[-1][0]:
+            raise damaged(path, f"frame {nth} ends its exposure before it starts")
     start_us, end_us = torch.tensor(times_us, dtype=torch.int64).unbind(1)
-    if bool((end_us < start_us).any()):
-        raise FileFormatError(
-            f"{path}: frame {int((end_us < start_us).nonzero()[0])} ends its exposure before it starts; the "
-            "file is damaged."
-        )
     return RecordedFrames(torch.from_numpy(np.stack(frames)), start_us, end_us)
 
 
