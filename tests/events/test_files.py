@@ -12,16 +12,7 @@ from codesign.events import read, write
 from codesign.events.formats import text
 from codesign.events.stream import ordered
 from codesign.flow.sources import read_recording
-
-FIELDS = ("t_us", "x", "y", "p")
-
-
-def random_events(count=20_000, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    t_us = torch.randint(0, 2**50, (count,), generator=generator)  # beyond 2^32
-    x, y, p = (torch.randint(0, high, (count,), generator=generator) for high in (346, 260, 2))
-    return ordered(t_us, x, y, 2 * p - 1, 260, 346)
-
+from tests.event_streams import FIELDS, random_stream
 
 EVENTS = [[7, 1_400_000, 2_000_000], [3, 0, 9], [0, 5, 2], [-1, 1, 1]]  # t_us, x, y, p
 T_US = np.array(EVENTS[0])
@@ -233,7 +224,7 @@ def test_npz_of_something_else_is_refused(tmp_path):
 
 
 def test_unknown_extensions_and_missing_places_are_refused(tmp_path):
-    stream = random_events(3)
+    stream = random_stream(3, 260, 346, 100)
     for name in ("e.log", "e"):
         with pytest.raises(FileFormatError, match=r"\.csv, \.dat, \.h5, \.hdf5, \.npy, \.npz, \.raw, \.txt"):
             read(tmp_path / name)

@@ -13,15 +13,11 @@ from codesign.errors import FileFormatError
 from codesign.events import read, write
 from codesign.events.formats.aedat4 import read_frames
 from codesign.events.stream import ordered
+from tests.event_streams import same, stream_of
 
-FIELDS = ("t_us", "x", "y", "p")
 RECORDING = "data/davis346_newton_cradle/demo-01.aedat4"
+DAVIS = {"height_px": 260, "width_px": 346}
 MAGIC = b"#!AER-DAT4.0\r\n"
-
-
-def stream_of(*events, height_px=260, width_px=346):
-    t_us, x, y, p = torch.tensor(events).unbind(1)
-    return ordered(t_us, x, y, p, height_px, width_px)
 
 
 def blocks(data):
@@ -104,7 +100,7 @@ def test_packets_and_header_are_laid_out_as_in_the_recording(shared, tmp_path):
 
 def test_every_compression_and_a_missing_table_are_read(tmp_path):
     path = tmp_path / "e.aedat4"
-    stream = stream_of((5, 1, 2, 1), (9, 3, 4, -1))
+    stream = stream_of((5, 1, 2, 1), (9, 3, 4, -1), **DAVIS)
     write(path, stream)
     header, packets, _ = blocks(path.read_bytes())
     body = lz4.frame.decompress(packets[0][2])
@@ -117,7 +113,7 @@ def test_every_compression_and_a_missing_table_are_read(tmp_path):
         struct.pack_into("<q", changed, 14 + 40, -1)  # recording was interrupted
         path.write_bytes(changed)
         back = read(path)
-        assert all(torch.equal(getattr(stream, name), getattr(back, name)) for name in FIELDS)
+        assert same(stream, back)
 
 
 def with_text(path, change):
@@ -143,7 +139,7 @@ def with_text(path, change):
 )
 def test_malformed_files_are_refused(tmp_path, change, words):
     path = tmp_path / "e.aedat4"
-    write(path, stream_of((5, 1, 2, 1), (9, 3, 4, -1)))
+    write(path, stream_of((5, 1, 2, 1), (9, 3, 4, -1), **DAVIS))
     with_text(path, change)
     with pytest.raises(FileFormatError, match=words):
         read(path)
@@ -151,7 +147,7 @@ def test_malformed_files_are_refused(tmp_path, change, words):
 
 def test_a_cut_file_and_missing_frames_are_refused(tmp_path):
     path = tmp_path / "e.aedat4"
-    write(path, stream_of((5, 1, 2, 1), (9, 3, 4, -1)))
+    write(path, stream_of((5, 1, 2, 1), (9, 3, 4, -1), **DAVIS))
     with pytest.raises(FileFormatError, match="0 streams of kind FRME"):
         read_frames(path)
     with pytest.raises(FileFormatError, match="no file lies"):
@@ -163,7 +159,7 @@ def test_a_cut_file_and_missing_frames_are_refused(tmp_path):
 
 def test_a_block_that_unpacks_without_end_is_refused(tmp_path):
     path = tmp_path / "e.aedat4"
-    write(path, stream_of((5, 1, 2, 1)))
+    write(path, stream_of((5, 1, 2, 1), **DAVIS))
     header, _, _ = blocks(path.read_bytes())
     for code, bomb in (
         (1, lz4.frame.compress(bytes(2**26))),
@@ -204,7 +200,7 @@ def test_aedat2_holds_mirrored_addresses_and_big_endian_times(tmp_path, extensio
 def test_aedat2_never_lets_an_event_pass_for_a_header_line(tmp_path):
     # row 140 from the bottom: its address begins with '#'
     path = tmp_path / "e.aedat2"
-    stream = stream_of((7, 1, 259 - 140, 1))
+    stream = stream_of((7, 1, 259 - 140, 1), **DAVIS)
     write(path, stream)
     data = path.read_bytes().split(b"#End Of ASCII Header\r\n", 1)[1]
     assert data[:1] != b"#"
@@ -218,8 +214,8 @@ def test_aedat2_never_lets_an_event_pass_for_a_header_line(tmp_path):
             stream_of((0, 1, 1, 1), height_px=480, width_px=640),
             "346 x 260 and 240 x 180 pixels, not 640 x 480",
         ),
-        (stream_of((2**31, 1, 1, 1)), "holds 0 to 2147483647"),
-        (stream_of((-1, 1, 1, 1)), "times span -1"),
+        (stream_of((2**31, 1, 1, 1), **DAVIS), "holds 0 to 2147483647"),
+        (stream_of((-1, 1, 1, 1), **DAVIS), "times span -1"),
     ],
 )
 def test_aedat2_refuses_what_it_cannot_hold(tmp_path, stream, words):

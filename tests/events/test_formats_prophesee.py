@@ -3,20 +3,14 @@ published bit layout."""
 
 import numpy as np
 import pytest
-import torch
 
 from codesign.errors import FileFormatError
 from codesign.events import read, write
-from codesign.events.stream import ordered
+from tests.event_streams import rows, stream_of
 
-FIELDS = ("t_us", "x", "y", "p")
 EVT3 = b"% evt 3.0\n% format EVT3;height=720;width=1280\n% geometry 1280x720\n% end\n"
 EVT2 = b"% evt 2.0\n% geometry 640x480\n% end\n"
 DAT = b"% Data file containing CD events\n% Version 2\n% Width 640\n% Height 480\n\x0c\x08"
-
-
-def rows(stream):
-    return [tuple(row) for row in torch.stack([getattr(stream, name) for name in FIELDS], 1).tolist()]
 
 
 def evt3(*words):
@@ -38,11 +32,6 @@ def dat(*events):
 
 def words_of(path, dtype):
     return np.frombuffer(path.read_bytes().split(b"% end\n")[1], dtype).tolist()
-
-
-def stream_of(*events, height_px=480, width_px=640):
-    t_us, x, y, p = torch.tensor(events).unbind(1)
-    return ordered(t_us, x, y, p, height_px, width_px)
 
 
 def test_a_recording_decodes_as_another_program_decodes_it(shared):

@@ -1,24 +1,13 @@
 """Round trips of 200,000 random events, exact in every format that can hold them."""
 
-from functools import cache
-
 import pytest
 import torch
 
 from codesign.events import read, write
 from codesign.events.stream import ordered
+from tests.event_streams import random_stream, same
 
 EPOCH_US = 1_643_243_628_737_093  # a clock that counts from 1970
-
-
-@cache
-def random_stream(first_us, span_us):
-    """Events with many equal times, every column, row and polarity of a 640 x 480 sensor."""
-    generator = torch.Generator().manual_seed(0)
-    t_us, x, y, p = (
-        torch.randint(0, high, (200_000,), generator=generator) for high in (span_us, 640, 480, 2)
-    )
-    return ordered(first_us + t_us, x, y, 2 * p - 1, 480, 640)
 
 
 def told(name):
@@ -44,10 +33,10 @@ def told(name):
     ],
 )
 def test_many_events_come_back_exactly(tmp_path, name, first_us, span_us, options):
-    stream = random_stream(first_us, span_us)
+    stream = random_stream(200_000, 480, 640, span_us - 1, first_us)
     write(tmp_path / name, stream, **options)
     back = read(tmp_path / name, **told(name))
-    assert all(torch.equal(getattr(stream, field), getattr(back, field)) for field in ("t_us", "x", "y", "p"))
+    assert same(stream, back)
     assert (back.height_px, back.width_px) == (480, 640)
 
 

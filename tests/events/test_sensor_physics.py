@@ -10,15 +10,11 @@ from scipy.integrate import solve_ivp
 
 from codesign.errors import DomainError
 from codesign.events import SensorModel, SensorState, concatenate, dense_counts, simulate, to_counts
+from tests.event_streams import same
 
-FIELDS = ("t_us", "x", "y", "p")
 EVERYTHING = SensorModel(
     0.15, 0.2, 0.03, cutoff_hz=60.0, leak_rate_hz=3.0, leak_jitter=0.2, rate_cov_decades=0.2, shot_rate_hz=20.0, refractory_s=2e-3, hot_pixel_share=0.05, hot_pixel_rate_hz=80.0
 )  # fmt: skip
-
-
-def same(first, second):
-    return all(torch.equal(getattr(first, name), getattr(second, name)) for name in FIELDS)
 
 
 def clip(frames=30, dtype=torch.float32):

@@ -18,12 +18,6 @@ from codesign.events import (
 )
 from codesign.events.stream import ordered
 
-FIELDS = ("t_us", "x", "y", "p")
-
-
-def same(first, second):
-    return all(torch.equal(getattr(first, name), getattr(second, name)) for name in FIELDS)
-
 
 def intensity(level):
     """Frames whose lin-log level is ``level`` (>= 3)."""

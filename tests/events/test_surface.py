@@ -9,19 +9,11 @@ from codesign.events.stream import ordered
 from codesign.events.volumes.surface import surface_from_counts, surface_from_stream, surface_from_times
 from codesign.events.volumes.traces import decay, decay_from_stream
 from codesign.types import EventStream
+from tests.event_streams import random_stream
 
 D = torch.float64
 EPOCH_US = 1_700_000_000_000_000
 TAU_S = 0.013
-
-
-def random_stream(count=400, height=3, width=4, last_us=100_000, offset_us=0, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-
-    def draw(high):
-        return torch.randint(0, high, (count,), generator=generator)
-
-    return ordered(draw(last_us + 1) + offset_us, draw(width), draw(height), draw(2) * 2 - 1, height, width)
 
 
 def by_hand(stream, at_us, last_only):
@@ -39,7 +31,7 @@ def by_hand(stream, at_us, last_only):
 
 @pytest.mark.parametrize("offset_us", [0, EPOCH_US])
 def test_streams_give_surface_and_trace_as_defined_at_any_time(offset_us):
-    stream = random_stream(offset_us=offset_us)
+    stream = random_stream(400, 3, 4, 100_000, offset_us)
     at_us = [
         offset_us + time_us
         for time_us in (-5, 17_000, 17_001, int(stream.t_us[200]) - offset_us, 100_000, 130_000)
@@ -58,7 +50,7 @@ def test_streams_give_surface_and_trace_as_defined_at_any_time(offset_us):
 
 
 def test_a_trace_goes_on_where_an_earlier_chunk_ended():
-    stream = random_stream()
+    stream = random_stream(400, 3, 4, 100_000)
     cut_us = 41_000
     early, late = (
         EventStream(stream.t_us[part], stream.x[part], stream.y[part], stream.p[part], 3, 4)
@@ -70,7 +62,7 @@ def test_a_trace_goes_on_where_an_earlier_chunk_ended():
 
 
 def test_real_times_give_the_surface_of_the_same_whole_microseconds():
-    stream = random_stream()
+    stream = random_stream(400, 3, 4, 100_000)
     shuffled = torch.randperm(400, generator=torch.Generator().manual_seed(1))
     at_us = [17_000, 100_000]
     t_s, x, y, p = (column[shuffled] for column in (stream.t_us.to(D) * 1e-6, stream.x, stream.y, stream.p))

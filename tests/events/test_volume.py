@@ -6,17 +6,7 @@ import torch
 from codesign.events import from_counts, from_stream
 from codesign.events.volumes.volume import spikes_from_counts, spikes_from_stream, stream_from_spikes
 from codesign.types import EventStream
-
-
-def random_stream(count, height, width, last_us, seed=0, offset_us=0):
-    generator = torch.Generator().manual_seed(seed)
-
-    def draw(high):
-        return torch.randint(0, high, (count,), generator=generator)
-
-    return EventStream(
-        draw(last_us + 1).sort().values + offset_us, draw(width), draw(height), draw(2) * 2 - 1, height, width
-    )
+from tests.event_streams import random_stream
 
 
 @pytest.mark.parametrize("bins", [1, 2, 5, 9])
@@ -71,7 +61,7 @@ def test_gradient_of_a_volume_is_its_share():
 @pytest.mark.parametrize("bins", [1, 2, 5])
 @pytest.mark.parametrize("offset_us", [0, 1_700_000_000_000_000])
 def test_stream_events_are_conserved_and_shared_by_time(bins, offset_us):
-    stream = random_stream(5000, 3, 4, 100_000, offset_us=offset_us)
+    stream = random_stream(5000, 3, 4, 100_000, first_us=offset_us)
     volume = from_stream(stream, offset_us, offset_us + 100_000, bins, dtype=torch.float64)
     truth = torch.zeros(2, bins, 3, 4, dtype=torch.float64)
     for t, x, y, p in zip(
@@ -118,7 +108,7 @@ def test_the_window_holds_both_ends_and_nothing_else():
 
 def test_spikes_are_events_per_step_and_go_back_exactly():
     offset_us = 1_700_000_000_000_000
-    stream = random_stream(3000, 3, 4, 99_999, offset_us=offset_us)
+    stream = random_stream(3000, 3, 4, 99_999, first_us=offset_us)
     spikes = spikes_from_stream(stream, offset_us, 1000, 100)
     truth = torch.zeros(2, 4, 3, 100)
     for t, x, y, p in zip(
