@@ -106,6 +106,26 @@ class Run(Loop):
             mode=self.dr.ReduceMode.NoConflicts,
         )
 
+    def fill(self, rows, source, place=0, at=0):
+        """Rows in the memory of a thread, from ``at`` on, as they stand in a source from row ``place`` on."""
+
+        def read(row, rows):
+            for group, mine in enumerate(rows):
+                mine[at + row] = self.gather(source, place + row * PHASES + group)
+            return (rows,)
+
+        return self.repeat(self.reach, read, rows)[0]
+
+    def keep(self, rows, target, place=0, at=0):
+        """The other way round."""
+
+        def write(row, rows):
+            for group, mine in enumerate(rows):
+                self.scatter(target, mine[at + row], place + row * PHASES + group)
+            return (rows,)
+
+        return self.repeat(self.reach, write, rows)[0]
+
     def of_part(self, source, part):
         return self.dr.gather(type(source), source, part)
 
@@ -237,26 +257,19 @@ def forward(parts, level, theta_on, theta_off, centre, position, heading, begun,
     target = run.nothing(2 * (len(level) - 1))
     stored = run.fresh(run.blocks * run.stored * run.width)
     behind = run.fresh(run.reach * PHASES * run.width)
-    begun_rows = run.load(rows)
-    local = run.local(run.reach + run.size)
-
-    def begin(row, local):
-        for group, mine in enumerate(local):
-            mine[run.size + row] = run.gather(begun_rows, row * PHASES + group)
-        return (local,)
+    local = run.fill(run.local(run.reach + run.size), run.load(rows), at=run.size)
 
     def walk_block(block, centre, position, heading, begun, local):
         first, size = run.ends(block)
         place = block * run.stored
 
         def shift(row, local):
-            for group, mine in enumerate(local):
-                value = mine[run.size + row]
-                mine[row] = value
-                run.scatter(stored, value, place + row * PHASES + group)
+            for mine in local:
+                mine[row] = mine[run.size + row]
             return (local,)
 
         (local,) = run.repeat(run.reach, shift, local)
+        local = run.keep(local, stored, place)
         for index, value in enumerate((*begun, centre, position, heading)):
             run.scatter(stored, value, place + run.reach * PHASES + index)
 
@@ -270,17 +283,10 @@ def forward(parts, level, theta_on, theta_off, centre, position, heading, begun,
 
         return run.repeat(size, walk, centre, position, heading, begun, local)
 
-    (local,) = run.repeat(run.reach, begin, local)
     start = (*map(run.load, (centre, position, heading)), [run.load(one) for one in begun])
     centre, position, heading, begun, local = run.repeat(run.blocks, walk_block, *start, local)
     last = run.count - (run.blocks - 1) * run.size
-
-    def write(row, local):
-        for group, mine in enumerate(local):
-            run.scatter(behind, mine[last + row], row * PHASES + group)
-        return (local,)
-
-    run.repeat(run.reach, write, local)
+    run.keep(local, behind, at=last)
     run.dr.eval(target, stored, behind, centre, position, heading, begun)
     run.dr.sync_thread()
     shape = level.shape[1:]
@@ -307,34 +313,15 @@ def adjoint(parts, level, theta_on, theta_off, stored, grad_kept, grad_after):
     dr = run.dr
     seed = run.load(grad_kept)
     target = run.nothing(len(level))
-    ahead = run.load(grad_after[4])
     before = run.fresh(run.reach * PHASES * run.width)
-
-    def begin(row, pull):
-        for group, mine in enumerate(pull):
-            mine[row] = run.gather(ahead, row * PHASES + group)
-        return (pull,)
-
-    def end(row, pull):
-        for group, mine in enumerate(pull):
-            run.scatter(before, mine[row], row * PHASES + group)
-        return (pull,)
 
     def back_block(done, pulls, pull, local, path):
         block = run.blocks - 1 - done
         first, size = run.ends(block)
         place = block * run.stored
-
-        def restore(row, local):
-            for group, mine in enumerate(local):
-                mine[row] = run.gather(stored, place + row * PHASES + group)
-            return (local,)
-
-        (local,) = run.repeat(run.reach, restore, local)
-        begun = [run.gather(stored, place + run.reach * PHASES + group) for group in range(PHASES)]
-        centre = run.gather(stored, place + run.reach * PHASES + PHASES)
-        position = run.gather(stored, place + run.reach * PHASES + PHASES + 1)
-        heading = run.gather(stored, place + run.reach * PHASES + PHASES + 2)
+        local = run.fill(local, stored, place)
+        state = place + run.reach * PHASES
+        *begun, centre, position, heading = (run.gather(stored, state + k) for k in range(PHASES + 3))
 
         def walk(index, centre, position, heading, begun, local, path):
             for mine, value in zip(path, (*begun, centre, position, heading), strict=True):
@@ -365,8 +352,7 @@ def adjoint(parts, level, theta_on, theta_off, stored, grad_kept, grad_after):
 
         return run.repeat(size, back, pulls, pull, local, path)
 
-    pull = run.local(run.reach + run.size)
-    (pull,) = run.repeat(run.reach, begin, pull)
+    pull = run.fill(run.local(run.reach + run.size), run.load(grad_after[4]))
     pulls = {
         "centre": run.load(grad_after[0]),
         "position": run.load(grad_after[1]),
@@ -377,7 +363,7 @@ def adjoint(parts, level, theta_on, theta_off, stored, grad_kept, grad_after):
     }
     path = run.local(run.size, PHASES + 3)
     pulls, pull, *_ = run.repeat(run.blocks, back_block, pulls, pull, run.local(run.reach + run.size), path)
-    run.repeat(run.reach, end, pull)
+    run.keep(pull, before)
     dr.eval(target, before, pulls)
     dr.sync_thread()
     shape = level.shape[1:]
