@@ -95,16 +95,14 @@ def read_columns(path: Path, asked: Asked) -> EventColumns:
     if path.suffix.lower() not in TABLES and (asked.columns, asked.time_unit) != ("auto", "auto"):
         raise FileFormatError(
             f"{path} has one order of columns and one clock by its format; leave columns and time_unit "
-            "away (they are "
-            f"for {', '.join(TABLES)})."
+            f"away (they are for {', '.join(TABLES)})."
         )
     with reading(check_regular(path)):
         columns = reader(path, asked)
     if not max(columns.height_px, columns.width_px) <= LIMIT_PX:
         raise FileFormatError(
             f"{path} gives a sensor of {columns.width_px} x {columns.height_px} pixels; at most {LIMIT_PX} "
-            "a side are "
-            "read."
+            "a side are read."
         )
     return columns
 

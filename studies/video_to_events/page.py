@@ -143,10 +143,8 @@ def warnings(view, state, sensor, slow):
     """What the reader must know before the events are used, in sentences."""
     share = (
         f"Of the pixels that make events, {state.large_share:.1%} step by {LARGE} thresholds or more from "
-        "one frame "
-        "to the next. What happens inside such a step is not in the video: its events lie on a straight "
-        "line of log "
-        "intensity between two frames."
+        "one frame to the next. What happens inside such a step is not in the video: its events lie on a "
+        "straight line of log intensity between two frames."
     )
     remedy = (
         f"Record at about {math.ceil(state.remedy)} times the frame rate, or put frames between with "
@@ -178,8 +176,7 @@ def warnings(view, state, sensor, slow):
     if state.largest > view.light.white:
         yield (
             f"The largest digital value is {state.largest:g}, above full light ({view.light.white:g}); "
-            "such values "
-            "are taken as they are, brighter than 255."
+            "such values are taken as they are, brighter than 255."
         )
     width, height = view.log.width_px, view.log.height_px
     if abs(width * view.source.height_px / (height * view.source.width_px) - 1) > 0.01:
@@ -199,8 +196,7 @@ def light(view):
     )
     return (
         f"Light: digital value {view.light.white:g} is 255 for the sensor; {gamma}. Colour is weighted "
-        "0.2126 red, "
-        "0.7152 green, 0.0722 blue."
+        "0.2126 red, 0.7152 green, 0.0722 blue."
     )
 
 

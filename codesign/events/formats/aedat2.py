@@ -16,8 +16,7 @@ CHIPS = {(260, 346): "DAVIS346", (180, 240): "DAVIS240C"}
 EXTERNAL = 1 << 10
 HEADER = (
     "#!AER-DAT2.0\r\n# Data format is int32 address, int32 timestamp (8 bytes total), repeated for each "
-    "event\r\n"
-    "# Timestamps tick is 1 us\r\n# AEChip: {}\r\n#End Of ASCII Header\r\n"
+    "event\r\n# Timestamps tick is 1 us\r\n# AEChip: {}\r\n#End Of ASCII Header\r\n"
 )
 
 

@@ -31,8 +31,7 @@ def check_asked(path, asked):
     if not isinstance(asked.columns, str) or sorted(asked.columns) not in (list("ptxy"), sorted("auto")):
         raise FileFormatError(
             f"columns {shown(asked.columns)} given for {path}; the four letters t, x, y, p in the file's "
-            "order are "
-            "needed, for example 'txyp'."
+            "order are needed, for example 'txyp'."
         )
     if not isinstance(asked.time_unit, str) or asked.time_unit not in ("auto", *UNITS_US):
         raise FileFormatError(
@@ -127,8 +126,7 @@ class Arrival:
             if size and self.size[k] not in (None, size[k]):
                 raise FileFormatError(
                     f"{path} comes from a sensor with {name} {size[k]} by {self.size_from}, but "
-                    f"{self.size[k]} was "
-                    "asked for."
+                    f"{self.size[k]} was asked for."
                 )
             self.size[k] = size[k] if size else self.size[k]
         self.size_from = self.size_from if size else "the options"

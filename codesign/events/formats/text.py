@@ -87,8 +87,7 @@ def _head(path, file):
             if not all(1 <= side <= LIMIT_PX for side in told):
                 raise FileFormatError(
                     f"{path}, line {used}: a sensor of {' x '.join(words)[:60]} pixels is announced; 1 to "
-                    f"{LIMIT_PX} a "
-                    "side are possible."
+                    f"{LIMIT_PX} a side are possible."
                 )
         else:
             file.seek(here)

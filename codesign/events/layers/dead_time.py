@@ -147,8 +147,7 @@ def _cut(interval_s, refractory_s, ago_s):
     if reach > MOST_ROWS:
         raise DomainError(
             f"the dead time of {refractory_s:g} s reaches over {int(back.max())} intervals; its gradient "
-            "over fewer "
-            f"than {MOST_ROWS}: give fewer frames per second."
+            f"over fewer than {MOST_ROWS}: give fewer frames per second."
         )
     reach = -(-reach // 4) * 4  # few sizes, and so few kernels
     slope = torch.where(inside, 1 / step, 0)
@@ -198,10 +197,9 @@ def warn_beyond(
     elif most > THRESHOLD_LOAD and any(theta.requires_grad for theta in thetas):
         # no figure in it, so that a design loop says it once
         warnings.warn(
-            f"rate x dead time is above {THRESHOLD_LOAD:g} for the average event: gradients to thresholds, "
-            "one apart from "
-            "the other, may point wrong there (docs/events.md); shorten the dead time, or set thresholds "
-            "by differences.",
+            f"rate x dead time is above {THRESHOLD_LOAD:g} for the average event: gradients to "
+            "thresholds, one apart from the other, may point wrong there (docs/events.md); shorten the "
+            "dead time, or set thresholds by differences.",
             stacklevel=4,
         )
 

@@ -95,8 +95,7 @@ class SensorModel:
                 )
                 raise DomainError(
                     f"SensorModel.{field.name} is {shown(value)} ({type(value).__name__}); a finite Python "
-                    "number "
-                    f"{'> 0' if positive else '>= 0'} is needed{hint}."
+                    f"number {'> 0' if positive else '>= 0'} is needed{hint}."
                 )
         if self.hot_pixel_share > 1:
             raise DomainError(
@@ -208,8 +207,7 @@ def with_design(sensor: SensorModel, design: Mapping[str, Tensor | float]) -> Se
         if isinstance(value, Tensor) and value.requires_grad and values[name] == 0:
             raise DomainError(
                 f"{name} is 0, which switches it off, and requires a gradient, which is then none; start "
-                "above "
-                "0."
+                "above 0."
             )
     return replace(check_sensor(sensor), **values)
 

@@ -50,8 +50,7 @@ def open_mraw(path):
     if not NUMBER.fullmatch(rate) or int(rate) == 0:
         raise FileFormatError(
             f"the description of {path.name} gives the record rate {str(facts.get('rate'))[:40]!r}; a "
-            "whole number of "
-            "frames per second is needed."
+            "whole number of frames per second is needed."
         )
     if bits not in (8, 12, 16) or width * height * bits % 8:
         raise FileFormatError(
