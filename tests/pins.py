@@ -37,6 +37,7 @@ RENAMED: dict[str, str] = {
     "task": "mount",
     "codesign.place": "codesign.mount",
     "codesign.place.mount": "codesign.mount.pose",
+    "codesign.place.ranges": "codesign.mount.pose",
     "codesign.place.criterion": "codesign.mount.sight",
     "codesign.place.solids": "codesign.mount.body",
     "codesign.task": "codesign.mount",

@@ -21,8 +21,7 @@ from codesign.mount.observability import (
     information,
     velocity_from_flow,
 )
-from codesign.mount.pose import Mount, yaw_pitch_roll_rad
-from codesign.mount.ranges import MountRanges
+from codesign.mount.pose import Mount, MountRanges, yaw_pitch_roll_rad
 from codesign.mount.requirements import (
     CableSide,
     Clearance,

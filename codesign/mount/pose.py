@@ -1,5 +1,5 @@
 """A camera mount on a robot body: six unconstrained numbers to a pose with a limited position and a free
-rotation.
+rotation; and bounds of all six (``MountRanges``), mounts by their shares of them.
 
 Body axes: x forward, y left, z up. Camera axes: x right, y down, z forward. Yaw turns the view to the left,
 pitch tilts it down (90 degrees looks straight down), roll turns the image about the view; at zero the camera
@@ -15,12 +15,20 @@ from torch import Tensor, nn
 
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.mount.observability import chief_lines, flow_of_points
-from codesign.pose import se3_exp
+from codesign.pose import check_poses, se3_exp
 from codesign.types import ChiefRayCamera
 
 UPRIGHT = 1e-12  # sine of the angle to the vertical below which the view has no direction over ground
 NEAREST_M = 1e-6  # of what moves in the image
 MOST_PIXELS = 255  # of a film, spread over it, at which the motion of the image is measured
+# of a mount, by its bounds
+NAMES = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "roll_rad")
+# yaw and roll come round again after a turn
+TURNS = [3, 5]
+PITCH = 4
+# m and rad by which a mount may be outside
+ROUNDING = 1e-9
+AXES = ("x forward", "y left", "z up")
 AXES_BODY_CAM = torch.tensor(
     [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64
 )  # of a level camera that looks forward
@@ -63,8 +71,8 @@ class Mount(nn.Module):
         position_m: Sequence[float] | Tensor | None = None,
     ) -> None:
         super().__init__()
-        nominal = _three(nominal_m, "nominal_m")
-        half = _three(half_range_m, "half_range_m")
+        nominal = _numbers(nominal_m, "mount: nominal_m", AXES, "metres")
+        half = _numbers(half_range_m, "mount: half_range_m", AXES, "metres")
         if bool((half < 0).any()):
             raise DomainError(
                 f"mount: half_range_m is {half.tolist()}; the box of allowed positions needs sizes of at "
@@ -75,7 +83,9 @@ class Mount(nn.Module):
         self.register_buffer("unit", torch.ones(6, dtype=torch.float64))
         self.register_buffer("start_attitude", attitude(yaw_rad, pitch_rad, roll_rad))
         start = torch.zeros(6, dtype=torch.float64)
-        start[:3] = self._unbounded(nominal if position_m is None else _three(position_m, "position_m"))
+        start[:3] = self._unbounded(
+            nominal if position_m is None else _numbers(position_m, "mount: position_m", AXES, "metres")
+        )
         self.numbers = nn.Parameter(start)
 
     def _unbounded(self, position):
@@ -106,11 +116,7 @@ class Mount(nn.Module):
         numbers = self.unit * numbers
         position = self.nominal_m + self.half_range_m * torch.tanh(numbers[..., :3])
         turn = se3_exp(torch.cat([torch.zeros_like(numbers[..., 3:]), numbers[..., 3:]], -1))[..., :3, :3]
-        top = torch.cat([self.start_attitude @ turn, position[..., None]], -1)
-        last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device).expand(
-            *top.shape[:-2], 1, 4
-        )
-        return torch.cat([top, last], -2)
+        return _pose(self.start_attitude @ turn, position)
 
     def numbers_at(self, T_body_cam: Tensor) -> Tensor:
         """Numbers [..., 6] that give poses [..., 4, 4], the inverse of ``forward``; no gradient.
@@ -232,12 +238,110 @@ def yaw_pitch_roll_rad(T_body_cam: Tensor) -> Tensor:
     return torch.stack([yaw, pitch, roll], -1)
 
 
-def _three(values, name):
-    values = check_finite(
-        torch.as_tensor(values, dtype=torch.float64), f"mount: {name}", "give finite metres"
-    )
-    if values.shape != (3,):
+class MountRanges:
+    """Bounds of position, yaw to the left, pitch downwards and roll in body axes (x forward, y left, z up).
+
+    A mount is six shares from 0 (low) to 1 (high): a cube in which any search can look.
+
+    >>> ranges = MountRanges((0.1, -0.1, 0.3, -0.5, 0.2, 0.0), (0.3, 0.1, 0.5, 0.5, 1.2, 0.0))
+    >>> middle = ranges.pose(torch.full((6,), 0.5, dtype=torch.float64))
+    >>> middle[:3, 3].round(decimals=12).tolist()
+    [0.2, 0.0, 0.4]
+    >>> ranges.share_at(middle).round(decimals=12).tolist()
+    [0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
+
+    Args: low, high: six finite numbers each, in the order of NAMES, metres and radians. Equal bounds hold a
+      number; its share means nothing and is given as 0.5. Pitch is strictly between straight up and down,
+      where yaw and roll would be one; yaw and roll have a turn at most.
+    low, high: [6] float64. held: [6] bool.
+    Raises: DomainError for bounds that are not finite, in the wrong order, or too wide; ShapeError.
+    """
+
+    low: Tensor
+    high: Tensor
+    held: Tensor
+
+    def __init__(self, low: Sequence[float] | Tensor, high: Sequence[float] | Tensor) -> None:
+        self.low = _numbers(low, "mount ranges: low", NAMES, "metres and radians").detach().clone()
+        self.high = _numbers(high, "mount ranges: high", NAMES, "metres and radians").detach().clone()
+        self.held = self.low == self.high
+        for name, least, most in zip(NAMES, self.low.tolist(), self.high.tolist(), strict=True):
+            said = f"mount ranges: {name} goes from {least:g} to {most:g}"
+            if least > most:
+                raise DomainError(f"{said}; give the lower bound first.")
+            if name == NAMES[PITCH] and not -math.pi / 2 < least <= most < math.pi / 2:
+                raise DomainError(
+                    f"{said}; straight up and down (pi / 2) yaw and roll are one, so stay strictly between them."
+                )
+            if name in (NAMES[k] for k in TURNS) and most - least > 2 * math.pi:
+                raise DomainError(f"{said}, more than a turn; give 2 pi at most, as from -pi to pi.")
+
+    def numbers(self, share: Tensor) -> Tensor:
+        """Position in metres and angles in radians [..., 6] of shares [..., 6]; exactly the bounds at 0 and
+        1.
+
+        Shares beyond these go on beyond the bounds, as differences at a wall need; see ``clamped``.
+        Gradient: exact, to the shares, none to what is held. Raises: ShapeError; DomainError for shares that
+          are not finite.
+        """
+        share = _shares(share)
+        return torch.where(self.held, self.low, torch.lerp(self.low, self.high, share))
+
+    def pose(self, share: Tensor) -> Tensor:
+        """T_body_cam [..., 4, 4] float64 of shares [..., 6], as ``numbers``; gradient and errors too."""
+        numbers = self.numbers(share)
+        return _pose(attitude(*numbers[..., 3:].unbind(-1)), numbers[..., :3])
+
+    def share_at(self, T_body_cam: Tensor) -> Tensor:
+        """Shares [..., 6] of mounts [..., 4, 4], the inverse of ``pose``; no gradient.
+
+        Raises: DomainError for a mount outside the bounds, or one that is not rigid; ShapeError.
+        """
+        poses = check_poses(T_body_cam.detach()[None])[0].double()
+        angles = yaw_pitch_roll_rad(poses)
+        numbers = torch.cat([poses[..., :3, 3], angles], -1)
+        middle = (self.low + self.high)[TURNS] / 2
+        numbers[..., TURNS] = (
+            middle + torch.remainder(numbers[..., TURNS] - middle + math.pi, 2 * math.pi) - math.pi
+        )
+        outside = (numbers < self.low - ROUNDING) | (numbers > self.high + ROUNDING)
+        if bool(outside.any()):
+            first = tuple(outside.nonzero()[0].tolist())
+            k = first[-1]
+            raise DomainError(
+                f"mount ranges: a mount has {NAMES[k]} = {float(numbers[first]):g}, outside {float(self.low[k]):g} "
+                f"to {float(self.high[k]):g}; move it inside, or widen the bounds."
+            )
+        width = torch.where(self.held, 1.0, self.high - self.low)
+        return self.clamped((numbers - self.low) / width)
+
+    def clamped(self, share: Tensor) -> Tensor:
+        """The nearest shares [..., 6] within 0..1, those of held numbers 0.5. Gradient: as of torch.clamp.
+
+        Raises: ShapeError; DomainError for shares that are not finite.
+        """
+        return torch.where(self.held, 0.5, _shares(share).clamp(0, 1))
+
+
+def _pose(turn, position):
+    """[..., 4, 4] of rotations [..., 3, 3] and positions [..., 3]."""
+    top = torch.cat([turn, position[..., None]], -1)
+    last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device)
+    return torch.cat([top, last.expand(*top.shape[:-2], 1, 4)], -2)
+
+
+def _numbers(values, name, names, unit):
+    """Finite float64 numbers, as many as there are names."""
+    values = check_finite(torch.as_tensor(values, dtype=torch.float64), name, f"give finite {unit}")
+    if values.shape != (len(names),):
+        count = "three" if len(names) == 3 else "six"
         raise ShapeError(
-            f"mount: {name} needs three numbers (x forward, y left, z up), got shape {tuple(values.shape)}."
+            f"{name} needs {count} numbers ({', '.join(names)}), got shape {tuple(values.shape)}."
         )
     return values
+
+
+def _shares(share):
+    if share.shape[-1:] != (6,):
+        raise ShapeError(f"mount ranges: shares are [..., 6] ({', '.join(NAMES)}), got {tuple(share.shape)}.")
+    return check_finite(share.double(), "mount ranges: shares", "go back to the last finite ones")

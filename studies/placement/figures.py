@@ -11,7 +11,7 @@ from matplotlib.patches import Rectangle
 from torch import Tensor
 
 from codesign import events
-from codesign.mount.ranges import NAMES
+from codesign.mount.pose import NAMES
 from codesign.render import Camera, frames
 from codesign.report import robot_figures
 from codesign.report.flow_colours import flow_colours

@@ -10,7 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from codesign.mount.ranges import NAMES
+from codesign.mount.pose import NAMES
 from studies.placement.problem import Problem
 from studies.placement.race import GRADIENT, Race
 
