@@ -152,9 +152,8 @@ def _level(name, paint):
 
 
 def _bitmap(mi, paint, scale):
-    upright = (scale * textures.check_texture(paint.picture, "of the scene"))[
-        ::-1, :, None
-    ]  # Mitsuba puts the first row at v = 0, the bottom
+    # Mitsuba puts the first row at v = 0, the bottom
+    upright = (scale * textures.check_texture(paint.picture, "of the scene"))[::-1, :, None]
     to_uv = mi.ScalarTransform3f().scale([float(n) for n in paint.repeat])
     return {
         "type": "bitmap",

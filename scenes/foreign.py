@@ -27,7 +27,8 @@ from codesign.render.placed import PlacedScene, Placement
 from scenes import trial_load, units
 
 Up = Literal["y", "z"]
-UP: dict[str, list[list[float]]] = {  # from the axes of a file with this up axis to ours, z up
+# from the axes of a file with this up axis to ours, z up
+UP: dict[str, list[list[float]]] = {
     "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
     "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
 }

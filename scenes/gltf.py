@@ -27,15 +27,17 @@ REPEAT = 10497  # where no sampler says
 FLOAT = 5126
 SHORTEST = 1e-3  # of a quaternion, whose length is 1
 OWN_BUFFER = "codesign:the binary chunk"
+# extensions that change neither shape nor base colour
 LIGHT_ONLY = (
     "KHR_materials_",
     "KHR_lights_",
     "KHR_xmp",
-)  # extensions that change neither shape nor base colour
+)
+# which change what is seen even where not required
 UNREAD = (
     "EXT_mesh_gpu_instancing",
     "KHR_texture_transform",
-)  # which change what is seen even where not required
+)
 
 
 @dataclass(frozen=True)

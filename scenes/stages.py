@@ -36,11 +36,12 @@ class Stage:
     centre_m: tuple[float, float, float] | None = None
 
 
+# past what is seen, with the camera to the left
 ALONG_WALL: dict[str, Any] = {
     "yaw_rad": 0.0,
     "turn_rad_s": 0.0,
     "aside_rad": math.pi / 2,
-}  # past what is seen, with the camera to the left
+}
 AHEAD: dict[str, Any] = {"yaw_rad": math.pi / 2, "turn_rad_s": 0.0}
 STAGES = {
     "room": Stage(),

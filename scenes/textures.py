@@ -186,9 +186,8 @@ def faded_to(texture, level, margin=0.12):
     ramps = []
     for size in texture.shape:
         at = (np.arange(size) + 0.5) / size
-        u = np.clip(
-            np.minimum(at, 1 - at) / margin - 0.25, 0, 1
-        )  # the outermost quarter of the margin is constant
+        # the outermost quarter of the margin is constant
+        u = np.clip(np.minimum(at, 1 - at) / margin - 0.25, 0, 1)
         ramps.append(u * u * (3 - 2 * u))
     return (level + (texture - level) * ramps[0][:, None] * ramps[1]).astype(np.float32)
 

@@ -301,7 +301,8 @@ WORLDS = {
     "blank-room": blank_room,
     "dark-room": dark_room,
 }
-VIEWS = {  # where a camera of about 45 degrees stands, and what it looks at, to see what a world has
+# where a camera of about 45 degrees stands, and what it looks at, to see what a world has
+VIEWS = {
     "checkerboard": ((0.13, -2.0, 0.08), (0.13, 0.0, 0.08)),
     "room": ((0.4, -1.5, 1.3), (-0.1, 1.0, 0.7)),
     "corridor": ((0.2, 0.6, 1.4), (-0.1, 8.0, 1.2)),

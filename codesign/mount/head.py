@@ -159,13 +159,13 @@ def _blur_px(camera, pixels, base, slope, base_step, slope_step, nearness):
     start = rays.origin_m.double().reshape(-1, 4, 3)
     off_base = start[..., :2] - (off_slope + slope[:, None]) * start[..., 2:] - base[:, None]
     near = nearness[..., None, None]
-    shift = torch.linalg.solve(
-        near * base_step + slope_step, (near * off_base + off_slope).mT
-    )  # [N, W, 2, 4]
+    # [N, W, 2, 4]
+    shift = torch.linalg.solve(near * base_step + slope_step, (near * off_base + off_slope).mT)
     share = lit / lit.sum(-1, keepdim=True).clamp_min(1)
     return ((shift.square().sum(-2) * share).sum(-1) + 1e-12).sqrt()
 
 
+# of what the solution so far makes of a window; -1 is mirrored, as in TOLD
 SOLVED = (
     -1,
     1,
@@ -173,7 +173,7 @@ SOLVED = (
     1,
     1,
     1,
-)  # of what the solution so far makes of a window; -1 is mirrored, as in evidence.TOLD
+)
 VELOCITY = (1, -1, 1, -1, 1, -1)  # forward, left, up, roll, pitch, yaw
 WIDEST = 6.0  # logarithm of the largest factor on a window's weight
 WIDER = 4.0  # of those on deviations

@@ -29,9 +29,8 @@ PITCH = 4
 # m and rad by which a mount may be outside
 ROUNDING = 1e-9
 AXES = ("x forward", "y left", "z up")
-AXES_BODY_CAM = torch.tensor(
-    [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64
-)  # of a level camera that looks forward
+# of a level camera that looks forward
+AXES_BODY_CAM = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
 
 
 class Mount(nn.Module):
@@ -226,9 +225,8 @@ def yaw_pitch_roll_rad(T_body_cam: Tensor) -> Tensor:
     """
     turn = T_body_cam[..., :3, :3] @ AXES_BODY_CAM.to(T_body_cam).mT
     upright = turn[..., :2, 0].detach().square().sum(-1) < UPRIGHT**2
-    safe = torch.where(
-        upright, 1.0, turn[..., 0, 0]
-    )  # where there is no direction, a safe one to differentiate
+    # where there is no direction, a safe one to differentiate
+    safe = torch.where(upright, 1.0, turn[..., 0, 0])
     aside = torch.where(upright, 0.0, turn[..., 1, 0])
     level = torch.where(upright, 0.0, torch.hypot(safe, aside))
     yaw = torch.where(upright, torch.atan2(-turn[..., 0, 1], turn[..., 1, 1]), torch.atan2(aside, safe))

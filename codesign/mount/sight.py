@@ -123,7 +123,8 @@ def _scales(values, information, name):
     return given
 
 
-ATTITUDES = {  # yaw and pitch, degrees
+# yaw and pitch, degrees
+ATTITUDES = {
     "forward": (0.0, 0.0),
     "oblique": (0.0, 45.0),
     "downward": (0.0, 90.0),

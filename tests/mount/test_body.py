@@ -205,9 +205,8 @@ def test_the_rover_is_a_body_without_its_camera():
     robot = robots.from_urdf(robots.ROVER)
     camera = robot.frame("camera_link")[:3, 3]
     whole = Body.of(robot.parts).distance_m(camera)
-    assert float(whole) == pytest.approx(
-        0.005, abs=1e-12
-    )  # the box of the camera ends 5 mm behind its origin
+    # the box of the camera ends 5 mm behind its origin
+    assert float(whole) == pytest.approx(0.005, abs=1e-12)
     # the mast ends 50 mm below it and stands, 15 mm thick, 40 mm behind it
     alone = Body.of(robot.parts, without=["camera_link"]).distance_m(camera)
     rim = 0.04 - 0.015 * math.cos(math.pi / 48)  # of 48 faces: between its apothem and its radius

@@ -86,9 +86,8 @@ def test_fresh_it_is_least_squares_on_any_film(mount, axes, windows):
 
 def test_blur_and_focal_length_are_those_of_the_thin_lens(mount):
     camera = camera_of()
-    level = torch.tensor(
-        [[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.8], [0, 0, 0, 1]], dtype=D
-    )  # looks straight down
+    # looks straight down
+    level = torch.tensor([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0.8], [0, 0, 0, 1]], dtype=D)
     plain = plain_of()
     read = plain.read(noisy(2), camera, None, level, level.expand(2, 3, 4, 4))
     found = evidence(read, plain.solve(read), camera, level, plain.prior).lens

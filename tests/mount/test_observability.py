@@ -13,7 +13,8 @@ from scenes import worlds
 
 D = torch.float64
 HEIGHT = 0.4
-MOUNTS = [  # yaw, pitch, roll, position
+# yaw, pitch, roll, position
+MOUNTS = [
     (0.0, math.pi / 2, 0.0, (0.0, 0.0, HEIGHT)),
     (0.0, 1.0, 0.0, (0.25, 0.05, HEIGHT)),
     (2.0, 0.7, -0.4, (-0.2, 0.1, 0.6)),
@@ -118,13 +119,13 @@ def test_straight_down_is_the_textbook_case(camera):
     expected = torch.zeros(24 * 16, 2, 3, dtype=D)
     expected[:, 1, 0] = focal_px / HEIGHT  # forward: the ground moves down in the image
     expected[:, 0, 1] = focal_px / HEIGHT  # to the left: it moves right
+    # body left turn seen from above: the image turns right
     expected[:, 0, 2], expected[:, 1, 2] = (
         -from_middle[:, 1],
         from_middle[:, 0],
-    )  # body left turn seen from above: the image turns right
-    torch.testing.assert_close(
-        rows, expected, rtol=0, atol=1e-9
-    )  # differences of positions of 10 px over 1e-3 px: 1e-12 relative
+    )
+    # differences of positions of 10 px over 1e-3 px: 1e-12 relative
+    torch.testing.assert_close(rows, expected, rtol=0, atol=1e-9)
     pixels = 24 * 16
     radius_2 = from_middle.square().sum()
     closed = torch.diag(
@@ -168,9 +169,8 @@ def test_gradients_of_velocity_and_information(camera, generator):
     with torch.no_grad():
         step = 1e-5
         difference = float(along(step) - along(-step)) / (2 * step)
-    assert analytic == pytest.approx(
-        difference, rel=1e-6
-    )  # truncation (1e-5)^2 times moderate third derivatives
+    # truncation (1e-5)^2 times moderate third derivatives
+    assert analytic == pytest.approx(difference, rel=1e-6)
 
 
 def test_a_prior_keeps_what_is_not_seen_at_zero(camera):

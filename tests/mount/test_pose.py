@@ -42,12 +42,13 @@ def test_angles_are_read_back(generator):
         (torch.rand(20, 3, generator=generator, dtype=D) * 2 - 1) * torch.tensor([3.1, 1.5, 3.1], dtype=D)
     ).tolist():
         mount = Mount(NOMINAL, HALF, yaw_rad=yaw, pitch_rad=pitch, roll_rad=roll)
+        # atan2 near the pole: rounding over cos 1.5
         torch.testing.assert_close(
             yaw_pitch_roll_rad(mount().detach()),
             torch.tensor([yaw, pitch, roll], dtype=D),
             rtol=0,
             atol=1e-13,
-        )  # atan2 near the pole: rounding over cos 1.5
+        )
 
 
 @pytest.mark.parametrize("up", [1.0, -1.0])
@@ -92,9 +93,8 @@ def test_start_position_is_kept_and_a_zero_range_holds_an_axis():
     assert float(moved[1, 3]) == -0.1
 
 
-@pytest.mark.parametrize(
-    "pitch", [0.3, math.pi / 2]
-)  # straight down, where yaw and roll are one, is no special case
+# straight down, where yaw and roll are one, is no special case
+@pytest.mark.parametrize("pitch", [0.3, math.pi / 2])
 def test_gradient_of_the_pose(generator, pitch):
     mount = Mount(NOMINAL, HALF, yaw_rad=0.4, pitch_rad=pitch)
     numbers = (0.5 * torch.randn(2, 6, generator=generator, dtype=D)).requires_grad_()
@@ -105,14 +105,12 @@ def test_gradient_of_the_pose(generator, pitch):
 
 def test_a_moving_body_carries_its_camera():
     mount = Mount((0.2, 0.0, 0.4), HALF, pitch_rad=math.pi / 2)
-    turned = torch.tensor(
-        [[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=D
-    )  # body at (5, 6), heading +y
+    # body at (5, 6), heading +y
+    turned = torch.tensor([[0.0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=D)
     pose = mount.in_world(turned).detach()
     torch.testing.assert_close(pose[:3, 3], torch.tensor([5.0, 6.2, 0.4], dtype=D), rtol=0, atol=1e-15)
-    torch.testing.assert_close(
-        pose[:3, 1], torch.tensor([0.0, -1, 0], dtype=D), rtol=0, atol=1e-15
-    )  # image down is backward
+    # image down is backward
+    torch.testing.assert_close(pose[:3, 1], torch.tensor([0.0, -1, 0], dtype=D), rtol=0, atol=1e-15)
 
 
 def far_points(camera, mount, depth_m):
@@ -144,9 +142,8 @@ def test_a_unit_of_every_number_moves_the_image_by_the_natural_step(optics, dept
         mount.numbers[i] += 1
         moved = render.project(camera, pose.apply(pose.inverse(mount()), points)) - base
         mount.numbers[i] -= 1
-        assert float(moved.square().sum(1).nanmean().sqrt()) == pytest.approx(
-            0.1, rel=0.1
-        )  # a larger step meets the walls of the box
+        # a larger step meets the walls of the box
+        assert float(moved.square().sum(1).nanmean().sqrt()) == pytest.approx(0.1, rel=0.1)
 
 
 def test_one_learning_rate_serves_lens_and_mount():

@@ -77,9 +77,8 @@ class TestDampedLeastSquares:
         solver = DampedLeastSquares(lambda x: A @ x - b, torch.zeros(4, dtype=D), damping=1e-15)
         solver.step()
         truth = torch.linalg.lstsq(A, b).solution
-        torch.testing.assert_close(
-            solver.variables, truth, rtol=1e-12, atol=1e-12
-        )  # condition of A some 10, damping 1e-15
+        # condition of A some 10, damping 1e-15
+        torch.testing.assert_close(solver.variables, truth, rtol=1e-12, atol=1e-12)
 
     @pytest.mark.parametrize(
         ("problem", "start"),
@@ -115,9 +114,8 @@ class TestDampedLeastSquares:
         )
         assert bool((found >= vector(*lower)).all())
         assert bool((found <= vector(*upper)).all())
-        assert solver.loss == pytest.approx(
-            truth.cost, rel=1e-6, abs=1e-12
-        )  # scipy's interior steps stop just short of a bound
+        # scipy's interior steps stop just short of a bound
+        assert solver.loss == pytest.approx(truth.cost, rel=1e-6, abs=1e-12)
         torch.testing.assert_close(found, torch.from_numpy(truth.x), rtol=1e-4, atol=1e-5)
 
     def test_a_hinge_row_gives_the_minimum_of_the_penalised_problem(self):
@@ -165,9 +163,8 @@ class TestDampedLeastSquares:
         for _ in range(6):
             plain.step()
             other.step()
-            torch.testing.assert_close(
-                units * other.variables, plain.variables, rtol=1e-9, atol=1e-12
-            )  # the same in exact arithmetic
+            # the same in exact arithmetic
+            torch.testing.assert_close(units * other.variables, plain.variables, rtol=1e-9, atol=1e-12)
 
     @pytest.mark.parametrize(("problem", "start"), [(rosenbrock, (-1.2, 1.0)), (decay, (1.0, 1.0, 0.0))])
     def test_no_floor_where_steps_succeed_however_the_units_differ(self, problem, start):
@@ -191,9 +188,8 @@ class TestDampedLeastSquares:
         solver = DampedLeastSquares(residuals, vector(3, 3, 0))
         found = solver.run(40)
         torch.testing.assert_close(found, vector(1, 2, -5e-7), rtol=0, atol=3e-5)
-        assert solver.loss == pytest.approx(
-            0.5, rel=1e-9
-        )  # x - 1 within (2e-9 / 2)^0.5; 0.509 without the floor
+        # x - 1 within (2e-9 / 2)^0.5; 0.509 without the floor
+        assert solver.loss == pytest.approx(0.5, rel=1e-9)
 
     def test_modes_of_a_lens_that_no_ray_sees_do_not_stall_it(self, monkeypatch):
         """The double Gauss has a plane stop in air: its curvature, and how the gap around it is shared, blur

@@ -368,10 +368,9 @@ def grid(mi, n, bsdf):
 def test_a_mesh_of_any_fineness_shows_the_falloff_of_a_lamp(cells):
     mi = backend.mitsuba()
     intensity, height, albedo = 5.0, 0.8, 0.5
+    # 64: finer than the texels, so light at vertices
     scene = {
-        "mesh": grid(
-            mi, cells, {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}
-        ),  # 64: finer than the texels, so light at vertices
+        "mesh": grid(mi, cells, {"type": "diffuse", "reflectance": {"type": "rgb", "value": albedo}}),
         "lamp": {
             "type": "point",
             "position": [0, 0, height],

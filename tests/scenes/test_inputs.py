@@ -23,9 +23,8 @@ def test_pictures_in_linear_light_hold_what_mitsuba_reads(tmp_path, name):
     made = {"new.hdr": seeds_scenes.hdr(), "flat.hdr": FLAT, "old.hdr": OLD, "sky.exr": seeds_scenes.exr()}
     path, known = tmp_path / name, tmp_path / f"known-{name}"
     path.write_bytes(made[name])
-    known.write_bytes(
-        FLAT if name == "old.hdr" else made[name]
-    )  # Mitsuba does not know the older run lengths
+    # Mitsuba does not know the older run lengths
+    known.write_bytes(FLAT if name == "old.hdr" else made[name])
     theirs = np.array(backend.mitsuba().Bitmap(str(known)))[..., :3]
     np.testing.assert_array_equal(rgbe.read(path).astype(np.float32), theirs.astype(np.float32))
 

@@ -193,9 +193,8 @@ def test_windows_of_a_screw_have_its_twist(page):
     found = own_pair(page(PAGE + "motion: screw.csv\n"))
     for number in (0, 7, UNSEEN):
         poses, twist = found.drive(number, 5)
-        torch.testing.assert_close(
-            twist, TWIST.expand(5, 6), rtol=0, atol=1e-5
-        )  # clocks of 1.7e9 s have 2e-7 s
+        # clocks of 1.7e9 s have 2e-7 s
+        torch.testing.assert_close(twist, TWIST.expand(5, 6), rtol=0, atol=1e-5)
         seen, _ = render.camera_velocity(poses, robot_pair.times())
         torch.testing.assert_close(seen, twist[:, None].expand_as(seen), rtol=0, atol=1e-5)
         angle = torch.atan2(poses[:, 0, 1, 0], poses[:, 0, 0, 0])

@@ -96,9 +96,8 @@ def test_oscillations_have_their_amplitude_period_and_axis(path, axis, start):
     check_poses(poses)
     moved = (poses[:, :3, 3] - start[:3, 3]) @ start[:3, :3]  # along the camera's axes
     shift = moved[:, axis]
-    assert float(shift.max()) == pytest.approx(
-        amplitude, rel=1e-4
-    )  # the crest lies within half a frame: cos(pi / 250)
+    # the crest lies within half a frame: cos(pi / 250)
+    assert float(shift.max()) == pytest.approx(amplitude, rel=1e-4)
     assert float(shift.min()) == pytest.approx(-amplitude, rel=1e-4)
     torch.testing.assert_close(shift[250:], shift[:-250], rtol=0, atol=1e-14)  # the period
     assert float(moved[:, [i for i in range(3) if i != axis]].abs().max()) <= 1e-15
@@ -188,9 +187,10 @@ def test_orbits_have_their_radius_rate_and_view():
     assert float(orbit(t)[:, 2, 1].abs().max()) == 0  # level: the left axis is horizontal
     bearing = torch.remainder(torch.atan2(away[:, 1], away[:, 0]).diff(), 2 * math.pi) / 0.01
     middle = (t[1:] + t[:-1]) / 2
+    # h^2/24 of (2 pi / 2.9)^2
     torch.testing.assert_close(
         bearing, 1.3 * (1 + 0.5 * (2 * math.pi * middle / 2.9).cos()), rtol=1e-4, atol=0
-    )  # h^2/24 of (2 pi / 2.9)^2
+    )
     # without swings: the closed form of a circle, and of its velocity
     plain = Orbital((0.0, 0.0, 0.0), 2.0, 0.0, 1.3)
     rate = 1.3
@@ -238,9 +238,8 @@ def test_waves_integrate_and_multiply_exactly_and_stay_in_bounds():
     two = Waves.random(seeded(4), -0.3, 0.5, 0.2, 1.0, 4)
     t = torch.linspace(-3, 9, 97, dtype=D)
     torch.testing.assert_close(one.times(two)(t), one(t) * two(t), rtol=0, atol=1e-15)
-    torch.testing.assert_close(
-        one.times(one)(t), one(t) ** 2, rtol=0, atol=1e-15
-    )  # differences of frequencies are 0
+    # differences of frequencies are 0
+    torch.testing.assert_close(one.times(one)(t), one(t) ** 2, rtol=0, atol=1e-15)
     nodes, weights = (torch.from_numpy(v) for v in np.polynomial.legendre.leggauss(200))
     numeric = ((one.times(one))(t[:, None] * (nodes + 1) / 2) * weights).sum(1) * t / 2
     torch.testing.assert_close(one.times(one).integral(t), numeric, rtol=0, atol=1e-12)
@@ -365,15 +364,13 @@ def test_minimum_snap_is_the_solution_of_the_quadratic_programme(waypoints):
     points, t = waypoints
     path = minimum_snap(points, t)
     reference = snap_by_quadratic_programme(points.numpy(), t.numpy())
-    mine = (
-        path.coefficient.numpy() / np.diff(t.numpy())[:, None, None] ** np.arange(8)[:, None]
-    )  # per second, as the reference has them
+    # per second, as the reference has them
+    mine = path.coefficient.numpy() / np.diff(t.numpy())[:, None, None] ** np.arange(8)[:, None]
     at = np.linspace(0, 1, 9)
     for m, length in enumerate(np.diff(t.numpy())):
         basis = (at[:, None] * length) ** np.arange(8)
-        np.testing.assert_allclose(
-            basis @ mine[m], basis @ reference[m], rtol=0, atol=1e-7
-        )  # the monomial basis costs it eight digits
+        # the monomial basis costs it eight digits
+        np.testing.assert_allclose(basis @ mine[m], basis @ reference[m], rtol=0, atol=1e-7)
 
 
 def test_minimum_snap_passes_its_points_and_has_six_continuous_derivatives(waypoints):
@@ -413,9 +410,8 @@ def test_perturbations_of_a_minimum_snap_path_raise_its_snap(waypoints):
         cross = cross + (weight[:, None] * snap * fourth).sum()
         bump = bump + (weight[:, None] * fourth**2).sum()
     assert float(path.cost()) == pytest.approx(float(cost), rel=1e-11)
-    assert abs(float(cross)) < 1e-9 * float(
-        (cost * bump) ** 0.5
-    )  # stationary: so a perturbation adds its own snap and nothing else
+    # stationary: so a perturbation adds its own snap and nothing else
+    assert abs(float(cross)) < 1e-9 * float((cost * bump) ** 0.5)
     # a waypoint's velocity changed while all points are kept: solved again from there, the sum of two paths
     # costs more
     middle = path(torch.tensor([2.5], dtype=D))
@@ -427,9 +423,8 @@ def test_perturbations_of_a_minimum_snap_path_raise_its_snap(waypoints):
         torch.cat([points[:3], middle, points[3:]]), torch.cat([t[:3], torch.tensor([2.5], dtype=D), t[3:]])
     )
     assert float(detour.cost()) > float(path.cost())
-    assert float(through.cost()) == pytest.approx(
-        float(path.cost()), rel=1e-9
-    )  # a point of the path changes nothing
+    # a point of the path changes nothing
+    assert float(through.cost()) == pytest.approx(float(path.cost()), rel=1e-9)
 
 
 def test_two_points_give_the_rest_to_rest_polynomial():
@@ -465,15 +460,13 @@ def test_a_flight_obeys_newton_and_its_rates_are_those_of_differential_flatness(
     rates = flight.velocity(t)[:, 3:]
     torch.testing.assert_close(rates[:, 0], -(change * pose[:, :3, 1]).sum(1), rtol=0, atol=1e-12)
     torch.testing.assert_close(rates[:, 1], (change * pose[:, :3, 0]).sum(1), rtol=0, atol=1e-12)
-    heading = torch.atan2(
-        pose[:, 1, 0], pose[:, 0, 0]
-    )  # of the forward axis, which lies in the plane of heading and thrust
+    # of the forward axis, which lies in the plane of heading and thrust
+    heading = torch.atan2(pose[:, 1, 0], pose[:, 0, 0])
     across = torch.stack([-heading.sin(), heading.cos(), torch.zeros_like(heading)], 1)
     yaw = flight.path(t)[:, 3]
     left = torch.stack([-yaw.sin(), yaw.cos(), torch.zeros_like(yaw)], 1)
-    assert (
-        float((pose[:, :3, 0] * left).sum(1).abs().max()) < 0.3
-    )  # small tilts: forward stays near the heading
+    # small tilts: forward stays near the heading
+    assert float((pose[:, :3, 0] * left).sum(1).abs().max()) < 0.3
     assert float((across * left).sum(1).min()) > 0.9
     # hovering ends: level, at rest
     ends = flight(torch.tensor([0.0, flight.span_s[1]], dtype=D))

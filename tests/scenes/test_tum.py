@@ -23,9 +23,8 @@ def some_poses(count, size=1.0):
 
 
 def test_round_trip_keeps_every_digit(tmp_path):
-    t = (
-        torch.cumsum(torch.rand(200, generator=torch.Generator().manual_seed(1), dtype=D) + 1e-3, 0) + 1.7e9
-    )  # epoch times
+    # epoch times
+    t = torch.cumsum(torch.rand(200, generator=torch.Generator().manual_seed(1), dtype=D) + 1e-3, 0) + 1.7e9
     poses = some_poses(200, 2.0)
     write_tum(tmp_path / "path.txt", t, poses)
     t_back, back = read_tum(tmp_path / "path.txt")
@@ -142,9 +141,8 @@ def test_a_recorded_path_is_a_geodesic_through_its_poses():
     knots = torch.tensor([0.0, 0.3, 1.0, 2.2], dtype=D)
     path = Recorded(knots, exact(knots))
     t = torch.linspace(0, 2.2, 45, dtype=D)
-    torch.testing.assert_close(
-        path(t), exact(t), rtol=0, atol=1e-13
-    )  # constant twist: the geodesic is the motion itself
+    # constant twist: the geodesic is the motion itself
+    torch.testing.assert_close(path(t), exact(t), rtol=0, atol=1e-13)
     torch.testing.assert_close(path.velocity(t), twist.expand(45, 6), rtol=0, atol=1e-12)
     other = Recorded(torch.arange(5, dtype=D), some_poses(6, 0.8)[torch.tensor([0, 2, 3, 4, 5])])
     torch.testing.assert_close(other(other.t_s), other.poses, rtol=0, atol=1e-13)
