@@ -12,12 +12,12 @@ BEGINNINGS = 1 << 16
 PAIRS_OF_THRESHOLDS = [(0.1, 0.3), (0.3, 0.1), (0.155, 0.172), (0.17, 0.23)]
 
 
-def mean_counts(level, theta_on, theta_off):
+def mean_counts(level, theta_on, theta_off, beginnings=BEGINNINGS):
     """Counts [T-1, 2] of one path [T], the mean over a pixel's beginnings: its memorised level lies evenly
     from theta_on/2 below the first level to theta_off/2 above it."""
-    share = (torch.arange(BEGINNINGS, dtype=torch.float64) + 0.5) / BEGINNINGS
+    share = (torch.arange(beginnings, dtype=torch.float64) + 0.5) / beginnings
     begun = level[0] - theta_on / 2 + share * (theta_on + theta_off) / 2
-    later = level[1:, None].expand(-1, BEGINNINGS)
+    later = level[1:, None].expand(-1, beginnings)
     return memory(later, theta_on, theta_off, state=begun, log_input=True)[0].mean(2)
 
 
@@ -77,7 +77,7 @@ def test_a_hundred_turns_leave_most_of_the_gradient_that_five_pairs_can_carry():
         level = level.cumsum(0)
         weight = torch.randn(99, 2, generator=generator, dtype=torch.float64)
         step = 2e-3
-        ends = [mean_counts(level + sign * step * move, 0.17, 0.23) for sign in (1, -1)]
+        ends = [mean_counts(level + sign * step * move, 0.17, 0.23, 1 << 14) for sign in (1, -1)]
         wanted = ((ends[0] - ends[1]) * weight).sum() / (2 * step)
         slopes = gradient(level, 0.17, 0.23, weight, gradient="exact")
         found.append(torch.stack((slopes @ move, wanted)))
