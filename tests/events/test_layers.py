@@ -144,8 +144,8 @@ def test_without_physics_its_gradient_is_that_of_the_memory_layer():
 
 
 # cosine and scale of the gradient of pooled counts against differences of the hard sensor's, measured
-# 0.98/0.93, 0.98/0.91, 0.95/0.69, 0.92/0.83 (dead time: test_dead_time): the bounds leave room for another seed, not for a
-# missing term (a threshold gradient without memory has scale below 0.5)
+# 0.98/0.93, 0.98/0.91, 0.95/0.69, 0.92/0.83 (dead time: test_dead_time): the bounds leave room for another
+# seed, not for a missing term (a threshold gradient without memory has scale below 0.5)
 @pytest.mark.parametrize(
     ("name", "sensor", "step", "cosine", "scales"),
     [
