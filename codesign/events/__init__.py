@@ -23,11 +23,10 @@ from codesign.events.sensor.state import SensorState
 from codesign.events.sources.opening import open_frames
 from codesign.events.spiking.losses import count_loss, van_rossum
 from codesign.events.spiking.spike_esim import SpikeEsim, SpikeEsimState
-from codesign.events.spiking.srm import srm
-from codesign.events.spiking.srm_scale import alpha_response, drive_scale
+from codesign.events.spiking.srm import alpha_response, drive_scale, srm
 from codesign.events.spiking.srm_state import SrmState
 from codesign.events.spiking.surrogate import FastSigmoid, Laplace, Triangular
-from codesign.events.spiking.two_branches import TwoBranchSpikes
+from codesign.events.spiking.thesis_network import TwoBranchSpikes
 from codesign.events.stream import concatenate, to_counts
 from codesign.events.upsampling.upsample import upsample, upsample_stream
 from codesign.events.views.pictures import decay_video, gray_picture, picture, rates, write_video

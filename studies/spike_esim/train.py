@@ -1,169 +1,253 @@
-"""Training: Spike-ESIM and the thesis network by van Rossum and count loss, ESIM's single threshold by
-search."""
+"""What is raced, trained on rendered sequences with the hard events of a physical sensor: the spiking network of the
+thesis in four forms, ESIM with its best threshold, and Spike-ESIM."""
 
 import math
+from dataclasses import dataclass
+from functools import partial
 
 import torch
+from torch import Tensor, nn
 
-from codesign import events
-from codesign.events import SensorModel
-from codesign.events.spiking.losses import count_loss, van_rossum
+from codesign import events, render
+from codesign.events import SensorModel, SpikeEsim, TwoBranchSpikes
+from scenes.dataset_motion import LEAD_S, motion
+from scenes.stages import make_world
+from studies.make_dataset import __main__ as make_dataset
+from studies.spike_esim.judge import TAU_S, distance
 
-TAU_S = 0.01  # of the van Rossum loss, as in the thesis
+RATE_HZ = 500.0
+RENDERED_TOGETHER = 40
+# what an ideal sensor lacks, all at once: unequal thresholds that scatter, bandwidth, leak, noise, dead time
+SENSOR = SensorModel(0.18, 0.22, theta_sigma=0.03, cutoff_hz=60.0, leak_rate_hz=0.1, leak_jitter=0.1,
+                     rate_cov_decades=0.1, shot_rate_hz=0.5, refractory_s=1e-3)  # fmt: skip
+THETAS = [0.12 * 1.15**k for k in range(18)]  # 0.12 to 1.3
 CROP_PX = 32
 BATCH = 2
-# step of Adam for convolution weights and for single physical numbers, for noise rates (Hz)
-SLOW = 3e-3
-FAST = 2e-2
-NOISE = 5e-2
-THETAS = [0.12 * 1.15**k for k in range(18)]  # 0.12 to 1.3
-COUNT_BLOCK = {"side_px": 8, "steps": 8}
+# of potentials of the busiest sequence at the threshold when training starts: the better by training loss is kept
+SHARES = (0.01, 0.04)
+SMOOTHING_MS = 10.0
+# frames are divided by it for the thesis network: weights of the order of 1, as its step of Adam supposes
+LIGHT = 32.0
 
 
-def distance(found, target, dt_s):
-    """Van Rossum loss over that of silence: 0 for the target itself, 1 for no event at all."""
-    silence = van_rossum(torch.zeros_like(target), target, tau_s=TAU_S, dt=dt_s)
-    return van_rossum(found, target, tau_s=TAU_S, dt=dt_s) / silence
+@dataclass(frozen=True)
+class Sequence:
+    """frames: [T, H, W], 0-255 scale. t_s: [T] float64. counts: [T-1, 2, H, W] of the physical sensor. again:
+    the same with another draw of thresholds and noise. name: world and motion."""
+
+    name: str
+    frames: Tensor
+    t_s: Tensor
+    counts: Tensor
+    again: Tensor
+
+    @property
+    def dt_s(self):
+        return float(self.t_s[-1] - self.t_s[0]) / (len(self.t_s) - 1)
 
 
-def pooled_distance(found, target):
-    """Count loss over that of silence."""
-    return count_loss(found, target, **COUNT_BLOCK) / count_loss(
-        torch.zeros_like(target), target, **COUNT_BLOCK
-    )
+def rendered(world, family, seed, frames):
+    """A sequence of ``frames`` frames at RATE_HZ. seed: of motion and sensor."""
+    scene, stage = make_world(world)
+    camera = make_dataset.make_camera(make_dataset.Config(size=64, samples=8, level="thin"))
+    t_s = torch.arange(frames, dtype=torch.float64) / RATE_HZ
+    path = motion(family, stage, scene, camera, float(t_s[-1]), torch.Generator().manual_seed(seed))
+    with torch.no_grad():
+        poses = path(LEAD_S + t_s).detach().split(RENDERED_TOGETHER)
+        pictures = torch.cat([render.frames(camera, scene, some) for some in poses])
+    draws = (torch.Generator().manual_seed(1000 * k + seed) for k in (1, 2))
+    hard = [events.dense_counts(pictures, t_s, SENSOR, draw) for draw in draws]
+    return Sequence(f"{world} {family}", pictures, t_s, *hard)
 
 
-def objective(found, target, dt_s, count_weight):
-    """What is made small: van Rossum distance and a share of the pooled one."""
-    return distance(found, target, dt_s) + count_weight * pooled_distance(found, target)
+class SecondModule(nn.Module):
+    """The thesis network, own reset, and a spike module behind it: its spikes, times one weight per polarity,
+    through an alpha response to a threshold of their own."""
+
+    def __init__(self, channels, *, dt, seed):
+        super().__init__()
+        self.first = TwoBranchSpikes(channels, kernel="thesis", dt=dt, seed=seed)
+        self.wake = self.first.wake
+        self.dt = dt
+        self.weight = nn.Parameter(torch.full((2, 1, 1), 1.05))  # a lone spike gives one
+
+    def forward(self, frames):
+        return self.second(self.first(frames)[0])
+
+    def second(self, spikes, **options):
+        times = {"tau_r": 1.0, "tau_s": SMOOTHING_MS, "dt": self.dt}
+        drive = self.weight * spikes
+        return events.srm(drive, theta=1.0, kernel="thesis", response="alpha", **times, **options)
 
 
-def crops(sequences, generator, batch=BATCH, size_px=CROP_PX):
-    """A batch of random squares out of random sequences of one length and rate: frames [T, B, h, w], t_s [T],
-    counts [T-1, 2, B, h, w].
+VARIANTS = {
+    "thesis": TwoBranchSpikes,
+    "own_reset": partial(TwoBranchSpikes, kernel="thesis"),
+    "smoothed": partial(TwoBranchSpikes, smoothing_tau=SMOOTHING_MS),
+    "second_module": SecondModule,
+}
 
-    A batch without any event has no relative loss; then another is drawn.
-    """
+
+class Store:
+    """Tensors by name, written after each training, so that a stopped run goes on behind the last one."""
+
+    def __init__(self, run):
+        stored = run.load_state() if run.resumed else None
+        self.run = run
+        self.tensors = dict(stored.tensors) if stored else {}
+
+    def __call__(self, key, make):
+        """The tensors {name: tensor} that ``make`` gives, or gave in an earlier session."""
+        start = f"{key}/"
+        if not any(name.startswith(start) for name in self.tensors):
+            self.tensors |= {start + name: value.clone() for name, value in make().items()}
+            self.run.save_state(self.tensors, {})
+        return {n.removeprefix(start): x for n, x in self.tensors.items() if n.startswith(start)}
+
+    def module(self, key, module, steps, train):
+        """``module`` after ``train(module, advance)`` of so many steps; it takes no gradient any more."""
+
+        def trained():
+            with self.run.progress(steps, f"training {key}") as progress:
+                train(module, progress.advance)
+            return module.state_dict()
+
+        module.load_state_dict(self(key, trained))
+        return module.requires_grad_(False)
+
+
+def generators(run, sequences):
+    """By name, functions from a sequence to counts [T-1, 2, H, W]; the fitted Spike-ESIM and ESIM's threshold."""
+    store = Store(run)
+    seed = run.config.seed + 1
+    made = {name: _thesis(store, name, sequences, run.config.steps // 2, seed) for name in VARIANTS}
+    theta = best_theta(sequences)
+    ours = SpikeEsim(0.2, 0.2, refractory_s=5e-4, width=4, seed=seed)
+
+    def train(model, advance):
+        train_ours(model, sequences, run.config.steps, torch.Generator().manual_seed(seed), advance)
+        calibrate(model, sequences)
+
+    store.module("ours", ours, run.config.steps, train)
+
+    def draw(sequence):
+        return ours.draw(sequence.frames, sequence.t_s, torch.Generator().manual_seed(0))[0]
+
+    made |= {"esim": partial(esim, theta=theta), "ours": draw, "sensor": lambda sequence: sequence.again}
+    return made, ours, theta
+
+
+def best_theta(sequences):
+    """The single threshold with which ESIM comes closest to all sequences together."""
+    return min(THETAS, key=lambda theta: distance([(esim(one, theta), one) for one in sequences]))
+
+
+def esim(sequence, theta):
+    """Counts of the ideal sensor."""
+    return events.dense_counts(sequence.frames, sequence.t_s, SensorModel(theta, theta))
+
+
+def _thesis(store, name, sequences, steps, seed):
+    """The variant from the better of two starts, trained the thesis's way: Adam at 0.01, van Rossum loss alone, one
+    sequence after the other."""
+
+    def spikes(network, sequence):
+        return network(sequence.frames / LIGHT)[0]
+
+    def train(network, advance):
+        generator = torch.Generator().manual_seed(seed)
+
+        def loss():
+            sequence = sequences[_integer(len(sequences), generator)]
+            found = spikes(network, sequence)
+            return events.van_rossum(found, sequence.counts, tau_s=TAU_S, dt=sequence.dt_s)
+
+        descend(torch.optim.Adam(network.parameters(), lr=0.01), loss, steps, advance)
+
+    busiest = max(sequences, key=lambda sequence: float(sequence.counts.sum()))
+    found = []
+    for share in SHARES:
+        network = VARIANTS[name](1, dt=1e3 * sequences[0].dt_s, seed=seed)
+        network.wake(busiest.frames / LIGHT, share)
+        network = store.module(f"{name}_{share}", network, steps, train)
+        found.append((distance([(spikes(network, one), one) for one in sequences]), network))
+    return partial(spikes, min(found, key=lambda pair: pair[0])[1])
+
+
+def descend(optimiser, loss, steps, advance, paces=None, clip=math.inf):
+    """Follow the gradient of ``loss()``; paces: one function a group of parameters, from step to share of its rate."""
+    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, paces or (lambda step: 1.0))
+    for _ in range(steps):
+        value = loss()
+        optimiser.zero_grad()
+        value.backward()
+        parameters = [p for group in optimiser.param_groups for p in group["params"]]
+        torch.nn.utils.clip_grad_norm_(parameters, clip)
+        optimiser.step()
+        schedule.step()
+        advance(loss=float(value.detach()))
+
+
+def objective(found, target, dt_s, count_weight=0.1, block_steps=8):
+    """Van Rossum distance and a share of that of pooled counts, each over that of silence."""
+
+    def over_silence(distance):
+        return distance(found, target) / distance(torch.zeros_like(target), target)
+
+    pooled = partial(events.count_loss, side_px=8, steps=block_steps)
+    loss = over_silence(partial(events.van_rossum, tau_s=TAU_S, dt=dt_s))
+    return loss + count_weight * over_silence(pooled) if count_weight else loss
+
+
+def train_ours(model, sequences, steps, generator, advance):
+    """Adam, its step falling as a half cosine to a twentieth; convolutions learn slowly, single numbers fast, and
+    noise, which remains when the signal is learnt, in the second half."""
+
+    def loss():
+        frames, t_s, counts = crops(sequences, generator)
+        found = model(frames, t_s)[0] + model.expected_noise(frames, t_s)
+        return objective(found, counts, float(t_s[1] - t_s[0]))
+
+    def falling(step):
+        return 0.05 + 0.475 * (1 + math.cos(math.pi * step / steps))
+
+    groups = {3e-3: [], 2e-2: [], 5e-2: []}  # by their step of Adam
+    for name, parameter in model.named_parameters():
+        slow = name.startswith(("branch", "prefilter"))
+        groups[3e-3 if slow else 5e-2 if name.startswith("noise") else 2e-2].append(parameter)
+    groups = [{"params": parameters, "lr": rate} for rate, parameters in groups.items()]
+    paces = [falling, falling, lambda step: float(2 * step >= steps)]
+    descend(torch.optim.Adam(groups, betas=(0.9, 0.98)), loss, steps, advance, paces, clip=1.0)
+
+
+def crops(sequences, generator, batch=BATCH):
+    """Random squares out of random sequences: frames [T, B, h, w], t_s [T], counts [T-1, 2, B, h, w]. A batch without
+    any event has no relative loss; then another is drawn."""
     while True:
-        frames = []
-        counts = []
+        frames, counts = [], []
         for _ in range(batch):
             sequence = sequences[_integer(len(sequences), generator)]
-            y, x = (_integer(side - size_px + 1, generator) for side in sequence.frames.shape[1:])
-            window = (..., slice(y, y + size_px), slice(x, x + size_px))
+            y, x = (_integer(side - CROP_PX + 1, generator) for side in sequence.frames.shape[1:])
+            window = (..., slice(y, y + CROP_PX), slice(x, x + CROP_PX))
             frames.append(sequence.frames[window])
             counts.append(sequence.counts[window])
         if any(bool(part.any()) for part in counts):
             return torch.stack(frames, 1), sequences[0].t_s, torch.stack(counts, 2)
 
 
-def parameter_groups(model, fast=FAST):
-    """Convolutions learn slowly, single numbers fast."""
-    slow = [
-        parameter for name, parameter in model.named_parameters() if name.startswith(("branch", "prefilter"))
-    ]
-    single = [
-        parameter
-        for name, parameter in model.named_parameters()
-        if not name.startswith(("branch", "prefilter", "noise"))
-    ]
-    noise = [parameter for name, parameter in model.named_parameters() if name.startswith("noise")]
-    return [{"params": slow, "lr": SLOW}, {"params": single, "lr": fast}, {"params": noise, "lr": NOISE}]
-
-
-def train_ours(
-    model, sequences, steps, generator, advance, until=None, *, count_weight=0.1, fast=FAST, **options
-):
-    """Adam, its step falling as a half cosine to a twentieth over ``steps``; stops after ``until`` steps.
-    options: of ``crops``. Returns losses."""
-    optimiser = torch.optim.Adam(parameter_groups(model, fast), betas=(0.9, 0.98))
-    losses = []
-
-    def falling(step):
-        return 0.05 + 0.475 * (1 + math.cos(math.pi * step / steps))
-
-    def late(step):
-        return float(2 * step >= steps)  # noise is what remains when the signal is learnt
-
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, [falling, falling, late])
-    for _ in range(steps if until is None else until):
-        frames, t_s, counts = crops(sequences, generator, **options)
-        found, _ = model(frames, t_s)
-        loss = objective(
-            found + model.expected_noise(frames, t_s), counts, float(t_s[1] - t_s[0]), count_weight
-        )
-        optimiser.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-        optimiser.step()
-        schedule.step()
-        losses.append(float(loss.detach()))
-        advance(loss=losses[-1])
-    return losses
-
-
-def train_thesis(network, sequences, steps, generator, advance, light=32.0):
-    """The thesis' way: Adam at 0.01, van Rossum loss alone, one sequence after the other. Returns losses."""
-    optimiser = torch.optim.Adam(network.parameters(), lr=0.01)
-    losses = []
-    for _ in range(steps):
-        sequence = sequences[_integer(len(sequences), generator)]
-        spikes, _, _ = network(sequence.frames / light)
-        loss = van_rossum(spikes, sequence.counts, tau_s=TAU_S, dt=sequence.dt_s)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        losses.append(float(loss.detach()))
-        advance(loss=losses[-1])
-    return losses
-
-
-def total_distance(generate, sequences):
-    """Van Rossum loss of all sequences together over that of silence. generate: function from a sequence to
-    counts."""
-    sums = torch.zeros(2, dtype=torch.float64)
-    for sequence in sequences:
-        for k, found in enumerate((generate(sequence), torch.zeros_like(sequence.counts))):
-            sums[k] += float(van_rossum(found, sequence.counts, tau_s=TAU_S, dt=sequence.dt_s))
-    return float(sums[0] / sums[1])
-
-
-def best_theta(sequences):
-    """The single threshold with which ESIM comes closest to all sequences together, by van Rossum
-    distance."""
-    return min(
-        THETAS,
-        key=lambda theta: total_distance(
-            lambda sequence: esim_counts(sequence.frames, sequence.t_s, theta), sequences
-        ),
-    )
-
-
-def esim_counts(frames, t_s, theta):
-    """Counts of the ideal sensor."""
-    return events.dense_counts(frames, t_s, SensorModel(theta, theta))
+@torch.no_grad()
+def calibrate(model, sequences, rounds=3):
+    """Scale the thresholds until the generator gives as many events as the target, noise included: squared errors
+    favour too few events where an edge is predicted beside its place."""
+    target = sum(sequence.counts.sum((0, 2, 3)).double() for sequence in sequences)
+    for _ in range(rounds):
+        found = torch.zeros(2, dtype=torch.float64)
+        for sequence in sequences:
+            counts = model(sequence.frames, sequence.t_s)[0]
+            found += (counts + model.expected_noise(sequence.frames, sequence.t_s)).sum((0, 2, 3)).double()
+        # events go as 1/theta for a steady change and as 1/theta^2 for a random walk
+        model.log_gain.add_(0.7 * (found / target).log())
 
 
 def _integer(limit, generator):
     return int(torch.randint(limit, (), generator=generator))
-
-
-@torch.no_grad()
-def calibrated_scale(model, sequences, rounds=3):
-    """Factors on the thresholds ON and OFF with which the generator gives as many events as the target, noise
-    included, on these sequences.
-
-    Squared errors favour too few events where an edge is predicted beside its place; the number of events is
-    set right afterwards.
-    """
-    target = sum(sequence.counts.sum((0, 2, 3)).double() for sequence in sequences)
-    scale = torch.ones(2, dtype=torch.float64)
-    for _ in range(rounds):
-        found = torch.zeros(2, dtype=torch.float64)
-        for sequence in sequences:
-            counts, _ = model(sequence.frames, sequence.t_s, theta_scale=scale)
-            found += (counts + model.expected_noise(sequence.frames, sequence.t_s)).sum((0, 2, 3)).double()
-        scale = (
-            scale * (found / target) ** 0.7
-        )  # events go as 1/theta for a steady change and as 1/theta^2 for a random walk
-    return scale.tolist()

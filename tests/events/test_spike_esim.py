@@ -1,18 +1,22 @@
-"""Spike-ESIM against the hard sensor, closed forms of its parts, and chunks against the whole."""
+"""Spike-ESIM against the hard sensor, the network of the thesis against an independent case, closed forms of their parts
+and losses, chunks against the whole."""
 
 import math
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from codesign import events
 from codesign.errors import DomainError, FileFormatError, ShapeError
 from codesign.events import SensorModel, lin_log, spiking
+from codesign.events.spiking.losses import count_loss, van_rossum
 from codesign.events.spiking.spike_esim import SpikeEsim
-from codesign.events.spiking.two_branches import TwoBranchSpikes
+from codesign.events.spiking.srm import srm
+from codesign.events.spiking.surrogate import Laplace
+from codesign.events.spiking.thesis_network import TwoBranchSpikes
 from tests.rounding_case import RoundsByPlace
 
 D = torch.float64
@@ -258,34 +262,155 @@ def test_the_generator_that_comes_along_has_learnt_its_sensor():
     assert float(found.detach().sum() / target.sum()) == pytest.approx(1, abs=0.25)
 
 
-def test_bad_input_is_refused():
-    frames, t_s = clip(frames=4)
-    model = SpikeEsim()
-    _, state = model(frames, t_s)
-    for pictures, times_s, before, error, words in [
-        (frames * math.nan, t_s, None, DomainError, "NaN"),
-        (frames * math.inf, t_s, None, DomainError, "infinit"),
-        (-frames, t_s, None, DomainError, "negative"),
-        (frames[:1], t_s[:1], None, ShapeError, "at least 2"),
-        (frames[:, 0], t_s, None, ShapeError, "H, W"),
-        (frames, t_s[:3], None, ShapeError, r"\[4\]"),
-        (frames, t_s, state, DomainError, "go on increasing"),
-        (frames[:, :6], t_s + 1, state, ShapeError, "keeps its frame size"),
-        (frames.float(), t_s + 1, state, ShapeError, "keeps its frame size"),
-    ]:
-        with pytest.raises(error, match=words):
-            model(pictures, times_s, before)
-    for scale in (0.0, -1.0, math.nan, [1.0, 2.0, 3.0]):
-        with pytest.raises(DomainError, match="theta_scale"):
-            model(frames, t_s, theta_scale=scale)
-    options: dict[str, Any]
-    for options, words in (
-        ({"theta_on": 0.0}, "theta_on"),
-        ({"theta_off": math.nan}, "theta_off"),
-        ({"comparator": "soft"}, "comparator"),
-        ({"refractory_s": -1.0}, "refractory_s"),
-    ):
-        with pytest.raises(DomainError, match=words):
-            SpikeEsim(**options)
-    with pytest.raises(DomainError, match="dead time"):
-        SpikeEsim(refractory_s=1e-3, comparator="srm")
+def steps_first(array):
+    return torch.from_numpy(np.moveaxis(array, -1, 0).astype(np.float64).copy())
+
+
+def of_thesis(data, through_reset):
+    network = TwoBranchSpikes(
+        3,
+        theta=0.7,
+        surrogate=Laplace(float(data["alpha"]), float(data["beta"])),
+        through_reset=through_reset,
+    ).double()
+    with torch.no_grad():
+        network.weight_on.copy_(torch.from_numpy(data["wp"]))
+        network.weight_off.copy_(torch.from_numpy(data["wn"]))
+    return network
+
+
+@pytest.mark.bits
+@pytest.mark.filterwarnings("ignore:max rho:RuntimeWarning")
+@pytest.mark.parametrize(("through_reset", "name"), [("off", "gw_slayer"), ("full", "gw_bptt")])
+def test_network_of_the_thesis_equals_the_reference(shared, through_reset, name):
+    data = dict(np.load(shared("refs/srm/z_spike_esim.npz")))
+    network = of_thesis(data, through_reset)
+    spikes, potential, _ = network(steps_first(data["I"]))
+    assert torch.equal(spikes, steps_first(data["spikes"]))
+    assert (potential - steps_first(data["u"])).abs().max() <= 1e-12
+    loss = van_rossum(spikes, steps_first(data["target"]), tau_s=float(data["tau_s"]))
+    assert abs(float(loss.detach()) - float(data["loss"])) <= 1e-10  # of 212
+    weights = [network.weight_on, network.weight_off]
+    found = torch.stack(torch.autograd.grad(loss, weights))
+    assert (found - torch.from_numpy(data[name])).abs().max() <= 1e-9  # values up to 340
+    if through_reset == "full":
+        drive, _ = network._drive(steps_first(data["I"]), None)
+        spikes, _, _ = srm(drive, theta=0.7, smooth=True, **network._options)
+        loss = van_rossum(spikes, steps_first(data["target"]), tau_s=float(data["tau_s"]))
+        found = torch.stack(torch.autograd.grad(loss, weights))
+        assert abs(float(loss.detach()) - float(data["smooth_loss"])) <= 1e-10
+        assert (found - torch.from_numpy(data["smooth_gw"])).abs().max() <= 1e-9
+        # central differences of the reference, of 1e-8 relative precision
+        assert (found[0] - torch.from_numpy(data["smooth_gw_fd_pos"])).abs().max() <= 1e-6
+
+
+def test_smoothing_is_the_alpha_response_of_the_drive_and_its_delay_two_time_constants():
+    tau = 10.0
+    network = TwoBranchSpikes(1, theta=1.0, smoothing_tau=tau).double()
+    with torch.no_grad():
+        network.weight_on.zero_()[0, 1, 1] = 0.01  # far below the threshold: no reset
+    frames = torch.zeros(201, 3, 3, dtype=D)
+    frames[1:] = 1.0  # one step of brightness
+    spikes, potential, _ = network(frames)
+    k = torch.arange(200, dtype=D)
+    truth = 0.01 * k / tau * torch.exp(1 - k / tau)
+    assert spikes.sum() == 0
+    assert (potential[:, 0, 1, 1] - truth).abs().max() <= 1e-14
+    course = potential[:, 0, 1, 1].detach()
+    delay = float((k * course).sum() / course.sum())
+    assert delay == pytest.approx(
+        2 * tau, rel=1e-3
+    )  # mean of t exp(-t/tau) is 2 tau; sampled: tau coth(1/(2 tau)), 8e-4 more
+
+
+def test_it_forgets_a_slow_ramp_and_wakes_on_silence_are_refused():
+    network = TwoBranchSpikes(1)
+    slow = torch.linspace(0, 8, 801)[:, None, None].expand(
+        -1, 4, 4
+    )  # eight thresholds in steps of a hundredth
+    with torch.no_grad():
+        network.weight_on.fill_(1 / 9)
+    assert network(slow)[0].sum() == 0
+    with pytest.raises(DomainError, match="silent"):
+        network.wake(torch.full((10, 4, 4), 3.0))
+
+
+def test_a_woken_network_reaches_its_threshold_with_the_share_asked():
+    frames = torch.rand(30, 16, 16, generator=torch.Generator().manual_seed(2), dtype=D)
+    network = TwoBranchSpikes(1, theta=0.7, kernel="step").double()
+    network.wake(frames, share=0.1)
+    drive, _ = network._drive(frames, None)
+    for branch in (0, 1):
+        assert float((drive[:, branch] >= 0.7 * (1 - 1e-6)).double().mean()) == pytest.approx(
+            0.1, abs=1 / drive[:, branch].numel()
+        )
+
+
+def test_van_rossum_of_a_lone_event_has_its_closed_form():
+    target = torch.zeros(4000, 2, 1, 1, dtype=D)
+    found = torch.zeros(4000, 2, 1, 1, dtype=D)
+    found[3, 0] = 1
+    h = 0.1
+    dt = 2e-3
+    q = math.exp(-2 * h)
+    truth = 0.5 * dt * h**2 * math.e**2 * q * (1 + q) / (1 - q) ** 3  # sum of k^2 q^k
+    assert float(van_rossum(found, target, tau_s=dt / h, dt=dt)) == pytest.approx(truth, rel=1e-12)
+    assert truth == pytest.approx(
+        math.e**2 * (dt / h) / 8, rel=1e-2
+    )  # the integral; the sum differs by O(h^2)
+    apart = found.roll(40, 0)  # the overlap of two responses z = 4 tau apart: e^2 tau/4 e^-z (1 + z)
+    overlap = math.e**2 * (dt / h) / 4 * math.exp(-4) * (1 + 4)
+    assert float(van_rossum(found, apart, tau_s=dt / h, dt=dt)) == pytest.approx(
+        2 * truth - overlap, rel=1e-2
+    )
+
+
+def test_count_loss_is_half_the_chi_square_of_blocks():
+    target = torch.zeros(4, 2, 4, 4, dtype=D)
+    target[0, 0, 0, 0] = 3  # block (0, 0, 0) of ON holds 3
+    found = torch.zeros(4, 2, 4, 4, dtype=D)
+    found[1, 0, 1, 1] = 1  # the same block: 1 against 3, (1 - 3)^2/(3 + 1) = 1
+    found[3, 1, 3, 3] = 2  # OFF, another block: 2 against 0, 4/1
+    assert float(count_loss(found, target, side_px=2, steps=2)) == 2.5
+    assert float(count_loss(target, target, side_px=2, steps=2)) == 0
+
+
+FRAMES, T_S = clip(frames=4)
+OURS = SpikeEsim()
+STATE = OURS(FRAMES, T_S)[1]
+NETWORK = TwoBranchSpikes(1)
+COUNTS = torch.zeros(4, 2, 3, 3)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda: OURS(FRAMES * math.nan, T_S), DomainError, "NaN"),
+        (lambda: OURS(FRAMES * math.inf, T_S), DomainError, "infinit"),
+        (lambda: OURS(-FRAMES, T_S), DomainError, "negative"),
+        (lambda: OURS(FRAMES[:1], T_S[:1]), ShapeError, "at least 2"),
+        (lambda: OURS(FRAMES[:, 0], T_S), ShapeError, "H, W"),
+        (lambda: OURS(FRAMES, T_S[:3]), ShapeError, r"\[4\]"),
+        (lambda: OURS(FRAMES, T_S, STATE), DomainError, "go on increasing"),
+        (lambda: OURS(FRAMES[:, :6], T_S + 1, STATE), ShapeError, "keeps its frame size"),
+        (lambda: OURS(FRAMES.float(), T_S + 1, STATE), ShapeError, "keeps its frame size"),
+        (lambda: OURS(FRAMES, T_S, theta_scale=0.0), DomainError, "theta_scale"),
+        (lambda: OURS(FRAMES, T_S, theta_scale=torch.ones(3)), DomainError, "theta_scale"),
+        (lambda: SpikeEsim(theta_on=0.0), DomainError, "theta_on"),
+        (lambda: SpikeEsim(theta_off=math.nan), DomainError, "theta_off"),
+        (lambda: SpikeEsim(comparator="soft"), DomainError, "comparator"),
+        (lambda: SpikeEsim(refractory_s=-1.0), DomainError, "refractory_s"),
+        (lambda: SpikeEsim(refractory_s=1e-3, comparator="srm"), DomainError, "dead time"),
+        (lambda: NETWORK(FRAMES * math.nan), DomainError, "NaN"),
+        (lambda: NETWORK(FRAMES[:1]), ShapeError, "at least 2"),
+        (lambda: NETWORK(FRAMES[:, None].expand(-1, 3, -1, -1)), ShapeError, "channels=1"),
+        (lambda: NETWORK(FRAMES[:, :4], NETWORK(FRAMES)[2]), ShapeError, "keeps its frame size"),
+        (lambda: TwoBranchSpikes(0), DomainError, "channels"),
+        (lambda: van_rossum(COUNTS, COUNTS[..., :2], tau_s=1.0), ShapeError, "no distance"),
+        (lambda: van_rossum(COUNTS[:, 0, 0], COUNTS[:, 0, 0], tau_s=1.0), DomainError, "ON first"),
+        (lambda: count_loss(COUNTS, COUNTS, side_px=4, steps=2), ShapeError, "do not fit"),
+    ],
+)
+def test_bad_input_is_refused(call, error, words):
+    with pytest.raises(error, match=words):
+        call()

@@ -29,7 +29,7 @@ from codesign.events.sensor.model import (
     draw_shot_counts,
     mismatched,
 )
-from codesign.events.spiking.comparators import count_spikes
+from codesign.events.spiking.srm import count_spikes
 
 MOST_REMEMBERED = 2**24  # random numbers of a draw
 MOST_STEPS = 4096  # of spiking neurons per frame interval
@@ -189,7 +189,7 @@ class Spikes:
             level = _between(_with_last(level, None if state is None else state[0]), self.steps)
             level = level if state is None else level[1:]
         thetas = torch.stack((theta_on, theta_off))
-        spikes, state = count_spikes(level, None, thetas, state, None, gradient=self.gradient)
+        spikes, state = count_spikes(level, thetas, state, self.gradient)
         return spikes.unflatten(0, (-1, self.steps)).sum(1) if self.steps > 1 else spikes, state
 
 

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
 from codesign.events.entry import check_layout, check_whole
-from codesign.events.spiking.srm_scale import alpha_response
+from codesign.events.spiking.srm import alpha_response
 
 
 def van_rossum(found: Tensor, target: Tensor, *, tau_s: Tensor | float, dt: float = 1.0) -> Tensor:

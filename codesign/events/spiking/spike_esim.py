@@ -1,15 +1,20 @@
 """Spike-ESIM: an event generator that starts as the ideal memorised-reference sensor and learns what a real
 one does differently."""
 
+import io
+import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Generator, Tensor, nn
 
-from codesign.errors import DomainError, ShapeError, check_seed
+from codesign.arrays import read_npz
+from codesign.atomic import write_atomic
+from codesign.errors import CodesignError, DomainError, FileFormatError, ShapeError, check_seed
 from codesign.events.entry import (
     Times,
     check_choice,
@@ -20,14 +25,23 @@ from codesign.events.entry import (
     shown,
 )
 from codesign.events.intensity import lin_log
-from codesign.events.sensor.model import check_generator
-from codesign.events.spiking.comparators import COMPARATORS
-from codesign.events.spiking.front import Bandwidth, Prefilter, ToneCurve
-from codesign.events.spiking.noise import NoiseRate
-from codesign.events.spiking.residual import ResidualBranch
-from codesign.events.spiking.saved import read_generator, write_generator
-from codesign.events.spiking.stepwise import stepwise
+from codesign.events.layers.memory import memory
+from codesign.events.layers.physical import sensor_counts
+from codesign.events.sensor.model import SensorModel, check_generator
+from codesign.events.spiking.spike_esim_parts import (
+    Bandwidth,
+    NoiseRate,
+    Prefilter,
+    ResidualBranch,
+    ToneCurve,
+    stepwise,
+)
+from codesign.events.spiking.srm import count_spikes
+from codesign.reading import reading
 
+COMPARATORS = ("memory", "srm")
+REMEDY = "give the .npz file that SpikeEsim.save wrote"
+SETTINGS = "settings"  # name of the settings, JSON, in a file beside the parameters
 SLOW_S = 0.05  # time constant of the slow level that the residual branch compares with
 
 
@@ -161,14 +175,23 @@ class SpikeEsim(nn.Module):
                 f"theta_scale is {shown(theta_scale)}; a finite factor > 0, or one each for ON and OFF, is needed."
             )
         seen, after = self._levels(frames, times_s, state)
-        compare = COMPARATORS[self.settings["comparator"]]
-        counts, comparator = compare(
-            seen,
-            times_s[-len(seen) :],
-            self.thetas() * scale,
-            None if state is None else state.comparator,
-            self.refractory_s(),
-        )
+        theta = self.thetas() * scale
+        before = None if state is None else state.comparator
+        if self.settings["comparator"] == "srm":
+            counts, comparator = count_spikes(seen, theta, before)
+        elif self.log_dead is None:
+            counts, comparator = memory(seen, theta[0], theta[1], state=before, log_input=True)
+        else:
+            counts, comparator = sensor_counts(
+                seen,
+                times_s[-len(seen) :],
+                SensorModel(),
+                state=before,
+                log_input=True,
+                theta_on=theta[0],
+                theta_off=theta[1],
+                refractory_s=self.refractory_s(),
+            )
         return counts, SpikeEsimState(*after, frames[-1], float(times_s[-1]), comparator)
 
     def expected_noise(self, frames: Tensor, t_s: Times, state: SpikeEsimState | None = None) -> Tensor:
@@ -199,13 +222,32 @@ class SpikeEsim(nn.Module):
 
     def save(self, path: str | Path) -> None:
         """Write settings and parameters as an .npz file."""
-        write_generator(check_path(path), self.settings, self.state_dict())
+        parameters = {name: value.detach().cpu().numpy() for name, value in self.state_dict().items()}
+        buffer = io.BytesIO()
+        np.savez(buffer, **{SETTINGS: np.array(json.dumps(self.settings))}, **parameters)
+        write_atomic(check_path(path), buffer.getvalue())
 
     @classmethod
     def load(cls, path: str | Path) -> "SpikeEsim":
         """A generator that ``save`` wrote. Raises: FileFormatError when the file is missing, damaged or of
         another kind."""
-        return read_generator(check_path(path), cls)
+        path = check_path(path)
+        stored = read_npz(path, REMEDY)
+        with reading(f"'{path}'", REMEDY):
+            settings = json.loads(str(stored.pop(SETTINGS)))
+            parameters = {name: torch.from_numpy(values) for name, values in stored.items()}
+        try:
+            with reading(f"'{path}'", REMEDY):
+                generator = cls(**settings)
+                generator.load_state_dict(parameters)
+        except CodesignError as error:
+            raise FileFormatError(f"'{path}' holds no generator ({error}); {REMEDY}.") from error
+        for name, value in parameters.items():
+            if not bool(value.isfinite().all()):
+                raise FileFormatError(
+                    f"'{path}' holds NaN or infinity in '{name}'; train and save the generator again."
+                )
+        return generator
 
     def _levels(self, frames, times_s, state):
         """What the comparators see, [T, ...], and (level, filtered, slow) after the last frame."""

@@ -3,27 +3,26 @@ constants, explicit state."""
 
 import warnings
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError, ShapeError, as_number, check_finite
+from codesign.errors import DomainError, ShapeError, as_number
 from codesign.events.entry import (
     check_choice,
     check_flag,
     check_layout,
     check_per_pixel,
     check_positive,
-    shown,
+    check_whole,
 )
-from codesign.events.spiking.srm_forward import Plan
-from codesign.events.spiking.srm_gradient import Setup, reset_sum, run
 from codesign.events.spiking.srm_kernels import RESETS, RESPONSES, STATES
-from codesign.events.spiking.srm_mean import check_mean, meant
-from codesign.events.spiking.srm_play import check_play, played
+from codesign.events.spiking.srm_loops import Setup, run
+from codesign.events.spiking.srm_mean import check_mean, mean_spikes
+from codesign.events.spiking.srm_play import check_play, instead, played, with_play
 from codesign.events.spiking.srm_state import SrmState, entering_state
-from codesign.events.spiking.srm_truncated import run_truncated
-from codesign.events.spiking.surrogate import Laplace, Surrogate
+from codesign.events.spiking.surrogate import FastSigmoid, Laplace, Surrogate
 
 GRADIENTS = ("surrogate", "play", "mean")
 THROUGH_RESET = ("off", "full", "bounded")
@@ -48,7 +47,6 @@ def srm(
     through_reset: str = "off",
     smooth: bool = False,
     segment: int | None = None,
-    truncation: float | None = None,
     nonfinite: str = "raise",
 ) -> tuple[Tensor, Tensor, SrmState]:
     """Spikes s_t = [u_t >= theta] of the potential u_t = (response of the drive)_t + sum over k >= 1 of nu_k
@@ -85,8 +83,6 @@ def srm(
         exact.
       segment: steps per segment. Potentials are then recomputed in the backward pass from the states kept
         between segments: O(sqrt(T)) memory at about sqrt(8 T).
-      truncation: cut both kernels where they fall below this value after their time constant, as SLAYER does
-        at 0.01; None: whole kernels.
       nonfinite: "raise", or "zero": NaN and infinite drives count as 0 and get no gradient.
     Returns:
       spikes, potential: [T, ...] as ``drive``; spikes are 0 or 1.
@@ -111,7 +107,7 @@ def srm(
     >>> spikes.flatten().tolist()  # it rests until the reset has faded to less than 0.2: e^-2
     [1.0, 0.0, 0.0, 1.0, 0.0, 0.0]
     """
-    drive = _checked_drive(drive, nonfinite, truncation)
+    check_layout(drive, 1, name="drive")  # the loop over time looks at every value anyway
     pixels = drive.shape[1:]
     check_flag(coupled, "coupled")
     check_flag(smooth, "smooth")
@@ -120,10 +116,14 @@ def srm(
             f"coupled polarities need a drive of shape [T, 2, ...], ON first, got {list(drive.shape)}; "
             "stack the two drives on axis 1."
         )
-    check_choice(kernel, "kernel", RESETS)
-    check_choice(response, "response", RESPONSES)
-    check_choice(through_reset, "through_reset", THROUGH_RESET)
-    check_choice(gradient, "gradient", GRADIENTS)
+    for value, name, choices in (
+        (nonfinite, "nonfinite", NONFINITE),
+        (kernel, "kernel", RESETS),
+        (response, "response", RESPONSES),
+        (through_reset, "through_reset", THROUGH_RESET),
+        (gradient, "gradient", GRADIENTS),
+    ):
+        check_choice(value, name, choices)
     dt = check_positive(dt, "dt")
     if reset_scale := as_number(reset_scale, "reset_scale"):
         reset_scale = check_positive(reset_scale, "reset_scale")
@@ -132,19 +132,10 @@ def srm(
     tau_r = _time_constant(tau_r, "tau_r", drive, dt) if kernel != "step" else torch.ones_like(theta)
     if gradient == "play":
         check_play(drive, kernel, response, reset_scale, coupled, state)
-        given = (drive, theta, state)
+        layer = {"kernel": kernel, "response": response, "reset_scale": reset_scale, "coupled": True}
         with torch.no_grad():
-            spikes, potential, after = srm(
-                drive,
-                theta=theta,
-                kernel=kernel,
-                state=state,
-                response=response,
-                reset_scale=reset_scale,
-                coupled=True,
-                truncation=truncation,
-            )
-        spikes, play = played(spikes, *given)
+            spikes, potential, after = srm(drive, theta=theta, state=state, **layer)
+        spikes, play = played(spikes, drive, theta, state)
         return spikes, potential, replace(after, play=play)
     if gradient == "mean":
         others = {
@@ -152,107 +143,156 @@ def srm(
             "through_reset": (through_reset, "off"),
             "smooth": (smooth, False),
             "segment": (segment, None),
-            "truncation": (truncation, None),
         }
         check_mean(kernel, coupled, others, state)
-        return _with_mean(
-            drive if nonfinite == "raise" else drive.where(drive.isfinite(), 0),
-            theta,
-            None if tau_s is None else tau_s / dt,
-            tau_r / dt,
-            kernel,
-            state,
-            response,
-            reset_scale,
-        )
+        drive = drive if nonfinite == "raise" else drive.where(drive.isfinite(), 0)
+        times = {"tau_s": tau_s, "dt": dt, "response": response}
+        return _with_mean(drive, theta, tau_r, kernel, reset_scale, state, times)
     if surrogate is None:
         surrogate = Laplace.unit(float(theta.detach().mean()))
     elif not isinstance(surrogate, Surrogate):
         raise DomainError(
             f"surrogate is {surrogate!r}; pass events.Laplace, events.FastSigmoid or events.Triangular."
         )
-    plan = Plan(
-        RESPONSES[response],
-        RESETS[kernel],
-        2 if coupled else 1,
-        type(surrogate),
-        smooth,
-        through_reset,
-        nonfinite == "zero",
-    )
-    setup = Setup(plan, kernel, reset_scale, surrogate, _segment(segment), tuple(drive.shape))
-    h_reset = dt / tau_r
-    if through_reset == "full" and torch.is_grad_enabled():
-        _warn_if_unstable(setup, theta.detach(), h_reset.detach(), drive.shape[0])
-    if truncation is not None:
-        if segment is not None:
-            raise DomainError(
-                "segment does not go with truncation, whose kernels have no states to begin a segment from; "
-                "leave one of them out."
-            )
-        return run_truncated(
-            setup,
-            drive,
-            theta,
-            None if tau_s is None else dt / tau_s,
-            h_reset,
-            state,
-            check_positive(truncation, "truncation", least=1e-300),
-        )
+    segment = None if segment is None else check_whole(segment, "segment", 1)
     if drive.numel() >= 2**32:
         raise ShapeError(
             f"drive holds {drive.numel()} values, a call addresses up to 2**32; give it in chunks of time "
             "and carry the state."
         )
-    state = entering_state(state, (STATES[plan.response], STATES[plan.reset]), pixels, drive.device)
+    setup = Setup(
+        RESPONSES[response],
+        RESETS[kernel],
+        kernel,
+        2 if coupled else 1,
+        reset_scale,
+        surrogate,
+        smooth,
+        through_reset,
+        nonfinite == "zero",
+        segment,
+        tuple(drive.shape),
+    )
+    h_reset = dt / tau_r
+    if through_reset == "full" and torch.is_grad_enabled():
+        _warn_if_unstable(setup, theta.detach(), h_reset.detach(), drive.shape[0])
+    state = entering_state(state, (STATES[setup.response], STATES[setup.reset]), pixels, drive.device)
 
     def lanes(x):
-        return x.expand(pixels).reshape(plan.channels, -1).contiguous()
+        return x.expand(pixels).reshape(setup.channels, -1).contiguous()
 
-    states = [
-        rows.reshape(rows.shape[0], plan.channels, pixels.numel() // plan.channels)
-        for rows in (state.response, state.reset)
-    ]
     spikes, potential, *after = run(
         setup,
-        drive.reshape(drive.shape[0], plan.channels, -1),
+        drive.reshape(drive.shape[0], setup.channels, -1),
         lanes(theta),
         None if tau_s is None else lanes(dt / tau_s),
         lanes(h_reset),
-        *states,
+        *(
+            rows.reshape(len(rows), setup.channels, pixels.numel() // setup.channels)
+            for rows in (state.response, state.reset)
+        ),
     )
-    return (
-        spikes.view(drive.shape),
-        potential.view(drive.shape),
-        SrmState(*(rows.reshape(rows.shape[0], *pixels) for rows in after)),
-    )
+    after = SrmState(*(rows.reshape(len(rows), *pixels) for rows in after))
+    return spikes.view(drive.shape), potential.view(drive.shape), after
 
 
-def _with_mean(drive, theta, tau_s, tau_r, kernel, state, response, reset_scale):
-    """The hard layer with the gradient of its mean response; time constants in steps."""
-    layer = {"tau_s": tau_s, "response": response}
+def count_spikes(level: Tensor, theta: Tensor, state: Any, gradient: str = "play") -> tuple[Tensor, Any]:
+    """At most one event per step and polarity: a layer with step kernels and coupled polarities, which memorises a level.
+
+    Args: level: [T, ...]. theta: [2], or [2, ...] of every pixel. state: what an earlier call returned, or None.
+    Returns: counts [T-1, 2, ...] ([T, 2, ...] with a state); state to carry on.
+    Gradient: "play": of the mean count over places inside the threshold, with the cap of one event per step (``srm``).
+      "surrogate": by a fast sigmoid of width theta, through the reset where it cannot grow.
+    """
+    start, neurons, play = (level[:1], None, None) if state is None else (state[0][None], *state[1:])
+    step = torch.cat((start, level if state is not None else level[1:])).diff(dim=0)
+    thetas = theta.to(level)[(..., *[None] * (level.ndim - theta.ndim))]
+    with torch.set_grad_enabled(torch.is_grad_enabled() and gradient == "surrogate"):
+        spikes, _, neurons = srm(
+            torch.stack((step, -step), 1),
+            theta=thetas,
+            kernel="step",
+            response="step",
+            reset_scale=1.0,
+            coupled=True,
+            state=neurons,
+            surrogate=FastSigmoid.unit(float(theta.detach().mean())),
+            through_reset="bounded",
+        )
+    if gradient == "play" and torch.is_grad_enabled():
+        # a chunk that kept no gradient carries no play on: it begins again at the last level
+        begun = level if play is not None or state is None else torch.cat((start, level))
+        spikes, play = with_play(spikes, begun, thetas[0], thetas[1], play)
+    return spikes, (level[-1], neurons, play)
+
+
+def alpha_response(
+    signal: Tensor, *, tau_s: Tensor | float, dt: float = 1.0, state: SrmState | None = None
+) -> tuple[Tensor, SrmState]:
+    """The alpha kernel applied to a signal, exactly: y_t = sum over k >= 1 of (k h) exp(1 - k h) signal_{t-k}
+    with h = dt / tau_s.
+
+    Args: as for ``srm``. signal: [T, ...], for example spikes (their difference to a target gives the van
+      Rossum loss).
+    Returns: y [T, ...] and the SrmState to carry on.
+    Gradient: signal, tau_s, state.
+    Raises: as ``srm``.
+    """
+    return _response(signal, tau_s=tau_s, dt=dt, response="alpha", state=state)
+
+
+def drive_scale(
+    drive: Tensor,
+    *,
+    theta: Tensor | float,
+    tau_s: Tensor | float | None = None,
+    dt: float = 1.0,
+    response: str = "none",
+    share: float = 0.05,
+) -> float:
+    """Factor for the drive that lifts a share of all potentials to their threshold before any reset, so that
+    training does not start dead or saturated.
+
+    Args:
+      drive: [T, ...]; theta, tau_s, dt, response: as for ``srm``.
+      share: of (time, pixel) pairs that reach the threshold, 0 < share < 1.
+    Returns: factor > 0, a float.
+    Raises: DomainError when less than that share of the potentials is above 0 (a silent input: no factor
+      helps), or share is out of range.
+    """
+    if isinstance(share, bool) or not isinstance(share, (int, float)) or not 0 < share < 1:
+        raise DomainError(f"share is {share!r}; give a number between 0 and 1 (0.05 is typical).")
+    with torch.no_grad():
+        potential, _ = _response(drive, tau_s=tau_s, dt=dt, response=response)
+        relative = (potential / check_per_pixel(theta, "theta", drive, torch.float64)).flatten()
+        reached = max(1, round(share * relative.numel()))
+        level = float(relative.kthvalue(relative.numel() + 1 - reached).values)
+    if level <= 0:
+        above = int((relative > 0).sum())
+        raise DomainError(
+            f"only {above} of {relative.numel()} potentials are above 0, {reached} are to reach the "
+            "threshold; the input is silent: check it, or lower share."
+        )
+    return 1 / level
+
+
+def _response(drive, state=None, **times):
+    """The response of the drive alone, and the state after it."""
+    _, response, state = srm(drive, theta=1.0, kernel="step", reset_scale=0.0, state=state, **times)
+    return response, state
+
+
+def _with_mean(drive, theta, tau_r, kernel, reset_scale, state, times):
+    """The hard layer with the gradient of its mean response."""
     with torch.no_grad():
         spikes, potential, after = srm(
-            drive, theta=theta, tau_r=tau_r, kernel=kernel, reset_scale=reset_scale, state=state, **layer
+            drive, theta=theta, tau_r=tau_r, kernel=kernel, reset_scale=reset_scale, state=state, **times
         )
     before = None if state is None else SrmState(state.response, torch.zeros_like(after.reset[:1]))
-    _, driven, responded = srm(drive, theta=1.0, kernel="step", reset_scale=0.0, state=before, **layer)
-    spikes, mean = meant(
-        spikes, driven, theta, 1 / tau_r, kernel, reset_scale, None if state is None else state.mean
-    )
-    return spikes, potential, replace(after, response=responded.response, mean=mean)
-
-
-def _checked_drive(drive, nonfinite, truncation):
-    check_layout(drive, 1, name="drive")
-    check_choice(nonfinite, "nonfinite", NONFINITE)
-    if truncation is None:
-        return drive  # the loop over time looks at every value anyway
-    return (
-        check_finite(drive, "drive", 'remove or repair them, or pass nonfinite="zero"')
-        if nonfinite == "raise"
-        else drive.where(drive.isfinite(), 0)
-    )
+    driven, responded = _response(drive, before, **times)
+    before = None if state is None else state.mean
+    mean, ages = mean_spikes(driven, theta, times["dt"] / tau_r, kernel, reset_scale, before)
+    return instead(spikes, mean), potential, replace(after, response=responded.response, mean=ages)
 
 
 def _time_constant(value, name, drive, dt):
@@ -267,17 +307,8 @@ def _time_constant(value, name, drive, dt):
     return value
 
 
-def _segment(segment):
-    if segment is not None and (isinstance(segment, bool) or not isinstance(segment, int) or segment < 1):
-        raise DomainError(
-            f"segment is {shown(segment)}; give a whole number of steps >= 1 (about the square root of 8 T needs "
-            "least memory), or None."
-        )
-    return segment
-
-
 def _warn_if_unstable(setup, theta, h_reset, steps):
-    bound = float(reset_sum(setup, theta, h_reset, steps).max()) / setup.surrogate.alpha
+    bound = float(setup.reset_sum(theta, h_reset, steps).max()) / setup.surrogate.alpha
     if bound >= 1:
         warnings.warn(
             f"max rho * sum|nu| is {bound:.3g}, not below 1: gradients through the reset may grow without "

@@ -1,20 +1,16 @@
-"""The kernels of the spike response model as linear recursions: one decay a, one amplitude m, at most two
-states.
+"""The kernels of the spike response model as linear recursions with one decay a, one amplitude m and at most two states; no sum is cut:
 
-    pair     q <- a (q + p), p <- a p, y = m q, p <- p + z      y_t = m sum_{k>=1} k a^k z_{t-k}      (alpha response, slayer reset)
-    late     p <- a p, y = m p, p <- p + z                      y_t = m sum_{k>=1} a^k z_{t-k}        (thesis reset)
-    early    y = m p, p <- a p + z                              y_t = m sum_{k>=1} a^{k-1} z_{t-k}    (exp and step reset)
-    sum      p <- p + z, y = p                                  y_t = sum_{k>=0} z_{t-k}              (step response)
-    none     y = z
-
-No sum is cut: the recursion is the whole kernel. ``retreat`` is the adjoint of ``advance``, and its
-derivative with respect to one parameter of a and m is ``retreat_tangent``; all three work on numbers and on
-arrays of any library.
+pair     q <- a (q + p), p <- a p, y = m q, p <- p + z      y_t = m sum_{k>=1} k a^k z_{t-k}      (alpha response, slayer reset)
+late     p <- a p, y = m p, p <- p + z                      y_t = m sum_{k>=1} a^k z_{t-k}        (thesis reset)
+early    y = m p, p <- a p + z                              y_t = m sum_{k>=1} a^{k-1} z_{t-k}    (exp and step reset)
+sum      p <- p + z, y = p                                  y_t = sum_{k>=0} z_{t-k}              (step response)
+none     y = z
 """
 
 import math
 from dataclasses import dataclass
-from typing import Any
+
+from torch import Tensor
 
 STATES = {"pair": 2, "late": 1, "early": 1, "sum": 1, "none": 0}
 RESPONSES = {"none": "none", "alpha": "pair", "step": "sum"}
@@ -23,27 +19,23 @@ RESETS = {"slayer": "pair", "thesis": "late", "exp": "early", "step": "early"}
 
 @dataclass(frozen=True)
 class Coefficients:
-    """Decay a and amplitude m per pixel, and their derivatives with respect to h = dt/tau; float64 tensors
-    [N]."""
+    """Decay a and amplitude m per pixel, and their derivatives with respect to h = dt/tau; tensors of one shape."""
 
-    a: Any
-    m: Any
-    a_h: Any
-    m_h: Any
+    a: Tensor
+    m: Tensor
+    a_h: Tensor
+    m_h: Tensor
 
 
-def response_coefficients(h):
-    """Alpha kernel (k h) exp(1 - k h), k >= 1: a = exp(-h), m = e h."""
+def response_coefficients(h: Tensor) -> Coefficients:
+    """Alpha kernel (k h) exp(1 - k h), k >= 1."""
     a = (-h).exp()
     return Coefficients(a, math.e * h, -a, (0 * h) + math.e)
 
 
-def reset_coefficients(kernel, h, amplitude):
-    """Reset kernel of the given name, with amplitude = -reset_scale * theta.
-
-    slayer: amplitude k h exp(1 - k h); thesis: amplitude exp(1 - k h); exp: amplitude exp(-(k - 1) h); step:
-      amplitude; all for k >= 1.
-    """
+def reset_coefficients(kernel: str, h: Tensor, amplitude: Tensor) -> Coefficients:
+    """Reset kernel of the given name, for k >= 1, with amplitude = -reset_scale * theta: slayer: amplitude k h exp(1 - k
+    h); thesis: amplitude exp(1 - k h); exp: amplitude exp(-(k - 1) h); step: amplitude."""
     a = (-h).exp()
     zero = 0 * h
     if kernel == "slayer":
@@ -55,22 +47,9 @@ def reset_coefficients(kernel, h, amplitude):
     return Coefficients(zero + 1, amplitude, zero, zero)
 
 
-def absolute_sum(kind, a, m, steps):
-    """Sum of |kernel| over its lags, closed form; a kernel that does not decay is summed over ``steps``
-    lags."""
-    if kind == "pair":
-        return m.abs() * a / (1 - a) ** 2
-    decaying = (1 - a**steps) / (1 - a)
-    total = decaying.where(a < 1, float(steps))
-    return m.abs() * (a * total if kind == "late" else total)
-
-
 def advance(kind, states, a, m, z=None):
     """One step of the recursion up to its output y; returns y and the states, into whose first one the input
-    z is still to be added.
-
-    ``sum`` and ``none`` take z in at once.
-    """
+    z is still to be added (``sum`` and ``none`` take z in at once)."""
     if kind == "pair":
         p, q = states
         q = a * (q + p)
@@ -83,14 +62,6 @@ def advance(kind, states, a, m, z=None):
     if kind == "sum":
         return states[0] + z, [states[0] + z]
     return z, []
-
-
-def inflow(kind, adjoint, y):
-    """Adjoint of the input z of a step, from the adjoint of the states after it and the adjoint y of its
-    output."""
-    if kind == "none":
-        return y
-    return adjoint[0] + y if kind == "sum" else adjoint[0]
 
 
 def retreat(kind, adjoint, a, m, y):

@@ -1,15 +1,32 @@
-"""The gradient of a spike response layer whose reset fades: that of the mean response of ``srm_ages``."""
+"""The gradient of spikes whose reset fades: that of the mean response of many noisy neurons, by the age of their
+last spike.
+
+All neurons of a pixel see one response v; a share P_k of them spiked last k steps ago, and carries the mean states
+of its resets. Where u = v + reset comes near theta a neuron spikes at the rate PACE / tau_r ln(1 + exp(x)), x = (u -
+theta) / (WIDTH theta): of each age the share F = 1 - exp(-dt rate) spikes in a step and goes to age 0; the others grow
+older, into a last age that holds all that are older still. The mean spikes, sum_k P_k F_k, are a smooth function of
+the response, and their gradient is exact.
+
+The equations are those of a population of neurons with escape noise: Gerstner and Kistler, Spiking Neuron Models,
+2002, section 6.2, with the resets of earlier spikes as a mean per age. For dt = tau_r / PACE the share is a logistic
+function of x.
+"""
 
 import math
+from functools import partial
 
+import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError
-from codesign.events.spiking.instead import instead
-from codesign.events.spiking.srm_ages import PACE, mean_spikes, rested
-from codesign.events.spiking.srm_kernels import RESETS, STATES, reset_coefficients
+from codesign.events.spiking.srm_kernels import RESETS, STATES, advance, reset_coefficients
 from codesign.events.spiking.srm_state import SrmState
+from codesign.events.spiking.step_by_step import recursion
 
+WIDTH = 0.087  # of the noise, in thresholds; a narrower one is nearer to hard spikes, and its gradient more erratic
+PACE = 1.2  # spikes per tau_r and x, far above the threshold
+MEAN_AGE = 3.0  # of the last spike before the first step, in time constants of the reset
+TINY = 1e-9  # share below which an age has no states of its own
 AGES_PER_TAU = 2  # an age for every step up to so many time constants of the reset, and MORE_AGES
 MORE_AGES = 3
 MOST_AGES = 64
@@ -43,42 +60,46 @@ def check_mean(
         )
 
 
-def meant(
-    spikes: Tensor,
-    response: Tensor,
-    theta: Tensor,
-    h_reset: Tensor,
-    kernel: str,
-    reset_scale: float,
-    before: Tensor | None,
+def mean_spikes(
+    response: Tensor, theta: Tensor, h_reset: Tensor, kernel: str, reset_scale: float, before: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """The spikes with the gradient of the mean response.
+    """Mean spikes of the noisy neurons.
 
-    Args: spikes: [T, ...] hard. response: [T, ...] of the drive, before any reset. theta, h_reset: threshold and
-      dt / tau_r, positive, broadcasting over [...]. before: [1 + states, ages, ...] of the chunk before, or None.
-    Returns: the same spikes; shares and states of the ages to carry on, with their graph. Gradient: response, theta,
+    Args: response: [T, ...] of the drive, before any reset. theta, h_reset: threshold and dt / tau_r, positive,
+      broadcasting over [...]. before: [1 + states, ages, ...] of the chunk before, or None.
+    Returns: [T, ...] in 0 to 1; shares and states of the ages to carry on, with their graph. Gradient: response, theta,
       h_reset, before.
     """
     pixels = response.shape[1:]
-    states = STATES[RESETS[kernel]]
+    kind = RESETS[kernel]
     count = _ages(h_reset) if before is None else before.shape[1]
     theta, h_reset = (value.expand(pixels).reshape(-1).to(response) for value in (theta, h_reset))
-    wanted = (1 + states, count, *pixels)
+    wanted = (1 + STATES[kind], count, *pixels)
     if before is None:
-        start = rested(count, states, h_reset)
-    elif before.shape == wanted and before.dtype == response.dtype:
-        start = before.reshape(1 + states, count, -1)
-    else:
+        before = rested(count, STATES[kind], h_reset)
+    elif before.shape != wanted or before.dtype != response.dtype:
         raise ShapeError(
             f"state.mean is {before.dtype} {list(before.shape)}, this layer keeps {response.dtype} {list(wanted)}; "
             "pass the state of the same layer and frame."
         )
     reset = reset_coefficients(kernel, h_reset, -reset_scale * theta)
-    flat = response.reshape(len(response), -1)
     # the noise is the model's: held where tau_r moves, as it moves no hard spike
     pace = PACE * h_reset.detach()
-    mean, after = mean_spikes(RESETS[kernel], flat, theta, reset.a, reset.m, pace, start)
-    return instead(spikes, mean.reshape(response.shape)), after.reshape(wanted)
+    numbers = torch.stack((theta, reset.a, reset.m, pace))
+    flat = response.reshape(len(response), -1)
+    mean, after = recursion(partial(_step, kind, count), flat, numbers, before.reshape(-1, flat.shape[1]))
+    return mean.reshape(response.shape), after.reshape(wanted)
+
+
+def rested(ages: int, states: int, h: Tensor) -> Tensor:
+    """[1 + states, ages, ...] shares and reset states of neurons that spiked last at a random time, MEAN_AGE time
+    constants ago on average. h: [...] dt/tau of the reset."""
+    # in time constants
+    age = torch.arange(ages, dtype=h.dtype, device=h.device).reshape(-1, *[1] * h.ndim) * h
+    older = (-age / MEAN_AGE).exp()
+    shares = older - torch.cat((older[1:], torch.zeros_like(older[:1])))
+    left = (-age - h / 2).exp()  # spikes come in the middle of a step on average
+    return torch.stack((shares, left, (age / h + 0.5) * left)[: 1 + states])
 
 
 def _ages(h_reset):
@@ -92,3 +113,32 @@ def _ages(h_reset):
             "steps, or gradient='surrogate'."
         )
     return count
+
+
+def _step(kind, ages, dr, response, numbers, flat):
+    """Mean spikes of one step; shares and states of all ages after it."""
+    theta, a, m, pace = numbers
+    sharpness = 1 / (WIDTH * theta)
+    rows = [flat[first : first + ages] for first in range(0, len(flat), ages)]
+    fired, kept, carried = [], [], []
+    for share, *states in zip(*rows, strict=True):
+        reset, states = advance(kind, states, a, m)
+        x = (response + reset - theta) * sharpness
+        hazard = pace * (dr.maximum(x, 0) + dr.log(1 + dr.exp(-dr.abs(x))))
+        kept.append(share * dr.exp(-hazard))
+        fired.append(share - kept[-1])
+        carried.append(states)
+    new = _mixed(fired, carried)
+    new[0] = new[0] + 1
+    old = _mixed(kept[-2:], carried[-2:])
+    after = [sum(fired), *kept[:-2], kept[-2] + kept[-1]]
+    for j in range(len(new)):
+        after += [new[j], *(states[j] for states in carried[:-2]), old[j]]
+    return after[0], after
+
+
+def _mixed(shares, carried):
+    """Mean states of some ages."""
+    total = sum(shares) + TINY * len(shares)
+    weighted = [[(share + TINY) * x for x in states] for share, states in zip(shares, carried, strict=True)]
+    return [sum(column) / total for column in zip(*weighted, strict=True)]

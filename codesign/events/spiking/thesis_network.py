@@ -8,10 +8,9 @@ from torch import Tensor, nn
 
 from codesign.errors import DomainError, ShapeError, check_seed
 from codesign.events.entry import check_frames, check_positive, check_whole
-from codesign.events.spiking.srm import srm
-from codesign.events.spiking.srm_scale import drive_scale
+from codesign.events.spiking.spike_esim_parts import stepwise
+from codesign.events.spiking.srm import drive_scale, srm
 from codesign.events.spiking.srm_state import SrmState
-from codesign.events.spiking.stepwise import stepwise
 from codesign.events.spiking.surrogate import Surrogate
 
 MOST_CHANNELS = 1024

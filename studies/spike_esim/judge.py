@@ -1,0 +1,128 @@
+"""What generated events are judged by: distance, number, rates over time, flicker, delay, patches, median filter."""
+
+import torch
+import torch.nn.functional as F
+
+from codesign import events
+
+TAU_S = 0.01  # of the van Rossum distance, as in the thesis
+BIN_S = 0.01  # of rates over time
+CELL_PX = 8
+BLOCK_PX = 16  # of the bootstrap
+MEDIAN_PX = 5
+PATCHES = 16  # per sequence
+LAGS_S = 0.03
+HIGH_HZ = 50.0  # flicker is the power of the rate above; half of what the steps can show where that is less
+
+
+def judge(pairs, resamples, seed):
+    """Figures by name of pairs (counts [T-1, 2, H, W], Sequence with the target's); ON and OFF: the smaller one."""
+    found, target = [made for made, _ in pairs], [sequence.counts for _, sequence in pairs]
+    dt_s = pairs[0][1].dt_s
+    loss, rate = intervals(pairs, resamples, seed)
+    cells = [[binned(counts, dt_s, CELL_PX) for counts in side] for side in (found, target)]
+    medians = [[median_filtered(counts, dt_s) for counts in side] for side in (found, target)]
+    power = [sum(flicker(counts, dt_s) for counts in side) for side in (found, target)]
+    return {
+        **{f"loss{end}": value for end, value in zip(("", "_low", "_high"), loss, strict=True)},
+        **{f"rate_ratio{end}": value for end, value in zip(("", "_low", "_high"), rate, strict=True)},
+        "rate_correlation": correlation(*([binned(x, dt_s) for x in side] for side in (found, target))),
+        "cell_correlation": correlation(*cells),
+        "patch_correlation": patch_correlation(*cells, torch.Generator().manual_seed(seed)),
+        "flicker_ratio": power[0] / power[1],
+        "delay_s": dt_s * delay(found, target, round(LAGS_S / dt_s)),
+        "median_rate_ratio": float(sum(x.sum() for x in medians[0]) / sum(x.sum() for x in medians[1])),
+    }
+
+
+def distance(pairs):
+    """Van Rossum distance over that of silence, all sequences together."""
+    found, silence, *_ = block_sums(pairs).sum(1).tolist()
+    return found / silence
+
+
+def intervals(pairs, resamples, seed):
+    """``distance``, and events over the target's: (value, low, high) each, 95 %, blocks of pixels drawn again."""
+    sums = block_sums(pairs)
+    generator = torch.Generator().manual_seed(seed)
+    chosen = torch.randint(sums.shape[1], (resamples, sums.shape[1]), generator=generator)
+    found, silence, made, wanted = torch.cat((sums.sum(1, keepdim=True), sums[:, chosen].sum(2)), 1)
+    ends = torch.tensor([0.025, 0.975], dtype=sums.dtype)
+    return [
+        (float(share[0]), *torch.quantile(share[1:], ends).tolist())
+        for share in (found / silence, made / wanted)
+    ]
+
+
+def block_sums(pairs):
+    """[4, blocks]: squared van Rossum responses of the error and of silence, events and those of the target."""
+    sums = []
+    for found, sequence in pairs:
+        target = sequence.counts
+        errors = (found - target, target)
+        responses = [events.alpha_response(error, tau_s=TAU_S, dt=sequence.dt_s)[0] for error in errors]
+        pictures = [x.sum((0, 1)) for x in (*(response.square() for response in responses), found, target)]
+        sums.append(F.avg_pool2d(torch.stack(pictures), BLOCK_PX).flatten(1) * BLOCK_PX**2)
+    return torch.cat(sums, 1).double()
+
+
+def binned(counts, dt_s, side_px=None):
+    """Events per bin, polarity and cell, [bins, 2, h, w]; one cell is the whole picture when side_px is None.
+    What fills no bin or cell is left out."""
+    steps = max(1, round(BIN_S / dt_s))
+    sums = counts[: len(counts) // steps * steps].unflatten(0, (-1, steps)).sum(1)
+    return sums.sum((-2, -1), keepdim=True) if side_px is None else F.avg_pool2d(sums, side_px) * side_px**2
+
+
+def correlation(found, target):
+    """Pearson's, of two lists [T, 2, ...]: the smaller one of ON and OFF."""
+    return min(
+        _pearson(*(torch.cat([x[:, polarity].flatten() for x in side]) for side in (found, target)))
+        for polarity in (0, 1)
+    )
+
+
+def patch_correlation(found, target, generator):
+    """Median over random cells that the target has events in, both polarities one after the other."""
+    values = []
+    for pair in zip(found, target, strict=True):
+        cells = [side.flatten(2) for side in pair]
+        for place in torch.randperm(cells[0].shape[-1], generator=generator)[:PATCHES].tolist():
+            made, wanted = (x[:, :, place].flatten() for x in cells)
+            if float(wanted.std()) > 0:
+                values.append(_pearson(made, wanted))
+    return float(torch.tensor(values).median())
+
+
+def flicker(counts, dt_s):
+    """Power of the whole-picture rates above HIGH_HZ, ON and OFF together."""
+    rate = counts.sum((-2, -1)).double()
+    # without a taper the drift of the rate leaks upwards
+    taper = torch.hann_window(len(rate), dtype=torch.float64)[:, None]
+    spectrum = torch.fft.rfft((rate - rate.mean(0)) * taper, dim=0).abs().square()
+    return float(spectrum[torch.fft.rfftfreq(len(rate), dt_s) > min(HIGH_HZ, 0.25 / dt_s)].sum())
+
+
+def delay(found, target, most):
+    """Steps by which the events of cells come later than the target's, where they correlate best."""
+
+    def aligned(lag):
+        windows = slice(max(lag, 0), min(lag, 0) or None), slice(max(-lag, 0), min(-lag, 0) or None)
+        sides = zip((found, target), windows, strict=True)
+        return [torch.cat([F.avg_pool2d(x[at], CELL_PX).flatten() for x in side]) for side, at in sides]
+
+    return max(range(-most, most + 1), key=lambda lag: _pearson(*aligned(lag)))
+
+
+def median_filtered(counts, dt_s):
+    """Event pictures of 10 ms behind a 5x5 median: lone events vanish, edges stay. [bins, 2, H, W]."""
+    wide = F.pad(binned(counts, dt_s, 1), (MEDIAN_PX // 2,) * 4, mode="replicate")
+    return wide.unfold(2, MEDIAN_PX, 1).unfold(3, MEDIAN_PX, 1).flatten(-2).median(-1).values
+
+
+def _pearson(first, second):
+    """Pearson's correlation; 0 when one side is constant."""
+    first = first.double() - first.double().mean()
+    second = second.double() - second.double().mean()
+    norm = float(first.norm() * second.norm())
+    return float(first @ second) / norm if norm > 0 else 0.0
