@@ -33,7 +33,6 @@ GROUPS = {
         "video_to_events",
         "event_gradient",
         "event_bench",
-        "event_classes",
         "sensor_fit",
         "spike_esim",
         "srm_bench",

@@ -49,7 +49,7 @@ def noise(seed, mean=0.5, steps=100, side=16):
     return torch.poisson(rate, generator=torch.Generator().manual_seed(seed))
 
 
-def walk(side=12):
+def walk(side):
     """Pictures whose log level goes at random."""
     draw = torch.randn(80, side, side, generator=torch.Generator().manual_seed(8))
     return (3.5 + (0.1 * draw).cumsum(0)).clamp(0, 5.5).exp()
@@ -121,7 +121,7 @@ def test_median_removes_lone_events_and_keeps_an_edge():
 
 
 def test_best_theta_is_that_of_the_target():
-    frames = walk()
+    frames = walk(16)
     truth = train.THETAS[4]
     one = made(frames, None)
     target = made(frames, train.esim(one, truth))
@@ -338,7 +338,7 @@ def test_intervals_are_those_worked_out_by_hand():
 def test_the_network_of_the_thesis_sees_each_picture_alone():
     t_s = frame_times(50.0)
     seen = frames(draw_pictures(3, "training", 5)[0], t_s)
-    network = events.TwoBranchSpikes(1, seed=0)
+    network = events.TwoBranchSpikes(1, seed=0).requires_grad_(False)
     network.wake(classes.tall(seen) / 255)
     together = classes.spikes_of(network, seen)
     assert float(together.sum()) > 0
