@@ -97,7 +97,9 @@ class Body:
     def distances_m(self, points_m: Tensor) -> Tensor:
         """Signed distance of points to every solid, negative inside.
 
-        Args: points_m: [..., 3], axes of the body. Returns: [..., solids] float64.
+        Args:
+          points_m: [..., 3], axes of the body.
+        Returns: [..., solids] float64.
         Gradient: to the points, the exact one of the distance; at a surface the normal of its face. It jumps
           where two parts of a solid are equally near.
         """
@@ -165,8 +167,9 @@ def _of_segments(start, end, triangles):
 def solids_of(vertices_m: Any, faces: Any) -> list[Tensor]:
     """Triangles of each closed surface of a mesh, and those of all that is not closed, together.
 
-    Args: vertices_m: [V, 3]. faces: [F, 3] indices of them. Vertices at one place count as one: seams of a
-      texture are no holes.
+    Args:
+      vertices_m: [V, 3].
+      faces: [F, 3] indices of them. Vertices at one place count as one: seams of a texture are no holes.
     Returns: list of [F', 3, 3] float64, turned outward where they are closed.
     Raises: ShapeError; DomainError for vertices that are not finite, faces of vertices that are not there,
       and closed surfaces whose faces turn different ways.

@@ -17,8 +17,11 @@ LEVEL = 1e-6  # metres that a ray must fall per metre of depth to meet the groun
 def ground_depth(camera: ChiefRayCamera, pixels: Tensor, T_world_cam: Tensor, scene: Any = None) -> Tensor:
     """Depth of the plane z = 0 of the world.
 
-    Args: camera: with ``chief_rays``. pixels: [N, P, 2] px. T_world_cam: [N, 4, 4]. scene: as for
-      ``scene_depth``; only the objects of a MovingScene are looked at, which hide the ground.
+    Args:
+      camera: with ``chief_rays``.
+      pixels: [N, P, 2] px.
+      T_world_cam: [N, 4, 4].
+      scene: as for ``scene_depth``; only the objects of a MovingScene are looked at, which hide the ground.
     Returns: [N, P] m along the camera's z axis, float64; infinite where a ray goes up or along the ground, or
       meets an object that moves.
     Gradient: pose, and the lens behind the chief rays.

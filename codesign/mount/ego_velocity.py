@@ -86,11 +86,11 @@ class EgoVelocity:
     Args:
       axes: which of the six velocities the body has: ``mount.PLANAR`` or ``mount.FREE``.
       prior: [K] standard deviations expected of them around zero, m/s and rad/s.
-      depth: "ground" (the plane z = 0 of the world under a body that knows its height and attitude), "scene"
-        (a perfect map), a function (camera, pixels [N, P, 2], T_world_cam [N, 4, 4], scene) -> [N, P] m, or
-        ``mount.UnknownDepth``: estimated with the velocity.
-      every_px: spacing of the points read. floor_px: standard deviation of flow errors that no covariance
-        knows of.
+      depth: "ground" (the plane z = 0 of the world under a body that knows its height and attitude),
+        "scene" (a perfect map), a function (camera, pixels [N, P, 2], T_world_cam [N, 4, 4], scene) -> [N,
+        P] m, or ``mount.UnknownDepth``: estimated with the velocity.
+      every_px: spacing of the points read.
+      floor_px: standard deviation of flow errors that no covariance knows of.
       outlier: errors of that many standard deviations count a quarter (Geman and McClure, 1987); None: all
         count.
       steps: of reweighting, for outliers.

@@ -80,11 +80,13 @@ def expected_errors(
 ) -> Expected:
     """Errors to be expected of a velocity by least squares.
 
-    Args: estimator: whose prior, axes and outliers count. read: what it reads. twist: [N, 6] true, m/s and
-      rad/s.
+    Args:
+      estimator: whose prior, axes and outliers count.
+      read: what it reads.
+      twist: [N, 6] true, m/s and rad/s.
       true_rows: [N, P, 2, K] px of flow per velocity at the true depth, where the estimator believes in
-        another one;
-      None: ``read.rows``. errors: of the flow.
+        another one; None: ``read.rows``.
+      errors: of the flow.
     Outliers count less by the mean of the squared misfit to be expected of a component, where the estimator
     goes by that of the draw.
     Gradient: readings, twist, rows. Raises: DomainError for readings whose depth is estimated with the
@@ -158,8 +160,10 @@ class VelocityErrors:
 def velocity_errors(velocity: Tensor, twist: Tensor, axes: Sequence[int]) -> VelocityErrors:
     """Errors of estimated velocities.
 
-    Args: velocity: [N, K] estimated, m/s and rad/s. twist: [N, 6] of the body: m/s forward, left, up, rad/s
-      about these axes. axes: which K of the six were estimated.
+    Args:
+      velocity: [N, K] estimated, m/s and rad/s.
+      twist: [N, 6] of the body: m/s forward, left, up, rad/s about these axes.
+      axes: which K of the six were estimated.
     Gradient: velocity, twist. Raises: ShapeError where they do not fit; DomainError for other axes.
 
     >>> twist = torch.tensor([[2.0, 0.0, 0.0, 0.0, 0.0, 0.5]])

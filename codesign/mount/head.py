@@ -76,9 +76,11 @@ def evidence(
 ) -> Evidence:
     """Evidence of what was read, and of the plain solution of it (``EgoVelocity.read`` and ``solve``).
 
-    Args: camera: one with ``rays_through`` says how it blurs, another counts as sharp. T_body_cam: [4, 4] or
-      [N, 4, 4].
-      prior: [K] standard deviations. volume: whose events are counted, None: they are not told.
+    Args:
+      camera: one with ``rays_through`` says how it blurs, another counts as sharp.
+      T_body_cam: [4, 4] or [N, 4, 4].
+      prior: [K] standard deviations.
+      volume: whose events are counted, None: they are not told.
     Gradient: readings, solution, lens, mount, counts.
     """
 
@@ -192,8 +194,10 @@ class VelocityHead(nn.Module):
     covariance and a correction of at most one standard deviation. It hears everything also as a mirror shows
     it, so that left and right are treated alike. Fresh weights give the velocity of ``plain`` as it is.
 
-    Args: plain: axes, prior, depth and how flow is read. width: of the layers. rounds: of weighing and
-      solving.
+    Args:
+      plain: axes, prior, depth and how flow is read.
+      width: of the layers.
+      rounds: of weighing and solving.
       design: False hides lens and mount from the network.
 
     >>> from codesign.mount import FREE, EgoVelocity, VelocityHead

@@ -31,8 +31,8 @@ def body_flow(
     """Flow that each unit of a body's twist makes in every pixel.
 
     Args:
-      camera: has ``chief_rays`` and ``film`` (see render.Camera). depth_m: [..., P] true depth along the
-        camera's z axis per pixel, film order.
+      camera: has ``chief_rays`` and ``film`` (see render.Camera).
+      depth_m: [..., P] true depth along the camera's z axis per pixel, film order.
       T_body_cam: [..., 4, 4]. Pixels without a surface carry a depth that is not finite or not positive.
       pixels: [P, 2] px to look at, or [..., P, 2]; all of the film when None.
     Returns: flow [..., P, 2, 6] px/s per m/s forward, left, up of the body's origin and per rad/s about these
@@ -146,7 +146,8 @@ def information(
 def flow_precision(covariance: Tensor, confidence: Tensor | None = None, floor: float = 0.0) -> Tensor:
     """Inverse covariance of flow as a measurement, out of what an estimator says of its flow.
 
-    Args: covariance: [..., 3] of the error (xx, xy, yy), px^2 as of FlowField.covariance_px2, or px^2/s^2.
+    Args:
+      covariance: [..., 3] of the error (xx, xy, yy), px^2 as of FlowField.covariance_px2, or px^2/s^2.
       confidence: [...] in 0..1, None: 1. A flow with a prior has precision S^-1 of which about confidence
         S^-1 came from events.
       floor: standard deviation of errors that no covariance knows of, px.
@@ -196,7 +197,9 @@ def chief_lines(camera: ChiefRayCamera, pixels: Tensor) -> tuple[Tensor, Tensor,
 def flow_of_points(velocity: Tensor, slope: Tensor, step: Tensor) -> Tensor:
     """Image motion [..., P, 2, K] px per unit of K motions of the points under pixels.
 
-    Args: velocity: [..., P, 3, K] m of the points, in camera axes. slope: [..., P, 2] of the chief rays.
+    Args:
+      velocity: [..., P, 3, K] m of the points, in camera axes.
+      slope: [..., P, 2] of the chief rays.
       step: [..., P, 2, 2] m by which a pixel's ray moves sideways at the point, last axis: pixel x, y.
     """
     sideways = velocity[..., :2, :] - slope[..., None] * velocity[..., 2:, :]

@@ -42,10 +42,10 @@ class Mount(nn.Module):
     >>> optimiser = torch.optim.Adam(mount.parameters(), lr=0.05)
 
     Args:
-      nominal_m: three numbers, body axes: middle of the box of allowed positions. half_range_m: half its size
-        per axis, >= 0 (0 holds that axis).
-      yaw_rad, pitch_rad, roll_rad: attitude where the rotation part of ``numbers`` is zero. position_m: where
-        to start, strictly inside the box; None starts in the middle.
+      nominal_m: three numbers, body axes: middle of the box of allowed positions.
+      half_range_m: half its size per axis, >= 0 (0 holds that axis).
+      yaw_rad, pitch_rad, roll_rad: attitude where the rotation part of ``numbers`` is zero.
+      position_m: where to start, strictly inside the box; None starts in the middle.
     numbers: [6] float64, learnable, unconstrained; with x = unit numbers, position = nominal + half_range
       tanh(x[:3]) and rotation = start attitude times exp(x[3:]), a rotation vector in camera axes (so looking
       straight down, where yaw and roll turn about one axis, is a pose like any other).
@@ -139,9 +139,10 @@ class Mount(nn.Module):
         RMS; the pose stays. Then one learning rate suits the mount, the lens's variables and a network.
 
         Args:
-          camera: has ``chief_rays`` and ``film`` (see render.Camera). depth_m: depth of the scene along the
-            view, one number or one per pixel [P]; pixels without a surface carry one that is not finite or
-            not positive. step_px: the natural step.
+          camera: has ``chief_rays`` and ``film`` (see render.Camera).
+          depth_m: depth of the scene along the view, one number or one per pixel [P]; pixels without a
+            surface carry one that is not finite or not positive.
+          step_px: the natural step.
         A number that hardly moves the image (a narrow box far from the scene) keeps 1 of its map's argument
         as unit, as does one that is held.
         Returns: [numbers], the mount's one Parameter, for torch.optim.

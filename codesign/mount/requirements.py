@@ -51,8 +51,11 @@ class Requirement(Protocol):
 class Clearance:
     """The housing stays ``margin_m`` away from the robot.
 
-    Args: body: in the axes of the mount. housing: of the camera. margin_m: >= 0. step: metres beyond the
-      margin within which ``penalty`` pushes.
+    Args:
+      body: in the axes of the mount.
+      housing: of the camera.
+      margin_m: >= 0.
+      step: metres beyond the margin within which ``penalty`` pushes.
     """
 
     body: Body
@@ -80,7 +83,9 @@ class Clearance:
 class CableSide:
     """The back of the housing, where the cable leaves, does not point into a cone.
 
-    Args: forbidden: direction in body axes, of any length. half_angle_rad: of the cone, above 0 and below pi.
+    Args:
+      forbidden: direction in body axes, of any length.
+      half_angle_rad: of the cone, above 0 and below pi.
     """
 
     forbidden: tuple[float, float, float]
@@ -119,13 +124,14 @@ class LookAhead:
     line across at that distance; with ``depth``, when what it sees lies there.
 
     Args:
-      distance_m: from the body's origin, along ``ahead``, > 0. share: of the film's pixels, above 0, at most
-        1.
-      ahead: direction in body axes, level. ground_z_m: height of the ground in body axes (0 for a body whose
-        origin is on the ground, as base_footprint of REP 105).
+      distance_m: from the body's origin, along ``ahead``, > 0.
+      share: of the film's pixels, above 0, at most 1.
+      ahead: direction in body axes, level.
+      ground_z_m: height of the ground in body axes (0 for a body whose origin is on the ground, as
+        base_footprint of REP 105).
       depth: (camera, pixels [P, 2], T_body_cam [4, 4]) -> [P] m along the camera's z axis, not finite where
-        nothing is seen; None is flat ground. smooth: share of the pixels over which the slack at the wanted
-        rank is averaged.
+        nothing is seen; None is flat ground.
+      smooth: share of the pixels over which the slack at the wanted rank is averaged.
     Raises: DomainError for numbers out of range.
     """
 
@@ -207,8 +213,9 @@ def penalty(requirements: Sequence[Requirement], T_body_cam: Tensor, camera: Chi
     """What to add to an objective so that a search keeps to its requirements: sum of max(0, 1 - slack /
     step)^2.
 
-    Args: T_body_cam: [..., 4, 4]. Returns: [...], 0 where every slack is at least its step, 1 where one of
-      them is 0.
+    Args:
+      T_body_cam: [..., 4, 4].
+    Returns: [...], 0 where every slack is at least its step, 1 where one of them is 0.
     Gradient: mount, lens; continuous wherever the slack's is.
     """
     total = T_body_cam.new_zeros(T_body_cam.shape[:-2], dtype=torch.float64)
@@ -273,9 +280,12 @@ class OwnBody:
     >>> round(float(OwnBody(sheet, 0.7).slack(level, camera)), 3)
     0.2
 
-    Args: body: in the axes of the mount. largest_share: 0 to 1. step: share below it from which on nothing
-      pushes. per_px: points of silhouettes per pixel length, for the gradient (before a rover, in 16 x 12
-      pixels, it is good to 2 %).
+    Args:
+      body: in the axes of the mount.
+      largest_share: 0 to 1.
+      step: share below it from which on nothing pushes.
+      per_px: points of silhouettes per pixel length, for the gradient (before a rover, in 16 x 12 pixels,
+        it is good to 2 %).
     Raises: DomainError for shares out of range.
     """
 

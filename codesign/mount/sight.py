@@ -26,9 +26,11 @@ def expected_error(
     """Root mean square error of K velocities, in units of ``unit``, that the best unbiased use of the flow
     leaves.
 
-    Args: information: [..., K, K] as of ``mount.information`` without prior, or of an estimator: the inverse
-      of ``mount.Motion.covariance`` less the prior's. unit: [K] errors that count 1. prior: [K] standard
-      deviations of the velocities around zero, by which what no flow shows counts.
+    Args:
+      information: [..., K, K] as of ``mount.information`` without prior, or of an estimator: the inverse of
+        ``mount.Motion.covariance`` less the prior's.
+      unit: [K] errors that count 1.
+      prior: [K] standard deviations of the velocities around zero, by which what no flow shows counts.
     Returns: [...]. Gradient: information.
     Raises: ShapeError; DomainError for units or priors that are not positive.
     Source: Cramer-Rao bound with a prior (Van Trees, 1968).
@@ -82,8 +84,11 @@ class Sight:
 def sight(information: Tensor, unit: Sequence[float] | Tensor, axes: Sequence[int] = FREE) -> Sight:
     """What a mount sees and what it is blind to.
 
-    Args: information: [K, K] without prior. unit: [K] by which metres and radians per second are compared.
-      axes: which of the six velocities the K are. Returns: Sight; no gradient.
+    Args:
+      information: [K, K] without prior.
+      unit: [K] by which metres and radians per second are compared.
+      axes: which of the six velocities the K are.
+    Returns: Sight; no gradient.
     Raises: ShapeError; DomainError.
 
     >>> sight(torch.diag(torch.tensor([100.0, 4.0, 0.0])), (0.1, 0.1, 0.1), (0, 1, 5)).blind()
@@ -204,8 +209,9 @@ def sight_table(
     """What forward, downward, sideways and oblique cameras see of the body's motion, and what they are blind
     to.
 
-    Args: attitudes: name -> yaw and pitch in degrees. unit: [K] errors that count 1; 0.1 m/s and 0.1 rad/s
-      when None.
+    Args:
+      attitudes: name -> yaw and pitch in degrees.
+      unit: [K] errors that count 1; 0.1 m/s and 0.1 rad/s when None.
     Returns: name -> "seen" (share of the picture), "sight" (mount.Sight), a column for each velocity
       (standard deviation in m/s or rad/s, all unknown), "blind" (names of velocities worse than one unit),
       "weakest" (the motion that shows least, in words) and "weakest_units" (its deviation). No gradient.
@@ -245,8 +251,10 @@ def sight_map(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Expected error over all directions that a camera at one place may look in.
 
-    Args: rows: from straight up to straight down; columns: all around, both at least 2. unit, prior: [K] as
-      of ``mount.expected_error``; 0.1 and 1 when None.
+    Args:
+      rows: from straight up to straight down;
+      columns: all around, both at least 2.
+      unit, prior: [K] as of ``mount.expected_error``; 0.1 and 1 when None.
     Returns: yaw [columns], pitch [rows] rad at the middle of the cells, and the error [rows, columns] in
       units. For ``report.mount_sphere``. No gradient.
     """

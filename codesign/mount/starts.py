@@ -36,9 +36,12 @@ def starts(
     """Numbers of mounts from which to search: quasi-random in the box and in the directions around the
     mount's start attitude, as far as they keep the requirements.
 
-    Args: count: how many. camera: for requirements that look through it. reach_rad: largest angle of the view
-      from that of the start attitude, up to pi (all directions). roll_rad: largest turn about the view either
-      way. seed: of the scrambling.
+    Args:
+      count: how many.
+      camera: for requirements that look through it.
+      reach_rad: largest angle of the view from that of the start attitude, up to pi (all directions).
+      roll_rad: largest turn about the view either way.
+      seed: of the scrambling.
     Returns: [count, 6] for ``Mount.forward`` or ``mount.numbers.copy_``; the same for the same seed.
       Gradient: none.
     Raises: DomainError when hardly any draw keeps the requirements, naming the one at which most fail; they

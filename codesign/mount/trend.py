@@ -78,7 +78,9 @@ class PrecisionTrend:
         """Readings of the same points and textures as if they had been made from another place, no picture of
         which there is.
 
-        Args: here: what was read. told_here, told_there: what the trend tells of either place (``told``).
+        Args:
+          here: what was read.
+          told_here, told_there: what the trend tells of either place (``told``).
           there: depth, rows and share from the other place; its estimates are not looked at.
         Precision and confidence are those of here, changed as the trend tells. A point that shows a surface
         only from there takes what the nearest window with surfaces had beside the trend: a mean would be too

@@ -12,7 +12,9 @@ PAIRS = 1 << 17  # of a point and a triangle looked at together
 def closest_points(points: Tensor, triangles: Tensor) -> tuple[Tensor, Tensor]:
     """The nearest point of a set of triangles.
 
-    Args: points: [N, 3]. triangles: [F, 3, 3], F >= 1; ones without area count as their edges.
+    Args:
+      points: [N, 3].
+      triangles: [F, 3, 3], F >= 1; ones without area count as their edges.
     Returns: closest [N, 3], and the triangle that it lies on [N]. Gradient: none.
     Source: Ericson, Real-Time Collision Detection, 2005, 5.1.5: inside the prism over a triangle its plane is
       nearest, elsewhere one of its edges.
@@ -45,7 +47,9 @@ def _closest(points, triangles):
 def winding_numbers(points: Tensor, triangles: Tensor) -> Tensor:
     """How often triangles wind around points: 1 inside a closed surface that faces outward, 0 outside of it.
 
-    Args: points: [N, 3]. triangles: [F, 3, 3].
+    Args:
+      points: [N, 3].
+      triangles: [F, 3, 3].
     Returns: [N]. Gradient: none.
     Source: solid angle of a triangle of van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 30, 1983; as a
       test of what is inside Jacobson, Kavan and Sorkine-Hornung, SIGGRAPH 2013.
@@ -63,7 +67,9 @@ def winding_numbers(points: Tensor, triangles: Tensor) -> Tensor:
 def first_crossings(origin: Tensor, direction: Tensor, triangles: Tensor) -> Tensor:
     """Where lines first cross triangles ahead of their origin, in lengths of their direction.
 
-    Args: origin, direction: [N, 3]. triangles: [F, 3, 3].
+    Args:
+      origin, direction: [N, 3].
+      triangles: [F, 3, 3].
     Returns: [N], infinite where there is no crossing. Gradient: none.
     Source: Moeller and Trumbore, J. Graphics Tools 2, 1997.
     """
@@ -91,7 +97,9 @@ def first_crossings(origin: Tensor, direction: Tensor, triangles: Tensor) -> Ten
 def nearest_to_edges(start: Tensor, end: Tensor, triangles: Tensor) -> Tensor:
     """Where along segments their distance to the edges of triangles is smallest.
 
-    Args: start, end: [N, 3]. triangles: [F, 3, 3].
+    Args:
+      start, end: [N, 3].
+      triangles: [F, 3, 3].
     Returns: [N] in 0..1. Gradient: none. Source: Ericson, 2005, 5.1.9.
     """
     corner = triangles.detach().reshape(-1, 3)

@@ -24,9 +24,11 @@ class ScaledAdam:
     the rays by the same distance.
 
     Args:
-      loss: differentiable by autograd. start: [V].
-      basis: [V] scales or [V, V], or None for 1. step_size: in units of the basis. betas: decay of the
-        averages of gradient and square.
+      loss: differentiable by autograd.
+      start: [V].
+      basis: [V] scales or [V, V], or None for 1.
+      step_size: in units of the basis.
+      betas: decay of the averages of gradient and square.
     A loss or gradient that is not finite is a failed step: the last good point comes back, averages restart,
       and the step size halves.
     variables: where it stands (always finite). best, best_loss: the lowest loss seen. history: History.

@@ -20,9 +20,12 @@ class Descent(torch.optim.Optimizer):
     that the objective does not see from wandering. velocity <- momentum velocity + (1 - momentum)(gradient +
     pull parameter); parameter <- parameter - lr velocity.
 
-    Args: params: as for any torch optimiser. lr: length of a step per unit of velocity. momentum: 0 to below
-      1.
-      pull: >= 0. normalised: every gradient counts by its direction alone, and every step has length lr.
+    Args:
+      params: as for any torch optimiser.
+      lr: length of a step per unit of velocity.
+      momentum: 0 to below 1.
+      pull: >= 0.
+      normalised: every gradient counts by its direction alone, and every step has length lr.
       grain: 1 over the spacing of the grid, on which steps below half its spacing do nothing; 0 for none.
     Raises: DomainError for numbers outside these ranges.
 

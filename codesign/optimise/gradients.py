@@ -22,8 +22,9 @@ def sample_gradients(losses: Iterable[Tensor], parameters: Sequence[Tensor]) -> 
     """Values and gradients of sample losses, each taken as soon as it is made, so that one graph lives at a
     time.
 
-    Args: losses: scalars, S of them; a generator makes each when it is needed. parameters: leaves that ask
-      for gradients, of any shapes.
+    Args:
+      losses: scalars, S of them; a generator makes each when it is needed.
+      parameters: leaves that ask for gradients, of any shapes.
     Returns: SampleGradients, float64.
     Raises: GradientError when a loss does not depend on any of the parameters, or shares its graph with
       another; DomainError, ShapeError for samples that are no scalar tensors, or none.

@@ -64,11 +64,11 @@ def reoptimise(
     """Damped least squares on the residuals of a lens, its focal length held by a curvature.
 
     Args:
-      residuals: lens -> [M]; limits enter as rows, see ``constraints.rows``. Values that are not finite, and
-        a DomainError, make a failed step.
+      residuals: lens -> [M]; limits enter as rows, see ``constraints.rows``. Values that are not finite,
+        and a DomainError, make a failed step.
       names, bounds: as in ``GeoLens.variables``; thicknesses stay above 0.
-      held: surfaces (from 0, from the last when negative) whose curvature is not to change. steps: most
-        steps.
+      held: surfaces (from 0, from the last when negative) whose curvature is not to change.
+      steps: most steps.
     Returns: Redesign; the lens given stays as it is.
     Raises: DomainError when the residuals of the lens given are not finite, a held surface is not there, or
       nothing can vary.
@@ -117,7 +117,9 @@ def remove_element(
     ``moves.flattened``) in ``path`` equal parts, each followed by a quarter of the ``steps``, so that the
     others take over its work.
 
-    Args: element: its number in ``elements(lens)``. path: 0 removes at once. The rest as for ``reoptimise``.
+    Args:
+      element: its number in ``elements(lens)``.
+      path: 0 removes at once. The rest as for ``reoptimise``.
     Returns: Redesign from the lens given to the one without the element.
     Raises: DomainError as ``without_element`` and ``reoptimise``.
     """
@@ -147,9 +149,11 @@ def exchange_glasses(
     """The lens with the glass of one element after another exchanged for the best of its nearest catalogue
     neighbours, where that is better after re-optimisation.
 
-    Args: count, among: neighbours tried per glass and the names they are chosen from, see
-      ``neighbour_glasses``. steps: most steps per trial, and for the lens given first, so that a neighbour
-      wins by its glass and not by its steps. The rest as for ``reoptimise``.
+    Args:
+      count, among: neighbours tried per glass and the names they are chosen from, see
+        ``neighbour_glasses``.
+      steps: most steps per trial, and for the lens given first, so that a neighbour wins by its glass and
+        not by its steps. The rest as for ``reoptimise``.
     Returns: Redesign; its log has a line per trial.
     Raises: DomainError for a lens without glass, or as ``reoptimise`` for the lens given.
     """

@@ -35,7 +35,8 @@ class Loop:
       clip: longest gradient of a sample within a parameter group; None clips to the median length of the
         samples.
       judge: () -> score, the lower the better, at the parameters as they are; without one the last point is
-        the best. judge_every: steps between judgements; the start and the end are judged too.
+        the best.
+      judge_every: steps between judgements; the start and the end are judged too.
       patience: worse judgements borne in a row before the loop goes back to the best point with its step
         sizes times ``shrink``; None never goes back.
       schedule: step number -> factor of the first step sizes (warm-up, decay).
@@ -109,8 +110,9 @@ class Loop:
     ) -> list[Tensor]:
         """Go on until ``steps`` are made in all, and leave the parameters at the best point.
 
-        Args: advance: called after every step with loss= and score=; may raise to stop. save: called after
-          every judgement.
+        Args:
+          advance: called after every step with loss= and score=; may raise to stop.
+          save: called after every judgement.
         Returns: the best point, one tensor per parameter.
         Raises: NonFiniteError when a loss or gradient is not finite; the parameters are then at the best
           point.
