@@ -251,6 +251,24 @@ def load(array: Any, tensor: Tensor) -> Any:
     return array(exclusive.keep(tensor.detach().contiguous().reshape(-1)))
 
 
+def pull_back(
+    function: Callable[..., Sequence[Any]],
+    given: Sequence[Any],
+    seeds: Sequence[Any],
+    leaves: Sequence[Any] = (),
+) -> list[Any]:
+    """Gradients of the drjit arrays that a function is given, one step of a loop for example, from those of what it gives;
+    then those of ``leaves``, which it may add its own to."""
+    import drjit as dr
+
+    with dr.resume_grad():
+        given = [dr.detach(value) + 0 for value in given]
+        dr.enable_grad(given)
+        products = [value * dr.detach(seed) for value, seed in zip(function(*given), seeds, strict=True)]
+        dr.backward_from(sum(products[1:], products[0]))
+        return [dr.grad(value) for value in (*given, *leaves)]
+
+
 def _to_torch(value, shape, inputs):
     tensor = value.torch()
     shared = any(tensor.data_ptr() == x.data_ptr() for x in inputs)

@@ -45,6 +45,10 @@ RENAMED: dict[str, str] = {
     "codesign.task.expected": "codesign.mount.errors",
     "codesign.task.own_body": "codesign.mount.requirements",
     "codesign.task.score": "codesign.mount.errors",
+    **{
+        f"codesign.events.spiking.{name}": "codesign.events.spiking.spike_esim_parts"
+        for name in ("front", "residual", "noise")
+    },
     "codesign.events.spiking.two_branches": "codesign.events.spiking.thesis_network",
     "codesign.events.layers.layer.ComparatorLayer": "codesign.events.layers.comparators.ComparatorLayer",
     "codesign.events.layers.layer.LayerState": "codesign.events.layers.comparators.LayerState",

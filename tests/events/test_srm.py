@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from codesign.errors import DomainError, GradientError, NonFiniteError, ShapeError
-from codesign.events.layers.memory import memory
 from codesign.events.spiking.srm import alpha_response, drive_scale, srm
 from codesign.events.spiking.srm_state import SrmState
 from codesign.events.spiking.surrogate import FastSigmoid, Laplace, Triangular
@@ -236,15 +235,6 @@ def test_a_tie_spikes():
     assert srm(drive, **settings)[0].flatten().tolist() == [1, 1, 1]
     # 0.5 - 1 ulp, then 0.75, then a sum that stays
     assert srm(below, **settings)[0].flatten().tolist() == [0, 1, 1]
-
-
-def test_step_kernel_follows_the_memory_layer_where_no_step_exceeds_a_threshold():
-    # multiples of 1/64 below theta = 1/4 per step: no rounding, and at most one event per step
-    steps = torch.randint(-15, 16, (300, 4, 5), generator=torch.Generator().manual_seed(3)).double() / 64
-    level = torch.cat([torch.zeros(1, 4, 5, dtype=F64), steps.cumsum(0)])
-    truth, _ = memory(level, 0.25, 0.25, log_input=True)
-    settings = {"theta": 0.25, "kernel": "step", "response": "step", "reset_scale": 1.0, "coupled": True}
-    assert torch.equal(srm(torch.stack([steps, -steps], 1), **settings)[0], truth)
 
 
 def test_silent_and_saturating_input_keep_finite_gradients():

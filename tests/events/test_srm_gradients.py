@@ -368,21 +368,6 @@ def test_chunks_of_the_play_give_the_spikes_and_the_gradient_of_the_whole(cut):
     assert torch.equal(found[0][0], plain)
 
 
-def test_the_event_layer_goes_on_in_chunks():
-    level = walk(8).requires_grad_()
-    t_s = torch.arange(len(level), dtype=D)
-    made = events.layer("srm", events.SensorModel(THETA, THETA), log_input=True)
-    whole = made(level[:, None], t_s)
-    seeds = torch.rand(whole.shape, generator=torch.Generator().manual_seed(9), dtype=D)
-    (by_whole,) = torch.autograd.grad((whole * seeds).sum(), level)
-    first, state = made.advance(level[:9, None], t_s[:9])
-    second, _ = made.advance(level[9:, None], t_s[9:], state)
-    both = torch.cat((first, second))
-    (by_chunks,) = torch.autograd.grad((both * seeds).sum(), level)
-    assert torch.equal(both, whole)
-    torch.testing.assert_close(by_chunks, by_whole, rtol=1e-12, atol=1e-12)
-
-
 def test_enough_steps_per_frame_give_the_counts_and_gradients_of_the_memory_layer():
     level = walk(10, frames=12, size=0.4).requires_grad_()  # up to six thresholds between two frames
     t_s = torch.arange(12, dtype=D)

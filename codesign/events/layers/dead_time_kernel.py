@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from codesign.backend import pull_back
 from codesign.events.layers.pixel_loop import Loop
 from codesign.exclusive import exclusive
 
@@ -203,7 +204,7 @@ class Run(Loop):
         seeds = [self.gather(seed, self.place(part, ahead)), pulls["centre"], pulls["position"]]
         for mine, one in zip(pull, pulls["begun"], strict=True):
             seeds += one, mine[now + 1]
-        level, theta_on, theta_off, blend, centre, position, *groups = self.back(
+        level, theta_on, theta_off, blend, centre, position, *groups = pull_back(
             lambda *values: self.step(heading, *values)[1:], given, seeds
         )
         before = now - self.of_part(self.back_rows, part)
@@ -223,16 +224,6 @@ class Run(Loop):
             "theta_off": pulls["theta_off"] + theta_off,
             "dead": pulls["dead"] - self.of_part(self.slope, part) * blend,
         }
-
-    def back(self, function, given, seeds):
-        """Gradients of what a function is given, from those of what it gives."""
-        dr = self.dr
-        with dr.resume_grad():
-            given = [dr.detach(value) + 0 for value in given]
-            dr.enable_grad(given)
-            products = [value * dr.detach(one) for value, one in zip(function(*given), seeds, strict=True)]
-            dr.backward_from(sum(products[1:], products[0]))
-            return [dr.grad(value) for value in given]
 
 
 def _filled(dr, place):

@@ -2,7 +2,8 @@
 lane per pixel (or pair of coupled polarities), in float64 whatever the drive.
 
 The adjoint is written by hand, since it needs no state of the layer, only its potential: letting drjit differentiate one
-step after the other takes the states of every step from memory, or computes them twice (1.7 to 2 times as long).
+step after the other (``step_by_step``) keeps or computes again the states of every step: 1.8 times as long, forward and
+backward, 2 x 128 x 128 pixels, T = 200.
 """
 
 from dataclasses import astuple, dataclass

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from codesign.backend import arrays, load
+from codesign.backend import arrays, load, pull_back
 from codesign.exclusive import exclusive
 
 
@@ -128,12 +128,18 @@ class _Loops:
         """Gradients before a span, of numbers and states, from those after it; of the values into target."""
         dr = self.dr
         first, end = self.bounds(span)
+        count = len(self.numbers)
+
+        def step(value, *others):
+            output, states = self.step(dr, value, others[:count], others[count:])
+            return output, *states
 
         def body(t, gathered, carried):
             t = t - 1
             before = [self.at(kept, (t - first) * self.states + j) for j in range(self.states)]
-            given = [self.at(self.values, t), self.numbers, before]
-            value, numbers, states = self.step_back(given, [self.at(seeds, t), *carried])
+            given = [self.at(self.values, t), *self.numbers, *before]
+            value, *found = pull_back(step, given, [self.at(seeds, t), *carried])
+            numbers, states = found[:count], found[count:]
             self.put(target, value, self.place(t))
             return t, [total + more for total, more in zip(gathered, numbers, strict=True)], states
 
@@ -143,19 +149,6 @@ class _Loops:
         )
         dr.eval(target, gathered, carried)
         return gathered, carried
-
-    def step_back(self, given, seeds):
-        """Gradients of what a step is given, from those of what it gives."""
-        dr = self.dr
-        with dr.resume_grad():
-            value, numbers, states = given
-            value, *others = [dr.detach(x) + 0 for x in (value, *numbers, *states)]
-            numbers, states = others[: len(numbers)], others[len(numbers) :]
-            dr.enable_grad(value, numbers, states)
-            output, after = self.step(dr, value, numbers, states)
-            products = [x * dr.detach(seed) for x, seed in zip((output, *after), seeds, strict=True)]
-            dr.backward_from(sum(products[1:], products[0]))
-            return dr.grad(value), dr.grad(numbers), dr.grad(states)
 
     def bounds(self, span):
         return [self.dr.opaque(self.arr.UInt32, value) for value in span]
