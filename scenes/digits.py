@@ -1,5 +1,5 @@
-"""Digits on pieces of photographs, moved by saccades in front of a small sensor, exact at any time: recordings to
-classify, in the manner of N-MNIST and N-Caltech101."""
+"""Digits on pieces of photographs, moved by saccades in front of a small sensor, exact at any time:
+recordings to classify, in the manner of N-MNIST and N-Caltech101."""
 
 import math
 from functools import cache
@@ -31,8 +31,8 @@ LEG_S = 0.06  # duration of one saccade
 
 
 def draw_pictures(count, photos, seed):
-    """Tiles [N, 64, 64], intensity on the 0-255 scale, periodic and band-limited: a digit in a random font, size, place
-    and contrast on a piece of a photograph behind a soft lens. Labels [N], in turn."""
+    """Tiles [N, 64, 64], intensity on the 0-255 scale, periodic and band-limited: a digit in a random font,
+    size, place and contrast on a piece of a photograph behind a soft lens. Labels [N], in turn."""
     random = np.random.default_rng(seed)
     tiles = softened(np.stack([_tile(index % CLASSES, photos, random) for index in range(count)]))
     return torch.from_numpy(tiles.astype(np.float32)), torch.arange(count) % CLASSES
@@ -45,7 +45,8 @@ def softened(tiles):
 
 
 def coverage(label, font, height_px, turn_deg, centre_px):
-    """Share of each pixel of a tile that a digit covers, [64, 64]. centre_px: (x, y) from the tile's middle."""
+    """Share of each pixel of a tile that a digit covers, [64, 64]. centre_px: (x, y) from the tile's
+    middle."""
     angle = np.deg2rad(turn_deg)
     turn = height_px * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     inside = np.zeros((TILE_PX * FINE,) * 2, dtype=bool)
@@ -95,8 +96,9 @@ def frame_times(rate_hz):
 
 
 def position_px(t_s):
-    """Where a picture has moved to at [T] times: [T, 2] pixels (x right, y down). Three legs of an equilateral triangle,
-    as for N-MNIST (Orchard et al. 2015), each with the course of minimum jerk (Flash and Hogan 1985)."""
+    """Where a picture has moved to at [T] times: [T, 2] pixels (x right, y down). Three legs of an
+    equilateral triangle, as for N-MNIST (Orchard et al. 2015), each with the course of minimum jerk (Flash
+    and Hogan 1985)."""
     corners = torch.tensor([[0, 0], [0.5, math.sqrt(0.75)], [1, 0], [0, 0]], dtype=torch.float64) * SIDE_PX
     leg = (t_s / LEG_S).floor().clamp(max=2).long()
     u = t_s / LEG_S - leg

@@ -1,8 +1,10 @@
-"""Do learnt generators make the events of a physical sensor: the spiking network of the thesis, ESIM, and ours?
+"""Do learnt generators make the events of a physical sensor: the spiking network of the thesis, ESIM, and
+ours?
 
-Trained on rendered sequences with hard events of a noisy, slow, unequal sensor; judged on motions and worlds never seen
-by van Rossum distance, number, rates over time, flicker, delay, patches and medians. With --classes instead by what a
-classifier that is trained on their events makes of the sensor's (docs/event_classes.md).
+Trained on rendered sequences with hard events of a noisy, slow, unequal sensor; judged on motions and worlds
+never seen by van Rossum distance, number, rates over time, flicker, delay, patches and medians. With
+--classes instead by what a classifier that is trained on their events makes of the sensor's
+(docs/event_classes.md).
 """
 
 import sys
@@ -25,8 +27,13 @@ TRAINING = [
 ]
 UNSEEN = {
     "motion": [("room", "flying", 50), ("corridor", "driving", 51), ("room", "radial", 52)],
-    "world": [("outdoor", "flying", 60), ("outdoor", "driving", 61), ("tabletop", "flying", 62), ("tabletop", "orbital", 63)],
-}  # fmt: skip
+    "world": [
+        ("outdoor", "flying", 60),
+        ("outdoor", "driving", 61),
+        ("tabletop", "flying", 62),
+        ("tabletop", "orbital", 63),
+    ],
+}
 PICTURE_S = 0.03
 TITLES = {
     "thesis": "thesis network, SLAYER's reset",
@@ -39,9 +46,9 @@ TITLES = {
 }
 PICTURED = ("thesis", "smoothed", "esim", "ours")
 CAPTION = (
-    "Loss: van Rossum distance, 10 ms, over that of silence. Rates of ON and OFF (the smaller correlation) in bins of "
-    "10 ms; cells and patches of 8 x 8 px; flicker: power of the rate above 50 Hz over the target's; median: events "
-    "behind a 5 x 5 median over the target's. Brackets: 95 %, blocks of 16 x 16 px drawn again."
+    "Loss: van Rossum distance, 10 ms, over that of silence. Rates of ON and OFF (the smaller correlation) in "
+    "bins of 10 ms; cells and patches of 8 x 8 px; flicker: power of the rate above 50 Hz over the target's; "
+    "median: events behind a 5 x 5 median over the target's. Brackets: 95 %, blocks of 16 x 16 px drawn again."
 )
 
 
@@ -126,7 +133,8 @@ def sequences(run, wanted):
 
 
 def show(run, name, shown, dt_s):
-    """Figures of counts by title: event pictures as they are and behind a median, rates over time, patches."""
+    """Figures of counts by title: event pictures as they are and behind a median, rates over time,
+    patches."""
     steps = round(PICTURE_S / dt_s)
     for end, text in (("pictures", "events of 30 ms"), ("median", "of 10 ms behind a 5 x 5 median")):
         figure = Figure(figsize=(2.2 * len(shown), 7), layout="constrained")

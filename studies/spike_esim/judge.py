@@ -1,4 +1,5 @@
-"""What generated events are judged by: distance, number, rates over time, flicker, delay, patches, median filter."""
+"""What generated events are judged by: distance, number, rates over time, flicker, delay, patches, median
+filter."""
 
 import torch
 import torch.nn.functional as F
@@ -16,7 +17,8 @@ HIGH_HZ = 50.0  # flicker is the power of the rate above; half of what the steps
 
 
 def judge(pairs, resamples, seed):
-    """Figures by name of pairs (counts [T-1, 2, H, W], Sequence with the target's); ON and OFF: the smaller one."""
+    """Figures by name of pairs (counts [T-1, 2, H, W], Sequence with the target's); ON and OFF: the smaller
+    one."""
     found, target = [made for made, _ in pairs], [sequence.counts for _, sequence in pairs]
     dt_s = pairs[0][1].dt_s
     loss, rate = intervals(pairs, resamples, seed)
@@ -42,7 +44,8 @@ def distance(pairs):
 
 
 def intervals(pairs, resamples, seed):
-    """``distance``, and events over the target's: (value, low, high) each, 95 %, blocks of pixels drawn again."""
+    """``distance``, and events over the target's: (value, low, high) each, 95 %, blocks of pixels drawn
+    again."""
     sums = block_sums(pairs)
     generator = torch.Generator().manual_seed(seed)
     chosen = torch.randint(sums.shape[1], (resamples, sums.shape[1]), generator=generator)
@@ -55,7 +58,8 @@ def intervals(pairs, resamples, seed):
 
 
 def block_sums(pairs):
-    """[4, blocks]: squared van Rossum responses of the error and of silence, events and those of the target."""
+    """[4, blocks]: squared van Rossum responses of the error and of silence, events and those of the
+    target."""
     sums = []
     for found, sequence in pairs:
         target = sequence.counts

@@ -1,5 +1,5 @@
-"""What is raced, trained on rendered sequences with the hard events of a physical sensor: the spiking network of the
-thesis in four forms, ESIM with its best threshold, and Spike-ESIM."""
+"""What is raced, trained on rendered sequences with the hard events of a physical sensor: the spiking
+network of the thesis in four forms, ESIM with its best threshold, and Spike-ESIM."""
 
 import math
 from dataclasses import dataclass
@@ -23,7 +23,8 @@ SENSOR = SensorModel(0.18, 0.22, theta_sigma=0.03, cutoff_hz=60.0, leak_rate_hz=
 THETAS = [0.12 * 1.15**k for k in range(18)]  # 0.12 to 1.3
 CROP_PX = 32
 BATCH = 2
-# of potentials of the busiest sequence at the threshold when training starts: the better by training loss is kept
+# of potentials of the busiest sequence at the threshold when training starts: the better by training loss is
+# kept
 SHARES = (0.01, 0.04)
 SMOOTHING_MS = 10.0
 # frames are divided by it for the thesis network: weights of the order of 1, as its step of Adam supposes
@@ -117,7 +118,8 @@ class Store:
 
 
 def generators(run, sequences):
-    """By name, functions from a sequence to counts [T-1, 2, H, W]; the fitted Spike-ESIM and ESIM's threshold."""
+    """By name, functions from a sequence to counts [T-1, 2, H, W]; the fitted Spike-ESIM and ESIM's
+    threshold."""
     store = Store(run)
     seed = run.config.seed + 1
     made = {name: _thesis(store, name, sequences, run.config.steps // 2, seed) for name in VARIANTS}
@@ -148,8 +150,8 @@ def esim(sequence, theta):
 
 
 def _thesis(store, name, sequences, steps, seed):
-    """The variant from the better of two starts, trained the thesis's way: Adam at 0.01, van Rossum loss alone, one
-    sequence after the other."""
+    """The variant from the better of two starts, trained the thesis's way: Adam at 0.01, van Rossum loss
+    alone, one sequence after the other."""
 
     def spikes(network, sequence):
         return network(sequence.frames / LIGHT)[0]
@@ -175,7 +177,8 @@ def _thesis(store, name, sequences, steps, seed):
 
 
 def descend(optimiser, loss, steps, advance, paces=None, clip=math.inf):
-    """Follow the gradient of ``loss()``; paces: one function a group of parameters, from step to share of its rate."""
+    """Follow the gradient of ``loss()``; paces: one function a group of parameters, from step to share of
+    its rate."""
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, paces or (lambda step: 1.0))
     for _ in range(steps):
         value = loss()
@@ -200,8 +203,8 @@ def objective(found, target, dt_s, count_weight=0.1, block_steps=8):
 
 
 def train_ours(model, sequences, steps, generator, advance):
-    """Adam, its step falling as a half cosine to a twentieth; convolutions learn slowly, single numbers fast, and
-    noise, which remains when the signal is learnt, in the second half."""
+    """Adam, its step falling as a half cosine to a twentieth; convolutions learn slowly, single numbers
+    fast, and noise, which remains when the signal is learnt, in the second half."""
 
     def loss():
         frames, t_s, counts = crops(sequences, generator)
@@ -221,8 +224,8 @@ def train_ours(model, sequences, steps, generator, advance):
 
 
 def crops(sequences, generator, batch=BATCH):
-    """Random squares out of random sequences: frames [T, B, h, w], t_s [T], counts [T-1, 2, B, h, w]. A batch without
-    any event has no relative loss; then another is drawn."""
+    """Random squares out of random sequences: frames [T, B, h, w], t_s [T], counts [T-1, 2, B, h, w]. A
+    batch without any event has no relative loss; then another is drawn."""
     while True:
         frames, counts = [], []
         for _ in range(batch):
@@ -237,8 +240,8 @@ def crops(sequences, generator, batch=BATCH):
 
 @torch.no_grad()
 def calibrate(model, sequences, rounds=3):
-    """Scale the thresholds until the generator gives as many events as the target, noise included: squared errors
-    favour too few events where an edge is predicted beside its place."""
+    """Scale the thresholds until the generator gives as many events as the target, noise included: squared
+    errors favour too few events where an edge is predicted beside its place."""
     target = sum(sequence.counts.sum((0, 2, 3)).double() for sequence in sequences)
     for _ in range(rounds):
         found = torch.zeros(2, dtype=torch.float64)

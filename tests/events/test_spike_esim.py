@@ -1,5 +1,5 @@
-"""Spike-ESIM against the hard sensor, the network of the thesis against an independent case, closed forms of their parts
-and losses, chunks against the whole."""
+"""Spike-ESIM against the hard sensor, the network of the thesis against an independent case, closed forms of
+their parts and losses, chunks against the whole."""
 
 import math
 from contextlib import nullcontext

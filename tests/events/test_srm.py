@@ -1,4 +1,5 @@
-"""The spike response layer against closed forms, finite kernels written out in torch, and independently computed cases."""
+"""The spike response layer against closed forms, finite kernels written out in torch, and independently
+computed cases."""
 
 import math
 import warnings
@@ -54,7 +55,8 @@ def test_one_spike_leaves_the_reset_kernel(kernel):
 
 
 def by_kernels(drive, theta, tau_s, tau_r, kernel, response):
-    """Spikes and potentials of coupled polarities, from all steps so far; gradient through the reset "bounded"."""
+    """Spikes and potentials of coupled polarities, from all steps so far; gradient through the reset
+    "bounded"."""
     lags = torch.arange(1, len(drive) + 1, dtype=F64)
     nu = {
         "slayer": (lags / tau_r) * (1 - lags / tau_r).exp(),

@@ -1,5 +1,6 @@
-"""The gradients "mean" and "play" of the spike response layer: the mean of a fading reset against recursions written
-out, that of a memorised level against the mean of hard counts over enumerated beginnings, both against differences."""
+"""The gradients "mean" and "play" of the spike response layer: the mean of a fading reset against recursions
+written out, that of a memorised level against the mean of hard counts over enumerated beginnings, both
+against differences."""
 
 import doctest
 import itertools
@@ -37,7 +38,8 @@ def mean_spikes(kind, response, theta, a, m, pace, start):
 
 
 def drawn(kind, ages=4, steps=7, lanes=3):
-    """Response, theta, decay, amplitude and start of some pixels, some of which spike and some of which rest."""
+    """Response, theta, decay, amplitude and start of some pixels, some of which spike and some of which
+    rest."""
     generator = torch.Generator().manual_seed(0)
     response, a, m, theta, pace = (
         low + (high - low) * torch.rand(shape, generator=generator, dtype=D)
@@ -124,7 +126,8 @@ def test_the_mean_is_that_of_noisy_neurons_where_only_the_last_spike_counts():
             chance *= fires if spike else 1 - fires
             reset = a * reset + spike
         truth += chance * np.array(history)
-    # a shift of the potential of 1e-4 * 2 theta, in each of the steps before, at a slope of less than 1/(4 WIDTH theta)
+    # a shift of the potential of 1e-4 * 2 theta, in each of the steps before, at a slope of less than 1/(4
+    # WIDTH theta)
     np.testing.assert_allclose(mean[:, 0], truth, rtol=0, atol=steps * 1e-4 * 2 / (4 * WIDTH))
 
 
@@ -252,7 +255,8 @@ def test_an_infinite_drive_that_counts_as_zero_gets_no_gradient():
 @pytest.mark.parametrize(
     ("kernel", "direction", "cosine", "surrogate"),
     [("exp", FOCUS, 0.95, 0.95), ("slayer", FOCUS, 0.93, 0.89), ("exp", SHIFT_X, 0.86, 0.79)],
-)  # measured: 0.970 beside 0.939 of Triangular/bounded, 0.958 beside 0.869, 0.900 beside 0.760; the first's interval
+)
+# measured: 0.970 beside 0.939 of Triangular/bounded, 0.958 beside 0.869, 0.900 beside 0.760; the first's interval
 # of 90 % is 0.958 to 0.979
 def test_it_points_to_where_hard_spikes_go(kernel, direction, cosine, surrogate):
     case = Case(5, size_px=32)

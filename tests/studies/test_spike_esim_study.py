@@ -1,5 +1,5 @@
-"""The Spike-ESIM study: figures of judgement, thesis variants, digits and saccades against closed forms and values worked
-out by hand; a run that goes on where it stopped."""
+"""The Spike-ESIM study: figures of judgement, thesis variants, digits and saccades against closed forms and
+values worked out by hand; a run that goes on where it stopped."""
 
 import json
 import math
@@ -344,8 +344,8 @@ def test_the_network_of_the_thesis_sees_each_picture_alone():
     assert float(together.sum()) > 0
     for k in range(3):
         alone = classes.spikes_of(network, seen[:, k : k + 1])
-        # a convolution of three pictures may round differently from one of one, by 9 products of 1e-7: of 27,648
-        # potentials few are that near a threshold, and their spikes come a step later
+        # a convolution of three pictures may round differently from one of one, by 9 products of 1e-7: of
+        # 27,648 potentials few are that near a threshold, and their spikes come a step later
         assert int((together[:, :, k : k + 1] != alone).sum()) <= 1e-3 * alone.numel()
 
 

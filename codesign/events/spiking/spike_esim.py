@@ -172,7 +172,8 @@ class SpikeEsim(nn.Module):
             scale = torch.zeros(())
         if scale.is_meta or scale.shape not in ((), (2,)) or not bool((scale.isfinite() & (scale > 0)).all()):
             raise DomainError(
-                f"theta_scale is {shown(theta_scale)}; a finite factor > 0, or one each for ON and OFF, is needed."
+                f"theta_scale is {shown(theta_scale)}; a finite factor > 0, or one each for ON and "
+                "OFF, is needed."
             )
         seen, after = self._levels(frames, times_s, state)
         theta = self.thetas() * scale

@@ -1,5 +1,5 @@
-"""The learnt parts of Spike-ESIM: noise prefilter, tone curve, bandwidth, a residual branch, noise. Each is without
-effect before it is trained: the identity, or zero."""
+"""The learnt parts of Spike-ESIM: noise prefilter, tone curve, bandwidth, a residual branch, noise. Each is
+without effect before it is trained: the identity, or zero."""
 
 import math
 from collections.abc import Callable
@@ -138,7 +138,8 @@ class NoiseRate(nn.Module):
 
 
 def stepwise(function: Callable[[Tensor], Tensor], pictures: Tensor) -> Tensor:
-    """Apply a function of pictures to every step of a sequence, so that chunks of time round as the whole does.
+    """Apply a function of pictures to every step of a sequence, so that chunks of time round as the whole
+    does.
 
     The matrix products behind a convolution may round by the number of pictures they get and by where these
     begin in memory (MKL documents equal bits for equal shapes at equally aligned addresses). Every step

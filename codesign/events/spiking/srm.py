@@ -71,9 +71,10 @@ def srm(
         ``response="step"``, ``reset_scale=1`` and log-intensity steps as drive (ON +, OFF -) this is the
         memorised-reference event model.
       gradient: "surrogate", or for that event model "play": the gradient of the mean count over where inside
-        its threshold a pixel may have begun, as ``events.memory``, with one event per step. For resets that fade
-        "mean": the exact gradient of a smooth mean response, of many neurons with noise at the threshold that
-        spiked last at a random time. It points better than a surrogate; docs/srm.md says how well.
+        its threshold a pixel may have begun, as ``events.memory``, with one event per step. For resets that
+        fade "mean": the exact gradient of a smooth mean response, of many neurons with noise at the
+        threshold that spiked last at a random time. It points better than a surrogate; docs/srm.md says how
+        well.
       surrogate: Laplace, FastSigmoid or Triangular; None: Laplace of unit mass and width mean(theta), that is
         alpha = 2 theta, beta = 1 / theta.
       through_reset: gradient of a spike by way of the resets it causes: "off" (as SLAYER), "full", or
@@ -90,9 +91,9 @@ def srm(
         whole bit for bit.
     Gradient: drive, theta, tau_s, tau_r, state; spikes by the surrogate. theta and tau_r act through the
       reset amplitude with spikes held, also when
-      through_reset is "off". With ``gradient="play"`` spikes carry a gradient to drive, theta and state.play, and
-      the potential none. With ``gradient="mean"`` spikes carry one to drive, theta, tau_s, tau_r, state.response and
-      state.mean, and the potential none. Second derivatives raise.
+      through_reset is "off". With ``gradient="play"`` spikes carry a gradient to drive, theta and
+      state.play, and the potential none. With ``gradient="mean"`` spikes carry one to drive, theta, tau_s,
+      tau_r, state.response and state.mean, and the potential none. Second derivatives raise.
     Raises: ShapeError for T = 0, no pixel, shapes that do not fit; DomainError for thresholds, time constants
       or dt that are not positive, unknown
       names, NaN or infinite drive; NonFiniteError when a finite drive overflows. Warns (RuntimeWarning) when
@@ -197,12 +198,14 @@ def srm(
 
 
 def count_spikes(level: Tensor, theta: Tensor, state: Any, gradient: str = "play") -> tuple[Tensor, Any]:
-    """At most one event per step and polarity: a layer with step kernels and coupled polarities, which memorises a level.
+    """At most one event per step and polarity: a layer with step kernels and coupled polarities, which
+    memorises a level.
 
-    Args: level: [T, ...]. theta: [2], or [2, ...] of every pixel. state: what an earlier call returned, or None.
+    Args: level: [T, ...]. theta: [2], or [2, ...] of every pixel. state: what an earlier call returned, or
+      None.
     Returns: counts [T-1, 2, ...] ([T, 2, ...] with a state); state to carry on.
-    Gradient: "play": of the mean count over places inside the threshold, with the cap of one event per step (``srm``).
-      "surrogate": by a fast sigmoid of width theta, through the reset where it cannot grow.
+    Gradient: "play": of the mean count over places inside the threshold, with the cap of one event per step
+      (``srm``). "surrogate": by a fast sigmoid of width theta, through the reset where it cannot grow.
     """
     start, neurons, play = (level[:1], None, None) if state is None else (state[0][None], *state[1:])
     step = torch.cat((start, level if state is not None else level[1:])).diff(dim=0)
@@ -296,13 +299,14 @@ def _with_mean(drive, theta, tau_r, kernel, reset_scale, state, times):
 
 
 def _time_constant(value, name, drive, dt):
-    """A time constant of every pixel, float64. Beyond a billionth and a billion of a step it is none: kernels and their
-    derivatives leave double precision."""
+    """A time constant of every pixel, float64. Beyond a billionth and a billion of a step it is none:
+    kernels and their derivatives leave double precision."""
     value = check_per_pixel(value, name, drive, torch.float64)
     low, high = (float(bound) / dt for bound in value.detach().aminmax())
     if not 1 / MOST_STEPS <= low <= high <= MOST_STEPS:
         raise DomainError(
-            f"{name} is {low:.3g} to {high:.3g} steps of dt; {1 / MOST_STEPS:g} to {MOST_STEPS:g} are possible."
+            f"{name} is {low:.3g} to {high:.3g} steps of dt; {1 / MOST_STEPS:g} to {MOST_STEPS:g} are "
+            "possible."
         )
     return value
 

@@ -1,10 +1,11 @@
-"""The kernels of the spike response model as linear recursions with one decay a, one amplitude m and at most two states; no sum is cut:
+"""The kernels of the spike response model as linear recursions with one decay a, one amplitude m and at most
+two states; no sum is cut:
 
-pair     q <- a (q + p), p <- a p, y = m q, p <- p + z      y_t = m sum_{k>=1} k a^k z_{t-k}      (alpha response, slayer reset)
-late     p <- a p, y = m p, p <- p + z                      y_t = m sum_{k>=1} a^k z_{t-k}        (thesis reset)
-early    y = m p, p <- a p + z                              y_t = m sum_{k>=1} a^{k-1} z_{t-k}    (exp and step reset)
-sum      p <- p + z, y = p                                  y_t = sum_{k>=0} z_{t-k}              (step response)
-none     y = z
+    pair     q <- a (q + p), p <- a p, y = m q, p <- p + z    y_t = m sum_{k>=1} k a^k z_{t-k}
+    late     p <- a p, y = m p, p <- p + z                    y_t = m sum_{k>=1} a^k z_{t-k}
+    early    y = m p, p <- a p + z                            y_t = m sum_{k>=1} a^{k-1} z_{t-k}
+    sum      p <- p + z, y = p                                y_t = sum_{k>=0} z_{t-k}
+    none     y = z
 """
 
 import math
@@ -19,7 +20,8 @@ RESETS = {"slayer": "pair", "thesis": "late", "exp": "early", "step": "early"}
 
 @dataclass(frozen=True)
 class Coefficients:
-    """Decay a and amplitude m per pixel, and their derivatives with respect to h = dt/tau; tensors of one shape."""
+    """Decay a and amplitude m per pixel, and their derivatives with respect to h = dt/tau; tensors of one
+    shape."""
 
     a: Tensor
     m: Tensor
@@ -34,8 +36,8 @@ def response_coefficients(h: Tensor) -> Coefficients:
 
 
 def reset_coefficients(kernel: str, h: Tensor, amplitude: Tensor) -> Coefficients:
-    """Reset kernel of the given name, for k >= 1, with amplitude = -reset_scale * theta: slayer: amplitude k h exp(1 - k
-    h); thesis: amplitude exp(1 - k h); exp: amplitude exp(-(k - 1) h); step: amplitude."""
+    """Reset kernel of the given name, for k >= 1, with amplitude = -reset_scale * theta: slayer: amplitude k
+    h exp(1 - k h); thesis: amplitude exp(1 - k h); exp: amplitude exp(-(k - 1) h); step: amplitude."""
     a = (-h).exp()
     zero = 0 * h
     if kernel == "slayer":

@@ -1,9 +1,9 @@
-"""The spike response model over time as one node of torch's graph: a symbolic drjit loop forward and one backward, one
-lane per pixel (or pair of coupled polarities), in float64 whatever the drive.
+"""The spike response model over time as one node of torch's graph: a symbolic drjit loop forward and one
+backward, one lane per pixel (or pair of coupled polarities), in float64 whatever the drive.
 
-The adjoint is written by hand, since it needs no state of the layer, only its potential: letting drjit differentiate one
-step after the other (``step_by_step``) keeps or computes again the states of every step: 1.8 times as long, forward and
-backward, 2 x 128 x 128 pixels, T = 200.
+The adjoint is written by hand, since it needs no state of the layer, only its potential: letting drjit
+differentiate one step after the other (``step_by_step``) keeps or computes again the states of every step:
+1.8 times as long, forward and backward, 2 x 128 x 128 pixels, T = 200.
 """
 
 from dataclasses import astuple, dataclass
@@ -25,7 +25,10 @@ from codesign.events.spiking.srm_kernels import (
 from codesign.events.spiking.surrogate import Operations, Surrogate
 from codesign.exclusive import exclusive
 
-FIRST_ONLY = "events.srm gives first derivatives only, and a second one was asked for; use differences of gradients instead."
+FIRST_ONLY = (
+    "events.srm gives first derivatives only, and a second one was asked for; use differences of gradients "
+    "instead."
+)
 # "bounded" keeps rho * sum|nu| at most this: the adjoint then shrinks by 10 % per pass through the reset
 BOUND = 0.9
 # floats ahead of the potential: where potentials and their gradient share their place in a memory page,
@@ -35,7 +38,8 @@ STAGGER = 768
 
 @dataclass(frozen=True)
 class Setup:
-    """Everything about a call that is not a tensor. response, reset: kinds of recursion. kernel: name of the reset.
+    """Everything about a call that is not a tensor. response, reset: kinds of recursion. kernel: name of the
+    reset.
     channels: 2 where ON and OFF reset one another, else 1. shape: of the drive as the caller gave it."""
 
     response: str
@@ -54,8 +58,8 @@ class Setup:
         return reset_coefficients(self.kernel, h_reset, -self.reset_scale * theta)
 
     def reset_sum(self, theta: Tensor, h_reset: Tensor, steps: int) -> Tensor:
-        """Sum of |nu| over all lags, of every pixel, doubled where a spike also lifts the other polarity; a kernel that
-        does not decay is summed over ``steps`` lags."""
+        """Sum of |nu| over all lags, of every pixel, doubled where a spike also lifts the other polarity; a
+        kernel that does not decay is summed over ``steps`` lags."""
         k = self.reset_of(theta, h_reset)
         if self.reset == "pair":
             return self.channels * k.m.abs() * k.a / (1 - k.a) ** 2
@@ -133,8 +137,8 @@ class _Srm(Function):
 
 @exclusive
 def _backward(ctx, saved, grads):
-    """Gradients of drive, theta, h_response, h_reset, response and reset; the initial states add their share to those of
-    the parameters."""
+    """Gradients of drive, theta, h_response, h_reset, response and reset; the initial states add their share
+    to those of the parameters."""
     import drjit as dr
 
     drive, theta, h_response, h_reset, response, reset, spikes, potential = saved
@@ -177,8 +181,8 @@ def _backward(ctx, saved, grads):
 
 
 class _Loops:
-    """The drjit side of one call: per-pixel numbers of every channel, and the loops. Numbers are evaluated or opaque,
-    so that no call compiles anew."""
+    """The drjit side of one call: per-pixel numbers of every channel, and the loops. Numbers are evaluated
+    or opaque, so that no call compiles anew."""
 
     def __init__(self, setup, drive, theta, h_response, h_reset):
         import drjit as dr
@@ -226,7 +230,8 @@ class _Loops:
         self.dr.scatter(flat, value, place, mode=self.dr.ReduceMode.NoConflicts)
 
     def numbers(self, more=None):
-        """Per channel, thresholds, decays and amplitudes [lanes] by name; ``more``: columns [channels, lanes] besides."""
+        """Per channel, thresholds, decays and amplitudes [lanes] by name; ``more``: columns [channels,
+        lanes] besides."""
         columns = {"theta": self.theta, "reset_a": self.reset.a, "reset_m": self.reset.m, **(more or {})}
         if self.response:
             columns |= {"response_a": self.response.a, "response_m": self.response.m}
@@ -255,8 +260,9 @@ class _Loops:
     def forward(self, states, span, origin, spikes, potential, shift):
         """Run steps span[0] to span[1] - 1.
 
-        Args: states: per channel, of response and reset. origin: the step that the first row of ``spikes`` and
-          ``potential`` belongs to, flat arrays scattered into, or None: not kept. shift: place of the first potential.
+        Args: states: per channel, of response and reset. origin: the step that the first row of ``spikes``
+          and ``potential`` belongs to, flat arrays scattered into, or None: not kept. shift: place of the
+          first potential.
         Returns: the states after the last step, and per lane whether something became NaN or infinite.
         """
         dr, setup, single = self.dr, self.setup, self.single
@@ -302,8 +308,9 @@ class _Loops:
         return states, bad
 
     def after(self, need, grad_response, grad_reset):
-        """Per channel, what the loop backward carries, after the last step, by name: adjoints of the states of response
-        and reset; where wanted, derivatives of those by h or theta (tangents), and gradients gathered so far (sums)."""
+        """Per channel, what the loop backward carries, after the last step, by name: adjoints of the states
+        of response and reset; where wanted, derivatives of those by h or theta (tangents), and gradients
+        gathered so far (sums)."""
         dr = self.dr
         setup = self.setup
         _, theta, response, reset, _, reset_state = need
@@ -331,9 +338,9 @@ class _Loops:
     def backward(self, carried, span, origin, flat):
         """Run steps span[1] - 1 down to span[0].
 
-        Args: carried: loop variables after the last step. origin: the step at which the potential begins. flat: arrays
-          by name; spikes, grad_spikes, grad_potential and grad_drive (scattered into) hold all steps. None: no such
-          gradient.
+        Args: carried: loop variables after the last step. origin: the step at which the potential begins.
+          flat: arrays by name; spikes, grad_spikes, grad_potential and grad_drive (scattered into) hold all
+          steps. None: no such gradient.
         Returns: loop variables before the first step.
         """
         dr, setup, single = self.dr, self.setup, self.single

@@ -1,15 +1,15 @@
-"""The gradient of spikes whose reset fades: that of the mean response of many noisy neurons, by the age of their
-last spike.
+"""The gradient of spikes whose reset fades: that of the mean response of many noisy neurons, by the age of
+their last spike.
 
-All neurons of a pixel see one response v; a share P_k of them spiked last k steps ago, and carries the mean states
-of its resets. Where u = v + reset comes near theta a neuron spikes at the rate PACE / tau_r ln(1 + exp(x)), x = (u -
-theta) / (WIDTH theta): of each age the share F = 1 - exp(-dt rate) spikes in a step and goes to age 0; the others grow
-older, into a last age that holds all that are older still. The mean spikes, sum_k P_k F_k, are a smooth function of
-the response, and their gradient is exact.
+All neurons of a pixel see one response v; a share P_k of them spiked last k steps ago, and carries the mean
+states of its resets. Where u = v + reset comes near theta a neuron spikes at the rate PACE / tau_r ln(1 +
+exp(x)), x = (u - theta) / (WIDTH theta): of each age the share F = 1 - exp(-dt rate) spikes in a step and
+goes to age 0; the others grow older, into a last age that holds all that are older still. The mean spikes,
+sum_k P_k F_k, are a smooth function of the response, and their gradient is exact.
 
-The equations are those of a population of neurons with escape noise: Gerstner and Kistler, Spiking Neuron Models,
-2002, section 6.2, with the resets of earlier spikes as a mean per age. For dt = tau_r / PACE the share is a logistic
-function of x.
+The equations are those of a population of neurons with escape noise: Gerstner and Kistler, Spiking Neuron
+Models, 2002, section 6.2, with the resets of earlier spikes as a mean per age. For dt = tau_r / PACE the
+share is a logistic function of x.
 """
 
 import math
@@ -23,7 +23,8 @@ from codesign.events.spiking.srm_kernels import RESETS, STATES, advance, reset_c
 from codesign.events.spiking.srm_state import SrmState
 from codesign.events.spiking.step_by_step import recursion
 
-WIDTH = 0.087  # of the noise, in thresholds; a narrower one is nearer to hard spikes, and its gradient more erratic
+# of the noise, in thresholds; a narrower one is nearer to hard spikes, and its gradient more erratic
+WIDTH = 0.087
 PACE = 1.2  # spikes per tau_r and x, far above the threshold
 MEAN_AGE = 3.0  # of the last spike before the first step, in time constants of the reset
 TINY = 1e-9  # share below which an age has no states of its own
@@ -35,17 +36,18 @@ MOST_AGES = 64
 def check_mean(
     kernel: str, coupled: bool, others: dict[str, tuple[object, object]], state: SrmState | None
 ) -> None:
-    """Raises: DomainError where the neurons of a pixel have no mean response of this kind, an argument of surrogates
-    is given (others: name -> (value, default)), or a state comes from a layer with another gradient."""
+    """Raises: DomainError where the neurons of a pixel have no mean response of this kind, an argument of
+    surrogates is given (others: name -> (value, default)), or a state comes from a layer with another
+    gradient."""
     if kernel == "step":
         raise DomainError(
-            "gradient 'mean' goes with a reset that fades ('slayer', 'thesis' or 'exp'), got kernel 'step'; use "
-            "gradient='play' for a layer that memorises a level."
+            "gradient 'mean' goes with a reset that fades ('slayer', 'thesis' or 'exp'), got kernel 'step'; "
+            "use gradient='play' for a layer that memorises a level."
         )
     if coupled:
         raise DomainError(
-            "gradient 'mean' goes with coupled=False: it takes the neurons of one polarity by themselves; use "
-            "gradient='surrogate'."
+            "gradient 'mean' goes with coupled=False: it takes the neurons of one polarity by themselves; "
+            "use gradient='surrogate'."
         )
     for name, (value, default) in others.items():
         if value != default:
@@ -65,10 +67,10 @@ def mean_spikes(
 ) -> tuple[Tensor, Tensor]:
     """Mean spikes of the noisy neurons.
 
-    Args: response: [T, ...] of the drive, before any reset. theta, h_reset: threshold and dt / tau_r, positive,
-      broadcasting over [...]. before: [1 + states, ages, ...] of the chunk before, or None.
-    Returns: [T, ...] in 0 to 1; shares and states of the ages to carry on, with their graph. Gradient: response, theta,
-      h_reset, before.
+    Args: response: [T, ...] of the drive, before any reset. theta, h_reset: threshold and dt / tau_r,
+      positive, broadcasting over [...]. before: [1 + states, ages, ...] of the chunk before, or None.
+    Returns: [T, ...] in 0 to 1; shares and states of the ages to carry on, with their graph. Gradient:
+      response, theta, h_reset, before.
     """
     pixels = response.shape[1:]
     kind = RESETS[kernel]
@@ -79,8 +81,8 @@ def mean_spikes(
         before = rested(count, STATES[kind], h_reset)
     elif before.shape != wanted or before.dtype != response.dtype:
         raise ShapeError(
-            f"state.mean is {before.dtype} {list(before.shape)}, this layer keeps {response.dtype} {list(wanted)}; "
-            "pass the state of the same layer and frame."
+            f"state.mean is {before.dtype} {list(before.shape)}, this layer keeps {response.dtype} "
+            f"{list(wanted)}; pass the state of the same layer and frame."
         )
     reset = reset_coefficients(kernel, h_reset, -reset_scale * theta)
     # the noise is the model's: held where tau_r moves, as it moves no hard spike
@@ -92,8 +94,8 @@ def mean_spikes(
 
 
 def rested(ages: int, states: int, h: Tensor) -> Tensor:
-    """[1 + states, ages, ...] shares and reset states of neurons that spiked last at a random time, MEAN_AGE time
-    constants ago on average. h: [...] dt/tau of the reset."""
+    """[1 + states, ages, ...] shares and reset states of neurons that spiked last at a random time, MEAN_AGE
+    time constants ago on average. h: [...] dt/tau of the reset."""
     # in time constants
     age = torch.arange(ages, dtype=h.dtype, device=h.device).reshape(-1, *[1] * h.ndim) * h
     older = (-age / MEAN_AGE).exp()
@@ -109,8 +111,8 @@ def _ages(h_reset):
     if count > MOST_AGES:
         raise DomainError(
             f"tau_r is up to {longest:.3g} steps, and gradient 'mean' goes up to "
-            f"{(MOST_AGES - MORE_AGES) // AGES_PER_TAU}, since it takes {AGES_PER_TAU} ages per step of it; take longer "
-            "steps, or gradient='surrogate'."
+            f"{(MOST_AGES - MORE_AGES) // AGES_PER_TAU}, since it takes {AGES_PER_TAU} ages per step of it; "
+            "take longer steps, or gradient='surrogate'."
         )
     return count
 

@@ -1,10 +1,11 @@
-"""The coupled spike response layer with step kernels, which memorises a level, and its gradient: that of the mean count
-of ``events.memory``, for a level that runs no faster than one threshold per step.
+"""The coupled spike response layer with step kernels, which memorises a level, and its gradient: that of the
+mean count of ``events.memory``, for a level that runs no faster than one threshold per step.
 
-Such a layer fires at most once a step and polarity; what is left of a larger step fires in the steps after it.
-With the memorised level r spread evenly over one threshold C below the edge E of the last engaged step, all
-pixels fire once where the level exceeds E + C, and r then fills the C below E + C: as if the level itself had
-stopped there. For C_on = C_off the mean is exact; otherwise E is the edge of a play of their mean width.
+Such a layer fires at most once a step and polarity; what is left of a larger step fires in the steps after
+it. With the memorised level r spread evenly over one threshold C below the edge E of the last engaged step,
+all pixels fire once where the level exceeds E + C, and r then fills the C below E + C: as if the level
+itself had stopped there. For C_on = C_off the mean is exact; otherwise E is the edge of a play of their mean
+width.
 """
 
 import torch
@@ -42,7 +43,8 @@ def with_play(
 
 
 def held_back(level: Tensor, centre: Tensor, theta_on: Tensor, theta_off: Tensor) -> tuple[Tensor, Tensor]:
-    """The level [T, ...], held back to one threshold beyond a play, and the centre [...] of the play after it."""
+    """The level [T, ...], held back to one threshold beyond a play, and the centre [...] of the play after
+    it."""
     pixels = level.shape[1:]
     numbers = torch.stack([theta.expand(pixels).reshape(-1) for theta in (theta_on, theta_off)])
     slow, after = recursion(_follow, level.reshape(len(level), -1), numbers, centre.reshape(1, -1))
@@ -65,14 +67,14 @@ def _follow(dr, level, thetas, centres):
 def check_play(
     drive: Tensor, kernel: str, response: str, reset_scale: float, coupled: bool, state: SrmState | None
 ) -> None:
-    """Raises: DomainError where a layer memorises no level, so that its mean count is not that of a play, or a
-    state comes from a layer with another gradient."""
+    """Raises: DomainError where a layer memorises no level, so that its mean count is not that of a play, or
+    a state comes from a layer with another gradient."""
     given = {"kernel": kernel, "response": response, "reset_scale": reset_scale, "coupled": coupled}
     for name, needed in {"kernel": "step", "response": "step", "reset_scale": 1.0, "coupled": True}.items():
         if given[name] != needed:
             raise DomainError(
-                f"gradient 'play' goes with {name}={needed!r}, got {given[name]!r}: only a layer that memorises a "
-                "level has it; use gradient='surrogate'."
+                f"gradient 'play' goes with {name}={needed!r}, got {given[name]!r}: only a layer that "
+                "memorises a level has it; use gradient='surrogate'."
             )
     if not torch.equal(drive[:, 0], -drive[:, 1]):
         raise DomainError(
@@ -87,7 +89,8 @@ def check_play(
 
 
 def played(spikes: Tensor, drive: Tensor, theta: Tensor, state: SrmState | None) -> tuple[Tensor, PlayState]:
-    """``with_play`` for a drive [T, 2, ...] of steps: the level is their sum. theta broadcasts over [2, ...]."""
+    """``with_play`` for a drive [T, 2, ...] of steps: the level is their sum. theta broadcasts over [2,
+    ...]."""
     pixels = drive.shape[1:]
     theta_on, theta_off = theta.expand(pixels).to(drive) if theta.numel() > 1 else (theta.to(drive),) * 2
     step = (drive[:, 0] - drive[:, 1]) / 2

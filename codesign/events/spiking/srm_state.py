@@ -10,8 +10,8 @@ from codesign.errors import DomainError, ShapeError, check_finite
 
 @dataclass(frozen=True)
 class PlayState:
-    """What ``gradient="play"`` carries on. memory: state of ``events.memory``. centre: [...] centre of the play
-    that holds the level back to a threshold per step. level: [...] sum of the drive so far."""
+    """What ``gradient="play"`` carries on. memory: state of ``events.memory``. centre: [...] centre of the
+    play that holds the level back to a threshold per step. level: [...] sum of the drive so far."""
 
     memory: Tensor
     centre: Tensor
@@ -31,8 +31,8 @@ class SrmState:
       1 drives with ``srm_truncated``).
     reset: [states, ...] of the reset kernel, likewise (1 or 2 states; the last taps - 1 spikes).
     play: PlayState with ``gradient="play"``, else None.
-    mean: [1 + states, ages, ...] with ``gradient="mean"``, in the type of the drive: shares of neurons by the age of
-      their last spike, and the mean states of their resets; else None.
+    mean: [1 + states, ages, ...] with ``gradient="mean"``, in the type of the drive: shares of neurons by
+      the age of their last spike, and the mean states of their resets; else None.
     """
 
     response: Tensor

@@ -1,5 +1,5 @@
-"""A recursion over time of every pixel in drjit, and its exact gradient: the loop backward lets drjit differentiate one
-step after the other, from states kept at some steps and computed again between."""
+"""A recursion over time of every pixel in drjit, and its exact gradient: the loop backward lets drjit
+differentiate one step after the other, from states kept at some steps and computed again between."""
 
 import math
 from collections.abc import Callable
@@ -19,7 +19,8 @@ def recursion(
 ) -> tuple[Tensor, Tensor]:
     """Carry states over time.
 
-    Args: step: (drjit, value, numbers, states) -> (output, states), of arrays of all pixels; it may hold no others.
+    Args: step: (drjit, value, numbers, states) -> (output, states), of arrays of all pixels; it may hold no
+      others.
       values: [T, N] one per step. numbers: [K, N] that stay. start: [S, N] states; all of one floating type.
     Returns: outputs [T, N]; states [S, N] after the last step. Gradient: values, numbers, start.
     """
@@ -46,8 +47,8 @@ class _Recursion(Function):
 
 
 class _Loops:
-    """The loops over time of every pixel, in spans whose states all take as much memory as the values, or as few as there
-    are spans."""
+    """The loops over time of every pixel, in spans whose states all take as much memory as the values, or as
+    few as there are spans."""
 
     def __init__(self, step, values, numbers, states):
         import drjit as dr
@@ -73,8 +74,8 @@ class _Loops:
         return self.dr.empty(self.arr.Float, longest * self.states * self.width)
 
     def forward(self, start, differentiated):
-        """Outputs; states after the last step; those before every span but the first, as lanes; where there is one span
-        alone, and it is to be differentiated, those before every step."""
+        """Outputs; states after the last step; those before every span but the first, as lanes; where there
+        is one span alone, and it is to be differentiated, those before every step."""
         dr = self.dr
         output = dr.empty(self.arr.Float, self.steps * self.width)
         kept = self.memory() if differentiated and len(self.spans) == 1 else None

@@ -1,8 +1,8 @@
 """Surrogate derivatives of the spike, with the antiderivative that makes an exact smooth twin of the layer.
 
 A surrogate is the density rho(x) that stands in for the derivative of the step at x = u - theta. Its integral
-from -infinity replaces the step in the smooth twin, whose gradient is therefore exact. All three have their largest
-value 1/alpha at the threshold and the width 1/beta.
+from -infinity replaces the step in the smooth twin, whose gradient is therefore exact. All three have their
+largest value 1/alpha at the threshold and the width 1/beta.
 """
 
 import math
@@ -74,8 +74,8 @@ class Surrogate:
         return self.density(TORCH, _real(x), *astuple(self))
 
     def torch_integral(self, x: Tensor) -> Tensor:
-        """Integral of rho up to a torch tensor x of real numbers, differentiable. Raises: DomainError for anything
-        else."""
+        """Integral of rho up to a torch tensor x of real numbers, differentiable. Raises: DomainError for
+        anything else."""
         return self.integral(TORCH, _real(x), *astuple(self))
 
 
