@@ -27,7 +27,7 @@ FIRST_MET = {  # modules whose examples a user meets first
     "codesign.flow.checkpoint",
     "codesign.flow.export",
     "codesign.flow.files",
-    "codesign.flow.lk",
+    "codesign.flow.lk.estimate",
     "codesign.flow.losses",
     "codesign.flow.metrics",
     "codesign.flow.refiner",

@@ -17,12 +17,12 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d
 
 from codesign.flow.checks import check_volume
-from codesign.flow.lk import check_start, descended, field
-from codesign.flow.lk_cool import cooled
-from codesign.flow.lk_kernel import blurred
-from codesign.flow.lk_lanes import Grid
-from codesign.flow.lk_level import along_path, gaussian
-from codesign.flow.lk_path import Path
+from codesign.flow.lk.blur import blurred
+from codesign.flow.lk.estimate import check_start, descended, field
+from codesign.flow.lk.hot_pixels import weighed_down
+from codesign.flow.lk.lanes import Grid
+from codesign.flow.lk.level import along_path, gaussian
+from codesign.flow.lk.path import Path
 from codesign.flow.warp import pixel_grid
 from codesign.types import EventVolume, FlowField
 
@@ -65,7 +65,7 @@ class Agreement:
     @torch.no_grad()
     def __init__(self, volume: EventVolume) -> None:
         counts = volume.counts.detach()
-        signed, _, kept = cooled(counts)
+        signed, _, kept = weighed_down(counts)
         self.signed = _blurred(signed, BLUR_PX)
         self.events = _blurred(counts.sum(1) * kept[:, None], BLUR_PX)
         self.apart = min(2, signed.shape[1] - 1)

@@ -15,7 +15,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from codesign.atomic import replacing
 from codesign.errors import DomainError, ShapeError
 from codesign.flow.checks import MOST_SIDE_PX, check_count, check_kind, check_number, check_path, check_real
-from codesign.flow.lk_plain import plain_operations
+from codesign.flow.lk.lanes import plain_operations
 from codesign.optional import require
 from codesign.types import EventVolume
 

@@ -1,7 +1,7 @@
 """What bins read along a flow say about the flow that is still missing: local least squares for V_t + u V_x + v V_y =
 0 at several blurs and in windows of several sizes, weighed by the noise of events scattered at random.
 
-The noise is that of the closed form (lk_level): rho scattered events per pixel behind a Gaussian of sigma give
+The noise is that of the closed form (lk.level): rho scattered events per pixel behind a Gaussian of sigma give
 temporal slopes of variance rho / (4 pi sigma^2 sum w t^2) and slopes of the mean of variance about rho / (8 pi
 sigma^4), alike over 4 pi sigma^2 px. With N the sums of products of slopes in a window, the precision is N over that
 variance and overlap; it counts by the share (g / (g + 4 z))^2 of the trace g of N, z what scattered events add to it.
@@ -16,9 +16,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, pad
 
-from codesign.flow.lk_kernel import blurred, cell_sums, moving
-from codesign.flow.lk_lanes import Grid
-from codesign.flow.lk_level import along_path, gaussian
+from codesign.flow.lk.blur import blurred
+from codesign.flow.lk.lanes import Grid
+from codesign.flow.lk.level import along_path, gaussian
+from codesign.flow.lk.slopes import cell_sums
+from codesign.flow.lk.warp import moving
 from codesign.flow.warp import pixel_grid
 from codesign.types import EventVolume
 
@@ -43,7 +45,7 @@ OVERLAP = 4 * math.pi
 
 
 class Evidence:
-    """A volume blurred at several scales, and what it says along a flow, px per way (lk_path).
+    """A volume blurred at several scales, and what it says along a flow, px per way (lk.path).
 
     Sides of the volume are multiples of CELL. density: [B, 1, h, w] events per px on cells; mean_density: [B, 1, 1, 1].
     net: [B, 1, 1, 1] displacement over the way, 1 for motion that never turns.

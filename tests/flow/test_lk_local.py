@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from codesign.errors import GradientError
-from codesign.flow import estimate_lk, lk_tree
-from codesign.flow.lk_plain import plain_operations
+from codesign.flow import estimate_lk
+from codesign.flow.lk import quadtree
+from codesign.flow.lk.lanes import plain_operations
 from codesign.types import EventVolume
 from scenes.flow_windows import RenderedWindows, planes
 from tests.certain_case import certain
@@ -42,7 +43,7 @@ def test_the_tree_finds_the_posterior_of_a_dense_solve(form, generator):
     pull = (precision @ torch.randn(2, ROWS, COLUMNS, 2, 1, generator=generator, dtype=D))[..., 0]
     xx, xy, yy = precision[..., 0, 0], precision[..., 0, 1], precision[..., 1, 1]
     with form():
-        found = lk_tree.posterior(torch.stack([xx, xy, yy], 1), pull.movedim(-1, 1), steps())
+        found = quadtree.posterior(torch.stack([xx, xy, yy], 1), pull.movedim(-1, 1), steps())
     cells = ROWS * COLUMNS
     for number, k in np.ndindex(2, 2):
         mean, covariance, evidence = (values[number] for values in found)
@@ -53,7 +54,7 @@ def test_the_tree_finds_the_posterior_of_a_dense_solve(form, generator):
         data = data.reshape(2 * cells, 2 * cells)
         h = pull[k].reshape(cells, 2).numpy().T.ravel()
         means, covariances, evidences = [], [], []
-        for shift in lk_tree.SHIFTS:
+        for shift in quadtree.SHIFTS:
             prior = SIZES[number] * np.kron(np.eye(2), prior_covariance(shift))
             posterior = np.linalg.inv(np.linalg.inv(prior) + data)
             means.append(posterior @ h)
@@ -79,9 +80,9 @@ def test_the_trees_gradient_is_that_of_differences(generator):
     precision = torch.stack([matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 1, 1]], 1).requires_grad_()
     pull = torch.randn(2, 2, 9, 6, generator=generator, dtype=D).requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda precision, pull: lk_tree.posterior(precision, pull, steps()), (precision, pull)
+        lambda precision, pull: quadtree.posterior(precision, pull, steps()), (precision, pull)
     )
-    mean, *_ = lk_tree.posterior(precision, pull, steps())
+    mean, *_ = quadtree.posterior(precision, pull, steps())
     (grad,) = torch.autograd.grad(mean.square().sum(), pull, create_graph=True)
     with pytest.raises(GradientError, match="first derivatives only"):
         grad.sum().backward()

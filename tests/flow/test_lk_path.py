@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from codesign import events
-from codesign.flow import estimate_lk, lk_path
+from codesign.flow import estimate_lk
+from codesign.flow.lk import path
 from codesign.types import EventVolume
 from tests.flow.test_lk import D, length, mean_error, moving, pattern
 
@@ -75,7 +76,7 @@ def test_even_motion_keeps_its_bins():
     span = volume.collected_s.sum()
     weight = volume.collected_s / span
     even = 1000 * weight[None]
-    found = lk_path.path(signed, even, weight, volume.centroid_s / span - 0.5)
+    found = path.path(signed, even, weight, volume.centroid_s / span - 0.5)
     torch.testing.assert_close(found.counts, signed, rtol=0, atol=1e-9)
     assert found.net.tolist() == pytest.approx([1.0])
     assert found.start.tolist() == pytest.approx([-0.5])
@@ -84,7 +85,7 @@ def test_even_motion_keeps_its_bins():
 def test_bins_are_shared_so_that_their_place_stays():
     nodes = torch.tensor([-0.4, -0.1, 0.2, 0.45], dtype=D)
     place = torch.tensor([[-0.5, -0.3, 0.0, 0.2, 0.44, 0.5]], dtype=D)
-    shares = lk_path._shared(place, nodes)
+    shares = path._shared(place, nodes)
     torch.testing.assert_close(shares.sum(2), torch.ones_like(place))
     torch.testing.assert_close(shares @ nodes, place)
 

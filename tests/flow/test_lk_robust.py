@@ -6,7 +6,7 @@ import torch
 
 from codesign.flow import estimate_lk
 from codesign.flow.export import evenly_timed
-from codesign.flow.lk_cool import cooled
+from codesign.flow.lk.hot_pixels import weighed_down
 from codesign.types import EventVolume
 from scenes.flow_windows import RenderedWindows, planes
 from tests.certain_case import certain
@@ -103,7 +103,7 @@ def test_pixels_count_by_what_their_surroundings_explain(generator):
     counts[0, 0, :, 0, 6] = 30.0
     counts[1, 1, :, 3, 3] = 9.0
     counts += 0.1 * torch.rand(counts.shape, generator=generator, dtype=D)  # off the kinks
-    signed, events, kept = cooled(counts)
+    signed, events, kept = weighed_down(counts)
     n = counts.sum((1, 2))
     hot = 0
     for image, y, x in np.ndindex(2, 6, 7):
@@ -115,4 +115,4 @@ def test_pixels_count_by_what_their_surroundings_explain(generator):
     assert hot == 2
     torch.testing.assert_close(events, kept * n, rtol=1e-14, atol=0)
     torch.testing.assert_close(signed, kept[:, None] * (counts[:, 0] - counts[:, 1]), rtol=1e-14, atol=0)
-    assert torch.autograd.gradcheck(cooled, counts.requires_grad_())
+    assert torch.autograd.gradcheck(weighed_down, counts.requires_grad_())

@@ -6,7 +6,8 @@ import torch
 
 from codesign import events, flow
 from codesign.errors import DomainError, ShapeError
-from codesign.flow import estimate_lk, lk_field
+from codesign.flow import estimate_lk
+from codesign.flow.lk import polynomials
 from codesign.types import EventVolume
 from tests.flow.test_lk import D, length, mean_error, moving, pattern
 
@@ -17,7 +18,7 @@ FINE_PX = (4.0, 8.0)  # a blur of 4 px leaves a thousandth of these textures
 def test_a_polynomial_is_read_off_its_own_flow(size, generator):
     """Within the fixed point (a factor of 0.1 in each of 5 steps) and the ridge (1e-6 of the mean diagonal, where the
     least term counts some hundredth of the mean)."""
-    shape = lk_field.Polynomials("affine", *size)
+    shape = polynomials.Polynomials("affine", *size)
     height, width = size
     matrix = 0.05 * torch.randn(2, 2, 2, generator=generator, dtype=D)
     shift = torch.randn(2, 2, generator=generator, dtype=D)

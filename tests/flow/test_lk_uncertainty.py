@@ -7,8 +7,9 @@ import numpy
 import pytest
 import torch
 
-from codesign.flow import estimate_lk, lk_field, lk_level
-from codesign.flow.lk_lanes import Grid
+from codesign.flow import estimate_lk
+from codesign.flow.lk import level, polynomials
+from codesign.flow.lk.lanes import Grid
 from codesign.types import EventVolume
 from scenes.flow_windows import RenderedWindows, planes
 from tests.certain_case import certain
@@ -23,7 +24,7 @@ def nowhere(x_px, y_px):
 
 @pytest.mark.parametrize("model", ["affine", "quadratic"])
 def test_step_to_the_start_solves_its_equation(model, generator):
-    shape = lk_field.Polynomials(model, 20, 30)
+    shape = polynomials.Polynomials(model, 20, 30)
     parameters = torch.randn(2, 2 * shape.terms, generator=generator, dtype=D) * 1.5
     flow, *_ = shape.at_start(parameters, torch.full((2,), -0.5, dtype=D), nowhere, False)
     # w(x) = v(x + w(x) / 2); the fixed point gains a factor of |grad v| / 2, some 0.3 for these wild fields,
@@ -37,7 +38,7 @@ def test_step_to_the_start_solves_its_equation(model, generator):
 def test_prior_and_its_spread_are_those_of_drawn_fields(generator):
     # fields drawn from the prior have the covariance that ``covariance`` gives; 20000 draws know a variance
     # to 1 %, tested at 5 standard errors
-    shape = lk_field.Polynomials("quadratic", 8, 12)
+    shape = polynomials.Polynomials("quadratic", 8, 12)
     spread = torch.linalg.inv(shape.prior_precision(2.0))
     drawn = torch.randn(20000, 12, generator=generator, dtype=D) @ torch.linalg.cholesky(spread).T
     _, places, *_ = shape.at_start(
@@ -69,11 +70,11 @@ def test_scattered_events_give_the_slopes_that_the_noise_model_says(generator):
     # independent samples of 8 bins: 1 to 2 % in the variance, tested at 5 standard errors
     for sigma in (1.0, 2.0):
         noise = torch.randn(1, 8, 160, 160, generator=generator, dtype=D)
-        step = lk_level.stride(sigma)
-        blurred, kernel = lk_level._blurred(noise, sigma, Grid(160, 160, step))
+        step = level.stride(sigma)
+        blurred, kernel = level._blurred(noise, sigma, Grid(160, 160, step))
         dy, dx = torch.gradient(blurred[..., 3:-3, 3:-3], dim=(2, 3))
         found = float(((dx.square() + dy.square()) / 2)[..., 1:-1, 1:-1].mean()) / step**2
-        assert found == pytest.approx(lk_level._slope_of_noise(kernel, step), rel=0.1)
+        assert found == pytest.approx(level._slope_of_noise(kernel, step), rel=0.1)
         assert float(blurred.square().mean()) == pytest.approx(
             1 / (4 * math.pi * sigma**2), rel=0.15
         )  # that of a Gaussian; its sampling costs up to 10 %

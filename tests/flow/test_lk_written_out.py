@@ -1,5 +1,5 @@
 """One step of the closed-form estimator against its formulas written out in numpy (docs/flow_closed_form.md and
-the heads of lk.py, lk_level.py): what the data say, how far they are trusted, how far a step goes."""
+the heads of lk/estimate.py, lk/level.py): what the data say, how far they are trusted, how far a step goes."""
 
 import math
 
@@ -8,8 +8,9 @@ import pytest
 import torch
 from scipy.ndimage import correlate1d
 
-from codesign.flow import estimate_lk, lk_cells
-from codesign.flow.lk_field import Polynomials
+from codesign.flow import estimate_lk
+from codesign.flow.lk import cells
+from codesign.flow.lk.polynomials import Polynomials
 from tests.certain_case import certain
 from tests.flow.test_lk import moving
 
@@ -136,7 +137,7 @@ def one_step(volume, terms, sigma_px):
 @pytest.mark.parametrize("per_pixel", [8.0, 0.01])
 def test_one_step_is_that_of_the_formulas_written_out(model, terms, sigma_px, per_pixel, monkeypatch):
     monkeypatch.setattr(
-        lk_cells, "SIZES", (1e-9,)
+        cells, "SIZES", (1e-9,)
     )  # the polynomial by itself: see test_lk_local for what it leaves
     # plenty of events and large motion, where the step is limited; a hundredth of an event per pixel, where the
     # prior and the few events of the start decide

@@ -1,4 +1,5 @@
-"""Means over squares and a symmetric kernel along both axes, mirrored at the border, in drjit; forward and adjoint.
+"""Means over squares and a symmetric kernel along both axes, mirrored at the border: in drjit, and as operations of
+torch.
 
 A lane goes down a column: it takes the horizontal sum of each row and keeps the last ones for the vertical sum, so
 nothing is stored between the two. An even continuation makes the blur A self-adjoint for a product in which the
@@ -7,32 +8,77 @@ outermost samples count half: A^T = E A E^-1, E = 1/2 at the ends of an axis, 1 
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
+from codesign.errors import ShapeError
 from codesign.exclusive import exclusive
-from codesign.flow.lk_lanes import Form, Grid, Lanes, recorded, tensors
+from codesign.flow.lk.lanes import Form, Grid, Kernel, Lanes, plain_wanted, recorded, tensors
 
-ROWS = 64  # that a lane goes down: columns of a whole image are far apart in memory
+# that a lane goes down: columns of a whole image are far apart in memory
+ROWS = 64
+
+
+def blurred(images: Tensor, grid: Grid, taps: Sequence[float]) -> Tensor:
+    """Images averaged over the squares of a grid, then blurred along both axes.
+
+    Args:
+      images: [B, n, H, W], the image that ``grid`` samples.
+      taps: of a symmetric kernel, in samples: the middle one, then those to one side.
+    Returns: [B, n, h, w]. Beyond the outermost samples the image is continued by its mirror image, again and again
+      where the kernel is longer.
+    Gradient: images; exact, the first one.
+    Raises: ShapeError where images and grid do not fit; GradientError for a second derivative.
+    """
+    if images.ndim != 4 or images.shape[2:] != (grid.height, grid.width) or 0 in grid.shape:
+        raise ShapeError(
+            f"images are {list(images.shape)}, the grid has {grid.height} x {grid.width} pixels and {grid.shape[0]} "
+            f"x {grid.shape[1]} samples; give [B, n, {grid.height}, {grid.width}] and at least one sample."
+        )
+    if plain_wanted():
+        return _plain(images, grid, taps)
+    return Kernel.apply(_forward, _adjoint, (grid, tuple(taps)), images)[0]
+
+
+def _plain(images, grid, taps):
+    pooled = avg_pool2d(images, grid.stride) if grid.stride > 1 else images
+    return _along_rows(_along_rows(pooled, taps).mT, taps).mT
+
+
+def _along_rows(images, taps):
+    """A symmetric kernel along the last axis, mirrored about the outermost samples as often as need be."""
+    size = images.shape[-1]
+    place = torch.arange(size)
+    found = taps[0] * images
+    for shift, tap in enumerate(taps[1:], 1):
+        for side in (-shift, shift):
+            found = found + tap * images[..., _mirrored(place + side, size)]
+    return found
+
+
+def _mirrored(place, size):
+    if size == 1:
+        return torch.zeros_like(place)
+    place = place % (2 * size - 2)
+    return torch.minimum(place, 2 * size - 2 - place)
 
 
 @exclusive
-def forward(images: Tensor, grid: Grid, taps: Sequence[float]) -> Tensor:
-    """[N, h, w] of images [N, H, W]; ``taps``: the middle one, then those to one side."""
-    form = Form.of(images, grid)
+def _forward(grid, taps, images):
+    form = Form.of(images.flatten(0, 1), grid)
     (source,) = form.load(images)
     if grid.stride > 1:
         source = _pooled(form, source)
-    return tensors((len(images), *grid.shape), _blurred(form, False, source, form.scalars(list(taps))))[0]
+    found = _blurred(form, False, source, form.scalars(list(taps)))
+    return tensors((*images.shape[:2], *grid.shape), found), ()
 
 
 @exclusive
-def adjoint(grad: Tensor, grid: Grid, taps: Sequence[float]) -> Tensor:
-    """[N, H, W], of a gradient [N, h, w]."""
-    form = Form.of(grad, grid)
-    found = _blurred(form, True, *form.load(grad), form.scalars(list(taps)))
-    if grid.stride > 1:
-        found = _spread(form, found)
-    return tensors((len(grad), grid.height, grid.width), found)[0]
+def _adjoint(grid, taps, images, grads, wanted):
+    form = Form.of(images.flatten(0, 1), grid)
+    found = _blurred(form, True, *form.load(grads[0]), form.scalars(list(taps)))
+    return tensors(images.shape, _spread(form, found) if grid.stride > 1 else found)
 
 
 @recorded

@@ -1,22 +1,30 @@
-"""The kernels of the closed form against the same written down in torch (lk_reference) and scipy, against
-differences, and against a plane that moves."""
+"""The kernels of the closed form against the same as operations of torch and in scipy, against differences, and against a
+plane that moves; programs that hold the plain operations."""
 
 import gc
 import sys
+from contextlib import nullcontext
 
 import drjit as dr
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import correlate1d
+from torch import nn
 
 from codesign import flow
 from codesign.errors import DomainError, GradientError, ShapeError
 from codesign.exclusive import exclusive
-from codesign.flow import lk_kernel, lk_warp_kernel
-from codesign.flow.lk_lanes import Grid, recorded
+from codesign.flow.export import evenly_timed, trace
+from codesign.flow.lk import warp
+from codesign.flow.lk.blur import blurred
+from codesign.flow.lk.cells import Cells
+from codesign.flow.lk.lanes import Grid, plain_operations, recorded
+from codesign.flow.lk.polynomials import Polynomials
+from codesign.flow.lk.slopes import cell_sums
+from codesign.flow.lk.start import at_start
+from codesign.flow.lk.warp import moving
 from codesign.types import EventVolume
-from tests.flow import lk_reference
 
 D = torch.float64
 FADE_PX = 2.3
@@ -27,7 +35,10 @@ CASES = [
     (32, 8, 20, 20, 1, 8),
     (3, 5, 17, 19, 4, 1),
     (1, 3, 1, 6, 1, 2),
+    (2, 5, 9, 21, 4, 1),
+    (2, 5, 3, 1, 1, 2),
 ]
+TAPS = (0.4, 0.2, 0.1)
 
 
 def times(bins):
@@ -50,28 +61,33 @@ def leaves(*tensors):
     return [x.detach().clone().requires_grad_() for x in tensors]
 
 
-def both(form, grid, cell, rate, flow, density, weights):
-    """Everything that one form gives: values, then gradients of their weighted sums."""
+def everything(form, grid, cell, rate, flow, density, weights):
+    """What kernels or plain operations give: values, then gradients of their weighted sums."""
     time, contrast = (x.to(rate) for x in times(rate.shape[1]))
-    rate, flow, density = leaves(rate, flow, density)
-    read = form.moving(rate, flow, time, contrast, grid, FADE_PX)
-    by_reading = torch.autograd.grad(
-        sum((w * x).sum() for w, x in zip(weights, read, strict=True)), (rate, flow), retain_graph=True
-    )
-    sums = form.cell_sums(*read, density, grid, cell)
-    pulls = torch.linspace(-1, 1, sums.numel(), dtype=D).to(sums).reshape(sums.shape)
-    return *read, sums, *by_reading, *torch.autograd.grad((pulls * sums).sum(), (rate, flow, density))
+    images = rate.repeat_interleave(grid.stride, 2).repeat_interleave(grid.stride, 3)
+    images = nn.functional.pad(images, (0, grid.width % grid.stride, 0, grid.height % grid.stride))
+    images, flow, density = leaves(images, flow, density)
+    with form():
+        rate = blurred(images, grid, TAPS)
+        read = moving(rate, flow, time, contrast, grid, FADE_PX)
+        by_reading = torch.autograd.grad(
+            sum((w * x).sum() for w, x in zip(weights, read, strict=True)), (images, flow), retain_graph=True
+        )
+        sums = cell_sums(*read, density, grid, cell)
+        pulls = torch.linspace(-1, 1, sums.numel(), dtype=D).to(sums).reshape(sums.shape)
+        by_sums = torch.autograd.grad((pulls * sums).sum(), (images, flow, density))
+    return rate, *read, sums, *by_reading, *by_sums
 
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("dtype", [D, torch.float32])
-def test_kernels_are_the_torch_form_and_its_gradients(case, dtype, generator):
+def test_kernels_are_the_plain_operations_and_their_gradients(case, dtype, generator):
     grid, cell, rate, flow = drawn(case, generator)
     density = torch.rand(rate[:, 0].shape, generator=generator, dtype=D)
     weights = torch.randn(3, *density.shape, generator=generator, dtype=D)
     given = [x.to(dtype) for x in (rate, flow, density, weights)]
-    found = both(lk_kernel, grid, cell, *given)
-    truth = both(lk_reference, grid, cell, *(x.to(D) for x in given))
+    found = everything(nullcontext, grid, cell, *given)
+    truth = everything(plain_operations, grid, cell, *(x.to(D) for x in given))
     # a place 20 px away is rounded by 10 eps, neighbours differ by up to 6 and slopes enter twice; a sum over
     # cells takes 64 of them
     for one, other in zip(found, truth, strict=True):
@@ -85,10 +101,10 @@ def test_gradients_are_those_of_differences(case, generator):
     grid, cell, rate, flow = drawn(case, generator, reach_px=2.0)
     time, contrast = times(rate.shape[1])
     assert torch.autograd.gradcheck(
-        lambda rate, flow: lk_kernel.moving(rate, flow, time, contrast, grid, FADE_PX), leaves(rate, flow)
+        lambda rate, flow: moving(rate, flow, time, contrast, grid, FADE_PX), leaves(rate, flow)
     )
     maps = torch.randn(4, *rate[:, 0].shape, generator=generator, dtype=D)
-    assert torch.autograd.gradcheck(lambda *maps: lk_kernel.cell_sums(*maps, grid, cell), leaves(*maps))
+    assert torch.autograd.gradcheck(lambda *maps: cell_sums(*maps, grid, cell), leaves(*maps))
 
 
 def test_a_plane_carried_back_along_its_flow_stands_still():
@@ -98,11 +114,11 @@ def test_a_plane_carried_back_along_its_flow_stands_still():
     shift = time[:, None, None] * torch.tensor([3.0, -2.0], dtype=D)
     bins = 0.7 * (x - shift[..., :1]) + 0.3 * (y[:, None] - shift[..., 1:])
     flow = torch.tensor([3.0, -2.0], dtype=D)[:, None, None].expand(2, *grid.shape)
-    mean, slope, seen = lk_kernel.moving(bins[None], flow[None], time, contrast, grid, FADE_PX)
+    mean, slope, seen = moving(bins[None], flow[None], time, contrast, grid, FADE_PX)
     inner = (0, slice(1, -1), slice(1, -1))  # the outermost samples read beyond the border
     torch.testing.assert_close(mean[inner], (0.7 * x + 0.3 * y[:, None])[1:-1, 1:-1])
     assert float(slope[inner].abs().max()) < 1e-13
-    sums = lk_kernel.cell_sums(mean, slope, seen, 2 * seen, grid)[0, :, 2:-2, 2:-2]
+    sums = cell_sums(mean, slope, seen, 2 * seen, grid)[0, :, 2:-2, 2:-2]
     window = seen[0, 2:-2, 2:-2]
     squares = torch.tensor([0.49, 0.21, 0.09, 0, 0, 0, 1], dtype=D)[:, None, None] * window
     torch.testing.assert_close(sums, torch.cat([squares, 2 * window[None].square()]))
@@ -126,7 +142,7 @@ def test_the_blur_is_that_of_scipy_and_so_is_its_adjoint(shape, stride, dtype, g
             found = correlate1d(found, np.array([*taps[:0:-1], *taps]), axis, mode="mirror")
         return torch.from_numpy(found)
 
-    found = lk_kernel.blurred(images, grid, taps)
+    found = blurred(images, grid, taps)
     rounding = 20 * torch.finfo(dtype).eps  # seven products both ways, means of 16
     torch.testing.assert_close(found.double(), truth(images), rtol=0, atol=4 * rounding)
     seed = torch.randn(found.shape, generator=generator, dtype=dtype)
@@ -142,7 +158,7 @@ def test_bins_read_far_outside_are_the_border_and_pull_at_no_flow(generator):
     time = torch.tensor([0.5, 1.0], dtype=D)
     contrast = torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=D)
     (flow,) = leaves(torch.full((1, 2, 6, 7), 100.0, dtype=D))
-    mean, slope, seen = lk_kernel.moving(rate, flow, time, contrast, grid, FADE_PX)
+    mean, slope, seen = moving(rate, flow, time, contrast, grid, FADE_PX)
     assert torch.equal(mean, rate[:, 0, -1:, -1:].expand_as(mean))
     assert torch.equal(slope, rate[:, 1, -1:, -1:].expand_as(slope))
     assert not seen.any()
@@ -156,11 +172,11 @@ def test_groups_of_bins_give_the_gradient_of_all_at_once(generator, monkeypatch)
     rate, flow = leaves(rate, flow)
 
     def gradients():
-        read = lk_kernel.moving(rate, flow, time, contrast, grid, FADE_PX)
+        read = moving(rate, flow, time, contrast, grid, FADE_PX)
         return torch.autograd.grad(sum(x.square().sum() for x in read), (rate, flow))
 
     whole = gradients()
-    monkeypatch.setattr(lk_warp_kernel, "MOST_VALUES", 2 * (4 * 2 * 10 * 9))  # two bins, two bins, one
+    monkeypatch.setattr(warp, "MOST_VALUES", 2 * (4 * 2 * 10 * 9))  # two bins, two bins, one
     torch.testing.assert_close(gradients(), whole, rtol=1e-13, atol=1e-13)
 
 
@@ -169,9 +185,7 @@ def test_other_sizes_need_no_new_kernel_but_for_copies_to_scatter_into(generator
         grid, cell, rate, flow = drawn(case, generator)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
-            both(lk_kernel, grid, cell, rate, flow, rate[:, 0], rate[:, :3].unbind(1))
-            (images,) = leaves(torch.rand(*case[:2], grid.height, grid.width, dtype=D))
-            torch.autograd.grad(lk_kernel.blurred(images, grid, (0.5, 0.25)).sum(), images)
+            everything(nullcontext, grid, cell, rate, flow, rate[:, 0], rate[:, :3].unbind(1))
             history = dr.kernel_history()
         return {entry["hash"] for entry in history if entry["type"] == dr.KernelType.JIT}
 
@@ -240,26 +254,31 @@ def test_a_second_derivative_is_refused(generator):
     grid, _, rate, flow = drawn((1, 2, 4, 5, 1, 1), generator)
     time, contrast = times(2)
     rate, flow = leaves(rate, flow)
-    read = lk_kernel.moving(rate, flow, time, contrast, grid, FADE_PX)
-    for output, given in ((read[0].sum(), rate), (lk_kernel.cell_sums(*read, read[0], grid).sum(), flow)):
+    read = moving(rate, flow, time, contrast, grid, FADE_PX)
+    for output, given in ((read[0].sum(), rate), (cell_sums(*read, read[0], grid).sum(), flow)):
         (first,) = torch.autograd.grad(output, given, create_graph=True)
         with pytest.raises(GradientError, match="second derivative through event flow"):
             torch.autograd.grad(first.sum(), flow)
 
 
-def test_what_does_not_fit_is_named(generator):
-    grid, _, rate, flow = drawn((1, 3, 4, 5, 1, 1), generator)
-    time, contrast = times(3)
-    with pytest.raises(ShapeError, match="their flow is"):
-        lk_kernel.moving(rate, flow[..., 1:], time, contrast, grid, FADE_PX)
-    with pytest.raises(ShapeError, match="3 bins have times"):
-        lk_kernel.moving(rate, flow, time[1:], contrast, grid, FADE_PX)
-    with pytest.raises(ShapeError, match="mean, slope, seen and density"):
-        lk_kernel.cell_sums(rate[:, 0], rate[:, 0], rate[:, 0], rate, grid)
-    with pytest.raises(ShapeError, match="the grid has 4 x 5 pixels and 2 x 2 samples"):
-        lk_kernel.blurred(rate[..., 1:], Grid(4, 5, 2), (0.5, 0.25))
-    with pytest.raises(DomainError, match="cell is 0"):
-        lk_kernel.cell_sums(*[rate[:, 0]] * 4, grid, 0)
+RATE = torch.zeros(1, 3, 4, 5, dtype=D)
+FLOW = torch.zeros(1, 2, 4, 5, dtype=D)
+MAP = RATE[:, 0]
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "sentence"),
+    [
+        (lambda: moving(RATE, FLOW[..., 1:], *times(3), Grid(4, 5), FADE_PX), ShapeError, "their flow is"),
+        (lambda: moving(RATE, FLOW, *times(2), Grid(4, 5), FADE_PX), ShapeError, "3 bins have times"),
+        (lambda: cell_sums(MAP, MAP, MAP, RATE, Grid(4, 5)), ShapeError, "mean, slope, seen and density"),
+        (lambda: cell_sums(MAP, MAP, MAP, MAP, Grid(4, 5), 0), DomainError, "cell is 0"),
+        (lambda: blurred(RATE, Grid(4, 6, 2), TAPS), ShapeError, "4 x 6 pixels and 2 x 3 samples"),
+    ],
+)
+def test_what_does_not_fit_is_named(call, error, sentence):
+    with pytest.raises(error, match=sentence):
+        call()
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
@@ -267,6 +286,84 @@ def test_a_gpu_gives_what_the_processor_gives(generator):
     grid, cell, rate, flow = drawn((2, 4, 33, 40, 1, 8), generator)
     given = rate, flow, rate[:, 0].square(), rate[:, :3].unbind(1)
     on_gpu = [x.cuda() if torch.is_tensor(x) else [y.cuda() for y in x] for x in given]
-    found = both(lk_kernel, grid, cell, *on_gpu)
-    for one, other in zip(found, both(lk_kernel, grid, cell, *given), strict=True):
+    found = everything(nullcontext, grid, cell, *on_gpu)
+    for one, other in zip(found, everything(nullcontext, grid, cell, *given), strict=True):
         torch.testing.assert_close(one.cpu(), other, rtol=1e-11, atol=1e-11)
+
+
+def places(model, joined, height, width, generator):
+    """Inputs of ``at_start``, and it as a function of them; flows lead beyond the border, cells differ by pixels."""
+    shape = Polynomials(model, height, width, 3.0)
+    cells = Cells(2, height, width, 3.0, torch.device("cpu"))
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator, dtype=D)
+
+    half = 0.3 * draw(2, 2 * shape.terms, 2 * shape.terms)
+    given = [
+        1.5 * draw(2, 2 * shape.terms),
+        half @ half.mT,
+        draw(*cells.value.shape),
+        draw(*cells.covariance.shape),
+        torch.tensor([-0.5, -0.4], dtype=D),
+    ]
+
+    def run(parameters, spread, value, covariance, start):
+        cells.value = value
+        cells.covariance = covariance
+        return at_start(shape, parameters, spread, cells, joined, start)
+
+    return run, [values.requires_grad_() for values in given]
+
+
+@pytest.mark.parametrize("joined", [False, True])
+@pytest.mark.parametrize(
+    ("model", "height", "width"), [("constant", 7, 12), ("affine", 20, 9), ("quadratic", 70, 17)]
+)
+def test_the_step_to_the_start_is_that_of_plain_operations(model, height, width, joined, generator):
+    run, given = places(model, joined, height, width, generator)
+    found = run(*given)
+    with plain_operations():
+        plain = run(*given)
+    torch.testing.assert_close(found, plain, rtol=1e-10, atol=1e-10)
+    weights = [torch.randn(values.shape, generator=generator, dtype=D) for values in found]
+    for wanted in (1, 3):  # the flow alone has an adjoint of its own
+        grads = []
+        for outcome in (found, plain):
+            parts = list(zip(outcome, weights, strict=True))[:wanted]
+            total = sum((values * weight).sum() for values, weight in parts)
+            grads.append(
+                torch.autograd.grad(
+                    total, given, retain_graph=True, allow_unused=True, materialize_grads=True
+                )
+            )
+        torch.testing.assert_close(grads[0], grads[1], rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("joined", [False, True])
+def test_the_gradient_of_the_step_to_the_start_is_that_of_differences(joined, generator):
+    run, given = places("affine", joined, 3, 10, generator)
+    assert torch.autograd.gradcheck(run, given)
+
+
+class Closed(nn.Module):
+    """The closed form as a network, at one blur."""
+
+    def __init__(self):
+        super().__init__()
+        self.config = {"bins": 2}
+
+    def forward(self, volume):
+        return flow.estimate_lk(volume, levels_px=(2.0,), steps=1)
+
+
+def test_a_program_follows_the_counts_it_is_given(generator):
+    """A kernel that the recording does not see would be a constant: the flow of the empty volume that was recorded.
+    The same sums in another order: 1e-4 px of flows of a pixel in single precision."""
+    program = trace(Closed(), 16, 20).module()
+    counts = torch.poisson(torch.full((1, 2, 2, 16, 20), 2.0), generator=generator)
+    expected = Closed()(evenly_timed(counts))
+    flow, confidence = program(counts)
+    assert float(expected.flow_px.abs().max()) > 0.01
+    torch.testing.assert_close(flow, expected.flow_px, rtol=0, atol=1e-4)
+    torch.testing.assert_close(confidence, expected.confidence, rtol=0, atol=1e-4)

@@ -18,12 +18,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from codesign.flow.lk_cool import cooled
-from codesign.flow.lk_field import Polynomials
-from codesign.flow.lk_kernel import blurred, cell_sums, moving
-from codesign.flow.lk_lanes import Grid
-from codesign.flow.lk_moments import Moments
-from codesign.flow.lk_path import Path, even, path
+from codesign.flow.lk.blur import blurred
+from codesign.flow.lk.hot_pixels import weighed_down
+from codesign.flow.lk.lanes import Grid
+from codesign.flow.lk.path import Path, even, path
+from codesign.flow.lk.polynomials import Moments, Polynomials
+from codesign.flow.lk.slopes import cell_sums
+from codesign.flow.lk.warp import moving
 from codesign.types import EventVolume
 
 # the factor 3 and the power 4 = 2^2 above
@@ -55,7 +56,7 @@ def along_path(volume: EventVolume, clock: str) -> tuple[Path, Tensor, Tensor]:
     span = volume.collected_s.sum()
     weight = (volume.collected_s / span).to(counts)
     time = (volume.centroid_s / span).to(counts) - 0.5
-    signed, density, kept = cooled(counts)
+    signed, density, kept = weighed_down(counts)
     if clock == "time":
         found = even(signed, weight, time)
     else:

@@ -1,8 +1,9 @@
-"""Flow, covariance and confidence of every pixel in drjit: the step to the pixels of the start; forward and adjoint.
+"""From the field at the mean place of the events to flow, covariance and confidence on the pixels of the start: in
+drjit, and as operations of torch.
 
 A lane goes down a part of a column with the coefficients of its image at hand; in the adjoint it sums up their
 gradients. The adjoint of a pixel, all rounds of its fixed point included, is left to drjit but for the cells, whose four
-values around a place are added to at once (as in lk_warp_kernel).
+values around a place are added to at once (as in ``warp``).
 """
 
 from dataclasses import dataclass
@@ -12,11 +13,16 @@ import torch
 from torch import Tensor
 
 from codesign.exclusive import exclusive
-from codesign.flow.lk_lanes import Form, Grid, Lanes, recorded, tensors
+from codesign.flow.lk.cells import CELL, Cells
+from codesign.flow.lk.lanes import Form, Grid, Kernel, Lanes, plain_wanted, recorded, tensors
+from codesign.flow.lk.polynomials import FIXED_POINT_STEPS, Polynomials
 
-OUT = 6  # flow x, y, covariance xx, xy, yy, confidence
-OF_CELL = 5  # flow x, y, covariance xx, xy, yy
-ROWS = 64  # that a lane goes down
+# flow x, y, covariance xx, xy, yy, confidence
+OUT = 6
+# flow x, y, covariance xx, xy, yy
+OF_CELL = 5
+# that a lane goes down
+ROWS = 64
 
 
 @dataclass(frozen=True)
@@ -43,38 +49,83 @@ class Setting:
         return self.of_flow + 4 * len(self.of_variance)
 
 
-@exclusive
-def forward(coefficients: Tensor, cells: Tensor, grid: Grid, setting: Setting) -> Tensor:
-    """[B, 6, H, W] of [B, numbers] and cells [B, 5, rows, columns]."""
-    form = Form.of(coefficients, grid)
-    found = _forward(form, setting, *form.load(coefficients, cells))
-    return tensors((len(cells), OUT, *grid.shape), found)[0]
+def at_start(
+    shape: Polynomials, parameters: Tensor, spread: Tensor, cells: Cells, joined: bool, start: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Flow, its covariance, and confidence.
+
+    Args:
+      parameters: [B, 2K] px per way, and spread: [B, 2K, 2K] their covariance.
+      cells: what is known of the field beside the polynomial.
+      joined: whether they are part of the flow; else their mean is error.
+      start: [B] place of the start on the way.
+    Returns: flow [B, 2, H, W] px per way, by ``Polynomials.at_start``; covariance [B, 3, H, W] of polynomial and cells;
+      confidence [B, H, W] in [0, 1], 1 - trace(covariance) / trace(prior covariance).
+    Gradient: parameters, spread, cells, start; exact, the first one.
+    """
+    prior = (shape.unit @ shape.unit.T).to(parameters)[None]
+    spread = spread.to(parameters)
+    if plain_wanted():
+        return _plain(shape, parameters, spread, prior, cells, joined, start)
+    xx, xy, yy = shape.squares(spread)
+    widest = shape.squares(prior)
+    widest = widest[0] + widest[2]
+    widest[:, 0] += 2 * cells.widest
+    of_flow = torch.cat([-start.to(parameters)[:, None], parameters], 1)
+    of_rest = torch.cat([xx, xy, yy, widest.expand_as(xx)], 1)
+    powers = tuple(tuple(pair) for pair in shape.powers.tolist())
+    setting = Setting(powers, shape.of_squares, *cells.value.shape[2:], CELL, FIXED_POINT_STEPS, joined)
+    of_cells = cells.value.to(parameters), cells.covariance.to(parameters)
+    grid = Grid(shape.height, shape.width)
+    flow, rest = Kernel.apply(_forward, _adjoint, (grid, setting), of_flow, of_rest, *of_cells)
+    return flow, rest[:, :3], rest[:, 3]
+
+
+def _plain(shape, parameters, spread, prior, cells, joined, start):
+    flow, places, misfit, doubt = shape.at_start(parameters, start, cells.at, joined)
+    covariance = doubt + shape.covariance(spread, places)
+    if not joined:
+        x, y = misfit.unbind(1)
+        covariance = covariance + torch.stack([x * x, x * y, y * y], 1)
+    widest = shape.covariance(prior, places)
+    widest = widest[:, 0] + widest[:, 2] + 2 * cells.widest
+    confidence = 1 - (covariance[:, 0] + covariance[:, 2]) / widest
+    return flow, covariance, confidence.clamp(0, 1)
 
 
 @exclusive
-def adjoint(
-    coefficients: Tensor, cells: Tensor, grid: Grid, setting: Setting, by_flow: Tensor, by_rest: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """Gradients of coefficients and cells. by_rest: of covariance and confidence [B, 4, H, W]; None, where only the flow
-    has one: then those of the coefficients end with the flow's."""
-    form = Form.of(coefficients, grid)
-    grads = form.load(by_flow) if by_rest is None else form.load(by_flow, by_rest)
-    sums, slots = _adjoint(form, setting, *form.load(coefficients, cells), *grads)
+def _forward(grid, setting, of_flow, of_rest, value, covariance):
+    form = Form.of(of_flow, grid)
+    given = torch.cat([of_flow, of_rest], 1), torch.cat([value, covariance], 1)
+    (found,) = tensors((form.images, OUT, *grid.shape), _outcomes(form, setting, *form.load(*given)))
+    return [found[:, :2].clone(), found[:, 2:].clone()], given
+
+
+@exclusive
+def _adjoint(grid, setting, of_flow, of_rest, value, covariance, coefficients, cells, grads, wanted):
+    """Most who follow a gradient follow that of the flow alone: what it does not depend on has none."""
+    by_flow, by_rest = grads
+    by_flow = torch.zeros_like(by_rest[:, :2]) if by_flow is None else by_flow
+    form = Form.of(of_flow, grid)
+    live = form.load(by_flow) if by_rest is None else form.load(by_flow, by_rest)
+    sums, slots = _gradients(form, setting, *form.load(coefficients, cells), *live)
     numbers = setting.of_flow if by_rest is None else setting.numbers
-    blocks = -(-grid.height // ROWS)
-    (sums,) = tensors((numbers, len(cells), blocks * grid.width), sums)
+    (sums,) = tensors((numbers, form.images, -(-grid.height // ROWS) * grid.width), sums)
     rows, columns = max(setting.rows - 1, 1), max(setting.columns - 1, 1)
-    (slots,) = tensors((len(cells), OF_CELL, rows, columns, 4), slots)
+    (slots,) = tensors((form.images, OF_CELL, rows, columns, 4), slots)
     of_cells = torch.zeros_like(cells)
     for corner, slot in enumerate(slots.unbind(4)):
         y = min(corner // 2, setting.rows - 1)
         x = min(corner % 2, setting.columns - 1)
         of_cells[:, :, y : y + rows, x : x + columns] += slot
-    return sums.sum(2).T, of_cells
+    by_coefficients = sums.sum(2).T
+    if by_rest is None:
+        return by_coefficients, None, of_cells[:, :2] if setting.joined else None, None
+    return *by_coefficients.tensor_split([setting.of_flow], 1), *of_cells.tensor_split([2], 1)
 
 
 @recorded
-def _forward(form, setting, coefficients, cells):
+def _outcomes(form, setting, coefficients, cells):
     pixels = _Pixels(form, setting, cells)
     dr = pixels.dr
     given = pixels.coefficients(coefficients)
@@ -91,7 +142,7 @@ def _forward(form, setting, coefficients, cells):
 
 
 @recorded
-def _adjoint(form, setting, coefficients, cells, by_flow, by_rest=None):
+def _gradients(form, setting, coefficients, cells, by_flow, by_rest=None):
     pixels = _Pixels(form, setting, cells)
     dr = pixels.dr
     numbers = setting.of_flow if by_rest is None else setting.numbers

@@ -1,8 +1,8 @@
 """The local part of a flow field: values on cells of 8 px that a polynomial leaves, as smooth as the data ask.
 
-What the data say of a cell is weighed as the whole image is in lk_level: by what scattered events alone would add to
+What the data say of a cell is weighed as the whole image is in level: by what scattered events alone would add to
 the slopes, and by the noise that a fit leaves, both over the 3 x 3 cells around. The field is a tree of steps
-(lk_tree) whose variance grows sixfold from a scale to the next coarser one. How large it is, is not known: several
+(quadtree) whose variance grows sixfold from a scale to the next coarser one. How large it is, is not known: several
 sizes are tried, and their fields averaged with the weights that the evidence gives them (empirical Bayes). So the
 local part vanishes where one polynomial explains the image.
 """
@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate, pad
 
-from codesign.flow import lk_tree
-from codesign.flow.lk_level import CALIBRATION, DOUBT, OVERLAP, RIDGE, TINY, Level
+from codesign.flow.lk import quadtree
+from codesign.flow.lk.level import CALIBRATION, DOUBT, OVERLAP, RIDGE, TINY, Level
 
 CELL = 8  # px
 SIZES = (0.005, 0.025, 0.1, 0.33)  # standard deviations of the cells' own steps, over the prior's
@@ -67,7 +67,7 @@ class Cells:
         pull = pull + _apply(precision, self.value)
         growth = GROWTH ** torch.arange(self.scales).to(pull)
         variances = (pull.new_tensor(SIZES) * self.prior_px) ** 2
-        means, covariances, evidence = lk_tree.posterior(precision, pull, growth[:, None] * variances)
+        means, covariances, evidence = quadtree.posterior(precision, pull, growth[:, None] * variances)
         weights = (evidence + self.prior.log()[:, None]).softmax(0)
         whole = weights[:, :, None, None, None]
         mean = (whole * means).sum(0)

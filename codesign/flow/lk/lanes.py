@@ -1,12 +1,16 @@
-"""What the kernels of the closed form share: the samples of an image, numbers for lanes of them, and recordings."""
+"""What the kernels of the closed form share: the samples of an image, numbers for lanes of them, recordings, how a
+kernel enters a graph of torch, and the switch to plain operations of torch."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache, wraps
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd import Function
 
 from codesign import backend
 
@@ -14,7 +18,25 @@ _FIRST_ONLY = (
     "the kernels of the closed form give first derivatives only; a second derivative through event flow was asked "
     "for. Use differences of gradients instead."
 )
-RECORDINGS = 64  # of a kernel: one for each size and setting in use
+# of a kernel: one for each size and setting in use
+RECORDINGS = 64
+_PLAIN = ContextVar("plain operations", default=False)
+
+
+@contextmanager
+def plain_operations() -> Iterator[None]:
+    """Within it, operations of torch take the kernels' place: slower, for programs that run without this package
+    (export), and to compare with."""
+    token = _PLAIN.set(True)
+    try:
+        yield
+    finally:
+        _PLAIN.reset(token)
+
+
+def plain_wanted() -> bool:
+    """Whether a ``plain_operations`` is open."""
+    return _PLAIN.get()
 
 
 @dataclass(frozen=True)
@@ -94,6 +116,33 @@ def tensors(shape: tuple[int, ...], *values: Any) -> list[Tensor]:
 
     dr.sync_thread()
     return [value.torch().reshape(shape) for value in values]
+
+
+class Kernel(Function):
+    """A kernel and its adjoint in a graph of torch.
+
+    ``Kernel.apply(forward, adjoint, settings, *given)``: forward(*settings, *given) gives the outputs and what else the
+    adjoint needs; adjoint(*settings, *given, *that, grads, wanted) a gradient, or None, of each of the given. ``grads``
+    are None where an output has no gradient, ``wanted`` says which of the given want one.
+    """
+
+    @staticmethod
+    def forward(ctx, forward, adjoint, settings, *given):
+        ctx.set_materialize_grads(False)
+        found, kept = forward(*settings, *given)
+        ctx.save_for_backward(*given, *kept)
+        ctx.rest = adjoint, settings, len(given)
+        return tuple(found)
+
+    @staticmethod
+    def backward(ctx, *grads):  # pyright: ignore[reportIncompatibleMethodOverride]
+        adjoint, settings, count = ctx.rest
+        live = [grad for grad in grads if grad is not None]
+        if not live:
+            return (None,) * (3 + count)
+        saved = ctx.saved_tensors
+        found = adjoint(*settings, *saved, grads, ctx.needs_input_grad[3:])
+        return None, None, None, *first_only(found, *saved[:count], *live)
 
 
 def first_only(found: Sequence[Tensor | None], *sources: Tensor) -> Sequence[Tensor | None]:

@@ -1,5 +1,5 @@
 """Polynomial flow fields: their basis, the prior on their parameters, the step from mid-interval to the
-start, the spread of the flow.
+start, the spread of the flow; values and sums on the samples of a grid.
 
 A field is u = sum p_k b_k(x, y), v = sum q_k b_k(x, y) with b = 1, x, y, x^2, xy, y^2 on coordinates that
 reach from -1 to 1 along the longer side. Parameters are [B, 2K]: p_1..p_K, q_1..q_K.
@@ -11,6 +11,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
+
+from codesign.flow.lk.lanes import Grid
 
 TERMS = {"constant": 1, "affine": 3, "quadratic": 6}
 POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # of x and y in the basis
@@ -75,7 +77,7 @@ class Polynomials:
     def equations(self) -> Tensor:
         """Sums over an image to normal equations, which are linear in them: [8 s^2, 8 K^2 + 2 K + 2], float64.
 
-        Rows: the sums of ``lk_kernel.cell_sums`` times y^i x^j, i, j < s = 2 degree + 1. Columns: in units of the
+        Rows: the sums of ``slopes.cell_sums`` times y^i x^j, i, j < s = 2 degree + 1. Columns: in units of the
         prior the matrix of the slopes and that of events as slopes along x and y, [2K, 2K] each, and the pull [2K];
         then energy of the temporal slopes, and events.
         """
@@ -181,3 +183,33 @@ class Polynomials:
         at = places.flatten(2)
         blocks = torch.stack([covariance[:, :k, :k], covariance[:, :k, k:], covariance[:, k:, k:]], 1)
         return ((blocks @ at[:, None]) * at[:, None]).sum(2).unflatten(2, places.shape[2:])
+
+
+class Moments:
+    """Powers of x and y at the samples of ``grid``, up to twice the degree of ``shape``: values of fields, and sums of
+    images times powers. Powers are separable, so each costs two small matrix products."""
+
+    def __init__(self, shape: Polynomials, grid: Grid, like: Tensor) -> None:
+        """Args: like: tells precision and device."""
+        self.side = shape.degree + 1
+        rows, columns = (
+            torch.arange(count).to(like) * grid.stride + (grid.stride - 1) / 2 for count in grid.shape
+        )
+        u, v = shape.scaled(columns, rows)
+        exponents = torch.arange(2 * shape.degree + 1, device=like.device)
+        self.x = u[:, None] ** exponents
+        self.y = v[:, None] ** exponents
+        self.of_x = self.x[:, : self.side].T.contiguous()
+        self.of_y = self.y[:, : self.side].contiguous()
+        # where each parameter stands in a table of powers of y and x
+        x, y = shape.powers.T
+        self.place = torch.eye(self.side**2).to(like)[self.side * y + x]
+
+    def flow(self, parameters: Tensor) -> Tensor:
+        """[B, 2, h, w] of parameters [B, 2K]."""
+        table = parameters.unflatten(1, (2, -1)) @ self.place
+        return self.of_y @ table.unflatten(2, (self.side, self.side)) @ self.of_x
+
+    def sums(self, images: Tensor) -> Tensor:
+        """[B, m s^2] of images [B, m, h, w]: sums times y^i x^j, i, j < s = 2 degree + 1."""
+        return ((self.y.T @ images) @ self.x).flatten(1)

@@ -1,21 +1,50 @@
-"""The trees of lk_tree in drjit; forward and adjoint.
+"""Fields on cells, smooth over many scales: the exact posterior on a quadtree (Luettgen, Karl and Willsky, 1994).
 
-A pass is one kernel for each scale, a lane for each cell. At the cells themselves the trees of one size of steps have
-the same data, so what goes up from there is found once for all of them. The adjoint of a cell is left to drjit; how
-cells hang together is written down here.
+A cell's value is its parent's plus a Gaussian step; the parents of the coarsest scale begin at zero. What the data
+say of the cells goes up the tree, each scale adding its doubt; means and covariances come down. All is linear in the
+number of cells. Trees see neighbours on two sides of a coarse border as strangers, so several, shifted against each
+other, are averaged.
+
+In drjit a pass is one kernel for each scale, a lane for each cell. At the cells themselves the trees of one size of
+steps have the same data, so what goes up from there is found once for all of them. The adjoint of a cell is left to
+drjit; how cells hang together is written down here.
 """
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from codesign.exclusive import exclusive
-from codesign.flow.lk_lanes import Form, Grid, Lanes, recorded, tensors
+from codesign.flow.lk.lanes import Form, Grid, Kernel, Lanes, plain_wanted, recorded, tensors
 
-DATA = 5  # of a cell: precision xx, xy, yy and pull x, y; or mean x, y and covariance xx, xy, yy
-UP = DATA + 1  # and the logarithm of the evidence
+# of a cell: precision xx, xy, yy and pull x, y; or mean x, y and covariance xx, xy, yy
+DATA = 5
+# and the logarithm of the evidence
+UP = DATA + 1
+# cells down and right: at each of the finer scales every alignment once
+SHIFTS = ((0, 0), (5, 2), (2, 7), (7, 5))
+
+
+def posterior(precision: Tensor, pull: Tensor, steps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, covariance and evidence of fields on cells, for steps of several sizes.
+
+    Args: precision: [B, 3, h, w] (xx, xy, yy) of what the data say of each cell by themselves, >= 0, float64. pull:
+      [B, 2, h, w] precision times the value they say. steps: [scales, S] variances of the steps to each scale, cells
+      first.
+    Returns: mean [S, B, 2, h, w], covariance [S, B, 3, h, w], and the logarithm [S, B] of the evidence for these
+      variances, relative to a field that is zero; covariance includes what the trees differ by.
+    Gradient: precision, pull; exact, the first one.
+    """
+    data = torch.cat([precision, pull], 1)
+    if plain_wanted():
+        values, evidence = _plain(data, steps)
+    else:
+        trees = Trees(steps.shape[1], len(steps), SHIFTS)
+        values, evidence = Kernel.apply(_forward, _adjoint, (trees,), data, steps)
+    return values[:, :, :2], values[:, :, 2:], evidence
 
 
 class Trees(NamedTuple):
@@ -34,14 +63,65 @@ class Trees(NamedTuple):
         return rows >> scale, columns >> scale
 
 
-@exclusive
-def forward(data: Tensor, variances: Tensor, trees: Trees) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """Mean and covariance [S, B, 5, h, w], evidence [S, B], and what the adjoint needs.
-
-    Args: data: [B, 5, h, w] float64. variances: [scales, S] of the steps.
-    """
+def _plain(data, steps):
+    """As operations of torch: [S, B, 5, h, w] and [S, B]."""
+    scales, sizes = steps.shape
     batch, _, height, width = data.shape
-    found = _forward(_form(data), trees, *_form(data).load(data, variances))
+    rows, columns = Trees(sizes, scales, SHIFTS).shape(0, height, width)
+    shifted = [pad(data, (x, columns - width - x, y, rows - height - y)) for y, x in SHIFTS]
+    trees = torch.stack(shifted, 1).flatten(0, 1).repeat(sizes, 1, 1, 1)
+    evidence = data.new_zeros(len(trees))
+    passed = []
+    for step in steps:
+        variance = step.repeat_interleave(batch * len(SHIFTS))[:, None, None]
+        xx, xy, yy, px, py = trees.unbind(1)
+        a = 1 + variance * xx
+        b = variance * xy
+        d = 1 + variance * yy
+        determinant = a * d - b * b
+        gain = d / determinant, -b / determinant, a / determinant  # (1 + variance P)^-1
+        up = _times(gain, px, py)
+        fit = variance * (px * up[0] + py * up[1])
+        evidence = evidence + (fit - determinant.log()).sum((1, 2)) / 2
+        passed.append((gain, px, py, variance))
+        above = torch.stack(
+            [gain[0] * xx + gain[1] * xy, gain[0] * xy + gain[1] * yy, gain[1] * xy + gain[2] * yy, *up], 1
+        )
+        trees = 4 * avg_pool2d(above, 2) if len(passed) < scales else above
+    value = trees.new_zeros(len(trees), 5, *trees.shape[2:])  # mean x, y, covariance xx, xy, yy
+    for number, (gain, px, py, variance) in enumerate(reversed(passed)):
+        if number:
+            value = interpolate(value, scale_factor=2.0)
+        x, y, xx, xy, yy = value.unbind(1)
+        mean = _times(gain, x + variance * px, y + variance * py)
+        first = _times(gain, xx, xy)
+        second = _times(gain, xy, yy)
+        value = torch.stack(
+            [
+                *mean,
+                gain[0] * first[0] + gain[1] * second[0] + variance * gain[0],
+                gain[1] * first[0] + gain[2] * second[0] + variance * gain[1],
+                gain[1] * first[1] + gain[2] * second[1] + variance * gain[2],
+            ],
+            1,
+        )
+    value = value.unflatten(0, (sizes, batch, len(SHIFTS)))
+    each = torch.stack(
+        [value[:, :, k, :, y : y + height, x : x + width] for k, (y, x) in enumerate(SHIFTS)], 2
+    )
+    mean = each.mean(2)
+    x, y = (each[:, :, :, :2] - mean[:, :, None, :2]).unbind(3)
+    differ = torch.stack([x * x, x * y, y * y], 3).mean(2)
+    evidence = evidence.unflatten(0, (sizes, batch, len(SHIFTS))).mean(2)
+    return torch.cat([mean[:, :, :2], mean[:, :, 2:] + differ], 2), evidence
+
+
+@exclusive
+def _forward(trees, data, steps):
+    """Mean and covariance [S, B, 5, h, w] and evidence [S, B] of data [B, 5, h, w], and what the adjoint needs."""
+    batch, _, height, width = data.shape
+    form = Form.of(data, Grid(height, width))
+    found = _up_and_down(form, trees, *form.load(data, steps))
     each = trees.sizes, batch, len(trees.shifts)
     shapes = [trees.shape(scale, height, width) for scale in range(1, trees.scales)]
     (values,) = tensors((trees.sizes, *data.shape), found[0])
@@ -50,30 +130,21 @@ def forward(data: Tensor, variances: Tensor, trees: Trees) -> tuple[Tensor, Tens
         tensors((*each, DATA, *shape), array)[0]
         for shape, array in zip([*shapes, *shapes], found[2:], strict=True)
     ]
-    return values, evidence.sum((3, 4)).mean(2), kept
+    return [values, evidence.sum((3, 4)).mean(2)], kept
 
 
 @exclusive
-def adjoint(
-    data: Tensor,
-    variances: Tensor,
-    trees: Trees,
-    kept: Sequence[Tensor],
-    by_values: Tensor,
-    by_evidence: Tensor,
-) -> Tensor:
-    """Gradient of data, from those of values and evidence."""
-    form = _form(data)
-    arrays = form.load(data, variances, by_values, by_evidence, *kept)
-    return tensors((trees.sizes, *data.shape), _adjoint(form, trees, *arrays))[0].sum(0)
-
-
-def _form(data):
-    return Form.of(data, Grid(*data.shape[2:]))
+def _adjoint(trees, data, steps, *rest):
+    *kept, grads, _ = rest
+    shapes = (trees.sizes, *data.shape), (trees.sizes, len(data))
+    grads = [data.new_zeros(shape) if by is None else by for by, shape in zip(grads, shapes, strict=True)]
+    form = Form.of(data, Grid(*data.shape[2:]))
+    found = _gradients(form, trees, *form.load(data, steps, *grads, *kept))
+    return tensors(shapes[0], found)[0].sum(0), None
 
 
 @recorded
-def _forward(form, trees, data, variances):
+def _up_and_down(form, trees, data, variances):
     scales = [_Cells(form, trees, variances, scale) for scale in range(trees.scales)]
     dr = scales[0].dr
     summed = []
@@ -100,7 +171,7 @@ def _forward(form, trees, data, variances):
 
 
 @recorded
-def _adjoint(form, trees, data, variances, by_values, by_evidence, *kept):
+def _gradients(form, trees, data, variances, by_values, by_evidence, *kept):
     scales = [_Cells(form, trees, variances, scale) for scale in range(trees.scales)]
     summed = [data, *kept[: trees.scales - 1]]
     values = [None, *kept[trees.scales - 1 :]]

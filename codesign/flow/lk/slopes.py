@@ -1,0 +1,188 @@
+"""Products of the slopes of an image, summed over cells: in drjit, and as operations of torch."""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from codesign.errors import DomainError, ShapeError
+from codesign.exclusive import exclusive
+from codesign.flow.lk.lanes import Form, Grid, Kernel, Lanes, plain_wanted, recorded, tensors
+
+PRODUCTS = 8
+
+
+def cell_sums(
+    mean: Tensor, slope: Tensor, seen: Tensor, density: Tensor, grid: Grid, cell: int = 1
+) -> Tensor:
+    """Products of slopes, summed over squares of cell x cell samples.
+
+    Args:
+      mean, slope, seen: [B, h, w] as from ``warp.moving``, on the samples of ``grid``.
+      density: [B, h, w].
+      cell: side of the squares in samples, >= 1; those at the lower and right border hold what is left.
+    Returns: [B, 8, ceil(h / cell), ceil(w / cell)], sums over samples of seen times x x, x y, y y, x s, y s, s s, 1,
+      density, where x and y are the slopes of the mean per px (central differences, one-sided at the border; 0 where
+      there is one sample) and s is the slope over time.
+    Gradient: mean, slope, seen, density; exact, the first one.
+    Raises: ShapeError where shapes do not fit; DomainError where cell < 1; GradientError for a second derivative.
+    """
+    shapes = [list(x.shape) for x in (mean, slope, seen, density)]
+    if any(shape != [len(mean), *grid.shape] for shape in shapes):
+        raise ShapeError(
+            f"mean, slope, seen and density are {', '.join(map(str, shapes))}; give [B, {grid.shape[0]}, "
+            f"{grid.shape[1]}] for all."
+        )
+    if cell < 1:
+        raise DomainError(f"cell is {cell}; give a side of at least 1 sample.")
+    if plain_wanted():
+        return _plain(mean, slope, seen, density, grid, cell)
+    return Kernel.apply(_forward, _adjoint, (grid, cell), mean, slope, seen, density)[0]
+
+
+def _plain(mean, slope, seen, density, grid, cell):
+    x = _differences(mean) / grid.stride
+    y = _differences(mean.mT).mT / grid.stride
+    ones = torch.ones_like(seen)
+    parts = [x * x, x * y, y * y, x * slope, y * slope, slope * slope, ones, density]
+    terms = seen[:, None] * torch.stack(parts, 1)
+    rows, columns = grid.shape
+    padded = pad(terms, (0, -columns % cell, 0, -rows % cell))
+    return padded.unflatten(3, (-1, cell)).unflatten(2, (-1, cell)).sum((3, 5))
+
+
+def _differences(image):
+    """Central differences along the last axis, one-sided at both ends; 0 where there is one sample."""
+    if image.shape[-1] == 1:
+        return torch.zeros_like(image)
+    step = image.diff(dim=-1)
+    return torch.cat([step[..., :1], (step[..., 1:] + step[..., :-1]) / 2, step[..., -1:]], -1)
+
+
+@exclusive
+def _forward(grid, cell, mean, slope, seen, density):
+    form = Form.of(mean, grid)
+    rows, columns = grid.shape
+    found = _sums_of_columns(form, cell, *form.load(mean, slope, seen, density))
+    (sums,) = tensors((len(mean), PRODUCTS, -(-rows // cell), columns), found)
+    return [sums if cell == 1 else pad(sums, (0, -columns % cell)).unflatten(3, (-1, cell)).sum(4)], ()
+
+
+@exclusive
+def _adjoint(grid, cell, mean, slope, seen, density, grads, wanted):
+    form = Form.of(mean, grid)
+    return tensors(mean.shape, *_gradients(form, cell, *form.load(mean, slope, seen, density, *grads)))
+
+
+@recorded
+def _sums_of_columns(form, cell, mean, slope, seen, density):
+    """[B, 8, ceil(h / cell), w]."""
+    image = _Slopes(form, cell, mean)
+    dr = image.dr
+    rows = image.cell_rows
+    width = image.images * rows * image.columns
+    number, place = image.split(image.lanes(width), rows * image.columns)
+    row, x = image.split(place, image.columns)
+    start = number * image.area
+    first = row * image.count(cell)
+    end = dr.minimum(first + image.count(cell), image.count(image.rows))
+
+    def body(y, *sums):
+        at = start + y * image.across + x
+        maps = [image.take(values, at) for values in (slope, seen, density)]
+        terms = _products(*image.slopes(start, y, x), *maps)
+        return [dr.fma(a, b, total) for (a, b), total in zip(terms, sums, strict=True)]
+
+    sums = image.loop(first, end, body, *([dr.zeros(image.arr.Float, width)] * PRODUCTS))
+    target = image.empty(PRODUCTS * width)
+    plane = image.count(rows * image.columns)
+    for k, total in enumerate(sums):
+        image.put(target, total, (number * PRODUCTS + k) * plane + place)
+    dr.eval(target)
+    return target
+
+
+def _products(x, y, slope, seen, density):
+    """The eight products of a sample, as pairs of factors."""
+    by_x = seen * x
+    by_y = seen * y
+    by_slope = seen * slope
+    return (
+        (by_x, x),
+        (by_x, y),
+        (by_y, y),
+        (by_x, slope),
+        (by_y, slope),
+        (by_slope, slope),
+        (seen, 1),
+        (seen, density),
+    )
+
+
+@recorded
+def _gradients(form, cell, mean, slope, seen, density, grad):
+    image = _Slopes(form, cell, mean)
+    dr = image.dr
+    across = -(-image.columns // cell)
+    at = image.lanes(image.width)
+    number, place = image.split(at, image.samples)
+    y, x = image.split(place, image.columns)
+    start = number * image.area
+    plane = image.count(image.cell_rows * across)
+    of_cell = (
+        number * PRODUCTS * plane + image.split(y, cell)[0] * image.count(across) + image.split(x, cell)[0]
+    )
+    seeds = [image.take(grad, of_cell + k * plane) for k in range(PRODUCTS)]
+    given = [*image.slopes(start, y, x), *(image.take(values, at) for values in (slope, seen, density))]
+    grad_x, grad_y, *others = image.back(lambda *given: [a * b for a, b in _products(*given)], given, seeds)
+    grad_x *= image.factor(x, image.edge)
+    grad_y *= image.factor(y, image.bottom)
+    dr.eval(grad_x, grad_y, *others)
+    grad_mean = _back(image, grad_x, start + y * image.across, x, image.edge, 1) + _back(
+        image, grad_y, start + x, y, image.bottom, image.across
+    )
+    dr.eval(grad_mean)
+    return grad_mean, *others
+
+
+class _Slopes(Lanes):
+    """The slopes of the mean at a sample, and the other values there."""
+
+    def __init__(self, form, cell, mean):
+        super().__init__(form)
+        self.mean = mean
+        self.cell_rows = -(-self.rows // cell)
+        self.bottom = self.count(self.rows - 1)
+        self.edge = self.count(self.columns - 1)
+        # of a slope between two neighbours of the sample, and of one at the border
+        self.per_two = self.number(1 / (2 * form.stride))
+        self.per_one = self.number(1 / form.stride)
+
+    def slopes(self, start, y, x):
+        """Central differences of the mean, one-sided at the border; ``start``: index of the image's first
+        sample."""
+        return (
+            self.difference(start + y * self.across, x, self.edge, 1),
+            self.difference(start + x, y, self.bottom, self.across),
+        )
+
+    def difference(self, start, at, last, step):
+        dr = self.dr
+        before = dr.select(at > 0, at - 1, at)
+        after = dr.minimum(at + 1, last)
+        change = self.take(self.mean, start + after * step) - self.take(self.mean, start + before * step)
+        return change * self.factor(at, last)
+
+    def factor(self, at, last):
+        return self.dr.select((at > 0) & (at < last), self.per_two, self.per_one)
+
+
+def _back(image, grad, start, at, last, step):
+    """Adjoint of ``difference`` without its factor: a sample is the upper end of the difference at the one before,
+    or at itself at the end, and the lower end of that at the next, or at itself at the beginning."""
+    dr = image.dr
+    inner = at > 0
+    before = image.take(grad, start + dr.select(inner, at - 1, 0) * step)
+    after = image.take(grad, start + dr.minimum(at + 1, last) * step)
+    here = image.take(grad, start + at * step)
+    ends = dr.select(at == last, here, 0) - dr.select(inner, 0, here)
+    return dr.select(inner, before, 0) - dr.select(at < last, after, 0) + ends
