@@ -14,7 +14,7 @@ from torch.nn.functional import avg_pool2d
 
 from codesign.errors import ShapeError
 from codesign.exclusive import exclusive
-from codesign.flow.lk.lanes import Form, Grid, Kernel, Lanes, plain_wanted, recorded, tensors
+from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
 
 # that a lane goes down: columns of a whole image are far apart in memory
 ROWS = 64
@@ -38,7 +38,7 @@ def blurred(images: Tensor, grid: Grid, taps: Sequence[float]) -> Tensor:
         )
     if plain_wanted():
         return _plain(images, grid, taps)
-    return Kernel.apply(_forward, _adjoint, (grid, tuple(taps)), images)[0]
+    return in_graph(_forward, _adjoint, (grid, tuple(taps)), images)[0]
 
 
 def _plain(images, grid, taps):

@@ -118,14 +118,20 @@ def tensors(shape: tuple[int, ...], *values: Any) -> list[Tensor]:
     return [value.torch().reshape(shape) for value in values]
 
 
-class Kernel(Function):
-    """A kernel and its adjoint in a graph of torch.
+def in_graph(
+    forward: Callable[..., Any], adjoint: Callable[..., Any], settings: tuple[Any, ...], *given: Tensor
+) -> tuple[Tensor, ...]:
+    """What a kernel gives, in a graph of torch.
 
-    ``Kernel.apply(forward, adjoint, settings, *given)``: forward(*settings, *given) gives the outputs and what else the
-    adjoint needs; adjoint(*settings, *given, *that, grads, wanted) a gradient, or None, of each of the given. ``grads``
-    are None where an output has no gradient, ``wanted`` says which of the given want one.
+    Args:
+      forward: forward(*settings, *given) gives the outputs and what else the adjoint needs.
+      adjoint: adjoint(*settings, *given, *that, grads, wanted) gives a gradient, or None, of each of the given; ``grads``
+        are None where an output has no gradient, ``wanted`` says which of the given want one.
     """
+    return _Kernel.apply(forward, adjoint, settings, *given)
 
+
+class _Kernel(Function):
     @staticmethod
     def forward(ctx, forward, adjoint, settings, *given):
         ctx.set_materialize_grads(False)

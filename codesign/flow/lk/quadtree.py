@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from codesign.exclusive import exclusive
-from codesign.flow.lk.lanes import Form, Grid, Kernel, Lanes, plain_wanted, recorded, tensors
+from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
 
 # of a cell: precision xx, xy, yy and pull x, y; or mean x, y and covariance xx, xy, yy
 DATA = 5
@@ -43,7 +43,7 @@ def posterior(precision: Tensor, pull: Tensor, steps: Tensor) -> tuple[Tensor, T
         values, evidence = _plain(data, steps)
     else:
         trees = Trees(steps.shape[1], len(steps), SHIFTS)
-        values, evidence = Kernel.apply(_forward, _adjoint, (trees,), data, steps)
+        values, evidence = in_graph(_forward, _adjoint, (trees,), data, steps)
     return values[:, :, :2], values[:, :, 2:], evidence
 
 

@@ -6,7 +6,7 @@ from torch.nn.functional import pad
 
 from codesign.errors import DomainError, ShapeError
 from codesign.exclusive import exclusive
-from codesign.flow.lk.lanes import Form, Grid, Kernel, Lanes, plain_wanted, recorded, tensors
+from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
 
 PRODUCTS = 8
 
@@ -36,7 +36,7 @@ def cell_sums(
         raise DomainError(f"cell is {cell}; give a side of at least 1 sample.")
     if plain_wanted():
         return _plain(mean, slope, seen, density, grid, cell)
-    return Kernel.apply(_forward, _adjoint, (grid, cell), mean, slope, seen, density)[0]
+    return in_graph(_forward, _adjoint, (grid, cell), mean, slope, seen, density)[0]
 
 
 def _plain(mean, slope, seen, density, grid, cell):

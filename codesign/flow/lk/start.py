@@ -14,7 +14,7 @@ from torch import Tensor
 
 from codesign.exclusive import exclusive
 from codesign.flow.lk.cells import CELL, Cells
-from codesign.flow.lk.lanes import Form, Grid, Kernel, Lanes, plain_wanted, recorded, tensors
+from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
 from codesign.flow.lk.polynomials import FIXED_POINT_STEPS, Polynomials
 
 # flow x, y, covariance xx, xy, yy, confidence
@@ -77,7 +77,7 @@ def at_start(
     setting = Setting(powers, shape.of_squares, *cells.value.shape[2:], CELL, FIXED_POINT_STEPS, joined)
     of_cells = cells.value.to(parameters), cells.covariance.to(parameters)
     grid = Grid(shape.height, shape.width)
-    flow, rest = Kernel.apply(_forward, _adjoint, (grid, setting), of_flow, of_rest, *of_cells)
+    flow, rest = in_graph(_forward, _adjoint, (grid, setting), of_flow, of_rest, *of_cells)
     return flow, rest[:, :3], rest[:, 3]
 
 

@@ -11,7 +11,7 @@ from torch.nn.functional import grid_sample
 
 from codesign.errors import ShapeError
 from codesign.exclusive import exclusive
-from codesign.flow.lk.lanes import Form, Grid, Kernel, Lanes, plain_wanted, recorded, tensors
+from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
 
 # in one kernel
 BINS = 16
@@ -54,7 +54,7 @@ def moving(
     if plain_wanted():
         return _plain(rate, flow_px, time, contrast, grid, fade_px)
     weights = torch.cat([time[None], contrast]).to(rate).T.flatten().tolist()
-    return Kernel.apply(_forward, _adjoint, (grid, fade_px, weights), rate, flow_px)
+    return in_graph(_forward, _adjoint, (grid, fade_px, weights), rate, flow_px)
 
 
 def _plain(rate, flow_px, time, contrast, grid, fade_px):
