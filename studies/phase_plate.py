@@ -19,9 +19,9 @@ from torch import Tensor
 
 from codesign import events, lens
 from codesign.errors import DomainError
-from codesign.lens import WAVELENGTH_UM, GeoLens, wave
+from codesign.lens import WAVELENGTH_UM, GeoLens, diffraction
 from codesign.lens.analysis import Light, psf_on_pixels
-from codesign.lens.plates import ZernikePlate, with_plate
+from codesign.lens.diffraction import ZernikePlate, with_plate
 from scenes import textures
 from studies.frame.run import Run, StudyConfig, main
 
@@ -112,21 +112,26 @@ def closed_forms(run, quick):
     energy = []
     for number in (0.5, 1.0, 2.0):
         z = half**2 / (wavelength * number)
-        field = wave.Field(wave.rectangle(count, pitch, (half, half)).to(torch.complex128), pitch, 0.5)
+        field = diffraction.Field(
+            diffraction.rectangle(count, pitch, (half, half)).to(torch.complex128), pitch, 0.5
+        )
         x = field.places_mm()
         scale = math.sqrt(2 / (wavelength * z))
         s1, c1 = special.fresnel(scale * (x.numpy() + half))
         s0, c0 = special.fresnel(scale * (x.numpy() - half))
         truth = torch.tensor((c1 - c0) ** 2 + (s1 - s0) ** 2) / 2
-        for found in (wave.angular_spectrum(field, z, may_leave=0.1), wave.fresnel(field, z, pitch, count)):
+        for found in (
+            diffraction.angular_spectrum(field, z, may_leave=0.1),
+            diffraction.fresnel(field, z, pitch, count),
+        ):
             errors.append(float((found.intensity - truth * truth[:, None]).abs().max()))
         beam = torch.exp(-(x.square() + x[:, None].square()) / (0.6 * half) ** 2).to(torch.complex128)
-        beam = wave.Field(beam, pitch, 0.5)
-        energy.append(abs(float(wave.angular_spectrum(beam, z / 4).energy / beam.energy) - 1))
+        beam = diffraction.Field(beam, pitch, 0.5)
+        energy.append(abs(float(diffraction.angular_spectrum(beam, z / 4).energy / beam.energy) - 1))
     radius, focus = 5.0, 100.0
     pitch = 2.05 * radius / (count // 2)
-    disc = wave.Field(wave.disc(count // 2, pitch, radius).to(torch.complex128), pitch, 0.5)
-    found = wave.fresnel(disc, focus, 0.001, 96, focus_mm=focus)
+    disc = diffraction.Field(diffraction.disc(count // 2, pitch, radius).to(torch.complex128), pitch, 0.5)
+    found = diffraction.fresnel(disc, focus, 0.001, 96, focus_mm=focus)
     x = found.places_mm()
     v = 2 * math.pi / wavelength * radius / focus * torch.sqrt(x.square() + x[:, None].square())
     airy = torch.where(v == 0, 1, 2 * torch.special.bessel_j1(v) / torch.where(v == 0, 1, v)).square()

@@ -4,12 +4,12 @@ from codesign.doors import explain
 from codesign.lens import analysis, catalogue, design
 from codesign.lens.aiming import aimed_rays
 from codesign.lens.analysis import pupil_grid, rms_spot_mm, spots
+from codesign.lens.analysis.field_curves import relative_illumination
 from codesign.lens.catalogue import half_field_deg
 from codesign.lens.files import load, save
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM, Glass
 from codesign.lens.pinhole import Pinhole, ThinLens
-from codesign.lens.radiometry import relative_illumination
 from codesign.lens.seidel import seidel_sums
 from codesign.lens.spectrum import Spectrum
 from codesign.lens.surface import Phase, Surface

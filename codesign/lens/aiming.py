@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from codesign.lens.glass import WAVELENGTH_UM
-from codesign.lens.plated import trace
-from codesign.lens.trace import Prescription, Status
+from codesign.lens.trace import Prescription, Status, trace
 from codesign.lens.traced import TracedLens, in_float64
 
 NEWTON_STEPS = 12

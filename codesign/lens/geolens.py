@@ -10,22 +10,16 @@ import torch
 from torch import nn
 
 from codesign.errors import DomainError
-from codesign.lens import paraxial
-from codesign.lens.aiming import aim_at_stop, area_at_stop
+from codesign.lens import camera, paraxial
 from codesign.lens.analysis.spots import spots
 from codesign.lens.distance import real_numbers
-from codesign.lens.focus import image_distance_mm
 from codesign.lens.glass import AIR, WAVELENGTH_UM, Glass
-from codesign.lens.hold_efl import hold_efl, holding_surface
-from codesign.lens.media import with_medium
-from codesign.lens.numbers import kinds
 from codesign.lens.pinhole import ThinLens
-from codesign.lens.plated import trace
 from codesign.lens.replaceable import Replaceable, settled
-from codesign.lens.surface import Surface, scaled
-from codesign.lens.trace import PlateAt, Prescription, Status, TraceResult, check_rays
-from codesign.lens.traced import in_float64
-from codesign.lens.variables import Bound, checked_step
+from codesign.lens.solves import hold_efl, holding_surface, image_distance_mm
+from codesign.lens.surface import Surface, scaled, with_medium
+from codesign.lens.trace import PlateAt, Prescription, TraceResult, check_rays, trace
+from codesign.lens.variables import Bound, checked_step, kinds
 from codesign.types import Rays
 
 LEARNABLES = (
@@ -57,7 +51,7 @@ class GeoLens(Replaceable):
     Errors of assembly (buffers, with gradients after ``requires_grad_`` or through ``replace``): decentre_mm
     [S, 2], tilt_rad [S, 2]; and semi_aperture_mm [S], the same way.
     half_field_deg: the half field the lens is made for, or None where nobody said.
-    plate: a phase plate, see ``plates.with_plate``; plate_at: the surface it follows, and mm behind its vertex.
+    plate: a phase plate, see ``diffraction.with_plate``; plate_at: the surface it follows, and mm behind its vertex.
     """
 
     tensor_names: tuple[str, ...] = (*LEARNABLES, "semi_aperture_mm")
@@ -325,7 +319,7 @@ class GeoLens(Replaceable):
         if self.plate is not None:
             raise DomainError(
                 f"{self.name}: its phase plate is no surface, so files, drawings and copies by surfaces cannot hold "
-                "it; take it out with plates.with_plate(lens, None)."
+                "it; take it out with diffraction.with_plate(lens, None)."
             )
         found = []
         at_first = torch.tensor([s.curvature_per_mm for s in self.surfaces], dtype=self.dtype).tolist()
@@ -479,41 +473,7 @@ class GeoLens(Replaceable):
           soft edges.
         Raises: DomainError when no ray passes or a pupil lies at infinity.
         """
-        if aim and self.dtype != torch.float64:
-            return in_float64(self).camera_rays(film_mm, pupil, wavelength_um, aim)
-        f = self.first_order(wavelength_um)
-        if not (math.isfinite(f.exit_pupil_z_mm.item()) and math.isfinite(f.entrance_pupil_z_mm.item())):
-            raise DomainError(
-                f"{self.name}: a pupil lies at infinity (the lens is telecentric), so pupil points have no "
-                "place; move the stop off the focal plane."
-            )
-        back = self.prescription(wavelength_um).reversed(-self._origin_z_mm(f, wavelength_um))
-        at_stop = len(self.surfaces) - 1 - self.stop_index
-        radius = f.exit_pupil_diameter_mm / 2
-
-        def towards(film, q):
-            return _towards(film, q, self.thickness_mm[-1], f.exit_pupil_z_mm)
-
-        if aim:
-            film = film_mm.to(self.dtype)
-
-            def field(q, share):
-                return towards(film.repeat(q.shape[0] // film.shape[0], 1) * share, q)
-
-            until = back.until(at_stop)
-            at = aim_at_stop(field, until, pupil.to(self.dtype), f.stop_semi_aperture_mm, radius)
-            area = area_at_stop(field, until, at, radius)
-            start, direction = (v.to(film_mm.dtype) for v in towards(film, at.point_mm))
-            spread = ((f.stop_semi_aperture_mm / radius).square() / area.abs()).to(film_mm.dtype)
-        else:
-            start, direction = (
-                v.to(film_mm.dtype) for v in towards(film_mm, pupil * radius.to(film_mm.dtype))
-            )
-            spread = torch.ones_like(film_mm[:, 0])
-        out = trace(back.to(film_mm.dtype).opened(at_stop), start, direction)
-        if bool((out.weight.detach() <= 0).all()):
-            raise DomainError(f"{self.name}: every ray fails{self._where(out)}.")
-        return Rays(out.position_mm * 1e-3, out.direction, out.weight, spread * direction[:, 2] ** 4)
+        return camera.camera_rays(self, film_mm, pupil, wavelength_um, aim)
 
     @settled
     def film_points(
@@ -528,66 +488,10 @@ class GeoLens(Replaceable):
           passed, so that ``camera_rays(film_mm, pupil)`` goes back to the point; passes [N] bool. Gradient:
           to points, pupil and lens.
         """
-        f = self.first_order(wavelength_um)
-        dtype = points_mm.dtype
-        at = torch.cat(
-            [pupil * (f.entrance_pupil_diameter_mm.to(dtype) / 2), torch.zeros_like(pupil[:, :1])], 1
-        )
-        flip = points_mm.new_tensor([1.0, 1.0, -1.0])
-        start = points_mm * flip
-        direction = torch.nn.functional.normalize((at - points_mm) * flip, dim=1)
-        start = torch.cat([start[:, :2], start[:, 2:] + self._origin_z_mm(f, wavelength_um).to(dtype)], 1)
-        out = trace(self.prescription(wavelength_um).to(dtype).opened(self.stop_index), start, direction)
-        back = (
-            (f.exit_pupil_z_mm - self.thickness_mm[-1]).to(dtype)
-            * out.direction[:, :2]
-            / out.direction[:, 2:]
-        )
-        return (
-            -out.position_mm[:, :2],
-            (out.position_mm[:, :2] + back) / (f.exit_pupil_diameter_mm.to(dtype) / 2),
-            out.weight.detach() > 0,
-        )
-
-    def _origin_z_mm(self, f, wavelength_um):
-        """Where the camera's origin lies: at the entrance pupil of the d line, one for all colours. f:
-        first-order figures at the wavelength."""
-        d = WAVELENGTH_UM["d"]
-        return (f if wavelength_um == d else self.first_order(d)).entrance_pupil_z_mm
-
-    def _where(self, out):
-        """What became of most rays of a backward trace, in words; surfaces are counted from the object."""
-        failed = out.failed_surface[out.status != Status.OK]
-        if failed.numel() == 0 and any(s.inner_semi_aperture_mm for s in self.surfaces):
-            return (
-                " (all of them are stopped by the edges of the apertures or by the central obstruction, which chief rays "
-                "meet; point spread maps need chief rays, so render traced frames)"
-            )
-        if failed.numel() == 0:
-            return " (all of them are stopped by the edges of the apertures); open the apertures"
-        at = len(self.surfaces) - int(failed.mode().values)
-        return (
-            f" (most at surface {at} of {len(self.surfaces)}, counted from the object)"
-            if at
-            else " (most before they leave the first surface forwards)"
-        ) + "; weaken the curvatures or open the apertures"
+        return camera.film_points(self, points_mm, pupil, wavelength_um)
 
     def extra_repr(self) -> str:
         return f"{self.name}, {len(self.surfaces)} surfaces, entrance pupil {self.entrance_pupil_diameter_mm:g} mm"
-
-
-def _towards(film_mm, at_mm, last_mm, exit_z_mm):
-    """Rays from upright image points [N, 2] to points [N, 2] of the exit pupil's plane, in the axes of the
-    reversed lens: start and direction [N, 3]."""
-
-    def place(points, z):
-        return torch.cat([points, -z.to(points.dtype).expand(points.shape[0], 1)], 1)
-
-    start = place(-film_mm, last_mm)  # the image is inverted on the film
-    direction = torch.nn.functional.normalize(place(at_mm, exit_z_mm) - start, dim=1)
-    return start, direction * torch.sign(
-        direction[:, 2:]
-    )  # a virtual exit pupil behind the film points the other way
 
 
 def _table(rows, dtype):

@@ -6,16 +6,17 @@ from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 from torch.utils.checkpoint import checkpoint
 
 from codesign.backend import run_kernel
 from codesign.errors import DomainError, ShapeError, check_finite, check_whole
-from codesign.lens.kernel import Kernel, Status, Works
+from codesign.lens.kernel import FORWARD, GRAZING, Kernel, Status, Works
 
 
 @dataclass(frozen=True)
 class PlateAt:
-    """A phase plate on a plane of a lens, for one wavelength; ``plated.trace`` sends rays through it.
+    """A phase plate on a plane of a lens, for one wavelength; ``trace`` sends rays through it.
 
     look: points [N, 2] mm -> phase [N] rad, its slope [N, 2] rad/mm, whether the plate reaches there [N] bool.
     gap: the surface it follows, -1 before the first. after_mm: from that surface's vertex (from the first where
@@ -55,7 +56,7 @@ class Prescription:
     borders_glass: S booleans, surfaces whose index step may change: where the step is 0 today, a derivative to
       ``index`` still needs the refraction. False for a surface in air, whose step stays 0.
     to_plane: whether rays go on to the plane behind the last thickness, or end on the last surface itself.
-    plate: a phase plate between the surfaces, or None; of no concern to ``trace``, see ``plated.trace``.
+    plate: a phase plate between the surfaces, or None; of no concern to ``trace_surfaces``, see ``trace``.
     """
 
     curvature_per_mm: Tensor
@@ -212,7 +213,7 @@ def _range(rows, function):
     return found[:, 0].min().item(), found[:, 1].max().item()
 
 
-def trace(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> TraceResult:
+def trace_surfaces(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> TraceResult:
     """Trace rays from points relative to the first vertex to the plane behind the last thickness.
 
     Args: origin_mm [N, 3], direction [N, 3] unit, both of the prescription's dtype.
@@ -292,9 +293,9 @@ def _in_segments(p, origin_mm, direction):
             efficiency=1.0 if found else p.efficiency,
         )
         if found is None:
-            found = trace(segment, origin_mm, direction)
+            found = trace_surfaces(segment, origin_mm, direction)
         else:
-            found = joined(found, trace(segment, *onward(found)), first)
+            found = joined(found, trace_surfaces(segment, *onward(found)), first)
     return found
 
 
@@ -329,6 +330,78 @@ def joined(front: TraceResult, rest: TraceResult, surfaces: int) -> TraceResult:
     )
 
 
+def trace(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> TraceResult:
+    """Trace rays through a lens that may hold a plate, see ``trace_surfaces``. At the plate a ray gains its phase as optical path, and
+    its direction across the axis, times index, gains the slope of that path: the local grating equation.
+
+    Gradient: also to the plate. Rays that leave a plate beyond its rim MISS; those it turns beyond a right angle
+      are TOTAL_REFLECTION.
+    """
+    p = prescription
+    placed = p.plate
+    if placed is None:
+        return trace_surfaces(p, origin_mm, direction)
+    gap = placed.gap
+    last = p.thickness_mm.shape[0] - 1
+    after = torch.as_tensor(placed.after_mm).to(p.thickness_mm)
+    index = p.index[gap + 1]
+    here = _plate_turns(to_plate(p, placed, origin_mm, direction), placed, index, max(gap, 0))
+    if gap == last:
+        rest = straight(here.position_mm, here.direction, p.thickness_mm[last] - after, index)
+    else:
+        depth = after - p.thickness_mm[gap] if gap >= 0 else after
+        at, safe = onward(here)
+        at = torch.cat([at[:, :2], depth.expand(len(at), 1)], 1)
+        rest = trace_surfaces(replace(p.part(gap + 1, last + 1), efficiency=1.0), at, safe)
+    return joined(here, rest, gap + 1)
+
+
+def to_plate(
+    prescription: Prescription, placed: PlateAt, origin_mm: Tensor, direction: Tensor
+) -> TraceResult:
+    """Rays on the plane of a lens's plate, before it turns them; positions relative to the plate's centre."""
+    p = prescription
+    after = torch.as_tensor(placed.after_mm).to(p.thickness_mm)
+    if placed.gap < 0:
+        return straight(origin_mm, direction, after, p.index[0])
+    gaps = torch.cat([p.thickness_mm[: placed.gap], after.reshape(1)])
+    front = replace(p.part(0, placed.gap + 1), thickness_mm=gaps, to_plane=True)
+    return trace_surfaces(front, origin_mm, direction)
+
+
+def straight(origin_mm: Tensor, direction: Tensor, to_mm: Tensor, index: Tensor) -> TraceResult:
+    """Rays on the plane z = ``to_mm``, without a surface on the way; positions relative to its centre."""
+    forward = direction[:, 2] > FORWARD
+    length = (to_mm - origin_mm[:, 2]) / torch.where(forward, direction[:, 2], 1)
+    flat = pad(origin_mm[:, :2] + direction[:, :2] * length[:, None], (0, 1))
+    deficit = torch.where(forward, 0, FORWARD - direction[:, 2])
+    packed = torch.where(forward, -8, int(Status.MISS)).int() + 4
+    return TraceResult(flat, direction, index * length, forward.to(flat.dtype), packed, deficit)
+
+
+def _plate_turns(rays, placed, index, surface):
+    """Rays on the plate's plane as they leave it; what it stops failed at ``surface``, the one before."""
+    phase, slope, reaches = placed.look(rays.position_mm[:, :2])
+    across = rays.direction[:, :2] + slope * (placed.mm_per_rad / index)
+    radicand = 1 - across.square().sum(1)
+    alive = rays.status == Status.OK
+    passes = radicand > GRAZING
+    axial = torch.where(passes, radicand, 1).sqrt()
+    good = alive & reaches & passes
+    why = torch.where(reaches, int(Status.TOTAL_REFLECTION), int(Status.MISS))
+    packed = torch.where(alive & ~good, 8 * surface + why + (rays.packed_status & 4), rays.packed_status)
+    return replace(
+        rays,
+        direction=torch.where(good[:, None], torch.cat([across, axial[:, None]], 1), rays.direction),
+        optical_path_mm=torch.where(
+            good, rays.optical_path_mm + phase * placed.mm_per_rad, rays.optical_path_mm
+        ),
+        weight=torch.where(good, rays.weight, 0),
+        packed_status=packed.int(),
+        deficit=torch.where(alive & reaches & ~passes, GRAZING - radicand, rays.deficit),
+    )
+
+
 def sum_over_chunks(function: Callable[..., Tensor], *rays: Tensor, rows: int = 262_144) -> Tensor:
     """Sum of ``function(*chunk)`` over chunks of rays, in bounded memory: a chunk is traced again when its
     gradient is due.
@@ -357,6 +430,3 @@ def _active(table):
     if table.requires_grad or not table.shape[1]:
         return [table.shape[1]] * table.shape[0]
     return [max((i + 1 for i, v in enumerate(row) if v != 0), default=0) for row in table.tolist()]
-
-
-__all__ = ["Prescription", "Status", "TraceResult", "check_rays", "sum_over_chunks", "trace"]

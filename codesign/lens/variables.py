@@ -1,5 +1,5 @@
-"""Numbers of a lens as dimensionless variables whose unit is a natural step: one that moves the rays on the film
-by a set distance."""
+"""Numbers of a lens as dimensionless variables whose unit is a natural step: one that moves the rays on the film by
+a set distance."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -10,8 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from codesign.errors import DomainError, ShapeError
+from codesign.lens.traced import TracedLens
 
-BEND = 5.0  # a bound on one side bends the map within about this part of the room that the start leaves
+BOUND_BEND = 5.0  # a bound on one side bends the map within about this part of the room that the start leaves
 TRIAL = 1e-4  # of a reach: the step of the differences that measure how rays move
 DEAD = 1e-6  # of the natural step: a number whose whole reach moves the rays by less is no variable
 
@@ -171,7 +172,7 @@ def checked_bounds(
 
 
 def _width(value, low, high):
-    room = torch.where(low.isfinite(), value - low, high - value) / BEND
+    room = torch.where(low.isfinite(), value - low, high - value) / BOUND_BEND
     width = torch.where(low.isfinite() & high.isfinite(), (high - low) / 2, room)
     return torch.where(low.isfinite() | high.isfinite(), width, 1.0)
 
@@ -286,3 +287,39 @@ def _kept(name, kind, value, bounds, mask):
             raise ShapeError(f"the mask of {name} needs {value.numel()} entries, got {tuple(asked.shape)}.")
         keep = keep & asked
     return keep
+
+
+# largest natural steps, for numbers that hardly move a ray
+GAP = 0.1  # thickness, in focal lengths
+BEND = 0.1  # slope that a change of shape adds at the rim
+INDEX = 0.05
+PHASE = 300.0  # radians at the rim, over its radius
+
+
+def kinds(lens: TracedLens) -> dict[str, Kind]:
+    """{name: Kind} of a GeoLens."""
+    rows = torch.arange(len(lens.surfaces), device=lens.semi_aperture_mm.device)
+    efl = lens.first_order().efl_mm.detach().abs()
+    rim = lens.semi_aperture_mm.minimum(efl)
+    gap = (GAP * efl).expand(rows.shape)
+    turn = (lens.curvature_per_mm.detach() * rim).square().clamp_min(1e-12)
+    index = torch.full_like(rim, INDEX)[lens.glass]
+    return {
+        "curvature": Kind("curvature_per_mm", rows, BEND / rim),
+        "thickness": Kind("thickness_mm", rows[:-1], gap[:-1], 0.0),
+        "focus": Kind("thickness_mm", rows[-1:], gap[-1:], 0.0),
+        "conic": Kind("conic", rows, BEND / turn),
+        "asphere": _polynomial("asphere", lens.asphere, BEND, rim),
+        "index": Kind("index_offset", rows[lens.glass], index),
+        "phase": _polynomial("phase", lens.phase, PHASE, rim),
+    }
+
+
+def _polynomial(name, table, slope, rim):
+    """Coefficients [S, A] of r^2, r^4, ...: each may add that much per millimetre at the rim."""
+    power = 2 * torch.arange(1, table.shape[1] + 1, dtype=rim.dtype, device=rim.device)
+    return Kind(
+        name,
+        torch.arange(table.numel(), device=rim.device),
+        (slope * rim[:, None] ** (1 - power)).reshape(-1),
+    )

@@ -30,8 +30,8 @@ from codesign.lens.design.moves import (
     with_glass,
     without_element,
 )
-from codesign.lens.design.solves import focus_paraxial, hold_efl, holding_surface
 from codesign.lens.glass import AIR
+from codesign.lens.solves import focus_paraxial, hold_efl, holding_surface
 from codesign.lens.variables import Bound
 from codesign.optimise.least_squares import DampedLeastSquares
 

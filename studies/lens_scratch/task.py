@@ -12,7 +12,7 @@ from codesign.lens import WAVELENGTH_UM, GeoLens, Glass, Surface
 from codesign.lens.analysis import field_rays, pupil_grid
 from codesign.lens.design.constraints import Constraint, Limits, evaluate, rows
 from codesign.lens.design.hits import paraxial_semi_aperture_mm, traced_semi_aperture_mm
-from codesign.lens.design.solves import focus_paraxial, hold_efl
+from codesign.lens.solves import focus_paraxial, hold_efl
 
 EFL_MM = 50.0
 PUPIL_MM = 10.0

@@ -20,19 +20,22 @@ import torch
 from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens import WAVELENGTH_UM
-from codesign.lens.design.solves import focus_rays
 from codesign.lens.design.tolerance import (
     LINEAR_FIGURES,
+    Tolerances,
     Trials,
     compare,
     compensated,
+    errors_of,
+    forecast_spot,
     linear_figures,
     monte_carlo,
     sensitivities,
+    spot_errors,
+    squared_spots,
     worst_offenders,
 )
-from codesign.lens.design.tolerance_errors import Tolerances, errors_of
-from codesign.lens.design.tolerance_spot import forecast_spot, spot_errors, squared_spots
+from codesign.lens.solves import focus_rays
 from studies.frame.run import Run, StudyConfig, main
 from studies.lens_tolerance.needed import report_needed
 

@@ -18,10 +18,16 @@ from codesign import flow, lens
 from codesign.errors import DomainError
 from codesign.lens.analysis.rays import source_rays, trace_source
 from codesign.lens.design import Tolerances, precision
-from codesign.lens.design.solves import focus_rays
-from codesign.lens.design.tolerance import compensated, monte_carlo, sensitivities
-from codesign.lens.design.tolerance_errors import errors_of, perturbed
-from codesign.lens.design.tolerance_spot import forecast_spot, squared_spots
+from codesign.lens.design.tolerance import (
+    compensated,
+    errors_of,
+    forecast_spot,
+    monte_carlo,
+    perturbed,
+    sensitivities,
+    squared_spots,
+)
+from codesign.lens.solves import focus_rays
 from studies.lens_opt.task import (
     DISTANCE_M,
     HELD_OUT,

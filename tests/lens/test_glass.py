@@ -13,6 +13,7 @@ from codesign.lens import WAVELENGTH_UM, Glass, glass_catalogue
 from codesign.lens.catalogue import LENSES
 from codesign.lens.glass import AIR, names
 from codesign.lens.spectrum import LINE_UM
+from tests.lens.systems import reference
 
 ROWS = {row[0]: row for row in glass_catalogue.rows()}
 
@@ -67,24 +68,22 @@ def conrady(name):
     return Glass.from_indices(glass.index_F, glass.index_d, glass.index_C)
 
 
-@pytest.mark.parametrize("name", ROWS)
-def test_every_entry_has_the_published_index_and_abbe_number(name):
-    *_, (nd, abbe), _, source = ROWS[name]
-    glass = Glass.named(name)
+def test_every_entry_has_the_published_index_and_abbe_number():
     # Five printed decimals, and the makers quote 5e-6 for their formulas. Sumita, Zeon and Osaka Gas print
     # measured values beside a fit: two or three units of the fifth decimal, of the third for the polyesters
     # (spread between lots), and Vd with at most one decimal.
-    index, number = {"Sumita": (2.5e-5, 0.25), "Zeon": (2.5e-5, 0.06), "Osaka": (1e-3, 0.3)}.get(
-        re.split("[, ]", source)[0], (6e-6, 0.01)
-    )
-    if name == "SAPPHIRE":  # printed to four decimals
-        index = 5e-5
-    assert glass.name == name
-    assert glass.index_d == pytest.approx(nd, abs=index)
-    assert glass.abbe_number == pytest.approx(abbe, abs=number)
-    # a mistyped term far from the visible would show as a rise towards the red
-    across = [glass.index(WAVELENGTH_UM["F"] + 0.01 * i) for i in range(18)]
-    assert across == sorted(across, reverse=True)
+    printed = {"Sumita": (2.5e-5, 0.25), "Zeon": (2.5e-5, 0.06), "Osaka": (1e-3, 0.3)}
+    for name, (*_, (nd, abbe), _, source) in ROWS.items():
+        index, number = printed.get(re.split("[, ]", source)[0], (6e-6, 0.01))
+        # printed to four decimals
+        index = 5e-5 if name == "SAPPHIRE" else index
+        glass = Glass.named(name)
+        assert glass.name == name
+        assert glass.index_d == pytest.approx(nd, abs=index), name
+        assert glass.abbe_number == pytest.approx(abbe, abs=number), name
+        # a mistyped term far from the visible would show as a rise towards the red
+        across = [glass.index(WAVELENGTH_UM["F"] + 0.01 * i) for i in range(18)]
+        assert across == sorted(across, reverse=True), name
 
 
 def test_the_catalogue_is_large_and_its_names_are_told_apart():
@@ -113,35 +112,23 @@ def test_blue_partial_dispersion_agrees_with_the_data_sheet(name):
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_catalogue_glasses_give_the_rounded_indices_of_the_reference_lenses(name, shared):
-    page = json.loads(shared(f"refs/lens/{name.replace('-', '_')}.json").read_text())
-    for row in page["surfaces"]:
-        if row["glass"]:
-            for line, wavelength_um in WAVELENGTH_UM.items():
-                assert Glass.named(row["material"]).index(wavelength_um) == pytest.approx(
-                    row["n"][line], abs=6e-10
-                )  # rounded to 1e-9
-
-
-@pytest.mark.parametrize("name", LENSES)
 def test_named_lenses_are_the_published_prescriptions(name, shared):
-    page = json.loads(shared(f"refs/lens/{name.replace('-', '_')}.json").read_text())
+    page = reference(name, shared)
     geo = lens.load(name)
-    assert (geo.stop_index, geo.entrance_pupil_diameter_mm, lens.half_field_deg(name)) == (
-        page["stop_index"],
-        page["epd"],
-        page["half_field_deg"],
-    )
+    facts = (geo.stop_index, geo.entrance_pupil_diameter_mm, lens.half_field_deg(name))
+    assert facts == (page["stop_index"], page["epd"], page["half_field_deg"])
     for mine, theirs in zip(geo.to_surfaces(), page["surfaces"], strict=True):
         assert mine.radius_mm == (math.inf if theirs["radius"] is None else theirs["radius"])
-        assert (mine.thickness_mm, mine.semi_aperture_mm, mine.conic) == (
-            theirs["thickness"],
-            theirs["semi_aperture"],
-            theirs["conic"],
+        assert (mine.thickness_mm, mine.semi_aperture_mm, mine.conic) == tuple(
+            theirs[key] for key in ("thickness", "semi_aperture", "conic")
         )
         for line, wavelength_um in WAVELENGTH_UM.items():
             index = 1.0 if mine.medium is None else mine.medium.index(wavelength_um)
             assert index == pytest.approx(theirs["n"][line], abs=1e-12)
+            if theirs["glass"]:
+                # of the catalogue, rounded to 1e-9 there
+                named = Glass.named(theirs["material"]).index(wavelength_um)
+                assert named == pytest.approx(theirs["n"][line], abs=6e-10)
 
 
 @pytest.mark.parametrize("name", ["N-BK7", "F2", "S-LAH79"])
@@ -304,9 +291,7 @@ def test_the_nearest_names_are_near():
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["x" * 10**7, "N-SF" * 10**6, 10**5000, None, ["N-BK7"], b"N-BK7"],
-    ids=["long", "repeated", "integer", "none", "list", "bytes"],
+    "name", ["x" * 10**7, "N-SF" * 10**6, 10**5000, None], ids=["long", "repeated", "integer", "none"]
 )
 def test_a_hostile_name_is_refused_at_once_in_a_short_sentence(name):
     start = time.perf_counter()

@@ -6,19 +6,11 @@ import pytest
 import torch
 
 from codesign import lens
-from codesign.errors import DomainError
-from codesign.lens import GeoLens, Surface, analysis
+from codesign.lens import GeoLens, analysis
 from codesign.lens.analysis import diffraction_psf, geometric_psf, psf_on_pixels, strehl_direct, wavefront
+from tests.lens.systems import LINES, check_gradient, paraboloid
 
 D = torch.float64
-LINES = (0.5875618, 0.4861327, 0.6562725)
-
-
-def paraboloid(diameter=5.0, focal_length=100.0):
-    return GeoLens(
-        [Surface(-2 * focal_length, focal_length, None, 30.0, conic=-1.0, is_stop=True, mirror=True)],
-        diameter,
-    )
 
 
 def test_the_airy_pattern():
@@ -98,46 +90,18 @@ def test_diffraction_keeps_the_mean_of_the_rays():
     assert mean == pytest.approx(rays, rel=0.15)  # tails that fall as 1 / r^2 are cut at the picture's rim
 
 
-def test_gradients_of_point_spreads():
+# bilinear: steps so small that hardly a ray changes its pixel
+@pytest.mark.parametrize(
+    ("make", "grid", "step", "rel"), [(psf_on_pixels, 64, 2e-6, 1e-5), (geometric_psf, 32, 2e-9, 1e-3)]
+)
+def test_gradients_of_point_spreads(make, grid, step, rel, generator):
     geo = GeoLens(lens.load("la1509").surfaces, 8.0)
-    generator = torch.Generator().manual_seed(3)
     picture = torch.rand(24, 24, dtype=D, generator=generator)
-
-    def check(make, step, rel):
-        value = geo.curvature_per_mm.detach()
-        leaf = value.clone().requires_grad_()
-
-        def loss(c):
-            return (make(geo.replace(curvature_per_mm=c)).energy * picture).sum()
-
-        (found,) = torch.autograd.grad(loss(leaf), leaf)
-        direction = torch.tensor([0.02, 0.001], dtype=D)
-        truth = float((loss(value + step * direction) - loss(value - step * direction)).detach()) / (2 * step)
-        assert float(found @ direction) == pytest.approx(truth, rel=rel)
-
-    check(lambda g: psf_on_pixels(g, 0.02, 0.002, 24, LINES, grid=64), 1e-6, 1e-5)
-    check(
-        lambda g: geometric_psf(g, 0.02, 0.002, 24, LINES, grid=32), 1e-9, 1e-3
-    )  # bilinear: steps so small that hardly a ray changes its pixel
-
-
-def test_what_cannot_be_sampled_is_refused():
-    geo = lens.load("double-gauss")
-    with pytest.raises(
-        DomainError,
-        match=r"neighbouring pupil cells differ by .* waves at field 14 degrees with a grid of 32",
-    ):
-        diffraction_psf(geo, math.radians(14.0), grid=32)
-    with pytest.raises(DomainError, match="padding 1 must be a whole number of at least 2"):
-        diffraction_psf(geo, 0.0, padding=1)
-    with pytest.raises(DomainError, match="wider than the"):
-        psf_on_pixels(paraboloid(), 0.0, 0.01, 512, grid=64)
-
-
-@pytest.mark.parametrize("psf", [analysis.psf_on_pixels, analysis.geometric_psf])
-@pytest.mark.parametrize("wrong", [-1, 0, math.nan, math.inf, None, "fine", []])
-@pytest.mark.parametrize("name", ["pixel_mm", "pixels"])
-def test_a_grid_of_no_pixels_is_refused(psf, wrong, name):
-    geo = lens.load("cooke-triplet")
-    with pytest.raises(DomainError, match=f"^{name} = "):
-        psf(geo, 0.0, **({"pixel_mm": 0.004, "pixels": 8} | {name: wrong}))
+    check_gradient(
+        lambda c: (
+            make(geo.replace(curvature_per_mm=c), 0.02, 0.002, 24, LINES, grid=grid).energy * picture
+        ).sum(),
+        geo.curvature_per_mm,
+        step=step,
+        rel=rel,
+    )

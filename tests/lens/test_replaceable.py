@@ -2,14 +2,13 @@
 
 import copy
 import dataclasses
-import math
 
 import pytest
 import torch
 
 from codesign import lens
 from codesign.errors import DomainError
-from codesign.lens import GeoLens, Glass, Phase, Pinhole, Surface, ThinLens, plates
+from codesign.lens import GeoLens, Glass, Phase, Pinhole, Surface, ThinLens, diffraction
 
 D = torch.float64
 GLASS = Glass.from_indices(1.51, 1.5, 1.49, "g")
@@ -35,18 +34,16 @@ def same(found, wanted):
 def test_air_is_no_variable(tmp_path):
     geo = lens.load("cooke-triplet")
     optimiser = torch.optim.Adam(geo.parameters(), lr=1e-5)
-    for _ in range(40):
+    for _ in range(10):
         optimiser.zero_grad()
-        origin, direction = rays()
-        geo.trace(origin, direction).position_mm.square().sum().backward()
+        geo.trace(*rays()).position_mm.square().sum().backward()
         optimiser.step()
-    moved = geo.index_offset.detach() != 0
-    assert moved.tolist() == [True, False, True, False, True, False]
+    filled = [True, False] * 3
+    assert (geo.index_offset.detach() != 0).tolist() == filled
     lens.save(geo, tmp_path / "a.json")
-    assert [s.medium and s.medium.name for s in lens.load(tmp_path / "a.json").surfaces] == [
-        s.medium and s.medium.name for s in geo.surfaces
-    ]
-    assert [s.medium is None for s in lens.load(tmp_path / "a.json").surfaces] == [False, True] * 3
+    after = lens.load(tmp_path / "a.json").surfaces
+    assert [s.medium is not None for s in after] == filled
+    assert [s.medium.name for s in after[::2]] == [s.medium.name for s in geo.surfaces[::2]]
 
 
 @pytest.mark.parametrize("medium", [None, Glass.named("air")])
@@ -68,29 +65,25 @@ def test_an_offset_of_air_or_of_a_mirror_does_nothing(medium):
     assert [s.medium for s in shifted.to_surfaces()[1:]] == [medium, medium]
 
 
-@pytest.mark.parametrize("change", [torch.nn.Module.float, lambda m: m.to(torch.float32)])
-def test_a_twin_and_its_original_are_converted_apart(change):
+def test_a_twin_and_its_original_are_converted_apart():
     geo = lens.load("la1509")
-    twin = geo.replace(thickness_mm=geo.thickness_mm * 2)
     first = tensors(geo)
-    change(twin)
+    twin = geo.replace(thickness_mm=geo.thickness_mm * 2).float()
     same(tensors(geo), first)
-    exact = geo.trace(*rays()).position_mm
-    assert exact.dtype == D
-    out = twin.trace(*rays(torch.float32))
     assert {v.dtype for v in tensors(twin).values()} == {torch.float32}
-    gradient = torch.autograd.grad(out.position_mm[:, :2].square().sum(), geo.curvature_per_mm)[0]
-    assert gradient.dtype == D
-    wanted = torch.autograd.grad(
-        geo.replace(thickness_mm=geo.thickness_mm * 2).trace(*rays()).position_mm[:, :2].square().sum(),
-        geo.curvature_per_mm,
-    )[0]
-    torch.testing.assert_close(gradient, wanted, rtol=1e-3, atol=0)  # float32 rays of 1e-6 at spots of 1e-3
+
+    def slope(made, dtype):
+        spot = made.trace(*rays(dtype)).position_mm[:, :2].square().sum()
+        return torch.autograd.grad(spot, geo.curvature_per_mm)[0]
+
+    found, wanted = slope(twin, torch.float32), slope(geo.replace(thickness_mm=geo.thickness_mm * 2), D)
+    assert found.dtype == D
+    # float32 rays of 1e-6 at spots of 1e-3
+    torch.testing.assert_close(found, wanted, rtol=1e-3, atol=0)
     other = lens.load("la1509")
     kept = other.replace(thickness_mm=other.thickness_mm * 2)
-    change(other)
-    assert kept.trace(*rays()).position_mm.dtype == D
-    assert other.trace(*rays(torch.float32)).position_mm.dtype == torch.float32
+    other.to(torch.float32)
+    assert (kept.trace(*rays()).position_mm.dtype, other.thickness_mm.dtype) == (D, torch.float32)
 
 
 def test_the_state_of_a_twin_holds_every_tensor_and_is_its_own():
@@ -113,8 +106,7 @@ def test_a_new_buffer_on_a_twin_stays_there():
     twin = geo.replace()
     twin.register_buffer("mark", torch.zeros(1))
     twin.add_module("part", torch.nn.Identity())
-    assert not hasattr(geo, "mark")
-    assert not hasattr(geo, "part")
+    assert not hasattr(geo, "mark") | hasattr(geo, "part")
 
 
 def test_a_copy_owns_its_numbers():
@@ -175,8 +167,8 @@ HYBRIDS = {
     "half field": (GeoLens(DOUBLET, 8.0, half_field_deg=5.0), GeoLens(DOUBLET, 8.0)),
     "numbers describe it": (TRIPLET, lens.load("double-gauss")),
     "ThinLens: its entrance pupil": (ThinLens(50.0, 10.0), ThinLens(50.0, 5.0)),
-    "term 1": tuple(plates.ZernikePlate({term: 1.0}, 4.0) for term in (5, 6)),
-    "finest detail": tuple(plates.GridPlate(torch.ones(6, 6), pitch) for pitch in (1.0, 2.0)),
+    "term 1": tuple(diffraction.ZernikePlate({term: 1.0}, 4.0) for term in (5, 6)),
+    "finest detail": tuple(diffraction.GridPlate(torch.ones(6, 6), pitch) for pitch in (1.0, 2.0)),
 }
 
 
@@ -259,13 +251,3 @@ def test_gradients_reach_the_tensors_a_thin_lens_is_given():
     assert float(slope) == pytest.approx(-0.3 / (1.02 * 50**2), rel=1e-12)
     kept = torch.nn.Parameter(torch.tensor(50.0, dtype=D))
     assert ThinLens(kept, 10.0).efl_mm is kept
-
-
-def test_what_cannot_be_replaced_or_frozen_gets_a_sentence():
-    with pytest.raises(DomainError, match="no tensor 'radius'; it has efl_mm, image_distance_mm"):
-        ThinLens(50.0, 10.0).replace(radius=torch.tensor(1.0))
-    geo = lens.load("la1509")
-    geo.variables("curvature")
-    with pytest.raises(DomainError, match="made from variables"):
-        geo.freeze("curvature_per_mm")
-    assert not math.isnan(float(geo.freeze().first_order().efl_mm))

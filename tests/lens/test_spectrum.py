@@ -1,12 +1,9 @@
 """Spectra against closed forms: strata of simple curves, Wien's and Planck's laws, the white point of D65,
 absorption of silicon."""
 
-import math
-
 import numpy as np
 import pytest
 
-from codesign.errors import DomainError, ShapeError
 from codesign.lens.spectrum import LINE_UM, Spectrum, blackbody, daylight_d65, silicon_response
 
 FLAT = (np.array([0.4, 0.7]), np.array([1.0, 1.0]))
@@ -131,56 +128,3 @@ def test_a_thick_layer_counts_every_visible_photon():
     assert value[visible] / w[visible] == pytest.approx(
         np.full(visible.sum(), value[visible][0] / w[visible][0]), rel=1e-12
     )
-
-
-@pytest.mark.parametrize(("wavelengths", "weights", "error", "sentence"), [
-    ((0.5,), (0.5, 0.5), ShapeError, "one weight each"),
-    ((), (), ShapeError, "1 to 1000 wavelengths"),
-    ((0.5,) * 1001, (1 / 1001,) * 1001, ShapeError, "1 to 1000 wavelengths"),
-    ((587.6,), (1.0,), DomainError, "in micrometres"),
-    ((math.nan,), (1.0,), DomainError, "in micrometres"),
-    ((0.5, 0.6), (0.5, 0.6), DomainError, "sum to 1.1"),
-    ((0.5, 0.6), (1.5, -0.5), DomainError, "at least 0"),
-    ((0.5, 0.6), (0.5, math.nan), DomainError, "sum to nan"),
-    (("x",), (1.0,), ShapeError, "sequences of numbers"),
-    (0.5, 1.0, ShapeError, "sequences of numbers"),
-])  # fmt: skip
-def test_spectra_that_cannot_be_are_refused(wavelengths, weights, error, sentence):
-    with pytest.raises(error, match=sentence):
-        Spectrum(wavelengths, weights)
-
-
-@pytest.mark.parametrize(("response", "illuminant", "count", "error", "sentence"), [
-    (FLAT, FLAT, 0, DomainError, "whole number from 1 to 1000"),
-    (FLAT, FLAT, 2.0, DomainError, "whole number"),
-    (FLAT, FLAT, True, DomainError, "whole number"),
-    (FLAT, (np.array([0.8, 0.9]), np.ones(2)), 3, DomainError, "share no wavelengths"),
-    (FLAT, (np.array([400.0, 700.0]), np.ones(2)), 3, DomainError, "give micrometres"),
-    (FLAT, (np.array([0.7, 0.4]), np.ones(2)), 3, DomainError, "must increase"),
-    (FLAT, (np.array([0.4, 0.7]), np.array([1.0, -1.0])), 3, DomainError, "at least 0"),
-    (FLAT, (np.array([0.4, 0.7]), np.array([1.0, math.nan])), 3, DomainError, "finite"),
-    (FLAT, (np.array([0.4, 0.7]), np.array([1.0, math.inf])), 3, DomainError, "finite"),
-    (FLAT, (np.array([0.4, 0.7]), np.zeros(2)), 3, DomainError, "not all 0"),
-    (FLAT, (np.array([0.4, math.nan]), np.ones(2)), 3, DomainError, "must increase"),
-    (FLAT, (np.array([0.4, 0.5, 0.7]), np.ones(2)), 3, ShapeError, r"got \(3,\) and \(2,\)"),
-    (FLAT, (np.array([0.4]), np.ones(1)), 3, ShapeError, "2 <= N"),
-    (FLAT, 3.0, 3, ShapeError, "must be a pair"),
-    (FLAT, ("ab", "cd"), 3, ShapeError, "must be a pair"),
-    ((np.array([0.4, 0.5, 0.7]), np.array([1.0, 0, 0])), (np.array([0.4, 0.5, 0.7]), np.array([0, 0, 1.0])), 3, DomainError, "zero everywhere"),
-])  # fmt: skip
-def test_curves_that_cannot_be_are_refused(response, illuminant, count, error, sentence):
-    with pytest.raises(error, match=sentence):
-        Spectrum.from_curves(response, illuminant, count)
-
-
-def test_named_curves_refuse_what_they_cannot_give():
-    for temperature_k in (0, -5, 1e9, math.nan):
-        with pytest.raises(DomainError, match="500 to 100000 K"):
-            blackbody(temperature_k)
-    with pytest.raises(DomainError, match="depth"):
-        silicon_response(0)
-    with pytest.raises(DomainError, match="known lines: i, h, g"):
-        Spectrum.line("q")
-    for weights in ((0, 0, 0), (1, math.nan, 1), (math.inf, 1, 1)):
-        with pytest.raises(DomainError, match="not all 0"):
-            Spectrum.visible_FdC(weights)

@@ -7,22 +7,28 @@ import pytest
 import torch
 
 from codesign import lens
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError
 from codesign.grad.jacobian import by_autograd
 from codesign.lens import GeoLens, Glass, Surface
 from codesign.lens.design import groups, moved_element
-from codesign.lens.design.solves import focus_paraxial, focus_rays
 from codesign.lens.design.tolerance import (
     LINEAR_FIGURES,
+    Error,
+    Tolerances,
     compare,
     compensated,
+    errors_of,
+    forecast_spot,
     linear_figures,
     monte_carlo,
+    perturbed,
     sensitivities,
+    spot_errors,
+    squared_spots,
     worst_offenders,
 )
-from codesign.lens.design.tolerance_errors import Error, Tolerances, errors_of, perturbed
-from codesign.lens.design.tolerance_spot import forecast_spot, spot_errors, squared_spots
+from codesign.lens.solves import focus_paraxial, focus_rays
+from tests.lens.systems import PLANE, glass
 
 D = torch.float64
 FIELD = math.radians(20)
@@ -37,29 +43,8 @@ def triplet():
 
 def singlet():
     return GeoLens(
-        [
-            Surface(60.0, 5.0, Glass.from_indices(1.5, 1.5, 1.5), 8.0, is_stop=True),
-            Surface(-90.0, 70.0, None, 8.0),
-        ],
-        10.0,
+        [Surface(60.0, 5.0, glass(1.5), 8.0, is_stop=True), Surface(-90.0, 70.0, None, 8.0)], 10.0
     ).freeze()
-
-
-def test_a_surface_between_equal_glasses_can_be_wrong():
-    """At the d line a buried surface bends nothing, at other wavelengths it does; a stop in air never."""
-    crown = Glass.from_indices(1.52, 1.51, 1.505, "crown")
-    flint = Glass.from_indices(1.53, 1.51, 1.50, "flint")
-    geo = GeoLens(
-        [
-            Surface(50.0, 3.0, crown, 8.0),
-            Surface(-40.0, 3.0, flint, 8.0),
-            Surface(-90.0, 2.0, None, 8.0),
-            Surface(math.inf, 50.0, None, 5.0, is_stop=True),
-        ],
-        8.0,
-    )
-    names = [e.name for e in errors_of(geo, Tolerances(radius_relative=1e-3, fringes=1.0))]
-    assert names == [f"curvature of surface {i}" for i in (1, 2, 3)]
 
 
 def efl(geo):
@@ -67,108 +52,52 @@ def efl(geo):
 
 
 def test_the_errors_of_a_lens_by_name_and_size():
-    found = {
-        e.name: e
-        for e in errors_of(
-            singlet(),
-            Tolerances(
-                radius_relative=1e-3,
-                radius_mm=0.1,
-                fringes=2.0,
-                thickness_mm=0.02,
-                index=1e-4,
-                decentre_mm=0.01,
-                tilt_deg=0.1,
-            ),
-        )
-    }
-    assert (
-        len(found) == 2 + 1 + 1 + 4 + 4
-    )  # curvatures, a thickness (the last is the focus), an index, decentres, tilts
-    c = 1 / 60
-    assert found["curvature of surface 1"].deviation == pytest.approx(
-        math.hypot(c * 1e-3, c * c * 0.1, 2 * 546.074e-6 / 64), rel=1e-12
-    )
-    assert found["thickness behind surface 1"] == Error(
-        "thickness behind surface 1", "thickness_mm", (0,), 0.02
-    )
-    assert found["tilt of surface 2 about y"].at == (1, 1)
-    assert found["tilt of surface 2 about y"].deviation == pytest.approx(math.radians(0.1), rel=1e-15)
-
-
-def test_fringes_are_half_wavelengths_of_sag():
     """N rings mean that the sag at the edge is off by N half wavelengths."""
-    geo = singlet()
-    rings = 3.0
-    error = errors_of(geo, Tolerances(fringes=rings))[0]
-
-    def sag(curvature):
-        return (1 - math.sqrt(1 - (curvature * 8) ** 2)) / curvature
-
-    change = sag(1 / 60 + error.deviation) - sag(1 / 60)
-    assert change == pytest.approx(
-        rings * 546.074e-6 / 2, rel=0.03
-    )  # a^2 / 2 is the first term of the sag: a^2 / R^2 = 2 % off in slope
-
-
-def test_a_stop_in_air_and_a_plane_have_no_radius_to_get_wrong():
-    geo = GeoLens(
-        [
-            Surface(math.inf, 2.0, None, 5.0, is_stop=True),
-            Surface(math.inf, 4.0, Glass.named("N-BK7"), 8.0),
-            Surface(-40.0, 70.0, None, 8.0),
-        ],
-        8.0,
-    ).freeze()
-    assert [e.name for e in errors_of(geo, Tolerances(radius_relative=1e-3))] == ["curvature of surface 3"]
-    assert [e.name for e in errors_of(geo, Tolerances(fringes=1.0))] == [
-        "curvature of surface 2",
-        "curvature of surface 3",
-    ]
-    assert {e.at[0] for e in errors_of(geo, Tolerances(decentre_mm=0.1))} == {1, 2}
+    sizes = {"radius_relative": 1e-3, "radius_mm": 0.1, "fringes": 2.0, "thickness_mm": 0.02, "index": 1e-4}
+    errors = errors_of(singlet(), Tolerances(**sizes, decentre_mm=0.01, tilt_deg=0.1))
+    # curvatures, a thickness (the last is the focus), an index, decentres, tilts
+    assert len(errors) == 2 + 1 + 1 + 4 + 4
+    found = {e.name: e for e in errors}
+    c = 1 / 60
+    curvature = math.hypot(c * 1e-3, c * c * 0.1, 2 * 546.074e-6 / 64)
+    assert found["curvature of surface 1"].deviation == pytest.approx(curvature, rel=1e-12)
+    thickness = "thickness behind surface 1"
+    assert found[thickness] == Error(thickness, "thickness_mm", (0,), 0.02)
+    tilt = found["tilt of surface 2 about y"]
+    assert (tilt.at, tilt.deviation) == ((1, 1), pytest.approx(math.radians(0.1), rel=1e-15))
+    bent = c + errors_of(singlet(), Tolerances(fringes=3.0))[0].deviation
+    sag = [(1 - math.sqrt(1 - (k * 8) ** 2)) / k for k in (c, bent)]
+    # a^2 / 2 is the first term of the sag: a^2 / R^2 = 2 % off in slope
+    assert sag[1] - sag[0] == pytest.approx(3 * 546.074e-6 / 2, rel=0.03)
 
 
 def test_the_perturbed_lens_has_the_errors_and_nothing_else(triplet):
     errors = errors_of(triplet, ALL)
-    amounts = torch.zeros(len(errors), dtype=D)
-    at = next(k for k, e in enumerate(errors) if e.name == "decentre of surface 3 in y")
-    amounts[at] = 2.0
+    amounts = torch.tensor([2.0 * (e.name == "decentre of surface 3 in y") for e in errors], dtype=D)
     faulty = perturbed(triplet, errors, amounts)
-    assert float(faulty.decentre_mm[2, 1]) == pytest.approx(0.02, rel=1e-14)
+    assert faulty.decentre_mm[2].tolist() == [0.0, pytest.approx(0.02, rel=1e-14)]
     assert int((faulty.decentre_mm != 0).sum()) == 1
     for name in ("curvature_per_mm", "thickness_mm", "index_offset", "tilt_rad"):
         assert torch.equal(getattr(faulty, name), getattr(triplet, name))
-    with pytest.raises(ShapeError, match="38 errors"):
-        perturbed(triplet, errors, amounts[:-1])
 
 
 def test_sensitivities_of_the_focal_length_by_the_lens_makers_equation():
     geo = singlet()
     t = Tolerances(radius_relative=1e-3, thickness_mm=0.02, index=5e-4)
-    found = sensitivities(geo, t, efl, by_autograd)[0]
-
-    def f(r1, r2, d, n):
-        return 1 / ((n - 1) * (1 / r1 - 1 / r2 + (n - 1) * d / (n * r1 * r2)))
-
-    step = 1e-4  # central differences of the formula: bend 1e-8, rounding 1e-11
-
-    def change(**by):
-        return f(**{k: v + by.get(k, 0.0) for k, v in (("r1", 60.0), ("r2", -90.0), ("d", 5.0), ("n", 1.5))})
-
-    def slope(key):
-        return (change(**{key: step}) - change(**{key: -step})) / (2 * step)
-
+    found = sensitivities(geo, t, efl, by_autograd)[0].tolist()
+    r1, r2, d, n = (torch.tensor(v, dtype=D, requires_grad=True) for v in (60.0, -90.0, 5.0, 1.5))
+    f = 1 / ((n - 1) * (1 / r1 - 1 / r2 + (n - 1) * d / (n * r1 * r2)))
+    by_r1, by_r2, by_d, by_n = (float(v) for v in torch.autograd.grad(f, (r1, r2, d, n)))
     # an error adds a share of |curvature| to the curvature: the front gets stronger, the back, which is
     # negative, weaker
     truth = {
-        "curvature of surface 1": -slope("r1") * 60 * 1e-3,
-        "thickness behind surface 1": slope("d") * 0.02,
-        "index behind surface 1": slope("n") * 5e-4,
-        "curvature of surface 2": -slope("r2") * 90 * 1e-3,
+        "curvature of surface 1": -by_r1 * 60 * 1e-3,
+        "thickness behind surface 1": by_d * 0.02,
+        "index behind surface 1": by_n * 5e-4,
+        "curvature of surface 2": -by_r2 * 90 * 1e-3,
     }
-    assert dict(zip((e.name for e in errors_of(geo, t)), found.tolist(), strict=True)) == {
-        name: pytest.approx(value, rel=1e-6) for name, value in truth.items()
-    }
+    names = [e.name for e in errors_of(geo, t)]
+    assert dict(zip(names, found, strict=True)) == pytest.approx(truth, rel=1e-12)
 
 
 def test_analytic_sensitivities_agree_with_differences(triplet):
@@ -182,74 +111,62 @@ def test_analytic_sensitivities_agree_with_differences(triplet):
 
 def test_a_decentred_thin_element_shifts_the_image_by_the_prism_it_makes():
     """Both surfaces of a thin lens shifted by s shift its axial image by s, whatever the lens."""
-    geo = GeoLens(
-        [
-            Surface(100.0, 1e-6, Glass.from_indices(1.5, 1.5, 1.5), 8.0, is_stop=True),
-            Surface(-100.0, 100.0, None, 8.0),
-        ],
-        2.0,
-    ).freeze()
+    thin = Surface(100.0, 1e-6, glass(1.5), 8.0, is_stop=True), Surface(-100.0, 100.0, None, 8.0)
+    geo = GeoLens(thin, 2.0).freeze()
     t = Tolerances(decentre_mm=0.01)
-    slopes = sensitivities(geo, t, linear_figures(0.05))
-    names = [e.name for e in errors_of(geo, t)]
-    pair = [names.index(f"decentre of surface {i} in x") for i in (1, 2)]
-    assert float(slopes[3, pair].sum()) == pytest.approx(
-        0.01, rel=2e-3
-    )  # aberration of an f/50 lens: (y / R)^2 = 1e-4 and its kin
-    assert float(slopes[4, pair].abs().max()) <= 1e-12
+    shifts = sensitivities(geo, t, linear_figures(0.05))[3:]
+    pair = [e.name.endswith("in x") for e in errors_of(geo, t)]
+    # aberration of an f/50 lens: (y / R)^2 = 1e-4 and its kin
+    assert float(shifts[0, pair].sum()) == pytest.approx(0.01, rel=2e-3)
+    assert float(shifts[1, pair].abs().max()) <= 1e-12
 
 
 def test_linear_forecast_and_trials_agree(triplet):
     figures = linear_figures(FIELD)
     slopes = sensitivities(triplet, ALL, figures)
-    trials = monte_carlo(triplet, ALL, figures, 400, torch.Generator().manual_seed(0))
+    trials = monte_carlo(triplet, ALL, figures, 200, torch.Generator().manual_seed(0))
     found = compare(slopes, trials)
     assert trials.failed == 0
-    # 400 trials know a standard deviation to 1 / sqrt(800) = 3.5 %: four such errors
-    torch.testing.assert_close(found.forecast / found.simulated, torch.ones(5, dtype=D), rtol=0, atol=0.14)
+    # 200 trials know a standard deviation to 1 / sqrt(400) = 5 %: three such errors
+    torch.testing.assert_close(found.forecast / found.simulated, torch.ones(5, dtype=D), rtol=0, atol=0.15)
     # errors of a thousandth bend their effect by about as much
     assert float(found.correlation.min()) >= 0.9999
-    assert float(found.bias.abs().max()) <= 4 / 400**0.5
-    quantiles = trials.quantiles((0.5,))[0]
-    torch.testing.assert_close(quantiles, trials.figures.median(0).values, rtol=0.01, atol=1e-3)
+    assert float(found.bias.abs().max()) <= 4 / 200**0.5
+    median = trials.figures.quantile(0.5, dim=0)
+    torch.testing.assert_close(trials.quantiles((0.5,))[0], median, rtol=1e-12, atol=0)
 
 
 def test_a_refocus_takes_the_shift_of_the_image_plane_out(triplet):
     """With the image plane at the paraxial focus the back focal length still varies, but no error of the last
     thickness does."""
-    figures = linear_figures(FIELD)
     t = Tolerances(radius_relative=1e-3)
-    plain = sensitivities(triplet, t, figures)
-    solved = sensitivities(triplet, t, figures, compensate=focus_paraxial)
-    torch.testing.assert_close(plain[:2], solved[:2], rtol=1e-9, atol=1e-12)
-    fixed, refocused = (
-        squared_spots(
-            sensitivities(triplet, t, spot_errors((0.0,)), compensate=c).square().sum(1).sqrt(), 1
-        ).item()
-        for c in (None, focus_paraxial)
-    )
-    assert refocused < 0.05 * fixed  # defocus is most of what radii do to an axial spot
+    size = {}
+    for compensate in (None, focus_paraxial):
+        figures = sensitivities(triplet, t, linear_figures(FIELD), compensate=compensate)[:2]
+        errors = sensitivities(triplet, t, spot_errors((0.0,)), compensate=compensate)
+        size[compensate] = figures, errors.square().sum().item()
+    torch.testing.assert_close(size[None][0], size[focus_paraxial][0], rtol=1e-9, atol=1e-12)
+    # defocus is most of what radii do to an axial spot
+    assert size[focus_paraxial][1] < 0.05 * size[None][1]
 
 
 @pytest.mark.parametrize("refocus", [False, True])
 def test_the_quadratic_forecast_of_the_spot_agrees_with_trials(triplet, refocus):
     compensate = partial(focus_rays, fields_rad=FIELDS, grid=8) if refocus else None
     figure = spot_errors(FIELDS, grid=8)
-    nominal = compensated(figure, compensate)(triplet)
-    forecast = forecast_spot(nominal, sensitivities(triplet, ALL, figure, compensate=compensate), 3)
-    trials = monte_carlo(
-        triplet,
-        ALL,
-        lambda faulty: squared_spots(figure(faulty), 3),
-        200,
-        torch.Generator().manual_seed(1),
-        compensate=compensate,
-    )
+    slopes = sensitivities(triplet, ALL, figure, compensate=compensate)
+    forecast = forecast_spot(compensated(figure, compensate)(triplet), slopes, 3)
+    generator = torch.Generator().manual_seed(1)
+
+    def spots(faulty):
+        return squared_spots(figure(faulty), 3)
+
+    trials = monte_carlo(triplet, ALL, spots, 100, generator, compensate=compensate)
     predicted = forecast.at(trials.amounts)
     # lens by lens: what is left out is the bend of the rays, some 1 % of the spot here
     torch.testing.assert_close(predicted.mean(0), trials.figures.mean(0), rtol=0.02, atol=0)
-    for f in range(3):
-        assert float(torch.corrcoef(torch.stack([predicted[:, f], trials.figures[:, f]]))[0, 1]) >= 0.999
+    for pair in zip(predicted.T, trials.figures.T, strict=True):
+        assert float(torch.corrcoef(torch.stack(pair))[0, 1]) >= 0.999
     # the slope alone forecasts much less than what happens to the axial spot, and says nothing of the mean
     linear = trials.amounts @ forecast.linear.T
     if not refocus:
@@ -278,10 +195,9 @@ def test_the_nominal_spot_is_the_traced_one(triplet):
 def test_worst_offenders_share_the_whole_variance(triplet):
     slopes = sensitivities(triplet, ALL, linear_figures(FIELD))
     every = worst_offenders(triplet, ALL, slopes, 0, most=100)
+    sizes = [abs(change) for _, change, _ in every]
     assert sum(share for *_, share in every) == pytest.approx(1.0, rel=1e-12)
-    assert [abs(change) for _, change, _ in every] == sorted(
-        (abs(change) for _, change, _ in every), reverse=True
-    )
+    assert sizes == sorted(sizes, reverse=True)
     # a lens of strong surfaces: the steepest radii lead, and decentres do not change the focal length at
     # first order
     assert every[0][0].startswith("curvature of surface")
@@ -309,43 +225,41 @@ def test_trials_repeat_and_failures_are_counted(triplet):
     assert bool(trials.quantiles().isfinite().all())
 
 
-def test_wrong_input_is_refused(triplet):
-    with pytest.raises(DomainError, match="index is -1"):
-        Tolerances(index=-1.0)
-    with pytest.raises(DomainError, match="nothing varies"):
-        Tolerances()
-    with pytest.raises(DomainError, match="at least 1"):
-        monte_carlo(triplet, ALL, efl, 0, torch.Generator())
-    with pytest.raises(DomainError, match="too few"):
-        compare(
-            torch.zeros(1, 38, dtype=D), monte_carlo(triplet, ALL, efl, 2, torch.Generator().manual_seed(0))
-        )
-
-
 def test_tolerances_of_elements_move_them_as_bodies():
     geo = lens.load("double-gauss").freeze()
-    t = Tolerances(element_decentre_mm=0.01, element_tilt_deg=0.02, element_wedge_deg=0.03)
-    errors = errors_of(geo, t)
-    assert [e.name for e in errors[:6]] == [
-        "decentre of element 1-2 in x",
-        "decentre of element 1-2 in y",
-        "tilt of element 1-2 about x",
-        "tilt of element 1-2 about y",
-        "wedge of element 1-2 about x",
-        "wedge of element 1-2 about y",
-    ]
-    assert len(errors) == 6 * len(groups(geo)) == 24
-    amounts = torch.zeros(24, dtype=D)
-    amounts[[6, 9, 16]] = torch.tensor([2.0, -1.0, 3.0], dtype=D)
-    assert [errors[k].name for k in (6, 9, 16)] == [
-        "decentre of element 3-5 in x",
-        "tilt of element 3-5 about y",
-        "wedge of element 7-9 about x",
-    ]
-    wanted = moved_element(
-        geo, (2, 4), torch.tensor([0.02, 0.0], dtype=D), torch.tensor([0.0, -math.radians(0.02)], dtype=D)
+    errors = errors_of(
+        geo, Tolerances(element_decentre_mm=0.01, element_tilt_deg=0.02, element_wedge_deg=0.03)
     )
-    wanted = moved_element(wanted, (6, 8), wedge_rad=torch.tensor([3 * math.radians(0.03), 0.0], dtype=D))
-    found = perturbed(geo, errors, amounts)
+    assert len(errors) == 6 * len(groups(geo)) == 24
+    drawn = {
+        "decentre of element 3-5 in x": 2.0,
+        "tilt of element 3-5 about y": -1.0,
+        "wedge of element 7-9 about x": 3.0,
+    }
+    assert drawn.keys() < {e.name for e in errors}
+    found = perturbed(geo, errors, torch.tensor([drawn.get(e.name, 0.0) for e in errors], dtype=D))
+    wanted = moved_element(geo, (2, 4), [0.02, 0.0], [0.0, -math.radians(0.02)])
+    wanted = moved_element(wanted, (6, 8), wedge_rad=[3 * math.radians(0.03), 0.0])
     for tensor in ("decentre_mm", "tilt_rad", "thickness_mm"):
         torch.testing.assert_close(getattr(found, tensor), getattr(wanted, tensor), rtol=1e-12, atol=1e-16)
+
+
+@pytest.mark.parametrize(
+    ("t", "first", "bent"),
+    [
+        # a plane keeps its radius but not its fringes; a stop in air has none of it
+        (Tolerances(radius_relative=1e-3), "curvature", (2, 3, 4)),
+        (Tolerances(fringes=1.0), "curvature", (1, 2, 3, 4)),
+        (Tolerances(decentre_mm=0.1), "decentre", (1, 2, 3, 4)),
+    ],
+)
+def test_stops_and_planes_have_less_to_get_wrong(t, first, bent):
+    """At the d line a buried surface bends nothing, at other wavelengths it does; a stop in air never."""
+    crown = Glass.from_indices(1.52, 1.51, 1.505, "crown")
+    flint = Glass.from_indices(1.53, 1.51, 1.50, "flint")
+    faces = (PLANE, 3.0, crown), (-40.0, 3.0, flint), (-90.0, 2.0, crown), (-80.0, 50.0, None)
+    stop = Surface(PLANE, 5.0, None, 5.0, is_stop=True)
+    geo = GeoLens([stop, *(Surface(*face, 8.0) for face in faces)], 8.0)
+    found = errors_of(geo, t)
+    assert {e.name.split()[0] for e in found} == {first}
+    assert {e.at[0] for e in found} == set(bent)

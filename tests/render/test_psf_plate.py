@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from codesign import lens, render
-from codesign.lens import plates
+from codesign.lens import diffraction
 from codesign.lens.analysis import geometric_psf
 
 D = torch.float64
@@ -21,13 +21,13 @@ def moments(energy):
 
 def plated_map(plate):
     geo = lens.load("cooke-triplet").scaled(0.22).requires_grad_(False).focus_at(0.56)
-    plated = plates.with_plate(geo, plate, z_mm=0.3)
+    plated = diffraction.with_plate(geo, plate, z_mm=0.3)
     camera = render.Camera(plated, 33, 33, pixel_pitch_mm=PITCH)
     return plated, render.psf_map(camera, nearest_m=0.3)
 
 
 def test_the_map_of_a_plated_lens_is_that_of_its_rays():
-    plate = plates.ZernikePlate({4: 0.3, 7: 0.8, 8: 0.9, 9: -0.6, 10: 0.6}, 0.9).requires_grad_(False)
+    plate = diffraction.ZernikePlate({4: 0.3, 7: 0.8, 8: 0.9, 9: -0.6, 10: 0.6}, 0.9).requires_grad_(False)
     plated, found = plated_map(plate)
     for at_m in (0.3, 5.0):
         mean, square = moments(found.energy(torch.tensor([at_m]))[0, 0])
@@ -38,7 +38,7 @@ def test_the_map_of_a_plated_lens_is_that_of_its_rays():
 
 
 def test_its_gradient_reaches_the_plate():
-    plate = plates.ZernikePlate({7: 0.8, 11: 0.5}, 0.9)
+    plate = diffraction.ZernikePlate({7: 0.8, 11: 0.5}, 0.9)
 
     def mean():
         return moments(plated_map(plate)[1].energy(torch.tensor([0.3]))[0, 0])[0].sum()

@@ -7,7 +7,7 @@ import torch
 
 from codesign import lens
 from codesign.lens.analysis.rays import trace_source
-from codesign.lens.design.tolerance_spot import spot_errors, squared_spots
+from codesign.lens.design.tolerance import spot_errors, squared_spots
 from studies.frame.run import open_run
 from studies.lens_opt.task import LIGHT, SENSOR_PX, LensTask
 from studies.lens_tolerance import needed

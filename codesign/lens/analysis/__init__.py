@@ -2,19 +2,25 @@
 field curvature, colour, depth of field."""
 
 from codesign.doors import explain
-from codesign.lens.analysis.chromatic import chromatic_focus_shift_mm, lateral_colour_mm
 from codesign.lens.analysis.depth_of_field import (
     DepthOfField,
     depth_of_field,
     hyperfocal_m,
     traced_depth_of_field,
 )
-from codesign.lens.analysis.distortion import chief_height_mm, distortion_percent
-from codesign.lens.analysis.fans import RayFan, ray_fan
-from codesign.lens.analysis.field_curvature import focus_shift_mm
+from codesign.lens.analysis.field_curves import (
+    RayFan,
+    chief_height_mm,
+    chromatic_focus_shift_mm,
+    distortion_percent,
+    focus_shift_mm,
+    lateral_colour_mm,
+    ray_fan,
+    through_focus_mtf,
+    through_focus_spot_mm,
+)
 from codesign.lens.analysis.mtf import diffraction_mtf, geometric_mtf, ideal_mtf
 from codesign.lens.analysis.psf import Psf, diffraction_psf, geometric_psf, psf_on_pixels
-from codesign.lens.analysis.pupil import PupilFunction, pupil_function
 from codesign.lens.analysis.rays import (
     ImageRays,
     Light,
@@ -32,7 +38,6 @@ from codesign.lens.analysis.spots import (
     spot_radius_mm,
     spots,
 )
-from codesign.lens.analysis.through_focus import through_focus_mtf, through_focus_spot_mm
 from codesign.lens.analysis.wavefront import (
     Wavefront,
     peak_to_valley_waves,
@@ -42,6 +47,7 @@ from codesign.lens.analysis.wavefront import (
     strehl_marechal,
     wavefront,
 )
+from codesign.lens.diffraction.pupil import PupilFunction, pupil_function
 
 __all__ = [
     "DepthOfField",

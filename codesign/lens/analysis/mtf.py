@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.lens.analysis.pupil import pupil_function
 from codesign.lens.analysis.rays import Light, Values, chief_ray, spectral_lines
 from codesign.lens.analysis.spots import polychromatic_spot
+from codesign.lens.diffraction.pupil import pupil_function
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM

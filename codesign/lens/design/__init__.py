@@ -3,7 +3,6 @@ motion."""
 
 from codesign.doors import explain
 from codesign.lens.design.constraints import Limits
-from codesign.lens.design.element_errors import moved_element
 from codesign.lens.design.glass_map import neighbour_glasses
 from codesign.lens.design.hits import fit_apertures
 from codesign.lens.design.modes import LensDesign, detune, edge_thickness_mm, make_design
@@ -11,12 +10,13 @@ from codesign.lens.design.moves import (
     elements,
     flattened,
     groups,
+    moved_element,
     with_glass,
     without_element,
     without_surface,
 )
-from codesign.lens.design.solves import focus_paraxial, focus_rays, hold_efl
-from codesign.lens.design.tolerance_errors import Tolerances
+from codesign.lens.design.tolerance import Tolerances
+from codesign.lens.solves import focus_paraxial, focus_rays, hold_efl
 
 __all__ = [
     "LensDesign",

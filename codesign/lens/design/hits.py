@@ -14,8 +14,7 @@ from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_p
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.paraxial import paraxial_rays
-from codesign.lens.plated import trace
-from codesign.lens.trace import onward
+from codesign.lens.trace import onward, trace
 
 DENSER = 1.5  # index behind a surface whose normal is looked for: no ray is totally reflected
 

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis import rms_spot_mm, spots
-from codesign.lens.design.solves import hold_efl, holding_surface
 from codesign.lens.geolens import LEARNABLES, GeoLens
+from codesign.lens.solves import hold_efl, holding_surface
 from codesign.lens.surface import sag_mm
 from codesign.lens.variables import ray_motion
 

@@ -22,9 +22,7 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
-from codesign.lens.design.tolerance import Compensator, Figures, compensated
-from codesign.lens.design.tolerance_errors import Error, perturbed
-from codesign.lens.design.tolerance_spot import SpotForecast
+from codesign.lens.design.tolerance import Compensator, Error, Figures, SpotForecast, compensated, perturbed
 from codesign.lens.distance import real_numbers
 from codesign.lens.geolens import GeoLens
 

@@ -1,4 +1,4 @@
-"""What manufacturing errors do to a lens: sensitivities, their linear forecast, and Monte Carlo to judge it.
+"""What manufacturing errors do to a lens: the errors, their sensitivities, linear forecasts, and Monte Carlo to judge.
 
     tolerances = Tolerances(radius_relative=1e-3, thickness_mm=0.02, index=5e-4, element_decentre_mm=0.01)
     J = sensitivities(geo, tolerances, linear_figures(0.3))
@@ -7,23 +7,174 @@
 A figure is a function from a lens to a vector [K]. Errors are independent, normal, and each number of
 Tolerances is one standard deviation. A compensator is a function from the faulty lens to the one that is used, such
 as ``functools.partial(solves.focus_rays, fields_rad=(0.0, 0.3), grid=8)``; every function takes it the same way.
+
+The spot: near an optimum its slope vanishes, so the linear forecast fails; the ray errors themselves stay linear.
+With r the ray errors of the nominal lens about their spot's mean (divided by the root of the ray count, so
+that r.r is the squared RMS spot) and A their change per standard deviation of each error, an error e gives |r
++ A e|^2. For independent normal e this has mean r.r + tr(A^T A) and variance 4 |A^T r|^2 + 2 tr((A^T A)^2).
+What is left out is the curvature of the rays themselves, r . d2r / de2.
 """
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from codesign.errors import DomainError
+from codesign.errors import DomainError, ShapeError
 from codesign.grad.jacobian import Jacobian, by_differences, finite
 from codesign.lens.analysis import spots
-from codesign.lens.design.tolerance_errors import Error, Tolerances, errors_of, perturbed
-from codesign.lens.distance import PARALLEL, one_distance, vergence_per_mm
+from codesign.lens.design.constraints import is_glass
+from codesign.lens.design.moves import groups, moved_element
+from codesign.lens.distance import PARALLEL, Distances, one_distance, vergence_per_mm
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.paraxial import image_scale_mm
+from codesign.lens.surface import passes_of
+
+OF_ELEMENT = "element "  # before the argument of ``moved_element``
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Standard deviations of independent normal errors, all at least 0; 0 leaves that kind out.
+
+    radius_relative: of every radius, as a share. radius_mm: of every radius, mm. fringes: rings of Newton's
+      power fringes over the semi-aperture, at 546 nm (N rings change the curvature by N wavelength /
+      semi-aperture^2). The three add in squares.
+    thickness_mm: of every thickness but the last, which is the focus. index: of every glass, the same at
+      every wavelength.
+    decentre_mm: of every surface, in x and in y. tilt_deg: of every surface, about x and about y.
+    element_decentre_mm, element_tilt_deg, element_wedge_deg: of every element, a cemented group being one, moved as a
+      rigid body; in x and y, and about x and y. See ``element_errors.moved_element``.
+    """
+
+    radius_relative: float = 0.0
+    radius_mm: float = 0.0
+    fringes: float = 0.0
+    thickness_mm: float = 0.0
+    index: float = 0.0
+    decentre_mm: float = 0.0
+    tilt_deg: float = 0.0
+    element_decentre_mm: float = 0.0
+    element_tilt_deg: float = 0.0
+    element_wedge_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 <= value < math.inf:
+                raise DomainError(
+                    f"tolerance {name} is {value}; it is a standard deviation, a finite number of at least 0."
+                )
+        if not any(vars(self).values()):
+            raise DomainError("all tolerances are 0, so nothing varies; give at least one.")
+
+
+@dataclass(frozen=True)
+class Error:
+    """One independent error: a name with the surfaces counted from 1, the lens tensor (or the argument of
+    ``moved_element``) and the entry it changes, and its standard deviation."""
+
+    name: str
+    tensor: str
+    at: tuple[int, ...]
+    deviation: float
+
+    @property
+    def drawn(self) -> str:
+        """The tolerance of a drawing it falls under: the name without the axis."""
+        return re.sub(r" (in|about) [xy]$", "", self.name)
+
+
+def errors_of(lens: GeoLens, tolerances: Tolerances | Sequence[Error]) -> list[Error]:
+    """The independent errors of a lens under ``tolerances``, a list of Error, surface by surface and then element by
+    element; errors given as such stay as they are. A plane keeps its radius but not its fringes.
+
+    Surfaces that do not bend light (a stop in air) have no shape or place to get wrong.
+    Raises: DomainError for tolerances of elements with a mirror in them, or that the light passes twice.
+    """
+    if not isinstance(tolerances, Tolerances):
+        return list(tolerances)
+    found = []
+    glass = is_glass(lens)
+    t = tolerances
+    for i, (c, a) in enumerate(
+        zip(lens.curvature_per_mm.tolist(), lens.semi_aperture_mm.tolist(), strict=True)
+    ):
+        where = f"surface {i + 1}"
+        bends = (
+            glass[i] or (i > 0 and glass[i - 1]) or lens.mirrors[i]
+        )  # even where both have one index today
+        curvature = (
+            math.hypot(c * t.radius_relative, c * c * t.radius_mm, t.fringes * 0.546074e-3 / a**2)
+            if bends
+            else 0.0
+        )
+        found.append(Error(f"curvature of {where}", "curvature_per_mm", (i,), curvature))
+        if i + 1 < len(glass):
+            found.append(Error(f"thickness behind {where}", "thickness_mm", (i,), t.thickness_mm))
+        if glass[i] and not lens.mirrors[i]:
+            found.append(Error(f"index behind {where}", "index_offset", (i,), t.index))
+        for axis, label in enumerate("xy"):
+            found.append(
+                Error(f"decentre of {where} in {label}", "decentre_mm", (i, axis), t.decentre_mm * bends)
+            )
+            found.append(
+                Error(
+                    f"tilt of {where} about {label}", "tilt_rad", (i, axis), math.radians(t.tilt_deg) * bends
+                )
+            )
+    of_elements = t.element_decentre_mm or t.element_tilt_deg or t.element_wedge_deg
+    for g, (first, last) in enumerate(groups(lens) if of_elements else ()):
+        _check_body(lens, first, last)
+        for kind, deviation in (
+            ("decentre_mm", t.element_decentre_mm),
+            ("tilt_rad", math.radians(t.element_tilt_deg)),
+            ("wedge_rad", math.radians(t.element_wedge_deg)),
+        ):
+            noun = kind.split("_")[0]
+            side = "in" if noun == "decentre" else "about"
+            for axis, label in enumerate("xy"):
+                name = f"{noun} of element {first + 1}-{last + 1} {side} {label}"
+                found.append(Error(name, OF_ELEMENT + kind, (g, axis), deviation))
+    return [error for error in found if error.deviation > 0]
+
+
+def _check_body(lens, first, last):
+    surfaces = lens.to_surfaces()
+    if any(lens.mirrors[first : last + 1]) or any(passes_of(surfaces, i) for i in range(first, last)):
+        raise DomainError(
+            f"{lens.name}: element {first + 1}-{last + 1} holds a mirror or is passed twice by the light, and moving it "
+            "as a body is not modelled; give tolerances of surfaces instead of elements."
+        )
+
+
+def perturbed(lens: GeoLens, errors: Sequence[Error], amounts: Tensor) -> GeoLens:
+    """The lens with errors of ``amounts`` [P] standard deviations. Gradient: to the amounts and to the
+    lens."""
+    if amounts.shape != (len(errors),):
+        raise ShapeError(f"{len(errors)} errors need as many amounts, got shape {tuple(amounts.shape)}.")
+    tensors = {}
+    bodies = {}
+    elements = groups(lens)
+    for name in dict.fromkeys(e.tensor for e in errors):
+        mine = [k for k, e in enumerate(errors) if e.tensor == name]
+        of_element = name.startswith(OF_ELEMENT)
+        base = lens.decentre_mm.new_zeros(len(elements), 2) if of_element else getattr(lens, name)
+        places = tuple(torch.tensor(axis) for axis in zip(*(errors[k].at for k in mine), strict=True))
+        sizes = torch.tensor([errors[k].deviation for k in mine], dtype=base.dtype, device=base.device)
+        faulty = base.index_put(places, sizes * amounts[mine], accumulate=True)
+        if of_element:
+            bodies[name.removeprefix(OF_ELEMENT)] = faulty
+        else:
+            tensors[name] = faulty
+    lens = lens.replace(**tensors)
+    for g, faces in enumerate(elements if bodies else ()):
+        lens = moved_element(lens, faces, **{name: table[g] for name, table in bodies.items()})
+    return lens
+
 
 Figures = Callable[[GeoLens], Tensor]
 Compensator = Callable[[GeoLens], GeoLens]
@@ -194,3 +345,80 @@ def worst_offenders(
     total = float(row.square().sum())
     order = row.abs().argsort(descending=True)[:most].tolist()
     return [(errors[k].name, float(row[k]), float(row[k]) ** 2 / total if total else 0.0) for k in order]
+
+
+@dataclass(frozen=True)
+class SpotForecast:
+    """Per field: nominal [F] squared RMS spot, linear [F, P] its slope 2 A^T r, added [F, P] the diagonal of
+    A^T A (mean square that each error adds), square [F, P, P] all of A^T A. In mm^2 and per standard
+    deviation."""
+
+    nominal: Tensor
+    linear: Tensor
+    added: Tensor
+    square: Tensor
+
+    @property
+    def mean(self) -> Tensor:
+        """Expected squared RMS spot, [F] mm^2."""
+        return self.nominal + self.added.sum(1)
+
+    @property
+    def deviation(self) -> Tensor:
+        """Standard deviation of the squared RMS spot, [F] mm^2."""
+        return (self.linear.square().sum(1) + 2 * self.square.square().sum((1, 2))).sqrt()
+
+    @property
+    def linear_deviation(self) -> Tensor:
+        """The same from the slope alone; far too small near an optimum."""
+        return torch.linalg.vector_norm(self.linear, dim=1)
+
+    def at(self, amounts: Tensor) -> Tensor:
+        """Squared RMS spot forecast for errors of ``amounts`` [N, P] standard deviations, [N, F] mm^2."""
+        return (
+            self.nominal
+            + amounts @ self.linear.T
+            + torch.einsum("np,fpq,nq->nf", amounts, self.square, amounts)
+        )
+
+
+def spot_errors(
+    fields_rad: Sequence[float],
+    wavelengths_um: Sequence[float] = (WAVELENGTH_UM["d"],),
+    grid: int = 12,
+    at_m: Distances = PARALLEL,
+) -> Callable[[GeoLens], Tensor]:
+    """The figure lens -> [F * M * 2]: ray errors about the mean point of their field over all wavelengths,
+    mm, divided by the root of the ray count.
+
+    Args: at_m: metres to the object plane; of D distances each counts as so many more fields, [D * F * M * 2].
+    Raises: DomainError when a ray fails.
+    """
+
+    def figure(lens):
+        found = [spots(lens, fields_rad, w, grid, at_m) for w in wavelengths_um]
+        position = torch.cat([p.flatten(0, -3) for p, _ in found], 1)
+        arrived = torch.cat([a.flatten(0, -2) for _, a in found], 1)
+        if not bool(arrived.bool().all()):
+            raise DomainError(
+                f"{lens.name}: {int((arrived == 0).sum())} rays fail; the forecast needs every ray, so use "
+                "smaller tolerances or fields."
+            )
+        return ((position - position.mean(1, keepdim=True)) / position.shape[1] ** 0.5).reshape(-1)
+
+    return figure
+
+
+def squared_spots(errors: Tensor, fields: int) -> Tensor:
+    """Squared RMS spots [F] mm^2 out of what ``spot_errors`` gives; fields: their number, times that of distances."""
+    return errors.reshape(fields, -1).square().sum(1)
+
+
+def forecast_spot(nominal: Tensor, slopes: Tensor, fields: int) -> SpotForecast:
+    """SpotForecast from ray errors [F * M * 2] and their sensitivities [F * M * 2, P]."""
+    r = nominal.reshape(fields, -1)
+    A = slopes.reshape(fields, -1, slopes.shape[1])
+    square = torch.einsum("fmp,fmq->fpq", A, A)
+    return SpotForecast(
+        r.square().sum(1), 2 * torch.einsum("fmp,fm->fp", A, r), square.diagonal(dim1=1, dim2=2), square
+    )

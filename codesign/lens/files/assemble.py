@@ -7,9 +7,8 @@ import math
 import torch
 
 from codesign.errors import FileFormatError
-from codesign.lens.files.system import FileLens
+from codesign.lens.files.system import FileLens, placed, unfold
 from codesign.lens.files.text import MOST_SURFACES
-from codesign.lens.files.unfold import placed, unfold
 from codesign.lens.geolens import GeoLens
 from codesign.lens.surface import Surface, sag_mm
 

@@ -5,8 +5,7 @@ import re
 from collections.abc import Iterator
 
 from codesign.errors import FileFormatError
-from codesign.lens.files.seq_glass import PrivateGlasses
-from codesign.lens.files.seq_surface import IDLE, SURFACE, SeqSurface
+from codesign.lens.files.seq_surface import IDLE, SURFACE, PrivateGlasses, SeqSurface
 from codesign.lens.files.system import FileLens
 from codesign.lens.files.text import MOST_SURFACES, at, lines, number, shown, title, whole
 

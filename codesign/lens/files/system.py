@@ -1,9 +1,12 @@
-"""A lens as files describe it: signed along a fixed axis, in the file's unit, with pupil and field given in
-many ways."""
+"""A lens as files describe it, and its way to light that always travels along +z in millimetres.
 
+Files are signed along a fixed axis, in a unit of their own, with pupil and field given in many ways."""
+
+import dataclasses
 import math
 from dataclasses import dataclass, field
 
+from codesign.errors import FileFormatError
 from codesign.lens.glass import Glass
 from codesign.lens.surface import Phase
 
@@ -59,3 +62,116 @@ class FileLens:
     focus: bool = False
     defocus: float = 0.0
     image_tilt_deg: float = 0.0
+
+
+ROUNDING = (
+    1e-9  # of a length in the file's unit; a gap negative by less is a rounding error and counts as none
+)
+
+
+def unfold(lens: FileLens) -> list[FileSurface]:
+    """The surfaces with lengths in millimetres and all signs along the light; dummy planes at which the light
+    steps back are folded away.
+
+    Args: lens: FileLens. Returns: list of FileSurface; the last thickness is 0 where the paraxial focus is to
+      be solved for.
+    Raises: FileFormatError when the light would have to travel backwards.
+    """
+    found = []
+    sign = 1.0
+    medium = None
+    for surface in lens.surfaces:
+        before = sign
+        sign = -sign if surface.mirror else sign
+        medium = medium if surface.mirror else surface.medium
+        found.append(
+            dataclasses.replace(
+                in_mm(surface, lens.unit_mm, before),
+                thickness=surface.thickness * lens.unit_mm * sign,
+                medium=medium,
+            )
+        )
+    if found:
+        found[-1].thickness = 0.0 if lens.focus else found[-1].thickness + lens.defocus * lens.unit_mm * sign
+    return _without_steps_back(found)
+
+
+def placed(surfaces: list[FileSurface]) -> list[FileSurface]:
+    """The surfaces of ``unfold`` with thicknesses along the axis of the image plane, where coordinate breaks moved
+    some; as they were elsewhere. Raises: FileFormatError as there."""
+    depths = [surface.depth for surface in surfaces] + [0.0]
+    found = []
+    sign = 1.0
+    for surface, depth, behind in zip(surfaces, depths, depths[1:], strict=False):
+        if depth is None or behind is None:
+            return surfaces
+        sign = -sign if surface.mirror else sign
+        found.append(dataclasses.replace(surface, thickness=sign * (behind - depth) + 0.0))
+    return _without_steps_back(found)
+
+
+def in_mm(surface: FileSurface, unit_mm: float, sign: float) -> FileSurface:
+    """The surface in millimetres, its shape and tilt mirrored in z where ``sign`` is -1; its thickness is
+    left alone."""
+    asphere = tuple(sign * a * unit_mm ** (-1 - 2 * i) for i, a in enumerate(surface.asphere))
+    phase = surface.phase and dataclasses.replace(
+        surface.phase,
+        coefficients=tuple(a * unit_mm ** (-2 - 2 * i) for i, a in enumerate(surface.phase.coefficients)),
+    )
+    aperture = None if surface.semi_aperture is None else surface.semi_aperture * unit_mm
+    x, y = surface.decentre
+    about_x, about_y = surface.tilt_deg
+    return dataclasses.replace(
+        surface,
+        curvature=sign * surface.curvature / unit_mm,
+        asphere=asphere,
+        phase=phase,
+        semi_aperture=aperture,
+        inner=surface.inner * unit_mm,
+        decentre=(x * unit_mm, y * unit_mm),
+        depth=None if surface.depth is None else surface.depth * unit_mm,
+        tilt_deg=(sign * about_x + 0.0, sign * about_y + 0.0),
+    )
+
+
+def is_dummy(surface: FileSurface, medium_before: Glass | None) -> bool:
+    """Whether a surface does nothing to any ray: a plane within one medium that neither stops nor turns
+    light."""
+    plain = (
+        surface.curvature == 0 and not any(surface.asphere) and surface.phase is None and not surface.mirror
+    )
+    return (
+        plain
+        and surface.medium == medium_before
+        and not surface.is_stop
+        and not surface.fixed
+        and surface.inner == 0
+    )
+
+
+def _without_steps_back(surfaces):
+    i = 0
+    while i < len(surfaces):
+        if surfaces[i].thickness >= 0:
+            i += 1
+        elif surfaces[i].thickness > -ROUNDING:
+            surfaces[i].thickness = 0.0
+        elif is_dummy(surfaces[i], surfaces[i - 1].medium if i else None):
+            gap = surfaces.pop(i).thickness
+            if i:
+                i -= 1
+                surfaces[i].thickness += gap
+        elif i + 1 < len(surfaces) and is_dummy(surfaces[i + 1], surfaces[i].medium):
+            surfaces[i].thickness += surfaces.pop(i + 1).thickness
+        else:
+            raise FileFormatError(
+                f"surface {surfaces[i].label}: the light would travel {-surfaces[i].thickness:.6g} mm "
+                "backwards behind it; "
+                "give every thickness along the light (its sign turns at each mirror)."
+            )
+    if not surfaces or not all(math.isfinite(s.thickness) for s in surfaces):
+        raise FileFormatError(
+            "no surface is left between object and image, or one lies infinitely far; give finite distances "
+            "between real surfaces."
+        )
+    return surfaces

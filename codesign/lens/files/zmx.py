@@ -8,10 +8,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from codesign.errors import FileFormatError
-from codesign.lens.files.frames import along, place
 from codesign.lens.files.system import FileLens, FileSurface
 from codesign.lens.files.text import MOST_SURFACES, at, lines, number, shown, title, whole
-from codesign.lens.files.zmx_surface import KEYWORDS, Entry
+from codesign.lens.files.zmx_surface import KEYWORDS, Entry, along, place
 
 UNITS_MM = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "INCH": 25.4, "M": 1000.0, "METER": 1000.0}
 FIELDS = ("angle", "object height", "image height", "image height")

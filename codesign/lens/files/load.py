@@ -1,5 +1,6 @@
-"""Load a lens by name or from a file."""
+"""Load a lens by name or from a file, and save one."""
 
+import json
 import math
 import os
 import warnings
@@ -7,17 +8,18 @@ from pathlib import Path
 
 import torch
 
+from codesign.atomic import replacing
 from codesign.errors import FileFormatError
 from codesign.lens import catalogue
 from codesign.lens.files import page
 from codesign.lens.files.assemble import assemble
-from codesign.lens.files.deeplens import is_deeplens, read_deeplens
-from codesign.lens.files.diffoptics import read_diffoptics
-from codesign.lens.files.native import read_native
+from codesign.lens.files.native import read_native, to_page
 from codesign.lens.files.optiland import is_optiland, read_optiland
 from codesign.lens.files.seq import read_seq
+from codesign.lens.files.tables import is_deeplens, read_deeplens, read_diffoptics
 from codesign.lens.files.text import at, read_text, title
 from codesign.lens.files.zmx import read_zmx
+from codesign.lens.files.zmx_write import to_zmx
 from codesign.lens.geolens import GeoLens
 from codesign.reading import reading
 
@@ -88,3 +90,30 @@ def _from_json(text, name, dtype):
     if is_deeplens(found):
         return assemble(read_deeplens(found, name), dtype)
     return read_native(found, name, dtype)
+
+
+WRITERS = {".json": lambda lens: json.dumps(to_page(lens), indent=2, allow_nan=False) + "\n", ".zmx": to_zmx}
+
+
+def save(lens: GeoLens, path: str | Path) -> None:
+    """Write the lens's current values to a .json file, exactly, or to a .zmx file for other programs
+    (docs/lens_files.md says what that keeps).
+
+    A file that was there stays until the new one is whole.
+    Raises: FileFormatError when the place is not writable or the format cannot hold the lens; DomainError for
+      values that ``load`` would refuse.
+
+    Example:
+    >>> from codesign import lens
+    >>> lens.save(lens.load("cooke-triplet").scaled(0.5), "half.json")
+    >>> round(lens.load("half.json").first_order().efl_mm.item(), 1)  # half of 50 mm
+    25.0
+    """
+    path = Path(path)
+    if path.suffix.lower() not in WRITERS:
+        raise FileFormatError(
+            f"lens file {path}: extension '{path.suffix}' is not written; use {' or '.join(WRITERS)}."
+        )
+    text = WRITERS[path.suffix.lower()](lens)
+    with at(f"lens file {path}"), replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
+from codesign.lens.diffraction.field import Field, check_grid
 from codesign.lens.distance import real_number, real_numbers
-from codesign.lens.wave.field import Field, check_grid
 
 LOST = 1e-2  # share of the light that may leave the grid unless more is allowed
 # a field is taken as undersampled when more than the second share of its light lies beyond the first of the

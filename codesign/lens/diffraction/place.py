@@ -8,10 +8,10 @@ from torch import Tensor
 from codesign.errors import DomainError
 from codesign.lens import paraxial
 from codesign.lens.analysis.rays import source_rays
+from codesign.lens.diffraction.plates import Plate
 from codesign.lens.geolens import GeoLens
-from codesign.lens.plated import to_plate
-from codesign.lens.plates.plate import Plate
 from codesign.lens.surface import sag_mm
+from codesign.lens.trace import to_plate
 
 HEIGHTS = 65  # at which the room between surfaces is looked at
 ACROSS = 129  # points of the plate at which its steepest phase is looked for
@@ -22,10 +22,10 @@ def with_plate(lens: GeoLens, plate: Plate | None, surface: int | None = None, z
     """A lens with a phase plate in its stop or behind its last surface.
 
     >>> from codesign import lens
-    >>> from codesign.lens import plates
+    >>> from codesign.lens import diffraction
     >>> geo = lens.load("double-gauss")  # its stop is a plane in air
-    >>> plate = plates.ZernikePlate({11: 0.0}, radius_mm=11.0)
-    >>> plated = plates.with_plate(geo, plate)
+    >>> plate = diffraction.ZernikePlate({11: 0.0}, radius_mm=11.0)
+    >>> plated = diffraction.with_plate(geo, plate)
     >>> optimiser = torch.optim.Adam([*plate.parameters(), *geo.variables("focus")], lr=0.1)
 
     Args: plate: None takes the lens's plate out. surface: from 0; None is the stop, -1 the last surface. z_mm:
@@ -112,7 +112,7 @@ def plate_waves(
     p = lens.prescription(wavelength_um)
     placed = p.plate
     if placed is None:
-        raise DomainError(f"{lens.name} has no phase plate; give it one with plates.with_plate.")
+        raise DomainError(f"{lens.name} has no phase plate; give it one with diffraction.with_plate.")
     source = source_rays(lens, field_rad, pupil, at_m)
     rays = to_plate(p, placed, source.origin_mm, source.direction)
     phase, _, reaches = placed.look(rays.position_mm[:, :2])

@@ -19,8 +19,8 @@ class Field:
       [N // 2, N // 2]. pitch_mm: distance of the samples. wavelength_um: in vacuum, and the field lies in it.
 
     >>> import torch
-    >>> from codesign.lens import wave
-    >>> slit = wave.Field(torch.ones(64, 64, dtype=torch.complex128), 0.002, 0.55)
+    >>> from codesign.lens import diffraction
+    >>> slit = diffraction.Field(torch.ones(64, 64, dtype=torch.complex128), 0.002, 0.55)
     >>> float(slit.energy)  # (64 x 2 um)^2
     0.016384
     """

@@ -1,0 +1,82 @@
+"""Lenses that several tests ask for, and what they ask of them in one word."""
+
+import json
+import math
+
+import torch
+
+from codesign import lens
+from codesign.lens import GeoLens, Glass, Surface
+
+NAMES = ("cooke-triplet", "double-gauss", "la1509")
+LINES = (0.5875618, 0.4861327, 0.6562725)
+PLANE = math.inf
+
+
+def glass(n):
+    """A glass of one index at every wavelength."""
+    return Glass.from_indices(n, n, n)
+
+
+def efl(geo):
+    return geo.first_order().efl_mm.item()
+
+
+def half_field(name):
+    return math.radians(lens.half_field_deg(name))
+
+
+def reference(name, shared):
+    """The page of reference values of a published lens."""
+    return json.loads(shared(f"refs/lens/{name.replace('-', '_')}.json").read_text())
+
+
+def paraboloid(diameter=5.0, focal_mm=100.0, defocus_mm=0.0):
+    """A mirror that is perfect on its axis."""
+    surface = Surface(-2 * focal_mm, focal_mm + defocus_mm, None, 30.0, conic=-1.0, is_stop=True, mirror=True)
+    return GeoLens([surface], diameter)
+
+
+class Asked(torch.nn.Module):
+    """A figure of a lens as its forward pass, for torch.func."""
+
+    def __init__(self, geo, figure):
+        super().__init__()
+        self.geo, self.figure = geo, figure
+
+    def forward(self):
+        return self.figure(self.geo)
+
+
+def figure_of(geo, figure, parameters):
+    """The function of the values of some Parameters of a lens that a figure of the lens is."""
+    names = {id(value): name for name, value in geo.named_parameters()}
+
+    def function(*values):
+        given = {f"geo.{names[id(p)]}": value for p, value in zip(parameters, values, strict=True)}
+        return torch.func.functional_call(Asked(geo, figure), given, ())
+
+    return function
+
+
+def check_gradient(function, *values, step=1e-4, rel=1e-6, seed=0):
+    """The slope of a scalar function along a direction drawn for every tensor, in proportion to its size, against
+    central differences of fourth order."""
+    generator = torch.Generator().manual_seed(seed)
+    leaves = [v.detach().clone().requires_grad_() for v in values]
+    slopes = torch.autograd.grad(function(*leaves), leaves)
+    for at, (value, slope) in enumerate(zip(values, slopes, strict=True)):
+        value = value.detach()
+        drawn = torch.rand(value.shape, generator=generator, dtype=torch.float64).to(value) + 0.5
+        size = value.abs().mean() if value.any() else torch.ones_like(value.sum())
+        direction = drawn * torch.where(value == 0, size, value)
+
+        def moved(amount, at=at, value=value, direction=direction):
+            others = [v.detach() for v in values]
+            others[at] = value + amount * step * direction
+            return float(function(*others).detach())
+
+        truth = (8 * (moved(1) - moved(-1)) - (moved(2) - moved(-2))) / (12 * step)
+        found = float((slope * direction).sum())
+        assert abs(found - truth) <= rel * max(abs(truth), 1e-3 * float((slope * direction).abs().sum()))
+        assert truth != 0
