@@ -57,6 +57,11 @@ RENAMED: dict[str, str] = {
     "codesign.events.layers.positive.PositiveValues": "codesign.events.layers.layer.PositiveValues",
     "codesign.events.layers.settled.Settled": "codesign.events.layers.layer.Settled",
     "codesign.events.layers.hard.HardSensor": "codesign.events.layers.layer.HardSensor",
+    "codesign.lens.plates.plate": "codesign.lens.diffraction.plates",
+    "codesign.lens.wave.field": "codesign.lens.diffraction.field",
+    "codesign.lens.analysis.pupil": "codesign.lens.diffraction.pupil",
+    "codesign.lens.design.tolerance_errors": "codesign.lens.design.tolerance",
+    "codesign.lens.design.tolerance_spot": "codesign.lens.design.tolerance",
 }
 CLOSE = {torch.float64: 1e-12, torch.float32: 2e-6}
 WRONG_EACH = 4  # of an argument

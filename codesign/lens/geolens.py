@@ -169,7 +169,7 @@ class GeoLens(Replaceable):
           bounds: (low, high) per name, numbers or one per entry, None for no bound; reached only in the limit.
             Thicknesses and focus stay above 0 unless others are given.
           mask: per name, which of its entries (one per surface, gap, coefficient or glass) may vary.
-          keep_efl: whether the curvature of ``design.solves.holding_surface`` is solved for today's focal length.
+          keep_efl: whether the curvature of ``solves.holding_surface`` is solved for today's focal length.
           focus_at_m: the distance that stays in focus, the last thickness being solved for it; see ``focus_at``.
           fields_rad: fields of the bundle; None is 0, 0.7 and 1 of the half field (10 degrees where unknown).
         A number so weak that its natural step would be out of proportion (0.1 focal lengths of a thickness, a
