@@ -33,7 +33,7 @@ import torch
 from codesign import doors
 from codesign.errors import CodesignError
 
-ROOMS = "pose state types events flow grad lens optimise place render system task train".split()  # noqa: SIM905
+ROOMS = "pose state types events flow grad lens mount optimise render system train".split()  # noqa: SIM905
 KEPT = 2  # calls of a function
 SECONDS = 10  # of a wrong call
 RIGHT_S = 2.0  # of a right one that is worth repeating
