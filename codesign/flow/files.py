@@ -8,12 +8,14 @@ Middlebury: the float32 202021.25, width and height as int32, then (right, down)
   data format page; Baker et al., A database and evaluation methodology for optical flow, IJCV 2011.
 """
 
+import io
 import struct
 import zlib
 from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 
 from codesign.atomic import replacing
 from codesign.errors import DomainError, FileFormatError, ShapeError
@@ -28,6 +30,14 @@ FLO_LIMIT = 1e9
 PNG_START = b"\x89PNG\r\n\x1a\n"
 MOST_PIXELS = 64_000_000  # what a file may announce
 MOST_BYTES = 1_000_000_000
+
+
+def _chunk(name, data):
+    """Of a PNG."""
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+
+PNG_END = _chunk(b"IEND", b"")
 
 
 def write_flow(path: str | Path, flow_px: torch.Tensor, valid: torch.Tensor | None = None) -> None:
@@ -134,53 +144,29 @@ def _to_png(flow, valid):
     )  # every row as its difference from the one above (PNG filter 2), modulo 256
     header = struct.pack(">IIBBBBB", flow.shape[2], flow.shape[1], 16, 2, 0, 0, 0)
     return (
-        PNG_START
-        + _chunk(b"IHDR", header)
-        + _chunk(b"IDAT", zlib.compress(filtered.tobytes(), 3))
-        + _chunk(b"IEND", b"")
+        PNG_START + _chunk(b"IHDR", header) + _chunk(b"IDAT", zlib.compress(filtered.tobytes(), 3)) + PNG_END
     )
-
-
-def _chunk(name, data):
-    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
 def _from_png(path, content):
-    header = None
-    packed = []
-    for name, data in _chunks(path, content):
-        if name == b"IHDR" and len(data) == 13:
-            header = struct.unpack(">IIBBBBB", data)
-        packed += [data] if name == b"IDAT" else []
-    if header is None or header[2:] != (16, 2, 0, 0, 0):
-        found = (
-            "no header"
-            if header is None
-            else f"bit depth {header[2]}, colour type {header[3]}, interlacing {header[6]}"
-        )
+    if content[:8] != PNG_START:
+        raise FileFormatError(f"{path} is not a PNG file.")
+    if PNG_END not in content:
+        raise FileFormatError(f"{path} is cut off: its end mark is missing.")
+    with reading(path, "it is damaged"):
+        width, height, *kind = struct.unpack_from(">IIBBBBB", content, 16)
+    if kind != [16, 2, 0, 0, 0]:
         raise FileFormatError(
-            f"{path} is not a flow PNG (three channels of 16 bits, not interlaced): {found}."
+            f"{path} is not a flow PNG (three channels of 16 bits, not interlaced): bit depth {kind[0]}, colour type "
+            f"{kind[1]}, interlacing {kind[4]}."
         )
-    width, height = header[:2]
     if not 1 <= width * height <= MOST_PIXELS:
         raise FileFormatError(f"{path} announces {width} x {height} pixels; up to {MOST_PIXELS} are read.")
-    size = height * (1 + 6 * width)
-    with reading(path, "it is damaged: its pixels do not unpack"):
-        raw = zlib.decompressobj().decompress(b"".join(packed), size + 1)
-    if len(raw) != size:
-        raise FileFormatError(
-            f"{path} is damaged: {width} x {height} pixels need {size} bytes, it holds "
-            f"{'more' if len(raw) > size else len(raw)}."
-        )
-    rows = np.frombuffer(raw, np.uint8).reshape(height, 1 + 6 * width)
-    if rows[:, 0].max() > 4:
-        raise FileFormatError(f"{path} is damaged: row filter {rows[:, 0].max()} does not exist.")
-    pixels = (
-        _unfiltered(rows[:, 0], rows[:, 1:].reshape(height, width, 6))
-        .reshape(height, -1)
-        .view(">u2")
-        .reshape(height, width, 3)
-    )
+    with reading(path, "it is cut off or damaged"):
+        with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
+            image.verify()
+        high, low = (_bytes(content, order) for order in ("B", "L"))
+    pixels = high.astype(np.uint16) << 8 | low
     if pixels[..., 2].max() > 1:
         raise FileFormatError(
             f"{path} is not a flow PNG: its third channel reaches {pixels[..., 2].max()}, but holds 1 for "
@@ -189,52 +175,9 @@ def _from_png(path, content):
     return (pixels[..., :2].transpose(2, 0, 1).astype(np.float64) - OFFSET) / SCALE, pixels[..., 2] == 1
 
 
-def _chunks(path, content):
-    """Name and data of the chunks of a PNG, with their checksums verified."""
-    if content[:8] != PNG_START:
-        raise FileFormatError(f"{path} is not a PNG file.")
-    at = 8
-    while at < len(content):
-        length = int.from_bytes(content[at : at + 4], "big")
-        name = content[at + 4 : at + 8]
-        data = content[at + 8 : at + 8 + length]
-        check = content[at + 8 + length : at + 12 + length]
-        if len(check) != 4 or int.from_bytes(check, "big") != zlib.crc32(name + data):
-            raise FileFormatError(f"{path} is cut off or damaged at byte {at}.")
-        yield name, data
-        if name == b"IEND":
-            return
-        at += 12 + length
-    raise FileFormatError(f"{path} is cut off: its end mark is missing.")
-
-
-def _unfiltered(kinds, filtered):
-    """Pixels [H, W, 6] uint8 from filtered ones (PNG filters 0 to 4, one per row), along diagonals, on which
-    no pixel depends on another."""
-    if (kinds <= 2).all() and not (kinds == 1).any():
-        out = filtered.copy()
-        for row in range(1, len(out)):
-            if kinds[row] == 2:
-                out[row] += out[row - 1]
-        return out
-    height, width, _ = filtered.shape
-    out = np.zeros((height + 1, width + 1, 6), np.int16)  # a border of zeros above and to the left
-    for diagonal in range(height + width - 1):
-        row = np.arange(max(0, diagonal - width + 1), min(height, diagonal + 1))
-        column = diagonal - row
-        kind = kinds[row, None]
-        left = out[row + 1, column]
-        up = out[row, column + 1]
-        corner = out[row, column]
-        guess = left + up - corner
-        to_left = abs(guess - left)
-        to_up = abs(guess - up)
-        to_corner = abs(guess - corner)
-        paeth = np.where(
-            (to_left <= to_up) & (to_left <= to_corner), left, np.where(to_up <= to_corner, up, corner)
-        )
-        out[row + 1, column + 1] = (
-            filtered[row, column]
-            + np.select([kind == 1, kind == 2, kind == 3, kind == 4], [left, up, (left + up) // 2, paeth], 0)
-        ) & 255
-    return out[1:, 1:].astype(np.uint8)
+def _bytes(content, order):
+    """The upper bytes [H, W, 3] of a PNG of 16 bits, or the lower ones where ``order`` says that they stand first:
+    Pillow keeps one byte of each number."""
+    with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
+        image.tile = [(*tile[:3], f"RGB;16{order}") for tile in image.tile]
+        return np.asarray(image)

@@ -163,13 +163,13 @@ def test_files_cut_off_anywhere_are_refused_in_one_sentence(name, field, tmp_pat
         (png(2, 1, b"\0" * 7, depth=8), "bit depth 8"),
         (png(2, 1, b"\0" * 5, colour=0), "colour type 0"),
         (png(2, 1, b"\0" * 13, interlace=1), "interlacing 1"),
-        (png(2, 1, b"\0" * 12), "holds 12"),
-        (png(2, 1, b"\0" * 14), "holds more"),
-        (png(2, 1, b"\x05" + b"\0" * 12), "filter 5"),
+        (png(2, 1, b"\0" * 12), "cut off or damaged"),
+        (png(2, 1, b"\x05" + b"\0" * 12), "cut off or damaged"),
         (png(2, 1, b"\0" * 6 + b"\2" + b"\0" * 6), "third channel"),
         (png(2**31, 2**31 - 1, b""), "up to"),
-        (png(2, 1, b"\0" * 13)[:-20] + b"\0" * 20, "damaged"),
-        (png(4000, 4000, b"\0" * 20_000_000), "holds 20000000"),
+        (png(2, 1, b"\0" * 13)[:-20] + b"\0" * 20, "cut off"),
+        (png(2, 1, b"\0" * 13).replace(b"k\0v", b"k\0w"), "cut off or damaged"),
+        (png(4000, 4000, b"\0" * 20_000_000), "cut off or damaged"),
     ],
 )
 def test_pngs_that_are_no_flow_are_refused(content, sentence, tmp_path):
