@@ -14,8 +14,9 @@ from torch.fx.experimental.proxy_tensor import make_fx
 
 from codesign.atomic import replacing
 from codesign.errors import DomainError, ShapeError
-from codesign.flow.checks import MOST_SIDE_PX, check_count, check_kind, check_number, check_path, check_real
+from codesign.flow.checks import MOST_SIDE_PX, check_count, check_kind, check_path, check_real
 from codesign.flow.lk.lanes import plain_operations
+from codesign.flow.sources.windows import bin_times
 from codesign.optional import require
 from codesign.types import EventVolume
 
@@ -23,16 +24,9 @@ from codesign.types import EventVolume
 def evenly_timed(counts: Tensor, interval_s: float = 1.0) -> EventVolume:
     """EventVolume of counts [B, 2, bins, H, W] whose bins are those of codesign.events.from_stream: equally
     spaced nodes, the two at the ends collecting half."""
-    interval_s = check_number(interval_s, "interval_s", above=0.0)
     if check_real(counts, "the counts").ndim != 5 or counts.shape[1] != 2 or counts.shape[2] < 2:
         raise ShapeError(f"the counts are {list(counts.shape)}; [B, 2, bins >= 2, H, W] is needed.")
-    bins = counts.shape[2]
-    step = interval_s / (bins - 1)
-    centroid_s = torch.arange(bins, dtype=torch.float64) * step
-    centroid_s[0], centroid_s[-1] = step / 3, interval_s - step / 3
-    collected_s = torch.full((bins,), step, dtype=torch.float64)
-    collected_s[[0, -1]] /= 2
-    return EventVolume(counts, centroid_s, collected_s)
+    return EventVolume(counts, *bin_times(counts.shape[2], interval_s))
 
 
 def export(network: nn.Module, path: str | Path, height_px: int, width_px: int, batch: int = 1) -> None:

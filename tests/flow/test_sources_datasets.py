@@ -15,8 +15,8 @@ from codesign.errors import DomainError, FileFormatError, ShapeError
 from codesign.events.formats.hdf5_rows import Rows
 from codesign.events.stream import ordered
 from codesign.flow.sources import DatasetWindows, RecordingWindows, open_windows
-from codesign.flow.sources.chain import chained
-from codesign.flow.sources.collate import bin_times
+from codesign.flow.sources.windows import bin_times
+from codesign.flow.warp import chained
 from codesign.render import flow_and_occlusion
 from scenes import worlds
 from studies.frame.run import main

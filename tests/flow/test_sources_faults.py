@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from codesign.errors import DomainError, FileFormatError
 from codesign.flow.files import write_flow
 from codesign.flow.sources import SKIPPABLE, PacketOptions, read_packets, read_text_events
-from codesign.flow.sources.calibration import Calibration, read_calibration
-from codesign.flow.sources.windows import across, gaps
+from codesign.flow.sources.camera import Calibration, read_calibration
+from codesign.flow.sources.packet import across, gaps
 from tests.recording_case import DAVIS, ETH_CALIBRATION, eth_text, made
 
 WINDOWS = PacketOptions(window_s=0.02, start_s=0.0, size_px=DAVIS)

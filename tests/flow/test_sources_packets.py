@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from codesign.errors import DomainError, FileFormatError
 from codesign.flow.files import write_flow
 from codesign.flow.sources import PacketOptions, read_packets
-from codesign.flow.sources.calibration import read_calibration
+from codesign.flow.sources.camera import read_calibration
 from tests.recording_case import DAVIS, ETH_CALIBRATION, eth_text, made
 
 

@@ -12,7 +12,7 @@ from codesign.errors import CodesignError, FileFormatError
 from codesign.events.stream import ordered
 from codesign.flow.files import write_flow
 from codesign.flow.sources import DsecWindows, MvsecWindows, open_windows
-from codesign.flow.sources.rectified import splatted
+from codesign.flow.sources.dsec import splatted
 from studies.make_dataset.store import h5
 
 # DSEC

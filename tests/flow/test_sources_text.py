@@ -12,8 +12,13 @@ from scipy.spatial.transform import Rotation
 from codesign.errors import DomainError, FileFormatError
 from codesign.events.formats import text as text_events
 from codesign.flow.sources import read_text_events
-from codesign.flow.sources.attitude import read_gyroscope, read_poses
-from codesign.flow.sources.calibration import Calibration, read_calibration, signed_axes
+from codesign.flow.sources.camera import (
+    Calibration,
+    read_calibration,
+    read_gyroscope,
+    read_poses,
+    signed_axes,
+)
 from tests.recording_case import DAVIS, ETH_CALIBRATION, eth_text, made
 
 

@@ -8,10 +8,10 @@ from scipy.io import savemat
 
 from codesign.errors import FileFormatError, ShapeError
 from codesign.flow.files import write_flow
-from codesign.flow.sources.calibration import Calibration
+from codesign.flow.sources.camera import Calibration
 from codesign.flow.sources.camera_fit import CameraFit
-from codesign.flow.sources.chain import chained
 from codesign.flow.sources.truth import read_truth, size_of
+from codesign.flow.warp import chained
 
 SIZE = (12, 17)
 

@@ -11,8 +11,7 @@ import torch
 
 from codesign.flow import checkpoint, files
 from codesign.flow.sources import truth
-from codesign.flow.sources.attitude import read_gyroscope, read_poses
-from codesign.flow.sources.calibration import read_calibration
+from codesign.flow.sources.camera import read_calibration, read_gyroscope, read_poses
 from codesign.flow.sources.packet import PacketOptions
 from codesign.flow.sources.packets import read_packets
 from tests.hostile.seeds_events import Seed, arrays

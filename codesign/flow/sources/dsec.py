@@ -8,7 +8,7 @@ Source: Gehrig et al., "DSEC: A Stereo Event Camera Dataset for Driving Scenario
 """
 
 import re
-from collections.abc import Iterable
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -19,21 +19,16 @@ from codesign.errors import FileFormatError
 from codesign.events.formats.hdf5 import Hdf5Events
 from codesign.events.formats.hdf5_rows import Rows
 from codesign.flow.files import read_flow
-from codesign.flow.sources.collate import Crop, Sample, check_indices, check_lengths, collate
 from codesign.flow.sources.folders import natural
-from codesign.flow.sources.rectified import splatted
+from codesign.flow.sources.windows import Sample, Windows, check_lengths
 from codesign.reading import read_text
-from codesign.types import FlowWindows
 
 SIZE_PX = (480, 640)
 SLACK_US = 2000  # of the clock of the flow beyond the events
 PNG_START = b"\x89PNG\r\n\x1a\n"
 
 
-__all__ = ["DsecWindows"]
-
-
-class DsecWindows:
+class DsecWindows(Windows):
     """Windows of all sequences under a folder that have flow.
 
     Args:
@@ -53,43 +48,12 @@ class DsecWindows:
         seed: int = 0,
         size_px: tuple[int, int] = SIZE_PX,
     ) -> None:
-        self.bins = bins
-        self.crop = Crop(crop_px, seed)
-        self.size_px = (int(size_px[0]), int(size_px[1]))
-        self.crop.check(*self.size_px)
-        self.sequences = [Sequence(events, flow, self.size_px) for events, flow in _places(Path(folder))]
-        self.windows = [
-            (k, index) for k, sequence in enumerate(self.sequences) for index in range(len(sequence.files))
-        ]
-        check_lengths(
-            [(t1 - t0) * 1e-6 for sequence in self.sequences for t0, t1 in sequence.spans_us],
-            f"DSEC in {folder}",
-        )
-
-    def __len__(self) -> int:
-        return len(self.windows)
-
-    def batch(self, indices: Iterable[int] | Tensor) -> FlowWindows:
-        """FlowWindows of these samples, without frames; each depends on its index and the seed alone."""
-        return collate(
-            [
-                self.crop(index, self._sample(*self.windows[index]))
-                for index in check_indices(indices, len(self))
-            ]
-        )
-
-    def _sample(self, sequence, index):
-        sequence = self.sequences[sequence]
-        t0_us, t1_us = sequence.spans_us[index]
-        flow, valid = read_flow(sequence.files[index])
-        if tuple(valid.shape) != self.size_px:
-            raise FileFormatError(
-                f"{sequence.files[index]} has {valid.shape[1]} x {valid.shape[0]} px; {self.size_px[1]} x "
-                f"{self.size_px[0]} are needed."
-            )
-        t_us, x_px, y_px, on = sequence.rectified(t0_us, t1_us)
-        counts = splatted(t_us, x_px, y_px, on, t0_us, t1_us, self.bins, *self.size_px)
-        return Sample(counts, flow, valid, (t1_us - t0_us) * 1e-6)
+        size_px = int(size_px[0]), int(size_px[1])
+        sequences = [Sequence(events, flow, size_px) for events, flow in _places(Path(folder))]
+        windows = [(k, index) for k, sequence in enumerate(sequences) for index in range(len(sequence.files))]
+        spans_us = [span for sequence in sequences for span in sequence.spans_us]
+        check_lengths([(t1 - t0) * 1e-6 for t0, t1 in spans_us], f"DSEC in {folder}")
+        super().__init__(sequences, windows, bins, crop_px, seed)
 
 
 class Sequence:
@@ -117,6 +81,19 @@ class Sequence:
                 f"{flow} has a flow from {outside[0][0]} to {outside[0][1]} us; the events of {self.path} "
                 f"run from {first_us} to {last_us} us."
             )
+
+    def sample(self, bins: int, index: int) -> Sample:
+        """One window: its events, rectified, and its flow."""
+        t0_us, t1_us = self.spans_us[index]
+        flow, valid = read_flow(self.files[index])
+        if tuple(valid.shape) != self.size_px:
+            raise FileFormatError(
+                f"{self.files[index]} has {valid.shape[1]} x {valid.shape[0]} px; {self.size_px[1]} x "
+                f"{self.size_px[0]} are needed."
+            )
+        t_us, x_px, y_px, on = self.rectified(t0_us, t1_us)
+        counts = splatted(t_us, x_px, y_px, on, t0_us, t1_us, bins, *self.size_px)
+        return Sample(counts, flow, valid, (t1_us - t0_us) * 1e-6)
 
     def rectified(self, t0_us: int, t1_us: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(t_us, x_px, y_px, on) of the events of a window, on the rectified picture."""
@@ -175,3 +152,37 @@ def _flows(folder):
             if opened.read(8) != PNG_START:
                 raise FileFormatError(f"{file} is not a PNG file.")
     return files, [(int(found[1]), int(found[2])) for found in numbers if found]
+
+
+def splatted(
+    t_us: Tensor,
+    x_px: Tensor,
+    y_px: Tensor,
+    on: Tensor,
+    t0_us: int,
+    t1_us: int,
+    bins: int,
+    height_px: int,
+    width_px: int,
+) -> Tensor:
+    """Counts [2, bins, H, W] float32 of events at fractional places, as rectification leaves them, shared bilinearly by
+    four pixels and linearly by two bins.
+
+    Args:
+      t_us: [N] int64 within t0_us to t1_us.
+      x_px, y_px: [N] float.
+      on: [N] bool.
+    Events, and shares of them, that fall outside the picture are left out; everything else is conserved.
+    """
+    axes = []
+    for place in ((t_us - t0_us).double() / (t1_us - t0_us) * (bins - 1), y_px.double(), x_px.double()):
+        low = place.floor()
+        axes.append(((low.long(), 1 - (place - low)), (low.long() + 1, place - low)))
+    counts = torch.zeros(2 * bins * height_px * width_px, dtype=torch.float64)
+    for (bin_, of_time), (row, of_y), (column, of_x) in product(*axes):
+        share = of_x * of_y * of_time
+        inside = (column >= 0) & (column < width_px) & (row >= 0) & (row < height_px) & (bin_ < bins)
+        inside &= share > 0
+        cell = (((~on).long() * bins + bin_) * height_px + row) * width_px + column
+        counts.index_add_(0, cell[inside], share[inside])
+    return counts.reshape(2, bins, height_px, width_px).float()

@@ -4,13 +4,12 @@
 A flow of the file leads from its own time to the next one's, on the raw (distorted) pixels of the left
 camera; (0, 0) means that nothing was measured. The usual tests take windows between grey frames: dt = 1 from
 one to the next, dt = 4 to the fourth. There the flow is followed from its time on, whole intervals and linear
-parts of them (see chain), and is not valid where it leads out of what was measured.
+parts of them (``warp.chained``), and is not valid where it leads out of what was measured.
 Sources: Zhu et al., "The Multivehicle Stereo Event Camera Dataset", RA-L 2018; Zhu et al., EV-FlowNet, RSS
   2018 (dt = 1, 4).
 """
 
 import math
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +21,8 @@ from codesign.errors import DomainError, FileFormatError
 from codesign.events.formats.hdf5 import Hdf5Events
 from codesign.events.formats.hdf5_rows import Rows
 from codesign.events.volumes.volume import from_stream
-from codesign.flow.sources.chain import chained
-from codesign.flow.sources.collate import ALIKE, Crop, Sample, check_indices, collate
-from codesign.types import FlowWindows
+from codesign.flow.sources.windows import ALIKE, Sample, Windows
+from codesign.flow.warp import chained
 
 DATA = "_data.hdf5"
 FLOW = "_gt_flow_dist.npz"
@@ -32,7 +30,7 @@ COMPONENTS = ("x_flow_dist", "y_flow_dist")
 MOST_BYTES = 2**35  # of one of them: outdoors the file has 9.5 GB
 
 
-class MvsecWindows:
+class MvsecWindows(Windows):
     """Windows of the sequences of a folder.
 
     Args:
@@ -60,12 +58,10 @@ class MvsecWindows:
                 f"frames is {frames}; 1 or 4 grey frames per window, or 0 for the intervals of the true "
                 "flow, is possible."
             )
-        self.bins = bins
-        self.crop = Crop(crop_px, seed)
-        self.sequences = [Sequence(*files) for files in _places(Path(folder))]
+        sequences = [Sequence(*files) for files in _places(Path(folder))]
         found = [
             (k, *window)
-            for k, sequence in enumerate(self.sequences)
+            for k, sequence in enumerate(sequences)
             for window in sequence.windows(frames, span_s)
         ]
         if not found:
@@ -74,30 +70,9 @@ class MvsecWindows:
                 "the part asked for too short?"
             )
         middle = float(np.median([t1 - t0 for _, t0, t1 in found]))
-        self.windows = [window for window in found if abs(window[2] - window[1] - middle) <= ALIKE * middle]
-        self.left_out = len(found) - len(self.windows)
-        for sequence in self.sequences:
-            self.crop.check(*sequence.size_px)
-
-    def __len__(self) -> int:
-        return len(self.windows)
-
-    def batch(self, indices: Iterable[int] | Tensor) -> FlowWindows:
-        """FlowWindows of these samples, without frames; each depends on its index and the seed alone."""
-        return collate(
-            [
-                self.crop(index, self._sample(*self.windows[index]))
-                for index in check_indices(indices, len(self))
-            ]
-        )
-
-    def _sample(self, sequence, t0_s, t1_s):
-        sequence = self.sequences[sequence]
-        flow, valid = sequence.flow(t0_s, t1_s)
-        t0_us = round(t0_s * 1e6)
-        t1_us = round(t1_s * 1e6)
-        volume = from_stream(sequence.events.window(t0_us, t1_us, sequence.size_px), t0_us, t1_us, self.bins)
-        return Sample(volume.counts[0], flow.float(), valid, t1_s - t0_s)
+        windows = [window for window in found if abs(window[2] - window[1] - middle) <= ALIKE * middle]
+        self.left_out = len(found) - len(windows)
+        super().__init__(sequences, windows, bins, crop_px, seed)
 
 
 class Sequence:
@@ -150,6 +125,14 @@ class Sequence:
             for t0, t1 in zip(ends[0][: -ends[1]], ends[0][ends[1] :], strict=True)
             if first <= t0 and t1 <= last
         ]
+
+    def sample(self, bins: int, t0_s: float, t1_s: float) -> Sample:
+        """The window of these times."""
+        flow, valid = self.flow(t0_s, t1_s)
+        t0_us = round(t0_s * 1e6)
+        t1_us = round(t1_s * 1e6)
+        volume = from_stream(self.events.window(t0_us, t1_us, self.size_px), t0_us, t1_us, bins)
+        return Sample(volume.counts[0], flow.float(), valid, t1_s - t0_s)
 
     def flow(self, t0_s: float, t1_s: float) -> tuple[Tensor, Tensor]:
         """(flow_px [2, H, W], valid [H, W]) on the pixels of t0_s, to t1_s."""

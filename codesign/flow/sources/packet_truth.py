@@ -10,11 +10,16 @@ import torch
 from codesign.errors import FileFormatError
 from codesign.events.columns import EventColumns
 from codesign.flow.sources import folders
-from codesign.flow.sources.attitude import Attitude, read_gyroscope, read_poses
-from codesign.flow.sources.calibration import Calibration, read_calibration, signed_axes
-from codesign.flow.sources.packet import Packet, PacketOptions
+from codesign.flow.sources.camera import (
+    Attitude,
+    Calibration,
+    read_calibration,
+    read_gyroscope,
+    read_poses,
+    signed_axes,
+)
+from codesign.flow.sources.packet import Packet, PacketOptions, across, gaps
 from codesign.flow.sources.truth import TrueFlow, read_truth
-from codesign.flow.sources.windows import across, gaps
 from codesign.types import FlowField
 
 NO_TRUTH = "no true flow in some windows: "

@@ -14,9 +14,17 @@ from codesign.events.files import read_columns
 from codesign.events.formats.arrival import Asked
 from codesign.flow.checks import check_kind, check_path, check_size
 from codesign.flow.sources import folders, truth
-from codesign.flow.sources.packet import OUTSIDE, Packet, PacketOptions, check_options
+from codesign.flow.sources.packet import (
+    OUTSIDE,
+    Packet,
+    PacketOptions,
+    check_options,
+    covers,
+    spread,
+    windows,
+    without,
+)
 from codesign.flow.sources.packet_truth import NO_TRUTH, Truth, is_motion, packet, read_source
-from codesign.flow.sources.windows import covers, spread, windows, without
 from codesign.reading import open_regular, reading
 
 LONGEST_S = 1.0  # of a packet that is a file of its own

@@ -1,24 +1,24 @@
-"""Windows of any recording that ``read_packets`` reads, with true flow where it has some."""
+"""Training data, whichever of the layouts it has, and windows of any recording that ``read_packets`` reads."""
 
-from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from codesign.events.volumes.volume import from_stream
-from codesign.flow.checks import check_count
-from codesign.flow.sources.collate import Crop, Sample, check_indices, check_lengths, collate
-from codesign.flow.sources.packet import PacketOptions
+from codesign.flow.checks import check_path
+from codesign.flow.sources.dsec import DsecWindows
+from codesign.flow.sources.mvsec import DATA, MvsecWindows
+from codesign.flow.sources.packet import Packet, PacketOptions
 from codesign.flow.sources.packets import read_packets
-from codesign.types import FlowWindows
+from codesign.flow.sources.rendered import DatasetWindows
+from codesign.flow.sources.windows import Sample, Windows, check_lengths
 
 WINDOW_S = 0.02
 ALL = 2**31  # more windows than any recording has
 
 
-class RecordingWindows:
+class RecordingWindows(Windows):
     """Windows of a recording: events in text, arrays or an event file, packets with flow files, or a zip of either.
 
     Args:
@@ -38,27 +38,55 @@ class RecordingWindows:
         options: PacketOptions | None = None,
     ) -> None:
         options = options or PacketOptions(window_s=WINDOW_S)
-        self.bins = check_count(bins, "bins", 1)
-        self.crop = Crop(crop_px, seed)
         self.packets = read_packets(path, None, replace(options, count=options.count or ALL))
         if options.events is None:
             check_lengths([1e-6 * (packet.t1_us - packet.t0_us) for packet in self.packets], str(path))
-        for packet in self.packets:
-            self.crop.check(packet.stream.height_px, packet.stream.width_px)
+        windows = [(k,) for k in range(len(self.packets))]
+        super().__init__([_Window(packet) for packet in self.packets], windows, bins, crop_px, seed)
 
-    def __len__(self) -> int:
-        return len(self.packets)
 
-    def batch(self, indices: Iterable[int] | Tensor) -> FlowWindows:
-        """FlowWindows of these samples, without frames; each depends on its index and the seed alone."""
-        return collate([self.crop(index, self._sample(index)) for index in check_indices(indices, len(self))])
+@dataclass(frozen=True)
+class _Window:
+    packet: Packet
 
-    def _sample(self, index):
-        packet = self.packets[index]
-        counts = from_stream(packet.stream, packet.t0_us, packet.t1_us, self.bins).counts[0]
+    @property
+    def size_px(self):
+        return self.packet.stream.height_px, self.packet.stream.width_px
+
+    def sample(self, bins):
+        packet = self.packet
+        counts = from_stream(packet.stream, packet.t0_us, packet.t1_us, bins).counts[0]
         if packet.truth is None or packet.translates:  # what rotation alone says is no truth then
             flow = torch.zeros(2, *counts.shape[-2:])
             valid = torch.zeros(counts.shape[-2:], dtype=torch.bool)
         else:
             flow, valid = packet.truth.flow_px[0].float(), packet.truth.valid[0]
         return Sample(counts, flow, valid, 1e-6 * (packet.t1_us - packet.t0_us))
+
+
+def open_windows(
+    folder: str | Path,
+    bins: int = 8,
+    window_frames: int = 1,
+    crop_px: tuple[int, int] | None = None,
+    seed: int = 0,
+    window_s: float = WINDOW_S,
+) -> DatasetWindows | DsecWindows | MvsecWindows | RecordingWindows:
+    """The source of windows that a folder or file is: one of our data sets, DSEC, MVSEC, or a recording.
+
+    Args: bins: of the volumes. window_frames: frame intervals per window (our data sets), or grey frames
+      (MVSEC); DSEC has its own windows.
+      crop_px: (height, width) of a piece at a random place, or None. seed: of that place.
+      window_s: length of the windows of a recording, seconds.
+    Returns: DatasetWindows, DsecWindows, MvsecWindows or RecordingWindows: ``len(source)`` and
+      ``source.batch(indices)``.
+    Raises: FileFormatError when nothing of these is there, or something in it is missing or damaged.
+    """
+    folder = check_path(folder, "the data set or recording")
+    if (folder / "manifest.json").is_file() or (folder / "frames.h5").is_file():
+        return DatasetWindows(folder, bins, window_frames, crop_px=crop_px, seed=seed)
+    if next(folder.rglob(f"*{DATA}"), None) is not None:
+        return MvsecWindows(folder, window_frames, bins, crop_px, seed)
+    if next(folder.rglob("forward_timestamps.txt"), None) is not None:
+        return DsecWindows(folder, bins, crop_px, seed)
+    return RecordingWindows(folder, bins, crop_px, seed, PacketOptions(window_s=window_s))

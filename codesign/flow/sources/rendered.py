@@ -14,16 +14,15 @@ from codesign.events.formats.hdf5 import Hdf5Events
 from codesign.events.formats.hdf5_rows import Rows
 from codesign.events.volumes.volume import from_stream
 from codesign.flow.sources.camera_fit import CameraFit
-from codesign.flow.sources.chain import chained
-from codesign.flow.sources.collate import Crop, Sample, check_indices, collate
+from codesign.flow.sources.windows import Sample, Windows
+from codesign.flow.warp import chained
 from codesign.reading import read_json, reading
-from codesign.types import FlowWindows
 
 FORMAT = "codesign-dataset/1"
 DONE = "sequence.json"
 
 
-class DatasetWindows:
+class DatasetWindows(Windows):
     """Windows of all sequences of a data set, one after the other.
 
     Args:
@@ -37,7 +36,7 @@ class DatasetWindows:
 
     Flow over one interval is the stored one. Over several, points of the static world are carried there by
     depth and poses through the camera's rays (exact to the fit of the camera, CameraFit.error_px); points of
-    moving objects, whose poses are not stored, along the flows in between (see chain).
+    moving objects, whose poses are not stored, along the flows in between (``warp.chained``).
     """
 
     def __init__(
@@ -55,50 +54,18 @@ class DatasetWindows:
                 f"window_frames is {window_frames}, stride_frames {stride_frames}; whole numbers from 1 are "
                 "needed."
             )
-        self.bins = bins
-        self.window_frames = window_frames
-        self.crop = Crop(crop_px, seed)
-        self.sequences = [Sequence(place, sizes) for place, sizes in _places(Path(folder), sequences)]
-        step = stride_frames or window_frames
-        self.windows = [
-            (k, first)
-            for k, sequence in enumerate(self.sequences)
-            for first in range(0, sequence.count - window_frames, step)
+        sequences = [Sequence(place, sizes) for place, sizes in _places(Path(folder), sequences)]
+        windows = [
+            (k, first, first + window_frames)
+            for k, sequence in enumerate(sequences)
+            for first in range(0, sequence.count - window_frames, stride_frames or window_frames)
         ]
-        if not self.windows:
+        if not windows:
             raise DomainError(
                 f"no sequence of {folder} has the {window_frames + 1} frames that windows of "
                 f"{window_frames} interval(s) need."
             )
-        for sequence in self.sequences:
-            self.crop.check(*sequence.size_px)
-
-    def __len__(self) -> int:
-        return len(self.windows)
-
-    def batch(self, indices: Iterable[int] | Tensor) -> FlowWindows:
-        """FlowWindows of these samples; each depends on its index and the seed alone."""
-        return collate(
-            [
-                self.crop(index, self._sample(*self.windows[index]))
-                for index in check_indices(indices, len(self))
-            ]
-        )
-
-    def _sample(self, sequence, first):
-        sequence = self.sequences[sequence]
-        last = first + self.window_frames
-        flow, valid = sequence.flow(first, last)
-        t0_us, t1_us = (int(sequence.times_us[k]) for k in (first, last))
-        volume = from_stream(sequence.events.window(t0_us, t1_us, sequence.size_px), t0_us, t1_us, self.bins)
-        frames = torch.from_numpy(np.stack([sequence.rows["frames"][k] for k in (first, last)]))
-        for values, name in ((frames, "frames"), (flow[:, valid], "flow marked as valid")):
-            if not bool(values.isfinite().all()):
-                raise FileFormatError(
-                    f"{sequence.folder / 'frames.h5'} holds {name} that is NaN or infinite, at frame {first} or {last}; "
-                    "make the sequence anew."
-                )
-        return Sample(volume.counts[0], flow, valid, (t1_us - t0_us) * 1e-6, frames)
+        super().__init__(sequences, windows, bins, crop_px, seed)
 
 
 class Sequence:
@@ -148,6 +115,20 @@ class Sequence:
         }
         self.rays = camera
         self.fit = None
+
+    def sample(self, bins: int, first: int, last: int) -> Sample:
+        """The window from one frame to another."""
+        flow, valid = self.flow(first, last)
+        t0_us, t1_us = (int(self.times_us[k]) for k in (first, last))
+        volume = from_stream(self.events.window(t0_us, t1_us, self.size_px), t0_us, t1_us, bins)
+        frames = torch.from_numpy(np.stack([self.rows["frames"][k] for k in (first, last)]))
+        for values, name in ((frames, "frames"), (flow[:, valid], "flow marked as valid")):
+            if not bool(values.isfinite().all()):
+                raise FileFormatError(
+                    f"{self.folder / 'frames.h5'} holds {name} that is NaN or infinite, at frame {first} or {last}; "
+                    "make the sequence anew."
+                )
+        return Sample(volume.counts[0], flow, valid, (t1_us - t0_us) * 1e-6, frames)
 
     def flow(self, first: int, last: int) -> tuple[Tensor, Tensor]:
         """(flow_px [2, H, W] float32, valid [H, W]) on the pixels of frame ``first``, to frame ``last``."""

@@ -1,99 +1,159 @@
-"""Where the windows of a recording lie, and where it has gaps."""
+"""Windows of recordings as samples to learn from: what every source of them shares, samples of a batch put together, and
+pieces cut out of large pictures."""
 
-from typing import TypeVar
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
-import numpy as np
+import torch
+from torch import Tensor
 
-from codesign.errors import DomainError
-from codesign.events.columns import EventColumns
-from codesign.flow.sources.packet import EMPTY, GAP, PacketOptions
+from codesign.errors import DomainError, ShapeError
+from codesign.flow.checks import check_count, check_number
+from codesign.types import EventVolume, FlowField, FlowWindows
 
-Choice = TypeVar("Choice")
-Window = tuple[int, int]
-WHOLE_S = 0.1  # a recording up to this long is one packet unless windows are asked for
-# otherwise
-WINDOW_S = 0.02
-PACKETS = 10
-# a gap: no event of the whole sensor for so long, and for so many times the mean time between events
-GAP_US = 10_000
-GAP_EVENTS = 100
+ALIKE = 0.05  # windows of one source may differ in length by this share
 
 
-def windows(
-    held: EventColumns, whole: Window, start_us: int, options: PacketOptions, in_turn: bool
-) -> tuple[list[Window], dict[str, int]]:
-    """Windows whose times no truth tells, and how many were left out by which fault.
+@dataclass(frozen=True)
+class Sample:
+    """counts: [2, bins, H, W]. flow_px: [2, H, W]. valid: [H, W]. seconds: length of the window. frames: [2,
+    H, W], or None."""
 
-    The whole of a short recording; otherwise some, one after the other where a start or flows are given
-    (``in_turn``), else spread evenly.
+    counts: Tensor
+    flow_px: Tensor
+    valid: Tensor
+    seconds: float
+    frames: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A piece of every picture, at a place that depends on the seed and the sample's number alone. size_px:
+    (height, width); None: the whole."""
+
+    size_px: tuple[int, int] | None
+    seed: int = 0
+
+    def check(self, height_px: int, width_px: int) -> None:
+        """Raise ShapeError unless the piece fits."""
+        if self.size_px is not None and not (
+            0 < self.size_px[0] <= height_px and 0 < self.size_px[1] <= width_px
+        ):
+            raise ShapeError(
+                f"pieces of {self.size_px[1]} x {self.size_px[0]} px were asked for; the pictures have "
+                f"{width_px} x {height_px}."
+            )
+
+    def __call__(self, index: int, sample: Sample) -> Sample:
+        """The piece of sample ``index``."""
+        if self.size_px is None:
+            return sample
+        height, width = sample.valid.shape
+        draw = torch.Generator().manual_seed((1_000_003 * self.seed + index) % 2**63)
+        top, left = (
+            int(torch.randint(n - m + 1, (), generator=draw))
+            for n, m in zip((height, width), self.size_px, strict=True)
+        )
+        cut = (..., slice(top, top + self.size_px[0]), slice(left, left + self.size_px[1]))
+        frames = None if sample.frames is None else sample.frames[cut]
+        return Sample(
+            sample.counts[cut].contiguous(),
+            sample.flow_px[cut].contiguous(),
+            sample.valid[cut].contiguous(),
+            sample.seconds,
+            frames,
+        )
+
+
+class Windows:
+    """A source of windows: ``len(source)`` and ``source.batch(indices)``.
+
+    Args:
+      sequences: each with ``size_px``, (height, width), and ``sample(bins, *window)``, a Sample.
+      windows: [(number of the sequence, *window)].
+      bins: of the volumes.
+      crop_px: (height, width) of a piece at a random place, or None.
+      seed: of that place.
     """
-    asked = options.window_s is not None or options.events is not None or options.count is not None
-    if not asked and options.start_s is None and whole[1] - whole[0] <= WHOLE_S * 1e6:
-        return [whole], {}
-    if options.events is not None:
-        first = int(np.searchsorted(held.t_us, start_us))
-        starts = range(first, len(held) - options.events + 1, options.events)
-        if not starts:
+
+    def __init__(
+        self,
+        sequences: Sequence[Any],
+        windows: Sequence[tuple[Any, ...]],
+        bins: int,
+        crop_px: tuple[int, int] | None,
+        seed: int,
+    ) -> None:
+        self.sequences = sequences
+        self.windows = windows
+        self.bins = check_count(bins, "bins", 1)
+        self.crop = Crop(crop_px, seed)
+        for sequence in sequences:
+            self.crop.check(*sequence.size_px)
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+    def batch(self, indices: Iterable[int] | Tensor) -> FlowWindows:
+        """FlowWindows of these samples; each depends on its index and the seed alone. Frames are None where a source has
+        none."""
+        chosen = [int(index) for index in indices]
+        if wrong := [index for index in chosen if not 0 <= index < len(self)]:
             raise DomainError(
-                f"{len(held) - first} events follow the start; windows of {options.events} need more."
+                f"sample {wrong[0]} was asked for; the source has {len(self)} (0 to {len(self) - 1})."
             )
-        ends = ((int(held.t_us[k]), int(held.t_us[k + options.events - 1])) for k in starts)
-        possible = [(t0, max(t1, t0 + 1)) for t0, t1 in ends]
-    else:
-        in_turn = in_turn or options.start_s is not None
-        length_us = round((options.window_s or min(WINDOW_S, (whole[1] - whole[0]) * 1e-6)) * 1e6)
-        number = (whole[1] - start_us) // length_us if length_us > 0 else 0
-        if number < 1:
-            raise DomainError(
-                f"the recording lasts {(whole[1] - whole[0]) * 1e-6:.6f} s; no window of {length_us * 1e-6:g} s "
-                "fits behind the start."
-            )
-        possible = [(start_us + k * length_us, start_us + (k + 1) * length_us) for k in range(number)]
-    kept, left_out = without(possible, held, options.skip)
-    count = options.count or PACKETS
-    return (kept[:count] if in_turn else spread(kept, count)), left_out
+        return collate([self.crop(index, self._sample(*self.windows[index])) for index in chosen])
+
+    def _sample(self, number, *window):
+        return self.sequences[number].sample(self.bins, *window)
 
 
-def without(
-    possible: list[Window], held: EventColumns, skip: tuple[str, ...]
-) -> tuple[list[Window], dict[str, int]]:
-    """The windows without those that ``skip`` names (EMPTY, GAP), and how many these were."""
-    left_out = {}
-    ends = np.array(possible, np.int64).reshape(-1, 2)
-    few = np.searchsorted(held.t_us, ends[:, 1] + 1) == np.searchsorted(held.t_us, ends[:, 0])
-    for fault, bad in ((EMPTY, few), (GAP, across(possible, gaps(held.t_us)))):
-        if fault in skip:
-            left_out[fault] = int(bad.sum())
-            few = few[~bad]
-            possible = [window for window, one in zip(possible, bad, strict=True) if not one]
-    if not possible:
-        raise DomainError(f"no window is left: {', '.join(f'{n} {name}' for name, n in left_out.items())}.")
-    return possible, left_out
+def collate(samples: Sequence[Sample]) -> FlowWindows:
+    """FlowWindows of samples. Flows stay those of each sample's own window; the times of the bins are those
+    of the mean window.
+
+    Raises: DomainError without a sample; ShapeError when sizes differ.
+    """
+    if not samples:
+        raise DomainError("a batch of no samples was asked for; give at least one index.")
+    if len({sample.counts.shape for sample in samples}) > 1:
+        raise ShapeError(
+            f"samples of shapes {sorted({tuple(sample.counts.shape) for sample in samples})} do not fit in "
+            "one batch; cut pieces of one size (crop_px)."
+        )
+    bins = samples[0].counts.shape[1]
+    seconds = sum(sample.seconds for sample in samples) / len(samples)
+    centroid_s, collected_s = bin_times(bins, seconds)
+    volume = EventVolume(torch.stack([sample.counts for sample in samples]), centroid_s, collected_s)
+    truth = FlowField(
+        torch.stack([sample.flow_px for sample in samples]),
+        torch.stack([sample.valid for sample in samples]),
+        seconds,
+    )
+    frames = [sample.frames for sample in samples if sample.frames is not None]
+    return FlowWindows(volume, truth, torch.stack(frames) if len(frames) == len(samples) else None)
 
 
-def gaps(t_us: np.ndarray) -> np.ndarray:
-    """Times without any event [N, 2], microseconds: at least 10 ms, and 100 times the mean time between events."""
-    least_us = max(GAP_US, GAP_EVENTS * float(t_us[-1] - t_us[0]) / max(len(t_us) - 1, 1)) if len(t_us) else 0
-    at = np.flatnonzero(np.diff(t_us) > least_us)
-    return np.stack([t_us[at], t_us[at + 1]], -1)
+def bin_times(bins: int, seconds: float) -> tuple[Tensor, Tensor]:
+    """(centroid_s, collected_s) [bins] of an even event rate, as events.from_stream has them."""
+    bins = check_count(bins, "bins", 1)
+    seconds = check_number(seconds, "the length of the interval", above=0.0)
+    if bins == 1:
+        return torch.tensor([seconds / 2], dtype=torch.float64), torch.tensor([seconds], dtype=torch.float64)
+    node = torch.arange(bins, dtype=torch.float64) / (bins - 1)
+    node[0], node[-1] = 1 / (3 * (bins - 1)), 1 - 1 / (3 * (bins - 1))
+    collected = torch.full((bins,), seconds / (bins - 1), dtype=torch.float64)
+    collected[[0, -1]] /= 2
+    return node * seconds, collected
 
 
-def across(possible: list[Window], empty_us: np.ndarray) -> np.ndarray:
-    """[N] whether at least half of each window lies in gaps [M, 2]."""
-    ends = np.array(possible, np.int64).reshape(-1, 1, 2)
-    common = np.minimum(ends[..., 1], empty_us[:, 1]) - np.maximum(ends[..., 0], empty_us[:, 0])
-    return 2 * np.maximum(common, 0).sum(1) >= (ends[:, 0, 1] - ends[:, 0, 0])
-
-
-def covers(whole: Window, span: Window) -> bool:
-    """Whether a window lies within the times of events; a tenth of it may lie beside, where nothing may have
-    happened."""
-    slack = (span[1] - span[0]) / 10
-    return whole[0] - slack <= span[0] and span[1] <= whole[1] + slack
-
-
-def spread(choices: list[Choice], count: int | None) -> list[Choice]:
-    """Evenly spread members of a list, at most ``count``."""
-    if not count or len(choices) <= count:
-        return choices
-    return [choices[k] for k in np.linspace(0, len(choices) - 1, count).round().astype(int)]
+def check_lengths(seconds: Sequence[float], name: str) -> None:
+    """Raise DomainError unless all windows of a source last alike within 5 percent of their median."""
+    middle = sorted(seconds)[len(seconds) // 2]
+    worst = max(seconds, key=lambda value: abs(value - middle))
+    if abs(worst - middle) > ALIKE * middle:
+        raise DomainError(
+            f"{name} has windows of {middle:.6f} s and one of {worst:.6f} s; all must last alike within "
+            f"{100 * ALIKE:g} %."
+        )
