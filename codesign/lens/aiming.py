@@ -30,7 +30,8 @@ DIFFERENCE = 1e-3
 class Aim:
     """Where rays cross the paraxial pupil's plane to meet the stop.
 
-    point_mm: [N, 2]. found: [N] bool; where False, no ray meets the stop there and the point is the paraxial one.
+    point_mm: [N, 2]. found: [N] bool; where False, no ray meets the stop there and the point is the paraxial
+      one.
     """
 
     point_mm: Tensor
@@ -86,8 +87,8 @@ def area_at_stop(
     aim: Aim,
     pupil_radius_mm: Tensor,
 ) -> Tensor:
-    """Area that aimed rays cover at the stop per area of the pupil's plane, [N], with its sign; 1 where no ray was
-    found.
+    """Area that aimed rays cover at the stop per area of the pupil's plane, [N], with its sign; 1 where no
+    ray was found.
 
     Args: as for ``aim_at_stop``, which returns ``aim``.
     Gradient: to every tensor behind ``rays`` and ``until_stop``, and through the aimed points.

@@ -82,7 +82,8 @@ def _where(lens, out):
     failed = out.failed_surface[out.status != Status.OK]
     if failed.numel() == 0 and any(s.inner_semi_aperture_mm for s in lens.surfaces):
         return (
-            " (all of them are stopped by the edges of the apertures or by the central obstruction, which chief rays "
+            " (all of them are stopped by the edges of the apertures or by the central obstruction, which "
+            "chief rays "
             "meet; point spread maps need chief rays, so render traced frames)"
         )
     if failed.numel() == 0:
@@ -104,6 +105,5 @@ def _towards(film_mm, at_mm, last_mm, exit_z_mm):
 
     start = place(-film_mm, last_mm)  # the image is inverted on the film
     direction = torch.nn.functional.normalize(place(at_mm, exit_z_mm) - start, dim=1)
-    return start, direction * torch.sign(
-        direction[:, 2:]
-    )  # a virtual exit pupil behind the film points the other way
+    # a virtual exit pupil behind the film points the other way
+    return start, direction * torch.sign(direction[:, 2:])

@@ -1,5 +1,5 @@
-"""How far away the object is: distances in metres from the camera's origin, as vergences, so that parallel light
-is 0 and needs no branch."""
+"""How far away the object is: distances in metres from the camera's origin, as vergences, so that parallel
+light is 0 and needs no branch."""
 
 import math
 from collections.abc import Sequence
@@ -18,11 +18,12 @@ PARALLEL = math.inf
 def vergence_per_mm(lens: ParaxialLens, at_m: Distances, origin_z_mm: Tensor | None = None) -> Tensor:
     """1 / distance of an object plane, per mm.
 
-    Args: at_m: metres before the camera's origin, the entrance pupil of the d line; one number, or [D] of them;
-      inf is parallel light. origin_z_mm: that pupil's place behind the first vertex, where it is known already.
+    Args: at_m: metres before the camera's origin, the entrance pupil of the d line; one number, or [D] of
+      them; inf is parallel light. origin_z_mm: that pupil's place behind the first vertex, where it is known
+      already.
     Returns: scalar, or [D], in the precision of the lens. Gradient: to at_m where it is a tensor.
-    Raises: DomainError for a distance that is not positive, lies in the lens or is NaN; ShapeError for more than
-      one axis or none given.
+    Raises: DomainError for a distance that is not positive, lies in the lens or is NaN; ShapeError for more
+      than one axis or none given.
     """
     like = lens.thickness_mm
     at = real_numbers(at_m, "object distances").to(like)
@@ -35,14 +36,16 @@ def vergence_per_mm(lens: ParaxialLens, at_m: Distances, origin_z_mm: Tensor | N
     )
     if not math.isfinite(origin_mm):
         raise DomainError(
-            f"{lens.name}: the entrance pupil lies at infinity, so object distances and fields have no origin; "
+            f"{lens.name}: the entrance pupil lies at infinity, so object distances and fields have no "
+            "origin; "
             "move the stop off the focal plane."
         )
     nearest = max(origin_mm, 0.0) * 1e-3
     bad = [d for d in at.detach().reshape(-1).tolist() if not d > nearest]
     if bad:
         raise DomainError(
-            f"{lens.name}: an object {', '.join(f'{d:.6g}' for d in bad)} m before the entrance pupil does not lie "
+            f"{lens.name}: an object {', '.join(f'{d:.6g}' for d in bad)} m before the entrance pupil does "
+            "not lie "
             f"before the lens; give distances above {nearest:.6g} m, inf for parallel light."
         )
     return 1 / (1e3 * at)

@@ -17,7 +17,7 @@ from codesign.lens.glass import AIR, WAVELENGTH_UM, Glass
 from codesign.lens.pinhole import ThinLens
 from codesign.lens.replaceable import Replaceable, settled
 from codesign.lens.solves import hold_efl, holding_surface, image_distance_mm
-from codesign.lens.surface import Surface, scaled, with_medium
+from codesign.lens.surface import Surface, checked, described, scaled, with_medium
 from codesign.lens.trace import PlateAt, Prescription, TraceResult, check_rays, trace
 from codesign.lens.variables import Bound, checked_step, kinds
 from codesign.types import Rays
@@ -45,13 +45,14 @@ class GeoLens(Replaceable):
 
     Learnables (nn.Parameter, one row per surface): curvature_per_mm [S], thickness_mm [S], conic [S], asphere
       [S, A],
-    index_offset [S] (added to the index of the glass behind each surface, dimensionless, zero at first; rows of
-    air and of mirrors do nothing and have no gradient), phase [S, P] (radians per mm^2, mm^4, ...).
+    index_offset [S] (added to the index of the glass behind each surface, dimensionless, zero at first; rows
+    of air and of mirrors do nothing and have no gradient), phase [S, P] (radians per mm^2, mm^4, ...).
     ``variables`` turns the named ones into functions of dimensionless variables and holds the others.
     Errors of assembly (buffers, with gradients after ``requires_grad_`` or through ``replace``): decentre_mm
     [S, 2], tilt_rad [S, 2]; and semi_aperture_mm [S], the same way.
     half_field_deg: the half field the lens is made for, or None where nobody said.
-    plate: a phase plate, see ``diffraction.with_plate``; plate_at: the surface it follows, and mm behind its vertex.
+    plate: a phase plate, see ``diffraction.with_plate``; plate_at: the surface it follows, and mm behind its
+      vertex.
     """
 
     tensor_names: tuple[str, ...] = (*LEARNABLES, "semi_aperture_mm")
@@ -82,12 +83,7 @@ class GeoLens(Replaceable):
         half_field_deg: float | None = None,
     ) -> None:
         super().__init__()
-        surfaces = tuple(surfaces)
-        if not surfaces or not all(isinstance(surface, Surface) for surface in surfaces):
-            kinds = ", ".join(sorted({type(surface).__name__ for surface in surfaces})) or "none"
-            raise DomainError(f"{name}: a lens needs at least one surface, each a Surface; given: {kinds}.")
-        for i, surface in enumerate(surfaces):
-            surface.check(f"{name}, surface {i + 1}")
+        surfaces, stop = checked(name, surfaces)
         if not 0 < entrance_pupil_diameter_mm < math.inf:
             raise DomainError(
                 f"{name}: entrance pupil diameter {entrance_pupil_diameter_mm} mm must be positive and "
@@ -100,14 +96,9 @@ class GeoLens(Replaceable):
             )
         if half_field_deg is not None and not 0 < half_field_deg < 90:
             raise DomainError(f"{name}: half field {half_field_deg} degrees must lie between 0 and 90.")
-        stops = [i for i, s in enumerate(surfaces) if s.is_stop]
-        if len(stops) > 1:
-            raise DomainError(
-                f"{name}: surfaces {[i + 1 for i in stops]} are all marked as the stop; mark one."
-            )
         self.name = name
         self.surfaces = surfaces
-        self.stop_index = stops[0] if stops else 0
+        self.stop_index = stop
         self.entrance_pupil_diameter_mm = float(entrance_pupil_diameter_mm)
         self.soft_edge_mm = float(soft_edge_mm)
         self.half_field_deg = half_field_deg
@@ -149,10 +140,10 @@ class GeoLens(Replaceable):
     ) -> list[nn.Parameter]:
         """Make the named numbers variables for torch.optim; every other number of the lens is held.
 
-        From then on the lens's tensors are functions of these Parameters: trace, render, go backward, and step.
-        They are dimensionless, zero now, and a unit of each moves the rays of a bundle on the film by ``step_mm``
-        RMS, so one learning rate suits them all, whatever the lens's size. Another call starts anew from the
-        lens as it then is.
+        From then on the lens's tensors are functions of these Parameters: trace, render, go backward, and
+        step. They are dimensionless, zero now, and a unit of each moves the rays of a bundle on the film by
+        ``step_mm`` RMS, so one learning rate suits them all, whatever the lens's size. Another call starts
+        anew from the lens as it then is.
 
         >>> from codesign import lens
         >>> geo = lens.load("cooke-triplet")
@@ -162,15 +153,16 @@ class GeoLens(Replaceable):
 
         Args:
           names: of "curvature", "thickness" (all gaps but the last), "focus" (the last), "conic", "asphere"
-            (coefficients, surface after surface), "index" (offset of every glass), "phase". Numbers that move no
-            ray (the curvature of a stop in air, the conic of a plane, what a solve makes) and thicknesses of 0
-            are left out.
+            (coefficients, surface after surface), "index" (offset of every glass), "phase". Numbers that
+            move no ray (the curvature of a stop in air, the conic of a plane, what a solve makes) and
+            thicknesses of 0 are left out.
           step_mm: the natural step, for example the pixel pitch; None is 1/1000 of the focal length.
-          bounds: (low, high) per name, numbers or one per entry, None for no bound; reached only in the limit.
-            Thicknesses and focus stay above 0 unless others are given.
+          bounds: (low, high) per name, numbers or one per entry, None for no bound; reached only in the
+            limit. Thicknesses and focus stay above 0 unless others are given.
           mask: per name, which of its entries (one per surface, gap, coefficient or glass) may vary.
           keep_efl: whether the curvature of ``solves.holding_surface`` is solved for today's focal length.
-          focus_at_m: the distance that stays in focus, the last thickness being solved for it; see ``focus_at``.
+          focus_at_m: the distance that stays in focus, the last thickness being solved for it; see
+            ``focus_at``.
           fields_rad: fields of the bundle; None is 0, 0.7 and 1 of the half field (10 degrees where unknown).
         A number so weak that its natural step would be out of proportion (0.1 focal lengths of a thickness, a
         sag slope of 0.1 at the rim for a shape, 0.05 of an index) gets that as its unit.
@@ -207,28 +199,14 @@ class GeoLens(Replaceable):
         super()._known(name)
 
     def _identity(self):
-        found = {
+        return {
             "entrance pupil diameter in mm": self.entrance_pupil_diameter_mm,
             "soft edge in mm": self.soft_edge_mm,
             "half field in degrees": self.half_field_deg or 0.0,
             "stop": self.stop_index + 1.0,
             "plate's surface": self.plate_at[0] if self.plate is not None else 0.0,
             "plate's distance in mm": float(self.plate_at[1]) if self.plate is not None else 0.0,
-        }
-        for i, s in enumerate(self.surfaces, 1):
-            medium = s.medium or AIR
-            low, high = medium.range_um
-            found |= {
-                f"index behind surface {i} at {line} ({medium.name} here)": medium.index(
-                    min(max(w, low), high)
-                )
-                for line, w in WAVELENGTH_UM.items()
-            }
-            found[f"mirror at surface {i}"] = float(s.mirror)
-            found[f"obstruction of surface {i} in mm"] = s.inner_semi_aperture_mm
-            found[f"diffraction order of surface {i}"] = float(s.phase.order if s.phase else 0)
-            found[f"blaze of surface {i} in um"] = (s.phase and s.phase.blaze_um) or 0.0
-        return found
+        } | described(self.surfaces)
 
     def _kinds(self):
         return kinds(self)
@@ -262,20 +240,21 @@ class GeoLens(Replaceable):
         >>> bool(near.thickness_mm[-1] > far.thickness_mm[-1])
         True
 
-        Args: distance_m: number or scalar tensor, metres before the camera's origin (the entrance pupil of the d
-          line); inf is allowed. wavelength_um: whose paraxial rays meet on the film. spot_grid: pupil samples
-          across, for the film of the least RMS spot of the point in place of the paraxial one.
-        Returns: a lens as from ``replace``; this one stays as it is. Its last thickness is the image distance.
+        Args: distance_m: number or scalar tensor, metres before the camera's origin (the entrance pupil of
+          the d line); inf is allowed. wavelength_um: whose paraxial rays meet on the film. spot_grid: pupil
+          samples across, for the film of the least RMS spot of the point in place of the paraxial one.
+        Returns: a lens as from ``replace``; this one stays as it is. Its last thickness is the image
+          distance.
         Gradient: to every lens tensor that bends or moves light, and to the distance.
-        Raises: DomainError for a point that does not lie before the lens and beyond its front focal plane, and for
-          a spot of a single ray.
+        Raises: DomainError for a point that does not lie before the lens and beyond its front focal plane,
+          and for a spot of a single ray.
         """
         image_mm = image_distance_mm(self, distance_m, wavelength_um, spot_grid)
         return self.replace(thickness_mm=torch.cat([self.thickness_mm[:-1], image_mm.reshape(1)]))
 
     def replace_glass(self, surface: int, glass: Glass | str | None) -> "GeoLens":
-        """The lens with another medium behind a surface; shapes, gaps and apertures stay, the focal length does not
-        (``design.with_glass`` holds it).
+        """The lens with another medium behind a surface; shapes, gaps and apertures stay, the focal length
+        does not (``design.with_glass`` holds it).
 
         >>> from codesign import lens
         >>> geo = lens.load("cooke-triplet").replace_glass(2, "SF2")
@@ -284,11 +263,13 @@ class GeoLens(Replaceable):
 
         Args: surface: counted from 0, from the last when negative. glass: a Glass, a name or code as
           ``Glass.named`` takes, None for air.
-        Returns: a lens as from ``replace``, without Parameters and variables of its own; this one stays as it is.
-        Gradient: to every tensor of this lens but the index offset of that surface, which belonged to the glass
+        Returns: a lens as from ``replace``, without Parameters and variables of its own; this one stays as
+          it is.
+        Gradient: to every tensor of this lens but the index offset of that surface, which belonged to the
+          glass
           that went: the new one has 0.
-        Raises: DomainError for a surface that is not there or a mirror, for glass that the light passes again behind a
-          mirror, and for a name the catalogue does not know,
+        Raises: DomainError for a surface that is not there or a mirror, for glass that the light passes
+          again behind a mirror, and for a name the catalogue does not know,
           with the nearest it knows.
         """
         surfaces = with_medium(self.name, self.surfaces, surface, glass)
@@ -318,7 +299,8 @@ class GeoLens(Replaceable):
         never changed keeps its value to the last bit. Raises: DomainError for a lens with a phase plate."""
         if self.plate is not None:
             raise DomainError(
-                f"{self.name}: its phase plate is no surface, so files, drawings and copies by surfaces cannot hold "
+                f"{self.name}: its phase plate is no surface, so files, drawings and copies by surfaces "
+                "cannot hold "
                 "it; take it out with diffraction.with_plate(lens, None)."
             )
         found = []

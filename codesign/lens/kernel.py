@@ -77,9 +77,8 @@ class Kernel:
         packed_status = arr.Int32(-8)
         inside = dr.full(arr.Bool, True, count)
         travels_forward = d.z > FORWARD
-        start = dr.select(
-            travels_forward, -o.z / dr.select(travels_forward, d.z, 1), 0
-        )  # to the first vertex plane: far objects would drown the quadratic in rounding
+        # to the first vertex plane: far objects would drown the quadratic in rounding
+        start = dr.select(travels_forward, -o.z / dr.select(travels_forward, d.z, 1), 0)
         o = arr.Array3(o.x + d.x * start, o.y + d.y * start, dr.select(travels_forward, 0, o.z))
         path = path + n[0] * start
         for i, work in enumerate(self.works):

@@ -123,9 +123,8 @@ def first_order(
         y = y - thickness_mm[i] * nu / index[i + 1]
         nu = nu + y * power[i]
     entrance_z = -y * index[0] / nu
-    semi_stop = (
-        entrance_pupil_diameter_mm / 2 * nu.abs()
-    )  # magnification of a pupil: reduced angle at the stop over reduced angle outside
+    # magnification of a pupil: reduced angle at the stop over reduced angle outside
+    semi_stop = entrance_pupil_diameter_mm / 2 * nu.abs()
     heights, angles = yu_trace(power, thickness_mm, index, zero, one, first=stop)
     y = heights[-1]
     nu = angles[-1]
@@ -225,17 +224,18 @@ def paraxial_rays(
 ) -> ParaxialRays:
     """ParaxialRays of an object plane.
 
-    Args: field_rad: half field, whose tangent is the slope of the d line's chief ray in object space; a number or
-      scalar tensor, below 90 degrees. vergence_per_mm: 1 / distance of the object from the entrance pupil of the d line, a
-      number or scalar tensor (see ``distance.vergence_per_mm``); 0 is parallel light. The diameter of the entrance
-      pupil is the lens's at every distance.
-    Gradient: to every lens tensor that bends or moves light, and to the vergence. Raises: DomainError for a field
-      of 90 degrees and more, or an entrance pupil at infinity.
+    Args: field_rad: half field, whose tangent is the slope of the d line's chief ray in object space; a
+      number or scalar tensor, below 90 degrees. vergence_per_mm: 1 / distance of the object from the
+      entrance pupil of the d line, a number or scalar tensor (see ``distance.vergence_per_mm``); 0 is
+      parallel light. The diameter of the entrance pupil is the lens's at every distance.
+    Gradient: to every lens tensor that bends or moves light, and to the vergence. Raises: DomainError for a
+      field of 90 degrees and more, or an entrance pupil at infinity.
     """
     field = torch.as_tensor(field_rad, dtype=torch.float64)
     if not abs(float(field.detach())) < math.pi / 2:
         raise DomainError(
-            f"{lens.name}: a paraxial chief ray at {math.degrees(float(field)):.4g} degrees has no slope; give "
+            f"{lens.name}: a paraxial chief ray at {math.degrees(float(field)):.4g} degrees has no slope; "
+            "give "
             "a field below 90 degrees."
         )
     f = lens.first_order(wavelength_um)
@@ -288,9 +288,9 @@ def focused_image(
 def image_place_mm(
     lens: ParaxialLens, vergence_per_mm: float | Tensor = 0.0, wavelength_um: float = D_LINE
 ) -> Tensor:
-    """Distance from the last vertex to the paraxial image of an axial point, mm: the back focal length for parallel
-    light. Negative where the image lies in the lens or is virtual, infinite where the light leaves parallel. Shape
-    of the vergence; gradient as for ``focused_image``."""
+    """Distance from the last vertex to the paraxial image of an axial point, mm: the back focal length for
+    parallel light. Negative where the image lies in the lens or is virtual, infinite where the light leaves
+    parallel. Shape of the vergence; gradient as for ``focused_image``."""
     height, angle = focused_image(lens, vergence_per_mm, wavelength_um)
     return -height * lens.index(wavelength_um)[-1] / angle
 

@@ -24,9 +24,9 @@ class ThinLens(Replaceable):
     52.631578947368425
     >>> optimiser = torch.optim.Adam(thin.variables("efl", "focus"), lr=0.1)
 
-    Args: efl_mm, image_distance_mm: numbers, or tensors that gradients flow to. A number becomes a Parameter that
-      asks for no gradient until ``requires_grad_()`` or ``variables``; a tensor with a gradient is kept as given.
-      image_distance_mm follows efl_mm when it is None.
+    Args: efl_mm, image_distance_mm: numbers, or tensors that gradients flow to. A number becomes a Parameter
+      that asks for no gradient until ``requires_grad_()`` or ``variables``; a tensor with a gradient is kept
+      as given. image_distance_mm follows efl_mm when it is None.
     Raises: DomainError for lengths that are not positive, or a diameter below 0.
     """
 
@@ -51,7 +51,8 @@ class ThinLens(Replaceable):
         focal_mm, image_mm = float(self.efl_mm.detach()), float(self.image_distance_mm.detach())
         if not (0 < focal_mm < float("inf") and 0 < image_mm < float("inf")):
             raise DomainError(
-                f"thin lens: focal length {focal_mm} mm and image distance {image_mm} mm must be positive and finite."
+                f"thin lens: focal length {focal_mm} mm and image distance {image_mm} mm must be positive "
+                "and finite."
             )
         if not 0 <= self.entrance_pupil_diameter_mm < float("inf"):
             raise DomainError(
@@ -82,7 +83,8 @@ class ThinLens(Replaceable):
         bounds: Mapping[str, tuple[Bound, Bound]] | None = None,
         fields_rad: Sequence[float] = (0.0, 0.25, 0.35),
     ) -> list[nn.Parameter]:
-        """Make "efl", "focus" (the image distance) or both variables for torch.optim; see ``GeoLens.variables``.
+        """Make "efl", "focus" (the image distance) or both variables for torch.optim; see
+        ``GeoLens.variables``.
 
         The lengths stay positive. Where the image distance follows the focal length, "efl" alone moves both.
 
@@ -112,8 +114,10 @@ class ThinLens(Replaceable):
         distance_mm = 1e3 * torch.as_tensor(distance_m, dtype=efl.dtype, device=efl.device)
         if not float(distance_mm.detach()) > float(efl.detach()):
             raise DomainError(
-                f"thin lens: a point {float(distance_mm.detach()) * 1e-3:.6g} m away lies inside the focal length "
-                f"({float(efl.detach()):.6g} mm), so its light leaves the lens without meeting; give a larger "
+                f"thin lens: a point {float(distance_mm.detach()) * 1e-3:.6g} m away lies inside the focal "
+                "length "
+                f"({float(efl.detach()):.6g} mm), so its light leaves the lens without meeting; give a "
+                "larger "
                 "distance, or a shorter focal length."
             )
         return self.replace(efl_mm=efl, image_distance_mm=1 / (1 / efl - 1 / distance_mm))

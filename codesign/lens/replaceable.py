@@ -1,5 +1,5 @@
-"""What every lens is as a torch Module: tensors that can be replaced, driven by variables, converted, saved and
-copied without touching another lens."""
+"""What every lens is as a torch Module: tensors that can be replaced, driven by variables, converted, saved
+and copied without touching another lens."""
 
 import copy
 import functools
@@ -28,16 +28,17 @@ def settled(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[An
 
 
 class Replaceable(nn.Module):
-    """Base of the lenses. A lens as it was built owns its numbers as Parameters; what ``replace`` returns owns
+    """Base of the lenses. A lens as it was built owns its numbers as Parameters; what ``replace`` returns
+    owns
     none: its tensors are buffers, shared or given, through which gradients reach where they came from.
 
     tensor_names: the tensors that ``replace`` takes. parameter_names: those of them that are Parameters of a
       lens as it was built.
-    A saved state also says what its tensors belong to (pupil, glasses, kinds of surfaces): ``load_state_dict`` refuses
-      that of another lens before it copies anything.
-    Conversions (``to``, ``float``, ``double``) and ``load_state_dict`` make new tensors wherever a tensor may be
-      shared, so make optimisers after converting, as torch asks. ``copy.deepcopy`` gives a lens that owns its
-      numbers, whatever it is a copy of.
+    A saved state also says what its tensors belong to (pupil, glasses, kinds of surfaces):
+      ``load_state_dict`` refuses that of another lens before it copies anything.
+    Conversions (``to``, ``float``, ``double``) and ``load_state_dict`` make new tensors wherever a tensor
+      may be shared, so make optimisers after converting, as torch asks. ``copy.deepcopy`` gives a lens that
+      owns its numbers, whatever it is a copy of.
     """
 
     tensor_names: tuple[str, ...] = ()
@@ -73,8 +74,8 @@ class Replaceable(nn.Module):
         return self._with(self._now() | tensors)
 
     def freeze(self, *names: str) -> Self:
-        """Stop the gradient to the named tensors (all Parameters and variables when none is named); returns the
-        lens."""
+        """Stop the gradient to the named tensors (all Parameters and variables when none is named); returns
+        the lens."""
         driver = self._driver
         if driver is not None and not names:
             driver.requires_grad_(False)
@@ -141,14 +142,16 @@ class Replaceable(nn.Module):
         given = state.tolist() if torch.is_tensor(state) and state.ndim == 1 else []
         if len(given) != len(own):
             raise DomainError(
-                f"the state is of another {type(self).__name__} ({len(given)} numbers describe it, {len(own)} this one); "
+                f"the state is of another {type(self).__name__} ({len(given)} numbers describe it, "
+                f"{len(own)} this one); "
                 f"{remedy}."
             )
         eps = 4 * torch.finfo(state.dtype if state.is_floating_point() else torch.float64).eps
         for (name, here), there in zip(own.items(), given, strict=True):
             if not abs(there - here) <= eps * abs(here):
                 raise DomainError(
-                    f"the state is of another {type(self).__name__}: its {name} is {there:.9g}, here {here:.9g}; {remedy}."
+                    f"the state is of another {type(self).__name__}: its {name} is {there:.9g}, here "
+                    f"{here:.9g}; {remedy}."
                 )
 
     def _load_from_state_dict(self, state_dict, prefix, local_metadata, strict, missing, *rest):
@@ -164,7 +167,8 @@ class Replaceable(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, local_metadata, strict, missing, *rest)
         if key in missing:  # torch names it in its error, unless it is asked not to be strict
             missing[missing.index(key)] = (
-                f"{key} (pupil, glasses and kinds of surfaces; states of earlier versions lack them: strict=False loads "
+                f"{key} (pupil, glasses and kinds of surfaces; states of earlier versions lack them: "
+                "strict=False loads "
                 "one that you know to be of this very lens)"
             )
 

@@ -63,8 +63,8 @@ def seidel_sums(
     and tilts do not count.
 
     Args: field_rad: half field. wavelength_um: of the monochromatic sums; short_um and long_um: ends of the
-      colour sums. at_m: metres from the entrance pupil to the object, inf for parallel light; the pupil's diameter
-      is the lens's at every distance.
+      colour sums. at_m: metres from the entrance pupil to the object, inf for parallel light; the pupil's
+      diameter is the lens's at every distance.
     Gradient: to every lens tensor and to at_m. Raises: DomainError, see ``paraxial_rays`` and
       ``distance.vergence_per_mm``.
     """
@@ -75,9 +75,8 @@ def seidel_sums(
     curvature = lens.curvature_per_mm + 2 * _column(lens.asphere, 0)
     layer = _thin_layer(rays, index[:-1], curvature, power, path[1])
     sphere = _refraction(rays, index, lens.mirrors, curvature, power)
-    figure = (
-        (1 + lens.conic) * lens.curvature_per_mm**3 / 8 + _column(lens.asphere, 1) - curvature**3 / 8
-    )  # r^4 beyond the osculating sphere
+    # r^4 beyond the osculating sphere
+    figure = (1 + lens.conic) * lens.curvature_per_mm**3 / 8 + _column(lens.asphere, 1) - curvature**3 / 8
     plate = _plate(rays, 8 * figure * bending(index, lens.mirrors))
     monochromatic = {name: a + b + c for name, a, b, c in zip(NAMES, layer, sphere, plate, strict=True)}
     axial, lateral = _colour(lens, rays, index, curvature, power, short_um, long_um)

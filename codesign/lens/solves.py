@@ -1,4 +1,5 @@
-"""Solves in closed form, differentiable: the focal length held by a curvature, focus by the last thickness."""
+"""Solves in closed form, differentiable: the focal length held by a curvature, focus by the last
+thickness."""
 
 from collections.abc import Sequence
 from typing import TypeVar
@@ -100,7 +101,8 @@ def image_distance_mm(
     height, angle = paraxial.focused_image(lens, vergence, wavelength_um)
     if not float(angle.detach()) < -1e-12:
         raise DomainError(
-            f"{lens.name}: the light of a point {float(1e-3 / vergence.detach()):.6g} m before the entrance pupil "
+            f"{lens.name}: the light of a point {float(1e-3 / vergence.detach()):.6g} m before the entrance "
+            "pupil "
             f"does not converge behind the lens; {_remedy(lens)}."
         )
     image = -height * lens.index(wavelength_um)[-1] / angle
@@ -113,8 +115,8 @@ def least_spot_shift(position: Tensor, slope: Tensor, weight: Tensor) -> tuple[T
     """How far behind their plane rays of several spots have the least mean square distance from their spot's
     mean, scalar mm; and the mean square slope that says how sharp that place is.
 
-    Straight rays make the squared spot a parabola in z: with d the distance of a ray from its spot's mean and s
-    the same of its slope, the least of sum |d + z s|^2 lies at z = -sum(d.s) / sum(s.s).
+    Straight rays make the squared spot a parabola in z: with d the distance of a ray from its spot's mean
+    and s the same of its slope, the least of sum |d + z s|^2 lies at z = -sum(d.s) / sum(s.s).
     Args: position, slope: [spots, M, 2]; weight: [spots, M, 1] >= 0, with a positive sum for every spot.
     """
     total = weight.sum(1, keepdim=True)
@@ -137,7 +139,8 @@ def _least_spot(lens, distance_m, image_mm, wavelength_um, grid):
     )
     if not float(sharpness.detach()) >= 1e-16:
         raise DomainError(
-            f"{lens.name}: {len(pupil)} rays of a pupil of {grid} samples across do not converge, so no spot is the "
+            f"{lens.name}: {len(pupil)} rays of a pupil of {grid} samples across do not converge, so no "
+            "spot is the "
             "least; give a spot_grid of at least 2, or leave it out."
         )
     return shift
@@ -157,18 +160,19 @@ def focus_paraxial(
     defocus_mm: float | Tensor = 0.0,
     at_m: float | Tensor = PARALLEL,
 ) -> L:
-    """The lens with its image plane at the paraxial image of an axial point, or ``defocus_mm`` (number or scalar
-    tensor) behind it. Differentiable.
+    """The lens with its image plane at the paraxial image of an axial point, or ``defocus_mm`` (number or
+    scalar tensor) behind it. Differentiable.
 
-    Args: at_m: metres from the entrance pupil to the point, inf for parallel light. ``GeoLens.focus_at`` does the
-      same and refuses images that are not real.
-    Raises: DomainError for light that leaves the lens parallel, or a distance inside the lens. A focus inside the
-      lens gives a negative last thickness, which constraints must push back.
+    Args: at_m: metres from the entrance pupil to the point, inf for parallel light. ``GeoLens.focus_at``
+      does the same and refuses images that are not real.
+    Raises: DomainError for light that leaves the lens parallel, or a distance inside the lens. A focus
+      inside the lens gives a negative last thickness, which constraints must push back.
     """
     height, angle = focused_image(lens, vergence_per_mm(lens, one_distance(at_m)), wavelength_um)
     if abs(float(angle.detach())) < 1e-12:
         raise DomainError(
-            f"{lens.name}: the light of a point {float(torch.as_tensor(at_m).detach()):.6g} m away leaves the lens parallel, "
+            f"{lens.name}: the light of a point {float(torch.as_tensor(at_m).detach()):.6g} m away leaves "
+            "the lens parallel, "
             "so it has no focus; the lens is afocal for it: change a curvature or the distance."
         )
     return _last_thickness(lens, -height * lens.index(wavelength_um)[-1] / angle + defocus_mm)
@@ -181,15 +185,16 @@ def focus_rays(
     grid: int = 16,
     at_m: Distances = PARALLEL,
 ) -> L:
-    """The lens with its image plane where the mean square spot over fields, distances and wavelengths is least.
+    """The lens with its image plane where the mean square spot over fields, distances and wavelengths is
+    least.
 
     Spots of one object point share their mean over the wavelengths; see ``focus.least_spot_shift``.
 
     Args: fields_rad: angles; wavelengths_um; grid: pupil samples across, without clipping by apertures.
-      Failed rays are left out. at_m: metres from the entrance pupil to the object plane, or several that share the
-      image plane; inf for parallel light.
-    Gradient: through the rays to every lens tensor and to at_m. Raises: DomainError when no ray of a field arrives,
-      none converges, or a distance lies inside the lens.
+      Failed rays are left out. at_m: metres from the entrance pupil to the object plane, or several that
+      share the image plane; inf for parallel light.
+    Gradient: through the rays to every lens tensor and to at_m. Raises: DomainError when no ray of a field
+      arrives, none converges, or a distance lies inside the lens.
 
     Example:
     >>> from codesign import lens

@@ -4,7 +4,7 @@ gap, which can be exchanged."""
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from torch import Tensor
@@ -109,7 +109,8 @@ class Surface:
         )
         if self.medium is not None and not isinstance(self.medium, Glass):
             raise DomainError(
-                f"{label}: medium {self.medium!r} is no glass; give Glass.named({str(self.medium)!r}), or None for air."
+                f"{label}: medium {self.medium!r} is no glass; give Glass.named({str(self.medium)!r}), or "
+                "None for air."
             )
         if math.isnan(self.radius_mm) or self.radius_mm == 0 or not all(math.isfinite(v) for v in numbers):
             raise DomainError(
@@ -146,6 +147,39 @@ class Surface:
                 "longer."
             )
         return self
+
+
+def checked(name: str, surfaces: Iterable[Surface]) -> tuple[tuple[Surface, ...], int]:
+    """Surfaces that can be a lens of that name, and which of them is the stop; the first where none is marked.
+
+    Raises: DomainError for none, for what is no Surface or cannot exist, and for two stops.
+    """
+    surfaces = tuple(surfaces)
+    if not surfaces or not all(isinstance(surface, Surface) for surface in surfaces):
+        kinds = ", ".join(sorted({type(surface).__name__ for surface in surfaces})) or "none"
+        raise DomainError(f"{name}: a lens needs at least one surface, each a Surface; given: {kinds}.")
+    for i, surface in enumerate(surfaces):
+        surface.check(f"{name}, surface {i + 1}")
+    stops = [i for i, s in enumerate(surfaces) if s.is_stop]
+    if len(stops) > 1:
+        raise DomainError(f"{name}: surfaces {[i + 1 for i in stops]} are all marked as the stop; mark one.")
+    return surfaces, stops[0] if stops else 0
+
+
+def described(surfaces: Iterable[Surface]) -> dict[str, float]:
+    """What surfaces are beside the tensors of a lens, {what: number}: media, mirrors, obstructions and gratings."""
+    found = {}
+    for i, s in enumerate(surfaces, 1):
+        medium = s.medium or AIR
+        low, high = medium.range_um
+        for line, w in WAVELENGTH_UM.items():
+            what = f"index behind surface {i} at {line} ({medium.name} here)"
+            found[what] = medium.index(min(max(w, low), high))
+        found[f"mirror at surface {i}"] = float(s.mirror)
+        found[f"obstruction of surface {i} in mm"] = s.inner_semi_aperture_mm
+        found[f"diffraction order of surface {i}"] = float(s.phase.order if s.phase else 0)
+        found[f"blaze of surface {i} in um"] = (s.phase and s.phase.blaze_um) or 0.0
+    return found
 
 
 def scaled(surface: Surface, factor: float) -> Surface:
@@ -196,10 +230,10 @@ def with_medium(
 ) -> tuple[Surface, ...]:
     """The surfaces with another medium behind one of them; see ``GeoLens.replace_glass``.
 
-    Args: name: the lens's, for errors. surface: counted from 0, from the last when negative. glass: a Glass, a
-      name or code as ``Glass.named`` takes, None for air.
-    Raises: DomainError for a surface that is not there or a mirror, glass passed twice, and a name the catalogue does
-      not know.
+    Args: name: the lens's, for errors. surface: counted from 0, from the last when negative. glass: a Glass,
+      a name or code as ``Glass.named`` takes, None for air.
+    Raises: DomainError for a surface that is not there or a mirror, glass passed twice, and a name the
+      catalogue does not know.
     """
     count = len(surfaces)
     if isinstance(surface, bool) or not isinstance(surface, int) or not -count <= surface < count:
@@ -208,12 +242,14 @@ def with_medium(
     label = f"{name}, surface {at + 1}"
     if surfaces[at].mirror:
         raise DomainError(
-            f"{label}: it is a mirror, behind which the light stays in the medium in front of it; replace that one."
+            f"{label}: it is a mirror, behind which the light stays in the medium in front of it; replace "
+            "that one."
         )
     passes = passes_of(surfaces, at)
     if passes:
         raise DomainError(
-            f"{label}: the light passes the glass behind it again behind surface {passes[0] + 1}, as a mirror sends it "
+            f"{label}: the light passes the glass behind it again behind surface {passes[0] + 1}, as a "
+            "mirror sends it "
             "back, and only one pass would change; build the lens with the other glass in both."
         )
     if isinstance(glass, str):
@@ -232,8 +268,9 @@ def with_medium(
 
 
 def passes_of(surfaces: Sequence[Surface], gap: int) -> list[int]:
-    """Other gaps of the same glass that take the same room on the axis, folded at the mirrors: further passes through
-    one piece. A gap behind a mirror is left out, as it takes its medium from the one in front."""
+    """Other gaps of the same glass that take the same room on the axis, folded at the mirrors: further
+    passes through one piece. A gap behind a mirror is left out, as it takes its medium from the one in
+    front."""
     places = [0.0]
     along = 1.0
     for surface in surfaces:

@@ -18,9 +18,10 @@ from codesign.lens.kernel import FORWARD, GRAZING, Kernel, Status, Works
 class PlateAt:
     """A phase plate on a plane of a lens, for one wavelength; ``trace`` sends rays through it.
 
-    look: points [N, 2] mm -> phase [N] rad, its slope [N, 2] rad/mm, whether the plate reaches there [N] bool.
-    gap: the surface it follows, -1 before the first. after_mm: from that surface's vertex (from the first where
-      gap is -1). mm_per_rad: optical path of a radian.
+    look: points [N, 2] mm -> phase [N] rad, its slope [N, 2] rad/mm, whether the plate reaches there [N]
+      bool.
+    gap: the surface it follows, -1 before the first. after_mm: from that surface's vertex (from the first
+      where gap is -1). mm_per_rad: optical path of a radian.
     """
 
     look: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]
@@ -53,8 +54,8 @@ class Prescription:
     decentre_mm, tilt_rad: [S, 2] each. mirrors: S booleans; the axis is unfolded behind a mirror (see
       Surface).
     inner_semi_aperture_mm: S numbers, radii of central obstructions (0: none).
-    borders_glass: S booleans, surfaces whose index step may change: where the step is 0 today, a derivative to
-      ``index`` still needs the refraction. False for a surface in air, whose step stays 0.
+    borders_glass: S booleans, surfaces whose index step may change: where the step is 0 today, a derivative
+      to ``index`` still needs the refraction. False for a surface in air, whose step stays 0.
     to_plane: whether rays go on to the plane behind the last thickness, or end on the last surface itself.
     plate: a phase plate between the surfaces, or None; of no concern to ``trace_surfaces``, see ``trace``.
     """
@@ -80,9 +81,10 @@ class Prescription:
         """The same lens seen from the image side; ``last_gap_mm`` is the distance of the plane where the rays
         end."""
         gaps = torch.cat([self.thickness_mm[:-1].flip(0), last_gap_mm.reshape(1)])
+        # a mirror faces the light from either way
         turn = torch.tensor(
             [1.0 if mirror else -1.0 for mirror in self.mirrors], dtype=gaps.dtype, device=gaps.device
-        )  # a mirror faces the light from either way
+        )
         shapes = {
             "curvature_per_mm": (turn * self.curvature_per_mm).flip(0),
             "asphere": (turn[:, None] * self.asphere).flip(0),
@@ -185,8 +187,8 @@ class TraceResult:
 
 
 def check_rays(origin_mm: Tensor, direction: Tensor) -> None:
-    """Raise ShapeError unless both are [N >= 1, 3]; DomainError for origins that are not finite or directions that
-    are not unit vectors."""
+    """Raise ShapeError unless both are [N >= 1, 3]; DomainError for origins that are not finite or
+    directions that are not unit vectors."""
     for label, value in (("origin_mm", origin_mm), ("direction", direction)):
         if value.ndim != 2 or value.shape[1] != 3 or value.shape[0] == 0:
             raise ShapeError(f"{label} must be [N >= 1, 3], got {tuple(value.shape)}.")
@@ -220,17 +222,16 @@ def trace_surfaces(prescription: Prescription, origin_mm: Tensor, direction: Ten
     Returns: TraceResult.
     Gradient: position, direction, optical path, weight and deficit, to rays and to every tensor of the
       prescription.
-    Lenses of more than LONGEST surfaces are traced in segments, each a kernel of its own: the time to compile one
-      grows with the square of its length, and segments alike share one.
+    Lenses of more than LONGEST surfaces are traced in segments, each a kernel of its own: the time to
+      compile one grows with the square of its length, and segments alike share one.
     """
     p = prescription
     count = origin_mm.shape[0]
     if len(p.mirrors) > LONGEST:
         return _in_segments(p, origin_mm, direction)
     edge = max(p.soft_edge_mm, 1e-6)
-    conics = [
-        p.conic.requires_grad or k != 0 for k in p.conic.tolist()
-    ]  # its value matters, or its derivative is wanted
+    # its value matters, or its derivative is wanted
+    conics = [p.conic.requires_grad or k != 0 for k in p.conic.tolist()]
     index = p.index.tolist()
     refracts = [
         a != b or (varies and p.index.requires_grad)
@@ -300,7 +301,8 @@ def _in_segments(p, origin_mm, direction):
 
 
 def onward(rays: TraceResult) -> tuple[Tensor, Tensor]:
-    """Origins and directions [N, 3] to trace on with; along the axis for rays that failed, which ``joined`` drops."""
+    """Origins and directions [N, 3] to trace on with; along the axis for rays that failed, which
+    ``joined`` drops."""
     alive = rays.packed_status < 0
     if bool(alive.all()):
         return rays.position_mm, rays.direction
@@ -331,11 +333,12 @@ def joined(front: TraceResult, rest: TraceResult, surfaces: int) -> TraceResult:
 
 
 def trace(prescription: Prescription, origin_mm: Tensor, direction: Tensor) -> TraceResult:
-    """Trace rays through a lens that may hold a plate, see ``trace_surfaces``. At the plate a ray gains its phase as optical path, and
+    """Trace rays through a lens that may hold a plate, see ``trace_surfaces``. At the plate a ray gains its
+    phase as optical path, and
     its direction across the axis, times index, gains the slope of that path: the local grating equation.
 
-    Gradient: also to the plate. Rays that leave a plate beyond its rim MISS; those it turns beyond a right angle
-      are TOTAL_REFLECTION.
+    Gradient: also to the plate. Rays that leave a plate beyond its rim MISS; those it turns beyond a right
+      angle are TOTAL_REFLECTION.
     """
     p = prescription
     placed = p.plate

@@ -1,5 +1,5 @@
-"""Numbers of a lens as dimensionless variables whose unit is a natural step: one that moves the rays on the film by
-a set distance."""
+"""Numbers of a lens as dimensionless variables whose unit is a natural step: one that moves the rays on the
+film by a set distance."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -41,9 +41,9 @@ class Kind:
 class Variables(nn.Module):
     """Tensors of a lens as functions of variables: value = bound(start + unit u).
 
-    For every kind a Parameter [K] of its name, zero at the values that ``tensors`` hold. Where bounds are given
-    on both sides the value is middle + half tanh(.), where on one side it is bound ± width log(1 + exp(.));
-    their slope at the start is in the unit, so that a step means the same with bounds and without.
+    For every kind a Parameter [K] of its name, zero at the values that ``tensors`` hold. Where bounds are
+    given on both sides the value is middle + half tanh(.), where on one side it is bound ± width log(1 +
+    exp(.)); their slope at the start is in the unit, so that a step means the same with bounds and without.
     Raises: DomainError for a start that does not lie strictly inside its bounds.
     """
 
@@ -103,8 +103,8 @@ class Variables(nn.Module):
 
 
 def ray_motion(ahead: tuple[Tensor, Tensor], behind: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """How rays move on the film between two states of a lens: [fields, M, 2] mm, and [fields, M] 1 for rays that
-    arrive in both, else 0.
+    """How rays move on the film between two states of a lens: [fields, M, 2] mm, and [fields, M] 1 for rays
+    that arrive in both, else 0.
 
     Args: ahead, behind: positions [fields, M, 2] and weights [fields, M], as from ``spots``.
     """
@@ -115,8 +115,8 @@ def ray_motion(ahead: tuple[Tensor, Tensor], behind: tuple[Tensor, Tensor]) -> t
 def natural_units(
     land: Callable[[Tensor], tuple[Tensor, Tensor]], values: Tensor, reach: Tensor, step_mm: float
 ) -> tuple[Tensor, Tensor]:
-    """Change of each number [K] that moves the rays by ``step_mm`` RMS over the bundle, at most its ``reach``;
-    and whether it moves them at all, [K] bool.
+    """Change of each number [K] that moves the rays by ``step_mm`` RMS over the bundle, at most its
+    ``reach``; and whether it moves them at all, [K] bool.
 
     Args: land: numbers [K] -> (positions [fields, M, 2] mm, weights [fields, M]).
     """
@@ -165,7 +165,8 @@ def checked_bounds(
     ):
         if not least < at < most:
             raise DomainError(
-                f"{name} {i + 1} is {at:.6g}, not strictly inside its bounds {least:.6g} to {most:.6g}; widen "
+                f"{name} {i + 1} is {at:.6g}, not strictly inside its bounds {least:.6g} to {most:.6g}; "
+                "widen "
                 "them, start elsewhere, or mask it."
             )
     return low, high
@@ -266,7 +267,8 @@ def make_variables(
     for name, unit, live in zip(names, units.split(counts), alive.split(counts), strict=True):
         if not bool(live.any()):
             raise DomainError(
-                f"{lens}: no {name} moves a ray (none is there, or all are masked), so it cannot be a variable; "
+                f"{lens}: no {name} moves a ray (none is there, or all are masked), so it cannot be a "
+                "variable; "
                 "leave it out."
             )
         rows = keep[name].nonzero()[:, 0][live]

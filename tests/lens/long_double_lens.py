@@ -1,8 +1,8 @@
 """An independent lens in long double, for tests: real rays from object points, paraxial rays, random systems.
 
-It shares nothing with codesign.lens: surfaces are met by Newton steps on z - sag, pupils come from two forward
-paraxial rays, wavefronts from whole path lengths (where ours subtracts first). With 64 bits of mantissa its
-rounding is some two thousand times finer than float64's.
+It shares nothing with codesign.lens: surfaces are met by Newton steps on z - sag, pupils come from two
+forward paraxial rays, wavefronts from whole path lengths (where ours subtracts first). With 64 bits of
+mantissa its rounding is some two thousand times finer than float64's.
 """
 
 from dataclasses import dataclass, replace
@@ -102,7 +102,8 @@ def _sag(p, c, k, asphere):
 
 
 def paraxial(system, line, y, nu):
-    """Heights and reduced angles just behind each surface, [S] each, of a paraxial ray at the first vertex."""
+    """Heights and reduced angles just behind each surface, [S] each, of a paraxial ray at the first
+    vertex."""
     n = system.index[line]
     found = []
     for i, c in enumerate(system.curvature + 2 * system.asphere[:, 0]):
@@ -119,16 +120,16 @@ def entrance_pupil(system):
 
 
 def crossing(system, line, at):
-    """Where the paraxial light of the axial point ``at`` mm before the entrance pupil meets the axis behind the
-    last vertex; at = 0 is the exit pupil."""
+    """Where the paraxial light of the axial point ``at`` mm before the entrance pupil meets the axis behind
+    the last vertex; at = 0 is the exit pupil."""
     y, nu = paraxial(system, line, at - entrance_pupil(system), 1)
     return -y[-1] * system.index[line][-1] / nu[-1]
 
 
 def path_differences(system, line, rays, chief):
-    """Path of the chief ray minus that of each ray [N], from the object point to the sphere about the chief ray's
-    point on the film through the centre of the exit pupil; and slopes [N, 2], n times the direction cosines from
-    the sphere to that point, minus the chief ray's."""
+    """Path of the chief ray minus that of each ray [N], from the object point to the sphere about the chief
+    ray's point on the film through the centre of the exit pupil; and slopes [N, 2], n times the direction
+    cosines from the sphere to that point, minus the chief ray's."""
     centre = np.array([*chief.position[0], 0], dtype=L)
     before = system.thickness[-1] - crossing(system, "d", 0)
     radius = np.sqrt(before**2 + (centre**2).sum())

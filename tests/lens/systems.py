@@ -60,8 +60,8 @@ def figure_of(geo, figure, parameters):
 
 
 def check_gradient(function, *values, step=1e-4, rel=1e-6, seed=0):
-    """The slope of a scalar function along a direction drawn for every tensor, in proportion to its size, against
-    central differences of fourth order."""
+    """The slope of a scalar function along a direction drawn for every tensor, in proportion to its size,
+    against central differences of fourth order."""
     generator = torch.Generator().manual_seed(seed)
     leaves = [v.detach().clone().requires_grad_() for v in values]
     slopes = torch.autograd.grad(function(*leaves), leaves)

@@ -1,4 +1,5 @@
-"""Sums over chunks of rays, and whatever else is computed again in the backward pass: the same gradient as in one piece."""
+"""Sums over chunks of rays, and whatever else is computed again in the backward pass: the same gradient as
+in one piece."""
 
 import pytest
 import torch

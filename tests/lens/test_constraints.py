@@ -78,7 +78,8 @@ def test_thicknesses_gaps_and_lengths_by_hand():
         "centre of glass between surfaces 1 and 2": 6.0,
         "edge of glass between surfaces 1 and 2": 6 - sag(40, 12) + sag(-60, 12),
         "edge of glass between surfaces 3 and 4": 3 - sag(-50, 11) + sag(-90, 11),
-        # surface 3 curves back faster than surface 2: the gap closes towards the edge, the larger of 12 and 11 mm
+        # surface 3 curves back faster than surface 2: the gap closes towards the edge, the larger of 12 and
+        # 11 mm
         "air between surfaces 2 and 3": 1 - sag(-60, 12) + sag(-50, 12),
         "total track": 80.0,
         "back focus": 70.0,

@@ -18,7 +18,8 @@ AXIS = torch.tensor([[0.0, 0.0, -1.0]], dtype=D), torch.tensor([[0.0, 0.0, 1.0]]
 
 
 def turned(point, pivot, tilt):
-    """A point turned about x by the first angle, then about the turned y axis by the second, around a pivot."""
+    """A point turned about x by the first angle, then about the turned y axis by the second, around a
+    pivot."""
     a, b = (real(angle) for angle in tilt)
     x, y, z = np.asarray(point, real) - pivot
     x, z = x * np.cos(b) + z * np.sin(b), z * np.cos(b) - x * np.sin(b)
@@ -27,7 +28,8 @@ def turned(point, pivot, tilt):
 
 
 class Bodies:
-    """A lens in space: of every surface a vertex and a centre of curvature (for a plane a point on its normal)."""
+    """A lens in space: of every surface a vertex and a centre of curvature (for a plane a point on its
+    normal)."""
 
     def __init__(self, geo):
         z = np.concatenate([[0], np.cumsum(np.array(geo.thickness_mm.tolist(), real))])
@@ -91,7 +93,8 @@ def test_moved_elements_are_rigid_bodies(name, generator):
 
 
 def test_a_tilted_plate_shifts_a_ray_by_the_closed_form():
-    """t sin(a) (1 - cos(a) / sqrt(n^2 - sin(a)^2)) along the tilt (Smith, Modern Optical Engineering, ch. 4)."""
+    """t sin(a) (1 - cos(a) / sqrt(n^2 - sin(a)^2)) along the tilt (Smith, Modern Optical Engineering, ch.
+    4)."""
     n, t, a = 1.6, 5.0, 0.4
     front = Surface(90.0, 1e-3, glass(1.5), 9.0, is_stop=True), Surface(-90.0, 50.0, None, 9.0)
     plate = Surface(PLANE, t, glass(n), 9.0), Surface(PLANE, 30.0, None, 9.0)
@@ -119,8 +122,8 @@ def test_a_wedge_turns_a_ray_like_a_prism(axis):
 
 
 def test_a_concentric_shell_turned_about_its_centre_does_nothing():
-    """Turning about the first vertex and shifting that vertex back on its circle is turning about the centre; the
-    shift along the axis, r (1 - cos), is given to the gap in front."""
+    """Turning about the first vertex and shifting that vertex back on its circle is turning about the
+    centre; the shift along the axis, r (1 - cos), is given to the gap in front."""
     r, t, a = 30.0, 4.0, 0.2
     shell = Surface(r, t, Glass.named("SF6"), 12.0), Surface(r - t, 40.0, None, 12.0)
     geo = GeoLens([Surface(PLANE, 10.0, None, 9.0, is_stop=True), *shell], 6.0).freeze()

@@ -1,4 +1,5 @@
-"""Lens files: exact round trips, what cannot be saved, and one sentence for everything a file can have wrong."""
+"""Lens files: exact round trips, what cannot be saved, and one sentence for everything a file can have
+wrong."""
 
 import os
 import random

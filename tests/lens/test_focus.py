@@ -1,5 +1,5 @@
-"""Solves: focal lengths held by a curvature, focus at a distance, semi-apertures that follow the rays; against
-first-order optics worked by hand, brute force and differences."""
+"""Solves: focal lengths held by a curvature, focus at a distance, semi-apertures that follow the rays;
+against first-order optics worked by hand, brute force and differences."""
 
 import math
 
@@ -152,8 +152,8 @@ def test_thin_lenses_follow_their_equation(distance_m):
 
 
 def fan(geo, distance_m, heights, wavelength_um=0.5875618):
-    """Rays from the axial point to heights [N] mm of the entrance pupil, and where they cross the axis behind the
-    film, [N] mm."""
+    """Rays from the axial point to heights [N] mm of the entrance pupil, and where they cross the axis
+    behind the film, [N] mm."""
     z = float(geo.first_order().entrance_pupil_z_mm)
     toward = torch.tensor([[0.0, h, z] for h in heights], dtype=D)
     start = torch.tensor([[0.0, 0.0, z - 1e3 * distance_m]], dtype=D).expand_as(toward)

@@ -1,4 +1,5 @@
-"""Coordinate breaks of .zmx files: the same rays traced by hand, from one local frame to the next as the file has them."""
+"""Coordinate breaks of .zmx files: the same rays traced by hand, from one local frame to the next as the
+file has them."""
 
 import math
 
@@ -12,13 +13,15 @@ HEAD = "MODE SEQ\nUNIT MM\nENPD 4\nFTYP 0 0 2 1 0 0 0\nYFLN 0 8\nWAVM 1 0.587561
 MEDIA = {"air": ["GLAS AIR"], "glass": ["GLAS ___BLANK 1 0 1.6 50"], "mirror": ["GLAS MIRROR 0 0 1.5 40"]}
 # rows of a kind, its thickness, and its curvature or PARM 1 to 6
 CASES = {
-    "an element shifted and back": "air 5 0, break 0 .4 -.3 0 0 0 0, glass 4 .02, air 0 -.01, break 60 -.4 .3 0 0 0 0",
+    "an element shifted and back": "air 5 0, break 0 .4 -.3 0 0 0 0, glass 4 .02, air 0 -.01, break 60 -.4 "
+    ".3 0 0 0 0",
     "an element tilted about a point inside it": "air 3 0, break -3 0 0 5 -3 0 0, glass 4 .02, air -1 -.01, "
     "break 61 0 0 -5 3 0 1",
     "tilted first, then shifted": "air 8 0, break 2 .5 .2 4 6 30 1, glass 4 .02, air -6 -.01, "
     "break 66 -.5 -.2 -4 -6 -30 0",
     "a tilted image plane": "glass 4 .02, air 55 -.01, break 1 .1 .2 3 -2 10 0",
-    "a turned last group behind a mirror": "break 0 0 0 10 0 0 0, mirror 0 -.005, break -30 0 0 10 0 0 0, glass -4 .01, "
+    "a turned last group behind a mirror": "break 0 0 0 10 0 0 0, mirror 0 -.005, break -30 0 0 10 0 0 0, "
+    "glass -4 .01, "
     "air -40 -.01",
 }
 
@@ -58,7 +61,8 @@ def load(folder, rows):
 
 
 def by_hand(rows, p, d, bends=True):
-    """A ray through the rows, each in the frame of its own; only led through the frames where it does not bend."""
+    """A ray through the rows, each in the frame of its own; only led through the frames where it does not
+    bend."""
     n = 1.0
     for kind, thickness, *what in [*rows, ("air", 0.0, 0.0)]:
         if kind == "break":

@@ -50,7 +50,8 @@ OTHERS = [
 REFUSED = {
     "deeplens/materials_data.json": "schema",
     "deeplens/zemax_double_gaussian.zmx": "surface 1: type PARAXIAL",
-    "deeplens/cellphone/3P_blank.json": "the sensor lies at 6.09375 mm, but the distances d_next lead to 6.59375 mm",
+    "deeplens/cellphone/3P_blank.json": "the sensor lies at 6.09375 mm, but the distances d_next lead to "
+    "6.59375 mm",
     "rayoptics/ASL5040-UV-Zemax(ZMX).zmx": "surface 1: type QED_TYPE",
     "rayoptics/CODV_35571.seq": "surface 2: its aperture is off the axis",
     "rayoptics/HoO-V2C18Ex46.zmx": "surface 7: type TOROIDAL",
@@ -82,9 +83,8 @@ def test_focal_lengths_are_within_half_a_percent_of_what_is_claimed(name, shared
 def test_camera_lenses_have_the_focal_length_of_their_name_as_far_as_names_are_rounded(name, claimed, shared):
     geo = lens.load(shared(f"{FOLDER}/deeplens/camera/{name}.json"))
     assert geo.first_order().efl_mm.item() == pytest.approx(claimed, rel=0.031)
-    assert geo.first_order().bfl_mm.item() == pytest.approx(
-        geo.thickness_mm[-1].item(), abs=0.05
-    )  # and they are in focus
+    # and they are in focus
+    assert geo.first_order().bfl_mm.item() == pytest.approx(geo.thickness_mm[-1].item(), abs=0.05)
 
 
 # file -> wavelength um; focal length, back focal length, entrance pupil diameter and its distance from the
@@ -203,9 +203,8 @@ def test_one_lens_as_text_and_as_zmx(shared):
     text, zmx = (
         lens.load(shared(f"{FOLDER}/diffoptics/DoubleGauss/US02532751-1.{kind}")) for kind in ("txt", "zmx")
     )
-    assert text.entrance_pupil_diameter_mm == pytest.approx(
-        zmx.entrance_pupil_diameter_mm, rel=1e-7
-    )  # its wavelength is 587.562 nm, not 587.5618
+    # its wavelength is 587.562 nm, not 587.5618
+    assert text.entrance_pupil_diameter_mm == pytest.approx(zmx.entrance_pupil_diameter_mm, rel=1e-7)
     same_rays(text, zmx, 5e-5)  # one radius is -7.02695 in one and -7.027 in the other
 
 
@@ -217,9 +216,8 @@ def test_one_lens_as_deeplens_and_as_zmx(shared):
 
 
 def test_one_lens_from_optiland_and_from_the_catalogue(shared):
-    same_rays(
-        lens.load("cooke-triplet"), lens.load(shared(f"{FOLDER}/optiland/Cooke_triplet.json")), 1e-7
-    )  # indices rounded to 1e-9 in one
+    # indices rounded to 1e-9 in one
+    same_rays(lens.load("cooke-triplet"), lens.load(shared(f"{FOLDER}/optiland/Cooke_triplet.json")), 1e-7)
 
 
 def test_double_gauss_of_the_program_that_sells_it_and_of_the_catalogue(shared):

@@ -67,9 +67,8 @@ def test_ray_paths_lie_on_the_surfaces_and_end_on_the_traced_points():
         assert path[-1] == pytest.approx([vertices[-1], height], abs=1e-9)
         for s, at, (z, y) in zip(geo.surfaces, vertices, path[1:], strict=False):
             c = s.curvature_per_mm
-            assert z - at == pytest.approx(
-                c * y * y / (1 + math.sqrt(1 - c * c * y * y)), abs=1e-9
-            )  # a sphere
+            # a sphere
+            assert z - at == pytest.approx(c * y * y / (1 + math.sqrt(1 - c * c * y * y)), abs=1e-9)
 
 
 def test_a_layout_is_saved_by_its_ending(tmp_path):

@@ -1,4 +1,5 @@
-"""Removed surfaces and elements against closed forms and invariances; neighbouring glasses against brute force."""
+"""Removed surfaces and elements against closed forms and invariances; neighbouring glasses against brute
+force."""
 
 import math
 
@@ -88,8 +89,8 @@ def test_the_stop_stays_in_its_place_when_its_element_goes(triplet):
     stop = left.to_surfaces()[2]
     assert (left.stop_index, stop.radius_mm, stop.medium) == (2, PLANE, None)
     assert left.glass.tolist() == [True, False, False, True, False]
-    # the entrance pupil is the image of that plane by the crown in front of it, between its principal planes, from
-    # the lens maker's formulae (Smith, ch. 2)
+    # the entrance pupil is the image of that plane by the crown in front of it, between its principal
+    # planes, from the lens maker's formulae (Smith, ch. 2)
     front, back = triplet.to_surfaces()[:2]
     n, d, r1, r2 = front.medium.index_d, front.thickness_mm, front.radius_mm, back.radius_mm
     f = 1 / ((n - 1) * (1 / r1 - 1 / r2 + (n - 1) * d / (n * r1 * r2)))

@@ -162,9 +162,8 @@ def waves(system, at_m):
     geo = geolens(system)
     field = np.where(seen, np.exp(-2j * np.arctan2(L(0), L(-1)) * np.where(seen, waves, 0)), 0)
     energy = (np.abs(field) ** 2).sum()
-    radius = (points * (slope - slope.mean(0))).sum(0) / (points**2).sum(
-        0
-    )  # of the pupil in direction cosines
+    # of the pupil in direction cosines
+    radius = (points * (slope - slope.mean(0))).sum(0) / (points**2).sum(0)
     pixel = float(0.25 * WAVELENGTH_MM / np.abs(radius).max())
     place = (np.arange(12) - 6) * L(pixel)
     wave_x, wave_y = (

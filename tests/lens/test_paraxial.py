@@ -29,9 +29,8 @@ def test_matrix_of_a_thick_lens():
     t = 8.0
     a = (n - 1) / 60.0
     b = (1 - n) / -90.0
-    truth = torch.tensor(
-        [[1 - a * t / n, t / n], [-(a + b - a * b * t / n), 1 - b * t / n]], dtype=D
-    )  # Gullstrand
+    # Gullstrand
+    truth = torch.tensor([[1 - a * t / n, t / n], [-(a + b - a * b * t / n), 1 - b * t / n]], dtype=D)
     torch.testing.assert_close(system_matrix(thick()).detach(), truth, rtol=1e-14, atol=1e-16)
 
 
@@ -73,8 +72,8 @@ def test_an_eye_has_its_nodal_points_apart_from_its_principal_points():
 
 @pytest.mark.parametrize("before", [1.0, 4 / 3])
 def test_pupils_of_a_stop_between_two_surfaces_by_gauss(before):
-    # n' / s' - n / s = power at each surface, s and s' of the stop and its image from the vertex; the image is
-    # n s' / (n' s) times as large
+    # n' / s' - n / s = power at each surface, s and s' of the stop and its image from the vertex; the image
+    # is n s' / (n' s) times as large
     n = 1.6
     after = 1.2
     front, back = 6.0, 9.0
@@ -105,9 +104,8 @@ def test_circle_of_confusion_is_the_spread_of_the_rays():
         pupil = torch.tensor([[1.0, 0.0]] * 2 + [[-1.0, 0.0]] * 2, dtype=D)
         rays = thin.camera_rays(film, pupil)
         at = rays.origin_m[:, 0] + rays.direction[:, 0] / rays.direction[:, 2] * distance_m
-        start = [
-            float(-a / (b - a)) for a, b in (at[:2], at[2:])
-        ]  # film points whose rays meet the axis there
+        # film points whose rays meet the axis there
+        start = [float(-a / (b - a)) for a, b in (at[:2], at[2:])]
         assert float(circle_of_confusion_mm(thin, distance_m)) == pytest.approx(
             abs(start[0] - start[1]), rel=1e-10
         )

@@ -219,8 +219,9 @@ def test_a_plate_in_the_pupil_adds_its_phase_to_the_wavefront():
 
 
 def test_light_behind_the_last_surface_is_that_between_plane_waves():
-    # a plate in the converging light of an f/12.5: its phase on rays of the bare lens, against a thin element in
-    # the field, whose rim diffracts on the way to the plate: that differs as 1 / Fresnel number of the plate
+    # a plate in the converging light of an f/12.5: its phase on rays of the bare lens, against a thin
+    # element in the field, whose rim diffracts on the way to the plate: that differs as 1 / Fresnel number
+    # of the plate
     geo = paraboloid(4.0, 50.0).requires_grad_(False)
     pixel = 0.002
 
@@ -261,7 +262,8 @@ def test_a_plate_of_no_phase_changes_nothing(plate):
 
 
 def test_a_corrector_is_found_from_zero():
-    # what flattens the wavefront is the conjugate of the lens's own Zernike terms, over the points of the plate
+    # what flattens the wavefront is the conjugate of the lens's own Zernike terms, over the points of the
+    # plate
     geo = landscape()
     radius = float(geo.first_order().stop_semi_aperture_mm)
     bare = analysis.wavefront(geo, 0.0, grid=32)
@@ -287,9 +289,8 @@ def test_a_corrector_is_found_from_zero():
     flat = analysis.wavefront(plated, 0.0, grid=32)
     assert float(analysis.rms_waves(flat)) < 0.05
     psf = analysis.psf_on_pixels(plated, 0.0, 0.001, 33, grid=128)
-    ideal = (
-        math.pi / 4 * (8.0 / (geo.first_order().efl_mm * 0.5875618e-3)) ** 2 * 0.001**2
-    )  # peak of Airy's pattern
+    # peak of Airy's pattern
+    ideal = math.pi / 4 * (8.0 / (geo.first_order().efl_mm * 0.5875618e-3)) ** 2 * 0.001**2
     assert float(psf.energy.max() / ideal) > 0.9
 
 

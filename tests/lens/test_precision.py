@@ -64,7 +64,8 @@ def test_cheapest_tolerances_of_a_linear_figure(slopes):
 
 
 def test_the_share_of_one_square_is_that_of_chi_squared():
-    """F = x^2: P(x^2 <= y) = erf(sqrt(y / 2)); a single square has the slowest characteristic function of all."""
+    """F = x^2: P(x^2 <= y) = erf(sqrt(y / 2)); a single square has the slowest characteristic function of
+    all."""
     forecast = Forecast(0.0, torch.zeros(1, dtype=D), torch.ones(1, 1, dtype=D))
     for y in (0.5, 1.0, 2.7, 6.0):
         truth = math.erf(math.sqrt(y / 2))
@@ -73,7 +74,8 @@ def test_the_share_of_one_square_is_that_of_chi_squared():
 
 
 def test_the_share_of_several_squares_and_of_a_slope():
-    """Ten squares: chi squared of ten degrees, 1 - exp(-y/2) sum (y/2)^k / k! over k < 5; a slope: the normal."""
+    """Ten squares: chi squared of ten degrees, 1 - exp(-y/2) sum (y/2)^k / k! over k < 5; a slope: the
+    normal."""
     ten = Forecast(0.0, torch.zeros(10, dtype=D), torch.eye(10, dtype=D))
     for y in (5.0, 12.0, 25.0):
         truth = 1 - math.exp(-y / 2) * sum((y / 2) ** k / math.factorial(k) for k in range(5))
@@ -124,7 +126,8 @@ def test_the_cheapest_is_a_minimum(spot, generator):
             middle = math.sqrt(low * high)
             inside = forecast.share_within(budget, (other * middle)[member]) >= SHARE
             low, high = (middle, high) if inside else (low, middle)
-        # at the minimum a change of 20 % costs its square; the normal approximation of the shape costs far less
+        # at the minimum a change of 20 % costs its square; the normal approximation of the shape costs far
+        # less
         assert float((1 / (other * low)).sum()) > found.cost * (1 + 1e-3)
 
 

@@ -1,4 +1,5 @@
-"""Free-space propagation against closed forms: Gaussian beams, slits, discs, gratings, the focus of a lens."""
+"""Free-space propagation against closed forms: Gaussian beams, slits, discs, gratings, the focus of a
+lens."""
 
 import math
 
@@ -23,7 +24,8 @@ def gaussian(count, pitch, waist, z):
 
 @pytest.mark.parametrize("z", [0.0, 4.0, -4.0, 12.0])
 def test_a_gaussian_beam_spreads_and_keeps_its_energy(z):
-    # roots against parabolas: the beam's fourth order is k z theta^4 / 8 = 2e-5 rad at z = 12, theta = W / (pi w)
+    # roots against parabolas: the beam's fourth order is k z theta^4 / 8 = 2e-5 rad at z = 12, theta = W /
+    # (pi w)
     field = Field(gaussian(256, 0.003, 0.06, 0.0), 0.003, 0.5)
     found = angular_spectrum(field, z)
     torch.testing.assert_close(found.amplitude, gaussian(256, 0.003, 0.06, z), rtol=0, atol=1e-4)

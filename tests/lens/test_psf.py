@@ -54,9 +54,10 @@ def test_the_two_transforms_agree():
     pixels = psf_on_pixels(geo, 0.0, float(fft.pitch_mm[0].detach()), 64, grid=32)
     torch.testing.assert_close(fft.pitch_mm[0], fft.pitch_mm[1], rtol=1e-10, atol=0)
     torch.testing.assert_close(pixels.energy, fft.energy, rtol=1e-6, atol=1e-12)
+    # w N / padding, N to (y / f)^2
     torch.testing.assert_close(
         fft.pitch_mm[0].detach(), torch.tensor(0.5875618e-3 * 99.65 / 8 / 2, dtype=D), rtol=5e-3, atol=0
-    )  # w N / padding, N to (y / f)^2
+    )
 
 
 def test_the_geometric_spread_keeps_light_and_its_mean():

@@ -79,13 +79,14 @@ RMS_SPOT_UM = {  # d line, fields 0, 0.7 and 1 of the half field
 }
 # double Gauss, d line, from (16.665, -10.866798566001341, -5) at 9.8 degrees: derivatives of x, y, N and
 # optical path (mpmath, 32 digits)
+# a plane between two glasses
 DERIVATIVES = {
     ("c", 3): (
         5.054248586538719,
         -2.2122001583739874,
         0.00458627719246008,
         -0.722414880552562,
-    ),  # a plane between two glasses
+    ),
     ("c", 8): (515.4695956561391, 281.3505333881791, 0.5931732155653981, 8.751435013693847),
     ("t", 4): (-0.03897951997189745, 0.12320344182157804, 0.0006355384841937334, 0.9844891460899354),
     ("t", 10): (-0.16987964230921274, 0.14748367492116188, 0.0, 1.0249929400924462),
@@ -204,9 +205,8 @@ def test_derivatives_of_a_double_gauss_ray():
     )
     for (kind, surface), truth in DERIVATIVES.items():
         mine = found[SLOT[kind]][[0, 1, 4, 5], surface]
-        torch.testing.assert_close(
-            mine, f64(truth), rtol=1e-7, atol=1e-9
-        )  # atol: entries that are 0, beside others of 0.1 to 500
+        # atol: entries that are 0, beside others of 0.1 to 500
+        torch.testing.assert_close(mine, f64(truth), rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", NAMES)

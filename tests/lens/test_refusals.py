@@ -88,7 +88,8 @@ MANGIN = GeoLens(
     ],
     10.0,
 )
-# one surface focuses at n R / (n - 1) = 90 mm inside the glass: a surface there meets the axial ray at height 0
+# one surface focuses at n R / (n - 1) = 90 mm inside the glass: a surface there meets the axial ray at
+# height 0
 AT_IMAGE = GeoLens([Surface(30.0, 90.0, CROWN, 5.0), Surface(-40.0, 10.0, None, 5.0)], 4.0)
 BEFORE = r"not lie before the lens; give distances above 0\.01"
 NO_NUMBER = r"distances: .* is no real number and no list of them; give numbers"
@@ -467,7 +468,8 @@ def test_the_grid_that_a_sentence_asks_for_is_enough(triplet):
     ) as caught:
         analysis.pupil_function(steep, 0.0, grid=64)
     needed = int(str(caught.value).split("at least ")[1].split(",")[0])
-    # a phase c Z11 steps by c sqrt(5) (24 - 12) / pi waves per radius at the rim; half a wave from cell to cell
+    # a phase c Z11 steps by c sqrt(5) (24 - 12) / pi waves per radius at the rim; half a wave from cell to
+    # cell
     assert needed == pytest.approx(60 * math.sqrt(5) * 12 / (2 * math.pi) * 2 * 2, rel=0.02)
     x = (torch.arange(64, dtype=D) - 32) * 0.002
     narrow = torch.exp(-(x.square() + x[:, None].square()) / 0.01**2)

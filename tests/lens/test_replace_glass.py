@@ -1,4 +1,5 @@
-"""A medium exchanged for another: the lens must be the one that is built with it, gradients and files included."""
+"""A medium exchanged for another: the lens must be the one that is built with it, gradients and files
+included."""
 
 import dataclasses
 

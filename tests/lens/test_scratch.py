@@ -87,10 +87,11 @@ def test_a_search_goes_on_exactly_after_a_break(method):
     else:  # the backward pass sums in parallel, so last bits differ
         assert resumed.losses == pytest.approx(whole.losses, rel=1e-9)
     assert (resumed.stage, resumed.steps) == (whole.stage, whole.steps)
+    # a break after a rejected step takes its Jacobian again
     assert resumed.evaluations - whole.evaluations in (
         0,
         11,
-    )  # a break after a rejected step takes its Jacobian again
+    )
 
 
 @pytest.mark.parametrize(("wins", "count"), [(0, 10), (6, 10), (10, 10)])

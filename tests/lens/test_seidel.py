@@ -122,7 +122,8 @@ def test_a_flat_diffractive_lens(distance):
     geo = stopped(distance, flat, diameter=2 * y) if distance else GeoLens([flat], 2 * y)
     if not distance:
         check_total(geo, 0.05, [y**4 / f**3, -(y**3) * u / f**2, (y * u) ** 2 / f, 0.0, 0.0])
-    # a thin lens behind its stop: C_II = C_I times the chief ray's height over the marginal ray's (Welford, ch. 10)
+    # a thin lens behind its stop: C_II = C_I times the chief ray's height over the marginal ray's (Welford,
+    # ch. 10)
     axial = y * y / f / DIFFRACTIVE_ABBE
     assert colour(geo, 0.05) == pytest.approx([axial, axial * distance * u / y], rel=1e-12, abs=1e-17)
 

@@ -140,8 +140,8 @@ def test_an_evanescent_order_is_total_reflection():
     assert out.weight[1].item() == 0
 
 
-# the normal of a face turned by +a about x is (0, -sin a, cos a): the ray is bent towards it, hence towards -y;
-# about y the normal turns to +x
+# the normal of a face turned by +a about x is (0, -sin a, cos a): the ray is bent towards it, hence towards
+# -y; about y the normal turns to +x
 @pytest.mark.parametrize(("tilt_deg", "axis", "sign"), [((30.0, 0.0), 1, -1), ((0.0, 30.0), 0, 1)])
 def test_a_tilted_plate_displaces_the_ray_by_its_closed_form(tilt_deg, axis, sign):
     """A plate turned by a displaces the axial ray by t sin(a) (1 - cos(a) / sqrt(n^2 - sin^2 a))."""

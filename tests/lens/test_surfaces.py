@@ -115,9 +115,8 @@ def test_conic_and_asphere_together_against_a_plain_newton_trace(generator):
         ]
         s = (7.0 - p[2]) / bent[2]
         truth = [p[0] + s * bent[0], p[1] + s * bent[1]]
-        assert (
-            math.dist(truth, found[:2]) <= 1e-9
-        )  # the slope by differences is good to 1e-11 or so, times 7 mm
+        # the slope by differences is good to 1e-11 or so, times 7 mm
+        assert math.dist(truth, found[:2]) <= 1e-9
 
 
 # ---- derivatives against central differences
@@ -176,9 +175,9 @@ def test_index_offsets_survive_into_surfaces_and_scaled_lenses():
     )
 
 
-# stigmatic conics (Born and Wolf, Principles of Optics, 4.2): all axial rays meet in one point, whatever their
-# height, by equal paths (Fermat): a hyperboloid k = -n^2 out of glass with radius -f (n - 1); an ellipsoid
-# k = -1/n^2 into glass, f = n R / (n - 1); a sphere misses by 2 mm at the edge
+# stigmatic conics (Born and Wolf, Principles of Optics, 4.2): all axial rays meet in one point, whatever
+# their height, by equal paths (Fermat): a hyperboloid k = -n^2 out of glass with radius -f (n - 1); an
+# ellipsoid k = -1/n^2 into glass, f = n R / (n - 1); a sphere misses by 2 mm at the edge
 @pytest.mark.parametrize(
     ("surfaces", "path"),
     [

@@ -149,9 +149,8 @@ def test_a_telecentric_lens_has_a_plane_for_a_reference_sphere():
         geo = GeoLens([stop, *(Surface(s.radius_mm, s.thickness_mm, s.medium, 12.7) for s in surfaces)], 10.0)
         found.append(wavefront(geo, 0.02, grid=16).waves.detach())
     assert bool(found[0].isfinite().all())
-    torch.testing.assert_close(
-        found[0], found[1], rtol=0, atol=1e-4
-    )  # moved 1e-4 mm: slopes of the wavefront by 1e-6 of 10 waves
+    # moved 1e-4 mm: slopes of the wavefront by 1e-6 of 10 waves
+    torch.testing.assert_close(found[0], found[1], rtol=0, atol=1e-4)
 
 
 def test_failed_and_vignetted_rays_weigh_nothing():

@@ -1,8 +1,9 @@
 """Depth of field: which object distances a fixed film shows with a blur below a limit.
 
-The blur of an axial point is the disc that its light fills on the film. Its diameter is linear in the vergence 1 /
-distance (from the entrance pupil), so both limits are closed forms; for a thin lens it is the circle of confusion.
-Traced limits hold the RMS spot instead, diameter / (2 sqrt 2) of an evenly filled disc, aberrations included.
+The blur of an axial point is the disc that its light fills on the film. Its diameter is linear in the
+vergence 1 / distance (from the entrance pupil), so both limits are closed forms; for a thin lens it is the
+circle of confusion. Traced limits hold the RMS spot instead, diameter / (2 sqrt 2) of an evenly filled disc,
+aberrations included.
 """
 
 import math
@@ -27,8 +28,8 @@ CLOSEST_PER_MM = 1e3  # to a pupil that has no surface before it
 
 @dataclass(frozen=True)
 class DepthOfField:
-    """Metres from the entrance pupil of the d line, scalar tensors: the nearest and the farthest distance within
-    the limit (inf where parallel light is), and the sharpest."""
+    """Metres from the entrance pupil of the d line, scalar tensors: the nearest and the farthest distance
+    within the limit (inf where parallel light is), and the sharpest."""
 
     near_m: Tensor
     far_m: Tensor
@@ -65,7 +66,8 @@ def depth_of_field(
         nearest, 1e-300
     ):
         raise DomainError(
-            f"{lens.name}: no point before the lens has a blur of {float(blur_mm):.4g} mm or less on its film; move "
+            f"{lens.name}: no point before the lens has a blur of {float(blur_mm):.4g} mm or less on its "
+            "film; move "
             "the film (focus_at), or allow more blur."
         )
     near = (1e-3 / (sharpest + reach)).clamp_min(nearest * 1e-3)
@@ -73,10 +75,11 @@ def depth_of_field(
 
 
 def hyperfocal_m(lens: GeoLens, blur_mm: float | Tensor, wavelength_um: float = WAVELENGTH_UM["d"]) -> Tensor:
-    """The nearest distance to focus on (metres from the entrance pupil) for which parallel light is blurred to a disc
-    of ``blur_mm`` and no more, scalar: f^2 / (N blur) + f for a thin lens.
+    """The nearest distance to focus on (metres from the entrance pupil) for which parallel light is blurred
+    to a disc of ``blur_mm`` and no more, scalar: f^2 / (N blur) + f for a thin lens.
 
-    Gradient: as for ``depth_of_field``. Raises: DomainError for a limit that is not positive, or a diverging lens.
+    Gradient: as for ``depth_of_field``. Raises: DomainError for a limit that is not positive, or a diverging
+      lens.
     """
     blur = _checked(lens, blur_mm)
     f = lens.first_order(wavelength_um)
@@ -101,7 +104,8 @@ def traced_depth_of_field(
     """DepthOfField where the RMS spot over the fields is at most that of an even disc ``blur_mm`` across.
 
     Aberrations share the blur: this range is the smaller the more of the limit they take. Args as for
-    ``depth_of_field``; fields_rad: angles whose mean square counts. Gradient: none (limits are searched, to 1e-6).
+    ``depth_of_field``; fields_rad: angles whose mean square counts. Gradient: none (limits are searched, to
+    1e-6).
     Raises: DomainError for a limit that is not positive, and when aberrations alone exceed it.
     """
     if torch.as_tensor(fields_rad).ndim != 1:
@@ -142,7 +146,8 @@ def traced_depth_of_field(
     best = int(found.argmin())
     if not float(found[best]) <= limit:
         raise DomainError(
-            f"{lens.name}: its RMS spot is {float(found[best]):.4g} mm at best, above the {limit:.4g} mm of a disc of "
+            f"{lens.name}: its RMS spot is {float(found[best]):.4g} mm at best, above the {limit:.4g} mm of "
+            "a disc of "
             f"{float(blur_mm):.4g} mm; allow more blur, or stop down."
         )
     far, near = (_edge(rms, at, found, best, step, limit) for step in (-1, 1))
@@ -167,8 +172,8 @@ def _edge(rms, at, found, best, step, limit):
 
 
 def _film_heights(lens, wavelength_um):
-    """Height on the film, and reduced angle there, of two rays: of height 1 and slope 0, and of height 0 and slope
-    1, at the centre of the entrance pupil."""
+    """Height on the film, and reduced angle there, of two rays: of height 1 and slope 0, and of height 0 and
+    slope 1, at the centre of the entrance pupil."""
     power, index = lens.surface_power(wavelength_um), lens.index(wavelength_um)
     pupil_z = lens.first_order().entrance_pupil_z_mm
     one, zero = torch.ones_like(pupil_z), torch.zeros_like(pupil_z)

@@ -1,5 +1,5 @@
-"""Figures over field, pupil, colour and focus: distortion, field curvature, axial colour, relative illumination, ray
-fans, and spots through focus."""
+"""Figures over field, pupil, colour and focus: distortion, field curvature, axial colour, relative
+illumination, ray fans, and spots through focus."""
 
 import math
 from collections.abc import Sequence
@@ -36,8 +36,8 @@ def lateral_colour_mm(
     reference_um: float = WAVELENGTH_UM["d"],
     at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """Chief ray heights minus that at the reference wavelength, [F, W] mm, [D, F, W] for D distances ``at_m`` of the
-    object (see ``trace_field``). Gradient: to every lens tensor."""
+    """Chief ray heights minus that at the reference wavelength, [F, W] mm, [D, F, W] for D distances
+    ``at_m`` of the object (see ``trace_field``). Gradient: to every lens tensor."""
     reference = chief_height_mm(lens, fields_rad, reference_um, at_m)
     heights = [chief_height_mm(lens, fields_rad, float(w), at_m) for w in wavelengths_um]
     return torch.stack([height - reference for height in heights], -1)
@@ -49,8 +49,8 @@ def chromatic_focus_shift_mm(
     reference_um: float = WAVELENGTH_UM["d"],
     at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """Place of the paraxial image of an axial point minus that at the reference wavelength, [W] mm, [D, W] for D
-    distances ``at_m``. Gradient: to every lens tensor and to at_m."""
+    """Place of the paraxial image of an axial point minus that at the reference wavelength, [W] mm, [D, W]
+    for D distances ``at_m``. Gradient: to every lens tensor and to at_m."""
     vergence = vergence_per_mm(lens, at_m)
     reference, *places = (image_place_mm(lens, vergence, float(w)) for w in (reference_um, *wavelengths_um))
     return torch.stack([place - reference for place in places], -1)
@@ -65,9 +65,9 @@ def chief_height_mm(
     wavelength_um: float = WAVELENGTH_UM["d"],
     at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """Height y of the real chief ray on the image plane, [F] mm; [D, F] for D distances ``at_m`` of the object, see
-    ``trace_field``. Gradient: to every lens tensor (a chief ray is the same at every distance). Raises: DomainError
-    when one does not arrive."""
+    """Height y of the real chief ray on the image plane, [F] mm; [D, F] for D distances ``at_m`` of the
+    object, see ``trace_field``. Gradient: to every lens tensor (a chief ray is the same at every distance).
+    Raises: DomainError when one does not arrive."""
     return chief_ray(lens, fields_rad, wavelength_um, at_m=at_m).position_mm[..., 0, 1]
 
 
@@ -80,12 +80,12 @@ def distortion_percent(
 ) -> Tensor:
     """100 (y / (f m(field)) - 1) of the real chief ray, [F] percent, [D, F] for D distances; 0 on the axis.
 
-    Args: mapping: "f-tan" (a picture without distortion) or "f-theta" (a scan lens or fisheye). at_m: metres to
-      the object plane. f is the height of the paraxial image of that plane per tangent: the focal length for
-      parallel light. On a film that is not focused there (``GeoLens.focus_at``) the change of scale by defocus is
-      part of the figure.
-    Gradient: to every lens tensor and to at_m. Raises: DomainError for another mapping, or when a chief ray does not
-      arrive.
+    Args: mapping: "f-tan" (a picture without distortion) or "f-theta" (a scan lens or fisheye). at_m: metres
+      to the object plane. f is the height of the paraxial image of that plane per tangent: the focal length
+      for parallel light. On a film that is not focused there (``GeoLens.focus_at``) the change of scale by
+      defocus is part of the figure.
+    Gradient: to every lens tensor and to at_m. Raises: DomainError for another mapping, or when a chief ray
+      does not arrive.
     """
     if mapping not in MAPPINGS:
         raise DomainError(f"mapping '{mapping}' is not known; known mappings: {', '.join(MAPPINGS)}.")
@@ -114,9 +114,11 @@ def focus_shift_mm(
     equations; four points cancel the terms of third order in the reach, so what is left is rounding (below
     1e-8 of the focal length).
 
-    Args: fields_rad: F angles. reach: share of the pupil radius. at_m: metres to the object plane, or D of them.
-    Returns: [F, 2] or [D, F, 2] mm, tangential (rays displaced in y) then sagittal (in x); positive behind the image
-      plane. Computed in float64, as the rays lie so close together, and given in the lens's precision.
+    Args: fields_rad: F angles. reach: share of the pupil radius. at_m: metres to the object plane, or D of
+      them.
+    Returns: [F, 2] or [D, F, 2] mm, tangential (rays displaced in y) then sagittal (in x); positive behind
+      the image plane. Computed in float64, as the rays lie so close together, and given in the lens's
+      precision.
     Gradient: to every lens tensor and to at_m. Raises: DomainError when a field does not arrive.
     """
     dtype = lens.dtype
@@ -173,8 +175,8 @@ def ray_fan(
       count: rays per diameter, odd to hold the chief ray. reference_mm: [2] image point to which both
         aberrations refer; None is the chief ray of this wavelength. Give that of a middle wavelength to see
         lateral colour. vignetting, defocus_mm, at_m (one distance): see ``trace_field``.
-    Gradient: aberrations to every lens tensor and to at_m. Raises: DomainError when no ray, or not the chief ray,
-      arrives.
+    Gradient: aberrations to every lens tensor and to at_m. Raises: DomainError when no ray, or not the chief
+      ray, arrives.
     """
     like = lens.curvature_per_mm
     line = torch.linspace(-1, 1, count, dtype=like.dtype, device=like.device)
@@ -263,7 +265,8 @@ def relative_illumination(
     """Irradiance of the image of a uniform world at each field, relative to the axis, vignetting included.
 
     Args: fields_rad: angles from the axis; grid: pupil points across the stop.
-    Returns: [fields], computed in float64 and given in the lens's precision. For an ideal lens of small aperture without distortion it is cos^4 of the field angle.
+    Returns: [fields], computed in float64 and given in the lens's precision. For an ideal lens of small
+      aperture without distortion it is cos^4 of the field angle.
     Gradient: to every lens tensor.
     Raises: DomainError for a field that no ray passes.
     Source: E = integral of radiance over image-space direction cosines (Slyusarev; Rimmer, Relative
@@ -277,9 +280,8 @@ def relative_illumination(
     film = torch.stack([torch.zeros_like(torch.stack(heights)), torch.stack(heights)], 1).repeat_interleave(
         pupil.shape[0], 0
     )
-    rays = lens.camera_rays(
-        -film, pupil.repeat(len(fields), 1), wavelength_um, aim=True
-    )  # camera rays take points as seen upright
+    # camera rays take points as seen upright
+    rays = lens.camera_rays(-film, pupil.repeat(len(fields), 1), wavelength_um, aim=True)
     assert rays.irradiance is not None  # GeoLens gives it
     light = (rays.weight * rays.irradiance).reshape(len(fields), -1).mean(1)
     return (light[1:] / light[0]).to(dtype)

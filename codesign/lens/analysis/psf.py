@@ -58,9 +58,8 @@ def diffraction_psf(
     # signs in a chequer put the reference point into the middle; columns of padding alone need no transform
     sign = 1 - 2 * (torch.arange(pupil.field.shape[0], device=pupil.field.device) % 2)
     light = (pupil.field.real.square() + pupil.field.imag.square()).sum()
-    field = (
-        pupil.field * (sign * sign[:, None]) * (count / light.sqrt())
-    )  # so that the energy sums to 1 (Parseval)
+    # so that the energy sums to 1 (Parseval)
+    field = pupil.field * (sign * sign[:, None]) * (count / light.sqrt())
     amplitude = torch.fft.ifft(torch.fft.ifft(field, n=count, dim=0), n=count, dim=1)
     energy = amplitude.real.square() + amplitude.imag.square()
     pitch = pupil.wavelength_mm / (2 * pupil.cosine_radius * int(padding))
@@ -85,8 +84,8 @@ def psf_on_pixels(
     and their lateral colour is in it. The energy of a pixel is the density at its centre times its area; the
     sum tells the share that falls on the grid.
 
-    Args: pixel_mm: size of a square pixel. pixels: rows and columns. light: see ``spectral_lines``. at_m: metres to the
-      object plane, see ``wavefront``.
+    Args: pixel_mm: size of a square pixel. pixels: rows and columns. light: see ``spectral_lines``. at_m:
+      metres to the object plane, see ``wavefront``.
     Gradient: to every lens tensor. Raises: DomainError, see ``pupil_function``, and when the grid is wider
       than the sampled pupil's period.
     """
@@ -133,8 +132,8 @@ def geometric_psf(
     """Psf by rays: each ray's weight is shared bilinearly among the four pixel centres around it. About the
     chief ray of the first wavelength.
 
-    Args: grid: pupil cells across. at_m: metres to the object plane, see ``wavefront``. Rays beyond the grid are lost: the sum of ``energy`` is the share that
-      falls on it.
+    Args: grid: pupil cells across. at_m: metres to the object plane, see ``wavefront``. Rays beyond the grid
+      are lost: the sum of ``energy`` is the share that falls on it.
     Gradient: energy to every lens tensor, piecewise linear in the ray positions.
     """
     pixel_mm, pixels = _pixels(pixel_mm, pixels)

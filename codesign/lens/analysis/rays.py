@@ -64,12 +64,12 @@ def source_rays(
     """The rays all analyses start with; the one place that decides where pupil points lie (on the paraxial
     entrance pupil of the d line) and where object points do.
 
-    The object point of a field lies on the plane ``at_m`` before the entrance pupil and is seen under the field
-    angle from the pupil's centre. Its light reaches the pupil point q along (q / distance + (0, tan field), 1),
-    which holds for parallel light too.
+    The object point of a field lies on the plane ``at_m`` before the entrance pupil and is seen under the
+    field angle from the pupil's centre. Its light reaches the pupil point q along (q / distance + (0, tan
+    field), 1), which holds for parallel light too.
 
-    Args: fields_rad: an angle in +y, or F of them. pupil: [M, 2] on the unit disc. at_m: a distance, or D of them;
-      see ``vergence_per_mm``. start_z_mm: plane on which the rays are given, from the first vertex.
+    Args: fields_rad: an angle in +y, or F of them. pupil: [M, 2] on the unit disc. at_m: a distance, or D of
+      them; see ``vergence_per_mm``. start_z_mm: plane on which the rays are given, from the first vertex.
     Returns: SourceRays with the axes [D, F], as far as several were given.
     Gradient: to the lens, whose pupil moves, and to at_m. Raises: DomainError for a distance inside the lens.
     """
@@ -88,7 +88,8 @@ def source_rays(
     direction = torch.stack([(part / length).expand(length.shape) for part in along], -1)
     back = (start_z_mm - f.entrance_pupil_z_mm) / direction[..., 2]
     start = (x + direction[..., 0] * back, y + direction[..., 1] * back, torch.full_like(back, start_z_mm))
-    # lean / (length + 1): distance of q from the object, less that of the pupil's centre, free of cancellation
+    # lean / (length + 1): distance of q from the object, less that of the pupil's centre, free of
+    # cancellation
     path = lean / (length + 1) + back
     shape = (*torch.as_tensor(at_m).shape, *fields.shape, pupil.shape[0])
     return SourceRays(
@@ -116,13 +117,13 @@ def field_rays(
 
 @dataclass(frozen=True)
 class ImageRays:
-    """Rays of one wavelength on a plane across the axis near the image, with leading axes [...] of distances and
-    fields.
+    """Rays of one wavelength on a plane across the axis near the image, with leading axes [...] of distances
+    and fields.
 
-    position_mm: [..., M, 2] (x, y). direction: [..., M, 3] unit. path_mm: [..., M] optical path to the plane from
-      the wavefront of the object point through the centre of the entrance pupil. weight: [..., M] >= 0, 0 for
-      rays that do not arrive. index: refractive index in image space. transmission: [..., M] what the apertures'
-      soft edges let pass.
+    position_mm: [..., M, 2] (x, y). direction: [..., M, 3] unit. path_mm: [..., M] optical path to the plane
+      from the wavefront of the object point through the centre of the entrance pupil. weight: [..., M] >= 0,
+      0 for rays that do not arrive. index: refractive index in image space. transmission: [..., M] what the
+      apertures' soft edges let pass.
     """
 
     position_mm: Tensor
@@ -174,11 +175,12 @@ def trace_field(
 
     Args:
       field_rad: an angle in +y, or F of them. pupil: [M, 2] on the unit disc. vignetting: weigh rays by the
-        apertures' soft edges; otherwise every ray that arrives weighs 1. defocus_mm: distance of the plane behind
-        the lens's own image plane. at_m: metres from the entrance pupil to the object plane, or D of them; see
-        ``source_rays``.
+        apertures' soft edges; otherwise every ray that arrives weighs 1. defocus_mm: distance of the plane
+        behind the lens's own image plane. at_m: metres from the entrance pupil to the object plane, or D of
+        them; see ``source_rays``.
     Returns: ImageRays with the axes [D, F, M], D and F as far as several were given.
-    Gradient: positions, directions and paths to every lens tensor and to at_m; with vignetting the weights too.
+    Gradient: positions, directions and paths to every lens tensor and to at_m; with vignetting the weights
+      too.
     Raises: DomainError when no ray of a field arrives, or for a distance inside the lens.
     """
     rays = trace_source(lens, source_rays(lens, field_rad, pupil, at_m), wavelength_um).shifted(defocus_mm)
@@ -199,7 +201,8 @@ def _lit(lens, rays, field_rad):
 
 
 def trace_source(lens: TracedLens, source: SourceRays, wavelength_um: float) -> ImageRays:
-    """ImageRays of source rays on the lens's own image plane, of weight 1 where they arrive; none need do so."""
+    """ImageRays of source rays on the lens's own image plane, of weight 1 where they arrive; none need do
+    so."""
     shape = source.path_mm.shape
     out = lens.trace(source.origin_mm.reshape(-1, 3), source.direction.reshape(-1, 3), wavelength_um)
     index = lens.index(wavelength_um)

@@ -49,8 +49,8 @@ def rms_spot_mm(
     grid: int = 32,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """RMS distance of rays from their mean point, [fields] mm; [D, fields] for D distances ``at_m``, see ``spots``.
-    Raises DomainError where no ray of a field arrives.
+    """RMS distance of rays from their mean point, [fields] mm; [D, fields] for D distances ``at_m``, see
+    ``spots``. Raises DomainError where no ray of a field arrives.
 
     Example:
     >>> from codesign import lens
@@ -73,9 +73,8 @@ def rms_spot_mm(
         )
     w = weight[..., None]
     centre = (positions * w).sum(-2, keepdim=True) / total[..., None, None]
-    return (
-        torch.linalg.vector_norm((positions - centre) * w, dim=(-2, -1)) / total.sqrt()
-    )  # weights are 0 or 1; the gradient at a point image is 0
+    # weights are 0 or 1; the gradient at a point image is 0
+    return torch.linalg.vector_norm((positions - centre) * w, dim=(-2, -1)) / total.sqrt()
 
 
 def polychromatic_spot(
@@ -89,12 +88,12 @@ def polychromatic_spot(
 ) -> tuple[Tensor, Tensor]:
     """Spot of one object point in light of several wavelengths, lateral colour included.
 
-    Args: light: see ``spectral_lines``. grid: pupil cells across. vignetting, defocus_mm, at_m (one distance): see
-      ``trace_field``.
+    Args: light: see ``spectral_lines``. grid: pupil cells across. vignetting, defocus_mm, at_m (one
+      distance): see ``trace_field``.
     Returns: positions [W, M, 2] mm on the image plane, and weights [W, M] that sum to 1 (rays of one
       wavelength share its weight as far as they arrive).
-    Gradient: positions (with vignetting also weights) to every lens tensor and to at_m. Raises: DomainError when
-      no ray of a wavelength arrives.
+    Gradient: positions (with vignetting also weights) to every lens tensor and to at_m. Raises: DomainError
+      when no ray of a wavelength arrives.
     """
     one_distance(at_m)
     pupil = pupil_grid(grid, lens.dtype, lens.curvature_per_mm.device)
@@ -134,8 +133,8 @@ def encircled_energy(
 ) -> Tensor:
     """Share of rays within circles about the spot's mean point (or the chief ray of the first wavelength).
 
-    Args: radii_mm: [K] increasing or not; the others as for ``polychromatic_spot``. Returns: [K] in [0, 1], geometric, without diffraction. Gradient:
-      none (a count).
+    Args: radii_mm: [K] increasing or not; the others as for ``polychromatic_spot``. Returns: [K] in [0, 1],
+      geometric, without diffraction. Gradient: none (a count).
     """
     distance, weight = _distances(lens, field_rad, light, grid, vignetting, defocus_mm, about_chief, at_m)
     radii = torch.as_tensor(radii_mm, dtype=distance.dtype, device=distance.device).reshape(-1)

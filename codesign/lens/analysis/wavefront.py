@@ -1,10 +1,11 @@
 """Wavefront error of a lens: optical path differences from the reference sphere, their RMS, and the Strehl
 ratio.
 
-Paths count from the object point, that is from its spherical wavefront through the centre of the entrance pupil (a
-plane for parallel light). The reference sphere is centred on the chief ray's image point (or another given point) and passes through the centre of the
-paraxial exit pupil. An optical path difference is positive where the wavefront is ahead of the sphere, so
-that undercorrected spherical aberration is positive (W040 = S_I / 8).
+Paths count from the object point, that is from its spherical wavefront through the centre of the entrance
+pupil (a plane for parallel light). The reference sphere is centred on the chief ray's image point (or
+another given point) and passes through the centre of the paraxial exit pupil. An optical path difference is
+positive where the wavefront is ahead of the sphere, so that undercorrected spherical aberration is positive
+(W040 = S_I / 8).
 Source: Welford, Aberrations of Optical Systems, ch. 7; Born and Wolf, ch. 9.
 """
 
@@ -28,8 +29,8 @@ class Wavefront:
 
     pupil: [M, 2] points of the unit disc (entrance pupil). opd_mm: [M], positive where the wavefront is
       ahead. weight: [M], 0 where no light passes. slope: [M, 2] direction cosines times index from the ray's
-      point on the reference sphere to its centre, minus those of the chief ray. reference_mm: [2] that centre, on
-      the image plane.
+      point on the reference sphere to its centre, minus those of the chief ray. reference_mm: [2] that
+      centre, on the image plane.
     """
 
     pupil: Tensor
@@ -78,10 +79,11 @@ def wavefront(
     Args:
       grid: pupil cells across (the points are those of ``pupil_grid``), unless ``pupil`` [M, 2] gives the
         points themselves.
-      vignetting, defocus_mm, at_m (one distance): see ``trace_field``. reference_mm: [2] centre of the reference sphere; None is
-        the chief ray's point.
+      vignetting, defocus_mm, at_m (one distance): see ``trace_field``. reference_mm: [2] centre of the
+        reference sphere; None is the chief ray's point.
     Returns: Wavefront, in the lens's precision; paths of many wavelengths are computed in float64.
-    Gradient: opd_mm to every lens tensor and to at_m. Raises: DomainError when no ray, or not the chief ray, arrives.
+    Gradient: opd_mm to every lens tensor and to at_m. Raises: DomainError when no ray, or not the chief ray,
+      arrives.
     """
     like = lens.curvature_per_mm
     lens = in_float64(lens)

@@ -83,7 +83,8 @@ class Limits:
     rays: whether every rim and chief ray of ``fields_rad`` must arrive.
     glass_polygon: corners (nd, Vd) of a convex region of the glass map, see glass_map. index_range: least and
       most nd of any glass.
-    at_m: distance of the object whose rays count, metres from the entrance pupil, or several; inf is parallel light.
+    at_m: distance of the object whose rays count, metres from the entrance pupil, or several; inf is
+      parallel light.
     scale_mm, scale_deg: violations that cost 1.
     """
 

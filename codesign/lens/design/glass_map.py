@@ -59,10 +59,10 @@ def neighbour_glasses(
     """The catalogue's glasses nearest to one on the (nd, Vd) map, the nearest first.
 
     The distance is hypot(nd difference, Vd difference / 100), see VD_PER_ND.
-    Args: medium: a Glass, or a name of the catalogue. apart: least distance; other makers' versions of the same
-      glass lie closer and are left out. among: names of the catalogue to choose from, None for all.
-    Returns: at most ``count`` glasses. Raises: DomainError for a name the catalogue does not know, or a medium
-      without dispersion.
+    Args: medium: a Glass, or a name of the catalogue. apart: least distance; other makers' versions of the
+      same glass lie closer and are left out. among: names of the catalogue to choose from, None for all.
+    Returns: at most ``count`` glasses. Raises: DomainError for a name the catalogue does not know, or a
+      medium without dispersion.
 
     >>> from codesign import lens
     >>> [glass.name for glass in lens.design.neighbour_glasses("F2", 3)]

@@ -36,8 +36,9 @@ def surface_hits(
     """Trace rays once per surface, up to it, and once to the image. Args: origin_mm, direction [N, 3], see
     GeoLens.trace. Returns: Hits.
 
-    The normal is read off the change of direction at the same surface before denser glass, n'd' - n d = const N, so
-    shapes, decentres and tilts need no second formula, and equal indices on both sides have a normal too.
+    The normal is read off the change of direction at the same surface before denser glass, n'd' - n d =
+    const N, so shapes, decentres and tilts need no second formula, and equal indices on both sides have a
+    normal too.
     Gradient: heights and cosines to rays and to every lens tensor. Raises: DomainError for a lens with
       diffractive phases, which bend off the normal.
     """
@@ -79,8 +80,8 @@ def surface_hits(
 def rim_rays(
     lens: GeoLens, fields_rad: Sequence[float], count: int = 16, at_m: Distances = PARALLEL
 ) -> tuple[Tensor, Tensor]:
-    """The chief ray and ``count`` rays on the rim of the entrance pupil, for each field and distance. Returns:
-    origins and directions [distances * fields * (count + 1), 3]."""
+    """The chief ray and ``count`` rays on the rim of the entrance pupil, for each field and distance.
+    Returns: origins and directions [distances * fields * (count + 1), 3]."""
     turn = (
         torch.arange(count, dtype=lens.dtype, device=lens.curvature_per_mm.device) * (2 * torch.pi / count)
         + torch.pi / 2
@@ -97,14 +98,15 @@ def traced_semi_aperture_mm(
     count: int = 16,
     at_m: Distances = PARALLEL,
 ) -> Tensor:
-    """Semi-aperture that lets the full pupil of all fields and distances pass, [S] mm: the largest height of a rim
-    ray, times 1 + margin.
+    """Semi-aperture that lets the full pupil of all fields and distances pass, [S] mm: the largest height of
+    a rim ray, times 1 + margin.
 
     Gradient: of the highest ray. Raises: DomainError when a rim ray fails, or for a margin below 0.
     """
     if not 0 <= margin < math.inf:
         raise DomainError(
-            f"{lens.name}: margin {margin} is added to semi-apertures as a share; give a finite number of at least 0."
+            f"{lens.name}: margin {margin} is added to semi-apertures as a share; give a finite number of "
+            "at least 0."
         )
     rays = rim_rays(lens, fields_rad, count, at_m)
     failed = lens.trace(*rays).status != 0
@@ -121,10 +123,11 @@ def traced_semi_aperture_mm(
 def fit_apertures(
     lens: GeoLens, fields_rad: Sequence[float], at_m: Distances = PARALLEL, margin: float = 0.05
 ) -> GeoLens:
-    """The lens with the semi-apertures that its rays need, so that edges and gaps of a design that changed are
-    judged, and its light clipped, where its glass would really end.
+    """The lens with the semi-apertures that its rays need, so that edges and gaps of a design that changed
+    are judged, and its light clipped, where its glass would really end.
 
-    Args: fields_rad, at_m: whose full pupil passes; give both signs of a field for a lens with decentres or tilts.
+    Args: fields_rad, at_m: whose full pupil passes; give both signs of a field for a lens with decentres or
+      tilts.
       margin: share added to the highest ray, as far as the surface reaches.
     Returns: a lens as from ``replace``. Gradient: semi_aperture_mm follows the highest rays.
     Raises: DomainError when a rim ray fails, or for a margin below 0.
@@ -146,7 +149,7 @@ def paraxial_semi_aperture_mm(
     margin: float = 0.05,
     at_m: float | Tensor = PARALLEL,
 ) -> Tensor:
-    """The same from the paraxial marginal and chief ray of one distance, |y| + |y_chief|, [S] mm: defined for every
-    lens, without tracing. Differentiable."""
+    """The same from the paraxial marginal and chief ray of one distance, |y| + |y_chief|, [S] mm: defined
+    for every lens, without tracing. Differentiable."""
     rays = paraxial_rays(lens, half_field_rad, vergence_per_mm=vergence_per_mm(lens, one_distance(at_m)))
     return (rays.marginal_height_mm.abs() + rays.chief_height_mm.abs()) * (1 + margin)

@@ -89,9 +89,8 @@ def make_design(
     Args: fields_rad: angles at which ray motion is measured. floors: another LensDesign whose thickness
       floors to keep; by default they are ``floor_share`` of today's centre and edge thicknesses.
     """
-    lens = lens.replace(
-        **{name: getattr(lens, name).detach().clone() for name in LEARNABLES}
-    )  # the caller's lens keeps its gradients
+    # the caller's lens keeps its gradients
+    lens = lens.replace(**{name: getattr(lens, name).detach().clone() for name in LEARNABLES})
     count = lens.curvature_per_mm.numel()
     size = torch.cat(
         [lens.curvature_per_mm.detach().abs().mean().expand(count - 1), lens.thickness_mm.detach()]
@@ -107,9 +106,8 @@ def make_design(
             )
         )
         plain = LensDesign(lens, float(lens.first_order().efl_mm), torch.diag(size), *least)
-        motion = (
-            torch.stack([_motion(plain, v, fields_rad) for v in range(size.numel())], 1) / step_mm
-        )  # [rays, V], steps per relative change
+        # [rays, V], steps per relative change
+        motion = torch.stack([_motion(plain, v, fields_rad) for v in range(size.numel())], 1) / step_mm
         power, modes = torch.linalg.eigh(motion.T @ motion)
         reach = torch.minimum(power.clamp_min(1e-30).rsqrt(), 0.1 / modes.abs().amax(0))
     return LensDesign(lens, plain.efl_mm, size[:, None] * modes * reach, *least)
@@ -122,9 +120,8 @@ def _motion(design, variable, fields_rad, step=1e-4):
     moved, weight = ray_motion(spots(design.lens(shift), fields_rad), spots(design.lens(-shift), fields_rad))
     moved = moved / (2 * step)
     weight = weight[..., None]
-    moved = moved - weight * moved.sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(
-        1
-    )  # a shift of the whole spot does not blur
+    # a shift of the whole spot does not blur
+    moved = moved - weight * moved.sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp_min(1)
     return moved.reshape(-1) / (moved.shape[0] * moved.shape[1]) ** 0.5
 
 
@@ -139,9 +136,9 @@ def detune(
     focal length held.
 
     Every curvature but the one that holds the focal length and the image distance get independent Gaussian
-    errors of one common relative size, which is raised until the target is met. spot_mm: what is raised to the
-    target, a scalar; None is the mean RMS spot in the d line. One that refocuses first asks for errors that no
-    focusing takes away. Raises: DomainError when 50 % is not enough.
+    errors of one common relative size, which is raised until the target is met. spot_mm: what is raised to
+    the target, a scalar; None is the mean RMS spot in the d line. One that refocuses first asks for errors
+    that no focusing takes away. Raises: DomainError when 50 % is not enough.
     """
     count = design.reference.curvature_per_mm.numel()
     at = holding_surface(design.reference)

@@ -1,12 +1,12 @@
 """Elements taken out, exchanged for another glass, or moved as rigid bodies.
 
-Moves between lens forms leave all other surfaces where they are, keep the focal length and the f-number, and the
-image plane as far from the paraxial focus as it was. Elements are single pieces of glass: a cemented doublet is two.
-Re-optimisation around these moves is in ``codesign.optimise.lens_moves``.
+Moves between lens forms leave all other surfaces where they are, keep the focal length and the f-number, and
+the image plane as far from the paraxial focus as it was. Elements are single pieces of glass: a cemented
+doublet is two. Re-optimisation around these moves is in ``codesign.optimise.lens_moves``.
 
-Errors of mounting: the lens knows a decentre and a tilt per surface. A rigid motion turns every vertex about the
-vertex of the first face, so that those behind it move sideways and along the axis, and turns every axis. Surfaces are
-symmetric about their axes, so two angles say where an axis points.
+Errors of mounting: the lens knows a decentre and a tilt per surface. A rigid motion turns every vertex about
+the vertex of the first face, so that those behind it move sideways and along the axis, and turns every axis.
+Surfaces are symmetric about their axes, so two angles say where an axis points.
 """
 
 import math
@@ -27,8 +27,8 @@ SAME_INDEX = 1e-9
 
 
 def elements(lens: GeoLens) -> tuple[tuple[int, int], ...]:
-    """Front and back surface (counted from 0) of every element, from the object: one pair per piece of glass, so
-    that neighbours in a cemented group share a surface.
+    """Front and back surface (counted from 0) of every element, from the object: one pair per piece of
+    glass, so that neighbours in a cemented group share a surface.
 
     >>> from codesign import lens
     >>> lens.design.elements(lens.load("cooke-triplet"))
@@ -38,8 +38,8 @@ def elements(lens: GeoLens) -> tuple[tuple[int, int], ...]:
 
 
 def groups(lens: GeoLens) -> tuple[tuple[int, int], ...]:
-    """First and last surface (counted from 0) of every group: elements that share no surface with another, and
-    cemented ones as a whole."""
+    """First and last surface (counted from 0) of every group: elements that share no surface with another,
+    and cemented ones as a whole."""
     found: list[tuple[int, int]] = []
     for front, back in elements(lens):
         if found and found[-1][1] == front:
@@ -51,13 +51,13 @@ def groups(lens: GeoLens) -> tuple[tuple[int, int], ...]:
 def without_element(lens: GeoLens, element: int) -> GeoLens:
     """The lens without one element; air takes its place.
 
-    An element that is cemented to another leaves the cemented face to that one. Where the stop was on a face that
-    goes, a plane stop stays in its place.
+    An element that is cemented to another leaves the cemented face to that one. Where the stop was on a face
+    that goes, a plane stop stays in its place.
     Args: element: its number in ``elements(lens)``, counted from 0; from the last when negative.
     Returns: a lens of its own, built from today's values. Its focal length is the old one, held by
       ``hold_efl``. A semi-aperture beyond the reach of its surface becomes that reach.
-    Raises: DomainError for an element that is not there, is the only one, or touches a mirror; and when the rest
-      cannot have the focal length with the image behind it.
+    Raises: DomainError for an element that is not there, is the only one, or touches a mirror; and when the
+      rest cannot have the focal length with the image behind it.
 
     >>> from codesign import lens
     >>> dialyte = lens.design.without_element(lens.load("cooke-triplet"), 1)
@@ -68,7 +68,8 @@ def without_element(lens: GeoLens, element: int) -> GeoLens:
     front, back = _element_faces(lens, pairs, element)
     if len(pairs) == 1 and not any(lens.mirrors):
         raise DomainError(
-            f"{lens.name}: element 1 is its only one, and without it nothing bends light; add an element first."
+            f"{lens.name}: element 1 is its only one, and without it nothing bends light; add an element "
+            "first."
         )
     filled = lens.glass.tolist()
     surfaces = _surfaces(lens)
@@ -83,12 +84,12 @@ def without_element(lens: GeoLens, element: int) -> GeoLens:
 
 
 def without_surface(lens: GeoLens, surface: int) -> GeoLens:
-    """The lens without one surface, a dummy in air or the face between two glasses; the gap in front of it grows
-    over it, with its medium.
+    """The lens without one surface, a dummy in air or the face between two glasses; the gap in front of it
+    grows over it, with its medium.
 
     A stop on that surface moves to the nearer neighbour.
-    Args: surface: counted from 0; from the last when negative. Returns, Raises: as ``without_element``; DomainError
-      too for a face between glass and air, whose element would have no end.
+    Args: surface: counted from 0; from the last when negative. Returns, Raises: as ``without_element``;
+      DomainError too for a face between glass and air, whose element would have no end.
     """
     count = len(lens.surfaces)
     if not -count <= surface < count:
@@ -101,7 +102,8 @@ def without_surface(lens: GeoLens, surface: int) -> GeoLens:
     filled = [False, *lens.glass.tolist()]
     if filled[at] != filled[at + 1] and not _same_medium(lens, at):
         raise DomainError(
-            f"{lens.name}: surface {at + 1} lies between glass and air, so the glass would have no face; take its "
+            f"{lens.name}: surface {at + 1} lies between glass and air, so the glass would have no face; "
+            "take its "
             "element out with without_element."
         )
     if count == 1:
@@ -110,8 +112,8 @@ def without_surface(lens: GeoLens, surface: int) -> GeoLens:
 
 
 def flattened(lens: GeoLens, element: int, share: float) -> GeoLens:
-    """The lens on its way to ``without_element``: at ``share`` 1 the element is a plane-parallel plate, or a shell
-    of equal curvatures where it is cemented to another; at 0 it is as now.
+    """The lens on its way to ``without_element``: at ``share`` 1 the element is a plane-parallel plate, or a
+    shell of equal curvatures where it is cemented to another; at 0 it is as now.
 
     Gradient: to the lens tensors. Focal length and focus are left alone.
     """
@@ -130,16 +132,18 @@ def flattened(lens: GeoLens, element: int, share: float) -> GeoLens:
 
 
 def with_glass(lens: GeoLens, surface: int, medium: Glass | str) -> GeoLens:
-    """The lens with another glass behind a surface (counted from 0), focal length, f-number and defocus as before;
-    ``GeoLens.replace_glass`` leaves them as they come.
+    """The lens with another glass behind a surface (counted from 0), focal length, f-number and defocus as
+    before; ``GeoLens.replace_glass`` leaves them as they come.
 
     Args: medium: a Glass, or a name of the catalogue.
-    Returns, Raises: as ``without_element``; DomainError for a gap that holds no glass, and for air in its place.
+    Returns, Raises: as ``without_element``; DomainError for a gap that holds no glass, and for air in its
+      place.
     """
     if surface not in [front for front, _ in elements(lens)]:
         fronts = ", ".join(str(front) for front, _ in elements(lens))
         raise DomainError(
-            f"{lens.name}: there is no glass behind surface {surface} to exchange; there is behind {fronts or 'none'}."
+            f"{lens.name}: there is no glass behind surface {surface} to exchange; there is behind "
+            f"{fronts or 'none'}."
         )
     other = lens.replace_glass(surface, medium)
     if other.surfaces[surface].medium is None:
@@ -158,7 +162,8 @@ def _element_faces(lens, pairs, element):
     front, back = pairs[element]
     if lens.mirrors[front] or lens.mirrors[back]:
         raise DomainError(
-            f"{lens.name}: element {range(len(pairs))[element] + 1} touches a mirror, and without that the light "
+            f"{lens.name}: element {range(len(pairs))[element] + 1} touches a mirror, and without that the "
+            "light "
             "turns no more; choose another."
         )
     passes = passes_of(lens.to_surfaces(), front)
@@ -183,8 +188,8 @@ def _surfaces(lens):
 
 
 def _without(surfaces, at, keep_stop):
-    """The list without a surface, the gap in front of it longer; a plane stop in its place when the stop is to
-    stay."""
+    """The list without a surface, the gap in front of it longer; a plane stop in its place when the stop is
+    to stay."""
     found = list(surfaces)
     gone = found.pop(at)
     if gone.is_stop and keep_stop:
@@ -217,8 +222,10 @@ def _held(lens, surfaces, label):
         image = float(held.thickness_mm[-1])
         if not image > 0:
             raise DomainError(
-                f"{lens.name} {label}: at its focal length of {float(f.efl_mm):.6g} mm the image lies {-image:.4g} mm "
-                "before the last surface; flatten the element in steps and re-optimise in between, or take out another."
+                f"{lens.name} {label}: at its focal length of {float(f.efl_mm):.6g} mm the image lies "
+                f"{-image:.4g} mm "
+                "before the last surface; flatten the element in steps and re-optimise in between, or take "
+                "out another."
             )
         made.curvature_per_mm.copy_(held.curvature_per_mm)
         made.thickness_mm.copy_(held.thickness_mm)
@@ -245,18 +252,21 @@ def moved_element(
 
     Args:
       faces: first and last surface (counted from 0), see ``moves.elements`` and ``moves.groups``.
-      decentre_mm: [2] of the vertex of the first face, x and y. tilt_rad: [2] about x, then about y, around that
-        vertex. wedge_rad: [2] tilt of the last face alone, about x and about y, around its own vertex and before
-        the element is tilted. None is no error.
-    Returns: a lens as from ``replace``, with other decentres, tilts and thicknesses (the gap in front of a vertex
-      that moves along the axis and the one behind it). Errors that the surfaces have already are turned along.
+      decentre_mm: [2] of the vertex of the first face, x and y. tilt_rad: [2] about x, then about y, around
+        that vertex. wedge_rad: [2] tilt of the last face alone, about x and about y, around its own vertex
+        and before the element is tilted. None is no error.
+    Returns: a lens as from ``replace``, with other decentres, tilts and thicknesses (the gap in front of a
+      vertex that moves along the axis and the one behind it). Errors that the surfaces have already are
+      turned along.
     Gradient: to the errors and to every tensor of the lens.
-    Raises: DomainError for faces that are not there or a mirror between them, whose axis is unfolded; ShapeError.
+    Raises: DomainError for faces that are not there or a mirror between them, whose axis is unfolded;
+      ShapeError.
     """
     count = len(lens.surfaces)
     if len(faces) != 2 or not all(isinstance(face, int) for face in faces):
         raise DomainError(
-            f"{lens.name}: faces {faces} of an element must be two whole numbers; give a pair out of elements(lens) or "
+            f"{lens.name}: faces {faces} of an element must be two whole numbers; give a pair out of "
+            "elements(lens) or "
             "groups(lens)."
         )
     first, last = faces
@@ -294,7 +304,8 @@ def moved_element(
 
 
 def _rotation(angles):
-    """Turn about x, then about the y that came of it, [3, 3]: from the axes of a surface to those of the lens."""
+    """Turn about x, then about the y that came of it, [3, 3]: from the axes of a surface to those of the
+    lens."""
     (ca, cb), (sa, sb) = angles.cos(), angles.sin()
     zero = torch.zeros_like(ca)
     return torch.stack([cb, zero, sb, sa * sb, ca, -sa * cb, -ca * sb, sa, ca * cb]).reshape(3, 3)

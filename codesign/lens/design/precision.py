@@ -1,12 +1,13 @@
 """What precision each surface needs: tolerances out of a budget, the other way round.
 
-A figure is forecast to second order in the errors, F(e) = F0 + s.e + e.Q e, with e in units of the deviations that
-the errors have so far. With factors f on these deviations its increase has the mean sum Q_ii f_i^2 and the variance
-sum s_i^2 f_i^2 + 2 sum Q_ij^2 f_i^2 f_j^2. The budget is the increase that a share of all lenses stays within. With v
-= f^2 and w the slope of mean + z deviation over v (z the normal quantile of the share), equal contributions mean
-w v alike for all, and the cheapest tolerances at costs c / f have f proportional to (c / w)^(1/3) (Lagrange). Where
-Q = 0 that is the closed form of a root sum of squares; else w depends on v, and both are a fixed point. The scale of
-all factors follows from the distribution of the quadratic form itself, not from its normal approximation.
+A figure is forecast to second order in the errors, F(e) = F0 + s.e + e.Q e, with e in units of the
+deviations that the errors have so far. With factors f on these deviations its increase has the mean sum Q_ii
+f_i^2 and the variance sum s_i^2 f_i^2 + 2 sum Q_ij^2 f_i^2 f_j^2. The budget is the increase that a share of
+all lenses stays within. With v = f^2 and w the slope of mean + z deviation over v (z the normal quantile of
+the share), equal contributions mean w v alike for all, and the cheapest tolerances at costs c / f have f
+proportional to (c / w)^(1/3) (Lagrange). Where Q = 0 that is the closed form of a root sum of squares; else
+w depends on v, and both are a fixed point. The scale of all factors follows from the distribution of the
+quadratic form itself, not from its normal approximation.
 
     forecast = of_spot(forecast_spot(nominal, slopes, 3))
     needed = cheapest(forecast, errors, 0.21 * forecast.nominal)  # the RMS spot grows by 10 % at most
@@ -35,8 +36,8 @@ ROUNDS = 40  # of the fixed point and of a bisection
 
 @dataclass(frozen=True)
 class Forecast:
-    """A figure to second order in P independent errors of one standard deviation each: nominal + linear . e + e .
-    square e, with a number, [P] and [P, P] symmetric."""
+    """A figure to second order in P independent errors of one standard deviation each: nominal + linear . e
+    + e . square e, with a number, [P] and [P, P] symmetric."""
 
     nominal: float
     linear: Tensor
@@ -49,7 +50,8 @@ class Forecast:
         )
 
     def moments(self, factors: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the increase when every error has its factor [P] times the deviation."""
+        """Mean and standard deviation of the increase when every error has its factor [P] times the
+        deviation."""
         v = factors.square()
         mean = self.square.diagonal() @ v
         return mean, (self.linear.square() @ v + 2 * v @ self.square.square() @ v).sqrt()
@@ -75,8 +77,9 @@ class Forecast:
 
 @dataclass(frozen=True)
 class Precision:
-    """Tolerances that spend a budget. errors: with the deviations needed. factors: [P], of these over those given;
-    one for both axes of a tolerance. shares: [P] of the budget that each error takes. cost: sum of cost / factor."""
+    """Tolerances that spend a budget. errors: with the deviations needed. factors: [P], of these over those
+    given; one for both axes of a tolerance. shares: [P] of the budget that each error takes. cost: sum of
+    cost / factor."""
 
     errors: tuple[Error, ...]
     factors: Tensor
@@ -96,11 +99,11 @@ def fitted(
     steps: Tensor | float = 1.0,
     compensate: Compensator | None = None,
 ) -> Forecast:
-    """Forecast of a figure without useful derivatives, such as a flow error: a parabola through the lens itself and
-    each error at plus and minus its step, 2 P + 1 evaluations; errors do not mix in it.
+    """Forecast of a figure without useful derivatives, such as a flow error: a parabola through the lens
+    itself and each error at plus and minus its step, 2 P + 1 evaluations; errors do not mix in it.
 
-    Args: figure: lens -> one number; draw the same random numbers in every call. steps: in standard deviations, a
-      number or [P]; large enough for the figure to rise above its noise.
+    Args: figure: lens -> one number; draw the same random numbers in every call. steps: in standard
+      deviations, a number or [P]; large enough for the figure to rise above its noise.
     """
     figure = compensated(figure, compensate)
     _check_some(errors)
@@ -144,16 +147,18 @@ def cheapest(
     most: float = math.inf,
     costs: Mapping[str, float] | None = None,
 ) -> Precision:
-    """Tolerances of the least total cost, each costing c over its factor, with which a share of all lenses keeps the
-    figure's increase within the budget.
+    """Tolerances of the least total cost, each costing c over its factor, with which a share of all lenses
+    keeps the figure's increase within the budget.
 
     Args:
-      errors: those of the forecast, in its order, as from ``errors_of``. Errors that one tolerance of a drawing
-        covers (x and y) get one factor.
-      budget: > 0, in the unit of the figure. share: of lenses, above a half and below 1. most: largest factor.
-      costs: c by name of a tolerance (``Error.drawn``) or by its first word ("tilt"); 1 where neither is named.
-    Raises: DomainError for a budget or share out of range, an unknown cost, a tolerance that the figure does not
-      grow with and ``most`` does not bound, and a budget that is not spent when all are at ``most``.
+      errors: those of the forecast, in its order, as from ``errors_of``. Errors that one tolerance of a
+        drawing covers (x and y) get one factor.
+      budget: > 0, in the unit of the figure. share: of lenses, above a half and below 1. most: largest
+        factor.
+      costs: c by name of a tolerance (``Error.drawn``) or by its first word ("tilt"); 1 where neither is
+        named.
+    Raises: DomainError for a budget or share out of range, an unknown cost, a tolerance that the figure does
+      not grow with and ``most`` does not bound, and a budget that is not spent when all are at ``most``.
     """
     return _solved(forecast, errors, budget, share, most, _costs(errors, costs), power=2 / 3)
 
@@ -172,7 +177,8 @@ def _solved(forecast, errors, budget, share, most, costs, power):
         )
     if isinstance(budget, bool) or not (0 < budget < math.inf and 0.5 < share < 1 and most > 0):
         raise DomainError(
-            f"budget {budget}, share {share} and largest factor {most}: the budget must be a positive increase of the "
+            f"budget {budget}, share {share} and largest factor {most}: the budget must be a positive "
+            "increase of the "
             "figure, the share lie between 0.5 and 1, and the factor be positive."
         )
     names = list(dict.fromkeys(e.drawn for e in errors))
@@ -181,7 +187,8 @@ def _solved(forecast, errors, budget, share, most, costs, power):
     factors = torch.ones(len(names), dtype=forecast.linear.dtype)
 
     def slopes():
-        """Slope of mean + z deviation over the squared factor of every tolerance, [names], and of every error."""
+        """Slope of mean + z deviation over the squared factor of every tolerance, [names], and of every
+        error."""
         v = factors[member].square()
         deviation = forecast.moments(factors[member])[1]
         w = forecast.square.diagonal() + z / (2 * deviation) * (
@@ -218,11 +225,13 @@ def _solved(forecast, errors, budget, share, most, costs, power):
 
 
 def _largest(shape, member, most, keeps):
-    """The largest factors in proportion to ``shape`` [names], none above ``most``, of which the budget keeps."""
+    """The largest factors in proportion to ``shape`` [names], none above ``most``, of which the budget
+    keeps."""
     low, high = -30.0, 30.0
     if keeps((shape * math.exp(high)).clamp_max(most)[member]):
         raise DomainError(
-            f"even at {most:g} times the deviations given the budget is not spent; allow larger factors, or start from "
+            f"even at {most:g} times the deviations given the budget is not spent; allow larger factors, or "
+            "start from "
             "larger deviations."
         )
     for _ in range(ROUNDS):
@@ -246,7 +255,8 @@ def _costs(errors, given):
     wrong = [f"{k} {v}" for k, v in given.items() if k not in known or not 0 < v < math.inf]
     if wrong:
         raise DomainError(
-            f"costs {', '.join(wrong)}: name tolerances out of {', '.join(sorted(known))}, with positive numbers."
+            f"costs {', '.join(wrong)}: name tolerances out of {', '.join(sorted(known))}, with positive "
+            "numbers."
         )
     return torch.tensor(
         [given.get(name, given.get(name.split()[0], 1.0)) for name in names], dtype=torch.float64

@@ -1,18 +1,20 @@
-"""What manufacturing errors do to a lens: the errors, their sensitivities, linear forecasts, and Monte Carlo to judge.
+"""What manufacturing errors do to a lens: the errors, their sensitivities, linear forecasts, and Monte Carlo
+to judge.
 
     tolerances = Tolerances(radius_relative=1e-3, thickness_mm=0.02, index=5e-4, element_decentre_mm=0.01)
     J = sensitivities(geo, tolerances, linear_figures(0.3))
     trials = monte_carlo(geo, tolerances, linear_figures(0.3), 1000, torch.Generator().manual_seed(0))
 
 A figure is a function from a lens to a vector [K]. Errors are independent, normal, and each number of
-Tolerances is one standard deviation. A compensator is a function from the faulty lens to the one that is used, such
-as ``functools.partial(solves.focus_rays, fields_rad=(0.0, 0.3), grid=8)``; every function takes it the same way.
+Tolerances is one standard deviation. A compensator is a function from the faulty lens to the one that is
+used, such as ``functools.partial(solves.focus_rays, fields_rad=(0.0, 0.3), grid=8)``; every function takes
+it the same way.
 
-The spot: near an optimum its slope vanishes, so the linear forecast fails; the ray errors themselves stay linear.
-With r the ray errors of the nominal lens about their spot's mean (divided by the root of the ray count, so
-that r.r is the squared RMS spot) and A their change per standard deviation of each error, an error e gives |r
-+ A e|^2. For independent normal e this has mean r.r + tr(A^T A) and variance 4 |A^T r|^2 + 2 tr((A^T A)^2).
-What is left out is the curvature of the rays themselves, r . d2r / de2.
+The spot: near an optimum its slope vanishes, so the linear forecast fails; the ray errors themselves stay
+linear. With r the ray errors of the nominal lens about their spot's mean (divided by the root of the ray
+count, so that r.r is the squared RMS spot) and A their change per standard deviation of each error, an error
+e gives |r + A e|^2. For independent normal e this has mean r.r + tr(A^T A) and variance 4 |A^T r|^2 + 2
+tr((A^T A)^2). What is left out is the curvature of the rays themselves, r . d2r / de2.
 """
 
 import math
@@ -47,8 +49,8 @@ class Tolerances:
     thickness_mm: of every thickness but the last, which is the focus. index: of every glass, the same at
       every wavelength.
     decentre_mm: of every surface, in x and in y. tilt_deg: of every surface, about x and about y.
-    element_decentre_mm, element_tilt_deg, element_wedge_deg: of every element, a cemented group being one, moved as a
-      rigid body; in x and y, and about x and y. See ``element_errors.moved_element``.
+    element_decentre_mm, element_tilt_deg, element_wedge_deg: of every element, a cemented group being one,
+      moved as a rigid body; in x and y, and about x and y. See ``element_errors.moved_element``.
     """
 
     radius_relative: float = 0.0
@@ -89,8 +91,8 @@ class Error:
 
 
 def errors_of(lens: GeoLens, tolerances: Tolerances | Sequence[Error]) -> list[Error]:
-    """The independent errors of a lens under ``tolerances``, a list of Error, surface by surface and then element by
-    element; errors given as such stay as they are. A plane keeps its radius but not its fringes.
+    """The independent errors of a lens under ``tolerances``, a list of Error, surface by surface and then
+    element by element; errors given as such stay as they are. A plane keeps its radius but not its fringes.
 
     Surfaces that do not bend light (a stop in air) have no shape or place to get wrong.
     Raises: DomainError for tolerances of elements with a mirror in them, or that the light passes twice.
@@ -104,9 +106,8 @@ def errors_of(lens: GeoLens, tolerances: Tolerances | Sequence[Error]) -> list[E
         zip(lens.curvature_per_mm.tolist(), lens.semi_aperture_mm.tolist(), strict=True)
     ):
         where = f"surface {i + 1}"
-        bends = (
-            glass[i] or (i > 0 and glass[i - 1]) or lens.mirrors[i]
-        )  # even where both have one index today
+        # even where both have one index today
+        bends = glass[i] or (i > 0 and glass[i - 1]) or lens.mirrors[i]
         curvature = (
             math.hypot(c * t.radius_relative, c * c * t.radius_mm, t.fringes * 0.546074e-3 / a**2)
             if bends
@@ -146,7 +147,8 @@ def _check_body(lens, first, last):
     surfaces = lens.to_surfaces()
     if any(lens.mirrors[first : last + 1]) or any(passes_of(surfaces, i) for i in range(first, last)):
         raise DomainError(
-            f"{lens.name}: element {first + 1}-{last + 1} holds a mirror or is passed twice by the light, and moving it "
+            f"{lens.name}: element {first + 1}-{last + 1} holds a mirror or is passed twice by the light, "
+            "and moving it "
             "as a body is not modelled; give tolerances of surfaces instead of elements."
         )
 
@@ -189,7 +191,8 @@ def linear_figures(
     """Figures that errors change in proportion: the function lens -> [5] of EFL, BFL, distortion at the field
     (relative), and the x and y of the axial spot's mean point; lengths in mm. Names: LINEAR_FIGURES.
 
-    Args: at_m: metres from the (faulty) lens's entrance pupil to the object of the spots and of the distortion.
+    Args: at_m: metres from the (faulty) lens's entrance pupil to the object of the spots and of the
+      distortion.
     """
     one_distance(at_m)
 
@@ -275,8 +278,8 @@ def monte_carlo(
 ) -> Trials:
     """Trials of ``count`` lenses with random errors.
 
-    Args: generator: torch.Generator (CPU). progress: called after every trial, or None. compensate: applied to every
-      faulty lens, and to the nominal one.
+    Args: generator: torch.Generator (CPU). progress: called after every trial, or None. compensate: applied
+      to every faulty lens, and to the nominal one.
     A lens that raises DomainError (no ray arrives, no focal length) is a failed trial: counted, never dropped
     in silence.
     """
@@ -391,7 +394,8 @@ def spot_errors(
     """The figure lens -> [F * M * 2]: ray errors about the mean point of their field over all wavelengths,
     mm, divided by the root of the ray count.
 
-    Args: at_m: metres to the object plane; of D distances each counts as so many more fields, [D * F * M * 2].
+    Args: at_m: metres to the object plane; of D distances each counts as so many more fields, [D * F * M *
+      2].
     Raises: DomainError when a ray fails.
     """
 
@@ -410,7 +414,8 @@ def spot_errors(
 
 
 def squared_spots(errors: Tensor, fields: int) -> Tensor:
-    """Squared RMS spots [F] mm^2 out of what ``spot_errors`` gives; fields: their number, times that of distances."""
+    """Squared RMS spots [F] mm^2 out of what ``spot_errors`` gives; fields: their number, times that of
+    distances."""
     return errors.reshape(fields, -1).square().sum(1)
 
 

@@ -1,5 +1,5 @@
-"""Diffraction: scalar fields in free space, the field a lens makes before its film, and phase plates as elements of a
-ray-traced lens."""
+"""Diffraction: scalar fields in free space, the field a lens makes before its film, and phase plates as
+elements of a ray-traced lens."""
 
 from codesign.lens.diffraction.field import Field, disc, rectangle
 from codesign.lens.diffraction.place import with_plate

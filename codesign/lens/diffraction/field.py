@@ -38,7 +38,8 @@ class Field:
             )
         if not (0 < self.pitch_mm < math.inf and 0 < self.wavelength_um < math.inf):
             raise DomainError(
-                f"pitch {self.pitch_mm} mm and wavelength {self.wavelength_um} um of a field must be positive."
+                f"pitch {self.pitch_mm} mm and wavelength {self.wavelength_um} um of a field must be "
+                "positive."
             )
 
         check_finite(self.amplitude, "field")
@@ -85,9 +86,10 @@ def rectangle(count: int, pitch_mm: float, half_mm: tuple[float, float]) -> Tens
 def disc(count: int, pitch_mm: float, radius_mm: float) -> Tensor:
     """Transmission of a round opening about the axis, [N, N] float64. No gradient.
 
-    Samples that are open or not make a staircase, which errs by 1e-3 of the peak of an Airy pattern at 128 across.
-    Here a sample is the integral of the opening over a cubic interpolation kernel, so that sums over samples are
-    integrals over the opening itself, to third order of the pitch; at the rim they lie a little outside of [0, 1].
+    Samples that are open or not make a staircase, which errs by 1e-3 of the peak of an Airy pattern at 128
+    across. Here a sample is the integral of the opening over a cubic interpolation kernel, so that sums over
+    samples are integrals over the opening itself, to third order of the pitch; at the rim they lie a little
+    outside of [0, 1].
     Source: Keys, Cubic convolution interpolation, IEEE Trans. ASSP 29 (1981).
     """
     _check_opening(count, pitch_mm, radius_mm)
@@ -103,7 +105,8 @@ def check_grid(count: int, pitch_mm: float) -> None:
     """Raise DomainError unless there can be a grid of ``count`` samples ``pitch_mm`` apart."""
     if not isinstance(count, int) or count < 2 or not 0 < pitch_mm < math.inf:
         raise DomainError(
-            f"a grid of {count} samples, {pitch_mm} mm apart, cannot be; give a whole number of at least 2 and a "
+            f"a grid of {count} samples, {pitch_mm} mm apart, cannot be; give a whole number of at least 2 "
+            "and a "
             "positive, finite pitch."
         )
 
@@ -112,7 +115,8 @@ def _check_opening(count, pitch_mm, *halves_mm):
     check_grid(count, pitch_mm)
     if not all(0 <= half < math.inf for half in halves_mm):
         raise DomainError(
-            f"half widths of an opening must be finite and at least 0, got {', '.join(map(str, halves_mm))} mm."
+            f"half widths of an opening must be finite and at least 0, got {', '.join(map(str, halves_mm))} "
+            "mm."
         )
 
 

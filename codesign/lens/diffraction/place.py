@@ -28,10 +28,10 @@ def with_plate(lens: GeoLens, plate: Plate | None, surface: int | None = None, z
     >>> plated = diffraction.with_plate(geo, plate)
     >>> optimiser = torch.optim.Adam([*plate.parameters(), *geo.variables("focus")], lr=0.1)
 
-    Args: plate: None takes the lens's plate out. surface: from 0; None is the stop, -1 the last surface. z_mm:
-      distance of the plate's plane from that surface's vertex, negative before the stop.
-    Returns: a lens as from ``replace``, which shares tensors and plate (a converted one has a plate of its own);
-      everything that traces rays sees the plate.
+    Args: plate: None takes the lens's plate out. surface: from 0; None is the stop, -1 the last surface.
+      z_mm: distance of the plate's plane from that surface's vertex, negative before the stop.
+    Returns: a lens as from ``replace``, which shares tensors and plate (a converted one has a plate of its
+      own); everything that traces rays sees the plate.
       First-order figures and Seidel sums are those of the lens alone.
     Raises: DomainError for another surface, in glass, or where the plane meets a surface.
     """
@@ -48,7 +48,8 @@ def with_plate(lens: GeoLens, plate: Plate | None, surface: int | None = None, z
     at = lens.stop_index if surface is None else surface % (last + 1) if -1 <= surface <= last else surface
     if at not in (lens.stop_index, last) or (z_mm < 0 and at != lens.stop_index):
         raise DomainError(
-            f"{lens.name}: a plate {z_mm:g} mm from surface {at + 1} is not modelled; put it next to the stop (surface "
+            f"{lens.name}: a plate {z_mm:g} mm from surface {at + 1} is not modelled; put it next to the "
+            "stop (surface "
             f"{lens.stop_index + 1}) or behind the last surface ({last + 1})."
         )
     gap = at if z_mm >= 0 else at - 1
@@ -56,7 +57,8 @@ def with_plate(lens: GeoLens, plate: Plate | None, surface: int | None = None, z
     after = z_mm if z_mm >= 0 or gap < 0 else float(room[gap]) + z_mm
     if gap >= 0 and bool(lens.glass[gap]):
         raise DomainError(
-            f"{lens.name}: the gap behind surface {gap + 1} is glass; put the plate on the other side of surface {at + 1}."
+            f"{lens.name}: the gap behind surface {gap + 1} is glass; put the plate on the other side of "
+            f"surface {at + 1}."
         )
     low = -math.inf if gap < 0 else _reach(lens, gap, 1)
     high = float(room[gap]) if gap >= 0 else 0.0
@@ -64,7 +66,8 @@ def with_plate(lens: GeoLens, plate: Plate | None, surface: int | None = None, z
     if not low <= after <= high:
         raise DomainError(
             f"{lens.name}: a plate {after:.4g} mm behind "
-            f"{f'surface {gap + 1}' if gap >= 0 else 'the first vertex'} meets a surface or the film; between "
+            f"{f'surface {gap + 1}' if gap >= 0 else 'the first vertex'} meets a surface or the film; "
+            "between "
             f"{low:.4g} and {high:.4g} mm there is room."
         )
     twin.plate_at = (gap, after)
@@ -72,8 +75,8 @@ def with_plate(lens: GeoLens, plate: Plate | None, surface: int | None = None, z
 
 
 def cells_for_plate(lens: GeoLens, wavelength_um: float) -> int:
-    """Cells across the pupil that a lens's plate asks for, so that its phase steps by at most half a wave from
-    cell to cell and no detail of it falls between them; 0 without a plate. No gradient.
+    """Cells across the pupil that a lens's plate asks for, so that its phase steps by at most half a wave
+    from cell to cell and no detail of it falls between them; 0 without a plate. No gradient.
 
     The beam is that of the axis in parallel light, by its paraxial marginal ray.
     """
@@ -103,11 +106,11 @@ def cells_for_plate(lens: GeoLens, wavelength_um: float) -> int:
 def plate_waves(
     lens: GeoLens, field_rad: float, pupil: Tensor, wavelength_um: float, at_m: float | Tensor
 ) -> tuple[Tensor, Tensor]:
-    """What a lens's plate adds to the light of an object point: optical path in waves where the rays of the bare
-    lens meet it, [M] for pupil points [M, 2], and whether it reaches there, [M] bool.
+    """What a lens's plate adds to the light of an object point: optical path in waves where the rays of the
+    bare lens meet it, [M] for pupil points [M, 2], and whether it reaches there, [M] bool.
 
-    This is a thin element in the field of the lens, for plates of any slope and place; turned rays agree with it
-    to second order of the angle. Gradient: to the plate, the lens and at_m.
+    This is a thin element in the field of the lens, for plates of any slope and place; turned rays agree
+    with it to second order of the angle. Gradient: to the plate, the lens and at_m.
     """
     p = lens.prescription(wavelength_um)
     placed = p.plate

@@ -1,7 +1,8 @@
 """Thin phase plates, in Zernike terms or on a grid, that light and rays see alike.
 
-Zernike terms are in Noll's order, orthonormal over the unit disc: a term's mean square there is 1, so its coefficient
-is its RMS. Odd terms are those of the sine. Source: Noll, Zernike polynomials and atmospheric turbulence, JOSA 66 (1976).
+Zernike terms are in Noll's order, orthonormal over the unit disc: a term's mean square there is 1, so its
+coefficient is its RMS. Odd terms are those of the sine. Source: Noll, Zernike polynomials and atmospheric
+turbulence, JOSA 66 (1976).
 """
 
 import math
@@ -33,8 +34,8 @@ def noll(term: int) -> tuple[int, int]:
 def zernike(terms: Sequence[int], points: Tensor) -> tuple[Tensor, Tensor]:
     """Values and slopes of Zernike terms.
 
-    Args: terms: K of Noll's indices, from 1. points: [N, 2] (x, y) in units of the disc's radius; beyond 1 the
-      polynomials go on.
+    Args: terms: K of Noll's indices, from 1. points: [N, 2] (x, y) in units of the disc's radius; beyond 1
+      the polynomials go on.
     Returns: values [N, K]; slopes [N, K, 2] along x and y, per radius. Gradient: both to the points.
     """
     x, y = points.unbind(1)
@@ -82,8 +83,8 @@ def _jacobi(k, a, b, t):
 class Plate(Replaceable):
     """What all plates are: a phase over (x, y) that adds optical path, positive phase more of it.
 
-    wavelength_um: where the phase holds. diffractive: whether the phase is the same at every wavelength (the first
-      order of a blazed grating, all light in it), or, as for a smooth relief, the optical path is.
+    wavelength_um: where the phase holds. diffractive: whether the phase is the same at every wavelength (the
+      first order of a blazed grating, all light in it), or, as for a smooth relief, the optical path is.
     finest_mm: length below which the phase has no detail.
     """
 
@@ -106,8 +107,8 @@ class Plate(Replaceable):
         }
 
     def look(self, points_mm: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Phase [N] rad, its slope [N, 2] rad/mm, and whether the plate reaches there, [N] bool, at points [N, 2]
-        mm from the axis. Gradient: to the points and to what the plate is made of."""
+        """Phase [N] rad, its slope [N, 2] rad/mm, and whether the plate reaches there, [N] bool, at points
+        [N, 2] mm from the axis. Gradient: to the points and to what the plate is made of."""
         raise NotImplementedError
 
     def mm_per_rad(self, wavelength_um: float) -> float:
@@ -123,7 +124,8 @@ class ZernikePlate(Plate):
     >>> plate.coefficients_rad.tolist()
     [0.0, 1.5]
 
-    Args: coefficients_rad: {Noll's index: radians RMS}. radius_mm: of the disc; the polynomials go on beyond it.
+    Args: coefficients_rad: {Noll's index: radians RMS}. radius_mm: of the disc; the polynomials go on beyond
+      it.
       wavelength_um, diffractive: see ``Plate``.
     coefficients_rad: [K] Parameter, in the order given.
     """
@@ -160,15 +162,16 @@ class ZernikePlate(Plate):
 
 
 class GridPlate(Plate):
-    """Phase given on a square grid about the axis; between the points the natural cubic spline through them, so
-    that rays meet a smooth slope.
+    """Phase given on a square grid about the axis; between the points the natural cubic spline through them,
+    so that rays meet a smooth slope.
 
     >>> import torch
     >>> from codesign.lens import diffraction
     >>> plate = diffraction.GridPlate(torch.zeros(16, 16, dtype=torch.float64), pitch_mm=0.5)  # 7.5 mm x 7.5 mm
 
-    Args: phase_rad: [N, N] unwrapped, rows along +y, columns along +x, point (N - 1) / 2 on the axis. pitch_mm:
-      distance of the points. wavelength_um, diffractive: see ``Plate``. Light beyond the outer points is stopped.
+    Args: phase_rad: [N, N] unwrapped, rows along +y, columns along +x, point (N - 1) / 2 on the axis.
+      pitch_mm: distance of the points. wavelength_um, diffractive: see ``Plate``. Light beyond the outer
+        points is stopped.
     phase_rad: [N, N] Parameter.
     """
 

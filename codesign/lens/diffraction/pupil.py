@@ -1,4 +1,5 @@
-"""The complex pupil of a field, sampled on a square grid for Fourier transforms, and the field it makes before the film."""
+"""The complex pupil of a field, sampled on a square grid for Fourier transforms, and the field it makes
+before the film."""
 
 import math
 from dataclasses import dataclass, replace
@@ -62,12 +63,13 @@ def pupil_function(
     Points that are even over the entrance pupil are taken as even in the direction cosines towards the image
     point (Abbe's sine condition); their scale in x and y, which holds the foreshortening off the axis, is
     fitted to the traced rays. A cell counts when its centre lies in the disc; the staircase at the rim costs
-    about 1e-3 of MTF at 64 cells and 3e-4 at 128. A phase plate adds its phase where the rays of the bare lens meet
-    it, as a thin element does to a field.
+    about 1e-3 of MTF at 64 cells and 3e-4 at 128. A phase plate adds its phase where the rays of the bare
+    lens meet it, as a thin element does to a field.
 
-    Args: grid: cells across; None picks a power of two from the aberration. reference_mm, at_m: see ``wavefront``.
-    Gradient: to every lens tensor and to at_m. Raises: DomainError when neighbouring cells differ by more than half a
-      wave, a phase plate is finer than the cells, or no ray arrives.
+    Args: grid: cells across; None picks a power of two from the aberration. reference_mm, at_m: see
+      ``wavefront``.
+    Gradient: to every lens tensor and to at_m. Raises: DomainError when neighbouring cells differ by more
+      than half a wave, a phase plate is finer than the cells, or no ray arrives.
     """
     if lens.plate is not None and reference_mm is None:
         reference_mm = chief_ray(lens, field_rad, wavelength_um, defocus_mm, at_m).position_mm[0]
@@ -76,8 +78,10 @@ def pupil_function(
     finest = cells_for_plate(lens, wavelength_um)
     if grid < finest:
         raise DomainError(
-            f"{lens.name}: the phase plate is finer than {grid} cells across the pupil resolve (its phase may step by "
-            f"half a wave from cell to cell, and has detail of {lens.plate.finest_mm:.3g} mm); give a grid of at least "
+            f"{lens.name}: the phase plate is finer than {grid} cells across the pupil resolve (its phase "
+            "may step by "
+            f"half a wave from cell to cell, and has detail of {lens.plate.finest_mm:.3g} mm); give a grid "
+            "of at least "
             f"{finest}, or a smoother plate."
         )
     like = lens.curvature_per_mm
@@ -112,9 +116,8 @@ def pupil_function(
         device=like.device,
     )
     field = field.masked_scatter(seen, torch.complex(amplitude * phase.cos(), -amplitude * phase.sin()))
-    mirrored = [
-        axis for axis, value in ((1, scale[0]), (0, scale[1])) if float(value.detach()) < 0
-    ]  # light from above goes down
+    # light from above goes down
+    mirrored = [axis for axis, value in ((1, scale[0]), (0, scale[1])) if float(value.detach()) < 0]
     return PupilFunction(field.flip(mirrored), scale.abs(), wavelength_um, front.reference_mm)
 
 
@@ -174,8 +177,8 @@ def before_image(
 ) -> Field:
     """Field of an axial object point on a plane ``distance_mm`` before the film, about the axis.
 
-    The pupil function holds the plane waves that the lens sends to the film; each is taken back by its own path.
-    A thin element there, of any phase (wrapped, stepped) or amplitude, is ``.times(transmission)``, and
+    The pupil function holds the plane waves that the lens sends to the film; each is taken back by its own
+    path. A thin element there, of any phase (wrapped, stepped) or amplitude, is ``.times(transmission)``, and
     ``angular_spectrum`` over the same distance goes on to the film.
 
     >>> from codesign import lens
@@ -189,8 +192,8 @@ def before_image(
     Args: grid, at_m: see ``pupil_function``. pitch_mm, count: of the result.
     Returns: Field whose energy is the share of the light on the grid.
     Gradient: to every lens tensor, its plate, distance_mm and at_m.
-    Raises: DomainError when the pupil's cells are too coarse for the distance or the size of the result, the pitch
-      for the lens's f-number, or as ``pupil_function``; it names what is needed.
+    Raises: DomainError when the pupil's cells are too coarse for the distance or the size of the result, the
+      pitch for the lens's f-number, or as ``pupil_function``; it names what is needed.
     """
     check_grid(count, pitch_mm)
     distance = real_number(distance_mm, "distance in mm")
@@ -206,8 +209,10 @@ def before_image(
     )
     if pitch_mm > coarsest or cells < needed:
         raise DomainError(
-            f"{lens.name}: a field of {count} samples of {pitch_mm:.3g} mm, {float(distance.detach()):.4g} mm before the "
-            f"film, asks for a pitch of at most {coarsest:.3g} mm and a pupil grid of at least {needed}, not {cells}."
+            f"{lens.name}: a field of {count} samples of {pitch_mm:.3g} mm, {float(distance.detach()):.4g} "
+            "mm before the "
+            f"film, asks for a pitch of at most {coarsest:.3g} mm and a pupil grid of at least {needed}, "
+            f"not {cells}."
         )
     line = (torch.arange(cells, dtype=torch.float64, device=like.device) + 0.5) / cells * 2 - 1
     x, y = (line * r for r in like)

@@ -137,7 +137,8 @@ def _pupil(lens, rows, optics):
     """Entrance pupil diameter, mm."""
     if lens.pupil is None:
         raise FileFormatError(
-            "it does not say how wide its beam is; give the entrance pupil diameter (ENPD in .zmx, EPD in .seq), or "
+            "it does not say how wide its beam is; give the entrance pupil diameter (ENPD in .zmx, EPD in "
+            ".seq), or "
             "FLOA in .zmx where the stop's semi-diameter says it."
         )
     kind, value = lens.pupil
@@ -163,11 +164,11 @@ def _pupil(lens, rows, optics):
         return value * lens.unit_mm
     if optics.index[-1] != 1:
         raise FileFormatError(
-            f"its {kind} is counted in the image space, which is glass here; give the entrance pupil diameter."
+            f"its {kind} is counted in the image space, which is glass here; give the entrance pupil "
+            "diameter."
         )
-    slope = (
-        value if kind == "numerical aperture" else 1 / (2 * value)
-    )  # of the marginal ray in the image space
+    # of the marginal ray in the image space
+    slope = value if kind == "numerical aperture" else 1 / (2 * value)
     if kind == "f-number" or math.isinf(lens.object_distance):
         return 2 * slope * abs(optics.focal_length())
     distance = lens.object_distance * lens.unit_mm
@@ -230,9 +231,8 @@ def _edge(front, back):
     there, mm."""
     heights = torch.linspace(0, min(front.semi_aperture, back.semi_aperture), 65, dtype=torch.float64)
     front_mm, back_mm = (sag_mm(heights, row.curvature, row.conic, row.asphere) for row in (front, back))
-    return heights, back_mm + front.thickness - (
-        -front_mm if front.mirror else front_mm
-    )  # behind a mirror its shape is seen from the other side
+    # behind a mirror its shape is seen from the other side
+    return heights, back_mm + front.thickness - (-front_mm if front.mirror else front_mm)
 
 
 def _check_glass(rows):

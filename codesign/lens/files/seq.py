@@ -154,7 +154,8 @@ class System:
             )
         elif command == "ZOO":
             raise FileFormatError(
-                f"it is a zoom (ZOO {shown(values[0])}), and only one lens at a time is read; save the position you "
+                f"it is a zoom (ZOO {shown(values[0])}), and only one lens at a time is read; save the "
+                "position you "
                 "want as a lens of its own."
             )
         elif command == "DIM":

@@ -266,9 +266,8 @@ class SeqSurface:
 
     def finish(self, unit_mm: float) -> FileSurface:
         """FileSurface of this surface, for a file in units of ``unit_mm``."""
-        moved = any(
-            v for name, v in self.moves.items() if name != "CDE"
-        )  # a turn about its own axis changes nothing
+        # a turn about its own axis changes nothing
+        moved = any(v for name, v in self.moves.items() if name != "CDE")
         if moved and not self.returns:
             raise FileFormatError(
                 "it shifts or tilts everything behind it (a decentre without DAR); only single surfaces "

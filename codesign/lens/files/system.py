@@ -19,8 +19,8 @@ class FileSurface:
     label: its number in the file. semi_aperture: None where the file says nothing. fixed: whether that
       aperture stops rays.
     tilt_deg: right-handed about +x, then about +y. inner: radius of a central obstruction.
-    depth: of the vertex along the axis of the image plane, from there, where coordinate breaks tilt or shift; the
-      thickness stays the one along the light.
+    depth: of the vertex along the axis of the image plane, from there, where coordinate breaks tilt or
+      shift; the thickness stays the one along the light.
     """
 
     label: int | str
@@ -97,8 +97,8 @@ def unfold(lens: FileLens) -> list[FileSurface]:
 
 
 def placed(surfaces: list[FileSurface]) -> list[FileSurface]:
-    """The surfaces of ``unfold`` with thicknesses along the axis of the image plane, where coordinate breaks moved
-    some; as they were elsewhere. Raises: FileFormatError as there."""
+    """The surfaces of ``unfold`` with thicknesses along the axis of the image plane, where coordinate breaks
+    moved some; as they were elsewhere. Raises: FileFormatError as there."""
     depths = [surface.depth for surface in surfaces] + [0.0]
     found = []
     sign = 1.0

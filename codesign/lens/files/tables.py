@@ -175,9 +175,6 @@ def _medium(text):
     return Glass.named(text)
 
 
-_TABLE_AIR = ("AIR", "VACUUM", "OCCLUDER")
-
-
 def read_diffoptics(text: str, name: str) -> FileLens:
     """FileLens of the text of a table.
 
@@ -247,14 +244,5 @@ def _table_surface(kind, words, label):
     asphere = (0.0, *rest[1:]) if kind == "S" and any(rest[1:]) else ()
     conic = rest[0] if kind == "S" and rest else 0.0
     return FileSurface(
-        label, 1 / radius if radius else 0.0, 0.0, _table_medium(words[4]), diameter / 2, True, conic, asphere
+        label, 1 / radius if radius else 0.0, 0.0, _medium(words[4]), diameter / 2, True, conic, asphere
     )
-
-
-def _table_medium(word):
-    if word.upper() in _TABLE_AIR:
-        return None
-    pair = word.split("/")
-    if len(pair) == 2:
-        return Glass.from_abbe(number(pair[0], "the index nd"), number(pair[1], "the Abbe number"), word)
-    return Glass.named(word)

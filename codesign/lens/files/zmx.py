@@ -31,7 +31,8 @@ def read_zmx(text: str, name: str) -> FileLens:
         keyword, *words = line.split() or [""]
         if keyword == "MNUM" and words and whole(words[0], keyword) > 1:
             raise FileFormatError(
-                f"it holds {whole(words[0], keyword)} configurations (MNUM), and only one lens at a time is read; save "
+                f"it holds {whole(words[0], keyword)} configurations (MNUM), and only one lens at a time is "
+                "read; save "
                 "the one you want as a lens of its own."
             )
         if keyword == "SURF":

@@ -31,8 +31,8 @@ def along(distance: float) -> np.ndarray:
 def coordinate_break(parameters: Mapping[int, float]) -> np.ndarray:
     """The frame [4, 4] behind a break, in the one before it.
 
-    PARM 1, 2: decentre x, y. PARM 3, 4, 5: right-handed tilts about the x, y, z in force, degrees. PARM 6 is 0: decentre,
-      then x, y, z; 1, which undoes it: z, y, x, then decentre.
+    PARM 1, 2: decentre x, y. PARM 3, 4, 5: right-handed tilts about the x, y, z in force, degrees. PARM 6 is
+      0: decentre, then x, y, z; 1, which undoes it: z, y, x, then decentre.
     Raises: FileFormatError for other parameters.
     """
     strange = [
@@ -40,7 +40,8 @@ def coordinate_break(parameters: Mapping[int, float]) -> np.ndarray:
     ]
     if strange:
         raise FileFormatError(
-            f"its PARM {strange[0]} is {parameters[strange[0]]:g}, which is not understood; a coordinate break has PARM 1 "
+            f"its PARM {strange[0]} is {parameters[strange[0]]:g}, which is not understood; a coordinate "
+            "break has PARM 1 "
             "to 5 and the order PARM 6, 0 or 1."
         )
     shift = np.eye(4)
@@ -60,8 +61,8 @@ def _turn(axis, angle_deg):
 
 
 def place(surfaces: Sequence[FileSurface], frames: Sequence[np.ndarray], image: np.ndarray) -> float:
-    """Write decentres, tilts and depths into the surfaces, seen from the image plane, whose normal through its centre
-    is the axis of the model.
+    """Write decentres, tilts and depths into the surfaces, seen from the image plane, whose normal through
+    its centre is the axis of the model.
 
     Args: frames: of the surfaces, and ``image``, in that of the object.
     Returns: angle between the object's axis and the image's, degrees.
@@ -74,8 +75,10 @@ def place(surfaces: Sequence[FileSurface], frames: Sequence[np.ndarray], image: 
         x, y, z = seen[:3, 2]
         if z <= NO_TILT:
             raise FileFormatError(
-                f"surface {surface.label}: its axis stands at {math.degrees(math.acos(max(z, -1.0))):.4g} degrees to that "
-                "of the image plane, less than 90 are traced; use a design that is not folded by coordinate breaks."
+                f"surface {surface.label}: its axis stands at {math.degrees(math.acos(max(z, -1.0))):.4g} "
+                "degrees to that "
+                "of the image plane, less than 90 are traced; use a design that is not folded by coordinate "
+                "breaks."
             )
         surface.tilt_deg = _rounded(math.atan2(-y, z)), _rounded(math.atan2(x, math.hypot(y, z)))
         across = np.where(np.abs(seen[:2, 3]) > NO_SHIFT * length, seen[:2, 3], 0.0)
@@ -249,11 +252,13 @@ class Entry:
         return any(v for i, v in self.parameters.items() if i != 6)
 
     def coordinate_break(self) -> np.ndarray:
-        """The frame [4, 4] behind this coordinate break, before its thickness; the light stays in its medium."""
+        """The frame [4, 4] behind this coordinate break, before its thickness; the light stays in its
+        medium."""
         self._check_lines()
         if self.is_stop or self.glass or any(self.extra.values()):
             raise FileFormatError(
-                "it is a coordinate break with a stop, a glass or extra data; give those to a surface of its own."
+                "it is a coordinate break with a stop, a glass or extra data; give those to a surface of "
+                "its own."
             )
         return coordinate_break(self.parameters)
 

@@ -11,8 +11,9 @@ MOST_ABBE = 150
 # a glass goes by its catalogue name when its indices at F, d and C are the catalogue's to this; published
 # tables round to 1e-9
 SAME_INDEX = 1e-8
-# how a glass's source begins -> the catalogue that every program has. Names of plastics and crystals stand for
-# other media elsewhere (COC of one program is 3 % of a focal length from that of another), so they are not written
+# how a glass's source begins -> the catalogue that every program has. Names of plastics and crystals stand
+# for other media elsewhere (COC of one program is 3 % of a focal length from that of another), so they are
+# not written
 CATALOGUES = {
     "Schott, optical glass": "SCHOTT",
     "Schott, earlier glasses": "SCHOTT",
@@ -28,10 +29,10 @@ def to_zmx(lens: GeoLens) -> str:
     """The text of a .zmx file of the lens's current values; numbers keep all their digits.
 
     Kept: curvatures, thicknesses and aspheres with their signs along a fixed axis, conics, stop, apertures
-      and central obstructions, mirrors, entrance pupil diameter, half field, name. A glass of the catalogue keeps
-      its name, with its true nd and Vd beside it and its maker among the catalogues, so that a program that has
-      another glass of that name can tell; any other, plastics among them, becomes a model glass of nd and Vd. Not kept: the width of the
-      soft edges.
+      and central obstructions, mirrors, entrance pupil diameter, half field, name. A glass of the catalogue
+      keeps its name, with its true nd and Vd beside it and its maker among the catalogues, so that a program
+      that has another glass of that name can tell; any other, plastics among them, becomes a model glass of
+      nd and Vd. Not kept: the width of the soft edges.
     Raises: DomainError for values that cannot be; FileFormatError for what a centred .zmx surface cannot
       hold.
     """
@@ -73,7 +74,8 @@ def _surface(surface, sign, label, is_stop):
         )
     if surface.phase is not None:
         raise FileFormatError(
-            f"{label}: programs that read .zmx refuse its diffractive phase or leave it out without a word; save the "
+            f"{label}: programs that read .zmx refuse its diffractive phase or leave it out without a word; "
+            "save the "
             "lens as .json."
         )
     terms = [sign * a + 0.0 for a in surface.asphere]
@@ -115,7 +117,8 @@ def _glass(surface, label):
 
 
 def _catalogues(surfaces):
-    """The line of the catalogues that hold the named glasses, in the order of their use; none without such."""
+    """The line of the catalogues that hold the named glasses, in the order of their use; none without
+    such."""
     used = [s.medium for s in surfaces if s.medium not in (None, AIR) and _is_named(s.medium)]
     makers = dict.fromkeys(_catalogue(Glass.named(glass.name)) for glass in used)
     return [f"GCAT {' '.join(makers)}"] if makers else []
@@ -131,12 +134,13 @@ def _is_named(glass):
         same = all(abs(known.index(w) - glass.index(w)) < SAME_INDEX for w in WAVELENGTH_UM.values())
     except CodesignError:
         return False
+    # 1.6123/44.1 is a name too, but only here
     return (
         same
         and known.name in names()
         and bool(_catalogue(known))
         and not any(c.isspace() for c in glass.name)
-    )  # 1.6123/44.1 is a name too, but only here
+    )
 
 
 def _plain(name):
