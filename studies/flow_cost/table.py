@@ -14,7 +14,7 @@ import torch  # isort: skip
 
 from codesign.flow import estimate_lk
 from codesign.flow.baselines import ECN, FlowNetEvents, IDNet, SpikeFlowNet
-from codesign.flow.baselines.weights import count_weights
+from codesign.flow.baselines.parts import count_weights
 from codesign.flow.refiner import Refiner
 from codesign.types import EventVolume, FlowField
 from studies.flow_cost.steps import StepByStep

@@ -3,18 +3,15 @@ cascaded one, and a recurrent one that deblurs. See docs/flow_baselines.md."""
 
 from codesign.flow.baselines.ecn import ECN
 from codesign.flow.baselines.flownet_events import FlowNetEvents
-from codesign.flow.baselines.halves import from_halves, to_halves
 from codesign.flow.baselines.idnet import IDNet
-from codesign.flow.baselines.neuron import integrate_and_fire
-from codesign.flow.baselines.rescale import rescale_flow
-from codesign.flow.baselines.spike_flownet import SpikeFlowNet
+from codesign.flow.baselines.parts import rescale_flow
+from codesign.flow.baselines.spike_flownet import SpikeFlowNet, integrate_and_fire, to_halves
 
 __all__ = [
     "ECN",
     "FlowNetEvents",
     "IDNet",
     "SpikeFlowNet",
-    "from_halves",
     "integrate_and_fire",
     "rescale_flow",
     "to_halves",

@@ -1,22 +1,17 @@
 """A small evenly cascaded network on event volumes."""
 
-from typing import Any
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, interpolate, pad, silu
 
-from codesign.flow.baselines.rescale import rescale_flow
-from codesign.flow.baselines.weights import channels, fill_budget, start
-from codesign.flow.entry import check_bins, check_sizes, normalise, pad_to, takes_volume, to_field
+from codesign.flow.baselines.parts import Baseline, channels, rescale_flow, start
 from codesign.flow.layers import GROUPS, Layer
-from codesign.types import EventVolume, FlowField
-
-STRIDE = 16
-INSIDE = 2.0  # channels inside the residual block, over the width
+from codesign.types import EventVolume
 
 
-class ECN(nn.Module):
+class ECN(Baseline):
     """Four encoding steps that each keep what came before, pooled and changed a little, and add as many new
     channels; one residual block; four decoding steps that give them back and each add to the flow.
 
@@ -25,10 +20,7 @@ class ECN(nn.Module):
         0.15 million weights; every layer takes the nearest multiple of 4.
       hidden: channels inside the residual block, a multiple of 4; None for twice ``width``. seed: of the
         first weights.
-    Called with an EventVolume [B, 2, bins, H, W] of any H, W: FlowField, px per interval at full resolution.
-      Its confidence only says whether the sample had events.
     Gradient: counts and weights; smooth, so any order.
-    Computed in the type of the weights, returned in that of the counts.
     Raises: ShapeError, DomainError.
     Source: Ye, Mitrokhin, Fermueller, Yorke, Aloimonos, Unsupervised learning of dense optical flow, depth and
       egomotion with event-based sensors, IROS 2020, sec. III: the network of flow alone, with group
@@ -39,12 +31,10 @@ class ECN(nn.Module):
     torch.Size([1, 2, 32, 48])
     """
 
+    INSIDE: ClassVar[float] = 2.0
+
     def __init__(self, bins: int = 8, width: float = 16.0, hidden: int | None = None, seed: int = 0) -> None:
-        super().__init__()
-        check_bins(bins)
-        check_sizes(width, hidden)
-        self.config: dict[str, Any] = {"bins": bins, "width": width, "hidden": hidden, "seed": seed}
-        inside = channels(width, INSIDE) if hidden is None else hidden
+        super().__init__(bins, width, hidden, seed=seed)
         sizes = [channels(width, factor) for factor in (1, 2, 3, 4)]
         kept = [channels(width, factor) for factor in (3, 2, 1, 0.5)]
         skips = [*reversed(sizes[:3]), 0]
@@ -52,7 +42,9 @@ class ECN(nn.Module):
             nn.Conv2d(a, b, 3, 2, 1, bias=False) for a, b in zip([2 * bins, *sizes], sizes, strict=False)
         )
         self.encoder_norms = nn.ModuleList(nn.GroupNorm(GROUPS, size) for size in sizes)
-        self.residual = nn.Sequential(Layer(sizes[3], inside), Layer(inside, sizes[3], active=False))
+        self.residual = nn.Sequential(
+            Layer(sizes[3], self.inside), Layer(self.inside, sizes[3], active=False)
+        )
         flows = [0, 2, 2, 2]
         self.decoder = nn.ModuleList(
             nn.Conv2d(a + skip + flow, b, 3, 1, 1, bias=False)
@@ -63,27 +55,8 @@ class ECN(nn.Module):
         start(self, seed, 2.0, self.heads)
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
-    @classmethod
-    def with_weights(cls, weights: int, bins: int = 8, seed: int = 0) -> "ECN":
-        """The network with the fewest weights that are not below the budget (at most 4 % above it from 0.1 M
-        on)."""
-        width, hidden = fill_budget(lambda **sizes: cls(bins, **sizes), weights, INSIDE)
-        return cls(bins, width, hidden, seed)
-
-    @takes_volume
-    def forward(self, volume: EventVolume) -> FlowField:
-        return self._finish(volume, self._levels(volume)[-1])
-
-    @takes_volume
-    def predictions(self, volume: EventVolume) -> list[FlowField]:
-        """Flow of every decoding step at full resolution, in pixels there, coarse first; the last is what a
-        call returns."""
-        return [self._finish(volume, level) for level in self._levels(volume)]
-
-    def _levels(self, volume) -> list[Tensor]:
-        """Flow at 1/8, 1/4, 1/2 and all of the padded resolution, in pixels of each."""
-        x = pad_to(normalise(volume.counts).flatten(1, 2), STRIDE)
-        x = x.contiguous(memory_format=torch.channels_last)
+    def levels(self, counts: Tensor, volume: EventVolume) -> list[Tensor]:
+        x = counts.contiguous(memory_format=torch.channels_last)
         skips = []
         for layer, norm in zip(self.encoder, self.encoder_norms, strict=True):
             new = layer(x)
@@ -103,11 +76,6 @@ class ECN(nn.Module):
             change = head(x)
             flows.append(held[0] + change if held else change)
         return flows
-
-    def _finish(self, volume, flow_px):
-        height, width = volume.counts.shape[3:]
-        full = (height + -height % STRIDE, width + -width % STRIDE)
-        return to_field(rescale_flow(flow_px, full)[..., :height, :width], volume)
 
 
 def _with_channels(image, count):

@@ -1,23 +1,22 @@
 """A recurrent network that reads the bins of a volume one after the other, and again after deblurring them."""
 
-from typing import Any
+import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad, unfold
 
-from codesign.flow.baselines.weights import channels, fill_budget, start
+from codesign.flow.baselines.parts import Baseline, channels, start
 from codesign.flow.checks import check_count
-from codesign.flow.entry import check_bins, check_sizes, normalise, pad_to, takes_volume, to_field
 from codesign.flow.layers import Layer
 from codesign.flow.warp import along_flow
-from codesign.types import EventVolume, FlowField
+from codesign.types import EventVolume
 
-STRIDE = 8  # of the cells on which flow is found
 STATE = 4  # channels of the recurrent state over the width
 
 
-class IDNet(nn.Module):
+class IDNet(Baseline):
     """Iterative deblurring: the bins are moved back along the flow so far, an encoder and a recurrent unit
     read them in turn, and the last state says what to add to the flow; again with the same weights.
 
@@ -27,10 +26,7 @@ class IDNet(nn.Module):
         multiple of 4.
       hidden: channels inside the head, a multiple of 4; None for 8 times ``width``. iterations: >= 1, 4 as
         published. seed: of the first weights.
-    Called with an EventVolume [B, 2, bins, H, W] of any H, W: FlowField, px per interval at full resolution.
-      Its confidence only says whether the sample had events.
     Gradient: counts and weights; piecewise smooth, as bilinear lookups and rectifiers are.
-    Computed in the type of the weights, returned in that of the counts.
     Raises: ShapeError, DomainError.
     Source: Wu, Paredes-Valles, de Croon, Lightweight event-based optical flow estimation via iterative
       deblurring, ICRA 2024, sec. III: without correlation volumes, flow at 1/8 resolution brought to all pixels
@@ -41,6 +37,8 @@ class IDNet(nn.Module):
     torch.Size([1, 2, 32, 48])
     """
 
+    STRIDE: ClassVar[int] = 8  # of the cells on which flow is found
+
     def __init__(
         self,
         bins: int = 8,
@@ -49,18 +47,8 @@ class IDNet(nn.Module):
         iterations: int = 4,
         seed: int = 0,
     ) -> None:
-        super().__init__()
-        check_bins(bins)
-        check_sizes(width, hidden)
         check_count(iterations, "iterations", 1)
-        self.config: dict[str, Any] = {
-            "bins": bins,
-            "width": width,
-            "hidden": hidden,
-            "iterations": iterations,
-            "seed": seed,
-        }
-        inside = channels(width, 8) if hidden is None else hidden
+        super().__init__(bins, width, hidden, iterations=iterations, seed=seed)
         c, state = channels(width), channels(width, STATE)
         self.encoder = nn.Sequential(
             Layer(2, c, stride=2),
@@ -70,34 +58,20 @@ class IDNet(nn.Module):
         )
         self.gates = nn.Conv2d(2 * state, 2 * state, 3, 1, 1)
         self.candidate = nn.Conv2d(2 * state, state, 3, 1, 1)
-        self.head = nn.Sequential(nn.Conv2d(state, inside, 3, 1, 1), nn.SiLU(), nn.Conv2d(inside, 2, 3, 1, 1))
-        self.blend = nn.Conv2d(state, 9 * STRIDE**2, 1)
+        self.head = nn.Sequential(
+            nn.Conv2d(state, self.inside, 3, 1, 1), nn.SiLU(), nn.Conv2d(self.inside, 2, 3, 1, 1)
+        )
+        self.blend = nn.Conv2d(state, 9 * self.STRIDE**2, 1)
         start(self, seed, 2.0, [self.head[2], self.blend])
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
-    @classmethod
-    def with_weights(cls, weights: int, bins: int = 8, seed: int = 0, iterations: int = 4) -> "IDNet":
-        """The network with the fewest weights that are not below the budget (at most 4 % above it from 0.1 M
-        on)."""
-        width, hidden = fill_budget(lambda **sizes: cls(bins, **sizes), weights)
-        return cls(bins, width, hidden, iterations, seed)
-
-    @takes_volume
-    def forward(self, volume: EventVolume) -> FlowField:
-        return self._field(volume, self._found(volume)[-1])
-
-    @takes_volume
-    def predictions(self, volume: EventVolume) -> list[FlowField]:
-        """Flow after every iteration; the last is what a call returns."""
-        return [self._field(volume, flow_px) for flow_px in self._found(volume)]
-
-    def _found(self, volume) -> list[Tensor]:
-        """Flow [B, 2, h, w] px of the padded volume after every iteration."""
-        counts = normalise(volume.counts)
-        batch, _, bins = counts.shape[:3]
-        padded = pad_to(counts.flatten(1, 2), STRIDE).unflatten(1, (2, bins))
+    def levels(self, counts: Tensor, volume: EventVolume) -> list[Tensor]:
+        """Flow px of all pixels after every iteration."""
+        batch = len(counts)
+        padded = counts.unflatten(1, (2, -1))
+        bins = padded.shape[2]
         time = (volume.centroid_s / volume.collected_s.sum()).to(padded)
-        cells = [side // STRIDE for side in padded.shape[3:]]
+        cells = [side // self.STRIDE for side in padded.shape[3:]]
         flow = padded.new_zeros(batch, 2, *cells)  # px on cells
         full = padded.new_zeros(batch, 2, *padded.shape[3:])
         found = []
@@ -106,7 +80,7 @@ class IDNet(nn.Module):
             each = moved.transpose(1, 2).flatten(0, 1).contiguous(memory_format=torch.channels_last)
             read = self.encoder(each).unflatten(0, (batch, bins))
             state = self._read(read)
-            flow = flow + STRIDE * self.head(state)
+            flow = flow + self.STRIDE * self.head(state)
             full = _blended(flow, self.blend(state))
             found.append(full)
         return found
@@ -121,16 +95,13 @@ class IDNet(nn.Module):
             state = state + update * (new - state)
         return state
 
-    def _field(self, volume, flow_px):
-        height, width = volume.counts.shape[3:]
-        return to_field(flow_px[..., :height, :width], volume)
-
 
 def _blended(flow, weights):
     """Every pixel as a learnt mean of the nine cells around its own (Teed and Deng, RAFT, ECCV 2020, section
     3.3)."""
     batch, _, height, width = flow.shape
-    mix = weights.reshape(batch, 1, 9, STRIDE, STRIDE, height, width).softmax(2)
+    side = math.isqrt(weights.shape[1] // 9)
+    mix = weights.reshape(batch, 1, 9, side, side, height, width).softmax(2)
     near = unfold(pad(flow, (1, 1, 1, 1), mode="replicate"), 3).reshape(batch, 2, 9, 1, 1, height, width)
     fine = (mix * near).sum(2).permute(0, 1, 4, 2, 5, 3)
-    return fine.reshape(batch, 2, STRIDE * height, STRIDE * width)
+    return fine.reshape(batch, 2, side * height, side * width)

@@ -1,26 +1,24 @@
 """A network with a spiking encoder and an analogue decoder, in the form of Spike-FlowNet."""
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv_transpose2d, leaky_relu
 
+from codesign.backend import NoSecondDerivative
 from codesign.errors import ShapeError
-from codesign.events.spiking.surrogate import FastSigmoid
-from codesign.flow.baselines.halves import to_halves
-from codesign.flow.baselines.neuron import integrate_and_fire
-from codesign.flow.baselines.rescale import rescale_flow
-from codesign.flow.baselines.weights import channels, fill_budget, start
+from codesign.events.spiking.surrogate import FastSigmoid, Surrogate
+from codesign.flow.baselines.parts import Baseline, channels, rescale_flow, start
 from codesign.flow.checks import check_number, check_real
-from codesign.flow.entry import check_bins, check_sizes, normalise, pad_to, takes_volume, to_field
-from codesign.types import EventVolume, FlowField
+from codesign.types import EventVolume
 
-STRIDE = 16
+_FIRST_ONLY = (
+    "a surrogate stands for the first derivative of a spike only; a second one through integrate-and-fire neurons was "
+    "asked for. Use differences of gradients instead."
+)
 LEAK = 0.1  # slope of the decoder's rectifiers for negative input
 
 
-class SpikeFlowNet(nn.Module):
+class SpikeFlowNet(Baseline):
     """Four strided layers of integrate-and-fire neurons, sums of what flowed into them, two residual blocks,
     a decoder with four flow scales that each add to the coarser one.
 
@@ -32,10 +30,7 @@ class SpikeFlowNet(nn.Module):
       threshold: potential at which a neuron fires, in normalised counts. surrogate_width: of the fast sigmoid
         that stands for the derivative of the step, in potential.
       seed: of the first weights.
-    Called with an EventVolume [B, 2, bins, H, W] of any H, W: FlowField, px per interval at full resolution.
-      Its confidence only says whether the sample had events.
     Gradient: counts and weights, through spikes by the surrogate. First derivatives only.
-    Computed in the type of the weights, returned in that of the counts.
     Raises: ShapeError, DomainError.
     Source: Lee et al., Spike-FlowNet, ECCV 2020, sec. 3 and fig. 4.
 
@@ -53,21 +48,11 @@ class SpikeFlowNet(nn.Module):
         surrogate_width: float = 0.75,
         seed: int = 0,
     ) -> None:
-        super().__init__()
-        check_bins(bins, even=True)
-        check_sizes(width, hidden)
         threshold = check_number(threshold, "threshold", above=0.0)
         surrogate_width = check_number(surrogate_width, "surrogate_width", above=0.0)
-        self.config: dict[str, Any] = {
-            "bins": bins,
-            "width": width,
-            "hidden": hidden,
-            "threshold": threshold,
-            "surrogate_width": surrogate_width,
-            "seed": seed,
-        }
+        own = {"threshold": threshold, "surrogate_width": surrogate_width, "seed": seed}
+        super().__init__(bins, width, hidden, even=True, **own)
         self.surrogate = FastSigmoid.unit(surrogate_width)
-        inside = channels(width, 8) if hidden is None else hidden
         down = [channels(width, factor) for factor in (1, 2, 4, 8)]
         up = [channels(width, 2), channels(width), 4]
         self.neck = channels(width, 0.5)  # channels between a level and its flow
@@ -78,8 +63,8 @@ class SpikeFlowNet(nn.Module):
         self.residual = nn.ModuleList(
             nn.ModuleList(
                 [
-                    nn.Conv2d(down[3], inside, 3, 1, 1, bias=False),
-                    nn.Conv2d(inside, down[3], 3, 1, 1, bias=False),
+                    nn.Conv2d(down[3], self.inside, 3, 1, 1, bias=False),
+                    nn.Conv2d(self.inside, down[3], 3, 1, 1, bias=False),
                 ]
             )
             for _ in range(2)
@@ -92,22 +77,12 @@ class SpikeFlowNet(nn.Module):
         start(self, seed, 3.0, self.heads)
         self.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
-    @classmethod
-    def with_weights(cls, weights: int, bins: int = 8, seed: int = 0) -> "SpikeFlowNet":
-        """The network with the fewest weights that are not below the budget (at most 4 % above it from 0.3 M
-        on)."""
-        width, hidden = fill_budget(lambda **sizes: cls(bins, **sizes), weights)
-        return cls(bins, width, hidden, seed=seed)
-
-    @takes_volume
-    def forward(self, volume: EventVolume) -> FlowField:
-        return self._finish(volume, self._levels(volume)[-1])
-
-    @takes_volume
-    def predictions(self, volume: EventVolume) -> list[FlowField]:
-        """Flow of every decoding layer at full resolution, in pixels there, coarse first; the last is what a
-        call returns."""
-        return [self._finish(volume, level) for level in self._levels(volume)]
+    def levels(self, counts: Tensor, volume: EventVolume) -> list[Tensor]:
+        halves = to_halves(counts.unflatten(1, (2, -1)))
+        # rounding to half precision makes other neurons fire
+        with torch.autocast(halves.device.type, enabled=False):
+            sums = self.encode(halves)
+        return self.decode(sums)
 
     def encode(self, halves: Tensor) -> list[Tensor]:
         """Sums over the steps of what flowed into each layer's neurons: [B, width, H/2, W/2] to [B, 8 width,
@@ -121,20 +96,19 @@ class SpikeFlowNet(nn.Module):
             halves.ndim != 5
             or halves.shape[1] != 4
             or 0 in halves.shape
-            or halves.shape[2] % STRIDE
-            or halves.shape[3] % STRIDE
+            or halves.shape[2] % self.STRIDE
+            or halves.shape[3] % self.STRIDE
         ):
             raise ShapeError(
-                f"the encoder takes [B, 4, H, W, steps] with H and W multiples of {STRIDE}, got "
+                f"the encoder takes [B, 4, H, W, steps] with H and W multiples of {self.STRIDE}, got "
                 f"{tuple(halves.shape)}."
             )
         steps = halves.shape[4]
         halves = halves.to(next(self.parameters()).dtype)
         x = halves.permute(4, 0, 1, 2, 3).flatten(0, 1).contiguous(memory_format=torch.channels_last)
         sums = []
-        for layer in (
-            self.encoder
-        ):  # every layer runs over all steps at once: nothing flows back, so this is the same as step by step
+        # every layer runs over all steps at once: nothing flows back, so this is the same as step by step
+        for layer in self.encoder:
             current = layer(x).permute(0, 2, 3, 1)
             # rows in the order of memory, which sums 15 times faster
             shape = current.shape
@@ -169,16 +143,83 @@ class SpikeFlowNet(nn.Module):
                 x = torch.cat([sums[2 - level], leaky_relu(self.decoder[level](x), LEAK), flows[-1]], 1)
         return flows
 
-    def _levels(self, volume):
-        counts = volume.counts
-        halves = to_halves(pad_to(normalise(counts), STRIDE))
-        with torch.autocast(
-            halves.device.type, enabled=False
-        ):  # rounding to half precision makes other neurons fire
-            sums = self.encode(halves)
-        return self.decode(sums)
 
-    def _finish(self, volume, flow_px):
-        height, width = volume.counts.shape[3:]
-        full = (height + -height % STRIDE, width + -width % STRIDE)
-        return to_field(rescale_flow(flow_px, full)[..., :height, :width], volume)
+def to_halves(counts: Tensor) -> Tensor:
+    """Bins of a volume as Spike-FlowNet takes them.
+
+    Args:
+      counts: [B, 2, 2 k, H, W] events per bin, ON first.
+    Returns: [B, 4, H, W, k] view: ON and OFF of the former half, ON and OFF of the latter; nothing is lost or
+      added. The bins keep their shared borders, so an event that crosses one, also the middle of the window,
+      changes the input continuously.
+    Gradient: counts.
+    Raises: ShapeError for an odd number of bins.
+    Source: Lee et al., Spike-FlowNet, ECCV 2020, sec. 3.1.
+    """
+    check_real(counts, "the counts")
+    if counts.ndim != 5 or counts.shape[1] != 2 or counts.shape[2] % 2 or counts.shape[2] == 0:
+        raise ShapeError(
+            "two halves need counts [B, 2, bins, H, W] with an even number of bins, got "
+            f"{tuple(counts.shape)}."
+        )
+    batch, _, bins, height, width = counts.shape
+    split = counts.unflatten(2, (2, bins // 2)).transpose(1, 2)  # [B, half, polarity, k, H, W]
+    return split.flatten(1, 2).permute(0, 1, 3, 4, 2)
+
+
+class _Fire(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, current, threshold, surrogate):
+        ctx.threshold = threshold
+        ctx.surrogate = surrogate
+        # the potential is made again: it would weigh as much, and the current ties a second derivative to its refusal
+        ctx.save_for_backward(current)
+        return _run(current, threshold, torch.empty_like(current[:1]))
+
+    @staticmethod
+    def backward(ctx, *grads):
+        (current,) = ctx.saved_tensors
+        with torch.no_grad():
+            potential = torch.empty_like(current)
+            spikes = _run(current, ctx.threshold, potential)
+            result = grads[0] * ctx.surrogate.torch_density(potential.sub_(ctx.threshold))
+            for t in range(len(result) - 2, -1, -1):
+                result[t].add_(result[t + 1]).addcmul_(result[t + 1], spikes[t], value=-1)
+        if torch.is_grad_enabled():
+            (result,) = NoSecondDerivative.apply(_FIRST_ONLY, 1, result, current, *grads)  # pyright: ignore[reportGeneralTypeIssues]
+        return result, None, None
+
+
+def _run(current, threshold, potential):
+    """Spikes [T, ...]; potentials before the reset are left in ``potential``, as far as it is long. Into
+    buffers made once: fresh ones cost more than the arithmetic."""
+    spikes = torch.empty_like(current)
+    rest = torch.zeros_like(current[0])
+    for t in range(len(current)):
+        u = torch.add(rest, current[t], out=potential[t % len(potential)])
+        torch.ge(u, threshold, out=spikes[t])
+        torch.addcmul(u, u, spikes[t], value=-1, out=rest)
+    return spikes
+
+
+def integrate_and_fire(current: Tensor, threshold: float, surrogate: Surrogate) -> Tensor:
+    """Spikes of neurons without leak that fall back to 0 when they fire: u_t = u_{t-1} (1 - s_{t-1}) + I_t,
+    s_t = [u_t >= threshold].
+
+    Args:
+      current: [T, ...] input of every step, in units of the potential.
+      threshold: > 0. surrogate: Surrogate, its density at u - threshold
+        stands for the derivative of the step.
+    Returns: [T, ...] spikes, 0 or 1.
+    Gradient: current; lambda_t = g_t rho(u_t - threshold) + (1 - s_t) lambda_{t+1}, the reset taken as it
+      happened. First derivatives only.
+    Raises: GradientError for a second derivative; ShapeError without a step; DomainError for a threshold <=
+      0.
+    Source: Lee et al., Spike-FlowNet, ECCV 2020, eqs. 1 to 3, which lets rho be 1 / threshold above it and 0
+      below.
+    """
+    check_real(current, "the current")
+    if current.ndim < 1 or len(current) < 1:
+        raise ShapeError(f"the current needs a time axis with at least one step, got {tuple(current.shape)}.")
+    check_number(threshold, "the threshold", above=0.0)
+    return _Fire.apply(current, threshold, surrogate)
