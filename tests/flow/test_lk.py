@@ -151,21 +151,6 @@ def test_samples_of_a_batch_do_not_touch_each_other():
     assert not found.flow_px[1].any()
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, D])
-def test_no_events_give_zero_flow_and_a_zero_gradient(dtype):
-    volume, _ = moving(0, steps=10)
-    empty = EventVolume(
-        torch.zeros(1, 2, 5, 32, 40, dtype=dtype, requires_grad=True), volume.centroid_s, volume.collected_s
-    )
-    field = estimate_lk(empty)
-    assert not field.flow_px.any()
-    assert not field.valid.any()
-    (grad,) = torch.autograd.grad(field.flow_px.sum(), empty.counts)
-    assert not grad.any()  # the pull is quadratic in the counts
-    (grad,) = torch.autograd.grad(estimate_lk(empty).flow_px.square().sum(), empty.counts)
-    assert not grad.any()
-
-
 @pytest.mark.parametrize("count", [1, 5, 20, 60, 200, 1000])
 def test_scattered_noise_gives_almost_no_flow(count):
     # up to one event per two pixels, at random places, times and signs: nothing moves. (Plain damping gives
@@ -217,74 +202,6 @@ def test_hard_events_of_fine_textures_beat_zero_flow_and_sparse_ones_do_not_lose
     assert ratios[0.05] <= 1.1  # hardly an event that is not noise: near zero flow, not far from it
 
 
-@pytest.mark.parametrize("model", ["constant", "affine", "quadratic", "local"])
-def test_gradcheck(model, generator):
-    volume, _ = moving(4, shift=(0.7, -0.4), steps=20, bins=3)
-    counts = volume.counts[..., 10:24, 8:22].clone().requires_grad_()
-    tangents = [torch.randn(counts.shape, generator=generator, dtype=D) for _ in range(4)]
-    weights = torch.randn(1, 2, 14, 14, generator=generator, dtype=D)
-
-    def loss(counts):
-        return (
-            estimate_lk(EventVolume(counts, volume.centroid_s, volume.collected_s), model=model).flow_px
-            * weights
-        ).sum()
-
-    (found,) = torch.autograd.grad(loss(counts), counts)
-    for tangent in tangents:
-        ahead, behind = (float(loss((counts + s * 1e-6 * tangent).detach())) for s in (1, -1))
-        truth = (ahead - behind) / 2e-6
-        # steps of 1e-6 events; the warp is only piecewise smooth, but so short a step crosses no kink
-        assert abs(float((found * tangent).sum()) - truth) <= 1e-5 * abs(truth) + 1e-6
-
-
-@pytest.mark.parametrize(
-    ("counts", "options", "error", "sentence"),
-    [
-        (torch.zeros(2, 5, 32, 32), {}, ShapeError, r"\[B, 2, bins >= 2, H, W\]"),
-        (torch.zeros(1, 2, 1, 32, 32), {}, ShapeError, r"bins >= 2"),
-        (torch.zeros(1, 3, 5, 32, 32), {}, ShapeError, r"\[B, 2"),
-        (
-            torch.zeros(1, 2, 5, 32, 1),
-            {},
-            ShapeError,
-            "32 x 1 pixels has no slopes both ways; give at least 2 x 2",
-        ),
-        (torch.full((1, 2, 5, 32, 32), math.nan), {}, DomainError, "event volume"),
-        (torch.zeros(1, 2, 5, 32, 32), {"model": "cubic"}, DomainError, "flow model 'cubic' is unknown"),
-        (torch.zeros(1, 2, 5, 32, 32), {"clock": ["time"]}, DomainError, "clock .* is unknown"),
-        (
-            torch.zeros(1, 2, 5, 32, 32),
-            {"levels_px": (0.05,)},
-            DomainError,
-            "0.05 px; 0.2 to 1000 are possible",
-        ),
-        (torch.zeros(1, 2, 5, 32, 32), {"prior_px": 1e20}, DomainError, "at most 10000 px"),
-        (
-            torch.zeros(1, 2, 5, 32, 32),
-            {"start_px": torch.full((1, 2), 1e300, dtype=torch.float64)},
-            DomainError,
-            "reaches 1e\\+300 px",
-        ),
-    ],
-)
-def test_volumes_and_models_that_cannot_be_are_refused(counts, options, error, sentence):
-    with pytest.raises(error, match=sentence):
-        estimate_lk(
-            EventVolume(counts, torch.linspace(0, 1, 5, dtype=D), torch.full((5,), 0.2, dtype=D)), **options
-        )
-
-
-@pytest.mark.parametrize("levels_px", [(4.0, 2.0, 1.0), (1.5, 1.0)])
-def test_small_images_work(levels_px):
-    volume, truth = moving(5, shift=(0.4, 0.2))
-    small = EventVolume(volume.counts[..., 20:30, 20:30].clone(), volume.centroid_s, volume.collected_s)
-    found = estimate_lk(small, model="constant", levels_px=levels_px)
-    assert found.flow_px.shape == (1, 2, 10, 10)
-    # a hundred pixels, with half of them near the border
-    assert mean_error(found, truth[:, 20:30, 20:30]) <= 0.3 * length(truth)
-
-
 def test_flow_belongs_to_the_pixels_of_the_start():
     # a zoom by 1 + m about the centre while shifting by s: a point seen at a is at (1 + m/2)/(1 - m/2) a + s'
     # at the end, so flow at the centre pixel is s / (1 - m/2) (worked out in ``moving``); taken on the pixels
@@ -316,19 +233,58 @@ def test_confidence_follows_from_the_covariance_and_is_zero_without_events():
     assert float(field.confidence[0].min()) > 0.99
 
 
-@pytest.mark.parametrize("model", ["affine", "quadratic", "local"])
-def test_gradients_of_the_uncertainty_are_those_of_differences(model, generator):
-    volume, _ = moving(4, shift=(0.7, -0.4), steps=20, bins=3)
-    counts = (volume.counts[..., 10:24, 8:22] * 0.3).clone().requires_grad_()
-    weights = torch.randn(4, 14, 14, generator=generator, dtype=D)
+@pytest.mark.parametrize(
+    ("model", "clock"),
+    [
+        ("constant", "time"),
+        ("affine", "time"),
+        ("quadratic", "time"),
+        ("local", "time"),
+        ("affine", "events"),
+    ],
+)
+def test_gradients_are_those_of_differences(model, clock, generator):
+    """Of the flow, its covariance and confidence; by events as the clock, of a motion that turns back."""
+    volume, _ = moving(4, shift=(0.7, -0.4), steps=20, bins=6)
+    counts = volume.counts[..., 10:24, 8:22] * 0.3
+    if clock == "events":
+        counts = torch.cat([counts, counts.flip(1, 2)[:, :, 1:4]], 2)
+    bins = counts.shape[2]
+    times = (torch.arange(bins, dtype=D) + 0.5) / bins, torch.full((bins,), 1 / bins, dtype=D)
+    weights = torch.randn(6, 14, 14, generator=generator, dtype=D)
 
     def loss(counts):
-        field = certain(estimate_lk(EventVolume(counts, volume.centroid_s, volume.collected_s), model=model))
-        return (field.confidence[0] * weights[0]).sum() + (field.covariance_px2[0] * weights[1:]).sum()
+        field = certain(estimate_lk(EventVolume(counts, *times), model, clock=clock))
+        values = torch.cat([field.flow_px[0], field.confidence, field.covariance_px2[0]])
+        return (values * weights).sum()
 
+    counts = counts.clone().requires_grad_()
     (found,) = torch.autograd.grad(loss(counts), counts)
     for _ in range(3):
         tangent = torch.randn(counts.shape, generator=generator, dtype=D)
         ahead, behind = (float(loss((counts + s * 1e-6 * tangent).detach())) for s in (1, -1))
         truth = (ahead - behind) / 2e-6
+        # steps of 1e-6 events; the warp is only piecewise smooth, but so short a step crosses no kink
         assert abs(float((found * tangent).sum()) - truth) <= 1e-5 * abs(truth) + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "sentence"),
+    [
+        ({"model": "cubic"}, DomainError, "flow model 'cubic' is unknown"),
+        ({"clock": ["time"]}, DomainError, "clock .* is unknown"),
+        ({"levels_px": (0.05,)}, DomainError, "0.05 px; 0.2 to 1000 are possible"),
+        ({"prior_px": 1e20}, DomainError, "at most 10000 px"),
+        ({"start_px": torch.full((1, 2), 1e300, dtype=D)}, DomainError, "reaches 1e\\+300 px"),
+        ({"start_px": torch.zeros(2)}, ShapeError, r"must be \[1, 2, 8, 8\], got \[2\]"),
+        ({"start_px": torch.zeros(2, 2)}, ShapeError, r"is \[2, 2\]; \[1, 2\] or \[1, 2, 8, 8\] is needed"),
+        ({"start_px": torch.zeros(1, 2, 7, 8)}, ShapeError, r"must be \[1, 2, 8, 8\]"),
+        ({"start_px": torch.full((1, 2), math.nan)}, DomainError, "start_px"),
+        ({"start_px": torch.zeros(1, 2).long()}, DomainError, "int64"),
+        ({"start_px": (1.0, 2.0)}, DomainError, "start_px is a tuple; a torch tensor is needed"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(options, error, sentence):
+    times = torch.linspace(0, 1, 5, dtype=D), torch.full((5,), 0.2, dtype=D)
+    with pytest.raises(error, match=sentence):
+        estimate_lk(EventVolume(torch.zeros(1, 2, 5, 8, 8), *times), **options)

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from codesign import events, flow
-from codesign.errors import DomainError, ShapeError
 from codesign.flow import estimate_lk
 from codesign.flow.lk import polynomials
 from codesign.types import EventVolume
@@ -92,22 +91,6 @@ def test_starts_of_a_batch_are_each_their_own_and_have_no_gradient():
     for k, volume in enumerate((a, b)):
         alone = estimate_lk(volume, start_px=starts[k : k + 1]).flow_px[0]
         torch.testing.assert_close(found[k], alone, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("start", "error", "sentence"),
-    [
-        (torch.zeros(2), ShapeError, r"must be \[1, 2, 48, 48\], got \[2\]"),
-        (torch.zeros(2, 2), ShapeError, r"start_px is \[2, 2\]; \[1, 2\] or \[1, 2, 48, 48\] is needed"),
-        (torch.zeros(1, 2, 40, 48), ShapeError, r"must be \[1, 2, 48, 48\], got \[1, 2, 40, 48\]"),
-        (torch.full((1, 2), torch.nan), DomainError, "start_px"),
-        ((1.0, 2.0), DomainError, "start_px is a tuple; a torch tensor is needed"),
-    ],
-)
-def test_starts_that_do_not_fit_are_refused(start, error, sentence):
-    volume, _ = moving(0, steps=5)
-    with pytest.raises(error, match=sentence):
-        estimate_lk(volume, start_px=start)
 
 
 def test_a_stream_that_speeds_up_is_followed_from_window_to_window():

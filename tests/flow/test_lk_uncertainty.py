@@ -3,7 +3,6 @@ covariance says how large errors are."""
 
 import math
 
-import numpy
 import pytest
 import torch
 
@@ -51,17 +50,6 @@ def test_prior_and_its_spread_are_those_of_drawn_fields(generator):
     torch.testing.assert_close(
         (flow[:, 0] * flow[:, 1]).mean(0), expected[1], rtol=0, atol=0.05 * float(expected[0].max())
     )
-    assert float(shape.mean_square(drawn).mean()) == pytest.approx(
-        float(_square_mean(shape, drawn)), rel=1e-9
-    )
-
-
-def _square_mean(shape, parameters):
-    """Mean squared flow over [-1, 1]^2 by Gauss-Legendre quadrature, exact for polynomials."""
-    nodes, weights = (torch.from_numpy(a) for a in numpy.polynomial.legendre.leggauss(4))
-    v, u = torch.meshgrid(nodes, nodes, indexing="ij")
-    flow = torch.einsum("nck,khw->nchw", parameters.reshape(len(parameters), 2, -1), shape.basis(u, v))
-    return (flow.square().sum(1) * weights * weights[:, None]).sum((1, 2)).mean() / 4
 
 
 def test_scattered_events_give_the_slopes_that_the_noise_model_says(generator):
@@ -101,15 +89,10 @@ def test_squared_errors_are_those_of_the_covariance():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, D])
-@pytest.mark.parametrize(
-    ("name", "largest_px"), [("empty", 0.0), ("one event", 0.3), ("saturated", 0.01), ("constant", 0.01)]
-)
+@pytest.mark.parametrize(("name", "largest_px"), [("empty", 0.0), ("saturated", 0.01), ("constant", 0.01)])
 def test_volumes_that_show_no_motion_give_none_and_finite_gradients(name, largest_px, dtype):
-    # one event says nothing; even counts have no slopes at all. All of it must come out as next to no flow,
-    # with finite gradients of every output
+    # even counts have no slopes at all: next to no flow, with finite gradients of every output
     counts = torch.zeros(1, 2, 8, 32, 32, dtype=dtype)
-    if name == "one event":
-        counts[0, 0, 3, 10, 12] = 1.0
     if name == "saturated":
         counts[:, 0] = 1e4
     if name == "constant":
@@ -117,9 +100,7 @@ def test_volumes_that_show_no_motion_give_none_and_finite_gradients(name, larges
     counts.requires_grad_()
     share = torch.tensor([1, 2, 2, 2, 2, 2, 2, 1], dtype=D) / 14
     centroid = torch.tensor([1 / 21, *(k / 7 for k in range(1, 7)), 20 / 21], dtype=D)
-    volume = EventVolume(
-        counts * (share.to(dtype)[:, None, None] * 8 if name != "one event" else 1), centroid, share
-    )
+    volume = EventVolume(counts * share.to(dtype)[:, None, None] * 8, centroid, share)
     field = certain(estimate_lk(volume))
     assert float(field.flow_px.detach().abs().max()) <= largest_px
     for value in (

@@ -256,30 +256,37 @@ def test_half_precision_predictions_lose_no_place(generator):
         assert loss(flow.bfloat16()).item() == loss(flow).item()
 
 
-def test_what_does_not_fit_is_refused():
-    with pytest.raises(ShapeError, match="no prediction"):
-        losses.supervised_loss([], TRUTH)
-    with pytest.raises(ShapeError, match=r"must be \[2, 2, 1, 2\].*got \[2, 2, 1, 1\]"):
-        losses.supervised_loss([replace(FIRST, flow_px=FIRST.flow_px[..., :1])], TRUTH)
-    with pytest.raises(ShapeError, match="unit_per_px must be"):
-        losses.supervised_loss([FIRST], TRUTH, unit_per_px=torch.ones(3))
-    with pytest.raises(DomainError, match="neither covariance_px2 nor confidence"):
-        losses.likelihood_loss([FIRST], TRUTH)
-    with pytest.raises(DomainError, match="not positive semidefinite"):
-        losses.likelihood_loss(
-            [
-                replace(
-                    FIRST,
-                    covariance_px2=torch.tensor([1.0, 2.0, 1.0], dtype=D)[None, :, None, None].expand(
-                        2, 3, 1, 2
-                    ),
-                )
-            ],
-            TRUTH,
-        )
-    with pytest.raises(DomainError, match="confidence lies outside 0 to 1"):
-        losses.likelihood_loss([replace(FIRST, confidence=torch.full((2, 1, 2), 1.5, dtype=D))], TRUTH)
-    with pytest.raises(ShapeError, match="frames must be"):
-        losses.photometric_loss(None, FIRST.flow_px)
-    with pytest.raises(ShapeError, match="the frame must be"):
-        losses.smoothness_loss(FIRST.flow_px, torch.zeros(1, 1, 2))
+TILTED = torch.tensor([1.0, 2.0, 1.0], dtype=D)[None, :, None, None].expand(2, 3, 1, 2)
+
+
+@pytest.mark.parametrize(
+    ("loss", "given", "error", "sentence"),
+    [
+        ("supervised_loss", ([], TRUTH), ShapeError, "no prediction"),
+        (
+            "supervised_loss",
+            ([replace(FIRST, flow_px=FIRST.flow_px[..., :1])], TRUTH),
+            ShapeError,
+            r"must be \[2",
+        ),
+        ("supervised_loss", ([FIRST], TRUTH, 0.8, 0.01, torch.ones(3)), ShapeError, "unit_per_px must be"),
+        ("likelihood_loss", ([FIRST], TRUTH), DomainError, "neither covariance_px2 nor confidence"),
+        (
+            "likelihood_loss",
+            ([replace(FIRST, covariance_px2=TILTED)], TRUTH),
+            DomainError,
+            "not positive semi",
+        ),
+        (
+            "likelihood_loss",
+            ([replace(FIRST, confidence=1.5 + TILTED[:, 0])], TRUTH),
+            DomainError,
+            "outside 0 to 1",
+        ),
+        ("photometric_loss", (None, FIRST.flow_px), ShapeError, "frames must be"),
+        ("smoothness_loss", (FIRST.flow_px, torch.zeros(1, 1, 2)), ShapeError, "the frame must be"),
+    ],
+)
+def test_what_does_not_fit_is_refused(loss, given, error, sentence):
+    with pytest.raises(error, match=sentence):
+        getattr(losses, loss)(*given)

@@ -21,13 +21,35 @@ def field(pairs):
 FOUND = field([(3.0, 4.0), (0.0, 0.0), (103.5, 0.0), (10.0, 4.5), (1.0, 1.0)])
 TRUTH = field([(0.0, 0.0), (0.0, 0.0), (100.0, 0.0), (10.0, 0.0), (1.0, 1.0)])
 ERRORS = [5.0, 0.0, 3.5, 4.5, 0.0]
+LONG = torch.tensor([[True, False, False, True, False]])
 
 
-def test_endpoint_errors_and_their_mean():
-    assert metrics.endpoint_error(FOUND, TRUTH).tolist() == [ERRORS]
-    assert metrics.aee(FOUND, TRUTH).item() == pytest.approx(13.0 / 5)
-    mask = torch.tensor([[True, False, False, True, False]])
-    assert metrics.aee(FOUND, TRUTH, mask).item() == pytest.approx(9.5 / 2)
+@pytest.mark.parametrize(
+    ("found", "right"),
+    [
+        (metrics.endpoint_error(FOUND, TRUTH).sum(), sum(ERRORS)),
+        (metrics.aee(FOUND, TRUTH), 13 / 5),
+        (metrics.aee(FOUND, TRUTH, LONG), 9.5 / 2),
+        (metrics.zero_flow_error(TRUTH), (100 + 10 + math.sqrt(2)) / 5),
+        (metrics.zero_flow_error(TRUTH, LONG), 5),
+        # 5 px of 0 and 4.5 px of 10 are outliers, 3.5 px of 100 (3.5 %) and exactly 3 px are none
+        (metrics.outlier_percent(FOUND, TRUTH), 40),
+        (metrics.outlier_percent(field([(3.0, 0.0)]), field([(0.0, 0.0)])), 0),
+        (metrics.outlier_percent(field([(3.9, 0.0)]), field([(1.0, 0.0)])), 0),
+        (metrics.outlier_percent(FOUND, TRUTH, share=0.0), 60),
+        (metrics.outlier_percent(FOUND, TRUTH, pixels=0.0, share=0.04), 40),
+        (metrics.npe(FOUND, TRUTH, 1.0), 60),
+        (metrics.npe(FOUND, TRUTH, 4.0), 40),
+        (metrics.npe(FOUND, TRUTH, 5.0), 0),
+        # between (u, v, 1) of the one and of the other
+        (metrics.angular_error_deg(field([(0.0, 0.0)]), field([(1.0, 0.0)])), 45),
+        (metrics.angular_error_deg(field([(1.0, 0.0)]), field([(-1.0, 0.0)])), 90),
+        (metrics.angular_error_deg(field([(1.0, 0.0)]), field([(0.0, 1.0)])), 60),
+        (metrics.angular_error_deg(field([(2.0, 3.0)]), field([(2.0, 3.0)])), 0),
+    ],
+)
+def test_errors_worked_out_by_hand(found, right):
+    assert float(found) == pytest.approx(right, abs=1e-12)
 
 
 def test_a_batch_is_averaged_over_pixels_not_over_samples():
@@ -35,34 +57,6 @@ def test_a_batch_is_averaged_over_pixels_not_over_samples():
     truth = torch.stack([TRUTH, TRUTH])
     mask = torch.tensor([[[True, False, False, False, False]], [[True, True, True, False, False]]])
     assert metrics.aee(found, truth, mask).item() == pytest.approx(5.0 / 4)
-
-
-def test_an_outlier_needs_both_three_pixels_and_five_per_cent():
-    # 5 px of 0: yes. 3.5 px of 100 (3.5 %): no. 4.5 px of 10: yes. 2.9 px of 1: no (below 3 px)
-    found = torch.cat([FOUND, field([(3.9, 0.0)])], 2)
-    truth = torch.cat([TRUTH, field([(1.0, 0.0)])], 2)
-    assert metrics.outlier_percent(found, truth).item() == pytest.approx(100 * 2 / 6)
-    assert (
-        metrics.outlier_percent(field([(3.0, 0.0)]), field([(0.0, 0.0)])).item() == 0
-    )  # exactly 3 px is not above
-
-
-def test_share_of_errors_above_a_number_of_pixels():
-    assert metrics.npe(FOUND, TRUTH, 1.0).item() == pytest.approx(60.0)
-    assert metrics.npe(FOUND, TRUTH, 4.0).item() == pytest.approx(40.0)
-    assert metrics.npe(FOUND, TRUTH, 5.0).item() == pytest.approx(0.0)
-
-
-def test_angular_error_in_closed_form():
-    # (0, 0, 1) to (1, 0, 1) is 45 degrees; (1, 0, 1) to (-1, 0, 1) is 90; (1, 0, 1) to (0, 1, 1) is 60
-    pairs = [
-        ((0.0, 0.0), (1.0, 0.0), 45.0),
-        ((1.0, 0.0), (-1.0, 0.0), 90.0),
-        ((1.0, 0.0), (0.0, 1.0), 60.0),
-        ((2.0, 3.0), (2.0, 3.0), 0.0),
-    ]
-    for a, b, degrees in pairs:
-        assert metrics.angular_error_deg(field([a]), field([b])).item() == pytest.approx(degrees, abs=1e-12)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, D])
@@ -82,45 +76,6 @@ def test_gradients_at_zero_error_are_zero_not_nan():
     assert grad[:, 0, 0].tolist() == pytest.approx(
         [0.6 / 5, 0.8 / 5]
     )  # the unit vector of the error over five pixels
-
-
-def test_empty_masks_and_wrong_shapes_are_refused():
-    nothing = torch.zeros(1, 5, dtype=torch.bool)
-    for measure in (
-        metrics.aee,
-        metrics.outlier_percent,
-        metrics.angular_error_deg,
-        lambda f, t, m: metrics.npe(f, t, 3.0, m),
-    ):
-        with pytest.raises(DomainError, match="selects no pixel"):
-            measure(FOUND, TRUTH, nothing)
-    with pytest.raises(ShapeError, match=r"\[\.\.\., 2, H, W\]"):
-        metrics.aee(FOUND, TRUTH[:, :, :3])
-    with pytest.raises(ShapeError, match=r"\[\.\.\., 2, H, W\]"):
-        metrics.aee(torch.zeros(3, 4, 4), torch.zeros(3, 4, 4))
-    with pytest.raises(ShapeError, match=r"mask.*\(4, 4\)"):
-        metrics.aee(FOUND, TRUTH, torch.ones(4, 4, dtype=torch.bool))
-    with pytest.raises(ShapeError, match=r"\[\.\.\., 2, H, W\]"):
-        metrics.angular_error_deg(torch.zeros(3, 4, 4), torch.zeros(3, 4, 4))
-
-
-def test_both_conditions_of_an_outlier_are_explicit():
-    assert metrics.outlier_percent(FOUND, TRUTH).item() == pytest.approx(100 * 2 / 5)
-    assert (
-        metrics.outlier_percent(FOUND, TRUTH, share=0.0).item()
-        == metrics.npe(FOUND, TRUTH, 3.0).item()
-        == pytest.approx(100 * 3 / 5)
-    )
-    assert metrics.outlier_percent(FOUND, TRUTH, pixels=0.0, share=0.04).item() == pytest.approx(
-        100 * 2 / 5
-    )  # 3.5 of 100 is 3.5 %
-
-
-def test_zero_flow_error_is_the_mean_true_length():
-    assert metrics.zero_flow_error(TRUTH).item() == pytest.approx((100 + 10 + math.sqrt(2)) / 5)
-    assert metrics.zero_flow_error(
-        TRUTH, torch.tensor([[True, False, False, True, False]])
-    ).item() == pytest.approx(5)
 
 
 def test_masks_of_events_and_truth():
@@ -214,14 +169,6 @@ def test_a_principal_point_off_the_middle():
     assert direction[0, 4].tolist() == pytest.approx([0.4, -0.2, 1])
 
 
-def test_rays_that_do_not_fit_are_refused():
-    flow = torch.zeros(2, 3, 5, dtype=D)
-    with pytest.raises(ShapeError, match=r"directions must be \[H, W, 3\]"):
-        metrics.ray_error_mrad(flow, flow, metrics.pinhole_directions(3, 4, 10.0))
-    with pytest.raises(DomainError, match="does not go forward"):
-        metrics.ray_error_mrad(flow, flow, -metrics.pinhole_directions(3, 5, 10.0))
-
-
 # events alone
 
 
@@ -282,20 +229,47 @@ def test_polarities_share_an_image_in_fwl_but_not_in_rsat():
     )  # (0 + 1) / 1 pixel against (0 + 1) / 2 pixels
 
 
-def test_event_measures_without_an_answer_are_refused():
-    stream, end_us = line(5, 12)
-    for measure in (metrics.fwl, metrics.rsat):
-        with pytest.raises(DomainError, match="no event lies between"):
-            measure(stream, constant(1.0, 12), end_us + 1, end_us + 5)
-    everywhere = ordered(
-        torch.arange(4), torch.tensor([0, 1, 0, 1]), torch.tensor([0, 0, 1, 1]), torch.ones(4), 2, 2
-    )
-    with pytest.raises(DomainError, match="equally many events"):
-        metrics.fwl(everywhere, torch.zeros(2, 2, 2), 0, 3)
-    with pytest.raises(DomainError, match="at the start of the interval"):
-        metrics.rsat(
-            ordered(torch.zeros(1), torch.zeros(1), torch.zeros(1), torch.ones(1), 2, 2),
-            torch.zeros(2, 2, 2),
-            0,
-            3,
-        )
+NOTHING = torch.zeros(1, 5, dtype=torch.bool)
+STILL = torch.zeros(2, 3, 5, dtype=D)
+ONES = torch.ones(4, dtype=torch.int64)
+EVERYWHERE = ordered(torch.arange(4), torch.tensor([0, 1, 0, 1]), torch.tensor([0, 0, 1, 1]), ONES, 2, 2)
+AT_ONCE = ordered(0 * ONES[:1], 0 * ONES[:1], 0 * ONES[:1], ONES[:1], 2, 2)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "sentence"),
+    [
+        (lambda: metrics.aee(FOUND, TRUTH, NOTHING), DomainError, "selects no pixel"),
+        (lambda: metrics.outlier_percent(FOUND, TRUTH, NOTHING), DomainError, "selects no pixel"),
+        (lambda: metrics.angular_error_deg(FOUND, TRUTH, NOTHING), DomainError, "selects no pixel"),
+        (lambda: metrics.npe(FOUND, TRUTH, 3.0, NOTHING), DomainError, "selects no pixel"),
+        (lambda: metrics.aee(FOUND, TRUTH[:, :, :3]), ShapeError, r"\[\.\.\., 2, H, W\]"),
+        (
+            lambda: metrics.angular_error_deg(torch.zeros(3, 4, 4), torch.zeros(3, 4, 4)),
+            ShapeError,
+            "2, H, W",
+        ),
+        (lambda: metrics.aee(FOUND, TRUTH, torch.ones(4, 4) > 0), ShapeError, r"mask.*\(4, 4\)"),
+        (
+            lambda: metrics.ray_error_mrad(STILL, STILL, metrics.pinhole_directions(3, 4, 10.0)),
+            ShapeError,
+            r"directions must be \[H, W, 3\]",
+        ),
+        (
+            lambda: metrics.ray_error_mrad(STILL, STILL, -metrics.pinhole_directions(3, 5, 10.0)),
+            DomainError,
+            "does not go forward",
+        ),
+        (lambda: metrics.fwl(EVERYWHERE, torch.zeros(2, 2, 2), 5, 9), DomainError, "no event lies between"),
+        (lambda: metrics.rsat(EVERYWHERE, torch.zeros(2, 2, 2), 5, 9), DomainError, "no event lies between"),
+        (lambda: metrics.fwl(EVERYWHERE, torch.zeros(2, 2, 2), 0, 3), DomainError, "equally many events"),
+        (
+            lambda: metrics.rsat(AT_ONCE, torch.zeros(2, 2, 2), 0, 3),
+            DomainError,
+            "at the start of the interval",
+        ),
+    ],
+)
+def test_what_has_no_answer_is_refused(call, error, sentence):
+    with pytest.raises(error, match=sentence):
+        call()

@@ -282,8 +282,10 @@ def test_times_of_the_bins_are_those_of_from_stream():
 def test_a_recording_is_a_source_of_windows(tmp_path):
     """Events of a text file, all of them, in windows of the length asked for; no flow is known."""
     columns = made(2000, duration_s=0.101)
-    (tmp_path / "events.txt").write_text(eth_text(columns))
-    source = open_windows(tmp_path, bins=4, window_s=0.025)
+    place = tmp_path / "set" / "walk"
+    place.mkdir(parents=True)
+    (place / "events.txt").write_text(eth_text(columns))
+    source = open_windows(place, bins=4, window_s=0.025)
     assert isinstance(source, RecordingWindows)
     windows = source.batch(range(len(source)))
     assert windows.volume.counts.shape == (4, 2, 4, 180, 240)
