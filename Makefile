@@ -7,8 +7,8 @@ ARGS ?=
 STUDY :=
 RUN := .venv/bin/python
 INSTALL := $(RUN) -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable
-STUDIES := lens-opt lens-report lens-scratch lens-tolerance lens-bench silhouettes dataset video-to-events \
-	event-gradient event-bench srm-bench sensor-fit train-flow flow-quality flow-compare flow-cost flow-recording \
+STUDIES := lens-opt lens-report lens-scratch lens-tolerance lens-bench dataset video-to-events \
+	event-bench srm-bench sensor-fit train-flow flow-quality flow-compare flow-cost flow-recording \
 	placement speed-error stability gradcheck
 
 .PHONY: help setup test fuzz kill-test test-bits lint core-check try-all doctor clean $(STUDIES)
@@ -41,11 +41,9 @@ lens-report: ## everything about one lens: make lens-report ARGS="--lens double-
 lens-scratch: ## triplets designed from flat plates
 lens-tolerance: ## what errors of making and mounting do to a lens
 lens-bench: .venv/with-bench.stamp ## speed and error against other ray tracers (installs them)
-silhouettes: ## gradients where objects hide one another
 dataset: .venv/with-event-files.stamp ## render trajectories with events and ground truth
 dataset: STUDY := make_dataset
 video-to-events: .venv/with-event-files.stamp .venv/with-video.stamp ## events out of a video: make video-to-events ARGS="--input clip.mp4"
-event-gradient: ## gradients of the event layers against differences of hard counts
 event-bench: ## speed and memory of the event stage
 srm-bench: .venv/with-bench.stamp ## the spiking layer against a convolution and two spiking libraries (installs them)
 sensor-fit: .venv/with-event-files.stamp ## fit a sensor to a recording of yours: make sensor-fit ARGS="--recording FILE.aedat4"
@@ -57,7 +55,7 @@ flow-recording: .venv/with-event-files.stamp ## flow of a recording: make flow-r
 placement: .venv/with-search.stamp ## where to mount the camera on a robot
 speed-error: ## time and error of every fidelity level
 stability: ## hard cases: outcome expected and seen
-gradcheck: ## autograd against differences, junction by junction
+gradcheck: ## gradients against differences: make gradcheck ARGS="--cases chain joint layers sensors timing silhouettes"
 gradcheck: STUDY := gradient_flow
 
 test: setup ## all tests, on all cores

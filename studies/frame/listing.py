@@ -24,14 +24,11 @@ GROUPS = {
     "render": (
         "render_quality",
         "psf_level",
-        "silhouettes",
-        "silhouettes_chain",
         "light_levels",
         "make_dataset",
     ),
     "events": (
         "video_to_events",
-        "event_gradient",
         "event_bench",
         "sensor_fit",
         "spike_esim",
@@ -48,7 +45,6 @@ GROUPS = {
     "whole chain": (
         "lens_opt",
         "lens_opt_seeds",
-        "joint_design",
         "placement",
         "velocity_head",
         "placement_step",

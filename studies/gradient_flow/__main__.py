@@ -1,137 +1,103 @@
-"""Certificate of the gradients along the chain: autograd against central differences with common random
-numbers.
+"""Are the gradients right, from the lens to the loss? Against central differences with common random numbers, by case.
 
-One row per junction and parameter group: lens rays and spots in float64, frames (textured room, no
-silhouettes) with respect to lens and pose, event counts, flow, and the final loss with respect to three
-curvatures and all six pose components, once with the smooth event layer and once with the straight-through
-layer against differences of the hard loss.
+chain, joint: junction by junction, and the whole graph with lens, mount, thresholds and network. layers,
+sensors, timing: the event layers against differences of hard counts. silhouettes, silhouettes_chain: where objects hide
+one another.
 """
 
 import sys
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import torch
+import numpy as np
 
 from codesign.errors import DomainError
-from codesign.grad import worst
 from codesign.report import chain_figures
 from studies.frame.run import Run, StudyConfig, main
-from studies.gradient_flow import cases as gradient_cases
+from studies.gradient_flow import chain
+from studies.gradient_flow.events import topics
+from studies.gradient_flow.silhouettes import flow, frames
+from studies.gradient_flow.topic import Row, Topic, label
+
+CASES: dict[str, Topic] = {
+    "chain": chain.CHAIN,
+    "joint": chain.JOINT,
+    "layers": topics.LAYERS,
+    "sensors": topics.SENSORS,
+    "timing": topics.TIMING,
+    "silhouettes": frames.TOPIC,
+    "silhouettes_chain": flow.TOPIC,
+}
 
 
 @dataclass(frozen=True)
 class Config(StudyConfig):
-    QUICK: ClassVar = {"hard_cases": 6}
+    QUICK: ClassVar = {"hard_cases": 6, "scenes": 1, "samples": 512, "seeds": 2}
+    cases: tuple[str, ...] = ("chain", "joint")
+    """What to measure: chain, joint, layers, sensors, timing, silhouettes, silhouettes_chain."""
     hard_cases: int = 32
-    """Motions and textures averaged for the straight-through layer against the hard loss."""
+    """Motions and textures averaged for the straight-through layer against the hard loss (chain)."""
+    scenes: int = 2
+    """Textures and paths over which cosine and scale are taken together (event layers, silhouettes_chain)."""
+    samples: int = 1024
+    """Samples per pixel of differences and precise gradients at silhouettes; a quarter of them along the chain."""
+    seeds: int = 4
+    """Seeds of these; twice as many along the chain."""
 
 
-def study(run: Run[Config]):
-    if run.config.hard_cases < 1:
-        raise DomainError(f"hard_cases = {run.config.hard_cases} must be at least 1.")
-    cases = [
-        *gradient_cases.smooth_cases(run.config.seed),
-        *gradient_cases.hard_cases(run.config.seed, run.config.hard_cases),
-    ]
-    rows = []
-    with run.progress(len(cases), "certifying") as bar:
-        for label, required, certificate in cases:
-            for row in certificate():
-                rows.append((label, required, row))
-                name = f"{label}_{row.name}".replace(",", "").replace(" ", "_")
-                run.record(
-                    **{
-                        f"{name}_relative_error": row.relative_error,
-                        f"{name}_cosine": row.cosine,
-                        f"{name}_signed_bias": row.signed_bias,
-                        f"{name}_noise_floor": row.noise_floor,
-                    }
-                )
-            bar.advance(error=worst([r for n, _, r in rows if n == label])[0])
-    passed = [_passes(required, row) for _, required, row in rows]
-    run.record(rows_total=len(rows), rows_passed=sum(passed))
-    run.card("Rows within their figure", f"{sum(passed)} of {len(rows)}")
-    for label in ("final loss, smooth events", "final loss, hard events"):
-        found = [row for n, _, row in rows if n == label]
-        if found:
-            run.card(
-                label,
-                f"cosine {min(r.cosine for r in found):.3f}",
-                f"relative error {max(r.relative_error for r in found):.3g}",
-            )
-    run.section(
-        "Certificate",
-        "Relative error is |autograd − difference| / |difference| over the group; the noise floor is the "
-        "disagreement of neighbouring step sizes, in the same unit.",
-    )
-    columns = [
-        "junction",
-        "parameters",
-        "relative error",
-        "cosine",
-        "signed bias",
-        "noise floor",
-        "plateau step",
-        "required",
-        "met",
-    ]
-    run.table(
-        "Autograd against differences",
-        columns,
-        [
-            [
-                label,
-                row.name,
-                row.relative_error,
-                row.cosine,
-                row.signed_bias,
-                row.noise_floor,
-                sorted(row.step_plateau)[len(row.step_plateau) // 2],
-                _words(required),
-                "yes" if ok else "NO",
-            ]
-            for (label, required, row), ok in zip(rows, passed, strict=True)
-        ],
-    )
-    junctions = list(dict.fromkeys(label for label, _, _ in rows))
-    groups = list(dict.fromkeys(row.name for *_, row in rows))
-    matrix = torch.full((len(junctions), len(groups)), float("nan"))
-    for label, _, row in rows:
-        matrix[junctions.index(label), groups.index(row.name)] = row.relative_error
-    run.figure(
-        chain_figures.heat_map(matrix.numpy(), junctions, groups, "relative error"),
-        "gradient_heat_map",
-        "Relative error of autograd against differences, per junction and parameter group.",
-    )
-    run.section("Components", "What each row compared, number by number (per step unit).")
-    for label, _, row in rows:
-        run.table(
-            f"{label}: {row.name}",
-            ["component", "autograd", "difference"],
-            [[k + 1, a, d] for k, (a, d) in enumerate(zip(row.autograd, row.difference, strict=True))],
-        )
+def study(run: Run[Config]) -> None:
+    config = run.config
+    unknown = [name for name in config.cases if name not in CASES]
+    if unknown or not config.cases:
+        raise DomainError(f"--cases is {' '.join(config.cases)!r}; choose among {', '.join(CASES)}.")
+    for name, least in (("hard_cases", 1), ("scenes", 1), ("samples", 64), ("seeds", 2)):
+        if getattr(config, name) < least:
+            raise DomainError(f"{name} = {getattr(config, name)} must be at least {least}.")
+    stored = run.load_state()
+    found: dict[str, list[Any]] = {} if stored is None else dict(stored.numbers)
+    work = [(name, job) for name in config.cases for job in CASES[name].jobs(config.quick)]
+    left = [(name, job) for name, job in work if label((name, *job)) not in found]
+    with run.progress(len(work), "differentiating", done=len(work) - len(left)) as progress:
+        for name, job in left:
+            rows = list(CASES[name].measure(config, *job))
+            for row in rows:
+                run.record(**row.metrics(name))
+            found[label((name, *job))] = [(row.names, row.numbers) for row in rows]
+            run.save_state({}, found)
+            progress.advance()
+    missed = []
+    for name in config.cases:
+        stored_rows = [row for job in CASES[name].jobs(config.quick) for row in found[label((name, *job))]]
+        missed += show(run, name, [Row(tuple(names), numbers) for names, numbers in stored_rows])
     run.finish(
-        "Gradients along the chain",
-        "Autograd against central differences with common random numbers, over a ladder of step sizes.",
-    )
-    for (label, required, row), ok in zip(rows, passed, strict=True):
-        run.say(
-            f"{'ok  ' if ok else 'MISS'} {label:28s} {row.name:12s} relative error {row.relative_error:.2e} "
-            f" cosine {row.cosine:.4f}  bias {row.signed_bias:+.3f}  floor {row.noise_floor:.1e}  "
-            f"({_words(required)})"
-        )
-
-
-def _passes(required, row):
-    return (row.relative_error <= required.get("error", float("inf"))) and row.cosine >= required.get(
-        "cosine", -1.0
+        "Gradients beside differences",
+        f"**Below what is asked:** {'; '.join(missed)}." if missed else "All that is asked is met.",
     )
 
 
-def _words(required):
-    signs = {"error": "≤", "cosine": "≥"}
-    return ", ".join(f"{name} {signs[name]} {value:g}" for name, value in required.items())
+def show(run: Run[Config], name: str, rows: list[Row]) -> list[str]:
+    """The section of a case; returns what falls short of what is asked."""
+    topic = CASES[name]
+    short = [row for row in rows if (asked := topic.asked(row)) and asked.missed(row)]
+    judged = sum(topic.asked(row) is not None for row in rows)
+    run.record(**{f"missed_{name}": len(short), f"judged_{name}": judged})
+    run.card(topic.title, f"{judged - len(short)} of {judged}", "rows that reach what is asked")
+    run.section(topic.title, topic.text)
+    numbers = list(rows[0].numbers)
+    run.table(
+        topic.title,
+        (*topic.columns, *(key.replace("_", " ") for key in numbers)),
+        [(*row.names, *(row.numbers[key] for key in numbers)) for row in rows],
+        caption="Below what is asked: " + "; ".join(" ".join(row.names) for row in short) if short else "",
+    )
+    if "relative_error" in numbers:
+        lines, columns = (list(dict.fromkeys(row.names[k] for row in rows)) for k in (0, 1))
+        errors = np.full((len(lines), len(columns)), np.nan)
+        for row in rows:
+            errors[lines.index(row.names[0]), columns.index(row.names[1])] = row.numbers["relative_error"]
+        figure = chain_figures.heat_map(errors, lines, columns, "relative error")
+        run.figure(figure, f"heat_map_{name}", f"{topic.title}: relative error against differences.")
+    return [f"{name}: {len(short)} of {judged} rows"] if short else []
 
 
 if __name__ == "__main__":

@@ -19,8 +19,9 @@ from codesign.events.spiking.srm import srm
 from codesign.events.spiking.srm_mean import PACE, WIDTH, rested
 from codesign.events.spiking.srm_play import held_back
 from codesign.events.spiking.step_by_step import recursion
-from studies.event_gradient import compare, spiking
-from studies.event_gradient.case import FOCUS, SHIFT_X, Case, times
+from studies.gradient_flow.events import compare
+from studies.gradient_flow.events.case import FOCUS, SHIFT_X, Case, times
+from tests.events import spiking_judge
 
 D = torch.float64
 THETA = 0.2
@@ -262,11 +263,11 @@ def test_it_points_to_where_hard_spikes_go(kernel, direction, cosine, surrogate)
     case = Case(5, size_px=32)
     t_s = times(240)
     ends = case.along(240, direction, 12)
-    truth = spiking.truth(kernel, ends[-1], t_s) - spiking.truth(kernel, ends[0], t_s)
+    truth = spiking_judge.truth(kernel, ends[-1], t_s) - spiking_judge.truth(kernel, ends[0], t_s)
     difference = compare.blocks(truth).double() / 2
 
     def row(name):
-        layer = spiking.layer_of(kernel, name, "bounded")
+        layer = spiking_judge.layer_of(kernel, name, "bounded")
         return compare.row((name,), [compare.Pair(compare.slope(ends, t_s, layer), difference)]).numbers
 
     mean = row("mean")

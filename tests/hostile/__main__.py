@@ -19,6 +19,7 @@ PARTS = {
     "kills": ("long studies killed at random, resumed and compared", 50),
     "threads": ("rounds of thirty threads with gradients, beside serial work", 20),
     "worlds": ("random worlds, three lenses each, gradients beside differences", 300),
+    "listed": ("worlds whose gradients at silhouettes once were wrong, beside differences", 100),
     "stages": ("stages of a System that are cut, wrapped or misshapen", 300),
 }
 

@@ -27,7 +27,7 @@ STUDIES = {
     "make_dataset": "--trajectories 2 --frames 14 --size 24 --samples 2 --chunk 4 --rate-hz 90",
     "train_flow": "--steps 8 --save-every 1 --validate-every 4 --batch 2 --height-px 32 --width-px 32 "
     "--reuse 2 --validation-windows 2 --final-windows 2",
-    "event_gradient": "--quick --topics curves",
+    "gradient_flow": "--quick --cases sensors layers",
     "spike_esim": "--classes --quick --training 20 --test 20 --calibration 10",
     "lens_scratch": "--quick --seeds 2",
     "placement": "--seeds 1 --steps 2 --worlds 1 --per-world 1 --judged-worlds 1 --judged-drives 2 --searches random",

@@ -1,7 +1,6 @@
 """Random worlds through three lenses: is every gradient that can be judged right, or refused?
 
-Judged as the study of silhouettes does, by differences with common random numbers, in two random directions of every walk
-instead of six. One line a case is written as soon as it is judged, and a later call goes on from there.
+Judged by differences with common random numbers, in two random directions of every walk instead of six components. One line a case is written as soon as it is judged, and a later call goes on from there.
 """
 
 import json
@@ -10,8 +9,8 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from scenes import random_worlds
-from studies.silhouettes.judge import HIGHEST, LENSES, RIGHT, Case, Effort, judge, nearest_m, optics_of
+from tests.hostile import random_worlds
+from tests.hostile.judge import HIGHEST, LENSES, RIGHT, Case, Effort, judge, nearest_m, optics_of
 
 EFFORT = Effort(samples=512, per_px=24.0, seeds=(3, 10), directions=2, enough=0.06)
 EACH = 10_000  # worlds of one seed

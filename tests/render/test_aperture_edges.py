@@ -9,7 +9,6 @@ from codesign.render.aperture_edges import aperture_edge_term
 from codesign.render.moving import views_of
 from scenes import silhouettes as silhouette_scenes
 
-F64 = torch.float64
 START = pose.look_at((0.05, -1.2, 1.0), (0.0, 1.0, 0.7))[None]
 WEIGHT = torch.nn.functional.interpolate(
     torch.randn(1, 1, 5, 5, generator=torch.Generator().manual_seed(3)), size=(32, 32), mode="bicubic"

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from codesign import lens, render
-from codesign.errors import DomainError, ShapeError
-from codesign.pose import apply, inverse, look_at, se3_exp
+from codesign.pose import apply, inverse, look_at
 from codesign.render import Camera, Film, MovingScene, TexturedPlane
 from codesign.render.time import adaptive_times
 from scenes import silhouettes, textures, trajectories, worlds
@@ -87,30 +86,6 @@ def test_gradients_of_a_batch_are_those_of_each_trajectory(way, generator):
         assert float((found - truth).norm() / truth.norm()) <= 256 * 2**-24
 
 
-@pytest.mark.parametrize("quantity", ["frames", "flow"])
-def test_gradients_to_a_batch_of_poses_are_differences(quantity, generator):
-    cam = camera()
-    scene = plane()
-    base = paths(3)
-    weights = torch.randn(2, 8, 12, generator=generator, dtype=D)
-
-    def loss(twist):
-        poses = base @ se3_exp(twist)
-        if quantity == "frames":
-            return (render.frames(cam, scene, poses) * weights[0]).sum((-2, -1))
-        return (render.true_flow(cam, scene, poses)[0] * weights).sum((-3, -2, -1))
-
-    twist = torch.zeros(*BATCH, 3, 6, dtype=D, requires_grad=True)
-    (found,) = torch.autograd.grad(loss(twist).sum(), twist)
-    direction = torch.randn(twist.shape, generator=generator, dtype=D)
-    step = 2e-6
-    ahead, behind = (loss(twist.detach() + sign * step * direction).sum(-1) for sign in (1, -1))
-    # central differences: waves of 31 rad/m, seen at up to 3 m/unit, change by (1e2 x 2e-6)^2 / 6 of themselves;
-    # rounding of 1e-16 over 2e-6
-    truth = (ahead - behind) / (2 * step)
-    assert float(((found * direction).sum((-2, -1)) - truth).norm() / truth.norm()) <= 1e-7
-
-
 @pytest.mark.bits
 @pytest.mark.parametrize("own", [False, True])
 def test_objects_move_the_same_for_all_trajectories_or_each_its_own_way(own):
@@ -159,54 +134,6 @@ def test_truth_of_a_batch_is_that_of_each_trajectory(stride):
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize("frame", [1, -1])
-def test_views_of_a_batch_are_those_of_each_trajectory(frame):
-    cards = paths(4, BATCH, torch.eye(4, dtype=D)) + 0
-    cards[..., 2, 3] += 0.4
-    cam = camera()
-    found = render.view(cam, MovingScene(plane(2), {"card": (plane(1), cards)}), paths(), frame)
-    assert found.points_world_m.shape == (*BATCH, *cam.film.shape, 3)
-    for index in ((0, 1), (1, 2)):
-        alone = MovingScene(plane(2), {"card": (plane(1), cards[index])})
-        truth = render.view(cam, alone, paths()[index], frame)
-        assert torch.equal(found.object_id[index], truth.object_id)
-        for name in ("points_world_m", "depth_m", "normal"):
-            torch.testing.assert_close(getattr(found, name)[index], getattr(truth, name), rtol=0, atol=1e-13)
-
-
-def test_a_bad_view_of_a_batch_is_named_by_its_frame():
-    poses = paths(2, (2,))
-    render.check_view(camera(), plane(), poses)
-    poses[1, 0] = look_at((0.0, 0.0, 2.0), (0.0, 0.0, 4.0), down=(0, 1, 0))
-    with pytest.raises(DomainError, match="frame 2 is empty"):
-        render.check_view(camera(), plane(), poses)
-
-
-def test_points_project_in_any_batch(generator):
-    cam = camera(optics=lens.load("cooke-triplet").scaled(0.2))
-    world = torch.rand(7, 3, generator=generator, dtype=D) * 0.2
-    points = apply(inverse(paths()), world)
-    assert points.shape == (*BATCH, 4, 7, 3)
-    torch.testing.assert_close(
-        render.project(cam, points),
-        torch.stack([render.project(cam, each) for each in points.reshape(-1, 7, 3)]).reshape(
-            *BATCH, 4, 7, 2
-        ),
-        rtol=0,
-        atol=1e-10,
-    )
-
-
-def test_velocities_of_a_batch_are_those_of_each_trajectory():
-    t_s = torch.linspace(0, 0.3, 4, dtype=D)
-    found = render.camera_velocity(paths(), t_s)
-    for k in range(2):
-        truth = one_by_one(lambda each, k=k: render.camera_velocity(each, t_s)[k], paths())
-        assert truth.shape == (*BATCH, 3, 6)
-        torch.testing.assert_close(found[k], truth, rtol=0, atol=1e-13)
-
-
-@pytest.mark.bits
 def test_exposures_chunks_and_times_take_several_trajectories():
     cam = camera()
     twist = torch.tensor([[0.2, 0.1, 0, 0, 0, 0], [0.4, 0.2, 0, 0, 0, 0.5]], dtype=D)
@@ -228,17 +155,28 @@ def test_exposures_chunks_and_times_take_several_trajectories():
     )
 
 
-def test_batches_that_do_not_fit_are_refused():
-    cards = paths(4, (3,), torch.eye(4, dtype=D))
-    scene = MovingScene(plane(2, -1.0), {"card": (plane(1), cards)})
-    for call in (render.frames, render.true_flow):
-        with pytest.raises(ShapeError, match=r"batch \(3,\) of trajectories, the camera for \(2,\)"):
-            call(camera(), scene, paths(4, (2,)))
-        with pytest.raises(ShapeError, match=r"batch \(3,\) of trajectories, the camera for \(\)"):
-            call(camera(), scene, paths(4, ()))
-        with pytest.raises(ShapeError, match="'card' has 4 poses for 3 frames"):
-            call(camera(), scene, paths(3, (3,)))
-    with pytest.raises(ShapeError, match="poses must be"):
-        render.frames(camera(), plane(), paths()[..., :3, :])
-    with pytest.raises(ShapeError, match="poses must be"):
-        render.frames(camera(), plane(), paths()[:0])
+def card_over_plane(objects):
+    return MovingScene(plane(2), {"card": (plane(1), objects)})
+
+
+def points_of_a_view(poses):
+    cards = inverse(start()) @ poses
+    cards[..., 2, 3] += 0.4
+    return render.view(camera(), card_over_plane(cards), poses, -1).points_world_m
+
+
+def projected(poses):
+    world = 0.2 * torch.rand(7, 3, generator=torch.Generator().manual_seed(0), dtype=D)
+    return render.project(camera(optics=lens.load("cooke-triplet").scaled(0.2)), apply(inverse(poses), world))
+
+
+def velocity(poses):
+    return torch.cat(render.camera_velocity(poses, torch.linspace(0, 0.3, 4, dtype=D)), -1)
+
+
+@pytest.mark.bits
+@pytest.mark.parametrize("of_poses", [points_of_a_view, projected, velocity])
+def test_what_a_batch_gives_is_what_each_trajectory_gives(of_poses):
+    found = of_poses(paths())
+    torch.testing.assert_close(found, one_by_one(of_poses, paths()), rtol=0, atol=1e-10)
+    assert not torch.equal(found[0, 0], found[0, 1])

@@ -7,13 +7,12 @@ import pytest
 import torch
 
 from codesign import backend, pose, render
-from codesign.errors import DomainError
 from codesign.render import MitsubaScene
 from codesign.render.moving import views_of
 from codesign.render.sequence import cheapest
 from codesign.render.silhouettes.curve_points import places as _places
 from scenes import silhouettes as silhouette_scenes
-from studies.silhouettes import STEPS, Task
+from studies.gradient_flow.silhouettes.frames import STEPS, Task
 
 F64 = torch.float64
 
@@ -136,22 +135,6 @@ def test_points_on_curves_stand_for_their_whole_length(lengths_px, generator):
         torch.testing.assert_close(
             gaps, torch.full_like(gaps, float(length[short].sum()) / len(at)), rtol=0, atol=1e-9
         )
-
-
-def test_unknown_ways_are_refused():
-    scene = silhouette_scenes.build("wall")
-    camera = render.Camera(render_pinhole(), 4, 4, 1.0, 1)
-    with pytest.raises(DomainError, match="choose one of interior, boundary, difference, auto"):
-        render.frames(camera, scene, torch.eye(4, dtype=F64)[None], gradient="exact")  # pyright: ignore[reportArgumentType]
-
-
-def test_differences_reach_no_object():
-    wall = silhouette_scenes.build("wall")
-    path = Task(wall, "pinhole").pose.expand(3, 4, 4)
-    asks = torch.eye(4, dtype=F64).expand(3, 4, 4).clone().requires_grad_(True)
-    moving = render.MovingScene(wall, {"card": (silhouette_scenes.build("cubes"), asks)})
-    with pytest.raises(DomainError, match="the pose of an object asks for one"):
-        render.frames(render.Camera(render_pinhole(), 8, 8, 1.0, 4), moving, path, gradient="difference")
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3])

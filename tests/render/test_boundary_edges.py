@@ -8,14 +8,11 @@ import pytest
 import torch
 from scipy.spatial import ConvexHull
 
-from codesign import backend, lens, pose, render
+from codesign import backend, pose, render
 from codesign.lens import GeoLens, Glass, Pinhole, Surface
 from codesign.render import MitsubaScene
-from codesign.render.camera import project
 from codesign.render.charts import emissive_mesh
 from codesign.render.silhouettes import Circles, outlines
-from codesign.render.silhouettes.curve_points import CurvePoints
-from codesign.render.silhouettes.jumps import _on_film
 from codesign.render.silhouettes.shapes import read
 
 F64 = torch.float64
@@ -128,29 +125,6 @@ def test_a_plate_narrower_than_a_reading_changes_nothing_before_a_picture(thick_
     assert sideways(camera, MitsubaScene({"wall": wall, "plate": plate}, merge=False)) == pytest.approx(
         bare, rel=1e-3
     )
-
-
-def test_points_are_found_on_the_film_through_their_own_point_of_the_pupil(generator):
-    """Against the projection of points through the same pupil points, and its differences."""
-    camera = render.Camera(lens.load("cooke-triplet"), 240, 180, 0.1, 1)
-    count = 24
-    y = torch.rand(count, 3, generator=generator, dtype=F64) - 0.5
-    y = y * torch.tensor([0.4, 0.3, 0.6], dtype=F64) + torch.tensor([0.0, 0.0, 1.0], dtype=F64)
-    moved = 1e-5 * torch.randn(count, 2, generator=generator, dtype=F64)
-    pupil = 1.2 * (torch.rand(count, 2, generator=generator, dtype=F64) - 0.5)
-    none = torch.zeros(count, dtype=torch.long)
-    asks = torch.zeros(count, dtype=F64)
-    apex = torch.full((count, 2, 3), torch.nan, dtype=F64)
-    points = CurvePoints(y, y, asks, asks, asks, asks > 0, apex, pupil, none, none, none, none)
-    with torch.no_grad():
-        at, per_px, _, passes = _on_film(camera, y, points)
-        assert bool(passes.all())
-        truth = project(camera, y, pupil)
-        ahead = torch.cat([y[:, :2] + moved, y[:, 2:]], 1)
-        then = project(camera, ahead, pupil)
-    torch.testing.assert_close(at, truth, rtol=0, atol=1e-6)
-    step = torch.linalg.solve(per_px, moved)
-    assert float((step - (then - truth)).norm() / step.norm()) <= 1e-5
 
 
 def test_both_rims_of_a_cylinder_are_circles_about_its_axis():

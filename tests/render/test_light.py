@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from codesign import backend, lens, render
-from codesign.errors import DomainError, GradientError
 from codesign.pose import look_at
 from codesign.render import Camera, MitsubaScene, light
 from codesign.render.charts import chart_of, emissive_mesh
@@ -203,43 +202,25 @@ def baked_still_life(still_life):
     return light.bake(still_life, texel_m=0.04, samples=256)
 
 
-def test_baked_light_is_path_traced_light_on_every_kind_of_shape(still_life, baked_still_life):
+@pytest.mark.parametrize("name", ["floor", "ball", "tube", "cap", "lamp", "cube", "bare", "unwrapped"])
+def test_baked_light_is_path_traced_light_on_every_kind_of_shape(still_life, baked_still_life, name):
+    """Face by face of meshes, whatever texture coordinates they have."""
     mi = backend.mitsuba()
     reference = light.PathScene(still_life, samples=256)
-    for name in ("floor", "ball", "tube", "cap", "lamp", "cube"):
-        shape = mi.load_dict(still_life[name])
-        u, v = np.random.default_rng(0).random((2, 4096 if name == "cube" else 512))
-        points, normals, inside = chart_of(mi, shape, 0.04, None).at(u, v)
-        for face in np.unique(normals[inside].round(3), axis=0) if name == "cube" else [None]:
-            there = inside if face is None else inside & (np.abs(normals - face).max(1) < 0.01)
-            ours, theirs = (
-                radiance_at(scene, points[there], normals[there], 5e-4)
-                for scene in (baked_still_life, reference)
-            )
-            # 131,072 paths per face, 16 to 6000 texels of 256 paths: below 0.5 %. Under the cube, 1 mm over
-            # the floor, there is next to no light
-            assert abs(float((ours - theirs).mean())) < 0.01 * max(float(theirs.mean()), 5.0), name
-
-
-@pytest.mark.parametrize("name", ["bare", "unwrapped"])
-def test_faces_of_a_mesh_show_their_light_whatever_texture_coordinates_it_has(
-    still_life, baked_still_life, name
-):
-    mi = backend.mitsuba()
-    reference = light.PathScene(still_life, samples=128)
-    points, normals, inside = chart_of(mi, still_life[name], 0.04, None).at(
-        *np.random.default_rng(0).random((2, 4096))
-    )
-    for face in np.unique(normals[inside].round(3), axis=0):
-        there = inside & (np.abs(normals - face).max(1) < 0.01)
+    made = isinstance(still_life[name], dict)
+    shape = mi.load_dict(still_life[name]) if made else still_life[name]
+    many = name in ("cube", "bare", "unwrapped")
+    u, v = np.random.default_rng(0).random((2, 4096 if many else 512))
+    points, normals, inside = chart_of(mi, shape, 0.04, None).at(u, v)
+    for face in np.unique(normals[inside].round(3), axis=0) if many else [None]:
+        there = inside if face is None else inside & (np.abs(normals - face).max(1) < 0.01)
         ours, theirs = (
             radiance_at(scene, points[there], normals[there], 5e-4) for scene in (baked_still_life, reference)
         )
-        # some 200 points x 128 paths and 50 texels x 256 paths of a relative spread of 0.5 to 1: below 1 %; light
-        # that falls off within a texel towards the floor is smeared
-        assert float(ours.mean()) == pytest.approx(
-            float(theirs.mean()), rel=0.03, abs=0.5
-        )  # the face over the floor has next to no light
+        # 131,072 paths per face, 16 to 6000 texels of 256 paths: below 0.5 %; 50 texels of a mesh's face: below 1 %, and
+        # light that falls off within a texel towards the floor is smeared. Over the floor there is next to no light
+        least, share = (5.0, 0.01) if made else (0.5 / 0.03, 0.03)
+        assert abs(float((ours - theirs).mean())) < share * max(float(theirs.mean()), least)
 
 
 def test_frames_of_baked_light_are_frames_of_path_tracing_within_its_noise(still_life, baked_still_life):
@@ -340,44 +321,3 @@ def test_the_cheapest_level_within_the_tolerance_is_chosen_and_says_why():
     assert (
         light.choose(levels, CAMERA, POSES, 0.01, after_gain=True).errors["plain"].rms_after_gain.max() < 0.01
     )
-
-
-def test_what_cannot_be_is_refused_in_a_sentence(still_life):
-    sheet = square((0, 0, 0), (0, 0, 1))
-    clear = {"type": "mask", "bsdf": {"type": "diffuse"}}
-    for bsdf in ({"type": "conductor"}, {"type": "dielectric"}, clear):
-        with pytest.raises(DomainError, match=r"shape 'a', a .*, lies behind it or before it"):
-            light.bake({"a": {**sheet, "bsdf": bsdf}})
-    with pytest.raises(DomainError, match="shape 'a' holds a medium"):
-        light.bake({"a": {**sheet, "interior": {"type": "homogeneous"}}})
-    copies = {
-        "group": {"type": "shapegroup", "one": sheet},
-        "a": {"type": "instance", "of": {"type": "ref", "id": "group"}},
-    }
-    with pytest.raises(
-        DomainError, match=r"shape 'a', a Instance, has no texture chart here; .*copies instead"
-    ):
-        light.bake(copies)
-    with pytest.raises(DomainError, match="nothing of shape 'a' can be seen"):
-        light.bake(
-            {"a": {**sheet, **grey(0.5)}, "b": square((0, 0, 4.5e-5), (0, 0, 1), 2.0, **grey(0.5))}, samples=1
-        )
-    for call in (
-        lambda: light.bake(still_life, samples=0),
-        lambda: light.PathScene(still_life, samples=0),
-        lambda: light.PathScene(still_life, max_depth=0),
-    ):
-        with pytest.raises(DomainError):
-            call()
-    with pytest.raises(DomainError, match="no level"):
-        light.choose({}, CAMERA, POSES, 0.1)
-    with pytest.raises(DomainError, match="tolerance = -1"):
-        light.choose({"a": flat_wall(1.0)}, CAMERA, POSES, -1)
-    with pytest.raises(DomainError, match="black"):
-        light.level_error(flat_wall(1.0), flat_wall(0.0), CAMERA, POSES)
-    efl = torch.tensor(6.0, dtype=D, requires_grad=True)
-    image = render.frames(
-        Camera(lens.Pinhole(efl), 4, 3, 0.6, 2), light.PathScene(still_life, samples=1), POSES[:1]
-    )
-    with pytest.raises(GradientError, match="PathScene has no gradient"):
-        image.sum().backward()

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from codesign import backend, lens, render
-from codesign.errors import DomainError, ShapeError
 from codesign.pose import inverse, look_at, se3_exp
 from codesign.render import Camera, MitsubaScene, MovingScene, TexturedPlane
 from scenes import textures
+from tests.render.differences import assert_gradients
 
 D = torch.float64
 FOCAL_MM = 8.0
@@ -179,34 +179,6 @@ def test_the_nearest_of_many_is_seen_whatever_their_order(order):
     torch.testing.assert_close(image, torch.full_like(image, 200.0), rtol=1e-12, atol=0)
 
 
-def test_gradients_to_object_poses_camera_poses_and_lens_in_double_precision(generator):
-    geo = lens.load("cooke-triplet").scaled(0.08)
-    weights = torch.randn(2, 8, 12, generator=generator, dtype=D)
-    wall = plane(2, -3.0)
-    card = plane(1)
-    objects = motion(2)
-    poses = path(2)
-
-    def loss(object_twist, twist, curvature):
-        scene = MovingScene(wall, {"card": (card, objects @ se3_exp(object_twist))})
-        changed = geo.replace(curvature_per_mm=geo.curvature_per_mm.detach() * (1 + curvature))
-        return (render.frames(camera(12, 8, 4, changed), scene, poses @ se3_exp(twist)) * weights).sum()
-
-    leaves = [torch.zeros(6, dtype=D, requires_grad=True) for _ in range(3)]
-    found = torch.autograd.grad(loss(*leaves), leaves)
-    for slot in range(3):
-        truth = torch.zeros(6, dtype=D)
-        for i in range(6):
-            shift = 1e-6 * torch.eye(6, dtype=D)[i]
-            ahead, behind = (
-                [s * shift if k == slot else torch.zeros(6, dtype=D) for k in range(3)] for s in (1, -1)
-            )
-            truth[i] = float((loss(*ahead) - loss(*behind)).detach()) / 2e-6
-        assert (
-            float((found[slot] - truth).norm() / truth.norm()) <= 1e-7
-        )  # smooth textures: rounding of 1e-13 over 1e-6, as in test_gradients
-
-
 def test_gradients_to_the_pose_of_a_textured_mesh_object(generator):
     # one per cent is asked of float32 scenes; bilinear texels have kinks, which the softened picture keeps
     # small; silhouettes lie outside the view
@@ -231,48 +203,18 @@ def test_gradients_to_the_pose_of_a_textured_mesh_object(generator):
         scene = MovingScene(plane(2, -3.0), {"card": (card, objects @ se3_exp(twist))})
         return (render.frames(cam, scene, poses).double() * weights).sum()
 
-    twist = torch.zeros(6, dtype=D, requires_grad=True)
-    (found,) = torch.autograd.grad(loss(twist), twist)
-    truth = torch.zeros(6, dtype=D)
-    with torch.no_grad():
-        for i in range(6):
-            shift = 2e-4 * torch.eye(6, dtype=D)[i]
-            truth[i] = float(loss(shift) - loss(-shift)) / 4e-4
-    assert float((found - truth).norm() / truth.norm()) <= 0.01
+    assert_gradients(loss, (torch.zeros(6, dtype=D),), (2e-4,), 0.01)
 
 
-@pytest.mark.bits
-def test_a_scene_cut_to_some_frames_is_that_part_of_the_sequence():
-    scene = MovingScene(plane(2, -3.0), {"card": (plane(1), motion(5))})
-    whole = render.frames(camera(), scene, path(5))
-    for frames in (slice(1, 4), [0, 4]):
-        assert torch.equal(render.frames(camera(), scene.during(frames), path(5)[frames]), whole[frames])
+def test_gradients_to_object_poses_camera_poses_and_lens_in_double_precision(generator):
+    geo = lens.load("cooke-triplet").scaled(0.08)
+    weights = torch.randn(2, 8, 12, generator=generator, dtype=D)
+    wall, card = plane(2, -3.0), plane(1)
 
+    def loss(object_twist, twist, curvature):
+        scene = MovingScene(wall, {"card": (card, motion(2) @ se3_exp(object_twist))})
+        changed = geo.replace(curvature_per_mm=geo.curvature_per_mm.detach() * (1 + curvature))
+        return (render.frames(camera(12, 8, 4, changed), scene, path(2) @ se3_exp(twist)) * weights).sum()
 
-class Brighter(MitsubaScene):
-    """Twice the radiance, whose distances would tell of the plain scene."""
-
-    def radiance(self, arr, origin, direction):
-        return 2 * super().radiance(arr, origin, direction)
-
-
-def test_moving_scenes_that_cannot_be_are_refused():
-    card = plane(1)
-    good = motion(3)
-    with pytest.raises(DomainError, match="object 'card': poses are not rigid"):
-        MovingScene(plane(2), {"card": (card, 1.1 * good)})
-    with pytest.raises(ShapeError, match="object 'card': poses must be"):
-        MovingScene(plane(2), {"card": (card, good[0])})
-    with pytest.raises(DomainError, match=r"object 'card': poses: .* NaN"):
-        MovingScene(plane(2), {"card": (card, good * math.nan)})
-    with pytest.raises(ShapeError, match=r"\{'a': 3, 'b': 2\} poses"):
-        MovingScene(plane(2), {"a": (card, good), "b": (card, good[:2])})
-    scene = MovingScene(plane(2), {"card": (card, good)})
-    with pytest.raises(ShapeError, match="'card' has 3 poses for 2 frames"):
-        render.frames(camera(), scene, path(2))
-    with pytest.raises(ShapeError, match="'card' has 3 poses for 2 frames"):
-        render.true_flow(camera(), scene, path(2))
-    with pytest.raises(DomainError, match="itself a moving scene"):
-        MovingScene(plane(2), {"world": (scene, good)})  # pyright: ignore[reportArgumentType]
-    with pytest.raises(DomainError, match="part 'lit', a Brighter, does not say how far"):
-        MovingScene(plane(2), {"lit": (Brighter({"ball": shape(1.0, type="sphere")}), good)})
+    # smooth textures: rounding of 1e-13 over 1e-6, as in test_gradients
+    assert_gradients(loss, [torch.zeros(6, dtype=D)] * 3, [1e-6] * 3, 1e-7)

@@ -10,18 +10,13 @@ from codesign import backend, pose, render
 from codesign.errors import DomainError
 from codesign.lens import Pinhole
 from codesign.render import MitsubaScene
-from codesign.render.charts import emissive_mesh
 from codesign.render.silhouettes import Segments, outlines
 from codesign.render.silhouettes.crossings import Overlaps, find_crossings, overlaps
-from codesign.render.silhouettes.edges import touching
 from codesign.render.silhouettes.intersections import Intersections
 from codesign.render.silhouettes.shapes import Mesh, read
-from scenes.silhouettes import smooth
-from studies.silhouettes.task import STEPS, Task
 
 F64 = torch.float64
 EYE = torch.tensor([0.3, -4.0, 2.0], dtype=F64)
-LIGHT = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 CUBE = np.array([face for a, b, c, d in SIDES for face in ((a, b, c), (a, c, d))])
@@ -50,53 +45,6 @@ def intersection(**shapes):
 def total_length(found):
     (edges,) = [curve for curve in found if isinstance(curve, Segments)]
     return float((edges.end - edges.start).norm(dim=1).sum())
-
-
-@pytest.mark.parametrize("height", [0.0, 0.3, -0.77])
-def test_a_sphere_through_a_floor_meets_it_in_a_circle(height):
-    ball = {"type": "sphere", "center": [0.1, 0.2, height], "radius": 0.8}
-    y, length = intersection(ball=ball, floor={"type": "rectangle", "to_world": place().scale(3)})
-    radius = math.sqrt(0.8**2 - height**2)
-    torch.testing.assert_close(y[:, 2], torch.zeros(len(y), dtype=F64), rtol=0, atol=1e-9)
-    away = (y[:, :2] - torch.tensor([0.1, 0.2], dtype=F64)).norm(dim=1)
-    torch.testing.assert_close(away, torch.full_like(away, radius), rtol=1e-6, atol=0)
-    assert length == pytest.approx(2 * math.pi * radius, rel=1e-4)
-
-
-def test_two_spheres_meet_in_a_circle():
-    y, length = intersection(
-        a={"type": "sphere", "radius": 0.5}, b={"type": "sphere", "center": [0.0, 0.6, 0.0], "radius": 0.4}
-    )
-    level = (0.6**2 + 0.5**2 - 0.4**2) / (2 * 0.6)
-    torch.testing.assert_close(y[:, 1], torch.full((len(y),), level, dtype=F64), rtol=0, atol=1e-7)
-    assert length == pytest.approx(2 * math.pi * math.sqrt(0.5**2 - level**2), rel=1e-4)
-
-
-def test_a_leaning_pole_meets_a_floor_in_an_ellipse():
-    """Half axes r and r / cos of the lean; the circumference by quadrature."""
-    lean = math.radians(35)
-    end = np.array([math.sin(lean), 0.0, math.cos(lean)])
-    pole = {"type": "cylinder", "p0": (-end).tolist(), "p1": end.tolist(), "radius": 0.2}
-    y, length = intersection(pole=pole, floor={"type": "rectangle", "to_world": place().scale(3)})
-    share = torch.hypot(y[:, 0] * math.cos(lean) / 0.2, y[:, 1] / 0.2)
-    torch.testing.assert_close(share, torch.ones_like(share), rtol=1e-6, atol=0)
-    t = (np.arange(10000) + 0.5) / 10000 * 2 * np.pi
-    around = np.hypot(0.2 / math.cos(lean) * np.sin(t), 0.2 * np.cos(t)).mean() * 2 * np.pi
-    assert length == pytest.approx(around, rel=1e-4)
-
-
-def test_two_poles_at_right_angles_meet_in_steinmetz_curves():
-    """Equal radii r, axes x and z: two ellipses in the planes x = +z and x = -z, half axes r and r sqrt(2)."""
-    y, length = intersection(
-        a={"type": "cylinder", "p0": [-1.0, 0, 0], "p1": [1.0, 0, 0], "radius": 0.3},
-        b={"type": "cylinder", "p0": [0, 0, -1.0], "p1": [0, 0, 1.0], "radius": 0.3},
-    )
-    torch.testing.assert_close(
-        y[:, 0].abs(), y[:, 2].abs(), rtol=0, atol=1e-4
-    )  # they cross where surfaces touch
-    t = (np.arange(10000) + 0.5) / 10000 * 2 * np.pi
-    around = 0.3 * np.hypot(math.sqrt(2) * np.sin(t), np.cos(t)).mean() * 2 * np.pi
-    assert length == pytest.approx(2 * around, rel=0.01)
 
 
 def test_a_box_through_a_floor_and_through_a_box():
@@ -170,18 +118,6 @@ def test_meshes_that_do_not_cross_themselves_have_no_crossing():
     assert len(find_crossings([sheet])[0].start) == 0
     nested = Mesh("nested", np.concatenate([CORNERS, 0.5 * CORNERS]), np.concatenate([CUBE, CUBE + 8]), None)
     assert len(find_crossings([nested])[0].start) == 0
-
-
-def test_pairs_of_boxes_that_touch_are_all_found(generator):
-    corners = torch.rand(200, 1, 3, generator=generator, dtype=F64) + 0.2 * torch.rand(
-        200, 3, 3, generator=generator
-    )
-    low, high = corners.amin(1), corners.amax(1)
-    meet = ((low[:, None] <= high) & (low <= high[:, None])).all(2)
-    truth = {(i, j) for i, j in torch.nonzero(meet).tolist() if i < j}
-    found = touching(corners.numpy(), 0.0)
-    assert {tuple(pair) for pair in found.tolist()} == truth
-    assert len(found) == len(truth)
 
 
 @pytest.mark.parametrize("shift", [0.0, 1e-7])
@@ -261,50 +197,72 @@ def clipped(polygon, by):
     return polygon
 
 
-def sunk(name):
-    """Worlds of shapes that stick in a floor, in each other, or in themselves."""
-    mi = backend.mitsuba()
-    texture = {"type": "bitmap", "bitmap": mi.Bitmap(smooth(3, cycles=3)), "raw": True}
-    turned = place().translate([0, 0.6, 0.3]).rotate([0, 0, 1], 5).rotate([1, 0, 0], 4).scale([3, 2, 1])
-    floor = {"type": "rectangle", "to_world": turned, "emitter": {"type": "area", "radiance": texture}}
-    bright = {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": 200.0}}}
-    if name == "sphere":
-        return {
-            "floor": floor,
-            "ball": {"type": "sphere", "center": [0.1, 0.5, 0.45], "radius": 0.4, **bright},
-        }
-    if name == "cylinder":
-        pole = {"type": "cylinder", "p0": [-0.3, 0.4, 0.0], "p1": [0.1, 0.6, 1.5], "radius": 0.2, **bright}
-        return {"floor": floor, "pole": pole}
-    if name == "box":
-        box = (
-            place()
-            .translate([0, 0.5, 0.4])
-            .rotate([0, 0, 1], 30)
-            .rotate([1, 0, 0], 10)
-            .scale([0.3, 0.3, 0.4])
-        )
-        return {"floor": floor, "box": {"type": "cube", "to_world": box, **bright}}
-    turn, other = (
-        np.array(place().rotate(axis, 30).matrix, dtype=np.float64).reshape(4, 4)[:3, :3]
-        for axis in ([1, 1, 0], [0, 1, 1])
-    )
-    vertices = np.concatenate(
-        [
-            CORNERS * [0.3, 0.3, 0.5] @ turn.T + [0, 0.5, 0.8],
-            CORNERS * [0.5, 0.2, 0.2] @ other.T + [0.1, 0.35, 0.8],
-        ]
-    )
-    light = np.concatenate([np.linspace(40, 120, 6), np.linspace(240, 150, 6)]).repeat(2)
-    return {"both": emissive_mesh(mi, vertices, np.concatenate([CUBE, CUBE + 8]), light)}
+def circle(radius):
+    """Length of a circle."""
+    return 2 * math.pi * radius
 
 
-@pytest.mark.parametrize("name", ["sphere", "cylinder", "box", "mesh"])
-def test_gradients_of_what_sticks_in_something(name):
-    """Differences with 512 samples at two seeds know the truth to 1 %."""
-    task = Task(MitsubaScene(sunk(name)), "pinhole")
-    scale = torch.tensor(STEPS["pose"], dtype=F64)
-    truth = torch.stack([task.differences("pose", 512, seed) for seed in (11, 12)]).mean(0) * scale
-    plain, whole = (task.gradient("pose", 512, 13, way, 16.0) * scale for way in ("interior", "boundary"))
-    assert float((plain - truth).norm() / truth.norm()) > 0.1
-    assert float((whole - truth).norm() / truth.norm()) < 0.04
+def ellipse(a, b):
+    """Circumference by quadrature."""
+    t = (np.arange(10000) + 0.5) / 10000 * 2 * np.pi
+    return np.hypot(a * np.sin(t), b * np.cos(t)).mean() * 2 * np.pi
+
+
+def sphere(*centre, radius):
+    return {"type": "sphere", "center": list(centre), "radius": radius}
+
+
+def cylinder(end, radius):
+    return {"type": "cylinder", "p0": [-v for v in end], "p1": list(end), "radius": radius}
+
+
+LEAN = math.radians(35)
+MEET = (0.6**2 + 0.5**2 - 0.4**2) / (2 * 0.6)  # of two spheres, from the first one's centre
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "off", "length", "rel"),
+    [
+        *(
+            (
+                sphere(0.1, 0.2, height, radius=0.8),
+                None,
+                lambda x, y, z: z,
+                circle(math.sqrt(0.8**2 - height**2)),
+                1e-4,
+            )
+            for height in (0.0, 0.3, -0.77)
+        ),
+        (
+            sphere(0, 0, 0, radius=0.5),
+            sphere(0.0, 0.6, 0.0, radius=0.4),
+            lambda x, y, z: y - MEET,
+            circle(math.sqrt(0.5**2 - MEET**2)),
+            1e-4,
+        ),
+        # half axes r and r / cos of the lean
+        (
+            cylinder((math.sin(LEAN), 0.0, math.cos(LEAN)), 0.2),
+            None,
+            lambda x, y, z: torch.hypot(x * math.cos(LEAN), y) - 0.2,
+            ellipse(0.2 / math.cos(LEAN), 0.2),
+            1e-4,
+        ),
+        # two ellipses in the planes x = +z and x = -z, half axes r and r sqrt(2); they cross where surfaces touch
+        (
+            cylinder((1.0, 0, 0), 0.3),
+            cylinder((0, 0, 1.0), 0.3),
+            lambda x, y, z: 1e-3 * (x.abs() - z.abs()),
+            2 * ellipse(0.3 * math.sqrt(2), 0.3),
+            0.01,
+        ),
+    ],
+    ids=["equator", "above", "below", "spheres", "leaning pole", "Steinmetz"],
+)
+def test_round_shapes_meet_others_in_curves_of_closed_form(one, other, off, length, rel):
+    """off: how far a point is from the curve, m. A floor where there is no other shape."""
+    floor = {"type": "rectangle", "to_world": place().scale(3)}
+    y, found = intersection(one=one, other=other or floor)
+    away = off(*y.unbind(1))
+    torch.testing.assert_close(away, torch.zeros_like(away), rtol=0, atol=1.1e-7)
+    assert found == pytest.approx(length, rel=rel)

@@ -199,15 +199,6 @@ def test_boxes_of_different_sizes_that_touch_share_their_edges():
     assert float(length.sum()) == pytest.approx(4 * 2.5 + 4 * 2.5 - 0.5 - 0.5, abs=1e-5)
 
 
-def test_a_seam_of_two_walls_counts_once():
-    mi = backend.mitsuba()
-    T = mi.ScalarTransform4f
-    wall = {"type": "rectangle", "to_world": T().translate([0, 1, 1]).rotate([1, 0, 0], 90), "emitter": LIGHT}
-    (edges,) = MitsubaScene({"floor": {"type": "rectangle", "emitter": LIGHT}, "wall": wall}).outline()
-    assert isinstance(edges, Segments)
-    assert edges.start.shape[0] == 7  # two rectangles of four edges, one shared
-
-
 def test_a_pole_and_its_lid_have_one_rim():
     mi = backend.mitsuba()
     tube_of, lid = pole(mi, (0.1, 0.2, 0.0), (0.4, 0.1, 1.3), 0.05)

@@ -13,8 +13,9 @@ from codesign.render import MitsubaScene
 from codesign.render.charts import emissive_mesh
 from codesign.render.silhouettes import occlusion_check
 from scenes.silhouettes import smooth
-from studies.silhouettes import judge
-from studies.silhouettes.task import PITCH_MM, SIZE_PX, STEPS, Task
+from studies.gradient_flow.silhouettes.frames import PITCH_MM, SIZE_PX, STEPS, Task
+from tests.hostile import judge
+from tests.hostile.outline_cases import icosphere
 
 F64 = torch.float64
 SCALE = torch.tensor(STEPS["pose"], dtype=F64)
@@ -101,72 +102,22 @@ def test_poles_however_thin_and_far(ratio):
     assert noise < 0.04
 
 
-def five_poles():
-    """Of 5 to 8 mm at a metre, with their ends in view."""
-    poles = {}
-    for k in range(5):
-        x = -0.5 + 0.25 * k
-        start, end = [x, -0.2 + 0.02 * k, 0.7 + 0.03 * k], [x + 0.1, -0.15, 1.2 - 0.02 * k]
-        poles[f"pole{k}"] = {
-            "type": "cylinder",
-            "p0": start,
-            "p1": end,
-            "radius": 0.0025 + 0.0004 * k,
-            "emitter": light(60 + 40 * k),
-        }
-    return poles
-
-
-def test_poles_with_their_ends_in_view():
-    """With points up to their very ends: an estimate of 2.5 points a pixel is off by no more than its usual noise,
-    whichever the seed."""
-    task = Task(MitsubaScene({**five_poles(), "wall": wall()}), "pinhole")
-    truth = torch.stack([task.differences("pose", 256, seed) for seed in (11, 12)]).mean(0) * SCALE
-    whole = task.gradient("pose", 256, 13, "boundary", 32.0) * SCALE
-    assert float((whole - truth).norm() / truth.norm()) < 0.03
-    single = torch.stack([task.gradient("pose", 16, seed, "boundary") for seed in range(20)]) * SCALE
-    assert float((single - whole).norm(dim=1).max() / whole.norm()) < 0.3
-
-
-def ball_of_triangles(divisions):
-    """Vertices and faces of a ball about the origin from an icosahedron, 20 * 4^divisions faces."""
-    g = (1 + math.sqrt(5)) / 2
-    corners = np.array([[0.0, a, b * g] for a in (-1, 1) for b in (-1, 1)])
-    corners = np.concatenate([np.roll(corners, k, axis=1) for k in range(3)])
-    near = np.linalg.norm(corners[:, None] - corners, axis=2) < 2.1
-    trios = [
-        (i, j, k)
-        for i in range(12)
-        for j in range(i)
-        for k in range(j)
-        if near[i, j] and near[j, k] and near[i, k]
-    ]
-    faces = corners[np.array(trios)]
-    inwards = (np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0]) * faces[:, 0]).sum(1) < 0
-    faces[inwards] = faces[inwards, ::-1]
-    for _ in range(divisions):
-        a, b, c = faces.transpose(1, 0, 2)
-        d, e, f = (a + b) / 2, (b + c) / 2, (c + a) / 2
-        faces = np.concatenate([np.stack(trio, 1) for trio in ((a, d, f), (d, b, e), (f, e, c), (d, e, f))])
-    points = faces / np.linalg.norm(faces, axis=2, keepdims=True)
-    vertices, index = np.unique(points.reshape(-1, 3).round(9), axis=0, return_inverse=True)
-    return vertices, index.reshape(-1, 3)
-
-
-def test_a_ball_of_5120_faces_with_one_radiance_each():
-    vertices, faces = ball_of_triangles(4)
-    assert len(faces) == 5120
-    corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    shade = 120 + 100 * (normal @ [0.3, -0.5, 0.8])
-    ball = emissive_mesh(backend.mitsuba(), 0.45 * vertices + [0, 0.6, 0.8], faces, shade)
-    check(MitsubaScene({"wall": wall(), "ball": ball}), 0.3)
+def test_the_outline_of_a_fine_mesh_through_a_wide_pupil():
+    """An aperture of 5 mm sees the outline of a ball of 20,480 faces move over edges next to it."""
+    vertices, faces = icosphere(5)
+    ball = emissive_mesh(backend.mitsuba(), 0.3 * vertices + [0, 0.1, 0.9], faces, np.full(len(faces), 200.0))
+    task = Task(MitsubaScene({"wall": wall(), "ball": ball}), "thin")
+    truth = torch.stack([task.differences("pose", 256, seed) for seed in (11, 12)]) * SCALE
+    noise = float((truth[0] - truth[1]).norm() / 2 / truth.mean(0).norm())
+    plain, whole = (task.gradient("pose", 256, 13, way, 16.0) * SCALE for way in ("interior", "boundary"))
+    assert float((plain - truth.mean(0)).norm() / truth.mean(0).norm()) > 0.3
+    assert float((whole - truth.mean(0)).norm() / truth.mean(0).norm()) < 0.03 + 2 * noise
+    assert noise < 0.04
 
 
 def test_lines_without_width_between_faces_are_no_jumps():
     """Rays along the middle row of the film meet edges of a mesh exactly, and may slip through."""
-    vertices, faces = ball_of_triangles(4)
+    vertices, faces = icosphere(4)
     ball = emissive_mesh(backend.mitsuba(), 0.5 * vertices + [0, 2, 0], faces, light(200))
     scene = MitsubaScene(
         {"ball": ball, "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 60.0}}}
@@ -176,43 +127,13 @@ def test_lines_without_width_between_faces_are_no_jumps():
     assert not bool(render.frames(camera, scene, ahead, gradient="boundary").isnan().any())
 
 
-def test_the_outline_of_a_fine_mesh_through_a_wide_pupil():
-    """An aperture of 5 mm sees the outline of a ball of 20,480 faces move over edges next to it."""
-    vertices, faces = ball_of_triangles(5)
-    ball = emissive_mesh(backend.mitsuba(), 0.3 * vertices + [0, 0.1, 0.9], faces, np.full(len(faces), 200.0))
-    check(MitsubaScene({"wall": wall(), "ball": ball}), 0.3, "thin")
-
-
-def test_an_edge_of_a_floor_against_two_edges_of_walls():
-    T = backend.mitsuba().ScalarTransform4f
-    turned = T().translate([0, 0.4, 0.6]).rotate([0, 1, 0], 17).rotate([0, 0, 1], 9)
-    upright = {-1.4: 1.6, 1.6: 1.4}  # middles and half widths of two rectangles along the floor's far edge
-    shapes = {"floor": {"type": "rectangle", "to_world": turned.scale([3, 1, 1]), "emitter": texture(3, 2)}}
-    for k, (middle, half) in enumerate(upright.items()):
-        place = turned.translate([middle, 1, 1]).rotate([1, 0, 0], 90).scale([half, 1, 1])
-        shapes[f"wall{k}"] = {"type": "rectangle", "to_world": place, "emitter": light(40 + 150 * k)}
-    check(MitsubaScene(shapes), 0.3)
-
-
-def check(scene, without, kind="pinhole"):
-    """The gradient is that of differences to 5 % and twice their noise; without its edges it is off by ``without`` at
-    least."""
-    task = Task(scene, kind)
-    truth = torch.stack([task.differences("pose", 256, seed) for seed in (11, 12)]) * SCALE
-    noise = float((truth[0] - truth[1]).norm() / 2 / truth.mean(0).norm())
-    plain, whole = (task.gradient("pose", 256, 13, way, 16.0) * SCALE for way in ("interior", "boundary"))
-    assert float((plain - truth.mean(0)).norm() / truth.mean(0).norm()) > without
-    assert float((whole - truth.mean(0)).norm() / truth.mean(0).norm()) < 0.03 + 2 * noise
-    assert noise < 0.04
-
-
 @pytest.mark.parametrize("ratio", [5, 50, 100])
 def test_a_dark_ball_through_a_mesh_however_far(ratio):
     """A mesh of 320 faces with a black ball of half its radius before its centre, the film narrower the further it is. The
     ball's outline lies just within the mesh and the curve along which the two meet just behind the ball, both nearer to
     what is seen than rays pass beside them."""
     radius, distance = 0.3, 0.3 * ratio
-    vertices, faces = ball_of_triangles(2)
+    vertices, faces = icosphere(2)
     ball = {"type": "sphere", "center": [0.06, distance - 0.24, 0.03], "radius": 0.15, "emitter": light(0)}
     mesh = emissive_mesh(backend.mitsuba(), radius * vertices + [0, distance, 0], faces, light(200))
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": 60.0}}

@@ -1,18 +1,16 @@
 """Point spread functions of a camera, and frames by them, against closed forms, forward traces and traced frames."""
 
-import dataclasses
 import math
 
 import pytest
 import torch
 
-from codesign import System, events, flow, lens, render
-from codesign.errors import DomainError, ShapeError
+from codesign import lens, render
 from codesign.pose import look_at, se3_exp
 from codesign.render.moving import views_of
 from codesign.render.wavefront import light_and_nearness
-from codesign.system import Batch
 from scenes import textures, worlds
+from tests.render.differences import assert_gradients
 
 D = torch.float64
 PITCH_MM = 0.02
@@ -37,12 +35,6 @@ def waves(seed=0, finest_period_m=0.02, **more):
 def rms_share(found, truth):
     """RMS difference over the RMS contrast of the truth."""
     return float(((found - truth).square().mean().sqrt() / truth.std()).detach())
-
-
-def moved(z):
-    stand = torch.eye(4, dtype=D)
-    stand[2, 3] = z
-    return stand
 
 
 def test_blur_of_a_thin_lens_is_the_circle_of_confusion():
@@ -221,17 +213,8 @@ def test_gradients_are_those_of_differences_and_near_those_of_traced_frames(gene
     coarse = torch.randn(1, 1, 4, 4, generator=generator, dtype=D)
     weights = torch.nn.functional.interpolate(coarse, size=(20, 24), mode="bilinear", align_corners=True)[0]
     loss, at = functional(lambda *stage: render.psf_frames(*stage), weights)
+    assert_gradients(loss, [torch.zeros(6, dtype=D)] * 3, [1e-6] * 3, 1e-5)
     found = torch.autograd.grad(loss(*at), at)
-    for k, (gradient, step) in enumerate(zip(found, (1e-6, 1e-6, 1e-6), strict=True)):
-        along = torch.randn(6, generator=generator, dtype=D)
-        ends = [
-            float(
-                loss(*[sign * step * along if n == k else torch.zeros(6, dtype=D) for n in range(3)]).detach()
-            )
-            for sign in (1, -1)
-        ]
-        truth = (ends[0] - ends[1]) / (2 * step)
-        assert float((gradient @ along - truth).abs()) < 1e-5 * float(gradient.norm() * along.norm())
     traced, at = functional(lambda cam, *rest: render.frames(cam, *rest), weights)
     for gradient, other in zip(found, torch.autograd.grad(traced(*at), at), strict=True):
         assert float((gradient - other).norm()) < 0.02 * float(other.norm())
@@ -248,64 +231,3 @@ def test_depth_of_mitsuba_scenes_has_the_gradient_of_tangent_planes():
     torch.testing.assert_close(1 / per_m[0].double(), depth, rtol=1e-5, atol=0)
     found, truth = (torch.autograd.grad(v.sum(), twist)[0] for v in (1 / per_m[0].double(), depth))
     torch.testing.assert_close(found, truth, rtol=1e-4, atol=1e-4 * float(truth.norm()))
-
-
-def test_a_system_takes_it_as_its_render_stage():
-    system = System(
-        camera=camera(THIN),
-        events=events.layer("counts"),
-        flow=flow.estimate_lk,
-        objectives={"error": lambda field, truth: (field.flow_px - truth.flow_px).square().mean()},
-        render=render.psf_frames,
-        scene=waves(),
-    )
-    poses = FRONT @ se3_exp(
-        torch.tensor([0.01, 0, 0, 0, 0, 0], dtype=D) * torch.linspace(0, 1, 5, dtype=D)[:, None]
-    )
-    run = system.begin(Batch(poses, torch.linspace(0, 0.02, 5, dtype=D)))
-    torch.testing.assert_close(run["frames"], render.psf_frames(camera(THIN), waves(), poses))
-
-
-def test_refusals():
-    psf = render.psf_map(camera(THIN), nearest_m=1.0)
-    with pytest.raises(DomainError, match=r"0.5 m is nearer than the 1 m.*smaller nearest_m"):
-        psf.energy(torch.tensor([0.5]))
-    with pytest.raises(DomainError, match=r"3 x 3 pixels do not hold the blur.*odd number of at least 5"):
-        psf.energy(torch.tensor([2.0]), size_px=3)
-    with pytest.raises(DomainError, match=r"0.5 m away, nearer than the 1 m of the map"):
-        render.psf_frames(camera(THIN), waves(), look_at((0, 0, 0.5), (0, 0, 0), down=(0, 1, 0))[None], psf)
-    with pytest.raises(DomainError, match=r"blur reaches .* pixels .* larger nearest_m, or render traced"):
-        render.psf_map(camera(lens.ThinLens(10.0, 5.0)), nearest_m=0.02)
-    with pytest.raises(DomainError, match=r"nearest_m = -1"):
-        render.psf_map(camera(THIN), nearest_m=-1)
-    with pytest.raises(DomainError, match=r"cell_px = 1"):
-        render.psf_map(camera(THIN), cell_px=1)
-    with pytest.raises(DomainError, match="rays_per_px = 9"):
-        render.psf_map(camera(THIN), rays_per_px=9)
-    for options in ({"cell_px": math.inf}, {"cell_px": math.nan}, {"rays_per_px": 16.0}):
-        with pytest.raises(DomainError, match=r"cell_px|rays_per_px"):
-            render.psf_map(camera(THIN), **options)
-    for single in (2.0, torch.tensor(1.0)):
-        with pytest.raises(ShapeError, match=r"distances must be a list \[D\]"):
-            psf.energy(single)
-    with pytest.raises(DomainError, match="nan x nan pixels do not hold"):
-        psf.energy(torch.tensor([2.0]), size_px=math.nan)
-    for per_m in (math.nan, -1.0, 1.1):
-        with pytest.raises(DomainError, match="must lie between 0 and 1 per metre"):
-            psf.offsets_px([per_m])
-    assert torch.equal(psf.offsets_px([0.5]), psf.offsets_px(torch.tensor([0.5], dtype=D)))
-    front, back = lens.load("la1509").to_surfaces()
-    hollow = lens.GeoLens([dataclasses.replace(front, inner_semi_aperture_mm=2.0), back], 20.0)
-    with pytest.raises(DomainError, match=r"central obstruction, which chief rays meet; .* traced frames"):
-        render.psf_map(camera(hollow, pitch_mm=0.001))
-    with pytest.raises(ShapeError, match="make the map of this camera"):
-        render.psf_frames(camera(THIN, 20), waves(), FRONT[None], psf)
-
-    class Glow:
-        dtype = D
-
-        def radiance(self, arr, origin, direction):
-            return arr.Float(1)
-
-    with pytest.raises(DomainError, match="a Glow does not say how far away"):
-        render.psf_frames(camera(THIN), Glow(), FRONT[None], psf)

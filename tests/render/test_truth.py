@@ -4,20 +4,17 @@ truth."""
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
 from codesign import backend, lens, render
-from codesign.errors import DomainError, ShapeError
 from codesign.pose import apply, inverse, look_at, se3_exp
 from codesign.render import Camera, MitsubaScene, TexturedPlane, true_flow
-from codesign.render.truth import flow_and_occlusion, view, world_points
-from scenes import textures, worlds
-from scenes.build import GAP_M
+from codesign.render.truth import flow_and_occlusion, view
+from scenes import textures
+from tests.render.differences import assert_gradients
 
 D = torch.float64
-WALL = np.full((8, 8), 50.0, dtype=np.float32)
 
 
 def start():
@@ -34,49 +31,6 @@ def upright_plane(normal_distance_m=0.0):
     T[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=D)
     T[1, 3] = normal_distance_m
     return TexturedPlane(*textures.waves(0), T_world_plane=T)
-
-
-def wall_homography(now, later, K):
-    """Pixels of one view to pixels of another, for the plane y = 0: K (R - t n^T / d) K^-1 (Hartley and
-    Zisserman, 13.1)."""
-    relative = np.linalg.inv(later.numpy()) @ now.numpy()
-    normal = now.numpy()[:3, :3].T @ np.array(
-        [0.0, 1.0, 0.0]
-    )  # n . X = d for points of the wall, in the first camera's axes
-    distance = -now.numpy()[1, 3]
-    return K @ (relative[:3, :3] + np.outer(relative[:3, 3], normal) / distance) @ np.linalg.inv(K)
-
-
-@pytest.mark.parametrize(
-    ("scene", "tolerance_px"), [(upright_plane, 1e-9), (lambda: worlds.wall(WALL), 1e-4)]
-)
-def test_pinhole_flow_of_a_wall_is_its_homography(scene, tolerance_px):
-    # Mitsuba's geometry is float32: 2e-7 of 2 m moves a point along its ray only, and so shifts the flow by
-    # less than 1e-5 px
-    poses = motions([0] * 6, [0.03, -0.02, 0.05, 0.01, -0.02, 0.03], [0.05, 0.02, 0.08, 0.03, -0.01, 0.05])
-    camera = Camera(lens.Pinhole(8.0), 20, 14, 0.1, 1)
-    flow, valid = true_flow(camera, scene(), poses)
-    assert bool(valid.all())
-    K = np.array([[80.0, 0, 9.5], [0, 80.0, 6.5], [0, 0, 1]])
-    pixels = camera.film.pixels().numpy()
-    for k in range(2):
-        h = (
-            np.concatenate([pixels, np.ones_like(pixels[:, :1])], 1)
-            @ wall_homography(poses[k], poses[k + 1], K).T
-        )
-        truth = (h[:, :2] / h[:, 2:] - pixels).T.reshape(2, 14, 20)
-        np.testing.assert_allclose(flow[k].numpy(), truth, rtol=0, atol=tolerance_px)
-
-
-def test_flow_points_right_and_down():
-    # the camera moves left: the world moves right; it moves up: the world moves down
-    camera = Camera(lens.Pinhole(8.0), 9, 7, 0.1, 1)
-    left, _ = true_flow(camera, upright_plane(), motions([0] * 6, [-0.025, 0, 0, 0, 0, 0]))
-    up, _ = true_flow(camera, upright_plane(), motions([0] * 6, [0, -0.025, 0, 0, 0, 0]))
-    # 8 mm, 2 m, 0.025 m, 0.1 mm: 1 px straight ahead of a wall that is nearly square to the view
-    assert float(left[0, 0, 3, 4]) == pytest.approx(1.0, abs=0.02)
-    assert float(up[0, 1, 3, 4]) == pytest.approx(1.0, abs=0.02)
-    assert abs(float(left[0, 1, 3, 4])) < 0.02
 
 
 @pytest.mark.parametrize("name", ["cooke-triplet", "double-gauss"])
@@ -96,71 +50,6 @@ def test_flow_through_a_traced_lens_leads_to_the_same_point_of_the_wall(name):
     pixel_m = 0.2 / float(camera.lens.first_order().efl_mm.detach()) * 2.0
     miss_px = (meet[0] - meet[1]).norm(dim=1)[valid.reshape(-1)] / pixel_m
     assert float(miss_px.max()) <= 1e-9
-
-
-def test_ignoring_the_distortion_of_the_lens_would_show():
-    # the fisheye-like error of a pinhole of the same focal length, so that the test above means something
-    camera = Camera(lens.load("cooke-triplet").scaled(0.2), 12, 10, 0.6, 1)
-    poses = motions([0] * 6, [0.2, 0.0, 0.0, 0, 0, 0])
-    traced, seen = true_flow(camera, upright_plane(), poses)
-    pinhole, _ = true_flow(
-        camera.with_lens(lens.Pinhole(camera.lens.first_order().efl_mm.detach())), upright_plane(), poses
-    )
-    assert float((traced - pinhole).detach().abs().amax(1)[seen].max()) > 0.02
-
-
-def test_points_and_depths_under_pixels():
-    camera = Camera(lens.Pinhole(8.0), 5, 5, 0.1, 1)
-    pose = look_at((0.0, -2.0, 0.0), (0.0, 0.0, 0.0))
-    points, depth, valid = world_points(camera.chief_rays(camera.film.pixels()), upright_plane(0.5), pose)
-    assert bool(valid.all())
-    torch.testing.assert_close(depth, torch.full((25,), 2.5, dtype=D), rtol=1e-14, atol=0)
-    offset = (camera.film.pixels() - 2) * 0.1 / 8.0 * 2.5
-    truth = torch.stack([offset[:, 0], torch.full((25,), 0.5, dtype=D), -offset[:, 1]], 1)
-    torch.testing.assert_close(points, truth, rtol=0, atol=1e-14)
-
-
-def test_depth_of_a_sphere_in_the_room_by_hand():
-    # the ball of the room, of radius 0.25 at (0.1, 0.5), rests just over the floor; seen from 1.5 m along -y
-    # at its height the depth is 1.25 m
-    height = 0.25 + GAP_M
-    camera = Camera(lens.Pinhole(8.0), 1, 1, 0.1, 1)
-    pose = look_at((0.1, -1.0, height), (0.1, 0.5, height))
-    points, depth, valid = world_points(camera.chief_rays(camera.film.pixels()), worlds.room(), pose)
-    assert valid.tolist() == [True]
-    assert depth.item() == pytest.approx(1.25, abs=1e-6)  # float32 geometry
-    assert points[0].tolist() == pytest.approx([0.1, 0.25, height], abs=1e-6)
-
-
-def test_gradients_of_flow_to_lens_and_poses(generator):
-    geo = lens.load("cooke-triplet").scaled(0.2)
-    scene = upright_plane()
-    base = start()
-    weights = torch.randn(1, 2, 4, 5, generator=generator, dtype=D)
-
-    def loss(curvature, thickness, twists):
-        camera = Camera(geo.replace(curvature_per_mm=curvature, thickness_mm=thickness), 5, 4, 0.8, 1)
-        return (true_flow(camera, scene, base @ se3_exp(twists))[0] * weights).sum()
-
-    inputs = [
-        geo.curvature_per_mm.detach(),
-        geo.thickness_mm.detach(),
-        torch.tensor([[0.01, 0, 0, 0, 0.01, 0], [0.03, -0.02, 0.05, 0.01, -0.02, 0.03]], dtype=D),
-    ]
-    leaves = [v.clone().requires_grad_() for v in inputs]
-    found = torch.autograd.grad(loss(*leaves), leaves)
-    for k, step in enumerate((1e-6, 1e-4, 1e-5)):
-        truth = torch.zeros(inputs[k].numel(), dtype=D)
-        for i in range(truth.numel()):
-            shift = torch.zeros(inputs[k].numel(), dtype=D)
-            shift[i] = step
-            ahead, behind = (
-                [v + s * shift.reshape(v.shape) if j == k else v for j, v in enumerate(inputs)]
-                for s in (1, -1)
-            )
-            truth[i] = float((loss(*ahead) - loss(*behind)).detach()) / (2 * step)
-        # rounding: 1e-11 px over 1e-5; the projection's Jacobian is good to 1e-7
-        assert float((found[k].reshape(-1) - truth).norm() / truth.norm()) <= 1e-6
 
 
 def test_what_leaves_the_field_or_meets_nothing_is_invalid_zero_and_without_gradient():
@@ -185,39 +74,8 @@ def test_what_leaves_the_field_or_meets_nothing_is_invalid_zero_and_without_grad
         return flow.square().sum()
 
     at = [torch.zeros(2, 6, dtype=D), geo.curvature_per_mm.detach(), geo.thickness_mm.detach()]
-    leaves = [value.clone().requires_grad_() for value in at]
-    found = torch.autograd.grad(loss(*leaves), leaves)
-    for slot, (value, step) in enumerate(zip(at, (1e-6, 1e-7, 1e-5), strict=True)):
-        way = torch.randn(value.shape, generator=torch.Generator().manual_seed(slot), dtype=D)
-        ahead, behind = (
-            float(loss(*(v + s * step * way if k == slot else v for k, v in enumerate(at))).detach())
-            for s in (1, -1)
-        )
-        # the points that leave the field carry no gradient, and the steps are too short to change which they are
-        assert float((found[slot] * way).sum()) == pytest.approx((ahead - behind) / (2 * step), rel=1e-5)
-
-
-def test_static_cameras_have_no_flow():
-    camera = Camera(lens.load("double-gauss").scaled(0.2), 6, 5, 0.2, 1)
-    flow, valid = true_flow(camera, worlds.room(), start()[None].expand(3, 4, 4))
-    assert bool(valid.all())
-    assert float(flow.detach().abs().max()) <= 1e-9
-
-
-@pytest.mark.parametrize("stride", [0, -1, 2, 5, 1.5, float("nan")])
-def test_strides_without_a_later_pose_are_refused(stride):
-    with pytest.raises(ShapeError, match="whole stride of at least 1"):
-        true_flow(
-            Camera(lens.Pinhole(8.0), 4, 4, 0.1, 1),
-            upright_plane(),
-            motions([0] * 6, [0.1] * 6),
-            stride=stride,
-        )
-
-
-def test_poses_that_are_not_rigid_are_refused():
-    with pytest.raises(DomainError, match="not rigid"):
-        true_flow(Camera(lens.Pinhole(8.0), 4, 4, 0.1, 1), upright_plane(), 2 * motions([0] * 6, [0.1] * 6))
+    # the points that leave the field carry no gradient, and the steps are too short to change which they are
+    assert_gradients(loss, at, (1e-6, 1e-7, 1e-5), 1e-5)
 
 
 def test_windows_have_the_flow_of_the_full_frame():
@@ -232,20 +90,6 @@ def test_windows_have_the_flow_of_the_full_frame():
         torch.testing.assert_close(
             part[0, :, k], full[0, :, top : top + 5, left : left + 6], rtol=0, atol=1e-10
         )
-
-
-def test_angles_of_the_field_survive_the_world(generator):
-    # distances between points under pixels do not depend on where the camera stands
-    camera = Camera(lens.Pinhole(8.0), 6, 6, 0.1, 1)
-    pose = se3_exp(torch.randn(6, generator=generator, dtype=D))
-    plane = upright_plane()
-    moved = TexturedPlane(
-        plane.frequency, plane.amplitude, plane.phase, T_world_plane=pose @ plane.T_world_plane
-    )
-    rays = camera.chief_rays(camera.film.pixels())
-    a, _, _ = world_points(rays, plane, start())
-    b, _, _ = world_points(rays, moved, pose @ start())
-    torch.testing.assert_close(apply(inverse(pose), b), a, rtol=0, atol=1e-13)
 
 
 def test_points_of_one_flat_ground_never_hide_each_other():

@@ -8,7 +8,6 @@ import pytest
 import torch
 from scipy.linalg import logm
 
-from codesign.errors import DomainError, ShapeError
 from codesign.pose import se3_exp
 from codesign.render import camera_velocity
 from codesign.render.velocity import se3_log
@@ -75,22 +74,3 @@ def test_gradcheck(scale, generator):
     assert torch.autograd.gradcheck(
         lambda w: se3_log(se3_exp(w)), twist, atol=1e-8
     )  # the identity, by way of the group
-
-
-def test_poses_and_times_without_a_velocity_are_refused():
-    poses = trajectories.body_twist(start(), TWIST, torch.tensor([0.0, 1.0, 2.0], dtype=D))
-    with pytest.raises(ShapeError, match="one time per pose"):
-        camera_velocity(poses, torch.tensor([0.0, 1.0]))
-    with pytest.raises(ShapeError, match="at least two"):
-        camera_velocity(poses[:1], torch.tensor([0.0]))
-    with pytest.raises(DomainError, match="must increase"):
-        camera_velocity(poses, torch.tensor([0.0, 1.0, 1.0]))
-    with pytest.raises(DomainError, match="times of the poses"):
-        camera_velocity(poses, torch.tensor([0.0, math.nan, 1.0]))
-    with pytest.raises(DomainError, match="turns by 178 degrees"):
-        camera_velocity(
-            torch.stack([poses[0], poses[0] @ se3_exp(torch.tensor([0, 0, 0, 0, 3.1, 0], dtype=D))]),
-            torch.tensor([0.0, 1.0]),
-        )
-    with pytest.raises(DomainError, match="not rigid"):
-        camera_velocity(2 * poses, torch.tensor([0.0, 1.0, 2.0]))

@@ -43,7 +43,7 @@ def test_the_list_shows_the_question_of_every_study():
         asked = listing.question(path)
         assert asked.endswith((".", "?")), f"{name}: its docstring begins with one sentence"
         assert f"{name} {asked}" in text
-    assert "silhouettes Is the gradient right where objects hide one another?" in text
+    assert "gradient_flow Are the gradients right, from the lens to the loss?" in text
 
 
 def test_a_study_without_a_group_is_listed_too(tmp_path, monkeypatch):

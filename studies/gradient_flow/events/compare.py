@@ -1,21 +1,27 @@
-"""Derivatives of a layer beside differences of the hard sensor, pooled over blocks: cosine and scale."""
+"""Derivatives of a layer beside differences of the hard sensor, pooled over blocks: cosine and scale.
+
+The hard sensor's counts are means over many places where a pixel may have begun inside its thresholds. The same
+beginnings serve both ends of a step (common random numbers).
+"""
 
 import itertools
-import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
-from studies.event_gradient.case import SECTIONS, Case, Direction, times
-from studies.event_gradient.judge import Judge
+from codesign import events
+from codesign.events.sensor.state import begin
+from studies.gradient_flow.events.case import SECTIONS, Case, Direction, times
+from studies.gradient_flow.topic import Row
 
+BEGINNINGS = 32
+AT_ONCE = 8  # beginnings that a kernel walks through side by side
 PARTS = 4  # of the time, for counts
 BLOCKS = 4  # per side of the picture
 RESAMPLES = 400
-LEAD = 2  # frames of a history
-LEAD_S = 1.0  # between them: longer than any dead time or time constant
 
 Maps = Callable[[Tensor, Tensor], Tensor]
 """What is differentiated: frames [T, H, W] and times [T] to maps [K, H, W], of a layer or of the hard sensor."""
@@ -29,20 +35,61 @@ class Pair:
     difference: Tensor
 
 
+def offsets(shape: tuple[int, ...], count: int, seed: int = 0) -> Tensor:
+    """[count, *shape] places in [0, 1): evenly spaced over the beginnings, with a random start and in random
+    order for every pixel, so that their mean over beginnings is far less noisy than that of free draws."""
+    generator = Generator().manual_seed(seed)
+    first = torch.rand(shape, generator=generator)
+    order = torch.rand((count, *shape), generator=generator).argsort(0)
+    return (order + first) / count
+
+
+def distance(place: Tensor, theta_on: Tensor | float, theta_off: Tensor | float) -> Tensor:
+    """How far the level lies above the memorised one at the first frame, for a place in [0, 1): even over -C_off/2
+    to C_on/2, which is what the memory layer assumes of a pixel without a history."""
+    return place * (theta_on + theta_off) / 2 - theta_off / 2
+
+
 @dataclass(frozen=True)
-class Row:
-    """A line of a table. names: what tells it from the others. numbers: figures by name, such as cosine and scale."""
+class Judge:
+    """Mean over beginnings of something that the hard sensor gives.
 
-    names: tuple[str, ...]
-    numbers: dict[str, float]
+    sensor: SensorModel. count: beginnings. seed: of the beginnings and of what the sensor draws itself, the same for
+      every one of them.
+    """
 
-    def metrics(self, prefix: str = "") -> dict[str, float]:
-        """Figures by the names that they have in metrics.json: cosine_memory_contrast_240fps."""
-        words = [prefix, *self.names]
-        name = "_".join(
-            filter(None, (re.sub(r"[^a-z0-9.]+", "_", word.lower()).strip("_") for word in words))
-        )
-        return {f"{key}_{name}": value for key, value in self.numbers.items()}
+    sensor: events.SensorModel
+    count: int = BEGINNINGS
+    seed: int = 0
+
+    @torch.no_grad()
+    def mean(self, frames: Tensor, t_s: Tensor, observe: Callable[[Tensor], Tensor]) -> Tensor:
+        """Mean of ``observe(counts)`` over beginnings.
+
+        Args: frames: [T, H, W], 0-255 scale. t_s: [T]. observe: counts [T-1, 2, B, H, W] of some beginnings to
+          what is wanted [K, B, H, W].
+        Returns: [K, H, W].
+        """
+        places = offsets(tuple(frames.shape[1:]), self.count, self.seed).to(frames)
+        total: Any = 0
+        for chosen in places.split(AT_ONCE):
+            several = frames[:, None].expand(-1, len(chosen), -1, -1)
+            state = self._begun(several[0], float(t_s[0]), chosen)
+            counts = events.dense_counts(several[1:], t_s[1:], self.sensor, state=state)
+            total = total + observe(counts).sum(1)
+        return total / self.count
+
+    def _begun(self, first, start_s, places):
+        """SensorState of frames [B, H, W] whose memorised levels lie at these places of the thresholds."""
+        generator = Generator().manual_seed(self.seed)
+        level = events.lin_log(first[:1])[0]
+        state = events.SensorState()
+        begin(state, self.sensor, first[0], level, start_s, generator)  # one draw of the sensor for all
+        for name, value in state.tensors().items():
+            setattr(state, name, value.expand(len(places), *value.shape).contiguous())
+        state.generator = generator
+        state.reference = level - distance(places, state.theta_on, state.theta_off)
+        return state
 
 
 def parts(counts: Tensor) -> Tensor:
@@ -67,23 +114,6 @@ def of_layer(layer: Callable[[Tensor, Tensor], Tensor], observe: Callable[[Tenso
 def of_judge(judge: Judge, observe: Callable[[Tensor], Tensor] = parts) -> Maps:
     """Maps of the hard sensor's counts, the mean over beginnings."""
     return lambda frames, t_s: judge.mean(frames, t_s, observe)
-
-
-def led_in(frames: Tensor, t_s: Tensor, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Frames and times with a history of LEAD frames before: half of the pixels come from far above, half from far
-    below, turn anywhere around their first level, and go to it. It moves with the first frame."""
-    generator = torch.Generator().manual_seed(seed)
-    draws = torch.rand(3, *frames.shape[1:], generator=generator, dtype=frames.dtype)
-    far = (1 + draws[0]) * (draws[1] - 0.5).sign()
-    near = 1.2 * (draws[2] - 0.5)
-    lead_s = t_s[0] + LEAD_S * torch.arange(-LEAD, 0, dtype=t_s.dtype)
-    return torch.cat((frames[0] * torch.stack((far, near)).exp(), frames)), torch.cat((lead_s, t_s))
-
-
-def with_history(maps_of: Callable[[Callable[[Tensor], Tensor]], Maps]) -> Maps:
-    """Maps of counts behind a history that is not counted itself. maps_of: from observe to maps."""
-    maps = maps_of(lambda counts: parts(counts[LEAD:]))
-    return lambda frames, t_s: maps(*led_in(frames, t_s))
 
 
 def pairs(

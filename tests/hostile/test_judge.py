@@ -11,9 +11,7 @@ import torch
 
 from codesign import backend, lens, pose
 from codesign.render import MitsubaScene
-from scenes import outline_cases, random_worlds
-from studies.silhouettes import judge, listed
-from tests.hostile import worlds
+from tests.hostile import judge, listed, outline_cases, random_worlds, worlds
 
 QUICK = judge.Effort(seeds=(4,))
 
@@ -130,6 +128,16 @@ def test_random_worlds_are_judged_once_and_counted(tmp_path):
     assert all(row["verdict"] == "right" and row["interior"] > 0.5 for row in rows if row["world"] == 1)
     assert worlds.measure(2, 0, told.append, path) == (figures, findings)
     assert told == []
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["poles", "facets", "t_junction", "sphere_in_floor", "cylinder_in_floor", "crossing_mesh", "defocus"],
+)
+def test_gradients_of_listed_worlds_are_right_and_need_their_silhouettes(name):
+    found = judge.judge(listed.case_of(outline_cases.CASES[name](), "pinhole"), effort=QUICK)
+    assert found.verdict == "right", found
+    assert found.interior > 2 * found.error
 
 
 def test_a_listed_world_is_told_from_a_wrong_gradient():

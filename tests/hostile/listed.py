@@ -1,13 +1,14 @@
 """Worlds in which gradients at silhouettes once were wrong without a word: each judged, or refused where its shapes
-pass through each other."""
+pass through each other. Shown by ``python -m tests.hostile listed``."""
 
-from typing import Any
+from collections.abc import Callable
 
 import torch
 
 from codesign import pose
-from scenes import outline_cases, silhouettes
-from studies.silhouettes.judge import (
+from scenes import silhouettes
+from tests.hostile import outline_cases
+from tests.hostile.judge import (
     RIGHT,
     USUAL,
     Case,
@@ -32,33 +33,30 @@ def case_of(world: outline_cases.World, kind: str) -> Case:
     return Case(world.scene, optics, world.T_world_cam, pitch_mm, WIDTH_PX, world.nearest_m)
 
 
-def listed(run: Any, effort: Effort = USUAL) -> list[str]:
-    """Judge all listed worlds, record and show them; returns what is not as asked."""
-    rows = []
-    missed = []
+def measure(
+    count: int, seed: int, say: Callable[[str], None] = print, effort: Effort = USUAL
+) -> tuple[dict[str, float], list[str]]:
+    """Figures and findings of the first ``count`` listed worlds, each before its lenses."""
     cases = [(name, kind) for name, build in outline_cases.CASES.items() for kind in build().kinds]
-    with run.progress(len(cases) + 1, "listed worlds") as progress:
-        for name, kind in cases:
-            rows.append((name, kind, judge(case_of(outline_cases.CASES[name](), kind), effort=effort)))
-            progress.advance()
-        rows.append(("auto_after_wall", "pinhole", auto_after_wall(effort)))
-        progress.advance()
-    for name, kind, found in rows:
-        label = f"listed_{name}_{kind}"
+    jobs = {
+        f"{name}_{kind}": lambda name=name, kind=kind: judge(
+            case_of(outline_cases.CASES[name](), kind), effort=effort
+        )
+        for name, kind in cases
+    }
+    jobs["auto_after_wall_pinhole"] = lambda: auto_after_wall(effort)
+    figures = {}
+    findings = []
+    for label, work in list(jobs.items())[:count]:
+        found = work()
         if found.verdict == "refused":
-            run.record(**{f"{label}_refused": 1})
+            figures[f"{label}_refused"] = 1.0
         else:
-            run.record(**{f"{label}_error": found.error or 0.0, f"{label}_noise": found.noise or 0.0})
-        if not passes(name, found):
-            missed.append(f"{name}, {kind}: {found.verdict}" + (f" {found.error:.1%}" if found.error else ""))
-    run.record(listed_missed=len(missed))
-    table = [
-        (name, kind, found.verdict, found.error, found.noise, found.interior, found.sentence)
-        for name, kind, found in rows
-    ]
-    columns = ("world", "lens", "verdict", "error", "noise", "interior only", "refused with")
-    run.table("Worlds that once were wrong", columns, table)
-    return missed
+            figures |= {f"{label}_error": found.error or 0.0, f"{label}_noise": found.noise or 0.0}
+        say(f"{label}: {found.verdict}, error {found.error}, noise {found.noise}, interior {found.interior}")
+        if not passes(label.rsplit("_", 1)[0], found):
+            findings.append(f"{label}: {found.verdict} {found.error or 0.0:.1%} {found.sentence}")
+    return figures, findings
 
 
 def passes(name: str, found: Judged) -> bool:

@@ -1,0 +1,69 @@
+"""A topic: some rows about one question, measured job by job, so that an interrupted run goes on behind the last."""
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+Job = tuple[str | float, ...]  # plain values, which tell it from other jobs
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of a table. names: what tells it from the others. numbers: figures by name, such as cosine and scale."""
+
+    names: tuple[str, ...]
+    numbers: dict[str, float]
+
+    def metrics(self, prefix: str = "") -> dict[str, float]:
+        """Figures by the names that they have in metrics.json: cosine_memory_contrast_240fps."""
+        words = [prefix, *self.names]
+        name = "_".join(
+            filter(None, (re.sub(r"[^a-z0-9.]+", "_", word.lower()).strip("_") for word in words))
+        )
+        return {f"{key}_{name}": value for key, value in self.numbers.items()}
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a row's numbers have to reach: at least, at most, by name."""
+
+    least: dict[str, float]
+    most: dict[str, float]
+
+    def missed(self, row: Row) -> bool:
+        """Whether a number falls short; NaN does."""
+        return not (
+            all(row.numbers[name] >= value for name, value in self.least.items())
+            and all(row.numbers[name] <= value for name, value in self.most.items())
+        )
+
+
+def pointing(cosine: float, low: float | None = None, high: float | None = None) -> Asked:
+    """Asked of a derivative beside differences: its cosine, and a scale within bounds."""
+    if low is None or high is None:
+        return Asked({"cosine": cosine}, {})
+    return Asked({"cosine": cosine, "scale": low}, {"scale": high})
+
+
+@dataclass(frozen=True)
+class Topic:
+    """Rows about one question.
+
+    title, text: heading and words of its section.
+    columns: what ``Row.names`` are.
+    jobs: quick -> what to measure, at best some seconds each.
+    measure: the study's configuration and one job -> its rows.
+    asked: what a row has to reach, None where nothing is asked.
+    """
+
+    title: str
+    text: str
+    columns: tuple[str, ...]
+    jobs: Callable[[bool], Sequence[Job]]
+    measure: Callable[..., Iterable[Row]]
+    asked: Callable[[Row], Asked | None] = lambda row: None
+
+
+def label(job: Job) -> str:
+    """The name of a job in the stored state."""
+    return " ".join(map(str, job))

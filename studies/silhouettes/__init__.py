@@ -1,3 +1,0 @@
-from studies.silhouettes.task import STEPS, Task
-
-__all__ = ["STEPS", "Task"]

@@ -1,0 +1,656 @@
+"""What a stranger gives wrongly is one sentence: what was given, what is allowed, what to do."""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from codesign import backend, lens, render
+from codesign.errors import BackendError, CodesignError, DomainError, FileFormatError, ShapeError
+from codesign.pose import as_poses, look_at, se3_exp
+from codesign.render import Camera, Film, MitsubaScene, MovingScene, TexturedPlane, light
+from codesign.render.charts import emissive_mesh
+from codesign.types import Rays
+from scenes import textures, worlds
+from tests.render.test_own_lens import Barrel
+
+D = torch.float64
+SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]])
+FACES = np.array([[0, 1, 2], [2, 1, 3]])
+PLANE = TexturedPlane([[0.7, 0.3]], [0.4], [0.2])
+ABOVE = look_at((0.1, -0.2, 2.0), (0.0, 0.1, 0.0), down=(0, -1, 0))
+POSES = ABOVE.repeat(2, 1, 1)
+STILL = torch.eye(4, dtype=D).repeat(3, 1, 1)
+PINHOLE = lens.Pinhole(8.0)
+CAMERA = Camera(PINHOLE, 6, 4, 0.5, 2)
+NARROW = Camera(lens.load("cooke-triplet").scaled(0.1), 32, 24, 0.1, 4)
+# any argument may be given to these
+make: Any = Camera
+show: Any = render
+lit: Any = light
+optics: Any = lens
+
+
+def area(value):
+    return {"type": "area", "radiance": {"type": "rgb", "value": value}}
+
+
+def picture(value):
+    bitmap = backend.mitsuba().Bitmap(np.full((2, 2, 1), value, dtype=np.float32))
+    return {"type": "area", "radiance": {"type": "bitmap", "bitmap": bitmap, "raw": True}}
+
+
+def mesh(vertices=SQUARE, faces=FACES, radiance=(5.0, 5.0)):
+    return emissive_mesh(backend.mitsuba(), vertices, faces, np.array(radiance))
+
+
+def cube(**surface):
+    return {"type": "cube", **surface}
+
+
+def with_vertex(value):
+    vertices = SQUARE.copy()
+    vertices[3, 1] = value
+    return vertices
+
+
+def moving(poses: Any, scene: Any = PLANE):
+    return MovingScene(PLANE, {"card": (scene, poses)})
+
+
+def flat(level):
+    return worlds.wall(np.full((8, 8), level, dtype=np.float32))
+
+
+def file_of(folder, faces):
+    """A triangle in a file of its own, with these vertices for its face."""
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    path = folder / "part.ply"
+    path.write_text(f"{header}0 0 0\n1 0 0\n0 1 0\n3 {faces}\n")
+    return {"part": {"type": "ply", "filename": str(path), "emitter": area(1.0)}}
+
+
+class Shining(TexturedPlane):
+    """A plane of one radiance, whatever it is: a scene of a user's own is not looked at where it is built."""
+
+    def __init__(self, level):
+        super().__init__([], [], [])
+        self.level = level
+
+    def radiance_and_distance(self, arr, origin, direction):
+        found, distance = super().radiance_and_distance(arr, origin, direction)
+        return 0 * found + self.level, distance
+
+
+class Brighter(MitsubaScene):
+    """Twice the radiance, whose distances would tell of the plain scene."""
+
+    def radiance(self, arr, origin, direction):
+        return 2 * super().radiance(arr, origin, direction)
+
+
+class Glow:
+    """A scene that does not say how far away its light comes from."""
+
+    dtype = D
+
+    def radiance(self, arr, origin, direction):
+        return arr.Float(1)
+
+
+def refused(calls):
+    """Tests of a table of (call, kind of error, part of the sentence)."""
+    return pytest.mark.parametrize(("call", "kind", "sentence"), calls)
+
+
+def placed_nowhere():
+    frame = backend.mitsuba().ScalarTransform4f().translate([math.nan, 0, 0])
+    return MitsubaScene({"ball": {"type": "sphere", "to_world": frame, "emitter": area(1.0)}})
+
+
+def unpainted():
+    named = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "face_colour"}}
+    return MitsubaScene({"painted": emissive_mesh(backend.mitsuba(), SQUARE, FACES, named)})
+
+
+def unlit(*names):
+    """Shapes that Mitsuba joins where they look alike."""
+    return MitsubaScene(
+        {"lamp": cube(emitter=area(3.0)), **{n: cube(bsdf={"type": "diffuse"}) for n in names}}
+    )
+
+
+def loaded():
+    """A scene of Mitsuba, not yet one of ours."""
+    return backend.mitsuba().load_dict({"type": "scene", "wall": {"type": "rectangle"}})
+
+
+@refused(
+    [
+        (lambda: mesh(with_vertex(math.nan)), DomainError, r"1 of 4 vertices are NaN .*\(first number 3\)"),
+        (
+            lambda: mesh(faces=np.array([[0, 1, 4]]), radiance=[1.0]),
+            DomainError,
+            "but it has 4, counted from 0",
+        ),
+        (lambda: mesh(faces=np.zeros((0, 3), dtype=int), radiance=[]), ShapeError, r"its faces are \(0, 3\)"),
+        (lambda: mesh(radiance=[1.0, 2.0, 3.0]), ShapeError, "3 values of radiance per face for 2"),
+        (
+            lambda: emissive_mesh(backend.mitsuba(), SQUARE, FACES, area(1.0), uv=np.zeros((1, 2))),
+            ShapeError,
+            "1 values of texture coordinates for 4",
+        ),
+        (placed_nowhere, DomainError, "shape 'ball': its place or size is NaN or infinite"),
+        (unpainted, DomainError, "'painted': the mesh has no attribute 'face_colour'"),
+        (
+            lambda: unlit("table", "chair"),
+            DomainError,
+            r"shape '(table|chair)', '(table|chair)' has no emitter",
+        ),
+        (lambda: MitsubaScene(loaded()), DomainError, "'wall' has no emitter"),
+        (
+            lambda: MitsubaScene({"shape": {"type": "no-such-shape"}}),
+            DomainError,
+            "Mitsuba cannot build the scene",
+        ),
+        (lambda: show.MitsubaScene("scene.xml"), DomainError, "got a str; .* worlds.from_mitsuba"),
+        (
+            lambda: worlds.wall(np.full((4, 4), math.nan)),
+            DomainError,
+            "texture of the scene: NaN or infinite",
+        ),
+        (lambda: worlds.room(photos=[np.ones(64)]), DomainError, r"shape \(64,\)"),
+        (lambda: moving(1.1 * STILL), DomainError, "object 'card': poses are not rigid"),
+        (lambda: moving(STILL[0]), ShapeError, "object 'card': poses must be"),
+        (
+            lambda: MovingScene(PLANE, {"a": (PLANE, STILL), "b": (PLANE, STILL[:2])}),
+            ShapeError,
+            r"\{'a': 3, 'b': 2\} poses",
+        ),
+        (lambda: moving(STILL, moving(STILL)), DomainError, "itself a moving scene"),
+        (
+            lambda: moving(STILL, Brighter({"ball": cube(emitter=area(1.0))})),
+            DomainError,
+            "part 'card', a Brighter, does not say how far",
+        ),
+        (lambda: show.MovingScene(PLANE, {"a": PLANE}), DomainError, "objects are a dictionary"),
+        (lambda: TexturedPlane([[math.nan, 1]], [1.0], [0.0]), DomainError, "frequency_per_m"),
+        (
+            lambda: TexturedPlane([[1, 1], [1, 2]], [1.0], [0.0, 1.0]),
+            DomainError,
+            "2 frequencies, 1 amplitudes",
+        ),
+    ]
+)
+def test_scenes_that_cannot_be(call, kind, sentence):
+    with pytest.raises(kind, match=sentence):
+        call()
+
+
+def test_a_mesh_of_ones_own_is_looked_at_before_mitsuba_uses_it():
+    mi = backend.mitsuba()
+    bare = mi.Mesh("own", 4, 2)
+    parameters = mi.traverse(bare)
+    parameters["vertex_positions"] = mi.Float(with_vertex(math.nan).astype(np.float32).reshape(-1))
+    parameters["faces"] = mi.UInt32(FACES.astype(np.uint32).reshape(-1))
+    parameters.update()
+    with pytest.raises(DomainError, match="mesh 'mine': 1 of 4 vertices are NaN"):
+        MitsubaScene({"mine": bare}, emissive=False)
+
+
+def test_files_are_looked_at_before_they_end_the_process(tmp_path):
+    with pytest.raises(DomainError, match="mesh 'part': its faces name vertices 0 to 9999999, but it has 3"):
+        MitsubaScene(file_of(tmp_path, "0 1 9999999"))
+    assert MitsubaScene(file_of(tmp_path, "0 1 2")).scene
+    (tmp_path / "broken.png").write_bytes(b"not a picture")
+    with pytest.raises(FileFormatError, match=r"broken\.png cannot be read"):
+        textures.photo(tmp_path / "broken.png")
+
+
+@pytest.mark.parametrize("value", [-2.0, math.nan, math.inf])
+def test_radiance_is_finite_and_at_least_0_wherever_it_stands(value):
+    mi = backend.mitsuba()
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.full((4, 8, 3), value, dtype=np.float32))}
+    checks = {"type": "checkerboard", "color1": {"type": "rgb", "value": value}}
+    for entry in (
+        cube(emitter=area(value)),
+        cube(emitter=picture(value)),
+        cube(emitter={"type": "area", "radiance": checks}),
+        {"type": "constant", "radiance": {"type": "rgb", "value": value}},
+        {"type": "point", "intensity": {"type": "rgb", "value": value}},
+        sky,
+    ):
+        with pytest.raises(DomainError, match=r"radiance of 'wrong': .* negative, NaN or infinite"):
+            MitsubaScene({"wrong": entry})
+    with pytest.raises(DomainError, match="radiance of 'wrong': face_radiance holds 1 values"):
+        MitsubaScene({"wrong": mesh(radiance=(1.0, value))})
+
+
+def test_black_shapes_are_there_where_black_is_meant_or_light_is_worked_out():
+    wall = {
+        "type": "rectangle",
+        "to_world": backend.mitsuba().ScalarTransform4f().scale(4.0),
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
+    }
+    black = render.frames(CAMERA, MitsubaScene({"wall": {**wall, "emitter": area(0.0)}}), POSES)
+    assert torch.equal(black, torch.zeros_like(black))
+    sky = {"wall": wall, "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 8.0}}}
+    for scene in (light.PathScene(sky, samples=256), light.bake(sky, texel_m=1.0, samples=64)):
+        # a white furnace: albedo times the sky's radiance; at least 4096 paths of a standard deviation of about
+        # 1, five standard errors
+        assert float(render.frames(CAMERA, scene, POSES).mean()) == pytest.approx(0.5 * 8.0, abs=5 / 64)
+
+
+# ---- devices
+
+
+@pytest.mark.parametrize("device", ["gpu", "CPU", "cuda:1", "mps", "", None])
+def test_an_unknown_device_is_refused_wherever_one_is_taken(device):
+    for build in (
+        lambda: MitsubaScene({}, device),
+        lambda: light.PathScene({}, device),
+        lambda: light.bake({}, device),
+        lambda: worlds.room(device=device),
+        lambda: backend.arrays(device),
+        lambda: backend.variant(device),
+    ):
+        with pytest.raises(DomainError, match="is not known here; choose 'cpu' or 'cuda'"):
+            build()
+
+
+def test_devices_may_be_those_of_torch():
+    assert backend.device_name(torch.device("cpu")) == "cpu"
+    assert {backend.device_name(name) for name in ("cuda", "cuda:0", torch.device("cuda", 0))} == {"cuda"}
+    if not torch.cuda.is_available():
+        with pytest.raises(BackendError, match="torch sees no CUDA device"):
+            MitsubaScene({}, "cuda:0")
+
+
+# ---- poses
+
+
+def test_numpy_arrays_and_lists_are_poses_too():
+    expected = render.frames(CAMERA, PLANE, POSES)
+    for given in (POSES.numpy(), POSES.tolist(), list(POSES), [POSES[0].numpy(), POSES[1].numpy()]):
+        assert torch.equal(render.frames(CAMERA, PLANE, given), expected)
+        assert torch.equal(
+            render.true_flow(CAMERA, PLANE, given)[0], render.true_flow(CAMERA, PLANE, POSES)[0]
+        )
+        assert torch.equal(torch.cat(list(render.frame_chunks(CAMERA, PLANE, given, 1))), expected)
+        assert torch.equal(render.camera_velocity(given, [0.0, 1.0])[0], torch.zeros(1, 6).double())
+        assert render.view(CAMERA, PLANE, given, 1).valid.all()
+        assert render.psf_frames(CAMERA, PLANE, given).shape == expected.shape
+    assert as_poses(np.eye(4, dtype=np.float32)).dtype == torch.float64
+
+
+def test_a_list_of_tensors_keeps_their_gradient():
+    poses = [POSES[k].clone().requires_grad_() for k in range(2)]
+    whole = POSES.clone().requires_grad_()
+    weight = torch.linspace(-1, 1, 48).reshape(2, 4, 6)
+    parts = torch.autograd.grad((render.frames(CAMERA, PLANE, poses) * weight).sum(), poses)
+    (expected,) = torch.autograd.grad((render.frames(CAMERA, PLANE, whole) * weight).sum(), whole)
+    assert float(expected.abs().max()) > 0
+    assert torch.equal(torch.stack(parts), expected)
+
+
+@pytest.mark.parametrize("call", [render.frames, render.true_flow])
+@pytest.mark.parametrize(
+    ("poses", "kind", "sentence"),
+    [
+        (POSES.half(), DomainError, "poses are torch.float16; give float32 or float64"),
+        ([[1.0, 2.0], [3.0]], DomainError, "poses are a list that holds no real numbers"),
+        (None, DomainError, "poses are a NoneType that holds no real numbers"),
+        ([POSES[0], POSES[0, :3]], ShapeError, r"a list of tensors \[\(3, 4\), \(4, 4\)\]"),
+        (POSES[0], ShapeError, r"got \(4, 4\); for one pose give pose\[None\]"),
+        ([], ShapeError, r"T >= 1"),
+        (POSES * torch.tensor([1, 1, -1, 1.0]), DomainError, "determinant -1"),
+        (POSES * 1.1, DomainError, "not rigid"),
+        (POSES.numpy() * math.nan, DomainError, "32 of 32 values are NaN"),
+        (POSES.to("meta"), DomainError, "poses are on meta, the rays of the camera on cpu"),
+    ],
+)
+def test_poses_that_are_none(call, poses, kind, sentence):
+    with pytest.raises(kind, match=sentence):
+        call(CAMERA, PLANE, poses)
+
+
+@pytest.mark.parametrize("call", [render.frames, render.true_flow, render.flow_and_occlusion])
+@pytest.mark.parametrize(
+    ("scene", "poses", "sentence"),
+    [
+        ([PLANE, PLANE], POSES.repeat(3, 1, 1, 1), r"2 scenes for poses \(3, 2, 4, 4\): give one scene"),
+        ([PLANE, PLANE], POSES, r"2 scenes for poses \(2, 4, 4\)"),
+        (
+            moving(STILL.repeat(3, 1, 1, 1)),
+            STILL.repeat(2, 1, 1, 1),
+            r"batch \(3,\) of .*, the camera for \(2,\)",
+        ),
+        (moving(STILL.repeat(3, 1, 1, 1)), STILL, r"batch \(3,\) of trajectories, the camera for \(\)"),
+        (moving(STILL), POSES, "'card' has 3 poses for 2 frames"),
+    ],
+)
+def test_scenes_and_poses_that_do_not_fit(call, scene, poses, sentence):
+    with pytest.raises(ShapeError, match=sentence):
+        call(CAMERA, scene, poses)
+
+
+@pytest.mark.parametrize(
+    ("scene", "sentence"),
+    [
+        ({"a": {"type": "sphere"}}, r"the scene is a dict, .* render.MitsubaScene\(description\) builds one"),
+        (None, "the scene is a NoneType, .* give a MitsubaScene"),
+        ((PLANE for _ in range(2)), "the scene is a generator, .* or a list of them"),
+        (render.TexturedPlane, r"make one, as by TexturedPlane\(...\)"),
+        (loaded(), r"the scene is a Scene, .* worlds.from_mitsuba\(scene\)"),
+    ],
+)
+def test_what_is_no_scene(scene, sentence):
+    for call in (
+        lambda: render.frames(CAMERA, scene, POSES),
+        lambda: render.true_flow(CAMERA, scene, POSES),
+        lambda: render.check_view(CAMERA, scene, POSES),
+        lambda: moving(POSES, scene),
+    ):
+        with pytest.raises(DomainError, match=sentence):
+            call()
+
+
+# ---- cameras, frames, truth
+
+
+def boundary(per_px: Any):
+    return render.frames(CAMERA, worlds.blank_room(), POSES, gradient="boundary", per_px=per_px)
+
+
+def too_many():
+    line = torch.zeros(1, 3).expand(2**31, 3)
+    return render.shade(Rays(line, line, line[:, 0]), PLANE, POSES, 1)
+
+
+def differences_to_an_object():
+    asks = STILL.clone().requires_grad_(True)
+    return render.frames(CAMERA, moving(asks), STILL, gradient="difference")
+
+
+def backwards_through_paths():
+    """A lamp seen by path tracing."""
+    efl = torch.tensor(6.0, dtype=D, requires_grad=True)
+    scene = light.PathScene({"lamp": cube(emitter=area(1.0))}, samples=1)
+    render.frames(Camera(lens.Pinhole(efl), 4, 3, 0.6, 2), scene, POSES[:1]).sum().backward()
+
+
+@refused(
+    [
+        (lambda: make(None, 8, 8, 0.1), DomainError, "a NoneType has no camera_rays"),
+        (lambda: make(lens.Pinhole, 8, 8, 0.1), DomainError, "so it is no lens"),
+        (
+            lambda: make(PINHOLE, 8, 8, 0.1, film=show.Film(9, 9, 8, 8, 0.1, ((0,),))),
+            DomainError,
+            r"window \(0,\) is no pair",
+        ),
+        (
+            lambda: make(PINHOLE, 8, 8, 0.1, film=Film(10, 10, 4, 4, 0.1, ((8, 0),))),
+            DomainError,
+            r"window \(8, 0\)",
+        ),
+        (lambda: make(PINHOLE, 8, 8, 0.1, film=Film(10, 10, 4, 4, 0.1, ())), DomainError, "no window"),
+        (
+            lambda: Camera(PINHOLE, 200_000, 200_000, 0.001),
+            DomainError,
+            r"6.4e\+11 rays per frame, at least 5.25e\+04 GiB; this machine has",
+        ),
+        (
+            lambda: show.frames(PINHOLE, PLANE, POSES),
+            DomainError,
+            "the camera is a Pinhole; give a render.Camera",
+        ),
+        (lambda: show.frames(CAMERA, PLANE, POSES, "exact"), DomainError, "choose one of interior, boundary"),
+        (lambda: show.frames(CAMERA, PLANE, POSES, rays=3), DomainError, "a int was given as rays"),
+        (
+            lambda: show.frames(CAMERA, PLANE, POSES, rays=NARROW.rays()),
+            ShapeError,
+            "3072 rays for a camera of 24 pixels with 2 samples",
+        ),
+        (
+            lambda: show.frames(CAMERA, PLANE, POSES, "auto", rays=CAMERA.rays()),
+            DomainError,
+            "leave rays out",
+        ),
+        (
+            lambda: render.frames(Camera(Barrel(), 8, 8, 1.0, 1), PLANE, POSES, gradient="difference"),
+            DomainError,
+            "no step for the lens's parameter 'efl_mm_'",
+        ),
+        (differences_to_an_object, DomainError, "the pose of an object asks for one"),
+        *((lambda v=v: boundary(v), DomainError, "per_px = ") for v in (0, math.nan, math.inf, "2")),
+        (
+            lambda: show.shade(CAMERA.rays(), PLANE, POSES, 5),
+            ShapeError,
+            "48 rays are not a whole number of pixels",
+        ),
+        (too_many, DomainError, r"4294967296 rays .* \(frame_chunks\)"),
+        (lambda: show.view(CAMERA, PLANE, POSES, 2), ShapeError, "frame 2 of a sequence of 2"),
+        *(
+            (lambda n=n: render.true_flow(CAMERA, PLANE, POSES, n), ShapeError, "whole stride of at least 1")
+            for n in (0, 2, 1.5, math.nan)
+        ),
+        (
+            lambda: show.project(CAMERA, torch.ones(3, 2)),
+            ShapeError,
+            r"points .* \[..., N, 3\], got \(3, 2\)",
+        ),
+        (lambda: render.project(CAMERA, torch.tensor([[0.0, 0.0, -1.0]])), DomainError, "behind the camera"),
+        (lambda: render.project(CAMERA, torch.full((1, 3), math.nan)), DomainError, "points to project"),
+    ]
+)
+def test_cameras_and_frames_that_cannot_be(call, kind, sentence):
+    with pytest.raises(kind, match=sentence):
+        call()
+
+
+def test_more_frames_than_memory_holds_are_refused(monkeypatch):
+    monkeypatch.setattr("codesign.render.wavefront.memory_bytes", lambda: 48 * 100 * 8 - 1)
+    render.frames(CAMERA, PLANE, POSES[:1].expand(99, 4, 4))  # 48 rays each, float64
+    with pytest.raises(DomainError, match=r"4.8e\+03 rays .* render fewer frames at a time"):
+        render.frames(CAMERA, PLANE, POSES[:1].expand(100, 4, 4))
+    window = Film(200_000, 200_000, 8, 8, 0.001, ((99_996, 99_996),))
+    assert Camera(lens.Pinhole(8.0), 8, 8, 0.001, 1, film=window).rays().weight.numel() == 64
+
+
+# ---- views
+
+
+def ball_that_comes_nearer():
+    ball = MitsubaScene({"ball": {"type": "sphere", "radius": 0.2, "emitter": area(9.0)}})
+    poses = torch.eye(4, dtype=D).repeat(2, 1, 1)
+    poses[:, 2, 3] = torch.tensor([0.5, 1.9])
+    return MovingScene(PLANE, {"ball": (ball, poses)})
+
+
+def towards(*views):
+    return torch.stack([look_at(*view) for view in views])
+
+
+UP = look_at((0, 0, 2.0), (0, 0, 4.0), down=(0, 1, 0))
+INSIDE = ((0.5, -1.2, 1.4), (0, 1, 0.8))
+
+
+@pytest.mark.parametrize(
+    ("scene", "poses", "sentence"),
+    [
+        (lambda: PLANE, 1.01 * POSES, "not rigid"),
+        (
+            worlds.room,
+            towards(INSIDE, ((0.1, 0.5, 0.25), (0, 1, 0.3))),
+            "frame 1: 100% .* meet surfaces from behind",
+        ),
+        (lambda: worlds.room(objects=False), towards(((0, -4.0, 1.3), (0, 0, 1.3))), "behind a wall"),
+        (lambda: flat(50.0), towards(((0, -2.0, 0), (0, -3.0, 0))), "frame 0 is empty"),
+        (lambda: PLANE, torch.stack([ABOVE, ABOVE, ABOVE, UP]).unflatten(0, (2, 2)), "frame 3 is empty"),
+        (
+            lambda: PLANE,
+            look_at((0, 0, 2e-4), (0, 0, 0), down=(0, 1, 0))[None],
+            "0.201 mm before the camera, which is less than the radius",
+        ),
+        (
+            ball_that_comes_nearer,
+            look_at((0, 0, 2.0), (0, 0, 0), down=(0, 1, 0)).repeat(2, 1, 1),
+            "frame 1: 100%",
+        ),
+        (lambda: Shining(-3.0), POSES, "frame 0 has a radiance of -3"),
+    ],
+)
+def test_views_no_camera_could_have(scene, poses, sentence):
+    with pytest.raises(DomainError, match=sentence):
+        render.check_view(NARROW, scene(), poses)
+
+
+# ---- time
+
+
+def exposed(t_s: Any = (0.0,), exposure_s: Any = 0.01, samples: Any = 4, scale=1.0):
+    return render.exposed_frames(
+        CAMERA, PLANE, lambda t: scale * ABOVE.repeat(len(t), 1, 1), list(t_s), exposure_s, samples
+    )
+
+
+def adaptive(start_s: Any = 0.0, end_s: Any = 1.0, largest_px: Any = 0.5, every_px: Any = 1, jump_m=0.0):
+    def path(t):
+        twist = torch.zeros(len(t), 6, dtype=D)
+        twist[:, 0] = torch.where(t > 0.5, jump_m, 0.0)
+        return ABOVE @ se3_exp(twist)
+
+    return render.adaptive_times(CAMERA, PLANE, path, start_s, end_s, largest_px, every_px)
+
+
+@refused(
+    [
+        (lambda: adaptive(jump_m=0.5), DomainError, "jumps by"),
+        (lambda: render.crossing_error_px(1.0, 8.0, 0), DomainError, "slope = 0"),
+        (
+            lambda: render.frame_chunks(CAMERA, moving(STILL), POSES, 1),
+            ShapeError,
+            "'card' has 3 poses for 2",
+        ),
+        (lambda: render.camera_velocity(STILL, [0.0, 1.0]), ShapeError, "one time per pose"),
+        (lambda: render.camera_velocity(STILL[:1], [0.0]), ShapeError, "at least two"),
+        (lambda: render.camera_velocity(STILL, [0.0, 1.0, 1.0]), DomainError, "must increase"),
+        (
+            lambda: render.camera_velocity(
+                se3_exp(torch.tensor([[0.0] * 6, [0, 0, 0, 0, 3.1, 0]], dtype=D)), [0.0, 1.0]
+            ),
+            DomainError,
+            "turns by 178 degrees",
+        ),
+    ]
+)
+def test_times_that_cannot_be(call, kind, sentence):
+    with pytest.raises(kind, match=sentence):
+        call()
+
+
+# ---- light and point spread functions
+
+SHEET = {"type": "rectangle"}
+GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
+COPIES = {
+    "group": {"type": "shapegroup", "one": SHEET},
+    "a": {"type": "instance", "of": {"type": "ref", "id": "group"}},
+}
+
+
+def baked(**surface):
+    return light.bake({"a": {**SHEET, **surface}})
+
+
+def covered():
+    above = backend.mitsuba().ScalarTransform4f().translate([0, 0, 4.5e-5]).scale(2.0)
+    return light.bake(
+        {"a": {**SHEET, "bsdf": GREY}, "b": {**SHEET, "to_world": above, "bsdf": GREY}}, samples=1
+    )
+
+
+@refused(
+    [
+        (
+            lambda: baked(bsdf={"type": "conductor"}),
+            DomainError,
+            "shape 'a', a .*, lies behind it or before it",
+        ),
+        (lambda: baked(bsdf={"type": "mask", "bsdf": GREY}), DomainError, "shape 'a', a .*, lies behind it"),
+        (lambda: baked(interior={"type": "homogeneous"}), DomainError, "shape 'a' holds a medium"),
+        (lambda: light.bake(COPIES), DomainError, r"a Instance, has no texture chart here; .*copies instead"),
+        (covered, DomainError, "nothing of shape 'a' can be seen"),
+        (lambda: light.choose({}, CAMERA, POSES, 0.1), DomainError, "no level"),
+        (lambda: light.level_error(flat(1.0), flat(0.0), CAMERA, POSES), DomainError, "black"),
+        (backwards_through_paths, CodesignError, "PathScene has no gradient"),
+    ]
+)
+def test_light_that_cannot_be(call, kind, sentence):
+    with pytest.raises(kind, match=sentence):
+        call()
+
+
+THIN = Camera(lens.ThinLens(10.0, 2.0).focus_at(1.0), 48, 40, 0.02, 256)
+
+
+@pytest.fixture(scope="module")
+def psf():
+    return render.psf_map(THIN, nearest_m=1.0)
+
+
+def hollow():
+    front, back = lens.load("la1509").to_surfaces()
+    ring = dataclasses.replace(front, inner_semi_aperture_mm=2.0)
+    return Camera(lens.GeoLens([ring, back], 20.0), 48, 40, 0.001)
+
+
+@refused(
+    [
+        (
+            lambda psf: psf.energy(torch.tensor([0.5])),
+            DomainError,
+            "0.5 m is nearer than the 1 m.*smaller nearest_m",
+        ),
+        (
+            lambda psf: psf.energy(torch.tensor([2.0]), size_px=3),
+            DomainError,
+            "3 x 3 pixels .* odd number of at least 5",
+        ),
+        (lambda psf: psf.energy(2.0), ShapeError, r"distances must be a list \[D\]"),
+        (lambda psf: psf.offsets_px([1.1]), DomainError, "must lie between 0 and 1 per metre"),
+        (
+            lambda psf: render.psf_frames(
+                THIN, PLANE, look_at((0, 0, 0.5), (0, 0, 0), down=(0, 1, 0))[None], psf
+            ),
+            DomainError,
+            "0.5 m away, nearer than the 1 m of the map",
+        ),
+        (
+            lambda psf: render.psf_map(Camera(lens.ThinLens(10.0, 5.0), 48, 40, 0.02), nearest_m=0.02),
+            DomainError,
+            "blur reaches .* pixels .* larger nearest_m, or render traced",
+        ),
+        (lambda psf: render.psf_map(THIN, rays_per_px=9), DomainError, "rays_per_px = 9"),
+        (
+            lambda psf: render.psf_map(hollow()),
+            DomainError,
+            "central obstruction, which chief rays meet; .* traced frames",
+        ),
+        (lambda psf: render.psf_frames(CAMERA, PLANE, POSES, psf), ShapeError, "make the map of this camera"),
+        (
+            lambda psf: show.psf_frames(THIN, Glow(), POSES, psf),
+            DomainError,
+            "a Glow does not say how far away",
+        ),
+    ]
+)
+def test_point_spread_functions_that_cannot_be(psf, call, kind, sentence):
+    with pytest.raises(kind, match=sentence):
+        call(psf)
