@@ -570,10 +570,11 @@ def baked(**surface):
 
 
 def covered():
-    above = backend.mitsuba().ScalarTransform4f().translate([0, 0, 4.5e-5]).scale(2.0)
-    return light.bake(
-        {"a": {**SHEET, "bsdf": GREY}, "b": {**SHEET, "to_world": above, "bsdf": GREY}}, samples=1
-    )
+    """A sheet less than the height above it from which it would be looked at."""
+    place = backend.mitsuba().ScalarTransform4f()
+    above = place.translate([0, 0, 4.5e-5])
+    sheets = {"a": {**SHEET, "to_world": place.scale(0.5)}, "b": {**SHEET, "to_world": above}}
+    return light.bake({name: {**sheet, "bsdf": GREY} for name, sheet in sheets.items()}, samples=1)
 
 
 @refused(
