@@ -54,8 +54,8 @@ class NetworkFile:
 def network_class(name: str) -> type[Any]:
     """Class of the network called ``name``.
 
-    Raises: DomainError for a name that is not in NETWORKS, also for one of a class of the user's own: no file makes
-      anything be imported.
+    Raises: DomainError for a name that is not in NETWORKS, also for one of a class of the user's own:
+      no file makes anything be imported.
     """
     if ":" in name:
         raise DomainError(f"'{name}' is a class of your own; hand it over: flow.load(path, kind=...).")
@@ -90,8 +90,8 @@ def save(network: nn.Module, path: str | Path, metadata: Mapping[str, Any] | Non
     Args:
       network: nn.Module with its constructor's arguments in ``config``.
       metadata: plain JSON values to keep with it (seed, steps, figures, command), or None.
-    Raises: DomainError for a network without ``config``, weights that are not finite, and metadata that JSON cannot
-      hold; FileFormatError when the file cannot be written.
+    Raises: DomainError for a network without ``config``, weights that are not finite, and metadata
+      that JSON cannot hold; FileFormatError when the file cannot be written.
 
     >>> network = load("refiner")
     >>> save(network, "again.safetensors", {"note": "as delivered"})

@@ -24,8 +24,8 @@ NEGATIVE = -1e-3  # counts a hair below 0 are let through: steps of differences 
 
 
 def check_real(value: Any, name: str, dtypes: tuple[torch.dtype, ...] | None = None) -> Tensor:
-    """``value`` unchanged when it is a dense tensor of real floating-point numbers, of one of ``dtypes`` where
-    given; DomainError otherwise."""
+    """``value`` unchanged when it is a dense tensor of real floating-point numbers, of one of
+    ``dtypes`` where given; DomainError otherwise."""
     if not isinstance(value, Tensor):
         raise DomainError(f"{name} is a {type(value).__name__}; a torch tensor is needed.")
     if not value.is_floating_point() or (dtypes is not None and value.dtype not in dtypes):

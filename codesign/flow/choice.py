@@ -1,11 +1,11 @@
-"""Flow whose prior, levels, model and clock are chosen by how well the bins agree along it, zero flow among the
-candidates.
+"""Flow whose prior, levels, model and clock are chosen by how well the bins agree along it, zero flow
+among the candidates.
 
-A flow that is right carries every bin to the same signed picture. The agreement r of a flow is the correlation of
-pairs of blurred bins read along it, at least two bins apart, since neighbours share events. Events scattered at random
-have r = 0 along any flow, with a variance that their density tells; no flow gains by squeezing events together, since r
-is relative to what is read. Twice the likelihood gained over zero flow is about n log((1 - r0^2) / (1 - r^2)), n the
-inverse of that variance.
+A flow that is right carries every bin to the same signed picture. The agreement r of a flow is the
+correlation of pairs of blurred bins read along it, at least two bins apart, since neighbours share
+events. Events scattered at random have r = 0 along any flow, with a variance that their density tells;
+no flow gains by squeezing events together, since r is relative to what is read. Twice the likelihood
+gained over zero flow is about n log((1 - r0^2) / (1 - r^2)), n the inverse of that variance.
 """
 
 import math
@@ -38,8 +38,9 @@ CLOCKS = {False: "time", True: "turn"}
 TURNED = 0.95  # factor on 1 - r from which on events are the clock
 FAR = 0.9  # and the wide prior is taken
 FEW = 25.0  # nats over zero flow at which half of the flow is believed
-# bodies before still ground, logistic: extent of what agrees, logarithms of the share of the cells that hold it and of
-# how much worse shifts of places explain it than one affine field, 1; fitted to scenes.flow_harsh, flow_sets, other seeds
+# bodies before still ground, logistic: extent of what agrees, logarithms of the share of the cells
+# that hold it and of how much worse shifts of places explain it than one affine field, 1; fitted to
+# scenes.flow_harsh, flow_sets, other seeds
 BODIES = (-5.85, -2.79, -9.29, -6.8)
 MOST = 0.5  # of the third
 SURE = 0.6  # probability from which on they are taken for such
@@ -51,8 +52,8 @@ LEAST = 1e-3
 
 
 class Agreed(NamedTuple):
-    """alike: [B] the agreement r. sure: [B] inverse of its variance for scattered events. z: [B, H, W] of the pixels'
-    share in it, over its deviation for scattered events; empty where not asked for."""
+    """alike: [B] the agreement r. sure: [B] inverse of its variance for scattered events. z: [B, H, W]
+    of the pixels' share in it, over its deviation for scattered events; empty where not asked for."""
 
     alike: Tensor
     sure: Tensor
@@ -105,18 +106,22 @@ def _read(bins, unit):
 
 
 def estimate(volume: EventVolume, start_px: Tensor | None = None) -> FlowField:
-    """Flow over the volume's interval, with its uncertainty, where nothing is known of scene, motion and sensor.
+    """Flow over the volume's interval, with its uncertainty, where nothing is known of scene, motion
+    and sensor.
 
-    Chosen for each sample by the agreement of the bins: time or events as the clock, or a motion that turns back once
-    (``net_share`` tells); a local field with the prior of ``estimate_lk`` or a wide one for motions of many pixels; and
-    zero flow, towards which all shrinks where it explains the events as well. Where few places give nearly all events
-    and do not move as one, they are taken for bodies before still ground, and there is no flow beyond their outlines.
+    Chosen for each sample by the agreement of the bins: time or events as the clock, or a motion that
+    turns back once (``net_share`` tells); a local field with the prior of ``estimate_lk`` or a wide
+    one for motions of many pixels; and zero flow, towards which all shrinks where it explains the
+    events as well. Where few places give nearly all events and do not move as one, they are taken for
+    bodies before still ground, and there is no flow beyond their outlines.
 
     Args: volume, start_px: as of ``estimate_lk``; with fewer than 4 bins little can be told apart.
-    Returns: as of ``estimate_lk``. The covariance takes in how far the candidates are apart, and what was shrunk.
+    Returns: as of ``estimate_lk``. The covariance takes in how far the candidates are apart, and what
+      was shrunk.
     Gradient: counts, as of ``estimate_lk``, through what was chosen; none through the choice.
     Raises: ShapeError, DomainError.
-    Cost: forward 4 times a local field (docs/flow_closed_form.md); where a gradient is asked for, one field more.
+    Cost: forward 4 times a local field (docs/flow_closed_form.md); where a gradient is asked for, one
+      field more.
 
     >>> import torch
     >>> from codesign.flow.export import evenly_timed
@@ -161,8 +166,8 @@ def _followed(volume, chosen, start):
 
 
 class _Chosen(NamedTuple):
-    """found: the fields chosen, without gradient. turned, far: [B] bool. believed: [B, H, W] share of the flow. apart:
-    [B, 3, H, W] what is added to the claim."""
+    """found: the fields chosen, without gradient. turned, far: [B] bool. believed: [B, H, W] share of
+    the flow. apart: [B, 3, H, W] what is added to the claim."""
 
     found: FlowField
     turned: Tensor
@@ -206,8 +211,8 @@ def _unexplained(alike):
 
 
 def _bodies(local, shifts, one):
-    """Probability [B] that what agrees along the local field are bodies before still ground. shifts, one: [B] what shifts
-    of places and one affine field leave of it."""
+    """Probability [B] that what agrees along the local field are bodies before still ground. shifts,
+    one: [B] what shifts of places and one affine field leave of it."""
     cells = avg_pool2d(local.z.clamp_min(0)[:, None], CELL, ceil_mode=True)[:, 0]
     share = cells.sum((1, 2)).square() / (cells.square().sum((1, 2)) + TINY) / cells[0].numel()
     cells = avg_pool2d((local.z - NOISE).clamp_min(0).sqrt()[:, None], CELL, ceil_mode=True)[:, 0]
@@ -221,7 +226,8 @@ def _bodies(local, shifts, one):
 
 
 def _enclosed(moves):
-    """[B, H, W] bool: pixels among those that move, also within an outline, less the edge that the blur adds."""
+    """[B, H, W] bool: pixels among those that move, also within an outline, less the edge that the
+    blur adds."""
     closed = max_pool2d(moves.float(), 2 * CELL + 1, 1, CELL)
     return max_pool2d(1 - closed, 2 * (CELL + EDGE) + 1, 1, CELL + EDGE) < 0.5
 

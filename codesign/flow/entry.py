@@ -1,5 +1,5 @@
-"""What every network does around its layers: check the volume and bring it to the weights' type, normalise it,
-pad it to the stride, and fade the flow in with the events."""
+"""What every network does around its layers: check the volume and bring it to the weights' type,
+normalise it, pad it to the stride, and fade the flow in with the events."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -48,10 +48,11 @@ def takes_volume(
 ) -> Callable[Concatenate[Any, EventVolume, Given], Found]:
     """Make a network's method of an EventVolume refuse what is none, and compute in the type of the weights.
 
-    The counts are converted to the weights' type, float32 as delivered; the flow, confidence and covariance that
-    come back have the type of the counts, so a chain in float64 stays in float64, to the precision of the weights.
-    Raises: as check_volume, for another number of bins than ``config["bins"]`` too; DomainError for events and
-      weights on different devices.
+    The counts are converted to the weights' type, float32 as delivered; the flow, confidence and
+    covariance that come back have the type of the counts, so a chain in float64 stays in float64, to
+    the precision of the weights.
+    Raises: as check_volume, for another number of bins than ``config["bins"]`` too; DomainError for
+      events and weights on different devices.
     """
 
     @wraps(method)

@@ -36,8 +36,8 @@ def export(network: nn.Module, path: str | Path, height_px: int, width_px: int, 
       network: flow network with ``config["bins"]``. path: .pt2 (torch.export) or .onnx.
       height_px, width_px, batch: of the counts [batch, 2, bins, H, W] that the program takes; it returns flow
         [batch, 2, H, W] and confidence [batch, H, W].
-    Raises: MissingPackageError for ONNX without its packages; DomainError for another extension, and for a network with an
-      operation that ONNX lacks; FileFormatError when the
+    Raises: MissingPackageError for ONNX without its packages; DomainError for another extension, and
+      for a network with an operation that ONNX lacks; FileFormatError when the
       file cannot be written.
 
     Load .pt2 by ``torch.export.load(path).module()``, .onnx by any ONNX runtime (input "counts", outputs

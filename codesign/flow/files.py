@@ -176,8 +176,8 @@ def _from_png(path, content):
 
 
 def _bytes(content, order):
-    """The upper bytes [H, W, 3] of a PNG of 16 bits, or the lower ones where ``order`` says that they stand first:
-    Pillow keeps one byte of each number."""
+    """The upper bytes [H, W, 3] of a PNG of 16 bits, or the lower ones where ``order`` says that they
+    stand first: Pillow keeps one byte of each number."""
     with Image.open(io.BytesIO(content), formats=["PNG"]) as image:
         image.tile = [(*tile[:3], f"RGB;16{order}") for tile in image.tile]
         return np.asarray(image)

@@ -128,11 +128,12 @@ def laplace_loss(
     constant.
 
     Returns: scalar, sqrt(3) m + ln det S / 2. Of all densities exp(-k m) of two components this one has the
-      covariance S. A pixel far off pulls no harder than one at a deviation; where little is claimed errors count
-      less, so what nothing can be known of leaves the rest alone.
+      covariance S. A pixel far off pulls no harder than one at a deviation; where little is claimed
+      errors count less, so what nothing can be known of leaves the rest alone.
     Gradient, raises: as likelihood_loss; smooth below a hundredth of a deviation.
-    Source: Ilg et al., Uncertainty estimates and multi-hypotheses networks for optical flow, ECCV 2018, for the
-      likelihood; the covariance follows from the integral of m^3 exp(-k m) over that of m exp(-k m), 6 / k^2 = 2.
+    Source: Ilg et al., Uncertainty estimates and multi-hypotheses networks for optical flow, ECCV
+      2018, for the likelihood; the covariance follows from the integral of m^3 exp(-k m) over that of
+      m exp(-k m), 6 / k^2 = 2.
     """
 
     def nll(field, error):

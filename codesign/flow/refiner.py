@@ -28,7 +28,8 @@ OWN = 7  # what is told beside bins and evidence
 WIDEST = 10.0  # logarithm of the largest factor on a claim
 SMALLEST_PX2 = 1e-4
 SPARE_PX2 = 0.01  # unit of the variance that is added to the start's claim
-BENT = 0.01  # what one quadratic field leaves of the start, over its length, at which the correction counts by half,
+# what one quadratic field leaves of the start, over its length, at which the correction counts by half,
+BENT = 0.01
 BENT_PX = 0.03  # and in px
 
 
@@ -37,16 +38,17 @@ class Refiner(nn.Module):
 
     Args: bins: time bins of the volumes. width: channels on cells of 4 px, a multiple of 16. steps:
       corrections, by the same weights.
-    A correction reads the volume along the flow so far and solves V_t + u V_x + v V_y = 0 by least squares for what
-    still moves, on cells of 4 px, at three blurs and in windows of 12, 28 and 36 px, and tries the flows of cells around
-    (refiner_evidence). A U-Net on cells of 4, 8 and 16 px reads these solutions and how sure they are, the bins as they
-    are and along the flow so far, all in units of the noise of scattered events, the density of events, the flow so far
-    and the deviation that the closed form claims. It says cell by cell how much of each solution and neighbour to add,
-    adds something of its own in units of the claimed deviation, and says how pixels mix cells and how wide the claim is
-    to be. Fresh weights give the closed form as it is.
-    Bins are read at q + t flow(q), so the flow belongs to the pixels of the window's start.
-    The correction counts as far as the closed form bends away from one quadratic field: it does so where the events have
-    evidence for it, and without any (noise, thin packets, cameras that turn) the closed form stands as it is.
+    A correction reads the volume along the flow so far and solves V_t + u V_x + v V_y = 0 by least
+    squares for what still moves, on cells of 4 px, at three blurs and in windows of 12, 28 and 36 px,
+    and tries the flows of cells around (refiner_evidence). A U-Net on cells of 4, 8 and 16 px reads
+    these solutions and how sure they are, the bins as they are and along the flow so far, all in units
+    of the noise of scattered events, the density of events, the flow so far and the deviation that the
+    closed form claims. It says cell by cell how much of each solution and neighbour to add, adds
+    something of its own in units of the claimed deviation, and says how pixels mix cells and how wide
+    the claim is to be. Fresh weights give the closed form as it is. Bins are read at q + t flow(q), so
+    the flow belongs to the pixels of the window's start. The correction counts as far as the closed
+    form bends away from one quadratic field: it does so where the events have evidence for it, and
+      without any (noise, thin packets, cameras that turn) the closed form stands as it is.
 
     >>> from codesign.flow.export import evenly_timed
     >>> network = Refiner(bins=4, width=16, steps=1)
@@ -81,10 +83,12 @@ class Refiner(nn.Module):
     def forward(self, volume: EventVolume, start_px: Tensor | None = None, clock: str = "time") -> FlowField:
         """Flow of an EventVolume [B, 2, bins, H, W] of any H, W.
 
-        Args: start_px: [B, 2] or [B, 2, H, W] flow that is expected, px per interval, such as that of the window
+        Args: start_px: [B, 2] or [B, 2, H, W] flow that is expected, px per interval, such as that of
+          the window
           before: the closed form begins from it too (``estimate_lk``). clock: "time" or "events", as of
           ``estimate_lk``; corrections fade where motion turns back.
-        Returns: FlowField with confidence and covariance. An empty sample has flow 0, confidence 0 and no gradient.
+        Returns: FlowField with confidence and covariance. An empty sample has flow 0, confidence 0 and
+          no gradient.
         Gradient: counts and weights.
         Raises: ShapeError for other shapes or numbers of bins; DomainError for counts that are no events.
         """
@@ -111,8 +115,8 @@ class Refiner(nn.Module):
         """FlowFields after each whole correction, as it is trained, of an estimate with covariance, such as
         ``start(volume)``, whose covariance says how far it may be off. Gradient: counts, start and weights.
 
-        through: False leaves out the gradient through the places at which bins are read, as in the training of
-          RAFT (Teed and Deng, ECCV 2020): it takes a third off a step.
+        through: False leaves out the gradient through the places at which bins are read, as in the
+          training of RAFT (Teed and Deng, ECCV 2020): it takes a third off a step.
         """
         with torch.autocast(volume.counts.device.type, enabled=False):
             evidence = Evidence(replace(volume, counts=pad_to(volume.counts, CELL)), clock)
@@ -161,9 +165,9 @@ def _on_cells(image):
 
 
 def _on_pixels(image, edges):
-    """Pixels [B, C, CELL h, CELL w] of an image [B, C, h, w] on cells: each a mean of the nine cells around, with
-    weights that begin as those of linear interpolation (edges [B, 9 CELL^2, h, w] are 0), as in RAFT (Teed and Deng,
-    ECCV 2020, sec. 3.3)."""
+    """Pixels [B, C, CELL h, CELL w] of an image [B, C, h, w] on cells: each a mean of the nine cells
+    around, with weights that begin as those of linear interpolation (edges [B, 9 CELL^2, h, w] are 0),
+    as in RAFT (Teed and Deng, ECCV 2020, sec. 3.3)."""
     batch, channels, rows, columns = image.shape
     logits = edges.unflatten(1, (9, CELL, CELL)) + _linear().to(edges).log()[:, :, :, None, None]
     around = unfold(pad(image, (1, 1, 1, 1), mode="replicate"), 3).unflatten(1, (channels, 9))
@@ -172,16 +176,17 @@ def _on_pixels(image, edges):
 
 
 def _linear():
-    """[9, CELL, CELL] weights of the nine cells around in linear interpolation to the pixels of the middle one."""
+    """[9, CELL, CELL] weights of the nine cells around in linear interpolation to the pixels of the
+    middle one."""
     place = (torch.arange(CELL) + 0.5) / CELL - 0.5
     along = torch.stack([-place, 1 - place.abs(), place]).clamp_min(NEVER)
     return (along[:, None, :, None] * along[None, :, None, :]).flatten(0, 1)
 
 
 def _field(volume, start, present, shown, change, claim):
-    """FlowField from the change of the flow [B, 2, >= H, >= W] px and the claim [B, 2, h, w] on cells: logarithms of
-    the factor on the start's covariance and of the variance that is added; ``shown`` [B, 1, 1, 1] is how much of both
-    counts."""
+    """FlowField from the change of the flow [B, 2, >= H, >= W] px and the claim [B, 2, h, w] on cells:
+    logarithms of the factor on the start's covariance and of the variance that is added; ``shown`` [B,
+    1, 1, 1] is how much of both counts."""
     height, width = start.flow_px.shape[-2:]
     change, claim = (part[..., :height, :width] for part in (change, larger(claim, CELL)))
     factor, added = (WIDEST * torch.tanh(claim / WIDEST)).exp().split(1, 1)
@@ -200,7 +205,8 @@ def _claiming(volume, flow, covariance, present):
 
 
 def _bends(flow):
-    """[B, 1, 1, 1] in 0..1 by the root mean square of what a quadratic field leaves of a flow [B, 2, H, W]."""
+    """[B, 1, 1, 1] in 0..1 by the root mean square of what a quadratic field leaves of a flow [B, 2,
+    H, W]."""
     y, x = (torch.linspace(-1, 1, size).to(flow) for size in flow.shape[2:])
     y, x = torch.meshgrid(y, x, indexing="ij")
     basis = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y], -1).flatten(0, 1)

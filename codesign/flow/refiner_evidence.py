@@ -1,13 +1,15 @@
-"""What bins read along a flow say about the flow that is still missing: local least squares for V_t + u V_x + v V_y =
-0 at several blurs and in windows of several sizes, weighed by the noise of events scattered at random.
+"""What bins read along a flow say about the flow that is still missing: local least squares for V_t +
+u V_x + v V_y = 0 at several blurs and in windows of several sizes, weighed by the noise of events
+scattered at random.
 
-The noise is that of the closed form (lk.level): rho scattered events per pixel behind a Gaussian of sigma give
-temporal slopes of variance rho / (4 pi sigma^2 sum w t^2) and slopes of the mean of variance about rho / (8 pi
-sigma^4), alike over 4 pi sigma^2 px. With N the sums of products of slopes in a window, the precision is N over that
-variance and overlap; it counts by the share (g / (g + 4 z))^2 of the trace g of N, z what scattered events add to it.
+The noise is that of the closed form (lk.level): rho scattered events per pixel behind a Gaussian of
+sigma give temporal slopes of variance rho / (4 pi sigma^2 sum w t^2) and slopes of the mean of
+variance about rho / (8 pi sigma^4), alike over 4 pi sigma^2 px. With N the sums of products of slopes
+in a window, the precision is N over that variance and overlap; it counts by the share (g / (g + 4
+z))^2 of the trace g of N, z what scattered events add to it.
 
-At the border between two motions no window says where it runs, but the events near by are sharp along one of the two:
-flows of cells around are tried as they are (PatchMatch: Barnes et al., SIGGRAPH 2009).
+At the border between two motions no window says where it runs, but the events near by are sharp along
+one of the two: flows of cells around are tried as they are (PatchMatch: Barnes et al., SIGGRAPH 2009).
 """
 
 import math
@@ -47,7 +49,8 @@ OVERLAP = 4 * math.pi
 class Evidence:
     """A volume blurred at several scales, and what it says along a flow, px per way (lk.path).
 
-    Sides of the volume are multiples of CELL. density: [B, 1, h, w] events per px on cells; mean_density: [B, 1, 1, 1].
+    Sides of the volume are multiples of CELL. density: [B, 1, h, w] events per px on cells;
+    mean_density: [B, 1, 1, 1].
     net: [B, 1, 1, 1] displacement over the way, 1 for motion that never turns.
     """
 
@@ -73,13 +76,14 @@ class Evidence:
             self.levels.append((blur, grid, counts, pooled))
 
     def at(self, flow: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-        """What is still missing along a flow [B, 2, h, w] px on cells, of which ``variance`` [B, 1, h, w] px^2 is
-        claimed.
+        """What is still missing along a flow [B, 2, h, w] px on cells, of which ``variance`` [B, 1, h,
+        w] px^2 is claimed.
 
-        Returns: told [B, TOLD, h, w]: per blur and window the two flows below (4), logarithms of twice the likelihood
-          gained and of the precision, orientation of the texture (2), logarithms of what moves and of the texture over
-          their noise. solved [B, SOLVED, 2, h, w]: per blur and window two flows in px, where next to nothing is
-          expected (MOST_PX), and where the claim is believed (MISFIT).
+        Returns: told [B, TOLD, h, w]: per blur and window the two flows below (4), logarithms of twice
+          the likelihood gained and of the precision, orientation of the texture (2), logarithms of
+          what moves and of the texture over their noise. solved [B, SOLVED, 2, h, w]: per blur and
+          window two flows in px, where next to nothing is expected (MOST_PX), and where the claim is
+          believed (MISFIT).
         Gradient: flow, variance, volume.
         """
         told = []
@@ -99,9 +103,9 @@ class Evidence:
         """What the flows of cells around would explain here.
 
         Args: flow: [B, 2, h, w] px on cells.
-        Returns: told [B, TRIED, h, w]: for each cell of AROUND and window of TRIED_IN, by how much the events have more
-          contrast along its flow than along the cell's own, over the sum of both and of noise. offered
-          [B, len(AROUND), 2, h, w]: its flow less the cell's own, px.
+        Returns: told [B, TRIED, h, w]: for each cell of AROUND and window of TRIED_IN, by how much the
+          events have more contrast along its flow than along the cell's own, over the sum of both and
+          of noise. offered [B, len(AROUND), 2, h, w]: its flow less the cell's own, px.
         Gradient: flow, volume.
         """
         blur, grid, counts, _ = self.levels[TRIED_AT]
@@ -126,8 +130,8 @@ class Evidence:
         return torch.cat(told, 1), torch.stack(offered, 1)
 
     def bins(self, flow: Tensor) -> Tensor:
-        """Bins [B, 2 n, 2 h, 2 w] averaged over 2 x 2 px, over the noise of scattered events, large ones compressed:
-        as they are, and along a flow [B, 2, h, w] px on cells. Gradient: flow, volume."""
+        """Bins [B, 2 n, 2 h, 2 w] averaged over 2 x 2 px, over the noise of scattered events, large
+        ones compressed: as they are, and along a flow [B, 2, h, w] px on cells. Gradient: flow, volume."""
         along = larger(flow, CELL // POOL) / POOL
         bins, height, width = self.pooled.shape[1:]
         at = pixel_grid(height, width, along) + self.time.to(along)[:, None, None, None] * along[:, None]
@@ -138,8 +142,8 @@ class Evidence:
         return torch.cat([self.pooled, found.unflatten(0, (-1, bins))[:, :, 0]], 1)
 
     def _solved(self, sums, blur, variance):
-        """Flows [B, 2, h, w] px that the sums of a window ask for with the one prior and the other, and what is told of
-        the first [B, 6, h, w]."""
+        """Flows [B, 2, h, w] px that the sums of a window ask for with the one prior and the other,
+        and what is told of the first [B, 6, h, w]."""
         xx, xy, yy, xs, ys, ss, seen, events = sums.unbind(1)
         alike = OVERLAP  # samples, blur px apart, over which noise is alike
         density = (events + FEW * (seen + 1)) / (seen + 1)

@@ -1,5 +1,5 @@
-"""Flow along a stream of events: windows by time or by number of events, each with its flow and confidence, as the
-chunks of a camera come in."""
+"""Flow along a stream of events: windows by time or by number of events, each with its flow and
+confidence, as the chunks of a camera come in."""
 
 import inspect
 import time
@@ -31,7 +31,8 @@ MOST_EMPTY = 10_000  # windows without events that one chunk may bring
 class TrackedWindow:
     """One window of a stream and its flow.
 
-    t0_us, t1_us: from its start, included, to its end, which belongs to the next window. events: how many it has.
+    t0_us, t1_us: from its start, included, to its end, which belongs to the next window. events: how
+      many it has.
     field: FlowField [1, ...], px from t0 to t1. warm: the estimator was given the flow of the window before.
     processor_s: processor time that volume and estimate took, of all threads.
     """
@@ -55,10 +56,10 @@ class Tracker:
       size_px: (height, width) of the sensor, for events as arrays; an EventStream says it itself.
       warm_start: hand the flow of the window before, scaled to the new duration and carried along itself, to
         estimators that take ``start_px``; for others it changes nothing.
-      skip: faults that are left out and counted in ``left_out`` instead of refused (events) or handed out with
-        flow 0, confidence 0 and valid False (windows): names of SKIPPABLE.
-    windows, events: how many came out so far. processor_s: processor time spent, event_s: time of the stream that
-      was covered, seconds. left_out: {fault: number}.
+      skip: faults that are left out and counted in ``left_out`` instead of refused (events) or handed
+        out with flow 0, confidence 0 and valid False (windows): names of SKIPPABLE.
+    windows, events: how many came out so far. processor_s: processor time spent, event_s: time of the
+      stream that was covered, seconds. left_out: {fault: number}.
     Every event is in one window, whatever the chunks; memory is that of one chunk and one window.
     Raises: DomainError, ShapeError.
 
@@ -124,10 +125,10 @@ class Tracker:
     def add(self, chunk: Chunk) -> list[TrackedWindow]:
         """Take the next events in and return the windows that they complete.
 
-        Args: chunk: EventStream, or arrays (t_us, x, y, p) of whole numbers, p +1 and -1 or 1 and 0, with rising
-          times; of any length, 0 included.
-        Raises: DomainError for what is no such stream, for events before those of the chunks before or off the
-          sensor; ShapeError for another sensor.
+        Args: chunk: EventStream, or arrays (t_us, x, y, p) of whole numbers, p +1 and -1 or 1 and 0,
+          with rising times; of any length, 0 included.
+        Raises: DomainError for what is no such stream, for events before those of the chunks before or
+          off the sensor; ShapeError for another sensor.
         """
         stream = self._checked(chunk)
         if not len(stream):
@@ -144,7 +145,8 @@ class Tracker:
         return self._cut(_joined(self._parts), self._start_us, last=False)
 
     def finish(self) -> list[TrackedWindow]:
-        """Return the last window, which ends at the last event (a microsecond later where that is its start), and
+        """Return the last window, which ends at the last event (a microsecond later where that is its
+        start), and
         forget stream and clock: what is added next is another stream."""
         rest = _joined(self._parts) if self._parts else None
         found = [] if rest is None or self._start_us is None else self._cut(rest, self._start_us, last=True)
@@ -210,8 +212,8 @@ class Tracker:
         return tuple(values[~bad] for values in columns)
 
     def _cut(self, stream: EventStream, start_us: int, last: bool) -> list[TrackedWindow]:
-        """The complete windows of the waiting events, and with ``last`` the rest of them; what is not complete
-        waits on."""
+        """The complete windows of the waiting events, and with ``last`` the rest of them; what is not
+        complete waits on."""
         found = []
         at = 0
         while at < len(stream):
@@ -234,8 +236,8 @@ class Tracker:
         return found
 
     def _end(self, stream, at, start_us):
-        """Number of the first event behind the window that begins with event ``at``; all of them where there is
-        none."""
+        """Number of the first event behind the window that begins with event ``at``; all of them where
+        there is none."""
         if self.number is not None:
             return min(at + self.number, len(stream))
         return int(torch.searchsorted(stream.t_us, start_us + (self.window_us or 0)))
@@ -350,7 +352,8 @@ def _part(stream, first, last):
 
 
 def _carried_on(before, duration_us):
-    """Flow [1, 2, H, W] of the window before, at the same speed over the new duration, on the pixels it has led
+    """Flow [1, 2, H, W] of the window before, at the same speed over the new duration, on the pixels
+    it has led
     to: read where each pixel came from."""
     flow = before.field.flow_px
     height, width = flow.shape[2:]

@@ -1,4 +1,5 @@
-"""Pixel grids, bins of an event volume looked up along a flow, and flow over a long window from flows over parts of it."""
+"""Pixel grids, bins of an event volume looked up along a flow, and flow over a long window from flows
+over parts of it."""
 
 import torch
 from torch import Tensor

@@ -1,5 +1,5 @@
-"""Wrong calls of the flow package, as somebody makes who meets it for the first time: each gets one sentence that
-names what was given. And right calls of every size and type: they get an answer."""
+"""Wrong calls of the flow package, as somebody makes who meets it for the first time: each gets one
+sentence that names what was given. And right calls of every size and type: they get an answer."""
 
 import math
 from dataclasses import replace

@@ -1,5 +1,6 @@
-"""What every network that flow is compared with promises (any size, empty samples, exact gradients, a budget of weights,
-the same network from its configuration and its file), and of each its arithmetic written out."""
+"""What every network that flow is compared with promises (any size, empty samples, exact gradients, a
+budget of weights, the same network from its configuration and its file), and of each its arithmetic
+written out."""
 
 import numpy as np
 import pytest
@@ -99,8 +100,8 @@ def test_the_flow_fades_in_with_the_square_of_the_events():
     [(FlowNetEvents, 0.0), (FlowNetEvents, 0.3), (FlowNetEvents, 200.0), (ECN, 0.3), (IDNet, 0.3)],
 )
 def test_gradients_of_counts_and_weights_against_differences_of_the_loss(network, mean, generator):
-    """Central differences in float64 along random directions: error of order step^2 and rounding / step. Counts of nothing
-    but one event, of a textured scene, and of a saturated one."""
+    """Central differences in float64 along random directions: error of order step^2 and rounding /
+    step. Counts of nothing but one event, of a textured scene, and of a saturated one."""
     net = small(network)
     counts = (busy(1, 20, 24, mean=mean) + 0.5 * (mean > 0)).requires_grad_()
     with torch.no_grad():
@@ -192,8 +193,8 @@ def test_unfit_constructions_are_refused(build, sentence):
 
 
 def test_the_recurrent_unit_written_out():
-    """On one cell the 3 x 3 kernels touch their centre alone: z and r by the logistic function, h' = tanh(U (r
-    h) + W x), h <- (1 - z) h + z h'."""
+    """On one cell the 3 x 3 kernels touch their centre alone: z and r by the logistic function, h' =
+    tanh(U (r h) + W x), h <- (1 - z) h + z h'."""
     net = small(IDNet)
     read = torch.randn(1, BINS, 32, 1, 1, dtype=D, generator=torch.Generator().manual_seed(5))
     held = net.state_dict()
@@ -210,7 +211,8 @@ def test_the_recurrent_unit_written_out():
 
 
 def test_the_second_iteration_reads_what_the_first_one_deblurred():
-    """With a head that always says 8 px to the right on cells of 8, each bin is read where its points have got
+    """With a head that always says 8 px to the right on cells of 8, each bin is read where its points
+    have got
     to: 8 t px further; a bar that moves so stands still."""
     net = small(IDNet, iterations=2)
     with torch.no_grad():

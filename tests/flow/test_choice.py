@@ -21,7 +21,8 @@ def judged(family):
 
 @pytest.mark.parametrize("family", ["zoom_fine", "roll_fine"])
 def test_as_good_as_the_better_option(family):
-    """A window of weak texture is lost by the closed form as it is set (1.0 of zero flow), not by the wide prior."""
+    """A window of weak texture is lost by the closed form as it is set (1.0 of zero flow), not by the
+    wide prior."""
     windows, found = judged(family)
     wide = {"prior_px": 20.0, "levels_px": (8.0, 4.0, 2.0, 1.0)}
     errors = [
@@ -34,7 +35,8 @@ def test_as_good_as_the_better_option(family):
 
 @pytest.mark.parametrize(
     ("family", "most"),
-    # of zero flow; the closed form as it is set has 7 to 9 on out_and_back, 15 on small_discs, whose ground is still
+    # of zero flow; the closed form as it is set has 7 to 9 on out_and_back, 15 on small_discs, whose
+    # ground is still
     [("out_and_back", 0.7), ("vibration_hard", 0.5), ("noise", 1.001), ("small_discs", 0.7)],
 )
 def test_error_over_zero_flow(family, most):
@@ -66,8 +68,9 @@ def test_samples_do_not_see_each_other():
 
 
 def test_gradient_is_that_of_the_closed_form_that_was_chosen():
-    """On a plane in plain motion the choice is the closed form as it is set, nearly all of it believed: differences of
-    the estimate along a random direction, in float64, agree with its gradient, as long as the choice stays."""
+    """On a plane in plain motion the choice is the closed form as it is set, nearly all of it
+    believed: differences of the estimate along a random direction, in float64, agree with its
+      gradient, as long as the choice stays."""
     volume = HARSH["roll_fine"](SEED, 8).batch([0]).volume
     counts = volume.counts.double().requires_grad_()
     weight = torch.randn(1, 2, 128, 128, generator=torch.Generator().manual_seed(1), dtype=torch.float64)

@@ -1,5 +1,5 @@
-"""The kernels of the closed form against the same as operations of torch and in scipy, against differences, and against a
-plane that moves; programs that hold the plain operations."""
+"""The kernels of the closed form against the same as operations of torch and in scipy, against
+differences, and against a plane that moves; programs that hold the plain operations."""
 
 import gc
 import sys
@@ -28,7 +28,8 @@ from codesign.types import EventVolume
 
 D = torch.float64
 FADE_PX = 2.3
-# batch, bins, height, width, stride, cell; whole cells and cells cut off, one pair of bins, one row of samples
+# batch, bins, height, width, stride, cell; whole cells and cells cut off, one pair of bins, one row of
+# samples
 CASES = [
     (2, 3, 13, 9, 1, 4),
     (1, 2, 7, 22, 2, 3),
@@ -196,7 +197,8 @@ def test_other_sizes_need_no_new_kernel_but_for_copies_to_scatter_into(generator
 
 
 def test_no_garbage_is_collected_in_a_recording():
-    """A scene that is freed in one ends the process: the kernel makes more garbage than the collector waits for."""
+    """A scene that is freed in one ends the process: the kernel makes more garbage than the collector
+    waits for."""
     before = gc.get_threshold()
     collections = []
 
@@ -227,7 +229,8 @@ def test_no_garbage_is_collected_in_a_recording():
 
 
 def test_replaying_runs_no_python_while_drjit_holds_its_lock(generator):
-    """Another thread that got Python's lock meanwhile would wait for drjit's, and this one for Python's, for ever."""
+    """Another thread that got Python's lock meanwhile would wait for drjit's, and this one for
+    Python's, for ever."""
     (counts,) = leaves(torch.rand(2, 2, 5, 32, 32, dtype=D, generator=generator))
     times_s = torch.linspace(0, 0.02, 5, dtype=D)
 
@@ -292,7 +295,8 @@ def test_a_gpu_gives_what_the_processor_gives(generator):
 
 
 def places(model, joined, height, width, generator):
-    """Inputs of ``at_start``, and it as a function of them; flows lead beyond the border, cells differ by pixels."""
+    """Inputs of ``at_start``, and it as a function of them; flows lead beyond the border, cells differ
+    by pixels."""
     shape = Polynomials(model, height, width, 3.0)
     cells = Cells(2, height, width, 3.0, torch.device("cpu"))
 
@@ -358,7 +362,8 @@ class Closed(nn.Module):
 
 
 def test_a_program_follows_the_counts_it_is_given(generator):
-    """A kernel that the recording does not see would be a constant: the flow of the empty volume that was recorded.
+    """A kernel that the recording does not see would be a constant: the flow of the empty volume that
+    was recorded.
     The same sums in another order: 1e-4 px of flows of a pixel in single precision."""
     program = trace(Closed(), 16, 20).module()
     counts = torch.poisson(torch.full((1, 2, 2, 16, 20), 2.0), generator=generator)

@@ -1,4 +1,5 @@
-"""The closed form's local part: its tree against a dense solve, its fields where one polynomial does not do."""
+"""The closed form's local part: its tree against a dense solve, its fields where one polynomial does
+not do."""
 
 from contextlib import nullcontext
 
@@ -89,8 +90,8 @@ def test_the_trees_gradient_is_that_of_differences(generator):
 
 
 def test_two_motions_side_by_side():
-    # the left half moves by (2, 1), the right one by (-2, 1) px: no polynomial of second degree comes near; the best
-    # one, u = -3.75 x / w, leaves 0.7 px in the mean
+    # the left half moves by (2, 1), the right one by (-2, 1) px: no polynomial of second degree comes
+    # near; the best one, u = -3.75 x / w, leaves 0.7 px in the mean
     (left, left_px), (right, right_px) = moving(0, shift=(2.0, 1.0)), moving(1, shift=(-2.0, 1.0))
     counts = torch.cat([left.counts[..., :24], right.counts[..., 24:]], 4)
     truth = torch.cat([left_px[..., :24], right_px[..., 24:]], 2)

@@ -1,4 +1,5 @@
-"""Motion that is not even: speed that changes, motion that turns back, against displacements known in closed form."""
+"""Motion that is not even: speed that changes, motion that turns back, against displacements known in
+closed form."""
 
 import math
 
@@ -19,8 +20,9 @@ TIME = (torch.arange(BINS, dtype=D) + 0.5) / BINS
 
 
 def along(seed, way, reach_px):
-    """Volume [1, 2, 8, 48, 48] of the signed rate dL/dt of a pattern whose points are reach_px * way(t) from where they
-    were at t = 0, t in 0..1, in bins of equal length, and the displacement over the whole time [2, 48, 48]."""
+    """Volume [1, 2, 8, 48, 48] of the signed rate dL/dt of a pattern whose points are reach_px *
+    way(t) from where they were at t = 0, t in 0..1, in bins of equal length, and the displacement over
+    the whole time [2, 48, 48]."""
     y, x = torch.meshgrid(torch.arange(SIZE, dtype=D), torch.arange(SIZE, dtype=D), indexing="ij")
     shade = pattern(seed)
     edges = torch.linspace(0, 1, STEPS + 1, dtype=D)
@@ -56,7 +58,8 @@ def test_motion_there_and_back_is_no_displacement(seed):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_sensor_that_begins_with_the_window_is_no_slow_start(seed):
-    """All pixels begin in the middle of their thresholds, so that the first bin has half of its events. By events alone the flow is 13 to 18 % short; by time 6 to 9 %, since the first events of a
+    """All pixels begin in the middle of their thresholds, so that the first bin has half of its
+    events. By events alone the flow is 13 to 18 % short; by time 6 to 9 %, since the first events of a
     pixel come late."""
     y, x = torch.meshgrid(torch.arange(SIZE, dtype=D), torch.arange(SIZE, dtype=D), indexing="ij")
     shade = pattern(seed)

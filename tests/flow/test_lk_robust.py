@@ -1,4 +1,5 @@
-"""The closed form on volumes that say little or nothing, on sensors with faulty pixels, on images of any size."""
+"""The closed form on volumes that say little or nothing, on sensors with faulty pixels, on images of
+any size."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
-"""Warm starts of the closed form: fields of a known flow, motions that are found from near by only, and starts that are
-wrong."""
+"""Warm starts of the closed form: fields of a known flow, motions that are found from near by only,
+and starts that are wrong."""
 
 import pytest
 import torch
@@ -15,8 +15,8 @@ FINE_PX = (4.0, 8.0)  # a blur of 4 px leaves a thousandth of these textures
 
 @pytest.mark.parametrize("size", [(16, 24), (31, 18), (2, 3)])
 def test_a_polynomial_is_read_off_its_own_flow(size, generator):
-    """Within the fixed point (a factor of 0.1 in each of 5 steps) and the ridge (1e-6 of the mean diagonal, where the
-    least term counts some hundredth of the mean)."""
+    """Within the fixed point (a factor of 0.1 in each of 5 steps) and the ridge (1e-6 of the mean
+    diagonal, where the least term counts some hundredth of the mean)."""
     shape = polynomials.Polynomials("affine", *size)
     height, width = size
     matrix = 0.05 * torch.randn(2, 2, 2, generator=generator, dtype=D)

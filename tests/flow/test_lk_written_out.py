@@ -1,5 +1,6 @@
-"""One step of the closed-form estimator against its formulas written out in numpy (docs/flow_closed_form.md and
-the heads of lk/estimate.py, lk/level.py): what the data say, how far they are trusted, how far a step goes."""
+"""One step of the closed-form estimator against its formulas written out in numpy
+(docs/flow_closed_form.md and the heads of lk/estimate.py, lk/level.py): what the data say, how far
+they are trusted, how far a step goes."""
 
 import math
 
@@ -38,8 +39,8 @@ def blurred(image, taps):
 
 
 def slope_of_white_noise(taps, step):
-    """Variance per px^2 of the slope in x at the middle of an image of white noise: the sum over all pixels of
-    the square of what one pixel does there."""
+    """Variance per px^2 of the slope in x at the middle of an image of white noise: the sum over all
+    pixels of the square of what one pixel does there."""
     count = len(taps) + 4
     middle = count // 2
     answer = np.array([correlate1d(row, taps) for row in np.eye(count)]).T  # [sample, sample that is lit]
@@ -53,7 +54,8 @@ def basis(x, y, terms):
 
 
 def prior_precision(terms):
-    """Of u = sum p b, v = sum q b: shifts, then divergence, rotation and shears as half sums, then quadratics."""
+    """Of u = sum p b, v = sum q b: shifts, then divergence, rotation and shears as half sums, then
+    quadratics."""
     unit = np.eye(2 * terms)
     rows = [(unit[0], 1.0), (unit[terms], 1.0)]
     if terms >= 3:
@@ -139,8 +141,8 @@ def test_one_step_is_that_of_the_formulas_written_out(model, terms, sigma_px, pe
     monkeypatch.setattr(
         cells, "SIZES", (1e-9,)
     )  # the polynomial by itself: see test_lk_local for what it leaves
-    # plenty of events and large motion, where the step is limited; a hundredth of an event per pixel, where the
-    # prior and the few events of the start decide
+    # plenty of events and large motion, where the step is limited; a hundredth of an event per pixel,
+    # where the prior and the few events of the start decide
     volume, _ = moving(3, ((0.02, -0.03), (0.01, 0.04)), (5.0, -4.0), per_pixel, steps=20)
     field = certain(estimate_lk(volume, model, PRIOR_PX, (sigma_px,), 1, FLOOR))
     flow, covariance = one_step(volume, terms, sigma_px)

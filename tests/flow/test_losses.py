@@ -139,8 +139,8 @@ def test_likelihood_is_that_of_a_gaussian(generator):
 
 
 def test_long_tailed_likelihood_is_that_of_a_density_with_the_covariance_claimed(generator):
-    """exp(-sqrt(3) |e|) integrated over the plane in polar coordinates has the mass 2 pi / 3 and the second moment 1
-    along each axis; with it the loss is the log density of errors whitened by the claim."""
+    """exp(-sqrt(3) |e|) integrated over the plane in polar coordinates has the mass 2 pi / 3 and the
+    second moment 1 along each axis; with it the loss is the log density of errors whitened by the claim."""
     radius = torch.linspace(0, 40, 400_001, dtype=D)
     density = torch.exp(-math.sqrt(3) * radius) * 2 * math.pi * radius
     mass = float(torch.trapezoid(density, radius))

@@ -1,5 +1,5 @@
-"""The refining network: where it stands still, what it does to sizes, gradients against differences, what it is
-told of the flow that is missing, and what a few steps of training do."""
+"""The refining network: where it stands still, what it does to sizes, gradients against differences,
+what it is told of the flow that is missing, and what a few steps of training do."""
 
 import math
 
@@ -88,8 +88,8 @@ def test_bins_are_looked_up_along_the_flow():
 
 @pytest.mark.parametrize("size", [(64, 64), (37, 50), (9, 6)])
 def test_a_fresh_network_is_the_closed_form(size):
-    """Its last layers are zero: flow and, but for the 0.01 px^2 that are added, covariance come through; at any
-    size."""
+    """Its last layers are zero: flow and, but for the 0.01 px^2 that are added, covariance come
+    through; at any size."""
     counts = events(2, 2, 8, *size)
     start = estimate_lk(volume(counts), model="local")
     found = Refiner().double().refined(volume(counts), start)[-1]
@@ -118,7 +118,8 @@ def on_thin_packets():
 
 @pytest.mark.parametrize(
     ("case", "most_px", "of_start", "of_whole"),
-    # the whole correction makes 1.3 px of noise, nearly doubles the error on packets, takes off a tenth on layers
+    # the whole correction makes 1.3 px of noise, nearly doubles the error on packets, takes off a
+    # tenth on layers
     [(on_noise, 0.1, 1.001, 1.0), (on_thin_packets, 0.1, 1.05, 0.9), (on_layers, 1.0, 0.93, 1.01)],
 )
 def test_the_correction_counts_as_far_as_events_bend_the_field(case, most_px, of_start, of_whole):
@@ -140,8 +141,8 @@ def test_the_correction_counts_as_far_as_events_bend_the_field(case, most_px, of
 
 @pytest.mark.parametrize("missing", [(0.0, 0.0), (0.6, -0.4), (-0.5, 0.0)])
 def test_the_evidence_says_what_is_missing(missing):
-    """A texture that drifts by (2, -1) px, looked at along a flow that is short by ``missing``: what the finest
-    blur asks for, within the 0.1 px that the prior and second differences take."""
+    """A texture that drifts by (2, -1) px, looked at along a flow that is short by ``missing``: what
+    the finest blur asks for, within the 0.1 px that the prior and second differences take."""
     short = torch.tensor([2.0 - missing[0], -1.0 - missing[1]], dtype=D)
     unknown = torch.full((1, 1, 16, 16), MOST_PX**2 / MISFIT, dtype=D)
     _, solved = Evidence(drifting((2.0, -1.0))).at(short[None, :, None, None].expand(1, 2, 16, 16), unknown)
@@ -150,8 +151,9 @@ def test_the_evidence_says_what_is_missing(missing):
 
 
 def test_the_evidence_is_damped_least_squares(generator):
-    """Sums of products of slopes over a window: the solutions of (w N + 1 / MOST^2) f = -w r and of the same with the
-    claimed variance, with the weight of the module's docstring, bent towards 3 px at a blur of 1 px."""
+    """Sums of products of slopes over a window: the solutions of (w N + 1 / MOST^2) f = -w r and of
+    the same with the claimed variance, with the weight of the module's docstring, bent towards 3 px at
+    a blur of 1 px."""
     evidence = Evidence(drifting((0.0, 0.0), 16))
     slopes = (
         torch.randn(3, 60, generator=generator, dtype=D) * torch.tensor([0.3, 0.2, 0.2], dtype=D)[:, None]
@@ -177,8 +179,9 @@ def test_the_evidence_is_damped_least_squares(generator):
 
 
 def test_beside_a_border_the_flow_of_the_other_side_is_told_true_from_false():
-    """Two textures meet between the cells 7 and 8 and drift apart. Along the true flow every cell loses contrast by the
-    flow of the other side; where the left flow reaches two cells too far, the right one gains."""
+    """Two textures meet between the cells 7 and 8 and drift apart. Along the true flow every cell
+    loses contrast by the flow of the other side; where the left flow reaches two cells too far, the
+    right one gains."""
     noise = torch.randn(64, 64, generator=torch.Generator().manual_seed(6), dtype=D)
     left, right = (torch.stack([noise.roll(way * k, 0) for k in range(8)]) for way in (1, -1))
     bins = torch.where(torch.arange(64) < 32, left, right)
@@ -200,8 +203,8 @@ def test_beside_a_border_the_flow_of_the_other_side_is_told_true_from_false():
 
 
 def test_cells_become_pixels_linearly_until_edges_are_learnt():
-    """Without weights a picture linear in x and y stays linear but for the thousandth that every cell keeps; a cell that
-    is chosen gives its value to all its pixels."""
+    """Without weights a picture linear in x and y stays linear but for the thousandth that every cell
+    keeps; a cell that is chosen gives its value to all its pixels."""
     y, x = torch.meshgrid(torch.arange(6, dtype=D), torch.arange(7, dtype=D), indexing="ij")
     image = torch.stack([x, 2 * y - x])[None]
     found = _on_pixels(image, torch.zeros(1, 9 * CELL**2, 6, 7, dtype=D))
@@ -255,8 +258,8 @@ def test_an_empty_volume_gives_zero_flow_zero_confidence_and_zero_gradient():
 
 @pytest.mark.parametrize("case", ["one event", "saturated", "constant", "one row"])
 def test_odd_volumes_keep_value_and_gradient_tame(case):
-    """No scene moves by more than a few times the prior, whatever the counts: bounded flow, and a gradient of the
-    corrections that one-sided differences confirm (counts are not negative)."""
+    """No scene moves by more than a few times the prior, whatever the counts: bounded flow, and a
+    gradient of the corrections that one-sided differences confirm (counts are not negative)."""
     counts = torch.zeros(1, 2, 8, 16, 16, dtype=D)
     if case == "one event":
         counts[0, 0, 3, 8, 8] = 1.0
@@ -301,8 +304,8 @@ def test_a_start_of_your_own_is_where_it_begins():
 
 
 def test_events_may_be_the_clock():
-    """Bins of uneven speed: a fresh network is the closed form by that clock; motion that turns back keeps it even with
-    other weights, as far as it comes back to where it began."""
+    """Bins of uneven speed: a fresh network is the closed form by that clock; motion that turns back
+    keeps it even with other weights, as far as it comes back to where it began."""
     counts = events(1, 2, 8, 32, 48) * torch.linspace(0.2, 3.0, 8, dtype=D)[:, None, None]
     by_events = estimate_lk(volume(counts), model="local", clock="events").flow_px
     assert (by_events - estimate_lk(volume(counts), model="local").flow_px).abs().max() > 1e-3

@@ -1,5 +1,5 @@
-"""Flow along a stream: windows that hold every event once however the stream comes in, warm starts, faults, and a
-motion that is known."""
+"""Flow along a stream: windows that hold every event once however the stream comes in, warm starts,
+faults, and a motion that is known."""
 # pyright: reportArgumentType=false
 
 import random

@@ -22,8 +22,8 @@ class ECN(Baseline):
         first weights.
     Gradient: counts and weights; smooth, so any order.
     Raises: ShapeError, DomainError.
-    Source: Ye, Mitrokhin, Fermueller, Yorke, Aloimonos, Unsupervised learning of dense optical flow, depth and
-      egomotion with event-based sensors, IROS 2020, sec. III: the network of flow alone, with group
+    Source: Ye, Mitrokhin, Fermueller, Yorke, Aloimonos, Unsupervised learning of dense optical flow,
+      depth and egomotion with event-based sensors, IROS 2020, sec. III: the network of flow alone, with group
       normalisation in place of feature decorrelation, and all bins in place of a time image.
 
     >>> from codesign.flow.export import evenly_timed

@@ -57,8 +57,8 @@ class FlowNetEvents(Baseline):
         for layer, head in zip(self.decoder, self.heads, strict=True):
             x = torch.cat([x, skips.pop(), *flows[-1:]], 1)
             x = layer(interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False))
-            # normalisation takes the mean from what is handed on, so each level adds to the flow instead of saying it
-            # anew
+            # normalisation takes the mean from what is handed on, so each level adds to the flow
+            # instead of saying it anew
             change = head(x)
             flows.append(rescale_flow(flows[-1], change.shape[2:]) + change if flows else change)
         return flows

@@ -1,4 +1,5 @@
-"""A recurrent network that reads the bins of a volume one after the other, and again after deblurring them."""
+"""A recurrent network that reads the bins of a volume one after the other, and again after deblurring
+them."""
 
 import math
 from typing import ClassVar
@@ -29,8 +30,9 @@ class IDNet(Baseline):
     Gradient: counts and weights; piecewise smooth, as bilinear lookups and rectifiers are.
     Raises: ShapeError, DomainError.
     Source: Wu, Paredes-Valles, de Croon, Lightweight event-based optical flow estimation via iterative
-      deblurring, ICRA 2024, sec. III: without correlation volumes, flow at 1/8 resolution brought to all pixels
-      by learnt means of nine cells. Here bins are moved in place of single events, and the state starts at 0.
+      deblurring, ICRA 2024, sec. III: without correlation volumes, flow at 1/8 resolution brought to
+      all pixels by learnt means of nine cells. Here bins are moved in place of single events, and the
+      state starts at 0.
 
     >>> from codesign.flow.export import evenly_timed
     >>> IDNet(bins=4, width=4.0, iterations=2)(evenly_timed(torch.ones(1, 2, 4, 32, 48))).flow_px.shape

@@ -1,5 +1,5 @@
-"""What the networks that event flow is compared with share: from volume to fields of flow, layers, how many weights they
-have, where these start, and the widths that fill a budget."""
+"""What the networks that event flow is compared with share: from volume to fields of flow, layers, how
+many weights they have, where these start, and the widths that fill a budget."""
 
 from collections.abc import Callable, Iterable
 from typing import Any, ClassVar, Self
@@ -19,9 +19,9 @@ MOST_WEIGHTS = 10**9
 class Baseline(nn.Module):
     """A network on the counts of a volume, normalised and padded with emptiness to multiples of STRIDE.
 
-    Called with an EventVolume [B, 2, bins, H, W] of any H, W: FlowField, px per interval at full resolution. Its
-    confidence only says whether the sample had events. Computed in the type of the weights, returned in that of the
-    counts.
+    Called with an EventVolume [B, 2, bins, H, W] of any H, W: FlowField, px per interval at full
+    resolution. Its confidence only says whether the sample had events. Computed in the type of the
+    weights, returned in that of the counts.
     """
 
     STRIDE: ClassVar[int] = 16
@@ -47,15 +47,16 @@ class Baseline(nn.Module):
 
     @takes_volume
     def predictions(self, volume: EventVolume) -> list[FlowField]:
-        """Flow of every level or iteration at full resolution, in pixels there, coarse or early first; the last is what a
-        call returns."""
+        """Flow of every level or iteration at full resolution, in pixels there, coarse or early first;
+        the last is what a call returns."""
         return self._finished(volume, self._found(volume))
 
     def _found(self, volume):
         return self.levels(pad_to(normalise(volume.counts).flatten(1, 2), self.STRIDE), volume)
 
     def levels(self, counts: Tensor, volume: EventVolume) -> list[Tensor]:
-        """Flows [B, 2, h, w] of the padded image, each in pixels of its own grid, from coarse or early ones to the last.
+        """Flows [B, 2, h, w] of the padded image, each in pixels of its own grid, from coarse or early
+        ones to the last.
 
         Args: counts: [B, 2 bins, H', W'] normalised and padded, ON first. volume: for its times.
         """

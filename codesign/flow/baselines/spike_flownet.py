@@ -172,7 +172,8 @@ class _Fire(torch.autograd.Function):
     def forward(ctx, current, threshold, surrogate):
         ctx.threshold = threshold
         ctx.surrogate = surrogate
-        # the potential is made again: it would weigh as much, and the current ties a second derivative to its refusal
+        # the potential is made again: it would weigh as much, and the current ties a second derivative
+        # to its refusal
         ctx.save_for_backward(current)
         return _run(current, threshold, torch.empty_like(current[:1]))
 

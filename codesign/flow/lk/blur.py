@@ -1,8 +1,9 @@
-"""Means over squares and a symmetric kernel along both axes, mirrored at the border: in drjit, and as operations of
-torch.
+"""Means over squares and a symmetric kernel along both axes, mirrored at the border: in drjit, and as
+operations of torch.
 
-A lane goes down a column: it takes the horizontal sum of each row and keeps the last ones for the vertical sum, so
-nothing is stored between the two. An even continuation makes the blur A self-adjoint for a product in which the
+A lane goes down a column: it takes the horizontal sum of each row and keeps the last ones for the
+vertical sum, so nothing is stored between the two. An even continuation makes the blur A self-adjoint
+for a product in which the
 outermost samples count half: A^T = E A E^-1, E = 1/2 at the ends of an axis, 1 within.
 """
 
@@ -26,8 +27,8 @@ def blurred(images: Tensor, grid: Grid, taps: Sequence[float]) -> Tensor:
     Args:
       images: [B, n, H, W], the image that ``grid`` samples.
       taps: of a symmetric kernel, in samples: the middle one, then those to one side.
-    Returns: [B, n, h, w]. Beyond the outermost samples the image is continued by its mirror image, again and again
-      where the kernel is longer.
+    Returns: [B, n, h, w]. Beyond the outermost samples the image is continued by its mirror image,
+      again and again where the kernel is longer.
     Gradient: images; exact, the first one.
     Raises: ShapeError where images and grid do not fit; GradientError for a second derivative.
     """

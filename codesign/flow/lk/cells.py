@@ -1,10 +1,11 @@
-"""The local part of a flow field: values on cells of 8 px that a polynomial leaves, as smooth as the data ask.
+"""The local part of a flow field: values on cells of 8 px that a polynomial leaves, as smooth as the
+data ask.
 
-What the data say of a cell is weighed as the whole image is in level: by what scattered events alone would add to
-the slopes, and by the noise that a fit leaves, both over the 3 x 3 cells around. The field is a tree of steps
-(quadtree) whose variance grows sixfold from a scale to the next coarser one. How large it is, is not known: several
-sizes are tried, and their fields averaged with the weights that the evidence gives them (empirical Bayes). So the
-local part vanishes where one polynomial explains the image.
+What the data say of a cell is weighed as the whole image is in level: by what scattered events alone
+would add to the slopes, and by the noise that a fit leaves, both over the 3 x 3 cells around. The
+field is a tree of steps (quadtree) whose variance grows sixfold from a scale to the next coarser one.
+How large it is, is not known: several sizes are tried, and their fields averaged with the weights that
+the evidence gives them (empirical Bayes). So the local part vanishes where one polynomial explains the image.
 """
 
 import math
@@ -29,8 +30,8 @@ CLAIM = 0.7  # of the calibration of the whole image: sums over cells share fewe
 class Cells:
     """The local part over an image of height x width pixels, and what is known of it.
 
-    value, covariance: [B, 2 or 3, rows, columns] px per way, float64. widest: variance of each component before anything
-    is seen.
+    value, covariance: [B, 2 or 3, rows, columns] px per way, float64. widest: variance of each
+    component before anything is seen.
     """
 
     def __init__(self, batch: int, height: int, width: int, prior_px: float, device: torch.device) -> None:
@@ -60,8 +61,8 @@ class Cells:
     def step(self, level: Level, products: Tensor, change: Tensor) -> None:
         """Moves to the posterior mean.
 
-        Args: products: [B, 8, h, w] of a level's samples. change: [B, 2, h, w] what the polynomial moved since
-          they were taken.
+        Args: products: [B, 8, h, w] of a level's samples. change: [B, 2, h, w] what the polynomial
+          moved since they were taken.
         """
         precision, pull = self._evidence(level, self._summed(products, CELL // level.stride, change))
         pull = pull + _apply(precision, self.value)
@@ -79,8 +80,8 @@ class Cells:
         self.value = self.value + change * (1 + far).rsqrt()
 
     def _summed(self, products, step, change):
-        """[B, 8, rows, columns] products summed over cells of step x step samples, as they are once the flow has
-        changed by the cell's mean of ``change``: V_t grows by the slopes times the change."""
+        """[B, 8, rows, columns] products summed over cells of step x step samples, as they are once
+        the flow has changed by the cell's mean of ``change``: V_t grows by the slopes times the change."""
         rows, columns = (
             step * cells - samples
             for cells, samples in zip(self.value.shape[2:], products.shape[2:], strict=True)
@@ -118,7 +119,8 @@ class Cells:
         return _around(trust, own) / scale, pull / scale
 
     def _noise(self, level, around, damped, near):
-        """Variance [B, rows, columns] of the temporal slopes per sample: what a fit to the cells around leaves."""
+        """Variance [B, rows, columns] of the temporal slopes per sample: what a fit to the cells
+        around leaves."""
         right = -around[:, 3:5]
         fit = _apply(_inverse(damped), right)
         explained = (fit * (2 * right - _apply(near, fit))).sum(1)

@@ -2,11 +2,11 @@
 
 The signed event rate of a moving texture moves with it, so the volume obeys V_t + u V_x + v V_y = 0 (Lucas
 and Kanade, 1981, with event rate in place of intensity); time is the way that the scene has gone (path). The
-volume is warped back along the current flow; per pixel, the regression of the bins over the way gives V_t and their
-mean gives V_x, V_y; all pixels together pull at the parameters of a polynomial field (level), those of cells at
-what it leaves (cells). Gaussian priors on the field (polynomials, quadtree) hold against the pull, which is weighed
-by the noise that scattered events put into it, so that few events mean small steps, and the spread of what is left
-is returned with the flow.
+volume is warped back along the current flow; per pixel, the regression of the bins over the way gives
+V_t and their mean gives V_x, V_y; all pixels together pull at the parameters of a polynomial field
+(level), those of cells at what it leaves (cells). Gaussian priors on the field (polynomials, quadtree)
+hold against the pull, which is weighed by the noise that scattered events put into it, so that few
+events mean small steps, and the spread of what is left is returned with the flow.
 """
 
 from collections.abc import Sequence
@@ -46,8 +46,8 @@ def estimate_lk(
 
     Args:
       volume: EventVolume, counts [B, 2, bins >= 2, H >= 2, W >= 2]. Hot pixels are weighed down (hot_pixels).
-      model: "constant", "affine" or "quadratic" field over the image, or "local": a quadratic one and values on
-        cells of 8 px, as smooth as the data ask, for layers and depth.
+      model: "constant", "affine" or "quadratic" field over the image, or "local": a quadratic one and
+        values on cells of 8 px, as smooth as the data ask, for layers and depth.
       prior_px: standard deviation expected of each component of the flow at the image centre, px per
         interval; weak evidence leaves the flow near zero.
       levels_px: Gaussian blur of the volume, coarse to fine. steps: Gauss-Newton steps at each.
@@ -55,18 +55,19 @@ def estimate_lk(
         counts without quantisation or noise.
       clock: "time": motion is even over the interval. "events": it goes as the events come, and may turn back
         (``path``); for sensors that saw the scene before the window began, in steady light.
-      start_px: flow [B, 2] or [B, 2, H, W] on the pixels of the start, px per interval, expected of these windows (in a
-        video, that of the window before): its least-squares fit by the polynomial is one more field to descend from,
-        with the prior about it at the first of several levels. The descents from zero stay, and are averaged with it
-        by the contrast of the events along each.
+      start_px: flow [B, 2] or [B, 2, H, W] on the pixels of the start, px per interval, expected of
+        these windows (in a video, that of the window before): its least-squares fit by the polynomial
+        is one more field to descend from, with the prior about it at the first of several levels. The
+        descents from zero stay, and are averaged with it by the contrast of the events along each.
     Returns: FlowField on the pixels of the start of the interval: flow_px [B, 2, H, W] px per interval;
-      covariance_px2 [B, 3, H, W] of its error by the posterior; confidence [B, H, W] in 0..1, 1 - trace(covariance) /
-      trace(prior covariance), both of the flow along the whole way (``path``); valid is False for samples without
-      events, whose flow and confidence are 0 and whose covariance is the prior's.
+      covariance_px2 [B, 3, H, W] of its error by the posterior; confidence [B, H, W] in 0..1, 1 -
+      trace(covariance) / trace(prior covariance), both of the flow along the whole way (``path``);
+      valid is False for samples without events, whose flow and confidence are 0 and whose covariance
+      is the prior's.
     Gradient: counts, of flow, covariance and confidence; none to start_px.
     Raises: ShapeError, DomainError.
-    Cost: linear in pixels and bins; a level of blur s works on a grid of spacing 2^floor(log2 s) px. start_px adds a
-      descent on the first two levels.
+    Cost: linear in pixels and bins; a level of blur s works on a grid of spacing 2^floor(log2 s) px.
+      start_px adds a descent on the first two levels.
 
     >>> import torch
     >>> from codesign.flow.export import evenly_timed
@@ -116,7 +117,8 @@ def descended(
     noise_floor: float = 0.02,
     start_px: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Flow [B, 2, H, W] px per way on the pixels of the start, its covariance [B, 3, H, W] and confidence [B, H, W].
+    """Flow [B, 2, H, W] px per way on the pixels of the start, its covariance [B, 3, H, W] and
+    confidence [B, H, W].
 
     Args: found: as of ``level.along_path``. Others, gradient: as of ``estimate_lk``.
     """
@@ -183,8 +185,8 @@ def check_start(start_px: Tensor, counts: Tensor) -> Tensor:
 class Descent:
     """A field, and how surely it is known: a polynomial, and values on cells.
 
-    Where not ``local``, the cells are no part of the flow. They are found once, at the end: what one polynomial does
-    not explain is error of the field.
+    Where not ``local``, the cells are no part of the flow. They are found once, at the end: what one
+    polynomial does not explain is error of the field.
     """
 
     def __init__(self, shape: Polynomials, prior_px: float, local: bool, like: Tensor) -> None:
@@ -201,8 +203,8 @@ class Descent:
         self.cells = Cells(batch, shape.height, shape.width, prior_px, like.device)
 
     def begin(self, flow_px: Tensor, start: Tensor) -> None:
-        """Moves to the least-squares fit of a flow [B, 2, H, W], px per way, on the pixels of the start, which lies at
-        ``start`` [B] on the way."""
+        """Moves to the least-squares fit of a flow [B, 2, H, W], px per way, on the pixels of the
+        start, which lies at ``start`` [B] on the way."""
         self.found = self.expected = self.shape.fitted(flow_px, start)
 
     def parameters(self) -> Tensor:
@@ -217,9 +219,10 @@ class Descent:
     def descend(self, level: Level, steps: int, bend: bool, last: bool, expected: bool = False) -> None:
         """Moves to the best field, by steps no longer than the linearisation reaches.
 
-        Args: bend: whether cells of a local field move too; they do from the second step on, or the only one, since
-          what the polynomial has not yet reached looks like a local part. last: whether nothing follows. expected:
-          whether the prior is about the field of ``begin``, which a blur that sees nothing then leaves as it is.
+        Args: bend: whether cells of a local field move too; they do from the second step on, or the
+          only one, since what the polynomial has not yet reached looks like a local part. last:
+          whether nothing follows. expected: whether the prior is about the field of ``begin``, which a
+          blur that sees nothing then leaves as it is.
         """
         centre = self.expected if expected and self.expected is not None else torch.zeros_like(self.found)
         for step in range(steps):
@@ -236,8 +239,8 @@ class Descent:
                 self.cells.step(level, products, by_polynomial)
 
     def join(self, other: "Descent", level: Level) -> None:
-        """The mean of this field and another, by how much contrast the events along each have; where this one began
-        somewhere, also by the prior, which it has had few steps to meet."""
+        """The mean of this field and another, by how much contrast the events along each have; where
+        this one began somewhere, also by the prior, which it has had few steps to meet."""
         more = level.contrast_along(self.flow(level)) - level.contrast_along(other.flow(level))
         if self.expected is not None:
             more = more + other.found.square().sum(1) - self.found.square().sum(1)
@@ -248,8 +251,8 @@ class Descent:
             self.cells.value = other.cells.value + share * (self.cells.value - other.cells.value)
 
     def at_start(self, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Flow [B, 2, H, W], its covariance [B, 3, H, W] and confidence [B, H, W] on the pixels of the start, which
-        lies at ``start`` [B] on the way."""
+        """Flow [B, 2, H, W], its covariance [B, 3, H, W] and confidence [B, H, W] on the pixels of the
+        start, which lies at ``start`` [B] on the way."""
         unit = self.shape.unit
         spread = unit @ torch.linalg.inv(self.precision) @ unit.T
         return at_start(self.shape, self.parameters(), spread, self.cells, self.local, start)

@@ -1,7 +1,8 @@
 """Hot pixels weighed down.
 
-A pixel counts by k = 1 / (1 + e^2), e = max(0, n - 4 q - m) / (q + m): n events of the pixel, q the mean of the 24 pixels
-around it, m = 5 events. Moving texture puts events on several pixels; a hot pixel has them alone.
+A pixel counts by k = 1 / (1 + e^2), e = max(0, n - 4 q - m) / (q + m): n events of the pixel, q the
+mean of the 24 pixels around it, m = 5 events. Moving texture puts events on several pixels; a hot
+pixel has them alone.
 """
 
 import torch
@@ -20,8 +21,8 @@ def weighed_down(counts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
     Args:
       counts: [B, 2, n, H, W].
-    Returns: ON less OFF [B, n, H, W], events of both signs and all bins [B, H, W], both weighed, and the weights
-      [B, H, W].
+    Returns: ON less OFF [B, n, H, W], events of both signs and all bins [B, H, W], both weighed, and
+      the weights [B, H, W].
     Gradient: counts.
     """
     events = counts.sum((1, 2))

@@ -1,5 +1,5 @@
-"""What the kernels of the closed form share: the samples of an image, numbers for lanes of them, recordings, how a
-kernel enters a graph of torch, and the switch to plain operations of torch."""
+"""What the kernels of the closed form share: the samples of an image, numbers for lanes of them,
+recordings, how a kernel enters a graph of torch, and the switch to plain operations of torch."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -25,8 +25,8 @@ _PLAIN = ContextVar("plain operations", default=False)
 
 @contextmanager
 def plain_operations() -> Iterator[None]:
-    """Within it, operations of torch take the kernels' place: slower, for programs that run without this package
-    (export), and to compare with."""
+    """Within it, operations of torch take the kernels' place: slower, for programs that run without
+    this package (export), and to compare with."""
     token = _PLAIN.set(True)
     try:
         yield
@@ -82,12 +82,15 @@ class Form(NamedTuple):
 
 
 def recorded(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of hashable settings and then drjit arrays or lists of them, which is traced once for each of the
-    settings and replayed after that: small images cost mostly tracing. Widths of arrays must follow from the settings.
+    """A function of hashable settings and then drjit arrays or lists of them, which is traced once for
+    each of the
+    settings and replayed after that: small images cost mostly tracing. Widths of arrays must follow
+      from the settings.
 
-    While drjit looks at what a recording is given, or at what its closure holds, it holds its own lock. Where that runs
-    anything in Python, as for a dataclass, another thread may get Python's lock and wait for drjit's for ever (one that
-    gives tensors back to torch does). So settings, which have methods in Python, are not given but bound as defaults.
+    While drjit looks at what a recording is given, or at what its closure holds, it holds its own
+    lock. Where that runs anything in Python, as for a dataclass, another thread may get Python's lock
+    and wait for drjit's for ever (one that gives tensors back to torch does). So settings, which have
+    methods in Python, are not given but bound as defaults.
     """
 
     @lru_cache(RECORDINGS)
@@ -125,8 +128,9 @@ def in_graph(
 
     Args:
       forward: forward(*settings, *given) gives the outputs and what else the adjoint needs.
-      adjoint: adjoint(*settings, *given, *that, grads, wanted) gives a gradient, or None, of each of the given; ``grads``
-        are None where an output has no gradient, ``wanted`` says which of the given want one.
+      adjoint: adjoint(*settings, *given, *that, grads, wanted) gives a gradient, or None, of each of
+        the given; ``grads`` are None where an output has no gradient, ``wanted`` says which of the
+        given want one.
     """
     return _Kernel.apply(forward, adjoint, settings, *given)
 
@@ -218,8 +222,8 @@ class Lanes:
     def back(
         self, function: Callable[..., Any], given: list[Any], seeds: list[Any], leaves: Sequence[Any] = ()
     ) -> list[Any]:
-        """Gradients of what a function of lanes is given, from those of what it gives; then those of ``leaves``, which
-        it may add its own to."""
+        """Gradients of what a function of lanes is given, from those of what it gives; then those of
+        ``leaves``, which it may add its own to."""
         dr = self.dr
         with dr.resume_grad():
             given = [dr.detach(value) + 0 for value in given]

@@ -50,7 +50,8 @@ def along_path(volume: EventVolume, clock: str) -> tuple[Path, Tensor, Tensor]:
     """The way of the samples, weight and time of the bins [2, n], events of both signs per pixel [B, H, W];
     hot pixels weighed down.
 
-    clock: "time", "events", or "turn": events, with one turn of any speed. Weights are the shares of the interval; time is 0 at mid-interval, in intervals.
+    clock: "time", "events", or "turn": events, with one turn of any speed. Weights are the shares of
+      the interval; time is 0 at mid-interval, in intervals.
     """
     counts = volume.counts
     span = volume.collected_s.sum()
@@ -101,8 +102,8 @@ class Level:
         return cell_sums(mean, slope, seen, self.density, self.grid)
 
     def contrast_along(self, flow: Tensor) -> Tensor:
-        """Mean square [B] of the rate over the level's samples, in units of what scattered events give it, times how
-        many independent samples there are."""
+        """Mean square [B] of the rate over the level's samples, in units of what scattered events give
+        it, times how many independent samples there are."""
         mean, _, seen = self._moving(flow)
         square = (seen * mean.square()).sum((1, 2)) / (seen.sum((1, 2)) + TINY)
         noise = (self.density.mean((1, 2)) + TINY) / (OVERLAP * self.sigma**2)
@@ -116,7 +117,8 @@ class Level:
         return mean, self.gain[:, None, None] * slope, seen
 
     def evidence(self, products: Tensor) -> tuple[Tensor, Tensor]:
-        """Precision [B, 2K, 2K] that the data add where their products were taken, and their pull [B, 2K] on the
+        """Precision [B, 2K, 2K] that the data add where their products were taken, and their pull [B,
+        2K] on the
         parameters: precision times the distance to the best fit."""
         side = 2 * self.shape.terms
         slopes, scattered, right, energy, events = (
@@ -172,8 +174,8 @@ def _trusted(normal, scattered, right):
 
 
 def gaussian(sigma_px: float, step: int) -> Tensor:
-    """Taps [2 radius + 1], float64, on samples ``step`` px apart, that after averaging over squares of ``step`` px make
-    a Gaussian of standard deviation sigma."""
+    """Taps [2 radius + 1], float64, on samples ``step`` px apart, that after averaging over squares of
+    ``step`` px make a Gaussian of standard deviation sigma."""
     # in samples: the averages have variance (step^2 - 1) / 12 px^2
     spread = math.sqrt(sigma_px**2 - (step**2 - 1) / 12) / step
     radius = int((3.0 if step == 1 else 2.5) * spread + 0.5)

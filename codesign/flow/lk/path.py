@@ -1,12 +1,13 @@
 """How far along its way the scene is in each bin: events are the clock.
 
-Moving texture gives events by the way it goes, not by the time it takes, so a bin's share of the events is its
-share of the path. Where the motion turns back, what was ON becomes OFF in the same place: the signed counts of
-nearby bins are alike while the direction holds, and opposite across a turn. Turns are looked for only where
-events become rare, since speed passes through zero there.
+Moving texture gives events by the way it goes, not by the time it takes, so a bin's share of the
+events is its share of the path. Where the motion turns back, what was ON becomes OFF in the same
+place: the signed counts of nearby bins are alike while the direction holds, and opposite across a
+turn. Turns are looked for only where events become rare, since speed passes through zero there.
 
-Events are a false clock where a bin has few of them for another reason: a sensor that begins with the window has
-all its pixels in the middle of their thresholds, light that changes makes events of its own. Then time is the clock.
+Events are a false clock where a bin has few of them for another reason: a sensor that begins with the
+window has all its pixels in the middle of their thresholds, light that changes makes events of its
+own. Then time is the clock.
 """
 
 from dataclasses import dataclass
@@ -29,11 +30,12 @@ POOL = 4  # pixels a side over which counts are compared
 class Path:
     """The way of each sample, its whole length 1.
 
-    counts: [B, n, H, W] ON less OFF, in bins evenly spaced on the path as the volume's are in time, events on the
-      way back with their sign turned. net: [B] displacement over the way, 1 for motion that never turns. start:
-      [B] place of the beginning; 0 is the mean place of the events. spread: [B] mean square place of the events.
-    place: [B, n] of the volume's bins on the way. direction: [B, n] of the motion in them, 1 forwards, -1 on the way
-      back.
+    counts: [B, n, H, W] ON less OFF, in bins evenly spaced on the path as the volume's are in time,
+      events on the way back with their sign turned. net: [B] displacement over the way, 1 for motion
+      that never turns. start: [B] place of the beginning; 0 is the mean place of the events. spread:
+      [B] mean square place of the events.
+    place: [B, n] of the volume's bins on the way. direction: [B, n] of the motion in them, 1 forwards,
+      -1 on the way back.
     """
 
     counts: Tensor
@@ -47,8 +49,8 @@ class Path:
 def path(signed: Tensor, events: Tensor, weight: Tensor, time: Tensor, mirrored: bool = False) -> Path:
     """The way of each sample.
 
-    Args: signed: [B, n, H, W] ON less OFF per bin. events: [B, n] of both signs. weight, time: [n] share of the
-      interval that each bin collects, and its mean time, in intervals.
+    Args: signed: [B, n, H, W] ON less OFF per bin. events: [B, n] of both signs. weight, time: [n]
+      share of the interval that each bin collects, and its mean time, in intervals.
     Gradient: signed, events.
     """
     weight = weight.double()
@@ -93,8 +95,8 @@ def _shared(place, nodes):
 
 
 def _mirror(signed, weight):
-    """[B, n] in -1..1: one turn, or none. Bins as far before it as after it have seen the same places, with the
-    opposite sign, whatever the texture, the speed and the direction."""
+    """[B, n] in -1..1: one turn, or none. Bins as far before it as after it have seen the same places,
+    with the opposite sign, whatever the texture, the speed and the direction."""
     bins = len(weight)
     side = min(POOL, *signed.shape[2:])
     images = avg_pool2d(signed.detach(), side).flatten(2).double()

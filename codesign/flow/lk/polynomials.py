@@ -75,11 +75,12 @@ class Polynomials:
 
     @cached_property
     def equations(self) -> Tensor:
-        """Sums over an image to normal equations, which are linear in them: [8 s^2, 8 K^2 + 2 K + 2], float64.
+        """Sums over an image to normal equations, which are linear in them: [8 s^2, 8 K^2 + 2 K + 2],
+        float64.
 
-        Rows: the sums of ``slopes.cell_sums`` times y^i x^j, i, j < s = 2 degree + 1. Columns: in units of the
-        prior the matrix of the slopes and that of events as slopes along x and y, [2K, 2K] each, and the pull [2K];
-        then energy of the temporal slopes, and events.
+        Rows: the sums of ``slopes.cell_sums`` times y^i x^j, i, j < s = 2 degree + 1. Columns: in
+        units of the prior the matrix of the slopes and that of events as slopes along x and y, [2K,
+        2K] each, and the pull [2K]; then energy of the temporal slopes, and events.
         """
         side = 2 * self.degree + 1
         one = torch.eye(8 * side**2, dtype=torch.float64, device=self.unit.device)
@@ -121,14 +122,14 @@ class Polynomials:
         local: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]],
         joined: bool,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """From the field v at the mean place of the events to the flow on the pixels of the start, by fixed point:
-        w(x) = v(x - start w(x)).
+        """From the field v at the mean place of the events to the flow on the pixels of the start, by
+        fixed point: w(x) = v(x - start w(x)).
 
-        Args: parameters: [B, 2K]. start: [B] place of the start on the way, -1/2 for even motion. local: local part
-          and its covariance at pixel coordinates, (x, y) -> ([B, 2, H, W], [B, 3, H, W]). joined: whether it is part
-          of v.
-        Returns: flow [B, 2, H, W] px per way; where each pixel is at the mean place: the basis [B, K, H, W], the local
-          part and its covariance.
+        Args: parameters: [B, 2K]. start: [B] place of the start on the way, -1/2 for even motion.
+          local: local part and its covariance at pixel coordinates, (x, y) -> ([B, 2, H, W], [B, 3, H,
+          W]). joined: whether it is part of v.
+        Returns: flow [B, 2, H, W] px per way; where each pixel is at the mean place: the basis [B, K,
+          H, W], the local part and its covariance.
         """
         p = parameters.reshape(len(parameters), 2, self.terms)
         y, x = torch.meshgrid(torch.arange(self.height).to(p), torch.arange(self.width).to(p), indexing="ij")
@@ -148,8 +149,8 @@ class Polynomials:
         return flow if local is None else flow + local(x_px, y_px)[0], places
 
     def fitted(self, flow_px: Tensor, start: Tensor) -> Tensor:
-        """Numbers [B, 2K], float64, for which unit @ numbers are the parameters whose flow on the pixels of the start is
-        nearest to this one, px per way; args as of ``at_start``."""
+        """Numbers [B, 2K], float64, for which unit @ numbers are the parameters whose flow on the
+        pixels of the start is nearest to this one, px per way; args as of ``at_start``."""
         side = max(1, min(POOL, self.height // 2, self.width // 2))
         flow = avg_pool2d(flow_px.double(), side)
         y, x = (torch.arange(count).to(flow) * side + (side - 1) / 2 for count in flow.shape[2:])
@@ -186,8 +187,8 @@ class Polynomials:
 
 
 class Moments:
-    """Powers of x and y at the samples of ``grid``, up to twice the degree of ``shape``: values of fields, and sums of
-    images times powers. Powers are separable, so each costs two small matrix products."""
+    """Powers of x and y at the samples of ``grid``, up to twice the degree of ``shape``: values of
+    fields, and sums of images times powers. Powers are separable, so each costs two small matrix products."""
 
     def __init__(self, shape: Polynomials, grid: Grid, like: Tensor) -> None:
         """Args: like: tells precision and device."""

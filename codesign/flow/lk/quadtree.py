@@ -1,13 +1,14 @@
-"""Fields on cells, smooth over many scales: the exact posterior on a quadtree (Luettgen, Karl and Willsky, 1994).
+"""Fields on cells, smooth over many scales: the exact posterior on a quadtree (Luettgen, Karl and
+Willsky, 1994).
 
-A cell's value is its parent's plus a Gaussian step; the parents of the coarsest scale begin at zero. What the data
-say of the cells goes up the tree, each scale adding its doubt; means and covariances come down. All is linear in the
-number of cells. Trees see neighbours on two sides of a coarse border as strangers, so several, shifted against each
-other, are averaged.
+A cell's value is its parent's plus a Gaussian step; the parents of the coarsest scale begin at zero.
+What the data say of the cells goes up the tree, each scale adding its doubt; means and covariances
+come down. All is linear in the number of cells. Trees see neighbours on two sides of a coarse border
+as strangers, so several, shifted against each other, are averaged.
 
-In drjit a pass is one kernel for each scale, a lane for each cell. At the cells themselves the trees of one size of
-steps have the same data, so what goes up from there is found once for all of them. The adjoint of a cell is left to
-drjit; how cells hang together is written down here.
+In drjit a pass is one kernel for each scale, a lane for each cell. At the cells themselves the trees
+of one size of steps have the same data, so what goes up from there is found once for all of them. The
+adjoint of a cell is left to drjit; how cells hang together is written down here.
 """
 
 from itertools import pairwise
@@ -31,11 +32,11 @@ SHIFTS = ((0, 0), (5, 2), (2, 7), (7, 5))
 def posterior(precision: Tensor, pull: Tensor, steps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Mean, covariance and evidence of fields on cells, for steps of several sizes.
 
-    Args: precision: [B, 3, h, w] (xx, xy, yy) of what the data say of each cell by themselves, >= 0, float64. pull:
-      [B, 2, h, w] precision times the value they say. steps: [scales, S] variances of the steps to each scale, cells
-      first.
-    Returns: mean [S, B, 2, h, w], covariance [S, B, 3, h, w], and the logarithm [S, B] of the evidence for these
-      variances, relative to a field that is zero; covariance includes what the trees differ by.
+    Args: precision: [B, 3, h, w] (xx, xy, yy) of what the data say of each cell by themselves, >= 0,
+      float64. pull: [B, 2, h, w] precision times the value they say. steps: [scales, S] variances of
+      the steps to each scale, cells first.
+    Returns: mean [S, B, 2, h, w], covariance [S, B, 3, h, w], and the logarithm [S, B] of the evidence
+      for these variances, relative to a field that is zero; covariance includes what the trees differ by.
     Gradient: precision, pull; exact, the first one.
     """
     data = torch.cat([precision, pull], 1)
@@ -48,8 +49,8 @@ def posterior(precision: Tensor, pull: Tensor, steps: Tensor) -> tuple[Tensor, T
 
 
 class Trees(NamedTuple):
-    """How many sizes of steps are tried, how many scales there are, and the cells (down, right) that each tree is
-    shifted by."""
+    """How many sizes of steps are tried, how many scales there are, and the cells (down, right) that
+    each tree is shifted by."""
 
     sizes: int
     scales: int
@@ -118,7 +119,8 @@ def _plain(data, steps):
 
 @exclusive
 def _forward(trees, data, steps):
-    """Mean and covariance [S, B, 5, h, w] and evidence [S, B] of data [B, 5, h, w], and what the adjoint needs."""
+    """Mean and covariance [S, B, 5, h, w] and evidence [S, B] of data [B, 5, h, w], and what the
+    adjoint needs."""
     batch, _, height, width = data.shape
     form = Form.of(data, Grid(height, width))
     found = _up_and_down(form, trees, *form.load(data, steps))
@@ -206,7 +208,8 @@ def _gradients(form, trees, data, variances, by_values, by_evidence, *kept):
 
 
 class _Cells(Lanes):
-    """The cells of one scale: of all trees, or at scale 0, where their data are the same, of all sizes and images."""
+    """The cells of one scale: of all trees, or at scale 0, where their data are the same, of all sizes
+    and images."""
 
     def __init__(self, form, trees, variances, scale):
         super().__init__(form)
@@ -247,7 +250,8 @@ class _Cells(Lanes):
         return self.take(array, self.whole) * (1 / self.trees if self.scale else 1)
 
     def of_children(self, below, array, parts, apart=False):
-        """Sums over the four children of [sets, parts, cells]; ``apart``: at scale 0 [sets, trees, parts, cells]."""
+        """Sums over the four children of [sets, parts, cells]; ``apart``: at scale 0 [sets, trees,
+        parts, cells]."""
         dr = self.dr
         found = [dr.zeros(self.arr.Float)] * parts
         chosen = self.set if below.scale or apart else self.whole
@@ -303,7 +307,8 @@ class _Cells(Lanes):
         return a * xx + b * xy, a * xy + b * yy, b * xy + d * yy, x, y, evidence
 
     def below(self, xx, xy, yy, px, py, x, y, uu, uv, vv):
-        """Mean and covariance of cells, from what is summed up there and the mean and covariance of their parents."""
+        """Mean and covariance of cells, from what is summed up there and the mean and covariance of
+        their parents."""
         (a, b, d), _ = self.gain(xx, xy, yy)
         mean = _times((a, b, d), x + self.variance * px, y + self.variance * py)
         first = _times((a, b, d), uu, uv)

@@ -20,11 +20,12 @@ def cell_sums(
       mean, slope, seen: [B, h, w] as from ``warp.moving``, on the samples of ``grid``.
       density: [B, h, w].
       cell: side of the squares in samples, >= 1; those at the lower and right border hold what is left.
-    Returns: [B, 8, ceil(h / cell), ceil(w / cell)], sums over samples of seen times x x, x y, y y, x s, y s, s s, 1,
-      density, where x and y are the slopes of the mean per px (central differences, one-sided at the border; 0 where
-      there is one sample) and s is the slope over time.
+    Returns: [B, 8, ceil(h / cell), ceil(w / cell)], sums over samples of seen times x x, x y, y y, x
+      s, y s, s s, 1, density, where x and y are the slopes of the mean per px (central differences,
+      one-sided at the border; 0 where there is one sample) and s is the slope over time.
     Gradient: mean, slope, seen, density; exact, the first one.
-    Raises: ShapeError where shapes do not fit; DomainError where cell < 1; GradientError for a second derivative.
+    Raises: ShapeError where shapes do not fit; DomainError where cell < 1; GradientError for a second
+      derivative.
     """
     shapes = [list(x.shape) for x in (mean, slope, seen, density)]
     if any(shape != [len(mean), *grid.shape] for shape in shapes):
@@ -177,8 +178,9 @@ class _Slopes(Lanes):
 
 
 def _back(image, grad, start, at, last, step):
-    """Adjoint of ``difference`` without its factor: a sample is the upper end of the difference at the one before,
-    or at itself at the end, and the lower end of that at the next, or at itself at the beginning."""
+    """Adjoint of ``difference`` without its factor: a sample is the upper end of the difference at the
+    one before, or at itself at the end, and the lower end of that at the next, or at itself at the
+    beginning."""
     dr = image.dr
     inner = at > 0
     before = image.take(grad, start + dr.select(inner, at - 1, 0) * step)

@@ -1,9 +1,9 @@
-"""From the field at the mean place of the events to flow, covariance and confidence on the pixels of the start: in
-drjit, and as operations of torch.
+"""From the field at the mean place of the events to flow, covariance and confidence on the pixels of
+the start: in drjit, and as operations of torch.
 
-A lane goes down a part of a column with the coefficients of its image at hand; in the adjoint it sums up their
-gradients. The adjoint of a pixel, all rounds of its fixed point included, is left to drjit but for the cells, whose four
-values around a place are added to at once (as in ``warp``).
+A lane goes down a part of a column with the coefficients of its image at hand; in the adjoint it sums
+up their gradients. The adjoint of a pixel, all rounds of its fixed point included, is left to drjit
+but for the cells, whose four values around a place are added to at once (as in ``warp``).
 """
 
 from dataclasses import dataclass
@@ -40,7 +40,8 @@ class Setting:
 
     @property
     def of_flow(self) -> int:
-        """Coefficients that the flow depends on: how far an image is from its start, and the polynomials' own."""
+        """Coefficients that the flow depends on: how far an image is from its start, and the
+        polynomials' own."""
         return 1 + 2 * len(self.powers)
 
     @property
@@ -59,8 +60,8 @@ def at_start(
       cells: what is known of the field beside the polynomial.
       joined: whether they are part of the flow; else their mean is error.
       start: [B] place of the start on the way.
-    Returns: flow [B, 2, H, W] px per way, by ``Polynomials.at_start``; covariance [B, 3, H, W] of polynomial and cells;
-      confidence [B, H, W] in [0, 1], 1 - trace(covariance) / trace(prior covariance).
+    Returns: flow [B, 2, H, W] px per way, by ``Polynomials.at_start``; covariance [B, 3, H, W] of
+      polynomial and cells; confidence [B, H, W] in [0, 1], 1 - trace(covariance) / trace(prior covariance).
     Gradient: parameters, spread, cells, start; exact, the first one.
     """
     prior = (shape.unit @ shape.unit.T).to(parameters)[None]
@@ -225,7 +226,8 @@ class _Pixels(Lanes):
         return (self.image * parts + part) * self.area + y * self.across + self.column
 
     def flow(self, given, y, read):
-        """Flow on a pixel of the start, and where that is at the mean place. ``read`` takes what cells gave."""
+        """Flow on a pixel of the start, and where that is at the mean place. ``read`` takes what cells
+        gave."""
         back, *given = given
         terms = len(self.setting.powers)
         field = given[:terms], given[terms : 2 * terms]

@@ -1,8 +1,9 @@
 """Bins read along a flow, their mean and their slope over time: in drjit, and as operations of torch.
 
-The adjoint of a bin is left to drjit, but for what is read: it belongs to four neighbours. A lane adds to all of them at
-once, to the four values of the slot of its upper left neighbour; a second pass collects what belongs to a sample. That
-is a third of the time of four additions, which processors do one by one.
+The adjoint of a bin is left to drjit, but for what is read: it belongs to four neighbours. A lane adds
+to all of them at once, to the four values of the slot of its upper left neighbour; a second pass
+collects what belongs to a sample. That is a third of the time of four additions, which processors do
+one by one.
 """
 
 import torch
@@ -32,14 +33,16 @@ def moving(
       fade_px: the windows below fall smoothly from 1 to 0 over this distance to the border, px.
     Returns:
       mean, slope: [B, h, w]. Bins are read bilinearly; beyond the outermost samples, as there.
-      seen: [B, h, w] in [0, 1], product of the windows along x and y where the first and the last bin are read.
-    Gradient: rate, flow_px; exact, the first one. The flow has none through bins that it reads beyond the outermost
-      samples.
+      seen: [B, h, w] in [0, 1], product of the windows along x and y where the first and the last bin
+        are read.
+    Gradient: rate, flow_px; exact, the first one. The flow has none through bins that it reads beyond
+      the outermost samples.
     Raises: ShapeError where shapes do not fit; GradientError for a second derivative.
-    Cost: one pass forward, two backward; nothing of n bins is stored forward. Backward four values per sample and
-      bin, or ``MOST_VALUES`` where that is less, in each thread. One kernel for each number of bins,
-      whatever the sizes; it is traced once for each size.
-    Source: Lucas and Kanade, 1981; Jaderberg et al., Spatial Transformer Networks, NeurIPS 2015, for the reading.
+    Cost: one pass forward, two backward; nothing of n bins is stored forward. Backward four values per
+      sample and bin, or ``MOST_VALUES`` where that is less, in each thread. One kernel for each number
+      of bins, whatever the sizes; it is traced once for each size.
+    Source: Lucas and Kanade, 1981; Jaderberg et al., Spatial Transformer Networks, NeurIPS 2015, for
+      the reading.
     """
     batch, bins = rate.shape[:2]
     if rate.shape[2:] != grid.shape or flow_px.shape != (batch, 2, *grid.shape):
@@ -180,7 +183,8 @@ class _Warp(Lanes):
         return [(first + j, weights) for j, weights in enumerate(self.weights[start : start + count])]
 
     def value(self, k, time, u, v, read=None):
-        """Bin k where the flow (u, v) leads; ``read`` takes the four values around it, which then have gradients."""
+        """Bin k where the flow (u, v) leads; ``read`` takes the four values around it, which then have
+        gradients."""
         dr = self.dr
         (x, a), (y, b) = (self.along(*pair, time) for pair in zip(self.axes, (u, v), strict=True))
         at = (self.image * self.n + k) * self.area + y * self.across + x
@@ -199,7 +203,8 @@ class _Warp(Lanes):
         return self.back(lambda *flow: [self.value(k, time, *flow, four)], self.flow, [seed], four)
 
     def along(self, axis, flow, time):
-        """The lower of two neighbours, and the share of the other; no gradient beyond the outermost samples."""
+        """The lower of two neighbours, and the share of the other; no gradient beyond the outermost
+        samples."""
         dr = self.dr
         start, last, last_lower, _ = axis
         at = dr.fma(time * flow, self.per_stride, start)

@@ -1,5 +1,6 @@
-"""The camera of a recording: a pinhole with radial and tangential distortion, as in calib.txt (fx fy cx cy k1 k2 p1 p2
-k3), and how it turned: from its gyroscope (imu.txt) or from recorded poses (groundtruth.txt)."""
+"""The camera of a recording: a pinhole with radial and tangential distortion, as in calib.txt (fx fy
+cx cy k1 k2 p1 p2 k3), and how it turned: from its gyroscope (imu.txt) or from recorded poses
+(groundtruth.txt)."""
 
 import math
 import warnings
@@ -85,9 +86,10 @@ class Calibration:
     def raw_flow(self, flow_px: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Flow of undistorted pixels carried to the sensor's own.
 
-        Args: flow_px: [2, H, W] on the pixels of a pinhole with these focal lengths and this centre. valid: [H, W].
-        Returns: flow_px [2, H, W] on the pixels as the lens makes them, 0 where not valid; valid [H, W], where the
-          four undistorted pixels around are.
+        Args: flow_px: [2, H, W] on the pixels of a pinhole with these focal lengths and this centre.
+          valid: [H, W].
+        Returns: flow_px [2, H, W] on the pixels as the lens makes them, 0 where not valid; valid [H,
+          W], where the four undistorted pixels around are.
         """
         height, width = valid.shape
         slopes = self.directions(height, width)[..., :2]
@@ -171,8 +173,8 @@ class Attitude:
         return (turns[1].inv() * turns[0]).as_matrix()
 
     def missing(self, t0_s: float, t1_s: float) -> str:
-        """Why a window cannot be told of, in words: it is not covered by samples, or lies across a gap of more
-        than 0.1 s; empty where it can."""
+        """Why a window cannot be told of, in words: it is not covered by samples, or lies across a gap
+        of more than 0.1 s; empty where it can."""
         window = f"the window {t0_s:.6f} to {t1_s:.6f} s"
         if not (self.t_s[0] <= t0_s and t1_s <= self.t_s[-1]):
             return f"{self.name} covers {self.t_s[0]:.6f} to {self.t_s[-1]:.6f} s, not {window}"

@@ -165,8 +165,8 @@ def splatted(
     height_px: int,
     width_px: int,
 ) -> Tensor:
-    """Counts [2, bins, H, W] float32 of events at fractional places, as rectification leaves them, shared bilinearly by
-    four pixels and linearly by two bins.
+    """Counts [2, bins, H, W] float32 of events at fractional places, as rectification leaves them,
+    shared bilinearly by four pixels and linearly by two bins.
 
     Args:
       t_us: [N] int64 within t0_us to t1_us.

@@ -13,8 +13,8 @@ from codesign.events.files import READERS
 from codesign.flow.checks import check_path
 from codesign.reading import open_regular, reading
 
-# of several event files of one name the first of these kinds is read: text as the Event-Camera Dataset has it, what
-# cameras write, then arrays that somebody made of either
+# of several event files of one name the first of these kinds is read: text as the Event-Camera Dataset
+# has it, what cameras write, then arrays that somebody made of either
 KINDS = (".txt", ".csv", ".h5", ".hdf5", ".aedat4", ".raw", ".dat")
 EVENT_SUFFIXES = set(READERS)
 FLOW_SUFFIXES = {".flo", ".png", ".npy", ".npz", ".mat", ".txt", ".csv"}

@@ -1,4 +1,5 @@
-"""Arrays of numbers of a MATLAB file (.mat, versions 5 to 7); text, cells, structures and the rest are passed over.
+"""Arrays of numbers of a MATLAB file (.mat, versions 5 to 7); text, cells, structures and the rest are
+passed over.
 
 Source: MathWorks, "MAT-File Format" (level 5).
 """

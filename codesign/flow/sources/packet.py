@@ -19,7 +19,8 @@ GAP = "windows_across_gaps"
 OUTSIDE = "true_flows_outside"  # the recording, or before the start asked for
 SKIPPABLE = (BACKWARDS, OFF_SENSOR, EMPTY, GAP)  # what PacketOptions.skip may name
 MOST_S = 1e9  # of a recording
-# the flow of a translation, for a scene 1 m away, that makes the flow of rotation alone no truth: px, and a share of it
+# the flow of a translation, for a scene 1 m away, that makes the flow of rotation alone no truth: px,
+# and a share of it
 TRANSLATION_PX = 0.1
 TRANSLATION_SHARE = 0.25
 
@@ -38,14 +39,15 @@ GAP_EVENTS = 100
 class Packet:
     """A window of events with its true flow.
 
-    stream: the events of the window. t0_us, t1_us: its ends, both included. truth: flow over the window [1, 2, H,
-      W], or None. name, notes: for people.
-    rotation_only: the truth is the flow of the camera's rotation alone. neglected_px: length of the flow that it
-      leaves out, for a scene 1 m away; None where nobody recorded how the camera moved.
-    undistorted_px: by how much the truth would be off in the mean if it belonged to undistorted pixels; 0 where
-      the camera has no distortion, or none is known.
+    stream: the events of the window. t0_us, t1_us: its ends, both included. truth: flow over the
+      window [1, 2, H, W], or None. name, notes: for people.
+    rotation_only: the truth is the flow of the camera's rotation alone. neglected_px: length of the
+      flow that it leaves out, for a scene 1 m away; None where nobody recorded how the camera moved.
+    undistorted_px: by how much the truth would be off in the mean if it belonged to undistorted
+      pixels; 0 where the camera has no distortion, or none is known.
     across_gap: at least half of the window lies where the recording has no event at all.
-    left_out: how many events and windows of the recording were left out, by fault; the same for all its packets.
+    left_out: how many events and windows of the recording were left out, by fault; the same for all
+      its packets.
     """
 
     name: str
@@ -81,9 +83,10 @@ class PacketOptions:
       "px" per interval or "px/s".
     truth_interval_s: what a flow without times of its own covers. gyro_axes: camera axes from the
       gyroscope's. calibration: file, instead of calib.txt beside.
-    truth_pixels: "raw" where flow files belong to the sensor's pixels, "undistorted" where to those of a pinhole
-      with the same focal lengths and centre, from which they are then carried to the sensor's.
-    skip: faults that are left out and counted instead of refused (events) or kept (windows): names of SKIPPABLE.
+    truth_pixels: "raw" where flow files belong to the sensor's pixels, "undistorted" where to those of
+      a pinhole with the same focal lengths and centre, from which they are then carried to the sensor's.
+    skip: faults that are left out and counted instead of refused (events) or kept (windows): names of
+      SKIPPABLE.
     """
 
     window_s: float | None = None
@@ -191,7 +194,8 @@ def without(
 
 
 def gaps(t_us: np.ndarray) -> np.ndarray:
-    """Times without any event [N, 2], microseconds: at least 10 ms, and 100 times the mean time between events."""
+    """Times without any event [N, 2], microseconds: at least 10 ms, and 100 times the mean time
+    between events."""
     least_us = max(GAP_US, GAP_EVENTS * float(t_us[-1] - t_us[0]) / max(len(t_us) - 1, 1)) if len(t_us) else 0
     at = np.flatnonzero(np.diff(t_us) > least_us)
     return np.stack([t_us[at], t_us[at + 1]], -1)

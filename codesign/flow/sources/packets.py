@@ -115,10 +115,12 @@ def read_text_events(
     """Read events from a file of text, or any other that events.read takes.
 
     Args:
-      path: file. size: (height, width) of the sensor. told, told_by: the same from what lies beside, and what that is.
-        Without either, the smallest sensor of SENSORS_PX that holds the events, where the file does not say.
+      path: file. size: (height, width) of the sensor. told, told_by: the same from what lies beside,
+        and what that is. Without either, the smallest sensor of SENSORS_PX that holds the events,
+        where the file does not say.
       columns, time_unit: as of events.read.
-      skip: faults whose events are left out and counted instead of refused: events_back_in_time, events_off_sensor.
+      skip: faults whose events are left out and counted instead of refused: events_back_in_time,
+        events_off_sensor.
     Returns: EventColumns in order of time. Events up to 1 ms late are put in order.
     Raises: FileFormatError, as events.read, and where no event is left.
     """
@@ -220,7 +222,8 @@ def _cut(file, truth_path, options):
 
 
 def _cut_by_flows(file, held, source: Truth, flows, whole, start_us, options, notes):
-    """Windows of one event file with a flow for each: those of the flows' own times, or one after the other."""
+    """Windows of one event file with a flow for each: those of the flows' own times, or one after the
+    other."""
     asked = options.window_s is not None or options.events is not None
     unlimited = replace(options, skip=(), count=options.count or len(flows))
     left_out = {}

@@ -1,4 +1,5 @@
-"""Training data, whichever of the layouts it has, and windows of any recording that ``read_packets`` reads."""
+"""Training data, whichever of the layouts it has, and windows of any recording that ``read_packets``
+reads."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,10 +20,12 @@ ALL = 2**31  # more windows than any recording has
 
 
 class RecordingWindows(Windows):
-    """Windows of a recording: events in text, arrays or an event file, packets with flow files, or a zip of either.
+    """Windows of a recording: events in text, arrays or an event file, packets with flow files, or a
+    zip of either.
 
     Args:
-      path: as for read_packets. bins: of the volumes. crop_px: (height, width) of a piece at a random place, or None.
+      path: as for read_packets. bins: of the volumes. crop_px: (height, width) of a piece at a random
+        place, or None.
       seed: of that place.
       options: PacketOptions; windows of 20 ms, all of them, where it does not say.
     Where nothing is known of the flow, ``truth.valid`` is False. All events are kept in memory.

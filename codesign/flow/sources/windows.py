@@ -1,5 +1,5 @@
-"""Windows of recordings as samples to learn from: what every source of them shares, samples of a batch put together, and
-pieces cut out of large pictures."""
+"""Windows of recordings as samples to learn from: what every source of them shares, samples of a batch
+put together, and pieces cut out of large pictures."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -96,8 +96,8 @@ class Windows:
         return len(self.windows)
 
     def batch(self, indices: Iterable[int] | Tensor) -> FlowWindows:
-        """FlowWindows of these samples; each depends on its index and the seed alone. Frames are None where a source has
-        none."""
+        """FlowWindows of these samples; each depends on its index and the seed alone. Frames are None
+        where a source has none."""
         chosen = [int(index) for index in indices]
         if wrong := [index for index in chosen if not 0 <= index < len(self)]:
             raise DomainError(
