@@ -126,8 +126,9 @@ def save(network: nn.Module, path: str | Path, metadata: Mapping[str, Any] | Non
 def load(name_or_path: str | Path, kind: Callable[..., Any] | None = None) -> "Network":
     """A trained network, in evaluation mode, on the CPU.
 
-    Args: name_or_path: "refiner", the one delivered with the package, or the path of a file that ``save``
-      wrote.
+    Args:
+      name_or_path: "refiner", the one delivered with the package, or the path of a file that ``save``
+        wrote.
       kind: the class of a network of one's own, called with the stored ``config``.
     Returns: the network, a callable from EventVolume to FlowField. Its weights still take gradients;
       ``requires_grad_(False)`` saves their cost.

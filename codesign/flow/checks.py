@@ -55,7 +55,8 @@ def check_mask(value: Any, name: str, shape: tuple[int, ...]) -> Tensor:
 def check_volume(volume: EventVolume, bins: int | None = None, least_bins: int = 1) -> Tensor:
     """Counts [B, 2, bins, H, W] of an event volume that an estimator or a loss can take.
 
-    Args: bins: as many are needed; None: at least ``least_bins``.
+    Args:
+      bins: as many are needed; None: at least ``least_bins``.
     Raises: DomainError for anything but an EventVolume, counts that are not float32 or float64, NaN, infinite
       or below -0.001, bins that collect no time; ShapeError for other axes, empty ones, or other bins.
     """

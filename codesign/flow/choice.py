@@ -115,7 +115,8 @@ def estimate(volume: EventVolume, start_px: Tensor | None = None) -> FlowField:
     events as well. Where few places give nearly all events and do not move as one, they are taken for
     bodies before still ground, and there is no flow beyond their outlines.
 
-    Args: volume, start_px: as of ``estimate_lk``; with fewer than 4 bins little can be told apart.
+    Args:
+      volume, start_px: as of ``estimate_lk``; with fewer than 4 bins little can be told apart.
     Returns: as of ``estimate_lk``. The covariance takes in how far the candidates are apart, and what
       was shrunk.
     Gradient: counts, as of ``estimate_lk``, through what was chosen; none through the choice.

@@ -60,10 +60,10 @@ def volume_tracks(volume: EventVolume, flow_px: Tensor, carry_steps: int = 0) ->
     """Tracks of the contents of an event volume, each bin at its centroid.
 
     Args:
-      volume: EventVolume, counts [B, 2, bins, H, W]. flow_px: [B, 2, H, W] pixels per window, on the pixels
-        of its start.
-      carry_steps: fixed-point steps that look for the start of each track; 0 takes the flow of the pixel
-        where the event is.
+      volume: EventVolume, counts [B, 2, bins, H, W].
+      flow_px: [B, 2, H, W] pixels per window, on the pixels of its start.
+      carry_steps: fixed-point steps that look for the start of each track; 0 takes the flow of the
+        pixel where the event is.
     Returns: EventTracks of N = bins H W.
     Gradient: counts and flow_px.
     Raises: ShapeError; DomainError for a flow that is not finite.
@@ -93,8 +93,10 @@ def stream_tracks(
     """Tracks of the single events from t0 to t1, both included, at their time stamps.
 
     Args:
-      stream: EventStream. flow_px: [2, H, W] or [1, 2, H, W] pixels from t0 to t1. t0_us, t1_us: whole
-        microseconds. carry_steps: as in volume_tracks.
+      stream: EventStream.
+      flow_px: [2, H, W] or [1, 2, H, W] pixels from t0 to t1.
+      t0_us, t1_us: whole microseconds.
+      carry_steps: as in volume_tracks.
     Returns: EventTracks of B = 1.
     Gradient: flow_px.
     Raises: ShapeError; DomainError for an empty interval, an interval without events, or a flow that is not
@@ -249,7 +251,8 @@ def area_change(jacobian: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
 def sharpness(image: Tensor) -> Tensor:
     """Mean squared slope of the image, both polarities added.
 
-    Args: image: [B, 2, H, W] counts.
+    Args:
+      image: [B, 2, H, W] counts.
     Returns: [B] (events per pixel)^2 per px^2, by differences of neighbours.
     Gradient: image.
     Source: Gallego et al., Focus is all you need, CVPR 2019.

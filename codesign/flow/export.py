@@ -33,9 +33,10 @@ def export(network: nn.Module, path: str | Path, height_px: int, width_px: int, 
     """Write a network as a program for one size of input.
 
     Args:
-      network: flow network with ``config["bins"]``. path: .pt2 (torch.export) or .onnx.
-      height_px, width_px, batch: of the counts [batch, 2, bins, H, W] that the program takes; it returns flow
-        [batch, 2, H, W] and confidence [batch, H, W].
+      network: flow network with ``config["bins"]``.
+      path: .pt2 (torch.export) or .onnx.
+      height_px, width_px, batch: of the counts [batch, 2, bins, H, W] that the program takes; it
+        returns flow [batch, 2, H, W] and confidence [batch, H, W].
     Raises: MissingPackageError for ONNX without its packages; DomainError for another extension, and
       for a network with an operation that ONNX lacks; FileFormatError when the
       file cannot be written.

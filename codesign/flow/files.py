@@ -43,8 +43,10 @@ PNG_END = _chunk(b"IEND", b"")
 def write_flow(path: str | Path, flow_px: torch.Tensor, valid: torch.Tensor | None = None) -> None:
     """Write one flow field; the file appears whole or not at all.
 
-    Args: path: ending in .png (DSEC) or .flo. flow_px: [2, H, W] px, +x right, +y down. valid: [H, W] bool,
-      everything when None.
+    Args:
+      path: ending in .png (DSEC) or .flo.
+      flow_px: [2, H, W] px, +x right, +y down.
+      valid: [H, W] bool, everything when None.
     Raises: ShapeError; DomainError when a valid flow is not finite or does not fit the format;
       FileFormatError for another extension or a folder not writable.
 

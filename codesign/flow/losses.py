@@ -56,13 +56,13 @@ def supervised_loss(
     """Charbonnier loss on the endpoint error of a list of predictions, coarse or early first.
 
     Args:
-      predictions: list of n FlowField [B, 2, H, W], all at full resolution. truth: FlowField of the same
-        size.
-      gamma: prediction i counts gamma^(n - 1 - i), scaled so that the weights sum to 1. epsilon: width of the
-        parabola at 0, in the unit of the error.
-      unit_per_px: what one pixel is worth: 1 for an error in px, ``relative_unit(truth)`` [B] for parts of
-        the motion of the sample,
-        ``metrics.mrad_per_pixel(direction)`` [H, W] or [B, H, W] for an angle.
+      predictions: list of n FlowField [B, 2, H, W], all at full resolution.
+      truth: FlowField of the same size.
+      gamma: prediction i counts gamma^(n - 1 - i), scaled so that the weights sum to 1.
+      epsilon: width of the parabola at 0, in the unit of the error.
+      unit_per_px: what one pixel is worth: 1 for an error in px, ``relative_unit(truth)`` [B] for parts
+        of the motion of the sample, ``metrics.mrad_per_pixel(direction)`` [H, W] or [B, H, W] for an
+        angle.
     Returns: scalar. Only valid pixels of the truth count. A sample without any counts 0, its place in the
       mean of the batch included, so that the denominator
       does not depend on how a batch is split; ``require_valid`` refuses such samples where data enter.
@@ -95,10 +95,11 @@ def likelihood_loss(
     Gaussian less its constant ln 2 pi.
 
     Args:
-      predictions, truth, gamma: as in supervised_loss. Each prediction has covariance_px2, or else confidence
-        c, read as the share of the prior that the events have removed: variance prior_px^2 (1 - c) per axis.
-      floor_px: standard deviation added to every claim (in squares), so that no claim is exact and the loss
-        stays bounded below by 2 ln floor_px.
+      predictions, truth, gamma: as in supervised_loss. Each prediction has covariance_px2, or else
+        confidence c, read as the share of the prior that the events have removed: variance prior_px^2
+        (1 - c) per axis.
+      floor_px: standard deviation added to every claim (in squares), so that no claim is exact and the
+        loss stays bounded below by 2 ln floor_px.
     Returns: scalar, (m^2 + ln det S) / 2 with S = covariance + floor_px^2 and m^2 = e^T S^-1 e, over the
       valid pixels as in supervised_loss. Another unit only shifts it.
     Gradient: flow_px, covariance_px2 or confidence.
@@ -176,10 +177,11 @@ def contrast_loss(
     when warped.
 
     Args:
-      volume: EventVolume, counts [B, 2, bins, H, W]. flow_px: [B, 2, H, W] pixels per window. carry_steps: as
-        in contrast.volume_tracks.
-      references: (time, weight) pairs; the images of warped events at these times count with these weights,
-        which sum to 1.
+      volume: EventVolume, counts [B, 2, bins, H, W].
+      flow_px: [B, 2, H, W] pixels per window.
+      carry_steps: as in contrast.volume_tracks.
+      references: (time, weight) pairs; the images of warped events at these times count with these
+        weights, which sum to 1.
     Returns: scalar mean over the batch of the weighted mean of the ratios; 1 for zero flow, less for flow
       that explains the events; 1 for a sample without events.
     Guard: an event counts as much as the warp stretches the area around it (from 0 where it folds or turns
@@ -252,8 +254,9 @@ def photometric_loss(
 ) -> Tensor:
     """Charbonnier difference between the start frame and the end frame read where the flow leads.
 
-    Args: frames: [B, 2, H, W] intensity at the start and at the end, 0..255. flow_px: [B, 2, H, W] pixels per
-      window.
+    Args:
+      frames: [B, 2, H, W] intensity at the start and at the end, 0..255.
+      flow_px: [B, 2, H, W] pixels per window.
     Returns: scalar, differences in units of 255. A pixel that leaves the image keeps its zero-flow
       difference, so that leaving never pays; over the last pixel before the border one blends into the other.
     Gradient: frames and flow; bilinear reading makes it piecewise smooth, with kinks where the flow leads to
@@ -296,8 +299,10 @@ def smoothness_loss(
 ) -> Tensor:
     """Charbonnier difference between the flows of neighbours in a row and in a column.
 
-    Args: flow_px: [B, 2, H, W]. frame: [B, H, W] intensity 0..255; a difference d (in units of 255) between
-      neighbours lets them part, by a factor exp(-|d| / edge). None: everywhere alike.
+    Args:
+      flow_px: [B, 2, H, W].
+      frame: [B, H, W] intensity 0..255; a difference d (in units of 255) between neighbours lets them
+        part, by a factor exp(-|d| / edge). None: everywhere alike.
     Returns: scalar, the mean over rows plus the mean over columns. Gradient: flow.
     Source: Zhu et al., EV-FlowNet, RSS 2018; edge weights: Heise et al., ICCV 2013.
     """

@@ -125,9 +125,10 @@ def ray_error_mrad(flow: Tensor, truth: Tensor, direction: Tensor, mask: Tensor 
     window.
 
     Args:
-      flow, truth: [..., 2, H, W] px. mask: [..., H, W] or None.
-      direction: [H, W, 3] of the rays through the pixel centres (camera axes, z forward), of any length:
-        chief rays of a camera, or pinhole_directions.
+      flow, truth: [..., 2, H, W] px.
+      mask: [..., H, W] or None.
+      direction: [H, W, 3] of the rays through the pixel centres (camera axes, z forward), of any
+        length: chief rays of a camera, or pinhole_directions.
     Returns: scalar. Between pixels x/z and y/z are bilinear, outside the image linear like its outermost
       pixels: exact for a pinhole.
     Gradient: flow, truth, direction. Raises: ShapeError; DomainError for rays that do not go forward.
@@ -193,9 +194,12 @@ def fwl(
     """Flow warp loss: variance of the image of warped events over its variance at zero flow. Above 1 the flow
     makes the events sharper.
 
-    Args: stream: EventStream. flow_px: [2, H, W] pixels from t0 to t1. t0_us, t1_us: whole microseconds, both
-      ends included. at: time the events are moved to, 0 for t0, 1 for t1. carry_steps: see contrast; 0 gives
-      each event the flow of its own pixel, as published.
+    Args:
+      stream: EventStream.
+      flow_px: [2, H, W] pixels from t0 to t1.
+      t0_us, t1_us: whole microseconds, both ends included.
+      at: time the events are moved to, 0 for t0, 1 for t1.
+      carry_steps: see contrast; 0 gives each event the flow of its own pixel, as published.
     Returns: float. Polarities added, every event on its nearest pixel, variance over all pixels of the
       sensor. Events that leave the image count in the denominator only.
     Gradient: none. Raises: DomainError for an interval without events, or with equally many events on every

@@ -36,8 +36,10 @@ BENT_PX = 0.03  # and in px
 class Refiner(nn.Module):
     """Event flow by a few corrections of the closed form ("local").
 
-    Args: bins: time bins of the volumes. width: channels on cells of 4 px, a multiple of 16. steps:
-      corrections, by the same weights.
+    Args:
+      bins: time bins of the volumes.
+      width: channels on cells of 4 px, a multiple of 16.
+      steps: corrections, by the same weights.
     A correction reads the volume along the flow so far and solves V_t + u V_x + v V_y = 0 by least
     squares for what still moves, on cells of 4 px, at three blurs and in windows of 12, 28 and 36 px,
     and tries the flows of cells around (refiner_evidence). A U-Net on cells of 4, 8 and 16 px reads
@@ -83,10 +85,10 @@ class Refiner(nn.Module):
     def forward(self, volume: EventVolume, start_px: Tensor | None = None, clock: str = "time") -> FlowField:
         """Flow of an EventVolume [B, 2, bins, H, W] of any H, W.
 
-        Args: start_px: [B, 2] or [B, 2, H, W] flow that is expected, px per interval, such as that of
-          the window
-          before: the closed form begins from it too (``estimate_lk``). clock: "time" or "events", as of
-          ``estimate_lk``; corrections fade where motion turns back.
+        Args:
+          start_px: [B, 2] or [B, 2, H, W] flow that is expected, px per interval, such as that of the
+            window before: the closed form begins from it too (``estimate_lk``).
+          clock: "time" or "events", as of ``estimate_lk``; corrections fade where motion turns back.
         Returns: FlowField with confidence and covariance. An empty sample has flow 0, confidence 0 and
           no gradient.
         Gradient: counts and weights.

@@ -102,7 +102,8 @@ class Evidence:
     def others(self, flow: Tensor) -> tuple[Tensor, Tensor]:
         """What the flows of cells around would explain here.
 
-        Args: flow: [B, 2, h, w] px on cells.
+        Args:
+          flow: [B, 2, h, w] px on cells.
         Returns: told [B, TRIED, h, w]: for each cell of AROUND and window of TRIED_IN, by how much the
           events have more contrast along its flow than along the cell's own, over the sum of both and
           of noise. offered [B, len(AROUND), 2, h, w]: its flow less the cell's own, px.

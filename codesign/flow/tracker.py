@@ -49,13 +49,14 @@ class Tracker:
     """Flow of one window after the other.
 
     Args:
-      estimate: estimator, EventVolume -> FlowField: flow.estimate_lk, a network, or a function of your own.
-      window_s: length of the windows in seconds, whole microseconds; or
-      events: number of events of a window, which then lasts until the first event of the next.
+      estimate: estimator, EventVolume -> FlowField: flow.estimate_lk, a network, or a function of your
+        own.
+      window_s: length of the windows in seconds, whole microseconds; or events: number of events of a
+        window, which then lasts until the first event of the next.
       bins: of the volumes; the network's own, else 8, when None.
       size_px: (height, width) of the sensor, for events as arrays; an EventStream says it itself.
-      warm_start: hand the flow of the window before, scaled to the new duration and carried along itself, to
-        estimators that take ``start_px``; for others it changes nothing.
+      warm_start: hand the flow of the window before, scaled to the new duration and carried along
+        itself, to estimators that take ``start_px``; for others it changes nothing.
       skip: faults that are left out and counted in ``left_out`` instead of refused (events) or handed
         out with flow 0, confidence 0 and valid False (windows): names of SKIPPABLE.
     windows, events: how many came out so far. processor_s: processor time spent, event_s: time of the
@@ -125,8 +126,9 @@ class Tracker:
     def add(self, chunk: Chunk) -> list[TrackedWindow]:
         """Take the next events in and return the windows that they complete.
 
-        Args: chunk: EventStream, or arrays (t_us, x, y, p) of whole numbers, p +1 and -1 or 1 and 0,
-          with rising times; of any length, 0 included.
+        Args:
+          chunk: EventStream, or arrays (t_us, x, y, p) of whole numbers, p +1 and -1 or 1 and 0, with
+            rising times; of any length, 0 included.
         Raises: DomainError for what is no such stream, for events before those of the chunks before or
           off the sensor; ShapeError for another sensor.
         """

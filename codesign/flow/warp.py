@@ -24,8 +24,9 @@ def pixel_grid(height: int, width: int, like: Tensor) -> Tensor:
 def along_flow(bins: Tensor, flow_px: Tensor, time: Tensor) -> Tensor:
     """What each bin holds where a point of the start has got to.
 
-    Args: bins: [B, T, H, W], or [B, C, T, H, W] with polarities or the like. flow_px: [B, 2, H, W] px per
-      window on pixels of the start.
+    Args:
+      bins: [B, T, H, W], or [B, C, T, H, W] with polarities or the like.
+      flow_px: [B, 2, H, W] px per window on pixels of the start.
       time: [T] bin times, 0 at the start of the window, 1 at its end.
     Returns: as bins: bin k at q + time_k flow(q) for every pixel q, bilinear; 0 outside the image.
     Raises: ShapeError, DomainError.
@@ -61,8 +62,8 @@ def chained(flows_px: Tensor, valid: Tensor, hidden: Tensor | None = None) -> tu
     Args:
       flows_px: [K, 2, H, W] px, each on the pixels of the start of its own part.
       valid: [K, H, W] bool.
-      hidden: [K, H, W] bool: the point is hidden by something at the end of the part, so that the next flow
-        read there would be that of another surface.
+      hidden: [K, H, W] bool: the point is hidden by something at the end of the part, so that the next
+        flow read there would be that of another surface.
     Returns: flow_px [2, H, W] on the pixels of the first instant, 0 where not valid; valid [H, W]: every part
       was, the place stayed in the picture up to the last one, was not hidden before it, and never between
       surfaces whose flows differ by more than 0.75 px.

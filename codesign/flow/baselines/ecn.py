@@ -16,10 +16,11 @@ class ECN(Baseline):
     channels; one residual block; four decoding steps that give them back and each add to the flow.
 
     Args:
-      bins: bins of the volumes, >= 2. width: channels that every encoding step adds, 16 for the published
-        0.15 million weights; every layer takes the nearest multiple of 4.
-      hidden: channels inside the residual block, a multiple of 4; None for twice ``width``. seed: of the
-        first weights.
+      bins: bins of the volumes, >= 2.
+      width: channels that every encoding step adds, 16 for the published 0.15 million weights; every
+        layer takes the nearest multiple of 4.
+      hidden: channels inside the residual block, a multiple of 4; None for twice ``width``.
+      seed: of the first weights.
     Gradient: counts and weights; smooth, so any order.
     Raises: ShapeError, DomainError.
     Source: Ye, Mitrokhin, Fermueller, Yorke, Aloimonos, Unsupervised learning of dense optical flow,

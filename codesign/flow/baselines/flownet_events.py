@@ -14,10 +14,11 @@ class FlowNetEvents(Baseline):
     on, with skip connections.
 
     Args:
-      bins: bins of the volumes, >= 2. width: channels of the first layer (8 times as many in the last); every
-        layer takes the nearest multiple of 4.
-      hidden: channels inside the residual blocks, a multiple of 4; None for 8 times ``width``. seed: of the
-        first weights.
+      bins: bins of the volumes, >= 2.
+      width: channels of the first layer (8 times as many in the last); every layer takes the nearest
+        multiple of 4.
+      hidden: channels inside the residual blocks, a multiple of 4; None for 8 times ``width``.
+      seed: of the first weights.
     Gradient: counts and weights; smooth, so any order.
     Raises: ShapeError, DomainError.
     Source: Zhu et al., EV-FlowNet, RSS 2018, fig. 4, with group normalisation (Wu and He, ECCV 2018) and

@@ -22,11 +22,13 @@ class IDNet(Baseline):
     read them in turn, and the last state says what to add to the flow; again with the same weights.
 
     Args:
-      bins: bins of the volumes, >= 2. width: channels of the first layer, four times as many in the recurrent
-        state; 32 for the published small network of some 1.4 million weights; every layer takes the nearest
-        multiple of 4.
-      hidden: channels inside the head, a multiple of 4; None for 8 times ``width``. iterations: >= 1, 4 as
-        published. seed: of the first weights.
+      bins: bins of the volumes, >= 2.
+      width: channels of the first layer, four times as many in the recurrent state; 32 for the
+        published small network of some 1.4 million weights; every layer takes the nearest multiple of
+        4.
+      hidden: channels inside the head, a multiple of 4; None for 8 times ``width``.
+      iterations: >= 1, 4 as published.
+      seed: of the first weights.
     Gradient: counts and weights; piecewise smooth, as bilinear lookups and rectifiers are.
     Raises: ShapeError, DomainError.
     Source: Wu, Paredes-Valles, de Croon, Lightweight event-based optical flow estimation via iterative

@@ -58,7 +58,9 @@ class Baseline(nn.Module):
         """Flows [B, 2, h, w] of the padded image, each in pixels of its own grid, from coarse or early
         ones to the last.
 
-        Args: counts: [B, 2 bins, H', W'] normalised and padded, ON first. volume: for its times.
+        Args:
+          counts: [B, 2 bins, H', W'] normalised and padded, ON first.
+          volume: for its times.
         """
         raise NotImplementedError
 
@@ -129,8 +131,11 @@ def start(module: nn.Module, seed: int, variance: float, heads: Iterable[nn.Modu
 def fill_budget(build: Callable[..., nn.Module], weights: int, inside: float = 8.0) -> tuple[float, int]:
     """Arguments (width, hidden) of the network with the fewest weights that is not below the budget.
 
-    Args: build: function of width and hidden (channels inside the residual blocks, None for the usual number)
-      that makes the network. weights: the budget. inside: the usual ``hidden`` over the width.
+    Args:
+      build: function of width and hidden (channels inside the residual blocks, None for the usual
+        number) that makes the network.
+      weights: the budget.
+      inside: the usual ``hidden`` over the width.
     Raises: DomainError when even the narrowest network is above the budget.
     """
 

@@ -24,11 +24,10 @@ class SpikeFlowNet(Baseline):
 
     Args:
       bins: bins of the volumes, even; half of them are the time steps of the encoder (10 as published).
-        width: channels of the first layer, 64 as published;
-        every layer takes the nearest multiple of 4. hidden: channels inside the residual blocks; None for 8
-          times ``width``.
-      threshold: potential at which a neuron fires, in normalised counts. surrogate_width: of the fast sigmoid
-        that stands for the derivative of the step, in potential.
+      width: channels of the first layer, 64 as published; every layer takes the nearest multiple of 4.
+      hidden: channels inside the residual blocks; None for 8 times ``width``.
+      threshold: potential at which a neuron fires, in normalised counts.
+      surrogate_width: of the fast sigmoid that stands for the derivative of the step, in potential.
       seed: of the first weights.
     Gradient: counts and weights, through spikes by the surrogate. First derivatives only.
     Raises: ShapeError, DomainError.
@@ -88,8 +87,9 @@ class SpikeFlowNet(Baseline):
         """Sums over the steps of what flowed into each layer's neurons: [B, width, H/2, W/2] to [B, 8 width,
         H/16, W/16].
 
-        Args: halves: [B, 4, H, W, steps], ON and OFF of the former half of the window, then of the latter; H
-          and W multiples of 16.
+        Args:
+          halves: [B, 4, H, W, steps], ON and OFF of the former half of the window, then of the latter;
+            H and W multiples of 16.
         """
         check_real(halves, "the encoder's input")
         if (
@@ -209,8 +209,8 @@ def integrate_and_fire(current: Tensor, threshold: float, surrogate: Surrogate) 
 
     Args:
       current: [T, ...] input of every step, in units of the potential.
-      threshold: > 0. surrogate: Surrogate, its density at u - threshold
-        stands for the derivative of the step.
+      threshold: > 0.
+      surrogate: Surrogate, its density at u - threshold stands for the derivative of the step.
     Returns: [T, ...] spikes, 0 or 1.
     Gradient: current; lambda_t = g_t rho(u_t - threshold) + (1 - s_t) lambda_{t+1}, the reset taken as it
       happened. First derivatives only.

@@ -61,8 +61,9 @@ class Cells:
     def step(self, level: Level, products: Tensor, change: Tensor) -> None:
         """Moves to the posterior mean.
 
-        Args: products: [B, 8, h, w] of a level's samples. change: [B, 2, h, w] what the polynomial
-          moved since they were taken.
+        Args:
+          products: [B, 8, h, w] of a level's samples.
+          change: [B, 2, h, w] what the polynomial moved since they were taken.
         """
         precision, pull = self._evidence(level, self._summed(products, CELL // level.stride, change))
         pull = pull + _apply(precision, self.value)

@@ -45,16 +45,18 @@ def estimate_lk(
     """Flow over the volume's interval, with its uncertainty.
 
     Args:
-      volume: EventVolume, counts [B, 2, bins >= 2, H >= 2, W >= 2]. Hot pixels are weighed down (hot_pixels).
+      volume: EventVolume, counts [B, 2, bins >= 2, H >= 2, W >= 2]. Hot pixels are weighed down
+        (hot_pixels).
       model: "constant", "affine" or "quadratic" field over the image, or "local": a quadratic one and
         values on cells of 8 px, as smooth as the data ask, for layers and depth.
       prior_px: standard deviation expected of each component of the flow at the image centre, px per
         interval; weak evidence leaves the flow near zero.
-      levels_px: Gaussian blur of the volume, coarse to fine. steps: Gauss-Newton steps at each.
-      noise_floor: least noise assumed, relative to that of a Poisson volume with these counts; matters for
-        counts without quantisation or noise.
-      clock: "time": motion is even over the interval. "events": it goes as the events come, and may turn back
-        (``path``); for sensors that saw the scene before the window began, in steady light.
+      levels_px: Gaussian blur of the volume, coarse to fine.
+      steps: Gauss-Newton steps at each.
+      noise_floor: least noise assumed, relative to that of a Poisson volume with these counts; matters
+        for counts without quantisation or noise.
+      clock: "time": motion is even over the interval. "events": it goes as the events come, and may
+        turn back (``path``); for sensors that saw the scene before the window began, in steady light.
       start_px: flow [B, 2] or [B, 2, H, W] on the pixels of the start, px per interval, expected of
         these windows (in a video, that of the window before): its least-squares fit by the polynomial
         is one more field to descend from, with the prior about it at the first of several levels. The
@@ -120,7 +122,8 @@ def descended(
     """Flow [B, 2, H, W] px per way on the pixels of the start, its covariance [B, 3, H, W] and
     confidence [B, H, W].
 
-    Args: found: as of ``level.along_path``. Others, gradient: as of ``estimate_lk``.
+    Args:
+      found: as of ``level.along_path``. Others, gradient: as of ``estimate_lk``.
     """
     way, bins, density = found
     counts = volume.counts
@@ -219,10 +222,12 @@ class Descent:
     def descend(self, level: Level, steps: int, bend: bool, last: bool, expected: bool = False) -> None:
         """Moves to the best field, by steps no longer than the linearisation reaches.
 
-        Args: bend: whether cells of a local field move too; they do from the second step on, or the
-          only one, since what the polynomial has not yet reached looks like a local part. last:
-          whether nothing follows. expected: whether the prior is about the field of ``begin``, which a
-          blur that sees nothing then leaves as it is.
+        Args:
+          bend: whether cells of a local field move too; they do from the second step on, or the only
+            one, since what the polynomial has not yet reached looks like a local part.
+          last: whether nothing follows.
+          expected: whether the prior is about the field of ``begin``, which a blur that sees nothing
+            then leaves as it is.
         """
         centre = self.expected if expected and self.expected is not None else torch.zeros_like(self.found)
         for step in range(steps):

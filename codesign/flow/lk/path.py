@@ -49,8 +49,10 @@ class Path:
 def path(signed: Tensor, events: Tensor, weight: Tensor, time: Tensor, mirrored: bool = False) -> Path:
     """The way of each sample.
 
-    Args: signed: [B, n, H, W] ON less OFF per bin. events: [B, n] of both signs. weight, time: [n]
-      share of the interval that each bin collects, and its mean time, in intervals.
+    Args:
+      signed: [B, n, H, W] ON less OFF per bin.
+      events: [B, n] of both signs.
+      weight, time: [n] share of the interval that each bin collects, and its mean time, in intervals.
     Gradient: signed, events.
     """
     weight = weight.double()

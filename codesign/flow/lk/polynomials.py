@@ -125,9 +125,12 @@ class Polynomials:
         """From the field v at the mean place of the events to the flow on the pixels of the start, by
         fixed point: w(x) = v(x - start w(x)).
 
-        Args: parameters: [B, 2K]. start: [B] place of the start on the way, -1/2 for even motion.
+        Args:
+          parameters: [B, 2K].
+          start: [B] place of the start on the way, -1/2 for even motion.
           local: local part and its covariance at pixel coordinates, (x, y) -> ([B, 2, H, W], [B, 3, H,
-          W]). joined: whether it is part of v.
+            W]).
+          joined: whether it is part of v.
         Returns: flow [B, 2, H, W] px per way; where each pixel is at the mean place: the basis [B, K,
           H, W], the local part and its covariance.
         """

@@ -32,9 +32,11 @@ SHIFTS = ((0, 0), (5, 2), (2, 7), (7, 5))
 def posterior(precision: Tensor, pull: Tensor, steps: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Mean, covariance and evidence of fields on cells, for steps of several sizes.
 
-    Args: precision: [B, 3, h, w] (xx, xy, yy) of what the data say of each cell by themselves, >= 0,
-      float64. pull: [B, 2, h, w] precision times the value they say. steps: [scales, S] variances of
-      the steps to each scale, cells first.
+    Args:
+      precision: [B, 3, h, w] (xx, xy, yy) of what the data say of each cell by themselves, >= 0,
+        float64.
+      pull: [B, 2, h, w] precision times the value they say.
+      steps: [scales, S] variances of the steps to each scale, cells first.
     Returns: mean [S, B, 2, h, w], covariance [S, B, 3, h, w], and the logarithm [S, B] of the evidence
       for these variances, relative to a field that is zero; covariance includes what the trees differ by.
     Gradient: precision, pull; exact, the first one.

@@ -74,7 +74,9 @@ class Calibration:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Flow of a camera that turns before a scene so far that its translation does not matter.
 
-        Args: R_later_earlier: [3, 3], takes directions in the camera's axes at the start to those at the end.
+        Args:
+          R_later_earlier: [3, 3], takes directions in the camera's axes at the start to those at the
+            end.
         Returns: flow_px [2, H, W] float64, 0 where not valid; valid [H, W].
         """
         rays = self.directions(height_px, width_px)
@@ -86,7 +88,8 @@ class Calibration:
     def raw_flow(self, flow_px: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Flow of undistorted pixels carried to the sensor's own.
 
-        Args: flow_px: [2, H, W] on the pixels of a pinhole with these focal lengths and this centre.
+        Args:
+          flow_px: [2, H, W] on the pixels of a pinhole with these focal lengths and this centre.
           valid: [H, W].
         Returns: flow_px [2, H, W] on the pixels as the lens makes them, 0 where not valid; valid [H,
           W], where the four undistorted pixels around are.
@@ -201,8 +204,9 @@ def read_gyroscope(path: str | Path, axes: np.ndarray | None = None) -> Attitude
     """Attitude of ``t ax ay az gx gy gz`` (seconds, m/s^2, rad/s): rates integrated from sample to sample,
     each interval at the mean of its ends.
 
-    Args: axes: [3, 3], camera axes from the gyroscope's (identity when None). The gyroscope's offset is not
-      removed.
+    Args:
+      axes: [3, 3], camera axes from the gyroscope's (identity when None). The gyroscope's offset is not
+        removed.
     """
     turned = np.eye(3) if axes is None else np.asarray(axes)
     if turned.shape != (3, 3) or turned.dtype.kind not in "fiu" or not np.isfinite(turned).all():

@@ -32,10 +32,12 @@ class DsecWindows(Windows):
     """Windows of all sequences under a folder that have flow.
 
     Args:
-      folder: one sequence, a folder of sequences, or one that holds train_events and train_optical_flow side
-        by side.
-      bins: of the volumes. crop_px: (height, width) of a piece at a random place, or None. seed: of that
-        place. size_px: of the camera.
+      folder: one sequence, a folder of sequences, or one that holds train_events and train_optical_flow
+        side by side.
+      bins: of the volumes.
+      crop_px: (height, width) of a piece at a random place, or None.
+      seed: of that place.
+      size_px: of the camera.
     Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or do not
       fit together.
     """

@@ -158,7 +158,9 @@ def truth_beside(events: Path, alone: bool) -> Path | None:
     """The flow file that lies beside a packet's event file: its name with flow or truth in it, or the same
     number; None when there is none.
 
-    Args: events: path of the event file. alone: it is the only one of its folder.
+    Args:
+      events: path of the event file.
+      alone: it is the only one of its folder.
     """
     beside = [
         entry

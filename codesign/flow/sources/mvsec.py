@@ -34,11 +34,14 @@ class MvsecWindows(Windows):
     """Windows of the sequences of a folder.
 
     Args:
-      folder: where NAME_data.hdf5 and NAME_gt_flow_dist.npz lie. frames: 1 or 4 grey frames per window (the
-        dt of the literature); 0: the intervals of the true flow itself. bins: of the volumes. crop_px:
-        (height, width) of a piece at a random place, or None. seed: of that place.
-      span_s: (from, to) part of the sequences in seconds after their first true flow, or None; published
-        tests leave out the start and the landing.
+      folder: where NAME_data.hdf5 and NAME_gt_flow_dist.npz lie.
+      frames: 1 or 4 grey frames per window (the dt of the literature); 0: the intervals of the true
+        flow itself.
+      bins: of the volumes.
+      crop_px: (height, width) of a piece at a random place, or None.
+      seed: of that place.
+      span_s: (from, to) part of the sequences in seconds after their first true flow, or None;
+        published tests leave out the start and the landing.
     Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or do not
       fit together. Windows that last longer or shorter than the median by 5 percent are not used:
       ``left_out`` counts them.

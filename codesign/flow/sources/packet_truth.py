@@ -85,7 +85,10 @@ def packet(
 ) -> Packet:
     """One packet; a flow is brought to its window.
 
-    Args: index: of the flow among several. whole: what a flow without times covers. left_out: see Packet.
+    Args:
+      index: of the flow among several.
+      whole: what a flow without times covers.
+      left_out: see Packet.
     """
     t0_us, t1_us = window
     empty = gaps(held.t_us)

@@ -43,11 +43,11 @@ def read_packets(
     """Read a recording and its true flow.
 
     Args:
-      path: folder with events.txt (Event-Camera Dataset), folder or subfolders of numbered packets, one event
-        file of any kind, or a zip archive.
-      truth_path: flow file or folder (see read_truth), imu.txt or groundtruth.txt. None: what lies beside the
-        events, flow files before the gyroscope before poses. The last two need calib.txt and give the flow of
-        rotation alone.
+      path: folder with events.txt (Event-Camera Dataset), folder or subfolders of numbered packets, one
+        event file of any kind, or a zip archive.
+      truth_path: flow file or folder (see read_truth), imu.txt or groundtruth.txt. None: what lies
+        beside the events, flow files before the gyroscope before poses. The last two need calib.txt and
+        give the flow of rotation alone.
     Returns: [Packet], at least one. A flow over another time than its packet's is scaled linearly, and a note
       says so. A window that the recorded motion does not cover is a packet without truth, and a note says so.
     Raises: FileFormatError, DomainError.
@@ -115,9 +115,10 @@ def read_text_events(
     """Read events from a file of text, or any other that events.read takes.
 
     Args:
-      path: file. size: (height, width) of the sensor. told, told_by: the same from what lies beside,
-        and what that is. Without either, the smallest sensor of SENSORS_PX that holds the events,
-        where the file does not say.
+      path: file.
+      size: (height, width) of the sensor.
+      told, told_by: the same from what lies beside, and what that is. Without either, the smallest
+        sensor of SENSORS_PX that holds the events, where the file does not say.
       columns, time_unit: as of events.read.
       skip: faults whose events are left out and counted instead of refused: events_back_in_time,
         events_off_sensor.

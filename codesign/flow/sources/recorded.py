@@ -24,8 +24,9 @@ class RecordingWindows(Windows):
     zip of either.
 
     Args:
-      path: as for read_packets. bins: of the volumes. crop_px: (height, width) of a piece at a random
-        place, or None.
+      path: as for read_packets.
+      bins: of the volumes.
+      crop_px: (height, width) of a piece at a random place, or None.
       seed: of that place.
       options: PacketOptions; windows of 20 ms, all of them, where it does not say.
     Where nothing is known of the flow, ``truth.valid`` is False. All events are kept in memory.
@@ -77,9 +78,12 @@ def open_windows(
 ) -> DatasetWindows | DsecWindows | MvsecWindows | RecordingWindows:
     """The source of windows that a folder or file is: one of our data sets, DSEC, MVSEC, or a recording.
 
-    Args: bins: of the volumes. window_frames: frame intervals per window (our data sets), or grey frames
-      (MVSEC); DSEC has its own windows.
-      crop_px: (height, width) of a piece at a random place, or None. seed: of that place.
+    Args:
+      bins: of the volumes.
+      window_frames: frame intervals per window (our data sets), or grey frames (MVSEC); DSEC has its
+        own windows.
+      crop_px: (height, width) of a piece at a random place, or None.
+      seed: of that place.
       window_s: length of the windows of a recording, seconds.
     Returns: DatasetWindows, DsecWindows, MvsecWindows or RecordingWindows: ``len(source)`` and
       ``source.batch(indices)``.

@@ -26,11 +26,13 @@ class DatasetWindows(Windows):
     """Windows of all sequences of a data set, one after the other.
 
     Args:
-      folder: a data set (with manifest.json) or one sequence of it. bins: of the volumes.
-      window_frames: frame intervals per window. stride_frames: between the starts of windows (window_frames
-        when None).
-      crop_px: (height, width) of a piece at a random place, or None. seed: of that place. sequences: names to
-        use, all when None.
+      folder: a data set (with manifest.json) or one sequence of it.
+      bins: of the volumes.
+      window_frames: frame intervals per window.
+      stride_frames: between the starts of windows (window_frames when None).
+      crop_px: (height, width) of a piece at a random place, or None.
+      seed: of that place.
+      sequences: names to use, all when None.
     Raises: FileFormatError, before anything is read in earnest, for files that are missing, cut, or do not
       fit together; DomainError for sequences too short.
 

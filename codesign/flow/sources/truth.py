@@ -71,10 +71,10 @@ def read_truth(path: str | Path, size_px: tuple[int, int]) -> list[TrueFlow]:
     """Read the flow fields of a file or folder, in order.
 
     Args:
-      path: .flo, .png (16 bits as in DSEC), .npy, .npz or .mat (up to version 7) ([2, H, W] or [H, W, 2], or
-        several along a first axis; .npz also as a pair of components and with valid and timestamps, the
-        layout of MVSEC among them), .txt or .csv (see docs/flow_recordings.md); or a folder of such files,
-        with their times in timestamps.txt or forward_timestamps.txt.
+      path: .flo, .png (16 bits as in DSEC), .npy, .npz or .mat (up to version 7) ([2, H, W] or [H, W,
+        2], or several along a first axis; .npz also as a pair of components and with valid and
+        timestamps, the layout of MVSEC among them), .txt or .csv (see docs/flow_recordings.md); or a
+        folder of such files, with their times in timestamps.txt or forward_timestamps.txt.
       size_px: (height, width) of the recording, which tables of text need; every flow must have it.
     Returns: [TrueFlow]. Flows that are not finite are not valid; in MVSEC's layout neither are those of
       exactly (0, 0).
