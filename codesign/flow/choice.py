@@ -17,11 +17,10 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d
 
 from codesign.flow.checks import check_volume
-from codesign.flow.lk.blur import blurred
 from codesign.flow.lk.estimate import check_start, descended, field
 from codesign.flow.lk.hot_pixels import weighed_down
 from codesign.flow.lk.lanes import Grid
-from codesign.flow.lk.level import along_path, gaussian
+from codesign.flow.lk.level import along_path, blurred_to
 from codesign.flow.lk.path import Path
 from codesign.flow.warp import pixel_grid
 from codesign.types import EventVolume, FlowField
@@ -235,8 +234,7 @@ def _enclosed(moves):
 
 def _blurred(images, sigma_px):
     """[B, n, H, W] through a Gaussian."""
-    taps = gaussian(sigma_px, 1)
-    return blurred(images, Grid(*images.shape[-2:]), taps[len(taps) // 2 :].tolist())
+    return blurred_to(images, sigma_px, Grid(*images.shape[-2:]))
 
 
 def _where(choice, one, other):

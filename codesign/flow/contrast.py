@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from codesign.errors import DomainError, ShapeError
 from codesign.events.entry import check_whole
@@ -27,6 +26,7 @@ from codesign.flow.checks import (
     check_real,
     check_volume,
 )
+from codesign.flow.warp import pixel_grid, read_at
 from codesign.types import EventStream, EventVolume
 
 LATEST_US = 2**60
@@ -72,9 +72,7 @@ def volume_tracks(volume: EventVolume, flow_px: Tensor, carry_steps: int = 0) ->
     batch, _, bins, height, width = counts.shape
     flow = _entered(flow_px, (batch, 2, height, width))
     time = volume_times(volume, flow)
-    y, x = torch.meshgrid(
-        *(torch.arange(size, dtype=flow.dtype, device=flow.device) for size in (height, width)), indexing="ij"
-    )
+    x, y = pixel_grid(height, width, flow)
     x, y, time = (values.expand(bins, height, width).flatten() for values in (x, y, time[:, None, None]))
     own = flow[:, :, None].expand(batch, 2, bins, height, width).flatten(2)
     return EventTracks(
@@ -314,14 +312,10 @@ def _entered(flow_px, shape):
 def _carried(flow, own, x, y, time, steps):
     """Flow [B, 2, N] of the tracks that pass (x, y) at a time."""
     steps = check_count(steps, "carry_steps")
-    height, width = flow.shape[2:]
-    size = torch.tensor([max(width - 1, 1), max(height - 1, 1)], dtype=flow.dtype, device=flow.device)
     found = own
     for _ in range(steps):
-        start = torch.stack([x - time * found[:, 0], y - time * found[:, 1]], -1)
-        found = grid_sample(flow, (2 * start / size - 1)[:, None], padding_mode="border", align_corners=True)[
-            :, :, 0
-        ]
+        start = torch.stack([x, y]) - time * found
+        found = read_at(flow, start[:, :, None])[:, :, 0]
     return found
 
 

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from codesign.errors import DomainError, ShapeError, shown
 from codesign.flow.checks import check_field, check_kind, check_number, check_real
@@ -22,6 +21,7 @@ from codesign.flow.contrast import (
     volume_tracks,
     warp_jacobian,
 )
+from codesign.flow.warp import pixel_grid, read_at
 from codesign.types import EventVolume, FlowField
 
 REFERENCES = (
@@ -274,18 +274,13 @@ def photometric_loss(
             f"{None if frames is None else list(frames.shape)}."
         )
     height, width = flow_px.shape[2:]
-    y, x = torch.meshgrid(
-        *(torch.arange(size, dtype=flow_px.dtype, device=flow_px.device) for size in (height, width)),
-        indexing="ij",
-    )
-    at = torch.stack([x + flow_px[:, 0], y + flow_px[:, 1]], -1)
-    size = torch.tensor([width - 1, height - 1], dtype=flow_px.dtype, device=flow_px.device)
+    at = pixel_grid(height, width, flow_px) + flow_px
+    last = flow_px.new_tensor([width - 1, height - 1])[:, None, None]
     start, end = (frames / 255).to(torch.promote_types(frames.dtype, flow_px.dtype)).split(1, 1)
-    read = grid_sample(
-        end, (2 * at / size.clamp_min(1) - 1).to(end), padding_mode="border", align_corners=True
-    )
-    depth = (torch.minimum(at, size - at) + 1).clamp(0, 1)  # 1 on the image, 0 from one pixel outside on
-    inside = (depth.square() * (3 - 2 * depth)).prod(-1, keepdim=True).movedim(-1, 1)
+    read = read_at(end, at.to(end))
+    # 1 on the image, 0 from one pixel outside on
+    depth = (torch.minimum(at, last - at) + 1).clamp(0, 1)
+    inside = (depth.square() * (3 - 2 * depth)).prod(1, keepdim=True)
     moved, still = (charbonnier((image - start).square(), epsilon, exponent) for image in (read, end))
     return (inside * moved + (1 - inside) * still).mean()
 

@@ -19,6 +19,7 @@ from codesign.flow.checks import (
     shown,
 )
 from codesign.flow.contrast import nearest_images, stream_tracks
+from codesign.flow.warp import pixel_grid
 from codesign.types import EventStream, EventVolume, FlowField
 
 
@@ -272,11 +273,7 @@ def _slopes(direction, like):
 def _ray_at(plane, flow):
     """Rays (x/z, y/z, 1) at the ends of a flow: bilinear in the nearest cell of four pixels."""
     height, width = plane.shape[1:]
-    y, x = torch.meshgrid(
-        *(torch.arange(size, dtype=flow.dtype, device=flow.device) for size in (height, width)), indexing="ij"
-    )
-    x = x + flow[..., 0, :, :]
-    y = y + flow[..., 1, :, :]
+    x, y = (pixel_grid(height, width, flow) + flow).unbind(-3)
     column = x.detach().floor().long().clamp(0, width - 2)
     row = y.detach().floor().long().clamp(0, height - 2)
     right = x - column

@@ -16,14 +16,13 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample, interpolate, pad
+from torch.nn.functional import avg_pool2d, interpolate, pad
 
-from codesign.flow.lk.blur import blurred
 from codesign.flow.lk.lanes import Grid
-from codesign.flow.lk.level import along_path, gaussian
+from codesign.flow.lk.level import along_path, blurred_to
 from codesign.flow.lk.slopes import cell_sums
 from codesign.flow.lk.warp import moving
-from codesign.flow.warp import pixel_grid
+from codesign.flow.warp import pixel_grid, read_at
 from codesign.types import EventVolume
 
 POOL = 2  # px a side over which the bins that are read are averaged
@@ -71,8 +70,7 @@ class Evidence:
         for blur in BLURS:
             grid = Grid(height, width, blur)
             pooled = avg_pool2d(density, blur) if blur > 1 else density
-            taps = gaussian(blur, blur)
-            counts = blurred(way.counts, grid, taps[len(taps) // 2 :].tolist())
+            counts = blurred_to(way.counts, blur, grid)
             self.levels.append((blur, grid, counts, pooled))
 
     def at(self, flow: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
@@ -136,10 +134,7 @@ class Evidence:
         along = larger(flow, CELL // POOL) / POOL
         bins, height, width = self.pooled.shape[1:]
         at = pixel_grid(height, width, along) + self.time.to(along)[:, None, None, None] * along[:, None]
-        half = torch.tensor([width / 2, height / 2]).to(along)[:, None, None]
-        unit = ((at + 0.5) / half - 1).permute(0, 1, 3, 4, 2).flatten(0, 1)
-        each = self.pooled.flatten(0, 1)[:, None]
-        found = grid_sample(each, unit, padding_mode="border", align_corners=False)
+        found = read_at(self.pooled.flatten(0, 1)[:, None], at.flatten(0, 1))
         return torch.cat([self.pooled, found.unflatten(0, (-1, bins))[:, :, 0]], 1)
 
     def _solved(self, sums, blur, variance):

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from codesign.errors import DomainError, ShapeError, shown
 from codesign.events.entry import check_whole
@@ -19,7 +18,7 @@ from codesign.events.stream import check_stream
 from codesign.events.volumes.volume import check_bins, from_stream
 from codesign.flow.checks import check_dense, check_field, check_number, check_size
 from codesign.flow.sources.packet import EMPTY
-from codesign.flow.warp import pixel_grid
+from codesign.flow.warp import pixel_grid, read_at
 from codesign.types import EventStream, EventVolume, FlowField
 
 Chunk = EventStream | tuple[Any, Any, Any, Any]
@@ -355,14 +354,10 @@ def _part(stream, first, last):
 
 def _carried_on(before, duration_us):
     """Flow [1, 2, H, W] of the window before, at the same speed over the new duration, on the pixels
-    it has led
-    to: read where each pixel came from."""
+    it has led to: read where each pixel came from."""
     flow = before.field.flow_px
-    height, width = flow.shape[2:]
-    half = flow.new_tensor([width / 2, height / 2])[:, None, None]
-    at = (pixel_grid(height, width, flow) - flow[0] + 0.5) / half - 1
-    read = grid_sample(flow, at.permute(1, 2, 0)[None], padding_mode="border", align_corners=False)
-    return read * (duration_us / (before.t1_us - before.t0_us))
+    came_from = pixel_grid(*flow.shape[2:], flow) - flow
+    return read_at(flow, came_from) * (duration_us / (before.t1_us - before.t0_us))
 
 
 def _nothing(size_px: Any, duration_us: int, device: torch.device) -> FlowField:

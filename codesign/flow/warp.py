@@ -21,6 +21,21 @@ def pixel_grid(height: int, width: int, like: Tensor) -> Tensor:
     return torch.stack([x, y])
 
 
+def read_at(images: Tensor, at_px: Tensor, padding: str = "border") -> Tensor:
+    """Images read bilinearly between pixels.
+
+    Args:
+      images: [N, C, H, W].
+      at_px: [N, 2, h, w] places (x, y), px.
+      padding: what there is beyond the outermost pixels: "border", as there, or "zeros".
+    Returns: [N, C, h, w].
+    Gradient: images, and places within the outermost pixels; piecewise smooth in the places.
+    """
+    size = at_px.new_tensor([images.shape[3], images.shape[2]])[:, None, None]
+    unit = ((2 * at_px + 1) / size - 1).movedim(1, 3)
+    return grid_sample(images, unit, padding_mode=padding, align_corners=False)
+
+
 def along_flow(bins: Tensor, flow_px: Tensor, time: Tensor) -> Tensor:
     """What each bin holds where a point of the start has got to.
 
@@ -46,13 +61,10 @@ def along_flow(bins: Tensor, flow_px: Tensor, time: Tensor) -> Tensor:
         )
     *_, count, height, width = bins.shape
     batch = bins.shape[0]
-    at = (
-        pixel_grid(height, width, flow_px) + time.to(flow_px)[:, None, None, None] * flow_px[:, None]
-    )  # [B, T, 2, H, W]
-    half = torch.tensor([width / 2, height / 2], dtype=flow_px.dtype, device=flow_px.device)[:, None, None]
-    unit = ((at + 0.5) / half - 1).permute(0, 1, 3, 4, 2).reshape(batch * count, height, width, 2)
+    # [B, T, 2, H, W]
+    at = pixel_grid(height, width, flow_px) + time.to(flow_px)[:, None, None, None] * flow_px[:, None]
     each = bins.reshape(batch, -1, count, height, width).transpose(1, 2)
-    found = grid_sample(each.reshape(batch * count, -1, height, width), unit, align_corners=False)
+    found = read_at(each.flatten(0, 1), at.flatten(0, 1), "zeros")
     return found.reshape(each.shape).transpose(1, 2).reshape(bins.shape)
 
 
@@ -76,22 +88,16 @@ def chained(flows_px: Tensor, valid: Tensor, hidden: Tensor | None = None) -> tu
         if mask is not None or name == "valid":
             check_mask(mask, name, (len(flows_px), *flows_px.shape[2:]))
     height, width = flows_px.shape[2:]
-    x, y = pixel_grid(height, width, flows_px)
     total = flows_px[0]
     seen = valid[0]
-    before = torch.stack([x, y], -1)
-    size = torch.tensor([max(width - 1, 1), max(height - 1, 1)], dtype=flows_px.dtype, device=flows_px.device)
+    place = pixel_grid(height, width, flows_px)
+    before = place
+    last = flows_px.new_tensor([width - 1, height - 1])[:, None, None]
     for k in range(1, len(flows_px)):
-        at = torch.stack([x + total[0], y + total[1]], -1)
-        inside = ((at >= 0) & (at <= size)).all(-1)
-        at = torch.where(inside[..., None], at, torch.zeros_like(at))
-        step = grid_sample(
-            flows_px[k : k + 1],
-            (2 * at / size - 1)[None],
-            mode="bilinear",
-            padding_mode="border",
-            align_corners=True,
-        )[0]
+        at = place + total
+        inside = ((at >= 0) & (at <= last)).all(0)
+        at = torch.where(inside, at, 0)
+        step = read_at(flows_px[k : k + 1], at[None])[0]
         seen = seen & inside & _sure(flows_px[k].detach(), valid[k], at.detach())
         if hidden is not None:
             seen = seen & ~_nearest(hidden[k - 1], before)
@@ -101,14 +107,14 @@ def chained(flows_px: Tensor, valid: Tensor, hidden: Tensor | None = None) -> tu
 
 
 def _nearest(mask, at):
-    return mask[at[..., 1].round().long(), at[..., 0].round().long()]
+    column, row = at.round().long()
+    return mask[row, column]
 
 
 def _sure(flow, valid, at):
     """Whether the four pixels around each place are valid and move alike."""
-    columns, rows = (
-        (at[..., k].floor().long(), at[..., k].ceil().long()) for k in (0, 1)
-    )  # one and the same where the place is on a pixel
+    # one and the same where the place is on a pixel
+    columns, rows = zip(at.floor().long(), at.ceil().long(), strict=True)
     corners = [(row, column) for column in columns for row in rows]
     around = torch.stack([flow[:, r, c] for r, c in corners])
     alike = (around.amax(0) - around.amin(0)).amax(0) <= EDGE_PX

@@ -84,7 +84,7 @@ class Level:
         self.noise_floor = noise_floor
         self.stride = stride(sigma_px, min(shape.height, shape.width))
         self.grid = Grid(shape.height, shape.width, self.stride)
-        self.counts, kernel = _blurred(way.counts, sigma_px, self.grid)
+        self.counts = blurred_to(way.counts, sigma_px, self.grid)
         self.density = avg_pool2d(density, self.stride) if self.stride > 1 else density
         self.moments = Moments(shape, self.grid, density)
         weight, time = bins
@@ -94,7 +94,7 @@ class Level:
         self.contrast = torch.stack([torch.ones_like(weight), self.place / spread])
         self.gain = (spread / way.spread).to(density)
         self.slope_noise = 1 / (way.spread * OVERLAP * sigma_px**2)
-        self.texture_noise = _slope_of_noise(kernel, self.stride)
+        self.texture_noise = _slope_of_noise(_whole_kernel(sigma_px, self.stride), self.stride)
 
     def products(self, flow: Tensor) -> Tensor:
         """[B, 8, h, w] as of ``cell_sums``, per sample, at a flow [B, 2, h, w] px per way."""
@@ -183,19 +183,20 @@ def gaussian(sigma_px: float, step: int) -> Tensor:
     return taps / taps.sum()
 
 
-def _blurred(images, sigma_px, grid):
-    """[B, n, H, W] averaged over squares, then through a Gaussian, together of standard deviation sigma;
-    mirrored at the border.
+def blurred_to(images: Tensor, sigma_px: float, grid: Grid) -> Tensor:
+    """Images [B, n, H, W] on the samples of ``grid``: averaged over squares, then through a Gaussian,
+    together of standard deviation sigma; mirrored at the border."""
+    taps = gaussian(sigma_px, grid.stride)
+    return blurred(images, grid, taps[len(taps) // 2 :].tolist())
 
-    Returns: images on the samples of ``grid``, and the whole kernel along one axis, taps of 1 px.
-    """
-    step = grid.stride
+
+def _whole_kernel(sigma_px, step):
+    """What ``blurred_to`` does along one axis, in taps of 1 px."""
     taps = gaussian(sigma_px, step)
-    radius = len(taps) // 2
-    kernel = torch.zeros(2 * radius * step + step, dtype=torch.float64)
+    kernel = torch.zeros(len(taps) * step, dtype=torch.float64)
     for shift in range(step):
-        kernel[shift : shift + 2 * radius * step + 1 : step] += taps / step
-    return blurred(images, grid, taps[radius:].tolist()), kernel
+        kernel[shift : shift + len(taps) * step - step + 1 : step] += taps / step
+    return kernel
 
 
 def _slope_of_noise(kernel, step):
