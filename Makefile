@@ -50,6 +50,7 @@ sensor-fit: .venv/with-event-files.stamp ## fit a sensor to a recording of yours
 train-flow: .venv/with-event-files.stamp .venv/with-training-logs.stamp ## train a flow network: make train-flow ARGS="--network refiner --cpu-minutes 20"
 flow-quality: ## error of the delivered refiner and of the closed form on unseen textures and worlds
 flow-compare: .venv/with-training-logs.stamp ## the refiner against networks of its size, same windows and budget
+flow-compare: STUDY := train_flow --race
 flow-cost: ## time and memory of flow estimators
 flow-recording: .venv/with-event-files.stamp ## flow of a recording: make flow-recording ARGS="--recording FOLDER"
 placement: .venv/with-search.stamp ## where to mount the camera on a robot

@@ -11,10 +11,10 @@ from torch import nn
 
 from codesign.flow import checkpoint
 from codesign.types import EventVolume, FlowField, FlowWindows
+from scenes.windows import sets
 from studies.frame.run import main
 from studies.train_flow import __main__ as train_flow
-from studies.train_flow import page as train_flow_page
-from studies.train_flow import sources as train_flow_sources
+from studies.train_flow import watch
 
 BINS = 2
 SIDE = 16
@@ -69,19 +69,15 @@ class Made:
 def register(before=lambda indices: None, frames=True):
     """Put the network and the source where the command finds them."""
     checkpoint.NETWORKS["linear"] = f"{Linear.__module__}:Linear"
-    train_flow_sources.TRAINING["made"] = lambda shape, seed: [(1.0, Made(seed, frames, before))]
-    train_flow_sources.VALIDATION.clear()
-    train_flow_sources.VALIDATION["unseen"] = lambda shape, seed: Made(seed + 77)
+    sets.TRAINING["made"] = lambda shape, seed: [(1.0, Made(seed, frames, before))]
+    sets.VALIDATION.clear()
+    sets.VALIDATION["unseen"] = lambda shape, seed: Made(seed + 77)
 
 
 @contextmanager
 def tables_kept():
     """The tables of networks and sources are as they were afterwards."""
-    tables: list[dict[str, Any]] = [
-        checkpoint.NETWORKS,
-        train_flow_sources.TRAINING,
-        train_flow_sources.VALIDATION,
-    ]
+    tables: list[dict[str, Any]] = [checkpoint.NETWORKS, sets.TRAINING, sets.VALIDATION]
     before = [dict(table) for table in tables]
     try:
         yield
@@ -94,7 +90,7 @@ def tables_kept():
 def undraw(replace=setattr):
     """Leave out the figures, which nobody looks at here and which take most of the time."""
     for name in ("curves", "pictures"):
-        replace(train_flow_page, name, lambda *_: plt.figure(figsize=(1, 1)))
+        replace(watch, name, lambda *_: plt.figure(figsize=(1, 1)))
 
 
 BASE = [

@@ -39,7 +39,7 @@ FAR = 0.9  # and the wide prior is taken
 FEW = 25.0  # nats over zero flow at which half of the flow is believed
 # bodies before still ground, logistic: extent of what agrees, logarithms of the share of the cells
 # that hold it and of how much worse shifts of places explain it than one affine field, 1; fitted to
-# scenes.flow_harsh, flow_sets, other seeds
+# scenes.windows.sets, other seeds
 BODIES = (-5.85, -2.79, -9.29, -6.8)
 MOST = 0.5  # of the third
 SURE = 0.6  # probability from which on they are taken for such

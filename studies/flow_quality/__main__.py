@@ -1,26 +1,36 @@
-"""How good is event flow? The closed form in all its models and the delivered network, beside zero flow, on
-textures, motions, densities and 3-D worlds that guided no choice, with hard events."""
+"""How good is event flow? The closed form in all its models, the delivered network or one of yours, and rivals, beside
+zero flow, on textures, motions, densities, 3-D worlds and recordings that guided no choice, with hard events.
+
+``--sets cells`` judges on single planes, one threshold and one level of noise at a time.
+"""
 
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
+import matplotlib.pyplot as plt
 import torch
 
 from codesign import flow
 from codesign.errors import DomainError
+from codesign.report.flow_colours import flow_colours
 from codesign.train.validation import batches
-from scenes.flow_worlds import ALL
-from studies.flow_quality import figures, packets_page
+from scenes.windows.files import FileWindows
+from scenes.windows.rendered import planes
+from scenes.windows.sets import HARSH, SETS, UNSEEN, VALIDATION, Shape
+from scenes.windows.worlds import ALL, WorldWindows
+from studies.flow_quality import recordings
 from studies.flow_quality.estimators import estimators
-from studies.flow_quality.measures import join, measure
-from studies.flow_quality.sets import judged
+from studies.flow_quality.measures import figures, join, mean_of_known, measure
 from studies.frame.run import Run, StudyConfig, main
 
+SEED = 77  # of what is judged here: windows that guided no choice
 SHOWN = 3  # windows of a set in its picture
+DEVIATION_PX = 2.0  # shown white
 BEST = "refiner"  # whose pictures and cards are shown, beside the closed form's
 START = "closed_form_affine"
+NOISE = (0.0005, 0.002, 0.01)  # of the cells: events per pixel, polarity and eighth of the window
 FIGURES = {
     "ratio": ("Endpoint error over that of zero flow", "Mean over valid pixels and windows.", 3),
     "worse_percent": ("Windows worse than zero flow, %", "", 1),
@@ -38,6 +48,11 @@ FIGURES = {
     "error_over_claimed_median": (
         "Error over claimed deviation, by medians",
         "1 for an honest claim of Gaussian errors.",
+        2,
+    ),
+    "normalised_square": (
+        "Half of e^T C^-1 e, e the error and C its covariance",
+        "1 when the covariance is right.",
         2,
     ),
     "rank_correlation": (
@@ -67,14 +82,16 @@ class Config(StudyConfig):
     """Network to judge: "refiner" (the delivered one) or the path of a network file."""
     models: tuple[str, ...] = ("constant", "affine", "quadratic", "local")
     """Models of the closed form to judge, "affine" among them."""
+    clock: Literal["events", "time"] = "events"
+    """Clock of the closed form and the refiner: how far a motion has come goes by the events, or is even over the window."""
     windows: int = 256
-    """Windows of every set of flat textures, 64 x 64."""
+    """Windows of every set of flat textures and of every cell, 64 x 64."""
     world_windows: int = 75
     """Windows of 3-D worlds, 128 x 128, the worlds in turn."""
     real_windows: int = 128
-    """Windows of every set of scenes.flow_sets: packets of few events, bent images, vibration, rotation."""
+    """Windows of every set of scenes.windows.sets: packets of few events, bent images, vibration, rotation."""
     sets: tuple[str, ...] = ()
-    """Sets to judge on; all when left out, with the recordings."""
+    """Sets to judge on, "cells" for all cells of single planes; all but those when left out, with the recordings."""
     middlebury: Path | None = None
     """Folder with Middlebury's .flo files, to move photographs by as they are and three times as far."""
     recording: tuple[Path, ...] = ()
@@ -90,6 +107,44 @@ class Config(StudyConfig):
 
 def study(run: Run[Config]) -> None:
     config = run.config
+    check(config)
+    network = flow.load(config.network).eval()
+    bins = network.config["bins"]
+    sets = judged(config, bins)
+    who = estimators(network, config.models, config.clock)
+    found = {}
+    about = {}
+    with run.progress(sum(number for _, number in sets.values()), "windows") as progress:
+        for name, (source, number) in sets.items():
+            rows, density, shown = _measured(source, number, who, progress)
+            found[name] = {each: figures(mine) for each, mine in rows.items()}
+            about[name] = (density, rows)
+            _record(run, name, found[name], density, rows)
+            run.figure(
+                _pictures(shown, who),
+                name,
+                f"{name.replace('_', ' ')}: events (red ON, blue OFF), true flow, estimates, and the deviation "
+                "that the network claims. Colour: direction, strength: length.",
+            )
+    _tables(run, found, about, who)
+    if config.middlebury is None:
+        run.text(
+            "Middlebury's flows were left out: give the folder of its .flo files with `--middlebury`. The sets "
+            "`many_depths` stand for them."
+        )
+    if "worlds" in found:
+        _worlds(run, about["worlds"][1])
+    if config.recording or not config.sets:
+        recordings.show(run, who, bins)
+    run.finish(
+        "Quality of event flow",
+        "Hard events with threshold mismatch and background noise; textures are photographs, unseen speckle "
+        "and few shapes, the worlds are seen by no training.",
+    )
+
+
+def check(config):
+    """Raises: DomainError for numbers and models that give no figures."""
     if min(config.windows, config.world_windows, config.real_windows) < 2:
         raise DomainError(
             f"--windows {config.windows}, --world-windows {config.world_windows}, --real-windows "
@@ -106,44 +161,43 @@ def study(run: Run[Config]) -> None:
         raise DomainError(
             f"--models {' '.join(config.models)}: affine is needed, which others are compared with."
         )
-    network = flow.load(config.network).eval()
-    sets = judged(config, network.config["bins"])
-    unknown = [name for name in config.sets if name not in sets]
-    if unknown:
-        raise DomainError(f"--sets {unknown[0]} is unknown; choose from {', '.join(sets)}.")
-    sets = {name: sets[name] for name in config.sets or sets}
-    who = estimators(network, config.models)
-    found = {}
-    about = {}
-    with run.progress(sum(number for _, number in sets.values()), "windows") as progress:
-        for name, (source, number) in sets.items():
-            found[name], about[name], shown = _judged(source, number, who, progress)
-            _record(run, name, found[name], about[name])
-            run.figure(
-                figures.windows(shown, who),
-                name,
-                f"{name.replace('_', ' ')}: events (red ON, blue OFF), true flow, estimates, and the deviation "
-                "that the network claims. Colour: direction, strength: length.",
-            )
-    _show(run, found, about, who)
-    if config.middlebury is None:
-        run.text(
-            "Middlebury's flows were left out: give the folder of its .flo files with `--middlebury`. The sets "
-            "`many_depths` stand for them."
+
+
+def judged(config, bins):
+    """Name -> (source, number of windows) of the sets that are asked for.
+
+    Raises: DomainError for an unknown name.
+    """
+    shape = Shape(64, 64, bins)
+    seed = SEED + config.seed
+    found = {name: (make(shape, seed), config.windows) for name, make in VALIDATION.items()}
+    found["worlds"] = (WorldWindows(ALL, seed=UNSEEN + seed, bins=bins), config.world_windows)
+    for name, make in (SETS | HARSH).items():
+        found[name] = (make(UNSEEN + seed, bins), config.real_windows)
+    if config.middlebury is not None:
+        for factor in (1, 3):
+            source = FileWindows(config.middlebury, factor, seed=UNSEEN + seed, bins=bins)
+            found[f"middlebury_x{factor}"] = (source, config.real_windows)
+    if not config.sets:
+        return found
+    cells = {
+        f"{kind}_theta_{theta:g}_noise_{noise:g}": (
+            shape(planes(kind, theta, (noise, noise)), config.seed + 1),
+            config.windows,
         )
-    if "worlds" in found:
-        _worlds(run, found["worlds"])
-    if config.recording or not config.sets:
-        packets_page.show(run, who, network.config["bins"])
-    run.finish(
-        "Quality of event flow",
-        "Hard events with threshold mismatch and background noise; textures are photographs, unseen speckle "
-        "and few shapes, the worlds are seen by no training.",
-    )
+        for kind in ("fine", "mixed")
+        for theta in (0.1, 0.2)
+        for noise in NOISE
+    }
+    chosen = [each for name in config.sets for each in (cells if name == "cells" else (name,))]
+    unknown = [name for name in chosen if name not in found | cells]
+    if unknown:
+        raise DomainError(f"--sets {unknown[0]} is unknown; choose from cells, {', '.join(found | cells)}.")
+    return {name: (found | cells)[name] for name in chosen}
 
 
-def _judged(source, number, who, progress):
-    """({estimator: Measured}, events per pixel [N], windows to show)."""
+def _measured(source, number, who, progress):
+    """({estimator: Rows}, events per pixel [N], windows to show)."""
     parts = {name: [] for name in who}
     density = []
     shown = []
@@ -152,82 +206,97 @@ def _judged(source, number, who, progress):
         for name, field in fields.items():
             parts[name].append(measure(field, windows))
         density.append(windows.volume.counts.sum((1, 2)).mean((1, 2)))
-        for k in range(min(SHOWN - len(shown), len(windows.truth.valid))):
-            shown.append((windows, fields, k))
+        shown += [(windows, fields, k) for k in range(len(windows.truth.valid))]
         for _ in windows.truth.valid:
             progress.advance()
-    return {name: join(mine) for name, mine in parts.items()}, torch.cat(density), shown
+    return {name: join(mine) for name, mine in parts.items()}, torch.cat(density), shown[:SHOWN]
 
 
-def _record(run, name, found, density):
-    zero = next(iter(found.values())).zero_px
+def _record(run, name, found, density, rows):
+    zero = rows[START]["zero_px"]
     run.record(
         **{
             f"{name}_windows": len(zero),
             f"{name}_zero_flow_px": zero.mean(),
             f"{name}_events_per_px_median": density.median(),
+            f"{name}_refiner_over_closed_form": found[BEST]["aee_px"] / found[START]["aee_px"],
         }
     )
-    for who, measured in found.items():
-        low, high = measured.ratio_interval()
-        figures_of = {key: getattr(measured, key) for key in FIGURES}
-        figures_of |= {"ratio_low": low, "ratio_high": high, "aee_px": measured.error_px.mean()}
-        run.record(**{f"{name}_{who}_{key}": value for key, value in figures_of.items() if value is not None})
-    if BEST in found and START in found:
-        run.record(
-            **{f"{name}_refiner_over_closed_form": found[BEST].error_px.mean() / found[START].error_px.mean()}
-        )
-        run.card(
-            name.replace("_", " "),
-            f"{found[BEST].ratio:.3f} x zero flow",
-            f"closed form {found[START].ratio:.3f}",
-        )
+    run.record(**{f"{name}_{who}_{key}": value for who, mine in found.items() for key, value in mine.items()})
+    run.card(
+        name.replace("_", " "),
+        f"{found[BEST]['ratio']:.3f} x zero flow",
+        f"closed form {found[START]['ratio']:.3f}",
+    )
 
 
-def _show(run, found, about, who):
-    rows = [
-        [
-            name.replace("_", " "),
-            len(about[name]),
-            round(float(about[name].median()), 3),
-            round(float(about[name].quantile(0.05)), 3),
-            round(float(about[name].quantile(0.95)), 3),
-            round(float(next(iter(found[name].values())).zero_px.mean()), 2),
-        ]
-        for name in found
-    ]
-    columns = ["set", "windows", "events per px, median", "5 %", "95 %", "mean flow, px"]
-    run.table("Sets", columns, rows)
+def _tables(run, found, about, who):
+    rows = []
+    for name, (density, measured) in about.items():
+        shares = [round(float(density.quantile(share)), 3) for share in (0.5, 0.05, 0.95)]
+        zero = round(float(measured[START]["zero_px"].mean()), 2)
+        rows.append([name.replace("_", " "), len(density), *shares, zero])
+    run.table("Sets", ["set", "windows", "events per px, median", "5 %", "95 %", "mean flow, px"], rows)
     for key, (title, note, digits) in FIGURES.items():
         rows = []
         for name, mine in found.items():
-            cells = []
-            for measured in mine.values():
-                value = getattr(measured, key)
-                interval = " ({:.3f} to {:.3f})".format(*measured.ratio_interval()) if key == "ratio" else ""
-                cells.append(None if value is None else f"{value:.{digits}f}{interval}")
+            cells = [_cell(each, key, digits) for each in mine.values()]
             if key == "sharpness":
-                truth = next(iter(mine.values())).truth_fwl
-                truth = truth[truth == truth]
-                cells.append(f"{truth.mean():.3f}" if len(truth) else None)
+                truth = mean_of_known(about[name][1][START]["truth_fwl"])
+                cells.append(f"{truth:.{digits}f}" if truth == truth else None)
             rows.append([name.replace("_", " "), *cells])
         extra = ["true flow"] if key == "sharpness" else []
         run.table(title, ["set", *(name.replace("_", " ") for name in who), *extra], rows, note)
 
 
-def _worlds(run, found):
+def _cell(figures, key, digits):
+    if key not in figures:
+        return None
+    interval = f" ({figures['ratio_low']:.3f} to {figures['ratio_high']:.3f})" if key == "ratio" else ""
+    return f"{figures[key]:.{digits}f}{interval}"
+
+
+def _worlds(run, measured):
     rows = []
     for place, name in enumerate(ALL):
-        zero = found[START].zero_px[place :: len(ALL)].mean()
-        shares = {who: float(mine.error_px[place :: len(ALL)].mean() / zero) for who, mine in found.items()}
+        zero = measured[START]["zero_px"][place :: len(ALL)].mean()
+        shares = {
+            who: float(mine["error_px"][place :: len(ALL)].mean() / zero) for who, mine in measured.items()
+        }
         run.record(**{f"world_{name}_{who}_ratio": share for who, share in shares.items()})
         rows.append([name, round(float(zero), 2), *(round(share, 3) for share in shares.values())])
     run.table(
         "World by world",
-        ["world", "zero flow (px)", *(who.replace("_", " ") for who in found)],
+        ["world", "zero flow (px)", *(who.replace("_", " ") for who in measured)],
         rows,
         "Endpoint error over that of zero flow.",
     )
+
+
+def _pictures(shown, who):
+    """Figure: a row per window of its events, true flow, every estimate, and the network's claim."""
+    size = (len(shown), len(who) + 3)
+    figure, axes = plt.subplots(
+        *size, figsize=(2.1 * size[1], 2.2 * size[0]), layout="constrained", squeeze=False
+    )
+    for row, (given, fields, k) in zip(axes, shown, strict=True):
+        counts = given.volume.counts[k]
+        row[0].imshow((counts[0] - counts[1]).sum(0).numpy(), cmap="RdBu_r", vmin=-4, vmax=4)
+        truth = given.truth.flow_px[k]
+        most = float(truth.square().sum(0).sqrt().max())
+        for axis, each in zip(row[1:-1], [truth, *(fields[name].flow_px[k] for name in who)], strict=True):
+            axis.imshow(flow_colours(each.numpy(), most))
+        covariance = fields[BEST].covariance_px2
+        if covariance is not None:
+            deviation = ((covariance[k, 0] + covariance[k, 2]) / 2).sqrt()
+            row[-1].imshow(deviation.numpy(), cmap="gray", vmin=0, vmax=DEVIATION_PX)
+    names = [name.replace("_", " ") for name in who]
+    titles = ("events", "true flow", *names, f"claimed (white: {DEVIATION_PX:g} px)")
+    for axis, title in zip(axes[0], titles, strict=True):
+        axis.set_title(title, fontsize=8)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    return figure
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 """Recordings, cut into packets of a fixed number of events: two that are made here, with exact flow, and those
 the user names."""
 
+import statistics
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -16,9 +17,27 @@ from codesign.flow import metrics
 from codesign.flow.sources import PacketOptions, read_packets
 from codesign.flow.sources.packets import Packet
 from codesign.types import EventStream
-from scenes.flow_streams import sliding, turning
+from scenes.windows.streams import sliding, turning
 from studies.flow_quality import sharpest
 
+MEASURES = {
+    "distance_px": (
+        "Distance to the contrast maximisation, px",
+        "Mean over pixels with events; mean over packets (worst). The judge sees single events, and searches "
+        "all rotations or affine flows.",
+        "largest",
+        max,
+    ),
+    "aee_px": (
+        "Endpoint error where events are, px",
+        "Against the exact flow; mean over packets (worst).",
+        "largest",
+        max,
+    ),
+    "fwl": ("Flow warp loss (FWL)", "Above 1 is sharper; mean over packets (least).", "least", min),
+}  # figure -> title and note of its table, what its worst value is called, and which that is
+JUDGED = "refiner"
+REFERENCE = "closed_form_quadratic"  # whose distance the network's is compared with
 CONTEXT = 30_000  # events around the middle of a packet that the contrast maximisation sees at least
 EDGE = 0.05  # of the events of a recording left out at either end
 
@@ -40,10 +59,10 @@ def cases(config, say):
     for make, turns in ((turning, True), (sliding, False)):
         recording = make(seed=config.seed)
         for count in config.packet_events:
-            packets = _cut(recording, count, config.packets)
+            packets = cut(recording, count, config.packets)
             assumed = "rotation" if turns else "affine"
             found += [
-                Case(_kind(recording.name, count), p, partial(_in_context, recording, p, turns), assumed)
+                Case(_kind(recording.name, count), p, partial(in_context, recording, p, turns), assumed)
                 for p in packets
             ]
     for path in config.recording:
@@ -66,96 +85,113 @@ def _kind(name, count):
     return f"{name.replace('-', '_').replace('.', '_')}_{count / 1000:g}k"
 
 
-def _cut(recording, count, packets):
+def cut(recording, count, packets):
     """Packets spread over a made recording."""
     stream = recording.stream
     total = len(stream)
     firsts = np.linspace(EDGE * total, (1 - EDGE) * total - count, packets).astype(int)
-    return [_window(recording, int(first), count) for first in firsts]
+    return [_packet(recording, int(first), int(first) + count) for first in firsts]
 
 
-def _window(recording, first, count):
-    stream = recording.stream
-    t0_us, t1_us = int(stream.t_us[first]), int(stream.t_us[first + count - 1])
-    return Packet(
-        f"{recording.name} {t0_us * 1e-6:.3f} s",
-        _part(stream, slice(first, first + count)),
-        t0_us,
-        t1_us,
-        recording.truth(t0_us, t1_us),
-    )
+def _packet(recording, first, stop):
+    whole = recording.stream
+    t_us, x, y, p = (getattr(whole, name)[first:stop] for name in ("t_us", "x", "y", "p"))
+    stream = check_stream(EventStream(t_us, x, y, p, whole.height_px, whole.width_px))
+    t0_us, t1_us = int(t_us[0]), int(t_us[-1])
+    name = f"{recording.name} {t0_us * 1e-6:.3f} s"
+    return Packet(name, stream, t0_us, t1_us, recording.truth(t0_us, t1_us))
 
 
-def _part(stream, part):
-    t_us, x, y, p = (getattr(stream, name)[part] for name in ("t_us", "x", "y", "p"))
-    return check_stream(EventStream(t_us, x, y, p, stream.height_px, stream.width_px))
-
-
-def _in_context(recording, packet, turns):
+def in_context(recording, packet, turns):
     """Flow of a packet of a made recording by contrast maximisation over at least CONTEXT events around its
     middle, scaled to its length: a few thousand events are too few to be sure of."""
     stream = recording.stream
     first = int(torch.searchsorted(stream.t_us, torch.tensor(packet.t0_us)))
     extra = max(0, CONTEXT - len(packet.stream)) // 2
-    start = max(0, first - extra)
     stop = min(len(stream), first + len(packet.stream) + extra)
-    wide = replace(
-        packet,
-        stream=_part(stream, slice(start, stop)),
-        t0_us=int(stream.t_us[start]),
-        t1_us=int(stream.t_us[stop - 1]),
-    )
+    wide = _packet(recording, max(0, first - extra), stop)
     found = sharpest.rotation(wide, recording.focal_px) if turns else sharpest.affine(wide)
     share = (packet.t1_us - packet.t0_us) / (wide.t1_us - wide.t0_us)
     return sharpest.Sharpest(share * found.flow_px, found.contrast)
 
 
-def judged(case, reference, estimate, bins):
-    """Figures of an estimator on a packet: distance_px to the contrast maximisation and aee_px to the truth,
-    over pixels with events; fwl. None where there is no truth."""
-    packet = case.packet
-    volume = events.from_stream(packet.stream, packet.t0_us, packet.t1_us, bins)
-    flow_px = estimate(volume).flow_px
-    return {
-        "distance_px": float(
-            metrics.aee(
-                flow_px,
-                torch.from_numpy(reference.flow_px).to(flow_px)[None],
-                metrics.event_mask(volume),
-            )
-        ),
-        **against_truth(packet, volume, flow_px),
-        "fwl": metrics.fwl(packet.stream, flow_px, packet.t0_us, packet.t1_us),
-    }
+def judged(packet, mask, flow_px, sharpest_px=None):
+    """Figures of a flow on a packet, those that are defined: distance_px to the contrast maximisation and aee_px to the
+    truth, over pixels with events (mask); fwl."""
+    found = {"fwl": float(metrics.fwl(packet.stream, flow_px, packet.t0_us, packet.t1_us))}
+    if sharpest_px is not None:
+        found["distance_px"] = float(metrics.aee(flow_px, sharpest_px.to(flow_px), mask))
+    if packet.truth is not None and bool((both := packet.truth.valid & mask).any()):
+        found["aee_px"] = float(metrics.aee(flow_px, packet.truth.flow_px, both))
+    return found
 
 
-def of_reference(case, reference, bins):
-    """The same figures of the contrast maximisation itself, and of the true flow where there is one."""
+def measured(case, who, bins):
+    """{name: figures} of all estimators on a packet, of the contrast maximisation itself, and of the true flow and of zero
+    flow where there is a truth."""
     packet = case.packet
+    sharpest_px = torch.from_numpy(case.seek().flow_px)[None]
     volume = events.from_stream(packet.stream, packet.t0_us, packet.t1_us, bins)
-    flow_px = torch.from_numpy(reference.flow_px).float()[None]
+    mask = metrics.event_mask(volume)
     rows = {
-        "contrast_maximisation": {
-            "distance_px": None,
-            **against_truth(packet, volume, flow_px),
-            "fwl": metrics.fwl(packet.stream, flow_px, packet.t0_us, packet.t1_us),
-        }
+        name: judged(packet, mask, estimate(volume).flow_px, sharpest_px) for name, estimate in who.items()
     }
+    rows["contrast_maximisation"] = judged(packet, mask, sharpest_px.float())
     if packet.truth is not None:
         true_px = packet.truth.flow_px
-        still = against_truth(packet, volume, torch.zeros_like(true_px))
-        rows["true_flow"] = {
-            "distance_px": None,
-            "aee_px": None,
-            "fwl": metrics.fwl(packet.stream, true_px, packet.t0_us, packet.t1_us),
-        }
-        rows["zero_flow"] = {"distance_px": None, **still, "fwl": 1.0}
+        rows["true_flow"] = {"fwl": judged(packet, mask, true_px)["fwl"]}
+        rows["zero_flow"] = judged(packet, mask, torch.zeros_like(true_px))
     return rows
 
 
-def against_truth(packet, volume, flow_px):
-    """{"aee_px"} over valid pixels with events."""
-    if packet.truth is None:
-        return {"aee_px": None}
-    mask = packet.truth.valid & metrics.event_mask(volume)
-    return {"aee_px": float(metrics.aee(flow_px, packet.truth.flow_px, mask)) if bool(mask.any()) else None}
+def show(run, who, bins):
+    """Measure, record, and show on the page."""
+    found = {}
+    cases_of = {}
+    todo = cases(run.config, run.say)
+    with run.progress(len(todo), "packets") as progress:
+        for case in todo:
+            found.setdefault(case.kind, []).append(measured(case, who, bins))
+            cases_of.setdefault(case.kind, []).append(case)
+            progress.advance()
+    for kind, packets in found.items():
+        record(run, kind, packets)
+    run.section(
+        "Recordings",
+        "Packets of a fixed number of events. `turning` and `sliding` are made here with the full sensor "
+        "(bandwidth, mismatch, noise, leak, dead time, hot pixels) and have exact flow.",
+    )
+    rows = []
+    for kind, mine in cases_of.items():
+        stream = mine[0].packet.stream
+        length_ms = statistics.fmean(1e-3 * (each.packet.t1_us - each.packet.t0_us) for each in mine)
+        density = statistics.fmean(len(each.packet.stream) for each in mine)
+        density /= stream.height_px * stream.width_px
+        rows.append([kind, len(mine), round(length_ms, 2), round(density, 3), mine[0].assumed])
+    run.table("Packets", ["packets", "number", "mean ms", "events per px", "contrast maximisation of"], rows)
+    names = [*who, "contrast_maximisation", "true_flow", "zero_flow"]
+    for measure, (title, note, _, worst) in MEASURES.items():
+        rows = []
+        for kind, packets in found.items():
+            values = [_values(packets, name, measure) for name in names]
+            cells = [f"{statistics.fmean(each):.2f} ({worst(each):.2f})" if each else None for each in values]
+            if any(cells):
+                rows.append([kind, *cells])
+        run.table(title, ["packets", *(name.replace("_", " ") for name in names)], rows, note)
+
+
+def record(run, kind, packets):
+    """Means and extremes over the packets of a kind."""
+    for name in sorted({name for rows in packets for name in rows}):
+        for measure, (_, _, extreme, worst) in MEASURES.items():
+            values = _values(packets, name, measure)
+            if values:
+                key = f"{kind}_{name}_{measure}"
+                run.record(**{key: statistics.fmean(values), f"{key}_{extreme}": worst(values)})
+    if JUDGED in packets[0] and REFERENCE in packets[0]:
+        shares = [rows[JUDGED]["distance_px"] / rows[REFERENCE]["distance_px"] for rows in packets]
+        run.record(**{f"{kind}_{JUDGED}_distance_over_closed_form_largest": max(shares)})
+
+
+def _values(packets, name, measure):
+    return [rows[name][measure] for rows in packets if measure in rows.get(name, {})]

@@ -6,12 +6,11 @@ packets of events with flow files, and every event file the package reads (docs/
 --recording a small synthetic one is made and used, and the page says so.
 """
 
-import statistics
 import sys
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 
@@ -21,22 +20,12 @@ from codesign.flow import metrics
 from codesign.flow.checkpoint import DELIVERED
 from codesign.flow.checkpoint import load as load_network
 from codesign.flow.sources import PacketOptions, read_packets, read_recording
-from studies.flow_recording import doubts, made, video
-from studies.flow_recording import figures as drawn
+from studies.flow_recording import made, page, video
 from studies.frame.run import Run, StudyConfig, main
 
 SHOWN = 4  # packets with pictures
-UNITS = {
-    "aee_px": "AEE, px",
-    "rotation_difference_px": "difference from the flow of rotation alone, px",
-    "aee_dense_px": "AEE everywhere, px",
-    "zero_aee_px": "AEE of zero flow, px",
-    "outlier_percent": "outliers, %",
-    "angular_error_deg": "angular error, degrees",
-    "fwl": "FWL",
-    "rsat": "RSAT",
-    "truth_fwl": "FWL of the true flow",
-}
+MADE_PX = (180, 240)  # of the synthetic recording
+MADE_QUICK_PX = (90, 120)
 
 
 @dataclass(frozen=True)
@@ -95,15 +84,14 @@ def study(run: Run[Config]) -> None:
     config = run.config
     estimators = load(config.estimator)
     recording = config.recording
-    synthetic = config.recording is None
     if recording is None:
         recording = run.folder / "recording"
-        duration_s, size_px = (0.06, (90, 120)) if config.quick else (0.2, (180, 240))
         run.say(
             "No --recording given: making a small synthetic one (a camera that turns in a rendered room)."
         )
-        made.make(recording, duration_s, size_px, config.seed)
-    packets = read_packets(recording, config.truth, options(config, synthetic))
+        made.make(recording, *((0.06, MADE_QUICK_PX) if config.quick else (0.2, MADE_PX)), config.seed)
+    read = options(config)
+    packets = read_packets(recording, config.truth, read)
     run.say(f"{len(packets)} packet(s); {'; '.join(packets[0].notes)}")
     rows = []
     with run.progress(len(packets) * len(estimators), "packets") as progress:
@@ -114,23 +102,18 @@ def study(run: Run[Config]) -> None:
                 rows.append((packet, name, found))
                 progress.advance()
             if number < SHOWN:
-                run.figure(drawn.packet(packet, fields), f"packet_{number:02d}", caption(packet))
-    made_video = config.video and filmed(run, recording, estimators, options(config, synthetic))
-    show(run, packets, rows, tuple(estimators), synthetic, made_video)
+                run.figure(page.pictures(packet, fields), f"packet_{number:02d}", page.caption(packet))
+    film = filmed(run, recording, estimators, read) if config.video else None
+    page.show(run, packets, rows, tuple(estimators), film)
 
 
 def filmed(run, recording, estimators, read):
     """The Film of a recording, by the last of the estimators; its figures are recorded."""
     name, (estimate, bins) = list(estimators.items())[-1]
-    held = read_recording(recording, read)
-    tracker = flow.Tracker(
-        estimate,
-        None if read.events else read.window_s or 0.02,
-        read.events,
-        bins or run.config.bins,
-        skip=("windows_without_events",),
-    )
-    film = video.write(run, held, tracker, name, read.start_s or 0.0)
+    window_s = None if read.events else read.window_s or 0.02
+    skip = ("windows_without_events",)
+    tracker = flow.Tracker(estimate, window_s, read.events, bins or run.config.bins, skip=skip)
+    film = video.write(run, read_recording(recording, read), tracker, name, read.start_s or 0.0)
     run.record(**film.metrics)
     return film
 
@@ -146,64 +129,59 @@ def load(name):
     return {name if name == "refiner" else Path(name).stem: (network, network.config.get("bins", 8))}
 
 
-def options(config, synthetic):
+def options(config):
     """PacketOptions of the command line."""
-    if (config.width_px is None) != (config.height_px is None):
+    height, width = config.height_px, config.width_px
+    if (width is None) != (height is None):
         raise DomainError("give both --width-px and --height-px, or neither.")
-    size = (
-        (config.height_px, config.width_px)
-        if config.height_px is not None and config.width_px is not None
-        else None
-    )
-    if synthetic:
-        size = (90, 120) if config.quick else (180, 240)
-
-    def seconds(ms):
-        return None if ms is None else ms * 1e-3
-
+    size = None if width is None else (height, width)
+    window_ms = config.window_ms
+    if config.recording is None:
+        size = MADE_QUICK_PX if config.quick else MADE_PX
+        window_ms = window_ms or 20.0
+    seconds = [None if ms is None else ms * 1e-3 for ms in (window_ms, config.truth_interval_ms)]
     return PacketOptions(
-        seconds(config.window_ms or (20.0 if synthetic else None)),
-        config.start_s,
-        config.packets,
-        config.events,
-        size,
-        config.columns,
-        config.time_unit,
-        config.truth_unit,
-        seconds(config.truth_interval_ms),
-        config.gyro_axes,
-        config.calibration,
-        config.truth_pixels,
-        config.skip,
+        window_s=seconds[0],
+        start_s=config.start_s,
+        count=config.packets,
+        events=config.events,
+        size_px=size,
+        columns=config.columns,
+        time_unit=config.time_unit,
+        truth_unit=config.truth_unit,
+        truth_interval_s=seconds[1],
+        gyro_axes=config.gyro_axes,
+        calibration=config.calibration,
+        truth_pixels=config.truth_pixels,
+        skip=config.skip,
     )
 
 
 @torch.no_grad()
 def measured(packet, estimate, bins):
-    """(FlowField, {figure: value}) of a packet; a figure is None where it is not defined (no truth, no
-    events)."""
+    """(FlowField, {figure: value}) of a packet; only figures that are defined (truth, events)."""
     volume = events.from_stream(packet.stream, packet.t0_us, packet.t1_us, bins or 8)
     field = estimate(volume)
-    found: dict[str, Any] = dict.fromkeys(UNITS)
+    found = {}
+    span = (packet.t0_us, packet.t1_us)
     if packet.truth is not None:
         truth = packet.truth.flow_px
-        valid = packet.truth.valid
         if truth.shape != field.flow_px.shape:
             raise ShapeError(
                 f"{packet.name}: the true flow has shape {list(truth.shape)}, the estimate "
                 f"{list(field.flow_px.shape)}; give the sensor's size."
             )
-        both = valid & (volume.counts.sum((1, 2)) > 0)
-        if packet.translates:  # what rotation alone says is no truth then
-            if bool(both.any()):
-                found["rotation_difference_px"] = float(metrics.aee(field.flow_px, truth, both))
-        else:
-            found |= errors(field.flow_px, truth, valid, both)
+        both = packet.truth.valid & metrics.event_mask(volume)
+        # what rotation alone says is no truth where the camera translates
+        if not packet.translates:
+            found |= errors(field.flow_px, truth, packet.truth.valid, both)
+        elif bool(both.any()):
+            found["rotation_difference_px"] = float(metrics.aee(field.flow_px, truth, both))
         if len(packet.stream):
-            found["truth_fwl"] = float(metrics.fwl(packet.stream, truth, packet.t0_us, packet.t1_us))
+            found["truth_fwl"] = float(metrics.fwl(packet.stream, truth, *span))
     if len(packet.stream):
-        found["fwl"] = float(metrics.fwl(packet.stream, field.flow_px, packet.t0_us, packet.t1_us))
-        found["rsat"] = float(metrics.rsat(packet.stream, field.flow_px, packet.t0_us, packet.t1_us))
+        found["fwl"] = float(metrics.fwl(packet.stream, field.flow_px, *span))
+        found["rsat"] = float(metrics.rsat(packet.stream, field.flow_px, *span))
     return field, found
 
 
@@ -218,83 +196,6 @@ def errors(flow_px, truth, valid, both):
     if bool(valid.any()):
         found["aee_dense_px"] = float(metrics.aee(flow_px, truth, valid))
     return found
-
-
-def caption(packet):
-    length = 1e-3 * (packet.t1_us - packet.t0_us)
-    return f"{packet.name}: {len(packet.stream)} events in {length:.2f} ms. {'; '.join(packet.notes)}. Hue is the direction of the flow, saturation its length; black where nothing is known."
-
-
-def show(run, packets, rows, names, synthetic, made_video):
-    """Figures, tables and page."""
-    for name in names:
-        mine = [found for _, estimator, found in rows if estimator == name]
-        key = name.replace("-", "_").replace(".", "_")
-        for figure in UNITS:
-            values = [found[figure] for found in mine if found[figure] is not None]
-            if values:
-                run.record(**{f"{key}_{figure}": statistics.fmean(values)})
-        sharp = [found["fwl"] for found in mine if found["fwl"] is not None]
-        if sharp:
-            run.record(
-                **{
-                    f"{key}_fwl_least": min(sharp),
-                    f"{key}_fwl_above_1_share": sum(value > 1 for value in sharp) / len(sharp),
-                }
-            )
-        worse = [found["aee_px"] > found["zero_aee_px"] for found in mine if found["aee_px"] is not None]
-        if worse:
-            run.record(**{f"{key}_worse_than_zero_share": sum(worse) / len(worse)})
-    run.record(packets=len(packets), **doubts.counts(packets, rows, names[-1]))
-    main_one = (
-        names[-1].replace("-", "_").replace(".", "_")
-    )  # the trained network where there is one; its figures also under plain names
-    run.record(
-        **{
-            figure: run.metrics[f"{main_one}_{figure}"]
-            for figure in UNITS
-            if f"{main_one}_{figure}" in run.metrics
-        }
-    )
-    for label, figure, unit in (("AEE where events are", "aee_px", " px"), ("FWL", "fwl", "")):
-        if f"{main_one}_{figure}" in run.metrics:
-            note = (
-                f"zero flow: {run.metrics[f'{main_one}_zero_aee_px']:.3f} px"
-                if figure == "aee_px"
-                else f"above 1 in {100 * run.metrics[f'{main_one}_fwl_above_1_share']:.0f} % of packets"
-            )
-            run.card(f"{label}, {names[-1]}", f"{run.metrics[f'{main_one}_{figure}']:.3f}{unit}", note)
-    made_up = (
-        "**The recording is synthetic**: a camera that turns in a rendered room; the simulator's events, "
-        "the gyroscope's exact rates. "
-        if synthetic
-        else ""
-    )
-    run.section("Packets", made_up + " ".join(f"{note}." for note in packets[0].notes))
-    columns = ("packet", "ms", "events", "estimator", *UNITS.values())
-    table = [
-        (packet.name, 1e-3 * (packet.t1_us - packet.t0_us), len(packet.stream), name, *found.values())
-        for packet, name, found in rows
-    ]
-    legend = "AEE, outliers (above 3 px and 5 % of the true length) and angles where events are and the truth is valid, unless said otherwise. "
-    run.table(
-        "Every packet",
-        columns,
-        table,
-        legend + "FWL above 1: sharper than without flow; RSAT below 1 likewise.",
-    )
-    means = [
-        (name, *(run.metrics.get(f"{name.replace('-', '_').replace('.', '_')}_{figure}") for figure in UNITS))
-        for name in names
-    ]
-    run.table("Means over packets", ("estimator", *UNITS.values()), means)
-    for sentence in doubts.sentences(packets, rows, names[-1]):
-        run.text(sentence)
-    if made_video:
-        run.section("Video", made_video.sentence)
-        run.video(made_video.path.name, made_video.caption)
-    source = "a synthetic recording" if synthetic else f"`{run.config.recording}`"
-    run.finish("Event flow on a recording", f"{len(packets)} packets of {source}.")
 
 
 if __name__ == "__main__":

@@ -35,10 +35,8 @@ GROUPS = {
         "srm_bench",
     ),
     "flow": (
-        "flow_closed_form",
         "train_flow",
         "flow_quality",
-        "flow_compare",
         "flow_cost",
         "flow_recording",
     ),

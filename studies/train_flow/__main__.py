@@ -3,7 +3,8 @@
 The budget is processor time (--cpu-minutes, all threads, making the data included) or a number of steps
 (--steps). With --steps the result depends on the options and the seed alone, and a resumed run gives the same
 numbers bit for bit on the same machine and number of threads. Several processes share every batch: torchrun
---nproc-per-node 2 -m studies.train_flow ...
+--nproc-per-node 2 -m studies.train_flow ... With --race the refiner, networks of its size and your own are trained
+alike, and judged side by side.
 """
 
 import os
@@ -20,6 +21,7 @@ from codesign.errors import CodesignError
 from codesign.train import Budget, Clock, Cosine, join, loop
 from codesign.train.parallel import place
 from studies.frame.run import Run, StudyConfig, main
+from studies.train_flow.race import race
 from studies.train_flow.setup import prepare
 from studies.train_flow.watch import Watch
 
@@ -41,7 +43,7 @@ class Config(StudyConfig):
     weights: int = 0
     """Number of weights wanted of a network that comes in sizes; 0 leaves its own."""
     mix: str = "real"
-    """Windows to train on (studies.train_flow.sources)."""
+    """Windows to train on (scenes.windows.sets)."""
     data: Path | None = None
     """Data set (ours, DSEC, MVSEC) or recording to train on instead; its last tenth is what is judged on. Without true
     flow: --loss contrast."""
@@ -49,8 +51,8 @@ class Config(StudyConfig):
     """Frame intervals per window of a data set."""
     window_ms: float = 20.0
     """Length of the windows of a recording."""
-    loss: str = "supervised"
-    """supervised, contrast or photometric."""
+    loss: Literal["supervised", "contrast", "photometric"] = "supervised"
+    """What is made small."""
     unit: Literal["px", "motion"] = "motion"
     """Errors count in pixels, or as shares of the window's own root mean square flow (supervised)."""
     claim_weight: float = 0.3
@@ -99,14 +101,25 @@ class Config(StudyConfig):
     """bfloat16 where it is safe; CUDA only."""
     threads: int = 1
     """Threads of torch per process; 0 for all cores."""
+    race: bool = False
+    """Train the refiner and networks of as many weights with every one of --seeds, and judge them side by side."""
+    own: tuple[str, ...] = ()
+    """Networks of your own to race too: module:Class, run from the folder of the module."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Of a race: every network sees the same windows with the same seed."""
+    jobs: int = 2
+    """Trainings of a race at a time, one thread each."""
 
 
 def study(run: Run[Config]) -> None:
+    if run.config.race:
+        race(run)
+        return
     ranks = join()
     config = run.config
     ranks.tell((config, run.folder, run.resumed))
     job, ranks, clock = begin(config, run.folder, run.resumed, ranks)
-    watch = Watch(run, config, job, clock)
+    watch = Watch(run, job, clock)
     with watch:
         train(config, job, clock, watch.after_step)
     ranks.leave()

@@ -25,7 +25,7 @@ from codesign.train import (
 )
 from codesign.train import checkpoint as training
 from codesign.train.batches import probe
-from studies.train_flow.sources import VALIDATION, Shape, training_parts
+from scenes.windows.sets import TRAINING, VALIDATION, Shape
 
 # the last window in so many of a data set is judged on: whole stretches, since neighbours look alike
 HELD_OUT = 10
@@ -36,6 +36,45 @@ LOSSES = {
     "contrast": lambda config: Contrast(config.smoothness),
     "photometric": lambda config: Photometric(config.smoothness),
 }
+# what the numbers of a run depend on beside network, data and seed
+SCHEDULE = (
+    "steps",
+    "cpu_minutes",
+    "batch",
+    "learning_rate",
+    "weight_decay",
+    "warm_up",
+    "clip",
+    "average",
+    "reuse",
+    "loss",
+    "unit",
+    "claim_weight",
+    "smoothness",
+)
+COUNTS = (
+    "batch",
+    "reuse",
+    "steps",
+    "validate_every",
+    "validation_windows",
+    "final_windows",
+    "save_every",
+    "window_frames",
+)
+# options -> what they must be
+LIMITS = (
+    (COUNTS, lambda value: value >= 1, "at least 1"),
+    (("height_px", "width_px"), lambda value: value >= 16, "at least 16"),
+    (("bins",), lambda value: value >= 2, "at least 2"),
+    (
+        ("threads", "weights", "weight_decay", "claim_weight", "smoothness"),
+        lambda value: value >= 0,
+        "0 or more",
+    ),
+    (("cpu_minutes", "learning_rate", "clip"), lambda value: value > 0, "more than 0"),
+    (("warm_up", "average"), lambda value: 0 <= value < 1, "a share from 0 to below 1"),
+)
 
 
 @dataclass
@@ -51,43 +90,11 @@ class Job:
 
 def check_numbers(config, processes):
     """Raise DomainError for options that make no sense alone or together."""
-    least = {
-        "batch": 1,
-        "height_px": 16,
-        "width_px": 16,
-        "bins": 2,
-        "reuse": 1,
-        "validate_every": 1,
-        "validation_windows": 1,
-        "final_windows": 1,
-        "save_every": 1,
-        "threads": 0,
-        "weights": 0,
-        "window_frames": 1,
-    }
-    for name, limit in least.items():
-        if getattr(config, name) < limit:
-            raise DomainError(
-                f"--{name.replace('_', '-')} is {getattr(config, name)}; at least {limit} is needed."
-            )
-    if config.steps is not None and config.steps < 1:
-        raise DomainError(f"--steps is {config.steps}; at least 1 is needed.")
-    if config.cpu_minutes is not None and config.cpu_minutes <= 0:
-        raise DomainError(f"--cpu-minutes is {config.cpu_minutes}; give more than 0.")
-    if config.learning_rate <= 0 or config.weight_decay < 0 or config.clip <= 0:
-        raise DomainError(
-            f"learning rate {config.learning_rate}, weight decay {config.weight_decay}, clip {config.clip}: "
-            "give > 0, >= 0 and > 0."
-        )
-    if config.claim_weight < 0 or config.smoothness < 0:
-        raise DomainError(
-            f"claim weight {config.claim_weight}, smoothness {config.smoothness}: weights of 0 or more are "
-            "needed."
-        )
-    if not 0 <= config.warm_up < 1 or not 0 <= config.average < 1:
-        raise DomainError(
-            f"warm-up {config.warm_up}, average {config.average}: shares from 0 to below 1 are needed."
-        )
+    for names, fits, wanted in LIMITS:
+        for name in names:
+            value = getattr(config, name)
+            if value is not None and not fits(value):
+                raise DomainError(f"--{name.replace('_', '-')} is {value}; {wanted} is needed.")
     if config.batch % processes:
         raise DomainError(
             f"--batch {config.batch} cannot be shared evenly by {processes} processes; give a multiple."
@@ -104,7 +111,7 @@ def prepare(config, folder, resumed, ranks, clock):
     Raises: CodesignError with one sentence for every unfit option, file or data set.
     """
     check_numbers(config, ranks.count)
-    loss = objective(config)
+    loss = LOSSES[config.loss](config)
     network = build_network(config)
     if config.start is not None:
         start(network, config)
@@ -134,7 +141,7 @@ def prepare(config, folder, resumed, ranks, clock):
         "network": config.network,
         "config": dict(network.config),
         "seed": config.seed,
-        "schedule": schedule_facts(config),
+        "schedule": {name: getattr(config, name) for name in SCHEDULE},
         "torch": torch.__version__,
     }
     progress = training.load(folder / "checkpoint", learner, facts) if resumed else None
@@ -142,36 +149,6 @@ def prepare(config, folder, resumed, ranks, clock):
         parts = [(share, Started(source, network.start, FOREIGN)) for share, source in parts]
     batches = Batches(parts, config.batch, config.reuse, POOL, ranks.mine)
     return Job(learner, batches, validation, progress or Progress(), facts)
-
-
-def objective(config):
-    """The loss that --loss names.
-
-    Raises: DomainError for an unknown name.
-    """
-    if config.loss not in LOSSES:
-        raise DomainError(f"--loss {config.loss} is unknown; choose one of {', '.join(LOSSES)}.")
-    return LOSSES[config.loss](config)
-
-
-def schedule_facts(config):
-    """What the numbers of a run depend on beside network, data and seed."""
-    names = (
-        "steps",
-        "cpu_minutes",
-        "batch",
-        "learning_rate",
-        "weight_decay",
-        "warm_up",
-        "clip",
-        "average",
-        "reuse",
-        "loss",
-        "unit",
-        "claim_weight",
-        "smoothness",
-    )
-    return {name: getattr(config, name) for name in names}
 
 
 def build_network(config):
@@ -249,13 +226,10 @@ def sources(config, shape):
     """Training parts, and sources to judge on with the number of windows they have (None: as many as
     wanted)."""
     if config.data is None:
-        chosen = config.validate_on or tuple(VALIDATION)
-        unknown = [name for name in chosen if name not in VALIDATION]
-        if unknown:
-            raise DomainError(f"--validate-on {unknown[0]} is unknown; choose from {', '.join(VALIDATION)}.")
-        return training_parts(config.mix, shape, config.seed), {
-            name: VALIDATION[name](shape, 0) for name in chosen
-        }
+        check_names("mix", (config.mix,), TRAINING)
+        check_names("validate-on", config.validate_on, VALIDATION)
+        chosen = config.validate_on or VALIDATION
+        return TRAINING[config.mix](shape, config.seed), {name: VALIDATION[name](shape, 0) for name in chosen}
     whole = open_windows(
         config.data,
         config.bins,
@@ -273,3 +247,10 @@ def sources(config, shape):
     return [(1.0, Part(whole, 0, len(whole) - held))], {
         "held_out": Part(whole, len(whole) - held, len(whole))
     }
+
+
+def check_names(option, names, table):
+    """Raise DomainError for a name that is not in the table."""
+    for name in names:
+        if name not in table:
+            raise DomainError(f"--{option} {name} is unknown; choose from {', '.join(table)}.")

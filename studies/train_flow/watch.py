@@ -1,28 +1,35 @@
-"""What the first process does beside training: progress, validation, checkpoints, logs, and the results at
-the end."""
+"""What the first process does beside training: progress, validation, checkpoints, logs, and the results and their page
+at the end."""
 
 import json
 import statistics
 import sys
+from dataclasses import asdict
 from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
 
 from codesign import flow
 from codesign.flow import checkpoint
 from codesign.optional import optional
+from codesign.report.flow_colours import flow_colours
 from codesign.train import checkpoint as training
+from codesign.train.batches import to_device
 from codesign.train.validation import batches, score
-from studies.train_flow import page
 
 tensorboard = optional("torch.utils.tensorboard", "training-logs", "the log of a training")
 RECENT = 50  # steps over which the shown loss is averaged
+OURS = "#1b6ca8"
 
 
 class Watch:
     """Context around the training of a run; call ``after_step`` after each step, ``finish`` at the end."""
 
-    def __init__(self, run, config, job, clock):
+    def __init__(self, run, job, clock):
         self.run = run
-        self.config = config
+        self.config = run.config
         self.job = job
         self.clock = clock
         self._earlier_s = job.progress.validation_s
@@ -50,19 +57,14 @@ class Watch:
     def after_step(self, share):
         """Log the step; validate and save when it is time. share: of the budget, spent."""
         progress = self.job.progress
-        config = self.config
         step = progress.step
-        for name, values in (
-            ("loss", progress.loss),
-            ("gradient_norm", progress.norm),
-            ("learning_rate", progress.rate),
-        ):
-            self._log.add_scalar(f"training/{name}", values[-1], step)
-        if step % config.validate_every == 0:
+        for name, key in (("loss", "loss"), ("gradient_norm", "norm"), ("learning_rate", "rate")):
+            self._log.add_scalar(f"training/{name}", getattr(progress, key)[-1], step)
+        if step % self.config.validate_every == 0:
             self.validate()
-        if step % config.save_every == 0:
+        if step % self.config.save_every == 0:
             self.save()
-        units = step if config.steps is not None else int(100 * min(share, 1.0))
+        units = step if self.config.steps is not None else int(100 * min(share, 1.0))
         for _ in range(units - self._units):
             self._units += 1  # before advance, where an interrupt leaves the loop
             self._bar.advance(loss=statistics.fmean(progress.loss[-RECENT:]), step=step)
@@ -73,6 +75,7 @@ class Watch:
 
     def validate(self):
         """Judge the network on the first windows of every set, and keep the figures."""
+        progress = self.job.progress
         with self.clock("validation"):
             figures = {}
             for name, source in self.job.validation.items():
@@ -86,32 +89,31 @@ class Watch:
                     "closed_form_ratio": self._closed_form[name].ratio,
                 }
                 for key, value in figures[name].items():
-                    self._log.add_scalar(f"{name}/{key}", value, self.job.progress.step)
-        self.job.progress.validation_s = self._earlier_s + self.clock.spent["validation"]
-        self.job.progress.validation.append({"step": self.job.progress.step, **figures})
+                    self._log.add_scalar(f"{name}/{key}", value, progress.step)
+        progress.validation_s = self._earlier_s + self.clock.spent["validation"]
+        progress.validation.append({"step": progress.step, **figures})
         shown = "  ".join(
             f"{name} {value['ratio']:.3f} ({value['closed_form_ratio']:.3f})"
             for name, value in figures.items()
         )
-        self.run.say(f"step {self.job.progress.step}: error over that of zero flow (closed form): {shown}")
+        self.run.say(f"step {progress.step}: error over that of zero flow (closed form): {shown}")
 
     def finish(self):
         """Save, judge on all windows, keep the network, write metrics and page."""
         run = self.run
-        config = self.config
         progress = self.job.progress
         learner = self.job.learner
         self.save()
         scores = {}
         with self.clock("validation"), run.progress(len(self.job.validation), "judging") as bar:
             for name, source in self.job.validation.items():
-                windows = list(batches(source, config.final_windows))
+                windows = list(batches(source, self.config.final_windows))
                 scores[name] = self._judged(windows), score(flow.estimate_lk, windows)
                 bar.advance()
         progress.validation_s = self._earlier_s + self.clock.spent["validation"]
         figures = {
             "steps": progress.step,
-            "windows_shown": progress.step * config.batch,
+            "windows_shown": progress.step * self.config.batch,
             "weights": sum(p.numel() for p in learner.network.parameters()),
             "loss_last": statistics.fmean(progress.loss[-RECENT:]),
             "gradient_norm_largest": max(progress.norm),
@@ -134,7 +136,7 @@ class Watch:
             {"training": kept, "metrics": figures, "python": sys.version.split()[0]},
         )
         self._log.close()
-        page.show(run, config, self.job, scores)
+        show(run, self.job, scores)
 
     def _judged(self, windows):
         network = self.job.learner.delivered
@@ -148,9 +150,95 @@ def _figures(found):
     """{name: value} of a Score; errors only where there is truth."""
     if found.blur is not None:
         return {"blur_ratio": found.blur, "worse_percent": found.worse_percent}
-    return {
-        "aee_px": found.aee_px,
-        "ratio": found.ratio,
-        "worse_percent": found.worse_percent,
-        "zero_flow_px": found.zero_flow_px,
-    }
+    figures = asdict(found) | {"ratio": found.ratio}
+    return {name: figures[name] for name in ("aee_px", "ratio", "worse_percent", "zero_flow_px")}
+
+
+def show(run, job, scores):
+    """Cards, table, figures and text of a finished run."""
+    config = run.config
+    progress = job.progress
+    rows = []
+    for name, (ours, closed) in scores.items():
+        run.card(
+            f"{'error' if ours.blur is None else 'blur'} over zero flow's, {name.replace('_', ' ')}",
+            f"{ours.ratio:.3f}",
+            f"closed form {closed.ratio:.3f}; worse than zero flow on {ours.worse_percent:.1f} %",
+        )
+        errors = (ours.aee_px, closed.aee_px, ours.zero_flow_px, ours.ratio, closed.ratio)
+        rows.append((name, *errors, ours.worse_percent, closed.worse_percent, ours.windows))
+    run.section(
+        "On windows never trained on",
+        "Error: mean endpoint error over valid pixels. Worse: windows whose own mean error is above that of "
+        "zero flow. Windows without any true flow are judged by the blur of their warped events over that of zero flow.",
+    )
+    errors = ("error px", "closed form px", "zero flow px", "ratio", "closed form ratio")
+    run.table("Errors", ("set", *errors, "worse %", "closed form worse %", "windows"), rows)
+    run.section(
+        "Training",
+        f"{progress.step} steps of {config.batch} windows. Processor time: {progress.data_s / 60:.2f} min "
+        f"making windows, {progress.training_s / 60:.2f} min training, "
+        f"{progress.validation_s / 60:.2f} min validation (not part of the budget). Gradients shortened in "
+        f"{progress.clipped} of {progress.step} steps.",
+    )
+    run.figure(curves(progress), "curves", "Loss, gradient norm and validation by step. Dashed: closed form.")
+    run.figure(
+        pictures(job, scores),
+        "flows",
+        "One window of each set: events (ON less OFF), true flow, closed form, network. Hue: direction; "
+        "white: no flow; grey: no truth.",
+    )
+    cpu = (progress.data_s + progress.training_s) / 60
+    run.finish(
+        f"Training of {config.network}",
+        f"{cpu:.1f} processor minutes, seed {config.seed}, loss {config.loss}.",
+    )
+
+
+def curves(progress):
+    """Figure of loss, gradient norm and validation."""
+    figure, axes = plt.subplots(1, 3, figsize=(13, 3.4), layout="constrained")
+    steps = np.arange(1, progress.step + 1)
+    for axis, values, label in ((axes[0], progress.loss, "loss"), (axes[1], progress.norm, "gradient norm")):
+        width = max(1, min(50, len(values) // 5))
+        axis.plot(steps, values, color=OURS, linewidth=0.5, alpha=0.4)
+        axis.plot(steps[width - 1 :], np.convolve(values, np.ones(width) / width, "valid"), color=OURS)
+        axis.set(xlabel="step", ylabel=label, yscale="log")
+    names = [name for name in (progress.validation[-1] if progress.validation else {}) if name != "step"]
+    for number, name in enumerate(names):
+        entries = [entry for entry in progress.validation if name in entry]
+        at = [entry["step"] for entry in entries]
+        for key, style, label in (("ratio", ".-", name), ("closed_form_ratio", "--", None)):
+            values = [entry[name][key] for entry in entries]
+            axes[2].plot(at, values, style, color=f"C{number}", label=label, linewidth=0.8)
+    axes[2].set(xlabel="step", ylabel="error over zero flow's", ylim=(0, None))
+    if names:
+        axes[2].legend(fontsize=7)
+    return figure
+
+
+@torch.no_grad()
+def pictures(job, scores):
+    """Figure: one window of each set, in rows."""
+    network = job.learner.delivered.eval()
+    device = next(network.parameters()).device
+    size = (len(scores), 4)
+    figure, axes = plt.subplots(*size, figsize=(9, 2.3 * size[0]), layout="constrained", squeeze=False)
+    for row, name in zip(axes, scores, strict=True):
+        windows = job.validation[name].batch([0])
+        counts = windows.volume.counts[0]
+        truth = windows.truth
+        lengths = truth.flow_px.square().sum(1).sqrt()[truth.valid]
+        longest = max(float(lengths.max()), 1e-6) if len(lengths) else 1.0
+        row[0].imshow((counts[0] - counts[1]).sum(0).clamp(-3, 3).numpy(), cmap="RdBu", vmin=-3, vmax=3)
+        closed = flow.estimate_lk(windows.volume).flow_px
+        ours = network(to_device(windows, device).volume).flow_px.float().cpu()
+        valid = truth.valid[0].numpy()[..., None]
+        row[1].imshow(np.where(valid, flow_colours(truth.flow_px[0].numpy(), longest), 0.6))
+        for axis, estimate in zip(row[2:], (closed, ours), strict=True):
+            axis.imshow(flow_colours(estimate[0].numpy(), longest))
+        titles = (name, f"truth, up to {longest:.1f} px", "closed form", "network")
+        for axis, title in zip(row, titles, strict=True):
+            axis.set_title(title, fontsize=8)
+            axis.axis("off")
+    return figure

@@ -8,7 +8,7 @@ import torch
 
 from codesign import flow
 from codesign.flow.metrics import aee, zero_flow_error
-from scenes.flow_harsh import HARSH
+from scenes.windows.sets import HARSH
 
 SEED = 4242  # of no study
 

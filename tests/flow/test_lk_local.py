@@ -12,7 +12,7 @@ from codesign.flow import estimate_lk
 from codesign.flow.lk import quadtree
 from codesign.flow.lk.lanes import plain_operations
 from codesign.types import EventVolume
-from scenes.flow_windows import RenderedWindows, planes
+from scenes.windows.rendered import RenderedWindows, planes
 from tests.certain_case import certain
 from tests.flow.test_lk import D, mean_error, moving
 

@@ -9,7 +9,7 @@ from codesign.flow import estimate_lk
 from codesign.flow.export import evenly_timed
 from codesign.flow.lk.hot_pixels import weighed_down
 from codesign.types import EventVolume
-from scenes.flow_windows import RenderedWindows, planes
+from scenes.windows.rendered import RenderedWindows, planes
 from tests.certain_case import certain
 
 D = torch.float64

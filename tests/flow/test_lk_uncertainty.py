@@ -10,7 +10,7 @@ from codesign.flow import estimate_lk
 from codesign.flow.lk import level, polynomials
 from codesign.flow.lk.lanes import Grid
 from codesign.types import EventVolume
-from scenes.flow_windows import RenderedWindows, planes
+from scenes.windows.rendered import RenderedWindows, planes
 from tests.certain_case import certain
 
 D = torch.float64

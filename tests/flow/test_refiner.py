@@ -26,10 +26,9 @@ from codesign.flow.refiner_evidence import (
 )
 from codesign.flow.warp import along_flow, pixel_grid
 from codesign.types import EventVolume, FlowField, FlowWindows
-from scenes.flow_harsh import HARSH
-from scenes.flow_sets import SETS
-from scenes.flow_streams import turning
-from scenes.flow_windows import RenderedWindows, planes
+from scenes.windows.rendered import RenderedWindows, planes
+from scenes.windows.sets import HARSH, SETS
+from scenes.windows.streams import turning
 
 SEED = 4242  # of no study
 D = torch.float64

@@ -15,9 +15,8 @@ from codesign.events.stream import ordered
 from codesign.flow import metrics
 from codesign.flow.sources.packets import Packet
 from codesign.types import FlowField
-from scenes import flow_streams
+from scenes.windows import streams
 from studies.flow_quality import recordings, sharpest
-from studies.flow_quality.packets_page import _record
 from studies.frame.run import StudyConfig, open_run
 
 SIZE = (48, 64)
@@ -53,7 +52,7 @@ def test_the_sharpest_rotation_of_turning_dots():
     turn = np.array([0.03, -0.06, 0.05])
 
     def move(x, y, time):
-        rotation = flow_streams.Rotation.from_rotvec(time * turn).as_matrix()
+        rotation = streams.Rotation.from_rotvec(time * turn).as_matrix()
         seen = rotation @ np.stack([x / focal, y / focal, np.ones_like(x)])
         return focal * seen[0] / seen[2], focal * seen[1] / seen[2]
 
@@ -103,14 +102,14 @@ def test_an_empty_packet_is_refused():
 
 @pytest.fixture(scope="module")
 def slid():
-    return flow_streams.sliding(0.03, SIZE, seed=1)
+    return streams.sliding(0.03, SIZE, seed=1)
 
 
 def test_the_flow_of_a_slider_is_inverse_to_depth(slid):
     flow = slid.truth(5_000, 25_000).flow_px
     assert float(flow[:, 1].abs().max()) < 1e-4
     speeds = sorted({round(float(value), 3) for value in flow[:, 0].unique()})
-    allowed = [-flow_streams.FOCAL_PX * flow_streams.SLIDE_M_S * 0.02 / z for z in flow_streams.DEPTHS_M]
+    allowed = [-streams.FOCAL_PX * streams.SLIDE_M_S * 0.02 / z for z in streams.DEPTHS_M]
     assert len(speeds) >= 2
     for speed in speeds:
         assert min(abs(speed - each) for each in allowed) < 2e-3
@@ -118,7 +117,7 @@ def test_the_flow_of_a_slider_is_inverse_to_depth(slid):
 
 def test_the_flow_of_a_turn_is_that_of_its_rays():
     """Rays of start and end pixels differ by one rotation: R from three pixels maps all others."""
-    made = flow_streams.turning(0.02, SIZE, seed=1)
+    made = streams.turning(0.02, SIZE, seed=1)
     flow = made.truth(2_000, 18_000).flow_px[0].double()
     assert float(flow.norm(dim=0).mean()) > 0.3
     y, x = torch.meshgrid(
@@ -147,25 +146,27 @@ def test_events_of_a_made_recording_follow_its_flow(slid):
 
 def test_packets_of_a_recording(slid, tmp_path):
     """Packets hold the events asked for, and what is recorded are means and extremes over them."""
-    first, second = recordings._cut(slid, 400, 2)
+    first, second = recordings.cut(slid, 400, 2)
     assert len(first.stream) == len(second.stream) == 400
     assert first.t1_us <= second.t0_us
-    case = recordings.Case("slid", first, partial(recordings._in_context, slid, first, False), "affine")
-    reference = case.seek()
+    case = recordings.Case("slid", first, partial(recordings.in_context, slid, first, False), "affine")
 
     def nothing_moves(volume):
         shape = (1, 2, *volume.counts.shape[3:])
         return FlowField(torch.zeros(shape), torch.ones(1, *shape[2:], dtype=torch.bool), 1.0)
 
-    still = recordings.judged(case, reference, nothing_moves, 4)
+    rows = recordings.measured(case, {"refiner": nothing_moves}, 4)
+    still = rows["refiner"]
     assert still["fwl"] == 1.0
+    assert rows["zero_flow"] == {"fwl": 1.0, "aee_px": still["aee_px"]}
+    assert rows["contrast_maximisation"]["fwl"] > 1 < rows["true_flow"]["fwl"]
     volume = events.from_stream(first.stream, first.t0_us, first.t1_us, 4)
     mask = metrics.event_mask(volume)[0]
     assert first.truth is not None
     assert still["aee_px"] == pytest.approx(float(first.truth.flow_px[0].norm(dim=0)[mask].mean()), rel=1e-5)
-    rows = [{"refiner": {**still, "fwl": value}, "closed_form_quadratic": still} for value in (1.0, 2.0)]
+    packets = [{"refiner": {**still, "fwl": value}, "closed_form_quadratic": still} for value in (1.0, 2.0)]
     run = open_run("flow_quality", Config(out=tmp_path))
-    _record(run, "slid", rows)
+    recordings.record(run, "slid", packets)
     assert run.metrics["slid_refiner_fwl"] == 1.5
     assert run.metrics["slid_refiner_fwl_least"] == 1.0
     assert run.metrics["slid_refiner_distance_over_closed_form_largest"] == 1.0

@@ -1,7 +1,7 @@
 """Recordings with exact flow at any time: streams of events as a real camera gives them, of a camera that turns
 before a photograph and of one that slides past layers of depth."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from codesign import events
 from codesign.events import SensorModel, SensorState
 from codesign.types import EventStream, FlowField
 from scenes import textures
-from scenes.flow_layers import Plane, apply, compose, cover, gaussian, lookup, mirrored
+from scenes.windows.layers import Layer, Plane, apply, compose, cover, gaussian, mirrored, pixels, topmost
 
 SENSOR = SensorModel(
     theta_on=0.27,
@@ -38,31 +38,30 @@ TURN_HZ = np.array([1.3, 0.9, 1.1])
 TURN_PHASE = np.array([0.3, 1.4, 2.2])
 SLIDE_M_S = 0.35
 DEPTHS_M = (1.6, 1.1, 0.8, 0.55)  # the wall, and layers before it
+PHOTOGRAPHS = ("gravel", "astronaut", "camera", "brick")  # on them
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A stream with its flow. name: for people. focal_px: of the pinhole camera, its axis in the middle."""
+    """A stream with its flow. name: for people. focal_px: of the pinhole camera, its axis in the middle. layers: whose
+    motion is a function from times to homographies."""
 
     name: str
     stream: EventStream
     focal_px: float
-    layers: tuple
+    layers: list[Layer]
 
     def truth(self, t0_us: int, t1_us: int) -> FlowField:
         """Flow [1, 2, H, W] px from t0 to t1 on the pixels at t0, valid everywhere."""
-        points = _pixels(self.stream.height_px, self.stream.width_px)
-        flow = torch.zeros(2, *points.shape[:2])
-        for number, (move, crop, place) in enumerate(self.layers):
-            first, last = move(np.array([t0_us, t1_us]) * 1e-6)
-            back = apply(torch.from_numpy(np.linalg.inv(first)).float(), points)
+        points = pixels(self.stream.height_px, self.stream.width_px)
+
+        def look(layer):
+            first, last = layer.motion(np.array([t0_us, t1_us]) * 1e-6)
+            origin = apply(torch.from_numpy(np.linalg.inv(first)).float(), points).movedim(0, -1)
             moved = apply(torch.from_numpy(last @ np.linalg.inv(first)).float(), points)
-            moved = moved - points.movedim(-1, 0)
-            if number == 0:
-                flow = moved
-            else:
-                covered = lookup(crop[None, 1:], apply(place, back.movedim(0, -1))[None])[0, 0]
-                flow = torch.where(covered > 0.5, moved, flow)
+            return moved - points.movedim(-1, 0), origin
+
+        flow = topmost(self.layers, look)
         valid = torch.ones(1, *points.shape[:2], dtype=torch.bool)
         return FlowField(flow[None], valid, (t1_us - t0_us) * 1e-6)
 
@@ -77,14 +76,13 @@ def turning(duration_s=0.3, size_px=(180, 240), seed=0, texture="coffee") -> Rec
         return k @ Rotation.from_rotvec(angles).as_matrix() @ np.linalg.inv(k)
 
     draw = np.random.default_rng((31, seed))
-    layers = ((move, *_layer(draw, texture, size_px, False)),)
+    layers = [_layer(draw, move, texture, size_px, False)]
     return _recorded("turning", layers, duration_s, size_px, seed)
 
 
 def sliding(duration_s=0.4, size_px=(180, 240), seed=0) -> Recording:
     """A camera that slides sideways, at a steady speed, past photographs at four depths."""
     draw = np.random.default_rng((32, seed))
-    names = ("gravel", "astronaut", "camera", "brick")
 
     def moving(depth_m):
         def move(t_s):
@@ -94,15 +92,14 @@ def sliding(duration_s=0.4, size_px=(180, 240), seed=0) -> Recording:
 
         return move
 
-    layers = tuple(
-        (moving(depth_m), *_layer(draw, name, size_px, bool(number)))
-        for number, (depth_m, name) in enumerate(zip(DEPTHS_M, names, strict=True))
-    )
+    layers = [
+        _layer(draw, moving(depth_m), name, size_px, bool(number))
+        for number, (depth_m, name) in enumerate(zip(DEPTHS_M, PHOTOGRAPHS, strict=True))
+    ]
     return _recorded("sliding", layers, duration_s, size_px, seed)
 
 
-def _layer(draw, name, size_px, covering):
-    """Texture with its cover [2, S, S] and where it lies [3, 3], as scenes.flow_windows has them."""
+def _layer(draw, move, name, size_px, covering):
     size = int(SCALE * (max(size_px) + 160))
     texture = torch.from_numpy(np.ascontiguousarray(textures.photo(name)))
     piece = torch.ones(2, size, size)
@@ -110,34 +107,24 @@ def _layer(draw, name, size_px, covering):
         piece[1] = cover(draw, size, SCALE, max(size_px))
     piece[0] = mirrored(texture, size) * piece[1]
     place = np.diag([2 * SCALE / size, 2 * SCALE / size, 1.0])
-    return gaussian(piece, BLUR_PX * SCALE), torch.from_numpy(place).float()
+    return Layer(move, gaussian(piece, BLUR_PX * SCALE), torch.from_numpy(place).float())
 
 
 def _recorded(name, layers, duration_s, size_px, seed):
     """Events of all frames; those of the first SETTLING_S are left out."""
-    points = _pixels(*size_px)
+    points = pixels(*size_px)
     t_s = np.arange(-round(SETTLING_S * FRAMES_HZ), round(duration_s * FRAMES_HZ) + 1) / FRAMES_HZ
     state = SensorState(generator=torch.Generator().manual_seed(seed))
     parts = []
     for first in range(0, len(t_s), CHUNK):
         some = t_s[first : first + CHUNK]
-        sample = {
-            "motion": [Plane(torch.from_numpy(move(some)).float()) for move, _, _ in layers],
-            "crop": [crop for _, crop, _ in layers],
-            "place": [place for _, _, place in layers],
-        }
-        frames = 255 * (compose(sample, points) / 255).clamp_min(1e-3) ** CONTRAST
+        moved = [
+            replace(layer, motion=Plane(torch.from_numpy(layer.motion(some)).float())) for layer in layers
+        ]
+        frames = 255 * (compose(moved, points) / 255).clamp_min(1e-3) ** CONTRAST
         parts.append(events.simulate(frames, torch.from_numpy(some + SETTLING_S), SENSOR, state=state))
     whole = events.concatenate(parts)
     start_us = round(SETTLING_S * 1e6)
     kept = whole.t_us >= start_us
     t_us, x, y, p = (values[kept] for values in (whole.t_us - start_us, whole.x, whole.y, whole.p))
     return Recording(name, EventStream(t_us, x, y, p, *size_px), FOCAL_PX, layers)
-
-
-def _pixels(height, width):
-    """Centred pixels [H, W, 2]."""
-    y, x = torch.meshgrid(
-        torch.arange(height) - (height - 1) / 2, torch.arange(width) - (width - 1) / 2, indexing="ij"
-    )
-    return torch.stack([x, y], -1)

@@ -7,6 +7,7 @@ from scipy.ndimage import gaussian_filter
 
 from codesign.errors import DomainError
 from scenes import textures
+from scenes.windows.layers import turned
 
 SIZE = 512
 PROCEDURAL_COUNT = 48
@@ -100,8 +101,7 @@ def pile(draw, size_px=SIZE, shapes=1500):
         else:
             angle = draw.uniform(0, np.pi)
             flat = draw.uniform(0.1, 1.0)
-            along = dx * np.cos(angle) + dy * np.sin(angle)
-            across = dy * np.cos(angle) - dx * np.sin(angle)
+            along, across = turned(dx, dy, angle)
             inside = (np.abs(along) < radius) & (np.abs(across) < flat * radius)
         value = np.float32(draw.uniform(1.5, 5.4)) + 0.5 * _ramp(
             dx * (size_px / (4 * radius)) + size_px / 2, dy * (size_px / (4 * radius)) + size_px / 2, draw

@@ -1,34 +1,35 @@
 """Windows of events as real sensors give them, to train on: few or many events per pixel, unequal thresholds,
 bandwidth, dead time, noise per second, leak and hot pixels; layers that bend and hurry while they move."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from codesign.events import SensorModel, SensorState, dense_counts, from_counts
+from codesign.events import SensorModel, SensorState, dense_counts
 from codesign.events.sensor.state import begin
-from codesign.types import FlowField, FlowWindows
-from scenes.flow_bends import Bent, displacement, pace
-from scenes.flow_layers import compose
-from scenes.flow_windows import LEAD, RenderedWindows
+from scenes.windows.layers import Bent, compose
+from scenes.windows.motion import displacement, pace
+from scenes.windows.rendered import DARKEST, LEAD, RenderedWindows, log_uniform
 
 CONTRAST = (0.02, 2.5)  # factors on the texture's log radiance that a density may ask for
 NOISE_SHARE = 0.5  # noise events at most, per event of the scene
-DARKEST = 1e-3  # radiance on the 0..255 scale
 
 
 @dataclass(frozen=True)
 class Sensors:
     """Ranges (least, most) of sensors and of what they look at, each drawn evenly in the logarithm.
 
-    density: events per pixel and window that contrast is set for (noise comes on top, and what contrasts of
-      0.02 to 2.5 times the texture's cannot reach stays as it is). light: mean radiance, 0..255 scale; the
-      bandwidth grows with it. duration_s: length of the window, which noise, leak, bandwidth and dead time
-      refer to. theta, imbalance: threshold ON, and OFF over ON. mismatch: spread over pixels, relative.
-      cutoff_hz, shot_rate_hz, leak_rate_hz, refractory_s, hot_rate_hz: as in events.SensorModel. hot_share:
-      of the pixels, drawn evenly from 0 to this.
-      bend: displacement of a layer on top of its homography, relative to flow_px's upper end, evenly from 0;
+    Args:
+      density: events per pixel and window that contrast is set for (noise comes on top, and what contrasts of
+        0.02 to 2.5 times the texture's cannot reach stays as it is).
+      light: mean radiance, 0..255 scale; the bandwidth grows with it.
+      duration_s: length of the window, which noise, leak, bandwidth and dead time refer to.
+      theta, imbalance: threshold ON, and OFF over ON.
+      mismatch: spread over pixels, relative.
+      cutoff_hz, shot_rate_hz, leak_rate_hz, refractory_s, hot_rate_hz: as in events.SensorModel.
+      hot_share: of the pixels, drawn evenly from 0 to this.
+      bend: displacement of a layer on top of its homography, relative to flow_px's upper end, evenly from 0.
       pace: largest change of speed within a window.
     """
 
@@ -49,40 +50,30 @@ class Sensors:
 
 
 class SensorWindows(RenderedWindows):
-    """Source of FlowWindows seen by sensors that all differ: ``batch(indices)``.
+    """Windows seen by sensors that all differ.
 
-    Args: draws: what moves (its theta, mismatch, noise and contrast are not used). sensors: what looks.
-      Others as RenderedWindows.
     The memorised levels start between the thresholds with the triangular density of a level that has wandered
     for long: each event sets it to the middle.
+    Args:
+      draws: what moves (its theta, mismatch, noise and contrast are not used).
+      sensors: what looks.
+      intervals: frames per window.
+      options: others as RenderedWindows.
     """
 
     def __init__(self, draws=None, sensors=None, *, intervals=24, **options):
         super().__init__(draws, intervals=intervals, **options)
         self.sensors = sensors or Sensors()
 
-    def batch(self, indices):
-        """As RenderedWindows.batch."""
-        counts = []
-        truth = []
-        ends = []
-        for index in indices:
-            draw = np.random.default_rng((self.seed, int(index), 1))
-            sample = self._draw(index, pace(draw, self.t, self.sensors.pace))
-            if self.sensors.bend > 0:
-                sample["motion"] = [self._bent(draw, plane) for plane in sample["motion"]]
-            points = self._undistorted([sample["distortion"]])[0]
-            frames = compose(sample, points)
-            counts.append(self._events(draw, frames))
-            truth.append(self._truth(sample, points))
-            ends.append(frames[[LEAD, -1]])
-        t_s = torch.linspace(0, 1, self.intervals + 1, dtype=torch.float64)
-        flow = torch.stack(truth)
-        return FlowWindows(
-            from_counts(torch.stack(counts, 2), t_s, self.bins),
-            FlowField(flow, torch.ones_like(flow[:, 0], dtype=torch.bool), 1.0),
-            torch.stack(ends),
-        )
+    def _window(self, index):
+        draw = np.random.default_rng((self.seed, index, 1))
+        sample = self._draw(index, pace(draw, self.t, self.sensors.pace))
+        if self.sensors.bend > 0:
+            layers = [replace(layer, motion=self._bent(draw, layer.motion)) for layer in sample.layers]
+            sample = replace(sample, layers=layers)
+        points = self._undistorted(sample.distortion)
+        frames = compose(sample.layers, points)
+        return self._events(draw, frames), *self._truth(sample, points), frames[[LEAD, -1]]
 
     def _bent(self, draw, plane):
         rms_px = draw.uniform(0, self.sensors.bend) * self.draws.flow_px[1]
@@ -93,20 +84,20 @@ class SensorWindows(RenderedWindows):
         """Counts [intervals, 2, H, W] of the window behind a sensor of its own."""
         s = self.sensors
         density, light, duration_s, theta, imbalance, mismatch = (
-            _log_uniform(draw, *limits)
+            log_uniform(draw, *limits)
             for limits in (s.density, s.light, s.duration_s, s.theta, s.imbalance, s.mismatch)
         )
         sensor = SensorModel(
             theta_on=theta,
             theta_off=theta * imbalance,
             theta_sigma=theta * mismatch,
-            cutoff_hz=_log_uniform(draw, *s.cutoff_hz),
-            leak_rate_hz=min(_log_uniform(draw, *s.leak_rate_hz), NOISE_SHARE / 2 * density / duration_s),
+            cutoff_hz=log_uniform(draw, *s.cutoff_hz),
+            leak_rate_hz=min(log_uniform(draw, *s.leak_rate_hz), NOISE_SHARE / 2 * density / duration_s),
             rate_cov_decades=0.2,
-            shot_rate_hz=min(_log_uniform(draw, *s.shot_rate_hz), NOISE_SHARE * density / duration_s),
-            refractory_s=_log_uniform(draw, *s.refractory_s),
+            shot_rate_hz=min(log_uniform(draw, *s.shot_rate_hz), NOISE_SHARE * density / duration_s),
+            refractory_s=log_uniform(draw, *s.refractory_s),
             hot_pixel_share=float(draw.uniform(0, s.hot_share)),
-            hot_pixel_rate_hz=_log_uniform(draw, *s.hot_rate_hz),
+            hot_pixel_rate_hz=log_uniform(draw, *s.hot_rate_hz),
         )
         level = frames.clamp_min(DARKEST).log()
         path = float(level[LEAD:].diff(dim=0).abs().sum(0).mean())
@@ -119,7 +110,3 @@ class SensorWindows(RenderedWindows):
         place = torch.rand((2, *level[0].shape), generator=generator).sum(0) - 1
         state.reference = state.reference - place * torch.where(place > 0, state.theta_on, state.theta_off)
         return dense_counts(level[1:], t_s[1:], sensor, generator, state, log_input=True)[LEAD:]
-
-
-def _log_uniform(draw, least, most):
-    return float(np.exp(draw.uniform(np.log(least), np.log(most))))

@@ -1,0 +1,225 @@
+"""The page of a recording: figures and their means, pictures, and what they do not say: windows and events left out, and
+why a true flow may be none."""
+
+import statistics
+
+import torch
+from matplotlib.figure import Figure
+
+from codesign.flow.contrast import count_image, stream_tracks
+from codesign.report.flow_colours import flow_colours
+
+BRIGHT = 0.99  # quantile of the counts of the still events that is shown white
+SHARPER = 1.02  # times the truth's FWL: estimates are sharper than a truth that is right by less
+NAMED = 5  # packets that a sentence names
+UNITS = {
+    "aee_px": "AEE, px",
+    "rotation_difference_px": "difference from the flow of rotation alone, px",
+    "aee_dense_px": "AEE everywhere, px",
+    "zero_aee_px": "AEE of zero flow, px",
+    "outlier_percent": "outliers, %",
+    "angular_error_deg": "angular error, degrees",
+    "fwl": "FWL",
+    "rsat": "RSAT",
+    "truth_fwl": "FWL of the true flow",
+}
+
+
+def show(run, packets, rows, names, film):
+    """Metrics, tables and page. rows: (packet, estimator, figures); names: of the estimators; film: or None."""
+    means = {name: _means([found for _, one, found in rows if one == name]) for name in names}
+    for name, mine in means.items():
+        run.record(**{f"{_key(name)}_{figure}": value for figure, value in mine.items()})
+    # the trained network where there is one; its figures also under plain names
+    best = names[-1]
+    main = means[best]
+    run.record(packets=len(packets), **counts(packets, rows, best))
+    run.record(**{figure: main[figure] for figure in UNITS if figure in main})
+    if "aee_px" in main:
+        zero = f"zero flow: {main['zero_aee_px']:.3f} px"
+        run.card(f"AEE where events are, {best}", f"{main['aee_px']:.3f} px", zero)
+    if "fwl" in main:
+        share = f"above 1 in {100 * main['fwl_above_1_share']:.0f} % of packets"
+        run.card(f"FWL, {best}", f"{main['fwl']:.3f}", share)
+    synthetic = run.config.recording is None
+    made_up = (
+        "**The recording is synthetic**: a camera that turns in a rendered room; the simulator's events, "
+        "the gyroscope's exact rates. "
+    )
+    notes = " ".join(f"{note}." for note in packets[0].notes)
+    run.section("Packets", f"{made_up if synthetic else ''}{notes}")
+    table = [
+        (packet.name, _ms(packet), len(packet.stream), name, *(found.get(figure) for figure in UNITS))
+        for packet, name, found in rows
+    ]
+    run.table(
+        "Every packet",
+        ("packet", "ms", "events", "estimator", *UNITS.values()),
+        table,
+        "AEE, outliers (above 3 px and 5 % of the true length) and angles where events are and the truth is valid, unless "
+        "said otherwise. FWL above 1: sharper than without flow; RSAT below 1 likewise.",
+    )
+    table = [(name, *(mine.get(figure) for figure in UNITS)) for name, mine in means.items()]
+    run.table("Means over packets", ("estimator", *UNITS.values()), table)
+    for sentence in doubts(packets, rows, best):
+        run.text(sentence)
+    if film is not None:
+        run.section("Video", film.sentence)
+        run.video(film.path.name, film.caption)
+    source = "a synthetic recording" if synthetic else f"`{run.config.recording}`"
+    run.finish("Event flow on a recording", f"{len(packets)} packets of {source}.")
+
+
+def _key(name):
+    return name.replace("-", "_").replace(".", "_")
+
+
+def _ms(packet):
+    return 1e-3 * (packet.t1_us - packet.t0_us)
+
+
+def _means(found):
+    """{figure: mean over the packets that have it}, and shares of packets."""
+    values = {figure: [each[figure] for each in found if figure in each] for figure in UNITS}
+    means = {figure: statistics.fmean(each) for figure, each in values.items() if each}
+    if sharp := values["fwl"]:
+        means |= {
+            "fwl_least": min(sharp),
+            "fwl_above_1_share": statistics.fmean(value > 1 for value in sharp),
+        }
+    if "aee_px" in means:
+        worse = [ours > zero for ours, zero in zip(values["aee_px"], values["zero_aee_px"], strict=True)]
+        means["worse_than_zero_share"] = statistics.fmean(worse)
+    return means
+
+
+def counts(packets, rows, name):
+    """{metric: number} of the faults of a recording and of its packets. name: the estimator that is compared with the
+    truth."""
+    return {
+        "packets_without_events": sum(not len(packet.stream) for packet in packets),
+        "packets_without_truth": sum(packet.truth is None for packet in packets),
+        "packets_translating": sum(packet.translates for packet in packets),
+        "packets_across_gaps": sum(packet.across_gap for packet in packets),
+        "packets_sharper_than_truth": len(_sharper(rows, name)),
+        "truth_undistorted_doubt_px": max(packet.undistorted_px for packet in packets),
+        "events": sum(len(packet.stream) for packet in packets),
+        **{f"left_out_{fault}": number for fault, number in packets[0].left_out.items()},
+    }
+
+
+def doubts(packets, rows, name):
+    """Paragraphs for the page, those alone that concern this recording."""
+    found = counts(packets, rows, name)
+    empty = found["packets_without_events"]
+    blind = found["packets_without_truth"]
+    left_out = [
+        f"{number} {fault.replace('_', ' ')}" for fault, number in packets[0].left_out.items() if number
+    ]
+    gaps = found["packets_across_gaps"]
+    moving = [packet.name for packet in packets if packet.translates]
+    distorted_px = found["truth_undistorted_doubt_px"]
+    sharper = _sharper(rows, name)
+    blurred = [
+        packet.name for packet, one, figures in rows if one == name and figures.get("truth_fwl", 1) < 1
+    ]
+    sentences = (
+        (
+            empty or blind,
+            f"{empty} packet(s) hold no event, {blind} have no true flow; they do not count in the figures that need one.",
+        ),
+        (left_out, f"**Left out**: {', '.join(left_out)}."),
+        (
+            gaps,
+            f"**{gaps} packet(s) lie across a gap** of the recording, where no pixel sent an event: their flow is that of "
+            "the rest of the window.",
+        ),
+        (
+            moving,
+            f"**The camera translates** in {_some(moving)}, and the only true flow is that of its rotation: the difference "
+            "from it is no error and is not counted as one; FWL says how good the flow is.",
+        ),
+        (
+            distorted_px,
+            "**The camera has distortion**, and the true flow comes from a file: if that is of undistorted pixels, it is "
+            f"{distorted_px:.2f} px off in the mean of a packet, enough to turn rankings round. `--truth-pixels "
+            "undistorted` carries it to the sensor's pixels.",
+        ),
+        (
+            sharper,
+            f"**{name} makes the events sharper than the true flow does** in {_some(sharper)}: the truth may belong to "
+            "other pixels or times, or leave something out; errors against it are then not the estimate's alone.",
+        ),
+        (
+            blurred,
+            f"**The true flow makes the events less sharp than none** in {_some(blurred)}: check its unit, times and axes, "
+            "or whether it holds there.",
+        ),
+    )
+    return [sentence for holds, sentence in sentences if holds]
+
+
+def _sharper(rows, name):
+    return [
+        packet.name
+        for packet, one, figures in rows
+        if one == name and "truth_fwl" in figures and figures["fwl"] > SHARPER * figures["truth_fwl"]
+    ]
+
+
+def _some(names):
+    return f"{len(names)} packet(s) ({', '.join(names[:NAMED])}{', ...' if len(names) > NAMED else ''})"
+
+
+def caption(packet):
+    return (
+        f"{packet.name}: {len(packet.stream)} events in {_ms(packet):.2f} ms. {'; '.join(packet.notes)}. Hue is the "
+        "direction of the flow, saturation its length; black where nothing is known."
+    )
+
+
+def pictures(packet, fields):
+    """Figure: per estimator a row of the events as they came, the events warped to the window's end, the
+    flow, and the true flow. fields: {name: FlowField}."""
+    height, width = packet.stream.height_px, packet.stream.width_px
+    figure = Figure(figsize=(12, (2.9 * height / width + 0.35) * len(fields)), layout="constrained")
+    axes = figure.subplots(len(fields), 4, squeeze=False)
+    still = _warped(packet, torch.zeros(1, 2, height, width))
+    bright = float(still[still > 0].quantile(BRIGHT)) if bool((still > 0).any()) else 1.0
+    truth = packet.truth
+    longest = None
+    if truth is not None and bool(truth.valid.any()):
+        longest = float(truth.flow_px.abs().amax(1)[truth.valid].max())
+    for row, (name, field) in zip(axes, fields.items(), strict=True):
+        full = longest or max(float(field.flow_px.abs().max()), 1e-6)
+        known = field.valid[0] if field.confidence is None else field.valid[0] & (field.confidence[0] > 0)
+        gray = {"cmap": "gray", "vmin": 0, "vmax": 2 * bright}
+        row[0].imshow(still.numpy(), **gray)
+        row[1].imshow(_warped(packet, field.flow_px).numpy(), **gray)
+        row[2].imshow(_colours(field.flow_px[0], known, full))
+        if truth is not None:
+            row[3].imshow(_colours(truth.flow_px[0], truth.valid[0], full))
+        else:
+            row[3].set_aspect(height / width)
+        titles = (
+            "events as they came",
+            f"warped by {name}",
+            f"{name}, full colour {full:.1f} px",
+            "no true flow" if truth is None else "true flow",
+        )
+        for axis, title in zip(row, titles, strict=True):
+            axis.set_title(title, fontsize=9)
+            axis.set_xticks([])
+            axis.set_yticks([])
+    return figure
+
+
+def _colours(flow_px, known, full):
+    colours = torch.from_numpy(flow_colours(flow_px.numpy(), full))
+    return torch.where(known[..., None], colours, torch.zeros_like(colours)).numpy()
+
+
+def _warped(packet, flow_px):
+    if not len(packet.stream):
+        return torch.zeros(flow_px.shape[2:])
+    return count_image(stream_tracks(packet.stream, flow_px, packet.t0_us, packet.t1_us), 1.0)[0].sum(0)
