@@ -8,7 +8,7 @@ STUDY :=
 RUN := .venv/bin/python
 INSTALL := $(RUN) -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable
 STUDIES := lens-opt lens-report lens-scratch lens-tolerance lens-bench dataset video-to-events \
-	event-bench srm-bench sensor-fit train-flow flow-quality flow-compare flow-cost flow-recording \
+	event-bench srm-bench sensor-fit train-flow flow-quality flow-cost flow-recording \
 	placement speed-error stability gradcheck
 
 .PHONY: help setup test fuzz kill-test test-bits lint core-check try-all doctor clean $(STUDIES)
@@ -49,8 +49,6 @@ srm-bench: .venv/with-bench.stamp ## the spiking layer against a convolution and
 sensor-fit: .venv/with-event-files.stamp ## fit a sensor to a recording of yours: make sensor-fit ARGS="--recording FILE.aedat4"
 train-flow: .venv/with-event-files.stamp .venv/with-training-logs.stamp ## train a flow network: make train-flow ARGS="--network refiner --cpu-minutes 20"
 flow-quality: ## error of the delivered refiner and of the closed form on unseen textures and worlds
-flow-compare: .venv/with-training-logs.stamp ## the refiner against networks of its size, same windows and budget
-flow-compare: STUDY := train_flow --race
 flow-cost: ## time and memory of flow estimators
 flow-recording: .venv/with-event-files.stamp ## flow of a recording: make flow-recording ARGS="--recording FOLDER"
 placement: .venv/with-search.stamp ## where to mount the camera on a robot

@@ -2,7 +2,12 @@
 both."""
 
 import json
+import os
+import socket
+import subprocess
+import sys
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -16,11 +21,11 @@ from studies.frame.run import main
 from studies.train_flow import __main__ as train_flow
 from studies.train_flow import watch
 
+ROOT = Path(__file__).resolve().parents[1]
 BINS = 2
 SIDE = 16
-TRUE_WEIGHTS = torch.tensor(
-    [[0.5, -0.25, 1.0, 0.0], [-1.0, 0.75, 0.25, 0.5]]
-)  # flow of a window is this times its counts, pixel by pixel
+# flow of a window is this times its counts, pixel by pixel
+TRUE_WEIGHTS = torch.tensor([[0.5, -0.25, 1.0, 0.0], [-1.0, 0.75, 0.25, 0.5]])
 
 
 class Linear(nn.Module):
@@ -39,27 +44,26 @@ class Linear(nn.Module):
         return self.predictions(volume)[-1]
 
 
+class Own(Linear):
+    """The same, in no table of networks."""
+
+
 class Made:
     """Source of windows whose flow is TRUE_WEIGHTS times the counts; ``before`` is called with the indices of
-    every batch."""
+    every batch; blind: no pixel has known flow."""
 
-    def __init__(self, seed=0, frames=True, before=lambda indices: None):
+    def __init__(self, seed=0, frames=True, before=lambda indices: None, blind=False):
         self.seed = seed
+        self.blind = blind
         self.frames = frames
         self.before = before
 
     def batch(self, indices):
         self.before(indices)
-        counts = torch.stack(
-            [
-                torch.randn(
-                    2, BINS, SIDE, SIDE, generator=torch.Generator().manual_seed(1000 * self.seed + i)
-                ).square()
-                for i in indices
-            ]
-        )
+        draws = [torch.Generator().manual_seed(1000 * self.seed + index) for index in indices]
+        counts = torch.stack([torch.randn(2, BINS, SIDE, SIDE, generator=draw).square() for draw in draws])
         flow = torch.einsum("fc,bchw->bfhw", TRUE_WEIGHTS, counts.flatten(1, 2))
-        valid = torch.ones(len(counts), SIDE, SIDE, dtype=torch.bool)
+        valid = torch.full((len(counts), SIDE, SIDE), not self.blind)
         times = torch.tensor([0.25, 0.75], dtype=torch.float64), torch.tensor([0.5, 0.5], dtype=torch.float64)
         return FlowWindows(
             EventVolume(counts, *times), FlowField(flow, valid, 1.0), counts[:, 0] if self.frames else None
@@ -115,13 +119,47 @@ BASE = [
 ]
 
 
-def train(folder, *more):
-    return main(train_flow.study, train_flow.Config, [*BASE, "--out", str(folder), *more])
+def train(folder, options=""):
+    return main(train_flow.study, train_flow.Config, [*BASE, "--out", str(folder), *options.split()])
+
+
+def resume(folder):
+    return main(train_flow.study, train_flow.Config, ["--resume", str(folder)])
+
+
+def in_two_processes(script, *arguments):
+    """(exit codes, outputs) of a script run by two processes, with the variables that torchrun sets."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    shared = {
+        "PYTHONPATH": str(ROOT),
+        "OMP_NUM_THREADS": "1",
+        "WORLD_SIZE": "2",
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+    }
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", script, *map(str, arguments)],
+            env={**os.environ, **shared, "RANK": str(rank)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for rank in (0, 1)
+    ]
+    try:
+        said = [process.communicate(timeout=300)[0] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    return [process.returncode for process in processes], said
 
 
 def state_of(folder):
-    """Every tensor of the last checkpoint, as bytes."""
-    (path,) = (folder / "checkpoint").glob("step_*.safetensors")
+    """Every tensor of the checkpoint in a folder, as bytes."""
+    (path,) = folder.glob("step_*.safetensors")
     return {
         name: tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
         for name, tensor in checkpoint.read_tensors(path)[0].items()

@@ -47,8 +47,12 @@ class Batches:
 
     Groups are shown in turns of ``pool``, so the same windows do not follow each other. A batch depends on
     its step and the arguments alone: after a resume, groups that are still needed are made again.
-    Args: parts: list of (share, source). batch: windows per step. reuse: times, >= 1; above 1 the sources
-      give FlowWindows. mine: function that selects this process's sample numbers (Ranks.mine).
+    Args:
+      parts: list of (share, source).
+      batch: windows per step.
+      reuse: times, >= 1; above 1 the sources give FlowWindows.
+      pool: groups shown in turns.
+      mine: function that selects this process's sample numbers (Ranks.mine).
     """
 
     def __init__(
@@ -161,9 +165,11 @@ class Part:
 class Started:
     """Windows of a source together with what a network begins from, estimated once however often they are shown.
 
-    Args: start: EventVolume -> FlowField with covariance, equivariant to turns and mirrors. foreign: share of the
-      samples that begin elsewhere, as from the window before: with half to one and a fifth of the start's flow, and a
-      covariance of 1 px^2 along both axes.
+    Args:
+      source: of the windows.
+      start: EventVolume -> FlowField with covariance, equivariant to turns and mirrors.
+      foreign: share of the samples that begin elsewhere, as from the window before: with half to one and a fifth of the
+        start's flow, and a covariance of 1 px^2 along both axes.
     """
 
     def __init__(self, source: Source, start: Callable[[EventVolume], FlowField], foreign: float = 0.0):

@@ -51,17 +51,21 @@ def fit(
         or ``forward(volume) -> FlowField``.
       windows: a source, ``batch(indices) -> FlowWindows`` (codesign.flow.sources); a list of (share, source);
         or a function step -> batch of anything (codesign.train.Batches, to show windows several times).
-      steps: number of steps, those of earlier calls included. batch: samples per step from a source.
-      loss: (prediction, batch) -> scalar; ``Supervised()`` when None. predict: (network, batch) ->
-        prediction.
+      steps: number of steps, those of earlier calls included.
+      batch: samples per step from a source.
+      loss: (prediction, batch) -> scalar; ``Supervised()`` when None.
+      predict: (network, batch) -> prediction.
       optimiser: torch optimiser over parameters of the network, all or some; AdamW with a step of 2e-3 when
-        None. schedule: share of the steps, 0 to 1 -> factor on its learning rates; ``Cosine()`` when None.
-      clip: longest gradient; longer ones are shortened to it. average: decay of a running average of the
-        weights, which is then judged and kept.
+        None.
+      schedule: share of the steps, 0 to 1 -> factor on its learning rates; ``Cosine()`` when None.
+      clip: longest gradient; longer ones are shortened to it.
+      average: decay of a running average of the weights, which is then judged and kept.
       validate: network, in evaluation mode -> score, lower is better (``error_ratio(source)``); called every
         ``validate_every`` steps and at the end. The network ends with the best weights that were judged,
         without ``validate`` with the last.
+      validate_every: steps between judgements.
       save_to: folder of the checkpoint, written every ``save_every`` steps and at the end; None keeps none.
+      save_every: steps between checkpoints.
       resume: go on from that checkpoint where there is one; it is started over when False.
       progress: told (steps made, loss) when a step is whole.
       seed: of what the network draws in a step (dropout).
@@ -116,7 +120,8 @@ def fit(
             save()
         if progress is not None and first:
             progress(made.step, made.loss[-1])
-        if ranks.count > 1:  # all stop at one step, whoever was asked
+        # all stop at one step, whoever was asked
+        if ranks.count > 1:
             interruption.requested = ranks.sum(float(interruption.requested))[0] > 0
         interruption.safe_point()
 

@@ -55,13 +55,16 @@ class Learner:
     A step depends on the learner's state and the batch alone: what a step draws from torch's global random
     numbers (dropout) is drawn from the seed and the step's number, and they are left as they were.
     Args:
-      network: nn.Module, on the device to train on. loss: (prediction, batch) -> scalar.
+      network: nn.Module, on the device to train on.
+      loss: (prediction, batch) -> scalar.
       optimiser: over the network's parameters, all or some; ``adamw(network)`` when None.
       predict: (network, batch) -> prediction.
-      clip: longest gradient; longer ones are shortened to it. average: decay per step of a running average
-        of the weights, which is then what is judged and kept; 0 for none.
+      clip: longest gradient; longer ones are shortened to it.
+      average: decay per step of a running average of the weights, which is then what is judged and kept; 0 for
+        none.
       validate: network, in evaluation mode -> score, lower is better; None when nobody judges.
-      ranks: this process among those that train. seed: of the random numbers within a step.
+      ranks: this process among those that train.
+      seed: of the random numbers within a step.
       mixed_precision: bfloat16 where it is safe, in ``predict`` alone; CUDA only.
     Raises: DomainError for an optimiser of other or frozen parameters.
     """
@@ -265,7 +268,8 @@ class Learner:
         state = {index: held[name] for index, name in enumerate(self._names) if name in held}
         self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": state})
         moved = [parameter for group in self.optimiser.param_groups for parameter in group["params"]]
-        for index, moments in state.items():  # numbers keep their dtype, which torch takes from the weights
+        # numbers keep their dtype, which torch takes from the weights
+        for index, moments in state.items():
             numbers = {name: value.clone() for name, value in moments.items() if value.ndim == 0}
             self.optimiser.state[moved[index]].update(numbers)
 

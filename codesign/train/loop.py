@@ -16,10 +16,14 @@ from codesign.train.learner import Learner
 class Progress:
     """What a training has done so far.
 
-    step: steps made. data_s, training_s: processor seconds of all processes, for making windows and for the
-      rest of the steps. validation_s: those of the first process for validation. clipped: steps whose
-      gradient was shortened. blind: windows shown that had no pixel with known flow. loss, norm, rate: by
-      step. validation: list of {"step", figures}.
+    Args:
+      step: steps made.
+      data_s, training_s: processor seconds of all processes, for making windows and for the rest of the steps.
+      validation_s: those of the first process for validation.
+      clipped: steps whose gradient was shortened.
+      blind: windows shown that had no pixel with known flow.
+      loss, norm, rate: by step.
+      validation: list of {"step", figures}.
     """
 
     step: int = 0
@@ -100,9 +104,14 @@ def run(
 ) -> None:
     """All steps that the budget leaves.
 
-    Args: batches: step -> batch. progress: of earlier sessions; is carried on. schedule: share of the budget
-      -> factor on the learning rates. clock: counts what was spent before. after_step: is told the share that
-      is spent, when a step is whole; what it raises ends the loop.
+    Args:
+      learner: what is trained.
+      batches: step -> batch.
+      progress: of earlier sessions; is carried on.
+      budget: when it ends.
+      schedule: share of the budget -> factor on the learning rates.
+      clock: counts what was spent before.
+      after_step: is told the share that is spent, when a step is whole; what it raises ends the loop.
     """
     clock = clock or Clock()
     ranks = learner.ranks

@@ -17,7 +17,8 @@ from codesign.flow.losses import (
 )
 from codesign.types import FlowField, FlowWindows
 
-GAMMA = 0.8  # an earlier prediction counts so much less than the next (Teed and Deng, RAFT, ECCV 2020, eq. 7)
+# an earlier prediction counts so much less than the next (Teed and Deng, RAFT, ECCV 2020, eq. 7)
+GAMMA = 0.8
 
 
 def flow_predictions(network: nn.Module, windows: FlowWindows) -> list[FlowField]:
@@ -34,8 +35,9 @@ class Supervised:
     """Distance to the true flow; and, where the network claims a covariance, the likelihood of the error under it, with
     long tails, which teaches the claim and leaves the flow alone.
 
-    unit: errors count in pixels, or as shares of the window's own root mean square flow. claim_weight: of the
-      likelihood.
+    Args:
+      unit: errors count in pixels, or as shares of the window's own root mean square flow.
+      claim_weight: of the likelihood.
     """
 
     unit: Literal["px", "motion"] = "motion"

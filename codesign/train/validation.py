@@ -19,12 +19,13 @@ TOGETHER = 16  # windows judged at a time
 class Score:
     """Figures of one estimator on one set.
 
-    aee_px, zero_flow_px: mean endpoint error over all valid pixels, of the estimate and of zero flow.
+    Args:
+      aee_px, zero_flow_px: mean endpoint error over all valid pixels, of the estimate and of zero flow.
       worse_percent: share of the windows on which the estimate's own mean error is above zero flow's.
       windows: how many were judged.
-    blur: of a set without any true flow, the blur of its events warped by the estimate, as a share of that of zero
-      flow (contrast_loss), which then stands for the errors; worse_percent counts windows where it is above 1. None
-      where there is truth.
+      blur: of a set without any true flow, the blur of its events warped by the estimate, as a share of that of zero
+        flow (contrast_loss), which then stands for the errors; worse_percent counts windows where it is above 1. None
+        where there is truth.
     """
 
     aee_px: float

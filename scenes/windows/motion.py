@@ -118,7 +118,7 @@ def warps(draw, t, width_px, height_px, flow_px, layers):
     )
     probe = torch.stack([x, y], -1).double()
     share = torch.from_numpy(np.asarray(t, dtype=np.float64))
-    unit = [Warp(*field, share) for field in found]
+    unit = [Warp(wave, phase, part, affine, share) for wave, phase, part, affine in found]
     length = torch.stack([field.displacement(probe).square().sum(-1) for field in unit]).mean().sqrt()
     size = wanted / float(length)
     steepest = size * float(torch.stack([field.stretch(probe) for field in unit]).max())

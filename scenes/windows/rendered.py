@@ -192,7 +192,7 @@ class RenderedWindows(Windows):
                 else ONE_PLANE[d.motion](draw, t, *size, d.flow_px)
             )
             motion = [Plane(layer) for layer in torch.from_numpy(matrices).float()]
-        blur_px = np.hypot(BLUR_LEAST_PX, draw.uniform(*d.blur_px))
+        blur_px = np.hypot(BLUR_LEAST_PX, draw.uniform(d.blur_px[0], d.blur_px[1]))
         layers = []
         for number, moved in enumerate(motion):
             crop, place = self._texture(draw, number > 0, blur_px)
@@ -202,8 +202,8 @@ class RenderedWindows(Windows):
         rate = log_uniform(draw, *d.noise) * 8 if d.noise[1] > 0 else 0.0
         events = draw.poisson(rate * 2 * shape[0] * shape[1])
         noise = np.stack([draw.integers(0, high, events) for high in (self.intervals, 2, *shape)])
-        distortion = draw.uniform(*d.distortion)
-        contrast = float(draw.uniform(*d.contrast))
+        distortion = draw.uniform(d.distortion[0], d.distortion[1])
+        contrast = float(draw.uniform(d.contrast[0], d.contrast[1]))
         ratio = log_uniform(draw, *d.on_over_off) ** 0.5
         thetas *= np.array([ratio, 1 / ratio])[:, None, None]
         return Sample(layers, distortion, contrast, torch.from_numpy(thetas).float(), torch.from_numpy(noise))

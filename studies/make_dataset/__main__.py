@@ -99,44 +99,31 @@ class Clock:
 @torch.no_grad()
 def study(run: Run[Config]) -> None:
     require("h5py", "event-files", "a data set")
-    config = checked(run.config)
-    scene, stage = make_world(config.world, config.light)
-    camera = make_camera(config)
-    clock = Clock()
     start = time.perf_counter()
+    config = checked(run.config)
+    maker = Maker(config)
     names = [
         f"sequence_{index:03d}_{FAMILIES[index % len(FAMILIES)]}" for index in range(config.trajectories)
     ]
-    size = chunk_size(config)
-    chunks = math.ceil(config.frames / size)
-    ready = {
-        name: chunks if store.is_done(run.folder / name) else store.parts_done(run.folder / name)
-        for name in names
-    }
-    table = ProjectionTable(camera)
-    rays = camera.rays()
-    chief = camera.chief_rays(camera.film.pixels())
-    segments = Segments(scene)
-    done = sum(ready.values())
+    folders = [run.folder / name for name in names]
+    ready = [maker.chunks if store.is_done(folder) else store.parts_done(folder) for folder in folders]
     resident_mb = []
-    with run.progress(chunks * len(names), "chunks", done) as progress:
-        for index, name in enumerate(names):
-            if store.is_done(run.folder / name):
+    with run.progress(maker.chunks * len(names), "chunks", sum(ready)) as progress:
+        for index, folder in enumerate(folders):
+            if store.is_done(folder):
                 continue
-            sequence = Sequence(
-                config, index, run.folder / name, scene, stage, camera, table, rays, chief, segments, clock
-            )
-            for chunk in range(ready[name], chunks):
-                events = sequence.make(chunk, size)
+            sequence = Sequence(maker, index, folder)
+            for chunk in range(ready[index], maker.chunks):
+                events = sequence.make(chunk)
                 progress.advance(sequence=index, events=events)
-            sequence.finish(chunks)
+            sequence.finish()
             resident_mb.append(resident_mb_now())
     wall_s = time.perf_counter() - start
     write_atomic(run.folder / "manifest.json", store.manifest(run.folder, names).encode())
-    fresh = (chunks * len(names) - done) * size
     if resident_mb:
         run.record(session_resident_mb_first=resident_mb[0], session_resident_mb_last=resident_mb[-1])
-    pages.show(run, names, clock.spent, wall_s, min(fresh, config.frames * len(names)))
+    fresh = min((maker.chunks * len(names) - sum(ready)) * maker.chunk_frames, config.frames * len(names))
+    pages.show(run, names, maker.clock.spent, wall_s, fresh)
 
 
 def checked(config):
@@ -161,11 +148,6 @@ def checked(config):
     return config
 
 
-def chunk_size(config):
-    """Frames per part; the same for every session of a run."""
-    return max(2, min(config.chunk, PIXELS_PER_CHUNK // config.size**2))
-
-
 def make_camera(config):
     """The camera of a configuration: the lens scaled to its focal length, the film to FIELD_SHARE of its
     field."""
@@ -179,96 +161,52 @@ def make_camera(config):
             "file."
         )
     geo = geo.scaled(config.focal_length_mm / float(geo.first_order().efl_mm.detach())).freeze()
-    pitch_mm = (
-        2
-        * config.focal_length_mm
-        * math.tan(math.radians(half_deg))
-        * FIELD_SHARE
-        / (config.size * math.sqrt(2))
-    )
-    chosen = {
+    diagonal_mm = 2 * config.focal_length_mm * math.tan(math.radians(half_deg)) * FIELD_SHARE
+    pitch_mm = diagonal_mm / (config.size * math.sqrt(2))
+    levels = {
         "traced": lambda: geo,
         "thin": geo.thin,
         "pinhole": lambda: lens.Pinhole(config.focal_length_mm),
-    }[config.level]()
-    samples = config.samples if config.level != "pinhole" or config.samples > 1 else 1
-    return Camera(chosen, config.size, config.size, pitch_mm, samples, config.seed)
+    }
+    return Camera(levels[config.level](), config.size, config.size, pitch_mm, config.samples, config.seed)
 
 
-class Sequence:
-    """One sequence in the making."""
+class Maker:
+    """What all sequences share: world, camera, sensor, the tables of truth, and the clock."""
 
-    def __init__(self, config, index, folder, scene, stage, camera, table, rays, chief, segments, clock):
+    def __init__(self, config):
         self.config = config
-        self.folder = folder
-        self.scene = scene
-        self.camera = camera
-        self.clock = clock
-        self.table = table
-        self.rays = rays
-        self.chief = chief
-        self.segments = segments
-        self.family = FAMILIES[index % len(FAMILIES)]
-        (folder / store.PARTS).mkdir(parents=True, exist_ok=True)
-        (folder / "flow" / "forward").mkdir(parents=True, exist_ok=True)
-        self.t_s = times(config.frames, config.rate_hz)
-        draw, self.noise = (
-            torch.Generator().manual_seed(1_000_003 * config.seed + 2 * index + k) for k in (0, 1)
+        self.scene, self.stage = make_world(config.world, config.light)
+        self.camera = make_camera(config)
+        self.sensor = SensorModel(
+            config.theta, config.theta, config.theta_sigma, shot_rate_hz=config.shot_rate_hz
         )
-        self.path = motion(self.family, stage, scene, camera, float(self.t_s[-1]), draw)
-        self.poses = self.path(LEAD_S + self.t_s).detach()
-        self.state = None
+        # the same for every session of a run
+        self.chunk_frames = max(2, min(config.chunk, PIXELS_PER_CHUNK // config.size**2))
+        self.chunks = math.ceil(config.frames / self.chunk_frames)
+        self.table = ProjectionTable(self.camera)
+        self.rays = self.camera.rays()
+        self.chief = self.camera.chief_rays(self.camera.film.pixels())
+        self.segments = Segments(self.scene)
+        self.clock = Clock()
 
-    def make(self, chunk, size):
-        """Render, simulate and store frames chunk * size and on; returns the number of events."""
-        first = chunk * size
-        last = min((chunk + 1) * size, self.config.frames)
-        if self.state is None:  # at the start of a session
-            self.state = (
-                store.read_state(store.part_path(self.folder, chunk - 1))
-                if chunk
-                else SensorState(generator=self.noise)
-            )
-        clock = self.clock
-        sensor = SensorModel(
-            self.config.theta,
-            self.config.theta,
-            self.config.theta_sigma,
-            shot_rate_hz=self.config.shot_rate_hz,
-        )
-        with clock.on("frames"):
-            frames = shade(
-                self.rays,
-                at_frames(self.scene, slice(first, last)),
-                self.poses[first:last],
-                self.camera.samples_per_pixel,
-            ).reshape(-1, *self.camera.film.shape)
-        with clock.on("truth"):
-            truth = self._truth(first, last)
-        with clock.on("events"):
-            events = simulate(frames, self.t_s[first:last], sensor, state=self.state)
-        with clock.on("flow files"):
-            for k, (flow, valid) in enumerate(zip(truth["flow"], truth["valid"], strict=True)):
-                for kind in ("png", "flo") if self.config.flo else ("png",):
-                    write_flow(self.folder / "flow" / "forward" / f"{first + k:06d}.{kind}", flow, valid)
-        with clock.on("writing"):
-            store.write_part(
-                store.part_path(self.folder, chunk), {"frames": frames, **truth}, events, self.state
-            )
-        return len(events)
+    def frames(self, poses, first, last):
+        """Images [last - first, H, W]."""
+        scene = at_frames(self.scene, slice(first, last))
+        images = shade(self.rays, scene, poses[first:last], self.camera.samples_per_pixel)
+        return images.reshape(-1, *self.camera.film.shape)
 
-    def _truth(self, first, last):
+    def truth(self, poses, first, last):
+        """Depth, objects, segments and flow of frames first to last, by the names of store.FRAME_TYPES."""
         step = max(1, PIXELS_PER_TRUTH // self.config.size**2)
         found = []
         for start in range(first, last, step):
-            stop = min(start + step, last)
-            some = slice(start, min(stop + 1, self.config.frames))
+            count = min(start + step, last) - start
+            some = slice(start, min(start + count + 1, self.config.frames))
             scene = at_frames(self.scene, some)
-            count = stop - start
-            truth = truth_of_frames(self.table, scene, self.poses[some], count, self.chief)
-            segments = self.segments.at(
-                self.chief, at_frames(scene, slice(count)), self.poses[start:stop], truth.object_id
-            )
+            truth = truth_of_frames(self.table, scene, poses[some], count, self.chief)
+            now = at_frames(scene, slice(count))
+            segments = self.segments.at(self.chief, now, poses[start : start + count], truth.object_id)
             found.append(
                 {
                     "depth": truth.depth_m,
@@ -281,47 +219,22 @@ class Sequence:
             )
         return {name: torch.cat([part[name] for part in found]) for name in found[0]}
 
-    def finish(self, count):
-        """Join the parts and write what describes the sequence; last of all the file that says so."""
-        with self.clock.on("writing"):
-            velocity = self.path.velocity(LEAD_S + self.t_s).detach()
-            store.join(
-                self.folder,
-                count,
-                self.t_s.numpy(),
-                {"poses": self.poses.numpy(), "velocity": velocity.numpy()},
-            )
-            write_tum(self.folder / "poses.txt", self.t_s, self.poses)
-            self._calibration()
-            us = np.rint(self.t_s.numpy() * 1e6).astype(np.int64)
-            lines = [
-                "# from_timestamp_us, to_timestamp_us",
-                *(f"{a}, {b}" for a, b in itertools.pairwise(us)),
-            ]
-            write_atomic(self.folder / "flow" / "forward_timestamps.txt", ("\n".join(lines) + "\n").encode())
-            store.finish(
-                self.folder,
-                {"family": self.family, **pages.statistics(self.folder), "segments": self.segments.names},
-            )
-
-    def _calibration(self):
+    def calibration(self, folder):
         """camera.h5: the chief ray of every pixel, camera axes, and the matrix of the pinhole that it is near
         the axis; lens.json for a traced lens."""
         film = self.camera.film
-        content = io.BytesIO()
-        centre = film.middle_px.tolist()
-        beside = self.camera.chief_rays(
-            film.middle_px
-            + torch.tensor([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]], dtype=torch.float64)
-        ).direction.double()
+        aside = torch.tensor([[0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5]], dtype=torch.float64)
+        beside = self.camera.chief_rays(film.middle_px + aside).direction.double()
         x = beside[:, 0] / beside[:, 2]
         y = beside[:, 1] / beside[:, 2]
-        fx = float(1 / (x[0] - x[1]))
-        fy = float(1 / (y[2] - y[3]))
+        cx, cy = film.middle_px.tolist()
+        content = io.BytesIO()
         with store.h5(content, "w") as file:
             file["direction"] = self.chief.direction.reshape(*film.shape, 3).double().numpy()
             file["origin_m"] = self.chief.origin_m.reshape(*film.shape, 3).double().numpy()
-            file["K"] = np.array([[fx, 0, centre[0]], [0, fy, centre[1]], [0, 0, 1.0]])
+            file["K"] = np.array(
+                [[float(1 / (x[0] - x[1])), 0, cx], [0, float(1 / (y[2] - y[3])), cy], [0, 0, 1.0]]
+            )
             file.attrs.update(
                 lens=self.config.lens,
                 level=self.config.level,
@@ -330,9 +243,73 @@ class Sequence:
                 width_px=film.width_px,
                 height_px=film.height_px,
             )
-        write_atomic(self.folder / "camera.h5", content.getvalue())
+        write_atomic(folder / "camera.h5", content.getvalue())
         if isinstance(self.camera.lens, lens.GeoLens):
-            lens.save(self.camera.lens, self.folder / "lens.json")
+            lens.save(self.camera.lens, folder / "lens.json")
+
+
+class Sequence:
+    """One sequence in the making."""
+
+    def __init__(self, maker, index, folder):
+        config = maker.config
+        self.maker = maker
+        self.folder = folder
+        self.family = FAMILIES[index % len(FAMILIES)]
+        (folder / store.PARTS).mkdir(parents=True, exist_ok=True)
+        (folder / "flow" / "forward").mkdir(parents=True, exist_ok=True)
+        self.t_s = times(config.frames, config.rate_hz)
+        draw, self.noise = (
+            torch.Generator().manual_seed(1_000_003 * config.seed + 2 * index + k) for k in (0, 1)
+        )
+        duration_s = float(self.t_s[-1])
+        self.path = motion(self.family, maker.stage, maker.scene, maker.camera, duration_s, draw)
+        self.poses = self.path(LEAD_S + self.t_s).detach()
+        self.state = None
+
+    def make(self, chunk):
+        """Render, simulate and store the frames of a chunk; returns the number of events."""
+        maker = self.maker
+        clock = maker.clock
+        first = chunk * maker.chunk_frames
+        last = min(first + maker.chunk_frames, maker.config.frames)
+        # at the start of a session
+        if self.state is None and chunk:
+            self.state = store.read_state(store.part_path(self.folder, chunk - 1))
+        elif self.state is None:
+            self.state = SensorState(generator=self.noise)
+        with clock.on("frames"):
+            frames = maker.frames(self.poses, first, last)
+        with clock.on("truth"):
+            truth = maker.truth(self.poses, first, last)
+        with clock.on("events"):
+            events = simulate(frames, self.t_s[first:last], maker.sensor, state=self.state)
+        with clock.on("flow files"):
+            for k, (flow, valid) in enumerate(zip(truth["flow"], truth["valid"], strict=True)):
+                for kind in ("png", "flo") if maker.config.flo else ("png",):
+                    write_flow(self.folder / "flow" / "forward" / f"{first + k:06d}.{kind}", flow, valid)
+        with clock.on("writing"):
+            part = store.part_path(self.folder, chunk)
+            store.write_part(part, {"frames": frames, **truth}, events, self.state)
+        return len(events)
+
+    def finish(self):
+        """Join the parts and write what describes the sequence; last of all the file that says so."""
+        maker = self.maker
+        with maker.clock.on("writing"):
+            velocity = self.path.velocity(LEAD_S + self.t_s).detach()
+            extra = {"poses": self.poses.numpy(), "velocity": velocity.numpy()}
+            store.join(self.folder, maker.chunks, self.t_s.numpy(), extra)
+            write_tum(self.folder / "poses.txt", self.t_s, self.poses)
+            maker.calibration(self.folder)
+            us = np.rint(self.t_s.numpy() * 1e6).astype(np.int64)
+            lines = [
+                "# from_timestamp_us, to_timestamp_us",
+                *(f"{a}, {b}" for a, b in itertools.pairwise(us)),
+            ]
+            write_atomic(self.folder / "flow" / "forward_timestamps.txt", ("\n".join(lines) + "\n").encode())
+            facts = {"family": self.family, **pages.statistics(self.folder), "segments": maker.segments.names}
+            store.finish(self.folder, facts)
 
 
 if __name__ == "__main__":

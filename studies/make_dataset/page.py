@@ -2,7 +2,6 @@
 sheet."""
 
 import json
-import math
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -15,6 +14,18 @@ from studies.make_dataset.store import h5
 
 SHOWN_FRAMES = 5  # whose events are in one picture
 BLOCK = 16  # frames read at a time
+COLUMNS = {
+    "events": "events",
+    "events_per_pixel_s": "per pixel and s",
+    "on_share": "ON",
+    "mean_flow_px": "mean flow, px",
+    "largest_flow_px": "largest, px",
+    "valid_share": "valid",
+    "occluded_share": "occluded",
+    "nearest_m": "nearest, m",
+    "farthest_m": "farthest, m",
+    "path_m": "path, m",
+}
 
 
 def statistics(folder):
@@ -25,32 +36,32 @@ def statistics(folder):
         count = frames["frames"].shape[0]
         poses = frames["poses"][()]
         duration_s = float(frames["t_s"][-1])
-        nearest = math.inf
-        farthest = 0.0
+        nearest = []
+        farthest = [0.0]
         light = 0.0
-        seen = 0
         for start in range(0, count, BLOCK):
             depth = frames["depth"][start : start + BLOCK]
             hit = depth[depth > 0]
-            nearest = min(nearest, float(hit.min(initial=math.inf)))
-            farthest = max(farthest, float(hit.max(initial=0)))
-            seen = seen + hit.size
+            if hit.size:
+                nearest.append(float(hit.min()))
+                farthest.append(float(hit.max()))
             light += float(frames["frames"][start : start + BLOCK].sum(dtype=np.float64))
         pixels = frames["frames"].size
         occluded = sum(int(frames["occluded"][k : k + BLOCK].sum()) for k in range(0, count, BLOCK))
         lengths = [_lengths(frames["flow"][k], frames["valid"][k]) for k in range(count - 1)]
+    mean_px, largest_px, valid = zip(*lengths, strict=True)
     return {
         "frames": count,
         "duration_s": duration_s,
         "events": events,
         "events_per_pixel_s": events / duration_s / (pixels / count),
         "on_share": on,
-        "mean_flow_px": float(np.mean([mean for mean, _, _ in lengths])),
-        "largest_flow_px": float(max(most for _, most, _ in lengths)),
-        "valid_share": float(np.mean([share for _, _, share in lengths])),
+        "mean_flow_px": float(np.mean(mean_px)),
+        "largest_flow_px": float(max(largest_px)),
+        "valid_share": float(np.mean(valid)),
         "occluded_share": occluded / pixels,
-        "nearest_m": nearest if seen else 0.0,
-        "farthest_m": farthest,
+        "nearest_m": min(nearest, default=0.0),
+        "farthest_m": max(farthest),
         "mean_radiance": light / pixels,
         "path_m": float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()),
     }
@@ -65,28 +76,18 @@ def _lengths(flow, valid):
 
 def show(run, names, spent, wall_s, frames_made):
     """Metrics and the page of a finished data set."""
-    facts = {
-        name: json.loads((run.folder / name / "sequence.json").read_text(encoding="utf-8")) for name in names
-    }
-    disk_mb = (
-        sum(
-            path.stat().st_size for name in names for path in (run.folder / name).rglob("*") if path.is_file()
-        )
-        / 1e6
-    )
-    events = sum(f["events"] for f in facts.values())
-    frames = sum(f["frames"] for f in facts.values())
-    run.record(
-        frames=frames,
-        events=events,
-        disk_mb=disk_mb,
-        sequences=len(names),
-        session_wall_s=wall_s,
-    )
+    folders = [run.folder / name for name in names]
+    facts = [json.loads((folder / "sequence.json").read_text(encoding="utf-8")) for folder in folders]
+    sizes = [path.stat().st_size for folder in folders for path in folder.rglob("*") if path.is_file()]
+    disk_mb = sum(sizes) / 1e6
+    events = sum(each["events"] for each in facts)
+    frames = sum(each["frames"] for each in facts)
+    run.record(frames=frames, events=events, disk_mb=disk_mb, sequences=len(names), session_wall_s=wall_s)
     run.record(**{f"session_{part.replace(' ', '_')}_s": seconds for part, seconds in spent.items()})
     run.card("Frames", f"{frames}", f"in {len(names)} sequences")
     run.card("Events", f"{events / 1e6:.2f} million", f"{events / max(frames - len(names), 1):.0f} per frame")
-    if frames_made:  # else the figures of the session that made the last ones stay
+    # else the figures of the session that made the last ones stay
+    if frames_made:
         run.record(session_frames_per_s=frames_made / wall_s)
         run.card("Speed", f"{frames_made / wall_s:.1f} frames/s", f"{wall_s:.0f} s in this session")
     run.card("Disk", f"{disk_mb:.0f} MB", f"{1e3 * disk_mb / frames:.0f} kB per frame, everything")
@@ -96,38 +97,14 @@ def show(run, names, spent, wall_s, frames_made):
         "the next frame, depth.",
     )
     run.figure(
-        contact_sheet(run.folder, names),
+        contact_sheet(folders),
         "contact_sheet",
         "Flow by colour: hue is the direction as in the wheel at the bottom, saturation the length, full at "
         "the longest of the picture. Depth: dark is near.",
     )
     run.section("Sequences")
-    columns = (
-        "events",
-        "events_per_pixel_s",
-        "on_share",
-        "mean_flow_px",
-        "largest_flow_px",
-        "valid_share",
-        "occluded_share",
-        "nearest_m",
-        "farthest_m",
-        "path_m",
-    )
-    titles = (
-        "sequence",
-        "events",
-        "per pixel and s",
-        "ON",
-        "mean flow, px",
-        "largest, px",
-        "valid",
-        "occluded",
-        "nearest, m",
-        "farthest, m",
-        "path, m",
-    )
-    run.table("Every sequence", titles, [(name, *(facts[name][key] for key in columns)) for name in names])
+    rows = [(name, *(each[key] for key in COLUMNS)) for name, each in zip(names, facts, strict=True)]
+    run.table("Every sequence", ("sequence", *COLUMNS.values()), rows)
     times = [(part, seconds, 1e3 * seconds / max(frames_made, 1)) for part, seconds in spent.items()]
     run.table(
         "Time",
@@ -139,23 +116,23 @@ def show(run, names, spent, wall_s, frames_made):
     run.finish("Data set", f"{len(names)} sequences, {frames} frames and {events} events, {disk_mb:.0f} MB.")
 
 
-def contact_sheet(root, names):
+def contact_sheet(folders):
     """Figure: one row per sequence, and the colour wheel."""
     figure, axes = plt.subplots(
-        len(names) + 1,
+        len(folders) + 1,
         4,
-        figsize=(9, 2.3 * len(names) + 1.5),
+        figsize=(9, 2.3 * len(folders) + 1.5),
         squeeze=False,
         layout="constrained",
-        height_ratios=[*[1] * len(names), 0.5],
+        height_ratios=[*[1] * len(folders), 0.5],
     )
-    for row, name in zip(axes, names, strict=False):
-        for axis, (title, image, options) in zip(row, _pictures(root / name), strict=True):
+    for row, folder in zip(axes, folders, strict=False):
+        for axis, (title, image, options) in zip(row, _pictures(folder), strict=True):
             axis.imshow(image, **options)
             axis.set_title(title, fontsize=8)
             axis.set_xticks([])
             axis.set_yticks([])
-        row[0].set_ylabel(name.removeprefix("sequence_"), fontsize=8)
+        row[0].set_ylabel(folder.name.removeprefix("sequence_"), fontsize=8)
     for axis in axes[-1]:
         axis.axis("off")
     y, x = np.mgrid[-1:1:128j, -1:1:128j]

@@ -8,9 +8,7 @@ Every training is a run of this study in a folder below; those that are done are
 import re
 import subprocess
 import sys
-import time
-
-import matplotlib.pyplot as plt
+from concurrent.futures import ThreadPoolExecutor, as_completed
 
 from codesign import flow
 from codesign.errors import CodesignError, DomainError
@@ -32,7 +30,6 @@ NAMES = {
 RATES = {"refiner": 2e-3, "flownet-events": 2e-3, "spike-flownet": 3e-3, "ecn": 1e-3, "idnet": 2e-3}
 ASKED = 0.6  # of a rival's error, at most
 SEED = 55  # of what is judged here
-POLL_S = 1.0
 
 
 def race(run):
@@ -59,28 +56,32 @@ def _folder(run, network, seed):
 def _train(run, wanted):
     """Run every training that is not done, some at a time."""
     waiting = [job for job in wanted if not (_folder(run, *job) / "report.html").exists()]
-    active: dict[tuple[str, int], subprocess.Popen] = {}
-    with run.progress(len(wanted), "trainings", done=len(wanted) - len(waiting)) as progress:
+    done = len(wanted) - len(waiting)
+    children: list[subprocess.Popen] = []
+    with (
+        ThreadPoolExecutor(run.config.jobs) as pool,
+        run.progress(len(wanted), "trainings", done) as progress,
+    ):
+        active = [pool.submit(_trained, job, _command(run, *job), children) for job in waiting]
         try:
-            while waiting or active:
-                while waiting and len(active) < run.config.jobs:
-                    job = waiting.pop(0)
-                    active[job] = subprocess.Popen(
-                        _command(run, *job), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-                    )
-                time.sleep(POLL_S)
-                for job in [job for job, process in active.items() if process.poll() is not None]:
-                    process = active.pop(job)
-                    said = (process.stderr.read() if process.stderr else "").strip().splitlines()
-                    if process.returncode != 0:
-                        raise CodesignError(
-                            f"the training of {job[0]} with seed {job[1]} ended with code "
-                            f"{process.returncode}: {said[-1] if said else 'no word'}"
-                        )
-                    progress.advance()
+            for each in as_completed(active):
+                each.result()
+                progress.advance()
         finally:
-            for process in active.values():
-                process.terminate()
+            for each in active:
+                each.cancel()
+            for child in children:
+                child.terminate()
+
+
+def _trained(job, command, children):
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as child:
+        children.append(child)
+        said = child.communicate()[1].strip().splitlines()[-1:] or ["no word"]
+    if child.returncode != 0:
+        raise CodesignError(
+            f"the training of {job[0]} with seed {job[1]} ended with code {child.returncode}: {said[0]}"
+        )
 
 
 def _command(run, network, seed):
@@ -164,11 +165,6 @@ def _show(run, names, networks, found):
     )
     rates = [[label, weights[name], RATES.get(name, config.learning_rate)] for name, label in names.items()]
     run.table("Networks", ["network", "weights", "learning rate"], rates)
-    run.figure(
-        _figure(found, config.seeds, names),
-        "compare",
-        "Error over that of zero flow; a dot is a seed, the line is the closed form.",
-    )
     run.finish(
         "Refiner against networks of its size",
         "The same budget each; textures, motions and worlds of the judging were never trained on.",
@@ -177,25 +173,3 @@ def _show(run, names, networks, found):
 
 def _key(network):
     return re.sub(r"\W+", "_", network)
-
-
-def _figure(found, seeds, names):
-    figure, axes = plt.subplots(figsize=(8, 0.9 + 0.5 * len(found)), layout="constrained")
-    for place, scores in enumerate(found.values()):
-        for shift, network in enumerate(names):
-            at = place + 0.15 * (shift - (len(names) - 1) / 2)
-            ratios = [scores[network, seed].ratio for seed in seeds]
-            axes.plot(
-                ratios, [at] * len(seeds), "o", color=f"C{shift}", label=None if place else names[network]
-            )
-        closed = [scores["closed form"].ratio] * 2
-        axes.plot(closed, [place - 0.35, place + 0.35], color="0.4", label=None if place else "closed form")
-    axes.set(
-        yticks=range(len(found)),
-        yticklabels=[name.replace("_", " ") for name in found],
-        xlabel="endpoint error over that of zero flow",
-        xlim=(0, None),
-    )
-    axes.invert_yaxis()
-    axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
-    return figure

@@ -1,34 +1,31 @@
-"""Training of flow networks: what is learnt, resumed, shared between processes, and counted."""
+"""Training of flow networks from the command line: what is learnt, resumed, shared between processes, raced, and
+refused."""
 
 import json
-import os
 import signal
-import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
 from codesign.flow import checkpoint, losses
-from studies.frame.run import main
-from studies.train_flow import __main__ as train_flow
+from studies.train_flow import race as races
 from studies.train_flow import setup as train_flow_setup
 from tests.flow_training_case import (
     BASE,
     TRUE_WEIGHTS,
     Linear,
     Made,
+    Own,
+    in_two_processes,
     metrics_of,
     register,
+    resume,
     state_of,
     tables_kept,
     train,
     undraw,
 )
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(autouse=True)
@@ -43,128 +40,72 @@ def undrawn(monkeypatch):
     undraw(monkeypatch.setattr)
 
 
+def weight_of(folder):
+    return checkpoint.load(folder / "network.safetensors").get_parameter("layer.weight").detach()
+
+
 def test_training_finds_the_known_answer(tmp_path):
     """At the end of a falling schedule AdamW is within about its last step sizes of the answer: 1e-2 of
     weights of order 1."""
-    assert (
-        train(
-            tmp_path / "run",
-            "--steps",
-            "250",
-            "--learning-rate",
-            "0.05",
-            "--weight-decay",
-            "0",
-            "--clip",
-            "10",
-            "--average",
-            "0",
-            "--reuse",
-            "1",
-        )
-        == 0
-    )
-    network = checkpoint.load(tmp_path / "run" / "network.safetensors")
-    assert torch.allclose(network.get_parameter("layer.weight")[:, :, 0, 0], TRUE_WEIGHTS, atol=1e-2)
-    found = metrics_of(tmp_path / "run")
-    assert found["steps"] == 250
-    assert found["windows_shown"] == 1000
-    assert found["weights"] == 8
+    options = "--steps 250 --learning-rate 0.05 --weight-decay 0 --clip 10 --average 0 --reuse 1"
+    assert train(tmp_path, options) == 0
+    assert torch.allclose(weight_of(tmp_path)[:, :, 0, 0], TRUE_WEIGHTS, atol=1e-2)
+    found = metrics_of(tmp_path)
+    expected = {"steps": 250, "windows_shown": 1000, "weights": 8, "unseen_windows": 8}
+    assert {name: found[name] for name in expected} == expected
     assert found["unseen_ratio"] < 0.02
-    assert found["unseen_windows"] == 8
     assert found["unseen_worse_percent"] == 0
-    assert (tmp_path / "run" / "curves.png").exists()
-    assert list((tmp_path / "run" / "tensorboard").iterdir())
+    assert (tmp_path / "curves.png").exists()
+    assert list((tmp_path / "tensorboard").iterdir())
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize(
-    "more", [(), ("--average", "0.9", "--reuse", "3")], ids=["plain", "average and reuse"]
-)
+@pytest.mark.parametrize("more", ["", "--average 0.9 --reuse 3"], ids=["plain", "average and reuse"])
 @pytest.mark.usefixtures("undrawn")
 def test_three_steps_and_three_are_six_bit_for_bit(tmp_path, capsys, more):
-    options = ["--steps", "6", "--save-every", "100", "--validate-every", "2", *more]
-    assert train(tmp_path / "whole", *options) == 0
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    options = f"--steps 6 --save-every 100 --validate-every 2 {more}"
+    assert train(whole, options) == 0
     made = []
 
     def interrupt(indices):
         made.append(len(indices))
-        if len(made) == 4:  # the probe, then three steps
+        # the probe, then three steps
+        if len(made) == 4:
             signal.raise_signal(signal.SIGINT)
 
     register(before=interrupt)
-    assert train(tmp_path / "parts", *options) == 130
-    assert (
-        json.loads((tmp_path / "parts" / "checkpoint" / "checkpoint.json").read_text())["progress"]["step"]
-        == 3
-    )
+    assert train(parts, options) == 130
+    stored = json.loads((parts / "checkpoint" / "checkpoint.json").read_text())
+    assert stored["progress"]["step"] == 3
+    # cut short while it was written
+    (parts / "checkpoint" / "step_0000009.safetensors").write_bytes(b"cut short")
     register()
-    assert main(train_flow.study, train_flow.Config, ["--resume", str(tmp_path / "parts")]) == 0
-    whole = state_of(tmp_path / "whole")
-    parts = state_of(tmp_path / "parts")
-    assert whole.keys() == parts.keys()
-    assert [name for name in whole if whole[name] != parts[name]] == []
-    assert (
-        checkpoint.read(tmp_path / "whole" / "network.safetensors").weights["layer.weight"].tolist()
-        == checkpoint.read(tmp_path / "parts" / "network.safetensors").weights["layer.weight"].tolist()
+    assert resume(parts) == 0
+    assert state_of(whole / "checkpoint") == state_of(parts / "checkpoint")
+    assert torch.equal(weight_of(whole), weight_of(parts))
+    one, two = (
+        {
+            name: value
+            for name, value in metrics_of(folder).items()
+            if name[:4] not in ("cpu_", "vers", "hard")
+        }
+        for folder in (whole, parts)
     )
-    same = [
-        name
-        for name in metrics_of(tmp_path / "whole")
-        if not name.startswith(("cpu_", "versions", "hardware"))
-    ]
-    assert {name: metrics_of(tmp_path / "whole")[name] for name in same} == {
-        name: metrics_of(tmp_path / "parts")[name] for name in same
-    }
+    assert one == two
     assert "step 6" in capsys.readouterr().out
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_a_killed_run_goes_on_from_its_last_checkpoint(tmp_path):
-    options = ["--steps", "6", "--save-every", "2"]
-    assert train(tmp_path / "whole", *options) == 0
-    made = []
-
-    def killed(indices):
-        made.append(len(indices))
-        if len(made) == 6:  # in the fifth step, with nothing saved since the fourth
-            raise MemoryError("killed")
-
-    register(before=killed)
-    with pytest.raises(MemoryError):
-        train(tmp_path / "parts", *options)
-    (tmp_path / "parts" / "checkpoint" / "step_0000009.safetensors").write_bytes(
-        b"cut short while it was written"
-    )
-    register()
-    assert main(train_flow.study, train_flow.Config, ["--resume", str(tmp_path / "parts")]) == 0
-    assert state_of(tmp_path / "whole") == state_of(tmp_path / "parts")
 
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("name", ["supervised", "motion", "contrast", "photometric"])
 def test_the_loss_is_the_one_that_is_asked_for(tmp_path, name):
     """The loss of the first step, put together by hand from the published terms."""
-    options = (
-        ["--loss", "supervised", "--unit", "motion"] if name == "motion" else ["--loss", name, "--unit", "px"]
-    )
+    kind = "--loss supervised --unit motion" if name == "motion" else f"--loss {name} --unit px"
     given = Linear()
     torch.nn.init.constant_(given.layer.weight, 0.2)
     checkpoint.save(given, tmp_path / "given.safetensors")
-    assert (
-        train(
-            tmp_path / "run",
-            *options,
-            "--steps",
-            "1",
-            "--smoothness",
-            "0.3",
-            "--start",
-            str(tmp_path / "given.safetensors"),
-        )
-        == 0
-    )
-    (path,) = (tmp_path / "run" / "checkpoint").glob("*.safetensors")
+    start = f"--start {tmp_path / 'given.safetensors'}"
+    assert train(tmp_path / "run", f"{kind} --steps 1 --smoothness 0.3 {start}") == 0
     windows = Made().batch(range(4))
     flow = given(windows.volume).flow_px.detach()
     truth = windows.truth.flow_px
@@ -174,14 +115,14 @@ def test_the_loss_is_the_one_that_is_asked_for(tmp_path, name):
     def charbonnier(squared):
         return ((squared + 1e-4).sqrt() - 1e-2).mean()
 
+    roughness = 0.3 * losses.smoothness_loss(flow)
     expected = {
         "supervised": lambda: charbonnier(error2),
         "motion": lambda: charbonnier(error2 / (1 + length2.mean((1, 2), keepdim=True))),
-        "contrast": lambda: losses.contrast_loss(windows.volume, flow) + 0.3 * losses.smoothness_loss(flow),
-        "photometric": lambda: (
-            losses.photometric_loss(windows.frames, flow) + 0.3 * losses.smoothness_loss(flow)
-        ),
+        "contrast": lambda: losses.contrast_loss(windows.volume, flow) + roughness,
+        "photometric": lambda: losses.photometric_loss(windows.frames, flow) + roughness,
     }[name]()
+    (path,) = (tmp_path / "run" / "checkpoint").glob("*.safetensors")
     assert checkpoint.read_tensors(path)[0]["curve/loss"].item() == pytest.approx(float(expected), rel=1e-5)
 
 
@@ -191,51 +132,21 @@ def test_a_run_begins_with_the_weights_it_is_given(tmp_path, capsys):
     with torch.no_grad():
         given.layer.weight.copy_(TRUE_WEIGHTS[:, :, None, None])
     checkpoint.save(given, tmp_path / "given.safetensors")
-    assert (
-        train(
-            tmp_path / "run",
-            "--start",
-            str(tmp_path / "given.safetensors"),
-            "--steps",
-            "1",
-            "--learning-rate",
-            "1e-9",
-        )
-        == 0
-    )
+    options = f"--start {tmp_path / 'given.safetensors'} --steps 1 --learning-rate 1e-9"
+    assert train(tmp_path / "run", options) == 0
     assert metrics_of(tmp_path / "run")["unseen_ratio"] < 1e-6
-    assert (
-        train(
-            tmp_path / "other",
-            "--start",
-            str(tmp_path / "given.safetensors"),
-            "--steps",
-            "1",
-            "--network",
-            "flownet-events",
-        )
-        == 2
-    )
+    assert train(tmp_path / "other", f"{options} --network flownet-events") == 2
     assert "holds a 'linear', --network is 'flownet-events'" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_gradients_that_are_shortened_are_counted(tmp_path):
-    """The gradient of a mean distance w.r.t. TRUE_WEIGHTS' estimate is of order 1: never above 1e3, always
-    above 1e-6."""
-    assert train(tmp_path / "none", "--steps", "5", "--clip", "1000") == 0
-    assert train(tmp_path / "all", "--steps", "5", "--clip", "1e-6") == 0
-    assert metrics_of(tmp_path / "none")["clipped_steps"] == 0
-    assert metrics_of(tmp_path / "all")["clipped_steps"] == 5
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_processor_time_is_a_budget(tmp_path):
     """A step costs milliseconds, so the run ends within a tenth of a budget of 0.6 s."""
-    assert train(tmp_path / "run", "--cpu-minutes", "0.01") == 0
-    found = metrics_of(tmp_path / "run")
+    assert train(tmp_path, "--cpu-minutes 0.01 --clip 1e-6") == 0
+    found = metrics_of(tmp_path)
     assert 0.01 <= found["cpu_data_minutes"] + found["cpu_training_minutes"] < 0.011
-    assert found["steps"] > 5
+    # a gradient of order 1 is always shortened to 1e-6
+    assert found["clipped_steps"] == found["steps"] > 5
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -246,35 +157,31 @@ def test_the_last_tenth_of_a_data_set_is_judged_on_alone(tmp_path, monkeypatch):
 
     asked = []
     opened = []
-    monkeypatch.setattr(
-        train_flow_setup,
-        "open_windows",
-        lambda *options: opened.append(options) or Folder(before=lambda indices: asked.append(list(indices))),
-    )
-    assert (
-        train(
-            tmp_path / "run",
-            "--data",
-            str(tmp_path),
-            "--window-frames",
-            "2",
-            "--steps",
-            "14",
-            "--validate-every",
-            "100",
-        )
-        == 0
-    )
+
+    def open_windows(*options):
+        opened.append(options)
+        return Folder(before=lambda indices: asked.append(list(indices)))
+
+    monkeypatch.setattr(train_flow_setup, "open_windows", open_windows)
+    options = f"--data {tmp_path} --window-frames 2 --steps 14 --validate-every 100"
+    assert train(tmp_path / "run", options) == 0
     assert opened == [(tmp_path, 2, 2, (16, 16), 0, 0.02)]
-    probe = asked[0]
-    steps = asked[1:15]
-    judged = asked[15]
+    probe, *steps = asked[:15]
     assert probe == [0, 13, 26]
     seen = [index for batch in steps for index in batch]
     assert sorted(seen[:27]) == list(range(27)), "each window once before any comes again"
     assert max(seen) == 26
-    assert judged == [27, 28, 29]
+    assert asked[15] == [27, 28, 29]
     assert metrics_of(tmp_path / "run")["held_out_windows"] == 3
+
+
+SHARED = """
+import sys
+from tests.flow_training_case import register, train_flow, undraw
+register()
+undraw()
+sys.exit(train_flow.run_here(sys.argv[1:]))
+"""
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -282,53 +189,105 @@ def test_two_processes_learn_what_one_does(tmp_path):
     """Halves of a batch are averaged in another order: float32 sums of 1024 terms differ by 1e-5 at most, and
     AdamW takes steps of at most 1e-2 times the relative change of a gradient, so three steps stay within
     1e-5."""
-    assert train(tmp_path / "one", "--steps", "3", "--learning-rate", "0.01") == 0
-    arguments = [*BASE, "--steps", "3", "--learning-rate", "0.01", "--out", str(tmp_path / "two")]
-    script = f"""
-import sys
-from tests.flow_training_case import register, train_flow, undraw
-register()
-undraw()
-sys.exit(train_flow.run_here({arguments!r}))
-"""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(ROOT),
-        "OMP_NUM_THREADS": "1",
-        "WORLD_SIZE": "2",
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": str(port),
-    }
-
-    def start(rank):
-        return subprocess.Popen(
-            [sys.executable, "-c", script],
-            env={**environment, "RANK": str(rank)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-
-    processes = [start(0), start(1)]  # with the variables that torchrun sets
-    try:
-        said = [process.communicate(timeout=300)[0] for process in processes]
-    finally:
-        for process in processes:
-            process.kill()
-    assert [process.returncode for process in processes] == [0, 0], said
+    options = "--steps 3 --learning-rate 0.01"
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert train(one, options) == 0
+    codes, said = in_two_processes(SHARED, *BASE, *options.split(), "--out", two)
+    assert codes == [0, 0], said
     assert "Done: " in said[0]
     assert said[1] == "", "one process speaks"
-    one, two = (
-        checkpoint.load(tmp_path / name / "network.safetensors").get_parameter("layer.weight")
-        for name in ("one", "two")
-    )
-    assert torch.allclose(one, two, atol=1e-5, rtol=0)
-    assert not torch.equal(one, Linear().layer.weight)
-    losses = [
-        checkpoint.read_tensors(next((tmp_path / name / "checkpoint").glob("*.safetensors")))[0]["curve/loss"]
-        for name in ("one", "two")
-    ]
-    assert torch.allclose(*losses, rtol=1e-5)
+    torch.testing.assert_close(weight_of(one), weight_of(two), atol=1e-5, rtol=0)
+    assert not torch.equal(weight_of(one), Linear().layer.weight)
+
+
+def test_a_race_trains_every_network_with_every_seed_and_judges_them_alike(tmp_path, monkeypatch):
+    """Of two networks the rival holds the answer already; the commands of trainings are looked at, not run."""
+    monkeypatch.setattr(races, "NAMES", {"refiner": "refiner"})
+    monkeypatch.setattr(races, "SETS", {})
+    monkeypatch.setattr(races, "VALIDATION", {"unseen": lambda shape, seed: Made(seed)})
+    monkeypatch.setattr(races, "WorldWindows", lambda *_, **__: Made(3))
+    commands = {}
+
+    def trained(job, command, children):
+        """Ours errs by half of the flow, the rival by none."""
+        options = dict(zip(command[3::2], command[4::2], strict=True))
+        commands[job[0], options["--seed"]] = options
+        network, share = (Linear(), 0.5) if job[0] == "refiner" else (Own(), 1.0)
+        with torch.no_grad():
+            network.layer.weight.copy_(share * TRUE_WEIGHTS[:, :, None, None])
+        Path(options["--out"]).mkdir()
+        checkpoint.save(network, Path(options["--out"]) / "network.safetensors")
+
+    monkeypatch.setattr(races, "_trained", trained)
+    own = "tests.flow_training_case:Own"
+    options = f"--race --own {own} --seeds 0 1 --cpu-minutes 3 --learning-rate 0.01 --final-windows 6"
+    assert train(tmp_path / "run", options) == 0
+    assert sorted(commands) == [("refiner", "0"), ("refiner", "1"), (own, "0"), (own, "1")]
+    assert commands[own, "1"]["--learning-rate"] == "0.01"
+    assert commands["refiner", "0"]["--learning-rate"] == "0.002"
+    assert {each["--cpu-minutes"] for each in commands.values()} == {"3.0"}
+    found = metrics_of(tmp_path / "run")
+    assert found["unseen_refiner_ratio_seed0"] == pytest.approx(0.5, rel=1e-5)
+    assert found["unseen_tests_flow_training_case_Own_ratio_seed1"] < 1e-6
+    assert (found["unseen_windows"], found["worlds_windows"]) == (6, 2)
+    assert (found["shares_met"], found["shares_asked"]) == (0, 2)
+
+
+def edit(folder, **changes):
+    path = folder / "checkpoint.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+@pytest.mark.parametrize(
+    ("damage", "sentence"),
+    [
+        (lambda folder: (folder / "checkpoint.json").write_text("{"), "is no whole JSON file"),
+        (lambda folder: next(folder.glob("*.safetensors")).write_bytes(b"short"), "is damaged"),
+        (lambda folder: next(folder.glob("*.safetensors")).unlink(), "no file lies at"),
+        (lambda folder: edit(folder, version=9), "format version 9"),
+        (lambda folder: edit(folder, network="refiner"), "written with network refiner, this run has linear"),
+        (lambda folder: edit(folder, seed=5), "written with seed 5, this run has 0"),
+        (lambda folder: edit(folder, tensors="../network.safetensors"), "outside its folder"),
+    ],
+)
+@pytest.mark.usefixtures("undrawn")
+def test_a_checkpoint_that_does_not_fit_is_named(tmp_path, capsys, damage, sentence):
+    assert train(tmp_path / "run", "--steps 1") == 0
+    damage(tmp_path / "run" / "checkpoint")
+    capsys.readouterr()
+    assert resume(tmp_path / "run") == 2
+    assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ("--network refinr", "network 'refinr' is unknown; choose one of ecn, flownet-events"),
+        ("--options depth=3", "has no option 'depth'; it has bins, gain"),
+        ("--options gain", "give name=number"),
+        ("--weights 500", "which 'linear' does not"),
+        ("--mix fog", "--mix fog is unknown; choose from"),
+        ("--validate-on fog", "--validate-on fog is unknown"),
+        ("--loss photometric", "needs frames, and these windows have none"),
+        ("--bins 5", "the windows have 2 time bins, the network 5"),
+        ("--steps 0", "--steps is 0; at least 1"),
+        ("--cpu-minutes -1", "--cpu-minutes is -1.0; more than 0"),
+        ("--height-px 8", "--height-px is 8; at least 16"),
+        ("--warm-up 1", "--warm-up is 1.0; a share from 0 to below 1"),
+        ("--mixed-precision", "--mixed-precision needs CUDA"),
+        ("--start nowhere.safetensors", "no file lies at nowhere.safetensors"),
+        ("--race --jobs 0", "one of --jobs"),
+        ("--steps 2 --options gain=1e30", "step 0: loss inf"),
+    ],
+)
+@pytest.mark.usefixtures("undrawn")
+def test_what_is_unfit_is_refused_before_the_first_step(tmp_path, capsys, options, sentence):
+    made = []
+    register(before=lambda indices: made.append(list(indices)), frames=False)
+    assert train(tmp_path / "run", options) == 2
+    complaint = capsys.readouterr().err
+    assert sentence in complaint
+    assert len(complaint.splitlines()) == 1
+    if "gain=1e30" not in options:
+        assert made in ([], [[0]]), "one window may be looked at, no more"
+    assert not (tmp_path / "run" / "checkpoint").exists()

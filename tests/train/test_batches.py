@@ -5,25 +5,7 @@ import torch
 
 from codesign.train.batches import Batches, Started, pick, probe, shuffled, to_device, turned, without_truth
 from codesign.types import EventVolume, FlowField, FlowWindows
-
-
-class Made:
-    """Source of windows with counts of their own; ``before`` is called with the indices of every batch."""
-
-    def __init__(self, before=lambda indices: None):
-        self.before = before
-
-    def batch(self, indices):
-        self.before(indices)
-        counts = torch.stack(
-            [torch.rand(2, 2, 6, 6, generator=torch.Generator().manual_seed(i)) for i in indices]
-        )
-        flow = counts[:, 0]
-        valid = torch.ones(len(counts), 6, 6, dtype=torch.bool)
-        return FlowWindows(
-            EventVolume(counts, torch.tensor([0.25, 0.75]), torch.tensor([0.5, 0.5])),
-            FlowField(flow, valid, 1.0),
-        )
+from tests.flow_training_case import SIDE, Made
 
 
 @pytest.mark.parametrize("way", range(16))
@@ -115,8 +97,8 @@ def test_a_finite_source_is_looked_at_from_end_to_end():
             return 19
 
     made = []
-    probe(Made(made.append))
-    probe(Short(made.append))
+    probe(Made(before=made.append))
+    probe(Short(before=made.append))
     assert made == [[0], [0, 9, 18]]
 
 
@@ -126,9 +108,16 @@ def test_everything_in_a_batch_moves_to_the_device():
     moved = to_device({"a": [windows, (torch.ones(2), "kept")]}, meta)
     found, (ones, kept) = moved["a"]
     assert isinstance(found, FlowWindows)
-    tensors = (found.volume.counts, found.volume.centroid_s, found.truth.flow_px, found.truth.valid, ones)
+    tensors = (
+        found.frames,
+        found.volume.counts,
+        found.volume.centroid_s,
+        found.truth.flow_px,
+        found.truth.valid,
+        ones,
+    )
     assert {tensor.device for tensor in tensors} == {meta}
-    assert (found.frames, found.truth.interval_s, kept) == (None, 1.0, "kept")
+    assert (found.truth.interval_s, kept) == (1.0, "kept")
 
 
 def test_windows_without_any_true_flow_are_counted():
@@ -161,7 +150,7 @@ def test_some_begin_elsewhere():
 
     def estimate(volume):
         flow = volume.counts.sum(1)
-        return FlowField(flow, flow[:, 0] > 0, 1.0, None, torch.zeros(len(flow), 3, 6, 6))
+        return FlowField(flow, flow[:, 0] > 0, 1.0, None, torch.zeros(len(flow), 3, SIDE, SIDE))
 
     windows = Started(Made(), estimate, foreign=0.2).batch(range(200))
     assert windows.start is not None

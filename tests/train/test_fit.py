@@ -3,12 +3,7 @@
 import doctest
 import importlib
 import json
-import os
 import signal
-import socket
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,10 +12,7 @@ from torch import nn
 
 from codesign import train
 from codesign.errors import DomainError, FileFormatError
-from codesign.flow import checkpoint
-from tests.flow_training_case import TRUE_WEIGHTS, Linear, Made
-
-ROOT = Path(__file__).resolve().parents[2]
+from tests.flow_training_case import TRUE_WEIGHTS, Linear, Made, in_two_processes, state_of
 
 
 def linear() -> Any:
@@ -138,11 +130,6 @@ def noisy_fit(folder, network, **options):
     )
 
 
-def state_of(folder):
-    (path,) = folder.glob("step_*.safetensors")
-    return {name: tensor.tolist() for name, tensor in checkpoint.read_tensors(path)[0].items()}
-
-
 @pytest.mark.bits
 def test_interrupted_and_resumed_is_uninterrupted_bit_for_bit(tmp_path):
     whole = Noisy()
@@ -170,18 +157,6 @@ def test_interrupted_and_resumed_is_uninterrupted_bit_for_bit(tmp_path):
     done: Any = Noisy()
     assert noisy_fit(tmp_path / "parts", done).step == 8
     assert torch.equal(done.layers[0].weight, parts.layers[0].weight), "nothing is left to do"
-
-
-def test_a_killed_training_goes_on_from_its_last_checkpoint(tmp_path):
-    def killed(step, loss):
-        if step == 5:
-            raise MemoryError("killed")
-
-    noisy_fit(tmp_path / "whole", Noisy())
-    with pytest.raises(MemoryError):
-        noisy_fit(tmp_path / "parts", Noisy(), progress=killed)
-    noisy_fit(tmp_path / "parts", Noisy())
-    assert state_of(tmp_path / "parts") == state_of(tmp_path / "whole")
 
 
 @pytest.mark.parametrize(
@@ -212,26 +187,17 @@ def test_another_training_is_not_resumed(tmp_path, options, sentence):
             "batch 3 cannot be shared evenly by 2",
         ),
         ({"loss": train.Photometric()}, "needs frames, and these windows have none"),
+        ({"blind": True}, "needs true flow, and the windows looked at have none"),
     ],
 )
 def test_what_is_unfit_is_refused_before_the_first_step(options, sentence):
     asked = []
     network = linear()
+    windows = Made(frames=False, blind=options.pop("blind", False), before=asked.append)
     with pytest.raises(DomainError, match=sentence):
-        train.fit(network, Made(frames=False, before=asked.append), **{"steps": 2, **options})
+        train.fit(network, windows, **{"steps": 2, **options})
     assert asked in ([], [[0]]), "one window may be looked at, no more"
     assert torch.equal(network.layer.weight, linear().layer.weight)
-
-
-def test_windows_without_any_true_flow_are_refused():
-    class Blind(Made):
-        def batch(self, indices):
-            windows = super().batch(indices)
-            windows.truth.valid[:] = False
-            return windows
-
-    with pytest.raises(DomainError, match="needs true flow, and the windows looked at have none"):
-        train.fit(linear(), Blind(), steps=2)
 
 
 def nearness(network):
@@ -281,34 +247,9 @@ def test_two_processes_interrupted_and_resumed_learn_what_one_does(tmp_path):
         validate=nearness,
         validate_every=2,
     )
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(ROOT),
-        "OMP_NUM_THREADS": "1",
-        "WORLD_SIZE": "2",
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": str(port),
-    }
-    folder = str(tmp_path / "two")
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-c", SHARED, folder],
-            env={**environment, "RANK": str(rank)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for rank in (0, 1)
-    ]
-    try:
-        said = [process.communicate(timeout=300)[0] for process in processes]
-    finally:
-        for process in processes:
-            process.kill()
-    assert [Path(f"{folder}.{rank}").exists() for rank in (0, 1)] == [True, True], said
+    folder = tmp_path / "two"
+    codes, said = in_two_processes(SHARED, folder)
+    assert codes == [0, 0], said
     found = [torch.load(f"{folder}.{rank}") for rank in (0, 1)]
     assert torch.equal(found[0][0], found[1][0]), "the best weights reach every process"
     assert torch.allclose(found[0][0], network.layer.weight, atol=1e-5, rtol=0)
@@ -318,6 +259,4 @@ def test_two_processes_interrupted_and_resumed_learn_what_one_does(tmp_path):
         assert norm == pytest.approx(alone.norm, rel=1e-5)
         assert asked == [1, 2, 2, 2] * 2, "one look and three steps on half a batch, twice"
     assert found[0][3] == 3
-    assert [path.name for path in (tmp_path / "two").iterdir() if path.suffix == ".json"] == [
-        "checkpoint.json"
-    ]
+    assert [path.name for path in folder.glob("*.json")] == ["checkpoint.json"]
