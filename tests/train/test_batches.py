@@ -108,6 +108,7 @@ def test_everything_in_a_batch_moves_to_the_device():
     moved = to_device({"a": [windows, (torch.ones(2), "kept")]}, meta)
     found, (ones, kept) = moved["a"]
     assert isinstance(found, FlowWindows)
+    assert found.frames is not None
     tensors = (
         found.frames,
         found.volume.counts,
