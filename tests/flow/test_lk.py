@@ -151,7 +151,7 @@ def test_samples_of_a_batch_do_not_touch_each_other():
     assert not found.flow_px[1].any()
 
 
-@pytest.mark.parametrize("count", [1, 5, 20, 60, 200, 1000])
+@pytest.mark.parametrize("count", [1, 20, 200, 1000])
 def test_scattered_noise_gives_almost_no_flow(count):
     # up to one event per two pixels, at random places, times and signs: nothing moves. (Plain damping gives
     # some 9 px here.)

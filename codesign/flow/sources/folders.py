@@ -133,16 +133,8 @@ def flow_files(folder: Path) -> list[Path]:
     folder = Path(folder)
     for inside in (folder / "flow" / "forward", folder / "forward", folder / "flow", folder):
         if inside.is_dir():
-            files = [
-                entry
-                for entry in inside.iterdir()
-                if entry.is_file()
-                and entry.suffix.lower() in FLOW_SUFFIXES
-                and entry.name.lower() not in SIDE_FILES
-            ]
-            named = [
-                entry for entry in files if FLOW_WORDS.search(entry.stem) or entry.suffix.lower() == ".flo"
-            ]
+            files = [entry for entry in inside.iterdir() if _may_hold_flow(entry)]
+            named = [entry for entry in files if _is_named_flow(entry)]
             chosen = (
                 files
                 if inside != folder and not named
@@ -162,17 +154,8 @@ def truth_beside(events: Path, alone: bool) -> Path | None:
       events: path of the event file.
       alone: it is the only one of its folder.
     """
-    beside = [
-        entry
-        for entry in sorted(events.parent.iterdir(), key=natural)
-        if entry.is_file() and entry != events and entry.name.lower() not in SIDE_FILES
-    ]
-    named = [
-        entry
-        for entry in beside
-        if entry.suffix.lower() in FLOW_SUFFIXES
-        and (FLOW_WORDS.search(entry.stem) or entry.suffix.lower() == ".flo")
-    ]
+    beside = sorted(events.parent.iterdir(), key=natural)
+    named = [entry for entry in beside if entry != events and _may_hold_flow(entry) and _is_named_flow(entry)]
     if not alone:
         numbers = re.findall(r"\d+", events.stem)
         named = [
@@ -191,10 +174,7 @@ def truth_folder(events: Path) -> Path | None:
             (entry for entry in place.iterdir() if entry.is_dir() and FLOW_WORDS.search(entry.name)),
             key=natural,
         ):
-            if any(
-                file.suffix.lower() in FLOW_SUFFIXES and file.name.lower() not in SIDE_FILES
-                for file in entry.rglob("*")
-            ):
+            if any(map(_may_hold_flow, entry.rglob("*"))):
                 return entry
     return None
 
@@ -204,6 +184,15 @@ def side_file(events: Path, name: str) -> Path | None:
     return next(
         (folder / name for folder in (events.parent, events.parent.parent) if (folder / name).is_file()), None
     )
+
+
+def _may_hold_flow(entry):
+    suffix = entry.suffix.lower()
+    return entry.is_file() and suffix in FLOW_SUFFIXES and entry.name.lower() not in SIDE_FILES
+
+
+def _is_named_flow(entry):
+    return bool(FLOW_WORDS.search(entry.stem)) or entry.suffix.lower() == ".flo"
 
 
 def _holds_events(entry):
