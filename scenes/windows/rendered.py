@@ -113,18 +113,22 @@ class Windows:
     def batch(self, indices: Sequence[int]) -> FlowWindows:
         """Samples of these numbers."""
         made = [self._window(int(index)) for index in indices]
-        counts, flow, valid, frames = zip(*made, strict=True)
+        seen, flow, valid, frames = zip(*made, strict=True)
         t_s = torch.linspace(0, 1, self.intervals + 1, dtype=torch.float64)
         return FlowWindows(
-            from_counts(torch.stack(counts, 2), t_s, self.bins),
+            from_counts(self._counts(seen), t_s, self.bins),
             FlowField(torch.stack(flow), torch.stack(valid), 1.0),
             torch.stack(frames),
         )
 
-    def _window(self, index: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Counts [intervals, 2, H, W], flow [2, H, W] on the pixels of the start, where it holds [H, W], and the frames
-        at both ends [2, H, W]."""
+    def _window(self, index: int) -> tuple[Any, Tensor, Tensor, Tensor]:
+        """Counts [intervals, 2, H, W] (or what ``_counts`` makes them of), flow [2, H, W] on the pixels of the start,
+        where it holds [H, W], and the frames at both ends [2, H, W]."""
         raise NotImplementedError
+
+    def _counts(self, seen: Sequence[Any]) -> Tensor:
+        """Counts [intervals, 2, B, H, W] of all samples."""
+        return torch.stack(list(seen), 2)
 
 
 @dataclass(frozen=True)
@@ -163,14 +167,22 @@ class RenderedWindows(Windows):
         sample = self._draw(index, self._times(index))
         points = self._undistorted(sample.distortion)
         frames = compose(sample.layers, points)
-        counts = self._counts(sample, frames)[LEAD:]
-        counts.index_put_(tuple(sample.noise), torch.ones(sample.noise.shape[1]), accumulate=True)
-        return counts, *self._truth(sample, points), frames[[LEAD, -1]]
+        seen = (self._level(sample, frames), sample.theta, sample.noise)
+        return seen, *self._truth(sample, points), frames[[LEAD, -1]]
 
-    def _counts(self, sample, frames):
-        """Counts [T - 1, 2, H, W] of ideal pixels that look at frames."""
-        level = frames.clamp_min(DARKEST).log_() * sample.contrast
-        return memory(level, *sample.theta, log_input=True)[0]
+    def _level(self, sample, frames):
+        """Log radiance [T, H, W] of a sample's frames, with its contrast."""
+        return frames.clamp_min(DARKEST).log_() * sample.contrast
+
+    def _counts(self, seen):
+        """Of ideal pixels: (log radiance [T, H, W], thresholds, noise) of every sample; all at once, which is cheaper."""
+        levels, thetas, noises = zip(*seen, strict=True)
+        counts, _ = memory(torch.stack(levels, 1), *torch.stack(thetas, 1), log_input=True)
+        counts = counts[LEAD:]
+        for number, (time, polarity, row, column) in enumerate(noises):
+            where = (time, polarity, torch.full_like(time, number), row, column)
+            counts.index_put_(where, torch.ones(len(time)), accumulate=True)
+        return counts
 
     def _times(self, index):
         """Times of the frames of a sample, those before the window among them; the motion drawn lasts from 0 to 1."""
@@ -271,8 +283,10 @@ class PacketWindows(RenderedWindows):
         lead = np.linspace(-PACKET_LEAD, 0, LEAD, endpoint=False)
         probes = np.linspace(0, 1, PROBES + 1) ** 2  # fine where packets of busy scenes end
         sample = self._draw(index, np.concatenate([lead, probes]))
-        counts = self._counts(sample, compose(sample.layers, self._undistorted(sample.distortion)))
-        so_far = counts[LEAD:].sum((1, 2, 3)).cumsum(0).double() / (self.height_px * self.width_px)
+        level = self._level(sample, compose(sample.layers, self._undistorted(sample.distortion)))
+        so_far = self._counts([(level, sample.theta, sample.noise[:, :0])]).sum((1, 2, 3, 4)).cumsum(
+            0
+        ).double() / (self.height_px * self.width_px)
         held = torch.cat([so_far.new_zeros(1), so_far]).numpy()
         end = np.interp(self.events_per_px, held, probes) if held[-1] > self.events_per_px else 1.0
         return np.concatenate([lead, max(end, SHORTEST) * np.linspace(0, 1, self.intervals + 1)])

@@ -10,7 +10,7 @@ from codesign.events import SensorModel, SensorState, dense_counts
 from codesign.events.sensor.state import begin
 from scenes.windows.layers import Bent, compose
 from scenes.windows.motion import displacement, pace
-from scenes.windows.rendered import DARKEST, LEAD, RenderedWindows, log_uniform
+from scenes.windows.rendered import DARKEST, LEAD, RenderedWindows, Windows, log_uniform
 
 CONTRAST = (0.02, 2.5)  # factors on the texture's log radiance that a density may ask for
 NOISE_SHARE = 0.5  # noise events at most, per event of the scene
@@ -74,6 +74,9 @@ class SensorWindows(RenderedWindows):
         points = self._undistorted(sample.distortion)
         frames = compose(sample.layers, points)
         return self._events(draw, frames), *self._truth(sample, points), frames[[LEAD, -1]]
+
+    def _counts(self, seen):
+        return Windows._counts(self, seen)
 
     def _bent(self, draw, plane):
         rms_px = draw.uniform(0, self.sensors.bend) * self.draws.flow_px[1]
