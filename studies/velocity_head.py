@@ -1,7 +1,8 @@
 """One velocity head for every design of a camera on a robot.
 
-It sees lens and mount, and is trained on designs drawn all over the bounds of the pairs, by the hard sensor. A quarter of
-the worlds chooses when to stop, and shows the head beside least squares. A resumed run renders what is missing.
+It sees lens and mount, and is trained on designs drawn all over the bounds of the pairs, by the
+hard sensor. A quarter of the worlds chooses when to stop, and shows the head beside least squares.
+A resumed run renders what is missing.
 """
 
 import functools
@@ -126,7 +127,8 @@ def samples(run: Run[Config], pair: RobotPair) -> tuple[Samples, Samples]:
 
 @torch.no_grad()
 def rendered(pair: RobotPair, design: Design, index: int, config: Config) -> dict[str, Tensor]:
-    """What a head hears of a design, by the name of its field, and "twist"; every design has drives of its own."""
+    """What a head hears of a design, by the name of its field, and "twist"; every design has drives
+    of its own."""
     first = index * config.motions % (DRIVES - config.motions + 1)
 
     def drive(number, count):

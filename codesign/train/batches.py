@@ -163,13 +163,14 @@ class Part:
 
 
 class Started:
-    """Windows of a source together with what a network begins from, estimated once however often they are shown.
+    """Windows of a source together with what a network begins from, estimated once however often
+    they are shown.
 
     Args:
       source: of the windows.
       start: EventVolume -> FlowField with covariance, equivariant to turns and mirrors.
-      foreign: share of the samples that begin elsewhere, as from the window before: with half to one and a fifth of the
-        start's flow, and a covariance of 1 px^2 along both axes.
+      foreign: share of the samples that begin elsewhere, as from the window before: with half to
+        one and a fifth of the start's flow, and a covariance of 1 px^2 along both axes.
     """
 
     def __init__(self, source: Source, start: Callable[[EventVolume], FlowField], foreign: float = 0.0):

@@ -60,8 +60,8 @@ class Learner:
       optimiser: over the network's parameters, all or some; ``adamw(network)`` when None.
       predict: (network, batch) -> prediction.
       clip: longest gradient; longer ones are shortened to it.
-      average: decay per step of a running average of the weights, which is then what is judged and kept; 0 for
-        none.
+      average: decay per step of a running average of the weights, which is then what is judged and
+        kept; 0 for none.
       validate: network, in evaluation mode -> score, lower is better; None when nobody judges.
       ranks: this process among those that train.
       seed: of the random numbers within a step.

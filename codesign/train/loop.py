@@ -18,7 +18,8 @@ class Progress:
 
     Args:
       step: steps made.
-      data_s, training_s: processor seconds of all processes, for making windows and for the rest of the steps.
+      data_s, training_s: processor seconds of all processes, for making windows and for the rest of
+        the steps.
       validation_s: those of the first process for validation.
       clipped: steps whose gradient was shortened.
       blind: windows shown that had no pixel with known flow.

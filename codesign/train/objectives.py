@@ -22,8 +22,8 @@ GAMMA = 0.8
 
 
 def flow_predictions(network: nn.Module, windows: FlowWindows) -> list[FlowField]:
-    """All predictions of a flow network, the last one counting most; of a plain one, its one flow. A network that
-    refines begins with the start of the windows where they have one."""
+    """All predictions of a flow network, the last one counting most; of a plain one, its one flow.
+    A network that refines begins with the start of the windows where they have one."""
     if windows.start is not None and hasattr(network, "refined"):
         return network.refined(windows.volume, windows.start, through=False)
     several = getattr(network, "predictions", None)
@@ -32,8 +32,8 @@ def flow_predictions(network: nn.Module, windows: FlowWindows) -> list[FlowField
 
 @dataclass(frozen=True)
 class Supervised:
-    """Distance to the true flow; and, where the network claims a covariance, the likelihood of the error under it, with
-    long tails, which teaches the claim and leaves the flow alone.
+    """Distance to the true flow; and, where the network claims a covariance, the likelihood of the
+    error under it, with long tails, which teaches the claim and leaves the flow alone.
 
     Args:
       unit: errors count in pixels, or as shares of the window's own root mean square flow.

@@ -23,9 +23,9 @@ class Score:
       aee_px, zero_flow_px: mean endpoint error over all valid pixels, of the estimate and of zero flow.
       worse_percent: share of the windows on which the estimate's own mean error is above zero flow's.
       windows: how many were judged.
-      blur: of a set without any true flow, the blur of its events warped by the estimate, as a share of that of zero
-        flow (contrast_loss), which then stands for the errors; worse_percent counts windows where it is above 1. None
-        where there is truth.
+      blur: of a set without any true flow, the blur of its events warped by the estimate, as a
+        share of that of zero flow (contrast_loss), which then stands for the errors; worse_percent
+        counts windows where it is above 1. None where there is truth.
     """
 
     aee_px: float
@@ -56,8 +56,8 @@ def score(
 ) -> Score:
     """Score of ``estimator`` on windows, computed on ``device``.
 
-    Windows without a valid pixel count for nothing beside others that have some; by themselves they are judged by how
-    sharp the estimate makes their events.
+    Windows without a valid pixel count for nothing beside others that have some; by themselves they
+    are judged by how sharp the estimate makes their events.
     """
     device = device or torch.device("cpu")
     sums = torch.zeros(3, dtype=torch.float64)  # error, error of zero flow, pixels

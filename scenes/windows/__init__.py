@@ -1,8 +1,9 @@
 """Windows of events with exact flow: what flow networks learn on and estimators are judged on.
 
-``rendered``: flat layers before a moving camera (read first), which ``sensors`` sees by sensors that all differ;
-``sets``: the named mixes and sets; ``worlds``: out of the 3-D worlds; ``files``: along flow files; ``streams``:
-recordings with flow at any time. Below them ``layers`` (what moves), ``motion`` (how) and ``textures``.
+``rendered``: flat layers before a moving camera (read first), which ``sensors`` sees by sensors
+that all differ; ``sets``: the named mixes and sets; ``worlds``: out of the 3-D worlds; ``files``:
+along flow files; ``streams``: recordings with flow at any time. Below them ``layers`` (what moves),
+``motion`` (how) and ``textures``.
 """
 
 from scenes.windows.files import FileWindows

@@ -1,8 +1,8 @@
 """Layers of texture over one another, and where their points go, in px from the image's centre.
 
-What moves a layer has ``texels(place, points)``: what is seen at points [H, W, 2] at each time, on the layer's texture
-in grid_sample's units, [T, 2, H, W], with place [3, 3] from points at time 0 to those units; and ``end(points)``: where
-points of the start are at the window's end, [H, W, 2].
+What moves a layer has ``texels(place, points)``: what is seen at points [H, W, 2] at each time, on
+the layer's texture in grid_sample's units, [T, 2, H, W], with place [3, 3] from points at time 0 to
+those units; and ``end(points)``: where points of the start are at the window's end, [H, W, 2].
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +23,8 @@ WITHIN_PX = 1e-5  # last change of a warp's inverse
 
 @dataclass(frozen=True)
 class Layer:
-    """What moves it (or a function that tells, of times), radiance and cover [2, S, S], and where points lie on these."""
+    """What moves it (or a function that tells, of times), radiance and cover [2, S, S], and where
+    points lie on these."""
 
     motion: Any
     crop: Tensor
@@ -112,8 +113,8 @@ class Warp:
     def origins(self, points):
         """Where what is seen at points [H, W, 2] at each time was at time 0: [T, H, W, 2], float32.
 
-        q = x - share v(q) by fixed point in float64, each time from those before. Raises: DomainError where the field
-        is so steep that this does not converge.
+        q = x - share v(q) by fixed point in float64, each time from those before. Raises:
+        DomainError where the field is so steep that this does not converge.
         """
         points = points.double()
         found = torch.empty(len(self.share), *points.shape)
@@ -239,8 +240,8 @@ def compose(layers: Sequence[Layer], points: Tensor) -> Tensor:
 
 
 def topmost(layers: Sequence[Layer], look: Callable[[Layer], tuple[Tensor, Tensor]]) -> Tensor:
-    """Values [2, H, W] of the layer that each pixel shows. look: layer -> its values, and where the pixels' points were
-    at time 0, [H, W, 2]."""
+    """Values [2, H, W] of the layer that each pixel shows. look: layer -> its values, and where the
+    pixels' points were at time 0, [H, W, 2]."""
     found = None
     for layer in layers:
         value, origin = look(layer)

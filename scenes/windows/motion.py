@@ -1,8 +1,9 @@
-"""Random motions of layers, drawn per sample: homographies over time [layers, T, 3, 3], from pixels at time 0 (px from
-the image's centre) to those at each time; and smooth fields of displacement, which no homography has.
+"""Random motions of layers, drawn per sample: homographies over time [layers, T, 3, 3], from pixels
+at time 0 (px from the image's centre) to those at each time; and smooth fields of displacement,
+which no homography has.
 
-Arguments of all: draw: numpy Generator. t: [T] times, window = 0..1. width_px, height_px: of the image. flow_px: (least,
-most), px per window.
+Arguments of all: draw: numpy Generator. t: [T] times, window = 0..1. width_px, height_px: of the
+image. flow_px: (least, most), px per window.
 """
 
 import numpy as np
@@ -22,7 +23,8 @@ STEEPEST = 0.25  # px of displacement per px; far below 1, where a field folds o
 
 
 def similarity(draw, t, width_px, height_px, flow_px):
-    """Rotation, zoom and translation about the image centre; flow_px: of the translation, uniform over the ring."""
+    """Rotation, zoom and translation about the image centre; flow_px: of the translation, uniform
+    over the ring."""
     least, most = flow_px
     length = np.sqrt(draw.uniform(least**2, most**2))
     angle = draw.uniform(0, 2 * np.pi)
@@ -35,8 +37,8 @@ def similarity(draw, t, width_px, height_px, flow_px):
 
 
 def vibration(draw, t, width_px, height_px, flow_px):
-    """A shaking camera: shifts along x and y and roll swing, each with its own frequency of 0.05 to 0.3 periods
-    per window, over a slow drift. flow_px: amplitude of a shift, drawn evenly."""
+    """A shaking camera: shifts along x and y and roll swing, each with its own frequency of 0.05 to
+    0.3 periods per window, over a slow drift. flow_px: amplitude of a shift, drawn evenly."""
     reach = np.hypot(width_px, height_px) / 2
     amplitude = draw.uniform(*flow_px, 3) * np.array([1, 1, 0.3 / reach])
     frequency = 2 * np.pi * draw.uniform(0.05, 0.3, 3)
@@ -58,7 +60,8 @@ def roll(draw, t, width_px, height_px, turn_rad):
 
 
 def out_and_back(draw, t, width_px, height_px, flow_px):
-    """A shift out and half to all of the way back, at an even pace, in the window. flow_px: of the way out."""
+    """A shift out and half to all of the way back, at an even pace, in the window. flow_px: of the
+    way out."""
     length = draw.uniform(*flow_px)
     angle = draw.uniform(0, 2 * np.pi)
     turn = 1 / (1 + draw.uniform(0.5, 1.0))  # when it turns
@@ -68,7 +71,8 @@ def out_and_back(draw, t, width_px, height_px, flow_px):
 
 
 def rotation(draw, t, width_px, height_px, flow_px):
-    """A pinhole camera with a random focal length that turns about its centre, at a steady rate; flow_px: as camera."""
+    """A pinhole camera with a random focal length that turns about its centre, at a steady rate;
+    flow_px: as camera."""
     extent = max(width_px, height_px)
     focal = draw.uniform(0.6, 2.5) * extent
     turn = draw.normal(0, 1, 3) * np.array([1, 1, 2 * focal / extent])
@@ -78,10 +82,11 @@ def rotation(draw, t, width_px, height_px, flow_px):
 
 
 def camera(draw, t, width_px, height_px, flow_px, layers):
-    """A pinhole camera with a random focal length that turns and moves before tilted planes at different depths, the
-    farthest first. One nearer layer in four moves by itself.
+    """A pinhole camera with a random focal length that turns and moves before tilted planes at
+    different depths, the farthest first. One nearer layer in four moves by itself.
 
-    flow_px: the root mean square flow at the image corners and centre over all layers is drawn evenly between these.
+    flow_px: the root mean square flow at the image corners and centre over all layers is drawn
+    evenly between these.
     """
     extent = max(width_px, height_px)
     focal = draw.uniform(0.6, 2.5) * extent
@@ -100,11 +105,11 @@ def camera(draw, t, width_px, height_px, flow_px, layers):
 
 
 def warps(draw, t, width_px, height_px, flow_px, layers):
-    """A Warp per layer, farthest first: a camera's translation that grows from layer to layer, and what each layer
-    does by itself.
+    """A Warp per layer, farthest first: a camera's translation that grows from layer to layer, and
+    what each layer does by itself.
 
-    flow_px: root mean square flow over the image and all layers, drawn evenly; the same draw with twice the range has
-    twice the flow. Raises: DomainError for a flow so long that the field would fold.
+    flow_px: root mean square flow over the image and all layers, drawn evenly; the same draw with
+    twice the range has twice the flow. Raises: DomainError for a flow so long that the field would fold.
     """
     extent = max(width_px, height_px)
     wanted = draw.uniform(*flow_px)
@@ -131,7 +136,8 @@ def warps(draw, t, width_px, height_px, flow_px, layers):
 
 
 def displacement(draw, width_px, height_px, rms_px):
-    """A smooth random field [2, h, w] of this root mean square length, or shorter where that were too steep."""
+    """A smooth random field [2, h, w] of this root mean square length, or shorter where that were
+    too steep."""
     knots = int(draw.integers(KNOTS[0], KNOTS[1] + 1))
     values = torch.from_numpy(draw.standard_normal((1, 2, knots, knots))).float()
     size = [int((1 + MARGIN) * side) for side in (height_px, width_px)]
@@ -142,8 +148,8 @@ def displacement(draw, width_px, height_px, rms_px):
 
 
 def pace(draw, t, most):
-    """Times at which a motion is at its steady course when it hurries and tarries: 0 and 1 stay. most: largest change
-    of speed, relative."""
+    """Times at which a motion is at its steady course when it hurries and tarries: 0 and 1 stay.
+    most: largest change of speed, relative."""
     frequency = 2 * np.pi * draw.uniform(0.2, 1.0)
     phase = draw.uniform(0, 2 * np.pi)
     swing = draw.uniform(0, most) / frequency
@@ -171,8 +177,9 @@ def _about(draw, t, width_px, rate):
 
 
 def _sized(focal, twists, size_px, wanted, size, most, t):
-    """H(t) = K (R(t) + T(t) n^T) K^-1 of (turn, move, normal) of every layer, all of one size such that the root mean
-    square flow is ``wanted`` (Hartley and Zisserman, 2004, eq. 13.2). size: to begin with; most: largest allowed."""
+    """H(t) = K (R(t) + T(t) n^T) K^-1 of (turn, move, normal) of every layer, all of one size such
+    that the root mean square flow is ``wanted`` (Hartley and Zisserman, 2004, eq. 13.2). size: to
+    begin with; most: largest allowed."""
     k = np.diag([focal, focal, 1.0])
     k_inverse = np.diag([1 / focal, 1 / focal, 1.0])
     width, height = size_px

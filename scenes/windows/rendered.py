@@ -52,8 +52,9 @@ class Draws:
 
     Args:
       textures: pool of scenes.windows.textures.
-      motion: "similarity" (one plane; rotation, zoom, translation), "rotation" (a camera that turns), "vibration" (one
-        that shakes), "zoom", "roll", "out_and_back", "camera" (tilted planes, perspective) or "warps" (layers that bend).
+      motion: "similarity" (one plane; rotation, zoom, translation), "rotation" (a camera that
+        turns), "vibration" (one that shakes), "zoom", "roll", "out_and_back", "camera" (tilted
+        planes, perspective) or "warps" (layers that bend).
       layers: planes before the background.
       flow_px: see scenes.windows.motion.
       theta: contrast threshold, drawn evenly in its logarithm.
@@ -122,8 +123,8 @@ class Windows:
         )
 
     def _window(self, index: int) -> tuple[Any, Tensor, Tensor, Tensor]:
-        """Counts [intervals, 2, H, W] (or what ``_counts`` makes them of), flow [2, H, W] on the pixels of the start,
-        where it holds [H, W], and the frames at both ends [2, H, W]."""
+        """Counts [intervals, 2, H, W] (or what ``_counts`` makes them of), flow [2, H, W] on the
+        pixels of the start, where it holds [H, W], and the frames at both ends [2, H, W]."""
         raise NotImplementedError
 
     def _counts(self, seen: Sequence[Any]) -> Tensor:
@@ -175,7 +176,8 @@ class RenderedWindows(Windows):
         return frames.clamp_min(DARKEST).log_() * sample.contrast
 
     def _counts(self, seen):
-        """Of ideal pixels: (log radiance [T, H, W], thresholds, noise) of every sample; all at once, which is cheaper."""
+        """Of ideal pixels: (log radiance [T, H, W], thresholds, noise) of every sample; all at
+        once, which is cheaper."""
         levels, thetas, noises = zip(*seen, strict=True)
         counts, _ = memory(torch.stack(levels, 1), *torch.stack(thetas, 1), log_input=True)
         counts = counts[LEAD:]
@@ -185,7 +187,8 @@ class RenderedWindows(Windows):
         return counts
 
     def _times(self, index):
-        """Times of the frames of a sample, those before the window among them; the motion drawn lasts from 0 to 1."""
+        """Times of the frames of a sample, those before the window among them; the motion drawn
+        lasts from 0 to 1."""
         del index
         return self.t
 
@@ -221,8 +224,9 @@ class RenderedWindows(Windows):
         return Sample(layers, distortion, contrast, torch.from_numpy(thetas).float(), torch.from_numpy(noise))
 
     def _texture(self, draw, covering, blur_px):
-        """A piece of a texture with its cover [2, C, C], blurred, and where pixels lie on it, [3, 3], turned and mirrored
-        at random. The radiance of one that does not cover everything is weighted with its cover."""
+        """A piece of a texture with its cover [2, C, C], blurred, and where pixels lie on it, [3,
+        3], turned and mirrored at random. The radiance of one that does not cover everything is
+        weighted with its cover."""
         texture = self.textures[draw.integers(len(self.textures))]
         size = min(self.crop, *texture.shape)
         top, left = (int(draw.integers(0, extent - size + 1)) for extent in texture.shape)
@@ -241,7 +245,8 @@ class RenderedWindows(Windows):
         return gaussian(piece, blur_px * scale), place
 
     def _undistorted(self, distortion):
-        """Where an ideal pinhole would see what each pixel sees, [H, W, 2]: x (1 + k r^2), r = 1 at the corner."""
+        """Where an ideal pinhole would see what each pixel sees, [H, W, 2]: x (1 + k r^2), r = 1 at
+        the corner."""
         at = pixels(self.height_px, self.width_px)
         radius2 = at.square().sum(-1) / at.square().sum(-1).max()
         return at * (1 + torch.tensor(distortion, dtype=torch.float32) * radius2[..., None])
@@ -266,8 +271,8 @@ class RenderedWindows(Windows):
 
 
 class PacketWindows(RenderedWindows):
-    """Windows cut as real recordings are: they end where they hold ``events_per_px`` events of the scene per pixel, and
-    at the latest where the motion drawn ends.
+    """Windows cut as real recordings are: they end where they hold ``events_per_px`` events of the
+    scene per pixel, and at the latest where the motion drawn ends.
 
     So much contrast, fine texture and a low threshold make short windows of little motion; a few edges make
     long ones. Noise comes on top. Args: as RenderedWindows.

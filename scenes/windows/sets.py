@@ -32,7 +32,8 @@ Make = Callable[[int, int], Windows]
 
 
 def packets(events_per_px: float, layers: tuple[int, int]) -> Make:
-    """Packets of so many events of the scene per pixel, and noise on top. layers: planes before the background."""
+    """Packets of so many events of the scene per pixel, and noise on top. layers: planes before the
+    background."""
     noise = tuple(share * events_per_px / 16 for share in NOISE_SHARE)  # two polarities, eight eighths
     theta, *contrast = CONTRASTS[events_per_px]
     return _packets(
@@ -91,8 +92,8 @@ HARSH: dict[str, Make] = {
     "packets_5k": _packets(5000 / (180 * 240), (180, 240), (0, 2), theta=(0.12, 0.35), contrast=(0.5, 1.2)),
     "noise": moved("similarity", (0.5, 6.0), textures="everyday", contrast=(0.0, 0.0), noise=(0.003, 0.06)),
 }
-"""Families that estimators of flow fail on: approach, roll, bodies before still ground, stripes, motion that turns
-back, packets of few events, and noise alone. Name -> function (seed, bins) -> source."""
+"""Families that estimators of flow fail on: approach, roll, bodies before still ground, stripes,
+motion that turns back, packets of few events, and noise alone. Name -> function (seed, bins) -> source."""
 
 
 @dataclass(frozen=True)
@@ -134,8 +135,8 @@ BENDING = Sensors(bend=0.4)
 
 
 def real(shape, seed):
-    """Windows as real sensors give them: planes, layers that bend, short and long flows; and a third as ideal ones
-    do."""
+    """Windows as real sensors give them: planes, layers that bend, short and long flows; and a
+    third as ideal ones do."""
     return [
         (0.12, shape.seen_by(STIFF, SHORT, seed)),
         (0.08, shape.seen_by(STIFF, PLANES, seed + 1)),

@@ -1,5 +1,5 @@
-"""Recordings with exact flow at any time: streams of events as a real camera gives them, of a camera that turns
-before a photograph and of one that slides past layers of depth."""
+"""Recordings with exact flow at any time: streams of events as a real camera gives them, of a
+camera that turns before a photograph and of one that slides past layers of depth."""
 
 from dataclasses import dataclass, replace
 
@@ -43,8 +43,8 @@ PHOTOGRAPHS = ("gravel", "astronaut", "camera", "brick")  # on them
 
 @dataclass(frozen=True)
 class Recording:
-    """A stream with its flow. name: for people. focal_px: of the pinhole camera, its axis in the middle. layers: whose
-    motion is a function from times to homographies."""
+    """A stream with its flow. name: for people. focal_px: of the pinhole camera, its axis in the
+    middle. layers: whose motion is a function from times to homographies."""
 
     name: str
     stream: EventStream

@@ -18,16 +18,17 @@ ALL = tuple(name for name in worlds.WORLDS if not name.startswith(("blank", "dar
 
 
 class WorldWindows(Windows):
-    """A window of interval 1 starts somewhere on a path of one of five families, and lasts until the root mean
-    square flow is ``flow_px`` (drawn evenly). Truth is valid where the world is seen (the sky has no flow) and its
-    point stays in the image.
+    """A window of interval 1 starts somewhere on a path of one of five families, and lasts until
+    the root mean square flow is ``flow_px`` (drawn evenly). Truth is valid where the world is seen
+    (the sky has no flow) and its point stays in the image.
 
     Args:
       names: worlds, taken in turn.
       size_px: width and height.
       flow_px: (least, most).
       theta: threshold, (least, most).
-      noise: background events per pixel, polarity and eighth of the window, (least, most), evenly in the logarithm.
+      noise: background events per pixel, polarity and eighth of the window, (least, most), evenly
+        in the logarithm.
       fov_deg: horizontal field, (least, most).
       samples: rays per pixel.
       seed, bins, intervals: as Windows.

@@ -1,5 +1,6 @@
-"""How good is event flow? The closed form in all its models, the delivered network or one of yours, and rivals, beside
-zero flow, on textures, motions, densities, 3-D worlds and recordings that guided no choice, with hard events.
+"""How good is event flow? The closed form in all its models, the delivered network or one of yours,
+and rivals, beside zero flow, on textures, motions, densities, 3-D worlds and recordings that guided
+no choice, with hard events.
 
 ``--sets cells`` judges on single planes, one threshold and one level of noise at a time.
 """
@@ -83,15 +84,18 @@ class Config(StudyConfig):
     models: tuple[str, ...] = ("constant", "affine", "quadratic", "local")
     """Models of the closed form to judge, "affine" among them."""
     clock: Literal["events", "time"] = "events"
-    """Clock of the closed form and the refiner: how far a motion has come goes by the events, or is even over the window."""
+    """Clock of the closed form and the refiner: how far a motion has come goes by the events, or is
+    even over the window."""
     windows: int = 256
     """Windows of every set of flat textures and of every cell, 64 x 64."""
     world_windows: int = 75
     """Windows of 3-D worlds, 128 x 128, the worlds in turn."""
     real_windows: int = 128
-    """Windows of every set of scenes.windows.sets: packets of few events, bent images, vibration, rotation."""
+    """Windows of every set of scenes.windows.sets: packets of few events, bent images, vibration,
+    rotation."""
     sets: tuple[str, ...] = ()
-    """Sets to judge on, "cells" for all cells of single planes; all but those when left out, with the recordings."""
+    """Sets to judge on, "cells" for all cells of single planes; all but those when left out, with
+    the recordings."""
     middlebury: Path | None = None
     """Folder with Middlebury's .flo files, to move photographs by as they are and three times as far."""
     recording: tuple[Path, ...] = ()
@@ -123,13 +127,15 @@ def study(run: Run[Config]) -> None:
             run.figure(
                 _pictures(shown, who),
                 name,
-                f"{name.replace('_', ' ')}: events (red ON, blue OFF), true flow, estimates, and the deviation "
+                f"{name.replace('_', ' ')}: events (red ON, blue OFF), true flow, estimates, and "
+                "the deviation "
                 "that the network claims. Colour: direction, strength: length.",
             )
     _tables(run, found, about, who)
     if config.middlebury is None:
         run.text(
-            "Middlebury's flows were left out: give the folder of its .flo files with `--middlebury`. The sets "
+            "Middlebury's flows were left out: give the folder of its .flo files with "
+            "`--middlebury`. The sets "
             "`many_depths` stand for them."
         )
     if "worlds" in found:

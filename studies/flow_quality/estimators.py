@@ -1,5 +1,5 @@
-"""The estimators that are judged: models of the closed form, the network, a plain solve of the same equations, and
-methods of frames on event images."""
+"""The estimators that are judged: models of the closed form, the network, a plain solve of the same
+equations, and methods of frames on event images."""
 
 from collections.abc import Callable
 from functools import partial
@@ -23,7 +23,8 @@ Estimator = Callable[[EventVolume], FlowField]
 
 
 def estimators(network, models, clock) -> dict[str, Estimator]:
-    """By name. models, clock: of the closed form. All sensors here saw the scene before, so events can be the clock."""
+    """By name. models, clock: of the closed form. All sensors here saw the scene before, so events
+    can be the clock."""
     found: dict[str, Estimator] = {
         f"closed_form_{model}": partial(flow.estimate_lk, model=model, clock=clock) for model in models
     }
@@ -36,7 +37,8 @@ def estimators(network, models, clock) -> dict[str, Estimator]:
 
 
 def _between_images(method, volume):
-    """Flow from the image of all events of the first half to that of the second, over the time between them."""
+    """Flow from the image of all events of the first half to that of the second, over the time
+    between them."""
     half = volume.counts.shape[2] // 2
     when = [part.mean() for part in (volume.centroid_s[:half], volume.centroid_s[half:])]
     whole = float(volume.collected_s.sum() / (when[1] - when[0]))
@@ -49,8 +51,8 @@ def _between_images(method, volume):
 
 
 def plain_lk(volume: EventVolume) -> FlowField:
-    """Affine Gauss-Newton on the warped volume with a small fixed damping, no prior and no noise model; on the pixels of
-    mid-interval, taken for those of the start."""
+    """Affine Gauss-Newton on the warped volume with a small fixed damping, no prior and no noise
+    model; on the pixels of mid-interval, taken for those of the start."""
     counts = volume.counts
     batch, _, _, height, width = counts.shape
     span = volume.collected_s.sum()

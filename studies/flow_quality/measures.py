@@ -1,5 +1,5 @@
-"""What is measured of an estimator on a set of windows: errors, how honest and how telling its claims are, and
-how sharp it makes the events."""
+"""What is measured of an estimator on a set of windows: errors, how honest and how telling its
+claims are, and how sharp it makes the events."""
 
 from collections.abc import Sequence
 
@@ -19,13 +19,15 @@ MUCH = 1.05  # error over that of zero flow from which on a window is worse than
 MARGIN_PX = 0.05  # windows without information give next to no flow, which loses by less every second time
 
 Rows = dict[str, np.ndarray]
-"""Of N windows: error_px, zero_px: [N] mean endpoint error over valid pixels of the estimate and of zero flow.
+"""Of N windows: error_px, zero_px: [N] mean endpoint error over valid pixels of the estimate and of
+zero flow.
 claim, claim_median: [N] mean squared error over the trace of the claimed covariance, and median of its root.
 normalised, within: [N] mean of half of e^T C^-1 e, and share of the pixels in the claimed ellipse of 90 %.
-spearman, spearman_if_true: [N] rank correlation within a window of 1 - confidence with the error, and with errors drawn
-from the claim. left, best: [N, len(SHARES)] mean error of the pixels left when a share of them is taken out, least
-confident first, and largest error first. fwl, truth_fwl: [N] by the estimate and by the true flow. NaN where nothing is
-claimed, the confidence is the same everywhere, or no event is."""
+spearman, spearman_if_true: [N] rank correlation within a window of 1 - confidence with the error,
+and with errors drawn from the claim. left, best: [N, len(SHARES)] mean error of the pixels left
+when a share of them is taken out, least confident first, and largest error first. fwl, truth_fwl:
+[N] by the estimate and by the true flow. NaN where nothing is claimed, the confidence is the same
+everywhere, or no event is."""
 
 
 def measure(field: FlowField, windows: FlowWindows) -> Rows:
@@ -59,7 +61,8 @@ def measure(field: FlowField, windows: FlowWindows) -> Rows:
 
 
 def of_claim(miss, covariance, doubt, random) -> dict[str, float]:
-    """What errors [2, N] say of covariances [3, N] (xx, xy, yy), and errors drawn from these of doubts [N]."""
+    """What errors [2, N] say of covariances [3, N] (xx, xy, yy), and errors drawn from these of
+    doubts [N]."""
     x, y = miss
     xx, xy, yy = covariance
     square = (yy * x**2 - 2 * xy * x * y + xx * y**2) / (xx * yy - xy**2)
@@ -108,8 +111,8 @@ def figures(rows: Rows) -> dict[str, float]:
 
 
 def curves(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
-    """Sparsification curves over SHARES, by confidence and by true error, relative to the error of all pixels; the
-    area between them is AUSE (Ilg et al., ECCV 2018)."""
+    """Sparsification curves over SHARES, by confidence and by true error, relative to the error of
+    all pixels; the area between them is AUSE (Ilg et al., ECCV 2018)."""
     whole = rows["left"][:, 0].mean()
     return rows["left"].mean(0) / whole, rows["best"].mean(0) / whole
 

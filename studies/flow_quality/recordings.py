@@ -1,5 +1,5 @@
-"""Recordings, cut into packets of a fixed number of events: two that are made here, with exact flow, and those
-the user names."""
+"""Recordings, cut into packets of a fixed number of events: two that are made here, with exact
+flow, and those the user names."""
 
 import statistics
 from collections.abc import Callable
@@ -116,8 +116,8 @@ def in_context(recording, packet, turns):
 
 
 def judged(packet, mask, flow_px, sharpest_px=None):
-    """Figures of a flow on a packet, those that are defined: distance_px to the contrast maximisation and aee_px to the
-    truth, over pixels with events (mask); fwl."""
+    """Figures of a flow on a packet, those that are defined: distance_px to the contrast
+    maximisation and aee_px to the truth, over pixels with events (mask); fwl."""
     found = {"fwl": float(metrics.fwl(packet.stream, flow_px, packet.t0_us, packet.t1_us))}
     if sharpest_px is not None:
         found["distance_px"] = float(metrics.aee(flow_px, sharpest_px.to(flow_px), mask))
@@ -127,8 +127,8 @@ def judged(packet, mask, flow_px, sharpest_px=None):
 
 
 def measured(case, who, bins):
-    """{name: figures} of all estimators on a packet, of the contrast maximisation itself, and of the true flow and of zero
-    flow where there is a truth."""
+    """{name: figures} of all estimators on a packet, of the contrast maximisation itself, and of
+    the true flow and of zero flow where there is a truth."""
     packet = case.packet
     sharpest_px = torch.from_numpy(case.seek().flow_px)[None]
     volume = events.from_stream(packet.stream, packet.t0_us, packet.t1_us, bins)

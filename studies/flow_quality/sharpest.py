@@ -131,8 +131,8 @@ class _Events:
         return x - (self.width - 1) / 2, y - (self.height - 1) / 2
 
     def contrast(self, flow, cell_px):
-        """Variance of the images of the events moved to the middle of the packet, both polarities added, on cells of
-        cell_px px.
+        """Variance of the images of the events moved to the middle of the packet, both polarities
+        added, on cells of cell_px px.
 
         Every event is spread by the quadratic B-spline, whose width does not depend on where it falls: with
         bilinear shares the unmoved image, whose events sit on pixels, would be the sharpest.

@@ -59,8 +59,8 @@ class Config(StudyConfig):
     truth_unit: Literal["px", "px/s"] = "px"
     """Unit of flow files."""
     truth_pixels: Literal["raw", "undistorted"] = "raw"
-    """Whose pixels flow files belong to: the sensor's, or those of a pinhole, from which they are then carried to
-    the sensor's by calib.txt."""
+    """Whose pixels flow files belong to: the sensor's, or those of a pinhole, from which they are
+    then carried to the sensor's by calib.txt."""
     skip: tuple[str, ...] = ()
     """Faults to leave out and count instead of refusing (events) or keeping (windows): events_back_in_time,
     events_off_sensor, windows_without_events, windows_across_gaps."""
@@ -71,7 +71,8 @@ class Config(StudyConfig):
     calibration: Path | None = None
     """Camera file, instead of the calib.txt beside the events."""
     video: bool = False
-    """Also write a video of the events with arrows of the flow, window after window (a tracker; see docs/flow.md)."""
+    """Also write a video of the events with arrows of the flow, window after window (a tracker; see
+    docs/flow.md)."""
     video_windows: int = 150
     """Most windows of the video."""
     video_fps: float = 15.0

@@ -1,5 +1,5 @@
-"""The page of a recording: figures and their means, pictures, and what they do not say: windows and events left out, and
-why a true flow may be none."""
+"""The page of a recording: figures and their means, pictures, and what they do not say: windows and
+events left out, and why a true flow may be none."""
 
 import statistics
 
@@ -26,7 +26,8 @@ UNITS = {
 
 
 def show(run, packets, rows, names, film):
-    """Metrics, tables and page. rows: (packet, estimator, figures); names: of the estimators; film: or None."""
+    """Metrics, tables and page. rows: (packet, estimator, figures); names: of the estimators; film:
+    or None."""
     means = {name: _means([found for _, one, found in rows if one == name]) for name in names}
     for name, mine in means.items():
         run.record(**{f"{_key(name)}_{figure}": value for figure, value in mine.items()})
@@ -56,7 +57,8 @@ def show(run, packets, rows, names, film):
         "Every packet",
         ("packet", "ms", "events", "estimator", *UNITS.values()),
         table,
-        "AEE, outliers (above 3 px and 5 % of the true length) and angles where events are and the truth is valid, unless "
+        "AEE, outliers (above 3 px and 5 % of the true length) and angles where events are and the "
+        "truth is valid, unless "
         "said otherwise. FWL above 1: sharper than without flow; RSAT below 1 likewise.",
     )
     table = [(name, *(mine.get(figure) for figure in UNITS)) for name, mine in means.items()]
@@ -94,8 +96,8 @@ def _means(found):
 
 
 def counts(packets, rows, name):
-    """{metric: number} of the faults of a recording and of its packets. name: the estimator that is compared with the
-    truth."""
+    """{metric: number} of the faults of a recording and of its packets. name: the estimator that is
+    compared with the truth."""
     return {
         "packets_without_events": sum(not len(packet.stream) for packet in packets),
         "packets_without_truth": sum(packet.truth is None for packet in packets),
@@ -126,33 +128,41 @@ def doubts(packets, rows, name):
     sentences = (
         (
             empty or blind,
-            f"{empty} packet(s) hold no event, {blind} have no true flow; they do not count in the figures that need one.",
+            f"{empty} packet(s) hold no event, {blind} have no true flow; they do not count in the "
+            "figures that need one.",
         ),
         (left_out, f"**Left out**: {', '.join(left_out)}."),
         (
             gaps,
-            f"**{gaps} packet(s) lie across a gap** of the recording, where no pixel sent an event: their flow is that of "
+            f"**{gaps} packet(s) lie across a gap** of the recording, where no pixel sent an "
+            "event: their flow is that of "
             "the rest of the window.",
         ),
         (
             moving,
-            f"**The camera translates** in {_some(moving)}, and the only true flow is that of its rotation: the difference "
+            f"**The camera translates** in {_some(moving)}, and the only true flow is that of its "
+            "rotation: the difference "
             "from it is no error and is not counted as one; FWL says how good the flow is.",
         ),
         (
             distorted_px,
-            "**The camera has distortion**, and the true flow comes from a file: if that is of undistorted pixels, it is "
-            f"{distorted_px:.2f} px off in the mean of a packet, enough to turn rankings round. `--truth-pixels "
+            "**The camera has distortion**, and the true flow comes from a file: if that is of "
+            "undistorted pixels, it is "
+            f"{distorted_px:.2f} px off in the mean of a packet, enough to turn rankings round. "
+            "`--truth-pixels "
             "undistorted` carries it to the sensor's pixels.",
         ),
         (
             sharper,
-            f"**{name} makes the events sharper than the true flow does** in {_some(sharper)}: the truth may belong to "
-            "other pixels or times, or leave something out; errors against it are then not the estimate's alone.",
+            f"**{name} makes the events sharper than the true flow does** in {_some(sharper)}: the "
+            "truth may belong to "
+            "other pixels or times, or leave something out; errors against it are then not the "
+            "estimate's alone.",
         ),
         (
             blurred,
-            f"**The true flow makes the events less sharp than none** in {_some(blurred)}: check its unit, times and axes, "
+            f"**The true flow makes the events less sharp than none** in {_some(blurred)}: check "
+            "its unit, times and axes, "
             "or whether it holds there.",
         ),
     )
@@ -173,7 +183,8 @@ def _some(names):
 
 def caption(packet):
     return (
-        f"{packet.name}: {len(packet.stream)} events in {_ms(packet):.2f} ms. {'; '.join(packet.notes)}. Hue is the "
+        f"{packet.name}: {len(packet.stream)} events in {_ms(packet):.2f} ms. "
+        f"{'; '.join(packet.notes)}. Hue is the "
         "direction of the flow, saturation its length; black where nothing is known."
     )
 

@@ -23,8 +23,9 @@ class Segments:
             self.names += [f"{label}/{shape.id()}" for shape in shapes] or [label]
 
     def at(self, rays, scene, T_world_cam, object_id):
-        """Numbers [F, H, W] of the segments that rays of all pixels meet in F frames; object_id [F, H, W] is the
-        number of the part that is met first. scene: as it is in these frames. T_world_cam: [F, 4, 4]."""
+        """Numbers [F, H, W] of the segments that rays of all pixels meet in F frames; object_id [F,
+        H, W] is the number of the part that is met first. scene: as it is in these frames.
+        T_world_cam: [F, 4, 4]."""
         owner = object_id.flatten(1)
         found = torch.full(owner.shape, -1)
         cameras = views_of(scene, T_world_cam).cameras[:, :, None]

@@ -3,8 +3,8 @@
 The budget is processor time (--cpu-minutes, all threads, making the data included) or a number of steps
 (--steps). With --steps the result depends on the options and the seed alone, and a resumed run gives the same
 numbers bit for bit on the same machine and number of threads. Several processes share every batch: torchrun
---nproc-per-node 2 -m studies.train_flow ... With --race the refiner, networks of its size and your own are trained
-alike, and judged side by side.
+--nproc-per-node 2 -m studies.train_flow ... With --race the refiner, networks of its size and your
+own are trained alike, and judged side by side.
 """
 
 import os
@@ -45,7 +45,8 @@ class Config(StudyConfig):
     mix: str = "real"
     """Windows to train on (scenes.windows.sets)."""
     data: Path | None = None
-    """Data set (ours, DSEC, MVSEC) or recording to train on instead; its last tenth is what is judged on. Without true
+    """Data set (ours, DSEC, MVSEC) or recording to train on instead; its last tenth is what is
+    judged on. Without true
     flow: --loss contrast."""
     window_frames: int = 1
     """Frame intervals per window of a data set."""
@@ -102,7 +103,8 @@ class Config(StudyConfig):
     threads: int = 1
     """Threads of torch per process; 0 for all cores."""
     race: bool = False
-    """Train the refiner and networks of as many weights with every one of --seeds, and judge them side by side."""
+    """Train the refiner and networks of as many weights with every one of --seeds, and judge them
+    side by side."""
     own: tuple[str, ...] = ()
     """Networks of your own to race too: module:Class, run from the folder of the module."""
     seeds: tuple[int, ...] = (0, 1, 2)

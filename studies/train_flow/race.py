@@ -1,8 +1,9 @@
-"""The refiner against a plain, a spiking, a cascaded and a deblurring network of as many weights, and networks of your
+"""The refiner against a plain, a spiking, a cascaded and a deblurring network of as many weights,
+and networks of your
 own: the same windows, the same budget, several seeds.
 
-Every training is a run of this study in a folder below; those that are done are kept when the race goes on with
---resume. Then all networks are judged on the same windows.
+Every training is a run of this study in a folder below; those that are done are kept when the race
+goes on with --resume. Then all networks are judged on the same windows.
 """
 
 import re
@@ -25,15 +26,16 @@ NAMES = {
     "ecn": "ECN",
     "idnet": "IDNet",
 }
-# largest steps, found in short trials of 300 to 750 steps (1e-3 and 3e-3 for the spiking network), for ECN and IDNet of
-# one processor minute (1e-3, 2e-3; IDNet also 4e-3)
+# largest steps, found in short trials of 300 to 750 steps (1e-3 and 3e-3 for the spiking network),
+# for ECN and IDNet of one processor minute (1e-3, 2e-3; IDNet also 4e-3)
 RATES = {"refiner": 2e-3, "flownet-events": 2e-3, "spike-flownet": 3e-3, "ecn": 1e-3, "idnet": 2e-3}
 ASKED = 0.6  # of a rival's error, at most
 SEED = 55  # of what is judged here
 
 
 def race(run):
-    """Train, judge and show. Of --final-windows, sets of packets and motions have a half, 3-D worlds a third."""
+    """Train, judge and show. Of --final-windows, sets of packets and motions have a half, 3-D
+    worlds a third."""
     config = run.config
     if not config.seeds or config.jobs < 1 or config.final_windows < 3:
         raise DomainError(

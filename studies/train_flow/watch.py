@@ -1,5 +1,5 @@
-"""What the first process does beside training: progress, validation, checkpoints, logs, and the results and their page
-at the end."""
+"""What the first process does beside training: progress, validation, checkpoints, logs, and the
+results and their page at the end."""
 
 import json
 import statistics
@@ -170,7 +170,8 @@ def show(run, job, scores):
     run.section(
         "On windows never trained on",
         "Error: mean endpoint error over valid pixels. Worse: windows whose own mean error is above that of "
-        "zero flow. Windows without any true flow are judged by the blur of their warped events over that of zero flow.",
+        "zero flow. Windows without any true flow are judged by the blur of their warped events "
+        "over that of zero flow.",
     )
     errors = ("error px", "closed form px", "zero flow px", "ratio", "closed form ratio")
     run.table("Errors", ("set", *errors, "worse %", "closed form worse %", "windows"), rows)

@@ -1,5 +1,5 @@
-"""Windows made on the fly, of every kind: their flow against the pictures themselves, their events against what was
-asked for."""
+"""Windows made on the fly, of every kind: their flow against the pictures themselves, their events
+against what was asked for."""
 
 import functools
 from dataclasses import replace
@@ -60,8 +60,9 @@ def warped(layers):
 
 
 BLURRED = Draws("fine", layers=(0, 0), flow_px=(2.0, 5.0), scale=(0.7, 0.9), blur_px=(1.3, 1.3))
-# kind -> source, and by how much the end frame read along the flow may miss the first one: mean over all pixels, median;
-# means over the change in place. They count what gets hidden, and the bilinear lookup of sharp edges.
+# kind -> source, and by how much the end frame read along the flow may miss the first one: mean
+# over all pixels, median; means over the change in place. They count what gets hidden, and the
+# bilinear lookup of sharp edges.
 SOURCES = {
     "layers": (
         lambda folder: RenderedWindows(
@@ -80,8 +81,8 @@ SOURCES = {
 
 @pytest.mark.parametrize("kind", SOURCES)
 def test_the_flow_leads_to_the_same_radiance(kind, tmp_path):
-    """Where a point stays in sight, the end frame at q + flow(q) shows what the first frame shows at q; in place, or
-    along the reversed flow, it does not."""
+    """Where a point stays in sight, the end frame at q + flow(q) shows what the first frame shows
+    at q; in place, or along the reversed flow, it does not."""
     make, mean_share, median_share = SOURCES[kind]
     windows = make(tmp_path).batch(range(2))
     assert windows.frames is not None
@@ -136,8 +137,8 @@ def test_every_pixel_has_the_flow_of_the_layer_it_shows():
 
 @pytest.mark.parametrize("ratio", [1.0, 4.0])
 def test_events_are_the_log_change_over_the_threshold(ratio):
-    """Without mismatch and noise, theta_on ON - theta_off OFF follows the change of log radiance to within a threshold
-    at either end."""
+    """Without mismatch and noise, theta_on ON - theta_off OFF follows the change of log radiance to
+    within a threshold at either end."""
     draws = replace(planes(theta=0.1, noise=NOISELESS), mismatch=0.0, on_over_off=(ratio, ratio))
     windows = RenderedWindows(draws, seed=2).batch(range(3))
     on, off = windows.volume.counts.sum(2).unbind(1)
@@ -211,7 +212,8 @@ def test_windows_of_worlds_last_until_the_flow_is_as_long_as_asked_and_count_who
 
 
 def test_an_even_motion_by_whole_pixels_shifts_the_photograph():
-    """At any place the shares of a point are alike after whole pixels, so the picture is the same, further on."""
+    """At any place the shares of a point are alike after whole pixels, so the picture is the same,
+    further on."""
     y, x = torch.meshgrid(torch.arange(40.0), torch.arange(48.0), indexing="ij")
     photo = 100 + 50 * torch.sin(x / 4) * torch.cos(y / 5)
     flow = torch.tensor([6.0, -4.0])[:, None, None].expand(2, 40, 48)

@@ -110,7 +110,8 @@ def test_a_field_that_folds_is_refused():
 
 
 def test_a_bent_layer_begins_flat_and_shows_at_the_end_what_it_showed_at_the_start():
-    """The texture seen at ``end(q)`` at the last time is that of q: to the fixed point's 0.25^12 of a few px."""
+    """The texture seen at ``end(q)`` at the last time is that of q: to the fixed point's 0.25^12 of
+    a few px."""
     homographies = torch.eye(3).repeat(3, 1, 1)
     homographies[1:, 0, 2] = torch.tensor([1.0, 2.0])
     homographies[2, 0, 1] = 0.03

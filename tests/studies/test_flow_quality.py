@@ -127,7 +127,8 @@ def test_quick_form(tmp_path):
     # 0.3 of the scene, up to 15 % of noise on top
     assert found["layers_0.3_events_per_px_median"] < 0.36
     assert found["layers_0.3_closed_form_affine_sharpness"] > 1
-    # the prior and the noise model are worth more than half of the plain solve's error (docs/flow_closed_form.md)
+    # the prior and the noise model are worth more than half of the plain solve's error
+    # (docs/flow_closed_form.md)
     cell = "mixed_theta_0.2_noise_0.002"
     assert found[f"{cell}_closed_form_affine_ratio"] < 0.5 * found[f"{cell}_plain_ratio"]
     assert (tmp_path / "report.html").exists()

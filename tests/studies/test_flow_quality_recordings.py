@@ -69,8 +69,8 @@ def test_the_sharpest_rotation_of_turning_dots():
 
 
 def test_the_sharpest_affine_flow_belongs_to_the_start():
-    """x(t) = c + t s with a zoom of 0.12: at the end of the window a pixel of the start has moved by just that
-    share."""
+    """x(t) = c + t s with a zoom of 0.12: at the end of the window a pixel of the start has moved
+    by just that share."""
 
     def move(x, y, time):
         return x + time * (2.0 + 0.12 * x), y + time * (-1.5 + 0.12 * y)

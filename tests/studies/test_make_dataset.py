@@ -216,9 +216,8 @@ def test_flow_files_hold_the_flow_and_the_truth_is_the_renderers(dataset):
                 slow = flow_and_occlusion(cam, scene, T)
                 images = render.frames(cam, scene, T)
             assert torch.equal(valid, slow.valid)
-            torch.testing.assert_close(
-                flow.double(), slow.flow_px, rtol=0, atol=2e-6
-            )  # the chart's, and float32
+            # the chart's, and float32
+            torch.testing.assert_close(flow.double(), slow.flow_px, rtol=0, atol=2e-6)
             torch.testing.assert_close(torch.from_numpy(frames["frames"][()]), images, rtol=0, atol=1e-4)
             torch.testing.assert_close(
                 torch.from_numpy(frames["depth"][3]).double(),

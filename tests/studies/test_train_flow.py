@@ -1,5 +1,5 @@
-"""Training of flow networks from the command line: what is learnt, resumed, shared between processes, raced, and
-refused."""
+"""Training of flow networks from the command line: what is learnt, resumed, shared between
+processes, raced, and refused."""
 
 import json
 import signal
@@ -201,7 +201,8 @@ def test_two_processes_learn_what_one_does(tmp_path):
 
 
 def test_a_race_trains_every_network_with_every_seed_and_judges_them_alike(tmp_path, monkeypatch):
-    """Ours errs by half of the flow, the rival by a quarter; the commands of trainings are looked at, not run."""
+    """Ours errs by half of the flow, the rival by a quarter; the commands of trainings are looked
+    at, not run."""
     monkeypatch.setattr(races, "NAMES", {"refiner": "refiner"})
     monkeypatch.setattr(races, "SETS", {})
     monkeypatch.setattr(races, "VALIDATION", {"unseen": lambda shape, seed: Made(seed)})

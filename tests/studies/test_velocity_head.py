@@ -60,8 +60,8 @@ def test_designs_keep_off_the_bounds_and_more_of_them_begin_alike():
 def test_a_little_training_lowers_the_error_on_worlds_kept_from_it_and_what_it_saves_loads(
     tmp_path, monkeypatch
 ):
-    """Training is of three worlds of four. In closed form: one window of four that reads half of its flow pulls least
-    squares; a head that hears which one it is leaves it out."""
+    """Training is of three worlds of four. In closed form: one window of four that reads half of
+    its flow pulls least squares; a head that hears which one it is leaves it out."""
 
     def rendered(pair, design, index, config):
         return made(config.worlds * config.motions, index)

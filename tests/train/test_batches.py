@@ -79,9 +79,8 @@ def test_a_mix_keeps_its_shares():
     parts = [(0.5, "a"), (0.3, "b"), (0.2, "c")]
     chosen = [pick(parts, group) for group in range(1000)]
     for share, name in parts:
-        assert (
-            abs(chosen.count(name) - 1000 * share) <= 3
-        )  # discrepancy of the golden ratio's multiples: of order log(1000)
+        # discrepancy of the golden ratio's multiples: of order log(1000)
+        assert abs(chosen.count(name) - 1000 * share) <= 3
 
 
 def test_a_finite_source_is_shown_whole_and_in_another_order_each_time():

@@ -66,10 +66,8 @@ def test_a_network_without_earlier_predictions_and_a_mix_are_enough():
 
     network = Plain()
     train.fit(network, [(0.75, count("a")), (0.25, count("b"))], steps=40, batch=4, optimiser=adam(network))
-    assert (asked["a"], asked["b"]) == (
-        pytest.approx(121, abs=4),
-        pytest.approx(41, abs=4),
-    )  # one looked at each
+    # one looked at each
+    assert (asked["a"], asked["b"]) == (pytest.approx(121, abs=4), pytest.approx(41, abs=4))
 
 
 def test_the_best_weights_are_what_remains():

@@ -62,8 +62,9 @@ def test_the_judge_of_a_fit_is_the_ratio_on_windows_made_once():
 
 
 def test_windows_without_truth_are_judged_by_the_blur_of_their_events():
-    """A dot crosses 4 px in a window: along its flow all five events fall on one pixel (a fifth of the energy spread out,
-    less the stretch of smoothing), unmoved they lie side by side, which is 1, and against it they part further."""
+    """A dot crosses 4 px in a window: along its flow all five events fall on one pixel (a fifth of
+    the energy spread out, less the stretch of smoothing), unmoved they lie side by side, which is
+    1, and against it they part further."""
     counts = torch.zeros(1, 2, 5, 9, 15)
     counts[0, 0, torch.arange(5), 4, 5 + torch.arange(5)] = 1.0
     volume = EventVolume(counts, torch.linspace(0, 1, 5), torch.tensor([0.125, 0.25, 0.25, 0.25, 0.125]))
