@@ -121,8 +121,11 @@ def test_rms_and_strehl_of_defocus_and_spherical_aberration(size):
     assert float(strehl_direct(defocus)) == pytest.approx(sinc**2, abs=3e-4)
     spherical = disc(lambda p, r2: size * r2**2)
     assert float(rms_waves(spherical)) == pytest.approx(2 * size / math.sqrt(45), rel=1e-3)
-    marechal = math.exp(-((2 * math.pi * size) ** 2) / 12)
-    assert float(strehl_marechal(defocus)) == pytest.approx(marechal, rel=1e-2 * size)
+
+
+def test_strehl_of_a_twentieth_of_a_wave_by_marechal():
+    marechal = math.exp(-((2 * math.pi * 0.05) ** 2) / 12)
+    assert float(strehl_marechal(disc(lambda p, r2: 0.05 * r2))) == pytest.approx(marechal, rel=1e-4)
 
 
 def test_fits_take_away_what_they_fit():
