@@ -231,3 +231,21 @@ def test_gradients_of_projection_to_points_and_lens(generator):
     # differences bend by 1e-7; the solver's own Jacobian (forward step of 1e-4 mm) is as good
     at = (points, geo.curvature_per_mm.detach(), geo.thickness_mm.detach())
     assert_gradients(loss, at, (1e-4, 1e-6, 1e-4), 1e-6)
+
+
+def test_the_blur_disc_of_a_thin_lens_has_the_diameter_of_the_defocus_formula():
+    # Focused at s: 1/s = 1/f - 1/s'. An object at z has a blur disc of diameter A s' |1/s - 1/z| on the film.
+    f = 8.0
+    aperture = 2.5
+    image = 8.05
+    z = 0.6
+    camera = Camera(lens.ThinLens(f, aperture, image), 9, 9, 0.02, 64)
+    diameter_mm = aperture * image * abs((1 / f - 1 / image) - 1 / (z * 1e3))
+    angle = torch.linspace(0, 2 * math.pi, 13, dtype=D)[:-1]
+    rim = torch.stack([angle.cos(), angle.sin()], 1)
+    rays = camera.lens.camera_rays(torch.zeros(12, 2, dtype=D), rim)
+    at = rays.origin_m + rays.direction * ((z - rays.origin_m[:, 2:]) / rays.direction[:, 2:])
+    on_film = at[:, :2] / z * image  # millimetres, by the central ray
+    torch.testing.assert_close(
+        2 * on_film.norm(dim=1), torch.full((12,), diameter_mm, dtype=D), rtol=1e-12, atol=0
+    )
