@@ -245,3 +245,15 @@ def test_hot_pixels_fire_on_at_their_rate_and_others_are_silent():
     assert bool((events.p == 1).all())
     gaps = events.t_us[(events.y * 100 + events.x) == int(hot.nonzero()[0])].diff()
     assert (gaps - 20_000).abs().max() <= 2
+
+
+def test_bad_frames_in_a_later_chunk_leave_the_state_as_it_was():
+    frames, t_s = clip()
+    state = SensorState()
+    simulate(frames[:5], t_s[:5], EVERYTHING, state=state)
+    before = {name: tensor.clone() for name, tensor in state.tensors().items()}
+    frames[20, 3, 3] = math.nan
+    with pytest.raises(DomainError, match="NaN"):
+        simulate(frames[5:], t_s[5:], EVERYTHING, state=state)
+    assert state.time_s == float(t_s[4])
+    assert all(torch.equal(tensor, before[name]) for name, tensor in state.tensors().items())
