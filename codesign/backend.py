@@ -257,8 +257,8 @@ def pull_back(
     seeds: Sequence[Any],
     leaves: Sequence[Any] = (),
 ) -> list[Any]:
-    """Gradients of the drjit arrays that a function is given, one step of a loop for example, from those of what it gives;
-    then those of ``leaves``, which it may add its own to."""
+    """Gradients of the drjit arrays that a function is given, one step of a loop for example, from those of
+    what it gives; then those of ``leaves``, which it may add its own to."""
     import drjit as dr
 
     with dr.resume_grad():

@@ -218,17 +218,3 @@ class Lanes:
             mode="symbolic",
         )
         return carried
-
-    def back(
-        self, function: Callable[..., Any], given: list[Any], seeds: list[Any], leaves: Sequence[Any] = ()
-    ) -> list[Any]:
-        """Gradients of what a function of lanes is given, from those of what it gives; then those of
-        ``leaves``, which it may add its own to."""
-        dr = self.dr
-        with dr.resume_grad():
-            given = [dr.detach(value) + 0 for value in given]
-            dr.enable_grad(given)
-            found = function(*given)
-            products = [value * dr.detach(seed) for value, seed in zip(found, seeds, strict=True)]
-            dr.backward_from(sum(products[1:], products[0]))
-            return [dr.grad(value) for value in (*given, *leaves)]

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
+from codesign.backend import pull_back
 from codesign.exclusive import exclusive
 from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
 
@@ -183,7 +184,7 @@ def _gradients(form, trees, data, variances, by_values, by_evidence, *kept):
     dr = cells.dr
     none = [dr.zeros(cells.arr.Float)] * DATA
     given = [*cells.data(data), *cells.of_parents(scales[1], values[1])]
-    found = cells.back(cells.mean_below, given, cells.loaded(by_values))
+    found = pull_back(cells.mean_below, given, cells.loaded(by_values))
     grads = [cells.stored(found[:DATA])]
     down = cells.stored(found[DATA:])
     dr.eval(grads[0], down)
@@ -191,7 +192,7 @@ def _gradients(form, trees, data, variances, by_values, by_evidence, *kept):
         top = cells is scales[-1]
         parent = none if top else cells.of_parent(scales[cells.scale + 1], values[cells.scale + 1])
         given = [*cells.loaded(summed[cells.scale]), *parent]
-        found = cells.back(cells.below, given, cells.of_children(below, down, DATA, apart=True))
+        found = pull_back(cells.below, given, cells.of_children(below, down, DATA, apart=True))
         grads.append(cells.stored(found[:DATA]))
         down = cells.stored(found[DATA:])
         dr.eval(grads[-1], down)
@@ -202,7 +203,7 @@ def _gradients(form, trees, data, variances, by_values, by_evidence, *kept):
             seeds = every(scales[cells.scale + 1], grads[cells.scale + 1])
             seeds = [sum(seeds[part::DATA]) for part in range(DATA)]
         given = cells.loaded(summed[cells.scale]) if cells.scale else cells.data(data)
-        found = cells.back(cells.above, given, [*seeds, cells.of_evidence(by_evidence)])
+        found = pull_back(cells.above, given, [*seeds, cells.of_evidence(by_evidence)])
         so_far = cells.loaded(grads[cells.scale])
         grads[cells.scale] = cells.stored([a + b for a, b in zip(found, so_far, strict=True)])
         dr.eval(grads[cells.scale])

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from codesign.backend import pull_back
 from codesign.errors import DomainError, ShapeError
 from codesign.exclusive import exclusive
 from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
@@ -134,7 +135,7 @@ def _gradients(form, cell, mean, slope, seen, density, grad):
     )
     seeds = [image.take(grad, of_cell + k * plane) for k in range(PRODUCTS)]
     given = [*image.slopes(start, y, x), *(image.take(values, at) for values in (slope, seen, density))]
-    grad_x, grad_y, *others = image.back(lambda *given: [a * b for a, b in _products(*given)], given, seeds)
+    grad_x, grad_y, *others = pull_back(lambda *given: [a * b for a, b in _products(*given)], given, seeds)
     grad_x *= image.factor(x, image.edge)
     grad_y *= image.factor(y, image.bottom)
     dr.eval(grad_x, grad_y, *others)

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from codesign.backend import pull_back
 from codesign.exclusive import exclusive
 from codesign.flow.lk.cells import CELL, Cells
 from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
@@ -162,7 +163,7 @@ def _gradients(form, setting, coefficients, cells, by_flow, by_rest=None):
             row = pixels.arr.Float(y)
             return pixels.flow(given, row, read)[0] if by_rest is None else pixels.outcome(given, row, read)
 
-        found = pixels.back(outcome, given, seeds, read.values)
+        found = pull_back(outcome, given, seeds, read.values)
         of_cells = found[numbers:]
         for number, slot in enumerate(read.slots):
             four = pixels.arr.Array4(*of_cells[4 * number : 4 * number + 4])

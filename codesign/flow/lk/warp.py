@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from codesign.backend import pull_back
 from codesign.errors import ShapeError
 from codesign.exclusive import exclusive
 from codesign.flow.lk.lanes import Form, Grid, Lanes, in_graph, plain_wanted, recorded, tensors
@@ -126,7 +127,7 @@ def _gradients(form, fade_px, wants_rate, together, rate, flow, by_mean, by_slop
     dr = warp.dr
     by_mean, by_slope, by_seen = (warp.take(by, warp.lane) for by in (by_mean, by_slope, by_seen))
     grad_rate = warp.empty(warp.bins * warp.width) if wants_rate else None
-    grad_flow = warp.back(lambda *flow: [warp.seen(*flow)], warp.flow, [by_seen])
+    grad_flow = pull_back(lambda *flow: [warp.seen(*flow)], warp.flow, [by_seen])
     # processors need no locks where each thread has a copy; with several, this kernel is one for each size
     mode = dr.ReduceMode.Expand if form.device == "cpu" else dr.ReduceMode.Auto
     for start in range(0, warp.bins, together):
@@ -200,7 +201,7 @@ class _Warp(Lanes):
     def pulled(self, k, time, seed):
         """Gradients of the flow and of the four values around, from that of a bin's value."""
         four = []
-        return self.back(lambda *flow: [self.value(k, time, *flow, four)], self.flow, [seed], four)
+        return pull_back(lambda *flow: [self.value(k, time, *flow, four)], self.flow, [seed], four)
 
     def along(self, axis, flow, time):
         """The lower of two neighbours, and the share of the other; no gradient beyond the outermost
