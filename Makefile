@@ -8,7 +8,7 @@ STUDY :=
 RUN := .venv/bin/python
 INSTALL := $(RUN) -m pip install --disable-pip-version-check --quiet --constraint constraints.txt --editable
 STUDIES := lens-opt lens-report lens-scratch lens-tolerance lens-bench dataset video-to-events \
-	event-bench srm-bench sensor-fit train-flow flow-quality flow-cost flow-recording \
+	srm-bench sensor-fit train-flow flow-quality flow-recording \
 	placement speed-error stability gradcheck
 
 .PHONY: help setup test fuzz kill-test test-bits lint core-check try-all doctor clean $(STUDIES)
@@ -40,19 +40,19 @@ lens-opt: .venv/with-video.stamp ## optimise a lens for event flow, the main job
 lens-report: ## everything about one lens: make lens-report ARGS="--lens double-gauss"
 lens-scratch: ## triplets designed from flat plates
 lens-tolerance: ## what errors of making and mounting do to a lens
-lens-bench: .venv/with-bench.stamp ## speed and error against other ray tracers (installs them)
+lens-bench: .venv/with-bench.stamp ## speed and error against another ray tracer (installs it)
+lens-bench: STUDY := speed_error --stages lens
 dataset: .venv/with-event-files.stamp ## render trajectories with events and ground truth
 dataset: STUDY := make_dataset
 video-to-events: .venv/with-event-files.stamp .venv/with-video.stamp ## events out of a video: make video-to-events ARGS="--input clip.mp4"
-event-bench: ## speed and memory of the event stage
 srm-bench: .venv/with-bench.stamp ## the spiking layer against a convolution and two spiking libraries (installs them)
+srm-bench: STUDY := speed_error --stages spiking
 sensor-fit: .venv/with-event-files.stamp ## fit a sensor to a recording of yours: make sensor-fit ARGS="--recording FILE.aedat4"
 train-flow: .venv/with-event-files.stamp .venv/with-training-logs.stamp ## train a flow network: make train-flow ARGS="--network refiner --cpu-minutes 20"
 flow-quality: ## error of the delivered refiner and of the closed form on unseen textures and worlds
-flow-cost: ## time and memory of flow estimators
 flow-recording: .venv/with-event-files.stamp ## flow of a recording: make flow-recording ARGS="--recording FOLDER"
 placement: .venv/with-search.stamp ## where to mount the camera on a robot
-speed-error: ## time and error of every fidelity level
+speed-error: ## time, memory and error of every stage: make speed-error ARGS="--stages lens events flow"
 stability: ## hard cases: outcome expected and seen
 gradcheck: ## gradients against differences: make gradcheck ARGS="--cases chain joint layers sensors timing silhouettes"
 gradcheck: STUDY := gradient_flow

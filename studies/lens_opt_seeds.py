@@ -8,11 +8,11 @@ from typing import ClassVar
 import torch
 
 from codesign.errors import DomainError
+from studies.frame.compare import log_ratios, pooled, student
 from studies.frame.config import configured
 from studies.frame.run import Run, StudyConfig, main, open_run
 from studies.lens_opt import __main__ as lens_opt
-from studies.lens_opt.comparison import DESIGNS, RIVALS, label
-from studies.lens_opt.paired import log_ratios, of_differences, pooled, verdict
+from studies.lens_opt.comparison import DESIGNS, RIVALS, label, verdict
 
 COMPARED = ("refocused", "spots", "edge")
 
@@ -40,20 +40,12 @@ def study(run: Run[Config]):
     for rival in COMPARED:
         logs = torch.stack([log_ratios(of["optimised"], of[rival]) for of in errors.values()])
         pairs[rival] = pooled(logs)
-        each = [of_differences(row).percent() for row in logs]
+        each = [student(row).percent() for row in logs]
         rows.append([RIVALS[rival], *each, pairs[rival].percent(), pairs[rival].outcome])
-        run.record(
-            **{
-                f"{rival}_log_ratio": pairs[rival].mean,
-                f"{rival}_seeds_better": int((logs.mean(1) < 0).sum()),
-            }
-        )
-        if pairs[rival].cases > 1:
-            run.record(
-                **{f"{rival}_log_ratio_low": pairs[rival].low, f"{rival}_log_ratio_high": pairs[rival].high}
-            )
+        run.record(**pairs[rival].metrics(f"{rival}_log_ratio"))
+        run.record(**{f"{rival}_seeds_better": int((logs.mean(1) < 0).sum())})
     after = torch.stack([log_ratios(of["after_spots"], of["spots"]) for of in errors.values()])
-    each = [of_differences(row).percent() for row in after]
+    each = [student(row).percent() for row in after]
     rows.append(
         [
             "flow steps after the spot designer, against it",
@@ -62,7 +54,7 @@ def study(run: Run[Config]):
             pooled(after).outcome,
         ]
     )
-    run.record(after_spots_log_ratio=pooled(after).mean, seeds=len(parts))
+    run.record(after_spots_log_ratio=pooled(after).value, seeds=len(parts))
     for rival in COMPARED:
         run.card(
             f"Against {RIVALS[rival]}", pairs[rival].percent(), "flow error of the flow design, all seeds"

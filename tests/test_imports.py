@@ -30,7 +30,7 @@ DOOR = "codesign"  # the package itself, which names its rooms and imports them 
 MITSUBA = {
     "codesign.render": "makes pictures with it",
     "scenes": "describe worlds to it",
-    "studies.render_quality": "compares with its sensors",
+    "studies.speed_error.frames": "compares with its sensors",
 }
 
 

@@ -117,12 +117,11 @@ def test_sources_name_extras_that_exist_and_no_other_package_is_imported_at_the_
         for path in (ROOT / top).rglob("*.py"):
             text = path.read_text()
             named |= set(re.findall(r'(?:optional|require)\(\s*[\w".]+,\s*"([\w-]+)",', text))
-            if path.parent.name not in ("lens_bench", "srm_bench"):  # studies of the extra "bench"
-                for node in ast.parse(text).body:
-                    if isinstance(node, ast.Import):
-                        modules |= {alias.name.split(".")[0] for alias in node.names}
-                    elif isinstance(node, ast.ImportFrom):
-                        modules.add((node.module or "").split(".")[0])
+            for node in ast.parse(text).body:
+                if isinstance(node, ast.Import):
+                    modules |= {alias.name.split(".")[0] for alias in node.names}
+                elif isinstance(node, ast.ImportFrom):
+                    modules.add((node.module or "").split(".")[0])
     assert named <= EXTRAS.keys()
     assert {"event-files", "video", "export", "training-logs"} <= named
     where = packages_distributions()

@@ -17,14 +17,8 @@ def strips(
         len(rows), len(rows[0]), figsize=(2.3 * len(rows[0]), 2.35 * len(rows)), squeeze=False
     )
     for r, (row, sign) in enumerate(zip(rows, signed, strict=True)):
-        top = max(float(np.quantile(np.abs(image), 0.99)) for image in row) or 1.0
         for c, (axis, image) in enumerate(zip(axes[r], row, strict=True)):
-            if sign:
-                axis.imshow(image, cmap="RdBu_r", vmin=-top, vmax=top)
-            else:
-                axis.imshow(np.clip(image / top, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
-            axis.set_xticks([])
-            axis.set_yticks([])
+            draw_image(axis, image, row, sign)
             if r == 0:
                 axis.set_title(titles[c], fontsize=9)
         axes[r, 0].set_ylabel(labels[r], fontsize=9)
@@ -32,21 +26,61 @@ def strips(
     return figure
 
 
+def draw_image(axis: Any, image: Any, of_scale: Sequence[Any], signed: bool = False) -> None:
+    """Draw an image [H, W] into an axis: grey with a display's gamma, or ``signed`` in red (above 0) and
+    blue.
+
+    Args:
+      of_scale: the images that share its scale, itself among them.
+      signed: whether zero is in the middle of the scale. An image [H, W, 3] is shown in its own colours, 0
+        to 1.
+    """
+    image = np.asarray(image)
+    top = max(float(np.quantile(np.abs(other), 0.99)) for other in of_scale) or 1.0
+    if image.ndim == 3:
+        axis.imshow(image)
+    elif signed:
+        axis.imshow(image, cmap="RdBu_r", vmin=-top, vmax=top)
+    else:
+        axis.imshow(np.clip(image / top, 0, 1) ** (1 / 2.2), cmap="gray", vmin=0, vmax=1)
+    axis.set_xticks([])
+    axis.set_yticks([])
+
+
 def curves(
     series: Mapping[str, tuple[Any, Any]], ylabel: str, xlabel: str = "step", logarithmic: bool = False
 ) -> Figure:
     """Figure of named curves: dict label -> (x, y)."""
     figure, axis = plt.subplots(figsize=(7, 3.4))
-    for label, (x, y) in series.items():
-        axis.plot(x, y, label=label, marker="o" if len(x) < 20 else None, ms=3, lw=1.4)
-    axis.set(xlabel=xlabel, ylabel=ylabel)
-    if logarithmic:
-        axis.set_yscale("log")
+    draw_curves(axis, series, xlabel, ylabel, "y" if logarithmic else "")
     if len(series) > 1:
         axis.legend(fontsize=8, ncols=2)
-    axis.grid(alpha=0.3)
     figure.tight_layout()
     return figure
+
+
+def draw_curves(
+    axis: Any,
+    series: Mapping[str, tuple[Any, Any]],
+    xlabel: str,
+    ylabel: str,
+    log: str = "",
+    levels: Sequence[float] = (),
+) -> None:
+    """Draw named curves, label -> (x, y), into an axis.
+
+    Args:
+      log: the axes that are logarithmic, of "xy".
+      levels: heights of dashed lines: what is asked, what is allowed.
+    """
+    for label, (x, y) in series.items():
+        axis.plot(x, y, label=label, marker="o" if len(x) < 20 else None, ms=3, lw=1.4)
+    for level in levels:
+        axis.axhline(level, color="firebrick", ls="--", lw=1)
+    axis.set(xlabel=xlabel, ylabel=ylabel)
+    axis.set_xscale("log" if "x" in log else "linear")
+    axis.set_yscale("log" if "y" in log else "linear")
+    axis.grid(alpha=0.3)
 
 
 def heat_map(values: Any, rows: Sequence[str], columns: Sequence[str], label: str) -> Figure:

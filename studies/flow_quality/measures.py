@@ -10,10 +10,10 @@ from scipy.stats import rankdata
 from codesign.flow.contrast import nearest_images, volume_tracks
 from codesign.flow.metrics import endpoint_error
 from codesign.types import EventVolume, FlowField, FlowWindows
+from studies.frame.compare import ratio_of_means
 
 SHARES = np.linspace(0, 0.95, 20)  # of the pixels left out of a sparsification curve
 HONEST_MEDIAN = np.log(2) ** 0.5  # of error over claimed deviation, when errors are Gaussian as claimed
-DRAWS = 2000  # of the bootstrap
 ELLIPSE = -2 * np.log(0.1)  # normalised square of two Gaussian errors that 90 % stay below
 MUCH = 1.05  # error over that of zero flow from which on a window is worse than by chance
 MARGIN_PX = 0.05  # windows without information give next to no flow, which loses by less every second time
@@ -87,13 +87,12 @@ def join(parts: Sequence[Rows]) -> Rows:
 def figures(rows: Rows) -> dict[str, float]:
     """Figures of a set by their names in metrics.json; those that are not defined are left out."""
     error, zero = rows["error_px"], rows["zero_px"]
-    pick = np.random.default_rng(0).integers(0, len(error), (DRAWS, len(error)))
-    low, high = np.quantile(error[pick].mean(1) / zero[pick].mean(1), (0.025, 0.975))
+    ratio = ratio_of_means(error, zero)
     ours, best = curves(rows)
     found = {
-        "ratio": error.mean() / zero.mean(),
-        "ratio_low": low,
-        "ratio_high": high,
+        "ratio": ratio.value,
+        "ratio_low": ratio.low,
+        "ratio_high": ratio.high,
         "aee_px": error.mean(),
         "worse_percent": 100 * (error > zero).mean(),
         "much_worse_percent": 100 * (error > MUCH * zero).mean(),

@@ -12,44 +12,13 @@ from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parents[1]
 GROUPS = {
-    "lens": (
-        "lens_report",
-        "lens_scratch",
-        "lens_tolerance",
-        "phase_plate",
-        "lens_files",
-        "lens_bench",
-        "benchmark",
-    ),
-    "render": (
-        "render_quality",
-        "psf_level",
-        "light_levels",
-        "make_dataset",
-    ),
-    "events": (
-        "video_to_events",
-        "event_bench",
-        "sensor_fit",
-        "spike_esim",
-        "srm_bench",
-    ),
-    "flow": (
-        "train_flow",
-        "flow_quality",
-        "flow_cost",
-        "flow_recording",
-    ),
+    "lens": ("lens_report", "lens_scratch", "lens_tolerance", "phase_plate", "lens_files"),
+    "render": ("make_dataset",),
+    "events": ("video_to_events", "sensor_fit", "spike_esim"),
+    "flow": ("train_flow", "flow_quality", "flow_recording"),
     "whole chain": (
-        "lens_opt",
-        "lens_opt_seeds",
-        "placement",
-        "velocity_head",
-        "placement_step",
-        "gradient_flow",
-        "speed_error",
-        "stability",
-        "chain_picture",
+        *("lens_opt", "lens_opt_seeds", "placement", "velocity_head"),
+        *("gradient_flow", "speed_error", "stability", "chain_picture"),
     ),
 }
 OTHERS = "others"  # where a study is listed that no group names

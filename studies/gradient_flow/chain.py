@@ -192,6 +192,22 @@ def loss_rows(seed):
     return certify(fn, params, scales=scales, ladder=(0.014, 0.01, 0.007, 0.005), tolerance=0.05)
 
 
+def plane_loss_rows():
+    """Endpoint error of the closed form on smooth counts of the analytic plane, whole chain in float64."""
+    plane = worlds.smooth_plane(3, pose.look_at((0, 0, 0), (0, -1, 0)))
+    t_s = torch.linspace(0, 0.05, 8, dtype=torch.float64)
+    path = trajectories.translation(pose.look_at((0.1, -2, 0.05), (0, 0, 0)), (0.4, 0.1, 0.2), t_s)
+
+    def loss(camera, twist):
+        moved = path @ twist
+        counts = events.soft_counts(render.frames(camera, plane, moved), 0.2, 0.2)
+        field = flow.estimate_lk(events.from_counts(counts, t_s, bins=5))
+        return flow.metrics.aee(field.flow_px, *render.true_flow(camera, plane, moved[[0, -1]]))
+
+    ladder = (3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)
+    return _camera_rows(loss, 24, 8, 0, 0.002, ladder=ladder, tolerance=1e-6)
+
+
 def hard_rows(seed, count):
     """Straight-through gradient against central differences of the hard loss.
 
@@ -332,6 +348,7 @@ JUNCTIONS = {
     "true flow, float64": (Asked({}, {"relative_error": 1e-5}), lambda seed: truth_rows()),
     "event counts, smooth": (Asked({}, {"relative_error": 1e-5}), lambda seed: count_rows(seed)),
     "flow estimate, float64": (Asked({}, {"relative_error": 1e-5}), lambda seed: flow_rows(seed)),
+    "final loss, plane, float64": (Asked({}, {"relative_error": 1e-6}), lambda seed: plane_loss_rows()),
     "final loss, smooth events": (
         Asked({"cosine": 0.99}, {"relative_error": 0.05}),
         lambda seed: loss_rows(seed),

@@ -18,12 +18,12 @@ from codesign.errors import DomainError, NonFiniteError
 from codesign.flow import checkpoint
 from codesign.lens.design import edge_thickness_mm
 from codesign.system import check
+from studies.frame.compare import log_ratio
 from studies.frame.run import Run, StudyConfig, main
 from studies.lens_opt import page as lens_opt_page
 from studies.lens_opt import rivals
 from studies.lens_opt.comparison import label
 from studies.lens_opt.descend import JUDGED, Job, development_error, prepare
-from studies.lens_opt.paired import paired
 from studies.lens_opt.task import HELD_OUT, LIGHT, draw_case, make_worlds
 
 
@@ -239,10 +239,8 @@ def _finish(run, course, lenses, seconds):
             }
         )
     for name, design, rival in pairs_of(lenses):
-        pair = paired(*([row["flow_error_mrad"] for row in found[n]] for n in (design, rival)))
-        run.record(**{f"log_ratio_{name}": pair.mean})
-        if pair.cases > 1:
-            run.record(**{f"log_ratio_{name}_low": pair.low, f"log_ratio_{name}_high": pair.high})
+        pair = log_ratio(*([row["flow_error_mrad"] for row in found[n]] for n in (design, rival)))
+        run.record(**pair.metrics(f"log_ratio_{name}"))
     blank = draw_case([lens_opt_page.blank_wall()], JUDGED, frames=17)
     for name in ("detuned", "optimised"):
         error = task.judge(lenses[name], blank, job.system.flow)["flow_error_mrad"]

@@ -1,10 +1,12 @@
 """The part of a lens_opt page that says who wins: cards, paired differences over all cases and by window, and what the
 rivals chose from."""
 
+from collections.abc import Mapping
+
 import matplotlib.pyplot as plt
 import numpy as np
 
-from studies.lens_opt.paired import paired
+from studies.frame.compare import Interval, log_ratio
 from studies.lens_opt.task import DISTANCE_M, FIELDS, PITCH_MM
 
 DESIGNS = {"flow": "the flow design", "edge": "the edge design"}
@@ -27,6 +29,31 @@ def label(name, objective):
     if name == "optimised":
         return DESIGNS[objective].removeprefix("the ")
     return LENSES.get(name) or RIVALS[name].removeprefix("the ")
+
+
+def verdict(design: str, rivals: Mapping[str, Interval]) -> str:
+    """One sentence that says first who wins: the rivals that do, those that tie, or the design where it beats all.
+
+    Args: design: what it is called, "the flow design". rivals: what each is called -> log ratio of the design over it.
+    """
+    said = []
+    for outcome, words in (("loses", ("wins", "win")), ("ties", ("ties", "tie"))):
+        found = {name: pair for name, pair in rivals.items() if pair.outcome == outcome}
+        if found:
+            several = len(found) > 1
+            said.append(
+                f"{' and '.join(found)} {words[several]}: the flow error of {design} against "
+                f"{'them' if several else 'it'} is {' and '.join(pair.percent() for pair in found.values())}"
+            )
+    if not said:
+        name, closest = max(rivals.items(), key=lambda item: item[1].value)
+        said.append(f"{design} wins: its flow error against its best rival, {name}, is {closest.percent()}")
+    cases = next(iter(rivals.values())).count
+    return f"{_capital('; '.join(said))} on {cases} unseen cases."
+
+
+def _capital(text):
+    return text[0].upper() + text[1:]
 
 
 def cards(run, pairs):
@@ -60,7 +87,7 @@ def who_wins(run, course, lenses, errors, complaints):
     rows = []
     for name in lenses:
         row = [label(name, objective), m[f"flow_error_mrad_hard_{name}"], m[f"rms_spot_um_{name}"]]
-        pair = None if name == "optimised" else paired(errors["optimised"], errors[name])
+        pair = None if name == "optimised" else log_ratio(errors["optimised"], errors[name])
         rows.append([*row, m[f"edge_below_floor_mm_{name}"], *_change(pair)])
     run.table(
         "Lenses on held-out cases",
@@ -77,7 +104,7 @@ def who_wins(run, course, lenses, errors, complaints):
         f"{PITCH_MM * 1e3:g} µm.",
     )
     if "after_spots" in lenses:
-        pair = paired(errors["after_spots"], errors["spots"])
+        pair = log_ratio(errors["after_spots"], errors["spots"])
         run.text(
             f"{run.config.after_steps} steps of the flow objective from the spot designer's lens change its flow error "
             f"by {pair.percent()}: that {_JUDGED[pair.outcome]}."
@@ -87,7 +114,7 @@ def who_wins(run, course, lenses, errors, complaints):
     for h in FIELDS:
         key = f"flow_error_mrad_field_{h:g}"
         own = [row[key] for row in found["optimised"]]
-        changes = [paired(own, [row[key] for row in found[name]]).percent() for name in rivals]
+        changes = [log_ratio(own, [row[key] for row in found[name]]).percent() for name in rivals]
         rows.append([f"{h:g}", sum(own) / len(own), *changes])
     run.table(
         "Where: by window",
@@ -119,9 +146,11 @@ def _pair_figure(pairs, design):
     for at, (own, rival) in enumerate(pairs.values()):
         ratios = np.array(own) / np.array(rival)
         axis.plot(ratios, np.full(len(ratios), at), "o", color="#1b6ca8", alpha=0.35, ms=4)
-        pair = paired(own, rival)
-        low, mean, high = np.exp([pair.low if pair.cases > 1 else pair.mean, pair.mean, min(pair.high, 50.0)])
-        if pair.cases > 1:
+        pair = log_ratio(own, rival)
+        low, mean, high = np.exp(
+            [pair.low if pair.count > 1 else pair.value, pair.value, min(pair.high, 50.0)]
+        )
+        if pair.count > 1:
             axis.plot([low, high], [at, at], "-", color="#c0392b", lw=3)
         axis.plot([mean], [at], "|", color="#c0392b", ms=14, mew=3)
     axis.axvline(1.0, color="0.4", lw=1)

@@ -7,9 +7,9 @@ from codesign import events, render
 from codesign.errors import MissingPackageError
 from codesign.report import chain_figures, lens_figures
 from scenes import worlds
+from studies.frame.compare import log_ratio
 from studies.lens_opt import comparison
 from studies.lens_opt.comparison import DESIGNS, RIVALS, label
-from studies.lens_opt.paired import paired, verdict
 from studies.lens_opt.task import DISTANCE_M, FIELDS, PITCH_MM, SENSOR
 
 
@@ -25,8 +25,8 @@ def write(run, course, lenses, junctions):
     found = course.found
     design = DESIGNS[config.objective]
     errors = {name: [row["flow_error_mrad"] for row in rows] for name, rows in found.items()}
-    pairs = {name: paired(errors["optimised"], errors[name]) for name in RIVALS if name in lenses}
-    said = verdict(design, {RIVALS[name]: pair for name, pair in pairs.items()})
+    pairs = {name: log_ratio(errors["optimised"], errors[name]) for name in RIVALS if name in lenses}
+    said = comparison.verdict(design, {RIVALS[name]: pair for name, pair in pairs.items()})
     complaints = {v["complaint"] for rows in course.choices.values() for v in rows if v["complaint"]}
     comparison.cards(run, pairs)
     comparison.who_wins(run, course, lenses, errors, complaints)

@@ -23,6 +23,7 @@ from codesign import lens
 from codesign.errors import DomainError
 from codesign.lens.design.constraints import active
 from codesign.report import lens_figures
+from studies.frame.compare import share
 from studies.frame.run import Run, StudyConfig, main
 from studies.lens_scratch.search import ATTEMPTS, METHODS, Outcome, Search
 from studies.lens_scratch.task import JUDGED_FIELDS, judge, polychromatic_spots_um
@@ -125,14 +126,14 @@ def judge_outcome(outcome):
 def record_method(run, method, found):
     """Figures of one method into metrics.json."""
     wins = sum(o.succeeded for o, _ in found)
-    low, high = wilson(wins, len(found))
+    succeeded = share(wins, len(found))
     spots = sorted(v.mean_um for _, v in found if v is not None and math.isfinite(v.mean_um))
     run.record(
         **{
             f"{method}_seeds": len(found),
             f"{method}_seeds_succeeded": wins,
-            f"{method}_success_low": low,
-            f"{method}_success_high": high,
+            f"{method}_success_low": succeeded.low,
+            f"{method}_success_high": succeeded.high,
             f"{method}_seeds_succeeded_at_first_attempt": sum(
                 o.succeeded and o.attempts == 1 for o, _ in found
             ),
@@ -148,15 +149,6 @@ def record_method(run, method, found):
                 f"{method}_worst_mean_spot_um": spots[-1],
             }
         )
-
-
-def wilson(wins, count, z=1.96):
-    """95 % interval of a success rate. Source: Wilson, J. Am. Stat. Assoc. 22 (1927)."""
-    share = wins / count
-    spread = z * z / count
-    centre = (share + spread / 2) / (1 + spread)
-    half = z * math.sqrt(share * (1 - share) / count + spread / (4 * count)) / (1 + spread)
-    return max(0.0, centre - half), min(1.0, centre + half)
 
 
 def show(run, published, found):

@@ -33,8 +33,8 @@ from scenes.dataset_motion import FAMILIES, LEAD_S, motion
 from scenes.stages import make_world
 from scenes.trajectories import times
 from scenes.tum import write_tum
+from studies.frame.bench import resident_mb as resident_mb_now
 from studies.frame.run import Run, StudyConfig, main
-from studies.frame.timing import resident_mb as resident_mb_now
 from studies.make_dataset import page as pages
 from studies.make_dataset import store
 from studies.make_dataset.segments import Segments

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from codesign.mount.pose import NAMES
+from studies.frame.compare import median_ratio, ratio_of_means
 from studies.placement.problem import Problem
 from studies.placement.race import GRADIENT, Race
 
@@ -37,27 +38,16 @@ class Paired:
 
 def paired(ours: Tensor, theirs: Tensor) -> Paired:
     """Of errors [seeds] each."""
-    ratio = ours / theirs
-    low, high = _interval(ratio[_resampled(len(ratio))].quantile(0.5, 1))
-    return Paired(float(ratio.quantile(0.5)), low, high, int((ratio < 1).sum()), len(ratio))
+    found = median_ratio(ours, theirs, level=INTERVAL, draws=RESAMPLED)
+    return Paired(found.value, found.low, found.high, int((ours < theirs).sum()), found.count)
 
 
 def over_worlds(ours: Tensor, theirs: Tensor, worlds: int) -> tuple[float, float, float]:
     """Ratio of mean errors [N], world after world, ours over theirs; and its interval over resampled
     worlds."""
-    means = torch.stack([ours, theirs]).unflatten(1, (worlds, -1)).mean(2)
-    resampled = means[:, _resampled(worlds)].mean(2)
-    return float(means[0].mean() / means[1].mean()), *_interval(resampled[0] / resampled[1])
-
-
-def _resampled(count):
-    """[RESAMPLED, count] of the numbers below count, with repetition; the same at every call."""
-    return torch.randint(count, (RESAMPLED, count), generator=torch.Generator().manual_seed(0))
-
-
-def _interval(values):
-    ends = torch.tensor([(1 - INTERVAL) / 2, (1 + INTERVAL) / 2], dtype=values.dtype)
-    return torch.quantile(values, ends).tolist()
+    means = (errors.unflatten(0, (worlds, -1)).mean(1) for errors in (ours, theirs))
+    found = ratio_of_means(*means, level=INTERVAL, draws=RESAMPLED)
+    return found.value, found.low, found.high
 
 
 def standard_error(errors: Tensor, worlds: int) -> float:

@@ -10,7 +10,6 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from matplotlib.figure import Figure
-from scipy.stats import t as student
 from torch import nn
 
 from codesign import events
@@ -18,6 +17,7 @@ from codesign.errors import DomainError
 from codesign.events import SensorModel, SpikeEsim, TwoBranchSpikes
 from codesign.types import EventStream
 from scenes.digits import CLASSES, LEG_S, WINDOW_PX, draw_pictures, frame_times, frames
+from studies.frame.compare import student
 from studies.spike_esim.train import Store, descend, objective
 
 TEST, CALIBRATION, TRAINING = 1, 2, 3  # each draws pictures, noise and weights of its own
@@ -199,13 +199,6 @@ def tall(pictures):
     return F.pad(pictures, (0, 0, 0, 1)).flatten(1, 2)
 
 
-def interval(values):
-    """Mean of [n] independent values, and Student's 95 % interval of it."""
-    mean, n = float(values.mean()), len(values)
-    half = float(values.std()) / math.sqrt(n) * float(student.ppf(0.975, n - 1))
-    return mean, mean - half, mean + half
-
-
 def study(run):
     """Train on every source with every seed, test on the physical sensor, write the page."""
     config = run.config
@@ -278,27 +271,25 @@ def best_thresholds(run, store):
 
 def show(run, sources, accuracy, tiles):
     """Tables of accuracies and of what was asked, and a picture of every source's events."""
-    means = {key: interval(values) for key, values in accuracy.items()}
-    gains = {(a, b): interval(accuracy[a] - accuracy[b]) for a, b in ASKED}
-    order = sorted(sources, key=lambda key: -means[key][0])
-    for name, values in {**means, **{f"{a}_over_{b}": gain for (a, b), gain in gains.items()}}.items():
-        run.record(
-            **{f"{name}_{end}": value for end, value in zip(("mean", "low", "high"), values, strict=True)}
-        )
+    means = {key: student(values) for key, values in accuracy.items()}
+    gains = {(a, b): student(accuracy[a] - accuracy[b]) for a, b in ASKED}
+    order = sorted(sources, key=lambda key: -means[key].value)
+    for name, mean in {**means, **{f"{a}_over_{b}": gain for (a, b), gain in gains.items()}}.items():
+        run.record(**{f"{name}_mean": mean.value, f"{name}_low": mean.low, f"{name}_high": mean.high})
     now = run.metrics
     columns = ("trained on events of", "physical events, %", "its own events, %", "events per picture")
     rows = []
     for key in order:
         own, number = 100 * now[f"{key}_own_events_accuracy"], now[f"{key}_events_per_picture"]
-        rows.append((sources[key].label, "{:.1%} ({:.1%} to {:.1%})".format(*means[key]), own, number))
+        rows.append((sources[key].label, f"{means[key]:.1%}", own, number))
     run.table(
         "Accuracy",
         columns,
         rows,
         f"95 % intervals over {run.config.seeds} seeds; chance is {1 / CLASSES:.0%}.",
     )
-    rows = [(f"{sources[a].label} over {sources[b].label}", "{:+.1%} ({:+.1%} to {:+.1%})".format(*gain),
-             "met" if gain[0] >= 0 else "missed") for (a, b), gain in gains.items()]  # fmt: skip
+    rows = [(f"{sources[a].label} over {sources[b].label}", f"{gain:+.1%}",
+             "met" if gain.value >= 0 else "missed") for (a, b), gain in gains.items()]  # fmt: skip
     run.table("What was asked", ("gain in accuracy", "paired over seeds", "first at least second"), rows)
     figure = Figure(figsize=(CLASSES + 2.2, len(order)), layout="constrained")
     for row, key in zip(figure.subplots(len(order), CLASSES), order, strict=True):
@@ -312,7 +303,7 @@ def show(run, sources, accuracy, tiles):
             axis.set(xticks=[], yticks=[])
         row[0].set_ylabel(sources[key].label, rotation=0, ha="right", va="center", fontsize=9)
     run.figure(figure, "events", f"Signed counts of the first {LEG_S:g} s. Red: more ON, blue: more OFF.")
-    best = ", ".join(f"{sources[key].label} {means[key][0]:.1%}" for key in order[:4])
+    best = ", ".join(f"{sources[key].label} {means[key].value:.1%}" for key in order[:4])
     run.finish(
         "Emulated events for a real sensor's classifier", f"Accuracy on a physical sensor's events: {best}."
     )

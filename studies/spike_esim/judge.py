@@ -5,6 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from codesign import events
+from studies.frame.compare import ratio_of_means
 
 TAU_S = 0.01  # of the van Rossum distance, as in the thesis
 BIN_S = 0.01  # of rates over time
@@ -26,8 +27,8 @@ def judge(pairs, resamples, seed):
     medians = [[median_filtered(counts, dt_s) for counts in side] for side in (found, target)]
     power = [sum(flicker(counts, dt_s) for counts in side) for side in (found, target)]
     return {
-        **{f"loss{end}": value for end, value in zip(("", "_low", "_high"), loss, strict=True)},
-        **{f"rate_ratio{end}": value for end, value in zip(("", "_low", "_high"), rate, strict=True)},
+        **loss.metrics("loss"),
+        **rate.metrics("rate_ratio"),
         "rate_correlation": correlation(*([binned(x, dt_s) for x in side] for side in (found, target))),
         "cell_correlation": correlation(*cells),
         "patch_correlation": patch_correlation(*cells, torch.Generator().manual_seed(seed)),
@@ -44,17 +45,9 @@ def distance(pairs):
 
 
 def intervals(pairs, resamples, seed):
-    """``distance``, and events over the target's: (value, low, high) each, 95 %, blocks of pixels drawn
-    again."""
-    sums = block_sums(pairs)
-    generator = torch.Generator().manual_seed(seed)
-    chosen = torch.randint(sums.shape[1], (resamples, sums.shape[1]), generator=generator)
-    found, silence, made, wanted = torch.cat((sums.sum(1, keepdim=True), sums[:, chosen].sum(2)), 1)
-    ends = torch.tensor([0.025, 0.975], dtype=sums.dtype)
-    return [
-        (float(share[0]), *torch.quantile(share[1:], ends).tolist())
-        for share in (found / silence, made / wanted)
-    ]
+    """``distance``, and events over the target's: Interval each, 95 %, blocks of pixels drawn again."""
+    found, silence, made, wanted = block_sums(pairs)
+    return [ratio_of_means(*pair, draws=resamples, seed=seed) for pair in ((found, silence), (made, wanted))]
 
 
 def block_sums(pairs):

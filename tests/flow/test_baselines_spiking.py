@@ -13,7 +13,6 @@ from codesign.flow.baselines.parts import count_weights
 from codesign.flow.entry import normalise
 from codesign.flow.losses import photometric_loss, smoothness_loss
 from codesign.types import EventStream, EventVolume
-from studies.flow_cost.steps import StepByStep
 
 D = torch.float64
 THETA = 0.75
@@ -254,14 +253,6 @@ def test_no_sample_is_skipped_for_having_few_events():
     torch.testing.assert_close(
         gradient([0, 1, 2, 3]), sum(alone[1:], alone[0]), rtol=1e-9, atol=1e-9
     )  # every sample counts, in full
-
-
-def test_the_step_by_step_form_of_the_cost_study_gives_the_same_flow():
-    fast = SpikeFlowNet(bins=8, width=8.0).double()
-    slow = StepByStep(bins=8, width=8.0).double()
-    volume = as_volume(busy(2, mean=0.6))
-    with torch.no_grad():
-        torch.testing.assert_close(slow(volume).flow_px, fast(volume).flow_px, rtol=1e-10, atol=1e-10)
 
 
 def test_the_published_loss_reaches_the_decoder_with_its_true_gradient(generator):

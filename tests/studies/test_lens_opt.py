@@ -3,21 +3,21 @@
 import html
 import json
 import math
-from statistics import stdev
 from types import SimpleNamespace
 
 import pytest
 import torch
 
 from codesign import events, flow, lens
-from codesign.errors import DomainError, ShapeError
+from codesign.errors import DomainError
 from codesign.lens.analysis import polychromatic_spot, spot_radius_mm
 from codesign.lens.design import edge_thickness_mm
+from studies.frame.compare import log_ratio
 from studies.frame.config import configured
 from studies.frame.run import main
 from studies.lens_opt import __main__ as lens_opt
 from studies.lens_opt import rivals
-from studies.lens_opt.paired import of_differences, paired, pooled, verdict
+from studies.lens_opt.comparison import verdict
 from studies.lens_opt.spots import spot_rays
 from studies.lens_opt.stages import estimator, weights_of
 from studies.lens_opt.task import DISTANCE_M, LIGHT, PITCH_MM, LensTask, make_task
@@ -122,34 +122,6 @@ def test_what_was_judged_before_a_kill_is_not_judged_again(tmp_path, monkeypatch
     assert last - 1 not in asked
 
 
-def test_paired_differences_of_a_made_up_table():
-    logs = [-0.2, -0.1, 0.0, 0.1]
-    rival = [0.5, 3.0, 0.7, 1.1]
-    pair = paired([r * math.exp(x) for r, x in zip(rival, logs, strict=True)], rival)
-    half = 3.182446 * stdev(logs) / 2  # Student's t, three degrees of freedom, two-sided 95 %
-    assert (pair.mean, pair.low, pair.high) == pytest.approx((-0.05, -0.05 - half, -0.05 + half), rel=1e-6)
-    assert pair.cases == 4
-    assert pair.outcome == "ties"
-    assert paired([1.0, 1.1], [2.0, 2.2]).outcome == "wins"
-    assert paired([1.0], [2.0]).percent() == "-50.0 % (-100.0 to inf %)"  # one case says nothing
-    with pytest.raises(ShapeError, match="1 and 2 errors"):
-        paired([1.0], [1.0, 2.0])
-    with pytest.raises(DomainError, match="above 0"):
-        paired([0.0], [1.0])
-
-
-def test_the_pooled_interval_is_the_wider_of_cases_and_seeds():
-    over_seeds = torch.tensor(
-        [[0.3, 0.3, 0.3], [-0.1, -0.1, -0.1]], dtype=torch.float64
-    )  # seeds alone differ
-    half = 12.7062 * stdev([0.3, -0.1]) / math.sqrt(2)  # one degree of freedom
-    pair = pooled(over_seeds)
-    assert (pair.mean, pair.high - pair.mean, pair.cases) == pytest.approx((0.1, half, 3), rel=1e-5)
-    over_cases = over_seeds.T
-    assert pooled(over_cases).high - 0.1 == pytest.approx(half, rel=1e-5)
-    assert pooled(over_seeds[:1]) == of_differences(over_seeds[0])
-
-
 @pytest.mark.parametrize(
     ("flow_mrad", "first_words"),
     [
@@ -163,7 +135,7 @@ def test_the_pooled_interval_is_the_wider_of_cases_and_seeds():
 )
 def test_the_first_words_say_who_wins(flow_mrad, first_words):
     rivals_mrad = {"the spot designer": [0.5, 0.51, 0.49], "refocusing alone": [0.8, 0.82, 0.79]}
-    said = verdict("the flow design", {name: paired(flow_mrad, row) for name, row in rivals_mrad.items()})
+    said = verdict("the flow design", {name: log_ratio(flow_mrad, row) for name, row in rivals_mrad.items()})
     assert said.startswith(first_words)
     assert said.endswith("3 unseen cases.")
 
@@ -175,7 +147,7 @@ def test_several_rivals_that_win_or_tie_are_all_named_those_that_win_first():
         "the spot designer": [0.5, 0.51, 0.49],
         "the edge": flow_mrad,
     }
-    said = verdict("the flow design", {name: paired(flow_mrad, row) for name, row in rows.items()})
+    said = verdict("the flow design", {name: log_ratio(flow_mrad, row) for name, row in rows.items()})
     assert said.startswith("The spot designer wins: the flow error of the flow design against it is +20")
     assert "; refocusing alone and the edge tie: the flow error of the flow design against them is +0" in said
     assert said.endswith("and +0.0 % (+0.0 to +0.0 %) on 3 unseen cases.")

@@ -327,13 +327,6 @@ def test_a_trivially_separable_set_is_learnt_completely_and_training_repeats_fro
     assert not torch.equal(weights[0], weights[2])
 
 
-def test_intervals_are_those_worked_out_by_hand():
-    mean, low, high = classes.interval(torch.tensor([0.8, 0.9, 1.0], dtype=D))
-    # deviation 0.1, Student's 97.5 % point for 2 degrees of freedom 4.30265
-    half = 4.30265 * 0.1 / math.sqrt(3)
-    assert (low, mean, high) == pytest.approx((0.9 - half, 0.9, 0.9 + half), rel=1e-5)
-
-
 @pytest.mark.bits
 def test_the_network_of_the_thesis_sees_each_picture_alone():
     t_s = frame_times(50.0)

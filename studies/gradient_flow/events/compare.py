@@ -14,6 +14,7 @@ from torch import Generator, Tensor
 
 from codesign import events
 from codesign.events.sensor.state import begin
+from studies.frame.compare import bootstrap
 from studies.gradient_flow.events.case import SECTIONS, Case, Direction, times
 from studies.gradient_flow.topic import Row
 
@@ -166,20 +167,17 @@ def row(names: Sequence[object], found: Sequence[Pair], seed: int = 0) -> Row:
     interval of 90 % of the cosine over draws of cases and blocks."""
     slope = torch.cat([one.slope for one in found], 1)
     difference = torch.cat([one.difference for one in found], 1)
-    products = torch.stack(
-        [(slope * difference).sum(0), (slope**2).sum(0), (difference**2).sum(0)]
-    )  # [3, units]
-    units = products.shape[1]
-    drawn = torch.randint(units, (RESAMPLES, units), generator=torch.Generator().manual_seed(seed))
-    low, high = _cosine(products[:, drawn].sum(-1)).quantile(torch.tensor([0.05, 0.95], dtype=torch.float64))
+    # [3, units]
+    products = torch.stack([(slope * difference).sum(0), (slope**2).sum(0), (difference**2).sum(0)])
+    cosine = bootstrap(lambda x: _cosine(x.sum(-1)), products, level=0.9, draws=RESAMPLES, seed=seed)
     whole = products.sum(1)
     return Row(
         tuple(str(name) for name in names),
         {
-            "cosine": float(_cosine(whole)),
+            "cosine": cosine.value,
             "scale": float(whole[0] / whole[2]),
-            "cosine_low": float(low),
-            "cosine_high": float(high),
+            "cosine_low": cosine.low,
+            "cosine_high": cosine.high,
         },
     )
 

@@ -1,4 +1,9 @@
-"""The fidelity levels of every stage on one small scene: a camera that passes a textured wall."""
+"""Stage "levels": every stage's cheaper and finer levels on one small scene, a camera that passes a
+textured wall, and the cheapest that is good enough.
+
+Lens (pinhole, thin, traced), samples per pixel, scene (bitmap, analytic), event layers and frame rates,
+time bins, flow models. A level's error is measured against the finest level or against the truth.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,7 +13,13 @@ from typing import Any
 import torch
 
 from codesign import events, flow, lens, pose, render
+from codesign.errors import DomainError
 from scenes import textures, trajectories, worlds
+from studies.frame.bench import measure
+from studies.frame.run import Run
+from studies.frame.show import Panel, panels, table
+from studies.frame.sweep import metrics, plain, select, sweep
+from studies.speed_error import Config
 
 DURATION_S = 0.1
 THETA = 0.2
@@ -29,9 +40,9 @@ class Level:
 
 
 @dataclass(frozen=True)
-class Stage:
-    """Levels from cheap to fine, the error of what a level returns, what that error measures, and how much of
-    it is tolerated."""
+class Part:
+    """A stage of the chain: levels from cheap to fine, the error of what a level returns, what that error
+    measures, and how much of it is tolerated."""
 
     name: str
     levels: tuple[Level, ...]
@@ -106,8 +117,61 @@ class Setup:
         return render.true_flow(self.camera(lens.load("cooke-triplet").freeze(), 1), self.wall, ends)[0]
 
 
-def stages(setup):
-    """All stages with their levels."""
+def stage(run: Run[Config]) -> str:
+    """Time against error of every level, and the choice."""
+    setup = Setup(32 if run.config.quick else 64, run.config.seed)
+    found = {part.name: part for part in parts(setup)}
+
+    def cell(part):
+        rows = []
+        for level in part.levels:
+            error = part.error(level.work())
+            timing = measure(level.work, run.config.repeats, warm=1)
+            rows.append({"level": level.name, "cpu_s": timing.cpu, "wall_s": timing.wall, "error": error})
+        return rows
+
+    rows = sweep(run, cell, "levels", part=found)
+    lines = []
+    for name, part in found.items():
+        levels = select(rows, part=name)
+        best, enough = cheapest(levels, part.tolerance)
+        run.record(**metrics(levels, "part", "level"))
+        run.record(**metrics([{**best, "within_tolerance": int(enough)}], "part", prefix="chosen"))
+        verdict = (
+            f"**{best['level']}** is the cheapest level with an error of at most {part.tolerance:g}"
+            if enough
+            else f"no level stays within {part.tolerance:g}; **{best['level']}** comes closest"
+        )
+        lines.append(f"{name}: {verdict} ({best['error']:.2g}, {1e3 * best['cpu_s']:.3g} CPU-ms).")
+        run.text(lines[-1])
+        floor = min([part.tolerance, *(row["error"] for row in levels if row["error"] > 0)]) / 5
+        points = {row["level"]: ([1e3 * row["cpu_s"]], [max(row["error"], floor)]) for row in levels}
+        chart = Panel(points, "processor time, ms (median)", "error", "xy", [part.tolerance])
+        run.figure(
+            panels(chart, width=7),
+            f"speed_error_{plain(name)}",
+            f"Error: {part.measure}. Dashed: the tolerance. A level without error stands at the bottom.",
+        )
+        run.table("", *table(levels, level="level", cpu_s="CPU-s", wall_s="wall s", error="error"))
+    return " ".join(lines)
+
+
+def cheapest(levels: list[dict[str, Any]], tolerance: float) -> tuple[dict[str, Any], bool]:
+    """The level of least processor time whose error is within ``tolerance``; where none is, the one of
+    least error.
+
+    Returns: the level, and whether it is within the tolerance. Raises: DomainError when there is no level.
+    """
+    if not levels:
+        raise DomainError("there is no level to choose from; give at least one.")
+    enough = [level for level in levels if level["error"] <= tolerance]
+    if enough:
+        return min(enough, key=lambda level: level["cpu_s"]), True
+    return min(levels, key=lambda level: level["error"]), False
+
+
+def parts(setup: Setup) -> list["Part"]:
+    """All stages of the chain with their levels."""
     return [_lens(setup), _samples(setup), _scene(setup), _events(setup), _bins(setup), _flow(setup)]
 
 
@@ -125,7 +189,7 @@ def _lens(setup):
         "traced": setup.lens,
     }
     levels = tuple(Level(name, lambda o=o: setup.frames(60, o, 16)) for name, o in optics.items())
-    return Stage(
+    return Part(
         "lens",
         levels,
         _contrast_error(levels[-1].work()),
@@ -138,7 +202,7 @@ def _samples(setup):
     levels = tuple(
         Level(f"{n} samples", lambda n=n: setup.frames(60, samples=n)) for n in (1, 2, 4, 8, 16, 32, 64)
     )
-    return Stage(
+    return Part(
         "sampling",
         levels,
         _contrast_error(setup.frames(60, samples=256)),
@@ -156,7 +220,7 @@ def _scene(setup):
     levels = tuple(
         Level(name, lambda world=world: setup.frames(60, world=world)) for name, world in made.items()
     )
-    return Stage(
+    return Part(
         "scene",
         levels,
         _contrast_error(levels[-1].work()),
@@ -177,7 +241,7 @@ def _events(setup):
         for name, layer in layers.items()
         for rate in RATES_HZ
     )
-    return Stage(
+    return Part(
         "events",
         levels,
         lambda found: float((found - truth).abs().sum() / truth.sum()),
@@ -196,7 +260,7 @@ def _volume(setup, bins):
 
 def _bins(setup):
     levels = tuple(Level(f"{n} bins", lambda n=n: flow.estimate_lk(_volume(setup, n))) for n in range(2, 10))
-    return Stage(
+    return Part(
         "time bins", levels, _flow_error(setup), "endpoint error of affine flow from hard events, px", 0.5
     )
 
@@ -212,4 +276,4 @@ def _flow(setup):
         )
         for model, blur in chosen
     )
-    return Stage("flow", levels, _flow_error(setup), "endpoint error from hard events in 5 bins, px", 0.5)
+    return Part("flow", levels, _flow_error(setup), "endpoint error from hard events in 5 bins, px", 0.5)

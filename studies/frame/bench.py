@@ -1,0 +1,214 @@
+"""What something costs: seconds by the clock and of the processor, memory, and functions in processes of
+their own.
+
+    timing = measure(lambda: trace(rays), repeats=7)
+    f"{1e3 * timing.cpu:.1f} ms of processor time, {1e3 * timing.wall:.1f} by the clock"
+
+    turns({"ours": ours, "peer": peer}, rounds=5)   # a change of the machine's load meets both
+    apart(cost_of_tracing, "float32", 1_000_000)    # a fresh process: its memory is the function's alone
+
+Processor time is what to judge by on a shared machine, the median what to judge by at all.
+"""
+
+import contextlib
+import importlib
+import importlib.util
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from codesign.errors import CodesignError
+
+Key = TypeVar("Key")
+RUNNING: set[subprocess.Popen] = set()
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of every repeat, in order: by the clock, and of the process's threads together."""
+
+    wall_s: tuple[float, ...]
+    cpu_s: tuple[float, ...]
+
+    @property
+    def wall(self) -> float:
+        return statistics.median(self.wall_s)
+
+    @property
+    def cpu(self) -> float:
+        return statistics.median(self.cpu_s)
+
+    @property
+    def wall_iqr(self) -> float:
+        """Difference of the upper and lower quartile of the wall-clock seconds."""
+        lower, _, upper = statistics.quantiles(self.wall_s, n=4, method="inclusive")
+        return upper - lower
+
+    def __add__(self, other: "Timing") -> "Timing":
+        """The repeats of both."""
+        return Timing(self.wall_s + other.wall_s, self.cpu_s + other.cpu_s)
+
+    def metrics(self, name: str) -> dict[str, float]:
+        """What ``Run.record`` takes: <name>_wall_s, <name>_wall_iqr_s, <name>_cpu_s."""
+        return {f"{name}_wall_s": self.wall, f"{name}_wall_iqr_s": self.wall_iqr, f"{name}_cpu_s": self.cpu}
+
+
+def measure(
+    function: Callable[[], object],
+    repeats: int,
+    warm: int = 2,
+    after_each: Callable[[], object] | None = None,
+) -> Timing:
+    """Times of a function.
+
+    Args:
+      function: what is timed; its result is dropped before the next call.
+      repeats: timed calls.
+      warm: untimed calls before them.
+      after_each: called, untimed, after every timed call.
+    """
+    for _ in range(warm):
+        function()
+    walls = []
+    cpus = []
+    for _ in range(repeats):
+        wall = time.perf_counter()
+        cpu = time.process_time()
+        function()
+        walls.append(time.perf_counter() - wall)
+        cpus.append(time.process_time() - cpu)
+        if after_each:
+            after_each()
+    return Timing(tuple(walls), tuple(cpus))
+
+
+def turns(
+    works: Mapping[Key, Callable[[], object]],
+    rounds: int,
+    repeats: int = 1,
+    warm: int = 1,
+    after_each: Callable[[], object] | None = None,
+) -> dict[Key, Timing]:
+    """Times of several functions, each ``repeats`` times in every round, so that what else the machine does
+    meets all.
+
+    Args:
+      works: what is timed, by name.
+      rounds: turns of each.
+      repeats: timed calls of a turn.
+      warm: untimed calls before each turn; one more before the first, which compiles.
+      after_each: called after every turn of every function.
+    """
+    found: dict[Key, Timing] = {}
+    for number in range(rounds):
+        for name, work in works.items():
+            timing = measure(work, repeats, warm if number else warm + 1)
+            found[name] = found[name] + timing if name in found else timing
+            if after_each:
+                after_each()
+    return found
+
+
+def installed(peers: Mapping[str, str]) -> list[str]:
+    """Those of the peers (name -> package it needs) that are installed."""
+    return [name for name, package in peers.items() if importlib.util.find_spec(package)]
+
+
+def apart(
+    function: Callable[..., Any],
+    *arguments: Any,
+    environment: Mapping[str, str] | None = None,
+    **keywords: Any,
+) -> Any:
+    """What a function returns in a fresh process; what it prints there goes nowhere.
+
+    Args:
+      function: of the top level of a module.
+      arguments, keywords: plain values, as JSON keeps them; so is what it returns.
+      environment: variables that the process has besides those of this one.
+    Raises: CodesignError with the last line of its stderr when the process fails.
+    """
+    name = f"{function.__module__}:{function.__qualname__}"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "studies.frame.bench", name, json.dumps([arguments, keywords])],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **(environment or {})},
+        # Ctrl-C is for the one who waits, which ends this process where it must
+        start_new_session=True,
+    )
+    RUNNING.add(process)
+    try:
+        said, complaint = process.communicate()
+    except BaseException:
+        process.kill()
+        process.communicate()
+        raise
+    finally:
+        RUNNING.discard(process)
+    if process.returncode:
+        last = (complaint.strip().splitlines() or ["no word"])[-1][:300]
+        given = ", ".join(map(str, (*arguments, *keywords.values())))
+        raise CodesignError(f"{function.__name__}({given}) ended with code {process.returncode}: {last}")
+    return json.loads(said)
+
+
+def end_running() -> None:
+    """End the processes that ``apart`` started, in other threads, and waits for."""
+    for process in list(RUNNING):
+        process.kill()
+
+
+def resident_mb() -> float:
+    """Memory of the process that is in use now, MB; its largest so far where the system does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+    except OSError:
+        return _largest_mb()
+
+
+def peak_mb(function: Callable[[], object]) -> float:
+    """Largest memory during one call beyond what was in use before it, MB.
+
+    Where the system cannot start that count anew (not Linux), earlier peaks count too. Freed memory that the
+    process kept hides a peak: ask in a process of its own (``apart``).
+    """
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+    before = resident_mb()
+    result = function()
+    try:
+        line = next(x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("VmHWM"))
+        largest = int(line.split()[1]) * 1024 / 1e6
+    except (OSError, StopIteration):
+        largest = _largest_mb()
+    del result
+    return largest - before
+
+
+def _largest_mb():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+
+
+def _called(name, arguments, keywords):
+    """JSON of what the function with this name returns."""
+    import codesign  # noqa: F401  (first: it sets OpenMP's wait policy before torch is imported)
+
+    module, function = name.split(":")
+    with contextlib.redirect_stdout(sys.stderr):
+        found = getattr(importlib.import_module(module), function)(*arguments, **keywords)
+    return json.dumps(found)
+
+
+if __name__ == "__main__":
+    print(_called(sys.argv[1], *json.loads(sys.argv[2])))

@@ -1,0 +1,168 @@
+"""How sure a figure is: intervals of means, of shares, of anything that can be resampled, and of paired
+errors.
+
+    student(accuracies)                             # mean over seeds, Student's t
+    bootstrap(lambda x: x.median(-1).values, errors)    # any statistic of units that can be redrawn
+    ratio_of_means(ours, zero_flow)                 # same windows, redrawn together
+    log_ratio(ours, theirs).percent()               # "-3.1 % (-5.0 to -1.2 %)": paired cases
+    share(wins, count)                              # of successes
+
+Every interval prints as "value (low to high)", with a format of its own: f"{interval:.3f}".
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from scipy.stats import norm
+from scipy.stats import t as student_t
+from torch import Tensor
+
+from codesign.errors import DomainError, ShapeError
+
+LEVEL = 0.95
+DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A figure, the ends of its interval, and of how many units it is."""
+
+    value: float
+    low: float
+    high: float
+    count: int
+
+    def __format__(self, spec: str) -> str:
+        return f"{self.value:{spec}} ({self.low:{spec}} to {self.high:{spec}})"
+
+    def __str__(self) -> str:
+        return f"{self:.3g}"
+
+    def metrics(self, name: str) -> dict[str, float]:
+        """What ``Run.record`` takes: <name>, and <name>_low and <name>_high where there are ends."""
+        found = {name: self.value}
+        if math.isfinite(self.low) and math.isfinite(self.high):
+            found |= {f"{name}_low": self.low, f"{name}_high": self.high}
+        return found
+
+    @property
+    def outcome(self) -> str:
+        """Of a log ratio of errors: "wins" or "loses" (ours) where the interval leaves out 0, "ties"
+        otherwise."""
+        if self.high < 0:
+            return "wins"
+        return "loses" if self.low > 0 else "ties"
+
+    def percent(self) -> str:
+        """A log ratio as the change it is: "-3.1 % (-5.0 to -1.2 %)"."""
+        value, low, high = (
+            f"{100 * math.expm1(x):+.1f}" if x < 700 else "inf" for x in (self.value, self.low, self.high)
+        )
+        return f"{value} % ({low} to {high} %)"
+
+
+def student(values: Any, level: float = LEVEL) -> Interval:
+    """Mean of independent values [N], by Student's t; of a single one the interval is infinite.
+
+    Raises: ShapeError where there is no value.
+    """
+    values = _units(values)
+    count = len(values)
+    mean = float(values.mean())
+    if count == 1:
+        return Interval(mean, -math.inf, math.inf, 1)
+    half = float(student_t.ppf((1 + level) / 2, count - 1)) * float(values.std()) / math.sqrt(count)
+    return Interval(mean, mean - half, mean + half, count)
+
+
+def pooled(values: Any, level: float = LEVEL) -> Interval:
+    """Mean of values [seeds, cases], the same cases for every seed.
+
+    The interval is the wider of two: over cases, each averaged over the seeds (other cases, these seeds),
+    and over seeds, each averaged over its cases (these cases, other seeds). Of a single seed it is that
+    over its cases.
+    """
+    values = torch.as_tensor(values, dtype=torch.float64)
+    if len(values) == 1:
+        return student(values[0], level)
+    both = (student(values.mean(0), level), student(values.mean(1), level))
+    return replace(max(both, key=lambda interval: interval.high - interval.low), count=values.shape[1])
+
+
+def bootstrap(
+    statistic: Callable[..., Tensor],
+    *samples: Any,
+    level: float = LEVEL,
+    draws: int = DRAWS,
+    seed: int = 0,
+) -> Interval:
+    """A statistic of units, and its percentile interval when they are redrawn.
+
+    Args:
+      statistic: takes every sample as a float64 tensor and reduces its last dimension; called once with the
+        units [..., N] and once with all draws [..., draws, N].
+      samples: arrays whose last dimension counts the N units, which are redrawn together (paired).
+      level: share of the draws between the ends.
+      draws: number of draws.
+      seed: of the draws.
+    Raises: ShapeError where samples differ in their number of units or have none.
+    """
+    units = [_units(sample) for sample in samples]
+    count = units[0].shape[-1]
+    if any(sample.shape[-1] != count for sample in units):
+        raise ShapeError(
+            f"{', '.join(str(sample.shape[-1]) for sample in units)} units; paired samples have one each "
+            "of all."
+        )
+    picked = torch.randint(count, (draws, count), generator=torch.Generator().manual_seed(seed))
+    drawn = statistic(*(sample[..., picked] for sample in units))
+    ends = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
+    low, high = torch.quantile(drawn.double(), ends).tolist()
+    return Interval(float(statistic(*units)), low, high, count)
+
+
+def ratio_of_means(ours: Any, theirs: Any, **how: Any) -> Interval:
+    """Mean of ours [N] over that of theirs, over the same units; ``how`` as of ``bootstrap``."""
+    return bootstrap(lambda a, b: a.mean(-1) / b.mean(-1), ours, theirs, **how)
+
+
+def median_ratio(ours: Any, theirs: Any, **how: Any) -> Interval:
+    """Median of the ratios of ours [N] to theirs, pair by pair; ``how`` as of ``bootstrap``."""
+    return bootstrap(lambda a, b: (a / b).quantile(0.5, -1), ours, theirs, **how)
+
+
+def log_ratios(ours: Sequence[float], theirs: Sequence[float]) -> Tensor:
+    """Log ratio of errors > 0, case by case, [N] float64.
+
+    Raises: ShapeError for rows of different lengths or none; DomainError for errors that are not above 0.
+    """
+    if len(ours) != len(theirs) or not len(ours):
+        raise ShapeError(f"{len(ours)} and {len(theirs)} errors; pairs need one of each per case.")
+    if not all(0 < e < math.inf for e in (*ours, *theirs)):
+        raise DomainError("errors must be finite and above 0, since their log ratio is taken.")
+    return torch.tensor(ours, dtype=torch.float64).log() - torch.tensor(theirs, dtype=torch.float64).log()
+
+
+def log_ratio(ours: Sequence[float], theirs: Sequence[float], level: float = LEVEL) -> Interval:
+    """Mean log ratio of errors on the same cases, by Student's t; below 0 ours are smaller."""
+    return student(log_ratios(ours, theirs), level)
+
+
+def share(wins: int, count: int, level: float = LEVEL) -> Interval:
+    """Share of successes. Source: Wilson, J. Am. Stat. Assoc. 22 (1927)."""
+    z = float(norm.ppf((1 + level) / 2))
+    value = wins / count
+    spread = z * z / count
+    centre = (value + spread / 2) / (1 + spread)
+    half = z * math.sqrt(value * (1 - value) / count + spread / (4 * count)) / (1 + spread)
+    return Interval(value, max(0.0, centre - half), min(1.0, centre + half), count)
+
+
+def _units(values) -> Tensor:
+    tensor = torch.as_tensor(values, dtype=torch.float64)
+    if not tensor.ndim or not tensor.shape[-1]:
+        raise ShapeError(f"values of shape {list(tensor.shape)}; give a row of at least one.")
+    return tensor

@@ -1,0 +1,193 @@
+"""What a page shows of figures: tables out of long rows, what was asked beside what was found, charts,
+pictures.
+
+    run.table("Errors", *table(rows, method="method", error_px="error, px"))
+    run.table("Errors", *pivot(rows, down="lens", across="method", value="error_px"))
+    lead = asked(run, [Asked("speed over optiland", 22.0, least=10.0), Asked("memory, MB", 3.0, most=5.0)])
+    run.figure(panels(Panel({"ours": (x, y)}, "rays", "seconds", log="xy")), "growth", "Time against rays.")
+    run.figure(pictures({"room": {"traced": frame, "difference": off}}, signed=["difference"]), "room", "…")
+    run.figure(bars({"ours": 0.1, "peer": interval}, "seconds", log=True, level=0.05), "times", "…")
+
+Single charts (``curves``), image strips, heat maps and lens layouts: codesign.report.chain_figures,
+lens_layout.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
+
+from codesign.report.chain_figures import draw_curves, draw_image
+from studies.frame.compare import Interval
+from studies.frame.run import Run
+from studies.frame.sweep import plain
+
+COLOURS = ("#1b6ca8", "#c0392b", "#2e8b57", "#e08e0b", "#8e44ad", "#888888")
+Rows = Iterable[Mapping[str, Any]]
+Shown = tuple[tuple[str, ...], list[tuple[Any, ...]]]
+
+
+def table(rows: Rows, **titles: str) -> Shown:
+    """Columns and rows for ``Run.table``.
+
+    Args:
+      rows: figures by name; one that a row lacks shows as a dash.
+      titles: name -> title of its column, in their order; all names as they are when none is given.
+    """
+    rows = list(rows)
+    titles = titles or {name: name.replace("_", " ") for row in rows for name in row}
+    return tuple(titles.values()), [tuple(_cell(row.get(name)) for name in titles) for row in rows]
+
+
+def pivot(rows: Rows, down: str, across: str, value: str) -> Shown:
+    """The same for one figure, with a line per value of one axis and a column per value of another."""
+    rows = list(rows)
+    columns = list(dict.fromkeys(row[across] for row in rows))
+    lines: dict[Any, dict[Any, Any]] = {}
+    for row in rows:
+        lines.setdefault(row[down], {})[row[across]] = row[value]
+    return (down.replace("_", " "), *map(str, columns)), [
+        (name, *(_cell(line.get(column)) for column in columns)) for name, line in lines.items()
+    ]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A figure that something was asked of: at least, at most, or between both.
+
+    what: names it. value: what was found. beside: the same measured otherwise, for the reader.
+    """
+
+    what: str
+    value: float
+    least: float = -math.inf
+    most: float = math.inf
+    beside: float | None = None
+
+    @property
+    def met(self) -> bool:
+        return self.least <= self.value <= self.most
+
+    @property
+    def wanted(self) -> str:
+        ends = [f"≥ {self.least:.3g}"] * (self.least > -math.inf) + [f"≤ {self.most:.3g}"] * (
+            self.most < math.inf
+        )
+        return ", ".join(ends) or "–"
+
+
+def asked(run: Run, figures: Iterable[Asked], title: str = "Against what was asked", beside: str = "") -> str:
+    """Show figures beside what was asked of them, as cards and a table, and record them by their names.
+
+    Args:
+      beside: title of the column ``Asked.beside``; no such column when left out.
+    Returns: "All figures are met." or the sentence about those that are not, for the head of the page.
+    """
+    figures = list(figures)
+    for figure in figures:
+        run.record(**{plain(figure.what): figure.value})
+        if figure.beside is not None:
+            run.record(**{plain(figure.what, beside): figure.beside})
+        run.card(
+            figure.what, f"{figure.value:.3g}", f"asked: {figure.wanted}{'' if figure.met else ' (missed)'}"
+        )
+    columns = ("what", "found", *([beside] if beside else []), "asked", "met")
+    run.table(
+        title,
+        columns,
+        [
+            (f.what, f.value, *([f.beside] if beside else []), f.wanted, "yes" if f.met else "NO")
+            for f in figures
+        ],
+    )
+    missed = [f"{f.what} {f.value:.3g} ({f.wanted})" for f in figures if not f.met]
+    return f"**Missed in this run:** {'; '.join(missed)}." if missed else "All figures are met."
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One chart. series: label -> (x, y). log: axes that are logarithmic, of "xy". levels: heights of
+    dashed lines."""
+
+    series: Mapping[str, tuple[Any, Any]]
+    xlabel: str
+    ylabel: str
+    log: str = ""
+    levels: Sequence[float] = ()
+
+
+def panels(*charts: Panel, width: float = 4.5) -> Figure:
+    """Figure of charts beside one another; a legend for all stands below where there are several series."""
+    figure, axes = plt.subplots(
+        1, len(charts), figsize=(width * len(charts), 3.4), squeeze=False, layout="constrained"
+    )
+    for axis, chart in zip(axes[0], charts, strict=True):
+        draw_curves(axis, chart.series, chart.xlabel, chart.ylabel, chart.log, chart.levels)
+    if max(len(chart.series) for chart in charts) > 1:
+        handles = {
+            label: line
+            for axis in axes[0]
+            for line, label in zip(*axis.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(
+            list(handles.values()),
+            list(handles),
+            loc="outside lower center",
+            ncols=4,
+            frameon=False,
+            fontsize=8,
+        )
+    return figure
+
+
+def pictures(rows: Mapping[str, Mapping[str, Any]], signed: Iterable[str] = (), side: float = 2.3) -> Figure:
+    """Figure of pictures: row label -> column title -> [H, W] or, in colours of 0 to 1, [H, W, 3].
+
+    Grey pictures of a row share their scale, with a display's gamma; columns that are ``signed`` are red
+    above zero and blue below, on one scale per row. A picture that a row lacks leaves its place empty.
+    """
+    titles = list(dict.fromkeys(title for row in rows.values() for title in row))
+    figure, axes = plt.subplots(
+        len(rows),
+        len(titles),
+        figsize=(side * len(titles), side * len(rows)),
+        squeeze=False,
+        layout="constrained",
+    )
+    signed = set(signed)
+    for line, (label, row) in zip(axes, rows.items(), strict=True):
+        for axis, title in zip(line, titles, strict=True):
+            axis.set(xticks=[], yticks=[])
+            if title not in row:
+                axis.axis("off")
+                continue
+            of_scale = [image for other, image in row.items() if (other in signed) == (title in signed)]
+            draw_image(axis, row[title], of_scale, title in signed)
+            axis.set_title(title if line is axes[0] else "", fontsize=9)
+        line[0].set_ylabel(label, fontsize=9)
+    return figure
+
+
+def bars(
+    values: Mapping[str, float | Interval], xlabel: str, log: bool = False, level: float | None = None
+) -> Figure:
+    """Figure of horizontal bars, with whiskers where a value is an Interval; ``level`` is drawn as a red
+    line."""
+    figure, axis = plt.subplots(figsize=(7, 0.8 + 0.4 * len(values)), layout="constrained")
+    for at, value in enumerate(values.values()):
+        of = value if isinstance(value, Interval) else Interval(value, value, value, 1)
+        whiskers = [[of.value - of.low], [of.high - of.value]] if of.low < of.high else None
+        axis.barh(at, of.value, 0.65, xerr=whiskers, color=COLOURS[0], ecolor="0.3", capsize=3)
+    if level is not None:
+        axis.axvline(level, color="firebrick", linewidth=1)
+    axis.set_yticks(range(len(values)), list(values))
+    axis.set(xlabel=xlabel, xscale="log" if log else "linear")
+    axis.invert_yaxis()
+    return figure
+
+
+def _cell(value):
+    return str(value) if isinstance(value, Interval) else value

@@ -1,0 +1,164 @@
+"""Every case by every method, as one long table that an interrupted run goes on with.
+
+    def cell(lens, seed):
+        return {"error_px": ..., "cpu_s": ...}
+
+    rows = sweep(run, cell, lens=("cooke-triplet", "double-gauss"), seed=range(5))
+    rows[0]      # {"lens": "cooke-triplet", "seed": 0, "error_px": 0.31, "cpu_s": 2.0}
+    column(rows, "error_px", lens="double-gauss")      # [0.28, 0.33, ...] by seed
+
+The table stands in the run's folder, a line of JSON a cell, written as soon as its figures are there.
+"""
+
+import itertools
+import json
+import re
+from collections.abc import Callable, Generator, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed, wait
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from codesign.errors import DomainError, FileFormatError
+from studies.frame import bench
+from studies.frame.run import Run
+
+Row = dict[str, Any]
+
+
+def sweep(
+    run: Run,
+    cell: Callable[..., Row | Iterable[Row]],
+    name: str = "table",
+    processes: int = 0,
+    **axes: Iterable[Any] | Mapping[str, Any],
+) -> list[Row]:
+    """Rows of every combination of the axes; those that an earlier session wrote are read back.
+
+    Args:
+      cell: called with one value of every axis, by the axis's name; returns figures by name, or several
+        such rows.
+      name: of the table, <name>.jsonl, and of the progress bar.
+      processes: 0 calls ``cell`` here; otherwise each call gets a fresh process, so many at a time, and
+        ``cell`` stands at the top level of a module.
+      axes: name -> values as JSON keeps them (numbers, text), or label -> value of any kind, where the row
+        has the label. The last axis changes fastest.
+    Returns: the long table, in the order of the axes: a row has the axes' values, then the figures.
+    Raises: DomainError when a figure is not plain and finite, or named as an axis; FileFormatError when the
+      table in the folder is of other axes or damaged.
+    """
+    path = run.path(f"{name}.jsonl")
+    known = _read(path, set(axes))
+    labels = [list(values) for values in axes.values()]
+    cells = [dict(zip(axes, point, strict=True)) for point in itertools.product(*labels)]
+    missing = [point for point in cells if _key(point) not in known]
+    measured = _measured(cell, missing, axes, processes)
+    with (
+        run.progress(len(cells), name, done=len(cells) - len(missing)) as progress,
+        closing(measured),  # an interruption ends the processes
+    ):
+        for point, found in measured:
+            rows = [found] if isinstance(found, Mapping) else found
+            known[_key(point)] = _append(path, point, [dict(row) for row in rows])
+            progress.advance()
+    return [point | row for point in cells for row in known[_key(point)]]
+
+
+def select(rows: Iterable[Row], **where: Any) -> list[Row]:
+    """The rows that have these values."""
+    return [row for row in rows if all(row.get(name) == value for name, value in where.items())]
+
+
+def column(rows: Iterable[Row], name: str, **where: Any) -> list[Any]:
+    """One figure of the rows that have these values."""
+    return [row[name] for row in select(rows, **where)]
+
+
+def metrics(rows: Iterable[Row], *axes: str, prefix: str = "") -> dict[str, float]:
+    """What ``Run.record`` takes of a table: every number by the values of the axes and its own name, in
+    plain letters.
+
+    Args:
+      axes: names of the columns that tell rows apart.
+      prefix: first word of every name.
+    """
+    found = {}
+    for row in rows:
+        name = plain(prefix, *(row[axis] for axis in axes))
+        numbers = {
+            key: value for key, value in row.items() if isinstance(value, int | float) and key not in axes
+        }
+        found |= {f"{name}_{key}": value for key, value in numbers.items()}
+    return found
+
+
+def plain(*words: object) -> str:
+    """A name for metrics.json: letters, digits and underscores."""
+    return "_".join(re.findall(r"\w+", " ".join(map(str, words)))).lower()
+
+
+def _measured(cell, points, axes, processes) -> Generator[tuple[Row, Any]]:
+    """Each point with what ``cell`` returns for it, in the order in which they are done."""
+
+    def values(point):
+        return {
+            axis: axes[axis][label] if isinstance(axes[axis], Mapping) else label
+            for axis, label in point.items()
+        }
+
+    if not processes:
+        for point in points:
+            yield point, cell(**values(point))
+        return
+    with ThreadPoolExecutor(processes) as pool:
+        waiting = {pool.submit(bench.apart, cell, **values(point)): point for point in points}
+        try:
+            for done in as_completed(waiting):
+                yield waiting[done], done.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            # one that is just being started is met by a later round
+            while wait(waiting, timeout=0.1).not_done:
+                bench.end_running()
+
+
+def _key(point):
+    return json.dumps(point)
+
+
+def _read(path: Path, axes: set[str]) -> dict[str, list[Row]]:
+    """Figures of an earlier session by cell. A line that was cut off when it was killed is cut away."""
+    known: dict[str, list[Row]] = {}
+    text = path.read_bytes() if path.exists() else b""
+    whole = text[: text.rfind(b"\n") + 1]
+    if whole != text:
+        with path.open("r+b") as file:
+            file.truncate(len(whole))
+    try:
+        for line in whole.splitlines():
+            point, rows = json.loads(line)
+            if set(point) != axes:
+                raise ValueError
+            known[_key(point)] = [dict(row) for row in rows]
+    except (ValueError, TypeError) as error:
+        raise FileFormatError(
+            f"'{path}' is damaged, or a table of other axes; remove it to begin it anew."
+        ) from error
+    return known
+
+
+def _append(path, point, rows):
+    """Write the rows of one cell as one line; returns them."""
+    if any(point.keys() & row.keys() for row in rows):
+        raise DomainError(
+            f"the cell {point} returns a figure named as an axis ({rows}); choose another name."
+        )
+    try:
+        line = json.dumps([point, rows], allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise DomainError(
+            f"the cell {point} returns what is no finite number, text or None ({error}): {str(rows)[:200]}"
+        ) from error
+    with path.open("a", encoding="utf-8") as file:
+        file.write(line + "\n")
+    return rows

@@ -1,0 +1,307 @@
+"""What studies share: sweeps that go on where they ended, intervals against closed forms, times, charts."""
+
+import json
+import math
+import os
+import sys
+import time
+from statistics import stdev
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.patches import Rectangle
+
+from codesign.errors import CodesignError, DomainError, FileFormatError, ShapeError
+from studies.frame import bench, compare, show
+from studies.frame.bench import Timing, apart, measure, turns
+from studies.frame.compare import Interval, bootstrap, student
+from studies.frame.config import StudyConfig
+from studies.frame.run import open_run
+from studies.frame.show import Asked, Panel
+from studies.frame.sweep import column, metrics, select, sweep
+
+
+@pytest.fixture
+def run(tmp_path):
+    return open_run("test_frame", StudyConfig(out=tmp_path / "out"))
+
+
+def power(base, exponent):
+    """A cell, and something to call in another process."""
+    print("noise")
+    if exponent < 0:
+        raise DomainError("exponents are not below 0")
+    return {"power": base**exponent, "process": os.getpid()}
+
+
+def variable(name):
+    return os.environ.get(name)
+
+
+# sweep
+
+
+def test_a_sweep_is_the_product_of_its_axes_in_order(run):
+    def cell(a, f):
+        return [{"k": k, "value": f(a)} for k in (0, 1)]
+
+    rows = sweep(run, cell, a=(2, 3), f={"square": lambda x: x * x})
+    assert rows == [{"a": a, "f": "square", "k": k, "value": a * a} for a in (2, 3) for k in (0, 1)]
+    assert column(rows, "value", a=3, k=1) == [9]
+    assert select(rows, a=4) == []
+
+
+@pytest.mark.parametrize("cut", [0, 5], ids=["whole", "a line cut off"])
+def test_an_interrupted_sweep_goes_on_where_it_ended(run, cut):
+    asked = []
+
+    def cell(seed, stop):
+        asked.append(seed)
+        if len(asked) == stop:
+            raise KeyboardInterrupt
+        return {"value": 0.1 * seed}
+
+    with pytest.raises(KeyboardInterrupt):
+        sweep(run, lambda seed: cell(seed, 3), seed=range(4))
+    path = run.folder / "table.jsonl"
+    path.write_bytes(path.read_bytes()[: -cut or None])
+    rows = sweep(run, lambda seed: cell(seed, -1), seed=range(5))
+    assert column(rows, "value") == [0.1 * seed for seed in range(5)]
+    assert asked == [0, 1, 2, *([1] if cut else []), 2, 3, 4]
+    assert len(path.read_text().splitlines()) == 5
+
+
+def test_cells_in_processes_give_the_same_table(run):
+    here = sweep(run, power, "here", base=(2, 3), exponent=(0, 5))
+    there = sweep(run, power, "there", processes=2, base=(2, 3), exponent=(0, 5))
+    assert column(here, "power") == column(there, "power") == [1, 32, 1, 243]
+    assert len(set(column(there, "process")) - {os.getpid()}) == 4
+    with pytest.raises(CodesignError, match=r"power\(2, -1\) ended with code 1.*not below 0"):
+        sweep(run, power, "refused", processes=2, base=(2,), exponent=(0, -1))
+    assert not bench.RUNNING
+
+
+def slow(seconds):
+    time.sleep(seconds)
+    return {"slept": seconds}
+
+
+def test_an_interruption_ends_the_processes_and_keeps_what_is_done(run):
+    run._interruption.requested = True  # as Ctrl-C does; the loop answers after a whole cell
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        sweep(run, slow, processes=2, seconds=(0, 300, 301))
+    assert time.monotonic() - start < 100
+    assert not bench.RUNNING
+    assert (run.folder / "table.jsonl").read_text() == '[{"seconds": 0}, [{"slept": 0}]]\n'
+
+
+@pytest.mark.parametrize(
+    ("cell", "sentence"),
+    [
+        (lambda seed: {"value": math.nan}, "no finite number"),
+        (lambda seed: {"value": torch.ones(2)}, "no finite number"),
+        (lambda seed: {"seed": 1}, "named as an axis"),
+    ],
+)
+def test_rows_that_no_table_can_keep_are_refused(run, cell, sentence):
+    with pytest.raises(DomainError, match=sentence):
+        sweep(run, cell, seed=(0,))
+    assert not (run.folder / "table.jsonl").exists()
+
+
+@pytest.mark.parametrize("text", ["{}\n", "what\n", '[{"other": 1}, [{"value": 1}]]\n'])
+def test_a_damaged_table_and_one_of_other_axes_are_refused(run, text):
+    (run.folder / "table.jsonl").write_text(text)
+    with pytest.raises(FileFormatError, match="damaged, or a table of other axes"):
+        sweep(run, power, base=(1,), exponent=(1,))
+
+
+def test_metrics_of_a_table_are_its_numbers_in_plain_names():
+    rows = [{"lens": "cooke-triplet", "px": 64, "error": 0.5, "note": "text", "none": None}]
+    assert metrics(rows, "lens", "px", prefix="flow, 2 levels") == {
+        "flow_2_levels_cooke_triplet_64_error": 0.5
+    }
+    assert metrics(rows, "lens") == {"cooke_triplet_px": 64, "cooke_triplet_error": 0.5}
+
+
+# compare
+
+
+def test_student_against_the_published_table():
+    """t(0.975, 4) = 2.776, t(0.95, 4) = 2.132."""
+    found = student([1.0, 2.0, 3.0, 4.0, 5.0])
+    half = 2.776 * math.sqrt(2.5 / 5)
+    assert (found.value, found.count) == (3, 5)
+    assert (found.high - 3, 3 - found.low) == pytest.approx((half, half), rel=2e-4)
+    assert student([1.0, 2.0, 3.0, 4.0, 5.0], 0.9).high == pytest.approx(3 + 2.132 * math.sqrt(0.5), rel=2e-4)
+    assert student([2.0]) == Interval(2, -math.inf, math.inf, 1)
+
+
+def test_wilson_against_the_published_example():
+    """0 of 10: 0 to 27.75 %; 5 of 10: 23.66 to 76.34 % (Newcombe, Stat. Med. 17 (1998), method 3)."""
+    assert compare.share(0, 10).high == pytest.approx(0.2775, abs=1e-4)
+    assert (compare.share(5, 10).low, compare.share(5, 10).high) == pytest.approx((0.2366, 0.7634), abs=1e-4)
+
+
+def test_a_bootstrapped_mean_has_the_standard_error_of_the_sample(generator):
+    values = torch.randn(400, generator=generator, dtype=torch.float64)
+    found = bootstrap(lambda x: x.mean(-1), values, draws=20_000)
+    half = 1.96 * float(values.std(correction=0)) / 20
+    assert found.value == float(values.mean())
+    # the draws' own noise is 1 % of an end
+    assert (found.high - found.low) / 2 == pytest.approx(half, rel=0.03)
+    assert found == bootstrap(lambda x: x.mean(-1), values, draws=20_000)
+    assert found != bootstrap(lambda x: x.mean(-1), values, draws=20_000, seed=1)
+
+
+def test_paired_units_are_drawn_together():
+    hard = torch.tensor([1.0, 10.0, 100.0, 1000.0])
+    for kind in (compare.ratio_of_means, compare.median_ratio):
+        found = kind(0.5 * hard, hard)
+        assert (found.value, found.low, found.high) == pytest.approx((0.5, 0.5, 0.5), rel=1e-12)
+    found = bootstrap(lambda x: x[0].sum(-1) / x[1].sum(-1), torch.stack([hard, 4 * hard]))
+    assert (found.low, found.high) == pytest.approx((0.25, 0.25), rel=1e-12)
+
+
+def test_log_ratios_say_who_wins():
+    logs = [-0.2, -0.1, 0.0, 0.1]
+    theirs = [0.5, 3.0, 0.7, 1.1]
+    found = compare.log_ratio([r * math.exp(x) for r, x in zip(theirs, logs, strict=True)], theirs)
+    half = 3.182446 * stdev(logs) / 2  # Student's t, three degrees of freedom, two-sided 95 %
+    assert (found.value, found.low, found.high) == pytest.approx(
+        (-0.05, -0.05 - half, -0.05 + half), rel=1e-6
+    )
+    assert (found.count, found.outcome) == (4, "ties")
+    assert compare.log_ratio([1.0, 1.1], [2.0, 2.2]).outcome == "wins"
+    assert compare.log_ratio([2.0, 2.2], [1.0, 1.1]).outcome == "loses"
+    # one case says nothing
+    assert compare.log_ratio([1.0], [2.0]).percent() == "-50.0 % (-100.0 to inf %)"
+
+
+def test_the_pooled_interval_is_the_wider_of_cases_and_seeds():
+    # seeds alone differ
+    over_seeds = torch.tensor([[0.3, 0.3, 0.3], [-0.1, -0.1, -0.1]], dtype=torch.float64)
+    half = 12.7062 * stdev([0.3, -0.1]) / math.sqrt(2)  # one degree of freedom
+    found = compare.pooled(over_seeds)
+    assert (found.value, found.high - found.value, found.count) == pytest.approx((0.1, half, 3), rel=1e-5)
+    assert compare.pooled(over_seeds.T).high - 0.1 == pytest.approx(half, rel=1e-5)
+    assert compare.pooled(over_seeds[:1]) == student(over_seeds[0])
+
+
+def test_intervals_print_and_record():
+    assert f"{Interval(0.5, 0.25, 1, 3):.2f}" == "0.50 (0.25 to 1.00)"
+    assert str(Interval(0.5, 0.25, 1, 3)) == "0.5 (0.25 to 1)"
+    assert Interval(0.5, 0.25, 1, 3).metrics("x") == {"x": 0.5, "x_low": 0.25, "x_high": 1}
+    assert student([2.0]).metrics("x") == {"x": 2}
+
+
+@pytest.mark.parametrize(
+    ("call", "kind", "sentence"),
+    [
+        (lambda: student([]), ShapeError, "at least one"),
+        (lambda: compare.ratio_of_means([1.0], [1.0, 2.0]), ShapeError, "paired samples"),
+        (lambda: compare.log_ratio([1.0], []), ShapeError, "one of each"),
+        (lambda: compare.log_ratio([0.0], [1.0]), DomainError, "above 0"),
+    ],
+)
+def test_comparisons_that_are_none_are_refused(call, kind, sentence):
+    with pytest.raises(kind, match=sentence):
+        call()
+
+
+# bench
+
+
+def test_times_count_the_repeats_only():
+    calls = []
+    timing = measure(lambda: calls.append(1), repeats=5, warm=2)
+    assert (len(calls), len(timing.wall_s), len(timing.cpu_s)) == (7, 5, 5)
+    assert min(timing.wall_s) <= timing.wall <= max(timing.wall_s)
+    assert Timing((1.0, 2.0, 3.0, 4.0), (1.0,)).metrics("x") == {
+        "x_wall_s": 2.5,
+        "x_wall_iqr_s": 1.5,
+        "x_cpu_s": 1,
+    }
+
+
+def test_processor_time_leaves_waiting_out():
+    timing = measure(lambda: time.sleep(0.05), repeats=3, warm=0)
+    assert timing.wall >= 0.05
+    assert timing.cpu < 0.02
+
+
+def test_functions_take_turns():
+    order = []
+    found = turns({name: lambda name=name: order.append(name) for name in "ab"}, rounds=2, repeats=2, warm=0)
+    assert "".join(order) == "aaabbbaabb"
+    assert {len(timing.wall_s) for timing in found.values()} == {4}
+
+
+def test_a_function_in_its_own_process():
+    found = apart(power, 2, exponent=3)
+    assert found["power"] == 8
+    assert found["process"] != os.getpid()
+    assert apart(variable, "CODESIGN_TEST", environment={"CODESIGN_TEST": "set"}) == "set"
+    with pytest.raises(CodesignError, match="not below 0"):
+        apart(power, 2, -1)
+    assert bench.installed({"yes": "torch", "no": "no_such_package"}) == ["yes"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not start the count of a peak anew")
+def test_a_peak_is_what_a_call_takes():
+    assert bench.peak_mb(lambda: np.ones(50_000_000, dtype=np.uint8).sum()) == pytest.approx(50, abs=5)
+    assert bench.peak_mb(lambda: None) < 5
+
+
+# show
+
+
+ROWS = [
+    {"lens": "a", "method": "flow", "error": 1.0},
+    {"lens": "b", "method": "flow", "error": Interval(2, 1, 3, 4)},
+    {"lens": "a", "method": "spots", "error": 3.0},
+]
+
+
+def test_tables_out_of_long_rows():
+    assert show.table(ROWS, method="method", error="error, px") == (
+        ("method", "error, px"),
+        [("flow", 1.0), ("flow", "2 (1 to 3)"), ("spots", 3.0)],
+    )
+    assert show.table(ROWS)[0] == ("lens", "method", "error")
+    assert show.pivot(ROWS, down="lens", across="method", value="error") == (
+        ("lens", "flow", "spots"),
+        [("a", 1.0, 3.0), ("b", "2 (1 to 3)", None)],
+    )
+
+
+def test_what_was_asked_and_missed(run):
+    figures = [Asked("speed", 12.0, least=10), Asked("memory", 6.0, most=5, beside=7.0), Asked("error", 0.5)]
+    assert show.asked(run, figures, beside="CPU") == "**Missed in this run:** memory 6 (≤ 5)."
+    assert show.asked(run, figures[:1]) == "All figures are met."
+    assert not Asked("number", math.nan, most=1).met
+    run.finish("T", "L")
+    page = (run.folder / "report.html").read_text()
+    assert "asked: ≤ 5 (missed)" in page
+    recorded = json.loads((run.folder / "metrics.json").read_text())
+    assert (recorded["speed"], recorded["memory"], recorded["memory_cpu"]) == (12, 6, 7)
+
+
+def test_figures_hold_what_they_are_given():
+    chart = show.panels(
+        Panel({"a": ([1, 2], [3, 4])}, "x", "y", "xy", [2.0]), Panel({"b": ([1], [1])}, "x", "y")
+    )
+    left, right = chart.axes
+    assert (left.get_xscale(), left.get_yscale(), right.get_yscale()) == ("log", "log", "linear")
+    assert [np.asarray(line.get_ydata()).tolist() for line in left.lines] == [[3, 4], [2, 2]]
+    image = np.linspace(0, 1, 12).reshape(3, 4)
+    grid = show.pictures({"r": {"i": image, "s": image - 0.5}, "q": {"i": np.ones((3, 4, 3))}}, signed=["s"])
+    assert [axis.axison for axis in grid.axes] == [True, True, True, False]
+    low, high = grid.axes[1].images[0].get_clim()
+    assert low == -high == pytest.approx(-0.5, abs=0.01)
+    drawn = show.bars({"a": 2.0, "b": Interval(1, 0.5, 2, 9)}, "s", log=True, level=1.5)
+    assert [bar.get_width() for bar in drawn.axes[0].patches if isinstance(bar, Rectangle)] == [2, 1]
+    for figure in (chart, grid, drawn):
+        show.plt.close(figure)
