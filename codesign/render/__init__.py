@@ -13,7 +13,6 @@ from codesign.render.psf_map import PsfMap, psf_map
 from codesign.render.sequence import frames
 from codesign.render.time import (
     adaptive_times,
-    crossing_error_px,
     exposed_frames,
     frame_chunks,
     gauss_legendre,
@@ -47,7 +46,6 @@ __all__ = [
     "angular_miss_rad",
     "camera_velocity",
     "check_view",
-    "crossing_error_px",
     "exposed_frames",
     "flow_and_occlusion",
     "frame_chunks",

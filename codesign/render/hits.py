@@ -1,16 +1,17 @@
 """What rays meet first, in any number of frames at once: one cast for all of them."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from codesign.render.moving import parts
+from codesign.render.rows import Rows
 
 
 @dataclass(frozen=True)
-class Hits:
+class Hits(Rows):
     """First surfaces along rays of F frames: local_m, normal [F, P, 3] in the axes of the part [F, P] that is
     met (-1 for none), distance_m [F, P] (infinite for none)."""
 
@@ -18,9 +19,6 @@ class Hits:
     normal: Tensor
     part: Tensor
     distance_m: Tensor
-
-    def __getitem__(self, frames: Any) -> "Hits":
-        return Hits(*(getattr(self, field.name)[frames] for field in fields(self)))
 
 
 def first_hits(origin_cam_m: Tensor, direction_cam: Tensor, lit: Tensor, scene: Any, cameras: Tensor) -> Hits:

@@ -134,7 +134,8 @@ def adaptive_times(
     the points seen at its end. Steps grow at
     most twofold and are judged at their middle too (on a coarser grid), so that a motion that comes back
     within a step is met by its parts.
-    Linear interpolation between the frames then times a crossing to within ``crossing_error_px`` of motion.
+    Linear interpolation between the frames then times a crossing of a pattern of wave number k to within k largest_px^2 / (8 s)
+    pixels of motion, s the slope there as a share of the largest: a chord misses by h^2 max|L''| / 8 at most.
     Raises: DomainError when the interval is empty, largest_px is not positive, or a displacement does not
       shrink with the step (a jump).
     Source: Rebecq, Gehrig and Scaramuzza, ESIM: an open event camera simulator, CoRL 2018 (adaptive sampling
@@ -172,24 +173,6 @@ def adaptive_times(
             times.append(end_s if now + step >= end_s - shortest else now + step)
             step *= min(GROWTH, AIM * largest_px / max(moved, 1e-300))
     return torch.tensor(times, dtype=torch.float64)
-
-
-def crossing_error_px(largest_px: float, period_px: float, slope: float = 1.0) -> float:
-    """How far a pattern has moved at most between the true and the linearly interpolated time at which a
-    pixel crosses a threshold.
-
-    Args: largest_px: motion between frames, at constant speed. period_px: the finest period in the image.
-      slope: of the level at the crossing, as a share of its largest slope, within the step, in 0..1.
-    Between frames a chord misses a level L by at most h^2 max|L''| / 8, hence the crossing by that over |L'|;
-    for a sinusoid of wave number k = 2 pi / period that moves by d per step this is k d^2 / (8 slope) pixels
-    of motion. Divided by the speed in px/s it is the error in seconds.
-    """
-    if not (largest_px > 0 and period_px > 0 and 0 < slope <= 1):
-        raise DomainError(
-            f"crossing error: largest_px = {largest_px}, period_px = {period_px} must be positive, and "
-            f"slope = {slope} in 0..1."
-        )
-    return 2 * math.pi / period_px * largest_px**2 / (8 * slope)
 
 
 def _displacement_px(camera, scene, trajectory, ends, grids, largest_px):

@@ -1,5 +1,6 @@
 """Curves along which shapes pass through each other: closed forms, and gradients against differences."""
 
+import itertools
 import math
 
 import numpy as np
@@ -14,12 +15,10 @@ from codesign.render.silhouettes import Segments, outlines
 from codesign.render.silhouettes.crossings import Overlaps, find_crossings, overlaps
 from codesign.render.silhouettes.intersections import Intersections
 from codesign.render.silhouettes.shapes import Mesh, read
+from tests.render.solids import CORNERS, CUBE, squares
 
 F64 = torch.float64
 EYE = torch.tensor([0.3, -4.0, 2.0], dtype=F64)
-CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-CUBE = np.array([face for a, b, c, d in SIDES for face in ((a, b, c), (a, c, d))])
 
 
 def place():
@@ -79,24 +78,12 @@ def test_half_a_ball_of_triangles_sunk_to_its_very_equator_has_it_as_an_edge():
     """A smooth mesh with a ring of vertices in the floor's plane: its edges there are no creases, and count."""
     n = 24
     turn = 2 * np.pi * np.arange(n) / n
-    ring = np.stack([np.cos(turn), np.sin(turn), 0 * turn], 1)
-    below, above = (np.stack([0.9 * ring[:, 0], 0.9 * ring[:, 1], 0 * turn + z], 1) for z in (-0.5, 0.5))
-    k = np.arange(n)
-    faces = np.concatenate(
-        [
-            np.concatenate(
-                [np.stack([k, (k + 1) % n, k + m], 1), np.stack([(k + 1) % n, (k + 1) % n + m, k + m], 1)]
-            )
-            for m in (n, 2 * n)
-        ]
-    )
-    drum = Mesh("drum", np.concatenate([ring, below, above]), faces, None)
-    floor = Mesh(
-        "floor",
-        np.array([[-3.0, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]]),
-        np.array([[0, 1, 2], [0, 2, 3]]),
-        None,
-    )
+    rings = [
+        np.stack([r * np.cos(turn), r * np.sin(turn), 0 * turn + z], 1)
+        for r, z in ((0.9, -0.5), (1, 0), (0.9, 0.5))
+    ]
+    drum = Mesh("drum", np.concatenate(rings), squares(3, n, around=True), None)
+    floor = Mesh("floor", 3 * CORNERS[::2] * [1, 1, 0], np.array([[0, 2, 3], [0, 3, 1]]), None)
     found, _ = find_crossings([drum, floor])
     length = np.linalg.norm(found.end - found.start, axis=1).sum()
     assert length == pytest.approx(n * 2 * math.sin(math.pi / n), rel=1e-9)
@@ -105,16 +92,9 @@ def test_half_a_ball_of_triangles_sunk_to_its_very_equator_has_it_as_an_edge():
 def test_meshes_that_do_not_cross_themselves_have_no_crossing():
     """A bumpy sheet: neighbours touch along edges and at corners only; and a cube inside another."""
     n = 30
-    x, y = (v.reshape(-1) for v in np.meshgrid(np.arange(n), np.arange(n), indexing="xy"))
-    z = np.random.default_rng(0).normal(size=n * n)
-    row, column = (v.reshape(-1) for v in np.divmod(np.arange((n - 1) ** 2), n - 1))
-    a = row * n + column
-    sheet = Mesh(
-        "sheet",
-        np.stack([x, y, z], 1),
-        np.stack([a, a + 1, a + n + 1, a, a + n + 1, a + n], 1).reshape(-1, 3),
-        None,
-    )
+    x, y = np.mgrid[:n, :n]
+    vertices = np.stack([x, y, np.random.default_rng(0).normal(size=(n, n))], 2).reshape(-1, 3)
+    sheet = Mesh("sheet", vertices, squares(n, n), None)
     assert len(find_crossings([sheet])[0].start) == 0
     nested = Mesh("nested", np.concatenate([CORNERS, 0.5 * CORNERS]), np.concatenate([CUBE, CUBE + 8]), None)
     assert len(find_crossings([nested])[0].start) == 0
@@ -161,40 +141,31 @@ def test_faces_in_one_plane_are_refused_where_they_are_seen(shift):
     )
 
 
-def test_what_two_triangles_in_a_plane_share_has_its_middle_where_a_clipper_puts_it(generator):
-    """Against the polygon cut out by half planes one after the other."""
+def test_what_two_triangles_in_a_plane_share_has_its_middle_where_its_corners_say(generator):
+    """Corners: where lines of two of the six sides meet that lie within all six."""
     p, q = (torch.rand(60, 3, 2, generator=generator, dtype=F64).numpy() for _ in range(2))
     normal = np.tile([0.0, 0.0, 1.0], (60, 1))
     rows, middle, end = overlaps(*(np.pad(v, ((0, 0), (0, 0), (0, 1))) for v in (p, q)), normal, 1e-6)
     for k in range(60):
-        polygon = clipped(p[k], q[k])
-        assert (k in rows) == (len(polygon) > 2)
+        corners = np.array(list(shared(p[k], q[k])))
+        assert (k in rows) == (len(corners) > 2)
         if k in rows:
             at = int(np.nonzero(rows == k)[0][0])
-            corners = np.unique(np.round(polygon, 9), axis=0)
             np.testing.assert_allclose(middle[at, :2], corners.mean(0), atol=1e-6)
             assert np.linalg.norm(corners - end[at, :2], axis=1).min() < 1e-6
 
 
-def clipped(polygon, by):
-    """Corners of a polygon [n, 2] within a triangle [3, 2], side after side."""
-    (a, b, c) = by
-    if (b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0] < 0:
-        by = by[::-1]
-    for k in range(3):
-        base, along = by[k], by[(k + 1) % 3] - by[k]
-        height = [along[0] * (p - base)[1] - along[1] * (p - base)[0] for p in polygon]
-        kept = []
-        for i, p in enumerate(polygon):
-            j = (i + 1) % len(polygon)
-            if height[i] >= 0:
-                kept.append(p)
-            if (height[i] >= 0) != (height[j] >= 0):
-                kept.append(p + height[i] / (height[i] - height[j]) * (polygon[j] - p))
-        polygon = kept
-        if not polygon:
-            return []
-    return polygon
+def shared(*triangles):
+    """Corners of what two triangles [3, 2] share."""
+    begin = np.concatenate(triangles)
+    along = np.concatenate([np.roll(t, -1, axis=0) - t for t in triangles])
+    out = np.stack([along[:, 1], -along[:, 0]], 1)
+    out *= np.sign([np.linalg.det(np.diff(t, axis=0)) for t in triangles]).repeat(3)[:, None]
+    level = (out * begin).sum(1)
+    for pair in itertools.combinations(range(6), 2):
+        at = np.linalg.solve(out[list(pair)], level[list(pair)])
+        if (out @ at <= level + 1e-12).all():
+            yield at
 
 
 def circle(radius):

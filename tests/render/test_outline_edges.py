@@ -12,23 +12,19 @@ from codesign.render.charts import emissive_mesh
 from codesign.render.silhouettes import Circles, Segments, mesh_edges
 from codesign.render.silhouettes.edges import edges_once, rims_once, segments
 from scenes.build import pole
+from tests.render import solids
+from tests.render.solids import CUBE
 
 F64 = torch.float64
-CORNERS = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
-SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-CUBE = np.array([face for a, b, c, d in SIDES for face in ((a, b, c), (a, c, d))])
+CORNERS = (solids.CORNERS + 1) / 2
 LIGHT = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
 
 
 def tube(sides=64):
     """Vertices and faces of an open prism about the z axis."""
-    angle = np.linspace(0, 2 * np.pi, sides + 1)[:-1]
+    angle = 2 * np.pi * np.arange(sides) / sides
     ring = np.concatenate([np.stack([np.cos(angle), np.sin(angle), 0 * angle + z], 1) for z in (0.0, 1.0)])
-    k = np.arange(sides)
-    following = (k + 1) % sides
-    return ring, np.concatenate(
-        [np.stack([k, following, sides + k], 1), np.stack([following, sides + following, sides + k], 1)]
-    )
+    return ring, solids.squares(2, sides, around=True)
 
 
 def silhouettes(edges, eye):
@@ -107,11 +103,9 @@ def test_an_edge_of_three_faces_counts_from_every_side():
 def test_edges_between_faces_of_unequal_radiance_count_even_where_flat():
     """A flat grid of n x n squares in rows of one radiance: n - 1 lines of n edges between rows, and the rim."""
     n = 7
-    x, y = (v.reshape(-1) for v in np.meshgrid(np.arange(n + 1.0), np.arange(n + 1.0), indexing="xy"))
-    row, column = (v.reshape(-1) for v in np.divmod(np.arange(n * n), n))
-    a = row * (n + 1) + column
-    faces = np.stack([a, a + 1, a + n + 2, a, a + n + 2, a + n + 1], 1).reshape(-1, 3)
-    vertices = np.stack([x, y, 0 * x], 1)
+    vertices = np.stack([*np.mgrid[: n + 1, : n + 1], np.zeros((n + 1, n + 1))], 2).reshape(-1, 3)
+    faces = solids.squares(n + 1, n + 1)
+    row = np.arange(n * n) // n
     light = np.repeat(np.random.default_rng(1).random(n)[row], 2)
     values = np.repeat(light[:, None, None], 3, 1)
     assert len(mesh_edges(vertices, faces)) == 4 * n
@@ -124,29 +118,9 @@ def test_edges_between_faces_of_unequal_radiance_count_even_where_flat():
     assert curve.start.shape[0] == 4 * n + (n - 1) * n
 
 
-def test_texture_coordinates_that_jump_along_a_flat_edge_make_it_one():
-    """Two triangles of a square: with one set of coordinates the diagonal is none; with a seam it is."""
-    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 0, 0], [1, 1, 0], [0, 1, 0]])
-    faces = np.array([[0, 1, 2], [3, 4, 5]])
-    values = square[:, :2][faces]
-    assert len(mesh_edges(square, faces, values)) == 4
-    values[1] += 0.3
-    edges = mesh_edges(square, faces, values)
-    assert len(edges) == 5
-    assert bool(edges.always.all())
-
-
 def lines(*ends):
     ends = np.array(ends, dtype=float)
     return segments(ends[:, 0], ends[:, 1])
-
-
-def test_a_floor_edge_against_two_wall_edges_counts_once_along_its_length():
-    floor = lines([(0, 0, 0), (4, 0, 0)], [(0, 0, 0), (0, 1, 0)])
-    walls = lines([(4, 0, 0), (2.5, 0, 0)], [(-1, 0, 0), (2.5, 0, 0)], [(2.5, 0, 0), (2.5, 0, 3)])
-    edges = edges_once([floor, walls], 1e-4)
-    assert float(edges.length_m.sum()) == pytest.approx(5 + 1 + 3, abs=1e-9)
-    assert len(edges) == 5
 
 
 @pytest.mark.parametrize("shift", [0.0, 3e-5, 0.49999e-4, 0.5e-4])

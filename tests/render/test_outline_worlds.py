@@ -25,22 +25,27 @@ def light(value):
     return {"type": "area", "radiance": {"type": "rgb", "value": float(value)}}
 
 
-def texture(seed, cycles):
-    mi = backend.mitsuba()
-    bitmap = mi.Bitmap(smooth(seed, cycles=cycles))
-    return {
-        "type": "area",
-        "radiance": {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "repeat"},
-    }
+def picture(seed, cycles=6):
+    bitmap = backend.mitsuba().Bitmap(smooth(seed, cycles=cycles))
+    radiance = {"type": "bitmap", "bitmap": bitmap, "raw": True, "wrap_mode": "repeat"}
+    return {"type": "area", "radiance": radiance}
 
 
 def wall():
-    T = backend.mitsuba().ScalarTransform4f
-    return {
-        "type": "cube",
-        "to_world": T().translate([0, 2.5, 0.5]).scale([4, 0.1, 4]),
-        "emitter": texture(1, 6),
-    }
+    place = backend.mitsuba().ScalarTransform4f().translate([0, 2.5, 0.5]).scale([4, 0.1, 4])
+    return {"type": "cube", "to_world": place, "emitter": picture(1)}
+
+
+SKY = {"type": "constant", "radiance": {"type": "rgb", "value": 60.0}}
+AHEAD = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+
+
+def judged(turn_rad, pitch_mm, nearest_m, **shapes):
+    """By differences with common random numbers, through a pinhole of 11 mm that looks along y."""
+    turned = AHEAD @ pose.se3_exp(torch.tensor([0, 0, 0, 0, 0, turn_rad], dtype=F64))
+    scene = MitsubaScene(shapes)
+    case = judge.Case(scene, lens.Pinhole(11.0), turned, pitch_mm, 28, nearest_m, 1)
+    return judge.judge(case, effort=judge.Effort(seeds=(6,), per_px=16.0))
 
 
 def loss_of_a_pole(task, start, end, radius, radiance, twist):
@@ -72,7 +77,7 @@ def loss_of_a_pole(task, start, end, radius, radiance, twist):
     return radiance * wide[0] * total / SIZE_PX**2
 
 
-@pytest.mark.parametrize("ratio", [20, 100, 250, 500, 600, 1000])
+@pytest.mark.parametrize("ratio", [20, 250, 1000])
 def test_poles_however_thin_and_far(ratio):
     start = np.float32([-0.5, 0.3, -2.0]).astype(np.float64)
     end = np.float32([0.3, 0.4, 4.0]).astype(np.float64)
@@ -104,18 +109,16 @@ def test_poles_however_thin_and_far(ratio):
 
 def five_poles():
     """Of 5 to 8 mm at a metre, with their ends in view."""
-    poles = {}
-    for k in range(5):
-        x = -0.5 + 0.25 * k
-        start, end = [x, -0.2 + 0.02 * k, 0.7 + 0.03 * k], [x + 0.1, -0.15, 1.2 - 0.02 * k]
-        poles[f"pole{k}"] = {
+    return {
+        f"pole{k}": {
             "type": "cylinder",
-            "p0": start,
-            "p1": end,
+            "p0": [-0.5 + 0.25 * k, -0.2 + 0.02 * k, 0.7 + 0.03 * k],
+            "p1": [-0.4 + 0.25 * k, -0.15, 1.2 - 0.02 * k],
             "radius": 0.0025 + 0.0004 * k,
             "emitter": light(60 + 40 * k),
         }
-    return poles
+        for k in range(5)
+    }
 
 
 def test_poles_with_their_ends_in_view():
@@ -146,15 +149,12 @@ def test_lines_without_width_between_faces_are_no_jumps():
     """Rays along the middle row of the film meet edges of a mesh exactly, and may slip through."""
     vertices, faces = icosphere(4)
     ball = emissive_mesh(backend.mitsuba(), 0.5 * vertices + [0, 2, 0], faces, light(200))
-    scene = MitsubaScene(
-        {"ball": ball, "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 60.0}}}
-    )
     camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.3575, 4)
-    ahead = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0))[None]
-    assert not bool(render.frames(camera, scene, ahead, gradient="boundary").isnan().any())
+    frames = render.frames(camera, MitsubaScene({"ball": ball, "sky": SKY}), AHEAD[None], gradient="boundary")
+    assert not bool(frames.isnan().any())
 
 
-@pytest.mark.parametrize("ratio", [5, 50, 100])
+@pytest.mark.parametrize("ratio", [5, 100])
 def test_a_dark_ball_through_a_mesh_however_far(ratio):
     """A mesh of 320 faces with a black ball of half its radius before its centre, the film narrower the further it is. The
     ball's outline lies just within the mesh and the curve along which the two meet just behind the ball, both nearer to
@@ -163,12 +163,7 @@ def test_a_dark_ball_through_a_mesh_however_far(ratio):
     vertices, faces = icosphere(2)
     ball = {"type": "sphere", "center": [0.06, distance - 0.24, 0.03], "radius": 0.15, "emitter": light(0)}
     mesh = emissive_mesh(backend.mitsuba(), radius * vertices + [0, distance, 0], faces, light(200))
-    sky = {"type": "constant", "radiance": {"type": "rgb", "value": 60.0}}
-    turned = pose.se3_exp(torch.tensor([0, 0, 0, 0, 0, 0.3], dtype=F64))
-    ahead = pose.look_at((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)) @ turned
-    scene = MitsubaScene({"mesh": mesh, "ball": ball, "sky": sky})
-    case = judge.Case(scene, lens.Pinhole(11.0), ahead, 22 * radius / distance / 12, 28, distance - radius, 1)
-    found = judge.judge(case, effort=judge.Effort(seeds=(6,)))
+    found = judged(0.3, 22 * radius / distance / 12, distance - radius, mesh=mesh, ball=ball, sky=SKY)
     assert found.error < 0.05 + 2 * found.noise
     assert found.noise < 0.05
 
@@ -182,20 +177,16 @@ def test_a_view_is_looked_at_though_another_was_right(twist, nearer, monkeypatch
     """A wall at 100 m that alone is seen at first, and a ball that moves through a cube 10 m ahead, aside, or as much
     smaller and nearer. A camera that moves by a thousandth of that is not looked through again."""
     T = backend.mitsuba().ScalarTransform4f
-    wall_of = {
-        "type": "rectangle",
-        "to_world": T().translate([0, 0, 100.0]).rotate([1, 0, 0], 180).scale(80.0),
-    }
-    cube = {
-        "type": "cube",
-        "to_world": T().scale(1 / nearer).translate([-7.2, 0, 10.0]).rotate([1, 1, 0], 40).scale(0.8),
-        "emitter": light(200),
+    far = T().translate([0, 0, 100.0]).rotate([1, 0, 0], 180).scale(80.0)
+    aside = T().scale(1 / nearer).translate([-7.2, 0, 10.0]).rotate([1, 1, 0], 40).scale(0.8)
+    static = {
+        "wall": {"type": "rectangle", "to_world": far, "emitter": picture(2)},
+        "cube": {"type": "cube", "to_world": aside, "emitter": light(200)},
     }
     ball = MitsubaScene({"ball": {"type": "sphere", "radius": 0.55 / nearer, "emitter": light(20)}})
-    static = MitsubaScene({"wall": {**wall_of, "emitter": texture(2, 6)}, "cube": cube})
     place = torch.eye(4, dtype=F64)[None].clone()
     place[0, :3, 3] = torch.tensor([-6.6, 0.1, 9.3]) / nearer
-    world = render.MovingScene(static, {"ball": (ball, place)})
+    world = render.MovingScene(MitsubaScene(static), {"ball": (ball, place)})
     camera = render.Camera(lens.Pinhole(11.0), 32, 32, 0.35, 4)
     looks = []
     listings = occlusion_check.listings
@@ -209,20 +200,19 @@ def test_a_view_is_looked_at_though_another_was_right(twist, nearer, monkeypatch
         render.frames(camera, world, other, gradient="boundary")
 
 
-@pytest.mark.parametrize("kind", ["ball", "tube", "disk", "mesh"])
+@pytest.mark.parametrize("kind", ["sphere", "cylinder", "disk", "cube"])
 def test_no_surface_is_nearer_than_it_is_said(kind, generator):
     """Against points spread over the shape, from outside and within."""
-    T = backend.mitsuba().ScalarTransform4f
-    placed = T().translate([0.3, -0.2, 0.5]).rotate([0.6, 0.8, 0], 50)
-    plugin = {"ball": "sphere", "tube": "cylinder", "disk": "disk", "mesh": "cube"}[kind]
-    scene = MitsubaScene({"thing": {"type": plugin, "to_world": placed.scale(0.4), "emitter": light(1)}})
+    centre = torch.tensor([0.3, -0.2, 0.5], dtype=F64)
+    place = (
+        backend.mitsuba().ScalarTransform4f().translate(centre.tolist()).rotate([0.6, 0.8, 0], 50).scale(0.4)
+    )
+    scene = MitsubaScene({"thing": {"type": kind, "to_world": place, "emitter": light(1)}})
     at = torch.randn(40_000, 2, 3, generator=generator, dtype=F64)
-    eyes = torch.cat([2 * at[:20, 0], 0.1 * at[20:40, 0] + torch.tensor([0.3, -0.2, 0.5], dtype=F64)])
-    target = torch.tensor([0.3, -0.2, 0.5], dtype=F64) + 0.4 * at[:, 1]
-    direction = torch.nn.functional.normalize(target - at[:, 0], dim=1)
+    direction = torch.nn.functional.normalize(centre + 0.4 * at[:, 1] - at[:, 0], dim=1)
     point, _, valid = scene.hit(at[:, 0], direction)
-    for eye in eyes:
+    for eye in torch.cat([2 * at[:20, 0], 0.1 * at[20:40, 0] + centre]):
         nearest = float((point[valid] - eye).norm(dim=1).min())
         assert scene.nearest_m(eye) <= nearest * (1 + 1e-5)
-        if kind in ("ball", "mesh"):
+        if kind in ("sphere", "cube"):
             assert scene.nearest_m(eye) > nearest - 0.06

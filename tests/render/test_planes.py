@@ -26,11 +26,9 @@ def tilted_plane(dtype=D, seed=3):
 
 def poses():
     base = look_at((0.4, -0.5, 2.6), (0.1, 0.1, 0.3), down=(0.2, 1.0, 0.1))
-    steps = torch.tensor(
-        [[0, 0, 0, 0, 0, 0], [0.05, -0.03, 0.08, 0.02, -0.03, 0.05], [0.1, 0.0, 0.1, -0.02, 0.03, 0.1]],
-        dtype=D,
-    )
-    return base @ se3_exp(steps)
+    moved = base @ se3_exp(torch.tensor([0.05, -0.03, 0.08, 0.02, -0.03, 0.05], dtype=D))
+    # from below the plane shows its front, mirrored
+    return torch.stack([base, moved, look_at((0.1, 0.2, -2.6), (0.1, 0.1, 0.3), down=(0.2, 1.0, 0.1))])
 
 
 def homography(pose, plane):
@@ -94,22 +92,6 @@ def test_the_sample_pattern_covers_the_pixel_and_the_pupil_evenly():
     assert torch.equal(film_pupil_pattern(16, 3)[1], film_pupil_pattern(16, 3)[1])
 
 
-def test_the_plane_is_seen_from_both_sides_and_its_back_is_the_mirrored_front():
-    plane = TexturedPlane(*textures.waves(1), dtype=D)
-    camera = Camera(lens.Pinhole(FOCAL_MM), WIDTH, HEIGHT, PITCH_MM, 1)
-    above = look_at((0, 0, 2.0), (0, 0, 0), down=(0, 1, 0))
-    below = look_at((0, 0, -2.0), (0, 0, 0), down=(0, 1, 0))
-    front, back = render.frames(camera, plane, torch.stack([above, below]))
-    torch.testing.assert_close(back, front.flip(1), rtol=1e-12, atol=0)
-
-
-def test_rays_beside_the_plane_see_its_mean():
-    plane = TexturedPlane(*textures.waves(1), mean=70.0, dtype=D)
-    camera = Camera(lens.Pinhole(FOCAL_MM), WIDTH, HEIGHT, PITCH_MM, 1)
-    away = look_at((0, 0, 2.0), (0, 0.01, 5.0), down=(0, 1, 0))
-    assert render.frames(camera, plane, away[None]).unique().tolist() == [70.0]
-
-
 def test_waves_stay_inside_their_band():
     frequency, amplitude, _ = textures.waves(
         7, count=200, finest_period_m=0.02, coarsest_period_m=0.3, log_contrast=0.5
@@ -121,42 +103,3 @@ def test_waves_stay_inside_their_band():
         0.25, rel=1e-12
     )  # variance of the log radiance is contrast squared
     assert isinstance(worlds.smooth_plane(2, finest_period_m=0.1), TexturedPlane)
-
-
-def test_mitsuba_renders_the_same_picture():
-    """The plane in closed form against the same pattern as a bitmap of 2048 texels under Mitsuba: bilinear
-    interpolation errs by (2 pi / (texels per wave))^2 / 8 of the pattern's log amplitude, 1e-5 here; float32
-    rays at 2 m move the pattern by 1e-7 m."""
-    import numpy as np
-
-    from codesign import backend, lens, pose, render
-
-    half = 1.5
-    texels = 2048
-    frequency = ((0.9, 0.3), (-0.4, 1.1))
-    amplitude = (0.4, 0.3)
-    phase = (0.3, 1.1)
-    at = ((np.arange(texels) + 0.5) / texels * 2 - 1) * half
-    wave = sum(
-        a * np.cos(2 * np.pi * (fx * at[None, :] + fy * at[:, None]) + p)
-        for (fx, fy), a, p in zip(frequency, amplitude, phase, strict=True)
-    )
-    mi = backend.mitsuba()
-    light = {
-        "type": "area",
-        "radiance": {
-            "type": "bitmap",
-            "bitmap": mi.Bitmap((100 * np.exp(wave))[..., None].astype(np.float32)),
-            "raw": True,
-        },
-    }
-    card = render.MitsubaScene(
-        {"card": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(half), "emitter": light}}
-    )
-    plane = render.TexturedPlane(frequency, amplitude, phase)
-    camera = render.Camera(lens.load("cooke-triplet").scaled(0.22).freeze(), 32, 24, 0.2, 16)
-    path = pose.look_at((0.1, 0.05, 2.0), (0.0, 0.1, 0.0), down=(0.0, -1.0, 0.0))[None]
-    ours = render.frames(camera, plane, path)
-    theirs = render.frames(camera, card, path)
-    assert float(ours.std()) > 10
-    torch.testing.assert_close(theirs.double(), ours, rtol=2e-5, atol=0)

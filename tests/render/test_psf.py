@@ -131,53 +131,50 @@ def test_a_wall_is_as_traced(optics):
     )  # 2 % are asked where blur changes slowly
 
 
-def test_windows_trajectories_and_lists_of_scenes_have_the_shapes_of_frames():
+def test_windows_trajectories_and_lists_of_scenes_are_as_traced():
     film = render.Film(120, 80, 24, 20, PITCH_MM, ((0, 0), (90, 55)))
-    cam = render.Camera(THIN, 24, 20, PITCH_MM, 256, film=film)
-    poses = FRONT.repeat(2, 3, 1, 1) @ se3_exp(0.02 * torch.arange(36, dtype=D).reshape(2, 3, 6) / 36)
+    cam = camera(THIN, 24, 20, film=film)
+    poses = FRONT @ se3_exp(0.02 * torch.arange(36, dtype=D).reshape(2, 3, 6) / 36)
     scenes = [waves(0), waves(1)]
     found = render.psf_frames(cam, scenes, poses)
     assert found.shape == (2, 3, 2, 20, 24)
     assert rms_share(found, render.frames(cam, scenes, poses)) < 0.005
 
 
-def test_more_rays_per_pixel_for_hard_edges():
-    """The edge of a card before a pinhole: 16 rays per pixel are the means of the parts they lie in."""
-    pose = look_at((0.0, 0.0, 1.5), (0, 0, 0), down=(0, 1, 0)) @ se3_exp(
-        torch.tensor([0, 0, 0, 0, 0, 0.3], dtype=D)
-    )
-    cam = camera(lens.Pinhole(10.0), 24, 20)
-    card = half_before(100.0, 50.0)
-    truth = render.frames(cam, card, pose[None])
-    few, many = (
-        render.psf_frames(cam, card, pose[None], render.psf_map(cam, rays_per_px=n)) for n in (4, 64)
-    )
-    # the share of a pixel behind an edge is known to half a row of points, 1 / 16, with 64 in a square
-    assert float((many - truth).abs().max()) < 50 / 16 + 0.5
-    assert float((many - truth).norm()) < 0.5 * float((few - truth).norm())
-
-
 def half_before(front, behind):
     """A card left of x = 0 at z = 1 before a wall at z = 0, both of one radiance."""
-    mi = worlds.backend.mitsuba()
+    T = worlds.backend.mitsuba().ScalarTransform4f
 
-    def card(level, x, z, half):
-        return {
-            "type": "rectangle",
-            "to_world": mi.ScalarTransform4f().translate([x, 0, z]).scale(half),
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": level}},
-        }
+    def card(level, place):
+        light = {"type": "area", "radiance": {"type": "rgb", "value": level}}
+        return {"type": "rectangle", "to_world": place, "emitter": light}
 
-    return render.MitsubaScene({"front": card(front, -2.0, 1.0, 2.0), "behind": card(behind, 0, 0, 4.0)})
+    near, far = T().translate([-2.0, 0, 1.0]).scale(2.0), T().scale(4.0)
+    return render.MitsubaScene({"front": card(front, near), "behind": card(behind, far)})
+
+
+ABOVE = look_at((0.0, 0.0, 1.5), (0, 0, 0), down=(0, 1, 0))
+
+
+def test_more_rays_per_pixel_for_hard_edges():
+    """The edge of a card before a pinhole: 16 rays per pixel are the means of the parts they lie in."""
+    seen = half_before(100.0, 50.0), (ABOVE @ se3_exp(torch.tensor([0, 0, 0, 0, 0, 0.3], dtype=D)))[None]
+    cam = camera(lens.Pinhole(10.0), 24, 20)
+    few, many = (
+        render.psf_frames(cam, *seen, render.psf_map(cam, rays_per_px=n)) - render.frames(cam, *seen)
+        for n in (4, 64)
+    )
+    # the share of a pixel behind an edge is known to half a row of points, 1 / 16, with 64 in a square
+    assert float(many.abs().max()) < 50 / 16 + 0.5
+    assert float(many.norm()) < 0.5 * float(few.norm())
 
 
 @pytest.mark.parametrize("blurred", ["front", "behind"])
 def test_the_edge_of_a_near_card(blurred):
     """A blurred card before a sharp wall: the integral of a disc; a sharp card before a blurred wall: a sharp
     edge, nothing of the wall on the card."""
-    pose = look_at((0.0, 0.0, 1.5), (0, 0, 0), down=(0, 1, 0))
     cam = camera(lens.ThinLens(10.0, 2.0).focus_at(1.5 if blurred == "front" else 0.5), 41, 8)
-    row = render.psf_frames(cam, half_before(100.0, 50.0), pose[None])[0, 4]
+    row = render.psf_frames(cam, half_before(100.0, 50.0), ABOVE[None])[0, 4]
     row = row if float(row[0]) > 75 else row.flip(0)
     x = torch.arange(41.0) - 20
     share = (row - 50) / 50
@@ -222,12 +219,11 @@ def test_gradients_are_those_of_differences_and_near_those_of_traced_frames(gene
 
 def test_depth_of_mitsuba_scenes_has_the_gradient_of_tangent_planes():
     scene = worlds.room()
-    pose = look_at((0.1, -1, 1.1), (0, 0.8, 0.5))
-    rays = camera(THIN, 12, 8, 1, 0.5).rays()
+    cam = camera(THIN, 12, 8, 1, 0.5)
     twist = torch.zeros(6, dtype=D, requires_grad=True)
-    _, per_m = light_and_nearness(rays, views_of(scene, (pose @ se3_exp(twist))[None]))
-    points, depth, valid = render.truth.world_points(rays, scene, pose @ se3_exp(twist))
-    assert bool(valid.all())
-    torch.testing.assert_close(1 / per_m[0].double(), depth, rtol=1e-5, atol=0)
-    found, truth = (torch.autograd.grad(v.sum(), twist)[0] for v in (1 / per_m[0].double(), depth))
+    poses = (look_at((0.1, -1, 1.1), (0, 0.8, 0.5)) @ se3_exp(twist))[None]
+    _, per_m = light_and_nearness(cam.rays(), views_of(scene, poses))
+    depth, truth = 1 / per_m[0].double(), render.view(cam, scene, poses, 0).depth_m.reshape(-1)
+    torch.testing.assert_close(depth, truth, rtol=1e-5, atol=0)
+    found, truth = (torch.autograd.grad(v.sum(), twist, retain_graph=True)[0] for v in (depth, truth))
     torch.testing.assert_close(found, truth, rtol=1e-4, atol=1e-4 * float(truth.norm()))

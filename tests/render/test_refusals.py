@@ -27,28 +27,26 @@ STILL = torch.eye(4, dtype=D).repeat(3, 1, 1)
 PINHOLE = lens.Pinhole(8.0)
 CAMERA = Camera(PINHOLE, 6, 4, 0.5, 2)
 NARROW = Camera(lens.load("cooke-triplet").scaled(0.1), 32, 24, 0.1, 4)
+THIN = Camera(lens.ThinLens(10.0, 2.0).focus_at(1.0), 48, 40, 0.02, 256)
+SHEET = {"type": "rectangle"}
+GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
 # any argument may be given to these
 make: Any = Camera
 show: Any = render
-lit: Any = light
-optics: Any = lens
+
+
+def refused(*calls):
+    """Tests of rows (call, kind of error, part of the sentence)."""
+    return pytest.mark.parametrize(("call", "kind", "sentence"), calls)
 
 
 def area(value):
     return {"type": "area", "radiance": {"type": "rgb", "value": value}}
 
 
-def picture(value):
-    bitmap = backend.mitsuba().Bitmap(np.full((2, 2, 1), value, dtype=np.float32))
-    return {"type": "area", "radiance": {"type": "bitmap", "bitmap": bitmap, "raw": True}}
-
-
-def mesh(vertices=SQUARE, faces=FACES, radiance=(5.0, 5.0)):
-    return emissive_mesh(backend.mitsuba(), vertices, faces, np.array(radiance))
-
-
-def cube(**surface):
-    return {"type": "cube", **surface}
+def mesh(vertices=SQUARE, faces=FACES, radiance: Any = (5.0, 5.0)):
+    radiance = radiance if isinstance(radiance, dict) else np.array(radiance)
+    return emissive_mesh(backend.mitsuba(), vertices, faces, radiance)
 
 
 def with_vertex(value):
@@ -63,17 +61,6 @@ def moving(poses: Any, scene: Any = PLANE):
 
 def flat(level):
     return worlds.wall(np.full((8, 8), level, dtype=np.float32))
-
-
-def file_of(folder, faces):
-    """A triangle in a file of its own, with these vertices for its face."""
-    header = (
-        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    path = folder / "part.ply"
-    path.write_text(f"{header}0 0 0\n1 0 0\n0 1 0\n3 {faces}\n")
-    return {"part": {"type": "ply", "filename": str(path), "emitter": area(1.0)}}
 
 
 class Shining(TexturedPlane):
@@ -95,18 +82,7 @@ class Brighter(MitsubaScene):
         return 2 * super().radiance(arr, origin, direction)
 
 
-class Glow:
-    """A scene that does not say how far away its light comes from."""
-
-    dtype = D
-
-    def radiance(self, arr, origin, direction):
-        return arr.Float(1)
-
-
-def refused(calls):
-    """Tests of a table of (call, kind of error, part of the sentence)."""
-    return pytest.mark.parametrize(("call", "kind", "sentence"), calls)
+# ---- scenes
 
 
 def placed_nowhere():
@@ -116,77 +92,47 @@ def placed_nowhere():
 
 def unpainted():
     named = {"type": "area", "radiance": {"type": "mesh_attribute", "name": "face_colour"}}
-    return MitsubaScene({"painted": emissive_mesh(backend.mitsuba(), SQUARE, FACES, named)})
+    return MitsubaScene({"painted": mesh(radiance=named)})
 
 
-def unlit(*names):
-    """Shapes that Mitsuba joins where they look alike."""
-    return MitsubaScene(
-        {"lamp": cube(emitter=area(3.0)), **{n: cube(bsdf={"type": "diffuse"}) for n in names}}
-    )
+def unlit():
+    """Shapes that Mitsuba joins, as they look alike."""
+    dull = {"type": "cube", "bsdf": {"type": "diffuse"}}
+    return MitsubaScene({"lamp": {"type": "cube", "emitter": area(3.0)}, "table": dull, "chair": dull})
 
 
 def loaded():
     """A scene of Mitsuba, not yet one of ours."""
-    return backend.mitsuba().load_dict({"type": "scene", "wall": {"type": "rectangle"}})
+    return backend.mitsuba().load_dict({"type": "scene", "wall": SHEET})
 
 
 @refused(
-    [
-        (lambda: mesh(with_vertex(math.nan)), DomainError, r"1 of 4 vertices are NaN .*\(first number 3\)"),
-        (
-            lambda: mesh(faces=np.array([[0, 1, 4]]), radiance=[1.0]),
-            DomainError,
-            "but it has 4, counted from 0",
-        ),
-        (lambda: mesh(faces=np.zeros((0, 3), dtype=int), radiance=[]), ShapeError, r"its faces are \(0, 3\)"),
-        (lambda: mesh(radiance=[1.0, 2.0, 3.0]), ShapeError, "3 values of radiance per face for 2"),
-        (
-            lambda: emissive_mesh(backend.mitsuba(), SQUARE, FACES, area(1.0), uv=np.zeros((1, 2))),
-            ShapeError,
-            "1 values of texture coordinates for 4",
-        ),
-        (placed_nowhere, DomainError, "shape 'ball': its place or size is NaN or infinite"),
-        (unpainted, DomainError, "'painted': the mesh has no attribute 'face_colour'"),
-        (
-            lambda: unlit("table", "chair"),
-            DomainError,
-            r"shape '(table|chair)', '(table|chair)' has no emitter",
-        ),
-        (lambda: MitsubaScene(loaded()), DomainError, "'wall' has no emitter"),
-        (
-            lambda: MitsubaScene({"shape": {"type": "no-such-shape"}}),
-            DomainError,
-            "Mitsuba cannot build the scene",
-        ),
-        (lambda: show.MitsubaScene("scene.xml"), DomainError, "got a str; .* worlds.from_mitsuba"),
-        (
-            lambda: worlds.wall(np.full((4, 4), math.nan)),
-            DomainError,
-            "texture of the scene: NaN or infinite",
-        ),
-        (lambda: worlds.room(photos=[np.ones(64)]), DomainError, r"shape \(64,\)"),
-        (lambda: moving(1.1 * STILL), DomainError, "object 'card': poses are not rigid"),
-        (lambda: moving(STILL[0]), ShapeError, "object 'card': poses must be"),
-        (
-            lambda: MovingScene(PLANE, {"a": (PLANE, STILL), "b": (PLANE, STILL[:2])}),
-            ShapeError,
-            r"\{'a': 3, 'b': 2\} poses",
-        ),
-        (lambda: moving(STILL, moving(STILL)), DomainError, "itself a moving scene"),
-        (
-            lambda: moving(STILL, Brighter({"ball": cube(emitter=area(1.0))})),
-            DomainError,
-            "part 'card', a Brighter, does not say how far",
-        ),
-        (lambda: show.MovingScene(PLANE, {"a": PLANE}), DomainError, "objects are a dictionary"),
-        (lambda: TexturedPlane([[math.nan, 1]], [1.0], [0.0]), DomainError, "frequency_per_m"),
-        (
-            lambda: TexturedPlane([[1, 1], [1, 2]], [1.0], [0.0, 1.0]),
-            DomainError,
-            "2 frequencies, 1 amplitudes",
-        ),
-    ]
+    (lambda: mesh(with_vertex(math.nan)), DomainError, r"1 of 4 vertices are NaN .*\(first number 3\)"),
+    (lambda: mesh(faces=np.array([[0, 1, 4]]), radiance=[1.0]), DomainError, "but it has 4, counted from 0"),
+    (lambda: mesh(radiance=[1.0, 2.0, 3.0]), ShapeError, "3 values of radiance per face for 2"),
+    (placed_nowhere, DomainError, "shape 'ball': its place or size is NaN or infinite"),
+    (unpainted, DomainError, "'painted': the mesh has no attribute 'face_colour'"),
+    (unlit, DomainError, r"shape '(table|chair)', '(table|chair)' has no emitter"),
+    (lambda: MitsubaScene(loaded()), DomainError, "'wall' has no emitter"),
+    (lambda: MitsubaScene({"a": {"type": "no-such"}}), DomainError, "Mitsuba cannot build the scene"),
+    (lambda: show.MitsubaScene("scene.xml"), DomainError, "got a str; .* worlds.from_mitsuba"),
+    (lambda: worlds.wall(np.full((4, 4), math.nan)), DomainError, "texture of the scene: NaN or infinite"),
+    (lambda: moving(1.1 * STILL), DomainError, "object 'card': poses are not rigid"),
+    (lambda: moving(STILL[0]), ShapeError, "object 'card': poses must be"),
+    (
+        lambda: MovingScene(PLANE, {"a": (PLANE, STILL), "b": (PLANE, STILL[:2])}),
+        ShapeError,
+        r"\{'a': 3, 'b': 2\} poses",
+    ),
+    (lambda: moving(STILL, moving(STILL)), DomainError, "itself a moving scene"),
+    (
+        lambda: moving(STILL, Brighter({"ball": {"type": "cube", "emitter": area(1.0)}})),
+        DomainError,
+        "part 'card', a Brighter, does not say how far",
+    ),
+    (lambda: show.MovingScene(PLANE, {"a": PLANE}), DomainError, "objects are a dictionary"),
+    (lambda: TexturedPlane([[math.nan, 1]], [1.0], [0.0]), DomainError, "frequency_per_m"),
+    (lambda: TexturedPlane([[1, 1], [1, 2]], [1.0], [0.0, 1.0]), DomainError, "2 frequencies, 1 amplitudes"),
 )
 def test_scenes_that_cannot_be(call, kind, sentence):
     with pytest.raises(kind, match=sentence):
@@ -205,9 +151,14 @@ def test_a_mesh_of_ones_own_is_looked_at_before_mitsuba_uses_it():
 
 
 def test_files_are_looked_at_before_they_end_the_process(tmp_path):
+    """A triangle in a file of its own."""
+    (tmp_path / "part.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        "0 0 0\n1 0 0\n0 1 0\n3 0 1 9999999\n"
+    )
     with pytest.raises(DomainError, match="mesh 'part': its faces name vertices 0 to 9999999, but it has 3"):
-        MitsubaScene(file_of(tmp_path, "0 1 9999999"))
-    assert MitsubaScene(file_of(tmp_path, "0 1 2")).scene
+        MitsubaScene({"part": {"type": "ply", "filename": str(tmp_path / "part.ply"), "emitter": area(1.0)}})
     (tmp_path / "broken.png").write_bytes(b"not a picture")
     with pytest.raises(FileFormatError, match=r"broken\.png cannot be read"):
         textures.photo(tmp_path / "broken.png")
@@ -215,16 +166,19 @@ def test_files_are_looked_at_before_they_end_the_process(tmp_path):
 
 @pytest.mark.parametrize("value", [-2.0, math.nan, math.inf])
 def test_radiance_is_finite_and_at_least_0_wherever_it_stands(value):
-    mi = backend.mitsuba()
-    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.full((4, 8, 3), value, dtype=np.float32))}
-    checks = {"type": "checkerboard", "color1": {"type": "rgb", "value": value}}
+    bitmap = backend.mitsuba().Bitmap(np.full((4, 8, 3), value, dtype=np.float32))
+    rgb = {"type": "rgb", "value": value}
+    for light_of in (
+        rgb,
+        {"type": "bitmap", "bitmap": bitmap, "raw": True},
+        {"type": "checkerboard", "color1": rgb},
+    ):
+        with pytest.raises(DomainError, match=r"radiance of 'wrong': .* negative, NaN or infinite"):
+            MitsubaScene({"wrong": {"type": "cube", "emitter": {"type": "area", "radiance": light_of}}})
     for entry in (
-        cube(emitter=area(value)),
-        cube(emitter=picture(value)),
-        cube(emitter={"type": "area", "radiance": checks}),
-        {"type": "constant", "radiance": {"type": "rgb", "value": value}},
-        {"type": "point", "intensity": {"type": "rgb", "value": value}},
-        sky,
+        {"type": "constant", "radiance": rgb},
+        {"type": "point", "intensity": rgb},
+        {"type": "envmap", "bitmap": bitmap},
     ):
         with pytest.raises(DomainError, match=r"radiance of 'wrong': .* negative, NaN or infinite"):
             MitsubaScene({"wrong": entry})
@@ -232,25 +186,14 @@ def test_radiance_is_finite_and_at_least_0_wherever_it_stands(value):
         MitsubaScene({"wrong": mesh(radiance=(1.0, value))})
 
 
-def test_black_shapes_are_there_where_black_is_meant_or_light_is_worked_out():
-    wall = {
-        "type": "rectangle",
-        "to_world": backend.mitsuba().ScalarTransform4f().scale(4.0),
-        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
-    }
-    black = render.frames(CAMERA, MitsubaScene({"wall": {**wall, "emitter": area(0.0)}}), POSES)
+def test_black_shapes_are_there_where_black_is_meant():
+    black = render.frames(
+        CAMERA, MitsubaScene({"wall": {**SHEET, "bsdf": GREY, "emitter": area(0.0)}}), POSES
+    )
     assert torch.equal(black, torch.zeros_like(black))
-    sky = {"wall": wall, "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 8.0}}}
-    for scene in (light.PathScene(sky, samples=256), light.bake(sky, texel_m=1.0, samples=64)):
-        # a white furnace: albedo times the sky's radiance; at least 4096 paths of a standard deviation of about
-        # 1, five standard errors
-        assert float(render.frames(CAMERA, scene, POSES).mean()) == pytest.approx(0.5 * 8.0, abs=5 / 64)
 
 
-# ---- devices
-
-
-@pytest.mark.parametrize("device", ["gpu", "CPU", "cuda:1", "mps", "", None])
+@pytest.mark.parametrize("device", ["gpu", "cuda:1", None])
 def test_an_unknown_device_is_refused_wherever_one_is_taken(device):
     for build in (
         lambda: MitsubaScene({}, device),
@@ -276,27 +219,30 @@ def test_devices_may_be_those_of_torch():
 
 
 def test_numpy_arrays_and_lists_are_poses_too():
-    expected = render.frames(CAMERA, PLANE, POSES)
-    for given in (POSES.numpy(), POSES.tolist(), list(POSES), [POSES[0].numpy(), POSES[1].numpy()]):
-        assert torch.equal(render.frames(CAMERA, PLANE, given), expected)
-        assert torch.equal(
-            render.true_flow(CAMERA, PLANE, given)[0], render.true_flow(CAMERA, PLANE, POSES)[0]
-        )
-        assert torch.equal(torch.cat(list(render.frame_chunks(CAMERA, PLANE, given, 1))), expected)
-        assert torch.equal(render.camera_velocity(given, [0.0, 1.0])[0], torch.zeros(1, 6).double())
-        assert render.view(CAMERA, PLANE, given, 1).valid.all()
-        assert render.psf_frames(CAMERA, PLANE, given).shape == expected.shape
+    for tell in (
+        lambda poses: render.frames(CAMERA, PLANE, poses),
+        lambda poses: render.true_flow(CAMERA, PLANE, poses)[0],
+        lambda poses: torch.cat(list(render.frame_chunks(CAMERA, PLANE, poses, 1))),
+        lambda poses: render.camera_velocity(poses, [0.0, 1.0])[0],
+        lambda poses: render.view(CAMERA, PLANE, poses, 1).points_world_m,
+        lambda poses: render.psf_frames(CAMERA, PLANE, poses),
+    ):
+        for given in (POSES.numpy(), POSES.tolist(), list(POSES), [POSES[0].numpy(), POSES[1].numpy()]):
+            assert torch.equal(tell(given), tell(POSES))
     assert as_poses(np.eye(4, dtype=np.float32)).dtype == torch.float64
 
 
 def test_a_list_of_tensors_keeps_their_gradient():
+    weight = torch.linspace(-1, 1, 48).reshape(2, 4, 6)
+
+    def gradient(poses, inputs):
+        return torch.autograd.grad((render.frames(CAMERA, PLANE, poses) * weight).sum(), inputs)
+
     poses = [POSES[k].clone().requires_grad_() for k in range(2)]
     whole = POSES.clone().requires_grad_()
-    weight = torch.linspace(-1, 1, 48).reshape(2, 4, 6)
-    parts = torch.autograd.grad((render.frames(CAMERA, PLANE, poses) * weight).sum(), poses)
-    (expected,) = torch.autograd.grad((render.frames(CAMERA, PLANE, whole) * weight).sum(), whole)
+    (expected,) = gradient(whole, whole)
     assert float(expected.abs().max()) > 0
-    assert torch.equal(torch.stack(parts), expected)
+    assert torch.equal(torch.stack(gradient(poses, poses)), expected)
 
 
 @pytest.mark.parametrize("call", [render.frames, render.true_flow])
@@ -305,7 +251,6 @@ def test_a_list_of_tensors_keeps_their_gradient():
     [
         (POSES.half(), DomainError, "poses are torch.float16; give float32 or float64"),
         ([[1.0, 2.0], [3.0]], DomainError, "poses are a list that holds no real numbers"),
-        (None, DomainError, "poses are a NoneType that holds no real numbers"),
         ([POSES[0], POSES[0, :3]], ShapeError, r"a list of tensors \[\(3, 4\), \(4, 4\)\]"),
         (POSES[0], ShapeError, r"got \(4, 4\); for one pose give pose\[None\]"),
         ([], ShapeError, r"T >= 1"),
@@ -320,18 +265,16 @@ def test_poses_that_are_none(call, poses, kind, sentence):
         call(CAMERA, PLANE, poses)
 
 
-@pytest.mark.parametrize("call", [render.frames, render.true_flow, render.flow_and_occlusion])
+SEVERAL = STILL.repeat(3, 1, 1, 1)
+
+
+@pytest.mark.parametrize("call", [render.frames, render.flow_and_occlusion])
 @pytest.mark.parametrize(
     ("scene", "poses", "sentence"),
     [
-        ([PLANE, PLANE], POSES.repeat(3, 1, 1, 1), r"2 scenes for poses \(3, 2, 4, 4\): give one scene"),
-        ([PLANE, PLANE], POSES, r"2 scenes for poses \(2, 4, 4\)"),
-        (
-            moving(STILL.repeat(3, 1, 1, 1)),
-            STILL.repeat(2, 1, 1, 1),
-            r"batch \(3,\) of .*, the camera for \(2,\)",
-        ),
-        (moving(STILL.repeat(3, 1, 1, 1)), STILL, r"batch \(3,\) of trajectories, the camera for \(\)"),
+        ([PLANE, PLANE], SEVERAL, r"2 scenes for poses \(3, 3, 4, 4\): give one scene"),
+        (moving(SEVERAL), SEVERAL[:2], r"batch \(3,\) of .*, the camera for \(2,\)"),
+        (moving(SEVERAL), STILL, r"batch \(3,\) of trajectories, the camera for \(\)"),
         (moving(STILL), POSES, "'card' has 3 poses for 2 frames"),
     ],
 )
@@ -350,22 +293,17 @@ def test_scenes_and_poses_that_do_not_fit(call, scene, poses, sentence):
         (loaded(), r"the scene is a Scene, .* worlds.from_mitsuba\(scene\)"),
     ],
 )
-def test_what_is_no_scene(scene, sentence):
-    for call in (
-        lambda: render.frames(CAMERA, scene, POSES),
-        lambda: render.true_flow(CAMERA, scene, POSES),
-        lambda: render.check_view(CAMERA, scene, POSES),
-        lambda: moving(POSES, scene),
-    ):
-        with pytest.raises(DomainError, match=sentence):
-            call()
+@pytest.mark.parametrize("call", [render.frames, render.true_flow, render.check_view])
+def test_what_is_no_scene(call, scene, sentence):
+    with pytest.raises(DomainError, match=sentence):
+        call(CAMERA, scene, POSES)
 
 
 # ---- cameras, frames, truth
 
 
-def boundary(per_px: Any):
-    return render.frames(CAMERA, worlds.blank_room(), POSES, gradient="boundary", per_px=per_px)
+def film(*windows):
+    return make(PINHOLE, 4, 4, 0.1, film=Film(10, 10, 4, 4, 0.1, windows))
 
 
 def too_many():
@@ -378,76 +316,55 @@ def differences_to_an_object():
     return render.frames(CAMERA, moving(asks), STILL, gradient="difference")
 
 
-def backwards_through_paths():
-    """A lamp seen by path tracing."""
-    efl = torch.tensor(6.0, dtype=D, requires_grad=True)
-    scene = light.PathScene({"lamp": cube(emitter=area(1.0))}, samples=1)
-    render.frames(Camera(lens.Pinhole(efl), 4, 3, 0.6, 2), scene, POSES[:1]).sum().backward()
-
-
 @refused(
-    [
-        (lambda: make(None, 8, 8, 0.1), DomainError, "a NoneType has no camera_rays"),
-        (lambda: make(lens.Pinhole, 8, 8, 0.1), DomainError, "so it is no lens"),
-        (
-            lambda: make(PINHOLE, 8, 8, 0.1, film=show.Film(9, 9, 8, 8, 0.1, ((0,),))),
-            DomainError,
-            r"window \(0,\) is no pair",
-        ),
-        (
-            lambda: make(PINHOLE, 8, 8, 0.1, film=Film(10, 10, 4, 4, 0.1, ((8, 0),))),
-            DomainError,
-            r"window \(8, 0\)",
-        ),
-        (lambda: make(PINHOLE, 8, 8, 0.1, film=Film(10, 10, 4, 4, 0.1, ())), DomainError, "no window"),
-        (
-            lambda: Camera(PINHOLE, 200_000, 200_000, 0.001),
-            DomainError,
-            r"6.4e\+11 rays per frame, at least 5.25e\+04 GiB; this machine has",
-        ),
-        (
-            lambda: show.frames(PINHOLE, PLANE, POSES),
-            DomainError,
-            "the camera is a Pinhole; give a render.Camera",
-        ),
-        (lambda: show.frames(CAMERA, PLANE, POSES, "exact"), DomainError, "choose one of interior, boundary"),
-        (lambda: show.frames(CAMERA, PLANE, POSES, rays=3), DomainError, "a int was given as rays"),
-        (
-            lambda: show.frames(CAMERA, PLANE, POSES, rays=NARROW.rays()),
-            ShapeError,
-            "3072 rays for a camera of 24 pixels with 2 samples",
-        ),
-        (
-            lambda: show.frames(CAMERA, PLANE, POSES, "auto", rays=CAMERA.rays()),
-            DomainError,
-            "leave rays out",
-        ),
-        (
-            lambda: render.frames(Camera(Barrel(), 8, 8, 1.0, 1), PLANE, POSES, gradient="difference"),
-            DomainError,
-            "no step for the lens's parameter 'efl_mm_'",
-        ),
-        (differences_to_an_object, DomainError, "the pose of an object asks for one"),
-        *((lambda v=v: boundary(v), DomainError, "per_px = ") for v in (0, math.nan, math.inf, "2")),
-        (
-            lambda: show.shade(CAMERA.rays(), PLANE, POSES, 5),
-            ShapeError,
-            "48 rays are not a whole number of pixels",
-        ),
-        (too_many, DomainError, r"4294967296 rays .* \(frame_chunks\)"),
-        (lambda: show.view(CAMERA, PLANE, POSES, 2), ShapeError, "frame 2 of a sequence of 2"),
-        *(
-            (lambda n=n: render.true_flow(CAMERA, PLANE, POSES, n), ShapeError, "whole stride of at least 1")
-            for n in (0, 2, 1.5, math.nan)
-        ),
-        (
-            lambda: show.project(CAMERA, torch.ones(3, 2)),
-            ShapeError,
-            r"points .* \[..., N, 3\], got \(3, 2\)",
-        ),
-        (lambda: render.project(CAMERA, torch.tensor([[0.0, 0.0, -1.0]])), DomainError, "behind the camera"),
-        (lambda: render.project(CAMERA, torch.full((1, 3), math.nan)), DomainError, "points to project"),
-    ]
+    (lambda: make(None, 8, 8, 0.1), DomainError, "a NoneType has no camera_rays"),
+    (lambda: make(lens.Pinhole, 8, 8, 0.1), DomainError, "so it is no lens"),
+    (lambda: film((0,)), DomainError, r"window \(0,\) is no pair"),
+    (lambda: film((8, 0)), DomainError, r"window \(8, 0\)"),
+    (film, DomainError, "no window"),
+    (
+        lambda: Camera(PINHOLE, 200_000, 200_000, 0.001),
+        DomainError,
+        r"6.4e\+11 rays per frame, at least 5.25e\+04 GiB; this machine has",
+    ),
+    (
+        lambda: show.frames(PINHOLE, PLANE, POSES),
+        DomainError,
+        "the camera is a Pinhole; give a render.Camera",
+    ),
+    (lambda: show.frames(CAMERA, PLANE, POSES, "exact"), DomainError, "choose one of interior, boundary"),
+    (lambda: show.frames(CAMERA, PLANE, POSES, rays=3), DomainError, "a int was given as rays"),
+    (
+        lambda: show.frames(CAMERA, PLANE, POSES, rays=NARROW.rays()),
+        ShapeError,
+        "3072 rays for a camera of 24 pixels with 2 samples",
+    ),
+    (
+        lambda: show.frames(CAMERA, PLANE, POSES, "auto", rays=CAMERA.rays()),
+        DomainError,
+        "leave rays out",
+    ),
+    (
+        lambda: render.frames(Camera(Barrel(), 8, 8, 1.0, 1), PLANE, POSES, gradient="difference"),
+        DomainError,
+        "no step for the lens's parameter 'efl_mm_'",
+    ),
+    (differences_to_an_object, DomainError, "the pose of an object asks for one"),
+    (
+        lambda: render.frames(CAMERA, worlds.blank_room(), POSES, "boundary", per_px=math.nan),
+        DomainError,
+        "per_px = ",
+    ),
+    (lambda: show.shade(CAMERA.rays(), PLANE, POSES, 5), ShapeError, "48 rays are not a whole number"),
+    (too_many, DomainError, r"4294967296 rays .* \(frame_chunks\)"),
+    (lambda: show.view(CAMERA, PLANE, POSES, 2), ShapeError, "frame 2 of a sequence of 2"),
+    *(
+        (lambda n=n: show.true_flow(CAMERA, PLANE, POSES, n), ShapeError, "whole stride of at least 1")
+        for n in (0, 2, 1.5)
+    ),
+    (lambda: show.project(CAMERA, torch.ones(3, 2)), ShapeError, r"points .* \[..., N, 3\], got \(3, 2\)"),
+    (lambda: render.project(CAMERA, torch.tensor([[0.0, 0.0, -1.0]])), DomainError, "behind the camera"),
+    (lambda: render.project(CAMERA, torch.full((1, 3), math.nan)), DomainError, "points to project"),
 )
 def test_cameras_and_frames_that_cannot_be(call, kind, sentence):
     with pytest.raises(kind, match=sentence):
@@ -460,49 +377,43 @@ def test_more_frames_than_memory_holds_are_refused(monkeypatch):
     with pytest.raises(DomainError, match=r"4.8e\+03 rays .* render fewer frames at a time"):
         render.frames(CAMERA, PLANE, POSES[:1].expand(100, 4, 4))
     window = Film(200_000, 200_000, 8, 8, 0.001, ((99_996, 99_996),))
-    assert Camera(lens.Pinhole(8.0), 8, 8, 0.001, 1, film=window).rays().weight.numel() == 64
+    assert Camera(PINHOLE, 8, 8, 0.001, 1, film=window).rays().weight.numel() == 64
 
 
 # ---- views
 
 
-def ball_that_comes_nearer():
+def nearing():
+    """A ball that comes nearer to a camera 2 m above."""
     ball = MitsubaScene({"ball": {"type": "sphere", "radius": 0.2, "emitter": area(9.0)}})
-    poses = torch.eye(4, dtype=D).repeat(2, 1, 1)
+    poses = STILL[:2].clone()
     poses[:, 2, 3] = torch.tensor([0.5, 1.9])
     return MovingScene(PLANE, {"ball": (ball, poses)})
 
 
-def towards(*views):
-    return torch.stack([look_at(*view) for view in views])
+def towards(*views, down=(0, 0, -1)):
+    return torch.stack([look_at(*view, down=down) for view in views])
 
 
-UP = look_at((0, 0, 2.0), (0, 0, 4.0), down=(0, 1, 0))
-INSIDE = ((0.5, -1.2, 1.4), (0, 1, 0.8))
+DOWN = towards(*[((0, 0, 2.0), (0, 0, 0))] * 2, down=(0, 1, 0))
+UP = towards(((0, 0, 2.0), (0, 0, 4.0)), down=(0, 1, 0))
+LOW = towards(((0.5, -1.2, 1.4), (0, 1, 0.8)), ((0.1, 0.5, 0.25), (0, 1, 0.3)))
 
 
 @pytest.mark.parametrize(
     ("scene", "poses", "sentence"),
     [
         (lambda: PLANE, 1.01 * POSES, "not rigid"),
-        (
-            worlds.room,
-            towards(INSIDE, ((0.1, 0.5, 0.25), (0, 1, 0.3))),
-            "frame 1: 100% .* meet surfaces from behind",
-        ),
+        (worlds.room, LOW, "frame 1: 100% .* meet surfaces from behind"),
         (lambda: worlds.room(objects=False), towards(((0, -4.0, 1.3), (0, 0, 1.3))), "behind a wall"),
         (lambda: flat(50.0), towards(((0, -2.0, 0), (0, -3.0, 0))), "frame 0 is empty"),
-        (lambda: PLANE, torch.stack([ABOVE, ABOVE, ABOVE, UP]).unflatten(0, (2, 2)), "frame 3 is empty"),
+        (lambda: PLANE, torch.cat([DOWN, DOWN[:1], UP]).unflatten(0, (2, 2)), "frame 3 is empty"),
         (
             lambda: PLANE,
-            look_at((0, 0, 2e-4), (0, 0, 0), down=(0, 1, 0))[None],
+            towards(((0, 0, 2e-4), (0, 0, 0)), down=(0, 1, 0)),
             "0.201 mm before the camera, which is less than the radius",
         ),
-        (
-            ball_that_comes_nearer,
-            look_at((0, 0, 2.0), (0, 0, 0), down=(0, 1, 0)).repeat(2, 1, 1),
-            "frame 1: 100%",
-        ),
+        (nearing, DOWN, "frame 1: 100%"),
         (lambda: Shining(-3.0), POSES, "frame 0 has a radiance of -3"),
     ],
 )
@@ -514,41 +425,26 @@ def test_views_no_camera_could_have(scene, poses, sentence):
 # ---- time
 
 
-def exposed(t_s: Any = (0.0,), exposure_s: Any = 0.01, samples: Any = 4, scale=1.0):
-    return render.exposed_frames(
-        CAMERA, PLANE, lambda t: scale * ABOVE.repeat(len(t), 1, 1), list(t_s), exposure_s, samples
-    )
-
-
-def adaptive(start_s: Any = 0.0, end_s: Any = 1.0, largest_px: Any = 0.5, every_px: Any = 1, jump_m=0.0):
+def jumping():
     def path(t):
         twist = torch.zeros(len(t), 6, dtype=D)
-        twist[:, 0] = torch.where(t > 0.5, jump_m, 0.0)
+        twist[:, 0] = torch.where(t > 0.5, 0.5, 0.0)
         return ABOVE @ se3_exp(twist)
 
-    return render.adaptive_times(CAMERA, PLANE, path, start_s, end_s, largest_px, every_px)
+    return render.adaptive_times(CAMERA, PLANE, path, 0.0, 1.0, 0.5)
+
+
+def half_a_turn():
+    return se3_exp(torch.tensor([[0.0] * 6, [0, 0, 0, 0, 3.1, 0]], dtype=D))
 
 
 @refused(
-    [
-        (lambda: adaptive(jump_m=0.5), DomainError, "jumps by"),
-        (lambda: render.crossing_error_px(1.0, 8.0, 0), DomainError, "slope = 0"),
-        (
-            lambda: render.frame_chunks(CAMERA, moving(STILL), POSES, 1),
-            ShapeError,
-            "'card' has 3 poses for 2",
-        ),
-        (lambda: render.camera_velocity(STILL, [0.0, 1.0]), ShapeError, "one time per pose"),
-        (lambda: render.camera_velocity(STILL[:1], [0.0]), ShapeError, "at least two"),
-        (lambda: render.camera_velocity(STILL, [0.0, 1.0, 1.0]), DomainError, "must increase"),
-        (
-            lambda: render.camera_velocity(
-                se3_exp(torch.tensor([[0.0] * 6, [0, 0, 0, 0, 3.1, 0]], dtype=D)), [0.0, 1.0]
-            ),
-            DomainError,
-            "turns by 178 degrees",
-        ),
-    ]
+    (jumping, DomainError, "jumps by"),
+    (lambda: render.frame_chunks(CAMERA, moving(STILL), POSES, 1), ShapeError, "'card' has 3 poses for 2"),
+    (lambda: render.camera_velocity(STILL, [0.0, 1.0]), ShapeError, "one time per pose"),
+    (lambda: render.camera_velocity(STILL[:1], [0.0]), ShapeError, "at least two"),
+    (lambda: render.camera_velocity(STILL, [0.0, 1.0, 1.0]), DomainError, "must increase"),
+    (lambda: render.camera_velocity(half_a_turn(), [0.0, 1.0]), DomainError, "turns by 178 degrees"),
 )
 def test_times_that_cannot_be(call, kind, sentence):
     with pytest.raises(kind, match=sentence):
@@ -557,8 +453,6 @@ def test_times_that_cannot_be(call, kind, sentence):
 
 # ---- light and point spread functions
 
-SHEET = {"type": "rectangle"}
-GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
 COPIES = {
     "group": {"type": "shapegroup", "one": SHEET},
     "a": {"type": "instance", "of": {"type": "ref", "id": "group"}},
@@ -572,38 +466,31 @@ def baked(**surface):
 def covered():
     """A sheet less than the height above it from which it would be looked at."""
     place = backend.mitsuba().ScalarTransform4f()
-    above = place.translate([0, 0, 4.5e-5])
-    sheets = {"a": {**SHEET, "to_world": place.scale(0.5)}, "b": {**SHEET, "to_world": above}}
-    return light.bake({name: {**sheet, "bsdf": GREY} for name, sheet in sheets.items()}, samples=1)
+    sheets = {"a": place.scale(0.5), "b": place.translate([0, 0, 4.5e-5])}
+    return light.bake({n: {**SHEET, "to_world": at, "bsdf": GREY} for n, at in sheets.items()}, samples=1)
 
 
 @refused(
-    [
-        (
-            lambda: baked(bsdf={"type": "conductor"}),
-            DomainError,
-            "shape 'a', a .*, lies behind it or before it",
-        ),
-        (lambda: baked(bsdf={"type": "mask", "bsdf": GREY}), DomainError, "shape 'a', a .*, lies behind it"),
-        (lambda: baked(interior={"type": "homogeneous"}), DomainError, "shape 'a' holds a medium"),
-        (lambda: light.bake(COPIES), DomainError, r"a Instance, has no texture chart here; .*copies instead"),
-        (covered, DomainError, "nothing of shape 'a' can be seen"),
-        (lambda: light.choose({}, CAMERA, POSES, 0.1), DomainError, "no level"),
-        (lambda: light.level_error(flat(1.0), flat(0.0), CAMERA, POSES), DomainError, "black"),
-        (backwards_through_paths, CodesignError, "PathScene has no gradient"),
-    ]
+    (lambda: baked(bsdf={"type": "conductor"}), DomainError, "shape 'a', a .*, lies behind it or before it"),
+    (lambda: baked(bsdf={"type": "mask", "bsdf": GREY}), DomainError, "shape 'a', a .*, lies behind it"),
+    (lambda: baked(interior={"type": "homogeneous"}), DomainError, "shape 'a' holds a medium"),
+    (lambda: light.bake(COPIES), DomainError, r"a Instance, has no texture chart here; .*copies instead"),
+    (covered, DomainError, "nothing of shape 'a' can be seen"),
+    (lambda: light.choose({}, CAMERA, POSES, 0.1), DomainError, "no level"),
+    (lambda: light.level_error(flat(1.0), flat(0.0), CAMERA, POSES), DomainError, "black"),
 )
 def test_light_that_cannot_be(call, kind, sentence):
     with pytest.raises(kind, match=sentence):
         call()
 
 
-THIN = Camera(lens.ThinLens(10.0, 2.0).focus_at(1.0), 48, 40, 0.02, 256)
+class Glow:
+    """A scene that does not say how far away its light comes from."""
 
+    dtype = D
 
-@pytest.fixture(scope="module")
-def psf():
-    return render.psf_map(THIN, nearest_m=1.0)
+    def radiance(self, arr, origin, direction):
+        return arr.Float(1)
 
 
 def hollow():
@@ -612,46 +499,44 @@ def hollow():
     return Camera(lens.GeoLens([ring, back], 20.0), 48, 40, 0.001)
 
 
+@pytest.fixture(scope="module")
+def psf():
+    return render.psf_map(THIN, nearest_m=1.0)
+
+
 @refused(
-    [
-        (
-            lambda psf: psf.energy(torch.tensor([0.5])),
-            DomainError,
-            "0.5 m is nearer than the 1 m.*smaller nearest_m",
-        ),
-        (
-            lambda psf: psf.energy(torch.tensor([2.0]), size_px=3),
-            DomainError,
-            "3 x 3 pixels .* odd number of at least 5",
-        ),
-        (lambda psf: psf.energy(2.0), ShapeError, r"distances must be a list \[D\]"),
-        (lambda psf: psf.offsets_px([1.1]), DomainError, "must lie between 0 and 1 per metre"),
-        (
-            lambda psf: render.psf_frames(
-                THIN, PLANE, look_at((0, 0, 0.5), (0, 0, 0), down=(0, 1, 0))[None], psf
-            ),
-            DomainError,
-            "0.5 m away, nearer than the 1 m of the map",
-        ),
-        (
-            lambda psf: render.psf_map(Camera(lens.ThinLens(10.0, 5.0), 48, 40, 0.02), nearest_m=0.02),
-            DomainError,
-            "blur reaches .* pixels .* larger nearest_m, or render traced",
-        ),
-        (lambda psf: render.psf_map(THIN, rays_per_px=9), DomainError, "rays_per_px = 9"),
-        (
-            lambda psf: render.psf_map(hollow()),
-            DomainError,
-            "central obstruction, which chief rays meet; .* traced frames",
-        ),
-        (lambda psf: render.psf_frames(CAMERA, PLANE, POSES, psf), ShapeError, "make the map of this camera"),
-        (
-            lambda psf: show.psf_frames(THIN, Glow(), POSES, psf),
-            DomainError,
-            "a Glow does not say how far away",
-        ),
-    ]
+    (
+        lambda psf: psf.energy(torch.tensor([0.5])),
+        DomainError,
+        "0.5 m is nearer than the 1 m.*smaller nearest_m",
+    ),
+    (lambda psf: psf.energy(torch.tensor([2.0]), size_px=3), DomainError, "3 x 3 pixels .* odd number"),
+    (lambda psf: psf.energy(2.0), ShapeError, r"distances must be a list \[D\]"),
+    (lambda psf: psf.offsets_px([1.1]), DomainError, "must lie between 0 and 1 per metre"),
+    (
+        lambda psf: render.psf_frames(THIN, PLANE, towards(((0, 0, 0.5), (0, 0, 0)), down=(0, 1, 0)), psf),
+        DomainError,
+        "0.5 m away, nearer than the 1 m of the map",
+    ),
+    (
+        lambda psf: render.psf_map(Camera(lens.ThinLens(10.0, 5.0), 48, 40, 0.02), nearest_m=0.02),
+        DomainError,
+        "blur reaches .* pixels .* larger nearest_m, or render traced",
+    ),
+    (lambda psf: render.psf_map(THIN, rays_per_px=9), DomainError, "rays_per_px = 9"),
+    (lambda psf: render.psf_map(hollow()), DomainError, "central obstruction, .* traced frames"),
+    (lambda psf: render.psf_frames(CAMERA, PLANE, POSES, psf), ShapeError, "make the map of this camera"),
+    (lambda psf: show.psf_frames(THIN, Glow(), POSES, psf), DomainError, "does not say how far away"),
 )
 def test_point_spread_functions_that_cannot_be(psf, call, kind, sentence):
     with pytest.raises(kind, match=sentence):
         call(psf)
+
+
+def test_light_that_is_traced_has_no_gradient():
+    efl = torch.tensor(6.0, dtype=D, requires_grad=True)
+    lamp = light.PathScene({"lamp": {"type": "cube", "emitter": area(1.0)}}, samples=1)
+    frames = render.frames(Camera(lens.Pinhole(efl), 4, 3, 0.6, 2), lamp, POSES[:1])
+    assert float(frames.detach().max()) > 0
+    with pytest.raises(CodesignError, match="PathScene has no gradient"):
+        frames.sum().backward()

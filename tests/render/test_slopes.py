@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from codesign import lens, pose, render
+from codesign import pose, render
 from codesign.errors import GradientError
 from codesign.render import slopes
-from codesign.render.light import PathScene
 from codesign.render.wavefront import look, shade
 from codesign.types import Rays
 
@@ -75,16 +74,6 @@ def test_second_derivatives_are_refused(rays, motion):
     (grad,) = torch.autograd.grad(pictures(*rays, *motion).sum(), motion[:1], create_graph=True)
     with pytest.raises(GradientError, match="first derivatives only"):
         grad.sum().backward()
-
-
-def test_a_scene_without_gradient_is_rendered_and_says_so_when_one_is_asked_for():
-    scene = PathScene({"light": {"type": "constant"}, "ball": {"type": "sphere"}}, samples=1)
-    camera = render.Camera(lens.Pinhole(8.0), 4, 4, pixel_pitch_mm=0.5, samples_per_pixel=1)
-    poses = pose.look_at((0, -4, 1), (0, 0, 0))[None].clone().requires_grad_()
-    image = render.frames(camera, scene, poses)
-    assert float(image.detach().mean()) > 0
-    with pytest.raises(GradientError, match="PathScene has no gradient"):
-        image.sum().backward()
 
 
 @pytest.mark.parametrize("shape", ["sphere", "rectangle", "cube"])

@@ -41,21 +41,6 @@ def test_velocity_in_world_axes_is_that_of_the_centre_and_the_spin_at_the_middle
     torch.testing.assert_close(world[0], torch.cat([velocity, omega]), rtol=0, atol=1e-7)
 
 
-def test_a_camera_that_only_slides_has_the_same_velocity_in_the_world_turned():
-    t_s = trajectories.times(4, 100.0)
-    body, world = camera_velocity(trajectories.translation(start(), (0.1, 0.2, -0.3), t_s), t_s)
-    torch.testing.assert_close(
-        body, torch.tensor([0.1, 0.2, -0.3, 0, 0, 0], dtype=D).expand(3, 6), rtol=0, atol=1e-13
-    )
-    torch.testing.assert_close(
-        world[:, :3],
-        (start()[:3, :3] @ torch.tensor([0.1, 0.2, -0.3], dtype=D)).expand(3, 3),
-        rtol=0,
-        atol=1e-13,
-    )
-    assert float(world[:, 3:].abs().max()) <= 1e-13
-
-
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-8, 1e-4, 9.9e-3, 1.01e-2, 0.5, 1.5, 1.6, 2.9])
 def test_logarithm_is_that_of_the_matrix(angle, generator):
     axis = torch.nn.functional.normalize(torch.randn(3, dtype=D, generator=generator), dim=0)

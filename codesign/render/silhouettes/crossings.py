@@ -4,14 +4,15 @@ Round shapes stand as fine triangles here; their segments are carried onto the t
 of different radiance lie in one plane, one over the other, rounding decides which is met: such views are refused.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.render.silhouettes.curves import Curve, cut, pieces_of
+from codesign.render.rows import Rows
+from codesign.render.silhouettes.curves import Curve, cut_line, on_line
 from codesign.render.silhouettes.edges import ROUNDING, touching, welded
 from codesign.render.silhouettes.shapes import Ball, Disk, Mesh, Shape
 
@@ -20,7 +21,7 @@ BLOCK = 1_000_000  # pairs at a time
 
 
 @dataclass(frozen=True)
-class Triangles:
+class Triangles(Rows):
     """corners: [N, 3, 3]; place: [N, 3], equal for corners of one shape at one place; shape, face: [N], numbers."""
 
     corners: np.ndarray
@@ -28,12 +29,9 @@ class Triangles:
     shape: np.ndarray
     face: np.ndarray
 
-    def __getitem__(self, rows):
-        return Triangles(*(getattr(self, f.name)[rows] for f in fields(self)))
-
 
 @dataclass(frozen=True)
-class Crossings:
+class Crossings(Rows):
     """Segments start, end [n, 3] along which two triangles cross; normals: [n, 2, 3] of these; shapes: [n, 2],
     their numbers."""
 
@@ -41,9 +39,6 @@ class Crossings:
     end: np.ndarray
     normals: np.ndarray
     shapes: np.ndarray
-
-    def __getitem__(self, rows):
-        return Crossings(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -59,11 +54,11 @@ class Overlaps(Curve):
     def pieces(self, viewpoint, angle, within_m=0.0):
         """As for Segments; none of faces that turn away, which are black."""
         kept = torch.nonzero(((viewpoint - self.start) * self.normal).sum(1) > 0)[:, 0]
-        return cut(kept, pieces_of(self.start[kept] - viewpoint, self.end[kept] - viewpoint, angle))
+        return cut_line(self, kept, viewpoint, angle)
 
     def points(self, index, s, viewpoint):
         """As for Segments."""
-        return self.start[index] + s[:, None] * (self.end - self.start)[index]
+        return on_line(self, index, s)
 
     def aside_rad(self, index, viewpoint):
         """Raise DomainError: an overlap may be in view."""
@@ -87,9 +82,8 @@ def find_crossings(shapes: list[Shape], apart_m: float = 0.0) -> tuple[Crossings
     mesh = np.array([isinstance(shape, Mesh) for shape in shapes])[triangles.shape[pairs[:, 0]]]
     pairs = pairs[~own | (mesh & ~_neighbours(triangles.place, pairs))]
     found = [_crossing(triangles, pairs[k : k + BLOCK], noise) for k in range(0, max(len(pairs), 1), BLOCK)]
-    crossed = [part for part, _ in found]
     return (
-        Crossings(*(np.concatenate([getattr(part, f.name) for part in crossed]) for f in fields(Crossings))),
+        Crossings.joined([part for part, _ in found]),
         _overlaps(shapes, triangles, np.concatenate([level for _, level in found]), apart_m),
     )
 
@@ -146,7 +140,7 @@ def _near_others(shapes):
         parts.append(
             Triangles(corners[kept], place[kept], np.full(int(kept.sum()), number), np.nonzero(kept)[0])
         )
-    return Triangles(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Triangles)))
+    return Triangles.joined(parts)
 
 
 def tessellated(shape: Shape) -> tuple[np.ndarray, np.ndarray]:

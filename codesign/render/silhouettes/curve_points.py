@@ -6,7 +6,7 @@ a lens out of focus spreads, and what is left gets points evenly along its lengt
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 from codesign.pose import apply, inverse
 from codesign.render.camera import Camera
 from codesign.render.film import film_pupil_pattern
+from codesign.render.rows import Rows
 
 # length of a piece on the film, and its angle, at most: one that reaches behind the camera is left out
 PIECE_PX = 8.0
@@ -32,7 +33,7 @@ FLOAT32_RAD = 5e-7  # by how much a float32 ray may miss, per length of its coor
 
 
 @dataclass(frozen=True)
-class CurvePoints:
+class CurvePoints(Rows):
     """Sampled points of curves, in the axes of the part of the scene that the curve belongs to.
 
     world_m, ahead_m [n, 3]: the point, and the same curve a little further on. share [n]: how many such steps each
@@ -56,9 +57,6 @@ class CurvePoints:
     frame: Tensor
     part: Tensor
 
-    def __getitem__(self, rows: Any) -> "CurvePoints":
-        return CurvePoints(*(getattr(self, field.name)[rows] for field in fields(self)))
-
 
 def curve_points(
     view: "FieldOfView", curves: Sequence[Sequence[Any]], cameras: Tensor, frames_each: int, per_px: float
@@ -77,13 +75,12 @@ def curve_points(
             for curve in of_part:
                 pieces = _in_view(view, curve, cameras[part], frames)
                 if pieces is not None:
-                    points = _on_pieces(view, curve, pieces, cameras[part], per_px, generator)
-                    found.append((*points, torch.full_like(points[-1], part)))
-    return CurvePoints(*(torch.cat(column) for column in zip(*found, strict=True))) if found else None
+                    found.append(_on_pieces(view, curve, pieces, cameras[part], part, per_px, generator))
+    return CurvePoints.joined(found) if found else None
 
 
 @dataclass(frozen=True)
-class _Pieces:
+class _Pieces(Rows):
     """Pieces of one curve that touch a window in a frame: index [n], bounds [n, 2], what is left of their length on
     the film: start and end share [n], length px [n], depths of their ends [n, 2]; frame and window [n]."""
 
@@ -111,19 +108,19 @@ def _in_view(view, curve, cameras, frames):
             rows, clip = view.clipped(window, *ends)
             if rows.numel():
                 numbers = (torch.full_like(rows, n) for n in (frame, window))
-                found.append((index[rows], bounds[rows], *clip, *numbers))
-    return _Pieces(*(torch.cat(column) for column in zip(*found, strict=True))) if found else None
+                found.append(_Pieces(index[rows], bounds[rows], *clip, *numbers))
+    return _Pieces.joined(found) if found else None
 
 
-def _on_pieces(view, curve, pieces, cameras, per_px, generator):
-    """Columns world_m .. window, frame of points on pieces of one curve."""
+def _on_pieces(view, curve, pieces, cameras, part, per_px, generator):
+    """CurvePoints on pieces of one curve."""
     piece, inside, fraction = places(pieces.length_px, per_px, generator)
-    index = pieces.index[piece]
-    low, high = pieces.bounds[piece].unbind(1)
-    start = pieces.start[piece]
-    kept = pieces.end[piece] - start
-    at = start + inside * kept  # evenly along the film, so in perspective along the piece
-    near, far = pieces.depths_m[piece].unbind(1)
+    pieces = pieces[piece]
+    index, frame = pieces.index, pieces.frame
+    low, high = pieces.bounds.unbind(1)
+    kept = pieces.end - pieces.start
+    at = pieces.start + inside * kept  # evenly along the film, so in perspective along the piece
+    near, far = pieces.depths_m.unbind(1)
     sight = (1 - at) * far + at * near
     s = low + at * near / sight * (high - low)
     share = fraction * kept * near * far / sight.square() / STEP
@@ -131,7 +128,6 @@ def _on_pieces(view, curve, pieces, cameras, per_px, generator):
     turn = torch.randint(PUPILS, (2,), generator=generator)
     number = torch.arange(count)
     pupil = view.pupils[(number + turn[0]) % PUPILS]
-    frame = pieces.frame[piece]
     pose = cameras[frame]
     eye = pose[:, :3, 3]
     viewpoint = eye + (pose[:, :3, :2] @ (pupil * view.aperture_m)[..., None])[..., 0]
@@ -140,7 +136,9 @@ def _on_pieces(view, curve, pieces, cameras, per_px, generator):
     share = share * curve.counts(index, y, viewpoint)
     colour = (number + turn[1]) % view.colours
     beside = known_beside(curve, index, y, viewpoint)
-    return y, on, share, *beside, pupil, colour, pieces.window[piece], frame
+    return CurvePoints(
+        y, on, share, *beside, pupil, colour, pieces.window, frame, torch.full_like(frame, part)
+    )
 
 
 def known_beside(curve: Any, index: Tensor, y: Tensor, viewpoint: Tensor) -> tuple[Tensor, ...]:

@@ -80,7 +80,7 @@ class Segments(Curve):
         outline = (facing.amin(1) <= within_m) & (facing.amax(1) >= -within_m)
         black = (facing < -within_m).all(1)
         kept = torch.nonzero((self.always | outline) & ~black)[:, 0]
-        return cut(kept, pieces_of(self.start[kept] - viewpoint, self.end[kept] - viewpoint, angle))
+        return cut_line(self, kept, viewpoint, angle)
 
     def counts(self, index, y, viewpoint):
         """As for Curve."""
@@ -94,7 +94,7 @@ class Segments(Curve):
 
     def points(self, index, s, viewpoint):
         """Points [n, 3] of the curves ``index`` [n] at parameters s [n]."""
-        return self.start[index] + s[:, None] * (self.end - self.start)[index]
+        return on_line(self, index, s)
 
     def aside_rad(self, index, viewpoint):
         """Angle [n] from the viewpoint [3] or [n, 3] at which radiances beside the curves ``index`` [n] are read."""
@@ -322,6 +322,16 @@ def pieces_of(a, b, angle):
     """Number [n] of pieces of segments a to b [n, 3] that subtend at most ``angle`` from the origin."""
     pieces = (b - a).norm(dim=1) / (_nearest(a, b).clamp_min(1e-6) * angle)
     return pieces.ceil().clamp(1, 4096).long()
+
+
+def cut_line(lines, index, viewpoint, angle):
+    """Pieces, as ``cut`` has them, of lines start to end [n, 3] that subtend at most ``angle`` from the viewpoint."""
+    return cut(index, pieces_of(lines.start[index] - viewpoint, lines.end[index] - viewpoint, angle))
+
+
+def on_line(lines, index, s):
+    """Points [n, 3] at parameters s [n] of lines start to end [n, 3]."""
+    return lines.start[index] + s[:, None] * (lines.end - lines.start)[index]
 
 
 def cut(index, count):

@@ -1,12 +1,14 @@
 """Straight edges of triangle meshes that may part two radiances; and what coincides counts once: seams of walls, edges
 that overlap in part, a tube's end and its lid."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+
+from codesign.render.rows import Rows
 
 SAME_POINT = 1e-6  # vertices of a mesh nearer than this share of its size, or than rounding, are one
 ROUNDING = 2.0**-21  # of float32 coordinates, four units in the last place
@@ -21,7 +23,7 @@ BITS = 10  # of each coordinate in the order along a space-filling curve
 
 
 @dataclass(frozen=True)
-class Edges:
+class Edges(Rows):
     """start, end: [E, 3]. normals: [E, 2, 3] of the two faces, the side that shines. always: [E], True where an
     edge counts from every side. free: [E], True where not just two faces of one mesh meet. width_m: [E], how far
     apart edges lie that count as this one. apexes: [E, 2, 3], third corners of the two faces, NaN for
@@ -35,9 +37,6 @@ class Edges:
     width_m: np.ndarray
     apexes: np.ndarray
 
-    def __getitem__(self, rows):
-        return Edges(*(getattr(self, f.name)[rows] for f in fields(self)))
-
     def __len__(self):
         return len(self.start)
 
@@ -45,11 +44,6 @@ class Edges:
     def length_m(self):
         """Lengths [E], metres."""
         return np.linalg.norm(self.end - self.start, axis=1)
-
-
-def joined(parts: list[Edges]) -> Edges:
-    """All edges of a list that is not empty, one after the other."""
-    return Edges(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Edges)))
 
 
 def segments(start: np.ndarray, end: np.ndarray) -> Edges:
@@ -161,7 +155,7 @@ def edges_once(parts: list[Edges], apart_m: float) -> Edges:
     every side.
     """
     parts = [part for part in parts if len(part)]
-    edges = joined(parts)
+    edges = Edges.joined(parts)
     chosen = (
         edges.always
         & (edges.length_m > SHORT * apart_m)
@@ -187,7 +181,7 @@ def edges_once(parts: list[Edges], apart_m: float) -> Edges:
     normals = np.where((count > 1)[:, None, None], 0.0, merged.normals)
     apexes = np.where((count > 1)[:, None, None], np.nan, merged.apexes)
     merged = replace(merged, normals=normals, width_m=width, apexes=apexes)
-    return joined([edges[~chosen], merged])
+    return Edges.joined([edges[~chosen], merged])
 
 
 def _beside_others(parts, edges, apart_m):

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from codesign.render.rows import Rows
 from codesign.render.silhouettes.crossings import AROUND, Crossings
 from codesign.render.silhouettes.curves import (
     ASIDE_RAD,
@@ -14,8 +15,8 @@ from codesign.render.silhouettes.curves import (
     SAFETY,
     Curve,
     behind_itself,
-    cut,
-    pieces_of,
+    cut_line,
+    on_line,
     rounding_rad,
 )
 from codesign.render.silhouettes.shapes import Ball, Disk, Mesh, Shape, Tube
@@ -25,7 +26,7 @@ FOUND = 1e-9  # share of the radius by which a point may miss the surfaces
 
 
 @dataclass(frozen=True)
-class Intersections(Curve):
+class Intersections(Curve, Rows):
     """Pieces start, end [n, 3] of curves on two surfaces each, f(x) = (x - c) A (x - c) + b (x - c) + k = 0 with
     gradients of length one: c, b, axis [n, 2, 3], A [n, 2, 3, 3], k [n, 2], axis that of a tube from c to its other
     end, 0 for others; curve: [n], which pieces are one curve; radius: [n], the lesser one of the two surfaces."""
@@ -42,12 +43,11 @@ class Intersections(Curve):
 
     def pieces(self, viewpoint, angle, within_m=0.0):
         """As for Segments; all of every curve."""
-        every = torch.arange(len(self.start))
-        return cut(every, pieces_of(self.start - viewpoint, self.end - viewpoint, angle))
+        return cut_line(self, torch.arange(len(self.start)), viewpoint, angle)
 
     def points(self, index, s, viewpoint):
         """As for Segments: by Newton's method from the chord, in the plane across it."""
-        return self.onto(index, self.start[index] + s[:, None] * (self.end - self.start)[index])[0]
+        return self.onto(index, on_line(self, index, s))[0]
 
     def counts(self, index, y, viewpoint):
         """As for Curve: not on the far side of a round shape, whose near side is before it."""
@@ -116,8 +116,7 @@ def on_surfaces(
     rows = torch.nonzero(good)[:, 0]
     if not rows.numel():
         return None, width
-    kept = Intersections(*(getattr(pieces, name)[rows] for name in pieces.__dataclass_fields__))
-    return replace(kept, start=start[rows], end=end[rows]), width
+    return replace(pieces, start=start, end=end)[rows], width
 
 
 def _surfaces(found, shapes, side):

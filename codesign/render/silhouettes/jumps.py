@@ -8,7 +8,7 @@ pass over them, and both their edges would tell of one jump.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -17,6 +17,7 @@ from torch.nn.functional import normalize
 
 from codesign.pose import apply, inverse
 from codesign.render.camera import Camera, coloured_rays
+from codesign.render.rows import Rows
 from codesign.render.silhouettes.curve_points import IN_FRONT_M, NEARBY, CurvePoints
 from codesign.render.wavefront import look
 
@@ -36,7 +37,7 @@ THIN = 1e-9
 
 
 @dataclass(frozen=True)
-class Jumps:
+class Jumps(Rows):
     """Points of curves on the film. row: [n], number of the given point. world [n, 3], frame and part [n], in the axes
     of the part; film position [n, 2] px, pupil [n, 2], colour [n], pixel [n] of the sequence; normal [n, 2] of the curve
     on the film; before, behind [n]: radiances along it; seen [n] bool; weight [n] of the jump; per_miss: the motion along
@@ -57,9 +58,6 @@ class Jumps:
     weight: Tensor
     per_miss: Tensor
     aside_px: Tensor
-
-    def __getitem__(self, rows: Any) -> "Jumps":
-        return Jumps(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     @property
     def contrast(self) -> Tensor:

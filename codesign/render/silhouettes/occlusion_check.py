@@ -8,7 +8,7 @@ differs makes the gradient of that term wrong, and is refused.
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from codesign.pose import apply
 from codesign.render.camera import Camera, coloured_rays
 from codesign.render.film import coarse_pixels, film_pupil_pattern
 from codesign.render.moving import parts, says_distance
+from codesign.render.rows import Rows
 from codesign.render.silhouettes.certified_views import MOST, Looked, looked_at, nearest_m
 from codesign.render.silhouettes.curve_points import CurvePoints, FieldOfView, known_beside, piece_rad
 from codesign.render.silhouettes.jumps import SAFETY, jumps
@@ -57,7 +58,7 @@ class Listing:
 
 
 @dataclass(frozen=True)
-class _Crossings:
+class _Crossings(Rows):
     """Jumps along lines: frame [n]; film position, direction of the line on the film and point of the pupil [n, 2];
     change [n] of radiance along the line; origin and direction [n, 3] of the ray in camera axes, and distance [n] m of the
     nearer side."""
@@ -71,9 +72,6 @@ class _Crossings:
     origin: Tensor
     direction: Tensor
     distance: Tensor
-
-    def __getitem__(self, rows: Any) -> "_Crossings":
-        return _Crossings(*(getattr(self, each.name)[rows] for each in fields(self)))
 
 
 def listings(
@@ -181,77 +179,82 @@ def _lines(film, most):
             yield at, torch.eye(2, dtype=torch.float64)[axis], pupils[turn], torch.full((lines,), window)
 
 
+@dataclass(frozen=True)
+class _Steps(Rows):
+    """Neighbouring rays between which light changes: frame [n]; film position, light and distance of both [n, 2, 4];
+    direction of their line on the film and point of the pupil [n, 2]; window [n]."""
+
+    frame: Tensor
+    ends: Tensor
+    along: Tensor
+    pupil: Tensor
+    window: Tensor
+
+    @property
+    def change(self):
+        """Of light [n] from the first to the second."""
+        return self.ends[:, 1, 2] - self.ends[:, 0, 2]
+
+
 def _crossings(camera, scene, cameras, most):
-    count = cameras.shape[1]
-    colour = torch.zeros(1, dtype=torch.long)
     aperture = getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) > 0
+    frames = torch.arange(cameras.shape[1])
 
-    def light(frame, at, q):
-        origin, direction, weight = coloured_rays(camera, at, q, colour.expand(len(at)))
-        if frame is None:  # the same rays in every frame
-            frame = torch.arange(count).repeat_interleave(len(at))
-            origin, direction, weight = (
-                origin.repeat(count, 1),
-                direction.repeat(count, 1),
-                weight.repeat(count),
-            )
-        seen, distance = look(scene, cameras, frame, origin, direction)
-        return weight * seen, distance, weight > 0
+    def rays(at, pupil):
+        return coloured_rays(camera, at, pupil, torch.zeros(len(at), dtype=torch.long))
 
-    columns = []
+    def seen(frame, at, pupil):
+        """Film position, light and distance [n, 4]."""
+        origin, direction, weight = rays(at, pupil)
+        light, distance = look(scene, cameras, frame, origin, direction)
+        return torch.cat([at, (weight * light)[:, None], distance[:, None]], 1)
+
+    found = []
     lit = []
     for at, along, pupil, window in _lines(camera.film, most):
         pupil = pupil * aperture
         lines, points = at.shape[:2]
-        seen, distance, passes = (
-            v.reshape(count, lines, points)
-            for v in light(None, at.reshape(-1, 2), pupil.repeat_interleave(points, 0))
-        )
-        lit.append(seen.reshape(count, -1))
+        at = at.reshape(-1, 2)
+        origin, direction, weight = rays(at, pupil.repeat_interleave(points, 0))
+        every, same = frames.repeat_interleave(len(at)), len(frames)
+        light, distance = look(scene, cameras, every, origin.repeat(same, 1), direction.repeat(same, 1))
+        light = weight.repeat(same) * light
+        told = torch.cat([at.repeat(same, 1), light[:, None], distance[:, None]], 1)
+        told = told.reshape(same, lines, points, 4)
+        passes = (weight > 0).reshape(lines, points)
+        lit.append(told[..., 2].flatten(1))
         frame, line, cell = torch.nonzero(
-            passes[..., 1:] & passes[..., :-1] & (seen.diff(dim=2) != 0)
+            passes[:, 1:] & passes[:, :-1] & (told[..., 2].diff(dim=2) != 0)
         ).unbind(1)
-        ends = [(v[frame, line, cell], v[frame, line, cell + 1]) for v in (seen, distance)]
-        columns.append(
-            (frame, at[line, cell], at[line, cell + 1], along.expand(len(line), 2), pupil[line], window[line])
-            + (*ends[0], *ends[1])
-        )
-    frame, low, high, along, pupil, window, first, second, near, far = (
-        torch.cat(column) for column in zip(*columns, strict=True)
-    )
+        ends = torch.stack([told[frame, line, cell], told[frame, line, cell + 1]], 1)
+        found.append(_Steps(frame, ends, along.expand(len(line), 2), pupil[line], window[line]))
+    found = _Steps.joined(found)
     lit = torch.cat(lit, 1)
-    least = CONTRAST * (lit.amax(1) - lit.amin(1))[frame]
-
-    def taken(rows, *values):
-        return [v[rows] for v in values]
-
-    rows = torch.nonzero((first - second).abs() > least)[:, 0]
-    frame, low, high, along, pupil, window, first, second, near, far, least = taken(
-        rows, frame, low, high, along, pupil, window, first, second, near, far, least
-    )
-    for _ in range(HALVINGS if len(low) else 0):
-        middle = (low + high) / 2
-        between, depth, _ = light(frame, middle, pupil)
-        left = (between - first).abs() > (second - between).abs()
-        low, high = torch.where(left[:, None], low, middle), torch.where(left[:, None], middle, high)
-        first, second = torch.where(left, first, between), torch.where(left, between, second)
-        near, far = torch.where(left, near, depth), torch.where(left, depth, far)
-    rows = torch.nonzero((second - first).abs() > least)[:, 0]
-    frame, at, along, pupil, window, near, least = taken(
-        rows, frame, (low + high) / 2, along, pupil, window, torch.minimum(near, far), least
-    )
+    least = CONTRAST * (lit.amax(1) - lit.amin(1))
+    found = found[found.change.abs() > least[found.frame]]
+    for _ in range(HALVINGS if len(found.frame) else 0):
+        between = seen(found.frame, found.ends[..., :2].mean(1), found.pupil)
+        first, second = found.ends[..., 2].unbind(1)
+        left = (between[:, 2] - first).abs() > (second - between[:, 2]).abs()
+        kept = torch.stack([left, ~left], 1)[..., None]
+        found = replace(found, ends=torch.where(kept, found.ends, between[:, None]))
+    found = found[found.change.abs() > least[found.frame]]
+    at = found.ends[..., :2].mean(1)
     if len(at):  # between faces that meet rays slip through a line without width
-        before, behind = (light(frame, at + side * FOUND_PX * along, pupil)[0] for side in (-1, 1))
-        rows = torch.nonzero((behind - before).abs() > least)[:, 0]
-        frame, at, along, pupil, window, near, change = taken(
-            rows, frame, at, along, pupil, window, near, behind - before
-        )
+        sides = [seen(found.frame, at + side * FOUND_PX * found.along, found.pupil)[:, 2] for side in (-1, 1)]
+        change = sides[1] - sides[0]
+        rows = change.abs() > least[found.frame]
+        found, at, change = found[rows], at[rows], change[rows]
     else:
-        change = near
-    if not len(at):
-        return _Crossings(frame, at, along, pupil, window, change, near, near, near)
-    origin, direction, _ = coloured_rays(camera, at, pupil, colour.expand(len(at)))
-    return _Crossings(frame, at, along, pupil, window, change, origin, direction, near)
+        change = found.change
+    near = found.ends[..., 3].amin(1)
+    if len(at):
+        origin, direction, _ = rays(at, found.pupil)
+    else:
+        origin = direction = torch.zeros(0, 3, dtype=torch.float64)
+    return _Crossings(
+        found.frame, at, found.along, found.pupil, found.window, change, origin, direction, near
+    )
 
 
 def _listed(camera, scene, curves, cameras, found):
@@ -260,7 +263,8 @@ def _listed(camera, scene, curves, cameras, found):
     angle = piece_rad(camera.slope_per_px())
     near_rad = NEAR_PX * abs(camera.slope_per_px())
     aperture_m = getattr(camera.lens, "entrance_pupil_diameter_mm", 0.0) * 1e-3 / 2
-    columns = []
+    rays = []
+    points = []
     for part, of_part in enumerate(curves):
         pose = cameras[part][found.frame]
         o = apply(pose, found.origin[:, None])[:, 0]
@@ -270,9 +274,8 @@ def _listed(camera, scene, curves, cameras, found):
             eye = cameras[part, frame, :3, 3]
             for curve in of_part:
                 index, bounds = curve.pieces(eye, angle, aperture_m)
-                ray, piece = _near(
-                    curve, index, bounds, eye, o[rows], d[rows], found.distance[rows], near_rad
-                )
+                near = curve, index, bounds, eye, o[rows], d[rows], found.distance[rows], near_rad
+                ray, piece = _near(*near)
                 if not ray.numel():
                     continue
                 ray = rows[ray]
@@ -280,25 +283,18 @@ def _listed(camera, scene, curves, cameras, found):
                 within, y, ahead = _place(curve, index, bounds, o[ray], d[ray])
                 count = curve.counts(index, y, o[ray]) & within
                 ray, index, y, ahead = (v[count] for v in (ray, index, y, ahead))
-                share = torch.ones(len(ray), dtype=torch.float64)
                 beside = known_beside(curve, index, y, o[ray])
-                numbers = (torch.full_like(ray, number) for number in (frame, part))
-                columns.append((ray, y, ahead, share, *beside, *numbers))
+                of_ray = found.pupil[ray], torch.zeros_like(ray), found.window[ray], found.frame[ray]
+                points.append(
+                    CurvePoints(
+                        y, ahead, torch.ones_like(y[:, 0]), *beside, *of_ray, torch.full_like(ray, part)
+                    )
+                )
+                rays.append(ray)
     total = torch.zeros_like(found.change)
     read = None
-    if columns:
-        ray, y, ahead, share, *beside, frame, part = (torch.cat(v) for v in zip(*columns, strict=True))
-        points = CurvePoints(
-            y,
-            ahead,
-            share,
-            *beside,
-            found.pupil[ray],
-            torch.zeros_like(ray),
-            found.window[ray],
-            frame,
-            part,
-        )
+    if rays:
+        ray, points = torch.cat(rays), CurvePoints.joined(points)
         read = jumps(camera, scene, cameras, points)
     if read is None:
         return found, total
