@@ -1,22 +1,24 @@
-"""Polynomial paths of least snap (fourth derivative) through points at given times, by one linear system.
+"""Polynomial paths of least snap (fourth derivative) through points at given times: splines of degree 7.
 
 The path of least integral of squared snap with given points, and with velocity, acceleration and jerk of 0 at
 both ends, has degree 7 between points and six continuous derivatives at them (the Euler-Lagrange equation
-x^(8) = 0 with its natural conditions). That is 8 conditions per segment for 8 coefficients.
+x^(8) = 0 with its natural conditions).
 Source: Mellinger and Kumar, Minimum snap trajectory generation and control for quadrotors, ICRA 2011.
 """
 
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.interpolate import make_interp_spline
 from torch import Tensor
 
 from codesign.errors import DomainError, ShapeError, check_finite
 
 TERMS = 8
 MOST_POINTS = 200
-LARGEST_RATIO = 100.0  # of segment durations: beyond, the linear system loses too many digits
+LARGEST_RATIO = 100.0  # of segment durations: beyond, the spline loses too many digits
 
 
 @dataclass(frozen=True)
@@ -78,38 +80,9 @@ def minimum_snap(points, t_s):
             f"the segments last from {float(length.min()):g} to {float(length.max()):g} s; let the longest "
             f"be at most {LARGEST_RATIO:g} times the shortest."
         )
-    segments = len(length)
-    relative = (length / length.mean()).tolist()
-    matrix = torch.zeros(TERMS * segments, TERMS * segments, dtype=torch.float64)
-    right = torch.zeros(TERMS * segments, points.shape[1], dtype=torch.float64)
-    row = 0
-
-    def put(segment, u, order, sign=1.0):
-        matrix[row, TERMS * segment : TERMS * (segment + 1)] += (
-            sign * _row(u, order) / relative[segment] ** order
-        )
-
-    for k in range(segments):
-        for u in (0.0, 1.0):
-            put(k, u, 0)
-            right[row] = points[k + int(u)]
-            row += 1
-    for order in (1, 2, 3):
-        for k, u in ((0, 0.0), (segments - 1, 1.0)):
-            put(k, u, order)
-            row += 1
-    for k in range(segments - 1):
-        for order in range(1, 7):
-            put(k, 1.0, order)
-            put(k + 1, 0.0, order, -1.0)
-            row += 1
-    scale = matrix.abs().amax(1, keepdim=True)
-    return Polynomials(torch.linalg.solve(matrix / scale, right / scale).reshape(segments, TERMS, -1), t_s)
-
-
-def _row(u, order):
-    """Factors of the 8 coefficients in the ``order``-th derivative by u."""
-    return torch.tensor(
-        [math.perm(k, order) * u ** (k - order) if k >= order else 0.0 for k in range(TERMS)],
-        dtype=torch.float64,
-    )
+    at_rest = [(order, np.zeros(points.shape[1])) for order in (1, 2, 3)]
+    spline = make_interp_spline(t_s.numpy(), points.numpy(), TERMS - 1, bc_type=(at_rest, at_rest))
+    # of powers of the time since a segment's start, in lengths of the segment
+    powers = [spline(t_s[:-1].numpy(), k) / math.factorial(k) for k in range(TERMS)]
+    scale = length[:, None] ** torch.arange(TERMS)
+    return Polynomials(torch.from_numpy(np.stack(powers, 1)) * scale[:, :, None], t_s)

@@ -34,33 +34,15 @@ class Trajectory(ABC):
         return self._pose(self._times(t_s))
 
     def velocity(self, t_s):
-        """Twist in body axes at times [n]: [n, 6] float64 (m/s, rad/s). Exact: the derivative of the poses,
-        number by number."""
+        """Twist in body axes at times [n]: [n, 6] float64 (m/s, rad/s), the exact derivative of the poses."""
         with torch.enable_grad():
             t = self._times(t_s).clone().requires_grad_()
-            pose = self._pose(t)
-            change = torch.stack(
-                [
-                    torch.autograd.grad(pose[:, i, j].sum(), t, retain_graph=True)[0]
-                    for i in range(3)
-                    for j in range(4)
-                ],
-                1,
-            ).reshape(-1, 3, 4)
-        pose = pose.detach()
-        local = pose[:, :3, :3].mT @ change
-        turn = (
-            torch.stack(
-                [
-                    local[:, 2, 1] - local[:, 1, 2],
-                    local[:, 0, 2] - local[:, 2, 0],
-                    local[:, 1, 0] - local[:, 0, 1],
-                ],
-                1,
-            )
-            / 2
-        )
-        return torch.cat([local[:, :, 3], turn], 1)
+            pose = self._pose(t)[:, :3]
+            entries = pose.flatten(1).unbind(1)
+            change = [torch.autograd.grad(entry.sum(), t, retain_graph=True)[0] for entry in entries]
+        local = pose[:, :, :3].detach().mT @ torch.stack(change, 1).reshape(-1, 3, 4)
+        turn = local[:, (2, 0, 1), (1, 2, 0)] - local[:, (1, 2, 0), (2, 0, 1)]
+        return torch.cat([local[:, :, 3], turn / 2], 1)
 
     @abstractmethod
     def _pose(self, t_s) -> Tensor:
