@@ -1,5 +1,4 @@
-"""Warm starts of the closed form: fields of a known flow, motions that are found from near by only,
-and starts that are wrong."""
+"""Warm starts of the closed form: motions that are found from near by only, and starts that are wrong."""
 
 import pytest
 import torch
@@ -8,28 +7,26 @@ from codesign import events, flow
 from codesign.flow import estimate_lk
 from codesign.flow.lk import polynomials
 from codesign.types import EventVolume
-from tests.flow.test_lk import D, length, mean_error, moving, pattern
+from tests.flow.test_lk import D, length, mean_error, moving, pattern, pixels
 
 FINE_PX = (4.0, 8.0)  # a blur of 4 px leaves a thousandth of these textures
 
 
-@pytest.mark.parametrize("size", [(16, 24), (31, 18), (2, 3)])
+@pytest.mark.parametrize("size", [(16, 24), (2, 3)])
 def test_a_polynomial_is_read_off_its_own_flow(size, generator):
     """Within the fixed point (a factor of 0.1 in each of 5 steps) and the ridge (1e-6 of the mean
     diagonal, where the least term counts some hundredth of the mean)."""
     shape = polynomials.Polynomials("affine", *size)
-    height, width = size
     matrix = 0.05 * torch.randn(2, 2, 2, generator=generator, dtype=D)
     shift = torch.randn(2, 2, generator=generator, dtype=D)
-    parameters = torch.cat([shift[:, :, None], matrix * shape.half], 2).flatten(1)
     start = torch.tensor([-0.5, -0.3], dtype=D)
-    y, x = torch.meshgrid(torch.arange(height, dtype=D), torch.arange(width, dtype=D), indexing="ij")
-    at = torch.stack([x - (width - 1) / 2, y - (height - 1) / 2])
+    x, y = pixels(*size)
+    at = torch.stack([x - x.mean(), y - y.mean()])
     # w = M (a - s w) + t
-    unit = torch.eye(2, dtype=D)
     right = torch.einsum("bij,jyx->biyx", matrix, at) + shift[:, :, None, None]
-    flow_px = torch.einsum("bij,bjyx->biyx", torch.linalg.inv(unit + start[:, None, None] * matrix), right)
-    found = shape.fitted(flow_px, start) @ shape.unit.T
+    inverse = torch.linalg.inv(torch.eye(2, dtype=D) + start[:, None, None] * matrix)
+    found = shape.fitted(torch.einsum("bij,bjyx->biyx", inverse, right), start) @ shape.unit.T
+    parameters = torch.cat([shift[:, :, None], matrix * shape.half], 2).flatten(1)
     torch.testing.assert_close(found, parameters, rtol=0, atol=1e-3)
 
 
@@ -37,16 +34,12 @@ def test_a_polynomial_is_read_off_its_own_flow(size, generator):
 def test_a_start_near_by_finds_what_the_coarse_blur_wipes_out(model):
     volume, truth = moving(1, shift=(18.0, 5.0), bins=8, waves_px=FINE_PX)
     near = 0.85 * torch.tensor([[18.0, 5.0]])
-    cold = estimate_lk(volume, model)
-    assert mean_error(cold, truth) >= 0.5 * length(truth)
-    assert mean_error(estimate_lk(volume, model, start_px=near), truth) <= 0.01 * length(truth)
+    assert mean_error(estimate_lk(volume, model), truth) >= 0.5 * length(truth)
+    found = estimate_lk(volume, model, start_px=near)
+    assert mean_error(found, truth) <= 0.01 * length(truth)
     whole = near[:, :, None, None].expand(-1, -1, *truth.shape[1:])
-    torch.testing.assert_close(
-        estimate_lk(volume, model, start_px=whole).flow_px,
-        estimate_lk(volume, model, start_px=near).flow_px,
-        rtol=0,
-        atol=1e-9,
-    )
+    again = estimate_lk(volume, model, start_px=whole)
+    torch.testing.assert_close(again.flow_px, found.flow_px, rtol=0, atol=1e-9)
 
 
 def test_a_start_near_by_does_with_fewer_levels_and_steps():
@@ -68,18 +61,17 @@ def test_a_wrong_start_leaves_what_is_found_without(waves_px, levels_px):
         assert mean_error(found, truth) <= cold + 0.01 * length(truth)
 
 
-@pytest.mark.parametrize("count", [0, 1, 20, 200])
+@pytest.mark.parametrize("count", [0, 1, 200])
 def test_events_that_say_nothing_keep_no_start(count):
     # few steps of at most 4 px do not lead back from 40 px: the prior drops it (without it 27 px stay)
-    shell, truth = moving(0, steps=10)
-    for seed in range(4):
-        generator = torch.Generator().manual_seed(seed)
-        counts = torch.zeros(2 * 5 * truth[0].numel(), dtype=D)
-        counts[torch.randint(len(counts), (count,), generator=generator)] += 1
-        volume = EventVolume(counts.reshape(1, 2, 5, *truth.shape[1:]), shell.centroid_s, shell.collected_s)
-        cold = estimate_lk(volume).flow_px
+    shell, _ = moving(0, steps=10)
+    for seed in range(2):
+        counts = torch.zeros_like(shell.counts)
+        places = torch.randint(counts.numel(), (count,), generator=torch.Generator().manual_seed(seed))
+        counts.view(-1)[places] += 1
+        volume = EventVolume(counts, shell.centroid_s, shell.collected_s)
         warm = estimate_lk(volume, start_px=torch.tensor([[40.0, -20.0]])).flow_px
-        torch.testing.assert_close(warm, cold, rtol=0, atol=1e-6)
+        torch.testing.assert_close(warm, estimate_lk(volume).flow_px, rtol=0, atol=1e-6)
 
 
 def test_starts_of_a_batch_are_each_their_own_and_have_no_gradient():
@@ -95,21 +87,18 @@ def test_starts_of_a_batch_are_each_their_own_and_have_no_gradient():
 
 def test_a_stream_that_speeds_up_is_followed_from_window_to_window():
     shade = pattern(0, *FINE_PX)
-    y, x = torch.meshgrid(torch.arange(48, dtype=D), torch.arange(48, dtype=D), indexing="ij")
+    x, y = pixels()
     times = torch.arange(121, dtype=D) / 2000  # 60 ms
-    places = 200 * times + 10_000 * times.square()  # 200 to 1400 px/s
-    frames = torch.stack([120 * torch.exp(0.5 * shade(x - place, y)) for place in places])
-    stream = events.simulate(frames, times, events.SensorModel(theta_on=0.1, theta_off=0.1))
+    frames = [120 * torch.exp(0.5 * shade(x - 200 * t - 10_000 * t**2, y)) for t in times]  # 200 to 1400 px/s
+    stream = events.simulate(torch.stack(frames), times, events.SensorModel(theta_on=0.1, theta_off=0.1))
     lost = {}
     for warm in (True, False):
-        found = list(flow.Tracker(estimate_lk, window_s=0.01, warm_start=warm).track([stream]))
-        assert [window.warm for window in found] == [False] + [warm] * (len(found) - 1)
         lost[warm] = 0
-        for window in found:
+        for window in flow.Tracker(estimate_lk, window_s=0.01, warm_start=warm).track([stream]):
             t0_s, t1_s = window.t0_us * 1e-6, window.t1_us * 1e-6
             right = 200 * (t1_s - t0_s) + 10_000 * (t1_s**2 - t0_s**2)
-            mean = window.field.flow_px[0].mean((1, 2)).tolist()
+            u, v = window.field.flow_px[0].mean((1, 2)).tolist()
             # what the closed form leaves on hard events of dense texture (0.02 to 0.06 of zero flow)
-            lost[warm] += abs(mean[0] - right) > 0.05 * right or abs(mean[1]) > 0.05 * right
+            lost[warm] += abs(u - right) > 0.05 * right or abs(v) > 0.05 * right
     assert lost[True] == 0
     assert lost[False] >= 3
