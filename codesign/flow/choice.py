@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d
 
-from codesign.flow.checks import check_volume
-from codesign.flow.lk.estimate import check_start, descended, field
+from codesign.flow.lk.estimate import check_slopes, check_start, descended, field
 from codesign.flow.lk.hot_pixels import weighed_down
 from codesign.flow.lk.lanes import Grid
 from codesign.flow.lk.level import along_path, blurred_to
@@ -131,7 +130,7 @@ def estimate(volume: EventVolume, start_px: Tensor | None = None) -> FlowField:
     >>> estimate(evenly_timed(counts)).flow_px[0, :, 24, 32].round(decimals=0).tolist()
     [2.0, 1.0]
     """
-    counts = check_volume(volume, least_bins=2)
+    counts = check_slopes(volume)
     start = None if start_px is None else check_start(start_px, counts)
     with torch.no_grad():
         chosen = _chosen(replace(volume, counts=counts.detach()), start)

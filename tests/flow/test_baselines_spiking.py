@@ -1,18 +1,17 @@
 """The spiking baseline against its published form, and the cure for each of the troubles that form is known
 for (docs/flow_baselines.md)."""
 
+import numpy as np
 import pytest
 import torch
 from torch.nn.functional import conv2d, conv_transpose2d, interpolate, leaky_relu
 
 from codesign.errors import DomainError, GradientError, ShapeError
-from codesign.events import from_stream
 from codesign.events.spiking.surrogate import FastSigmoid, Surrogate
 from codesign.flow.baselines import SpikeFlowNet, integrate_and_fire, to_halves
 from codesign.flow.baselines.parts import count_weights
 from codesign.flow.entry import normalise
-from codesign.flow.losses import photometric_loss, smoothness_loss
-from codesign.types import EventStream, EventVolume
+from codesign.types import EventVolume
 
 D = torch.float64
 THETA = 0.75
@@ -98,12 +97,8 @@ def test_halves_are_on_off_former_latter():
     counts = torch.arange(2 * 2 * 6 * 3 * 5, dtype=D).reshape(2, 2, 6, 3, 5)
     halves = to_halves(counts)
     assert halves.shape == (2, 4, 3, 5, 3)
-    for half in (0, 1):
-        for polarity in (0, 1):
-            for step in range(3):
-                assert torch.equal(
-                    halves[:, 2 * half + polarity, :, :, step], counts[:, polarity, 3 * half + step]
-                )
+    for half, polarity, step in np.ndindex(2, 2, 3):
+        assert torch.equal(halves[:, 2 * half + polarity, ..., step], counts[:, polarity, 3 * half + step])
     with pytest.raises(ShapeError, match="even number of bins"):
         to_halves(counts[:, :, :5])
 
@@ -115,18 +110,12 @@ def test_spikes_and_their_gradient_by_hand():
     spikes = integrate_and_fire(current, THETA, surrogate)
     assert spikes.tolist() == [0, 1, 0, 0, 1]
     seed = torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0], dtype=D)
-    own = seed * torch.tensor(
-        [1 / (2 * THETA * (1 + abs(u - THETA) / THETA) ** 2) for u in (0.5, 1.0, -0.2, 0.5, 0.9)], dtype=D
-    )
-    truth = torch.stack(
-        [own[0] + own[1], own[1], own[2:].sum(), own[3:].sum(), own[4]]
-    )  # nothing passes the reset after the second step
-    torch.testing.assert_close(
-        torch.autograd.grad(spikes, current, seed, create_graph=True)[0], truth, rtol=1e-14, atol=0
-    )
-    (grad,) = torch.autograd.grad(
-        integrate_and_fire(current, THETA, surrogate), current, seed, create_graph=True
-    )
+    potential = torch.tensor([0.5, 1.0, -0.2, 0.5, 0.9], dtype=D)
+    own = seed / (2 * THETA * (1 + (potential - THETA).abs() / THETA) ** 2)
+    # nothing passes the reset after the second step
+    truth = torch.stack([own[0] + own[1], own[1], own[2:].sum(), own[3:].sum(), own[4]])
+    (grad,) = torch.autograd.grad(spikes, current, seed, create_graph=True)
+    torch.testing.assert_close(grad, truth, rtol=1e-14, atol=0)
     with pytest.raises(GradientError, match="first derivative of a spike only"):
         torch.autograd.grad(grad.sum(), current)
     with pytest.raises(ShapeError, match="time axis"):
@@ -147,146 +136,37 @@ def deep_gradient(surrogate, scale):
     sums = net.encode(halves)
     weight = torch.randn(sums[3].shape, generator=torch.Generator().manual_seed(1), dtype=D)
     (grad,) = torch.autograd.grad((sums[3] * weight).sum(), halves)
-    return float(grad.norm()), float(sums[3].detach().abs().max())
-
-
-def test_a_silent_encoder_receives_gradient():
-    hard, seen = deep_gradient(Published(THETA, 1.0), 0.05)
-    soft, _ = deep_gradient(FastSigmoid.unit(THETA), 0.05)
-    assert seen == 0.0  # no spike in the layers before
-    assert hard == 0.0
-    # at rest the density is 1 / (8 theta), an eighth of the published one: at least that share cubed, three
-    # layers, of what an encoder in full activity gets
-    active, _ = deep_gradient(Published(THETA, 1.0), 1.0)
-    assert soft >= active / 8**3
+    return float(grad.norm())
 
 
 def test_gradient_norms_stay_within_bounds_over_contrast():
     # the density lies between 1/(8 theta) at rest and 1/(2 theta) at threshold and falls slowly beyond; the
-    # published one jumps between 0 and 1/theta
+    # published one jumps between 0 and 1/theta, and gives nothing where no spike is
     scales = (0.02, 0.1, 0.3, 1.0, 3.0)
-    hard = [deep_gradient(Published(THETA, 1.0), s)[0] for s in scales]
-    soft = [deep_gradient(FastSigmoid.unit(THETA), s)[0] for s in scales]
-    assert min(hard) == 0.0
-    assert max(soft) <= 4**3 * min(soft)  # three layers
+    hard, soft = (
+        [deep_gradient(surrogate, scale) for scale in scales]
+        for surrogate in (Published(THETA, 1.0), FastSigmoid.unit(THETA))
+    )
+    assert hard[0] == 0.0
+    # at rest an eighth of the published one: that share cubed, three layers, of what full activity gets
+    assert soft[0] >= hard[3] / 8**3
+    assert max(soft) <= 4**3 * min(soft)
     assert max(soft) < max(hard)
 
 
-def test_the_gradient_passes_the_threshold_continuously():
-    near = 1e-6
-    for surrogate, jump in ((Published(THETA, 1.0), 1 / THETA), (FastSigmoid.unit(THETA), 0.0)):
-        current = torch.tensor([[THETA - near, THETA + near]], dtype=D, requires_grad=True)
-        (grad,) = torch.autograd.grad(integrate_and_fire(current, THETA, surrogate).sum(), current)
-        assert float(grad[0, 1] - grad[0, 0]) == pytest.approx(jump, abs=1e-5)  # the slope times the distance
+# trouble (b): another sensor, another contrast
 
 
-# trouble (b): hard borders of time bins
-
-
-def test_an_event_that_crosses_a_bin_border_changes_the_input_continuously():
-    # 8 nodes over 7 ms: a microsecond moves a thousandth of an event from one bin to the next, so the input
-    # changes by 2/1000, also from half to half
-    def halves(t_us):
-        column = torch.tensor([t_us])
-        return to_halves(
-            from_stream(
-                EventStream(column, torch.tensor([3]), torch.tensor([2]), torch.tensor([1]), 6, 5),
-                0,
-                7000,
-                8,
-                dtype=D,
-            ).counts
-        )
-
-    for border in (500, 999, 1000, 3000, 3499, 3500, 4000, 6999):
-        change = (halves(border + 1) - halves(border)).abs().sum()
-        assert float(change) == pytest.approx(2e-3, rel=1e-9)
-        assert float(halves(border).sum()) == pytest.approx(1.0, rel=1e-12)
-    # bins of equal length give an event away whole: at the middle of the window it goes from half to half
-    hard = [torch.nn.functional.one_hot(torch.tensor(8 * t // 7000), 8) for t in (3499, 3500)]
-    assert int((hard[1] - hard[0]).abs().sum()) == 2
-
-
-# trouble (c): another sensor, another contrast
-
-
-@pytest.mark.parametrize("factor", [0.5, 3.0, 20.0])
+@pytest.mark.parametrize("factor", [0.5, 20.0])
 def test_the_input_does_not_depend_on_the_threshold_that_made_the_counts(factor):
     # usual count (sum c^2 + 1) / (sum c + 1): a factor k on all counts cancels but for the added event, 1
     # part in k sum c or so
     counts = busy(mean=0.6)
-    plain = normalise(counts)
-    scaled = normalise(factor * counts)
     n = float(counts.sum())
     n2 = float(counts.square().sum())
     expected = factor * ((n2 + 1) / (n + 1)) / ((factor**2 * n2 + 1) / (factor * n + 1))
-    torch.testing.assert_close(scaled, plain * expected, rtol=1e-12, atol=0)
     assert abs(expected - 1) <= 2 / (min(factor, 1.0) * n)
-    net = SpikeFlowNet(bins=8, width=8.0).double()
-    with torch.no_grad():
-        first = net(as_volume(counts)).flow_px
-        second = net(as_volume(factor * counts)).flow_px
-    assert float((first - second).norm()) <= 0.05 * float(
-        first.norm()
-    )  # few neurons lie within that part of their threshold
-
-
-# trouble (d): sparse samples
-
-
-def test_no_sample_is_skipped_for_having_few_events():
-    net = SpikeFlowNet(bins=8, width=8.0).double()
-    counts = busy(4)
-    counts[1:] = 0
-    counts[2, 0, 3, 7, 9] = 1
-    counts[3, 1, 5, 4:7, 9] = 1
-
-    def gradient(samples):
-        net.zero_grad()
-        target = torch.ones(len(samples), 2, 32, 32, dtype=D)
-        (net(as_volume(counts[samples])).flow_px - target).square().sum().backward()
-        return torch.cat([p.grad.flatten() for p in net.parameters() if p.grad is not None])
-
-    alone = [gradient([k]) for k in range(4)]
-    assert not alone[1].any()
-    assert all(bool(alone[k].any()) for k in (0, 2, 3))
-    torch.testing.assert_close(
-        gradient([0, 1, 2, 3]), sum(alone[1:], alone[0]), rtol=1e-9, atol=1e-9
-    )  # every sample counts, in full
-
-
-def test_the_published_loss_reaches_the_decoder_with_its_true_gradient(generator):
-    # photometric plus ten times smoothness at every scale; spikes do not depend on the decoder, so its
-    # gradient is exact and differences of the loss must show it
-    net = SpikeFlowNet(bins=8, width=8.0).double()
-    volume = as_volume(busy(mean=0.6))
-    frames = 255 * torch.rand(1, 2, 32, 32, generator=generator, dtype=D)
-    smooth = torch.nn.functional.avg_pool2d(
-        frames, 5, 1, 2
-    )  # a bilinear reading has kinks; a gentle picture has gentle ones
-    weights = [weight for name, weight in net.named_parameters() if name.startswith(("necks", "heads"))]
-
-    def loss():
-        fields = net.predictions(volume)
-        return sum(
-            (photometric_loss(smooth, f.flow_px) + 10 * smoothness_loss(f.flow_px) for f in fields),
-            torch.zeros((), dtype=D),
-        )
-
-    found = torch.autograd.grad(loss(), weights)
-    tangents = [torch.randn(w.shape, generator=generator, dtype=D) * w.detach().std() for w in weights]
-    values = []
-    step = 1e-7
-    with torch.no_grad():
-        for sign in (1, -2):
-            for weight, tangent in zip(weights, tangents, strict=True):
-                weight += sign * step * tangent
-            values.append(float(loss()))
-    truth = (values[0] - values[1]) / (2 * step)
-    # rounding 1e-15 / step, and a kink crossed by one reading in ten thousand
-    assert float(sum((g * t).sum() for g, t in zip(found, tangents, strict=True))) == pytest.approx(
-        truth, rel=1e-4
-    )
+    torch.testing.assert_close(normalise(factor * counts), normalise(counts) * expected, rtol=1e-12, atol=0)
 
 
 def test_mixed_precision_makes_no_neuron_fire_that_did_not():

@@ -6,10 +6,12 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from scipy.ndimage import correlate1d
 
 from codesign.flow import estimate_lk
 from codesign.flow.lk import cells
+from codesign.flow.lk.polynomials import Polynomials
 from tests.certain_case import certain
 from tests.flow.test_lk import moving
 
@@ -148,3 +150,10 @@ def test_one_step_is_that_of_the_formulas_written_out(model, terms, sigma_px, pe
     # the estimator adds ridges of 1e-6 and stops its fixed point after four rounds, each a factor of 0.04
     assert np.abs(found - flow).max() <= 1e-4 * np.abs(flow).max()
     assert np.abs(field.covariance_px2[0].numpy() - covariance).max() <= 1e-4 * np.abs(covariance).max()
+
+
+@pytest.mark.parametrize(("model", "terms"), [("constant", 1), ("affine", 3), ("quadratic", 6)])
+def test_the_length_of_a_step_is_its_mean_over_the_image(model, terms, generator):
+    parameters = torch.randn(5, 2 * terms, generator=generator, dtype=torch.float64)
+    found = Polynomials(model, 40, 40).mean_square(parameters)
+    assert found.tolist() == pytest.approx([mean_square(p, terms) for p in parameters.numpy()], rel=1e-12)

@@ -20,7 +20,6 @@ from codesign.flow.refiner_evidence import (
     MISFIT,
     MOST_PX,
     NOISE,
-    SOLVED,
     TRIED_IN,
     Evidence,
 )
@@ -62,16 +61,18 @@ def begun(flow):
     return FlowField(flow, torch.ones_like(flow[:, 0], dtype=torch.bool), 1.0, None, covariance)
 
 
-def drifting(flow, side=64, rate=2.0):
+def signed(bins):
+    """A volume of signed bins [n, H, W]."""
+    return volume(torch.stack([bins.clamp(min=0), (-bins).clamp(min=0)])[None])
+
+
+def drifting(flow, side=64):
     """A volume of a smooth texture that drifts, without quantisation."""
     x, y = pixel_grid(side, side, torch.zeros((), dtype=D))
-    bins = []
-    for t in (torch.arange(8, dtype=D) + 0.5) / 8:
-        u = x - flow[0] * t
-        v = y - flow[1] * t
-        bins.append(torch.sin(u / 2 + v / 7) + torch.sin(v / 2 - u / 5) + torch.sin((u + v) / 3))
-    counts = torch.stack(bins) * rate
-    return volume(torch.stack([counts.clamp(min=0), (-counts).clamp(min=0)])[None])
+    time = ((torch.arange(8, dtype=D) + 0.5) / 8)[:, None, None]
+    u = x - flow[0] * time
+    v = y - flow[1] * time
+    return signed(2 * (torch.sin(u / 2 + v / 7) + torch.sin(v / 2 - u / 5) + torch.sin((u + v) / 3)))
 
 
 def test_bins_are_looked_up_along_the_flow():
@@ -85,18 +86,25 @@ def test_bins_are_looked_up_along_the_flow():
     torch.testing.assert_close(found[0, :, 2:-2, 2:-2], expected[:, 2:-2, 2:-2], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("size", [(64, 64), (37, 50), (9, 6)])
+@pytest.mark.parametrize("size", [(64, 64), (9, 6)])
 def test_a_fresh_network_is_the_closed_form(size):
     """Its last layers are zero: flow and, but for the 0.01 px^2 that are added, covariance come
-    through; at any size."""
-    counts = events(2, 2, 8, *size)
-    start = estimate_lk(volume(counts), model="local")
-    found = Refiner().double().refined(volume(counts), start)[-1]
+    through; at any size, by events as the clock, from an expected flow."""
+    counts = events(2, 2, 8, *size) * torch.linspace(0.2, 3.0, 8, dtype=D)[:, None, None]
+    given = volume(counts)
+    made = Refiner().double()
+    start = estimate_lk(given, model="local")
+    found = made.refined(given, start)[-1]
     assert torch.equal(found.flow_px, start.flow_px)
-    added = found.covariance_px2 - start.covariance_px2
     shown = counts.flatten(1).sum(1).square() / (counts.flatten(1).sum(1).square() + 100)
     expected = (0.01 * shown)[:, None, None, None] * torch.tensor([1.0, 0.0, 1.0], dtype=D)[:, None, None]
+    added = found.covariance_px2 - start.covariance_px2
     torch.testing.assert_close(added, expected.expand_as(added), rtol=0, atol=1e-12)
+    expected = torch.tensor([[5.0, -2.0]], dtype=D).expand(2, 2)
+    for options in ({"clock": "events"}, {"start_px": expected}):
+        closed = estimate_lk(given, model="local", **options).flow_px
+        assert float((closed - start.flow_px).abs().max()) > 1e-6
+        assert torch.equal(made(given, **options).flow_px, closed)
 
 
 def on_noise():
@@ -104,13 +112,13 @@ def on_noise():
 
 
 def on_layers():
-    return [SETS["layers_3"](SEED, 8).batch(range(16))]
+    return [SETS["layers_3"](SEED, 8).batch(range(8))]
 
 
 def on_thin_packets():
-    """4 x 5,000 events of a camera that turns, 240 x 180 px."""
+    """2 x 5,000 events of a camera that turns, 240 x 180 px."""
     made = turning(seed=SEED)
-    firsts = [len(made.stream) * k // 5 for k in range(1, 5)]
+    firsts = [len(made.stream) * k // 5 for k in (1, 3)]
     ends = [[int(made.stream.t_us[k]) for k in (first, first + 5000)] for first in firsts]
     return [FlowWindows(from_stream(made.stream, *both, 8), made.truth(*both)) for both in ends]
 
@@ -138,7 +146,7 @@ def test_the_correction_counts_as_far_as_events_bend_the_field(case, most_px, of
     assert error <= of_whole * of_all
 
 
-@pytest.mark.parametrize("missing", [(0.0, 0.0), (0.6, -0.4), (-0.5, 0.0)])
+@pytest.mark.parametrize("missing", [(0.0, 0.0), (0.6, -0.4)])
 def test_the_evidence_says_what_is_missing(missing):
     """A texture that drifts by (2, -1) px, looked at along a flow that is short by ``missing``: what
     the finest blur asks for, within the 0.1 px that the prior and second differences take."""
@@ -184,7 +192,7 @@ def test_beside_a_border_the_flow_of_the_other_side_is_told_true_from_false():
     noise = torch.randn(64, 64, generator=torch.Generator().manual_seed(6), dtype=D)
     left, right = (torch.stack([noise.roll(way * k, 0) for k in range(8)]) for way in (1, -1))
     bins = torch.where(torch.arange(64) < 32, left, right)
-    evidence = Evidence(volume(torch.stack([bins.clamp(min=0), (-bins).clamp(min=0)])[None]))
+    evidence = Evidence(signed(bins))
     rightwards = AROUND.index((0, 3))
     leftwards = AROUND.index((0, -3))
 
@@ -220,43 +228,19 @@ def test_cells_become_pixels_linearly_until_edges_are_learnt():
     )
 
 
-@pytest.mark.parametrize("clock", ["time", "events"])
-def test_loss_gradient_to_the_volume_passes_gradcheck(clock):
-    made = network()
-    counts = events(1, 2, 8, 16, 16, rate=1.0).requires_grad_()
-    weights = torch.randn(1, 2, 16, 16, dtype=D, generator=torch.Generator().manual_seed(2))
-
-    def loss(counts):
-        field = made(volume(counts), clock=clock)
-        return (field.flow_px * weights).sum(), field.covariance_px2.sum(), field.confidence.sum()
-
-    assert torch.autograd.gradcheck(loss, (counts,), eps=1e-6, atol=1e-5, rtol=1e-3, fast_mode=True)
-
-
-def test_gradient_to_a_start_passes_gradcheck():
+def test_gradient_to_a_start_passes_gradcheck(generator):
     made = network()
     counts = volume(events(1, 2, 8, 16, 16, rate=1.0))
-    start = torch.randn(1, 2, 16, 16, dtype=D, generator=torch.Generator().manual_seed(4)).requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda start: made.refined(counts, begun(start))[-1].flow_px,
-        (start,),
-        eps=1e-6,
-        atol=1e-5,
-        rtol=1e-3,
-        fast_mode=True,
-    )
+    start = torch.randn(1, 2, 16, 16, dtype=D, generator=generator).requires_grad_()
+
+    def refined(start):
+        return made.refined(counts, begun(start))[-1].flow_px
+
+    assert torch.autograd.gradcheck(refined, start, atol=1e-5, rtol=1e-3, fast_mode=True)
 
 
-def test_an_empty_volume_gives_zero_flow_zero_confidence_and_zero_gradient():
-    counts = torch.zeros(1, 2, 8, 20, 24, dtype=D, requires_grad=True)
-    field = network()(volume(counts))
-    assert not bool(field.flow_px.any() | field.confidence.any() | field.valid.any())
-    (gradient,) = torch.autograd.grad(field.flow_px.sum() + field.confidence.sum(), counts)
-    assert torch.equal(gradient, torch.zeros_like(gradient))
-
-
-@pytest.mark.parametrize("case", ["one event", "saturated", "constant", "one row"])
-def test_odd_volumes_keep_value_and_gradient_tame(case):
+@pytest.mark.parametrize("case", ["one event", "saturated", "one row"])
+def test_odd_volumes_keep_value_and_gradient_tame(case, generator):
     """No scene moves by more than a few times the prior, whatever the counts: bounded flow, and a
     gradient of the corrections that one-sided differences confirm (counts are not negative)."""
     counts = torch.zeros(1, 2, 8, 16, 16, dtype=D)
@@ -265,89 +249,46 @@ def test_odd_volumes_keep_value_and_gradient_tame(case):
     elif case == "one row":
         counts[0, :, :, 8] = 5.0
     else:
-        counts += 1e4 if case == "saturated" else 2.0
+        counts += 1e4
     made = network()
-    counts = counts.requires_grad_()
-    direction = (
-        torch.rand(counts.shape, dtype=D, generator=torch.Generator().manual_seed(3)) * counts.detach().max()
-    )
-
-    def total(step):
-        return made.refined(volume(counts.detach() + step * direction), still)[-1].flow_px.sum()
-
+    direction = torch.rand(counts.shape, dtype=D, generator=generator) * counts.max()
     still = begun(torch.zeros(1, 2, 16, 16, dtype=D))
+
+    def total(counts):
+        return made.refined(volume(counts), still)[-1].flow_px.sum()
+
     assert made(volume(counts)).flow_px.abs().max() < 40.0
-    field = made.refined(volume(counts), still)[-1]
-    (gradient,) = torch.autograd.grad(field.flow_px.sum(), counts)
+    (gradient,) = torch.autograd.grad(total(counts.requires_grad_()), counts)
     step = 1e-6
     with torch.no_grad():
-        difference = (-3 * total(0) + 4 * total(step) - total(2 * step)) / (2 * step)
+        none, one, two = (total(counts + k * step * direction) for k in range(3))
+        difference = (-3 * none + 4 * one - two) / (2 * step)
     torch.testing.assert_close((gradient * direction).sum(), difference, rtol=2e-3, atol=1e-4)
 
 
-def test_samples_do_not_see_each_other():
-    made = network()
-    counts = events(3, 2, 8, 32, 32)
-    counts[1] *= 100
-    together = made(volume(counts))
-    alone = made(volume(counts[2:]))
-    torch.testing.assert_close(together.flow_px[2], alone.flow_px[0], rtol=0, atol=1e-9)
-
-
-def test_a_start_of_your_own_is_where_it_begins():
-    """Fresh weights give it back; no closed form is asked."""
-    start = torch.randn(1, 2, 32, 48, dtype=D, generator=torch.Generator().manual_seed(5))
-    made = Refiner().double()
-    found = made.refined(volume(events(1, 2, 8, 32, 48)), begun(start))[-1]
-    assert torch.equal(found.flow_px, start)
-
-
-def test_events_may_be_the_clock():
-    """Bins of uneven speed: a fresh network is the closed form by that clock; motion that turns back
-    keeps it even with other weights, as far as it comes back to where it began."""
-    counts = events(1, 2, 8, 32, 48) * torch.linspace(0.2, 3.0, 8, dtype=D)[:, None, None]
-    by_events = estimate_lk(volume(counts), model="local", clock="events").flow_px
-    assert (by_events - estimate_lk(volume(counts), model="local").flow_px).abs().max() > 1e-3
-    assert torch.equal(Refiner().double()(volume(counts), clock="events").flow_px, by_events)
+def test_motion_that_turns_back_keeps_the_closed_form_by_events_as_far_as_it_comes_back():
     x, y = pixel_grid(32, 32, torch.zeros((), dtype=D))
     time = ((torch.arange(8, dtype=D) + 0.5) / 8 * math.pi)[:, None, None]
     u = x - 4 * torch.sin(time)  # there and back
-    rate = 20 * torch.cos(time) * (torch.sin(u / 2 + y / 7) + torch.sin(y / 2 - u / 5))
-    turned = volume(torch.stack([rate.clamp(min=0), (-rate).clamp(min=0)])[None])
+    turned = signed(20 * torch.cos(time) * (torch.sin(u / 2 + y / 7) + torch.sin(y / 2 - u / 5)))
     start = estimate_lk(turned, model="local", clock="events").flow_px
     found = network()(turned, clock="events")
     assert (found.flow_px - start).abs().max() < 1e-3
-    assert found.confidence is not None
-    assert found.covariance_px2 is not None
     spread = (found.covariance_px2[:, 0] + found.covariance_px2[:, 2]) / 2
     torch.testing.assert_close(found.confidence, 9 / (9 + spread), rtol=1e-3, atol=0)
     assert (network().refined(turned, begun(start))[-1].flow_px - start).abs().max() > 0.1
 
 
-def test_an_expected_flow_is_handed_to_the_closed_form():
-    counts = volume(events(1, 2, 8, 32, 48))
-    expected = torch.tensor([[5.0, -2.0]], dtype=D)
-    found = Refiner().double()(counts, expected)
-    assert torch.equal(found.flow_px, estimate_lk(counts, model="local", start_px=expected).flow_px)
-
-
 def test_a_few_steps_teach_what_the_closed_form_leaves():
-    """Eight windows learnt by heart: from a start 1 px off everywhere, forty steps must take away most of
-    it."""
-    windows = RenderedWindows(planes("fine", 0.1), seed=9, height_px=32, width_px=32).batch(range(8))
-    made = network(dtype=torch.float32, steps=2).train()
+    """Four windows learnt by heart: from a start 1 px off everywhere, 25 steps must take away most of it."""
+    windows = RenderedWindows(planes("fine", 0.1), seed=9, height_px=32, width_px=32).batch(range(4))
+    made = network(dtype=torch.float32).train()
     truth = windows.truth.flow_px
-    start = truth + torch.tensor([0.8, -0.6])[:, None, None]
-    optimiser = torch.optim.Adam(made.parameters(), 3e-3)
-    for _ in range(40):
-        error = (
-            (made.refined(windows.volume, begun(start))[-1].flow_px - truth)
-            .square()
-            .sum(1)
-            .add(1e-6)
-            .sqrt()
-            .mean()
-        )
+    start = begun(truth + torch.tensor([0.8, -0.6])[:, None, None])
+    optimiser = torch.optim.Adam(made.parameters(), 6e-3)
+    for _ in range(25):
+        off = made.refined(windows.volume, start)[-1].flow_px - truth
+        error = off.square().sum(1).add(1e-6).sqrt().mean()
         optimiser.zero_grad()
         error.backward()
         optimiser.step()
@@ -358,6 +299,5 @@ def test_the_budget_of_weights():
     made = Refiner()
     assert sum(parameter.numel() for parameter in made.parameters()) <= 400_000
     assert made.config == {"bins": 8, "width": 48, "steps": 2}
-    assert SOLVED == 10
     with pytest.raises(DomainError, match="multiple of 16"):
         Refiner(width=10)

@@ -80,7 +80,7 @@ def estimate_lk(
     >>> estimate_lk(evenly_timed(counts)).flow_px[0, :, 24, 32].round(decimals=0).tolist()
     [2.0, 1.0]
     """
-    counts = check_volume(volume, least_bins=2)
+    check_slopes(volume)
     if not isinstance(model, str) or model not in MODELS:
         raise DomainError(f"flow model '{model}' is unknown; choose one of {', '.join(MODELS)}.")
     if not isinstance(clock, str) or clock not in CLOCKS:
@@ -98,11 +98,6 @@ def estimate_lk(
             raise DomainError(
                 f"a blur of levels_px is {blur_px:g} px; {LEAST_BLUR_PX} to {MOST_BLUR_PX} are possible."
             )
-    height, width = counts.shape[-2:]
-    if min(height, width) < 2:
-        raise ShapeError(
-            f"an event volume of {height} x {width} pixels has no slopes both ways; give at least 2 x 2."
-        )
     found = along_path(volume, clock)
     return field(
         volume, found[0], *descended(volume, found, model, prior_px, levels_px, steps, noise_floor, start_px)
@@ -167,6 +162,17 @@ def _seen(counts):
     """[B, H, W] whether a sample has events."""
     batch, *_, height, width = counts.shape
     return (counts.detach().sum((1, 2, 3, 4)) > 0)[:, None, None].expand(batch, height, width)
+
+
+def check_slopes(volume: EventVolume) -> Tensor:
+    """Counts [B, 2, bins, H, W] of a volume of 2 bins, rows and columns at least."""
+    counts = check_volume(volume, least_bins=2)
+    height, width = counts.shape[-2:]
+    if min(height, width) < 2:
+        raise ShapeError(
+            f"an event volume of {height} x {width} pixels has no slopes both ways; give at least 2 x 2."
+        )
+    return counts
 
 
 def check_start(start_px: Tensor, counts: Tensor) -> Tensor:
