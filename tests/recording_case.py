@@ -1,6 +1,9 @@
 """Random events and a calibration in the layout of the Event-Camera Dataset, for tests of recordings."""
 
+import shutil
+
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 DAVIS = (180, 240)
 ETH_CALIBRATION = "199.092366542 198.82882047 132.192071378 110.712660011 -0.368436311798 0.150947243557 -0.000296130534385 -0.000759431726241 0.0"
@@ -23,3 +26,48 @@ def eth_text(columns, form="{t:.9f} {x} {y} {p}\n"):
         form.format(t=t * 1e-6, t_us=t, x=x, y=y, p=p, sign=2 * p - 1)
         for t, x, y, p in zip(*(c.tolist() for c in columns), strict=True)
     )
+
+
+def recording(folder, columns, calibration=ETH_CALIBRATION):
+    """A folder in the layout of the Event-Camera Dataset, without motion; its events."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "events.txt").write_text(eth_text(columns))
+    (folder / "calib.txt").write_text(calibration)
+    return columns
+
+
+def gyroscope(folder, first_s, last_s, rate=(0.2, -0.3, 0.5)):
+    t_s = np.arange(round(first_s * 1000), round(last_s * 1000) + 1) / 1000
+    rows = np.column_stack([t_s, np.zeros((len(t_s), 3)), np.tile(rate, (len(t_s), 1))])
+    np.savetxt(folder / "imu.txt", rows, fmt="%.9f")
+
+
+def poses(folder, speed_m_s, rate_rad_s, start_s=99.9):
+    t_s = start_s + np.arange(81) / 200
+    turns = Rotation.from_rotvec(np.outer(t_s - t_s[0], rate_rad_s)).as_quat()
+    rows = np.column_stack([t_s, np.outer(t_s, speed_m_s), turns])
+    np.savetxt(folder / "groundtruth.txt", rows, fmt="%.9f")
+
+
+# damage
+
+
+def gone(path):
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def halved(path):
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+
+
+def stores(path, name, values):
+    import h5py
+
+    with h5py.File(path, "r+") as file:
+        del file[name]
+        file[name] = values
+
+
+def rewritten(path, old, new):
+    path.write_text(path.read_text().replace(old, new))

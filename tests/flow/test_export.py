@@ -8,9 +8,8 @@ import torch
 from torch import nn
 
 from codesign.errors import DomainError, FileFormatError
-from codesign.events import from_stream
 from codesign.flow.export import eliminate, evenly_timed, export
-from codesign.types import EventStream, FlowField
+from codesign.types import FlowField
 
 needs_onnx = pytest.mark.skipif(
     importlib.util.find_spec("onnxscript") is None or importlib.util.find_spec("onnx") is None,
@@ -76,14 +75,6 @@ def test_the_program_gives_the_numbers_of_the_network(tmp_path, generator, name)
     assert torch.allclose(flow, expected.flow_px, atol=0 if name.endswith("pt2") else 1e-5, rtol=0)
     assert torch.equal(confidence, expected.valid.float())
     assert float(flow.abs().max()) > 0.1
-
-
-def test_the_bins_are_those_of_a_stream():
-    empty = torch.zeros(0, dtype=torch.int64)
-    stream = from_stream(EventStream(empty, empty, empty, empty, 3, 3), 0, 1_000_000, 5)
-    ours = evenly_timed(torch.zeros(1, 2, 5, 3, 3))
-    assert torch.allclose(ours.centroid_s, stream.centroid_s, rtol=1e-15)
-    assert torch.allclose(ours.collected_s, stream.collected_s, rtol=1e-15)
 
 
 def test_solving_by_elimination_is_solving(generator):

@@ -95,14 +95,6 @@ def test_kernels_are_the_plain_operations_and_their_gradients(case, dtype, gener
         assert float(off) <= 100 * torch.finfo(dtype).eps * float(other.detach().abs().max())
 
 
-def test_gradients_are_those_of_differences(generator):
-    grid, cell, rate, flow, density, weights = drawn((2, 3, 6, 4, 2, 1), generator)
-    assert torch.autograd.gradcheck(
-        lambda rate, flow: moving(rate, flow, *times(3), grid, FADE_PX), leaves(rate, flow / 2)
-    )
-    assert torch.autograd.gradcheck(lambda *maps: cell_sums(*maps, grid, cell), leaves(*weights, density))
-
-
 def test_a_plane_carried_back_along_its_flow_stands_still():
     grid = Grid(21, 33, 2)
     time, contrast = times(5)

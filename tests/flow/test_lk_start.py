@@ -42,14 +42,6 @@ def test_a_start_near_by_finds_what_the_coarse_blur_wipes_out(model):
     torch.testing.assert_close(again.flow_px, found.flow_px, rtol=0, atol=1e-9)
 
 
-def test_a_start_near_by_does_with_fewer_levels_and_steps():
-    volume, truth = moving(0, shift=(10.0, -4.0))
-    options = {"levels_px": (2.0, 1.0), "steps": 2}
-    assert mean_error(estimate_lk(volume, **options), truth) >= 0.02 * length(truth)
-    near = estimate_lk(volume, **options, start_px=torch.tensor([[8.0, -3.0]]))
-    assert mean_error(near, truth) <= 0.005 * length(truth)
-
-
 @pytest.mark.parametrize("waves_px", [FINE_PX, (6.0, 24.0)])
 @pytest.mark.parametrize("levels_px", [(4.0, 2.0, 1.0), (2.0, 1.0)])
 def test_a_wrong_start_leaves_what_is_found_without(waves_px, levels_px):

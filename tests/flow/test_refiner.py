@@ -112,7 +112,7 @@ def on_noise():
 
 
 def on_layers():
-    return [SETS["layers_3"](SEED, 8).batch(range(8))]
+    return [SETS["layers_3"](SEED, 8).batch(range(16))]
 
 
 def on_thin_packets():

@@ -1,77 +1,27 @@
-"""Recordings cut into packets, each with its true flow."""
+"""Recordings cut into packets, each with its true flow, whichever way that is stored."""
 
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from codesign.errors import DomainError, FileFormatError
+from codesign.errors import CodesignError
 from codesign.flow.files import write_flow
 from codesign.flow.sources import PacketOptions, read_packets
 from codesign.flow.sources.camera import read_calibration
-from tests.recording_case import DAVIS, ETH_CALIBRATION, eth_text, made
+from tests.recording_case import DAVIS, eth_text, gyroscope, made, poses, recording
+
+RATE = (0.2, -0.3, 0.5)
 
 
-def true(packet):
-    """The true flow of a packet that must have one."""
-    assert packet.truth is not None
-    return packet.truth
-
-
-def recording(folder, rate=(0.2, -0.3, 0.5), start_s=100.0, duration_s=0.5, count=4000):
-    """A folder in the layout of the Event-Camera Dataset, turning at a fixed rate."""
-    folder.mkdir(parents=True, exist_ok=True)
-    columns = made(count, start_s=start_s, duration_s=duration_s)
-    (folder / "events.txt").write_text(eth_text(columns))
-    t_s = start_s - 0.1 + np.arange(round((duration_s + 0.2) * 1000)) / 1000
-    np.savetxt(
-        folder / "imu.txt",
-        np.column_stack([t_s, np.zeros((len(t_s), 3)), np.tile(rate, (len(t_s), 1))]),
-        fmt="%.9f",
-    )
-    (folder / "calib.txt").write_text(ETH_CALIBRATION)
-    return columns
-
-
-def test_a_recording_is_cut_into_windows_with_the_flow_of_its_rotation(tmp_path):
-    columns = recording(tmp_path / "shapes_rotation")
-    packets = read_packets(
-        tmp_path / "shapes_rotation", options=PacketOptions(window_s=0.02, start_s=0.1, count=3)
-    )
-    camera = read_calibration(tmp_path / "shapes_rotation" / "calib.txt")
-    expected, valid = camera.rotation_flow(
-        Rotation.from_rotvec(-np.array([0.2, -0.3, 0.5]) * 0.02).as_matrix(), *DAVIS
-    )
-    assert len(packets) == 3
-    for k, packet in enumerate(packets):
-        assert (packet.t0_us, packet.t1_us) == (
-            columns[0][0] + 100_000 + 20_000 * k,
-            columns[0][0] + 120_000 + 20_000 * k,
-        )
-        inside = (columns[0] >= packet.t0_us) & (columns[0] <= packet.t1_us)
-        assert len(packet.stream) == inside.sum()
-        np.testing.assert_array_equal(packet.stream.t_us.numpy(), columns[0][inside])
-        assert torch.equal(true(packet).valid[0], torch.from_numpy(valid))
-        np.testing.assert_allclose(
-            true(packet).flow_px[0].numpy(), expected, rtol=0, atol=1e-5
-        )  # float32 of some px
-        assert true(packet).interval_s == pytest.approx(0.02)
-        assert any("rotation alone" in note for note in packet.notes)
-    spread = read_packets(tmp_path / "shapes_rotation", options=PacketOptions(window_s=0.02, count=3))
-    assert [round((p.t0_us - columns[0][0]) / 20_000) for p in spread] == [0, 12, 23]
-    by_number = read_packets(tmp_path / "shapes_rotation", options=PacketOptions(events=500, count=2))
-    assert all(len(packet.stream) in (500, 501) for packet in by_number)
-
-
-def test_without_a_truth_beside_there_is_none(tmp_path):
-    recording(tmp_path / "a", duration_s=0.08)
-    (tmp_path / "a" / "calib.txt").unlink()
-    (packet,) = read_packets(tmp_path / "a")  # shorter than a tenth of a second: one packet
-    assert packet.truth is None
-    with pytest.raises(FileFormatError, match="no calib"):
-        read_packets(tmp_path / "a", tmp_path / "a" / "imu.txt")
+@pytest.fixture
+def place(tmp_path):
+    """Events of half a second in a folder."""
+    recording(tmp_path / "a", made(4000, start_s=100.0, duration_s=0.5))
+    return tmp_path / "a"
 
 
 def field(k=0):
@@ -80,123 +30,185 @@ def field(k=0):
     return torch.stack([(x - 100) / 64 + k, (y - 80) / 32 - k])
 
 
-@pytest.mark.parametrize(
-    "layout", ["files", "subfolders", "folders", "folder of truth", "one file of truth", "zip"]
-)
+def starts_ms(packets, t_us):
+    return [round((packet.t0_us - t_us[0]) / 1000) for packet in packets]
+
+
+def test_a_recording_is_cut_into_windows_with_the_flow_of_its_rotation(place):
+    (t_us, *_) = made(4000, start_s=100.0, duration_s=0.5)
+    gyroscope(place, 99.9, 100.7, RATE)
+    packets = read_packets(place, options=PacketOptions(window_s=0.02, start_s=0.1, count=3))
+    turn = Rotation.from_rotvec(-0.02 * np.array(RATE)).as_matrix()
+    expected, valid = read_calibration(place / "calib.txt").rotation_flow(turn, *DAVIS)
+    assert starts_ms(packets, t_us) == [100, 120, 140]
+    for packet in packets:
+        assert packet.t1_us == packet.t0_us + 20_000
+        inside = (t_us >= packet.t0_us) & (t_us <= packet.t1_us)
+        np.testing.assert_array_equal(packet.stream.t_us.numpy(), t_us[inside])
+        np.testing.assert_array_equal(packet.truth.valid[0].numpy(), valid)
+        # float32 of some px
+        np.testing.assert_allclose(packet.truth.flow_px[0].numpy(), expected, rtol=0, atol=1e-5)
+        assert packet.truth.interval_s == pytest.approx(0.02)
+        assert any("rotation alone" in note for note in packet.notes)
+    spread = read_packets(place, options=PacketOptions(window_s=0.02, count=3))
+    assert starts_ms(spread, t_us) == [0, 240, 460]
+    by_number = read_packets(place, options=PacketOptions(events=500, count=2))
+    assert all(len(packet.stream) in (500, 501) for packet in by_number)
+
+
+def test_motion_that_covers_a_part_of_the_windows_tells_of_that_part(place):
+    gyroscope(place, 100.018, 101)
+    options = PacketOptions(window_s=0.02, start_s=0.0, count=4)
+    packets = read_packets(place, options=options)
+    assert [packet.truth is not None for packet in packets] == [False, True, True, True]
+    gyroscope(place, 200, 201)
+    with pytest.raises(CodesignError, match="one clock"):
+        read_packets(place, options=options)
+
+
+@pytest.mark.parametrize("layout", ["subfolders", "folders", "one file of truth", "zip"])
 def test_numbered_packets_and_their_flows(layout, tmp_path):
     place = tmp_path / "data"
-    truth = None
+    truth = tmp_path / "flow.npy" if layout == "one file of truth" else None
     kept = {}
     for k in (2, 10, 1):  # in order of numbers, not of letters
-        columns = kept[k] = made(300, seed=k, start_s=k, duration_s=0.03)
+        kept[k] = made(300, seed=k, start_s=k, duration_s=0.03)
         folder = place / {"subfolders": f"packet_{k}", "folders": "events"}.get(layout, "")
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / ("events.txt" if layout == "subfolders" else f"packet_{k}.txt")).write_text(
-            eth_text(columns)
-        )
-        if layout == "folder of truth":
-            truth = tmp_path / "truth"
-            truth.mkdir(exist_ok=True)
-            write_flow(truth / f"{k:06d}.png", field(k))
-        elif layout == "folders":
+        name = "events" if layout == "subfolders" else f"packet_{k}"
+        (folder / f"{name}.txt").write_text(eth_text(kept[k]))
+        if layout == "folders":
             (place / "flow").mkdir(exist_ok=True)
             np.save(place / "flow" / f"{k}.npy", field(k).numpy())
-        elif layout != "one file of truth":
-            write_flow(folder / ("flow.flo" if layout == "subfolders" else f"packet_{k}_flow.flo"), field(k))
-    if layout == "one file of truth":
-        truth = tmp_path / "flow.npy"
+        elif truth is None:
+            write_flow(folder / ("flow.flo" if layout == "subfolders" else f"{name}_flow.flo"), field(k))
+    if truth is not None:
         np.save(truth, np.stack([field(k).permute(1, 2, 0).numpy() for k in (1, 2, 10)]))
     if layout == "zip":
         with zipfile.ZipFile(tmp_path / "data.zip", "w", zipfile.ZIP_DEFLATED) as archive:
             for file in place.rglob("*.*"):
                 archive.write(file, f"inside/{file.relative_to(place)}")
         place = tmp_path / "data.zip"
-    packets = read_packets(place, truth)
-    assert len(packets) == 3
-    for k, packet in zip((1, 2, 10), packets, strict=True):
+    for k, packet in zip((1, 2, 10), read_packets(place, truth), strict=True):
         np.testing.assert_array_equal(packet.stream.t_us.numpy(), kept[k][0])
         assert (packet.t0_us, packet.t1_us) == (kept[k][0][0], kept[k][0][-1])
-        assert torch.equal(true(packet).flow_px[0], field(k))
+        assert torch.equal(packet.truth.flow_px[0], field(k))
 
 
-def test_flows_without_times_follow_one_another_and_long_files_are_no_packets(tmp_path):
-    columns = recording(tmp_path / "a" / "one", start_s=100.0, duration_s=2.0)
+def test_flows_without_times_follow_one_another_but_for_windows_left_out(tmp_path):
+    t_us, *rest = made(4000, start_s=100.0, duration_s=0.1)
+    t_us = np.where(t_us > t_us[0] + 20_000, t_us + 20_000, t_us)
+    recording(tmp_path / "a", (t_us, *rest))
     np.save(tmp_path / "flow.npy", np.stack([field(k).numpy() for k in range(3)]))
-    packets = read_packets(
-        tmp_path / "a" / "one", tmp_path / "flow.npy", PacketOptions(window_s=0.02, truth_interval_s=0.02)
-    )
-    assert [packet.t0_us - columns[0][0] for packet in packets] == [0, 20_000, 40_000]
-    assert all(torch.equal(true(packet).flow_px[0], field(k)) for k, packet in enumerate(packets))
-    recording(tmp_path / "a" / "two", start_s=300.0, duration_s=2.0)
-    with pytest.raises(DomainError, match="too long for one packet"):
-        read_packets(tmp_path / "a")
-
-
-def test_a_flow_over_another_time_is_scaled_and_says_so(tmp_path):
-    recording(tmp_path / "a", start_s=100.0, duration_s=0.1)
-    np.savez(tmp_path / "flow.npz", flow=field().numpy(), t0=100.01, t1=100.06)
-    (packet,) = read_packets(tmp_path / "a", tmp_path / "flow.npz")
-    assert (packet.t0_us, packet.t1_us) == (100_010_000, 100_060_000)  # the truth says when
-    assert torch.equal(true(packet).flow_px[0], field())
-    (short,) = read_packets(tmp_path / "a", tmp_path / "flow.npz", PacketOptions(window_s=0.01))
-    assert (short.t0_us, short.t1_us) == (100_010_000, 100_020_000)
-    torch.testing.assert_close(true(short).flow_px[0], field() / 5, rtol=1e-6, atol=0)
-    assert any("scaled linearly" in note for note in short.notes)
-    write_flow(tmp_path / "flow.flo", field())
-    (whole,) = read_packets(tmp_path / "a", tmp_path / "flow.flo")  # no times: the flow of the whole packet
-    assert torch.equal(true(whole).flow_px[0], field())
-    (rate,) = read_packets(
-        tmp_path / "a", tmp_path / "flow.flo", PacketOptions(window_s=0.02, start_s=0.0, truth_unit="px/s")
-    )
-    torch.testing.assert_close(true(rate).flow_px[0], field() * 0.02, rtol=1e-6, atol=0)
-    (told,) = read_packets(
-        tmp_path / "a",
-        tmp_path / "flow.flo",
-        PacketOptions(window_s=0.02, start_s=0.0, truth_interval_s=0.08),
-    )
-    torch.testing.assert_close(true(told).flow_px[0], field() / 4, rtol=1e-6, atol=0)
-
-
-def test_flows_outside_the_recording_are_counted(tmp_path):
-    recording(tmp_path / "a", start_s=100.0, duration_s=0.1)
-    np.savez(
-        tmp_path / "flow.npz",
-        flow=np.stack([field(k).numpy() for k in range(3)]),
-        t0=[99.9, 100.02, 100.05],
-        t1=[99.95, 100.04, 100.07],
-    )
-    packets = read_packets(tmp_path / "a", tmp_path / "flow.npz")
-    assert [packet.t0_us for packet in packets] == [100_020_000, 100_050_000]
-    assert all("1 of 3 true flows lie outside" in packet.notes[0] for packet in packets)
-    assert torch.equal(true(packets[1]).flow_px[0], field(2))
-    np.savez(tmp_path / "flow.npz", flow=field().numpy(), t0=5.0, t1=5.1)
-    with pytest.raises(FileFormatError, match="are both on one clock"):
-        read_packets(tmp_path / "a", tmp_path / "flow.npz")
+    options = PacketOptions(window_s=0.02, truth_interval_s=0.02, start_s=0.0)
+    packets = read_packets(tmp_path / "a", tmp_path / "flow.npy", options)
+    assert starts_ms(packets, t_us) == [0, 20, 40]
+    assert all(torch.equal(packet.truth.flow_px[0], field(k)) for k, packet in enumerate(packets))
+    skipping = replace(options, skip=("windows_without_events",))
+    some = read_packets(tmp_path / "a", tmp_path / "flow.npy", skipping)
+    assert [float(packet.truth.flow_px[0, 0, 80, 100]) for packet in some] == [0.0, 2.0]
+    assert some[0].left_out == {"windows_without_events": 1}
 
 
 @pytest.mark.parametrize(
-    ("options", "error", "reason"),
+    ("times", "options", "span_us", "factor"),
     [
-        (PacketOptions(window_s=-1.0), DomainError, "number > 0"),
-        (PacketOptions(window_s=0.1, events=3), DomainError, "one of both"),
-        (PacketOptions(truth_unit="m"), DomainError, "'px/s'"),
-        (PacketOptions(window_s=9.0), DomainError, "no window of 9 s"),
-        (PacketOptions(events=10**6), DomainError, "windows of 1000000"),
-        (PacketOptions(columns="abcd"), FileFormatError, "four letters"),
-        (PacketOptions(time_unit="h"), FileFormatError, "time unit 'h'"),
+        # the truth says when
+        ({"t0": 100.01, "t1": 100.06}, {}, (10_000, 60_000), 1.0),
+        ({"t0": 100.01, "t1": 100.06}, {"window_s": 0.01}, (10_000, 20_000), 0.2),
+        # no times: the flow of the whole packet, of a second, of a time that is told
+        ({}, {"window_s": 0.02, "start_s": 0.0, "truth_unit": "px/s"}, (0, 20_000), 0.02),
+        ({}, {"window_s": 0.02, "start_s": 0.0, "truth_interval_s": 0.08}, (0, 20_000), 0.25),
     ],
 )
-def test_options_that_mean_nothing(options, error, reason, tmp_path):
-    recording(tmp_path / "a", duration_s=0.05)
-    with pytest.raises(error, match=reason):
-        read_packets(tmp_path / "a", options=options)
+def test_a_flow_over_another_time_is_scaled(times, options, span_us, factor, place):
+    (t_us, *_) = made(4000, start_s=100.0, duration_s=0.5)
+    np.savez(place.parent / "flow.npz", flow=field().numpy(), **times)
+    (packet, *_) = read_packets(place, place.parent / "flow.npz", PacketOptions(**options))
+    first = 100_000_000 if times else t_us[0]
+    assert (packet.t0_us - first, packet.t1_us - first) == span_us
+    torch.testing.assert_close(packet.truth.flow_px[0], field() * factor, rtol=1e-6, atol=0)
+    assert any("scaled linearly" in note for note in packet.notes) == (factor == 0.2 or factor == 0.25)
+
+
+def test_flows_outside_the_recording_are_counted(place):
+    truth = place.parent / "flow.npz"
+    flows = np.stack([field(k).numpy() for k in range(3)])
+    np.savez(truth, flow=flows, t0=[99.9, 100.02, 100.05], t1=[99.95, 100.04, 100.07])
+    packets = read_packets(place, truth)
+    assert [packet.t0_us for packet in packets] == [100_020_000, 100_050_000]
+    assert all("1 of 3 true flows lie outside" in packet.notes[0] for packet in packets)
+    assert torch.equal(packets[1].truth.flow_px[0], field(2))
+    np.savez(truth, flow=field().numpy(), t0=5.0, t1=5.1)
+    with pytest.raises(CodesignError, match="are both on one clock"):
+        read_packets(place, truth)
+
+
+@pytest.mark.parametrize("by", ["poses", "gyroscope"])
+def test_the_flow_of_rotation_is_no_truth_of_a_slider(by, place):
+    poses(place, (0.25, 0.0, 0.0), (0.0, 0.0, 0.0))
+    if by == "gyroscope":
+        gyroscope(place, 99.9, 101, (0.0, 0.0, 0.0))
+    (packet, *_) = read_packets(place, options=PacketOptions(window_s=0.02, start_s=0.0))
+    assert packet.rotation_only
+    assert packet.translates
+    # 5 mm in 20 ms, at 1 m: f x / z
+    assert packet.neglected_px == pytest.approx((199.092366542 + 198.82882047) / 2 * 0.005, rel=1e-4)
+    # 0.08 px of a scene 1 m away beside 4 px
+    poses(place, (0.02, 0.0, 0.0), (0.0, 1.0, 0.0))
+    (place / "imu.txt").unlink(missing_ok=True)
+    (packet, *_) = read_packets(place, options=PacketOptions(window_s=0.02, start_s=0.0))
+    assert packet.rotation_only
+    assert not packet.translates
+
+
+def test_a_recording_in_two_forms_is_one(place):
+    (t_us, *_) = made(4000, start_s=100.0, duration_s=0.5)
+    np.save(place / "events.npy", np.zeros((3, 4)))  # somebody's array: no events at all
+    (packet, *_) = read_packets(place, options=PacketOptions(window_s=0.02, start_s=0.0))
+    assert len(packet.stream) == (t_us <= t_us[0] + 20_000).sum()
+    assert any("events from events.txt; events.npy beside it not read" in note for note in packet.notes)
+
+
+def test_without_a_truth_beside_there_is_none(tmp_path):
+    recording(tmp_path / "a", made(400, duration_s=0.08))
+    (tmp_path / "a" / "calib.txt").unlink()
+    (packet,) = read_packets(tmp_path / "a")  # shorter than a tenth of a second: one packet
+    assert packet.truth is None
+    gyroscope(tmp_path / "a", 0, 1)
+    with pytest.raises(CodesignError, match="no calib"):
+        read_packets(tmp_path / "a", tmp_path / "a" / "imu.txt")
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"window_s": -1.0}, "number > 0"),
+        ({"window_s": 0.1, "events": 3}, "one of both"),
+        ({"truth_unit": "m"}, "'px/s'"),
+        ({"window_s": 9.0}, "no window of 9 s"),
+        ({"events": 10**6}, "windows of 1000000"),
+        ({"columns": "abcd"}, "four letters"),
+        ({"time_unit": "h"}, "time unit 'h'"),
+        ({"skip": ("all",)}, "windows_without_events"),
+        ({"truth_pixels": "ideal"}, "'raw' or 'undistorted'"),
+    ],
+)
+def test_options_that_mean_nothing(options, reason, place):
+    with pytest.raises(CodesignError, match=reason):
+        read_packets(place, options=PacketOptions(**options))
 
 
 def test_folders_without_events_and_damaged_archives(tmp_path):
     (tmp_path / "empty").mkdir()
-    for path, reason in ((tmp_path / "absent", "nothing lies"), (tmp_path / "empty", "holds no events")):
-        with pytest.raises(FileFormatError, match=reason):
-            read_packets(path)
     (tmp_path / "a.zip").write_bytes(b"PK\x03\x04 cut off")
-    with pytest.raises(FileFormatError, match="no whole zip archive"):
-        read_packets(tmp_path / "a.zip")
+    for k in (1, 2):
+        recording(tmp_path / "long" / str(k), made(100, start_s=k, duration_s=2.0))
+    for name, reason in (
+        ("absent", "nothing lies"),
+        ("empty", "holds no events"),
+        ("a.zip", "no whole zip archive"),
+        ("long", "too long for one packet"),
+    ):
+        with pytest.raises(CodesignError, match=reason):
+            read_packets(tmp_path / name)

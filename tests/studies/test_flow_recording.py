@@ -14,6 +14,7 @@ from codesign.types import FlowField
 from studies.flow_recording import __main__ as study
 from studies.flow_recording import made, video
 from studies.frame.run import main
+from tests.recording_case import poses
 
 SIZE = (45, 60)
 
@@ -45,46 +46,34 @@ def true(packet):
     return packet.truth
 
 
-def run(folder, *options):
-    code = main(study.study, study.Config, ["--out", str(folder), "--estimator", "lk", *options])
+PIXELS = ("--width-px", "60", "--height-px", "45")
+
+
+def run(folder, recording, options=""):
+    """Exit code, and what was measured."""
+    given = ["--out", str(folder), "--estimator", "lk", "--recording", str(recording), *PIXELS]
+    code = main(study.study, study.Config, [*given, *options.split()])
     metrics = folder / "metrics.json"
-    return code, json.loads(metrics.read_text()) if metrics.is_file() else None
+    return code, json.loads(metrics.read_text()) if metrics.is_file() else {}
 
 
 def test_figures_of_a_run(recording, tmp_path):
     threads = torch.get_num_threads()
-    code, metrics = run(
-        tmp_path / "run",
-        "--recording",
-        str(recording[0]),
-        "--window-ms",
-        "20",
-        "--start-s",
-        "0.005",
-        "--packets",
-        "2",
-        "--width-px",
-        "60",
-        "--height-px",
-        "45",
-    )
+    code, metrics = run(tmp_path / "run", recording[0], "--window-ms 20 --start-s 0.005 --packets 2")
     torch.set_num_threads(threads)
     assert code == 0
-    assert metrics is not None
-    packets = read_packets(
-        recording[0], options=PacketOptions(window_s=0.02, start_s=0.005, count=2, size_px=SIZE)
-    )
+    options = PacketOptions(window_s=0.02, start_s=0.005, count=2, size_px=SIZE)
+    packets = read_packets(recording[0], options=options)
     errors = []
     zero = []
     for packet in packets:
         volume = events.from_stream(packet.stream, packet.t0_us, packet.t1_us, 8)
         field, _ = study.measured(packet, study.load("lk")["lk"][0], 8)
         seen = (volume.counts.sum((1, 2)) > 0)[0]
-        errors.append(float((field.flow_px - true(packet).flow_px)[0].square().sum(0).sqrt()[seen].mean()))
-        zero.append(float(true(packet).flow_px[0].square().sum(0).sqrt()[seen].mean()))
-    assert metrics["lk_aee_px"] == pytest.approx(np.mean(errors), rel=1e-5)
+        errors.append(float((field.flow_px - true(packet).flow_px)[0].norm(dim=0)[seen].mean()))
+        zero.append(float(true(packet).flow_px[0].norm(dim=0)[seen].mean()))
+    assert metrics["lk_aee_px"] == metrics["aee_px"] == pytest.approx(np.mean(errors), rel=1e-5)
     assert metrics["lk_zero_aee_px"] == pytest.approx(np.mean(zero), rel=1e-5)
-    assert metrics["aee_px"] == metrics["lk_aee_px"]
     assert metrics["packets"] == 2
     assert metrics["events"] == sum(len(packet.stream) for packet in packets)
     page = (tmp_path / "run" / "report.html").read_text()
@@ -113,22 +102,18 @@ def test_a_recording_without_truth_has_its_sharpness_only(tmp_path):
     (tmp_path / "events.txt").write_text(
         "".join(f"{0.1 + k * 1e-4:.6f} {(k * 7) % 60} {(k * 3) % 45} {k % 2}\n" for k in range(400))
     )
-    code, metrics = run(
-        tmp_path / "run", "--recording", str(tmp_path / "events.txt"), "--width-px", "60", "--height-px", "45"
-    )
+    code, metrics = run(tmp_path / "run", tmp_path / "events.txt")
     assert code == 0
-    assert metrics is not None
     assert metrics["packets_without_truth"] == metrics["packets"] == 1  # shorter than 0.1 s: one packet
     assert "lk_aee_px" not in metrics
     assert metrics["lk_fwl"] > 0
 
 
 def test_a_video_of_all_windows(recording, tmp_path):
-    size = ["--width-px", "60", "--height-px", "45"]
-    cut = ["--window-ms", "5", "--packets", "1", "--video", "--video-windows", "99"]
-    code, metrics = run(tmp_path / "run", "--recording", str(recording[0]), *size, *cut)
+    code, metrics = run(
+        tmp_path / "run", recording[0], "--window-ms 5 --packets 1 --video --video-windows 99"
+    )
     assert code == 0
-    assert metrics is not None
     held = read_recording(recording[0], PacketOptions(size_px=SIZE))
     assert metrics["video_events"] == len(held)
     assert metrics["video_event_s"] == pytest.approx((held.t_us[-1] - held.t_us[0]) * 1e-6, abs=2e-6)
@@ -161,18 +146,10 @@ def test_a_slider_has_no_error_against_its_rotation(tmp_path):
     lines = [f"{1 + k * 1e-4:.6f} {(k * 7) % 60} {(k * 3) % 45} {k % 2}" for k in range(600)]
     (folder / "events.txt").write_text("\n".join([*lines, "1.070000 99 3 1"]) + "\n")
     (folder / "calib.txt").write_text("60 60 30 22 0 0 0 0 0\n")
-    t_s = 0.9 + np.arange(60) / 100
-    still = np.zeros((60, 2))
-    np.savetxt(
-        folder / "groundtruth.txt",
-        np.column_stack([t_s, t_s, still, np.zeros((60, 3)), np.ones(60)]),
-        fmt="%.9f",
-    )
-    options = ["--recording", str(folder), "--width-px", "60", "--height-px", "45", "--window-ms", "20"]
-    assert run(tmp_path / "refused", *options)[0] == 2  # an event off the sensor
-    code, metrics = run(tmp_path / "run", *options, "--skip", "events_off_sensor")
+    poses(folder, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0), start_s=0.9)
+    assert run(tmp_path / "refused", folder, "--window-ms 20")[0] == 2  # an event off the sensor
+    code, metrics = run(tmp_path / "run", folder, "--window-ms 20 --skip events_off_sensor")
     assert code == 0
-    assert metrics is not None
     assert metrics["packets_translating"] == metrics["packets"] == 2
     assert metrics["left_out_events_off_sensor"] == 1
     assert not [name for name in metrics if name.endswith("aee_px")]
@@ -195,7 +172,7 @@ def test_a_slider_has_no_error_against_its_rotation(tmp_path):
 )
 def test_bad_input_is_one_sentence_and_exit_code_2(options, sentence, recording, tmp_path, capsys):
     base = [] if "--recording" in options else ["--recording", str(recording[0])]
-    size = [] if "--width-px" in options else ["--width-px", "60", "--height-px", "45"]
+    size = [] if "--width-px" in options else PIXELS
     assert main(study.study, study.Config, ["--out", str(tmp_path / "run"), *base, *size, *options]) == 2
     error = capsys.readouterr().err
     assert sentence in error

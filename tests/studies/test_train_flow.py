@@ -60,11 +60,10 @@ def test_training_finds_the_known_answer(tmp_path):
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize("more", ["", "--average 0.9 --reuse 3"], ids=["plain", "average and reuse"])
 @pytest.mark.usefixtures("undrawn")
-def test_three_steps_and_three_are_six_bit_for_bit(tmp_path, capsys, more):
+def test_three_steps_and_three_are_six_bit_for_bit(tmp_path, capsys):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    options = f"--steps 6 --save-every 100 --validate-every 2 {more}"
+    options = "--steps 6 --save-every 100 --validate-every 2 --average 0.9 --reuse 3"
     assert train(whole, options) == 0
     made = []
 
@@ -84,44 +83,32 @@ def test_three_steps_and_three_are_six_bit_for_bit(tmp_path, capsys, more):
     assert resume(parts) == 0
     assert state_of(whole / "checkpoint") == state_of(parts / "checkpoint")
     assert torch.equal(weight_of(whole), weight_of(parts))
-    one, two = (
-        {
-            name: value
-            for name, value in metrics_of(folder).items()
-            if name[:4] not in ("cpu_", "vers", "hard")
-        }
-        for folder in (whole, parts)
-    )
-    assert one == two
+    one, two = (metrics_of(folder) for folder in (whole, parts))
+    assert {name for name in one if one[name] != two[name]} <= {name for name in one if name[:4] == "cpu_"}
     assert "step 6" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("name", ["supervised", "motion", "contrast", "photometric"])
-def test_the_loss_is_the_one_that_is_asked_for(tmp_path, name):
+@pytest.mark.parametrize(
+    "kind", ["supervised --unit px", "supervised --unit motion", "contrast", "photometric"]
+)
+def test_the_loss_is_the_one_that_is_asked_for(tmp_path, kind):
     """The loss of the first step, put together by hand from the published terms."""
-    kind = "--loss supervised --unit motion" if name == "motion" else f"--loss {name} --unit px"
     given = Linear()
     torch.nn.init.constant_(given.layer.weight, 0.2)
     checkpoint.save(given, tmp_path / "given.safetensors")
     start = f"--start {tmp_path / 'given.safetensors'}"
-    assert train(tmp_path / "run", f"{kind} --steps 1 --smoothness 0.3 {start}") == 0
+    assert train(tmp_path / "run", f"--loss {kind} --steps 1 --smoothness 0.3 {start}") == 0
     windows = Made().batch(range(4))
     flow = given(windows.volume).flow_px.detach()
     truth = windows.truth.flow_px
-    error2 = (flow - truth).square().sum(1)
-    length2 = truth.square().sum(1)
-
-    def charbonnier(squared):
-        return ((squared + 1e-4).sqrt() - 1e-2).mean()
-
-    roughness = 0.3 * losses.smoothness_loss(flow)
-    expected = {
-        "supervised": lambda: charbonnier(error2),
-        "motion": lambda: charbonnier(error2 / (1 + length2.mean((1, 2), keepdim=True))),
-        "contrast": lambda: losses.contrast_loss(windows.volume, flow) + roughness,
-        "photometric": lambda: losses.photometric_loss(windows.frames, flow) + roughness,
-    }[name]()
+    if "supervised" in kind:
+        unit2 = 1 + truth.square().sum(1).mean((1, 2), keepdim=True) if "motion" in kind else 1
+        expected = (((flow - truth).square().sum(1) / unit2 + 1e-4).sqrt() - 1e-2).mean()
+    else:
+        by_frames = losses.photometric_loss(windows.frames, flow)
+        fit = losses.contrast_loss(windows.volume, flow) if kind == "contrast" else by_frames
+        expected = fit + 0.3 * losses.smoothness_loss(flow)
     (path,) = (tmp_path / "run" / "checkpoint").glob("*.safetensors")
     assert checkpoint.read_tensors(path)[0]["curve/loss"].item() == pytest.approx(float(expected), rel=1e-5)
 
@@ -244,10 +231,8 @@ def edit(folder, **changes):
     [
         (lambda folder: (folder / "checkpoint.json").write_text("{"), "is no whole JSON file"),
         (lambda folder: next(folder.glob("*.safetensors")).write_bytes(b"short"), "is damaged"),
-        (lambda folder: next(folder.glob("*.safetensors")).unlink(), "no file lies at"),
         (lambda folder: edit(folder, version=9), "format version 9"),
         (lambda folder: edit(folder, network="refiner"), "written with network refiner, this run has linear"),
-        (lambda folder: edit(folder, seed=5), "written with seed 5, this run has 0"),
         (lambda folder: edit(folder, tensors="../network.safetensors"), "outside its folder"),
     ],
 )
@@ -265,16 +250,12 @@ def test_a_checkpoint_that_does_not_fit_is_named(tmp_path, capsys, damage, sente
     [
         ("--network refinr", "network 'refinr' is unknown; choose one of ecn, flownet-events"),
         ("--options depth=3", "has no option 'depth'; it has bins, gain"),
-        ("--options gain", "give name=number"),
         ("--weights 500", "which 'linear' does not"),
         ("--mix fog", "--mix fog is unknown; choose from"),
-        ("--validate-on fog", "--validate-on fog is unknown"),
         ("--loss photometric", "needs frames, and these windows have none"),
         ("--bins 5", "the windows have 2 time bins, the network 5"),
         ("--steps 0", "--steps is 0; at least 1"),
         ("--cpu-minutes -1", "--cpu-minutes is -1.0; more than 0"),
-        ("--height-px 8", "--height-px is 8; at least 16"),
-        ("--warm-up 1", "--warm-up is 1.0; a share from 0 to below 1"),
         ("--mixed-precision", "--mixed-precision needs CUDA"),
         ("--start nowhere.safetensors", "no file lies at nowhere.safetensors"),
         ("--race --jobs 0", "one of --jobs"),

@@ -1,7 +1,5 @@
 """Training in one call: what is learnt, kept, resumed and refused, alone and in two processes."""
 
-import doctest
-import importlib
 import json
 import signal
 from typing import Any
@@ -28,13 +26,6 @@ def distance(network: Any):
     return float((network.layer.weight.detach()[:, :, 0, 0] - TRUE_WEIGHTS).abs().max())
 
 
-@pytest.mark.parametrize("name", ["fit", "loop"])
-def test_examples_run(name):
-    found = doctest.testmod(importlib.import_module(f"codesign.train.{name}"))
-    assert found.failed == 0
-    assert found.attempted > 0
-
-
 def test_a_flow_network_finds_the_known_answer():
     """At the end of a falling schedule Adam is within about its last step sizes of the answer: 1e-2 of
     weights of order 1."""
@@ -56,31 +47,23 @@ def test_a_network_without_earlier_predictions_and_a_mix_are_enough():
         def forward(self, volume):
             return self.inner(volume)
 
-    asked: dict[str, int] = {"a": 0, "b": 0}
-
-    def count(name):
-        def before(indices):
-            asked[name] += len(indices)
-
-        return Made(seed=0, before=before)
-
+    asked = {"a": [], "b": []}
     network = Plain()
-    train.fit(network, [(0.75, count("a")), (0.25, count("b"))], steps=40, batch=4, optimiser=adam(network))
+    mix = [(0.75, Made(before=asked["a"].extend)), (0.25, Made(before=asked["b"].extend))]
+    train.fit(network, mix, steps=40, batch=4, optimiser=adam(network))
     # one looked at each
-    assert (asked["a"], asked["b"]) == (pytest.approx(121, abs=4), pytest.approx(41, abs=4))
+    assert len(asked["a"]) == pytest.approx(121, abs=4)
+    assert len(asked["b"]) == pytest.approx(41, abs=4)
 
 
 def test_the_best_weights_are_what_remains():
     """A step that is far too long in the second half leaves the answer again."""
     network = linear()
-    scores = {}
+    scores = []
 
     def judge(network):
-        scores[len(scores)] = distance(network)
-        return distance(network)
-
-    def schedule(share):
-        return 1.0 if share < 0.5 else 40.0
+        scores.append(distance(network))
+        return scores[-1]
 
     made = train.fit(
         network,
@@ -88,14 +71,13 @@ def test_the_best_weights_are_what_remains():
         steps=60,
         batch=4,
         optimiser=adam(network),
-        schedule=schedule,
+        schedule=lambda share: 1.0 if share < 0.5 else 40.0,
         validate=judge,
         validate_every=7,
     )
     assert [entry["step"] for entry in made.validation] == [7, 14, 21, 28, 35, 42, 49, 56, 60]
-    assert [entry["score"] for entry in made.validation] == list(scores.values())
-    assert distance(network) == min(scores.values())
-    assert scores[8] > min(scores.values())
+    assert [entry["score"] for entry in made.validation] == scores
+    assert distance(network) == min(scores) < scores[8]
 
 
 class Noisy(nn.Module):
@@ -152,16 +134,13 @@ def test_interrupted_and_resumed_is_uninterrupted_bit_for_bit(tmp_path):
     assert state_of(tmp_path / "parts") == state_of(tmp_path / "whole")
     for name, tensor in whole.state_dict().items():
         assert torch.equal(tensor, parts.state_dict()[name]), name
-    done: Any = Noisy()
-    assert noisy_fit(tmp_path / "parts", done).step == 8
-    assert torch.equal(done.layers[0].weight, parts.layers[0].weight), "nothing is left to do"
+    assert noisy_fit(tmp_path / "parts", Noisy()).step == 8, "nothing is left to do"
 
 
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
         ({"steps": 9}, "written with steps 8, this run has 9"),
-        ({"seed": 2}, "written with seed 0, this run has 2"),
         ({"clip": 1.0}, "written with clip inf, this run has 1.0"),
     ],
 )
@@ -176,8 +155,6 @@ def test_another_training_is_not_resumed(tmp_path, options, sentence):
     ("options", "sentence"),
     [
         ({"steps": 0}, "steps is 0; at least 1"),
-        ({"batch": 0}, "batch is 0; at least 1"),
-        ({"save_every": 0}, "save_every is 0"),
         ({"clip": 0.0}, "clip 0.0"),
         ({"average": 1.0}, "average 1.0"),
         (
@@ -235,16 +212,8 @@ def test_two_processes_interrupted_and_resumed_learn_what_one_does(tmp_path):
     order: float32 sums of 1024 terms differ by 1e-5 at most, and Adam takes steps of at most 1e-2 times the
     relative change of a gradient."""
     network = linear()
-    alone = train.fit(
-        network,
-        Made(),
-        steps=6,
-        batch=4,
-        optimiser=adam(network, 0.01),
-        average=0.5,
-        validate=nearness,
-        validate_every=2,
-    )
+    options = {"average": 0.5, "validate": nearness, "validate_every": 2}
+    alone = train.fit(network, Made(), steps=6, batch=4, optimiser=adam(network, 0.01), **options)
     folder = tmp_path / "two"
     codes, said = in_two_processes(SHARED, folder)
     assert codes == [0, 0], said

@@ -1,0 +1,253 @@
+"""Windows of our data sets and of recordings: against what is stored and the renderer; damage before training;
+rows of large files."""
+
+import shutil
+
+import hdf5plugin
+import numpy as np
+import pytest
+import torch
+
+from codesign import events
+from codesign.errors import CodesignError, ShapeError
+from codesign.events.formats.hdf5_rows import Rows
+from codesign.events.stream import ordered
+from codesign.flow.export import evenly_timed
+from codesign.flow.sources import DatasetWindows, RecordingWindows, open_windows
+from codesign.flow.sources.windows import bin_times
+from codesign.flow.warp import chained
+from codesign.render import flow_and_occlusion
+from scenes import worlds
+from studies.frame.run import main
+from studies.make_dataset import __main__ as study
+from studies.make_dataset.store import h5
+from tests.recording_case import eth_text, gone, halved, made, rewritten, stores
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    threads = torch.get_num_threads()
+    folder = tmp_path_factory.mktemp("data") / "set"
+    options = [
+        "--trajectories",
+        "2",
+        "--frames",
+        "13",
+        "--size",
+        "40",
+        "--samples",
+        "2",
+        "--chunk",
+        "5",
+        "--rate-hz",
+        "90",
+        "--out",
+    ]
+    assert main(study.study, study.Config, [*options, str(folder)]) == 0
+    torch.set_num_threads(threads)
+    return folder
+
+
+def stored(dataset, name):
+    """Stream, and all that is stored with the frames, of a sequence."""
+    stream = events.read(dataset / name / "events.h5", height_px=40, width_px=40)
+    with h5(dataset / name / "frames.h5") as file:
+        return stream, {key: file[key][()] for key in file}
+
+
+@pytest.mark.bits
+def test_windows_of_one_interval_are_what_is_stored(dataset):
+    assert isinstance(open_windows(dataset, window_frames=2), DatasetWindows)
+    source = DatasetWindows(dataset, bins=4)
+    assert len(source) == 24
+    batch = source.batch([15, 2])
+    for k, (name, frame) in enumerate((("sequence_001_radial", 3), ("sequence_000_orbital", 2))):
+        stream, file = stored(dataset, name)
+        volume = events.from_stream(stream, *(int(t) for t in file["timestamps"][frame : frame + 2]), 4)
+        assert float(volume.counts.sum()) > 0
+        assert torch.equal(batch.volume.counts[k], volume.counts[0])
+        for found, right in (
+            (batch.truth.flow_px, file["flow"][frame]),
+            (batch.truth.valid, file["valid"][frame]),
+            (batch.frames, file["frames"][frame : frame + 2]),
+        ):
+            np.testing.assert_array_equal(found[k].numpy(), right)
+        # frame times are whole microseconds: 11111 or 11112
+        torch.testing.assert_close(batch.volume.centroid_s, volume.centroid_s, rtol=1e-4, atol=0)
+        torch.testing.assert_close(batch.volume.collected_s, volume.collected_s, rtol=1e-4, atol=0)
+    assert batch.truth.interval_s == pytest.approx(1 / 90, rel=1e-4)
+
+
+def test_flow_over_several_frames_is_the_renderers(dataset):
+    stream, file = stored(dataset, "sequence_000_orbital")
+    camera = study.make_camera(study.Config(size=40, samples=2))
+    with torch.no_grad():
+        rendered = flow_and_occlusion(camera, worlds.room(), torch.from_numpy(file["poses"])[[3, 9]])
+    truth, seen = rendered.flow_px[0], rendered.valid[0]
+    assert float(truth.norm(dim=0).mean()) > 1
+    source = DatasetWindows(dataset / "sequence_000_orbital", window_frames=6, stride_frames=3)
+    assert len(source) == 3
+    batch = source.batch([1])
+    both = batch.truth.valid[0] & seen
+    # points far outside the picture have no place in the fit
+    assert float((both == seen).double().mean()) > 0.99
+    # float32 depth to 6e-8 of some metres over a flow of some px, and the fit of the camera (1e-4 px,
+    # measured with traced rays)
+    assert float((batch.truth.flow_px[0].double() - truth).norm(dim=0)[both].max()) < 2e-4
+    np.testing.assert_array_equal(batch.frames[0].numpy(), file["frames"][[3, 9]])
+    ends = (int(file["timestamps"][k]) for k in (3, 9))
+    assert torch.equal(batch.volume.counts, events.from_stream(stream, *ends, 8).counts)
+    # followed from frame to frame instead: bilinear lookups smooth the flow by its curvature; across edges of
+    # depth that differ by less than the threshold it is wrong by a part of that
+    flows, valid, occluded = (torch.from_numpy(file[name][3:9]) for name in ("flow", "valid", "occluded"))
+    flow, followed = chained(flows.double(), valid, occluded)
+    followed &= seen
+    assert float(followed.double().mean()) > 0.5
+    error = (flow - truth).norm(dim=0)[followed]
+    assert float(error.median()) < 0.01
+    assert float(error.quantile(0.95)) < 0.3
+
+
+@pytest.mark.bits
+def test_pieces_depend_on_seed_and_number_alone(dataset):
+    source = DatasetWindows(dataset, crop_px=(16, 24), seed=5)
+    one, other = source.batch([7, 3]), source.batch([3])
+    assert torch.equal(one.volume.counts[1], other.volume.counts[0])
+    full = DatasetWindows(dataset).batch([3])
+    pieces = [(slice(top, top + 16), slice(left, left + 24)) for top in range(25) for left in range(17)]
+    found = [
+        torch.equal(full.truth.flow_px[(0, ..., *piece)], other.truth.flow_px[0])
+        and torch.equal(full.volume.counts[(0, ..., *piece)], other.volume.counts[0])
+        and torch.equal(full.frames[(0, ..., *piece)], other.frames[0])
+        for piece in pieces
+    ]
+    assert sum(found) == 1
+    again = [DatasetWindows(dataset, crop_px=(16, 24), seed=seed).batch([3]) for seed in range(3)]
+    assert not all(torch.equal(batch.truth.flow_px, other.truth.flow_px) for batch in again)
+    with pytest.raises(ShapeError, match="the pictures have 40 x 40"):
+        DatasetWindows(dataset, crop_px=(16, 41))
+
+
+@pytest.mark.parametrize(
+    ("call", "reason"),
+    [
+        (lambda folder: DatasetWindows(folder).batch([24]), "the source has 24"),
+        (lambda folder: DatasetWindows(folder).batch([-1]), "the source has 24"),
+        (lambda folder: DatasetWindows(folder).batch([]), "no samples"),
+        (lambda folder: DatasetWindows(folder, window_frames=13), "no sequence"),
+        (lambda folder: DatasetWindows(folder, window_frames=0), "whole numbers from 1"),
+        (lambda folder: DatasetWindows(folder, sequences=["x"]), "has no sequence 'x'"),
+    ],
+)
+def test_numbers_that_mean_nothing(call, reason, dataset):
+    with pytest.raises(CodesignError, match=reason):
+        call(dataset)
+
+
+def test_times_of_the_bins_are_those_of_from_stream():
+    one = torch.tensor([1])
+    for bins in (1, 2, 5):
+        volume = events.from_stream(ordered(one, one, one, one, 3, 3), 0, 1_000_000, bins)
+        right = volume.centroid_s, volume.collected_s
+        torch.testing.assert_close(bin_times(bins, 1.0), right, rtol=1e-12, atol=0)
+        ours = evenly_timed(volume.counts) if bins > 1 else volume
+        torch.testing.assert_close((ours.centroid_s, ours.collected_s), right, rtol=1e-12, atol=0)
+
+
+def test_a_recording_is_a_source_of_windows(tmp_path):
+    """Events of a text file, all of them, in windows of the length asked for; no flow is known."""
+    columns = made(2000, duration_s=0.101)
+    place = tmp_path / "set" / "walk"
+    place.mkdir(parents=True)
+    (place / "events.txt").write_text(eth_text(columns))
+    source = open_windows(place, bins=4, window_s=0.025)
+    assert isinstance(source, RecordingWindows)
+    windows = source.batch(range(len(source)))
+    assert windows.volume.counts.shape == (4, 2, 4, 180, 240)
+    t_us = columns[0] - columns[0][0]
+    # an event on the border of two windows is in both
+    inside = (t_us <= 100_000).sum() + sum((t_us == k * 25_000).sum() for k in (1, 2, 3))
+    assert float(windows.volume.counts.sum()) == pytest.approx(inside)
+    assert not bool(windows.truth.valid.any())
+
+
+RADIAL = "sequence_001_radial"
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda at: gone(at / RADIAL / "events.h5"), "lacks events.h5"),
+        (lambda at: halved(at / RADIAL / "frames.h5"), "by the manifest; it was cut"),
+        (lambda at: gone(at / "manifest.json"), "has no manifest.json"),
+        (
+            lambda at: rewritten(at / "manifest.json", "-dataset/1", "-dataset/9"),
+            "format 'codesign-dataset/9'",
+        ),
+    ],
+)
+def test_damage_is_refused_at_once(damage, reason, dataset, tmp_path):
+    folder = tmp_path / "set"
+    shutil.copytree(dataset, folder)
+    damage(folder)
+    with pytest.raises(CodesignError, match=reason):
+        DatasetWindows(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "values", "reason"),
+    [
+        ("frames.h5", "flow", np.zeros((12, 2, 40, 39), np.float32), r"flow has shape \[12, 2, 40, 39\], \["),
+        ("frames.h5", "timestamps", np.zeros(13, np.int64), "do not rise"),
+        ("events.h5", "ms_to_idx", np.full(200, 10**9, np.uint64), "no index"),
+    ],
+)
+def test_a_sequence_whose_parts_do_not_fit(name, key, values, reason, dataset, tmp_path):
+    shutil.copytree(dataset / RADIAL, tmp_path / "one")
+    stores(tmp_path / "one" / name, key, values)
+    with pytest.raises(CodesignError, match=reason):
+        DatasetWindows(tmp_path / "one")
+
+
+# rows of files
+
+
+@pytest.mark.parametrize(
+    "packing",
+    [
+        {},
+        {"chunks": (7, 2, 3), "compression": "gzip", "shuffle": True, "fletcher32": True},
+        {"chunks": (16, 4, 5), **hdf5plugin.Blosc()},
+    ],
+)
+def test_rows_are_those_of_the_library(packing, tmp_path):
+    values = np.random.default_rng(0).normal(size=(50, 4, 5))
+    with h5(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("a", data=values, **packing)
+    rows = Rows(tmp_path / "a.h5", "a", (4, 5), 50)
+    for first, last in ((0, 50), (6, 8), (7, 14), (49, 50), (20, 20)):
+        np.testing.assert_array_equal(rows.read(first, last), values[first:last])
+    np.testing.assert_array_equal(rows[33], values[33])
+    with pytest.raises(CodesignError, match="rows 40 to 51"):
+        rows.read(40, 51)
+
+
+def test_rows_refuse_what_the_library_would_end_the_process_on(tmp_path):
+    path = tmp_path / "a.h5"
+    with h5(path, "w") as file:
+        data = file.create_dataset("a", (40,), np.int32, chunks=(10,), compression="gzip")
+        data[:] = np.arange(40)
+        data.id.write_direct_chunk((20,), b"\x78\x9c\x03\x00\x00\x00\x00\x01")  # unpacks to nothing
+        file.create_dataset("b", data=np.arange(40), chunks=(10,), compression="lzf")
+        file["d"] = np.array([b"text"])
+    rows = Rows(path, "a")
+    np.testing.assert_array_equal(rows.read(0, 20), np.arange(20))
+    with pytest.raises(CodesignError, match="does not unpack"):
+        rows.read(0, 40)
+    for name, reason in (
+        ("b", "through the filters"),
+        ("d", "no list of numbers"),
+        ("e", "absent or a link"),
+    ):
+        with pytest.raises(CodesignError, match=reason):
+            Rows(path, name)
