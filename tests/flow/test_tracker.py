@@ -215,6 +215,7 @@ def tracker(estimator=summed, **options):
         (lambda: tracker(events=5).add(None), "the chunk is None"),
         (lambda: tracker(events=5).add(([1], [1], [1], [1])), "give size_px"),
         (lambda: tracker(events=5, size_px=SIZE).add(([1], [1], [1], [3])), "polarity 3"),
+        (lambda: tracker(events=5, size_px=SIZE).add(([1.5], [1], [1], [1])), "t_us is"),
         (lambda: tracker(events=5, size_px=SIZE).add(([1, 2], [1], [1], [1])), "entries"),
         (lambda: tracker(events=5, size_px=(3, 3)).add(stream_of([1])), "sensor of 16 x 12 px"),
         (lambda: tracker(window_s=1e-3).add(stream_of([0, 10**11])), "did the clock jump"),
