@@ -12,7 +12,7 @@ from studies.frame.compare import log_ratios, pooled, student
 from studies.frame.config import configured
 from studies.frame.run import Run, StudyConfig, main, open_run
 from studies.lens_opt import __main__ as lens_opt
-from studies.lens_opt.comparison import DESIGNS, RIVALS, label, verdict
+from studies.lens_opt.page import DESIGNS, RIVALS, label, verdict
 
 COMPARED = ("refocused", "spots", "edge")
 

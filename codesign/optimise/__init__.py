@@ -1,7 +1,6 @@
 """Optimisers and the loop around them."""
 
 from codesign.doors import explain
-from codesign.optimise.adam import ScaledAdam
 from codesign.optimise.descent import Descent
 from codesign.optimise.gradients import SampleGradients, clipped_mean, sample_gradients
 from codesign.optimise.least_squares import DampedLeastSquares, StopRules
@@ -13,7 +12,6 @@ __all__ = [
     "Loop",
     "Record",
     "SampleGradients",
-    "ScaledAdam",
     "StopRules",
     "check_parameters",
     "clipped_mean",

@@ -22,8 +22,8 @@ from studies.frame.compare import log_ratio
 from studies.frame.run import Run, StudyConfig, main
 from studies.lens_opt import page as lens_opt_page
 from studies.lens_opt import rivals
-from studies.lens_opt.comparison import label
 from studies.lens_opt.descend import JUDGED, Job, development_error, prepare
+from studies.lens_opt.page import label
 from studies.lens_opt.task import HELD_OUT, LIGHT, draw_case, make_worlds
 
 

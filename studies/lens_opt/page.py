@@ -1,16 +1,62 @@
 """The page of a lens_opt run: who wins, the rivals, layouts, spots, frames, event frames, curves, junction table."""
 
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from codesign import events, render
-from codesign.errors import MissingPackageError
-from codesign.report import chain_figures, lens_figures
+from codesign.report import lens_figures
 from scenes import worlds
-from studies.frame.compare import log_ratio
-from studies.lens_opt import comparison
-from studies.lens_opt.comparison import DESIGNS, RIVALS, label
+from studies.frame.compare import Interval, log_ratio
+from studies.frame.show import Panel, bars, panels, pictures, table
 from studies.lens_opt.task import DISTANCE_M, FIELDS, PITCH_MM, SENSOR
+
+DESIGNS = {"flow": "the flow design", "edge": "the edge design"}
+RIVALS = {
+    "refocused": "refocusing alone",
+    "spots": "the spot designer",
+    "edge": "the edge objective",
+    "flow": "the flow objective",
+}
+LENSES = {
+    "nominal": "published lens, in focus",
+    "defocused": "detuned, with its focus error",
+    "detuned": "detuned, in focus: the start",
+    "after_spots": "flow steps after the spot designer",
+}
+
+
+def label(name, objective):
+    """What a lens is called on the page."""
+    if name == "optimised":
+        return DESIGNS[objective].removeprefix("the ")
+    return LENSES.get(name) or RIVALS[name].removeprefix("the ")
+
+
+def verdict(design: str, rivals: Mapping[str, Interval]) -> str:
+    """One sentence that says first who wins: the rivals that do, those that tie, or the design where it beats all.
+
+    Args:
+      design: what it is called, "the flow design".
+      rivals: what each is called -> log ratio of the design over it.
+    """
+    said = []
+    for outcome, words in (("loses", ("wins", "win")), ("ties", ("ties", "tie"))):
+        found = {name: pair for name, pair in rivals.items() if pair.outcome == outcome}
+        if found:
+            several = len(found) > 1
+            said.append(
+                f"{' and '.join(found)} {words[several]}: the flow error of {design} against "
+                f"{'them' if several else 'it'} is {' and '.join(pair.percent() for pair in found.values())}"
+            )
+    if not said:
+        name, closest = max(rivals.items(), key=lambda item: item[1].value)
+        said.append(f"{design} wins: its flow error against its best rival, {name}, is {closest.percent()}")
+    sentence = f"{'; '.join(said)} on {next(iter(rivals.values())).count} unseen cases."
+    return sentence[0].upper() + sentence[1:]
 
 
 def blank_wall():
@@ -21,178 +67,209 @@ def blank_wall():
 def write(run, course, lenses, junctions):
     """Fill and finish the run's page."""
     config = run.config
-    job = course.jobs["optimised"]
-    found = course.found
-    design = DESIGNS[config.objective]
-    errors = {name: [row["flow_error_mrad"] for row in rows] for name, rows in found.items()}
-    pairs = {name: log_ratio(errors["optimised"], errors[name]) for name in RIVALS if name in lenses}
-    said = comparison.verdict(design, {RIVALS[name]: pair for name, pair in pairs.items()})
-    complaints = {v["complaint"] for rows in course.choices.values() for v in rows if v["complaint"]}
-    comparison.cards(run, pairs)
-    comparison.who_wins(run, course, lenses, errors, complaints)
-    comparison.settings(run, course)
-    _lenses(run, job.task, lenses)
-    _seen_by_the_sensor(run, job, lenses)
+    task = course.jobs["optimised"].task
+    names = {name: label(name, config.objective) for name in lenses}
+    errors = {name: [row["flow_error_mrad"] for row in rows] for name, rows in course.found.items()}
+    pairs = {name: log_ratio(errors["optimised"], errors[name]) for name in lenses if name != "optimised"}
+    rivals = [name for name in RIVALS if name in lenses]
+    said = verdict(DESIGNS[config.objective], {RIVALS[name]: pairs[name] for name in rivals})
+    _who_wins(run, names, pairs, rivals)
+    for complaint in sorted({v["complaint"] for rows in course.choices.values() for v in rows} - {""}):
+        run.text(f"**Note**: {complaint}")
+    if "after_spots" in lenses:
+        pair = log_ratio(errors["after_spots"], errors["spots"])
+        run.text(
+            f"{config.after_steps} steps of the flow objective from the spot designer's lens change its flow error "
+            f"by {pair.percent()}: by its interval, it {pair.outcome}."
+        )
+    _by_window(run, course.found, names, rivals)
+    _settings(run, course)
+    shown = {names[name]: lenses[name] for name in ("nominal", "detuned", "spots", "optimised")}
+    _lenses(run, task, shown)
+    _seen_by_the_sensor(run, course.jobs["optimised"], shown)
     _way(run, course)
-    _junctions(run, junctions)
-    _cases(run, errors, lenses)
-    m = run.metrics
-    trained = ", the network trained with the lens" if config.train_network else ""
-    pace = f" at {m['seconds_per_step']:.2f} s" if "seconds_per_step" in m else ""
-    lead = (
-        f"**{said}**\n\nAsked: what does an event-flow objective buy a lens designer over the best spot-size designer? "
-        f"{config.lens}, curvatures detuned by seed {config.seed} and refocused, objective {config.objective}, events "
-        f"{config.events}, flow {config.flow}{trained}: {m['steps']} steps{pace}. Changes are of the geometric mean "
-        "flow error, case by case, with 95 % intervals of Student's t."
-    )
-    run.finish("Lens optimisation for event flow", lead)
-    run.say(said)
-
-
-def _lenses(run, task, lenses):
-    run.section("The lenses", "Cross-sections with meridional rays at the three fields, and their spots.")
-    named = {
-        label(name, run.config.objective): optics
-        for name, optics in lenses.items()
-        if name in ("nominal", "detuned", "spots", "optimised")
-    }
-    run.figure(
-        lens_figures.layouts(named, task.fields_rad),
-        "lens_layout",
-        "Light comes from the left. Colours are fields 0, 0.7 and 1 of the half diagonal.",
-    )
-    run.figure(
-        lens_figures.spot_diagrams(named, task.fields_rad, PITCH_MM, DISTANCE_M),
-        "spot_diagrams",
-        f"Spots of the wall at {DISTANCE_M:g} m and 587.6 nm about their mean; the red square is one pixel.",
-    )
-
-
-def _seen_by_the_sensor(run, job, lenses):
-    run.section(
-        "What the sensor sees",
-        "One training scene through the detuned, the spot designer's and the optimised lens: first frame and signed "
-        "event counts over the whole interval, at the three windows.",
-    )
-    run.figure(
-        _seen(
-            job.task,
-            {name: lenses[name] for name in ("detuned", "spots", "optimised")},
-            job.probe,
-            run.config,
-        ),
-        "frames_and_events",
-        "Top of each pair: frame; below: ON minus OFF events (red minus blue).",
-    )
-    _seed_emulator(run, job.task, lenses["optimised"], job.probe)
-
-
-def _way(run, course):
-    run.section("The way there")
-    for name, job in course.jobs.items():
-        objective = "flow" if name == "after_spots" else run.config.objective if name == "optimised" else name
-        record = job.loop.record
-        done = list(range(1, len(record.loss) + 1))
-        losses = {
-            "each step, its own cases": (done, record.loss),
-            "fixed training cases, hard sensor": (record.judged_step, record.score),
-        }
-        run.figure(
-            chain_figures.curves(losses, _loss_label(objective)),
-            f"loss_curve_{name}",
-            f"Loss while optimising: {label(name, run.config.objective)}.",
-        )
-    job = course.jobs["optimised"]
-    steps = job.loop.record.judged_step
-    spots = {f"field {h:g}": (steps, [row[k] for row in job.history.spot_um]) for k, h in enumerate(FIELDS)}
-    run.figure(
-        chain_figures.curves(spots, "RMS spot (µm)"), "spot_curve", "RMS spot of the best design so far."
-    )
-    for name, unit in (("curvature", "1/mm"), ("thickness", "mm")):
-        rows = np.array(getattr(job.history, name))
-        series = {f"surface {k + 1}": (steps, rows[:, k] - rows[0, k]) for k in range(rows.shape[1])}
-        run.figure(
-            chain_figures.curves(series, f"change of {name} ({unit})"),
-            f"{name}_curves",
-            f"Change of each {name} since the detuned start; the last curvature holds the focal length.",
-        )
-
-
-def _junctions(run, junctions):
     run.section(
         "Gradient at every junction",
         "One pass at the end point: norms of value and gradient, and the share of gradient entries that are "
         "exactly zero.",
     )
+    run.table("Junctions", *table(junctions))
+    _cases(run, errors, names)
+    m = run.metrics
+    trained = ", the network trained with the lens" if config.train_network else ""
+    pace = f" at {m['seconds_per_step']:.2f} s" if "seconds_per_step" in m else ""
+    run.finish(
+        "Lens optimisation for event flow",
+        f"**{said}**\n\nAsked: what does an event-flow objective buy a lens designer over the best spot-size designer? "
+        f"{config.lens}, curvatures detuned by seed {config.seed} and refocused, objective {config.objective}, events "
+        f"{config.events}, flow {config.flow}{trained}: {m['steps']} steps{pace}. Changes are of the geometric mean "
+        "flow error, case by case, with 95 % intervals of Student's t.",
+    )
+    run.say(said)
+
+
+def _who_wins(run, names, pairs, rivals):
+    """Cards, and table and bars of the paired differences over all windows."""
+    design = names["optimised"]
+    m = run.metrics
+    for name in ("optimised", *rivals):
+        change = (
+            f"the design against it: {pairs[name].percent()}" if name in pairs else "mean of held-out cases"
+        )
+        error, spot = m[f"flow_error_mrad_hard_{name}"], m[f"rms_spot_um_{name}"]
+        run.card(f"Flow error, {names[name]}", f"{error:.3f} mrad", f"RMS spot {spot:.1f} µm; {change}")
+    run.section(
+        "Who wins",
+        "Hard events from the physical sensor, textures and motions never optimised on, the same cases for every "
+        f"lens. A change below 0 says that the {design} errs less than the lens of the row; where the interval holds "
+        "0, the two tie. All lenses have the same free variables, focal length, f-number and floors of thickness; the "
+        "published lens is a yardstick that no design here knows.",
+    )
+    rows = []
+    for name, title in names.items():
+        figures = (
+            m[f"{key}_{name}"] for key in ("flow_error_mrad_hard", "rms_spot_um", "edge_below_floor_mm")
+        )
+        change = (pairs[name].percent(), pairs[name].outcome) if name in pairs else ("", "")
+        rows.append([title, *figures, *change])
     run.table(
-        "Junctions",
-        ["junction", "value norm", "gradient norm", "zero share"],
-        [[r["junction"], r["value_norm"], r["gradient_norm"], r["zero_share"]] for r in junctions],
+        "Lenses on held-out cases",
+        [
+            "lens",
+            "flow error (mrad)",
+            "RMS spot (µm)",
+            "edge below its floor (mm)",
+            f"change by the {design}",
+            "it",
+        ],
+        rows,
+        f"RMS spot: mean over three fields of a wall at {DISTANCE_M:g} m, four wavelengths; a pixel is "
+        f"{PITCH_MM * 1e3:g} µm.",
+    )
+    ratios = {
+        names[name]: replace(
+            pair, **{k: math.exp(min(getattr(pair, k), 4.0)) for k in ("value", "low", "high")}
+        )
+        for name, pair in pairs.items()
+        if name not in ("nominal", "defocused")
+    }
+    run.figure(
+        bars(ratios, f"flow error of the {design} / flow error of the lens", log=True, level=1.0),
+        "pairs",
+        f"Flow error of the {design} over that of each lens: mean and 95 % interval.",
     )
 
 
-def _cases(run, errors, lenses):
-    m = run.metrics
+def _by_window(run, found, names, rivals):
+    rows = []
+    for h in FIELDS:
+        key = f"flow_error_mrad_field_{h:g}"
+        own, *others = ([row[key] for row in found[name]] for name in ("optimised", *rivals))
+        rows.append([f"{h:g}", sum(own) / len(own), *(log_ratio(own, other).percent() for other in others)])
+    run.table(
+        "Where: by window",
+        [
+            "window, of the way to the corner",
+            f"{names['optimised']} (mrad)",
+            *(names[name] for name in rivals),
+        ],
+        rows,
+        "Change of flow error by the design against each rival, in one window.",
+    )
+
+
+def _settings(run, course):
+    config = run.config
+    run.section(
+        "The rivals at their best",
+        f"Refocusing moves the film alone. The spot designer minimises the weighted mean square spot of the wall in the "
+        f"camera's own light by damped least squares, from {config.spot_starts} starts. Both choose among the settings "
+        f"below by the geometric mean flow error on {config.developed} development cases, of other textures than those "
+        "optimised on and those judged on. The other gradient objective runs from the same start, for as many steps, "
+        "with a clip and a step size of its own, the best of a few on development cases.",
+    )
+    for name, rows in course.choices.items():
+        columns = {
+            "setting": "setting",
+            "error_mrad": "flow error on development cases (mrad), the least is chosen",
+        }
+        run.table(f"Settings: {label(name, config.objective)}", *table(rows, **columns))
+
+
+def _lenses(run, task, shown):
+    run.section("The lenses", "Cross-sections with meridional rays at the three fields, and their spots.")
+    run.figure(
+        lens_figures.layouts(shown, task.fields_rad),
+        "lens_layout",
+        "Light comes from the left. Colours are fields 0, 0.7 and 1 of the half diagonal.",
+    )
+    run.figure(
+        lens_figures.spot_diagrams(shown, task.fields_rad, PITCH_MM, DISTANCE_M),
+        "spot_diagrams",
+        f"Spots of the wall at {DISTANCE_M:g} m and 587.6 nm about their mean; the red square is one pixel.",
+    )
+
+
+def _seen_by_the_sensor(run, job, shown):
+    case = job.probe
+    rows = {}
+    for title, optics in shown.items():
+        with torch.no_grad():
+            camera = job.task.camera(optics, run.config.samples, case.seed)
+            frames = render.frames(camera, case.scene, case.T_world_body)
+            on, off = events.memory(frames, SENSOR.theta_on, SENSOR.theta_off)[0].sum(0)
+        for h, frame, count in zip(FIELDS, frames[0], on - off, strict=True):
+            rows.setdefault(title, {}).update({f"field {h:g}": frame, f"events {h:g}": count})
+    run.section(
+        "What the sensor sees",
+        "One training scene: first frame and signed event counts over the whole interval, at the three windows.",
+    )
+    run.figure(
+        pictures(rows, signed=[f"events {h:g}" for h in FIELDS]),
+        "frames_and_events",
+        "Frames, and ON minus OFF events (red minus blue).",
+    )
+
+
+def _way(run, course):
+    run.section("The way there")
     objective = run.config.objective
+    for name, job in course.jobs.items():
+        record = job.loop.record
+        of = "flow" if name == "after_spots" else objective if name == "optimised" else name
+        losses = {
+            "each step, its own cases": (range(1, len(record.loss) + 1), record.loss),
+            "fixed training cases, hard sensor": (record.judged_step, record.score),
+        }
+        title = "mean log angular error (log mrad)" if of == "flow" else "−(edge energy − λ activity)"
+        caption = f"Loss while optimising: {label(name, objective)}."
+        run.figure(panels(Panel(losses, "step", title), width=7), f"loss_curve_{name}", caption)
+    job = course.jobs["optimised"]
+    steps = job.loop.record.judged_step
+    charts = []
+    for name, unit in (("curvature", "1/mm"), ("thickness", "mm")):
+        rows = np.array(getattr(job.history, name))
+        series = {f"surface {k + 1}": (steps, column) for k, column in enumerate((rows - rows[0]).T)}
+        charts.append(Panel(series, "step", f"change of {name} ({unit})"))
+    spots = zip(FIELDS, np.array(job.history.spot_um).T, strict=True)
+    charts.append(Panel({f"field {h:g}": (steps, row) for h, row in spots}, "step", "RMS spot (µm)"))
+    run.figure(
+        panels(*charts),
+        "design_curves",
+        "The best design so far: change since the detuned start (the last curvature holds the focal length), and spots.",
+    )
+
+
+def _cases(run, errors, names):
+    m = run.metrics
     run.section("Case by case", "The control is a wall without texture, where no lens can help.")
-    rows = [[i + 1, *(round(errors[name][i], 3) for name in lenses)] for i in range(len(errors["optimised"]))]
-    names = [label(name, objective) for name in lenses]
-    run.table("Angular flow error per held-out case (mrad)", ["case", *names], rows)
+    rows = [[i + 1, *(round(errors[name][i], 3) for name in names)] for i in range(len(errors["optimised"]))]
+    run.table("Angular flow error per held-out case (mrad)", ["case", *names.values()], rows)
+    keys = ("edge_energy_hard", "events_per_pixel_hard", "efl_mm", "fno")
     run.table(
         "Means",
         ["lens", "edge energy", "events per pixel", "focal length (mm)", "f-number"],
-        [
-            [
-                label(n, objective),
-                *(m[f"{key}_{n}"] for key in ("edge_energy_hard", "events_per_pixel_hard", "efl_mm", "fno")),
-            ]
-            for n in lenses
-        ],
+        [[title, *(m[f"{key}_{name}"] for key in keys)] for name, title in names.items()],
     )
-    run.text(
-        f"Control without texture: detuned {m['flow_error_mrad_hard_control_detuned']:.2f} mrad, optimised "
-        f"{m['flow_error_mrad_hard_control_optimised']:.2f} mrad."
-    )
-
-
-def _seed_emulator(run, task, optics, case):
-    """The seed project's view of the same scene: naive frame-difference events as CSV, and their
-    exponential-decay video."""
-    with torch.no_grad():
-        frames = render.frames(
-            task.camera(optics, run.config.samples, case.seed), case.scene, case.T_world_body
-        )
-    tall = frames.reshape(frames.shape[0], -1, frames.shape[-1])  # the windows above one another
-    stream = events.naive(tall, case.t_s, SENSOR.theta_on)
-    events.write(run.path("events_naive.csv"), stream)
-    try:
-        events.decay_video(run.path("events_decay.mp4"), stream, case.t_s, 0.015, fps=8)
-    except MissingPackageError as error:
-        run.text(f"**Left out**: the video of fading events. {error}")
-        run.say(f"left out: the video of fading events; {error}")
-        return
-    run.video(
-        "events_decay.mp4",
-        f"{len(stream)} events of the naive frame-difference emulator (events_naive.csv), fading over 15 "
-        "ms; the three windows above one another.",
-    )
-
-
-def _loss_label(objective):
-    return "mean log angular error (log mrad)" if objective == "flow" else "−(edge energy − λ activity)"
-
-
-def _seen(task, lenses, case, config):
-    rows = []
-    labels = []
-    signed = []
-    for name, optics in lenses.items():
-        with torch.no_grad():
-            camera = task.camera(optics, config.samples, case.seed)
-            frames = render.frames(camera, case.scene, case.T_world_body)
-            counts, _ = events.memory(frames, SENSOR.theta_on, SENSOR.theta_off)
-        total = counts.sum(0)
-        rows += [list(frames[0].numpy()), list((total[0] - total[1]).numpy())]
-        labels += [f"{label(name, config.objective)}: {what}" for what in ("frame", "events")]
-        signed += [False, True]
-    return chain_figures.strips(rows, [f"field {h:g}" for h in FIELDS], signed, labels)
+    detuned, optimised = (m[f"flow_error_mrad_hard_control_{name}"] for name in ("detuned", "optimised"))
+    run.text(f"Control without texture: detuned {detuned:.2f} mrad, optimised {optimised:.2f} mrad.")

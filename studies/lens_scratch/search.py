@@ -5,15 +5,13 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from codesign.grad.jacobian import column_scales
-from codesign.optimise.adam import ScaledAdam
+from codesign.grad.jacobian import by_differences
 from codesign.optimise.least_squares import DampedLeastSquares, StopRules
-from studies.lens_scratch.task import LINES, Stage, draw_start, jacobian, judge, residuals_of
+from studies.lens_scratch.task import LINES, STEPS, Stage, draw_start, judge, residuals_of
 
 METHODS = {
     "curriculum": "damped least squares; aperture and field grow together",
     "direct": "damped least squares at full aperture and field at once",
-    "adam": "Adam with steps scaled by the Jacobian, full aperture and field",
 }
 STAGES = {
     "curriculum": (
@@ -23,15 +21,10 @@ STAGES = {
         Stage(1.0, 1.0, LINES, 150),
     ),
     "direct": (Stage(1.0, 1.0, LINES, 200),),
-    "adam": (Stage(1.0, 1.0, LINES, 1000),),
 }
-ATTEMPTS = {"curriculum": 3, "direct": 3, "adam": 1}  # draws of a start until one succeeds
+ATTEMPTS = 3  # draws of a start until one succeeds
 NUMBERS = ("steps", "evaluations", "seconds", "losses")  # of a search, which outlive its stages
 LOSS_CHANGE = 1e-6  # a stage ends when a step gains less than this share
-ADAM_STEP = 1.0  # residual units (0.01 mm RMS) per step
-ADAM_LIMIT = torch.tensor(
-    [1e-2] * 5 + [1.0] * 6, dtype=torch.float64
-)  # per mm and mm: some thicknesses of plane plates move no ray
 
 
 @dataclass(frozen=True)
@@ -73,11 +66,9 @@ class Search:
         entry = self.optimiser.step()
         self.losses.append(entry.loss)
         self.steps += 1
-        ended = len(self.optimiser.history) >= self.stages[self.stage].steps or getattr(
-            self.optimiser, "stopped", ""
-        )
+        ended = len(self.optimiser.history) >= self.stages[self.stage].steps or self.optimiser.stopped
         if ended and self.stage + 1 < len(self.stages):
-            self._begin_stage(self.stage + 1, self._variables())
+            self._begin_stage(self.stage + 1, self.optimiser.variables)
         elif ended:
             self._end_attempt()
         return entry
@@ -98,7 +89,7 @@ class Search:
         for name in NUMBERS:
             setattr(self, name, state[name])
         taken = self.optimiser.history
-        if self.method != "adam" and taken and not taken[-1].accepted:
+        if taken and not taken[-1].accepted:
             self.evaluations -= len(self.began)  # slopes behind a rejected step are found a second time
         return self
 
@@ -115,21 +106,12 @@ class Search:
             self.evaluations += 1
             return plain(at)
 
-        if self.method == "adam":
-            scales = column_scales(jacobian()(residuals, variables, plain(variables)), ADAM_LIMIT)
-            self.optimiser = ScaledAdam(
-                lambda at: residuals(at).square().sum() / 2, variables, scales, ADAM_STEP
-            )
-        else:
-            self.optimiser = DampedLeastSquares(
-                residuals, variables, jacobian(), stop=StopRules(loss=LOSS_CHANGE)
-            )
-
-    def _variables(self):
-        return self.optimiser.best if isinstance(self.optimiser, ScaledAdam) else self.optimiser.variables
+        self.optimiser = DampedLeastSquares(
+            residuals, variables, by_differences(STEPS), stop=StopRules(loss=LOSS_CHANGE)
+        )
 
     def _end_attempt(self):
-        verdict = judge(self._variables())
+        verdict = judge(self.optimiser.variables)
         succeeded = (
             verdict is not None
             and verdict.rays_pass
@@ -137,9 +119,9 @@ class Search:
             and verdict.mean_um <= self.goal_um
         )
         self.attempt += 1
-        if not succeeded and self.attempt < ATTEMPTS[self.method]:
+        if not succeeded and self.attempt < ATTEMPTS:
             self._begin_attempt()
             return
         numbers = {name: getattr(self, name) for name in NUMBERS}
-        variables = self._variables().tolist()
+        variables = self.optimiser.variables.tolist()
         self.outcome = Outcome(self.method, self.seed, variables, succeeded, self.attempt, **numbers)

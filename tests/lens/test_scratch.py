@@ -1,17 +1,15 @@
 """The design study from plane plates: its residuals are the spots it is judged by, its searches go on
-exactly, its intervals are Wilson's."""
+exactly."""
 
 import json
 import math
 
 import pytest
-import scipy.stats
 import torch
 
 from codesign import lens
 from codesign.lens import WAVELENGTH_UM
 from codesign.lens.analysis import pupil_grid
-from studies.lens_scratch.__main__ import wilson
 from studies.lens_scratch.search import Search
 from studies.lens_scratch.task import (
     EFL_MM,
@@ -70,34 +68,21 @@ def test_the_judge_sees_the_published_lens_as_it_is():
     assert judge(torch.full((11,), 0.5, dtype=D)) is None  # radii of 2 mm pass no rays
 
 
-@pytest.mark.parametrize("method", ["curriculum", "adam"])
-def test_a_search_goes_on_exactly_after_a_break(method):
-    whole = Search(method, 5, 21.6)
-    first = Search(method, 5, 21.6)
-    for _ in range(24):  # past the end of the curriculum's first stage
+def test_a_search_goes_on_exactly_after_a_break():
+    whole = Search("curriculum", 5, 21.6)
+    first = Search("curriculum", 5, 21.6)
+    for _ in range(24):  # past the end of the first stage
         whole.step()
     for _ in range(22):
         first.step()
-    resumed = Search(method, 5, 21.6).resume(json.loads(json.dumps(first.state())))
+    resumed = Search("curriculum", 5, 21.6).resume(json.loads(json.dumps(first.state())))
     for _ in range(2):
         resumed.step()
-    if method == "curriculum":
-        assert resumed.losses == whole.losses
-        assert resumed.optimiser.variables.tolist() == whole.optimiser.variables.tolist()
-    else:  # the backward pass sums in parallel, so last bits differ
-        assert resumed.losses == pytest.approx(whole.losses, rel=1e-9)
+    assert resumed.losses == whole.losses
+    assert resumed.optimiser.variables.tolist() == whole.optimiser.variables.tolist()
     assert (resumed.stage, resumed.steps) == (whole.stage, whole.steps)
     # a break after a rejected step takes its Jacobian again
-    assert resumed.evaluations - whole.evaluations in (
-        0,
-        11,
-    )
-
-
-@pytest.mark.parametrize(("wins", "count"), [(0, 10), (6, 10), (10, 10)])
-def test_wilson_interval_against_scipy(wins, count):
-    truth = scipy.stats.binomtest(wins, count).proportion_ci(0.95, method="wilson")
-    assert wilson(wins, count) == pytest.approx((truth.low, truth.high), abs=2e-5)  # 1.96 for 1.959964
+    assert resumed.evaluations - whole.evaluations in (0, 11)
 
 
 def test_one_seed_reaches_the_published_lens():

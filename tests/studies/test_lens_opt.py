@@ -17,7 +17,7 @@ from studies.frame.config import configured
 from studies.frame.run import main
 from studies.lens_opt import __main__ as lens_opt
 from studies.lens_opt import rivals
-from studies.lens_opt.comparison import verdict
+from studies.lens_opt.page import verdict
 from studies.lens_opt.spots import spot_rays
 from studies.lens_opt.stages import estimator, weights_of
 from studies.lens_opt.task import DISTANCE_M, LIGHT, PITCH_MM, LensTask, make_task
