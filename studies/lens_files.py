@@ -6,6 +6,8 @@ or file note claims a focal length, it is compared with the paraxial one of the 
 of the claim.
 """
 
+import csv
+import itertools
 import json
 import math
 import sys
@@ -36,41 +38,13 @@ class Claim:
     remark: str = ""
 
 
-NAME_ROUNDS = "product names round the focal length"
-CLAIMS = {
-    "deeplens/camera/ef35mm_f2.0.zmx": Claim(35.0, D_UM, "name", NAME_ROUNDS),
-    "deeplens/camera/ef85mm_f1.8.json": Claim(
-        85.0, D_UM, "name", "the header holds another quantity, see below"
-    ),
-    "deeplens/camera/rf16mm_f2.8.json": Claim(16.0, D_UM, "name", NAME_ROUNDS),
-    "deeplens/camera/rf24mm_f1.8.json": Claim(
-        24.0, D_UM, "name", NAME_ROUNDS + "; the header repeats that of ef40mm_f2.8 to the last digit"
-    ),
-    "deeplens/thorlabs/acl12708u.json": Claim(
-        8.0, D_UM, "catalogue", "the catalogue rounds, and holds for its own wavelength (8.03 mm at 780 nm)"
-    ),
-    "diffoptics/ThorLabs/ACL5040U.txt": Claim(40.0, D_UM, "catalogue"),
-    "diffoptics/ThorLabs/LA1131.txt": Claim(49.8, D_UM, "catalogue"),
-    "diffoptics/end2end/end2end_edof.txt": Claim(100.0, D_UM, "catalogue, its doublet"),
-    "optiland/Cooke_triplet.json": Claim(50.0, 0.55, "sample lens, 50 mm f/5"),
-    "rayoptics/354710-C-Zemax(ZMX).zmx": Claim(1.49, 1.55, "NAME line"),
-    "rayoptics/CODV_32327.seq": Claim(100.0, D_UM, "catalogue"),
-    "rayoptics/CODV_49664.seq": Claim(35.0, D_UM, "title"),
-    "rayoptics/CODV_65988.seq": Claim(15.0, D_UM, "catalogue"),
-    "rayoptics/HoO-V2C18Ex03.zmx": Claim(80.0, 0.55, "f/4 and 20 mm"),
-    "rayoptics/US00583336-2-scaled.zmx": Claim(49.4, D_UM, "target in the file"),
-    "rayoptics/ag_dblgauss.seq": Claim(100.0, D_UM, "title f/2, pupil 50 mm"),
-    "rayoptics/paraboloid.seq": Claim(100.0, 0.55, "title f/1, pupil 100 mm"),
-    "rayoptics/paraboloid_f8.seq": Claim(200.0, 0.55, "title"),
-    "rayoptics/questar35.seq": Claim(1282.0, 0.555, "maker, 3.5 inch"),
-    "rayoptics/rc_f16.seq": Claim(
-        3962.4 * 8,
-        0.55,
-        "f/8 and 3962.4 mm",
-        "the title says f/16; the file has the pupil 3962.4 mm in a comment and twice that in force",
-    ),
-    "rayoptics/zmax_55278.zmx": Claim(52.24, D_UM, "DBDT record"),
-}
+def _claims():
+    with Path(__file__).with_name("lens_claims.csv").open(encoding="utf-8", newline="") as table:
+        for file, efl_mm, wavelength_um, *why in itertools.islice(csv.reader(table), 1, None):
+            yield file, Claim(float(efl_mm), float(wavelength_um), *why)
+
+
+CLAIMS = dict(_claims())
 
 
 @dataclass(frozen=True)

@@ -34,54 +34,42 @@ def study(run: Run[Config]):
     for seed in config.seeds:
         run.say(f"seed {seed}")
         parts[seed] = _one(run, seed)
-    errors = {seed: _errors(part) for seed, part in parts.items()}
     pairs = {}
     rows = []
-    for rival in COMPARED:
-        logs = torch.stack([log_ratios(of["optimised"], of[rival]) for of in errors.values()])
-        pairs[rival] = pooled(logs)
+    for design, rival in [*(("optimised", name) for name in COMPARED), ("after_spots", "spots")]:
+        logs = torch.stack([_log_ratios(part, design, rival) for part in parts.values()])
+        pair = pooled(logs)
         each = [student(row).percent() for row in logs]
-        rows.append([RIVALS[rival], *each, pairs[rival].percent(), pairs[rival].outcome])
-        run.record(**pairs[rival].metrics(f"{rival}_log_ratio"))
-        run.record(**{f"{rival}_seeds_better": int((logs.mean(1) < 0).sum())})
-    after = torch.stack([log_ratios(of["after_spots"], of["spots"]) for of in errors.values()])
-    each = [student(row).percent() for row in after]
-    rows.append(
-        [
-            "flow steps after the spot designer, against it",
-            *each,
-            pooled(after).percent(),
-            pooled(after).outcome,
-        ]
-    )
-    run.record(after_spots_log_ratio=pooled(after).value, seeds=len(parts))
-    for rival in COMPARED:
-        run.card(
-            f"Against {RIVALS[rival]}", pairs[rival].percent(), "flow error of the flow design, all seeds"
-        )
+        if design == "optimised":
+            pairs[RIVALS[rival]] = pair
+            name = rival
+            run.record(**{f"{rival}_seeds_better": int((logs.mean(1) < 0).sum())})
+            run.card(f"Against {RIVALS[rival]}", pair.percent(), "flow error of the flow design, all seeds")
+        else:
+            name = design
+        run.record(**pair.metrics(f"{name}_log_ratio"))
+        title = RIVALS[rival] if name == rival else "flow steps after the spot designer, against it"
+        rows.append([title, *each, pair.percent(), pair.outcome])
     run.section(
         "Change of flow error by the flow design",
         "Geometric mean over held-out cases, the same for every seed. An interval of all seeds is the wider of two: "
         "over cases, each averaged over the seeds, and over seeds, each averaged over its cases.",
     )
     run.table("Rivals", ["rival", *(f"seed {s}" for s in parts), "all seeds", "the flow design"], rows)
-    _lenses(run, parts)
-    said = verdict(DESIGNS["flow"], {RIVALS[rival]: pair for rival, pair in pairs.items()})
-    run.finish(
-        "Lens optimisation over seeds",
-        f"**{said}**\n\n{config.lens}; every seed detunes the lens in its own way, to the same RMS spot at best focus.",
-    )
-    run.say(said)
-
-
-def _lenses(run, parts):
     names = ("nominal", "detuned", *COMPARED, "optimised", "after_spots")
     run.section("Flow error and spots of every lens")
     for key, title in (("flow_error_mrad_hard", "Flow error (mrad)"), ("rms_spot_um", "Mean RMS spot (µm)")):
         rows = [[seed, *(part.metrics[f"{key}_{name}"] for name in names)] for seed, part in parts.items()]
         run.table(title, ["seed", *(label(name, "flow") for name in names)], rows)
-        for seed, part in parts.items():
-            run.record(**{f"seed{seed}_{key}_{name}": part.metrics[f"{key}_{name}"] for name in names})
+        for seed, *figures in rows:
+            run.record(**{f"seed{seed}_{key}_{name}": f for name, f in zip(names, figures, strict=True)})
+    run.record(seeds=len(parts))
+    said = verdict(DESIGNS["flow"], pairs)
+    run.finish(
+        "Lens optimisation over seeds",
+        f"**{said}**\n\n{config.lens}; every seed detunes the lens in its own way, to the same RMS spot at best focus.",
+    )
+    run.say(said)
 
 
 def _one(run, seed):
@@ -102,10 +90,10 @@ def _one(run, seed):
     return part
 
 
-def _errors(part):
-    """Flow errors of every lens of a finished run on its held-out cases, by name."""
+def _log_ratios(part, design, rival):
+    """Of the flow errors of two lenses of a finished run on its held-out cases, [cases]."""
     found = part.load_state().numbers["found"]
-    return {name: [row["flow_error_mrad"] for row in rows] for name, rows in found.items()}
+    return log_ratios(*([row["flow_error_mrad"] for row in found[name]] for name in (design, rival)))
 
 
 if __name__ == "__main__":

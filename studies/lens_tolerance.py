@@ -202,7 +202,7 @@ def report_linear(run, slopes, trials):
         forecast = trials.amounts[good] @ slopes[k]
         ends = [float(forecast.min()), float(forecast.max())]
         simulated = trials.figures[good, k] - trials.nominal[k]
-        axis.plot(forecast, simulated, ".", markersize=3, color="#1b6ca8")
+        axis.plot(forecast.numpy(), simulated.numpy(), ".", markersize=3, color="#1b6ca8")
         axis.plot(ends, ends, color="k", linewidth=0.8)
         axis.set(xlabel="forecast", ylabel="simulated", title=f"change of {LINEAR_FIGURES[k]}")
     run.figure(

@@ -228,7 +228,7 @@ def draw(run, rivals, curves, per_m, losses):
     """Contrast over depth, losses, and point spreads."""
     charts = [
         Panel(
-            {name: (per_m, curve[0, :, index]) for name, curve in curves.items()},
+            {name: (per_m.tolist(), curve[0, :, index].tolist()) for name, curve in curves.items()},
             "1 / distance (1/m)",
             f"contrast on the axis, period of {period} px",
         )

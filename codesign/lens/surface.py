@@ -182,13 +182,22 @@ def described(surfaces: Iterable[Surface]) -> dict[str, float]:
     return found
 
 
+def scaled_asphere(coefficients: Sequence[float], factor: float) -> tuple[float, ...]:
+    """Coefficients of r^2, r^4, ... of a sag when all lengths are multiplied by ``factor``."""
+    return tuple(a * factor ** (-1 - 2 * i) for i, a in enumerate(coefficients))
+
+
+def scaled_phase(phase: Phase | None, factor: float) -> Phase | None:
+    """The phase when all lengths are multiplied by ``factor``."""
+    if phase is None:
+        return None
+    return replace(
+        phase, coefficients=tuple(a * factor ** (-2 - 2 * i) for i, a in enumerate(phase.coefficients))
+    )
+
+
 def scaled(surface: Surface, factor: float) -> Surface:
     """The same surface with all lengths multiplied by ``factor``."""
-    asphere = tuple(a * factor ** (1 - 2 * (i + 1)) for i, a in enumerate(surface.asphere))
-    phase = surface.phase and replace(
-        surface.phase,
-        coefficients=tuple(a * factor ** (-2 * (i + 1)) for i, a in enumerate(surface.phase.coefficients)),
-    )
     lengths = {
         name: getattr(surface, name) * factor
         for name in ("radius_mm", "thickness_mm", "semi_aperture_mm", "inner_semi_aperture_mm")
@@ -196,8 +205,8 @@ def scaled(surface: Surface, factor: float) -> Surface:
     return replace(
         surface,
         **lengths,
-        asphere=asphere,
-        phase=phase,
+        asphere=scaled_asphere(surface.asphere, factor),
+        phase=scaled_phase(surface.phase, factor),
         decentre_mm=(surface.decentre_mm[0] * factor, surface.decentre_mm[1] * factor),
     )
 

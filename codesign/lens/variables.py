@@ -210,11 +210,9 @@ def _unbounded(value, low, high, width):
 
 def _slope(x, low, high, width):
     """Derivative of ``_bounded``."""
-    (both, below, above), _, _ = _sides(low, high)
-    x = x / width
-    slope = torch.where(both, 1 - torch.tanh(x).square(), 1.0)
-    slope = torch.where(below, torch.sigmoid(x), slope)
-    return torch.where(above, torch.sigmoid(-x), slope)
+    with torch.enable_grad():
+        x = x.detach().requires_grad_()
+        return torch.autograd.grad(_bounded(x, low, high, width).sum(), x)[0]
 
 
 def make_variables(

@@ -1,5 +1,8 @@
 """Pictures of lens errors over the field, over focus, and over the surfaces: distortion, field curvature,
-through focus, Seidel sums."""
+through focus, Seidel sums.
+
+at_m, in all of them: metres to the object plane, inf for parallel light. The first wavelength is the reference.
+"""
 
 import math
 from collections.abc import Sequence
@@ -15,14 +18,10 @@ from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
 from codesign.lens.seidel import SeidelSums
 from codesign.report.lens_figures import COLOURS, VISIBLE_UM
+from codesign.report.lens_layout import degrees
 
-SEIDEL_NAMES = (
-    "spherical $S_I$",
-    "coma $S_{II}$",
-    "astigmatism $S_{III}$",
-    "Petzval $S_{IV}$",
-    "distortion $S_V$",
-)
+SEIDEL_NAMES = ("spherical $S_I$", "coma $S_{II}$", "astigmatism $S_{III}$", "Petzval $S_{IV}$")
+SEIDEL_NAMES += ("distortion $S_V$",)
 SEIDEL_COLOURS = ("#1b6ca8", "#2e8b57", "#d68910", "#8e44ad", "#c0392b")
 
 
@@ -35,35 +34,31 @@ def field_errors(
     count: int = 21,
     at_m: float = PARALLEL,
 ) -> Figure:
-    """Figure over the field: tangential and sagittal focus, distortion, and lateral colour against the first
-    wavelength. at_m, here as in the other curves: metres to the object plane, inf for parallel light."""
+    """Figure over the field: tangential and sagittal focus, distortion, and lateral colour."""
     reference, *others = analysis.spectral_lines(light)[0]
     fields = [half_field_rad * i / (count - 1) for i in range(count)]
-    degrees = np.degrees(fields)
+    angles = np.degrees(fields)
     figure, axes = plt.subplots(1, 3, figsize=(10, 3.8), sharey=True, layout="constrained")
     shifts = analysis.focus_shift_mm(lens, fields, reference, at_m=at_m).numpy()
-    axes[0].plot(shifts[:, 0], degrees, color=COLOURS[0], label="tangential")
-    axes[0].plot(shifts[:, 1], degrees, color=COLOURS[0], ls="--", label="sagittal")
+    axes[0].plot(shifts[:, 0], angles, color=COLOURS[0], label="tangential")
+    axes[0].plot(shifts[:, 1], angles, color=COLOURS[0], ls="--", label="sagittal")
     axes[0].set(xlabel="focus shift (mm)", ylabel="field (degrees)", title="Field curvature")
-    axes[0].legend(frameon=False, fontsize=8)
-    axes[1].plot(
-        analysis.distortion_percent(lens, fields[1:], mapping, reference, at_m).numpy(),
-        degrees[1:],
-        color=COLOURS[2],
-    )  # on the axis it is 0 by definition
+    # on the axis it is 0 by definition
+    distortion = analysis.distortion_percent(lens, fields[1:], mapping, reference, at_m)
+    axes[1].plot(distortion.numpy(), angles[1:], color=COLOURS[2])
     axes[1].set(xlabel=f"distortion (%), {mapping}", title="Distortion")
-    if others:
-        colour = analysis.lateral_colour_mm(lens, fields, others, reference, at_m).numpy() * 1e3
-        for k, wavelength in enumerate(others):
-            axes[2].plot(colour[:, k], degrees, color=COLOURS[1:][k % 3], label=f"{wavelength * 1e3:.0f} nm")
-        axes[2].legend(frameon=False, fontsize=8)
+    colour = analysis.lateral_colour_mm(lens, fields, others, reference, at_m) if others else ()
+    for k, wavelength in enumerate(others):
+        label = f"{wavelength * 1e3:.0f} nm"
+        axes[2].plot(1e3 * colour[:, k].numpy(), angles, color=COLOURS[1:][k % 3], label=label)
     axes[2].set(xlabel=f"height − that at {reference * 1e3:.0f} nm (µm)", title="Lateral colour")
     for axis in axes:
+        if axis.get_legend_handles_labels()[0]:
+            axis.legend(frameon=False, fontsize=8)
         axis.axvline(0, color="0.5", lw=0.6)
-        axis.set_ylim(0, degrees[-1])
         axis.grid(alpha=0.3)
         widest = np.abs(axis.get_xlim()).max()
-        axis.set_xlim(-widest, widest)
+        axis.set(xlim=(-widest, widest), ylim=(0, angles[-1]))
     return figure
 
 
@@ -83,18 +78,17 @@ def through_focus(
     z = np.asarray(defocus_mm, dtype=float)
     sizes = analysis.through_focus_spot_mm(lens, fields_rad, z, light, 24, vignetting, at_m) * 1e3
     for field, row, colour in zip(fields_rad, sizes, COLOURS * len(fields_rad), strict=False):
-        label = f"{math.degrees(field):.3g}°"
-        axes[0].plot(z, row.numpy(), color=colour, label=label)
+        axes[0].plot(z, row.numpy(), color=colour, label=degrees(field))
         curves = analysis.through_focus_mtf(
             lens, field, frequency_per_mm, z, light, method, vignetting=vignetting, at_m=at_m
-        ).numpy()
-        axes[1].plot(z, curves[0], color=colour, label=f"{label}, tangential")
-        axes[1].plot(z, curves[1], color=colour, ls="--", label=f"{label}, sagittal")
-    axes[0].set(xlabel="defocus (mm)", ylabel="RMS spot (µm)")
-    axes[0].set_ylim(bottom=0)
-    axes[1].set(xlabel="defocus (mm)", ylabel=f"{method} MTF at {frequency_per_mm:g} / mm", ylim=(0, 1.02))
+        )
+        for side, curve, style in zip(("tangential", "sagittal"), curves.numpy(), ("-", "--"), strict=True):
+            axes[1].plot(z, curve, style, color=colour, label=f"{degrees(field)}, {side}")
+    axes[0].set(ylabel="RMS spot (µm)", ylim=(0, None))
+    axes[1].set(ylabel=f"{method} MTF at {frequency_per_mm:g} / mm", ylim=(0, 1.02))
     for axis in axes:
         axis.axvline(0, color="0.5", lw=0.6)
+        axis.set_xlabel("defocus (mm)")
         axis.grid(alpha=0.3)
         axis.legend(frameon=False, fontsize=8)
     return figure
@@ -102,23 +96,20 @@ def through_focus(
 
 def seidel_bars(sums: SeidelSums, wavelength_um: float = WAVELENGTH_UM["d"]) -> Figure:
     """Figure of Seidel sums (``SeidelSums``) per surface and, on a scale of its own, in total; in waves."""
-    values = sums.per_surface.detach().numpy() / (wavelength_um * 1e-3)
-    total = sums.total.detach().numpy() / (wavelength_um * 1e-3)
+    values, total = (v.detach().numpy() / (wavelength_um * 1e-3) for v in (sums.per_surface, sums.total))
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), width_ratios=[4, 1.2], layout="constrained")
     place = np.arange(len(values))
     for k, (name, colour) in enumerate(zip(SEIDEL_NAMES, SEIDEL_COLOURS, strict=True)):
         axes[0].bar(place + 0.16 * (k - 2), values[:, k], 0.16, color=colour, label=name)
-    axes[1].bar(range(5), total, 0.7, color=SEIDEL_COLOURS)
-    axes[0].set_xticks(place, [str(i + 1) for i in range(len(values))])
-    axes[1].set_xticks(range(5), ["I", "II", "III", "IV", "V"])
+    axes[1].bar(["I", "II", "III", "IV", "V"], total, 0.7, color=SEIDEL_COLOURS)
+    axes[0].set_xticks(place, place + 1)
     axes[0].set(xlabel="surface", ylabel="waves")
     axes[1].set(xlabel="sum", title="whole lens")
     for axis in axes:
         axis.axhline(0, color="k", lw=0.7)
         axis.grid(axis="y", alpha=0.3)
-    figure.legend(
-        *axes[0].get_legend_handles_labels(), loc="outside upper left", frameon=False, fontsize=8, ncols=5
-    )
+    handles = axes[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside upper left", frameon=False, fontsize=8, ncols=5)
     return figure
 
 
@@ -132,20 +123,13 @@ def encircled_curves(
 ) -> Figure:
     """Figure of encircled energy (rays, about their mean) over the radius, a curve per field."""
     figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
-    largest = max(
-        float(analysis.encircled_radius_mm(lens, field, 1.0, light, 48, vignetting, at_m=at_m))
-        for field in fields_rad
-    )
-    radii = torch.linspace(0, 1.02 * largest, 200, dtype=lens.dtype)
+    options = (light, 48, vignetting)
+    largest = [analysis.encircled_radius_mm(lens, field, 1.0, *options, at_m=at_m) for field in fields_rad]
+    radii = torch.linspace(0, 1.02 * float(max(largest)), 200, dtype=lens.dtype)
     for field, colour in zip(fields_rad, COLOURS * len(fields_rad), strict=False):
-        axis.plot(
-            radii.numpy() * 1e3,
-            analysis.encircled_energy(lens, field, radii, light, 48, vignetting, at_m=at_m).numpy(),
-            color=colour,
-            label=f"{math.degrees(field):.3g}°",
-        )
-    axis.set(xlabel="radius (µm)", ylabel="share of rays inside", ylim=(0, 1.02))
-    axis.set_xlim(left=0)
+        energy = analysis.encircled_energy(lens, field, radii, *options, at_m=at_m)
+        axis.plot(radii.numpy() * 1e3, energy.numpy(), color=colour, label=degrees(field))
+    axis.set(xlabel="radius (µm)", ylabel="share of rays inside", ylim=(0, 1.02), xlim=(0, None))
     axis.grid(alpha=0.3)
     axis.legend(frameon=False, fontsize=8)
     return figure
@@ -166,7 +150,7 @@ def depth_curves(
     sizes = analysis.rms_spot_mm(lens, fields_rad, wavelength_um, 16, 1 / vergence) * 1e3
     figure, axis = plt.subplots(figsize=(7, 3.4), layout="constrained")
     for field, column, colour in zip(fields_rad, sizes.T, COLOURS * len(fields_rad), strict=False):
-        axis.plot(vergence.numpy(), column.numpy(), color=colour, label=f"{math.degrees(field):.3g}°")
+        axis.plot(vergence.numpy(), column.numpy(), color=colour, label=degrees(field))
     axis.axhline(1e3 * blur_mm / math.sqrt(8), color="0.4", ls="--", lw=1)
     ticks = np.linspace(1 / far_m, 1 / near_m, 7)
     axis.set_xticks(ticks, [f"{1 / t:.3g}" if t > 0 else "∞" for t in ticks])

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -18,12 +17,18 @@ from codesign.lens.analysis.rays import field_rays
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.surface import sag_mm
+from codesign.lens.trace import trace
 
 COLOURS = ("#1b6ca8", "#2e8b57", "#c0392b", "#8e44ad")
 OUTLINE = "#24425c"
 GLASS = "#9cc3dd"
 MIRROR = "#5f6b76"
 ENDINGS = (".svg", ".png", ".pdf")
+
+
+def degrees(angle_rad: float) -> str:
+    """An angle as it stands in a title."""
+    return f"{math.degrees(angle_rad):.3g}°"
 
 
 def lens_layout(
@@ -35,9 +40,11 @@ def lens_layout(
 ) -> Figure:
     """Figure of a lens's cross-section with meridional rays.
 
-    Args: fields_rad: angles; None takes 0, 0.7 and 1 of the lens's half field (10 degrees where none is
-      known). path: where to save, .svg, .png or .pdf, or None. rays: per field. at_m: metres
-      from the entrance pupil to the object plane. Mirrors are drawn along the unfolded axis.
+    Args:
+      fields_rad: angles; None takes 0, 0.7 and 1 of the lens's half field (10 degrees where none is known).
+      path: where to save, .svg, .png or .pdf, or None.
+      rays: per field.
+      at_m: metres from the entrance pupil to the object plane. Mirrors are drawn along the unfolded axis.
     Returns: matplotlib Figure. Raises: FileFormatError for another ending or a place that is not writable.
     """
     if path is not None and Path(path).suffix.lower() not in ENDINGS:
@@ -71,149 +78,76 @@ def draw_layout(
     """Draw the cross-section of a lens with meridional rays of each field into a matplotlib axis. Lengths in
     mm."""
     surfaces = lens.to_surfaces()
-    vertices = np.concatenate([[0.0], np.cumsum([s.thickness_mm for s in surfaces])])
-    _draw_glass(axis, surfaces, vertices)
-    for i, (s, at) in enumerate(zip(surfaces, vertices, strict=False)):
-        if not s.mirror and s.phase is None and _same_media(surfaces, i):
-            continue  # a stop or dummy in air: its mark below says enough
-        z, y = _profile(s, at)
-        obstructed = np.abs(y) < s.inner_semi_aperture_mm
-        axis.plot(
-            z,
-            np.where(obstructed, np.nan, y),
-            color=MIRROR if s.mirror else OUTLINE,
-            lw=2.2 if s.mirror else 1,
-            ls="--" if s.phase else "-",
-        )
+    *vertices, film = np.cumsum([0.0, *(s.thickness_mm for s in surfaces)])
+    outlines = [_outline(s, at) for s, at in zip(surfaces, vertices, strict=True)]
     tallest = max(s.semi_aperture_mm for s in surfaces)
-    _draw_stop(axis, lens, surfaces, vertices, tallest)
-    film = vertices[-1]
-    start = -max(
-        0.12 * film,
-        1.05 * max(0.0, -min(_profile(s, at)[0].min() for s, at in zip(surfaces, vertices, strict=False))),
-    )
+    before = None
+    for i, (s, (z, y)) in enumerate(zip(surfaces, outlines, strict=True)):
+        if s.medium is not None and not s.mirror and i + 1 < len(surfaces) and not surfaces[i + 1].mirror:
+            _draw_glass(axis, outlines[i : i + 2])
+        # a stop or dummy in one medium: its mark below says enough
+        if s.mirror or s.phase is not None or before != s.medium:
+            y = np.where(np.abs(y) < s.inner_semi_aperture_mm, np.nan, y)
+            look = {"color": MIRROR, "lw": 2.2} if s.mirror else {"color": OUTLINE, "lw": 1}
+            axis.plot(z, y, ls="--" if s.phase else "-", **look)
+        before = s.medium
+    # black bars from the edge of the paraxial stop outwards
+    stop = surfaces[lens.stop_index]
+    radius = float(lens.first_order().stop_semi_aperture_mm.detach())
+    at = _outline(stop, vertices[lens.stop_index], min(radius, stop.semi_aperture_mm))[0][-1]
+    for sign in (-1, 1):
+        reach = max(radius * 1.25, radius + 0.12 * tallest)
+        axis.plot([at, at], [sign * radius, sign * reach], color="k", lw=2)
+    start = min(-0.12 * film, 1.05 * min(z.min() for z, _ in outlines))
+    line = torch.linspace(-1, 1, rays, dtype=lens.dtype)
+    pupil = torch.stack([torch.zeros_like(line), line], 1)
     highest = 0.0
     for field, colour in zip(fields_rad, COLOURS * len(fields_rad), strict=False):
-        pupil = torch.stack(
-            [torch.zeros(rays, dtype=lens.dtype), torch.linspace(-1, 1, rays, dtype=lens.dtype)], 1
-        )
-        paths = ray_paths(lens, field, pupil, start, at_m)
-        for k, path in enumerate(paths):
-            axis.plot(
-                path[:, 0],
-                path[:, 1],
-                color=colour,
-                lw=0.6,
-                label=f"{math.degrees(field):.3g}°" if k == 0 else None,
-            )
+        for k, path in enumerate(ray_paths(lens, field, pupil, start, at_m)):
+            axis.plot(*path.T, color=colour, lw=0.6, label=None if k else degrees(field))
             highest = max(highest, abs(path[-1, 1]))
     film_height = 1.1 * highest if highest > 0.05 * tallest else 0.5 * tallest
     axis.plot([film, film], [-film_height, film_height], color="k", lw=1.5)
     axis.axhline(0, color="0.6", lw=0.5, ls=(0, (8, 3, 1, 3)), zorder=0)
-    axis.set(xlabel="z (mm)", ylabel="y (mm)")
-    axis.set_aspect("equal")
-    axis.legend(
-        loc="upper left",
-        bbox_to_anchor=(1.0, 1.0),
-        frameon=False,
-        fontsize=8,
-        title="field",
-        title_fontsize=8,
-    )
+    axis.set(xlabel="z (mm)", ylabel="y (mm)", aspect="equal")
+    place = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
+    axis.legend(frameon=False, fontsize=8, title="field", title_fontsize=8, **place)
     if any(lens.mirrors):
-        axis.text(
-            1.0,
-            1.02,
-            "mirrors (thick) along the unfolded axis",
-            transform=axis.transAxes,
-            ha="right",
-            fontsize=8,
-            color=MIRROR,
-        )
+        note = "mirrors (thick) along the unfolded axis"
+        axis.text(1.0, 1.02, note, transform=axis.transAxes, ha="right", fontsize=8, color=MIRROR)
 
 
+@torch.no_grad()
 def ray_paths(
     lens: GeoLens, field_rad: float, pupil: Tensor, start_z_mm: float, at_m: float = PARALLEL
 ) -> list[np.ndarray]:
-    """Polylines [points, 2] (z, y) in mm of the rays of a field that arrive, found by tracing the lens cut
-    off behind each surface."""
-    surfaces = lens.to_surfaces()
-    with torch.no_grad():
-        origin, direction = field_rays(lens, field_rad, pupil, start_z_mm=start_z_mm, at_m=at_m)
-        points = [torch.stack([origin[:, 2], origin[:, 1]], 1)]
-        z = 0.0
-        for i, s in enumerate(surfaces):
-            part = GeoLens(
-                [
-                    *(replace(q, is_stop=False) for q in surfaces[:i]),
-                    replace(s, thickness_mm=0.0, is_stop=False),
-                ],
-                lens.entrance_pupil_diameter_mm,
-                lens.dtype,
-            )
-            out = part.trace(origin, direction)
-            # rays end on the vertex plane behind surface i: step back along the ray onto the surface
-            y = out.position_mm[:, 1]
-            slope = out.direction[:, 1] / out.direction[:, 2]
-            sag = torch.zeros_like(y)
-            for _ in range(40):  # each step shrinks the miss by slope times slope of the surface
-                sag = sag_mm(y + slope * sag, s.curvature_per_mm, s.conic, s.asphere)
-            points.append(torch.stack([z + sag, y + slope * sag], 1))
-            z += s.thickness_mm
-        end = lens.trace(origin, direction)
-    points.append(torch.stack([torch.full_like(end.position_mm[:, 1], z), end.position_mm[:, 1]], 1))
-    passed = (end.status == 0) & (end.weight > 0)  # rays that an aperture stops are not drawn
-    return [np.array([p[k].tolist() for p in points]) for k in range(pupil.shape[0]) if bool(passed[k])]
+    """Polylines [points, 2] (z, y) in mm of the rays of a field that arrive, found by tracing them up to each
+    surface."""
+    rays = field_rays(lens, field_rad, pupil, start_z_mm=start_z_mm, at_m=at_m)
+    whole = lens.prescription()
+    vertices = [0.0, *lens.thickness_mm.cumsum(0).tolist()]
+    count = len(lens.surfaces)
+    end = lens.trace(*rays)
+    places = [trace(whole.until(i), *rays).position_mm for i in range(count)] + [end.position_mm]
+    depths = [rays[0][:, 2], *(p[:, 2] + z for p, z in zip(places, vertices, strict=True))]
+    points = torch.stack([torch.stack(depths), torch.stack([rays[0][:, 1], *(p[:, 1] for p in places)])], -1)
+    # rays that an aperture stops are not drawn
+    passed = (end.status == 0) & (end.weight > 0)
+    return list(points.transpose(0, 1)[passed].numpy())
 
 
-def _profile(surface, vertex_mm, height_mm=None):
+def _outline(surface, vertex_mm, height_mm=None):
     """(z, y) of a surface out to its semi-aperture, in mm."""
     reach = surface.semi_aperture_mm if height_mm is None else height_mm
     y = torch.linspace(-reach, reach, 121, dtype=torch.float64)
     return vertex_mm + sag_mm(y, surface.curvature_per_mm, surface.conic, surface.asphere).numpy(), y.numpy()
 
 
-def _draw_glass(axis, surfaces, vertices):
-    """Elements between surfaces with glass behind them; the smaller face gets a flat rim out to the larger
-    one's edge."""
-    for i, s in enumerate(surfaces[:-1]):
-        behind = surfaces[i + 1]
-        if s.medium is None or s.mirror or behind.mirror:
-            continue
-        rim = max(s.semi_aperture_mm, behind.semi_aperture_mm)
-        faces = []
-        for face, at in ((s, vertices[i]), (behind, vertices[i + 1])):
-            z, y = _profile(face, at)
-            if face.semi_aperture_mm < rim:  # flat out to the rim
-                z = np.concatenate([z[:1], z, z[-1:]])
-                y = np.concatenate([[-rim], y, [rim]])
-            faces.append((z, y))
-        (za, ya), (zb, yb) = faces
-        axis.fill(
-            np.concatenate([za, zb[::-1]]),
-            np.concatenate([ya, yb[::-1]]),
-            facecolor=GLASS,
-            edgecolor=OUTLINE,
-            alpha=0.55,
-            lw=0.8,
-        )
-
-
-def _draw_stop(axis, lens, surfaces, vertices, tallest):
-    """Black bars from the edge of the paraxial stop outwards."""
-    radius = float(lens.first_order().stop_semi_aperture_mm.detach())
-    at = (
-        vertices[lens.stop_index]
-        + _profile(surfaces[lens.stop_index], 0.0, min(radius, surfaces[lens.stop_index].semi_aperture_mm))[
-            0
-        ][-1]
+def _draw_glass(axis, faces):
+    """A piece of glass between two outlines; the smaller face gets a flat rim out to the larger one's edge."""
+    rim = max(y[-1] for _, y in faces)
+    (za, ya), (zb, yb) = (
+        (np.concatenate([z[:1], z, z[-1:]]), np.concatenate([[-rim], y, [rim]])) for z, y in faces
     )
-    for sign in (-1, 1):
-        axis.plot(
-            [at, at], [sign * radius, sign * max(radius * 1.25, radius + 0.12 * tallest)], color="k", lw=2
-        )
-
-
-def _same_media(surfaces, i):
-    before = surfaces[i - 1].medium if i else None
-    return before == surfaces[i].medium
+    outline = np.concatenate([za, zb[::-1]]), np.concatenate([ya, yb[::-1]])
+    axis.fill(*outline, facecolor=GLASS, edgecolor=OUTLINE, alpha=0.55, lw=0.8)

@@ -218,7 +218,7 @@ def _seen_by_the_sensor(run, job, shown):
             camera = job.task.camera(optics, run.config.samples, case.seed)
             frames = render.frames(camera, case.scene, case.T_world_body)
             on, off = events.memory(frames, SENSOR.theta_on, SENSOR.theta_off)[0].sum(0)
-        for h, frame, count in zip(FIELDS, frames[0], on - off, strict=True):
+        for h, frame, count in zip(FIELDS, frames[0].numpy(), (on - off).numpy(), strict=True):
             rows.setdefault(title, {}).update({f"field {h:g}": frame, f"events {h:g}": count})
     run.section(
         "What the sensor sees",

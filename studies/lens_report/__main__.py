@@ -18,8 +18,9 @@ from codesign.errors import DomainError
 from codesign.lens import analysis
 from codesign.lens.distance import vergence_per_mm
 from codesign.lens.paraxial import cardinal_points, image_scale_mm
-from codesign.lens.seidel import seidel_sums
+from codesign.lens.seidel import NAMES, seidel_sums
 from codesign.report import lens_curves, lens_figures
+from codesign.report.lens_layout import degrees
 from studies.frame.run import Run, StudyConfig, main
 from studies.lens_report.depth import depth
 
@@ -127,39 +128,33 @@ def first_order(run, geo, light, half_deg, at_m):
     run.card("Focal length", f"{float(f.efl_mm):.4g} mm", f"f/{float(f.fno):.3g} at {light[0] * 1e3:.0f} nm")
     run.record(efl_mm=f.efl_mm, bfl_mm=f.bfl_mm, fno=f.fno)
     run.section("First order")
-    total = float(geo.thickness_mm[:-1].sum())
-    rows = [
-        ("effective focal length", f.efl_mm),
-        ("back focal length", f.bfl_mm),
-        ("f-number (no unit)", f.fno),
-        ("image plane behind the last vertex", geo.thickness_mm[-1]),
-        ("length, first to last vertex", torch.tensor(total)),
-        ("entrance pupil, from the first vertex", f.entrance_pupil_z_mm),
-        ("entrance pupil diameter", f.entrance_pupil_diameter_mm),
-        ("exit pupil, from the last vertex", f.exit_pupil_z_mm),
-        ("exit pupil diameter", f.exit_pupil_diameter_mm),
-        ("stop semi-aperture", f.stop_semi_aperture_mm),
-        ("front focal point, from the first vertex", points.front_focal_z_mm),
-        ("front principal point, from the first vertex", points.front_principal_z_mm),
-        ("rear principal point, from the last vertex", points.rear_principal_z_mm),
-        ("rear nodal point, from the last vertex", points.rear_nodal_z_mm),
-        (
-            f"image height at {half_deg:.4g}°, paraxial",
-            image_scale_mm(geo, vergence_per_mm(geo, at_m), light[0]) * math.tan(math.radians(half_deg)),
-        ),
-    ]
+    scale = image_scale_mm(geo, vergence_per_mm(geo, at_m), light[0])
+    figures = {
+        "effective focal length": f.efl_mm,
+        "back focal length": f.bfl_mm,
+        "f-number (no unit)": f.fno,
+        "image plane behind the last vertex": geo.thickness_mm[-1],
+        "length, first to last vertex": geo.thickness_mm[:-1].sum(),
+        "entrance pupil, from the first vertex": f.entrance_pupil_z_mm,
+        "entrance pupil diameter": f.entrance_pupil_diameter_mm,
+        "exit pupil, from the last vertex": f.exit_pupil_z_mm,
+        "exit pupil diameter": f.exit_pupil_diameter_mm,
+        "stop semi-aperture": f.stop_semi_aperture_mm,
+        "front focal point, from the first vertex": points.front_focal_z_mm,
+        "front principal point, from the first vertex": points.front_principal_z_mm,
+        "rear principal point, from the last vertex": points.rear_principal_z_mm,
+        "rear nodal point, from the last vertex": points.rear_nodal_z_mm,
+        f"image height at {half_deg:.4g}°, paraxial": scale * math.tan(math.radians(half_deg)),
+    }
     run.table(
         f"Paraxial figures at {light[0] * 1e3:.1f} nm, mm",
         ("figure", "mm"),
-        [(name, f"{float(value):.6g}") for name, value in rows],
+        [(name, f"{float(value):.6g}") for name, value in figures.items()],
     )
-    colour = analysis.chromatic_focus_shift_mm(geo, light, light[0], at_m)
     if len(light) > 1:
-        run.table(
-            "Paraxial focus by wavelength",
-            ("nm", "shift (µm)"),
-            [(f"{w * 1e3:.1f}", f"{1e3 * float(shift):.4g}") for w, shift in zip(light, colour, strict=True)],
-        )
+        colour = 1e3 * analysis.chromatic_focus_shift_mm(geo, light, light[0], at_m)
+        rows = [(f"{w * 1e3:.1f}", f"{float(shift):.4g}") for w, shift in zip(light, colour, strict=True)]
+        run.table("Paraxial focus by wavelength", ("nm", "shift (µm)"), rows)
 
 
 def seidel(run, geo, half_rad, wavelength_um, at_m):
@@ -170,29 +165,21 @@ def seidel(run, geo, half_rad, wavelength_um, at_m):
         "Wavefront coefficients in waves at the rims of pupil and field; positive spherical aberration is "
         "undercorrected. Colour sums lie between F and C.",
     )
-    run.figure(
-        lens_curves.seidel_bars(sums, wavelength_um),
-        "seidel",
-        "Contributions of the surfaces, and their sums.",
-    )
-    waves = 1 / (wavelength_um * 1e-3)
-    columns = (
-        torch.cat([sums.per_surface, sums.axial_colour[:, None], sums.lateral_colour[:, None]], 1) * waves
-    )
-    rows = [(str(i + 1), *(f"{float(v):.4f}" for v in row)) for i, row in enumerate(columns)]
+    figure = lens_curves.seidel_bars(sums, wavelength_um)
+    run.figure(figure, "seidel", "Contributions of the surfaces, and their sums.")
+    colours = torch.stack([sums.axial_colour, sums.lateral_colour], 1)
+    columns = torch.cat([sums.per_surface, colours], 1) / (wavelength_um * 1e-3)
+    total = columns.sum(0)
+    labels = [*range(1, len(columns) + 1), "total"]
     run.table(
         "Seidel sums, waves",
         ("surface", "S I", "S II", "S III", "S IV", "S V", "C I", "C II"),
-        [*rows, ("total", *(f"{float(v):.4f}" for v in columns.sum(0)))],
+        [
+            (str(label), *(f"{float(v):.4f}" for v in row))
+            for label, row in zip(labels, [*columns, total], strict=True)
+        ],
     )
-    run.record(
-        **{
-            f"seidel_{name}_waves": float(v) * waves
-            for name, v in zip(
-                ("spherical", "coma", "astigmatism", "petzval", "distortion"), sums.total, strict=True
-            )
-        }
-    )
+    run.record(**{f"seidel_{name}_waves": value for name, value in zip(NAMES, total[:5], strict=True)})
 
 
 def pictures(run, geo, fields, light, quick, at_m):
@@ -220,10 +207,9 @@ def pictures(run, geo, fields, light, quick, at_m):
         "Encircled energy of the rays about their mean.",
     )
     run.section("Over the field")
+    half = fields[-1] or math.radians(0.5)
     run.figure(
-        lens_curves.field_errors(
-            geo, fields[-1] or math.radians(0.5), light, count=9 if quick else 21, at_m=at_m
-        ),
+        lens_curves.field_errors(geo, half, light, count=9 if quick else 21, at_m=at_m),
         "field_errors",
         "Field curvature of thin bundles, distortion against f tan, and lateral colour of the chief ray.",
     )
@@ -231,39 +217,24 @@ def pictures(run, geo, fields, light, quick, at_m):
     for field in fields:
         positions, weight = analysis.polychromatic_spot(geo, field, light, 32, True, at_m=at_m)
         shift = analysis.focus_shift_mm(geo, [field], light[0], at_m=at_m)[0]
-        name = f"{math.degrees(field):.3g}".replace(".", "p")
         radius = 1e3 * float(analysis.spot_radius_mm(positions, weight))
         distortion = float(analysis.distortion_percent(geo, [field], wavelength_um=light[0], at_m=at_m)[0])
         passed = arrival(geo, field, light[0], at_m)
-        run.record(
-            **{
-                f"rms_spot_um_{name}deg": radius,
-                f"distortion_percent_{name}deg": distortion,
-                f"passed_share_{name}deg": passed,
-            }
-        )
-        rows.append(
-            (
-                f"{math.degrees(field):.3g}",
-                f"{radius:.2f}",
-                f"{distortion:.3f}",
-                f"{float(shift[0]):.4f}",
-                f"{float(shift[1]):.4f}",
-                f"{passed:.3f}",
-            )
-        )
+        record_at(run, field, rms_spot_um=radius, distortion_percent=distortion, passed_share=passed)
+        foci = (f"{float(s):.4f}" for s in shift)
+        rows.append((degrees(field), f"{radius:.2f}", f"{distortion:.3f}", *foci, f"{passed:.3f}"))
     run.table(
         "By field",
-        (
-            "degrees",
-            "RMS spot (µm)",
-            "distortion (%)",
-            "tangential focus (mm)",
-            "sagittal focus (mm)",
-            "share that passes",
-        ),
+        ("field", "RMS spot (µm)", "distortion (%)", "tangential focus (mm)", "sagittal focus (mm)")
+        + ("share that passes",),
         rows,
     )
+
+
+def record_at(run, field, **figures):
+    """Record figures of a field."""
+    place = f"{math.degrees(field):.3g}deg".replace(".", "p")
+    run.record(**{f"{name}_{place}": float(value) for name, value in figures.items()})
 
 
 def sharpness(run, geo, fields, light, quick, at_m):
@@ -280,62 +251,49 @@ def sharpness(run, geo, fields, light, quick, at_m):
     for field in fields:
         front = analysis.wavefront(geo, field, light[0], 64, True, at_m=at_m)
         flat = analysis.remove_fit(front)
-        rms = float(analysis.rms_waves(front))
-        run.record(**{f"rms_waves_{math.degrees(field):.3g}".replace(".", "p") + "deg": rms})
-        rows.append(
-            (
-                f"{math.degrees(field):.3g}",
-                f"{rms:.4f}",
-                f"{float(analysis.rms_waves(flat)):.4f}",
-                f"{float(analysis.peak_to_valley_waves(front)):.3f}",
-                f"{float(analysis.strehl_direct(flat)):.4f}",
-            )
+        figures = (
+            analysis.rms_waves(front),
+            analysis.rms_waves(flat),
+            analysis.peak_to_valley_waves(front),
+            analysis.strehl_direct(flat),
         )
+        record_at(run, field, rms_waves=figures[0])
+        rows.append((degrees(field), *(f"{float(v):.4f}" for v in figures)))
     run.table(
         "Wavefront by field",
-        ("degrees", "RMS (waves)", "RMS without tilt", "peak to valley", "Strehl ratio without tilt"),
+        ("field", "RMS (waves)", "RMS without tilt", "peak to valley", "Strehl ratio without tilt"),
         rows,
     )
     fno = float(geo.first_order(light[0]).fno.abs())
+    airy = light[0] * 1e-3 * fno
     widest = max(
         float(analysis.encircled_radius_mm(geo, field, 0.99, light, 48, True, about_chief=True, at_m=at_m))
         for field in fields
     )
     pixels = 64 if quick else 96
-    pixel = max(2.6 * widest, 12 * light[0] * 1e-3 * fno) / pixels
-    top = round_frequency(min(1 / (light[0] * 1e-3 * fno), 250.0))
-    frequency = torch.linspace(0, top, 51, dtype=geo.dtype)
-    psfs = []
-    titles = []
+    pixel = max(2.6 * widest, 12 * airy) / pixels
+    frequency = torch.linspace(0, round_frequency(min(1 / airy, 250.0)), 51, dtype=geo.dtype)
+    ideal = analysis.ideal_mtf(frequency, fno, light[0])
+    psfs = {}
     curves = {}
     for field in fields:
-        title = f"{math.degrees(field):.3g}°"
         steep = not sampled(geo, field, light, at_m)
-        if (
-            steep or 1.2 * pixels * pixel > MOST_CELLS * min(light) * 1e-3 * fno
-        ):  # the picture repeats with the number of cells
-            psfs.append(analysis.geometric_psf(geo, field, pixel, pixels, light, 256, True, at_m=at_m))
-            titles.append(f"{title}, rays")
+        # the picture repeats with the number of cells
+        if steep or 1.2 * pixels * pixel > MOST_CELLS * min(light) * 1e-3 * fno:
+            psf = analysis.geometric_psf(geo, field, pixel, pixels, light, 256, True, at_m=at_m)
+            psfs[f"{degrees(field)}, rays"] = psf
         else:
-            psfs.append(analysis.psf_on_pixels(geo, field, pixel, pixels, light, MOST_CELLS, True, at_m=at_m))
-            titles.append(f"{title}, diffraction")
+            psf = analysis.psf_on_pixels(geo, field, pixel, pixels, light, MOST_CELLS, True, at_m=at_m)
+            psfs[f"{degrees(field)}, diffraction"] = psf
         if steep:
-            curve = analysis.geometric_mtf(
-                geo, field, frequency, light, 96, True, at_m=at_m
-            ) * analysis.ideal_mtf(frequency, fno, light[0])
+            curve = ideal * analysis.geometric_mtf(geo, field, frequency, light, 96, True, at_m=at_m)
         else:
-            curve = analysis.diffraction_mtf(
-                geo, field, frequency, light, 256 if quick else MOST_CELLS, True, at_m=at_m
-            )
-        curves[f"{title}{', rays' if steep else ''}"] = curve
-        run.record(
-            **{
-                f"mtf_{side}_{math.degrees(field):.3g}".replace(".", "p") + "deg": float(value)
-                for side, value in zip(("tangential", "sagittal"), curve[:, 20], strict=True)
-            }
-        )
+            cells = 256 if quick else MOST_CELLS
+            curve = analysis.diffraction_mtf(geo, field, frequency, light, cells, True, at_m=at_m)
+        curves[f"{degrees(field)}{', rays' if steep else ''}"] = curve
+        record_at(run, field, mtf_tangential=curve[0, 20], mtf_sagittal=curve[1, 20])
     run.record(mtf_at_per_mm=float(frequency[20]))
-    traced = any("rays" in name for name in (*titles, *curves))
+    traced = any("rays" in name for name in (*psfs, *curves))
     run.section(
         "Point spread and MTF",
         "Where it says rays, the aberration is too large for a sampled wavefront: rays stand in, their MTF "
@@ -344,22 +302,22 @@ def sharpness(run, geo, fields, light, quick, at_m):
         else "",
     )
     run.figure(
-        lens_figures.psf_pictures(psfs, titles),
+        lens_figures.psf_pictures(list(psfs.values()), list(psfs)),
         "psf",
         f"Point spread in light of {len(light)} wavelength{'s' * (len(light) > 1)}, each over its peak.",
     )
     run.figure(
-        lens_figures.mtf_curves(frequency, curves, analysis.ideal_mtf(frequency, fno, light[0])),
+        lens_figures.mtf_curves(frequency, curves, ideal),
         "mtf",
         "MTF; dotted: a perfect lens of the same f-number on the axis.",
     )
-    depth = max(8 * light[0] * 1e-3 * fno**2, 2 * widest * fno)
+    depth = max(8 * airy * fno, 2 * widest * fno)
     shifts = torch.linspace(-depth, depth, 11 if quick else 31).tolist()
+    middle = float(frequency[10])
     run.figure(
-        lens_curves.through_focus(geo, fields, shifts, float(frequency[10]), light, True, at_m=at_m),
+        lens_curves.through_focus(geo, fields, shifts, middle, light, True, at_m=at_m),
         "through_focus",
-        f"RMS spot, and geometric MTF at {float(frequency[10]):g} line pairs per mm, over the place of the "
-        "image plane.",
+        f"RMS spot, and geometric MTF at {middle:g} line pairs per mm, over the place of the image plane.",
     )
 
 

@@ -8,21 +8,16 @@ from torch import Tensor
 
 from codesign.errors import DomainError
 from codesign.lens.analysis import rms_spot_mm, spots
+from codesign.lens.design.constraints import gap_mm
 from codesign.lens.geolens import LEARNABLES, GeoLens
 from codesign.lens.solves import hold_efl, holding_surface
-from codesign.lens.surface import sag_mm
 from codesign.lens.variables import ray_motion
 
 
 def edge_thickness_mm(lens: GeoLens) -> Tensor:
     """Gap between neighbouring surfaces at the larger of their semi-apertures, [S - 1] mm. Gradient:
     curvatures, thicknesses, conics."""
-    a = torch.maximum(lens.semi_aperture_mm[:-1], lens.semi_aperture_mm[1:])
-    return lens.thickness_mm[:-1] + _sag(lens, slice(1, None), a) - _sag(lens, slice(None, -1), a)
-
-
-def _sag(lens, rows, height):
-    return sag_mm(height, lens.curvature_per_mm[rows], lens.conic[rows], lens.asphere[rows].unbind(1))
+    return gap_mm(lens, torch.ones_like(lens.thickness_mm[:1]))[:, 0]
 
 
 @dataclass(frozen=True)

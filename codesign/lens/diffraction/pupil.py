@@ -42,11 +42,6 @@ class PupilFunction:
     def wavelength_mm(self) -> float:
         return self.wavelength_um * 1e-3
 
-    @property
-    def cutoff_per_mm(self) -> Tensor:
-        """[2] (x, y) spatial frequency where the diffraction MTF ends, line pairs per mm."""
-        return 2 * self.cosine_radius / self.wavelength_mm
-
 
 def pupil_function(
     lens: GeoLens,

@@ -29,8 +29,6 @@ def read_native(page: Any, name: str, dtype: torch.dtype) -> GeoLens:
     surfaces = []
     for i, row in enumerate(p.rows(page, "surfaces"), 1):
         with at(f"surface {i}"):
-            if not isinstance(row, dict):
-                raise FileFormatError(f"it is {shown(row)!r}, an object is needed; see docs/lens_files.md.")
             surfaces.append(_surface(row).check("its shape"))
     diameter = p.number(page, "entrance_pupil_diameter_mm", infinite=True)
     soft_edge = p.number(page, "soft_edge_mm", 0.2)

@@ -44,10 +44,8 @@ def read_optiland(page: Page, name: str) -> FileLens:
     """FileLens of a page; solves and pickups keep the stored values. Raises: FileFormatError naming surface
     and field."""
     entries = []
-    for i, row in enumerate(p.rows(p.entry(page, "surface_group"), "surfaces")):
+    for i, row in enumerate(p.rows(p.entry(page, "surface_group"), "surfaces", first=0)):
         with at(f"surface {i}"):
-            if not isinstance(row, dict):
-                raise FileFormatError(f"it is {shown(row)!r}, an object is needed.")
             entries.append((row, _place(row, infinite=i == 0)))
     if len(entries) < 3:
         raise FileFormatError(
@@ -85,11 +83,7 @@ def read_optiland(page: Page, name: str) -> FileLens:
 def _take_pupil(lens, aperture, surfaces):
     kind = p.present(aperture, "type")
     value = p.number(aperture, "value")
-    if p.boolean(aperture, "object_space_telecentric"):
-        raise FileFormatError(
-            "the object space is telecentric, so its pupil is not that of the stop; switch that off in the "
-            "file."
-        )
+    _check_pupil(aperture)
     if kind == "float_by_stop_size":
         next(s for s in surfaces if s.is_stop).semi_aperture = value / 2
         lens.pupil = "stop", 0.0
@@ -102,6 +96,14 @@ def _take_pupil(lens, aperture, surfaces):
         )
 
 
+def _check_pupil(row):
+    if p.boolean(row, "object_space_telecentric") or p.boolean(row, "telecentric"):
+        raise FileFormatError(
+            "the object space is telecentric, so its pupil is not that of the stop; switch that off in the "
+            "file."
+        )
+
+
 def _take_field(lens, fields):
     if not isinstance(fields, dict) or not isinstance(fields.get("fields"), list) or not fields["fields"]:
         return
@@ -111,11 +113,7 @@ def _take_field(lens, fields):
     kind = kind.get("field_type") if isinstance(kind, dict) else kind
     if not isinstance(kind, str) or kind not in FIELDS:
         raise FileFormatError(f"the fields are given as {shown(kind)}; known are {', '.join(FIELDS)}.")
-    if p.boolean(fields, "object_space_telecentric") or p.boolean(fields, "telecentric"):
-        raise FileFormatError(
-            "the object space is telecentric, so its pupil is not that of the stop; switch that off in the "
-            "file."
-        )
+    _check_pupil(fields)
     points = [f for f in fields["fields"] if isinstance(f, dict)]
     lens.field = (
         FIELDS[kind],

@@ -102,11 +102,14 @@ def entry(row: Page, key: str) -> Page:
     return value
 
 
-def rows(page: Page, key: str) -> list[Any]:
-    """The list of 1 to MOST_SURFACES objects under a key."""
+def rows(page: Page, key: str, first: int = 1) -> list[Page]:
+    """The list of 1 to MOST_SURFACES objects, surfaces numbered from ``first``, under a key."""
     value = page.get(key)
     if not isinstance(value, list) or not 0 < len(value) <= MOST_SURFACES:
         raise FileFormatError(f'"{key}" must be a list of 1 to {MOST_SURFACES} surfaces; add at least one.')
+    for i, row in enumerate(value, first):
+        if not isinstance(row, dict):
+            raise FileFormatError(f"surface {i}: it is {shown(row)!r}, an object is needed.")
     return value
 
 

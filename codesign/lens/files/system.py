@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from codesign.errors import FileFormatError
 from codesign.lens.glass import Glass
-from codesign.lens.surface import Phase
+from codesign.lens.surface import Phase, scaled_asphere, scaled_phase
 
 
 @dataclass
@@ -113,19 +113,14 @@ def placed(surfaces: list[FileSurface]) -> list[FileSurface]:
 def in_mm(surface: FileSurface, unit_mm: float, sign: float) -> FileSurface:
     """The surface in millimetres, its shape and tilt mirrored in z where ``sign`` is -1; its thickness is
     left alone."""
-    asphere = tuple(sign * a * unit_mm ** (-1 - 2 * i) for i, a in enumerate(surface.asphere))
-    phase = surface.phase and dataclasses.replace(
-        surface.phase,
-        coefficients=tuple(a * unit_mm ** (-2 - 2 * i) for i, a in enumerate(surface.phase.coefficients)),
-    )
     aperture = None if surface.semi_aperture is None else surface.semi_aperture * unit_mm
     x, y = surface.decentre
     about_x, about_y = surface.tilt_deg
     return dataclasses.replace(
         surface,
         curvature=sign * surface.curvature / unit_mm,
-        asphere=asphere,
-        phase=phase,
+        asphere=scaled_asphere([sign * a for a in surface.asphere], unit_mm),
+        phase=scaled_phase(surface.phase, unit_mm),
         semi_aperture=aperture,
         inner=surface.inner * unit_mm,
         decentre=(x * unit_mm, y * unit_mm),

@@ -56,8 +56,6 @@ def read_deeplens(page: Page, name: str) -> FileLens:
     stops = []
     for i, row in enumerate(p.rows(page, "surfaces"), 1):
         with at(f"surface {i}"):
-            if not isinstance(row, dict):
-                raise FileFormatError(f"it is {shown(row)!r}, an object is needed.")
             _check_front(row, page["surfaces"][: i - 1])
             surfaces.append(_surface(row, i))
             stops += [i - 1] if row["type"] in ("Stop", "Aperture") else []
