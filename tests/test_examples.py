@@ -39,7 +39,6 @@ FIRST_MET = {  # modules whose examples a user meets first
     "codesign.lens.glass",
     "codesign.lens.spectrum",
     "codesign.lens.surface",
-    "codesign.optimise.adam",
     "codesign.optimise.least_squares",
     "codesign.mount.body",
     "codesign.mount.pose",

@@ -336,12 +336,14 @@ class GeoLens(Replaceable):
         base = torch.tensor(values, dtype=self.dtype, device=self.semi_aperture_mm.device)
         offset = torch.where(self.glass, self.index_offset, 0)
         found = base + torch.cat([torch.zeros_like(offset[:1]), offset])
-        if not any(self.mirrors):
-            return found
-        source = list(range(len(values)))
+        return found[self._unfolded([*range(len(values))])] if any(self.mirrors) else found
+
+    def _unfolded(self, gaps):
+        """What is said of gaps [S + 1], the one before the lens among them; behind a mirror that of the one
+        before."""
         for i, mirror in enumerate(self.mirrors):
-            source[i + 1] = source[i] if mirror else i + 1
-        return found[source]
+            gaps[i + 1] = gaps[i] if mirror else gaps[i + 1]
+        return gaps
 
     def path_mm(self, wavelength_um: float = WAVELENGTH_UM["d"]) -> torch.Tensor:
         """Optical path that the diffractive phases add, as coefficients [S, P] of r^2, r^4, ... in mm."""
@@ -386,9 +388,7 @@ class GeoLens(Replaceable):
         shape = (self.curvature_per_mm, self.thickness_mm, self.conic, self.asphere)
         efficiency = math.prod(s.phase.efficiency(wavelength_um) for s in self.surfaces if s.phase)
         inner = tuple(s.inner_semi_aperture_mm for s in self.surfaces)
-        filled = [False, *self.glass.tolist()]
-        for i, mirror in enumerate(self.mirrors):
-            filled[i + 1] = filled[i] if mirror else filled[i + 1]
+        filled = self._unfolded([False, *self.glass.tolist()])
         return Prescription(
             *shape,
             self.index(wavelength_um),

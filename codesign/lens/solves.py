@@ -106,9 +106,10 @@ def image_distance_mm(
             f"does not converge behind the lens; {_remedy(lens)}."
         )
     image = -height * lens.index(wavelength_um)[-1] / angle
-    return (
-        image if spot_grid is None else image + _least_spot(lens, distance_m, image, wavelength_um, spot_grid)
-    )
+    if spot_grid is None:
+        return image
+    at_focus = _last_thickness(lens, image)
+    return focus_rays(at_focus, [0.0], [wavelength_um], spot_grid, distance_m).thickness_mm[-1]
 
 
 def least_spot_shift(position: Tensor, slope: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -125,25 +126,6 @@ def least_spot_shift(position: Tensor, slope: Tensor, weight: Tensor) -> tuple[T
     )
     sharpness = slope.square().sum()
     return -(position * slope).sum() / sharpness, sharpness
-
-
-def _least_spot(lens, distance_m, image_mm, wavelength_um, grid):
-    """Shift of the film from the paraxial image to the least RMS spot of the axial point."""
-    pupil = pupil_grid(grid, lens.dtype, lens.semi_aperture_mm.device)
-    placed = lens.replace(thickness_mm=torch.cat([lens.thickness_mm[:-1], image_mm.reshape(1)]))
-    rays = trace_source(placed, source_rays(lens, [0.0], pupil, distance_m), wavelength_um)
-    if not bool(rays.weight.any()):
-        raise DomainError(f"{lens.name}: no ray of the axial point arrives; leave spot_grid out.")
-    shift, sharpness = least_spot_shift(
-        rays.position_mm, rays.direction[..., :2] / rays.direction[..., 2:], rays.weight[..., None]
-    )
-    if not float(sharpness.detach()) >= 1e-16:
-        raise DomainError(
-            f"{lens.name}: {len(pupil)} rays of a pupil of {grid} samples across do not converge, so no "
-            "spot is the "
-            "least; give a spot_grid of at least 2, or leave it out."
-        )
-    return shift
 
 
 def _remedy(lens):
@@ -222,8 +204,12 @@ def focus_rays(
             "weaker curvatures."
         )
     shift, sharpness = least_spot_shift(position, slope, weight)
-    if float(sharpness.detach()) < 1e-16:
-        raise DomainError(f"{lens.name}: its rays leave parallel, so no image plane is better than another.")
+    if not float(sharpness.detach()) >= 1e-16:
+        raise DomainError(
+            f"{lens.name}: {pupil.shape[0]} rays of a pupil of {grid} samples across do not converge: they are "
+            "too few or leave parallel, so no image plane is better than another; give at least 2 samples, or "
+            "another lens."
+        )
     return _last_thickness(lens, lens.thickness_mm[-1] + shift)
 
 

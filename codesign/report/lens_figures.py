@@ -37,6 +37,7 @@ __all__ = [
 ]
 
 VISIBLE_UM = tuple(WAVELENGTH_UM[line] for line in "dFC")
+FLOOR = 1e-4  # of the peak of a point spread
 LINE_COLOURS = ("#2e8b57", "#1b6ca8", "#c0392b", "#8e44ad", "#d68910")
 
 
@@ -156,15 +157,15 @@ def opd_maps(
     return figure
 
 
-def psf_pictures(psfs: Sequence[Psf], titles: Sequence[str], floor: float = 1e-4) -> Figure:
+def psf_pictures(psfs: Sequence[Psf], titles: Sequence[str]) -> Figure:
     """Figure of point spreads (list of ``Psf``), each over its own peak on a logarithmic scale. Axes in µm
     about the reference point."""
     figure, axes = _grid(1, len(psfs), 2.9, 3.0)
     for axis, psf, title in zip(axes[0], psfs, titles, strict=True):
         energy = psf.energy.detach().numpy()
         x, y = (energy.shape[0] / 2 * float(p) * 1e3 for p in psf.pitch_mm.detach())
-        picture = np.maximum(energy / max(energy.max(), 1e-300), floor)
-        axis.imshow(picture, origin="lower", extent=(-x, x, -y, y), cmap="magma", norm=LogNorm(floor, 1))
+        picture = np.maximum(energy / max(energy.max(), 1e-300), FLOOR)
+        axis.imshow(picture, origin="lower", extent=(-x, x, -y, y), cmap="magma", norm=LogNorm(FLOOR, 1))
         axis.set(xlabel="x (µm)")
         axis.set_title(title, fontsize=9)
     axes[0, 0].set_ylabel("y (µm)")
@@ -172,9 +173,7 @@ def psf_pictures(psfs: Sequence[Psf], titles: Sequence[str], floor: float = 1e-4
     return figure
 
 
-def mtf_curves(
-    frequency_per_mm: Tensor, curves: Mapping[str, Tensor], ideal: Tensor | None = None, title: str = ""
-) -> Figure:
+def mtf_curves(frequency_per_mm: Tensor, curves: Mapping[str, Tensor], ideal: Tensor | None = None) -> Figure:
     """Figure of MTFs.
 
     Args:
@@ -192,7 +191,6 @@ def mtf_curves(
     axis.set(
         xlabel="line pairs per mm", ylabel="modulation", ylim=(0, 1.02), xlim=(0, float(frequency.max()))
     )
-    axis.set_title(title, loc="left", fontsize=10)
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8, frameon=False)
     return figure

@@ -25,6 +25,7 @@ from codesign.lens.design.constraints import active
 from codesign.report import lens_figures
 from studies.frame.compare import share
 from studies.frame.run import Run, StudyConfig, main
+from studies.frame.show import table
 from studies.lens_scratch.search import ATTEMPTS, METHODS, Outcome, Search
 from studies.lens_scratch.task import JUDGED_FIELDS, judge, polychromatic_spots_um
 
@@ -56,17 +57,15 @@ def study(run: Run[Config]):
     goal_um = ALLOWED * published_um
     run.say(f"{YARDSTICK}: mean RMS spot {published_um:.2f} um in F, d, C; goal {goal_um:.2f} um")
     outcomes = search_all(run, [(method, seed) for method in methods for seed in seeds], goal_um)
-    verdicts = [judge_outcome(outcome) for outcome in outcomes]
+    found = [(outcome, judge_outcome(outcome)) for outcome in outcomes]
     for method in methods:
-        record_method(
-            run, method, [(o, v) for o, v in zip(outcomes, verdicts, strict=True) if o.method == method]
-        )
+        record_method(run, method, [(o, v) for o, v in found if o.method == method])
     run.record(
         published_mean_spot_um=published_um,
         published_mean_spot_d_um=mean(polychromatic_spots_um(published, ("d",))),
         goal_mean_spot_um=goal_um,
     )
-    show(run, published, list(zip(outcomes, verdicts, strict=True)))
+    show(run, published, found)
 
 
 def search_all(run, jobs, goal_um):
@@ -124,47 +123,36 @@ def judge_outcome(outcome):
 
 
 def record_method(run, method, found):
-    """Figures of one method into metrics.json."""
-    wins = sum(o.succeeded for o, _ in found)
-    succeeded = share(wins, len(found))
-    spots = sorted(v.mean_um for _, v in found if v is not None and math.isfinite(v.mean_um))
-    run.record(
-        **{
-            f"{method}_seeds": len(found),
-            f"{method}_seeds_succeeded": wins,
-            f"{method}_success_low": succeeded.low,
-            f"{method}_success_high": succeeded.high,
-            f"{method}_seeds_succeeded_at_first_attempt": sum(
-                o.succeeded and o.attempts == 1 for o, _ in found
-            ),
-            f"{method}_seconds_total": sum(o.seconds for o, _ in found),
-            f"{method}_evaluations_total": sum(o.evaluations for o, _ in found),
-        }
-    )
+    """Figures of one method into metrics.json, and its card."""
+    wins = [o for o, _ in found if o.succeeded]
+    succeeded = share(len(wins), len(found))
+    figures = {
+        "seeds": len(found),
+        "seeds_succeeded": len(wins),
+        "success_low": succeeded.low,
+        "success_high": succeeded.high,
+        "seeds_succeeded_at_first_attempt": sum(o.attempts == 1 for o in wins),
+        "seconds_total": sum(o.seconds for o, _ in found),
+        "evaluations_total": sum(o.evaluations for o, _ in found),
+    }
+    spots = [v.mean_um for _, v in found if v is not None and math.isfinite(v.mean_um)]
     if spots:
-        run.record(
-            **{
-                f"{method}_best_mean_spot_um": spots[0],
-                f"{method}_median_mean_spot_um": statistics.median(spots),
-                f"{method}_worst_mean_spot_um": spots[-1],
-            }
-        )
+        for name, statistic in (("best", min), ("median", statistics.median), ("worst", max)):
+            figures[f"{name}_mean_spot_um"] = statistic(spots)
+    run.record(**{f"{method}_{name}": value for name, value in figures.items()})
+    run.card(
+        method.capitalize(),
+        f"{len(wins)} of {len(found)} seeds",
+        f"{METHODS[method]}; 95 % interval {succeeded.low:.0%} to {succeeded.high:.0%}",
+    )
 
 
 def show(run, published, found):
     """The page: success by method, the designs of the first one, all searches."""
-    metrics = run.metrics
-    for method in run.config.methods:
-        low, high = metrics[f"{method}_success_low"], metrics[f"{method}_success_high"]
-        run.card(
-            method.capitalize(),
-            f"{metrics[f'{method}_seeds_succeeded']} of {metrics[f'{method}_seeds']} seeds",
-            f"{METHODS[method]}; 95 % interval {low:.0%} to {high:.0%}",
-        )
-    goal_um = metrics["goal_mean_spot_um"]
+    published_um, goal_um = (run.metrics[f"{name}_mean_spot_um"] for name in ("published", "goal"))
     run.card(
         "Published lens",
-        f"{metrics['published_mean_spot_um']:.2f} µm",
+        f"{published_um:.2f} µm",
         f"mean RMS spot in F, d, C; the goal is {goal_um:.2f} µm",
     )
     first = [(o, v) for o, v in found if o.method == run.config.methods[0]]
@@ -175,14 +163,16 @@ def show(run, published, found):
     )
     rows = []
     for o, v in found:
-        row = [o.method, o.seed, "yes" if o.succeeded else "no", o.attempts, o.steps, o.evaluations]
-        row += [round(o.seconds, 1), None, None]
+        row = {name: getattr(o, name) for name in ("method", "seed", "attempts", "steps", "evaluations")}
+        row |= {"success": "yes" if o.succeeded else "no", "seconds": round(o.seconds, 1)}
         if v is not None:
             tight = [f"{c.name} ({c.state(TIGHT)})" for c in active(v.limits, TIGHT)]
-            row[-2:] = [round(v.mean_um, 2), "; ".join(tight) or "none"]
+            row |= {
+                "mean spot (µm)": round(v.mean_um, 2),
+                "limits that bind or fail": "; ".join(tight) or "none",
+            }
         rows.append(row)
-    columns = ("method", "seed", "success", "attempts", "steps", "evaluations", "seconds", "mean spot (µm)")
-    run.table("Seeds", (*columns, "limits that bind or fail"), rows)
+    run.table("Seeds", *table(rows))
     run.finish(
         "A lens from plane plates",
         "Three glasses in a given order, a stop, a focal length and limits; no start design, no drawing "

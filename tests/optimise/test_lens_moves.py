@@ -110,12 +110,10 @@ def test_an_element_goes_and_the_rest_takes_over(triplet, path):
 
 
 def test_held_surfaces_keep_their_curvature(triplet):
-    found = reoptimise(triplet, spot_errors, ("curvature", "focus"), held=(0, 5), steps=4)
+    found = reoptimise(triplet, spot_errors, ("curvature", "focus"), held=(0, -1), steps=4)
     same = (found.lens.curvature_per_mm == triplet.curvature_per_mm).tolist()
     assert [same[0], same[5], any(same[1:5])] == [True, True, False]
     assert found.after < found.before
-    last = reoptimise(triplet, spot_errors, ("curvature", "focus"), held=(-1,), steps=1).lens
-    assert last.curvature_per_mm[5] == triplet.curvature_per_mm[5]
 
 
 def test_a_ray_that_fails_is_a_failed_step(triplet):

@@ -99,12 +99,6 @@ def test_minima_agree_with_scipy(problem, start, lower, upper):
     torch.testing.assert_close(found, torch.from_numpy(truth.x), rtol=1e-5 if free else 1e-4, atol=1e-5)
 
 
-def test_a_hinge_row_gives_the_minimum_of_the_penalised_problem():
-    """min (x - 3)^2 + w^2 max(0, x - 1)^2 lies at (3 + w^2) / (1 + w^2)."""
-    solver = DampedLeastSquares(lambda x: torch.stack([x[0] - 3, 10 * (x[0] - 1).clamp_min(0)]), vector(0.0))
-    assert solver.run(100).item() == pytest.approx((3 + 100) / 101, rel=1e-9)
-
-
 def test_residuals_that_are_not_finite_are_failed_steps():
     """log(x) = -5 from x = 2: the full step lands below 0, where the logarithm is NaN."""
     seen = []

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.lens.analysis.rays import Light, Values, chief_ray, spectral_lines
-from codesign.lens.analysis.spots import polychromatic_spot
-from codesign.lens.diffraction.pupil import pupil_function
+from codesign.lens.analysis.rays import Light, Values
+from codesign.lens.analysis.spots import lit_points
+from codesign.lens.diffraction.pupil import pupil_functions
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
@@ -52,18 +52,11 @@ def diffraction_mtf(
     Gradient: to every lens tensor. Raises: DomainError for a negative frequency, and see ``pupil_function``.
     """
     frequency = _frequencies(lens, frequency_per_mm)
-    wavelengths, shares = spectral_lines(light)
-    reference = chief_ray(lens, field_rad, wavelengths[0], defocus_mm, at_m).position_mm[0]
-    total = torch.zeros(
-        2,
-        frequency.numel(),
-        dtype=torch.complex128 if lens.dtype == torch.float64 else torch.complex64,
-        device=frequency.device,
+    _, pupils = pupil_functions(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
+    transfers = (
+        share * torch.stack([_transfer(pupil, axis, frequency) for axis in (1, 0)]) for share, pupil in pupils
     )
-    for wavelength_um, share in zip(wavelengths, shares, strict=True):
-        pupil = pupil_function(lens, field_rad, wavelength_um, grid, vignetting, defocus_mm, reference, at_m)
-        total = total + share * torch.stack([_transfer(pupil, axis, frequency) for axis in (1, 0)])
-    return total.abs()
+    return sum(transfers, torch.zeros_like(frequency)).abs()
 
 
 def geometric_mtf(
@@ -82,10 +75,7 @@ def geometric_mtf(
     Multiply by ``ideal_mtf`` for the usual estimate between the two limits.
     """
     frequency = _frequencies(lens, frequency_per_mm)
-    positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
-    lit = weight.reshape(-1).detach() > 0
-    points = positions.reshape(-1, 2)[lit]
-    weight = weight.reshape(-1)[lit]
+    points, weight = lit_points(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
     away = points - (points * weight[:, None]).sum(0)
     found = []
     for axis in (1, 0):

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from codesign.errors import DomainError, as_number, check_whole
 from codesign.lens.analysis.rays import Light, chief_ray, spectral_lines
-from codesign.lens.analysis.spots import polychromatic_spot
-from codesign.lens.diffraction.pupil import pupil_function
+from codesign.lens.analysis.spots import lit_points
+from codesign.lens.diffraction.pupil import pupil_function, pupil_functions
 from codesign.lens.distance import PARALLEL
 from codesign.lens.geolens import GeoLens
 from codesign.lens.glass import WAVELENGTH_UM
@@ -90,31 +90,19 @@ def psf_on_pixels(
       than the sampled pupil's period.
     """
     pixel_mm, pixels = _pixels(pixel_mm, pixels)
-    wavelengths, shares = spectral_lines(light)
-    reference = chief_ray(lens, field_rad, wavelengths[0], defocus_mm, at_m).position_mm[0]
+    reference, pupils = pupil_functions(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
     at = (torch.arange(pixels, dtype=lens.dtype, device=reference.device) - pixels // 2) * pixel_mm
     total = torch.zeros(pixels, pixels, dtype=lens.dtype, device=reference.device)
-    for wavelength_um, share in zip(wavelengths, shares, strict=True):
-        pupil = pupil_function(lens, field_rad, wavelength_um, grid, vignetting, defocus_mm, reference, at_m)
+    for share, pupil in pupils:
         n = pupil.field.shape[0]
-        line = (torch.arange(n, dtype=lens.dtype, device=reference.device) + 0.5) / n * 2 - 1
         period = n * pupil.wavelength_mm / (2 * float(pupil.cosine_radius.detach().max()))
         if pixels * pixel_mm > period:
             raise DomainError(
                 f"{lens.name}: {pixels} pixels of {pixel_mm:g} mm are wider than the {period:.3g} mm that "
                 f"{n} pupil cells resolve; give fewer pixels or a finer pupil grid."
             )
-        phases = [
-            torch.polar(torch.ones_like(a), a)
-            for a in (2 * math.pi / pupil.wavelength_mm * r * at[:, None] * line for r in pupil.cosine_radius)
-        ]
-        amplitude = phases[1] @ pupil.field @ phases[0].T
-        cell = (2 / n) ** 2 * pupil.cosine_radius.prod()  # solid angle of a pupil cell in direction cosines
-        density = (amplitude.real.square() + amplitude.imag.square()) * cell / pupil.wavelength_mm**2
-        total = (
-            total
-            + share * density * pixel_mm**2 / (pupil.field.real.square() + pupil.field.imag.square()).sum()
-        )
+        amplitude = pupil.amplitude(at)
+        total = total + share * pixel_mm**2 * (amplitude.real.square() + amplitude.imag.square())
     return Psf(total, torch.full((2,), pixel_mm, dtype=lens.dtype), reference)
 
 
@@ -137,9 +125,9 @@ def geometric_psf(
     Gradient: energy to every lens tensor, piecewise linear in the ray positions.
     """
     pixel_mm, pixels = _pixels(pixel_mm, pixels)
-    positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
+    points, weight = lit_points(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
     reference = chief_ray(lens, field_rad, spectral_lines(light)[0][0], defocus_mm, at_m).position_mm[0]
-    place = (positions.reshape(-1, 2) - reference) / pixel_mm + pixels // 2  # x, y in pixels
+    place = (points - reference) / pixel_mm + pixels // 2  # x, y in pixels
     low = place.detach().floor()
     share = place - low
     low = low.long()
@@ -149,7 +137,7 @@ def geometric_psf(
             x = low[:, 0] + step_x
             y = low[:, 1] + step_y
             part = (
-                weight.reshape(-1)
+                weight
                 * (share[:, 0] if step_x else 1 - share[:, 0])
                 * (share[:, 1] if step_y else 1 - share[:, 1])
             )

@@ -1,6 +1,5 @@
 """Spot diagrams and encircled energy of a lens."""
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -61,16 +60,10 @@ def rms_spot_mm(
     >>> [round(spot, 3) for spot in near.tolist()]
     [0.172, 0.015, 0.108]
     """
-    positions, weight = spots(lens, fields_rad, wavelength_um, grid, at_m)
+    pupil = pupil_grid(grid, lens.curvature_per_mm.dtype, lens.curvature_per_mm.device)
+    rays = trace_field(lens, fields_rad, pupil, wavelength_um, at_m=at_m)
+    positions, weight = rays.position_mm, rays.weight
     total = weight.sum(-1)
-    if bool((total == 0).any()):
-        dark = (total == 0).reshape(-1, len(fields_rad)).any(0).tolist()
-        dead = [
-            round(math.degrees(float(f)), 2) for f, nothing in zip(fields_rad, dark, strict=True) if nothing
-        ]
-        raise DomainError(
-            f"{lens.name}: no ray arrives at field {dead} degrees; use a smaller field or weaker curvatures."
-        )
     w = weight[..., None]
     centre = (positions * w).sum(-2, keepdim=True) / total[..., None, None]
     # weights are 0 or 1; the gradient at a point image is 0
@@ -101,6 +94,21 @@ def polychromatic_spot(
     rays = [trace_field(lens, field_rad, pupil, w, vignetting, defocus_mm, at_m) for w in wavelengths]
     weight = torch.stack([r.weight * share for r, share in zip(rays, shares, strict=True)])
     return torch.stack([r.position_mm for r in rays]), weight / weight.sum()
+
+
+def lit_points(
+    lens: TracedLens,
+    field_rad: float,
+    light: Light,
+    grid: int,
+    vignetting: bool,
+    defocus_mm: float | Tensor,
+    at_m: float | Tensor,
+) -> tuple[Tensor, Tensor]:
+    """The rays of a ``polychromatic_spot`` that arrive: positions [N, 2] mm and weights [N]."""
+    positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
+    lit = weight.detach() > 0
+    return positions[lit], weight[lit]
 
 
 def spot_radius_mm(positions_mm: Tensor, weight: Tensor) -> Tensor:
@@ -170,12 +178,9 @@ def encircled_radius_mm(
 
 
 def _distances(lens, field_rad, light, grid, vignetting, defocus_mm, about_chief, at_m):
-    positions, weight = polychromatic_spot(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
-    points = positions.reshape(-1, 2)
-    weight = weight.reshape(-1)
+    points, weight = lit_points(lens, field_rad, light, grid, vignetting, defocus_mm, at_m)
     if about_chief:
         centre = chief_ray(lens, field_rad, spectral_lines(light)[0][0], defocus_mm, at_m).position_mm
     else:
         centre = (points * weight[:, None]).sum(0)
-    kept = weight.detach() > 0
-    return torch.linalg.vector_norm(points[kept] - centre, dim=1), weight[kept]
+    return torch.linalg.vector_norm(points - centre, dim=1), weight

@@ -2,13 +2,14 @@
 before the film."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from codesign.errors import DomainError
-from codesign.lens.analysis.rays import chief_ray
+from codesign.lens.analysis.rays import Light, chief_ray, spectral_lines
 from codesign.lens.analysis.wavefront import wavefront
 from codesign.lens.diffraction.field import Field, check_grid
 from codesign.lens.diffraction.place import cells_for_plate, plate_waves, with_plate
@@ -41,6 +42,26 @@ class PupilFunction:
     @property
     def wavelength_mm(self) -> float:
         return self.wavelength_um * 1e-3
+
+    def cosines(self) -> tuple[Tensor, Tensor]:
+        """Direction cosines [n] times index of the columns (x) and the rows (y)."""
+        n, like = self.field.shape[0], self.cosine_radius
+        line = (torch.arange(n, dtype=like.dtype, device=like.device) + 0.5) / n * 2 - 1
+        return like[0] * line, like[1] * line
+
+    def amplitude(self, places_mm: Tensor) -> Tensor:
+        """Field [K, K] about the image point at places [K] along y and x; the energy of all of it is 1.
+
+        The Fourier integral is summed for each place, as two matrix products.
+        """
+        k = 2 * math.pi / self.wavelength_mm
+        to_x, to_y = (
+            torch.polar(torch.ones_like(a), a) for a in (k * places_mm[:, None] * c for c in self.cosines())
+        )
+        # solid angle of a cell in direction cosines
+        cell = (2 / self.field.shape[0]) ** 2 * self.cosine_radius.prod()
+        power = (self.field.real.square() + self.field.imag.square()).sum()
+        return (to_y @ self.field @ to_x.T) * ((cell / power).sqrt() / self.wavelength_mm)
 
 
 def pupil_function(
@@ -114,6 +135,24 @@ def pupil_function(
     # light from above goes down
     mirrored = [axis for axis, value in ((1, scale[0]), (0, scale[1])) if float(value.detach()) < 0]
     return PupilFunction(field.flip(mirrored), scale.abs(), wavelength_um, front.reference_mm)
+
+
+def pupil_functions(
+    lens: GeoLens,
+    field_rad: float,
+    light: Light,
+    grid: int | None,
+    vignetting: bool,
+    defocus_mm: float | Tensor,
+    at_m: float | Tensor,
+) -> tuple[Tensor, Iterator[tuple[float, PupilFunction]]]:
+    """The chief ray's image point [2] of the first wavelength, and share and PupilFunction of each about it."""
+    wavelengths, shares = spectral_lines(light)
+    reference = chief_ray(lens, field_rad, wavelengths[0], defocus_mm, at_m).position_mm[0]
+    return reference, (
+        (share, pupil_function(lens, field_rad, w, grid, vignetting, defocus_mm, reference, at_m))
+        for w, share in zip(wavelengths, shares, strict=True)
+    )
 
 
 def _cosine_radius(front):
@@ -209,14 +248,9 @@ def before_image(
             f"film, asks for a pitch of at most {coarsest:.3g} mm and a pupil grid of at least {needed}, "
             f"not {cells}."
         )
-    line = (torch.arange(cells, dtype=torch.float64, device=like.device) + 0.5) / cells * 2 - 1
-    x, y = (line * r for r in like)
+    x, y = pupil.cosines()
     axial = (1 - x.square() - y[:, None].square()).clamp_min(0).sqrt()
-    k = 2 * math.pi / pupil.wavelength_mm
-    waves = pupil.field * torch.polar(torch.ones_like(axial), -k * distance * axial)
-    at = (torch.arange(count, dtype=torch.float64, device=like.device) - count // 2) * pitch_mm
-    to_x, to_y = (torch.polar(torch.ones_like(a), a) for a in (k * at[:, None] * c for c in (x, y)))
-    cell = (2 / cells) ** 2 * like.prod()  # solid angle of a cell in direction cosines
-    power = (pupil.field.real.square() + pupil.field.imag.square()).sum()
-    amplitude = (to_y @ waves @ to_x.T) * (cell / power).sqrt() / pupil.wavelength_mm
+    back = torch.polar(torch.ones_like(axial), -2 * math.pi / pupil.wavelength_mm * distance * axial)
+    at = (torch.arange(count, dtype=axial.dtype, device=like.device) - count // 2) * pitch_mm
+    amplitude = replace(pupil, field=pupil.field * back).amplitude(at)
     return Field(amplitude, pitch_mm, wavelength_um)

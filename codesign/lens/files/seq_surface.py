@@ -16,27 +16,27 @@ ASPHERE = {letter: 2 + i for i, letter in enumerate("ABCDEFGHJ")}
 # where the last number is 0 they do nothing
 OF_NOTHING = ("ADX", "ADY", "ARO", "CUX", "RDX")
 REFUSED = {
-    "it tilts or shifts everything behind it": ("REV",),
-    "it bends the axis": ("BEN",),
-    "it returns to the axes of another surface": ("RET",),
-    "it is placed in global axes": ("GLB",),
-    "it is toroidal": ("XTO", "YTO"),
-    "it is cylindrical": ("CYL",),
-    "it is anamorphic": ("AAS",),
-    "it is a special surface": ("SPS",),
-    "its shape is user-defined": ("UDS",),
-    "its shape is a spline": ("SPL",),
-    "its shape is not one of revolution": ("ZRN",),
-    "its index has a gradient": ("GRN",),
-    "it is a two-point hologram": ("HOE",),
-    "it is a ruled grating": ("GRT",),
-    "its shape is deformed": ("DEF",),
-    "it is not sequential": ("NSS",),
-    "its aperture is rectangular": ("REX", "REY"),
-    "its aperture is elliptical": ("ELX", "ELY"),
-    "its aperture is off the axis": ("ADX", "ADY"),
-    "its aperture is turned": ("ARO",),
-    "its two curvatures differ": ("CUX", "RDX"),
+    "it tilts or shifts everything behind it": "REV",
+    "it bends the axis": "BEN",
+    "it returns to the axes of another surface": "RET",
+    "it is placed in global axes": "GLB",
+    "it is toroidal": "XTO YTO",
+    "it is cylindrical": "CYL",
+    "it is anamorphic": "AAS",
+    "it is a special surface": "SPS",
+    "its shape is user-defined": "UDS",
+    "its shape is a spline": "SPL",
+    "its shape is not one of revolution": "ZRN",
+    "its index has a gradient": "GRN",
+    "it is a two-point hologram": "HOE",
+    "it is a ruled grating": "GRT",
+    "its shape is deformed": "DEF",
+    "it is not sequential": "NSS",
+    "its aperture is rectangular": "REX REY",
+    "its aperture is elliptical": "ELX ELY",
+    "its aperture is off the axis": "ADX ADY",
+    "its aperture is turned": "ARO",
+    "its two curvatures differ": "CUX RDX",
 }
 
 
@@ -132,7 +132,7 @@ SURFACE = {
         keyword: f"{reason} ({keyword}), which is not read; use a design of centred surfaces of revolution "
         "with circular apertures."
         for reason, keywords in REFUSED.items()
-        for keyword in keywords
+        for keyword in keywords.split()
     },
     **dict.fromkeys(ASPHERE, Rule("terms", _term)),
     **dict.fromkeys(("XDE", "YDE", "ZDE", "ADE", "BDE", "CDE"), Rule("moves", _move)),

@@ -29,10 +29,10 @@ SLAB HIDE MIRR POPS FIMP COAT COMM PZUP PPAR VPAR VDSZ VCON PKUP MAZH MARG EDGE 
 SCOL SOPA DRAW NOTE RCMF
 """
 APERTURES = {
-    "rectangular": ("SQAP", "SQOB"),
-    "elliptical": ("ELAP", "ELOB"),
-    "user-defined": ("UDAP", "UDAD", "USAP"),
-    "spider": ("SPID",),
+    "rectangular": "SQAP SQOB",
+    "elliptical": "ELAP ELOB",
+    "user-defined": "UDAP UDAD USAP",
+    "spider": "SPID",
 }
 
 
@@ -91,7 +91,7 @@ SURFACE = {
         keyword: f"its aperture is {shape} ({keyword}), only circles around the axis are read; replace it by "
         "its circle."
         for shape, keywords in APERTURES.items()
-        for keyword in keywords
+        for keyword in keywords.split()
     },
     "TYPE": Rule("kind", _word),
     "CURV": Rule("curvature", one_number),
