@@ -22,7 +22,8 @@ from codesign.lens.analysis import Light, Psf, psf_on_pixels
 from codesign.lens.diffraction import ZernikePlate, with_plate
 from codesign.report import lens_figures
 from studies.frame.run import Run, StudyConfig, main
-from studies.frame.show import Panel, panels
+from studies.frame.show import Panel, panels, table
+from studies.frame.sweep import plain
 
 D = torch.float64
 PERIODS_PX = (8, 4)
@@ -174,34 +175,28 @@ def compare(run, rivals, losses):
             found = [[contrast(config, geo, 1 / p, s, LINES) for p in per_m] for s in config.fields]
             # field, depth, period
             curves[name] = curve = torch.stack([torch.stack(f) for f in found])
-            worst = curve.amin((0, 1))
-            figures = {
+            low, high = curve.amin((0, 1)).tolist()
+            row = {
                 "light": light,
-                **{
-                    f"contrast_{period}px_worst": float(w)
-                    for period, w in zip(PERIODS_PX, worst, strict=True)
-                },
+                "contrast_8px_worst": low,
+                "contrast_4px_worst": high,
                 "contrast_4px_mean": float(curve[..., 1].mean()),
                 "contrast_4px_spread": float(curve[..., 1].std() / curve[..., 1].mean()),
+                "signal_over_noise_8px_worst": low * math.sqrt(light),
+                "signal_over_noise_4px_worst": high * math.sqrt(light),
             }
-            run.record(**{f"{metric_key(name)}_{figure}": value for figure, value in figures.items()})
-            noise = (worst * math.sqrt(light)).tolist()
-            rows.append((name, *(f"{value:.3f}" for value in (*figures.values(), *noise))))
+            run.record(**{f"{plain(name)}_{figure}": value for figure, value in row.items()})
+            rows.append({"lens": name, **row})
             progress.advance()
     run.section("Over depth")
     run.table(
         f"Contrast from {config.near_m:g} to {config.far_m:g} m",
-        ("lens", "light", "8 px worst", "4 px worst", "4 px mean", "4 px spread / mean")
-        + ("8 px worst × √light", "4 px worst × √light"),
-        rows,
-        "RMS transfer over directions of patterns with a period of 8 and 4 pixels; F, d and C light.",
+        *table(rows),
+        "RMS transfer over directions of patterns with a period of 8 and 4 pixels; F, d and C light. Over shot noise: "
+        "contrast times the root of the light.",
     )
     draw(run, rivals, curves, per_m, losses)
     run.finish("A phase plate for depth", verdict(run, rivals, curves))
-
-
-def metric_key(name):
-    return name.replace(",", "").replace(" ", "_").replace(".", "p")
 
 
 def verdict(run, rivals, curves):
@@ -209,10 +204,10 @@ def verdict(run, rivals, curves):
     found = []
     for index, period in enumerate(PERIODS_PX):
         worst = {name: float(curve.amin((0, 1))[index]) for name, curve in curves.items()}
-        plain = [(light, worst[name]) for name, (_, light) in rivals.items() if name != PLATED]
+        stops = [(light, worst[name]) for name, (_, light) in rivals.items() if name != PLATED]
         gain = worst[PLATED] / worst["open"]
-        noise = worst[PLATED] / max(contrast * math.sqrt(light) for light, contrast in plain)
-        light = max((light for light, contrast in plain if contrast >= worst[PLATED]), default=0.0)
+        noise = worst[PLATED] / max(contrast * math.sqrt(light) for light, contrast in stops)
+        light = max((light for light, contrast in stops if contrast >= worst[PLATED]), default=0.0)
         names = "over_open_contrast", "over_best_stop_signal_over_noise", "equal_stop_light"
         for figure, value in zip(names, (gain, noise, light), strict=True):
             run.record(**{f"plate_{figure}_{period}px": value})
@@ -245,7 +240,7 @@ def draw(run, rivals, curves, per_m, losses):
             spreads = [spread(run.config, rivals[name][0], at_m, 0.0, LINES) for at_m in SHOWN_M]
         titles = [f"{at_m:g} m" for at_m in SHOWN_M]
         run.figure(
-            lens_figures.psf_pictures(spreads, titles), f"psf_{metric_key(name)}", f"Point spreads, {name}."
+            lens_figures.psf_pictures(spreads, titles), f"psf_{plain(name)}", f"Point spreads, {name}."
         )
 
 

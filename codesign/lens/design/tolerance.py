@@ -118,29 +118,29 @@ def errors_of(lens: GeoLens, tolerances: Tolerances | Sequence[Error]) -> list[E
             found.append(Error(f"thickness behind {where}", "thickness_mm", (i,), t.thickness_mm))
         if glass[i] and not lens.mirrors[i]:
             found.append(Error(f"index behind {where}", "index_offset", (i,), t.index))
-        for axis, label in enumerate("xy"):
-            found.append(
-                Error(f"decentre of {where} in {label}", "decentre_mm", (i, axis), t.decentre_mm * bends)
-            )
-            found.append(
-                Error(
-                    f"tilt of {where} about {label}", "tilt_rad", (i, axis), math.radians(t.tilt_deg) * bends
-                )
-            )
-    of_elements = t.element_decentre_mm or t.element_tilt_deg or t.element_wedge_deg
-    for g, (first, last) in enumerate(groups(lens) if of_elements else ()):
+        decentres = _two("decentre", where, "decentre_mm", i, t.decentre_mm * bends)
+        tilts = _two("tilt", where, "tilt_rad", i, math.radians(t.tilt_deg) * bends)
+        found += [error for axis in zip(decentres, tilts, strict=True) for error in axis]
+    of_elements = {
+        "decentre_mm": t.element_decentre_mm,
+        "tilt_rad": math.radians(t.element_tilt_deg),
+        "wedge_rad": math.radians(t.element_wedge_deg),
+    }
+    for g, (first, last) in enumerate(groups(lens) if any(of_elements.values()) else ()):
         _check_body(lens, first, last)
-        for kind, deviation in (
-            ("decentre_mm", t.element_decentre_mm),
-            ("tilt_rad", math.radians(t.element_tilt_deg)),
-            ("wedge_rad", math.radians(t.element_wedge_deg)),
-        ):
-            noun = kind.split("_")[0]
-            side = "in" if noun == "decentre" else "about"
-            for axis, label in enumerate("xy"):
-                name = f"{noun} of element {first + 1}-{last + 1} {side} {label}"
-                found.append(Error(name, OF_ELEMENT + kind, (g, axis), deviation))
+        for kind, deviation in of_elements.items():
+            element = f"element {first + 1}-{last + 1}"
+            found += _two(kind.split("_")[0], element, OF_ELEMENT + kind, g, deviation)
     return [error for error in found if error.deviation > 0]
+
+
+def _two(noun, where, tensor, row, deviation):
+    """An error along or about x, and the same for y."""
+    side = "in" if noun == "decentre" else "about"
+    return [
+        Error(f"{noun} of {where} {side} {label}", tensor, (row, axis), deviation)
+        for axis, label in enumerate("xy")
+    ]
 
 
 def _check_body(lens, first, last):
